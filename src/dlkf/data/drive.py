@@ -1,0 +1,97 @@
+"""A drive as tensors on an epoch grid, and the batch of pieces that a filter runs on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+from dlkf.navigation.earth import TangentFrame
+from dlkf.navigation.state import NavState
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One drive, resampled to a uniform IMU rate and cut into N epochs of M samples.
+
+    Epoch k (k = 0 … N−1) spans ``t0 + k·epoch_s`` to ``t0 + (k+1)·epoch_s``. Per-epoch rows of length N+1
+    belong to the epoch *boundaries*: row 0 to ``t0``, row k+1 to the end of epoch k. The grid is chosen so
+    that GNSS fixes fall on boundaries where their rate allows; a fix that lies ``gnss_lag`` seconds before
+    its boundary keeps its own time. NaN or False where unknown. Positions and velocities are ECEF float64.
+    """
+
+    name: str
+    group: str
+    dataset: str
+    t0: float
+    epoch_s: float
+    rate_hz: float
+    imu: Tensor  # (N, M, 6) accelerometer, gyroscope; mean over the sample, ``dtype`` of the loader
+    gnss_r_e: Tensor  # (N+1, 3) float64
+    gnss_v_e: Tensor  # (N+1, 3) float64
+    gnss_std: Tensor  # (N+1, 6) m, m/s in NED; defaults by quality where the file has NaN
+    gnss_valid: Tensor  # (N+1, 6) bool: position and velocity components that may be used
+    gnss_lag: Tensor  # (N+1,) s ≥ 0
+    quality: Tensor  # (N+1,) int64 NMEA GGA code, 0 where there is no fix
+    ref_r_e: Tensor  # (N+1, 3) float64, NaN where unknown
+    ref_v_e: Tensor  # (N+1, 3) float64
+    ref_C_eb: Tensor  # (N+1, 3, 3) float64, NaN where the source has no full attitude
+    ref_valid: Tensor  # (N+1,) bool: position and velocity may be scored
+    ref_imu_error: Tensor  # (N+1, 6) float64, NaN unless the source (a simulation) knows it
+    lever_arm_b: Tensor  # (3,) m, IMU → antenna
+
+    @property
+    def epochs(self) -> int:
+        """Number of epochs N."""
+        return self.imu.shape[0]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """B pieces of T epochs of M samples, ready for the filter loop. Row t belongs to the *end* of epoch t.
+
+    Tensors have the working precision (float32 in training) in the tangent frame of each piece's start;
+    ``start`` and ``start_std`` (position, velocity, attitude; 1σ) are what a filter is told at t = 0.
+    ``available`` marks epochs whose fix a filter may use: outages and decimation switch it off.
+    """
+
+    imu: Tensor  # (B, T, M, 6)
+    dt: float  # s per IMU sample
+    frame: TangentFrame
+    gnss: Tensor  # (B, T, 6) antenna position and velocity in n; zero where not valid
+    gnss_std: Tensor  # (B, T, 6)
+    gnss_valid: Tensor  # (B, T, 6) bool
+    gnss_lag: Tensor  # (B, T) s before the epoch's end
+    available: Tensor  # (B, T) bool
+    lever_arm_b: Tensor  # (B, 3)
+    start: NavState  # (B, …)
+    start_std: Tensor  # (B, 9)
+    truth: NavState  # (B, T, …) NaN where unknown
+    truth_valid: Tensor  # (B, T) bool: position and velocity
+    attitude_valid: Tensor  # (B, T) bool
+    true_imu_error: Tensor  # (B, T, 6) NaN unless simulated
+    present: Tensor  # (B, T) bool: False in the padding of shorter drives
+    drive: tuple[str, ...]  # name per piece
+    t_start: Tensor  # (B,) float64 s, file clock
+
+    @property
+    def size(self) -> tuple[int, int, int]:
+        """(B, T, M)."""
+        return self.imu.shape[0], self.imu.shape[1], self.imu.shape[2]
+
+    @property
+    def epoch_s(self) -> float:
+        """Length of an epoch [s]."""
+        return self.dt * self.imu.shape[2]
+
+    def to(self, device: torch.device | str) -> Batch:
+        """The same batch on another device."""
+        moved = {}
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if isinstance(value, (Tensor, TangentFrame)):
+                moved[f.name] = value.to(device)
+            elif isinstance(value, NavState):
+                moved[f.name] = NavState(*(x.to(device) for x in value))
+        return replace(self, **moved)

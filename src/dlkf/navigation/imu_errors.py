@@ -1,0 +1,60 @@
+"""IMU error model: what a sensor adds to the truth, and what a filter is told about it.
+
+Model (checklist 2.7, paper eqs 7, 8): measured = (I + M) true + b + w, with M's diagonal the scale factors
+and its off-diagonal the misalignments, b a turn-on bias plus an in-run part that is first-order
+Gauss-Markov with time constant τ (a random walk of the same strength while t ≪ τ), w white noise.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+from dlkf.errors import InputError
+
+DEG = math.pi / 180
+MILLIGAL = 1e-5  # m/s²
+
+
+@dataclass(frozen=True)
+class SensorErrors:
+    """One sigma of every error of a triad (accelerometers in m/s², gyroscopes in rad/s).
+
+    ``noise_density`` √S of the white noise [unit/√Hz]; ``turn_on_bias`` [unit]; ``instability`` σ of the
+    in-run bias [unit] with ``correlation_time`` τ [s]; ``scale_factor`` and ``misalignment`` [–].
+    """
+
+    noise_density: float = 0.0
+    turn_on_bias: float = 0.0
+    instability: float = 0.0
+    correlation_time: float = 3600.0
+    scale_factor: float = 0.0
+    misalignment: float = 0.0
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if not isinstance(value, (int, float)) or not math.isfinite(value) or value < 0:
+                raise InputError(f"IMU preset: {f.name} is {value!r}, must be a finite number ≥ 0")
+        if self.correlation_time <= 0:
+            raise InputError("IMU preset: correlation_time is 0, must be positive seconds")
+
+    @property
+    def noise_psd(self) -> float:
+        """S of the white noise [unit²/Hz]."""
+        return self.noise_density**2
+
+    @property
+    def walk_psd(self) -> float:
+        """Driving noise of the in-run bias, 2σ²/τ [unit²/s]."""
+        return 2 * self.instability**2 / self.correlation_time
+
+
+@dataclass(frozen=True)
+class ImuSpec:
+    """An IMU as a preset of ``conf/imu/`` describes it; ``source`` says where the numbers come from."""
+
+    name: str
+    accel: SensorErrors
+    gyro: SensorErrors
+    source: str = ""
