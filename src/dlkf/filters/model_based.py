@@ -14,7 +14,7 @@ from dlkf.data.drive import Batch
 from dlkf.filters.integration import Correction, Epoch
 from dlkf.navigation.error_model import masked, noise_weights, window_noise, window_transition
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, IMU, PVA, STATES, VELOCITY
+from dlkf.navigation.state import IMU, PVA, STATES
 
 STANDARD_GRAVITY = 9.80665
 
@@ -57,7 +57,7 @@ class Memory(NamedTuple):
     """Covariance and noise weights of a Kalman filter between epochs."""
 
     P: Tensor  # (B, 15, 15)
-    weights: dict[slice, Tensor]
+    weights: dict[str, Tensor]
 
 
 def bias_sigma(imu: ImuSpec) -> Float[Tensor, " 6"]:
@@ -96,14 +96,14 @@ class Mbkf15:
         weights = noise_weights(batch.epoch_s, batch.imu.dtype, batch.imu.device)
         return Memory(torch.diag_embed(sigma**2), weights), mean
 
-    def psd(self) -> dict[slice, float]:
+    def psd(self) -> dict[str, float]:
         """Over-bounded power spectral densities of the noise sources (R016)."""
         t, a, g = self.tuning, self.imu.accel, self.imu.gyro
         return {
-            VELOCITY: t.accel_noise**2 * a.noise_psd,
-            ATTITUDE: t.gyro_noise**2 * g.noise_psd,
-            ACCEL: t.accel_walk**2 * max(a.walk_psd, t.walk_floor_accel**2),
-            GYRO: t.gyro_walk**2 * max(g.walk_psd, t.walk_floor_gyro**2),
+            "accel_noise": t.accel_noise**2 * a.noise_psd,
+            "gyro_noise": t.gyro_noise**2 * g.noise_psd,
+            "accel_walk": t.accel_walk**2 * max(a.walk_psd, t.walk_floor_accel**2),
+            "gyro_walk": t.gyro_walk**2 * max(g.walk_psd, t.walk_floor_gyro**2),
         }
 
     def step(self, memory: Memory, epoch: Epoch) -> tuple[Memory, Correction]:

@@ -20,8 +20,12 @@ from dlkf.navigation.strapdown import Window
 
 # Response to a source acting at time τ of a window of length T grows like (T − τ)ⁿ: n per source and state
 # block, none where the source does not reach the block within the window.
-_GROWTH = {VELOCITY: (1, 0, None, None, None), ATTITUDE: (2, 1, 0, None, None),
-           ACCEL: (2, 1, None, 0, None), GYRO: (3, 2, 1, None, 0)}  # fmt: skip
+SOURCES = {
+    "accel_noise": (VELOCITY, (1, 0, None, None, None)),
+    "gyro_noise": (ATTITUDE, (2, 1, 0, None, None)),
+    "accel_walk": (ACCEL, (2, 1, None, 0, None)),
+    "gyro_walk": (GYRO, (3, 2, 1, None, 0)),
+}
 
 
 def window_transition(
@@ -71,10 +75,10 @@ def window_transition(
     return Phi
 
 
-def noise_weights(T: float, dtype: torch.dtype, device: torch.device) -> dict[slice, Float[Tensor, "15 15"]]:
+def noise_weights(T: float, dtype: torch.dtype, device: torch.device) -> dict[str, Float[Tensor, "15 15"]]:
     """∫ (1−τ/T)^(nᵢ+nⱼ) dτ = T/(nᵢ+nⱼ+1) for every pair of states and each noise source."""
     weights = {}
-    for source, powers in _GROWTH.items():
+    for source, (_, powers) in SOURCES.items():
         n = torch.tensor([float("inf") if p is None else float(p) for p in powers], dtype=dtype, device=device)
         n = n.repeat_interleave(3)
         weights[source] = T / (n[:, None] + n[None, :] + 1)
@@ -82,19 +86,18 @@ def noise_weights(T: float, dtype: torch.dtype, device: torch.device) -> dict[sl
 
 
 def window_noise(
-    Phi: Float[Tensor, "B 15 15"], psd: dict[slice, float], weights: dict[slice, Float[Tensor, "15 15"]]
+    Phi: Float[Tensor, "B 15 15"], psd: dict[str, float], weights: dict[str, Float[Tensor, "15 15"]]
 ) -> Float[Tensor, "B 15 15"]:
     """Process noise Q of a whole window from the PSDs of its sources (checklist 2.6, R016).
 
     Q = Σ_source S ∫ L(τ) L(τ)ᵀ dτ, where the response L(τ) to noise at time τ is the source's column of Φ
-    shrunk by (1−τ/T)ⁿ: exact while attitude and specific force are constant over the window. ``psd`` maps
-    VELOCITY (accelerometer noise, m²/s³), ATTITUDE (gyroscope noise, rad²/s), ACCEL and GYRO (random walk of
-    their errors, m²/s⁵ and rad²/s³) to S.
+    shrunk by (1−τ/T)ⁿ: exact while attitude and specific force are constant over the window. ``psd`` gives S
+    of ``accel_noise`` [m²/s³], ``gyro_noise`` [rad²/s], ``accel_walk`` [m²/s⁵] and ``gyro_walk`` [rad²/s³].
     """
     Q = torch.zeros_like(Phi)
     for source, S in psd.items():
         if S:
-            L = Phi[:, :, source]
+            L = Phi[:, :, SOURCES[source][0]]
             Q = Q + (S * weights[source]) * (L @ L.mT)
     return Q
 
