@@ -1,0 +1,101 @@
+"""The paper's CNN-LSTM (R035–R049): two convolutions over the window, stacked LSTM, two dense layers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from dlkf.errors import InputError
+from dlkf.networks.features import CNN_CHANNELS, COMPONENTS
+
+FUSIONS = ("concat", "strict30")
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes of the network; the defaults are the paper's.
+
+    ``fusion``: ``concat`` feeds CNN output and components to the LSTM side by side; ``strict30`` squeezes
+    them into the 30 inputs that the paper names (checklist 4.1). ``flags`` further inputs are appended.
+    """
+
+    samples: int = 50
+    cnn_channels: int = 32
+    kernel: int = 3
+    lstm_hidden: int = 256
+    lstm_layers: int = 4
+    dense: tuple[int, ...] = (512, 256)
+    dropout: float = 0.5
+    fusion: str = "concat"
+    leaky_slope: float = 0.01
+    flags: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "dense", tuple(self.dense))
+        if self.fusion not in FUSIONS:
+            raise InputError(f"model.network.fusion is {self.fusion!r}; choose one of {', '.join(FUSIONS)}")
+        if self.kernel % 2 == 0:
+            raise InputError(f"model.network.kernel is {self.kernel}; it must be odd to keep the window's length")
+        if min(self.samples, self.cnn_channels, self.lstm_hidden, self.lstm_layers, *self.dense) < 1:
+            raise InputError("model.network: every size must be at least 1")
+        if not 0 <= self.dropout < 1:
+            raise InputError(f"model.network.dropout is {self.dropout}; it must be in [0, 1)")
+
+
+LstmState = tuple[Tensor, Tensor]  # each (layers, B, hidden)
+
+
+class CnnLstm(nn.Module):
+    """Window (B, 15, M) and components (B, 30 + flags) to a feature vector (B, dense[-1]), with memory."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        pad = config.kernel // 2
+        self.cnn = nn.Sequential(
+            nn.Conv1d(CNN_CHANNELS, config.cnn_channels, config.kernel, padding=pad),
+            nn.LeakyReLU(config.leaky_slope),
+            nn.Conv1d(config.cnn_channels, 1, config.kernel, padding=pad),
+            nn.LeakyReLU(config.leaky_slope),
+        )
+        width = config.samples + COMPONENTS + config.flags
+        self.squeeze = nn.Linear(width, COMPONENTS) if config.fusion == "strict30" else nn.Identity()
+        self.lstm = nn.LSTM(COMPONENTS if config.fusion == "strict30" else width, config.lstm_hidden, config.lstm_layers)
+        layers: list[nn.Module] = []
+        size = config.lstm_hidden
+        for i, out in enumerate(config.dense):
+            if i:
+                layers.append(nn.Dropout(config.dropout))
+            layers += [nn.Linear(size, out), nn.LeakyReLU(config.leaky_slope)]
+            size = out
+        self.dense = nn.Sequential(*layers)
+        self._initialise()
+
+    def _initialise(self) -> None:
+        """Orthogonal recurrent weights and a forget-gate bias of 1 (checklist 4.13)."""
+        hidden = self.config.lstm_hidden
+        for name, parameter in self.lstm.named_parameters():
+            if name.startswith("weight_hh"):
+                for gate in parameter.data.chunk(4):
+                    nn.init.orthogonal_(gate)
+            elif name.startswith("bias_ih"):
+                nn.init.zeros_(parameter)
+                parameter.data[hidden : 2 * hidden] = 1.0
+            elif name.startswith("bias_hh"):
+                nn.init.zeros_(parameter)
+
+    def start(self, batch_size: int, like: Tensor) -> LstmState:
+        """Empty memory."""
+        zeros = like.new_zeros(self.config.lstm_layers, batch_size, self.config.lstm_hidden)
+        return zeros, zeros
+
+    def forward(
+        self, window: Float[Tensor, "B 15 M"], components: Float[Tensor, "B C"], memory: LstmState
+    ) -> tuple[Float[Tensor, "B D"], LstmState]:
+        """One epoch."""
+        x = torch.cat((self.cnn(window).squeeze(1), components), -1)
+        y, memory = self.lstm(self.squeeze(x).unsqueeze(0), memory)
+        return self.dense(y.squeeze(0)), memory

@@ -1,0 +1,61 @@
+"""Checkpoints: the last state for resuming, the best weights for use. Files appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import lightning as L
+from lightning.pytorch.callbacks import Callback, Checkpoint
+
+from dlkf.filters.learned import save_filter
+
+LAST = "last.ckpt"
+BEST = "best"
+
+
+class ResumePoint(Checkpoint):
+    """Writes ``last.ckpt`` at the end of every ``every`` epochs, beside and renamed: safe against kill -9."""
+
+    def __init__(self, folder: str, every: int = 1) -> None:
+        self.folder, self.every = Path(folder), every
+
+    def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """Save after all other callbacks (Lightning runs checkpoints last)."""
+        epoch = trainer.current_epoch + 1
+        if epoch % self.every and epoch != trainer.max_epochs:
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        beside = self.folder / f"{LAST}.{os.getpid()}.part"
+        trainer.save_checkpoint(beside)
+        beside.replace(self.folder / LAST)
+
+
+class BestWeights(Callback):
+    """Keeps the weights of the epoch with the lowest ``monitor`` in ``best/`` (checklist 4.14)."""
+
+    def __init__(self, folder: str, monitor: str = "val/outage_position_rms", start_epoch: int = 0) -> None:
+        self.folder, self.monitor, self.start_epoch = Path(folder), monitor, start_epoch
+        self.score, self.epoch = float("inf"), -1
+
+    def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """Save when the validation improved."""
+        if trainer.sanity_checking or trainer.current_epoch < self.start_epoch:
+            return
+        score = float(trainer.callback_metrics[self.monitor])
+        if score < self.score:
+            self.score, self.epoch = score, trainer.current_epoch
+            beside, final = self.folder / f".{BEST}.{os.getpid()}", self.folder / BEST
+            shutil.rmtree(beside, ignore_errors=True)
+            save_filter(module.filter, beside)
+            shutil.rmtree(final, ignore_errors=True)
+            beside.rename(final)
+
+    def state_dict(self) -> dict:
+        """Best score so far."""
+        return {"score": self.score, "epoch": self.epoch}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Best score of a checkpoint."""
+        self.score, self.epoch = state["score"], state["epoch"]

@@ -1,0 +1,62 @@
+"""Training loss on position, velocity and attitude (paper eq 9; R061–R067)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import smooth_l1_loss
+
+from dlkf.data.drive import Batch
+from dlkf.filters.integration import Solution
+from dlkf.navigation.state import NavState
+
+TERMS = ("position", "velocity", "attitude")
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """``scale`` [m, m/s, rad]: the error where smooth-L1 turns from square to linear; ``prior`` and
+    ``posterior``: how much the states before and after the update count (checklist 2.8, 4.12)."""
+
+    position_scale: float = 1.0
+    velocity_scale: float = 0.1
+    attitude_scale: float = 0.02
+    prior: float = 1.0
+    posterior: float = 1.0
+
+
+def pva_losses(solution: Solution, batch: Batch, config: LossConfig) -> dict[str, Tensor]:
+    """Mean smooth-L1 of the scaled errors of position, velocity and attitude, unweighted between the three.
+
+    Attitude error is log(C_ref Ĉᵀ), never a difference of angles. Epochs without truth do not count; a batch
+    without any attitude truth has an attitude loss of 0.
+    """
+    losses = {}
+    total = config.prior + config.posterior
+    scales = (config.position_scale, config.velocity_scale, config.attitude_scale)
+    masks = (batch.truth_valid, batch.truth_valid, batch.attitude_valid)
+    eye = torch.eye(3, dtype=batch.imu.dtype, device=batch.imu.device)
+    truth = NavState(
+        torch.nan_to_num(batch.truth.p_n),
+        torch.nan_to_num(batch.truth.v_n),
+        torch.where(batch.attitude_valid[..., None, None], batch.truth.C_nb, eye),
+    )
+    errors = [(w, state.error_to(truth)) for w, state in
+              ((config.prior, solution.prior), (config.posterior, solution.posterior)) if w]  # fmt: skip
+    for i, (term, scale, mask) in enumerate(zip(TERMS, scales, masks)):
+        keep = (mask & batch.present)[..., None]
+        count = (3 * keep.sum()).clamp_min(1)
+        value = batch.imu.new_zeros(())
+        for weight, error in errors:
+            e = error[..., 3 * i : 3 * i + 3] / scale
+            each = smooth_l1_loss(e, torch.zeros_like(e), reduction="none")
+            value = value + weight / total * torch.where(keep, each, torch.zeros_like(each)).sum() / count
+        losses[term] = value
+    return losses
+
+
+def weighted(losses: dict[str, Tensor], weights: dict[str, float]) -> Tensor:
+    """w_p L_p + w_v L_v + w_h L_h (paper eq 9)."""
+    return sum(weights[term] * losses[term] for term in TERMS)
