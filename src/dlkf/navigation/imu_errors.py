@@ -8,6 +8,7 @@ Gauss-Markov with time constant τ (a random walk of the same strength while t �
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 from dlkf.errors import InputError
@@ -58,3 +59,33 @@ class ImuSpec:
     accel: SensorErrors
     gyro: SensorErrors
     source: str = ""
+
+
+def imu_spec(config: Mapping) -> ImuSpec:
+    """The preset that a mapping with the keys of a ``conf/imu/*.yaml`` file describes.
+
+    Every number of both sensors has to be there, so that a misspelt key cannot become a silent zero.
+    Raises InputError for a missing or unknown key or a value that is no number ≥ 0.
+    """
+    name = str(config.get("name", "unnamed")) if isinstance(config, Mapping) else repr(config)
+    _check_keys(config, {"name", "accel", "gyro"}, {"source"}, f"IMU preset {name}")
+    numbers = {f.name for f in fields(SensorErrors)}
+    sensors = {}
+    for sensor in ("accel", "gyro"):
+        where = f"IMU preset {name}, {sensor}"
+        _check_keys(config[sensor], numbers, set(), where)
+        try:
+            sensors[sensor] = SensorErrors(**config[sensor])
+        except InputError as error:
+            raise InputError(str(error).replace("IMU preset", where, 1)) from None
+    return ImuSpec(name=name, source=str(config.get("source", "")), **sensors)
+
+
+def _check_keys(config: Mapping, needed: set[str], optional: set[str], where: str) -> None:
+    if not isinstance(config, Mapping):
+        raise InputError(f"{where}: is {config!r}, must be a mapping with {', '.join(sorted(needed))}")
+    if missing := needed - set(config):
+        raise InputError(f"{where}: {', '.join(sorted(missing))} missing")
+    if unknown := {str(key) for key in config} - needed - optional:
+        known = ", ".join(sorted(needed | optional))
+        raise InputError(f"{where}: unknown key {', '.join(sorted(unknown))}; known are {known}")
