@@ -1,0 +1,316 @@
+"""Figures of an evaluation; every function returns a matplotlib Figure and touches no global state.
+
+Colours are Okabe & Ito's, which colour-blind readers tell apart; each filter also has its own line style.
+Truth is black, an outage is shaded.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from dlkf.evaluation.bootstrap import rms_band
+from dlkf.evaluation.metrics import QUANTITIES, Array, magnitudes, outage_at, rms_over_pieces, windows
+from dlkf.evaluation.scores import Scores
+from dlkf.evaluation.table import number
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#6A3D9A", "#8C510A")
+STYLES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (7, 2)), (0, (3, 1, 1, 1)), (0, (2, 2)))
+SHADE = "#DDDDDD"
+OFF_SCALE = 20.0  # a filter this many times worse than the best does not set the scale
+LABELS = {
+    "position": "3D position error [m]",
+    "horizontal": "Horizontal error [m]",
+    "vertical": "Vertical error [m]",
+    "velocity": "Velocity error [m/s]",
+    "attitude": "Attitude error [°]",
+    "heading": "Heading error [°]",
+}
+IMU_AXES = (
+    ("Accelerometer x", "m/s²", 1.0), ("Accelerometer y", "m/s²", 1.0), ("Accelerometer z", "m/s²", 1.0),
+    ("Gyroscope x", "°/s", 180 / math.pi), ("Gyroscope y", "°/s", 180 / math.pi),
+    ("Gyroscope z", "°/s", 180 / math.pi),
+)  # fmt: skip
+
+
+def line_of(scores: Scores, name: str) -> dict[str, object]:
+    """Colour and style of a filter, the same in every figure of these scores."""
+    k = list(scores.filters).index(name)
+    return {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[k % len(STYLES)]}
+
+
+def representative(scores: Scores, n: int, filter_name: str | None = None) -> list[int]:
+    """Up to n pieces from good to bad: even quantiles of the horizontal error in outages (or anywhere)."""
+    run = scores.filters[filter_name or next(iter(scores.filters))]
+    size = magnitudes(run.error)["horizontal"]
+    if scores.outage.any():
+        size = np.where(scores.outage, size, np.nan)
+    worst = np.nanmax(np.where(np.isnan(size), -1.0, size), axis=-1)
+    order = [int(i) for i in np.argsort(worst, kind="stable") if worst[i] >= 0]
+    if len(order) <= n:
+        return order
+    return [order[round(q * (len(order) - 1))] for q in (np.arange(n) + 0.5) / n]
+
+
+def tracks(scores: Scores, pieces: Sequence[int]) -> Figure:
+    """2D track of some pieces: truth, every filter's path, outages marked on the truth (figs 10, 12).
+
+    Below each track its outage of median error, zoomed to where GNSS comes back.
+    """
+    hidden = [i for i in pieces if scores.outage[i].any()]
+    rows = 2 if hidden else 1
+    figure = Figure(figsize=(max(4.1 * len(pieces), 6), 4.3 * rows + 0.5), layout="constrained")
+    axes = figure.subplots(rows, len(pieces), squeeze=False)
+    for k, i in enumerate(pieces):
+        truth = scores.truth_p_n[i, :, :2]
+        low, high = np.nanmin(truth, 0), np.nanmax(truth, 0)
+        middle = 0.5 * (low + high)
+        half = 0.6 * max(*(high - low), 40.0)
+        _track(axes[0, k], scores, i, middle, half)
+        there = ~np.isnan(truth[:, 0])
+        paths = {n: np.nan_to_num(r.p_n[i, there, :2], nan=np.inf) for n, r in scores.filters.items()}
+        _absent(axes[0, k], [n for n, p in paths.items() if (np.abs(p - middle) > half).any()])
+        known = truth[~np.isnan(truth[:, 0])]
+        axes[0, k].plot(known[0, 1], known[0, 0], "o", color="black", ms=5, zorder=5)
+        axes[0, k].annotate(
+            "start", known[0, ::-1], xytext=(6, 6), textcoords="offset points", fontsize=8, zorder=6
+        )
+        axes[0, k].set_title(_name(scores, i), fontsize=9)
+        if i in hidden:
+            _outage_end(axes[1, k], scores, i)
+        elif hidden:
+            axes[1, k].set_visible(False)
+    handles = [Line2D([], [], color="black", lw=1.6, label="truth")]
+    if hidden:
+        handles.append(Line2D([], [], color=SHADE, lw=8, solid_capstyle="round", label="outage"))
+    handles += [Line2D([], [], lw=1.8, label=n, **line_of(scores, n)) for n in scores.filters]
+    _legend(figure, handles)
+    return figure
+
+
+def _track(ax: Axes, scores: Scores, i: int, middle: Array, half: float) -> None:
+    """Truth, outages and filters of a piece in a square of 2·half around ``middle`` (north, east)."""
+    truth, outage = scores.truth_p_n[i, :, :2], scores.outage[i]
+    before = np.roll(outage, -1)
+    before[-1] = False  # an outage is drawn from the last fix on
+    hidden = np.where((outage | before)[:, None], truth, np.nan)
+    ax.plot(hidden[:, 1], hidden[:, 0], color=SHADE, lw=9, solid_capstyle="round", zorder=1)
+    ax.plot(truth[:, 1], truth[:, 0], color="black", lw=1.6, zorder=3)
+    for name, run in scores.filters.items():
+        p = run.p_n[i, :, :2]
+        ax.plot(p[:, 1], p[:, 0], lw=1.8, alpha=0.9, zorder=4, **line_of(scores, name))
+    ax.set_aspect("equal")
+    ax.set_xlim(middle[1] - half, middle[1] + half)
+    ax.set_ylim(middle[0] - half, middle[0] + half)
+    ax.set(xlabel="East [m]", ylabel="North [m]")
+    _plain(ax)
+
+
+def _absent(ax: Axes, names: Sequence[str]) -> None:
+    if names:
+        box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1}
+        note = f"leaves the picture: {', '.join(names)}"
+        ax.text(0.02, 0.02, note, transform=ax.transAxes, fontsize=8, color="#555555", zorder=6, bbox=box)
+
+
+def _outage_end(ax: Axes, scores: Scores, i: int) -> None:
+    """The end of a piece's outage of median error; a ring is the last position without GNSS."""
+    w = windows(scores.outage[i : i + 1])
+    ends = {n: magnitudes(r.error[i, w.last])["horizontal"] for n, r in scores.filters.items()}
+    best = np.min([np.where(np.isfinite(e), e, np.inf) for e in ends.values()], 0)
+    k = int(np.argsort(best)[len(best) // 2])
+    last = int(w.last[k])
+    near = [e[k] for e in ends.values() if np.isfinite(e[k]) and e[k] <= 12 * max(best[k], 1.0)]
+    truth = scores.truth_p_n[i, last, :2]
+    half = max(1.6 * max(near, default=1.0), 4.0)
+    _track(ax, scores, i, truth, half)
+    absent: list[str] = []
+    ax.plot(truth[1], truth[0], "o", ms=8, mfc="none", mec="black", mew=1.6, zorder=5)
+    for name, run in scores.filters.items():
+        p = run.p_n[i, last]
+        if not (np.abs(p[:2] - truth) <= half).all():
+            absent.append(name)
+        ax.plot(p[1], p[0], "o", ms=8, mfc="none", mec=line_of(scores, name)["color"], mew=1.6, zorder=5)
+    _absent(ax, absent)
+    ax.set_title(f"end of the outage, {w.length[k] * scores.epoch_s:g} s without GNSS", fontsize=9)
+
+
+def error_over_time(
+    scores: Scores,
+    pieces: Sequence[int] | None = None,
+    quantities: Sequence[str] = ("horizontal", "velocity", "attitude"),
+) -> Figure:
+    """RMS over pieces at each time since their start, middle 80 % of the pieces as a band (figs 13, 14).
+
+    One piece gives its error itself. Outages are shaded, darker where more pieces have one.
+    """
+    index = list(range(len(scores.pieces))) if pieces is None else list(pieces)
+    sizes = {n: magnitudes(r.error[index]) for n, r in scores.filters.items()}
+    shown = [q for q in quantities if any(np.isfinite(s[q]).any() for s in sizes.values())]
+    figure = Figure(figsize=(9, 2.5 * max(len(shown), 1) + 0.9), layout="constrained")
+    axes = figure.subplots(max(len(shown), 1), 1, sharex=True, squeeze=False).ravel()
+    length = scores.t[np.flatnonzero(~np.isnan(scores.truth_p_n[index]).all((0, 2)))[-1]]
+    for ax, q in zip(axes, shown):
+        scale = 180 / math.pi if q in ("attitude", "heading") else 1.0
+        _shade(ax, scores, index)
+        for name in scores.filters:
+            x = sizes[name][q] * scale
+            finite = np.where(np.isfinite(x), x, np.nan)
+            style = line_of(scores, name)
+            ax.plot(scores.t, rms_over_pieces(np.where(np.isinf(x), np.nan, x)), lw=1.8, zorder=3, **style)
+            if len(index) > 4:
+                some = (~np.isnan(finite)).sum(0) > 4
+                band = np.nanpercentile(finite[:, some], [10, 90], axis=0)
+                ax.fill_between(scores.t[some], *band, color=style["color"], alpha=0.13, lw=0, zorder=2)
+        ax.set_yscale("log")
+        ax.set_ylabel(LABELS[q])
+        ax.set_xlim(0, length)
+        _plain(ax)
+    axes[len(shown) - 1].set_xlabel(
+        "Time since the start [s]" if len(index) == 1 else "Time since the start of the piece [s]"
+    )
+    what = _name(scores, index[0]) if len(index) == 1 else f"RMS over {len(index)} pieces"
+    if len(index) > 4:
+        what += ", band: middle 80 % of the pieces"
+    axes[0].set_title(what, fontsize=9, loc="left")
+    handles = [Line2D([], [], lw=1.8, label=n, **line_of(scores, n)) for n in scores.filters]
+    _legend(figure, handles + _outage_handle(scores, index))
+    return figure
+
+
+def imu_errors(scores: Scores, pieces: Sequence[int]) -> Figure:
+    """IMU-error estimates over time, six axes; truth in black, ±1σ as a band for one piece (figs 6, 11)."""
+    figure = Figure(figsize=(12, 6.4), layout="constrained")
+    axes = figure.subplots(2, 3, sharex=True)
+    known = ~np.isnan(scores.true_imu_error[list(pieces)]).all()
+    alone = len(pieces) == 1
+    last = np.flatnonzero(~np.isnan(scores.truth_p_n[list(pieces)]).all((0, 2)))[-1]
+    settled = scores.t > 0.2 * scores.t[last]
+    for k, (ax, (label, unit, scale)) in enumerate(zip(axes.ravel(), IMU_AXES)):
+        _shade(ax, scores, pieces)
+        extent: list[Array] = []
+        for name, run in scores.filters.items():
+            if not np.nan_to_num(run.imu_error[list(pieces)]).any():
+                continue  # a filter that estimates none
+            style = line_of(scores, name)
+            for i in pieces:
+                y = run.imu_error[i, :, k] * scale
+                ax.plot(
+                    scores.t, y, lw=1.7 if alone else 0.9, alpha=1.0 if alone else 0.65, zorder=3, **style
+                )
+                extent.append(y[settled])
+                if alone:
+                    s = run.imu_std[i, :, k] * scale
+                    ax.fill_between(scores.t, y - s, y + s, color=style["color"], alpha=0.15, lw=0, zorder=2)
+                    extent += [(y - s)[settled], (y + s)[settled]]
+        for i in pieces if known else ():
+            y = scores.true_imu_error[i, :, k] * scale
+            ax.plot(scores.t, y, color="black", lw=1.4 if alone else 0.7, ls="-" if alone else ":", zorder=4)
+            extent.append(y[settled])
+        _limits(ax, extent)
+        ax.set_title(label, fontsize=9, loc="left")
+        ax.set_ylabel(f"Error [{unit}]")
+        ax.set_xlim(0, scores.t[last])
+        if k >= 3:
+            ax.set_xlabel("Time since the start [s]")
+        _plain(ax)
+    handles = (
+        [Line2D([], [], color="black", lw=1.4, ls="-" if alone else ":", label="truth")] if known else []
+    )
+    for n, r in scores.filters.items():
+        if np.nan_to_num(r.imu_error[list(pieces)]).any():
+            handles.append(Line2D([], [], lw=1.7, label=n, **line_of(scores, n)))
+    stds = any(np.isfinite(r.imu_std[list(pieces)]).any() for r in scores.filters.values())
+    if alone and stds:
+        handles.append(Patch(color=COLOURS[1], alpha=0.2, label="±1σ, as the filter says"))
+    title = _name(scores, pieces[0]) if alone else f"{len(pieces)} pieces"
+    figure.suptitle(f"IMU-error estimates, {title}", fontsize=10)
+    _legend(figure, handles + _outage_handle(scores, pieces))
+    return figure
+
+
+def error_growth(scores: Scores, quantity: str = "horizontal", *, seed: int = 0) -> Figure:
+    """RMS over outages against the time without GNSS, with its 95 % bootstrap band."""
+    w = scores.windows
+    longest = int(w.length.max())
+    seconds = scores.epoch_s * np.arange(1, longest + 1)
+    groups = [scores.pieces[i].group for i in w.piece]
+    scale = 180 / math.pi if quantity in ("attitude", "heading") else 1.0
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    ax = figure.subplots()
+    ends: dict[str, float] = {}
+    tops: dict[str, float] = {}
+    for name, run in scores.filters.items():
+        x = outage_at(magnitudes(run.error)[quantity] * scale, w, seconds, scores.epoch_s)
+        rms, low, high = rms_band(x, groups=groups, seed=seed)
+        style = line_of(scores, name)
+        ax.plot(seconds, np.where(np.isfinite(rms), rms, np.nan), lw=2, label=name, zorder=3, **style)
+        ax.fill_between(seconds, low, high, color=style["color"], alpha=0.15, lw=0, zorder=2)
+        ends[name] = float(np.nanmax(rms, initial=0.0))
+        tops[name] = max(float(np.nanmax(high, initial=0.0)), ends[name])
+    inside = [
+        n for n in ends if np.isfinite(ends[n]) and ends[n] <= OFF_SCALE * max(min(ends.values()), 1e-9)
+    ]
+    outside = [
+        f"{n} ({number(ends[n])} {'°' if scale > 1 else QUANTITIES[quantity]})"
+        for n in ends
+        if n not in inside
+    ]
+    ax.set_ylim(0, 1.05 * max((tops[n] for n in inside), default=1.0))
+    if outside:
+        note = f"off the scale at the end: {', '.join(outside)}"
+        ax.text(0.02, 0.96, note, transform=ax.transAxes, fontsize=8, color="#555555", va="top")
+    ax.set_xlim(0, seconds[-1])
+    ax.set(xlabel="Time without GNSS [s]", ylabel=LABELS[quantity].replace(" error", " error, RMS"))
+    ax.set_title(f"{len(w.piece)} outages, band: 95 % bootstrap interval of the RMS", fontsize=9, loc="left")
+    _plain(ax)
+    _legend(figure, ax.get_legend_handles_labels()[0])
+    return figure
+
+
+def _shade(ax: Axes, scores: Scores, pieces: Iterable[int]) -> None:
+    share = scores.outage[list(pieces)].mean(0)
+    edges = np.concatenate(([0.0], scores.t))
+    change = np.flatnonzero(np.diff(share, prepend=-1.0, append=-1.0))
+    for a, b in pairwise(change):
+        if share[a] > 0:
+            ax.axvspan(edges[a], edges[b], color=SHADE, alpha=0.25 + 0.75 * share[a], lw=0, zorder=0)
+
+
+def _outage_handle(scores: Scores, pieces: Sequence[int]) -> list[Patch]:
+    return [Patch(color=SHADE, label="outage")] if scores.outage[list(pieces)].any() else []
+
+
+def _limits(ax: Axes, extent: list[Array]) -> None:
+    """Limits by the settled part of the lines with room to see them converge; the first swings may leave."""
+    values = np.concatenate(extent) if extent else np.empty(0)
+    values = values[np.isfinite(values)]
+    if values.size:
+        low, high = values.min(), values.max()
+        margin = 0.6 * (high - low) or 1e-6
+        ax.set_ylim(low - margin, high + margin)
+
+
+def _name(scores: Scores, i: int) -> str:
+    p = scores.pieces[i]
+    return f"{p.drive}, from t = {p.t_start:.0f} s"
+
+
+def _legend(figure: Figure, handles: Sequence) -> None:
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=min(len(handles), 6), frameon=False, fontsize=9
+    )
+
+
+def _plain(ax: Axes) -> None:
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.grid(color="#EEEEEE", lw=0.8, zorder=0)
+    ax.set_axisbelow(True)
+    ax.tick_params(labelsize=8)

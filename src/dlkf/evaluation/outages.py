@@ -1,0 +1,116 @@
+"""Outage schedules: which epochs of a batch lose their fix, the same for every filter.
+
+An outage of d seconds that starts at s withholds the fixes at s < t ≤ s + d. The last fix used is that of s,
+and the error of the last withheld epoch is the error after exactly d seconds without GNSS.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dlkf.data.drive import Batch
+from dlkf.errors import InputError
+
+LAST_FIX_WITHIN_S = 2.0  # an outage counts from a fix: one must lie this close before its start
+
+
+@dataclass(frozen=True)
+class OutagePlan:
+    """When GNSS is taken away [s since the start of a piece].
+
+    ``first_s`` and ``duration_s`` are numbers, or (low, high): drawn for each piece, uniformly, in whole
+    epochs. ``every_s`` repeats the outage to the end of the piece (None: one outage). Each of ``offsets_s``
+    gives one run over the same pieces with the whole schedule shifted, so that the windows cover a drive.
+    """
+
+    first_s: float | Sequence[float] = 60.0
+    duration_s: float | Sequence[float] = 60.0
+    every_s: float | None = None
+    offsets_s: Sequence[float] = (0.0,)
+
+    def __post_init__(self) -> None:
+        low, high = _bounds("outage.duration_s", self.duration_s)
+        _bounds("outage.first_s", self.first_s)
+        if low <= 0:
+            raise InputError(f"outage.duration_s is {low:g} s, must be above 0")
+        if not self.offsets_s or min(self.offsets_s) < 0:
+            raise InputError("outage.offsets_s must be a list of numbers ≥ 0, such as [0]")
+        if self.every_s is not None and self.every_s <= high:
+            raise InputError(
+                f"outage.every_s is {self.every_s:g} s but the outages last {high:g} s: "
+                "leave time with GNSS between them"
+            )
+
+    def masks(self, batch: Batch, generator: torch.Generator | None = None) -> list[Tensor]:
+        """One mask (B, T) per offset, True where a fix is withheld; only outages that can be scored stay."""
+        B, T, _ = batch.size
+        epoch_s = batch.epoch_s
+        first = _drawn(self.first_s, B, epoch_s, generator)
+        duration = _drawn(self.duration_s, B, epoch_s, generator)
+        repeats = 1 if self.every_s is None else max(1, int(T * epoch_s / self.every_s) + 1)
+        out = []
+        for offset in self.offsets_s:
+            mask = torch.zeros(B, T, dtype=torch.bool)
+            for k in range(repeats):
+                start = first + offset + k * (self.every_s or 0.0)
+                mask |= outage_mask(batch, start, duration)
+            out.append(scorable(batch, mask))
+        return out
+
+
+def outage_mask(batch: Batch, start_s: Tensor, duration_s: Tensor) -> Tensor:
+    """True where an epoch's end t has start < t ≤ start + duration (B,); all False where that leaves it."""
+    T, epoch_s = batch.size[1], batch.epoch_s
+    t = torch.arange(1, T + 1, dtype=torch.float64) * epoch_s
+    start, stop = start_s.double()[:, None], (start_s + duration_s).double()[:, None]
+    slack = 1e-6 * epoch_s
+    inside = (t > start + slack) & (t <= stop + slack)
+    length = batch.present.cpu().sum(-1, keepdim=True) * epoch_s
+    return inside & (start > -slack) & (stop <= length + slack)
+
+
+def scorable(batch: Batch, outage: Tensor) -> Tensor:
+    """The mask without the outages whose truth is not known throughout, or that no fix precedes closely."""
+    truth = batch.truth_valid.cpu() & batch.present.cpu()
+    position = batch.gnss_valid[..., :3].all(-1).cpu() & batch.available.cpu()
+    reach = max(1, round(LAST_FIX_WITHIN_S / batch.epoch_s))
+    before = torch.nn.functional.pad(position, (reach, 0))  # column t + reach is epoch t
+    recent = before.unfold(1, reach, 1)[:, : outage.shape[1]].any(-1)  # a fix in the `reach` epochs before t
+    first = outage & ~torch.nn.functional.pad(outage, (1, 0))[:, :-1]
+    bad_start = first & ~recent
+    bad_start[:, 0] = False  # an outage from the very start counts from the initial state
+    window = first.long().cumsum(-1) * outage  # 1, 2, … within each outage, 0 outside
+    faulty = torch.zeros(outage.shape[0], int(window.max()) + 1, dtype=torch.long)
+    faulty.scatter_add_(1, window, (outage & (~truth | bad_start)).long())
+    return outage & (faulty.gather(1, window) == 0)
+
+
+def with_outage(batch: Batch, outage: Tensor) -> Batch:
+    """The batch with the fixes of the mask (B, T) withheld."""
+    return replace(batch, available=batch.available & ~outage.to(batch.available.device))
+
+
+def _bounds(name: str, value: float | Sequence[float]) -> tuple[float, float]:
+    values = [value] if isinstance(value, (int, float)) else list(value)
+    if (
+        len(values) not in (1, 2)
+        or not np.isfinite(values).all()
+        or min(values) < 0
+        or values[0] > values[-1]
+    ):
+        raise InputError(f"{name} is {value!r}, must be a number ≥ 0 or [low, high] in seconds")
+    return float(values[0]), float(values[-1])
+
+
+def _drawn(
+    value: float | Sequence[float], n: int, epoch_s: float, generator: torch.Generator | None
+) -> Tensor:
+    low, high = _bounds("outage", value)
+    steps = round((high - low) / epoch_s)
+    draw = torch.randint(0, steps + 1, (n,), generator=generator) if steps else torch.zeros(n)
+    return low + draw.double() * epoch_s

@@ -1,0 +1,191 @@
+"""Results as tables (terminal, markdown, CSV) and as ``metrics.json``.
+
+Every kind of data has its own table. A dash is "no truth to compare with"; ∞ is a filter whose output was
+not finite in at least one piece, never left out.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from rich.table import Table as RichTable
+
+from dlkf.evaluation.metrics import QUANTITIES
+
+DASH = "–"
+
+
+class Table(NamedTuple):
+    """A titled table of text; the first column is the filter."""
+
+    title: str
+    note: str
+    columns: list[str]
+    rows: list[list[str]]
+
+
+def number(x: float | None, scale: float = 1.0) -> str:
+    """Three significant digits, – for NaN, ∞ for inf."""
+    if x is None or math.isnan(x):
+        return DASH
+    if math.isinf(x):
+        return "∞" if x > 0 else "−∞"
+    x = x * scale
+    if x == 0:
+        return "0"
+    decimals = max(0, 2 - math.floor(math.log10(float(f"{abs(x):.2e}"))))
+    return f"{x:.{min(decimals, 6)}f}" if abs(x) < 1e5 else f"{x:.2e}"
+
+
+def with_interval(c: dict[str, Any]) -> str:
+    """Ratio with its confidence interval: ``0.71 [0.62, 0.83]``."""
+    bounds = f" [{number(c['ratio_low'])}, {number(c['ratio_high'])}]"
+    return number(c["ratio"]) + ("" if math.isnan(c["ratio_low"]) else bounds)
+
+
+def tables(dataset: str, result: dict[str, Any]) -> list[Table]:
+    """The tables of one kind of data: whole pieces, then outages if there are any."""
+    n = result["count"]
+    what = f"{dataset} ({result['kind']})"
+    settled = f"after {result['settle_s']:g} s"
+    whole = Table(
+        title=f"{what}: {_count(n['pieces'], 'piece')} of {_count(n['drives'], 'drive')}",
+        note="RMS over each piece, then RMS over the pieces; median and 95 % over the pieces.",
+        columns=[
+            "Filter", "3D pos. [m]", f"3D {settled} [m]", f"Horiz. {settled} [m]", "median", "95 %",
+            "Velocity [m/s]", "Attitude [°]", "Heading [°]", "not finite",
+        ],
+        rows=[],
+    )  # fmt: skip
+    for name, f in result["filters"].items():
+        p = f["pieces"]
+        flat = p["horizontal"]["settled"]
+        whole.rows.append(
+            [name, number(p["position"]["all"]["rms"]), number(p["position"]["settled"]["rms"])]
+            + [number(flat[s]) for s in ("rms", "median", "p95")]
+            + [number(p["velocity"]["all"]["rms"])]
+            + [number(p[q]["all"]["rms"], 180 / math.pi) for q in ("attitude", "heading")]
+            + [str(p["position"]["all"]["nonfinite"])]
+        )
+    return [whole] if not n["outages"] else [whole, outage_table(what, result)]
+
+
+def outage_table(what: str, result: dict[str, Any]) -> Table:
+    """Errors at the end of the outages, at round times into them, and against the baseline."""
+    n, low, high = result["count"], *result["count"]["outage_s"]
+    length = f"{low:g} s" if low == high else f"{low:g} to {high:g} s"
+    first = next(iter(result["filters"].values()))
+    at = [s for s in first["outages"]["at"] if float(s) < high][-3:]
+    against = next((c["baseline"] for c in result["comparisons"].values()), None)
+    note = "Horizontal error at the end (RMS, median, 95 % over the outages), at times into it (RMS); "
+    note += "velocity and attitude at the end (RMS); drift: horizontal error per distance driven (median)."
+    if against:
+        note += (
+            f" Last column: horizontal RMS at the end, ratio to {against}, 95 % interval by paired bootstrap."
+        )
+    table = Table(
+        title=f"{what}: {_count(n['outages'], 'outage')} of {length} in {_count(n['drives'], 'drive')}",
+        note=note,
+        columns=["Filter", "End RMS [m]", "median", "95 %"]
+        + [f"at {s} s [m]" for s in at]
+        + ["Vel. [m/s]", "Att. [°]", "Drift [%]"]
+        + ([f"vs {against}"] if against else []),
+        rows=[],
+    )
+    for name, f in result["filters"].items():
+        o = f["outages"]
+        row = [name] + [number(o["end"]["horizontal"][s]) for s in ("rms", "median", "p95")]
+        row += [number(o["at"][s]["horizontal"]["rms"]) for s in at]
+        row += [number(o["end"]["velocity"]["rms"]), number(o["end"]["attitude"]["rms"], 180 / math.pi)]
+        row += [number(o["drift"]["median"], 100)]
+        if against:
+            c = result["comparisons"].get(name)
+            row.append("1" if c is None else with_interval(c["outage_end"]["horizontal"]))
+        table.rows.append(row)
+    return table
+
+
+def slope_table(dataset: str, result: dict[str, Any]) -> Table | None:
+    """Slope of the IMU-error estimate against the true or the injected error; None where neither is known."""
+    axes = ["accel x", "accel y", "accel z", "gyro x", "gyro y", "gyro z"]
+    injected = any("injected_slope" in f["imu_error"] for f in result["filters"].values())
+    key = "injected_slope" if injected else "slope"
+    rows = [
+        [n] + [number(s) for s in f["imu_error"].get(key, [math.nan] * 6)]
+        for n, f in result["filters"].items()
+    ]
+    if all(cell == DASH for row in rows for cell in row[1:]):
+        return None
+    cause = "an injected bias" if injected else "the true error, over the pieces"
+    return Table(
+        title=f"{dataset} ({result['kind']}): does the filter estimate the IMU error?",
+        note=f"Slope of the estimate at the end of a piece against {cause}: 1 = estimates it, 0 = memorised.",
+        columns=["Filter", *axes],
+        rows=rows,
+    )
+
+
+def as_rich(table: Table) -> RichTable:
+    """For the terminal."""
+    out = RichTable(title=table.title, caption=table.note, title_justify="left", caption_justify="left")
+    for i, column in enumerate(table.columns):
+        out.add_column(column, justify="right" if i else "left", overflow="fold")
+    for row in table.rows:
+        out.add_row(*row)
+    return out
+
+
+def as_markdown(table: Table) -> str:
+    """A markdown table under its title."""
+    head = "| " + " | ".join(table.columns) + " |"
+    rule = "|" + "|".join([":--"] + ["--:"] * (len(table.columns) - 1)) + "|"
+    rows = ["| " + " | ".join(row) + " |" for row in table.rows]
+    return "\n".join([f"**{table.title}**", "", head, rule, *rows, "", table.note, ""])
+
+
+def as_csv(dataset: str, results: Sequence[dict[str, Any]]) -> str:
+    """Every summary, one value a line, with its unit."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["dataset", "kind", "filter", "over", "part", "quantity", "statistic", "value", "unit"])
+    for r in results:
+        for name, f in r["filters"].items():
+            parts = [("pieces", phase, q, s) for q, by in f["pieces"].items() for phase, s in by.items()]
+            if "outages" in f:
+                o = f["outages"]
+                parts += [("outages", part, q, s) for part in ("end", "rms") for q, s in o[part].items()]
+                parts += [("outages", f"at {t} s", q, s) for t, by in o["at"].items() for q, s in by.items()]
+                parts.append(("outages", "end", "drift", o["drift"]))
+            for over, part, quantity, stats in parts:
+                unit = QUANTITIES.get(quantity, "1")
+                for statistic, value in stats.items():
+                    u = "1" if statistic in ("n", "nonfinite") else unit
+                    writer.writerow([dataset, r["kind"], name, over, part, quantity, statistic, value, u])
+    return out.getvalue()
+
+
+def plain(x: Any) -> Any:
+    """The same value in strict JSON: NaN becomes null, infinities the strings "inf" and "-inf"."""
+    if isinstance(x, dict):
+        return {str(k): plain(v) for k, v in x.items()}
+    if isinstance(x, (list, tuple)):
+        return [plain(v) for v in x]
+    if hasattr(x, "item"):
+        x = x.item()
+    if isinstance(x, float) and not math.isfinite(x):
+        return None if math.isnan(x) else ("inf" if x > 0 else "-inf")
+    return x
+
+
+def as_json(content: dict[str, Any]) -> str:
+    """The text of ``metrics.json``."""
+    return json.dumps(plain(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _count(n: int, noun: str) -> str:
+    return f"{n} {noun}" + ("" if n == 1 else "s")

@@ -1,0 +1,80 @@
+"""A batch of car-like pieces whose truth is what the strapdown makes of a perfect IMU."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from dlkf.data.drive import Batch
+from dlkf.navigation.attitude import rotation_from_rpy
+from dlkf.navigation.earth import tangent_frame
+from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
+from dlkf.navigation.state import NavState
+from dlkf.navigation.strapdown import strapdown
+
+IMU = ImuSpec("test", SensorErrors(2e-3, 0.05, 0.0), SensorErrors(1e-4, 2e-3, 0.0))
+
+
+def car_batch(
+    B: int = 4, T: int = 60, M: int = 20, seed: int = 0, dtype: torch.dtype = torch.float64
+) -> Batch:
+    """B pieces of T s: speed and yaw rate vary smoothly, new IMU biases in every piece, cm GNSS."""
+    g = torch.Generator().manual_seed(seed)
+
+    def draw(*size: int) -> torch.Tensor:
+        return torch.randn(*size, generator=g, dtype=torch.float64)
+
+    frame = tangent_frame(torch.full((B,), 0.7), torch.full((B,), 0.2), torch.full((B,), 300.0))
+    dt = 1.0 / M
+    t = torch.arange(T * M, dtype=torch.float64) * dt
+    phase = draw(B, 4, 1)
+    forward = 1.2 * torch.sin(2 * math.pi * t / 24 + phase[:, 0])
+    yaw_rate = (
+        0.12 * torch.sin(2 * math.pi * t / 31 + phase[:, 1]) * torch.sin(2 * math.pi * t / 13 + phase[:, 2])
+    )
+    speed = 14 + (forward * dt).cumsum(-1)
+    yaw = 3 * phase[:, 3, 0]
+    zero = torch.zeros_like(forward)
+    gravity = frame.gravity(torch.zeros(B, 3, dtype=torch.float64))[:, 2:].expand_as(forward)
+    perfect = torch.stack((forward, speed * yaw_rate, -gravity, zero, zero, yaw_rate), -1).unflatten(
+        1, (T, M)
+    )
+    v0 = 14 * torch.stack((torch.cos(yaw), torch.sin(yaw), 0 * yaw), -1)
+    start = NavState(
+        torch.zeros(B, 3).double(), v0, rotation_from_rpy(torch.stack((0 * yaw, 0 * yaw, yaw), -1))
+    )
+    states, state = [], start
+    for k in range(T):
+        state = strapdown(state, perfect[:, k], dt, frame).end
+        states.append(NavState(*(x.clone() for x in state)))
+    truth = NavState(*(torch.stack(x, 1) for x in zip(*states)))
+    bias = torch.tensor([0.05] * 3 + [2e-3] * 3, dtype=torch.float64) * draw(B, 6)
+    white = torch.tensor([2e-3] * 3 + [1e-4] * 3, dtype=torch.float64) * math.sqrt(M)
+    imu = perfect + bias[:, None, None] + white * draw(B, T, M, 6)
+    std = torch.tensor([0.03] * 3 + [0.02] * 3, dtype=torch.float64).expand(B, T, 6)
+    law = torch.tensor(
+        [1.0] * 3 + [0.1] * 3 + [math.radians(1)] * 2 + [math.radians(10)], dtype=torch.float64
+    )
+    yes = torch.ones(B, T, dtype=torch.bool)
+    batch = Batch(
+        imu=imu, dt=dt, frame=frame,
+        gnss=torch.cat((truth.p_n, truth.v_n), -1) + std * draw(B, T, 6), gnss_std=std,
+        gnss_valid=yes[..., None].expand(B, T, 6), gnss_lag=torch.zeros(B, T).double(), available=yes,
+        lever_arm_b=torch.zeros(B, 3).double(), start=start.corrected(-law * draw(B, 9)),
+        start_std=law.expand(B, 9), truth=truth, truth_valid=yes, attitude_valid=yes,
+        true_imu_error=bias[:, None].expand(B, T, 6), present=yes,
+        drive=tuple(f"car-{i:02d}" for i in range(B)), t_start=100.0 * torch.arange(B).double(),
+    )  # fmt: skip
+    if dtype is torch.float64:
+        return batch
+    from dlkf.evaluation.chunks import in_precision
+
+    return in_precision(batch, dtype)
+
+
+@pytest.fixture(scope="session")
+def cars() -> Batch:
+    """Six pieces of 60 s."""
+    return car_batch(6, 60)
