@@ -64,8 +64,12 @@ def window_transition(
     Phi[:, POSITION, VELOCITY] = T * eye - T * T * W
     Phi[:, VELOCITY, POSITION] = T * gradient
     Phi[:, VELOCITY, VELOCITY] -= 2 * T * W
-    Phi[:, VELOCITY, ATTITUDE] = -skew(end.v_n - start.v_n - T * gravity)
-    Phi[:, POSITION, ATTITUDE] = -skew(end.p_n - start.p_n - T * start.v_n - 0.5 * T * T * gravity)
+    moved = end.p_n - start.p_n
+    swept = T / 3 * moved + T * T / 6 * start.v_n  # ∫(p − p₀), exact for constant acceleration
+    coriolis_v = 2 * torch.linalg.cross(frame.earth_rate_n, moved)
+    coriolis_p = 2 * torch.linalg.cross(frame.earth_rate_n, swept)
+    Phi[:, VELOCITY, ATTITUDE] = -skew(end.v_n - start.v_n - T * gravity + coriolis_v)
+    Phi[:, POSITION, ATTITUDE] = -skew(moved - T * start.v_n - 0.5 * T * T * gravity + coriolis_p)
     Phi[:, ATTITUDE, ATTITUDE] = rotation_from_vector(-T * frame.earth_rate_n)
     Phi[:, VELOCITY, ACCEL] = -A1.unflatten(-1, (3, 3))
     Phi[:, POSITION, ACCEL] = -A2.unflatten(-1, (3, 3))

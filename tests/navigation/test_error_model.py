@@ -1,0 +1,115 @@
+"""Φ against finite differences of the nonlinear strapdown, Q against Van Loan, H against its definition."""
+
+import pytest
+import torch
+from scipy.linalg import expm
+
+from dlkf.navigation.attitude import rotation_from_rpy, skew
+from dlkf.navigation.error_model import measurement, noise_weights, window_noise, window_transition
+from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, POSITION, VELOCITY, NavState
+from dlkf.navigation.strapdown import strapdown
+
+from .oracle import frame_at, lively_imu
+
+DT, M = 0.02, 50
+PSD = {"accel_noise": 1e-5, "gyro_noise": 3e-8, "accel_walk": 5e-8, "gyro_walk": 5e-10}
+
+
+def scene(seed: int = 5):
+    g = torch.Generator().manual_seed(seed)
+    p, v, a = (s * torch.randn(1, 3, generator=g, dtype=torch.float64) for s in (200.0, 15.0, 0.5))
+    return NavState(p, v, rotation_from_rpy(a)), lively_imu(1, M, seed), frame_at()
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_transition_matches_finite_differences(seed):
+    """Column by column, truth = estimate ⊞ dx and true IMU = corrected − error, central differences."""
+    state, imu, frame = scene(seed)
+    window = strapdown(state, imu, DT, frame)
+    Phi = window_transition(state, window, DT, frame)[0]
+    steps = torch.tensor([1.0, 0.1, 1e-4, 1e-3, 1e-4]).repeat_interleave(3)
+    numeric = torch.zeros(15, 15, dtype=torch.float64)
+    for i in range(15):
+        ends = []
+        for sign in (1, -1):
+            dx = torch.zeros(1, 15, dtype=torch.float64)
+            dx[0, i] = sign * steps[i]
+            truth = strapdown(state.corrected(dx[:, :9]), imu - dx[:, None, 9:], DT, frame).end
+            ends.append(torch.cat((window.end.error_to(truth), dx[:, 9:]), -1)[0])
+        numeric[:, i] = (ends[0] - ends[1]) / (2 * steps[i])
+    # left out on purpose: Earth rotation acting on the attitude columns within the window, g · 3 ω_ie T² = 2e-3
+    size = numeric.abs().clamp_min(1.0)
+    assert ((Phi - numeric).abs() / size).max() < 3e-3
+
+
+def continuous(C: torch.Tensor, force_n: torch.Tensor) -> torch.Tensor:
+    """Jacobian F of the error model with Earth rotation left out (checklist 2.1)."""
+    F = torch.zeros(15, 15, dtype=torch.float64)
+    F[POSITION, VELOCITY] = torch.eye(3, dtype=torch.float64)
+    F[VELOCITY, ATTITUDE] = -skew(force_n)
+    F[VELOCITY, ACCEL] = F[ATTITUDE, GYRO] = -C
+    return F
+
+
+def test_noise_matches_van_loan():
+    """Attitude and force held constant, the case in which the closed form is exact (Van Loan 1978)."""
+    frame = frame_at()
+    C = rotation_from_rpy(torch.tensor([[0.1, -0.2, 0.7]], dtype=torch.float64))
+    f_b = torch.tensor([1.5, -2.0, -9.5], dtype=torch.float64)
+    zero = torch.zeros(1, 3, dtype=torch.float64)
+    imu = torch.cat((f_b, torch.zeros(3, dtype=torch.float64))).expand(1, M, 6)
+    state = NavState(zero, zero, C)
+    Phi = window_transition(state, strapdown(state, imu, DT, frame), DT, frame)
+    Q = window_noise(Phi, PSD, noise_weights(1.0, torch.float64, Phi.device))[0]
+    G = torch.zeros(15, 15, dtype=torch.float64)
+    for block, name in ((VELOCITY, "accel_noise"), (ATTITUDE, "gyro_noise"), (ACCEL, "accel_walk"), (GYRO, "gyro_walk")):
+        G[block, block] = PSD[name] * torch.eye(3, dtype=torch.float64)
+    F = continuous(C[0], C[0] @ f_b)
+    big = torch.zeros(30, 30, dtype=torch.float64)
+    big[:15, :15], big[:15, 15:], big[15:, 15:] = -F, G, F.T
+    exponential = torch.from_numpy(expm(big.numpy()))
+    expected = exponential[15:, 15:].T @ exponential[:15, 15:]
+    size = torch.sqrt(expected.diagonal()[:, None] * expected.diagonal()[None, :])
+    assert ((Q - expected) / size).abs().max() < 2e-3  # Earth rotation, and sums for integrals: 1 / (2 M)²
+
+
+def test_noise_of_rough_motion_matches_sample_by_sample():
+    """Brute force P ← Φₖ P Φₖᵀ + Qₖ over 50 samples; the window formula assumes a constant force."""
+    state, imu, frame = scene(4)
+    window = strapdown(state, imu, DT, frame)
+    Phi = window_transition(state, window, DT, frame)
+    Q = window_noise(Phi, PSD, noise_weights(1.0, torch.float64, Phi.device))[0]
+    total = torch.zeros(15, 15, dtype=torch.float64)
+    at = state
+    for k in range(M):
+        one = strapdown(at, imu[:, k : k + 1], DT, frame)
+        step = window_transition(at, one, DT, frame)
+        total = step[0] @ total @ step[0].T + window_noise(step, PSD, noise_weights(DT, torch.float64, step.device))[0]
+        at = one.end
+    std, expected = Q.diagonal().sqrt(), total.diagonal().sqrt()
+    assert ((std / expected) - 1).abs().max() < 0.03
+    assert torch.linalg.eigvalsh(Q / (std[:, None] * std)).min() > -1e-12
+
+
+def test_measurement_matrix_matches_finite_differences():
+    state, imu, frame = scene(6)
+    arm = torch.tensor([[1.2, -0.4, -1.5]], dtype=torch.float64)
+    rate = torch.tensor([[0.05, -0.02, 0.4]], dtype=torch.float64)
+    predicted, H = measurement(state, rate, arm, frame)
+    step = 1e-5
+    for i in range(15):
+        dx = torch.zeros(1, 15, dtype=torch.float64)
+        dx[0, i] = step
+        ahead = measurement(state.corrected(dx[:, :9]), rate - dx[:, 12:], arm, frame)[0]
+        behind = measurement(state.corrected(-dx[:, :9]), rate + dx[:, 12:], arm, frame)[0]
+        numeric = (ahead - behind)[0] / (2 * step)
+        # the rate's own error enters with +Ĉ[l×]: truth − estimate of (ω − ζ)×l is l×ζ
+        assert (numeric - H[0, :, i]).abs().max() < 1e-6, i
+
+
+def test_zero_lever_arm_is_the_paper_s_h():
+    state, _, frame = scene(7)
+    zero = torch.zeros(1, 3, dtype=torch.float64)
+    predicted, H = measurement(state, zero + 0.3, zero, frame)
+    assert torch.equal(H[0, :, :6], torch.eye(6, dtype=torch.float64)) and not H[0, :, 6:].any()
+    assert torch.equal(predicted, torch.cat((state.p_n, state.v_n), -1))
