@@ -146,10 +146,9 @@ class LearnedFilter(nn.Module):
     def _run(self, memory, epoch, rows, whole, has_fix):
         """Gain in n, IMU error and new LSTM state of the pieces in ``rows``."""
         pick = (lambda x: x) if whole else (lambda x: x[rows])
-        window = type(epoch.window)(*(pick(x) for x in epoch.window))
-        if self.config.detach_features:
-            window = type(window)(*(x.detach() for x in window))
-        C_hn = level_rotation(window.C_nb[:, -1], self.config.frame)
+        cut = Tensor.detach if self.config.detach_features else (lambda x: x)
+        p_n, v_n, C_nb = (pick(cut(x)) for x in epoch.window[:3])
+        C_hn = level_rotation(C_nb[:, -1], self.config.frame)
         moved = torch.where(memory.had_fix & epoch.used, epoch.fix - memory.fix, torch.zeros_like(epoch.fix))
         parts = [
             memory.difference / memory.difference_s.unsqueeze(-1),
@@ -157,13 +156,12 @@ class LearnedFilter(nn.Module):
             moved / memory.since_fix.unsqueeze(-1),
             epoch.z,
         ]
-        parts = [pick(x.detach() if self.config.detach_features else x) for x in parts]
-        components = component_features(*parts, C_hn)
+        components = component_features(*(pick(cut(x)) for x in parts), C_hn)
         if self.config.outage_mode == "run":
             age = torch.log1p(pick(memory.since_fix)) * ~pick(has_fix)
             components = torch.cat((components, pick(has_fix)[:, None].to(age.dtype), age[:, None]), -1)
         dtype = self.imu_error.linear.weight.dtype
-        channels = window_features(window, pick(epoch.imu), C_hn, self.config.frame)
+        channels = window_features(p_n, v_n, C_nb, pick(epoch.imu), C_hn, self.config.frame)
         lstm = memory.lstm if whole else tuple(x[:, rows] for x in memory.lstm)
         h, lstm = self.network(channels.to(dtype), components.to(dtype), lstm)
         K, error = self.gain(h).to(epoch.z.dtype), self.imu_error(h).to(epoch.z.dtype)

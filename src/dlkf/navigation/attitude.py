@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 from torch import Tensor
 
 
@@ -88,33 +88,24 @@ def orthonormalised(C: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
     return 0.5 * C @ (3 * eye - C.mT @ C)
 
 
-def spinor_from_vector(phi: Float[Tensor, "*b 3"]) -> tuple[Complex[Tensor, "*b"], Complex[Tensor, "*b"]]:
-    """Rotation as the Cayley-Klein pair (α, β) = (w + i z, y − i x); |φ| up to about 1 rad per call.
+def prefix_rotations(phi: Float[Tensor, "3 b m"]) -> Float[Tensor, "3 3 b m"]:
+    """All prefix products exp([φ₁×]) … exp([φ_k×]), k = 1…m, in log₂(m) doubling steps, no Python loop over m.
 
-    Two complex numbers multiply in a third of the tensor operations that a quaternion needs.
+    Axes come first, so that every operation runs over contiguous planes. A rotation is carried as the
+    Cayley-Klein pair (α, β) = (w + i z, y − i x) of its quaternion: two complex numbers multiply in a third
+    of the tensor operations that a quaternion needs. |φ| up to about 1 rad per factor.
     """
-    x = (phi * phi).sum(-1) * 0.25  # (θ/2)²
-    c = 1 - x / 2 * (1 - x / 12 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90))))
-    s = 0.5 - x / 12 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72)))
-    u = s.unsqueeze(-1) * phi
-    return torch.complex(c, u[..., 2]), torch.complex(u[..., 1], -u[..., 0])
-
-
-def prefix_rotations(phi: Float[Tensor, "b m 3"]) -> Float[Tensor, "b m 3 3"]:
-    """All prefix products exp([φ₁×]) … exp([φ_k×]), k = 1…m, in log₂(m) doubling steps, no Python loop over m."""
-    a, b = spinor_from_vector(phi)
+    x = (phi * phi).sum(0) * 0.25  # (θ/2)²
+    cosine = 1 - x / 2 * (1 - x / 12 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90))))
+    u = (0.5 - x / 12 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72)))) * phi
+    a, b = torch.complex(cosine, u[2]), torch.complex(u[1], -u[0])
     step = 1
     while step < a.shape[1]:
         a0, b0, a1, b1 = a[:, :-step], b[:, :-step], a[:, step:], b[:, step:]
         a = torch.cat((a[:, :step], a0 * a1 - b0 * b1.conj()), 1)
         b = torch.cat((b[:, :step], a0 * b1 + b0 * a1.conj()), 1)
         step *= 2
-    return rotation_from_spinor(a, b)
-
-
-def rotation_from_spinor(a: Complex[Tensor, "*b"], b: Complex[Tensor, "*b"]) -> Float[Tensor, "*b 3 3"]:
-    """Rotation matrix of a Cayley-Klein pair."""
-    w, z, y, x = a.real, a.imag, b.real, -b.imag
+    w, x, y, z = a.real, -b.imag, b.real, a.imag
     xx, yy, zz = x * x, y * y, z * z
     xy, xz, yz, wx, wy, wz = x * y, x * z, y * z, w * x, w * y, w * z
     return torch.stack(
@@ -123,5 +114,4 @@ def rotation_from_spinor(a: Complex[Tensor, "*b"], b: Complex[Tensor, "*b"]) -> 
             2 * (xy + wz), 1 - 2 * (xx + zz), 2 * (yz - wx),
             2 * (xz - wy), 2 * (yz + wx), 1 - 2 * (xx + yy),
         ),
-        -1,
-    ).unflatten(-1, (3, 3))  # fmt: skip
+    ).unflatten(0, (3, 3))  # fmt: skip

@@ -74,14 +74,17 @@ def imu_spec(config: Mapping) -> ImuSpec:
     for sensor in ("accel", "gyro"):
         where = f"IMU preset {name}, {sensor}"
         _check_keys(config[sensor], numbers, set(), where)
+        for key, value in config[sensor].items():
+            if not isinstance(value, (int, float)) or isinstance(value, bool):
+                raise InputError(f"{where}: {key} is {value!r}, must be a finite number ≥ 0")
         try:
-            sensors[sensor] = SensorErrors(**config[sensor])
+            sensors[sensor] = SensorErrors(**{key: float(value) for key, value in config[sensor].items()})
         except InputError as error:
             raise InputError(str(error).replace("IMU preset", where, 1)) from None
     return ImuSpec(name=name, source=str(config.get("source", "")), **sensors)
 
 
-def _check_keys(config: Mapping, needed: set[str], optional: set[str], where: str) -> None:
+def _check_keys(config: object, needed: set[str], optional: set[str], where: str) -> None:
     if not isinstance(config, Mapping):
         raise InputError(f"{where}: is {config!r}, must be a mapping with {', '.join(sorted(needed))}")
     if missing := needed - set(config):

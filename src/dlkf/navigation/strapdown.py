@@ -30,16 +30,12 @@ from dlkf.navigation.state import NavState
 
 
 class Window(NamedTuple):
-    """What the strapdown made of one window of M samples: the state at the end of each sample."""
+    """What the strapdown made of one window of M samples: the state at the end of each, and at the very end."""
 
     p_n: Tensor  # (B, M, 3) m
     v_n: Tensor  # (B, M, 3) m/s
     C_nb: Tensor  # (B, M, 3, 3)
-
-    @property
-    def end(self) -> NavState:
-        """State at the end of the window."""
-        return NavState(self.p_n[:, -1], self.v_n[:, -1], self.C_nb[:, -1])
+    end: NavState  # (B, …), attitude orthonormalised
 
     def before(self, lag: Float[Tensor, " B"], dt: float) -> NavState:
         """State ``lag`` seconds before the window's end, linear between samples (0 ≤ lag < window)."""
@@ -68,91 +64,110 @@ def strapdown(
     with torch.no_grad():
         half = 0.5 * dt * imu.shape[1]
         gravity = frame.gravity(start.p_n + half * start.v_n)
-    p, v, C = _Strapdown.apply(
+    p, v, C, *end = _Strapdown.apply(
         start.p_n, start.v_n, start.C_nb, imu, dt, gravity, frame.gravity_gradient(), frame.earth_rate_n
     )
-    return Window(p, v, C)
-
-
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    return torch.linalg.cross(*torch.broadcast_tensors(a, b), dim=-1)
-
-
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    return (a * b).sum(-1, keepdim=True)
+    return Window(p, v, C, NavState(*end))
 
 
 class _Strapdown(torch.autograd.Function):
-    """Forward and adjoint of the window; lower-case names follow the module's equations."""
+    """Forward and adjoint of the window; names follow the module's equations.
+
+    Inside, the axes come first and the samples last: (3, B, M) vectors and (3, 3, B, M) matrices, so that
+    every operation runs over contiguous planes.
+    """
 
     @staticmethod
     def forward(ctx, p0, v0, C0, imu, dt, g, gradient, earth_rate):
-        f, phi = imu[..., :3], imu[..., 3:] * dt
-        B, M = phi.shape[:2]
-        R = prefix_rotations(phi)
-        R_before = torch.cat((torch.eye(3, dtype=R.dtype, device=R.device).expand(B, 1, 3, 3), R[:, :-1]), 1)
+        planes = imu.permute(2, 0, 1).contiguous()
+        f, phi = planes[:3], planes[3:] * dt
+        B, M = phi.shape[1:]
+        C = C0.permute(1, 2, 0).unsqueeze(-1)  # (3, 3, B, 1)
+        p, v, g3, w = (x.mT.unsqueeze(-1) for x in (p0, v0, g, earth_rate))
+        A = _product(C, prefix_rotations(phi))  # C₀ R at each sample's end, Earth rotation left out
+        A_before = torch.cat((C, A[..., :-1]), -1)
         # mean of exp(s φ) over the sample, once for velocity, twice integrated for position
         turn = _cross(phi, f)
         turn2 = _cross(phi, turn)
-        f1 = f + turn / 2 + turn2 / 6
-        f2 = f / 2 + turn / 6 + turn2 / 24
-        gained = (R_before * f1.unsqueeze(-2)).sum(-1) * dt @ C0.mT  # ΔV per sample in n
-        moved = (R_before * f2.unsqueeze(-2)).sum(-1) * dt**2 @ C0.mT
-        S = gained.cumsum(1)
-        P = (moved + dt * (S - gained)).cumsum(1)
-        t = torch.arange(1, M + 1, dtype=phi.dtype, device=phi.device)[:, None] * dt
-        w, v, gn = earth_rate.unsqueeze(1), v0.unsqueeze(1), g.unsqueeze(1)
-        v_n = v + gn * t + S - _cross(w, t * (S + 2 * v + gn * t) + P)
-        p_n = p0.unsqueeze(1) + t * (v + 0.5 * gn * t) + P - _cross(w, t * (P + t * (v + gn * t / 3)))
-        A = (R.mT.reshape(B, 3 * M, 3) @ C0.mT).reshape(B, M, 3, 3).mT  # C0 R
-        C_nb = A - t.unsqueeze(-1) * (skew(earth_rate).unsqueeze(1) @ A)
-        C_nb = torch.cat((C_nb[:, :-1], orthonormalised(C_nb[:, -1:])), 1)
-        ctx.save_for_backward(imu, C0, A, gained, moved, gradient, earth_rate)
+        gained = _rotate(A_before, f + turn / 2 + turn2 / 6) * dt  # ΔV of each sample
+        moved = _rotate(A_before, f / 2 + turn / 6 + turn2 / 24) * dt**2
+        S = gained.cumsum(-1)
+        P = (moved + dt * (S - gained)).cumsum(-1)
+        t = torch.arange(1, M + 1, dtype=phi.dtype, device=phi.device) * dt
+        fallen = g3 * t
+        v_n = v + fallen + S - _cross(w, t * (S + 2 * v + fallen) + P)
+        p_n = p + t * (v + 0.5 * fallen) + P - _cross(w, t * (P + t * (v + fallen / 3)))
+        C_nb = A - t * _cross(w.unsqueeze(1), A)
+        ctx.save_for_backward(f, phi, C0, A, A_before, gained, moved, gradient, earth_rate)
         ctx.dt = dt
-        return p_n, v_n, C_nb
+        ctx.set_materialize_grads(False)
+        p_n, v_n, C_nb = p_n.permute(1, 2, 0), v_n.permute(1, 2, 0), C_nb.permute(2, 3, 0, 1)
+        return p_n, v_n, C_nb, p_n[:, -1].clone(), v_n[:, -1].clone(), orthonormalised(C_nb[:, -1])
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, Gp, Gv, GC):
-        imu, C0, A, gained, moved, gradient, earth_rate = ctx.saved_tensors
-        dt = ctx.dt
-        f, phi = imu[..., :3], imu[..., 3:] * dt
-        M = phi.shape[1]
-        t = torch.arange(1, M + 1, dtype=phi.dtype, device=phi.device)[:, None] * dt
-        w = earth_rate.unsqueeze(1)
+    def backward(ctx, Gp, Gv, GC, gp, gv, gC):
+        f, phi, C0, A, A_before, gained, moved, gradient, earth_rate = ctx.saved_tensors
+        dt, M = ctx.dt, phi.shape[-1]
+        t = torch.arange(1, M + 1, dtype=phi.dtype, device=phi.device) * dt
+        w = earth_rate.mT.unsqueeze(-1)
+        Gp = _with_end(Gp, gp, gained, (2, 0, 1))
+        Gv = _with_end(Gv, gv, gained, (2, 0, 1))
         Hv, Hp = _cross(w, Gv), _cross(w, Gp)
-        grad_g = (t * (Gv + 0.5 * t * Gp + t * Hv + t * t * Hp / 3)).sum(1)
-        grad_v0 = (Gv + t * (Gp + 2 * Hv + t * Hp)).sum(1) + 0.5 * M * dt * gradient * grad_g
-        grad_p0 = Gp.sum(1) + gradient * grad_g
-        # suffix sums: what each ΔP and ΔV in n is worth
+        grad_g = (t * (Gv + 0.5 * t * Gp + t * Hv + t * t * Hp / 3)).sum(-1).mT
+        grad_v0 = (Gv + t * (Gp + 2 * Hv + t * Hp)).sum(-1).mT + 0.5 * M * dt * gradient * grad_g
+        grad_p0 = Gp.sum(-1).mT + gradient * grad_g
+        # suffix sums: what each ΔP and ΔV is worth
         U = _suffix_sum(Gp + Hv + t * Hp)
         V = _suffix_sum(Gv + t * Hv) + dt * (_suffix_sum(U) - U)
-        # attitude: tangent gradient in n at each sample's start and end
-        GA = GC + t.unsqueeze(-1) * (skew(earth_rate).unsqueeze(1) @ GC)
-        tau_end = _axial(GA, A)
-        tau_start = _cross(gained, V) + _cross(moved, U)
-        T = _suffix_sum(tau_end) + _suffix_sum(tau_start) - tau_start  # at the end of each sample
-        grad_theta = T[:, 0] + tau_start[:, 0]
-        A_before = torch.cat((C0.unsqueeze(1), A[:, :-1]), 1)
-        to_body = (A_before * V.unsqueeze(-1)).sum(-2) * dt
-        to_body2 = (A_before * U.unsqueeze(-1)).sum(-2) * dt**2
-        e0 = to_body + to_body2 / 2
-        e1 = to_body / 2 + to_body2 / 6
-        e2 = to_body / 6 + to_body2 / 24
-        grad_f = e0 + _cross(e1, phi) + _cross(phi, _cross(phi, e2))
-        torque = (A * T.unsqueeze(-1)).sum(-2)
-        spin = _cross(phi, torque)
+        # attitude: tangent gradient in n, for a turn at each sample's end (T) and start
+        torque = _cross(gained, V) + _cross(moved, U)
+        at_end = None
+        if GC is not None or gC is not None:
+            GC = _with_end(GC, gC, A, (2, 3, 0, 1))
+            at_end = _cross(A, GC + t * _cross(w.unsqueeze(1), GC)).sum(1)
+        T = _suffix_sum(torque if at_end is None else torque + at_end)
+        grad_C0 = 0.5 * skew(T[..., 0].mT) @ C0
+        T = T - torque
+        r1, r2 = _rotate_back(A_before, V) * dt, _rotate_back(A_before, U) * dt**2
+        e1, e2 = r1 / 2 + r2 / 6, r1 / 6 + r2 / 24
+        grad_f = r1 + r2 / 2 + _cross(e1, phi) + _cross(phi, _cross(phi, e2))
+        twist = _rotate_back(A, T)
+        spin = _cross(phi, twist)
         spin2 = _cross(phi, spin)
-        grad_phi = torque + spin / 2 + spin2 / 6 + _cross(phi, spin2) / 24
+        grad_phi = twist + spin / 2 + spin2 / 6 + _cross(phi, spin2) / 24
         grad_phi = grad_phi + _cross(f, e1) + e2 * _dot(phi, f) + f * _dot(e2, phi) - 2 * phi * _dot(f, e2)
-        grad_C0 = 0.5 * skew(grad_theta) @ C0
-        return grad_p0, grad_v0, grad_C0, torch.cat((grad_f, grad_phi * dt), -1), None, None, None, None
+        grad_imu = torch.cat((grad_f, grad_phi * dt)).permute(1, 2, 0)
+        return grad_p0, grad_v0, grad_C0, grad_imu, None, None, None, None
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    return torch.linalg.cross(*torch.broadcast_tensors(a, b), dim=0)
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return (a * b).sum(0)
+
+
+def _rotate(C: Tensor, u: Tensor) -> Tensor:
+    return (C * u).sum(1)
+
+
+def _rotate_back(C: Tensor, u: Tensor) -> Tensor:
+    return (C * u.unsqueeze(1)).sum(0)
+
+
+def _product(A: Tensor, B: Tensor) -> Tensor:
+    return (A.unsqueeze(2) * B.unsqueeze(0)).sum(1)
 
 
 def _suffix_sum(x: Tensor) -> Tensor:
-    return x.sum(1, keepdim=True) - x.cumsum(1) + x
+    return x.sum(-1, keepdim=True) - x.cumsum(-1) + x
 
 
-def _axial(G: Tensor, A: Tensor) -> Tensor:
-    """g with tr(Gᵀ [δ×] A) = g·δ: the sum over columns of A_col × G_col."""
-    return torch.linalg.cross(A, G, dim=-2).sum(-1)
+def _with_end(samples: Tensor | None, end: Tensor | None, like: Tensor, order: tuple[int, ...]) -> Tensor:
+    """Gradient of all samples with that of the end state added to the last, axes first."""
+    full = torch.zeros_like(like) if samples is None else samples.permute(*order).contiguous()
+    if end is not None:
+        full[..., -1] += end.permute(*range(1, end.ndim), 0)
+    return full

@@ -13,7 +13,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.navigation.attitude import rpy_from_rotation
-from dlkf.navigation.strapdown import Window
 
 FRAMES = ("ned", "heading")
 CNN_CHANNELS = 15
@@ -40,13 +39,17 @@ def level_rotation(C_nb: Float[Tensor, "B 3 3"], frame: str) -> Float[Tensor, "B
 
 
 def window_features(
-    window: Window, imu: Float[Tensor, "B M 6"], C_hn: Float[Tensor, "B 3 3"], frame: str
+    p: Float[Tensor, "B M 3"],
+    v: Float[Tensor, "B M 3"],
+    C: Float[Tensor, "B M 3 3"],
+    imu: Float[Tensor, "B M 6"],
+    C_hn: Float[Tensor, "B 3 3"],
+    frame: str,
 ) -> Float[Tensor, "B 15 M"]:
     """Channels over time: position, velocity, attitude of the INS and the raw IMU (paper line 31).
 
     In the ``heading`` frame the position counts from the window's first sample and yaw from its last.
     """
-    p, v, C = window.p_n, window.v_n, window.C_nb
     rpy = rpy_from_rotation(C)
     if frame == "heading":
         p, v = (p - p[:, :1]) @ C_hn.mT, v @ C_hn.mT
