@@ -1,0 +1,168 @@
+"""The Parquet contract of a dataset: its columns, and writers that leave whole files or none.
+
+::
+
+    <dataset>/drives.parquet                       one row per drive
+    <dataset>/imu/drive=<id>/part-0.parquet        t, gyro_x|y|z [rad/s], accel_x|y|z [m/s²]; mean over the
+                                                   interval that ends at t, FRD, −g on z at rest
+    <dataset>/gnss/drive=<id>/part-0.parquet       antenna, instantaneous at t; quality = NMEA GGA code
+    <dataset>/reference/drive=<id>/part-0.parquet  optional; instantaneous at t
+
+NaN stands for what a source does not know. Any other column is carried along.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from dlkf.errors import InputError
+
+F, I, B = pa.float64(), pa.int8(), pa.bool_()
+ACCEL = ("accel_x", "accel_y", "accel_z")
+GYRO = ("gyro_x", "gyro_y", "gyro_z")
+POSITION = ("lat_deg", "lon_deg", "height_m")
+VELOCITY = ("vel_n", "vel_e", "vel_d")
+STD = ("std_pos_n", "std_pos_e", "std_pos_d", "std_vel_n", "std_vel_e", "std_vel_d")
+ATTITUDE = ("roll", "pitch", "yaw")
+IMU_ERROR = ("accel_error_x", "accel_error_y", "accel_error_z", "gyro_error_x", "gyro_error_y", "gyro_error_z")
+LEVER_ARM = ("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m")
+
+
+def _schema(kinds: Mapping[str, pa.DataType]) -> pa.Schema:
+    return pa.schema([pa.field(name, kind) for name, kind in kinds.items()])
+
+
+SCHEMAS: dict[str, pa.Schema] = {
+    "imu": _schema(dict.fromkeys(("t", *GYRO, *ACCEL), F)),
+    "gnss": _schema(dict.fromkeys(("t", *POSITION, *VELOCITY, *STD), F) | {"quality": I}),
+    "reference": _schema(dict.fromkeys(("t", *POSITION, *VELOCITY, *ATTITUDE), F) | {"valid": B}),
+}
+OPTIONAL: dict[str, pa.Schema] = {  # read where present
+    "imu": pa.schema([]),
+    "gnss": pa.schema([]),
+    "reference": _schema(dict.fromkeys(IMU_ERROR, F)),
+}
+TEXTS = ("drive", "group", "source", "licence", "imu", "gnss", "reference")
+NUMBERS = ("imu_rate_hz", "gnss_rate_hz", "duration_s", "distance_m", *LEVER_ARM)
+DRIVES = _schema(dict.fromkeys(TEXTS, pa.string()) | dict.fromkeys(NUMBERS, F))
+DRIVES_REQUIRED = ("drive", "group")
+
+
+def drive_file(folder: Path, kind: str, drive: str) -> Path:
+    """Where a table of a drive is written; ``kind`` is imu, gnss or reference."""
+    return Path(folder) / kind / f"drive={drive}" / "part-0.parquet"
+
+
+@contextmanager
+def new_dataset(folder: str | Path, overwrite: bool = False) -> Iterator[Path]:
+    """A folder to write a dataset into, which becomes ``folder`` when the block ends well, else vanishes.
+
+    Raises InputError if ``folder`` already holds something and ``overwrite`` is False.
+    """
+    target = Path(folder).absolute()
+    if target.is_file() or (target.is_dir() and any(target.iterdir()) and not overwrite):
+        raise InputError(f"out={folder}: exists already; give another folder, or overwrite=true to replace it")
+    beside = target.with_name(f".{target.name}.partial-{os.getpid()}")
+    try:
+        beside.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(f"out={folder}: cannot write there ({error.strerror}); give another folder") from None
+    old = target.with_name(f".{target.name}.old-{os.getpid()}")
+    try:
+        yield beside
+        if target.exists():
+            target.rename(old)
+        beside.rename(target)
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def write_parquet(path: Path, table: pa.Table) -> None:
+    """Write a table beside its place, then rename it into place."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        pq.write_table(table, beside, compression="zstd")
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def write_drive(
+    folder: str | Path,
+    meta: Mapping[str, Any],
+    imu: pd.DataFrame,
+    gnss: pd.DataFrame,
+    reference: pd.DataFrame | None = None,
+) -> dict[str, Any]:
+    """Write the tables of a drive and return its completed row for :func:`write_drives_table`.
+
+    ``meta`` needs ``drive``; ``group`` defaults to it, rates, duration and distance are filled in from the
+    tables where absent. Columns beyond the contract are kept. Raises InputError for a missing column.
+    """
+    row = dict(meta)
+    name = check_name(str(row["drive"]))
+    folder = Path(folder)
+    for kind, frame in (("imu", imu), ("gnss", gnss), ("reference", reference)):
+        if frame is not None:
+            write_parquet(drive_file(folder, kind, name), contract_table(kind, frame, name))
+    row.setdefault("group", name)
+    row.setdefault("imu_rate_hz", _rate(imu["t"]))
+    row.setdefault("gnss_rate_hz", _rate(gnss["t"]))
+    row.setdefault("duration_s", float(imu["t"].iloc[-1] - imu["t"].iloc[0]) if len(imu) else 0.0)
+    row.setdefault("distance_m", _distance(gnss if reference is None else reference))
+    return row
+
+
+def write_drives_table(folder: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write ``drives.parquet``; texts that a row lacks become empty, numbers NaN, lever arms zero."""
+    frame = pd.DataFrame([dict(row) for row in rows])
+    for name in TEXTS:
+        frame[name] = frame[name].fillna("").astype(str) if name in frame else ""
+    for name in NUMBERS:
+        default = 0.0 if name in LEVER_ARM else np.nan
+        frame[name] = frame[name].astype(float).fillna(default) if name in frame else default
+    ordered = frame[[*DRIVES.names, *(c for c in frame.columns if c not in DRIVES.names)]]
+    write_parquet(Path(folder) / "drives.parquet", pa.Table.from_pandas(ordered, preserve_index=False))
+
+
+def contract_table(kind: str, frame: pd.DataFrame, drive: str) -> pa.Table:
+    """A frame in the contract's column order and types, extra columns last.
+
+    Raises InputError naming the drive and what is missing.
+    """
+    schema = SCHEMAS[kind]
+    if missing := [name for name in schema.names if name not in frame]:
+        raise InputError(f"drive {drive}, {kind}: column {', '.join(missing)} missing; has {', '.join(frame.columns)}")
+    extra = [name for name in frame.columns if name not in schema.names]
+    columns = [pa.array(frame[n].to_numpy(), type=schema.field(n).type) for n in schema.names]
+    columns += [pa.array(frame[name]) for name in extra]
+    return pa.table(dict(zip([*schema.names, *extra], columns)))
+
+
+def check_name(drive: str) -> str:
+    """The drive's name, if it can be part of a path ``drive=<name>``; InputError if not."""
+    if not drive or drive.startswith(".") or any(c in drive for c in "/\\=") or drive != drive.strip():
+        raise InputError(f"drive {drive!r}: a drive's name must be non-empty, without '/', '\\', '=' or a leading dot")
+    return drive
+
+
+def _rate(t: pd.Series) -> float:
+    return float(1 / np.median(np.diff(t))) if len(t) > 1 else float("nan")
+
+
+def _distance(frame: pd.DataFrame) -> float:
+    """Length of the way [m] from the horizontal velocities (trapezoid); unknown velocities count as zero."""
+    speed = np.nan_to_num(np.hypot(frame["vel_n"], frame["vel_e"]))
+    return float(np.trapezoid(speed, frame["t"])) if len(frame) > 1 else 0.0
