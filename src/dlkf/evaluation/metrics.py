@@ -37,7 +37,7 @@ def local_axes(batch: Batch) -> torch.Tensor:
     """C_ln (B, T, 3, 3, float64): rotates the tangent frame n to true local NED at the true position."""
     x, y, z = batch.frame.to_ecef(batch.truth.p_n.double()).cpu().unbind(-1)
     lat, lon, _ = pymap3d.ecef2geodetic(x.numpy(), y.numpy(), z.numpy(), deg=False)
-    C_el = ned_axes(torch.as_tensor(lat), torch.as_tensor(lon))
+    C_el = ned_axes(*(torch.as_tensor(u).reshape(x.shape) for u in (lat, lon)))  # pymap3d drops axes of 1
     return C_el.mT @ batch.frame.C_en.cpu().double().unsqueeze(1)
 
 

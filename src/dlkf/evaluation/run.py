@@ -53,7 +53,7 @@ def score(
         for batch, mask in zip(batches, masks, strict=True):
             blank = _blank(batch)
             for index in chunks(batch, chunk_samples):
-                _fill(blank, index, with_outage(take(batch, index), mask[index]), estimator, state)
+                _fill(blank, index, take(with_outage(batch, mask), index), estimator, state)
                 done += len(index)
                 if progress is not None:
                     progress(name, done, total)
