@@ -1,0 +1,203 @@
+"""Any number of hours of simulated drives as a dataset of the data contract, the same for a seed."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from dlkf.data.schema import new_dataset, write_drive, write_drives_table
+from dlkf.errors import InputError
+from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.simulation.drive import Rates, simulate_drive
+from dlkf.simulation.gnss import GnssConfig
+from dlkf.simulation.imu import draw_unit
+from dlkf.simulation.vehicle import VehicleConfig
+
+LONGEST_DRIVE = 240.0  # minutes; a drive is held in memory as a whole
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class DatasetConfig:
+    """What to simulate. ``imu_errors``: ``one`` unit for all drives, or a new one ``per_drive``.
+
+    With ``one``, turn-on bias, scale factors and misalignment are drawn once, from ``unit_seed``: the same
+    IMU on other roads is another seed with the same ``unit_seed``. White noise and the in-run bias belong to
+    each drive either way.
+    """
+
+    name: str
+    hours: float = 5.0
+    drive_minutes: float = 10.0
+    imu_rate_hz: int = 100
+    reference_rate_hz: int = 10
+    imu_errors: str = "one"
+    unit_seed: int = 0
+    vehicle: VehicleConfig = field(default_factory=VehicleConfig)
+    gnss: GnssConfig = field(default_factory=GnssConfig)
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", self.name):
+            raise InputError(f"dataset: name {self.name!r} must be letters, digits, _ . - ")
+        if not 0.005 <= self.hours <= 1e5:
+            raise InputError(f"dataset: hours {self.hours} is outside 0.005 (18 s) to 100000")
+        if not 0.25 <= self.drive_minutes <= LONGEST_DRIVE:
+            raise InputError(
+                f"dataset: drive_minutes {self.drive_minutes} is outside 0.25 to {LONGEST_DRIVE:g}"
+            )
+        for name in ("imu_rate_hz", "reference_rate_hz"):
+            rate = getattr(self, name)
+            if rate != round(rate) or not 1 <= rate <= 2000:
+                raise InputError(f"dataset: {name} {rate} must be a whole number from 1 to 2000")
+        if self.imu_rate_hz < 10:
+            raise InputError(f"dataset: imu_rate_hz {self.imu_rate_hz} is below 10, too slow for a car")
+        rates = {"gnss.rate_hz": self.gnss.rate_hz, "reference_rate_hz": self.reference_rate_hz}
+        for name, rate in rates.items():
+            samples = self.imu_rate_hz / rate if rate > 0 else 0.0
+            if samples < 1 or abs(samples - round(samples)) > 1e-9:
+                raise InputError(
+                    f"dataset: imu_rate_hz {self.imu_rate_hz} is not a multiple of {name} {rate}"
+                )
+        if self.imu_errors not in ("one", "per_drive"):
+            raise InputError(f"dataset: imu_errors {self.imu_errors!r} must be one or per_drive")
+        if not isinstance(self.unit_seed, int) or self.unit_seed < 0:
+            raise InputError(f"dataset: unit_seed {self.unit_seed!r} must be a whole number ≥ 0")
+
+    @property
+    def durations(self) -> list[int]:
+        """Whole seconds of every drive: the hours shared out evenly over drives of at most drive_minutes."""
+        total = round(self.hours * 3600)
+        drives = math.ceil(total / (self.drive_minutes * 60) - 1e-9)
+        return [total // drives + (k < total % drives) for k in range(drives)]
+
+
+def dataset_config(config: Mapping[str, Any]) -> DatasetConfig:
+    """A dataset from a mapping like ``conf/dataset/*.yaml``. InputError for unknown keys and odd values."""
+    values = dict(config) if isinstance(config, Mapping) else {}
+    if not isinstance(values.get("name"), str):
+        raise InputError("dataset: name is missing, give it as in conf/dataset/*.yaml")
+    for key, kind in (("vehicle", VehicleConfig), ("gnss", GnssConfig)):
+        values[key] = _built(kind, values.get(key, {}), key)
+    return _built(DatasetConfig, values, "dataset")
+
+
+def simulate_from_config(
+    config: Mapping[str, Any], out: str | Path, *, overwrite: bool = False, progress: bool = True
+) -> Path:
+    """Simulate what a mapping with ``dataset``, ``imu``, ``seed`` and perhaps ``workers`` says into ``out``.
+
+    InputError as of :func:`dataset_config`, :func:`imu_spec` and :func:`simulate_dataset`.
+    """
+    for key in ("dataset", "imu", "seed"):
+        if config.get(key) is None:
+            raise InputError(f"simulation: {key} is missing")
+    seed, workers = config["seed"], config.get("workers")
+    if not isinstance(seed, int) or seed < 0:
+        raise InputError(f"simulation: seed {seed!r} must be a whole number ≥ 0")
+    if workers is not None and (not isinstance(workers, int) or workers < 1):
+        raise InputError(f"simulation: workers {workers!r} must be a whole number ≥ 1")
+    return simulate_dataset(
+        dataset_config(config["dataset"]), imu_spec(config["imu"]), seed, Path(out),
+        overwrite=overwrite, workers=workers, progress=progress,
+    )  # fmt: skip
+
+
+def simulate_dataset(
+    config: DatasetConfig,
+    spec: ImuSpec,
+    seed: int,
+    out: Path,
+    *,
+    overwrite: bool = False,
+    workers: int | None = None,
+    progress: bool = True,
+) -> Path:
+    """Write the dataset to ``out``, whole or not at all, and return its path.
+
+    Drive k depends on the seed and k alone, whatever the number of ``workers`` (threads; by default one per
+    core). Memory is that of ``workers`` drives, whatever the hours. InputError if ``out`` exists.
+    """
+    with new_dataset(out, overwrite) as folder:
+        _write_drives(config, spec, seed, folder, workers or os.cpu_count() or 1, progress)
+    return out
+
+
+def _write_drives(
+    config: DatasetConfig, spec: ImuSpec, seed: int, folder: Path, workers: int, progress: bool
+) -> None:
+    durations = config.durations
+    shared = draw_unit(np.random.default_rng(np.random.SeedSequence(config.unit_seed, spawn_key=(0,))), spec)
+    rates = Rates(int(config.imu_rate_hz), config.gnss.rate_hz, int(config.reference_rate_hz))
+
+    def one(index: int) -> dict[str, Any]:
+        *streams, unit_seed = np.random.SeedSequence(seed, spawn_key=(1, index)).spawn(4)
+        unit = shared if config.imu_errors == "one" else draw_unit(np.random.default_rng(unit_seed), spec)
+        seconds = durations[index]
+        tables = simulate_drive(tuple(streams), seconds, rates, config.vehicle, spec, unit, config.gnss)
+        name = f"{config.name}-{seed}-{index:05d}"
+        row = {
+            "drive": name,
+            "group": name,
+            "source": f"simulation, seed {seed}, drive {index}",
+            "licence": "none: simulated",
+            "imu": spec.name,
+            "gnss": f"simulated, white noise, quality {config.gnss.quality}",
+            "reference": "exact",
+            "imu_rate_hz": float(rates.imu_hz),
+            "gnss_rate_hz": float(rates.gnss_hz),
+            "duration_s": float(seconds),
+            "distance_m": tables.distance_m,
+            **{f"lever_arm_{axis}_m": float(x) for axis, x in zip("xyz", config.gnss.lever_arm_b)},
+        }
+        write_drive(folder, row, tables.imu, tables.gnss, tables.reference)
+        return row
+
+    with ThreadPoolExecutor(workers) as pool:
+        jobs = [pool.submit(one, index) for index in range(len(durations))]
+        try:
+            shown = track(
+                as_completed(jobs), f"simulating {config.name}", total=len(jobs),
+                disable=not progress, console=Console(stderr=True),
+            )  # fmt: skip
+            for job in shown:
+                job.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    write_drives_table(folder, [job.result() for job in jobs])
+    described = {"seed": seed, "dataset": asdict(config), "imu": asdict(spec)}
+    (folder / "simulation.json").write_text(json.dumps(described, indent=2, ensure_ascii=False) + "\n")
+
+
+def _built(kind: type[T], config: Any, where: str) -> T:
+    """A config dataclass from a mapping: every key known, every number a finite number."""
+    if not isinstance(config, Mapping):
+        raise InputError(f"{where}: is {config!r}, must be a mapping")
+    known = {f.name: f for f in fields(kind)}
+    if unknown := sorted(str(key) for key in config if key not in known):
+        raise InputError(f"{where}: unknown key {', '.join(unknown)}; known are {', '.join(known)}")
+    values = {}
+    for key, value in config.items():
+        if known[key].type in ("float", "int"):
+            number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if not number or not math.isfinite(value):
+                raise InputError(f"{where}: {key} is {value!r}, must be a number")
+        elif known[key].type.startswith("tuple"):
+            if not isinstance(value, (list, tuple)) or not all(isinstance(x, (int, float)) for x in value):
+                raise InputError(f"{where}: {key} is {value!r}, must be a list of numbers")
+            value = tuple(float(x) for x in value)
+        elif known[key].type == "str" and not isinstance(value, str):
+            raise InputError(f"{where}: {key} is {value!r}, must be a word")
+        values[key] = value
+    return kind(**values)

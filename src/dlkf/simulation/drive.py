@@ -1,0 +1,88 @@
+"""One simulated drive: a seed to truth, to IMU, to GNSS, to the three tables of the data contract."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR
+from dlkf.navigation.imu_errors import ImuSpec
+from dlkf.simulation.gnss import GnssConfig, observe
+from dlkf.simulation.imu import ImuUnit, corrupt, inverse_mechanisation
+from dlkf.simulation.vehicle import Truth, VehicleConfig, drive_vehicle
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Sample rates [Hz]; the IMU's is a multiple of the other two."""
+
+    imu_hz: int
+    gnss_hz: float
+    reference_hz: int
+
+
+@dataclass(frozen=True)
+class DriveTables:
+    """The tables of one drive and how far it went [m]."""
+
+    imu: pd.DataFrame
+    gnss: pd.DataFrame
+    reference: pd.DataFrame
+    distance_m: float
+
+
+def simulate_drive(
+    seeds: tuple[np.random.SeedSequence, np.random.SeedSequence, np.random.SeedSequence],
+    duration_s: int,
+    rates: Rates,
+    vehicle: VehicleConfig,
+    spec: ImuSpec,
+    unit: ImuUnit,
+    gnss: GnssConfig,
+) -> DriveTables:
+    """One drive; motion, IMU and GNSS each have a seed, so changing one leaves the others as they were."""
+    motion_rng, imu_rng, gnss_rng = (np.random.default_rng(seed) for seed in seeds)
+    t = np.arange(duration_s * rates.imu_hz + 1) / rates.imu_hz
+    truth = drive_vehicle(motion_rng, vehicle, t)
+    true_imu = inverse_mechanisation(truth)
+    measured, error = corrupt(imu_rng, true_imu, spec, unit, rates.imu_hz)
+    fixes = slice(None, None, round(rates.imu_hz / rates.gnss_hz))
+    rows = slice(None, None, rates.imu_hz // rates.reference_hz)
+    return DriveTables(
+        imu=pd.DataFrame({"t": t[1:], **dict(zip((*ACCEL, *GYRO), measured.T))}),
+        gnss=observe(gnss_rng, sliced(truth, fixes), _rate_at_rows(true_imu[:, 3:])[fixes], gnss),
+        reference=_reference(sliced(truth, rows), np.concatenate((error[:1], error))[rows]),
+        distance_m=float(np.linalg.norm(truth.v_n, axis=1)[1:].sum() / rates.imu_hz),
+    )
+
+
+def sliced(truth: Truth, rows: slice) -> Truth:
+    """Some rows of the truth."""
+    return Truth(*(getattr(truth, name)[rows] for name in Truth.__dataclass_fields__))
+
+
+def _rate_at_rows(rate: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Body rate at the N+1 truth rows from the N sample means between them: the mean of both neighbours."""
+    padded = np.concatenate((rate[:1], rate, rate[-1:]))
+    return 0.5 * (padded[1:] + padded[:-1])
+
+
+def _reference(truth: Truth, error: NDArray[np.float64]) -> pd.DataFrame:
+    """Reference table; the IMU error of a row is that of the sample which ends there, without white noise."""
+    return pd.DataFrame(
+        {
+            "t": truth.t,
+            "lat_deg": np.degrees(truth.lat),
+            "lon_deg": np.degrees(truth.lon),
+            "height_m": truth.height,
+            **{f"vel_{axis}": truth.v_n[:, k] for k, axis in enumerate("ned")},
+            "roll": truth.rpy[:, 0],
+            "pitch": truth.rpy[:, 1],
+            "yaw": np.arctan2(np.sin(truth.rpy[:, 2]), np.cos(truth.rpy[:, 2])),
+            "valid": np.ones(len(truth.t), dtype=bool),
+            **dict(zip(IMU_ERROR, error.T)),
+        }
+    )

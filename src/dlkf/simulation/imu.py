@@ -1,0 +1,127 @@
+"""What an IMU on the vehicle measures: exact sample means from the truth, then the errors of a sensor."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+from torch import Tensor
+
+from dlkf.navigation.attitude import rotation_from_rpy, rotation_from_vector, skew, vector_from_rotation
+from dlkf.navigation.earth import EARTH_RATE, ecef_from_geodetic, ned_axes, normal_gravity
+from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
+from dlkf.simulation.vehicle import Truth
+
+Array = NDArray[np.float64]
+CHUNK = 65536  # samples at a time: memory independent of the length of a drive
+
+
+def inverse_mechanisation(truth: Truth) -> Array:
+    """Mean specific force [m/s²] and rate [rad/s] of the N−1 samples between N truth rows, (N−1, 6).
+
+    Constant rate ω and force f within a sample reproduce attitude and velocity at its end exactly:
+
+        φ = ω dt = log(C_ib(t₋)ᵀ C_ib(t₊)),   f = (J(φ) dt)⁻¹ C_ib(t₋)ᵀ (Δv_i − ∫γ dt)
+
+    in the inertial frame that coincides with ECEF at t₋, so Earth rotation is included (R089); J(φ) is the
+    mean of exp([sφ×]) over 0 ≤ s ≤ 1 and γ gravitation, normal gravity plus centrifugal part, by the
+    trapezoid rule (Groves 5.4 inverted). Position follows to f' dt³/12 per sample.
+    """
+    chunks = []
+    for first in range(0, len(truth.t) - 1, CHUNK):
+        rows = slice(first, first + CHUNK + 1)
+        parts = (truth.lat, truth.lon, truth.height, truth.v_n, truth.rpy)
+        dt = torch.from_numpy(np.diff(truth.t[rows]))
+        chunks.append(_sample_means(*(torch.from_numpy(part[rows]) for part in parts), dt))
+    return torch.cat(chunks).numpy()
+
+
+def _sample_means(
+    lat: Float[Tensor, " n"],
+    lon: Float[Tensor, " n"],
+    height: Float[Tensor, " n"],
+    v_n: Float[Tensor, "n 3"],
+    rpy: Float[Tensor, "n 3"],
+    dt: Float[Tensor, " m"],
+) -> Float[Tensor, "m 6"]:
+    C_en = ned_axes(lat, lon)
+    C_eb = C_en @ rotation_from_rpy(rpy)
+    earth_rate = torch.tensor((0.0, 0.0, EARTH_RATE), dtype=torch.float64)
+    spin = skew(earth_rate)
+    r_e = ecef_from_geodetic(lat, lon, height)
+    inertial_velocity = (C_en @ v_n.unsqueeze(-1)).squeeze(-1) + r_e @ spin.mT
+    gravity = normal_gravity(torch.sin(lat), height).unsqueeze(-1) * C_en[..., 2]
+    gravitation = gravity + r_e @ (spin @ spin).mT
+    turn = rotation_from_vector(earth_rate * dt.unsqueeze(-1))  # ECEF axes at t₊ in those at t₋
+    C_ib = C_eb[:-1].mT
+    phi = vector_from_rotation(C_ib @ turn @ C_eb[1:])
+    end = (turn @ torch.stack((inertial_velocity[1:], gravitation[1:]), -1)).unbind(-1)
+    step = dt.unsqueeze(-1)
+    gained = end[0] - inertial_velocity[:-1] - 0.5 * step * (end[1] + gravitation[:-1])
+    mean_force = (C_ib @ gained.unsqueeze(-1)).squeeze(-1) / step
+    return torch.cat((_inverse_mean_rotation(phi, mean_force), phi / step), -1)
+
+
+def _inverse_mean_rotation(phi: Float[Tensor, "m 3"], u: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
+    """J(φ)⁻¹ u = u − φ×u/2 + (1/θ² − cot(θ/2)/(2θ)) φ×(φ×u), θ = |φ| below about 3 rad."""
+    squared = (phi * phi).sum(-1, keepdim=True)
+    small = squared < 1e-4
+    theta = torch.sqrt(torch.where(small, torch.ones_like(squared), squared))
+    series = 1 / 12 + squared / 720 + squared**2 / 30240
+    factor = torch.where(small, series, 1 / theta**2 - 1 / (2 * theta * torch.tan(theta / 2)))
+    turned = torch.linalg.cross(phi, u)
+    return u - 0.5 * turned + factor * torch.linalg.cross(phi, turned)
+
+
+@dataclass(frozen=True)
+class ImuUnit:
+    """One drawn IMU: turn-on bias (6,) and the matrices M of scale factor and misalignment (2, 3, 3).
+
+    Accelerometer first, then gyroscope, in m/s² and rad/s.
+    """
+
+    bias: Array
+    matrix: Array
+
+
+def draw_unit(rng: np.random.Generator, spec: ImuSpec) -> ImuUnit:
+    """A unit of the preset's kind: every error an independent normal draw with the preset's 1σ."""
+    bias, matrices = [], []
+    for sensor in (spec.accel, spec.gyro):
+        bias.append(sensor.turn_on_bias * rng.standard_normal(3))
+        sigma = np.where(np.eye(3, dtype=bool), sensor.scale_factor, sensor.misalignment)
+        matrices.append(sigma * rng.standard_normal((3, 3)))
+    return ImuUnit(np.concatenate(bias), np.stack(matrices))
+
+
+def corrupt(
+    rng: np.random.Generator, true_imu: Array, spec: ImuSpec, unit: ImuUnit, rate_hz: float
+) -> tuple[Array, Array]:
+    """Measured samples and their complete error without white noise, both (N, 6) (checklist 2.7, R090).
+
+        measured = (I + M) true + b(t) + w,   error = M true + b(t),   std(w) = √S · √rate (R094)
+
+    b(t) is the unit's turn-on bias plus the in-run Gauss-Markov part of this drive.
+    """
+    scaled = np.concatenate((true_imu[:, :3] @ unit.matrix[0].T, true_imu[:, 3:] @ unit.matrix[1].T), -1)
+    drift = [gauss_markov(rng, len(true_imu), sensor, rate_hz) for sensor in (spec.accel, spec.gyro)]
+    error = scaled + unit.bias + np.concatenate(drift, -1)
+    density = np.repeat((spec.accel.noise_density, spec.gyro.noise_density), 3)
+    noise = density * math.sqrt(rate_hz) * rng.standard_normal(true_imu.shape)
+    return true_imu + error + noise, error
+
+
+def gauss_markov(rng: np.random.Generator, samples: int, sensor: SensorErrors, rate_hz: float) -> Array:
+    """In-run bias (samples, 3): stationary first-order Gauss-Markov process, discretised exactly.
+
+    b₀ ~ N(0, σ²), b_k = a b_{k−1} + σ √(1 − a²) n_k with a = exp(−1/(rate τ)).
+    """
+    step = -1 / (rate_hz * sensor.correlation_time)
+    n = sensor.instability * rng.standard_normal((samples, 3))
+    n[1:] *= math.sqrt(-math.expm1(2 * step))
+    return lfilter([1.0], [1.0, -math.exp(step)], n, axis=0)
