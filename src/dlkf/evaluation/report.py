@@ -81,6 +81,7 @@ def write_report(
     protocol: dict[str, Any],
     by_time: bool,
     baseline: str | None = None,
+    dpi: int = 130,
 ) -> list[Path]:
     """Write the whole report into ``out``, all files or none; returns their paths.
 
@@ -92,7 +93,7 @@ def write_report(
     for kind in scores.kinds:
         suffix = "" if len(scores.kinds) == 1 else f"_{kind}"
         for name, caption, figure in all_figures(scores.of_kind(kind), by_time=by_time, baseline=baseline):
-            pictures.append((f"{name}{suffix}.png", f"{caption} ({kind})", png(figure)))
+            pictures.append((f"{name}{suffix}.png", f"{caption} ({kind})", png(figure, dpi)))
     files: dict[str, bytes] = {
         "metrics.json": as_json(
             {"dataset": dataset, "protocol": protocol, "results": list(results)}

@@ -1,0 +1,93 @@
+"""Paired bootstrap: coverage, pairing, groups, and what is not finite."""
+
+import math
+
+import numpy as np
+import pytest
+
+from dlkf.evaluation.bootstrap import compare, resampled_weights, rms_band, weighted
+
+
+def test_weighted_statistics_equal_those_of_the_repeated_values():
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=31) ** 2
+    w = rng.integers(0, 4, size=(5, 31)).astype(float)
+    for row, got in zip(w, zip(*(weighted(x, w, s) for s in ("rms", "mean", "median")))):
+        drawn = np.repeat(x, row.astype(int))
+        assert np.allclose(got, (np.sqrt(np.mean(drawn**2)), drawn.mean(), np.median(drawn)))
+
+
+def test_same_seed_same_interval_and_blocks_do_not_matter(monkeypatch):
+    a, b = np.random.default_rng(1).normal(size=(2, 50)) ** 2
+    whole = compare(a, b, resamples=300, seed=7)
+    assert whole == compare(a, b, resamples=300, seed=7) != compare(a, b, resamples=300, seed=8)
+    monkeypatch.setattr("dlkf.evaluation.bootstrap._CELLS", 999)
+    assert whole == compare(a, b, resamples=300, seed=7)
+
+
+def test_interval_covers_the_true_ratio_about_as_often_as_it_says():
+    """200 experiments of 60 pairs with true RMS ratio 0.7; the percentile interval is a little optimistic.
+
+    95 % nominal; binomial 3σ over 200 experiments is 4.6 points, optimism at 60 pairs about 2 points.
+    """
+    rng = np.random.default_rng(3)
+    hits = 0
+    for k in range(200):
+        hard = np.exp(0.3 * rng.normal(size=60))  # pieces differ in difficulty, for both filters alike
+        a, b = 0.7 * hard * np.abs(rng.normal(size=60)), hard * np.abs(rng.normal(size=60))
+        c = compare(a, b, resamples=400, seed=k)
+        hits += c.ratio_low <= 0.7 <= c.ratio_high
+    assert 0.88 <= hits / 200 <= 0.99
+
+
+def test_pairing_takes_the_difficulty_of_pieces_out_of_the_interval():
+    rng = np.random.default_rng(4)
+    hard = np.exp(rng.normal(size=80))
+    paired = compare(0.8 * hard, hard, seed=1)
+    assert paired.ratio == pytest.approx(0.8) and paired.ratio_high - paired.ratio_low < 1e-9
+    shuffled = compare(0.8 * hard, rng.permutation(hard), seed=1)
+    assert shuffled.ratio_high - shuffled.ratio_low > 0.2
+
+
+def test_outages_of_one_drive_are_drawn_together():
+    rng = np.random.default_rng(5)
+    level = np.repeat(np.exp(0.5 * rng.normal(size=12)), 20)  # 12 drives of 20 like outages each
+    a, b = level * (1 + 0.01 * rng.normal(size=240)), np.ones(240)
+    groups = np.repeat([f"d{i}" for i in range(12)], 20)
+    alone, together = compare(a, b, seed=2), compare(a, b, groups=groups, seed=2)
+    assert together.groups == 12 and alone.groups == 240
+    ratio = (together.ratio_high - together.ratio_low) / (alone.ratio_high - alone.ratio_low)
+    assert 0.6 * math.sqrt(20) < ratio < 1.4 * math.sqrt(20)  # effective sample 240 against 12
+    few = compare(a, b, groups=np.repeat(["x", "y"], 120), seed=2)
+    assert few.groups == 240  # two recordings make no interval
+
+
+def test_missing_truth_is_left_out_of_both_and_a_broken_filter_stays():
+    a, b = np.array([1.0, np.nan, 3.0, 4.0]), np.array([2.0, 5.0, np.nan, 8.0])
+    c = compare(a, b, seed=0)
+    assert c.units == 2 and c.ratio == pytest.approx(0.5)
+    broken = compare(np.array([1.0, np.inf, 1.0]), np.ones(3), seed=0)
+    assert broken.ratio == math.inf and broken.ratio_high == math.inf and broken.ratio_low == 1.0
+    none = compare(np.full(3, np.nan), np.ones(3))
+    assert none.units == 0 and math.isnan(none.ratio) and math.isnan(none.ratio_low)
+
+
+def test_weights_draw_every_group_as_often_on_average():
+    groups = np.array([0, 0, 1, 2, 2, 2, 3])
+    w = np.concatenate(list(resampled_weights(groups, 4000, np.random.default_rng(0))))
+    assert np.array_equal(w[:, 0], w[:, 1]) and (w[:, [0, 2, 3, 6]].sum(-1) == 4).all()
+    assert np.allclose(w.mean(0), 1.0, atol=0.06)  # σ of the mean of 4000 draws is 0.014
+
+
+def test_band_is_as_wide_as_theory_says_and_gaps_are_gaps():
+    x = np.random.default_rng(6).normal(size=(400, 3))
+    x[:, 2] = np.nan
+    rms, low, high = rms_band(x, resamples=1000)
+    # RMS of n unit normals has σ = 1/√(2n): the 95 % band is 2·1.96/√800 = 0.139 wide
+    assert rms[:2] == pytest.approx([1, 1], abs=0.12) and high[:2] - low[:2] == pytest.approx(
+        [0.139] * 2, rel=0.2
+    )
+    assert np.isnan([rms[2], low[2], high[2]]).all()
+    x[3, 0] = np.inf
+    rms, low, high = rms_band(x, resamples=50)
+    assert rms[0] == np.inf and np.isnan(low[0]) and np.isfinite(low[1])

@@ -1,0 +1,74 @@
+"""Outage schedules: which fixes go, and that none is scored that cannot be."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dlkf.errors import InputError
+from dlkf.evaluation.metrics import windows
+from dlkf.evaluation.outages import OutagePlan, scorable, with_outage
+
+
+def _windows(mask):
+    return list(zip(*(a.tolist() for a in windows(mask.numpy()))))
+
+
+def test_an_outage_withholds_the_fixes_after_its_start_up_to_its_end(cars):
+    (mask,) = OutagePlan(first_s=20, duration_s=10).masks(cars)
+    t = torch.arange(1, 61)
+    assert all(t[row].tolist() == list(range(21, 31)) for row in mask)
+    masked = with_outage(cars, mask)
+    assert not masked.available[mask].any() and masked.available[~mask].all() and cars.available.all()
+
+
+def test_offsets_shift_the_whole_schedule_until_it_covers_the_drive(cars):
+    masks = OutagePlan(first_s=5, duration_s=10, every_s=20, offsets_s=(0, 10)).masks(cars)
+    assert _windows(masks[0])[:3] == [(0, 5, 10), (0, 25, 10), (0, 45, 10)]
+    assert _windows(masks[1])[:2] == [(0, 15, 10), (0, 35, 10)]
+    assert (masks[0] | masks[1])[:, 5:55].all()
+
+
+def test_drawn_outages_repeat_with_the_seed_and_stay_in_their_bounds(cars):
+    plan = OutagePlan(first_s=(10, 25), duration_s=(5, 30))
+    first, again = (plan.masks(cars, torch.Generator().manual_seed(3))[0] for _ in range(2))
+    assert torch.equal(first, again)
+    found = _windows(first)
+    assert len(found) == 6 and len({n for _, _, n in found}) > 2
+    assert all(10 <= start <= 25 and 5 <= n <= 30 for _, start, n in found)
+
+
+def test_outages_without_truth_or_without_a_fix_before_them_are_dropped(cars):
+    truth, available, present = cars.truth_valid.clone(), cars.available.clone(), cars.present.clone()
+    truth[0, 27] = False  # in the window
+    available[1, 17:20] = False  # the three fixes before it
+    available[2, 19] = False  # only the last one: the outage counts from the fix 1 s earlier
+    present[3, 25:] = False  # the drive ends in the window
+    batch = replace(cars, truth_valid=truth, available=available, present=present)
+    (mask,) = OutagePlan(first_s=20, duration_s=10).masks(batch)
+    assert mask.any(-1).tolist() == [False, False, True, False, True, True]
+
+
+def test_one_bad_outage_of_several_leaves_the_others(cars):
+    truth = cars.truth_valid.clone()
+    truth[0, 30] = False
+    mask = torch.zeros(6, 60, dtype=torch.bool)
+    mask[:, 5:10] = mask[:, 25:35] = mask[:, 50:60] = True
+    kept = scorable(replace(cars, truth_valid=truth), mask)
+    assert [w[1:] for w in _windows(kept) if w[0] == 0] == [(5, 5), (50, 10)]
+    assert torch.equal(kept[1:], mask[1:])
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"duration_s": 0},
+        {"duration_s": [30, 10]},
+        {"first_s": -1},
+        {"every_s": 60, "duration_s": 60},
+        {"offsets_s": []},
+    ],
+)
+def test_impossible_schedules_are_refused(settings):
+    with pytest.raises(InputError, match="outage"):
+        OutagePlan(**settings)

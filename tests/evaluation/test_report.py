@@ -1,0 +1,165 @@
+"""Tables, figures and files of a report; what has no truth is a dash, what broke is ∞."""
+
+import csv
+import io
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from dlkf.errors import InputError
+from dlkf.evaluation import figures
+from dlkf.evaluation.kinds import drive_kind
+from dlkf.evaluation.outages import OutagePlan
+from dlkf.evaluation.report import png, write_report
+from dlkf.evaluation.results import results
+from dlkf.evaluation.run import score
+from dlkf.evaluation.staging import staged
+from dlkf.evaluation.table import as_csv, as_json, as_markdown, number, slope_table, tables
+from dlkf.filters.build import build_filter
+from tests.evaluation.conftest import IMU
+
+FILTERS = {name: build_filter(name, IMU) for name in ("ins", "mbkf15")}
+
+
+@pytest.fixture(scope="module")
+def scores(cars):
+    outages = OutagePlan(first_s=30, duration_s=20).masks(cars)
+    return score(FILTERS, [cars], outages=outages, kinds="simulated")
+
+
+def test_numbers_are_plain():
+    assert [number(x) for x in (math.nan, math.inf, 0.0, 0.99961, 12.345, 1234.5, 0.01234)] == [
+        "–", "∞", "0", "1.00", "12.3", "1234", "0.0123",
+    ]  # fmt: skip
+
+
+def test_tables_hold_the_results(scores):
+    r = results(scores, resamples=200)
+    whole, outages = tables("town", r)
+    assert whole.title == "town (simulated): 6 pieces of 6 drives"
+    assert outages.title == "town (simulated): 6 outages of 20 s in 6 drives"
+    end = r["filters"]["mbkf15"]["outages"]["end"]["horizontal"]
+    assert outages.rows[1][:4] == ["mbkf15", *(number(end[s]) for s in ("rms", "median", "p95"))]
+    assert outages.rows[1][-1] == "1" and "[" in outages.rows[0][-1]
+    assert r["filters"]["mbkf15"]["outages"]["at"]["20"] == r["filters"]["mbkf15"]["outages"]["end"]
+    per_outage = [o["end"]["mbkf15"]["horizontal"] for o in r["per_outage"]]
+    assert math.sqrt(np.mean(np.square(per_outage))) == pytest.approx(end["rms"])
+    assert all(len(row) == len(t.columns) for t in (whole, outages) for row in t.rows)
+    markdown = as_markdown(whole)
+    assert markdown.count("\n| ") == 3 and "| mbkf15 |" in markdown
+
+
+def test_csv_and_json_carry_every_value(scores):
+    r = results(scores, resamples=50)
+    rows = list(csv.DictReader(io.StringIO(as_csv("town", [r]))))
+    (value,) = (
+        row["value"]
+        for row in rows
+        if (row["filter"], row["part"], row["quantity"], row["statistic"])
+        == ("ins", "at 10 s", "velocity", "p95")
+    )
+    assert float(value) == r["filters"]["ins"]["outages"]["at"]["10"]["velocity"]["p95"]
+    content = json.loads(
+        as_json({"r": r, "nan": math.nan, "inf": np.float64(-np.inf)}), parse_constant=pytest.fail
+    )
+    assert content["nan"] is None and content["inf"] == "-inf" and len(content["r"]["per_piece"]) == 6
+
+
+def test_missing_attitude_is_a_dash_and_a_broken_filter_infinite(cars):
+    batch = replace(cars, attitude_valid=torch.zeros_like(cars.attitude_valid))
+    scores = score(FILTERS, [batch], kinds="real")
+    scores.filters["ins"].error[0, 20, :3] = np.inf
+    r = results(scores, resamples=50)
+    (whole,) = tables("town", r)
+    column = {c: i for i, c in enumerate(whole.columns)}
+    assert all(row[column["Attitude [°]"]] == "–" and row[column["Heading [°]"]] == "–" for row in whole.rows)
+    assert whole.rows[0][column["3D pos. [m]"]] == "∞" and whole.rows[0][column["not finite"]] == "1"
+    assert float(whole.rows[1][column["3D pos. [m]"]]) < 1
+    assert json.loads(as_json(r))["filters"]["ins"]["pieces"]["position"]["all"]["rms"] == "inf"
+
+
+def test_kinds_of_data_are_never_mixed(cars):
+    mixed = score(FILTERS, [cars], kinds={"car-00": "real"})
+    with pytest.raises(ValueError, match="must not be mixed"):
+        results(mixed)
+    assert [results(mixed.of_kind(k))["count"]["pieces"] for k in mixed.kinds] == [1, 5]
+
+
+def test_slope_over_drives_of_known_error(scores, cars):
+    r = results(scores, resamples=50)
+    slopes = r["filters"]["mbkf15"]["imu_error"]["slope"]
+    assert np.allclose(slopes[2:5], 1.0, atol=0.1) and np.allclose(
+        r["filters"]["ins"]["imu_error"]["slope"], 0.0
+    )
+    assert slope_table("town", r).rows[0][1:] == ["0"] * 6
+    unknown = replace(cars, true_imu_error=torch.full_like(cars.true_imu_error, math.nan))
+    assert slope_table("town", results(score(FILTERS, [unknown], kinds="real"), resamples=50)) is None
+
+
+def test_kind_of_a_drive():
+    assert drive_kind({"source": "dlkf.simulate"}) == "simulated"
+    assert drive_kind({"source": "KITTI raw", "gnss": "SYNTHETIC from the reference"}) == "semi-real"
+    assert drive_kind({"source": "car", "gnss": "u-blox F9P", "imu": "consumer MEMS"}) == "real"
+    assert drive_kind({"source": "car", "kind": "semi-real"}) == "semi-real"
+    with pytest.raises(InputError, match="none of simulated"):
+        drive_kind({"drive": "a", "kind": "fake"})
+
+
+@pytest.mark.parametrize("draw", ["tracks", "over_time", "one", "imu", "imu_all", "growth"])
+def test_figures_have_content(scores, draw):
+    figure = {
+        "tracks": lambda: figures.tracks(scores, [0, 3]),
+        "over_time": lambda: figures.error_over_time(scores),
+        "one": lambda: figures.error_over_time(scores, [2]),
+        "imu": lambda: figures.imu_errors(scores, [1]),
+        "imu_all": lambda: figures.imu_errors(scores, list(range(6))),
+        "growth": lambda: figures.error_growth(scores, "attitude"),
+    }[draw]()
+    data = png(figure, dpi=40)
+    assert data.startswith(b"\x89PNG") and len(data) > 5000
+    assert all(ax.get_xlabel() or ax.get_shared_x_axes() for ax in figure.axes)
+
+
+def test_figures_survive_missing_truth_and_broken_filters(cars):
+    truth = cars.truth_valid.clone()
+    truth[:, :7] = truth[0, 30:] = False
+    batch = replace(cars, truth_valid=truth, attitude_valid=torch.zeros_like(truth))
+    outages = OutagePlan(first_s=20, duration_s=20).masks(batch)
+    s = score(FILTERS, [batch], outages=outages, kinds="real")
+    for run in s.filters.values():
+        run.error[1, 15:], run.p_n[1, 15:], run.imu_error[1, 15:] = np.inf, np.nan, np.nan
+    pieces = figures.representative(s, 4, "mbkf15")
+    for figure in (figures.tracks(s, pieces), figures.error_over_time(s), figures.error_growth(s)):
+        assert len(png(figure, dpi=30)) > 4000
+    assert len(png(figures.imu_errors(s, [1]), dpi=30)) > 4000
+
+
+def test_report_is_complete_and_replaces_an_older_one(scores, tmp_path):
+    out = tmp_path / "a" / "b"
+    out.mkdir(parents=True)
+    (out / "table.md").write_text("old")
+    paths = write_report(
+        out, "town", scores, [results(scores, resamples=50)],
+        protocol={"mode": "pieces"}, by_time=True, baseline="mbkf15", dpi=30,
+    )  # fmt: skip
+    assert (out / "table.md").read_text().startswith("**town (simulated)")
+    assert all(p.is_file() and p.stat().st_size > 100 for p in paths)
+    names = {str(p.relative_to(out)) for p in out.rglob("*") if p.is_file()}
+    assert {"metrics.json", "table.md", "table.csv", "report.html", "figures/tracks.png"} <= names
+    assert not any("partial" in n for n in names)
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 5 and "http" not in page
+
+
+def test_a_failed_write_leaves_nothing(tmp_path):
+    with pytest.raises(RuntimeError), staged(tmp_path / "new" / "deep") as folder:
+        (folder / "x").write_text("half")
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot write"), staged(tmp_path / "file" / "sub"):
+        pass

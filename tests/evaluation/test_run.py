@@ -1,0 +1,138 @@
+"""Scoring through the real filter loop: chunks, precision, masks, order, and the slope of a Kalman filter."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from dlkf.errors import InputError
+from dlkf.evaluation.chunks import chunks, in_precision, take
+from dlkf.evaluation.imu_slope import injected_slope
+from dlkf.evaluation.metrics import magnitudes, rms_over_pieces
+from dlkf.evaluation.outages import OutagePlan
+from dlkf.evaluation.run import score
+from dlkf.filters.build import build_filter
+from dlkf.filters.integration import Correction
+from tests.evaluation.conftest import IMU
+
+FILTERS = {name: build_filter(name, IMU) for name in ("ins", "mbkf15")}
+
+
+def _ragged(batch):
+    present = batch.present.clone()
+    for i, n in enumerate((60, 31, 45, 60, 12, 50)):
+        present[i, n:] = False
+    return replace(batch, present=present)
+
+
+def test_chunked_equals_whole_with_pieces_of_different_length(cars):
+    batch = _ragged(cars)
+    seen = []
+    whole = score(FILTERS, [batch], kinds="real")
+    parts = score(FILTERS, [batch], kinds="real", chunk_samples=2500, progress=lambda *a: seen.append(a))
+    for name in FILTERS:
+        for field in ("error", "p_n", "imu_error", "imu_std"):
+            a, b = getattr(whole.filters[name], field), getattr(parts.filters[name], field)
+            assert np.allclose(a, b, rtol=1e-9, atol=1e-9, equal_nan=True), field  # batched matmul rounding
+    assert (
+        np.isnan(whole.filters["ins"].error[4, 12:]).all()
+        and np.isfinite(whole.filters["ins"].error[4, :12]).all()
+    )
+    assert len(seen) > 2 * len(FILTERS) and seen[-1] == ("mbkf15", 6, 6)
+
+
+def test_chunks_cover_every_piece_once_and_drop_the_padding(cars):
+    batch = _ragged(cars)
+    found = list(chunks(batch, 2500))
+    assert sorted(i for c in found for i in c.tolist()) == list(range(6))
+    shortest = take(batch, found[-1])
+    assert shortest.size[1] == int(batch.present[found[-1]].sum(-1).max())
+    assert shortest.drive == tuple(batch.drive[i] for i in found[-1])
+    assert torch.equal(shortest.frame.origin_e, batch.frame.origin_e[found[-1]])
+
+
+def test_outage_errors_grow_until_gnss_is_back(cars):
+    (mask,) = OutagePlan(first_s=30, duration_s=20).masks(cars)
+    scores = score(FILTERS, [cars], outages=[mask])
+    rms = rms_over_pieces(magnitudes(scores.filters["mbkf15"].error)["horizontal"])
+    assert (np.diff(rms[32:50]) > 0).all() and rms[49] > 10 * rms[29] and rms[50] < 0.1 * rms[49]
+    free = score(FILTERS, [cars])
+    inside = free.filters["mbkf15"].error[:, 49]
+    assert np.abs(inside[:, :3]).max() < 0.2  # the same epochs with GNSS: centimetres
+    assert np.array_equal(free.filters["ins"].error, scores.filters["ins"].error)
+
+
+def test_several_batches_are_joined_and_named(cars):
+    short = take(cars, torch.tensor([1, 2]))
+    short = replace(short, present=short.present.clone().index_fill_(1, torch.arange(40, 60), False))
+    short = take(short, torch.tensor([0, 1]))
+    scores = score({"ins": FILTERS["ins"]}, [cars, short], groups={"car-01": "g"}, kinds={"car-01": "real"})
+    assert len(scores.pieces) == 8 and scores.filters["ins"].error.shape == (8, 60, 9)
+    assert [p.group for p in scores.pieces][-2:] == ["g", "car-02"]
+    assert [p.kind for p in scores.pieces][-2:] == ["real", "unknown"]
+    assert np.isnan(scores.truth_p_n[6:, 40:]).all()
+    one = scores.of_kind("real")
+    assert (
+        len(one.pieces) == 2
+        and one.filters["ins"].error.shape[0] == 2
+        and scores.kinds == ["real", "unknown"]
+    )
+
+
+def test_a_filter_with_parameters_runs_in_their_precision(cars):
+    seen = []
+
+    class Probe(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.weight = torch.nn.Parameter(torch.zeros(1))
+
+        def begin(self, batch):
+            seen.append(
+                (batch.imu.dtype, batch.frame.radius.dtype, batch.frame.origin_e.dtype, self.training)
+            )
+            return None, batch.imu.new_zeros(batch.size[0], 6)
+
+        def step(self, memory, epoch):
+            return None, Correction(epoch.z.new_zeros(len(epoch.z), 9), epoch.imu_error)
+
+    scores = score({"probe": Probe(), "ins": FILTERS["ins"]}, [cars])
+    assert seen == [(torch.float32, torch.float32, torch.float64, False)]
+    gap = scores.filters["probe"].p_n - scores.filters["ins"].p_n
+    assert 0 < np.abs(gap).max() < 0.5  # float32 over a minute of raw strapdown, 840 m driven
+
+
+def test_float32_agrees_with_float64(cars):
+    low = score({"mbkf15": FILTERS["mbkf15"]}, [in_precision(cars, torch.float32)])
+    high = score({"mbkf15": FILTERS["mbkf15"]}, [cars])
+    gap = np.abs(low.filters["mbkf15"].error - high.filters["mbkf15"].error)[:, 10:, :3]
+    assert gap.max() < 0.02  # a third of the filter's own 3 cm
+
+
+def test_a_kalman_filter_follows_an_injected_bias_and_pure_inertial_does_not(cars):
+    base = score(FILTERS, [cars])
+    slopes = injected_slope(base, FILTERS, [cars], accel=0.03, gyro=1e-3, seed=4)
+    assert np.allclose(slopes["ins"], 0.0)
+    assert np.allclose(slopes["mbkf15"][[2, 3, 4]], 1.0, atol=0.05)  # down and level rates: always seen
+    assert np.all(slopes["mbkf15"] > 0.5)  # level accelerations and yaw rate need turns
+
+
+def test_nothing_to_score_and_unequal_epochs_are_refused(cars):
+    with pytest.raises(InputError, match="nothing to score"):
+        score({}, [cars])
+    with pytest.raises(InputError, match="epoch"):
+        score(FILTERS, [cars, replace(cars, dt=cars.dt * 2)])
+
+
+def test_a_diverging_filter_shows_as_inf(cars):
+    class Explodes:
+        def begin(self, batch):
+            return None, batch.imu.new_zeros(batch.size[0], 6)
+
+        def step(self, memory, epoch):
+            return None, Correction(epoch.z.new_full((len(epoch.z), 9), math.nan), epoch.imu_error)
+
+    scores = score({"bad": Explodes()}, [cars])
+    assert np.isinf(scores.filters["bad"].error).all()
