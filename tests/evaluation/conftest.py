@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -69,9 +70,24 @@ def car_batch(
     )  # fmt: skip
     if dtype is torch.float64:
         return batch
-    from dlkf.evaluation.chunks import in_precision
-
     return in_precision(batch, dtype)
+
+
+def in_precision(batch: Batch, dtype: torch.dtype) -> Batch:
+    """The batch with its working fields in ``dtype``; file clock and ECEF origin stay float64."""
+    if batch.imu.dtype == dtype:
+        return batch
+    frame = batch.frame
+    working = ("axis_n", "earth_rate_n", "radius", "stretch", "height")
+    frame = replace(frame, **{name: getattr(frame, name).to(dtype) for name in working})
+    cast = {}
+    for f in fields(batch):
+        value = getattr(batch, f.name)
+        if isinstance(value, NavState):
+            cast[f.name] = NavState(*(x.to(dtype) for x in value))
+        elif isinstance(value, torch.Tensor) and value.is_floating_point() and f.name != "t_start":
+            cast[f.name] = value.to(dtype)
+    return replace(batch, frame=frame, **cast)
 
 
 @pytest.fixture(scope="session")

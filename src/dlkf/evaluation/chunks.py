@@ -1,4 +1,4 @@
-"""Run a filter over a large batch a few pieces at a time, in its own precision, without gradients."""
+"""Run a filter over a large batch a few pieces at a time, without gradients."""
 
 from __future__ import annotations
 
@@ -46,26 +46,9 @@ def chunks(batch: Batch, samples: int = CHUNK_SAMPLES) -> Iterator[Tensor]:
 
 
 def run_filter(batch: Batch, estimator: Estimator) -> Solution:
-    """The filter loop without gradients, in the precision and on the device of the estimator's parameters."""
+    """The filter loop without gradients, on the device of the estimator's parameters."""
     parameter = next(estimator.parameters(), None) if isinstance(estimator, torch.nn.Module) else None
     if parameter is not None:
-        batch = in_precision(batch, parameter.dtype).to(parameter.device)
+        batch = batch.to(parameter.device)
     with torch.inference_mode():
         return integrate(batch, estimator)
-
-
-def in_precision(batch: Batch, dtype: torch.dtype) -> Batch:
-    """The batch with its working fields in ``dtype``; file clock and ECEF origin stay float64."""
-    if batch.imu.dtype == dtype:
-        return batch
-    frame = batch.frame
-    working = ("axis_n", "earth_rate_n", "radius", "stretch", "height")
-    frame = replace(frame, **{name: getattr(frame, name).to(dtype) for name in working})
-    cast = {}
-    for f in fields(batch):
-        value = getattr(batch, f.name)
-        if isinstance(value, NavState):
-            cast[f.name] = NavState(*(x.to(dtype) for x in value))
-        elif isinstance(value, Tensor) and value.is_floating_point() and f.name != "t_start":
-            cast[f.name] = value.to(dtype)
-    return replace(batch, frame=frame, **cast)

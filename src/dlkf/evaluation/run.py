@@ -35,8 +35,7 @@ def score(
     ``outages`` has one mask (B, T) per batch, whose fixes are withheld from every filter; ``groups`` and
     ``kinds`` map a drive's name to its recording and its kind. ``state`` is the one that is scored, after
     (``posterior``) or before (``prior``) the update. ``progress(filter, pieces done, pieces in all)`` is
-    called after each chunk. A filter with its own parameters runs in their precision and on their device,
-    others in that of the batch.
+    called after each chunk. A filter with parameters of its own runs on their device.
     """
     if not filters or not batches:
         raise InputError("nothing to score: give at least one filter and one piece of a drive")

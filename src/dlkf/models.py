@@ -1,0 +1,81 @@
+"""From what a user writes after ``model=`` to a filter that runs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from dlkf.errors import InputError
+from dlkf.filters.build import MODEL_BASED, build_filter
+from dlkf.filters.integration import Estimator
+from dlkf.filters.learned import CONFIG, WEIGHTS, load_filter
+from dlkf.navigation.imu_errors import ImuSpec
+
+RUN_ID = re.compile(r"[0-9a-f]{32}")
+
+
+def resolve_model(
+    spec: str,
+    imu: ImuSpec,
+    tracking_uri: str | None = None,
+    *,
+    tuning: Mapping[str, float] | None = None,
+    prior: Mapping[str, Sequence[float]] | None = None,
+) -> Estimator:
+    """A filter by name, from a folder with weights and config, an MLflow run id, or ``models:/name@alias``.
+
+    ``imu`` and ``tuning`` belong to the model-based filters, ``prior`` (``mean``, ``std``) to
+    ``mbkf15_prior``. Raises InputError for anything else, listing what is known.
+    """
+    if spec in MODEL_BASED:
+        given: dict[str, Any] = {} if spec == "ins" else {"tuning": tuning}
+        if spec.endswith("_prior") and prior:
+            given |= {"prior_mean": prior.get("mean"), "prior_std": prior.get("std")}
+        return build_filter(spec, imu, **given)
+    if is_tracked(spec):
+        from dlkf.training.registry import download_model  # MLflow takes seconds to import
+
+        return load_filter(download_model(spec, tracking_uri))
+    folder = Path(spec).expanduser()
+    if folder.is_dir():
+        return load_filter(folder)
+    if folder.is_file():
+        raise InputError(
+            f"model={spec} is a file; give the folder with {WEIGHTS} and {CONFIG} (pickles are not read)"
+        )
+    raise InputError(
+        f"unknown model {spec!r}: neither a known filter ({', '.join(MODEL_BASED)}) nor a folder, "
+        "an MLflow run id or models:/name@alias"
+    )
+
+
+def is_tracked(spec: str) -> bool:
+    """Whether a model is to be had from MLflow: a run id, ``runs:/…`` or ``models:/…``."""
+    return bool(RUN_ID.fullmatch(spec)) or spec.startswith(("models:/", "runs:/"))
+
+
+def resolve_models(specs: str | Sequence[str], imu: ImuSpec, tracking_uri: str | None = None, **options: Any):
+    """``{name in tables: filter}`` for one spec or several, in their order; a repeated name gets a number."""
+    listed = [specs] if isinstance(specs, str) else [str(s) for s in specs]
+    if not listed:
+        raise InputError("model is an empty list; give at least one model, such as model=mbkf15")
+    models: dict[str, Estimator] = {}
+    for spec in listed:
+        name = short_name(spec)
+        if name in models:
+            name = f"{name}#{sum(n == name or n.startswith(name + '#') for n in models) + 1}"
+        models[name] = resolve_model(spec, imu, tracking_uri, **options)
+    return models
+
+
+def short_name(spec: str) -> str:
+    """What a table calls a model: its name, its folder's, its registered one, or a run's first 8 digits."""
+    if spec in MODEL_BASED:
+        return spec
+    if RUN_ID.fullmatch(spec):
+        return spec[:8]
+    if spec.startswith("models:/"):
+        return spec.removeprefix("models:/")
+    return Path(spec).expanduser().resolve().name
