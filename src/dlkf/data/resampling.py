@@ -1,0 +1,238 @@
+"""One drive on a uniform grid: averaged IMU samples, fixes assigned to epochs, reference at the boundaries."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, IMU_ERROR, POSITION, STD, VELOCITY
+from dlkf.data.tables import Columns
+from dlkf.data.validate import GNSS_QUALITIES
+from dlkf.errors import InputError
+from dlkf.navigation.attitude import rotation_from_rpy, rotation_from_vector, vector_from_rotation
+from dlkf.navigation.earth import ecef_from_geodetic, ned_axes
+
+ON_BOUNDARY_S = 1e-3  # a fix this close to a boundary counts as on it
+LONGEST_BRIDGE_S = 1.1  # the reference is interpolated between samples no further apart
+SMALLEST_STD = 1e-3  # m, m/s: what a source calls zero
+# horizontal position [m] and velocity [m/s] 1σ where a source gives none, by NMEA GGA quality
+DEFAULT_STD = {4: (0.02, 0.05), 5: (0.3, 0.1), 2: (1.0, 0.1), 3: (1.0, 0.1), 9: (1.0, 0.1), 1: (2.5, 0.2)}
+VERTICAL_FACTOR = 1.5  # of the default position std
+
+
+@dataclass(frozen=True)
+class Grid:
+    """N epochs of M samples from ``t0``; boundary k is at ``t0 + k·epoch_s``."""
+
+    t0: float
+    epoch_s: float
+    epochs: int
+    samples: int
+
+    @property
+    def boundaries(self) -> np.ndarray:
+        """Times of the N+1 boundaries [s]."""
+        return self.t0 + self.epoch_s * np.arange(self.epochs + 1)
+
+    @property
+    def sample_times(self) -> np.ndarray:
+        """Times of the N·M+1 limits of the samples [s]."""
+        return self.t0 + self.epoch_s / self.samples * np.arange(self.epochs * self.samples + 1)
+
+
+def epoch_grid(t_imu: np.ndarray, t_fix: np.ndarray, rate_hz: float, epoch_s: float, drive: str) -> Grid:
+    """The grid inside the IMU's time whose boundaries the fixes fall on.
+
+    Raises InputError if an epoch is no whole number of samples, or the drive is shorter than an epoch.
+    """
+    samples = round(rate_hz * epoch_s)
+    if samples < 1 or abs(samples - rate_hz * epoch_s) > 1e-6:
+        raise InputError(f"rate_hz={rate_hz:g}, epoch_s={epoch_s:g}: an epoch must hold a whole number of samples")
+    step = float(np.median(np.diff(t_imu)))
+    first, last = t_imu[0] - step, t_imu[-1]  # the first sample covers the interval before its stamp
+    slack = 0.5 * min(step, epoch_s / samples)
+    phase = fix_phase(t_fix, epoch_s)
+    t0 = phase + np.ceil((first - phase - slack) / epoch_s) * epoch_s
+    epochs = int(np.floor((last - t0 + slack) / epoch_s))
+    if epochs < 1:
+        raise InputError(f"drive {drive}: only {last - first:.2f} s of IMU, shorter than an epoch of {epoch_s:g} s")
+    return Grid(float(t0), epoch_s, epochs, samples)
+
+
+def fix_phase(t: np.ndarray, epoch_s: float) -> float:
+    """Phase of the fixes in an epoch [s]: their circular median where that is where most of them are.
+
+    Several fixes in an epoch (5 Hz) or jittering ones have no such phase: then the most frequent one of 1 ms
+    width, and the latest of jittering fixes, so that a fix waits as little as can be for its boundary.
+    """
+    if not len(t):
+        return 0.0
+    phase = np.mod(t, epoch_s)
+    mean = np.exp(2j * np.pi * phase / epoch_s).mean()
+    centre = np.angle(mean) / (2 * np.pi) * epoch_s if abs(mean) > 0.5 else phase[0]
+    around = np.mod(phase - centre + epoch_s / 2, epoch_s) - epoch_s / 2
+    if abs(mean) > 0.5:
+        median = float(np.median(around))
+        settled = np.mean(np.abs(around - median) <= ON_BOUNDARY_S) > 0.5
+        return float(centre + (median if settled else np.quantile(around, 0.95)))
+    bins, counts = np.unique(np.round(around / ON_BOUNDARY_S), return_counts=True)
+    best = bins[counts.argmax()] * ON_BOUNDARY_S
+    return float(centre + np.median(around[np.abs(around - best) <= ON_BOUNDARY_S]))
+
+
+def resample_imu(imu: Columns, grid: Grid) -> np.ndarray:
+    """Mean specific force and rate (N, M, 6) over the grid's samples.
+
+    A sample is the mean over the interval that ends at its stamp, so the cumulative integral is known at the
+    stamps and linear between them; its difference between the grid's times is exact for whole ratios and
+    unbiased for any other. Where stamps are missing (an interval over 1.5 medians), the mean of the two
+    neighbours fills the missing part.
+    """
+    t = imu["t"]
+    values = np.stack([imu[c] for c in (*ACCEL, *GYRO)], -1)
+    step = np.diff(t, prepend=t[0] - np.median(np.diff(t)))
+    usual = float(np.median(step))
+    missing = np.where(step > 1.5 * usual, step - usual, 0.0)
+    before = np.concatenate((values[:1], values[:-1]))
+    increments = values * (step - missing)[:, None] + 0.5 * (values + before) * missing[:, None]
+    # knots: stamps, one interval before the first, and one after the last for the slack of the grid
+    knots = np.concatenate((t[:1] - 2 * step[0], t[:1] - step[0], t, t[-1:] + step[-1]))
+    zero = np.zeros((1, 6))
+    total = np.cumsum(np.concatenate((zero, values[:1] * step[0], increments, values[-1:] * step[-1])), 0)
+    at = grid.sample_times
+    place = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
+    part = (at - knots[place]) / (knots[place + 1] - knots[place])
+    integral = total[place] + part[:, None] * (total[place + 1] - total[place])
+    mean = np.diff(integral, axis=0) / (grid.epoch_s / grid.samples)
+    return mean.reshape(grid.epochs, grid.samples, 6)
+
+
+@dataclass(frozen=True)
+class Fixes:
+    """GNSS at the N+1 boundaries; the columns of :class:`dlkf.data.drive.Drive`."""
+
+    r_e: np.ndarray
+    v_e: np.ndarray
+    std: np.ndarray
+    valid: np.ndarray
+    lag: np.ndarray
+    quality: np.ndarray
+
+
+def assign_fixes(gnss: Columns, grid: Grid) -> Fixes:
+    """Each fix to the first boundary at or after it; the latest in an epoch wins.
+
+    Unknown stds take the defaults of ``DEFAULT_STD``; components that are NaN are not valid.
+    """
+    rows = grid.epochs + 1
+    usable = np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite(np.stack([gnss[c] for c in POSITION])).all(0)
+    place = np.ceil((gnss["t"] - grid.t0 - ON_BOUNDARY_S) / grid.epoch_s).astype(np.int64)
+    inside = np.flatnonzero(usable & (place >= 0) & (place < rows))
+    chosen = np.full(rows, -1)
+    chosen[place[inside]] = inside  # rows are in order of time: the last assignment stays
+    at = np.flatnonzero(chosen >= 0)
+    src = chosen[at]
+    r_e, v_e, C_en = _ecef(gnss, src)
+    quality = np.zeros(rows, np.int64)
+    quality[at] = gnss["quality"][src]
+    default = np.array([_default_std(int(q)) for q in gnss["quality"][src]]).reshape(-1, 6)
+    std = np.stack([gnss[c][src] for c in STD], -1)
+    std = np.maximum(np.where(np.isnan(std), default, std), SMALLEST_STD)
+    v_ned = np.stack([gnss[c][src] for c in VELOCITY], -1)
+    known = np.isfinite(v_ned)
+    v_e = (C_en @ np.where(known, v_ned, 0.0)[..., None])[..., 0]
+    lag = np.clip(grid.boundaries[at] - gnss["t"][src], 0.0, None)
+    lag[lag <= ON_BOUNDARY_S] = 0.0
+    return Fixes(
+        r_e=_spread(r_e, at, rows, np.nan),
+        v_e=_spread(v_e, at, rows, np.nan),
+        std=_spread(std, at, rows, np.nan),
+        valid=_spread(np.concatenate((np.ones_like(known), known), -1), at, rows, False),
+        lag=_spread(lag, at, rows, 0.0),
+        quality=quality,
+    )
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Reference at the N+1 boundaries; the columns of :class:`dlkf.data.drive.Drive`."""
+
+    r_e: np.ndarray
+    v_e: np.ndarray
+    C_eb: np.ndarray
+    valid: np.ndarray
+    imu_error: np.ndarray
+
+
+def reference_at(reference: Columns | None, grid: Grid) -> Truth:
+    """The reference interpolated to the boundaries, from samples that are both valid and close.
+
+    Position by cubic Hermite with the velocities (linear where samples are dense), velocity and IMU error
+    linear, attitude along the geodesic of SO(3). NaN and not valid elsewhere.
+    """
+    rows = grid.epochs + 1
+    nan3 = np.full((rows, 3), np.nan)
+    empty = Truth(nan3, nan3.copy(), np.full((rows, 3, 3), np.nan), np.zeros(rows, bool), np.full((rows, 6), np.nan))
+    if reference is None:
+        return empty
+    known = reference["valid"] & np.isfinite(np.stack([reference[c] for c in (*POSITION, *VELOCITY)])).all(0)
+    t, at = reference["t"], grid.boundaries
+    if len(t) < 2:
+        return empty
+    i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+    h = t[i + 1] - t[i]
+    s = (at - t[i]) / h
+    near = np.minimum(np.abs(at - t[i]), np.abs(at - t[i + 1])) <= ON_BOUNDARY_S
+    nearest = np.where(np.abs(at - t[i]) <= np.abs(at - t[i + 1]), i, i + 1)
+    between = known[i] & known[i + 1] & (h <= LONGEST_BRIDGE_S) & (s >= 0) & (s <= 1)
+    alone = near & known[nearest] & ~between
+    i = np.where(alone, np.minimum(nearest, len(t) - 2), i)
+    s = np.where(alone, nearest - i, np.clip(s, 0, 1)).astype(float)
+    h = t[i + 1] - t[i]
+    rows_at = np.flatnonzero(between | alone)
+    i, s, h = i[rows_at], s[rows_at][:, None], h[rows_at][:, None]
+    r0, v0, C0 = _ecef(reference, i, attitude=True)
+    r1, v1, C1 = _ecef(reference, i + 1, attitude=True)
+    r_e = r0 + (r1 - r0) * (s * s * (3 - 2 * s)) + h * s * (1 - s) * ((1 - s) * v0 - s * v1)
+    v_e = v0 + s * (v1 - v0)
+    turn = vector_from_rotation(torch.from_numpy(C0.transpose(0, 2, 1) @ C1))
+    C_eb = C0 @ rotation_from_vector(torch.from_numpy(s) * turn).numpy()
+    for end, C in ((0.0, C0), (1.0, C1)):  # a neighbour without attitude does not spoil an exact hit
+        C_eb = np.where((s == end)[..., None], C, C_eb)
+        r_e = np.where(s == end, r0 if end == 0 else r1, r_e)
+        v_e = np.where(s == end, v0 if end == 0 else v1, v_e)
+    error = np.full((len(i), 6), np.nan)
+    if all(c in reference for c in IMU_ERROR):
+        e = np.stack([reference[c] for c in IMU_ERROR], -1)
+        error = np.where(s == 0, e[i], np.where(s == 1, e[i + 1], e[i] + s * (e[i + 1] - e[i])))
+    return Truth(
+        r_e=_spread(r_e, rows_at, rows, np.nan),
+        v_e=_spread(v_e, rows_at, rows, np.nan),
+        C_eb=_spread(C_eb, rows_at, rows, np.nan),
+        valid=_spread(np.ones(len(i), bool), rows_at, rows, False),
+        imu_error=_spread(error, rows_at, rows, np.nan),
+    )
+
+
+def _default_std(quality: int) -> tuple[float, ...]:
+    position, velocity = DEFAULT_STD[quality]
+    return (position, position, VERTICAL_FACTOR * position, velocity, velocity, velocity)
+
+
+def _spread(values: np.ndarray, at: np.ndarray, rows: int, fill: float | bool) -> np.ndarray:
+    out = np.full((rows, *values.shape[1:]), fill, dtype=values.dtype)
+    out[at] = values
+    return out
+
+
+def _ecef(table: Columns, rows: np.ndarray, attitude: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """ECEF position and velocity, and C_en, or C_eb with ``attitude``, of some rows."""
+    lat, lon = (torch.from_numpy(np.radians(table[c][rows])) for c in ("lat_deg", "lon_deg"))
+    r_e = ecef_from_geodetic(lat, lon, torch.from_numpy(table["height_m"][rows]))
+    C = ned_axes(lat, lon)
+    v_e = (C @ torch.from_numpy(np.stack([table[c][rows] for c in VELOCITY], -1)).unsqueeze(-1)).squeeze(-1)
+    if attitude:
+        C = C @ rotation_from_rpy(torch.from_numpy(np.stack([table[c][rows] for c in ATTITUDE], -1)))
+    return r_e.numpy(), v_e.numpy(), C.numpy()

@@ -1,0 +1,82 @@
+"""Load a dataset: every drive checked, resampled to a uniform rate and cut into epochs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+
+from dlkf.data.drive import Drive
+from dlkf.data.resampling import assign_fixes, epoch_grid, reference_at, resample_imu
+from dlkf.data.tables import dataset_digest, read_drives
+from dlkf.data.validate import GNSS_QUALITIES, DriveTables, Limits, read_checked
+from dlkf.errors import InputError
+
+__all__ = ["dataset_digest", "drive_from_tables", "load_dataset"]
+
+
+def load_dataset(
+    folder: str | Path,
+    *,
+    rate_hz: float = 50.0,
+    epoch_s: float = 1.0,
+    dtype: torch.dtype = torch.float32,
+    reference: bool = True,
+    drives: Sequence[str] | None = None,
+    limits: Limits = Limits(),
+    progress: Callable[[str, int, int], None] | None = None,
+) -> list[Drive]:
+    """The drives of a dataset, or those named, on an epoch grid; IMU in ``dtype``, the rest float64.
+
+    With ``reference=False`` the folder ``reference/`` is not opened. ``progress(drive, done, all)`` is called
+    after each drive. Raises InputError for the first fault in the data or an unknown drive.
+    """
+    folder = Path(folder)
+    rows = read_drives(folder)
+    if drives is not None:
+        known = {row.name: row for row in rows}
+        if unknown := [name for name in drives if name not in known]:
+            shown = ", ".join(list(known)[:8]) + (", …" if len(known) > 8 else "")
+            raise InputError(f"dataset {folder}: no drive {unknown[0]}; has {shown}")
+        rows = [known[name] for name in drives]
+    loaded = []
+    for row in rows:
+        tables = read_checked(folder, row, reference=reference, limits=limits)
+        loaded.append(drive_from_tables(tables, folder.absolute().name, rate_hz, epoch_s, dtype))
+        if progress is not None:
+            progress(row.name, len(loaded), len(rows))
+    return loaded
+
+
+def drive_from_tables(
+    tables: DriveTables, dataset: str, rate_hz: float, epoch_s: float, dtype: torch.dtype
+) -> Drive:
+    """One drive's checked tables on its epoch grid; raises InputError if it is shorter than an epoch."""
+    imu, gnss = tables.imu, tables.gnss
+    fix = torch.from_numpy(gnss["quality"])
+    usable = torch.isin(fix, torch.tensor(GNSS_QUALITIES)).numpy()
+    grid = epoch_grid(imu["t"], gnss["t"][usable], rate_hz, epoch_s, tables.row.name)
+    fixes = assign_fixes(gnss, grid)
+    truth = reference_at(tables.reference, grid)
+    return Drive(
+        name=tables.row.name,
+        group=tables.row.group,
+        dataset=dataset,
+        t0=grid.t0,
+        epoch_s=epoch_s,
+        rate_hz=rate_hz,
+        imu=torch.from_numpy(resample_imu(imu, grid)).to(dtype),
+        gnss_r_e=torch.from_numpy(fixes.r_e),
+        gnss_v_e=torch.from_numpy(fixes.v_e),
+        gnss_std=torch.from_numpy(fixes.std),
+        gnss_valid=torch.from_numpy(fixes.valid),
+        gnss_lag=torch.from_numpy(fixes.lag),
+        quality=torch.from_numpy(fixes.quality),
+        ref_r_e=torch.from_numpy(truth.r_e),
+        ref_v_e=torch.from_numpy(truth.v_e),
+        ref_C_eb=torch.from_numpy(truth.C_eb),
+        ref_valid=torch.from_numpy(truth.valid),
+        ref_imu_error=torch.from_numpy(truth.imu_error),
+        lever_arm_b=torch.tensor(tables.row.lever_arm_b, dtype=torch.float64),
+    )

@@ -1,0 +1,144 @@
+"""Checks of a dataset: one clear line for the first thing that is wrong, with drive, file, row and remedy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dlkf.data.plausibility import check_attitude, check_gnss_units, check_imu_units, check_turns
+from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY
+from dlkf.data.tables import Columns, DriveRow, read_drives, read_table
+from dlkf.errors import InputError
+
+GNSS_QUALITIES = (1, 2, 3, 4, 5, 9)  # NMEA GGA codes that are a satellite fix; 6, 7, 8 are not
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What is still accepted: an IMU gap is one longer than both ``gap_s`` and ``gap_samples`` intervals."""
+
+    gap_s: float = 0.25
+    gap_samples: float = 5.0
+
+
+@dataclass(frozen=True)
+class DriveTables:
+    """The checked tables of one drive."""
+
+    row: DriveRow
+    imu: Columns
+    gnss: Columns
+    reference: Columns | None
+
+
+def validate_dataset(folder: str | Path, *, reference: bool = True, limits: Limits = Limits()) -> list[DriveRow]:  # noqa: B008
+    """Check every drive of a dataset and return their rows; raises InputError for the first fault.
+
+    With ``reference=False`` the folder ``reference/`` is not opened.
+    """
+    rows = read_drives(folder)
+    for row in rows:
+        read_checked(folder, row, reference=reference, limits=limits)
+    return rows
+
+
+def read_checked(
+    folder: str | Path,
+    row: DriveRow,
+    *,
+    reference: bool = True,
+    limits: Limits = Limits(),  # noqa: B008
+) -> DriveTables:
+    """Read and check the tables of one drive; raises InputError for the first fault."""
+    name = row.name
+    imu = read_table(folder, "imu", name)
+    gnss = read_table(folder, "gnss", name)
+    assert imu is not None and gnss is not None  # read_table raises for these two
+    truth = read_table(folder, "reference", name) if reference else None
+    _check_imu(imu, _where(name, "imu"), limits)
+    _check_gnss(gnss, imu, _where(name, "gnss"))
+    check_turns(imu, gnss, _where(name, "imu"))
+    if truth is not None:
+        _check_reference(truth, _where(name, "reference"))
+    return DriveTables(row, imu, gnss, truth)
+
+
+def gap_rows(t: np.ndarray, limits: Limits = Limits()) -> np.ndarray:  # noqa: B008
+    """Rows before which the IMU has a gap."""
+    if len(t) < 2:
+        return np.zeros(0, dtype=np.int64)
+    step = np.diff(t)
+    return np.flatnonzero(step > max(limits.gap_s, limits.gap_samples * float(np.median(step)))) + 1
+
+
+def _where(drive: str, kind: str) -> str:
+    return f"drive {drive}, {kind}/drive={drive}"
+
+
+def _check_time(t: np.ndarray, where: str) -> None:
+    bad = np.flatnonzero(~np.isfinite(t))
+    if len(bad):
+        raise InputError(f"{where}: row {bad[0]}: t is {t[bad[0]]}; remove the row or give its time in seconds")
+    back = np.flatnonzero(np.diff(t) <= 0)
+    if len(back):
+        k = int(back[0])
+        if t[k + 1] == t[k]:
+            raise InputError(f"{where}: row {k + 1}: t = {t[k]:.6f} stands twice; remove duplicate samples")
+        raise InputError(
+            f"{where}: row {k + 1}: t goes back from {t[k]:.6f} to {t[k + 1]:.6f}; sort the rows, or split the drive"
+        )
+
+
+def _check_finite(table: Columns, names: tuple[str, ...], where: str, *, nan: bool) -> None:
+    for name in names:
+        values = table[name]
+        bad = np.flatnonzero(np.isinf(values) if nan else ~np.isfinite(values))
+        if len(bad):
+            k = int(bad[0])
+            remedy = "write NaN where it is unknown" if nan else "remove the row or split the drive there"
+            raise InputError(f"{where}: row {k}: {name} is {values[k]}; {remedy}")
+
+
+def _check_imu(imu: Columns, where: str, limits: Limits) -> None:
+    t = imu["t"]
+    _check_time(t, where)
+    _check_finite(imu, (*GYRO, *ACCEL), where, nan=False)
+    if len(t) < 2:
+        raise InputError(f"{where}: has a single sample; leave the drive out or give its data")
+    gaps = gap_rows(t, limits)
+    if len(gaps):
+        k = int(gaps[0])
+        raise InputError(
+            f"{where}: row {k}: IMU gap of {t[k] - t[k - 1]:.3f} s after t = {t[k - 1]:.3f}; split the drive there "
+            "(dlkf.ingest split_gaps=true)"
+        )
+    check_imu_units(imu, where)
+
+
+def _check_gnss(gnss: Columns, imu: Columns, where: str) -> None:
+    _check_time(gnss["t"], where)
+    _check_finite(gnss, (*POSITION, *VELOCITY, *STD), where, nan=True)
+    fix = np.isin(gnss["quality"], GNSS_QUALITIES) & np.all([np.isfinite(gnss[c]) for c in POSITION], axis=0)
+    if not fix.any():
+        raise InputError(f"{where}: no GNSS fix at all (position NaN or quality 0 in every row); leave the drive out")
+    for name in STD:
+        bad = np.flatnonzero(gnss[name] < 0)
+        if len(bad):
+            raise InputError(f"{where}: row {bad[0]}: {name} is {gnss[name][bad[0]]}; must be ≥ 0, or NaN if unknown")
+    t, first, last = gnss["t"][fix], imu["t"][0], imu["t"][-1]
+    if not ((t > first) & (t <= last + 1)).any():
+        raise InputError(
+            f"{where}: fixes from t = {t[0]:.3f} to {t[-1]:.3f} lie outside the IMU's {first:.3f} to {last:.3f}; "
+            "both need the same clock"
+        )
+    check_gnss_units({name: values[fix] for name, values in gnss.items()}, where)
+
+
+def _check_reference(reference: Columns, where: str) -> None:
+    _check_time(reference["t"], where)
+    _check_finite(reference, (*POSITION, *VELOCITY, *ATTITUDE), where, nan=True)
+    known = reference["valid"] & np.isfinite(reference["lat_deg"]) & np.isfinite(reference["lon_deg"])
+    check_gnss_units({name: values[known] for name, values in reference.items()}, where)
+    check_attitude({name: values[known] for name, values in reference.items()}, where)
