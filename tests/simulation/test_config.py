@@ -1,0 +1,69 @@
+"""The shipped configurations: every preset reads, every dataset brings its IMU, the command line wins."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from dlkf.data.validate import validate_dataset
+from dlkf.navigation.imu_errors import imu_spec
+from dlkf.simulation.dataset import dataset_config, simulate_from_config
+
+CONF = Path(__file__).parents[2] / "conf"
+PRESETS = sorted(path.stem for path in (CONF / "imu").glob("*.yaml"))
+BRINGS = {
+    "one_imu": "automotive_mems",
+    "per_drive": "automotive_mems",
+    "paper_clean": "table3_standin",
+    "paper_mems": "groves_consumer",
+}
+
+
+def composed(*overrides: str) -> dict:
+    with initialize_config_dir(config_dir=str(CONF), version_base="1.3"):
+        return OmegaConf.to_container(compose("simulate", list(overrides)), resolve=True)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_read_and_say_where_they_come_from(name):
+    spec = imu_spec(yaml.safe_load((CONF / "imu" / f"{name}.yaml").read_text()))
+    assert spec.name == name and spec.source
+    assert (spec.accel.noise_density == 0) == (name == "perfect")
+
+
+@pytest.mark.parametrize(
+    ("name", "accel", "gyro"),
+    [  # √S of checklist 2.10 in m/s²/√Hz and rad/s/√Hz, given to three digits
+        ("groves_consumer", 9.81e-3, 2.91e-4),
+        ("icm20602_datasheet", 9.81e-4, 6.98e-5),
+        ("icm20602_i2nav", 3.33e-3, 5.82e-5),
+        ("bmi055_class", 1.47e-3, 2.44e-4),
+        ("bmi270", 1.57e-3, 1.22e-4),
+        ("adis16465_i2nav", 1.67e-3, 2.91e-5),
+    ],
+)
+def test_noise_densities_are_those_of_the_sources(name, accel, gyro):
+    spec = imu_spec(yaml.safe_load((CONF / "imu" / f"{name}.yaml").read_text()))
+    assert spec.accel.noise_density == pytest.approx(accel, rel=4e-3)
+    assert spec.gyro.noise_density == pytest.approx(gyro, rel=4e-3)
+
+
+@pytest.mark.parametrize("name", BRINGS)
+def test_datasets_bring_their_imu_and_the_command_line_wins(name):
+    config = composed(f"dataset={name}")
+    assert dataset_config(config["dataset"]).name == name
+    assert config["imu"]["name"] == BRINGS[name]
+    assert config["out"] == f"data/{name}"
+    assert composed("imu=consumer", f"dataset={name}")["imu"]["name"] == "consumer"
+
+
+def test_every_dataset_is_listed_here():
+    assert sorted(BRINGS) == sorted(path.stem for path in (CONF / "dataset").glob("*.yaml"))
+
+
+def test_a_simulated_dataset_keeps_the_contract(tmp_path):
+    config = composed("dataset=per_drive", "dataset.hours=0.05", "dataset.drive_minutes=1", "seed=4")
+    rows = validate_dataset(simulate_from_config(config, tmp_path / "toy", progress=False))
+    assert [row.name for row in rows] == [f"per_drive-4-0000{k}" for k in range(3)]
