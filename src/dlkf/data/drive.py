@@ -95,3 +95,14 @@ class Batch:
             elif isinstance(value, NavState):
                 moved[f.name] = NavState(*(x.to(device) for x in value))
         return replace(self, **moved)
+
+    def in_precision(self, dtype: torch.dtype) -> Batch:
+        """The same batch with its working fields in ``dtype``; file clock and ECEF origin stay float64."""
+
+        def cast(x: Tensor) -> Tensor:
+            return x.to(dtype) if x.is_floating_point() else x
+
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        tensors = {k: cast(v) for k, v in values.items() if isinstance(v, Tensor) and k != "t_start"}
+        states = {k: NavState(*map(cast, v)) for k, v in values.items() if isinstance(v, NavState)}
+        return replace(self, frame=self.frame.in_precision(dtype), **tensors, **states)

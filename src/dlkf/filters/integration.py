@@ -8,7 +8,7 @@ all, so that a comparison between filters compares their answers and nothing els
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -47,6 +47,7 @@ class Correction(NamedTuple):
     gain: Tensor | None = None  # (B, 9, 6)
 
 
+@runtime_checkable
 class Estimator(Protocol):
     """The part of a filter that differs from filter to filter."""
 

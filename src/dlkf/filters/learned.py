@@ -68,6 +68,7 @@ class LearnedConfig:
         values.setdefault("rate_hz", cls.rate_hz)
         values.setdefault("epoch_s", cls.epoch_s)
         network.setdefault("samples", round(values["rate_hz"] * values["epoch_s"]))
+        network["dense"] = tuple(network.get("dense", NetworkConfig.dense))
         network["flags"] = 2 if values.get("outage_mode", cls.outage_mode) == "run" else 0
         return cls(network=NetworkConfig(**network), **values)
 

@@ -83,6 +83,11 @@ class TangentFrame:
         """The same frames on another device."""
         return replace(self, **{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
+    def in_precision(self, dtype: torch.dtype) -> TangentFrame:
+        """The same frames with their working fields in ``dtype``."""
+        working = ("axis_n", "earth_rate_n", "radius", "stretch", "height")
+        return replace(self, **{name: getattr(self, name).to(dtype) for name in working})
+
     def __getitem__(self, index) -> TangentFrame:
         """The frames of some batch elements."""
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})

@@ -34,7 +34,6 @@ class NetworkConfig:
     flags: int = 0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "dense", tuple(self.dense))
         if self.fusion not in FUSIONS:
             raise InputError(f"model.network.fusion is {self.fusion!r}; choose one of {', '.join(FUSIONS)}")
         if self.kernel % 2 == 0:

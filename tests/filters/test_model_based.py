@@ -1,0 +1,181 @@
+"""The loop and the 15-state filter: consistency, the textbook update, outages, lever arm, late fixes."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from scipy.stats import chi2
+
+from dlkf.errors import InputError
+from dlkf.filters.build import MODEL_BASED, build_filter
+from dlkf.filters.integration import integrate
+from dlkf.filters.model_based import Ins, Mbkf15, kalman_update
+from dlkf.navigation.state import NavState
+from dlkf.navigation.strapdown import strapdown
+
+from .scene import IMU, scene
+
+
+class Watched(Mbkf15):
+    """Keeps the covariances it had, for NEES."""
+
+    def begin(self, batch):
+        object.__setattr__(self, "seen", [])
+        return super().begin(batch)
+
+    def step(self, memory, epoch):
+        memory, correction = super().step(memory, epoch)
+        self.seen.append(memory.P)
+        return memory, correction
+
+
+def hidden(batch, first: int, last: int):
+    available = batch.available.clone()
+    available[:, first:last] = False
+    return replace(batch, available=available)
+
+
+def errors(batch, solution):
+    pva = solution.posterior.error_to(batch.truth)
+    return torch.cat((pva, batch.true_imu_error - solution.imu_error), -1)
+
+
+def test_gain_is_the_brute_force_least_squares_solution():
+    """Kalman update = minimum of the weighted squares of prior and measurement (batch solution by lstsq)."""
+    g = torch.Generator().manual_seed(0)
+    L = torch.randn(4, 15, 15, generator=g, dtype=torch.float64)
+    P, H = L @ L.mT, torch.randn(4, 6, 15, generator=g, dtype=torch.float64)
+    R, z = torch.rand(4, 6, generator=g, dtype=torch.float64) + 0.1, torch.randn(4, 6, generator=g, dtype=torch.float64)
+    K, updated = kalman_update(P, H, R)
+    information = torch.linalg.inv(P) + H.mT @ (H / R.unsqueeze(-1))
+    expected = torch.linalg.solve(information, H.mT @ (z / R).unsqueeze(-1))
+    assert torch.allclose(K @ z.unsqueeze(-1), expected, rtol=1e-6, atol=1e-8)
+    assert torch.allclose(updated, torch.linalg.inv(information), rtol=1e-6, atol=1e-8)
+
+
+def test_normalised_errors_lie_in_the_chi_square_band():
+    """NEES of 15 states over 100 cars, errors drawn from what the filter is told; with a 20 s outage."""
+    batch = hidden(scene(100, 60, seed=1), 30, 50)
+    estimator = Watched(IMU)
+    solution = integrate(batch, estimator)
+    e = errors(batch, solution)
+    for t in (5, 20, 29, 40, 49, 59):
+        P = estimator.seen[t]
+        nees = (e[:, t].unsqueeze(-1) * torch.linalg.solve(P, e[:, t].unsqueeze(-1))).sum()
+        low, high = chi2.ppf([0.001, 0.999], 15 * 100)
+        # second-order effects of a 5° heading error widen the band a little
+        assert 0.93 * low < float(nees) < 1.10 * high, t
+        assert torch.linalg.eigvalsh(P).min() > 0 and (P - P.mT).abs().max() == 0
+
+
+def test_filter_finds_the_biases_and_beats_pure_inertial():
+    batch = hidden(scene(20, 90, seed=2), 60, 90)
+    filtered, inertial = integrate(batch, Mbkf15(IMU)), integrate(batch, Ins())
+    before = (batch.true_imu_error - filtered.imu_error)[:, 59]
+    assert before[:, :3].abs().mean() < 0.03 and before[:, 3:].abs().mean() < 2e-4
+    drift = (filtered.posterior.p_n - batch.truth.p_n)[:, -1].norm(dim=-1)
+    free = (inertial.posterior.p_n - batch.truth.p_n)[:, -1].norm(dim=-1)
+    assert drift.median() < 0.05 * free.median()
+    assert not inertial.posterior.p_n.isnan().any()
+
+
+def test_outage_changes_nothing_but_the_missing_updates():
+    """Hidden fixes are not looked at: the same solution whatever they say."""
+    batch = hidden(scene(3, 30, seed=3), 10, 20)
+    garbage = batch.gnss.clone()
+    garbage[:, 10:20] = 1e6
+    a, b = integrate(batch, Mbkf15(IMU)), integrate(replace(batch, gnss=garbage), Mbkf15(IMU))
+    assert torch.equal(a.posterior.p_n, b.posterior.p_n)
+    assert not a.used[:, 10:20].any() and a.used[:, 20:].all()
+    assert torch.equal(a.prior.p_n[:, 10:20], a.posterior.p_n[:, 10:20])
+
+
+def test_truth_is_never_read():
+    """Every reference field replaced by NaN: the same solution."""
+    batch = scene(2, 20, seed=4)
+    blind = replace(
+        batch,
+        truth=NavState(*(torch.full_like(x, torch.nan) for x in batch.truth)),
+        true_imu_error=torch.full_like(batch.true_imu_error, torch.nan),
+        truth_valid=torch.zeros_like(batch.truth_valid),
+        attitude_valid=torch.zeros_like(batch.attitude_valid),
+    )
+    a, b = integrate(batch, Mbkf15(IMU)), integrate(blind, Mbkf15(IMU))
+    assert torch.equal(a.posterior.p_n, b.posterior.p_n)
+
+
+def test_velocity_component_missing():
+    """A fix without down velocity updates the other five components (comma2k19)."""
+    batch = scene(4, 40, seed=5)
+    valid = batch.gnss_valid.clone()
+    valid[..., 5] = False
+    gnss = batch.gnss.clone()
+    gnss[..., 5] = torch.nan
+    gnss[..., 5] = torch.where(valid[..., 5], gnss[..., 5], torch.zeros_like(gnss[..., 5]))
+    solution = integrate(replace(batch, gnss=gnss, gnss_valid=valid), Mbkf15(IMU))
+    error = (solution.posterior.p_n - batch.truth.p_n)[:, 10:].norm(dim=-1)
+    assert error.mean() < 0.2
+    assert not solution.gain[..., 5].any()
+
+
+def test_lever_arm_is_modelled():
+    """An antenna 2 m off: with the arm the filter is as good as without one, ignoring it costs decimetres."""
+    batch = scene(20, 40, seed=6, lever_arm=(1.0, 0.5, -1.5))
+    good = integrate(batch, Mbkf15(IMU))
+    ignorant = integrate(replace(batch, lever_arm_b=torch.zeros_like(batch.lever_arm_b)), Mbkf15(IMU))
+    plain = scene(20, 40, seed=6)
+    reference = integrate(plain, Mbkf15(IMU))
+
+    def rms(solution, batch):
+        return (solution.posterior.p_n - batch.truth.p_n)[:, 15:].square().sum(-1).mean().sqrt()
+
+    assert rms(good, batch) < 1.5 * rms(reference, plain)
+    assert rms(ignorant, batch) > 5 * rms(good, batch)
+
+
+def test_late_fix_is_compared_at_its_own_time():
+    """A fix 0.3 s before the epoch's end at 12 m/s: 3.6 m off if it were taken for the end."""
+    batch = scene(20, 40, seed=7, noise=False, bias=torch.zeros(20, 6, dtype=torch.float64))
+    shifted = replace(batch, gnss_lag=torch.full_like(batch.gnss_lag, 0.3))
+    # where the car was 0.3 s earlier: run the clean strapdown and read the samples
+    rows, state = [], batch.start
+    for t in range(batch.size[1]):
+        window = strapdown(state, batch.imu[:, t], batch.dt, batch.frame)
+        at = window.before(shifted.gnss_lag[:, t], batch.dt)
+        rows.append(torch.cat((at.p_n, at.v_n), -1))
+        state = window.end
+    shifted = replace(shifted, gnss=torch.stack(rows, 1))
+    solution = integrate(shifted, Mbkf15(IMU))
+    assert (solution.posterior.p_n - batch.truth.p_n).abs().max() < 5e-3  # linear between samples
+
+
+def test_prior_mean_starts_the_bias():
+    batch = scene(5, 5, seed=8, bias=torch.full((5, 6), 0.01, dtype=torch.float64))
+    told = build_filter("mbkf15_prior", IMU, prior_mean=[0.01] * 6, prior_std=[1e-4] * 6)
+    solution = integrate(batch, told)
+    assert (solution.imu_error - 0.01).abs().max() < 1e-3
+    assert (solution.std[:, -1, 9:] < 2e-3).all()
+
+
+@pytest.mark.parametrize("name", MODEL_BASED)
+def test_every_filter_runs_in_float32(name):
+    
+    prior = {"prior_mean": [0.0] * 6, "prior_std": [0.1] * 6} if name == "mbkf15_prior" else {}
+    solution = integrate(scene(2, 10).in_precision(torch.float32), build_filter(name, IMU, **prior))
+    assert solution.posterior.p_n.dtype == torch.float32 and solution.posterior.p_n.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    "arguments,words",
+    [
+        ({"name": "mbkf99"}, "known filters"),
+        ({"name": "mbkf15", "tuning": {"accel_nose": 2.0}}, "accel_noise"),
+        ({"name": "mbkf15", "tuning": {"accel_noise": -1.0}}, "above 0"),
+        ({"name": "mbkf15_prior"}, "prior.mean"),
+        ({"name": "mbkf15_prior", "prior_mean": [0.0], "prior_std": [1.0]}, "6 values"),
+    ],
+)
+def test_mistakes_are_one_clear_line(arguments, words):
+    with pytest.raises(InputError, match=words) as error:
+        build_filter(imu=IMU, **arguments)
+    assert "\n" not in str(error.value)
