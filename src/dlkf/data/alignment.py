@@ -1,0 +1,172 @@
+"""Attitude at every epoch boundary from IMU and GNSS alone: course for yaw, levelling for roll and pitch.
+
+Over a window that ends at the boundary the gyroscopes carry the specific force to the boundary's body axes,
+u_b = mean(C_b(end)b(t) f_b(t)), and GNSS tells the same vector in n, u_n = Δv/Δt − g. With yaw ψ from the
+course, C_nb u_b = u_n is solved for roll and pitch in closed form (Groves sect. 5.6.2, with motion).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dlkf.data.drive import Drive
+from dlkf.data.geodetic import geodetic_from_ecef
+from dlkf.navigation.attitude import prefix_rotations, rotation_from_rpy, rotation_from_vector
+from dlkf.navigation.earth import EARTH_RATE, ned_axes, normal_gravity
+from dlkf.navigation.state import NavState
+
+SIDESLIP_STD = math.radians(1.5)  # course is not heading: sideslip, mounting yaw
+ACCEL_BIAS_STD = 0.1  # m/s²; tilts the level by bias / g
+UNKNOWN_VELOCITY_STD, UNKNOWN_SLOPE_STD = 0.2, 0.05  # m/s and slope of the road, where v_d is not measured
+SPREAD_STD = math.radians(0.5)  # lever arm to the rear axle, vibration
+
+
+@dataclass(frozen=True)
+class AlignConfig:
+    """``min_speed`` [m/s] below which course is no heading; ``window_s`` [s] over which f is levelled."""
+
+    min_speed: float = 2.0
+    window_s: float = 2.0
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """State of the IMU at the N+1 boundaries, where ``ok``; float64, garbage elsewhere.
+
+    ``r_e`` [m], ``v_e`` [m/s] in ECEF, ``C_eb``; ``std`` (9) of position, velocity, attitude in local NED.
+    """
+
+    ok: Bool[Tensor, " rows"]
+    r_e: Float[Tensor, "rows 3"]
+    v_e: Float[Tensor, "rows 3"]
+    C_eb: Float[Tensor, "rows 3 3"]
+    std: Float[Tensor, "rows 9"]
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a filter starts on a drive: epoch ``first``, tangent origin [rad, rad, m], state there (one
+    element, float64, in the tangent frame of that origin) and its 1σ (9)."""
+
+    first: int
+    lat: float
+    lon: float
+    height: float
+    state: NavState
+    std: Float[Tensor, " 9"]
+
+
+def align_boundaries(drive: Drive, config: AlignConfig = AlignConfig()) -> Aligned:
+    """Align at every boundary that has a fix with velocity faster than ``min_speed`` and one a window before.
+
+    A source without any velocity has it taken from three successive positions. Reads no reference.
+    """
+    rows = drive.epochs + 1
+    back = max(1, round(config.window_s / drive.epoch_s))
+    lat, lon, height = geodetic_from_ecef(torch.nan_to_num(drive.gnss_r_e, nan=1e6))
+    C_en = ned_axes(lat, lon)
+    position = drive.gnss_valid[:, :3].all(-1)
+    v_n, v_std, moving = _velocity(drive, C_en, position)
+
+    then = torch.arange(rows) - back
+    ok = position & moving & (then >= 0)
+    then = then.clamp_min(0)
+    ok &= moving[then]
+    span = back * drive.epoch_s - drive.gnss_lag + drive.gnss_lag[then]
+    ok &= span > 0.5 * drive.epoch_s
+    span = span.clamp_min(0.5 * drive.epoch_s)
+
+    u_b, rate_b, turned = _carried_force(drive, back)
+    # velocity of the IMU in n at both ends: the antenna's less the swing of the lever arm
+    swing_b = torch.linalg.cross(rate_b, drive.lever_arm_b.expand_as(rate_b))
+    speed = v_n[:, :2].norm(dim=-1)
+    slip = torch.asin((swing_b[:, 1] / speed.clamp_min(0.1)).clamp(-0.9, 0.9))
+    yaw = torch.atan2(v_n[:, 1], v_n[:, 0]) - slip + drive.gnss_lag * rate_b[:, 2]
+    C_level = rotation_from_rpy(torch.stack((torch.zeros_like(yaw), torch.zeros_like(yaw), yaw), -1))
+    v_imu = v_n - (C_level @ swing_b.unsqueeze(-1)).squeeze(-1)
+    swing_then = torch.linalg.cross(rate_b[then], drive.lever_arm_b.expand_as(rate_b))
+    v_then = v_n[then] - (C_level @ turned @ swing_then.unsqueeze(-1)).squeeze(-1)
+    acceleration = (v_imu - v_then) / span.unsqueeze(-1)
+    gravity = torch.stack((0 * lat, 0 * lat, normal_gravity(torch.sin(lat), height)), -1)
+    earth_n = EARTH_RATE * torch.stack((torch.cos(lat), 0 * lat, -torch.sin(lat)), -1)
+    u_n = acceleration + 2 * torch.linalg.cross(earth_n, (v_imu + v_then) / 2) - gravity
+    roll, pitch = _level(u_b, (C_level.mT @ u_n.unsqueeze(-1)).squeeze(-1))
+    C_nb = rotation_from_rpy(torch.stack((roll, pitch, yaw), -1))
+    now = v_imu + drive.gnss_lag.unsqueeze(-1) * acceleration
+    r_e = drive.gnss_r_e + (C_en @ (drive.gnss_lag.unsqueeze(-1) * v_n).unsqueeze(-1)).squeeze(-1)
+    r_e = r_e - (C_en @ C_nb @ drive.lever_arm_b).reshape(rows, 3)
+
+    noise = v_std[:, :2].amax(-1)
+    tilt = torch.sqrt((ACCEL_BIAS_STD / 9.8) ** 2 + (1.41 * noise / (9.8 * span)) ** 2 + SPREAD_STD**2)
+    heading = torch.sqrt(SIDESLIP_STD**2 + (noise / speed.clamp_min(0.1)) ** 2)
+    attitude_std = torch.stack((tilt, tilt, heading), -1)
+    std = torch.cat((drive.gnss_std[:, :3], v_std, attitude_std), -1)
+    C_eb = C_en @ C_nb
+    finite = torch.cat((r_e, now, C_eb.flatten(1), std), -1).isfinite().all(-1)
+    ok &= (speed > config.min_speed) & finite
+    return Aligned(ok, r_e, (C_en @ now.unsqueeze(-1)).squeeze(-1), C_eb, std)
+
+
+def _velocity(
+    drive: Drive, C_en: Float[Tensor, "rows 3 3"], position: Bool[Tensor, " rows"]
+) -> tuple[Float[Tensor, "rows 3"], Float[Tensor, "rows 3"], Bool[Tensor, " rows"]]:
+    """Antenna velocity in n with std, and where its horizontal part is known; unknown down velocity is zero."""
+    known = drive.gnss_valid[:, 3:]
+    if bool(known[:, :2].any()):
+        v_n = (C_en.mT @ drive.gnss_v_e.unsqueeze(-1)).squeeze(-1)
+        v_n = torch.where(known, v_n, torch.zeros_like(v_n))
+        guess = UNKNOWN_VELOCITY_STD + UNKNOWN_SLOPE_STD * v_n[:, :2].norm(dim=-1, keepdim=True)
+        return v_n, torch.where(known, drive.gnss_std[:, 3:], guess), known[:, :2].all(-1)
+    r, h = drive.gnss_r_e, drive.epoch_s
+    v_e = torch.full_like(r, torch.nan)
+    v_e[2:] = (3 * r[2:] - 4 * r[1:-1] + r[:-2]) / (2 * h)  # backward difference, second order
+    v_n = torch.nan_to_num((C_en.mT @ v_e.unsqueeze(-1)).squeeze(-1))
+    usable = position & position.roll(1) & position.roll(2) & (drive.gnss_lag == 0)
+    usable[:2] = False
+    usable &= (drive.gnss_lag.roll(1) == 0) & (drive.gnss_lag.roll(2) == 0)
+    return v_n, drive.gnss_std[:, :3] * (math.sqrt(26) / (2 * h)), usable
+
+
+def _carried_force(
+    drive: Drive, back: int
+) -> tuple[Float[Tensor, "rows 3"], Float[Tensor, "rows 3"], Float[Tensor, "rows 3 3"]]:
+    """Mean specific force of the ``back`` epochs before each boundary in the boundary's body axes.
+
+    Also the rate there (mean of the last 0.2 s) and C_b(boundary)b(window's start). Rows < ``back`` repeat.
+    """
+    imu = drive.imu.double()
+    N, M = imu.shape[:2]
+    back = min(back, N)
+    phi = imu[..., 3:] / drive.rate_hz
+    to_start = prefix_rotations(phi.permute(2, 0, 1)).permute(2, 3, 0, 1)  # C_b(epoch start)b(end of sample)
+    identity = torch.eye(3, dtype=torch.float64).expand(N, 1, 3, 3)
+    middle = torch.cat((identity, to_start[:, :-1]), 1) @ rotation_from_vector(0.5 * phi)
+    force = (middle @ imu[..., :3, None])[..., 0].sum(1)  # per epoch, axes of its start
+    to_end = to_start[:, -1].mT
+    total = torch.zeros(N + 1 - back, 3, dtype=torch.float64)
+    turned = torch.eye(3, dtype=torch.float64).expand(N + 1 - back, 3, 3)
+    for j in range(back):  # epochs of the window, latest first
+        epoch = slice(back - 1 - j, N - j)
+        turned = turned @ to_end[epoch]
+        total = total + (turned @ force[epoch, :, None])[..., 0]
+    tail = max(1, min(M, round(0.2 * drive.rate_hz)))
+    rate = torch.cat((imu[:1, :tail, 3:], imu[:, -tail:, 3:])).mean(1)
+    total = torch.cat((total[:1].expand(back, 3), total)) / (back * M)
+    turned = torch.cat((turned[:1].expand(back, 3, 3), turned))
+    return total, rate, turned
+
+
+def _level(
+    u_b: Float[Tensor, "rows 3"], u_h: Float[Tensor, "rows 3"]
+) -> tuple[Float[Tensor, " rows"], Float[Tensor, " rows"]]:
+    """Roll and pitch with Ry(pitch) Rx(roll) u_b = u_h, u_h in level axes along the heading."""
+    x, y, z = u_b.unbind(-1)
+    roll = torch.asin((u_h[:, 1] / torch.hypot(y, z)).clamp(-1, 1)) - torch.atan2(y, -z)
+    down = torch.sin(roll) * y + torch.cos(roll) * z
+    pitch = torch.atan2(x, -down) - torch.asin((u_h[:, 0] / torch.hypot(x, down)).clamp(-1, 1))
+    return roll, pitch
