@@ -81,7 +81,8 @@ def possible_starts(
 
     The reference must be valid at the start and at ``min_valid`` of the boundaries after it, and a whole start
     state known, from the reference or, unless ``attitude`` asks for true attitude, from IMU and GNSS. With
-    ``span`` (a label per boundary) a piece must stay inside one span; −1 belongs to none.
+    ``span`` (a label per boundary, that of the epoch it begins) a piece must stay inside one span; −1 belongs
+    to none.
     """
     stack = stacked(drives)
     truth = stack.start_from_truth
@@ -96,7 +97,7 @@ def possible_starts(
     last = last.clamp(max=rows - 1)
     ok = inside & start & (bad[last + 1] - bad[row + 1] <= (1 - min_valid) * epochs + 1e-9)
     if span is not None:
-        ok &= (span >= 0) & (span == span[last])
+        ok &= (span >= 0) & (span == span[(last - 1).clamp_min(0)])
     return ok
 
 
@@ -257,6 +258,20 @@ def _assemble(
         drive=tuple(stack[d].name for d in drive.tolist()),
         t_start=stack.t0[drive] + first * stack.epoch_s,
     )
+
+
+def select(batch: Batch, index: Int[Tensor, " b"]) -> Batch:
+    """Some pieces of a batch."""
+    part = {}
+    for f in fields(batch):
+        value = getattr(batch, f.name)
+        if isinstance(value, NavState):
+            part[f.name] = NavState(*(x[index] for x in value))
+        elif isinstance(value, (Tensor, TangentFrame)):
+            part[f.name] = value[index]
+        elif isinstance(value, tuple):
+            part[f.name] = tuple(value[i] for i in index.tolist())
+    return replace(batch, **part)
 
 
 def inject_outage(batch: Batch, start_s: float, duration_s: float) -> Batch:

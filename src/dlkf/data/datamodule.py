@@ -1,0 +1,294 @@
+"""Drives as training, validation and test batches for Lightning; everything in memory, no worker processes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import numpy as np
+import torch
+
+from dlkf.data.augmentation import inject_bias, turn_frames
+from dlkf.data.drive import Batch, Drive
+from dlkf.data.segments import (
+    Piece,
+    StartLaw,
+    cut_pieces,
+    epochs_of,
+    inject_outage,
+    make_batch,
+    pieces_at,
+    possible_starts,
+    select,
+)
+from dlkf.data.splits import SIDES, Split, split_rows
+from dlkf.data.stack import DriveStack
+from dlkf.data.store import load_dataset
+from dlkf.errors import InputError
+
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+
+
+class DriveDataModule(L.LightningDataModule):
+    """Pieces of any number of datasets, split by recording (checklist 4.8), as :class:`Batch` objects.
+
+    Training: in every epoch pieces of ``train_length_s`` (or ``length_law(epoch)`` where a curriculum sets
+    that attribute) start at random, spread evenly over the training drives, with a start error drawn from
+    ``start``. Batches depend on (seed, epoch, step) alone, so a resumed run sees what an uninterrupted one
+    sees; with several processes each takes its share of every batch. Validation and test pieces of
+    ``eval_length_s`` every ``eval_stride_s`` are fixed by ``seed``; ``eval_outage`` = (start_s, duration_s)
+    withholds GNSS there. Lengths that change need ``Trainer(reload_dataloaders_every_n_epochs=1)``.
+
+    Groups of the same name in several datasets count as one recording. ``split`` and ``fractions`` as in
+    :func:`dlkf.data.splits.split_rows`; ``turn_frames`` and ``bias_injection`` = (m/s², °/s) augment training.
+    """
+
+    def __init__(
+        self,
+        datasets: Sequence[str | Path] | str | Path,
+        *,
+        rate_hz: float = 50.0,
+        epoch_s: float = 1.0,
+        dtype: str = "float32",
+        split: Split = "group",
+        fractions: Sequence[float] = (0.7, 0.15, 0.15),
+        batch_size: int = 50,
+        train_length_s: float = 60.0,
+        eval_length_s: float = 60.0,
+        eval_stride_s: float | None = None,
+        eval_outage: Sequence[float] | None = None,
+        min_valid: float = 1.0,
+        start: StartLaw | Mapping[str, float] | None = None,
+        turn_frames: bool = False,
+        bias_injection: Sequence[float] | None = None,
+        seed: int = 0,
+        split_seed: int = 0,
+        progress: Callable[[str, int, int], None] | None = None,
+    ) -> None:
+        super().__init__()
+        if dtype not in DTYPES:
+            raise InputError(f"dtype={dtype}: must be {' or '.join(DTYPES)}")
+        if batch_size < 1:
+            raise InputError(f"batch_size={batch_size}: must be ≥ 1")
+        self.datasets = [str(d) for d in ([datasets] if isinstance(datasets, (str, Path)) else datasets)]
+        self.rate_hz, self.epoch_s, self.dtype = rate_hz, epoch_s, DTYPES[dtype]
+        self.split, self.fractions = split, tuple(fractions)
+        self.batch_size, self.train_length_s = batch_size, train_length_s
+        self.eval_length_s, self.eval_stride_s, self.min_valid = eval_length_s, eval_stride_s, min_valid
+        self.eval_outage = _pair(eval_outage, "eval_outage")
+        self.bias_injection = _pair(bias_injection, "bias_injection")
+        self.start, self.turn_frames = StartLaw.of(start), turn_frames
+        self.seed, self.split_seed, self.progress = seed, split_seed, progress
+        self.length_law: Callable[[int], float] | None = None
+        self._starts: dict[int, torch.Tensor] = {}
+        self._latest: tuple[int, int, list[list[Piece]]] = (-1, -1, [])
+
+    def setup(self, stage: str | None = None) -> None:
+        """Load, stack and split the drives; does nothing when that is done."""
+        if hasattr(self, "stack"):
+            return
+        drives: list[Drive] = []
+        for folder in self.datasets:
+            drives += load_dataset(
+                folder, rate_hz=self.rate_hz, epoch_s=self.epoch_s, dtype=self.dtype, progress=self.progress
+            )
+        self.stack = DriveStack(drives)
+        self.spans = split_rows(self.stack, self.split, self.fractions, self.split_seed, self.eval_length_s)
+
+    def drives(self, side: str) -> list[Drive]:
+        """The drives that have something on a side (``train``, ``val``, ``test``)."""
+        self.setup()
+        spans = self.spans[side]
+        ends = zip(self.stack.first_row.tolist(), self.stack.epochs.tolist())
+        return [d for d, (row, n) in zip(self.stack, ends) if bool((spans[row : row + n] >= 0).any())]
+
+    def length_s(self, epoch: int) -> float:
+        """Length of the training pieces in an epoch [s]."""
+        return self.train_length_s if self.length_law is None else self.length_law(epoch)
+
+    def train_pieces(self, epoch: int) -> list[list[Piece]]:
+        """The pieces of an epoch, batch by batch: one start drawn from each of as many equal parts of all
+        possible starts as pieces fit into the training time, in random order."""
+        self.setup()
+        length = epochs_of(self.length_s(epoch), self.epoch_s)
+        if self._latest[:2] == (epoch, length):
+            return self._latest[2]
+        if length not in self._starts:
+            allowed = possible_starts(self.stack, length, min_valid=self.min_valid, span=self.spans["train"])
+            self._starts[length] = torch.nonzero(allowed).flatten()
+        starts = self._starts[length]
+        if not len(starts):
+            raise InputError(
+                f"no training piece of {length * self.epoch_s:g} s: the drives are shorter or not valid that "
+                "long; choose a shorter data.train_length_s"
+            )
+        change = torch.zeros(len(self.spans["train"]) + 1, dtype=torch.int64)
+        change[starts] += 1
+        change[starts + length] -= 1
+        count = max(1, int((change.cumsum(0) > 0).sum()) // length)  # epochs that some piece covers
+        rng = np.random.default_rng((self.seed, epoch))
+        part = (np.arange(count) + rng.random(count)) / count
+        rows = starts[torch.from_numpy((part * len(starts)).astype(np.int64))]
+        pieces = pieces_at(self.stack, rows[torch.from_numpy(rng.permutation(count))], length)
+        batches = [pieces[k : k + self.batch_size] for k in range(0, count, self.batch_size)]
+        self._latest = (epoch, length, batches)
+        return batches
+
+    def train_batch(self, epoch: int, step: int, share: tuple[int, int] = (0, 1)) -> Batch:
+        """The batch of a training step; ``share`` = (k, n) gives every n-th piece from k on, as many as others."""
+        generator = torch.Generator().manual_seed(_seed(self.seed, epoch, step))
+        pieces = self.train_pieces(epoch)[step]
+        batch = make_batch(self.stack, pieces, dtype=self.dtype, start=self.start, generator=generator)
+        if self.turn_frames:
+            batch = turn_frames(batch, generator)
+        if self.bias_injection is not None:
+            batch = inject_bias(batch, *self.bias_injection, generator)
+        k, n = share
+        return batch if n == 1 else select(batch, torch.arange(k, len(pieces) // n * n, n))
+
+    def pieces(self, side: str) -> list[Piece]:
+        """The fixed pieces of a side, for scoring."""
+        self.setup()
+        pieces = cut_pieces(
+            self.stack, self.eval_length_s, self.eval_stride_s, min_valid=self.min_valid, span=self.spans[side]
+        )
+        if not pieces:
+            raise InputError(
+                f"no {side} piece of {self.eval_length_s:g} s: its drives are shorter or not valid that long; choose a "
+                "shorter data.eval_length_s or another split"
+            )
+        return pieces
+
+    def batches(self, side: str, *, dtype: torch.dtype | None = None) -> list[Batch]:
+        """The fixed batches of a side, with the same start errors for every filter and in every run."""
+        pieces, out = self.pieces(side), []
+        for step, k in enumerate(range(0, len(pieces), self.batch_size)):
+            generator = torch.Generator().manual_seed(_seed(self.seed, SIDES.index(side), step, 1))
+            part = pieces[k : k + self.batch_size]
+            batch = make_batch(
+                self.stack, part, dtype=dtype or self.dtype, start=self.start, generator=generator
+            )
+            out.append(batch if self.eval_outage is None else inject_outage(batch, *self.eval_outage))
+        return out
+
+    def train_dataloader(self) -> TrainBatches:
+        """Batches of the epoch that the trainer is in."""
+        return TrainBatches(self)
+
+    def val_dataloader(self) -> FixedBatches | list:
+        """Validation batches; no loader where the split has no validation side."""
+        return self._fixed("val") if self.drives("val") else []
+
+    def test_dataloader(self) -> FixedBatches:
+        """Test batches."""
+        return self._fixed("test")
+
+    def _fixed(self, side: str) -> FixedBatches:
+        return FixedBatches(self.batches(side)[self._rank :: self._world])
+
+    def summary(self) -> list[dict[str, Any]]:
+        """Per side: drives, groups, minutes of driving, and pieces for scoring."""
+        table = []
+        for side in SIDES:
+            drives, span = self.drives(side), self.spans[side]
+            pieces = cut_pieces(
+                self.stack, self.eval_length_s, self.eval_stride_s, min_valid=self.min_valid, span=span
+            )
+            ends = self.stack.first_row + self.stack.epochs  # the last boundary begins no epoch
+            epochs = int((span >= 0).sum() - (span[ends] >= 0).sum())
+            table.append(
+                {
+                    "split": side,
+                    "drives": len(drives),
+                    "groups": len({d.group for d in drives}),
+                    "minutes": round(epochs * self.epoch_s / 60, 1),
+                    "pieces": len(pieces),
+                }
+            )
+        return table
+
+    def describe(self) -> str:
+        """The summary as a small table."""
+        rows = self.summary()
+        lines = ["split   drives  groups  minutes  pieces"]
+        for r in rows:
+            lines.append(
+                f"{r['split']:<6} {r['drives']:>7} {r['groups']:>7} {r['minutes']:>8.1f} {r['pieces']:>7}"
+            )
+        return "\n".join(lines)
+
+    @property
+    def _rank(self) -> int:
+        return self.trainer.global_rank if self.trainer is not None else 0
+
+    @property
+    def _world(self) -> int:
+        return self.trainer.world_size if self.trainer is not None else 1
+
+
+class TrainBatches:
+    """The training batches of the epoch that the trainer is in, one pass; its state resumes inside an epoch."""
+
+    def __init__(self, module: DriveDataModule) -> None:
+        self.module = module
+        self.step = 0
+        self._resume: tuple[int, int] | None = None
+
+    @property
+    def epoch(self) -> int:
+        """The trainer's epoch; 0 outside a trainer."""
+        return self.module.trainer.current_epoch if self.module.trainer is not None else 0
+
+    def _steps(self, epoch: int) -> int:
+        world = self.module._world
+        return sum(len(batch) >= world for batch in self.module.train_pieces(epoch))
+
+    def __len__(self) -> int:
+        return self._steps(self.epoch)
+
+    def __iter__(self) -> Iterator[Batch]:
+        epoch, self.step = self.epoch, 0
+        if self._resume is not None and self._resume[0] == epoch:
+            self.step = self._resume[1]
+        self._resume = None
+        share = (self.module._rank, self.module._world)
+        while self.step < self._steps(epoch):
+            self.step += 1
+            yield self.module.train_batch(epoch, self.step - 1, share)
+
+    def state_dict(self) -> dict[str, int]:
+        """Epoch and number of batches given out."""
+        return {"epoch": self.epoch, "step": self.step}
+
+    def load_state_dict(self, state: Mapping[str, int]) -> None:
+        """Go on in that epoch after that many batches."""
+        self._resume = (state["epoch"], state["step"])
+
+
+class FixedBatches:
+    """A loader that gives the same batches in every pass (Lightning would take a list for several loaders)."""
+
+    def __init__(self, batches: Sequence[Batch]) -> None:
+        self.batches = batches
+
+    def __len__(self) -> int:
+        return len(self.batches)
+
+    def __iter__(self) -> Iterator[Batch]:
+        return iter(self.batches)
+
+
+def _pair(values: Sequence[float] | None, name: str) -> tuple[float, float] | None:
+    if values is None:
+        return None
+    pair = tuple(float(v) for v in values)
+    if len(pair) != 2:
+        raise InputError(f"{name}={list(values)}: must be two numbers or null")
+    return pair
+
+
+def _seed(*numbers: int) -> int:
+    """One seed from several numbers, the same on every machine."""
+    return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0]) >> 1
