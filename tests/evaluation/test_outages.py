@@ -66,7 +66,7 @@ def test_one_bad_outage_of_several_leaves_the_others(cars):
         {"duration_s": [30, 10]},
         {"first_s": -1},
         {"every_s": 60, "duration_s": 60},
-        {"offsets_s": []},
+        {"offsets_s": [-5]},
     ],
 )
 def test_impossible_schedules_are_refused(settings):

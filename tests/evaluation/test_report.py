@@ -76,9 +76,11 @@ def test_missing_attitude_is_a_dash_and_a_broken_filter_infinite(cars):
     r = results(scores, resamples=50)
     (whole,) = tables("town", r)
     column = {c: i for i, c in enumerate(whole.columns)}
-    assert all(row[column["Attitude [°]"]] == "–" and row[column["Heading [°]"]] == "–" for row in whole.rows)
-    assert whole.rows[0][column["3D pos. [m]"]] == "∞" and whole.rows[0][column["not finite"]] == "1"
-    assert float(whole.rows[1][column["3D pos. [m]"]]) < 1
+    assert all(
+        row[column["Attitude\n[°]"]] == "–" and row[column["Heading\n[°]"]] == "–" for row in whole.rows
+    )
+    assert whole.rows[0][column["3D\n[m]"]] == "∞" and whole.rows[0][column["Not\nfinite"]] == "1 piece"
+    assert float(whole.rows[1][column["3D\n[m]"]]) < 1
     assert json.loads(as_json(r))["filters"]["ins"]["pieces"]["position"]["all"]["rms"] == "inf"
 
 

@@ -9,8 +9,8 @@ import torch
 
 from dlkf.errors import InputError
 from dlkf.evaluation.chunks import chunks, take
-from dlkf.evaluation.imu_slope import injected_slope
-from dlkf.evaluation.metrics import magnitudes, rms_over_pieces
+from dlkf.evaluation.imu_slope import injected_response
+from dlkf.evaluation.metrics import magnitudes, rms_over_pieces, slope
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.run import score
 from dlkf.filters.build import build_filter
@@ -40,7 +40,7 @@ def test_chunked_equals_whole_with_pieces_of_different_length(cars):
         np.isnan(whole.filters["ins"].error[4, 12:]).all()
         and np.isfinite(whole.filters["ins"].error[4, :12]).all()
     )
-    assert len(seen) > 2 * len(FILTERS) and seen[-1] == ("mbkf15", 6, 6)
+    assert len(seen) > 2 * len(FILTERS) and seen[-1] == (12, 12)
 
 
 def test_chunks_cover_every_piece_once_and_drop_the_padding(cars):
@@ -106,7 +106,9 @@ def test_float32_agrees_with_float64(cars):
 
 def test_a_kalman_filter_follows_an_injected_bias_and_pure_inertial_does_not(cars):
     base = score(FILTERS, [cars])
-    slopes = injected_slope(base, FILTERS, [cars], accel=0.03, gyro=1e-3, seed=4)
+    no_outage = torch.zeros(cars.size[:2], dtype=torch.bool)
+    cause, followed = injected_response(base, FILTERS, [(cars, no_outage)], accel=0.03, gyro=1e-3, seed=4)
+    slopes = {name: slope(x, cause, intercept=False) for name, x in followed.items()}
     assert np.allclose(slopes["ins"], 0.0)
     assert np.allclose(slopes["mbkf15"][[2, 3, 4]], 1.0, atol=0.05)  # down and level rates: always seen
     assert np.all(slopes["mbkf15"] > 0.5)  # level accelerations and yaw rate need turns

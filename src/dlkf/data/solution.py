@@ -3,7 +3,8 @@
 One row per epoch. ``t`` [s] is the drive's own clock; position is geodetic (WGS-84), velocity and attitude
 are in true local NED at the vehicle; ``accel_error``, ``gyro_error`` [m/s², rad/s] are what the filter takes
 off the IMU, body axes; ``std_*`` are 1σ: ``std_pos_n|e|d`` [m], ``std_vel_n|e|d`` [m/s],
-``std_roll|pitch|yaw`` [rad], and of the IMU errors. ``gnss_used``: a fix corrected this row. NaN where the filter has no value.
+``std_roll|pitch|yaw`` [rad], and of the IMU errors. ``gnss_used``: a fix corrected this row. NaN where the
+filter has no value.
 """
 
 from __future__ import annotations
@@ -12,11 +13,11 @@ from pathlib import Path
 
 import pandas as pd
 import pyarrow as pa
-import pymap3d
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dlkf.data.geodetic import geodetic_from_ecef
 from dlkf.data.schema import write_parquet
 from dlkf.navigation.attitude import rotation_from_rpy, rpy_from_rotation
 from dlkf.navigation.earth import TangentFrame, ned_axes
@@ -55,9 +56,7 @@ def solution_table(
     δh = J δ(roll, pitch, yaw), J = [Rz Ry e₁, Rz e₂, e₃].
     """
     state = NavState(*(x.detach().cpu().double() for x in state))
-    r_e = frame.to_ecef(state.p_n.unsqueeze(0))[0].cpu()
-    lat, lon, height = pymap3d.ecef2geodetic(*(x.numpy() for x in r_e.unbind(-1)), deg=False)
-    lat, lon, height = (torch.as_tensor(x).reshape(len(r_e)) for x in (lat, lon, height))  # pymap3d drops a 1
+    lat, lon, height = geodetic_from_ecef(frame.to_ecef(state.p_n.unsqueeze(0))[0])
     C_ln = ned_axes(lat, lon).mT @ frame.C_en[0].cpu().double()
     rpy = rpy_from_rotation(C_ln @ state.C_nb)
     columns = {"t": t.double(), "lat_deg": torch.rad2deg(lat), "lon_deg": torch.rad2deg(lon)}

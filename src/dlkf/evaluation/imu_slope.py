@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from dlkf.data.drive import Batch
-from dlkf.evaluation.metrics import Array, slope
+from dlkf.evaluation.metrics import Array
 from dlkf.evaluation.results import last_known
-from dlkf.evaluation.run import score
+from dlkf.evaluation.run import Scene, score_scenes
 from dlkf.evaluation.scores import Scores
 from dlkf.filters.integration import Estimator
 
@@ -26,30 +25,35 @@ def injected(batch: Batch, bias: Tensor) -> Batch:
     )
 
 
-def injected_slope(
+def injected_response(
     base: Scores,
     filters: Mapping[str, Estimator],
-    batches: Sequence[Batch],
+    scenes: Iterable[Scene],
     *,
     accel: float,
     gyro: float,
-    outages: Sequence[Tensor] | None = None,
     seed: int = 0,
-) -> dict[str, Array]:
-    """Slope (6,) per filter of the change of its last estimate against a bias injected into every piece.
+    total: int | None = None,
+    progress: Callable[[int, int | None], None] | None = None,
+) -> tuple[Array, dict[str, Array]]:
+    """A bias injected into every piece (P, 6), and how far each filter's last estimate followed it (P, 6).
 
     The bias is drawn per piece from N(0, accel²) [m/s²] and N(0, gyro²) [rad/s]; ``base`` are the scores of
-    the same filters, batches and outages without it. Works on real drives, whose IMU error nobody knows.
+    the same filters and scenes without it. Works on real drives, whose IMU error nobody knows. The slope of
+    the second against the first (metrics.slope) is 1 for an estimator, 0 for a memoriser.
     """
     generator = torch.Generator().manual_seed(seed)
     sigma = torch.tensor([accel] * 3 + [gyro] * 3, dtype=torch.float64)
-    biases = [sigma * torch.randn(b.size[0], 6, generator=generator, dtype=torch.float64) for b in batches]
-    shifted = [injected(b, bias) for b, bias in zip(batches, biases, strict=True)]
-    scores = score(filters, shifted, outages=outages)
-    cause = np.concatenate([b.numpy() for b in biases])
-    return {
-        name: slope(
-            last_known(run.imu_error) - last_known(base.filters[name].imu_error), cause, intercept=False
-        )
+    drawn: list[Tensor] = []
+
+    def shifted() -> Iterator[Scene]:
+        for batch, mask in scenes:
+            drawn.append(sigma * torch.randn(batch.size[0], 6, generator=generator, dtype=torch.float64))
+            yield injected(batch, drawn[-1]), mask
+
+    scores = score_scenes(filters, shifted(), total=total, progress=progress)
+    followed = {
+        name: last_known(run.imu_error) - last_known(base.filters[name].imu_error)
         for name, run in scores.filters.items()
     }
+    return torch.cat(drawn).numpy(), followed

@@ -11,11 +11,11 @@ import warnings
 from typing import NamedTuple
 
 import numpy as np
-import pymap3d
 import torch
 from numpy.typing import NDArray
 
 from dlkf.data.drive import Batch
+from dlkf.data.geodetic import geodetic_from_ecef
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.state import NavState
 
@@ -35,10 +35,8 @@ QUANTITIES: dict[str, str] = {
 
 def local_axes(batch: Batch) -> torch.Tensor:
     """C_ln (B, T, 3, 3, float64): rotates the tangent frame n to true local NED at the true position."""
-    x, y, z = batch.frame.to_ecef(batch.truth.p_n.double()).cpu().unbind(-1)
-    lat, lon, _ = pymap3d.ecef2geodetic(x.numpy(), y.numpy(), z.numpy(), deg=False)
-    C_el = ned_axes(*(torch.as_tensor(u).reshape(x.shape) for u in (lat, lon)))  # pymap3d drops axes of 1
-    return C_el.mT @ batch.frame.C_en.cpu().double().unsqueeze(1)
+    lat, lon, _ = geodetic_from_ecef(batch.frame.to_ecef(batch.truth.p_n.double()))
+    return ned_axes(lat, lon).mT @ batch.frame.C_en.cpu().double().unsqueeze(1)
 
 
 def error_series(batch: Batch, state: NavState) -> Array:

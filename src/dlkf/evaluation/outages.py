@@ -25,20 +25,21 @@ class OutagePlan:
 
     ``first_s`` and ``duration_s`` are numbers, or (low, high): drawn for each piece, uniformly, in whole
     epochs. ``every_s`` repeats the outage to the end of the piece (None: one outage). Each of ``offsets_s``
-    gives one run over the same pieces with the whole schedule shifted, so that the windows cover a drive.
+    gives one run over the same pieces with the whole schedule shifted, so that the windows cover a drive
+    (none: one run, not shifted).
     """
 
     first_s: float | Sequence[float] = 60.0
     duration_s: float | Sequence[float] = 60.0
     every_s: float | None = None
-    offsets_s: Sequence[float] = (0.0,)
+    offsets_s: Sequence[float] = ()
 
     def __post_init__(self) -> None:
         low, high = _bounds("outage.duration_s", self.duration_s)
         _bounds("outage.first_s", self.first_s)
         if low <= 0:
             raise InputError(f"outage.duration_s is {low:g} s, must be above 0")
-        if not self.offsets_s or min(self.offsets_s) < 0:
+        if min(self.offsets_s, default=0.0) < 0:
             raise InputError("outage.offsets_s must be a list of numbers ≥ 0, such as [0]")
         if self.every_s is not None and self.every_s <= high:
             raise InputError(
@@ -54,7 +55,7 @@ class OutagePlan:
         duration = _drawn(self.duration_s, B, epoch_s, generator)
         repeats = 1 if self.every_s is None else max(1, int(T * epoch_s / self.every_s) + 1)
         out = []
-        for offset in self.offsets_s:
+        for offset in self.offsets_s or (0.0,):
             mask = torch.zeros(B, T, dtype=torch.bool)
             for k in range(repeats):
                 start = first + offset + k * (self.every_s or 0.0)

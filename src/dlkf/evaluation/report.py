@@ -110,13 +110,17 @@ def write_report(
     return [Path(out) / name for name in files]
 
 
+def _heading(text: str) -> str:
+    return html.escape(text).replace("\n", "<br>")
+
+
 def report_html(
     dataset: str, parts: Sequence[Table], pictures: Sequence[tuple[str, str, bytes]], protocol: dict[str, Any]
 ) -> str:
     """One self-contained page: tables, figures (PNG inside), and how the scores were made."""
     body = [f"<h1>Evaluation on {html.escape(dataset)}</h1>"]
     for t in parts:
-        head = "".join(f"<th>{html.escape(c)}</th>" for c in t.columns)
+        head = "".join(f"<th>{_heading(c)}</th>" for c in t.columns)
         rows = "".join(
             "<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in t.rows
         )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,72 +19,104 @@ from dlkf.evaluation.scores import FilterRun, Piece, Scores
 from dlkf.filters.integration import Estimator
 from dlkf.navigation.state import IMU, NavState
 
+Scene = tuple[Batch, Tensor]
+
 
 def score(
     filters: Mapping[str, Estimator],
     batches: Sequence[Batch],
     *,
     outages: Sequence[Tensor] | None = None,
+    **options: Any,
+) -> Scores:
+    """Run every filter over the same batches and keep the errors.
+
+    ``outages`` has one mask (B, T) per batch, whose fixes are withheld from every filter. Options as in
+    :func:`score_scenes`.
+    """
+    masks = [torch.zeros(b.size[:2], dtype=torch.bool) for b in batches] if outages is None else outages
+    total = sum(b.size[0] for b in batches)
+    return score_scenes(filters, zip(batches, masks, strict=True), total=total, **options)
+
+
+def score_scenes(
+    filters: Mapping[str, Estimator],
+    scenes: Iterable[Scene],
+    *,
+    total: int | None = None,
     groups: Mapping[str, str] | None = None,
     kinds: Mapping[str, str] | str = "unknown",
     state: str = "posterior",
     chunk_samples: int = CHUNK_SAMPLES,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Callable[[int, int | None], None] | None = None,
 ) -> Scores:
-    """Run every filter over the same batches and keep the errors.
+    """Run every filter over the same scenes: batches, each with the mask (B, T) of its withheld fixes.
 
-    ``outages`` has one mask (B, T) per batch, whose fixes are withheld from every filter; ``groups`` and
-    ``kinds`` map a drive's name to its recording and its kind. ``state`` is the one that is scored, after
-    (``posterior``) or before (``prior``) the update. ``progress(filter, pieces done, pieces in all)`` is
-    called after each chunk. A filter with parameters of its own runs on their device.
+    ``groups`` and ``kinds`` map a drive's name to its recording and its kind. ``state`` is the one that is
+    scored, after (``posterior``) or before (``prior``) the update. ``progress(done, of all)`` counts
+    a piece once per filter; ``total`` is the number of pieces where it is known. A filter with parameters of
+    its own runs on their device. Scenes are consumed one by one, so they may be cut as they are needed.
+    Raises InputError if there is nothing to score or the epochs differ in length.
     """
-    if not filters or not batches:
-        raise InputError("nothing to score: give at least one filter and one piece of a drive")
-    epoch_s = batches[0].epoch_s
-    if any(abs(b.epoch_s - epoch_s) > 1e-9 for b in batches):
-        raise InputError("the batches to be scored have different epoch lengths; score them one by one")
-    masks = [torch.zeros(b.size[:2], dtype=torch.bool) for b in batches] if outages is None else outages
-    runs: dict[str, list[FilterRun]] = {}
-    total = sum(b.size[0] for b in batches)
-    for name, estimator in filters.items():
+    for estimator in filters.values():
         if isinstance(estimator, torch.nn.Module):
             estimator.eval()
-        done, rows = 0, []
-        for batch, mask in zip(batches, masks, strict=True):
-            blank = _blank(batch)
+    runs: dict[str, list[FilterRun]] = {name: [] for name in filters}
+    truths: list[_Truth] = []
+    done = 0
+    for batch, mask in scenes:
+        truths.append(_Truth.of(batch, mask))
+        if abs(batch.epoch_s - truths[0].epoch_s) > 1e-9:
+            raise InputError("the batches to be scored have different epoch lengths; score them one by one")
+        masked = with_outage(batch, mask)
+        for name, estimator in filters.items():
+            runs[name].append(_blank(batch))
             for index in chunks(batch, chunk_samples):
-                _fill(blank, index, take(with_outage(batch, mask), index), estimator, state)
+                _fill(runs[name][-1], index, take(masked, index), estimator, state)
                 done += len(index)
                 if progress is not None:
-                    progress(name, done, total)
-            rows.append(blank)
-        runs[name] = rows
-    T = max(b.size[1] for b in batches)
+                    progress(done, total and total * len(filters))
+    if not filters or not truths:
+        raise InputError("nothing to score: give at least one filter and one piece of a drive")
+    T = max(x.outage.shape[1] for x in truths)
 
-    def joined(parts: Sequence[Array]) -> Array:
-        return np.concatenate([_padded(x, T) for x in parts])
-
-    def truth(x: Tensor, b: Batch) -> Array:
-        known = (b.truth_valid & b.present).unsqueeze(-1)
-        return torch.where(known, x.double(), torch.nan).cpu().numpy()
+    def joined(rows: Sequence[object], name: str) -> Array:
+        return np.concatenate([_padded(getattr(r, name), T) for r in rows])
 
     kind_of = (lambda d: kinds) if isinstance(kinds, str) else (lambda d: kinds.get(d, "unknown"))
+    origin = [(d, t) for x in truths for d, t in zip(x.drive, x.t_start)]
     return Scores(
-        epoch_s=epoch_s,
-        pieces=[
-            Piece(d, (groups or {}).get(d, d), kind_of(d), float(t))
-            for b in batches
-            for d, t in zip(b.drive, b.t_start)
-        ],
-        outage=joined([m.cpu().numpy().astype(float) for m in masks]) == 1,
-        truth_p_n=joined([truth(b.truth.p_n, b) for b in batches]),
-        truth_v_n=joined([truth(b.truth.v_n, b) for b in batches]),
-        true_imu_error=joined([b.true_imu_error.double().cpu().numpy() for b in batches]),
+        epoch_s=truths[0].epoch_s,
+        pieces=[Piece(d, (groups or {}).get(d, d), kind_of(d), t) for d, t in origin],
+        outage=joined(truths, "outage") == 1,
+        truth_p_n=joined(truths, "p_n"),
+        truth_v_n=joined(truths, "v_n"),
+        true_imu_error=joined(truths, "imu_error"),
         filters={
-            name: FilterRun(**{f.name: joined([getattr(r, f.name) for r in rows]) for f in fields(FilterRun)})
+            name: FilterRun(**{f.name: joined(rows, f.name) for f in fields(FilterRun)})
             for name, rows in runs.items()
         },
     )
+
+
+class _Truth(NamedTuple):
+    """What stays of a scene after its filters ran."""
+
+    epoch_s: float
+    drive: tuple[str, ...]
+    t_start: list[float]
+    outage: Array
+    p_n: Array
+    v_n: Array
+    imu_error: Array
+
+    @staticmethod
+    def of(batch: Batch, mask: Tensor) -> _Truth:
+        known = (batch.truth_valid & batch.present).unsqueeze(-1)
+        p, v = (torch.where(known, x.double(), torch.nan).cpu().numpy() for x in batch.truth[:2])
+        error = batch.true_imu_error.double().cpu().numpy()
+        outage = mask.cpu().numpy().astype(float)
+        return _Truth(batch.epoch_s, batch.drive, batch.t_start.tolist(), outage, p, v, error)
 
 
 def _blank(batch: Batch) -> FilterRun:

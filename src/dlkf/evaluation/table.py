@@ -13,7 +13,9 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from rich.box import SIMPLE_HEAD
 from rich.table import Table as RichTable
+from rich.text import Text
 
 from dlkf.evaluation.metrics import QUANTITIES
 
@@ -21,7 +23,7 @@ DASH = "–"
 
 
 class Table(NamedTuple):
-    """A titled table of text; the first column is the filter."""
+    """A titled table of text; the first column is the filter, a heading may hold a line break."""
 
     title: str
     note: str
@@ -57,8 +59,8 @@ def tables(dataset: str, result: dict[str, Any]) -> list[Table]:
         title=f"{what}: {_count(n['pieces'], 'piece')} of {_count(n['drives'], 'drive')}",
         note="RMS over each piece, then RMS over the pieces; median and 95 % over the pieces.",
         columns=[
-            "Filter", "3D pos. [m]", f"3D {settled} [m]", f"Horiz. {settled} [m]", "median", "95 %",
-            "Velocity [m/s]", "Attitude [°]", "Heading [°]", "not finite",
+            "Filter", "3D\n[m]", f"3D, {settled}\n[m]", f"Horiz., {settled}\n[m]", "median\n[m]", "95 %\n[m]",
+            "Velocity\n[m/s]", "Attitude\n[°]", "Heading\n[°]",
         ],
         rows=[],
     )  # fmt: skip
@@ -70,8 +72,12 @@ def tables(dataset: str, result: dict[str, Any]) -> list[Table]:
             + [number(flat[s]) for s in ("rms", "median", "p95")]
             + [number(p["velocity"]["all"]["rms"])]
             + [number(p[q]["all"]["rms"], 180 / math.pi) for q in ("attitude", "heading")]
-            + [str(p["position"]["all"]["nonfinite"])]
         )
+    broken = [f["pieces"]["position"]["all"]["nonfinite"] for f in result["filters"].values()]
+    if any(broken):
+        whole.columns.append("Not\nfinite")
+        for row, count in zip(whole.rows, broken):
+            row.append(_count(count, "piece"))
     return [whole] if not n["outages"] else [whole, outage_table(what, result)]
 
 
@@ -91,10 +97,10 @@ def outage_table(what: str, result: dict[str, Any]) -> Table:
     table = Table(
         title=f"{what}: {_count(n['outages'], 'outage')} of {length} in {_count(n['drives'], 'drive')}",
         note=note,
-        columns=["Filter", "End RMS [m]", "median", "95 %"]
-        + [f"at {s} s [m]" for s in at]
-        + ["Vel. [m/s]", "Att. [°]", "Drift [%]"]
-        + ([f"vs {against}"] if against else []),
+        columns=["Filter", "End, RMS\n[m]", "median\n[m]", "95 %\n[m]"]
+        + [f"{s} s\n[m]" for s in at]
+        + ["Velocity\n[m/s]", "Attitude\n[°]", "Drift\n[%]"]
+        + ([f"ratio to\n{against}"] if against else []),
         rows=[],
     )
     for name, f in result["filters"].items():
@@ -112,7 +118,7 @@ def outage_table(what: str, result: dict[str, Any]) -> Table:
 
 def slope_table(dataset: str, result: dict[str, Any]) -> Table | None:
     """Slope of the IMU-error estimate against the true or the injected error; None where neither is known."""
-    axes = ["accel x", "accel y", "accel z", "gyro x", "gyro y", "gyro z"]
+    axes = [f"{sensor}\n{axis}" for sensor in ("accel", "gyro") for axis in "xyz"]
     injected = any("injected_slope" in f["imu_error"] for f in result["filters"].values())
     key = "injected_slope" if injected else "slope"
     rows = [
@@ -132,17 +138,18 @@ def slope_table(dataset: str, result: dict[str, Any]) -> Table | None:
 
 def as_rich(table: Table) -> RichTable:
     """For the terminal."""
-    out = RichTable(title=table.title, caption=table.note, title_justify="left", caption_justify="left")
+    out = RichTable(title=Text(table.title), caption=Text(table.note), box=SIMPLE_HEAD, padding=(0, 1))
+    out.title_justify, out.caption_justify, out.title_style = "left", "left", "bold"
     for i, column in enumerate(table.columns):
-        out.add_column(column, justify="right" if i else "left", overflow="fold")
+        out.add_column(Text(column), justify="right" if i else "left", vertical="bottom")
     for row in table.rows:
-        out.add_row(*row)
+        out.add_row(*map(Text, row))  # Text: brackets are units, not markup
     return out
 
 
 def as_markdown(table: Table) -> str:
     """A markdown table under its title."""
-    head = "| " + " | ".join(table.columns) + " |"
+    head = "| " + " | ".join(c.replace("\n", " ") for c in table.columns) + " |"
     rule = "|" + "|".join([":--"] + ["--:"] * (len(table.columns) - 1)) + "|"
     rows = ["| " + " | ".join(row) + " |" for row in table.rows]
     return "\n".join([f"**{table.title}**", "", head, rule, *rows, "", table.note, ""])

@@ -1,0 +1,172 @@
+"""How drives become scenes: pieces from the truth, or whole drives from their own alignment, with outages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import torch
+
+from dlkf.data.alignment import Start
+from dlkf.data.drive import Drive
+from dlkf.data.segments import Piece, StartLaw, cut_pieces, make_batch, whole_drives
+from dlkf.data.stack import DriveStack
+from dlkf.errors import InputError
+from dlkf.evaluation.chunks import CHUNK_SAMPLES
+from dlkf.evaluation.outages import OutagePlan
+from dlkf.evaluation.run import Scene
+from dlkf.filters.start import align
+
+MODES = ("auto", "pieces", "drives")
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """The rules of a comparison, the same for every filter (DESIGN 10).
+
+    ``pieces``: ``length_s`` every ``stride_s`` wherever the truth is valid, from the truth plus an error
+    drawn from ``start``. ``drives``: whole drives from their own alignment, the outage repeated every
+    ``every_s`` (default twice its length) in one run per offset (default 0 and its length: covers the drive).
+    ``auto``: pieces where the truth has attitude and is long enough, else drives.
+    """
+
+    mode: str = "auto"
+    length_s: float = 120.0
+    stride_s: float = 60.0
+    start: StartLaw = field(default_factory=StartLaw)
+    outage: OutagePlan | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.mode not in MODES:
+            raise InputError(f"mode={self.mode} is none of {', '.join(MODES)}")
+        for name in ("length_s", "stride_s"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name}={getattr(self, name)} must be above 0 s")
+
+
+class Scenes:
+    """The scenes of a protocol over some drives; iterating cuts them anew, a bounded part at a time.
+
+    ``mode`` is the one chosen, ``runs`` the number of pieces over all scenes, ``skipped`` the drives that
+    cannot be used and why. Raises InputError where nothing can be scored or no outage fits into the pieces.
+    """
+
+    def __init__(self, drives: Sequence[Drive], protocol: Protocol) -> None:
+        stack = DriveStack(drives)
+        pieces: list[Piece] = []
+        if protocol.mode != "drives":
+            attitude = protocol.mode == "auto"
+            pieces = cut_pieces(stack, protocol.length_s, protocol.stride_s, attitude=attitude)
+        self.mode = "pieces" if protocol.mode == "pieces" or pieces else "drives"
+        self.skipped: dict[str, str] = {}
+        self._batches: list[tuple[Sequence[Drive], list[Piece] | list[Start]]]
+        if self.mode == "pieces":
+            if not pieces:
+                raise InputError(
+                    f"no piece of {protocol.length_s:g} s lies within valid truth; give a shorter length_s, "
+                    "or mode=drives"
+                )
+            self._batches = [(stack, part) for part in _parts(pieces, [p.epochs for p in pieces], stack)]
+            self.outage = protocol.outage and _fitting(protocol.outage, protocol.length_s)
+        else:
+            starts = self._aligned(stack)
+            order = sorted(starts, key=lambda d: -stack[d].epochs)  # like lengths together: little padding
+            parts = _parts(order, [stack[d].epochs for d in order], stack)
+            self._batches = [([stack[d] for d in part], [starts[d] for d in part]) for part in parts]
+            self.outage = protocol.outage and repeated(protocol.outage)
+        self.protocol = protocol
+        offsets = len(self.outage.offsets_s) if self.outage else 1
+        self.runs = offsets * sum(len(part) for _, part in self._batches)
+
+    def __iter__(self) -> Iterator[Scene]:
+        generator = torch.Generator().manual_seed(self.protocol.seed)
+        for drives, part in self._batches:
+            if self.mode == "pieces":
+                batch = make_batch(
+                    drives, part, dtype=torch.float64, start=self.protocol.start, generator=generator
+                )
+            else:
+                batch = whole_drives(drives, part)
+            if self.outage is None:
+                yield batch, torch.zeros(batch.size[:2], dtype=torch.bool)
+                continue
+            for mask in self.outage.masks(batch, generator):
+                yield batch, mask
+
+    def described(self) -> dict[str, Any]:
+        """The rules as plain values, for files."""
+        p = self.protocol
+        common: dict[str, Any] = {"mode": self.mode, "seed": p.seed}
+        if self.mode == "pieces":
+            common |= {"length_s": p.length_s, "stride_s": p.stride_s, "start": asdict(p.start)}
+        else:
+            common["start"] = "alignment from GNSS and levelling"
+        return common | {"outage": asdict(self.outage) if self.outage else None, "skipped": self.skipped}
+
+    def _aligned(self, drives: Sequence[Drive]) -> dict[int, Start]:
+        starts: dict[int, Start] = {}
+        for k, drive in enumerate(drives):
+            if not bool(drive.ref_valid.any()):
+                self.skipped[drive.name] = f"drive {drive.name}: has no valid reference to score against"
+                continue
+            try:
+                starts[k] = align(drive)
+            except InputError as error:
+                self.skipped[drive.name] = str(error)
+        if not starts:
+            more = f" (and {len(self.skipped) - 1} more)" if len(self.skipped) > 1 else ""
+            raise InputError(f"no drive can be scored: {next(iter(self.skipped.values()))}{more}")
+        return starts
+
+
+def repeated(plan: OutagePlan) -> OutagePlan:
+    """The plan for whole drives: repeated to the end, in as many runs as cover the drive, where not given."""
+    longest = plan.duration_s if isinstance(plan.duration_s, (int, float)) else max(plan.duration_s)
+    every = plan.every_s if plan.every_s is not None else 2.0 * longest
+    return replace(plan, every_s=every, offsets_s=plan.offsets_s or (0.0, float(longest)))
+
+
+def _fitting(plan: OutagePlan, length_s: float) -> OutagePlan:
+    plan = replace(plan, offsets_s=plan.offsets_s or (0.0,))
+    first, last = (x if isinstance(x, (int, float)) else max(x) for x in (plan.first_s, plan.duration_s))
+    end = first + last + max(plan.offsets_s)
+    if end > length_s + 1e-6:
+        raise InputError(
+            f"the outage ends after {end:g} s but pieces are {length_s:g} s long; "
+            "give a larger length_s, or a smaller outage.first_s or outage.duration_s"
+        )
+    return plan
+
+
+def _parts(items: Sequence, epochs: Sequence[int], stack: DriveStack) -> list[list]:
+    """Items in order, as many together as four chunks hold when padded to the longest of them."""
+    samples = stack.imu.shape[1]
+    parts: list[list] = []
+    longest = 0
+    for item, n in zip(items, epochs):
+        longest = max(longest, n)
+        if not parts or (len(parts[-1]) + 1) * longest * samples > 4 * CHUNK_SAMPLES:
+            parts.append([])
+            longest = n
+        parts[-1].append(item)
+    return parts
+
+
+def protocol_from(config: Mapping[str, Any]) -> Protocol:
+    """A protocol from plain values: the keys of ``conf/evaluate.yaml``; InputError for unknown ones."""
+    outage = config.get("outage")
+    if outage is not None:
+        known = {"first_s", "duration_s", "every_s", "offsets_s"}
+        if unknown := sorted(set(outage) - known):
+            raise InputError(f"outage: unknown key {unknown[0]}; known are {', '.join(sorted(known))}")
+        outage = OutagePlan(**{**outage, "offsets_s": tuple(outage.get("offsets_s") or ())})
+    return Protocol(
+        mode=config.get("mode", "auto"),
+        length_s=config.get("length_s", 120.0),
+        stride_s=config.get("stride_s") or config.get("length_s", 120.0),
+        start=StartLaw.of(config.get("start")),
+        outage=outage,
+        seed=config.get("seed", 0),
+    )

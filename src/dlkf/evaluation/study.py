@@ -1,0 +1,52 @@
+"""One comparison from scenes to numbers: what both ``evaluate`` and the end of a training run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dlkf.evaluation.imu_slope import injected_response
+from dlkf.evaluation.metrics import slope
+from dlkf.evaluation.progress import counting
+from dlkf.evaluation.protocol import Scenes
+from dlkf.evaluation.results import BASELINE, SETTLE_S, results
+from dlkf.evaluation.run import score_scenes
+from dlkf.evaluation.scores import Scores
+from dlkf.filters.integration import Estimator
+
+
+def study(
+    filters: Mapping[str, Estimator],
+    scenes: Scenes,
+    *,
+    kinds: Mapping[str, str] | str,
+    groups: Mapping[str, str] | None = None,
+    baseline: str = BASELINE,
+    settle_s: float = SETTLE_S,
+    injected_bias: Mapping[str, float] | None = None,
+    seed: int = 0,
+) -> tuple[Scores, list[dict[str, Any]]]:
+    """Scores of every filter, and the results (results.results) of each kind of data.
+
+    With ``injected_bias`` (``accel`` m/s², ``gyro`` rad/s, 1σ) everything runs once more with biases added to
+    the IMU, and the results carry ``imu_error.injected_slope`` per filter.
+    """
+    with counting("Running filters") as progress:
+        scores = score_scenes(
+            filters, scenes, total=scenes.runs, kinds=kinds, groups=groups, progress=progress
+        )
+    made = [
+        results(scores.of_kind(kind), settle_s=settle_s, baseline=baseline, seed=seed)
+        for kind in scores.kinds
+    ]
+    if injected_bias:
+        with counting("Running with injected biases") as progress:
+            cause, followed = injected_response(
+                scores, filters, scenes, total=scenes.runs, progress=progress, seed=seed, **injected_bias
+            )
+        for result in made:
+            rows = [i for i, p in enumerate(scores.pieces) if p.kind == result["kind"]]
+            for name, x in followed.items():
+                quality = result["filters"][name]["imu_error"]
+                quality["injected_slope"] = slope(x[rows], cause[rows], intercept=False).tolist()
+    return scores, made

@@ -1,0 +1,61 @@
+"""Navigate whole drives: ``python -m dlkf.navigate model=mbkf15 dataset=data/town out=outputs/town``.
+
+From IMU and GNSS alone; ``reference/`` is never opened. Writes ``out/drive=<id>/solution.parquet`` for every
+drive, or nothing (columns: dlkf.data.solution).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from dlkf.command import command
+from dlkf.data.solution import write_solution
+from dlkf.data.store import load_dataset
+from dlkf.errors import InputError
+from dlkf.evaluation.drives import navigate_drives
+from dlkf.evaluation.progress import counting
+from dlkf.evaluation.staging import staged
+from dlkf.models import resolve_model
+from dlkf.navigation.imu_errors import imu_spec
+
+
+@command("navigate")
+def main(cfg: DictConfig) -> None:
+    """Load, align, run, write; print a line per drive."""
+    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
+    if not isinstance(config["model"], str):
+        raise InputError(f"navigate runs one model at a time, got model={config['model']}")
+    model = resolve_model(
+        config["model"],
+        imu_spec(config["imu"]),
+        config["tracking_uri"],
+        tuning=config["tuning"],
+        prior=config["prior"],
+    )
+    with counting("Loading drives") as progress:
+        drives = load_dataset(
+            config["dataset"],
+            rate_hz=config["rate_hz"],
+            epoch_s=config["epoch_s"],
+            dtype=torch.float64,
+            reference=False,
+            drives=config["drives"],
+            progress=lambda name, done, total: progress(done, total),
+        )
+    skipped: dict[str, str] | None = {} if config["skip_unaligned"] else None
+    lines = []
+    with staged(config["out"]) as folder, counting("Navigating") as progress:
+        for result in navigate_drives(drives, model, skipped=skipped, progress=progress):
+            write_solution(folder / f"drive={result.drive}" / "solution.parquet", result.table)
+            lines.append(result.summary())
+    print("\n".join(sorted(lines)))
+    for reason in (skipped or {}).values():
+        print(f"left out: {reason}")
+    print(f"Solutions: {config['out']}/drive=*/solution.parquet")
+
+
+if __name__ == "__main__":
+    main()
