@@ -34,6 +34,9 @@ class AlignConfig:
     window_s: float = 2.0
 
 
+ALIGN = AlignConfig()
+
+
 @dataclass(frozen=True)
 class Aligned:
     """State of the IMU at the N+1 boundaries, where ``ok``; float64, garbage elsewhere.
@@ -61,7 +64,7 @@ class Start:
     std: Float[Tensor, " 9"]
 
 
-def align_boundaries(drive: Drive, config: AlignConfig = AlignConfig()) -> Aligned:
+def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     """Align at every boundary that has a fix with velocity faster than ``min_speed`` and one a window before.
 
     A source without any velocity has it taken from three successive positions. Reads no reference.
@@ -115,7 +118,7 @@ def align_boundaries(drive: Drive, config: AlignConfig = AlignConfig()) -> Align
 def _velocity(
     drive: Drive, C_en: Float[Tensor, "rows 3 3"], position: Bool[Tensor, " rows"]
 ) -> tuple[Float[Tensor, "rows 3"], Float[Tensor, "rows 3"], Bool[Tensor, " rows"]]:
-    """Antenna velocity in n with std, and where its horizontal part is known; unknown down velocity is zero."""
+    """Antenna velocity in n with std, and where its horizontal part is known; an unknown v_d is zero."""
     known = drive.gnss_valid[:, 3:]
     if bool(known[:, :2].any()):
         v_n = (C_en.mT @ drive.gnss_v_e.unsqueeze(-1)).squeeze(-1)

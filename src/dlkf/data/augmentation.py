@@ -47,8 +47,12 @@ def turn_frames(batch: Batch, generator: torch.Generator | None = None) -> Batch
         earth_rate_n=turned(batch.frame.earth_rate_n),
     )
     # turned, a horizontal component is known only where both are
-    horizontal = [v[..., :2].all(-1, keepdim=True).expand_as(v[..., :2]) for v in batch.gnss_valid.split(3, -1)]
-    valid = torch.cat((horizontal[0], batch.gnss_valid[..., 2:3], horizontal[1], batch.gnss_valid[..., 5:]), -1)
+    horizontal = [
+        v[..., :2].all(-1, keepdim=True).expand_as(v[..., :2]) for v in batch.gnss_valid.split(3, -1)
+    ]
+    valid = torch.cat(
+        (horizontal[0], batch.gnss_valid[..., 2:3], horizontal[1], batch.gnss_valid[..., 5:]), -1
+    )
     return replace(
         batch,
         frame=frame,

@@ -1,4 +1,4 @@
-"""Drives as training, validation and test batches for Lightning; everything in memory, no worker processes."""
+"""Drives as training, validation and test batches for Lightning; all in memory, no worker processes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ DTYPES = {"float32": torch.float32, "float64": torch.float64}
 class DriveDataModule(L.LightningDataModule):
     """Pieces of any number of datasets, split by recording (checklist 4.8), as :class:`Batch` objects.
 
-    Training: in every epoch pieces of ``train_length_s`` (or ``length_law(epoch)`` where a curriculum sets
+    Training: in every epoch pieces of ``length_s`` (or ``length_law(epoch)`` where a curriculum sets
     that attribute) start at random, spread evenly over the training drives, with a start error drawn from
     ``start``. Batches depend on (seed, epoch, step) alone, so a resumed run sees what an uninterrupted one
     sees; with several processes each takes its share of every batch. Validation and test pieces of
@@ -42,7 +42,8 @@ class DriveDataModule(L.LightningDataModule):
     withholds GNSS there. Lengths that change need ``Trainer(reload_dataloaders_every_n_epochs=1)``.
 
     Groups of the same name in several datasets count as one recording. ``split`` and ``fractions`` as in
-    :func:`dlkf.data.splits.split_rows`; ``turn_frames`` and ``bias_injection`` = (m/s², °/s) augment training.
+    :func:`dlkf.data.splits.split_rows`; ``turn_frames`` and ``bias_injection``
+    = (m/s², °/s) augment training.
     """
 
     def __init__(
@@ -55,7 +56,7 @@ class DriveDataModule(L.LightningDataModule):
         split: Split = "group",
         fractions: Sequence[float] = (0.7, 0.15, 0.15),
         batch_size: int = 50,
-        train_length_s: float = 60.0,
+        length_s: float = 60.0,
         eval_length_s: float = 60.0,
         eval_stride_s: float | None = None,
         eval_outage: Sequence[float] | None = None,
@@ -75,7 +76,7 @@ class DriveDataModule(L.LightningDataModule):
         self.datasets = [str(d) for d in ([datasets] if isinstance(datasets, (str, Path)) else datasets)]
         self.rate_hz, self.epoch_s, self.dtype = rate_hz, epoch_s, DTYPES[dtype]
         self.split, self.fractions = split, tuple(fractions)
-        self.batch_size, self.train_length_s = batch_size, train_length_s
+        self.batch_size, self.train_length_s = batch_size, length_s
         self.eval_length_s, self.eval_stride_s, self.min_valid = eval_length_s, eval_stride_s, min_valid
         self.eval_outage = _pair(eval_outage, "eval_outage")
         self.bias_injection = _pair(bias_injection, "bias_injection")
@@ -122,7 +123,7 @@ class DriveDataModule(L.LightningDataModule):
         if not len(starts):
             raise InputError(
                 f"no training piece of {length * self.epoch_s:g} s: the drives are shorter or not valid that "
-                "long; choose a shorter data.train_length_s"
+                "long; choose a shorter data.length_s"
             )
         change = torch.zeros(len(self.spans["train"]) + 1, dtype=torch.int64)
         change[starts] += 1
@@ -137,7 +138,7 @@ class DriveDataModule(L.LightningDataModule):
         return batches
 
     def train_batch(self, epoch: int, step: int, share: tuple[int, int] = (0, 1)) -> Batch:
-        """The batch of a training step; ``share`` = (k, n) gives every n-th piece from k on, as many as others."""
+        """The batch of a training step; ``share`` = (k, n) gives every n-th piece from k on."""
         generator = torch.Generator().manual_seed(_seed(self.seed, epoch, step))
         pieces = self.train_pieces(epoch)[step]
         batch = make_batch(self.stack, pieces, dtype=self.dtype, start=self.start, generator=generator)
@@ -152,12 +153,16 @@ class DriveDataModule(L.LightningDataModule):
         """The fixed pieces of a side, for scoring."""
         self.setup()
         pieces = cut_pieces(
-            self.stack, self.eval_length_s, self.eval_stride_s, min_valid=self.min_valid, span=self.spans[side]
+            self.stack,
+            self.eval_length_s,
+            self.eval_stride_s,
+            min_valid=self.min_valid,
+            span=self.spans[side],
         )
         if not pieces:
             raise InputError(
-                f"no {side} piece of {self.eval_length_s:g} s: its drives are shorter or not valid that long; choose a "
-                "shorter data.eval_length_s or another split"
+                f"no {side} piece of {self.eval_length_s:g} s: its drives are shorter or not valid "
+                "that long; choose a shorter data.eval_length_s or another split"
             )
         return pieces
 
@@ -229,7 +234,7 @@ class DriveDataModule(L.LightningDataModule):
 
 
 class TrainBatches:
-    """The training batches of the epoch that the trainer is in, one pass; its state resumes inside an epoch."""
+    """The training batches of the trainer's epoch, one pass; its state resumes inside an epoch."""
 
     def __init__(self, module: DriveDataModule) -> None:
         self.module = module
@@ -268,7 +273,7 @@ class TrainBatches:
 
 
 class FixedBatches:
-    """A loader that gives the same batches in every pass (Lightning would take a list for several loaders)."""
+    """A loader with the same batches in every pass (Lightning takes a list for several loaders)."""
 
     def __init__(self, batches: Sequence[Batch]) -> None:
         self.batches = batches

@@ -11,7 +11,7 @@ from torch import Tensor
 def geodetic_from_ecef(
     r_e: Float[Tensor, "*b 3"],
 ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"], Float[Tensor, "*b"]]:
-    """Latitude, longitude [rad] and ellipsoidal height [m], float64 (You 2000, as in pymap3d); NaN stays NaN."""
+    """Latitude, longitude [rad] and ellipsoidal height [m], float64 (You 2000, by pymap3d); NaN stays."""
     flat = r_e.detach().cpu().double().reshape(-1, 3)
     known = flat.isfinite().all(-1)
     out = torch.full_like(flat, torch.nan)

@@ -24,7 +24,9 @@ def check_imu_units(imu: Columns, where: str) -> None:
     force = np.stack([imu[c] for c in ACCEL], -1)
     size = float(np.median(np.linalg.norm(force, axis=-1)))
     if 0.8 < size < 1.3:
-        raise InputError(f"{where}: median specific force is {size:.2f}: looks like g; multiply accel by 9.80665")
+        raise InputError(
+            f"{where}: median specific force is {size:.2f}: looks like g; multiply accel by 9.80665"
+        )
     if not 7.0 < size < 13.0:
         raise InputError(
             f"{where}: median specific force is {size:.3g} m/s², must be near 9.8; check the unit, "
@@ -33,18 +35,20 @@ def check_imu_units(imu: Columns, where: str) -> None:
     axes = np.median(force, axis=0)
     if axes[2] > 0.7 * size:
         raise InputError(
-            f"{where}: accel_z is {axes[2]:+.2f} m/s² in the median, must be about −9.8 (Forward-Right-Down); the z axis "
-            "points up (FLU?): turn the signs of y and z of accel and gyro"
+            f"{where}: accel_z is {axes[2]:+.2f} m/s² in the median, must be about −9.8 (Forward-Right-"
+            "Down); the z axis points up (FLU?): turn the signs of y and z of accel and gyro"
         )
     if axes[2] > -0.7 * size:
         k = int(np.abs(axes).argmax())
         raise InputError(
-            f"{where}: gravity lies on {ACCEL[k]} ({axes[k]:+.2f} m/s² in the median), must be −9.8 on accel_z "
-            "(Forward-Right-Down); reorder the axes of accel and gyro"
+            f"{where}: gravity lies on {ACCEL[k]} ({axes[k]:+.2f} m/s² in the median), must be −9.8 on "
+            "accel_z (Forward-Right-Down); reorder the axes of accel and gyro"
         )
     rate = float(np.quantile(np.linalg.norm(np.stack([imu[c] for c in GYRO], -1), axis=-1), 0.999))
     if rate > FASTEST_RATE:
-        raise InputError(f"{where}: gyro reaches {rate:.0f} rad/s: looks like degrees; multiply gyro by π/180")
+        raise InputError(
+            f"{where}: gyro reaches {rate:.0f} rad/s: looks like degrees; multiply gyro by π/180"
+        )
 
 
 def check_gnss_units(gnss: Columns, where: str) -> None:
@@ -74,7 +78,8 @@ def _check_way(gnss: Columns, where: str) -> None:
     whole = np.isfinite(v_n) & np.isfinite(v_e)
     smooth = (step <= 2.0) & whole[1:] & whole[:-1]
     way_n, way_e = (
-        np.concatenate(([0.0], np.cumsum(np.where(smooth, step * (v[1:] + v[:-1]) / 2, 0.0)))) for v in (v_n, v_e)
+        np.concatenate(([0.0], np.cumsum(np.where(smooth, step * (v[1:] + v[:-1]) / 2, 0.0))))
+        for v in (v_n, v_e)
     )
     breaks = np.concatenate(([0], np.cumsum(~smooth)))
     first = np.arange(len(t))
@@ -100,7 +105,11 @@ def _check_way(gnss: Columns, where: str) -> None:
         return
     readings = {
         "latitude and longitude look swapped; exchange lat_deg and lon_deg": (lon, lat, moved),
-        "lat_deg and lon_deg look like radians; multiply them by 180/π": (np.degrees(lat), np.degrees(lon), moved),
+        "lat_deg and lon_deg look like radians; multiply them by 180/π": (
+            np.degrees(lat),
+            np.degrees(lon),
+            moved,
+        ),
         "vel_n and vel_e look swapped; exchange them": (lat, lon, moved[:, ::-1]),
         "the velocities look like km/h; divide them by 3.6": (lat, lon, moved / 3.6),
         "the velocities look like knots; multiply them by 0.5144": (lat, lon, moved * 0.514444),
@@ -131,10 +140,13 @@ def check_turns(imu: Columns, gnss: Columns, where: str) -> None:
     if alike < 0.9:
         return
     if slope > 20:
-        raise InputError(f"{where}: gyro_z is {slope:.0f} times the turn of the course: looks like degrees; use rad/s")
+        raise InputError(
+            f"{where}: gyro_z is {slope:.0f} times the turn of the course: looks like degrees; use rad/s"
+        )
     if slope < -0.3:
         raise InputError(
-            f"{where}: gyro_z turns against the course (slope {slope:.2f}): z must point down; turn the signs of y and z"
+            f"{where}: gyro_z turns against the course (slope {slope:.2f}): z must point down; "
+            "turn the signs of y and z"
         )
 
 
@@ -143,7 +155,9 @@ def check_attitude(reference: Columns, where: str) -> None:
     for name in ATTITUDE:
         largest = np.nanmax(np.abs(reference[name]), initial=0.0)
         if largest > 2 * np.pi + 0.01:
-            raise InputError(f"{where}: {name} reaches {largest:.1f}: looks like degrees; multiply attitudes by π/180")
+            raise InputError(
+                f"{where}: {name} reaches {largest:.1f}: looks like degrees; multiply attitudes by π/180"
+            )
     speed = np.hypot(reference["vel_n"], reference["vel_e"])
     with np.errstate(invalid="ignore"):
         fast = (speed > 3) & np.isfinite(reference["yaw"])

@@ -1,4 +1,4 @@
-"""One drive on a uniform grid: averaged IMU samples, fixes assigned to epochs, reference at the boundaries."""
+"""One drive on a uniform grid: averaged IMU samples, fixes in epochs, reference at the boundaries."""
 
 from __future__ import annotations
 
@@ -49,7 +49,9 @@ def epoch_grid(t_imu: np.ndarray, t_fix: np.ndarray, rate_hz: float, epoch_s: fl
     """
     samples = round(rate_hz * epoch_s)
     if samples < 1 or abs(samples - rate_hz * epoch_s) > 1e-6:
-        raise InputError(f"rate_hz={rate_hz:g}, epoch_s={epoch_s:g}: an epoch must hold a whole number of samples")
+        raise InputError(
+            f"rate_hz={rate_hz:g}, epoch_s={epoch_s:g}: an epoch must hold a whole number of samples"
+        )
     step = float(np.median(np.diff(t_imu)))
     first, last = t_imu[0] - step, t_imu[-1]  # the first sample covers the interval before its stamp
     slack = 0.5 * min(step, epoch_s / samples)
@@ -57,7 +59,9 @@ def epoch_grid(t_imu: np.ndarray, t_fix: np.ndarray, rate_hz: float, epoch_s: fl
     t0 = phase + np.ceil((first - phase - slack) / epoch_s) * epoch_s
     epochs = int(np.floor((last - t0 + slack) / epoch_s))
     if epochs < 1:
-        raise InputError(f"drive {drive}: only {last - first:.2f} s of IMU, shorter than an epoch of {epoch_s:g} s")
+        raise InputError(
+            f"drive {drive}: only {last - first:.2f} s of IMU, shorter than an epoch of {epoch_s:g} s"
+        )
     return Grid(float(t0), epoch_s, epochs, samples)
 
 
@@ -127,7 +131,9 @@ def assign_fixes(gnss: Columns, grid: Grid) -> Fixes:
     Unknown stds take the defaults of ``DEFAULT_STD``; components that are NaN are not valid.
     """
     rows = grid.epochs + 1
-    usable = np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite(np.stack([gnss[c] for c in POSITION])).all(0)
+    usable = np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite(
+        np.stack([gnss[c] for c in POSITION])
+    ).all(0)
     place = np.ceil((gnss["t"] - grid.t0 - ON_BOUNDARY_S) / grid.epoch_s).astype(np.int64)
     inside = np.flatnonzero(usable & (place >= 0) & (place < rows))
     chosen = np.full(rows, -1)
@@ -174,7 +180,9 @@ def reference_at(reference: Columns | None, grid: Grid) -> Truth:
     """
     rows = grid.epochs + 1
     nan3 = np.full((rows, 3), np.nan)
-    empty = Truth(nan3, nan3.copy(), np.full((rows, 3, 3), np.nan), np.zeros(rows, bool), np.full((rows, 6), np.nan))
+    empty = Truth(
+        nan3, nan3.copy(), np.full((rows, 3, 3), np.nan), np.zeros(rows, bool), np.full((rows, 6), np.nan)
+    )
     if reference is None:
         return empty
     known = reference["valid"] & np.isfinite(np.stack([reference[c] for c in (*POSITION, *VELOCITY)])).all(0)
@@ -227,7 +235,9 @@ def _spread(values: np.ndarray, at: np.ndarray, rows: int, fill: float | bool) -
     return out
 
 
-def _ecef(table: Columns, rows: np.ndarray, attitude: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _ecef(
+    table: Columns, rows: np.ndarray, attitude: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """ECEF position and velocity, and C_en, or C_eb with ``attitude``, of some rows."""
     lat, lon = (torch.from_numpy(np.radians(table[c][rows])) for c in ("lat_deg", "lon_deg"))
     r_e = ecef_from_geodetic(lat, lon, torch.from_numpy(table["height_m"][rows]))

@@ -34,7 +34,14 @@ POSITION = ("lat_deg", "lon_deg", "height_m")
 VELOCITY = ("vel_n", "vel_e", "vel_d")
 STD = ("std_pos_n", "std_pos_e", "std_pos_d", "std_vel_n", "std_vel_e", "std_vel_d")
 ATTITUDE = ("roll", "pitch", "yaw")
-IMU_ERROR = ("accel_error_x", "accel_error_y", "accel_error_z", "gyro_error_x", "gyro_error_y", "gyro_error_z")
+IMU_ERROR = (
+    "accel_error_x",
+    "accel_error_y",
+    "accel_error_z",
+    "gyro_error_x",
+    "gyro_error_y",
+    "gyro_error_z",
+)
 LEVER_ARM = ("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m")
 
 
@@ -71,12 +78,16 @@ def new_dataset(folder: str | Path, overwrite: bool = False) -> Iterator[Path]:
     """
     target = Path(folder).absolute()
     if target.is_file() or (target.is_dir() and any(target.iterdir()) and not overwrite):
-        raise InputError(f"out={folder}: exists already; give another folder, or overwrite=true to replace it")
+        raise InputError(
+            f"out={folder}: exists already; give another folder, or overwrite=true to replace it"
+        )
     beside = target.with_name(f".{target.name}.partial-{os.getpid()}")
     try:
         beside.mkdir(parents=True)
     except OSError as error:
-        raise InputError(f"out={folder}: cannot write there ({error.strerror}); give another folder") from None
+        raise InputError(
+            f"out={folder}: cannot write there ({error.strerror}); give another folder"
+        ) from None
     old = target.with_name(f".{target.name}.old-{os.getpid()}")
     try:
         yield beside
@@ -144,7 +155,9 @@ def contract_table(kind: str, frame: pd.DataFrame, drive: str) -> pa.Table:
     """
     schema = SCHEMAS[kind]
     if missing := [name for name in schema.names if name not in frame]:
-        raise InputError(f"drive {drive}, {kind}: column {', '.join(missing)} missing; has {', '.join(frame.columns)}")
+        raise InputError(
+            f"drive {drive}, {kind}: column {', '.join(missing)} missing; has {', '.join(frame.columns)}"
+        )
     extra = [name for name in frame.columns if name not in schema.names]
     columns = [pa.array(frame[n].to_numpy(), type=schema.field(n).type) for n in schema.names]
     columns += [pa.array(frame[name]) for name in extra]
@@ -154,7 +167,9 @@ def contract_table(kind: str, frame: pd.DataFrame, drive: str) -> pa.Table:
 def check_name(drive: str) -> str:
     """The drive's name, if it can be part of a path ``drive=<name>``; InputError if not."""
     if not drive or drive.startswith(".") or any(c in drive for c in "/\\=") or drive != drive.strip():
-        raise InputError(f"drive {drive!r}: a drive's name must be non-empty, without '/', '\\', '=' or a leading dot")
+        raise InputError(
+            f"drive {drive!r}: a drive's name must be non-empty, without '/', '\\', '=' or a leading dot"
+        )
     return drive
 
 

@@ -22,7 +22,7 @@ REST = (0.0, 0.0, -9.8, 0.0, 0.0, 0.0)  # IMU in the padding after a piece's end
 
 
 class Piece(NamedTuple):
-    """``epochs`` epochs of drive number ``drive`` from epoch ``first`` on; it starts at boundary ``first``."""
+    """``epochs`` epochs of drive number ``drive`` from boundary ``first`` on."""
 
     drive: int
     first: int
@@ -70,18 +70,25 @@ def epochs_of(length_s: float, epoch_s: float) -> int:
     """Whole epochs in a length; InputError if there is none."""
     epochs = round(length_s / epoch_s)
     if epochs < 1:
-        raise InputError(f"length of {length_s:g} s is shorter than an epoch of {epoch_s:g} s; give a longer one")
+        raise InputError(
+            f"length of {length_s:g} s is shorter than an epoch of {epoch_s:g} s; give a longer one"
+        )
     return epochs
 
 
 def possible_starts(
-    drives: Sequence[Drive], epochs: int, *, attitude: bool = False, min_valid: float = 1.0, span: Int[Tensor, " rows"] | None = None
+    drives: Sequence[Drive],
+    epochs: int,
+    *,
+    attitude: bool = False,
+    min_valid: float = 1.0,
+    span: Int[Tensor, " rows"] | None = None,
 ) -> Bool[Tensor, " rows"]:
     """Boundaries of the stack from which ``epochs`` epochs can be cut.
 
-    The reference must be valid at the start and at ``min_valid`` of the boundaries after it, and a whole start
-    state known, from the reference or, unless ``attitude`` asks for true attitude, from IMU and GNSS. With
-    ``span`` (a label per boundary, that of the epoch it begins) a piece must stay inside one span; −1 belongs
+    The reference must be valid at the start and at ``min_valid`` of the boundaries after it, and a whole
+    start state known, from the reference or, unless ``attitude`` asks for true attitude, from IMU and GNSS.
+    With ``span`` (a label per boundary, that of the epoch it begins) a piece must stay inside one span; −1 belongs
     to none.
     """
     stack = stacked(drives)
@@ -169,7 +176,9 @@ def make_batch(
     return _assemble(stack, drive, first, epochs, frame, truth.corrected(-dx), std, dtype)
 
 
-def whole_drives(drives: Sequence[Drive], starts: Sequence[Start], *, dtype: torch.dtype = torch.float64) -> Batch:
+def whole_drives(
+    drives: Sequence[Drive], starts: Sequence[Start], *, dtype: torch.dtype = torch.float64
+) -> Batch:
     """Complete drives from the given starts on, as one batch padded to the longest."""
     stack = stacked(drives)
     if len(starts) != len(stack):
@@ -195,8 +204,8 @@ def _with_alignment(
         drive = int(torch.searchsorted(stack.first_row, row[k], right=True)) - 1
         t = stack[drive].t0 + float(row[k] - stack.first_row[drive]) * stack.epoch_s
         raise InputError(
-            f"drive {stack[drive].name}: no start state at t = {t:.1f}: neither the reference nor GNSS in motion gives "
-            "an attitude; start where the car moves"
+            f"drive {stack[drive].name}: no start state at t = {t:.1f}: neither the reference nor GNSS in "
+            "motion gives an attitude; start where the car moves"
         )
     replaced = torch.cat((no_reference[:, None].expand(-1, 6), no_attitude[:, None].expand(-1, 3)), -1)
     std = torch.where(replaced, a.std[row], std)

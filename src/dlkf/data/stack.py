@@ -9,7 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from dlkf.data.alignment import Aligned, AlignConfig, align_boundaries
+from dlkf.data.alignment import Aligned, align_boundaries
 from dlkf.data.drive import Drive
 from dlkf.data.geodetic import geodetic_from_ecef
 from dlkf.errors import InputError
@@ -33,7 +33,9 @@ class DriveStack(Sequence[Drive]):
             raise InputError("no drives: give a dataset with at least one")
         for d in drives:
             if (d.rate_hz, d.epoch_s) != (drives[0].rate_hz, drives[0].epoch_s):
-                raise InputError(f"drive {d.name}: rate and epoch differ from those of {drives[0].name}; load alike")
+                raise InputError(
+                    f"drive {d.name}: rate and epoch differ from those of {drives[0].name}; load alike"
+                )
         lengths = torch.tensor([d.epochs for d in drives])
         self.epochs = lengths
         self.first_epoch = lengths.cumsum(0) - lengths
@@ -64,13 +66,15 @@ class DriveStack(Sequence[Drive]):
     @cached_property
     def aligned(self) -> Aligned:
         """Attitude from IMU and GNSS at every boundary of every drive."""
-        parts = [align_boundaries(d, AlignConfig()) for d in self.drives]
-        return Aligned(*(torch.cat([getattr(a, f) for a in parts]) for f in ("ok", "r_e", "v_e", "C_eb", "std")))
+        parts = [align_boundaries(d) for d in self.drives]
+        return Aligned(
+            *(torch.cat([getattr(a, f) for a in parts]) for f in ("ok", "r_e", "v_e", "C_eb", "std"))
+        )
 
     @cached_property
     def origin(self) -> Tensor:
-        """(rows, 3) latitude, longitude [rad], height [m] of a tangent frame at each boundary: reference, else
-        GNSS, else the nearest boundary that has one."""
+        """(rows, 3) latitude, longitude [rad], height [m] of a tangent frame at each boundary: reference,
+        else GNSS, else the nearest boundary that has one."""
         r_e = torch.where(self.rows["ref_valid"][:, None], self.rows["ref_r_e"], self.rows["gnss_r_e"])
         llh = torch.stack(geodetic_from_ecef(r_e), -1)
         for first, count in zip(self.first_row.tolist(), (self.epochs + 1).tolist()):

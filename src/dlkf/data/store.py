@@ -24,7 +24,7 @@ def load_dataset(
     dtype: torch.dtype = torch.float32,
     reference: bool = True,
     drives: Sequence[str] | None = None,
-    limits: Limits = Limits(),
+    limits: Limits = LIMITS,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> list[Drive]:
     """The drives of a dataset, or those named, on an epoch grid; IMU in ``dtype``, the rest float64.

@@ -69,7 +69,9 @@ def read_table(folder: str | Path, kind: str, drive: str) -> Columns | None:
         if kind == "reference":
             return None
         if kind == "gnss":
-            raise InputError(f"drive {drive}: no GNSS, {place}/ has no Parquet file; a filter needs position fixes")
+            raise InputError(
+                f"drive {drive}: no GNSS, {place}/ has no Parquet file; a filter needs position fixes"
+            )
         raise InputError(f"drive {drive}: {place}/ has no Parquet file though drives.parquet lists the drive")
     pieces = []
     for part in parts:
@@ -92,7 +94,7 @@ def read_table(folder: str | Path, kind: str, drive: str) -> Columns | None:
 
 
 def dataset_digest(folder: str | Path) -> str:
-    """Hash of the contents of a dataset's files, 32 hexadecimal digits; names count, times of change do not."""
+    """Hash of the contents of a dataset's files, 32 hexadecimal digits; names count, dates do not."""
     folder = Path(folder)
     digest = hashlib.blake2b(digest_size=16)
     for path in sorted(folder.rglob("*.parquet"), key=lambda p: p.relative_to(folder).as_posix()):

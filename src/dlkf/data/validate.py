@@ -23,6 +23,9 @@ class Limits:
     gap_samples: float = 5.0
 
 
+LIMITS = Limits()
+
+
 @dataclass(frozen=True)
 class DriveTables:
     """The checked tables of one drive."""
@@ -33,7 +36,9 @@ class DriveTables:
     reference: Columns | None
 
 
-def validate_dataset(folder: str | Path, *, reference: bool = True, limits: Limits = Limits()) -> list[DriveRow]:  # noqa: B008
+def validate_dataset(
+    folder: str | Path, *, reference: bool = True, limits: Limits = LIMITS
+) -> list[DriveRow]:
     """Check every drive of a dataset and return their rows; raises InputError for the first fault.
 
     With ``reference=False`` the folder ``reference/`` is not opened.
@@ -49,7 +54,7 @@ def read_checked(
     row: DriveRow,
     *,
     reference: bool = True,
-    limits: Limits = Limits(),  # noqa: B008
+    limits: Limits = LIMITS,
 ) -> DriveTables:
     """Read and check the tables of one drive; raises InputError for the first fault."""
     name = row.name
@@ -65,7 +70,7 @@ def read_checked(
     return DriveTables(row, imu, gnss, truth)
 
 
-def gap_rows(t: np.ndarray, limits: Limits = Limits()) -> np.ndarray:  # noqa: B008
+def gap_rows(t: np.ndarray, limits: Limits = LIMITS) -> np.ndarray:
     """Rows before which the IMU has a gap."""
     if len(t) < 2:
         return np.zeros(0, dtype=np.int64)
@@ -80,14 +85,17 @@ def _where(drive: str, kind: str) -> str:
 def _check_time(t: np.ndarray, where: str) -> None:
     bad = np.flatnonzero(~np.isfinite(t))
     if len(bad):
-        raise InputError(f"{where}: row {bad[0]}: t is {t[bad[0]]}; remove the row or give its time in seconds")
+        raise InputError(
+            f"{where}: row {bad[0]}: t is {t[bad[0]]}; remove the row or give its time in seconds"
+        )
     back = np.flatnonzero(np.diff(t) <= 0)
     if len(back):
         k = int(back[0])
         if t[k + 1] == t[k]:
             raise InputError(f"{where}: row {k + 1}: t = {t[k]:.6f} stands twice; remove duplicate samples")
         raise InputError(
-            f"{where}: row {k + 1}: t goes back from {t[k]:.6f} to {t[k + 1]:.6f}; sort the rows, or split the drive"
+            f"{where}: row {k + 1}: t goes back from {t[k]:.6f} to {t[k + 1]:.6f}; "
+            "sort the rows, or split the drive"
         )
 
 
@@ -111,8 +119,8 @@ def _check_imu(imu: Columns, where: str, limits: Limits) -> None:
     if len(gaps):
         k = int(gaps[0])
         raise InputError(
-            f"{where}: row {k}: IMU gap of {t[k] - t[k - 1]:.3f} s after t = {t[k - 1]:.3f}; split the drive there "
-            "(dlkf.ingest split_gaps=true)"
+            f"{where}: row {k}: IMU gap of {t[k] - t[k - 1]:.3f} s after t = {t[k - 1]:.3f}; split the drive "
+            "there (dlkf.ingest split_gaps=true)"
         )
     check_imu_units(imu, where)
 
@@ -122,16 +130,20 @@ def _check_gnss(gnss: Columns, imu: Columns, where: str) -> None:
     _check_finite(gnss, (*POSITION, *VELOCITY, *STD), where, nan=True)
     fix = np.isin(gnss["quality"], GNSS_QUALITIES) & np.all([np.isfinite(gnss[c]) for c in POSITION], axis=0)
     if not fix.any():
-        raise InputError(f"{where}: no GNSS fix at all (position NaN or quality 0 in every row); leave the drive out")
+        raise InputError(
+            f"{where}: no GNSS fix at all (position NaN or quality 0 in every row); leave the drive out"
+        )
     for name in STD:
         bad = np.flatnonzero(gnss[name] < 0)
         if len(bad):
-            raise InputError(f"{where}: row {bad[0]}: {name} is {gnss[name][bad[0]]}; must be ≥ 0, or NaN if unknown")
+            raise InputError(
+                f"{where}: row {bad[0]}: {name} is {gnss[name][bad[0]]}; must be ≥ 0, or NaN if unknown"
+            )
     t, first, last = gnss["t"][fix], imu["t"][0], imu["t"][-1]
     if not ((t > first) & (t <= last + 1)).any():
         raise InputError(
-            f"{where}: fixes from t = {t[0]:.3f} to {t[-1]:.3f} lie outside the IMU's {first:.3f} to {last:.3f}; "
-            "both need the same clock"
+            f"{where}: fixes from t = {t[0]:.3f} to {t[-1]:.3f} lie outside the IMU's {first:.3f} to "
+            f"{last:.3f}; both need the same clock"
         )
     check_gnss_units({name: values[fix] for name, values in gnss.items()}, where)
 

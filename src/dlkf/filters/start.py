@@ -15,7 +15,7 @@ from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.state import NavState
 
 
-def align(drive: Drive, config: AlignConfig = AlignConfig(), *, earliest: int = 0) -> Start:
+def align(drive: Drive, config: AlignConfig = ALIGN, *, earliest: int = 0) -> Start:
     """Position, velocity and attitude at the first boundary ≥ ``earliest`` where the car moves under GNSS.
 
     Yaw from the course, roll and pitch by levelling (:mod:`dlkf.data.alignment`); the tangent origin is the
@@ -27,8 +27,8 @@ def align(drive: Drive, config: AlignConfig = AlignConfig(), *, earliest: int = 
     candidates = torch.nonzero(aligned.ok[earliest : drive.epochs]).flatten()
     if not len(candidates):
         raise InputError(
-            f"drive {drive.name}: never moves faster than {config.min_speed:g} m/s for {config.window_s:g} s with "
-            "GNSS, so yaw is unknown; lower align.min_speed or leave the drive out"
+            f"drive {drive.name}: never moves faster than {config.min_speed:g} m/s for {config.window_s:g} s "
+            "with GNSS, so yaw is unknown; lower align.min_speed or leave the drive out"
         )
     k = int(candidates[0]) + earliest
     lat, lon, height = geodetic_from_ecef(aligned.r_e[k])
@@ -38,7 +38,7 @@ def align(drive: Drive, config: AlignConfig = AlignConfig(), *, earliest: int = 
 
 
 def aligned_drives(
-    drives: Sequence[Drive], config: AlignConfig = AlignConfig(), *, dtype: torch.dtype = torch.float64
+    drives: Sequence[Drive], config: AlignConfig = ALIGN, *, dtype: torch.dtype = torch.float64
 ) -> Batch:
     """Complete drives, each from its own :func:`align`, as one padded batch."""
     return whole_drives(drives, [align(drive, config) for drive in drives], dtype=dtype)

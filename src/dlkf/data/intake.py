@@ -1,0 +1,80 @@
+"""Foreign logs into a dataset: read, split at gaps, write, check, all or nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from dlkf.data.readers.frames import DriveFrames
+from dlkf.data.schema import new_dataset, write_drive, write_drives_table
+from dlkf.data.validate import LIMITS, Limits, gap_rows, validate_dataset
+from dlkf.errors import InputError
+
+
+def ingest_drives(
+    drives: Iterable[DriveFrames],
+    out: str | Path,
+    *,
+    split_gaps: bool = False,
+    shortest_s: float = 10.0,
+    overwrite: bool = False,
+    limits: Limits = LIMITS,
+    progress: Callable[[str, int], None] | None = None,
+) -> int:
+    """Write drives as a dataset at ``out`` and return how many there are.
+
+    With ``split_gaps`` a drive with IMU gaps becomes parts ``<drive>-s0``, ``-s1``, … of one group; parts
+    shorter than ``shortest_s`` or without GNSS are left out. ``progress(drive, done)`` is called after each.
+    Raises InputError, leaving nothing behind, if a drive does not pass the checks or none is left.
+    """
+    rows = []
+    with new_dataset(out, overwrite) as folder:
+        for drive in drives:
+            for part in split_at_gaps(drive, shortest_s, limits) if split_gaps else [drive]:
+                rows.append(write_drive(folder, part.meta, part.imu, part.gnss, part.reference))
+                if progress is not None:
+                    progress(part.name, len(rows))
+        if not rows:
+            raise InputError(
+                f"out={out}: no drive of at least {shortest_s:g} s with GNSS; nothing was written"
+            )
+        write_drives_table(folder, rows)
+        validate_dataset(folder, limits=limits)
+    return len(rows)
+
+
+def split_at_gaps(drive: DriveFrames, shortest_s: float, limits: Limits = LIMITS) -> Iterator[DriveFrames]:
+    """The parts of a drive between its IMU gaps; the drive itself where it has none."""
+    t = drive.imu["t"].to_numpy()
+    gaps = gap_rows(t, limits)
+    if not len(gaps):
+        yield drive
+        return
+    edges = np.concatenate(([0], gaps, [len(t)]))
+    count = 0
+    for first, last in pairwise(edges):
+        begin, end = t[first], t[last - 1]
+        gnss = _between(drive.gnss, begin, end)
+        if end - begin < shortest_s or not len(gnss):
+            continue
+        reference = None if drive.reference is None else _between(drive.reference, begin, end)
+        if reference is not None and not len(reference):
+            reference = None
+        yield replace(
+            drive,
+            meta={**drive.meta, "drive": f"{drive.name}-s{count}"},
+            imu=drive.imu.iloc[first:last].reset_index(drop=True),
+            gnss=gnss,
+            reference=reference,
+        )
+        count += 1
+
+
+def _between(frame: pd.DataFrame, begin: float, end: float) -> pd.DataFrame:
+    t = frame["t"]
+    return frame[(t >= begin) & (t <= end)].reset_index(drop=True)
