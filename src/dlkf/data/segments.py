@@ -88,8 +88,8 @@ def possible_starts(
 
     The reference must be valid at the start and at ``min_valid`` of the boundaries after it, and a whole
     start state known, from the reference or, unless ``attitude`` asks for true attitude, from IMU and GNSS.
-    With ``span`` (a label per boundary, that of the epoch it begins) a piece must stay inside one span; −1 belongs
-    to none.
+    With ``span`` (a label per boundary, that of the epoch it begins; −1 belongs to none) a piece must stay
+    inside one span.
     """
     stack = stacked(drives)
     truth = stack.start_from_truth

@@ -10,7 +10,7 @@ import torch
 from dlkf.data.drive import Drive
 from dlkf.data.resampling import assign_fixes, epoch_grid, reference_at, resample_imu
 from dlkf.data.tables import dataset_digest, read_drives
-from dlkf.data.validate import GNSS_QUALITIES, DriveTables, Limits, read_checked
+from dlkf.data.validate import GNSS_QUALITIES, LIMITS, DriveTables, Limits, read_checked
 from dlkf.errors import InputError
 
 __all__ = ["dataset_digest", "drive_from_tables", "load_dataset"]

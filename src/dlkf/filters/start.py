@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
-from dlkf.data.alignment import AlignConfig, Start, align_boundaries
+from dlkf.data.alignment import ALIGN, AlignConfig, Start, align_boundaries
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.geodetic import geodetic_from_ecef
 from dlkf.data.segments import whole_drives
