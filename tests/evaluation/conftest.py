@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import fields, replace
+from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 import torch
 
 from dlkf.data.drive import Batch
-from dlkf.navigation.attitude import rotation_from_rpy
-from dlkf.navigation.earth import tangent_frame
+from dlkf.data.geodetic import geodetic_from_ecef
+from dlkf.data.schema import write_drive, write_drives_table
+from dlkf.navigation.attitude import rotation_from_rpy, rpy_from_rotation
+from dlkf.navigation.earth import ned_axes, tangent_frame
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import strapdown
@@ -94,3 +100,50 @@ def in_precision(batch: Batch, dtype: torch.dtype) -> Batch:
 def cars() -> Batch:
     """Six pieces of 60 s."""
     return car_batch(6, 60)
+
+
+def write_cars(folder: Path, batch: Batch, kinds: Sequence[str] = ()) -> Path:
+    """The pieces of a batch as a dataset: IMU at its rate, GNSS and reference at 1 Hz, from t = 100 s on."""
+    B, T, M = batch.size
+    rows = []
+    for i in range(B):
+        C_en = batch.frame.C_en[i]
+        t = 100.0 + np.arange(1, T * M + 1) * batch.dt
+        imu = batch.imu[i].reshape(-1, 6).numpy()
+        fixes = 100.0 + np.arange(1, T + 1)
+
+        def placed(p_n: torch.Tensor, v_n: torch.Tensor, i: int = i, C_en: torch.Tensor = C_en) -> dict:
+            r_e = batch.frame.to_ecef(p_n.expand(B, *p_n.shape))[i]
+            lat, lon, height = geodetic_from_ecef(r_e)
+            v = torch.einsum("tji,jk,tk->ti", ned_axes(lat, lon), C_en, v_n)
+            return {
+                "lat_deg": torch.rad2deg(lat), "lon_deg": torch.rad2deg(lon), "height_m": height,
+                "vel_n": v[:, 0], "vel_e": v[:, 1], "vel_d": v[:, 2],
+            }  # fmt: skip
+
+        gnss = placed(batch.gnss[i, :, :3], batch.gnss[i, :, 3:])
+        std = {f"std_{k}_{a}": np.full(T, s) for k, s in (("pos", 0.03), ("vel", 0.02)) for a in "ned"}
+        truth = placed(batch.truth.p_n[i], batch.truth.v_n[i])
+        rpy = rpy_from_rotation(batch.truth.C_nb[i])  # within 1.5e-4 rad of local NED over a kilometre
+        angles = dict(zip(("roll", "pitch", "yaw"), rpy.T.numpy()))
+        named = [f"{s}_{a}" for s in ("accel", "gyro") for a in "xyz"]
+        meta = {"drive": batch.drive[i], "group": f"g{i % 3}", "source": "simulated by a test"}
+        if kinds:
+            meta["kind"] = kinds[i]
+        rows.append(
+            write_drive(
+                folder,
+                meta,
+                pd.DataFrame({"t": t} | dict(zip(named, imu.T))),
+                pd.DataFrame({"t": fixes} | gnss | std | {"quality": np.full(T, 4)}),
+                pd.DataFrame({"t": fixes} | truth | angles | {"valid": np.ones(T, bool)}),
+            )
+        )
+    write_drives_table(folder, rows)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def town(cars, tmp_path_factory) -> Path:
+    """The six pieces as a dataset."""
+    return write_cars(tmp_path_factory.mktemp("data") / "town", cars)

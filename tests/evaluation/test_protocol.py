@@ -1,0 +1,150 @@
+"""From a dataset to scenes, scores and solutions."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pyarrow.parquet as pq
+import pymap3d
+import pytest
+import torch
+
+from dlkf.data.store import load_dataset
+from dlkf.errors import InputError
+from dlkf.evaluation.drives import navigate_drives
+from dlkf.evaluation.kinds import drive_kinds
+from dlkf.evaluation.outages import OutagePlan
+from dlkf.evaluation.protocol import Protocol, Scenes, protocol_from
+from dlkf.evaluation.report import all_tables
+from dlkf.evaluation.study import study
+from dlkf.filters.build import build_filter
+from dlkf.models import resolve_model, resolve_models
+from tests.evaluation.conftest import IMU
+
+MBKF = build_filter("mbkf15", IMU)
+
+
+@pytest.fixture(scope="module")
+def drives(town):
+    return load_dataset(town, rate_hz=20, dtype=torch.float64)
+
+
+def test_pieces_are_cut_where_truth_allows_and_outages_put_in(drives):
+    protocol = Protocol(length_s=25, stride_s=25, outage=OutagePlan(first_s=10, duration_s=10), seed=1)
+    scenes = Scenes(drives, protocol)
+    (batch, mask), again = next(iter(scenes)), next(iter(scenes))
+    assert scenes.mode == "pieces" and scenes.runs == batch.size[0] == 12 and batch.size[1] == 25
+    assert mask[:, 10:20].all() and mask.sum() == 12 * 10
+    assert torch.equal(batch.start.p_n, again[0].start.p_n)  # iterating again is the same experiment
+    other = next(iter(Scenes(drives, replace(protocol, seed=2))))[0]
+    assert not torch.equal(batch.start.p_n, other.start.p_n)
+
+
+def test_truth_without_attitude_means_whole_drives_from_their_own_alignment(drives):
+    nothing = torch.full_like(drives[0].ref_C_eb, torch.nan)
+    blind = [replace(d, ref_C_eb=nothing) for d in drives]
+    scenes = Scenes(blind, Protocol(outage=OutagePlan(first_s=10, duration_s=10)))
+    assert scenes.mode == "drives" and scenes.runs == 12 and scenes.outage.offsets_s == (0.0, 10.0)
+    masks = torch.stack([mask for _, mask in scenes])
+    t = torch.arange(1, masks.shape[-1] + 1)
+    assert masks.any(0)[:, (t > 10) & (t <= 50)].all() and not masks.all(0).any()  # covered, once each
+    _, (result,) = study({"mbkf15": MBKF}, scenes, kinds="real")
+    pieces = result["filters"]["mbkf15"]["pieces"]
+    assert pieces["attitude"]["all"]["n"] == 0 and pieces["position"]["all"]["n"] == 12
+    assert result["filters"]["mbkf15"]["outages"]["end"]["horizontal"]["rms"] < 5
+    assert len(all_tables("town", [result])) == 2
+
+
+def test_study_reports_each_kind_apart_and_the_slope_of_an_injected_bias(drives):
+    scenes = Scenes(drives, Protocol(length_s=50, stride_s=50))
+    kinds = {d.name: "real" if i < 2 else "simulated" for i, d in enumerate(drives)}
+    groups = {d.name: d.group for d in drives}
+    bias = {"accel": 0.03, "gyro": 1e-3}
+    _, made = study({"mbkf15": MBKF}, scenes, kinds=kinds, groups=groups, injected_bias=bias)
+    assert [(r["kind"], r["count"]["pieces"]) for r in made] == [("real", 2), ("simulated", 4)]
+    for r in made:
+        slope = r["filters"]["mbkf15"]["imu_error"]["injected_slope"]
+        assert slope[2] == pytest.approx(1, abs=0.1) and slope[3] == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"mode": "piece"}, "mode=piece"),
+        ({"mode": "pieces", "length_s": 500}, "no piece of 500 s"),
+        ({"length_s": 40, "outage": {"first_s": 30, "duration_s": 20}}, "outage ends after 50 s"),
+        ({"outage": {"start": 3}}, "unknown key start"),
+        ({"length_s": -1}, "length_s"),
+    ],
+)
+def test_impossible_protocols_are_refused(drives, settings, said):
+    with pytest.raises(InputError, match=said):
+        Scenes(drives, protocol_from(settings))
+
+
+def test_kinds_come_from_the_dataset(town):
+    assert set(drive_kinds(town).values()) == {"simulated"}
+
+
+def test_navigation_of_whole_drives_without_a_reference_folder(town, tmp_path, cars):
+    shutil.copytree(town, tmp_path / "town")
+    shutil.rmtree(tmp_path / "town" / "reference")
+    drives = load_dataset(tmp_path / "town", rate_hz=20, dtype=torch.float64, reference=False)
+    results = {r.drive: r for r in navigate_drives(drives, MBKF)}
+    assert set(results) == set(cars.drive)
+    for i, name in enumerate(cars.drive):
+        table = results[name].table
+        truth = pq.read_table(town / "reference" / f"drive={name}" / "part-0.parquet").to_pandas()
+        both = table.merge(truth, on="t", suffixes=("", "_true"))
+        assert len(both) == len(table) > 50
+        north, east, down = pymap3d.geodetic2ned(
+            *both[["lat_deg", "lon_deg", "height_m"]].to_numpy().T,
+            *both[["lat_deg_true", "lon_deg_true", "height_m_true"]].to_numpy().T,
+        )
+        late = both.t > 130
+        assert np.hypot(north, east)[late].max() < 0.2 and np.abs(down)[late].max() < 0.2  # cm GNSS
+        turn = np.angle(np.exp(1j * (both.yaw - both.yaw_true)))
+        assert np.abs(turn[late]).max() < np.radians(3)
+        assert both.gnss_used.all() and np.isfinite(table.drop(columns="gnss_used")).all().all()
+        bias = cars.true_imu_error[i, -1].numpy()
+        assert abs(table.accel_error_z.iloc[-1] - bias[2]) < 5e-3  # the down axis is seen at once
+    assert "fixes used" in results[cars.drive[0]].summary()
+
+
+def test_the_reference_is_never_opened(town, tmp_path):
+    """What lies in reference/ is unreadable, and nobody notices."""
+    shutil.copytree(town, tmp_path / "town")
+    for path in (tmp_path / "town" / "reference").rglob("*.parquet"):
+        path.write_bytes(b"not Parquet")
+    with pytest.raises(InputError):
+        load_dataset(tmp_path / "town", rate_hz=20)
+    drives = load_dataset(tmp_path / "town", rate_hz=20, dtype=torch.float64, reference=False)
+    assert len(list(navigate_drives(drives[:1], MBKF))) == 1
+
+
+def test_a_drive_that_cannot_be_aligned_is_named_or_left_out(drives):
+    lost = replace(drives[0], gnss_valid=torch.zeros_like(drives[0].gnss_valid))
+    with pytest.raises(InputError, match="car-00: no GNSS"):
+        list(navigate_drives([lost, drives[1]], MBKF))
+    skipped = {}
+    assert [r.drive for r in navigate_drives([lost, drives[1]], MBKF, skipped=skipped)] == ["car-01"]
+    assert "car-00" in skipped["car-00"]
+    with pytest.raises(InputError, match="car-00"):
+        list(navigate_drives([lost], MBKF, skipped={}))
+
+
+def test_models_by_name_and_folder(tmp_path):
+    models = resolve_models(["ins", "mbkf15", "mbkf15"], IMU, tuning={"accel_noise": 2.0})
+    assert list(models) == ["ins", "mbkf15", "mbkf15#2"] and models["mbkf15"].tuning.accel_noise == 2.0
+    prior = {"mean": [0.0] * 6, "std": [1.0] * 6}
+    assert resolve_model("mbkf15_prior", IMU, prior=prior).prior_std == (1.0,) * 6
+    for spec, said in (
+        ("mbkf99", "ins, mbkf15"),
+        (str(tmp_path), "no config.yaml"),
+        ("mbkf15_prior", "prior"),
+    ):
+        with pytest.raises(InputError, match=said):
+            resolve_model(spec, IMU)
+    (tmp_path / "model.pkl").write_bytes(b"\x80\x04")
+    with pytest.raises(InputError, match="is a file"):
+        resolve_model(str(tmp_path / "model.pkl"), IMU)
