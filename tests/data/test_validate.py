@@ -1,0 +1,200 @@
+"""Every kind of bad input is told in one line that names the drive; good and odd data pass."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from dlkf.data.schema import drive_file, write_drive, write_drives_table
+from dlkf.data.store import load_dataset
+from dlkf.data.validate import Limits, validate_dataset
+from dlkf.errors import InputError
+from tests.data.conftest import REAL, Tables
+
+NAME = "town-7"
+
+
+def _write(folder, tables: Tables) -> None:
+    row = write_drive(folder, {"drive": NAME}, tables["imu"], tables["gnss"], tables.get("reference"))
+    write_drives_table(folder, [row])
+
+
+def _complaint(folder, **kwargs) -> str:
+    with pytest.raises(InputError) as error:
+        validate_dataset(folder, **kwargs)
+    text = str(error.value)
+    assert "\n" not in text and len(text) < 400
+    return text
+
+
+def _set(kind: str, column: str, change):
+    def apply(tables: Tables) -> Tables:
+        frame = tables[kind].copy()
+        frame[column] = change(frame[column].to_numpy().copy())
+        return {**tables, kind: frame}
+
+    return apply
+
+
+def _rows(kind: str, pick):
+    return lambda tables: {**tables, kind: pick(tables[kind]).reset_index(drop=True)}
+
+
+def _at(row: int, value):
+    def change(x: np.ndarray) -> np.ndarray:
+        x[row] = value
+        return x
+
+    return change
+
+
+def _columns(kind: str, change):
+    def apply(tables: Tables) -> Tables:
+        frame = tables[kind].copy()
+        change(frame)
+        return {**tables, kind: frame}
+
+    return apply
+
+
+def _swap(a: str, b: str):
+    def change(frame: pd.DataFrame) -> None:
+        frame[a], frame[b] = frame[b].copy(), frame[a].copy()
+
+    return change
+
+
+def _scale(names: list[str], factor):
+    def change(frame: pd.DataFrame) -> None:
+        frame[names] = frame[names] * factor
+
+    return change
+
+
+GYRO, ACCEL = ["gyro_x", "gyro_y", "gyro_z"], ["accel_x", "accel_y", "accel_z"]
+BAD = {
+    "nan in the IMU": (_set("imu", "gyro_y", _at(17, np.nan)), "row 17: gyro_y is nan"),
+    "inf in the IMU": (_set("imu", "accel_x", _at(18, np.inf)), "row 18: accel_x is inf"),
+    "time goes back": (_set("imu", "t", _at(100, 0.5)), "row 100: t goes back"),
+    "duplicate stamp": (_set("imu", "t", lambda t: _at(100, t[99])(t)), "row 100: t = 1.0.* stands twice"),
+    "nan time": (_set("gnss", "t", _at(3, np.nan)), "row 3: t is nan"),
+    "IMU gap": (_rows("imu", lambda f: f.drop(f.index[1000:1100])), "IMU gap of 1.010 s after t = 10.000"),
+    "no samples": (_rows("imu", lambda f: f.iloc[:0]), "has no rows"),
+    "no fixes": (_rows("gnss", lambda f: f.iloc[:0]), "has no rows"),
+    "no fix at all": (_set("gnss", "quality", lambda q: 0 * q), "no GNSS fix at all"),
+    "degrees per second": (_columns("imu", _scale(GYRO, 180 / np.pi)), "looks like degrees"),
+    "g": (_columns("imu", _scale(ACCEL, 1 / 9.80665)), "looks like g; multiply"),
+    "no gravity": (_columns("imu", _scale(["accel_z"], 0.01)), "median specific force"),
+    "z up": (_columns("imu", _scale(["accel_y", "accel_z", "gyro_y", "gyro_z"], -1)), "points up"),
+    "gyro z up": (_columns("imu", _scale(["gyro_z"], -1)), "gyro_z turns against the course"),
+    "wrong axis": (_columns("imu", _swap("accel_x", "accel_z")), "gravity lies on accel_x"),
+    "swapped position": (_columns("gnss", _swap("lat_deg", "lon_deg")), "latitude and longitude look swapped"),
+    "latitude out of range": (_columns("gnss", _scale(["lat_deg"], 2)), "lat_deg is 97.*swapped"),
+    "radians": (_columns("gnss", _scale(["lat_deg", "lon_deg"], np.pi / 180)), "look like radians"),
+    "swapped velocity": (_columns("gnss", _swap("vel_n", "vel_e")), "vel_n and vel_e look swapped"),
+    "km/h": (_columns("gnss", _scale(["vel_n", "vel_e", "vel_d"], 3.6)), "km/h"),
+    "another clock": (_set("gnss", "t", lambda t: t + 1e5), "same clock"),
+    "negative std": (_set("gnss", "std_pos_n", _at(2, -1.0)), "row 2: std_pos_n is -1.0"),
+    "attitude in degrees": (_columns("reference", _scale(["yaw"], 180 / np.pi)), "yaw reaches .* degrees"),
+    "yaw from East": (_set("reference", "yaw", lambda y: np.pi / 2 - y), "yaw counts from East"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_numbers(tmp_path, tables, case):
+    change, told = BAD[case]
+    _write(tmp_path, change(tables))
+    text = _complaint(tmp_path)
+    assert NAME in text
+    import re
+
+    assert re.search(told, text), text
+
+
+@pytest.mark.parametrize("kind", ["imu", "gnss", "reference"])
+def test_damaged_files(tmp_path, tables, kind):
+    _write(tmp_path, tables)
+    path = drive_file(tmp_path, kind, NAME)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    text = _complaint(tmp_path)
+    assert NAME in text and "not a whole Parquet file" in text
+    path.write_bytes(b"")
+    assert "not a whole Parquet file" in _complaint(tmp_path)
+    frame = tables[kind].drop(columns=tables[kind].columns[1])
+    frame.to_parquet(path)
+    text = _complaint(tmp_path)
+    assert NAME in text and f"column {tables[kind].columns[1]} missing" in text
+    frame = tables[kind].copy()
+    frame[frame.columns[2]] = frame[frame.columns[2]].astype(str)
+    frame.to_parquet(path)
+    text = _complaint(tmp_path)
+    assert NAME in text and "must be double" in text
+
+
+def test_missing_parts(tmp_path, tables):
+    assert "no such folder" in _complaint(tmp_path / "nowhere")
+    assert "drives.parquet is missing" in _complaint(tmp_path)
+    _write(tmp_path, tables)
+    shutil.move(tmp_path / "gnss", tmp_path / "gps")
+    assert f"drive {NAME}: no GNSS" in _complaint(tmp_path)
+    shutil.move(tmp_path / "gps", tmp_path / "gnss")
+    shutil.rmtree(tmp_path / "imu" / f"drive={NAME}")
+    assert f"drive {NAME}: imu/drive={NAME}/ has no Parquet file" in _complaint(tmp_path)
+    row = {"drive": NAME}
+    write_drives_table(tmp_path, [row, row])
+    assert "stands twice" in _complaint(tmp_path)
+
+
+def test_what_a_source_does_not_know_may_be_nan(tmp_path, tables):
+    gnss = tables["gnss"].copy()
+    gnss[[c for c in gnss if c.startswith("std") or c == "vel_d"]] = np.nan
+    reference = tables["reference"].copy()
+    reference[["roll", "pitch", "yaw"]] = np.nan
+    _write(tmp_path, {**tables, "gnss": gnss, "reference": reference})
+    assert [row.name for row in validate_dataset(tmp_path)] == [NAME]
+    _write(tmp_path, {**tables, "gnss": gnss.assign(vel_n=np.nan, vel_e=np.nan)})
+    validate_dataset(tmp_path)
+
+
+def test_whole_numbers_may_stand_for_floats(tmp_path, tables):
+    _write(tmp_path, tables)
+    path = drive_file(tmp_path, "gnss", NAME)
+    tables["gnss"].assign(height_m=200, quality=np.float32(4)).to_parquet(path)
+    drive = load_dataset(tmp_path)[0]
+    assert set(drive.quality.tolist()) == {4}
+
+
+def test_a_broken_reference_is_not_opened_where_none_is_asked_for(tmp_path, tables):
+    _write(tmp_path, tables)
+    drive_file(tmp_path, "reference", NAME).write_bytes(b"no Parquet")
+    assert len(validate_dataset(tmp_path, reference=False)) == 1
+    assert not load_dataset(tmp_path, reference=False)[0].ref_valid.any()
+    shutil.rmtree(tmp_path / "reference")
+    assert not load_dataset(tmp_path)[0].ref_valid.any()
+
+
+def test_limits_of_gaps_are_configurable(tmp_path, tables):
+    _write(tmp_path, _rows("imu", lambda f: f.drop(f.index[1000:1020]))(tables))
+    validate_dataset(tmp_path)  # 0.21 s
+    assert "IMU gap of 0.210" in _complaint(tmp_path, limits=Limits(gap_s=0.1))
+
+
+def test_noisy_gnss_raises_no_alarm(tmp_path, tables):
+    """Position noise of 5 m and velocity noise of 2 m/s, the worst that the paper simulates (checklist 2.10)."""
+    rng = np.random.default_rng(1)
+    gnss = tables["gnss"].copy()
+    for names, sigma in ((["lat_deg", "lon_deg"], 5 / 111e3), (["vel_n", "vel_e", "vel_d"], 2.0)):
+        gnss[names] += sigma * rng.standard_normal((len(gnss), len(names)))
+    _write(tmp_path, {**tables, "gnss": gnss})
+    validate_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["rtkx", "kitti", "comma2k19"])
+def test_real_drives_pass(name):
+    if not (REAL / name).is_dir():
+        pytest.skip("real drives are not here")
+    assert validate_dataset(REAL / name)
