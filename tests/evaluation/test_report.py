@@ -40,8 +40,8 @@ def test_numbers_are_plain():
 def test_tables_hold_the_results(scores):
     r = results(scores, resamples=200)
     whole, outages = tables("town", r)
-    assert whole.title == "town (simulated): 6 pieces of 6 drives"
-    assert outages.title == "town (simulated): 6 outages of 20 s in 6 drives"
+    assert whole.title == "town (simulated): 6 pieces, 6 drives"
+    assert outages.title == "town (simulated): 6 outages of 20 s, 6 drives"
     end = r["filters"]["mbkf15"]["outages"]["end"]["horizontal"]
     assert outages.rows[1][:4] == ["mbkf15", *(number(end[s]) for s in ("rms", "median", "p95"))]
     assert outages.rows[1][-1] == "1" and "[" in outages.rows[0][-1]

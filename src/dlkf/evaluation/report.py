@@ -60,16 +60,16 @@ def all_figures(
         return
     middle = chosen[len(chosen) // 2]
     if scores.outage.any():
-        yield "error_growth", "Horizontal error against the time without GNSS.", figures.error_growth(scores)
+        yield "error_growth", "horizontal error against the time without GNSS", figures.error_growth(scores)
     yield (
         "tracks",
-        "Tracks of pieces from good to bad (quantiles of the error of the baseline).",
+        "tracks of pieces from good to bad (quantiles of the error of the baseline)",
         figures.tracks(scores, chosen),
     )
     if by_time and len(scores.pieces) > 1:
-        yield "error_over_time", "Errors over time, all pieces.", figures.error_over_time(scores)
-    yield "error_over_time_one", "Errors over time, one piece.", figures.error_over_time(scores, [middle])
-    yield "imu_errors", "IMU-error estimates, one piece.", figures.imu_errors(scores, [middle])
+        yield "error_over_time", "errors over time, all pieces", figures.error_over_time(scores)
+    yield "error_over_time_one", "errors over time, one piece", figures.error_over_time(scores, [middle])
+    yield "imu_errors", "IMU-error estimates, one piece", figures.imu_errors(scores, [middle])
 
 
 def write_report(
@@ -93,7 +93,7 @@ def write_report(
     for kind in scores.kinds:
         suffix = "" if len(scores.kinds) == 1 else f"_{kind}"
         for name, caption, figure in all_figures(scores.of_kind(kind), by_time=by_time, baseline=baseline):
-            pictures.append((f"{name}{suffix}.png", f"{caption} ({kind})", png(figure, dpi)))
+            pictures.append((f"{name}{suffix}.png", f"{kind.capitalize()} data: {caption}", png(figure, dpi)))
     files: dict[str, bytes] = {
         "metrics.json": as_json(
             {"dataset": dataset, "protocol": protocol, "results": list(results)}

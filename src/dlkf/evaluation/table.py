@@ -54,10 +54,11 @@ def tables(dataset: str, result: dict[str, Any]) -> list[Table]:
     """The tables of one kind of data: whole pieces, then outages if there are any."""
     n = result["count"]
     what = f"{dataset} ({result['kind']})"
+    unit = "run" if n["repeated"] else "piece"
     settled = f"after {result['settle_s']:g} s"
     whole = Table(
-        title=f"{what}: {_count(n['pieces'], 'piece')} of {_count(n['drives'], 'drive')}",
-        note="RMS over each piece, then RMS over the pieces; median and 95 % over the pieces.",
+        title=f"{what}: {_count(n['pieces'], unit)}, {_count(n['drives'], 'drive')}",
+        note=f"RMS over each {unit}, then RMS over the {unit}s; median and 95 % over the {unit}s.",
         columns=[
             "Filter", "3D\n[m]", f"3D, {settled}\n[m]", f"Horiz., {settled}\n[m]", "median\n[m]", "95 %\n[m]",
             "Velocity\n[m/s]", "Attitude\n[°]", "Heading\n[°]",
@@ -77,7 +78,7 @@ def tables(dataset: str, result: dict[str, Any]) -> list[Table]:
     if any(broken):
         whole.columns.append("Not\nfinite")
         for row, count in zip(whole.rows, broken):
-            row.append(_count(count, "piece"))
+            row.append(_count(count, unit))
     return [whole] if not n["outages"] else [whole, outage_table(what, result)]
 
 
@@ -95,7 +96,7 @@ def outage_table(what: str, result: dict[str, Any]) -> Table:
             f" Last column: horizontal RMS at the end, ratio to {against}, 95 % interval by paired bootstrap."
         )
     table = Table(
-        title=f"{what}: {_count(n['outages'], 'outage')} of {length} in {_count(n['drives'], 'drive')}",
+        title=f"{what}: {_count(n['outages'], 'outage')} of {length}, {_count(n['outage_drives'], 'drive')}",
         note=note,
         columns=["Filter", "End, RMS\n[m]", "median\n[m]", "95 %\n[m]"]
         + [f"{s} s\n[m]" for s in at]
