@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from dlkf.data.schema import write_drive, write_drives_table
+from dlkf.navigation.attitude import rpy_from_rotation
 from dlkf.navigation.earth import ned_axes, tangent_frame
 
 REAL = Path(__file__).parents[2].parent / "shared" / "data" / "real"
@@ -19,7 +20,7 @@ Tables = dict[str, pd.DataFrame]
 
 
 def car(seconds: float = 60.0, rate: float = 100.0, gnss_hz: float = 1.0, t0: float = 0.0) -> Tables:
-    """Speed 10 ± 3 m/s, gentle turns, level road; the path of every call is the same."""
+    """Speed 10 ± 3 m/s, gentle turns, a plane road; the path of every call is the same."""
     dt = 1 / (rate * FINE)
     n = round(seconds * rate) * FINE
     t = np.arange(n + 1) * dt
@@ -59,8 +60,8 @@ def car(seconds: float = 60.0, rate: float = 100.0, gnss_hz: float = 1.0, t0: fl
         gnss[f"std_pos_{axis}"], gnss[f"std_vel_{axis}"] = 0.02, 0.05
     gnss["quality"] = 4
     reference = state.iloc[:: FINE * round(rate / 10)].reset_index(drop=True)
-    reference["roll"], reference["pitch"] = 0.0, 0.0
-    reference["yaw"] = np.mod(yaw[:: FINE * round(rate / 10)] + np.pi, 2 * np.pi) - np.pi
+    C_lb = np.einsum("tji,jk,tkl->til", C_el, frame.C_en[0].numpy(), C_nb)[:: FINE * round(rate / 10)]
+    reference[["roll", "pitch", "yaw"]] = rpy_from_rotation(torch.from_numpy(C_lb)).numpy()
     reference["valid"] = True
     return {"imu": imu, "gnss": gnss, "reference": reference}
 

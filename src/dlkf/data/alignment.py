@@ -23,6 +23,7 @@ from dlkf.navigation.state import NavState
 SIDESLIP_STD = math.radians(1.5)  # course is not heading: sideslip, mounting yaw
 ACCEL_BIAS_STD = 0.1  # m/s²; tilts the level by bias / g
 UNKNOWN_VELOCITY_STD, UNKNOWN_SLOPE_STD = 0.2, 0.05  # m/s and slope of the road, where v_d is not measured
+JERK_STD = 0.7  # m/s³, of a car
 SPREAD_STD = math.radians(0.5)  # lever arm to the rear axle, vibration
 
 
@@ -105,7 +106,9 @@ def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     r_e = r_e - (C_en @ C_nb @ drive.lever_arm_b).reshape(rows, 3)
 
     noise = v_std[:, :2].amax(-1)
-    tilt = torch.sqrt((ACCEL_BIAS_STD / 9.8) ** 2 + (1.41 * noise / (9.8 * span)) ** 2 + SPREAD_STD**2)
+    shift = torch.maximum(drive.gnss_lag, drive.gnss_lag[then])  # of the velocities' window against the IMU's
+    pull = (1.41 * noise / span) ** 2 + (JERK_STD * shift) ** 2 + ACCEL_BIAS_STD**2  # (m/s²)²
+    tilt = torch.sqrt(pull / 9.8**2 + SPREAD_STD**2)
     heading = torch.sqrt(SIDESLIP_STD**2 + (noise / speed.clamp_min(0.1)) ** 2)
     attitude_std = torch.stack((tilt, tilt, heading), -1)
     std = torch.cat((drive.gnss_std[:, :3], v_std, attitude_std), -1)

@@ -1,0 +1,159 @@
+"""Splits share no recording; batches depend on seed, epoch and step alone."""
+
+from __future__ import annotations
+
+import lightning as L
+import pytest
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+
+from dlkf.data.datamodule import DriveDataModule
+from dlkf.data.segments import inject_outage
+from dlkf.errors import InputError
+from tests.data.conftest import REAL, write_cars
+
+
+def _module(*folders, **kwargs) -> DriveDataModule:
+    defaults = {"length_s": 10.0, "eval_length_s": 20.0, "batch_size": 4, "rate_hz": 10.0}
+    return DriveDataModule(list(folders), **{**defaults, **kwargs})
+
+
+def test_no_group_is_on_two_sides(tmp_path):
+    folder = write_cars(tmp_path / "set", 12, groups=5, seconds=20)
+    for seed in range(4):
+        data = _module(folder, split_seed=seed)
+        groups = {side: {d.group for d in data.drives(side)} for side in ("train", "val", "test")}
+        assert all(groups.values()) and sum(len(g) for g in groups.values()) == 5
+        assert sum(row["drives"] for row in data.summary()) == 12
+        pieces = {side: {p.drive for p in data.pieces(side)} for side in ("val", "test")}
+        trained = {p.drive for batch in data.train_pieces(0) for p in batch}
+        assert not trained & pieces["val"] and not trained & pieces["test"] and not pieces["val"] & pieces["test"]
+
+
+def test_the_same_recording_in_two_datasets_stays_on_one_side(town, tmp_path):
+    other = write_cars(tmp_path / "again", 6, seconds=20)
+    data = _module(town, other)
+    for side in ("train", "val", "test"):
+        drives = data.drives(side)
+        assert len(drives) == 2 * len({d.group for d in drives})
+        assert {d.dataset for d in drives} == {"town", "again"}
+
+
+def test_named_groups_and_their_mistakes(town):
+    data = _module(town, split={"train": "rest", "val": ["day-1"], "test": ["day-0", "day-4"]})
+    assert [len(data.drives(s)) for s in ("train", "val", "test")] == [3, 1, 2]
+    everything = _module(town, split={"test": "all"})
+    assert len(everything.drives("test")) == 6 and everything.val_dataloader() == []
+    for split, told in (
+        ({"train": ["day-9"]}, "split.train: no group day-9; has day-0"),
+        ({"train": "rest", "test": "all"}, "on one side only"),
+        ({"learn": ["day-1"]}, "unknown side learn"),
+        ("by_hand", "split=by_hand"),
+    ):
+        with pytest.raises(InputError, match=told):
+            _module(town, split=split).setup()
+    with pytest.raises(InputError, match="needs a group for each of train, val, test, but there are only 1"):
+        _module(write_cars(town.parent / "single", 1, seconds=20)).setup()
+    with pytest.raises(InputError, match="fractions"):
+        _module(town, fractions=(0.5, 0.1, 0.1)).setup()
+    with pytest.raises(InputError, match="no training piece of 90 s"):
+        _module(town, length_s=90).train_pieces(0)
+
+
+def test_the_papers_split_shuffles_blocks(town):
+    data = _module(town, split="random", fractions=(0.5, 0.25, 0.25))
+    assert [row["pieces"] for row in data.summary()] == [9, 5, 4]
+    assert [row["minutes"] for row in data.summary()] == pytest.approx([3.0, 1.7, 1.3], abs=0.05)
+    used = {side: set() for side in ("train", "val", "test")}
+    for side in ("val", "test"):
+        used[side] = {(p.drive, p.first + k) for p in data.pieces(side) for k in range(p.epochs)}
+    for epoch in range(5):
+        pieces = [p for batch in data.train_pieces(epoch) for p in batch]
+        used["train"] |= {(p.drive, p.first + k) for p in pieces for k in range(p.epochs)}
+    assert not used["train"] & used["val"] and not used["train"] & used["test"]
+
+
+def test_an_epoch_covers_the_training_time_once_from_random_starts(town):
+    data = _module(town, split={"train": "all"})
+    first = [[p for b in data.train_pieces(e) for p in b] for e in range(30)]
+    assert {len(pieces) for pieces in first} == {36}  # 6 drives · 60 s / 10 s
+    assert len({tuple(pieces) for pieces in first}) == 30
+    starts = {(p.drive, p.first) for pieces in first for p in pieces}
+    assert len(starts) > 0.9 * 6 * 51  # nearly every possible start has come up
+    data.length_law = lambda epoch: 10.0 + 10 * epoch
+    assert {p.epochs for b in data.train_pieces(2) for p in b} == {30}
+
+
+def test_batches_depend_on_seed_epoch_and_step_alone(town):
+    a, b = _module(town, turn_frames=True, bias_injection=(0.1, 0.3)), _module(
+        town, turn_frames=True, bias_injection=(0.1, 0.3)
+    )  # fmt: skip
+    b.train_batch(0, 0), b.train_pieces(7)
+    for epoch, step in ((0, 2), (3, 0)):
+        x, y = a.train_batch(epoch, step), b.train_batch(epoch, step)
+        assert torch.equal(x.imu, y.imu) and torch.equal(x.start.C_nb, y.start.C_nb) and x.drive == y.drive
+    assert not torch.equal(a.train_batch(0, 2).imu, _module(town, seed=1).train_batch(0, 2).imu)
+    whole = a.train_batch(1, 0)
+    shares = [a.train_batch(1, 0, (k, 2)) for k in range(2)]
+    assert torch.equal(torch.stack([s.imu for s in shares], 1).flatten(0, 1), whole.imu)
+
+
+def test_scoring_batches_are_fixed(town):
+    data = _module(town, eval_outage=(5, 10), eval_stride_s=10)
+    one, two = data.batches("test"), _module(town, eval_outage=(5, 10), eval_stride_s=10).batches("test")
+    assert all(torch.equal(x.start.p_n, y.start.p_n) for x, y in zip(one, two))
+    plain = _module(town, eval_stride_s=10).batches("test")
+    assert torch.equal(inject_outage(plain[0], 5, 10).available, one[0].available)
+    assert (~one[0].available).sum(1).unique().tolist() == [10]
+    assert len(data.describe().splitlines()) == 4
+
+
+class _Recorder(L.LightningModule):
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(1))
+        self.seen: list[tuple] = []
+
+    def training_step(self, batch, step):
+        self.seen.append((self.current_epoch, step, batch.size[1], float(batch.start.p_n.sum())))
+        return self.weight * 1
+
+    def validation_step(self, batch, step):
+        pass
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), 0.1)
+
+
+def _fit(town, folder, checkpoint=None, callbacks=()):
+    data, recorder = _module(town), _Recorder()
+    data.length_law = lambda epoch: 10.0 + 10 * (epoch // 2)
+    trainer = L.Trainer(
+        max_epochs=3, logger=False, enable_progress_bar=False, enable_model_summary=False, accelerator="cpu",
+        reload_dataloaders_every_n_epochs=1, default_root_dir=folder, callbacks=list(callbacks),
+        enable_checkpointing=bool(callbacks),
+    )  # fmt: skip
+    trainer.fit(recorder, data, ckpt_path=checkpoint)
+    return recorder.seen
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_resumed_run_sees_the_batches_of_an_uninterrupted_one(town, tmp_path):
+    every = ModelCheckpoint(tmp_path, every_n_train_steps=2, save_top_k=-1)
+    whole = _fit(town, tmp_path, callbacks=[every])
+    assert [x[2] for x in whole if x[0] == 2] == [20] * len([x for x in whole if x[0] == 2])
+    for path in sorted(tmp_path.glob("*.ckpt")):
+        rest = _fit(town, tmp_path, path)
+        assert rest == whole[len(whole) - len(rest) :], path.name
+    assert len(list(tmp_path.glob("*.ckpt"))) >= 4
+
+
+def test_real_drives_load():
+    if not (REAL / "kitti").is_dir():
+        pytest.skip("real drives are not here")
+    data = DriveDataModule([REAL / "kitti", REAL / "rtkx", REAL / "comma2k19"], length_s=20, eval_length_s=20)
+    rows = data.summary()
+    assert sum(row["drives"] for row in rows) == 45 and sum(row["minutes"] for row in rows) > 50
+    batch = data.train_batch(0, 0)
+    assert batch.size == (50, 20, 50) and batch.imu.isfinite().all() and batch.start.C_nb.isfinite().all()
+    assert batch.truth_valid.all() and batch.truth.p_n.isfinite().all()

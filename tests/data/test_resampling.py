@@ -1,0 +1,156 @@
+"""Averages are exact, fixes keep their time, the reference is interpolated only where it may be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dlkf.data.resampling import Grid, assign_fixes, epoch_grid, fix_phase, reference_at, resample_imu
+from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, IMU_ERROR, POSITION, STD, VELOCITY
+from dlkf.errors import InputError
+from dlkf.navigation.attitude import rotation_from_rpy
+from dlkf.navigation.earth import ecef_from_geodetic, ned_axes
+
+
+def _imu(t: np.ndarray, values: np.ndarray) -> dict:
+    return {"t": t, **dict(zip((*ACCEL, *GYRO), values.T))}
+
+
+def _means(t: np.ndarray, first: float) -> np.ndarray:
+    """Exact means of six polynomials and sines over (t_{k−1}, t_k]."""
+    at = np.concatenate(([first], t))
+    integrals = [at, at**2 / 2, np.sin(at), -np.cos(3 * at) / 3, at**3 / 3, np.exp(-at)]
+    return np.stack([np.diff(x) / np.diff(at) for x in integrals], -1)
+
+
+def test_a_whole_ratio_is_the_average_of_the_samples():
+    t = 5.0 + np.arange(1, 2001) / 100
+    x = np.random.default_rng(0).standard_normal((2000, 6))
+    grid = epoch_grid(t, np.array([6.0, 7.0]), 50, 1.0, "a")
+    assert (grid.t0, grid.epochs, grid.samples) == (5.0, 20, 50)
+    out = resample_imu(_imu(t, x), grid)
+    # rounding of the stamps, 1e-15 · 25 s, over the sample of 0.02 s
+    np.testing.assert_allclose(out.reshape(-1, 6), x.reshape(-1, 2, 6).mean(1), atol=1e-11)
+
+
+@pytest.mark.parametrize("rate", [104.3, 100.0, 73.1, 400.0])
+@pytest.mark.parametrize("jitter", [0.0, 0.2])
+def test_odd_and_jittering_rates_keep_the_integral(rate, jitter):
+    """At any grid time the integral is off by no more than one sample's curvature, h² f'/8."""
+    rng = np.random.default_rng(1)
+    t = np.arange(1, round(30 * rate)) / rate
+    t = t + jitter / rate * rng.uniform(-1, 1, len(t))
+    x = _means(t, t[0] - float(np.median(np.diff(t))))
+    grid = epoch_grid(t, np.array([3.25, 4.25]), 50, 1.0, "a")
+    assert grid.t0 == pytest.approx(0.25)
+    out = resample_imu(_imu(t, x), grid).reshape(-1, 6)
+    at = grid.sample_times
+    exact = _means(at[1:], at[0])
+    worst = (1 + 2 * jitter) ** 2 / rate**2 / 8 * np.array([1e-9, 1, 1, 3, 2 * 30, 1])
+    drift = np.abs(np.cumsum(out - exact, 0) * 0.02)
+    assert (drift <= 2.1 * worst + 1e-9).all()
+
+
+def test_constant_input_stays_constant_through_gaps():
+    t = np.delete(np.arange(1, 1001) / 100, slice(300, 310))
+    out = resample_imu(_imu(t, np.ones((len(t), 6))), epoch_grid(t, np.array([1.0]), 50, 1.0, "a"))
+    np.testing.assert_allclose(out, 1.0, atol=1e-12)
+
+
+def test_a_gap_is_filled_from_both_sides():
+    """Over 0.2 s missing of a ramp the mean of the neighbours is right to the ramp over one sample."""
+    t = np.arange(1, 1001) / 100
+    x = np.repeat((t - 0.005)[:, None], 6, 1)
+    kept = np.delete(np.arange(1000), slice(300, 320))
+    grid = epoch_grid(t[kept], np.array([1.0]), 50, 1.0, "a")
+    whole, part = (resample_imu(_imu(t[k], x[k]), grid) for k in (np.arange(1000), kept))
+    assert np.abs((whole - part).sum((0, 1)) * 0.02).max() < 0.2 * 0.01
+
+
+def test_the_phase_is_that_of_the_fixes():
+    assert fix_phase(np.arange(10) + 0.999, 1.0) % 1 == pytest.approx(0.999)
+    assert fix_phase(np.arange(10) + np.where(np.arange(10) % 2, 1e-4, -1e-4), 1.0) == pytest.approx(0, abs=2e-4)
+    mostly = np.arange(20) + 0.4
+    mostly[3] -= 0.1
+    assert fix_phase(mostly, 1.0) % 1 == pytest.approx(0.4)
+    assert fix_phase(0.07 + np.arange(50) / 5, 1.0) * 5 % 1 == pytest.approx(0.35)  # any of the five
+    jitter = np.arange(200) + 0.5 + 0.05 * np.random.default_rng(0).uniform(-1, 1, 200)
+    assert 0.53 < fix_phase(jitter, 1.0) % 1 < 0.55  # a late one: few fixes wait a whole epoch
+    assert fix_phase(np.zeros(0), 1.0) == 0.0
+
+
+def _gnss(t: np.ndarray) -> dict:
+    n = len(t)
+    table = {"t": t, "quality": np.full(n, 4)}
+    table |= {"lat_deg": 50 + 1e-5 * t, "lon_deg": 9 + 0 * t, "height_m": 100 + t}
+    table |= dict.fromkeys(VELOCITY, np.ones(n)) | dict.fromkeys(STD, np.full(n, 0.1))
+    return table
+
+
+def test_a_fix_goes_to_the_first_boundary_at_or_after_it_and_keeps_its_lag():
+    t = np.array([0.0, 1.0005, 1.9, 2.7, 2.8, 4.3])
+    fixes = assign_fixes(_gnss(t), Grid(0.0, 1.0, 5, 50))
+    assert fixes.valid[:, 0].tolist() == [True, True, True, True, False, True]
+    np.testing.assert_allclose(fixes.lag, [0, 0, 0.1, 0.2, 0, 0.7], atol=1e-12)
+    lat, lon = torch.tensor(np.radians(50 + 1e-5 * 2.8)), torch.tensor(np.radians(9.0))
+    r_e = ecef_from_geodetic(lat, lon, torch.tensor(102.8, dtype=torch.float64)).numpy()
+    np.testing.assert_allclose(fixes.r_e[3], r_e, atol=1e-8)  # the latest in the epoch
+
+
+def test_unknown_stds_and_velocities():
+    gnss = _gnss(np.arange(6.0))
+    gnss["quality"] = np.array([4, 5, 2, 1, 0, 6])
+    for name in STD:
+        gnss[name] = np.full(6, np.nan)
+    gnss["vel_d"] = np.full(6, np.nan)
+    fixes = assign_fixes(gnss, Grid(0.0, 1.0, 5, 50))
+    assert fixes.valid.tolist() == [[True] * 5 + [False]] * 4 + [[False] * 6] * 2
+    np.testing.assert_allclose(fixes.std[:4, 0], [0.02, 0.3, 1.0, 2.5])
+    np.testing.assert_allclose(fixes.std[:4, 2], np.array([0.02, 0.3, 1.0, 2.5]) * 1.5)
+    np.testing.assert_allclose(fixes.std[:4, 3], [0.05, 0.1, 0.1, 0.2])
+    assert np.isfinite(fixes.v_e[:4]).all()
+
+
+def _reference(t: np.ndarray) -> dict:
+    n = len(t)
+    table = {"t": t, "valid": np.ones(n, bool)}
+    table |= dict(zip(POSITION, (50 + 0 * t, 9 + 0 * t, 100 + t**3)))
+    table |= dict(zip(VELOCITY, (0 * t, 0 * t, -3 * t**2)))
+    table |= dict(zip(ATTITUDE, (0 * t, 0 * t, 0.4 * t)))
+    return table | {name: k * t for k, name in enumerate(IMU_ERROR)}
+
+
+def test_the_reference_between_samples():
+    """A cubic height is exact under Hermite interpolation, a constant turn along the geodesic."""
+    truth = reference_at(_reference(np.arange(0, 6, 0.4) + 0.1), Grid(1.0, 1.0, 3, 50))
+    assert truth.valid.all()
+    at = np.arange(1.0, 5.0)
+    lat, lon = (torch.full((4,), np.radians(x), dtype=torch.float64) for x in (50.0, 9.0))
+    r_e = ecef_from_geodetic(lat, lon, torch.from_numpy(100 + at**3)).numpy()
+    np.testing.assert_allclose(truth.r_e, r_e, atol=1e-8)
+    C_eb = ned_axes(lat, lon) @ rotation_from_rpy(torch.from_numpy(np.stack((0 * at, 0 * at, 0.4 * at), -1)))
+    np.testing.assert_allclose(truth.C_eb, C_eb.numpy(), atol=1e-12)
+    np.testing.assert_allclose(truth.imu_error, np.arange(6) * at[:, None], atol=1e-12)
+
+
+def test_the_reference_is_not_invented():
+    table = _reference(np.array([0.0, 0.5, 1.0, 1.5, 3.5, 4.0, 4.5, 5.0, 5.5]))
+    table["valid"][5] = False  # t = 4.0
+    table["roll"][7] = np.nan  # t = 5.0
+    truth = reference_at(table, Grid(0.0, 1.0, 6, 50))
+    # 2 and 3 lie in a gap of 2 s, 4 is not valid, 5 has no roll, 6 is past the end
+    assert truth.valid.tolist() == [True, True, False, False, False, True, False]
+    assert np.isnan(truth.C_eb).any((1, 2)).tolist() == [False, False, True, True, True, True, True]
+    beside = reference_at(table, Grid(0.5, 1.0, 4, 50))  # an exact hit next to an unusable sample stands
+    assert beside.valid.tolist() == [True, True, False, True, True]
+    assert np.isfinite(beside.C_eb[3]).all()
+    assert not reference_at(None, Grid(0.0, 1.0, 5, 50)).valid.any()
+
+
+def test_impossible_grids_are_refused():
+    t = np.arange(1, 50) / 100
+    with pytest.raises(InputError, match="drive a: only 0.49 s"):
+        epoch_grid(t, np.zeros(1), 50, 1.0, "a")
+    with pytest.raises(InputError, match="whole number of samples"):
+        epoch_grid(t, np.zeros(1), 50, 0.25, "a")
