@@ -52,11 +52,11 @@ def test_noise_densities_are_those_of_the_sources(name, accel, gyro):
 
 @pytest.mark.parametrize("name", BRINGS)
 def test_datasets_bring_their_imu_and_the_command_line_wins(name):
-    config = composed(f"dataset={name}")
+    config = composed(f"simulated@dataset={name}")
     assert dataset_config(config["dataset"]).name == name
     assert config["imu"]["name"] == BRINGS[name]
     assert config["out"] == f"data/{name}"
-    assert composed("imu=consumer", f"dataset={name}")["imu"]["name"] == "consumer"
+    assert composed("imu=consumer", f"simulated@dataset={name}")["imu"]["name"] == "consumer"
 
 
 def test_every_dataset_is_listed_here():
@@ -64,6 +64,6 @@ def test_every_dataset_is_listed_here():
 
 
 def test_a_simulated_dataset_keeps_the_contract(tmp_path):
-    config = composed("dataset=per_drive", "dataset.hours=0.05", "dataset.drive_minutes=1", "seed=4")
+    config = composed("simulated@dataset=per_drive", "dataset.hours=0.05", "dataset.drive_minutes=1", "seed=4")
     rows = validate_dataset(simulate_from_config(config, tmp_path / "toy", progress=False))
     assert [row.name for row in rows] == [f"per_drive-4-0000{k}" for k in range(3)]

@@ -83,10 +83,10 @@ class DatasetConfig:
 
 
 def dataset_config(config: Mapping[str, Any]) -> DatasetConfig:
-    """A dataset from a mapping like ``conf/dataset/*.yaml``. InputError for unknown keys and odd values."""
+    """A dataset from a mapping like ``conf/simulated/*.yaml``. InputError for unknown keys and odd values."""
     values = dict(config) if isinstance(config, Mapping) else {}
     if not isinstance(values.get("name"), str):
-        raise InputError("dataset: name is missing, give it as in conf/dataset/*.yaml")
+        raise InputError("dataset: name is missing, give it as in conf/simulated/*.yaml")
     for key, kind in (("vehicle", VehicleConfig), ("gnss", GnssConfig)):
         values[key] = _built(kind, values.get(key, {}), key)
     return _built(DatasetConfig, values, "dataset")
