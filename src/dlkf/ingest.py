@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from hydra.utils import instantiate
-from omegaconf import DictConfig
+from hydra.utils import get_class
+from omegaconf import DictConfig, OmegaConf
 
 from dlkf.command import command
 from dlkf.data.intake import ingest_drives
@@ -13,7 +13,8 @@ from dlkf.data.validate import Limits
 @command("ingest")
 def main(cfg: DictConfig) -> None:
     """Read every drive under ``source``, check it and write the dataset ``out``."""
-    reader = instantiate(cfg.reader, _convert_="all")
+    settings = OmegaConf.to_container(cfg.reader, resolve=True)
+    reader = get_class(settings.pop("_target_"))(**settings)
     count = ingest_drives(
         reader.read(cfg.source),
         cfg.out,

@@ -1,0 +1,263 @@
+"""A log with odd columns, units, axes and clocks comes out as the drive that it is."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pandas as pd
+import pytest
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from dlkf.data.intake import ingest_drives
+from dlkf.data.readers.csv import CsvReader
+from dlkf.data.readers.units import rotation, seconds
+from dlkf.data.tables import read_drives, read_table
+from dlkf.data.validate import validate_dataset
+from dlkf.errors import InputError
+from tests.data.conftest import car
+
+PLAIN = {
+    "imu": {
+        "file": "imu.csv",
+        "time": {"column": "t"},
+        "accel": {"columns": ["accel_x", "accel_y", "accel_z"]},
+        "gyro": {"columns": ["gyro_x", "gyro_y", "gyro_z"]},
+    },
+    "gnss": {
+        "file": "gnss.csv",
+        "time": {"column": "t"},
+        "position": {"columns": ["lat_deg", "lon_deg", "height_m"]},
+        "velocity": {"columns": ["vel_n", "vel_e", "vel_d"]},
+        "std_position": {"columns": ["std_pos_n", "std_pos_e", "std_pos_d"]},
+        "std_velocity": {"columns": ["std_vel_n", "std_vel_e", "std_vel_d"]},
+        "quality": {"column": "quality"},
+    },
+}
+GPS_WEEK, TOW = 2350, 345_600  # and the same moment in Unix time
+UNIX = GPS_WEEK * 604_800 + TOW + 315_964_800 - 18
+
+
+def _plain(folder, tables) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for kind, frame in tables.items():
+        frame.to_csv(folder / f"{kind}.csv", index=False)
+
+
+def _reader(**changes) -> CsvReader:
+    spec = copy.deepcopy(PLAIN)
+    for path, value in changes.items():
+        *nodes, last = path.split("__")
+        node = spec
+        for name in nodes:
+            node = node.setdefault(name, {})
+        node[last] = value
+    return CsvReader(spec.pop("imu"), spec.pop("gnss"), spec.pop("reference", None), **spec)
+
+
+def test_an_odd_log_round_trips(tmp_path, tables):
+    """Nanoseconds of Unix time, Right-Forward-Up axes, g and °/s; GPS weeks, ENU in km/h, radians, words."""
+    imu, gnss, reference = (tables[k] for k in ("imu", "gnss", "reference"))
+    folder = tmp_path / "logs" / "monday"
+    folder.mkdir(parents=True)
+    t = np.round((imu.t + 5) * 1e9).astype(np.int64) + UNIX * 10**9
+    odd = pd.DataFrame({"#timestamp [ns]": t})
+    for name, sensor, unit in (("a", "accel", 9.80665), ("w", "gyro", np.pi / 180)):
+        f, r, d = (imu[f"{sensor}_{axis}"] / unit for axis in "xyz")
+        odd[f"{name}x"], odd[f"{name}y"], odd[f"{name}z"] = r, f, -d
+    odd.to_csv(folder / "xsens_imu.txt", index=False, sep=";")
+    fix = pd.DataFrame({"week": GPS_WEEK, "tow_ms": (TOW + gnss.t + 5) * 1000})
+    fix["phi"], fix["lam"], fix["h"] = np.radians(gnss.lat_deg), np.radians(gnss.lon_deg), gnss.height_m * 1000
+    fix["ve"], fix["vn"], fix["vu"] = 3.6 * gnss.vel_e, 3.6 * gnss.vel_n, -3.6 * gnss.vel_d
+    fix["eph"], fix["epv"], fix["mode"] = 2.0, 2.0, "FIX"
+    fix.loc[3, ["phi", "lam", "h"]] = np.nan
+    fix.loc[4, "mode"] = "FLT"
+    fix.to_csv(folder / "rtk_gnss.txt", index=False, sep=";")
+    ref = pd.DataFrame({"t": UNIX + reference.t + 5, "lat": reference.lat_deg, "lon": reference.lon_deg})
+    ref["h"], ref["sog"] = reference.height_m, np.hypot(reference.vel_n, reference.vel_e)
+    ref["cog"], ref["climb"] = np.degrees(np.arctan2(reference.vel_e, reference.vel_n)), -reference.vel_d
+    ref["r"], ref["p"] = np.degrees(reference.roll), -np.degrees(reference.pitch)
+    ref["y"], ref["ok"] = 90 - np.degrees(reference.yaw), 1
+    ref.loc[7, "ok"] = 0
+    ref.to_csv(folder / "pos_ref.txt", index=False, sep=";")
+    reader = CsvReader(
+        imu={
+            "file": "*_imu.txt",
+            "time": {"column": "#timestamp [ns]", "unit": "ns", "clock": "unix"},
+            "accel": {"columns": ["ax", "ay", "az"], "unit": "g", "axes": "rfu"},
+            "gyro": {"columns": ["wx", "wy", "wz"], "unit": "deg/s", "axes": ["y", "x", "-z"]},
+        },
+        gnss={
+            "file": "*_gnss.txt",
+            "time": {"column": "tow_ms", "unit": "ms", "week": "week"},
+            "position": {"columns": ["phi", "lam", "h"], "unit": "rad", "height_unit": "mm"},
+            "velocity": {"columns": ["ve", "vn", "vu"], "unit": "km/h", "frame": "enu"},
+            "std_position": {"columns": ["eph", "epv"], "unit": "cm"},
+            "quality": {"column": "mode", "map": {"FIX": 4, "FLT": 5}},
+        },
+        reference={
+            "file": "*_ref.txt",
+            "time": {"column": "t", "clock": "unix"},
+            "position": {"columns": ["lat", "lon", "h"]},
+            "velocity": {"columns": ["sog", "cog", "climb"], "frame": "course"},
+            "attitude": {"columns": ["r", "p", "y"], "unit": "deg", "convention": "enu"},
+            "valid": {"column": "ok"},
+        },
+        separator=";",
+        lever_arm_m=[1.0, 0.5, -1.2],
+        group="day-1",
+        meta={"licence": "mine"},
+    )
+    assert ingest_drives(reader.read(tmp_path / "logs"), tmp_path / "out") == 1
+    row = read_drives(tmp_path / "out")[0]
+    assert (row.name, row.group, row.lever_arm_b) == ("monday", "day-1", (1.0, 0.5, -1.2))
+    back = {kind: read_table(tmp_path / "out", kind, "monday") for kind in ("imu", "gnss", "reference")}
+    shift = 5.0  # counted from the whole second of the first IMU stamp
+    assert pd.read_parquet(tmp_path / "out" / "drives.parquet").time_zero_s[0] == GPS_WEEK * 604_800 + TOW + shift
+    for name in imu:
+        tolerance = 1e-9 if name == "t" else 1e-12
+        np.testing.assert_allclose(back["imu"][name], imu[name], atol=tolerance, err_msg=name)
+    np.testing.assert_allclose(back["gnss"]["t"], gnss.t, atol=1e-9)
+    for name in ("lat_deg", "lon_deg", "height_m", "vel_n", "vel_e", "vel_d", "std_pos_n", "std_pos_d"):
+        expected = gnss[name].to_numpy().copy()
+        if name in ("lat_deg", "lon_deg", "height_m"):
+            expected[3] = np.nan
+        np.testing.assert_allclose(back["gnss"][name], expected, rtol=1e-12, atol=1e-12, err_msg=name)
+    assert np.isnan(back["gnss"]["std_vel_n"]).all()
+    assert back["gnss"]["quality"].tolist()[:6] == [4, 4, 4, 0, 5, 4]
+    np.testing.assert_allclose(back["reference"]["t"], reference.t, atol=3e-7)  # Unix seconds as floats: 2⁻²² s
+    for name in ("vel_n", "vel_e", "vel_d", "roll", "pitch", "yaw"):
+        np.testing.assert_allclose(back["reference"][name], reference[name], atol=1e-9, err_msg=name)
+    assert np.flatnonzero(~back["reference"]["valid"]).tolist() == [7]
+
+
+def test_increments_and_stamps_at_the_start(tmp_path, tables):
+    imu = tables["imu"].copy()
+    imu.iloc[:, 1:] *= 0.01
+    imu["t"] -= 0.01
+    _plain(tmp_path / "a", {**tables, "imu": imu})
+    reader = _reader(imu__increments=True, imu__stamp="start", time_zero="keep")
+    drive = next(iter(reader.read(tmp_path / "a")))
+    assert drive.name == "a" and drive.reference is None
+    for name in tables["imu"]:
+        np.testing.assert_allclose(drive.imu[name], tables["imu"][name], atol=1e-9)
+
+
+def test_a_table_without_header(tmp_path, tables):
+    folder = tmp_path / "a"
+    folder.mkdir()
+    for kind in ("imu", "gnss"):
+        tables[kind].to_csv(folder / f"{kind}.csv", index=False, header=False, sep=" ")
+    reader = _reader(
+        header=False,
+        separator=r"\s+",
+        imu__time__column=0,
+        imu__gyro__columns=[1, 2, 3],
+        imu__accel__columns=[4, 5, 6],
+        gnss__time__column=0,
+        gnss__position__columns=[1, 2, 3],
+        gnss__velocity__columns=[4, 5, 6],
+        gnss__std_position=None,
+        gnss__std_velocity=None,
+        gnss__quality={"default": 2},
+    )
+    drive = next(iter(reader.read(folder)))
+    np.testing.assert_allclose(drive.imu.accel_z, tables["imu"].accel_z)
+    assert set(drive.gnss.quality) == {2}
+
+
+MISTAKES = {
+    "imu__accel__columns": (["ax", "ay", "az"], "no column 'ax'; has t, gyro_x"),
+    "imu__accel__unit": ("furlong", "reader.imu.accel.unit: unknown unit 'furlong'; known are m/s2"),
+    "imu__accel__axes": ("fru", "no right-handed triad"),
+    "imu__gyro__axes": ("forward", "axes 'forward' must be three letters"),
+    "imu__time__unit": ("h", "unknown time unit 'h'"),
+    "imu__time__clock": ("utc", "unknown clock 'utc'"),
+    "imu__stamp": ("late", "reader.imu.stamp=late"),
+    "imu__file": ("imu.txt", "no file imu.txt and no subfolders"),
+    "gnss__file": ("*.csv", "3 files match, one must be"),
+    "gnss__velocity__frame": ("nwu", "reader.gnss.velocity.frame=nwu"),
+    "gnss__quality__map": ({"5": 5}, "quality '4' is not in reader.gnss.quality.map"),
+    "time_zero": ("now", "reader.time_zero=now"),
+    "lever_arm_m": ([1.0], "reader.lever_arm_m"),
+}
+
+
+@pytest.mark.parametrize("path", MISTAKES)
+def test_mistakes_in_the_mapping(tmp_path, tables, path):
+    value, told = MISTAKES[path]
+    _plain(tmp_path / "a", tables)
+    with pytest.raises(InputError) as error:
+        list(_reader(**{path: value}).read(tmp_path / "a"))
+    assert told in str(error.value) and "\n" not in str(error.value)
+
+
+def test_mistakes_in_the_files(tmp_path, tables):
+    _plain(tmp_path / "a", tables)
+    path = tmp_path / "a" / "imu.csv"
+    lines = path.read_text().splitlines()
+    for line, cells, told in (
+        (41, "0.4,0,0,oops,0,0,-9.8", "line 42: column 'gyro_z' is 'oops', not a number"),
+        (41, "0.4,0,0,,0,0,-9.8", "line 42: column 'gyro_z' is empty"),
+        (41, "0.4,0,0,0,0,0,-9.8,7,7", "cannot be read as a table"),
+        (41, "0.39,0,0,0,0,0,-9.8", "row 40: t = 0.390000 stands twice|row 40: t"),
+    ):
+        path.write_text("\n".join([*lines[:line], cells, *lines[line + 1 :]]))
+        with pytest.raises(InputError, match=told):
+            ingest_drives(_reader().read(tmp_path), tmp_path / "out")
+        assert [p.name for p in tmp_path.iterdir()] == ["a"]  # whole or none
+    path.write_text("")
+    with pytest.raises(InputError, match="cannot be read as a table"):
+        list(_reader().read(tmp_path))
+    path.write_text(lines[0] + "\n")
+    with pytest.raises(InputError, match="has no rows"):
+        list(_reader().read(tmp_path))
+    with pytest.raises(InputError, match="no such folder"):
+        list(_reader().read(tmp_path / "b"))
+
+
+def test_drives_are_split_at_gaps(tmp_path, tables):
+    imu = tables["imu"]
+    holes = imu[~imu.t.between(20.0, 21.5) & ~imu.t.between(25.0, 26.0)]
+    _plain(tmp_path / "logs" / "a", {**tables, "imu": holes})
+    _plain(tmp_path / "logs" / "b", tables)
+    with pytest.raises(InputError, match=r"drive a.*IMU gap of 1\.5.*split_gaps=true"):
+        ingest_drives(_reader().read(tmp_path / "logs"), tmp_path / "out")
+    seen = []
+    count = ingest_drives(
+        _reader().read(tmp_path / "logs"),
+        tmp_path / "out",
+        split_gaps=True,
+        progress=lambda drive, done: seen.append(drive),
+    )
+    rows = validate_dataset(tmp_path / "out")
+    assert count == 3 and seen == [r.name for r in rows] == ["a-s0", "a-s1", "b"]
+    assert [r.group for r in rows] == ["a", "a", "b"]
+    part = read_table(tmp_path / "out", "gnss", "a-s1")
+    assert part["t"].min() > 26 and part["t"].max() <= 60
+
+
+def test_axes_and_clocks():
+    assert (rotation("frd", "") == np.eye(3)).all()
+    assert (rotation("flu", "") == np.diag([1, -1, -1])).all()
+    assert (rotation(["x", "-y", "-z"], "") == rotation("FLU", "")).all()
+    assert (rotation("rfu", "") @ [1, 2, 3] == [2, 1, -3]).all()
+    whole, part = seconds(np.array([1_700_000_000_123_456_789]), "ns", None, None, "")
+    assert whole[0] == 1_700_000_000 and part[0] == pytest.approx(0.123456789, abs=1e-12)
+    week, _ = seconds(np.array([TOW]), "s", np.array([GPS_WEEK]), None, "")
+    unix, _ = seconds(np.array([UNIX]), "s", None, "unix", "")
+    assert week[0] == unix[0]
+
+
+def test_the_preset_reads_the_contracts_own_columns(tmp_path):
+    """conf/reader/csv.yaml as it stands, with a reference."""
+    from pathlib import Path
+
+    config = OmegaConf.load(Path(__file__).parents[2] / "conf" / "reader" / "csv.yaml")
+    config.reference.file = "reference.csv"
+    config.gnss.quality.column = "quality"
+    _plain(tmp_path / "logs", car(20))
+    reader = instantiate(config, _convert_="all")
+    assert ingest_drives(reader.read(tmp_path / "logs"), tmp_path / "out") == 1
+    assert set(read_table(tmp_path / "out", "gnss", "logs")["quality"]) == {4}
