@@ -57,7 +57,7 @@ def _reader(**changes) -> CsvReader:
 
 
 def test_an_odd_log_round_trips(tmp_path, tables):
-    """Nanoseconds of Unix time, Right-Forward-Up axes, g and °/s; GPS weeks, ENU in km/h, radians, words."""
+    """Nanoseconds of Unix time, Right-Forward-Up, g and °/s; GPS weeks, ENU in km/h, radians, words."""
     imu, gnss, reference = (tables[k] for k in ("imu", "gnss", "reference"))
     folder = tmp_path / "logs" / "monday"
     folder.mkdir(parents=True)
@@ -68,7 +68,11 @@ def test_an_odd_log_round_trips(tmp_path, tables):
         odd[f"{name}x"], odd[f"{name}y"], odd[f"{name}z"] = r, f, -d
     odd.to_csv(folder / "xsens_imu.txt", index=False, sep=";")
     fix = pd.DataFrame({"week": GPS_WEEK, "tow_ms": (TOW + gnss.t + 5) * 1000})
-    fix["phi"], fix["lam"], fix["h"] = np.radians(gnss.lat_deg), np.radians(gnss.lon_deg), gnss.height_m * 1000
+    fix["phi"], fix["lam"], fix["h"] = (
+        np.radians(gnss.lat_deg),
+        np.radians(gnss.lon_deg),
+        gnss.height_m * 1000,
+    )
     fix["ve"], fix["vn"], fix["vu"] = 3.6 * gnss.vel_e, 3.6 * gnss.vel_n, -3.6 * gnss.vel_d
     fix["eph"], fix["epv"], fix["mode"] = 2.0, 2.0, "FIX"
     fix.loc[3, ["phi", "lam", "h"]] = np.nan
@@ -114,7 +118,10 @@ def test_an_odd_log_round_trips(tmp_path, tables):
     assert (row.name, row.group, row.lever_arm_b) == ("monday", "day-1", (1.0, 0.5, -1.2))
     back = {kind: read_table(tmp_path / "out", kind, "monday") for kind in ("imu", "gnss", "reference")}
     shift = 5.0  # counted from the whole second of the first IMU stamp
-    assert pd.read_parquet(tmp_path / "out" / "drives.parquet").time_zero_s[0] == GPS_WEEK * 604_800 + TOW + shift
+    assert (
+        pd.read_parquet(tmp_path / "out" / "drives.parquet").time_zero_s[0]
+        == GPS_WEEK * 604_800 + TOW + shift
+    )
     for name in imu:
         tolerance = 1e-9 if name == "t" else 1e-12
         np.testing.assert_allclose(back["imu"][name], imu[name], atol=tolerance, err_msg=name)
@@ -126,7 +133,9 @@ def test_an_odd_log_round_trips(tmp_path, tables):
         np.testing.assert_allclose(back["gnss"][name], expected, rtol=1e-12, atol=1e-12, err_msg=name)
     assert np.isnan(back["gnss"]["std_vel_n"]).all()
     assert back["gnss"]["quality"].tolist()[:6] == [4, 4, 4, 0, 5, 4]
-    np.testing.assert_allclose(back["reference"]["t"], reference.t, atol=3e-7)  # Unix seconds as floats: 2⁻²² s
+    np.testing.assert_allclose(
+        back["reference"]["t"], reference.t, atol=3e-7
+    )  # Unix seconds as floats: 2⁻²² s
     for name in ("vel_n", "vel_e", "vel_d", "roll", "pitch", "yaw"):
         np.testing.assert_allclose(back["reference"][name], reference[name], atol=1e-9, err_msg=name)
     assert np.flatnonzero(~back["reference"]["valid"]).tolist() == [7]

@@ -5,8 +5,11 @@ from __future__ import annotations
 import lightning as L
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
 from lightning.pytorch.callbacks import ModelCheckpoint
 
+from dlkf.config import config_dir
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.segments import inject_outage
 from dlkf.errors import InputError
@@ -27,7 +30,11 @@ def test_no_group_is_on_two_sides(tmp_path):
         assert sum(row["drives"] for row in data.summary()) == 12
         pieces = {side: {p.drive for p in data.pieces(side)} for side in ("val", "test")}
         trained = {p.drive for batch in data.train_pieces(0) for p in batch}
-        assert not trained & pieces["val"] and not trained & pieces["test"] and not pieces["val"] & pieces["test"]
+        assert (
+            not trained & pieces["val"]
+            and not trained & pieces["test"]
+            and not pieces["val"] & pieces["test"]
+        )
 
 
 def test_the_same_recording_in_two_datasets_stays_on_one_side(town, tmp_path):
@@ -146,6 +153,20 @@ def test_a_resumed_run_sees_the_batches_of_an_uninterrupted_one(town, tmp_path):
         rest = _fit(town, tmp_path, path)
         assert rest == whole[len(whole) - len(rest) :], path.name
     assert len(list(tmp_path.glob("*.ckpt"))) >= 4
+
+
+def test_the_presets_make_a_module(town):
+    """Every conf/data preset as Hydra gives it, lists and mappings of its own kind included."""
+    presets = sorted(p.stem for p in (config_dir() / "data").glob("*.yaml"))
+    assert "one_imu" in presets
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        for preset in presets:
+            split = "data.split={train:rest,val:[day-1],test:[day-2]}"
+            overrides = [f"+data={preset}", f"data.datasets=[{town}]", split, "data.eval_outage=[10,5]"]
+            config = compose(overrides=overrides)
+            data = instantiate(config.data, length_s=10, eval_length_s=20)
+            assert [row["drives"] for row in data.summary()] == [4, 1, 1]
+            assert data.train_batch(0, 0).size == (24, 10, 50)
 
 
 def test_real_drives_load():

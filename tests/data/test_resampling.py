@@ -70,7 +70,9 @@ def test_a_gap_is_filled_from_both_sides():
 
 def test_the_phase_is_that_of_the_fixes():
     assert fix_phase(np.arange(10) + 0.999, 1.0) % 1 == pytest.approx(0.999)
-    assert fix_phase(np.arange(10) + np.where(np.arange(10) % 2, 1e-4, -1e-4), 1.0) == pytest.approx(0, abs=2e-4)
+    assert fix_phase(np.arange(10) + np.where(np.arange(10) % 2, 1e-4, -1e-4), 1.0) == pytest.approx(
+        0, abs=2e-4
+    )
     mostly = np.arange(20) + 0.4
     mostly[3] -= 0.1
     assert fix_phase(mostly, 1.0) % 1 == pytest.approx(0.4)
@@ -150,7 +152,7 @@ def test_the_reference_is_not_invented():
 
 def test_impossible_grids_are_refused():
     t = np.arange(1, 50) / 100
-    with pytest.raises(InputError, match="drive a: only 0.49 s"):
+    with pytest.raises(InputError, match=r"drive a: only 0\.49 s"):
         epoch_grid(t, np.zeros(1), 50, 1.0, "a")
     with pytest.raises(InputError, match="whole number of samples"):
         epoch_grid(t, np.zeros(1), 50, 0.25, "a")

@@ -35,7 +35,9 @@ def test_other_engines_read_the_dataset_as_it_is(town):
     import pyarrow.dataset as ds
 
     imu = ds.dataset(town / "imu", partitioning="hive").to_table(columns=["drive", "t"])
-    assert imu.num_rows == 6 * 6000 and set(imu["drive"].unique().to_pylist()) == {f"car-{k}" for k in range(6)}
+    assert imu.num_rows == 6 * 6000 and set(imu["drive"].unique().to_pylist()) == {
+        f"car-{k}" for k in range(6)
+    }
 
 
 def test_a_missing_column_is_named(tmp_path, tables):

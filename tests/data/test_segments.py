@@ -102,7 +102,7 @@ def test_pieces_lie_where_the_reference_is_valid(drives):
         make_batch(drives, [])
     with pytest.raises(InputError, match="beyond its drive"):
         make_batch(drives, [Piece(0, 55, 10)])
-    with pytest.raises(InputError, match="start.yaw is|start: unknown key yaw"):
+    with pytest.raises(InputError, match="start: unknown key yaw"):
         StartLaw.of({"yaw": 3})
 
 
@@ -116,7 +116,7 @@ def test_without_true_attitude_the_start_comes_from_imu_and_gnss(drives):
     assert (batch.start_std[0, 6:] < np.radians(4)).all() and not batch.truth.C_nb.isfinite().any()
     stopped = _masked(blind, gnss_v_e=(slice(None), 0.0))
     assert not cut_pieces([stopped], 20)
-    with pytest.raises(InputError, match="drive car-0: no start state at t = 10.0"):
+    with pytest.raises(InputError, match=r"drive car-0: no start state at t = 10\.0"):
         make_batch([stopped], [Piece(0, 10, 20)])
 
 
@@ -147,24 +147,30 @@ def test_whole_drives_are_padded(drives):
 def test_masks(drives):
     batch = make_batch(drives, [Piece(0, 0, 30)])
     out = inject_outage(batch, 10, 15)
-    assert torch.nonzero(~out.available[0]).flatten().tolist() == list(range(10, 25))  # ends of epochs 11 … 25 s
+    assert torch.nonzero(~out.available[0]).flatten().tolist() == list(
+        range(10, 25)
+    )  # ends of epochs 11 … 25 s
     assert torch.nonzero(decimate(batch, 5).available[0]).flatten().tolist() == [4, 9, 14, 19, 24, 29]
     assert batch.available.all()
 
 
 def test_turned_frames_are_the_same_piece(drives):
-    """Strapdown in the turned frame ends where the turned strapdown ends: Earth rotation and gravity turn too."""
+    """Strapdown in the turned frame ends at the same place: Earth rotation and gravity turn too."""
     plain = make_batch(drives, [Piece(0, 0, 30), Piece(1, 7, 30)], dtype=torch.float64, start=EXACT)
     turned = turn_frames(plain, torch.Generator().manual_seed(0))
     assert not torch.allclose(turned.start.v_n, plain.start.v_n)
-    assert torch.allclose(turned.frame.earth_rate_n.norm(dim=-1), torch.tensor(EARTH_RATE, dtype=torch.float64))
+    assert torch.allclose(
+        turned.frame.earth_rate_n.norm(dim=-1), torch.tensor(EARTH_RATE, dtype=torch.float64)
+    )
     ends = []
     for batch in (plain, turned):
         state = batch.start
         for t in range(30):
             state = strapdown(state, batch.imu[:, t], batch.dt, batch.frame).end
         ends.append((batch.frame.to_ecef(state.p_n), batch.frame.C_en @ state.C_nb))
-    assert torch.allclose(ends[0][0], ends[1][0], atol=1e-6) and torch.allclose(ends[0][1], ends[1][1], atol=1e-9)
+    assert torch.allclose(ends[0][0], ends[1][0], atol=1e-6) and torch.allclose(
+        ends[0][1], ends[1][1], atol=1e-9
+    )
     for a, b in ((plain.truth.p_n, turned.truth.p_n), (plain.gnss[..., :3], turned.gnss[..., :3])):
         assert torch.allclose(plain.frame.to_ecef(a), turned.frame.to_ecef(b), atol=1e-8)
     assert torch.allclose(plain.gnss_std, turned.gnss_std)  # equal in North and East here

@@ -29,7 +29,10 @@ def _errors(drive, aligned):
     C = ned_axes(lat, lon)
     ok = aligned.ok & drive.ref_valid
     attitude = torch.rad2deg(vector_from_rotation(C.mT @ drive.ref_C_eb @ aligned.C_eb.mT @ C))[ok]
-    turn = [(C.mT @ x.unsqueeze(-1)).squeeze(-1)[ok] for x in (drive.ref_r_e - aligned.r_e, drive.ref_v_e - aligned.v_e)]
+    turn = [
+        (C.mT @ x.unsqueeze(-1)).squeeze(-1)[ok]
+        for x in (drive.ref_r_e - aligned.r_e, drive.ref_v_e - aligned.v_e)
+    ]
     return attitude, *turn, aligned.std[ok]
 
 
@@ -49,7 +52,7 @@ def _with_arm(drive, arm: torch.Tensor):
 
 @pytest.mark.parametrize("arm", [(0.0, 0.0, 0.0), (2.0, -0.5, -1.5)])
 def test_perfect_data_give_the_attitude(drive, arm):
-    """Left are the rate's change over the last 0.2 s and the 2 s mean of a lever arm's pull: hundredths of a degree."""
+    """Left are the rate's change over the last 0.2 s and a lever arm's pull over 2 s."""
     moved = _with_arm(drive, torch.tensor(arm, dtype=torch.float64))
     attitude, r, v, _ = _errors(moved, align_boundaries(moved))
     assert len(attitude) == 59  # all but the first two

@@ -94,7 +94,9 @@ def possible_starts(
     stack = stacked(drives)
     truth = stack.start_from_truth
     valid = truth if attitude else stack.rows["ref_valid"]
-    start = truth if attitude else truth | (valid & stack.start_from_gnss)
+    start = truth
+    if not attitude and bool((valid & ~truth).any()):
+        start = truth | (valid & stack.start_from_gnss)
     bad = torch.cat((torch.zeros(1, dtype=torch.int64), (~valid).long().cumsum(0)))
     rows = len(valid)
     ends = torch.repeat_interleave(stack.first_row + stack.epochs, stack.epochs + 1)
