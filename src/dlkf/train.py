@@ -1,0 +1,78 @@
+"""Train a filter and score it against the baselines: ``python -m dlkf.train +experiment=outage``.
+
+Simulated datasets that are missing are made first. Killed at any moment, the same command goes on where it
+stopped, in the same MLflow run.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from hydra import compose
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+
+from dlkf.command import command
+from dlkf.config import config_dir
+from dlkf.data.store import dataset_digest
+from dlkf.evaluation.report import all_tables
+from dlkf.evaluation.table import as_rich
+from dlkf.training.grid import PARENT_RUN
+from dlkf.training.run_folder import run_folder, write_state
+from dlkf.training.study import load_data, run_study
+from dlkf.training.summary import key_metrics, note
+from dlkf.training.tracking import lightning_logger, start_run, tracking_uri
+
+
+@command("train")
+def main(cfg: DictConfig) -> None:
+    """Data, run, study, table."""
+    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
+    console = Console(width=None if sys.stdout.isatty() else 110)
+    make_missing(config, console)
+    data = load_data(config, console.print)
+    folder, state = run_folder(config)
+    if state:
+        console.print(f"going on with the unfinished run in {folder}")
+    name = ",".join(HydraConfig.get().overrides.task) or config["name"]
+    parent = os.environ.get(PARENT_RUN)
+    uri = tracking_uri(config["tracking"]["uri"])
+    with start_run(uri, config["name"], name, parent_run_id=parent, run_id=state.get("run_id")) as run:
+        write_state(folder, run_id=run.id)
+        if not state:
+            run.log_config(config)
+            for dataset in data.datasets:
+                run.log_dataset(dataset, dataset_digest(dataset), "training")
+        outcome = run_study(config, data, folder, lightning_logger(run), console.print)
+        metrics = key_metrics(outcome)
+        run.log_metrics(metrics)
+        run.log_files(folder / "report")
+        tracking = config["tracking"]
+        run.log_model(outcome.weights, register=tracking["register"], alias=tracking["alias"], metrics=metrics)
+        run.note(note(config, outcome))
+        write_state(folder, finished=True)
+    for table in all_tables(", ".join(Path(d).name for d in data.datasets), outcome.results):
+        console.print(as_rich(table))
+    seconds = ", ".join(f"{k} {v:.0f} s" for k, v in outcome.seconds.items())
+    console.print(f"{seconds}\nReport: {folder}/report/report.html\nModel:  {outcome.weights}\nMLflow: run {run.id}")
+
+
+def make_missing(config: dict[str, Any], console: Console) -> None:
+    """Simulate the datasets under ``data/`` that have a preset and are not there yet."""
+    from dlkf.simulation.dataset import simulate_from_config
+
+    for dataset in config["data"]["datasets"]:
+        path = Path(dataset)
+        if path.exists() or path.parent != Path("data") or not (config_dir() / "simulated" / f"{path.name}.yaml").is_file():
+            continue
+        console.print(f"{dataset} is not there: simulating it")
+        preset = compose("simulate", overrides=[f"simulated@dataset={path.name}"])
+        simulate_from_config(OmegaConf.to_container(preset, resolve=True), path)
+
+
+if __name__ == "__main__":
+    main()

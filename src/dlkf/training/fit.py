@@ -1,0 +1,67 @@
+"""Fit a filter: data module, callbacks and Lightning trainer from plain settings."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from hydra.utils import instantiate
+from lightning.pytorch.loggers import Logger
+
+from dlkf.data.datamodule import DriveDataModule
+from dlkf.errors import InputError
+from dlkf.training.callbacks.checkpoints import BEST, LAST, BestWeights, ResumePoint
+from dlkf.training.callbacks.progress import TrainingProgress
+from dlkf.training.module import FilterTraining
+
+
+def fit(config: Mapping[str, Any], data: DriveDataModule, folder: Path, logger: Logger | bool) -> Path:
+    """Train, going on from ``folder/last.ckpt`` if it is there; returns the folder of the best weights.
+
+    ``config`` has ``model``, ``loss``, ``optimizer``, ``scheduler``, ``trainer``, ``callbacks`` and ``seed``.
+    Raises InputError where no epoch was validated.
+    """
+    settings = config["trainer"]
+    if settings["threads"]:
+        torch.set_num_threads(settings["threads"])
+    module = FilterTraining(
+        **{k: config[k] for k in ("model", "loss", "optimizer", "scheduler")}, seed=config["seed"]
+    )
+    logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module="lightning")
+        trainer = L.Trainer(
+            max_epochs=settings["max_epochs"],
+            accelerator=settings["accelerator"],
+            devices=1,
+            logger=logger,
+            callbacks=[
+                *(instantiate(c) for c in config["callbacks"].values() if c is not None),
+                TrainingProgress(),
+                BestWeights(str(folder), start_epoch=settings["best_from_epoch"]),
+                ResumePoint(str(folder), settings["checkpoint_every"]),
+            ],
+            gradient_clip_val=settings["gradient_clip"],
+            check_val_every_n_epoch=settings["validate_every"],
+            num_sanity_val_steps=0,
+            log_every_n_steps=1,
+            reload_dataloaders_every_n_epochs=1,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            default_root_dir=folder,
+        )
+        last = folder / LAST
+        trainer.fit(module, datamodule=data, ckpt_path=str(last) if last.is_file() else None)
+    if trainer.interrupted:
+        raise KeyboardInterrupt
+    if not (folder / BEST).is_dir():
+        raise InputError(
+            f"no epoch was validated: trainer.max_epochs={settings['max_epochs']} ends before "
+            f"trainer.best_from_epoch={settings['best_from_epoch']} and validate_every={settings['validate_every']}"
+        )
+    return folder / BEST

@@ -1,0 +1,47 @@
+"""Where a training run keeps what it needs to go on after a kill: a folder named by its configuration."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+STATE = "state.json"
+NOT_HASHED = ("tracking", "resume")
+
+
+def configuration_hash(config: Mapping[str, Any]) -> str:
+    """Eight hex digits of everything that decides the weights and the scores."""
+    kept = {k: v for k, v in config.items() if k not in NOT_HASHED}
+    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()[:8]
+
+
+def run_folder(config: Mapping[str, Any], root: Path = Path("outputs/train")) -> tuple[Path, dict[str, Any]]:
+    """Folder and state of the unfinished run of this configuration, or a new one with an empty state."""
+    base = root / str(config["name"]) / configuration_hash(config)
+    attempt = 1
+    while True:
+        folder = base.with_name(base.name if attempt == 1 else f"{base.name}-{attempt}")
+        if not folder.exists():
+            return folder, {}
+        state = read_state(folder)
+        if config["resume"] and not state.get("finished"):
+            return folder, state
+        attempt += 1
+
+
+def read_state(folder: Path) -> dict[str, Any]:
+    """The state file, empty where there is none."""
+    path = folder / STATE
+    return json.loads(path.read_text()) if path.is_file() else {}
+
+
+def write_state(folder: Path, **values: Any) -> None:
+    """Merge values into the state file, whole or not at all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    beside = folder / f"{STATE}.{os.getpid()}"
+    beside.write_text(json.dumps(read_state(folder) | values, indent=1))
+    beside.replace(folder / STATE)

@@ -1,0 +1,109 @@
+"""A training study from data to scores: tune the baselines, train, run all filters over the test drives."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra.utils import instantiate
+from lightning.pytorch.loggers import Logger
+
+from dlkf.data.datamodule import DriveDataModule
+from dlkf.errors import InputError
+from dlkf.evaluation.kinds import drive_kinds
+from dlkf.evaluation.outages import OutagePlan
+from dlkf.evaluation.report import write_report
+from dlkf.evaluation.results import BASELINE
+from dlkf.evaluation.scores import Scores
+from dlkf.evaluation.study import study
+from dlkf.filters.build import build_filter
+from dlkf.filters.integration import Estimator
+from dlkf.filters.learned import load_filter
+from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.training.baselines import mean_imu_error, tuned, tuning_values
+from dlkf.training.fit import fit
+from dlkf.training.scenes import SplitScenes
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a study leaves: scores, results per kind of data, the baselines' settings, the best weights."""
+
+    scores: Scores
+    results: list[dict[str, Any]]
+    tuning: dict[str, float]
+    prior: dict[str, list[float]]
+    weights: Path
+    seconds: dict[str, float]
+
+
+def load_data(config: Mapping[str, Any], say: Say) -> DriveDataModule:
+    """The data module of ``config['data']``, loaded and split."""
+    data: DriveDataModule = instantiate(config["data"])
+    data.setup()
+    say(data.describe())
+    return data
+
+
+def run_study(
+    config: Mapping[str, Any], data: DriveDataModule, folder: Path, logger: Logger | bool, say: Say
+) -> Outcome:
+    """Tune, train, score and write the report into ``folder/report``."""
+    spec, seconds = imu_spec(config["imu"]), {}
+    plan = OutagePlan(**{"offsets_s": (0.0,), **config["scoring"]["outage"]})
+    clock = time.perf_counter()
+    tuning, prior = _baseline_knowledge(config, spec, data, plan, say)
+    seconds["tuning"] = time.perf_counter() - clock
+    clock = time.perf_counter()
+    weights = fit(config, data, folder, logger)
+    seconds["training"] = time.perf_counter() - clock
+    clock = time.perf_counter()
+    filters: dict[str, Estimator] = {}
+    for name in config["baselines"]["models"]:
+        given = {"prior_mean": prior["mean"], "prior_std": prior["std"]} if name.endswith("_prior") else {}
+        filters[name] = build_filter(name, spec, tuning=tuning, **given)
+    learned = str(config["model"]["kind"])
+    if learned in filters:
+        raise InputError(f"baselines.models has {learned}, the name of the trained filter; take it out")
+    filters[learned] = load_filter(weights)
+    scenes = SplitScenes(data, "test", plan, config["seed"])
+    kinds: dict[str, str] = {}
+    for dataset in data.datasets:
+        kinds |= drive_kinds(dataset)
+    scores, made = study(
+        filters,
+        scenes,
+        kinds=kinds,
+        groups={d.name: d.group for d in data.stack},
+        settle_s=config["scoring"]["settle_s"],
+        injected_bias=config["scoring"]["slope"],
+        seed=config["seed"],
+    )
+    seconds["scoring"] = time.perf_counter() - clock
+    write_report(
+        folder / "report",
+        ", ".join(Path(d).name for d in data.datasets),
+        scores,
+        made,
+        protocol={"imu": spec.name, "tuning": tuning, "prior": prior, **scenes.described()},
+        by_time=True,
+        baseline=BASELINE if BASELINE in filters else None,
+    )
+    return Outcome(scores, made, tuning, prior, weights, seconds)
+
+
+def _baseline_knowledge(
+    config: Mapping[str, Any], spec: ImuSpec, data: DriveDataModule, plan: OutagePlan, say: Say
+) -> tuple[dict[str, float], dict[str, list[float]]]:
+    """Over-bounding factors and mean IMU error, from training pieces alone."""
+    settings = config["baselines"]
+    pieces = SplitScenes(data, "train", plan, config["seed"], settings["pieces"]).withheld()
+    best, rms = tuned(spec, pieces, rounds=settings["rounds"] if settings["tune"] else 0)
+    say(f"mbkf15 {'tuned' if settings['tune'] else 'untuned'}: {rms:.2f} m RMS in the outages of training pieces")
+    mean, std = mean_imu_error(spec, best, pieces)
+    return tuning_values(best), {"mean": list(mean), "std": list(std)}
