@@ -29,7 +29,7 @@ SAMPLE_EVERY_S, SAMPLES_PER_POINT = 1, 5  # system metrics: MLflow's own 10 s le
 
 
 def mlflow_module() -> ModuleType:
-    """MLflow, quiet, without usage reports, and unable to load a pickle. Imported on use: it takes seconds."""
+    """MLflow, quiet, without usage reports, unable to load a pickle. Imported on use: it takes seconds."""
     os.environ["MLFLOW_ALLOW_PICKLE_DESERIALIZATION"] = "false"
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
@@ -64,20 +64,17 @@ def store_missing(uri: str) -> bool:
 @contextmanager
 def reachable(uri: str) -> Iterator[None]:
     """Turn a failing connection to a tracking server into an InputError."""
+    from mlflow.exceptions import MlflowException
     from requests.exceptions import RequestException
 
     try:
         yield
-    except RequestException:
-        unreachable = True
-    except Exception as error:
-        unreachable = uri.startswith("http") and "API request" in str(error) and "failed with exception" in str(error)
-        if not unreachable:
+    except (RequestException, MlflowException) as error:
+        no_answer = isinstance(error, RequestException) or "failed with exception" in str(error)
+        if not (uri.startswith("http") and no_answer):
             raise
-    else:
-        unreachable = False
-    if unreachable:
-        raise InputError(f"the MLflow server {uri} does not answer; start it, or mend tracking.uri")
+        message = f"the MLflow server {uri} does not answer; start it, or mend tracking.uri"
+        raise InputError(message) from None
 
 
 def experiment_id(client: MlflowClient, name: str) -> str:
@@ -101,7 +98,7 @@ def experiment_id(client: MlflowClient, name: str) -> str:
                 raise
             found = client.get_experiment_by_name(name)
     if found.lifecycle_stage == "deleted":
-        raise InputError(f"the MLflow experiment {name!r} was deleted; restore it in the UI or give another name=")
+        raise InputError(f"the MLflow experiment {name!r} was deleted; restore it or give another name=")
     return found.experiment_id
 
 
@@ -180,7 +177,7 @@ def dataset_entity(folder: Path | str, digest: str):
 
 
 def flattened(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """``{"optimizer.lr": "0.001", …}``: names joined by dots, values as YAML writes them, cut at MLflow's limits."""
+    """``{"optimizer.lr": "0.001", …}``: names joined by dots, values as JSON, cut at MLflow's limits."""
     params: dict[str, str] = {}
     for key, value in config.items():
         name = f"{prefix}{key}"
