@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import time
+from datetime import timedelta
+
 import lightning as L
 from lightning.pytorch.callbacks import Callback
 from rich.console import Console
@@ -18,12 +21,13 @@ class TrainingProgress(Callback):
 
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Open the bar where training starts or resumes."""
+        self.began, self.first = time.monotonic(), trainer.current_epoch
         if not self.console.is_terminal:
             return
         self.bar = Progress(
             TextColumn("epoch"), MofNCompleteColumn(), BarColumn(), TextColumn("{task.description}"),
             TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(elapsed_when_finished=False),
-            console=self.console,
+            console=self.console, speed_estimate_period=600.0,
         )  # fmt: skip
         self.task = self.bar.add_task("", total=trainer.max_epochs, completed=trainer.current_epoch)
         self.bar.start()
@@ -37,7 +41,9 @@ class TrainingProgress(Callback):
         if self.bar is not None:
             self.bar.update(self.task, completed=done, description=text)
         elif done % self.every == 0 or done == trainer.max_epochs:
-            self.console.print(f"epoch {done}/{trainer.max_epochs}  {text}", highlight=False)
+            pace = (time.monotonic() - self.began) / (done - self.first)
+            left = timedelta(seconds=round(pace * (trainer.max_epochs - done)))
+            self.console.print(f"epoch {done}/{trainer.max_epochs}  {text}  {left} left", highlight=False)
 
     def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Close the bar."""
