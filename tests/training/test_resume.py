@@ -1,0 +1,124 @@
+"""Killed at any moment and started again, training ends with the same weights as if nothing had happened."""
+
+import subprocess
+import sys
+import textwrap
+
+import pytest
+import torch
+import yaml
+from safetensors.torch import load_file
+
+from dlkf.config import config_dir
+from dlkf.data.datamodule import DriveDataModule
+from dlkf.errors import InputError
+from dlkf.simulation.dataset import simulate_from_config
+from dlkf.training.fit import fit
+from dlkf.training.run_folder import configuration_hash, read_state, run_folder, write_state
+
+
+def preset(path: str) -> dict:
+    return yaml.safe_load((config_dir() / path).read_text())
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data") / "tiny"
+    values = preset("simulated/one_imu.yaml") | {"hours": 0.25, "drive_minutes": 3.0}
+    values.pop("defaults")
+    config = {"dataset": values, "imu": preset("imu/automotive_mems.yaml"), "seed": 1}
+    return simulate_from_config(config, folder, progress=False)
+
+
+def data(dataset) -> DriveDataModule:
+    return DriveDataModule(
+        [dataset], batch_size=4, length_s=20.0, eval_length_s=30.0, eval_outage=(10.0, 10.0), fractions=(0.6, 0.2, 0.2)
+    )
+
+
+def settings(**trainer) -> dict:
+    train = preset("train.yaml")
+    callbacks = train["callbacks"]
+    callbacks["curriculum"] |= {"warm_s": 10.0, "full_s": 20.0, "warm_until": 1, "full_from": 3}
+    callbacks["outage"] |= {"shortest_s": 3.0, "longest_s": 6.0, "before_s": 5.0, "start_epoch": 2}
+    train["trainer"] |= {"max_epochs": 5, "validate_every": 2, "best_from_epoch": 0, "accelerator": "cpu", **trainer}
+    train["scheduler"]["restart_epochs"] = 3
+    model = preset("filter/dlkf.yaml")
+    model["network"] |= {"lstm_hidden": 16, "lstm_layers": 2, "dense": [16, 8]}
+    keys = ("loss", "optimizer", "scheduler", "trainer", "callbacks")
+    return {k: train[k] for k in keys} | {"model": model, "seed": 3}
+
+
+def weights(folder) -> dict:
+    return torch.load(folder / "last.ckpt", weights_only=True)["state_dict"]
+
+
+KILLED = """
+    import os, sys, pickle
+    import lightning as L
+    from dlkf.training.module import FilterTraining
+    sys.path.insert(0, {root!r})
+    from tests.training import test_resume as t
+    step = FilterTraining.training_step
+    def dying(self, batch, index):
+        if self.global_step >= {at}:
+            os.kill(os.getpid(), 9)
+        return step(self, batch, index)
+    FilterTraining.training_step = dying
+    from pathlib import Path
+    t.fit(t.settings(), t.data({dataset!r}), Path({folder!r}), False)
+"""
+
+
+def test_kill_minus_nine_changes_nothing(dataset, tmp_path, request):
+    """A real SIGKILL in the middle of an epoch, twice, against an uninterrupted run: equal bit by bit."""
+    root = str(request.config.rootpath)
+    fit(settings(), data(dataset), tmp_path / "whole", False)
+    folder = tmp_path / "killed"
+    for at in (4, 8):
+        script = textwrap.dedent(KILLED.format(root=root, at=at, dataset=str(dataset), folder=str(folder)))
+        died = subprocess.run([sys.executable, "-c", script], cwd=root, capture_output=True, text=True, check=False)
+        assert died.returncode == -9, died.stderr[-2000:]
+    fit(settings(), data(dataset), folder, False)
+    one, other = weights(tmp_path / "whole"), weights(folder)
+    assert one.keys() == other.keys() and all(torch.equal(one[k], other[k]) for k in one)
+    best = [load_file(f / "best" / "weights.safetensors") for f in (tmp_path / "whole", folder)]
+    assert all(torch.equal(best[0][k], best[1][k]) for k in best[0])
+
+
+def test_training_moves_towards_the_reference(dataset, tmp_path):
+    """The loss falls on a tiny network in a few epochs."""
+    from dlkf.filters.integration import integrate
+    from dlkf.filters.learned import LearnedConfig, LearnedFilter, load_filter
+    from dlkf.training.loss import LossConfig, pva_losses
+
+    torch.manual_seed(3)
+    before = LearnedFilter(LearnedConfig.from_mapping(settings()["model"])).eval()
+    longer = settings(max_epochs=12)
+    longer["optimizer"]["lr"] = 1e-2
+    after = load_filter(fit(longer, data(dataset), tmp_path / "run", False))
+    batch = data(dataset).batches("test")[0]
+
+    def loss(model):
+        with torch.inference_mode():
+            return float(pva_losses(integrate(batch, model), batch, LossConfig())["position"])
+
+    assert loss(after) < 0.9 * loss(before)
+
+
+def test_no_validated_epoch_is_said_clearly(dataset, tmp_path):
+    with pytest.raises(InputError, match="no epoch was validated"):
+        fit(settings(max_epochs=1, validate_every=1, best_from_epoch=3), data(dataset), tmp_path / "run", False)
+
+
+def test_run_folder_is_found_again_until_it_is_finished(tmp_path):
+    config = {"name": "a", "resume": True, "seed": 1, "tracking": {"uri": None}}
+    folder, state = run_folder(config, tmp_path)
+    assert state == {} and folder == tmp_path / "a" / configuration_hash(config)
+    write_state(folder, run_id="abc")
+    elsewhere = config | {"tracking": {"uri": "http://server"}}
+    assert run_folder(elsewhere, tmp_path) == (folder, {"run_id": "abc"})
+    assert run_folder(config | {"seed": 2}, tmp_path)[0] != folder
+    write_state(folder, finished=True)
+    assert read_state(folder) == {"run_id": "abc", "finished": True}
+    assert run_folder(config, tmp_path)[0].name == folder.name + "-2"
