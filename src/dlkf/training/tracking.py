@@ -213,6 +213,8 @@ def start_run(
         resumed = run_id is not None and run_exists(client, run_id)
         if resumed:
             active = mlflow.start_run(run_id, log_system_metrics=system_metrics)
+            if parent_run_id:
+                client.set_tag(run_id, PARENT_TAG, parent_run_id)  # a point of a grid search started again
         else:
             active = mlflow.start_run(
                 experiment_id=experiment_id(client, experiment),
