@@ -19,9 +19,10 @@ from rich.console import Console
 from dlkf.command import command
 from dlkf.config import config_dir
 from dlkf.data.store import dataset_digest
+from dlkf.errors import InputError
 from dlkf.evaluation.report import all_tables
 from dlkf.evaluation.table import as_rich
-from dlkf.training.grid import PARENT_RUN
+from dlkf.training.grid import PARENT_RUN, run_name
 from dlkf.training.run_folder import run_folder, write_state
 from dlkf.training.study import load_data, run_study
 from dlkf.training.summary import key_metrics, note
@@ -38,15 +39,14 @@ def main(cfg: DictConfig) -> None:
     folder, state = run_folder(config)
     if state:
         console.print(f"going on with the unfinished run in {folder}")
-    name = ",".join(HydraConfig.get().overrides.task) or config["name"]
+    name = run_name(config["name"], HydraConfig.get().overrides.task)
     parent = os.environ.get(PARENT_RUN)
     uri = tracking_uri(config["tracking"]["uri"])
     with start_run(uri, config["name"], name, parent_run_id=parent, run_id=state.get("run_id")) as run:
         write_state(folder, run_id=run.id)
-        if not state:
-            run.log_config(config)
-            for dataset in data.datasets:
-                run.log_dataset(dataset, dataset_digest(dataset), "training")
+        run.log_config(config)
+        for dataset in data.datasets:
+            run.log_dataset(dataset, dataset_digest(dataset), "training")
         outcome = run_study(config, data, folder, lightning_logger(run), console.print)
         metrics = key_metrics(outcome)
         run.log_metrics(metrics)
@@ -71,7 +71,11 @@ def make_missing(config: dict[str, Any], console: Console) -> None:
             continue
         console.print(f"{dataset} is not there: simulating it")
         preset = compose("simulate", overrides=[f"simulated@dataset={path.name}"])
-        simulate_from_config(OmegaConf.to_container(preset, resolve=True), path)
+        try:
+            simulate_from_config(OmegaConf.to_container(preset, resolve=True), path)
+        except InputError:
+            if not path.exists():  # else a run beside this one made the same drives first
+                raise
 
 
 if __name__ == "__main__":
