@@ -28,7 +28,6 @@ from dlkf.filters.integration import integrate
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.navigation.attitude import rotation_from_vector
 from dlkf.navigation.imu_errors import imu_spec
-from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import strapdown
 from dlkf.simulation.dataset import simulate_from_config
 from dlkf.training.callbacks.batches import GnssDecimation, OutageInjection

@@ -67,7 +67,8 @@ def make_missing(config: dict[str, Any], console: Console) -> None:
 
     for dataset in config["data"]["datasets"]:
         path = Path(dataset)
-        if path.exists() or path.parent != Path("data") or not (config_dir() / "simulated" / f"{path.name}.yaml").is_file():
+        preset_file = config_dir() / "simulated" / f"{path.name}.yaml"
+        if path.exists() or path.parent != Path("data") or not preset_file.is_file():
             continue
         console.print(f"{dataset} is not there: simulating it")
         preset = compose("simulate", overrides=[f"simulated@dataset={path.name}"])

@@ -1,6 +1,7 @@
 """Training strategy without a Trainer: curriculum, weights, decimation, outages, guard; all resume from state."""
 
 import math
+from itertools import pairwise
 from types import SimpleNamespace
 
 import pytest
@@ -52,7 +53,7 @@ def test_decimation_keeps_every_nth_fix_per_piece():
     intervals = set()
     for row in kept:
         at = (row.nonzero().flatten() + 1).tolist()
-        gaps = {b - a for a, b in zip(at, at[1:])}
+        gaps = {b - a for a, b in pairwise(at)}
         assert len(gaps) == 1 and at[0] == next(iter(gaps))
         intervals |= gaps
     assert intervals == {2, 3, 4, 5}

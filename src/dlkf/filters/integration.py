@@ -75,7 +75,7 @@ class Solution:
 
 def integrate(batch: Batch, estimator: Estimator) -> Solution:
     """Run an estimator over a batch from its start state; differentiable where the estimator is."""
-    B, T, M = batch.size
+    _, T, M = batch.size
     state = batch.start
     memory, imu_error = estimator.begin(batch)
     usable = batch.gnss_valid & batch.available.unsqueeze(-1)

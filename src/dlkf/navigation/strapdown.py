@@ -81,7 +81,7 @@ class _Strapdown(torch.autograd.Function):
     def forward(ctx, p0, v0, C0, imu, dt, g, gradient, earth_rate):
         planes = imu.permute(2, 0, 1).contiguous()
         f, phi = planes[:3], planes[3:] * dt
-        B, M = phi.shape[1:]
+        M = phi.shape[2]
         C = C0.permute(1, 2, 0).unsqueeze(-1)  # (3, 3, B, 1)
         p, v, g3, w = (x.mT.unsqueeze(-1) for x in (p0, v0, g, earth_rate))
         A = _product(C, prefix_rotations(phi))  # C₀ R at each sample's end, Earth rotation left out
