@@ -48,15 +48,14 @@ def main(cfg: DictConfig) -> None:
         for dataset in data.datasets:
             run.log_dataset(dataset, dataset_digest(dataset), "training")
         outcome = run_study(config, data, folder, lightning_logger(run), console.print)
+        for table in all_tables(", ".join(Path(d).name for d in data.datasets), outcome.results):
+            console.print(as_rich(table))
         metrics = key_metrics(outcome)
-        run.log_metrics(metrics)
         run.log_files(folder / "report")
         tracking = config["tracking"]
         run.log_model(outcome.weights, register=tracking["register"], alias=tracking["alias"], metrics=metrics)
         run.note(note(config, outcome))
         write_state(folder, finished=True)
-    for table in all_tables(", ".join(Path(d).name for d in data.datasets), outcome.results):
-        console.print(as_rich(table))
     seconds = ", ".join(f"{k} {v:.0f} s" for k, v in outcome.seconds.items())
     console.print(f"{seconds}\nReport: {folder}/report/report.html\nModel:  {outcome.weights}\nMLflow: run {run.id}")
 

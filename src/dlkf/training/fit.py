@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
-import torch
 from hydra.utils import instantiate
 from lightning.pytorch.loggers import Logger
 
@@ -27,8 +26,6 @@ def fit(config: Mapping[str, Any], data: DriveDataModule, folder: Path, logger: 
     Raises InputError where no epoch was validated.
     """
     settings = config["trainer"]
-    if settings["threads"]:
-        torch.set_num_threads(settings["threads"])
     module = FilterTraining(
         **{k: config[k] for k in ("model", "loss", "optimizer", "scheduler")}, seed=config["seed"]
     )

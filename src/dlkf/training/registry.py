@@ -72,7 +72,7 @@ def log_model(
 
 
 def _log_model_metrics(run: Run, model_id: str, metrics: Mapping[str, float]) -> None:
-    """Metrics of the model and of the run: points that the run has already are taken over, not doubled."""
+    """Metrics of the run that stand beside the model and its dataset in the UI."""
     from mlflow.entities import Metric
     from mlflow.utils.time import get_current_time_millis
 
@@ -80,11 +80,9 @@ def _log_model_metrics(run: Run, model_id: str, metrics: Mapping[str, float]) ->
     data = {}
     if len(inputs) == 1:
         data = {"dataset_name": inputs[0].dataset.name, "dataset_digest": inputs[0].dataset.digest}
-    now, points = get_current_time_millis(), []
-    for key, value in metrics.items():
-        same = [m for m in run.client.get_metric_history(run.id, key) if m.value == value]
-        time, step = (same[-1].timestamp, same[-1].step) if same else (now, 0)
-        points.append(Metric(key, float(value), time, step, model_id=model_id, **data))
+    # a time of its own: MLflow links what the run has logged to a new model itself, and refuses the same point twice
+    now = get_current_time_millis()
+    points = [Metric(key, float(value), now, 0, model_id=model_id, **data) for key, value in metrics.items()]
     if points:
         run.client.log_batch(run.id, metrics=points)
 
@@ -157,7 +155,7 @@ def _registered(client: MlflowClient, spec: str, uri: str) -> str:
     try:
         if name.startswith("m-") and not alias and not number:
             return client.get_logged_model(name).artifact_location
-        versions = sorted((int(v.version) for v in client.search_model_versions(f"name='{_quoted(name)}'")))
+        versions = sorted(int(v.version) for v in client.search_model_versions(f"name='{_quoted(name)}'"))
         aliases = client.get_registered_model(name).aliases
     except MlflowException as error:
         if error.error_code != "RESOURCE_DOES_NOT_EXIST":

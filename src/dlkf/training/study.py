@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from hydra.utils import instantiate
 from lightning.pytorch.loggers import Logger
 
@@ -55,6 +56,8 @@ def run_study(
 ) -> Outcome:
     """Tune, train, score and write the report into ``folder/report``."""
     spec, seconds = imu_spec(config["imu"]), {}
+    if config["trainer"]["threads"]:
+        torch.set_num_threads(config["trainer"]["threads"])
     plan = OutagePlan(**{"offsets_s": (0.0,), **config["scoring"]["outage"]})
     clock = time.perf_counter()
     tuning, prior = _baseline_knowledge(config, spec, data, plan, say)
