@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+_TINY = 1e-30  # keeps sin(x)/x finite at zero; its root vanishes against 1 in any precision
+
 
 def skew(u: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """Cross-product matrix [u×]: skew(u) @ a = u × a."""
@@ -93,12 +95,11 @@ def prefix_rotations(phi: Float[Tensor, "3 b m"]) -> Float[Tensor, "3 3 b m"]:
 
     Axes come first, so that every operation runs over contiguous planes. A rotation is carried as the
     Cayley-Klein pair (α, β) = (w + i z, y − i x) of its quaternion: two complex numbers multiply in a third
-    of the tensor operations that a quaternion needs. |φ| up to about 1 rad per factor.
+    of the tensor operations that a quaternion needs.
     """
-    x = (phi * phi).sum(0) * 0.25  # (θ/2)²
-    cosine = 1 - x / 2 * (1 - x / 12 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90))))
-    u = (0.5 - x / 12 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72)))) * phi
-    a, b = torch.complex(cosine, u[2]), torch.complex(u[1], -u[0])
+    half = torch.sqrt(0.25 * (phi * phi).sum(0) + _TINY)
+    u = (0.5 * torch.sin(half) / half) * phi
+    a, b = torch.complex(torch.cos(half), u[2]), torch.complex(u[1], -u[0])
     step = 1
     while step < a.shape[1]:
         a0, b0, a1, b1 = a[:, :-step], b[:, :-step], a[:, step:], b[:, step:]
