@@ -12,7 +12,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dlkf.config import config_dir
@@ -37,6 +37,8 @@ def command(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], 
         @wraps(function)
         def task(cfg: DictConfig) -> None:
             try:
+                for key in sorted(OmegaConf.missing_keys(cfg)):
+                    raise InputError(f"{key} is missing; give {key}=…")
                 function(cfg)
             except (InputError, OmegaConfBaseException) as error:
                 if HydraConfig.get().mode == RunMode.MULTIRUN:

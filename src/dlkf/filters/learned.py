@@ -57,20 +57,33 @@ class LearnedConfig:
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> LearnedConfig:
-        """From plain values; raises InputError for a key it does not know."""
+        """From plain values; raises InputError for a key it does not know or a value of another type."""
         values = dict(values)
-        network = dict(values.pop("network", {}))
+        network = values.pop("network", {})
+        if not isinstance(network, Mapping):
+            raise InputError(f"model.network is {network!r}; it must hold the network's settings")
+        network = dict(network)
         for given, target, where in ((values, cls, "model"), (network, NetworkConfig, "model.network")):
-            known = {f.name for f in fields(target)}
-            for key in given:
+            known = {f.name: f.default for f in fields(target) if f.name != "network"}
+            for key, value in given.items():
                 if key not in known:
                     raise InputError(f"{where}: unknown key {key!r}; known: {', '.join(sorted(known))}")
+                if not _is_like(value, known[key]):
+                    raise InputError(f"{where}.{key} is {value!r}; must be like {known[key]!r}")
         values.setdefault("rate_hz", cls.rate_hz)
         values.setdefault("epoch_s", cls.epoch_s)
         network.setdefault("samples", round(values["rate_hz"] * values["epoch_s"]))
         network["dense"] = tuple(network.get("dense", NetworkConfig.dense))
         network["flags"] = 2 if values.get("outage_mode", cls.outage_mode) == "run" else 0
         return cls(network=NetworkConfig(**network), **values)
+
+
+def _is_like(value: Any, default: Any) -> bool:
+    """Whether a setting has the type of its default; whole numbers may stand for floats."""
+    if isinstance(default, tuple):
+        return isinstance(value, (list, tuple)) and all(_is_like(v, default[0]) for v in value)
+    kinds = (int, float) if isinstance(default, float) else type(default)
+    return isinstance(value, kinds) and isinstance(value, bool) == isinstance(default, bool)
 
 
 class Memory(NamedTuple):

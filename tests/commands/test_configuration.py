@@ -1,0 +1,104 @@
+"""Every shipped configuration composes, and what it names can be built."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import get_class, instantiate
+from omegaconf import OmegaConf
+
+from dlkf.config import config_dir
+from dlkf.filters.learned import LearnedConfig
+from dlkf.navigation.imu_errors import imu_spec
+from dlkf.simulation.dataset import dataset_config
+from dlkf.training.loss import LossConfig
+
+CONF = config_dir()
+GROUPS = {  # group of the defaults list: folder under conf/
+    "simulate": {"imu": "imu", "simulated@dataset": "simulated"},
+    "ingest": {"reader": "reader"},
+    "evaluate": {"imu": "imu"},
+    "navigate": {"imu": "imu"},
+    "train": {"imu": "imu", "data": "data", "filter@model": "filter"},
+}
+
+
+def presets(folder: str) -> list[str]:
+    return sorted(path.stem for path in (CONF / folder).glob("*.yaml"))
+
+
+def composed(primary: str, *overrides: str) -> dict:
+    with initialize_config_dir(config_dir=str(CONF), version_base="1.3"):
+        return OmegaConf.to_container(compose(primary, list(overrides)), resolve=True)
+
+
+EXPERIMENTS = [
+    [f"+experiment={experiment}", *profile]
+    for experiment in presets("experiment")
+    for profile in ([], *([f"+profile={name}"] for name in presets("profile")))
+]
+OPTIONS = {
+    primary: [[], *([f"{group}={name}"] for group, folder in groups.items() for name in presets(folder))]
+    for primary, groups in GROUPS.items()
+}
+CASES = [(primary, option) for primary in GROUPS for option in OPTIONS[primary]]
+CASES += [  # an IMU preset replaces one node whole, so its composition alone is enough
+    ("train", [*option, *experiment])
+    for option in OPTIONS["train"]
+    for experiment in EXPERIMENTS
+    if not option or not option[0].startswith("imu=")
+]
+
+
+def test_all_folders_are_covered():
+    """A new folder of presets must be added to GROUPS."""
+    folders = {path.name for path in CONF.iterdir() if path.is_dir()}
+    assert folders == {f for groups in GROUPS.values() for f in groups.values()} | {"experiment", "profile"}
+
+
+@pytest.mark.parametrize(
+    ("primary", "overrides"), CASES, ids=lambda x: x if isinstance(x, str) else " ".join(x)
+)
+def test_it_composes_and_builds(primary, overrides):
+    config = composed(primary, *overrides)
+    if "imu" in config:
+        imu_spec(config["imu"])
+    if primary == "simulate":
+        dataset_config(config["dataset"])
+    if primary == "ingest":
+        settings = config["reader"]
+        get_class(settings.pop("_target_"))(**settings)
+    if primary == "train":
+        LearnedConfig.from_mapping(config["model"])
+        LossConfig(**config["loss"])
+        assert all(
+            instantiate(callback).state_dict() is not None for callback in config["callbacks"].values()
+        )
+        get_class(config["data"]["_target_"])
+
+
+@pytest.mark.parametrize("name", [*GROUPS, *(f"experiment/{name}" for name in presets("experiment"))])
+def test_it_opens_with_its_claim_and_command(name):
+    text = (CONF / f"{name}.yaml").read_text()
+    lead = text[: text.index("\n", text.rindex("#   python") if "#   python" in text else 0)]
+    command = name.split("/")[0] if "/" not in name else "train"
+    assert f"python -m dlkf.{command}" in lead
+
+
+def test_a_users_own_presets_are_found(tmp_path, call, town):
+    """``--config-dir`` adds to every group of a command."""
+    mine = tmp_path / "mine"
+    for folder, text in {
+        "imu": (CONF / "imu" / "consumer.yaml").read_text().replace("name: consumer", "name: mine"),
+        "simulated": "defaults: [one_imu, _self_]\nname: mine\nhours: 0.01\n",
+    }.items():
+        (mine / folder).mkdir(parents=True)
+        (mine / folder / "mine.yaml").write_text(text)
+    done = call("simulate", "--config-dir", mine, "dataset=mine", "imu=mine")
+    assert done.code == 0, done.err
+    assert "data/mine: 0.01 h" in done.out and "IMU mine" in done.out
+    assert Path("data/mine/drives.parquet").is_file()
+    done = call("navigate", "--config-dir", mine, "model=mbkf15", "imu=mine", f"dataset={town}", "out=solved")
+    assert done.code == 0, done.err

@@ -1,0 +1,309 @@
+"""Whatever a user gets wrong: exit code 2, one line on stderr that says what and where, nothing half-written."""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+import torch
+import yaml
+
+from dlkf.data.schema import drive_file
+from dlkf.filters.learned import LearnedConfig, LearnedFilter, save_filter
+
+from .conftest import in_shell
+
+DRIVE = "town-3-00001"  # the second of two: nothing of the first may be written either
+FAST = {
+    "evaluate": (
+        "rate_hz=10",
+        "length_s=60",
+        "outage.first_s=20",
+        "outage.duration_s=20",
+        "injected_bias=null",
+    ),
+    "navigate": ("rate_hz=10",),
+}
+
+
+def change(kind: str, edit: Callable[[pd.DataFrame], pd.DataFrame | None]) -> Callable[[Path], None]:
+    """A fault that edits one table of one drive."""
+
+    def apply(folder: Path) -> None:
+        path = drive_file(folder, kind, DRIVE)
+        table = pd.read_parquet(path, partitioning=None)
+        edited = edit(table)
+        (table if edited is None else edited).to_parquet(path, index=False)
+
+    return apply
+
+
+def put(column: str, row: int, value: float) -> Callable[[pd.DataFrame], None]:
+    def edit(table: pd.DataFrame) -> None:
+        table.loc[row, column] = value
+
+    return edit
+
+
+def scale(prefix: str, factor: float) -> Callable[[pd.DataFrame], None]:
+    def edit(table: pd.DataFrame) -> None:
+        columns = [c for c in table if c.startswith(prefix)]
+        table[columns] *= factor
+
+    return edit
+
+
+def swapped(table: pd.DataFrame) -> None:
+    table[["lat_deg", "lon_deg"]] = table[["lon_deg", "lat_deg"]].to_numpy()
+
+
+def as_text(table: pd.DataFrame) -> None:
+    table["accel_x"] = table["accel_x"].map("{:.3f}".format)
+
+
+def back_in_time(table: pd.DataFrame) -> None:
+    table.loc[500:, "t"] -= 1.0
+
+
+def twice(table: pd.DataFrame) -> pd.DataFrame:
+    return table.iloc[[*range(500), *range(499, len(table))]]
+
+
+def no_fix(table: pd.DataFrame) -> None:
+    table["quality"] = np.int8(0)
+
+
+def truncated(folder: Path) -> None:
+    path = drive_file(folder, "imu", DRIVE)
+    path.write_bytes(path.read_bytes()[:-1000])
+
+
+def no_bytes(folder: Path) -> None:
+    drive_file(folder, "imu", DRIVE).write_bytes(b"")
+
+
+def drop(*parts: str) -> Callable[[Path], None]:
+    """A fault: a file or folder that is not there."""
+
+    def apply(folder: Path) -> None:
+        path = folder.joinpath(*parts)
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    return apply
+
+
+FAULTS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
+    "no drives.parquet": (drop("drives.parquet"), ("drives.parquet is missing",)),
+    "no IMU folder": (drop("imu", f"drive={DRIVE}"), (DRIVE, "imu")),
+    "no GNSS folder": (drop("gnss", f"drive={DRIVE}"), (DRIVE, "no GNSS")),
+    "missing column": (change("imu", lambda t: t.drop(columns="gyro_y")), (DRIVE, "gyro_y missing")),
+    "missing GNSS column": (change("gnss", lambda t: t.drop(columns="vel_e")), (DRIVE, "vel_e missing")),
+    "wrong type": (change("imu", as_text), (DRIVE, "accel_x", "must be double")),
+    "NaN in the IMU": (change("imu", put("gyro_z", 700, np.nan)), (DRIVE, "row 700", "gyro_z")),
+    "infinite IMU": (change("imu", put("accel_y", 700, np.inf)), (DRIVE, "row 700", "accel_y")),
+    "infinite position": (change("gnss", put("height_m", 7, np.inf)), (DRIVE, "row 7", "height_m")),
+    "time goes back": (change("imu", back_in_time), (DRIVE, "row 500", "goes back")),
+    "time of GNSS goes back": (change("gnss", put("t", 9, 3.0)), (DRIVE, "gnss", "row 9")),
+    "duplicate stamps": (change("imu", twice), (DRIVE, "row 500", "twice")),
+    "gap": (change("imu", lambda t: t.drop(index=range(800, 900))), (DRIVE, "row 800", "gap of 2.0")),
+    "no rows": (change("imu", lambda t: t.iloc[:0]), (DRIVE, "no rows")),
+    "no GNSS rows": (change("gnss", lambda t: t.iloc[:0]), (DRIVE, "gnss", "no rows")),
+    "empty file": (no_bytes, (DRIVE, "not a whole Parquet file")),
+    "truncated file": (truncated, (DRIVE, "not a whole Parquet file")),
+    "gyro in degrees": (change("imu", scale("gyro_", 180 / np.pi)), (DRIVE, "degrees")),
+    "position in radians": (change("gnss", scale("l", np.pi / 180)), (DRIVE, "radians")),
+    "accelerations in g": (change("imu", scale("accel_", 1 / 9.80665)), (DRIVE, "looks like g", "9.80665")),
+    "latitude and longitude swapped": (change("gnss", swapped), (DRIVE, "swapped")),
+    "no fix at all": (change("gnss", no_fix), (DRIVE, "no GNSS fix")),
+    "another clock": (change("gnss", lambda t: t.assign(t=t["t"] + 1e6)), (DRIVE, "same clock")),
+}
+REFERENCE_FAULTS = {
+    "attitude in degrees": (change("reference", scale("yaw", 180 / np.pi)), (DRIVE, "yaw", "degrees")),
+    "reference time goes back": (change("reference", put("t", 9, 0.2)), (DRIVE, "reference", "row 9")),
+    "reference without a column": (change("reference", lambda t: t.drop(columns="roll")), ("roll missing",)),
+}
+
+
+def is_refused(ended, *said: str, folder: Path) -> None:
+    assert ended.code == 2, ended
+    lines = ended.err.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("dlkf: error: "), ended.err
+    assert len(lines[0]) < 500
+    for text in said:
+        assert text in lines[0], lines[0]
+    left = [path.name for path in folder.iterdir() if path.name not in ("town", "mine", "logs")]
+    assert left == [], f"left behind: {left}"
+
+
+@pytest.fixture
+def copy(town, tmp_path) -> Path:
+    return Path(shutil.copytree(town, tmp_path / "town"))
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("command", FAST)
+def test_faulty_data(command, fault, copy, call, tmp_path):
+    spoil, said = FAULTS[fault]
+    spoil(copy)
+    done = call(command, "model=mbkf15", "dataset=town", "out=made/here", *FAST[command])
+    is_refused(done, *said, folder=tmp_path)
+
+
+@pytest.mark.parametrize("fault", REFERENCE_FAULTS)
+def test_a_faulty_reference_stops_evaluate_and_not_navigate(fault, copy, call, tmp_path):
+    spoil, said = REFERENCE_FAULTS[fault]
+    spoil(copy)
+    is_refused(
+        call("evaluate", "model=ins", "dataset=town", "out=made", *FAST["evaluate"]), *said, folder=tmp_path
+    )
+    done = call("navigate", "model=ins", "dataset=town", "out=made", *FAST["navigate"])
+    assert done.code == 0, done.err
+
+
+@pytest.mark.parametrize("command", FAST)
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["model=mbkf15", "dataset=nowhere"], ("nowhere", "no such folder")),
+        (["model=mbkf16", "dataset=town"], ("unknown model 'mbkf16'", "mbkf15")),
+        (["model=mbkf15_prior", "dataset=town"], ("prior.mean",)),
+        (["model=mbkf15", "dataset=town", "imu=best"], ("imu/best", "consumer")),
+        (["model=mbkf15", "dataset=town", "speed=1"], ("unknown config key 'speed'",)),
+        (["model=mbkf15", "dataset=town", "tuning.fun=2"], ("unknown config key 'tuning.fun'",)),
+        (["model=mbkf15", "dataset=town", "imu.gyro.noise_density=-1"], ("noise_density", "-1")),
+        (["model=mbkf15", "dataset=town", "imu.gyro.noise_density=low"], ("noise_density", "'low'")),
+        (["model=mbkf15", "dataset=town", "rate_hz=0"], ("rate_hz",)),
+        (["model=mbkf15", "dataset=town", "drives=[nobody]"], ("nobody",)),
+        (["model=mbkf15", "dataset"], ("dataset",)),
+        (["model=mbkf15"], ("dataset is missing",)),
+        (["dataset=town"], ("model is missing",)),
+    ],
+    ids=lambda x: " ".join(x),
+)
+def test_wrong_arguments(command, arguments, said, copy, call, tmp_path):
+    done = call(command, *arguments, "out=made")
+    is_refused(done, *said, folder=tmp_path)
+
+
+@pytest.fixture
+def model(tmp_path) -> Path:
+    """A saved filter, small."""
+    network = {"lstm_hidden": 8, "lstm_layers": 1, "dense": [8, 8], "cnn_channels": 4}
+    folder = tmp_path / "mine"
+    save_filter(LearnedFilter(LearnedConfig.from_mapping({"network": network, "rate_hz": 10.0})), folder)
+    return folder
+
+
+def other_width(model: Path) -> None:
+    config = yaml.safe_load((model / "config.yaml").read_text())
+    config["network"]["lstm_hidden"] = 16
+    (model / "config.yaml").write_text(yaml.safe_dump(config))
+
+
+def other_key(model: Path) -> None:
+    config = yaml.safe_load((model / "config.yaml").read_text())
+    (model / "config.yaml").write_text(yaml.safe_dump(config | {"colour": "red"}))
+
+
+def as_pickle(model: Path) -> None:
+    torch.save({"weight": torch.zeros(3)}, model / "weights.safetensors")
+
+
+class Trap:
+    """A pickle that would make a folder if anybody loaded it."""
+
+    def __reduce__(self):
+        return (Path.mkdir, (Path("pwned"),))
+
+
+def as_trap(model: Path) -> None:
+    (model / "weights.safetensors").write_bytes(pickle.dumps(Trap()))
+
+
+BROKEN = {
+    "other width": (other_width, ("does not fit config.yaml", "in the config")),
+    "unknown key": (other_key, ("unknown key 'colour'",)),
+    "torch pickle": (as_pickle, ("not a safetensors file",)),
+    "trap": (as_trap, ("not a safetensors file",)),
+    "no weights": (lambda m: (m / "weights.safetensors").unlink(), ("has no weights.safetensors",)),
+    "no config": (lambda m: (m / "config.yaml").unlink(), ("has no config.yaml",)),
+    "empty config": (lambda m: (m / "config.yaml").write_text(""), ("holds no settings",)),
+    "not YAML": (lambda m: (m / "config.yaml").write_text("a: [1"), ("not readable YAML",)),
+    "no network": (lambda m: (m / "config.yaml").write_text("network: 3"), ("model.network is 3",)),
+    "a word for a number": (
+        lambda m: (m / "config.yaml").write_text("network: {lstm_hidden: many}"),
+        ("lstm_hidden is 'many'",),
+    ),
+    "half weights": (
+        lambda m: (m / "weights.safetensors").write_bytes((m / "weights.safetensors").read_bytes()[:-9]),
+        ("not a safetensors file",),
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", BROKEN)
+@pytest.mark.parametrize("command", FAST)
+def test_a_model_that_does_not_load(command, fault, model, copy, call, tmp_path):
+    spoil, said = BROKEN[fault]
+    spoil(model)
+    done = call(command, "model=mine", "dataset=town", "out=made", *FAST[command])
+    is_refused(done, *said, folder=tmp_path)
+    assert not (tmp_path / "pwned").exists()
+
+
+@pytest.mark.parametrize("command", FAST)
+def test_a_pickle_as_model(command, copy, call, tmp_path):
+    (tmp_path / "mine").mkdir()
+    torch.save({}, tmp_path / "mine" / "model.pt")
+    done = call(command, "model=mine/model.pt", "dataset=town", "out=made")
+    is_refused(done, "pickles are not read", folder=tmp_path)
+
+
+@pytest.mark.parametrize("command", FAST)
+def test_another_rate_than_the_models(command, model, copy, call, tmp_path):
+    done = call(command, "model=mine", "dataset=town", "out=made", *FAST[command], "rate_hz=20")
+    is_refused(done, "set rate_hz=10", folder=tmp_path)
+
+
+def test_a_sound_model_runs(model, copy, call, tmp_path):
+    """The same files and arguments as above, unspoilt."""
+    done = call("navigate", "model=mine", "dataset=town", "out=made", *FAST["navigate"])
+    assert done.code == 0, done.err
+    assert pq.read_table(tmp_path / "made" / f"drive={DRIVE}" / "solution.parquet").num_rows > 60
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "said"),
+    [
+        ("simulate", ["dataset=mars"], "simulated/mars"),
+        ("simulate", ["dataset.hours=-1", "out=made"], "hours"),
+        ("simulate", ["dataset.vehicle.colour=red", "out=made"], "dataset.vehicle.colour"),
+        ("simulate", ["out=town"], "exists already"),
+        ("ingest", ["source=nowhere", "out=made"], "nowhere"),
+        ("ingest", ["reader=tape", "source=town", "out=made"], "reader/tape"),
+    ],
+)
+def test_of_making_data(command, arguments, said, copy, call, tmp_path):
+    is_refused(call(command, *arguments), said, folder=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "said"),
+    [
+        (
+            "evaluate",
+            ["model=mbkf15", "dataset=town", "colour=red", "out=made"],
+            "unknown config key 'colour'",
+        ),
+        ("navigate", ["model=mbkf15", "dataset=town", "out=made", "rate_hz=10"], "gyro_z"),
+    ],
+)
+def test_in_a_shell(command, arguments, said, copy, tmp_path):
+    FAULTS["NaN in the IMU"][0](copy)
+    is_refused(in_shell(tmp_path, command, *arguments), said, folder=tmp_path)
