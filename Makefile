@@ -43,7 +43,7 @@ lint: .venv/installed-dev
 	$(BIN)/pyright
 
 bench: .venv/installed
-	$(BIN)/python -m pipelines.benchmark $(ARGS)
+	$(BIN)/python pipelines/benchmark.py $(ARGS)
 
 ui: .venv/installed
 	MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false $(BIN)/mlflow ui --workers 1 --host 127.0.0.1 \

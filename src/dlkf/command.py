@@ -87,5 +87,6 @@ def one_line(error: Exception) -> str:
     if missing := re.search(r"Missing mandatory value: (\S+)", text):
         return f"{missing[1]} is missing; give {missing[1]}=…"
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    lines = [line for line in lines if not line.startswith(("full_key:", "object_type=", "reference_type=", "See https"))]
+    hints = ("full_key:", "object_type=", "reference_type=", "See https")
+    lines = [line for line in lines if not line.startswith(hints)]
     return "; ".join(lines) or type(error).__name__

@@ -10,6 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from dlkf.config import config_dir
+from dlkf.simulation.dataset import simulate_from_config
 
 SIZE = ("dataset.hours=0.05", "dataset.drive_minutes=1.5", "dataset.imu_rate_hz=50", "seed=3")
 
@@ -59,7 +64,7 @@ def call(tmp_path, monkeypatch, capfd):
 @pytest.fixture(scope="session")
 def town(tmp_path_factory) -> Path:
     """Two drives of 90 s in a town."""
-    folder = tmp_path_factory.mktemp("data")
-    made = in_shell(folder, "simulate", "dataset=per_drive", "dataset.name=town", "out=town", *SIZE)
-    assert made.code == 0, made.err
-    return folder / "town"
+    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
+        config = compose("simulate", ["simulated@dataset=per_drive", "dataset.name=town", *SIZE])
+    folder = tmp_path_factory.mktemp("data") / "town"
+    return simulate_from_config(OmegaConf.to_container(config, resolve=True), folder, progress=False)

@@ -164,8 +164,8 @@ def _write_drives(
         return row
 
     with ThreadPoolExecutor(workers) as pool:
-        jobs = [pool.submit(one, index) for index in range(len(durations))]
-        try:
+        try:  # from here on, so that an interrupt never waits for drives that have not begun
+            jobs = [pool.submit(one, index) for index in range(len(durations))]
             shown = track(
                 as_completed(jobs), f"simulating {config.name}", total=len(jobs),
                 disable=not progress, console=Console(stderr=True),
