@@ -77,11 +77,12 @@ class GridParent(Callback):
         runs = children(client, parent)
         table = comparison(runs)
         if len(table):
-            chosen = compared(table)
+            metric, chosen = compared(table)
+            text = as_text(chosen)
             client.log_text(parent, table.to_csv(index=False), "comparison.csv")
-            client.log_text(parent, as_text(chosen), "comparison.md")
-            client.set_tag(parent, NOTE_TAG, as_text(chosen))
-            print(f"\n{as_text(chosen)}\nGrid search: MLflow run {parent} in {self.uri}")
+            client.log_text(parent, text, "comparison.md")
+            client.set_tag(parent, NOTE_TAG, f"`{metric}` of the test pieces\n\n{text}" if metric else text)
+            print(f"\n{metric}\n{text}\nGrid search: MLflow run {parent} in {self.uri}")
         client.set_terminated(parent, parent_status([r.info.status for r in runs], ended))
 
 
@@ -95,11 +96,8 @@ def parent_status(statuses: Sequence[str], ended: bool) -> str:
 def children(client, parent: str) -> list:
     """The runs under a parent, oldest first, in all experiments (a sweep may go over their names)."""
     experiments = [e.experiment_id for e in client.search_experiments()]
-    return list(
-        client.search_runs(
-            experiments, f"tags.`{PARENT_TAG}` = '{parent}'", order_by=["attributes.start_time"], max_results=5000
-        )
-    )
+    mine = f"tags.`{PARENT_TAG}` = '{parent}'"
+    return list(client.search_runs(experiments, mine, order_by=["attributes.start_time"], max_results=5000))
 
 
 def comparison(runs: Sequence) -> pd.DataFrame:
@@ -116,25 +114,33 @@ def comparison(runs: Sequence) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def compared(table: pd.DataFrame) -> pd.DataFrame:
-    """The columns to look at, without ``run_id`` and parameters (the names tell), best learned filter first."""
+def compared(table: pd.DataFrame) -> tuple[str, pd.DataFrame]:
+    """The metric to compare by, and run, status and its value for every filter; best trained filter first.
+
+    Without ``test/`` metrics (all runs failed) the name is empty and run and status are left.
+    """
     for metric in COMPARED:
         columns = [c for c in table if c.startswith("test/") and c.endswith(f"/{metric}")]
         if columns:
             break
-    learned = [c for c in columns if c.split("/")[-2].startswith("dlkf")]
-    ordered = table.sort_values(learned[:1], na_position="last") if learned else table
-    return ordered[["run", "status", *columns]]
+    else:
+        return "", table[["run", "status"]]
+    names = {c: c.removeprefix("test/").removesuffix(f"/{metric}") for c in columns}
+    trained = [c for c in columns if names[c].rpartition("/")[2].startswith("dlkf")]
+    ordered = table.sort_values(trained[:1], na_position="last") if trained else table
+    columns = trained + [c for c in columns if c not in trained]
+    return metric, ordered[["run", "status", *columns]].rename(columns=names)
 
 
 def as_text(table: pd.DataFrame) -> str:
     """A Markdown table with aligned columns; metrics with three digits, an empty cell where there is none."""
+
     def cell(value: Any) -> str:
         if isinstance(value, float):
             return f"{value:.3g}" if value == value else ""
         return "" if value is None else str(value).replace("|", "\\|")
 
-    rows = [[c.removeprefix("test/") for c in table], *([cell(v) for v in row] for row in table.itertuples(index=False))]
+    rows = [list(table), *([cell(v) for v in row] for row in table.itertuples(index=False))]
     widths = [max(len(row[i]) for row in rows) for i in range(len(table.columns))]
     rows.insert(1, ["-" * w for w in widths])
     return "\n".join("| " + " | ".join(c.ljust(w) for c, w in zip(row, widths)) + " |" for row in rows) + "\n"
@@ -145,9 +151,8 @@ def swept_overrides(config: DictConfig) -> dict[str, str]:
     given = OmegaConf.to_container(config.hydra.sweeper.get("params") or OmegaConf.create({}))
     lines = [f"{k}={v}" for k, v in given.items()] + list(config.hydra.overrides.task)
     overrides = OverridesParser.create().parse_overrides(lines)
-    return {
-        o.get_key_element(): o.get_value_element_as_str() for o in overrides if o.is_sweep_override()
-    }
+    swept = [o for o in overrides if o.is_sweep_override()]
+    return {o.get_key_element(): o.input_line.partition("=")[2] for o in swept}
 
 
 def run_name(name: str, overrides: Sequence[str]) -> str:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
 
 NAME = "model"
+NO_STEP = -1  # at a step of training MLflow would give the model that step's losses and CPU load as its metrics
 CODE = Path(__file__).with_name("pyfunc_model.py")
 REQUIRED = (
     "mlflow",
@@ -62,6 +63,7 @@ def log_model(
         artifacts={"filter": str(folder)},
         code_paths=[str(Path(dlkf.__file__).parent)],
         pip_requirements=pinned_requirements(),
+        step=NO_STEP,
     )
     _log_model_metrics(run, info.model_id, metrics or {})
     if register:
@@ -88,7 +90,7 @@ def _log_model_metrics(run: Run, model_id: str, metrics: Mapping[str, float]) ->
 
 
 def pinned_requirements() -> list[str]:
-    """What a logged model needs, in the versions at hand, without build tags (``2.13.0+cpu`` → ``2.13.0``)."""
+    """What a logged model needs, in the versions at hand; without build tags: ``2.13.0+cpu`` → ``2.13.0``."""
     return [f"{name}=={version(name).partition('+')[0]}" for name in REQUIRED]
 
 
@@ -121,11 +123,8 @@ def download_model(spec: str, uri: str | None = None) -> Path:
     mlflow = mlflow_module()
     with reachable(uri):
         client = mlflow.MlflowClient(uri)
-        if spec.startswith("models:/"):
-            source = _registered(client, spec, uri)
-        else:
-            source = _of_run(client, spec, uri)
-        return _fetch(source, spec, uri)
+        find = _registered if spec.startswith("models:/") else _of_run
+        return _fetch(find(client, spec, uri), spec, uri)
 
 
 def _of_run(client: MlflowClient, spec: str, uri: str) -> str:
@@ -150,7 +149,7 @@ def _registered(client: MlflowClient, spec: str, uri: str) -> str:
     reference = spec.removeprefix("models:/")
     match = SPEC.fullmatch(reference)
     if match is None:
-        raise InputError(f"model={spec} is malformed; write models:/<name>@<alias> or models:/<name>/<version>")
+        raise InputError(f"model={spec} is malformed; write models:/<name>@<alias>, models:/<name>/<version>")
     name, alias, number = match["name"], match["alias"], match["version"]
     try:
         if name.startswith("m-") and not alias and not number:
@@ -171,7 +170,8 @@ def _registered(client: MlflowClient, spec: str, uri: str) -> str:
         raise InputError(f"model={spec}: {name} has no versions")
     wanted = versions[-1] if number in (None, "latest") else int(number)
     if wanted not in versions:
-        raise InputError(f"model={spec}: {name} has no version {wanted}; known: {', '.join(map(str, versions))}")
+        known = ", ".join(map(str, versions))
+        raise InputError(f"model={spec}: {name} has no version {wanted}; known: {known}")
     return client.get_model_version_download_uri(name, str(wanted))
 
 

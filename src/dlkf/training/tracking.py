@@ -9,6 +9,7 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -207,6 +208,7 @@ def start_run(
     """
     mlflow = mlflow_module()
     mlflow.set_tracking_uri(uri)
+    system_metrics = system_metrics and find_spec("psutil") is not None  # else MLflow refuses the run
     mlflow.set_system_metrics_sampling_interval(SAMPLE_EVERY_S)
     mlflow.set_system_metrics_samples_before_logging(SAMPLES_PER_POINT)
     with reachable(uri):

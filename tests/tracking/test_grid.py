@@ -1,0 +1,176 @@
+"""Grid search: parent run, children, final status, comparison; with sweeps that take no training."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+from omegaconf import OmegaConf
+
+from dlkf.training.grid import PARENT_RUN, SWEPT, GridParent, parent_status, run_name, swept_overrides
+from dlkf.training.tracking import mlflow_module, start_run
+
+TASK = ["+experiment=outage", "optimizer.lr=1e-3,1e-4", "filter@model=dlkf", "seed=range(2)", "data.x=[1,2]"]
+
+
+def sweep_config(uri, task=TASK, params=None):
+    hydra = {"overrides": {"task": list(task)}, "sweeper": {"params": params}}
+    return OmegaConf.create({"name": "town", "tracking": {"uri": uri}, "hydra": hydra})
+
+
+def point(uri, name, rms=None, error=None, experiment="town"):
+    """A child as the train command makes it."""
+    with start_run(uri, experiment, name, parent_run_id=os.environ[PARENT_RUN], system_metrics=False) as run:
+        run.log_config({"optimizer": {"lr": name}, "seed": 0, "tracking": {"uri": uri + name}})
+        if error:
+            raise error
+        run.log_metrics({"test/dlkf/outage_horizontal_rms_m": rms, "test/mbkf15/outage_horizontal_rms_m": 9.0})
+    return run
+
+
+def test_only_what_is_swept_counts(uri):
+    config = sweep_config(uri, params={"loss.prior": "0,1", "trainer.max_epochs": "5"})
+    swept = swept_overrides(config)
+    assert swept == {"loss.prior": "0,1", "optimizer.lr": "1e-3,1e-4", "seed": "range(2)"}
+
+
+def test_a_sweep_that_finishes(uri, client, capsys):
+    """Parent and children in one experiment; the table lists the best first and what differs."""
+    grid = GridParent()
+    grid.on_multirun_start(sweep_config(uri))
+    parent = os.environ[PARENT_RUN]
+    assert run_name("town", ["+experiment=outage", "optimizer.lr=0.001", "seed=1"]) == "optimizer.lr=0.001 seed=1"
+    worse, better = point(uri, "worse", 5.0), point(uri, "better", 2.0)
+    grid.on_multirun_end(OmegaConf.create())
+    assert PARENT_RUN not in os.environ and SWEPT not in os.environ
+    found = client.get_run(parent)
+    assert found.info.status == "FINISHED" and found.info.run_name == "grid optimizer.lr × seed"
+    assert found.data.params == {"optimizer.lr": "1e-3,1e-4", "seed": "range(2)"}
+    for run in (worse, better):
+        child = client.get_run(run.id)
+        assert child.data.tags["mlflow.parentRunId"] == parent
+        assert child.info.experiment_id == found.info.experiment_id
+    printed = capsys.readouterr().out
+    assert printed.index("better") < printed.index("worse") and parent in printed
+    assert "outage_horizontal_rms_m" in printed and "better" in found.data.tags["mlflow.note.content"]
+    table = mlflow_module().artifacts.load_text(f"{found.info.artifact_uri}/comparison.csv").splitlines()
+    assert table[0].startswith("run,run_id,status,optimizer.lr,test/dlkf/")
+    assert table[1] == f"worse,{worse.id},FINISHED,worse,5.0,9.0"
+
+
+def test_a_failed_child_fails_the_parent_but_not_the_table(uri, client, capsys):
+    """Hydra leaves out on_multirun_end then; what runs at exit does the same work."""
+    grid = GridParent()
+    grid.on_multirun_start(sweep_config(uri))
+    parent = os.environ[PARENT_RUN]
+    point(uri, "good", 5.0)
+    with pytest.raises(ValueError):
+        point(uri, "bad", error=ValueError())
+    grid.close(ended=False)
+    assert client.get_run(parent).info.status == "FAILED"
+    printed = capsys.readouterr().out
+    assert "| good | FINISHED | 5    | 9      |" in printed and "| bad  | FAILED   |" in printed
+    grid.close(ended=False)
+    assert capsys.readouterr().out == "", "closed once"
+
+
+def test_children_that_were_cut_down_do_not_stay_running(uri, client):
+    grid = GridParent()
+    grid.on_multirun_start(sweep_config(uri))
+    parent = client.get_run(os.environ[PARENT_RUN])
+    tags = {"mlflow.parentRunId": parent.info.run_id}
+    child = client.create_run(parent.info.experiment_id, tags=tags)
+    grid.close(ended=False)
+    assert client.get_run(child.info.run_id).info.status == "FAILED"
+    assert client.get_run(parent.info.run_id).info.status == "FAILED"
+
+
+def test_children_in_other_experiments_are_found(uri, client, capsys):
+    """A sweep over experiment=a,b changes the name and with it the MLflow experiment."""
+    grid = GridParent()
+    grid.on_multirun_start(sweep_config(uri))
+    point(uri, "elsewhere", 1.0, experiment="city")
+    grid.on_multirun_end(OmegaConf.create())
+    assert "elsewhere" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("statuses", "ended", "status"),
+    [
+        (["FINISHED", "FINISHED"], True, "FINISHED"),
+        (["FINISHED", "FAILED"], True, "FAILED"),
+        (["FINISHED", "KILLED"], False, "KILLED"),
+        (["FINISHED"], False, "FAILED"),
+        ([], True, "FAILED"),
+    ],
+)
+def test_the_parent_ends_as_its_children_do(statuses, ended, status):
+    assert parent_status(statuses, ended) == status
+
+
+def test_a_single_run_is_named_by_what_was_changed(monkeypatch):
+    monkeypatch.delenv(PARENT_RUN, raising=False)
+    overrides = ["+experiment=outage", "+profile=quick", "seed=1", "tracking.uri=x", "filter@model=dlkf_run"]
+    assert run_name("outage", overrides) == "outage quick seed=1 model=dlkf_run"
+    assert run_name("town", ["name=town"]) == "town"
+
+
+def test_a_store_that_cannot_be_opened_stops_the_sweep(uri, capsys):
+    """Hydra would turn any other exception of a callback into a warning."""
+    with pytest.raises(SystemExit) as end:
+        GridParent().on_multirun_start(sweep_config("./mlruns"))
+    assert end.value.code == 2 and capsys.readouterr().err.count("\n") == 1
+
+
+PROGRAM = """
+import os, sys
+from hydra import main
+from dlkf.training.tracking import start_run, tracking_uri
+from dlkf.training.grid import PARENT_RUN, run_name
+from hydra.core.hydra_config import HydraConfig
+
+@main(version_base="1.3", config_path=".", config_name="conf")
+def task(cfg):
+    name = run_name(cfg.name, HydraConfig.get().overrides.task)
+    with start_run(tracking_uri(), cfg.name, name, parent_run_id=os.environ[PARENT_RUN]) as run:
+        for step in range(20):
+            run.log_metrics({"train/loss": 1.0 / (step + 1)}, step)
+        if cfg.x == 3:
+            raise ValueError("three")
+        run.log_metrics({"test/dlkf/position_rms_m": float(cfg.x)})
+
+if __name__ == "__main__":
+    task()
+"""
+CONF = """
+name: town
+x: 0
+tracking: {uri: null}
+hydra:
+  output_subdir: null
+  callbacks: {grid: {_target_: dlkf.training.grid.GridParent}}
+"""
+
+
+def test_a_real_sweep_with_a_failing_point(uri, client, tmp_path):
+    """Through Hydra: the parent's id reaches worker processes, all write into one SQLite store at once."""
+    (tmp_path / "sweep.py").write_text(PROGRAM)
+    (tmp_path / "conf.yaml").write_text(CONF)
+    done = subprocess.run(
+        [sys.executable, "sweep.py", "-m", "x=1,2,3", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
+        cwd=tmp_path,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 1 and "ValueError: three" in done.stderr
+    experiment = client.get_experiment_by_name("town").experiment_id
+    runs = {r.info.run_name: r for r in client.search_runs([experiment])}
+    assert {name: r.info.status for name, r in runs.items()} == {
+        "grid x": "FAILED", "x=1": "FINISHED", "x=2": "FINISHED", "x=3": "FAILED"
+    }  # fmt: skip
+    parent = runs["grid x"].info.run_id
+    assert all(r.data.tags["mlflow.parentRunId"] == parent for n, r in runs.items() if n != "grid x")
+    assert all(len(client.get_metric_history(runs[f"x={k}"].info.run_id, "train/loss")) == 20 for k in (1, 2, 3))
+    assert "position_rms_m" in done.stdout and parent in done.stdout

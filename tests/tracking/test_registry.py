@@ -1,0 +1,158 @@
+"""Models: logged without a pickle, fetched by run, version or alias, run as a pyfunc."""
+
+import shutil
+import subprocess
+import sys
+
+import pandas as pd
+import pytest
+import torch
+
+from dlkf.data.store import load_dataset
+from dlkf.errors import InputError
+from dlkf.evaluation.drives import navigate_drives
+from dlkf.filters.learned import load_filter
+from dlkf.training.registry import check_registration, download_model
+from dlkf.training.tracking import mlflow_module, start_run
+
+
+@pytest.fixture
+def logged(uri, weights):
+    """A finished run with a registered model; the folder it was logged from is gone."""
+    folder = shutil.copytree(weights, "best")
+    with start_run(uri, "town", "one", system_metrics=False) as run:
+        run.log_dataset("data/town", "0123", "training")
+        run.log_metrics({"train/loss": 3.0}, step=0)
+        run.log_model(folder, register="town", alias="champion", metrics={"test/dlkf/rms_m": 2.5})
+    shutil.rmtree(folder)
+    return run
+
+
+def same_weights(folder, weights) -> bool:
+    one, other = load_filter(folder).state_dict(), load_filter(weights).state_dict()
+    return one.keys() == other.keys() and all(torch.equal(one[k], other[k]) for k in one)
+
+
+def test_every_name_of_a_model_leads_to_its_weights(logged, uri, weights):
+    for spec in (
+        logged.id,
+        f"runs:/{logged.id}",
+        f"runs:/{logged.id}/model",
+        "models:/town@champion",
+        "models:/town/1",
+        "models:/town/latest",
+        "models:/town",
+    ):
+        assert same_weights(download_model(spec, uri), weights), spec
+    assert same_weights(download_model(logged.id), weights), "the store of this folder by default"
+
+
+def test_the_model_stands_with_its_scores_and_data(logged, client):
+    run = client.get_run(logged.id)
+    (model,) = client.search_logged_models([run.info.experiment_id])
+    assert [(m.key, m.value, m.dataset_name) for m in model.metrics] == [("test/dlkf/rms_m", 2.5, "town")]
+    assert run.data.metrics == {"train/loss": 3.0, "test/dlkf/rms_m": 2.5}
+    assert len(client.get_metric_history(logged.id, "test/dlkf/rms_m")) == 1
+
+
+def test_an_alias_moves_to_the_newer_version(logged, uri, client, weights):
+    with start_run(uri, "town", "two", system_metrics=False) as run:
+        model_uri = run.log_model(weights, register="town", alias="champion")
+    assert client.get_model_version_by_alias("town", "champion").version in (2, "2")
+    assert same_weights(download_model(model_uri, uri), weights)
+    with start_run(uri, "village", "three", system_metrics=False) as run:
+        run.log_model(weights, alias="candidate")  # registered under the experiment's name
+    assert same_weights(download_model("models:/village@candidate", uri), weights)
+
+
+def test_the_pyfunc_gives_what_navigate_gives(logged, uri, weights, cars):
+    """Same rows to the last bit: the same code ran. A list, a table and one path mean the same."""
+    mlflow = mlflow_module()
+    mlflow.set_tracking_uri(uri)
+    model = mlflow.pyfunc.load_model("models:/town@champion")
+    given = model.predict([str(cars)])
+    drives = load_dataset(cars, rate_hz=50.0, epoch_s=1.0, dtype=torch.float64, reference=False)
+    wanted = {r.drive: r.table for r in navigate_drives(drives, load_filter(weights))}
+    assert set(given.drive) == set(wanted) and set(given.dataset) == {str(cars)}
+    for drive, rows in given.groupby("drive"):
+        pd.testing.assert_frame_equal(
+            rows.drop(columns=["dataset", "drive"]).reset_index(drop=True), wanted[drive], check_exact=True
+        )
+    pd.testing.assert_frame_equal(model.predict(pd.DataFrame({"dataset": [str(cars)]})), given)
+
+
+def test_a_logged_model_brings_its_code_and_no_pickle(logged, uri, cars):
+    """Loaded in an interpreter where pickles are refused; neither Hydra nor Lightning are needed to run it."""
+    folder = download_model("models:/town/1", uri).parents[1]
+    assert not [p for p in folder.rglob("*") if p.suffix in (".pkl", ".pickle", ".pt", ".ckpt", ".pyc")]
+    requirements = (folder / "requirements.txt").read_text().split()
+    assert all("==" in line and "+" not in line for line in requirements) and len(requirements) == 10
+    program = (
+        "import sys, mlflow\n"
+        "from mlflow.environment_variables import MLFLOW_ALLOW_PICKLE_DESERIALIZATION as allowed\n"
+        "assert not allowed.get()\n"
+        f"model = mlflow.pyfunc.load_model({str(folder)!r})\n"
+        f"assert len(model.predict([{str(cars)!r}])) > 20\n"
+        "import dlkf\n"
+        f"assert dlkf.__file__.startswith({str(folder)!r}), dlkf.__file__\n"
+        "assert not {'hydra', 'lightning', 'omegaconf'} & set(sys.modules)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        env={"MLFLOW_ALLOW_PICKLE_DESERIALIZATION": "false", "OMP_NUM_THREADS": "1", "PATH": ""},
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("spec", "says"),
+    [
+        ("0" * 32, "has no run"),
+        ("runs:/nonsense", "has no run"),
+        ("models:/city@champion", r"has no model 'city'; known: town"),
+        ("models:/town@old", r"no alias 'old'; known: champion \(version 1\)"),
+        ("models:/town/7", "no version 7; known: 1"),
+        ("models:/town/champion", "malformed"),
+        ("models:/m-" + "0" * 32, "has no model"),
+    ],
+)
+def test_unknown_models_are_refused_in_one_line(logged, uri, spec, says):
+    with pytest.raises(InputError, match=says) as error:
+        download_model(spec, uri)
+    assert "\n" not in str(error.value)
+
+
+def test_runs_without_a_model(uri, client):
+    with pytest.raises(ValueError), start_run(uri, "town", "one", system_metrics=False) as run:
+        raise ValueError
+    with pytest.raises(InputError, match=r"logged no model.*FAILED"):
+        download_model(run.id, uri)
+    with start_run(uri, "town", "child", parent_run_id=run.id, system_metrics=False):
+        pass
+    with pytest.raises(InputError, match="parent run of a grid search"):
+        download_model(run.id, uri)
+
+
+def test_no_store_is_made_by_looking_for_a_model(tmp_path, monkeypatch):
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="no MLflow store"):
+        download_model("models:/town@champion")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_lost_files_are_said(logged, uri, tmp_path):
+    shutil.rmtree(tmp_path / "mlruns")
+    with pytest.raises(InputError, match="cannot be had") as error:
+        download_model(logged.id, uri)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("name", "alias"), [("a/b", None), ("a", "latest"), ("a", "v2"), ("a", "no way")])
+def test_names_the_registry_would_refuse(name, alias):
+    with pytest.raises(InputError):
+        check_registration(name, alias)
+    check_registration("town", "champion")
+    check_registration(None, None)
