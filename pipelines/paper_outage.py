@@ -2,7 +2,7 @@
 
     python pipelines/paper_outage.py                    the paper's 500 epochs
     python pipelines/paper_outage.py --quick            some minutes on two cores
-    python pipelines/paper_outage.py --seeds 0 1 2      several trainings, for the spread between them
+    python pipelines/paper_outage.py --seeds 0,1,2      several trainings, for the spread between them
 
 Every seed is trained with ``+experiment=outage``, scored beside the classical filters on the test drives, and
 registered as ``models:/outage@seed<n>``. All of them then run over ``data/per_drive``, where each drive has an
@@ -30,15 +30,16 @@ def main() -> None:
     """Train every seed, then evaluate all models together."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     arguments.add_argument("--quick", action="store_true", help="a few minutes of training instead of 500 epochs")
-    arguments.add_argument("--seeds", type=int, nargs="+", default=[0])
+    arguments.add_argument("--seeds", default="0", help="one training for each; key=value goes to dlkf.train")
     options, overrides = arguments.parse_known_args()
     profile = ["+profile=quick"] if options.quick else []
-    for seed in options.seeds:
+    seeds = options.seeds.split(",")
+    for seed in seeds:
         register = ["tracking.register=outage", f"tracking.alias=seed{seed}"]
         run("train", "+experiment=outage", *profile, f"seed={seed}", *register, *overrides)
     if not NEW_IMUS.exists():
         run("simulate", "dataset=per_drive", f"out={NEW_IMUS}")
-    models = ",".join(["ins", "mbkf15", *(f"models:/outage@seed{seed}" for seed in options.seeds)])
+    models = ",".join(["ins", "mbkf15", *(f"models:/outage@seed{seed}" for seed in seeds)])
     outage = ["length_s=80", "stride_s=80", "outage.first_s=[20,25]", "outage.duration_s=[30,50]", "start.yaw_deg=2"]
     run("evaluate", f"model=[{models}]", f"dataset={NEW_IMUS}", "out=outputs/paper_outage/new_imus", *outage)
 
