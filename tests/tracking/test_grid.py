@@ -24,6 +24,8 @@ def point(uri, name, rms=None, error=None, experiment="town"):
         run.log_config({"optimizer": {"lr": name}, "seed": 0, "tracking": {"uri": uri + name}})
         if error:
             raise error
+        run.log_metrics({"val/outage_position_rms": 2 * rms}, step=1)
+        run.log_metrics({"val/outage_position_rms": 3 * rms}, step=2)
         run.log_metrics({"test/dlkf/outage_horizontal_rms_m": rms, "test/mbkf15/outage_horizontal_rms_m": 9.0})
     return run
 
@@ -35,7 +37,7 @@ def test_only_what_is_swept_counts(uri):
 
 
 def test_a_sweep_that_finishes(uri, client, capsys):
-    """Parent and children in one experiment; the table lists the best first and what differs."""
+    """Parent and children in one experiment; the table lists what differs, by the best validation of each."""
     grid = GridParent()
     grid.on_multirun_start(sweep_config(uri))
     parent = os.environ[PARENT_RUN]
@@ -52,10 +54,12 @@ def test_a_sweep_that_finishes(uri, client, capsys):
         assert child.info.experiment_id == found.info.experiment_id
     printed = capsys.readouterr().out
     assert printed.index("better") < printed.index("worse") and parent in printed
+    assert found.data.tags["best_run"] == "better"
+    assert found.data.metrics["test/dlkf/outage_horizontal_rms_m"] == 2.0, "scores of the best beside the grid"
     assert "outage_horizontal_rms_m" in printed and "better" in found.data.tags["mlflow.note.content"]
     table = mlflow_module().artifacts.load_text(f"{found.info.artifact_uri}/comparison.csv").splitlines()
-    assert table[0].startswith("run,run_id,status,optimizer.lr,test/dlkf/")
-    assert table[1] == f"worse,{worse.id},FINISHED,worse,5.0,9.0"
+    assert table[0].startswith("run,run_id,status,optimizer.lr,val/outage_position_rms,test/dlkf/")
+    assert table[1] == f"worse,{worse.id},FINISHED,worse,10.0,5.0,9.0"
 
 
 def test_a_failed_child_fails_the_parent_but_not_the_table(uri, client, capsys):
@@ -69,7 +73,8 @@ def test_a_failed_child_fails_the_parent_but_not_the_table(uri, client, capsys):
     grid.close(ended=False)
     assert client.get_run(parent).info.status == "FAILED"
     printed = capsys.readouterr().out
-    assert "| good | FINISHED | 5    | 9      |" in printed and "| bad  | FAILED   |" in printed
+    assert "| good | FINISHED | 10         | 5    | 9      |" in printed
+    assert "| bad  | FAILED   |            |" in printed
     grid.close(ended=False)
     assert capsys.readouterr().out == "", "closed once"
 

@@ -30,6 +30,7 @@ from dlkf.training.tracking import (
 PARENT_RUN, SWEPT = "DLKF_PARENT_RUN_ID", "DLKF_SWEPT_KEYS"  # read by the runs of the sweep, in any process
 NAMELESS = ("tracking", "hydra", "resume", "name")  # settings that say nothing about the result
 PRESETS = ("experiment", "profile")
+VALIDATION = "val/outage_position_rms"  # what training keeps the best weights by
 COMPARED = ("outage_horizontal_rms_m", "position_rms_m")  # the first that the children have
 
 
@@ -75,15 +76,29 @@ class GridParent(Callback):
             if run.info.status == "RUNNING":
                 client.set_terminated(run.info.run_id, "FAILED")
         runs = children(client, parent)
-        table = comparison(runs)
+        table = comparison(runs, [best_validation(client, r) for r in runs])
         if len(table):
             metric, chosen = compared(table)
             text = as_text(chosen)
             client.log_text(parent, table.to_csv(index=False), "comparison.csv")
             client.log_text(parent, text, "comparison.md")
-            client.set_tag(parent, NOTE_TAG, f"`{metric}` of the test pieces\n\n{text}" if metric else text)
-            print(f"\n{metric}\n{text}\nGrid search: MLflow run {parent} in {self.uri}")
+            title = f"{metric} of the test pieces; runs by their validation" if metric else "no run was scored"
+            client.set_tag(parent, NOTE_TAG, f"{title}\n\n{text}")
+            print(f"\n{title}\n{text}\nGrid search: MLflow run {parent} in {self.uri}")
+            self._show_best(client, parent, table, runs)
         client.set_terminated(parent, parent_status([r.info.status for r in runs], ended))
+
+    def _show_best(self, client, parent: str, table: pd.DataFrame, runs: Sequence) -> None:
+        """The parent carries the scores of the point that validated best."""
+        from mlflow.entities import Metric
+
+        if VALIDATION not in table:
+            return
+        best = runs[int(table[VALIDATION].astype(float).idxmin())]
+        scores = {k: v for k, v in best.data.metrics.items() if k.startswith("test/")}
+        now = best.info.end_time or best.info.start_time
+        client.log_batch(parent, metrics=[Metric(k, v, now, 0) for k, v in scores.items()])
+        client.set_tag(parent, "best_run", best.info.run_name)
 
 
 def parent_status(statuses: Sequence[str], ended: bool) -> str:
@@ -100,36 +115,46 @@ def children(client, parent: str) -> list:
     return list(client.search_runs(experiments, mine, order_by=["attributes.start_time"], max_results=5000))
 
 
-def comparison(runs: Sequence) -> pd.DataFrame:
-    """A row per run: name, status, the parameters that differ between runs, all ``test/`` metrics."""
+def best_validation(client, run) -> float | None:
+    """The least validation error [m] of a run: that of its kept weights."""
+    history = client.get_metric_history(run.info.run_id, VALIDATION)
+    return min((m.value for m in history), default=None)
+
+
+def comparison(runs: Sequence, validated: Sequence[float | None]) -> pd.DataFrame:
+    """A row per run: name, status, the parameters that differ between runs, validation, ``test/`` metrics."""
     given = pd.DataFrame([r.data.params for r in runs], dtype=object)
     names = [key for key in sorted(given) if given[key].nunique(dropna=False) > 1]
     names = [key for key in names if key.partition(".")[0] not in NAMELESS]
     metrics = sorted({key for r in runs for key in r.data.metrics if key.startswith("test/")})
     rows = []
-    for run in runs:
+    for run, value in zip(runs, validated):
         row = {"run": run.info.run_name, "run_id": run.info.run_id, "status": run.info.status}
         row |= {key: run.data.params.get(key) for key in names}
+        if any(v is not None for v in validated):
+            row[VALIDATION] = value
         rows.append(row | {key: run.data.metrics.get(key) for key in metrics})
     return pd.DataFrame(rows)
 
 
 def compared(table: pd.DataFrame) -> tuple[str, pd.DataFrame]:
-    """The metric to compare by, and run, status and its value for every filter; best trained filter first.
+    """The metric to compare by, and run, status, validation and its value for every filter.
 
-    Without ``test/`` metrics (all runs failed) the name is empty and run and status are left.
+    Sorted by validation: test drives choose nothing (R018). Without ``test/`` metrics (all runs failed) the
+    name is empty.
     """
+    first = [c for c in ("run", "status", VALIDATION) if c in table]
+    ordered = table.sort_values(VALIDATION, na_position="last") if VALIDATION in table else table
     for metric in COMPARED:
         columns = [c for c in table if c.startswith("test/") and c.endswith(f"/{metric}")]
         if columns:
             break
     else:
-        return "", table[["run", "status"]]
+        return "", ordered[first]
     names = {c: c.removeprefix("test/").removesuffix(f"/{metric}") for c in columns}
     trained = [c for c in columns if names[c].rpartition("/")[2].startswith("dlkf")]
-    ordered = table.sort_values(trained[:1], na_position="last") if trained else table
     columns = trained + [c for c in columns if c not in trained]
-    return metric, ordered[["run", "status", *columns]].rename(columns=names)
+    return metric, ordered[[*first, *columns]].rename(columns=names | {VALIDATION: "validation"})
 
 
 def as_text(table: pd.DataFrame) -> str:

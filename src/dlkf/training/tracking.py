@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 STORE, ARTIFACTS = "mlflow.db", "mlruns"
 SQLITE = "sqlite:///"
 PARENT_TAG, NOTE_TAG = "mlflow.parentRunId", "mlflow.note.content"
+KIND = {"mlflow.experimentKind": "custom_model_development"}  # else the UI shows pages for language models
 KEY_LENGTH, VALUE_LENGTH, PARAMS_AT_ONCE, METRICS_AT_ONCE = 250, 6000, 100, 1000  # MLflow's limits
 SAMPLE_EVERY_S, SAMPLES_PER_POINT = 1, 5  # system metrics: MLflow's own 10 s leaves short runs empty
 
@@ -94,7 +95,7 @@ def experiment_id(client: MlflowClient, name: str) -> str:
     found = client.get_experiment_by_name(name)
     if found is None:
         try:
-            return client.create_experiment(name, artifact_location=location)
+            return client.create_experiment(name, artifact_location=location, tags=KIND)
         except MlflowException as error:
             if error.error_code != "RESOURCE_ALREADY_EXISTS":  # made by another process in the meantime
                 raise
