@@ -32,12 +32,21 @@ def stopped(folder: Path, begun: str, how: signal.Signals, *command: str) -> int
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
+        preexec_fn=_heed_interrupts,
     )
     end = time.monotonic() + 60
     while not any(folder.glob(begun)) and time.monotonic() < end and process.poll() is None:
         time.sleep(0.02)
     process.send_signal(how)
-    return process.wait(timeout=60)
+    try:
+        return process.wait(timeout=60)
+    finally:
+        process.kill()
+
+
+def _heed_interrupts() -> None:
+    """A shell's background job, and all that it starts, ignores SIGINT; a command at a prompt does not."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
