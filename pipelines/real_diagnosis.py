@@ -95,7 +95,7 @@ def clock_offset(tables: DriveTables, imu: ImuSpec, tuning: Tuning, rate_hz: flo
 
 
 def velocity_delay(reference: dict[str, np.ndarray]) -> str:
-    """Delay of the receiver's velocity against the derivative of its position, per axis."""
+    """Delay of the reference velocity against the derivative of its position, per axis (rtkx: the receiver itself)."""
     t, p = reference["t"], track(reference)
     out = []
     for axis, name in enumerate(("n", "e", "d")):
@@ -105,7 +105,7 @@ def velocity_delay(reference: dict[str, np.ndarray]) -> str:
         off = [np.std((slope - np.interp(middle + d, t, reference[f"vel_{name}"]))[steady]) for d in delays]
         k = int(np.argmin(off))
         out.append(f"{name} {1e3 * delays[k]:.0f} ms ({off[0]:.3f} → {off[k]:.3f} m/s)")
-    return "velocity behind the derivative of position: " + ", ".join(out)
+    return "reference velocity behind the derivative of its position: " + ", ".join(out)
 
 
 def track(table: dict[str, np.ndarray]) -> np.ndarray:
