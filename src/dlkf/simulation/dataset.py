@@ -19,10 +19,11 @@ from rich.progress import track
 from dlkf.data.schema import new_dataset, write_drive, write_drives_table
 from dlkf.errors import InputError
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.simulation.drive import Rates, simulate_drive
+from dlkf.simulation.drive import Rates, Seeds, simulate_drive
 from dlkf.simulation.gnss import GnssConfig
 from dlkf.simulation.imu import draw_unit
-from dlkf.simulation.vehicle import VehicleConfig
+from dlkf.simulation.routes import VehicleConfig
+from dlkf.simulation.surroundings import Surroundings
 
 LONGEST_DRIVE = 240.0  # minutes; a drive is held in memory as a whole
 T = TypeVar("T")
@@ -45,6 +46,7 @@ class DatasetConfig:
     imu_errors: str = "one"
     unit_seed: int = 0
     vehicle: VehicleConfig = field(default_factory=VehicleConfig)
+    surroundings: Surroundings = field(default_factory=Surroundings)
     gnss: GnssConfig = field(default_factory=GnssConfig)
 
     def __post_init__(self) -> None:
@@ -87,7 +89,8 @@ def dataset_config(config: Mapping[str, Any]) -> DatasetConfig:
     values = dict(config) if isinstance(config, Mapping) else {}
     if not isinstance(values.get("name"), str):
         raise InputError("dataset: name is missing, give it as in conf/simulated/*.yaml")
-    for key, kind in (("vehicle", VehicleConfig), ("gnss", GnssConfig)):
+    parts = {"vehicle": VehicleConfig, "surroundings": Surroundings, "gnss": GnssConfig}
+    for key, kind in parts.items():
         values[key] = _built(kind, values.get(key, {}), key)
     return _built(DatasetConfig, values, "dataset")
 
@@ -141,10 +144,12 @@ def _write_drives(
     rates = Rates(int(config.imu_rate_hz), config.gnss.rate_hz, int(config.reference_rate_hz))
 
     def one(index: int) -> dict[str, Any]:
-        *streams, unit_seed = np.random.SeedSequence(seed, spawn_key=(1, index)).spawn(4)
+        motion, imu, gnss, unit_seed, sky = np.random.SeedSequence(seed, spawn_key=(1, index)).spawn(5)
         unit = shared if config.imu_errors == "one" else draw_unit(np.random.default_rng(unit_seed), spec)
         seconds = durations[index]
-        tables = simulate_drive(tuple(streams), seconds, rates, config.vehicle, spec, unit, config.gnss)
+        tables = simulate_drive(
+            Seeds(motion, imu, gnss, sky), seconds, rates, config.vehicle, config.surroundings, spec, unit, config.gnss
+        )
         name = f"{config.name}-{seed}-{index:05d}"
         row = {
             "drive": name,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -12,7 +13,18 @@ from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.simulation.gnss import GnssConfig, observe
 from dlkf.simulation.imu import ImuUnit, corrupt, inverse_mechanisation
-from dlkf.simulation.vehicle import Truth, VehicleConfig, drive_vehicle
+from dlkf.simulation.routes import VehicleConfig
+from dlkf.simulation.surroundings import Surroundings, sky_along
+from dlkf.simulation.vehicle import Truth, random_drive
+
+
+class Seeds(NamedTuple):
+    """One seed for each part of a drive."""
+
+    motion: np.random.SeedSequence
+    imu: np.random.SeedSequence
+    gnss: np.random.SeedSequence
+    surroundings: np.random.SeedSequence
 
 
 @dataclass(frozen=True)
@@ -35,25 +47,27 @@ class DriveTables:
 
 
 def simulate_drive(
-    seeds: tuple[np.random.SeedSequence, np.random.SeedSequence, np.random.SeedSequence],
+    seeds: Seeds,
     duration_s: int,
     rates: Rates,
     vehicle: VehicleConfig,
+    surroundings: Surroundings,
     spec: ImuSpec,
     unit: ImuUnit,
     gnss: GnssConfig,
 ) -> DriveTables:
-    """One drive; motion, IMU and GNSS each have a seed, so changing one leaves the others as they were."""
-    motion_rng, imu_rng, gnss_rng = (np.random.default_rng(seed) for seed in seeds)
+    """One drive; each part has a seed of its own, so changing one leaves the others as they were."""
+    motion_rng, imu_rng, gnss_rng, sky_rng = (np.random.default_rng(seed) for seed in seeds)
     t = np.arange(duration_s * rates.imu_hz + 1) / rates.imu_hz
-    truth = drive_vehicle(motion_rng, vehicle, t)
+    truth, motion = random_drive(motion_rng, vehicle, t)
     true_imu = inverse_mechanisation(truth)
     measured, error = corrupt(imu_rng, true_imu, spec, unit, rates.imu_hz)
     fixes = slice(None, None, round(rates.imu_hz / rates.gnss_hz))
     rows = slice(None, None, rates.imu_hz // rates.reference_hz)
+    sky = sky_along(sky_rng, surroundings, motion.distance[fixes])
     return DriveTables(
         imu=pd.DataFrame({"t": t[1:], **dict(zip((*ACCEL, *GYRO), measured.T))}),
-        gnss=observe(gnss_rng, sliced(truth, fixes), _rate_at_rows(true_imu[:, 3:])[fixes], gnss),
+        gnss=observe(gnss_rng, sliced(truth, fixes), _rate_at_rows(true_imu[:, 3:])[fixes], gnss, sky=sky),
         reference=_reference(sliced(truth, rows), np.concatenate((error[:1], error))[rows]),
         distance_m=float(np.linalg.norm(truth.v_n, axis=1)[1:].sum() / rates.imu_hz),
     )

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dlkf.errors import InputError
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.earth import EARTH_RATE, ECCENTRICITY_SQ, transverse_radius
+from dlkf.simulation.surroundings import Sky
 from dlkf.simulation.vehicle import Truth
 
 QUALITIES = (1, 2, 4, 5)
@@ -54,9 +55,13 @@ class GnssConfig:
 
 
 def observe(
-    rng: np.random.Generator, truth: Truth, rate_b: NDArray[np.float64], config: GnssConfig
+    rng: np.random.Generator,
+    truth: Truth,
+    rate_b: NDArray[np.float64],
+    config: GnssConfig,
+    sky: Sky | None = None,
 ) -> pd.DataFrame:
-    """GNSS table of the data contract at every row of ``truth``.
+    """GNSS table of the data contract at every row of ``truth`` whose sky is not blocked.
 
     Antenna (checklist 2.5): p + C l and v + C(ω_ib × l) − ω_ie × (C l), with ``rate_b`` (N, 3) the body's
     ω_ib [rad/s] at those times.
@@ -79,7 +84,7 @@ def observe(
     }
     table = pd.DataFrame(columns)
     table["quality"] = np.full(len(table), config.quality, dtype=np.int64)
-    return table
+    return table if sky is None else table[~sky.blocked].reset_index(drop=True)
 
 
 def shifted(truth: Truth, offset_n: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:

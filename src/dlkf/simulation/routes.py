@@ -1,0 +1,174 @@
+"""Where a car goes and how fast: random plans of manoeuvres within bounds, in closed form.
+
+A plan is a row of segments. In each, speed and course change by given amounts through one smooth window
+w(x): a cubic ramp up, a plateau, a ramp down. So longitudinal acceleration (its jerk bounded) and yaw rate
+(a clothoid-like turn) are continuous, and speed, course and distance are polynomials in closed form. Bounds:
+R084-R088 of the paper (speed 0-80 km/h, longitudinal 0-2 m/s², turns of 40-150 m radius at 0.5-5 m/s²
+lateral, the last two on the plateau of a turn).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlkf.errors import InputError
+
+Array = NDArray[np.float64]
+KMH = 1 / 3.6
+
+
+@dataclass(frozen=True)
+class VehicleConfig:
+    """Bounds of the motion and where it starts; ``slope_std`` is the RMS grade, 0 for a flat road."""
+
+    max_speed_kmh: float = 80.0
+    max_acceleration: float = 2.0  # m/s², along the road
+    min_radius: float = 40.0  # m
+    max_radius: float = 150.0
+    min_lateral: float = 0.5  # m/s², on the plateau of a turn
+    max_lateral: float = 5.0
+    slope_std: float = 0.03
+    lat_deg: float = 52.15
+    lon_deg: float = 9.95
+    height_m: float = 100.0
+
+    def __post_init__(self) -> None:
+        for low, high in (("min_radius", "max_radius"), ("min_lateral", "max_lateral")):
+            if not 0 < getattr(self, low) <= getattr(self, high):
+                raise InputError(
+                    f"vehicle: {low} {getattr(self, low)} and {high} {getattr(self, high)} "
+                    f"must be positive and in that order"
+                )
+        if not 0.2 <= self.max_acceleration <= 10:
+            raise InputError(f"vehicle: max_acceleration {self.max_acceleration} m/s² is outside 0.2 to 10")
+        if not 0 <= self.slope_std <= 0.1:
+            raise InputError(f"vehicle: slope_std {self.slope_std} is outside 0 to 0.1")
+        slowest = math.sqrt(self.min_lateral * self.min_radius) / KMH
+        if not slowest <= self.max_speed_kmh <= 300:
+            raise InputError(
+                f"vehicle: max_speed_kmh {self.max_speed_kmh} is outside {slowest:.1f} to 300: a turn of "
+                f"{self.min_radius} m radius with {self.min_lateral} m/s² lateral takes {slowest:.1f} km/h"
+            )
+        if not (abs(self.lat_deg) <= 80 and abs(self.lon_deg) <= 180 and -500 <= self.height_m <= 9000):
+            raise InputError(
+                f"vehicle: start at {self.lat_deg}°, {self.lon_deg}°, {self.height_m} m is outside "
+                f"±80°, ±180°, -500 to 9000 m"
+            )
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Segments: start time, length and ramp [s]; speed [m/s], course [rad], distance [m] at the start."""
+
+    start: Array
+    length: Array
+    ramp: Array
+    speed: Array
+    speed_change: Array
+    course: Array
+    course_change: Array
+    distance: Array
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """Motion along the road at the times ``t`` (N,): all that depends on the plan alone, in closed form."""
+
+    t: Array  # s
+    speed: Array  # m/s
+    acceleration: Array  # m/s², along the road
+    course: Array  # rad, continuous
+    yaw_rate: Array  # rad/s
+    distance: Array  # m
+
+
+def random_plan(rng: np.random.Generator, config: VehicleConfig, duration: float) -> Plan:
+    """Manoeuvres (R084) until ``duration`` [s] is filled: stretches, turns, stops, figure-eights."""
+    rows: list[tuple[float, float, float, float]] = []  # length, ramp, speed change, course change
+    top = config.max_speed_kmh * KMH
+    clock, speed = 0.0, 0.0
+
+    def add(length: float, ramp: float = 1.0, faster: float = 0.0, turned: float = 0.0) -> None:
+        nonlocal clock, speed
+        rows.append((length, ramp, faster, turned))
+        clock += length
+        speed += faster
+
+    def reach(target: float) -> None:
+        if abs(target - speed) < 1e-6:
+            return
+        rate = rng.uniform(0.4, 1.0) * config.max_acceleration
+        ramp = rng.uniform(0.6, 1.5)
+        add(abs(target - speed) / rate + ramp, ramp, target - speed)
+
+    def turn(angle: float, radius: float, lateral: float) -> None:
+        rate = math.sqrt(lateral / radius)
+        ramp = min(max(0.8, lateral / rng.uniform(1.5, 3.0)), abs(angle) / rate)
+        add(abs(angle) / rate + ramp, ramp, turned=angle)
+
+    def bend(max_radius: float) -> tuple[float, float]:
+        radius = rng.uniform(config.min_radius, min(max_radius, top**2 / config.min_lateral))
+        sharp = rng.triangular(config.min_lateral, config.min_lateral, config.max_lateral)
+        return radius, min(sharp, top**2 / radius)
+
+    add(rng.uniform(2.0, 8.0))
+    while clock < duration:
+        kind = rng.choice(4, p=(0.35, 0.50, 0.10, 0.05))
+        side = rng.choice((-1.0, 1.0))
+        if kind == 0:
+            reach(rng.uniform(0.25, 1.0) * top)
+            add(rng.uniform(2.0, 20.0))
+        elif kind == 1:
+            radius, lateral = bend(config.max_radius)
+            reach(math.sqrt(lateral * radius))
+            turn(side * math.radians(rng.uniform(20.0, 120.0)), radius, lateral)
+            add(rng.uniform(1.0, 8.0))
+        elif kind == 2 and speed > 0:
+            reach(0.0)
+            add(rng.uniform(3.0, 25.0))
+        elif kind == 3:
+            radius, lateral = bend(0.5 * (config.min_radius + config.max_radius))
+            reach(math.sqrt(lateral * radius))
+            turn(side * 2 * math.pi, radius, lateral)
+            turn(-side * 2 * math.pi, radius, lateral)
+    length, ramp, faster, turned = np.array(rows).T
+    speed_at = np.cumsum(faster) - faster
+    speed_at[np.abs(speed_at) < 1e-9] = 0.0  # a standstill is exactly still
+    course = rng.uniform(-math.pi, math.pi) + np.cumsum(turned) - turned
+    driven = speed_at * length + 0.5 * faster * length  # the window is symmetric
+    return Plan(
+        np.cumsum(length) - length, length, ramp, speed_at, faster, course, turned, np.cumsum(driven) - driven
+    )
+
+
+def along(plan: Plan, t: Array) -> Kinematics:
+    """The motion at ``t``, by the window and its integrals."""
+    k = np.searchsorted(plan.start, t, side="right") - 1
+    x, ramp, length = t - plan.start[k], plan.ramp[k], plan.length[k]
+    up = _ramp_integrals(x / ramp)
+    down = _ramp_integrals((x - length + ramp) / ramp)
+    area = length - ramp  # of the whole window, so w/area integrates to one
+    w, first, second = ((u - d) * ramp**n / area for n, (u, d) in enumerate(zip(up, down)))
+    speed, faster, turned = plan.speed[k], plan.speed_change[k], plan.course_change[k]
+    return Kinematics(
+        t,
+        speed + faster * first,
+        faster * w,
+        plan.course[k] + turned * first,
+        turned * w,
+        plan.distance[k] + speed * x + faster * second,
+    )
+
+
+def _ramp_integrals(x: Array) -> tuple[Array, Array, Array]:
+    """The ramp 3x² − 2x³ (0 before, 1 after) and its first and second integral."""
+    c, over = np.clip(x, 0, 1), np.maximum(x - 1, 0)
+    return (
+        c * c * (3 - 2 * c),
+        c**3 * (1 - c / 2) + over,
+        c**4 * (1 / 4 - c / 10) + over * (1 + over) / 2,
+    )

@@ -1,0 +1,95 @@
+"""What stands around the road and hides the sky: buildings on both sides, tunnels, bridges, garages.
+
+Everything is a function of the distance driven, so a car that stands sees the same sky, and the same road
+sampled at another rate has the same buildings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlkf.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sky:
+    """What a receiver on the car sees of the sky at each of N times.
+
+    ``mask_left``, ``mask_right``: elevation [rad] up to which buildings hide the sky across the road, to the
+    left and to the right of the course (right = course + 90°); along the road the sky is open.
+    ``blocked``: no sky at all, as in a tunnel or a garage.
+    """
+
+    mask_left: Array
+    mask_right: Array
+    blocked: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Statistics of what stands along a road; the defaults are open country.
+
+    A side of the road is a row of fronts, ``front_length`` [m] long on average (exponential): with
+    probability ``built_share`` a building of log-normal height (median ``building_height`` [m], 40 %), whose
+    face is ``building_distance`` [m] from the car (0.7 to 1.5 times), else open. Tunnels, or whatever covers
+    the road, are ``tunnel_length`` [m] long (uniform in 0.5 to 1.5 times) and leave ``tunnel_spacing`` [m] of
+    open road in between (uniform in 0.5 to 1.5 times); 0 is none.
+    """
+
+    building_height: float = 0.0
+    building_distance: float = 15.0
+    front_length: float = 25.0
+    built_share: float = 0.8
+    tunnel_length: float = 0.0
+    tunnel_spacing: float = 1000.0
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if not 0 <= getattr(self, f.name) < 1e6:
+                raise InputError(f"surroundings: {f.name} {getattr(self, f.name)} is outside 0 to 1e6")
+        for name in ("building_distance", "front_length", "tunnel_spacing"):
+            if getattr(self, name) < 1:
+                raise InputError(f"surroundings: {name} {getattr(self, name)} m is below 1 m")
+        if self.built_share > 1:
+            raise InputError(f"surroundings: built_share {self.built_share} is above 1")
+        if 0 < self.tunnel_length < 5:
+            raise InputError(f"surroundings: tunnel_length {self.tunnel_length} m is below 5 m (0 is none)")
+
+
+def sky_along(rng: np.random.Generator, surroundings: Surroundings, distance: Array) -> Sky:
+    """The sky at distances (N,) [m, not falling] along a road with random surroundings."""
+    left_rng, right_rng, tunnel_rng = rng.spawn(3)
+    return Sky(
+        _mask(left_rng, surroundings, distance),
+        _mask(right_rng, surroundings, distance),
+        _covered(tunnel_rng, surroundings, distance),
+    )
+
+
+def _mask(rng: np.random.Generator, surroundings: Surroundings, distance: Array) -> Array:
+    """Elevation of the house fronts on one side, atan(height / distance to the face) [rad]."""
+    if surroundings.building_height == 0:
+        return np.zeros_like(distance)
+    fronts = distance[-1] / surroundings.front_length
+    count = 2 + int(fronts + 10 * fronts**0.5)  # ten sigma more than it takes
+    ends = np.cumsum(surroundings.front_length * rng.standard_exponential(count))
+    height = surroundings.building_height * np.exp(0.4 * rng.standard_normal(count))
+    height[rng.random(count) >= surroundings.built_share] = 0.0
+    away = surroundings.building_distance * rng.uniform(0.7, 1.5, count)
+    front = np.minimum(np.searchsorted(ends, distance, side="right"), count - 1)
+    return np.arctan2(height, away)[front]
+
+
+def _covered(rng: np.random.Generator, surroundings: Surroundings, distance: Array) -> NDArray[np.bool_]:
+    """Whether the road is covered: open and covered stretches in turn, the first one open."""
+    if surroundings.tunnel_length == 0:
+        return np.zeros(distance.shape, dtype=bool)
+    mean = np.array((surroundings.tunnel_spacing, surroundings.tunnel_length))
+    count = 1 + int(2 * distance[-1] / mean.sum())
+    ends = np.cumsum(mean * rng.uniform(0.5, 1.5, (count, 2)))
+    return np.searchsorted(ends, distance, side="right") % 2 == 1
