@@ -23,16 +23,16 @@ from torch import Tensor
 
 from dlkf.config import config_dir
 from dlkf.data.alignment import align_boundaries
-from dlkf.data.drive import Batch, Drive
+from dlkf.data.drive import Drive
 from dlkf.data.segments import whole_drives
 from dlkf.data.store import drive_from_tables
 from dlkf.data.tables import read_drives
 from dlkf.data.validate import DriveTables, read_checked
-from dlkf.filters.integration import Correction, Epoch, integrate
-from dlkf.filters.model_based import Mbkf15, Memory, Tuning
+from dlkf.filters.integration import integrate
+from dlkf.filters.model_based import Mbkf
 from dlkf.filters.start import align
+from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import prefix_rotations, vector_from_rotation
-from dlkf.navigation.error_model import masked, window_noise, window_transition
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 
 SETTLE = 2  # epochs whose innovations say more of the start than of the filter
@@ -41,27 +41,13 @@ METRES_PER_RADIAN = 6.371e6
 GROUP_S = 5.0  # length over which a drift of the gyroscope is fitted
 
 
-class Watched(Mbkf15):
-    """``mbkf15`` that keeps its innovations (T, 6), their covariances (T, 6, 6) and what was used (T, 6)."""
-
-    def begin(self, batch: Batch) -> tuple[Memory, Tensor]:
-        object.__setattr__(self, "seen", [])
-        return super().begin(batch)
-
-    def step(self, memory: Memory, epoch: Epoch) -> tuple[Memory, Correction]:
-        Phi = window_transition(epoch.start, epoch.window, epoch.dt, epoch.frame)
-        P = Phi @ memory.P @ Phi.mT + window_noise(Phi, self.psd(), memory.weights)
-        H, R = masked(epoch.H, self._variance(epoch), epoch.used)
-        self.seen.append((epoch.z[0], (H @ P @ H.mT + torch.diag_embed(R))[0], epoch.used[0]))
-        return super().step(memory, epoch)
-
-
 def innovations(drive: Drive, imu: ImuSpec, tuning: Tuning) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Innovation z (T, 6), S (T, 6, 6), use (T, 6) and log-likelihood (T,) of a drive with all its GNSS."""
-    estimator = Watched(imu, tuning)
+    batch = whole_drives([drive], [align(drive)])
     with torch.inference_mode():
-        integrate(whole_drives([drive], [align(drive)]), estimator)
-        z, S, used = (torch.stack(x)[SETTLE:] for x in zip(*estimator.seen))
+        solution = integrate(batch, Mbkf(imu, tuning), keep_covariances=True)
+        z, S = solution.innovation[0, SETTLE:], solution.covariances.innovation[0, SETTLE:]
+        used = (batch.gnss_valid & batch.available.unsqueeze(-1))[0, SETTLE:]
         nis = (z.unsqueeze(-2) @ torch.linalg.solve(S, z.unsqueeze(-1))).flatten()
         return z, S, used, -0.5 * (nis + torch.logdet(S))
 
@@ -257,7 +243,7 @@ def main() -> None:
     print(velocity_delay(tables.reference))
     print(clock_offset(tables, imu, tuning, options.rate_hz))
     with torch.inference_mode():
-        end = integrate(whole_drives([drive], [align(drive)]), Mbkf15(imu, tuning)).imu_error[0, -1, 3:]
+        end = integrate(whole_drives([drive], [align(drive)]), Mbkf(imu, tuning)).imu_error[0, -1, 3:]
     print(pitch_witnesses(tables, drive, end.tolist(), options.figure))
     if options.fit:
         half = len(L) // 2

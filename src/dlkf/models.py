@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dlkf.errors import InputError
-from dlkf.filters.build import MODEL_BASED, build_filter
+from dlkf.filters.build import build_filter, is_filter, known_filters
 from dlkf.filters.integration import Estimator
 from dlkf.filters.learned import CONFIG, WEIGHTS, load_filter
 from dlkf.navigation.imu_errors import ImuSpec
@@ -29,9 +29,9 @@ def resolve_model(
     ``imu`` and ``tuning`` belong to the model-based filters, ``prior`` (``mean``, ``std``) to
     ``mbkf15_prior``. Raises InputError for anything else, listing what is known.
     """
-    if spec in MODEL_BASED:
+    if is_filter(spec):
         given: dict[str, Any] = {} if spec == "ins" else {"tuning": tuning}
-        if spec.endswith("_prior") and prior:
+        if "_prior" in spec and prior:
             given |= {"prior_mean": prior.get("mean"), "prior_std": prior.get("std")}
         return build_filter(spec, imu, **given)
     if is_tracked(spec):
@@ -46,7 +46,7 @@ def resolve_model(
             f"model={spec} is a file; give the folder with {WEIGHTS} and {CONFIG} (pickles are not read)"
         )
     raise InputError(
-        f"unknown model {spec!r}: neither a known filter ({', '.join(MODEL_BASED)}) nor a folder, "
+        f"unknown model {spec!r}: neither a known filter ({known_filters()}) nor a folder, "
         "an MLflow run id or models:/name@alias"
     )
 
@@ -72,7 +72,7 @@ def resolve_models(specs: str | Sequence[str], imu: ImuSpec, tracking_uri: str |
 
 def short_name(spec: str) -> str:
     """What a table calls a model: its name, its folder's, its registered one, or a run's first 8 digits."""
-    if spec in MODEL_BASED:
+    if is_filter(spec):
         return spec
     if RUN_ID.fullmatch(spec):
         return spec[:8]

@@ -9,24 +9,11 @@ from scipy.stats import chi2
 from dlkf.errors import InputError
 from dlkf.filters.build import MODEL_BASED, build_filter
 from dlkf.filters.integration import integrate
-from dlkf.filters.model_based import Ins, Mbkf15, kalman_update
+from dlkf.filters.model_based import Ins, Mbkf, kalman_update
 from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import strapdown
 
 from .scene import IMU, scene
-
-
-class Watched(Mbkf15):
-    """Keeps the covariances it had, for NEES."""
-
-    def begin(self, batch):
-        object.__setattr__(self, "seen", [])
-        return super().begin(batch)
-
-    def step(self, memory, epoch):
-        memory, correction = super().step(memory, epoch)
-        self.seen.append(memory.P)
-        return memory, correction
 
 
 def hidden(batch, first: int, last: int):
@@ -56,11 +43,10 @@ def test_gain_is_the_brute_force_least_squares_solution():
 def test_normalised_errors_lie_in_the_chi_square_band():
     """NEES of 15 states over 100 cars, errors drawn from what the filter is told; with a 20 s outage."""
     batch = hidden(scene(100, 60, seed=1), 30, 50)
-    estimator = Watched(IMU)
-    solution = integrate(batch, estimator)
+    solution = integrate(batch, Mbkf(IMU), keep_covariances=True)
     e = errors(batch, solution)
     for t in (5, 20, 29, 40, 49, 59):
-        P = estimator.seen[t]
+        P = solution.covariances.updated[:, t]
         nees = (e[:, t].unsqueeze(-1) * torch.linalg.solve(P, e[:, t].unsqueeze(-1))).sum()
         low, high = chi2.ppf([0.001, 0.999], 15 * 100)
         # second-order effects of a 5° heading error widen the band a little
@@ -70,7 +56,7 @@ def test_normalised_errors_lie_in_the_chi_square_band():
 
 def test_filter_finds_the_biases_and_beats_pure_inertial():
     batch = hidden(scene(20, 90, seed=2), 60, 90)
-    filtered, inertial = integrate(batch, Mbkf15(IMU)), integrate(batch, Ins())
+    filtered, inertial = integrate(batch, Mbkf(IMU)), integrate(batch, Ins())
     before = (batch.true_imu_error - filtered.imu_error)[:, 59]
     assert before[:, :3].abs().mean() < 0.03 and before[:, 3:].abs().mean() < 2e-4
     drift = (filtered.posterior.p_n - batch.truth.p_n)[:, -1].norm(dim=-1)
@@ -84,7 +70,7 @@ def test_outage_changes_nothing_but_the_missing_updates():
     batch = hidden(scene(3, 30, seed=3), 10, 20)
     garbage = batch.gnss.clone()
     garbage[:, 10:20] = 1e6
-    a, b = integrate(batch, Mbkf15(IMU)), integrate(replace(batch, gnss=garbage), Mbkf15(IMU))
+    a, b = integrate(batch, Mbkf(IMU)), integrate(replace(batch, gnss=garbage), Mbkf(IMU))
     assert torch.equal(a.posterior.p_n, b.posterior.p_n)
     assert not a.used[:, 10:20].any() and a.used[:, 20:].all()
     assert torch.equal(a.prior.p_n[:, 10:20], a.posterior.p_n[:, 10:20])
@@ -100,7 +86,7 @@ def test_truth_is_never_read():
         truth_valid=torch.zeros_like(batch.truth_valid),
         attitude_valid=torch.zeros_like(batch.attitude_valid),
     )
-    a, b = integrate(batch, Mbkf15(IMU)), integrate(blind, Mbkf15(IMU))
+    a, b = integrate(batch, Mbkf(IMU)), integrate(blind, Mbkf(IMU))
     assert torch.equal(a.posterior.p_n, b.posterior.p_n)
 
 
@@ -112,7 +98,7 @@ def test_velocity_component_missing():
     gnss = batch.gnss.clone()
     gnss[..., 5] = torch.nan
     gnss[..., 5] = torch.where(valid[..., 5], gnss[..., 5], torch.zeros_like(gnss[..., 5]))
-    solution = integrate(replace(batch, gnss=gnss, gnss_valid=valid), Mbkf15(IMU))
+    solution = integrate(replace(batch, gnss=gnss, gnss_valid=valid), Mbkf(IMU))
     error = (solution.posterior.p_n - batch.truth.p_n)[:, 10:].norm(dim=-1)
     assert error.mean() < 0.2
     assert not solution.gain[..., 5].any()
@@ -121,10 +107,10 @@ def test_velocity_component_missing():
 def test_lever_arm_is_modelled():
     """An antenna 2 m off: with the arm the filter is as good as without one, ignoring it costs decimetres."""
     batch = scene(20, 40, seed=6, lever_arm=(1.0, 0.5, -1.5))
-    good = integrate(batch, Mbkf15(IMU))
-    ignorant = integrate(replace(batch, lever_arm_b=torch.zeros_like(batch.lever_arm_b)), Mbkf15(IMU))
+    good = integrate(batch, Mbkf(IMU))
+    ignorant = integrate(replace(batch, lever_arm_b=torch.zeros_like(batch.lever_arm_b)), Mbkf(IMU))
     plain = scene(20, 40, seed=6)
-    reference = integrate(plain, Mbkf15(IMU))
+    reference = integrate(plain, Mbkf(IMU))
 
     def rms(solution, batch):
         return (solution.posterior.p_n - batch.truth.p_n)[:, 15:].square().sum(-1).mean().sqrt()
@@ -145,7 +131,7 @@ def test_late_fix_is_compared_at_its_own_time():
         rows.append(torch.cat((at.p_n, at.v_n), -1))
         state = window.end
     shifted = replace(shifted, gnss=torch.stack(rows, 1))
-    solution = integrate(shifted, Mbkf15(IMU))
+    solution = integrate(shifted, Mbkf(IMU))
     assert (solution.posterior.p_n - batch.truth.p_n).abs().max() < 5e-3  # linear between samples
 
 

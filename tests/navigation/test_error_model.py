@@ -1,12 +1,15 @@
 """Φ against finite differences of the nonlinear strapdown, Q against Van Loan, H against its definition."""
 
+import math
+
 import pytest
 import torch
 from scipy.linalg import expm
 
 from dlkf.navigation.attitude import rotation_from_rpy, skew
-from dlkf.navigation.error_model import measurement, noise_weights, window_noise, window_transition
-from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, POSITION, VELOCITY, NavState
+from dlkf.navigation.calibration import ImuError
+from dlkf.navigation.error_model import PLAIN, antenna, measurement_matrix, window_model
+from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, POSITION, VELOCITY, ErrorStates, NavState
 from dlkf.navigation.strapdown import strapdown
 
 from .oracle import frame_at, lively_imu
@@ -21,25 +24,43 @@ def scene(seed: int = 5):
     return NavState(p, v, rotation_from_rpy(a)), lively_imu(1, M, seed), frame_at()
 
 
+def model_of(frame, states=PLAIN, samples=M, **options):
+    return window_model(frame, DT, samples, PSD, states=states, **options)
+
+
+@pytest.mark.parametrize("matrix", ["none", "scale", "full"])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_transition_matches_finite_differences(seed):
-    """Column by column, truth = estimate ⊞ dx and true IMU = corrected − error, central differences."""
-    state, imu, frame = scene(seed)
-    window = strapdown(state, imu, DT, frame)
-    Phi = window_transition(state, window, DT, frame)[0]
-    steps = torch.tensor([1.0, 0.1, 1e-4, 1e-3, 1e-4]).repeat_interleave(3)
-    numeric = torch.zeros(15, 15, dtype=torch.float64)
-    for i in range(15):
+def test_transition_matches_finite_differences(seed, matrix):
+    """Column by column: truth = estimate ⊞ dx, true IMU error = estimated ⊞ dx, central differences."""
+    state, raw, frame = scene(seed)
+    states = ErrorStates(matrix)
+    n = states.count
+    error = ImuError(torch.full((1, 6), 0.01, dtype=torch.float64))
+    corrected = error.corrected(raw)
+    window = strapdown(state, corrected, DT, frame)
+    Phi = model_of(frame, states).transition(state, window, corrected, frame)[0]
+    steps = torch.full((n,), 1e-4, dtype=torch.float64)
+    steps[:12] = torch.tensor([1.0, 0.1, 1e-4, 1e-3]).repeat_interleave(3)
+    numeric = torch.eye(n, dtype=torch.float64)
+    for i in range(n):
         ends = []
         for sign in (1, -1):
-            dx = torch.zeros(1, 15, dtype=torch.float64)
+            dx = torch.zeros(1, n, dtype=torch.float64)
             dx[0, i] = sign * steps[i]
-            truth = strapdown(state.corrected(dx[:, :9]), imu - dx[:, None, 9:], DT, frame).end
-            ends.append(torch.cat((window.end.error_to(truth), dx[:, 9:]), -1)[0])
-        numeric[:, i] = (ends[0] - ends[1]) / (2 * steps[i])
+            true_imu = error.updated(dx, states).corrected(raw)
+            ends.append(window.end.error_to(strapdown(state.corrected(dx[:, :9]), true_imu, DT, frame).end)[0])
+        numeric[:9, i] = (ends[0] - ends[1]) / (2 * steps[i])
     # left out on purpose: Earth rotation acting on the attitude columns within the window, g · 3 ω_ie T² = 2e-3
     size = numeric.abs().clamp_min(1.0)
     assert ((Phi - numeric).abs() / size).max() < 3e-3
+
+
+def test_gauss_markov_biases_decay():
+    frame = frame_at()
+    model = model_of(frame, decay=(1 / 100.0, 0.0))
+    diagonal = model.still[0].diagonal()
+    assert torch.allclose(diagonal[ACCEL], torch.tensor(math.exp(-0.01), dtype=torch.float64))
+    assert torch.equal(diagonal[GYRO], torch.ones(3, dtype=torch.float64))
 
 
 def continuous(C: torch.Tensor, force_n: torch.Tensor) -> torch.Tensor:
@@ -59,8 +80,8 @@ def test_noise_matches_van_loan():
     zero = torch.zeros(1, 3, dtype=torch.float64)
     imu = torch.cat((f_b, torch.zeros(3, dtype=torch.float64))).expand(1, M, 6)
     state = NavState(zero, zero, C)
-    Phi = window_transition(state, strapdown(state, imu, DT, frame), DT, frame)
-    Q = window_noise(Phi, PSD, noise_weights(1.0, torch.float64, Phi.device))[0]
+    model = model_of(frame)
+    Q = model.noise(model.transition(state, strapdown(state, imu, DT, frame), imu, frame))[0]
     G = torch.zeros(15, 15, dtype=torch.float64)
     sources = zip((VELOCITY, ATTITUDE, ACCEL, GYRO), PSD, strict=True)
     for block, name in sources:
@@ -78,14 +99,14 @@ def test_noise_of_rough_motion_matches_sample_by_sample():
     """Brute force P ← Φₖ P Φₖᵀ + Qₖ over 50 samples; the window formula assumes a constant force."""
     state, imu, frame = scene(4)
     window = strapdown(state, imu, DT, frame)
-    Phi = window_transition(state, window, DT, frame)
-    Q = window_noise(Phi, PSD, noise_weights(1.0, torch.float64, Phi.device))[0]
+    model, short = model_of(frame), model_of(frame, samples=1)
+    Q = model.noise(model.transition(state, window, imu, frame))[0]
     total = torch.zeros(15, 15, dtype=torch.float64)
     at = state
     for k in range(M):
         one = strapdown(at, imu[:, k : k + 1], DT, frame)
-        step = window_transition(at, one, DT, frame)
-        total = step[0] @ total @ step[0].T + window_noise(step, PSD, noise_weights(DT, torch.float64, step.device))[0]
+        step = short.transition(at, one, imu[:, k : k + 1], frame)
+        total = step[0] @ total @ step[0].T + short.noise(step)[0]
         at = one.end
     std, expected = Q.diagonal().sqrt(), total.diagonal().sqrt()
     assert ((std / expected) - 1).abs().max() < 0.03
@@ -96,13 +117,13 @@ def test_measurement_matrix_matches_finite_differences():
     state, _, frame = scene(6)
     arm = torch.tensor([[1.2, -0.4, -1.5]], dtype=torch.float64)
     rate = torch.tensor([[0.05, -0.02, 0.4]], dtype=torch.float64)
-    H = measurement(state, rate, arm, frame)[1]
+    H = measurement_matrix(state, rate, arm, frame)
     step = 1e-5
     for i in range(15):
         dx = torch.zeros(1, 15, dtype=torch.float64)
         dx[0, i] = step
-        ahead = measurement(state.corrected(dx[:, :9]), rate - dx[:, 12:], arm, frame)[0]
-        behind = measurement(state.corrected(-dx[:, :9]), rate + dx[:, 12:], arm, frame)[0]
+        ahead = antenna(state.corrected(dx[:, :9]), rate - dx[:, 12:], arm, frame)
+        behind = antenna(state.corrected(-dx[:, :9]), rate + dx[:, 12:], arm, frame)
         numeric = (ahead - behind)[0] / (2 * step)
         # the rate's own error enters with +Ĉ[l×]: truth − estimate of (ω − ζ)×l is l×ζ
         assert (numeric - H[0, :, i]).abs().max() < 1e-6, i
@@ -111,6 +132,6 @@ def test_measurement_matrix_matches_finite_differences():
 def test_zero_lever_arm_is_the_paper_s_h():
     state, _, frame = scene(7)
     zero = torch.zeros(1, 3, dtype=torch.float64)
-    predicted, H = measurement(state, zero + 0.3, zero, frame)
+    predicted, H = (f(state, zero + 0.3, zero, frame) for f in (antenna, measurement_matrix))
     assert torch.equal(H[0, :, :6], torch.eye(6, dtype=torch.float64)) and not H[0, :, 6:].any()
     assert torch.equal(predicted, torch.cat((state.p_n, state.v_n), -1))

@@ -14,37 +14,76 @@ import torch
 from torch import Tensor
 
 from dlkf.data.drive import Batch
+from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import TangentFrame
-from dlkf.navigation.error_model import measurement
+from dlkf.navigation.error_model import antenna
 from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import Window, strapdown
 
 RATE_AVERAGE_S = 0.1  # the lever arm's swing uses the mean rate over this last part of the window
 
 
+class Fix(NamedTuple):
+    """GNSS of one epoch: what a receiver said, and which of it may be used."""
+
+    value: Tensor  # (B, 6) antenna position and velocity in n
+    std: Tensor  # (B, 6)
+    used: Tensor  # (B, 6) bool
+    lag: Tensor | None  # (B,) s before the epoch's end; None: all on it
+
+
 class Epoch(NamedTuple):
     """What an estimator sees at the end of a window; nothing here comes from a reference."""
 
     imu: Tensor  # (B, M, 6) raw samples
-    imu_error: Tensor  # (B, 6) that was taken off them
+    corrected: Tensor  # (B, M, 6) without the IMU error
+    error: ImuError  # that was taken off them
     start: NavState  # at the window's start, after the last correction
     window: Window
+    at_fix: NavState  # the window's end, or where a late fix was taken
+    rate_b: Tensor  # (B, 3) corrected angular rate there
     z: Tensor  # (B, 6) GNSS − prediction, zero where not used
-    H: Tensor  # (B, 6, 15)
-    used: Tensor  # (B, 6) bool
-    fix: Tensor  # (B, 6) antenna position and velocity in n, zero where not used
-    fix_std: Tensor  # (B, 6)
+    fix: Fix
+    lever_arm_b: Tensor  # (B, 3)
     dt: float
     frame: TangentFrame
 
+    @property
+    def imu_error(self) -> Tensor:
+        """(B, 6) bias that was taken off the samples."""
+        return self.error.bias
+
+    @property
+    def used(self) -> Tensor:
+        """(B, 6) bool: components of the fix that may be used."""
+        return self.fix.used
+
+
+class Covariances(NamedTuple):
+    """What a Kalman filter knows of an epoch: for smoothing and for tests of consistency."""
+
+    Phi: Tensor  # (B, n, n) of the window
+    predicted: Tensor  # (B, n, n) P before the update
+    updated: Tensor  # (B, n, n) P after it
+    H: Tensor  # (B, 6, n) of GNSS, zero rows where a component may not be used
+    R: Tensor  # (B, 6) its variance, one there
+    dx: Tensor  # (B, n) the whole correction
+
+    @property
+    def innovation(self) -> Tensor:
+        """Covariance of the innovation before gating, H P Hᵀ + R."""
+        return self.H @ self.predicted @ self.H.mT + torch.diag_embed(self.R)
+
 
 class Correction(NamedTuple):
-    """An estimator's answer: correction (B, 9), IMU error (B, 6), and what it can tell about itself."""
+    """An estimator's answer: correction (B, 9), IMU error, and what it can tell about itself."""
 
     dx: Tensor
-    imu_error: Tensor
+    imu_error: Tensor | ImuError  # (B, 6), or with the sensor matrices
     std: Tensor | None = None  # (B, 15) 1σ after the update
     gain: Tensor | None = None  # (B, 9, 6)
+    accepted: Tensor | None = None  # (B,) bool: a fix was used; None: all that might be
+    covariances: Covariances | None = None
 
 
 @runtime_checkable
@@ -60,61 +99,107 @@ class Estimator(Protocol):
         ...
 
 
+class Step(NamedTuple):
+    """One turn of the loop."""
+
+    prior: NavState
+    posterior: NavState
+    error: ImuError
+    innovation: Tensor  # (B, 6)
+    complete_error: Tensor  # (B, 6) bias + M · mean of the window's samples
+    answer: Correction
+
+
 @dataclass(frozen=True)
 class Solution:
     """A filter's output over a batch, one row at the end of each epoch."""
 
     prior: NavState  # (B, T, …) before the update
     posterior: NavState  # (B, T, …) after it
-    imu_error: Tensor  # (B, T, 6) estimate after the epoch
+    imu_error: Tensor  # (B, T, 6) complete estimate after the epoch
     innovation: Tensor  # (B, T, 6)
     used: Tensor  # (B, T) bool: a fix was used
     std: Tensor | None  # (B, T, 15)
     gain: Tensor | None  # (B, T, 9, 6)
+    covariances: Covariances | None = None  # (B, T, …) where asked for and known
+    error: ImuError | None = None  # (B, T, …) likewise: bias and sensor matrices apart
 
 
-def integrate(batch: Batch, estimator: Estimator) -> Solution:
+def advance(
+    estimator: Estimator,
+    memory: Any,
+    state: NavState,
+    error: ImuError,
+    imu: Tensor,
+    fix: Fix,
+    *,
+    dt: float,
+    frame: TangentFrame,
+    lever_arm_b: Tensor,
+) -> tuple[Any, Step]:
+    """One epoch: strapdown over its samples (B, M, 6), innovation, the estimator's answer, feedback."""
+    corrected = error.corrected(imu)
+    window = strapdown(state, corrected, dt, frame)
+    prior = window.end
+    tail = max(1, min(imu.shape[1], round(RATE_AVERAGE_S / dt)))
+    at_fix = prior if fix.lag is None else window.before(fix.lag, dt)
+    rate_b = corrected[:, -tail:, 3:].mean(1)
+    predicted = antenna(at_fix, rate_b, lever_arm_b, frame)
+    z = torch.where(fix.used, fix.value - predicted, 0.0)
+    epoch = Epoch(imu, corrected, error, state, window, at_fix, rate_b, z, fix, lever_arm_b, dt, frame)
+    memory, answer = estimator.step(memory, epoch)
+    after = answer.imu_error if isinstance(answer.imu_error, ImuError) else ImuError(answer.imu_error)
+    complete = after.bias if after.matrix is None else after.at(corrected.mean(1))
+    return memory, Step(prior, prior.corrected(answer.dx), after, z, complete, answer)
+
+
+def integrate(batch: Batch, estimator: Estimator, *, keep_covariances: bool = False) -> Solution:
     """Run an estimator over a batch from its start state; differentiable where the estimator is."""
-    _, T, M = batch.size
     state = batch.start
     memory, imu_error = estimator.begin(batch)
+    error = ImuError(imu_error)
     usable = batch.gnss_valid & batch.available.unsqueeze(-1)
     late = bool(batch.gnss_lag.any())
-    tail = max(1, min(M, round(RATE_AVERAGE_S / batch.dt)))
-    priors, posteriors, answers, innovations = [], [], [], []
-    for t in range(T):
-        raw = batch.imu[:, t]
-        corrected = raw - imu_error.unsqueeze(1)
-        window = strapdown(state, corrected, batch.dt, batch.frame)
-        prior = window.end
-        lag = batch.gnss_lag[:, t]
-        at_fix = window.before(lag, batch.dt) if late else prior
-        predicted, H = measurement(at_fix, corrected[:, -tail:, 3:].mean(1), batch.lever_arm_b, batch.frame)
-        if late:  # δp at the fix = δp at the window's end − lag · δv
-            H[:, 0, 3] = H[:, 1, 4] = H[:, 2, 5] = -lag
-        used = usable[:, t]
-        z = torch.where(used, batch.gnss[:, t] - predicted, torch.zeros_like(predicted))
-        epoch = Epoch(
-            imu=raw, imu_error=imu_error, start=state, window=window, z=z, H=H, used=used,
-            fix=batch.gnss[:, t], fix_std=batch.gnss_std[:, t], dt=batch.dt, frame=batch.frame,
+    steps: list[Step] = []
+    for t in range(batch.size[1]):
+        fix = Fix(batch.gnss[:, t], batch.gnss_std[:, t], usable[:, t], batch.gnss_lag[:, t] if late else None)
+        memory, step = advance(
+            estimator, memory, state, error, batch.imu[:, t], fix,
+            dt=batch.dt, frame=batch.frame, lever_arm_b=batch.lever_arm_b,
         )  # fmt: skip
-        memory, answer = estimator.step(memory, epoch)
-        state, imu_error = prior.corrected(answer.dx), answer.imu_error
-        priors.append(prior)
-        posteriors.append(state)
-        answers.append(answer)
-        innovations.append(z)
+        if not keep_covariances:
+            step = step._replace(answer=step.answer._replace(covariances=None))
+        state, error = step.posterior, step.error
+        steps.append(step)
+    return gathered(steps, usable.any(-1), keep_errors=keep_covariances)
 
-    def gathered(name: str) -> Tensor | None:
-        rows = [getattr(a, name) for a in answers]
+
+def gathered(steps: list[Step], offered: Tensor, *, keep_errors: bool = False) -> Solution:
+    """The steps of a run as one solution; ``offered`` (B, T) tells where a fix might have been used."""
+
+    def over_time(rows: list) -> Tensor | None:
         return None if rows[0] is None else torch.stack(rows, 1)
 
+    def each(rows: list[tuple], kind: type) -> Any:
+        """Named tuples field by field; a field that appears with the first update is zero before."""
+        fields = []
+        for column in zip(*rows):
+            known = next((x for x in column if x is not None), None)
+            fill = None if known is None else torch.zeros_like(known)
+            fields.append(over_time([fill if x is None else x for x in column]))
+        return kind(*fields)
+
+    answers = [s.answer for s in steps]
+    accepted = over_time([a.accepted for a in answers])
+    covariances = [a.covariances for a in answers]
     return Solution(
-        prior=NavState(*(torch.stack(x, 1) for x in zip(*priors))),
-        posterior=NavState(*(torch.stack(x, 1) for x in zip(*posteriors))),
-        imu_error=torch.stack([a.imu_error for a in answers], 1),
-        innovation=torch.stack(innovations, 1),
-        used=usable.any(-1),
-        std=gathered("std"),
-        gain=gathered("gain"),
+        prior=each([s.prior for s in steps], NavState),
+        posterior=each([s.posterior for s in steps], NavState),
+        imu_error=torch.stack([s.complete_error for s in steps], 1),
+        innovation=torch.stack([s.innovation for s in steps], 1),
+        used=offered if accepted is None else offered & accepted,
+        std=over_time([a.std for a in answers]),
+        gain=over_time([a.gain for a in answers]),
+        covariances=None if covariances[0] is None else each(covariances, Covariances),
+        error=each([s.error for s in steps], ImuError) if keep_errors else None,
     )

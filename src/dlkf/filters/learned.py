@@ -163,7 +163,7 @@ class LearnedFilter(nn.Module):
         cut = Tensor.detach if self.config.detach_features else (lambda x: x)
         p_n, v_n, C_nb = (pick(cut(x)) for x in epoch.window[:3])
         C_hn = level_rotation(C_nb[:, -1], self.config.frame)
-        moved = torch.where(memory.had_fix & epoch.used, epoch.fix - memory.fix, torch.zeros_like(epoch.fix))
+        moved = torch.where(memory.had_fix & epoch.used, epoch.fix.value - memory.fix, torch.zeros_like(memory.fix))
         parts = [
             memory.difference / memory.difference_s.unsqueeze(-1),
             memory.correction,
@@ -202,7 +202,7 @@ class LearnedFilter(nn.Module):
             difference=choose(difference, memory.difference),
             difference_s=choose(memory.elapsed, memory.difference_s),
             correction=choose(dx.detach(), memory.correction),
-            fix=torch.where(epoch.used, epoch.fix, memory.fix),
+            fix=torch.where(epoch.used, epoch.fix.value, memory.fix),
             had_fix=memory.had_fix | epoch.used,
         )
 

@@ -1,4 +1,4 @@
-"""Model-based estimators: pure inertial, and the 15-state error-state Kalman filter (MBKF; R007–R020)."""
+"""Model-based estimators: pure inertial, and error-state Kalman filters (MBKF; R007–R020)."""
 
 from __future__ import annotations
 
@@ -11,34 +11,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.data.drive import Batch
-from dlkf.filters.integration import Correction, Epoch
-from dlkf.navigation.error_model import masked, noise_weights, window_noise, window_transition
+from dlkf.filters.adaptive import Adaptation, AdaptiveNoise
+from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD, Constraints, Measurement
+from dlkf.filters.gating import Gate, GateMemory
+from dlkf.filters.integration import Correction, Covariances, Epoch
+from dlkf.filters.tuning import Tuning
+from dlkf.navigation.error_model import PLAIN, WindowModel, masked, measurement_matrix, window_model
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.navigation.state import IMU, PVA, STATES
+from dlkf.navigation.state import PVA, STATES, ErrorStates
 
 STANDARD_GRAVITY = 9.80665
-
-
-@dataclass(frozen=True)
-class Tuning:
-    """Over-bounding factors on standard deviations, ≥ 1 as a rule, fitted on training drives only (R016, R018).
-
-    ``accel_noise``, ``gyro_noise`` scale √S of the white noise; ``accel_walk``, ``gyro_walk`` that of the bias
-    random walk; ``position_std``, ``velocity_std`` the GNSS stds. ``walk_floor_accel`` [m/s²/√s] and
-    ``walk_floor_gyro`` [rad/s/√s] keep the bias states awake when the preset has no in-run instability, and
-    ``position_floor`` [m], ``velocity_floor`` [m/s] keep R positive.
-    """
-
-    accel_noise: float = 1.0
-    gyro_noise: float = 1.0
-    accel_walk: float = 1.0
-    gyro_walk: float = 1.0
-    position_std: float = 1.0
-    velocity_std: float = 1.0
-    walk_floor_accel: float = 1e-5
-    walk_floor_gyro: float = 1e-7
-    position_floor: float = 0.01
-    velocity_floor: float = 0.01
 
 
 class Ins:
@@ -50,51 +32,75 @@ class Ins:
 
     def step(self, memory: None, epoch: Epoch) -> tuple[None, Correction]:
         """No correction."""
-        return None, Correction(epoch.z.new_zeros(len(epoch.z), 9), epoch.imu_error)
+        return None, Correction(epoch.z.new_zeros(len(epoch.z), 9), epoch.error)
 
 
 class Memory(NamedTuple):
-    """Covariance and noise weights of a Kalman filter between epochs."""
+    """What a Kalman filter carries from epoch to epoch."""
 
-    P: Tensor  # (B, 15, 15)
-    weights: dict[str, Tensor]
+    P: Tensor  # (B, n, n)
+    windows: WindowModel
+    structure: Tensor | None = None  # (B, 4) of the car
+    quietest: Tensor | None = None  # (B, 2) spread of the samples
+    gate: GateMemory | None = None
+    noise: AdaptiveNoise | None = None
 
 
-def bias_sigma(imu: ImuSpec) -> Float[Tensor, " 6"]:
+def bias_sigma(imu: ImuSpec, states: ErrorStates = PLAIN) -> Float[Tensor, " 6"]:
     """1σ of the error that a constant-bias state has to carry at the start [m/s², rad/s].
 
     Turn-on bias and in-run part, plus what scale factor (down axis) and misalignment (level axes) make of
-    gravity: to a filter without those states they are biases.
+    gravity where the filter has no states for them: then they are biases.
     """
-    accel = math.hypot(imu.accel.turn_on_bias, imu.accel.instability)
-    level = math.hypot(accel, STANDARD_GRAVITY * imu.accel.misalignment)
-    down = math.hypot(accel, STANDARD_GRAVITY * imu.accel.scale_factor)
-    gyro = math.hypot(imu.gyro.turn_on_bias, imu.gyro.instability)
+    a, g = imu.accel, imu.gyro
+    accel, gyro = math.hypot(a.turn_on_bias, a.instability), math.hypot(g.turn_on_bias, g.instability)
+    level = accel if states.matrix == "full" else math.hypot(accel, STANDARD_GRAVITY * a.misalignment)
+    down = math.hypot(accel, STANDARD_GRAVITY * a.scale_factor) if states.matrix == "none" else accel
     return torch.tensor([level, level, down, gyro, gyro, gyro], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
-class Mbkf15:
-    """Error-state Kalman filter with position, velocity, attitude and both biases (paper eqs 1–6).
+class Mbkf:
+    """Error-state Kalman filter with position, velocity, attitude and IMU errors (paper eqs 1–6).
 
-    ``prior_mean`` and ``prior_std`` [m/s², rad/s] replace zero and the preset's spread as the bias's initial
-    knowledge: with a training set's mean error this is ``mbkf15_prior`` (checklist 4.6).
+    ``states`` gives 15 (the paper's), 21 or 33 of them. ``prior_mean`` and ``prior_std`` [m/s², rad/s] replace
+    zero and the preset's spread as the bias's initial knowledge: with a training set's mean error this is
+    ``mbkf15_prior`` (checklist 4.6). ``gauss_markov`` lets the biases decay with the preset's correlation time
+    instead of walking. ``constrained`` adds what a car cannot do, ``gated`` refuses outliers, ``adaptive``
+    adapts Q and R.
     """
 
     imu: ImuSpec
     tuning: Tuning = field(default_factory=Tuning)
+    states: ErrorStates = PLAIN
     prior_mean: tuple[float, ...] = (0.0,) * 6
     prior_std: tuple[float, ...] | None = None
+    gauss_markov: bool = False
+    constrained: bool = False
+    gated: bool = False
+    adaptive: bool = False
 
     def begin(self, batch: Batch) -> tuple[Memory, Tensor]:
         """P₀ from the start's law and the preset; biases at their prior mean."""
         like = {"dtype": batch.imu.dtype, "device": batch.imu.device}
-        B = batch.size[0]
-        spread = bias_sigma(self.imu) if self.prior_std is None else torch.tensor(self.prior_std)
-        sigma = torch.cat((batch.start_std, spread.to(**like).expand(B, 6)), -1)
-        mean = torch.tensor(self.prior_mean, **like).repeat(B, 1)
-        weights = noise_weights(batch.epoch_s, batch.imu.dtype, batch.imu.device)
-        return Memory(torch.diag_embed(sigma**2), weights), mean
+        B, _, M = batch.size
+        sigma = torch.cat((batch.start_std, self._imu_sigma().to(**like).expand(B, -1)), -1)
+        structure = quietest = None
+        if self.states.structure:
+            known = torch.tensor(STRUCTURE_STD, **like).expand(B, 4)
+            sigma, structure = torch.cat((sigma, known), -1), torch.zeros_like(known)
+        if self.constrained:
+            quietest = batch.imu.new_full((B, 2), math.inf)
+        decay = (0.0, 0.0)
+        if self.gauss_markov:
+            decay = (1 / self.imu.accel.correlation_time, 1 / self.imu.gyro.correlation_time)
+        windows = window_model(
+            batch.frame, batch.dt, M, self.psd(), states=self.states, decay=decay,
+            walk=torch.tensor(STRUCTURE_WALK_STD) ** 2,
+        )  # fmt: skip
+        gate = Gate(self.tuning.gate).begin(batch.imu) if self.gated else None
+        memory = Memory(torch.diag_embed(sigma**2), windows, structure, quietest, gate)
+        return memory, torch.tensor(self.prior_mean, **like).repeat(B, 1)
 
     def psd(self) -> dict[str, float]:
         """Over-bounded power spectral densities of the noise sources (R016)."""
@@ -107,27 +113,69 @@ class Mbkf15:
         }
 
     def step(self, memory: Memory, epoch: Epoch) -> tuple[Memory, Correction]:
-        """Propagate P over the window, update where a fix may be used (paper eqs 2–6, Joseph form)."""
-        P = memory.P
-        Phi = window_transition(epoch.start, epoch.window, epoch.dt, epoch.frame)
-        P = Phi @ P @ Phi.mT + window_noise(Phi, self.psd(), memory.weights)
-        dx = P.new_zeros(len(P), STATES)
-        K = P.new_zeros(len(P), STATES, 6)
-        if bool(epoch.used.any()):
-            H, R = masked(epoch.H, self._variance(epoch), epoch.used)
+        """Propagate P over the window, update where there is something to learn (paper eqs 2–6, Joseph form)."""
+        Phi = memory.windows.transition(epoch.start, epoch.window, epoch.corrected, epoch.frame)
+        Q = memory.windows.noise(Phi)
+        if memory.noise is not None and memory.noise.Q is not None:
+            Q = memory.noise.Q
+        predicted = Phi @ memory.P @ Phi.mT + Q
+        fix = self._fix(epoch, memory)
+        H, R = masked(fix.H, fix.R, fix.used)
+        offered, gate, accepted, P = (H, R), memory.gate, None, predicted
+        if self.gated:
+            S = H @ predicted @ H.mT + torch.diag_embed(R)
+            gate, passed, opened = Gate(self.tuning.gate).judge(memory.gate, epoch, S, fix.R)
+            P = predicted + torch.nn.functional.pad(torch.diag_embed(opened), (0, P.shape[-1] - 6) * 2)
+            fix = fix._replace(used=passed)
+            accepted = passed.any(-1)
+            H, R = masked(fix.H, fix.R, passed)
+        z, quietest = torch.where(fix.used, fix.z, 0.0), memory.quietest
+        informative = bool(fix.used.any())
+        if self.constrained:
+            rules, quietest = Constraints(self.tuning, self.states).rows(epoch, memory.structure, quietest, P)
+            Hc, Rc = masked(rules.H, rules.R, rules.used)
+            H, R, z = torch.cat((H, Hc), 1), torch.cat((R, Rc), -1), torch.cat((z, rules.z), -1)
+            informative = informative or bool(rules.used.any())
+        dx, K = P.new_zeros(P.shape[:2]), P.new_zeros(*P.shape[:2], H.shape[1])
+        prior = P
+        if informative:
             K, P = kalman_update(P, H, R)
-            dx = (K @ epoch.z.unsqueeze(-1)).squeeze(-1)
+            dx = (K @ z.unsqueeze(-1)).squeeze(-1)
         P = 0.5 * (P + P.mT)
-        std = P.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
-        return Memory(P, memory.weights), Correction(
-            dx[:, PVA], epoch.imu_error + dx[:, IMU], std=std, gain=K[:, PVA]
-        )
+        noise = memory.noise
+        if self.adaptive:
+            rule = Adaptation(self.tuning.forgetting)
+            noise = rule.learned(noise, epoch, fix.used, H[:, :6], prior, K[:, :, :6], dx, Q)
+        structure = memory.structure
+        if structure is not None:
+            structure = structure + dx[:, self.states.of_structure]
+        std = P.diagonal(dim1=-2, dim2=-1)[:, :STATES].clamp_min(0).sqrt()
+        return Memory(P, memory.windows, structure, quietest, gate, noise), Correction(
+            dx[:, PVA], epoch.error.updated(dx, self.states), std=std, gain=K[:, PVA, :6], accepted=accepted,
+            covariances=Covariances(Phi, prior, P, *offered, dx),
+        )  # fmt: skip
 
-    def _variance(self, epoch: Epoch) -> Tensor:
-        t = self.tuning
-        scale = epoch.fix_std.new_tensor([t.position_std] * 3 + [t.velocity_std] * 3)
-        floor = epoch.fix_std.new_tensor([t.position_floor] * 3 + [t.velocity_floor] * 3)
-        return (scale * epoch.fix_std).clamp_min(floor) ** 2
+    def _imu_sigma(self) -> Float[Tensor, " k"]:
+        bias = bias_sigma(self.imu, self.states) if self.prior_std is None else torch.tensor(self.prior_std).double()
+        of_matrix = [
+            sensor.scale_factor if i == j else sensor.misalignment
+            for sensor in (self.imu.accel, self.imu.gyro)
+            for i, j in self.states.elements
+        ]
+        return torch.cat((bias, torch.tensor(of_matrix, dtype=torch.float64)))
+
+    def _fix(self, epoch: Epoch, memory: Memory) -> Measurement:
+        """GNSS position and velocity as rows of an update."""
+        H = measurement_matrix(epoch.at_fix, epoch.rate_b, epoch.lever_arm_b, epoch.frame, self.states.count)
+        if epoch.fix.lag is not None:  # δp at the fix = δp at the window's end − lag · δv
+            H[:, 0, 3] = H[:, 1, 4] = H[:, 2, 5] = -epoch.fix.lag
+        t, std = self.tuning, epoch.fix.std
+        scale = std.new_tensor([t.position_std] * 3 + [t.velocity_std] * 3)
+        floor = std.new_tensor([t.position_floor] * 3 + [t.velocity_floor] * 3)
+        R = (scale * std).clamp_min(floor) ** 2
+        if memory.noise is not None:
+            R = torch.where(memory.noise.known, memory.noise.R, R)
+        return Measurement(epoch.z, H, R, epoch.used)
 
 
 def kalman_update(

@@ -1,13 +1,17 @@
-"""Error-state model of the tangent-frame strapdown over one whole window (checklist 2.1, 2.5, 2.6).
+"""Error-state model of the tangent-frame strapdown over one whole window (checklist 2.1, 2.5–2.7).
 
-Truth − estimate, order position, velocity, attitude, accelerometer error, gyroscope error:
+Truth − estimate, order position, velocity, attitude, accelerometer error, gyroscope error, and where a filter
+carries them the elements of the sensor matrices M (measured = (I + M) true + bias):
 
     δp' = δv
-    δv' = G δp − 2W δv − [(C f̂)×] δh − C ε        W = [ω_ie×], G = ∂g/∂p
-    δh' = −W δh − C ζ
+    δv' = G δp − 2W δv − [(C f̂)×] δh − C (ε + δM_a f̂)      W = [ω_ie×], G = ∂g/∂p
+    δh' = −W δh − C (ζ + δM_g ω̂)
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,123 +19,181 @@ from torch import Tensor
 
 from dlkf.navigation.attitude import rotation_from_vector, skew
 from dlkf.navigation.earth import TangentFrame
-from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, POSITION, STATES, VELOCITY, NavState
+from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, POSITION, STATES, VELOCITY, ErrorStates, NavState
 from dlkf.navigation.strapdown import Window
 
 # Response to a source acting at time τ of a window of length T grows like (T − τ)ⁿ: n per source and state
-# block, none where the source does not reach the block within the window.
+# block, none where the source does not reach the block within the window. In the order of the states driven.
 SOURCES = {
-    "accel_noise": (VELOCITY, (1, 0, None, None, None)),
-    "gyro_noise": (ATTITUDE, (2, 1, 0, None, None)),
-    "accel_walk": (ACCEL, (2, 1, None, 0, None)),
-    "gyro_walk": (GYRO, (3, 2, 1, None, 0)),
+    "accel_noise": (1, 0, None, None, None),  # through VELOCITY
+    "gyro_noise": (2, 1, 0, None, None),  # ATTITUDE
+    "accel_walk": (2, 1, None, 0, None),  # ACCEL
+    "gyro_walk": (3, 2, 1, None, 0),  # GYRO
 }
+DRIVEN = slice(VELOCITY.start, GYRO.stop)  # four blocks of three columns of Φ, one per source
+PLAIN = ErrorStates()
 
 
-def window_transition(
-    start: NavState, window: Window, dt: float, frame: TangentFrame
-) -> Float[Tensor, "B 15 15"]:
-    """Φ of a whole window in closed form from prefix sums, no product of per-sample matrices.
+@dataclass(frozen=True)
+class WindowModel:
+    """What Φ and Q of all windows of a batch have in common; build with :func:`window_model`."""
 
-    With s(t) the specific-force velocity gained since the window's start and C(t) the attitude,
+    states: ErrorStates
+    dt: float
+    still: Tensor  # (B, n, n) Φ of a window in which nothing moves: Earth rotation, gravity gradient, decay
+    left: Tensor  # (2, M) time from each sample's middle to the end, and 1: integrates once and twice
+    spread: Tensor  # (4, n, n) S ∫ (1−τ/T)^(nᵢ+nⱼ) dτ of each noise source
+    walk: Tensor  # (n,) variance that a window adds to the states of the car
 
-        Φ_vh = −[s(T)×]   Φ_ph = −[∫s×]   Φ_hζ = Φ_vε = −∫C   Φ_pε = −∬C
-        Φ_vζ = ∫[C f×] (∫C)   Φ_pζ = ∬[C f×] (∫C)
+    def transition(
+        self, start: NavState, window: Window, corrected: Float[Tensor, "B M 6"], frame: TangentFrame
+    ) -> Float[Tensor, "B n n"]:
+        """Φ of a whole window in closed form from prefix sums, no product of per-sample matrices.
 
-    plus Earth rotation, Coriolis and gravity gradient to first order in T.
+        With s(t) the specific-force velocity gained since the window's start, C(t) the attitude and e a sensor
+        error of unit size in body axes (constant for a bias, f̂ or ω̂ along an axis for an element of M),
+
+            Φ_vh = −[s(T)×]   Φ_ph = −[∫s×]   Φ_he = −∫C e   Φ_ve = −∫C e (force), ∫[C f×] (∫C e) (rate)
+
+        and once more integrated for position; Earth rotation, Coriolis and gravity gradient to first order in T.
+        """
+        B, M = window.p_n.shape[:2]
+        dt, end = self.dt, window.end
+        T = M * dt
+        before = torch.cat((start.C_nb.unsqueeze(1), window.C_nb[:, :-1]), 1)
+        turned = torch.add(before, window.C_nb).mul_(0.5 * dt)  # ∫C over each sample
+        v_before = torch.cat((start.v_n.unsqueeze(1), window.v_n[:, :-1]), 1)
+        gained = window.v_n - v_before - (dt * window.gravity).unsqueeze(1)
+        force, rate = self._columns(turned, corrected)
+        swept_rate = torch.sub(rate.cumsum(1), rate, alpha=0.5)
+        lever = torch.linalg.cross(gained.unsqueeze(-1).expand_as(rate), swept_rate, dim=-2)
+        columns = torch.cat(self._in_order(-force, lever), -1)  # of the velocity gained in each sample
+        moved = end.p_n - start.p_n
+        swept = (T / 3) * moved + (T * T / 6) * start.v_n  # ∫(p − p₀), exact for constant acceleration
+        coriolis = 2 * torch.linalg.cross(frame.earth_rate_n.unsqueeze(1), torch.stack((swept, moved), 1))
+        fallen = T * window.gravity
+        s = torch.stack((moved - T * (start.v_n + 0.5 * fallen), end.v_n - start.v_n - fallen), 1) + coriolis
+        Phi = self.still.clone()
+        Phi[:, :6, ATTITUDE] = skew(-s).flatten(1, 2)
+        n = self.states.navigation
+        Phi[:, :6, ACCEL.start : n] = (self.left @ columns.flatten(2)).reshape(B, 6, -1)
+        turned_by = -rate.sum(1)
+        Phi[:, ATTITUDE, GYRO] = turned_by[..., :3]
+        if n > STATES:
+            Phi[:, ATTITUDE, STATES + len(self.states.elements) : n] = turned_by[..., 3:]
+        return Phi
+
+    def noise(self, Phi: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
+        """Process noise Q of a whole window from the PSDs of its sources (checklist 2.6, R016).
+
+        Q = Σ_source S ∫ L(τ) L(τ)ᵀ dτ, where the response L(τ) to noise at time τ is the source's column of Φ
+        shrunk by (1−τ/T)ⁿ: exact while attitude and specific force are constant over the window.
+        """
+        L = Phi[:, :, DRIVEN].unflatten(-1, (4, 3)).transpose(1, 2)
+        Q = ((L @ L.mT) * self.spread).sum(1)
+        if self.states.structure:
+            Q = Q + self.walk.diag()
+        return Q
+
+    def _columns(self, turned: Tensor, corrected: Tensor) -> tuple[Tensor, Tensor]:
+        """∫C e over each sample for the accelerometers' and the gyroscopes' errors (B, M, 3, k)."""
+        if self.states.matrix == "none":
+            return turned, turned
+        f, w = (x.unsqueeze(-2) for x in corrected.split(3, -1))
+        if self.states.matrix == "scale":
+            return torch.cat((turned, turned * f), -1), torch.cat((turned, turned * w), -1)
+        rows, columns = zip(*self.states.elements)
+        along = turned[..., list(rows)]
+        listed = list(columns)
+        return (
+            torch.cat((turned, along * f[..., listed]), -1),
+            torch.cat((turned, along * w[..., listed]), -1),
+        )
+
+    def _in_order(self, force: Tensor, lever: Tensor) -> tuple[Tensor, ...]:
+        if self.states.matrix == "none":
+            return force, lever
+        return force[..., :3], lever[..., :3], force[..., 3:], lever[..., 3:]
+
+
+def window_model(
+    frame: TangentFrame,
+    dt: float,
+    samples: int,
+    psd: Mapping[str, float],
+    *,
+    states: ErrorStates = PLAIN,
+    decay: tuple[float, float] = (0.0, 0.0),
+    walk: Float[Tensor, " 4"] | None = None,
+) -> WindowModel:
+    """The common part of the windows of a batch of frames.
+
+    ``psd`` gives S of ``accel_noise`` [m²/s³], ``gyro_noise`` [rad²/s], ``accel_walk`` [m²/s⁵] and
+    ``gyro_walk`` [rad²/s³]. ``decay`` is 1/τ [1/s] of first-order Gauss-Markov biases (accelerometers,
+    gyroscopes), 0 for random walks. ``walk`` is the PSD of the random walks of the states of the car.
     """
-    B, M = window.p_n.shape[:2]
-    T = M * dt
-    like = {"dtype": window.p_n.dtype, "device": window.p_n.device}
-    gravity = frame.gravity(start.p_n + 0.5 * T * start.v_n)
-    C_before = torch.cat((start.C_nb.unsqueeze(1), window.C_nb[:, :-1]), 1)
-    turned = (0.5 * dt) * (C_before + window.C_nb)  # ∫C over each sample
-    A_mid = turned.cumsum(1) - 0.5 * turned
-    v_before = torch.cat((start.v_n.unsqueeze(1), window.v_n[:, :-1]), 1)
-    gained = window.v_n - v_before - (dt * gravity).unsqueeze(1)
-    left = T - (torch.arange(M, **like) + 0.5) * dt  # time from each sample's middle to the end
-    lever = torch.linalg.cross(gained.unsqueeze(-1).expand(B, M, 3, 3), A_mid, dim=-2)
-    weights = torch.stack((torch.ones_like(left), left))
-    integrals = weights @ torch.cat((turned.flatten(2), lever.flatten(2)), -1)  # (B, 2, 18)
-    (A1, B1), (A2, B2) = (x.split(9, -1) for x in integrals.unbind(1))
-
-    W = skew(frame.earth_rate_n)
-    eye = torch.eye(3, **like)
-    Phi = torch.eye(STATES, **like).repeat(B, 1, 1)
-    end = window.end
+    T, n = samples * dt, states.count
+    like = {"dtype": frame.earth_rate_n.dtype, "device": frame.earth_rate_n.device}
+    W, eye = skew(frame.earth_rate_n), torch.eye(3, **like)
     gradient = torch.diag_embed(frame.gravity_gradient())
-    Phi[:, POSITION, POSITION] += 0.5 * T * T * gradient
-    Phi[:, POSITION, VELOCITY] = T * eye - T * T * W
-    Phi[:, VELOCITY, POSITION] = T * gradient
-    Phi[:, VELOCITY, VELOCITY] -= 2 * T * W
-    moved = end.p_n - start.p_n
-    swept = T / 3 * moved + T * T / 6 * start.v_n  # ∫(p − p₀), exact for constant acceleration
-    coriolis_v = 2 * torch.linalg.cross(frame.earth_rate_n, moved)
-    coriolis_p = 2 * torch.linalg.cross(frame.earth_rate_n, swept)
-    Phi[:, VELOCITY, ATTITUDE] = -skew(end.v_n - start.v_n - T * gravity + coriolis_v)
-    Phi[:, POSITION, ATTITUDE] = -skew(moved - T * start.v_n - 0.5 * T * T * gravity + coriolis_p)
-    Phi[:, ATTITUDE, ATTITUDE] = rotation_from_vector(-T * frame.earth_rate_n)
-    Phi[:, VELOCITY, ACCEL] = -A1.unflatten(-1, (3, 3))
-    Phi[:, POSITION, ACCEL] = -A2.unflatten(-1, (3, 3))
-    Phi[:, ATTITUDE, GYRO] = -A1.unflatten(-1, (3, 3))
-    Phi[:, VELOCITY, GYRO] = B1.unflatten(-1, (3, 3))
-    Phi[:, POSITION, GYRO] = B2.unflatten(-1, (3, 3))
-    return Phi
+    still = torch.eye(n, **like).repeat(len(W), 1, 1)
+    still[:, POSITION, POSITION] += 0.5 * T * T * gradient
+    still[:, POSITION, VELOCITY] = T * eye - T * T * W
+    still[:, VELOCITY, POSITION] = T * gradient
+    still[:, VELOCITY, VELOCITY] -= 2 * T * W
+    still[:, ATTITUDE, ATTITUDE] = rotation_from_vector(-T * frame.earth_rate_n)
+    for block, inverse in zip((ACCEL, GYRO), decay):
+        still[:, block, block] *= torch.exp(torch.tensor(-T * inverse, **like))
+    left = T - (torch.arange(samples, **like) + 0.5) * dt
+    spread = torch.zeros(4, n, n, **like)
+    for k, (source, powers) in enumerate(SOURCES.items()):
+        order = torch.tensor([float("inf") if p is None else float(p) for p in powers], **like)
+        order = order.repeat_interleave(3)
+        spread[k, :STATES, :STATES] = psd[source] * T / (order[:, None] + order[None, :] + 1)
+    drift = torch.zeros(n, **like)
+    if states.structure and walk is not None:
+        drift[states.of_structure] = T * walk.to(**like)
+    return WindowModel(states, dt, still, torch.stack((left, torch.ones_like(left))), spread, drift)
 
 
-def noise_weights(T: float, dtype: torch.dtype, device: torch.device) -> dict[str, Float[Tensor, "15 15"]]:
-    """∫ (1−τ/T)^(nᵢ+nⱼ) dτ = T/(nᵢ+nⱼ+1) for every pair of states and each noise source."""
-    weights = {}
-    for source, (_, powers) in SOURCES.items():
-        n = torch.tensor([float("inf") if p is None else float(p) for p in powers], dtype=dtype, device=device)
-        n = n.repeat_interleave(3)
-        weights[source] = T / (n[:, None] + n[None, :] + 1)
-    return weights
+def antenna(
+    state: NavState, rate_b: Float[Tensor, "B 3"], lever_arm_b: Float[Tensor, "B 3"], frame: TangentFrame
+) -> Float[Tensor, "B 6"]:
+    """Position and velocity of the antenna in n (checklist 2.5).
 
-
-def window_noise(
-    Phi: Float[Tensor, "B 15 15"], psd: dict[str, float], weights: dict[str, Float[Tensor, "15 15"]]
-) -> Float[Tensor, "B 15 15"]:
-    """Process noise Q of a whole window from the PSDs of its sources (checklist 2.6, R016).
-
-    Q = Σ_source S ∫ L(τ) L(τ)ᵀ dτ, where the response L(τ) to noise at time τ is the source's column of Φ
-    shrunk by (1−τ/T)ⁿ: exact while attitude and specific force are constant over the window. ``psd`` gives S
-    of ``accel_noise`` [m²/s³], ``gyro_noise`` [rad²/s], ``accel_walk`` [m²/s⁵] and ``gyro_walk`` [rad²/s³].
+    ``rate_b`` is the corrected angular rate at the fix [rad/s], ``lever_arm_b`` IMU → antenna [m].
     """
-    Q = torch.zeros_like(Phi)
-    for source, S in psd.items():
-        if S:
-            L = Phi[:, :, SOURCES[source][0]]
-            Q = Q + (S * weights[source]) * (L @ L.mT)
-    return Q
+    arm_n, swing_n = _arm(state, rate_b, lever_arm_b)
+    velocity = state.v_n + swing_n - torch.linalg.cross(frame.earth_rate_n, arm_n)
+    return torch.cat((state.p_n + arm_n, velocity), -1)
 
 
-def measurement(
+def measurement_matrix(
     state: NavState,
     rate_b: Float[Tensor, "B 3"],
     lever_arm_b: Float[Tensor, "B 3"],
     frame: TangentFrame,
-) -> tuple[Float[Tensor, "B 6"], Float[Tensor, "B 6 15"]]:
-    """Predicted antenna position and velocity, and H with the lever arm in it (checklist 2.5).
+    states: int = STATES,
+) -> Float[Tensor, "B 6 n"]:
+    """H of antenna position and velocity with the lever arm in it (checklist 2.5)."""
+    like = {"dtype": rate_b.dtype, "device": rate_b.device}
+    H = torch.eye(6, states, **like).repeat(len(rate_b), 1, 1)
+    if bool(lever_arm_b.any()):
+        arm_n, swing_n = _arm(state, rate_b, lever_arm_b)
+        H[:, :3, ATTITUDE] = -skew(arm_n)
+        H[:, 3:, ATTITUDE] = -skew(swing_n) + skew(frame.earth_rate_n) @ skew(arm_n)
+        H[:, 3:, GYRO] = state.C_nb @ skew(lever_arm_b)
+    return H
 
-    ``rate_b`` is the corrected angular rate at the fix [rad/s], ``lever_arm_b`` IMU → antenna [m].
-    """
-    arm_n = (state.C_nb @ lever_arm_b.unsqueeze(-1)).squeeze(-1)
-    swing_n = (state.C_nb @ torch.linalg.cross(rate_b, lever_arm_b).unsqueeze(-1)).squeeze(-1)
-    velocity = state.v_n + swing_n - torch.linalg.cross(frame.earth_rate_n, arm_n)
-    predicted = torch.cat((state.p_n + arm_n, velocity), -1)
-    B = len(arm_n)
-    H = torch.zeros(B, 6, STATES, dtype=arm_n.dtype, device=arm_n.device)
-    H[:, :3, POSITION] = torch.eye(3, dtype=arm_n.dtype, device=arm_n.device)
-    H[:, 3:, VELOCITY] = torch.eye(3, dtype=arm_n.dtype, device=arm_n.device)
-    H[:, :3, ATTITUDE] = -skew(arm_n)
-    H[:, 3:, ATTITUDE] = -skew(swing_n) + skew(frame.earth_rate_n) @ skew(arm_n)
-    H[:, 3:, GYRO] = state.C_nb @ skew(lever_arm_b)
-    return predicted, H
+
+def _arm(state: NavState, rate_b: Tensor, lever_arm_b: Tensor) -> tuple[Tensor, Tensor]:
+    """The lever arm and its swing ω × l in n."""
+    both = torch.stack((lever_arm_b, torch.linalg.cross(rate_b, lever_arm_b)), -1)
+    return (state.C_nb @ both).unbind(-1)
 
 
 def masked(
-    H: Float[Tensor, "B 6 15"], R: Float[Tensor, "B 6"], used: Bool[Tensor, "B 6"]
-) -> tuple[Float[Tensor, "B 6 15"], Float[Tensor, "B 6"]]:
+    H: Float[Tensor, "B m n"], R: Float[Tensor, "B m"], used: Bool[Tensor, "B m"]
+) -> tuple[Float[Tensor, "B m n"], Float[Tensor, "B m"]]:
     """H and diagonal R in which unused components have no effect: zero row, unit variance."""
     return H * used.unsqueeze(-1), torch.where(used, R, torch.ones_like(R))

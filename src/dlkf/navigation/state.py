@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -19,6 +20,53 @@ PVA = slice(0, 9)
 PV = slice(0, 6)
 IMU = slice(9, 15)
 STATES = 15
+MATRICES = ("none", "scale", "full")
+STRUCTURE = ("mounting_yaw", "mounting_pitch", "rear_axle", "sideslip")
+
+
+@dataclass(frozen=True)
+class ErrorStates:
+    """Error states of a filter: the 15 above, then those of the sensor matrices, then those of the car.
+
+    ``matrix`` of M in measured = (I + M) true + bias: ``none`` (15 states), ``scale`` its diagonal (21), ``full``
+    also the misalignments (33). Columns 15… hold the accelerometers' elements, then the gyroscopes', each the
+    diagonal first, then row by row. ``structure`` adds the four of :data:`STRUCTURE` at the end
+    (:mod:`dlkf.filters.constraints`).
+    """
+
+    matrix: str = "none"
+    structure: bool = False
+
+    def __post_init__(self) -> None:
+        if self.matrix not in MATRICES:
+            raise ValueError(f"matrix {self.matrix!r} is none of {MATRICES}")
+
+    @property
+    def elements(self) -> tuple[tuple[int, int], ...]:
+        """(row, column) of the estimated elements of a sensor's M, in the order of their states."""
+        diagonal = tuple((i, i) for i in range(3)) if self.matrix != "none" else ()
+        others = tuple((i, j) for i in range(3) for j in range(3) if i != j) if self.matrix == "full" else ()
+        return diagonal + others
+
+    @property
+    def navigation(self) -> int:
+        """Number of states without those of the car."""
+        return STATES + 2 * len(self.elements)
+
+    @property
+    def count(self) -> int:
+        """Number of states."""
+        return self.navigation + (len(STRUCTURE) if self.structure else 0)
+
+    @property
+    def of_matrix(self) -> slice:
+        """The states of both sensor matrices."""
+        return slice(STATES, self.navigation)
+
+    @property
+    def of_structure(self) -> slice:
+        """The states of the car."""
+        return slice(self.navigation, self.count)
 
 
 class NavState(NamedTuple):

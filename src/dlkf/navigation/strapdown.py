@@ -36,6 +36,7 @@ class Window(NamedTuple):
     v_n: Tensor  # (B, M, 3) m/s
     C_nb: Tensor  # (B, M, 3, 3)
     end: NavState  # (B, …), attitude orthonormalised
+    gravity: Tensor  # (B, 3) m/s² that acted over the window
 
     def before(self, lag: Float[Tensor, " B"], dt: float) -> NavState:
         """State ``lag`` seconds before the window's end, linear between samples (0 ≤ lag < window)."""
@@ -67,7 +68,7 @@ def strapdown(
     p, v, C, *end = _Strapdown.apply(
         start.p_n, start.v_n, start.C_nb, imu, dt, gravity, frame.gravity_gradient(), frame.earth_rate_n
     )
-    return Window(p, v, C, NavState(*end))
+    return Window(p, v, C, NavState(*end), gravity)
 
 
 class _Strapdown(torch.autograd.Function):

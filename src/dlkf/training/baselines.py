@@ -13,7 +13,7 @@ import torch
 from dlkf.data.drive import Batch
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Estimator, integrate
-from dlkf.filters.model_based import Tuning
+from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec
 
 FACTORS: Mapping[str, tuple[float, ...]] = {

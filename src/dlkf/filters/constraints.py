@@ -1,0 +1,122 @@
+"""What a car cannot do, as pseudo-measurements: slide sideways, leave the road, and move while it stands.
+
+Non-holonomic constraint (NHC; Dissanayake et al. 2001). The velocity of the IMU in body axes is, across the car,
+
+    v_y = ψ v_x + a ω_z + k v_x² ω_z      v_z = θ v_x − a ω_y
+
+with ψ, θ the direction in which the car moves seen from the IMU's axes (mounting), a how far ahead of the rear axle
+the IMU sits, and k the sideslip per lateral acceleration and speed (single-track model). Plain, all four are zero;
+with structure they are further states of the filter. A standstill, found from the IMU's samples alone, says v = 0
+(zero-velocity update) and ω_b = Earth rate (zero-angular-rate update).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dlkf.filters.integration import Epoch
+from dlkf.filters.tuning import Tuning
+from dlkf.navigation.attitude import skew
+from dlkf.navigation.state import ATTITUDE, GYRO, VELOCITY, ErrorStates
+
+STRUCTURE_STD = (0.05, 0.05, 1.5, 0.01)  # rad, rad, m, s²/m: what is known of a car before it moves
+STRUCTURE_WALK_STD = (2e-5, 2e-5, 1e-4, 1e-6)  # per √s
+QUIET_FACTOR = 2.5  # a standstill is at most so much livelier than the quietest second so far
+PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 3.0  # m/s, 1σ: a standstill must not contradict the filter
+SLOWEST = 0.5  # m/s: below, course and yaw rate say nothing of the car's structure
+
+
+class Measurement(NamedTuple):
+    """Rows of a Kalman update: innovation, its H, variance, and which rows count."""
+
+    z: Tensor  # (B, m)
+    H: Tensor  # (B, m, n)
+    R: Tensor  # (B, m)
+    used: Tensor  # (B, m) bool
+
+
+@dataclass(frozen=True)
+class Constraints:
+    """Constraints on a car's motion for a filter with the given error states."""
+
+    tuning: Tuning
+    states: ErrorStates
+
+    def rows(
+        self,
+        epoch: Epoch,
+        structure: Float[Tensor, "B 4"] | None,
+        quietest: Float[Tensor, "B 2"],
+        P: Float[Tensor, "B n n"],
+    ) -> tuple[Measurement, Float[Tensor, "B 2"]]:
+        """NHC (2 rows), zero velocity (3), zero angular rate (3); and the quietest second so far."""
+        t = self.tuning
+        resting, quietest = self._at_rest(epoch, quietest, P)
+        zn, Hn, moving = self._across(epoch, structure)
+        zr, Hr = self._standing(epoch)
+        std = zn.new_tensor([t.lateral_std, t.vertical_std] + [t.rest_velocity_std] * 3 + [t.rest_rate_std] * 3)
+        resting = resting.unsqueeze(-1)
+        used = torch.cat(((moving.unsqueeze(-1) & ~resting).expand(-1, 2), resting.expand(-1, 6)), -1)
+        z = torch.where(used, torch.cat((zn, zr), -1), 0.0)
+        return Measurement(z, torch.cat((Hn, Hr), 1), (std * std).expand_as(z), used), quietest
+
+    def _across(
+        self, epoch: Epoch, structure: Float[Tensor, "B 4"] | None
+    ) -> tuple[Float[Tensor, "B 2"], Float[Tensor, "B 2 n"], Bool[Tensor, " B"]]:
+        """Innovation and H of the velocity across the car at the window's end."""
+        state, rate = epoch.window.end, epoch.rate_b
+        C_bn = state.C_nb.mT
+        v_b = (C_bn @ state.v_n.unsqueeze(-1)).squeeze(-1)
+        vx, w_y, w_z = v_b[:, 0], rate[:, 1], rate[:, 2]
+        zero = torch.zeros_like(vx)
+        yaw, pitch, axle, slip = (zero,) * 4 if structure is None else structure.unbind(-1)
+        model = torch.stack(
+            (yaw * vx + (axle + slip * vx * vx) * w_z, pitch * vx - axle * w_y),
+            -1,
+        )
+        # h(x) = v_across − model = 0; the innovation is 0 − h(x̂)
+        H = torch.zeros(len(vx), 2, self.states.count, dtype=vx.dtype, device=vx.device)
+        J = C_bn[:, 1:] - torch.stack((yaw + 2 * slip * vx * w_z, pitch), -1).unsqueeze(-1) * C_bn[:, :1]
+        H[:, :, VELOCITY] = J
+        H[:, :, ATTITUDE] = J @ skew(state.v_n)
+        # δω = −ζ: the model's rates are too large by the gyroscopes' remaining error
+        H[:, 0, GYRO.start + 2] = axle + slip * vx * vx
+        H[:, 1, GYRO.start + 1] = -axle
+        if self.states.structure:
+            lateral = torch.stack((vx, zero, w_z, vx * vx * w_z), -1)
+            vertical = torch.stack((zero, vx, -w_y, zero), -1)
+            H[:, :, self.states.of_structure] = -torch.stack((lateral, vertical), 1)
+        return model - v_b[:, 1:], H, vx.abs() > SLOWEST
+
+    def _standing(self, epoch: Epoch) -> tuple[Float[Tensor, "B 6"], Float[Tensor, "B 6 n"]]:
+        """Innovation and H of a standstill: zero velocity, and the Earth rate in body axes."""
+        state = epoch.window.end
+        earth_b = (state.C_nb.mT @ epoch.frame.earth_rate_n.unsqueeze(-1)).squeeze(-1)
+        z = torch.cat((-state.v_n, epoch.corrected[..., 3:].mean(1) - earth_b), -1)
+        H = z.new_zeros(len(z), 6, self.states.count)
+        eye = torch.eye(3, dtype=z.dtype, device=z.device)
+        H[:, :3, VELOCITY] = eye
+        H[:, 3:, GYRO] = eye
+        return z, H
+
+    def _at_rest(
+        self, epoch: Epoch, quietest: Float[Tensor, "B 2"], P: Float[Tensor, "B n n"]
+    ) -> tuple[Bool[Tensor, " B"], Float[Tensor, "B 2"]]:
+        """Whether the samples of the window are as quiet as a standing car's.
+
+        Their spread must be below fixed limits and below a multiple of the quietest second of this drive, since
+        idling engines differ; and the filter must not know better.
+        """
+        spread = epoch.imu.unflatten(-1, (2, 3)).var(1).sum(-1).sqrt()  # (B, 2) accelerometers, gyroscopes
+        quietest = torch.minimum(quietest, spread)
+        limit = torch.minimum(
+            QUIET_FACTOR * quietest, spread.new_tensor([self.tuning.rest_accel, self.tuning.rest_gyro])
+        )
+        sigma = P.diagonal(dim1=-2, dim2=-1)[:, VELOCITY][:, :2].sum(-1).sqrt()
+        speed = epoch.window.end.v_n[:, :2].norm(dim=-1)
+        return (spread <= limit).all(-1) & (speed < PLAUSIBLE_SPEED + PLAUSIBLE_SIGMAS * sigma), quietest

@@ -1,0 +1,41 @@
+"""Factors and standard deviations of the model-based filters that are fitted on training drives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """Over-bounding factors on standard deviations, ≥ 1 as a rule, fitted on training drives only (R016, R018).
+
+    ``accel_noise``, ``gyro_noise`` scale √S of the white noise; ``accel_walk``, ``gyro_walk`` that of the bias
+    random walk; ``position_std``, ``velocity_std`` the GNSS stds. ``walk_floor_accel`` [m/s²/√s] and
+    ``walk_floor_gyro`` [rad/s/√s] keep the bias states awake when the preset has no in-run instability, and
+    ``position_floor`` [m], ``velocity_floor`` [m/s] keep R positive.
+
+    Filters with constraints: ``lateral_std``, ``vertical_std`` [m/s] of the velocity across the car, once per
+    epoch, ``rest_velocity_std`` [m/s], ``rest_rate_std`` [rad/s] of a standstill; ``rest_accel`` [m/s²] and
+    ``rest_gyro`` [rad/s] are the highest spread of the samples that may count as one.
+    Filters with a gate: ``gate`` is the probability that a good fix passes. ``aekf``: ``forgetting`` is the share
+    of the past in the adapted Q and R (Akhlaghi et al. 2017: 0.3).
+    """
+
+    accel_noise: float = 1.0
+    gyro_noise: float = 1.0
+    accel_walk: float = 1.0
+    gyro_walk: float = 1.0
+    position_std: float = 1.0
+    velocity_std: float = 1.0
+    walk_floor_accel: float = 1e-5
+    walk_floor_gyro: float = 1e-7
+    position_floor: float = 0.01
+    velocity_floor: float = 0.01
+    lateral_std: float = 0.2
+    vertical_std: float = 0.2
+    rest_velocity_std: float = 0.05
+    rest_rate_std: float = 2e-3
+    rest_accel: float = 0.12
+    rest_gyro: float = 0.025
+    gate: float = 0.9999
+    forgetting: float = 0.3
