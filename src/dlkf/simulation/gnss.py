@@ -1,4 +1,4 @@
-"""A GNSS receiver's position and velocity at the antenna, with white noise of known size."""
+"""A GNSS receiver's position and velocity at the antenna, with white noise of known size: no satellites."""
 
 from __future__ import annotations
 
@@ -63,16 +63,12 @@ def observe(
 ) -> pd.DataFrame:
     """GNSS table of the data contract at every row of ``truth`` whose sky is not blocked.
 
-    Antenna (checklist 2.5): p + C l and v + C(ω_ib × l) − ω_ie × (C l), with ``rate_b`` (N, 3) the body's
-    ω_ib [rad/s] at those times.
+    ``rate_b`` (N, 3): the body's ω_ib [rad/s] at those times, for the velocity of the antenna.
     """
-    C_nb = rotation_from_rpy(torch.from_numpy(truth.rpy)).numpy()
-    arm = C_nb @ np.asarray(config.lever_arm_b)
-    earth_rate = EARTH_RATE * np.stack((np.cos(truth.lat), np.zeros_like(truth.lat), -np.sin(truth.lat)), -1)
-    swing = np.einsum("tij,tj->ti", C_nb, np.cross(rate_b, config.lever_arm_b)) - np.cross(earth_rate, arm)
+    arm, antenna_v_n = antenna(truth, rate_b, config.lever_arm_b)
     error = config.std * rng.standard_normal((len(truth.t), 6))
     lat, lon, height = shifted(truth, arm + error[:, :3])
-    velocity = truth.v_n + swing + error[:, 3:]
+    velocity = antenna_v_n + error[:, 3:]
     columns = {
         "t": truth.t,
         "lat_deg": np.degrees(lat),
@@ -85,6 +81,20 @@ def observe(
     table = pd.DataFrame(columns)
     table["quality"] = np.full(len(table), config.quality, dtype=np.int64)
     return table if sky is None else table[~sky.blocked].reset_index(drop=True)
+
+
+def antenna(
+    truth: Truth, rate_b: NDArray[np.float64], lever_arm_b: tuple[float, float, float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Offset of the antenna from the body C l [m] and its velocity v + C(ω_ib × l) − ω_ie × (C l) [m/s], (N, 3) NED.
+
+    Checklist 2.5; ``lever_arm_b`` [m] in body axes, ``rate_b`` (N, 3) the body's ω_ib [rad/s].
+    """
+    C_nb = rotation_from_rpy(torch.from_numpy(truth.rpy)).numpy()
+    arm = C_nb @ np.asarray(lever_arm_b)
+    earth_rate = EARTH_RATE * np.stack((np.cos(truth.lat), np.zeros_like(truth.lat), -np.sin(truth.lat)), -1)
+    swing = np.einsum("tij,tj->ti", C_nb, np.cross(rate_b, lever_arm_b)) - np.cross(earth_rate, arm)
+    return arm, truth.v_n + swing
 
 
 def shifted(truth: Truth, offset_n: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
