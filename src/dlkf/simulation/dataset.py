@@ -8,9 +8,9 @@ import os
 import re
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -19,23 +19,24 @@ from rich.progress import track
 from dlkf.data.schema import new_dataset, write_drive, write_drives_table
 from dlkf.errors import InputError
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.simulation.chassis import ChassisConfig
 from dlkf.simulation.drive import Rates, Seeds, simulate_drive
 from dlkf.simulation.gnss import GnssConfig
 from dlkf.simulation.imu import draw_unit
 from dlkf.simulation.routes import VehicleConfig
+from dlkf.simulation.settings import built
 from dlkf.simulation.surroundings import Surroundings
 
 LONGEST_DRIVE = 240.0  # minutes; a drive is held in memory as a whole
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class DatasetConfig:
-    """What to simulate. ``imu_errors``: ``one`` unit for all drives, or a new one ``per_drive``.
+    """What to simulate. ``imu_errors``: ``one`` unit for all drives, a new one ``per_drive``, or a ``fleet``.
 
     With ``one``, turn-on bias, scale factors and misalignment are drawn once, from ``unit_seed``: the same
     IMU on other roads is another seed with the same ``unit_seed``. White noise and the in-run bias belong to
-    each drive either way.
+    each drive either way. With ``fleet``, each drive has a new unit of a type drawn from ``fleet``.
     """
 
     name: str
@@ -45,7 +46,9 @@ class DatasetConfig:
     reference_rate_hz: int = 10
     imu_errors: str = "one"
     unit_seed: int = 0
+    fleet: Mapping[str, ImuSpec] = field(default_factory=dict)
     vehicle: VehicleConfig = field(default_factory=VehicleConfig)
+    chassis: ChassisConfig = field(default_factory=ChassisConfig)
     surroundings: Surroundings = field(default_factory=Surroundings)
     gnss: GnssConfig = field(default_factory=GnssConfig)
 
@@ -71,8 +74,10 @@ class DatasetConfig:
                 raise InputError(
                     f"dataset: imu_rate_hz {self.imu_rate_hz} is not a multiple of {name} {rate}"
                 )
-        if self.imu_errors not in ("one", "per_drive"):
-            raise InputError(f"dataset: imu_errors {self.imu_errors!r} must be one or per_drive")
+        if self.imu_errors not in ("one", "per_drive", "fleet"):
+            raise InputError(f"dataset: imu_errors {self.imu_errors!r} must be one, per_drive or fleet")
+        if self.imu_errors == "fleet" and not self.fleet:
+            raise InputError("dataset: imu_errors is fleet, but fleet names no IMU presets (see simulated/fleet.yaml)")
         if not isinstance(self.unit_seed, int) or self.unit_seed < 0:
             raise InputError(f"dataset: unit_seed {self.unit_seed!r} must be a whole number ≥ 0")
 
@@ -86,13 +91,12 @@ class DatasetConfig:
 
 def dataset_config(config: Mapping[str, Any]) -> DatasetConfig:
     """A dataset from a mapping like ``conf/simulated/*.yaml``. InputError for unknown keys and odd values."""
-    values = dict(config) if isinstance(config, Mapping) else {}
-    if not isinstance(values.get("name"), str):
+    if not isinstance(config, Mapping) or not isinstance(config.get("name"), str):
         raise InputError("dataset: name is missing, give it as in conf/simulated/*.yaml")
-    parts = {"vehicle": VehicleConfig, "surroundings": Surroundings, "gnss": GnssConfig}
-    for key, kind in parts.items():
-        values[key] = _built(kind, values.get(key, {}), key)
-    return _built(DatasetConfig, values, "dataset")
+    fleet = config.get("fleet") or {}
+    if not isinstance(fleet, Mapping):
+        raise InputError(f"dataset: fleet is {fleet!r}, must be a mapping of IMU presets")
+    return built(DatasetConfig, {**config, "fleet": {key: imu_spec(fleet[key]) for key in fleet}}, "dataset")
 
 
 def simulate_from_config(
@@ -144,26 +148,28 @@ def _write_drives(
     rates = Rates(int(config.imu_rate_hz), config.gnss.rate_hz, int(config.reference_rate_hz))
 
     def one(index: int) -> dict[str, Any]:
-        motion, imu, gnss, unit_seed, sky = np.random.SeedSequence(seed, spawn_key=(1, index)).spawn(5)
-        unit = shared if config.imu_errors == "one" else draw_unit(np.random.default_rng(unit_seed), spec)
+        motion, imu, gnss, unit_seed, *others, type_seed = np.random.SeedSequence(seed, spawn_key=(1, index)).spawn(7)
+        kind = _imu_type(config, spec, type_seed)
+        unit = shared if config.imu_errors == "one" else draw_unit(np.random.default_rng(unit_seed), kind)
         seconds = durations[index]
         tables = simulate_drive(
-            Seeds(motion, imu, gnss, sky), seconds, rates, config.vehicle, config.surroundings, spec, unit, config.gnss
-        )
+            Seeds(motion, imu, gnss, *others), seconds, rates, config.vehicle, config.chassis, config.surroundings,
+            kind, unit, config.gnss,
+        )  # fmt: skip
         name = f"{config.name}-{seed}-{index:05d}"
         row = {
             "drive": name,
             "group": name,
             "source": f"simulation, seed {seed}, drive {index}",
             "licence": "none: simulated",
-            "imu": spec.name,
+            "imu": kind.name,
             "gnss": f"simulated, white noise, quality {config.gnss.quality}",
             "reference": "exact",
             "imu_rate_hz": float(rates.imu_hz),
             "gnss_rate_hz": float(rates.gnss_hz),
             "duration_s": float(seconds),
-            "distance_m": tables.distance_m,
             **{f"lever_arm_{axis}_m": float(x) for axis, x in zip("xyz", config.gnss.lever_arm_b)},
+            **tables.facts,
         }
         write_drive(folder, row, tables.imu, tables.gnss, tables.reference)
         return row
@@ -185,24 +191,9 @@ def _write_drives(
     (folder / "simulation.json").write_text(json.dumps(described, indent=2, ensure_ascii=False) + "\n")
 
 
-def _built(kind: type[T], config: Any, where: str) -> T:
-    """A config dataclass from a mapping: every key known, every number a finite number."""
-    if not isinstance(config, Mapping):
-        raise InputError(f"{where}: is {config!r}, must be a mapping")
-    known = {f.name: f for f in fields(kind)}
-    if unknown := sorted(str(key) for key in config if key not in known):
-        raise InputError(f"{where}: unknown key {', '.join(unknown)}; known are {', '.join(known)}")
-    values = {}
-    for key, value in config.items():
-        if known[key].type in ("float", "int"):
-            number = isinstance(value, (int, float)) and not isinstance(value, bool)
-            if not number or not math.isfinite(value):
-                raise InputError(f"{where}: {key} is {value!r}, must be a number")
-        elif known[key].type.startswith("tuple"):
-            if not isinstance(value, (list, tuple)) or not all(isinstance(x, (int, float)) for x in value):
-                raise InputError(f"{where}: {key} is {value!r}, must be a list of numbers")
-            value = tuple(float(x) for x in value)
-        elif known[key].type == "str" and not isinstance(value, str):
-            raise InputError(f"{where}: {key} is {value!r}, must be a word")
-        values[key] = value
-    return kind(**values)
+def _imu_type(config: DatasetConfig, spec: ImuSpec, seed: np.random.SeedSequence) -> ImuSpec:
+    """The IMU preset of a drive: the dataset's, or one of the fleet's."""
+    if config.imu_errors != "fleet":
+        return spec
+    types = list(config.fleet.values())
+    return types[np.random.default_rng(seed).integers(len(types))]

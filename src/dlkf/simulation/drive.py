@@ -7,15 +7,18 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+import torch
 from numpy.typing import NDArray
 
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR
+from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.imu_errors import ImuSpec
+from dlkf.simulation.chassis import Car, ChassisConfig, draw_car, mounted, slip_angle
 from dlkf.simulation.gnss import GnssConfig, observe
 from dlkf.simulation.imu import ImuUnit, corrupt, inverse_mechanisation
 from dlkf.simulation.routes import VehicleConfig
 from dlkf.simulation.surroundings import Surroundings, sky_along
-from dlkf.simulation.vehicle import Truth, random_drive
+from dlkf.simulation.vehicle import Route, Truth, follow, random_route
 
 
 class Seeds(NamedTuple):
@@ -25,6 +28,7 @@ class Seeds(NamedTuple):
     imu: np.random.SeedSequence
     gnss: np.random.SeedSequence
     surroundings: np.random.SeedSequence
+    chassis: np.random.SeedSequence
 
 
 @dataclass(frozen=True)
@@ -38,12 +42,12 @@ class Rates:
 
 @dataclass(frozen=True)
 class DriveTables:
-    """The tables of one drive and how far it went [m]."""
+    """The tables of one drive, and what is worth knowing of it: a row of ``drives.parquet``."""
 
     imu: pd.DataFrame
     gnss: pd.DataFrame
     reference: pd.DataFrame
-    distance_m: float
+    facts: dict[str, float]
 
 
 def simulate_drive(
@@ -51,25 +55,29 @@ def simulate_drive(
     duration_s: int,
     rates: Rates,
     vehicle: VehicleConfig,
+    chassis: ChassisConfig,
     surroundings: Surroundings,
     spec: ImuSpec,
     unit: ImuUnit,
     gnss: GnssConfig,
 ) -> DriveTables:
     """One drive; each part has a seed of its own, so changing one leaves the others as they were."""
-    motion_rng, imu_rng, gnss_rng, sky_rng = (np.random.default_rng(seed) for seed in seeds)
+    motion_rng, imu_rng, gnss_rng, sky_rng, chassis_rng = (np.random.default_rng(seed) for seed in seeds)
     t = np.arange(duration_s * rates.imu_hz + 1) / rates.imu_hz
-    truth, motion = random_drive(motion_rng, vehicle, t)
+    route = random_route(motion_rng, vehicle, float(duration_s))
+    car = draw_car(chassis_rng, chassis)
+    axle = follow(route, vehicle, t)
+    truth = axle if chassis.is_point and not vehicle.is_banked else mounted(chassis_rng, car, route, axle)
     true_imu = inverse_mechanisation(truth)
     measured, error = corrupt(imu_rng, true_imu, spec, unit, rates.imu_hz)
     fixes = slice(None, None, round(rates.imu_hz / rates.gnss_hz))
     rows = slice(None, None, rates.imu_hz // rates.reference_hz)
-    sky = sky_along(sky_rng, surroundings, motion.distance[fixes])
+    sky = sky_along(sky_rng, surroundings, route.motion(t[fixes]).distance)
     return DriveTables(
         imu=pd.DataFrame({"t": t[1:], **dict(zip((*ACCEL, *GYRO), measured.T))}),
         gnss=observe(gnss_rng, sliced(truth, fixes), _rate_at_rows(true_imu[:, 3:])[fixes], gnss, sky=sky),
         reference=_reference(sliced(truth, rows), np.concatenate((error[:1], error))[rows]),
-        distance_m=float(np.linalg.norm(truth.v_n, axis=1)[1:].sum() / rates.imu_hz),
+        facts=_facts(car, route, axle, truth, rates.imu_hz),
     )
 
 
@@ -82,6 +90,26 @@ def _rate_at_rows(rate: NDArray[np.float64]) -> NDArray[np.float64]:
     """Body rate at the N+1 truth rows from the N sample means between them: the mean of both neighbours."""
     padded = np.concatenate((rate[:1], rate, rate[-1:]))
     return 0.5 * (padded[1:] + padded[:-1])
+
+
+def _facts(car: Car, route: Route, axle: Truth, truth: Truth, rate_hz: int) -> dict[str, float]:
+    """Distance, velocity across the car while it moves (RMS, above 2 m/s), and the car itself.
+
+    ``lateral_axle_mps`` is the rear axle's in the car, ``lateral_imu_mps`` and ``down_imu_mps`` the IMU's in its
+    own axes, as a constraint of a filter would see them.
+    """
+    motion = route.motion(axle.t)
+    moving = motion.speed > 2.0
+    v_b = np.einsum("tij,ti->tj", rotation_from_rpy(torch.from_numpy(truth.rpy)).numpy(), truth.v_n)
+    across = motion.speed * np.sin(slip_angle(car, route, motion)[0]), v_b[:, 1], v_b[:, 2]
+    rms = (float(np.sqrt(np.mean(v[moving] ** 2))) if moving.any() else 0.0 for v in across)
+    return {
+        "distance_m": float(np.linalg.norm(truth.v_n, axis=1)[1:].sum() / rate_hz),
+        **dict(zip(("lateral_axle_mps", "lateral_imu_mps", "down_imu_mps"), rms)),
+        **{f"imu_arm_{axis}_m": float(x) for axis, x in zip("xyz", car.imu_arm)},
+        **{f"mounting_{name}_deg": float(np.degrees(x)) for name, x in zip(("roll", "pitch", "yaw"), car.mounting)},
+        "sideslip_s2pm": car.sideslip,
+    }
 
 
 def _reference(truth: Truth, error: NDArray[np.float64]) -> pd.DataFrame:

@@ -10,7 +10,7 @@ lateral, the last two on the plateau of a turn).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,54 @@ KMH = 1 / 3.6
 
 
 @dataclass(frozen=True)
+class Manoeuvres:
+    """What a driver does how often, and for how long (R084); each pair is the range of a uniform draw.
+
+    ``stretch``, ``turn``, ``stop``, ``eight``, ``lane_change`` are shares of the manoeuvres and sum to 1.
+    A stretch goes to a speed of at least ``slowest`` of the top speed and holds it for ``stretch_s``; a turn
+    of ``turn_deg`` is followed by ``after_turn_s`` straight on, a lane change of ``lane_deg`` there and back
+    by a stretch's time; a stop lasts ``stop_s``. A figure-eight is a full circle each way.
+    """
+
+    stretch: float = 0.35
+    turn: float = 0.50
+    stop: float = 0.10
+    eight: float = 0.05
+    lane_change: float = 0.0
+    slowest: float = 0.25
+    stretch_s: tuple[float, float] = (2.0, 20.0)
+    turn_deg: tuple[float, float] = (20.0, 120.0)
+    after_turn_s: tuple[float, float] = (1.0, 8.0)
+    lane_deg: tuple[float, float] = (1.5, 4.0)
+    stop_s: tuple[float, float] = (3.0, 25.0)
+
+    def __post_init__(self) -> None:
+        if min(self.shares) < 0 or abs(sum(self.shares) - 1) > 1e-9:
+            raise InputError(
+                f"manoeuvres: stretch, turn, stop, eight and lane_change sum to {sum(self.shares):g}, must be "
+                f"shares that sum to 1"
+            )
+        if self.shares[0] == 0:
+            raise InputError("manoeuvres: stretch is 0, must be positive, or a standing car would never set off")
+        if not 0 < self.slowest <= 1:
+            raise InputError(f"manoeuvres: slowest {self.slowest} is outside 0 to 1")
+        for name in ("stretch_s", "turn_deg", "after_turn_s", "lane_deg", "stop_s"):
+            span = getattr(self, name)
+            if len(span) != 2 or not 0 < span[0] <= span[1] <= 3600:
+                raise InputError(f"manoeuvres: {name} {list(span)} must be two positive numbers in rising order")
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        return self.stretch, self.turn, self.stop, self.eight, self.lane_change
+
+
+@dataclass(frozen=True)
 class VehicleConfig:
-    """Bounds of the motion and where it starts; ``slope_std`` is the RMS grade, 0 for a flat road."""
+    """Bounds of the motion, where it starts, and the road.
+
+    ``slope_std`` is the RMS grade, ``bank_std`` the RMS cross slope, 0 for a flat road; in a turn the road is
+    banked inwards by ``superelevation`` [rad per m/s² of lateral acceleration].
+    """
 
     max_speed_kmh: float = 80.0
     max_acceleration: float = 2.0  # m/s², along the road
@@ -32,9 +78,12 @@ class VehicleConfig:
     min_lateral: float = 0.5  # m/s², on the plateau of a turn
     max_lateral: float = 5.0
     slope_std: float = 0.03
+    bank_std: float = 0.0
+    superelevation: float = 0.0
     lat_deg: float = 52.15
     lon_deg: float = 9.95
     height_m: float = 100.0
+    manoeuvres: Manoeuvres = field(default_factory=Manoeuvres)
 
     def __post_init__(self) -> None:
         for low, high in (("min_radius", "max_radius"), ("min_lateral", "max_lateral")):
@@ -47,6 +96,10 @@ class VehicleConfig:
             raise InputError(f"vehicle: max_acceleration {self.max_acceleration} m/s² is outside 0.2 to 10")
         if not 0 <= self.slope_std <= 0.1:
             raise InputError(f"vehicle: slope_std {self.slope_std} is outside 0 to 0.1")
+        if not 0 <= self.bank_std <= 0.1:
+            raise InputError(f"vehicle: bank_std {self.bank_std} is outside 0 to 0.1")
+        if not 0 <= self.superelevation <= 0.1:
+            raise InputError(f"vehicle: superelevation {self.superelevation} rad/(m/s²) is outside 0 to 0.1")
         slowest = math.sqrt(self.min_lateral * self.min_radius) / KMH
         if not slowest <= self.max_speed_kmh <= 300:
             raise InputError(
@@ -58,6 +111,11 @@ class VehicleConfig:
                 f"vehicle: start at {self.lat_deg}°, {self.lon_deg}°, {self.height_m} m is outside "
                 f"±80°, ±180°, -500 to 9000 m"
             )
+
+    @property
+    def is_banked(self) -> bool:
+        """Whether the road has a cross slope anywhere."""
+        return self.bank_std > 0 or self.superelevation > 0
 
 
 @dataclass(frozen=True)
@@ -83,11 +141,13 @@ class Kinematics:
     acceleration: Array  # m/s², along the road
     course: Array  # rad, continuous
     yaw_rate: Array  # rad/s
+    yaw_acceleration: Array  # rad/s²
     distance: Array  # m
 
 
 def random_plan(rng: np.random.Generator, config: VehicleConfig, duration: float) -> Plan:
-    """Manoeuvres (R084) until ``duration`` [s] is filled: stretches, turns, stops, figure-eights."""
+    """Manoeuvres (R084) until ``duration`` [s] is filled: stretches, turns, stops, figure-eights, lane changes."""
+    habits = config.manoeuvres
     rows: list[tuple[float, float, float, float]] = []  # length, ramp, speed change, course change
     top = config.max_speed_kmh * KMH
     clock, speed = 0.0, 0.0
@@ -117,24 +177,31 @@ def random_plan(rng: np.random.Generator, config: VehicleConfig, duration: float
 
     add(rng.uniform(2.0, 8.0))
     while clock < duration:
-        kind = rng.choice(4, p=(0.35, 0.50, 0.10, 0.05))
+        kind = rng.choice(5, p=habits.shares)
         side = rng.choice((-1.0, 1.0))
         if kind == 0:
-            reach(rng.uniform(0.25, 1.0) * top)
-            add(rng.uniform(2.0, 20.0))
+            reach(rng.uniform(habits.slowest, 1.0) * top)
+            add(rng.uniform(*habits.stretch_s))
         elif kind == 1:
             radius, lateral = bend(config.max_radius)
             reach(math.sqrt(lateral * radius))
-            turn(side * math.radians(rng.uniform(20.0, 120.0)), radius, lateral)
-            add(rng.uniform(1.0, 8.0))
+            turn(side * math.radians(rng.uniform(*habits.turn_deg)), radius, lateral)
+            add(rng.uniform(*habits.after_turn_s))
         elif kind == 2 and speed > 0:
             reach(0.0)
-            add(rng.uniform(3.0, 25.0))
+            add(rng.uniform(*habits.stop_s))
         elif kind == 3:
             radius, lateral = bend(0.5 * (config.min_radius + config.max_radius))
             reach(math.sqrt(lateral * radius))
             turn(side * 2 * math.pi, radius, lateral)
             turn(-side * 2 * math.pi, radius, lateral)
+        elif kind == 4:
+            radius, lateral = bend(config.max_radius)
+            angle = side * math.radians(rng.uniform(*habits.lane_deg))
+            reach(math.sqrt(lateral * radius))
+            turn(angle, radius, lateral)
+            turn(-angle, radius, lateral)
+            add(rng.uniform(*habits.stretch_s))
     length, ramp, faster, turned = np.array(rows).T
     speed_at = np.cumsum(faster) - faster
     speed_at[np.abs(speed_at) < 1e-9] = 0.0  # a standstill is exactly still
@@ -160,8 +227,14 @@ def along(plan: Plan, t: Array) -> Kinematics:
         faster * w,
         plan.course[k] + turned * first,
         turned * w,
+        turned * (_ramp_slope(x / ramp) - _ramp_slope((x - length + ramp) / ramp)) / (ramp * area),
         plan.distance[k] + speed * x + faster * second,
     )
+
+
+def _ramp_slope(x: Array) -> Array:
+    c = np.clip(x, 0, 1)
+    return 6 * c * (1 - c)
 
 
 def _ramp_integrals(x: Array) -> tuple[Array, Array, Array]:

@@ -1,7 +1,8 @@
 """How a car moves: position, velocity and attitude along a plan of manoeuvres.
 
 Speed, course and distance of a plan are in closed form; only the position is integrated, on the ellipsoid.
-The road rises and falls gently; the body lies along the road: yaw = course, pitch = slope, roll = 0.
+The road rises and falls gently; a point on it lies along the road: yaw = course, pitch = slope, roll = 0.
+What a car adds is in ``chassis``.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from dlkf.navigation.earth import ECCENTRICITY_SQ, transverse_radius
-from dlkf.simulation.routes import Kinematics, VehicleConfig, along, random_plan
+from dlkf.simulation.routes import Kinematics, Plan, VehicleConfig, along, random_plan
 
 Array = NDArray[np.float64]
 
@@ -32,44 +33,73 @@ class Truth:
 
 
 @dataclass(frozen=True)
-class Road:
-    """Slope [rad] against distance, a sum of waves: Σ amplitude · sin(wavenumber · s + phase)."""
+class Waves:
+    """An angle of the road against distance, Σ amplitude · sin(wavenumber · s + phase) [rad]."""
 
     amplitude: Array
     wavenumber: Array
     phase: Array
 
+    def at(self, motion: Kinematics) -> tuple[Array, Array]:
+        """The angle [rad] where the car is, and its rate [rad/s]."""
+        angle, rate = np.zeros_like(motion.t), np.zeros_like(motion.t)
+        for amplitude, wavenumber, phase in zip(self.amplitude, self.wavenumber, self.phase):
+            where = wavenumber * motion.distance + phase
+            angle += amplitude * np.sin(where)
+            rate += amplitude * wavenumber * np.cos(where) * motion.speed
+        return angle, rate
+
+
+@dataclass(frozen=True)
+class Route:
+    """A plan and the road below it: slope, cross slope, and how far turns are banked [rad per m/s²]."""
+
+    plan: Plan
+    slope: Waves
+    cross_slope: Waves
+    superelevation: float
+
+    def motion(self, t: Array) -> Kinematics:
+        """Where along the road the car is at times ``t`` [s], and how fast."""
+        return along(self.plan, t)
+
+    def bank(self, motion: Kinematics) -> tuple[Array, Array]:
+        """Bank of the road [rad], positive where its right edge is the lower, and its rate [rad/s]."""
+        angle, rate = self.cross_slope.at(motion)
+        lateral = motion.speed * motion.yaw_rate
+        change = motion.acceleration * motion.yaw_rate + motion.speed * motion.yaw_acceleration
+        return angle + self.superelevation * lateral, rate + self.superelevation * change
+
 
 def drive_vehicle(rng: np.random.Generator, config: VehicleConfig, t: Array) -> Truth:
-    """One random drive at the uniformly spaced times ``t`` [s], which start at 0."""
-    return random_drive(rng, config, t)[0]
+    """One random drive of a point at the uniformly spaced times ``t`` [s], which start at 0."""
+    return follow(random_route(rng, config, float(t[-1])), config, t)
 
 
-def random_drive(rng: np.random.Generator, config: VehicleConfig, t: Array) -> tuple[Truth, Kinematics]:
-    """One random drive at the uniformly spaced times ``t`` [s], which start at 0, and its motion along the road."""
-    motion = along(random_plan(rng, config, float(t[-1])), t)
-    return follow(motion, random_road(rng, config), config), motion
+def random_route(rng: np.random.Generator, config: VehicleConfig, duration: float) -> Route:
+    """A random plan of at least ``duration`` [s] on a random road."""
+    (cross_rng,) = rng.spawn(1)
+    plan = random_plan(rng, config, duration)
+    slope = random_waves(rng, config.slope_std)
+    return Route(plan, slope, random_waves(cross_rng, config.bank_std), config.superelevation)
 
 
-def random_road(rng: np.random.Generator, config: VehicleConfig, waves: int = 6) -> Road:
-    """Hills of 200 to 1500 m wavelength with an RMS grade of ``slope_std`` on average."""
-    amplitude = config.slope_std * math.sqrt(2 / waves) * rng.uniform(0.5, 1.35, waves)
+def random_waves(rng: np.random.Generator, rms: float, waves: int = 6) -> Waves:
+    """Waves of 200 to 1500 m wavelength with a given RMS on average: hills, or the bank of a road."""
+    amplitude = rms * math.sqrt(2 / waves) * rng.uniform(0.5, 1.35, waves)
     wavelength = np.exp(rng.uniform(math.log(200), math.log(1500), waves))
-    return Road(amplitude, 2 * math.pi / wavelength, rng.uniform(0, 2 * math.pi, waves))
+    return Waves(amplitude, 2 * math.pi / wavelength, rng.uniform(0, 2 * math.pi, waves))
 
 
-def follow(motion: Kinematics, road: Road, config: VehicleConfig) -> Truth:
-    """Truth of a point that moves along a road, at uniform times.
+def follow(route: Route, config: VehicleConfig, t: Array) -> Truth:
+    """Truth of a point that moves along a route, at uniform times ``t`` [s]; it has no roll.
 
     Positions are the integral of the velocities by the trapezoid rule with end correction,
     ∫f dt = dt/2 (f₀ + f₁) + dt²/12 (f₀' − f₁'), exact for cubics: below 1 µm at 100 Hz.
     """
-    t, speed, acceleration, yaw_rate = motion.t, motion.speed, motion.acceleration, motion.yaw_rate
-    slope, slope_rate = np.zeros_like(t), np.zeros_like(t)
-    for amplitude, wavenumber, phase in zip(road.amplitude, road.wavenumber, road.phase):
-        angle = wavenumber * motion.distance + phase
-        slope += amplitude * np.sin(angle)
-        slope_rate += amplitude * wavenumber * np.cos(angle) * speed
+    motion = route.motion(t)
+    slope, slope_rate = route.slope.at(motion)
+    speed, acceleration, yaw_rate = motion.speed, motion.acceleration, motion.yaw_rate
     flat, rise = np.cos(slope), np.sin(slope)
     level, level_rate = speed * flat, acceleration * flat - speed * rise * slope_rate
     north, east = np.cos(motion.course), np.sin(motion.course)
@@ -97,14 +127,14 @@ def _walk(
     """
     lat = np.full_like(height, lat0)
     for _ in range(3):
-        _, per_metre = _radians_per_metre(lat, height)
+        _, per_metre = radians_per_metre(lat, height)
         lat = lat0 + _integral(v_n[:, 0] * per_metre, a_north * per_metre, dt)
-    turn, per_metre = _radians_per_metre(lat, height)
+    turn, per_metre = radians_per_metre(lat, height)
     speed_up = a_east + v_n[:, 0] * v_n[:, 1] * np.tan(lat) * per_metre  # d/dt of 1/cos L
     return lat, lon0 + _integral(v_n[:, 1] * turn, speed_up * turn, dt)
 
 
-def _radians_per_metre(lat: Array, height: Array) -> tuple[Array, Array]:
+def radians_per_metre(lat: Array, height: Array) -> tuple[Array, Array]:
     """1/((R_E + h) cos L) and 1/(R_N + h) [rad/m]."""
     transverse = transverse_radius(torch.from_numpy(lat)).numpy()
     meridian = (1 - ECCENTRICITY_SQ) * transverse / (1 - ECCENTRICITY_SQ * np.sin(lat) ** 2)
