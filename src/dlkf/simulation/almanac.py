@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -58,13 +59,14 @@ class Almanac:
     af1: Array
 
 
-def read_almanac(path: str | Path | None = None) -> Almanac:
-    """The almanac in a YUMA file, or the packaged one. Unhealthy satellites are left out.
+@cache
+def read_almanac(path: str = "") -> Almanac:
+    """The almanac in a YUMA file, or the packaged one where none is named. Unhealthy satellites are left out.
 
     A ten-bit week is taken to be the one nearest to that of the packaged almanac. InputError, with file and
     satellite, for a record with a missing, unreadable or impossible element, and for fewer than four satellites.
     """
-    file = PACKAGED if path is None or path == "" else Path(path)
+    file = Path(path) if path else PACKAGED
     try:
         text = file.read_text(encoding="ascii", errors="replace")
     except OSError as error:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from dlkf.data.geodetic import geodetic_from_ecef
 from dlkf.data.schema import POSITION, STD, VELOCITY
 from dlkf.navigation.earth import ecef_from_geodetic, ned_axes
-from dlkf.simulation.almanac import Almanac
-from dlkf.simulation.gnss import GnssConfig, antenna, shifted
+from dlkf.simulation.almanac import Almanac, read_almanac
+from dlkf.simulation.gnss import GnssConfig, antenna, observe, shifted
 from dlkf.simulation.least_squares import Observations, Solution, solve
 from dlkf.simulation.obstruction import held, in_view
 from dlkf.simulation.receiver import Receiver, clock, range_errors
@@ -27,8 +27,8 @@ FOR_FIX = 5  # satellites that resolve carrier ambiguities
 FLOAT = 5  # NMEA GGA code: RTK with open ambiguities
 
 
-class SatelliteGnss(NamedTuple):
-    """``fixes``: GNSS table of the data contract with the columns satellites, gdop, pdop, hdop, vdop on top.
+class Received(NamedTuple):
+    """``fixes``: GNSS table of the data contract; from satellites with satellites, gdop, pdop, hdop, vdop on top.
 
     A row without a fix has quality 0 and NaN. ``raw``: a row per epoch and tracked satellite; t; gps_week, tow
     [s]; prn; pseudorange_m and pseudorange_rate [m/s] as measured, with both clocks in them, doppler_hz; their
@@ -39,7 +39,21 @@ class SatelliteGnss(NamedTuple):
     """
 
     fixes: pd.DataFrame
-    raw: pd.DataFrame
+    raw: pd.DataFrame | None
+
+
+def receive(
+    rng: np.random.Generator,
+    truth: Truth,
+    rate_b: Array,
+    config: GnssConfig,
+    receiver: Receiver | None,
+    sky: Sky | None = None,
+) -> Received:
+    """GNSS at every row of ``truth``: white noise around the truth without a ``receiver``, else from satellites."""
+    if receiver is None:
+        return Received(observe(rng, truth, rate_b, config, sky), None)
+    return observe_satellites(rng, truth, rate_b, config, receiver, sky)
 
 
 def observe_satellites(
@@ -48,14 +62,14 @@ def observe_satellites(
     rate_b: Array,
     config: GnssConfig,
     receiver: Receiver,
-    almanac: Almanac,
     sky: Sky | None = None,
-) -> SatelliteGnss:
+) -> Received:
     """What a receiver makes of the satellites at every row of ``truth`` (uniform in time), by least squares.
 
     The drive starts at a random second of the almanac's week. ``rate_b`` (N, 3) is the body's ω_ib [rad/s], for
     the antenna; s_p, s_v of ``config`` are added to the fix (paper eqs 12, 13; R130).
     """
+    almanac = read_almanac(receiver.almanac)
     rows = len(truth.t)
     dt = float(truth.t[1] - truth.t[0]) if rows > 1 else 1.0
     start = float(rng.integers(WEEK))
@@ -82,7 +96,7 @@ def observe_satellites(
     fix = solution.solved & (solution.dop.pdop <= receiver.max_pdop)
     quality = np.where(fix, np.where(is_float, FLOAT, receiver.quality), 0)
     fixes = _fixes(truth.t, solution, quality, added, (config.s_p, config.s_v))
-    return SatelliteGnss(fixes, _raw(truth.t, start, almanac, seen, observed))
+    return Received(fixes, _raw(truth.t, start, almanac, seen, observed))
 
 
 def _fixes(
