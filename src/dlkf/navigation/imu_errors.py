@@ -3,6 +3,8 @@
 Model (checklist 2.7, paper eqs 7, 8): measured = (I + M) true + b + w, with M's diagonal the scale factors
 and its off-diagonal the misalignments, b a turn-on bias plus an in-run part that is first-order
 Gauss-Markov with time constant τ (a random walk of the same strength while t ≪ τ), w white noise.
+Optional, none by default: a rate random walk and a warm-up drift in b, a gyroscope's g-dependent error G f,
+quantisation and a full-scale range of what is put out (Groves 4.4).
 """
 
 from __future__ import annotations
@@ -23,6 +25,10 @@ class SensorErrors:
 
     ``noise_density`` √S of the white noise [unit/√Hz]; ``turn_on_bias`` [unit]; ``instability`` σ of the
     in-run bias [unit] with ``correlation_time`` τ [s]; ``scale_factor`` and ``misalignment`` [–].
+
+    Optional: ``random_walk`` K of the bias [unit/√s]; ``warm_up`` σ of the drift c (1 − exp(−t/``warm_up_time``))
+    as the unit warms up after switching on [unit, s]; ``g_sensitivity`` of a gyroscope, σ of the entries of
+    G [rad/s per m/s²]; ``quantisation`` step of the output [unit], and its ``full_scale`` [unit], 0 for none.
     """
 
     noise_density: float = 0.0
@@ -31,6 +37,12 @@ class SensorErrors:
     correlation_time: float = 3600.0
     scale_factor: float = 0.0
     misalignment: float = 0.0
+    random_walk: float = 0.0
+    warm_up: float = 0.0
+    warm_up_time: float = 600.0
+    g_sensitivity: float = 0.0
+    quantisation: float = 0.0
+    full_scale: float = 0.0
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -39,6 +51,12 @@ class SensorErrors:
                 raise InputError(f"IMU preset: {f.name} is {value!r}, must be a finite number ≥ 0")
         if self.correlation_time <= 0:
             raise InputError("IMU preset: correlation_time is 0, must be positive seconds")
+        if self.warm_up > 0 and self.warm_up_time <= 0:
+            raise InputError("IMU preset: warm_up_time is 0, must be positive seconds")
+        if 0 < self.full_scale < 2 * self.quantisation:
+            raise InputError(
+                f"IMU preset: full_scale {self.full_scale} is below two steps of quantisation {self.quantisation}"
+            )
 
     @property
     def noise_psd(self) -> float:
@@ -47,8 +65,8 @@ class SensorErrors:
 
     @property
     def walk_psd(self) -> float:
-        """Driving noise of the in-run bias, 2σ²/τ [unit²/s]."""
-        return 2 * self.instability**2 / self.correlation_time
+        """Driving noise of the in-run bias, 2σ²/τ + K² [unit²/s]."""
+        return 2 * self.instability**2 / self.correlation_time + self.random_walk**2
 
 
 @dataclass(frozen=True)
@@ -64,16 +82,18 @@ class ImuSpec:
 def imu_spec(config: Mapping) -> ImuSpec:
     """The preset that a mapping with the keys of a ``conf/imu/*.yaml`` file describes.
 
-    Every number of both sensors has to be there, so that a misspelt key cannot become a silent zero.
+    Every number of both sensors but the optional ones has to be there, and no unknown one, so that a misspelt
+    key cannot become a silent zero.
     Raises InputError for a missing or unknown key or a value that is no number ≥ 0.
     """
     name = str(config.get("name", "unnamed")) if isinstance(config, Mapping) else repr(config)
     _check_keys(config, {"name", "accel", "gyro"}, {"source"}, f"IMU preset {name}")
-    numbers = {f.name for f in fields(SensorErrors)}
+    optional = {"random_walk", "warm_up", "warm_up_time", "g_sensitivity", "quantisation", "full_scale"}
+    needed = {f.name for f in fields(SensorErrors)} - optional
     sensors = {}
     for sensor in ("accel", "gyro"):
         where = f"IMU preset {name}, {sensor}"
-        _check_keys(config[sensor], numbers, set(), where)
+        _check_keys(config[sensor], needed, optional, where)
         for key, value in config[sensor].items():
             if not isinstance(value, (int, float)) or isinstance(value, bool):
                 raise InputError(f"{where}: {key} is {value!r}, must be a finite number ≥ 0")
@@ -81,6 +101,8 @@ def imu_spec(config: Mapping) -> ImuSpec:
             sensors[sensor] = SensorErrors(**{key: float(value) for key, value in config[sensor].items()})
         except InputError as error:
             raise InputError(str(error).replace("IMU preset", where, 1)) from None
+    if sensors["accel"].g_sensitivity:
+        raise InputError(f"IMU preset {name}, accel: g_sensitivity is an error of gyroscopes alone, leave it out")
     return ImuSpec(name=name, source=str(config.get("source", "")), **sensors)
 
 

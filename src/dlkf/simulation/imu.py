@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -80,13 +80,16 @@ def _inverse_mean_rotation(phi: Float[Tensor, "m 3"], u: Float[Tensor, "m 3"]) -
 
 @dataclass(frozen=True)
 class ImuUnit:
-    """One drawn IMU: turn-on bias (6,) and the matrices M of scale factor and misalignment (2, 3, 3).
+    """One drawn IMU: turn-on bias (6,), the matrices M of scale factor and misalignment (2, 3, 3), the final
+    warm-up drift (6,), and the gyroscope's g-sensitivity G (3, 3) [rad/s per m/s²].
 
     Accelerometer first, then gyroscope, in m/s² and rad/s.
     """
 
     bias: Array
     matrix: Array
+    warm_up: Array = field(default_factory=lambda: np.zeros(6))
+    g_sensitivity: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 def draw_unit(rng: np.random.Generator, spec: ImuSpec) -> ImuUnit:
@@ -96,7 +99,9 @@ def draw_unit(rng: np.random.Generator, spec: ImuSpec) -> ImuUnit:
         bias.append(sensor.turn_on_bias * rng.standard_normal(3))
         sigma = np.where(np.eye(3, dtype=bool), sensor.scale_factor, sensor.misalignment)
         matrices.append(sigma * rng.standard_normal((3, 3)))
-    return ImuUnit(np.concatenate(bias), np.stack(matrices))
+    warm_up = np.repeat((spec.accel.warm_up, spec.gyro.warm_up), 3) * rng.standard_normal(6)
+    g_sensitivity = spec.gyro.g_sensitivity * rng.standard_normal((3, 3))
+    return ImuUnit(np.concatenate(bias), np.stack(matrices), warm_up, g_sensitivity)
 
 
 def corrupt(
@@ -104,16 +109,40 @@ def corrupt(
 ) -> tuple[Array, Array]:
     """Measured samples and their complete error without white noise, both (N, 6) (checklist 2.7, R090).
 
-        measured = (I + M) true + b(t) + w,   error = M true + b(t),   std(w) = √S · √rate (R094)
+        error = M true + G f + b(t),   measured = put out(true + error + w),   std(w) = √S · √rate (R094)
 
-    b(t) is the unit's turn-on bias plus the in-run Gauss-Markov part of this drive.
+    G f, with f the specific force, is in the rates alone. b(t) is the unit's turn-on bias and warm-up drift plus
+    the in-run bias of this drive. What is put out is limited to the full scale and rounded to whole steps of
+    the quantisation; neither is part of the error.
     """
     scaled = np.concatenate((true_imu[:, :3] @ unit.matrix[0].T, true_imu[:, 3:] @ unit.matrix[1].T), -1)
-    drift = [gauss_markov(rng, len(true_imu), sensor, rate_hz) for sensor in (spec.accel, spec.gyro)]
+    sensors = (spec.accel, spec.gyro)
+    drift = [gauss_markov(rng, len(true_imu), sensor, rate_hz) for sensor in sensors]
     error = scaled + unit.bias + np.concatenate(drift, -1)
-    density = np.repeat((spec.accel.noise_density, spec.gyro.noise_density), 3)
+    density = np.repeat([sensor.noise_density for sensor in sensors], 3)
     noise = density * math.sqrt(rate_hz) * rng.standard_normal(true_imu.shape)
-    return true_imu + error + noise, error
+    if unit.g_sensitivity.any():
+        error[:, 3:] += true_imu[:, :3] @ unit.g_sensitivity.T
+    for part, sensor in zip((slice(0, 3), slice(3, 6)), sensors):
+        if sensor.random_walk > 0:
+            steps = sensor.random_walk / math.sqrt(rate_hz) * rng.standard_normal((len(true_imu), 3))
+            error[:, part] += np.cumsum(steps, axis=0)
+        if sensor.warm_up > 0:
+            t = np.arange(1, len(true_imu) + 1) / rate_hz
+            error[:, part] -= np.expm1(-t / sensor.warm_up_time)[:, None] * unit.warm_up[part]
+    measured = true_imu + error + noise
+    for part, sensor in zip((slice(0, 3), slice(3, 6)), sensors):
+        measured[:, part] = put_out(measured[:, part], sensor)
+    return measured, error
+
+
+def put_out(x: Array, sensor: SensorErrors) -> Array:
+    """What a sensor's output register holds of x: within ± its full scale, in whole steps."""
+    if sensor.full_scale > 0:
+        x = np.clip(x, -sensor.full_scale, sensor.full_scale)
+    if sensor.quantisation > 0:
+        x = sensor.quantisation * np.round(x / sensor.quantisation)
+    return x
 
 
 def gauss_markov(rng: np.random.Generator, samples: int, sensor: SensorErrors, rate_hz: float) -> Array:

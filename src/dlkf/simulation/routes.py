@@ -68,7 +68,8 @@ class VehicleConfig:
     """Bounds of the motion, where it starts, and the road.
 
     ``slope_std`` is the RMS grade, ``bank_std`` the RMS cross slope, 0 for a flat road; in a turn the road is
-    banked inwards by ``superelevation`` [rad per m/s² of lateral acceleration].
+    banked inwards by ``superelevation`` [rad per m/s² of lateral acceleration]. ``wander_deg``: RMS by which
+    the driver's course departs from the plan, in waves of 60 to 400 m; the bounds are those of the plan.
     """
 
     max_speed_kmh: float = 80.0
@@ -80,6 +81,7 @@ class VehicleConfig:
     slope_std: float = 0.03
     bank_std: float = 0.0
     superelevation: float = 0.0
+    wander_deg: float = 0.0
     lat_deg: float = 52.15
     lon_deg: float = 9.95
     height_m: float = 100.0
@@ -100,6 +102,8 @@ class VehicleConfig:
             raise InputError(f"vehicle: bank_std {self.bank_std} is outside 0 to 0.1")
         if not 0 <= self.superelevation <= 0.1:
             raise InputError(f"vehicle: superelevation {self.superelevation} rad/(m/s²) is outside 0 to 0.1")
+        if not 0 <= self.wander_deg <= 3:
+            raise InputError(f"vehicle: wander_deg {self.wander_deg} is outside 0 to 3")
         slowest = math.sqrt(self.min_lateral * self.min_radius) / KMH
         if not slowest <= self.max_speed_kmh <= 300:
             raise InputError(

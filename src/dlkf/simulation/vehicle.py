@@ -8,7 +8,7 @@ What a car adds is in ``chassis``.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -49,19 +49,33 @@ class Waves:
             rate += amplitude * wavenumber * np.cos(where) * motion.speed
         return angle, rate
 
+    def steered(self, motion: Kinematics) -> Kinematics:
+        """The motion with the angle added to its course."""
+        angle, rate = self.at(motion)
+        curved = Waves(-self.amplitude * self.wavenumber**2, self.wavenumber, self.phase).at(motion)[0]
+        bend = Waves(self.amplitude * self.wavenumber, self.wavenumber, self.phase + 0.5 * math.pi).at(motion)[0]
+        return replace(
+            motion,
+            course=motion.course + angle,
+            yaw_rate=motion.yaw_rate + rate,
+            yaw_acceleration=motion.yaw_acceleration + curved * motion.speed**2 + bend * motion.acceleration,
+        )
+
 
 @dataclass(frozen=True)
 class Route:
-    """A plan and the road below it: slope, cross slope, and how far turns are banked [rad per m/s²]."""
+    """A plan, how the driver wanders from it, and the road: slope, cross slope, bank of turns [rad per m/s²]."""
 
     plan: Plan
+    wander: Waves | None
     slope: Waves
     cross_slope: Waves
     superelevation: float
 
     def motion(self, t: Array) -> Kinematics:
         """Where along the road the car is at times ``t`` [s], and how fast."""
-        return along(self.plan, t)
+        planned = along(self.plan, t)
+        return planned if self.wander is None else self.wander.steered(planned)
 
     def bank(self, motion: Kinematics) -> tuple[Array, Array]:
         """Bank of the road [rad], positive where its right edge is the lower, and its rate [rad/s]."""
@@ -78,16 +92,19 @@ def drive_vehicle(rng: np.random.Generator, config: VehicleConfig, t: Array) -> 
 
 def random_route(rng: np.random.Generator, config: VehicleConfig, duration: float) -> Route:
     """A random plan of at least ``duration`` [s] on a random road."""
-    (cross_rng,) = rng.spawn(1)
+    cross_rng, wander_rng = rng.spawn(2)
     plan = random_plan(rng, config, duration)
     slope = random_waves(rng, config.slope_std)
-    return Route(plan, slope, random_waves(cross_rng, config.bank_std), config.superelevation)
+    wander = random_waves(wander_rng, math.radians(config.wander_deg), (60.0, 400.0)) if config.wander_deg else None
+    return Route(plan, wander, slope, random_waves(cross_rng, config.bank_std), config.superelevation)
 
 
-def random_waves(rng: np.random.Generator, rms: float, waves: int = 6) -> Waves:
-    """Waves of 200 to 1500 m wavelength with a given RMS on average: hills, or the bank of a road."""
+def random_waves(
+    rng: np.random.Generator, rms: float, lengths: tuple[float, float] = (200, 1500), waves: int = 6
+) -> Waves:
+    """Waves with a given RMS on average, their wavelengths [m] log-uniform: hills, or the bank of a road."""
     amplitude = rms * math.sqrt(2 / waves) * rng.uniform(0.5, 1.35, waves)
-    wavelength = np.exp(rng.uniform(math.log(200), math.log(1500), waves))
+    wavelength = np.exp(rng.uniform(math.log(lengths[0]), math.log(lengths[1]), waves))
     return Waves(amplitude, 2 * math.pi / wavelength, rng.uniform(0, 2 * math.pi, waves))
 
 
