@@ -1,13 +1,16 @@
-"""Simulated drives as a dataset: ``python -m dlkf.simulate dataset=per_drive imu=consumer``."""
+"""Simulated and semi-real drives as a dataset: ``python -m dlkf.simulate dataset=per_drive imu=consumer``."""
 
 from __future__ import annotations
 
+import sys
 import time
 
+import pyarrow.parquet as pq
 from omegaconf import DictConfig, OmegaConf
 
 from dlkf.command import command
 from dlkf.simulation.dataset import simulate_from_config
+from dlkf.simulation.semi_real import semi_real_from_config
 
 
 @command("simulate")
@@ -15,12 +18,21 @@ def main(cfg: DictConfig) -> None:
     """Write the dataset to ``out`` (default ``data/<name>``) and say what it holds."""
     start = time.perf_counter()
     config = OmegaConf.to_container(cfg, resolve=True)
-    out = simulate_from_config(config, config["out"], overwrite=config["overwrite"])
+    make = semi_real_from_config if config["source"] else simulate_from_config
+    out = make(config, config["out"], overwrite=config["overwrite"])
+    hours = sum(pq.read_table(out / "drives.parquet", columns=["duration_s"])["duration_s"].to_pylist()) / 3600
     print(
-        f"{out}: {config['dataset']['hours']:g} h of drives with IMU {config['imu']['name']} "
+        f"{out}: {hours:.3g} h of {'semi-real ' if config['source'] else ''}drives with IMU {config['imu']['name']} "
         f"({config['dataset']['imu_errors']}), seed {config['seed']}, in {time.perf_counter() - start:.1f} s"
     )
 
 
+def arguments_of_source(arguments: list[str]) -> list[str]:
+    """``source=`` alone means the dataset ``semi_real``, not simulated drives' default."""
+    given = {argument.partition("=")[0].removeprefix("simulated@") for argument in arguments}
+    return [*arguments, "dataset=semi_real"] if "source" in given and "dataset" not in given else arguments
+
+
 if __name__ == "__main__":
+    sys.argv[1:] = arguments_of_source(sys.argv[1:])
     main()

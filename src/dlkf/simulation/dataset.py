@@ -8,26 +8,31 @@ import os
 import re
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
 from rich.console import Console
 from rich.progress import track
 
-from dlkf.data.schema import new_dataset, write_drive, write_drives_table
+from dlkf.data.schema import drive_file, new_dataset, write_drive, write_drives_table, write_parquet
 from dlkf.errors import InputError
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.simulation.almanac import read_almanac
 from dlkf.simulation.chassis import ChassisConfig
 from dlkf.simulation.drive import Rates, Seeds, simulate_drive
 from dlkf.simulation.gnss import GnssConfig
 from dlkf.simulation.imu import draw_unit
+from dlkf.simulation.receiver import Receiver, receiver_spec
 from dlkf.simulation.routes import VehicleConfig
 from dlkf.simulation.settings import built
 from dlkf.simulation.surroundings import Surroundings
 
 LONGEST_DRIVE = 240.0  # minutes; a drive is held in memory as a whole
+FASTEST_RECEIVER = 20.0  # Hz
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,8 @@ class DatasetConfig:
     With ``one``, turn-on bias, scale factors and misalignment are drawn once, from ``unit_seed``: the same
     IMU on other roads is another seed with the same ``unit_seed``. White noise and the in-run bias belong to
     each drive either way. With ``fleet``, each drive has a new unit of a type drawn from ``fleet``.
+    Fixes come from the satellites that a ``receiver`` sees, or have white noise without one; ``raw`` keeps its
+    observations as well.
     """
 
     name: str
@@ -51,6 +58,8 @@ class DatasetConfig:
     chassis: ChassisConfig = field(default_factory=ChassisConfig)
     surroundings: Surroundings = field(default_factory=Surroundings)
     gnss: GnssConfig = field(default_factory=GnssConfig)
+    receiver: Receiver | None = None
+    raw: bool = False
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", self.name):
@@ -80,6 +89,12 @@ class DatasetConfig:
             raise InputError("dataset: imu_errors is fleet, but fleet names no IMU presets (see simulated/fleet.yaml)")
         if not isinstance(self.unit_seed, int) or self.unit_seed < 0:
             raise InputError(f"dataset: unit_seed {self.unit_seed!r} must be a whole number ≥ 0")
+        if not isinstance(self.raw, bool) or (self.raw and self.receiver is None):
+            raise InputError(f"raw={self.raw}: there are raw observations with a satellite receiver=<preset> only")
+        if self.receiver is not None and self.gnss.rate_hz > FASTEST_RECEIVER:
+            raise InputError(
+                f"dataset: gnss.rate_hz {self.gnss.rate_hz} is above {FASTEST_RECEIVER:g} for a satellite receiver"
+            )
 
     @property
     def durations(self) -> list[int]:
@@ -106,18 +121,25 @@ def simulate_from_config(
 
     InputError as of :func:`dataset_config`, :func:`imu_spec` and :func:`simulate_dataset`.
     """
-    for key in ("dataset", "imu", "seed"):
-        if config.get(key) is None:
-            raise InputError(f"simulation: {key} is missing")
-    seed, workers = config["seed"], config.get("workers")
-    if not isinstance(seed, int) or seed < 0:
-        raise InputError(f"simulation: seed {seed!r} must be a whole number ≥ 0")
+    settings, spec, seed = simulation_settings(config)
+    workers = config.get("workers")
     if workers is not None and (not isinstance(workers, int) or workers < 1):
         raise InputError(f"simulation: workers {workers!r} must be a whole number ≥ 1")
     return simulate_dataset(
-        dataset_config(config["dataset"]), imu_spec(config["imu"]), seed, Path(out),
-        overwrite=overwrite, workers=workers, progress=progress,
-    )  # fmt: skip
+        settings, spec, seed, Path(out), overwrite=overwrite, workers=workers, progress=progress
+    )
+
+
+def simulation_settings(config: Mapping[str, Any]) -> tuple[DatasetConfig, ImuSpec, int]:
+    """Dataset, IMU and seed from a mapping with ``dataset``, ``imu``, ``seed``, perhaps ``receiver`` and ``raw``."""
+    for key in ("dataset", "imu", "seed"):
+        if config.get(key) is None:
+            raise InputError(f"simulation: {key} is missing")
+    seed = config["seed"]
+    if not isinstance(seed, int) or seed < 0:
+        raise InputError(f"simulation: seed {seed!r} must be a whole number ≥ 0")
+    gnss = {"receiver": receiver_spec(config.get("receiver")), "raw": config.get("raw", False)}
+    return replace(dataset_config(config["dataset"]), **gnss), imu_spec(config["imu"]), seed
 
 
 def simulate_dataset(
@@ -149,12 +171,12 @@ def _write_drives(
 
     def one(index: int) -> dict[str, Any]:
         motion, imu, gnss, unit_seed, *others, type_seed = np.random.SeedSequence(seed, spawn_key=(1, index)).spawn(7)
-        kind = _imu_type(config, spec, type_seed)
+        kind = imu_type(config, spec, type_seed)
         unit = shared if config.imu_errors == "one" else draw_unit(np.random.default_rng(unit_seed), kind)
         seconds = durations[index]
         tables = simulate_drive(
             Seeds(motion, imu, gnss, *others), seconds, rates, config.vehicle, config.chassis, config.surroundings,
-            kind, unit, config.gnss,
+            kind, unit, config.gnss, config.receiver,
         )  # fmt: skip
         name = f"{config.name}-{seed}-{index:05d}"
         row = {
@@ -163,7 +185,7 @@ def _write_drives(
             "source": f"simulation, seed {seed}, drive {index}",
             "licence": "none: simulated",
             "imu": kind.name,
-            "gnss": f"simulated, white noise, quality {config.gnss.quality}",
+            "gnss": gnss_text(config),
             "reference": "exact",
             "imu_rate_hz": float(rates.imu_hz),
             "gnss_rate_hz": float(rates.gnss_hz),
@@ -172,6 +194,8 @@ def _write_drives(
             **tables.facts,
         }
         write_drive(folder, row, tables.imu, tables.gnss, tables.reference)
+        if config.raw:
+            write_raw(folder, name, tables.raw)
         return row
 
     with ThreadPoolExecutor(workers) as pool:
@@ -191,7 +215,21 @@ def _write_drives(
     (folder / "simulation.json").write_text(json.dumps(described, indent=2, ensure_ascii=False) + "\n")
 
 
-def _imu_type(config: DatasetConfig, spec: ImuSpec, seed: np.random.SeedSequence) -> ImuSpec:
+def gnss_text(config: DatasetConfig) -> str:
+    """How the fixes were made, for ``drives.parquet``."""
+    if config.receiver is None:
+        return f"simulated, white noise, quality {config.gnss.quality}"
+    almanac = read_almanac(config.receiver.almanac)
+    return f"simulated from satellites, receiver {config.receiver.name}, GPS almanac of week {almanac.week}"
+
+
+def write_raw(folder: Path, drive: str, raw: pd.DataFrame | None) -> None:
+    """Raw observations of a drive beside its other tables, ``raw/drive=<id>/part-0.parquet``."""
+    if raw is not None:
+        write_parquet(drive_file(folder, "raw", drive), pa.Table.from_pandas(raw, preserve_index=False))
+
+
+def imu_type(config: DatasetConfig, spec: ImuSpec, seed: np.random.SeedSequence) -> ImuSpec:
     """The IMU preset of a drive: the dataset's, or one of the fleet's."""
     if config.imu_errors != "fleet":
         return spec

@@ -14,9 +14,11 @@ from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.simulation.chassis import Car, ChassisConfig, draw_car, mounted, slip_angle
-from dlkf.simulation.gnss import GnssConfig, observe
+from dlkf.simulation.gnss import GnssConfig
 from dlkf.simulation.imu import ImuUnit, corrupt, inverse_mechanisation
+from dlkf.simulation.receiver import Receiver
 from dlkf.simulation.routes import VehicleConfig
+from dlkf.simulation.satellite_fixes import receive
 from dlkf.simulation.surroundings import Surroundings, sky_along
 from dlkf.simulation.vehicle import Route, Truth, follow, random_route
 
@@ -47,6 +49,7 @@ class DriveTables:
     imu: pd.DataFrame
     gnss: pd.DataFrame
     reference: pd.DataFrame
+    raw: pd.DataFrame | None  # GNSS observations, where fixes come from satellites
     facts: dict[str, float]
 
 
@@ -60,6 +63,7 @@ def simulate_drive(
     spec: ImuSpec,
     unit: ImuUnit,
     gnss: GnssConfig,
+    receiver: Receiver | None = None,
 ) -> DriveTables:
     """One drive; each part has a seed of its own, so changing one leaves the others as they were."""
     motion_rng, imu_rng, gnss_rng, sky_rng, chassis_rng = (np.random.default_rng(seed) for seed in seeds)
@@ -73,10 +77,13 @@ def simulate_drive(
     fixes = slice(None, None, round(rates.imu_hz / rates.gnss_hz))
     rows = slice(None, None, rates.imu_hz // rates.reference_hz)
     sky = sky_along(sky_rng, surroundings, route.motion(t[fixes]).distance)
+    rate_b = _rate_at_rows(true_imu[:, 3:])[fixes]
+    received = receive(gnss_rng, sliced(truth, fixes), rate_b, gnss, receiver, sky)
     return DriveTables(
         imu=pd.DataFrame({"t": t[1:], **dict(zip((*ACCEL, *GYRO), measured.T))}),
-        gnss=observe(gnss_rng, sliced(truth, fixes), _rate_at_rows(true_imu[:, 3:])[fixes], gnss, sky=sky),
+        gnss=received.fixes,
         reference=_reference(sliced(truth, rows), np.concatenate((error[:1], error))[rows]),
+        raw=received.raw,
         facts=_facts(car, route, axle, truth, rates.imu_hz),
     )
 

@@ -1,0 +1,178 @@
+"""Semi-real drives: a real car's motion and its high-grade IMU, with the errors of another IMU and GNSS made anew.
+
+Truth stays the source's reference. GNSS exists only where the reference is known: a fix is made of it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+
+from dlkf.data.geodetic import geodetic_from_ecef
+from dlkf.data.resampling import Grid, reference_at
+from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR, new_dataset, write_drive, write_drives_table
+from dlkf.data.tables import read_drives
+from dlkf.data.validate import DriveTables, read_checked, validate_dataset
+from dlkf.errors import InputError
+from dlkf.navigation.attitude import rpy_from_rotation
+from dlkf.navigation.earth import ned_axes
+from dlkf.navigation.imu_errors import ImuSpec
+from dlkf.simulation.dataset import DatasetConfig, gnss_text, imu_type, simulation_settings, write_raw
+from dlkf.simulation.imu import ImuUnit, corrupt, draw_unit
+from dlkf.simulation.satellite_fixes import Received, receive
+from dlkf.simulation.surroundings import Sky, sky_along
+from dlkf.simulation.vehicle import Truth
+
+Array = NDArray[np.float64]
+KIND = "semi-real"
+INJECTED = "the injected part only: the source's own IMU errors remain and are not known"
+
+
+def semi_real_from_config(
+    config: Mapping[str, Any], out: str | Path, *, overwrite: bool = False, progress: bool = True
+) -> Path:
+    """Semi-real drives as a mapping with ``source``, ``dataset``, ``imu``, ``seed`` and so on says, into ``out``."""
+    settings, spec, seed = simulation_settings(config)
+    return simulate_semi_real(
+        config["source"], settings, spec, seed, Path(out), overwrite=overwrite, progress=progress
+    )
+
+
+def simulate_semi_real(
+    source: str | Path,
+    config: DatasetConfig,
+    spec: ImuSpec,
+    seed: int,
+    out: Path,
+    *,
+    overwrite: bool = False,
+    progress: bool = True,
+) -> Path:
+    """Write every drive of the dataset ``source`` to ``out`` with IMU errors injected and GNSS made anew.
+
+    Of ``config`` the IMU errors, surroundings, gnss, receiver and raw count; motion, rates and lengths are the
+    source's. The columns of the true IMU error hold the injected part only. InputError for a drive without a
+    usable reference, or whose IMU errors are known already (it is no real drive).
+    """
+    rows = read_drives(source)
+    described = pq.read_table(Path(source) / "drives.parquet").to_pandas().to_dict("records")
+    shared = draw_unit(np.random.default_rng(np.random.SeedSequence(config.unit_seed, spawn_key=(0,))), spec)
+    shown = track(
+        range(len(rows)), f"semi-real {config.name}", disable=not progress, console=Console(stderr=True)
+    )
+    with new_dataset(out, overwrite) as folder:
+        written = []
+        for index in shown:
+            tables = read_checked(source, rows[index])
+            *streams, unit_seed, type_seed = np.random.SeedSequence(seed, spawn_key=(2, index)).spawn(5)
+            kind = imu_type(config, spec, type_seed)
+            unit = shared if config.imu_errors == "one" else draw_unit(np.random.default_rng(unit_seed), kind)
+            imu_rng, gnss_rng, sky_rng = (np.random.default_rng(stream) for stream in streams)
+            imu, reference = injected(imu_rng, tables, kind, unit)
+            received = gnss_of_reference(gnss_rng, sky_rng, tables, config)
+            row = _row(described[index], config, kind)
+            written.append(write_drive(folder, row, imu, received.fixes, reference))
+            if config.raw:
+                write_raw(folder, rows[index].name, received.raw)
+        write_drives_table(folder, written)
+        validate_dataset(folder)
+        settings = {"source": str(source), "seed": seed, "dataset": asdict(config), "imu": asdict(spec)}
+        (folder / "simulation.json").write_text(json.dumps(settings, indent=2, ensure_ascii=False) + "\n")
+    return out
+
+
+def injected(
+    rng: np.random.Generator, tables: DriveTables, spec: ImuSpec, unit: ImuUnit
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """IMU table with the errors of a unit added to the source's samples, and the reference with those errors.
+
+    White noise and in-run bias are those of the source's median rate. A row of the reference has the error of the
+    sample that covers its time. InputError without a reference, or if the reference states IMU errors already.
+    """
+    name, imu, reference = tables.row.name, tables.imu, tables.reference
+    if reference is None:
+        raise InputError(f"drive {name}: no reference, so there is no truth to make GNSS of; leave the drive out")
+    if any(np.isfinite(reference[c]).any() for c in IMU_ERROR if c in reference):
+        raise InputError(
+            f"drive {name}: its IMU errors are known, so it is simulated or semi-real; source= takes real drives"
+        )
+    t = imu["t"]
+    samples = np.stack([imu[c] for c in (*ACCEL, *GYRO)], -1)
+    measured, error = corrupt(rng, samples, spec, unit, 1 / float(np.median(np.diff(t))))
+    covering = np.minimum(np.searchsorted(t, reference["t"], side="left"), len(t) - 1)
+    return (
+        pd.DataFrame({"t": t, **dict(zip((*ACCEL, *GYRO), measured.T))}),
+        pd.DataFrame({**reference, **dict(zip(IMU_ERROR, error[covering].T))}),
+    )
+
+
+def gnss_of_reference(
+    rng: np.random.Generator, sky_rng: np.random.Generator, tables: DriveTables, config: DatasetConfig
+) -> Received:
+    """GNSS at whole multiples of 1/rate where the reference is known, between samples close enough to interpolate.
+
+    Where it is not known there is no fix, as under a roof. InputError if it is known nowhere, or has no attitude
+    while the configuration asks for a lever arm.
+    """
+    name, reference, gnss = tables.row.name, tables.reference, config.gnss
+    assert reference is not None  # :func:`injected` raises for that
+    t = _epochs(tables.imu["t"], reference["t"], gnss.rate_hz, name)
+    at = reference_at(reference, Grid(t[0], 1 / gnss.rate_hz, len(t) - 1, 1))
+    known = np.flatnonzero(at.valid)
+    if not len(known):
+        raise InputError(f"drive {name}: its reference is valid at no GNSS epoch; leave the drive out")
+    # elsewhere the last known state before: of no use, but finite
+    filled = known[np.maximum(np.searchsorted(known, np.arange(len(t)), side="right") - 1, 0)]
+    r_e, v_e, C_eb = (torch.from_numpy(x[filled]) for x in (at.r_e, at.v_e, at.C_eb))
+    lat, lon, height = geodetic_from_ecef(r_e)
+    C_ne = ned_axes(lat, lon).mT
+    v_n = (C_ne @ v_e[..., None])[..., 0].numpy()
+    rpy = rpy_from_rotation(C_ne @ C_eb).numpy()
+    if np.isnan(rpy).any() and any(gnss.lever_arm_b):
+        raise InputError(
+            f"drive {name}: its reference has no attitude, which gnss.lever_arm_b needs; give [0, 0, 0]"
+        )
+    course = np.unwrap(np.arctan2(v_n[:, 1], v_n[:, 0]))
+    rpy = np.where(np.isnan(rpy).any(-1, keepdims=True), np.stack((0 * course, 0 * course, course), -1), rpy)
+    truth = Truth(t, lat.numpy(), lon.numpy(), height.numpy(), v_n, rpy)
+    speed = np.where(at.valid, np.hypot(v_n[:, 0], v_n[:, 1]), 0.0)
+    sky = sky_along(sky_rng, config.surroundings, np.cumsum(speed) / gnss.rate_hz)
+    sky = Sky(sky.mask_left, sky.mask_right, sky.blocked | ~at.valid)
+    middle = tables.imu["t"] - 0.5 * float(np.median(np.diff(tables.imu["t"])))
+    rate_b = np.stack([np.interp(t, middle, tables.imu[c]) for c in GYRO], -1)
+    return receive(rng, truth, rate_b, gnss, config.receiver, sky)
+
+
+def _epochs(t_imu: Array, t_reference: Array, rate_hz: float, name: str) -> Array:
+    """Multiples of 1/rate [s] that both IMU and reference span."""
+    first = np.ceil(max(t_imu[0], t_reference[0]) * rate_hz)
+    last = np.floor(min(t_imu[-1], t_reference[-1]) * rate_hz)
+    if last < first + 1:
+        raise InputError(f"drive {name}: IMU and reference have less than two GNSS epochs in common; leave it out")
+    return np.arange(first, last + 1) / rate_hz
+
+
+def _row(described: dict[str, Any], config: DatasetConfig, spec: ImuSpec) -> dict[str, Any]:
+    """The drive's row of ``drives.parquet``: what it was, what was done to it, and the source's licence."""
+    return {
+        **described,
+        "kind": KIND,
+        "source": f"{KIND}, motion of: {described.get('source') or 'not stated'}",
+        "licence": described.get("licence") or "not stated by the source",
+        "imu": f"{spec.name} errors injected into: {described.get('imu') or 'not stated'}",
+        "imu_error": INJECTED,
+        "gnss": f"{gnss_text(config)}, made of the reference",
+        "gnss_rate_hz": config.gnss.rate_hz,
+        **{f"lever_arm_{axis}_m": float(x) for axis, x in zip("xyz", config.gnss.lever_arm_b)},
+    }
