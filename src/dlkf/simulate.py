@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 
-import pyarrow.parquet as pq
+import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 
 from dlkf.command import command
@@ -20,11 +21,15 @@ def main(cfg: DictConfig) -> None:
     config = OmegaConf.to_container(cfg, resolve=True)
     make = semi_real_from_config if config["source"] else simulate_from_config
     out = make(config, config["out"], overwrite=config["overwrite"])
-    hours = sum(pq.read_table(out / "drives.parquet", columns=["duration_s"])["duration_s"].to_pylist()) / 3600
+    drives = pd.read_parquet(out / "drives.parquet")
+    hours = drives["duration_s"].sum() / 3600
     print(
         f"{out}: {hours:.3g} h of {'semi-real ' if config['source'] else ''}drives with IMU {config['imu']['name']} "
         f"({config['dataset']['imu_errors']}), seed {config['seed']}, in {time.perf_counter() - start:.1f} s"
     )
+    if "lateral_axle_mps" in drives:
+        axle, imu = (math.sqrt((drives[f"lateral_{at}_mps"] ** 2).mean()) for at in ("axle", "imu"))
+        print(f"velocity across the car, RMS above 2 m/s: {axle:.3f} m/s at the rear axle, {imu:.3f} m/s at the IMU")
 
 
 def arguments_of_source(arguments: list[str]) -> list[str]:

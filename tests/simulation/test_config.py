@@ -18,6 +18,8 @@ BRINGS = {
     "per_drive": "automotive_mems",
     "paper_clean": "table3_standin",
     "paper_mems": "groves_consumer",
+    "semi_real": "automotive_mems",
+    **dict.fromkeys(("lifelike", "city", "highway", "car_park", "tunnel", "fleet"), "lifelike_mems"),
 }
 
 
