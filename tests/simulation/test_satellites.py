@@ -74,7 +74,7 @@ def test_velocity_and_clock_rate_are_derivatives():
 
 
 def test_ground_track_repeats_after_a_sidereal_day():
-    """Two revolutions and one turn of the Earth; 7 s that a period differs from half of it are 0.1 ° along the orbit."""
+    """Two revolutions, one turn of the Earth; 7 s between a period and half a turn are 0.12 ° along the orbit."""
     t = np.arange(0, 3600.0, 600)
     apart = np.linalg.norm(satellite_state(ALMANAC, t + SIDEREAL_DAY).r_e - satellite_state(ALMANAC, t).r_e, axis=-1)
     assert apart.max() < 26.6e6 * np.radians(0.13)

@@ -15,11 +15,14 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from dlkf.errors import InputError
+from dlkf.simulation.settings import built
 
 Array = NDArray[np.float64]
 LOWEST = math.radians(3.0)  # mappings and noise grow without bound towards the horizon
 EARTH_RADIUS, IONOSPHERE = 6378.1363e3, 350e3  # m, radius and height of the thin shell (RTCA DO-229 A.4.4.10.4)
 QUALITIES = (1, 2, 4, 5)
+POSITIVE = ("std_range", "std_range_rate", "multipath_s", "orbit_s", "atmosphere_s", "ambiguity_s", "max_pdop")
+WHITE = "white"  # the receiver of a dataset without satellites
 
 
 @dataclass(frozen=True)
@@ -58,20 +61,17 @@ class Receiver:
     almanac: str = ""
 
     def __post_init__(self) -> None:
-        positive = ("std_range", "std_range_rate", "multipath_s", "orbit_s", "atmosphere_s", "ambiguity_s", "max_pdop")
+        where = f"receiver {self.name}"
         for f in fields(self):
             value = getattr(self, f.name)
-            if f.name in ("name", "almanac"):
-                if not isinstance(value, str):
-                    raise InputError(f"receiver: {f.name} is {value!r}, must be a word")
-            elif not isinstance(value, (int, float)) or isinstance(value, bool) or not 0 <= value < 1e6:
-                raise InputError(f"receiver {self.name}: {f.name} is {value!r}, must be a number from 0 to 1e6")
-            elif f.name in positive and value == 0:
-                raise InputError(f"receiver {self.name}: {f.name} is 0, must be positive")
+            if f.name not in ("name", "almanac") and not 0 <= value < 1e6:
+                raise InputError(f"{where}: {f.name} {value} is outside 0 to 1e6")
+            if f.name in POSITIVE and value == 0:
+                raise InputError(f"{where}: {f.name} is 0, must be positive")
         if self.quality not in QUALITIES:
-            raise InputError(f"receiver {self.name}: quality {self.quality} is none of {QUALITIES} (NMEA GGA codes)")
+            raise InputError(f"{where}: quality {self.quality} is none of {QUALITIES} (NMEA GGA codes)")
         if self.mask_deg >= 60:
-            raise InputError(f"receiver {self.name}: mask_deg {self.mask_deg:g} is not below 60")
+            raise InputError(f"{where}: mask_deg {self.mask_deg:g} is not below 60")
 
 
 def receiver_spec(config: Mapping | None) -> Receiver | None:
@@ -79,14 +79,11 @@ def receiver_spec(config: Mapping | None) -> Receiver | None:
 
     InputError for an unknown key or an impossible value.
     """
-    if config is None or (isinstance(config, Mapping) and config.get("name") == "white"):
+    if config is None or (isinstance(config, Mapping) and dict(config) == {"name": WHITE}):
         return None
-    if not isinstance(config, Mapping) or "name" not in config:
-        raise InputError(f"receiver: is {config!r}, must be a mapping with a name, as in conf/receiver/*.yaml")
-    known = [f.name for f in fields(Receiver)]
-    if unknown := sorted(str(key) for key in config if key not in known):
-        raise InputError(f"receiver: unknown key {', '.join(unknown)}; known are {', '.join(known)}")
-    return Receiver(**config)
+    if not isinstance(config, Mapping) or config.get("name") in (None, WHITE):
+        raise InputError(f"receiver: is {config!r}; give one of conf/receiver/*.yaml, white has nothing to set")
+    return built(Receiver, config, "receiver")
 
 
 @dataclass(frozen=True)
