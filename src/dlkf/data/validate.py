@@ -70,6 +70,14 @@ def read_checked(
     return DriveTables(row, imu, gnss, truth)
 
 
+def read_imu(folder: str | Path, drive: str, limits: Limits = LIMITS) -> Columns:
+    """Read and check the IMU of a drive alone, with GNSS or without; raises InputError for the first fault."""
+    imu = read_table(folder, "imu", drive)
+    assert imu is not None  # read_table raises for this one
+    _check_imu(imu, _where(drive, "imu"), limits)
+    return imu
+
+
 def gap_rows(t: np.ndarray, limits: Limits = LIMITS) -> np.ndarray:
     """Rows before which the IMU has a gap."""
     if len(t) < 2:

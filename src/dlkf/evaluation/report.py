@@ -100,7 +100,7 @@ def write_report(
         ).encode(),
         "table.md": "\n".join(map(as_markdown, parts)).encode(),
         "table.csv": as_csv(dataset, results).encode(),
-        "report.html": report_html(dataset, parts, pictures, protocol).encode(),
+        "report.html": report_html(f"Evaluation on {dataset}", parts, pictures, protocol).encode(),
         **{f"figures/{name}": data for name, _, data in pictures},
     }
     with staged(out) as folder:
@@ -115,10 +115,10 @@ def _heading(text: str) -> str:
 
 
 def report_html(
-    dataset: str, parts: Sequence[Table], pictures: Sequence[tuple[str, str, bytes]], protocol: dict[str, Any]
+    title: str, parts: Sequence[Table], pictures: Sequence[tuple[str, str, bytes]], protocol: dict[str, Any]
 ) -> str:
-    """One self-contained page: tables, figures (PNG inside), and how the scores were made."""
-    body = [f"<h1>Evaluation on {html.escape(dataset)}</h1>"]
+    """One self-contained page: tables, figures (PNG inside), and how the numbers were made."""
+    body = [f"<h1>{html.escape(title)}</h1>"]
     for t in parts:
         head = "".join(f"<th>{_heading(c)}</th>" for c in t.columns)
         rows = "".join(
@@ -138,6 +138,6 @@ def report_html(
     body.append(f"<h2>Protocol</h2><dl>{settings}</dl>")
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        f"<title>Evaluation on {html.escape(dataset)}</title><style>{_STYLE}</style></head>"
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head>"
         f"<body>{''.join(body)}</body></html>\n"
     )

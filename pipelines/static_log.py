@@ -1,0 +1,66 @@
+"""A simulated IMU at rest as a dataset: a log for ``dlkf.allan`` whose noise is known.
+
+    python pipelines/static_log.py data/bench --imu consumer --hours 6
+    python -m dlkf.allan dataset=data/bench imu=consumer name=bench out=outputs/allan
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from dlkf.config import config_dir
+from dlkf.data.schema import ACCEL, GYRO, new_dataset, write_drive, write_drives_table
+from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.simulation.imu import corrupt, draw_unit, inverse_mechanisation
+from dlkf.simulation.vehicle import Truth
+
+LAT, LON, HEIGHT = math.radians(52.15), math.radians(9.95), 100.0
+
+
+def write_static_log(folder: Path, spec: ImuSpec, hours: float, rate_hz: int, seed: int, overwrite: bool) -> None:
+    """One drive of a level IMU at rest, with the errors of a unit of the preset's kind."""
+    rng = np.random.default_rng(seed)
+    n = round(hours * 3600 * rate_hz)
+    three, zero = np.arange(3) / rate_hz, np.zeros(3)
+    still = Truth(three, zero + LAT, zero + LON, zero + HEIGHT, np.zeros((3, 3)), np.zeros((3, 3)))
+    sample = inverse_mechanisation(still)[0]  # at rest every sample is alike
+    measured, _ = corrupt(rng, np.tile(sample, (n, 1)), spec, draw_unit(rng, spec), rate_hz)
+    t = np.arange(1, n + 1) / rate_hz
+    fixes = t[rate_hz - 1 :: rate_hz]
+    still_fix = {"lat_deg": math.degrees(LAT), "lon_deg": math.degrees(LON), "height_m": HEIGHT}
+    still_fix |= {f"vel_{axis}": 0.0 for axis in "ned"} | {f"std_pos_{axis}": 0.02 for axis in "ned"}
+    still_fix |= {f"std_vel_{axis}": 0.02 for axis in "ned"} | {"quality": 4}
+    row = {"drive": "static", "source": f"simulation, seed {seed}", "licence": "none: simulated", "imu": spec.name}
+    with new_dataset(folder, overwrite) as beside:
+        imu = pd.DataFrame({"t": t} | dict(zip((*ACCEL, *GYRO), measured.T)))
+        gnss = pd.DataFrame({"t": fixes} | {k: np.full(len(fixes), v) for k, v in still_fix.items()})
+        write_drives_table(beside, [write_drive(beside, row, imu, gnss)])
+
+
+def main() -> int:
+    """Simulate and write."""
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    arguments.add_argument("folder", type=Path)
+    arguments.add_argument("--imu", default="consumer", help="a preset of conf/imu")
+    arguments.add_argument("--hours", type=float, default=6.0)
+    arguments.add_argument("--rate-hz", type=int, default=100)
+    arguments.add_argument("--seed", type=int, default=0)
+    arguments.add_argument("--overwrite", action="store_true")
+    o = arguments.parse_args()
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        imu = OmegaConf.to_container(compose("allan", [f"imu={o.imu}"]), resolve=True)["imu"]
+    write_static_log(o.folder, imu_spec(imu), o.hours, o.rate_hz, o.seed, o.overwrite)
+    print(f"{o.folder}: {o.hours:g} h of {o.imu} at rest, {o.rate_hz} Hz, seed {o.seed}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,180 @@
+"""Allan deviation of a static log, and the noise model of an IMU preset fitted to it (R015, R109; IEEE Std 952).
+
+With θ the integral of the samples over time, the overlapping Allan variance at cluster time τ = m dt is
+
+    σ²(τ) = 1 / (2 τ² (N − 2m)) · Σ_k (θ_{k+2m} − 2 θ_{k+m} + θ_k)²,
+
+and of independent noise sources it is the sum (IEEE Std 952-1997, annex C; quantisation, white noise of density N,
+first-order Gauss-Markov bias of 1σ s and correlation time T):
+
+    σ²(τ) = 3 Q²/τ² + N²/τ + (2 s² T/τ) [1 − T/(2τ) (3 − 4 e^{−τ/T} + e^{−2τ/T})].
+
+For τ ≪ T the last term is K² τ/3, a rate random walk with K = s √(2/T): the walk that drives a filter's biases.
+The bias instability is B = min σ / √(2 ln 2/π), read at the curve's lowest point.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from dlkf.errors import InputError
+from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
+
+Array = NDArray[np.float64]
+FLICKER = math.sqrt(2 * math.log(2) / math.pi)  # the floor of a curve over B
+CLUSTERS = 10  # at least so many at the longest cluster time: below, the curve is chance
+PER_DECADE = 15  # cluster times
+WHITE_S = 100.0  # a log must be so long for the white noise
+RISE = 1.5  # the curve must end so far above its white part for the in-run bias to be seen
+RESOLVED = 20.0  # correlation times that a log must hold for one to be believed
+FIRST = ("noise_density", "turn_on_bias", "instability", "correlation_time", "scale_factor", "misalignment")
+STILL_RATE, STILL_FORCE = math.radians(1.0), 0.3  # rad/s, m/s²: a second's mean away from the log's median
+
+
+@dataclass(frozen=True)
+class NoiseFit:
+    """Noise of a sensor [unit: m/s² or rad/s]: ``density`` N [unit/√Hz], ``floor`` B [unit] at ``floor_s`` [s],
+    ``walk`` K [unit/√s], Gauss-Markov ``sigma`` s [unit] and ``time`` T [s], ``quantisation`` Q [unit·s].
+
+    ``rises`` tells whether the log is long enough to see the in-run bias, ``resolved`` whether T is the log's own.
+    """
+
+    density: float
+    floor: float
+    floor_s: float
+    walk: float
+    sigma: float
+    time: float
+    quantisation: float
+    rises: bool
+    resolved: bool
+
+    def curve(self, tau: Array) -> Array:
+        """The fitted Allan deviation at cluster times ``tau`` [s]."""
+        parts = np.array([self.quantisation, self.density, self.sigma]) ** 2
+        return np.sqrt(_shapes(tau, self.time) @ parts)
+
+
+def cluster_sizes(samples: int) -> NDArray[np.int64]:
+    """Numbers of samples m of the cluster times, evenly spaced on a logarithmic scale."""
+    decades = math.log10(max(samples // CLUSTERS, 1))
+    return np.unique(np.round(10 ** np.arange(0, decades + 1e-9, 1 / PER_DECADE)).astype(np.int64))
+
+
+def allan_variance(samples: Array, dt: float, sizes: Sequence[int] | NDArray[np.int64]) -> Array:
+    """Overlapping Allan variance [unit²] of samples (N,) at cluster times ``sizes`` · ``dt``."""
+    theta = np.concatenate(((0.0,), np.cumsum(samples - samples.mean()))) * dt
+    out = np.empty(len(sizes))
+    for k, m in enumerate(sizes):
+        steps = theta[2 * m :] - 2 * theta[m:-m] + theta[: -2 * m]
+        out[k] = steps @ steps / (2 * (m * dt) ** 2 * len(steps))
+    return out
+
+
+def fit_noise(tau: Array, variance: Array, duration_s: float, correlation_time: float) -> NoiseFit:
+    """The noise model whose Allan variance is nearest to a measured one, in relative terms.
+
+    Least squares over non-negative Q², N², s² for every T of a logarithmic grid; a point weighs as much as its
+    number of independent clusters. A log cannot tell correlation times above a twentieth of its length:
+    there T is ``correlation_time`` [s], and s follows, so that K is the log's all the same.
+    """
+    weight = np.sqrt(np.maximum(duration_s / tau - 1, 0.1))
+
+    def fitted(T: float) -> tuple[float, Array]:
+        shapes, scale = _shapes(tau, T), variance
+        for _ in range(3):  # relative to the fit itself: relative to the data would favour what is low by chance
+            rows = weight / scale
+            parts, rest = nnls(shapes * rows[:, None], variance * rows)
+            scale = np.maximum(shapes @ parts, 1e-3 * variance)
+        return rest, parts
+
+    grid = np.geomspace(10 * tau[0], 100 * duration_s, 60)
+    T = float(min(grid, key=lambda T: fitted(T)[0]))
+    resolved = duration_s / RESOLVED >= T
+    T = T if resolved else correlation_time
+    parts = fitted(T)[1]
+    Q, N, s = np.sqrt(parts)
+    low = int(variance.argmin())
+    rises = variance[-3:].mean() > RISE * N**2 / tau[-3:].mean()
+    return NoiseFit(
+        float(N), math.sqrt(variance[low]) / FLICKER, float(tau[low]), float(s * math.sqrt(2 / T)), float(s), T,
+        float(Q), bool(rises and s > 0), bool(resolved),
+    )  # fmt: skip
+
+
+def check_static(imu: Array, rate_hz: float, where: str) -> None:
+    """Raises InputError unless accelerometers and gyroscopes (N, 6) are those of an IMU at rest, long enough."""
+    n = max(1, round(rate_hz))
+    if len(imu) < WHITE_S * rate_hz:
+        raise InputError(
+            f"{where}: {len(imu) / rate_hz:.0f} s are too short for the noise density; give at least "
+            f"{WHITE_S:g} s at rest, and hours for the in-run bias"
+        )
+    seconds = imu[: len(imu) // n * n].reshape(-1, n, 6).mean(1)
+    off = np.abs(seconds - np.median(seconds, axis=0)).reshape(-1, 2, 3).max(-1) / (STILL_FORCE, STILL_RATE)
+    moved = np.flatnonzero((off > 1).any(-1))
+    if len(moved):
+        k = int(moved[0])
+        raise InputError(
+            f"{where}: is not static: {len(moved)} of its {len(seconds)} seconds are more than {STILL_FORCE:g} m/s² "
+            f"or {math.degrees(STILL_RATE):g} °/s off its median, the first {k} s after its start; choose a part at "
+            "rest with from_s= and to_s=, or give another log"
+        )
+
+
+def preset(name: str, triads: Sequence[NoiseFit], base: ImuSpec, source: str, *, in_run: str = "fit") -> ImuSpec:
+    """An IMU preset of the fits of accelerometers and gyroscopes.
+
+    A log at rest tells nothing of turn-on bias, scale factor and misalignment: those are ``base``'s, and with
+    ``in_run="keep"`` the in-run bias is so too. Raises InputError where the log is too short to see it.
+    """
+    sensors = []
+    for kind, fit, sensor in zip(("accelerometers", "gyroscopes"), triads, (base.accel, base.gyro)):
+        if in_run == "fit" and not fit.rises:
+            raise InputError(
+                f"the log is too short for the in-run bias of the {kind}: at its longest cluster time their Allan "
+                f"deviation still falls like white noise; give a longer log, or in_run=keep for that of imu={base.name}"
+            )
+        values = {"noise_density": _rounded(fit.density)}
+        if in_run == "fit":
+            values |= {"instability": _rounded(fit.sigma), "correlation_time": _rounded(fit.time), "random_walk": 0.0}
+        sensors.append(replace(sensor, **values))
+    return ImuSpec(name, *sensors, source=source)
+
+
+def preset_yaml(spec: ImuSpec) -> str:
+    """The text of ``imu/<name>.yaml``: what ``imu=`` takes with ``--config-dir``."""
+    lines = [f"name: {spec.name}", f"source: {json.dumps(spec.source, ensure_ascii=False)}"]
+    for key, unit, sensor in (("accel", "m/s²", spec.accel), ("gyro", "rad/s", spec.gyro)):
+        units = {"noise_density": f"{unit}/√Hz", "turn_on_bias": unit, "instability": unit, "correlation_time": "s"}
+        lines.append(f"{key}:")
+        for field in fields(SensorErrors):
+            value = getattr(sensor, field.name)
+            if field.name in FIRST or value != field.default:
+                note = f" # {units[field.name]}" if field.name in units else ""
+                lines.append(f"  {field.name}: {_number(value)}{note}")
+    return "\n".join(lines) + "\n"
+
+
+def _number(x: float) -> str:
+    text = f"{x:.6g}"
+    return text.replace("e", ".0e") if "e" in text and "." not in text else text  # YAML 1.1 takes 1e-3 for a word
+
+
+def _shapes(tau: Array, T: float) -> Array:
+    """Allan variance of Q = 1, N = 1 and a Gauss-Markov process of s = 1, (len(tau), 3)."""
+    x = tau / T
+    # the bracket is x²/3 − x³/4 + … where differences of ones would lose it
+    bracket = np.where(x < 1e-3, x * x * (1 / 3 - x / 4), 1 - (3 - 4 * np.exp(-x) + np.exp(-2 * x)) / (2 * x))
+    return np.stack((3 / tau**2, 1 / tau, 2 / x * bracket), -1)
+
+
+def _rounded(x: float) -> float:
+    return float(f"{x:.4g}")
