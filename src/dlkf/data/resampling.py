@@ -47,11 +47,7 @@ def epoch_grid(t_imu: np.ndarray, t_fix: np.ndarray, rate_hz: float, epoch_s: fl
 
     Raises InputError if an epoch is no whole number of samples, or the drive is shorter than an epoch.
     """
-    samples = round(rate_hz * epoch_s)
-    if samples < 1 or abs(samples - rate_hz * epoch_s) > 1e-6:
-        raise InputError(
-            f"rate_hz={rate_hz:g}, epoch_s={epoch_s:g}: an epoch must hold a whole number of samples"
-        )
+    samples = samples_per_epoch(rate_hz, epoch_s)
     step = float(np.median(np.diff(t_imu)))
     first, last = t_imu[0] - step, t_imu[-1]  # the first sample covers the interval before its stamp
     slack = 0.5 * min(step, epoch_s / samples)
@@ -63,6 +59,16 @@ def epoch_grid(t_imu: np.ndarray, t_fix: np.ndarray, rate_hz: float, epoch_s: fl
             f"drive {drive}: only {last - first:.2f} s of IMU, shorter than an epoch of {epoch_s:g} s"
         )
     return Grid(float(t0), epoch_s, epochs, samples)
+
+
+def samples_per_epoch(rate_hz: float, epoch_s: float) -> int:
+    """Samples in an epoch; InputError if that is no whole number."""
+    samples = round(rate_hz * epoch_s)
+    if samples < 1 or abs(samples - rate_hz * epoch_s) > 1e-6:
+        raise InputError(
+            f"rate_hz={rate_hz:g}, epoch_s={epoch_s:g}: an epoch must hold a whole number of samples"
+        )
+    return samples
 
 
 def fix_phase(t: np.ndarray, epoch_s: float) -> float:
@@ -86,18 +92,19 @@ def fix_phase(t: np.ndarray, epoch_s: float) -> float:
     return float(centre + np.median(around[np.abs(around - best) <= ON_BOUNDARY_S]))
 
 
-def resample_imu(imu: Columns, grid: Grid) -> np.ndarray:
+def resample_imu(imu: Columns, grid: Grid, usual: float | None = None) -> np.ndarray:
     """Mean specific force and rate (N, M, 6) over the grid's samples.
 
     A sample is the mean over the interval that ends at its stamp, so the cumulative integral is known at the
     stamps and linear between them; its difference between the grid's times is exact for whole ratios and
-    unbiased for any other. Where stamps are missing (an interval over 1.5 medians), the mean of the two
-    neighbours fills the missing part.
+    unbiased for any other. Where stamps are missing (an interval over 1.5 ``usual`` ones [s], by default their
+    median), the mean of the two neighbours fills the missing part.
     """
     t = imu["t"]
     values = np.stack([imu[c] for c in (*ACCEL, *GYRO)], -1)
-    step = np.diff(t, prepend=t[0] - np.median(np.diff(t)))
-    usual = float(np.median(step))
+    if usual is None:
+        usual = float(np.median(np.diff(t)))
+    step = np.diff(t, prepend=t[0] - usual)
     missing = np.where(step > 1.5 * usual, step - usual, 0.0)
     before = np.concatenate((values[:1], values[:-1]))
     increments = values * (step - missing)[:, None] + 0.5 * (values + before) * missing[:, None]
@@ -125,40 +132,49 @@ class Fixes:
     quality: np.ndarray
 
 
+# what a boundary without a fix holds
+BLANK = {"r_e": np.nan, "v_e": np.nan, "std": np.nan, "valid": False, "lag": 0.0, "quality": 0}
+
+
 def assign_fixes(gnss: Columns, grid: Grid) -> Fixes:
     """Each fix to the first boundary at or after it; the latest in an epoch wins.
 
     Unknown stds take the defaults of ``DEFAULT_STD``; components that are NaN are not valid.
     """
     rows = grid.epochs + 1
-    usable = np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite(
-        np.stack([gnss[c] for c in POSITION])
-    ).all(0)
-    place = np.ceil((gnss["t"] - grid.t0 - ON_BOUNDARY_S) / grid.epoch_s).astype(np.int64)
-    inside = np.flatnonzero(usable & (place >= 0) & (place < rows))
+    place = boundary_after(gnss["t"], grid)
+    inside = np.flatnonzero(usable_fixes(gnss) & (place >= 0) & (place < rows))
     chosen = np.full(rows, -1)
     chosen[place[inside]] = inside  # rows are in order of time: the last assignment stays
     at = np.flatnonzero(chosen >= 0)
-    src = chosen[at]
-    r_e, v_e, C_en = _ecef(gnss, src)
-    quality = np.zeros(rows, np.int64)
-    quality[at] = gnss["quality"][src]
-    default = np.array([_default_std(int(q)) for q in gnss["quality"][src]]).reshape(-1, 6)
-    std = np.stack([gnss[c][src] for c in STD], -1)
+    found = fixes_at(gnss, chosen[at], grid.boundaries[at])
+    return Fixes(*(_spread(getattr(found, name), at, rows, blank) for name, blank in BLANK.items()))
+
+
+def usable_fixes(gnss: Columns) -> np.ndarray:
+    """Rows whose quality is that of a satellite fix and whose position is finite."""
+    position = np.stack([gnss[c] for c in POSITION])
+    return np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite(position).all(0)
+
+
+def boundary_after(t: np.ndarray, grid: Grid) -> np.ndarray:
+    """Number of the first boundary at or after times [s]; it may lie outside the grid."""
+    return np.ceil((t - grid.t0 - ON_BOUNDARY_S) / grid.epoch_s).astype(np.int64)
+
+
+def fixes_at(gnss: Columns, rows: np.ndarray, boundaries: np.ndarray) -> Fixes:
+    """Some rows of a GNSS table as fixes of the boundaries [s] given for them."""
+    r_e, v_e, C_en = _ecef(gnss, rows)
+    quality = gnss["quality"][rows].astype(np.int64)
+    default = np.array([_default_std(int(q)) for q in quality]).reshape(-1, 6)
+    std = np.stack([gnss[c][rows] for c in STD], -1)
     std = np.maximum(np.where(np.isnan(std), default, std), SMALLEST_STD)
-    v_ned = np.stack([gnss[c][src] for c in VELOCITY], -1)
+    v_ned = np.stack([gnss[c][rows] for c in VELOCITY], -1)
     known = np.isfinite(v_ned)
     v_e = (C_en @ np.where(known, v_ned, 0.0)[..., None])[..., 0]
-    lag = np.clip(grid.boundaries[at] - gnss["t"][src], 0.0, None)
+    lag = np.clip(boundaries - gnss["t"][rows], 0.0, None)
     lag[lag <= ON_BOUNDARY_S] = 0.0
-    return Fixes(
-        r_e=_spread(r_e, at, rows, np.nan),
-        v_e=_spread(v_e, at, rows, np.nan),
-        std=_spread(std, at, rows, np.nan),
-        valid=_spread(np.concatenate((np.ones_like(known), known), -1), at, rows, False),
-        lag=_spread(lag, at, rows, 0.0),
-        quality=quality,
-    )
+    return Fixes(r_e, v_e, std, np.concatenate((np.ones_like(known), known), -1), lag, quality)
 
 
 @dataclass(frozen=True)
