@@ -49,7 +49,19 @@ def solution_table(
     std: Float[Tensor, "T 15"] | None,
     used: Bool[Tensor, " T"],
 ) -> pd.DataFrame:
-    """Rows of ``solution.parquet`` from one drive's states (T, …) in its tangent frame (one element).
+    """Rows of ``solution.parquet`` from one drive's states (T, …) in its tangent frame (one element)."""
+    columns = solution_columns(t, frame, state, imu_error, std)
+    return pd.DataFrame({k: v.numpy() for k, v in columns.items()} | {"gnss_used": used.cpu().numpy()})
+
+
+def solution_columns(
+    t: Float[Tensor, " T"],
+    frame: TangentFrame,
+    state: NavState,
+    imu_error: Float[Tensor, "T 6"],
+    std: Float[Tensor, "T 15"] | None,
+) -> dict[str, Float[Tensor, " T"]]:
+    """The columns of ``solution.parquet`` without ``gnss_used``, float64.
 
     C_lb = C_elᵀ C_en C_nb with C_el at the estimated position. The 1σ of vectors turn with the axes as
     uncorrelated errors do, σ'² = (C∘C) σ²; those of roll, pitch and yaw follow by (J⁻¹∘J⁻¹) σ² from
@@ -66,7 +78,7 @@ def solution_table(
     columns |= dict(zip(_RPY, rpy.unbind(-1)))
     columns |= dict(zip(IMU_COLUMNS, imu_error.detach().cpu().double().unbind(-1)))
     columns |= dict(zip(STD_COLUMNS, _std_columns(std, C_ln, rpy).unbind(-1)))
-    return pd.DataFrame({k: v.numpy() for k, v in columns.items()} | {"gnss_used": used.cpu().numpy()})
+    return columns
 
 
 def _std_columns(std: Tensor | None, C_ln: Tensor, rpy: Tensor) -> Tensor:
