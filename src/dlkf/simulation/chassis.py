@@ -171,7 +171,8 @@ def rough_road(rng: np.random.Generator, roughness: float, distance: Array) -> A
     the height does not wander off. Front and rear wheels run over the same profile; left and right differ
     by a profile of their own, below 10 m wavelength.
     """
-    count = int((distance[-1] + 2 * WHEELBASE) / PROFILE_STEP) + 3
+    distance = distance - distance.min()
+    count = int((distance.max() + 2 * WHEELBASE) / PROFILE_STEP) + 3
     steepness = math.sqrt((0.2 * math.pi) ** 2 * roughness / (2 * PROFILE_STEP))
     white = steepness * PROFILE_STEP * rng.standard_normal((2, count))
     along, across = (

@@ -25,10 +25,11 @@ KMH = 1 / 3.6
 class Manoeuvres:
     """What a driver does how often, and for how long (R084); each pair is the range of a uniform draw.
 
-    ``stretch``, ``turn``, ``stop``, ``eight``, ``lane_change`` are shares of the manoeuvres and sum to 1.
+    ``stretch``, ``turn``, ``stop``, ``eight``, ``lane_change``, ``reverse`` are shares of the manoeuvres and sum to 1.
     A stretch goes to a speed of at least ``slowest`` of the top speed and holds it for ``stretch_s``; a turn
     of ``turn_deg`` is followed by ``after_turn_s`` straight on, a lane change of ``lane_deg`` there and back
-    by a stretch's time; a stop lasts ``stop_s``. A figure-eight is a full circle each way.
+    by a stretch's time; a stop lasts ``stop_s``. A figure-eight is a full circle each way. Reversing is a stop,
+    a turn backwards, and another stop.
     """
 
     stretch: float = 0.35
@@ -36,6 +37,7 @@ class Manoeuvres:
     stop: float = 0.10
     eight: float = 0.05
     lane_change: float = 0.0
+    reverse: float = 0.0
     slowest: float = 0.25
     stretch_s: tuple[float, float] = (2.0, 20.0)
     turn_deg: tuple[float, float] = (20.0, 120.0)
@@ -46,8 +48,8 @@ class Manoeuvres:
     def __post_init__(self) -> None:
         if min(self.shares) < 0 or abs(sum(self.shares) - 1) > 1e-9:
             raise InputError(
-                f"manoeuvres: stretch, turn, stop, eight and lane_change sum to {sum(self.shares):g}, must be "
-                f"shares that sum to 1"
+                f"manoeuvres: stretch, turn, stop, eight, lane_change and reverse sum to {sum(self.shares):g}, "
+                f"must be shares that sum to 1"
             )
         if self.shares[0] == 0:
             raise InputError("manoeuvres: stretch is 0, must be positive, or a standing car would never set off")
@@ -60,7 +62,7 @@ class Manoeuvres:
 
     @property
     def shares(self) -> tuple[float, ...]:
-        return self.stretch, self.turn, self.stop, self.eight, self.lane_change
+        return self.stretch, self.turn, self.stop, self.eight, self.lane_change, self.reverse
 
 
 @dataclass(frozen=True)
@@ -181,7 +183,7 @@ def random_plan(rng: np.random.Generator, config: VehicleConfig, duration: float
 
     add(rng.uniform(2.0, 8.0))
     while clock < duration:
-        kind = rng.choice(5, p=habits.shares)
+        kind = rng.choice(6, p=habits.shares)
         side = rng.choice((-1.0, 1.0))
         if kind == 0:
             reach(rng.uniform(habits.slowest, 1.0) * top)
@@ -206,6 +208,14 @@ def random_plan(rng: np.random.Generator, config: VehicleConfig, duration: float
             turn(angle, radius, lateral)
             turn(-angle, radius, lateral)
             add(rng.uniform(*habits.stretch_s))
+        elif kind == 5:
+            reach(0.0)
+            add(rng.uniform(1.0, 3.0))
+            radius, lateral = config.min_radius, config.min_lateral
+            reach(-math.sqrt(lateral * radius))
+            turn(side * math.radians(rng.uniform(*habits.turn_deg)), radius, lateral)
+            reach(0.0)
+            add(rng.uniform(1.0, 3.0))
     length, ramp, faster, turned = np.array(rows).T
     speed_at = np.cumsum(faster) - faster
     speed_at[np.abs(speed_at) < 1e-9] = 0.0  # a standstill is exactly still

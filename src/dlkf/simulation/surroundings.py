@@ -62,7 +62,8 @@ class Surroundings:
 
 
 def sky_along(rng: np.random.Generator, surroundings: Surroundings, distance: Array) -> Sky:
-    """The sky at distances (N,) [m, not falling] along a road with random surroundings."""
+    """The sky at distances (N,) [m] along a road with random surroundings; what lies before its start is its start."""
+    distance = np.maximum(distance, 0.0)
     left_rng, right_rng, tunnel_rng = rng.spawn(3)
     return Sky(
         _mask(left_rng, surroundings, distance),
@@ -75,7 +76,7 @@ def _mask(rng: np.random.Generator, surroundings: Surroundings, distance: Array)
     """Elevation of the house fronts on one side, atan(height / distance to the face) [rad]."""
     if surroundings.building_height == 0:
         return np.zeros_like(distance)
-    fronts = distance[-1] / surroundings.front_length
+    fronts = distance.max() / surroundings.front_length
     count = 2 + int(fronts + 10 * fronts**0.5)  # ten sigma more than it takes
     ends = np.cumsum(surroundings.front_length * rng.standard_exponential(count))
     height = surroundings.building_height * np.exp(0.4 * rng.standard_normal(count))
@@ -90,6 +91,6 @@ def _covered(rng: np.random.Generator, surroundings: Surroundings, distance: Arr
     if surroundings.tunnel_length == 0:
         return np.zeros(distance.shape, dtype=bool)
     mean = np.array((surroundings.tunnel_spacing, surroundings.tunnel_length))
-    count = 1 + int(2 * distance[-1] / mean.sum())
+    count = 1 + int(2 * distance.max() / mean.sum())
     ends = np.cumsum(mean * rng.uniform(0.5, 1.5, (count, 2)))
     return np.searchsorted(ends, distance, side="right") % 2 == 1
