@@ -6,6 +6,7 @@ import pytest
 import torch
 from scipy.linalg import expm
 
+from dlkf.navigation import compiled
 from dlkf.navigation.attitude import rotation_from_rpy, skew
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.error_model import PLAIN, antenna, measurement_matrix, window_model
@@ -135,3 +136,14 @@ def test_zero_lever_arm_is_the_paper_s_h():
     predicted, H = (f(state, zero + 0.3, zero, frame) for f in (antenna, measurement_matrix))
     assert torch.equal(H[0, :, :6], torch.eye(6, dtype=torch.float64)) and not H[0, :, 6:].any()
     assert torch.equal(predicted, torch.cat((state.p_n, state.v_n), -1))
+
+
+@pytest.mark.parametrize("matrix", ["none", "scale", "full"])
+def test_compiled_columns_are_the_tensor_form_s(matrix):
+    state, imu, frame = scene(8)
+    model = model_of(frame, ErrorStates(matrix))
+    window = strapdown(state, imu, DT, frame)
+    expected = model.transition(state, window, imu, frame)
+    with torch.no_grad():
+        assert compiled.fits(imu)
+        assert torch.allclose(model.transition(state, window, imu, frame), expected, rtol=1e-12, atol=1e-12)

@@ -7,6 +7,7 @@ import pytest
 import torch
 from pyins.strapdown import Integrator
 
+from dlkf.navigation import compiled
 from dlkf.navigation.attitude import rotation_from_rpy, rotation_from_vector, vector_from_rotation
 from dlkf.navigation.earth import EARTH_RATE
 from dlkf.navigation.state import NavState
@@ -174,3 +175,21 @@ def test_python_ins_agrees_on_a_minute_of_driving():
     offset = pymap3d.geodetic2ned(theirs["lat"], theirs["lon"], theirs["alt"], lat2, lon2, height2)
     # their gravity drops part of the height term and their in-sample force is not turned: 2 cm over 1 km
     assert np.linalg.norm(offset) < 0.05
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_compiled_form_is_the_tensor_form(dtype):
+    """Without gradients on a CPU the samples are summed by a compiled loop: the same to rounding."""
+    frame = frame_at(batch=3, dtype=dtype)
+    g = torch.Generator().manual_seed(8)
+    p, v, a = (s * torch.randn(3, 3, generator=g, dtype=torch.float64) for s in (300.0, 20.0, 1.0))
+    start = NavState(*(x.to(dtype) for x in (p, v, rotation_from_rpy(a))))
+    imu = lively_imu(3, 100, 9).to(dtype)
+    imu[1, :, 3:] = 0.0  # no turn at all
+    expected = strapdown(start, imu, 0.01, frame)
+    with torch.no_grad():
+        assert compiled.fits(imu)
+        got = strapdown(start, imu, 0.01, frame)
+    eps = torch.finfo(dtype).eps
+    for one, other in zip((*got[:3], *got.end), (*expected[:3], *expected.end)):
+        assert (one - other).abs().max() < 50 * eps * other.abs().max()

@@ -62,7 +62,7 @@ class Constraints:
         std = zn.new_tensor([t.lateral_std, t.vertical_std] + [t.rest_velocity_std] * 3 + [t.rest_rate_std] * 3)
         resting = resting.unsqueeze(-1)
         used = torch.cat(((moving.unsqueeze(-1) & ~resting).expand(-1, 2), resting.expand(-1, 6)), -1)
-        z = torch.where(used, torch.cat((zn, zr), -1), 0.0)
+        z = torch.cat((zn, zr), -1) * used
         return Measurement(z, torch.cat((Hn, Hr), 1), (std * std).expand_as(z), used), quietest
 
     def _across(

@@ -44,7 +44,7 @@ class Epoch(NamedTuple):
     rate_b: Tensor  # (B, 3) corrected angular rate there
     z: Tensor  # (B, 6) GNSS − prediction, zero where not used
     fix: Fix
-    lever_arm_b: Tensor  # (B, 3)
+    lever_arm_b: Tensor | None  # (B, 3); None: the antenna is at the IMU
     dt: float
     frame: TangentFrame
 
@@ -135,7 +135,7 @@ def advance(
     *,
     dt: float,
     frame: TangentFrame,
-    lever_arm_b: Tensor,
+    lever_arm_b: Tensor | None,
 ) -> tuple[Any, Step]:
     """One epoch: strapdown over its samples (B, M, 6), innovation, the estimator's answer, feedback."""
     corrected = error.corrected(imu)
@@ -145,7 +145,7 @@ def advance(
     at_fix = prior if fix.lag is None else window.before(fix.lag, dt)
     rate_b = corrected[:, -tail:, 3:].mean(1)
     predicted = antenna(at_fix, rate_b, lever_arm_b, frame)
-    z = torch.where(fix.used, fix.value - predicted, 0.0)
+    z = (fix.value - predicted) * fix.used
     epoch = Epoch(imu, corrected, error, state, window, at_fix, rate_b, z, fix, lever_arm_b, dt, frame)
     memory, answer = estimator.step(memory, epoch)
     after = answer.imu_error if isinstance(answer.imu_error, ImuError) else ImuError(answer.imu_error)
@@ -160,12 +160,13 @@ def integrate(batch: Batch, estimator: Estimator, *, keep_covariances: bool = Fa
     error = ImuError(imu_error)
     usable = batch.gnss_valid & batch.available.unsqueeze(-1)
     late = bool(batch.gnss_lag.any())
+    lever_arm_b = batch.lever_arm_b if bool(batch.lever_arm_b.any()) else None
     steps: list[Step] = []
     for t in range(batch.size[1]):
         fix = Fix(batch.gnss[:, t], batch.gnss_std[:, t], usable[:, t], batch.gnss_lag[:, t] if late else None)
         memory, step = advance(
             estimator, memory, state, error, batch.imu[:, t], fix,
-            dt=batch.dt, frame=batch.frame, lever_arm_b=batch.lever_arm_b,
+            dt=batch.dt, frame=batch.frame, lever_arm_b=lever_arm_b,
         )  # fmt: skip
         if not keep_covariances:
             step = step._replace(answer=step.answer._replace(covariances=None))

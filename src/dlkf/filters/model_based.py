@@ -40,6 +40,7 @@ class Memory(NamedTuple):
 
     P: Tensor  # (B, n, n)
     windows: WindowModel
+    fix_scale: Tensor  # (2, 6) factor and floor of the fixes' stds
     structure: Tensor | None = None  # (B, 4) of the car
     quietest: Tensor | None = None  # (B, 2) spread of the samples
     gate: GateMemory | None = None
@@ -99,7 +100,11 @@ class Mbkf:
             walk=torch.tensor(STRUCTURE_WALK_STD) ** 2,
         )  # fmt: skip
         gate = Gate(self.tuning.gate).begin(batch.imu) if self.gated else None
-        memory = Memory(torch.diag_embed(sigma**2), windows, structure, quietest, gate)
+        t = self.tuning
+        scale = [t.position_std] * 3 + [t.velocity_std] * 3, [t.position_floor] * 3 + [t.velocity_floor] * 3
+        memory = Memory(
+            torch.diag_embed(sigma**2), windows, torch.tensor(scale, **like), structure, quietest, gate
+        )
         return memory, torch.tensor(self.prior_mean, **like).repeat(B, 1)
 
     def psd(self) -> dict[str, float]:
@@ -129,7 +134,7 @@ class Mbkf:
             fix = fix._replace(used=passed)
             accepted = passed.any(-1)
             H, R = masked(fix.H, fix.R, passed)
-        z, quietest = torch.where(fix.used, fix.z, 0.0), memory.quietest
+        z, quietest = fix.z * fix.used, memory.quietest
         informative = bool(fix.used.any())
         if self.constrained:
             rules, quietest = Constraints(self.tuning, self.states).rows(epoch, memory.structure, quietest, P)
@@ -150,7 +155,8 @@ class Mbkf:
         if structure is not None:
             structure = structure + dx[:, self.states.of_structure]
         std = P.diagonal(dim1=-2, dim2=-1)[:, :STATES].clamp_min(0).sqrt()
-        return Memory(P, memory.windows, structure, quietest, gate, noise), Correction(
+        memory = Memory(P, memory.windows, memory.fix_scale, structure, quietest, gate, noise)
+        return memory, Correction(
             dx[:, PVA], epoch.error.updated(dx, self.states), std=std, gain=K[:, PVA, :6], accepted=accepted,
             covariances=Covariances(Phi, prior, P, *offered, dx),
         )  # fmt: skip
@@ -168,11 +174,10 @@ class Mbkf:
         """GNSS position and velocity as rows of an update."""
         H = measurement_matrix(epoch.at_fix, epoch.rate_b, epoch.lever_arm_b, epoch.frame, self.states.count)
         if epoch.fix.lag is not None:  # δp at the fix = δp at the window's end − lag · δv
+            H = H.clone()
             H[:, 0, 3] = H[:, 1, 4] = H[:, 2, 5] = -epoch.fix.lag
-        t, std = self.tuning, epoch.fix.std
-        scale = std.new_tensor([t.position_std] * 3 + [t.velocity_std] * 3)
-        floor = std.new_tensor([t.position_floor] * 3 + [t.velocity_floor] * 3)
-        R = (scale * std).clamp_min(floor) ** 2
+        scale, floor = memory.fix_scale
+        R = torch.maximum(scale * epoch.fix.std, floor).square()
         if memory.noise is not None:
             R = torch.where(memory.noise.known, memory.noise.R, R)
         return Measurement(epoch.z, H, R, epoch.used)
@@ -182,8 +187,9 @@ def kalman_update(
     P: Float[Tensor, "B n n"], H: Float[Tensor, "B m n"], R: Float[Tensor, "B m"]
 ) -> tuple[Float[Tensor, "B n m"], Float[Tensor, "B n n"]]:
     """Gain K = P Hᵀ (H P Hᵀ + R)⁻¹ and Joseph-form covariance for diagonal R (paper eqs 4, 6)."""
-    PHt = P @ H.mT
-    S = H @ PHt + torch.diag_embed(R)
-    K = torch.cholesky_solve(PHt.mT, torch.linalg.cholesky(S)).mT
-    A = torch.eye(P.shape[-1], dtype=P.dtype, device=P.device) - K @ H
-    return K, A @ P @ A.mT + (K * R.unsqueeze(-2)) @ K.mT
+    HP = H @ P
+    S = torch.baddbmm(torch.diag_embed(R), HP, H.mT)
+    K = torch.cholesky_solve(HP, torch.linalg.cholesky_ex(S)[0]).mT
+    A = K @ H
+    A = torch.eye(P.shape[-1], dtype=P.dtype, device=P.device) - A
+    return K, torch.baddbmm((K * R.unsqueeze(-2)) @ K.mT, A @ P, A.mT)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -9,25 +11,55 @@ from torch import Tensor
 _TINY = 1e-30  # keeps sin(x)/x finite at zero; its root vanishes against 1 in any precision
 
 
+@lru_cache
+@torch.inference_mode(False)
+def _skew_map(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(3, 9): u ↦ [u×] row by row."""
+    levi_civita = torch.zeros(3, 3, 3, dtype=dtype, device=device)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        levi_civita[j, i, k], levi_civita[j, k, i] = 1, -1
+    return levi_civita.flatten(1)
+
+
+@lru_cache
+@torch.inference_mode(False)
+def _quaternion_maps(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """(16, 4): q ↦ the matrix of multiplication by q from the left; (9, 16): q qᵀ ↦ rotation matrix, by rows."""
+    like = {"dtype": dtype, "device": device}
+    w, x, y, z = torch.eye(4, **like)
+    left = torch.stack((w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w))
+    rotation = torch.zeros(9, 4, 4, **like)
+    signs = ((1, 1, -1, -1), (1, -1, 1, -1), (1, -1, -1, 1))
+    for i, row in enumerate(signs):
+        rotation[4 * i] = torch.diag(torch.tensor(row, **like))
+    for i, j, k, sign in ((0, 1, 2, -1), (1, 0, 2, 1), (0, 2, 1, 1), (2, 0, 1, -1), (1, 2, 0, -1), (2, 1, 0, 1)):
+        rotation[3 * i + j, 1 + i, 1 + j] = 2
+        rotation[3 * i + j, 0, 1 + k] = 2 * sign
+    return left, rotation.flatten(1)
+
+
 def skew(u: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """Cross-product matrix [u×]: skew(u) @ a = u × a."""
-    x, y, z = u.unbind(-1)
-    o = torch.zeros_like(x)
-    return torch.stack((o, -z, y, z, o, -x, -y, x, o), -1).unflatten(-1, (3, 3))
+    return (u @ _skew_map(u.dtype, u.device)).unflatten(-1, (3, 3))
 
 
 def rotation_from_vector(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """exp([φ×]) by Rodrigues' formula; φ [rad]. Smooth at zero (series below 0.1 rad)."""
-    x = (phi * phi).sum(-1)
-    small = x < 1e-2
-    safe = torch.where(small, torch.ones_like(x), x)
-    angle = torch.sqrt(safe)
-    a = torch.where(small, 1 - x / 6 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72))), torch.sin(angle) / angle)
-    half = torch.sin(angle / 2) / angle
-    b = torch.where(small, (1 - x / 12 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90)))) / 2, 2 * half * half)
-    K = skew(phi)
-    eye = torch.eye(3, dtype=phi.dtype, device=phi.device)
-    return eye + a[..., None, None] * K + b[..., None, None] * (K @ K)
+    """exp([φ×]) through the quaternion of φ [rad]; smooth at zero."""
+    planes = phi.reshape(-1, 3).mT
+    return _rotation_planes(_quaternion_planes(planes)).movedim(-1, 0).reshape(*phi.shape, 3)
+
+
+def _quaternion_planes(phi: Tensor) -> Tensor:
+    """Quaternions (4, …), scalar first, of rotation vectors (3, …)."""
+    half = torch.sqrt(0.25 * (phi * phi).sum(0, keepdim=True) + _TINY)
+    return torch.cat((torch.cos(half), (0.5 * torch.sin(half) / half) * phi))
+
+
+def _rotation_planes(q: Tensor) -> Tensor:
+    """Rotation matrices (3, 3, …) of unit quaternions (4, …)."""
+    rotation = _quaternion_maps(q.dtype, q.device)[1]
+    pairs = (q.unsqueeze(0) * q.unsqueeze(1)).reshape(16, -1)
+    return (rotation @ pairs).reshape(3, 3, *q.shape[1:])
 
 
 def vector_from_rotation(C: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
@@ -86,33 +118,21 @@ def rpy_from_rotation(C: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 
 def orthonormalised(C: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
     """One Newton step towards the nearest rotation, C(3I − CᵀC)/2: enough for rounding errors."""
-    eye = torch.eye(3, dtype=C.dtype, device=C.device)
-    return 0.5 * C @ (3 * eye - C.mT @ C)
+    return 1.5 * C - 0.5 * (C @ (C.mT @ C))
 
 
 def prefix_rotations(phi: Float[Tensor, "3 b m"]) -> Float[Tensor, "3 3 b m"]:
     """All prefix products exp([φ₁×]) … exp([φ_k×]), k = 1…m, in log₂(m) doubling steps, no Python loop over m.
 
-    Axes come first, so that every operation runs over contiguous planes. A rotation is carried as the
-    Cayley-Klein pair (α, β) = (w + i z, y − i x) of its quaternion: two complex numbers multiply in a third
-    of the tensor operations that a quaternion needs.
+    Axes come first, so that every operation runs over contiguous planes; rotations are quaternions, multiplied by
+    the matrix of left multiplication, in six tensor operations a step.
     """
-    half = torch.sqrt(0.25 * (phi * phi).sum(0) + _TINY)
-    u = (0.5 * torch.sin(half) / half) * phi
-    a, b = torch.complex(torch.cos(half), u[2]), torch.complex(u[1], -u[0])
+    q = _quaternion_planes(phi)
+    left = _quaternion_maps(q.dtype, q.device)[0]
     step = 1
-    while step < a.shape[1]:
-        a0, b0, a1, b1 = a[:, :-step], b[:, :-step], a[:, step:], b[:, step:]
-        a = torch.cat((a[:, :step], a0 * a1 - b0 * b1.conj()), 1)
-        b = torch.cat((b[:, :step], a0 * b1 + b0 * a1.conj()), 1)
+    while step < q.shape[2]:
+        earlier = q[..., :-step]
+        matrix = (left @ earlier.reshape(4, -1)).reshape(4, 4, *earlier.shape[1:])
+        q = torch.cat((q[..., :step], (matrix * q[..., step:]).sum(1)), -1)
         step *= 2
-    w, x, y, z = a.real, -b.imag, b.real, a.imag
-    xx, yy, zz = x * x, y * y, z * z
-    xy, xz, yz, wx, wy, wz = x * y, x * z, y * z, w * x, w * y, w * z
-    return torch.stack(
-        (
-            1 - 2 * (yy + zz), 2 * (xy - wz), 2 * (xz + wy),
-            2 * (xy + wz), 1 - 2 * (xx + zz), 2 * (yz - wx),
-            2 * (xz - wy), 2 * (yz + wx), 1 - 2 * (xx + yy),
-        ),
-    ).unflatten(0, (3, 3))  # fmt: skip
+    return _rotation_planes(q)

@@ -7,6 +7,7 @@ ch. 2 (equation numbers below); working frame: checklist 2.3.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -99,16 +100,37 @@ class TangentFrame:
         with k of the origin that is (0, 0, −(R_E+h)) + p + (k−1) a (a·p) in n, a the Earth's axis, which
         float32 carries without cancellation. Error below 1e-6 m/s² within 100 km of the origin.
         """
-        along_axis = (p_n * self.axis_n).sum(-1, keepdim=True)
-        normal = p_n + (self.stretch - 1).unsqueeze(-1) * along_axis * self.axis_n
-        normal = torch.cat((normal[..., :2], normal[..., 2:] - self.radius.unsqueeze(-1)), -1)
-        up = normal / normal.norm(dim=-1, keepdim=True)
-        height = self.height - p_n[..., 2] + (p_n[..., 0] ** 2 + p_n[..., 1] ** 2) / (2 * self.radius)
-        sin_lat = (up * self.axis_n).sum(-1)
-        return -normal_gravity(sin_lat, height).unsqueeze(-1) * up
+        stretching, centre, factor, slope = self._normal
+        normal = torch.baddbmm(centre, stretching, p_n.unsqueeze(-1)).squeeze(-1)
+        level = p_n[..., :2]
+        height = torch.addcmul(self.height - p_n[..., 2], (level * level).sum(-1), factor)
+        inverse = torch.linalg.vector_norm(normal, dim=-1).reciprocal()
+        s2 = ((normal * self.axis_n).sum(-1) * inverse).square()
+        surface = torch.add(GRAVITY_EQUATOR, s2, alpha=GRAVITY_EQUATOR * SOMIGLIANA) * torch.rsqrt(
+            torch.add(1.0, s2, alpha=-ECCENTRICITY_SQ)
+        )
+        shrink = torch.addcmul(torch.ones_like(height), height, 3 / SEMI_MAJOR**2 * height - slope)
+        return normal * (-surface * shrink * inverse).unsqueeze(-1)
+
+    @cached_property
+    @torch.inference_mode(False)
+    def _normal(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """I + (k−1) a aᵀ, the centre of curvature (0, 0, −(R_E+h)), 1/(2 (R_E+h)), and dg/dh over −g."""
+        a = self.axis_n
+        eye = torch.eye(3, dtype=a.dtype, device=a.device)
+        stretching = eye + (self.stretch - 1)[..., None, None] * a.unsqueeze(-1) * a.unsqueeze(-2)
+        centre = torch.zeros_like(a)
+        centre[..., 2] = -self.radius
+        slope = 2 / SEMI_MAJOR * (1 + FLATTENING * (1 - 2 * a[..., 2] ** 2) + _M)
+        return stretching, centre.unsqueeze(-1), 0.5 / self.radius, slope
 
     def gravity_gradient(self) -> Float[Tensor, "b 3"]:
         """Diagonal of ∂g/∂p in n [s⁻²]: (−g/R, −g/R, 2g/R), the Schuler and vertical-channel terms."""
+        return self._gradient
+
+    @cached_property
+    @torch.inference_mode(False)
+    def _gradient(self) -> Float[Tensor, "b 3"]:
         rate = normal_gravity(self.axis_n[..., 2], self.height) / self.radius
         return torch.stack((-rate, -rate, 2 * rate), -1)
 

@@ -12,11 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dlkf.navigation import compiled
 from dlkf.navigation.attitude import rotation_from_vector, skew
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, POSITION, STATES, VELOCITY, ErrorStates, NavState
@@ -57,30 +60,17 @@ class WindowModel:
 
         and once more integrated for position; Earth rotation, Coriolis and gravity gradient to first order in T.
         """
-        B, M = window.p_n.shape[:2]
-        dt, end = self.dt, window.end
-        T = M * dt
-        before = torch.cat((start.C_nb.unsqueeze(1), window.C_nb[:, :-1]), 1)
-        turned = torch.add(before, window.C_nb).mul_(0.5 * dt)  # ∫C over each sample
-        v_before = torch.cat((start.v_n.unsqueeze(1), window.v_n[:, :-1]), 1)
-        gained = window.v_n - v_before - (dt * window.gravity).unsqueeze(1)
-        force, rate = self._columns(turned, corrected)
-        swept_rate = torch.sub(rate.cumsum(1), rate, alpha=0.5)
-        lever = torch.linalg.cross(gained.unsqueeze(-1).expand_as(rate), swept_rate, dim=-2)
-        columns = torch.cat(self._in_order(-force, lever), -1)  # of the velocity gained in each sample
+        end, T = window.end, window.p_n.shape[1] * self.dt
+        columns = self._sensor_columns(start, window, corrected)
         moved = end.p_n - start.p_n
-        swept = (T / 3) * moved + (T * T / 6) * start.v_n  # ∫(p − p₀), exact for constant acceleration
-        coriolis = 2 * torch.linalg.cross(frame.earth_rate_n.unsqueeze(1), torch.stack((swept, moved), 1))
+        swept = torch.add((T / 3) * moved, start.v_n, alpha=T * T / 6)  # ∫(p − p₀), exact for constant acceleration
+        coriolis = torch.linalg.cross(frame.earth_rate_n.unsqueeze(1), torch.stack((swept, moved), 1))
         fallen = T * window.gravity
-        s = torch.stack((moved - T * (start.v_n + 0.5 * fallen), end.v_n - start.v_n - fallen), 1) + coriolis
+        left = torch.add(start.v_n, fallen, alpha=0.5)
+        s = torch.stack((torch.sub(moved, left, alpha=T), end.v_n - start.v_n - fallen), 1)
         Phi = self.still.clone()
-        Phi[:, :6, ATTITUDE] = skew(-s).flatten(1, 2)
-        n = self.states.navigation
-        Phi[:, :6, ACCEL.start : n] = (self.left @ columns.flatten(2)).reshape(B, 6, -1)
-        turned_by = -rate.sum(1)
-        Phi[:, ATTITUDE, GYRO] = turned_by[..., :3]
-        if n > STATES:
-            Phi[:, ATTITUDE, STATES + len(self.states.elements) : n] = turned_by[..., 3:]
+        Phi[:, :6, ATTITUDE] = skew(torch.add(s, coriolis, alpha=2).neg_()).flatten(1, 2)
+        Phi[:, :9, ACCEL.start : self.states.navigation] = columns
         return Phi
 
     def noise(self, Phi: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
@@ -94,6 +84,30 @@ class WindowModel:
         if self.states.structure:
             Q = Q + self.walk.diag()
         return Q
+
+    def _sensor_columns(
+        self, start: NavState, window: Window, corrected: Float[Tensor, "B M 6"]
+    ) -> Float[Tensor, "B 9 k"]:
+        """Columns of Φ of the biases and the elements of M."""
+        if compiled.fits(corrected):
+            elements = np.array(self.states.elements, dtype=np.int64).reshape(-1, 2)
+            return compiled.sensor_columns(
+                start.C_nb, start.v_n, window.C_nb, window.v_n, window.gravity, corrected, self.dt, elements
+            )
+        dt = self.dt
+        before = torch.cat((start.C_nb.unsqueeze(1), window.C_nb[:, :-1]), 1)
+        turned = torch.add(before, window.C_nb).mul_(0.5 * dt)  # ∫C over each sample
+        v_before = torch.cat((start.v_n.unsqueeze(1), window.v_n[:, :-1]), 1)
+        gained = torch.sub(window.v_n - v_before, window.gravity.unsqueeze(1), alpha=dt)
+        force, rate = self._columns(turned, corrected)
+        swept_rate = torch.sub(rate.cumsum(1), rate, alpha=0.5)
+        lever = torch.linalg.cross(gained.unsqueeze(-1).expand_as(rate), swept_rate, dim=-2)
+        columns = torch.cat(self._in_order(-force, lever), -1)  # of the velocity gained in each sample
+        PV = (self.left @ columns.flatten(2)).reshape(len(columns), 6, -1)
+        turned_by = -rate.sum(1)
+        zero = torch.zeros_like(turned_by)
+        A = torch.cat((zero[..., :3], turned_by[..., :3], zero[..., 3:], turned_by[..., 3:]), -1)
+        return torch.cat((PV, A), 1)
 
     def _columns(self, turned: Tensor, corrected: Tensor) -> tuple[Tensor, Tensor]:
         """∫C e over each sample for the accelerometers' and the gyroscopes' errors (B, M, 3, k)."""
@@ -157,12 +171,14 @@ def window_model(
 
 
 def antenna(
-    state: NavState, rate_b: Float[Tensor, "B 3"], lever_arm_b: Float[Tensor, "B 3"], frame: TangentFrame
+    state: NavState, rate_b: Float[Tensor, "B 3"], lever_arm_b: Float[Tensor, "B 3"] | None, frame: TangentFrame
 ) -> Float[Tensor, "B 6"]:
     """Position and velocity of the antenna in n (checklist 2.5).
 
-    ``rate_b`` is the corrected angular rate at the fix [rad/s], ``lever_arm_b`` IMU → antenna [m].
+    ``rate_b`` is the corrected angular rate at the fix [rad/s], ``lever_arm_b`` IMU → antenna [m], None for none.
     """
+    if lever_arm_b is None:
+        return torch.cat((state.p_n, state.v_n), -1)
     arm_n, swing_n = _arm(state, rate_b, lever_arm_b)
     velocity = state.v_n + swing_n - torch.linalg.cross(frame.earth_rate_n, arm_n)
     return torch.cat((state.p_n + arm_n, velocity), -1)
@@ -171,19 +187,25 @@ def antenna(
 def measurement_matrix(
     state: NavState,
     rate_b: Float[Tensor, "B 3"],
-    lever_arm_b: Float[Tensor, "B 3"],
+    lever_arm_b: Float[Tensor, "B 3"] | None,
     frame: TangentFrame,
     states: int = STATES,
 ) -> Float[Tensor, "B 6 n"]:
     """H of antenna position and velocity with the lever arm in it (checklist 2.5)."""
-    like = {"dtype": rate_b.dtype, "device": rate_b.device}
-    H = torch.eye(6, states, **like).repeat(len(rate_b), 1, 1)
-    if bool(lever_arm_b.any()):
+    H = _identity(states, rate_b.dtype, rate_b.device).expand(len(rate_b), 6, states)
+    if lever_arm_b is not None:
+        H = H.clone()
         arm_n, swing_n = _arm(state, rate_b, lever_arm_b)
         H[:, :3, ATTITUDE] = -skew(arm_n)
         H[:, 3:, ATTITUDE] = -skew(swing_n) + skew(frame.earth_rate_n) @ skew(arm_n)
         H[:, 3:, GYRO] = state.C_nb @ skew(lever_arm_b)
     return H
+
+
+@lru_cache
+@torch.inference_mode(False)
+def _identity(states: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    return torch.eye(6, states, dtype=dtype, device=device)
 
 
 def _arm(state: NavState, rate_b: Tensor, lever_arm_b: Tensor) -> tuple[Tensor, Tensor]:
@@ -196,4 +218,4 @@ def masked(
     H: Float[Tensor, "B m n"], R: Float[Tensor, "B m"], used: Bool[Tensor, "B m"]
 ) -> tuple[Float[Tensor, "B m n"], Float[Tensor, "B m"]]:
     """H and diagonal R in which unused components have no effect: zero row, unit variance."""
-    return H * used.unsqueeze(-1), torch.where(used, R, torch.ones_like(R))
+    return H * used.unsqueeze(-1), torch.where(used, R, 1.0)

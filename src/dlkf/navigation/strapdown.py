@@ -18,12 +18,14 @@ forward pass instead of a graph of some hundred nodes.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dlkf.navigation import compiled
 from dlkf.navigation.attitude import orthonormalised, prefix_rotations, skew
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import NavState
@@ -64,53 +66,78 @@ def strapdown(
     """
     with torch.no_grad():
         half = 0.5 * dt * imu.shape[1]
-        gravity = frame.gravity(start.p_n + half * start.v_n)
-    p, v, C, *end = _Strapdown.apply(
-        start.p_n, start.v_n, start.C_nb, imu, dt, gravity, frame.gravity_gradient(), frame.earth_rate_n
-    )
+        gravity = frame.gravity(torch.add(start.p_n, start.v_n, alpha=half))
+    if torch.is_grad_enabled():
+        p, v, C, *end = _Strapdown.apply(
+            start.p_n, start.v_n, start.C_nb, imu, dt, gravity, frame.gravity_gradient(), frame.earth_rate_n
+        )
+    elif compiled.fits(imu):
+        p, v, C = compiled.mechanised(*start, imu, dt, gravity, frame.earth_rate_n)
+        end = p[:, -1], v[:, -1], orthonormalised(C[:, -1])
+    else:
+        (p, v, C, *end), _ = _mechanised(*start, imu, dt, gravity, frame.earth_rate_n)
     return Window(p, v, C, NavState(*end), gravity)
 
 
-class _Strapdown(torch.autograd.Function):
-    """Forward and adjoint of the window; names follow the module's equations.
+@lru_cache
+@torch.inference_mode(False)
+def _times(M: int, dt: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Time since the window's start at the end of each sample."""
+    return torch.arange(1, M + 1, dtype=dtype, device=device) * dt
+
+
+def _mechanised(p0: Tensor, v0: Tensor, C0: Tensor, imu: Tensor, dt: float, g: Tensor, earth_rate: Tensor):
+    """States after every sample and at the end, and what the adjoint needs of the way there.
 
     Inside, the axes come first and the samples last: (3, B, M) vectors and (3, 3, B, M) matrices, so that
     every operation runs over contiguous planes.
     """
+    planes = imu.permute(2, 0, 1).contiguous()
+    f, phi = planes[:3], planes[3:] * dt
+    M = phi.shape[2]
+    C = C0.permute(1, 2, 0).unsqueeze(-1)  # (3, 3, B, 1)
+    p, v, g3, w = (x.mT.unsqueeze(-1) for x in (p0, v0, g, earth_rate))
+    A = _product(C, prefix_rotations(phi))  # C₀ R at each sample's end, Earth rotation left out
+    A_before = torch.cat((C, A[..., :-1]), -1)
+    # ∫ exp(s φ) ds f over the sample, once for velocity, twice for position
+    dv = f * dt
+    turn = torch.linalg.cross(phi, dv, dim=0)
+    turn2 = torch.linalg.cross(phi, turn, dim=0)
+    once = torch.add(torch.add(dv, turn, alpha=1 / 2), turn2, alpha=1 / 6)
+    twice = torch.add(torch.add(0.5 * dv, turn, alpha=1 / 6), turn2, alpha=1 / 24)
+    gained, moved = (A_before.unsqueeze(1) * torch.stack((once, twice)).unsqueeze(0)).sum(2).unbind(1)
+    S = gained.cumsum(-1)
+    moved = moved * dt
+    P = torch.add(moved, torch.sub(S, gained), alpha=dt).cumsum(-1)
+    t = _times(M, dt, phi.dtype, phi.device)
+    fallen = g3 * t
+    reach = torch.stack((v + fallen / 3, v + fallen + v + S)) * t + P  # under the Coriolis cross products
+    swing = torch.linalg.cross(w.expand_as(reach[0]).unsqueeze(0), reach, dim=1)
+    v_n = v + fallen + S - swing[1]
+    p_n = p + t * (torch.add(v, fallen, alpha=0.5) - swing[0]) + P
+    C_nb = A - t * torch.linalg.cross(w.unsqueeze(1), A, dim=0)
+    p_n, v_n, C_nb = p_n.permute(1, 2, 0), v_n.permute(1, 2, 0), C_nb.permute(2, 3, 0, 1)
+    states = p_n, v_n, C_nb, p_n[:, -1].clone(), v_n[:, -1].clone(), orthonormalised(C_nb[:, -1])
+    return states, (f, phi, A, A_before, gained, moved)
+
+
+class _Strapdown(torch.autograd.Function):
+    """Forward and adjoint of the window; names follow the module's equations."""
 
     @staticmethod
     def forward(ctx, p0, v0, C0, imu, dt, g, gradient, earth_rate):
-        planes = imu.permute(2, 0, 1).contiguous()
-        f, phi = planes[:3], planes[3:] * dt
-        M = phi.shape[2]
-        C = C0.permute(1, 2, 0).unsqueeze(-1)  # (3, 3, B, 1)
-        p, v, g3, w = (x.mT.unsqueeze(-1) for x in (p0, v0, g, earth_rate))
-        A = _product(C, prefix_rotations(phi))  # C₀ R at each sample's end, Earth rotation left out
-        A_before = torch.cat((C, A[..., :-1]), -1)
-        # mean of exp(s φ) over the sample, once for velocity, twice integrated for position
-        turn = _cross(phi, f)
-        turn2 = _cross(phi, turn)
-        gained = _rotate(A_before, f + turn / 2 + turn2 / 6) * dt  # ΔV of each sample
-        moved = _rotate(A_before, f / 2 + turn / 6 + turn2 / 24) * dt**2
-        S = gained.cumsum(-1)
-        P = (moved + dt * (S - gained)).cumsum(-1)
-        t = torch.arange(1, M + 1, dtype=phi.dtype, device=phi.device) * dt
-        fallen = g3 * t
-        v_n = v + fallen + S - _cross(w, t * (S + 2 * v + fallen) + P)
-        p_n = p + t * (v + 0.5 * fallen) + P - _cross(w, t * (P + t * (v + fallen / 3)))
-        C_nb = A - t * _cross(w.unsqueeze(1), A)
+        states, (f, phi, A, A_before, gained, moved) = _mechanised(p0, v0, C0, imu, dt, g, earth_rate)
         ctx.save_for_backward(f, phi, C0, A, A_before, gained, moved, gradient, earth_rate)
         ctx.dt = dt
         ctx.set_materialize_grads(False)
-        p_n, v_n, C_nb = p_n.permute(1, 2, 0), v_n.permute(1, 2, 0), C_nb.permute(2, 3, 0, 1)
-        return p_n, v_n, C_nb, p_n[:, -1].clone(), v_n[:, -1].clone(), orthonormalised(C_nb[:, -1])
+        return states
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, Gp, Gv, GC, gp, gv, gC):
         f, phi, C0, A, A_before, gained, moved, gradient, earth_rate = ctx.saved_tensors
         dt, M = ctx.dt, phi.shape[-1]
-        t = torch.arange(1, M + 1, dtype=phi.dtype, device=phi.device) * dt
+        t = _times(M, dt, phi.dtype, phi.device)
         w = earth_rate.mT.unsqueeze(-1)
         Gp = _with_end(Gp, gp, gained, (2, 0, 1))
         Gv = _with_end(Gv, gv, gained, (2, 0, 1))
@@ -148,10 +175,6 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).sum(0)
-
-
-def _rotate(C: Tensor, u: Tensor) -> Tensor:
-    return (C * u).sum(1)
 
 
 def _rotate_back(C: Tensor, u: Tensor) -> Tensor:

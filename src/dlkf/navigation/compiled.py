@@ -1,0 +1,137 @@
+"""The window's sums sample by sample, compiled: what a filter without gradients on a CPU spends its time in.
+
+The same equations as :mod:`dlkf.navigation.strapdown` and :mod:`dlkf.navigation.error_model` in the form in which a
+textbook writes them, for one drive as for many. Without numba, or on a GPU, the tensor forms take over.
+"""
+
+from __future__ import annotations
+
+import math
+from importlib.util import find_spec
+from typing import no_type_check
+
+import numpy as np
+import torch
+from torch import Tensor
+
+AVAILABLE = find_spec("numba") is not None
+
+
+def fits(x: Tensor) -> bool:
+    """Whether the compiled form may stand in for the tensor form: no gradient asked for, in main memory."""
+    return AVAILABLE and x.device.type == "cpu" and not torch.is_grad_enabled()
+
+
+if AVAILABLE:
+    from numba import njit
+else:
+
+    def njit(**_):
+        """Leaves the function as it is; :func:`fits` keeps it from being called."""
+        return lambda function: function
+
+
+def mechanised(
+    p0: Tensor, v0: Tensor, C0: Tensor, imu: Tensor, dt: float, g: Tensor, earth_rate: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Position (B, M, 3), velocity (B, M, 3) and attitude (B, M, 3, 3) at the end of every sample."""
+    B, M, _ = imu.shape
+    p, v, C = imu.new_empty(B, M, 3), imu.new_empty(B, M, 3), imu.new_empty(B, M, 3, 3)
+    inputs = (x.detach().numpy() for x in (p0, v0, C0, imu, g, earth_rate))
+    _mechanise(*inputs, dt, p.numpy(), v.numpy(), C.numpy())
+    return p, v, C
+
+
+def sensor_columns(
+    C0: Tensor, v0: Tensor, C: Tensor, v: Tensor, g: Tensor, samples: Tensor, dt: float, elements: np.ndarray
+) -> Tensor:
+    """Columns of Φ (B, 9, 6 + 2 e) for the biases and the ``elements`` (e, 2) of the sensor matrices."""
+    out = v.new_zeros(len(v), 9, 6 + 2 * len(elements))
+    inputs = (x.detach().numpy() for x in (C0, v0, C, v, g, samples))
+    _sensor_columns(*inputs, dt, elements, out.numpy())
+    return out
+
+
+@njit(cache=True)
+@no_type_check
+def _mechanise(p0, v0, C0, imu, g, w, dt, p, v, C):
+    B, M, _ = imu.shape
+    for b in range(B):
+        A = C0[b].copy()
+        new = np.empty_like(A)
+        S, P = np.zeros(3), np.zeros(3)
+        phi, dv = np.empty(3), np.empty(3)
+        R = np.empty((3, 3))
+        for k in range(M):
+            for i in range(3):
+                dv[i], phi[i] = imu[b, k, i] * dt, imu[b, k, 3 + i] * dt
+            x, y, z = phi
+            turn0, turn1, turn2 = y * dv[2] - z * dv[1], z * dv[0] - x * dv[2], x * dv[1] - y * dv[0]
+            again0, again1, again2 = y * turn2 - z * turn1, z * turn0 - x * turn2, x * turn1 - y * turn0
+            once0, twice0 = dv[0] + turn0 / 2 + again0 / 6, dv[0] / 2 + turn0 / 6 + again0 / 24
+            once1, twice1 = dv[1] + turn1 / 2 + again1 / 6, dv[1] / 2 + turn1 / 6 + again1 / 24
+            once2, twice2 = dv[2] + turn2 / 2 + again2 / 6, dv[2] / 2 + turn2 / 6 + again2 / 24
+            for i in range(3):
+                P[i] += (A[i, 0] * twice0 + A[i, 1] * twice1 + A[i, 2] * twice2 + S[i]) * dt
+                S[i] += A[i, 0] * once0 + A[i, 1] * once1 + A[i, 2] * once2
+            half = 0.5 * math.sqrt(x * x + y * y + z * z)
+            scale = 0.5 if half < 1e-8 else 0.5 * math.sin(half) / half
+            q0, q1, q2, q3 = math.cos(half), scale * x, scale * y, scale * z
+            R[0, 0], R[1, 1] = 1 - 2 * (q2 * q2 + q3 * q3), 1 - 2 * (q1 * q1 + q3 * q3)
+            R[2, 2] = 1 - 2 * (q1 * q1 + q2 * q2)
+            R[0, 1], R[1, 0] = 2 * (q1 * q2 - q0 * q3), 2 * (q1 * q2 + q0 * q3)
+            R[0, 2], R[2, 0] = 2 * (q1 * q3 + q0 * q2), 2 * (q1 * q3 - q0 * q2)
+            R[1, 2], R[2, 1] = 2 * (q2 * q3 - q0 * q1), 2 * (q2 * q3 + q0 * q1)
+            for i in range(3):
+                for j in range(3):
+                    new[i, j] = A[i, 0] * R[0, j] + A[i, 1] * R[1, j] + A[i, 2] * R[2, j]
+            A, new = new, A
+            t = (k + 1) * dt
+            for i in range(3):
+                i1, i2 = (i + 1) % 3, (i + 2) % 3
+                a1 = t * (S[i1] + 2 * v0[b, i1] + g[b, i1] * t) + P[i1]
+                a2 = t * (S[i2] + 2 * v0[b, i2] + g[b, i2] * t) + P[i2]
+                b1 = t * (v0[b, i1] + g[b, i1] * t / 3) + P[i1]
+                b2 = t * (v0[b, i2] + g[b, i2] * t / 3) + P[i2]
+                w1, w2 = w[b, i1], w[b, i2]
+                v[b, k, i] = v0[b, i] + g[b, i] * t + S[i] - (w1 * a2 - w2 * a1)
+                p[b, k, i] = p0[b, i] + t * (v0[b, i] + 0.5 * g[b, i] * t - (w1 * b2 - w2 * b1)) + P[i]
+                for j in range(3):
+                    C[b, k, i, j] = A[i, j] - t * (w1 * A[i2, j] - w2 * A[i1, j])
+
+
+@njit(cache=True)
+@no_type_check
+def _sensor_columns(C0, v0, C, v, g, samples, dt, elements, out):
+    B, M = v.shape[:2]
+    e = len(elements)
+    turned, swept = np.empty((3, 3)), np.zeros((3, 3 + e))
+    gained, column, lever = np.empty(3), np.empty(3), np.empty(3)
+    for b in range(B):
+        swept[:] = 0.0
+        for k in range(M):
+            left = (M - k - 0.5) * dt
+            for i in range(3):
+                gained[i] = v[b, k, i] - (v[b, k - 1, i] if k else v0[b, i]) - g[b, i] * dt
+                for j in range(3):
+                    turned[i, j] = 0.5 * dt * ((C[b, k - 1, i, j] if k else C0[b, i, j]) + C[b, k, i, j])
+            for n in range(3 + e):
+                if n < 3:
+                    c, f, w = n, 1.0, 1.0
+                    to_f, to_w = n, 3 + n
+                else:
+                    c = elements[n - 3, 0]
+                    f, w = samples[b, k, elements[n - 3, 1]], samples[b, k, 3 + elements[n - 3, 1]]
+                    to_f, to_w = 3 + n, 3 + e + n
+                for i in range(3):
+                    column[i] = swept[i, n] + 0.5 * w * turned[i, c]
+                    swept[i, n] += w * turned[i, c]
+                lever[0] = gained[1] * column[2] - gained[2] * column[1]
+                lever[1] = gained[2] * column[0] - gained[0] * column[2]
+                lever[2] = gained[0] * column[1] - gained[1] * column[0]
+                for i in range(3):
+                    out[b, i, to_f] -= left * f * turned[i, c]
+                    out[b, 3 + i, to_f] -= f * turned[i, c]
+                    out[b, i, to_w] += left * lever[i]
+                    out[b, 3 + i, to_w] += lever[i]
+                    out[b, 6 + i, to_w] -= w * turned[i, c]
