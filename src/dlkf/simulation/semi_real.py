@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -71,7 +72,7 @@ def simulate_semi_real(
     shown = track(
         range(len(rows)), f"semi-real {config.name}", disable=not progress, console=Console(stderr=True)
     )
-    with new_dataset(out, overwrite) as folder:
+    with closing(shown), new_dataset(out, overwrite) as folder:
         written = []
         for index in shown:
             tables = read_checked(source, rows[index])
