@@ -35,7 +35,7 @@ def car(seconds: float = 60.0, rate: float = 100.0, gnss_hz: float = 1.0, t0: fl
     origin = [torch.tensor([x], dtype=torch.float64) for x in (0.85, 0.15, 200.0)]
     frame = tangent_frame(*origin)
     p_t = torch.from_numpy(p)
-    g = frame.gravity(p_t).numpy()
+    g = frame[torch.zeros(len(p_t), dtype=torch.int64)].gravity(p_t).numpy()
     w = frame.earth_rate_n[0].numpy()
     f_n = a - g + 2 * np.cross(w, v)
     C_nb = np.stack((heading, left, np.broadcast_to([0.0, 0, 1], v.shape)), -1)

@@ -1,4 +1,4 @@
-"""One drive on a uniform grid: averaged IMU samples, fixes in epochs, reference at the boundaries."""
+"""One drive on a uniform grid: composed IMU samples, fixes in epochs, reference at the boundaries."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from dlkf.data.increments import merged, two_sample
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, IMU_ERROR, POSITION, STD, VELOCITY
 from dlkf.data.tables import Columns
 from dlkf.data.validate import GNSS_QUALITIES
@@ -93,31 +94,36 @@ def fix_phase(t: np.ndarray, epoch_s: float) -> float:
 
 
 def resample_imu(imu: Columns, grid: Grid, usual: float | None = None) -> np.ndarray:
-    """Mean specific force and rate (N, M, 6) over the grid's samples.
+    """Specific force and rate (N, M, 6), constant within each of the grid's samples, that act like the file's.
 
-    A sample is the mean over the interval that ends at its stamp, so the cumulative integral is known at the
-    stamps and linear between them; its difference between the grid's times is exact for whole ratios and
-    unbiased for any other. Where stamps are missing (an interval over 1.5 ``usual`` ones [s], by default their
-    median), the mean of the two neighbours fills the missing part.
+    A sample of the file is the mean over the interval that ends at its stamp. Its integral is corrected for coning
+    and sculling from the interval before (:mod:`dlkf.data.increments`) and spread evenly over the interval; the grid's
+    samples are composed of the pieces of intervals inside them. So their integral is exact for whole ratios and
+    unbiased for any other, and their rectified motion is that of the file's rate. Where stamps are missing (an
+    interval over 1.5 ``usual`` ones [s], by default their median), the mean of the two neighbours fills the
+    missing part.
     """
     t = imu["t"]
-    values = np.stack([imu[c] for c in (*ACCEL, *GYRO)], -1)
+    values = np.stack([imu[c] for c in (*ACCEL, *GYRO)])
     if usual is None:
         usual = float(np.median(np.diff(t)))
     step = np.diff(t, prepend=t[0] - usual)
-    missing = np.where(step > 1.5 * usual, step - usual, 0.0)
-    before = np.concatenate((values[:1], values[:-1]))
-    increments = values * (step - missing)[:, None] + 0.5 * (values + before) * missing[:, None]
-    # knots: stamps, one interval before the first, and one after the last for the slack of the grid
+    whole = step <= 1.5 * usual
+    missing = np.where(whole, 0.0, step - usual)
+    before = np.concatenate((values[:, :1], values[:, :-1]), 1)
+    integrals = values * (step - missing) + 0.5 * (values + before) * missing
+    follows = whole & np.concatenate(([False], whole[:-1]))
+    rates = two_sample(integrals, step, follows) / step
+    # one interval more before the first, and one after the last, for the slack of the grid
+    rates = np.concatenate((values[:, :1], rates, values[:, -1:]), 1)
     knots = np.concatenate((t[:1] - 2 * step[0], t[:1] - step[0], t, t[-1:] + step[-1]))
-    zero = np.zeros((1, 6))
-    total = np.cumsum(np.concatenate((zero, values[:1] * step[0], increments, values[-1:] * step[-1])), 0)
     at = grid.sample_times
-    place = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
-    part = (at - knots[place]) / (knots[place + 1] - knots[place])
-    integral = total[place] + part[:, None] * (total[place + 1] - total[place])
-    mean = np.diff(integral, axis=0) / (grid.epoch_s / grid.samples)
-    return mean.reshape(grid.epochs, grid.samples, 6)
+    times = np.concatenate((at, knots[(knots > at[0]) & (knots < at[-1])]))
+    times.sort(kind="stable")
+    place = np.searchsorted(knots, times[:-1], side="right") - 1
+    pieces = rates.take(place, 1, mode="clip") * np.diff(times)
+    samples = merged(pieces, np.searchsorted(times, at[:-1])) / (grid.epoch_s / grid.samples)
+    return np.ascontiguousarray(samples.T).reshape(grid.epochs, grid.samples, 6)
 
 
 @dataclass(frozen=True)
