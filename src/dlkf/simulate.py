@@ -23,13 +23,19 @@ def main(cfg: DictConfig) -> None:
     out = make(config, config["out"], overwrite=config["overwrite"])
     drives = pd.read_parquet(out / "drives.parquet")
     hours = drives["duration_s"].sum() / 3600
+    errors = config["dataset"]["imu_errors"]
+    imu = f"of {len(config['dataset']['fleet'])} types" if errors == "fleet" else config["imu"]["name"]
     print(
-        f"{out}: {hours:.3g} h of {'semi-real ' if config['source'] else ''}drives with IMU {config['imu']['name']} "
-        f"({config['dataset']['imu_errors']}), seed {config['seed']}, in {time.perf_counter() - start:.1f} s"
+        f"{out}: {hours:.3g} h of {'semi-real ' if config['source'] else ''}drives with IMU {imu} "
+        f"({errors}), seed {config['seed']}, in {time.perf_counter() - start:.1f} s"
     )
     if "lateral_axle_mps" in drives:
-        axle, imu = (math.sqrt((drives[f"lateral_{at}_mps"] ** 2).mean()) for at in ("axle", "imu"))
-        print(f"velocity across the car, RMS above 2 m/s: {axle:.3f} m/s at the rear axle, {imu:.3f} m/s at the IMU")
+        axle, at_imu = (math.sqrt((drives[f"lateral_{at}_mps"] ** 2).mean()) for at in ("axle", "imu"))
+        print(f"velocity across the car, RMS above 2 m/s: {axle:.3f} m/s at the rear axle, {at_imu:.3f} m/s at the IMU")
+    if config["pictures"]:
+        from dlkf.simulation.pictures import write_pictures  # matplotlib takes a second to load
+
+        print("pictures: " + ", ".join(str(path) for path in write_pictures(out, out / "pictures")))
 
 
 def arguments_of_source(arguments: list[str]) -> list[str]:

@@ -1,0 +1,218 @@
+"""Pictures of drives, simulated or real: one drive as in the paper's figure 4, and how a dataset moves.
+
+Colours are Okabe & Ito's, which colour-blind readers tell apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.signal import savgol_filter
+
+from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR
+from dlkf.data.tables import Columns, read_drives
+from dlkf.data.validate import DriveTables, read_checked
+from dlkf.errors import InputError
+
+Array = NDArray[np.float64]
+AXES = (("x", "#0072B2"), ("y", "#D55E00"), ("z", "#009E73"))
+INK, GREY, LIMIT = "#222222", "#BBBBBB", "#CC79A7"
+PAPER = {"speed": (0.0, 80.0), "along": (0.0, 2.0), "radius": (40.0, 150.0), "lateral": (0.5, 5.0)}  # R085-R088
+SMOOTH_S = 0.5  # window of the derivatives
+MOVING = 2.0  # m/s above which a course means something
+TURNING = 1 / 2000  # 1/m, curvature of what counts as a turn
+SHARP = 300.0  # m, radius of the turns whose lateral acceleration is shown
+STEADY = 0.02  # rad/s² below which the yaw rate of a turn counts as steady
+METRES_PER_DEGREE = 111_194.9  # of latitude on a sphere, for a picture
+
+
+@dataclass(frozen=True)
+class Driving:
+    """How a drive moves over the ground at the times t (N,), from its reference, else its GNSS fixes."""
+
+    t: Array  # s
+    north: Array  # m from the start
+    east: Array
+    speed: Array  # m/s
+    along: Array  # m/s²
+    yaw_rate: Array  # rad/s, of the course; 0 below 2 m/s
+    steady: NDArray[np.bool_]  # in a turn of steady yaw rate
+
+    @property
+    def lateral(self) -> Array:
+        """Speed times yaw rate [m/s²]."""
+        return self.speed * self.yaw_rate
+
+    @property
+    def turning(self) -> NDArray[np.bool_]:
+        """Where the path is bent to 2000 m or less."""
+        return np.abs(self.yaw_rate) > TURNING * np.maximum(self.speed, MOVING)
+
+    def every(self, seconds: float) -> Driving:
+        """Thinned out to about one row in so many seconds."""
+        step = max(1, round(seconds / float(np.median(np.diff(self.t)))))
+        return Driving(*(getattr(self, f.name)[::step] for f in fields(self)))
+
+
+def driving(tables: DriveTables) -> Driving:
+    """Speed, acceleration and yaw rate over the ground; derivatives by a sliding parabola of half a second.
+
+    InputError for a drive with less than ten rows that have a velocity.
+    """
+    source = tables.gnss if tables.reference is None else tables.reference
+    known = np.isfinite(np.stack([source[c] for c in ("lat_deg", "lon_deg", "vel_n", "vel_e")])).all(0)
+    if "valid" in source:
+        known &= source["valid"].astype(bool)
+    if known.sum() < 10:
+        raise InputError(f"drive {tables.row.name}: less than ten rows have position and velocity, nothing to draw")
+    t, lat, lon, v_n, v_e = (source[c][known] for c in ("t", "lat_deg", "lon_deg", "vel_n", "vel_e"))
+    dt = float(np.median(np.diff(t)))
+    width = max(3, 2 * round(0.5 * SMOOTH_S / dt) + 1)
+    a_n, a_e = (savgol_filter(v, width, 2, deriv=1, delta=dt) for v in (v_n, v_e))
+    speed = np.hypot(v_n, v_e)
+    moving = speed > MOVING
+    safe = np.where(moving, speed, 1.0)
+    along = np.where(moving, (v_n * a_n + v_e * a_e) / safe, 0.0)
+    yaw_rate = np.where(moving, (v_n * a_e - v_e * a_n) / safe**2, 0.0)
+    change = savgol_filter(yaw_rate, width, 2, deriv=1, delta=dt)
+    turning = np.abs(yaw_rate) > TURNING * np.maximum(speed, MOVING)
+    north = METRES_PER_DEGREE * (lat - lat[0])
+    east = METRES_PER_DEGREE * (lon - lon[0]) * np.cos(np.radians(lat[0]))
+    return Driving(t, north, east, speed, along, yaw_rate, turning & (np.abs(change) < STEADY))
+
+
+def drive_figure(tables: DriveTables) -> Figure:
+    """One drive: track, speed, specific force, rates, and the IMU's errors where they are known (paper, figure 4)."""
+    moved = driving(tables)
+    errors = _known_errors(tables.reference)
+    rows = 3 if errors is None else 5
+    figure = Figure(figsize=(11.5, 1.9 * rows + 0.5), layout="constrained")
+    grid = figure.add_gridspec(rows, 2, width_ratios=(1, 1.35))
+    _track(figure.add_subplot(grid[:, 0]), figure, moved, tables)
+    first = figure.add_subplot(grid[0, 1])
+    first.plot(moved.t, 3.6 * moved.speed, color=INK, linewidth=0.8)
+    first.set_ylabel("speed [km/h]")
+    panels = [(tables.imu, ACCEL, 1.0, "specific force\n[m/s²]"), (tables.imu, GYRO, 180 / np.pi, "rate [°/s]")]
+    if errors is not None:
+        panels += [
+            (errors, IMU_ERROR[:3], 1.0, "accelerometer\nerror [m/s²]"),
+            (errors, IMU_ERROR[3:], 180 / np.pi, "gyroscope\nerror [°/s]"),
+        ]
+    lower = []
+    for k, (source, columns, scale, label) in enumerate(panels, start=1):
+        lower.append(figure.add_subplot(grid[k, 1], sharex=first))
+        for column, (axis, colour) in zip(columns, AXES):
+            lower[-1].plot(source["t"], scale * source[column], color=colour, linewidth=0.5, label=axis)
+        lower[-1].set_ylabel(label)
+    lower[0].legend(loc="lower right", ncols=3, fontsize=8, bbox_to_anchor=(1.0, 1.0), frameon=False, borderpad=0)
+    for line in lower[0].get_legend().get_lines():
+        line.set_linewidth(2.0)
+    for axes in (first, *lower):
+        axes.grid(color=GREY, linewidth=0.3)
+    for axes in (first, *lower[:-1]):
+        axes.tick_params(labelbottom=False)
+    last = lower[-1]
+    last.set_xlabel("time [s]")
+    figure.align_ylabels((first, *lower))
+    figure.suptitle(tables.row.name, x=0.01, ha="left")
+    return figure
+
+
+def motion_figure(drives: Sequence[Driving], title: str) -> Figure:
+    """Histograms of speed, accelerations and radii over drives, with the bounds of the paper (R085-R088).
+
+    Radius and lateral acceleration are those of turns below 2000 m and below 300 m radius; filled where the yaw
+    rate is steady, which is where the bounds apply: on the way into a turn and out of it the path is a clothoid.
+    """
+    joined = Driving(*(np.concatenate([getattr(d, f.name) for d in drives]) for f in fields(Driving)))
+    figure = Figure(figsize=(11.5, 3.2), layout="constrained")
+    speed, along, radius, lateral = figure.subplots(1, 4)
+    _histogram(speed, 3.6 * joined.speed, None, PAPER["speed"], "speed [km/h]")
+    braking = np.abs(joined.along[np.abs(joined.along) > 0.05])
+    _histogram(along, braking, None, PAPER["along"], "|longitudinal| [m/s²]")
+    turning, steady = joined.turning, joined.steady[joined.turning]
+    radii = joined.speed[turning] / np.abs(joined.yaw_rate[turning])
+    _histogram(radius, radii, steady, PAPER["radius"], "radius of turns [m]", np.geomspace(3, 2000, 50))
+    radius.set_xscale("log")
+    sharp = radii < SHARP
+    sideways = np.abs(joined.lateral[turning][sharp])
+    _histogram(lateral, sideways, steady[sharp], PAPER["lateral"], f"|lateral| below {SHARP:g} m radius [m/s²]")
+    speed.set_ylabel("share of time")
+    radius.legend(frameon=False, fontsize=8)
+    figure.suptitle(f"{title}: {len(drives)} drives; dashed: the bounds R085-R088", x=0.01, ha="left")
+    return figure
+
+
+def write_pictures(dataset: str | Path, out: str | Path, names: Sequence[str] = ()) -> list[Path]:
+    """Draw the named drives of a dataset (its first one by default), and all of its motion, into ``out``.
+
+    InputError for a drive that the dataset has not got, or tables that break the contract.
+    """
+    rows = {row.name: row for row in read_drives(dataset)}
+    if unknown := [name for name in names if name not in rows]:
+        raise InputError(f"dataset {dataset}: no drive {', '.join(unknown)}; has {', '.join(list(rows)[:5])} …")
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    paths, moved = [], []
+    for name, row in rows.items():
+        tables = read_checked(dataset, row)
+        moved.append(driving(tables).every(0.5))
+        if name in (names or list(rows)[:1]):
+            paths.append(out / f"{name}.png")
+            drive_figure(tables).savefig(paths[-1], dpi=90)
+    paths.append(out / "motion.png")
+    motion_figure(moved, Path(dataset).resolve().name).savefig(paths[-1], dpi=90)
+    return paths
+
+
+def _track(axes: Axes, figure: Figure, moved: Driving, tables: DriveTables) -> None:
+    drawn = axes.scatter(moved.east, moved.north, c=3.6 * moved.speed, s=2, cmap="viridis", linewidths=0)
+    axes.plot(moved.east[0], moved.north[0], "o", color=INK, markersize=5, label="start")
+    fixes = tables.gnss["t"][tables.gnss["quality"] > 0]
+    edges = np.concatenate(((moved.t[0],), fixes, (moved.t[-1],)))
+    before = np.searchsorted(edges, moved.t, side="right").clip(1, len(edges) - 1)
+    usual = float(np.median(np.diff(fixes))) if len(fixes) > 1 else np.inf
+    dark = edges[before] - edges[before - 1] > max(2.5 * usual, 2.0)
+    if dark.any():
+        axes.scatter(moved.east[dark], moved.north[dark], s=14, color=LIMIT, linewidths=0, zorder=0.4, label="no GNSS")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("east [m]")
+    axes.set_ylabel("north [m]")
+    axes.grid(color=GREY, linewidth=0.3)
+    axes.legend(frameon=False, fontsize=8)
+    bar = {"location": "bottom", "shrink": 0.7, "aspect": 40, "fraction": 0.05, "pad": 0.02}
+    figure.colorbar(drawn, ax=axes, label="speed [km/h]", **bar)
+
+
+def _known_errors(reference: Columns | None) -> Columns | None:
+    if reference is None or not all(c in reference and np.isfinite(reference[c]).any() for c in IMU_ERROR):
+        return None
+    return reference
+
+
+def _histogram(
+    axes: Axes,
+    x: Array,
+    steady: NDArray[np.bool_] | None,
+    bounds: tuple[float, float],
+    label: str,
+    edges: Array | None = None,
+) -> None:
+    if len(x):
+        if edges is None:
+            edges = np.linspace(0.0, 1.05 * max(float(np.percentile(x, 99.9)), bounds[1]), 50)
+        share = np.full(len(x), 1 / len(x))
+        if steady is None:
+            axes.hist(x, edges, weights=share, color=AXES[0][1])
+        else:
+            axes.hist(x, edges, weights=share, histtype="step", color=INK, label="whole turn")
+            axes.hist(x[steady], edges, weights=share[steady], color=AXES[0][1], label="steady")
+    for bound in bounds:
+        axes.axvline(bound, color=LIMIT, linestyle="--", linewidth=1)
+    axes.set_xlabel(label)
