@@ -1,0 +1,144 @@
+"""IMU samples one at a time, brought to the epoch grid as :mod:`dlkf.data.resampling` brings a whole drive."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+from dlkf.data.resampling import Grid, epoch_grid, resample_imu, samples_per_epoch
+from dlkf.data.schema import ACCEL, GYRO
+from dlkf.data.validate import LIMITS, Limits
+from dlkf.errors import InputError
+
+COLUMNS = ("t", *ACCEL, *GYRO)
+FULL_SCALE = (400.0, 40.0)  # m/s², rad/s: beyond any IMU of a car, so a damaged packet
+BEFORE = 3  # stamps kept before the open epoch: an interval is resampled with the one before it
+ASTRAY_S = 1.0  # samples out of line that go on for so long are the truth, and the line before was not
+
+
+class ImuStream:
+    """Samples in, epochs of uniform samples out, with no more memory than an epoch's.
+
+    ``step_s`` is the usual interval between stamps [s]; None: the median of the samples before the grid began.
+    A sample is in line if its stamp lies after the last one, by no more than ``limits`` call a gap; missing
+    samples within are bridged as the loader does. Out of line are stamps that run back or leap ahead.
+    """
+
+    def __init__(
+        self,
+        rate_hz: float,
+        epoch_s: float,
+        *,
+        step_s: float | None = None,
+        limits: Limits = LIMITS,
+        keep_s: float = 10.0,
+    ) -> None:
+        self._samples = samples_per_epoch(rate_hz, epoch_s)
+        self._rate_hz, self._epoch_s, self._limits, self._keep_s = rate_hz, epoch_s, limits, keep_s
+        self._given = step_s
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all samples and the grid."""
+        self._rows: deque[tuple[float, ...]] = deque()
+        self._astray: tuple[float, float] | None = None  # first and last stamp of a run out of line
+        self._step = self._given
+        self._longest = self._longest_step(self._given)
+        self.grid: Grid | None = None
+        self.epochs = 0  # closed
+        self.end = math.inf  # of the open epoch [s]
+
+    @property
+    def latest(self) -> float:
+        """Stamp of the last sample in line [s]; −∞ before the first."""
+        return self._rows[-1][0] if self._rows else -math.inf
+
+    @property
+    def lost(self) -> bool:
+        """Samples out of line have gone on for longer than an accident does: the stream must begin anew."""
+        return self._astray is not None and self._astray[1] - self._astray[0] >= ASTRAY_S
+
+    def refused(self, t: float, accel: Sequence[float], gyro: Sequence[float]) -> str:
+        """Take a sample (s, m/s², rad/s); a reason if it cannot be, else nothing."""
+        row = (float(t), *map(float, accel), *map(float, gyro))
+        if len(row) != 7:
+            return f"accel and gyro have {len(row) - 1} values together, must be 3 and 3"
+        if not math.isfinite(sum(row)):
+            return "t, accel or gyro is not a finite number"
+        if max(map(abs, row[1:4])) > FULL_SCALE[0] or max(map(abs, row[4:])) > FULL_SCALE[1]:
+            return f"accel or gyro is beyond {FULL_SCALE[0]:g} m/s², {FULL_SCALE[1]:g} rad/s"
+        last = self.latest
+        if self._rows and not last < row[0] <= last + self._longest:
+            return self._out_of_line(row[0], last)
+        self._astray = None
+        self._rows.append(row)
+        if self.grid is None and row[0] - self._rows[0][0] > self._keep_s:
+            self._rows.popleft()
+        return ""
+
+    def begin(self, t_fix: np.ndarray) -> bool:
+        """Lay the grid through the times of fixes [s]; False while there is less than an epoch of samples."""
+        t = np.array([row[0] for row in self._rows])
+        if len(t) < 2:
+            return False
+        try:
+            grid = epoch_grid(t, t_fix, self._rate_hz, self._epoch_s, "stream")
+        except InputError:
+            return False
+        self.grid = Grid(grid.t0, grid.epoch_s, 1, grid.samples)
+        self._step = float(np.median(np.diff(t))) if self._given is None else self._given
+        self._longest = self._longest_step(self._step)
+        self.end = grid.t0 + self._epoch_s
+        return True
+
+    def closed(self, slack_s: float = 0.0) -> list[np.ndarray]:
+        """Samples (1, M, 6) of the epochs whose end the stream has reached, each of them once.
+
+        ``slack_s`` [s] before an epoch's end counts as reached.
+        """
+        done = []
+        while self.latest >= self.end - max(slack_s, 4 * math.ulp(self.end)):
+            assert self.grid is not None  # end is infinite without
+            begin = self.grid.t0 + self.epochs * self._epoch_s
+            done.append(self._resampled(Grid(begin, self._epoch_s, 1, self._samples)))
+            self.epochs += 1
+            begin, self.end = self.end, self.grid.t0 + (self.epochs + 1) * self._epoch_s
+            while len(self._rows) > BEFORE and self._rows[BEFORE][0] <= begin:
+                self._rows.popleft()
+        return done
+
+    @property
+    def slack_s(self) -> float:
+        """How long before an epoch's end a drive may stop for the loader to count the epoch as whole [s]."""
+        return 0.5 * min(self._step or math.inf, self._epoch_s / self._samples)
+
+    def open(self) -> tuple[np.ndarray, float] | None:
+        """Samples (1, m, 6) from the open epoch's beginning to the latest stamp, and their length [s]."""
+        if self.grid is None:
+            return None
+        begin = self.grid.t0 + self.epochs * self._epoch_s
+        span = self.latest - begin
+        if span <= 4 * math.ulp(begin):
+            return None
+        m = max(1, math.ceil(span * self._rate_hz - 1e-6))
+        return self._resampled(Grid(begin, span, 1, m)), span / m
+
+    def _resampled(self, grid: Grid) -> np.ndarray:
+        table = np.array(self._rows)
+        return resample_imu(dict(zip(COLUMNS, table.T)), grid, self._step)
+
+    def _longest_step(self, usual: float | None) -> float:
+        return max(self._limits.gap_s, self._limits.gap_samples * (usual or 0.0))
+
+    def _out_of_line(self, t: float, last: float) -> str:
+        run = self._astray
+        follows = run is not None and run[1] < t <= run[1] + self._longest
+        self._astray = (run[0], t) if run is not None and follows else (t, t)
+        if t == last:
+            return f"t = {t:.6f} again"
+        if t < last:
+            return f"t goes back from {last:.6f} to {t:.6f}"
+        return f"gap of {t - last:.3f} s after t = {last:.6f}"

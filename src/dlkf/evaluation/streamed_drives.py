@@ -1,0 +1,108 @@
+"""Logged drives through the streaming filter: sample by sample, what a vehicle would have known by then."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
+from dlkf.data.store import drive_from_tables
+from dlkf.data.tables import Columns, read_drives
+from dlkf.data.validate import DriveTables, read_checked
+from dlkf.errors import InputError
+from dlkf.evaluation.drives import Navigated
+from dlkf.filters.estimate import Estimate, estimates_table
+from dlkf.filters.integration import Estimator
+from dlkf.filters.start import align
+from dlkf.filters.streaming import Receipt, Status, StreamingFilter
+
+
+def played(
+    stream: StreamingFilter, imu: Columns, gnss: Columns, arrival: Sequence[float] | None = None
+) -> Iterator[Receipt]:
+    """Feed the tables of a drive to a stream in order of time; the receipts.
+
+    ``arrival`` [s] is when each fix comes, by default at its own time, before a sample of the same time.
+    """
+    t, arrival = imu["t"], gnss["t"] if arrival is None else np.asarray(arrival)
+    samples = np.stack([imu[c] for c in (*ACCEL, *GYRO)], -1).tolist()
+    fixes = np.stack([gnss[c] for c in ("t", *POSITION, *VELOCITY, *STD)], -1).tolist()
+    quality = gnss["quality"].tolist()
+    order = np.argsort(arrival, kind="stable")
+    before = np.searchsorted(t, arrival[order], side="left").tolist()
+    order, done = order.tolist(), 0
+    for k, stamp in enumerate(t.tolist()):
+        while done < len(order) and before[done] <= k:
+            x = fixes[order[done]]
+            yield stream.gnss(*x[:4], x[4:7], x[7:], quality[order[done]])
+            done += 1
+        yield stream.imu(stamp, samples[k][:3], samples[k][3:])
+    yield stream.finish()
+    for j in order[done:]:
+        x = fixes[j]
+        yield stream.gnss(*x[:4], x[4:7], x[7:], quality[j])
+
+
+def stream_drive(
+    tables: DriveTables, estimator: Estimator, *, rate_hz: float, epoch_s: float, arrival: Sequence[float] | None = None
+) -> Navigated:
+    """One drive through a stream, on the grid that the loader gives it: the same solution as its batch run.
+
+    Raises InputError if the drive cannot be aligned, or the filter diverges.
+    """
+    drive = drive_from_tables(tables, "", rate_hz, epoch_s, torch.float64)
+    stream = StreamingFilter(
+        estimator, rate_hz=rate_hz, epoch_s=epoch_s, lever_arm_b=tables.row.lever_arm_b,
+        phase_s=drive.t0, imu_step_s=float(np.median(np.diff(tables.imu["t"]))),
+    )  # fmt: skip
+    found: dict[float, Estimate] = {}
+    for receipt in played(stream, tables.imu, tables.gnss, arrival):
+        found.update((e.t, e) for e in receipt.estimates)
+        if receipt.status is Status.RESTARTED or stream.counts["diverged"]:
+            reason = receipt.reason or "the filter diverged (its output is not finite)"
+            raise InputError(f"drive {tables.row.name}: {reason}")
+    if not found:
+        align(drive)  # raises what is missing
+        raise InputError(f"drive {tables.row.name}: shorter than its alignment and an epoch")
+    estimates = [found[t] for t in sorted(found)]
+    return Navigated(tables.row.name, estimates[0].t - epoch_s, estimates_table(estimates))
+
+
+def stream_drives(
+    folder: str | Path,
+    estimator: Estimator,
+    *,
+    rate_hz: float,
+    epoch_s: float,
+    drives: Sequence[str] | None = None,
+    skipped: dict[str, str] | None = None,
+    progress: Callable[[int, int | None], None] | None = None,
+) -> Iterator[Navigated]:
+    """The drives of a dataset, or those named, each through a stream of its own; no reference is read.
+
+    As :func:`dlkf.evaluation.drives.navigate_drives` does, a drive that cannot be aligned raises InputError or goes
+    to ``skipped``, unless none is left. ``progress(drives done, drives in all)``.
+    """
+    rows = {row.name: row for row in read_drives(folder)}
+    if unknown := [name for name in drives or () if name not in rows]:
+        raise InputError(f"dataset {folder}: no drive {unknown[0]}; has {', '.join(list(rows)[:8])}")
+    names = list(rows if drives is None else drives)
+    solved = 0
+    for k, name in enumerate(names):
+        tables = read_checked(folder, rows[name], reference=False)
+        try:
+            result = stream_drive(tables, estimator, rate_hz=rate_hz, epoch_s=epoch_s)
+        except InputError as error:
+            if skipped is None:
+                raise
+            skipped[name] = str(error)
+        else:
+            solved += 1
+            yield result
+        if progress is not None:
+            progress(k + 1, len(names))
+    if not solved:
+        raise InputError(next(iter((skipped or {}).values()), "no drives: give a dataset with at least one"))
