@@ -93,10 +93,19 @@ def solve(observed: Observations) -> Solution:
         rate[:, 3],
         covariance,
         _spread(rate_gain, observed.rate_variance, observed.common[:0]),
-        _dop(geometry, observed.used, r_e),
+        dilution(unit, observed.used, r_e),
         observed.used.sum(-1),
         solved,
     )
+
+
+def dilution(unit: Array, used: Mask, r_e: Array) -> Dop:
+    """Dilution of precision at positions ``r_e`` (T, 3) of the ``used`` satellites in directions ``unit`` (T, S, 3)."""
+    turned = np.concatenate((unit @ ned_at(r_e), np.ones_like(unit[..., :1])), -1) * used[..., None]
+    cofactor = np.linalg.inv(_regular(np.swapaxes(turned, -1, -2) @ turned))
+    north, east, down, time = np.moveaxis(np.diagonal(cofactor, axis1=-2, axis2=-1), -1, 0)
+    horizontal = north + east
+    return Dop(*(np.sqrt(x) for x in (horizontal + down + time, horizontal + down, horizontal, down)))
 
 
 def _gauss_newton(observed: Observations, state: Array) -> tuple[Array, Mask]:
@@ -143,14 +152,6 @@ def _spread(gain: Array, variance: Array, common: Array) -> Array:
         shift = _apply(gain, error)
         spread += shift[:, :, None] * shift[:, None, :]
     return spread
-
-
-def _dop(geometry: Array, used: Mask, r_e: Array) -> Dop:
-    turned = np.concatenate((geometry[..., :3] @ ned_at(r_e), geometry[..., 3:]), -1) * used[..., None]
-    cofactor = np.linalg.inv(_regular(np.swapaxes(turned, -1, -2) @ turned))
-    north, east, down, time = np.moveaxis(np.diagonal(cofactor, axis1=-2, axis2=-1), -1, 0)
-    horizontal = north + east
-    return Dop(*(np.sqrt(x) for x in (horizontal + down + time, horizontal + down, horizontal, down)))
 
 
 def _rows(observed: Observations, rows: NDArray[np.int64]) -> Observations:

@@ -1,0 +1,162 @@
+"""The sky over simulated or semi-real drives: what the fixes are worth, measured, and pictures.
+
+    python -m dlkf.simulate dataset=city receiver=standalone raw=true out=data/city_standalone
+    python -m pipelines.satellite_sky data/city_standalone --figures docs/figures/satellites
+    python -m pipelines.satellite_sky --world --figures docs/figures/satellites
+
+For a dataset made with a satellite receiver: share of epochs with a fix, satellites, dilution, errors against
+their claimed covariance and against noise times dilution; pictures of one drive. ``--world``: satellites in view
+and dilution everywhere on the Earth over one day.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pymap3d
+import torch
+from matplotlib.figure import Figure
+
+from dlkf.data.schema import ATTITUDE, VELOCITY, drive_file
+from dlkf.data.tables import read_drives
+from dlkf.navigation.attitude import rotation_from_rpy
+from dlkf.simulation import sky_figures
+from dlkf.simulation.almanac import read_almanac
+from dlkf.simulation.least_squares import dilution
+from dlkf.simulation.satellites import direction, signals
+
+STD = [f"std_{kind}_{axis}" for kind in ("pos", "vel") for axis in "ned"]
+
+
+def tables(dataset: Path, drive: str) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame | None]:
+    """Fixes, reference and raw observations of a drive."""
+    fixes, reference = (pd.read_parquet(drive_file(dataset, kind, drive)) for kind in ("gnss", "reference"))
+    if "satellites" not in fixes:
+        raise SystemExit(f"{dataset}: fixes without satellites; simulate it with receiver=standalone, say")
+    raw = drive_file(dataset, "raw", drive)
+    return fixes, reference, pd.read_parquet(raw) if raw.exists() else None
+
+
+def fix_errors(fixes: pd.DataFrame, reference: pd.DataFrame, lever_arm_b: np.ndarray) -> np.ndarray:
+    """Position and velocity error (N, 6) of the antenna in NED, NaN where the reference has no row at the fix.
+
+    The velocity of an antenna away from the IMU needs the turn rate, which a reference has not got: NaN as well.
+    """
+    at = np.minimum(np.searchsorted(reference.t, fixes.t - 1e-6), len(reference) - 1)
+    truth = reference.iloc[at].reset_index(drop=True)
+    C_nb = rotation_from_rpy(torch.tensor(truth[list(ATTITUDE)].to_numpy())).numpy()
+    east, north, up = pymap3d.geodetic2enu(
+        fixes.lat_deg, fixes.lon_deg, fixes.height_m, truth.lat_deg, truth.lon_deg, truth.height_m
+    )
+    position = np.column_stack((north, east, -up)) - C_nb @ lever_arm_b
+    velocity = (fixes[list(VELOCITY)] - truth[list(VELOCITY)]).to_numpy()
+    error = np.column_stack((position, np.where(lever_arm_b.any(), np.nan, velocity)))
+    return np.where((np.abs(truth.t - fixes.t) < 1e-6).to_numpy()[:, None], error, np.nan)
+
+
+def summary(dataset: Path) -> None:
+    """Print what all drives of a dataset say together."""
+    parts, wrong = [], []
+    for row in read_drives(dataset):
+        fixes, reference, _ = tables(dataset, row.name)
+        parts.append(fixes)
+        wrong.append(fix_errors(fixes, reference, np.array(row.lever_arm_b)))
+    fixes, error = pd.concat(parts, ignore_index=True), np.concatenate(wrong)
+    fix = (fixes.quality > 0).to_numpy()
+    shares = {quality: f"{(fixes.quality == quality).mean():.3f}" for quality in sorted(set(fixes.quality))}
+    print(f"{dataset}: {len(parts)} drives, {len(fixes)} epochs; share by quality {shares}")
+    few, middle, many = fixes.satellites.quantile((0.05, 0.5, 0.95))
+    print(f"satellites 5 % {few:g}, median {middle:g}, 95 % {many:g}, mean {fixes.satellites.mean():.2f}")
+    lengths = [len(run) for part in parts for run in re.findall("0+", "".join("01"[q > 0] for q in part.quality))]
+    if lengths:
+        print(f"without a fix {len(lengths)} times, median {np.median(lengths):g} and at most {max(lengths)} epochs")
+    for name in ("gdop", "pdop", "hdop", "vdop"):
+        half, most = fixes[name][fix].quantile((0.5, 0.95))
+        print(f"{name.upper()} median {half:.2f}, 95 % {most:.2f}")
+    std = fixes[STD].to_numpy()
+    for name, columns in (("position", slice(0, 3)), ("velocity", slice(3, 6))):
+        known = fix & np.isfinite(error[:, columns]).all(1)
+        if not known.any():
+            print(f"{name} error not known: no row of the reference at a fix, or a lever arm")
+            continue
+        rms, claimed = (np.sqrt(np.mean(x[known, columns] ** 2, 0)) for x in (error, std))
+        ratio = np.sqrt(np.mean((error[known, columns] / std[known, columns]) ** 2, 0))
+        print(f"{name} error RMS N, E, D {rms.round(4)}, claimed {claimed.round(4)}, error/σ RMS {ratio.round(3)}")
+
+
+def save(figure: Figure, folder: Path, name: str) -> None:
+    """A PNG of a figure."""
+    folder.mkdir(parents=True, exist_ok=True)
+    figure.savefig(folder / f"{name}.png", bbox_inches="tight")
+    print(f"wrote {folder / name}.png")
+
+
+def pictures(dataset: Path, drive: str | None, folder: Path) -> None:
+    """Sky, dilution, route and errors of one drive, by default the first."""
+    rows = {row.name: row for row in read_drives(dataset)}
+    name = drive or next(iter(rows))
+    if name not in rows:
+        raise SystemExit(f"{dataset}: no drive {name}; there are {', '.join(list(rows)[:5])}, …")
+    fixes, reference, raw = tables(dataset, name)
+    title, stem = f"{name}", dataset.name
+    if raw is not None:
+        save(sky_figures.sky_plot(raw, title), folder, f"{stem}_sky")
+    save(sky_figures.dilution(fixes, title), folder, f"{stem}_dilution")
+    save(sky_figures.route(fixes, reference, title), folder, f"{stem}_route")
+    error = fix_errors(fixes, reference, np.array(rows[name].lever_arm_b))
+    if np.isfinite(error).any():
+        save(sky_figures.errors(fixes, error[:, :3], title), folder, f"{stem}_errors")
+
+
+def world(mask_deg: float, folder: Path | None) -> None:
+    """Satellites in view and PDOP on a grid of 10 degrees, both poles and the date line included, over a day."""
+    almanac = read_almanac()
+    lat, lon = np.arange(-90.0, 91, 10), np.arange(-180.0, 181, 10)
+    places = np.stack(pymap3d.geodetic2ecef(*(x.ravel() for x in np.meshgrid(lat, lon, indexing="ij")), 0.0), -1)
+    counts, pdops = [], []
+    for t in np.arange(0, 86400.0, 600):
+        seen = signals(almanac, np.full(len(places), t), places, np.zeros_like(places))
+        used = seen.elevation > np.radians(mask_deg)
+        counts.append(used.sum(-1))
+        pdops.append(dilution(direction(seen.satellite.r_e, places)[1], used, places).pdop)
+    count, pdop = np.array(counts), np.array(pdops)
+    share = np.mean((count >= 6) & (count <= 12))
+    print(
+        f"mask {mask_deg:g}°: satellites {count.min()} to {count.max()}, mean {count.mean():.2f}, "
+        f"6 to 12 in {share:.4f}; PDOP median {np.median(pdop):.2f}, 95 % {np.quantile(pdop, 0.95):.2f}, "
+        f"below 6 in {np.mean(pdop <= 6):.4f}, worst {pdop.max():.1f}"
+    )
+    if folder is not None:
+        shape = len(lat), len(lon)
+        title = f"GPS of week {almanac.week}, {len(almanac.prn)} satellites, above {mask_deg:g}°, one day"
+        figure = sky_figures.world(
+            lat, lon, count.mean(0).reshape(shape), np.quantile(pdop, 0.95, axis=0).reshape(shape), title
+        )
+        save(figure, folder, "world")
+
+
+def main() -> None:
+    """Measure and draw."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("dataset", nargs="?", type=Path, help="made with a satellite receiver")
+    parser.add_argument("--drive", help="the one to draw; the first by default")
+    parser.add_argument("--world", action="store_true", help="satellites and dilution everywhere on the Earth")
+    parser.add_argument("--mask-deg", type=float, default=5.0, help="lowest elevation for --world")
+    parser.add_argument("--figures", type=Path, help="folder for PNGs")
+    options = parser.parse_args()
+    if not options.world and options.dataset is None:
+        parser.error("give a dataset or --world")
+    if options.world:
+        world(options.mask_deg, options.figures)
+    if options.dataset is not None:
+        summary(options.dataset)
+        if options.figures is not None:
+            pictures(options.dataset, options.drive, options.figures)
+
+
+if __name__ == "__main__":
+    main()
