@@ -26,7 +26,8 @@ from dlkf.navigation.state import ATTITUDE, GYRO, VELOCITY, ErrorStates
 
 STRUCTURE_STD = (0.05, 0.05, 1.5, 0.01)  # rad, rad, m, s²/m: what is known of a car before it moves
 STRUCTURE_WALK_STD = (2e-5, 2e-5, 1e-4, 1e-6)  # per √s
-QUIET_FACTOR = 2.5  # a standstill is at most so much livelier than the quietest second so far
+QUIET_FACTOR = 2.5  # a standstill is at most so much livelier than the quietest second of standing so far
+SURE_SPEED = 0.3  # m/s: below, 1σ included, the filter is sure to stand
 PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 3.0  # m/s, 1σ: a standstill must not contradict the filter
 SLOWEST = 0.5  # m/s: below, course and yaw rate say nothing of the car's structure
 
@@ -54,7 +55,7 @@ class Constraints:
         quietest: Float[Tensor, "B 2"],
         P: Float[Tensor, "B n n"],
     ) -> tuple[Measurement, Float[Tensor, "B 2"]]:
-        """NHC (2 rows), zero velocity (3), zero angular rate (3); and the quietest second so far."""
+        """NHC (2 rows), zero velocity (3), zero angular rate (3); and the quietest second of standing so far."""
         t = self.tuning
         resting, quietest = self._at_rest(epoch, quietest, P)
         zn, Hn, moving = self._across(epoch, structure)
@@ -109,14 +110,20 @@ class Constraints:
     ) -> tuple[Bool[Tensor, " B"], Float[Tensor, "B 2"]]:
         """Whether the samples of the window are as quiet as a standing car's.
 
-        Their spread must be below fixed limits and below a multiple of the quietest second of this drive, since
-        idling engines differ; and the filter must not know better.
+        Their spread must be below a multiple of that of the quietest second in which the filter was sure to stand,
+        since idling engines differ, and below fixed limits, of which a third counts until there was such a second.
+        And the filter must not know better.
         """
         spread = epoch.imu.unflatten(-1, (2, 3)).var(1).sum(-1).sqrt()  # (B, 2) accelerometers, gyroscopes
-        quietest = torch.minimum(quietest, spread)
-        limit = torch.minimum(
-            QUIET_FACTOR * quietest, spread.new_tensor([self.tuning.rest_accel, self.tuning.rest_gyro])
-        )
         sigma = P.diagonal(dim1=-2, dim2=-1)[:, VELOCITY][:, :2].sum(-1).sqrt()
         speed = epoch.window.end.v_n[:, :2].norm(dim=-1)
-        return (spread <= limit).all(-1) & (speed < PLAUSIBLE_SPEED + PLAUSIBLE_SIGMAS * sigma), quietest
+        sure = (speed + sigma < SURE_SPEED) & (spread < spread.new_tensor(self._limits)).all(-1)
+        quietest = torch.where(sure.unsqueeze(-1), torch.minimum(quietest, spread), quietest)
+        limit = spread.new_tensor(self._limits)
+        limit = torch.where(quietest.isinf(), limit / 3, torch.minimum(QUIET_FACTOR * quietest, limit))
+        plausible = speed < PLAUSIBLE_SPEED + PLAUSIBLE_SIGMAS * sigma
+        return (spread <= limit).all(-1) & plausible, quietest
+
+    @property
+    def _limits(self) -> tuple[float, float]:
+        return self.tuning.rest_accel, self.tuning.rest_gyro
