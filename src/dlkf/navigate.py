@@ -6,6 +6,7 @@ drive, or nothing (columns: dlkf.data.solution).
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -18,6 +19,7 @@ from dlkf.errors import InputError
 from dlkf.evaluation.drives import navigate_drives
 from dlkf.evaluation.progress import counting
 from dlkf.evaluation.staging import staged
+from dlkf.evaluation.streamed_drives import stream_drives
 from dlkf.models import resolve_model
 from dlkf.navigation.imu_errors import imu_spec
 
@@ -35,20 +37,23 @@ def main(cfg: DictConfig) -> None:
         tuning=config["tuning"],
         prior=config["prior"],
     )
-    with counting("Loading drives") as progress:
-        drives = load_dataset(
-            config["dataset"],
-            rate_hz=config["rate_hz"],
-            epoch_s=config["epoch_s"],
-            dtype=torch.float64,
-            reference=False,
-            drives=config["drives"],
-            progress=lambda name, done, total: progress(done, total),
-        )
+    grid = {key: config[key] for key in ("rate_hz", "epoch_s", "drives")}
     skipped: dict[str, str] | None = {} if config["skip_unaligned"] else None
+    if config["streaming"]:
+        navigated = partial(stream_drives, config["dataset"], model, skipped=skipped, **grid)
+    else:
+        with counting("Loading drives") as progress:
+            drives = load_dataset(
+                config["dataset"],
+                dtype=torch.float64,
+                reference=False,
+                progress=lambda name, done, total: progress(done, total),
+                **grid,
+            )
+        navigated = partial(navigate_drives, drives, model, skipped=skipped)
     lines = []
     with staged(config["out"]) as folder, counting("Navigating") as progress:
-        for result in navigate_drives(drives, model, skipped=skipped, progress=progress):
+        for result in navigated(progress=progress):
             write_solution(folder / f"drive={result.drive}" / "solution.parquet", result.table)
             lines.append(result.summary())
     print("\n".join(sorted(lines)))

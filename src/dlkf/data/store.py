@@ -9,7 +9,7 @@ import torch
 
 from dlkf.data.drive import Drive
 from dlkf.data.resampling import assign_fixes, epoch_grid, reference_at, resample_imu
-from dlkf.data.tables import dataset_digest, read_drives
+from dlkf.data.tables import DriveRow, dataset_digest, read_drives
 from dlkf.data.validate import GNSS_QUALITIES, LIMITS, DriveTables, Limits, read_checked
 from dlkf.errors import InputError
 
@@ -33,13 +33,7 @@ def load_dataset(
     after each drive. Raises InputError for the first fault in the data or an unknown drive.
     """
     folder = Path(folder)
-    rows = read_drives(folder)
-    if drives is not None:
-        known = {row.name: row for row in rows}
-        if unknown := [name for name in drives if name not in known]:
-            shown = ", ".join(list(known)[:8]) + (", …" if len(known) > 8 else "")
-            raise InputError(f"dataset {folder}: no drive {unknown[0]}; has {shown}")
-        rows = [known[name] for name in drives]
+    rows = drive_rows(folder, drives)
     loaded = []
     for row in rows:
         tables = read_checked(folder, row, reference=reference, limits=limits)
@@ -47,6 +41,18 @@ def load_dataset(
         if progress is not None:
             progress(row.name, len(loaded), len(rows))
     return loaded
+
+
+def drive_rows(folder: str | Path, drives: Sequence[str] | None = None) -> list[DriveRow]:
+    """What ``drives.parquet`` says of all drives, or of those named; InputError for an unknown one."""
+    rows = read_drives(folder)
+    if drives is None:
+        return rows
+    known = {row.name: row for row in rows}
+    if unknown := [name for name in drives if name not in known]:
+        shown = ", ".join(list(known)[:8]) + (", …" if len(known) > 8 else "")
+        raise InputError(f"dataset {folder}: no drive {unknown[0]}; has {shown}")
+    return [known[name] for name in drives]
 
 
 def drive_from_tables(

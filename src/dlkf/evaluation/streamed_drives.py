@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
-from dlkf.data.store import drive_from_tables
-from dlkf.data.tables import Columns, read_drives
+from dlkf.data.store import drive_from_tables, drive_rows
+from dlkf.data.tables import Columns
 from dlkf.data.validate import DriveTables, read_checked
 from dlkf.errors import InputError
 from dlkf.evaluation.drives import Navigated
@@ -18,6 +18,10 @@ from dlkf.filters.estimate import Estimate, estimates_table
 from dlkf.filters.integration import Estimator
 from dlkf.filters.start import align
 from dlkf.filters.streaming import Receipt, Status, StreamingFilter
+
+
+class UnalignedError(InputError):
+    """The drive never gives a filter a start."""
 
 
 def played(
@@ -51,7 +55,7 @@ def stream_drive(
 ) -> Navigated:
     """One drive through a stream, on the grid that the loader gives it: the same solution as its batch run.
 
-    Raises InputError if the drive cannot be aligned, or the filter diverges.
+    Raises UnalignedError if the drive cannot be aligned, InputError if the filter diverges.
     """
     drive = drive_from_tables(tables, "", rate_hz, epoch_s, torch.float64)
     stream = StreamingFilter(
@@ -65,8 +69,10 @@ def stream_drive(
             reason = receipt.reason or "the filter diverged (its output is not finite)"
             raise InputError(f"drive {tables.row.name}: {reason}")
     if not found:
-        align(drive)  # raises what is missing
-        raise InputError(f"drive {tables.row.name}: shorter than its alignment and an epoch")
+        try:
+            align(drive)
+        except InputError as error:
+            raise UnalignedError(str(error)) from None
     estimates = [found[t] for t in sorted(found)]
     return Navigated(tables.row.name, estimates[0].t - epoch_s, estimates_table(estimates))
 
@@ -86,23 +92,20 @@ def stream_drives(
     As :func:`dlkf.evaluation.drives.navigate_drives` does, a drive that cannot be aligned raises InputError or goes
     to ``skipped``, unless none is left. ``progress(drives done, drives in all)``.
     """
-    rows = {row.name: row for row in read_drives(folder)}
-    if unknown := [name for name in drives or () if name not in rows]:
-        raise InputError(f"dataset {folder}: no drive {unknown[0]}; has {', '.join(list(rows)[:8])}")
-    names = list(rows if drives is None else drives)
+    rows = drive_rows(folder, drives)
     solved = 0
-    for k, name in enumerate(names):
-        tables = read_checked(folder, rows[name], reference=False)
+    for k, row in enumerate(rows):
+        tables = read_checked(folder, row, reference=False)
         try:
             result = stream_drive(tables, estimator, rate_hz=rate_hz, epoch_s=epoch_s)
-        except InputError as error:
+        except UnalignedError as error:
             if skipped is None:
                 raise
-            skipped[name] = str(error)
+            skipped[row.name] = str(error)
         else:
             solved += 1
             yield result
         if progress is not None:
-            progress(k + 1, len(names))
+            progress(k + 1, len(rows))
     if not solved:
         raise InputError(next(iter((skipped or {}).values()), "no drives: give a dataset with at least one"))
