@@ -142,7 +142,7 @@ def motion_figure(drives: Sequence[Driving], title: str) -> Figure:
     radius.set_xscale("log")
     sharp = radii < SHARP
     sideways = np.abs(joined.lateral[turning][sharp])
-    _histogram(lateral, sideways, steady[sharp], PAPER["lateral"], f"|lateral| below {SHARP:g} m radius [m/s²]")
+    _histogram(lateral, sideways, steady[sharp], PAPER["lateral"], f"|lateral| below {SHARP:g} m [m/s²]")
     speed.set_ylabel("share of time")
     radius.legend(frameon=False, fontsize=8)
     figure.suptitle(f"{title}: {len(drives)} drives; dashed: the bounds R085-R088", x=0.01, ha="left")
