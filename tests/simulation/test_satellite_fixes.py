@@ -5,9 +5,11 @@ import math
 import numpy as np
 import pymap3d
 import pytest
+import yaml
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
+from dlkf.config import config_dir
 from dlkf.errors import InputError
 from dlkf.simulation.almanac import read_almanac
 from dlkf.simulation.gnss import GnssConfig
@@ -224,6 +226,17 @@ def test_clock_walks_as_its_spectra_say():
 
 def test_white_is_no_receiver():
     assert receiver_spec({"name": "white"}) is None and receiver_spec(None) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "limits"), [("undisturbed", (0.005, 0.05)), ("rtk", (0.004, 0.05)), ("standalone", (0.5, 6.0))]
+)
+def test_presets_are_as_good_as_they_say(name, limits):
+    """Under an open sky: centimetres for the paper's undisturbed satellites and for RTK, metres for a lone receiver."""
+    preset = receiver_spec(yaml.safe_load((config_dir() / "receiver" / f"{name}.yaml").read_text()))
+    fixes = received(preset, straight(200)).fixes
+    assert fixes[STD[:3]].min().min() > limits[0] and fixes[STD[:3]].max().max() < limits[1]
+    assert (fixes.quality == preset.quality).all()
 
 
 @pytest.mark.parametrize(
