@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.filters.integration import Estimator, Solution, integrate
+from dlkf.filters.smoother import Smoothed, smooth
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import NavState
 
@@ -46,9 +47,9 @@ def chunks(batch: Batch, samples: int = CHUNK_SAMPLES) -> Iterator[Tensor]:
 
 
 def run_filter(batch: Batch, estimator: Estimator) -> Solution:
-    """The filter loop without gradients, on the device of the estimator's parameters."""
+    """The filter loop, smoothed where asked for, without gradients, on the device of the estimator's parameters."""
     parameter = next(estimator.parameters(), None) if isinstance(estimator, torch.nn.Module) else None
     if parameter is not None:
         batch = batch.to(parameter.device)
     with torch.inference_mode():
-        return integrate(batch, estimator)
+        return smooth(batch, estimator.filter) if isinstance(estimator, Smoothed) else integrate(batch, estimator)

@@ -8,6 +8,7 @@ from dataclasses import fields
 from dlkf.errors import InputError
 from dlkf.filters.integration import Estimator
 from dlkf.filters.model_based import Ins, Mbkf
+from dlkf.filters.smoother import Smoothed
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.state import ErrorStates
@@ -19,6 +20,7 @@ ENDINGS: Mapping[str, str] = {
     "car": "the same, with mounting angles, rear axle and sideslip as states",
     "gated": "refuses outliers",
     "gm": "biases as first-order Gauss-Markov processes",
+    "rts": "smoothed backwards over the whole drive (Rauch-Tung-Striebel)",
 }
 MODEL_BASED: tuple[str, ...] = ("ins", "mbkf15", "mbkf15_prior", "mbkf21", "mbkf33", "aekf")
 
@@ -58,7 +60,7 @@ def build_filter(
         if len(prior_mean) != 6 or len(prior_std) != 6:
             raise InputError(f"prior.mean and prior.std of {name} must have 6 values (m/s² x3, rad/s x3)")
         given = {"prior_mean": tuple(map(float, prior_mean)), "prior_std": tuple(map(float, prior_std))}
-    return Mbkf(
+    estimator = Mbkf(
         imu,
         tuning if isinstance(tuning, Tuning) else _tuning(tuning or {}),
         ErrorStates(KALMAN[base], structure="car" in endings),
@@ -68,6 +70,7 @@ def build_filter(
         adaptive=base == "aekf",
         **given,
     )
+    return Smoothed(estimator) if "rts" in endings else estimator
 
 
 def known_filters() -> str:

@@ -1,0 +1,95 @@
+"""Rauch-Tung-Striebel smoother over a closed-loop error-state filter: the best use of a whole drive (Groves 3.4.3).
+
+A closed-loop filter starts every epoch with a zero error state, so what the future knows of epoch k beyond its
+filtered state is δₖ, the smoothed error of that state:
+
+    δₖ = Gₖ (dxₖ₊₁ + δₖ₊₁)     Gₖ = Pₖ⁺ Φₖ₊₁ᵀ (Pₖ₊₁⁻)⁻¹     Pₖˢ = Pₖ⁺ + Gₖ (Pₖ₊₁ˢ − Pₖ₊₁⁻) Gₖᵀ
+
+with dxₖ₊₁ the correction that the filter made at k+1. The smoothed state is the filtered one ⊞ δₖ.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dlkf.data.drive import Batch
+from dlkf.errors import InputError
+from dlkf.filters.integration import Correction, Epoch, Estimator, Solution, integrate
+from dlkf.navigation.state import IMU, PVA, STATES, NavState
+
+ROUNDING = 1e-13  # added to unit variances
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """A filter whose solution is to be smoothed; as an estimator it is the filter itself."""
+
+    filter: Estimator
+
+    def begin(self, batch: Batch) -> tuple[Any, Tensor]:
+        """The filter's start."""
+        return self.filter.begin(batch)
+
+    def step(self, memory: Any, epoch: Epoch) -> tuple[Any, Correction]:
+        """The filter's step."""
+        return self.filter.step(memory, epoch)
+
+
+def smooth(batch: Batch, estimator: Estimator) -> Solution:
+    """Filter a batch forwards and smooth it backwards; the solution's posterior, IMU error and std are smoothed.
+
+    Epochs in the padding after a piece's end carry nothing back. Raises InputError for a filter without a
+    covariance (``ins``, a learned filter).
+    """
+    filtered = integrate(batch, estimator, keep_covariances=True)
+    known = filtered.covariances
+    if known is None:
+        raise InputError("smoother=rts needs a filter with a covariance: mbkf15, mbkf21, mbkf33, aekf, with endings")
+    present = batch.present.to(known.updated.device)
+    T = present.shape[1]
+    delta, P = torch.zeros_like(known.dx[:, -1]), known.updated[:, -1]
+    deltas, variances = [delta], [P.diagonal(dim1=-2, dim2=-1)]
+    for k in range(T - 2, -1, -1):
+        predicted, updated = known.predicted[:, k + 1], known.updated[:, k]
+        G = _gain(predicted, known.Phi[:, k + 1] @ updated)
+        here = present[:, k + 1, None]
+        carried = (G @ (known.dx[:, k + 1] + delta).unsqueeze(-1)).squeeze(-1)
+        delta = torch.where(here, carried, 0.0)
+        smoothed = updated + G @ (P - predicted) @ G.mT
+        P = torch.where(here.unsqueeze(-1), 0.5 * (smoothed + smoothed.mT), updated)
+        deltas.append(delta)
+        variances.append(P.diagonal(dim1=-2, dim2=-1))
+    dx, variance = (torch.stack(x[::-1], 1) for x in (deltas, variances))
+    return replace(
+        filtered,
+        posterior=NavState(*filtered.posterior).corrected(dx[..., PVA]),
+        imu_error=filtered.imu_error + dx[..., IMU] + _matrix_part(filtered, dx, batch, estimator),
+        std=variance[..., :STATES].clamp_min(0).sqrt(),
+    )
+
+
+def _gain(predicted: Tensor, cross: Tensor) -> Tensor:
+    """(P⁻⁻¹ Φ P⁺)ᵀ, with states brought to unit variance; one that is known for certain (variance 0) gains nothing."""
+    sigma = predicted.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+    certain = sigma == 0
+    unit = torch.where(certain, 1.0, sigma)
+    normalised = predicted / (unit.unsqueeze(-1) * unit.unsqueeze(-2)) + torch.diag_embed(certain + ROUNDING)
+    solved = torch.cholesky_solve(cross / unit.unsqueeze(-1), torch.linalg.cholesky_ex(normalised)[0])
+    return (solved / unit.unsqueeze(-1)).mT
+
+
+def _matrix_part(filtered: Solution, dx: Tensor, batch: Batch, estimator: Any) -> Tensor | float:
+    """What the smoothed change of the sensor matrices makes of each epoch's mean sample (B, T, 6)."""
+    states = estimator.states
+    if not states.elements:
+        return 0.0
+    mean = batch.imu.mean(2) - filtered.imu_error
+    change = dx[..., states.of_matrix].unflatten(-1, (2, -1))
+    parts = torch.zeros_like(mean).unflatten(-1, (2, 3))
+    for n, (i, j) in enumerate(states.elements):
+        parts[..., i] += change[..., n] * mean.unflatten(-1, (2, 3))[..., j]
+    return parts.flatten(-2)
