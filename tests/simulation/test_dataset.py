@@ -83,6 +83,39 @@ def test_one_unit_or_a_new_one_per_drive(tmp_path):
     assert len(set(biases(imu_errors="per_drive"))) == 3
 
 
+def test_a_fleet_has_new_units_of_several_types(tmp_path):
+    kinds = {name: {"name": name, "accel": BIASED, "gyro": BIASED} for name in ("a", "b", "c")}
+    fleet = config(imu_errors="fleet", fleet=kinds, hours=0.2)
+    drives = pd.read_parquet(simulate_from_config(fleet, tmp_path / "fleet", progress=False) / "drives.parquet")
+    assert set(drives.imu) == {"a", "b", "c"}
+    biases = [table(tmp_path / "fleet", "reference", k).accel_error_x.iloc[0] for k in range(len(drives))]
+    assert len(set(biases)) == len(drives) == 12
+
+
+CAR = {"sideslip": 0.0075, "imu_arm": [-0.32, 0.0, -0.6], "roughness": 64e-6, "vibration": 0.2}
+
+
+def test_velocity_across_the_car_is_told_and_zero_for_a_point(tmp_path):
+    point = pd.read_parquet(simulate_from_config(config(), tmp_path / "point", progress=False) / "drives.parquet")
+    car = pd.read_parquet(
+        simulate_from_config(config(chassis=CAR), tmp_path / "car", progress=False) / "drives.parquet"
+    )
+    for column in ("lateral_axle_mps", "lateral_imu_mps", "down_imu_mps"):
+        assert point[column].max() < 1e-12
+        assert car[column].max() > 0.01
+    assert (car.imu_arm_x_m == -0.32).all() and (car.sideslip_s2pm == 0.0075).all()
+    reference, moved = table(tmp_path / "car", "reference"), table(tmp_path / "point", "reference")
+    apart = np.hypot(reference.vel_n - moved.vel_n, reference.vel_e - moved.vel_e)
+    assert 0 < apart.max() < 1.0  # the same road
+
+
+def test_tunnels_leave_no_fixes(tmp_path):
+    tunnels = {"tunnel_length": 100.0, "tunnel_spacing": 100.0}
+    out = simulate_from_config(config(surroundings=tunnels, drive_minutes=3.0), tmp_path / "toy", progress=False)
+    t = table(out, "gnss").t
+    assert len(t) < 170 and np.diff(t).max() > 4
+
+
 def test_existing_data_are_kept_unless_told(tmp_path):
     out = simulate_from_config(config(), tmp_path / "toy", progress=False)
     before = digest(out)
@@ -126,6 +159,16 @@ def test_hours_are_shared_out_evenly():
         ({"name": "a/b"}, "name"),
         ({"hour": 1.0}, "hour"),
         ({"vehicle": {"max_sped": 1.0}}, "max_sped"),
+        ({"vehicle": {"manoeuvres": {"turns": 1.0}}}, "turns"),
+        ({"vehicle": {"manoeuvres": {"turn": 0.9}}}, "sum"),
+        ({"vehicle": {"min_radius": 40.0, "max_radius": 30.0}}, "max_radius"),
+        ({"vehicle": {"min_lateral": 5.0, "min_radius": 150.0}}, "98.6 km/h"),
+        ({"chassis": {"sideslip": -1.0}}, "sideslip"),
+        ({"chassis": {"imu_arm": "left"}}, "imu_arm"),
+        ({"surroundings": {"tunnel_length": -3.0}}, "tunnel_length"),
+        ({"imu_errors": "fleet"}, "fleet"),
+        ({"fleet": ["consumer"]}, "fleet"),
+        ({"fleet": {"a": {"name": "a"}}}, "accel"),
         ({"vehicle": {"max_speed_kmh": 10.0}}, "km/h"),
         ({"gnss": {"lever_arm_b": [1.0]}}, "lever_arm_b"),
         ({"gnss": {"lever_arm_b": 1.0}}, "lever_arm_b"),
