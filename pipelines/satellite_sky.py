@@ -21,7 +21,7 @@ import pymap3d
 import torch
 from matplotlib.figure import Figure
 
-from dlkf.data.schema import ATTITUDE, VELOCITY, drive_file
+from dlkf.data.schema import ATTITUDE, POSITION, VELOCITY, drive_file
 from dlkf.data.tables import read_drives
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.simulation import sky_figures
@@ -88,6 +88,18 @@ def summary(dataset: Path) -> None:
         print(f"{name} error RMS N, E, D {rms.round(4)}, claimed {claimed.round(4)}, error/σ RMS {ratio.round(3)}")
 
 
+def above_horizon(raw: pd.DataFrame, reference: pd.DataFrame) -> pd.DataFrame:
+    """prn, azimuth and elevation [rad] of everything above the horizon over the drive, with the packaged almanac."""
+    almanac, epoch = read_almanac(), raw.iloc[0]
+    start = (epoch.gps_week - almanac.week) * 604800 + epoch.tow - almanac.toa
+    t = start + np.linspace(0, raw.t.iloc[-1] - epoch.t, 60)
+    place = pymap3d.geodetic2ecef(*(reference[name].median() for name in POSITION))
+    seen = signals(almanac, t, np.tile(place, (len(t), 1)), np.zeros((len(t), 3)))
+    row, column = np.nonzero(seen.elevation > 0)
+    columns = {"azimuth": seen.azimuth[row, column], "elevation": seen.elevation[row, column]}
+    return pd.DataFrame({"prn": almanac.prn[column], **columns})
+
+
 def save(figure: Figure, folder: Path, name: str) -> None:
     """A PNG of a figure."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -104,7 +116,7 @@ def pictures(dataset: Path, drive: str | None, folder: Path) -> None:
     fixes, reference, raw = tables(dataset, name)
     title, stem = f"{name}", dataset.name
     if raw is not None:
-        save(sky_figures.sky_plot(raw, title), folder, f"{stem}_sky")
+        save(sky_figures.sky_plot(raw, above_horizon(raw, reference), title), folder, f"{stem}_sky")
     save(sky_figures.dilution(fixes, title), folder, f"{stem}_dilution")
     save(sky_figures.route(fixes, reference, title), folder, f"{stem}_route")
     error = fix_errors(fixes, reference, np.array(rows[name].lever_arm_b))

@@ -20,8 +20,9 @@ COUNTS = np.arange(3.5, 13.5)  # limits of the colours of a number of satellites
 DPI = 110
 
 
-def sky_plot(raw: pd.DataFrame, title: str = "") -> Figure:
-    """Where the tracked satellites were: azimuth around, elevation inwards, the name at the last place."""
+def sky_plot(raw: pd.DataFrame, above: pd.DataFrame, title: str = "") -> Figure:
+    """Azimuth around, elevation inwards: tracks of all satellites ``above`` the horizon (prn, azimuth, elevation [rad])
+    in grey, the epochs at which each was tracked in blue, the name at the last place."""
     figure = Figure(figsize=(5.6, 5.6), layout="constrained", dpi=DPI)
     axes = figure.add_subplot(projection="polar")
     axes.set_theta_zero_location("N")
@@ -29,13 +30,16 @@ def sky_plot(raw: pd.DataFrame, title: str = "") -> Figure:
     axes.set_thetagrids(range(0, 360, 45), ("N", "45°", "E", "135°", "S", "225°", "W", "315°"))
     axes.set_rlim(0, 90)
     axes.set_rgrids((0, 30, 60), ("90°", "60°", "30°"), angle=67.5)
-    for prn, track in raw.groupby("prn"):
-        zenith = 90 - np.degrees(track.elevation)
-        axes.plot(track.azimuth, zenith, ".", color=BLUE, markersize=2)
-        last = track.azimuth.iloc[-1], zenith.iloc[-1]
-        axes.plot(*last, "o", color=BLUE, markersize=9)
-        axes.annotate(f"G{prn:02d}", last, xytext=(7, 5), textcoords="offset points", fontsize=9)
-    axes.set_title(title, fontsize=10)
+    share = raw.groupby("prn").size() / raw.t.nunique()
+    for prn, track in above.groupby("prn"):
+        tracked = raw[raw.prn == prn]
+        axes.plot(track.azimuth, 90 - np.degrees(track.elevation), color="#999999", linewidth=3, zorder=1)
+        axes.plot(tracked.azimuth, 90 - np.degrees(tracked.elevation), ".", color=BLUE, markersize=4, zorder=2)
+        last = track.azimuth.iloc[-1], 90 - np.degrees(track.elevation.iloc[-1])
+        axes.plot(*last, "o", color=BLUE if len(tracked) else "#999999", markersize=6, zorder=3)
+        text = f"G{prn:02d} {100 * share.get(prn, 0.0):.0f} %"
+        axes.annotate(text, last, xytext=(7, 5), textcoords="offset points", fontsize=8)
+    axes.set_title(f"{title}\nshare of the epochs in which each was tracked", fontsize=10)
     return figure
 
 
