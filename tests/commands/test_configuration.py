@@ -21,6 +21,8 @@ GROUPS = {  # group of the defaults list: folder under conf/
     "ingest": {"reader": "reader"},
     "evaluate": {"imu": "imu"},
     "navigate": {"imu": "imu"},
+    "allan": {"imu": "imu"},
+    "consistency": {"imu": "imu", "chassis@chassis": "chassis"},
     "train": {"imu": "imu", "data": "data", "filter@model": "filter"},
 }
 

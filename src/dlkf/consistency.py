@@ -1,0 +1,55 @@
+"""NEES and NIS of Kalman filters: ``python -m dlkf.consistency 'model=[mbkf15,mbkf21]' imu=consumer drives=100``.
+
+Simulates, for every filter, drives with the IMU errors that it models, and leaves table.md, consistency.png and
+consistency.json in ``out``.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+
+from dlkf.command import command
+from dlkf.errors import InputError
+from dlkf.evaluation.consistency import Normalised, consistency, consistency_table, states_of, write_consistency
+from dlkf.evaluation.matched_drives import matched_batch, matched_drives, matching
+from dlkf.evaluation.outages import OutagePlan, with_outage
+from dlkf.evaluation.progress import counting
+from dlkf.evaluation.table import as_rich
+from dlkf.filters.build import build_filter
+from dlkf.navigation.imu_errors import imu_spec
+
+
+@command("consistency")
+def main(cfg: DictConfig) -> None:
+    """Simulate, run, compare, write, print."""
+    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
+    names = [config["model"]] if isinstance(config["model"], str) else list(config["model"])
+    if not names:
+        raise InputError("model is an empty list; give at least one Kalman filter, such as model=mbkf15")
+    settings, preset = matched_drives(config), imu_spec(config["imu"])
+    states = {name: states_of(name, build_filter(name, preset, tuning=config["tuning"])) for name in names}
+    results: dict[str, Normalised] = {}
+    outage = None
+    for name in names:
+        spec = matching(preset, states[name])
+        with counting(f"Simulating for {name}") as progress:
+            batch, matrices = matched_batch(settings, spec, progress)
+        if config["outage"] is not None:
+            (mask,) = OutagePlan(**config["outage"]).masks(batch)
+            batch, outage = with_outage(batch, mask), mask[0].numpy()
+        with counting(f"Running {name}") as progress:
+            filters = build_filter(name, spec, tuning=config["tuning"])
+            results[name] = consistency(filters, batch, matrices, progress)
+    title = f"{settings.drives} simulated drives of {settings.minutes:g} min, IMU {preset.name}, errors as modelled"
+    table = consistency_table(results, config["settle_s"], title)
+    write_consistency(config["out"], results, table, outage)
+    Console(width=None if sys.stdout.isatty() else 110).print(as_rich(table))
+    print(f"Report: {config['out']}/consistency.png, table.md")
+
+
+if __name__ == "__main__":
+    main()
