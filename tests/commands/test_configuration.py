@@ -17,12 +17,12 @@ from dlkf.training.loss import LossConfig
 
 CONF = config_dir()
 GROUPS = {  # group of the defaults list: folder under conf/
-    "simulate": {"imu": "imu", "simulated@dataset": "simulated"},
+    "simulate": {"imu": "imu", "receiver": "receiver", "simulated@dataset": "simulated"},
     "ingest": {"reader": "reader"},
     "evaluate": {"imu": "imu"},
     "navigate": {"imu": "imu"},
     "allan": {"imu": "imu"},
-    "consistency": {"imu": "imu", "chassis@chassis": "chassis"},
+    "consistency": {"imu": "imu", "chassis": "chassis"},
     "train": {"imu": "imu", "data": "data", "filter@model": "filter"},
 }
 
