@@ -8,7 +8,8 @@ course, C_nb u_b = u_n is solved for roll and pitch in closed form (Groves sect.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,11 +17,13 @@ from torch import Tensor
 
 from dlkf.data.drive import Drive
 from dlkf.data.geodetic import geodetic_from_ecef
-from dlkf.navigation.attitude import prefix_rotations, rotation_from_rpy, rotation_from_vector
+from dlkf.errors import InputError
+from dlkf.navigation.attitude import prefix_rotations, rotation_from_rpy, rotation_from_vector, rpy_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, ned_axes, normal_gravity
 from dlkf.navigation.state import NavState
 
 SIDESLIP_STD = math.radians(1.5)  # course is not heading: sideslip, mounting yaw
+AXLE_STD = 0.7  # m, how far the IMU may sit before the rear axle; in a turn that is no small angle
 ACCEL_BIAS_STD = 0.1  # m/s²; tilts the level by bias / g
 UNKNOWN_VELOCITY_STD, UNKNOWN_SLOPE_STD = 0.2, 0.05  # m/s and slope of the road, where v_d is not measured
 JERK_STD = 0.7  # m/s³, of a car
@@ -29,10 +32,37 @@ SPREAD_STD = math.radians(0.5)  # lever arm to the rear axle, vibration
 
 @dataclass(frozen=True)
 class AlignConfig:
-    """``min_speed`` [m/s] below which course is no heading; ``window_s`` [s] over which f is levelled."""
+    """``min_speed`` [m/s] below which course is no heading; ``window_s`` [s] over which f is levelled.
+
+    ``search_s`` [s] of motion over which headings are weighed against each other, 0 to believe the course;
+    ``from_rest``: start with the first fix, not with first motion (both look ahead: :mod:`dlkf.filters.start`).
+    """
 
     min_speed: float = 2.0
     window_s: float = 2.0
+    search_s: float = 0.0
+    from_rest: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("min_speed", "window_s", "search_s"):
+            value = getattr(self, name)
+            number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+            if not number or value < 0 or (value == 0 and name != "search_s"):
+                above = "≥ 0" if name == "search_s" else "above 0"
+                raise InputError(f"align.{name} is {value!r}, must be a number {above}")
+        if not isinstance(self.from_rest, bool):
+            raise InputError(f"align.from_rest is {self.from_rest!r}, must be true or false")
+
+    @staticmethod
+    def of(config: AlignConfig | Mapping[str, float | bool] | None) -> AlignConfig:
+        """From a mapping of its fields; InputError for unknown ones."""
+        if isinstance(config, AlignConfig):
+            return config
+        config = dict(config or {})
+        known = [f.name for f in fields(AlignConfig)]
+        if unknown := sorted(set(config) - set(known)):
+            raise InputError(f"align: unknown key {unknown[0]}; known are {', '.join(known)}")
+        return AlignConfig(**config)
 
 
 ALIGN = AlignConfig()
@@ -109,13 +139,32 @@ def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     shift = torch.maximum(drive.gnss_lag, drive.gnss_lag[then])  # of the velocities' window against the IMU's
     pull = (1.41 * noise / span) ** 2 + (JERK_STD * shift) ** 2 + ACCEL_BIAS_STD**2  # (m/s²)²
     tilt = torch.sqrt(pull / 9.8**2 + SPREAD_STD**2)
-    heading = torch.sqrt(SIDESLIP_STD**2 + (noise / speed.clamp_min(0.1)) ** 2)
+    turning = AXLE_STD * rate_b[:, 2]  # m/s across the car
+    heading = torch.sqrt(SIDESLIP_STD**2 + (noise**2 + turning**2) / speed.clamp_min(0.1) ** 2)
     attitude_std = torch.stack((tilt, tilt, heading), -1)
     std = torch.cat((drive.gnss_std[:, :3], v_std, attitude_std), -1)
     C_eb = C_en @ C_nb
     finite = torch.cat((r_e, now, C_eb.flatten(1), std), -1).isfinite().all(-1)
     ok &= (speed > config.min_speed) & finite
     return Aligned(ok, r_e, (C_en @ now.unsqueeze(-1)).squeeze(-1), C_eb, std)
+
+
+def mean_force(drive: Drive, row: int, config: AlignConfig = ALIGN) -> Float[Tensor, " 3"]:
+    """Mean specific force [m/s²] of the window that ends at boundary ``row``, carried to the body axes there."""
+    back = min(row, max(1, round(config.window_s / drive.epoch_s)))
+    return _carried_force(drive.part(row - back, row), back)[0][-1]
+
+
+def levelled(
+    C_nb: Float[Tensor, "*k 3 3"], force_b: Float[Tensor, " 3"], force_n: Float[Tensor, " 3"]
+) -> Float[Tensor, "*k 3 3"]:
+    """Attitudes with the yaw of ``C_nb`` under which ``force_b`` is ``force_n`` [m/s²]."""
+    yaw = rpy_from_rotation(C_nb)[..., 2]
+    zero = torch.zeros_like(yaw)
+    C_level = rotation_from_rpy(torch.stack((zero, zero, yaw), -1))
+    force_h = (C_level.mT @ force_n.unsqueeze(-1)).squeeze(-1)
+    roll, pitch = _level(force_b.expand_as(force_h), force_h)
+    return rotation_from_rpy(torch.stack((roll, pitch, yaw), -1))
 
 
 def _velocity(
@@ -168,11 +217,11 @@ def _carried_force(
 
 
 def _level(
-    u_b: Float[Tensor, "rows 3"], u_h: Float[Tensor, "rows 3"]
-) -> tuple[Float[Tensor, " rows"], Float[Tensor, " rows"]]:
+    u_b: Float[Tensor, "*b 3"], u_h: Float[Tensor, "*b 3"]
+) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
     """Roll and pitch with Ry(pitch) Rx(roll) u_b = u_h, u_h in level axes along the heading."""
     x, y, z = u_b.unbind(-1)
-    roll = torch.asin((u_h[:, 1] / torch.hypot(y, z)).clamp(-1, 1)) - torch.atan2(y, -z)
+    roll = torch.asin((u_h[..., 1] / torch.hypot(y, z)).clamp(-1, 1)) - torch.atan2(y, -z)
     down = torch.sin(roll) * y + torch.cos(roll) * z
-    pitch = torch.atan2(x, -down) - torch.asin((u_h[:, 0] / torch.hypot(x, down)).clamp(-1, 1))
+    pitch = torch.atan2(x, -down) - torch.asin((u_h[..., 0] / torch.hypot(x, down)).clamp(-1, 1))
     return roll, pitch

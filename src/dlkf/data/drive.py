@@ -46,6 +46,17 @@ class Drive:
         """Number of epochs N."""
         return self.imu.shape[0]
 
+    def part(self, first: int, last: int) -> Drive:
+        """Epochs ``first`` to ``last`` − 1 as a drive of its own."""
+        rows = slice(first, last + 1)
+        of_boundaries = [f.name for f in fields(self) if f.name.startswith(("gnss_", "ref_"))] + ["quality"]
+        return replace(
+            self,
+            t0=self.t0 + first * self.epoch_s,
+            imu=self.imu[first:last],
+            **{name: getattr(self, name)[rows] for name in of_boundaries},
+        )
+
 
 @dataclass(frozen=True)
 class Batch:
