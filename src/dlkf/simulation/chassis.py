@@ -130,13 +130,13 @@ def mounted(rng: np.random.Generator, car: Car, route: Route, axle: Truth) -> Tr
     C = rotation_from_rpy(torch.from_numpy(axle.rpy)).numpy()
     rate = np.stack((-motion.yaw_rate * np.sin(slope), slope_rate, motion.yaw_rate * np.cos(slope)), -1)
     C, rate = _turned(C, rate, 0, *route.bank(motion))
-    C, rate = _turned(C, rate, 2, -slip, -slip_rate)
+    C, rate = _turned(C, rate, 2, shake[:, 5] - slip, shake_rate[:, 5] - slip_rate)
     moved, moved_rate = shake[:, :3].copy(), shake_rate[:, :3].copy()
     moved[:, 2] -= heave
     moved_rate[:, 2] -= heave_rate
     offset, change = _rotated(C, moved), _rotated(C, np.cross(rate, moved) + moved_rate)
-    C, rate = _turned(C, rate, 1, pitch + shake[:, 3], pitch_rate + shake_rate[:, 3])
-    C, rate = _turned(C, rate, 0, roll + shake[:, 4], roll_rate + shake_rate[:, 4])
+    C, rate = _turned(C, rate, 1, pitch + shake[:, 4], pitch_rate + shake_rate[:, 4])
+    C, rate = _turned(C, rate, 0, roll + shake[:, 3], roll_rate + shake_rate[:, 3])
     arm = np.broadcast_to(car.imu_arm, rate.shape)
     offset += _rotated(C, arm)
     change += _rotated(C, np.cross(rate, arm))
@@ -186,16 +186,16 @@ def rough_road(rng: np.random.Generator, roughness: float, distance: Array) -> A
 
 
 def vibration(rng: np.random.Generator, kind: ChassisConfig, motion: Kinematics) -> tuple[Array, Array]:
-    """Displacement along three axes [m], pitch and roll [rad] by vibration, and their rates, (N, 5) each.
+    """Displacement along three axes [m] and roll, pitch, yaw [rad] by vibration, and their rates, (N, 6) each.
 
     Tones of fixed amplitude with phase 2π(f t + g s): the frequency f + g v rises with the speed v, the specific
     force with its square, as an unbalanced mass has it. All lie below 50 Hz up to 130 km/h.
     """
-    shake, change = (np.zeros((len(motion.t), 5)) for _ in range(2))
+    shake, change = (np.zeros((len(motion.t), 6)) for _ in range(2))
     for rest, per_metre, share in TONES:
-        start = rng.uniform(0, 2 * math.pi, 5)
+        start = rng.uniform(0, 2 * math.pi, 6)
         w = 2 * math.pi * (rest + per_metre * TONE_SPEED)
-        size = math.sqrt(2 * share) * np.array([kind.vibration / w**2] * 3 + [kind.vibration_rate / w] * 2)
+        size = math.sqrt(2 * share) * np.array([kind.vibration / w**2] * 3 + [kind.vibration_rate / w] * 3)
         phase = 2 * math.pi * (rest * motion.t + per_metre * motion.distance)[:, None] + start
         shake += size * np.sin(phase)
         change += size * np.cos(phase) * 2 * math.pi * (rest + per_metre * motion.speed)[:, None]
