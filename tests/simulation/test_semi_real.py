@@ -101,6 +101,26 @@ def test_the_antenna_is_where_the_lever_arm_says(real, tmp_path):
     assert np.allclose(moved, 1.0, atol=0.15)
 
 
+def test_a_fix_claims_no_more_than_the_reference_holds(real, tmp_path):
+    """Positions that jump by 0.1 m north, 0.3 m down: known to 5 · 10 % from 50 epochs. A smooth one adds 1 mm."""
+    rng = np.random.default_rng(9)
+
+    def jumping(reference):
+        shift = rng.standard_normal((len(reference), 2)) * (0.1, 0.3)
+        return reference.assign(
+            lat_deg=reference.lat_deg + np.degrees(shift[:, 0] / 6.37e6), height_m=reference.height_m + shift[:, 1]
+        )
+
+    smooth = tables(semi(real, tmp_path / "smooth"), "r1")["gnss"]
+    out = semi(changed(real, tmp_path / "source", jumping), tmp_path / "rough")
+    rough = tables(out, "r1")["gnss"]
+    assert smooth.std_pos_n.to_numpy() == pytest.approx(0.02, abs=1e-3)
+    assert rough.std_pos_n.to_numpy() == pytest.approx(0.1, rel=0.5)
+    assert rough.std_pos_d.to_numpy() == pytest.approx(0.3, rel=0.5)
+    assert rough.std_pos_e.to_numpy() == pytest.approx(0.02, abs=1e-3)
+    assert pd.read_parquet(out / "drives.parquet").reference_roughness_m[0] == pytest.approx(0.18, rel=0.5)
+
+
 def test_they_are_marked_and_carry_source_and_licence(real, tmp_path):
     out = semi(real, tmp_path / "semi")
     rows = pd.read_parquet(out / "drives.parquet")

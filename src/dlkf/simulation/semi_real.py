@@ -1,6 +1,7 @@
 """Semi-real drives: a real car's motion and its high-grade IMU, with the errors of another IMU and GNSS made anew.
 
-Truth stays the source's reference. GNSS exists only where the reference is known: a fix is made of it.
+Truth stays the source's reference. GNSS exists only where the reference is known: a fix is made of it, and claims
+no more than the reference holds.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from rich.progress import track
 
 from dlkf.data.geodetic import geodetic_from_ecef
 from dlkf.data.resampling import Grid, reference_at
-from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR, new_dataset, write_drive, write_drives_table
-from dlkf.data.tables import read_drives
+from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR, VELOCITY, new_dataset, write_drive, write_drives_table
+from dlkf.data.tables import Columns, read_drives
 from dlkf.data.validate import DriveTables, read_checked, validate_dataset
 from dlkf.errors import InputError
 from dlkf.navigation.attitude import rpy_from_rotation
@@ -81,8 +82,8 @@ def simulate_semi_real(
             unit = shared if config.imu_errors == "one" else draw_unit(np.random.default_rng(unit_seed), kind)
             imu_rng, gnss_rng, sky_rng = (np.random.default_rng(stream) for stream in streams)
             imu, reference = injected(imu_rng, tables, kind, unit)
-            received = gnss_of_reference(gnss_rng, sky_rng, tables, config)
-            row = _row(described[index], config, kind)
+            received, rough = gnss_of_reference(gnss_rng, sky_rng, tables, config)
+            row = _row(described[index], config, kind, rough)
             written.append(write_drive(folder, row, imu, received.fixes, reference))
             if config.raw:
                 write_raw(folder, rows[index].name, received.raw)
@@ -120,10 +121,11 @@ def injected(
 
 def gnss_of_reference(
     rng: np.random.Generator, sky_rng: np.random.Generator, tables: DriveTables, config: DatasetConfig
-) -> Received:
-    """GNSS at whole multiples of 1/rate where the reference is known, between samples close enough to interpolate.
+) -> tuple[Received, Array]:
+    """GNSS at whole multiples of 1/rate where the reference is known, and the reference's roughness (3,) [m].
 
-    Where it is not known there is no fix, as under a roof. InputError if it is known nowhere, or has no attitude
+    Known is between valid samples close enough to interpolate; elsewhere there is no fix, as under a roof. The
+    :func:`roughness` is added in square to the position's std. InputError if it is known nowhere, or has no attitude
     while the configuration asks for a lever arm.
     """
     name, reference, gnss = tables.row.name, tables.reference, config.gnss
@@ -152,7 +154,28 @@ def gnss_of_reference(
     sky = Sky(sky.mask_left, sky.mask_right, sky.blocked | ~at.valid)
     middle = tables.imu["t"] - 0.5 * float(np.median(np.diff(tables.imu["t"])))
     rate_b = np.stack([np.interp(t, middle, tables.imu[c]) for c in GYRO], -1)
-    return receive(rng, truth, rate_b, gnss, config.receiver, sky)
+    received = receive(rng, truth, rate_b, gnss, config.receiver, sky)
+    rough = roughness(reference, t, C_ne.numpy(), np.where(at.valid[:, None], at.r_e, np.nan))
+    claimed = {f"std_pos_{a}": np.hypot(received.fixes[f"std_pos_{a}"], x) for a, x in zip("ned", rough)}
+    return Received(received.fixes.assign(**claimed), received.raw), rough
+
+
+def roughness(reference: Columns, t: Array, C_ne: Array, r_e: Array) -> Array:
+    """By how much [m, 1σ, (3,) in NED] the reference's positions jump from epoch to epoch ``t`` (T,).
+
+    RMS of the change of position ``r_e`` (T, 3), NaN where unknown, less the integral of the reference's velocities,
+    over √2: a fix made of such a position is no better, however small its own noise, since the car did not jump.
+    """
+    way = np.stack([np.interp(t, reference["t"], _integral(reference["t"], reference[c])) for c in VELOCITY], -1)
+    moved = (C_ne[:-1] @ np.diff(r_e, axis=0)[..., None])[..., 0]
+    jump = moved - np.diff(way, axis=0)
+    known = np.isfinite(jump).all(1)
+    return np.sqrt(np.mean(jump[known] ** 2, 0) / 2) if known.any() else np.zeros(3)
+
+
+def _integral(t: Array, rate: Array) -> Array:
+    steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(t)
+    return np.concatenate(((0.0,), np.cumsum(np.nan_to_num(steps))))
 
 
 def _epochs(t_imu: Array, t_reference: Array, rate_hz: float, name: str) -> Array:
@@ -164,7 +187,7 @@ def _epochs(t_imu: Array, t_reference: Array, rate_hz: float, name: str) -> Arra
     return np.arange(first, last + 1) / rate_hz
 
 
-def _row(described: dict[str, Any], config: DatasetConfig, spec: ImuSpec) -> dict[str, Any]:
+def _row(described: dict[str, Any], config: DatasetConfig, spec: ImuSpec, rough: Array) -> dict[str, Any]:
     """The drive's row of ``drives.parquet``: what it was, what was done to it, and the source's licence."""
     return {
         **described,
@@ -175,5 +198,6 @@ def _row(described: dict[str, Any], config: DatasetConfig, spec: ImuSpec) -> dic
         "imu_error": INJECTED,
         "gnss": f"{gnss_text(config)}, made of the reference",
         "gnss_rate_hz": config.gnss.rate_hz,
+        "reference_roughness_m": float(np.sqrt(np.mean(rough**2))),
         **{f"lever_arm_{axis}_m": float(x) for axis, x in zip("xyz", config.gnss.lever_arm_b)},
     }
