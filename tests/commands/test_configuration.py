@@ -22,6 +22,7 @@ GROUPS = {  # group of the defaults list: folder under conf/
     "evaluate": {"imu": "imu"},
     "navigate": {"imu": "imu"},
     "allan": {"imu": "imu"},
+    "tune": {"imu": "imu"},
     "consistency": {"imu": "imu", "chassis": "chassis"},
     "train": {"imu": "imu", "data": "data", "filter@model": "filter"},
 }

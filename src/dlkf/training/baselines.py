@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
+from typing import NamedTuple
 
 import torch
 
@@ -26,46 +27,89 @@ FACTORS: Mapping[str, tuple[float, ...]] = {
 }
 
 
-def outage_rms(estimator: Estimator, batches: Sequence[Batch]) -> float:
-    """Horizontal position RMS [m] over the epochs without GNSS of all batches; inf if the filter diverged."""
-    square, count = 0.0, 0
+# what a filter with these endings, or of this base, is told beside
+MORE_FACTORS: Mapping[str, Mapping[str, tuple[float, ...]]] = {
+    "nhc": {"lateral_std": (0.05, 0.1, 0.2, 0.5, 1.0), "vertical_std": (0.05, 0.1, 0.2, 0.5, 1.0)},
+    "car": {"lateral_std": (0.02, 0.05, 0.1, 0.2, 0.5), "vertical_std": (0.02, 0.05, 0.1, 0.2, 0.5)},
+    "gated": {"gate": (0.99, 0.999, 0.9999, 0.999999)},
+    "aekf": {"forgetting": (0.3, 0.7, 0.9, 0.97, 0.99, 0.997)},
+}
+OBJECTIVES = ("rms", "median", "log")
+
+
+class Trial(NamedTuple):
+    """One point of the search: which factor had which value, and the objective [m]."""
+
+    factor: str
+    value: float
+    score: float
+
+
+def factors_of(name: str) -> dict[str, tuple[float, ...]]:
+    """The factors of a filter that a search tries, and their values."""
+    found = dict(FACTORS)
+    for part in name.split("_"):
+        found |= MORE_FACTORS.get(part, {})
+    return found
+
+
+def outage_error(estimator: Estimator, batches: Sequence[Batch], objective: str = "rms") -> float:
+    """Horizontal position error [m] over the epochs without GNSS of all batches; inf if the filter diverged.
+
+    ``rms`` over all epochs, which a few hard outages decide; or over each piece, and of these the ``median`` or
+    the geometric mean (``log``), to which every piece counts alike.
+    """
+    squares, counts = [], []
     for batch in batches:
         with torch.inference_mode():
             solution = integrate(batch, estimator)
         hidden = ~batch.available & batch.truth_valid & batch.present
-        error = (solution.posterior.p_n - batch.truth.p_n)[..., :2].square().sum(-1)[hidden]
-        square += float(error.sum())
-        count += len(error)
-    rms = (square / count) ** 0.5 if count else float("nan")
-    return rms if rms == rms else float("inf")
+        error = (solution.posterior.p_n - batch.truth.p_n)[..., :2].square().sum(-1)
+        squares.append(torch.where(hidden, error, 0.0).sum(-1))
+        counts.append(hidden.sum(-1))
+    square, count = torch.cat(squares), torch.cat(counts)
+    seen = count > 0
+    if not (bool(square.isfinite().all()) and bool(seen.any())):
+        return float("inf")
+    if objective == "rms":
+        return float(square.sum() / count.sum()) ** 0.5
+    pieces = (square[seen] / count[seen]).sqrt()
+    return float(pieces.quantile(0.5) if objective == "median" else pieces.clamp_min(1e-3).log().mean().exp())
 
 
 def tuned(
     imu: ImuSpec,
     batches: Sequence[Batch],
     *,
-    factors: Mapping[str, Sequence[float]] = FACTORS,
+    name: str = "mbkf15",
+    factors: Mapping[str, Sequence[float]] | None = None,
+    start: Tuning | None = None,
+    objective: str = "rms",
     rounds: int = 2,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[Trial], None] | None = None,
 ) -> tuple[Tuning, float]:
-    """Over-bounding factors of the 15-state filter by coordinate search on training pieces with outages.
+    """Over-bounding factors of a filter by coordinate search on training pieces with outages.
 
-    Returns the best factors and their outage RMS [m].
+    Returns the best factors and their :func:`outage_error` [m]; ``progress`` is told every trial.
     """
-    best = Tuning()
-    score = outage_rms(build_filter("mbkf15", imu, tuning=best), batches)
+
+    def judged(trial: Tuning) -> float:
+        return outage_error(build_filter(name, imu, tuning=trial), batches, objective)
+
+    best = start or Tuning()
+    score = judged(best)
     for _ in range(rounds):
         before = best
-        for name, values in factors.items():
+        for factor, values in (factors or factors_of(name)).items():
             for value in values:
-                if value == getattr(best, name):
+                if value == getattr(best, factor):
                     continue
-                trial = replace(best, **{name: value})
-                rms = outage_rms(build_filter("mbkf15", imu, tuning=trial), batches)
-                if rms < score:
-                    best, score = trial, rms
-            if progress is not None:
-                progress(f"tuning {name}: {getattr(best, name):g}, outage RMS {score:.2f} m")
+                trial = replace(best, **{factor: value})
+                error = judged(trial)
+                if progress is not None:
+                    progress(Trial(factor, value, error))
+                if error < score:
+                    best, score = trial, error
         if best == before:
             break
     return best, score

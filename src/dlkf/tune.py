@@ -1,0 +1,67 @@
+"""Tune a Kalman filter: ``python -m dlkf.tune model=mbkf21 dataset=data/per_drive name=town out=mine``.
+
+Writes ``out/tuning/<name>.yaml``, which evaluate and navigate take with ``--config-dir <out> +tuning=<name>``, and
+logs the search to MLflow.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+
+from dlkf.command import command
+from dlkf.data.store import dataset_digest, load_dataset
+from dlkf.errors import InputError
+from dlkf.evaluation.progress import counting
+from dlkf.evaluation.protocol import protocol_from
+from dlkf.evaluation.table import as_markdown, as_rich
+from dlkf.filters.build import build_filter
+from dlkf.navigation.imu_errors import imu_spec
+from dlkf.training.tracking import start_run, tracking_uri
+from dlkf.training.tuning_search import check, search, sides, tuning_table, write_tuning
+
+
+@command("tune")
+def main(cfg: DictConfig) -> None:
+    """Load, split, search, check, write, log, print."""
+    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
+    model, name, spec = str(config["model"]), str(config["name"]), imu_spec(config["imu"])
+    check(model, config["objective"])
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):
+        raise InputError(f"name={name} must be letters, digits, _ and -: it names a file")
+    start = build_filter(model, spec, tuning=config["tuning"]).tuning
+    protocol, uri = protocol_from(config), tracking_uri(config["tracking"]["uri"])
+    with counting("Loading drives") as progress:
+        drives = load_dataset(
+            config["dataset"],
+            rate_hz=config["rate_hz"],
+            epoch_s=config["epoch_s"],
+            dtype=torch.float64,
+            drives=config["drives"],
+            progress=lambda _, done, total: progress(done, total),
+        )
+    parts, dataset = sides(drives, config), drives[0].dataset
+    with start_run(uri, "tune", f"{model} {dataset}") as run:
+        run.log_config(config)
+        run.log_dataset(config["dataset"], dataset_digest(config["dataset"]), "tuning")
+        options = {key: config[key] for key in ("objective", "rounds", "pieces")}
+        result = search(model, spec, parts, protocol, start=start, **options)
+        table = tuning_table(result, dataset)
+        write_tuning(config["out"], name, result, table)
+        run.log_metrics(result.metrics())
+        run.log_metrics({f"tuned/{k}": v for k, v in result.changed.items()})
+        for file in (f"tuning/{name}.yaml", "search.csv", "table.md"):
+            run.log_files(Path(config["out"]) / file)
+        run.note(as_markdown(table))
+    Console(width=None if sys.stdout.isatty() else 110).print(as_rich(table))
+    print(f"Factors: {config['out']}/tuning/{name}.yaml; MLflow: run {run.id}")
+
+
+if __name__ == "__main__":
+    main()
