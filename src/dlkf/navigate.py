@@ -13,6 +13,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from dlkf.command import command
+from dlkf.data.alignment import AlignConfig
 from dlkf.data.solution import write_solution
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
@@ -20,6 +21,7 @@ from dlkf.evaluation.drives import navigate_drives
 from dlkf.evaluation.progress import counting
 from dlkf.evaluation.staging import staged
 from dlkf.evaluation.streamed_drives import stream_drives
+from dlkf.filters.smoother import smoothed
 from dlkf.models import resolve_model
 from dlkf.navigation.imu_errors import imu_spec
 
@@ -39,6 +41,10 @@ def main(cfg: DictConfig) -> None:
     )
     grid = {key: config[key] for key in ("rate_hz", "epoch_s", "drives")}
     skipped: dict[str, str] | None = {} if config["skip_unaligned"] else None
+    if config["smoother"] is not None:
+        if config["streaming"]:
+            raise InputError("a smoother looks ahead, a stream cannot: give smoother or streaming, not both")
+        model = smoothed(model, config["smoother"])
     if config["streaming"]:
         navigated = partial(stream_drives, config["dataset"], model, skipped=skipped, **grid)
     else:
@@ -50,7 +56,7 @@ def main(cfg: DictConfig) -> None:
                 progress=lambda name, done, total: progress(done, total),
                 **grid,
             )
-        navigated = partial(navigate_drives, drives, model, skipped=skipped)
+        navigated = partial(navigate_drives, drives, model, align=AlignConfig.of(config["align"]), skipped=skipped)
     lines = []
     with staged(config["out"]) as folder, counting("Navigating") as progress:
         for result in navigated(progress=progress):

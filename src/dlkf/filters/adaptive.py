@@ -1,9 +1,10 @@
 """Adaptive Q and R from innovations and residuals (Akhlaghi, Zhou and Huang 2017, IEEE PESGM).
 
-    R ← α R + (1 − α) (ε εᵀ + H P⁻ Hᵀ)     ε = z − H dx, the residual after the update
-    Q ← α Q + (1 − α) K d dᵀ Kᵀ             d = z, the innovation
+    R ← α R + (1 − α) (ε εᵀ + H P⁺ Hᵀ)     ε = z − H dx, the residual after the update
+    Q ← α Q + (1 − α) K d dᵀ Kᵀ             d = z, the innovation; K d is the correction
 
-per GNSS fix, α the ``forgetting`` factor (0.3 in the paper). R keeps its diagonal; where fixes are further apart
+per GNSS fix, α the ``forgetting`` factor (0.3 in the paper); with the covariance after the update E[ε εᵀ] + H P⁺ Hᵀ
+is R (Mohamed and Schwarz 1999). R keeps its diagonal; where fixes are further apart
 than an epoch, Q is what each epoch contributes. Between fixes and in an outage the last Q and R hold.
 """
 
@@ -19,14 +20,16 @@ from torch import Tensor
 from dlkf.filters.integration import Epoch
 
 SMALLEST_VARIANCE = 1e-6  # m², (m/s)²
+SETTLE_FIXES = 30  # the first corrections are of the start's errors and say nothing of noise
 
 
 class AdaptiveNoise(NamedTuple):
-    """The adapted noise; R holds where a component has been ``known`` by a fix."""
+    """The adapted noise, in force where and once it is ``settled``."""
 
-    Q: Tensor | None  # (B, n, n) of one epoch
+    Q: Tensor  # (B, n, n) of one epoch
     R: Tensor  # (B, 6)
-    known: Tensor  # (B, 6) bool
+    settled: Tensor  # (B,) bool
+    fixes: Tensor  # (B,) so far
     epochs: Tensor  # (B,) since the last fix
 
 
@@ -42,27 +45,28 @@ class Adaptation:
         epoch: Epoch,
         used: Bool[Tensor, "B 6"],
         H: Float[Tensor, "B 6 n"],
-        predicted: Float[Tensor, "B n n"],
-        K: Float[Tensor, "B n 6"],
+        R: Float[Tensor, "B 6"],
+        updated: Float[Tensor, "B n n"],
         dx: Float[Tensor, "B n"],
         Q: Float[Tensor, "B n n"],
     ) -> AdaptiveNoise:
-        """The noise after an epoch; ``H`` has zero rows and ``K`` zero columns where nothing was used."""
+        """The noise after an epoch that ran with ``Q`` and ``R``; ``H`` has zero rows where nothing was used."""
         if noise is None:
-            noise = AdaptiveNoise(None, torch.ones_like(epoch.z), torch.zeros_like(used), epoch.z.new_zeros(len(used)))
+            start = epoch.z.new_zeros(2, len(used))
+            noise = AdaptiveNoise(Q, R, torch.zeros_like(used[:, 0]), *start)
         epochs = noise.epochs + 1
         has_fix = used.any(-1)
-        if not bool(has_fix.any()):
-            return noise._replace(epochs=epochs)
+        fixes = noise.fixes + has_fix
+        learns = has_fix & (fixes > SETTLE_FIXES)
         a = self.forgetting
         residual = epoch.z - (H @ dx.unsqueeze(-1)).squeeze(-1)
-        seen = residual.square() + (H @ predicted @ H.mT).diagonal(dim1=-2, dim2=-1)
-        R = torch.where(noise.known, a * noise.R + (1 - a) * seen, seen).clamp_min(SMALLEST_VARIANCE)
-        push = (K @ torch.where(used, epoch.z, 0.0).unsqueeze(-1))
-        adapted = a * Q + (1 - a) * (push @ push.mT) / epochs[:, None, None]
+        seen = residual.square() + (H @ updated @ H.mT).diagonal(dim1=-2, dim2=-1)
+        adapted_R = (a * R + (1 - a) * seen).clamp_min(SMALLEST_VARIANCE)
+        adapted_Q = a * Q + (1 - a) * (dx.unsqueeze(-1) * dx.unsqueeze(-2)) / epochs[:, None, None]
         return AdaptiveNoise(
-            torch.where(has_fix[:, None, None], adapted, Q),
-            torch.where(used, R, noise.R),
-            noise.known | used,
+            torch.where(learns[:, None, None], adapted_Q, Q),
+            torch.where(used & learns.unsqueeze(-1), adapted_R, R),
+            noise.settled | learns,
+            fixes,
             torch.where(has_fix, 0.0, epochs),
         )

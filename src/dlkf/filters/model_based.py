@@ -121,8 +121,8 @@ class Mbkf:
         """Propagate P over the window, update where there is something to learn (paper eqs 2–6, Joseph form)."""
         Phi = memory.windows.transition(epoch.start, epoch.window, epoch.corrected, epoch.frame)
         Q = memory.windows.noise(Phi)
-        if memory.noise is not None and memory.noise.Q is not None:
-            Q = memory.noise.Q
+        if memory.noise is not None:
+            Q = torch.where(memory.noise.settled[:, None, None], memory.noise.Q, Q)
         predicted = Phi @ memory.P @ Phi.mT + Q
         fix = self._fix(epoch, memory)
         H, R = masked(fix.H, fix.R, fix.used)
@@ -150,7 +150,7 @@ class Mbkf:
         noise = memory.noise
         if self.adaptive:
             rule = Adaptation(self.tuning.forgetting)
-            noise = rule.learned(noise, epoch, fix.used, H[:, :6], prior, K[:, :, :6], dx, Q)
+            noise = rule.learned(noise, epoch, fix.used, H[:, :6], fix.R, P, dx, Q)
         structure = memory.structure
         if structure is not None:
             structure = structure + dx[:, self.states.of_structure]
@@ -179,7 +179,7 @@ class Mbkf:
         scale, floor = memory.fix_scale
         R = torch.maximum(scale * epoch.fix.std, floor).square()
         if memory.noise is not None:
-            R = torch.where(memory.noise.known, memory.noise.R, R)
+            R = torch.where(memory.noise.settled.unsqueeze(-1), memory.noise.R, R)
         return Measurement(epoch.z, H, R, epoch.used)
 
 

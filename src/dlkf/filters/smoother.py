@@ -19,8 +19,10 @@ from torch import Tensor
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
 from dlkf.filters.integration import Correction, Epoch, Estimator, Solution, integrate
+from dlkf.filters.model_based import Mbkf
 from dlkf.navigation.state import IMU, PVA, STATES, NavState
 
+NO_COVARIANCE = "smoother=rts needs a filter with a covariance: mbkf15, mbkf21, mbkf33 or aekf, with their endings"
 ROUNDING = 1e-13  # added to unit variances
 
 
@@ -39,6 +41,15 @@ class Smoothed:
         return self.filter.step(memory, epoch)
 
 
+def smoothed(estimator: Estimator, smoother: str) -> Smoothed:
+    """A filter to be smoothed by name (``rts``); InputError for another name or a filter without a covariance."""
+    if smoother != "rts":
+        raise InputError(f"unknown smoother {smoother!r}; known: rts")
+    if not isinstance(estimator, (Smoothed, Mbkf)):
+        raise InputError(NO_COVARIANCE)
+    return estimator if isinstance(estimator, Smoothed) else Smoothed(estimator)
+
+
 def smooth(batch: Batch, estimator: Estimator) -> Solution:
     """Filter a batch forwards and smooth it backwards; the solution's posterior, IMU error and std are smoothed.
 
@@ -48,7 +59,7 @@ def smooth(batch: Batch, estimator: Estimator) -> Solution:
     filtered = integrate(batch, estimator, keep_covariances=True)
     known = filtered.covariances
     if known is None:
-        raise InputError("smoother=rts needs a filter with a covariance: mbkf15, mbkf21, mbkf33, aekf, with endings")
+        raise InputError(NO_COVARIANCE)
     present = batch.present.to(known.updated.device)
     T = present.shape[1]
     delta, P = torch.zeros_like(known.dx[:, -1]), known.updated[:, -1]

@@ -18,7 +18,7 @@ class Tuning:
     epoch, ``rest_velocity_std`` [m/s], ``rest_rate_std`` [rad/s] of a standstill; ``rest_accel`` [m/s²] and
     ``rest_gyro`` [rad/s] are the highest spread of the samples that may count as one.
     Filters with a gate: ``gate`` is the probability that a good fix passes. ``aekf``: ``forgetting`` is the share
-    of the past in the adapted Q and R (Akhlaghi et al. 2017: 0.3).
+    of the past in the adapted Q and R (0.3 in Akhlaghi et al. 2017, which lost wherever it was tried).
     """
 
     accel_noise: float = 1.0
@@ -38,4 +38,4 @@ class Tuning:
     rest_accel: float = 0.12
     rest_gyro: float = 0.025
     gate: float = 0.9999
-    forgetting: float = 0.3
+    forgetting: float = 0.995

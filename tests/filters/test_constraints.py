@@ -1,0 +1,177 @@
+"""Constraints: Jacobians by finite differences, what they are worth, standstills, and the structure of a car."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dlkf.filters.build import build_filter
+from dlkf.filters.constraints import Constraints
+from dlkf.filters.integration import Epoch, Fix, integrate
+from dlkf.filters.model_based import Mbkf
+from dlkf.filters.tuning import Tuning
+from dlkf.navigation.attitude import rotation_from_rpy
+from dlkf.navigation.calibration import ImuError
+from dlkf.navigation.state import ErrorStates, NavState
+from dlkf.navigation.strapdown import strapdown
+
+from .scene import IMU, M, scene
+
+STATES = ErrorStates("scale", structure=True)
+D = torch.float64
+
+
+def epoch_of(batch, state: NavState, error: ImuError) -> Epoch:
+    raw = batch.imu[:, 0]
+    corrected = error.corrected(raw)
+    window = strapdown(state, corrected, batch.dt, batch.frame)._replace(end=state)
+    none = torch.zeros(len(raw), 6, dtype=D)
+    fix = Fix(none, none + 1, none > 0, None)
+    return Epoch(raw, corrected, error, state, window, state, corrected[:, -5:, 3:].mean(1), none, fix, None,
+                 batch.dt, batch.frame)  # fmt: skip
+
+
+def test_jacobian_matches_finite_differences():
+    """z(x̂) falls by H dx when the estimate moves by dx, state by state: navigation, gyroscopes, the car."""
+    batch = scene(1, 1, seed=3)
+    structure = torch.tensor([[0.03, -0.02, 1.2, 0.008]], dtype=D)
+    error = ImuError(torch.zeros(1, 6, dtype=D))
+    rules = Constraints(Tuning(), STATES)
+
+    def innovation(dx):
+        moved = epoch_of(batch, batch.start.corrected(dx[:, :9]), error.updated(dx, STATES))
+        across = rules._across(moved, structure + dx[:, STATES.of_structure])[0]
+        return torch.cat((across, rules._standing(moved)[0]), -1)
+
+    still = epoch_of(batch, batch.start, error)
+    H = torch.cat((rules._across(still, structure)[1], rules._standing(still)[1]), 1)[0]
+    for i in (*range(3, 9), *range(12, 15), *range(21, 25)):
+        dx = torch.zeros(1, STATES.count, dtype=D)
+        dx[0, i] = 1e-6
+        numeric = -(innovation(dx) - innovation(-dx))[0] / 2e-6
+        # left out on purpose: Earth rate turned by an attitude error (7e-5)
+        assert (numeric - H[:, i]).abs().max() < 1e-4, i
+
+
+def outage(batch, first: int, last: int):
+    available = batch.available.clone()
+    available[:, first:last] = False
+    return replace(batch, available=available)
+
+
+def drift(batch, name: str, **tuning: float) -> torch.Tensor:
+    solution = integrate(batch, build_filter(name, IMU, tuning=tuning))
+    return (solution.posterior.p_n - batch.truth.p_n)[:, -1, :2].norm(dim=-1).square().mean().sqrt()
+
+
+@pytest.mark.parametrize("base", ["mbkf15", "mbkf21"])
+def test_cars_that_do_not_slide_drift_less(base):
+    batch = outage(slipping(30, 90, (0.0, 0.0, 0.0, 0.0)), 45, 90)
+    assert drift(batch, f"{base}_nhc", lateral_std=0.05, vertical_std=0.05) < 0.35 * drift(batch, base)
+
+
+def test_structure_of_the_car_is_found_and_pays():
+    """Mounting angles, rear axle and sideslip unknown: a filter that estimates them beats one that cannot."""
+    true = (0.02, -0.015, 1.4, 0.004)
+    batch = outage(slipping(30, 150, true), 105, 150)
+    estimator = Mbkf(IMU, Tuning(lateral_std=0.05, vertical_std=0.05), ErrorStates(structure=True), constrained=True)
+    memory = None
+
+    class Watched(Mbkf):
+        def step(self, memory, epoch):
+            nonlocal watched
+            memory, answer = super().step(memory, epoch)
+            watched = memory.structure
+            return memory, answer
+
+    watched = memory
+    with torch.no_grad():
+        integrate(batch, Watched(**vars(estimator)))
+    assert watched is not None
+    error = watched.mean(0) - torch.tensor(true, dtype=D)
+    assert (error.abs() < torch.tensor([2e-3, 2e-3, 0.15, 1e-3])).all(), error
+    tuning = {"lateral_std": 0.05, "vertical_std": 0.05}
+    assert drift(batch, "mbkf15_car", **tuning) < 0.6 * drift(batch, "mbkf15_nhc", **tuning)
+
+
+def test_a_standing_car_stays_where_it_is():
+    """Stopped after 40 s, GNSS gone from then on: zero-velocity updates hold the position and find the gyro bias."""
+    batch = outage(slipping(10, 100, (0.0, 0.0, 0.0, 0.0), stop=40), 40, 100)
+    held, free = drift(batch, "mbkf15_nhc"), drift(batch, "mbkf15")
+    assert held < 0.3 and held < 0.02 * free
+    solution = integrate(batch, build_filter("mbkf15_nhc", IMU))
+    bias = (batch.true_imu_error - solution.imu_error)[:, -1, 3:]
+    assert bias.abs().max() < 3e-4  # rest_rate_std over √60, the turn-on bias being 5e-3
+
+
+def test_a_moving_car_is_not_taken_for_a_standing_one():
+    """Steady straight driving is as quiet as standing; the filter's own speed speaks against it."""
+    batch = outage(scene(20, 60, seed=10), 30, 60)
+    quiet = replace(batch, imu=batch.imu.mean(2, keepdim=True).expand_as(batch.imu).clone())
+    P = torch.eye(15, dtype=D).expand(20, 15, 15) * 0.01
+    rules = Constraints(Tuning(), ErrorStates())
+    epoch = epoch_of(quiet, NavState(*(x[:, 30] for x in batch.truth)), ImuError(torch.zeros(20, 6, dtype=D)))
+    resting, _ = rules._at_rest(epoch, torch.full((20, 2), math.inf, dtype=D), P)
+    assert not resting.any()
+
+
+def slipping(batch: int, epochs: int, structure: tuple[float, float, float, float], stop: float | None = None):
+    """Cars whose IMU moves as the constraint with these parameters says, and the truth that goes with it.
+
+    Body velocity follows from speed and yaw rate; forces from its derivative, gravity and Earth rotation at the
+    samples' middle; then the strapdown itself makes the truth, so that IMU and truth agree to rounding.
+    """
+    yaw, pitch, axle, slip = structure
+    base = scene(batch, epochs, seed=12)
+    t = torch.arange(epochs * M + 1, dtype=D) * base.dt
+    g = torch.Generator().manual_seed(5)
+    phase = 2 * math.pi * torch.rand(batch, 2, 1, generator=g, dtype=D)
+    vx = 12 + 3 * torch.sin(2 * math.pi * t / 31 + phase[:, 0])
+    wz = 0.3 * torch.sin(2 * math.pi * t / 23 + phase[:, 1])
+    if stop is not None:
+        fade = (1 - torch.cos(math.pi * ((stop - t) / 8).clamp(0, 1))) / 2
+        vx, wz = vx * fade, wz * fade
+    v_b = torch.stack((vx, yaw * vx + (axle + slip * vx**2) * wz, pitch * vx), -1)
+    dt = base.dt
+    rate = torch.zeros(batch, epochs * M, 3, dtype=D)
+    rate[..., 2] = 0.5 * (wz[:, 1:] + wz[:, :-1])
+    middle = 0.5 * (v_b[:, 1:] + v_b[:, :-1])
+    heading = 2 * math.pi * torch.rand(batch, 1, generator=g, dtype=D) + dt * rate[..., 2].cumsum(1)
+    before = heading - 0.5 * dt * rate[..., 2]  # at the samples' middle
+    C = rotation_from_rpy(torch.stack((0 * before, 0 * before, before), -1))
+    v_n = (C @ middle.unsqueeze(-1)).squeeze(-1)
+    p_n = dt * v_n.cumsum(1) - 0.5 * dt * v_n
+    row = torch.arange(batch).repeat_interleave(epochs * M)
+    gravity = base.frame[row].gravity(p_n.flatten(0, 1)).unflatten(0, (batch, -1))
+    earth_n = base.frame.earth_rate_n[:, None].expand_as(v_n)
+    pull = 2 * torch.linalg.cross(earth_n, v_n) - gravity
+    force = (v_b[:, 1:] - v_b[:, :-1]) / dt + torch.linalg.cross(rate, middle)
+    force = force + (C.mT @ pull.unsqueeze(-1)).squeeze(-1)
+    rate = rate + (C.mT @ earth_n.unsqueeze(-1)).squeeze(-1)
+    first = heading[:, 0] - dt * rate[:, 0, 2]
+    C0 = rotation_from_rpy(torch.stack((0 * first, 0 * first, first), -1))
+    start = NavState(torch.zeros(batch, 3, dtype=D), (C0 @ v_b[:, 0].unsqueeze(-1)).squeeze(-1), C0)
+    clean = torch.cat((force, rate), -1).reshape(batch, epochs, M, 6)
+    return driven(base, start, clean)
+
+
+def driven(base, start: NavState, clean: torch.Tensor):
+    """A batch in which the error-free samples ``clean`` move the cars from ``start``; errors and noises of ``base``."""
+    rows, state = [], start
+    with torch.no_grad():
+        for k in range(clean.shape[1]):
+            state = strapdown(state, clean[:, k], base.dt, base.frame).end
+            rows.append(state)
+    truth = NavState(*(torch.stack(x, 1) for x in zip(*rows)))
+    old = torch.cat((base.truth.p_n, base.truth.v_n), -1)
+    off = base.start.error_to(NavState(torch.zeros_like(base.start.p_n), base.start.v_n, base.start.C_nb))
+    noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(2), dtype=D)
+    white = torch.tensor([1e-3] * 3 + [7e-5] * 3, dtype=D) * math.sqrt(1 / base.dt)
+    return replace(
+        base,
+        imu=clean + base.true_imu_error.unsqueeze(2) + white * noise,
+        gnss=torch.cat((truth.p_n, truth.v_n), -1) + base.gnss - old,
+        truth=truth,
+        start=start.corrected(-off),
+    )

@@ -1,0 +1,95 @@
+"""Outliers, frozen fixes, long gaps and lock-out; adaptive noise; filters by name."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dlkf.errors import InputError
+from dlkf.filters.build import ENDINGS, KALMAN, build_filter, is_filter
+from dlkf.filters.integration import integrate
+from dlkf.filters.smoother import Smoothed
+
+from .scene import IMU, scene
+
+D = torch.float64
+
+
+def error(batch, name: str, imu=IMU, **tuning: float) -> torch.Tensor:
+    solution = integrate(batch, build_filter(name, imu, tuning=tuning))
+    return (solution.posterior.p_n - batch.truth.p_n).norm(dim=-1)
+
+
+def with_outliers(batch, share: float = 0.05, size: float = 100.0):
+    g = torch.Generator().manual_seed(1)
+    hit = torch.rand(batch.size[:2], generator=g) < share
+    hit[:, :5] = False
+    gnss = batch.gnss.clone()
+    direction = torch.randn(*hit.shape, 3, generator=g, dtype=D)
+    gnss[..., :3] += hit.unsqueeze(-1) * size * direction / direction.norm(dim=-1, keepdim=True)
+    return replace(batch, gnss=gnss), hit
+
+
+def test_outliers_are_refused_and_good_fixes_are_not():
+    clean = scene(30, 120, seed=1)
+    batch, hit = with_outliers(clean)
+    gated = integrate(batch, build_filter("mbkf15_gated", IMU))
+    worst = (gated.posterior.p_n - batch.truth.p_n).norm(dim=-1)[:, 20:]
+    assert worst.max() < 1.0 and error(batch, "mbkf15")[:, 20:].max() > 10.0
+    without = integrate(clean, build_filter("mbkf15_gated", IMU)).used
+    assert without[:, 10:].float().mean() > 0.995
+
+
+def test_a_filter_sure_of_a_wrong_place_finds_back():
+    """Start 200 m off and told 1 m: every good fix is refused at first; without giving in it would be for ever."""
+    batch = scene(10, 60, seed=2)
+    lost = replace(batch, start=batch.start._replace(p_n=batch.start.p_n + 200.0))
+    off = error(lost, "mbkf15_gated")
+    assert off[:, 2].min() > 100.0 and off[:, 30:].max() < 1.0
+
+
+def test_frozen_receiver_is_not_believed():
+    batch = scene(10, 90, seed=3)
+    gnss = batch.gnss.clone()
+    gnss[:, 40:60] = gnss[:, 39:40]
+    frozen = replace(batch, gnss=gnss)
+    assert error(frozen, "mbkf15_gated")[:, 40:60].max() < 30.0  # twenty seconds on inertial sensors alone
+    assert error(frozen, "mbkf15_gated")[:, 65:].max() < 1.0
+    assert error(frozen, "mbkf15")[:, 40:60].max() > 100.0
+
+
+def test_recovers_by_itself_after_a_long_gap():
+    batch = scene(5, 300, seed=4)
+    available = batch.available.clone()
+    available[:, 60:260] = False
+    off = error(replace(batch, available=available), "mbkf15_gated")
+    assert off[:, 259].max() > 50.0 and off[:, 270:].max() < 1.0
+
+
+def test_adaptive_noise_learns_what_the_receiver_does_not_say():
+    """Fixes three times worse than their std says: R grows towards the truth, and stays where it was right."""
+    said = scene(20, 200, seed=5, position_std=0.3, velocity_std=0.3)
+    wrong = replace(said, gnss_std=said.gnss_std / 3)
+
+    def adapted(batch):
+        filter = build_filter("aekf", IMU, tuning={"forgetting": 0.98})
+        with torch.no_grad():
+            R = integrate(batch, filter, keep_covariances=True).covariances.R
+        return R[:, -30:].mean().sqrt()
+
+    assert 0.2 < adapted(wrong) < 0.4 and 0.2 < adapted(said) < 0.4
+
+
+def test_names():
+    for base in KALMAN:
+        for ending in ENDINGS:
+            if ending != "prior":
+                built = build_filter(f"{base}_{ending}", IMU)
+                assert isinstance(built, Smoothed) == (ending == "rts")
+    assert is_filter("mbkf33_nhc_gated") and not is_filter("mbkf15_nhc_nhc") and not is_filter("mbkf16")
+    with pytest.raises(InputError, match="_nhc"):
+        build_filter("mbkf21_nch", IMU)
+    with pytest.raises(InputError, match="gate is 1.5, must be below 1"):
+        build_filter("mbkf21", IMU, tuning={"gate": 1.5})
+    with pytest.raises(InputError, match="prior.mean"):
+        build_filter("mbkf21_prior_nhc", IMU)
