@@ -9,13 +9,14 @@ import numpy as np
 import pandas as pd
 import torch
 
+from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.drive import Drive
 from dlkf.data.segments import whole_drives
 from dlkf.data.solution import solution_table
 from dlkf.errors import InputError
 from dlkf.evaluation.chunks import CHUNK_SAMPLES, run_filter
 from dlkf.filters.integration import Estimator
-from dlkf.filters.start import align
+from dlkf.filters.start import align_each
 
 
 @dataclass(frozen=True)
@@ -43,23 +44,24 @@ def navigate_drives(
     drives: Sequence[Drive],
     estimator: Estimator,
     *,
+    align: AlignConfig = ALIGN,
     skipped: dict[str, str] | None = None,
     progress: Callable[[int, int | None], None] | None = None,
 ) -> Iterator[Navigated]:
-    """Run a filter over whole drives, from the first moment at which each can be aligned.
+    """Run a filter over whole drives, from the first moment at which each can be aligned as ``align`` says.
 
     Drives of like length run together, a bounded number at a time. A drive that cannot be aligned raises
     InputError; with ``skipped`` it is left out and the reason put there, unless none is left. Raises
     InputError where a solution is not finite. ``progress(drives done, drives in all)``.
     """
     starts = {}
-    for k, drive in enumerate(drives):
-        try:
-            starts[k] = align(drive)
-        except InputError as error:
-            if skipped is None:
-                raise
-            skipped[drive.name] = str(error)
+    for k, start in enumerate(align_each(drives, align)):
+        if not isinstance(start, InputError):
+            starts[k] = start
+        elif skipped is None:
+            raise start
+        else:
+            skipped[drives[k].name] = str(start)
     if not starts:
         raise InputError(next(iter((skipped or {}).values()), "no drives: give a dataset with at least one"))
     todo = sorted(starts, key=lambda k: drives[k].epochs - starts[k].first, reverse=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from dlkf.data.alignment import Start
+from dlkf.data.alignment import ALIGN, AlignConfig, Start
 from dlkf.data.drive import Drive
 from dlkf.data.segments import Piece, StartLaw, cut_pieces, make_batch, whole_drives
 from dlkf.data.stack import DriveStack
@@ -16,7 +16,7 @@ from dlkf.errors import InputError
 from dlkf.evaluation.chunks import CHUNK_SAMPLES
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.run import Scene
-from dlkf.filters.start import align
+from dlkf.filters.start import align_each
 
 MODES = ("auto", "pieces", "drives")
 
@@ -26,7 +26,7 @@ class Protocol:
     """The rules of a comparison, the same for every filter (DESIGN 10).
 
     ``pieces``: ``length_s`` every ``stride_s`` wherever the truth is valid, from the truth plus an error
-    drawn from ``start``. ``drives``: whole drives from their own alignment, the outage repeated every
+    drawn from ``start``. ``drives``: whole drives from their own alignment (``align``), the outage repeated every
     ``every_s`` (default twice its length) in one run per offset (default 0 and its length: covers the drive).
     ``auto``: pieces where the truth has attitude and is long enough, else drives.
     """
@@ -35,6 +35,7 @@ class Protocol:
     length_s: float = 120.0
     stride_s: float = 60.0
     start: StartLaw = field(default_factory=StartLaw)
+    align: AlignConfig = ALIGN
     outage: OutagePlan | None = None
     seed: int = 0
 
@@ -71,7 +72,7 @@ class Scenes:
             self._batches = [(stack, part) for part in _parts(pieces, [p.epochs for p in pieces], stack)]
             self.outage = protocol.outage and _fitting(protocol.outage, protocol.length_s)
         else:
-            starts = self._aligned(stack)
+            starts = self._aligned(stack, protocol.align)
             order = sorted(starts, key=lambda d: -stack[d].epochs)  # like lengths together: little padding
             parts = _parts(order, [stack[d].epochs for d in order], stack)
             self._batches = [([stack[d] for d in part], [starts[d] for d in part]) for part in parts]
@@ -103,18 +104,19 @@ class Scenes:
             common |= {"length_s": p.length_s, "stride_s": p.stride_s, "start": asdict(p.start)}
         else:
             common["start"] = "alignment from GNSS and levelling"
+            common["align"] = asdict(p.align)
         return common | {"outage": asdict(self.outage) if self.outage else None, "skipped": self.skipped}
 
-    def _aligned(self, drives: Sequence[Drive]) -> dict[int, Start]:
+    def _aligned(self, drives: Sequence[Drive], config: AlignConfig) -> dict[int, Start]:
+        scored = [k for k, drive in enumerate(drives) if bool(drive.ref_valid.any())]
+        for k in sorted(set(range(len(drives))) - set(scored)):
+            self.skipped[drives[k].name] = f"drive {drives[k].name}: has no valid reference to score against"
         starts: dict[int, Start] = {}
-        for k, drive in enumerate(drives):
-            if not bool(drive.ref_valid.any()):
-                self.skipped[drive.name] = f"drive {drive.name}: has no valid reference to score against"
-                continue
-            try:
-                starts[k] = align(drive)
-            except InputError as error:
-                self.skipped[drive.name] = str(error)
+        for k, start in zip(scored, align_each([drives[k] for k in scored], config)):
+            if isinstance(start, InputError):
+                self.skipped[drives[k].name] = str(start)
+            else:
+                starts[k] = start
         if not starts:
             more = f" (and {len(self.skipped) - 1} more)" if len(self.skipped) > 1 else ""
             raise InputError(f"no drive can be scored: {next(iter(self.skipped.values()))}{more}")
@@ -167,6 +169,7 @@ def protocol_from(config: Mapping[str, Any]) -> Protocol:
         length_s=config.get("length_s", 120.0),
         stride_s=config.get("stride_s") or config.get("length_s", 120.0),
         start=StartLaw.of(config.get("start")),
+        align=AlignConfig.of(config.get("align")),
         outage=outage,
         seed=config.get("seed", 0),
     )
