@@ -69,3 +69,17 @@ def test_a_simulated_dataset_keeps_the_contract(tmp_path):
     config = composed("simulated@dataset=per_drive", "dataset.hours=0.05", "dataset.drive_minutes=1", "seed=4")
     rows = validate_dataset(simulate_from_config(config, tmp_path / "toy", progress=False))
     assert [row.name for row in rows] == [f"per_drive-4-0000{k}" for k in range(3)]
+
+
+def test_any_dataset_can_have_another_car():
+    """Both settings are presets: the paper's point, and a lifelike car."""
+    point = composed("simulated@dataset=lifelike", "chassis@dataset.chassis=point")
+    car = composed("simulated@dataset=one_imu", "+chassis@dataset.chassis=lifelike")
+    assert dataset_config(point["dataset"]).chassis.is_point
+    assert dataset_config(car["dataset"]).chassis.sideslip == 0.0075
+    assert dataset_config(composed("simulated@dataset=paper_clean")["dataset"]).chassis.is_point
+
+
+def test_a_fleet_brings_its_types():
+    config = dataset_config(composed("simulated@dataset=fleet", "imu@dataset.fleet.consumer=roof_mems")["dataset"])
+    assert len(config.fleet) == 7 and config.fleet["consumer"].name == "roof_mems"
