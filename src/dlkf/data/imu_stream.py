@@ -13,6 +13,7 @@ from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.validate import LIMITS, Limits
 from dlkf.errors import InputError
 
+Row = Sequence[float] | np.ndarray
 COLUMNS = ("t", *ACCEL, *GYRO)
 FULL_SCALE = (400.0, 40.0)  # m/s², rad/s: beyond any IMU of a car, so a damaged packet
 BEFORE = 3  # stamps kept before the open epoch: an interval is resampled with the one before it
@@ -61,7 +62,7 @@ class ImuStream:
         """Samples out of line have gone on for longer than an accident does: the stream must begin anew."""
         return self._astray is not None and self._astray[1] - self._astray[0] >= ASTRAY_S
 
-    def refused(self, t: float, accel: Sequence[float], gyro: Sequence[float]) -> str:
+    def refused(self, t: float, accel: Row, gyro: Row) -> str:
         """Take a sample (s, m/s², rad/s); a reason if it cannot be, else nothing."""
         row = (float(t), *map(float, accel), *map(float, gyro))
         if len(row) != 7:

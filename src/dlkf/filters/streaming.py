@@ -35,7 +35,7 @@ from torch import Tensor
 
 from dlkf.data.alignment import ALIGN, AlignConfig, Start
 from dlkf.data.drive import Batch, Drive
-from dlkf.data.imu_stream import ImuStream
+from dlkf.data.imu_stream import ImuStream, Row
 from dlkf.data.resampling import BLANK, ON_BOUNDARY_S, Fixes, boundary_after, fixes_at, usable_fixes
 from dlkf.data.schema import POSITION, STD, VELOCITY
 from dlkf.data.segments import REST, whole_drives
@@ -122,6 +122,8 @@ class StreamingFilter:
     ) -> None:
         if not history_s >= 0:
             raise InputError(f"history_s is {history_s!r}, must be ≥ 0 s")
+        if align.search_s > 0 or align.from_rest:
+            raise InputError("align.search_s and align.from_rest look ahead, which a stream cannot; leave them out")
         self.estimator, self._align = estimator, align
         self._rate_hz, self._epoch_s, self._anchor_m = rate_hz, epoch_s, anchor_m
         self._lever_arm_b = torch.tensor(lever_arm_b, dtype=torch.float64)
@@ -158,7 +160,7 @@ class StreamingFilter:
         """The last closed epoch's estimate, late fixes included; None while aligning."""
         return self._latest
 
-    def imu(self, t: float, accel: Sequence[float], gyro: Sequence[float]) -> Receipt:
+    def imu(self, t: float, accel: Row, gyro: Row) -> Receipt:
         """Take a sample: mean specific force [m/s²] and rate [rad/s] over the interval that ends at ``t`` [s].
 
         The receipt holds the estimates of the epochs that end with it: as a rule none, or one once an epoch, and
@@ -186,8 +188,8 @@ class StreamingFilter:
         lat_deg: float,
         lon_deg: float,
         height_m: float,
-        velocity_ned: Sequence[float] | None = None,
-        std: Sequence[float] | None = None,
+        velocity_ned: Row | None = None,
+        std: Row | None = None,
         quality: int = 1,
     ) -> Receipt:
         """Take a fix of the antenna, instantaneous at ``t`` [s, clock of the samples].
