@@ -45,8 +45,9 @@ def main(cfg: DictConfig) -> None:
         if config["streaming"]:
             raise InputError("a smoother looks ahead, a stream cannot: give smoother or streaming, not both")
         model = smoothed(model, config["smoother"])
+    align = AlignConfig.of(config["align"])
     if config["streaming"]:
-        navigated = partial(stream_drives, config["dataset"], model, skipped=skipped, **grid)
+        navigated = partial(stream_drives, config["dataset"], model, align=align, skipped=skipped, **grid)
     else:
         with counting("Loading drives") as progress:
             drives = load_dataset(
@@ -56,7 +57,7 @@ def main(cfg: DictConfig) -> None:
                 progress=lambda name, done, total: progress(done, total),
                 **grid,
             )
-        navigated = partial(navigate_drives, drives, model, align=AlignConfig.of(config["align"]), skipped=skipped)
+        navigated = partial(navigate_drives, drives, model, align=align, skipped=skipped)
     lines = []
     with staged(config["out"]) as folder, counting("Navigating") as progress:
         for result in navigated(progress=progress):

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
 from dlkf.data.store import drive_from_tables, drive_rows
 from dlkf.data.tables import Columns
 from dlkf.data.validate import DriveTables, read_checked
 from dlkf.errors import InputError
 from dlkf.evaluation.drives import Navigated
+from dlkf.filters import start
 from dlkf.filters.estimate import Estimate, estimates_table
 from dlkf.filters.integration import Estimator
-from dlkf.filters.start import align
 from dlkf.filters.streaming import Receipt, Status, StreamingFilter
 
 
@@ -51,15 +53,23 @@ def played(
 
 
 def stream_drive(
-    tables: DriveTables, estimator: Estimator, *, rate_hz: float, epoch_s: float, arrival: Sequence[float] | None = None
+    tables: DriveTables,
+    estimator: Estimator,
+    *,
+    rate_hz: float,
+    epoch_s: float,
+    align: AlignConfig = ALIGN,
+    arrival: Sequence[float] | None = None,
 ) -> Navigated:
     """One drive through a stream, on the grid that the loader gives it: the same solution as its batch run.
 
+    Of ``align`` what looks ahead is left out, in a batch run ``search_s=0`` and ``from_rest=False``.
     Raises UnalignedError if the drive cannot be aligned, InputError if the filter diverges.
     """
     drive = drive_from_tables(tables, "", rate_hz, epoch_s, torch.float64)
+    causal = replace(align, search_s=0.0, from_rest=False)
     stream = StreamingFilter(
-        estimator, rate_hz=rate_hz, epoch_s=epoch_s, lever_arm_b=tables.row.lever_arm_b,
+        estimator, rate_hz=rate_hz, epoch_s=epoch_s, lever_arm_b=tables.row.lever_arm_b, align=causal,
         phase_s=drive.t0, imu_step_s=float(np.median(np.diff(tables.imu["t"]))),
     )  # fmt: skip
     found: dict[float, Estimate] = {}
@@ -70,7 +80,7 @@ def stream_drive(
             raise InputError(f"drive {tables.row.name}: {reason}")
     if not found:
         try:
-            align(drive)
+            start.align(drive, causal)
         except InputError as error:
             raise UnalignedError(str(error)) from None
     estimates = [found[t] for t in sorted(found)]
@@ -83,6 +93,7 @@ def stream_drives(
     *,
     rate_hz: float,
     epoch_s: float,
+    align: AlignConfig = ALIGN,
     drives: Sequence[str] | None = None,
     skipped: dict[str, str] | None = None,
     progress: Callable[[int, int | None], None] | None = None,
@@ -97,7 +108,7 @@ def stream_drives(
     for k, row in enumerate(rows):
         tables = read_checked(folder, row, reference=False)
         try:
-            result = stream_drive(tables, estimator, rate_hz=rate_hz, epoch_s=epoch_s)
+            result = stream_drive(tables, estimator, rate_hz=rate_hz, epoch_s=epoch_s, align=align)
         except UnalignedError as error:
             if skipped is None:
                 raise
