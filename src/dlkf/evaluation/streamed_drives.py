@@ -83,6 +83,7 @@ def stream_drive(
             start.align(drive, causal)
         except InputError as error:
             raise UnalignedError(str(error)) from None
+        raise UnalignedError(f"drive {tables.row.name}: ends before a filter could start")
     estimates = [found[t] for t in sorted(found)]
     return Navigated(tables.row.name, estimates[0].t - epoch_s, estimates_table(estimates))
 
