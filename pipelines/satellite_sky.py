@@ -3,10 +3,12 @@
     python -m dlkf.simulate dataset=city receiver=standalone raw=true out=data/city_standalone
     python -m pipelines.satellite_sky data/city_standalone --figures docs/figures/satellites
     python -m pipelines.satellite_sky --world --figures docs/figures/satellites
+    python -m pipelines.satellite_sky --accuracy 200000
 
 For a dataset made with a satellite receiver: share of epochs with a fix, satellites, dilution, errors against
 their claimed covariance and against noise times dilution; pictures of one drive. ``--world``: satellites in view
-and dilution everywhere on the Earth over one day.
+and dilution everywhere on the Earth over one day. ``--accuracy``: orbits against closed forms and finite
+differences, and that many least-squares solutions at random places and times against their covariance.
 """
 
 from __future__ import annotations
@@ -20,15 +22,17 @@ import pandas as pd
 import pymap3d
 import torch
 from matplotlib.figure import Figure
+from scipy.stats import chi2
 
 from dlkf.data.schema import ATTITUDE, POSITION, VELOCITY, drive_file
 from dlkf.data.tables import read_drives
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.simulation import sky_figures
 from dlkf.simulation.almanac import read_almanac
-from dlkf.simulation.least_squares import dilution
-from dlkf.simulation.satellites import direction, signals
+from dlkf.simulation.least_squares import Observations, dilution, solve
+from dlkf.simulation.satellites import EARTH_SPIN, GRAVITATION, LIGHT, direction, satellite_state, signals
 
+EPOCHS = 20000  # solved at once
 STD = [f"std_{kind}_{axis}" for kind in ("pos", "vel") for axis in "ned"]
 
 
@@ -151,17 +155,56 @@ def world(mask_deg: float, folder: Path | None) -> None:
         save(figure, folder, "world")
 
 
+def accuracy(solutions: int) -> None:
+    """Orbits, and errors of least squares against covariance (χ² of 3 degrees) and dilution."""
+    almanac, rng = read_almanac(), np.random.default_rng(0)
+    period = 2 * np.pi * almanac.sqrt_a**3 / np.sqrt(GRAVITATION)
+    before, now, after = (satellite_state(almanac, np.linspace(0, 86400, 500) + step) for step in (-1.0, 0.0, 1.0))
+    slope = np.abs((after.r_e - before.r_e) / 2 - now.v_e).max()
+    radius = np.linalg.norm(now.r_e, axis=-1) / 1e3
+    print(f"period {period.min():.1f} to {period.max():.1f} s, half a sidereal day {np.pi / EARTH_SPIN:.1f} s")
+    print(f"radius {radius.min():.0f} to {radius.max():.0f} km; velocity off differences by {slope:.1e} m/s")
+    squared, ratio, light = [], [], 0.0
+    while len(squared) * EPOCHS < solutions:
+        lat, lon = np.degrees(np.arcsin(rng.uniform(-1, 1, EPOCHS))), rng.uniform(-180, 180, EPOCHS)
+        r_e, t = np.stack(pymap3d.geodetic2ecef(lat, lon, 0.0), -1), rng.uniform(0, 604800, EPOCHS)
+        v_e = rng.normal(0, 15.0, (EPOCHS, 3))
+        seen = signals(almanac, t, r_e, v_e)
+        exact = satellite_state(almanac, t[:, None] - seen.distance / LIGHT, t).r_e
+        light = max(light, np.abs(np.linalg.norm(exact - r_e[:, None], axis=-1) - seen.distance).max())
+        used = seen.elevation > np.radians(5)
+        noise, one = rng.standard_normal((2, *used.shape)), np.ones(used.shape)
+        solution = solve(
+            Observations(
+                seen.satellite, seen.distance + 2 * noise[0], seen.distance_rate + 0.1 * noise[1], used, 4 * one,
+                0.01 * one, np.zeros((0, *used.shape)),
+            )
+        )  # fmt: skip
+        pairs = (solution.r_e - r_e, solution.covariance), (solution.v_e - v_e, solution.rate_covariance)
+        squared.append([np.einsum("ti,tij,tj->t", e, np.linalg.inv(P[:, :3, :3]), e) for e, P in pairs])
+        ratio.append(((pairs[0][0] ** 2).sum(-1) + solution.clock**2) / (2 * solution.dop.gdop) ** 2)
+    print(f"light time against the implicit equation: {light:.1e} m")
+    for name, values in zip(("position", "velocity"), np.concatenate(squared, 1)):
+        tails = [f"{100 * (values > chi2.ppf(level, 3)).mean():.3f} %" for level in (0.95, 0.999)]
+        spread = np.sqrt(6 / len(values))
+        print(f"χ² of {name}, {len(values)} solutions: {values.mean():.4f} ± {spread:.4f}, above 95 %, 99.9 %: {tails}")
+    print(f"error in space and time over σ · GDOP, RMS: {np.sqrt(np.mean(ratio)):.4f}")
+
+
 def main() -> None:
     """Measure and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("dataset", nargs="?", type=Path, help="made with a satellite receiver")
     parser.add_argument("--drive", help="the one to draw; the first by default")
     parser.add_argument("--world", action="store_true", help="satellites and dilution everywhere on the Earth")
+    parser.add_argument("--accuracy", type=int, default=0, metavar="N", help="orbits, and N least-squares solutions")
     parser.add_argument("--mask-deg", type=float, default=5.0, help="lowest elevation for --world")
     parser.add_argument("--figures", type=Path, help="folder for PNGs")
     options = parser.parse_args()
-    if not options.world and options.dataset is None:
-        parser.error("give a dataset or --world")
+    if not (options.world or options.accuracy or options.dataset):
+        parser.error("give a dataset, --world or --accuracy")
+    if options.accuracy:
+        accuracy(options.accuracy)
     if options.world:
         world(options.mask_deg, options.figures)
     if options.dataset is not None:

@@ -111,8 +111,8 @@ def satellite_state(almanac: Almanac, t: Array, t_axes: Array | None = None) -> 
 def signals(almanac: Almanac, t: Array, r_e: Array, v_e: Array) -> Signals:
     """Signals at an antenna at ``r_e`` [m] with velocity ``v_e`` [m/s] (T, 3) in ECEF at reception times ``t`` (T,).
 
-    Light time τ: c τ = |r_s(t − τ) − r(t)|, to first order in τ from the satellite at t, which is exact to
-    2 mm / c, or 10 ns · 1 km/s = 10 µm of satellite motion.
+    Light time τ: c τ = |r_s(t − τ) − r(t)|, solved to first order in τ from the satellite at t. What is left out,
+    its acceleration over τ, is 2 mm of distance or 7 ps of τ, in which the satellite moves less than 1 µm.
     """
     now = satellite_state(almanac, t)
     distance, unit = direction(now.r_e, r_e)
