@@ -1,6 +1,7 @@
 """Speed, all from one run: ``make bench`` or ``python pipelines/benchmark.py [--threads 2] [--hours 8]``.
 
-Windowed strapdown against a loop over samples, ``mbkf15`` for one drive and for 64, one training epoch.
+Windowed strapdown against a loop over samples, Kalman filters for one drive and for 64, one training epoch.
+The other half of the comparison, python-ins on the same files, is ``pipelines/parity.py``.
 """
 
 from __future__ import annotations
@@ -23,11 +24,12 @@ from dlkf.config import config_dir
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.drive import Batch
 from dlkf.data.segments import StartLaw, cut_pieces, make_batch
+from dlkf.data.store import load_dataset
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.navigation.attitude import rotation_from_vector
-from dlkf.navigation.imu_errors import imu_spec
+from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.navigation.strapdown import strapdown
 from dlkf.simulation.dataset import simulate_from_config
 from dlkf.training.callbacks.batches import GnssDecimation, OutageInjection
@@ -70,6 +72,22 @@ def windows(batch: Batch) -> torch.Tensor:
         state = strapdown(state, batch.imu[:, t] - error.unsqueeze(1), batch.dt, batch.frame).end
     (state.p_n.sum() + state.v_n.sum()).backward()
     return state.p_n.detach()
+
+
+def filters(table: Table, dataset: Path, imu: ImuSpec) -> None:
+    """Rows for the Kalman filters over drives at the file's own 100 Hz, one and 64 at a time, and for one online."""
+    drives = load_dataset(dataset, rate_hz=100, dtype=torch.float64, reference=True)
+    length = 300.0
+    pieces = (cut_pieces(drives, length) * 8)[:64]
+    for name in ("mbkf15", "mbkf21", "mbkf21_nhc"):
+        estimator, rates = build_filter(name, imu), {}
+        for n in (1, 64):
+            batch = make_batch(drives, pieces[:n], dtype=torch.float64)
+            with torch.inference_mode():
+                took = seconds(lambda batch=batch, estimator=estimator: integrate(batch, estimator), 3)
+            rates[n] = n * batch.size[1] * batch.size[2] / took
+            table.add_row(f"{name}, {n} drive{'s' * (n > 1)}, 100 Hz", f"{rates[n]:,.0f} IMU epochs/s")
+        table.add_row(f"{name}, 64 drives at once against one", f"{rates[64] / rates[1]:.1f} ×")
 
 
 def training_epoch(data: DriveDataModule, model: LearnedFilter) -> tuple[float, int]:
@@ -117,14 +135,7 @@ def main() -> None:
         table.add_row("largest difference of the two after 60 s", f"{apart:.1e} m")
         single = make_batch(data.stack, pieces[:50], dtype=torch.float32, start=exact)
         table.add_row(f"windowed strapdown, {what}, float32", f"{seconds(lambda: windows(single)):.3f} s")
-        estimator = build_filter("mbkf15", imu_spec(config["imu"]))
-        rates = {}
-        for n in (1, 64):
-            some = make_batch(data.stack, pieces[:n], dtype=torch.float64)
-            with torch.inference_mode():
-                rates[n] = n * 60 * some.size[2] / seconds(lambda some=some: integrate(some, estimator), 3)
-            table.add_row(f"mbkf15, {n} drive{'s' * (n > 1)}, 50 Hz", f"{rates[n]:,.0f} IMU epochs/s")
-        table.add_row("64 drives at once against one", f"{rates[64] / rates[1]:.1f} ×")
+        filters(table, Path(folder) / "drives", imu_spec(config["imu"]))
         model = LearnedFilter(LearnedConfig()).train()
         training_epoch(data, model)
         took, steps = training_epoch(data, model)

@@ -61,3 +61,11 @@ def test_tangent_round_trip():
     frame = tangent_frame(lat, lon, torch.zeros_like(lat))
     p_n = torch.randn(len(lat), 7, 3, dtype=torch.float64) * 1e4
     assert (frame.from_ecef(frame.to_ecef(p_n)) - p_n).abs().max() < 1e-8
+
+
+def test_compiled_gravity_is_the_tensor_form_s():
+    frame = tangent_frame(*(torch.tensor(x, dtype=torch.float64) for x in ([0.9, -0.3], [0.2, 3.0], [80.0, 2500.0])))
+    p = torch.tensor([[3e4, -2e4, 150.0], [-500.0, 900.0, -30.0]], dtype=torch.float64)
+    expected = frame.gravity(p)
+    with torch.no_grad():
+        assert (frame.gravity(p) - expected).abs().max() < 1e-13

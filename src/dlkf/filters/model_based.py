@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -123,7 +124,7 @@ class Mbkf:
         Q = memory.windows.noise(Phi)
         if memory.noise is not None:
             Q = torch.where(memory.noise.settled[:, None, None], memory.noise.Q, Q)
-        predicted = Phi @ memory.P @ Phi.mT + Q
+        predicted = torch.baddbmm(Q, torch.bmm(Phi, memory.P), Phi.mT)
         fix = self._fix(epoch, memory)
         H, R = masked(fix.H, fix.R, fix.used)
         offered, gate, accepted, P = (H, R), memory.gate, None, predicted
@@ -141,12 +142,13 @@ class Mbkf:
             Hc, Rc = masked(rules.H, rules.R, rules.used)
             H, R, z = torch.cat((H, Hc), 1), torch.cat((R, Rc), -1), torch.cat((z, rules.z), -1)
             informative = informative or bool(rules.used.any())
-        dx, K = P.new_zeros(P.shape[:2]), P.new_zeros(*P.shape[:2], H.shape[1])
         prior = P
         if informative:
             K, P = kalman_update(P, H, R)
-            dx = (K @ z.unsqueeze(-1)).squeeze(-1)
-        P = 0.5 * (P + P.mT)
+            dx = torch.bmm(K, z.unsqueeze(-1)).squeeze(-1)
+        else:
+            dx, K = P.new_zeros(P.shape[:2]), P.new_zeros(*P.shape[:2], H.shape[1])
+        P = (P + P.mT).mul_(0.5)
         noise = memory.noise
         if self.adaptive:
             rule = Adaptation(self.tuning.forgetting)
@@ -187,9 +189,14 @@ def kalman_update(
     P: Float[Tensor, "B n n"], H: Float[Tensor, "B m n"], R: Float[Tensor, "B m"]
 ) -> tuple[Float[Tensor, "B n m"], Float[Tensor, "B n n"]]:
     """Gain K = P Hᵀ (H P Hᵀ + R)⁻¹ and Joseph-form covariance for diagonal R (paper eqs 4, 6)."""
-    HP = H @ P
+    HP = torch.bmm(H, P)
     S = torch.baddbmm(torch.diag_embed(R), HP, H.mT)
     K = torch.cholesky_solve(HP, torch.linalg.cholesky_ex(S)[0]).mT
-    A = K @ H
-    A = torch.eye(P.shape[-1], dtype=P.dtype, device=P.device) - A
-    return K, torch.baddbmm((K * R.unsqueeze(-2)) @ K.mT, A @ P, A.mT)
+    A = torch.baddbmm(_identity(P.shape[-1], P.dtype, P.device), K, H, alpha=-1)
+    return K, torch.baddbmm(torch.bmm(K * R.unsqueeze(-2), K.mT), torch.bmm(A, P), A.mT)
+
+
+@lru_cache
+@torch.inference_mode(False)
+def _identity(n: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    return torch.eye(n, dtype=dtype, device=device).unsqueeze(0)

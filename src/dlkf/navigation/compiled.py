@@ -52,6 +52,35 @@ def sensor_columns(
     return out
 
 
+def gravity(
+    p_n: Tensor, stretching: Tensor, centre: Tensor, axis: Tensor, shape: Tensor, constants: tuple[float, ...]
+) -> Tensor:
+    """Gravity (B, 3) of :meth:`dlkf.navigation.earth.TangentFrame.gravity`; ``shape`` (B, 3) is height, 1/(2R), slope."""
+    g = torch.empty_like(p_n)
+    inputs = (x.detach().numpy() for x in (p_n, stretching, centre, axis, shape))
+    _gravity(*inputs, *constants, g.numpy())
+    return g
+
+
+@njit(cache=True)
+@no_type_check
+def _gravity(p, stretching, centre, axis, shape, equator, somigliana, eccentricity_sq, curvature, g):
+    for b in range(len(p)):
+        along, square = 0.0, 0.0
+        for i in range(3):
+            g[b, i] = centre[b, i, 0]
+            for j in range(3):
+                g[b, i] += stretching[b, i, j] * p[b, j]
+            along += g[b, i] * axis[b, i]
+            square += g[b, i] * g[b, i]
+        s2 = along * along / square
+        height = shape[b, 0] - p[b, 2] + (p[b, 0] ** 2 + p[b, 1] ** 2) * shape[b, 1]
+        surface = equator * (1 + somigliana * s2) / math.sqrt(1 - eccentricity_sq * s2)
+        factor = -surface * (1 + height * (curvature * height - shape[b, 2])) / math.sqrt(square)
+        for i in range(3):
+            g[b, i] *= factor
+
+
 @njit(cache=True)
 @no_type_check
 def _mechanise(p0, v0, C0, imu, g, w, dt, p, v, C):
