@@ -1,0 +1,324 @@
+"""The classical filters beside those of an independent public package, python-ins, on the same files in one run.
+
+    python pipelines/parity.py --drives 3 --out outputs/parity
+
+Car-like drives at 100 Hz whose IMU is made by python-ins' inverse mechanisation, with the errors of the preset
+``consumer``, RTK at 1 Hz (0.02 m, 0.05 m/s) and outages of 60 s. Both filters start from the same wrong state with
+the same P₀, and have the same Q, R and masks. Theirs, ``pyins.filters.run_feedback_filter``,
+takes minutes per drive: it is kept in ``out`` and not run again. ``table.md`` holds the result.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import pyins
+import torch
+import yaml
+from numpy.typing import NDArray
+from pyins import filters, inertial_sensor, measurements, sim, strapdown
+from pyins.util import ACCEL_COLS, GYRO_COLS, LLA_COLS, RPH_COLS, VEL_COLS
+from rich.console import Console
+
+from dlkf.config import config_dir
+from dlkf.data.drive import Batch
+from dlkf.data.geodetic import geodetic_from_ecef
+from dlkf.data.schema import ACCEL, GYRO, new_dataset, write_drive, write_drives_table
+from dlkf.data.segments import StartLaw, cut_pieces, make_batch
+from dlkf.data.store import load_dataset
+from dlkf.evaluation.bootstrap import compare
+from dlkf.evaluation.staging import staged
+from dlkf.evaluation.table import Table, as_markdown, as_rich, number
+from dlkf.filters.build import build_filter
+from dlkf.filters.integration import integrate
+from dlkf.navigation.attitude import rpy_from_rotation
+from dlkf.navigation.earth import ned_axes
+from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.navigation.state import NavState
+from dlkf.simulation.imu import corrupt, draw_unit
+from dlkf.simulation.routes import VehicleConfig
+from dlkf.simulation.vehicle import drive_vehicle
+
+Array = NDArray[np.float64]
+RATE, POSITION_STD, VELOCITY_STD = 100, 0.02, 0.05  # Hz, m, m/s
+START = StartLaw(position_m=1.0, velocity_mps=0.1, roll_pitch_deg=1.0, yaw_deg=3.0)
+EXACT = StartLaw(0.0, 0.0, 0.0, 0.0)
+FIRST_S, EVERY_S, OUTAGE_S = 300, 180, 60  # outages
+FILTERS = {15: "mbkf15", 21: "mbkf21", 33: "mbkf33"}
+
+
+class Result(NamedTuple):
+    """Horizontal errors [m] of ours and theirs at the epochs of a drive, and processor seconds."""
+
+    ours: Array
+    ours_s: float
+    theirs: Array
+    theirs_s: float
+    hidden: NDArray[np.bool_]
+
+
+def preset(name: str) -> ImuSpec:
+    """An IMU preset of ``conf/imu``."""
+    return imu_spec(yaml.safe_load((config_dir() / "imu" / f"{name}.yaml").read_text()))
+
+
+def write_drives(folder: Path, spec: ImuSpec, drives: int, minutes: float) -> None:
+    """Drives of python-ins' inverse mechanisation in the data contract."""
+    rows = []
+    with new_dataset(folder) as beside:
+        for seed in range(drives):
+            motion, unit, errors, gnss = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
+            t = np.arange(round(minutes * 60 * RATE) + 1) / RATE
+            car = VehicleConfig()
+            truth = drive_vehicle(motion, car, t)
+            trajectory, imu = sim.generate_imu(
+                t, (car.lat_deg, car.lon_deg, car.height_m), np.degrees(truth.rpy), truth.v_n, "increment"
+            )
+            exact = imu[[*ACCEL_COLS, *GYRO_COLS]].to_numpy()[1:] * RATE
+            measured, error = corrupt(errors, exact, spec, draw_unit(unit, spec), RATE)
+            at = trajectory.iloc[::RATE]
+            fixes = at.iloc[1:]
+            position = sim.generate_position_measurements(fixes, POSITION_STD, gnss.integers(2**31))
+            velocity = sim.generate_ned_velocity_measurements(fixes, VELOCITY_STD, gnss.integers(2**31))
+            meta = {"drive": f"parity-{seed:02d}", "source": f"simulation: python-ins {pyins.__version__}, seed {seed}"}
+            rows.append(
+                write_drive(
+                    beside,
+                    meta | {"imu": spec.name, "gnss": "simulated, white noise"},
+                    pd.DataFrame({"t": t[1:]} | dict(zip((*ACCEL, *GYRO), measured.T))),
+                    pd.DataFrame(_named(fixes.index, position.to_numpy(), velocity.to_numpy()) | _stds(len(fixes))),
+                    pd.DataFrame(
+                        _named(at.index, at[LLA_COLS].to_numpy(), at[VEL_COLS].to_numpy())
+                        | dict(zip(("roll", "pitch", "yaw"), _wrapped(np.radians(at[RPH_COLS].to_numpy())).T))
+                        | {"valid": np.ones(len(at), bool)}
+                        | dict(zip((f"{s}_error_{a}" for s in ("accel", "gyro") for a in "xyz"), _at(error, at).T))
+                    ),
+                )
+            )
+        write_drives_table(beside, rows)
+
+
+def _named(t: pd.Index, lla: Array, v_n: Array) -> dict[str, Array]:
+    names = ("lat_deg", "lon_deg", "height_m", "vel_n", "vel_e", "vel_d")
+    return {"t": t.to_numpy()} | dict(zip(names, np.column_stack((lla, v_n)).T))
+
+
+def _stds(n: int) -> dict[str, Array]:
+    stds = {f"std_{k}_{a}": np.full(n, s) for k, s in (("pos", POSITION_STD), ("vel", VELOCITY_STD)) for a in "ned"}
+    return stds | {"quality": np.full(n, 4)}
+
+
+def _wrapped(angles: Array) -> Array:
+    return np.arctan2(np.sin(angles), np.cos(angles))
+
+
+def _at(error: Array, at: pd.DataFrame) -> Array:
+    return np.concatenate((error[:1], error))[:: RATE][: len(at)]
+
+
+def with_outages(batch: Batch) -> Batch:
+    """The batch with fixes withheld: ``OUTAGE_S`` every ``EVERY_S`` from ``FIRST_S`` on."""
+    end = torch.arange(1, batch.size[1] + 1) * batch.epoch_s
+    since = end - FIRST_S
+    hidden = (since > 0) & ((since - 1e-6) % EVERY_S < OUTAGE_S)
+    return replace(batch, available=batch.available & ~hidden)
+
+
+def start_of(batch: Batch) -> pd.Series:
+    """The start state of a batch of one as python-ins wants it: degrees, true local NED."""
+    lla, v_n, C = _local(batch, NavState(*(x.unsqueeze(1) for x in batch.start)))
+    rph = np.degrees(rpy_from_rotation(C[0]).numpy())
+    values = np.concatenate((lla[0], v_n[0], rph))
+    return pd.Series(values, index=[*LLA_COLS, *VEL_COLS, *RPH_COLS], name=float(batch.t_start[0]))
+
+
+def _local(batch: Batch, state: NavState) -> tuple[Array, Array, torch.Tensor]:
+    lat, lon, height = geodetic_from_ecef(batch.frame.to_ecef(state.p_n)[0])
+    C_local = ned_axes(lat, lon).mT @ batch.frame.C_en[0]
+    v_n = (C_local @ state.v_n[0].unsqueeze(-1)).squeeze(-1)
+    return torch.stack((lat.rad2deg(), lon.rad2deg(), height), -1).numpy(), v_n.numpy(), C_local @ state.C_nb[0]
+
+
+def theirs(folder: Path, batch: Batch, spec: ImuSpec, states: int, step_s: float) -> tuple[Array, float]:
+    """Horizontal error [m] at the ends of the epochs of python-ins' feedback filter, and seconds."""
+    drive = batch.drive[0]
+    table = pd.read_parquet(folder / f"imu/drive={drive}/part-0.parquet").set_index("t")
+    gnss = pd.read_parquet(folder / f"gnss/drive={drive}/part-0.parquet").set_index("t")
+    start = start_of(batch)
+    imu = table[[*GYRO, *ACCEL]] / RATE
+    first = imu.iloc[:1].copy()  # by convention the sample before the first: the first itself
+    first.index = first.index - 1 / RATE
+    increments = strapdown.compute_increments_from_imu(pd.concat((first, imu)), "increment")
+    increments = increments[increments.index > start.name + 0.5 / RATE]
+    end = float(batch.t_start[0]) + batch.epoch_s * np.arange(1, batch.size[1] + 1)
+    shown = batch.available[0].numpy()
+    offered = gnss.loc[np.round(end[shown], 6)]
+    offered.columns = [{"lat_deg": "lat", "lon_deg": "lon", "height_m": "alt", "vel_n": "VN", "vel_e": "VE",
+                        "vel_d": "VD"}.get(c, c) for c in offered.columns]  # fmt: skip
+    estimator = build_filter(FILTERS[states], spec)
+    sigma = estimator.begin(batch)[0].P[0].diagonal().sqrt().numpy()
+    psd, models = estimator.psd(), []
+    for k, sensor, errors in ((9, "accel", spec.accel), (12, "gyro", spec.gyro)):
+        matrix = np.full((3, 3), errors.misalignment if states == 33 else 0.0)
+        np.fill_diagonal(matrix, errors.scale_factor if states > 15 else 0.0)
+        noise, walk = (math.sqrt(psd[f"{sensor}_{x}"]) for x in ("noise", "walk"))
+        models.append(inertial_sensor.EstimationModel(sigma[k : k + 3], noise, walk, matrix if states > 15 else None))
+    degrees = np.degrees(sigma[6:9])
+    began = time.process_time()
+    result = filters.run_feedback_filter(
+        start, sigma[0], sigma[3], degrees[0], degrees[2], increments, models[1], models[0],
+        measurements=[
+            measurements.Position(offered, POSITION_STD), measurements.NedVelocity(offered, VELOCITY_STD)
+        ],
+        time_step=step_s,
+    )  # fmt: skip
+    took = time.process_time() - began
+    nearest = np.searchsorted(result.trajectory.index, end - 0.5 / RATE)
+    lla = result.trajectory[LLA_COLS].to_numpy()[nearest]
+    return horizontal(batch, lla), took
+
+
+def ours(batch: Batch, spec: ImuSpec, states: int, score: bool = True) -> tuple[Array, float]:
+    """Horizontal error [m] of our filter at the ends of the epochs, and seconds."""
+    estimator = build_filter(FILTERS[states], spec)
+    with torch.inference_mode():
+        began = time.process_time()
+        solution = integrate(batch, estimator)
+        took = time.process_time() - began
+    return horizontal(batch, _local(batch, solution.posterior)[0]) if score else np.empty(0), took
+
+
+def horizontal(batch: Batch, lla: Array) -> Array:
+    """Horizontal distance [m] of geodetic positions (T, 3) from the truth of a batch of one."""
+    truth = _local(batch, batch.truth)[0]
+    difference = pyins.transform.compute_lla_difference(lla, truth)
+    return np.hypot(difference[:, 0], difference[:, 1])
+
+
+def outage_ends(hidden: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """The last hidden epoch of every whole outage."""
+    return np.flatnonzero(hidden[:-1] & ~hidden[1:])
+
+
+def perfect_drift(folder: Path, rate_hz: float) -> float:
+    """Largest horizontal error [m] after 60 s of strapdown of an error-free IMU from the exact start."""
+    drives = load_dataset(folder, rate_hz=rate_hz, dtype=torch.float64)
+    batch = make_batch(drives, cut_pieces(drives, float(OUTAGE_S)), dtype=torch.float64, start=EXACT)
+    with torch.inference_mode():
+        solution = integrate(batch, build_filter("ins", preset("perfect")))
+    return float((solution.posterior.p_n - batch.truth.p_n)[:, -1, :2].norm(dim=-1).max())
+
+
+def rates(folder: Path, spec: ImuSpec, states: int) -> tuple[float, float]:
+    """IMU epochs per second of ours: one piece of five minutes, and 64 at once; best of three."""
+    drives = load_dataset(folder, rate_hz=float(RATE), dtype=torch.float64)
+    pieces = cut_pieces(drives, 300.0)
+    out = []
+    for n in (1, 64):
+        batch = make_batch(drives, (pieces * n)[:n], dtype=torch.float64, start=START)
+        best = min(ours(batch, spec, states, score=False)[1] for _ in range(3))
+        out.append(n * 300 * RATE / best)
+    return out[0], out[1]
+
+
+def run(folder: Path, kept: Path, drive: int, spec: ImuSpec, states: int, step_s: float) -> Result:
+    """Both filters over one drive; theirs from what is kept of an earlier run, where it was run."""
+    loaded = load_dataset(folder, rate_hz=float(RATE), dtype=torch.float64, drives=[f"parity-{drive:02d}"])
+    whole = cut_pieces(loaded, loaded[0].epochs - 1.0)[:1]
+    generator = torch.Generator().manual_seed(drive)
+    batch = with_outages(make_batch(loaded, whole, dtype=torch.float64, start=START, generator=generator))
+    file = kept / f"drive={drive:02d}-states={states}-step={step_s:g}.npz"
+    if not file.is_file():
+        error, seconds = theirs(folder, batch, spec, states, step_s)
+        with staged(kept) as beside:
+            np.savez(beside / file.name, error=error, seconds=seconds)
+    with np.load(file) as x:
+        error, seconds = x["error"], float(x["seconds"])
+    return Result(*ours(batch, spec, states), error, seconds, ~batch.available[0].numpy())
+
+
+def rms(x: Array) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(x**2)))
+
+
+def table_of(results: dict[int, list[Result]], minutes: float) -> Table:
+    """Errors in the outages of all drives, ours and theirs, and their ratio with its interval."""
+    drives, outages = 0, 0
+    rows = []
+    for states, runs in results.items():
+        ends = [outage_ends(r.hidden) for r in runs]
+        drives, outages = len(runs), sum(map(len, ends))
+        a, b = (np.concatenate([getattr(r, x)[e] for r, e in zip(runs, ends)]) for x in ("ours", "theirs"))
+        inside = [rms(np.concatenate([getattr(r, x)[r.hidden] for r in runs])) for x in ("ours", "theirs")]
+        c = compare(a, b, statistic="rms")
+        samples = RATE * sum(len(r.hidden) for r in runs)
+        speed = [samples / sum(getattr(r, x) for r in runs) for x in ("ours_s", "theirs_s")]
+        rows.append(
+            [f"{states}", number(c.a), number(c.b), f"{c.ratio:.3f} [{c.ratio_low:.3f}, {c.ratio_high:.3f}]"]
+            + [number(float(np.median(x))) for x in (a, b)] + [number(x) for x in inside]
+            + [f"{x:,.0f}" for x in speed] + [f"{speed[0] / speed[1]:.0f}"]
+        )  # fmt: skip
+    return Table(
+        title=f"{drives} drives of {minutes:g} min, {outages} outages of {OUTAGE_S} s: horizontal error",
+        note="End: RMS and median at the end of the outages; inside: RMS over their epochs. Ratio of the RMS at the "
+        "end with its 95 % interval by paired bootstrap over outages. Speed: IMU epochs per second of one processor.",
+        columns=["States", "End, ours\n[m]", "theirs\n[m]", "ratio", "median, ours\n[m]", "theirs\n[m]",
+                 "Inside, ours\n[m]", "theirs\n[m]", "Speed, ours", "theirs", "times"],
+        rows=rows,
+    )  # fmt: skip
+
+
+def main() -> int:
+    """Simulate, run what was not run, print."""
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    arguments.add_argument("--drives", type=int, default=3)
+    arguments.add_argument("--minutes", type=float, default=30.0)
+    arguments.add_argument("--states", type=int, nargs="+", default=list(FILTERS), choices=list(FILTERS))
+    arguments.add_argument("--step", type=float, default=0.1, help="theirs: step of the covariance [s], up to 1")
+    arguments.add_argument("--imu", default="consumer")
+    arguments.add_argument("--out", type=Path, default=Path("outputs/parity"))
+    arguments.add_argument("--threads", type=int, default=1)
+    o = arguments.parse_args()
+    torch.set_num_threads(o.threads)
+    console, spec, folder = Console(width=150), preset(o.imu), o.out / "drives"
+    if not (folder / "drives.parquet").is_file():
+        write_drives(folder, spec, o.drives, o.minutes)
+        write_drives(o.out / "perfect", preset("perfect"), 2, o.minutes)
+    results: dict[int, list[Result]] = {}
+    for drive in range(o.drives):
+        for states in o.states:
+            r = run(folder, o.out, drive, spec, states, o.step)
+            results.setdefault(states, []).append(r)
+            ends = outage_ends(r.hidden)
+            console.print(
+                f"drive {drive}, {states} states: {len(ends)} outages, ours {rms(r.ours[ends]):.3f} m, "
+                f"theirs {rms(r.theirs[ends]):.3f} m; {r.ours_s:.1f} s and {r.theirs_s:.1f} s"
+            )
+    table = table_of(results, o.minutes)
+    columns = ["States", "one drive", "64 at once", "times"]
+    speed = Table("Ours, 5 minutes at 100 Hz, IMU epochs per second", "", columns, [])
+    for states in o.states:
+        one, many = rates(folder, spec, states)
+        speed.rows.append([f"{states}", f"{one:,.0f}", f"{many:,.0f}", f"{many / one:.1f}"])
+    text = "\n".join(map(as_markdown, (table, speed)))
+    drift = " and ".join(f"{perfect_drift(o.out / 'perfect', hz):.4f} m at {hz} Hz" for hz in (50, 100))
+    text += f"\nError-free IMU, exact start, 60 s without GNSS: at most {drift}, horizontal.\n"
+    with staged(o.out) as beside:
+        (beside / "table.md").write_text(text)
+    for shown in (table, speed):
+        console.print(as_rich(shown))
+    console.print(text.splitlines()[-1])
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
