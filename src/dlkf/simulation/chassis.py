@@ -24,7 +24,7 @@ from scipy.signal import bilinear, lfilter, lfilter_zi
 from dlkf.errors import InputError
 from dlkf.navigation.attitude import rotation_from_rpy, rpy_from_rotation
 from dlkf.simulation.routes import Kinematics
-from dlkf.simulation.vehicle import Route, Truth, radians_per_metre
+from dlkf.simulation.vehicle import Route, Truth, Waves, radians_per_metre, random_waves
 
 Array = NDArray[np.float64]
 GRAVITY = 9.81  # m/s², for the load on the springs alone
@@ -45,7 +45,8 @@ class ChassisConfig:
 
     ``sideslip`` K: the rear axle's slip angle per lateral acceleration [s²/m], so that on a level road its
     velocity to the right is −K v² χ' (single-track model with K = m l_f/(L C_r), exact, without a lag, where
-    the dynamic index I_z/(m l_f l_r) is one). Suspension: the body rolls outwards by ``roll_gradient`` and
+    the dynamic index I_z/(m l_f l_r) is one); ``slip_noise`` [rad] is the RMS of what side wind and ruts add, in
+    waves of 20 to 300 m. Suspension: the body rolls outwards by ``roll_gradient`` and
     pitches back by ``pitch_gradient`` [rad per m/s² of specific force], with a second-order lag.
     ``roughness``: ISO 8608 G_d(0.1/m) [m³] (a good road 16e-6, an average one 64e-6). ``vibration`` [m/s²] and
     ``vibration_rate`` [rad/s]: RMS per axis at 15 m/s. ``imu_arm``: rear axle → IMU, forward, right, down [m].
@@ -54,6 +55,7 @@ class ChassisConfig:
     """
 
     sideslip: float = 0.0
+    slip_noise: float = 0.0
     roll_gradient: float = 0.0
     pitch_gradient: float = 0.0
     roughness: float = 0.0
@@ -67,8 +69,8 @@ class ChassisConfig:
 
     def __post_init__(self) -> None:
         limits = {
-            "sideslip": 0.05, "roll_gradient": 0.05, "pitch_gradient": 0.05, "roughness": 2e-3, "vibration": 20.0,
-            "vibration_rate": 0.5, "imu_arm_std": 2.0, "mounting_std_deg": 10.0, "spread": 0.5,
+            "sideslip": 0.05, "slip_noise": 0.05, "roll_gradient": 0.05, "pitch_gradient": 0.05, "roughness": 2e-3,
+            "vibration": 20.0, "vibration_rate": 0.5, "imu_arm_std": 2.0, "mounting_std_deg": 10.0, "spread": 0.5,
         }  # fmt: skip
         for name, limit in limits.items():
             if not 0 <= getattr(self, name) <= limit:
@@ -94,6 +96,7 @@ class Car:
     pitch_gradient: float
     imu_arm: Array  # (3,) m
     mounting: Array  # (3,) roll, pitch, yaw [rad]
+    gusts: Waves  # what is added to the slip angle [rad]
 
 
 def draw_car(rng: np.random.Generator, kind: ChassisConfig) -> Car:
@@ -102,18 +105,20 @@ def draw_car(rng: np.random.Generator, kind: ChassisConfig) -> Car:
     arm = np.asarray(kind.imu_arm) + kind.imu_arm_std * rng.standard_normal(3)
     mounting = np.radians(np.asarray(kind.mounting_deg) + kind.mounting_std_deg * rng.standard_normal(3))
     values = factors * (kind.sideslip, kind.roll_gradient, kind.pitch_gradient)
-    return Car(kind, *(float(x) for x in values), arm, mounting)
+    gusts = random_waves(rng, kind.slip_noise, (20.0, 300.0))
+    return Car(kind, *(float(x) for x in values), arm, mounting, gusts)
 
 
 def slip_angle(car: Car, route: Route, motion: Kinematics) -> tuple[Array, Array]:
     """β of the rear axle [rad] and its rate [rad/s]; the velocity to the right there is v sin β.
 
-    The tyres carry the lateral acceleration less what the bank of the road does: β = −K (v χ' − g bank).
+    The tyres carry the lateral acceleration less what the bank of the road does: β = −K (v χ' − g bank) + gusts.
     """
+    gust, gust_rate = car.gusts.at(motion)
     bank, bank_rate = route.bank(motion)
     load = motion.speed * motion.yaw_rate - GRAVITY * bank
     change = motion.acceleration * motion.yaw_rate + motion.speed * motion.yaw_acceleration
-    return -car.sideslip * load, -car.sideslip * (change - GRAVITY * bank_rate)
+    return gust - car.sideslip * load, gust_rate - car.sideslip * (change - GRAVITY * bank_rate)
 
 
 def mounted(rng: np.random.Generator, car: Car, route: Route, axle: Truth) -> Truth:

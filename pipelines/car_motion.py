@@ -1,0 +1,89 @@
+"""How cars move besides along their way, from any dataset with attitude: slip, arm, mounting, vibration.
+
+    python -m pipelines.car_motion ../shared/data/real/kitti data/lifelike --longest 20
+
+Per dataset, over its longest drives: velocity to the right and down in the axes of the reference, RMS above 2 m/s;
+the least-squares fit v_right = arm · r − K v² r + yaw · v with r the yaw rate, and what it leaves, for all drives
+together and for each by itself; and the RMS of the IMU's six channels in bands of frequency.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.signal import welch
+
+from dlkf.data.schema import ACCEL, GYRO
+from dlkf.data.tables import read_drives
+from dlkf.data.validate import DriveTables, read_checked
+from dlkf.errors import InputError
+from dlkf.navigation.attitude import rotation_from_rpy
+
+BANDS = ((0.5, 3.0), (3.0, 10.0), (10.0, 20.0), (20.0, 45.0))  # Hz
+MOVING = 2.0  # m/s
+
+
+def across(tables: DriveTables) -> tuple[np.ndarray, np.ndarray]:
+    """Regressors (r, −v² r, v) and velocity to the right and down where the car moves, (N, 3) and (N, 2)."""
+    reference = tables.reference
+    if reference is None or not np.isfinite(reference["yaw"]).any():
+        raise InputError(f"drive {tables.row.name}: no attitude in its reference, so no velocity across the car")
+    C_nb = rotation_from_rpy(torch.from_numpy(np.stack([reference[c] for c in ("roll", "pitch", "yaw")], -1))).numpy()
+    v_b = np.einsum("tij,ti->tj", C_nb, np.stack([reference[c] for c in ("vel_n", "vel_e", "vel_d")], -1))
+    rate = np.interp(reference["t"], tables.imu["t"], tables.imu["gyro_z"])
+    moving = (v_b[:, 0] > MOVING) & reference["valid"].astype(bool)
+    v, r = v_b[moving, 0], rate[moving]
+    return np.stack((r, -(v**2) * r, v), -1), v_b[moving, 1:]
+
+
+def bands(imu: dict[str, np.ndarray]) -> dict[str, list[float]]:
+    """RMS of each channel in each band [m/s², °/s]."""
+    rate = 1 / float(np.median(np.diff(imu["t"])))
+    out = {}
+    for column in (*ACCEL, *GYRO):
+        f, density = welch(imu[column] - imu[column].mean(), rate, nperseg=1024)
+        scale = 180 / np.pi if column in GYRO else 1.0
+        power = [density[(f >= low) & (f < high)].sum() * f[1] for low, high in BANDS]
+        out[column] = [scale * float(np.sqrt(x)) for x in power]
+    return out
+
+
+def rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
+def describe(folder: Path, longest: int) -> None:
+    drives = [read_checked(folder, row) for row in read_drives(folder)]
+    drives = sorted(drives, key=lambda tables: len(tables.imu["t"]))[-longest:]
+    parts = [across(tables) for tables in drives]
+    x, v = (np.concatenate(columns) for columns in zip(*parts))
+    fit = np.linalg.lstsq(x, v[:, 0], rcond=None)[0]
+    alone = [y[:, 0] - a @ np.linalg.lstsq(a, y[:, 0], rcond=None)[0] for a, y in parts]
+    print(f"\n{folder}: {len(drives)} drives, {sum(len(t.imu['t']) for t in drives)} samples")
+    print(f"velocity to the right {rms(v[:, 0]):.3f} m/s, down {rms(v[:, 1]):.3f} m/s")
+    print(f"arm {fit[0]:.2f} m, slip {fit[1]:.4f} s²/m, yaw {np.degrees(fit[2]):.2f}°; ", end="")
+    print(f"left {rms(v[:, 0] - x @ fit):.3f} m/s, fitted by drive {rms(np.concatenate(alone)):.3f} m/s")
+    print(f"| channel | {' | '.join(f'{low:g}–{high:g} Hz' for low, high in BANDS)} |\n|---|{'---|' * len(BANDS)}")
+    for column, row in bands(drives[-1].imu).items():
+        print(f"| {column} | {' | '.join(f'{value:.3f}' for value in row)} |")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("datasets", nargs="+", type=Path)
+    parser.add_argument("--longest", type=int, default=20, help="how many of the longest drives of each")
+    arguments = parser.parse_args()
+    try:
+        for folder in arguments.datasets:
+            describe(folder, arguments.longest)
+    except InputError as error:
+        print(f"dlkf: error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()
