@@ -55,7 +55,7 @@ def sensor_columns(
 def gravity(
     p_n: Tensor, stretching: Tensor, centre: Tensor, axis: Tensor, shape: Tensor, constants: tuple[float, ...]
 ) -> Tensor:
-    """Gravity (B, 3) of :meth:`dlkf.navigation.earth.TangentFrame.gravity`; ``shape`` (B, 3) is height, 1/(2R), slope."""
+    """Gravity (B, 3) of :class:`dlkf.navigation.earth.TangentFrame`; ``shape`` (B, 3) is height, 1/(2R), slope."""
     g = torch.empty_like(p_n)
     inputs = (x.detach().numpy() for x in (p_n, stretching, centre, axis, shape))
     _gravity(*inputs, *constants, g.numpy())
