@@ -17,9 +17,9 @@ from dlkf.data.drive import Drive
 from dlkf.navigation.attitude import prefix_rotations
 from dlkf.navigation.earth import EARTH_RATE
 
-REST_SPREAD = (0.25, 0.04)  # m/s², rad/s: the most that the samples of a standing car scatter, engine on
+REST_SPREAD = (0.4, 0.05)  # m/s², rad/s: the most that the samples of a standing car scatter, engine on
 REST_SPEED = 0.2  # m/s, on top of what the receiver may be wrong by
-REST_POSITION_STD = 0.5  # m: fixes without velocity that are no better than that tell nothing
+REST_POSITION_STD = 0.1  # m: fixes without velocity that are no better than that tell nothing
 SHORTEST_REST_S = 2.0
 RATE_STD = 5e-3  # rad/s, of gyroscopes that have not been seen at rest
 RATE_DRIFT_STD = 5e-4  # rad/s, since they have

@@ -31,6 +31,8 @@ PRIOR = (0.9, 0.05, 0.05)  # of the course, of its reverse, of the ring together
 NIS_CAP = 30.0  # what one epoch may say against a heading: an outlier is no proof
 DECIDED = 5.0  # ln of the odds against any other heading
 OTHER = math.radians(25)  # apart, at the end, to be another
+COARSE = math.radians(5)  # a course that is no better than this is given up for a posterior that is
+OVERBOUND = 2.0  # on the posterior's 1σ: the errors of the IMU are a guess
 PATIENCE = 4  # as many times the search's length while it is undecided
 BATCH_EPOCHS = 20_000  # at a time: bounds the memory
 # an IMU of which nothing is known: what MEMS on a car's roof have been seen to do
@@ -66,7 +68,8 @@ class Heading:
 def likeliest(cases: Sequence[Case], search_s: float) -> list[Heading]:
     """The likeliest heading of each case after ``search_s``, or up to ``PATIENCE`` times that if it leaves doubt.
 
-    A posterior that agrees with the course or its reverse within 3σ gives that; any other is taken itself.
+    A posterior that agrees with the course or its reverse within 3σ gives that, unless the course is a poor one; it
+    is taken itself otherwise.
     """
     found: dict[int, Heading] = {}
     todo, spent = list(range(len(cases))), search_s
@@ -120,12 +123,12 @@ def _smoothed(
     P = solution.covariances.updated[row, last][states][:, states]
     J = torch.cat((torch.eye(3, dtype=P.dtype), C_nb.sum(0) * bank.epoch_s), 1)
     noise = ANY_IMU.gyro.noise_psd * (last + 1) * bank.epoch_s
-    std = math.sqrt(float((J @ P @ J.mT)[2, 2]) + noise)
+    std = OVERBOUND * math.sqrt(float((J @ P @ J.mT)[2, 2]) + noise)
     for k, origin in enumerate(("course", "reverse")):
         known = bank.start.C_nb[first + k]
         course_std = float(bank.start_std[first + k, ATTITUDE][2])
         apart = float(vector_from_rotation(C @ known.mT)[2])
-        if abs(apart) < 3 * math.hypot(std, course_std):
+        if abs(apart) < 3 * math.hypot(std, course_std) and course_std < max(COARSE, std):
             return Heading(known.clone(), course_std, origin, decided)
     force_n = case.start.state.C_nb @ case.force_b
     return Heading(levelled(C, case.force_b, force_n), std, "bank", decided)
