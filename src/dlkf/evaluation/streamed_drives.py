@@ -34,22 +34,25 @@ def played(
     ``arrival`` [s] is when each fix comes, by default at its own time, before a sample of the same time.
     """
     t, arrival = imu["t"], gnss["t"] if arrival is None else np.asarray(arrival)
-    samples = np.stack([imu[c] for c in (*ACCEL, *GYRO)], -1).tolist()
-    fixes = np.stack([gnss[c] for c in ("t", *POSITION, *VELOCITY, *STD)], -1).tolist()
-    quality = gnss["quality"].tolist()
+    samples = np.stack([imu[c] for c in ("t", *ACCEL, *GYRO)], -1)
+    fixes = np.stack([gnss[c] for c in ("t", *POSITION, *VELOCITY, *STD)], -1)
     order = np.argsort(arrival, kind="stable")
-    before = np.searchsorted(t, arrival[order], side="left").tolist()
-    order, done = order.tolist(), 0
-    for k, stamp in enumerate(t.tolist()):
+    before = np.searchsorted(t, arrival[order], side="left")
+    done = 0
+
+    def fix(j: int) -> Receipt:
+        x = fixes[j].tolist()
+        return stream.gnss(*x[:4], x[4:7], x[7:], int(gnss["quality"][j]))
+
+    for k, row in enumerate(samples):
         while done < len(order) and before[done] <= k:
-            x = fixes[order[done]]
-            yield stream.gnss(*x[:4], x[4:7], x[7:], quality[order[done]])
+            yield fix(order[done])
             done += 1
-        yield stream.imu(stamp, samples[k][:3], samples[k][3:])
+        x = row.tolist()
+        yield stream.imu(x[0], x[1:4], x[4:])
     yield stream.finish()
     for j in order[done:]:
-        x = fixes[j]
-        yield stream.gnss(*x[:4], x[4:7], x[7:], quality[j])
+        yield fix(j)
 
 
 def stream_drive(
