@@ -68,7 +68,7 @@ def run_study(
     clock = time.perf_counter()
     filters: dict[str, Estimator] = {}
     for name in config["baselines"]["models"]:
-        given = {"prior_mean": prior["mean"], "prior_std": prior["std"]} if name.endswith("_prior") else {}
+        given = {"prior_mean": prior["mean"], "prior_std": prior["std"]} if "_prior" in name else {}
         filters[name] = build_filter(name, spec, tuning=tuning, **given)
     learned = str(config["model"]["kind"])
     if learned in filters:
