@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+from typing import Any, cast
 
 import pandas as pd
 from omegaconf import DictConfig, OmegaConf
@@ -18,7 +19,7 @@ from dlkf.simulation.semi_real import semi_real_from_config
 def main(cfg: DictConfig) -> None:
     """Write the dataset to ``out`` (default ``data/<name>``) and say what it holds."""
     start = time.perf_counter()
-    config = OmegaConf.to_container(cfg, resolve=True)
+    config = cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True))
     make = semi_real_from_config if config["source"] else simulate_from_config
     out = make(config, config["out"], overwrite=config["overwrite"])
     drives = pd.read_parquet(out / "drives.parquet")

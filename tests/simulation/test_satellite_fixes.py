@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from dlkf.config import config_dir
 from dlkf.errors import InputError
 from dlkf.simulation.almanac import read_almanac
+from dlkf.simulation.dataset import DatasetConfig
 from dlkf.simulation.gnss import GnssConfig
 from dlkf.simulation.least_squares import Observations, solve
 from dlkf.simulation.obstruction import held, in_view
@@ -256,4 +257,18 @@ def test_presets_are_as_good_as_they_say(name, limits):
 def test_bad_receivers_are_one_clear_line(change, said):
     with pytest.raises(InputError) as caught:
         receiver_spec({"name": "mine", "std_range": 1.0, **change})
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"raw": True}, "receiver=<preset>"),
+        ({"raw": 1, "receiver": ALL}, "raw=1"),
+        ({"receiver": ALL, "gnss": GnssConfig(rate_hz=20.0), "drive_minutes": 120.0}, "144000 epochs"),
+    ],
+)
+def test_datasets_that_cannot_be_are_one_clear_line(change, said):
+    with pytest.raises(InputError) as caught:
+        DatasetConfig("toy", **change)
     assert said in str(caught.value) and "\n" not in str(caught.value)

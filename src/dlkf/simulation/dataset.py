@@ -32,7 +32,7 @@ from dlkf.simulation.settings import built
 from dlkf.simulation.surroundings import Surroundings
 
 LONGEST_DRIVE = 240.0  # minutes; a drive is held in memory as a whole
-FASTEST_RECEIVER = 20.0  # Hz
+MOST_EPOCHS = 100_000  # of a drive with satellites, 2 GB
 
 
 @dataclass(frozen=True)
@@ -91,9 +91,11 @@ class DatasetConfig:
             raise InputError(f"dataset: unit_seed {self.unit_seed!r} must be a whole number ≥ 0")
         if not isinstance(self.raw, bool) or (self.raw and self.receiver is None):
             raise InputError(f"raw={self.raw}: there are raw observations with a satellite receiver=<preset> only")
-        if self.receiver is not None and self.gnss.rate_hz > FASTEST_RECEIVER:
+        epochs = self.gnss.rate_hz * self.drive_minutes * 60
+        if self.receiver is not None and epochs > MOST_EPOCHS:
             raise InputError(
-                f"dataset: gnss.rate_hz {self.gnss.rate_hz} is above {FASTEST_RECEIVER:g} for a satellite receiver"
+                f"dataset: gnss.rate_hz {self.gnss.rate_hz} over drive_minutes {self.drive_minutes:g} are {epochs:.0f} "
+                f"epochs of satellites, more than {MOST_EPOCHS}; make the drives shorter or the rate lower"
             )
 
     @property

@@ -72,7 +72,7 @@ def solve(observed: Observations) -> Solution:
     ``solved``: at least four satellites and converged.
     """
     enough = observed.used.sum(-1) >= FEWEST
-    best = np.argmax(observed.used.sum(-1))[None]
+    best = np.array([observed.used.sum(-1).argmax()])
     start = _gauss_newton(_rows(observed, best), np.zeros((1, 4)))[0]
     state, converged = _gauss_newton(observed, np.repeat(start, len(enough), 0))
     r_e, solved = state[:, :3], enough & converged

@@ -70,13 +70,11 @@ def simulate_semi_real(
     rows = read_drives(source)
     described = pq.read_table(Path(source) / "drives.parquet").to_pandas().to_dict("records")
     shared = draw_unit(np.random.default_rng(np.random.SeedSequence(config.unit_seed, spawn_key=(0,))), spec)
-    shown = track(
-        range(len(rows)), f"semi-real {config.name}", disable=not progress, console=Console(stderr=True)
-    )
-    with closing(shown), new_dataset(out, overwrite) as folder:
+    shown = track(rows, f"semi-real {config.name}", disable=not progress, console=Console(stderr=True))
+    with closing(iter(shown)) as drives, new_dataset(out, overwrite) as folder:  # type: ignore[type-var]
         written = []
-        for index in shown:
-            tables = read_checked(source, rows[index])
+        for index, drive in enumerate(drives):
+            tables = read_checked(source, drive)
             *streams, unit_seed, type_seed = np.random.SeedSequence(seed, spawn_key=(2, index)).spawn(5)
             kind = imu_type(config, spec, type_seed)
             unit = shared if config.imu_errors == "one" else draw_unit(np.random.default_rng(unit_seed), kind)
@@ -86,7 +84,7 @@ def simulate_semi_real(
             row = _row(described[index], config, kind, rough)
             written.append(write_drive(folder, row, imu, received.fixes, reference))
             if config.raw:
-                write_raw(folder, rows[index].name, received.raw)
+                write_raw(folder, drive.name, received.raw)
         write_drives_table(folder, written)
         validate_dataset(folder)
         settings = {"source": str(source), "seed": seed, "dataset": asdict(config), "imu": asdict(spec)}

@@ -5,11 +5,14 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
+from matplotlib.projections.polar import PolarAxes
 from numpy.typing import NDArray
 
 from dlkf.navigation.earth import SEMI_MAJOR
@@ -24,7 +27,7 @@ def sky_plot(raw: pd.DataFrame, above: pd.DataFrame, title: str = "") -> Figure:
     """Azimuth around, elevation inwards: tracks of all satellites ``above`` the horizon (prn, azimuth, elevation [rad])
     in grey, the epochs at which each was tracked in blue, the name at the last place."""
     figure = Figure(figsize=(5.6, 5.6), layout="constrained", dpi=DPI)
-    axes = figure.add_subplot(projection="polar")
+    axes = cast(PolarAxes, figure.add_subplot(projection="polar"))
     axes.set_theta_zero_location("N")
     axes.set_theta_direction(-1)
     axes.set_thetagrids(range(0, 360, 45), ("N", "45°", "E", "135°", "S", "225°", "W", "315°"))
