@@ -50,6 +50,7 @@ class AlignConfig:
             if not number or value < 0 or (value == 0 and name != "search_s"):
                 above = "≥ 0" if name == "search_s" else "above 0"
                 raise InputError(f"align.{name} is {value!r}, must be a number {above}")
+            object.__setattr__(self, name, float(value))
         if not isinstance(self.from_rest, bool):
             raise InputError(f"align.from_rest is {self.from_rest!r}, must be true or false")
 
