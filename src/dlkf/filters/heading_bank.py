@@ -32,6 +32,7 @@ NIS_CAP = 30.0  # what one epoch may say against a heading: an outlier is no pro
 DECIDED = 5.0  # ln of the odds against any other heading
 OTHER = math.radians(25)  # apart, at the end, to be another
 COARSE = math.radians(5)  # a course that is no better than this is given up for a posterior that is
+AGAIN_STD = math.radians(6)  # of a heading that a second run begins with
 OVERBOUND = 2.0  # on the posterior's 1σ: the errors of the IMU are a guess
 PATIENCE = 4  # as many times the search's length while it is undecided
 BATCH_EPOCHS = 20_000  # at a time: bounds the memory
@@ -53,6 +54,13 @@ class Case:
     force_b: Float[Tensor, " 3"]
     gyro_error: Float[Tensor, " 3"]
 
+    def towards(self, heading: Heading) -> Case:
+        """The same from another heading, no surer than ``AGAIN_STD``."""
+        yaw_std = self.start.std.new_tensor([max(AGAIN_STD, heading.std)])
+        state = self.start.state._replace(C_nb=heading.C_nb)
+        std = torch.cat((self.start.std[: ATTITUDE.stop - 1], yaw_std))
+        return replace(self, start=replace(self.start, state=state, std=std))
+
 
 @dataclass(frozen=True)
 class Heading:
@@ -73,16 +81,23 @@ def likeliest(cases: Sequence[Case], search_s: float) -> list[Heading]:
     """
     found: dict[int, Heading] = {}
     todo, spent = list(range(len(cases))), search_s
-    while todo:
-        epochs = {k: min(cases[k].drive.epochs, max(1, round(spent / cases[k].drive.epoch_s))) for k in todo}
-        count = max(1, BATCH_EPOCHS // (max(epochs.values()) * (RING + 2)))
-        for part in (todo[i : i + count] for i in range(0, len(todo), count)):
-            found |= zip(part, _weighed([cases[k] for k in part], [epochs[k] for k in part]))
-        todo = [k for k in todo if not found[k].decided and epochs[k] < cases[k].drive.epochs]
+    while todo and spent <= PATIENCE * search_s:
+        found |= zip(todo, _in_parts([cases[k] for k in todo], spent))
+        todo = [k for k in todo if not found[k].decided and spent < cases[k].drive.epochs * cases[k].drive.epoch_s]
         spent *= 2
-        if spent > PATIENCE * search_s:
-            break
+    # a filter that began far off has learned wrong things on its way: once more from where it came to
+    far = [k for k, heading in found.items() if heading.origin == "bank"]
+    again = _in_parts([cases[k].towards(found[k]) for k in far], search_s)
+    found |= {k: replace(h, origin="bank", decided=found[k].decided) for k, h in zip(far, again)}
     return [found[k] for k in range(len(cases))]
+
+
+def _in_parts(cases: Sequence[Case], seconds: float) -> list[Heading]:
+    """:func:`_weighed` a bounded number at a time."""
+    epochs = [min(c.drive.epochs, max(1, round(seconds / c.drive.epoch_s))) for c in cases]
+    count = max(1, BATCH_EPOCHS // (max(epochs, default=1) * (RING + 2)))
+    parts = range(0, len(cases), count)
+    return [h for i in parts for h in _weighed(cases[i : i + count], epochs[i : i + count])]
 
 
 @torch.inference_mode()
