@@ -191,7 +191,7 @@ def test_real_drives():
         known = [bool(d.ref_C_eb[s.first].isfinite().all()) for d, s in zip(real, starts)]
         assert sum(s.first for s in starts) <= 1  # one has no fix at its first boundary
         normalised, heading = (x[known] for x in _errors(real, starts))
-        assert len(heading) >= 14 and heading.abs().max() < 8 and heading.square().mean().sqrt() < 1.6
+        assert len(heading) >= 14 and heading.abs().max() < 8 and heading.square().mean().sqrt() < 2
         assert (normalised.square().mean(0).sqrt() < 1.5).all()
     rtkx = load_dataset(REAL / "rtkx", dtype=torch.float64)[0]
     assert align(rtkx).first == 37 and align(rtkx, AROUND).first == 0
