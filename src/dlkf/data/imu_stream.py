@@ -102,14 +102,17 @@ class ImuStream:
         """
         done = []
         while self.latest >= self.end - max(slack_s, 4 * math.ulp(self.end)):
-            assert self.grid is not None  # end is infinite without
-            begin = self.grid.t0 + self.epochs * self._epoch_s
-            done.append(self._resampled(Grid(begin, self._epoch_s, 1, self._samples)))
+            done.append(self._resampled(Grid(self.boundary(self.epochs), self._epoch_s, 1, self._samples)))
             self.epochs += 1
-            begin, self.end = self.end, self.grid.t0 + (self.epochs + 1) * self._epoch_s
-            while len(self._rows) > BEFORE and self._rows[BEFORE][0] <= begin:
+            self.end = self.boundary(self.epochs + 1)
+            while len(self._rows) > BEFORE and self._rows[BEFORE][0] <= self.boundary(self.epochs):
                 self._rows.popleft()
         return done
+
+    def boundary(self, number: int) -> float:
+        """Time of a boundary of the grid [s]."""
+        assert self.grid is not None
+        return self.grid.t0 + number * self._epoch_s
 
     @property
     def slack_s(self) -> float:
@@ -120,7 +123,7 @@ class ImuStream:
         """Samples (1, m, 6) from the open epoch's beginning to the latest stamp, and their length [s]."""
         if self.grid is None:
             return None
-        begin = self.grid.t0 + self.epochs * self._epoch_s
+        begin = self.boundary(self.epochs)
         span = self.latest - begin
         if span <= 4 * math.ulp(begin):
             return None

@@ -33,16 +33,16 @@ def played(
 
     ``arrival`` [s] is when each fix comes, by default at its own time, before a sample of the same time.
     """
-    t, arrival = imu["t"], gnss["t"] if arrival is None else np.asarray(arrival)
+    when = gnss["t"] if arrival is None else np.asarray(arrival)
     samples = np.stack([imu[c] for c in ("t", *ACCEL, *GYRO)], -1)
     fixes = np.stack([gnss[c] for c in ("t", *POSITION, *VELOCITY, *STD)], -1)
-    order = np.argsort(arrival, kind="stable")
-    before = np.searchsorted(t, arrival[order], side="left")
+    order = np.argsort(when, kind="stable")
+    before = np.searchsorted(imu["t"], when[order], side="left")
     done = 0
 
     def fix(j: int) -> Receipt:
         x = fixes[j].tolist()
-        return stream.gnss(*x[:4], x[4:7], x[7:], int(gnss["quality"][j]))
+        return stream.gnss(x[0], x[1], x[2], x[3], x[4:7], x[7:], int(gnss["quality"][j]))
 
     for k, row in enumerate(samples):
         while done < len(order) and before[done] <= k:

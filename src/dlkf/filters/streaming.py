@@ -103,7 +103,7 @@ class StreamingFilter:
     ``rate_hz``, ``epoch_s``: the grid that the filter works on, as in training and in ``navigate``.
     ``lever_arm_b`` [m]: IMU → antenna, Forward-Right-Down. ``history_s``: how late a fix may be. ``counts`` tells how
     often each status was returned (samples that are taken do not count), and how often the state was no longer finite
-    (``diverged``). Raises InputError if the filter cannot work on such a grid.
+    (``diverged``). For one thread at a time. Raises InputError if the filter cannot work on such a grid.
     """
 
     def __init__(
@@ -120,13 +120,12 @@ class StreamingFilter:
         anchor_m: float = 50_000.0,
         limits: Limits = LIMITS,
     ) -> None:
-        if not history_s >= 0:
-            raise InputError(f"history_s is {history_s!r}, must be ≥ 0 s")
+        if not 0 <= history_s < math.inf:
+            raise InputError(f"history_s is {history_s!r}, must be a finite number ≥ 0")
         if align.search_s > 0 or align.from_rest:
             raise InputError("align.search_s and align.from_rest look ahead, which a stream cannot; leave them out")
         self.estimator, self._align = estimator, align
         self._rate_hz, self._epoch_s, self._anchor_m = rate_hz, epoch_s, anchor_m
-        self._lever_arm_b = torch.tensor(lever_arm_b, dtype=torch.float64)
         self._phase_s, self._history_s = phase_s, history_s
         self._samples = ImuStream(
             rate_hz, epoch_s, step_s=imu_step_s, limits=limits, keep_s=max(history_s, 2 * SETTLE_S)
@@ -135,6 +134,7 @@ class StreamingFilter:
         self._rewind = math.ceil(history_s / epoch_s) + 1  # epochs that may be replayed
         parameter = next(estimator.parameters(), None) if isinstance(estimator, torch.nn.Module) else None
         self._device = torch.device("cpu") if parameter is None else parameter.device
+        self._lever_arm_b = torch.tensor([lever_arm_b], dtype=torch.float64, device=self._device)
         self.counts: Counter[str] = Counter()
         self._clear()
         with torch.inference_mode():  # a model that does not fit must be told now, not on the road
@@ -272,8 +272,8 @@ class StreamingFilter:
             if held[0] == t:
                 return self._answer(Status.REFUSED, f"fix at t = {t:.3f} again")
             return self._answer(Status.SUPERSEDED)
-        boundary = grid.t0 + row * self._epoch_s
-        self._fixes[row] = (t, fixes_at(fix, np.zeros(1, np.int64), np.array([boundary])))
+        boundary = np.array([self._samples.boundary(row)])
+        self._fixes[row] = (t, fixes_at(fix, np.zeros(1, np.int64), boundary))
         if row > done or not self._closed:
             return self._answer(Status.TAKEN)
         start = max(0, row - 1 - self._closed[0].number)
@@ -293,10 +293,10 @@ class StreamingFilter:
         try:
             memory, step = advance(
                 self.estimator, running.memory, running.state, running.error, epoch.imu, fix,
-                dt=1 / self._rate_hz, frame=running.frame, lever_arm_b=self._first.lever_arm_b,
+                dt=1 / self._rate_hz, frame=running.frame, lever_arm_b=self._lever_arm_b,
             )  # fmt: skip
             finite = all(bool(x.isfinite().all()) for x in step.posterior)
-        except torch.linalg.LinAlgError:
+        except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage]
             finite = False
         if not finite:
             self.counts["diverged"] += 1
@@ -305,7 +305,7 @@ class StreamingFilter:
         self._running = self._anchored(Running(memory, step.posterior, step.error, running.frame))
         accepted = step.answer.accepted
         used = bool(fix.used.any()) and (accepted is None or bool(accepted.any()))
-        t = self._samples.grid.t0 + (epoch.number + 1) * self._epoch_s
+        t = self._samples.boundary(epoch.number + 1)
         self._latest = Estimate(t, running.frame, step.posterior, step.complete_error, step.answer.std, used)
         return [self._latest]
 
@@ -347,13 +347,14 @@ class StreamingFilter:
             gnss_r_e=found["r_e"], gnss_v_e=found["v_e"], gnss_std=found["std"], gnss_valid=found["valid"],
             gnss_lag=found["lag"], quality=found["quality"],
             ref_r_e=unknown(3), ref_v_e=unknown(3), ref_C_eb=unknown(3, 3),
-            ref_valid=torch.zeros(rows, dtype=torch.bool), ref_imu_error=unknown(6), lever_arm_b=self._lever_arm_b,
+            ref_valid=torch.zeros(rows, dtype=torch.bool), ref_imu_error=unknown(6),
+            lever_arm_b=self._lever_arm_b[0].cpu(),
         )  # fmt: skip
 
     def _anchored(self, running: Running) -> Running:
         """The filter in a frame whose origin is near the car."""
         away = float(running.state.p_n[0, :2].norm())
-        if away <= self._anchor_m or not can_reanchor(running.memory):
+        if away <= self._anchor_m or self._first is None or not can_reanchor(running.memory):
             return running
         change = FrameChange(running.frame, frame_at(running.state, running.frame))
         state = change.state(running.state)
