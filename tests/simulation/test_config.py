@@ -74,7 +74,7 @@ def test_a_simulated_dataset_keeps_the_contract(tmp_path):
 def test_any_dataset_can_have_another_car():
     """Both settings are presets: the paper's point, and a lifelike car."""
     point = composed("simulated@dataset=lifelike", "chassis@dataset.chassis=point")
-    car = composed("simulated@dataset=one_imu", "+chassis@dataset.chassis=lifelike")
+    car = composed("simulated@dataset=one_imu", "chassis@dataset.chassis=lifelike")
     assert dataset_config(point["dataset"]).chassis.is_point
     assert dataset_config(car["dataset"]).chassis.sideslip == 0.0075
     assert dataset_config(composed("simulated@dataset=paper_clean")["dataset"]).chassis.is_point
