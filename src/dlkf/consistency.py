@@ -16,8 +16,9 @@ from dlkf.command import command
 from dlkf.errors import InputError
 from dlkf.evaluation.consistency import Normalised, consistency, consistency_table, states_of, write_consistency
 from dlkf.evaluation.matched_drives import matched_batch, matched_drives, matching
-from dlkf.evaluation.outages import OutagePlan, with_outage
+from dlkf.evaluation.outages import with_outage
 from dlkf.evaluation.progress import counting
+from dlkf.evaluation.protocol import protocol_from
 from dlkf.evaluation.table import as_rich
 from dlkf.filters.build import build_filter
 from dlkf.navigation.imu_errors import imu_spec
@@ -31,6 +32,7 @@ def main(cfg: DictConfig) -> None:
     if not names:
         raise InputError("model is an empty list; give at least one Kalman filter, such as model=mbkf15")
     settings, preset = matched_drives(config), imu_spec(config["imu"])
+    plan = protocol_from(config).outage
     states = {name: states_of(name, build_filter(name, preset, tuning=config["tuning"])) for name in names}
     results: dict[str, Normalised] = {}
     outage = None
@@ -38,8 +40,10 @@ def main(cfg: DictConfig) -> None:
         spec = matching(preset, states[name])
         with counting(f"Simulating for {name}") as progress:
             batch, matrices = matched_batch(settings, spec, progress)
-        if config["outage"] is not None:
-            (mask,) = OutagePlan(**config["outage"]).masks(batch)
+        if plan is not None:
+            mask = plan.masks(batch)[0]
+            if not bool(mask.any()):
+                raise InputError(f"no outage fits into {settings.minutes:g} minutes; see outage.* and minutes")
             batch, outage = with_outage(batch, mask), mask[0].numpy()
         with counting(f"Running {name}") as progress:
             filters = build_filter(name, spec, tuning=config["tuning"])

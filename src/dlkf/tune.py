@@ -1,6 +1,6 @@
 """Tune a Kalman filter: ``python -m dlkf.tune model=mbkf21 dataset=data/per_drive name=town out=mine``.
 
-Writes ``out/tuning/<name>.yaml``, which evaluate and navigate take with ``--config-dir <out> +tuning=<name>``, and
+Writes ``out/tuning/<name>.yaml``, which evaluate and navigate take with ``--config-dir <out> tuning=<name>``, and
 logs the search to MLflow.
 """
 

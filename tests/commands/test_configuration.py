@@ -19,11 +19,11 @@ CONF = config_dir()
 GROUPS = {  # group of the defaults list: folder under conf/
     "simulate": {"imu": "imu", "receiver": "receiver", "simulated@dataset": "simulated"},
     "ingest": {"reader": "reader"},
-    "evaluate": {"imu": "imu"},
-    "navigate": {"imu": "imu"},
+    "evaluate": {"imu": "imu", "tuning": "tuning"},
+    "navigate": {"imu": "imu", "tuning": "tuning"},
     "allan": {"imu": "imu"},
-    "tune": {"imu": "imu"},
-    "consistency": {"imu": "imu", "chassis": "chassis"},
+    "tune": {"imu": "imu", "tuning": "tuning"},
+    "consistency": {"imu": "imu", "tuning": "tuning", "chassis": "chassis"},
     "train": {"imu": "imu", "data": "data", "filter@model": "filter"},
 }
 

@@ -41,7 +41,7 @@ class Tuned:
 
     @property
     def changed(self) -> dict[str, float]:
-        """What a later command has to be told."""
+        """What is not as it comes."""
         start, default = tuning_values(self.after), tuning_values(Tuning())
         return {k: v for k, v in start.items() if v != default[k]}
 
@@ -139,7 +139,7 @@ def tuning_table(result: Tuned, dataset: str) -> Table:
 
 def write_tuning(out: str | Path, name: str, result: Tuned, table: Table) -> None:
     """Write tuning/<name>.yaml, table.md and search.csv into ``out``, all or none."""
-    factors = f"# {table.title}\n{yaml.safe_dump(result.changed, sort_keys=False)}"
+    factors = f"# {table.title}\n{yaml.safe_dump(tuning_values(result.after), sort_keys=False)}"
     trials = io.StringIO()
     writer = csv.writer(trials, lineterminator="\n")
     writer.writerow(["factor", "value", "error_m"])
