@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -55,7 +56,7 @@ class AlignConfig:
             raise InputError(f"align.from_rest is {self.from_rest!r}, must be true or false")
 
     @staticmethod
-    def of(config: AlignConfig | Mapping[str, float | bool] | None) -> AlignConfig:
+    def of(config: AlignConfig | Mapping[str, Any] | None) -> AlignConfig:
         """From a mapping of its fields; InputError for unknown ones."""
         if isinstance(config, AlignConfig):
             return config

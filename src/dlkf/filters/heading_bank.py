@@ -20,7 +20,7 @@ from torch import Tensor
 from dlkf.data.alignment import Start, levelled
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.segments import select, whole_drives
-from dlkf.filters.integration import Solution, integrate
+from dlkf.filters.integration import Covariances, Solution, integrate
 from dlkf.filters.model_based import Mbkf
 from dlkf.navigation.attitude import prefix_rotations, rotation_from_rpy, vector_from_rotation
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
@@ -106,7 +106,8 @@ def _weighed(cases: Sequence[Case], epochs: Sequence[int]) -> list[Heading]:
     bank = _bank(cases, epochs)
     solution = integrate(bank, Mbkf(ANY_IMU), keep_covariances=True)
     prior = torch.tensor([PRIOR[0], PRIOR[1], *[PRIOR[2] / RING] * RING], dtype=torch.float64).log()
-    scores = _log_likelihood(solution).unflatten(0, (len(cases), -1)) + prior
+    assert solution.covariances is not None  # asked for, and a Kalman filter has them
+    scores = _log_likelihood(solution.innovation, solution.covariances).unflatten(0, (len(cases), -1)) + prior
     headings = []
     for k, score in enumerate(scores):
         first, best = k * len(prior), int(score.argmax())
@@ -114,12 +115,13 @@ def _weighed(cases: Sequence[Case], epochs: Sequence[int]) -> list[Heading]:
         C_end = solution.posterior.C_nb[first : first + len(prior), last]
         apart = vector_from_rotation(C_end @ C_end[best].mT)[:, 2].abs() > OTHER
         decided = bool(score[best] - score[apart].amax() > DECIDED) if bool(apart.any()) else True
-        headings.append(_smoothed(cases[k], bank, solution, first, best, last, decided))
+        P = solution.covariances.updated[first + best, last]
+        headings.append(_smoothed(cases[k], bank, solution, P, first, best, last, decided))
     return headings
 
 
 def _smoothed(
-    case: Case, bank: Batch, solution: Solution, first: int, best: int, last: int, decided: bool
+    case: Case, bank: Batch, solution: Solution, P: Tensor, first: int, best: int, last: int, decided: bool
 ) -> Heading:
     """The heading at the bank's first boundary that the best one's end speaks for.
 
@@ -135,7 +137,7 @@ def _smoothed(
     for turn in turns.flip(0):
         C = C @ turn.mT
     states = [*range(STATES)[ATTITUDE], *range(STATES)[GYRO]]
-    P = solution.covariances.updated[row, last][states][:, states]
+    P = P[states][:, states]
     J = torch.cat((torch.eye(3, dtype=P.dtype), C_nb.sum(0) * bank.epoch_s), 1)
     noise = ANY_IMU.gyro.noise_psd * (last + 1) * bank.epoch_s
     std = OVERBOUND * math.sqrt(float((J @ P @ J.mT)[2, 2]) + noise)
@@ -169,10 +171,10 @@ def _bank(cases: Sequence[Case], epochs: Sequence[int]) -> Batch:
     return replace(bank, start=NavState(p, v, C.flatten(0, 1)), start_std=std.flatten(0, 1))
 
 
-def _log_likelihood(solution: Solution) -> Float[Tensor, " B"]:
+def _log_likelihood(z: Float[Tensor, "B T 6"], covariances: Covariances) -> Float[Tensor, " B"]:
     """−½ Σ (zᵀ S⁻¹ z + ln |S|), zᵀ S⁻¹ z of an epoch capped; components without a fix have z = 0, S = 1."""
-    factor = torch.linalg.cholesky(solution.covariances.innovation)
-    white = torch.linalg.solve_triangular(factor, solution.innovation.unsqueeze(-1), upper=False).squeeze(-1)
+    factor = torch.linalg.cholesky(covariances.innovation)
+    white = torch.linalg.solve_triangular(factor, z.unsqueeze(-1), upper=False).squeeze(-1)
     nis = white.square().sum(-1).clamp(max=NIS_CAP)
     spread = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     return -0.5 * (nis + spread).sum(-1)
