@@ -130,11 +130,10 @@ class Mbkf:
         offered, gate, accepted, P = (H, R), memory.gate, None, predicted
         if self.gated:
             S = H @ predicted @ H.mT + torch.diag_embed(R)
-            gate, passed, opened = Gate(self.tuning.gate).judge(memory.gate, epoch, S, fix.R)
-            P = predicted + torch.nn.functional.pad(torch.diag_embed(opened), (0, P.shape[-1] - 6) * 2)
-            fix = fix._replace(used=passed)
-            accepted = passed.any(-1)
-            H, R = masked(fix.H, fix.R, passed)
+            gate, verdict = Gate(self.tuning.gate).judge(memory.gate, epoch, S, fix.R)
+            P, accepted = verdict.opened(predicted), verdict.used
+            fix = fix._replace(used=verdict.passed)
+            H, R = masked(fix.H, fix.R, fix.used)
         z, quietest = fix.z * fix.used, memory.quietest
         informative = bool(fix.used.any())
         if self.constrained:
