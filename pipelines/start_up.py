@@ -5,6 +5,9 @@ and with ``align.search_s``, ``align.from_rest``; as recorded, in motion from it
 (the body axes turned about), with velocities of 1 m/s white noise, and, where a drive stops twice, backing out between
 the two standstills and then going forward. Printed: drives started, epochs before the start, error of the heading
 there against the reference (RMS, median, largest), and its RMS over the stated 1σ.
+
+With ``--imu``: what the starts are worth to filters in outages of 30 s, at the same times for all of them, counted
+from first motion (every 60 s, in runs 10 s apart, the first after 20 s): horizontal error at the end.
 """
 
 from __future__ import annotations
@@ -16,16 +19,22 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
+import yaml
 from torch import Tensor
 
+from dlkf.config import config_dir
 from dlkf.data.alignment import ALIGN, AlignConfig, Start
 from dlkf.data.drive import Drive
+from dlkf.data.segments import whole_drives
 from dlkf.data.standstill import at_rest, runs
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
+from dlkf.evaluation.chunks import run_filter
+from dlkf.filters.build import build_filter
 from dlkf.filters.start import align_each
 from dlkf.navigation.attitude import vector_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, ned_axes
+from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 
 CONFIGS = {
     "course": ALIGN,
@@ -36,6 +45,8 @@ HEAD = (
     "| scenario | start | started | epochs before it, mean | heading error RMS / median / max [°] | RMS over 1σ "
     "| beyond 90° | s |\n|:--|:--|--:|--:|--:|--:|--:|--:|"
 )
+
+OUTAGES = "| filter | start | outages | median [m] | RMS [m] | 95 % [m] |\n|:--|:--|--:|--:|--:|--:|"
 
 
 def in_motion(drive: Drive) -> Drive | None:
@@ -101,11 +112,41 @@ def heading_errors(drives: Sequence[Drive], starts: Sequence[Start | InputError]
     return error, std
 
 
+def outages(recorded: Sequence[Drive], imu: ImuSpec, model: str, velocity_std: float) -> None:
+    """Horizontal error at the end of outages with every kind of start."""
+    estimator = build_filter(model, imu, tuning={"velocity_std": velocity_std})
+    moving = [s for s in align_each(recorded) if isinstance(s, Start)]
+    for name, config in CONFIGS.items():
+        starts = [s for s in align_each(recorded, config) if isinstance(s, Start)]
+        batch = whole_drives(recorded, starts)
+        lead = torch.tensor([s.first - m.first for s, m in zip(starts, moving)])[:, None]
+        since = torch.arange(1, batch.size[1] + 1) + lead
+        ends = []
+        for offset in range(0, 60, 10):
+            phase = (since - 20 - offset) % 60
+            hidden = (since > 20 + offset) & (phase > 0) & (phase <= 30)
+            end = run_filter(replace(batch, available=batch.available & ~hidden), estimator)
+            error = (end.posterior.p_n - batch.truth.p_n)[..., :2].norm(dim=-1)
+            ends.append(error[hidden & (phase == 30) & batch.truth_valid])
+        error = torch.cat(ends)
+        values = error.median(), error.square().mean().sqrt(), error.quantile(0.95)
+        print(f"| {model} | {name} | {len(error)} | " + " | ".join(f"{x:.2f}" for x in values) + " |", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("datasets", nargs="+")
-    for folder in parser.parse_args().datasets:
+    parser.add_argument("--imu", help="a preset of conf/imu, for outages instead of headings")
+    parser.add_argument("--velocity-std", type=float, default=1.0, help="factor on the receiver's")
+    args = parser.parse_args()
+    for folder in args.datasets:
         recorded = load_dataset(folder, dtype=torch.float64)
+        if args.imu:
+            imu = imu_spec(yaml.safe_load((config_dir() / "imu" / f"{args.imu}.yaml").read_text()))
+            print(f"\n{folder}\n{OUTAGES}")
+            for model in ("mbkf15", "mbkf15_nhc"):
+                outages(recorded, imu, model, args.velocity_std)
+            continue
         print(f"\n{folder}\n{HEAD}")
         for scenario, made in SCENARIOS.items():
             drives = [d for d in map(made, recorded) if d is not None]
