@@ -7,6 +7,7 @@ import sys
 import time
 from typing import Any, cast
 
+import numpy as np
 import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 
@@ -31,7 +32,7 @@ def main(cfg: DictConfig) -> None:
         f"({errors}), seed {config['seed']}, in {time.perf_counter() - start:.1f} s"
     )
     if "lateral_axle_mps" in drives:
-        axle, at_imu = (math.sqrt((drives[f"lateral_{at}_mps"] ** 2).mean()) for at in ("axle", "imu"))
+        axle, at_imu = (math.sqrt(np.mean(drives[f"lateral_{at}_mps"].to_numpy() ** 2)) for at in ("axle", "imu"))
         print(f"velocity across the car, RMS above 2 m/s: {axle:.3f} m/s at the rear axle, {at_imu:.3f} m/s at the IMU")
     if config["pictures"]:
         from dlkf.simulation.pictures import write_pictures  # matplotlib takes a second to load

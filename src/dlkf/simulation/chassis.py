@@ -104,9 +104,9 @@ def draw_car(rng: np.random.Generator, kind: ChassisConfig) -> Car:
     factors = np.exp(kind.spread * rng.standard_normal(3))
     arm = np.asarray(kind.imu_arm) + kind.imu_arm_std * rng.standard_normal(3)
     mounting = np.radians(np.asarray(kind.mounting_deg) + kind.mounting_std_deg * rng.standard_normal(3))
-    values = factors * (kind.sideslip, kind.roll_gradient, kind.pitch_gradient)
+    slip, roll, pitch = (factors * (kind.sideslip, kind.roll_gradient, kind.pitch_gradient)).tolist()
     gusts = random_waves(rng, kind.slip_noise, (20.0, 300.0))
-    return Car(kind, *(float(x) for x in values), arm, mounting, gusts)
+    return Car(kind, slip, roll, pitch, arm, mounting, gusts)
 
 
 def slip_angle(car: Car, route: Route, motion: Kinematics) -> tuple[Array, Array]:

@@ -80,7 +80,7 @@ def observe(
     }
     table = pd.DataFrame(columns)
     table["quality"] = np.full(len(table), config.quality, dtype=np.int64)
-    return table if sky is None else table[~sky.blocked].reset_index(drop=True)
+    return table if sky is None else table.loc[~sky.blocked].reset_index(drop=True)
 
 
 def antenna(

@@ -35,9 +35,9 @@ def inverse_mechanisation(truth: Truth) -> Array:
     chunks = []
     for first in range(0, len(truth.t) - 1, CHUNK):
         rows = slice(first, first + CHUNK + 1)
-        parts = (truth.lat, truth.lon, truth.height, truth.v_n, truth.rpy)
-        dt = torch.from_numpy(np.diff(truth.t[rows]))
-        chunks.append(_sample_means(*(torch.from_numpy(part[rows]) for part in parts), dt))
+        dt = np.diff(truth.t[rows])
+        parts = (truth.lat[rows], truth.lon[rows], truth.height[rows], truth.v_n[rows], truth.rpy[rows], dt)
+        chunks.append(_sample_means(*map(torch.from_numpy, parts)))
     return torch.cat(chunks).numpy()
 
 
@@ -153,4 +153,4 @@ def gauss_markov(rng: np.random.Generator, samples: int, sensor: SensorErrors, r
     step = -1 / (rate_hz * sensor.correlation_time)
     n = sensor.instability * rng.standard_normal((samples, 3))
     n[1:] *= math.sqrt(-math.expm1(2 * step))
-    return lfilter([1.0], [1.0, -math.exp(step)], n, axis=0)
+    return np.asarray(lfilter([1.0], [1.0, -math.exp(step)], n, axis=0))

@@ -74,13 +74,13 @@ def driving(tables: DriveTables) -> Driving:
     t, lat, lon, v_n, v_e = (source[c][known] for c in ("t", "lat_deg", "lon_deg", "vel_n", "vel_e"))
     dt = float(np.median(np.diff(t)))
     width = max(3, 2 * round(0.5 * SMOOTH_S / dt) + 1)
-    a_n, a_e = (savgol_filter(v, width, 2, deriv=1, delta=dt) for v in (v_n, v_e))
+    a_n, a_e = (np.asarray(savgol_filter(v, width, 2, deriv=1, delta=dt)) for v in (v_n, v_e))
     speed = np.hypot(v_n, v_e)
     moving = speed > MOVING
     safe = np.where(moving, speed, 1.0)
     along = np.where(moving, (v_n * a_n + v_e * a_e) / safe, 0.0)
     yaw_rate = np.where(moving, (v_n * a_e - v_e * a_n) / safe**2, 0.0)
-    change = savgol_filter(yaw_rate, width, 2, deriv=1, delta=dt)
+    change = np.asarray(savgol_filter(yaw_rate, width, 2, deriv=1, delta=dt))
     turning = np.abs(yaw_rate) > TURNING * np.maximum(speed, MOVING)
     north = METRES_PER_DEGREE * (lat - lat[0])
     east = METRES_PER_DEGREE * (lon - lon[0]) * np.cos(np.radians(lat[0]))
@@ -207,12 +207,13 @@ def _histogram(
     if len(x):
         if edges is None:
             edges = np.linspace(0.0, 1.05 * max(float(np.percentile(x, 99.9)), bounds[1]), 50)
+        bins = edges.tolist()
         share = np.full(len(x), 1 / len(x))
         if steady is None:
-            axes.hist(x, edges, weights=share, color=AXES[0][1])
+            axes.hist(x, bins, weights=share, color=AXES[0][1])
         else:
-            axes.hist(x, edges, weights=share, histtype="step", color=INK, label="whole turn")
-            axes.hist(x[steady], edges, weights=share[steady], color=AXES[0][1], label="steady")
+            axes.hist(x, bins, weights=share, histtype="step", color=INK, label="whole turn")
+            axes.hist(x[steady], bins, weights=share[steady], color=AXES[0][1], label="steady")
     for bound in bounds:
         axes.axvline(bound, color=LIMIT, linestyle="--", linewidth=1)
     axes.set_xlabel(label)

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
-from typing import Any, TypeVar, get_type_hints
+from dataclasses import is_dataclass
+from typing import Any, ClassVar, Protocol, TypeVar, get_type_hints
 
 from dlkf.errors import InputError
 
-T = TypeVar("T")
+
+class Settings(Protocol):
+    """A dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+
+T = TypeVar("T", bound=Settings)
 
 
 def built(kind: type[T], config: Any, where: str) -> T:
@@ -21,14 +28,14 @@ def built(kind: type[T], config: Any, where: str) -> T:
         return config
     if not isinstance(config, Mapping):
         raise InputError(f"{where}: is {config!r}, must be a mapping")
-    known = {f.name: get_type_hints(kind)[f.name] for f in fields(kind)}
+    known = {name: hint for name, hint in get_type_hints(kind).items() if name in kind.__dataclass_fields__}
     if unknown := sorted(str(key) for key in config if key not in known):
         raise InputError(f"{where}: unknown key {', '.join(unknown)}; known are {', '.join(known)}")
     return kind(**{key: _value(known[key], value, key, where) for key, value in config.items()})
 
 
 def _value(kind: Any, value: Any, key: str, where: str) -> Any:
-    if is_dataclass(kind):
+    if isinstance(kind, type) and is_dataclass(kind):
         return built(kind, value, key)
     if kind in (float, int):
         if not _is_number(value) or not math.isfinite(value):
