@@ -43,7 +43,7 @@ IMU_AXES = (
 def line_of(scores: Scores, name: str) -> dict[str, object]:
     """Colour and style of a filter, the same in every figure of these scores."""
     k = list(scores.filters).index(name)
-    return {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[k % len(STYLES)]}
+    return {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[(k + k // len(COLOURS)) % len(STYLES)]}
 
 
 def representative(scores: Scores, n: int, filter_name: str | None = None) -> list[int]:
