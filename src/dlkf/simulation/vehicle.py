@@ -43,6 +43,8 @@ class Waves:
     def at(self, motion: Kinematics) -> tuple[Array, Array]:
         """The angle [rad] where the car is, and its rate [rad/s]."""
         angle, rate = np.zeros_like(motion.t), np.zeros_like(motion.t)
+        if not self.amplitude.any():
+            return angle, rate
         for amplitude, wavenumber, phase in zip(self.amplitude, self.wavenumber, self.phase):
             where = wavenumber * motion.distance + phase
             angle += amplitude * np.sin(where)
@@ -51,14 +53,18 @@ class Waves:
 
     def steered(self, motion: Kinematics) -> Kinematics:
         """The motion with the angle added to its course."""
-        angle, rate = self.at(motion)
-        curved = Waves(-self.amplitude * self.wavenumber**2, self.wavenumber, self.phase).at(motion)[0]
-        bend = Waves(self.amplitude * self.wavenumber, self.wavenumber, self.phase + 0.5 * math.pi).at(motion)[0]
+        angle, bend, curl = (np.zeros_like(motion.t) for _ in range(3))  # and its derivatives by distance
+        for amplitude, wavenumber, phase in zip(self.amplitude, self.wavenumber, self.phase):
+            where = wavenumber * motion.distance + phase
+            wave = amplitude * np.sin(where)
+            angle += wave
+            bend += amplitude * wavenumber * np.cos(where)
+            curl -= wavenumber**2 * wave
         return replace(
             motion,
             course=motion.course + angle,
-            yaw_rate=motion.yaw_rate + rate,
-            yaw_acceleration=motion.yaw_acceleration + curved * motion.speed**2 + bend * motion.acceleration,
+            yaw_rate=motion.yaw_rate + bend * motion.speed,
+            yaw_acceleration=motion.yaw_acceleration + curl * motion.speed**2 + bend * motion.acceleration,
         )
 
 
