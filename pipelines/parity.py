@@ -5,7 +5,8 @@
 Car-like drives at 100 Hz whose IMU is made by python-ins' inverse mechanisation, with the errors of the preset
 ``consumer``, RTK at 1 Hz (0.02 m, 0.05 m/s) and outages of 60 s. Both filters start from the same wrong state with
 the same P₀, and have the same Q, R and masks. Theirs, ``pyins.filters.run_feedback_filter``, takes minutes per
-drive, and what it found is kept in ``out``; ``--step 0.5`` is five times as fast. ``table.md`` holds the result.
+drive, and what it found is kept in ``out``; ``--step 0.5`` is five times as fast. ``table.md`` and ``parity.png``
+hold the result.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import pandas as pd
 import pyins
 import torch
 import yaml
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pyins import filters, inertial_sensor, measurements, sim, strapdown
 from pyins.util import ACCEL_COLS, GYRO_COLS, LLA_COLS, RPH_COLS, VEL_COLS
@@ -35,6 +37,8 @@ from dlkf.data.schema import ACCEL, GYRO, new_dataset, write_drive, write_drives
 from dlkf.data.segments import StartLaw, cut_pieces, make_batch
 from dlkf.data.store import load_dataset
 from dlkf.evaluation.bootstrap import compare
+from dlkf.evaluation.figures import COLOURS
+from dlkf.evaluation.report import png
 from dlkf.evaluation.staging import staged
 from dlkf.evaluation.table import Table, as_markdown, as_rich, number
 from dlkf.filters.build import build_filter
@@ -277,6 +281,32 @@ def table_of(results: dict[int, list[Result]], minutes: float) -> Table:
     )  # fmt: skip
 
 
+def figure(results: dict[int, list[Result]]) -> Figure:
+    """Error at the end of every outage, ours against theirs, and through an outage, RMS over all."""
+    out = Figure(figsize=(10, 4.6), layout="constrained")
+    ends_ax, growth_ax = out.subplots(1, 2)
+    for (states, runs), colour, marker in zip(results.items(), COLOURS, "os^"):
+        ends = [outage_ends(r.hidden) for r in runs]
+        a, b = (np.concatenate([getattr(r, x)[e] for r, e in zip(runs, ends)]) for x in ("ours", "theirs"))
+        ends_ax.loglog(b, a, marker, color=colour, ms=5, alpha=0.8, lw=0, label=f"{states} states")
+        t = np.arange(1, OUTAGE_S + 1)
+        for x, style in (("ours", "-"), ("theirs", ":")):
+            rows = np.stack([getattr(r, x)[e - OUTAGE_S + 1 : e + 1] for r, es in zip(runs, ends) for e in es])
+            width = 1.2 if x == "ours" else 3.0
+            growth = np.sqrt(np.mean(rows**2, 0))
+            growth_ax.plot(t, growth, style, color=colour, lw=width, label=f"{states} states, {x}")
+    limits = ends_ax.get_xlim()
+    ends_ax.plot(limits, limits, color="#777777", lw=0.8, zorder=0)
+    ends_ax.set(xlabel="Theirs, at the end of an outage [m]", ylabel="Ours [m]", title="Every outage")
+    growth_ax.set(xlabel="Time without GNSS [s]", ylabel="Horizontal RMS [m]", title="All outages")
+    for ax in (ends_ax, growth_ax):
+        ax.grid(color="#EEEEEE", lw=0.8)
+        ax.set_axisbelow(True)
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.legend(frameon=False, fontsize=9)
+    return out
+
+
 def main() -> int:
     """Simulate, run what was not run, print."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -317,6 +347,7 @@ def main() -> int:
     text += f"\nError-free IMU, exact start, 60 s without GNSS: at most {drift}, horizontal.\n"
     with staged(o.out) as beside:
         (beside / "table.md").write_text(text)
+        (beside / "parity.png").write_bytes(png(figure(results)))
     for shown in (table, speed):
         console.print(as_rich(shown))
     console.print(text.splitlines()[-1])
