@@ -143,7 +143,7 @@ def advance(
     prior = window.end
     tail = max(1, min(imu.shape[1], round(RATE_AVERAGE_S / dt)))
     at_fix = prior if fix.lag is None else window.before(fix.lag, dt)
-    rate_b = corrected[:, -tail:, 3:].mean(1)
+    rate_b = corrected[:, -tail:, 3:].sum(1) / tail
     predicted = antenna(at_fix, rate_b, lever_arm_b, frame)
     z = (fix.value - predicted) * fix.used
     epoch = Epoch(imu, corrected, error, state, window, at_fix, rate_b, z, fix, lever_arm_b, dt, frame)

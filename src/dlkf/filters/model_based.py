@@ -147,7 +147,7 @@ class Mbkf:
             dx = torch.bmm(K, z.unsqueeze(-1)).squeeze(-1)
         else:
             dx, K = P.new_zeros(P.shape[:2]), P.new_zeros(*P.shape[:2], H.shape[1])
-        P = (P + P.mT).mul_(0.5)
+        P = torch.lerp(P, P.mT, 0.5)
         noise = memory.noise
         if self.adaptive:
             rule = Adaptation(self.tuning.forgetting)
@@ -190,7 +190,7 @@ def kalman_update(
     """Gain K = P Hᵀ (H P Hᵀ + R)⁻¹ and Joseph-form covariance for diagonal R (paper eqs 4, 6)."""
     HP = torch.bmm(H, P)
     S = torch.baddbmm(torch.diag_embed(R), HP, H.mT)
-    K = torch.cholesky_solve(HP, torch.linalg.cholesky_ex(S)[0]).mT
+    K = torch.linalg.solve_ex(S, HP)[0].mT
     A = torch.baddbmm(_identity(P.shape[-1], P.dtype, P.device), K, H, alpha=-1)
     return K, torch.baddbmm(torch.bmm(K * R.unsqueeze(-2), K.mT), torch.bmm(A, P), A.mT)
 

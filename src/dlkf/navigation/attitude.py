@@ -118,7 +118,8 @@ def rpy_from_rotation(C: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 
 def orthonormalised(C: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
     """One Newton step towards the nearest rotation, C(3I − CᵀC)/2: enough for rounding errors."""
-    return 1.5 * C - 0.5 * (C @ (C.mT @ C))
+    flat = C.reshape(-1, 3, 3)
+    return torch.baddbmm(flat, flat, torch.bmm(flat.mT, flat), beta=1.5, alpha=-0.5).reshape(C.shape)
 
 
 def prefix_rotations(phi: Float[Tensor, "3 b m"]) -> Float[Tensor, "3 3 b m"]:

@@ -19,7 +19,7 @@ AVAILABLE = find_spec("numba") is not None
 
 def fits(x: Tensor) -> bool:
     """Whether the compiled form may stand in for the tensor form: no gradient asked for, in main memory."""
-    return AVAILABLE and x.device.type == "cpu" and not torch.is_grad_enabled()
+    return AVAILABLE and x.device.type == "cpu" and not torch.is_grad_enabled() and not x.requires_grad
 
 
 if AVAILABLE:
@@ -37,7 +37,7 @@ def mechanised(
     """Position (B, M, 3), velocity (B, M, 3) and attitude (B, M, 3, 3) at the end of every sample."""
     B, M, _ = imu.shape
     p, v, C = imu.new_empty(B, M, 3), imu.new_empty(B, M, 3), imu.new_empty(B, M, 3, 3)
-    inputs = (x.detach().numpy() for x in (p0, v0, C0, imu, g, earth_rate))
+    inputs = (x.numpy() for x in (p0, v0, C0, imu, g, earth_rate))
     _mechanise(*inputs, dt, p.numpy(), v.numpy(), C.numpy())
     return p, v, C
 
@@ -47,7 +47,7 @@ def sensor_columns(
 ) -> Tensor:
     """Columns of Φ (B, 9, 6 + 2 e) for the biases and the ``elements`` (e, 2) of the sensor matrices."""
     out = v.new_zeros(len(v), 9, 6 + 2 * len(elements))
-    inputs = (x.detach().numpy() for x in (C0, v0, C, v, g, samples))
+    inputs = (x.numpy() for x in (C0, v0, C, v, g, samples))
     _sensor_columns(*inputs, dt, elements, out.numpy())
     return out
 
@@ -57,7 +57,7 @@ def gravity(
 ) -> Tensor:
     """Gravity (B, 3) of :class:`dlkf.navigation.earth.TangentFrame`; ``shape`` (B, 3) is height, 1/(2R), slope."""
     g = torch.empty_like(p_n)
-    inputs = (x.detach().numpy() for x in (p_n, stretching, centre, axis, shape))
+    inputs = (x.numpy() for x in (p_n, stretching, centre, axis, shape))
     _gravity(*inputs, *constants, g.numpy())
     return g
 
