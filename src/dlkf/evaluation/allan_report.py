@@ -156,7 +156,7 @@ def chosen(names: Sequence[str], drive: str | None) -> str:
     """The drive to look at. Raises InputError where there are several and none is named, or it does not exist."""
     if drive is None and len(names) == 1:
         return names[0]
-    if drive not in names:
+    if drive is None or drive not in names:
         shown = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
         raise InputError(f"drive={drive}: give the drive at rest, one of {shown}")
     return drive

@@ -114,9 +114,9 @@ def search(
     batches = {"train": training}
     if drives["test"]:
         batches["test"] = withheld(drives["test"], protocol)
-    before_after = [build_filter(model, imu, tuning=t) for t in (start, after)]
+    old, new = (build_filter(model, imu, tuning=t) for t in (start, after))
     errors = [
-        (side, o, *(outage_error(f, b, o) for f in before_after)) for side, b in batches.items() for o in OBJECTIVES
+        (side, o, outage_error(old, b, o), outage_error(new, b, o)) for side, b in batches.items() for o in OBJECTIVES
     ]
     return Tuned(model, start, after, tuple(trials), tuple(errors))
 
