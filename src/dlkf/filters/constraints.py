@@ -28,7 +28,7 @@ STRUCTURE_STD = (0.05, 0.05, 1.5, 0.01)  # rad, rad, m, s²/m: what is known of 
 STRUCTURE_WALK_STD = (2e-5, 2e-5, 1e-4, 1e-6)  # per √s
 QUIET_FACTOR = 2.5  # a standstill is at most so much livelier than the quietest second of standing so far
 SURE_SPEED = 0.3  # m/s: below, 1σ included, the filter is sure to stand
-PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 3.0  # m/s, 1σ: a standstill must not contradict the filter
+PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 2.0  # m/s, 1σ: a standstill must not contradict the filter
 SLOWEST = 0.5  # m/s: below, course and yaw rate say nothing of the car's structure
 
 
