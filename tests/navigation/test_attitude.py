@@ -71,3 +71,12 @@ def test_orthonormalised_removes_rounding():
     C = rotation_from_vector(vectors(1.0)) + 1e-6 * torch.randn(200, 3, 3, dtype=torch.float64)
     O = orthonormalised(C)
     assert (O @ O.mT - torch.eye(3)).abs().max() < 1e-10  # squares the 1e-6 that came in
+
+
+def test_compiled_rotations_are_the_tensor_form_s():
+    phi = torch.randn(4, 5, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    phi[0, 0] = 0.0
+    phi[0, 1] = 1e-9
+    expected = rotation_from_vector(phi)
+    with torch.no_grad():
+        assert (rotation_from_vector(phi) - expected).abs().max() < 1e-14

@@ -162,10 +162,11 @@ def integrate(batch: Batch, estimator: Estimator, *, keep_covariances: bool = Fa
     late = bool(batch.gnss_lag.any())
     lever_arm_b = batch.lever_arm_b if bool(batch.lever_arm_b.any()) else None
     steps: list[Step] = []
-    for t in range(batch.size[1]):
-        fix = Fix(batch.gnss[:, t], batch.gnss_std[:, t], usable[:, t], batch.gnss_lag[:, t] if late else None)
+    lags = batch.gnss_lag.unbind(1) if late else [None] * batch.size[1]
+    fixes = map(Fix, batch.gnss.unbind(1), batch.gnss_std.unbind(1), usable.unbind(1), lags)
+    for imu, fix in zip(batch.imu.unbind(1), fixes):
         memory, step = advance(
-            estimator, memory, state, error, batch.imu[:, t], fix,
+            estimator, memory, state, error, imu, fix,
             dt=batch.dt, frame=batch.frame, lever_arm_b=lever_arm_b,
         )  # fmt: skip
         if not keep_covariances:

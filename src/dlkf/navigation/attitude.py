@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dlkf.navigation import compiled
+
 _TINY = 1e-30  # keeps sin(x)/x finite at zero; its root vanishes against 1 in any precision
 
 
@@ -45,6 +47,8 @@ def skew(u: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
 def rotation_from_vector(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """exp([φ×]) through the quaternion of φ [rad]; smooth at zero."""
+    if compiled.fits(phi):
+        return compiled.rotations(phi)
     planes = phi.reshape(-1, 3).mT
     return _rotation_planes(_quaternion_planes(planes)).movedim(-1, 0).reshape(*phi.shape, 3)
 

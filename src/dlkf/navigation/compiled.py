@@ -52,6 +52,13 @@ def sensor_columns(
     return out
 
 
+def rotations(phi: Tensor) -> Tensor:
+    """exp([φ×]) of rotation vectors (…, 3)."""
+    out = phi.new_empty(*phi.shape, 3)
+    _rotations(phi.reshape(-1, 3).numpy(), out.view(-1, 3, 3).numpy())
+    return out
+
+
 def gravity(
     p_n: Tensor, stretching: Tensor, centre: Tensor, axis: Tensor, shape: Tensor, constants: tuple[float, ...]
 ) -> Tensor:
@@ -60,6 +67,26 @@ def gravity(
     inputs = (x.numpy() for x in (p_n, stretching, centre, axis, shape))
     _gravity(*inputs, *constants, g.numpy())
     return g
+
+
+@njit(cache=True)
+@no_type_check
+def _rotation(x, y, z, R):
+    half = 0.5 * math.sqrt(x * x + y * y + z * z)
+    scale = 0.5 if half < 1e-8 else 0.5 * math.sin(half) / half
+    q0, q1, q2, q3 = math.cos(half), scale * x, scale * y, scale * z
+    R[0, 0], R[1, 1] = 1 - 2 * (q2 * q2 + q3 * q3), 1 - 2 * (q1 * q1 + q3 * q3)
+    R[2, 2] = 1 - 2 * (q1 * q1 + q2 * q2)
+    R[0, 1], R[1, 0] = 2 * (q1 * q2 - q0 * q3), 2 * (q1 * q2 + q0 * q3)
+    R[0, 2], R[2, 0] = 2 * (q1 * q3 + q0 * q2), 2 * (q1 * q3 - q0 * q2)
+    R[1, 2], R[2, 1] = 2 * (q2 * q3 - q0 * q1), 2 * (q2 * q3 + q0 * q1)
+
+
+@njit(cache=True)
+@no_type_check
+def _rotations(phi, out):
+    for b in range(len(phi)):
+        _rotation(phi[b, 0], phi[b, 1], phi[b, 2], out[b])
 
 
 @njit(cache=True)
@@ -103,14 +130,7 @@ def _mechanise(p0, v0, C0, imu, g, w, dt, p, v, C):
             for i in range(3):
                 P[i] += (A[i, 0] * twice0 + A[i, 1] * twice1 + A[i, 2] * twice2 + S[i]) * dt
                 S[i] += A[i, 0] * once0 + A[i, 1] * once1 + A[i, 2] * once2
-            half = 0.5 * math.sqrt(x * x + y * y + z * z)
-            scale = 0.5 if half < 1e-8 else 0.5 * math.sin(half) / half
-            q0, q1, q2, q3 = math.cos(half), scale * x, scale * y, scale * z
-            R[0, 0], R[1, 1] = 1 - 2 * (q2 * q2 + q3 * q3), 1 - 2 * (q1 * q1 + q3 * q3)
-            R[2, 2] = 1 - 2 * (q1 * q1 + q2 * q2)
-            R[0, 1], R[1, 0] = 2 * (q1 * q2 - q0 * q3), 2 * (q1 * q2 + q0 * q3)
-            R[0, 2], R[2, 0] = 2 * (q1 * q3 + q0 * q2), 2 * (q1 * q3 - q0 * q2)
-            R[1, 2], R[2, 1] = 2 * (q2 * q3 - q0 * q1), 2 * (q2 * q3 + q0 * q1)
+            _rotation(x, y, z, R)
             for i in range(3):
                 for j in range(3):
                     new[i, j] = A[i, 0] * R[0, j] + A[i, 1] * R[1, j] + A[i, 2] * R[2, j]
