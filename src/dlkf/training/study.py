@@ -24,7 +24,7 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Estimator
 from dlkf.filters.learned import load_filter
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.training.baselines import mean_imu_error, tuned, tuning_values
+from dlkf.training.baselines import FACTORS, factors_of, mean_imu_error, tuned, tuning_values
 from dlkf.training.fit import fit
 from dlkf.training.scenes import SplitScenes
 
@@ -60,7 +60,7 @@ def run_study(
         torch.set_num_threads(config["trainer"]["threads"])
     plan = OutagePlan(**{"offsets_s": (0.0,), **config["scoring"]["outage"]})
     clock = time.perf_counter()
-    tuning, prior = _baseline_knowledge(config, spec, data, plan, say)
+    tuning, own, prior = _baseline_knowledge(config, spec, data, plan, say)
     seconds["tuning"] = time.perf_counter() - clock
     clock = time.perf_counter()
     weights = fit(config, data, folder, logger)
@@ -69,7 +69,7 @@ def run_study(
     filters: dict[str, Estimator] = {}
     for name in config["baselines"]["models"]:
         given = {"prior_mean": prior["mean"], "prior_std": prior["std"]} if "_prior" in name else {}
-        filters[name] = build_filter(name, spec, tuning=tuning, **given)
+        filters[name] = build_filter(name, spec, tuning=own.get(name, tuning), **given)
     learned = str(config["model"]["kind"])
     if learned in filters:
         raise InputError(f"baselines.models has {learned}, the name of the trained filter; take it out")
@@ -93,7 +93,7 @@ def run_study(
         ", ".join(Path(d).name for d in data.datasets),
         scores,
         made,
-        protocol={"imu": spec.name, "tuning": tuning, "prior": prior, **scenes.described()},
+        protocol={"imu": spec.name, "tuning": tuning, "own_tuning": own, "prior": prior, **scenes.described()},
         by_time=True,
         baseline=BASELINE if BASELINE in filters else None,
     )
@@ -102,11 +102,23 @@ def run_study(
 
 def _baseline_knowledge(
     config: Mapping[str, Any], spec: ImuSpec, data: DriveDataModule, plan: OutagePlan, say: Say
-) -> tuple[dict[str, float], dict[str, list[float]]]:
-    """Over-bounding factors and mean IMU error, from training pieces alone."""
+) -> tuple[dict[str, float], dict[str, dict[str, float]], dict[str, list[float]]]:
+    """Over-bounding factors and mean IMU error, from training pieces alone.
+
+    The factors are those of ``mbkf15``, which all filters share, and beside them by name those of filters that have
+    more to tune, such as the noise of a constraint.
+    """
     settings = config["baselines"]
     pieces = SplitScenes(data, "train", plan, config["seed"], settings["pieces"]).withheld()
-    best, rms = tuned(spec, pieces, rounds=settings["rounds"] if settings["tune"] else 0)
-    say(f"mbkf15 {'tuned' if settings['tune'] else 'untuned'}: {rms:.2f} m RMS in the outages of training pieces")
+    rounds = settings["rounds"] if settings["tune"] else 0
+    best, rms = tuned(spec, pieces, rounds=rounds)
+    how = "tuned" if settings["tune"] else "untuned"
+    say(f"mbkf15 {how}: {rms:.2f} m RMS in the outages of training pieces")
+    own = {}
+    for name in settings["models"]:
+        if set(factors_of(name)) > set(FACTORS) and "_prior" not in name:
+            found, rms = tuned(spec, pieces, name=name, start=best, rounds=rounds)
+            own[name] = tuning_values(found)
+            say(f"{name} {how}: {rms:.2f} m")
     mean, std = mean_imu_error(spec, best, pieces)
-    return tuning_values(best), {"mean": list(mean), "std": list(std)}
+    return tuning_values(best), own, {"mean": list(mean), "std": list(std)}
