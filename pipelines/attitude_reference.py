@@ -25,10 +25,10 @@ from dlkf.config import config_dir
 from dlkf.data.schema import ATTITUDE, drive_file, new_dataset, write_drive, write_drives_table
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
-from dlkf.evaluation.drives import navigate_drives
 from dlkf.filters.build import build_filter
 from dlkf.filters.smoother import smoothed
 from dlkf.navigation.imu_errors import imu_spec
+from dlkf.running.offline import navigate_drives
 
 RPY = ["roll", "pitch", "yaw"]
 

@@ -32,7 +32,7 @@ from dlkf.navigation.attitude import rotation_from_vector
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.navigation.strapdown import strapdown
 from dlkf.simulation.dataset import simulate_from_config
-from dlkf.training.callbacks.batches import GnssDecimation, OutageInjection
+from dlkf.training.callbacks.masking import GnssDecimation, OutageInjection
 from dlkf.training.loss import TERMS, LossConfig, pva_losses, weighted
 
 

@@ -28,8 +28,8 @@ from dlkf.data.segments import StartLaw, cut_pieces, make_batch
 from dlkf.data.store import drive_from_tables, load_dataset
 from dlkf.data.tables import Columns, read_drives
 from dlkf.data.validate import DriveTables, read_checked
-from dlkf.evaluation.chunks import run_filter
 from dlkf.filters.model_based import Ins
+from dlkf.running.batched import run_filter
 
 CHANNELS = (*ACCEL, *GYRO)
 SECONDS = 20

@@ -32,24 +32,24 @@ from rich.console import Console
 
 from dlkf.config import config_dir
 from dlkf.data.drive import Batch
-from dlkf.data.geodetic import geodetic_from_ecef
 from dlkf.data.schema import ACCEL, GYRO, new_dataset, write_drive, write_drives_table
 from dlkf.data.segments import StartLaw, cut_pieces, make_batch
 from dlkf.data.store import load_dataset
 from dlkf.evaluation.bootstrap import compare
 from dlkf.evaluation.figures import COLOURS
 from dlkf.evaluation.report import png
-from dlkf.evaluation.staging import staged
 from dlkf.evaluation.table import Table, as_markdown, as_rich, number
+from dlkf.files import staged
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.navigation.attitude import rpy_from_rotation
 from dlkf.navigation.earth import ned_axes
+from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.navigation.state import NavState
 from dlkf.simulation.imu import corrupt, draw_unit
-from dlkf.simulation.routes import VehicleConfig
-from dlkf.simulation.vehicle import drive_vehicle
+from dlkf.simulation.motion.routes import VehicleConfig
+from dlkf.simulation.motion.vehicle import drive_vehicle
 
 Array = NDArray[np.float64]
 RATE, POSITION_STD, VELOCITY_STD = 100, 0.02, 0.05  # Hz, m, m/s

@@ -30,10 +30,10 @@ from dlkf.data.tables import read_drives
 from dlkf.data.validate import DriveTables, read_checked
 from dlkf.filters.integration import integrate
 from dlkf.filters.model_based import Mbkf
-from dlkf.filters.start import align
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import prefix_rotations, vector_from_rotation
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.running.start import align
 
 SETTLE = 2  # epochs whose innovations say more of the start than of the filter
 GRAVITY = 9.8

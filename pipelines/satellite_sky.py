@@ -27,10 +27,10 @@ from scipy.stats import chi2
 from dlkf.data.schema import ATTITUDE, POSITION, VELOCITY, drive_file
 from dlkf.data.tables import read_drives
 from dlkf.navigation.attitude import rotation_from_rpy
-from dlkf.simulation import sky_figures
-from dlkf.simulation.almanac import read_almanac
-from dlkf.simulation.least_squares import Observations, dilution, solve
-from dlkf.simulation.satellites import EARTH_SPIN, GRAVITATION, LIGHT, direction, satellite_state, signals
+from dlkf.simulation.gnss import sky_figures
+from dlkf.simulation.gnss.almanac import read_almanac
+from dlkf.simulation.gnss.least_squares import Observations, dilution, solve
+from dlkf.simulation.gnss.satellites import EARTH_SPIN, GRAVITATION, LIGHT, direction, satellite_state, signals
 
 EPOCHS = 20000  # solved at once
 STD = [f"std_{kind}_{axis}" for kind in ("pos", "vel") for axis in "ned"]

@@ -22,18 +22,18 @@ from rich.console import Console
 from rich.progress import track
 
 from dlkf.config import config_dir
-from dlkf.evaluation.allan import allan_variance
+from dlkf.diagnosis.allan import allan_variance
 from dlkf.navigation.attitude import rotation_from_rpy, vector_from_rotation
 from dlkf.navigation.earth import ecef_from_geodetic, ned_axes, tangent_frame
 from dlkf.navigation.imu_errors import SensorErrors, imu_spec
 from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import strapdown
-from dlkf.simulation.chassis import draw_car, mounted, slip_angle
 from dlkf.simulation.dataset import DatasetConfig, dataset_config
 from dlkf.simulation.drive import sliced
 from dlkf.simulation.imu import corrupt, draw_unit, inverse_mechanisation
-from dlkf.simulation.routes import along
-from dlkf.simulation.vehicle import Truth, follow, random_route
+from dlkf.simulation.motion.chassis import draw_car, mounted, slip_angle
+from dlkf.simulation.motion.routes import along
+from dlkf.simulation.motion.vehicle import Truth, follow, random_route
 
 PROFILES = ("paper_clean", "lifelike", "city", "highway", "car_park", "tunnel")
 PRESETS = ("consumer", "icm20602_i2nav", "adis16465_i2nav")

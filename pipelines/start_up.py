@@ -26,15 +26,15 @@ from dlkf.config import config_dir
 from dlkf.data.alignment import ALIGN, AlignConfig, Start
 from dlkf.data.drive import Drive
 from dlkf.data.segments import whole_drives
-from dlkf.data.standstill import at_rest, runs
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
-from dlkf.evaluation.chunks import run_filter
 from dlkf.filters.build import build_filter
-from dlkf.filters.start import align_each
 from dlkf.navigation.attitude import vector_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, ned_axes
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.running.batched import run_filter
+from dlkf.running.standstill import at_rest, runs
+from dlkf.running.start import align_each
 
 CONFIGS = {
     "course": ALIGN,

@@ -20,7 +20,7 @@ from dlkf.config import config_dir
 from dlkf.data.schema import ACCEL, GYRO, new_dataset, write_drive, write_drives_table
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.simulation.imu import corrupt, draw_unit, inverse_mechanisation
-from dlkf.simulation.vehicle import Truth
+from dlkf.simulation.motion.vehicle import Truth
 
 LAT, LON, HEIGHT = math.radians(52.15), math.radians(9.95), 100.0
 

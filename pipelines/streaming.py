@@ -21,19 +21,19 @@ from rich.console import Console
 from rich.table import Table
 
 from dlkf.config import config_dir
-from dlkf.data.geodetic import geodetic_from_ecef
 from dlkf.data.tables import Columns
-from dlkf.evaluation.streamed_drives import played
 from dlkf.filters.build import build_filter
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
-from dlkf.filters.streaming import Status, StreamingFilter
+from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.imu_errors import imu_spec
-from dlkf.simulation.chassis import ChassisConfig
+from dlkf.running.replay import played
+from dlkf.running.streaming import Status, StreamingFilter
 from dlkf.simulation.drive import Rates, Seeds, simulate_drive
-from dlkf.simulation.gnss import GnssConfig
+from dlkf.simulation.gnss.surroundings import Surroundings
+from dlkf.simulation.gnss.white import GnssConfig
 from dlkf.simulation.imu import draw_unit
-from dlkf.simulation.routes import VehicleConfig
-from dlkf.simulation.surroundings import Surroundings
+from dlkf.simulation.motion.chassis import ChassisConfig
+from dlkf.simulation.motion.routes import VehicleConfig
 
 ARM = (1.0, 0.3, -1.2)
 SPEC = imu_spec(yaml.safe_load((config_dir() / "imu" / "consumer.yaml").read_text()))

@@ -16,9 +16,9 @@ from rich.console import Console
 from dlkf.command import command
 from dlkf.data.tables import read_drives
 from dlkf.data.validate import read_imu
+from dlkf.diagnosis.allan import preset
+from dlkf.diagnosis.allan_report import analyse, chosen, noise_table, part, write_allan
 from dlkf.errors import InputError
-from dlkf.evaluation.allan import preset
-from dlkf.evaluation.allan_report import analyse, chosen, noise_table, part, write_allan
 from dlkf.evaluation.table import as_rich
 from dlkf.navigation.imu_errors import imu_spec
 

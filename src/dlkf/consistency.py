@@ -13,11 +13,11 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from dlkf.command import command
+from dlkf.console import counting
+from dlkf.diagnosis.consistency import Normalised, consistency, consistency_table, states_of, write_consistency
+from dlkf.diagnosis.matched_drives import matched_batch, matched_drives, matching
 from dlkf.errors import InputError
-from dlkf.evaluation.consistency import Normalised, consistency, consistency_table, states_of, write_consistency
-from dlkf.evaluation.matched_drives import matched_batch, matched_drives, matching
 from dlkf.evaluation.outages import with_outage
-from dlkf.evaluation.progress import counting
 from dlkf.evaluation.protocol import protocol_from
 from dlkf.evaluation.table import as_rich
 from dlkf.filters.build import build_filter

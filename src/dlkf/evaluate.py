@@ -13,9 +13,9 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from dlkf.command import command
+from dlkf.console import counting
+from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import load_dataset
-from dlkf.evaluation.kinds import drive_kinds
-from dlkf.evaluation.progress import counting
 from dlkf.evaluation.protocol import Scenes, protocol_from
 from dlkf.evaluation.report import all_tables, write_report
 from dlkf.evaluation.study import study

@@ -35,7 +35,7 @@ def resolve_model(
             given |= {"prior_mean": prior.get("mean"), "prior_std": prior.get("std")}
         return build_filter(spec, imu, **given)
     if is_tracked(spec):
-        from dlkf.training.registry import download_model  # MLflow takes seconds to import
+        from dlkf.tracking.registry import download_model  # MLflow takes seconds to import
 
         return load_filter(download_model(spec, tracking_uri))
     folder = Path(spec).expanduser()

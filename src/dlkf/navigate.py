@@ -1,7 +1,7 @@
 """Navigate whole drives: ``python -m dlkf.navigate model=mbkf15 dataset=data/town out=outputs/town``.
 
 From IMU and GNSS alone; ``reference/`` is never opened. Writes ``out/drive=<id>/solution.parquet`` for every
-drive, or nothing (columns: dlkf.data.solution).
+drive, or nothing (columns: dlkf.running.solution).
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from dlkf.command import command
+from dlkf.console import counting
 from dlkf.data.alignment import AlignConfig
-from dlkf.data.solution import write_solution
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
-from dlkf.evaluation.drives import navigate_drives
-from dlkf.evaluation.progress import counting
-from dlkf.evaluation.staging import staged
-from dlkf.evaluation.streamed_drives import stream_drives
+from dlkf.files import staged
 from dlkf.filters.smoother import smoothed
 from dlkf.models import resolve_model
 from dlkf.navigation.imu_errors import imu_spec
+from dlkf.running.offline import navigate_drives
+from dlkf.running.replay import stream_drives
+from dlkf.running.solution import write_solution
 
 
 @command("navigate")

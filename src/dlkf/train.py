@@ -22,11 +22,12 @@ from dlkf.data.store import dataset_digest
 from dlkf.errors import InputError
 from dlkf.evaluation.report import all_tables
 from dlkf.evaluation.table import as_rich
-from dlkf.training.grid import PARENT_RUN, run_name
+from dlkf.tracking.grid import PARENT_RUN, run_name
+from dlkf.tracking.registry import log_model
+from dlkf.tracking.runs import lightning_logger, start_run, tracking_uri
 from dlkf.training.run_folder import run_folder, write_state
 from dlkf.training.study import load_data, run_study
 from dlkf.training.summary import key_metrics, note
-from dlkf.training.tracking import lightning_logger, start_run, tracking_uri
 
 
 @command("train")
@@ -53,7 +54,7 @@ def main(cfg: DictConfig) -> None:
         metrics = key_metrics(outcome)
         run.log_files(folder / "report")
         tracking = config["tracking"]
-        run.log_model(outcome.weights, register=tracking["register"], alias=tracking["alias"], metrics=metrics)
+        log_model(run, outcome.weights, register=tracking["register"], alias=tracking["alias"], metrics=metrics)
         run.note(note(config, outcome))
         write_state(folder, finished=True)
     seconds = ", ".join(f"{k} {v:.0f} s" for k, v in outcome.seconds.items())

@@ -16,15 +16,15 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from dlkf.command import command
+from dlkf.console import counting
 from dlkf.data.store import dataset_digest, load_dataset
 from dlkf.errors import InputError
-from dlkf.evaluation.progress import counting
 from dlkf.evaluation.protocol import protocol_from
 from dlkf.evaluation.table import as_markdown, as_rich
 from dlkf.filters.build import build_filter
 from dlkf.navigation.imu_errors import imu_spec
-from dlkf.training.tracking import start_run, tracking_uri
-from dlkf.training.tuning_search import check, search, sides, tuning_table, write_tuning
+from dlkf.tracking.runs import start_run, tracking_uri
+from dlkf.tuning.study import check, search, sides, tuning_table, write_tuning
 
 
 @command("tune")

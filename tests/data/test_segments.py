@@ -22,11 +22,11 @@ from dlkf.data.segments import (
 from dlkf.data.stack import DriveStack
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
-from dlkf.filters.start import align
 from dlkf.navigation.attitude import vector_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, tangent_frame
 from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import strapdown
+from dlkf.running.start import align
 
 EXACT = StartLaw(0.0, 0.0, 0.0, 0.0)
 

@@ -13,10 +13,10 @@ import pytest
 import torch
 
 from dlkf.data.drive import Batch
-from dlkf.data.geodetic import geodetic_from_ecef
 from dlkf.data.schema import write_drive, write_drives_table
 from dlkf.navigation.attitude import rotation_from_rpy, rpy_from_rotation
 from dlkf.navigation.earth import ned_axes, tangent_frame
+from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import strapdown

@@ -9,7 +9,7 @@ import sys
 import pyarrow.parquet as pq
 import pytest
 
-from dlkf.data.solution import SCHEMA
+from dlkf.running.solution import SCHEMA
 
 
 def run(folder, command, *arguments):

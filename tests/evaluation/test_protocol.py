@@ -9,16 +9,16 @@ import pymap3d
 import pytest
 import torch
 
+from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
-from dlkf.evaluation.drives import navigate_drives
-from dlkf.evaluation.kinds import drive_kinds
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Protocol, Scenes, protocol_from
 from dlkf.evaluation.report import all_tables
 from dlkf.evaluation.study import study
 from dlkf.filters.build import build_filter
 from dlkf.models import resolve_model, resolve_models
+from dlkf.running.offline import navigate_drives
 from tests.evaluation.conftest import IMU
 
 MBKF = build_filter("mbkf15", IMU)

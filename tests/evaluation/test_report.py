@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import torch
 
+from dlkf.data.kinds import drive_kind
 from dlkf.errors import InputError
 from dlkf.evaluation import figures
-from dlkf.evaluation.kinds import drive_kind
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.report import png, write_report
 from dlkf.evaluation.results import results
 from dlkf.evaluation.run import score
-from dlkf.evaluation.staging import staged
 from dlkf.evaluation.table import as_csv, as_json, as_markdown, number, slope_table, tables
+from dlkf.files import staged
 from dlkf.filters.build import build_filter
 from tests.evaluation.conftest import IMU
 

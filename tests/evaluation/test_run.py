@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from dlkf.errors import InputError
-from dlkf.evaluation.chunks import chunks, take
-from dlkf.evaluation.imu_slope import injected_response
+from dlkf.evaluation.bias_slope import injected_response
 from dlkf.evaluation.metrics import magnitudes, rms_over_pieces, slope
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.run import score
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Correction
+from dlkf.running.batched import chunks, take
 from tests.evaluation.conftest import IMU, in_precision
 
 FILTERS = {name: build_filter(name, IMU) for name in ("ins", "mbkf15")}

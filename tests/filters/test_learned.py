@@ -8,9 +8,9 @@ import yaml
 from safetensors.torch import load_file, save_file
 
 from dlkf.errors import InputError
-from dlkf.evaluation.chunks import take
 from dlkf.filters.integration import integrate
 from dlkf.filters.learned import LearnedConfig, LearnedFilter, load_filter, save_filter
+from dlkf.running.batched import take
 
 from .scene import scene
 

@@ -7,12 +7,12 @@ import torch
 from scipy.stats import chi2
 
 from dlkf.errors import InputError
-from dlkf.evaluation.chunks import run_filter
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.model_based import Ins, Mbkf
 from dlkf.filters.smoother import smooth
 from dlkf.filters.tuning import Tuning
+from dlkf.running.batched import run_filter
 
 from . import scene as scenes
 from .scene import IMU, scene

@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 from tests.simulation.oracle import attitude, axes, ecef, strapdown
 
 from dlkf.errors import InputError
-from dlkf.simulation.chassis import ChassisConfig, draw_car, mounted, rough_road, slip_angle, vibration
 from dlkf.simulation.dataset import dataset_config
 from dlkf.simulation.imu import inverse_mechanisation
-from dlkf.simulation.routes import Kinematics, Plan, VehicleConfig
-from dlkf.simulation.vehicle import Route, Truth, follow, random_route, random_waves
+from dlkf.simulation.motion.chassis import ChassisConfig, draw_car, mounted, rough_road, slip_angle, vibration
+from dlkf.simulation.motion.routes import Kinematics, Plan, VehicleConfig
+from dlkf.simulation.motion.vehicle import Route, Truth, follow, random_route, random_waves
 
 CONF = Path(__file__).parents[2] / "conf"
 LEVEL = VehicleConfig(slope_std=0.0, height_m=0.0)

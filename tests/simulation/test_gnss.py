@@ -7,9 +7,9 @@ import pymap3d
 import pytest
 
 from dlkf.errors import InputError
-from dlkf.simulation.gnss import GnssConfig, observe
+from dlkf.simulation.gnss.white import GnssConfig, observe
 from dlkf.simulation.imu import inverse_mechanisation
-from dlkf.simulation.vehicle import Truth, VehicleConfig, drive_vehicle
+from dlkf.simulation.motion.vehicle import Truth, VehicleConfig, drive_vehicle
 
 RATE = 100
 QUIET = dict.fromkeys(("std_horizontal", "std_vertical", "std_velocity"), 1e-12)

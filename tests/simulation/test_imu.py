@@ -23,7 +23,7 @@ from dlkf.simulation.imu import (
     inverse_mechanisation,
     put_out,
 )
-from dlkf.simulation.vehicle import Truth, VehicleConfig, drive_vehicle
+from dlkf.simulation.motion.vehicle import Truth, VehicleConfig, drive_vehicle
 
 CONF = Path(__file__).parents[2] / "conf"
 NO_UNIT = ImuUnit(np.zeros(6), np.zeros((2, 3, 3)))

@@ -7,8 +7,8 @@ import pytest
 from tests.simulation.test_chassis import preset
 
 from dlkf.errors import InputError
-from dlkf.simulation.routes import Manoeuvres, VehicleConfig, along, random_plan
-from dlkf.simulation.vehicle import drive_vehicle, random_route
+from dlkf.simulation.motion.routes import Manoeuvres, VehicleConfig, along, random_plan
+from dlkf.simulation.motion.vehicle import drive_vehicle, random_route
 
 RATE = 20
 PROFILES = ["paper_clean", "lifelike", "city", "highway", "car_park", "tunnel"]

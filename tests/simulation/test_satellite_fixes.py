@@ -11,16 +11,16 @@ from scipy.stats import chi2
 
 from dlkf.config import config_dir
 from dlkf.errors import InputError
-from dlkf.simulation.almanac import read_almanac
 from dlkf.simulation.dataset import DatasetConfig
-from dlkf.simulation.gnss import GnssConfig
-from dlkf.simulation.least_squares import Observations, solve
-from dlkf.simulation.obstruction import held, in_view
-from dlkf.simulation.receiver import Receiver, clock, gauss_markov, receiver_spec
-from dlkf.simulation.satellite_fixes import observe_satellites
-from dlkf.simulation.satellites import LIGHT, signals
-from dlkf.simulation.surroundings import Sky
-from dlkf.simulation.vehicle import Truth
+from dlkf.simulation.gnss.almanac import read_almanac
+from dlkf.simulation.gnss.least_squares import Observations, solve
+from dlkf.simulation.gnss.obstruction import held, in_view
+from dlkf.simulation.gnss.receiver import Receiver, clock, gauss_markov, receiver_spec
+from dlkf.simulation.gnss.satellite_fixes import observe_satellites
+from dlkf.simulation.gnss.satellites import LIGHT, signals
+from dlkf.simulation.gnss.surroundings import Sky
+from dlkf.simulation.gnss.white import GnssConfig
+from dlkf.simulation.motion.vehicle import Truth
 
 PURE = Receiver("pure", quality=4, mask_deg=5.0, std_range=0.01, std_range_rate=0.01)
 ALL = Receiver("all", multipath=0.5, orbit=0.6, iono=1.5, tropo=0.12)

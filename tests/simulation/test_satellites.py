@@ -8,9 +8,9 @@ import pytest
 from scipy.optimize import brentq
 
 from dlkf.errors import InputError
-from dlkf.simulation.almanac import ELEMENTS, PACKAGED, Almanac, read_almanac
-from dlkf.simulation.least_squares import Observations, solve
-from dlkf.simulation.satellites import EARTH_SPIN, GRAVITATION, LIGHT, satellite_state, signals
+from dlkf.simulation.gnss.almanac import ELEMENTS, PACKAGED, Almanac, read_almanac
+from dlkf.simulation.gnss.least_squares import Observations, solve
+from dlkf.simulation.gnss.satellites import EARTH_SPIN, GRAVITATION, LIGHT, satellite_state, signals
 
 ALMANAC = read_almanac()
 SIDEREAL_DAY = 2 * np.pi / EARTH_SPIN

@@ -6,10 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from dlkf.data.kinds import drive_kinds
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR, write_drive, write_drives_table
 from dlkf.data.validate import validate_dataset
 from dlkf.errors import InputError
-from dlkf.evaluation.kinds import drive_kinds
 from dlkf.navigation.imu_errors import SensorErrors
 from dlkf.simulate import arguments_of_source
 from dlkf.simulation.dataset import simulate_from_config

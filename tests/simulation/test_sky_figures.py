@@ -8,8 +8,8 @@ from pipelines.satellite_sky import above_horizon, fix_errors, summary, tables
 from dlkf.data.tables import read_table
 from dlkf.data.validate import validate_dataset
 from dlkf.navigation.imu_errors import SensorErrors
-from dlkf.simulation import sky_figures
 from dlkf.simulation.dataset import simulate_from_config
+from dlkf.simulation.gnss import sky_figures
 
 QUIET = {**dict.fromkeys(SensorErrors.__dataclass_fields__, 0.0), "correlation_time": 3600.0}
 

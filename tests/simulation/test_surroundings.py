@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dlkf.errors import InputError
-from dlkf.simulation.surroundings import Surroundings, sky_along
+from dlkf.simulation.gnss.surroundings import Surroundings, sky_along
 
 DISTANCE = np.arange(0.0, 200_000.0, 1.0)
 

@@ -8,7 +8,7 @@ import pymap3d
 import pytest
 
 from dlkf.errors import InputError
-from dlkf.simulation.vehicle import VehicleConfig, drive_vehicle
+from dlkf.simulation.motion.vehicle import VehicleConfig, drive_vehicle
 
 RATE = 100
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from dlkf.filters.learned import LearnedConfig, LearnedFilter, save_filter
-from dlkf.training.grid import PARENT_RUN, SWEPT
-from dlkf.training.tracking import SQLITE, mlflow_module
+from dlkf.tracking.grid import PARENT_RUN, SWEPT
+from dlkf.tracking.runs import SQLITE, mlflow_module
 from tests.data.conftest import write_cars
 
 

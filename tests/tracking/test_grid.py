@@ -7,8 +7,8 @@ import sys
 import pytest
 from omegaconf import OmegaConf
 
-from dlkf.training.grid import PARENT_RUN, SWEPT, GridParent, parent_status, run_name, swept_overrides
-from dlkf.training.tracking import mlflow_module, start_run
+from dlkf.tracking.grid import PARENT_RUN, SWEPT, GridParent, parent_status, run_name, swept_overrides
+from dlkf.tracking.runs import mlflow_module, start_run
 
 TASK = ["+experiment=outage", "optimizer.lr=1e-3,1e-4", "filter@model=dlkf", "seed=range(2)", "data.x=[1,2]"]
 
@@ -130,8 +130,8 @@ def test_a_store_that_cannot_be_opened_stops_the_sweep(uri, capsys):
 PROGRAM = """
 import os, sys
 from hydra import main
-from dlkf.training.tracking import start_run, tracking_uri
-from dlkf.training.grid import PARENT_RUN, run_name
+from dlkf.tracking.runs import start_run, tracking_uri
+from dlkf.tracking.grid import PARENT_RUN, run_name
 from hydra.core.hydra_config import HydraConfig
 
 @main(version_base="1.3", config_path=".", config_name="conf")
@@ -153,7 +153,7 @@ x: 0
 tracking: {uri: null}
 hydra:
   output_subdir: null
-  callbacks: {grid: {_target_: dlkf.training.grid.GridParent}}
+  callbacks: {grid: {_target_: dlkf.tracking.grid.GridParent}}
 """
 
 

@@ -10,10 +10,10 @@ import torch
 
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
-from dlkf.evaluation.drives import navigate_drives
 from dlkf.filters.learned import load_filter
-from dlkf.training.registry import check_registration, download_model
-from dlkf.training.tracking import mlflow_module, start_run
+from dlkf.running.offline import navigate_drives
+from dlkf.tracking.registry import check_registration, download_model, log_model
+from dlkf.tracking.runs import mlflow_module, start_run
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def logged(uri, weights):
     with start_run(uri, "town", "one", system_metrics=False) as run:
         run.log_dataset("data/town", "0123", "training")
         run.log_metrics({"train/loss": 3.0}, step=0)
-        run.log_model(folder, register="town", alias="champion", metrics={"test/dlkf/rms_m": 2.5})
+        log_model(run, folder, register="town", alias="champion", metrics={"test/dlkf/rms_m": 2.5})
     shutil.rmtree(folder)
     return run
 
@@ -57,11 +57,11 @@ def test_the_model_stands_with_its_scores_and_data(logged, client):
 
 def test_an_alias_moves_to_the_newer_version(logged, uri, client, weights):
     with start_run(uri, "town", "two", system_metrics=False) as run:
-        model_uri = run.log_model(weights, register="town", alias="champion")
+        model_uri = log_model(run, weights, register="town", alias="champion")
     assert client.get_model_version_by_alias("town", "champion").version in (2, "2")
     assert same_weights(download_model(model_uri, uri), weights)
     with start_run(uri, "village", "three", system_metrics=False) as run:
-        run.log_model(weights, alias="candidate")  # registered under the experiment's name
+        log_model(run, weights, alias="candidate")  # registered under the experiment's name
     assert same_weights(download_model("models:/village@candidate", uri), weights)
 
 

@@ -7,8 +7,8 @@ import pytest
 import yaml
 
 from dlkf.errors import InputError
-from dlkf.training import tracking
-from dlkf.training.tracking import (
+from dlkf.tracking import runs as tracking
+from dlkf.tracking.runs import (
     VALUE_LENGTH,
     flattened,
     lightning_logger,

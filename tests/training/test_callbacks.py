@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from dlkf.errors import InputError
-from dlkf.training.callbacks.batches import GnssDecimation, OutageInjection
 from dlkf.training.callbacks.curriculum import LengthCurriculum
 from dlkf.training.callbacks.guard import StepGuard
 from dlkf.training.callbacks.loss_weights import AdaptiveLossWeights
+from dlkf.training.callbacks.masking import GnssDecimation, OutageInjection
 from tests.filters.scene import scene
 
 

@@ -17,10 +17,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dlkf.data.drive import Drive
-from dlkf.data.geodetic import geodetic_from_ecef
 from dlkf.errors import InputError
 from dlkf.navigation.attitude import prefix_rotations, rotation_from_rpy, rotation_from_vector, rpy_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, ned_axes, normal_gravity
+from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.state import NavState
 
 SIDESLIP_STD = math.radians(1.5)  # course is not heading: sideslip, mounting yaw
@@ -36,7 +36,7 @@ class AlignConfig:
     """``min_speed`` [m/s] below which course is no heading; ``window_s`` [s] over which f is levelled.
 
     ``search_s`` [s] of motion over which headings are weighed against each other, 0 to believe the course;
-    ``from_rest``: start with the first fix, not with first motion (both look ahead: :mod:`dlkf.filters.start`).
+    ``from_rest``: start with the first fix, not with first motion (both look ahead: :mod:`dlkf.running.start`).
     """
 
     min_speed: float = 2.0

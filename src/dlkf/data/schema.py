@@ -8,7 +8,7 @@
     <dataset>/gnss/drive=<id>/part-0.parquet       antenna, instantaneous at t; quality = NMEA GGA code
     <dataset>/reference/drive=<id>/part-0.parquet  optional; instantaneous at t
     <dataset>/raw/drive=<id>/part-0.parquet        optional; satellite observations, see
-                                                   dlkf.simulation.satellite_fixes.Received
+                                                   dlkf.simulation.gnss.satellite_fixes.Received
 
 NaN stands for what a source does not know. Any other column is carried along.
 """

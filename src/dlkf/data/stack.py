@@ -11,8 +11,8 @@ from torch import Tensor
 
 from dlkf.data.alignment import Aligned, align_boundaries
 from dlkf.data.drive import Drive
-from dlkf.data.geodetic import geodetic_from_ecef
 from dlkf.errors import InputError
+from dlkf.navigation.geodetic import geodetic_from_ecef
 
 ROWS = (
     "gnss_r_e", "gnss_v_e", "gnss_std", "gnss_valid", "gnss_lag",

@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 
 from dlkf.data.drive import Batch
-from dlkf.data.geodetic import geodetic_from_ecef
 from dlkf.navigation.earth import ned_axes
+from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.state import NavState
 
 Array = NDArray[np.float64]

@@ -13,10 +13,10 @@ from dlkf.data.drive import Drive
 from dlkf.data.segments import Piece, StartLaw, cut_pieces, make_batch, whole_drives
 from dlkf.data.stack import DriveStack
 from dlkf.errors import InputError
-from dlkf.evaluation.chunks import CHUNK_SAMPLES
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.run import Scene
-from dlkf.filters.start import align_each
+from dlkf.running.batched import CHUNK_SAMPLES
+from dlkf.running.start import align_each
 
 MODES = ("auto", "pieces", "drives")
 

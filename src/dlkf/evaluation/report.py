@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from dlkf.evaluation import figures
 from dlkf.evaluation.scores import Scores
-from dlkf.evaluation.staging import staged
 from dlkf.evaluation.table import Table, as_csv, as_json, as_markdown, slope_table, tables
+from dlkf.files import staged
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; }

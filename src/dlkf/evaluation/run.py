@@ -12,12 +12,12 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
-from dlkf.evaluation.chunks import CHUNK_SAMPLES, chunks, run_filter, take
 from dlkf.evaluation.metrics import Array, error_series
 from dlkf.evaluation.outages import with_outage
 from dlkf.evaluation.scores import FilterRun, Piece, Scores
 from dlkf.filters.integration import Estimator
 from dlkf.navigation.state import IMU, NavState
+from dlkf.running.batched import CHUNK_SAMPLES, chunks, run_filter, take
 
 Scene = tuple[Batch, Tensor]
 

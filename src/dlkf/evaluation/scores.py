@@ -8,8 +8,6 @@ import numpy as np
 
 from dlkf.evaluation.metrics import Array, Mask, Windows, windows
 
-KINDS = ("simulated", "semi-real", "real", "unknown")
-
 
 @dataclass(frozen=True)
 class Piece:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from dlkf.evaluation.imu_slope import injected_response
+from dlkf.console import counting
+from dlkf.evaluation.bias_slope import injected_response
 from dlkf.evaluation.metrics import slope
-from dlkf.evaluation.progress import counting
 from dlkf.evaluation.protocol import Scenes
 from dlkf.evaluation.results import BASELINE, SETTLE_S, results
 from dlkf.evaluation.run import score_scenes

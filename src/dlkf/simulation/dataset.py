@@ -21,15 +21,15 @@ from rich.progress import track
 from dlkf.data.schema import drive_file, new_dataset, write_drive, write_drives_table, write_parquet
 from dlkf.errors import InputError
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.simulation.almanac import read_almanac
-from dlkf.simulation.chassis import ChassisConfig
+from dlkf.settings import built
 from dlkf.simulation.drive import Rates, Seeds, simulate_drive
-from dlkf.simulation.gnss import GnssConfig
+from dlkf.simulation.gnss.almanac import read_almanac
+from dlkf.simulation.gnss.receiver import Receiver, receiver_spec
+from dlkf.simulation.gnss.surroundings import Surroundings
+from dlkf.simulation.gnss.white import GnssConfig
 from dlkf.simulation.imu import draw_unit
-from dlkf.simulation.receiver import Receiver, receiver_spec
-from dlkf.simulation.routes import VehicleConfig
-from dlkf.simulation.settings import built
-from dlkf.simulation.surroundings import Surroundings
+from dlkf.simulation.motion.chassis import ChassisConfig
+from dlkf.simulation.motion.routes import VehicleConfig
 
 LONGEST_DRIVE = 240.0  # minutes; a drive is held in memory as a whole
 MOST_EPOCHS = 100_000  # of a drive with satellites, 2 GB

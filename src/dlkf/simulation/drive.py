@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.simulation.chassis import Car, ChassisConfig, draw_car, mounted, slip_angle
-from dlkf.simulation.gnss import GnssConfig
+from dlkf.simulation.gnss.receiver import Receiver
+from dlkf.simulation.gnss.satellite_fixes import receive
+from dlkf.simulation.gnss.surroundings import Surroundings, sky_along
+from dlkf.simulation.gnss.white import GnssConfig
 from dlkf.simulation.imu import ImuUnit, corrupt, inverse_mechanisation
-from dlkf.simulation.receiver import Receiver
-from dlkf.simulation.routes import VehicleConfig
-from dlkf.simulation.satellite_fixes import receive
-from dlkf.simulation.surroundings import Surroundings, sky_along
-from dlkf.simulation.vehicle import Route, Truth, follow, random_route
+from dlkf.simulation.motion.chassis import Car, ChassisConfig, draw_car, mounted, slip_angle
+from dlkf.simulation.motion.routes import VehicleConfig
+from dlkf.simulation.motion.vehicle import Route, Truth, follow, random_route
 
 
 class Seeds(NamedTuple):

@@ -15,7 +15,7 @@ from torch import Tensor
 from dlkf.navigation.attitude import rotation_from_rpy, rotation_from_vector, skew, vector_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, ecef_from_geodetic, ned_axes, normal_gravity
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
-from dlkf.simulation.vehicle import Truth
+from dlkf.simulation.motion.vehicle import Truth
 
 Array = NDArray[np.float64]
 CHUNK = 65536  # samples at a time: memory independent of the length of a drive

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from dlkf.data.geodetic import geodetic_from_ecef
 from dlkf.data.resampling import Grid, reference_at
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR, VELOCITY, new_dataset, write_drive, write_drives_table
 from dlkf.data.tables import Columns, read_drives
@@ -29,12 +28,13 @@ from dlkf.data.validate import DriveTables, read_checked, validate_dataset
 from dlkf.errors import InputError
 from dlkf.navigation.attitude import rpy_from_rotation
 from dlkf.navigation.earth import ned_axes
+from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.simulation.dataset import DatasetConfig, gnss_text, imu_type, simulation_settings, write_raw
+from dlkf.simulation.gnss.satellite_fixes import Received, receive
+from dlkf.simulation.gnss.surroundings import Sky, sky_along
 from dlkf.simulation.imu import ImuUnit, corrupt, draw_unit
-from dlkf.simulation.satellite_fixes import Received, receive
-from dlkf.simulation.surroundings import Sky, sky_along
-from dlkf.simulation.vehicle import Truth
+from dlkf.simulation.motion.vehicle import Truth
 
 Array = NDArray[np.float64]
 KIND = "semi-real"

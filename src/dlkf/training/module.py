@@ -12,7 +12,7 @@ from torch import Tensor
 from dlkf.data.drive import Batch
 from dlkf.filters.integration import integrate
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
-from dlkf.training.callbacks.batches import BatchCallback
+from dlkf.training.callbacks.masking import BatchCallback
 from dlkf.training.loss import TERMS, LossConfig, pva_losses, weighted
 
 

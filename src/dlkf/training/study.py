@@ -13,8 +13,8 @@ from hydra.utils import instantiate
 from lightning.pytorch.loggers import Logger
 
 from dlkf.data.datamodule import DriveDataModule
+from dlkf.data.kinds import drive_kinds
 from dlkf.errors import InputError
-from dlkf.evaluation.kinds import drive_kinds
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.report import write_report
 from dlkf.evaluation.results import BASELINE
@@ -24,9 +24,9 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Estimator
 from dlkf.filters.learned import load_filter
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.training.baselines import FACTORS, factors_of, mean_imu_error, tuned, tuning_values
 from dlkf.training.fit import fit
 from dlkf.training.scenes import SplitScenes
+from dlkf.tuning.search import FACTORS, factors_of, mean_imu_error, tuned, tuning_values
 
 Say = Callable[[str], None]
 

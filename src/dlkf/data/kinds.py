@@ -1,0 +1,38 @@
+"""Is a drive simulated, semi-real or real? Their results are never mixed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import pandas as pd
+
+from dlkf.errors import InputError
+
+KINDS = ("simulated", "semi-real", "real", "unknown")
+
+
+def drive_kind(row: Mapping[str, object]) -> str:
+    """Kind of one drive by its row of ``drives.parquet``.
+
+    A column ``kind`` decides where there is one. Otherwise: a source that says it is simulated is simulated;
+    a synthetic or simulated GNSS or IMU on a real drive makes it semi-real; all else is real.
+    """
+    stated = row.get("kind")
+    if isinstance(stated, str) and stated:
+        if stated not in KINDS:
+            raise InputError(
+                f"drives.parquet: kind {stated!r} of drive {row.get('drive')} is none of {', '.join(KINDS)}"
+            )
+        return stated
+    source, gnss, imu = (str(row.get(c, "")).lower() for c in ("source", "gnss", "imu"))
+    if "simulat" in source:
+        return "simulated"
+    made_up = ("synthetic", "simulated", "injected")
+    return "semi-real" if any(word in text for text in (gnss, imu) for word in made_up) else "real"
+
+
+def drive_kinds(dataset: str | Path) -> dict[str, str]:
+    """Kind of every drive of a dataset."""
+    table = pd.read_parquet(Path(dataset) / "drives.parquet")
+    return {str(row["drive"]): drive_kind(row) for row in table.to_dict("records")}

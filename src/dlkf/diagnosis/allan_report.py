@@ -1,0 +1,162 @@
+"""A static log's Allan deviation as preset, picture, page and tables: what ``dlkf.allan`` leaves behind."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from dlkf.diagnosis.allan import (
+    Array,
+    NoiseFit,
+    allan_variance,
+    check_static,
+    cluster_sizes,
+    fit_noise,
+    preset_yaml,
+)
+from dlkf.errors import InputError
+from dlkf.evaluation.figures import COLOURS
+from dlkf.evaluation.report import png, report_html
+from dlkf.evaluation.table import Table, as_json, as_markdown, number
+from dlkf.files import staged
+from dlkf.navigation.imu_errors import DEG, MILLIGAL, ImuSpec
+
+AXES = tuple(f"{sensor}_{axis}" for sensor in ("accel", "gyro") for axis in "xyz")
+TRIADS = ("accel", "gyro")
+NAMES = {"accel": "Accelerometers", "gyro": "Gyroscopes"}
+UNITS = {"accel": "m/s²", "gyro": "rad/s"}
+
+
+@dataclass(frozen=True)
+class StaticLog:
+    """Allan deviation of six axes (accelerometers, gyroscopes) and the noise fitted to each and to each triad."""
+
+    drive: str
+    duration_s: float
+    rate_hz: float
+    tau: Array  # (K,) s
+    deviation: Array  # (K, 6)
+    fits: dict[str, NoiseFit]  # by axis, and by triad: "accel", "gyro"
+
+
+def analyse(drive: str, imu: Array, rate_hz: float, base: ImuSpec) -> StaticLog:
+    """Allan deviation and noise of the samples (N, 6) of an IMU at rest.
+
+    A triad's noise is that of the mean variance of its axes. Raises InputError if the log is not static, or too
+    short for the white noise. ``base`` gives the correlation time where the log is too short for it.
+    """
+    check_static(imu, rate_hz, f"drive {drive}")
+    sizes = cluster_sizes(len(imu))
+    tau, duration = sizes / rate_hz, len(imu) / rate_hz
+    variance = np.stack([allan_variance(x, 1 / rate_hz, sizes) for x in imu.T], -1)
+    times = {"accel": base.accel.correlation_time, "gyro": base.gyro.correlation_time}
+    fits = {
+        axis: fit_noise(tau, variance[:, k], duration, times[axis.split("_")[0]]) for k, axis in enumerate(AXES)
+    }
+    for k, triad in enumerate(TRIADS):
+        fits[triad] = fit_noise(tau, variance[:, 3 * k : 3 * k + 3].mean(-1), duration, times[triad])
+    return StaticLog(drive, duration, rate_hz, tau, np.sqrt(variance), fits)
+
+
+def noise_table(log: StaticLog) -> Table:
+    """N, B, K and the Gauss-Markov bias, by axis and by triad, in the units that data sheets use."""
+    rows = []
+    for name, fit in log.fits.items():
+        accel = name.startswith("accel")
+        walk, bias = (60.0, 1 / MILLIGAL) if accel else (60 / DEG, 3600 / DEG)
+        time = number(fit.time) + ("" if fit.resolved else "*")
+        row = [number(fit.density * walk), number(fit.floor * bias), number(fit.floor_s), number(fit.walk * bias * 60)]
+        row += [number(fit.sigma * bias), time] if fit.rises else ["–", "–"]
+        rows.append([f"{NAMES[name]}, all axes" if name in TRIADS else name.replace("_", " "), *row])
+    order = [0, 1, 2, 6, 3, 4, 5, 7]
+    return Table(
+        title=f"{log.drive}: {log.duration_s / 3600:.3g} h at rest, {log.rate_hz:g} Hz",
+        note=(
+            "Accelerometers: N in m/s/√h, B and bias in mGal, K in mGal/√h. Gyroscopes: N in °/√h, B and bias in °/h, "
+            "K in °/h/√h. τ*: too long for this log, taken from the preset; – the log is too short."
+        ),
+        columns=["Axis", "N", "B", "at [s]", "K", "In-run bias, 1σ", "τ [s]"],
+        rows=[rows[k] for k in order],
+    )
+
+
+def figure(log: StaticLog) -> Figure:
+    """Allan deviation of the six axes, the fits of the triads, and where N, B and K are read."""
+    out = Figure(figsize=(11, 4.8), layout="constrained")
+    for ax, k, triad in zip(out.subplots(1, 2), (0, 3), TRIADS):
+        fit = log.fits[triad]
+        for axis, colour in zip(range(3), COLOURS):
+            ax.loglog(log.tau, log.deviation[:, k + axis], color=colour, lw=1.3, label="xyz"[axis])
+        ax.loglog(log.tau, fit.curve(log.tau), "--", color="black", lw=1.6, label="fit, all axes")
+        low = log.deviation[:, k : k + 3].min()
+        ax.loglog(log.tau, fit.density / np.sqrt(log.tau), ":", color="#777777", lw=1.1, label="N/√τ")
+        if fit.rises:
+            ax.loglog(log.tau, fit.walk * np.sqrt(log.tau / 3), "-.", color="#777777", lw=1.1, label="K √(τ/3)")
+        ax.set_ylim(0.6 * low, 1.5 * log.deviation[:, k : k + 3].max())
+        ax.plot([1], [fit.density], "o", mfc="white", mec="black", zorder=5, label="N, at 1 s")
+        ax.plot([fit.floor_s], [fit.floor * 0.664], "s", mfc="white", mec="black", zorder=5, label="floor, 0.664 B")
+        ax.set(title=NAMES[triad], xlabel="Cluster time τ [s]", ylabel=f"Allan deviation [{UNITS[triad]}]")
+        ax.grid(True, which="both", color="#EEEEEE", lw=0.8)
+        ax.set_axisbelow(True)
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.legend(frameon=False, fontsize=8, ncols=2)
+    return out
+
+
+def write_allan(out: str | Path, log: StaticLog, spec: ImuSpec) -> list[Path]:
+    """Write imu/<name>.yaml, allan.png, allan.html, allan.csv and allan.json into ``out``, all or none."""
+    picture, table = png(figure(log)), noise_table(log)
+    settings = {
+        "drive": log.drive, "duration": f"{log.duration_s:g} s", "rate": f"{log.rate_hz:g} Hz", "preset": spec.name
+    }  # fmt: skip
+    files = {
+        f"imu/{spec.name}.yaml": preset_yaml(spec).encode(),
+        "allan.png": picture,
+        "allan.html": report_html(
+            f"Allan deviation of {log.drive}",
+            [table],
+            [("allan.png", "Overlapping Allan deviation (IEEE Std 952)", picture)],
+            settings,
+        ).encode(),
+        "allan.md": as_markdown(table).encode(),
+        "allan.csv": _csv(log).encode(),
+        "allan.json": as_json(settings | {name: asdict(fit) for name, fit in log.fits.items()}).encode(),
+    }
+    with staged(out) as folder:
+        (folder / "imu").mkdir()
+        for name, data in files.items():
+            (folder / name).write_bytes(data)
+    return [Path(out) / name for name in files]
+
+
+def _csv(log: StaticLog) -> str:
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["tau_s", *(f"{axis}_{unit}" for axis, unit in zip(AXES, ["m_s2"] * 3 + ["rad_s"] * 3))])
+    writer.writerows([f"{x:.6g}" for x in row] for row in np.column_stack((log.tau, log.deviation)))
+    return out.getvalue()
+
+
+def part(imu: dict[str, Array], from_s: float | None, to_s: float | None) -> tuple[Array, float]:
+    """Samples (N, 6) between two times after the start of a table's IMU, and their rate [Hz]."""
+    t = imu["t"]
+    kept = (t >= t[0] + (from_s or 0.0)) & (t <= t[0] + (math.inf if to_s is None else to_s))
+    samples = np.stack([imu[c][kept] for c in AXES], -1)
+    return samples, float((len(t) - 1) / (t[-1] - t[0]))
+
+
+def chosen(names: Sequence[str], drive: str | None) -> str:
+    """The drive to look at. Raises InputError where there are several and none is named, or it does not exist."""
+    if drive is None and len(names) == 1:
+        return names[0]
+    if drive is None or drive not in names:
+        shown = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
+        raise InputError(f"drive={drive}: give the drive at rest, one of {shown}")
+    return drive

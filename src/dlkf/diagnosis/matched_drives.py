@@ -1,0 +1,150 @@
+"""Simulated drives whose IMU errs exactly as a filter models it: what a test of consistency needs (R020, R090).
+
+A filter of 15 states knows biases alone, one of 21 also scale factors, one of 33 also misalignment; so each has
+drives of its own, with the errors that it does not model switched off, and is told the same preset. GNSS errors
+are white, its antenna is the IMU, and every drive has a new unit and a new car.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dlkf.data.drive import Batch, Drive
+from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, IMU_ERROR, POSITION, STD, VELOCITY
+from dlkf.data.segments import Piece, StartLaw, make_batch
+from dlkf.data.store import drive_from_tables
+from dlkf.data.tables import Columns, DriveRow
+from dlkf.data.validate import DriveTables
+from dlkf.errors import InputError
+from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
+from dlkf.navigation.state import ErrorStates
+from dlkf.settings import built
+from dlkf.simulation.imu import corrupt, draw_unit, inverse_mechanisation
+from dlkf.simulation.motion.chassis import ChassisConfig, draw_car, mounted
+from dlkf.simulation.motion.routes import VehicleConfig
+from dlkf.simulation.motion.vehicle import Truth, follow, radians_per_metre, random_route
+
+
+@dataclass(frozen=True)
+class MatchedDrives:
+    """How many drives, how long, and what a filter is given: 1 Hz GNSS and start errors, 1σ."""
+
+    drives: int = 100
+    minutes: float = 5.0
+    rate_hz: int = 50
+    position_m: float = 0.02
+    velocity_mps: float = 0.05
+    vehicle: VehicleConfig = field(default_factory=VehicleConfig)
+    chassis: ChassisConfig = field(default_factory=ChassisConfig)
+    start: StartLaw = field(default_factory=StartLaw)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.drives, int) and self.drives >= 2):
+            raise InputError(f"drives={self.drives} must be a whole number of at least 2")
+        if not 0.5 <= self.minutes <= 60:
+            raise InputError(f"minutes={self.minutes} is outside 0.5 to 60")
+        if not (isinstance(self.rate_hz, int) and 10 <= self.rate_hz <= 1000):
+            raise InputError(f"rate_hz={self.rate_hz} must be a whole number from 10 to 1000")
+        if not (self.position_m > 0 and self.velocity_mps > 0):
+            raise InputError("gnss.position_m and gnss.velocity_mps must be above 0")
+
+
+def matched_drives(config: Mapping[str, Any]) -> MatchedDrives:
+    """Settings from the keys of ``conf/consistency.yaml``; InputError for unknown ones and odd values."""
+    plain = {key: config[key] for key in ("drives", "minutes", "rate_hz", "vehicle", "chassis", "start", "seed")}
+    return built(MatchedDrives, plain | dict(config["gnss"]), "consistency")
+
+
+def matching(spec: ImuSpec, states: ErrorStates) -> ImuSpec:
+    """The preset without the errors that a filter with these states does not model."""
+    left_out = {"warm_up": 0.0, "g_sensitivity": 0.0, "quantisation": 0.0, "full_scale": 0.0}
+    if states.matrix == "none":
+        left_out["scale_factor"] = 0.0
+    if states.matrix != "full":
+        left_out["misalignment"] = 0.0
+
+    def of(sensor: SensorErrors) -> SensorErrors:
+        return replace(sensor, **left_out)
+
+    return replace(spec, name=f"{spec.name}, {states.matrix}", accel=of(spec.accel), gyro=of(spec.gyro))
+
+
+def matched_batch(
+    settings: MatchedDrives, spec: ImuSpec, progress: Callable[[int, int], None] | None = None
+) -> tuple[Batch, Tensor]:
+    """The drives as one batch, and the units' matrices M (B, 2, 3, 3).
+
+    ``true_imu_error`` of the batch is the bias b(t) alone, without M.
+    """
+    drives, matrices = [], []
+    for k in range(settings.drives):
+        drive, matrix = _drive(settings, spec, k)
+        drives.append(drive)
+        matrices.append(torch.from_numpy(matrix))
+        if progress is not None:
+            progress(k + 1, settings.drives)
+    epochs = min(d.epochs for d in drives)
+    batch = make_batch(
+        drives,
+        [Piece(k, 0, epochs) for k in range(len(drives))],
+        dtype=torch.float64,
+        start=settings.start,
+        generator=torch.Generator().manual_seed(settings.seed),
+    )
+    return batch, torch.stack(matrices)
+
+
+def _drive(settings: MatchedDrives, spec: ImuSpec, index: int) -> tuple[Drive, np.ndarray]:
+    seeds = np.random.SeedSequence(settings.seed, spawn_key=(index,)).spawn(5)
+    motion, unit_rng, imu_rng, gnss_rng, car_rng = (np.random.default_rng(s) for s in seeds)
+    rate = settings.rate_hz
+    t = np.arange(round(settings.minutes * 60) * rate + 1) / rate
+    route = random_route(motion, settings.vehicle, float(t[-1]))
+    truth = follow(route, settings.vehicle, t)
+    if not settings.chassis.is_point:
+        truth = mounted(car_rng, draw_car(car_rng, settings.chassis), route, truth)
+    exact, unit = inverse_mechanisation(truth), draw_unit(unit_rng, spec)
+    measured, error = corrupt(imu_rng, exact, spec, unit, rate)
+    bias = error - np.concatenate((exact[:, :3] @ unit.matrix[0].T, exact[:, 3:] @ unit.matrix[1].T), -1)
+    tables = DriveTables(
+        DriveRow(f"matched-{index:03d}", f"matched-{index:03d}", (0.0, 0.0, 0.0)),
+        {"t": t[1:]} | dict(zip((*ACCEL, *GYRO), measured.T)),
+        _gnss(settings, gnss_rng, truth, rate),
+        _reference(truth, np.concatenate((bias[:1], bias)), rate),
+    )
+    return drive_from_tables(tables, "matched", float(rate), 1.0, torch.float64), unit.matrix
+
+
+def _gnss(settings: MatchedDrives, rng: np.random.Generator, truth: Truth, rate: int) -> Columns:
+    """Fixes once a second, from the first second on, with white errors."""
+    rows = slice(rate, None, rate)
+    n = len(truth.t[rows])
+    off = settings.position_m * rng.standard_normal((n, 3))
+    east, north = radians_per_metre(truth.lat[rows], truth.height[rows])
+    place = (truth.lat[rows] + off[:, 0] * north, truth.lon[rows] + off[:, 1] * east, truth.height[rows] - off[:, 2])
+    velocity = truth.v_n[rows] + settings.velocity_mps * rng.standard_normal((n, 3))
+    std = np.repeat([[settings.position_m] * 3 + [settings.velocity_mps] * 3], n, axis=0)
+    columns = {"t": truth.t[rows], "quality": np.full(n, 4, dtype=np.int64)} | _position(place)
+    return columns | dict(zip(VELOCITY, velocity.T)) | dict(zip(STD, std.T))
+
+
+def _reference(truth: Truth, bias: np.ndarray, rate: int) -> Columns:
+    rows = slice(None, None, rate)
+    angles = np.column_stack((truth.rpy[:, :2], np.arctan2(np.sin(truth.rpy[:, 2]), np.cos(truth.rpy[:, 2]))))
+    columns = {"t": truth.t[rows], "valid": np.ones(len(truth.t[rows]), dtype=bool)}
+    columns |= _position((truth.lat[rows], truth.lon[rows], truth.height[rows]))
+    columns |= dict(zip(VELOCITY, truth.v_n[rows].T)) | dict(zip(ATTITUDE, angles[rows].T))
+    return columns | dict(zip(IMU_ERROR, bias[rows].T))
+
+
+def _position(place: tuple[np.ndarray, ...]) -> Columns:
+    lat, lon, height = place
+    return dict(zip(POSITION, (lat * 180 / math.pi, lon * 180 / math.pi, height)))

@@ -1,0 +1,105 @@
+"""``solution.parquet``: what ``navigate`` writes, and the way there from the filter's tangent frame.
+
+One row per epoch. ``t`` [s] is the drive's own clock; position is geodetic (WGS-84), velocity and attitude
+are in true local NED at the vehicle; ``accel_error``, ``gyro_error`` [m/s², rad/s] are what the filter takes
+off the IMU, body axes; ``std_*`` are 1σ: ``std_pos_n|e|d`` [m], ``std_vel_n|e|d`` [m/s],
+``std_roll|pitch|yaw`` [rad], and of the IMU errors. ``gnss_used``: a fix corrected this row. NaN where the
+filter has no value.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pyarrow as pa
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dlkf.data.schema import write_parquet
+from dlkf.navigation.attitude import rotation_from_rpy, rpy_from_rotation
+from dlkf.navigation.earth import TangentFrame, ned_axes
+from dlkf.navigation.geodetic import geodetic_from_ecef
+from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, POSITION, VELOCITY, NavState
+
+_NED, _XYZ, _RPY = ("n", "e", "d"), ("x", "y", "z"), ("roll", "pitch", "yaw")
+IMU_COLUMNS = tuple(f"{sensor}_error_{axis}" for sensor in ("accel", "gyro") for axis in _XYZ)
+STD_COLUMNS = (
+    tuple(f"std_pos_{a}" for a in _NED)
+    + tuple(f"std_vel_{a}" for a in _NED)
+    + tuple(f"std_{a}" for a in _RPY)
+    + tuple(f"std_{c}" for c in IMU_COLUMNS)
+)
+COLUMNS = (
+    ("t", "lat_deg", "lon_deg", "height_m")
+    + tuple(f"vel_{a}" for a in _NED)
+    + _RPY
+    + IMU_COLUMNS
+    + STD_COLUMNS
+)
+SCHEMA = pa.schema([pa.field(c, pa.float64()) for c in COLUMNS] + [pa.field("gnss_used", pa.bool_())])
+
+
+def solution_table(
+    t: Float[Tensor, " T"],
+    frame: TangentFrame,
+    state: NavState,
+    imu_error: Float[Tensor, "T 6"],
+    std: Float[Tensor, "T 15"] | None,
+    used: Bool[Tensor, " T"],
+) -> pd.DataFrame:
+    """Rows of ``solution.parquet`` from one drive's states (T, …) in its tangent frame (one element)."""
+    columns = solution_columns(t, frame, state, imu_error, std)
+    return pd.DataFrame({k: v.numpy() for k, v in columns.items()} | {"gnss_used": used.cpu().numpy()})
+
+
+def solution_columns(
+    t: Float[Tensor, " T"],
+    frame: TangentFrame,
+    state: NavState,
+    imu_error: Float[Tensor, "T 6"],
+    std: Float[Tensor, "T 15"] | None,
+) -> dict[str, Float[Tensor, " T"]]:
+    """The columns of ``solution.parquet`` without ``gnss_used``, float64.
+
+    C_lb = C_elᵀ C_en C_nb with C_el at the estimated position. The 1σ of vectors turn with the axes as
+    uncorrelated errors do, σ'² = (C∘C) σ²; those of roll, pitch and yaw follow by (J⁻¹∘J⁻¹) σ² from
+    δh = J δ(roll, pitch, yaw), J = [Rz Ry e₁, Rz e₂, e₃].
+    """
+    state = NavState(*(x.detach().cpu().double() for x in state))
+    lat, lon, height = geodetic_from_ecef(frame.to_ecef(state.p_n.unsqueeze(0))[0])
+    C_ln = ned_axes(lat, lon).mT @ frame.C_en[0].cpu().double()
+    rpy = rpy_from_rotation(C_ln @ state.C_nb)
+    columns = {"t": t.double(), "lat_deg": torch.rad2deg(lat), "lon_deg": torch.rad2deg(lon)}
+    columns["height_m"] = height
+    velocity = torch.einsum("tij,tj->ti", C_ln, state.v_n)
+    columns |= dict(zip((f"vel_{a}" for a in _NED), velocity.unbind(-1)))
+    columns |= dict(zip(_RPY, rpy.unbind(-1)))
+    columns |= dict(zip(IMU_COLUMNS, imu_error.detach().cpu().double().unbind(-1)))
+    columns |= dict(zip(STD_COLUMNS, _std_columns(std, C_ln, rpy).unbind(-1)))
+    return columns
+
+
+def _std_columns(std: Tensor | None, C_ln: Tensor, rpy: Tensor) -> Tensor:
+    if std is None:
+        return torch.full((len(rpy), 15), torch.nan, dtype=torch.float64)
+    variance = std.detach().cpu().double() ** 2
+
+    def turned(C: Tensor, part: slice) -> Tensor:
+        return torch.einsum("tij,tj->ti", C * C, variance[:, part])
+
+    zero = torch.zeros_like(rpy[:, 0])
+    heading = rotation_from_rpy(torch.stack((zero, zero, rpy[:, 2]), -1))
+    tilted = rotation_from_rpy(torch.stack((zero, rpy[:, 1], rpy[:, 2]), -1))
+    down = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(rpy)
+    J = torch.stack((tilted[..., 0], heading[..., 1], down), -1)
+    to_rpy = torch.linalg.inv(J) @ C_ln
+    parts = (turned(C_ln, POSITION), turned(C_ln, VELOCITY), turned(to_rpy, ATTITUDE))
+    return torch.cat((*parts, variance[:, ACCEL], variance[:, GYRO]), -1).sqrt()
+
+
+def write_solution(path: str | Path, table: pd.DataFrame) -> None:
+    """Write ``solution.parquet``: to a file beside, then renamed."""
+    arrays = [pa.array(table[f.name].to_numpy(), f.type, from_pandas=False) for f in SCHEMA]  # NaN stays NaN
+    write_parquet(Path(path), pa.Table.from_arrays(arrays, schema=SCHEMA))

@@ -1,0 +1,150 @@
+"""GNSS fixes and raw observations of a drive, from the satellites above it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+
+from dlkf.data.schema import POSITION, STD, VELOCITY
+from dlkf.navigation.earth import ecef_from_geodetic, ned_axes
+from dlkf.navigation.geodetic import geodetic_from_ecef
+from dlkf.simulation.gnss.almanac import Almanac, read_almanac
+from dlkf.simulation.gnss.least_squares import Observations, Solution, solve
+from dlkf.simulation.gnss.obstruction import held, in_view
+from dlkf.simulation.gnss.receiver import Receiver, clock, range_errors
+from dlkf.simulation.gnss.satellites import L1, LIGHT, Signals, ned_at, signals
+from dlkf.simulation.gnss.surroundings import Sky
+from dlkf.simulation.gnss.white import GnssConfig, antenna, observe, shifted
+from dlkf.simulation.motion.vehicle import Truth
+
+Array = NDArray[np.float64]
+WEEK = 604800  # s
+FOR_FIX = 5  # satellites that resolve carrier ambiguities
+FLOAT = 5  # NMEA GGA code: RTK with open ambiguities
+
+
+class Received(NamedTuple):
+    """``fixes``: GNSS table of the data contract; from satellites with satellites, gdop, pdop, hdop, vdop on top.
+
+    A row without a fix has quality 0 and NaN. ``raw``: a row per epoch and tracked satellite; t; gps_week, tow
+    [s]; prn; pseudorange_m and pseudorange_rate [m/s] as measured, with both clocks in them, doppler_hz; their
+    1σ; elevation, azimuth [rad]; sat_x|y|z_m, sat_vx|y|z: the satellite at emission in the ECEF axes of
+    reception; sat_clock_s, sat_clock_rate. So
+
+        pseudorange = |r_s − r| + receiver clock − c · sat_clock + error
+    """
+
+    fixes: pd.DataFrame
+    raw: pd.DataFrame | None
+
+
+def receive(
+    rng: np.random.Generator,
+    truth: Truth,
+    rate_b: Array,
+    config: GnssConfig,
+    receiver: Receiver | None,
+    sky: Sky | None = None,
+) -> Received:
+    """GNSS at every row of ``truth``: white noise around the truth without a ``receiver``, else from satellites."""
+    if receiver is None:
+        return Received(observe(rng, truth, rate_b, config, sky), None)
+    return observe_satellites(rng, truth, rate_b, config, receiver, sky)
+
+
+def observe_satellites(
+    rng: np.random.Generator,
+    truth: Truth,
+    rate_b: Array,
+    config: GnssConfig,
+    receiver: Receiver,
+    sky: Sky | None = None,
+) -> Received:
+    """What a receiver makes of the satellites at every row of ``truth`` (uniform in time), by least squares.
+
+    The drive starts at a random second of the almanac's week. ``rate_b`` (N, 3) is the body's ω_ib [rad/s], for
+    the antenna; s_p, s_v of ``config`` are added to the fix (paper eqs 12, 13; R130).
+    """
+    almanac = read_almanac(receiver.almanac)
+    rows = len(truth.t)
+    dt = float(truth.t[1] - truth.t[0]) if rows > 1 else 1.0
+    start = float(rng.integers(WEEK))
+    offset_n, v_n = antenna(truth, rate_b, config.lever_arm_b)
+    lat, lon, height = (torch.from_numpy(x) for x in shifted(truth, offset_n))
+    r_e = ecef_from_geodetic(lat, lon, height).numpy()
+    v_e = (ned_axes(lat, lon).numpy() @ v_n[..., None])[..., 0]
+    seen = signals(almanac, start - almanac.toa + truth.t - truth.t[0], r_e, v_e)
+    view = seen.elevation > np.radians(receiver.mask_deg)
+    if sky is not None:
+        view &= in_view(sky, truth.rpy[:, 2], seen.elevation, seen.azimuth)
+    used = held(view, round(receiver.reacquire_s / dt))
+    fixed = held(used.sum(-1) >= FOR_FIX, round(receiver.refix_s / dt))
+    is_float = ~fixed & (receiver.ambiguity > 0)
+    errors = range_errors(rng, receiver, seen.elevation, is_float, dt)
+    offset, drift = clock(rng, receiver, rows, dt)
+    geometric = seen.distance + errors.range + offset[:, None]
+    rate = seen.distance_rate + errors.rate + drift[:, None]
+    observed = Observations(
+        seen.satellite, geometric, rate, used, errors.variance, errors.rate_variance, errors.common
+    )
+    solution = solve(observed)
+    added = rng.standard_normal((rows, 6)) * np.repeat((config.s_p, config.s_v), 3)
+    fix = solution.solved & (solution.dop.pdop <= receiver.max_pdop)
+    quality = np.where(fix, np.where(is_float, FLOAT, receiver.quality), 0)
+    fixes = _fixes(truth.t, solution, quality, added, (config.s_p, config.s_v))
+    return Received(fixes, _raw(truth.t, start, almanac, seen, observed))
+
+
+def _fixes(
+    t: Array, solution: Solution, quality: NDArray[np.int64], added_n: Array, scale: tuple[float, float]
+) -> pd.DataFrame:
+    """The table of fixes in latitude, longitude, height and NED, with noise ``added_n`` (T, 6) of ``scale`` on top."""
+    fix = quality > 0
+    r_e = np.where(fix[:, None], solution.r_e, np.nan)
+    C_en = ned_at(r_e)
+    place = geodetic_from_ecef(torch.from_numpy(r_e + (C_en @ added_n[:, :3, None])[..., 0]))
+    v_n = (np.swapaxes(C_en, -1, -2) @ solution.v_e[..., None])[..., 0] + added_n[:, 3:]
+    std = [
+        np.sqrt(np.einsum("tij,tik,tkj->tj", C_en, covariance[:, :3, :3], C_en) + added**2)
+        for covariance, added in zip((solution.covariance, solution.rate_covariance), scale)
+    ]
+    values = (*(x.numpy() for x in place), *v_n.T, *std[0].T, *std[1].T)
+    table = {"t": t, **dict(zip((*POSITION, *VELOCITY, *STD), values))}
+    for name in POSITION[:2]:
+        table[name] = np.degrees(table[name])
+    known = solution.satellites >= 4
+    dops = {f"{d}dop": np.where(known, getattr(solution.dop, f"{d}dop"), np.nan) for d in "gphv"}
+    return pd.DataFrame({**table, "quality": quality, "satellites": solution.satellites, **dops})
+
+
+def _raw(t: Array, start: float, almanac: Almanac, seen: Signals, observed: Observations) -> pd.DataFrame:
+    """The tracked satellites' observations as rows, in order of time and satellite."""
+    row, column = np.nonzero(observed.used)
+    tow = start + t - t[0]
+    satellite = seen.satellite
+    sat_clock, sat_rate = satellite.clock[row, column], satellite.clock_rate[row, column]
+    rate = observed.pseudorange_rate[row, column] - LIGHT * sat_rate
+    variance = observed.variance + (observed.common**2).sum(0)
+    return pd.DataFrame(
+        {
+            "t": t[row],
+            "gps_week": almanac.week + (tow // WEEK).astype(np.int64)[row],
+            "tow": (tow % WEEK)[row],
+            "prn": almanac.prn[column],
+            "pseudorange_m": observed.pseudorange[row, column] - LIGHT * sat_clock,
+            "pseudorange_rate": rate,
+            "doppler_hz": -L1 / LIGHT * rate,
+            "std_pseudorange_m": np.sqrt(variance[row, column]),
+            "std_pseudorange_rate": np.sqrt(observed.rate_variance[row, column]),
+            "elevation": seen.elevation[row, column],
+            "azimuth": seen.azimuth[row, column],
+            **{f"sat_{axis}_m": satellite.r_e[row, column, k] for k, axis in enumerate("xyz")},
+            **{f"sat_v{axis}": satellite.v_e[row, column, k] for k, axis in enumerate("xyz")},
+            "sat_clock_s": sat_clock,
+            "sat_clock_rate": sat_rate,
+        }
+    )

@@ -1,0 +1,201 @@
+"""Models in MLflow: logged as code with weights (no pickle), registered by name, fetched for evaluation."""
+
+from __future__ import annotations
+
+import atexit
+import re
+import shutil
+import tempfile
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import dlkf
+from dlkf.errors import InputError
+from dlkf.filters.learned import WEIGHTS
+from dlkf.tracking.runs import Run, mlflow_module, reachable, run_exists, store_missing, tracking_uri
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+
+NAME = "model"
+NO_STEP = -1  # at a step of training MLflow would give the model that step's losses and CPU load as its metrics
+CODE = Path(__file__).with_name("pyfunc_model.py")
+REQUIRED = (
+    "mlflow",
+    "torch",
+    "numpy",
+    "scipy",
+    "pandas",
+    "pyarrow",
+    "safetensors",
+    "pyyaml",
+    "pymap3d",
+    "jaxtyping",
+)
+RUN_ID = re.compile(r"[0-9a-f]{32}")
+SPEC = re.compile(r"(?P<name>[^/:@]+)(?:@(?P<alias>[^/@]+)|/(?P<version>\d+|latest))?")
+
+
+def log_model(
+    run: Run,
+    folder: Path | str,
+    *,
+    register: str | None = None,
+    alias: str | None = None,
+    metrics: Mapping[str, float] | None = None,
+) -> str:
+    """Log a folder of ``weights.safetensors`` and ``config.yaml`` as a model of the active run.
+
+    Stored are :mod:`dlkf.tracking.pyfunc_model`, this package's source and pinned requirements. ``register``
+    makes it a version in the model registry, ``alias`` points there (an alias alone registers under the
+    experiment's name). ``metrics`` stand beside the model in the UI. Returns ``models:/<id>``.
+    """
+    mlflow = mlflow_module()
+    client = run.client
+    if alias and not register:
+        register = client.get_experiment(client.get_run(run.id).info.experiment_id).name
+    check_registration(register, alias)
+    info = mlflow.pyfunc.log_model(
+        name=NAME,
+        python_model=str(CODE),
+        artifacts={"filter": str(folder)},
+        code_paths=[str(Path(dlkf.__file__).parent)],
+        pip_requirements=pinned_requirements(),
+        step=NO_STEP,
+    )
+    _log_model_metrics(run, info.model_id, metrics or {})
+    if register:
+        made = mlflow.register_model(info.model_uri, register, await_registration_for=0)
+        if alias:
+            client.set_registered_model_alias(register, alias, made.version)
+    return info.model_uri
+
+
+def _log_model_metrics(run: Run, model_id: str, metrics: Mapping[str, float]) -> None:
+    """Metrics of the run that stand beside the model and its dataset in the UI."""
+    from mlflow.entities import Metric
+    from mlflow.utils.time import get_current_time_millis
+
+    inputs = run.client.get_run(run.id).inputs.dataset_inputs
+    data = {}
+    if len(inputs) == 1:
+        data = {"dataset_name": inputs[0].dataset.name, "dataset_digest": inputs[0].dataset.digest}
+    # a time of its own: MLflow links what the run has logged to a new model itself, and refuses the same point twice
+    now = get_current_time_millis()
+    points = [Metric(key, float(value), now, 0, model_id=model_id, **data) for key, value in metrics.items()]
+    if points:
+        run.client.log_batch(run.id, metrics=points)
+
+
+def pinned_requirements() -> list[str]:
+    """What a logged model needs, in the versions at hand; without build tags: ``2.13.0+cpu`` → ``2.13.0``."""
+    return [f"{name}=={version(name).partition('+')[0]}" for name in REQUIRED]
+
+
+def check_registration(register: str | None, alias: str | None) -> None:
+    """Raises InputError for a name or an alias that the model registry would refuse after training."""
+    if register is not None and not re.fullmatch(r"[^/:@]+", register):
+        raise InputError(f"tracking.register={register!r}: a name in the registry has none of / : @")
+    if alias is not None and (
+        not re.fullmatch(r"[\w-]+", alias) or alias.lower() == "latest" or re.fullmatch(r"[vV]\d+", alias)
+    ):
+        raise InputError(
+            f"tracking.alias={alias!r}: letters, digits, _ and - only, and neither latest nor v<number>; "
+            "such as champion"
+        )
+
+
+def download_model(spec: str, uri: str | None = None) -> Path:
+    """Folder with ``weights.safetensors`` and ``config.yaml`` of a model in MLflow.
+
+    ``spec``: a run id, ``runs:/<id>[/…]``, ``models:/<name>@<alias>``, ``models:/<name>[/<version>]`` (the
+    newest without one) or ``models:/m-<id>``. Raises InputError where there is no such store, run, model,
+    version or alias.
+    """
+    uri = tracking_uri(uri)
+    if store_missing(uri):
+        raise InputError(
+            f"model={spec}: there is no MLflow store at {uri.removeprefix('sqlite:///')}; "
+            "run from the folder of the training or give tracking_uri=…"
+        )
+    mlflow = mlflow_module()
+    with reachable(uri):
+        client = mlflow.MlflowClient(uri)
+        find = _registered if spec.startswith("models:/") else _of_run
+        return _fetch(find(client, spec, uri), spec, uri)
+
+
+def _of_run(client: MlflowClient, spec: str, uri: str) -> str:
+    run_id = spec.removeprefix("runs:/").partition("/")[0]
+    if not RUN_ID.fullmatch(run_id) or not run_exists(client, run_id):
+        raise InputError(f"model={spec}: {uri} has no run {run_id!r}")
+    run = client.get_run(run_id)
+    logged = run.outputs.model_outputs if run.outputs else []
+    if logged:
+        return client.get_logged_model(logged[-1].model_id).artifact_location
+    children = client.search_runs(
+        [run.info.experiment_id], f"tags.`mlflow.parentRunId` = '{run_id}'", max_results=1
+    )
+    if children:
+        raise InputError(f"model={spec} is the parent run of a grid search; name one of its children")
+    raise InputError(f"model={spec}: the run logged no model (its status is {run.info.status})")
+
+
+def _registered(client: MlflowClient, spec: str, uri: str) -> str:
+    from mlflow.exceptions import MlflowException
+
+    reference = spec.removeprefix("models:/")
+    match = SPEC.fullmatch(reference)
+    if match is None:
+        raise InputError(f"model={spec} is malformed; write models:/<name>@<alias>, models:/<name>/<version>")
+    name, alias, number = match["name"], match["alias"], match["version"]
+    try:
+        if name.startswith("m-") and not alias and not number:
+            return client.get_logged_model(name).artifact_location
+        versions = sorted(int(v.version) for v in client.search_model_versions(f"name='{_quoted(name)}'"))
+        aliases = client.get_registered_model(name).aliases
+    except MlflowException as error:
+        if error.error_code != "RESOURCE_DOES_NOT_EXIST":
+            raise
+        known = ", ".join(m.name for m in client.search_registered_models(max_results=20)) or "none"
+        raise InputError(f"model={spec}: {uri} has no model {name!r}; known: {known}") from None
+    if alias:
+        if alias not in aliases:
+            known = ", ".join(f"{a} (version {v})" for a, v in aliases.items()) or "none"
+            raise InputError(f"model={spec}: {name} has no alias {alias!r}; known: {known}")
+        number = aliases[alias]
+    if not versions:
+        raise InputError(f"model={spec}: {name} has no versions")
+    wanted = versions[-1] if number in (None, "latest") else int(number)
+    if wanted not in versions:
+        known = ", ".join(map(str, versions))
+        raise InputError(f"model={spec}: {name} has no version {wanted}; known: {known}")
+    return client.get_model_version_download_uri(name, str(wanted))
+
+
+def _quoted(name: str) -> str:
+    if "'" in name:
+        raise InputError(f"model=models:/{name}: a name with a quote cannot be looked up")
+    return name
+
+
+def _fetch(source: str, spec: str, uri: str) -> Path:
+    """The files, where they lie or in a folder that goes with this process."""
+    from mlflow.artifacts import download_artifacts
+    from mlflow.exceptions import MlflowException
+
+    there = None
+    if not source.startswith("file:"):
+        there = tempfile.mkdtemp(prefix="dlkf-model-")
+        atexit.register(shutil.rmtree, there, ignore_errors=True)
+    try:
+        folder = Path(download_artifacts(artifact_uri=source, dst_path=there, tracking_uri=uri))
+    except (OSError, MlflowException) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"model={spec}: its files cannot be had from {source}: {reason}") from None
+    found = sorted(folder.rglob(WEIGHTS))
+    if not found:
+        raise InputError(f"model={spec}: {source} holds no {WEIGHTS}; was this model logged by dlkf?")
+    return found[0].parent

@@ -1,0 +1,250 @@
+"""Runs in MLflow: an embedded SQLite store here by default, a server by one setting (``tracking.uri``)."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from dlkf.errors import InputError
+
+if TYPE_CHECKING:
+    from lightning.pytorch.loggers import MLFlowLogger
+    from mlflow import MlflowClient
+
+STORE, ARTIFACTS = "mlflow.db", "mlruns"
+SQLITE = "sqlite:///"
+PARENT_TAG, NOTE_TAG = "mlflow.parentRunId", "mlflow.note.content"
+KIND = {"mlflow.experimentKind": "custom_model_development"}  # else the UI shows pages for language models
+KEY_LENGTH, VALUE_LENGTH, PARAMS_AT_ONCE, METRICS_AT_ONCE = 250, 6000, 100, 1000  # MLflow's limits
+SAMPLE_EVERY_S, SAMPLES_PER_POINT = 1, 5  # system metrics: MLflow's own 10 s leaves short runs empty
+
+
+def mlflow_module() -> ModuleType:
+    """MLflow, quiet, without usage reports, unable to load a pickle. Imported on use: it takes seconds."""
+    os.environ["MLFLOW_ALLOW_PICKLE_DESERIALIZATION"] = "false"
+    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+    os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
+    import mlflow
+
+    for name in ("mlflow", "alembic"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    return mlflow
+
+
+def tracking_uri(given: str | None = None) -> str:
+    """Where runs are kept: ``given``, else ``MLFLOW_TRACKING_URI``, else ``mlflow.db`` in this folder.
+
+    A relative SQLite path is made absolute. Raises InputError for a plain folder, which MLflow refuses.
+    """
+    uri = given or os.environ.get("MLFLOW_TRACKING_URI") or SQLITE + STORE
+    if uri.startswith(SQLITE):
+        return SQLITE + str(Path(uri.removeprefix(SQLITE)).expanduser().resolve())
+    if "://" not in uri or uri.startswith("file:"):
+        raise InputError(
+            f"tracking.uri={uri} is a plain folder, which MLflow no longer takes; "
+            f"give sqlite:///<path>.db or the address of a server (http://…)"
+        )
+    return uri
+
+
+def store_missing(uri: str) -> bool:
+    """Whether the URI is an embedded store that does not exist yet."""
+    return uri.startswith(SQLITE) and not Path(uri.removeprefix(SQLITE)).is_file()
+
+
+@contextmanager
+def reachable(uri: str) -> Iterator[None]:
+    """Turn a failing connection to a tracking server into an InputError."""
+    from mlflow.exceptions import MlflowException
+    from requests.exceptions import RequestException
+
+    try:
+        yield
+    except (RequestException, MlflowException) as error:
+        no_answer = isinstance(error, RequestException) or "failed with exception" in str(error)
+        if not (uri.startswith("http") and no_answer):
+            raise
+        message = f"the MLflow server {uri} does not answer; start it, or mend tracking.uri"
+        raise InputError(message) from None
+
+
+def experiment_id(client: MlflowClient, name: str) -> str:
+    """The experiment of this name, made if need be; artifacts of an embedded store lie beside it.
+
+    Raises InputError if the experiment was deleted.
+    """
+    from mlflow.exceptions import MlflowException
+
+    uri, location = client.tracking_uri, None
+    if uri.startswith(SQLITE):
+        store = Path(uri.removeprefix(SQLITE))
+        store.parent.mkdir(parents=True, exist_ok=True)
+        location = (store.parent / ARTIFACTS / name).as_uri()
+    found = client.get_experiment_by_name(name)
+    if found is None:
+        try:
+            return client.create_experiment(name, artifact_location=location, tags=KIND)
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_ALREADY_EXISTS":  # made by another process in the meantime
+                raise
+            found = client.get_experiment_by_name(name)
+    if found.lifecycle_stage == "deleted":
+        raise InputError(f"the MLflow experiment {name!r} was deleted; restore it or give another name=")
+    return found.experiment_id
+
+
+@dataclass(frozen=True)
+class Run:
+    """One MLflow run that is being written."""
+
+    id: str
+    uri: str
+    resumed: bool
+    client: MlflowClient
+
+    def log_config(self, config: Mapping[str, Any]) -> None:
+        """The whole config as ``config.yaml``, and flattened into parameters (those that are not there yet).
+
+        Values longer than MLflow takes are cut in the parameters, never in the file.
+        """
+        from mlflow.entities import Param
+
+        there = self.client.get_run(self.id).data.params
+        params = [Param(k, v) for k, v in flattened(config).items() if k not in there]
+        for first in range(0, len(params), PARAMS_AT_ONCE):
+            self.client.log_batch(self.id, params=params[first : first + PARAMS_AT_ONCE])
+        self.client.log_text(self.id, yaml.safe_dump(dict(config), sort_keys=False), "config.yaml")
+
+    def log_dataset(self, folder: Path | str, digest: str, context: str) -> None:
+        """A dataset folder with its digest: the Dataset column of the UI."""
+        from mlflow.entities import DatasetInput, InputTag
+
+        given = DatasetInput(dataset_entity(folder, digest), [InputTag("mlflow.data.context", context)])
+        self.client.log_inputs(self.id, datasets=[given])
+
+    def log_metrics(self, metrics: Mapping[str, float], step: int = 0) -> None:
+        """Many metrics in one transaction; those that are not finite are left out."""
+        from mlflow.entities import Metric
+        from mlflow.utils.time import get_current_time_millis
+
+        now = get_current_time_millis()
+        kept = [Metric(k, float(v), now, step) for k, v in metrics.items() if math.isfinite(v)]
+        for first in range(0, len(kept), METRICS_AT_ONCE):
+            self.client.log_batch(self.id, metrics=kept[first : first + METRICS_AT_ONCE])
+
+    def log_files(self, folder: Path | str, under: str | None = None) -> None:
+        """Everything in a folder, or one file, as artifacts."""
+        path = Path(folder)
+        if path.is_dir():
+            self.client.log_artifacts(self.id, str(path), under)
+        else:
+            self.client.log_artifact(self.id, str(path), under)
+
+    def note(self, markdown: str) -> None:
+        """What the UI shows as the description of the run."""
+        self.client.set_tag(self.id, NOTE_TAG, markdown)
+
+
+def dataset_entity(folder: Path | str, digest: str):
+    """A dataset folder as MLflow knows it: name, digest and place; the data stay where they are."""
+    from mlflow.entities import Dataset
+
+    path = Path(folder).expanduser().resolve()
+    source = json.dumps({"uri": path.as_uri()})
+    return Dataset(name=path.name, digest=digest[:36], source_type="local", source=source)
+
+
+def flattened(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """``{"optimizer.lr": "0.001", …}``: names joined by dots, values as JSON, cut at MLflow's limits."""
+    params: dict[str, str] = {}
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping) and value:
+            params |= flattened(value, f"{name}.")
+        else:
+            text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+            params[name[:KEY_LENGTH]] = text[:VALUE_LENGTH]
+    return params
+
+
+@contextmanager
+def start_run(
+    uri: str,
+    experiment: str,
+    name: str,
+    *,
+    parent_run_id: str | None = None,
+    run_id: str | None = None,
+    system_metrics: bool = True,
+) -> Iterator[Run]:
+    """Open a run, or go on with ``run_id`` if this store has it; its status at the end tells how it ended.
+
+    ``parent_run_id`` makes it a child. Status: FINISHED, FAILED after an exception, KILLED after Ctrl-C.
+    Raises InputError where the server does not answer or the experiment was deleted.
+    """
+    mlflow = mlflow_module()
+    mlflow.set_tracking_uri(uri)
+    system_metrics = system_metrics and find_spec("psutil") is not None  # else MLflow refuses the run
+    mlflow.set_system_metrics_sampling_interval(SAMPLE_EVERY_S)
+    mlflow.set_system_metrics_samples_before_logging(SAMPLES_PER_POINT)
+    with reachable(uri):
+        client = mlflow.MlflowClient(uri)
+        resumed = run_id is not None and run_exists(client, run_id)
+        if resumed:
+            active = mlflow.start_run(run_id, log_system_metrics=system_metrics)
+            if parent_run_id:
+                client.set_tag(run_id, PARENT_TAG, parent_run_id)  # a point of a grid search started again
+        else:
+            active = mlflow.start_run(
+                experiment_id=experiment_id(client, experiment),
+                run_name=name,
+                tags={PARENT_TAG: parent_run_id} if parent_run_id else None,
+                log_system_metrics=system_metrics,
+            )
+    try:
+        yield Run(active.info.run_id, uri, resumed, client)
+    except KeyboardInterrupt:
+        mlflow.end_run("KILLED")
+        raise
+    except BaseException:
+        mlflow.end_run("FAILED")
+        raise
+    mlflow.end_run("FINISHED")
+
+
+def run_exists(client: MlflowClient, run_id: str) -> bool:
+    """Whether the store holds this run, not deleted."""
+    from mlflow.exceptions import MlflowException
+
+    try:
+        return client.get_run(run_id).info.lifecycle_stage == "active"
+    except MlflowException as error:
+        if error.error_code != "RESOURCE_DOES_NOT_EXIST":
+            raise
+        return False
+
+
+def lightning_logger(run: Run) -> MLFlowLogger:
+    """Lightning's logger on this run. Parameters and the final status stay the run's own business."""
+    from lightning.pytorch.loggers import MLFlowLogger
+
+    class MetricsOnly(MLFlowLogger):
+        def log_hyperparams(self, params: Any) -> None:
+            """The run has the whole config already, uncut."""
+
+        def finalize(self, status: str = "success") -> None:
+            """The run goes on after training: scores and model follow."""
+
+    return MetricsOnly(run_id=run.id, tracking_uri=run.uri)

@@ -1,0 +1,152 @@
+"""Fit a filter's over-bounding factors on training drives and check them on test drives (R016, R018)."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+from dlkf.console import counting
+from dlkf.data.drive import Batch, Drive
+from dlkf.data.segments import select
+from dlkf.data.splits import split_rows
+from dlkf.data.stack import DriveStack
+from dlkf.errors import InputError
+from dlkf.evaluation.outages import with_outage
+from dlkf.evaluation.protocol import Protocol, Scenes
+from dlkf.evaluation.table import Table, as_markdown, number
+from dlkf.files import staged
+from dlkf.filters.build import build_filter, is_filter
+from dlkf.filters.tuning import Tuning
+from dlkf.navigation.imu_errors import ImuSpec
+from dlkf.tuning.search import OBJECTIVES, Trial, factors_of, outage_error, tuned, tuning_values
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """Factors before and after, the trials, and errors in outages [m]: (side, objective, before, after)."""
+
+    model: str
+    before: Tuning
+    after: Tuning
+    trials: tuple[Trial, ...]
+    errors: tuple[tuple[str, str, float, float], ...]
+
+    @property
+    def changed(self) -> dict[str, float]:
+        """What is not as it comes."""
+        start, default = tuning_values(self.after), tuning_values(Tuning())
+        return {k: v for k, v in start.items() if v != default[k]}
+
+    def metrics(self) -> dict[str, float]:
+        """For a log: ``train/outage_rms/tuned`` and the like."""
+        return {
+            f"{side}/outage_{objective}/{when}": value
+            for side, objective, *values in self.errors
+            for when, value in zip(("untuned", "tuned"), values)
+        }
+
+
+def check(model: str, objective: str) -> None:
+    """Raises InputError for a name that is no Kalman filter to be tuned, or an unknown objective."""
+    if not is_filter(model) or model == "ins":
+        raise InputError(f"model={model} has no noise to tune; give the name of a Kalman filter, such as mbkf21")
+    if "prior" in model.split("_"):
+        raise InputError(f"model={model}: the factors of a filter do not depend on its prior; tune it without _prior")
+    if objective not in OBJECTIVES:
+        raise InputError(f"objective={objective} is none of {', '.join(OBJECTIVES)}")
+
+
+def sides(drives: Sequence[Drive], config: Mapping[str, Any]) -> dict[str, list[Drive]]:
+    """Training and test drives, whole recordings on one side; split as in :mod:`dlkf.data.splits`."""
+    stack = DriveStack(drives)
+    labels = split_rows(stack, config["split"], config["fractions"], config["split_seed"], config["length_s"])
+    out = {}
+    for side in ("train", "test"):
+        rows = zip(stack.first_row.tolist(), stack.epochs.tolist())
+        out[side] = [d for d, (row, n) in zip(stack, rows) if bool((labels[side][row : row + n] >= 0).any())]
+    return out
+
+
+def withheld(drives: Sequence[Drive], protocol: Protocol, pieces: int | None = None) -> list[Batch]:
+    """Batches of drives with their outages, of at most so many pieces, spread evenly.
+
+    Raises InputError if no outage fits.
+    """
+    scenes = Scenes(drives, protocol)
+    step = 1 if pieces is None else max(1, -(-scenes.runs // pieces))
+    batches = [with_outage(b, mask) for b, mask in scenes]
+    kept = [select(b, torch.arange(0, b.size[0], step)) for b in batches]
+    if not any(bool((~b.available & b.truth_valid & b.present).any()) for b in kept):
+        raise InputError("no outage fits into the valid truth of the training drives; see outage.* and length_s")
+    return kept
+
+
+def search(
+    model: str,
+    imu: ImuSpec,
+    drives: Mapping[str, Sequence[Drive]],
+    protocol: Protocol,
+    *,
+    start: Tuning,
+    objective: str,
+    rounds: int,
+    pieces: int | None,
+) -> Tuned:
+    """Fit on ``drives["train"]``, then errors before and after on both sides."""
+    training = withheld(drives["train"], protocol, pieces)
+    trials: list[Trial] = []
+    most = rounds * sum(map(len, factors_of(model).values()))
+    with counting(f"Tuning {model}") as progress:
+
+        def tell(trial: Trial) -> None:
+            trials.append(trial)
+            progress(len(trials), most)
+
+        after, _ = tuned(imu, training, name=model, start=start, objective=objective, rounds=rounds, progress=tell)
+    batches = {"train": training}
+    if drives["test"]:
+        batches["test"] = withheld(drives["test"], protocol)
+    old, new = (build_filter(model, imu, tuning=t) for t in (start, after))
+    errors = [
+        (side, o, outage_error(old, b, o), outage_error(new, b, o)) for side, b in batches.items() for o in OBJECTIVES
+    ]
+    return Tuned(model, start, after, tuple(trials), tuple(errors))
+
+
+def tuning_table(result: Tuned, dataset: str) -> Table:
+    """Errors in outages before and after, on both sides."""
+    rows = [
+        [side, objective, number(before), number(after), number(after / before)]
+        for side, objective, before, after in result.errors
+    ]
+    factors = ", ".join(f"{k}={v:g}" for k, v in result.changed.items()) or "all as they were"
+    return Table(
+        title=f"{result.model} on {dataset}: {factors}",
+        note="Horizontal error over the epochs without GNSS [m]: RMS over all, median and geometric mean (log) over "
+        "the pieces. Fitted on the training drives alone.",
+        columns=["Drives", "Objective", "Before", "After", "Ratio"],
+        rows=rows,
+    )
+
+
+def write_tuning(out: str | Path, name: str, result: Tuned, table: Table) -> None:
+    """Write tuning/<name>.yaml, table.md and search.csv into ``out``, all or none."""
+    factors = f"# {table.title}\n{yaml.safe_dump(tuning_values(result.after), sort_keys=False)}"
+    trials = io.StringIO()
+    writer = csv.writer(trials, lineterminator="\n")
+    writer.writerow(["factor", "value", "error_m"])
+    writer.writerows(result.trials)
+    with staged(out) as folder:
+        (folder / "tuning").mkdir()
+        (folder / "tuning" / f"{name}.yaml").write_text(factors)
+        (folder / "table.md").write_text(as_markdown(table))
+        (folder / "search.csv").write_text(trials.getvalue())
+        (folder / "errors.json").write_text(json.dumps(result.metrics(), indent=1) + "\n")

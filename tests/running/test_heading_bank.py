@@ -1,0 +1,197 @@
+"""Starting from data alone: at rest, in motion, in reverse, with a bad course; the bank of headings behind it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dlkf.data.alignment import AlignConfig, levelled, mean_force
+from dlkf.data.store import load_dataset
+from dlkf.errors import InputError
+from dlkf.navigation.attitude import rotation_from_rpy, vector_from_rotation
+from dlkf.navigation.earth import ned_axes
+from dlkf.running.heading_bank import RING, Case, likeliest
+from dlkf.running.standstill import at_rest
+from dlkf.running.start import WORST_HEADING_STD, align, align_each
+from dlkf.simulation.dataset import simulate_from_config
+from tests.data.conftest import REAL
+
+SEARCH = AlignConfig(search_s=20.0)
+AROUND = AlignConfig(search_s=20.0, from_rest=True)
+# a consumer's MEMS: 0.3 °/s and 0.1 m/s² at turn-on
+ACCEL = {"noise_density": 1e-3, "turn_on_bias": 0.1, "instability": 1e-3, "correlation_time": 3600.0}
+GYRO = {"noise_density": 7e-5, "turn_on_bias": 5e-3, "instability": 1e-4, "correlation_time": 3600.0}
+MATRIX = {"scale_factor": 5e-3, "misalignment": 5e-3}
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory):
+    """Eight cars of 90 s that stand for some seconds before they set off, each with an IMU of its own."""
+    dataset = {"name": "toy", "hours": 0.2, "drive_minutes": 1.5, "imu_errors": "per_drive"}
+    dataset["gnss"] = {"lever_arm_b": [1.0, -0.3, -1.2]}
+    imu = {"name": "mems", "accel": ACCEL | MATRIX, "gyro": GYRO | MATRIX}
+    config = {"dataset": dataset, "imu": imu, "seed": 4, "workers": 1}
+    folder = simulate_from_config(config, tmp_path_factory.mktemp("start") / "toy", progress=False)
+    return load_dataset(folder, dtype=torch.float64)
+
+
+def _errors(drives, starts):
+    """truth ⊖ start in n over the stated 1σ (n, 9), and the heading's error [°]."""
+    rows, headings = [], []
+    for d, s in zip(drives, starts):
+        C_en = ned_axes(*torch.tensor([s.lat, s.lon], dtype=torch.float64))
+        attitude = vector_from_rotation(C_en.mT @ d.ref_C_eb[s.first] @ s.state.C_nb.mT)
+        velocity = C_en.mT @ d.ref_v_e[s.first] - s.state.v_n
+        rows.append(torch.cat((velocity, attitude)) / s.std[3:])
+        headings.append(math.degrees(attitude[2]))
+    return torch.stack(rows), torch.tensor(headings)
+
+
+def _in_reverse(drive):
+    """The same drive by a car that faces the other way: IMU and lever arm turned about."""
+    about = rotation_from_rpy(torch.tensor([0.0, 0.0, math.pi], dtype=torch.float64))
+    imu = torch.cat((drive.imu[..., :3] @ about, drive.imu[..., 3:] @ about), -1)
+    return replace(drive, imu=imu, ref_C_eb=drive.ref_C_eb @ about, lever_arm_b=about.mT @ drive.lever_arm_b)
+
+
+def test_a_drive_that_begins_at_rest_starts_with_its_first_fix(drives):
+    causal, around = align_each(drives), align_each(drives, AROUND)
+    waited = sum(s.first for s in causal)
+    assert all(s.first == 0 for s in around) and waited > 5 * len(drives)
+    normalised, heading = _errors(drives, around)
+    assert heading.abs().max() < 2.5 and heading.square().mean().sqrt() < 1.2
+    assert normalised.abs().max() < 3.5 and normalised.square().mean(0).max() < 2  # 8 draws
+    for d, s in zip(drives, around):
+        assert at_rest(d)[0] and s.state.v_n.abs().max() == 0
+        assert 1e-3 < s.std[8] < math.radians(3)
+
+
+def test_a_drive_that_begins_in_motion_starts_with_its_first_fix_too(drives):
+    parts = [d.part(int(torch.nonzero(d.gnss_v_e.norm(dim=-1) > 5)[0]), d.epochs) for d in drives]
+    around = align_each(parts, AROUND)
+    assert [s.first for s in around] == [0] * len(parts) and [s.first for s in align_each(parts)] == [2] * len(parts)
+    normalised, heading = _errors(parts, around)
+    assert heading.square().mean().sqrt() < 2 and normalised.abs().max() < 3.5
+
+
+@pytest.mark.parametrize("config", [SEARCH, AROUND])
+def test_reverse_is_recognised_where_the_course_is_mistaken(drives, config):
+    turned = [_in_reverse(d) for d in drives]
+    mistaken = _errors(turned, align_each(turned))[1]
+    assert (mistaken.abs() > 170).all()
+    normalised, heading = _errors(turned, align_each(turned, config))
+    assert heading.abs().max() < 3 and normalised[:, 5].abs().max() < 3.5
+
+
+def test_the_search_leaves_a_good_course_alone(drives):
+    causal, searched = _errors(drives, align_each(drives))[1], _errors(drives, align_each(drives, SEARCH))[1]
+    assert searched.square().mean().sqrt() < causal.square().mean().sqrt() + 0.2
+
+
+@pytest.mark.parametrize("turn_deg", [-60, 90, -135, 180])
+def test_a_heading_wrong_by_any_angle_converges(drives, turn_deg):
+    cases, truth = [], []
+    for d in drives:
+        s = align(d)
+        C, force_b = s.state.C_nb, mean_force(d, s.first)
+        yaw = torch.tensor([0.0, 0.0, math.radians(turn_deg)], dtype=torch.float64)
+        wrong = levelled(rotation_from_rpy(yaw) @ C, force_b, C @ force_b)
+        start = replace(s, first=0, state=s.state._replace(C_nb=wrong))
+        cases.append(Case(d.part(s.first, d.epochs), start, force_b, torch.zeros(3, dtype=torch.float64)))
+        C_en = ned_axes(*torch.tensor([s.lat, s.lon], dtype=torch.float64))
+        truth.append(C_en.mT @ d.ref_C_eb[s.first])
+    found = likeliest(cases, 20.0)
+    off = torch.stack([vector_from_rotation(C @ h.C_nb.mT)[2] for C, h in zip(truth, found)])
+    assert torch.rad2deg(off).abs().max() < 3
+    assert (off.abs() / torch.tensor([h.std for h in found]) < 3.5).all()
+    assert all(h.decided for h in found)
+    assert {h.origin for h in found} == {"reverse" if turn_deg == 180 else "bank"}
+
+
+def test_bad_velocities_give_a_heading_that_is_as_good_as_it_says(drives):
+    """1 m/s of noise on a course at 2 to 4 m/s: tens of degrees, and the bank finds it from what comes after."""
+    g = torch.Generator().manual_seed(0)
+    bad = []
+    for d in drives:
+        noise = torch.randn(d.gnss_v_e.shape, generator=g, dtype=torch.float64)
+        std = torch.cat((d.gnss_std[:, :3], d.gnss_std[:, 3:] + 1.0), -1)
+        bad.append(replace(d, gnss_v_e=d.gnss_v_e + noise, gnss_std=std))
+    course, searched = (_errors(bad, align_each(bad, c)) for c in (AlignConfig(), SEARCH))
+    assert searched[1].square().mean() < 0.25 * course[1].square().mean()
+    assert searched[0][:, 5].abs().max() < 3.5
+
+
+def test_doubt_is_told_and_costs_more_time(drives):
+    """Straight on at a constant speed every heading fits the fixes: the course is believed, but not as decided."""
+    d = drives[0]
+    s = align(d)
+    n = 90
+    C_en = ned_axes(*torch.tensor([s.lat, s.lon], dtype=torch.float64))
+    v_e = C_en @ torch.tensor([10.0, 0.0, 0.0], dtype=torch.float64)
+    level = torch.tensor([0.0, 0.0, -9.81, 0.0, 0.0, 0.0], dtype=torch.float64)
+    t = torch.arange(n + 1, dtype=torch.float64)[:, None]
+    straight = replace(
+        d.part(0, n), imu=level.expand(n, 50, 6), gnss_r_e=d.gnss_r_e[s.first] + t * v_e, gnss_v_e=v_e.expand(n + 1, 3),
+        gnss_valid=torch.ones(n + 1, 6, dtype=torch.bool), lever_arm_b=torch.zeros(3, dtype=torch.float64),
+    )  # fmt: skip
+    start = align(straight, SEARCH)
+    assert abs(vector_from_rotation(start.state.C_nb)[2]) < math.radians(2)
+    case = Case(straight.part(2, n), replace(start, first=0), mean_force(straight, 2), torch.zeros(3).double())
+    heading = likeliest([case], 2.0)[0]
+    assert heading.origin == "course" and not heading.decided
+
+
+def test_what_keeps_a_drive_from_starting_is_told_in_place(drives):
+    good, blind = drives[0], replace(drives[1], gnss_valid=torch.zeros_like(drives[1].gnss_valid))
+    parked = replace(drives[2], gnss_v_e=0 * drives[2].gnss_v_e)
+    starts = align_each([good, blind, parked], AROUND)
+    assert starts[0].first == 0 and all(isinstance(s, InputError) for s in starts[1:])
+    assert "no GNSS fix" in str(starts[1]) and "never moves faster than 2 m/s" in str(starts[2])
+    alone = align(good, AROUND)
+    assert (alone.state.C_nb - starts[0].state.C_nb).abs().max() < 1e-9
+    later = align(good, AROUND, earliest=30)
+    assert later.first == 30
+
+
+def test_heading_is_not_carried_further_than_it_is_worth(drives):
+    """A course that comes late to a car in motion, and no standstill to tell the gyroscopes' error."""
+    d = next(d for d in drives if (d.gnss_v_e[20:81].norm(dim=-1) > 1.5).all()).part(20, 90)
+    slow = replace(d, gnss_v_e=torch.where(torch.arange(71)[:, None] > 55, 1.0, 0.15) * d.gnss_v_e)
+    config = AlignConfig(from_rest=True, min_speed=4.0)
+    moving, start = align(slow, replace(config, from_rest=False)), align(slow, config)
+    assert 0 < start.first < moving.first
+    assert moving.std[8] < start.std[8] <= WORST_HEADING_STD
+    assert align(slow, config, earliest=start.first + 3).first == start.first + 3
+
+
+@pytest.mark.parametrize("fault, said", [
+    ({"serch_s": 3}, "align: unknown key serch_s"),
+    ({"min_speed": 0}, "align.min_speed is 0"),
+    ({"search_s": -1}, "align.search_s is -1"),
+    ({"search_s": math.nan}, "align.search_s is nan"),
+    ({"from_rest": 1}, "align.from_rest is 1"),
+])  # fmt: skip
+def test_settings_are_checked(fault, said):
+    with pytest.raises(InputError, match=said):
+        AlignConfig.of(fault)
+    assert AlignConfig.of(None) == AlignConfig() and AlignConfig.of({"search_s": 0}).search_s == 0
+    assert RING >= 12  # neighbours no further apart than a filter bears
+
+
+def test_real_drives():
+    """kitti against its reference: every drive from its first fix, forwards and backwards; rtkx 37 s earlier."""
+    if not (REAL / "kitti").is_dir():
+        pytest.skip("real drives are not here")
+    kitti = load_dataset(REAL / "kitti", dtype=torch.float64)
+    for real in (kitti, [_in_reverse(d) for d in kitti[::3]]):
+        starts = align_each(real, AROUND)
+        known = [bool(d.ref_C_eb[s.first].isfinite().all()) for d, s in zip(real, starts)]
+        assert sum(s.first for s in starts) <= 1  # one has no fix at its first boundary
+        normalised, heading = (x[known] for x in _errors(real, starts))
+        assert len(heading) >= 14 and heading.abs().max() < 8 and heading.square().mean().sqrt() < 2
+        assert (normalised.square().mean(0).sqrt() < 1.5).all()
+    rtkx = load_dataset(REAL / "rtkx", dtype=torch.float64)[0]
+    assert align(rtkx).first == 37 and align(rtkx, AROUND).first == 0

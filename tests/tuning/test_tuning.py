@@ -1,0 +1,87 @@
+"""Over-bounding factors: what the objectives count, what a search finds, and what the command leaves behind."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from dlkf.errors import InputError
+from dlkf.evaluation.outages import OutagePlan, with_outage
+from dlkf.filters.build import build_filter
+from dlkf.filters.integration import integrate
+from dlkf.filters.tuning import Tuning
+from dlkf.tuning.search import FACTORS, factors_of, outage_error, tuned
+from dlkf.tuning.study import check
+from tests.commands.conftest import call  # noqa: F401
+from tests.evaluation.conftest import IMU, cars, town, write_cars  # noqa: F401
+from tests.tracking.conftest import template, uri  # noqa: F401
+
+
+def hidden(batch):
+    return with_outage(batch, OutagePlan(30.0, 20.0).masks(batch)[0])
+
+
+def test_objectives_are_what_they_say(cars):  # noqa: F811
+    batch = hidden(cars)
+    solution = integrate(batch, build_filter("mbkf15", IMU))
+    error = (solution.posterior.p_n - batch.truth.p_n)[:, 30:50, :2].norm(dim=-1)
+    pieces = error.square().mean(-1).sqrt()
+    found = {o: outage_error(build_filter("mbkf15", IMU), [batch], o) for o in ("rms", "median", "log")}
+    assert found["rms"] == pytest.approx(float(error.square().mean().sqrt()))
+    assert found["median"] == pytest.approx(float(pieces.quantile(0.5)))
+    assert found["log"] == pytest.approx(float(pieces.log().mean().exp()))
+
+
+def test_one_lost_piece_decides_rms_but_not_the_median(cars):  # noqa: F811
+    batch = hidden(cars)
+    imu = batch.imu.clone()
+    imu[0, 30:] += torch.tensor([2.0, 2.0, 0, 0, 0, 0.1])
+    lost = replace(batch, imu=imu)
+    filters = build_filter("mbkf15", IMU)
+    before, after = ([outage_error(filters, [b], o) for o in ("rms", "median")] for b in (batch, lost))
+    assert after[0] > 10 * before[0]
+    assert after[1] < 2 * before[1]
+
+
+def test_a_search_mends_noise_that_is_told_too_small(cars):  # noqa: F811
+    small = replace(IMU, accel=replace(IMU.accel, noise_density=1e-5), gyro=replace(IMU.gyro, noise_density=1e-6))
+    trials = []
+    factors = {"accel_noise": (1.0, 100.0), "gyro_noise": (1.0, 100.0)}
+    best, score = tuned(small, [hidden(cars)], factors=factors, rounds=1, progress=trials.append)
+    assert (best.accel_noise, best.gyro_noise) != (1.0, 1.0)
+    assert score == min(t.score for t in trials) < outage_error(build_filter("mbkf15", small), [hidden(cars)])
+
+
+def test_every_filter_has_the_factors_that_it_uses():
+    assert factors_of("mbkf15") == dict(FACTORS)
+    assert set(factors_of("mbkf33_car_gated")) == {*FACTORS, "lateral_std", "vertical_std", "gate"}
+    assert set(factors_of("aekf")) == {*FACTORS, "forgetting"}
+    known = set(Tuning.__dataclass_fields__)
+    for name in ("mbkf15_nhc", "mbkf21_car", "mbkf15_gated", "aekf"):
+        assert set(factors_of(name)) <= known
+
+
+@pytest.mark.parametrize("model", ["ins", "mbkf15_prior", "no_such"])
+def test_what_has_no_noise_of_its_own_is_refused(model):
+    with pytest.raises(InputError, match=f"model={model}"):
+        check(model, "rms")
+
+
+def test_the_command_writes_factors_that_evaluate_takes(uri, call, town):  # noqa: F811
+    size = ("length_s=50", "outage.first_s=25", "outage.duration_s=20", "fractions=[0.5,0,0.5]", "rounds=1")
+    done = call("tune", "model=mbkf15", f"dataset={town}", "imu=perfect", "name=cars", "out=found", *size)
+    assert done.code == 0, done.err
+    factors = yaml.safe_load(Path("found/tuning/cars.yaml").read_text())
+    assert build_filter("mbkf15", IMU, tuning=factors).tuning != Tuning()  # a perfect IMU's noise is too small here
+    assert "train" in done.out and "test" in done.out and Path("mlflow.db").is_file()
+    cut = ("length_s=50", "outage.first_s=25", "outage.duration_s=20", "injected_bias=null")
+    done = call(
+        "evaluate", "--config-dir", "found", "tuning=cars", "model=mbkf15", f"dataset={town}", "out=seen", *cut
+    )
+    assert done.code == 0, done.err
+    done = call("tune", "model=mbkf15", f"dataset={town}", "out=none", *size[:1], "outage.first_s=45", *size[2:])
+    assert done.code == 2 and not Path("none").exists(), done.err
