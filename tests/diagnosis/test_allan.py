@@ -95,7 +95,7 @@ def test_a_log_that_is_too_short_is_refused():
     assert kept.gyro.noise_density == pytest.approx(base.gyro.noise_density, rel=0.1)
 
 
-def test_the_command_writes_a_preset_that_a_filter_takes(tmp_path, call, town):  # noqa: F811
+def test_the_command_writes_a_preset_that_a_filter_takes(tmp_path, call, town):
     imu = at_rest(spec_of("icm20602_i2nav"), 1.0)
     t = np.arange(1, len(imu) + 1) / RATE
     gnss = {"t": t[-1:], "quality": np.array([0])} | {

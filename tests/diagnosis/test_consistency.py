@@ -73,7 +73,7 @@ def test_errors_beyond_the_states_are_switched_off():
     assert matching(CONSUMER, build_filter("mbkf33", CONSUMER).states).gyro == CONSUMER.gyro
 
 
-def test_the_command_writes_table_picture_and_numbers(call):  # noqa: F811
+def test_the_command_writes_table_picture_and_numbers(call):
     size = ("drives=2", "minutes=0.5", "rate_hz=10", "outage.first_s=15", "outage.duration_s=10", "settle_s=2")
     done = call("consistency", "model=[mbkf15,mbkf21_car]", "out=found", *size)
     assert done.code == 0, done.err
