@@ -1,5 +1,6 @@
 """From a dataset to scenes, scores and solutions."""
 
+import json
 import shutil
 from dataclasses import replace
 
@@ -9,11 +10,13 @@ import pymap3d
 import pytest
 import torch
 
+from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.kinds import drive_kinds
+from dlkf.data.segments import StartLaw
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
 from dlkf.evaluation.outages import OutagePlan
-from dlkf.evaluation.protocol import Protocol, Scenes, protocol_from
+from dlkf.evaluation.protocol import Protocol, Scenes, protocol_from, spread
 from dlkf.evaluation.report import all_tables
 from dlkf.evaluation.study import study
 from dlkf.filters.build import build_filter
@@ -38,6 +41,51 @@ def test_pieces_are_cut_where_truth_allows_and_outages_put_in(drives):
     assert torch.equal(batch.start.p_n, again[0].start.p_n)  # iterating again is the same experiment
     other = next(iter(Scenes(drives, replace(protocol, seed=2))))[0]
     assert not torch.equal(batch.start.p_n, other.start.p_n)
+
+
+def tables_of(folder, **settings):
+    """Plain results of a filter over the test side of a data module, with drawn outages and injected biases."""
+    size = {"length_s": 20.0, "eval_length_s": 25.0, "eval_stride_s": 5.0, "rate_hz": 20}
+    data = DriveDataModule(folder, split={"train": ["g0"], "val": ["g1"], "test": ["g2"]}, **{**size, **settings})
+    scenes = Scenes.of_split(data, "test", OutagePlan(first_s=(5, 10), duration_s=(5, 15)), seed=4)
+    names = {"mbkf15": MBKF, "ins": build_filter("ins", IMU)}
+    return study(names, scenes, kinds="simulated", injected_bias={"accel": 0.05, "gyro": 2e-3}, seed=4)[1]
+
+
+def test_the_test_is_the_same_for_every_batch_size_and_training_seed(town):
+    """To the last bit: a comparison of trainings is one of trainings and not of tests."""
+    one = json.dumps(tables_of(town, batch_size=10, seed=0))
+    assert one == json.dumps(tables_of(town, batch_size=50, seed=1))
+    assert one != json.dumps(tables_of(town, start=StartLaw(yaw_deg=1.0)))
+    first, second = (
+        [b for k in (3, 50) for b in DriveDataModule(
+            town, split={"train": ["g0"], "val": ["g1"], "test": ["g2"]}, eval_length_s=25.0, batch_size=k, seed=k
+        ).batches(side)]
+        for side in ("val", "test")
+    )  # fmt: skip
+    for batches in (first, second):
+        alone, together = torch.cat([b.start.C_nb for b in batches[:-1]]), batches[-1].start.C_nb
+        assert len(batches) == 3 and torch.equal(alone, together)
+
+
+def test_start_errors_and_outages_do_not_know_the_imu_rate_nor_the_pieces_beside(town):
+    plan = OutagePlan(first_s=(5, 10), duration_s=(5, 15))
+    law = Protocol(length_s=25, stride_s=25, outage=plan, seed=1)
+    both = [load_dataset(town, rate_hz=rate, dtype=torch.float64) for rate in (10, 20)]
+    (slow, mask), (fast, other) = (next(iter(Scenes(drives, law))) for drives in both)
+    assert torch.equal(mask, other) and torch.equal(slow.start.p_n, fast.start.p_n)
+    part, few = next(iter(Scenes(both[1][2:4][::-1], law)))
+    where = [list(zip(fast.drive, fast.t_start)).index(piece) for piece in zip(part.drive, part.t_start)]
+    assert torch.equal(few, other[where]) and torch.equal(part.start.v_n, fast.start.v_n[where])
+
+
+def test_a_limit_keeps_pieces_of_all_drives(drives):
+    law = Protocol(length_s=10, stride_s=10)
+    ((batch, _),) = Scenes(drives, law, limit=6)
+    assert sorted(batch.drive) == sorted(d.name for d in drives)
+    assert spread(range(10), 3) == [1, 5, 8] and spread(range(10), None) == list(range(10)) == spread(range(10), 99)
+    with pytest.raises(InputError, match="pieces=0"):
+        spread(range(10), 0)
 
 
 def test_truth_without_attitude_means_whole_drives_from_their_own_alignment(drives):

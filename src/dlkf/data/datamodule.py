@@ -38,8 +38,9 @@ class DriveDataModule(L.LightningDataModule):
     that attribute) start at random, spread evenly over the training drives, with a start error drawn from
     ``start``. Batches depend on (seed, epoch, step) alone, so a resumed run sees what an uninterrupted one
     sees; with several processes each takes its share of every batch. Validation and test pieces of
-    ``eval_length_s`` every ``eval_stride_s`` are fixed by ``seed``; ``eval_outage`` = (start_s, duration_s)
-    withholds GNSS there. Lengths that change need ``Trainer(reload_dataloaders_every_n_epochs=1)``.
+    ``eval_length_s`` every ``eval_stride_s`` have start errors drawn from ``eval_seed``, each piece its own, so that
+    they are the same for every ``seed`` and ``batch_size``; ``eval_outage`` = (start_s, duration_s) withholds GNSS
+    there. Lengths that change need ``Trainer(reload_dataloaders_every_n_epochs=1)``.
 
     Groups of the same name in several datasets count as one recording. ``split`` and ``fractions`` as in
     :func:`dlkf.data.splits.split_rows`; ``turn_frames`` and ``bias_injection``
@@ -65,6 +66,7 @@ class DriveDataModule(L.LightningDataModule):
         turn_frames: bool = False,
         bias_injection: Sequence[float] | None = None,
         seed: int = 0,
+        eval_seed: int = 0,
         split_seed: int = 0,
         progress: Callable[[str, int, int], None] | None = None,
     ) -> None:
@@ -81,7 +83,7 @@ class DriveDataModule(L.LightningDataModule):
         self.eval_outage = _pair(eval_outage, "eval_outage")
         self.bias_injection = _pair(bias_injection, "bias_injection")
         self.start, self.turn_frames = StartLaw.of(start), turn_frames
-        self.seed, self.split_seed, self.progress = seed, split_seed, progress
+        self.seed, self.eval_seed, self.split_seed, self.progress = seed, eval_seed, split_seed, progress
         self.length_law: Callable[[int], float] | None = None
         self._starts: dict[int, torch.Tensor] = {}
         self._latest: tuple[int, int, list[list[Piece]]] = (-1, -1, [])
@@ -169,12 +171,9 @@ class DriveDataModule(L.LightningDataModule):
     def batches(self, side: str, *, dtype: torch.dtype | None = None) -> list[Batch]:
         """The fixed batches of a side, with the same start errors for every filter and in every run."""
         pieces, out = self.pieces(side), []
-        for step, k in enumerate(range(0, len(pieces), self.batch_size)):
-            generator = torch.Generator().manual_seed(_seed(self.seed, SIDES.index(side), step, 1))
+        for k in range(0, len(pieces), self.batch_size):
             part = pieces[k : k + self.batch_size]
-            batch = make_batch(
-                self.stack, part, dtype=dtype or self.dtype, start=self.start, generator=generator
-            )
+            batch = make_batch(self.stack, part, dtype=dtype or self.dtype, start=self.start, seed=self.eval_seed)
             out.append(batch if self.eval_outage is None else inject_outage(batch, *self.eval_outage))
         return out
 

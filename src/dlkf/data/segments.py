@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dlkf.data.alignment import Start
+from dlkf.data.draws import drawn_per_piece
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.stack import DriveStack, stacked
 from dlkf.errors import InputError
@@ -153,11 +154,13 @@ def make_batch(
     *,
     dtype: torch.dtype = torch.float32,
     start: StartLaw = StartLaw(),
+    seed: int | None = None,
     generator: torch.Generator | None = None,
 ) -> Batch:
     """Cut pieces out of drives; the tangent frame of each lies at its true (else GNSS) start.
 
-    start = truth ⊞ (−δ), δ ~ N(0, Σ₀) of the law drawn from ``generator``. Where the reference has no
+    start = truth ⊞ (−δ), δ ~ N(0, Σ₀) of the law. With a ``seed`` it is drawn for each piece by itself
+    (:mod:`dlkf.data.draws`), as a test needs it, else for the batch from ``generator``. Where the reference has no
     attitude, attitude and its std come from IMU and GNSS instead (the law's are then not added), and so does
     everything where there is no reference at all. Pieces of different lengths are padded (``present``).
     Pass a :class:`DriveStack` where many batches are cut from the same drives.
@@ -171,7 +174,15 @@ def make_batch(
     frame = tangent_frame(*origin.unbind(-1), dtype)
     truth = _state(frame, *(stack.rows[name][row] for name in ("ref_r_e", "ref_v_e", "ref_C_eb")))
     std = start.std.expand(len(drive), 9)
-    dx = std * torch.randn(len(drive), 9, generator=generator, dtype=torch.float64)
+    if seed is None:
+        noise = torch.randn(len(drive), 9, generator=generator, dtype=torch.float64)
+    else:
+        t_start = stack.t0[drive] + first * stack.epoch_s
+        names = [stack[d].name for d in drive.tolist()]
+        noise = drawn_per_piece(
+            lambda g: torch.randn(9, generator=g, dtype=torch.float64), seed, "start", names, t_start
+        )
+    dx = std * noise
     from_truth = stack.start_from_truth[row]
     if not bool(from_truth.all()):
         truth, std, dx = _with_alignment(stack, row, frame, truth, std, dx)

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dlkf.data.draws import drawn_per_piece
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
 
@@ -47,12 +48,15 @@ class OutagePlan:
                 "leave time with GNSS between them"
             )
 
-    def masks(self, batch: Batch, generator: torch.Generator | None = None) -> list[Tensor]:
-        """One mask (B, T) per offset, True where a fix is withheld; only outages that can be scored stay."""
+    def masks(self, batch: Batch, seed: int = 0) -> list[Tensor]:
+        """One mask (B, T) per offset, True where a fix is withheld; only outages that can be scored stay.
+
+        What is drawn for a piece depends on ``seed`` and on the piece alone (:mod:`dlkf.data.draws`).
+        """
         B, T, _ = batch.size
         epoch_s = batch.epoch_s
-        first = _drawn(self.first_s, B, epoch_s, generator)
-        duration = _drawn(self.duration_s, B, epoch_s, generator)
+        first = _drawn(self.first_s, batch, seed, "first_s")
+        duration = _drawn(self.duration_s, batch, seed, "duration_s")
         repeats = 1 if self.every_s is None else max(1, int(T * epoch_s / self.every_s) + 1)
         out = []
         for offset in self.offsets_s or (0.0,):
@@ -108,10 +112,14 @@ def _bounds(name: str, value: float | Sequence[float]) -> tuple[float, float]:
     return float(values[0]), float(values[-1])
 
 
-def _drawn(
-    value: float | Sequence[float], n: int, epoch_s: float, generator: torch.Generator | None
-) -> Tensor:
-    low, high = _bounds("outage", value)
-    steps = round((high - low) / epoch_s)
-    draw = torch.randint(0, steps + 1, (n,), generator=generator) if steps else torch.zeros(n)
-    return low + draw.double() * epoch_s
+def _drawn(value: float | Sequence[float], batch: Batch, seed: int, name: str) -> Tensor:
+    low, high = _bounds(f"outage.{name}", value)
+    steps = round((high - low) / batch.epoch_s)
+    if not steps:
+        return torch.full((batch.size[0],), low, dtype=torch.float64)
+
+    def whole_epochs(generator: torch.Generator) -> Tensor:
+        return torch.randint(0, steps + 1, (), generator=generator)
+
+    draws = drawn_per_piece(whole_epochs, seed, f"outage.{name}", batch.drive, batch.t_start)
+    return low + draws.double() * batch.epoch_s

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 
 from dlkf.data.alignment import ALIGN, AlignConfig, Start
-from dlkf.data.drive import Drive
+from dlkf.data.drive import Batch, Drive
 from dlkf.data.segments import Piece, StartLaw, cut_pieces, make_batch, whole_drives
-from dlkf.data.stack import DriveStack
+from dlkf.data.stack import DriveStack, stacked
 from dlkf.errors import InputError
-from dlkf.evaluation.outages import OutagePlan
+from dlkf.evaluation.outages import OutagePlan, with_outage
 from dlkf.evaluation.run import Scene
 from dlkf.running.batched import CHUNK_SAMPLES
 from dlkf.running.start import align_each
 
+if TYPE_CHECKING:
+    from dlkf.data.datamodule import DriveDataModule
+
+Item = TypeVar("Item")
 MODES = ("auto", "pieces", "drives")
 
 
@@ -50,16 +54,26 @@ class Protocol:
 class Scenes:
     """The scenes of a protocol over some drives; iterating cuts them anew, a bounded part at a time.
 
-    ``mode`` is the one chosen, ``runs`` the number of pieces over all scenes, ``skipped`` the drives that
+    The same protocol gives the same scenes, whatever is scored on them: each piece has its own draws of start error
+    and outage. ``pieces`` are those to use, else they are cut by the protocol; ``limit`` keeps so many, spread evenly
+    over all. ``mode`` is the one chosen, ``runs`` the number of pieces over all scenes, ``skipped`` the drives that
     cannot be used and why. Raises InputError where nothing can be scored or no outage fits into the pieces.
     """
 
-    def __init__(self, drives: Sequence[Drive], protocol: Protocol) -> None:
-        stack = DriveStack(drives)
-        pieces: list[Piece] = []
-        if protocol.mode != "drives":
+    def __init__(
+        self,
+        drives: Sequence[Drive],
+        protocol: Protocol,
+        *,
+        pieces: Sequence[Piece] | None = None,
+        limit: int | None = None,
+    ) -> None:
+        stack = stacked(drives)
+        if pieces is None and protocol.mode != "drives":
             attitude = protocol.mode == "auto"
             pieces = cut_pieces(stack, protocol.length_s, protocol.stride_s, attitude=attitude)
+        pieces = spread(pieces or (), limit)
+        self.side: str | None = None
         self.mode = "pieces" if protocol.mode == "pieces" or pieces else "drives"
         self.skipped: dict[str, str] = {}
         self._batches: list[tuple[Sequence[Drive], list[Piece] | list[Start]]]
@@ -73,6 +87,7 @@ class Scenes:
             self.outage = protocol.outage and _fitting(protocol.outage, protocol.length_s)
         else:
             starts = self._aligned(stack, protocol.align)
+            starts = {d: starts[d] for d in spread(list(starts), limit)}
             order = sorted(starts, key=lambda d: -stack[d].epochs)  # like lengths together: little padding
             parts = _parts(order, [stack[d].epochs for d in order], stack)
             self._batches = [([stack[d] for d in part], [starts[d] for d in part]) for part in parts]
@@ -82,24 +97,39 @@ class Scenes:
         self.runs = offsets * sum(len(part) for _, part in self._batches)
 
     def __iter__(self) -> Iterator[Scene]:
-        generator = torch.Generator().manual_seed(self.protocol.seed)
+        seed = self.protocol.seed
         for drives, part in self._batches:
             if self.mode == "pieces":
-                batch = make_batch(
-                    drives, part, dtype=torch.float64, start=self.protocol.start, generator=generator
-                )
+                batch = make_batch(drives, part, dtype=torch.float64, start=self.protocol.start, seed=seed)
             else:
                 batch = whole_drives(drives, part)
             if self.outage is None:
                 yield batch, torch.zeros(batch.size[:2], dtype=torch.bool)
                 continue
-            for mask in self.outage.masks(batch, generator):
+            for mask in self.outage.masks(batch, seed):
                 yield batch, mask
+
+    @classmethod
+    def of_split(
+        cls, data: DriveDataModule, side: str, outage: OutagePlan | None, seed: int, limit: int | None = None
+    ) -> Scenes:
+        """The scenes of the pieces on one side of a split (``train``, ``val``, ``test``), of at most ``limit``."""
+        pieces, stride = data.pieces(side), data.eval_stride_s or data.eval_length_s
+        protocol = Protocol("pieces", data.eval_length_s, stride, data.start, outage=outage, seed=seed)
+        scenes = cls(data.stack, protocol, pieces=pieces, limit=limit)
+        scenes.side = side
+        return scenes
+
+    def withheld(self) -> list[Batch]:
+        """All batches with the outages applied."""
+        return [with_outage(batch, mask) for batch, mask in self]
 
     def described(self) -> dict[str, Any]:
         """The rules as plain values, for files."""
         p = self.protocol
-        common: dict[str, Any] = {"mode": self.mode, "seed": p.seed}
+        common: dict[str, Any] = {"mode": self.mode, "runs": self.runs, "seed": p.seed}
+        if self.side is not None:
+            common["split"] = self.side
         if self.mode == "pieces":
             common |= {"length_s": p.length_s, "stride_s": p.stride_s, "start": asdict(p.start)}
         else:
@@ -121,6 +151,16 @@ class Scenes:
             more = f" (and {len(self.skipped) - 1} more)" if len(self.skipped) > 1 else ""
             raise InputError(f"no drive can be scored: {next(iter(self.skipped.values()))}{more}")
         return starts
+
+
+def spread(items: Sequence[Item], limit: int | None) -> list[Item]:
+    """At most ``limit`` items (None: all), at even distances over the whole sequence."""
+    n = len(items)
+    if limit is None or limit >= n:
+        return list(items)
+    if limit < 1:
+        raise InputError(f"pieces={limit} must be at least 1, or null for all")
+    return [items[(2 * k + 1) * n // (2 * limit)] for k in range(limit)]
 
 
 def repeated(plan: OutagePlan) -> OutagePlan:

@@ -16,6 +16,7 @@ from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.kinds import drive_kinds
 from dlkf.errors import InputError
 from dlkf.evaluation.outages import OutagePlan
+from dlkf.evaluation.protocol import Scenes
 from dlkf.evaluation.report import write_report
 from dlkf.evaluation.results import BASELINE
 from dlkf.evaluation.scores import Scores
@@ -25,7 +26,6 @@ from dlkf.filters.integration import Estimator
 from dlkf.filters.learned import load_filter
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.training.fit import fit
-from dlkf.training.scenes import SplitScenes
 from dlkf.tuning.search import FACTORS, factors_of, mean_imu_error, tuned, tuning_values
 
 Say = Callable[[str], None]
@@ -74,7 +74,7 @@ def run_study(
     if learned in filters:
         raise InputError(f"baselines.models has {learned}, the name of the trained filter; take it out")
     filters[learned] = load_filter(weights)
-    scenes = SplitScenes(data, "test", plan, config["seed"])
+    scenes = Scenes.of_split(data, "test", plan, config["scoring"]["seed"])
     kinds: dict[str, str] = {}
     for dataset in data.datasets:
         kinds |= drive_kinds(dataset)
@@ -85,7 +85,7 @@ def run_study(
         groups={d.name: d.group for d in data.stack},
         settle_s=config["scoring"]["settle_s"],
         injected_bias=config["scoring"]["slope"],
-        seed=config["seed"],
+        seed=config["scoring"]["seed"],
     )
     seconds["scoring"] = time.perf_counter() - clock
     write_report(
@@ -109,7 +109,7 @@ def _baseline_knowledge(
     more to tune, such as the noise of a constraint.
     """
     settings = config["baselines"]
-    pieces = SplitScenes(data, "train", plan, config["seed"], settings["pieces"]).withheld()
+    pieces = Scenes.of_split(data, "train", plan, config["scoring"]["seed"], settings["pieces"]).withheld()
     rounds = settings["rounds"] if settings["tune"] else 0
     best, rms = tuned(spec, pieces, rounds=rounds)
     how = "tuned" if settings["tune"] else "untuned"

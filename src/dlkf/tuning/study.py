@@ -10,16 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
 
 from dlkf.console import counting
 from dlkf.data.drive import Batch, Drive
-from dlkf.data.segments import select
 from dlkf.data.splits import split_rows
 from dlkf.data.stack import DriveStack
 from dlkf.errors import InputError
-from dlkf.evaluation.outages import with_outage
 from dlkf.evaluation.protocol import Protocol, Scenes
 from dlkf.evaluation.table import Table, as_markdown, number
 from dlkf.files import staged
@@ -80,10 +77,7 @@ def withheld(drives: Sequence[Drive], protocol: Protocol, pieces: int | None = N
 
     Raises InputError if no outage fits.
     """
-    scenes = Scenes(drives, protocol)
-    step = 1 if pieces is None else max(1, -(-scenes.runs // pieces))
-    batches = [with_outage(b, mask) for b, mask in scenes]
-    kept = [select(b, torch.arange(0, b.size[0], step)) for b in batches]
+    kept = Scenes(drives, protocol, limit=pieces).withheld()
     if not any(bool((~b.available & b.truth_valid & b.present).any()) for b in kept):
         raise InputError("no outage fits into the valid truth of the training drives; see outage.* and length_s")
     return kept
