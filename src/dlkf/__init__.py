@@ -19,6 +19,9 @@ Units
     SI and radians. Degrees only in columns named ``_deg``. Quaternions scalar-first.
 Shapes
     (batch, epoch, sample, axis). An epoch is one update interval, 1 s unless said otherwise.
+Citations
+    R085 (what the paper asks for, by number) and "paper.md 4.10" (how it was read) are in docs/paper.md; "paper eq 9"
+    is the paper itself. The equations from the sample to the solution are in docs/algorithm.md.
 """
 
 __version__ = "0.1.0"

@@ -184,7 +184,7 @@ def test_limits_of_gaps_are_configurable(tmp_path, tables):
 
 
 def test_noisy_gnss_raises_no_alarm(tmp_path, tables):
-    """Position noise of 5 m and velocity noise of 2 m/s, more than the degraded sets (checklist 2.10)."""
+    """Position noise of 5 m and velocity noise of 2 m/s, more than the degraded sets (paper.md 2.10)."""
     rng = np.random.default_rng(1)
     gnss = tables["gnss"].copy()
     for names, sigma in ((["lat_deg", "lon_deg"], 5 / 111e3), (["vel_n", "vel_e", "vel_d"], 2.0)):

@@ -35,7 +35,7 @@ def single(batch):
 
 
 def test_the_paper_s_network_has_its_2_2_million_parameters():
-    """Layer by layer as in checklist 4.1: CNN, LSTM 4 × 256 on 80 inputs, dense 512 and 256, heads 54 + 6."""
+    """Layer by layer as in paper.md 4.1: CNN, LSTM 4 × 256 on 80 inputs, dense 512 and 256, heads 54 + 6."""
     model = LearnedFilter(LearnedConfig())
     cnn = (15 * 32 * 3 + 32) + (32 * 3 + 1)
     lstm = 4 * 256 * (80 + 256 + 2) + 3 * 4 * 256 * (256 + 256 + 2)
@@ -80,7 +80,7 @@ def test_pieces_of_a_batch_do_not_touch_each_other():
 
 
 def test_heading_frame_does_not_see_the_direction_of_driving():
-    """The same drive turned by 90° about the vertical gives the same solution, turned (checklist 4.9).
+    """The same drive turned by 90° about the vertical gives the same solution, turned (paper.md 4.9).
 
     Earth rotation off, or turning would change the physics.
     """

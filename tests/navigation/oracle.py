@@ -15,7 +15,7 @@ def matrix(vector: torch.Tensor) -> torch.Tensor:
 
 
 def mechanise(start: NavState, imu: torch.Tensor, dt: float, frame: TangentFrame, substeps: int = 40):
-    """States at the end of every sample by small Heun steps of the continuous equations (checklist 2.1)."""
+    """States at the end of every sample by small Heun steps of the continuous equations (paper.md 2.1)."""
     p, v, C = start
     h = dt / substeps
     rate = frame.earth_rate_n

@@ -65,7 +65,7 @@ def test_gauss_markov_biases_decay():
 
 
 def continuous(C: torch.Tensor, force_n: torch.Tensor) -> torch.Tensor:
-    """Jacobian F of the error model with Earth rotation left out (checklist 2.1)."""
+    """Jacobian F of the error model with Earth rotation left out (paper.md 2.1)."""
     F = torch.zeros(15, 15, dtype=torch.float64)
     F[POSITION, VELOCITY] = torch.eye(3, dtype=torch.float64)
     F[VELOCITY, ATTITUDE] = -skew(force_n)

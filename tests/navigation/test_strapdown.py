@@ -65,7 +65,7 @@ def test_constant_acceleration_error_drifts_180_m_in_a_minute():
 
 
 def test_constant_gyro_error_tilts_into_gravity():
-    """A north gyro error w makes g w t³ / 6 of east drift: 44 km per rad/s at 30 s (checklist 4.11)."""
+    """A north gyro error w makes g w t³ / 6 of east drift: 44 km per rad/s at 30 s (paper.md 4.11)."""
     frame = frame_at()
     imu = still_imu(frame, 30 * M)
     imu[..., 3] += 1e-5

@@ -37,7 +37,7 @@ def test_presets_read_and_say_where_they_come_from(name):
 
 @pytest.mark.parametrize(
     ("name", "accel", "gyro"),
-    [  # √S of checklist 2.10 in m/s²/√Hz and rad/s/√Hz, given to three digits
+    [  # √S of paper.md 2.10 in m/s²/√Hz and rad/s/√Hz, given to three digits
         ("groves_consumer", 9.81e-3, 2.91e-4),
         ("icm20602_datasheet", 9.81e-4, 6.98e-5),
         ("icm20602_i2nav", 3.33e-3, 5.82e-5),

@@ -61,7 +61,7 @@ def test_decimation_keeps_every_nth_fix_per_piece():
 
 
 def test_outages_have_the_paper_s_lengths_and_leave_room():
-    """R070: 10–30 s; ≥ 10 s with GNSS before, ≥ 5 s after (checklist 4.14); none in warm-up (R072)."""
+    """R070: 10–30 s; ≥ 10 s with GNSS before, ≥ 5 s after (paper.md 4.14); none in warm-up (R072)."""
     batch = scene(300, 60)
     hidden = ~OutageInjection(start_epoch=40).transform(batch, 40, generator()).available
     length = hidden.sum(-1)

@@ -20,7 +20,7 @@ def shifted(batch, solution, metres: float):
 
 
 def test_smooth_l1_in_closed_form():
-    """0.5 e² below the scale, e − 0.5 above it, over three axes (checklist 2.8)."""
+    """0.5 e² below the scale, e − 0.5 above it, over three axes (paper.md 2.8)."""
     batch = scene(2, 5)
     solution = integrate(batch, Ins())
     for metres, scale, expected in ((0.4, 1.0, 0.5 * 0.16 / 3), (3.0, 1.0, 2.5 / 3), (3.0, 2.0, 1.0 / 3)):

@@ -1,4 +1,4 @@
-"""Augmentation of training pieces: turned frames and fresh IMU biases (checklist 4.7, 4.9)."""
+"""Augmentation of training pieces: turned frames and fresh IMU biases (paper.md 4.7, 4.9)."""
 
 from __future__ import annotations
 

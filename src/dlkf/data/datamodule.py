@@ -32,7 +32,7 @@ DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 class DriveDataModule(L.LightningDataModule):
-    """Pieces of any number of datasets, split by recording (checklist 4.8), as :class:`Batch` objects.
+    """Pieces of any number of datasets, split by recording (paper.md 4.8), as :class:`Batch` objects.
 
     Training: in every epoch pieces of ``length_s`` (or ``length_law(epoch)`` where a curriculum sets
     that attribute) start at random, spread evenly over the training drives, with a start error drawn from

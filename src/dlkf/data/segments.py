@@ -32,7 +32,7 @@ class Piece(NamedTuple):
 
 @dataclass(frozen=True)
 class StartLaw:
-    """1σ of the initial error that every filter gets, truth ⊖ start ~ N(0, Σ₀) (checklist 4.5).
+    """1σ of the initial error that every filter gets, truth ⊖ start ~ N(0, Σ₀) (paper.md 4.5).
 
     All zero starts from the exact truth.
     """

@@ -1,4 +1,4 @@
-"""Who trains and who tests: whole recordings on one side (checklist 4.8)."""
+"""Who trains and who tests: whole recordings on one side (paper.md 4.8)."""
 
 from __future__ import annotations
 

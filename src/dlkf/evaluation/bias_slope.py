@@ -1,4 +1,4 @@
-"""Does a filter estimate the IMU error, or has it memorised one? (checklist 4.7)"""
+"""Does a filter estimate the IMU error, or has it memorised one? (paper.md 4.7)"""
 
 from __future__ import annotations
 

@@ -158,7 +158,7 @@ def outage_distance(v_truth: Array, w: Windows, epoch_s: float) -> Array:
 
 
 def slope(estimate: Array, cause: Array, *, intercept: bool) -> Array:
-    """Least-squares slope per axis of an IMU-error estimate against what caused it (checklist 4.7).
+    """Least-squares slope per axis of an IMU-error estimate against what caused it (paper.md 4.7).
 
     1 = the filter estimates the error, 0 = it has memorised one. ``estimate`` and ``cause`` (P, 6). With
     ``intercept`` across drives of different true error; without, of the change of the estimate against a

@@ -27,7 +27,7 @@ MODES = ("auto", "pieces", "drives")
 
 @dataclass(frozen=True)
 class Protocol:
-    """The rules of a comparison, the same for every filter (DESIGN 10).
+    """The rules of a comparison, the same for every filter (paper.md 4.5, 4.8).
 
     ``pieces``: ``length_s`` every ``stride_s`` wherever the truth is valid, from the truth plus an error
     drawn from ``start``. ``drives``: whole drives from their own alignment (``align``), the outage repeated every

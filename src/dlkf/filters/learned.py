@@ -22,7 +22,7 @@ from dlkf.networks.features import FRAMES, component_features, level_rotation, w
 from dlkf.networks.heads import GainHead, ImuErrorHead
 
 OUTAGE_MODES = ("hold", "run")
-MAX_TRAINING_TURN = 0.2  # rad per correction, a guard in training only (checklist 4.10)
+MAX_TRAINING_TURN = 0.2  # rad per correction, a guard in training only (paper.md 4.10)
 WEIGHTS, CONFIG = "weights.safetensors", "config.yaml"
 
 
@@ -32,8 +32,8 @@ class LearnedConfig:
 
     ``outage_mode``: ``hold`` runs the network at GNSS updates only and keeps the last IMU error in between
     (the paper); ``run`` runs it every epoch, with a fix flag and the time since the last fix as further
-    inputs (checklist 4.3). ``frame``: axes of features and gain. ``detach_features`` stops the gradient at
-    the network's inputs (checklist 4.13). ``rate_hz``, ``epoch_s``: what it was trained on.
+    inputs (paper.md 4.3). ``frame``: axes of features and gain. ``detach_features`` stops the gradient at
+    the network's inputs (paper.md 4.13). ``rate_hz``, ``epoch_s``: what it was trained on.
     """
 
     network: NetworkConfig = field(default_factory=NetworkConfig)

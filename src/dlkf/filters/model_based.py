@@ -67,7 +67,7 @@ class Mbkf:
 
     ``states`` gives 15 (the paper's), 21 or 33 of them. ``prior_mean`` and ``prior_std`` [m/s², rad/s] replace
     zero and the preset's spread as the bias's initial knowledge: with a training set's mean error this is
-    ``mbkf15_prior`` (checklist 4.6). ``gauss_markov`` lets the biases decay with the preset's correlation time
+    ``mbkf15_prior`` (paper.md 4.6). ``gauss_markov`` lets the biases decay with the preset's correlation time
     instead of walking. ``constrained`` adds what a car cannot do, ``gated`` refuses outliers, ``adaptive``
     adapts Q and R.
     """

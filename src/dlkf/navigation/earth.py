@@ -1,7 +1,7 @@
 """WGS-84 ellipsoid, normal gravity and the tangent frame, as batched functions on tensors.
 
 Sources: Groves, *Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems*, 2nd ed.,
-ch. 2 (equation numbers below); working frame: checklist 2.3.
+ch. 2 (equation numbers below); working frame: paper.md 2.3.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Error-state model of the tangent-frame strapdown over one whole window (checklist 2.1, 2.5–2.7).
+"""Error-state model of the tangent-frame strapdown over one whole window (paper.md 2.1, 2.5–2.7).
 
 Truth − estimate, order position, velocity, attitude, accelerometer error, gyroscope error, and where a filter
 carries them the elements of the sensor matrices M (measured = (I + M) true + bias):
@@ -74,7 +74,7 @@ class WindowModel:
         return Phi
 
     def noise(self, Phi: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
-        """Process noise Q of a whole window from the PSDs of its sources (checklist 2.6, R016).
+        """Process noise Q of a whole window from the PSDs of its sources (paper.md 2.6, R016).
 
         Q = Σ_source S ∫ L(τ) L(τ)ᵀ dτ, where the response L(τ) to noise at time τ is the source's column of Φ
         shrunk by (1−τ/T)ⁿ: exact while attitude and specific force are constant over the window.
@@ -173,7 +173,7 @@ def window_model(
 def antenna(
     state: NavState, rate_b: Float[Tensor, "B 3"], lever_arm_b: Float[Tensor, "B 3"] | None, frame: TangentFrame
 ) -> Float[Tensor, "B 6"]:
-    """Position and velocity of the antenna in n (checklist 2.5).
+    """Position and velocity of the antenna in n (paper.md 2.5).
 
     ``rate_b`` is the corrected angular rate at the fix [rad/s], ``lever_arm_b`` IMU → antenna [m], None for none.
     """
@@ -191,7 +191,7 @@ def measurement_matrix(
     frame: TangentFrame,
     states: int = STATES,
 ) -> Float[Tensor, "B 6 n"]:
-    """H of antenna position and velocity with the lever arm in it (checklist 2.5)."""
+    """H of antenna position and velocity with the lever arm in it (paper.md 2.5)."""
     H = _identity(states, rate_b.dtype, rate_b.device).expand(len(rate_b), 6, states)
     if lever_arm_b is not None:
         H = H.clone()

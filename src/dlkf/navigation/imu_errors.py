@@ -1,6 +1,6 @@
 """IMU error model: what a sensor adds to the truth, and what a filter is told about it.
 
-Model (checklist 2.7, paper eqs 7, 8): measured = (I + M) true + b + w, with M's diagonal the scale factors
+Model (paper.md 2.7, paper eqs 7, 8): measured = (I + M) true + b + w, with M's diagonal the scale factors
 and its off-diagonal the misalignments, b a turn-on bias plus an in-run part that is first-order
 Gauss-Markov with time constant τ (a random walk of the same strength while t ≪ τ), w white noise.
 Optional, none by default: a rate random walk and a warm-up drift in b, a gyroscope's g-dependent error G f,

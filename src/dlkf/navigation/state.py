@@ -77,7 +77,7 @@ class NavState(NamedTuple):
     C_nb: Tensor  # (*b, 3, 3)
 
     def corrected(self, dx: Float[Tensor, "*b 9"]) -> NavState:
-        """State ⊞ dx: the closed-loop feedback, C ← exp([δh×]) C (checklist 2, closed loop)."""
+        """State ⊞ dx: the closed-loop feedback, C ← exp([δh×]) C (paper.md 2)."""
         return NavState(
             self.p_n + dx[..., POSITION],
             self.v_n + dx[..., VELOCITY],

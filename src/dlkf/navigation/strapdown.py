@@ -1,7 +1,7 @@
 """Strapdown by the window: position, velocity and attitude after every sample, without a loop over samples.
 
 Inside a window the IMU error is constant, so attitude is a prefix product of rotations and velocity and
-position are prefix sums. In the tangent frame n, which is fixed to the Earth (checklist 2.1, 2.3),
+position are prefix sums. In the tangent frame n, which is fixed to the Earth (paper.md 2.1, 2.3),
 
     C' = C [w_b×] − [ω×] C,    v' = C f_b + g(p) − 2 ω × v,    p' = v,    ω = Earth rate.
 

@@ -19,7 +19,7 @@ class NetworkConfig:
     """Sizes of the network; the defaults are the paper's.
 
     ``fusion``: ``concat`` feeds CNN output and components to the LSTM side by side; ``strict30`` squeezes
-    them into the 30 inputs that the paper names (checklist 4.1). ``flags`` further inputs are appended.
+    them into the 30 inputs that the paper names (paper.md 4.1). ``flags`` further inputs are appended.
     """
 
     samples: int = 50
@@ -78,7 +78,7 @@ class CnnLstm(nn.Module):
         self._initialise()
 
     def _initialise(self) -> None:
-        """Orthogonal recurrent weights and a forget-gate bias of 1 (checklist 4.13)."""
+        """Orthogonal recurrent weights and a forget-gate bias of 1 (paper.md 4.13)."""
         hidden = self.config.lstm_hidden
         for name, parameter in self.lstm.named_parameters():
             if name.endswith("weight_hh"):

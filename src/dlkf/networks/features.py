@@ -1,7 +1,7 @@
 """What the network sees: the window for the CNN and the four components for the LSTM (R037–R044).
 
 Everything is divided by a fixed physical size; the components then pass asinh, which keeps sign and small
-signals and tames the innovations after an outage (checklist 4.9). ``frame`` chooses the axes of every
+signals and tames the innovations after an outage (paper.md 4.9). ``frame`` chooses the axes of every
 horizontal pair: ``ned`` is the paper's reading, ``heading`` turns them by the estimated yaw, which makes the
 network blind to the direction of driving.
 """
@@ -46,7 +46,7 @@ def window_features(
     C_hn: Float[Tensor, "B 3 3"],
     frame: str,
 ) -> Float[Tensor, "B 15 M"]:
-    """Channels over time: position, velocity, attitude of the INS and the raw IMU (paper line 31).
+    """Channels over time: position, velocity, attitude of the INS and the raw IMU (R037).
 
     In the ``heading`` frame the position counts from the window's first sample and yaw from its last.
     """
@@ -66,7 +66,7 @@ def component_features(
     innovation: Float[Tensor, "B 6"],
     C_hn: Float[Tensor, "B 3 3"],
 ) -> Float[Tensor, "B 30"]:
-    """The four components a–d of the paper (line 29); the two differences come per second (checklist 4.2)."""
+    """The four components a–d of the paper (R040–R043); the two differences come per second (paper.md 4.2)."""
     x = torch.cat((posterior_rate, last_correction, gnss_rate, innovation), -1)
     x = (x.unflatten(-1, (10, 3)) @ C_hn.mT).flatten(1)
     return torch.asinh(x / x.new_tensor(COMPONENT_SCALE))

@@ -1,6 +1,6 @@
 """Output layers (R048): a 9×6 Kalman gain and a six-axis IMU error, both in physical size.
 
-Heads start near zero around a usable filter (checklist 4.10 G0, 4.11 E0): position and velocity gain ½ I,
+Heads start near zero around a usable filter (paper.md 4.10 G0, 4.11 E0): position and velocity gain ½ I,
 IMU error 0. Unscaled random heads would end in the blow-up that the paper describes.
 """
 

@@ -107,7 +107,7 @@ def draw_unit(rng: np.random.Generator, spec: ImuSpec) -> ImuUnit:
 def corrupt(
     rng: np.random.Generator, true_imu: Array, spec: ImuSpec, unit: ImuUnit, rate_hz: float
 ) -> tuple[Array, Array]:
-    """Measured samples and their complete error without white noise, both (N, 6) (checklist 2.7, R090).
+    """Measured samples and their complete error without white noise, both (N, 6) (paper.md 2.7, R090).
 
         error = M true + G f + b(t),   measured = put out(true + error + w),   std(w) = √S · √rate (R094)
 

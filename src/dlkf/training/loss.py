@@ -18,7 +18,7 @@ TERMS = ("position", "velocity", "attitude")
 @dataclass(frozen=True)
 class LossConfig:
     """``scale`` [m, m/s, rad]: the error where smooth-L1 turns from square to linear; ``prior`` and
-    ``posterior``: how much the states before and after the update count (checklist 2.8, 4.12)."""
+    ``posterior``: how much the states before and after the update count (paper.md 2.8, 4.12)."""
 
     position_scale: float = 1.0
     velocity_scale: float = 0.1

@@ -41,7 +41,7 @@ class FilterTraining(L.LightningModule):
         self.seed = seed
 
     def configure_optimizers(self):
-        """AdamW, heads at their own rate, cosine annealing with warm restarts (R073; checklist 4.13)."""
+        """AdamW, heads at their own rate, cosine annealing with warm restarts (R073; paper.md 4.13)."""
         o, s = self.hparams["optimizer"], self.hparams["scheduler"]
         heads = [p for n, p in self.filter.named_parameters() if n.startswith(("gain", "imu_error"))]
         body = [p for n, p in self.filter.named_parameters() if n.startswith("network")]

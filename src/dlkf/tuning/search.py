@@ -1,6 +1,6 @@
 """Baselines as good as training drives can make them: tuned noise, and the prior knowledge of one IMU.
 
-Nothing here looks at validation or test drives (R018, R111; checklist 4.6).
+Nothing here looks at validation or test drives (R018; paper.md 4.6).
 """
 
 from __future__ import annotations

@@ -88,7 +88,7 @@ def antenna(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Offset of the antenna from the body C l [m] and its velocity v + C(ω_ib × l) − ω_ie × (C l) [m/s], (N, 3) NED.
 
-    Checklist 2.5; ``lever_arm_b`` [m] in body axes, ``rate_b`` (N, 3) the body's ω_ib [rad/s].
+    paper.md 2.5; ``lever_arm_b`` [m] in body axes, ``rate_b`` (N, 3) the body's ω_ib [rad/s].
     """
     C_nb = rotation_from_rpy(torch.from_numpy(truth.rpy)).numpy()
     arm = C_nb @ np.asarray(lever_arm_b)

@@ -33,7 +33,7 @@ class ResumePoint(Checkpoint):
 
 
 class BestWeights(Callback):
-    """Keeps the weights of the epoch with the lowest ``monitor`` in ``best/`` (checklist 4.14)."""
+    """Keeps the weights of the epoch with the lowest ``monitor`` in ``best/`` (paper.md 4.14)."""
 
     def __init__(self, folder: str, monitor: str = "val/outage_position_rms", start_epoch: int = 0) -> None:
         self.folder, self.monitor, self.start_epoch = Path(folder), monitor, start_epoch

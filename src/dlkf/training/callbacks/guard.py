@@ -1,4 +1,4 @@
-"""Guard against non-finite and exploding steps (R077; checklist 4.13)."""
+"""Guard against non-finite and exploding steps (R077; paper.md 4.13)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Adaptive weights of the position, velocity and attitude losses (R065, R066; checklist 2.8)."""
+"""Adaptive weights of the position, velocity and attitude losses (R065, R066; paper.md 2.8)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class AdaptiveLossWeights(Callback):
     """w_p = 1, w_v = clip(L̄_p / L̄_v, 1, w_max), w_h likewise, from moving averages of past epochs.
 
     Velocity and attitude count more while the position loss is large and fall by themselves as the filter
-    converges (paper line 40). ``memory`` is the share that an epoch leaves of the old average.
+    converges (R066). ``memory`` is the share that an epoch leaves of the old average.
     """
 
     def __init__(self, w_max: float = 10.0, memory: float = 0.8) -> None:

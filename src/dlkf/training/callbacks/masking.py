@@ -20,7 +20,7 @@ class BatchCallback(Callback):
 
 
 class GnssDecimation(BatchCallback):
-    """Updates only every ``shortest`` … ``longest`` seconds, drawn per sub-trajectory (R069, paper line 42)."""
+    """Updates only every ``shortest`` … ``longest`` seconds, drawn per sub-trajectory (R069)."""
 
     def __init__(self, shortest_s: int = 2, longest_s: int = 5, start_epoch: int = 0) -> None:
         if not 1 <= shortest_s <= longest_s:
@@ -43,7 +43,7 @@ class GnssDecimation(BatchCallback):
 
 
 class OutageInjection(BatchCallback):
-    """One outage of random length in every sub-trajectory, once warm-up is over (R070, R072; checklist 4.14).
+    """One outage of random length in every sub-trajectory, once warm-up is over (R070, R072; paper.md 4.14).
 
     The outage leaves ``before_s`` seconds with GNSS at the start and ``after_s`` at the end, so that
     re-convergence is trained too; pieces too short for the shortest outage get none.

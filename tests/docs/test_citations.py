@@ -1,0 +1,90 @@
+"""What code and pages cite is there: requirements and readings of docs/paper.md, files, links."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAPER = (ROOT / "docs" / "paper.md").read_text()
+CITING = [
+    file
+    for folder in ("src", "conf", "pipelines", "tests", "docs")
+    for file in sorted((ROOT / folder).rglob("*"))
+    if file.suffix in (".py", ".yaml", ".md") and file != ROOT / "docs" / "paper.md"
+]
+PAGES = [ROOT / "README.md", ROOT / "RESULTS.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+REQUIREMENT = re.compile(r"\bR(\d{3})(?:\s?[–-]\s?R?(\d{3}))?\b")  # R085, R085–R088, R085-088
+READING = re.compile(r"paper\.md\s+((?:\d+(?:\.\d+)?(?:\s+[A-Z]\d)?(?:,\s+|\s?–\s?|\s+and\s+)?)+)")
+LINK = re.compile(r"\]\(([^)#\s]+)(#[^)\s]*)?\)")
+FILE = re.compile(r"`((?:[a-z_]+/)+[a-z_0-9]+\.(?:py|yaml|md))`")
+
+
+def requirements(text: str) -> set[int]:
+    """The numbers behind R…, ranges in full."""
+    return {n for a, b in REQUIREMENT.findall(text) for n in range(int(a), int(b or a) + 1)}
+
+
+def readings(text: str) -> set[str]:
+    """The numbers behind "paper.md", ranges in full."""
+    found: set[str] = set()
+    for listed in READING.findall(text):
+        for low, high in re.findall(r"(\d+(?:\.\d+)?)(?:\s?–\s?(\d+\.\d+))?", re.sub(r"[A-Z]\d", "", listed)):
+            found.add(low)
+            if high:
+                chapter, first = low.split(".")
+                found |= {f"{chapter}.{n}" for n in range(int(first), int(high.split(".")[1]) + 1)}
+    return found
+
+
+STATED = {n for row in re.findall(r"^\| (R[^|]+) \|", PAPER, re.M) for n in requirements(row)}
+READ = set(re.findall(r"^### (\d+(?:\.\d+)?) ", PAPER, re.M))
+
+
+def test_the_ways_of_citing_are_understood() -> None:
+    assert requirements("(R085–R088, R090; R012)") == {85, 86, 87, 88, 90, 12}
+    assert readings("(paper.md 4.10 G0, 4.11 E0): x 5.1") == {"4.10", "4.11"}
+    assert readings("paper.md 2.1, 2.5–2.7)") == {"2.1", "2.5", "2.6", "2.7"}
+    assert readings("see paper.md\n    4.7 and 4.9.") == {"4.7", "4.9"}
+
+
+def test_every_cited_requirement_and_reading_is_in_the_page_of_the_paper() -> None:
+    assert len(STATED) > 100 and len(READ) > 20
+    missing = []
+    for file in CITING:
+        text = file.read_text()
+        lost = {f"R{n:03}" for n in requirements(text) - STATED} | (readings(text) - READ)
+        missing += [f"{file.relative_to(ROOT)}: {', '.join(sorted(lost))}"] if lost else []
+    assert not missing, missing
+
+
+def test_the_page_of_the_paper_cites_its_own_readings() -> None:
+    of_tables = "\n".join(line for line in PAPER.splitlines() if line.startswith("| R"))
+    cited = set(re.findall(r", ([124]\.\d{1,2})(?= \|)", of_tables))
+    assert cited and cited <= READ
+
+
+@pytest.mark.parametrize("file", CITING, ids=lambda file: str(file.relative_to(ROOT)))
+def test_no_source_outside_the_project_is_cited(file: Path) -> None:
+    if file != Path(__file__):
+        assert not re.search(r"\b[Cc]hecklist \d|\bDESIGN\b|paper,? line \d", file.read_text())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_and_named_files_exist(page: Path) -> None:
+    text = page.read_text()
+    lost = [t for t, _ in LINK.findall(text) if "://" not in t and not (page.parent / t).exists()]
+    homes = (ROOT, ROOT / "src" / "dlkf")
+    lost += [f for f in FILE.findall(text) if not f.startswith("mine/") and not any((h / f).exists() for h in homes)]
+    places = [(t, a) for t, a in LINK.findall(text) if a and t.endswith(".md")]
+    lost += [f"{t}{a}" for t, a in places if a[1:] not in anchors(page.parent / t)]
+    assert not lost, lost
+
+
+def anchors(page: Path) -> set[str]:
+    """Anchors of a page's headings, as GitHub and MkDocs make them."""
+    heads = re.findall(r"^#+ (.+)$", page.read_text(), re.M) if page.exists() else []
+    return {re.sub(r"[^\w\- ]", "", h.replace("`", "").lower()).strip().replace(" ", "-") for h in heads}
