@@ -42,6 +42,7 @@ from dlkf.evaluation.table import Table, as_markdown, as_rich, number
 from dlkf.files import staged
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
+from dlkf.filters.model_based import Ins
 from dlkf.navigation.attitude import rpy_from_rotation
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
@@ -217,7 +218,7 @@ def perfect_drift(folder: Path, rate_hz: float) -> float:
     drives = load_dataset(folder, rate_hz=rate_hz, dtype=torch.float64)
     batch = make_batch(drives, cut_pieces(drives, float(OUTAGE_S)), dtype=torch.float64, start=EXACT)
     with torch.inference_mode():
-        solution = integrate(batch, build_filter("ins", preset("perfect")))
+        solution = integrate(batch, Ins(free=True))
     return float((solution.posterior.p_n - batch.truth.p_n)[:, -1, :2].norm(dim=-1).max())
 
 

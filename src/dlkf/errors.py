@@ -1,4 +1,4 @@
-"""The one exception for a user's mistake."""
+"""A user's mistake, and the end that a signal asks for."""
 
 
 class InputError(ValueError):
@@ -6,3 +6,7 @@ class InputError(ValueError):
 
     Commands print it as one line and exit with code 2.
     """
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM: the command ends as after Ctrl-C, with exit code 143."""

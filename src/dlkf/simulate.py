@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
 from typing import Any, cast
 
@@ -16,7 +15,13 @@ from dlkf.simulation.dataset import simulate_from_config
 from dlkf.simulation.semi_real import semi_real_from_config
 
 
-@command("simulate")
+def arguments_of_source(arguments: list[str]) -> list[str]:
+    """``source=`` alone means the dataset ``semi_real``, not simulated drives' default."""
+    given = {argument.partition("=")[0].removeprefix("simulated@") for argument in arguments}
+    return [*arguments, "dataset=semi_real"] if "source" in given and "dataset" not in given else arguments
+
+
+@command("simulate", arguments_of_source)
 def main(cfg: DictConfig) -> None:
     """Write the dataset to ``out`` (default ``data/<name>``) and say what it holds."""
     start = time.perf_counter()
@@ -40,12 +45,5 @@ def main(cfg: DictConfig) -> None:
         print("pictures: " + ", ".join(str(path) for path in write_pictures(out, out / "pictures")))
 
 
-def arguments_of_source(arguments: list[str]) -> list[str]:
-    """``source=`` alone means the dataset ``semi_real``, not simulated drives' default."""
-    given = {argument.partition("=")[0].removeprefix("simulated@") for argument in arguments}
-    return [*arguments, "dataset=semi_real"] if "source" in given and "dataset" not in given else arguments
-
-
 if __name__ == "__main__":
-    sys.argv[1:] = arguments_of_source(sys.argv[1:])
     main()

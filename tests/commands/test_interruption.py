@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pandas as pd
@@ -49,12 +51,15 @@ def _heed_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -signal.SIGKILL}
+
+
+@pytest.mark.parametrize("how", CODES)
 def test_simulate(how, call, tmp_path):
     code = stopped(tmp_path, "made/.town.partial*/imu/*", how, *SIMULATE, ENOUGH)
-    assert code == (130 if how == signal.SIGINT else -how)
+    assert code == CODES[how]
     assert not (tmp_path / "made" / "town").exists()
-    if how == signal.SIGINT:
+    if how != signal.SIGKILL:
         assert list((tmp_path / "made").iterdir()) == []
         return
     done = call(*SIMULATE, "dataset.hours=0.02")
@@ -83,3 +88,24 @@ def test_ingest(town, tmp_path):
     )
     assert code == 130
     assert list((tmp_path / "made").iterdir()) == []
+
+
+TRAIN = (
+    "train", "name=town", "data=drives", "data.datasets=[town]", "data.batch_size=2", "data.length_s=20",
+    "data.eval_length_s=24", "data.split=random", "model.network.lstm_hidden=4", "model.network.lstm_layers=1",
+    "model.network.dense=[4,4]", "baselines.tune=false", "baselines.models=[mbkf15]", "baselines.pieces=2",
+    "trainer.max_epochs=100000", "callbacks.curriculum.warm_s=10",  "callbacks.curriculum.full_s=20",
+    "scoring.outage={first_s:10,duration_s:10}", "callbacks.curriculum.full_from=2", "callbacks.curriculum.warm_until=1", "trainer.accelerator=cpu",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("how", "begun"),
+    [(signal.SIGTERM, "outputs/train/town/*/last.ckpt"), (signal.SIGINT, "outputs/train/town/*/state.json")],
+)
+def test_train(how, begun, town, tmp_path):
+    """In the middle of the training, and before it: the exit code says so, and MLflow's run is no longer running."""
+    (tmp_path / "town").symlink_to(town)
+    assert stopped(tmp_path, begun, how, *TRAIN) == CODES[how]
+    with closing(sqlite3.connect(tmp_path / "mlflow.db")) as store:
+        assert store.execute("select status from runs").fetchall() == [("KILLED",)]

@@ -14,6 +14,7 @@ from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.run import score
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Correction
+from dlkf.filters.model_based import Ins
 from dlkf.running.batched import chunks, take
 from tests.evaluation.conftest import IMU, in_precision
 
@@ -61,7 +62,19 @@ def test_outage_errors_grow_until_gnss_is_back(cars):
     free = score(FILTERS, [cars])
     inside = free.filters["mbkf15"].error[:, 49]
     assert np.abs(inside[:, :3]).max() < 0.2  # the same epochs with GNSS: centimetres
-    assert np.array_equal(free.filters["ins"].error, scores.filters["ins"].error)
+    strapdown, nothing = {"free": Ins(free=True)}, torch.zeros_like(mask)
+    never, masked = (score(strapdown, [cars], outages=[m]).filters["free"].error for m in (nothing, mask))
+    assert np.array_equal(never, masked), "strapdown from the start knows no GNSS"
+
+
+def test_ins_runs_free_from_the_last_fix_not_from_the_start(cars):
+    """Position and velocity of the fix, attitude from the start: centimetres at the fix, a parabola from there."""
+    (mask,) = OutagePlan(first_s=30, duration_s=20).masks(cars)
+    scores = score({"ins": Ins(), "free": Ins(free=True)}, [cars], outages=[mask])
+    size = {n: magnitudes(r.error)["horizontal"] for n, r in scores.filters.items()}
+    assert np.abs(size["ins"][:, :30]).max() < 0.1  # 0.03 m is the fixes' 1σ per axis
+    assert (size["ins"][:, 30] < 2).all() and (size["ins"][:, 49] > 10).all()
+    assert (size["ins"][:, 30] < 0.1 * size["free"][:, 30]).all()
 
 
 def test_several_batches_are_joined_and_named(cars):
@@ -92,7 +105,7 @@ def test_a_network_is_scored_in_evaluation_mode_without_gradients(cars):
         def step(self, memory, epoch):
             return None, Correction(epoch.z.new_zeros(len(epoch.z), 9), epoch.imu_error)
 
-    scores = score({"probe": Probe(), "ins": FILTERS["ins"]}, [cars])
+    scores = score({"probe": Probe(), "ins": Ins(free=True)}, [cars])
     assert seen == [(False, False, torch.float64)]
     assert np.array_equal(scores.filters["probe"].error, scores.filters["ins"].error)
 

@@ -24,16 +24,24 @@ from dlkf.navigation.state import PVA, STATES, ErrorStates
 STANDARD_GRAVITY = 9.80665
 
 
+@dataclass(frozen=True)
 class Ins:
-    """Pure inertial navigation: no update, no IMU error (R012)."""
+    """Inertial navigation from the last fix (R012): the raw IMU is believed, and no error of it is estimated.
+
+    A fix sets position and velocity, so that an outage begins where those of the Kalman filters begin; attitude runs
+    from the start, for nothing corrects it. ``free``: nothing is set, pure strapdown from the start.
+    """
+
+    free: bool = False
 
     def begin(self, batch: Batch) -> tuple[None, Tensor]:
         """No memory; the raw IMU is believed."""
         return None, batch.imu.new_zeros(batch.size[0], 6)
 
     def step(self, memory: None, epoch: Epoch) -> tuple[None, Correction]:
-        """No correction."""
-        return None, Correction(epoch.z.new_zeros(len(epoch.z), 9), epoch.error)
+        """The innovation itself, as far as position and velocity are seen."""
+        dx = torch.nn.functional.pad(torch.zeros_like(epoch.z) if self.free else epoch.z, (0, 3))
+        return None, Correction(dx, epoch.error)
 
 
 class Memory(NamedTuple):

@@ -53,7 +53,10 @@ def fit(config: Mapping[str, Any], data: DriveDataModule, folder: Path, logger: 
             default_root_dir=folder,
         )
         last = folder / LAST
-        trainer.fit(module, datamodule=data, ckpt_path=str(last) if last.is_file() else None)
+        try:
+            trainer.fit(module, datamodule=data, ckpt_path=str(last) if last.is_file() else None)
+        except SystemExit as end:  # what Lightning makes of Ctrl-C and SIGTERM
+            raise (end.__context__ if isinstance(end.__context__, KeyboardInterrupt) else end) from None
     if trainer.interrupted:
         raise KeyboardInterrupt
     if not (folder / BEST).is_dir():

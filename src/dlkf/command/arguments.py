@@ -1,0 +1,75 @@
+"""The command line before Hydra reads it: ordinary paths and words need no quotes, a number must be one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from hydra import compose
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+
+from dlkf.errors import InputError
+
+
+def readable(argument: str) -> str:
+    """An override that Hydra's grammar takes: a value that it does not is quoted, ``~/`` is the home folder.
+
+    ``out=Straße (1)`` → ``out='Straße (1)'``; in a list every word by itself. What is in the grammar stays as it is.
+    """
+    key, equals, value = argument.partition("=")
+    if not equals or argument.startswith(("-", "~")):
+        return argument
+    if value.startswith("~/"):
+        value = str(Path(value).expanduser())
+    if _parses(f"{key}={value}"):
+        return f"{key}={value}"
+    if value.startswith("[") and value.endswith("]"):
+        words = [word.strip() for word in value[1:-1].split(",")]
+        listed = ",".join(word if _parses(f"{key}={word}") else _quoted(word) for word in words)
+        if _parses(f"{key}=[{listed}]"):
+            return f"{key}=[{listed}]"
+    quoted = f"{key}={_quoted(value)}"
+    return quoted if _parses(quoted) else argument
+
+
+def _parses(override: str) -> bool:
+    try:
+        OverridesParser.create().parse_override(override)
+    except (HydraException, ValueError):
+        return False
+    return True
+
+
+def _quoted(value: str) -> str:
+    return "'" + value.replace("'", "\\'") + "'"
+
+
+def checked_types(name: str, cfg: DictConfig, overrides: Sequence[str]) -> None:
+    """InputError for a word where the defaults of ``conf/<name>.yaml`` have a number or a switch."""
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    words = {
+        o.get_key_element(): value
+        for o in parsed
+        if not o.is_delete()
+        and not {"@", "/"} & set(o.get_key_element())
+        and isinstance(value := OmegaConf.select(cfg, o.get_key_element()), str)
+    }
+    if not words:
+        return
+    presets = [text for o, text in zip(parsed, overrides) if o.get_key_element() not in words and not _inside(cfg, o)]
+    usual = compose(name, overrides=presets)
+    for key, value in words.items():
+        default = OmegaConf.select(usual, key, throw_on_missing=False)
+        if isinstance(default, bool):
+            raise InputError(f"{key} is {value!r}, must be true or false")
+        if isinstance(default, (int, float)):
+            raise InputError(f"{key} is {value!r}, must be a number")
+
+
+def _inside(cfg: DictConfig, override) -> bool:
+    """Whether an override changes a value, not a preset."""
+    return "." in override.get_key_element() or not isinstance(
+        OmegaConf.select(cfg, override.get_key_element().partition("@")[2] or override.get_key_element()), DictConfig
+    )

@@ -1,0 +1,88 @@
+"""What went wrong as one line, or None where it is a fault of this program."""
+
+from __future__ import annotations
+
+import errno
+import re
+from collections.abc import Iterator
+
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
+
+from dlkf.errors import InputError
+
+AGAIN = "then give the same command again"
+OF_THE_DISK = {
+    errno.ENOSPC: f"the disk is full; make room, {AGAIN}",
+    errno.EDQUOT: f"the quota of the disk is used up; make room, {AGAIN}",
+    errno.EROFS: "the disk is read-only; run from a folder that can be written to",
+    errno.EACCES: "permission denied; run from a folder that can be written to, or mend its permissions",
+    errno.EPERM: "permission denied; run from a folder that can be written to, or mend its permissions",
+}
+# what an exception says: what it means
+SAID = {
+    r"database is locked": f"the MLflow store is locked by another program; wait or close it, {AGAIN}",
+    r"readonly database|unable to open database file": "the MLflow store cannot be written; run from a folder that "
+    "can be written to, or give tracking.uri=sqlite:///<path>.db",
+    r"database or disk is full": f"the disk is full: the MLflow store cannot grow; make room, {AGAIN}",
+    r"file is not a database|disk image is malformed": "the MLflow store is damaged or no SQLite file; move mlflow.db "
+    "away or give tracking.uri=sqlite:///<path>.db",
+    r"out-of-date database schema|Can't locate revision": "the MLflow store belongs to another version of MLflow; "
+    "run mlflow db upgrade on it or give tracking.uri=sqlite:///<path>.db",
+    r"CUDA out of memory|MPS backend out of memory": "the memory of the GPU is full; give a smaller data.batch_size",
+    r"No supported gpu backend|CUDAAccelerator. can not run|MPSAccelerator. can not run": "there is no GPU that "
+    "PyTorch can use; give trainer.accelerator=cpu",
+    r"invalid accelerator name|[Yy]ou selected an invalid": "trainer.accelerator is unknown; known: auto, cpu, gpu",
+}
+
+
+def fault(error: BaseException) -> str | None:
+    """One line: what a user or the machine did wrong, where, and how to mend it."""
+    chain = list(_chain(error))
+    for link in chain:
+        if isinstance(link, InputError):
+            return one_line(link)
+    for link in chain:
+        if isinstance(link, OSError) and link.errno in OF_THE_DISK:
+            where = f"{link.filename}: " if link.filename else ""
+            return f"{where}{OF_THE_DISK[link.errno]}"
+    for link in chain:
+        for pattern, meaning in SAID.items():
+            if re.search(pattern, str(link)):
+                return meaning
+    for link in chain:
+        if isinstance(link, (HydraException, OmegaConfBaseException)):
+            return one_line(link)
+    return None
+
+
+def _chain(error: BaseException) -> Iterator[BaseException]:
+    """An exception and what it came from, the outermost first."""
+    seen: set[int] = set()
+    link: BaseException | None = error
+    while link is not None and id(link) not in seen:
+        seen.add(id(link))
+        yield link
+        link = link.__cause__ or (None if link.__suppress_context__ else link.__context__)
+
+
+def one_line(error: BaseException) -> str:
+    """A message as one line; Hydra's and OmegaConf's lists and hints are folded into it."""
+    text = str(error)
+    if missing := re.search(r"Could not find '([^']+)'", text):
+        options = re.search(r"Available options in '([^']+)':\n((?:\t.*\n?)+)", text)
+        hint = f"; available in {options[1]}: {', '.join(options[2].split())}" if options else ""
+        return f"unknown preset or config {missing[1]!r}{hint}"
+    if unknown := re.search(r"Could not override '([^']+)'|full_key: (\S+)[\s\S]*is not in struct", text):
+        return f"unknown config key {unknown[1] or unknown[2]!r}; --cfg job prints all keys"
+    if unknown := re.search(r"Key '([^']+)' is not in struct", text):
+        return f"unknown config key {unknown[1]!r}; --cfg job prints all keys"
+    if missing := re.search(r"Missing mandatory value: (\S+)", text):
+        return f"{missing[1]} is missing; give {missing[1]}=…"
+    if malformed := re.search(r"(?:LexerNoViableAltException|mismatched input|extraneous input)[\s\S]*", text):
+        words = " ".join(malformed[0].replace("LexerNoViableAltException:", "").replace("^", "").split())
+        return f"cannot read {words!r}; quote a value with such signs: 'key=\"value\"'"
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    hints = ("full_key:", "object_type=", "reference_type=", "See https")
+    lines = [line for line in lines if not line.startswith(hints)]
+    return "; ".join(lines) or type(error).__name__
