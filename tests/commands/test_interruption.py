@@ -94,18 +94,13 @@ TRAIN = (
     "train", "name=town", "data=drives", "data.datasets=[town]", "data.batch_size=2", "data.length_s=20",
     "data.eval_length_s=24", "data.split=random", "model.network.lstm_hidden=4", "model.network.lstm_layers=1",
     "model.network.dense=[4,4]", "baselines.tune=false", "baselines.models=[mbkf15]", "baselines.pieces=2",
-    "trainer.max_epochs=100000", "callbacks.curriculum.warm_s=10",  "callbacks.curriculum.full_s=20",
-    "scoring.outage={first_s:10,duration_s:10}", "callbacks.curriculum.full_from=2", "callbacks.curriculum.warm_until=1", "trainer.accelerator=cpu",
+    "trainer.max_epochs=100000", "trainer.accelerator=cpu", "scoring.outage={first_s:10,duration_s:10}",
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("how", "begun"),
-    [(signal.SIGTERM, "outputs/train/town/*/last.ckpt"), (signal.SIGINT, "outputs/train/town/*/state.json")],
-)
-def test_train(how, begun, town, tmp_path):
-    """In the middle of the training, and before it: the exit code says so, and MLflow's run is no longer running."""
+def test_train(town, tmp_path):
+    """SIGTERM in the middle of the training: the exit code says so, and MLflow's run is no longer running."""
     (tmp_path / "town").symlink_to(town)
-    assert stopped(tmp_path, begun, how, *TRAIN) == CODES[how]
+    assert stopped(tmp_path, "outputs/train/town/*/last.ckpt", signal.SIGTERM, *TRAIN) == 143
     with closing(sqlite3.connect(tmp_path / "mlflow.db")) as store:
         assert store.execute("select status from runs").fetchall() == [("KILLED",)]
