@@ -11,7 +11,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from dlkf.data.intake import ingest_drives
-from dlkf.data.readers.csv import CsvReader
+from dlkf.data.readers.logs import LogReader
 from dlkf.data.readers.units import rotation, seconds
 from dlkf.data.tables import read_drives, read_table
 from dlkf.data.validate import validate_dataset
@@ -45,7 +45,7 @@ def _plain(folder, tables) -> None:
         frame.to_csv(folder / f"{kind}.csv", index=False)
 
 
-def _reader(**changes) -> CsvReader:
+def _reader(**changes) -> LogReader:
     spec = copy.deepcopy(PLAIN)
     for path, value in changes.items():
         *nodes, last = path.split("__")
@@ -53,7 +53,7 @@ def _reader(**changes) -> CsvReader:
         for name in nodes:
             node = node.setdefault(name, {})
         node[last] = value
-    return CsvReader(spec.pop("imu"), spec.pop("gnss"), spec.pop("reference", None), **spec)
+    return LogReader(spec.pop("imu"), spec.pop("gnss"), spec.pop("reference", None), **spec)
 
 
 def test_an_odd_log_round_trips(tmp_path, tables):
@@ -85,7 +85,7 @@ def test_an_odd_log_round_trips(tmp_path, tables):
     ref["y"], ref["ok"] = 90 - np.degrees(reference.yaw), 1
     ref.loc[7, "ok"] = 0
     ref.to_csv(folder / "pos_ref.txt", index=False, sep=";")
-    reader = CsvReader(
+    reader = LogReader(
         imu={
             "file": "*_imu.txt",
             "time": {"column": "#timestamp [ns]", "unit": "ns", "clock": "unix"},
@@ -182,7 +182,7 @@ MISTAKES = {
     "imu__accel__axes": ("fru", "no right-handed triad"),
     "imu__gyro__axes": ("forward", "axes 'forward' must be three letters"),
     "imu__time__unit": ("h", "unknown time unit 'h'"),
-    "imu__time__clock": ("utc", "unknown clock 'utc'"),
+    "imu__time__clock": ("tai", "unknown clock 'tai'"),
     "imu__stamp": ("late", "reader.imu.stamp=late"),
     "imu__file": ("imu.txt", "no file imu.txt and no subfolders"),
     "gnss__file": ("*.csv", "3 files match, one must be"),
@@ -222,7 +222,7 @@ def test_mistakes_in_the_files(tmp_path, tables):
     path.write_text(lines[0] + "\n")
     with pytest.raises(InputError, match="has no rows"):
         list(_reader().read(tmp_path))
-    with pytest.raises(InputError, match="no such folder"):
+    with pytest.raises(InputError, match="no such file or folder"):
         list(_reader().read(tmp_path / "b"))
 
 
@@ -238,7 +238,7 @@ def test_drives_are_split_at_gaps(tmp_path, tables):
         _reader().read(tmp_path / "logs"),
         tmp_path / "out",
         split_gaps=True,
-        progress=lambda drive, done: seen.append(drive),
+        progress=lambda drive, done: seen.append(drive.name),
     )
     rows = validate_dataset(tmp_path / "out")
     assert count == 3 and seen == [r.name for r in rows] == ["a-s0", "a-s1", "b"]

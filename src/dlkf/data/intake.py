@@ -12,7 +12,8 @@ import pandas as pd
 
 from dlkf.data.readers.frames import DriveFrames
 from dlkf.data.schema import new_dataset, write_drive, write_drives_table
-from dlkf.data.validate import LIMITS, Limits, gap_rows, validate_dataset
+from dlkf.data.tables import read_drives
+from dlkf.data.validate import LIMITS, Limits, gap_rows, read_checked, read_imu
 from dlkf.errors import InputError
 
 
@@ -24,12 +25,13 @@ def ingest_drives(
     shortest_s: float = 10.0,
     overwrite: bool = False,
     limits: Limits = LIMITS,
-    progress: Callable[[str, int], None] | None = None,
+    progress: Callable[[DriveFrames, int], None] | None = None,
 ) -> int:
     """Write drives as a dataset at ``out`` and return how many there are.
 
     With ``split_gaps`` a drive with IMU gaps becomes parts ``<drive>-s0``, ``-s1``, … of one group; parts
-    shorter than ``shortest_s`` or without GNSS are left out. ``progress(drive, done)`` is called after each.
+    shorter than ``shortest_s`` or, of a log with GNSS, without fixes are left out. ``progress(drive, done)`` is called
+    after each.
     Raises InputError, leaving nothing behind, if a drive does not pass the checks or none is left.
     """
     rows = []
@@ -38,13 +40,17 @@ def ingest_drives(
             for part in split_at_gaps(drive, shortest_s, limits) if split_gaps else [drive]:
                 rows.append(write_drive(folder, part.meta, part.imu, part.gnss, part.reference))
                 if progress is not None:
-                    progress(part.name, len(rows))
+                    progress(part, len(rows))
         if not rows:
             raise InputError(
                 f"out={out}: no drive of at least {shortest_s:g} s with GNSS; nothing was written"
             )
         write_drives_table(folder, rows)
-        validate_dataset(folder, limits=limits)
+        for row in read_drives(folder):
+            if (folder / "gnss" / f"drive={row.name}").is_dir():
+                read_checked(folder, row, limits=limits)
+            else:
+                read_imu(folder, row.name, limits)
     return len(rows)
 
 
@@ -59,8 +65,8 @@ def split_at_gaps(drive: DriveFrames, shortest_s: float, limits: Limits = LIMITS
     count = 0
     for first, last in pairwise(edges):
         begin, end = t[first], t[last - 1]
-        gnss = _between(drive.gnss, begin, end)
-        if end - begin < shortest_s or not len(gnss):
+        gnss = None if drive.gnss is None else _between(drive.gnss, begin, end)
+        if end - begin < shortest_s or (gnss is not None and not len(gnss)):
             continue
         reference = None if drive.reference is None else _between(drive.reference, begin, end)
         if reference is not None and not len(reference):

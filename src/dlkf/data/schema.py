@@ -116,13 +116,14 @@ def write_drive(
     folder: str | Path,
     meta: Mapping[str, Any],
     imu: pd.DataFrame,
-    gnss: pd.DataFrame,
+    gnss: pd.DataFrame | None,
     reference: pd.DataFrame | None = None,
 ) -> dict[str, Any]:
     """Write the tables of a drive and return its completed row for :func:`write_drives_table`.
 
     ``meta`` needs ``drive``; ``group`` defaults to it, rates, duration and distance are filled in from the
-    tables where absent. Columns beyond the contract are kept. Raises InputError for a missing column.
+    tables where absent; a log for :mod:`dlkf.allan` needs no GNSS. Columns beyond the contract are kept. Raises
+    InputError for a missing column.
     """
     row = dict(meta)
     name = check_name(str(row["drive"]))
@@ -132,9 +133,11 @@ def write_drive(
             write_parquet(drive_file(folder, kind, name), contract_table(kind, frame, name))
     row.setdefault("group", name)
     row.setdefault("imu_rate_hz", _rate(imu["t"]))
-    row.setdefault("gnss_rate_hz", _rate(gnss["t"]))
+    if gnss is not None:
+        row.setdefault("gnss_rate_hz", _rate(gnss["t"]))
     row.setdefault("duration_s", float(imu["t"].iloc[-1] - imu["t"].iloc[0]) if len(imu) else 0.0)
-    row.setdefault("distance_m", _distance(gnss if reference is None else reference))
+    way = gnss if reference is None else reference
+    row.setdefault("distance_m", float("nan") if way is None else _distance(way))
     return row
 
 

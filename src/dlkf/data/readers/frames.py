@@ -1,21 +1,42 @@
-"""What every reader of foreign logs hands over: one drive as tables in the data contract's columns."""
+"""What passes between the steps of reading: a file's table as it stands, and one drive in the contract's columns."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 
 @dataclass(frozen=True)
+class Table:
+    """A table of a log file in the file's own columns and units.
+
+    The index of ``frame`` numbers its rows as ``row`` calls them (line of a text file, row, message), for messages to
+    the user; ``units`` are those that the file states, by column; ``notes`` what was met on the way.
+    """
+
+    frame: pd.DataFrame
+    path: Path
+    row: str = "row"
+    units: dict[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class DriveFrames:
-    """A drive in contract units, axes and columns; ``meta`` is its row of ``drives.parquet``."""
+    """A drive in contract units, axes and columns; ``meta`` is its row of ``drives.parquet``.
+
+    ``notes`` tell what the reader met and found out; ``mapping`` explains the log so that it reads the same again.
+    """
 
     meta: dict[str, Any]
     imu: pd.DataFrame
-    gnss: pd.DataFrame
+    gnss: pd.DataFrame | None
     reference: pd.DataFrame | None = field(default=None)
+    notes: tuple[str, ...] = ()
+    mapping: dict[str, Any] = field(default_factory=dict)
 
     @property
     def name(self) -> str:

@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import pandas as pd
+from scipy.spatial.transform import Rotation
 
 from dlkf.errors import InputError
 
@@ -16,9 +18,18 @@ ANGLE = {"rad": 1.0, "deg": DEG, "1e-7deg": DEG * 1e-7}
 SPEED = {"m/s": 1.0, "km/h": 1 / 3.6, "knots": 1852 / 3600, "cm/s": 0.01, "mm/s": 1e-3, "mph": 0.44704}
 LENGTH = {"m": 1.0, "mm": 1e-3, "cm": 0.01, "km": 1e3, "ft": 0.3048}
 TIME = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": 1_000_000_000}  # ticks per second
-WEEK_S = 604_800
+ISO = "iso"  # calendar texts: 2025-07-05T23:57:12.7Z, 2025/07/05 23:57:12.700
+CLOCKS = ("gps", "unix", "utc")
+WEEK_S, DAY_S = 604_800, 86_400
 GPS_EPOCH_UNIX = 315_964_800  # 1980-01-06 in Unix seconds
-LEAP_S = 18  # GPS − UTC since 2017
+# days from which GPS − UTC is one second more than before (IERS Bulletin C): 0 in 1980, 18 since 2017
+LEAP_DAYS = (
+    *("1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01", "1991-01-01"),
+    *("1992-07-01", "1993-07-01", "1994-07-01", "1996-01-01", "1997-07-01", "1999-01-01", "2006-01-01"),
+    *("2009-01-01", "2012-07-01", "2015-07-01", "2017-01-01"),
+)
+
+LEAP_UNIX = np.array(LEAP_DAYS, dtype="datetime64[s]").astype(np.int64)
 
 LETTERS = {"f": (0, 1), "b": (0, -1), "r": (1, 1), "l": (1, -1), "d": (2, 1), "u": (2, -1)}
 
@@ -34,13 +45,18 @@ def factor(unit: str | float, table: Mapping[str, float], where: str) -> float:
     return float(table[unit])
 
 
-def rotation(axes: str | Sequence[str], where: str) -> np.ndarray:
+def rotation(axes: str | Sequence[str] | Mapping[str, float], where: str) -> np.ndarray:
     """Matrix (3, 3) from the sensor's axes to Forward-Right-Down.
 
-    ``axes`` is three letters that say where the sensor's x, y, z point (``frd``, ``flu``, ``rfu``, …), or the
-    sensor's axes that make Forward, Right, Down (``[x, -y, -z]``). InputError if they make no right-handed
-    triad.
+    ``axes`` is three letters that say where the sensor's x, y, z point (``frd``, ``flu``, ``rfu``, …), or the sensor's
+    axes that make Forward, Right, Down (``[x, -y, -z]``), or the sensor's ``{roll, pitch, yaw}`` in the car [deg].
+    InputError if they make no right-handed triad.
     """
+    if isinstance(axes, Mapping):
+        if set(axes) != {"roll", "pitch", "yaw"}:
+            raise InputError(f"{where}: has {', '.join(map(str, axes))}; must have roll, pitch and yaw [deg]")
+        turns = [_number(axes[name], f"{where}.{name}") for name in ("yaw", "pitch", "roll")]
+        return Rotation.from_euler("ZYX", turns, degrees=True).as_matrix()
     matrix = np.zeros((3, 3))
     if isinstance(axes, str) and len(axes) == 3 and all(c in LETTERS for c in axes.lower()):
         for column, letter in enumerate(axes.lower()):
@@ -50,15 +66,11 @@ def rotation(axes: str | Sequence[str], where: str) -> np.ndarray:
         names = [str(a).strip().lower() for a in ([] if isinstance(axes, str) else axes)]
         bare = [n.lstrip("+-") for n in names]
         if len(names) != 3 or any(b not in ("x", "y", "z") for b in bare):
-            raise InputError(
-                f"{where}: axes {axes!r} must be three letters like flu, or a list like [x, -y, -z]"
-            )
+            raise InputError(f"{where}: axes {axes!r} must be three letters like flu, or a list like [x, -y, -z]")
         for row, (name, b) in enumerate(zip(names, bare)):
             matrix[row, "xyz".index(b)] = -1.0 if name.startswith("-") else 1.0
     if abs(np.linalg.det(matrix) - 1) > 1e-9:
-        raise InputError(
-            f"{where}: axes {axes!r} make no right-handed triad; turn a sign or exchange two axes"
-        )
+        raise InputError(f"{where}: axes {axes!r} make no right-handed triad; turn a sign or exchange two axes")
     return matrix
 
 
@@ -67,23 +79,72 @@ def seconds(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Whole seconds (int64) and the rest (float64) of stamps, so that nanoseconds since 1970 lose nothing.
 
-    With ``week`` the stamps are seconds of the GPS week. ``clock`` = unix turns Unix time into GPS time, so
-    that it can be mixed with GPS weeks; gps and null leave the stamps as they are.
+    With ``week`` the stamps are seconds of the GPS week. ``clock`` = unix or utc turns Unix time (calendar texts in
+    UTC) into GPS time, leap seconds of their day included, so that it can be mixed with GPS weeks; gps says that
+    calendar texts are GPS time already; numbers of a gps clock, and all of none, stay as they are.
     """
-    if unit not in TIME:
-        raise InputError(f"{where}: unknown time unit {unit!r}; known are {', '.join(TIME)}")
-    if clock not in (None, "gps", "unix"):
-        raise InputError(f"{where}: unknown clock {clock!r}; known are gps, unix, or null")
-    ticks = TIME[unit]
-    if np.issubdtype(values.dtype, np.integer):
-        whole, rest = np.divmod(values.astype(np.int64), ticks)
-        part = rest / ticks
+    if unit not in (*TIME, ISO):
+        raise InputError(f"{where}: unknown time unit {unit!r}; known are {', '.join((*TIME, ISO))}")
+    if clock not in (None, *CLOCKS):
+        raise InputError(f"{where}: unknown clock {clock!r}; known are {', '.join(CLOCKS)}, or null")
+    if unit == ISO:
+        whole, part = _split(_calendar(values, where), TIME["ns"])
+        if clock == "gps":
+            return whole - GPS_EPOCH_UNIX, part
     else:
-        value = values / ticks
-        whole = np.floor(value).astype(np.int64)
-        part = value - whole
+        whole, part = _split(values, TIME[unit])
     if week is not None:
         whole = whole + WEEK_S * week.astype(np.int64)
-    if clock == "unix":
-        whole = whole - GPS_EPOCH_UNIX + LEAP_S
+    if clock in ("unix", "utc"):
+        whole = whole - GPS_EPOCH_UNIX + leap_seconds(whole)
     return whole, part
+
+
+def leap_seconds(unix: np.ndarray | int) -> np.ndarray:
+    """GPS − UTC [s] at Unix times."""
+    return np.searchsorted(LEAP_UNIX, unix, side="right")
+
+
+def unwrapped(values: np.ndarray, wrap: float) -> np.ndarray:
+    """Stamps that start again after ``wrap`` (week, day, counter) made to go on."""
+    if np.issubdtype(values.dtype, np.integer):
+        wrap = int(wrap)
+    turns = np.concatenate(([0], np.cumsum(np.diff(values) < -wrap / 2)))
+    return values + turns * wrap
+
+
+def degrees_minutes(values: np.ndarray) -> np.ndarray:
+    """NMEA's ddmm.mmmm as degrees."""
+    size = np.abs(values)
+    whole = np.floor(size / 100)
+    return np.sign(values) * (whole + (size - 100 * whole) / 60)
+
+
+def _split(values: np.ndarray, ticks: int) -> tuple[np.ndarray, np.ndarray]:
+    if np.issubdtype(values.dtype, np.integer):
+        whole, rest = np.divmod(values.astype(np.int64), ticks)
+        return whole, rest / ticks
+    value = values / ticks
+    whole = np.floor(value).astype(np.int64)
+    return whole, value - whole
+
+
+def _calendar(values: np.ndarray, where: str) -> np.ndarray:
+    """Nanoseconds since 1970 of calendar texts; InputError names the first that is none."""
+    texts = pd.Series(values).astype(str).str.strip().str.replace("/", "-", regex=False)
+    try:
+        stamps = pd.to_datetime(texts, utc=True, format="ISO8601")
+    except ValueError:
+        stamps = pd.to_datetime(texts, utc=True, format="mixed", errors="coerce", dayfirst=False)
+        if bool(stamps.isna().any()):
+            bad = int(np.flatnonzero(stamps.isna())[0])
+            raise InputError(
+                f"{where}: row {bad}: {values[bad]!r} is no date and time; must be like 2025-07-05T23:57:12.7Z"
+            ) from None
+    return stamps.dt.as_unit("ns").astype(np.int64).to_numpy()
+
+
+def _number(value: object, where: str) -> float:
+    if not isinstance(value, (int, float)) or isinstance(value, bool) or not math.isfinite(value):
+        raise InputError(f"{where} is {value!r}, must be a number")
+    return float(value)

@@ -1,0 +1,222 @@
+"""A mapped table as one of the contract's tables: SI, Forward-Right-Down, degrees, North-East-Down."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pymap3d
+from scipy.spatial.transform import Rotation
+
+from dlkf.data.readers import units
+from dlkf.data.readers.mapping import Mapped
+from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY
+from dlkf.errors import InputError
+
+LATE = {"end": 0.0, "middle": 0.5, "start": 1.0}  # of the interval, by which a stamp is early
+ANGLES = {"deg": 1.0, "rad": 1 / units.DEG, "1e-7deg": 1e-7, "ddmm": 1.0}  # degrees per unit
+NO_FIX = 1e-6  # degrees: what receivers write before they have a position
+
+
+def imu_frame(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
+    """Rates and specific forces over intervals that end at ``t``."""
+    step = np.diff(t, prepend=np.nan)
+    usual = float(np.median(step[1:])) if len(t) > 1 else float("nan")
+    step[0] = usual
+    out: dict[str, np.ndarray] = {}
+    for key, names, known in (("gyro", GYRO, units.RATE), ("accel", ACCEL, units.ACCELERATION)):
+        values = mapped.vector(key, (3,), nan=False) * mapped.scale(key, known)
+        turn = units.rotation(mapped.spec[key].get("axes", "frd"), f"reader.imu.{key}.axes")
+        if mapped.spec.get("increments"):
+            with np.errstate(divide="ignore"):  # stamps that stand twice are refused with their row later
+                values = np.where(step[:, None] > 0, values / step[:, None], 0.0)
+        out |= dict(zip(names, (values @ turn.T).T))
+    stamp = mapped.spec.get("stamp") or "end"
+    if stamp not in LATE:
+        raise InputError(f"reader.imu.stamp={stamp}: must be end, middle or start of the sample's interval")
+    return pd.DataFrame({"t": t + LATE[stamp] * usual, **out})
+
+
+def gnss_frame(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
+    """Fixes; thinned where ``every_s`` asks for it."""
+    position = positions(mapped)
+    frame = {"t": t, **position, **velocities(mapped, position)}
+    stds = _stds(mapped, "std_position", units.LENGTH, position) + _stds(mapped, "std_velocity", units.SPEED, position)
+    frame |= dict(zip(STD, stds))
+    fixed = np.all([np.isfinite(frame[c]) for c in POSITION], axis=0)
+    out = pd.DataFrame({**frame, "quality": np.where(fixed, _quality(mapped), 0).astype(np.int8)})
+    late = float((mapped.spec.get("position") or {}).get("delay_s") or 0.0)
+    if late:
+        out = _carried(out, late)
+    every = mapped.spec.get("every_s")
+    if every:
+        turn = np.floor((t - t[0]) / float(every) + 1e-6)
+        out = out[np.diff(turn, prepend=-1) > 0].reset_index(drop=True)
+    return out
+
+
+def reference_frame(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
+    """States of a reference."""
+    position = positions(mapped)
+    frame = {"t": t, **position, **velocities(mapped, position)}
+    frame |= dict.fromkeys(ATTITUDE, np.full(len(t), np.nan))
+    if mapped.has("attitude"):
+        frame |= dict(zip(ATTITUDE, _attitudes(mapped).T))
+    valid = np.all([np.isfinite(frame[c]) for c in (*POSITION, *VELOCITY)], axis=0)
+    if mapped.has("valid"):
+        marks = mapped.of("valid").column(mapped.spec["valid"]["column"], nan=True)
+        good = mapped.spec["valid"].get("values")
+        valid &= np.isin(marks, good) if good else np.nan_to_num(marks) != 0
+    return pd.DataFrame({**frame, "valid": valid})
+
+
+def positions(mapped: Mapped) -> dict[str, np.ndarray]:
+    """Latitude and longitude [deg] and height above the ellipsoid [m], from those or from ECEF."""
+    spec = mapped.spec.get("position") or {}
+    where = f"reader.{mapped.kind}.position"
+    frame, zero = spec.get("frame") or "llh", spec.get("zero") or "fix"
+    if frame not in ("llh", "ecef"):
+        raise InputError(f"{where}.frame={frame}: must be llh or ecef")
+    if zero not in ("fix", "none"):
+        raise InputError(f"{where}.zero={zero}: must be fix, or none where 0°/0° means no position")
+    if frame == "ecef":
+        xyz = mapped.vector("position", (3,), nan=True) * mapped.scale("position", units.LENGTH)
+        lost = ~np.isfinite(xyz).all(-1) | (np.linalg.norm(xyz, axis=-1) < 1e6)
+        with np.errstate(invalid="ignore"):
+            lat, lon, height = pymap3d.ecef2geodetic(*np.where(lost[:, None], np.nan, xyz).T)
+    else:
+        unit = spec.get("unit") or "deg"
+        angle = mapped.scale("position", ANGLES)
+        lat, lon, height = _latitudes(mapped, unit == "ddmm")
+        lat, lon = lat * angle, lon * angle
+        height = height * mapped.scale("position", units.LENGTH, "height_unit")
+        if spec.get("geoid") is not None:
+            geoid = mapped.of("position").column(spec["geoid"], nan=True)
+            height = height + geoid * mapped.scale("position", units.LENGTH, "height_unit")
+    with np.errstate(invalid="ignore"):
+        lost = (np.abs(lat) < NO_FIX) & (np.abs(lon) < NO_FIX) & (zero == "none")
+    return dict(zip(POSITION, (np.where(lost, np.nan, x) for x in (lat, lon, height))))
+
+
+def velocities(mapped: Mapped, position: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """North, East, Down [m/s]; NaN where the source has none."""
+    if not mapped.has("velocity"):
+        return dict.fromkeys(VELOCITY, np.full(len(mapped), np.nan))
+    v = mapped.vector("velocity", (2, 3), nan=True)
+    frame = mapped.spec["velocity"].get("frame") or "ned"
+    speed = mapped.scale("velocity", units.SPEED)
+    third = v[:, 2] * speed if v.shape[1] == 3 else np.full(len(v), np.nan)
+    if frame == "course":  # speed over ground, course over ground [deg], climb
+        course = v[:, 1] * units.DEG
+        still = v[:, 0] * speed < 0.05  # receivers leave the course empty at rest
+        course = np.where(np.isnan(course) & still, 0.0, course)
+        return dict(zip(VELOCITY, (speed * v[:, 0] * np.cos(course), speed * v[:, 0] * np.sin(course), -third)))
+    if frame == "ecef":
+        if v.shape[1] != 3:
+            raise InputError(f"reader.{mapped.kind}.velocity.columns has 2 names, must have 3 with frame=ecef")
+        return dict(zip(VELOCITY, _to_ned(v * speed, position).T))
+    if frame not in ("ned", "enu"):
+        raise InputError(f"reader.{mapped.kind}.velocity.frame={frame}: must be ned, enu, course or ecef")
+    north, east = (v[:, 1], v[:, 0]) if frame == "enu" else (v[:, 0], v[:, 1])
+    return dict(zip(VELOCITY, (speed * north, speed * east, -third if frame == "enu" else third)))
+
+
+def _latitudes(mapped: Mapped, minutes: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Latitude, longitude, height in the file's units, signs from the hemispheres' columns."""
+    spec = mapped.spec["position"]
+    llh = mapped.vector("position", (3,), nan=True)
+    angles = units.degrees_minutes(llh[:, :2]) if minutes else llh[:, :2].copy()
+    sides = spec.get("hemispheres")
+    if sides is None:
+        return angles[:, 0], angles[:, 1], llh[:, 2]
+    if isinstance(sides, str) or len(sides) != 2:
+        raise InputError(f"reader.{mapped.kind}.position.hemispheres={sides}: must be two columns, of N/S and of E/W")
+    part = mapped.of("position")
+    for k, (name, letters) in enumerate(zip(sides, ("NS", "EW"))):
+        texts = part.texts(name).str.upper().to_numpy()
+        known = np.isin(texts, list(letters)) | ~np.isfinite(angles[:, k])
+        if not known.all():
+            row = int(np.flatnonzero(~known)[0])
+            part.fail(row, name, f"is {texts[row]!r}, must be {letters[0]} or {letters[1]}")
+        angles[:, k] *= np.where(texts == letters[1], -1.0, 1.0)
+    return angles[:, 0], angles[:, 1], llh[:, 2]
+
+
+def _to_ned(vectors: np.ndarray, position: Mapping[str, np.ndarray]) -> np.ndarray:
+    """ECEF vectors (rows, 3) in North-East-Down at the positions."""
+    east, north, up = pymap3d.ecef2enuv(*vectors.T, position["lat_deg"], position["lon_deg"])
+    return np.stack((north, east, -up), -1)
+
+
+def _stds(
+    mapped: Mapped, key: str, known: Mapping[str, float], position: Mapping[str, np.ndarray]
+) -> list[np.ndarray]:
+    """North, East, Down from three columns, or from one for all, or from horizontal and vertical."""
+    if not mapped.has(key):
+        return [np.full(len(mapped), np.nan)] * 3
+    s = mapped.vector(key, (1, 2, 3), nan=True) * mapped.scale(key, known)
+    frame = mapped.spec[key].get("frame") or "ned"
+    if frame not in ("ned", "enu", "ecef"):
+        raise InputError(f"reader.{mapped.kind}.{key}.frame={frame}: must be ned, enu or ecef")
+    if frame == "ecef" and s.shape[1] == 3:  # variances turned, correlations unknown
+        axes = [_to_ned(np.broadcast_to(unit, s.shape), position) for unit in np.eye(3)]
+        return list(np.sqrt(sum((s[:, [k]] * axis) ** 2 for k, axis in enumerate(axes))).T)
+    columns = {1: [0, 0, 0], 2: [0, 0, 1], 3: [1, 0, 2] if frame == "enu" else [0, 1, 2]}
+    return [s[:, k] for k in columns[s.shape[1]]]
+
+
+def _quality(mapped: Mapped) -> np.ndarray:
+    """NMEA GGA codes: through ``map`` where one is given, else the column as it is, else ``default``."""
+    spec: Any = mapped.spec.get("quality") or {}
+    name, default = spec.get("column"), spec.get("default")
+    if name is None:
+        return np.full(len(mapped), 1 if default is None else int(default))
+    part = mapped.of("quality")
+    if not spec.get("map"):
+        return np.nan_to_num(part.column(name, nan=True)).astype(np.int64)
+    codes = {str(k): int(v) for k, v in spec["map"].items()}
+    texts = part.texts(name)
+    unknown = sorted(set(texts) - set(codes))
+    if unknown and default is None:
+        raise InputError(
+            f"{part.table.path}: quality {unknown[0]!r} is not in reader.gnss.quality.map; add it, "
+            f"or set reader.gnss.quality.default for all that are not"
+        )
+    return texts.map(codes).fillna(int(default or 0)).to_numpy().astype(np.int64)
+
+
+def _attitudes(mapped: Mapped) -> np.ndarray:
+    """Roll, pitch, yaw [rad] of Forward-Right-Down in North-East-Down, from angles or quaternions (body → n)."""
+    spec = mapped.spec["attitude"]
+    convention, order = spec.get("convention") or "ned", spec.get("order") or "wxyz"
+    if convention not in ("ned", "enu"):
+        raise InputError(f"reader.reference.attitude.convention={convention}: must be ned or enu")
+    if order not in ("wxyz", "xyzw"):
+        raise InputError(f"reader.reference.attitude.order={order}: must be wxyz or xyzw")
+    values = mapped.vector("attitude", (3, 4), nan=True)
+    if values.shape[1] == 3:
+        rpy = values * mapped.scale("attitude", units.ANGLE)
+        if convention == "enu":  # Forward-Left-Up in East-North-Up, yaw counter-clockwise from East
+            rpy = np.stack((rpy[:, 0], -rpy[:, 1], np.pi / 2 - rpy[:, 2]), -1)
+    else:
+        known = np.isfinite(values).all(-1) & (np.linalg.norm(np.nan_to_num(values), axis=-1) > 0.5)
+        scalar_last = values[:, [1, 2, 3, 0]] if order == "wxyz" else values
+        turn = Rotation.from_quat(np.where(known[:, None], scalar_last, [0.0, 0, 0, 1])).as_matrix()
+        if convention == "enu":
+            turn = units.rotation("rfu", "") @ turn @ units.rotation("flu", "").T
+        yaw_pitch_roll = Rotation.from_matrix(turn).as_euler("ZYX")
+        rpy = np.where(known[:, None], yaw_pitch_roll[:, ::-1], np.nan)
+    rpy[:, 2] = np.mod(rpy[:, 2] + np.pi, 2 * np.pi) - np.pi
+    return rpy
+
+
+def _carried(gnss: pd.DataFrame, late: float) -> pd.DataFrame:
+    """Positions that are ``late`` [s] older than the velocities beside them, carried on by these."""
+    north, east, down = (np.nan_to_num(gnss[c]) for c in VELOCITY)
+    out = gnss.copy()
+    out["lat_deg"], out["lon_deg"], out["height_m"] = pymap3d.enu2geodetic(
+        east * late, north * late, -down * late, gnss["lat_deg"], gnss["lon_deg"], gnss["height_m"]
+    )
+    return out

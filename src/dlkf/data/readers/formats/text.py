@@ -1,0 +1,148 @@
+"""Text tables: separators, headers, rows of units, comments, encodings, and logs that end in the middle of a line."""
+
+from __future__ import annotations
+
+import codecs
+import gzip
+import io
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from dlkf.data.readers.frames import Table
+from dlkf.errors import InputError
+
+DEFAULTS = {
+    "separator": ",",
+    "decimal": ".",
+    "header": True,
+    "comment": None,
+    "skip_rows": 0,
+    "encoding": None,
+    "lines": None,
+}
+ENCODINGS = ("utf-8-sig", "cp1252", "latin-1")  # tried in turn; the last one reads anything
+
+
+def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> Table:
+    """A text table; the frame's index is the number of each row's line in the file."""
+    options = {**DEFAULTS, **{k: v for k, v in text.items() if v is not None}}
+    content = decoded(path, options["encoding"])
+    lines = content.splitlines()
+    comment, pattern = options["comment"], options["lines"]
+    chosen = _pattern(pattern) if pattern else None
+    keep = [
+        k
+        for k in range(int(options["skip_rows"]), len(lines))
+        if lines[k].strip() and not (comment and lines[k].lstrip().startswith(comment))
+    ]
+    head = keep[:1] if options["header"] else []
+    rows = keep[len(head) :]
+    if chosen is not None:
+        rows = [k for k in rows if chosen.search(lines[k])]
+    units, notes = {}, []
+    if head and len(rows) > 1 and _is_units(lines[rows[0]], lines[rows[1]], options):
+        names, cells = (_cells(lines[k], options["separator"]) for k in (head[0], rows[0]))
+        units = {n.strip().strip('"'): u.strip().strip('"') for n, u in zip(names, cells)}
+        rows = rows[1:]
+    if len(rows) > 1 and (told := _cut_off(lines, rows, content.endswith(("\n", "\r")), options)):
+        notes.append(f"{path.name}: line {rows[-1] + 1}, the last, {told}: left out, the log seems cut off there")
+        rows = rows[:-1]
+    frame = _parsed(path, [lines[k] for k in (*head, *rows)], [k + 1 for k in (*head, *rows)], options)
+    if not len(frame):
+        raise InputError(f"{path}: has no rows; leave the drive out or give its data")
+    frame.index = pd.Index([k + 1 for k in rows][: len(frame)])
+    return Table(frame, path, "line", units, tuple(notes))
+
+
+def decoded(path: Path, encoding: str | None) -> str:
+    """A text file, gzip or not; without an ``encoding`` the first that fits of UTF-8, UTF-16 by its mark, Windows."""
+    opened = gzip.open if path.suffix == ".gz" else open
+    try:
+        with opened(path, "rb") as file:
+            raw = file.read()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    if encoding is not None:
+        try:
+            return raw.decode(encoding)
+        except (LookupError, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: reader.encoding={encoding}: {error}; leave it out or mend it") from None
+    if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return raw.decode("utf-16", errors="replace")
+    if b"\0" in raw[:4096]:
+        raise InputError(f"{path}: is no text file; set its format (reader.imu.format, reader.gnss.format)")
+    for name in ENCODINGS:
+        try:
+            return raw.decode(name)
+        except UnicodeDecodeError:
+            continue
+    raise AssertionError("latin-1 reads any byte")
+
+
+def _parsed(path: Path, lines: list[str], numbers: list[int], options: Mapping[str, Any]) -> pd.DataFrame:
+    try:
+        frame = pd.read_csv(
+            io.StringIO("\n".join(lines)),
+            sep=options["separator"],
+            decimal=options["decimal"],
+            header=0 if options["header"] else None,
+            comment=options["comment"],
+            skipinitialspace=True,
+            index_col=False,
+            low_memory=False,
+        )
+    except (pd.errors.ParserError, pd.errors.EmptyDataError, ValueError, re.error) as error:
+        told = str(error).splitlines()[0].strip()
+        if found := re.search(r"line (\d+)", told):
+            place = min(int(found[1]), len(numbers)) - 1
+            told = told.replace(found[0], f"line {numbers[place]}")
+        raise InputError(f"{path}: cannot be read as a table: {told}") from None
+    frame.columns = [str(c).strip() for c in frame.columns]
+    return frame
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    if separator in (r"\s+", " "):
+        return line.split()
+    return line.split(separator) if len(separator) == 1 else re.split(separator, line)
+
+
+def _is_number(cell: str, decimal: str) -> bool:
+    try:
+        float(cell.strip().strip('"').replace(decimal, "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _is_units(first: str, second: str, options: Mapping[str, Any]) -> bool:
+    """No number in the first row under the header, and at least two in the second."""
+    row, under = (_cells(line, options["separator"]) for line in (first, second))
+    return not any(_is_number(c, options["decimal"]) for c in row) and (
+        sum(_is_number(c, options["decimal"]) for c in under) >= 2
+    )
+
+
+def _cut_off(lines: list[str], rows: list[int], ended: bool, options: Mapping[str, Any]) -> str | None:
+    """What is wrong with the last line, if it is not whole."""
+    before, last = (_cells(lines[k], options["separator"]) for k in rows[-2:])
+    if rows[-1] != len(lines) - 1:
+        return None
+    if len(last) < len(before):
+        return f"has {len(last)} cells instead of {len(before)}"
+    if not ended and len(last) == len(before):
+        for a, b in zip(before, last):
+            if _is_number(a, options["decimal"]) and not _is_number(b, options["decimal"]):
+                return f"ends in {b.strip()!r} where a number was"
+    return None
+
+
+def _pattern(pattern: str) -> re.Pattern[str]:
+    try:
+        return re.compile(pattern)
+    except re.error as error:
+        raise InputError(f"lines={pattern!r} is no regular expression: {error}") from None

@@ -1,0 +1,209 @@
+"""Drives from log files of any format: the one way from a folder of logs to the contract's tables.
+
+A file of some format gives a table in its own columns (:mod:`dlkf.data.readers.formats`); the mapping of the reader's
+configuration (``conf/reader/csv.yaml`` explains every key) says what the columns are; the result is a drive in the
+contract's units, axes and clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from dlkf.data.readers import formats
+from dlkf.data.readers.contract import gnss_frame, imu_frame, reference_frame
+from dlkf.data.readers.frames import DriveFrames
+from dlkf.data.readers.mapping import SOURCE, Mapped, Spec, check_keys, respaced, selected
+from dlkf.errors import InputError
+
+TEXT = ("separator", "decimal", "header", "comment", "skip_rows", "encoding")
+NEAR_S = 0.05  # rows of two GNSS tables this close are of one fix
+FRAMES = {"imu": imu_frame, "gnss": gnss_frame, "reference": reference_frame}
+
+
+class LogReader:
+    """Reads a file, a folder with one drive's files, or a folder with one subfolder per drive.
+
+    ``imu``, ``gnss`` and ``reference`` say format, file, columns, units, axes and clock as the comments of
+    ``conf/reader/csv.yaml`` explain; the other arguments are the format of text files and the drive's row in
+    ``drives.parquet``. All errors are InputErrors with file, and column or line.
+    """
+
+    def __init__(
+        self,
+        imu: Spec,
+        gnss: Spec,
+        reference: Spec | None = None,
+        *,
+        separator: str = ",",
+        decimal: str = ".",
+        header: bool = True,
+        comment: str | None = None,
+        skip_rows: int = 0,
+        encoding: str | None = None,
+        time_zero: str = "imu",
+        drive: str | None = None,
+        group: str | None = None,
+        lever_arm_m: Sequence[float] = (0.0, 0.0, 0.0),
+        meta: Spec | None = None,
+    ) -> None:
+        if time_zero not in ("imu", "keep"):
+            raise InputError(f"reader.time_zero={time_zero}: must be imu (count from the first sample) or keep")
+        self.specs: dict[str, Spec] = {"imu": imu, "gnss": gnss, "reference": reference or {}}
+        for kind, spec in self.specs.items():
+            check_keys(spec, kind)
+        self.text = dict(zip(TEXT, (separator, decimal, header, comment, skip_rows, encoding)))
+        self.time_zero, self.drive, self.group = time_zero, drive, group
+        self.lever_arm_m, self.meta = _lever_arm(lever_arm_m), dict(meta or {})
+
+    def read(self, source: str | Path) -> Iterator[DriveFrames]:
+        """The drives of a folder, in the order of their names."""
+        source = Path(source)
+        if source.is_file():
+            yield self._drive(source.parent, self.drive or source.name.partition(".")[0], source)
+            return
+        if not source.is_dir():
+            raise InputError(f"source={source}: no such file or folder; it holds one drive, or one subfolder per drive")
+        patterns = self.specs["imu"].get("file")
+        if _matching(source, patterns):
+            yield self._drive(source, self.drive or source.absolute().name)
+            return
+        folders = sorted(p for p in source.iterdir() if p.is_dir() and not p.name.startswith("."))
+        if not folders:
+            raise InputError(f"source={source}: no file {_said(patterns)} and no subfolders; set reader.imu.file")
+        for folder in folders:
+            yield self._drive(folder, folder.name)
+
+    def _drive(self, folder: Path, name: str, only: Path | None = None) -> DriveFrames:
+        kinds = [kind for kind, spec in self.specs.items() if spec.get("file") is not None]
+        if "imu" not in kinds:
+            raise InputError("reader.imu.file is null; a drive needs an IMU")
+        mapped = {kind: self._mapped(folder, self.specs[kind], kind, only) for kind in kinds}
+        stamps = {kind: part.stamps() for kind, part in mapped.items()}
+        zero = int(stamps["imu"][0][0]) if self.time_zero == "imu" else 0
+        frames: dict[str, pd.DataFrame] = {}
+        for kind, (whole, part) in stamps.items():
+            t = (whole - zero) + part
+            if (self.specs[kind].get("time") or {}).get("respace"):
+                t = respaced(t)
+            frames[kind] = FRAMES[kind](mapped[kind], t)
+        meta = {"drive": name, "group": self.group or name, "time_zero_s": float(zero), **self.meta}
+        meta |= dict(zip(("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m"), self.lever_arm_m))
+        notes = [note for part in mapped.values() for one in (part, *part.parts.values()) for note in one.table.notes]
+        return DriveFrames(
+            meta, frames["imu"], frames.get("gnss"), frames.get("reference"), notes=tuple(dict.fromkeys(notes))
+        )
+
+    def _mapped(self, folder: Path, spec: Spec, kind: str, only: Path | None) -> Mapped:
+        """The table of a kind, with the entries that come from other tables brought to its rows."""
+        whole = selected(self._table(folder, spec, kind, f"reader.{kind}", only))
+        parts: dict[str, Mapped] = {}
+        for key, entry in spec.items():
+            if not isinstance(entry, Mapping) or key == "time" or not any(entry.get(s) is not None for s in SOURCE):
+                continue
+            if not whole.has(key):
+                continue
+            own = {**spec, **{s: entry[s] for s in SOURCE if entry.get(s) is not None}}
+            parts[key] = selected(self._table(folder, own, kind, f"reader.{kind}.{key}", only))
+        return _joined(whole, parts) if parts else whole
+
+    def _table(self, folder: Path, spec: Spec, kind: str, where: str, only: Path | None) -> Mapped:
+        path = _file(folder, spec, kind, where, only)
+        text = {**self.text, **(spec.get("text") or {}), "lines": spec.get("lines")}
+        if unknown := [key for key in text if key not in (*TEXT, "lines")]:
+            raise InputError(f"{where}.text: unknown key {unknown[0]}; known are {', '.join(TEXT)}")
+        name = None if spec.get("table") is None else str(spec["table"])
+        table = formats.read(spec.get("format") or "csv", path, kind=kind, table=name, text=text, where=where)
+        return Mapped(table, spec, kind)
+
+
+def _file(folder: Path, spec: Spec, kind: str, where: str, only: Path | None) -> Path:
+    if only is not None and any(only.match(str(p)) for p in _patterns(spec.get("file"))):
+        return only
+    found = _matching(folder, spec.get("file"))
+    if len(found) != 1:
+        have = ", ".join(sorted(p.name for p in folder.iterdir())[:8]) or "nothing"
+        what = "no" if not found else f"{len(found)} files match, one must be"
+        raise InputError(f"{folder}: {what} {kind} file {_said(spec.get('file'))}; has {have}; set {where}.file")
+    return found[0]
+
+
+def _patterns(file: Any) -> list[str]:
+    return [str(p) for p in (file if isinstance(file, (list, tuple)) else [file]) if p is not None]
+
+
+def _said(file: Any) -> str:
+    return " or ".join(_patterns(file))
+
+
+def _matching(folder: Path, file: Any) -> list[Path]:
+    """What the first pattern that fits anything fits."""
+    for pattern in _patterns(file):
+        try:
+            found = sorted(p for p in folder.glob(pattern) if not p.name.startswith("."))
+        except (ValueError, NotImplementedError):
+            raise InputError(f"file {pattern!r}: must be a name or pattern inside the drive's folder") from None
+        if found:
+            return found
+    return []
+
+
+def _joined(whole: Mapped, parts: Mapping[str, Mapped]) -> Mapped:
+    """The parts at the rows of the whole: of GNSS the row of the same fix, of an IMU interpolated."""
+    base, rest = whole.stamps()
+    zero = base[0]
+    t = (base - zero) + rest
+    keep = np.ones(len(t), bool)
+    brought: dict[str, Mapped] = {}
+    for key, part in parts.items():
+        seconds, fraction = part.stamps()
+        at = (seconds - zero) + fraction
+        if whole.kind == "imu":
+            frame, near = _interpolated(part, key, at, t)
+        else:
+            order = np.argsort(at, kind="stable")
+            place = np.clip(np.searchsorted(at[order], t), 1, max(len(at) - 1, 1))
+            before, after = order[place - 1], order[np.minimum(place, len(at) - 1)]
+            nearest = np.where(np.abs(at[before] - t) <= np.abs(at[after] - t), before, after)
+            near = np.abs(at[nearest] - t) <= NEAR_S
+            frame = part.table.frame.iloc[nearest].reset_index(drop=True)
+            if key != "position":
+                frame = frame.astype(object).where(near[:, None]) if not near.all() else frame
+                near = np.ones(len(t), bool)
+        if not near.any():
+            raise InputError(
+                f"{part.table.path}: no row within {NEAR_S:g} s of those of {whole.table.path.name}; both need one "
+                f"clock (reader.{whole.kind}.{key}.time)"
+            )
+        keep &= near
+        brought[key] = replace(part, table=replace(part.table, frame=frame))
+    joined = replace(whole, parts=brought)
+    return joined if keep.all() else joined.rows(keep)
+
+
+def _interpolated(part: Mapped, key: str, at: np.ndarray, t: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:
+    """A sensor's columns at another sensor's stamps, and where it has neighbours close enough."""
+    values = part.vector(key, (3,), nan=False)
+    order = np.argsort(at, kind="stable")
+    at, values = at[order], values[order]
+    usual = float(np.median(np.diff(at))) if len(at) > 1 else 0.0
+    place = np.clip(np.searchsorted(at, t), 1, max(len(at) - 1, 1))
+    bridged = (at[np.minimum(place, len(at) - 1)] - at[place - 1]) <= max(0.25, 5 * usual)
+    near = (t >= at[0] - usual) & (t <= at[-1] + usual) & bridged
+    names = [str(n) for n in part.spec[key]["columns"]]
+    return pd.DataFrame({n: np.interp(t, at, v) for n, v in zip(names, values.T)}), near
+
+
+def _lever_arm(arm: Any) -> tuple[float, float, float]:
+    numbers = arm if isinstance(arm, (list, tuple)) else [arm]
+    fine = [isinstance(x, (int, float)) and not isinstance(x, bool) and np.isfinite(x) for x in numbers]
+    if len(numbers) != 3 or not all(fine):
+        raise InputError(
+            f"reader.lever_arm_m={arm}: must be three numbers, IMU → antenna: '[forward, right, down]' [m]"
+        )
+    return float(numbers[0]), float(numbers[1]), float(numbers[2])

@@ -1,0 +1,215 @@
+"""A table of a log and the part of the mapping that explains it: columns as numbers, vectors, stamps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from dlkf.data.readers import units
+from dlkf.data.readers.frames import Table
+from dlkf.errors import InputError
+
+Spec = Mapping[str, Any]
+SOURCE = ("format", "file", "table", "lines", "rows", "text", "time")
+TIME = ("column", "unit", "week", "week_number", "day", "wraps_s", "clock", "offset_s", "respace")
+GROUPS = {
+    "imu": ("accel", "gyro", "increments", "stamp"),
+    "gnss": ("position", "velocity", "std_position", "std_velocity", "quality", "every_s"),
+    "reference": ("position", "velocity", "attitude", "valid"),
+}
+ENTRIES = {
+    "accel": ("columns", "unit", "axes"),
+    "gyro": ("columns", "unit", "axes"),
+    "position": ("columns", "unit", "height_unit", "frame", "geoid", "hemispheres", "zero", "delay_s"),
+    "velocity": ("columns", "unit", "frame"),
+    "std_position": ("columns", "unit", "frame"),
+    "std_velocity": ("columns", "unit", "frame"),
+    "quality": ("column", "map", "default"),
+    "attitude": ("columns", "unit", "convention", "order"),
+    "valid": ("column", "values"),
+}
+
+
+def check_keys(spec: Spec, kind: str) -> None:
+    """InputError for a key of ``imu``, ``gnss`` or ``reference`` that means nothing."""
+    _known(spec, (*SOURCE, *GROUPS[kind]), f"reader.{kind}")
+    _known(spec.get("time"), TIME, f"reader.{kind}.time")
+    for name in GROUPS[kind]:
+        if name in ENTRIES:
+            _known(spec.get(name), (*ENTRIES[name], *SOURCE), f"reader.{kind}.{name}")
+            _known((spec.get(name) or {}).get("time"), TIME, f"reader.{kind}.{name}.time")
+
+
+def _known(spec: Any, known: tuple[str, ...], where: str) -> None:
+    if spec is None:
+        return
+    if not isinstance(spec, Mapping):
+        raise InputError(f"{where} is {spec!r}, must be a mapping of {', '.join(known)}")
+    if unknown := [str(key) for key in spec if key not in known]:
+        raise InputError(f"{where}: unknown key {unknown[0]}; known are {', '.join(known)}")
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """A table with the mapping of its ``kind`` (imu, gnss, reference).
+
+    ``parts`` are entries that come from another table, its rows already brought to the rows of this one.
+    """
+
+    table: Table
+    spec: Spec
+    kind: str
+    parts: Mapping[str, Mapped] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.table.frame)
+
+    def column(self, name: str | int, *, nan: bool) -> np.ndarray:
+        """A column as numbers; empty cells are NaN where ``nan`` allows."""
+        values = self._cells(name)
+        if not pd.api.types.is_numeric_dtype(values) or pd.api.types.is_bool_dtype(values):
+            texts = values.astype(str).str.strip()
+            numbers = pd.to_numeric(texts, errors="coerce")
+            empty = values.isna() | texts.str.lower().isin(["", "nan", "na", "none", "null"])
+            bad = np.flatnonzero((numbers.isna() & ~empty).to_numpy())
+            if len(bad):
+                remedy = "mend the line"
+                if np.mean(numbers.isna()) > 0.5 and str(name) == str((self.spec.get("time") or {}).get("column")):
+                    remedy = f"set reader.{self.kind}.time.unit=iso if that is a date and time"
+                self.fail(int(bad[0]), name, f"is {values.iloc[bad[0]]!r}, not a number; {remedy}")
+            values = numbers
+        if not nan and bool(values.isna().any()):
+            row = int(np.flatnonzero(values.isna())[0])
+            remedy = f"mend or remove the line, or leave such rows out with reader.{self.kind}.rows=filled"
+            self.fail(row, name, f"is empty; {remedy}")
+        return values.to_numpy()
+
+    def texts(self, name: str | int) -> pd.Series:
+        """A column as stripped texts; whole numbers without a point."""
+        values = self._cells(name)
+        whole = values.map(lambda v: str(int(v)) if isinstance(v, float) and v.is_integer() else str(v))
+        return whole.str.strip()
+
+    def vector(self, key: str, count: tuple[int, ...], *, nan: bool) -> np.ndarray:
+        """The columns of an entry of the mapping, as floats (rows, n)."""
+        names = self.spec[key]["columns"]
+        if isinstance(names, str) or len(names) not in count:
+            many = " or ".join(str(c) for c in count)
+            has = "a single name" if isinstance(names, str) else f"{len(names)} names"
+            raise InputError(f"reader.{self.kind}.{key}.columns has {has}, must have {many}")
+        part = self.of(key)
+        return np.stack([part.column(n, nan=nan).astype(float) for n in names], -1)
+
+    def of(self, key: str) -> Mapped:
+        """The table that an entry's columns are in."""
+        return self.parts.get(key, self)
+
+    def has(self, key: str) -> bool:
+        """Whether the mapping explains an optional entry."""
+        entry = self.spec.get(key)
+        if not entry:
+            return False
+        return entry.get("columns") is not None or entry.get("column") is not None
+
+    def stamps(self) -> tuple[np.ndarray, np.ndarray]:
+        """Whole seconds and the rest of the rows' times, offset included."""
+        time = self.spec.get("time") or {}
+        where = f"reader.{self.kind}.time"
+        name, unit = time.get("column"), time.get("unit") or "s"
+        if name is None:
+            raise InputError(f"{where}.column is missing; name the column of the stamps")
+        if unit == units.ISO:
+            names = [name] if isinstance(name, (str, int)) else list(name)
+            values = self._cells(names[0]).astype(str)
+            for more in names[1:]:
+                values = values.str.cat(self._cells(more).astype(str), sep=" ")
+            values = values.to_numpy()
+        else:
+            values = self.column(name, nan=False)
+        if time.get("wraps_s") is not None:
+            values = units.unwrapped(values, float(time["wraps_s"]) * units.TIME.get(unit, 1))
+        week = self.column(time["week"], nan=False) if time.get("week") is not None else None
+        if time.get("week_number") is not None:
+            week = np.full(len(self), int(time["week_number"]))
+        whole, part = units.seconds(values, unit, week, time.get("clock"), f"{self.table.path}, {where}")
+        if time.get("day") is not None:
+            day = np.array([str(time["day"])])
+            whole = whole + units.seconds(day, units.ISO, None, time.get("clock"), f"{where}.day")[0]
+        offset = _finite(time.get("offset_s") or 0.0, f"{where}.offset_s")
+        jump = math.floor(offset)
+        return whole + jump, part + (offset - jump)
+
+    def scale(self, key: str, table: Mapping[str, float], name: str = "unit") -> float:
+        """SI per unit of an entry; the first unit of the table if the entry has none."""
+        unit = self.spec[key].get(name)
+        where = f"reader.{self.kind}.{key}.{name}"
+        return units.factor(next(iter(table)) if unit is None else unit, table, where)
+
+    def rows(self, keep: np.ndarray) -> Mapped:
+        """Some rows, of the parts too."""
+        parts = {key: part.rows(keep) for key, part in self.parts.items()}
+        return replace(self, table=replace(self.table, frame=self.table.frame[keep]), parts=parts)
+
+    def fail(self, row: int, name: str | int, what: str) -> None:
+        """Raise InputError for a row, by its number in the file."""
+        number = self.table.frame.index[row]
+        raise InputError(f"{self.table.path}: {self.table.row} {number}: column {str(name)!r} {what}")
+
+    def _cells(self, name: str | int) -> pd.Series:
+        name = str(name)
+        if name not in self.table.frame:
+            have = [str(c) for c in self.table.frame.columns]
+            has = ", ".join(have[:24]) + (", …" if len(have) > 24 else "")
+            raise InputError(f"{self.table.path}: no column {name!r}; has {has}; set it in reader.{self.kind}")
+        return self.table.frame[name]
+
+
+def selected(mapped: Mapped) -> Mapped:
+    """The rows that ``rows`` chooses: ``{column: …, is: [...]}``, or ``filled``: those whose columns are not empty."""
+    rows = mapped.spec.get("rows")
+    where = f"reader.{mapped.kind}.rows"
+    if rows is None:
+        return mapped
+    if rows == "filled":
+        names = {str(n) for key in ("accel", "gyro", "position") for n in _names(mapped, key)}
+        time = (mapped.spec.get("time") or {}).get("column")
+        names |= {str(n) for n in ([time] if isinstance(time, (str, int)) else time or [])}
+        frame = mapped.table.frame
+        cells = frame[[c for c in frame.columns if c in names]]
+        empty = cells.isna() | cells.astype(str).apply(lambda c: c.str.strip() == "")
+        keep = ~empty.any(axis=1).to_numpy()
+    elif isinstance(rows, Mapping) and set(rows) == {"column", "is"}:
+        values = rows["is"] if isinstance(rows["is"], (list, tuple)) else [rows["is"]]
+        keep = mapped.texts(rows["column"]).isin([str(v) for v in values]).to_numpy()
+    else:
+        raise InputError(f"{where} is {rows!r}, must be filled or {{column: …, is: [...]}}")
+    if not keep.any():
+        raise InputError(f"{mapped.table.path}: no row is left by {where}={rows}; set it right")
+    return mapped.rows(keep)
+
+
+def respaced(t: np.ndarray) -> np.ndarray:
+    """Rows of one stamp spread evenly over the time since the stamp before (a clock coarser than the rate)."""
+    first = np.flatnonzero(np.diff(t, prepend=-np.inf) != 0)
+    count = np.diff(first, append=len(t))
+    steps = np.diff(t[first])
+    usual = float(np.median(steps / count[1:])) if len(steps) else 0.0
+    since = np.concatenate(([usual * count[0]], np.minimum(steps, 3 * usual * count[1:]))) if len(first) else steps
+    place = np.arange(len(t)) - np.repeat(first, count) + 1
+    return t - np.repeat(since, count) * (1 - place / np.repeat(count, count))
+
+
+def _names(mapped: Mapped, key: str) -> list[Any]:
+    entry = mapped.spec.get(key) or {}
+    return [] if key in mapped.parts else list(entry.get("columns") or [])
+
+
+def _finite(value: Any, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise InputError(f"{where} is {value!r}, must be a number")
+    return float(value)

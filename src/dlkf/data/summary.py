@@ -1,0 +1,58 @@
+"""A drive in one line: what makes one trust an import, or not."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dlkf.data.readers.frames import DriveFrames
+
+QUALITIES = {0: "no fix", 1: "single", 2: "DGNSS", 3: "PPS", 4: "RTK fixed", 5: "RTK float", 9: "SBAS"}
+
+
+def drive_line(drive: DriveFrames) -> str:
+    """Duration, rates, distance, share of fixes by quality, largest gaps of a drive."""
+    t = drive.imu["t"].to_numpy()
+    step = np.diff(t)
+    told = [_duration(t[-1] - t[0]), f"IMU {1 / np.median(step):.4g} Hz, largest gap {_short(step.max())}"]
+    if drive.gnss is None or not len(drive.gnss):
+        return ", ".join((*told, "no GNSS"))
+    at, quality = drive.gnss["t"].to_numpy(), drive.gnss["quality"].to_numpy()
+    shares = {int(q): float(np.mean(quality == q)) for q in np.unique(quality)}
+    named = (f"{QUALITIES.get(q, f'quality {q}')} {100 * share:.3g} %" for q, share in shares.items())
+    fixed = at[quality > 0]
+    gaps = np.diff(fixed)
+    rate = f"{1 / np.median(np.diff(at)):.3g} Hz" if len(at) > 1 else "a single row"
+    told.append(f"GNSS {rate}, {len(fixed)} fixes ({', '.join(named)})")
+    if len(gaps):
+        told.append(f"largest gap {_short(gaps.max())}")
+    told.insert(1, f"{_way(drive) / 1000:.2f} km")
+    if drive.reference is not None:
+        told.append(f"reference {100 * float(drive.reference['valid'].mean()):.3g} % valid")
+    return ", ".join(told)
+
+
+def _way(drive: DriveFrames) -> float:
+    """Length of the way [m] from velocities, or between fixes at least 5 m apart."""
+    gnss = drive.gnss
+    assert gnss is not None
+    speed = np.hypot(gnss["vel_n"], gnss["vel_e"]).to_numpy()
+    if np.isfinite(speed).mean() > 0.5:
+        return float(np.trapezoid(np.nan_to_num(speed), gnss["t"]))
+    lat, lon = (np.radians(gnss[c].dropna().to_numpy()) for c in ("lat_deg", "lon_deg"))
+    if not len(lat):
+        return 0.0
+    north, east = 6.37e6 * (lat - lat[0]), 6.37e6 * np.cos(lat[0]) * (lon - lon[0])
+    way, last = 0.0, (north[0], east[0])
+    for here in zip(north, east):
+        if (moved := float(np.hypot(here[0] - last[0], here[1] - last[1]))) > 5.0:
+            way, last = way + moved, here
+    return way
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(seconds, 60)
+    return f"{minutes:.0f} min {rest:02.0f} s" if minutes else f"{rest:.1f} s"
+
+
+def _short(seconds: float) -> str:
+    return f"{seconds:.2f} s" if seconds >= 0.095 else f"{1000 * seconds:.3g} ms"
