@@ -17,6 +17,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from dlkf.evaluation.table import comparison, with_interval
+
 
 def main() -> int:
     """``dlkf.evaluate`` for every folder and length; 0 if all of them went well."""
@@ -57,9 +59,10 @@ def summary(home: Path, lengths: list[float]) -> str:
         cells = []
         for _, result in made:
             end = result["filters"][name]["outages"]["end"]["horizontal"]
-            ratio = result.get("comparisons", {}).get(name, {}).get("outage_end", {}).get("horizontal")
+            which = {"over": "outages", "part": "end", "quantity": "horizontal", "statistic": "rms"}
+            ratio = comparison(result, name, **which)
             cells.append(f"{end['rms']:.3g} ({end['median']:.3g})")
-            cells.append("{ratio:.2f} [{ratio_low:.2f}, {ratio_high:.2f}]".format(**ratio) if ratio else "1")
+            cells.append(with_interval(ratio) if ratio else "1")
         lines.append(f"| `{name}` | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 

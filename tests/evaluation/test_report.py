@@ -17,7 +17,7 @@ from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.report import png, write_report
 from dlkf.evaluation.results import results
 from dlkf.evaluation.run import score
-from dlkf.evaluation.table import as_csv, as_json, as_markdown, number, slope_table, tables
+from dlkf.evaluation.table import as_csv, as_json, as_markdown, number, ratio_table, slope_table, tables, with_interval
 from dlkf.files import staged
 from dlkf.filters.build import build_filter
 from tests.evaluation.conftest import IMU
@@ -44,7 +44,14 @@ def test_tables_hold_the_results(scores):
     assert outages.title == "town (simulated): 6 outages of 20 s, 6 drives"
     end = r["filters"]["mbkf15"]["outages"]["end"]["horizontal"]
     assert outages.rows[1][:4] == ["mbkf15", *(number(end[s]) for s in ("rms", "median", "p95"))]
-    assert outages.rows[1][-1] == "1" and "[" in outages.rows[0][-1]
+    ratios = ratio_table("town", r)
+    assert ratios.title.endswith("ratio to mbkf15, 6 recordings") and [row[0] for row in ratios.rows] == ["ins"]
+    assert len(ratios.columns) == 6 and all(cell.endswith(" (n<8)") for cell in ratios.rows[0][1:])
+    assert ratio_table("town", results(scores, baseline="none such")) is None
+    found = {(c["over"], c["quantity"], c["statistic"]): c for c in r["comparisons"]}
+    assert len(found) == 2 * 6 * 3 and all(c["baseline"] == "mbkf15" and c["groups"] == 6 for c in found.values())
+    wider = {**found["outages", "horizontal", "rms"], "groups": 8, "ratio": 0.7, "ratio_low": 0.6, "ratio_high": 0.8}
+    assert with_interval(wider) == "0.70 [0.60–0.80]"
     assert r["filters"]["mbkf15"]["outages"]["at"]["20"] == r["filters"]["mbkf15"]["outages"]["end"]
     per_outage = [o["end"]["mbkf15"]["horizontal"] for o in r["per_outage"]]
     assert math.sqrt(np.mean(np.square(per_outage))) == pytest.approx(end["rms"])

@@ -1,8 +1,12 @@
 """Paired bootstrap: how sure is it that one filter is better than another on the same pieces?
 
-Both filters are resampled with the same weights, so that a piece that is hard for both does not widen the
-interval (Efron & Tibshirani, *An Introduction to the Bootstrap*, ch. 13, percentile interval). Pieces or
-outages of one recording are not independent: give their recordings as ``groups`` and these are drawn.
+Both filters are resampled with the same weights, so that a piece that is hard for both does not widen the interval
+(Efron & Tibshirani, *An Introduction to the Bootstrap*, ch. 13). Pieces or outages of one recording are not
+independent: give their recordings as ``groups``, and these are drawn. Few of them make a percentile interval too
+narrow, so its levels are those of Student's t with as many degrees of freedom (the expanded percentile interval:
+Hesterberg, *What Teachers Should Know About the Bootstrap*, 2015, section 5.3), and with fewer than
+:data:`MIN_GROUPS` there is none. On log-normal errors of clustered pieces it covers 90 to 95 % where it says 95 %
+(tests/evaluation/test_bootstrap.py); the plain percentile interval covered 83 to 92 %, BCa 80 to 89 %.
 """
 
 from __future__ import annotations
@@ -12,17 +16,21 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
-from dlkf.evaluation.metrics import Array
+from dlkf.evaluation.metrics import LEAST_LOG, Array
 
-STATISTICS = ("rms", "mean", "median")
-MIN_GROUPS = 8  # with fewer recordings than this, pieces are drawn one by one
+STATISTICS = ("rms", "mean", "median", "geomean")
+MIN_GROUPS = 8  # with fewer recordings, or independent pieces, than this there is no interval
 _CELLS = 4_000_000  # weights held at a time
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """``a`` against ``b``: ratio and difference of a statistic over the same units, with their intervals."""
+    """``a`` against ``b``: ratio and difference of a statistic over the same units, with their intervals.
+
+    The bounds are NaN where ``groups``, the number of recordings (of units where none were given), is too small.
+    """
 
     statistic: str
     a: float
@@ -43,12 +51,18 @@ class Comparison:
 
 
 def weighted(values: Array, weights: Array, statistic: str) -> Array:
-    """RMS, mean or median of ``values`` (U,) under each row of non-negative ``weights`` (R, U): (R,)."""
+    """A statistic of ``values`` (U,) under each row of non-negative ``weights`` (R, U): (R,).
+
+    The geometric mean counts every unit's ratio alike, where RMS is decided by the few largest.
+    """
     total = weights.sum(-1)
     if statistic == "rms":
         return np.sqrt(_dot(weights, values**2) / total)
     if statistic == "mean":
         return _dot(weights, values) / total
+    if statistic == "geomean":
+        with np.errstate(divide="ignore"):
+            return np.exp(_dot(weights, np.maximum(np.log(values), LEAST_LOG)) / total)
     if statistic == "median":
         order = np.argsort(values)
         running = np.cumsum(weights[:, order], -1)
@@ -77,15 +91,19 @@ def resampled_weights(
         yield generator.multinomial(G, np.full(G, 1 / G), size=rows)[:, groups].astype(float)
 
 
-def _intervals(values: Sequence[Array], confidence: float) -> list[tuple[float, float]]:
-    q = [50 * (1 - confidence), 50 * (1 + confidence)]
-    out = []
-    for x in values:
-        known = x[~np.isnan(x)]
-        method = "linear" if np.isfinite(known).all() else "nearest"
-        low, high = np.percentile(known, q, method=method) if known.size else (np.nan, np.nan)
-        out.append((float(low), float(high)))
-    return out
+def levels(groups: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Percentiles of the resamples that bound the interval: Φ(√(G/(G−1)) t) with t of G − 1 degrees of freedom."""
+    t = stats.t.ppf(0.5 * (1 + confidence), groups - 1) * np.sqrt(groups / (groups - 1))
+    return 100 * float(stats.norm.cdf(-t)), 100 * float(stats.norm.cdf(t))
+
+
+def _interval(values: Array, groups: int, confidence: float) -> tuple[float, float]:
+    known = values[~np.isnan(values)]
+    if not known.size:
+        return np.nan, np.nan
+    method = "linear" if np.isfinite(known).all() else "nearest"
+    low, high = np.percentile(known, levels(groups, confidence), method=method)
+    return float(low), float(high)
 
 
 def compare(
@@ -98,32 +116,32 @@ def compare(
     confidence: float = 0.95,
     seed: int = 0,
 ) -> Comparison:
-    """Ratio a/b and difference a − b of a statistic over paired units (U,), with percentile intervals.
+    """Ratio a/b and difference a − b of a statistic over paired units (U,), with their intervals.
 
-    Units where either value is NaN (no truth) are left out of both. With fewer than two units the interval
-    is NaN.
+    Units where either value is NaN (no truth) are left out of both. With fewer than :data:`MIN_GROUPS` recordings
+    (units where no ``groups`` are given) the bounds are NaN.
     """
     a, b = np.asarray(a, float), np.asarray(b, float)
     keep = ~(np.isnan(a) | np.isnan(b))
     a, b = a[keep], b[keep]
-    unit_groups = np.arange(len(a))
-    if groups is not None and len(a):
-        unit_groups = np.unique(np.asarray(groups, dtype=str)[keep], return_inverse=True)[1]
-        if unit_groups.max() + 1 < MIN_GROUPS:
-            unit_groups = np.arange(len(a))
-    drawn = int(unit_groups.max()) + 1 if len(a) else 0
+    drawn = np.arange(len(a)) if groups is None else _numbered(np.asarray(groups, dtype=str)[keep])
+    G = int(drawn.max()) + 1 if len(a) else 0
     one = np.ones((1, len(a)))
     sa, sb = ((float(weighted(x, one, statistic)[0]) if len(a) else np.nan) for x in (a, b))
     ratios, differences = [np.empty(0)], [np.empty(0)]
     with np.errstate(invalid="ignore", divide="ignore"):
-        if drawn > 1:
-            for w in resampled_weights(unit_groups, resamples, np.random.default_rng(seed)):
+        if G >= MIN_GROUPS:
+            for w in resampled_weights(drawn, resamples, np.random.default_rng(seed)):
                 ra, rb = weighted(a, w, statistic), weighted(b, w, statistic)
                 ratios.append(ra / rb)
                 differences.append(ra - rb)
         ratio, difference = float(np.divide(sa, sb)), float(np.subtract(sa, sb))
-    (rl, rh), (dl, dh) = _intervals((np.concatenate(ratios), np.concatenate(differences)), confidence)
-    return Comparison(statistic, sa, sb, ratio, rl, rh, difference, dl, dh, len(a), drawn, confidence)
+    (rl, rh), (dl, dh) = (_interval(np.concatenate(x), G, confidence) for x in (ratios, differences))
+    return Comparison(statistic, sa, sb, ratio, rl, rh, difference, dl, dh, len(a), G, confidence)
+
+
+def _numbered(groups: NDArray[np.str_]) -> NDArray[np.int64]:
+    return np.unique(groups, return_inverse=True)[1] if len(groups) else np.empty(0, np.int64)
 
 
 def rms_band(
@@ -136,24 +154,24 @@ def rms_band(
 ) -> tuple[Array, Array, Array]:
     """RMS over units at each column of (U, K), and the bounds of its bootstrap interval; each (K,).
 
-    NaN where a column has no value. The bounds are NaN where it has one only, or one that is not finite.
+    NaN where a column has no value. The bounds are NaN too where one is not finite, or where fewer than
+    :data:`MIN_GROUPS` recordings (rows where no ``groups`` are given) have one.
     """
     valid = ~np.isnan(x)
     n = valid.sum(0)
     square = np.where(valid, x, 0.0) ** 2
     rms = np.where(n > 0, np.sqrt(square.sum(0) / np.maximum(n, 1)), np.nan)
     low, high = np.full((2, len(rms)), np.nan)
-    sure = (n > 1) & np.isfinite(rms)
-    if not sure.any():
+    drawn = np.arange(len(x)) if groups is None else _numbered(np.asarray(groups, dtype=str))
+    counted = np.array([len(np.unique(drawn[valid[:, k]])) for k in range(len(rms))])  # groups with a value
+    sure = np.flatnonzero((counted >= MIN_GROUPS) & np.isfinite(rms))
+    if not len(sure):
         return rms, low, high
-    index = np.arange(len(x))
-    if groups is not None:
-        by_group = np.unique(np.asarray(groups, dtype=str), return_inverse=True)[1]
-        index = by_group if by_group.max() + 1 >= MIN_GROUPS else index
-    square, counted, draws = square[:, sure], valid[:, sure].astype(float), []
+    draws = []
     with np.errstate(invalid="ignore"):
-        for w in resampled_weights(index, resamples, np.random.default_rng(seed)):
-            draws.append(np.sqrt((w @ square) / (w @ counted)))
-    bounds = np.nanpercentile(np.concatenate(draws), [50 * (1 - confidence), 50 * (1 + confidence)], axis=0)
-    low[sure], high[sure] = bounds
+        for w in resampled_weights(drawn, resamples, np.random.default_rng(seed)):
+            draws.append(np.sqrt((w @ square[:, sure]) / (w @ valid[:, sure].astype(float))))
+    every = np.concatenate(draws)
+    for k, column in enumerate(sure):
+        low[column], high[column] = _interval(every[:, k], int(counted[column]), confidence)
     return rms, low, high

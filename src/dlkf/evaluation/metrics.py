@@ -19,6 +19,7 @@ from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.state import NavState
 
+LEAST_LOG = -50.0  # what the logarithm of an exact zero counts as in a geometric mean
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -82,11 +83,11 @@ def rms_over_pieces(x: Array) -> Array:
 
 
 def summary(values: Array) -> dict[str, float]:
-    """n, RMS, mean, median, 95 % and maximum over pieces or outages; NaN left out, inf kept and counted."""
+    """n, RMS, mean, geometric mean, median, 95 % and maximum over pieces or outages; NaN left out, inf counted."""
     x = np.asarray(values, float)
     x = x[~np.isnan(x)]
     if x.size == 0:
-        nothing = dict.fromkeys(("rms", "mean", "median", "p95", "max"), float("nan"))
+        nothing = dict.fromkeys(("rms", "mean", "geomean", "median", "p95", "max"), float("nan"))
         return {"n": 0, **nothing, "nonfinite": 0}
     finite = np.isfinite(x)
     method = "linear" if finite.all() else "higher"  # inf cannot be interpolated
@@ -94,11 +95,18 @@ def summary(values: Array) -> dict[str, float]:
         "n": int(x.size),
         "rms": float(np.sqrt(np.mean(x**2))),
         "mean": float(np.mean(x)),
+        "geomean": geometric_mean(x),
         "median": float(np.percentile(x, 50, method=method)),
         "p95": float(np.percentile(x, 95, method=method)),
         "max": float(x.max()),
         "nonfinite": int((~finite).sum()),
     }
+
+
+def geometric_mean(x: Array) -> float:
+    """exp of the mean logarithm of |x|, to which every value counts alike; an exact zero counts as e⁻⁵⁰."""
+    with np.errstate(divide="ignore"):
+        return float(np.exp(np.mean(np.maximum(np.log(np.abs(x)), LEAST_LOG))))
 
 
 class Windows(NamedTuple):

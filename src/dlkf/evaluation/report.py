@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from dlkf.evaluation import figures
 from dlkf.evaluation.scores import Scores
-from dlkf.evaluation.table import Table, as_csv, as_json, as_markdown, slope_table, tables
+from dlkf.evaluation.table import Table, as_csv, as_json, as_markdown, ratio_table, slope_table, tables
 from dlkf.files import staged
 
 _STYLE = """
@@ -42,8 +42,8 @@ def all_tables(dataset: str, results: Sequence[dict[str, Any]]) -> list[Table]:
     """The tables of every kind of data, one kind after the other."""
     out = []
     for r in results:
-        slopes = slope_table(dataset, r)
-        out += tables(dataset, r) + ([slopes] if slopes else [])
+        more = (ratio_table(dataset, r), slope_table(dataset, r))
+        out += tables(dataset, r) + [t for t in more if t is not None]
     return out
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from dlkf.evaluation.scores import Scores
 SETTLE_S = 10.0  # "settled" leaves out this much of every piece, where the initial error dominates
 INTO_OUTAGE_S = (10.0, 20.0, 30.0, 40.0, 50.0, 60.0)
 BASELINE = "mbkf15"
+COMPARED = ("rms", "mean", "geomean")  # statistics of which ratios to the baseline are given
 
 
 def results(
@@ -76,26 +78,18 @@ def results(
             "at": {f"{s:g}": {q: summary(at[q][:, i]) for q in QUANTITIES} for i, s in enumerate(seconds)},
             "drift": summary(ends[name]["drift"]),
         }
-    against = baseline if baseline in scores.filters else None
-    comparisons: dict[str, Any] = {}
-    for name in scores.filters if against else ():
-        if name == against:
-            continue
-        options: dict[str, Any] = {"resamples": resamples, "seed": seed}
-        comparisons[name] = {
-            "baseline": against,
-            "pieces": {
-                q: compare(
-                    pieces[name][q]["all"], pieces[against][q]["all"], groups=piece_groups, **options
-                ).as_dict()
-                for q in QUANTITIES
-            },
-        }
-        if ends:
-            comparisons[name]["outage_end"] = {
-                q: compare(ends[name][q], ends[against][q], groups=outage_groups, **options).as_dict()
-                for q in QUANTITIES
-            }
+    units = {("pieces", "all"): ({n: {q: v["all"] for q, v in by.items()} for n, by in pieces.items()}, piece_groups)}
+    if ends:
+        units["outages", "end"] = (ends, outage_groups)
+    options: dict[str, Any] = {"resamples": resamples, "seed": seed}
+    comparisons = [
+        {"filter": name, "baseline": baseline, "over": over, "part": part, "quantity": q}
+        | compare(values[name][q], values[baseline][q], statistic=s, groups=groups, **options).as_dict()
+        for name in scores.filters
+        if baseline in scores.filters and name != baseline
+        for (over, part), (values, groups) in units.items()
+        for q, s in product(QUANTITIES, COMPARED)
+    ]
     return {
         "kind": scores.kinds[0],
         "count": {

@@ -10,16 +10,18 @@ import csv
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from dlkf.evaluation.bootstrap import MIN_GROUPS
 from dlkf.evaluation.metrics import QUANTITIES
 
 DASH = "–"
+_WHICH = ("over", "part", "quantity", "statistic")
 
 
 class Table(NamedTuple):
@@ -31,23 +33,32 @@ class Table(NamedTuple):
     rows: list[list[str]]
 
 
-def number(x: float | None, scale: float = 1.0) -> str:
-    """Three significant digits, – for NaN, ∞ for inf."""
-    if x is None or math.isnan(x):
+def number(x: float | str | None, scale: float = 1.0, digits: int = 3) -> str:
+    """Three (or so many) significant digits, – for NaN, ∞ for inf; also of a value as ``metrics.json`` has it."""
+    x = math.nan if x is None else float(x)
+    if math.isnan(x):
         return DASH
     if math.isinf(x):
         return "∞" if x > 0 else "−∞"
     x = x * scale
     if x == 0:
         return "0"
-    decimals = max(0, 2 - math.floor(math.log10(float(f"{abs(x):.2e}"))))
+    decimals = max(0, digits - 1 - math.floor(math.log10(float(f"{abs(x):.{digits - 1}e}"))))
     return f"{x:.{min(decimals, 6)}f}" if abs(x) < 1e5 else f"{x:.2e}"
 
 
-def with_interval(c: dict[str, Any]) -> str:
-    """Ratio with its confidence interval: ``0.71 [0.62, 0.83]``."""
-    bounds = f" [{number(c['ratio_low'])}, {number(c['ratio_high'])}]"
-    return number(c["ratio"]) + ("" if math.isnan(c["ratio_low"]) else bounds)
+def with_interval(c: Mapping[str, Any]) -> str:
+    """Ratio with its confidence interval: ``0.71 [0.62–0.83]``, or ``0.71 (n<8)`` of too few recordings for one."""
+    ratio, low, high = (number(c[key], digits=2) for key in ("ratio", "ratio_low", "ratio_high"))
+    if c["groups"] < MIN_GROUPS:
+        return ratio if ratio == DASH else f"{ratio} (n<{MIN_GROUPS})"
+    return f"{ratio} [{low}–{high}]"
+
+
+def comparison(result: Mapping[str, Any], name: str, **which: str) -> dict[str, Any] | None:
+    """The row of ``comparisons`` with these ``over``, ``part``, ``quantity``, ``statistic``; None for the baseline."""
+    rows = [c for c in result["comparisons"] if c["filter"] == name and which.items() <= c.items()]
+    return rows[0] if rows else None
 
 
 def tables(dataset: str, result: dict[str, Any]) -> list[Table]:
@@ -83,25 +94,19 @@ def tables(dataset: str, result: dict[str, Any]) -> list[Table]:
 
 
 def outage_table(what: str, result: dict[str, Any]) -> Table:
-    """Errors at the end of the outages, at round times into them, and against the baseline."""
+    """Errors at the end of the outages, at round times into them, before the fixes are back."""
     n, low, high = result["count"], *result["count"]["outage_s"]
     length = f"{low:g} s" if low == high else f"{low:g} to {high:g} s"
     first = next(iter(result["filters"].values()))
     at = [s for s in first["outages"]["at"] if float(s) < high][-3:]
-    against = next((c["baseline"] for c in result["comparisons"].values()), None)
     note = "Horizontal error at the end (RMS, median, 95 % over the outages), at times into it (RMS); "
     note += "velocity and attitude at the end (RMS); drift: horizontal error per distance driven (median)."
-    if against:
-        note += (
-            f" Last column: horizontal RMS at the end, ratio to {against}, 95 % interval by paired bootstrap."
-        )
     table = Table(
         title=f"{what}: {_count(n['outages'], 'outage')} of {length}, {_count(n['outage_drives'], 'drive')}",
         note=note,
         columns=["Filter", "End, RMS\n[m]", "median\n[m]", "95 %\n[m]"]
         + [f"{s} s\n[m]" for s in at]
-        + ["Velocity\n[m/s]", "Attitude\n[°]", "Drift\n[%]"]
-        + ([f"ratio to\n{against}"] if against else []),
+        + ["Velocity\n[m/s]", "Attitude\n[°]", "Drift\n[%]"],
         rows=[],
     )
     for name, f in result["filters"].items():
@@ -110,11 +115,38 @@ def outage_table(what: str, result: dict[str, Any]) -> Table:
         row += [number(o["at"][s]["horizontal"]["rms"]) for s in at]
         row += [number(o["end"]["velocity"]["rms"]), number(o["end"]["attitude"]["rms"], 180 / math.pi)]
         row += [number(o["drift"]["median"], 100)]
-        if against:
-            c = result["comparisons"].get(name)
-            row.append("1" if c is None else with_interval(c["outage_end"]["horizontal"]))
         table.rows.append(row)
     return table
+
+
+RATIOS = {
+    "end of outages,\nRMS": ("outages", "end", "horizontal", "rms"),
+    "end of outages,\ngeom. mean": ("outages", "end", "horizontal", "geomean"),
+    "position,\nmean": ("pieces", "all", "position", "mean"),
+    "velocity,\nmean": ("pieces", "all", "velocity", "mean"),
+    "attitude,\nmean": ("pieces", "all", "attitude", "mean"),
+}
+
+
+def ratio_table(dataset: str, result: dict[str, Any]) -> Table | None:
+    """Every filter against the baseline, with intervals; None where there is nothing to compare."""
+    rows = result["comparisons"]
+    heads = [head for head, (over, *_) in RATIOS.items() if any(c["over"] == over for c in rows)]
+    if not rows:
+        return None
+    cells = []
+    for name in dict.fromkeys(c["filter"] for c in rows):
+        found = [comparison(result, name, **dict(zip(_WHICH, RATIOS[head]))) for head in heads]
+        cells.append([name] + [DASH if c is None else with_interval(c) for c in found])
+    return Table(
+        title=f"{dataset} ({result['kind']}): ratio to {rows[0]['baseline']}, {_count(rows[0]['groups'], 'recording')}",
+        note="Below 1: better than it. Of the horizontal error at the end of the outages: RMS, which the largest "
+        "errors decide, and geometric mean, to which every outage counts alike. Of the pieces' RMS (3D): mean over the "
+        "pieces, as in the paper. In brackets the 95 % interval by paired bootstrap over the recordings; "
+        f"n<{MIN_GROUPS}: too few recordings for one.",
+        columns=["Filter", *heads],
+        rows=cells,
+    )
 
 
 def slope_table(dataset: str, result: dict[str, Any]) -> Table | None:
