@@ -6,7 +6,7 @@ PROFILE ?= quick
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help install train test lint bench ui clean
+.PHONY: help install train test lint bench docs ui clean
 
 help:
 	@echo "make install   what training, evaluating and navigating need, into .venv"
@@ -14,6 +14,7 @@ help:
 	@echo "make test      all tests"
 	@echo "make lint      ruff and pyright"
 	@echo "make bench     speed of the filters and of training"
+	@echo "make docs      the pages of docs/ with search, equations and the API, in outputs/docs"
 	@echo "make ui        MLflow's pages over the runs of this folder"
 	@echo "make clean     remove what can be made again; data and runs stay"
 
@@ -27,7 +28,7 @@ help:
 	@touch $@
 
 .venv/installed-dev: .venv/installed
-	$(BIN)/pip install --quiet --no-compile --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/pip install --quiet --no-compile --constraint constraints.txt --editable '.[dev,docs]'
 	@touch $@
 
 install: .venv/installed
@@ -39,11 +40,15 @@ test: .venv/installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(ARGS)
 
 lint: .venv/installed-dev
-	$(BIN)/ruff check src tests pipelines
+	$(BIN)/ruff check src tests pipelines docs
 	$(BIN)/pyright
 
 bench: .venv/installed
 	$(BIN)/python pipelines/benchmark.py $(ARGS)
+
+docs: .venv/installed-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+	@echo "outputs/docs/index.html"
 
 ui: .venv/installed
 	MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false $(BIN)/mlflow ui --workers 1 --host 127.0.0.1 \

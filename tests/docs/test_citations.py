@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -88,3 +90,24 @@ def anchors(page: Path) -> set[str]:
     """Anchors of a page's headings, as GitHub and MkDocs make them."""
     heads = re.findall(r"^#+ (.+)$", page.read_text(), re.M) if page.exists() else []
     return {re.sub(r"[^\w\- ]", "", h.replace("`", "").lower()).strip().replace(" ", "-") for h in heads}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_named_objects_exist(page: Path) -> None:
+    named = set(re.findall(r"`(dlkf(?:\.\w+)+)(?:\(\))?`", page.read_text()))
+    assert not [name for name in sorted(named) if not found(name)]
+
+
+def found(name: str) -> bool:
+    """Whether a dotted name leads to a module or to something in one."""
+    module, _, rest = name.partition(".")
+    thing = import_module(module)
+    for part in rest.split("."):
+        module = f"{module}.{part}"
+        if hasattr(thing, part):
+            thing = getattr(thing, part)
+        elif getattr(thing, "__path__", None) and find_spec(module):
+            thing = import_module(module)
+        else:
+            return False
+    return True
