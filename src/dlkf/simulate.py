@@ -31,7 +31,8 @@ def main(cfg: DictConfig) -> None:
     drives = pd.read_parquet(out / "drives.parquet")
     hours = drives["duration_s"].sum() / 3600
     errors = config["dataset"]["imu_errors"]
-    imu = f"of {len(config['dataset']['fleet'])} types" if errors == "fleet" else config["imu"]["name"]
+    types = {"fleet": f"of {len(config['dataset'].get('fleet', ()))} types", "wide": "of a new type each"}
+    imu = types.get(errors, config["imu"]["name"])
     print(
         f"{out}: {hours:.3g} h of {'semi-real ' if config['source'] else ''}drives with IMU {imu} "
         f"({errors}), seed {config['seed']}, in {time.perf_counter() - start:.1f} s"

@@ -212,7 +212,7 @@ def test_rough_road_has_the_spectrum_of_iso_8608():
     """G_d(n) = G_d(0.1) (n/0.1)⁻² between 0.05 and 0.5 cycles/m; 40 km hold 500 of Welch's windows."""
     step = 0.25
     distance = np.arange(0, 40_000, step)
-    road = rough_road(np.random.default_rng(1), 64e-6, distance)
+    road = rough_road(np.random.default_rng(1), ChassisConfig(roughness=64e-6), distance)
     n, height = welch(road[:, 2], 1 / step, nperseg=640)
     for wave in (0.05, 0.1, 0.3):  # the mean of front and rear wheels takes cos²(π n 2.7)
         k = np.argmin(np.abs(n - wave))

@@ -19,6 +19,7 @@ BRINGS = {
     "paper_clean": "table3_standin",
     "paper_mems": "groves_consumer",
     "semi_real": "automotive_mems",
+    **dict.fromkeys(("wide", "calm"), "wide"),
     **dict.fromkeys(("lifelike", "city", "highway", "car_park", "tunnel", "fleet"), "lifelike_mems"),
 }
 

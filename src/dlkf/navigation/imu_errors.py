@@ -3,8 +3,9 @@
 Model (paper.md 2.7, paper eqs 7, 8): measured = (I + M) true + b + w, with M's diagonal the scale factors
 and its off-diagonal the misalignments, b a turn-on bias plus an in-run part that is first-order
 Gauss-Markov with time constant τ (a random walk of the same strength while t ≪ τ), w white noise.
-Optional, none by default: a rate random walk and a warm-up drift in b, a gyroscope's g-dependent error G f,
-quantisation and a full-scale range of what is put out (Groves 4.4).
+Optional, none by default: a rate random walk, a warm-up drift and a second, faster Gauss-Markov part in b, a
+gyroscope's g-dependent error G f, white noise that differs from axis to axis, quantisation and a full-scale range of
+what is put out (Groves 4.4).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 from dlkf.errors import InputError
+from dlkf.ranges import middle
 
 DEG = math.pi / 180
 MILLIGAL = 1e-5  # m/s²
@@ -28,7 +30,9 @@ class SensorErrors:
 
     Optional: ``random_walk`` K of the bias [unit/√s]; ``warm_up`` σ of the drift c (1 − exp(−t/``warm_up_time``))
     as the unit warms up after switching on [unit, s]; ``g_sensitivity`` of a gyroscope, σ of the entries of
-    G [rad/s per m/s²]; ``quantisation`` step of the output [unit], and its ``full_scale`` [unit], 0 for none.
+    G [rad/s per m/s²]; ``quantisation`` step of the output [unit], and its ``full_scale`` [unit], 0 for none;
+    ``wander`` σ of a part of the bias that forgets itself within ``wander_time`` [unit, s], as of a MEMS that feels its
+    supply and its mount; ``unevenness`` log-std of the factors by which the axes' white noise differs [–].
     """
 
     noise_density: float = 0.0
@@ -43,6 +47,9 @@ class SensorErrors:
     g_sensitivity: float = 0.0
     quantisation: float = 0.0
     full_scale: float = 0.0
+    wander: float = 0.0
+    wander_time: float = 5.0
+    unevenness: float = 0.0
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -51,8 +58,9 @@ class SensorErrors:
                 raise InputError(f"IMU preset: {f.name} is {value!r}, must be a finite number ≥ 0")
         if self.correlation_time <= 0:
             raise InputError("IMU preset: correlation_time is 0, must be positive seconds")
-        if self.warm_up > 0 and self.warm_up_time <= 0:
-            raise InputError("IMU preset: warm_up_time is 0, must be positive seconds")
+        for name in ("warm_up", "wander"):
+            if getattr(self, name) > 0 and getattr(self, f"{name}_time") <= 0:
+                raise InputError(f"IMU preset: {name}_time is 0, must be positive seconds")
         if 0 < self.full_scale < 2 * self.quantisation:
             raise InputError(
                 f"IMU preset: full_scale {self.full_scale} is below two steps of quantisation {self.quantisation}"
@@ -84,12 +92,16 @@ def imu_spec(config: Mapping) -> ImuSpec:
 
     Every number of both sensors but the optional ones has to be there, and no unknown one, so that a misspelt
     key cannot become a silent zero.
+    Of a preset with ranges (``conf/imu/wide.yaml``) it is the middle: what a filter is told of an IMU that can be any.
     Raises InputError for a missing or unknown key or a value that is no number ≥ 0.
     """
+    config = middle(config)
     name = str(config.get("name", "unnamed")) if isinstance(config, Mapping) else repr(config)
     _check_keys(config, {"name", "accel", "gyro"}, {"source"}, f"IMU preset {name}")
-    optional = {"random_walk", "warm_up", "warm_up_time", "g_sensitivity", "quantisation", "full_scale"}
-    needed = {f.name for f in fields(SensorErrors)} - optional
+    needed = {
+        "noise_density", "turn_on_bias", "instability", "correlation_time", "scale_factor", "misalignment",
+    }  # fmt: skip
+    optional = {f.name for f in fields(SensorErrors)} - needed
     sensors = {}
     for sensor in ("accel", "gyro"):
         where = f"IMU preset {name}, {sensor}"

@@ -21,8 +21,9 @@ from rich.progress import track
 from dlkf.data.schema import drive_file, new_dataset, write_drive, write_drives_table, write_parquet
 from dlkf.errors import InputError
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.ranges import draw, has_ranges, middle
 from dlkf.settings import built
-from dlkf.simulation.drive import Rates, Seeds, simulate_drive
+from dlkf.simulation.drive import DriveTables, Rates, Seeds, simulate_drive
 from dlkf.simulation.gnss.almanac import read_almanac
 from dlkf.simulation.gnss.receiver import Receiver, receiver_spec
 from dlkf.simulation.gnss.surroundings import Surroundings
@@ -33,15 +34,17 @@ from dlkf.simulation.motion.routes import VehicleConfig
 
 LONGEST_DRIVE = 240.0  # minutes; a drive is held in memory as a whole
 MOST_EPOCHS = 100_000  # of a drive with satellites, 2 GB
+OF_ALL_DRIVES = ("name", "hours", "drive_minutes", "imu_errors", "unit_seed")
 
 
 @dataclass(frozen=True)
 class DatasetConfig:
-    """What to simulate. ``imu_errors``: ``one`` unit for all drives, a new one ``per_drive``, or a ``fleet``.
+    """What to simulate. ``imu_errors``: ``one`` unit for all drives, a new one ``per_drive``, a ``fleet``, or ``wide``.
 
     With ``one``, turn-on bias, scale factors and misalignment are drawn once, from ``unit_seed``: the same
     IMU on other roads is another seed with the same ``unit_seed``. White noise and the in-run bias belong to
-    each drive either way. With ``fleet``, each drive has a new unit of a type drawn from ``fleet``.
+    each drive either way. With ``fleet``, each drive has a new unit of a type drawn from ``fleet``; with ``wide``, of
+    a type of its own, drawn from the ranges of the IMU preset.
     Fixes come from the satellites that a ``receiver`` sees, or have white noise without one; ``raw`` keeps its
     observations as well.
     """
@@ -83,8 +86,8 @@ class DatasetConfig:
                 raise InputError(
                     f"dataset: imu_rate_hz {self.imu_rate_hz} is not a multiple of {name} {rate}"
                 )
-        if self.imu_errors not in ("one", "per_drive", "fleet"):
-            raise InputError(f"dataset: imu_errors {self.imu_errors!r} must be one, per_drive or fleet")
+        if self.imu_errors not in ("one", "per_drive", "fleet", "wide"):
+            raise InputError(f"dataset: imu_errors {self.imu_errors!r} must be one, per_drive, fleet or wide")
         if self.imu_errors == "fleet" and not self.fleet:
             raise InputError("dataset: imu_errors is fleet, but fleet names no IMU presets (see simulated/fleet.yaml)")
         if not isinstance(self.unit_seed, int) or self.unit_seed < 0:
@@ -107,7 +110,11 @@ class DatasetConfig:
 
 
 def dataset_config(config: Mapping[str, Any]) -> DatasetConfig:
-    """A dataset from a mapping like ``conf/simulated/*.yaml``. InputError for unknown keys and odd values."""
+    """A dataset from a mapping like ``conf/simulated/*.yaml``, of ranges the middle.
+
+    InputError for unknown keys and odd values.
+    """
+    config = middle(config)
     if not isinstance(config, Mapping) or not isinstance(config.get("name"), str):
         raise InputError("dataset: name is missing, give it as in conf/simulated/*.yaml")
     fleet = config.get("fleet") or {}
@@ -116,43 +123,74 @@ def dataset_config(config: Mapping[str, Any]) -> DatasetConfig:
     return built(DatasetConfig, {**config, "fleet": {key: imu_spec(fleet[key]) for key in fleet}}, "dataset")
 
 
-def simulate_from_config(
-    config: Mapping[str, Any], out: str | Path, *, overwrite: bool = False, progress: bool = True
-) -> Path:
-    """Simulate what a mapping with ``dataset``, ``imu``, ``seed`` and perhaps ``workers`` says into ``out``.
+@dataclass(frozen=True)
+class Recipe:
+    """What a dataset is made by: settings of the whole, and those of a drive, which ranges may draw anew for each.
 
-    InputError as of :func:`dataset_config`, :func:`imu_spec` and :func:`simulate_dataset`.
+    ``ranges``: a mapping with ``dataset``, ``imu`` and ``receiver`` as :mod:`dlkf.ranges` has them, or none.
     """
-    settings, spec, seed = simulation_settings(config)
-    workers = config.get("workers")
-    if workers is not None and (not isinstance(workers, int) or workers < 1):
-        raise InputError(f"simulation: workers {workers!r} must be a whole number ≥ 1")
-    return simulate_dataset(
-        settings, spec, seed, Path(out), overwrite=overwrite, workers=workers, progress=progress
-    )
+
+    dataset: DatasetConfig
+    imu: ImuSpec
+    seed: int
+    ranges: Mapping[str, Any] | None = None
+
+    def of_drive(self, seed: np.random.SeedSequence) -> tuple[DatasetConfig, ImuSpec]:
+        """The settings of one drive. InputError where what was drawn is impossible."""
+        return (self.dataset, self.imu) if self.ranges is None else _settings(draw(self.ranges, seed))
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """All of it as plain values, ranges as ranges."""
+        plain = self.ranges or {"dataset": asdict(self.dataset), "imu": asdict(self.imu)}
+        return {"seed": self.seed, **plain}
 
 
-def simulation_settings(config: Mapping[str, Any]) -> tuple[DatasetConfig, ImuSpec, int]:
-    """Dataset, IMU and seed from a mapping with ``dataset``, ``imu``, ``seed``, perhaps ``receiver`` and ``raw``."""
+def recipe(config: Mapping[str, Any]) -> Recipe:
+    """What a mapping with ``dataset``, ``imu``, ``seed``, perhaps ``receiver`` and ``raw`` says; InputError if odd."""
     for key in ("dataset", "imu", "seed"):
         if config.get(key) is None:
             raise InputError(f"simulation: {key} is missing")
     seed = config["seed"]
     if not isinstance(seed, int) or seed < 0:
         raise InputError(f"simulation: seed {seed!r} must be a whole number ≥ 0")
-    gnss = {"receiver": receiver_spec(config.get("receiver")), "raw": config.get("raw", False)}
-    return replace(dataset_config(config["dataset"]), **gnss), imu_spec(config["imu"]), seed
+    plain = {key: config.get(key) for key in ("dataset", "imu", "receiver")} | {"raw": config.get("raw", False)}
+    settings, spec = _settings(middle(plain))
+    if not has_ranges(plain):
+        return Recipe(settings, spec, seed)
+    for key in OF_ALL_DRIVES:
+        if has_ranges(plain["dataset"].get(key)):
+            raise InputError(f"dataset: {key} is a range, but all drives have the same; give a value")
+    if has_ranges(plain["imu"]) and settings.imu_errors == "one":
+        raise InputError("imu: is drawn for every drive, but dataset.imu_errors is one; set dataset.imu_errors=wide")
+    return Recipe(settings, spec, seed, plain)
 
 
-def simulate_dataset(
-    config: DatasetConfig,
-    spec: ImuSpec,
-    seed: int,
-    out: Path,
-    *,
-    overwrite: bool = False,
-    workers: int | None = None,
-    progress: bool = True,
+def _settings(plain: Mapping[str, Any]) -> tuple[DatasetConfig, ImuSpec]:
+    settings = dataset_config(plain["dataset"])
+    return replace(settings, receiver=receiver_spec(plain["receiver"]), raw=plain["raw"]), imu_spec(plain["imu"])
+
+
+def simulate_from_config(
+    config: Mapping[str, Any], out: str | Path, *, overwrite: bool = False, progress: bool = True
+) -> Path:
+    """Simulate what a mapping with ``dataset``, ``imu``, ``seed`` and perhaps ``workers`` says into ``out``.
+
+    InputError as of :func:`recipe` and :func:`simulate_dataset`.
+    """
+    workers = config.get("workers")
+    if workers is not None and (not isinstance(workers, int) or workers < 1):
+        raise InputError(f"simulation: workers {workers!r} must be a whole number ≥ 1")
+    return simulate(recipe(config), Path(out), overwrite=overwrite, workers=workers, progress=progress)
+
+
+def simulate_dataset(config: DatasetConfig, spec: ImuSpec, seed: int, out: Path, **options: Any) -> Path:
+    """Write a dataset without ranges to ``out``, by :func:`simulate`."""
+    return simulate(Recipe(config, spec, seed), out, **options)
+
+
+def simulate(
+    made_by: Recipe, out: Path, *, overwrite: bool = False, workers: int | None = None, progress: bool = True
 ) -> Path:
     """Write the dataset to ``out``, whole or not at all, and return its path.
 
@@ -160,44 +198,54 @@ def simulate_dataset(
     core). Memory is that of ``workers`` drives, whatever the hours. InputError if ``out`` exists.
     """
     with new_dataset(out, overwrite) as folder:
-        _write_drives(config, spec, seed, folder, workers or os.cpu_count() or 1, progress)
+        _write_drives(made_by, folder, workers or os.cpu_count() or 1, progress)
     return out
 
 
-def _write_drives(
-    config: DatasetConfig, spec: ImuSpec, seed: int, folder: Path, workers: int, progress: bool
-) -> None:
-    durations = config.durations
-    shared = draw_unit(np.random.default_rng(np.random.SeedSequence(config.unit_seed, spawn_key=(0,))), spec)
+def drive_of(made_by: Recipe, index: int, seconds: int) -> tuple[DriveTables, dict[str, Any]]:
+    """Drive ``index`` of a dataset, ``seconds`` long: its tables, and its row of ``drives.parquet``."""
+    *seeds, unit_seed, surroundings, chassis, type_seed, ranges_seed = np.random.SeedSequence(
+        made_by.seed, spawn_key=(1, index)
+    ).spawn(8)
+    config, spec = made_by.of_drive(ranges_seed)
+    kind = imu_type(config, spec, type_seed)
+    if config.imu_errors == "one":
+        unit_seed = np.random.SeedSequence(config.unit_seed, spawn_key=(0,))
+    unit = draw_unit(np.random.default_rng(unit_seed), kind)
     rates = Rates(int(config.imu_rate_hz), config.gnss.rate_hz, int(config.reference_rate_hz))
+    tables = simulate_drive(
+        Seeds(*seeds, surroundings, chassis), seconds, rates, config.vehicle, config.chassis, config.surroundings,
+        kind, unit, config.gnss, config.receiver,
+    )  # fmt: skip
+    name = f"{config.name}-{made_by.seed}-{index:05d}"
+    row = {
+        "drive": name,
+        "group": name,
+        "source": f"simulation, seed {made_by.seed}, drive {index}",
+        "licence": "none: simulated",
+        "imu": kind.name,
+        "gnss": gnss_text(config),
+        "reference": "exact",
+        "imu_rate_hz": float(rates.imu_hz),
+        "gnss_rate_hz": float(rates.gnss_hz),
+        "duration_s": float(seconds),
+        **{f"lever_arm_{axis}_m": float(x) for axis, x in zip("xyz", config.gnss.lever_arm_b)},
+        **tables.facts,
+    }
+    if made_by.ranges is not None:
+        row["drawn"] = json.dumps({"dataset": asdict(config), "imu": asdict(spec)}, ensure_ascii=False)
+    return tables, row
+
+
+def _write_drives(made_by: Recipe, folder: Path, workers: int, progress: bool) -> None:
+    config = made_by.dataset
+    durations = config.durations
 
     def one(index: int) -> dict[str, Any]:
-        motion, imu, gnss, unit_seed, *others, type_seed = np.random.SeedSequence(seed, spawn_key=(1, index)).spawn(7)
-        kind = imu_type(config, spec, type_seed)
-        unit = shared if config.imu_errors == "one" else draw_unit(np.random.default_rng(unit_seed), kind)
-        seconds = durations[index]
-        tables = simulate_drive(
-            Seeds(motion, imu, gnss, *others), seconds, rates, config.vehicle, config.chassis, config.surroundings,
-            kind, unit, config.gnss, config.receiver,
-        )  # fmt: skip
-        name = f"{config.name}-{seed}-{index:05d}"
-        row = {
-            "drive": name,
-            "group": name,
-            "source": f"simulation, seed {seed}, drive {index}",
-            "licence": "none: simulated",
-            "imu": kind.name,
-            "gnss": gnss_text(config),
-            "reference": "exact",
-            "imu_rate_hz": float(rates.imu_hz),
-            "gnss_rate_hz": float(rates.gnss_hz),
-            "duration_s": float(seconds),
-            **{f"lever_arm_{axis}_m": float(x) for axis, x in zip("xyz", config.gnss.lever_arm_b)},
-            **tables.facts,
-        }
+        tables, row = drive_of(made_by, index, durations[index])
         write_drive(folder, row, tables.imu, tables.gnss, tables.reference)
         if config.raw:
-            write_raw(folder, name, tables.raw)
+            write_raw(folder, row["drive"], tables.raw)
         return row
 
     with ThreadPoolExecutor(workers) as pool:
@@ -213,8 +261,7 @@ def _write_drives(
             pool.shutdown(cancel_futures=True)
             raise
     write_drives_table(folder, [job.result() for job in jobs])
-    described = {"seed": seed, "dataset": asdict(config), "imu": asdict(spec)}
-    (folder / "simulation.json").write_text(json.dumps(described, indent=2, ensure_ascii=False) + "\n")
+    (folder / "simulation.json").write_text(json.dumps(made_by.described, indent=2, ensure_ascii=False) + "\n")
 
 
 def gnss_text(config: DatasetConfig) -> str:

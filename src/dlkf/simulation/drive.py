@@ -14,6 +14,7 @@ from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.simulation.gnss.receiver import Receiver
+from dlkf.simulation.gnss.reporting import late
 from dlkf.simulation.gnss.satellite_fixes import receive
 from dlkf.simulation.gnss.surroundings import Surroundings, sky_along
 from dlkf.simulation.gnss.white import GnssConfig
@@ -74,11 +75,11 @@ def simulate_drive(
     truth = axle if chassis.is_point and not vehicle.is_banked else mounted(chassis_rng, car, route, axle)
     true_imu = inverse_mechanisation(truth)
     measured, error = corrupt(imu_rng, true_imu, spec, unit, rates.imu_hz)
-    fixes = slice(None, None, round(rates.imu_hz / rates.gnss_hz))
+    fixes = np.arange(0, len(t), round(rates.imu_hz / rates.gnss_hz))
     rows = slice(None, None, rates.imu_hz // rates.reference_hz)
     sky = sky_along(sky_rng, surroundings, route.motion(t[fixes]).distance)
-    rate_b = _rate_at_rows(true_imu[:, 3:])[fixes]
-    received = receive(gnss_rng, sliced(truth, fixes), rate_b, gnss, receiver, sky)
+    seen, rate_b = late(truth, _rate_at_rows(true_imu[:, 3:]), fixes, gnss, rates.imu_hz)
+    received = receive(gnss_rng, seen, rate_b, gnss, receiver, sky)
     return DriveTables(
         imu=pd.DataFrame({"t": t[1:], **dict(zip((*ACCEL, *GYRO), measured.T))}),
         gnss=received.fixes,

@@ -81,7 +81,8 @@ def _inverse_mean_rotation(phi: Float[Tensor, "m 3"], u: Float[Tensor, "m 3"]) -
 @dataclass(frozen=True)
 class ImuUnit:
     """One drawn IMU: turn-on bias (6,), the matrices M of scale factor and misalignment (2, 3, 3), the final
-    warm-up drift (6,), and the gyroscope's g-sensitivity G (3, 3) [rad/s per m/s²].
+    warm-up drift (6,), the gyroscope's g-sensitivity G (3, 3) [rad/s per m/s²], and the factors (6,) of the axes'
+    white noise.
 
     Accelerometer first, then gyroscope, in m/s² and rad/s.
     """
@@ -90,10 +91,11 @@ class ImuUnit:
     matrix: Array
     warm_up: Array = field(default_factory=lambda: np.zeros(6))
     g_sensitivity: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    noise_factors: Array = field(default_factory=lambda: np.ones(6))
 
 
 def draw_unit(rng: np.random.Generator, spec: ImuSpec) -> ImuUnit:
-    """A unit of the preset's kind: every error an independent normal draw with the preset's 1σ."""
+    """A unit of the preset's kind: every error an independent normal draw with the preset's 1σ, noise log-normal."""
     bias, matrices = [], []
     for sensor in (spec.accel, spec.gyro):
         bias.append(sensor.turn_on_bias * rng.standard_normal(3))
@@ -101,7 +103,9 @@ def draw_unit(rng: np.random.Generator, spec: ImuSpec) -> ImuUnit:
         matrices.append(sigma * rng.standard_normal((3, 3)))
     warm_up = np.repeat((spec.accel.warm_up, spec.gyro.warm_up), 3) * rng.standard_normal(6)
     g_sensitivity = spec.gyro.g_sensitivity * rng.standard_normal((3, 3))
-    return ImuUnit(np.concatenate(bias), np.stack(matrices), warm_up, g_sensitivity)
+    unevenness = np.repeat((spec.accel.unevenness, spec.gyro.unevenness), 3)
+    factors = np.exp(unevenness * rng.standard_normal(6)) if unevenness.any() else np.ones(6)
+    return ImuUnit(np.concatenate(bias), np.stack(matrices), warm_up, g_sensitivity, factors)
 
 
 def corrupt(
@@ -112,14 +116,16 @@ def corrupt(
         error = M true + G f + b(t),   measured = put out(true + error + w),   std(w) = √S · √rate (R094)
 
     G f, with f the specific force, is in the rates alone. b(t) is the unit's turn-on bias and warm-up drift plus
-    the in-run bias of this drive. What is put out is limited to the full scale and rounded to whole steps of
-    the quantisation; neither is part of the error.
+    the in-run bias, the wander and the random walk of this drive. What is put out is limited to the full scale and
+    rounded to whole steps of the quantisation; neither is part of the error.
     """
     scaled = np.concatenate((true_imu[:, :3] @ unit.matrix[0].T, true_imu[:, 3:] @ unit.matrix[1].T), -1)
     sensors = (spec.accel, spec.gyro)
-    drift = [gauss_markov(rng, len(true_imu), sensor, rate_hz) for sensor in sensors]
+    drift = [
+        gauss_markov(rng, len(true_imu), sensor.instability, sensor.correlation_time, rate_hz) for sensor in sensors
+    ]
     error = scaled + unit.bias + np.concatenate(drift, -1)
-    density = np.repeat([sensor.noise_density for sensor in sensors], 3)
+    density = np.repeat([sensor.noise_density for sensor in sensors], 3) * unit.noise_factors
     noise = density * math.sqrt(rate_hz) * rng.standard_normal(true_imu.shape)
     if unit.g_sensitivity.any():
         error[:, 3:] += true_imu[:, :3] @ unit.g_sensitivity.T
@@ -130,6 +136,8 @@ def corrupt(
         if sensor.warm_up > 0:
             t = np.arange(1, len(true_imu) + 1) / rate_hz
             error[:, part] -= np.expm1(-t / sensor.warm_up_time)[:, None] * unit.warm_up[part]
+        if sensor.wander > 0:
+            error[:, part] += gauss_markov(rng, len(true_imu), sensor.wander, sensor.wander_time, rate_hz)
     measured = true_imu + error + noise
     for part, sensor in zip((slice(0, 3), slice(3, 6)), sensors):
         measured[:, part] = put_out(measured[:, part], sensor)
@@ -145,12 +153,12 @@ def put_out(x: Array, sensor: SensorErrors) -> Array:
     return x
 
 
-def gauss_markov(rng: np.random.Generator, samples: int, sensor: SensorErrors, rate_hz: float) -> Array:
-    """In-run bias (samples, 3): stationary first-order Gauss-Markov process, discretised exactly.
+def gauss_markov(rng: np.random.Generator, samples: int, sigma: float, time: float, rate_hz: float) -> Array:
+    """A wandering bias (samples, 3): stationary first-order Gauss-Markov process, discretised exactly.
 
-    b₀ ~ N(0, σ²), b_k = a b_{k−1} + σ √(1 − a²) n_k with a = exp(−1/(rate τ)).
+    b₀ ~ N(0, σ²), b_k = a b_{k−1} + σ √(1 − a²) n_k with a = exp(−1/(rate τ)), τ the ``time`` [s].
     """
-    step = -1 / (rate_hz * sensor.correlation_time)
-    n = sensor.instability * rng.standard_normal((samples, 3))
+    step = -1 / (rate_hz * time)
+    n = sigma * rng.standard_normal((samples, 3))
     n[1:] *= math.sqrt(-math.expm1(2 * step))
     return np.asarray(lfilter([1.0], [1.0, -math.exp(step)], n, axis=0))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,7 @@ from dlkf.navigation.attitude import rpy_from_rotation
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.simulation.dataset import DatasetConfig, gnss_text, imu_type, simulation_settings, write_raw
+from dlkf.simulation.dataset import DatasetConfig, Recipe, gnss_text, imu_type, recipe, write_raw
 from dlkf.simulation.gnss.satellite_fixes import Received, receive
 from dlkf.simulation.gnss.surroundings import Sky, sky_along
 from dlkf.simulation.imu import ImuUnit, corrupt, draw_unit
@@ -45,17 +44,12 @@ def semi_real_from_config(
     config: Mapping[str, Any], out: str | Path, *, overwrite: bool = False, progress: bool = True
 ) -> Path:
     """Semi-real drives as a mapping with ``source``, ``dataset``, ``imu``, ``seed`` and so on says, into ``out``."""
-    settings, spec, seed = simulation_settings(config)
-    return simulate_semi_real(
-        config["source"], settings, spec, seed, Path(out), overwrite=overwrite, progress=progress
-    )
+    return simulate_semi_real(config["source"], recipe(config), Path(out), overwrite=overwrite, progress=progress)
 
 
 def simulate_semi_real(
     source: str | Path,
-    config: DatasetConfig,
-    spec: ImuSpec,
-    seed: int,
+    made_by: Recipe,
     out: Path,
     *,
     overwrite: bool = False,
@@ -63,21 +57,25 @@ def simulate_semi_real(
 ) -> Path:
     """Write every drive of the dataset ``source`` to ``out`` with IMU errors injected and GNSS made anew.
 
-    Of ``config`` the IMU errors, surroundings, gnss, receiver and raw count; motion, rates and lengths are the
+    Of the recipe the IMU errors, surroundings, gnss, receiver and raw count; motion, rates and lengths are the
     source's. The columns of the true IMU error hold the injected part only. InputError for a drive without a
     usable reference, or whose IMU errors are known already (it is no real drive).
     """
     rows = read_drives(source)
     described = pq.read_table(Path(source) / "drives.parquet").to_pandas().to_dict("records")
-    shared = draw_unit(np.random.default_rng(np.random.SeedSequence(config.unit_seed, spawn_key=(0,))), spec)
-    shown = track(rows, f"semi-real {config.name}", disable=not progress, console=Console(stderr=True))
+    shown = track(rows, f"semi-real {made_by.dataset.name}", disable=not progress, console=Console(stderr=True))
     with closing(iter(shown)) as drives, new_dataset(out, overwrite) as folder:  # type: ignore[type-var]
         written = []
         for index, drive in enumerate(drives):
             tables = read_checked(source, drive)
-            *streams, unit_seed, type_seed = np.random.SeedSequence(seed, spawn_key=(2, index)).spawn(5)
+            *streams, unit_seed, type_seed, ranges_seed = np.random.SeedSequence(
+                made_by.seed, spawn_key=(2, index)
+            ).spawn(6)
+            config, spec = made_by.of_drive(ranges_seed)
             kind = imu_type(config, spec, type_seed)
-            unit = shared if config.imu_errors == "one" else draw_unit(np.random.default_rng(unit_seed), kind)
+            if config.imu_errors == "one":
+                unit_seed = np.random.SeedSequence(config.unit_seed, spawn_key=(0,))
+            unit = draw_unit(np.random.default_rng(unit_seed), kind)
             imu_rng, gnss_rng, sky_rng = (np.random.default_rng(stream) for stream in streams)
             imu, reference = injected(imu_rng, tables, kind, unit)
             received, rough = gnss_of_reference(gnss_rng, sky_rng, tables, config)
@@ -87,7 +85,7 @@ def simulate_semi_real(
                 write_raw(folder, drive.name, received.raw)
         write_drives_table(folder, written)
         validate_dataset(folder)
-        settings = {"source": str(source), "seed": seed, "dataset": asdict(config), "imu": asdict(spec)}
+        settings = {"source": str(source), **made_by.described}
         (folder / "simulation.json").write_text(json.dumps(settings, indent=2, ensure_ascii=False) + "\n")
     return out
 

@@ -16,15 +16,15 @@ from dlkf.simulation.gnss.almanac import Almanac, read_almanac
 from dlkf.simulation.gnss.least_squares import Observations, Solution, solve
 from dlkf.simulation.gnss.obstruction import held, in_view
 from dlkf.simulation.gnss.receiver import Receiver, clock, range_errors
+from dlkf.simulation.gnss.reporting import reported
 from dlkf.simulation.gnss.satellites import L1, LIGHT, Signals, ned_at, signals
 from dlkf.simulation.gnss.surroundings import Sky
-from dlkf.simulation.gnss.white import GnssConfig, antenna, observe, shifted
+from dlkf.simulation.gnss.white import FLOAT, GnssConfig, antenna, observe, shifted
 from dlkf.simulation.motion.vehicle import Truth
 
 Array = NDArray[np.float64]
 WEEK = 604800  # s
 FOR_FIX = 5  # satellites that resolve carrier ambiguities
-FLOAT = 5  # NMEA GGA code: RTK with open ambiguities
 
 
 class Received(NamedTuple):
@@ -51,9 +51,12 @@ def receive(
     sky: Sky | None = None,
 ) -> Received:
     """GNSS at every row of ``truth``: white noise around the truth without a ``receiver``, else from satellites."""
+    (reporting_rng,) = rng.spawn(1)
     if receiver is None:
-        return Received(observe(rng, truth, rate_b, config, sky), None)
-    return observe_satellites(rng, truth, rate_b, config, receiver, sky)
+        received = Received(observe(rng, truth, rate_b, config, sky), None)
+    else:
+        received = observe_satellites(rng, truth, rate_b, config, receiver, sky)
+    return Received(reported(reporting_rng, received.fixes, config), received.raw)
 
 
 def observe_satellites(

@@ -13,10 +13,13 @@ from numpy.typing import NDArray
 from dlkf.errors import InputError
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.earth import EARTH_RATE, ECCENTRICITY_SQ, transverse_radius
+from dlkf.simulation.gnss.receiver import gauss_markov
 from dlkf.simulation.gnss.surroundings import Sky
 from dlkf.simulation.motion.vehicle import Truth
 
 QUALITIES = (1, 2, 4, 5)
+FLOAT = 5  # NMEA GGA code: RTK with open ambiguities
+AXES = np.array((1.0, 1.0, 1.5))  # of errors that last, north, east, down
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,13 @@ class GnssConfig:
 
     Std of a fix is √(σ² + s²), and is what the fix claims. ``quality`` is an NMEA GGA code;
     ``lever_arm_b`` runs from the IMU to the antenna in body axes [m].
+
+    What receivers do besides, nothing by default: position and velocity are ``position_lag_s`` and
+    ``velocity_lag_s`` older than their stamp; claimed stds are ``std_factor`` times the true ones; fixes are missing
+    for ``dropout_share`` of the time, ``dropout_s`` at a time. Without satellites only, as with them it comes of the
+    receiver: ``wander`` [m], 1σ per horizontal axis and half as much again vertically, Gauss-Markov with a time
+    constant of ``wander_s`` (multipath), which the claimed std includes; and for ``float_share`` of the time,
+    ``float_s`` at a time, carrier ambiguities are open: a Gauss-Markov error of ``float_std`` [m], quality 5.
     """
 
     rate_hz: float = 1.0
@@ -35,6 +45,16 @@ class GnssConfig:
     s_v: float = 0.0  # m/s
     quality: int = 4
     lever_arm_b: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    position_lag_s: float = 0.0
+    velocity_lag_s: float = 0.0
+    std_factor: float = 1.0
+    dropout_share: float = 0.0
+    dropout_s: float = 3.0
+    wander: float = 0.0
+    wander_s: float = 30.0
+    float_share: float = 0.0
+    float_s: float = 30.0
+    float_std: float = 0.3
 
     def __post_init__(self) -> None:
         for name in ("std_horizontal", "std_vertical", "std_velocity"):
@@ -42,6 +62,14 @@ class GnssConfig:
                 raise InputError(f"gnss: {name} {getattr(self, name)} must be positive")
         if not (0 <= self.s_p < 1e4 and 0 <= self.s_v < 1e4):
             raise InputError(f"gnss: s_p {self.s_p} and s_v {self.s_v} must not be negative")
+        limits = {
+            "position_lag_s": (0, 1), "velocity_lag_s": (0, 1), "std_factor": (0.05, 20), "dropout_share": (0, 0.9),
+            "dropout_s": (0.1, 600), "wander": (0, 100), "wander_s": (0.1, 1e4), "float_share": (0, 1),
+            "float_s": (1, 1e4), "float_std": (0, 100),
+        }  # fmt: skip
+        for name, (low, high) in limits.items():
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"gnss: {name} {getattr(self, name)} is outside {low:g} to {high:g}")
         if self.quality not in QUALITIES:
             raise InputError(f"gnss: quality {self.quality} is none of {QUALITIES} (NMEA GGA codes)")
         if len(self.lever_arm_b) != 3 or not all(math.isfinite(x) and abs(x) < 100 for x in self.lever_arm_b):
@@ -67,6 +95,12 @@ def observe(
     """
     arm, antenna_v_n = antenna(truth, rate_b, config.lever_arm_b)
     error = config.std * rng.standard_normal((len(truth.t), 6))
+    wandering, is_float = _wandering(rng.spawn(1)[0], truth.t, config)
+    error[:, :3] += wandering
+    std = np.broadcast_to(config.std, error.shape).copy()
+    if config.wander > 0 or config.float_share > 0:
+        sizes = np.hypot(config.wander, config.float_std * is_float)[:, None] * AXES
+        std[:, :3] = np.hypot(std[:, :3], sizes)
     lat, lon, height = shifted(truth, arm + error[:, :3])
     velocity = antenna_v_n + error[:, 3:]
     columns = {
@@ -75,13 +109,41 @@ def observe(
         "lon_deg": np.degrees(lon),
         "height_m": height,
         **{f"vel_{axis}": velocity[:, k] for k, axis in enumerate("ned")},
-        **{f"std_pos_{axis}": config.std[k] for k, axis in enumerate("ned")},
-        **{f"std_vel_{axis}": config.std[3 + k] for k, axis in enumerate("ned")},
+        **{f"std_pos_{axis}": std[:, k] for k, axis in enumerate("ned")},
+        **{f"std_vel_{axis}": std[:, 3 + k] for k, axis in enumerate("ned")},
     }
     table = pd.DataFrame(columns)
-    table["quality"] = np.full(len(table), config.quality, dtype=np.int64)
+    table["quality"] = np.where(is_float, FLOAT, config.quality).astype(np.int64)
     return table if sky is None else table.loc[~sky.blocked].reset_index(drop=True)
 
+
+def _wandering(
+    rng: np.random.Generator, t: NDArray[np.float64], config: GnssConfig
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Errors (N, 3) [m] in NED that last, by multipath and open ambiguities, and where the latter are open (N,)."""
+    error, is_float = np.zeros((len(t), 3)), np.zeros(len(t), dtype=bool)
+    dt = float(t[1] - t[0]) if len(t) > 1 else 1.0
+    if config.wander > 0:
+        error += config.wander * AXES * gauss_markov(rng, error.shape, config.wander_s, dt)
+    if config.float_share > 0:
+        is_float = episodes(rng, t, config.float_share, config.float_s)
+        error += config.float_std * AXES * gauss_markov(rng, error.shape, config.float_s, dt) * is_float[:, None]
+    return error, is_float
+
+
+def episodes(
+    rng: np.random.Generator, t: NDArray[np.float64], share: float, mean_s: float
+) -> NDArray[np.bool_]:
+    """Times (N,) that lie within random episodes of a mean length [s], exponential, which make a share of the time."""
+    if share >= 1:
+        return np.ones(len(t), dtype=bool)
+    between = mean_s * (1 - share) / share
+    mean = (float(t[-1] - t[0]) if len(t) else 0.0) / (mean_s + between)
+    count = 2 + int(mean + 10 * math.sqrt(mean))  # ten sigma more than it takes
+    starts_in = bool(rng.random() < share)
+    spans = rng.exponential((mean_s, between) if starts_in else (between, mean_s), (count, 2)).ravel()
+    odd = np.searchsorted(np.cumsum(spans), t - (t[0] if len(t) else 0.0), side="right") % 2 == 1
+    return odd != starts_in
 
 def antenna(
     truth: Truth, rate_b: NDArray[np.float64], lever_arm_b: tuple[float, float, float]

@@ -3,17 +3,17 @@
 The rear axle follows the road exactly; on top of it comes a chain of rotations, each with its rate, from the
 path through the car to the IMU:
 
-    C_nb = C_path(slope, course) · R_x(bank) · R_z(−β) · R_y(pitch) R_x(roll) · C_mounting
+    C_nb = C_path(slope, course) · R_x(bank) · R_z(−β) · R_y(pitch) R_x(roll) · C_shaken · C_mounting
 
-and the IMU stands off the axle by o = R_x R_z (d + R_y R_x l), with d heave and vibration and l its place in
-the car. Position and velocity of the IMU are those of the axle plus o and its derivative by the product rule,
-so nothing is integrated and truth stays exact at any sample rate.
+and the IMU stands off the axle by o = R_x R_z (d + R_y R_x l), with d heave, vibration and shaking and l its place
+in the car; C_shaken is what the mount itself turns (``shaking``). Position and velocity of the IMU are those of the
+axle plus o and its derivative by the product rule, so nothing is integrated and truth stays exact at any sample rate.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import torch
@@ -24,19 +24,20 @@ from scipy.signal import bilinear, lfilter, lfilter_zi
 from dlkf.errors import InputError
 from dlkf.navigation.attitude import rotation_from_rpy, rpy_from_rotation
 from dlkf.simulation.motion.routes import Kinematics
+from dlkf.simulation.motion.shaking import Shaking, shaken
 from dlkf.simulation.motion.vehicle import Route, Truth, Waves, radians_per_metre, random_waves
 
 Array = NDArray[np.float64]
 GRAVITY = 9.81  # m/s², for the load on the springs alone
 NODE_HZ = 100  # suspension is solved at this rate, whatever the IMU's, and a spline lies between
-BODY_HZ, BODY_DAMPING = 1.4, 0.35  # sprung mass on its springs
-WHEEL_HZ, WHEEL_DAMPING = 12.0, 0.5  # unsprung mass on its tyres
-WHEELBASE, TRACK = 2.7, 1.55  # m
 PROFILE_STEP = 0.25  # m, about the length of a tyre's contact
 FULL_WAVE, ROLL_WAVE = 0.01, 0.1  # cycles/m below which the rough road is flat, for heave and across
 # vibration: cycles per second at rest, cycles per metre driven, share of the power
 TONES = ((24.0, 0.5, 0.5), (12.0, 0.25, 0.2), (0.0, 0.51, 0.3))  # engine firing, half of it, a wheel's turn
 TONE_SPEED = 15.0  # m/s at which the vibration has its stated size
+SHAPE = (  # of what moves, if anything does
+    "body_hz", "body_damping", "wheel_hz", "wheel_damping", "wheelbase", "track", "roughness_length", "shaking",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -48,10 +49,15 @@ class ChassisConfig:
     the dynamic index I_z/(m l_f l_r) is one); ``slip_noise`` [rad] is the RMS of what side wind and ruts add, in
     waves of 20 to 300 m. Suspension: the body rolls outwards by ``roll_gradient`` and
     pitches back by ``pitch_gradient`` [rad per m/s² of specific force], with a second-order lag.
-    ``roughness``: ISO 8608 G_d(0.1/m) [m³] (a good road 16e-6, an average one 64e-6). ``vibration`` [m/s²] and
-    ``vibration_rate`` [rad/s]: RMS per axis at 15 m/s. ``imu_arm``: rear axle → IMU, forward, right, down [m].
-    ``mounting_deg``: roll, pitch, yaw of the IMU in the car. Each drive has a car of its own: 1σ
-    ``imu_arm_std`` [m] and ``mounting_std_deg`` per axis, and ``spread``, relative, of slip and suspension.
+    ``body_hz``, ``body_damping``: sprung mass on its springs; ``wheel_hz``, ``wheel_damping``: unsprung mass on its
+    tyres; ``wheelbase``, ``track`` [m].
+    ``roughness``: ISO 8608 G_d(0.1/m) [m³] (classes A to E: 16, 64, 256, 1024, 4096 · 1e-6), which changes by stretches
+    of ``roughness_length`` [m] on average (exponential) by a log-normal factor of the amplitude, log-std
+    ``roughness_spread`` (0.7 is one class). ``vibration`` [m/s²] and ``vibration_rate`` [rad/s]: RMS per axis at
+    15 m/s of tones that follow the speed; ``shaking``: what does not tell it.
+    ``imu_arm``: rear axle → IMU, forward, right, down [m]. ``mounting_deg``: roll, pitch, yaw of the IMU in the car.
+    Each drive has a car of its own: 1σ ``imu_arm_std`` [m] and ``mounting_std_deg`` per axis, and ``spread``, relative,
+    of slip and suspension.
     """
 
     sideslip: float = 0.0
@@ -66,15 +72,29 @@ class ChassisConfig:
     mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     mounting_std_deg: float = 0.0
     spread: float = 0.0
+    body_hz: float = 1.4
+    body_damping: float = 0.35
+    wheel_hz: float = 12.0
+    wheel_damping: float = 0.5
+    wheelbase: float = 2.7
+    track: float = 1.55
+    roughness_spread: float = 0.0
+    roughness_length: float = 300.0
+    shaking: Shaking = field(default_factory=Shaking)
 
     def __post_init__(self) -> None:
         limits = {
-            "sideslip": 0.05, "slip_noise": 0.05, "roll_gradient": 0.05, "pitch_gradient": 0.05, "roughness": 2e-3,
+            "sideslip": 0.05, "slip_noise": 0.05, "roll_gradient": 0.05, "pitch_gradient": 0.05, "roughness": 1e-2,
             "vibration": 20.0, "vibration_rate": 0.5, "imu_arm_std": 2.0, "mounting_std_deg": 10.0, "spread": 0.5,
+            "roughness_spread": 2.0,
         }  # fmt: skip
-        for name, limit in limits.items():
-            if not 0 <= getattr(self, name) <= limit:
-                raise InputError(f"chassis: {name} {getattr(self, name)} is outside 0 to {limit:g}")
+        ranges = {name: (0, limit) for name, limit in limits.items()} | {
+            "body_hz": (0.5, 5), "body_damping": (0.05, 1), "wheel_hz": (5, 25), "wheel_damping": (0.05, 1),
+            "wheelbase": (1, 8), "track": (0.5, 3), "roughness_length": (10, 1e5),
+        }  # fmt: skip
+        for name, (low, high) in ranges.items():
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"chassis: {name} {getattr(self, name)} is outside {low:g} to {high:g}")
         for name, limit in (("imu_arm", 10.0), ("mounting_deg", 45.0)):
             value = getattr(self, name)
             if len(value) != 3 or not all(abs(x) <= limit for x in value):
@@ -83,7 +103,8 @@ class ChassisConfig:
     @property
     def is_point(self) -> bool:
         """Whether there is nothing to a car of this kind but its rear axle."""
-        return all(not np.any(getattr(self, f.name)) for f in fields(self))
+        added = [name for name in (f.name for f in fields(self)) if name not in SHAPE]
+        return self.shaking.is_still and not any(np.any(getattr(self, name)) for name in added)
 
 
 @dataclass(frozen=True)
@@ -123,11 +144,12 @@ def slip_angle(car: Car, route: Route, motion: Kinematics) -> tuple[Array, Array
 
 def mounted(rng: np.random.Generator, car: Car, route: Route, axle: Truth) -> Truth:
     """Truth of the IMU in a car whose rear axle moves as ``axle`` does along ``route``."""
-    ride_rng, tone_rng = rng.spawn(2)
+    ride_rng, tone_rng, stretch_rng, shaking_rng = rng.spawn(4)
     motion = route.motion(axle.t)
     slope, slope_rate = route.slope.at(motion)
     slip, slip_rate = slip_angle(car, route, motion)
-    suspended = suspension(ride_rng, car, route, float(axle.t[-1]))
+    stretches = draw_stretches(stretch_rng, car.kind, float(np.ptp(motion.distance)))
+    suspended = suspension(ride_rng, car, route, float(axle.t[-1]), stretches)
     roll, pitch, heave = suspended(axle.t).T
     roll_rate, pitch_rate, heave_rate = suspended(axle.t, nu=1).T
     shake, shake_rate = vibration(tone_rng, car.kind, motion)
@@ -139,16 +161,56 @@ def mounted(rng: np.random.Generator, car: Car, route: Route, axle: Truth) -> Tr
     moved, moved_rate = shake[:, :3].copy(), shake_rate[:, :3].copy()
     moved[:, 2] -= heave
     moved_rate[:, 2] -= heave_rate
+    mount = None
+    if not car.kind.shaking.is_still:
+        mount = shaken(
+            shaking_rng, car.kind.shaking, route.motion, axle.t, lambda t: stretches.at(route.motion(t).distance),
+            lambda t: loads(route, route.motion(t)),
+        )  # fmt: skip
+        moved += mount.moved
+        moved_rate += mount.moved_rate
     offset, change = _rotated(C, moved), _rotated(C, np.cross(rate, moved) + moved_rate)
     C, rate = _turned(C, rate, 1, pitch + shake[:, 4], pitch_rate + shake_rate[:, 4])
     C, rate = _turned(C, rate, 0, roll + shake[:, 3], roll_rate + shake_rate[:, 3])
     arm = np.broadcast_to(car.imu_arm, rate.shape)
     offset += _rotated(C, arm)
     change += _rotated(C, np.cross(rate, arm))
+    if mount is not None:
+        C = C @ rotation_from_rpy(torch.from_numpy(mount.turned)).numpy()
     return _shifted(axle, offset, change, C @ rotation_from_rpy(torch.from_numpy(car.mounting)).numpy())
 
 
-def suspension(rng: np.random.Generator, car: Car, route: Route, end: float) -> BSpline:
+@dataclass(frozen=True)
+class Stretches:
+    """The roughness of a road relative to its mean (amplitude), by stretches that end at ``ends`` [m]."""
+
+    ends: Array
+    factors: Array
+
+    def at(self, distance: Array) -> Array:
+        """The factor at distances from the road's start [m]."""
+        return self.factors[np.minimum(np.searchsorted(self.ends, distance, side="right"), len(self.factors) - 1)]
+
+
+def draw_stretches(rng: np.random.Generator, kind: ChassisConfig, length: float) -> Stretches:
+    """Stretches of a road as long as that [m]; a single one where the kind has no spread."""
+    if kind.roughness_spread == 0:
+        return Stretches(np.array((math.inf,)), np.ones(1))
+    mean = length / kind.roughness_length
+    count = 2 + int(mean + 10 * math.sqrt(mean))  # ten sigma more than it takes
+    ends = np.cumsum(kind.roughness_length * rng.standard_exponential(count))
+    return Stretches(ends, np.exp(kind.roughness_spread * rng.standard_normal(count)))
+
+
+def loads(route: Route, motion: Kinematics) -> tuple[Array, Array]:
+    """Specific force along the road, forward and to the right [m/s²]."""
+    forward = motion.acceleration + GRAVITY * route.slope.at(motion)[0]
+    return forward, motion.speed * motion.yaw_rate - GRAVITY * route.bank(motion)[0]
+
+
+def suspension(
+    rng: np.random.Generator, car: Car, route: Route, end: float, stretches: Stretches | None = None
+) -> BSpline:
     """Roll, pitch [rad] and heave [m, up] of the body against the road, until ``end`` [s], as a spline.
 
     Each is a sprung mass: driven by the load it settles at gradient · specific force, H = ω²/(s² + 2ζωs + ω²);
@@ -156,20 +218,21 @@ def suspension(rng: np.random.Generator, car: Car, route: Route, end: float) -> 
     """
     nodes = np.arange(math.ceil(end * NODE_HZ) + 1) / NODE_HZ
     motion = route.motion(nodes)
-    forward = motion.acceleration + GRAVITY * route.slope.at(motion)[0]
-    right = motion.speed * motion.yaw_rate - GRAVITY * route.bank(motion)[0]
+    forward, right = loads(route, motion)
     load = np.stack((-car.roll_gradient * right, car.pitch_gradient * forward, np.zeros_like(nodes)), -1)
-    w, z = 2 * math.pi * BODY_HZ, BODY_DAMPING
+    w, z = 2 * math.pi * car.kind.body_hz, car.kind.body_damping
     body = _filtered([w * w], [1, 2 * z * w, w * w], load)
     if car.kind.roughness > 0:
-        road = rough_road(rng, car.kind.roughness, motion.distance)
-        u, y = 2 * math.pi * WHEEL_HZ, WHEEL_DAMPING
+        road = rough_road(rng, car.kind, motion.distance, stretches)
+        u, y = 2 * math.pi * car.kind.wheel_hz, car.kind.wheel_damping
         wheels = _filtered([u * u], [1, 2 * y * u, u * u], road)
         body += _filtered([2 * z * w, w * w], [1, 2 * z * w, w * w], wheels)
     return make_interp_spline(nodes, body, k=5)
 
 
-def rough_road(rng: np.random.Generator, roughness: float, distance: Array) -> Array:
+def rough_road(
+    rng: np.random.Generator, kind: ChassisConfig, distance: Array, stretches: Stretches | None = None
+) -> Array:
     """Roll, pitch [rad] and height [m] of the road under four wheels at distances (N,) → (N, 3) (ISO 8608).
 
     G_d(n) = G_d(n₀) (n/n₀)⁻², n₀ = 0.1/m: a white slope of one-sided PSD (2π n₀)² G_d(n₀), made leaky, so that
@@ -177,17 +240,19 @@ def rough_road(rng: np.random.Generator, roughness: float, distance: Array) -> A
     by a profile of their own, below 10 m wavelength.
     """
     distance = distance - distance.min()
-    count = int((distance.max() + 2 * WHEELBASE) / PROFILE_STEP) + 3
-    steepness = math.sqrt((0.2 * math.pi) ** 2 * roughness / (2 * PROFILE_STEP))
+    count = int((distance.max() + 2 * kind.wheelbase) / PROFILE_STEP) + 3
+    steepness = math.sqrt((0.2 * math.pi) ** 2 * kind.roughness / (2 * PROFILE_STEP))
     white = steepness * PROFILE_STEP * rng.standard_normal((2, count))
+    if stretches is not None and len(stretches.factors) > 1:
+        white *= stretches.at(PROFILE_STEP * np.arange(count))
     along, across = (
         lfilter([1.0], [1.0, -math.exp(-2 * math.pi * wave * PROFILE_STEP)], x)
         for wave, x in zip((FULL_WAVE, ROLL_WAVE), white)
     )
     at = PROFILE_STEP * np.arange(count)
-    rear, front = (np.interp(distance + shift, at, along) for shift in (0.0, WHEELBASE))
-    roll = math.sqrt(2) * np.interp(distance, at, across) / TRACK
-    return np.stack((roll, (front - rear) / WHEELBASE, 0.5 * (front + rear)), -1)
+    rear, front = (np.interp(distance + shift, at, along) for shift in (0.0, kind.wheelbase))
+    roll = math.sqrt(2) * np.interp(distance, at, across) / kind.track
+    return np.stack((roll, (front - rear) / kind.wheelbase, 0.5 * (front + rear)), -1)
 
 
 def vibration(rng: np.random.Generator, kind: ChassisConfig, motion: Kinematics) -> tuple[Array, Array]:
