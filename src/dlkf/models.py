@@ -10,7 +10,7 @@ from typing import Any
 from dlkf.errors import InputError
 from dlkf.filters.build import build_filter, is_filter, known_filters
 from dlkf.filters.integration import Estimator
-from dlkf.filters.learned import CONFIG, WEIGHTS, load_filter
+from dlkf.filters.saved import CONFIG, WEIGHTS, load_filter
 from dlkf.navigation.imu_errors import ImuSpec
 
 RUN_ID = re.compile(r"[0-9a-f]{32}")

@@ -15,7 +15,8 @@ import torch
 import yaml
 
 from dlkf.data.schema import drive_file
-from dlkf.filters.learned import LearnedConfig, LearnedFilter, save_filter
+from dlkf.filters.learned import LearnedConfig, LearnedFilter
+from dlkf.filters.saved import save_filter
 
 from .conftest import in_shell
 

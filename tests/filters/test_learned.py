@@ -9,7 +9,8 @@ from safetensors.torch import load_file, save_file
 
 from dlkf.errors import InputError
 from dlkf.filters.integration import integrate
-from dlkf.filters.learned import LearnedConfig, LearnedFilter, load_filter, save_filter
+from dlkf.filters.learned import LearnedConfig, LearnedFilter
+from dlkf.filters.saved import load_filter, save_filter
 from dlkf.running.batched import take
 
 from .scene import scene

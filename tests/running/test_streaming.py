@@ -18,6 +18,7 @@ from dlkf.data.validate import DriveTables, read_checked
 from dlkf.errors import InputError
 from dlkf.filters.build import build_filter
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
+from dlkf.filters.plus import PARTS, PlusConfig, PlusFilter
 from dlkf.navigation.earth import tangent_frame
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.navigation.state import NavState
@@ -67,7 +68,19 @@ def network(**settings) -> LearnedFilter:
     return model.double()
 
 
+def plus() -> PlusFilter:
+    """A small one with weights, whose speed takes part."""
+    torch.manual_seed(0)
+    model = PlusFilter(PlusConfig.from_mapping({"parts": PARTS, "network": {"hidden": 16}})).eval()
+    for p in model.heads():
+        torch.nn.init.normal_(p, std=0.2)
+    model.network.speed.bias.data[1] = -4.0
+    return model.double()
+
+
 def estimator(name: str):
+    if name == "plus":
+        return plus()
     return network(outage_mode=name[4:]) if name.startswith("net_") else build_filter(name, IMU)
 
 
@@ -107,7 +120,7 @@ def until(tables: DriveTables, t: float) -> DriveTables:
 ROUNDING = 1e-8
 
 
-@pytest.mark.parametrize("name", ["mbkf15", "mbkf21_nhc", "mbkf15_gated", "net_hold", "net_run"])
+@pytest.mark.parametrize("name", ["mbkf15", "mbkf21_nhc", "mbkf15_gated", "net_hold", "net_run", "plus"])
 def test_a_stream_gives_the_batch_s_solution(piece, name):
     """At the first try, and when fixes come late and out of order from before the alignment on."""
     whole = batch(piece, name)
@@ -297,7 +310,7 @@ def test_put_away_and_taken_up_again_it_goes_on(piece):
 @pytest.mark.parametrize(
     "name,metres",
     # with an outage of 25 s: gravity is good to 1e-8 m/s² within a kilometre, the linear model to its square
-    [("mbkf21_nhc_gated", 1e-4), ("aekf", 1e-2), ("ins", 2e-2)],
+    [("mbkf21_nhc_gated", 1e-4), ("plus", 2e-3), ("aekf", 1e-2), ("ins", 2e-2)],
 )
 def test_moving_the_frame_along_changes_nothing(drive, name, metres):
     tables = some(drive, (drive.gnss["t"] < 25) | (drive.gnss["t"] > 50), "gnss")

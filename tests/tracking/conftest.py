@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from dlkf.filters.learned import LearnedConfig, LearnedFilter, save_filter
+from dlkf.filters.learned import LearnedConfig, LearnedFilter
+from dlkf.filters.saved import save_filter
 from dlkf.tracking.grid import PARENT_RUN, SWEPT
 from dlkf.tracking.runs import SQLITE, mlflow_module
 from tests.data.conftest import write_cars

@@ -10,7 +10,7 @@ import torch
 
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
-from dlkf.filters.learned import load_filter
+from dlkf.filters.saved import load_filter
 from dlkf.running.offline import navigate_drives
 from dlkf.tracking.registry import check_registration, download_model, log_model
 from dlkf.tracking.runs import mlflow_module, start_run

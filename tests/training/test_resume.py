@@ -89,7 +89,8 @@ def test_kill_minus_nine_changes_nothing(dataset, tmp_path, request):
 def test_training_moves_towards_the_reference(dataset, tmp_path):
     """The loss falls on a tiny network in a few epochs."""
     from dlkf.filters.integration import integrate
-    from dlkf.filters.learned import LearnedConfig, LearnedFilter, load_filter
+    from dlkf.filters.learned import LearnedConfig, LearnedFilter
+    from dlkf.filters.saved import load_filter
     from dlkf.training.loss import LossConfig, pva_losses
 
     torch.manual_seed(3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -47,12 +47,8 @@ def turn_frames(batch: Batch, generator: torch.Generator | None = None) -> Batch
         earth_rate_n=turned(batch.frame.earth_rate_n),
     )
     # turned, a horizontal component is known only where both are
-    horizontal = [
-        v[..., :2].all(-1, keepdim=True).expand_as(v[..., :2]) for v in batch.gnss_valid.split(3, -1)
-    ]
-    valid = torch.cat(
-        (horizontal[0], batch.gnss_valid[..., 2:3], horizontal[1], batch.gnss_valid[..., 5:]), -1
-    )
+    horizontal = [v[..., :2].all(-1, keepdim=True).expand_as(v[..., :2]) for v in batch.gnss_valid.split(3, -1)]
+    valid = torch.cat((horizontal[0], batch.gnss_valid[..., 2:3], horizontal[1], batch.gnss_valid[..., 5:]), -1)
     return replace(
         batch,
         frame=frame,
@@ -65,9 +61,7 @@ def turn_frames(batch: Batch, generator: torch.Generator | None = None) -> Batch
     )
 
 
-def inject_bias(
-    batch: Batch, accel_mps2: float, gyro_dps: float, generator: torch.Generator | None = None
-) -> Batch:
+def inject_bias(batch: Batch, accel_mps2: float, gyro_dps: float, generator: torch.Generator | None = None) -> Batch:
     """Add to each piece's raw IMU a fresh constant drawn from N(0, σ²) per axis, and to its known IMU error.
 
     σ is ``accel_mps2`` [m/s²] and ``gyro_dps`` [°/s]. Where the true error is unknown it stays NaN.
@@ -77,3 +71,76 @@ def inject_bias(
     bias = drawn.to(batch.imu)
     imu = torch.where(batch.present[..., None, None], batch.imu + bias[:, None, None], batch.imu)
     return replace(batch, imu=imu, true_imu_error=batch.true_imu_error + bias[:, None])
+
+
+@dataclass(frozen=True)
+class Rough:
+    """IMUs and receivers worse than any preset, drawn anew for every piece; each pair is a log-uniform range.
+
+    ``share`` of the pieces get white noise [m/s²/√Hz, rad/s/√Hz], uneven over the axes by ``uneven`` (1σ of the
+    logarithm), and an error that wanders with a correlation time of 1 to 20 s [m/s², rad/s]; ``shaken`` of them have
+    what is faster than some 3 Hz made weaker or stronger, from nothing to twice; ``gnss`` of them have further errors
+    of position [m] and velocity [m/s], half white and half lasting, which their stds tell only within a factor of two.
+    """
+
+    share: float = 0.6
+    accel_noise: tuple[float, ...] = (1e-3, 3e-2)
+    gyro_noise: tuple[float, ...] = (1e-4, 5e-3)
+    accel_wander: tuple[float, ...] = (3e-3, 0.15)
+    gyro_wander: tuple[float, ...] = (1e-4, 5e-3)
+    wander_s: tuple[float, ...] = (1.0, 20.0)
+    uneven: float = 0.7
+    shaken: float = 0.4
+    gnss: float = 0.5
+    position: tuple[float, ...] = (0.01, 3.0)
+    velocity: tuple[float, ...] = (0.01, 0.3)
+
+
+def roughen(batch: Batch, rough: Rough, generator: torch.Generator | None = None) -> Batch:
+    """The batch with the IMU and the receiver of each piece made worse as ``rough`` says, by chance."""
+    B, T, M = batch.size
+
+    def chance(share: float) -> Tensor:
+        return torch.rand(B, generator=generator) < share
+
+    def drawn(bounds: tuple[float, ...], *shape: int) -> Tensor:
+        low, high = (math.log(x) for x in bounds)
+        return torch.exp(low + (high - low) * torch.rand(*shape, generator=generator))
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    imu = batch.imu
+    shaken = torch.where(chance(rough.shaken), 2 * torch.rand(B, generator=generator), 1.0).to(imu)
+    flat = imu.flatten(1, 2)
+    reach = max(1, round(0.08 / batch.dt))
+    slow = torch.nn.functional.avg_pool1d(
+        torch.nn.functional.pad(flat.mT, (reach, reach), mode="replicate"), 2 * reach + 1, 1
+    ).mT
+    flat = torch.where((shaken != 1)[:, None, None], slow + shaken[:, None, None] * (flat - slow), flat)
+    hit = chance(rough.share)
+    axes = torch.exp(rough.uneven * normal(B, 6))
+    white = torch.cat([drawn(b, B, 1).expand(B, 3) for b in (rough.accel_noise, rough.gyro_noise)], -1) * axes
+    slowly = torch.cat([drawn(b, B, 1).expand(B, 3) for b in (rough.accel_wander, rough.gyro_wander)], -1)
+    slowly = slowly * torch.exp(rough.uneven * normal(B, 6))
+    keep = torch.exp(-batch.epoch_s / drawn(rough.wander_s, B, 1))
+    wander = wandering(normal(B, T, 6), keep) * slowly[:, None]
+    noise = (white / batch.dt**0.5)[:, None] * normal(B, T * M, 6) + wander.repeat_interleave(M, 1)
+    flat = flat + (noise * hit[:, None, None]).to(imu)
+    worse = chance(rough.gnss)[:, None, None]
+    size = torch.cat([drawn(b, B, 1).expand(B, 3) for b in (rough.position, rough.velocity)], -1)[:, None]
+    lasting = wandering(normal(B, T, 6), torch.exp(-batch.epoch_s / drawn((5.0, 60.0), B, 1)))
+    error = size * (0.5**0.5) * (normal(B, T, 6) + lasting * torch.tensor([1.0] * 3 + [0.3] * 3))
+    told = size * torch.exp(0.7 * normal(B, 1, 1))
+    gnss = torch.where(worse & batch.gnss_valid, batch.gnss + error.to(batch.gnss), batch.gnss)
+    std = torch.where(worse, (batch.gnss_std.square() + told.square().to(imu)).sqrt(), batch.gnss_std)
+    return replace(batch, imu=flat.unflatten(1, (T, M)), gnss=gnss, gnss_std=std)
+
+
+def wandering(white: Tensor, keep: Tensor) -> Tensor:
+    """First-order Gauss-Markov of unit variance along the second axis of white noise (B, T, k); ``keep`` (B, 1)."""
+    state, rows, fresh = white[:, 0], [], (1 - keep.square()).sqrt()
+    for now in white.unbind(1):
+        rows.append(state)
+        state = keep * state + fresh * now
+    return torch.stack(rows, 1)

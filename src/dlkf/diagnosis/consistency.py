@@ -29,7 +29,7 @@ from dlkf.evaluation.report import png
 from dlkf.evaluation.table import Table, as_json, as_markdown, number
 from dlkf.files import staged
 from dlkf.filters.integration import Estimator, Solution, integrate
-from dlkf.filters.model_based import Mbkf
+from dlkf.filters.model_based import Analytic, has_covariance
 from dlkf.navigation.state import PVA, ErrorStates
 from dlkf.running.batched import take
 
@@ -95,13 +95,13 @@ def state_error(
 
 def states_of(name: str, estimator: Estimator) -> ErrorStates:
     """The error states of a filter. Raises InputError for one without a covariance."""
-    if not isinstance(estimator, Mbkf):
+    if not has_covariance(estimator):
         raise InputError(f"model {name} has no covariance to compare its errors with; give a Kalman filter")
     return estimator.states
 
 
 def consistency(
-    estimator: Mbkf,
+    estimator: Analytic,
     batch: Batch,
     matrices: Float[Tensor, "B 2 3 3"],
     progress: Callable[[int, int], None] | None = None,

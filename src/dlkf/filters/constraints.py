@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dlkf.filters.advice import ABSENT
 from dlkf.filters.integration import Epoch
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import skew
@@ -63,8 +64,13 @@ class Constraints:
         std = zn.new_tensor([t.lateral_std, t.vertical_std] + [t.rest_velocity_std] * 3 + [t.rest_rate_std] * 3)
         resting = resting.unsqueeze(-1)
         used = torch.cat(((moving.unsqueeze(-1) & ~resting).expand(-1, 2), resting.expand(-1, 6)), -1)
+        variance = (std * std).expand(len(zn), -1)
+        if epoch.advice is not None and epoch.advice.across is not None:
+            variance = torch.cat((variance[:, :2] * epoch.advice.across.square(), variance[:, 2:]), -1)
+        if epoch.advice is not None and epoch.advice.offset is not None:
+            zn = zn + epoch.advice.offset
         z = torch.cat((zn, zr), -1) * used
-        return Measurement(z, torch.cat((Hn, Hr), 1), (std * std).expand_as(z), used), quietest
+        return Measurement(z, torch.cat((Hn, Hr), 1), variance, used), quietest
 
     def _across(
         self, epoch: Epoch, structure: Float[Tensor, "B 4"] | None
@@ -127,3 +133,15 @@ class Constraints:
     @property
     def _limits(self) -> tuple[float, float]:
         return self.tuning.rest_accel, self.tuning.rest_gyro
+
+
+def forward_speed(epoch: Epoch, speed: Float[Tensor, "B 2"], states: ErrorStates) -> Measurement:
+    """A forward speed of the IMU and its standard deviation [m/s] as one row: v_x = (C_bn v_n)_x."""
+    state = epoch.window.end
+    forward = state.C_nb[:, :, :1].mT
+    H = torch.zeros(len(speed), 1, states.count, dtype=speed.dtype, device=speed.device)
+    H[:, :, VELOCITY] = forward
+    H[:, :, ATTITUDE] = forward @ skew(state.v_n)
+    used = speed[:, 1:] < ABSENT
+    z = (speed[:, :1] - (forward @ state.v_n.unsqueeze(-1)).squeeze(-1)) * used
+    return Measurement(z, H, speed[:, 1:].square(), used)

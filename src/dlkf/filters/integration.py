@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from dlkf.data.drive import Batch
+from dlkf.filters.advice import Advice
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.error_model import antenna
@@ -47,6 +48,7 @@ class Epoch(NamedTuple):
     lever_arm_b: Tensor | None  # (B, 3); None: the antenna is at the IMU
     dt: float
     frame: TangentFrame
+    advice: Advice | None = None  # of a network round the filter
 
     @property
     def imu_error(self) -> Tensor:

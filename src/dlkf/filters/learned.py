@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-import yaml
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from dlkf.data.drive import Batch
@@ -23,7 +19,6 @@ from dlkf.networks.heads import GainHead, ImuErrorHead
 
 OUTAGE_MODES = ("hold", "run")
 MAX_TRAINING_TURN = 0.2  # rad per correction, a guard in training only (paper.md 4.10)
-WEIGHTS, CONFIG = "weights.safetensors", "config.yaml"
 
 
 @dataclass(frozen=True)
@@ -77,6 +72,13 @@ class LearnedConfig:
         network["flags"] = 2 if values.get("outage_mode", cls.outage_mode) == "run" else 0
         return cls(network=NetworkConfig(**network), **values)
 
+    def plain(self) -> dict[str, Any]:
+        """Plain values for a file."""
+        values = asdict(self)
+        values["network"]["dense"] = list(values["network"]["dense"])
+        values["network"].pop("flags")
+        return values
+
 
 def _is_like(value: Any, default: Any) -> bool:
     """Whether a setting has the type of its default; whole numbers may stand for floats."""
@@ -110,6 +112,11 @@ class LearnedFilter(nn.Module):
         width = config.network.dense[-1]
         self.gain = GainHead(width, config.initial_gain)
         self.imu_error = ImuErrorHead(width)
+
+    def heads(self) -> Iterator[nn.Parameter]:
+        """Weights of the output layers, which may learn at their own rate."""
+        yield from self.gain.parameters()
+        yield from self.imu_error.parameters()
 
     def begin(self, batch: Batch) -> tuple[Memory, Tensor]:
         """Empty memory, no IMU error."""
@@ -205,45 +212,3 @@ class LearnedFilter(nn.Module):
             fix=torch.where(epoch.used, epoch.fix.value, memory.fix),
             had_fix=memory.had_fix | epoch.used,
         )
-
-
-def save_filter(model: LearnedFilter, folder: Path | str) -> None:
-    """Write ``weights.safetensors`` and ``config.yaml``."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    config = asdict(model.config)
-    config["network"]["dense"] = list(config["network"]["dense"])
-    config["network"].pop("flags")
-    save_file({k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}, folder / WEIGHTS)
-    (folder / CONFIG).write_text(yaml.safe_dump(config, sort_keys=False))
-
-
-def load_filter(folder: Path | str) -> LearnedFilter:
-    """Read a saved filter, ready to run. Raises InputError for missing, foreign or unfitting files."""
-    folder = Path(folder)
-    for name in (CONFIG, WEIGHTS):
-        if not (folder / name).is_file():
-            raise InputError(f"model folder {folder} has no {name}; a model is {WEIGHTS} beside {CONFIG}")
-    try:
-        values = yaml.safe_load((folder / CONFIG).read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{folder / CONFIG} is not readable YAML: {str(error).splitlines()[0]}") from None
-    if not isinstance(values, dict):
-        raise InputError(f"{folder / CONFIG} holds no settings; expected the config.yaml that training wrote")
-    model = LearnedFilter(LearnedConfig.from_mapping(values))
-    try:
-        weights = load_file(folder / WEIGHTS)
-    except (SafetensorError, OSError):
-        raise InputError(
-            f"{folder / WEIGHTS} is not a safetensors file (a pickle is never loaded); export the model again"
-        ) from None
-    expected = model.state_dict()
-    for name in sorted(set(expected) | set(weights)):
-        if name not in weights or name not in expected or weights[name].shape != expected[name].shape:
-            have = tuple(weights[name].shape) if name in weights else "nothing"
-            want = tuple(expected[name].shape) if name in expected else "nothing"
-            raise InputError(
-                f"{folder / WEIGHTS} does not fit {CONFIG}: {name} is {have} in the file, {want} in the config"
-            )
-    model.load_state_dict(weights)
-    return model.eval()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, TypeGuard, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -13,11 +13,11 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.filters.adaptive import Adaptation, AdaptiveNoise
-from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD, Constraints, Measurement
+from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD, Constraints, Measurement, forward_speed
 from dlkf.filters.gating import Gate, GateMemory
-from dlkf.filters.integration import Correction, Covariances, Epoch
+from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
 from dlkf.filters.tuning import Tuning
-from dlkf.navigation.error_model import PLAIN, WindowModel, masked, measurement_matrix, window_model
+from dlkf.navigation.error_model import PLAIN, WindowModel, masked, measurement_matrix, source_scale, window_model
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.state import PVA, STATES, ErrorStates
 
@@ -89,6 +89,7 @@ class Mbkf:
     constrained: bool = False
     gated: bool = False
     adaptive: bool = False
+    cut_transition: bool = False  # no gradient through Φ, which makes training several times faster
 
     def begin(self, batch: Batch) -> tuple[Memory, Tensor]:
         """P₀ from the start's law and the preset; biases at their prior mean."""
@@ -111,9 +112,7 @@ class Mbkf:
         gate = Gate(self.tuning.gate).begin(batch.imu) if self.gated else None
         t = self.tuning
         scale = [t.position_std] * 3 + [t.velocity_std] * 3, [t.position_floor] * 3 + [t.velocity_floor] * 3
-        memory = Memory(
-            torch.diag_embed(sigma**2), windows, torch.tensor(scale, **like), structure, quietest, gate
-        )
+        memory = Memory(torch.diag_embed(sigma**2), windows, torch.tensor(scale, **like), structure, quietest, gate)
         return memory, torch.tensor(self.prior_mean, **like).repeat(B, 1)
 
     def psd(self) -> dict[str, float]:
@@ -128,8 +127,9 @@ class Mbkf:
 
     def step(self, memory: Memory, epoch: Epoch) -> tuple[Memory, Correction]:
         """Propagate P over the window, update where there is something to learn (paper eqs 2–6, Joseph form)."""
-        Phi = memory.windows.transition(epoch.start, epoch.window, epoch.corrected, epoch.frame)
-        Q = memory.windows.noise(Phi)
+        Phi = self._transition(memory, epoch)
+        process = None if epoch.advice is None else epoch.advice.process
+        Q = memory.windows.noise(Phi, None if process is None else source_scale(process, epoch.start.C_nb))
         if memory.noise is not None:
             Q = torch.where(memory.noise.settled[:, None, None], memory.noise.Q, Q)
         predicted = torch.baddbmm(Q, torch.bmm(Phi, memory.P), Phi.mT)
@@ -149,6 +149,12 @@ class Mbkf:
             Hc, Rc = masked(rules.H, rules.R, rules.used)
             H, R, z = torch.cat((H, Hc), 1), torch.cat((R, Rc), -1), torch.cat((z, rules.z), -1)
             informative = informative or bool(rules.used.any())
+        if epoch.advice is not None and epoch.advice.speed is not None:
+            told = forward_speed(epoch, epoch.advice.speed, self.states)
+            if bool(told.used.any()):
+                Hs, Rs = masked(told.H, told.R, told.used)
+                H, R, z = torch.cat((H, Hs), 1), torch.cat((R, Rs), -1), torch.cat((z, told.z), -1)
+                informative = True
         prior = P
         if informative:
             K, P = kalman_update(P, H, R)
@@ -170,6 +176,14 @@ class Mbkf:
             covariances=Covariances(Phi, prior, P, *offered, dx),
         )  # fmt: skip
 
+    def _transition(self, memory: Memory, epoch: Epoch) -> Float[Tensor, "B n n"]:
+        if not (self.cut_transition and torch.is_grad_enabled()):
+            return memory.windows.transition(epoch.start, epoch.window, epoch.corrected, epoch.frame)
+        with torch.no_grad():
+            w = epoch.window
+            window = w._replace(p_n=w.p_n.detach(), v_n=w.v_n.detach(), C_nb=w.C_nb.detach(), end=w.end.detach())
+            return memory.windows.transition(epoch.start.detach(), window, epoch.corrected.detach(), epoch.frame)
+
     def _imu_sigma(self) -> Float[Tensor, " k"]:
         bias = bias_sigma(self.imu, self.states) if self.prior_std is None else torch.tensor(self.prior_std).double()
         of_matrix = [
@@ -189,7 +203,25 @@ class Mbkf:
         R = torch.maximum(scale * epoch.fix.std, floor).square()
         if memory.noise is not None:
             R = torch.where(memory.noise.settled.unsqueeze(-1), memory.noise.R, R)
+        factors = None if epoch.advice is None else epoch.advice.fix_std
+        if factors is not None:
+            R = R * factors.square()
         return Measurement(epoch.z, H, R, epoch.used)
+
+
+@runtime_checkable
+class Analytic(Estimator, Protocol):
+    """An estimator that carries error states and their covariance: a Kalman filter, or one with a network round it."""
+
+    @property
+    def states(self) -> ErrorStates:
+        """Its error states."""
+        ...
+
+
+def has_covariance(estimator: Estimator) -> TypeGuard[Analytic]:
+    """Whether an estimator can be smoothed and its covariance compared with its errors."""
+    return isinstance(estimator, Analytic)
 
 
 def kalman_update(

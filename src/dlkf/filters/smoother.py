@@ -19,7 +19,7 @@ from torch import Tensor
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
 from dlkf.filters.integration import Correction, Epoch, Estimator, Solution, integrate
-from dlkf.filters.model_based import Mbkf
+from dlkf.filters.model_based import has_covariance
 from dlkf.navigation.state import IMU, PVA, STATES, NavState
 
 NO_COVARIANCE = "smoother=rts needs a filter with a covariance: mbkf15, mbkf21, mbkf33 or aekf, with their endings"
@@ -45,7 +45,7 @@ def smoothed(estimator: Estimator, smoother: str) -> Smoothed:
     """A filter to be smoothed by name (``rts``); InputError for another name or a filter without a covariance."""
     if smoother != "rts":
         raise InputError(f"unknown smoother {smoother!r}; known: rts")
-    if not isinstance(estimator, (Smoothed, Mbkf)):
+    if not (isinstance(estimator, Smoothed) or has_covariance(estimator)):
         raise InputError(NO_COVARIANCE)
     return estimator if isinstance(estimator, Smoothed) else Smoothed(estimator)
 

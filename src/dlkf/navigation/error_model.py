@@ -73,13 +73,18 @@ class WindowModel:
         Phi[:, :9, ACCEL.start : self.states.navigation] = columns
         return Phi
 
-    def noise(self, Phi: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
+    def noise(
+        self, Phi: Float[Tensor, "B n n"], scale: Float[Tensor, "B 4 3 3"] | None = None
+    ) -> Float[Tensor, "B n n"]:
         """Process noise Q of a whole window from the PSDs of its sources (paper.md 2.6, R016).
 
         Q = Σ_source S ∫ L(τ) L(τ)ᵀ dτ, where the response L(τ) to noise at time τ is the source's column of Φ
         shrunk by (1−τ/T)ⁿ: exact while attitude and specific force are constant over the window.
+        ``scale`` multiplies the standard deviations of the sources, in the axes of their columns of Φ.
         """
         L = Phi[:, :, DRIVEN].unflatten(-1, (4, 3)).transpose(1, 2)
+        if scale is not None:
+            L = L @ scale
         Q = ((L @ L.mT) * self.spread).sum(1)
         if self.states.structure:
             Q = Q + self.walk.diag()
@@ -200,6 +205,17 @@ def measurement_matrix(
         H[:, 3:, ATTITUDE] = -skew(swing_n) + skew(frame.earth_rate_n) @ skew(arm_n)
         H[:, 3:, GYRO] = state.C_nb @ skew(lever_arm_b)
     return H
+
+
+def source_scale(factors: Float[Tensor, "B 4 3"], C_nb: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 4 3 3"]:
+    """Factors on the noise sources' standard deviations, given along the body's axes, in the axes of Φ's columns.
+
+    White noise enters through velocity and attitude, whose columns are in n: I + C diag(f − 1) Cᵀ, which is I to the
+    bit where all factors are 1; the walks drive the biases, whose columns are in b.
+    """
+    excess = torch.diag_embed(factors - 1)
+    white = C_nb.unsqueeze(1) @ excess[:, :2] @ C_nb.mT.unsqueeze(1)
+    return torch.eye(3, dtype=factors.dtype, device=factors.device) + torch.cat((white, excess[:, 2:]), 1)
 
 
 @lru_cache

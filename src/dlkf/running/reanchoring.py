@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dlkf.filters import learned, model_based
+from dlkf.filters import learned, model_based, plus
 from dlkf.navigation.earth import TangentFrame, tangent_frame
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.state import PVA, NavState
@@ -109,3 +109,9 @@ def _(memory: learned.Memory, change: FrameChange, fresh: learned.Memory) -> lea
         correction=change.vectors(memory.correction),
         fix=torch.where(memory.had_fix, change.fixes(memory.fix), memory.fix),
     )
+
+
+@reanchored.register
+def _(memory: plus.Memory, change: FrameChange, fresh: plus.Memory) -> plus.Memory:
+    """The Kalman filter's part; what the network remembers has axes of the body."""
+    return memory._replace(kalman=reanchored(memory.kalman, change, fresh.kalman))

@@ -16,7 +16,7 @@ class NavigationFilter(PythonModel):
 
     def load_context(self, context) -> None:
         """Read ``weights.safetensors`` and ``config.yaml``."""
-        from dlkf.filters.learned import load_filter
+        from dlkf.filters.saved import load_filter
 
         self.filter = load_filter(context.artifacts["filter"])
 

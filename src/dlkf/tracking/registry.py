@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import dlkf
 from dlkf.errors import InputError
-from dlkf.filters.learned import WEIGHTS
+from dlkf.filters.saved import WEIGHTS
 from dlkf.tracking.runs import Run, mlflow_module, reachable, run_exists, store_missing, tracking_uri
 
 if TYPE_CHECKING:

@@ -11,13 +11,13 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.filters.integration import integrate
-from dlkf.filters.learned import LearnedConfig, LearnedFilter
+from dlkf.filters.saved import learned_filter
 from dlkf.training.callbacks.masking import BatchCallback
 from dlkf.training.loss import TERMS, LossConfig, pva_losses, weighted
 
 
 class FilterTraining(L.LightningModule):
-    """Trains a :class:`LearnedFilter` end to end on reference position, velocity and attitude (R060–R062).
+    """Trains a learned filter (``model.kind``) end to end on reference position, velocity and attitude (R060–R062).
 
     ``model``, ``loss``, ``optimizer``, ``scheduler`` are plain mappings; ``loss_weights`` is set by the
     adaptive-weights callback. Randomness of a step depends on (seed, step) alone, so that a resumed run
@@ -35,7 +35,7 @@ class FilterTraining(L.LightningModule):
         super().__init__()
         self.save_hyperparameters()
         torch.manual_seed(seed)
-        self.filter = LearnedFilter(LearnedConfig.from_mapping(model))
+        self.filter = learned_filter(model)
         self.loss_config = LossConfig(**loss)
         self.loss_weights = dict.fromkeys(TERMS, 1.0)
         self.seed = seed
@@ -43,8 +43,8 @@ class FilterTraining(L.LightningModule):
     def configure_optimizers(self):
         """AdamW, heads at their own rate, cosine annealing with warm restarts (R073; paper.md 4.13)."""
         o, s = self.hparams["optimizer"], self.hparams["scheduler"]
-        heads = [p for n, p in self.filter.named_parameters() if n.startswith(("gain", "imu_error"))]
-        body = [p for n, p in self.filter.named_parameters() if n.startswith("network")]
+        heads = list(self.filter.heads())
+        body = [p for p in self.filter.parameters() if all(p is not h for h in heads)]
         groups = [{"params": body, "lr": o["lr"]}, {"params": heads, "lr": o["lr"] * o["head_lr_factor"]}]
         optimizer = torch.optim.AdamW(groups, weight_decay=o["weight_decay"])
         scheduler = torch.optim.lr_scheduler.CosineAnnealingWarmRestarts(

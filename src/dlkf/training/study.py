@@ -23,7 +23,7 @@ from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.study import study
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Estimator
-from dlkf.filters.learned import load_filter
+from dlkf.filters.saved import load_filter
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.training.fit import fit
 from dlkf.tuning.search import FACTORS, factors_of, mean_imu_error, tuned, tuning_values

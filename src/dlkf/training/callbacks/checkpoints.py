@@ -9,7 +9,7 @@ from pathlib import Path
 import lightning as L
 from lightning.pytorch.callbacks import Callback, Checkpoint
 
-from dlkf.filters.learned import save_filter
+from dlkf.filters.saved import save_filter
 
 LAST = "last.ckpt"
 BEST = "best"

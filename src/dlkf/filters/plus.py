@@ -1,0 +1,291 @@
+"""``plus``: the analytic Kalman filter whose noise and pseudo-measurements a recurrent network sets every epoch.
+
+States, strapdown and Riccati recursion are those of a classical filter (``base``); the network says how far to trust
+what goes into them, in outages too: factors on the process noise of each axis, on GNSS standard deviations, on the
+constraints' standard deviations, velocities across the car beside those of its model, and a forward speed. It sees the
+samples, what the filter believes and how its innovations fit, and how wrong its own speed has been while GNSS was
+there. With weights of zero it is ``base`` to the bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from dlkf.data.drive import Batch
+from dlkf.errors import InputError
+from dlkf.filters.advice import ABSENT, Advice
+from dlkf.filters.build import build_filter
+from dlkf.filters.integration import Correction, Epoch
+from dlkf.filters.model_based import Mbkf
+from dlkf.filters.model_based import Memory as KalmanMemory
+from dlkf.filters.tuning import Tuning
+from dlkf.navigation.calibration import ImuError
+from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.navigation.state import ATTITUDE, IMU, POSITION, VELOCITY, ErrorStates
+from dlkf.networks.features import level_rotation
+from dlkf.networks.plus import WINDOW_FEATURES, Heads, PlusNetwork, PlusNetworkConfig, window_features
+from dlkf.settings import built
+
+PARTS = ("process", "fix", "across", "offset", "speed", "residual")
+ANY_MEMS: Mapping[str, Any] = {  # what is known of an IMU of which nothing is known
+    "name": "any MEMS",
+    "accel": {
+        "noise_density": 9.80665e-4, "turn_on_bias": 0.1, "instability": 1e-3, "correlation_time": 3600.0,
+        "scale_factor": 5e-3, "misalignment": 5.236e-3,
+    },
+    "gyro": {
+        "noise_density": 6.98132e-5, "turn_on_bias": 5.236e-3, "instability": 9.69627e-5, "correlation_time": 3600.0,
+        "scale_factor": 5e-3, "misalignment": 5.236e-3,
+    },
+}  # fmt: skip
+# by python -m dlkf.tune objective=log on simulated cars; where training begins
+START_TUNING: Mapping[str, float] = {
+    "accel_noise": 30.0, "gyro_noise": 3.0, "accel_walk": 100.0, "gyro_walk": 10.0,
+    "position_std": 2.0, "velocity_std": 2.0, "lateral_std": 0.1,
+}  # fmt: skip
+SPREADS = (5.0, 60.0)  # s, memories of the normalised innovations
+SPEED_MEMORY = 60.0  # fixes over which the speed's errors are remembered
+SPEED_PRIOR, SPEED_PRIOR_WEIGHT = 8.0, 0.5  # m/s: how wrong it is taken to be before it was ever compared
+SPEED_DOUBT = 2.0  # its errors last: 1σ counts at least that many times its RMS so far, times the network's factor
+SILENT_SHARE = 0.5  # of the training pieces run without the speed, so that the rest learns to do without it
+OLDEST = 600.0  # s: times are told up to here
+
+
+@dataclass(frozen=True)
+class PlusConfig:
+    """A ``plus`` filter: its classical filter, which parts of the network are in force, what it was trained on."""
+
+    kind: str = "plus"
+    base: str = "mbkf21_car"
+    parts: tuple[str, ...] = PARTS[:4]
+    network: PlusNetworkConfig = field(default_factory=PlusNetworkConfig)
+    tuning: Mapping[str, float] = field(default_factory=lambda: dict(START_TUNING))
+    imu: Mapping[str, Any] = field(default_factory=lambda: dict(ANY_MEMS))
+
+    def __post_init__(self) -> None:
+        if unknown := sorted(set(self.parts) - set(PARTS)):
+            raise InputError(f"model.parts: unknown part {unknown[0]!r}; known: {', '.join(PARTS)}")
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> PlusConfig:
+        """From plain values; InputError for unknown keys or values that do not fit."""
+        known = {"kind", "base", "parts", "network", "tuning", "imu"}
+        if unknown := sorted(set(values) - known):
+            raise InputError(f"model: unknown key {unknown[0]!r}; known: {', '.join(sorted(known))}")
+        given = {k: v for k, v in values.items() if v is not None}
+        if "parts" in given:
+            given["parts"] = tuple(given["parts"])
+        if "network" in given:
+            given["network"] = built(PlusNetworkConfig, given["network"], "model.network")
+        return cls(**given)
+
+    def plain(self) -> dict[str, Any]:
+        """Plain values for a file."""
+        values = asdict(self) | {"parts": list(self.parts), "network": {"hidden": self.network.hidden}}
+        return {**values, "tuning": dict(self.tuning), "imu": _plain(self.imu)}
+
+
+class Memory(NamedTuple):
+    """What the filter carries from epoch to epoch; nothing of it but the Kalman filter's part has axes in n."""
+
+    kalman: KalmanMemory
+    hidden: Tensor  # (B, h)
+    elapsed: Tensor  # (B,) s since the start
+    since_fix: Tensor  # (B,) s
+    surprise: Tensor  # (B, 4) running means of normalised squared innovations, position and velocity
+    fix_speed: Tensor  # (B,) m/s forward at the last fix
+    wrong: Tensor  # (B, 3) of the speed: number of comparisons, sum and sum of squares of its errors, fading
+    residual: Tensor  # (B, 6) part of the IMU error that the network added
+    silent: Tensor  # (B,) bool: pieces in which training withholds the speed
+    seen: Heads | None = None  # of the last epoch, for training and pictures
+
+
+class PlusFilter(nn.Module):
+    """Estimator round a classical one."""
+
+    def __init__(self, config: PlusConfig) -> None:
+        super().__init__()
+        self.config = config
+        kalman = build_filter(config.base, imu_spec(config.imu), tuning=config.tuning)
+        if not isinstance(kalman, Mbkf):
+            raise InputError(f"model.base={config.base} is no Kalman filter that plus can stand on; take mbkf21_car")
+        self.kalman = Mbkf(**{**kalman.__dict__, "cut_transition": True})
+        count = self.kalman.states.count
+        now = 3 + 3 + 3 + 2
+        features = WINDOW_FEATURES + count + (count - 9) + 2 + 4 + 6 + 4 + 3 + 5 + now
+        self.network = PlusNetwork(PlusNetworkConfig(config.network.hidden, features), now)
+        self.parts = frozenset(config.parts)
+
+    @property
+    def states(self):
+        """The error states of the Kalman filter."""
+        return self.kalman.states
+
+    @property
+    def tuning(self) -> Tuning:
+        """Where its noise begins."""
+        return self.kalman.tuning
+
+    @property
+    def imu(self) -> ImuSpec:
+        """What it takes an unknown IMU for."""
+        return self.kalman.imu
+
+    def heads(self) -> Iterator[nn.Parameter]:
+        """Weights of the output layers."""
+        yield from self.network.noise.parameters()
+        yield from self.network.speed.parameters()
+
+    def begin(self, batch: Batch) -> tuple[Memory, Tensor]:
+        """Of the Kalman filter, and nothing seen yet."""
+        kalman, error = self.kalman.begin(batch)
+        zeros, B = batch.imu.new_zeros, batch.size[0]
+        memory = Memory(
+            kalman, self.network.start(B), zeros(B), zeros(B), zeros(B, 4) + 1.0, zeros(B), zeros(B, 3), zeros(B, 6),
+            torch.rand(B, device=batch.imu.device) < (SILENT_SHARE if self.training else 0.0),
+        )  # fmt: skip
+        return memory, error
+
+    def step(self, memory: Memory, epoch: Epoch) -> tuple[Memory, Correction]:
+        """Network, then the Kalman filter with its advice."""
+        span = epoch.dt * epoch.imu.shape[1]
+        fixed = epoch.used.any(-1)
+        with torch.no_grad():
+            forward = (epoch.window.end.C_nb[:, :, 0] * epoch.window.end.v_n).sum(-1)
+            normalised = self._normalised(memory, epoch)
+            memory = memory._replace(
+                elapsed=memory.elapsed + span,
+                since_fix=torch.where(fixed, 0.0, memory.since_fix + span),
+                fix_speed=torch.where(fixed, forward, memory.fix_speed),
+                surprise=_faded(memory.surprise, normalised, epoch.used, span),
+            )
+            features, now = self._features(memory, epoch, normalised, forward)
+        dtype = self.network.inward.weight.dtype
+        heads, hidden = self.network(features.to(dtype), now.to(dtype), memory.hidden)
+        heads = Heads(*(x.to(epoch.z.dtype) for x in heads))
+        advice = self._advice(heads, memory)
+        kalman, correction = self.kalman.step(memory.kalman, epoch._replace(advice=advice))
+        residual = memory.residual
+        if "residual" in self.parts:
+            error = correction.imu_error
+            assert isinstance(error, ImuError)
+            correction = correction._replace(imu_error=error._replace(bias=error.bias + heads.residual - residual))
+            residual = heads.residual
+        with torch.no_grad():
+            off = (heads.speed[:, 0] - forward) * fixed
+            fade = torch.where(fixed, 1 - 1 / SPEED_MEMORY, 1.0).unsqueeze(-1)
+            wrong = memory.wrong * fade + torch.stack((fixed.to(off.dtype), off, off * off), -1)
+        memory = memory._replace(kalman=kalman, hidden=hidden, wrong=wrong, residual=residual, seen=heads)
+        return memory, correction
+
+    def _advice(self, heads: Heads, memory: Memory) -> Advice:
+        """What of the network's answer is in force. A speed is no better than it was while GNSS was there."""
+        given = {name: getattr(heads, name) for name in ("process", "fix", "across", "offset") if name in self.parts}
+        if "speed" in self.parts:
+            doubt = SPEED_DOUBT * heads.doubt * speed_rms(memory.wrong)
+            std = (heads.speed[:, 1].square() + doubt.square()).sqrt()
+            std = torch.where(memory.silent, 2 * ABSENT, std)
+            given["speed"] = torch.stack((heads.speed[:, 0], std), -1)
+        return Advice(**given)
+
+    def _normalised(self, memory: Memory, epoch: Epoch) -> Float[Tensor, "B 6"]:
+        """Innovations over their 1σ as the filter of the last epoch has it, in heading axes; zero without a fix."""
+        C_hn = level_rotation(epoch.window.end.C_nb, "heading")
+        variance = torch.stack(
+            [(C_hn @ memory.kalman.P[:, b, b] @ C_hn.mT).diagonal(dim1=-2, dim2=-1) for b in (POSITION, VELOCITY)], 1
+        ).flatten(1)
+        R = (C_hn.unsqueeze(1).square() @ epoch.fix.std.square().unflatten(-1, (2, 3, 1))).squeeze(-1).flatten(1)
+        z = (C_hn.unsqueeze(1) @ epoch.z.unflatten(-1, (2, 3, 1))).squeeze(-1).flatten(1)
+        return z / (variance + R + 1e-4).sqrt()
+
+    def _features(
+        self, memory: Memory, epoch: Epoch, normalised: Float[Tensor, "B 6"], forward: Float[Tensor, " B"]
+    ) -> tuple[Float[Tensor, "B F"], Float[Tensor, "B N"]]:
+        """What the network sees, each of order 1; the second part goes to the noise's heads directly as well."""
+        P, C_nb = memory.kalman.P, epoch.window.end.C_nb
+        fixed = epoch.used.any(-1, keepdim=True).to(P.dtype)
+        body = torch.cat([_turned_variance(P[:, b, b], C_nb) for b in (POSITION, VELOCITY, ATTITUDE)], -1)
+        variance = torch.cat((body, P.diagonal(dim1=-2, dim2=-1)[:, IMU.start :]), -1).clamp_min(1e-18)
+        size = self._sizes(P)
+        v_b = (C_nb.mT @ epoch.window.end.v_n.unsqueeze(-1)).squeeze(-1)
+        rate, force = epoch.rate_b, epoch.corrected[..., :3].mean(1)
+        known = _flat(epoch.error, memory.kalman.structure, self.kalman.states)
+        fix_std = torch.log(epoch.fix.std[:, [0, 2, 3, 5]].clamp(1e-3, 1e3)) / 3 * fixed
+        age = torch.log1p(torch.stack((memory.since_fix, memory.elapsed), -1).clamp_max(OLDEST)) / 3
+        count, mean, rms = memory.wrong[:, 0], _mean_wrong(memory.wrong), speed_rms(memory.wrong)
+        spread = (rms.square() - mean.square()).clamp_min(1e-4).sqrt()
+        said = memory.seen.speed if memory.seen is not None else torch.zeros_like(age)
+        history = torch.stack(
+            (torch.log1p(count) / 3, torch.asinh(mean), torch.log(rms), said[:, 0] / 20, torch.log(spread)), -1
+        )
+        now = torch.cat(
+            (v_b / v_b.new_tensor((10.0, 1.0, 1.0)), torch.log(variance[:, 3:6]) / 6, v_b[:, :1] * rate[:, 2:] / 3,
+             force[:, 1:2] / 3, rate[:, 2:] / 0.3, fixed, age[:, :1]), -1,
+        )  # fmt: skip
+        features = torch.cat(
+            (
+                window_features(epoch.corrected, epoch.dt), torch.log(variance) / 4 - torch.log(size) / 2,
+                torch.asinh(known / size[9:]), age, fix_std, torch.asinh(normalised),
+                torch.log(memory.surprise + 0.01) / 2, fixed, fixed * forward.unsqueeze(-1) / 10,
+                memory.fix_speed.unsqueeze(-1) / 10, history, now,
+            ), -1,
+        )  # fmt: skip
+        return features, now
+
+    def _sizes(self, like: Tensor) -> Float[Tensor, " n"]:
+        """Typical sizes of the states, for scaling."""
+        states = self.kalman.states
+        matrix, car = 2 * len(states.elements), (0.05, 0.05, 1.0, 0.01) if states.structure else ()
+        return like.new_tensor(
+            (1.0,) * 3 + (0.3,) * 3 + (0.02,) * 3 + (0.1,) * 3 + (0.005,) * 3 + (0.005,) * matrix + car
+        )
+
+
+def speed_rms(wrong: Float[Tensor, "B 3"]) -> Float[Tensor, " B"]:
+    """How wrong the network's speed has been while GNSS was there [m/s]; at first, as wrong as it is taken to be."""
+    count, _, squares = wrong.unbind(-1)
+    return ((squares + SPEED_PRIOR_WEIGHT * SPEED_PRIOR**2) / (count + SPEED_PRIOR_WEIGHT)).sqrt()
+
+
+def _mean_wrong(wrong: Float[Tensor, "B 3"]) -> Float[Tensor, " B"]:
+    return wrong[:, 1] / (wrong[:, 0] + SPEED_PRIOR_WEIGHT)
+
+
+def _faded(mean: Tensor, normalised: Tensor, used: Tensor, span: float) -> Tensor:
+    """Running means of the squares over :data:`SPREADS`, of position and velocity; unchanged without a fix."""
+    parts = []
+    for k, block in enumerate((slice(0, 3), slice(3, 6))):
+        n = used[:, block].sum(-1)
+        new = normalised[:, block].square().sum(-1) / n.clamp_min(1)
+        for j, memory_s in enumerate(SPREADS):
+            old = mean[:, 2 * k + j]
+            parts.append(torch.where(n > 0, torch.lerp(old, new.clamp_max(1e4), min(1.0, span / memory_s)), old))
+    return torch.stack(parts, -1)
+
+
+def _turned_variance(P: Float[Tensor, "B 3 3"], C_nb: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 3"]:
+    return (C_nb.mT @ P @ C_nb).diagonal(dim1=-2, dim2=-1)
+
+
+def _flat(error: ImuError, structure: Tensor | None, states: ErrorStates) -> Float[Tensor, "B k"]:
+    """Estimates of the IMU's errors and of the car's structure in the order of their states."""
+    parts = [error.bias]
+    if states.elements:
+        if error.matrix is None:
+            parts.append(error.bias.new_zeros(len(error.bias), 2 * len(states.elements)))
+        elif error.matrix.ndim == 2:
+            parts.append(error.matrix)
+        else:
+            rows, columns = (list(x) for x in zip(*states.elements))
+            parts.append(error.matrix[:, :, rows, columns].flatten(1))
+    return torch.cat(parts if structure is None else [*parts, structure], -1)
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: _plain(v) if isinstance(v, Mapping) else v for k, v in values.items()}

@@ -1,0 +1,70 @@
+"""Learned filters on disk: ``weights.safetensors`` beside a ``config.yaml`` whose ``kind`` says which filter it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from dlkf.errors import InputError
+from dlkf.filters.learned import LearnedConfig, LearnedFilter
+from dlkf.filters.plus import PlusConfig, PlusFilter
+
+WEIGHTS, CONFIG = "weights.safetensors", "config.yaml"
+KINDS: Mapping[str, tuple[type, Callable[..., nn.Module]]] = {
+    "dlkf": (LearnedConfig, LearnedFilter),
+    "plus": (PlusConfig, PlusFilter),
+}
+
+
+def learned_filter(values: Mapping[str, Any]) -> nn.Module:
+    """A filter with fresh weights from its settings; InputError for an unknown ``kind`` or setting."""
+    kind = values.get("kind", "dlkf")
+    if kind not in KINDS:
+        raise InputError(f"model.kind is {kind!r}; choose one of {', '.join(KINDS)}")
+    config, filter_type = KINDS[kind]
+    return filter_type(config.from_mapping(values))
+
+
+def save_filter(model: nn.Module, folder: Path | str) -> None:
+    """Write ``weights.safetensors`` and ``config.yaml``."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_file({k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}, folder / WEIGHTS)
+    (folder / CONFIG).write_text(yaml.safe_dump(model.config.plain(), sort_keys=False))
+
+
+def load_filter(folder: Path | str) -> nn.Module:
+    """Read a saved filter, ready to run. Raises InputError for missing, foreign or unfitting files."""
+    folder = Path(folder)
+    for name in (CONFIG, WEIGHTS):
+        if not (folder / name).is_file():
+            raise InputError(f"model folder {folder} has no {name}; a model is {WEIGHTS} beside {CONFIG}")
+    try:
+        values = yaml.safe_load((folder / CONFIG).read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"{folder / CONFIG} is not readable YAML: {str(error).splitlines()[0]}") from None
+    if not isinstance(values, dict):
+        raise InputError(f"{folder / CONFIG} holds no settings; expected the config.yaml that training wrote")
+    model = learned_filter(values)
+    try:
+        weights = load_file(folder / WEIGHTS)
+    except (SafetensorError, OSError):
+        raise InputError(
+            f"{folder / WEIGHTS} is not a safetensors file (a pickle is never loaded); export the model again"
+        ) from None
+    expected = model.state_dict()
+    for name in sorted(set(expected) | set(weights)):
+        if name not in weights or name not in expected or weights[name].shape != expected[name].shape:
+            have = tuple(weights[name].shape) if name in weights else "nothing"
+            want = tuple(expected[name].shape) if name in expected else "nothing"
+            raise InputError(
+                f"{folder / WEIGHTS} does not fit {CONFIG}: {name} is {have} in the file, {want} in the config"
+            )
+    model.load_state_dict(weights)
+    return model.eval()

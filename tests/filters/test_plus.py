@@ -1,0 +1,160 @@
+"""plus: at zero the classical filter, blind to the direction of driving, differentiable, and on disk."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dlkf.data.augmentation import turn_frames
+from dlkf.errors import InputError
+from dlkf.filters.build import build_filter
+from dlkf.filters.integration import integrate
+from dlkf.filters.model_based import has_covariance
+from dlkf.filters.plus import PARTS, PlusConfig, PlusFilter, speed_rms
+from dlkf.filters.saved import learned_filter, load_filter, save_filter
+from dlkf.filters.smoother import smooth
+from dlkf.networks.plus import bounded, window_features
+
+from .scene import scene
+
+
+def plus(parts=PARTS, base="mbkf21_car", weights: float = 0.0, hidden: int = 16) -> PlusFilter:
+    torch.manual_seed(1)
+    model = PlusFilter(PlusConfig.from_mapping({"base": base, "parts": parts, "network": {"hidden": hidden}})).eval()
+    if weights:
+        for p in model.heads():
+            torch.nn.init.normal_(p, std=weights)
+        model.network.speed.bias.data[1] = -4.0  # σ 0.8 m/s: the speed takes part
+    return model
+
+
+def car(pieces: int, epochs: int, seed: int = 0):
+    batch = scene(pieces, epochs, seed=seed, lever_arm=(0.4, 0.1, -0.7))
+    available = batch.available.clone()
+    available[:, epochs // 2 : epochs - 3] = False
+    return replace(batch, available=available)
+
+
+@pytest.mark.parametrize("base", ["mbkf21_car", "mbkf33_car_gated"])
+@pytest.mark.parametrize("parts", [(), PARTS])
+def test_with_weights_of_zero_it_is_the_classical_filter_to_the_bit(base, parts):
+    batch, model = car(3, 16), plus(parts, base)
+    with torch.no_grad():
+        a, b = integrate(batch, model), integrate(batch, build_filter(base, model.imu, tuning=model.tuning))
+    for one, other in zip(
+        (*a.posterior, a.imu_error, a.std, a.gain), (*b.posterior, b.imu_error, b.std, b.gain), strict=True
+    ):
+        assert torch.equal(one, other)
+
+
+def test_it_does_not_know_where_north_is():
+    """The same drive in a turned frame: the same solution, turned. 1e-6 of kilometres and radians is rounding."""
+    batch, model = car(4, 24, seed=2), plus(weights=0.3).double()
+    turned = turn_frames(batch, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        a, b = integrate(batch, model), integrate(turned, model)
+    C = turned.truth.C_nb @ batch.truth.C_nb.mT
+    assert not torch.allclose(a.posterior.p_n, b.posterior.p_n, atol=1.0)
+    assert torch.allclose((C @ a.posterior.p_n.unsqueeze(-1)).squeeze(-1), b.posterior.p_n, atol=1e-6)
+    assert torch.allclose(C @ a.posterior.C_nb, b.posterior.C_nb, atol=1e-8)
+    assert torch.allclose(a.imu_error, b.imu_error, atol=1e-9)
+
+
+def test_weights_matter_in_outages_too():
+    batch = car(2, 20)
+    with torch.no_grad():
+        a, b = integrate(batch, plus()), integrate(batch, plus(weights=0.3))
+    assert not torch.allclose(a.std[:, 14], b.std[:, 14])
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_gradient_reaches_the_head_of_every_part(part, monkeypatch):
+    """From the position in the outage, by finite differences: Riccati recursion and state. Only biases, since what the
+    network sees is cut by design, as is the history of its speed; so is Φ in training, for speed, but not here."""
+    monkeypatch.setattr("dlkf.filters.plus.SPEED_DOUBT", 0.0)
+    batch, model = car(2, 14, seed=3), plus((part,), weights=0.05).double()
+    model.kalman = replace(model.kalman, cut_transition=False)
+    for layer in (model.network.noise, model.network.speed):
+        torch.nn.init.zeros_(layer.weight)
+
+    def loss() -> torch.Tensor:
+        e = integrate(batch, model).posterior.p_n - batch.truth.p_n
+        return e[:, 7:11].square().sum()
+
+    head = (model.network.speed if part == "speed" else model.network.noise).bias
+    loss().backward()
+    gradient = head.grad.clone()
+    direction, step = gradient / gradient.norm(), 1e-4
+    values = []
+    for sign in (1, -1):
+        with torch.no_grad():
+            head += sign * step * direction
+            values.append(float(loss()))
+            head -= sign * step * direction
+    assert gradient.norm() > 0
+    assert (values[0] - values[1]) / (2 * step) == pytest.approx(float(gradient.norm()), rel=1e-4)
+
+
+def test_a_speed_that_was_wrong_makes_itself_absent():
+    right, wrong = (torch.tensor([[60.0, 60.0 * e, 60.0 * e * e]]) for e in (0.2, 12.0))
+    assert float(speed_rms(right)) < 1.0 < 11.0 < float(speed_rms(wrong))
+    model = plus(("speed",), weights=1e-3)
+    batch = car(2, 20)
+    model.network.speed.bias.data[0] = 5.0  # says 60 m/s to a car of 12
+    with torch.no_grad():
+        a, b = integrate(batch, model), integrate(batch, plus(()))
+    gone = batch.available.logical_not()
+    off = (a.posterior.v_n - b.posterior.v_n)[gone].norm(dim=-1)
+    assert float(off.max()) < 0.2
+
+
+def test_factors_are_bounded_and_begin_with_the_slope_of_exp():
+    x = torch.tensor([-50.0, 0.0, 50.0], requires_grad=True)
+    y = bounded(x, 2.0)
+    (gradient,) = torch.autograd.grad(y.sum(), x)
+    assert y.tolist() == pytest.approx([torch.e**-2, 1.0, torch.e**2]) and float(gradient[1]) == 1.0
+
+
+def test_band_variances_do_not_depend_on_the_rate():
+    """White noise of the same density, and a tone, at 50 and 200 Hz; 30 % is what 500 windows leave of scatter."""
+    g = torch.Generator().manual_seed(0)
+    seen = []
+    for rate in (50, 200):
+        t = torch.arange(rate) / rate
+        noise = 1e-2 * rate**0.5 * torch.randn(500, rate, 6, generator=g)
+        tone = 0.5 * torch.sin(2 * torch.pi * 7 * t)[:, None]
+        seen.append(window_features(noise + tone, 1 / rate)[:, 6:].mean(0))
+    assert torch.allclose(seen[0], seen[1], atol=0.3 / 4)
+
+
+def test_a_saved_filter_is_the_same_filter(tmp_path):
+    model, batch = plus(weights=0.2), car(2, 12)
+    save_filter(model, tmp_path / "model")
+    again = load_filter(tmp_path / "model")
+    assert again.config.parts == model.config.parts and again.imu == model.imu
+    with torch.no_grad():
+        assert torch.equal(integrate(batch, again).posterior.p_n, integrate(batch, model).posterior.p_n)
+
+
+def test_it_can_be_smoothed():
+    batch, model = car(6, 40, seed=5), plus(PARTS[:4])
+    assert has_covariance(model)
+    with torch.no_grad():
+        f, s = integrate(batch, model), smooth(batch, model)
+    before, after = ((x.posterior.p_n - batch.truth.p_n)[:, 30].norm(dim=-1).mean() for x in (f, s))
+    assert after < 0.5 * before
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"kind": "minus"}, "dlkf, plus"),
+        ({"kind": "plus", "parts": ["speeed"]}, "unknown part 'speeed'"),
+        ({"kind": "plus", "hiden": 3}, "unknown key 'hiden'"),
+        ({"kind": "plus", "base": "ins"}, "no Kalman filter"),
+        ({"kind": "plus", "network": {"hidden": 1000}}, "between 8 and 256"),
+    ],
+)
+def test_mistakes_are_one_line(settings, words):
+    with pytest.raises(InputError, match=words):
+        learned_filter(settings)
