@@ -31,9 +31,9 @@ class Resolution(NamedTuple):
     std: bool = True  # has a std of velocity
 
 
-# half a step of the format each: UBX a sample of time (its tags are
-# brought to GPS time by the order of messages), 2⁻¹⁰ m/s², 2⁻¹² °/s, 1e-9 deg (0.1 mm), mm/s; NMEA with 7 digits of a minute and
-# 4 of knots and degrees; seconds since 1970 as doubles 2⁻²² s; text with as many digits as it has
+# half a step of the format each: UBX a sample of time (its tags are brought to GPS time by the order of messages),
+# 2⁻¹⁰ m/s², 2⁻¹² °/s, 1e-9 deg (0.1 mm) and truncation, mm/s; NMEA with 7 digits of a minute, 4 of knots and degrees;
+# seconds since 1970 as doubles 2⁻²² s; text with as many digits as it has
 RESOLUTION = {
     "ubx": Resolution(t=0.0101, accel=5e-4, gyro=2.2e-6, position=1e-3, velocity=5.1e-4),
     "nmea": Resolution(position=1e-3, velocity=1e-4, down=False, std=False),
