@@ -20,6 +20,7 @@ from dlkf.errors import InputError
 from dlkf.evaluation.outages import with_outage
 from dlkf.evaluation.protocol import protocol_from
 from dlkf.evaluation.table import as_rich
+from dlkf.files import vacant
 from dlkf.filters.build import build_filter
 from dlkf.navigation.imu_errors import imu_spec
 
@@ -31,6 +32,7 @@ def main(cfg: DictConfig) -> None:
     names = [config["model"]] if isinstance(config["model"], str) else list(config["model"])
     if not names:
         raise InputError("model is an empty list; give at least one Kalman filter, such as model=mbkf15")
+    vacant(config["out"], overwrite=config["overwrite"])
     settings, preset = matched_drives(config), imu_spec(config["imu"])
     plan = protocol_from(config).outage
     states = {name: states_of(name, build_filter(name, preset, tuning=config["tuning"])) for name in names}

@@ -6,6 +6,7 @@ Prints the results table and leaves metrics.json, table.md, table.csv, figures/ 
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -15,13 +16,20 @@ from rich.console import Console
 from dlkf.command import command
 from dlkf.console import counting
 from dlkf.data.kinds import drive_kinds
-from dlkf.data.store import load_dataset
+from dlkf.data.store import dataset_digest, load_dataset
+from dlkf.errors import InputError
 from dlkf.evaluation.protocol import Scenes, protocol_from
 from dlkf.evaluation.report import all_tables, write_report
 from dlkf.evaluation.study import study
+from dlkf.evaluation.summary import answer, metrics_of
 from dlkf.evaluation.table import as_rich
-from dlkf.models import resolve_models
+from dlkf.files import vacant
+from dlkf.filters.build import is_filter
+from dlkf.models import grid_of, resolve_models
 from dlkf.navigation.imu_errors import imu_spec
+from dlkf.provenance import provenance
+from dlkf.tracking.evaluations import log_evaluation
+from dlkf.tracking.runs import tracking_uri
 
 
 @command("evaluate")
@@ -29,21 +37,25 @@ def main(cfg: DictConfig) -> None:
     """Load, run every model over the same scenes, score, write, print."""
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
     console = Console(width=None if sys.stdout.isatty() else 110)
-    protocol = protocol_from(config)
+    vacant(config["out"], overwrite=config["overwrite"])
+    protocol, uri = protocol_from(config), tracking_uri(config["tracking"]["uri"])
     options = {"tuning": config["tuning"], "prior": config["prior"]}
-    models = resolve_models(config["model"], imu_spec(config["imu"]), config["tracking_uri"], **options)
+    models = resolve_models(config["model"], imu_spec(config["imu"]), uri, **options)
+    check_baseline(config["baseline"], models)
+    grid = grid_of(models.values(), config["rate_hz"], config["epoch_s"])
     with counting("Loading drives") as progress:
         drives = load_dataset(
             config["dataset"],
-            rate_hz=config["rate_hz"],
-            epoch_s=config["epoch_s"],
             dtype=torch.float64,
             drives=config["drives"],
             progress=lambda name, done, total: progress(done, total),
+            **grid,
         )
     scenes = Scenes(drives, protocol)
     for reason in scenes.skipped.values():
         console.print(f"left out: {reason}", style="yellow")
+    name = drives[0].dataset
+    digest = dataset_digest(config["dataset"])
     scores, made = study(
         models,
         scenes,
@@ -54,26 +66,36 @@ def main(cfg: DictConfig) -> None:
         injected_bias=config["injected_bias"],
         seed=config["seed"],
     )
-    name = drives[0].dataset
-    write_report(
-        config["out"],
-        name,
-        scores,
-        made,
-        protocol={
-            "models": config["model"],
-            "imu": config["imu"]["name"],
-            "rate_hz": config["rate_hz"],
-            **scenes.described(),
-        },
-        by_time=scenes.mode == "pieces",
-        baseline=config["baseline"],
-    )
-    for table in all_tables(name, made):
+    made_how = {
+        **provenance(),
+        "models": config["model"],
+        "dataset": config["dataset"],
+        "digest": digest,
+        "imu": config["imu"]["name"],
+        "imu values": {k: v for k, v in config["imu"].items() if k in ("accel", "gyro")},
+        "tuning": config["tuning"],
+        **grid,
+        **scenes.described(),
+    }
+    by_time, baseline = scenes.mode == "pieces", config["baseline"]
+    write_report(config["out"], name, scores, made, protocol=made_how, by_time=by_time, baseline=baseline)
+    tables, run = all_tables(name, made), None
+    if config["tracking"]["log"]:
+        run = log_evaluation(config, uri, f"{' '.join(models)} on {name}", digest, metrics_of(made), tables)
+    for table in tables:
         console.print(as_rich(table))
     if scenes.outage and not scores.outage.any():
         console.print("no outage fits into the valid truth of these drives; see outage.*", style="yellow")
-    console.print(f"Report: {config['out']}/report.html")
+    for result in made:
+        console.print(f"\n[bold]{answer(result)}[/bold]", highlight=False)
+    where = f"; MLflow: run {run}" if run else ""
+    console.print(f"Report: {config['out']}/report.html{where}", soft_wrap=True)
+
+
+def check_baseline(baseline: str, models: Mapping[str, Any]) -> None:
+    """InputError for a baseline that is neither among the models nor a filter's name."""
+    if baseline not in models and not is_filter(str(baseline)):
+        raise InputError(f"baseline={baseline} is none of the models {', '.join(models)}; see model=")
 
 
 if __name__ == "__main__":

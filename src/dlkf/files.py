@@ -12,6 +12,13 @@ from pathlib import Path
 from dlkf.errors import InputError
 
 
+def vacant(folder: str | Path, *, overwrite: bool) -> None:
+    """InputError if ``folder`` holds something that a new result would lie among, unless ``overwrite``."""
+    target = Path(folder).expanduser()
+    if not overwrite and target.is_dir() and any(target.iterdir()):
+        raise InputError(f"out={folder} exists already and is not empty; give another out= or overwrite=true")
+
+
 @contextmanager
 def staged(folder: str | Path) -> Iterator[Path]:
     """A temporary folder whose files move into ``folder`` when the block ends well, and vanish otherwise.

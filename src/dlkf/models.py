@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import CONFIG, WEIGHTS, load_filter
 from dlkf.navigation.imu_errors import ImuSpec
 
+BEST = "best"  # folder of the weights that a training keeps
 RUN_ID = re.compile(r"[0-9a-f]{32}")
 
 
@@ -51,6 +52,15 @@ def resolve_model(
     )
 
 
+def grid_of(
+    models: Iterable[Estimator], rate_hz: float | None, epoch_s: float | None, usual_epoch_s: float = 1.0
+) -> dict[str, float]:
+    """``rate_hz`` and ``epoch_s``: as given, else what a trained filter was trained on, else 50 Hz and the usual."""
+    trained = [m.config for m in models if hasattr(m, "config") and hasattr(m.config, "rate_hz")]
+    own = (trained[0].rate_hz, trained[0].epoch_s) if trained else (50.0, usual_epoch_s)
+    return {"rate_hz": own[0] if rate_hz is None else rate_hz, "epoch_s": own[1] if epoch_s is None else epoch_s}
+
+
 def is_tracked(spec: str) -> bool:
     """Whether a model is to be had from MLflow: a run id, ``runs:/…`` or ``models:/…``."""
     return bool(RUN_ID.fullmatch(spec)) or spec.startswith(("models:/", "runs:/"))
@@ -71,11 +81,17 @@ def resolve_models(specs: str | Sequence[str], imu: ImuSpec, tracking_uri: str |
 
 
 def short_name(spec: str) -> str:
-    """What a table calls a model: its name, its folder's, its registered one, or a run's first 8 digits."""
+    """What a table calls a model: its name, its folder's, its registered one, or a run's first 8 digits.
+
+    The folder ``best`` of a training is called after the training.
+    """
     if is_filter(spec):
         return spec
     if RUN_ID.fullmatch(spec):
         return spec[:8]
     if spec.startswith("models:/"):
         return spec.removeprefix("models:/")
-    return Path(spec).expanduser().resolve().name
+    folder = Path(spec).expanduser().resolve()
+    if folder.name == BEST:  # outputs/train/<name>/<hash>/best
+        return f"{folder.parents[1].name}-{folder.parent.name}"
+    return folder.name

@@ -15,13 +15,13 @@ from omegaconf import DictConfig, OmegaConf
 from dlkf.command import command
 from dlkf.console import counting
 from dlkf.data.alignment import AlignConfig
-from dlkf.data.store import load_dataset
+from dlkf.data.store import drive_rows, load_dataset
 from dlkf.errors import InputError
-from dlkf.files import staged
+from dlkf.files import staged, vacant
 from dlkf.filters.smoother import smoothed
-from dlkf.models import resolve_model
+from dlkf.models import grid_of, resolve_model
 from dlkf.navigation.imu_errors import imu_spec
-from dlkf.running.offline import navigate_drives
+from dlkf.running.offline import FixSpacing, epoch_for, navigate_drives
 from dlkf.running.replay import stream_drives
 from dlkf.running.solution import write_solution
 
@@ -30,16 +30,20 @@ from dlkf.running.solution import write_solution
 def main(cfg: DictConfig) -> None:
     """Load, align, run, write; print a line per drive."""
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
+    vacant(config["out"], overwrite=config["overwrite"])
     if not isinstance(config["model"], str):
         raise InputError(f"navigate runs one model at a time, got model={config['model']}")
     model = resolve_model(
         config["model"],
         imu_spec(config["imu"]),
-        config["tracking_uri"],
+        config["tracking"]["uri"],
         tuning=config["tuning"],
         prior=config["prior"],
     )
-    grid = {key: config[key] for key in ("rate_hz", "epoch_s", "drives")}
+    rows = drive_rows(config["dataset"], config["drives"])
+    spacings = {row.name: FixSpacing.of(config["dataset"], row.name) for row in rows}
+    usual = epoch_for(spacings.values(), config["rate_hz"] or 50.0, model)
+    grid = {"drives": config["drives"], **grid_of([model], config["rate_hz"], config["epoch_s"], usual)}
     skipped: dict[str, str] | None = {} if config["skip_unaligned"] else None
     if config["smoother"] is not None:
         if config["streaming"]:
@@ -62,7 +66,7 @@ def main(cfg: DictConfig) -> None:
     with staged(config["out"]) as folder, counting("Navigating") as progress:
         for result in navigated(progress=progress):
             write_solution(folder / f"drive={result.drive}" / "solution.parquet", result.table)
-            lines.append(result.summary())
+            lines.append(result.summary(spacings[result.drive]))
     print("\n".join(sorted(lines)))
     for reason in (skipped or {}).values():
         print(f"left out: {reason}")

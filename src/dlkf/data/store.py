@@ -43,11 +43,12 @@ def load_dataset(
     return loaded
 
 
-def drive_rows(folder: str | Path, drives: Sequence[str] | None = None) -> list[DriveRow]:
+def drive_rows(folder: str | Path, drives: Sequence[str] | str | None = None) -> list[DriveRow]:
     """What ``drives.parquet`` says of all drives, or of those named; InputError for an unknown one."""
     rows = read_drives(folder)
     if drives is None:
         return rows
+    drives = [drives] if isinstance(drives, str) else list(drives)
     known = {row.name: row for row in rows}
     if unknown := [name for name in drives if name not in known]:
         shown = ", ".join(list(known)[:8]) + (", …" if len(known) > 8 else "")

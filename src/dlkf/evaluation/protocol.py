@@ -199,7 +199,11 @@ def _parts(items: Sequence, epochs: Sequence[int], stack: DriveStack) -> list[li
 def protocol_from(config: Mapping[str, Any]) -> Protocol:
     """A protocol from plain values: the keys of ``conf/evaluate.yaml``; InputError for unknown ones."""
     outage = config.get("outage")
+    if outage in ("none", "off", False):
+        outage = None
     if outage is not None:
+        if not isinstance(outage, Mapping):
+            raise InputError(f"outage is {outage!r}, must be null, or have first_s, duration_s, every_s, offsets_s")
         known = {"first_s", "duration_s", "every_s", "offsets_s"}
         if unknown := sorted(set(outage) - known):
             raise InputError(f"outage: unknown key {unknown[0]}; known are {', '.join(sorted(known))}")

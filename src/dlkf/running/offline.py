@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,11 +13,48 @@ import torch
 from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.drive import Drive
 from dlkf.data.segments import whole_drives
+from dlkf.data.tables import read_table
+from dlkf.data.validate import GNSS_QUALITIES
 from dlkf.errors import InputError
 from dlkf.filters.integration import Estimator
 from dlkf.running.batched import CHUNK_SAMPLES, run_filter
 from dlkf.running.solution import solution_table
 from dlkf.running.start import align_each
+
+
+@dataclass(frozen=True)
+class FixSpacing:
+    """Times of the fixes [s] in a drive's file that a filter could use, and how far apart they usually are."""
+
+    t: np.ndarray
+
+    @staticmethod
+    def of(folder: str | Path, drive: str) -> FixSpacing:
+        """Of a drive of a dataset."""
+        gnss = read_table(folder, "gnss", drive)
+        assert gnss is not None  # read_table raises where there is none
+        return FixSpacing(gnss["t"][np.isin(gnss["quality"], GNSS_QUALITIES)])
+
+    @property
+    def usual_s(self) -> float:
+        """Median spacing, to the millisecond; infinite with fewer than two fixes."""
+        return round(float(np.median(np.diff(self.t))), 3) if len(self.t) > 1 else np.inf
+
+    def between(self, first: float, last: float) -> int:
+        """Fixes after ``first`` and not after ``last``."""
+        return int(((self.t > first + 1e-3) & (self.t <= last + 1e-3)).sum())
+
+
+def epoch_for(spacings: Iterable[FixSpacing], rate_hz: float, estimator: Estimator) -> float:
+    """Update interval [s] that uses every fix: the closest usual spacing, at most 1 s.
+
+    1 s where it is no whole number of IMU samples, and for filters with constraints, whose noise is meant for one a
+    second.
+    """
+    closest = min((s.usual_s for s in spacings), default=1.0)
+    samples = closest * rate_hz
+    whole = samples >= 1 and abs(samples - round(samples)) < 1e-6
+    return closest if closest < 1.0 and whole and not getattr(estimator, "constrained", False) else 1.0
 
 
 @dataclass(frozen=True)
@@ -27,13 +65,17 @@ class Navigated:
     aligned_at: float
     table: pd.DataFrame
 
-    def summary(self) -> str:
-        """One line: rows, alignment, fixes used, and the filter's own 1σ at the end."""
-        last = self.table.iloc[-1]
-        text = (
-            f"{self.drive}: aligned at t = {self.aligned_at:.1f} s, {len(self.table)} epochs, "
-            f"{int(self.table.gnss_used.sum())} fixes used"
-        )
+    def summary(self, spacing: FixSpacing | None = None) -> str:
+        """One line: rows, alignment, fixes used (of those in the file), and the filter's own 1σ at the end."""
+        last, used = self.table.iloc[-1], int(self.table.gnss_used.sum())
+        text = f"{self.drive}: aligned at t = {self.aligned_at:.1f} s, {len(self.table)} epochs, "
+        if spacing is None:
+            text += f"{used} fixes used"
+        else:
+            offered = spacing.between(self.aligned_at, last.t)
+            text += f"{used} of {offered} fixes used"
+            if offered > 1.5 * len(self.table):
+                text += f" (one an epoch; epoch_s={spacing.usual_s:g} takes all)"
         position = np.hypot(last.std_pos_n, last.std_pos_e)
         if np.isfinite(position):
             text += f", final 1σ {position:.2g} m horizontal, {np.degrees(last.std_yaw):.2g}° heading"

@@ -118,7 +118,7 @@ def download_model(spec: str, uri: str | None = None) -> Path:
     if store_missing(uri):
         raise InputError(
             f"model={spec}: there is no MLflow store at {uri.removeprefix('sqlite:///')}; "
-            "run from the folder of the training or give tracking_uri=…"
+            "run from the folder of the training or give tracking.uri=…"
         )
     mlflow = mlflow_module()
     with reachable(uri):

@@ -1,0 +1,44 @@
+"""Where a result comes from: the command, the version of this program, its commit, the day."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+
+import dlkf
+
+
+def provenance() -> dict[str, str]:
+    """``command``, ``date``, ``version`` and, run from a clone, ``commit`` (with ``+`` where files were changed)."""
+    made = {"command": command_line(), "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"), "version": version()}
+    return made | ({"commit": found} if (found := commit()) else {})
+
+
+def version() -> str:
+    """Of this package."""
+    return dlkf.__version__
+
+
+def command_line() -> str:
+    """What was typed, as a shell takes it."""
+    program = Path(sys.argv[0])
+    name = "dlkf" if program.name in ("dlkf", "__main__.py") else f"python -m dlkf.{program.stem}"
+    return shlex.join([*name.split(), *sys.argv[1:]])
+
+
+def commit() -> str | None:
+    """Commit of the clone that this package runs from, None outside of one."""
+    root = Path(dlkf.__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None
+    try:
+        said = [
+            subprocess.run(["git", "-C", str(root), *what], capture_output=True, text=True, timeout=10, check=True)
+            for what in (["rev-parse", "--short=10", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
+        ]
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return said[0].stdout.strip() + ("+" if said[1].stdout.strip() else "")
