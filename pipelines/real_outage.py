@@ -37,7 +37,7 @@ def main() -> int:
             command = [
                 *("-m", "dlkf.evaluate", f"model=[{','.join(options.models)}]", f"dataset={folder}"),
                 *(f"imu={options.imu}", f"outage.duration_s={length:g}", f"length_s={60 + length:g}"),
-                *("injected_bias=null", f"out={home}/{length:g}s", *overrides),
+                *("injected_bias=null", f"out={home}/{length:g}s", "overwrite=true", *overrides),
             ]
             print("\n$ python " + " ".join(command), flush=True)
             worst = max(worst, subprocess.run([sys.executable, *command]).returncode)

@@ -22,7 +22,7 @@ FLOORS = (
     {"training"},
     {"models"},
     {"command"},
-    {"allan", "consistency", "evaluate", "ingest", "navigate", "simulate", "train", "tune"},
+    {"allan", "consistency", "evaluate", "ingest", "navigate", "register", "simulate", "train", "tune"},
 )
 FLOOR = {room: n for n, rooms in enumerate(FLOORS) for room in rooms}
 GLUE = {"hydra", "mlflow", "lightning", "omegaconf"}

@@ -23,7 +23,7 @@ from dlkf.errors import InputError
 from dlkf.evaluation.report import all_tables
 from dlkf.evaluation.table import as_rich
 from dlkf.tracking.grid import PARENT_RUN, run_name
-from dlkf.tracking.registry import log_model
+from dlkf.tracking.registry import check_registration, log_model
 from dlkf.tracking.runs import lightning_logger, start_run, tracking_uri
 from dlkf.training.run_folder import run_folder, write_state
 from dlkf.training.study import load_data, run_study
@@ -35,6 +35,7 @@ def main(cfg: DictConfig) -> None:
     """Data, run, study, table."""
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
     console = Console(width=None if sys.stdout.isatty() else 110)
+    check_registration(config["tracking"]["register"], config["tracking"]["alias"])
     make_missing(config, console)
     data = load_data(config, console.print)
     folder, state = run_folder(config)
@@ -53,9 +54,9 @@ def main(cfg: DictConfig) -> None:
             console.print(as_rich(table))
         metrics = key_metrics(outcome)
         run.log_files(folder / "report")
-        tracking = config["tracking"]
-        log_model(run, outcome.weights, register=tracking["register"], alias=tracking["alias"], metrics=metrics)
         run.note(note(config, outcome))
+        chosen = {} if parent else {key: config["tracking"][key] for key in ("register", "alias")}  # the grid's best is
+        log_model(run, outcome.weights, metrics=metrics, **chosen)
         write_state(folder, finished=True)
     seconds = ", ".join(f"{k} {v:.0f} s" for k, v in outcome.seconds.items())
     console.print(f"{seconds}\nReport: {folder}/report/report.html\nModel:  {outcome.weights}\nMLflow: run {run.id}")

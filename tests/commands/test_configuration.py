@@ -22,6 +22,7 @@ GROUPS = {  # group of the defaults list: folder under conf/
     "evaluate": {"imu": "imu", "tuning": "tuning"},
     "navigate": {"imu": "imu", "tuning": "tuning"},
     "allan": {"imu": "imu"},
+    "register": {},
     "tune": {"imu": "imu", "tuning": "tuning"},
     "consistency": {"imu": "imu", "tuning": "tuning", "chassis": "chassis"},
     "train": {"imu": "imu", "data": "data", "filter@model": "filter"},

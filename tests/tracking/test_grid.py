@@ -46,7 +46,7 @@ def test_a_sweep_that_finishes(uri, client, capsys):
     grid.on_multirun_end(OmegaConf.create())
     assert PARENT_RUN not in os.environ and SWEPT not in os.environ
     found = client.get_run(parent)
-    assert found.info.status == "FINISHED" and found.info.run_name == "grid optimizer.lr × seed"
+    assert found.info.status == "FINISHED" and found.info.run_name == "grid lr 1e-3,1e-4 × seed range(2)"
     assert found.data.params == {"optimizer.lr": "1e-3,1e-4", "seed": "range(2)"}
     for run in (worse, better):
         child = client.get_run(run.id)
@@ -173,9 +173,9 @@ def test_a_real_sweep_with_a_failing_point(uri, client, tmp_path):
     experiment = client.get_experiment_by_name("town").experiment_id
     runs = {r.info.run_name: r for r in client.search_runs([experiment])}
     assert {name: r.info.status for name, r in runs.items()} == {
-        "grid x": "FAILED", "x=1": "FINISHED", "x=2": "FINISHED", "x=3": "FAILED"
+        "grid x 1,2,3": "FAILED", "x=1": "FINISHED", "x=2": "FINISHED", "x=3": "FAILED"
     }  # fmt: skip
-    parent = runs["grid x"].info.run_id
-    assert all(r.data.tags["mlflow.parentRunId"] == parent for n, r in runs.items() if n != "grid x")
+    parent = runs["grid x 1,2,3"].info.run_id
+    assert all(r.data.tags["mlflow.parentRunId"] == parent for n, r in runs.items() if n != "grid x 1,2,3")
     assert all(len(client.get_metric_history(runs[f"x={k}"].info.run_id, "train/loss")) == 20 for k in (1, 2, 3))
     assert "position_rms_m" in done.stdout and parent in done.stdout

@@ -1,5 +1,6 @@
 """Models: logged without a pickle, fetched by run, version or alias, run as a pyfunc."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -7,12 +8,14 @@ import sys
 import pandas as pd
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
 from dlkf.filters.saved import load_filter
 from dlkf.running.offline import navigate_drives
-from dlkf.tracking.registry import check_registration, download_model, log_model
+from dlkf.tracking.grid import PARENT_RUN, VALIDATION, GridParent, best_of
+from dlkf.tracking.registry import check_registration, download_model, log_model, registered
 from dlkf.tracking.runs import mlflow_module, start_run
 
 
@@ -156,3 +159,46 @@ def test_names_the_registry_would_refuse(name, alias):
         check_registration(name, alias)
     check_registration("town", "champion")
     check_registration(None, None)
+
+
+def test_a_moved_folder_keeps_its_models(logged, uri, weights, tmp_path):
+    """The store names absolute places: they follow it, and new runs do not go to where it was."""
+    moved = tmp_path / "moved here"
+    moved.mkdir()
+    for name in ("mlflow.db", "mlruns"):
+        shutil.move(tmp_path / name, moved / name)
+    there = f"sqlite:///{moved / 'mlflow.db'}"
+    assert same_weights(download_model("models:/town@champion", there), weights)
+    with start_run(there, "town", "two", system_metrics=False) as run:
+        log_model(run, weights, register="town")
+    assert same_weights(download_model("models:/town/2", there), weights)
+    assert not (tmp_path / "mlruns").exists()
+
+
+def test_the_best_of_a_grid_is_registered_at_its_end(uri, client, weights, capsys):
+    """Not the last: the one with the least validation error."""
+    grid = GridParent()
+    config = {"name": "town", "tracking": {"uri": uri, "alias": "champion"}}
+    hydra = {"overrides": {"task": ["seed=0,1,2"]}, "sweeper": {"params": None}}
+    grid.on_multirun_start(OmegaConf.create(config | {"hydra": hydra}))
+    parent, ids = os.environ[PARENT_RUN], []
+    for rms in (5.0, 2.0, 3.0):
+        with start_run(uri, "town", f"rms {rms}", parent_run_id=parent, system_metrics=False) as run:
+            run.log_metrics({VALIDATION: rms})
+            log_model(run, weights)
+        ids.append(run.id)
+    grid.on_multirun_end(OmegaConf.create())
+    assert client.get_model_version_by_alias("town", "champion").run_id == ids[1]
+    assert "Registered the best, rms 2.0: models:/town/1" in capsys.readouterr().out
+    assert best_of(client, parent).info.run_id == ids[1] and best_of(client, ids[2]).info.run_id == ids[2]
+    version = client.get_model_version("town", registered(client, ids[0], "town"))
+    assert version.run_id == ids[0] and "rms 5.0" in version.description
+
+
+@pytest.mark.parametrize("alias", ["latest", "v3", "a b"])
+def test_a_grid_with_a_bad_alias_does_not_start(uri, alias, capsys):
+    config = {"name": "town", "tracking": {"uri": uri, "alias": alias}}
+    hydra = {"overrides": {"task": ["seed=0,1"]}, "sweeper": {"params": None}}
+    with pytest.raises(SystemExit) as end:
+        GridParent().on_multirun_start(OmegaConf.create(config | {"hydra": hydra}))
+    assert end.value.code == 2 and capsys.readouterr().err.count("\n") == 1

@@ -18,6 +18,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from dlkf.errors import InputError
+from dlkf.tracking.registry import check_registration, registered
 from dlkf.tracking.runs import (
     NOTE_TAG,
     PARENT_TAG,
@@ -39,16 +40,22 @@ class GridParent(Callback):
 
     def __init__(self) -> None:
         self.run_id: str | None = None
+        self.register: str | None = None
+        self.alias: str | None = None
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Make store, experiment and parent run; hand its id and the swept keys on by the environment."""
         swept = swept_overrides(config)
+        if not config.tracking.get("log", True):
+            return
+        self.register, self.alias = (config.tracking.get(key) for key in ("register", "alias"))
         try:
+            check_registration(self.register, self.alias)
             self.uri = tracking_uri(config.tracking.uri)
             mlflow = mlflow_module()
             with reachable(self.uri):
                 client = mlflow.MlflowClient(self.uri)
-                name = "grid " + " × ".join(shown(key) for key in swept)
+                name = "grid " + " × ".join(grid_name(key, values) for key, values in swept.items())
                 run = client.create_run(experiment_id(client, config.name), run_name=name[:250])
         except InputError as error:  # Hydra would make a warning of it and go on
             print(f"dlkf: error: {error}", file=sys.stderr)
@@ -87,6 +94,10 @@ class GridParent(Callback):
             print(f"\n{title}\n{text}\nGrid search: MLflow run {parent} in {self.uri}")
             self._show_best(client, parent, table, runs)
         client.set_terminated(parent, parent_status([r.info.status for r in runs], ended))
+        if ended and (self.register or self.alias) and (best := best_child(client, runs)):
+            name = self.register or client.get_experiment(best.info.experiment_id).name
+            number = registered(client, best.info.run_id, name, self.alias)
+            print(f"Registered the best, {best.info.run_name}: models:/{name}/{number}, alias {self.alias or 'none'}")
 
     def _show_best(self, client, parent: str, table: pd.DataFrame, runs: Sequence) -> None:
         """The parent carries the scores of the point that validated best."""
@@ -99,6 +110,7 @@ class GridParent(Callback):
         now = best.info.end_time or best.info.start_time
         client.log_batch(parent, metrics=[Metric(k, v, now, 0) for k, v in scores.items()])
         client.set_tag(parent, "best_run", best.info.run_name)
+        client.set_tag(parent, "best_run_id", best.info.run_id)
 
 
 def parent_status(statuses: Sequence[str], ended: bool) -> str:
@@ -119,6 +131,23 @@ def best_validation(client, run) -> float | None:
     """The least validation error [m] of a run: that of its kept weights."""
     history = client.get_metric_history(run.info.run_id, VALIDATION)
     return min((m.value for m in history), default=None)
+
+
+def best_child(client, runs: Sequence):
+    """The finished run that validated best, None where none did."""
+    validated = [(best_validation(client, r), r) for r in runs if r.info.status == "FINISHED"]
+    known = [(value, run) for value, run in validated if value is not None]
+    return min(known, key=lambda pair: pair[0])[1] if known else None
+
+
+def best_of(client, run_id: str):
+    """A run, or of a grid search's parent its best child; InputError where none of them was validated."""
+    runs = children(client, run_id)
+    if not runs:
+        return client.get_run(run_id)
+    if (best := best_child(client, runs)) is None:
+        raise InputError(f"run={run_id}: no point of this grid search was validated")
+    return best
 
 
 def comparison(runs: Sequence, validated: Sequence[float | None]) -> pd.DataFrame:
@@ -196,6 +225,11 @@ def run_name(name: str, overrides: Sequence[str]) -> str:
                 continue
             words.append(value if key in PRESETS else shown(override))
     return " ".join(words)[:250] or name
+
+
+def grid_name(key: str, values: str) -> str:
+    """A swept key and its values, short enough to be told apart in a list: ``lstm_hidden 8,64``."""
+    return f"{shown(key).rpartition('.')[2]} {values if len(values) <= 24 else values[:23] + '…'}"
 
 
 def shown(override: str) -> str:

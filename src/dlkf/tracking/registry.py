@@ -14,7 +14,16 @@ from typing import TYPE_CHECKING
 import dlkf
 from dlkf.errors import InputError
 from dlkf.filters.saved import WEIGHTS
-from dlkf.tracking.runs import Run, mlflow_module, reachable, run_exists, store_missing, tracking_uri
+from dlkf.tracking.runs import (
+    NOTE_TAG,
+    Run,
+    found_again,
+    mlflow_module,
+    reachable,
+    run_exists,
+    store_missing,
+    tracking_uri,
+)
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -67,10 +76,40 @@ def log_model(
     )
     _log_model_metrics(run, info.model_id, metrics or {})
     if register:
-        made = mlflow.register_model(info.model_uri, register, await_registration_for=0)
-        if alias:
-            client.set_registered_model_alias(register, alias, made.version)
+        registered(client, run.id, register, alias)
     return info.model_uri
+
+
+def registered(client: MlflowClient, run_id: str, name: str, alias: str | None = None) -> str:
+    """Make the model of a run a version of ``name`` and let ``alias`` point there; returns the version.
+
+    The version carries a card: the run's note, its parameters and scores. Raises InputError where the run logged no
+    model or the name is none.
+    """
+    check_registration(name, alias)
+    run = client.get_run(run_id)
+    logged = run.outputs.model_outputs if run.outputs else []
+    if not logged:
+        raise InputError(f"run {run_id} logged no model (its status is {run.info.status})")
+    mlflow = mlflow_module()
+    mlflow.set_tracking_uri(client.tracking_uri)
+    scores = {k: f"{v:.4g}" for k, v in run.data.metrics.items() if k.startswith(("test/", "val/"))}
+    made = mlflow.register_model(
+        f"models:/{logged[-1].model_id}", name, await_registration_for=0, tags={"run": run.info.run_name, **scores}
+    )
+    client.update_model_version(name, made.version, card(run))
+    if alias:
+        client.set_registered_model_alias(name, alias, made.version)
+    return str(made.version)
+
+
+def card(run) -> str:
+    """What a registered version says of itself, in Markdown: where it comes from, how to use it, how good it is."""
+    params = run.data.params
+    told = {key: params[key] for key in ("data.datasets", "imu.name", "seed", "trainer.max_epochs") if key in params}
+    rows = "\n".join(f"- {key}: `{value}`" for key, value in told.items())
+    how = "`predict` takes a table of a drive (IMU and GNSS rows), or folders of datasets; see the input example."
+    return f"# {run.info.run_name}\n\nRun `{run.info.run_id}`. {how}\n\n{rows}\n\n{run.data.tags.get(NOTE_TAG, '')}"
 
 
 def _log_model_metrics(run: Run, model_id: str, metrics: Mapping[str, float]) -> None:
@@ -121,6 +160,7 @@ def download_model(spec: str, uri: str | None = None) -> Path:
             "run from the folder of the training or give tracking.uri=…"
         )
     mlflow = mlflow_module()
+    found_again(uri)
     with reachable(uri):
         client = mlflow.MlflowClient(uri)
         find = _registered if spec.startswith("models:/") else _of_run

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from dlkf.errors import InputError
+from dlkf.tracking.moved import follow
 
 if TYPE_CHECKING:
     from lightning.pytorch.loggers import MLFlowLogger
@@ -62,6 +63,12 @@ def tracking_uri(given: str | None = None) -> str:
 def store_missing(uri: str) -> bool:
     """Whether the URI is an embedded store that does not exist yet."""
     return uri.startswith(SQLITE) and not Path(uri.removeprefix(SQLITE)).is_file()
+
+
+def found_again(uri: str) -> None:
+    """The artifacts of an embedded store whose folder was moved."""
+    if uri.startswith(SQLITE):
+        follow(Path(uri.removeprefix(SQLITE)), ARTIFACTS)
 
 
 @contextmanager
@@ -195,6 +202,7 @@ def start_run(
     Raises InputError where the server does not answer or the experiment was deleted.
     """
     mlflow = mlflow_module()
+    found_again(uri)
     mlflow.set_tracking_uri(uri)
     system_metrics = system_metrics and find_spec("psutil") is not None  # else MLflow refuses the run
     mlflow.set_system_metrics_sampling_interval(SAMPLE_EVERY_S)

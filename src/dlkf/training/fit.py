@@ -59,6 +59,9 @@ def fit(config: Mapping[str, Any], data: DriveDataModule, folder: Path, logger: 
             raise (end.__context__ if isinstance(end.__context__, KeyboardInterrupt) else end) from None
     if trainer.interrupted:
         raise KeyboardInterrupt
+    loss = trainer.callback_metrics.get("train/loss")
+    if not (folder / BEST).is_dir() and loss is not None and not bool(loss.isfinite()):
+        raise InputError(f"the training diverged (its loss is {float(loss)}); give a smaller optimizer.lr")
     if not (folder / BEST).is_dir():
         raise InputError(
             f"no epoch was validated: trainer.max_epochs={settings['max_epochs']} ends before "
