@@ -62,7 +62,7 @@ def command(
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors reach us whole instead of Hydra's exit
             given = [_with_group(argument, GROUPS.get(name, {})) for argument in arguments(sys.argv[1:])]
             sys.argv[1:] = [readable(argument) for argument in given]
-            signal.signal(signal.SIGTERM, _terminate)
+            before = signal.signal(signal.SIGTERM, _terminate)
             try:
                 run = hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)
                 run(task)()
@@ -71,10 +71,11 @@ def command(
                     raise
                 _refuse(error)
             except KeyboardInterrupt as end:
-                signal.signal(signal.SIGTERM, signal.SIG_DFL)
                 terminated = isinstance(end, Terminated)
                 print(f"dlkf: {'terminated' if terminated else 'interrupted'}", file=sys.stderr)
                 sys.exit(TERMINATED if terminated else INTERRUPTED)
+            finally:
+                signal.signal(signal.SIGTERM, before)
 
         return main
 
