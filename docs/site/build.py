@@ -55,6 +55,7 @@ def on_page_content(text: str, page: Page, config: MkDocsConfig, files: Files) -
 
 def on_page_markdown(text: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Names of functions and classes become links to their API."""
+    text = text.replace("](../README.md", "](index.md").replace("](../RESULTS.md", "](results/index.md")
     parts = FENCE.split(text)  # every second one is a fenced block
     parts[::2] = [NAMED.sub(lambda found: f"[`{shortened(found[1])}`][{found[1]}]", part) for part in parts[::2]]
     return "".join(parts)

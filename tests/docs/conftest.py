@@ -1,0 +1,81 @@
+"""A folder as a reader of the pages has it, and commands called in it without a new interpreter."""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+from dlkf.config import config_dir
+from dlkf.simulation.dataset import simulate_from_config
+from dlkf.tracking.runs import SQLITE, mlflow_module
+
+Run = Callable[[Sequence[str]], None]
+# what makes a command small; an override that is not wanted stands later in the line than the page's own
+SMALL = {
+    "simulate": ["dataset.hours=0.03", "dataset.drive_minutes=0.6", "dataset.imu_rate_hz=50"],
+    "evaluate": ["outage.first_s=10", "outage.duration_s=10", "length_s=25", "stride_s=25", "injected_bias=null"],
+    "train": [
+        "data.datasets=[data/consumer]", "data.fractions=[0.5,0.25,0.25]", "data.length_s=20", "data.eval_length_s=30",
+        "data.eval_outage=[10,10]", "trainer.max_epochs=1", "trainer.validate_every=1", "trainer.best_from_epoch=0",
+        "scoring.outage={first_s:10,duration_s:10}", "baselines.models=[mbkf15]", "baselines.tune=false",
+        "baselines.pieces=2", "callbacks.curriculum.warm_s=15", "callbacks.curriculum.full_s=20",
+        "model.network.lstm_hidden=8", "model.network.lstm_layers=1", "model.network.dense=[8,8]",
+    ],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five drives of 40 s, as ``simulate dataset=per_drive`` makes them."""
+    from hydra import compose, initialize_config_dir
+    from omegaconf import OmegaConf
+
+    size = ["dataset.hours=0.0555", "dataset.drive_minutes=0.67", "dataset.imu_rate_hz=50", "seed=3"]
+    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
+        config = compose("simulate", ["simulated@dataset=per_drive", *size])
+    folder = tmp_path_factory.mktemp("data") / "consumer"
+    return simulate_from_config(OmegaConf.to_container(config, resolve=True), folder, progress=False)
+
+
+@pytest.fixture(scope="session")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An empty MLflow store, made once: a fresh one costs seconds."""
+    path = tmp_path_factory.mktemp("store") / "mlflow.db"
+    mlflow_module().MlflowClient(SQLITE + str(path)).search_experiments()
+    return path
+
+
+@pytest.fixture
+def desk(drives: Path, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder that one stands in: data/consumer, an empty store, Python files importable."""
+    (tmp_path / "data").mkdir()
+    shutil.copytree(drives, tmp_path / "data" / "consumer")
+    shutil.copy(store, tmp_path / "mlflow.db")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"{SQLITE}{tmp_path}/mlflow.db")  # MLflow sets it; back to what it was
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return tmp_path
+
+
+@pytest.fixture
+def run(desk: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
+    """Runs ``python -m dlkf.<command> …`` of a page, small; fails unless it ends well."""
+
+    def call(words: Sequence[str]) -> None:
+        assert list(words[:2]) == ["python", "-m"], words
+        command = words[2].removeprefix("dlkf.")
+        given = [w for w in words[3:] if not any(w.startswith(s.split("=")[0] + "=") for s in SMALL.get(command, []))]
+        monkeypatch.setattr(sys, "argv", [words[2], *given, *SMALL.get(command, [])])
+        code: object = 0
+        try:
+            importlib.import_module(f"dlkf.{command}").main()
+        except SystemExit as end:
+            code = end.code
+        assert not code, f"{' '.join(words)}: {capfd.readouterr().err}"
+
+    return call

@@ -1,0 +1,96 @@
+"""The recipes of docs/developing.md, followed to the letter on small data; and its map of the rooms."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from dlkf.tracking.runs import SQLITE, mlflow_module
+from tests.docs.conftest import Run
+from tests.docs.pages import ROOT, Block, blocks, commands
+from tests.test_imports import FLOORS, GLUED
+
+PAGE = ROOT / "docs" / "developing.md"
+RECIPES: dict[str, list[Block]] = {}
+for block in blocks(PAGE):
+    RECIPES.setdefault(block.heading, []).append(block)
+LONGEST = 20  # lines of code
+
+
+def written(recipe: str, desk: Path) -> None:
+    """The files of a recipe."""
+    for block in RECIPES[recipe]:
+        if block.file:
+            (desk / block.file).parent.mkdir(parents=True, exist_ok=True)
+            (desk / block.file).write_text(block.text)
+
+
+def lines(recipe: str) -> list[list[str]]:
+    """The commands of a recipe."""
+    return [words for block in RECIPES[recipe] if not block.file for words in commands(block.text)]
+
+
+def followed(recipe: str, desk: Path, run: Run) -> None:
+    """Write the files and run the commands of a recipe."""
+    written(recipe, desk)
+    for words in lines(recipe):
+        run(words)
+
+
+def test_the_map_shows_the_floors() -> None:
+    rows = re.findall(r"^\| (\d+) \| ([^|]+) \|", PAGE.read_text(), re.M)
+    assert [int(n) for n, _ in rows] == list(range(len(FLOORS), 0, -1))
+    for number, rooms in rows:
+        assert set(re.findall(r"`(\w+)`", rooms)) == FLOORS[int(number) - 1] - {""}, f"floor {number}"
+    above = PAGE.read_text().partition("| | | |")[0]
+    lowest = len(FLOORS) + 1 - len(re.findall(r"^\| \d+ \|", above, re.M))
+    assert all(rooms & GLUED for rooms in FLOORS[lowest - 1 :][:2])
+    assert not any(rooms & GLUED for rooms in FLOORS[: lowest - 1])
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_a_recipe_is_short(recipe: str) -> None:
+    for block in RECIPES[recipe]:
+        code = [line for line in block.text.splitlines() if line.strip() and not line.startswith("#")]
+        assert len(code) <= LONGEST, f"{recipe}: {len(code)} lines"
+
+
+def test_an_imu(desk: Path, run: Run) -> None:
+    followed("An IMU", desk, run)
+    assert (desk / "outputs" / "shed" / "metrics.json").is_file()
+
+
+def test_a_car(desk: Path, run: Run) -> None:
+    followed("A car", desk, run)
+    table = pd.read_parquet(desk / "data" / "van" / "drives.parquet")
+    assert (table["lever_arm_z_m"] == -1.9).all()
+
+
+def test_a_reader(desk: Path, run: Run) -> None:
+    (desk / "logs" / "shed").mkdir(parents=True)
+    drive = pd.read_parquet(desk / "data" / "consumer" / "drives.parquet")["drive"][0]
+    tables = {k: pd.read_parquet(desk / "data" / "consumer" / k / f"drive={drive}") for k in ("imu", "gnss")}
+    columns = ["t", "lat_deg", "lon_deg", "height_m", "vel_n", "vel_e", "vel_d"]
+    imu = ["t", "gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"]
+    np.savez(desk / "logs" / "shed" / "monday.npz", imu=tables["imu"][imu], gnss=tables["gnss"][columns])
+    followed("A reader", desk, run)
+    read = pd.read_parquet(desk / "data" / "shed" / "imu" / "drive=monday")
+    np.testing.assert_array_equal(read["accel_z"], tables["imu"]["accel_z"])
+
+
+def test_an_experiment_and_a_callback(desk: Path, run: Run) -> None:
+    """One training that both recipes ask for."""
+    written("An experiment", desk)
+    written("A callback", desk)
+    (experiment,) = lines("An experiment")
+    (callback,) = lines("A callback")
+    run([*experiment, *(word for word in callback if word.startswith("+callbacks"))])
+    (config,) = (desk / "outputs" / "train" / "heading").glob("*/best/config.yaml")
+    assert "frame: heading" in config.read_text()
+    client = mlflow_module().MlflowClient(f"{SQLITE}{desk}/mlflow.db")
+    (made,) = client.search_runs([e.experiment_id for e in client.search_experiments()])
+    assert made.data.metrics["train/epoch_s"] > 0
