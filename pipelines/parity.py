@@ -35,6 +35,7 @@ from dlkf.data.drive import Batch
 from dlkf.data.schema import ACCEL, GYRO, new_dataset, write_drive, write_drives_table
 from dlkf.data.segments import StartLaw, cut_pieces, make_batch
 from dlkf.data.store import load_dataset
+from dlkf.data.tables import Columns
 from dlkf.evaluation.bootstrap import compare
 from dlkf.evaluation.figures import COLOURS
 from dlkf.evaluation.report import png
@@ -50,7 +51,8 @@ from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.navigation.state import NavState
 from dlkf.simulation.imu import corrupt, draw_unit
 from dlkf.simulation.motion.routes import VehicleConfig
-from dlkf.simulation.motion.vehicle import drive_vehicle
+from dlkf.simulation.motion.vehicle import Truth, drive_vehicle
+from dlkf.simulation.tables import fix_columns, imu_columns, reference_columns
 
 Array = NDArray[np.float64]
 RATE, POSITION_STD, VELOCITY_STD = 100, 0.02, 0.05  # Hz, m, m/s
@@ -98,31 +100,23 @@ def write_drives(folder: Path, spec: ImuSpec, drives: int, minutes: float) -> No
                 write_drive(
                     beside,
                     meta | {"imu": spec.name, "gnss": "simulated, white noise"},
-                    pd.DataFrame({"t": t[1:]} | dict(zip((*ACCEL, *GYRO), measured.T))),
-                    pd.DataFrame(_named(fixes.index, position.to_numpy(), velocity.to_numpy()) | _stds(len(fixes))),
-                    pd.DataFrame(
-                        _named(at.index, at[LLA_COLS].to_numpy(), at[VEL_COLS].to_numpy())
-                        | dict(zip(("roll", "pitch", "yaw"), _wrapped(np.radians(at[RPH_COLS].to_numpy())).T))
-                        | {"valid": np.ones(len(at), bool)}
-                        | dict(zip((f"{s}_error_{a}" for s in ("accel", "gyro") for a in "xyz"), _at(error, at).T))
-                    ),
+                    pd.DataFrame(imu_columns(t[1:], measured)),
+                    pd.DataFrame(_fixes(fixes.index.to_numpy(), position.to_numpy(), velocity.to_numpy())),
+                    pd.DataFrame(reference_columns(_truth(at), _at(error, at))),
                 )
             )
         write_drives_table(beside, rows)
 
 
-def _named(t: pd.Index, lla: Array, v_n: Array) -> dict[str, Array]:
-    names = ("lat_deg", "lon_deg", "height_m", "vel_n", "vel_e", "vel_d")
-    return {"t": t.to_numpy()} | dict(zip(names, np.column_stack((lla, v_n)).T))
+def _fixes(t: Array, lla: Array, v_n: Array) -> Columns:
+    std = np.tile((POSITION_STD,) * 3 + (VELOCITY_STD,) * 3, (len(t), 1))
+    return fix_columns(t, *np.radians(lla[:, :2]).T, lla[:, 2], v_n, std, np.full(len(t), 4))
 
 
-def _stds(n: int) -> dict[str, Array]:
-    stds = {f"std_{k}_{a}": np.full(n, s) for k, s in (("pos", POSITION_STD), ("vel", VELOCITY_STD)) for a in "ned"}
-    return stds | {"quality": np.full(n, 4)}
-
-
-def _wrapped(angles: Array) -> Array:
-    return np.arctan2(np.sin(angles), np.cos(angles))
+def _truth(at: pd.DataFrame) -> Truth:
+    lla = at[LLA_COLS].to_numpy()
+    place = (*np.radians(lla[:, :2]).T, lla[:, 2])
+    return Truth(at.index.to_numpy(), *place, at[VEL_COLS].to_numpy(), np.radians(at[RPH_COLS].to_numpy()))
 
 
 def _at(error: Array, at: pd.DataFrame) -> Array:

@@ -17,10 +17,11 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from dlkf.config import config_dir
-from dlkf.data.schema import ACCEL, GYRO, new_dataset, write_drive, write_drives_table
+from dlkf.data.schema import new_dataset, write_drive, write_drives_table
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.simulation.imu import corrupt, draw_unit, inverse_mechanisation
 from dlkf.simulation.motion.vehicle import Truth
+from dlkf.simulation.tables import fix_columns, imu_columns
 
 LAT, LON, HEIGHT = math.radians(52.15), math.radians(9.95), 100.0
 
@@ -35,13 +36,12 @@ def write_static_log(folder: Path, spec: ImuSpec, hours: float, rate_hz: int, se
     measured, _ = corrupt(rng, np.tile(sample, (n, 1)), spec, draw_unit(rng, spec), rate_hz)
     t = np.arange(1, n + 1) / rate_hz
     fixes = t[rate_hz - 1 :: rate_hz]
-    still_fix = {"lat_deg": math.degrees(LAT), "lon_deg": math.degrees(LON), "height_m": HEIGHT}
-    still_fix |= {f"vel_{axis}": 0.0 for axis in "ned"} | {f"std_pos_{axis}": 0.02 for axis in "ned"}
-    still_fix |= {f"std_vel_{axis}": 0.02 for axis in "ned"} | {"quality": 4}
+    n_fixes = len(fixes)
+    place = (np.full(n_fixes, x) for x in (LAT, LON, HEIGHT))
+    fix = fix_columns(fixes, *place, np.zeros((n_fixes, 3)), np.full((n_fixes, 6), 0.02), np.full(n_fixes, 4))
     row = {"drive": "static", "source": f"simulation, seed {seed}", "licence": "none: simulated", "imu": spec.name}
     with new_dataset(folder, overwrite) as beside:
-        imu = pd.DataFrame({"t": t} | dict(zip((*ACCEL, *GYRO), measured.T)))
-        gnss = pd.DataFrame({"t": fixes} | {k: np.full(len(fixes), v) for k, v in still_fix.items()})
+        imu, gnss = pd.DataFrame(imu_columns(t, measured)), pd.DataFrame(fix)
         write_drives_table(beside, [write_drive(beside, row, imu, gnss)])
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 from typing import Any
 
-from hydra.errors import InstantiationException
-from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 
 from dlkf.command import command
@@ -42,11 +41,11 @@ def _reader(settings: Any) -> Any:
     target = settings.pop("_target_", None)
     if not target:
         raise InputError("reader has no _target_; it names the reader's class, as in conf/reader/csv.yaml")
+    module, _, name = str(target).rpartition(".")
     try:
-        kind = get_class(target)
-    except (InstantiationException, ImportError, ValueError) as error:
-        reason = str(error.__cause__ or error).splitlines()[0]
-        raise InputError(f"reader._target_={target}: cannot be imported ({reason}); put it on PYTHONPATH") from None
+        kind = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InputError(f"reader._target_={target}: cannot be imported ({error}); put it on PYTHONPATH") from None
     try:
         return kind(**settings)
     except TypeError as error:

@@ -7,12 +7,19 @@ import pymap3d
 import pytest
 
 from dlkf.errors import InputError
+from dlkf.simulation.gnss.reporting import late, reported
 from dlkf.simulation.gnss.white import GnssConfig, observe
 from dlkf.simulation.imu import inverse_mechanisation
 from dlkf.simulation.motion.vehicle import Truth, VehicleConfig, drive_vehicle
 
 RATE = 100
 QUIET = dict.fromkeys(("std_horizontal", "std_vertical", "std_velocity"), 1e-12)
+
+
+def still(seconds: int) -> Truth:
+    """A standing car, once a second."""
+    zero = np.zeros(seconds)
+    return Truth(np.arange(seconds) * 1.0, zero + 0.9, zero + 0.2, zero, np.zeros((seconds, 3)), np.zeros((seconds, 3)))
 
 
 @pytest.fixture(scope="module")
@@ -71,3 +78,50 @@ def test_noise_and_stated_std(truth):
 def test_bad_receivers_are_one_clear_line(change):
     with pytest.raises(InputError, match=next(iter(change))):
         GnssConfig(**change)
+
+
+def test_open_ambiguities_and_multipath_last_and_are_claimed():
+    """A Gauss-Markov error of the stated size, that lasts; quality 5 where ambiguities are open."""
+    truth = still(40_000)
+    config = GnssConfig(std_horizontal=0.01, wander=0.5, wander_s=30.0, float_share=0.3, float_s=20.0, float_std=0.8)
+    fixes = observe(np.random.default_rng(3), truth, np.zeros((40_000, 3)), config)
+    north = (np.radians(fixes.lat_deg.to_numpy()) - truth.lat) * 6.37e6
+    is_float = (fixes.quality == 5).to_numpy()
+    assert is_float.mean() == pytest.approx(0.3, abs=0.03)  # 600 episodes
+    assert north[~is_float].std() == pytest.approx(0.5, rel=0.1)
+    assert north[is_float].std() == pytest.approx(math.hypot(0.5, 0.8), rel=0.1)
+    assert fixes.std_pos_n[is_float].to_numpy() == pytest.approx(math.hypot(0.5, 0.8), rel=0.01)
+    x = north[~is_float]
+    assert np.corrcoef(x[1:], x[:-1])[0, 1] > 0.9
+    assert set(np.round(fixes.std_vel_n, 9)) == {0.02}
+
+
+def test_reports_are_biased_and_drop_out():
+    fixes = observe(np.random.default_rng(3), still(20_000), np.zeros((20_000, 3)), GnssConfig())
+    config = GnssConfig(std_factor=0.5, dropout_share=0.1, dropout_s=4.0)
+    seen = reported(np.random.default_rng(1), fixes, config)
+    assert len(seen) / len(fixes) == pytest.approx(0.9, abs=0.015)  # 500 gaps
+    gaps = np.diff(seen.t.to_numpy())
+    assert gaps[gaps > 1.5].mean() - 1 == pytest.approx(4.5, abs=0.7)  # of those that hold a fix at all
+    assert np.all(seen.std_pos_n == 0.01) and np.all(seen.lat_deg == fixes.lat_deg[fixes.t.isin(seen.t)].to_numpy())
+    assert reported(np.random.default_rng(1), fixes, GnssConfig()) is fixes
+
+
+@pytest.mark.parametrize(("place", "moving"), [(0.2, 0.2), (0.1, 0.3), (0.0, 0.25)])
+def test_late_fixes_are_those_of_their_lag_before(place, moving):
+    """Position and velocity of the antenna, with its lever arm, of the moments that lie that far back."""
+    rate, arm = 100, (1.5, -0.5, -2.0)
+    truth = drive_vehicle(np.random.default_rng(4), VehicleConfig(), np.arange(60 * rate + 1) / rate)
+    rate_b = np.random.default_rng(5).uniform(-0.3, 0.3, (len(truth.t), 3))
+    rows = np.arange(0, len(truth.t), rate)
+    config = GnssConfig(lever_arm_b=arm, position_lag_s=place, velocity_lag_s=moving, **QUIET)
+    seen, swing = late(truth, rate_b, rows, config, rate)
+    fixes = observe(np.random.default_rng(0), seen, swing, config)
+    on_time = observe(np.random.default_rng(0), truth, rate_b, GnssConfig(lever_arm_b=arm, **QUIET))
+    assert np.array_equal(fixes.t, truth.t[rows])
+    for lag, names in ((place, ("lat_deg", "lon_deg", "height_m")), (moving, ("vel_n", "vel_e", "vel_d"))):
+        before = np.maximum(rows - round(lag * rate), 0)
+        for name in names:
+            scale = 1.1e5 if name.endswith("_deg") else 1.0
+            apart = (fixes[name].to_numpy() - on_time[name].to_numpy()[before]) * scale
+            assert np.abs(apart).max() < 1e-5  # metres or m/s: QUIET's noise, and the second order of a metre's shift

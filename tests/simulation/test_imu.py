@@ -26,6 +26,10 @@ from dlkf.simulation.imu import (
 from dlkf.simulation.motion.vehicle import Truth, VehicleConfig, drive_vehicle
 
 CONF = Path(__file__).parents[2] / "conf"
+FLAT = {
+    "noise_density": 1e-3, "turn_on_bias": 0.1, "instability": 0.0, "correlation_time": 100.0, "scale_factor": 0.0,
+    "misalignment": 0.0,
+}  # fmt: skip
 NO_UNIT = ImuUnit(np.zeros(6), np.zeros((2, 3, 3)))
 
 
@@ -273,3 +277,29 @@ def test_bad_presets_are_one_clear_line(change, said):
     with pytest.raises(InputError) as caught:
         imu_spec({**GOOD, **change})
     assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_wander_forgets_itself_and_axes_differ():
+    """Autocorrelation of the second Gauss-Markov part at its time constant; noise factors log-normal per axis."""
+    spec = imu_spec(
+        {
+            "name": "rough",
+            **{s: {**FLAT, "wander": 0.05, "wander_time": 4.0, "unevenness": 0.6} for s in ("accel", "gyro")},
+        }
+    )
+    units = [draw_unit(np.random.default_rng(k), spec) for k in range(500)]
+    factors = np.log([unit.noise_factors for unit in units])
+    assert factors.std() == pytest.approx(0.6, rel=0.05) and factors.mean() == pytest.approx(0, abs=0.05)
+    measured, error = corrupt(np.random.default_rng(1), np.zeros((400_000, 6)), spec, units[0], 20)
+    wander = error - units[0].bias
+    assert wander.std(0) == pytest.approx([0.05] * 6, rel=0.08)  # 20000 s are 2500 spans of 2τ, 1σ 2 %
+    for x in wander.T:
+        assert np.corrcoef(x[80:], x[:-80])[0, 1] == pytest.approx(math.exp(-1), abs=0.06)
+    white = (measured - error).std(0) / (FLAT["noise_density"] * math.sqrt(20))
+    assert white == pytest.approx(units[0].noise_factors, rel=0.01)
+
+
+def test_a_preset_with_ranges_is_its_middle():
+    ranged = {**FLAT, "noise_density": {"log_uniform": [1e-4, 1e-2]}, "wander": {"uniform": [0, 1], "absent": 0.9}}
+    spec = imu_spec({"name": "any", "accel": ranged, "gyro": FLAT})
+    assert spec.accel.noise_density == pytest.approx(1e-3) and spec.accel.wander == 0

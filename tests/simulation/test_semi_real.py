@@ -90,6 +90,17 @@ def test_fixes_are_at_the_reference_and_only_where_it_is_known(real, tmp_path):
         assert (out / "raw" / "drive=r0" / "part-0.parquet").exists() == (receiver is not None)
 
 
+def test_late_fixes_are_of_the_reference_before(real, tmp_path):
+    """0.2 and 0.1 s are whole samples of the reference at 50 Hz; noise is 1 mm."""
+    quiet = dict.fromkeys(("std_horizontal", "std_vertical", "std_velocity"), 0.001)
+    out = semi(real, tmp_path / "semi", gnss={**quiet, "position_lag_s": 0.2, "velocity_lag_s": 0.1})
+    made = tables(out, "r1")
+    reference = made["reference"].set_index(np.round(made["reference"].t * 50).astype(int))
+    for lag, name, scale in ((10, "lat_deg", 1.1e5), (5, "vel_e", 1.0)):
+        apart = made["gnss"][name].to_numpy() - reference[name].loc[np.round(made["gnss"].t * 50).astype(int) - lag]
+        assert np.abs(apart).max() * scale < 0.005
+
+
 def test_the_antenna_is_where_the_lever_arm_says(real, tmp_path):
     here = tables(semi(real, tmp_path / "here"), "r1")["gnss"]
     there = tables(semi(real, tmp_path / "there", gnss={"lever_arm_b": [1.0, 0.0, -1.5]}), "r1")["gnss"]

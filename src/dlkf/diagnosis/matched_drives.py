@@ -7,7 +7,6 @@ are white, its antenna is the IMU, and every drive has a new unit and a new car.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -17,7 +16,6 @@ import torch
 from torch import Tensor
 
 from dlkf.data.drive import Batch, Drive
-from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, IMU_ERROR, POSITION, STD, VELOCITY
 from dlkf.data.segments import Piece, StartLaw, make_batch
 from dlkf.data.store import drive_from_tables
 from dlkf.data.tables import Columns, DriveRow
@@ -26,10 +24,12 @@ from dlkf.errors import InputError
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.navigation.state import ErrorStates
 from dlkf.settings import built
+from dlkf.simulation.drive import sliced
 from dlkf.simulation.imu import corrupt, draw_unit, inverse_mechanisation
 from dlkf.simulation.motion.chassis import ChassisConfig, draw_car, mounted
 from dlkf.simulation.motion.routes import VehicleConfig
 from dlkf.simulation.motion.vehicle import Truth, follow, radians_per_metre, random_route
+from dlkf.simulation.tables import fix_columns, imu_columns, reference_columns
 
 
 @dataclass(frozen=True)
@@ -117,9 +117,9 @@ def _drive(settings: MatchedDrives, spec: ImuSpec, index: int) -> tuple[Drive, n
     bias = error - np.concatenate((exact[:, :3] @ unit.matrix[0].T, exact[:, 3:] @ unit.matrix[1].T), -1)
     tables = DriveTables(
         DriveRow(f"matched-{index:03d}", f"matched-{index:03d}", (0.0, 0.0, 0.0)),
-        {"t": t[1:]} | dict(zip((*ACCEL, *GYRO), measured.T)),
+        imu_columns(t[1:], measured),
         _gnss(settings, gnss_rng, truth, rate),
-        _reference(truth, np.concatenate((bias[:1], bias)), rate),
+        reference_columns(sliced(truth, slice(None, None, rate)), np.concatenate((bias[:1], bias))[::rate]),
     )
     return drive_from_tables(tables, "matched", float(rate), 1.0, torch.float64), unit.matrix
 
@@ -133,19 +133,5 @@ def _gnss(settings: MatchedDrives, rng: np.random.Generator, truth: Truth, rate:
     place = (truth.lat[rows] + off[:, 0] * north, truth.lon[rows] + off[:, 1] * east, truth.height[rows] - off[:, 2])
     velocity = truth.v_n[rows] + settings.velocity_mps * rng.standard_normal((n, 3))
     std = np.repeat([[settings.position_m] * 3 + [settings.velocity_mps] * 3], n, axis=0)
-    columns = {"t": truth.t[rows], "quality": np.full(n, 4, dtype=np.int64)} | _position(place)
-    return columns | dict(zip(VELOCITY, velocity.T)) | dict(zip(STD, std.T))
-
-
-def _reference(truth: Truth, bias: np.ndarray, rate: int) -> Columns:
-    rows = slice(None, None, rate)
-    angles = np.column_stack((truth.rpy[:, :2], np.arctan2(np.sin(truth.rpy[:, 2]), np.cos(truth.rpy[:, 2]))))
-    columns = {"t": truth.t[rows], "valid": np.ones(len(truth.t[rows]), dtype=bool)}
-    columns |= _position((truth.lat[rows], truth.lon[rows], truth.height[rows]))
-    columns |= dict(zip(VELOCITY, truth.v_n[rows].T)) | dict(zip(ATTITUDE, angles[rows].T))
-    return columns | dict(zip(IMU_ERROR, bias[rows].T))
-
-
-def _position(place: tuple[np.ndarray, ...]) -> Columns:
-    lat, lon, height = place
-    return dict(zip(POSITION, (lat * 180 / math.pi, lon * 180 / math.pi, height)))
+    quality = np.full(n, 4, dtype=np.int64)
+    return fix_columns(truth.t[rows], *place, velocity, std, quality)

@@ -10,7 +10,6 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
-from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.simulation.gnss.receiver import Receiver
@@ -22,6 +21,7 @@ from dlkf.simulation.imu import ImuUnit, corrupt, inverse_mechanisation
 from dlkf.simulation.motion.chassis import Car, ChassisConfig, draw_car, mounted, slip_angle
 from dlkf.simulation.motion.routes import VehicleConfig
 from dlkf.simulation.motion.vehicle import Route, Truth, follow, random_route
+from dlkf.simulation.tables import imu_columns, reference_columns
 
 
 class Seeds(NamedTuple):
@@ -45,7 +45,10 @@ class Rates:
 
 @dataclass(frozen=True)
 class DriveTables:
-    """The tables of one drive, and what is worth knowing of it: a row of ``drives.parquet``."""
+    """The tables of one drive, and what is worth knowing of it: a row of ``drives.parquet``.
+
+    The IMU error in a row of the reference is that of the sample which ends there, without white noise.
+    """
 
     imu: pd.DataFrame
     gnss: pd.DataFrame
@@ -81,9 +84,9 @@ def simulate_drive(
     seen, rate_b = late(truth, _rate_at_rows(true_imu[:, 3:]), fixes, gnss, rates.imu_hz)
     received = receive(gnss_rng, seen, rate_b, gnss, receiver, sky)
     return DriveTables(
-        imu=pd.DataFrame({"t": t[1:], **dict(zip((*ACCEL, *GYRO), measured.T))}),
+        imu=pd.DataFrame(imu_columns(t[1:], measured)),
         gnss=received.fixes,
-        reference=_reference(sliced(truth, rows), np.concatenate((error[:1], error))[rows]),
+        reference=pd.DataFrame(reference_columns(sliced(truth, rows), np.concatenate((error[:1], error))[rows])),
         raw=received.raw,
         facts=_facts(car, route, axle, truth, rates.imu_hz),
     )
@@ -118,21 +121,3 @@ def _facts(car: Car, route: Route, axle: Truth, truth: Truth, rate_hz: int) -> d
         **{f"mounting_{name}_deg": float(np.degrees(x)) for name, x in zip(("roll", "pitch", "yaw"), car.mounting)},
         "sideslip_s2pm": car.sideslip,
     }
-
-
-def _reference(truth: Truth, error: NDArray[np.float64]) -> pd.DataFrame:
-    """Reference table; the IMU error of a row is that of the sample which ends there, without white noise."""
-    return pd.DataFrame(
-        {
-            "t": truth.t,
-            "lat_deg": np.degrees(truth.lat),
-            "lon_deg": np.degrees(truth.lon),
-            "height_m": truth.height,
-            **{f"vel_{axis}": truth.v_n[:, k] for k, axis in enumerate("ned")},
-            "roll": truth.rpy[:, 0],
-            "pitch": truth.rpy[:, 1],
-            "yaw": np.arctan2(np.sin(truth.rpy[:, 2]), np.cos(truth.rpy[:, 2])),
-            "valid": np.ones(len(truth.t), dtype=bool),
-            **dict(zip(IMU_ERROR, error.T)),
-        }
-    )

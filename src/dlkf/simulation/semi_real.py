@@ -121,19 +121,24 @@ def gnss_of_reference(
     """GNSS at whole multiples of 1/rate where the reference is known, and the reference's roughness (3,) [m].
 
     Known is between valid samples close enough to interpolate; elsewhere there is no fix, as under a roof. The
-    :func:`roughness` is added in square to the position's std. InputError if it is known nowhere, or has no attitude
-    while the configuration asks for a lever arm.
+    :func:`roughness` is added in square to the position's std. Late fixes (``position_lag_s``, ``velocity_lag_s``) are
+    of the reference that long before, the lever arm as at the velocity's time. InputError if it is known nowhere, or
+    has no attitude while the configuration asks for a lever arm.
     """
     name, reference, gnss = tables.row.name, tables.reference, config.gnss
     assert reference is not None  # :func:`injected` raises for that
     t = _epochs(tables.imu["t"], reference["t"], gnss.rate_hz, name)
-    at = reference_at(reference, Grid(t[0], 1 / gnss.rate_hz, len(t) - 1, 1))
-    known = np.flatnonzero(at.valid)
+    at, moving = (
+        reference_at(reference, Grid(t[0] - lag, 1 / gnss.rate_hz, len(t) - 1, 1))
+        for lag in (gnss.position_lag_s, gnss.velocity_lag_s)
+    )
+    valid = at.valid & moving.valid
+    known = np.flatnonzero(valid)
     if not len(known):
         raise InputError(f"drive {name}: its reference is valid at no GNSS epoch; leave the drive out")
     # elsewhere the last known state before: of no use, but finite
     filled = known[np.maximum(np.searchsorted(known, np.arange(len(t)), side="right") - 1, 0)]
-    r_e, v_e, C_eb = (torch.from_numpy(x[filled]) for x in (at.r_e, at.v_e, at.C_eb))
+    r_e, v_e, C_eb = (torch.from_numpy(x[filled]) for x in (at.r_e, moving.v_e, moving.C_eb))
     lat, lon, height = geodetic_from_ecef(r_e)
     C_ne = ned_axes(lat, lon).mT
     v_n = (C_ne @ v_e[..., None])[..., 0].numpy()
@@ -145,13 +150,13 @@ def gnss_of_reference(
     course = np.unwrap(np.arctan2(v_n[:, 1], v_n[:, 0]))
     rpy = np.where(np.isnan(rpy).any(-1, keepdims=True), np.stack((0 * course, 0 * course, course), -1), rpy)
     truth = Truth(t, lat.numpy(), lon.numpy(), height.numpy(), v_n, rpy)
-    speed = np.where(at.valid, np.hypot(v_n[:, 0], v_n[:, 1]), 0.0)
+    speed = np.where(valid, np.hypot(v_n[:, 0], v_n[:, 1]), 0.0)
     sky = sky_along(sky_rng, config.surroundings, np.cumsum(speed) / gnss.rate_hz)
-    sky = Sky(sky.mask_left, sky.mask_right, sky.blocked | ~at.valid)
+    sky = Sky(sky.mask_left, sky.mask_right, sky.blocked | ~valid)
     middle = tables.imu["t"] - 0.5 * float(np.median(np.diff(tables.imu["t"])))
-    rate_b = np.stack([np.interp(t, middle, tables.imu[c]) for c in GYRO], -1)
+    rate_b = np.stack([np.interp(t - gnss.velocity_lag_s, middle, tables.imu[c]) for c in GYRO], -1)
     received = receive(rng, truth, rate_b, gnss, config.receiver, sky)
-    rough = roughness(reference, t, C_ne.numpy(), np.where(at.valid[:, None], at.r_e, np.nan))
+    rough = roughness(reference, t - gnss.position_lag_s, C_ne.numpy(), np.where(valid[:, None], at.r_e, np.nan))
     claimed = {f"std_pos_{a}": np.hypot(received.fixes[f"std_pos_{a}"], x) for a, x in zip("ned", rough)}
     return Received(received.fixes.assign(**claimed), received.raw), rough
 

@@ -109,6 +109,7 @@ def velocities(mapped: Mapped, position: Mapping[str, np.ndarray]) -> dict[str, 
     speed = mapped.scale("velocity", units.SPEED)
     third = v[:, 2] * speed if v.shape[1] == 3 else np.full(len(v), np.nan)
     if frame == "course":  # speed over ground, course over ground [deg], climb
+        v = np.where(v[:, :1] < 0, np.nan, v)  # a phone's −1 for an unknown speed
         course = v[:, 1] * units.DEG
         still = v[:, 0] * speed < 0.05  # receivers leave the course empty at rest
         course = np.where(np.isnan(course) & still, 0.0, course)
@@ -157,6 +158,7 @@ def _stds(
     if not mapped.has(key):
         return [np.full(len(mapped), np.nan)] * 3
     s = mapped.vector(key, (1, 2, 3), nan=True) * mapped.scale(key, known)
+    s = np.where(s < 0, np.nan, s)  # phones and receivers write −1 for what they do not know
     frame = mapped.spec[key].get("frame") or "ned"
     if frame not in ("ned", "enu", "ecef"):
         raise InputError(f"reader.{mapped.kind}.{key}.frame={frame}: must be ned, enu or ecef")

@@ -16,6 +16,7 @@ from dlkf.navigation.earth import EARTH_RATE, ECCENTRICITY_SQ, transverse_radius
 from dlkf.simulation.gnss.receiver import gauss_markov
 from dlkf.simulation.gnss.surroundings import Sky
 from dlkf.simulation.motion.vehicle import Truth
+from dlkf.simulation.tables import fix_columns
 
 QUALITIES = (1, 2, 4, 5)
 FLOAT = 5  # NMEA GGA code: RTK with open ambiguities
@@ -103,17 +104,8 @@ def observe(
         std[:, :3] = np.hypot(std[:, :3], sizes)
     lat, lon, height = shifted(truth, arm + error[:, :3])
     velocity = antenna_v_n + error[:, 3:]
-    columns = {
-        "t": truth.t,
-        "lat_deg": np.degrees(lat),
-        "lon_deg": np.degrees(lon),
-        "height_m": height,
-        **{f"vel_{axis}": velocity[:, k] for k, axis in enumerate("ned")},
-        **{f"std_pos_{axis}": std[:, k] for k, axis in enumerate("ned")},
-        **{f"std_vel_{axis}": std[:, 3 + k] for k, axis in enumerate("ned")},
-    }
-    table = pd.DataFrame(columns)
-    table["quality"] = np.where(is_float, FLOAT, config.quality).astype(np.int64)
+    quality = np.where(is_float, FLOAT, config.quality).astype(np.int64)
+    table = pd.DataFrame(fix_columns(truth.t, lat, lon, height, velocity, std, quality))
     return table if sky is None else table.loc[~sky.blocked].reset_index(drop=True)
 
 

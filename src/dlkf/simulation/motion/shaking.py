@@ -246,9 +246,10 @@ def _add_tone(
 
 def noise(rng: np.random.Generator, kind: Shaking, envelope: Array) -> Array:
     """Displacements (N, 6) at the nodes by road noise of the size ``envelope`` (N,) [m/s²] and by knocks; the last
-    three columns, of the same size, are those that turn the mount."""
+    three columns, of the same size, are those that turn the mount. Each has a log-normal share of the noise."""
     count = len(envelope)
-    white = envelope[:, None] * rng.standard_normal((count, 6)) if kind.rumble > 0 else np.zeros((count, 6))
+    axes = np.exp(0.5 * rng.standard_normal(6) - 0.25)
+    white = envelope[:, None] * axes * rng.standard_normal((count, 6)) if kind.rumble > 0 else np.zeros((count, 6))
     w = 2 * math.pi * ROAD_HZ
     b, a = bilinear([1.0], [1.0, 2 * ROAD_DAMPING * w, w * w], NODE_HZ)
     x = _through_mount(kind, lfilter(b, a, white, axis=0) / _acceleration_rms(b, a))

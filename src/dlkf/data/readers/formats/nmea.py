@@ -1,0 +1,123 @@
+"""NMEA 0183 logs by pynmeagps: GGA for position, RMC or VTG for speed and course, GST for the accuracy."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from dlkf.data.readers.formats import library
+from dlkf.data.readers.frames import Table
+from dlkf.data.schema import POSITION, STD, VELOCITY
+from dlkf.errors import InputError
+
+KNOTS, KMH = 1852 / 3600, 1 / 3.6
+DAY_NS = 86_400 * 10**9
+COLUMNS = (*POSITION, *VELOCITY, *STD, "quality")
+
+
+def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> Table:
+    """One row per epoch, with the contract's columns and ``utc_ns`` since 1970."""
+    with path.open("rb") as stream:
+        content = stream.read()
+    return Table(fixes(sentences(content), str(path)), path, "fix")
+
+
+def sentences(content: bytes) -> Iterator[Any]:
+    """The sentences in a log, with whatever else is in it left out."""
+    pynmeagps = library("pynmeagps", "an NMEA log")
+    for line in content.splitlines():
+        start = line.find(b"$")
+        if start < 0:
+            continue
+        reader = pynmeagps.NMEAReader(
+            io.BytesIO(line[start:].strip() + b"\r\n"), quitonerror=pynmeagps.ERR_IGNORE, nmeaonly=False
+        )
+        _, message = next(iter(reader), (None, None))
+        if message is not None:
+            yield message
+
+
+def fixes(messages: Iterator[Any], where: str) -> pd.DataFrame:
+    """Epochs of equal time of day; the date is that of RMC or ZDA, and goes on over midnight."""
+    rows: list[dict[str, Any]] = []
+    date: int | None = None  # nanoseconds of the day's beginning
+    seen: str | None = None
+    for m in messages:
+        time = getattr(m, "time", None)
+        stamp = _of_day(time)
+        if m.msgID in ("RMC", "ZDA") and (day := _day(m)) is not None:
+            date = day
+        if m.msgID == "VTG":  # carries no time: it belongs to the epoch that is open
+            if rows and "vel_n" not in rows[-1]:
+                _set_velocity(rows[-1], m.sogn, m.cogt)
+            continue
+        if m.msgID not in ("GGA", "RMC", "GST", "GNS") or stamp is None:
+            continue
+        seen = m.msgID
+        if not rows or rows[-1]["of_day"] != stamp:
+            rows.append({"of_day": stamp})
+        row = rows[-1]
+        row["date"] = date
+        if m.msgID == "GGA" and m.lat not in ("", None):
+            row |= {"lat_deg": m.lat, "lon_deg": m.lon, "quality": int(m.quality)}
+            row["height_m"] = _float(m.alt) + np.nan_to_num(_float(m.sep))
+        elif m.msgID == "RMC":
+            _set_velocity(row, m.spd, m.cog)
+        elif m.msgID == "GST":
+            row |= dict(zip(STD[:3], (_float(m.stdLat), _float(m.stdLong), _float(m.stdAlt))))
+    if seen is None:
+        raise InputError(f"{where}: has no GGA, RMC or GST sentence; give an NMEA log")
+    frame = pd.DataFrame(rows)
+    if "lat_deg" not in frame:
+        raise InputError(f"{where}: has no GGA sentence with a position; log GGA beside RMC")
+    if frame["date"].isna().all():
+        raise InputError(f"{where}: has no date (RMC or ZDA); log RMC beside GGA")
+    for name in COLUMNS:
+        if name not in frame:
+            frame[name] = np.nan
+    frame["quality"] = frame["quality"].fillna(0)
+    frame["utc_ns"] = _stamps(frame["of_day"].to_numpy(np.int64), frame["date"])
+    return frame[["utc_ns", *COLUMNS]]
+
+
+def _stamps(of_day: np.ndarray, date: pd.Series) -> np.ndarray:
+    """Time of day and the first date that is known, days counted on at each midnight."""
+    turns = np.concatenate(([0], np.cumsum(np.diff(of_day) < -DAY_NS // 2)))
+    known = int(np.flatnonzero(date.notna())[0])
+    # a date read at row k belongs to the day of that row
+    first = int(date.iloc[known]) - int(turns[known]) * DAY_NS
+    return first + turns * DAY_NS + of_day
+
+
+def _set_velocity(row: dict[str, Any], knots: Any, course: Any) -> None:
+    speed, angle = _float(knots) * KNOTS, _float(course)
+    if np.isnan(speed):
+        return
+    if np.isnan(angle):  # receivers leave the course empty at rest
+        if speed > 0.3:
+            return
+        angle = 0.0
+    row["vel_n"], row["vel_e"] = speed * np.cos(np.radians(angle)), speed * np.sin(np.radians(angle))
+
+
+def _of_day(time: Any) -> int | None:
+    if not hasattr(time, "hour"):
+        return None
+    return ((time.hour * 60 + time.minute) * 60 + time.second) * 10**9 + time.microsecond * 1000
+
+
+def _day(m: Any) -> int | None:
+    if m.msgID == "ZDA":
+        date = f"{int(m.year):04d}-{int(m.month):02d}-{int(m.day):02d}" if m.year else None
+    else:
+        date = m.date.isoformat() if hasattr(m.date, "isoformat") else None
+    return None if date is None else int(np.datetime64(date, "ns").astype(np.int64))
+
+
+def _float(value: Any) -> float:
+    return float("nan") if value in ("", None) else float(value)

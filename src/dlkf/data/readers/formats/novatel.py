@@ -1,0 +1,139 @@
+"""NovAtel's texts: exports of Inertial Explorer, and ASCII logs of OEM receivers (#BESTPOSA, %RAWIMUSA, …).
+
+An export keeps the names of its own header; a latitude in degrees, minutes and seconds becomes degrees. Of the logs,
+fixes have the contract's columns (BESTPOS with BESTVEL), INSPVA those of a reference, and an IMU's counts the names
+``accel_x`` … ``gyro_z`` in counts, whose unit depends on the IMU. All have ``week`` and ``sow``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from dlkf.data.readers.formats.text import decoded
+from dlkf.data.readers.frames import Table
+from dlkf.data.schema import POSITION, STD, VELOCITY
+from dlkf.errors import InputError
+
+LOG = re.compile(r"^[#%](\w+?)A?,([^;]*);(.*?)(\*[0-9a-fA-F]{8})?$")
+IMUS = ("RAWIMUS", "RAWIMU", "RAWIMUSX", "RAWIMUX")
+SIZES = {"RAWIMUSX": 2, "RAWIMUX": 2}  # IMU info and type stand before week and seconds
+
+
+def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> Table:
+    """An export's table, or the logs of a ``kind``; ``table`` names the IMU's log, or INSPVA."""
+    lines = decoded(path, None).splitlines()
+    if any(LOG.match(line) for line in lines[:200]):
+        return _logs(lines, path, kind, table)
+    return _export(lines, path)
+
+
+def _export(lines: list[str], path: Path) -> Table:
+    heads = [k for k, line in enumerate(lines) if re.search(r"\b(GPSTime|UTCTime|Latitude)\b", line)]
+    if not heads or heads[0] + 2 >= len(lines):
+        raise InputError(f"{path}: has no header with GPSTime or Latitude; export it with headers")
+    names = lines[heads[0]].split()
+    marks = re.findall(r"\([^)]*\)", lines[heads[0] + 1])
+    first = heads[0] + (2 if marks else 1)
+    rows = [(k + 1, line.split()) for k, line in enumerate(lines) if k >= first and line.strip()]
+    widths = [3 if "D M S" in m else 1 for m in marks] if len(marks) == len(names) else [1] * len(names)
+    notes = ()
+    if rows and len(rows[-1][1]) < sum(widths):
+        notes = (f"{path.name}: line {rows[-1][0]}, the last, is cut off: left out",)
+        rows = rows[:-1]
+    if not rows:
+        raise InputError(f"{path}: has no rows; leave the drive out or give its data")
+    if bad := [n for n, cells in rows if len(cells) != sum(widths)]:
+        raise InputError(f"{path}: line {bad[0]}: has not the {sum(widths)} cells that the header names")
+    cells = pd.DataFrame([c for _, c in rows], index=pd.Index([n for n, _ in rows]))
+    out, at = {}, 0
+    for name, width in zip(names, widths):
+        part = cells.iloc[:, at : at + width]
+        if width == 3:
+            d = part.apply(pd.to_numeric, errors="coerce").to_numpy()
+            negative = part.iloc[:, 0].str.startswith("-").to_numpy()
+            out[name] = np.where(negative, -1, 1) * (np.abs(d) @ [1, 1 / 60, 1 / 3600])
+        else:
+            numbers = pd.to_numeric(part.iloc[:, 0], errors="coerce")
+            out[name] = part.iloc[:, 0].to_numpy() if bool(numbers.isna().any()) else numbers.to_numpy()
+        at += width
+    return Table(pd.DataFrame(out, index=cells.index), path, "line", dict(zip(names, marks)), notes)
+
+
+def _logs(lines: list[str], path: Path, kind: str, table: str | None) -> Table:
+    logs: dict[str, list[tuple[int, float, list[str]]]] = {}
+    for line in lines:
+        if not (found := LOG.match(line)):
+            continue
+        header = found[2].split(",")
+        week, sow = (header[0], header[1]) if line.startswith("%") else (header[4], header[5])
+        logs.setdefault(found[1], []).append((int(week), float(sow), found[3].split(",")))
+    have = ", ".join(f"{name} ({len(rows)})" for name, rows in logs.items())
+    if kind == "imu":
+        name = table or next((n for n in IMUS if n in logs), None)
+        if name is None or name not in logs:
+            raise InputError(f"{path}: no log {name or ', '.join(IMUS)}; has {have}; set reader.imu.table")
+        return Table(_imu(logs[name], SIZES.get(name, 0)), path, "log")
+    if table == "INSPVA" or (kind == "reference" and "INSPVA" in logs):
+        return Table(_inspva(logs.get("INSPVA") or _absent(path, "INSPVA", have)), path, "log")
+    return Table(_best(logs.get("BESTPOS") or _absent(path, "BESTPOS", have), logs.get("BESTVEL", [])), path, "log")
+
+
+def _absent(path: Path, name: str, have: str) -> Any:
+    raise InputError(f"{path}: has no log {name}; has {have}")
+
+
+def _imu(rows: list[tuple[int, float, list[str]]], skip: int) -> pd.DataFrame:
+    """RAWIMU: z, −y, x of the accelerometers, then of the gyroscopes, as counts gained since the sample before."""
+    values = np.array([[float(c) for c in cells[skip + 3 : skip + 9]] for _, _, cells in rows])
+    signs = {"x": (2, 1), "y": (1, -1), "z": (0, 1)}
+    out: dict[str, Any] = {
+        "week": [int(cells[skip]) for _, _, cells in rows],
+        "sow": [float(cells[skip + 1]) for _, _, cells in rows],
+    }
+    for axis, (k, sign) in signs.items():
+        out[f"accel_{axis}"], out[f"gyro_{axis}"] = sign * values[:, k], sign * values[:, 3 + k]
+    return pd.DataFrame(out)
+
+
+def _best(positions: list[tuple[int, float, list[str]]], speeds: list[tuple[int, float, list[str]]]) -> pd.DataFrame:
+    """BESTPOS (height above sea level and undulation), with the BESTVEL of the same time."""
+    velocity = {}
+    for week, sow, c in speeds:
+        if c[0] == "SOL_COMPUTED":
+            speed, course, up = float(c[4]), np.radians(float(c[5])), float(c[6])
+            velocity[week, sow] = (speed * np.cos(course), speed * np.sin(course), -up)
+    rows = []
+    for week, sow, c in positions:
+        llh = (float(c[2]), float(c[3]), float(c[4]) + float(c[5]))
+        row: dict[str, Any] = {"week": week, "sow": sow, **dict(zip(POSITION, llh))}
+        row |= dict(zip(VELOCITY, velocity.get((week, sow), (np.nan,) * 3)))
+        row |= dict.fromkeys(STD, np.nan) | dict(zip(STD[:3], (float(c[7]), float(c[8]), float(c[9]))))
+        rows.append(row | {"quality": _quality(c[1]) if c[0] == "SOL_COMPUTED" else 0})
+    return pd.DataFrame(rows)
+
+
+def _inspva(rows: list[tuple[int, float, list[str]]]) -> pd.DataFrame:
+    out = []
+    for _, _, c in rows:
+        lat, lon, height, north, east, up, roll, pitch, azimuth = (float(x) for x in c[2:11])
+        row = {"week": int(c[0]), "sow": float(c[1]), **dict(zip(POSITION, (lat, lon, height)))}
+        row |= dict(zip(VELOCITY, (north, east, -up))) | {"roll": roll, "pitch": pitch, "yaw": azimuth}
+        out.append(row | {"valid": float(c[11].startswith("INS_SOLUTION_GOOD")), "quality": 1})
+    return pd.DataFrame(out)
+
+
+def _quality(kind: str) -> int:
+    """NMEA GGA code of a position type."""
+    if kind == "NONE":
+        return 0
+    if kind.endswith(("_INT", "RTKFIXED")):
+        return 4
+    if kind.endswith(("_FLOAT", "RTKFLOAT")):
+        return 5
+    return 1 if kind in ("SINGLE", "INS_PSRSP", "INS_SBAS") or "PROPAGATED" in kind else 2

@@ -1,0 +1,136 @@
+"""ROS 1 and 2 bags by rosbags: IMU, fixes, velocities, NMEA sentences and u-blox messages.
+
+Tables have the contract's columns and ``t_ns``: the header's stamp, the bag's where a message has none. The axes of an
+IMU are those of its frame; velocities of geometry_msgs are East-North-Up (REP 103).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from dlkf.data.readers.formats import library, nmea
+from dlkf.data.readers.frames import Table
+from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
+from dlkf.errors import InputError
+
+Row = dict[str, Any]
+
+
+def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> Table:
+    """The topic ``table``, or the only one whose type holds what ``kind`` needs; ROS 2: the bag's metadata.yaml."""
+    highlevel = library("rosbags.highlevel", "a ROS bag")
+    typesys = library("rosbags.typesys", "a ROS bag")
+    bag = path.parent if path.name == "metadata.yaml" else path
+    store = typesys.get_typestore(typesys.Stores.LATEST)
+    try:
+        with highlevel.AnyReader([bag], default_typestore=store) as reader:
+            return _read(reader, path, kind, table)
+    except InputError:
+        raise
+    except Exception as error:
+        # rosbags raises errors of its own, of sqlite, lz4 and struct for damaged bags
+        raise InputError(f"{path}: cannot be read as a bag ({_first_line(error)}); give a whole one") from None
+
+
+def _read(reader: Any, path: Path, kind: str, table: str | None) -> Table:
+    known = {*IMU} if kind == "imu" else {*FIX, SENTENCE}
+    topics = {c.topic: c for c in reader.connections}
+    have = ", ".join(f"{name} ({c.msgtype})" for name, c in sorted(topics.items()))
+    if table is not None:
+        if table not in topics:
+            raise InputError(f"{path}: no topic {table}; has {have}; set reader.{kind}.table")
+        chosen = [topics[table]]
+    else:
+        chosen = [c for c in topics.values() if _short(c.msgtype) in known]
+        if len(chosen) != 1:
+            what = "no topic" if not chosen else f"{len(chosen)} topics"
+            raise InputError(f"{path}: {what} with {', '.join(sorted(known))}; has {have}; set reader.{kind}.table")
+    name = _short(chosen[0].msgtype)
+    every = IMU if kind == "imu" else {**FIX, **VELOCITIES}
+    if name not in (*every, SENTENCE):
+        raise InputError(f"{path}: {chosen[0].topic} is {chosen[0].msgtype}; must be {', '.join(every)}")
+    messages = ((stamp, reader.deserialize(raw, c.msgtype)) for c, stamp, raw in reader.messages(connections=chosen))
+    if name == SENTENCE:
+        return Table(_sentences(messages, f"{path}, {chosen[0].topic}"), path, "message")
+    rows = []
+    for stamp, message in messages:
+        header = getattr(message, "header", None)
+        own = 0 if header is None else header.stamp.sec * 10**9 + header.stamp.nanosec
+        rows.append({"t_ns": own or stamp, **every[name](message)})
+    if not rows:
+        raise InputError(f"{path}: topic {chosen[0].topic} has no messages; give another one")
+    frame = pd.DataFrame(rows)
+    if kind != "imu":
+        for column in (*POSITION, *VELOCITY, *STD):
+            if column not in frame:
+                frame[column] = np.nan
+    return Table(frame, path, "message")
+
+
+def _imu(m: Any) -> Row:
+    w, f = m.angular_velocity, m.linear_acceleration
+    return dict(zip((*GYRO, *ACCEL), (w.x, w.y, w.z, f.x, f.y, f.z)))
+
+
+def _nav_sat_fix(m: Any) -> Row:
+    """Covariance is East-North-Up; status −1 is no fix, 2 corrections of a ground station."""
+    row: Row = {"lat_deg": m.latitude, "lon_deg": m.longitude, "height_m": m.altitude}
+    if m.position_covariance_type > 0:
+        east, north, up = (float(np.sqrt(max(x, 0.0))) for x in np.asarray(m.position_covariance)[[0, 4, 8]])
+        row |= dict(zip(STD[:3], (north, east, up)))
+    row["quality"] = {-1: 0, 0: 1, 1: 2, 2: 2}.get(int(m.status.status), 1)
+    return row
+
+
+def _twist(m: Any) -> Row:
+    twist = m.twist.twist if hasattr(m.twist, "twist") else m.twist
+    v = twist.linear
+    row: Row = dict(zip(VELOCITY, (v.y, v.x, -v.z)))
+    if hasattr(m.twist, "covariance"):
+        east, north, up = (float(np.sqrt(max(x, 0.0))) for x in np.asarray(m.twist.covariance)[[0, 7, 14]])
+        row |= dict(zip(STD[3:], (north, east, up)))
+    return row
+
+
+def _nav_pvt(m: Any) -> Row:
+    """ublox_msgs/NavPVT: the fields of UBX-NAV-PVT, as whole numbers."""
+    field = {name.lower(): getattr(m, name) for name in dir(m) if not name.startswith("_")}
+    h, v, s = field["hacc"] / 1000 / np.sqrt(2), field["vacc"] / 1000, field["sacc"] / 1000 / np.sqrt(3)
+    row: Row = {"lat_deg": field["lat"] * 1e-7, "lon_deg": field["lon"] * 1e-7, "height_m": field["height"] / 1000}
+    row |= dict(zip(VELOCITY, (field["veln"] / 1000, field["vele"] / 1000, field["veld"] / 1000)))
+    flags = int(field["flags"])
+    fixed = bool(flags & 1) and int(field.get("fixtype", field.get("fix_type", 3))) in (2, 3, 4)
+    row["quality"] = {2: 4, 1: 5}.get(flags >> 6, 2 if flags & 2 else 1) if fixed else 0
+    return row | dict(zip(STD, (h, h, v, s, s, s)))
+
+
+def _sentences(messages: Iterator[tuple[int, Any]], where: str) -> pd.DataFrame:
+    """nmea_msgs/Sentence: fixes with the UTC of the sentences themselves as ``t_ns``."""
+    content = "\n".join(m.sentence.strip() for _, m in messages).encode()
+    return nmea.fixes(nmea.sentences(content), where).rename(columns={"utc_ns": "t_ns"})
+
+
+def _short(msgtype: str) -> str:
+    return msgtype.replace("/msg/", "/")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:120]
+
+
+SENTENCE = "nmea_msgs/Sentence"  # several make a fix
+IMU: dict[str, Callable[[Any], Row]] = {"sensor_msgs/Imu": _imu}
+FIX: dict[str, Callable[[Any], Row]] = {
+    "sensor_msgs/NavSatFix": _nav_sat_fix,
+    "ublox_msgs/NavPVT": _nav_pvt,
+    "ublox_msgs/NavPVT7": _nav_pvt,
+}
+VELOCITIES: dict[str, Callable[[Any], Row]] = {
+    "geometry_msgs/TwistStamped": _twist,
+    "geometry_msgs/TwistWithCovarianceStamped": _twist,
+}

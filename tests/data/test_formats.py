@@ -1,0 +1,107 @@
+"""The same drive through every reader gives the same tables of the contract, within the format's resolution."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import get_class
+from omegaconf import OmegaConf
+
+from dlkf.config import config_dir
+from dlkf.data.intake import ingest_drives
+from dlkf.data.readers.frames import DriveFrames
+from dlkf.data.summary import drive_line
+from tests.data import logs
+from tests.data.conftest import car
+
+
+class Resolution(NamedTuple):
+    """What a format can hold: seconds, m/s², rad/s, metres, m/s."""
+
+    t: float = 1e-6
+    accel: float = 1e-9
+    gyro: float = 1e-9
+    position: float = 1e-4
+    velocity: float = 1e-5
+    down: bool = True  # has a vertical velocity
+    speed: bool = True
+    std: bool = True  # has a std of velocity
+
+
+# half a step of the format each: UBX a sample of time (its tags are brought to GPS time by the order of messages),
+# 2⁻¹⁰ m/s², 2⁻¹² °/s, 1e-9 deg (0.1 mm) and truncation, mm/s; NMEA with 7 digits of a minute, 4 of knots and degrees;
+# seconds since 1970 as doubles 2⁻²² s; text with as many digits as it has
+RESOLUTION = {
+    "ubx": Resolution(t=0.0101, accel=5e-4, gyro=2.2e-6, position=1e-3, velocity=5.1e-4),
+    "nmea": Resolution(position=1e-3, velocity=1e-4, down=False, std=False),
+    "navego": Resolution(t=1e-9),
+    "navego_73": Resolution(t=1e-9),
+    "matlab": Resolution(t=1e-9),
+    "parquet": Resolution(t=5e-7),
+    "kitti": Resolution(position=1e-3, velocity=1e-8),
+    "kfgins": Resolution(speed=False, std=False, position=1e-3),
+    "rtklib": Resolution(position=3e-4, velocity=5.1e-6),
+    "inertial_explorer": Resolution(position=1e-4, velocity=5.1e-6),
+    "gnss_logger": Resolution(accel=5e-8, gyro=1e-9, down=False, velocity=2e-6),
+    "sensor_logger": Resolution(down=False),
+    "phyphox": Resolution(down=False, std=False),
+    "novatel": Resolution(accel=8e-7, gyro=5e-8, velocity=2e-6, std=False),
+    "ros1": Resolution(std=False),
+    "ros2": Resolution(std=False),
+}
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Twenty seconds; ``fine`` has the state at every IMU sample."""
+    tables = car(20)
+    fine = car(20, gnss_hz=100)["gnss"].iloc[1:].reset_index(drop=True)
+    return {**tables, "fine": fine}
+
+
+def read(folder, overrides: list[str]) -> list[DriveFrames]:
+    """The drives of a folder, by overrides as on the command line."""
+    own = [f"++{o}" if o.startswith("reader.") else o for o in overrides]
+    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
+        settings = OmegaConf.to_container(compose("ingest", own).reader, resolve=True)
+    return list(get_class(settings.pop("_target_"))(**settings).read(folder))
+
+
+@pytest.mark.parametrize("writer", logs.WRITERS, ids=lambda w: w.__name__)
+def test_the_same_drive(writer, drive, tmp_path):
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    fine = RESOLUTION.get(writer.__name__, Resolution())
+    options = writer(folder, drive)
+    (got,) = read(folder if writer is not logs.ros2 else folder / "drive", options)
+    imu, gnss = got.imu, got.gnss
+    want = drive["imu"].iloc[: len(imu)]
+    assert len(drive["imu"]) - len(imu) <= 1  # UBX: samples after the last fix have no fix before them
+    shift = np.round(np.median(imu.t - want.t))  # a whole second: IMU clocks start at their own
+    np.testing.assert_allclose(imu.t - shift, want.t, atol=fine.t)
+    for names, tolerance in (
+        (("accel_x", "accel_y", "accel_z"), fine.accel),
+        (("gyro_x", "gyro_y", "gyro_z"), fine.gyro),
+    ):
+        for name in names:
+            np.testing.assert_allclose(imu[name], want[name], atol=tolerance, err_msg=name)
+    truth = drive["gnss"]
+    if writer is logs.kitti:  # its first row is that of the first IMU sample
+        truth = drive["fine"].iloc[::100].reset_index(drop=True)
+    assert len(gnss) == len(truth)
+    np.testing.assert_allclose(gnss.t - shift, truth.t, atol=1e-6)
+    assert logs.metres(gnss, truth).max() < fine.position
+    if fine.speed:
+        for name in ("vel_n", "vel_e", *(["vel_d"] if fine.down else [])):
+            np.testing.assert_allclose(gnss[name], truth[name], atol=fine.velocity, err_msg=name)
+    else:
+        assert gnss[["vel_n", "vel_e", "vel_d"]].isna().all(axis=None)
+    np.testing.assert_allclose(gnss.std_pos_e, 0.02, rtol=1e-6)
+    if fine.std:
+        np.testing.assert_allclose(gnss.std_vel_e, 0.05, rtol=1e-6)
+    assert set(gnss.quality) == {4}
+    assert ingest_drives([got], tmp_path / "out") == 1
+    assert "IMU 100 Hz" in drive_line(got) and "RTK fixed 100 %" in drive_line(got)
