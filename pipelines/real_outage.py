@@ -17,7 +17,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from dlkf.evaluation.table import comparison, with_interval
+from dlkf.evaluation.results import Results
+from dlkf.evaluation.table import with_interval
 
 
 def main() -> int:
@@ -50,19 +51,17 @@ def main() -> int:
 def summary(home: Path, lengths: list[float]) -> str:
     """Horizontal error at the end of the outages, every filter and length: RMS (median), ratio to mbkf15."""
     found = {n: json.loads(p.read_text()) for n in lengths if (p := home / f"{n:g}s" / "metrics.json").is_file()}
-    made = [(n, result) for n, x in found.items() for result in x["results"]]
+    made = [(n, Results.of(result)) for n, x in found.items() for result in x["results"]]
     if not made:
         return "no outage could be scored\n"
-    heads = [f"{n:g} s, {r['count']['outages']} outages ({r['kind']}) [m] | ratio" for n, r in made]
+    heads = [f"{n:g} s, {r.count['outages']} outages ({r.kind}) [m] | ratio" for n, r in made]
     lines = [f"| filter | {' | '.join(heads)} |", "|:--|" + "--:|" * (2 * len(heads))]
-    for name in made[0][1]["filters"]:
+    end = ("outages", "end", "horizontal")
+    for name in made[0][1].filters:
         cells = []
         for _, result in made:
-            end = result["filters"][name]["outages"]["end"]["horizontal"]
-            which = {"over": "outages", "part": "end", "quantity": "horizontal", "statistic": "rms"}
-            ratio = comparison(result, name, **which)
-            cells.append(f"{end['rms']:.3g} ({end['median']:.3g})")
-            cells.append(with_interval(ratio) if ratio else "1")
+            cells.append(f"{result.value(name, *end):.3g} ({result.value(name, *end, 'median'):.3g})")
+            cells.append(with_interval(result.versus(name, *end)))
         lines.append(f"| `{name}` | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 

@@ -5,6 +5,7 @@ import io
 import json
 import math
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ import torch
 from dlkf.data.kinds import drive_kind
 from dlkf.errors import InputError
 from dlkf.evaluation import figures
+from dlkf.evaluation.metrics import QUANTITIES
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.report import png, write_report
-from dlkf.evaluation.results import results
+from dlkf.evaluation.results import IMU_AXES, Results, summarise_scores
 from dlkf.evaluation.run import score
 from dlkf.evaluation.table import as_csv, as_json, as_markdown, number, ratio_table, slope_table, tables, with_interval
 from dlkf.files import staged
@@ -37,23 +39,27 @@ def test_numbers_are_plain():
     ]  # fmt: skip
 
 
-def test_tables_hold_the_results(scores):
-    r = results(scores, resamples=200)
+def test_tables_hold_the_summarise_scores(scores):
+    r = summarise_scores(scores, resamples=200)
     whole, outages = tables("town", r)
     assert whole.title == "town (simulated): 6 pieces, 6 drives"
     assert outages.title == "town (simulated): 6 outages of 20 s, 6 drives"
-    end = r["filters"]["mbkf15"]["outages"]["end"]["horizontal"]
-    assert outages.rows[1][:4] == ["mbkf15", *(number(end[s]) for s in ("rms", "median", "p95"))]
+    end = {s: r.value("mbkf15", "outages", "end", "horizontal", s) for s in ("rms", "median", "p95")}
+    assert outages.rows[1][:4] == ["mbkf15", *map(number, end.values())]
     ratios = ratio_table("town", r)
     assert ratios.title.endswith("ratio to mbkf15, 6 recordings") and [row[0] for row in ratios.rows] == ["ins"]
     assert len(ratios.columns) == 6 and all(cell.endswith(" (n<8)") for cell in ratios.rows[0][1:])
-    assert ratio_table("town", results(scores, baseline="none such")) is None
-    found = {(c["over"], c["quantity"], c["statistic"]): c for c in r["comparisons"]}
-    assert len(found) == 2 * 6 * 3 and all(c["baseline"] == "mbkf15" and c["groups"] == 6 for c in found.values())
-    wider = {**found["outages", "horizontal", "rms"], "groups": 8, "ratio": 0.7, "ratio_low": 0.6, "ratio_high": 0.8}
-    assert with_interval(wider) == "0.70 [0.60–0.80]"
-    assert r["filters"]["mbkf15"]["outages"]["at"]["20"] == r["filters"]["mbkf15"]["outages"]["end"]
-    per_outage = [o["end"]["mbkf15"]["horizontal"] for o in r["per_outage"]]
+    assert ratio_table("town", summarise_scores(scores, baseline="none such")) is None
+    assert len(r.comparisons) == 2 * 6 * 3 and r.baseline == "mbkf15"
+    assert all(c.filter == "ins" and c.against.groups == 6 for c in r.comparisons)
+    few = r.versus("ins", "outages", "end", "horizontal")
+    assert with_interval(replace(few, groups=8, ratio=0.7, ratio_low=0.6, ratio_high=0.8)) == "0.70 [0.60–0.80]"
+    assert few.a == r.value("ins", "outages", "end", "horizontal")
+    assert r.versus("mbkf15", "outages", "end", "heading") is None
+    last = r.seconds_into_outage()[-1]
+    for q, s in product(QUANTITIES, ("rms", "geomean", "n")):
+        assert r.value("mbkf15", "outages", f"at {last} s", q, s) == r.value("mbkf15", "outages", "end", q, s)
+    per_outage = [o["end"]["mbkf15"]["horizontal"] for o in r.per_outage]
     assert math.sqrt(np.mean(np.square(per_outage))) == pytest.approx(end["rms"])
     assert all(len(row) == len(t.columns) for t in (whole, outages) for row in t.rows)
     markdown = as_markdown(whole)
@@ -61,7 +67,7 @@ def test_tables_hold_the_results(scores):
 
 
 def test_csv_and_json_carry_every_value(scores):
-    r = results(scores, resamples=50)
+    r = summarise_scores(scores, resamples=50)
     rows = list(csv.DictReader(io.StringIO(as_csv("town", [r]))))
     (value,) = (
         row["value"]
@@ -69,9 +75,12 @@ def test_csv_and_json_carry_every_value(scores):
         if (row["filter"], row["part"], row["quantity"], row["statistic"])
         == ("ins", "at 10 s", "velocity", "p95")
     )
-    assert float(value) == r["filters"]["ins"]["outages"]["at"]["10"]["velocity"]["p95"]
+    assert float(value) == r.value("ins", "outages", "at 10 s", "velocity", "p95") and len(rows) == len(r.values)
+    again = Results.of(json.loads(as_json(r.as_dict())))
+    for part in ("values", "comparisons", "count"):
+        assert repr(getattr(again, part)) == repr(getattr(r, part))
     content = json.loads(
-        as_json({"r": r, "nan": math.nan, "inf": np.float64(-np.inf)}), parse_constant=pytest.fail
+        as_json({"r": r.as_dict(), "nan": math.nan, "inf": np.float64(-np.inf)}), parse_constant=pytest.fail
     )
     assert content["nan"] is None and content["inf"] == "-inf" and len(content["r"]["per_piece"]) == 6
 
@@ -80,7 +89,7 @@ def test_missing_attitude_is_a_dash_and_a_broken_filter_infinite(cars):
     batch = replace(cars, attitude_valid=torch.zeros_like(cars.attitude_valid))
     scores = score(FILTERS, [batch], kinds="real")
     scores.filters["ins"].error[0, 20, :3] = np.inf
-    r = results(scores, resamples=50)
+    r = summarise_scores(scores, resamples=50)
     (whole,) = tables("town", r)
     column = {c: i for i, c in enumerate(whole.columns)}
     assert all(
@@ -88,25 +97,25 @@ def test_missing_attitude_is_a_dash_and_a_broken_filter_infinite(cars):
     )
     assert whole.rows[0][column["3D\n[m]"]] == "∞" and whole.rows[0][column["Not\nfinite"]] == "1 piece"
     assert float(whole.rows[1][column["3D\n[m]"]]) < 1
-    assert json.loads(as_json(r))["filters"]["ins"]["pieces"]["position"]["all"]["rms"] == "inf"
+    content = json.loads(as_json(r.as_dict()))
+    assert ["real", "ins", "pieces", "all", "position", "rms", "inf", "m"] in content["values"]["data"]
+    assert Results.of(content).value("ins", "pieces", "all", "position") == math.inf
 
 
 def test_kinds_of_data_are_never_mixed(cars):
     mixed = score(FILTERS, [cars], kinds={"car-00": "real"})
     with pytest.raises(ValueError, match="must not be mixed"):
-        results(mixed)
-    assert [results(mixed.of_kind(k))["count"]["pieces"] for k in mixed.kinds] == [1, 5]
+        summarise_scores(mixed)
+    assert [summarise_scores(mixed.of_kind(k)).count["pieces"] for k in mixed.kinds] == [1, 5]
 
 
 def test_slope_over_drives_of_known_error(scores, cars):
-    r = results(scores, resamples=50)
-    slopes = r["filters"]["mbkf15"]["imu_error"]["slope"]
-    assert np.allclose(slopes[2:5], 1.0, atol=0.1) and np.allclose(
-        r["filters"]["ins"]["imu_error"]["slope"], 0.0
-    )
+    r = summarise_scores(scores, resamples=50)
+    slopes = {n: [r.value(n, "pieces", "last", axis, "slope") for axis in IMU_AXES] for n in FILTERS}
+    assert np.allclose(slopes["mbkf15"][2:5], 1.0, atol=0.1) and np.allclose(slopes["ins"], 0.0)
     assert slope_table("town", r).rows[0][1:] == ["0"] * 6
     unknown = replace(cars, true_imu_error=torch.full_like(cars.true_imu_error, math.nan))
-    assert slope_table("town", results(score(FILTERS, [unknown], kinds="real"), resamples=50)) is None
+    assert slope_table("town", summarise_scores(score(FILTERS, [unknown], kinds="real"), resamples=50)) is None
 
 
 def test_kind_of_a_drive():
@@ -152,7 +161,7 @@ def test_report_is_complete_and_replaces_an_older_one(scores, tmp_path):
     out.mkdir(parents=True)
     (out / "table.md").write_text("old")
     paths = write_report(
-        out, "town", scores, [results(scores, resamples=50)],
+        out, "town", scores, [summarise_scores(scores, resamples=50)],
         protocol={"mode": "pieces"}, by_time=True, baseline="mbkf15", dpi=30,
     )  # fmt: skip
     assert (out / "table.md").read_text().startswith("**town (simulated)")

@@ -14,6 +14,7 @@ import torch
 
 from dlkf.data.alignment import align_boundaries
 from dlkf.data.store import load_dataset
+from dlkf.evaluation.results import Results
 from dlkf.navigation.attitude import vector_from_rotation
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "real"
@@ -84,7 +85,7 @@ def test_outages_of_30_s_stay_where_they_were_measured(tmp_path, name, options, 
         "outage.duration_s=30", "injected_bias=null", *options,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    (result,) = json.loads((tmp_path / "report" / "metrics.json").read_text())["results"]
-    assert result["count"]["outages"] == outages
-    end = result["filters"]["mbkf15"]["outages"]["end"]["horizontal"]
-    assert end["nonfinite"] == 0 and low < end["rms"] < high
+    (content,) = json.loads((tmp_path / "report" / "metrics.json").read_text())["results"]
+    result, end = Results.of(content), ("mbkf15", "outages", "end", "horizontal")
+    assert result.count["outages"] == outages
+    assert result.value(*end, "nonfinite") == 0 and low < result.value(*end) < high

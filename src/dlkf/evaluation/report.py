@@ -13,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from dlkf.evaluation import figures
+from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.table import Table, as_csv, as_json, as_markdown, ratio_table, slope_table, tables
 from dlkf.files import staged
@@ -38,7 +39,7 @@ def png(figure: Figure, dpi: int = 130) -> bytes:
     return out.getvalue()
 
 
-def all_tables(dataset: str, results: Sequence[dict[str, Any]]) -> list[Table]:
+def all_tables(dataset: str, results: Sequence[Results]) -> list[Table]:
     """The tables of every kind of data, one kind after the other."""
     out = []
     for r in results:
@@ -76,7 +77,7 @@ def write_report(
     out: str | Path,
     dataset: str,
     scores: Scores,
-    results: Sequence[dict[str, Any]],
+    results: Sequence[Results],
     *,
     protocol: dict[str, Any],
     by_time: bool,
@@ -85,7 +86,7 @@ def write_report(
 ) -> list[Path]:
     """Write the whole report into ``out``, all files or none; returns their paths.
 
-    ``results`` has one entry per kind of data (results.results of scores.of_kind); ``protocol`` is how the
+    ``results`` has one entry per kind of data (of scores.of_kind); ``protocol`` is how the
     scores were made, in plain values. Raises InputError if ``out`` cannot be written to.
     """
     parts = all_tables(dataset, results)
@@ -96,7 +97,7 @@ def write_report(
             pictures.append((f"{name}{suffix}.png", f"{kind.capitalize()} data: {caption}", png(figure, dpi)))
     files: dict[str, bytes] = {
         "metrics.json": as_json(
-            {"dataset": dataset, "protocol": protocol, "results": list(results)}
+            {"dataset": dataset, "protocol": protocol, "results": [r.as_dict() for r in results]}
         ).encode(),
         "table.md": "\n".join(map(as_markdown, parts)).encode(),
         "table.csv": as_csv(dataset, results).encode(),

@@ -1,14 +1,20 @@
-"""From scores to the numbers that are printed, written and compared: plain values, ready for JSON."""
+"""From scores to the numbers that are printed, written and compared: one tidy frame.
+
+Every number is a row (:class:`Value`): of which filter, on which kind of data, over pieces or outages, which part of
+them, which quantity and statistic. Tables, CSV, ``metrics.json``, MLflow's keys and sentences are selections from it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from dlkf.evaluation.bootstrap import compare
+from dlkf.evaluation.bootstrap import Comparison, compare
 from dlkf.evaluation.metrics import (
     QUANTITIES,
     Array,
@@ -27,9 +33,135 @@ SETTLE_S = 10.0  # "settled" leaves out this much of every piece, where the init
 INTO_OUTAGE_S = (10.0, 20.0, 30.0, 40.0, 50.0, 60.0)
 BASELINE = "mbkf15"
 COMPARED = ("rms", "mean", "geomean")  # statistics of which ratios to the baseline are given
+IMU_AXES = {f"{sensor}_{axis}": unit for sensor, unit in (("accel", "m/s²"), ("gyro", "rad/s")) for axis in "xyz"}
+UNITS = {**QUANTITIES, "drift": "1", **IMU_AXES}
+COUNTS = ("n", "nonfinite", "slope", "injected_slope")  # statistics without a unit
+TEXT = ("kind", "filter", "baseline", "over", "part", "quantity", "statistic")  # columns that are no numbers
 
 
-def results(
+class Value(NamedTuple):
+    """One number. ``over``: pieces or outages.
+
+    ``part`` of pieces: ``all``; ``settled`` = without the first ``settle_s`` seconds; ``with_gnss`` = settled and
+    outside the outages (each the RMS over that part); ``last`` = the last estimate, of the IMU error. Of outages:
+    the error at their ``end``, the ``rms`` over them, or the error ``at 10 s`` after the last fix.
+    ``quantity``: those of :data:`dlkf.evaluation.metrics.QUANTITIES`, ``drift`` = horizontal error at the end per
+    distance driven in the outage, ``accel_x`` … ``gyro_z`` = the IMU-error estimate.
+    """
+
+    kind: str
+    filter: str
+    over: str
+    part: str
+    quantity: str
+    statistic: str
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Versus:
+    """A filter against the baseline in one quantity; ``over`` and ``part`` as in :class:`Value`."""
+
+    kind: str
+    filter: str
+    baseline: str
+    over: str
+    part: str
+    quantity: str
+    against: Comparison
+
+    def as_dict(self) -> dict[str, Any]:
+        """One flat row of plain values."""
+        row = asdict(self)
+        against = row.pop("against")
+        return row | against
+
+
+@dataclass(frozen=True)
+class Results:
+    """What is said about one kind of data: values, comparisons with the baseline, and how much they rest on.
+
+    ``per_piece`` and ``per_outage`` have one row each per piece and outage, with the error of every filter.
+    """
+
+    kind: str
+    count: Mapping[str, Any]
+    settle_s: float
+    values: tuple[Value, ...]
+    comparisons: tuple[Versus, ...]
+    per_piece: tuple[Mapping[str, Any], ...] = ()
+    per_outage: tuple[Mapping[str, Any], ...] = ()
+
+    @cached_property
+    def _at(self) -> dict[tuple[str, ...], float]:
+        return {v[1:6]: v.value for v in self.values}
+
+    @cached_property
+    def filters(self) -> list[str]:
+        """Names in the order in which they were scored."""
+        return list(dict.fromkeys(v.filter for v in self.values))
+
+    @property
+    def baseline(self) -> str | None:
+        """What the others are compared with."""
+        return next((c.baseline for c in self.comparisons), None)
+
+    def value(self, filter: str, over: str, part: str, quantity: str, statistic: str = "rms") -> float:
+        """One number, NaN where there is none."""
+        return self._at.get((filter, over, part, quantity, statistic), float("nan"))
+
+    def versus(self, filter: str, over: str, part: str, quantity: str, statistic: str = "rms") -> Comparison | None:
+        """One comparison; None for the baseline itself, or what is not compared."""
+        wanted = (filter, over, part, quantity, statistic)
+        same = (
+            c.against
+            for c in self.comparisons
+            if (c.filter, c.over, c.part, c.quantity, c.against.statistic) == wanted
+        )
+        return next(same, None)
+
+    def seconds_into_outage(self) -> list[str]:
+        """Times since the last fix at which there are errors, as ``part`` names them without ``at`` and ``s``."""
+        found = dict.fromkeys(v.part for v in self.values if v.part.startswith("at "))
+        return [part.removeprefix("at ").removesuffix(" s") for part in found]
+
+    def with_values(self, values: Sequence[Value]) -> Results:
+        """The same and more."""
+        return replace(self, values=(*self.values, *values))
+
+    def as_dict(self) -> dict[str, Any]:
+        """For ``metrics.json``; ``pandas.DataFrame(**result["values"])`` is the frame, and so for ``comparisons``."""
+        rows = [c.as_dict() for c in self.comparisons]
+        return {
+            "kind": self.kind,
+            "count": dict(self.count),
+            "settle_s": self.settle_s,
+            "values": {"columns": Value._fields, "data": [list(v) for v in self.values]},
+            "comparisons": {"columns": list(rows[0]) if rows else [], "data": [list(r.values()) for r in rows]},
+            "per_piece": list(self.per_piece),
+            "per_outage": list(self.per_outage),
+        }
+
+    @staticmethod
+    def of(content: Mapping[str, Any]) -> Results:
+        """Results as ``metrics.json`` has them: the inverse of :meth:`as_dict`."""
+        comparisons, columns = [], content["comparisons"]["columns"]
+        for row in content["comparisons"]["data"]:
+            named = {k: x if k in TEXT else _real(x) for k, x in zip(columns, row)}
+            against = Comparison(**{f.name: named.pop(f.name) for f in fields(Comparison)})
+            comparisons.append(Versus(**named, against=against))
+        values = (Value(*row[:-2], _real(row[-2]), row[-1]) for row in content["values"]["data"])
+        kept = {k: content[k] for k in ("kind", "count", "settle_s")}
+        lists = {k: tuple(content[k]) for k in ("per_piece", "per_outage")}
+        return Results(**kept, values=tuple(values), comparisons=tuple(comparisons), **lists)
+
+
+def _real(x: float | str | None) -> float:
+    return float("nan") if x is None else x if isinstance(x, int) else float(x)
+
+
+def summarise_scores(
     scores: Scores,
     *,
     settle_s: float = SETTLE_S,
@@ -37,108 +169,76 @@ def results(
     baseline: str = BASELINE,
     resamples: int = 2000,
     seed: int = 0,
-) -> dict[str, Any]:
-    """Every number of one kind of data: per filter, per filter against the baseline, per piece, per outage.
-
-    Phases of a piece: ``all``; ``settled`` = without the first ``settle_s`` seconds; ``with_gnss`` = settled
-    and outside the outages. Values over pieces are of the pieces' RMS. Outages: error at the ``end``, RMS
-    over the outage, error ``at`` so many seconds after the last fix, ``drift`` = horizontal error at the end
-    per distance driven in the outage. Raises ValueError for scores of several kinds (split them first).
-    """
+) -> Results:
+    """The results of one kind of data. Raises ValueError for scores of several kinds (split them first)."""
     if len(scores.kinds) > 1:
         raise ValueError(f"results of {' and '.join(scores.kinds)} data must not be mixed: use of_kind")
-    w = scores.windows
-    phases = _phases(scores, settle_s)
-    seconds = np.asarray(into_outage_s, float)
+    w, groups = scores.windows, np.array([p.group for p in scores.pieces])
     lengths = w.length * scores.epoch_s
-    if len(lengths):
-        seconds = seconds[seconds <= lengths.max() + 1e-9]
     distance = outage_distance(scores.truth_v_n, w, scores.epoch_s)
-    piece_groups = np.array([p.group for p in scores.pieces])
-    outage_groups = piece_groups[w.piece]
-    pieces: dict[str, dict[str, dict[str, Array]]] = {}
-    ends: dict[str, dict[str, Array]] = {}
-    filters: dict[str, Any] = {}
-    for name, run in scores.filters.items():
-        size = magnitudes(run.error)
-        pieces[name] = {q: {k: piece_rms(size[q], m) for k, m in phases.items()} for q in QUANTITIES}
-        filters[name] = {
-            "pieces": {q: {k: summary(x) for k, x in by.items()} for q, by in pieces[name].items()},
-            "imu_error": imu_error_quality(scores, name),
-        }
-        if not len(w.piece):
-            continue
-        ends[name] = {q: outage_end(size[q], w) for q in QUANTITIES}
-        at = {q: outage_at(size[q], w, seconds, scores.epoch_s) for q in QUANTITIES}
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ends[name]["drift"] = np.where(distance > 1.0, ends[name]["horizontal"] / distance, np.nan)
-        filters[name]["outages"] = {
-            "end": {q: summary(x) for q, x in ends[name].items() if q != "drift"},
-            "rms": {q: summary(outage_rms(size[q], w)) for q in QUANTITIES},
-            "at": {f"{s:g}": {q: summary(at[q][:, i]) for q in QUANTITIES} for i, s in enumerate(seconds)},
-            "drift": summary(ends[name]["drift"]),
-        }
-    units = {("pieces", "all"): ({n: {q: v["all"] for q, v in by.items()} for n, by in pieces.items()}, piece_groups)}
-    if ends:
-        units["outages", "end"] = (ends, outage_groups)
-    options: dict[str, Any] = {"resamples": resamples, "seed": seed}
-    comparisons = [
-        {"filter": name, "baseline": baseline, "over": over, "part": part, "quantity": q}
-        | compare(values[name][q], values[baseline][q], statistic=s, groups=groups, **options).as_dict()
-        for name in scores.filters
-        if baseline in scores.filters and name != baseline
-        for (over, part), (values, groups) in units.items()
-        for q, s in product(QUANTITIES, COMPARED)
-    ]
-    return {
-        "kind": scores.kinds[0],
-        "count": {
+    samples: dict[str, dict[tuple[str, str, str], Array]] = {}  # filter → (over, part, quantity) → one per unit
+    values: list[Value] = []
+    for name in scores.filters:
+        samples[name] = _piece_samples(scores, name, settle_s)
+        if len(w.piece):
+            samples[name] |= _outage_samples(scores, name, into_outage_s, distance)
+        for (over, part, quantity), x in samples[name].items():
+            values += values_of(scores.kinds[0], name, over, part, quantity, summary(x))
+        values += _imu_error_quality(scores, name)
+    return Results(
+        kind=scores.kinds[0],
+        count={
             "pieces": len(scores.pieces),
             "drives": len({p.drive for p in scores.pieces}),
-            "groups": len(set(piece_groups)),
+            "groups": len(set(groups)),
             "repeated": len({(p.drive, p.t_start) for p in scores.pieces}) < len(scores.pieces),
             "outages": len(w.piece),
             "outage_drives": len({scores.pieces[i].drive for i in w.piece}),
             "outage_s": [float(lengths.min()), float(lengths.max())] if len(lengths) else None,
             "scored_s": float((~np.isnan(scores.truth_p_n[..., 0])).sum() * scores.epoch_s),
         },
-        "settle_s": settle_s,
-        "filters": filters,
-        "comparisons": comparisons,
-        "per_piece": [
+        settle_s=settle_s,
+        values=tuple(values),
+        comparisons=tuple(_comparisons(scores, samples, baseline, groups, resamples=resamples, seed=seed)),
+        per_piece=tuple(
             {
                 "drive": p.drive,
                 "group": p.group,
                 "t_start": p.t_start,
-                "rms": {n: {q: float(by["all"][i]) for q, by in pieces[n].items()} for n in pieces},
+                "rms": {n: {q: float(x["pieces", "all", q][i]) for q in QUANTITIES} for n, x in samples.items()},
             }
             for i, p in enumerate(scores.pieces)
-        ],
-        "per_outage": [
+        ),
+        per_outage=tuple(
             {
                 "drive": scores.pieces[i].drive,
                 "group": scores.pieces[i].group,
                 "t_start": scores.pieces[i].t_start + float(w.first[k]) * scores.epoch_s,
                 "length_s": float(lengths[k]),
                 "distance_m": float(distance[k]),
-                "end": {n: {q: float(x[k]) for q, x in by.items()} for n, by in ends.items()},
+                "end": {
+                    n: {q: float(x["outages", "end", q][k]) for q in (*QUANTITIES, "drift")} for n, x in samples.items()
+                },
             }
             for k, i in enumerate(w.piece)
-        ],
-    }
+        ),
+    )
 
 
-def imu_error_quality(scores: Scores, name: str) -> dict[str, list[float]]:
-    """Slope over the pieces of the last estimate against the true IMU error, and its RMS error; 6 values.
+def values_of(
+    kind: str, filter: str, over: str, part: str, quantity: str, statistics: Mapping[str, float]
+) -> list[Value]:
+    """Rows of several statistics of one thing, with their unit."""
+    unit = UNITS[quantity]
+    return [
+        Value(kind, filter, over, part, quantity, s, x, "1" if s in COUNTS else unit) for s, x in statistics.items()
+    ]
 
-    NaN where the truth is unknown (a real drive), or the same in every piece (slope).
-    """
-    truth = last_known(scores.true_imu_error)
-    estimate = last_known(scores.filters[name].imu_error)
-    return {
-        "slope": slope(estimate, truth, intercept=True).tolist(),
-        "rms": piece_rms((estimate - truth).T).tolist(),
-    }
+
+def imu_error_values(kind: str, filter: str, statistic: str, six: Array) -> list[Value]:
+    """Rows of one statistic of the six axes of the IMU-error estimate at the end of a piece."""
+    rows = (values_of(kind, filter, "pieces", "last", q, {statistic: float(x)}) for q, x in zip(IMU_AXES, six))
+    return [row for one in rows for row in one]
 
 
 def last_known(x: Array) -> Array:
@@ -146,6 +246,58 @@ def last_known(x: Array) -> Array:
     known = ~np.isnan(x)
     last = x.shape[1] - 1 - np.argmax(known[:, ::-1], axis=1)
     return np.take_along_axis(x, last[:, None], axis=1)[:, 0]
+
+
+def _piece_samples(scores: Scores, name: str, settle_s: float) -> dict[tuple[str, str, str], Array]:
+    size, phases = magnitudes(scores.filters[name].error), _phases(scores, settle_s)
+    return {("pieces", k, q): piece_rms(size[q], mask) for q in QUANTITIES for k, mask in phases.items()}
+
+
+def _outage_samples(
+    scores: Scores, name: str, into_outage_s: Sequence[float], distance: Array
+) -> dict[tuple[str, str, str], Array]:
+    w, size = scores.windows, magnitudes(scores.filters[name].error)
+    seconds = np.asarray(into_outage_s, float)
+    seconds = seconds[seconds <= w.length.max() * scores.epoch_s + 1e-9]
+    at = {q: outage_at(size[q], w, seconds, scores.epoch_s) for q in QUANTITIES}
+    end = {q: outage_end(size[q], w) for q in QUANTITIES}
+    with np.errstate(divide="ignore", invalid="ignore"):
+        end["drift"] = np.where(distance > 1.0, end["horizontal"] / distance, np.nan)
+    found = {("outages", "end", q): x for q, x in end.items()}
+    found |= {("outages", "rms", q): outage_rms(size[q], w) for q in QUANTITIES}
+    return found | {("outages", f"at {s:g} s", q): at[q][:, i] for i, s in enumerate(seconds) for q in QUANTITIES}
+
+
+def _comparisons(
+    scores: Scores,
+    samples: Mapping[str, Mapping[tuple[str, str, str], Array]],
+    baseline: str,
+    groups: Array,
+    **options: Any,
+) -> Iterator[Versus]:
+    if baseline not in scores.filters:
+        return
+    units = {("pieces", "all"): groups}
+    if len(scores.windows.piece):
+        units["outages", "end"] = groups[scores.windows.piece]
+    for name in samples:
+        for ((over, part), g), q, s in product(units.items(), QUANTITIES, COMPARED):
+            if name != baseline:
+                a, b = (samples[n][over, part, q] for n in (name, baseline))
+                compared = compare(a, b, statistic=s, groups=g, **options)
+                yield Versus(scores.kinds[0], name, baseline, over, part, q, compared)
+
+
+def _imu_error_quality(scores: Scores, name: str) -> list[Value]:
+    """Slope over the pieces of the last estimate against the true IMU error, and its RMS error; six axes.
+
+    NaN where the truth is unknown (a real drive), or the same in every piece (slope).
+    """
+    truth = last_known(scores.true_imu_error)
+    estimate = last_known(scores.filters[name].imu_error)
+    slopes, rms = slope(estimate, truth, intercept=True), piece_rms((estimate - truth).T)
+    kind = scores.kinds[0]
+    return imu_error_values(kind, name, "slope", slopes) + imu_error_values(kind, name, "rms", rms)
 
 
 def _phases(scores: Scores, settle_s: float) -> dict[str, Array]:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from dlkf.console import counting
 from dlkf.evaluation.bias_slope import injected_response
 from dlkf.evaluation.metrics import slope
 from dlkf.evaluation.protocol import Scenes
-from dlkf.evaluation.results import BASELINE, SETTLE_S, results
+from dlkf.evaluation.results import BASELINE, SETTLE_S, Results, imu_error_values, summarise_scores
 from dlkf.evaluation.run import score_scenes
 from dlkf.evaluation.scores import Scores
 from dlkf.filters.integration import Estimator
@@ -25,18 +24,18 @@ def study(
     settle_s: float = SETTLE_S,
     injected_bias: Mapping[str, float] | None = None,
     seed: int = 0,
-) -> tuple[Scores, list[dict[str, Any]]]:
-    """Scores of every filter, and the results (results.results) of each kind of data.
+) -> tuple[Scores, list[Results]]:
+    """Scores of every filter, and the results of each kind of data.
 
     With ``injected_bias`` (``accel`` m/s², ``gyro`` rad/s, 1σ) everything runs once more with biases added to
-    the IMU, and the results carry ``imu_error.injected_slope`` per filter.
+    the IMU, and the results carry the ``injected_slope`` of its IMU-error estimate per filter.
     """
     with counting("Running filters") as progress:
         scores = score_scenes(
             filters, scenes, total=scenes.runs, kinds=kinds, groups=groups, progress=progress
         )
     made = [
-        results(scores.of_kind(kind), settle_s=settle_s, baseline=baseline, seed=seed)
+        summarise_scores(scores.of_kind(kind), settle_s=settle_s, baseline=baseline, seed=seed)
         for kind in scores.kinds
     ]
     if injected_bias:
@@ -44,9 +43,9 @@ def study(
             cause, followed = injected_response(
                 scores, filters, scenes, total=scenes.runs, progress=progress, seed=seed, **injected_bias
             )
-        for result in made:
-            rows = [i for i, p in enumerate(scores.pieces) if p.kind == result["kind"]]
-            for name, x in followed.items():
-                quality = result["filters"][name]["imu_error"]
-                quality["injected_slope"] = slope(x[rows], cause[rows], intercept=False).tolist()
+        for k, result in enumerate(made):
+            rows = [i for i, p in enumerate(scores.pieces) if p.kind == result.kind]
+            slopes = {n: slope(x[rows], cause[rows], intercept=False) for n, x in followed.items()}
+            values = (imu_error_values(result.kind, n, "injected_slope", six) for n, six in slopes.items())
+            made[k] = result.with_values([v for six in values for v in six])
     return scores, made

@@ -3,78 +3,79 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-from dlkf.evaluation.table import number
+from dlkf.evaluation.results import IMU_AXES, Results
+from dlkf.evaluation.table import DEGREES, number
 
 ASKED_S = ("30", "60", "20", "10", "40", "50")  # times without GNSS, the first that the outages reach is told
+END = ("outages", "end", "horizontal")
+METRICS = {
+    "position_rms_m": ("pieces", "all", "position", "rms"),
+    "velocity_rms_mps": ("pieces", "all", "velocity", "rms"),
+    "attitude_rms_deg": ("pieces", "all", "attitude", "rms"),
+    "outage_position_rms_m": ("outages", "rms", "position", "rms"),
+    "outage_horizontal_rms_m": ("outages", "rms", "horizontal", "rms"),
+    "outage_end_horizontal_m": (*END, "rms"),
+    "outage_end_horizontal_geomean_m": (*END, "geomean"),
+    "outage_end_horizontal_median_m": (*END, "median"),
+}
 
 
-def metrics_of(results: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+def metrics_of(results: Sequence[Results]) -> dict[str, float]:
     """``test/<filter>/…``: errors in outages and over the pieces, slope of the IMU-error estimate; finite ones.
 
-    With several kinds of data ``test/<kind>/<filter>/…``. The slopes are means over the three axes.
+    ``ratio_…`` are to the baseline, of the error at the end of the outages, with the bounds of their interval. With
+    several kinds of data ``test/<kind>/<filter>/…``. The slopes are means over the three axes.
     """
     metrics: dict[str, float] = {}
     for result in results:
-        prefix = "test" if len(results) == 1 else f"test/{result['kind']}"
-        for name, values in result["filters"].items():
-            pieces, flat = values["pieces"], {}
-            flat["position_rms_m"] = pieces["position"]["all"]["rms"]
-            flat["velocity_rms_mps"] = pieces["velocity"]["all"]["rms"]
-            flat["attitude_rms_deg"] = math.degrees(pieces["attitude"]["all"]["rms"])
-            if "outages" in values:
-                flat["outage_position_rms_m"] = values["outages"]["rms"]["position"]["rms"]
-                flat["outage_horizontal_rms_m"] = values["outages"]["rms"]["horizontal"]["rms"]
-                flat["outage_end_horizontal_m"] = values["outages"]["end"]["horizontal"]["rms"]
-            slopes = values["imu_error"].get("injected_slope") or []
-            for sensor, three in (("accel", slopes[:3]), ("gyro", slopes[3:])):
-                known = [s for s in three if s is not None]
-                if known:
-                    flat[f"bias_slope_{sensor}"] = sum(known) / len(known)
-            metrics |= {f"{prefix}/{name}/{k}": float(v) for k, v in flat.items() if v is not None}
+        prefix = "test" if len(results) == 1 else f"test/{result.kind}"
+        for name in result.filters:
+            flat = {key: result.value(name, *which) for key, which in METRICS.items()}
+            flat["attitude_rms_deg"] *= DEGREES
+            for sensor in ("accel", "gyro"):
+                axes = [a for a in IMU_AXES if a.startswith(sensor)]
+                slopes = [result.value(name, "pieces", "last", a, "injected_slope") for a in axes]
+                known = [s for s in slopes if not math.isnan(s)]
+                flat[f"bias_slope_{sensor}"] = sum(known) / len(known) if known else math.nan
+            for statistic in ("rms", "geomean"):
+                c = result.versus(name, *END, statistic)
+                bounds = {} if c is None else {"": c.ratio, "_low": c.ratio_low, "_high": c.ratio_high}
+                flat |= {f"ratio_{statistic}{bound}": x for bound, x in bounds.items()}
+            metrics |= {f"{prefix}/{name}/{k}": v for k, v in flat.items()}
     return {k: v for k, v in metrics.items() if math.isfinite(v)}
 
 
-
-
-
-def asked(result: Mapping[str, Any]) -> str | None:
+def asked(result: Results) -> str | None:
     """The time without GNSS [s] that the answer is about, as the results name it; None without outages."""
-    outages = [f["outages"]["at"] for f in result["filters"].values() if "outages" in f]
-    if not outages or not outages[0]:
-        return None
-    return next((s for s in ASKED_S if s in outages[0]), next(iter(outages[0])))
+    reached = result.seconds_into_outage()
+    return next((s for s in (*ASKED_S, *reached) if s in reached), None)
 
 
-def answer(result: Mapping[str, Any]) -> str:
+def answer(result: Results) -> str:
     """The answer to "how far does it drift?" in one sentence, of the best filter and of the best classical one.
 
     "After 30 s without GNSS: 10 m in half of the cases, 24 m in 95 %, with dlkf; best classical (mbkf21_car) 14, 31."
     The best has the least median; of filters without outages, the least error over the pieces.
     """
-    filters, seconds = result["filters"], asked(result)
+    seconds = asked(result)
     if seconds is None:
-        errors = {n: f["pieces"]["horizontal"]["settled"] for n, f in filters.items()}
-        lead = "With GNSS throughout"
+        where, lead = ("pieces", "settled", "horizontal"), "With GNSS throughout"
     else:
-        errors = {n: f["outages"]["at"][seconds]["horizontal"] for n, f in filters.items()}
-        lead = f"After {seconds} s without GNSS"
-    errors = {n: e for n, e in errors.items() if not math.isnan(e["median"])}
-    if not errors:
+        where, lead = ("outages", f"at {seconds} s", "horizontal"), f"After {seconds} s without GNSS"
+    errors = {n: tuple(result.value(n, *where, s) for s in ("median", "p95")) for n in result.filters}
+    order = sorted((n for n in errors if not math.isnan(errors[n][0])), key=lambda n: errors[n][0])
+    if not order:
         return "No filter could be scored: there is no valid truth where it counts."
-    order = sorted(errors, key=lambda n: errors[n]["median"])
-    best = errors[order[0]]
-    text = f"{lead}: {number(best['median'])} m in half of the cases, {number(best['p95'])} m in 95 %, with {order[0]}"
+    told = {n: tuple(map(number, errors[n])) for n in order}
+    text = f"{lead}: {told[order[0]][0]} m in half of the cases, {told[order[0]][1]} m in 95 %, with {order[0]}"
     classical = next((n for n in order if is_classical(n)), None)
     if is_classical(order[0]):
-        second = next((n for n in order[1:]), None)
-        if second is not None:
-            text += f"; next {second} {number(errors[second]['median'])}, {number(errors[second]['p95'])} m"
+        if order[1:]:
+            text += f"; next {order[1]} {', '.join(told[order[1]])} m"
     elif classical is not None:
-        text += f"; best classical ({classical}) {number(errors[classical]['median'])}, "
-        text += f"{number(errors[classical]['p95'])} m"
+        text += f"; best classical ({classical}) {', '.join(told[classical])} m"
     return text + "."
 
 

@@ -21,7 +21,7 @@ from dlkf.errors import InputError
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Scenes
 from dlkf.evaluation.report import write_report
-from dlkf.evaluation.results import BASELINE
+from dlkf.evaluation.results import BASELINE, Results
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.study import study
 from dlkf.filters.build import build_filter
@@ -40,7 +40,7 @@ class Outcome:
     """What a study leaves: scores, results per kind of data, the baselines' settings, the best weights."""
 
     scores: Scores
-    results: list[dict[str, Any]]
+    results: list[Results]
     tuning: dict[str, float]
     prior: dict[str, list[float]]
     weights: Path
