@@ -52,6 +52,13 @@ def test_variants_are_merged_and_what_stands_beside_them_wins():
     assert middle(config)["car"] == {"speed": 1.5, "size": 2.0, "bumpy": True}
 
 
+def test_a_choice_may_hold_ranges():
+    config = {"x": {"choice": [[0.0, 0.0], [{"uniform": [1, 2]}, {"uniform": [3, 4]}]]}}
+    drawn_ones = [draw(config, seed)["x"] for seed in SEEDS[:200]]
+    assert all(x == [0, 0] or (1 <= x[0] <= 2 and 3 <= x[1] <= 4) for x in drawn_ones)
+    assert len({tuple(x) for x in drawn_ones}) > 50 and middle(config)["x"] == [0, 0]
+
+
 def test_the_middle():
     config = {
         "u": {"uniform": [1, 3]}, "l": {"log_uniform": [1e-4, 1e-2]}, "n": {"normal": [5, 1]}, "c": {"choice": [7, 8]},

@@ -4,8 +4,9 @@ A range is a mapping with one of these keys, and perhaps ``absent``, the probabi
 
     {uniform: [a, b]}   {log_uniform: [a, b]}   {normal: [mean, std]}   {choice: [x, y, …]}
 
-A mapping with ``one_of`` has variants by name, each with a ``share`` of the draws (1 if it says none); what the drawn
-one says is merged into the mapping, and what stands beside ``one_of`` wins, so that a key of the command line does.
+What is chosen may hold ranges itself. A mapping with ``one_of`` has variants by name, each with a ``share`` of the
+draws (1 if it says none); what the drawn one says is merged into the mapping, and what stands beside ``one_of`` wins,
+so that a key of the command line does.
 
 Every value has a generator of its own, from the seed and the path of its key: to fix one leaves all others as drawn.
 """
@@ -78,7 +79,8 @@ def has_ranges(config: Any) -> bool:
 def _resolved(config: Any, path: str, pick: Pick, value: Value) -> Any:
     if isinstance(config, Mapping):
         if _is_range(config):
-            return value(path, config)
+            drawn = value(path, config)
+            return _resolved(drawn, f"{path}.chosen", pick, value) if "choice" in config else drawn
         if "one_of" in config:
             config = _merged(_variant(config["one_of"], path, pick), {k: v for k, v in config.items() if k != "one_of"})
             return _resolved(config, path, pick, value)

@@ -143,6 +143,18 @@ def test_a_soft_mount_amplifies_its_band():
     assert ratio[(f > 50) & (f < 70)].mean() < 0.1
 
 
+def test_loudness_scales_all_and_bursts_make_the_noise_uneven():
+    """Linear; the mean square of bursts is that without them, within 2 · 10 % of its sampling."""
+    kind = Shaking(rumble=1.0, rattle=5.0, wheel=0.5)
+    loud, low = (force(shake(replace(kind, loudness=x), 15.0)) for x in (1.0, 0.1))
+    assert np.abs(0.1 * loud - low).max() < 1e-9 * np.abs(loud).max()
+    even, uneven = (force(shake(Shaking(rumble=1.0, bursts=x), 15.0, 200.0)) for x in (0.0, 0.7))
+    assert np.mean(uneven**2) == pytest.approx(np.mean(even**2), rel=0.2)
+    fourth = [np.mean(x[:, 0] ** 4) / np.mean(x[:, 0] ** 2) ** 2 for x in (even, uneven)]
+    assert fourth[0] == pytest.approx(3, abs=0.3) and fourth[1] > 4
+    assert Shaking(loudness=0.0, rumble=1.0).is_still
+
+
 def test_knocks_do_not_depend_on_the_speed():
     kind = Shaking(rattle=10.0, rattle_per_minute=60.0)
     still, fast = (force(shake(kind, v, 120.0)) for v in (0.0, 30.0))

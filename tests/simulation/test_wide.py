@@ -35,7 +35,7 @@ def test_every_drive_is_a_world_of_its_own_and_says_which(fleet):
         values = [one[part][key] for one in of]
         assert len(set(values)) == len(values) == 3
     described = json.loads((fleet / "simulation.json").read_text())
-    assert described["seed"] == 4 and "log_uniform" in described["imu"]["accel"]["noise_density"]
+    assert described["seed"] == 4 and "log_uniform" in described["imu"]["accel"]["turn_on_bias"]
     assert len(load_dataset(fleet, drives=[drives["drive"][0]])) == 1  # passes the checks of the contract
 
 
@@ -63,7 +63,7 @@ def test_a_fixed_value_leaves_the_rest_of_the_fleet_alone():
 def test_the_middle_is_what_a_filter_is_told():
     made_by = wide()
     assert made_by.imu.name == "wide"
-    assert made_by.imu.accel.noise_density == pytest.approx(np.sqrt(1e-4 * 0.03))
+    assert made_by.imu.accel.noise_density == pytest.approx(np.sqrt(2e-4 * 0.03))
     assert made_by.dataset.receiver is None and made_by.dataset.imu_errors == "wide"
 
 

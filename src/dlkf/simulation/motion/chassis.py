@@ -30,6 +30,7 @@ from dlkf.simulation.motion.vehicle import Route, Truth, Waves, radians_per_metr
 Array = NDArray[np.float64]
 GRAVITY = 9.81  # m/s², for the load on the springs alone
 NODE_HZ = 100  # suspension is solved at this rate, whatever the IMU's, and a spline lies between
+ROUGHEST = 0.0115  # m³ · m/s, G_d(0.1/m) times speed, that a driver bears: about 3 m/s² RMS of the body
 PROFILE_STEP = 0.25  # m, about the length of a tyre's contact
 FULL_WAVE, ROLL_WAVE = 0.01, 0.1  # cycles/m below which the rough road is flat, for heave and across
 # vibration: cycles per second at rest, cycles per metre driven, share of the power
@@ -90,7 +91,7 @@ class ChassisConfig:
         }  # fmt: skip
         ranges = {name: (0, limit) for name, limit in limits.items()} | {
             "body_hz": (0.5, 5), "body_damping": (0.05, 1), "wheel_hz": (5, 25), "wheel_damping": (0.05, 1),
-            "wheelbase": (1, 8), "track": (0.5, 3), "roughness_length": (10, 1e5),
+            "wheelbase": (1, 8), "track": (0.5, 3), "roughness_length": (2, 1e5),
         }  # fmt: skip
         for name, (low, high) in ranges.items():
             if not low <= getattr(self, name) <= high:
@@ -148,7 +149,7 @@ def mounted(rng: np.random.Generator, car: Car, route: Route, axle: Truth) -> Tr
     motion = route.motion(axle.t)
     slope, slope_rate = route.slope.at(motion)
     slip, slip_rate = slip_angle(car, route, motion)
-    stretches = draw_stretches(stretch_rng, car.kind, float(np.ptp(motion.distance)))
+    stretches = draw_stretches(stretch_rng, car.kind, float(np.ptp(motion.distance)), float(motion.speed.max()))
     suspended = suspension(ride_rng, car, route, float(axle.t[-1]), stretches)
     roll, pitch, heave = suspended(axle.t).T
     roll_rate, pitch_rate, heave_rate = suspended(axle.t, nu=1).T
@@ -192,14 +193,19 @@ class Stretches:
         return self.factors[np.minimum(np.searchsorted(self.ends, distance, side="right"), len(self.factors) - 1)]
 
 
-def draw_stretches(rng: np.random.Generator, kind: ChassisConfig, length: float) -> Stretches:
-    """Stretches of a road as long as that [m]; a single one where the kind has no spread."""
+def draw_stretches(rng: np.random.Generator, kind: ChassisConfig, length: float, fastest: float) -> Stretches:
+    """Stretches of a road as long as that [m]; a single one where the kind has no spread.
+
+    None is rougher than a driver would take at the ``fastest`` [m/s] of the drive: the body's acceleration goes with
+    √(G_d v), and ``ROUGHEST`` is an average road (64e-6) at 180 m/s, or a poor one (1024e-6) at 11 m/s.
+    """
     if kind.roughness_spread == 0:
         return Stretches(np.array((math.inf,)), np.ones(1))
     mean = length / kind.roughness_length
     count = 2 + int(mean + 10 * math.sqrt(mean))  # ten sigma more than it takes
     ends = np.cumsum(kind.roughness_length * rng.standard_exponential(count))
-    return Stretches(ends, np.exp(kind.roughness_spread * rng.standard_normal(count)))
+    most = math.sqrt(ROUGHEST / max(kind.roughness * max(fastest, 1.0), 1e-12))
+    return Stretches(ends, np.minimum(np.exp(kind.roughness_spread * rng.standard_normal(count)), most))
 
 
 def loads(route: Route, motion: Kinematics) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ ROAD_HZ, ROAD_DAMPING = 6.0, 0.7  # the body's own springs keep road noise above
 SHIFT_S = 0.4  # s that the revolutions take to follow a change of gear
 ENGINE_ORDERS = ((1.0, 0.6), (0.5, 0.25), (2.0, 0.15))  # of the firing frequency, share of the power
 WHEEL_ORDERS = ((1.0, 0.7), (2.0, 0.3))
+SOURCES = ("engine", "wheel", "hum", "rumble", "rattle")
+BURST_S = 0.1  # s
 NOISE_TURN_HZ = 15.0  # frequency at which noise turns the mount by ``turning``
 
 
@@ -35,13 +37,15 @@ NOISE_TURN_HZ = 15.0  # frequency at which noise turns the mount by ``turning``
 class Shaking:
     """Sizes are RMS per axis on average [m/s²] before the mount amplifies them; 0 switches a source off.
 
+    ``loudness``: share of all sizes but ``sway`` that a car lets through, 0 for none.
     ``engine``: at a firing frequency of 50 Hz, growing in proportion to it; ``idle_hz`` is the firing frequency at
     standstill, ``idling`` the size there against what it would be in motion (0 for an engine that stops).
     First gear fires ``first_gear`` times a metre, each of the ``gears`` ``gear_step`` times as often as the one below;
     it changes up at ``shift_hz``, to which ``gears`` 0 holds it whatever the speed, as a variable transmission does.
     ``wheel``: at 15 m/s, with the square of the speed, ``wheel_turns`` per metre. ``hum``: fans and compressors at
     ``hum_hz``, on for ``hum_share`` of the time. ``wander``: relative, slow, of the frequencies of engine and hum.
-    ``rumble``: road noise above 6 Hz, at 15 m/s, in proportion to speed and the road's roughness.
+    ``rumble``: road noise above 6 Hz, at 15 m/s, in proportion to speed and the road's roughness; it comes in bursts,
+    of log-std ``bursts``, of ``BURST_S``.
     ``rattle``: peak of a knock [m/s²], ``rattle_per_minute`` of them at any speed, each ringing at ``rattle_hz``.
 
     The mount is a resonance at ``mount_hz`` with ``mount_damping`` for all of it (0 Hz: rigid); with the shaking it
@@ -49,6 +53,7 @@ class Shaking:
     at ``sway_hz`` with ``sway_damping``.
     """
 
+    loudness: float = 1.0
     engine: float = 0.0
     idle_hz: float = 25.0
     idling: float = 1.0
@@ -63,6 +68,7 @@ class Shaking:
     hum_share: float = 0.5
     wander: float = 0.0
     rumble: float = 0.0
+    bursts: float = 0.0
     rattle: float = 0.0
     rattle_per_minute: float = 30.0
     rattle_hz: float = 30.0
@@ -75,12 +81,12 @@ class Shaking:
 
     def __post_init__(self) -> None:
         limits = {
-            "engine": (0, 20), "idle_hz": (5, 60), "idling": (0, 5), "gears": (0, 12), "first_gear": (0.5, 40),
-            "gear_step": (0.4, 0.95), "shift_hz": (30, 300), "wheel": (0, 20), "wheel_turns": (0.2, 1),
-            "hum": (0, 20), "hum_hz": (5, 400), "hum_share": (0, 1), "wander": (0, 0.2), "rumble": (0, 20),
-            "rattle": (0, 100), "rattle_per_minute": (0, 600), "rattle_hz": (5, 80), "mount_hz": (0, 80),
-            "mount_damping": (0.02, 2), "turning": (0, 1), "sway": (0, 0.1), "sway_hz": (0.5, 20),
-            "sway_damping": (0.02, 2),
+            "loudness": (0, 1), "engine": (0, 20), "idle_hz": (5, 60), "idling": (0, 5), "gears": (0, 12),
+            "first_gear": (0.5, 40), "gear_step": (0.4, 0.95), "shift_hz": (30, 300), "wheel": (0, 20),
+            "wheel_turns": (0.2, 1), "hum": (0, 20), "hum_hz": (5, 400), "hum_share": (0, 1), "wander": (0, 0.2),
+            "rumble": (0, 20), "bursts": (0, 1.5), "rattle": (0, 100), "rattle_per_minute": (0, 600),
+            "rattle_hz": (5, 80), "mount_hz": (0, 80), "mount_damping": (0.02, 2), "turning": (0, 1),
+            "sway": (0, 0.1), "sway_hz": (0.5, 20), "sway_damping": (0.02, 2),
         }  # fmt: skip
         for name, (low, high) in limits.items():
             if not low <= getattr(self, name) <= high:
@@ -93,7 +99,7 @@ class Shaking:
     @property
     def is_still(self) -> bool:
         """Whether nothing shakes."""
-        return not any((self.engine, self.wheel, self.hum, self.rumble, self.rattle, self.sway))
+        return not any((*(self.loudness * getattr(self, name) for name in SOURCES), self.sway))
 
 
 @dataclass(frozen=True)
@@ -118,6 +124,7 @@ def shaken(
     ``motion_at``: the car's motion at any times; ``roughness``: of the road relative to its mean (amplitude) there;
     ``load``: specific force forward and to the right [m/s²] there.
     """
+    kind = replace(kind, **{name: kind.loudness * getattr(kind, name) for name in SOURCES})
     engine_rng, wheel_rng, hum_rng, noise_rng, sway_rng = rng.spawn(5)
     end = float(t[-1])
     coarse = motion_at(np.arange(math.ceil(end * TONE_HZ) + 2) / TONE_HZ)
@@ -249,6 +256,10 @@ def noise(rng: np.random.Generator, kind: Shaking, envelope: Array) -> Array:
     three columns, of the same size, are those that turn the mount. Each has a log-normal share of the noise."""
     count = len(envelope)
     axes = np.exp(0.5 * rng.standard_normal(6) - 0.25)
+    if kind.bursts > 0:
+        keep = math.exp(-1 / (BURST_S * NODE_HZ))
+        level = lfilter([math.sqrt(1 - keep**2)], [1.0, -keep], rng.standard_normal(count))
+        envelope = envelope * np.exp(kind.bursts * level - kind.bursts**2)
     white = envelope[:, None] * axes * rng.standard_normal((count, 6)) if kind.rumble > 0 else np.zeros((count, 6))
     w = 2 * math.pi * ROAD_HZ
     b, a = bilinear([1.0], [1.0, 2 * ROAD_DAMPING * w, w * w], NODE_HZ)
