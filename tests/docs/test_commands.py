@@ -1,0 +1,134 @@
+"""Every command line and every setting that the pages name exists: commands compose, scripts know their options."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig, OmegaConf
+
+from dlkf.command import GROUPS
+from dlkf.command.arguments import readable
+from dlkf.config import config_dir
+from tests.docs.pages import PAGES, ROOT, blocks, commands
+
+PRIMARIES = sorted(p.stem for p in config_dir().glob("*.yaml") if p.stem != "hydra_output")
+SHELL = [
+    (page, tuple(words))
+    for page in PAGES
+    for text in (
+        *(b.text for b in blocks(page) if not b.language and not b.file),
+        *re.findall(r"`((?:python|make) [^`\n]+)`", page.read_text()),
+    )
+    for words in commands(text)
+    if words[0] in ("python", "make", "dlkf")
+]
+# presets that the pages tell a reader to write into mine/
+MINE = {
+    "imu": ["my_imu", "shed"],
+    "tuning": ["town"],
+    "reader": ["xsens", "shed"],
+    "experiment": ["heading"],
+    "simulated": ["van"],
+}
+# conf of one command has only what is chosen; these choices bring in the keys that others lack
+VARIANTS = {
+    "simulate": [
+        ["simulated@dataset=city", "receiver=rtk"],
+        ["simulated@dataset=paper_clean", "receiver=undisturbed"],
+        ["simulated@dataset=fleet"],
+    ],
+    "train": [["+experiment=outage"]],
+}
+SETTING = re.compile(r"^([a-z_]+(?:\.[a-z_]+)+)(?:=.*)?$")
+
+
+@pytest.fixture(scope="module")
+def mine(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A reader's own presets: as the pages print them where they do, else like one of ours."""
+    folder = tmp_path_factory.mktemp("mine")
+    like = {"imu": "consumer", "tuning": "untuned", "reader": "csv", "experiment": "outage", "simulated": "lifelike"}
+    for group, names in MINE.items():
+        (folder / group).mkdir()
+        for name in names:
+            (folder / group / f"{name}.yaml").write_text((config_dir() / group / f"{like[group]}.yaml").read_text())
+    for page in PAGES:
+        for block in blocks(page):
+            if block.file and block.file.startswith("mine/"):
+                (folder / block.file.removeprefix("mine/")).write_text(block.text)
+    return folder
+
+
+def composed(primary: str, overrides: list[str]) -> DictConfig:
+    """A command's configuration, as the command itself would compose it."""
+    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
+        return compose(primary, overrides)
+
+
+def as_hydra_takes_it(command: str, word: str) -> str:
+    key, equals, value = word.partition("=")
+    groups = GROUPS.get(command, {})
+    if command == "ingest" and key.startswith("reader."):
+        return readable(f"++{word}")
+    return readable(f"{groups[key]}@{key}={value}" if equals and key in groups else word)
+
+
+@pytest.mark.parametrize(("page", "words"), SHELL, ids=[f"{p.stem}: {' '.join(w)[:60]}" for p, w in SHELL])
+def test_a_command_line_of_the_pages(page: Path, words: tuple[str, ...], mine: Path) -> None:
+    given = [w for w in words if w != "…" and "<" not in w]
+    if given[0] == "make":
+        targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.M)
+        assert set(w for w in given[1:] if "=" not in w) <= set(targets)
+    elif given[1] == "-m" and given[2].startswith("dlkf"):
+        command = given[2].removeprefix("dlkf.")
+        rest = given[3:]
+        if "--config-dir" in rest:
+            k = rest.index("--config-dir")
+            rest[k : k + 2] = [f"hydra.searchpath=[file://{mine}]"]
+        sweep = "-m" in rest
+        overrides = [as_hydra_takes_it(command, w) for w in rest if w not in ("-m", "--multirun")]
+        if sweep:  # a point of it
+            overrides = [re.sub(r"=([^\[,]+),.*$", r"=\1", o) for o in overrides]
+        composed(command, overrides)
+    elif given[1:3] == ["-m", "pytest"]:
+        assert all((ROOT / w).exists() for w in given[3:])
+    else:
+        script = given[2].replace(".", "/") + ".py" if given[1] == "-m" else given[1]
+        assert (ROOT / script).is_file(), script
+        text = (ROOT / script).read_text()
+        unknown = [w for w in given[2:] if w.startswith("--") and f'"{w.partition("=")[0]}"' not in text]
+        assert not unknown, f"{script} knows no {unknown}"
+
+
+@cache
+def keys() -> frozenset[str]:
+    """Every setting of every command, dotted, and every preset's."""
+    found: set[str] = set()
+    for primary in PRIMARIES:
+        for variant in VARIANTS.get(primary, [[]]):
+            found |= dotted(OmegaConf.to_container(composed(primary, variant), resolve=False))
+    return frozenset(found)
+
+
+def known(name: str) -> bool:
+    """Whether a dotted name is a setting, or ends one."""
+    return any(key == name or key.endswith(f".{name}") for key in keys())
+
+
+def dotted(values: Any, prefix: str = "") -> set[str]:
+    if not isinstance(values, dict):
+        return set()
+    return {f"{prefix}{key}" for key in values}.union(*(dotted(v, f"{prefix}{k}.") for k, v in values.items()))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_settings_named_in_the_text_exist(page: Path) -> None:
+    text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.M | re.S)
+    named = {m[1] for code in re.findall(r"`([^`\n]+)`", text) for w in code.split() if (m := SETTING.match(w))}
+    groups = {part for key in keys() for part in key.split(".")[:-1]}
+    lost = sorted(n for n in named if n.partition(".")[0] in groups and not known(n))
+    assert not lost, lost
