@@ -25,7 +25,7 @@ SHELL = [
         *re.findall(r"`((?:python|make) [^`\n]+)`", page.read_text()),
     )
     for words in commands(text)
-    if words[0] in ("python", "make", "dlkf")
+    if words[0] in ("python", "make", "dlkf") and not re.search(r"dlkf\.[…<]|pipelines/…", " ".join(words))
 ]
 # presets that the pages tell a reader to write into mine/
 MINE = {
