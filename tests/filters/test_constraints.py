@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dlkf.filters.build import build_filter
-from dlkf.filters.constraints import Constraints
+from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import Epoch, Fix, integrate
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.tuning import Tuning
@@ -37,7 +37,7 @@ def test_jacobian_matches_finite_differences():
     batch = scene(1, 1, seed=3)
     structure = torch.tensor([[0.03, -0.02, 1.2, 0.008]], dtype=D)
     error = ImuError(torch.zeros(1, 6, dtype=D))
-    rules = Constraints(Tuning(), STATES)
+    rules = CarConstraints(Tuning(), STATES)
 
     def innovation(dx):
         moved = epoch_of(batch, batch.start.corrected(dx[:, :9]), error.updated(dx, STATES))
@@ -75,7 +75,7 @@ def test_structure_of_the_car_is_found_and_pays():
     """Mounting angles, rear axle and sideslip unknown: a filter that estimates them beats one that cannot."""
     true = (0.02, -0.015, 1.4, 0.004)
     batch = outage(slipping(30, 150, true), 105, 150)
-    estimator = Mbkf(IMU, Tuning(lateral_std=0.05, vertical_std=0.05), ErrorStates(structure=True), constrained=True)
+    estimator = build_filter("mbkf15_car", IMU, tuning={"lateral_std": 0.05, "vertical_std": 0.05})
     memory = None
 
     class Watched(Mbkf):
@@ -110,7 +110,7 @@ def test_a_moving_car_is_not_taken_for_a_standing_one():
     batch = outage(scene(20, 60, seed=10), 30, 60)
     quiet = replace(batch, imu=batch.imu.mean(2, keepdim=True).expand_as(batch.imu).clone())
     P = torch.eye(15, dtype=D).expand(20, 15, 15) * 0.01
-    rules = Constraints(Tuning(), ErrorStates())
+    rules = CarConstraints(Tuning(), ErrorStates())
     epoch = epoch_of(quiet, NavState(*(x[:, 30] for x in batch.truth)), ImuError(torch.zeros(20, 6, dtype=D)))
     resting, _ = rules._at_rest(epoch, torch.full((20, 2), math.inf, dtype=D), P)
     assert not resting.any()

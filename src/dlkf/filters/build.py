@@ -1,14 +1,24 @@
-"""Filters by name: ``ins``, or a Kalman filter with endings for what it carries, as in ``mbkf21_nhc_gated``."""
+"""Filters by name: ``ins``, or a Kalman filter with endings for what it carries, as in ``mbkf21_nhc_gated``.
+
+A source of measurements of one's own stands behind a plus, as in ``mbkf21_nhc+my_sources:SpeedLimit``: a module on
+PYTHONPATH and a class in it (:mod:`dlkf.filters.sources`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from importlib import import_module
+from typing import Any
 
 from dlkf.errors import InputError
+from dlkf.filters.adaptive import Adaptation
+from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import Estimator
 from dlkf.filters.model_based import Ins, Mbkf
 from dlkf.filters.smoother import Smoothed
+from dlkf.filters.sources import Source
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.state import ErrorStates
@@ -22,14 +32,18 @@ ENDINGS: Mapping[str, str] = {
     "gm": "biases as first-order Gauss-Markov processes",
     "rts": "smoothed backwards over the whole drive (Rauch-Tung-Striebel)",
 }
+OWN_SOURCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 MODEL_BASED: tuple[str, ...] = ("ins", "mbkf15", "mbkf15_prior", "mbkf21", "mbkf33", "aekf")
 
 
 def is_filter(name: str) -> bool:
     """Whether a name is that of a model-based filter."""
+    name, *own = name.split("+")
     base, *endings = name.split("_")
     if name == "ins":
-        return True
+        return not own
+    if not all(OWN_SOURCE.fullmatch(part) for part in own):
+        return False
     return base in KALMAN and len(set(endings)) == len(endings) and set(endings) <= set(ENDINGS)
 
 
@@ -40,16 +54,18 @@ def build_filter(
     tuning: Mapping[str, float] | Tuning | None = None,
     prior_mean: Sequence[float] | None = None,
     prior_std: Sequence[float] | None = None,
-) -> Estimator:
+) -> Estimator | Smoothed:
     """A model-based filter for an IMU; ``prior_*`` (6 values, m/s² and rad/s) belong to names with ``_prior``.
 
-    Raises InputError for an unknown name, an unknown tuning factor, or a missing prior.
+    With the ending ``rts`` it is no estimator but a filter to be smoothed, which only looks back on whole drives.
+    Raises InputError for an unknown name, an unknown tuning factor, a missing prior, or an own source that is missing.
     """
     if not is_filter(name):
         raise InputError(f"unknown model {name!r}; known filters: {known_filters()}")
     if name == "ins":
         return Ins()
-    base, *endings = name.split("_")
+    kind, *own = name.split("+")
+    base, *endings = kind.split("_")
     given = {}
     if "prior" in endings:
         if prior_mean is None or prior_std is None:
@@ -60,17 +76,49 @@ def build_filter(
         if len(prior_mean) != 6 or len(prior_std) != 6:
             raise InputError(f"prior.mean and prior.std of {name} must have 6 values (m/s² x3, rad/s x3)")
         given = {"prior_mean": tuple(map(float, prior_mean)), "prior_std": tuple(map(float, prior_std))}
+    factors = tuning if isinstance(tuning, Tuning) else _tuning(tuning or {})
+    states = ErrorStates(KALMAN[base], structure="car" in endings)
+    sources: list[Source] = []
+    if {"nhc", "car"} & set(endings):
+        sources.append(CarConstraints(factors, states))
+    sources += [own_source(part)(imu, factors, states) for part in own]
     estimator = Mbkf(
         imu,
-        tuning if isinstance(tuning, Tuning) else _tuning(tuning or {}),
-        ErrorStates(KALMAN[base], structure="car" in endings),
+        factors,
+        states,
         gauss_markov="gm" in endings,
-        constrained=bool({"nhc", "car"} & set(endings)),
         gated="gated" in endings,
-        adaptive=base == "aekf",
+        sources=tuple(sources),
+        noise=Adaptation(factors.forgetting) if base == "aekf" else None,
         **given,
     )
     return Smoothed(estimator) if "rts" in endings else estimator
+
+
+def build_causal(name: str, imu: ImuSpec, why: str, **given: Any) -> Estimator:
+    """As :func:`build_filter`, for what needs an estimator; InputError with ``why`` for a smoothed one."""
+    refuse_smoothed(name, why)
+    built = build_filter(name, imu, **given)
+    assert not isinstance(built, Smoothed)
+    return built
+
+
+def refuse_smoothed(name: str, why: str) -> None:
+    """InputError for the name of a filter that is to be smoothed."""
+    if "rts" in name.partition("+")[0].split("_"):
+        raise InputError(f"model {name} is smoothed: it looks ahead, {why}; take {name.replace('_rts', '')}")
+
+
+def own_source(spec: str) -> Callable[[ImuSpec, Tuning, ErrorStates], Source]:
+    """A user's class of a source from ``module:Class``; InputError where there is none."""
+    module, _, name = spec.partition(":")
+    try:
+        found = getattr(import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"source {spec}: {error}; give module:Class, with the module's folder in PYTHONPATH") from None
+    if not (callable(found) and hasattr(found, "rows") and hasattr(found, "begin")):
+        raise InputError(f"source {spec} has no begin and rows; dlkf.filters.sources says what a source is")
+    return found
 
 
 def known_filters() -> str:

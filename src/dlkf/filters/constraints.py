@@ -12,15 +12,16 @@ with structure they are further states of the filter. A standstill, found from t
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dlkf.filters.advice import ABSENT
+from dlkf.data.drive import Batch
 from dlkf.filters.integration import Epoch
+from dlkf.filters.sources import Believed, Measurement
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import skew
 from dlkf.navigation.state import ATTITUDE, GYRO, VELOCITY, ErrorStates
@@ -33,33 +34,24 @@ PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 2.0  # m/s, 1σ: a standstill must not 
 SLOWEST = 0.5  # m/s: below, course and yaw rate say nothing of the car's structure
 
 
-class Measurement(NamedTuple):
-    """Rows of a Kalman update: innovation, its H, variance, and which rows count."""
-
-    z: Tensor  # (B, m)
-    H: Tensor  # (B, m, n)
-    R: Tensor  # (B, m)
-    used: Tensor  # (B, m) bool
-
-
 @dataclass(frozen=True)
-class Constraints:
+class CarConstraints:
     """Constraints on a car's motion for a filter with the given error states."""
 
     tuning: Tuning
     states: ErrorStates
 
+    def begin(self, batch: Batch) -> Float[Tensor, "B 2"]:
+        """The quietest second of standing so far: none."""
+        return batch.imu.new_full((batch.size[0], 2), math.inf)
+
     def rows(
-        self,
-        epoch: Epoch,
-        structure: Float[Tensor, "B 4"] | None,
-        quietest: Float[Tensor, "B 2"],
-        P: Float[Tensor, "B n n"],
+        self, epoch: Epoch, quietest: Float[Tensor, "B 2"], believed: Believed
     ) -> tuple[Measurement, Float[Tensor, "B 2"]]:
         """NHC (2 rows), zero velocity (3), zero angular rate (3); and the quietest second of standing so far."""
         t = self.tuning
-        resting, quietest = self._at_rest(epoch, quietest, P)
-        zn, Hn, moving = self._across(epoch, structure)
+        resting, quietest = self._at_rest(epoch, quietest, believed.P)
+        zn, Hn, moving = self._across(epoch, believed.structure)
         zr, Hr = self._standing(epoch)
         std = zn.new_tensor([t.lateral_std, t.vertical_std] + [t.rest_velocity_std] * 3 + [t.rest_rate_std] * 3)
         resting = resting.unsqueeze(-1)
@@ -133,15 +125,3 @@ class Constraints:
     @property
     def _limits(self) -> tuple[float, float]:
         return self.tuning.rest_accel, self.tuning.rest_gyro
-
-
-def forward_speed(epoch: Epoch, speed: Float[Tensor, "B 2"], states: ErrorStates) -> Measurement:
-    """A forward speed of the IMU and its standard deviation [m/s] as one row: v_x = (C_bn v_n)_x."""
-    state = epoch.window.end
-    forward = state.C_nb[:, :, :1].mT
-    H = torch.zeros(len(speed), 1, states.count, dtype=speed.dtype, device=speed.device)
-    H[:, :, VELOCITY] = forward
-    H[:, :, ATTITUDE] = forward @ skew(state.v_n)
-    used = speed[:, 1:] < ABSENT
-    z = (speed[:, :1] - (forward @ state.v_n.unsqueeze(-1)).squeeze(-1)) * used
-    return Measurement(z, H, speed[:, 1:].square(), used)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import lru_cache
-from typing import NamedTuple, Protocol, TypeGuard, runtime_checkable
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple, Protocol, TypeGuard, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -13,11 +13,11 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.filters.adaptive import Adaptation, AdaptiveNoise
-from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD, Constraints, Measurement, forward_speed
-from dlkf.filters.gating import Gate, GateMemory
+from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
+from dlkf.filters.sources import Believed, FixMemory, GnssFix, Measurement, Source
 from dlkf.filters.tuning import Tuning
-from dlkf.navigation.error_model import PLAIN, WindowModel, masked, measurement_matrix, source_scale, window_model
+from dlkf.navigation.error_model import PLAIN, WindowModel, masked, source_scale, window_model
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.state import PVA, STATES, ErrorStates
 
@@ -49,10 +49,9 @@ class Memory(NamedTuple):
 
     P: Tensor  # (B, n, n)
     windows: WindowModel
-    fix_scale: Tensor  # (2, 6) factor and floor of the fixes' stds
+    fix: FixMemory
+    sources: tuple[Any, ...] = ()  # one of each
     structure: Tensor | None = None  # (B, 4) of the car
-    quietest: Tensor | None = None  # (B, 2) spread of the samples
-    gate: GateMemory | None = None
     noise: AdaptiveNoise | None = None
 
 
@@ -76,8 +75,8 @@ class Mbkf:
     ``states`` gives 15 (the paper's), 21 or 33 of them. ``prior_mean`` and ``prior_std`` [m/s², rad/s] replace
     zero and the preset's spread as the bias's initial knowledge: with a training set's mean error this is
     ``mbkf15_prior`` (paper.md 4.6). ``gauss_markov`` lets the biases decay with the preset's correlation time
-    instead of walking. ``constrained`` adds what a car cannot do, ``gated`` refuses outliers, ``adaptive``
-    adapts Q and R.
+    instead of walking. ``gated`` refuses outliers among the fixes, ``sources`` gives further measurements, ``noise``
+    adapts Q and R to the innovations.
     """
 
     imu: ImuSpec
@@ -86,22 +85,25 @@ class Mbkf:
     prior_mean: tuple[float, ...] = (0.0,) * 6
     prior_std: tuple[float, ...] | None = None
     gauss_markov: bool = False
-    constrained: bool = False
     gated: bool = False
-    adaptive: bool = False
-    cut_transition: bool = False  # no gradient through Φ, which makes training several times faster
+    sources: tuple[Source, ...] = ()
+    noise: Adaptation | None = None
+    cut_transition: bool = False  # no gradient through Φ, which makes training faster
+
+    @cached_property
+    def fix(self) -> GnssFix:
+        """Where GNSS comes in."""
+        return GnssFix(self.tuning, self.states.count, self.gated)
 
     def begin(self, batch: Batch) -> tuple[Memory, Tensor]:
         """P₀ from the start's law and the preset; biases at their prior mean."""
         like = {"dtype": batch.imu.dtype, "device": batch.imu.device}
         B, _, M = batch.size
         sigma = torch.cat((batch.start_std, self._imu_sigma().to(**like).expand(B, -1)), -1)
-        structure = quietest = None
+        structure = None
         if self.states.structure:
             known = torch.tensor(STRUCTURE_STD, **like).expand(B, 4)
             sigma, structure = torch.cat((sigma, known), -1), torch.zeros_like(known)
-        if self.constrained:
-            quietest = batch.imu.new_full((B, 2), math.inf)
         decay = (0.0, 0.0)
         if self.gauss_markov:
             decay = (1 / self.imu.accel.correlation_time, 1 / self.imu.gyro.correlation_time)
@@ -109,10 +111,8 @@ class Mbkf:
             batch.frame, batch.dt, M, self.psd(), states=self.states, decay=decay,
             walk=torch.tensor(STRUCTURE_WALK_STD) ** 2,
         )  # fmt: skip
-        gate = Gate(self.tuning.gate).begin(batch.imu) if self.gated else None
-        t = self.tuning
-        scale = [t.position_std] * 3 + [t.velocity_std] * 3, [t.position_floor] * 3 + [t.velocity_floor] * 3
-        memory = Memory(torch.diag_embed(sigma**2), windows, torch.tensor(scale, **like), structure, quietest, gate)
+        sources = tuple(source.begin(batch) for source in self.sources)
+        memory = Memory(torch.diag_embed(sigma**2), windows, self.fix.begin(batch), sources, structure)
         return memory, torch.tensor(self.prior_mean, **like).repeat(B, 1)
 
     def psd(self) -> dict[str, float]:
@@ -133,28 +133,19 @@ class Mbkf:
         if memory.noise is not None:
             Q = torch.where(memory.noise.settled[:, None, None], memory.noise.Q, Q)
         predicted = torch.baddbmm(Q, torch.bmm(Phi, memory.P), Phi.mT)
-        fix = self._fix(epoch, memory)
-        H, R = masked(fix.H, fix.R, fix.used)
-        offered, gate, accepted, P = (H, R), memory.gate, None, predicted
-        if self.gated:
-            S = H @ predicted @ H.mT + torch.diag_embed(R)
-            gate, verdict = Gate(self.tuning.gate).judge(memory.gate, epoch, S, fix.R)
-            P, accepted = verdict.opened(predicted), verdict.used
-            fix = fix._replace(used=verdict.passed)
-            H, R = masked(fix.H, fix.R, fix.used)
-        z, quietest = fix.z * fix.used, memory.quietest
-        informative = bool(fix.used.any())
-        if self.constrained:
-            rules, quietest = Constraints(self.tuning, self.states).rows(epoch, memory.structure, quietest, P)
-            Hc, Rc = masked(rules.H, rules.R, rules.used)
-            H, R, z = torch.cat((H, Hc), 1), torch.cat((R, Rc), -1), torch.cat((z, rules.z), -1)
-            informative = informative or bool(rules.used.any())
-        if epoch.advice is not None and epoch.advice.speed is not None:
-            told = forward_speed(epoch, epoch.advice.speed, self.states)
-            if bool(told.used.any()):
-                Hs, Rs = masked(told.H, told.R, told.used)
-                H, R, z = torch.cat((H, Hs), 1), torch.cat((R, Rs), -1), torch.cat((z, told.z), -1)
-                informative = True
+        believed = Believed(predicted, memory.structure, memory.noise)
+        fix, fix_memory = self.fix.rows(epoch, memory.fix, believed)
+        believed = believed._replace(P=fix.P)
+        parts, sources = [fix.rows], []
+        for source, of_source in zip(self.sources, memory.sources, strict=True):
+            told, of_source = source.rows(epoch, of_source, believed)
+            sources.append(of_source)
+            if told is not None:
+                H, R = masked(told.H, told.R, told.used)
+                parts.append(Measurement(told.z * told.used, H, R, told.used))
+        z, H, R = ((x[0] if len(x) == 1 else torch.cat(x, 1)) for x in ([m[k] for m in parts] for k in range(3)))
+        informative = any(bool(m.used.any()) for m in parts)
+        P = fix.P
         prior = P
         if informative:
             K, P = kalman_update(P, H, R)
@@ -163,17 +154,16 @@ class Mbkf:
             dx, K = P.new_zeros(P.shape[:2]), P.new_zeros(*P.shape[:2], H.shape[1])
         P = torch.lerp(P, P.mT, 0.5)
         noise = memory.noise
-        if self.adaptive:
-            rule = Adaptation(self.tuning.forgetting)
-            noise = rule.learned(noise, epoch, fix.used, H[:, :6], fix.R, P, dx, Q)
+        if self.noise is not None:
+            noise = self.noise.learned(noise, epoch, fix.rows.used, H[:, :6], fix.variance, P, dx, Q)
         structure = memory.structure
         if structure is not None:
             structure = structure + dx[:, self.states.of_structure]
         std = P.diagonal(dim1=-2, dim2=-1)[:, :STATES].clamp_min(0).sqrt()
-        memory = Memory(P, memory.windows, memory.fix_scale, structure, quietest, gate, noise)
+        memory = Memory(P, memory.windows, fix_memory, tuple(sources), structure, noise)
         return memory, Correction(
-            dx[:, PVA], epoch.error.updated(dx, self.states), std=std, gain=K[:, PVA, :6], accepted=accepted,
-            covariances=Covariances(Phi, prior, P, *offered, dx),
+            dx[:, PVA], epoch.error.updated(dx, self.states), std=std, gain=K[:, PVA, :6], accepted=fix.accepted,
+            covariances=Covariances(Phi, prior, P, *fix.offered, dx),
         )  # fmt: skip
 
     def _transition(self, memory: Memory, epoch: Epoch) -> Float[Tensor, "B n n"]:
@@ -192,21 +182,6 @@ class Mbkf:
             for i, j in self.states.elements
         ]
         return torch.cat((bias, torch.tensor(of_matrix, dtype=torch.float64)))
-
-    def _fix(self, epoch: Epoch, memory: Memory) -> Measurement:
-        """GNSS position and velocity as rows of an update."""
-        H = measurement_matrix(epoch.at_fix, epoch.rate_b, epoch.lever_arm_b, epoch.frame, self.states.count)
-        if epoch.fix.lag is not None:  # δp at the fix = δp at the window's end − lag · δv
-            H = H.clone()
-            H[:, 0, 3] = H[:, 1, 4] = H[:, 2, 5] = -epoch.fix.lag
-        scale, floor = memory.fix_scale
-        R = torch.maximum(scale * epoch.fix.std, floor).square()
-        if memory.noise is not None:
-            R = torch.where(memory.noise.settled.unsqueeze(-1), memory.noise.R, R)
-        factors = None if epoch.advice is None else epoch.advice.fix_std
-        if factors is not None:
-            R = R * factors.square()
-        return Measurement(epoch.z, H, R, epoch.used)
 
 
 @runtime_checkable

@@ -10,7 +10,7 @@ there. With weights of zero it is ``base`` to the bit.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
 from dlkf.filters.advice import ABSENT, Advice
+from dlkf.filters.advised_speed import AdvisedSpeed
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Correction, Epoch
 from dlkf.filters.model_based import Mbkf
@@ -115,7 +116,8 @@ class PlusFilter(nn.Module):
         kalman = build_filter(config.base, imu_spec(config.imu), tuning=config.tuning)
         if not isinstance(kalman, Mbkf):
             raise InputError(f"model.base={config.base} is no Kalman filter that plus can stand on; take mbkf21_car")
-        self.kalman = Mbkf(**{**kalman.__dict__, "cut_transition": True})
+        speed = (AdvisedSpeed(kalman.states),) if "speed" in config.parts else ()
+        self.kalman = replace(kalman, sources=(*kalman.sources, *speed), cut_transition=True)
         count = self.kalman.states.count
         now = 3 + 3 + 3 + 2
         features = WINDOW_FEATURES + count + (count - 9) + 2 + 4 + 6 + 4 + 3 + 5 + now

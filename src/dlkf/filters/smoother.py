@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
-from dlkf.filters.integration import Correction, Epoch, Estimator, Solution, integrate
+from dlkf.filters.integration import Estimator, Solution, integrate
 from dlkf.filters.model_based import has_covariance
 from dlkf.navigation.state import IMU, PVA, STATES, NavState
 
@@ -28,20 +28,12 @@ ROUNDING = 1e-13  # added to unit variances
 
 @dataclass(frozen=True)
 class Smoothed:
-    """A filter whose solution is to be smoothed; as an estimator it is the filter itself."""
+    """A filter whose solution is to be smoothed: no estimator, since what it says of an epoch needs those after it."""
 
     filter: Estimator
 
-    def begin(self, batch: Batch) -> tuple[Any, Tensor]:
-        """The filter's start."""
-        return self.filter.begin(batch)
 
-    def step(self, memory: Any, epoch: Epoch) -> tuple[Any, Correction]:
-        """The filter's step."""
-        return self.filter.step(memory, epoch)
-
-
-def smoothed(estimator: Estimator, smoother: str) -> Smoothed:
+def smoothed(estimator: Estimator | Smoothed, smoother: str) -> Smoothed:
     """A filter to be smoothed by name (``rts``); InputError for another name or a filter without a covariance."""
     if smoother != "rts":
         raise InputError(f"unknown smoother {smoother!r}; known: rts")

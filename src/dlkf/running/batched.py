@@ -46,7 +46,7 @@ def chunks(batch: Batch, samples: int = CHUNK_SAMPLES) -> Iterator[Tensor]:
         start += size
 
 
-def run_filter(batch: Batch, estimator: Estimator) -> Solution:
+def run_filter(batch: Batch, estimator: Estimator | Smoothed) -> Solution:
     """The filter loop, smoothed where asked for, without gradients, on the device of the estimator's parameters."""
     parameter = next(estimator.parameters(), None) if isinstance(estimator, torch.nn.Module) else None
     if parameter is not None:

@@ -87,13 +87,19 @@ def _(memory: None, change: FrameChange, fresh: None) -> None:
 
 @reanchored.register
 def _(memory: model_based.Memory, change: FrameChange, fresh: model_based.Memory) -> model_based.Memory:
-    gate, noise = memory.gate, memory.noise
+    gate, noise = memory.fix.gate, memory.noise
     if gate is not None:  # NaN: equal to no other fix, so a frozen receiver shows one fix later
         gate = gate._replace(innovation=change.vectors(gate.innovation), fix=torch.full_like(gate.fix, torch.nan))
     if noise is not None:
         Q = None if noise.Q is None else change.covariance(noise.Q)
         noise = noise._replace(Q=Q, R=change.variances(noise.R))
-    return memory._replace(P=change.covariance(memory.P), windows=fresh.windows, gate=gate, noise=noise)
+    sources = tuple(
+        reanchored(old, change, new) if can_reanchor(old) else old for old, new in zip(memory.sources, fresh.sources)
+    )
+    return memory._replace(
+        P=change.covariance(memory.P), windows=fresh.windows, fix=memory.fix._replace(gate=gate), sources=sources,
+        noise=noise,
+    )  # fmt: skip
 
 
 @reanchored.register

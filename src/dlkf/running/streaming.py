@@ -41,6 +41,7 @@ from dlkf.data.segments import REST, whole_drives
 from dlkf.data.validate import LIMITS, Limits
 from dlkf.errors import InputError
 from dlkf.filters.integration import Estimator, Fix, advance
+from dlkf.filters.smoother import Smoothed
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import NavState
@@ -124,6 +125,8 @@ class StreamingFilter:
             raise InputError(f"history_s is {history_s!r}, must be a finite number ≥ 0")
         if align.search_s > 0 or align.from_rest:
             raise InputError("align.search_s and align.from_rest look ahead, which a stream cannot; leave them out")
+        if isinstance(estimator, Smoothed):
+            raise InputError("a smoothed filter looks ahead, which a stream cannot; take it without _rts")
         self.estimator, self._align = estimator, align
         self._rate_hz, self._epoch_s, self._anchor_m = rate_hz, epoch_s, anchor_m
         self._phase_s, self._history_s = phase_s, history_s

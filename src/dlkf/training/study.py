@@ -24,7 +24,7 @@ from dlkf.evaluation.report import write_report
 from dlkf.evaluation.results import BASELINE, Results
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.study import study
-from dlkf.filters.build import build_filter
+from dlkf.filters.build import build_filter, refuse_smoothed
 from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import load_filter
 from dlkf.filters.tuning import Tuning
@@ -59,6 +59,8 @@ def run_study(
     config: Mapping[str, Any], data: DriveDataModule, folder: Path, logger: Logger | bool, say: Say
 ) -> Outcome:
     """Tune, train, score and write the report into ``folder/report``."""
+    for name in config["baselines"]["models"]:
+        refuse_smoothed(name, "the filters of this table do not")
     spec, seconds = imu_spec(config["imu"]), {}
     if config["trainer"]["threads"]:
         torch.set_num_threads(config["trainer"]["threads"])

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 
 from dlkf.data.drive import Batch
-from dlkf.filters.build import build_filter
+from dlkf.filters.build import build_causal
 from dlkf.filters.integration import Estimator, integrate
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec
@@ -48,7 +48,7 @@ class Trial(NamedTuple):
 def factors_of(name: str) -> dict[str, tuple[float, ...]]:
     """The factors of a filter that a search tries, and their values."""
     found = dict(FACTORS)
-    for part in name.split("_"):
+    for part in name.partition("+")[0].split("_"):
         found |= MORE_FACTORS.get(part, {})
     return found
 
@@ -94,7 +94,7 @@ def tuned(
     """
 
     def judged(trial: Tuning) -> float:
-        return outage_error(build_filter(name, imu, tuning=trial), batches, objective)
+        return outage_error(build_causal(name, imu, "tuning does not", tuning=trial), batches, objective)
 
     best = start or Tuning()
     score = judged(best)
@@ -128,7 +128,8 @@ def mean_imu_error(
     for batch in batches:
         seen = replace(batch, available=torch.ones_like(batch.available))
         with torch.inference_mode():
-            last.append(integrate(seen, build_filter("mbkf15", imu, tuning=tuning)).imu_error[:, -1])
+            filtered = integrate(seen, build_causal("mbkf15", imu, "a prior does not", tuning=tuning))
+        last.append(filtered.imu_error[:, -1])
     estimates = torch.cat(last)
     floor = torch.tensor([1e-3] * 3 + [1e-5] * 3, dtype=estimates.dtype)
     mean, spread = estimates.mean(0), torch.maximum(estimates.std(0), floor)

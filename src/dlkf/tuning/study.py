@@ -55,6 +55,8 @@ def check(model: str, objective: str) -> None:
     """Raises InputError for a name that is no Kalman filter to be tuned, or an unknown objective."""
     if not is_filter(model) or model == "ins":
         raise InputError(f"model={model} has no noise to tune; give the name of a Kalman filter, such as mbkf21")
+    if "rts" in model.split("_"):
+        raise InputError(f"model={model} is smoothed, its noise is that of the filter; tune it without _rts")
     if "prior" in model.split("_"):
         raise InputError(f"model={model}: the factors of a filter do not depend on its prior; tune it without _prior")
     if objective not in OBJECTIVES:

@@ -1,0 +1,88 @@
+"""A source of measurements of one's own, from the docstring of dlkf.filters.sources to the letter."""
+
+import re
+import sys
+from textwrap import dedent
+
+import pytest
+import torch
+
+from dlkf.errors import InputError
+from dlkf.filters import sources
+from dlkf.filters.build import build_filter, is_filter, refuse_smoothed
+from dlkf.filters.gating import Gate
+from dlkf.filters.integration import integrate
+from dlkf.filters.smoother import Smoothed
+
+from .scene import IMU, scene
+
+IMPORTS = """
+from dataclasses import dataclass
+import torch
+from dlkf.data.drive import Batch
+from dlkf.filters.integration import Epoch
+from dlkf.filters.sources import Believed, Measurement
+from dlkf.filters.tuning import Tuning
+from dlkf.navigation.imu_errors import ImuSpec
+from dlkf.navigation.state import ErrorStates
+"""
+
+
+@pytest.fixture
+def on_path(tmp_path, monkeypatch):
+    example = sources.__doc__.split("::\n", 1)[1].split("\nand every command", 1)[0]
+    (tmp_path / "speed_limit.py").write_text(IMPORTS + dedent(example).replace("36.0", "10.0"))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield
+    sys.modules.pop("speed_limit", None)
+
+
+def test_a_source_of_one_s_own_is_heard(on_path):
+    """Cars of 12 m/s told that 10 is the limit: slower in the outage, the same filter otherwise."""
+    name = "mbkf21_nhc+speed_limit:SpeedLimit"
+    batch = scene(3, 30)
+    batch.available[:, 15:] = False
+    assert is_filter(name)
+    with torch.no_grad():
+        told, plain = (integrate(batch, build_filter(n, IMU)) for n in (name, "mbkf21_nhc"))
+    over = [(s.posterior.v_n[:, 15:, :2].norm(dim=-1) - 10.0).clamp_min(0).sum() for s in (told, plain)]
+    assert over[0] < 0.9 * over[1]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("mbkf21+nowhere:Source", "No module named 'nowhere'"),
+        ("mbkf21+math:sources", "no attribute 'sources'"),
+        ("mbkf21+math:sqrt", "no begin and rows"),
+        ("mbkf21+math", "unknown model"),
+    ],
+)
+def test_what_is_no_source_is_told(name, words):
+    with pytest.raises(InputError, match=re.escape(words)):
+        build_filter(name, IMU)
+
+
+def test_a_smoothed_filter_is_no_estimator():
+    built = build_filter("mbkf21_rts", IMU)
+    assert isinstance(built, Smoothed) and not hasattr(built, "step")
+    with pytest.raises(InputError, match="take mbkf21_nhc"):
+        refuse_smoothed("mbkf21_nhc_rts", "a stream cannot")
+
+
+def test_the_gate_s_limits_are_computed_once(monkeypatch):
+    calls = []
+    monkeypatch.setattr("dlkf.filters.gating.chi2.ppf", lambda p, n: calls.append(p) or [1e9] * len(n))
+    with torch.no_grad():
+        integrate(scene(2, 5), build_filter("mbkf15_gated", IMU))
+    assert len(calls) == 1 and isinstance(build_filter("mbkf15_gated", IMU).fix.gate, Gate)
+
+
+def test_what_needs_a_causal_filter_refuses_a_smoothed_one_in_one_line():
+    from dlkf.running.streaming import StreamingFilter
+    from dlkf.tuning.study import check
+
+    with pytest.raises(InputError, match="which a stream cannot"):
+        StreamingFilter(build_filter("mbkf21_rts", IMU))
+    with pytest.raises(InputError, match="tune it without _rts"):
+        check("mbkf21_rts", "log")
