@@ -1,0 +1,158 @@
+"""The offset between the clocks of an IMU and of GNSS, whatever it is: yaw rate and horizontal force against GNSS.
+
+The yaw rate about the vertical against the change of course, and the horizontal force as a complex number (whose
+argument in the sensor's axes is not known) against the acceleration along and across the course, are correlated over
+all lags at which the logs overlap, by FFT. Neither needs to know units or pose. Then Λ = −n/2 ln(1 − ρ²) of the one
+plus −n ln(1 − |ρ|²) of the other is the gain in log-likelihood over no connection at all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft
+
+from dlkf.data.discovery.motion import MOVING, RESTING, Complex, Floats, Motion
+
+STEP_S = 0.25
+LEAST_S = 20.0  # of common time in intervals with a known course
+NEIGHBOUR_S = 3.0  # lags this close belong to one peak
+
+
+@dataclass(frozen=True)
+class Lag:
+    """``lag_s`` is added to GNSS stamps to give those of the IMU; ``gain`` its Λ, ``rival`` the next best peak's."""
+
+    lag_s: float
+    gain: float
+    rival: float
+    rival_s: float
+    yaw: float  # correlation of the yaw rate with the course at the lag
+    force: float  # of the horizontal force with the acceleration
+    overlap_s: float
+
+    @property
+    def clear(self) -> bool:
+        """No other lag explains nearly as much."""
+        strong = self.gain > 25.0 and (self.yaw > 0.5 or self.force > 0.5)
+        return strong and self.rival < 0.6 * self.gain and self.gain - self.rival > 15.0
+
+    def at_zero(self) -> bool:
+        """Whether the clocks agree already, as far as a search in quarters of seconds tells."""
+        return abs(self.lag_s) < 1.0
+
+
+def find_lag(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, within_s: float | None = None) -> Lag | None:
+    """The lag of the best agreement, at most ``within_s`` from zero; None where the drive is too short or too even.
+
+    ``accel`` and ``gyro`` (n, 3) in any units and axes; the vertical is the mean of ``accel``.
+    """
+    first, last = gnss.intervals()
+    if len(first) < 5 or len(t) < 10:
+        return None
+    known, rate, pull = _gnss_signals(gnss, first, last)
+    if known.sum() < 5:
+        return None
+    usual = float(np.median(gnss.t[last] - gnss.t[first]))
+    yaw, force, there, start = _imu_signals(t, accel, gyro, usual)
+    middle = 0.5 * (gnss.t[first] + gnss.t[last])[known]
+    cell = np.round((middle - middle[0]) / STEP_S).astype(int)
+    n = int(cell[-1]) + 1
+    weight, r, a = np.zeros(n), np.zeros(n), np.zeros(n, complex)
+    weight[cell], r[cell], a[cell] = 1.0, rate[known], pull[known]
+    gain, yaws, forces, count = _scores(weight, r, a, there, yaw, force)
+    lags = (np.arange(len(gain)) - (n - 1)) * STEP_S + start - middle[0]
+    allowed = count * usual >= LEAST_S
+    if within_s is not None:
+        allowed &= np.abs(lags) <= within_s
+    if not allowed.any():
+        return None
+    gain = np.where(allowed, gain, -np.inf)
+    best = int(gain.argmax())
+    others = np.where(np.abs(lags - lags[best]) > NEIGHBOUR_S, gain, -np.inf)
+    rival = int(others.argmax())
+    other = float(others[rival]) if np.isfinite(others[rival]) else 0.0
+    numbers = (lags[best], gain[best], other, lags[rival], yaws[best], forces[best], count[best] * usual)
+    return Lag(*(float(x) for x in numbers))
+
+
+def gain_at(lag: Lag | None, zero: Lag | None) -> float:
+    """By how much of its gain a lag is better than another."""
+    if lag is None or zero is None or lag.gain <= 0:
+        return 0.0
+    return 1 - max(zero.gain, 0.0) / lag.gain
+
+
+def _gnss_signals(gnss: Motion, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, Floats, Complex]:
+    """Which intervals count, their rate of turn [rad/s], and acceleration forward + i right [m/s²]."""
+    span = gnss.t[last] - gnss.t[first]
+    slow = np.minimum(gnss.speed[first], gnss.speed[last])
+    moving, resting = slow > MOVING, np.maximum(gnss.speed[first], gnss.speed[last]) < RESTING
+    turned = np.angle(np.exp(1j * (gnss.course[last] - gnss.course[first])))
+    rate = np.where(moving, turned / span, 0.0)
+    mean = gnss.v[first] + gnss.v[last]
+    along = np.where(np.abs(mean) > 0.5, mean / np.maximum(np.abs(mean), 1e-9), 1.0)
+    pull = (gnss.v[last] - gnss.v[first]) / span * np.conj(along) + 9.81 * 0.5 * (gnss.climb[first] + gnss.climb[last])
+    return moving | resting, rate, np.where(moving, pull, 0.0)
+
+
+def _imu_signals(t: Floats, accel: Floats, gyro: Floats, width_s: float) -> tuple[Floats, Complex, Floats, float]:
+    """Yaw rate and horizontal force as means over ``width_s`` on a grid, where there are any, and the grid's start."""
+    up = accel.mean(0)
+    up = up / max(float(np.linalg.norm(up)), 1e-12)
+    helper = np.eye(3)[int(np.abs(up).argmin())]
+    e1 = helper - up * (helper @ up)
+    e1 /= np.linalg.norm(e1)
+    e2 = np.cross(-up, e1)
+    f = accel @ e1 + 1j * (accel @ e2)
+    w = gyro @ -up
+    step = np.diff(t, prepend=t[0])
+    step = np.where(step > 1.0, 0.0, step)
+    covered, angle, gained = np.cumsum(step), np.cumsum(w * step), np.cumsum(f * step)
+    grid = np.arange(t[0] + width_s / 2, t[-1] - width_s / 2, STEP_S)
+    if len(grid) < 2:
+        grid = np.array([t[0], t[0] + STEP_S])
+
+    def mean(total: np.ndarray) -> np.ndarray:
+        return np.interp(grid + width_s / 2, t, total) - np.interp(grid - width_s / 2, t, total)
+
+    there = (mean(covered) > 0.9 * width_s).astype(float)
+    force = (mean(gained.real) + 1j * mean(gained.imag)) / width_s
+    return mean(angle) / width_s, force, there, float(grid[0])
+
+
+def _scores(
+    weight: Floats, r: Floats, a: Complex, there: Floats, yaw: Floats, force: Complex
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Λ, both correlations and the number of intervals of every lag; index 0 has the last fix on the first sample."""
+    size = fft.next_fast_len(len(weight) + len(there) - 1)
+
+    def turned(x: np.ndarray) -> np.ndarray:
+        return fft.fft(x, size)
+
+    def against(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        out = fft.ifft(np.conj(left) * right)
+        return np.concatenate((out[size - len(weight) + 1 :], out[: len(there)]))
+
+    scale = max(float(np.std(yaw[there > 0])) if (there > 0).any() else 0.0, 1e-12)
+    pull = max(float(np.std(force[there > 0])) if (there > 0).any() else 0.0, 1e-12)
+    g, f = yaw / scale * there, force / pull * there
+    W, M = turned(weight), turned(there)
+    n = np.maximum(against(W, M).real, 1e-9)
+    count = np.round(n)
+    n = np.maximum(n, 1.0)
+
+    def correlation(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+        A, B = turned(ours), turned(theirs)
+        mean_a, mean_b = np.conj(against(A, M)) / n, against(W, B) / n
+        covariance = against(A, B) / n - np.conj(mean_a) * mean_b
+        power_a = against(turned(np.abs(ours) ** 2), M).real / n - np.abs(mean_a) ** 2
+        power_b = against(W, turned(np.abs(theirs) ** 2)).real / n - np.abs(mean_b) ** 2
+        least_a = 1e-3 * float(np.sum(np.abs(ours) ** 2)) / max(float(weight.sum()), 1.0)
+        return covariance / np.sqrt(np.maximum(power_a, least_a) * np.maximum(power_b, 1e-4))
+
+    yaws = np.clip(correlation(r * weight, g).real, -0.9999, 0.9999)
+    forces = np.clip(np.abs(correlation(a * weight, f)), 0.0, 0.9999)
+    gain = -0.5 * n * np.log1p(-np.maximum(yaws, 0.0) ** 2) - n * np.log1p(-(forces**2))
+    return np.where(count > 3, gain, 0.0), yaws, forces, count

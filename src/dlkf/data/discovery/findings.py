@@ -1,0 +1,210 @@
+"""What a drive tells of its own log: units, pose, clock offset, delays, lever arm, each with how sure it is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dlkf.data.discovery.clock import Lag, find_lag
+from dlkf.data.discovery.motion import MOVING, Floats, Motion, motion, position_delay
+from dlkf.data.discovery.orientation import Pose, find_pose
+from dlkf.data.discovery.units import G, accel_unit, nearest_unit
+
+LEAST_EXPLAINED, AGREE = 0.8, (0.8, 1.25)
+FARTHEST_DOWN = math.radians(6.0)
+KNOWN_OFFSETS = {18.0: "leap seconds of GPS against UTC", 37.0: "TAI against UTC", 19.0: "TAI against GPS"}
+
+
+@dataclass(frozen=True)
+class Sure:
+    """What is sure enough: 2.5σ of the pose [deg] and of the clock offset [s] lie below."""
+
+    angle_deg: float = 2.0
+    time_s: float = 0.02
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A ``setting`` of the reader with its value; ``told`` are the numbers behind it."""
+
+    setting: str
+    value: Any
+    sure: bool
+    told: str
+
+
+@dataclass
+class Findings:
+    """All findings of a drive."""
+
+    found: list[Finding] = field(default_factory=list)
+    pose: Pose | None = None
+    lag: Lag | None = None
+
+    def add(self, setting: str, value: Any, sure: bool, told: str) -> None:
+        """One more."""
+        self.found.append(Finding(setting, value, sure, told))
+
+    def get(self, setting: str) -> Any:
+        """The value of a setting, None if it was not looked for or not found."""
+        return next((f.value for f in self.found if f.setting == setting), None)
+
+    def doubtful(self) -> Finding | None:
+        """The first that is not sure."""
+        return next((f for f in self.found if not f.sure), None)
+
+
+@dataclass(frozen=True)
+class Raw:
+    """A drive in its sensor's axes: accelerations and rates times ``accel_factor`` and ``gyro_factor`` are SI.
+
+    A factor is None where the unit is not known. Times of both tables [s]; positions [deg], velocities NED [m/s].
+    """
+
+    t: Floats
+    accel: Floats
+    gyro: Floats
+    accel_factor: float | None
+    gyro_factor: float | None
+    gnss_t: Floats
+    lat_deg: Floats
+    lon_deg: Floats
+    v_ned: Floats
+
+
+def discover(
+    raw: Raw,
+    wanted: set[str],
+    sure: Sure = Sure(),  # noqa: B008
+    *,
+    accel_units: Mapping[str, float],
+    gyro_units: Mapping[str, float],
+    increments: bool = False,
+) -> Findings:
+    """Find the settings in ``wanted`` (as ``imu.accel.unit``, ``imu.axes``, ``time.offset_s``, ``lever_arm_m``, …)."""
+    out = Findings()
+    size = float(np.median(np.linalg.norm(raw.accel, axis=-1)))
+    factor = raw.accel_factor
+    if factor is None:
+        unit = accel_unit(size, accel_units)
+        factor = accel_units[unit] if unit else G / size
+        out.add("imu.accel.unit", unit or round(factor, 9), size > 0 and (unit is not None or increments),
+                f"median force {size:.4g}" + ("" if unit else ": no known unit, taken for gravity"))  # fmt: skip
+    gnss = motion(raw.gnss_t, raw.lat_deg, raw.lon_deg, raw.v_ned)
+    away = "imu.time.offset_s" in wanted or "gnss.time.offset_s" in wanted
+    lag = find_lag(raw.t, raw.accel, raw.gyro, gnss, None if away else 2.0)
+    if raw.accel_factor is None:  # some devices give the reaction's opposite
+        other = find_lag(raw.t, -raw.accel, raw.gyro, gnss, None if away else 2.0)
+        if other is not None and (lag is None or other.gain > 1.5 * lag.gain) and other.yaw > 0.7:
+            lag, factor = other, -factor
+            out.found[0] = Finding("imu.accel.unit", factor, True, out.found[0].told + ", its sign turned round")
+    out.lag = lag
+    pose = find_pose(raw.t, raw.accel * factor, raw.gyro, gnss, lag.lag_s) if lag is not None else None
+    out.pose = pose
+    _gyro_unit(out, raw, pose, gyro_units, increments)
+    sound = pose is not None and pose.explained > LEAST_EXPLAINED and AGREE[0] < pose.scale < AGREE[1]
+    sound = sound and not (pose is not None and pose.down_apart > FARTHEST_DOWN)
+    if away:
+        _offset(out, lag, pose if sound else None, wanted, sure)
+    if "imu.axes" in wanted:
+        _axes(out, pose, bool(sound) and lag is not None and lag.clear, gnss, sure)
+    if "lever_arm_m" in wanted:
+        _arm(out, pose if sound else None)
+    if "gnss.position.delay_s" in wanted:
+        _delay(out, raw)
+    return out
+
+
+def _gyro_unit(
+    out: Findings, raw: Raw, pose: Pose | None, known: Mapping[str, float], increments: bool
+) -> None:
+    if raw.gyro_factor is not None:
+        return
+    if pose is None:
+        out.add("imu.gyro.unit", None, False, "no turn to compare with the course")
+        return
+    told = f"{pose.gyro_scale:.4g} ± {pose.gyro_scale_std:.1g} rad per unit of {np.degrees(pose.turned):.0f}° of turns"
+    unit = nearest_unit(pose.gyro_scale, pose.gyro_scale_std, known)
+    counted = unit is None and increments and pose.gyro_scale_std < 0.01 * pose.gyro_scale
+    out.add("imu.gyro.unit", unit or float(f"{pose.gyro_scale:.6g}"), unit is not None or counted, told)
+
+
+def _offset(out: Findings, lag: Lag | None, pose: Pose | None, wanted: set[str], sure: Sure) -> None:
+    setting = "gnss.time.offset_s" if "gnss.time.offset_s" in wanted else "imu.time.offset_s"
+    sign = 1.0 if setting.startswith("gnss") else -1.0
+    if lag is None or pose is None:
+        value = None if lag is None else round(sign * lag.lag_s, 1)
+        out.add(setting, value, False, "too little motion in the time that both logs have" if lag is None else _peak(lag))
+        return
+    certain = lag.clear and 2.5 * pose.lag_std <= sure.time_s
+    value = 0.0 if abs(pose.lag_s) < max(3 * pose.lag_std, 0.01) and abs(pose.lag_s) < 0.05 else pose.lag_s
+    told = f"{sign * pose.lag_s:+.3f} ± {pose.lag_std:.3f} s, delay of the velocities included; {_peak(lag)}"
+    out.add(setting, round(sign * value, 4), certain, told + _named(pose.lag_s))
+
+
+def _peak(lag: Lag) -> str:
+    return f"yaw rate {lag.yaw:.2f}, force {lag.force:.2f} alike, next best lag {100 * lag.rival / lag.gain:.0f} % as good"
+
+
+def _named(lag_s: float) -> str:
+    """What an offset is known for."""
+    for weeks in (round(lag_s / 604_800),):
+        if weeks and abs(lag_s - weeks * 604_800) < 40:
+            rest = lag_s - weeks * 604_800
+            return f"; {weeks} GPS weeks" + (f" and {rest:.1f} s" if abs(rest) > 0.5 else "")
+    for known, name in KNOWN_OFFSETS.items():
+        if abs(abs(lag_s) - known) < 0.5:
+            return f"; {name}"
+    hours = lag_s / 3600
+    if abs(hours) > 0.9 and abs(hours - round(hours * 4) / 4) * 3600 < 40:
+        return f"; a time zone of {round(hours * 4) / 4:+g} h"
+    return ""
+
+
+def _axes(out: Findings, pose: Pose | None, sound: bool, gnss: Motion, sure: Sure) -> None:
+    if pose is None:
+        moved = float(np.mean(gnss.speed > MOVING)) if len(gnss.t) else 0.0
+        out.add("imu.axes", None, False, f"too little motion: {100 * moved:.0f} % of {len(gnss.t)} fixes above 2 m/s")
+        return
+    yaw, pitch, roll = Rotation.from_matrix(pose.matrix).as_euler("ZYX", degrees=True)
+    value = {"roll": round(float(roll), 2), "pitch": round(float(pitch), 2), "yaw": round(float(yaw), 2)}
+    limit = math.radians(sure.angle_deg)
+    certain = sound and 2.5 * pose.yaw_std <= limit and 2.5 * pose.tilt_std <= limit
+    told = (
+        f"± {math.degrees(pose.yaw_std):.1f}° about the vertical, ± {math.degrees(pose.tilt_std):.1f}° level; forces "
+        f"{pose.scale:.2f} of GNSS', {100 * pose.explained:.0f} % explained"
+    )
+    if not math.isnan(pose.down_apart):
+        told += f", gravity and turns {math.degrees(pose.down_apart):.1f}° apart"
+    out.add("imu.axes", value, certain, told)
+
+
+def _arm(out: Findings, pose: Pose | None) -> None:
+    """The horizontal lever arm, where it can be seen to 0.3 m (1σ); else zero, said so."""
+    if pose is None or pose.lever_arm_std > 0.3:
+        seen = "not at all" if pose is None else f"only to {pose.lever_arm_std:.1f} m"
+        out.add("lever_arm_m", [0.0, 0.0, 0.0], True, f"can be seen {seen}: zero kept, measure it")
+        return
+    value = [round(pose.lever_arm.real, 2), round(pose.lever_arm.imag, 2), 0.0]
+    out.add("lever_arm_m", value, True, f"± {pose.lever_arm_std:.2f} m; the height cannot be seen, measure it")
+
+
+def _delay(out: Findings, raw: Raw) -> None:
+    late, std = position_delay(raw.gnss_t, raw.lat_deg, raw.lon_deg, raw.v_ned)
+    if math.isnan(late) or std > 0.03 or abs(late) < max(3 * std, 0.02):
+        seen = "cannot be seen" if math.isnan(late) else f"{late:+.3f} ± {std:.3f} s"
+        out.add("gnss.position.delay_s", 0.0, True, f"{seen}: none taken")
+        return
+    out.add("gnss.position.delay_s", round(late, 3), True, f"± {std:.3f} s, against the velocities")
+
+
+def resting_s(gnss: Motion) -> float:
+    """Seconds at rest by GNSS."""
+    first, last = gnss.intervals()
+    still = np.maximum(gnss.speed[first], gnss.speed[last]) < 0.15
+    return float(np.sum((gnss.t[last] - gnss.t[first])[still]))

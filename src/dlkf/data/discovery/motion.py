@@ -1,0 +1,156 @@
+"""What GNSS tells of a car's motion, and an IMU's integrals to compare it with.
+
+Horizontal vectors are complex numbers: North + i East, or forward + i right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+MOVING, RESTING = 2.0, 0.3  # m/s: above, the course is known; below, the car stands
+LONGEST_STEP_S = 2.5  # fixes further apart make no interval
+SHORTEST_STEP_S = 0.45  # faster fixes are thinned: the noise of a difference of velocities grows with its rate
+EARTH_M = 6_371_000.0
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Velocities [m/s] at times ``t`` [s] of the GNSS clock; ``climb`` is the slope of the way, 0 where not known."""
+
+    t: Floats
+    v: Complex
+    climb: Floats
+    from_positions: bool = False
+
+    @property
+    def speed(self) -> Floats:
+        """Horizontal speed [m/s]."""
+        return np.abs(self.v)
+
+    @property
+    def course(self) -> Floats:
+        """Course over ground [rad], clockwise from North."""
+        return np.angle(self.v)
+
+    def intervals(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """First and last rows of the intervals between successive fixes."""
+        first = np.flatnonzero(np.diff(self.t) <= LONGEST_STEP_S)
+        return first, first + 1
+
+
+def motion(t: Floats, lat_deg: Floats, lon_deg: Floats, v_ned: Floats) -> Motion:
+    """From fixes; where they have no velocities, from the differences of their positions."""
+    place = np.isfinite(lat_deg) & np.isfinite(lon_deg)
+    known = np.isfinite(v_ned[:, :2]).all(-1)
+    if known.sum() < 0.2 * len(t):
+        return _from_positions(t[place], lat_deg[place], lon_deg[place])
+    rows = _thinned(t, known)
+    v = v_ned[rows, 0] + 1j * v_ned[rows, 1]
+    speed = np.abs(v)
+    climb = np.where(speed > MOVING, -np.nan_to_num(v_ned[rows, 2]) / np.maximum(speed, 0.1), 0.0)
+    return Motion(t[rows], v, np.clip(climb, -0.3, 0.3))
+
+
+def _thinned(t: Floats, good: NDArray[np.bool_]) -> NDArray[np.int64]:
+    rows = np.flatnonzero(good)
+    if not len(rows):
+        return rows
+    step = float(np.median(np.diff(t[rows]))) if len(rows) > 1 else 1.0
+    return rows[:: max(1, int(np.ceil(SHORTEST_STEP_S / max(step, 1e-3) - 0.01)))]
+
+
+def _from_positions(t: Floats, lat_deg: Floats, lon_deg: Floats) -> Motion:
+    """Velocity between two fixes, at the middle of their interval."""
+    rows = _thinned(t, np.isfinite(t))
+    t, lat, lon = t[rows], np.radians(lat_deg[rows]), np.radians(lon_deg[rows])
+    step = np.diff(t)
+    fine = (step > 0) & (step <= LONGEST_STEP_S)
+    z = EARTH_M * (np.diff(lat) + 1j * np.cos(lat[:-1]) * np.diff(lon))
+    middle = 0.5 * (t[1:] + t[:-1])[fine]
+    return Motion(middle, z[fine] / step[fine], np.zeros(int(fine.sum())), from_positions=True)
+
+
+def position_delay(t: Floats, lat_deg: Floats, lon_deg: Floats, v_ned: Floats) -> tuple[float, float]:
+    """Seconds by which positions are older than the velocities beside them, and 1σ; NaN where it cannot be seen.
+
+    Δp − ∫v dt = −δ Δv: what a turn or a braking car leaves between them.
+    """
+    good = np.isfinite(v_ned[:, :2]).all(-1) & np.isfinite(lat_deg) & np.isfinite(lon_deg)
+    rows = _thinned(t, good)
+    t, v = t[rows], v_ned[rows, 0] + 1j * v_ned[rows, 1]
+    lat, lon = np.radians(lat_deg[rows]), np.radians(lon_deg[rows])
+    step = np.diff(t)
+    fine = (step > 0) & (step < LONGEST_STEP_S)
+    # the mean radius is good to 0.3 %: what it spoils is a share of the way, so it is fitted beside the delay
+    moved = (EARTH_M * (np.diff(lat) + 1j * np.cos(lat[:-1]) * np.diff(lon)))[fine]
+    way, change = ((v[1:] + v[:-1]) / 2 * step)[fine], np.diff(v)[fine]
+    if len(way) < 20 or np.sum(np.abs(change) ** 2) < 20.0:
+        return float("nan"), float("nan")
+    keep = np.ones(len(way), bool)
+    fitted = np.zeros(4)
+    sigma = float("nan")
+    design = np.concatenate(
+        [
+            np.column_stack((-change.real, way.real, 0 * way.real)),
+            np.column_stack((-change.imag, 0 * way.real, way.imag)),
+        ]
+    )
+    left = np.concatenate((moved.real, moved.imag))
+    for _ in range(3):
+        both = np.concatenate((keep, keep))
+        fitted, *_ = np.linalg.lstsq(design[both], left[both], rcond=None)
+        off = left - design @ fitted
+        size = np.hypot(*off.reshape(2, -1))
+        keep = size <= 4 * max(float(np.median(size[keep])), 1e-4)
+        spread = float(np.sqrt(np.mean(off[np.concatenate((keep, keep))] ** 2)))
+        sigma = 2 * spread / float(np.sqrt(np.sum(np.abs(change[keep]) ** 2)))  # 2: neighbours share a fix's noise
+    return float(fitted[0]), sigma
+
+
+@dataclass(frozen=True)
+class Levelled:
+    """An IMU in axes (e1, e2, down) that do not turn with the sensor's pose; all integrals start at ``t[0]``.
+
+    ``turn`` is the angle about down, ``force`` and ``ones`` the integrals of e^{i turn} times the horizontal force
+    and 1, ``swing`` = i ω e^{i turn}, each at the limits of the samples ``t``. ``tilted`` is ``force`` with what the
+    gyroscopes tell of pitch and roll: q = ∫ e^{i turn} (ω₂ − i ω₁) dt is the horizontal part of the sensor's third axis,
+    and f_z q its share of gravity (small angles; q drifts slowly).
+    """
+
+    t: Floats
+    turn: Floats
+    force: Complex
+    ones: Complex
+    swing: Complex
+    tilted: Complex
+    axes: Floats  # (3, 3): rows e1, e2, down in the sensor's axes
+
+
+def levelled(t: Floats, accel: Floats, gyro: Floats, down: Floats) -> Levelled:
+    """Integrate samples that end at ``t`` (n,); ``accel`` [m/s²], ``gyro`` [rad/s] (n, 3), ``down`` a unit vector."""
+    helper = np.eye(3)[int(np.abs(down).argmin())]
+    e1 = helper - down * (helper @ down)
+    e1 /= np.linalg.norm(e1)
+    axes = np.stack((e1, np.cross(down, e1), down))
+    step = np.diff(t, prepend=t[0] - np.median(np.diff(t)))
+    step = np.where(step > 1.0, 0.0, step)  # nothing is known of gaps
+    f, rates = accel @ axes.T, gyro @ axes.T
+    w = rates[:, 2]
+    turn = np.concatenate(([0.0], np.cumsum(w * step)))
+    middle = np.exp(0.5j * (turn[1:] + turn[:-1]))
+    force = np.concatenate(([0.0], np.cumsum(middle * (f[:, 0] + 1j * f[:, 1]) * step)))
+    ones = np.concatenate(([0.0], np.cumsum(middle * step)))
+    pitching = middle * (rates[:, 1] - rates[:, 1].mean() - 1j * (rates[:, 0] - rates[:, 0].mean()))
+    q = np.concatenate(([0.0], np.cumsum(pitching * step)))
+    level = middle * (f[:, 0] + 1j * f[:, 1]) + f[:, 2] * 0.5 * (q[1:] + q[:-1])
+    tilted = np.concatenate(([0.0], np.cumsum(level * step)))
+    limits = np.concatenate((t[:1] - step[0], t))
+    width = max(1, round(0.1 / float(np.median(step))))
+    smooth = np.convolve(np.concatenate((w[:1], w)), np.ones(width) / width, mode="same")
+    return Levelled(limits, turn, force, ones, 1j * smooth * np.exp(1j * turn), tilted, axes)

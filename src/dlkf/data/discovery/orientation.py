@@ -1,0 +1,318 @@
+"""How a sensor sits in a car, and what goes with it: fine clock offset, scale of the gyroscopes, lever arm.
+
+With the sensor levelled by gravity, h(t) the car's heading (integrated yaw rate, held to the course of GNSS) and
+complex horizontal vectors, every interval between two fixes has
+
+    Δv + g ∫ s e^{ih} dt = α ∫ e^{ih} (f + b) dt + λ Δ(i ω e^{ih}),
+
+s the slope of the way, f the horizontal force in the sensor's axes: the argument of α turns these into forward and
+right, |α| is one, b is what levelling by the mean left over, and λ the lever arm from IMU to antenna. This is linear
+in (α, α b, λ); the clock offset is scanned for the least residuals. The course tells of it too, yet it is no heading:
+
+    course = h + ω (l / v + K v),
+
+l from the rear axle to the antenna and K the sideslip (DESIGN: −0.32 m and −0.0075 s²/m on a real car), which looks like
+a delay of l/v + K v, some 0.1 s. So l and K are fitted beside it, and taken out of the course that holds h.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from dlkf.data.discovery.motion import MOVING, Complex, Floats, Levelled, Motion, levelled
+
+G = 9.80665
+SPAN_S, STEP_S = 0.6, 0.04  # of the first scan round the coarse lag; the next ones are in quarters of a step
+BLOCKS = 8  # of the drive, left out one at a time (jackknife)
+SMOOTH_S = 4.0  # over which course minus turn is averaged: sideslip and noise, not the drift of a gyroscope
+FEWEST = 20  # intervals in motion
+SLOW_ROWS = 10.0  # intervals (of about a second), 1σ of the mean that is taken off
+LEVEL_STD = np.radians(0.8)  # of levelling: an accelerometer's bias of 0.1 m/s², the road's crown
+AXIS_STD = np.radians(3.0)  # of the axis of turning, over the root of the turn [rad]: slopes, bumps, rolling in turns
+SLIP_NOISE = 0.1  # m/s, of a change of course times speed: the weight of what is known of l and K
+
+
+@dataclass(frozen=True)
+class Pose:
+    """``matrix`` takes the sensor's axes to Forward-Right-Down; stds by a jackknife over pieces of the drive."""
+
+    matrix: Floats
+    yaw_std: float  # rad
+    tilt_std: float
+    scale: float  # |α|: one, or units do not agree
+    lag_s: float
+    lag_std: float
+    gyro_scale: float  # rad per unit of the gyroscopes
+    gyro_scale_std: float
+    lever_arm: complex  # m, forward + i right
+    lever_arm_std: float
+    explained: float  # share of the variance of Δv
+    turned: float  # rad, sum of what the car turned
+    pulled: float  # m/s, root of the sum of squared Δv
+    down_apart: float  # rad between gravity and the axis about which the car turns; NaN where it turns too little
+
+
+@dataclass(frozen=True)
+class _Intervals:
+    t0: Floats
+    t1: Floats
+    dv: Complex
+    slope: Complex
+    turned: Floats  # change of course
+    weight: Floats  # of the change of course
+    v0: Floats
+    v1: Floats
+    moving: np.ndarray
+    block: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Fit:
+    lag_s: float
+    alpha: complex
+    bias: complex  # of the horizontal force, in the levelled sensor's axes
+    arm: complex
+    scale: float
+    rest: float
+    total: float
+    arm_std: float
+    slip: tuple[float, float]  # l [m], K [s²/m]
+
+
+def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float) -> Pose | None:
+    """Pose of a sensor with ``accel`` in m/s², ``gyro`` in any unit (n, 3), near a clock offset ``lag_s`` [s].
+
+    None where the drive has too little motion to say anything.
+    """
+    parts = _intervals(gnss)
+    if parts.moving.sum() < FEWEST:
+        return None
+    down = -accel.mean(0)
+    down = down / np.linalg.norm(down)
+    unit = _gyro_scale(t, gyro @ down, parts, lag_s)
+    if unit is None:
+        return None
+    lag, fit, level, slip = lag_s, None, None, (0.0, 0.0)
+    for span in (SPAN_S, 0.1, 0.04):
+        level = levelled(t, accel, gyro * unit, down)
+        fit = _scan(level, gnss, parts, lag, span, np.ones(len(parts.t0), bool), slip)
+        if fit is None:
+            return None
+        lag, unit, slip = fit.lag_s, unit * fit.scale, fit.slip
+        tilt = fit.bias.real * level.axes[0] + fit.bias.imag * level.axes[1]
+        down = level.axes[2] + np.clip(tilt / G, -0.2, 0.2)
+        down /= np.linalg.norm(down)
+    assert fit is not None and level is not None
+    axis, turned = _axis(t, gyro, parts, lag)
+    weight = turned / (turned + (AXIS_STD / LEVEL_STD) ** 2) if axis is not None else 0.0
+    apart = float(np.arccos(np.clip(axis @ down, -1, 1))) if axis is not None else float("nan")
+    if axis is not None and apart < np.radians(5.0):
+        down = (1 - weight) * down + weight * axis
+        down /= np.linalg.norm(down)
+    final = _matrix(level, fit, down)
+    leave = []
+    for block in range(BLOCKS):
+        keep = parts.block != block
+        if (keep & parts.moving).sum() >= FEWEST // 2 and (one := _scan(level, gnss, parts, lag, 0.06, keep, slip)):
+            leave.append(one)
+    if len(leave) < BLOCKS // 2:
+        return None
+    yaw_std = _jackknife(np.angle([one.alpha / fit.alpha for one in leave]))
+    tilts = np.array([one.bias for one in leave]) / G
+    tilt_std = float(np.hypot(_jackknife(tilts.real), _jackknife(tilts.imag)))
+    arms = np.array([one.arm for one in leave])
+    arm_std = max(float(np.hypot(_jackknife(arms.real), _jackknife(arms.imag))), fit.arm_std)
+    scale_std = unit * _jackknife(np.array([one.scale for one in leave]))
+    explained = 1 - fit.rest / max(fit.total, 1e-9)
+    floor = LEVEL_STD * np.sqrt(1 - weight)
+    return Pose(
+        final, yaw_std, float(np.hypot((1 - weight) * tilt_std, floor)), abs(fit.alpha), lag, _jackknife(np.array([one.lag_s for one in leave])),
+        float(unit), float(scale_std), fit.arm, arm_std, float(explained),
+        turned, float(np.sqrt(fit.total)), apart,
+    )  # fmt: skip
+
+
+def _intervals(gnss: Motion) -> _Intervals:
+    first, last = gnss.intervals()
+    t0, t1 = gnss.t[first], gnss.t[last]
+    slow = np.minimum(gnss.speed[first], gnss.speed[last])
+    moving = slow > MOVING
+    mean = gnss.v[first] + gnss.v[last]
+    along = mean / np.maximum(np.abs(mean), 1e-9)
+    slope = G * 0.5 * (gnss.climb[first] + gnss.climb[last]) * (t1 - t0) * along
+    turned = np.angle(np.exp(1j * (gnss.course[last] - gnss.course[first])))
+    block = np.minimum((BLOCKS * np.arange(len(t0))) // max(len(t0), 1), BLOCKS - 1)
+    dv = gnss.v[last] - gnss.v[first]
+    return _Intervals(t0, t1, dv, np.where(moving, slope, 0.0), turned, np.minimum(slow, 15.0), gnss.speed[first], gnss.speed[last],
+                      moving, block)  # fmt: skip
+
+
+def _gyro_scale(t: Floats, rate: Floats, parts: _Intervals, lag_s: float) -> float | None:
+    """Radians per unit of the gyroscopes: slope of change of course over integrated rate, at the coarse lag."""
+    angle = np.concatenate(([0.0], np.cumsum(rate[1:] * np.diff(t))))
+    use = parts.moving & (parts.t0 + lag_s >= t[0]) & (parts.t1 + lag_s <= t[-1])
+    if use.sum() < FEWEST // 2:
+        return None
+    turn = np.interp(parts.t1[use] + lag_s, t, angle) - np.interp(parts.t0[use] + lag_s, t, angle)
+    span = (parts.t1 - parts.t0)[use]
+    w = parts.weight[use]
+    design = np.column_stack((turn, span)) * w[:, None]
+    keep = np.ones(len(w), bool)
+    slope = 0.0
+    for _ in range(3):
+        if np.ptp(design[keep, 0]) == 0:
+            return None
+        (slope, bias), *_ = np.linalg.lstsq(design[keep], (parts.turned[use] * w)[keep], rcond=None)
+        off = np.abs(parts.turned[use] * w - design @ [slope, bias])
+        keep = off <= 4 * max(float(np.median(off[keep])), 1e-4)
+    return float(slope) if slope > 0 else None
+
+
+def _scan(
+    level: Levelled, gnss: Motion, parts: _Intervals, lag_s: float, span: float, keep: np.ndarray,
+    slip: tuple[float, float],
+) -> _Fit | None:
+    """The fit of the lag with the least residuals; a parabola through the best three."""
+    step = STEP_S if span > 0.3 else STEP_S / 4
+    lags = lag_s + np.arange(-round(span / step), round(span / step) + 1) * step
+    use = keep & (parts.t0 + lags[0] >= level.t[0]) & (parts.t1 + lags[-1] <= level.t[-1])
+    if (use & parts.moving).sum() < FEWEST // 2:
+        return None
+    good = _sound(level, gnss, parts, lag_s, use, slip)
+    costs = np.array([_fit(level, gnss, parts, lag, use & good, slip)[1] for lag in lags])
+    best = int(costs.argmin())
+    lag = float(lags[best])
+    if 0 < best < len(lags) - 1:
+        a, b, c = costs[best - 1 : best + 2]
+        lag += float(np.clip(0.5 * (a - c) / max(a - 2 * b + c, 1e-12), -1, 1)) * step
+    fit = _fit(level, gnss, parts, lag, use & good, slip)[0]
+    return replace(fit, bias=_bias(level, gnss, parts, lag, use & good, slip))
+
+
+def _bias(
+    level: Levelled, gnss: Motion, parts: _Intervals, lag: float, use: np.ndarray, slip: tuple[float, float]
+) -> complex:
+    """Mean horizontal force that is not the car's: what levelling left over, and the accelerometers' bias."""
+    design, left = _design(level, gnss, parts, lag, slip, level.force, 1.0)
+    x, *_ = np.linalg.lstsq(design[use], left[use], rcond=None)
+    return complex(x[1] / x[0]) if x[0] else 0j
+
+
+def _sound(
+    level: Levelled, gnss: Motion, parts: _Intervals, lag: float, use: np.ndarray, slip: tuple[float, float]
+) -> np.ndarray:
+    """Intervals without outliers of GNSS: residuals at most five medians, of a fit to all."""
+    design, left = _design(level, gnss, parts, lag, slip, level.tilted, 0.0)
+    A, y = _quick(design, use), _quick(left[:, None], use)[:, 0]
+    x, *_ = np.linalg.lstsq(A[use], y[use], rcond=None)
+    off = np.abs(y - A @ x)
+    return off <= 5 * max(float(np.median(off[use])), 1e-3)
+
+
+def _design(
+    level: Levelled, gnss: Motion, parts: _Intervals, lag: float, slip: tuple[float, float], force: Complex, slope: float
+) -> tuple[Complex, Complex]:
+    """Columns (α, α b, λ) and left side of the equations; ``slope`` 1 to take the way's slope from GNSS."""
+    middle = 0.5 * (parts.t0 + parts.t1)
+    hold = np.exp(1j * _held(level, gnss, lag, slip)(middle))
+
+    def gained(values: Complex) -> Complex:
+        ends = [np.interp(t + lag, level.t, values.real) + 1j * np.interp(t + lag, level.t, values.imag)
+                for t in (parts.t0, parts.t1)]  # fmt: skip
+        return hold * (ends[1] - ends[0])
+
+    design = np.stack([gained(x) for x in (force, level.ones, level.swing)], -1)
+    return design, parts.dv + slope * parts.slope
+
+
+def _quick(columns: Complex, use: np.ndarray) -> Complex:
+    """Columns less their mean over ``SLOW_ROWS`` round each row, of the rows in use: tilt drifts, cars do not wait."""
+    weight = use.astype(float)
+    share = np.maximum(gaussian_filter1d(weight, SLOW_ROWS, mode="constant"), 1e-6)
+    masked = columns * weight[:, None]
+    slow = gaussian_filter1d(masked.real, SLOW_ROWS, axis=0, mode="constant") + 1j * gaussian_filter1d(
+        masked.imag, SLOW_ROWS, axis=0, mode="constant"
+    )
+    return columns - slow / share[:, None]
+
+
+def _rates(level: Levelled, at: Floats) -> Floats:
+    """Yaw rate [rad/s] round times of the IMU, mean of 0.2 s."""
+    return (np.interp(at + 0.1, level.t, level.turn) - np.interp(at - 0.1, level.t, level.turn)) / 0.2
+
+
+def _held(level: Levelled, gnss: Motion, lag: float, slip: tuple[float, float]):
+    """Heading minus turn as a function of GNSS time: averaged over seconds, weighted by speed."""
+    moving = gnss.speed > MOVING
+    t, speed = gnss.t[moving], gnss.speed[moving]
+    beside = _rates(level, t + lag) * (slip[0] / speed + slip[1] * speed)
+    apart = np.exp(1j * (gnss.course[moving] - beside - np.interp(t + lag, level.t, level.turn)))
+    weight = np.minimum(gnss.speed[moving], 15.0) ** 2
+    reach = max(1, round(2 * SMOOTH_S / max(float(np.median(np.diff(t))) if len(t) > 1 else 1.0, 0.1)))
+    total = np.zeros(len(t), complex)
+    for shift in range(-reach, reach + 1):
+        other = np.arange(len(t)) + shift
+        inside = (other >= 0) & (other < len(t))
+        other = other[inside]
+        near = np.exp(-0.5 * ((t[other] - t[inside]) / SMOOTH_S) ** 2)
+        total[inside] += near * weight[other] * apart[other]
+    angle = np.unwrap(np.angle(total))
+    return lambda at: np.interp(at, t, angle)
+
+
+def _fit(
+    level: Levelled, gnss: Motion, parts: _Intervals, lag: float, use: np.ndarray, slip: tuple[float, float]
+) -> tuple[_Fit, float]:
+    """Least squares at a lag, and −2 ln of its likelihood (velocities, and changes of course)."""
+    design, left = _design(level, gnss, parts, lag, slip, level.tilted, 0.0)
+    A, y = _quick(design, use)[use], _quick(left[:, None], use)[use, 0]
+    x, *_ = np.linalg.lstsq(A, y, rcond=None)
+    rest = float(np.sum(np.abs(y - A @ x) ** 2)) + 1e-9
+    inverse = np.linalg.pinv(A.conj().T @ A)
+    arm_std = float(np.sqrt(abs(inverse[2, 2]) * rest / max(len(y) - 3, 1)))
+    turning = use & parts.moving
+    turn = np.interp(parts.t1 + lag, level.t, level.turn) - np.interp(parts.t0 + lag, level.t, level.turn)
+    rate0, rate1 = _rates(level, parts.t0 + lag), _rates(level, parts.t1 + lag)
+    v0, v1 = np.maximum(parts.v0, MOVING), np.maximum(parts.v1, MOVING)
+    columns = (turn, parts.t1 - parts.t0, rate1 / v1 - rate0 / v0, rate1 * v1 - rate0 * v0)
+    B = np.column_stack(columns)[turning] * parts.weight[turning, None]
+    z = parts.turned[turning] * parts.weight[turning]
+    # what is known of cars: an antenna 2 m or so from the axle, sideslip of 0.01 s²/m
+    prior = np.diag([0.0, 0.0, 1 / 2.0, 1 / 0.01]) * SLIP_NOISE
+    s, *_ = np.linalg.lstsq(np.concatenate((B, prior)), np.concatenate((z, np.zeros(4))), rcond=None)
+    off = np.abs(z - B @ s)
+    limit = 4 * max(float(np.median(off)), 1e-3)
+    swung = float(np.sum(np.minimum(off, limit) ** 2)) + 1e-9
+    alpha = complex(x[0])
+    fit = _Fit(lag, alpha, 0j, complex(x[2]), float(s[0]), rest,
+               float(np.sum(np.abs(y) ** 2)), arm_std, (float(s[2]), float(s[3])))  # fmt: skip
+    return fit, 2 * len(y) * np.log(rest) + len(z) * np.log(swung)
+
+
+def _matrix(level: Levelled, fit: _Fit, down: Floats) -> Floats:
+    a = fit.alpha / abs(fit.alpha)
+    e1, e2, _ = level.axes
+    forward = a.real * e1 - a.imag * e2
+    forward = forward - down * (forward @ down)
+    forward /= np.linalg.norm(forward)
+    return np.stack((forward, np.cross(down, forward), down))
+
+
+def _axis(t: Floats, gyro: Floats, parts: _Intervals, lag: float) -> tuple[Floats | None, float]:
+    """The axis about which the gyroscopes turn with the course, and by how much they did [rad]; None below 1.5."""
+    total = np.concatenate((np.zeros((1, 3)), np.cumsum(gyro[1:] * np.diff(t)[:, None], 0)))
+    use = parts.moving & (parts.t0 + lag >= t[0]) & (parts.t1 + lag <= t[-1])
+    ends = [np.stack([np.interp(at[use] + lag, t, c) for c in total.T], -1) for at in (parts.t0, parts.t1)]
+    turned, span = parts.turned[use], (parts.t1 - parts.t0)[use]
+    much = float(np.sum(np.abs(turned[np.abs(turned) > 0.05])))
+    x, *_ = np.linalg.lstsq(np.column_stack((turned, span)), ends[1] - ends[0], rcond=None)
+    size = float(np.linalg.norm(x[0]))
+    return (x[0] / size, much) if much > 1.5 and size > 0 else (None, much)
+
+
+def _jackknife(values: np.ndarray) -> float:
+    n = len(values)
+    return float(np.sqrt((n - 1) / n * np.sum((values - values.mean()) ** 2))) if n > 1 else float("inf")

@@ -1,0 +1,71 @@
+"""Units of a log from its numbers: gravity for accelerometers, the car's motion for all else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from dlkf.data.discovery.motion import EARTH_M, Floats
+
+G = 9.80665
+NEAR = 0.06  # of gravity: a scale error, the road's curves, a cold sensor
+ALIKE = 0.12  # of a unit's size, of what is regressed
+
+
+def accel_unit(size: float, known: Mapping[str, float]) -> str | None:
+    """The unit in which ``size`` is gravity; None if none is."""
+    fits = {name: abs(size * factor / G - 1) for name, factor in known.items()}
+    best = min(fits, key=lambda name: fits[name])
+    return best if fits[best] < NEAR else None
+
+
+def nearest_unit(factor: float, std: float, known: Mapping[str, float]) -> str | None:
+    """The unit of about ``factor`` SI, if one is within 12 % and the others beyond four sigma."""
+    apart = {name: abs(np.log(factor / value)) for name, value in known.items()}
+    best = min(apart, key=lambda name: apart[name])
+    certain = std / factor < 0.25 * min(
+        (abs(np.log(known[best] / value)) for value in known.values() if value != known[best]), default=1.0
+    )
+    return best if apart[best] < ALIKE and certain else None
+
+
+def speed_factor(t: Floats, lat_deg: Floats, lon_deg: Floats, speed: Floats) -> tuple[float, float]:
+    """Metres of the way per unit of speed and second, and its spread; NaN where the car hardly moved.
+
+    Over stretches of ten seconds, so that the noise of fixes does not matter.
+    """
+    good = np.isfinite(lat_deg) & np.isfinite(lon_deg) & np.isfinite(speed)
+    t, lat, lon, speed = t[good], np.radians(lat_deg[good]), np.radians(lon_deg[good]), speed[good]
+    if len(t) < 5:
+        return float("nan"), float("nan")
+    step = np.diff(t)
+    north, east = EARTH_M * np.diff(lat), EARTH_M * np.cos(lat[:-1]) * np.diff(lon)
+    fine = (step > 0) & (step <= 2.5)
+    moved = np.concatenate(([0.0], np.cumsum(np.where(fine, np.hypot(north, east), 0.0))))
+    way = np.concatenate(([0.0], np.cumsum(np.where(fine, 0.5 * (speed[1:] + speed[:-1]) * step, 0.0))))
+    last = np.searchsorted(t, t + 10.0)
+    first = np.flatnonzero(last < len(t))
+    last = last[first]
+    far = (moved[last] - moved[first]) > 30.0
+    if far.sum() < 3:
+        return float("nan"), float("nan")
+    ratio = (moved[last] - moved[first])[far] / np.maximum((way[last] - way[first])[far], 1e-9)
+    middle = float(np.median(ratio))
+    return middle, float(np.median(np.abs(ratio - middle))) * 1.5
+
+
+def time_unit(values: Floats, slowest_s: float, fastest_s: float) -> str | None:
+    """Unit of stamps: by their size where they count from 1970, else by their usual step; None if in doubt."""
+    numbers = np.asarray(values, dtype=float)
+    size = float(np.nanmedian(np.abs(numbers)))
+    for unit, ticks in (("ns", 1e9), ("us", 1e6), ("ms", 1e3), ("s", 1.0)):
+        if 8e8 * ticks < size < 5e9 * ticks:
+            return unit
+    step = np.diff(numbers)
+    step = step[step > 0]
+    if not len(step):
+        return None
+    usual = float(np.median(step))
+    fits = [u for u, ticks in (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)) if fastest_s <= usual / ticks <= slowest_s]
+    return fits[0] if len(fits) == 1 else None
