@@ -154,5 +154,5 @@ def _scores(
 
     yaws = np.clip(correlation(r * weight, g).real, -0.9999, 0.9999)
     forces = np.clip(np.abs(correlation(a * weight, f)), 0.0, 0.9999)
-    gain = -0.5 * n * np.log1p(-np.maximum(yaws, 0.0) ** 2) - n * np.log1p(-(forces**2))
+    gain = -0.5 * n * np.log1p(-(np.maximum(yaws, 0.0) ** 2)) - n * np.log1p(-(forces**2))
     return np.where(count > 3, gain, 0.0), yaws, forces, count

@@ -80,7 +80,7 @@ class Raw:
 def discover(
     raw: Raw,
     wanted: set[str],
-    sure: Sure = Sure(),  # noqa: B008
+    sure: Sure = Sure(),
     *,
     accel_units: Mapping[str, float],
     gyro_units: Mapping[str, float],
@@ -120,9 +120,7 @@ def discover(
     return out
 
 
-def _gyro_unit(
-    out: Findings, raw: Raw, pose: Pose | None, known: Mapping[str, float], increments: bool
-) -> None:
+def _gyro_unit(out: Findings, raw: Raw, pose: Pose | None, known: Mapping[str, float], increments: bool) -> None:
     if raw.gyro_factor is not None:
         return
     if pose is None:
@@ -139,7 +137,9 @@ def _offset(out: Findings, lag: Lag | None, pose: Pose | None, wanted: set[str],
     sign = 1.0 if setting.startswith("gnss") else -1.0
     if lag is None or pose is None:
         value = None if lag is None else round(sign * lag.lag_s, 1)
-        out.add(setting, value, False, "too little motion in the time that both logs have" if lag is None else _peak(lag))
+        out.add(
+            setting, value, False, "too little motion in the time that both logs have" if lag is None else _peak(lag)
+        )
         return
     certain = lag.clear and 2.5 * pose.lag_std <= sure.time_s
     value = 0.0 if abs(pose.lag_s) < max(3 * pose.lag_std, 0.01) and abs(pose.lag_s) < 0.05 else pose.lag_s
@@ -148,7 +148,9 @@ def _offset(out: Findings, lag: Lag | None, pose: Pose | None, wanted: set[str],
 
 
 def _peak(lag: Lag) -> str:
-    return f"yaw rate {lag.yaw:.2f}, force {lag.force:.2f} alike, next best lag {100 * lag.rival / lag.gain:.0f} % as good"
+    return (
+        f"yaw rate {lag.yaw:.2f}, force {lag.force:.2f} alike, next best lag {100 * lag.rival / lag.gain:.0f} % as good"
+    )
 
 
 def _named(lag_s: float) -> str:

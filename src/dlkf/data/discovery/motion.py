@@ -119,8 +119,8 @@ class Levelled:
 
     ``turn`` is the angle about down, ``force`` and ``ones`` the integrals of e^{i turn} times the horizontal force
     and 1, ``swing`` = i ω e^{i turn}, each at the limits of the samples ``t``. ``tilted`` is ``force`` with what the
-    gyroscopes tell of pitch and roll: q = ∫ e^{i turn} (ω₂ − i ω₁) dt is the horizontal part of the sensor's third axis,
-    and f_z q its share of gravity (small angles; q drifts slowly).
+    gyroscopes tell of pitch and roll: q = ∫ e^{i turn} (ω₂ − i ω₁) dt is the horizontal part of the sensor's third
+    axis, and f_z q its share of gravity (small angles; q drifts slowly).
     """
 
     t: Floats

@@ -7,12 +7,15 @@ complex horizontal vectors, every interval between two fixes has
 
 s the slope of the way, f the horizontal force in the sensor's axes: the argument of α turns these into forward and
 right, |α| is one, b is what levelling by the mean left over, and λ the lever arm from IMU to antenna. This is linear
-in (α, α b, λ); the clock offset is scanned for the least residuals. The course tells of it too, yet it is no heading:
+in (α, α b, λ); the clock offset is scanned for the least residuals. The course would tell of it too, yet it is no
+heading:
 
     course = h + ω (l / v + K v),
 
-l from the rear axle to the antenna and K the sideslip (DESIGN: −0.32 m and −0.0075 s²/m on a real car), which looks like
-a delay of l/v + K v, some 0.1 s. So l and K are fitted beside it, and taken out of the course that holds h.
+l from the rear axle to the antenna and K the sideslip (−0.32 m and −0.0075 s²/m on a real car), which looks like a
+delay of l/v + K v, some 0.1 s. So l and K are fitted, and taken out of the course that holds h. Pitch and
+roll of a second or ten come from the gyroscopes; what is slower (drift of the tilt) is taken off both sides as a
+moving mean.
 """
 
 from __future__ import annotations
@@ -51,7 +54,6 @@ class Pose:
     lever_arm_std: float
     explained: float  # share of the variance of Δv
     turned: float  # rad, sum of what the car turned
-    pulled: float  # m/s, root of the sum of squared Δv
     down_apart: float  # rad between gravity and the axis about which the car turns; NaN where it turns too little
 
 
@@ -129,10 +131,20 @@ def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float
     explained = 1 - fit.rest / max(fit.total, 1e-9)
     floor = LEVEL_STD * np.sqrt(1 - weight)
     return Pose(
-        final, yaw_std, float(np.hypot((1 - weight) * tilt_std, floor)), abs(fit.alpha), lag, _jackknife(np.array([one.lag_s for one in leave])),
-        float(unit), float(scale_std), fit.arm, arm_std, float(explained),
-        turned, float(np.sqrt(fit.total)), apart,
-    )  # fmt: skip
+        matrix=final,
+        yaw_std=yaw_std,
+        tilt_std=float(np.hypot((1 - weight) * tilt_std, floor)),
+        scale=abs(fit.alpha),
+        lag_s=lag,
+        lag_std=_jackknife(np.array([one.lag_s for one in leave])),
+        gyro_scale=float(unit),
+        gyro_scale_std=float(scale_std),
+        lever_arm=fit.arm,
+        lever_arm_std=arm_std,
+        explained=float(explained),
+        turned=turned,
+        down_apart=apart,
+    )
 
 
 def _intervals(gnss: Motion) -> _Intervals:
@@ -146,8 +158,9 @@ def _intervals(gnss: Motion) -> _Intervals:
     turned = np.angle(np.exp(1j * (gnss.course[last] - gnss.course[first])))
     block = np.minimum((BLOCKS * np.arange(len(t0))) // max(len(t0), 1), BLOCKS - 1)
     dv = gnss.v[last] - gnss.v[first]
-    return _Intervals(t0, t1, dv, np.where(moving, slope, 0.0), turned, np.minimum(slow, 15.0), gnss.speed[first], gnss.speed[last],
-                      moving, block)  # fmt: skip
+    v0, v1 = gnss.speed[first], gnss.speed[last]
+    slopes = np.where(moving, slope, 0.0)
+    return _Intervals(t0, t1, dv, slopes, turned, np.minimum(slow, 15.0), v0, v1, moving, block)
 
 
 def _gyro_scale(t: Floats, rate: Floats, parts: _Intervals, lag_s: float) -> float | None:
@@ -172,7 +185,12 @@ def _gyro_scale(t: Floats, rate: Floats, parts: _Intervals, lag_s: float) -> flo
 
 
 def _scan(
-    level: Levelled, gnss: Motion, parts: _Intervals, lag_s: float, span: float, keep: np.ndarray,
+    level: Levelled,
+    gnss: Motion,
+    parts: _Intervals,
+    lag_s: float,
+    span: float,
+    keep: np.ndarray,
     slip: tuple[float, float],
 ) -> _Fit | None:
     """The fit of the lag with the least residuals; a parabola through the best three."""
@@ -213,7 +231,13 @@ def _sound(
 
 
 def _design(
-    level: Levelled, gnss: Motion, parts: _Intervals, lag: float, slip: tuple[float, float], force: Complex, slope: float
+    level: Levelled,
+    gnss: Motion,
+    parts: _Intervals,
+    lag: float,
+    slip: tuple[float, float],
+    force: Complex,
+    slope: float,
 ) -> tuple[Complex, Complex]:
     """Columns (α, α b, λ) and left side of the equations; ``slope`` 1 to take the way's slope from GNSS."""
     middle = 0.5 * (parts.t0 + parts.t1)
@@ -266,7 +290,7 @@ def _held(level: Levelled, gnss: Motion, lag: float, slip: tuple[float, float]):
 def _fit(
     level: Levelled, gnss: Motion, parts: _Intervals, lag: float, use: np.ndarray, slip: tuple[float, float]
 ) -> tuple[_Fit, float]:
-    """Least squares at a lag, and −2 ln of its likelihood (velocities, and changes of course)."""
+    """Least squares at a lag, and its residuals' squared sum."""
     design, left = _design(level, gnss, parts, lag, slip, level.tilted, 0.0)
     A, y = _quick(design, use)[use], _quick(left[:, None], use)[use, 0]
     x, *_ = np.linalg.lstsq(A, y, rcond=None)
@@ -283,13 +307,10 @@ def _fit(
     # what is known of cars: an antenna 2 m or so from the axle, sideslip of 0.01 s²/m
     prior = np.diag([0.0, 0.0, 1 / 2.0, 1 / 0.01]) * SLIP_NOISE
     s, *_ = np.linalg.lstsq(np.concatenate((B, prior)), np.concatenate((z, np.zeros(4))), rcond=None)
-    off = np.abs(z - B @ s)
-    limit = 4 * max(float(np.median(off)), 1e-3)
-    swung = float(np.sum(np.minimum(off, limit) ** 2)) + 1e-9
     alpha = complex(x[0])
     fit = _Fit(lag, alpha, 0j, complex(x[2]), float(s[0]), rest,
                float(np.sum(np.abs(y) ** 2)), arm_std, (float(s[2]), float(s[3])))  # fmt: skip
-    return fit, 2 * len(y) * np.log(rest) + len(z) * np.log(swung)
+    return fit, rest
 
 
 def _matrix(level: Levelled, fit: _Fit, down: Floats) -> Floats:

@@ -67,5 +67,7 @@ def time_unit(values: Floats, slowest_s: float, fastest_s: float) -> str | None:
     if not len(step):
         return None
     usual = float(np.median(step))
-    fits = [u for u, ticks in (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)) if fastest_s <= usual / ticks <= slowest_s]
+    fits = [
+        u for u, ticks in (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)) if fastest_s <= usual / ticks <= slowest_s
+    ]
     return fits[0] if len(fits) == 1 else None

@@ -151,9 +151,7 @@ def _to_ned(vectors: np.ndarray, position: Mapping[str, np.ndarray]) -> np.ndarr
     return np.stack((north, east, -up), -1)
 
 
-def _stds(
-    mapped: Mapped, key: str, known: Mapping[str, float], position: Mapping[str, np.ndarray]
-) -> list[np.ndarray]:
+def _stds(mapped: Mapped, key: str, known: Mapping[str, float], position: Mapping[str, np.ndarray]) -> list[np.ndarray]:
     """North, East, Down from three columns, or from one for all, or from horizontal and vertical."""
     if not mapped.has(key):
         return [np.full(len(mapped), np.nan)] * 3

@@ -15,11 +15,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from dlkf.data.discovery.findings import Sure
 from dlkf.data.readers import formats
 from dlkf.data.readers.contract import gnss_frame, imu_frame, reference_frame
 from dlkf.data.readers.frames import DriveFrames
 from dlkf.data.readers.mapping import SOURCE, Mapped, Spec, check_keys, respaced, selected
+from dlkf.data.readers.settling import AUTO, open_settings, placeholders, settle
 from dlkf.errors import InputError
+from dlkf.settings import built
 
 TEXT = ("separator", "decimal", "header", "comment", "skip_rows", "encoding")
 NEAR_S = 0.05  # rows of two GNSS tables this close are of one fix
@@ -49,8 +52,9 @@ class LogReader:
         time_zero: str = "imu",
         drive: str | None = None,
         group: str | None = None,
-        lever_arm_m: Sequence[float] = (0.0, 0.0, 0.0),
+        lever_arm_m: Sequence[float] | str = (0.0, 0.0, 0.0),
         meta: Spec | None = None,
+        sure: Spec | None = None,
     ) -> None:
         if time_zero not in ("imu", "keep"):
             raise InputError(f"reader.time_zero={time_zero}: must be imu (count from the first sample) or keep")
@@ -59,7 +63,10 @@ class LogReader:
             check_keys(spec, kind)
         self.text = dict(zip(TEXT, (separator, decimal, header, comment, skip_rows, encoding)))
         self.time_zero, self.drive, self.group = time_zero, drive, group
-        self.lever_arm_m, self.meta = _lever_arm(lever_arm_m), dict(meta or {})
+        self.lever_arm_m = lever_arm_m if lever_arm_m == AUTO else _lever_arm(lever_arm_m)
+        self.meta, self.sure = dict(meta or {}), built(Sure, sure or {}, "reader.sure")
+        self.wanted = open_settings(self.specs, lever_arm_m)
+        self.neutral = placeholders(self.specs)
 
     def read(self, source: str | Path) -> Iterator[DriveFrames]:
         """The drives of a folder, in the order of their names."""
@@ -83,21 +90,36 @@ class LogReader:
         kinds = [kind for kind, spec in self.specs.items() if spec.get("file") is not None]
         if "imu" not in kinds:
             raise InputError("reader.imu.file is null; a drive needs an IMU")
-        mapped = {kind: self._mapped(folder, self.specs[kind], kind, only) for kind in kinds}
+        mapped = {kind: self._mapped(folder, self.neutral[kind], kind, only) for kind in kinds}
+        zero, t = self._times(mapped)
+        arm, found, mapping = self.lever_arm_m, (), {}
+        if self.wanted:
+            settled = settle(mapped, t, self.wanted, self.sure, f"drive {name}", arm)
+            mapped = {kind: replace(part, spec=settled.specs[kind]) for kind, part in mapped.items()}
+            zero, t = self._times(mapped)
+            arm, found = settled.lever_arm_m, settled.notes
+            mapping = self._mapping({**self.neutral, **settled.specs}, arm)
+        frames = {kind: FRAMES[kind](part, t[kind]) for kind, part in mapped.items()}
+        meta = {"drive": name, "group": self.group or name, "time_zero_s": float(zero), **self.meta}
+        meta |= dict(zip(("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m"), arm))
+        notes = [note for part in mapped.values() for one in (part, *part.parts.values()) for note in one.table.notes]
+        told = (*dict.fromkeys(notes), *found)
+        return DriveFrames(meta, frames["imu"], frames.get("gnss"), frames.get("reference"), told, mapping)
+
+    def _times(self, mapped: Mapping[str, Mapped]) -> tuple[int, dict[str, np.ndarray]]:
+        """The second that a drive's times count from, and those of its tables."""
         stamps = {kind: part.stamps() for kind, part in mapped.items()}
         zero = int(stamps["imu"][0][0]) if self.time_zero == "imu" else 0
-        frames: dict[str, pd.DataFrame] = {}
-        for kind, (whole, part) in stamps.items():
-            t = (whole - zero) + part
-            if (self.specs[kind].get("time") or {}).get("respace"):
-                t = respaced(t)
-            frames[kind] = FRAMES[kind](mapped[kind], t)
-        meta = {"drive": name, "group": self.group or name, "time_zero_s": float(zero), **self.meta}
-        meta |= dict(zip(("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m"), self.lever_arm_m))
-        notes = [note for part in mapped.values() for one in (part, *part.parts.values()) for note in one.table.notes]
-        return DriveFrames(
-            meta, frames["imu"], frames.get("gnss"), frames.get("reference"), notes=tuple(dict.fromkeys(notes))
-        )
+        t = {kind: (whole - zero) + part for kind, (whole, part) in stamps.items()}
+        for kind, part in mapped.items():
+            if (part.spec.get("time") or {}).get("respace"):
+                t[kind] = respaced(t[kind])
+        return zero, t
+
+    def _mapping(self, specs: Mapping[str, Any], arm: Sequence[float]) -> dict[str, Any]:
+        """The settings of a reader that reads this drive again, without anything to find out."""
+        named = {"time_zero": self.time_zero, "group": self.group, "lever_arm_m": list(arm), "meta": self.meta}
+        return {"_target_": "dlkf.data.readers.logs.LogReader", **self.text, **named, **specs}
 
     def _mapped(self, folder: Path, spec: Spec, kind: str, only: Path | None) -> Mapped:
         """The table of a kind, with the entries that come from other tables brought to its rows."""

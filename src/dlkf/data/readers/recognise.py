@@ -15,8 +15,8 @@ from dlkf.data.readers.frames import Table
 Spec = dict[str, Any]
 
 SENSOR = {
-    "accel": r"(acc|accel|acceleration|accelerometer|linear ?acceleration|specific ?force|force|f|a|fb|total ?acceleration)",
-    "gyro": r"(gyr|gyro|gyroscope|omega|w|g|angular ?(velocity|rate)|rate|rotation ?rate|wb|ang ?vel|turn ?rate)",
+    "accel": r"((total |linear )?acc(el(eration|erometer)?)?|specific ?force|force|f|a|fb)",
+    "gyro": r"(gyro?(scope)?|omega|w|g|ang(ular)? ?(velocity|vel|rate)|rate|(rotation|turn) ?rate|wb)",
 }
 ONE = {
     "lat": r"(gps |gnss )?lat(itude)?( deg| rad)?",
@@ -31,8 +31,10 @@ ONE = {
     "quality": r"(gps |gnss )?(quality|fix ?quality|gga ?quality)",
     "geoid": r"(geoid|undulation|geoid ?sep\w*|sep|geoid ?height)( m)?",
 }
-TIME = r"(#?t|#?time|#?time ?stamp|tow|sow|gps ?time|gps ?sow|gps ?tow|unix ?(time)?|utc|stamp|epoch|sec|secs|seconds|datetime|" \
-    r"date ?time|ros ?time|itow|utc ?time|seconds ?elapsed)( s| sec| ms| us| ns| unix| utc| gps)*"
+TIME = (
+    r"#?(t|time|time ?stamp|tow|sow|gps ?(time|sow|tow)|unix ?(time)?|utc|stamp|epoch|secs?|seconds|date ?time"
+    r"|ros ?time|itow|utc ?time|seconds ?elapsed)( s| sec| ms| us| ns| unix| utc| gps)*"
+)
 
 
 def imu_spec(table: Table) -> Spec | None:

@@ -39,9 +39,7 @@ def factor(unit: str | float, table: Mapping[str, float], where: str) -> float:
     if isinstance(unit, (int, float)) and not isinstance(unit, bool):
         return float(unit)
     if unit not in table:
-        raise InputError(
-            f"{where}: unknown unit {unit!r}; known are {', '.join(table)}, or a number (SI per unit)"
-        )
+        raise InputError(f"{where}: unknown unit {unit!r}; known are {', '.join(table)}, or a number (SI per unit)")
     return float(table[unit])
 
 

@@ -1,0 +1,181 @@
+"""What a mapping leaves to be found out (``auto``), settled from the drive itself."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from dlkf.data.discovery.findings import Finding, Findings, Raw, Sure, discover
+from dlkf.data.discovery.units import speed_factor
+from dlkf.data.readers import units
+from dlkf.data.readers.contract import gnss_frame, imu_frame, positions
+from dlkf.data.readers.mapping import Mapped
+from dlkf.data.schema import ACCEL, GYRO, VELOCITY
+from dlkf.errors import InputError
+
+AUTO = "auto"
+# settings that may be auto: where they stand in the mapping, and what stands there until they are known
+PLACES: dict[str, tuple[tuple[str, ...], Any]] = {
+    "imu.accel.unit": (("imu", "accel", "unit"), 1.0),
+    "imu.gyro.unit": (("imu", "gyro", "unit"), 1.0),
+    "imu.accel.axes": (("imu", "accel", "axes"), "frd"),
+    "imu.gyro.axes": (("imu", "gyro", "axes"), "frd"),
+    "imu.time.offset_s": (("imu", "time", "offset_s"), 0.0),
+    "gnss.time.offset_s": (("gnss", "time", "offset_s"), 0.0),
+    "gnss.velocity.unit": (("gnss", "velocity", "unit"), 1.0),
+    "gnss.position.delay_s": (("gnss", "position", "delay_s"), 0.0),
+}
+SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "knots": 1852 / 3600, "cm/s": 0.01, "mm/s": 1e-3, "mph": 0.44704}
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Specs without ``auto``, the lever arm, and what was found."""
+
+    specs: dict[str, Any]
+    lever_arm_m: tuple[float, float, float]
+    findings: list[Finding]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """A line per finding."""
+        return tuple(f"found reader.{f.setting}={_said(f.value)}  ({f.told})" for f in self.findings)
+
+
+def open_settings(specs: Mapping[str, Any], lever_arm_m: Any) -> set[str]:
+    """Settings that are ``auto``."""
+    wanted = {name for name, (path, _) in PLACES.items() if _at(specs, path) == AUTO}
+    return wanted | ({"lever_arm_m"} if lever_arm_m == AUTO else set())
+
+
+def placeholders(specs: Mapping[str, Any]) -> dict[str, Any]:
+    """The specs with neutral values for every ``auto``."""
+    out = copy.deepcopy({kind: _plain(spec) for kind, spec in specs.items()})
+    for path, neutral in PLACES.values():
+        if _at(out, path) == AUTO:
+            _set(out, path, neutral)
+    return out
+
+
+def settle(
+    mapped: Mapping[str, Mapped], t: Mapping[str, np.ndarray], wanted: set[str], sure: Sure, where: str, arm: Any
+) -> Settled:
+    """Find out what is wanted of a drive, its tables mapped with neutral values.
+
+    ``t`` are the stamps of the tables. InputError where an answer is not sure.
+    """
+    specs = {kind: copy.deepcopy(_plain(part.spec)) for kind, part in mapped.items()}
+    if "gnss" not in mapped:
+        raise InputError(f"{where}: reader.{sorted(wanted)[0]}=auto needs GNSS to compare with; give the value")
+    found = Findings()
+    if "gnss.velocity.unit" in wanted:
+        _speed_unit(found, mapped["gnss"], t["gnss"], where)
+        _refuse_doubt(found, where)
+        specs["gnss"]["velocity"]["unit"] = found.get("gnss.velocity.unit")
+    imu = imu_frame(mapped["imu"], t["imu"])
+    gnss = gnss_frame(Mapped(mapped["gnss"].table, specs["gnss"], "gnss", mapped["gnss"].parts), t["gnss"])
+    raw = _raw(imu, gnss, {key: None if f"imu.{key}.unit" in wanted else 1.0 for key in ("accel", "gyro")})
+    asked = set(wanted)
+    if {"imu.accel.axes", "imu.gyro.axes"} & wanted:
+        asked.add("imu.axes")
+    more = discover(
+        raw,
+        asked,
+        sure,
+        accel_units=units.ACCELERATION,
+        gyro_units=units.RATE,
+        increments=bool(mapped["imu"].spec.get("increments")),
+    )
+    found.found += more.found
+    _refuse_doubt(found, where)
+    for name in wanted & set(PLACES):
+        value = copy.deepcopy(found.get("imu.axes" if name.endswith("axes") else name))
+        if value is not None:
+            _set(specs, PLACES[name][0], value)
+    lever = found.get("lever_arm_m") if "lever_arm_m" in wanted else arm
+    return Settled(specs, tuple(float(x) for x in lever), _told(found.found, wanted))
+
+
+def _raw(imu: pd.DataFrame, gnss: pd.DataFrame, factors: Mapping[str, float | None]) -> Raw:
+    good = gnss[(gnss["quality"] > 0) & gnss["lat_deg"].notna() & gnss["lon_deg"].notna()]
+    good = good[np.concatenate(([True], np.diff(good["t"]) > 0))] if len(good) else good
+    rows = imu[np.concatenate(([True], np.diff(imu["t"]) > 0))]
+    return Raw(
+        t=rows["t"].to_numpy(),
+        accel=rows[list(ACCEL)].to_numpy(),
+        gyro=rows[list(GYRO)].to_numpy(),
+        accel_factor=factors["accel"],
+        gyro_factor=factors["gyro"],
+        gnss_t=good["t"].to_numpy(),
+        lat_deg=good["lat_deg"].to_numpy(),
+        lon_deg=good["lon_deg"].to_numpy(),
+        v_ned=good[list(VELOCITY)].to_numpy(),
+    )
+
+
+def _speed_unit(found: Findings, gnss: Mapped, t: np.ndarray, where: str) -> None:
+    if not gnss.has("velocity"):
+        found.add("gnss.velocity.unit", "m/s", True, "no velocities")
+        return
+    v = gnss.vector("velocity", (2, 3), nan=True)
+    speed = v[:, 0] if gnss.spec["velocity"].get("frame") == "course" else np.hypot(v[:, 0], v[:, 1])
+    place = positions(gnss)
+    factor, spread = speed_factor(t, place["lat_deg"], place["lon_deg"], speed)
+    apart = {name: abs(np.log(factor / f)) if factor > 0 else np.inf for name, f in SPEEDS.items()}
+    best = min(apart, key=lambda name: apart[name])
+    certain = apart[best] < 0.08 and spread < 0.2 * factor
+    found.add("gnss.velocity.unit", best, bool(certain), f"positions move {factor:.3g} ± {spread:.1g} m per unit")
+
+
+def _refuse_doubt(found: Findings, where: str) -> None:
+    doubt = found.doubtful()
+    if doubt is None:
+        return
+    setting = doubt.setting.replace("imu.axes", "imu.accel.axes and .gyro.axes")
+    best = "" if doubt.value is None else f"; the best guess is {_said(doubt.value)}"
+    raise InputError(
+        f"{where}: not sure of reader.{setting} ({doubt.told}){best}; give it, a longer drive, or a wider reader.sure"
+    )
+
+
+def _told(found: list[Finding], wanted: set[str]) -> list[Finding]:
+    """Findings by the settings they answer."""
+    out = []
+    for one in found:
+        names = sorted(wanted & {"imu.accel.axes", "imu.gyro.axes"}) if one.setting == "imu.axes" else [one.setting]
+        out += [Finding(name, one.value, one.sure, one.told if k == 0 else "the same") for k, name in enumerate(names)]
+    return out
+
+
+def _said(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{k}: {v}" for k, v in value.items()) + "}"
+    return str(value)
+
+
+def _plain(spec: Any) -> Any:
+    if isinstance(spec, Mapping):
+        return {key: _plain(value) for key, value in spec.items()}
+    return [_plain(x) for x in spec] if isinstance(spec, (list, tuple)) else spec
+
+
+def _at(specs: Mapping[str, Any], path: tuple[str, ...]) -> Any:
+    node: Any = specs
+    for key in path:
+        if not isinstance(node, Mapping) or key not in node:
+            return None
+        node = node[key]
+    return node
+
+
+def _set(specs: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
+    node = specs
+    for key in path[:-1]:
+        node[key] = dict(node.get(key) or {})
+        node = node[key]
+    node[path[-1]] = value
