@@ -2,7 +2,7 @@
 
     python pipelines/grid_search.py
     python pipelines/grid_search.py optimizer.lr=1e-3,3e-3 seed=0,1,2
-    python pipelines/grid_search.py --jobs 4 model=dlkf,dlkf_run optimizer.lr=1e-3,3e-3
+    python pipelines/grid_search.py --jobs 4 model=dlkf,dlkf_literal optimizer.lr=1e-3,3e-3
 
 Without a grid it goes over learning rate and seed. It trains with ``+experiment=outage +profile=quick``; give
 others with ``--experiment`` and ``--profile`` (an empty profile is the full length). A point that is already

@@ -25,6 +25,7 @@ from dlkf.evaluation.summary import answer, metrics_of
 from dlkf.evaluation.table import as_rich
 from dlkf.files import vacant
 from dlkf.filters.build import is_filter
+from dlkf.filters.card import without_seen
 from dlkf.models import grid_of, resolve_models
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.provenance import provenance
@@ -51,6 +52,10 @@ def main(cfg: DictConfig) -> None:
             progress=lambda name, done, total: progress(done, total),
             **grid,
         )
+    cards = {name: getattr(model, "card", {}) for name, model in models.items()}
+    drives, seen = without_seen(cards, drives, dataset_digest(config["dataset"]), leave_out=config["unseen"])
+    for line in seen:
+        console.print(line, style="yellow")
     scenes = Scenes(drives, protocol)
     for reason in scenes.skipped.values():
         console.print(f"left out: {reason}", style="yellow")

@@ -25,7 +25,7 @@ from dlkf.evaluation.table import as_rich
 from dlkf.tracking.grid import PARENT_RUN, run_name
 from dlkf.tracking.registry import check_registration, log_model
 from dlkf.tracking.runs import lightning_logger, start_run, tracking_uri
-from dlkf.training.run_folder import run_folder, write_state
+from dlkf.training.run_folder import checked_digests, run_folder, write_state
 from dlkf.training.study import load_data, run_study
 from dlkf.training.summary import key_metrics, note
 
@@ -45,12 +45,12 @@ def main(cfg: DictConfig) -> None:
     parent = os.environ.get(PARENT_RUN)
     uri = tracking_uri(config["tracking"]["uri"])
     with start_run(uri, config["name"], name, parent_run_id=parent, run_id=state.get("run_id")) as run:
-        write_state(folder, run_id=run.id)
+        write_state(folder, run_id=run.id, data=checked_digests(data.datasets, state))
         run.log_config(config)
         for dataset in data.datasets:
             run.log_dataset(dataset, dataset_digest(dataset), "training")
         outcome = run_study(config, data, folder, lightning_logger(run), console.print)
-        for table in all_tables(", ".join(Path(d).name for d in data.datasets), outcome.results):
+        for table in (*all_tables(", ".join(Path(d).name for d in data.datasets), outcome.results), *outcome.tables):
             console.print(as_rich(table))
         metrics = key_metrics(outcome)
         run.log_files(folder / "report")
@@ -62,17 +62,22 @@ def main(cfg: DictConfig) -> None:
     console.print(f"{seconds}\nReport: {folder}/report/report.html\nModel:  {outcome.weights}\nMLflow: run {run.id}")
 
 
+HOUR_SEED = 71  # the roads of the long drives are not those of the others
+
+
 def make_missing(config: dict[str, Any], console: Console) -> None:
     """Simulate the datasets under ``data/`` that have a preset and are not there yet."""
     from dlkf.simulation.dataset import simulate_from_config
 
-    for dataset in config["data"]["datasets"]:
+    hour = [config["scoring"]["hour"]] if config["scoring"]["hour"] else []
+    for dataset in [*config["data"]["datasets"], *hour]:
         path = Path(dataset)
         preset_file = config_dir() / "simulated" / f"{path.name}.yaml"
         if path.exists() or path.parent != Path("data") or not preset_file.is_file():
             continue
         console.print(f"{dataset} is not there: simulating it")
-        preset = compose("simulate", overrides=[f"simulated@dataset={path.name}"])
+        seed = HOUR_SEED if dataset in hour else 1
+        preset = compose("simulate", overrides=[f"simulated@dataset={path.name}", f"seed={seed}"])
         try:
             simulate_from_config(OmegaConf.to_container(preset, resolve=True), path)
         except InputError:

@@ -104,10 +104,15 @@ def test_heading_frame_does_not_see_the_direction_of_driving():
     assert (turned(a.posterior).p_n - b.posterior.p_n).abs().max() > 0.05
 
 
-@pytest.mark.parametrize("fusion", ["concat", "strict30"])
-def test_gradient_reaches_every_parameter(fusion):
+@pytest.mark.parametrize(
+    "network",
+    [{"fusion": "strict30"}, {"cell": "gru"}, {"cell": "none"}, {"window": False}, {"init": "responsive"}],
+    ids=str,
+)
+def test_gradient_reaches_every_parameter(network):
+    """In the paper's network and in its relatives (R052)."""
     batch = single(scene(3, 12, seed=5))
-    model = small(network={**SMALL["network"], "fusion": fusion, "dropout": 0.0}).train()
+    model = small(network={**SMALL["network"], **network, "dropout": 0.0}).train()
     solution = integrate(batch, model)
     ((solution.prior.p_n - batch.truth.p_n) ** 2).mean().backward()
     for name, parameter in model.named_parameters():
@@ -135,6 +140,74 @@ def test_gradient_of_the_whole_loop_agrees_with_finite_differences():
         numeric = float(loss(base + step).detach() - loss(base - step).detach()) / 2e-4
         # the last correction and the past posterior enter the features detached: a small part is missing
         assert abs(numeric - float(gradient[i])) < 0.05 * max(abs(numeric), float(gradient.abs().max()) * 0.1), i
+
+
+def test_an_affine_error_takes_off_what_a_sensor_matrix_puts_on():
+    """M of both sensors by the head's bias alone: the window's samples come out as if there were none."""
+    model = small(imu_error="affine", outage_mode="run")
+    M = 0.02 * torch.tensor([[[1.0, -0.5, 0.2], [0.0, -1.0, 0.3], [0.4, 0.0, 0.5]]] * 2)
+    with torch.no_grad():
+        model.imu_error.linear.weight.zero_()
+        model.imu_error.linear.bias[6:] = (M / 0.01).flatten()
+    batch = scene(2, 4, seed=8, noise=False, bias=torch.zeros(2, 6, dtype=torch.float64))
+    force, rate = batch.imu[..., :3], batch.imu[..., 3:]
+    wrong = torch.cat((force @ (torch.eye(3) + M[0]).double().T, rate @ (torch.eye(3) + M[1]).double().T), -1)
+    solution = integrate(single(replace(batch, imu=wrong)), model)
+    from_second = (wrong - batch.imu).mean(2)[:, 1:]  # nothing is known in the first epoch
+    assert torch.allclose(solution.imu_error[:, 1:].double(), from_second, atol=2e-4)
+
+
+def test_features_take_the_sizes_of_training_pieces_and_keep_them(tmp_path):
+    """After learning sizes every input is of size one; the sizes are stored with the weights."""
+    batches = [single(scene(20, 30, seed=9))]
+    model = small(frame="heading", outage_mode="run")
+    model.learn_sizes(batches)
+    with model.recording() as seen, torch.inference_mode():
+        integrate(batches[0], model)
+    scaled = model.scaling(*(torch.cat(x) for x in zip(*seen)))
+    spread = scaled[1].std(0)
+    assert ((spread > 0.3) & (spread < 3.0)).all(), spread
+    save_filter(model, tmp_path / "model")
+    again = load_filter(tmp_path / "model")
+    assert torch.equal(again.scaling.component_size, model.scaling.component_size)
+
+
+def test_a_mean_error_is_where_the_imu_error_starts():
+    model = small(imu_error_bound=5.0)
+    mean = [0.1, -0.2, 0.05, 3e-3, -1e-3, 5e-3]
+    model.imu_error.start_at(mean)
+    with torch.no_grad():
+        model.imu_error.linear.weight.zero_()
+    error = model.imu_error(torch.randn(2, 12)).bias
+    assert torch.allclose(error, torch.tensor([mean] * 2), rtol=1e-4)
+
+
+def test_a_trained_network_answers_a_parked_car_otherwise_than_a_turning_one():
+    """Ten steps of training on turning cars: the gain depends on what the car does, and on its fixes. A network that
+    is a constant would pass every test of accuracy after a cold start."""
+    network = {**SMALL["network"], "init": "responsive", "dropout": 0.0}
+    model = small(frame="heading", outage_mode="run", network=network)
+    batch = single(scene(16, 20, seed=10))
+    model.learn_sizes([batch])
+    optimizer = torch.optim.AdamW(model.parameters(), lr=3e-3)
+    for _ in range(10):
+        solution = integrate(batch, model.train())
+        error = solution.prior.error_to(batch.truth)[:, 5:]
+        loss = (error / torch.tensor([1.0] * 3 + [0.1] * 3 + [0.02] * 3)).abs().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimizer.step()
+    model.eval()
+    parked = torch.zeros_like(batch.imu)
+    parked[..., 2] = -9.8124
+    still = replace(batch, imu=parked, start=batch.start._replace(v_n=torch.zeros_like(batch.start.v_n)))
+    still = replace(still, gnss=torch.cat((batch.start.p_n[:, None].expand(-1, 20, -1), torch.zeros(16, 20, 3)), -1))
+    with torch.inference_mode():
+        turning, standing = (integrate(b, model).gain[:, 10:] / model.gain.scale for b in (batch, still))
+    apart = (turning.mean((0, 1)) - standing.mean((0, 1))).abs()
+    assert apart.max() > 0.02  # of the heads' sizes; the constant network of a plain start has 1e-5
+    assert turning.std((0, 1)).square().mean().sqrt() > 5e-3
 
 
 def test_saved_and_loaded_it_is_the_same_filter(tmp_path):

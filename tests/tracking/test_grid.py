@@ -24,8 +24,8 @@ def point(uri, name, rms=None, error=None, experiment="town"):
         run.log_config({"optimizer": {"lr": name}, "seed": 0, "tracking": {"uri": uri + name}})
         if error:
             raise error
-        run.log_metrics({"val/outage_position_rms": 2 * rms}, step=1)
-        run.log_metrics({"val/outage_position_rms": 3 * rms}, step=2)
+        run.log_metrics({"val/outage_end_m": 2 * rms}, step=1)
+        run.log_metrics({"val/outage_end_m": 3 * rms}, step=2)
         run.log_metrics({"test/dlkf/outage_horizontal_rms_m": rms, "test/mbkf15/outage_horizontal_rms_m": 9.0})
     return run
 
@@ -58,7 +58,7 @@ def test_a_sweep_that_finishes(uri, client, capsys):
     assert found.data.metrics["test/dlkf/outage_horizontal_rms_m"] == 2.0, "scores of the best beside the grid"
     assert "outage_horizontal_rms_m" in printed and "better" in found.data.tags["mlflow.note.content"]
     table = mlflow_module().artifacts.load_text(f"{found.info.artifact_uri}/comparison.csv").splitlines()
-    assert table[0].startswith("run,run_id,status,optimizer.lr,val/outage_position_rms,test/dlkf/")
+    assert table[0].startswith("run,run_id,status,optimizer.lr,val/outage_end_m,test/dlkf/")
     assert table[1] == f"worse,{worse.id},FINISHED,worse,10.0,5.0,9.0"
 
 
@@ -115,8 +115,8 @@ def test_the_parent_ends_as_its_children_do(statuses, ended, status):
 
 def test_a_single_run_is_named_by_what_was_changed(monkeypatch):
     monkeypatch.delenv(PARENT_RUN, raising=False)
-    overrides = ["+experiment=outage", "+profile=quick", "seed=1", "tracking.uri=x", "filter@model=dlkf_run"]
-    assert run_name("outage", overrides) == "outage quick seed=1 model=dlkf_run"
+    overrides = ["+experiment=outage", "+profile=quick", "seed=1", "tracking.uri=x", "filter@model=dlkf_literal"]
+    assert run_name("outage", overrides) == "outage quick seed=1 model=dlkf_literal"
     assert run_name("town", ["name=town"]) == "town"
 
 

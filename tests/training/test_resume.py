@@ -14,7 +14,7 @@ from dlkf.data.datamodule import DriveDataModule
 from dlkf.errors import InputError
 from dlkf.simulation.dataset import simulate_from_config
 from dlkf.training.fit import fit
-from dlkf.training.run_folder import configuration_hash, read_state, run_folder, write_state
+from dlkf.training.run_folder import checked_digests, configuration_hash, read_state, run_folder, write_state
 
 
 def preset(path: str) -> dict:
@@ -105,6 +105,28 @@ def test_training_moves_towards_the_reference(dataset, tmp_path):
             return float(pva_losses(integrate(batch, model), batch, LossConfig())["position"])
 
     assert loss(after) < 0.9 * loss(before)
+
+
+def test_without_outages_the_loss_chooses_the_weights(dataset, tmp_path):
+    """No outage in validation: every better epoch is kept by val/loss, not the first one for ever."""
+    plain = DriveDataModule([dataset], batch_size=9, length_s=20.0, eval_length_s=30.0, fractions=(0.6, 0.2, 0.2))
+    chosen = settings(max_epochs=3, validate_every=1)
+    best = fit(chosen, plain, tmp_path / "run", False)
+    state = torch.load(tmp_path / "run" / "last.ckpt", weights_only=True)["callbacks"]
+    kept = next(v for k, v in state.items() if k.startswith("BestWeights"))
+    assert best.is_dir() and kept["epoch"] > 0 and 0 < kept["score"] < float("inf")
+
+
+def test_an_unknown_monitor_is_said_clearly(dataset, tmp_path):
+    with pytest.raises(InputError, match="val/colour is not logged; choose one of val/gain_std"):
+        fit(settings(max_epochs=1, validate_every=1, monitor="val/colour"), data(dataset), tmp_path / "run", False)
+
+
+def test_other_data_than_the_unfinished_run_began_with_are_refused(dataset, tmp_path):
+    digests = checked_digests([str(dataset)], {})
+    assert checked_digests([str(dataset)], {"data": digests}) == digests
+    with pytest.raises(InputError, match="resume=false"):
+        checked_digests([str(dataset)], {"data": {str(dataset): "0" * 32}})
 
 
 def test_no_validated_epoch_is_said_clearly(dataset, tmp_path):

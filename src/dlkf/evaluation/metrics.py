@@ -136,6 +136,30 @@ def outage_end(x: Array, w: Windows) -> Array:
     return x[w.piece, w.last]
 
 
+def end_errors(batch: Batch, state: NavState) -> Array:
+    """Horizontal error [m] at the end of every outage of a batch whose masks are applied; inf where not finite.
+
+    What tuning, the choice of weights and the tables go by, so that all of them mean the same. An outage that the
+    truth does not reach to its end counts as long as the truth does.
+    """
+    hidden = (~batch.available & batch.truth_valid & batch.present).cpu().numpy()
+    off = (state.p_n.detach().double() - batch.truth.p_n.to(state.p_n.device).double())[..., :2].norm(dim=-1)
+    return outage_end(np.nan_to_num(off.cpu().numpy(), nan=np.inf), windows(hidden))
+
+
+OBJECTIVES = ("log", "rms", "median")
+
+
+def mean_error(errors: Array, objective: str) -> float:
+    """One number of many errors [m]: geometric mean (``log``), to which every outage counts alike, ``median``, or
+    ``rms``, which a few hard ones decide. NaN without errors, inf where one is not finite."""
+    if not len(errors) or not np.isfinite(errors).all():
+        return float("inf") if len(errors) else float("nan")
+    if objective == "rms":
+        return float(np.sqrt(np.mean(errors**2)))
+    return float(np.median(errors) if objective == "median" else np.exp(np.mean(np.log(np.maximum(errors, 1e-3)))))
+
+
 def outage_at(x: Array, w: Windows, seconds: Array, epoch_s: float) -> Array:
     """Value ``seconds`` (K,) after the last fix: (P, T) → (W, K), NaN where the outage is shorter."""
     steps = np.rint(np.asarray(seconds, float) / epoch_s).astype(int)

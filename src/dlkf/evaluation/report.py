@@ -82,14 +82,16 @@ def write_report(
     protocol: dict[str, Any],
     by_time: bool,
     baseline: str | None = None,
+    more: Sequence[Table] = (),
     dpi: int = 130,
 ) -> list[Path]:
     """Write the whole report into ``out``, all files or none; returns their paths.
 
     ``results`` has one entry per kind of data (of scores.of_kind); ``protocol`` is how the
-    scores were made, in plain values. Raises InputError if ``out`` cannot be written to.
+    scores were made, in plain values; ``more`` tables follow those of the results. Raises InputError if
+    ``out`` cannot be written to.
     """
-    parts = all_tables(dataset, results)
+    parts = [*all_tables(dataset, results), *more]
     pictures: list[tuple[str, str, bytes]] = []
     for kind in scores.kinds:
         suffix = "" if len(scores.kinds) == 1 else f"_{kind}"

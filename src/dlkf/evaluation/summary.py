@@ -43,6 +43,9 @@ def metrics_of(results: Sequence[Results]) -> dict[str, float]:
                 c = result.versus(name, *END, statistic)
                 bounds = {} if c is None else {"": c.ratio, "_low": c.ratio_low, "_high": c.ratio_high}
                 flat |= {f"ratio_{statistic}{bound}": x for bound, x in bounds.items()}
+            for q in ("position", "velocity", "attitude"):  # the paper's ratios, of the means over the pieces (R141)
+                c = result.versus(name, "pieces", "all", q, "mean")
+                flat |= {} if c is None else {f"ratio_mean_{q}": c.ratio}
             metrics |= {f"{prefix}/{name}/{k}": v for k, v in flat.items()}
     return {k: v for k, v in metrics.items() if math.isfinite(v)}
 

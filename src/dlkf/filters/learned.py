@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, NamedTuple
 
@@ -11,37 +12,46 @@ from torch import Tensor, nn
 
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
-from dlkf.filters.integration import Correction, Epoch
+from dlkf.filters.integration import Correction, Epoch, integrate
+from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.state import ATTITUDE, NavState
-from dlkf.networks.cnn_lstm import CnnLstm, LstmState, NetworkConfig
-from dlkf.networks.features import FRAMES, component_features, level_rotation, window_features
-from dlkf.networks.heads import GainHead, ImuErrorHead
+from dlkf.networks.cnn_lstm import CnnLstm, NetworkConfig, Recurrent
+from dlkf.networks.features import FRAMES, Scaling, component_features, level_rotation, window_features
+from dlkf.networks.heads import FORMS, GainHead, ImuErrorHead
 
 OUTAGE_MODES = ("hold", "run")
+KNOWN_FROM = ("nothing", "training")
 MAX_TRAINING_TURN = 0.2  # rad per correction, a guard in training only (paper.md 4.10)
 
 
 @dataclass(frozen=True)
 class LearnedConfig:
-    """How the literal DLKF reads the paper.
+    """How the DLKF reads the paper; the defaults are the literal reading.
 
     ``outage_mode``: ``hold`` runs the network at GNSS updates only and keeps the last IMU error in between
     (the paper); ``run`` runs it every epoch, with a fix flag and the time since the last fix as further
-    inputs (paper.md 4.3). ``frame``: axes of features and gain. ``detach_features`` stops the gradient at
-    the network's inputs (paper.md 4.13). ``rate_hz``, ``epoch_s``: what it was trained on.
+    inputs (paper.md 4.3). ``frame``: axes of features and gain. ``imu_error``: ``constant`` through an epoch, or
+    ``affine`` in the samples, with sensor matrices (paper.md 4.11 E0, E4); ``imu_error_bound`` [σ] limits its bias,
+    0 does not. ``known_from``: with ``training``, features have the sizes and the IMU error starts at the mean that
+    training pieces have (no truth is used); with ``nothing``, fixed sizes and zero. ``detach_features`` stops the
+    gradient at the network's inputs (paper.md 4.13). ``rate_hz``, ``epoch_s``: what it was trained on.
     """
 
     network: NetworkConfig = field(default_factory=NetworkConfig)
     outage_mode: str = "hold"
     frame: str = "ned"
     detach_features: bool = True
+    imu_error: str = "constant"
+    imu_error_bound: float = 0.0
+    known_from: str = "nothing"
     initial_gain: float = 0.5
     rate_hz: float = 50.0
     epoch_s: float = 1.0
     kind: str = "dlkf"
 
     def __post_init__(self) -> None:
-        for name, known in (("outage_mode", OUTAGE_MODES), ("frame", FRAMES), ("kind", ("dlkf",))):
+        choices = {"outage_mode": OUTAGE_MODES, "frame": FRAMES, "imu_error": FORMS, "known_from": KNOWN_FROM}
+        for name, known in (choices | {"kind": ("dlkf",)}).items():
             if getattr(self, name) not in known:
                 raise InputError(f"model.{name} is {getattr(self, name)!r}; choose one of {', '.join(known)}")
         if round(self.rate_hz * self.epoch_s) != self.network.samples:
@@ -89,9 +99,10 @@ def _is_like(value: Any, default: Any) -> bool:
 
 
 class Memory(NamedTuple):
-    """What the filter carries from epoch to epoch; the last four belong to the last network run."""
+    """What the filter carries from epoch to epoch; the last six belong to the last network run."""
 
-    lstm: LstmState
+    recurrent: Recurrent
+    origin: Tensor  # (B, 3) estimated position at the start, from which features count
     elapsed: Tensor  # (B,) s since the last network run
     since_fix: Tensor  # (B,) s since the last fix
     posterior: NavState  # after the last run
@@ -108,10 +119,10 @@ class LearnedFilter(nn.Module):
     def __init__(self, config: LearnedConfig) -> None:
         super().__init__()
         self.config = config
+        self.scaling = Scaling()
         self.network = CnnLstm(config.network)
-        width = config.network.dense[-1]
-        self.gain = GainHead(width, config.initial_gain)
-        self.imu_error = ImuErrorHead(width)
+        self.gain = GainHead(self.network.width, config.initial_gain)
+        self.imu_error = ImuErrorHead(self.network.width, config.imu_error, config.imu_error_bound)
 
     def heads(self) -> Iterator[nn.Parameter]:
         """Weights of the output layers, which may learn at their own rate."""
@@ -130,7 +141,7 @@ class LearnedFilter(nn.Module):
         state = NavState(*(x.detach() for x in batch.start))
         zeros = batch.imu.new_zeros
         memory = Memory(
-            lstm=self.network.start(B, parameter),
+            recurrent=self.network.start(B, parameter), origin=state.p_n,
             elapsed=zeros(B), since_fix=zeros(B), posterior=state, difference=zeros(B, 9),
             difference_s=batch.imu.new_ones(B), correction=zeros(B, 9), fix=zeros(B, 6),
             had_fix=torch.zeros(B, 6, dtype=torch.bool, device=batch.imu.device),
@@ -148,51 +159,68 @@ class LearnedFilter(nn.Module):
         dx = epoch.z.new_zeros(B, 9)
         gain = epoch.z.new_zeros(B, 9, 6)
         if len(rows) == 0:
-            return memory, Correction(dx, epoch.imu_error, gain=gain)
+            return memory, Correction(dx, epoch.error, gain=gain)
         whole = len(rows) == B
-        K, error, lstm = self._run(memory, epoch, rows, whole, has_fix)
+        K, error, recurrent = self._run(memory, epoch, rows, whole, has_fix)
         part = (K @ epoch.z[rows].unsqueeze(-1)).squeeze(-1)
         if self.training:
             turn = part[:, ATTITUDE].norm(dim=-1, keepdim=True).detach()
             shrink = (MAX_TRAINING_TURN / turn.clamp_min(1e-9)).clamp(max=1.0)
             part = torch.cat((part[:, :6], part[:, ATTITUDE] * shrink), -1)
         if whole:
-            dx, gain, imu_error = part, K, error
+            dx, gain = part, K
         else:
             dx, gain = dx.index_copy(0, rows, part), gain.index_copy(0, rows, K)
-            imu_error = epoch.imu_error.index_copy(0, rows, error)
-            lstm = tuple(old.index_copy(1, rows, new) for old, new in zip(memory.lstm, lstm))
-        return self._remember(memory, epoch, dx, has_fix, rows, lstm), Correction(dx, imu_error, gain=gain)
+            error = _with_rows(epoch.error, rows, error)
+            recurrent = tuple(old.index_copy(1, rows, new) for old, new in zip(memory.recurrent, recurrent))
+        return self._remember(memory, epoch, dx, has_fix, rows, recurrent), Correction(dx, error, gain=gain)
 
-    def _run(self, memory, epoch, rows, whole, has_fix):
-        """Gain in n, IMU error and new LSTM state of the pieces in ``rows``."""
-        pick = (lambda x: x) if whole else (lambda x: x[rows])
-        cut = Tensor.detach if self.config.detach_features else (lambda x: x)
-        p_n, v_n, C_nb = (pick(cut(x)) for x in epoch.window[:3])
-        C_hn = level_rotation(C_nb[:, -1], self.config.frame)
-        moved = torch.where(memory.had_fix & epoch.used, epoch.fix.value - memory.fix, torch.zeros_like(memory.fix))
-        parts = [
-            memory.difference / memory.difference_s.unsqueeze(-1),
-            memory.correction,
-            moved / memory.since_fix.unsqueeze(-1),
-            epoch.z,
-        ]
-        components = component_features(*(pick(cut(x)) for x in parts), C_hn)
+    def _run(
+        self, memory: Memory, epoch: Epoch, rows: Tensor, whole: bool, has_fix: Tensor
+    ) -> tuple[Tensor, ImuError, Recurrent]:
+        """Gain in n, IMU error and new state of the cells for the pieces in ``rows``."""
+
+        def pick(x: Tensor) -> Tensor:
+            x = x.detach() if self.config.detach_features else x
+            return x if whole else x[rows]
+
+        window, components, C_hn = self._features(memory, epoch, pick)
+        window, components = self.scaling(window, components)
         if self.config.outage_mode == "run":
-            age = torch.log1p(pick(memory.since_fix)) * ~pick(has_fix)
-            components = torch.cat((components, pick(has_fix)[:, None].to(age.dtype), age[:, None]), -1)
+            fixed = pick(has_fix)
+            age = torch.log1p(pick(memory.since_fix)) * ~fixed
+            components = torch.cat((components, fixed[:, None].to(age.dtype), age[:, None]), -1)
         dtype = self.imu_error.linear.weight.dtype
-        channels = window_features(p_n, v_n, C_nb, pick(epoch.imu), C_hn, self.config.frame)
-        lstm = memory.lstm if whole else tuple(x[:, rows] for x in memory.lstm)
-        h, lstm = self.network(channels.to(dtype), components.to(dtype), lstm)
-        K, error = self.gain(h).to(epoch.z.dtype), self.imu_error(h).to(epoch.z.dtype)
+        recurrent = memory.recurrent if whole else tuple(x[:, rows] for x in memory.recurrent)
+        h, recurrent = self.network(window.to(dtype), components.to(dtype), recurrent)
+        K, error = self.gain(h).to(epoch.z.dtype), self.imu_error(h)
+        error = ImuError(*(x if x is None else x.to(epoch.z.dtype) for x in error))
         if self.config.frame == "heading":
             left, right = (torch.block_diag(*[torch.ones(3, 3)] * n).to(K) for n in (3, 2))
-            C_nh = C_hn.mT
-            K = (C_nh.repeat(1, 3, 3) * left) @ K @ (C_hn.repeat(1, 2, 2) * right)
-        return K, error, lstm
+            K = (C_hn.mT.repeat(1, 3, 3) * left) @ K @ (C_hn.repeat(1, 2, 2) * right)
+        return K, error, recurrent
 
-    def _remember(self, memory, epoch, dx, has_fix, rows, lstm) -> Memory:
+    def _features(
+        self, memory: Memory, epoch: Epoch, pick: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Window (b, M, 15), components (b, 30) in physical units, and the rotation into their axes (b, 3, 3)."""
+        p_n, v_n, C_nb = (pick(x) for x in epoch.window[:3])
+        C_hn = level_rotation(C_nb[:, -1], self.config.frame)
+        moved = torch.where(memory.had_fix & epoch.used, epoch.fix.value - memory.fix, 0.0)
+        components = component_features(
+            pick(memory.difference / memory.difference_s.unsqueeze(-1)),
+            pick(memory.correction),
+            pick(moved / memory.since_fix.unsqueeze(-1)),
+            pick(epoch.z),
+            C_hn,
+        )
+        moved_n = p_n - pick(memory.origin)[:, None]
+        window = window_features(moved_n, v_n, C_nb, pick(epoch.imu), C_hn, self.config.frame)
+        return window, components, C_hn
+
+    def _remember(
+        self, memory: Memory, epoch: Epoch, dx: Tensor, has_fix: Tensor, rows: Tensor, recurrent: Recurrent
+    ) -> Memory:
         """Memory after the network ran on ``rows``."""
         ran = torch.zeros_like(has_fix).index_fill(0, rows, True)
         posterior = epoch.window.end.detach().corrected(dx.detach())
@@ -202,7 +230,8 @@ class LearnedFilter(nn.Module):
             return torch.where(which.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
         return Memory(
-            lstm=lstm,
+            recurrent=recurrent,
+            origin=memory.origin,
             elapsed=choose(torch.zeros_like(memory.elapsed), memory.elapsed),
             since_fix=choose(torch.zeros_like(memory.since_fix), memory.since_fix, has_fix),
             posterior=NavState(*(choose(n, o) for n, o in zip(posterior, memory.posterior))),
@@ -212,3 +241,30 @@ class LearnedFilter(nn.Module):
             fix=torch.where(epoch.used, epoch.fix.value, memory.fix),
             had_fix=memory.had_fix | epoch.used,
         )
+
+    @contextmanager
+    def recording(self) -> Iterator[list[tuple[Tensor, Tensor]]]:
+        """Windows (b, M, 15) and components (b, 30) of every run of the network inside the block, unscaled."""
+        seen: list[tuple[Tensor, Tensor]] = []
+        hook = self.scaling.register_forward_pre_hook(lambda _, given: seen.append((given[0], given[1])))
+        try:
+            yield seen
+        finally:
+            hook.remove()
+
+    def learn_sizes(self, batches: Sequence[Batch]) -> None:
+        """Set the sizes of the features to those of these pieces, as the filter stands."""
+        with torch.inference_mode(), self.recording() as seen:
+            for batch in batches:
+                integrate(batch, self)
+        windows, components = (torch.cat(x).float() for x in zip(*seen))
+        self.scaling.fit(windows.clone(), components.clone())
+
+
+def _with_rows(old: ImuError, rows: Tensor, new: ImuError) -> ImuError:
+    """The errors of all pieces after those in ``rows`` got new ones."""
+    bias = old.bias.index_copy(0, rows, new.bias)
+    if new.matrix is None:
+        return ImuError(bias)
+    before = new.matrix.new_zeros(len(bias), *new.matrix.shape[1:]) if old.matrix is None else old.matrix
+    return ImuError(bias, before.index_copy(0, rows, new.matrix))

@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from dlkf.errors import InputError
+from dlkf.filters.card import CARD, read_card
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.plus import PlusConfig, PlusFilter
 
@@ -31,12 +32,14 @@ def learned_filter(values: Mapping[str, Any]) -> nn.Module:
     return filter_type(config.from_mapping(values))
 
 
-def save_filter(model: nn.Module, folder: Path | str) -> None:
-    """Write ``weights.safetensors`` and ``config.yaml``."""
+def save_filter(model: nn.Module, folder: Path | str, card: Mapping[str, Any] | None = None) -> None:
+    """Write ``weights.safetensors`` and ``config.yaml``; what it was made of goes beside, as ``card.yaml``."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     save_file({k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}, folder / WEIGHTS)
     (folder / CONFIG).write_text(yaml.safe_dump(model.config.plain(), sort_keys=False))
+    if card is not None:
+        (folder / CARD).write_text(yaml.safe_dump(dict(card), sort_keys=False, allow_unicode=True))
 
 
 def load_filter(folder: Path | str) -> nn.Module:
@@ -67,4 +70,5 @@ def load_filter(folder: Path | str) -> nn.Module:
                 f"{folder / WEIGHTS} does not fit {CONFIG}: {name} is {have} in the file, {want} in the config"
             )
     model.load_state_dict(weights)
+    model.card = read_card(folder)
     return model.eval()

@@ -1,4 +1,4 @@
-"""The paper's CNN-LSTM (R035–R049): two convolutions over the window, stacked LSTM, two dense layers."""
+"""The paper's CNN-LSTM (R035–R049) and its relatives (R050, R052): convolutions, recurrent cells, dense layers."""
 
 from __future__ import annotations
 
@@ -12,30 +12,43 @@ from dlkf.errors import InputError
 from dlkf.networks.features import CNN_CHANNELS, COMPONENTS
 
 FUSIONS = ("concat", "strict30")
+CELLS = {"lstm": nn.LSTMCell, "gru": nn.GRUCell, "none": None}
+INITS = ("plain", "responsive")
 
 
 @dataclass(frozen=True)
 class NetworkConfig:
     """Sizes of the network; the defaults are the paper's.
 
-    ``fusion``: ``concat`` feeds CNN output and components to the LSTM side by side; ``strict30`` squeezes
+    ``fusion``: ``concat`` feeds CNN output and components to the recurrent cells side by side; ``strict30`` squeezes
     them into the 30 inputs that the paper names (paper.md 4.1). ``flags`` further inputs are appended.
+    ``window=False`` leaves out the CNN, ``cell`` is ``lstm``, ``gru`` or ``none`` (dense layers alone; R052).
+
+    ``init``: ``plain`` is torch's own; a fresh network of the paper's depth then hands on a thousandth of what it
+    sees, and training makes a constant of it. ``responsive`` keeps the variance from layer to layer: Kaiming
+    convolutions and dense layers, orthogonal input weights with gain 2. ``conv_activation`` puts the paper's
+    LeakyReLU behind the last convolution too, where it cuts off half of the one channel.
     """
 
     samples: int = 50
+    window: bool = True
     cnn_channels: int = 32
     kernel: int = 3
+    cell: str = "lstm"
     lstm_hidden: int = 256
     lstm_layers: int = 4
     dense: tuple[int, ...] = (512, 256)
     dropout: float = 0.5
     fusion: str = "concat"
     leaky_slope: float = 0.01
+    init: str = "plain"
+    conv_activation: bool = True
     flags: int = 0
 
     def __post_init__(self) -> None:
-        if self.fusion not in FUSIONS:
-            raise InputError(f"model.network.fusion is {self.fusion!r}; choose one of {', '.join(FUSIONS)}")
+        for name, known in (("fusion", FUSIONS), ("cell", tuple(CELLS)), ("init", INITS)):
+            if getattr(self, name) not in known:
+                raise InputError(f"model.network.{name} is {getattr(self, name)!r}; choose one of {', '.join(known)}")
         if self.kernel % 2 == 0:
             raise InputError(f"model.network.kernel is {self.kernel}; it must be odd to keep the window's length")
         if min(self.samples, self.cnn_channels, self.lstm_hidden, self.lstm_layers, *self.dense) < 1:
@@ -44,65 +57,77 @@ class NetworkConfig:
             raise InputError(f"model.network.dropout is {self.dropout}; it must be in [0, 1)")
 
 
-LstmState = tuple[Tensor, Tensor]  # each (layers, B, hidden)
+Recurrent = tuple[Tensor, ...]  # each (layers, B, hidden); h and c of LSTM cells, h of GRU cells, empty without cells
 
 
 class CnnLstm(nn.Module):
-    """Window (B, 15, M) and components (B, 30 + flags) to a feature vector (B, dense[-1]), with memory."""
+    """Window (B, 15, M) and components (B, 30 + flags) to a feature vector (B, width), with memory."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        pad = config.kernel // 2
-        self.cnn = nn.Sequential(
-            nn.Conv1d(CNN_CHANNELS, config.cnn_channels, config.kernel, padding=pad),
-            nn.LeakyReLU(config.leaky_slope),
-            nn.Conv1d(config.cnn_channels, 1, config.kernel, padding=pad),
-            nn.LeakyReLU(config.leaky_slope),
-        )
-        width = config.samples + COMPONENTS + config.flags
-        self.squeeze = nn.Linear(width, COMPONENTS) if config.fusion == "strict30" else nn.Identity()
-        # cells, not nn.LSTM: with a batch that changes from epoch to epoch oneDNN's kernel is six times slower
-        first = COMPONENTS if config.fusion == "strict30" else width
-        self.lstm = nn.ModuleList(
-            nn.LSTMCell(config.lstm_hidden if i else first, config.lstm_hidden) for i in range(config.lstm_layers)
-        )
+        self.width = config.dense[-1]
+        pad, slope = config.kernel // 2, config.leaky_slope
         layers: list[nn.Module] = []
-        size = config.lstm_hidden
+        if config.window:
+            layers = [
+                nn.Conv1d(CNN_CHANNELS, config.cnn_channels, config.kernel, padding=pad),
+                nn.LeakyReLU(slope),
+                nn.Conv1d(config.cnn_channels, 1, config.kernel, padding=pad),
+                *([nn.LeakyReLU(slope)] if config.conv_activation else []),
+            ]
+        self.cnn = nn.Sequential(*layers)
+        size = (config.samples if config.window else 0) + COMPONENTS + config.flags
+        self.squeeze: nn.Module = nn.Identity()
+        if config.fusion == "strict30":
+            self.squeeze, size = nn.Linear(size, COMPONENTS), COMPONENTS
+        cells = []
+        for _ in range(config.lstm_layers if config.cell != "none" else 0):
+            cells.append(CELLS[config.cell](size, config.lstm_hidden))
+            size = config.lstm_hidden
+        self.lstm = nn.ModuleList(cells)
+        layers = []
         for i, out in enumerate(config.dense):
             if i:
                 layers.append(nn.Dropout(config.dropout))
-            layers += [nn.Linear(size, out), nn.LeakyReLU(config.leaky_slope)]
+            layers += [nn.Linear(size, out), nn.LeakyReLU(slope)]
             size = out
         self.dense = nn.Sequential(*layers)
         self._initialise()
 
     def _initialise(self) -> None:
-        """Orthogonal recurrent weights and a forget-gate bias of 1 (paper.md 4.13)."""
+        """Orthogonal recurrent weights and an LSTM forget-gate bias of 1 (paper.md 4.13); see ``init``."""
         hidden = self.config.lstm_hidden
+        responsive = self.config.init == "responsive"
+        gates = {"lstm": 4, "gru": 3, "none": 1}[self.config.cell]
         for name, parameter in self.lstm.named_parameters():
-            if name.endswith("weight_hh"):
-                for gate in parameter.data.chunk(4):
-                    nn.init.orthogonal_(gate)
-            elif name.endswith("bias_ih"):
+            if name.endswith("weight_hh") or (responsive and name.endswith("weight_ih")):
+                for gate in parameter.data.chunk(gates):
+                    nn.init.orthogonal_(gate, gain=1.0 if name.endswith("weight_hh") else 2.0)
+            elif name.endswith(("bias_ih", "bias_hh")):
                 nn.init.zeros_(parameter)
-                parameter.data[hidden : 2 * hidden] = 1.0
-            elif name.endswith("bias_hh"):
-                nn.init.zeros_(parameter)
+                if name.endswith("bias_ih") and self.config.cell == "lstm":
+                    parameter.data[hidden : 2 * hidden] = 1.0
+        if responsive:
+            for layer in (*self.cnn, *self.dense):
+                if isinstance(layer, (nn.Conv1d, nn.Linear)):
+                    nn.init.kaiming_normal_(layer.weight, self.config.leaky_slope, nonlinearity="leaky_relu")
+                    nn.init.zeros_(layer.bias)
 
-    def start(self, batch_size: int, like: Tensor) -> LstmState:
+    def start(self, batch_size: int, like: Tensor) -> Recurrent:
         """Empty memory."""
         zeros = like.new_zeros(self.config.lstm_layers, batch_size, self.config.lstm_hidden)
-        return zeros, zeros
+        return (zeros,) * {"lstm": 2, "gru": 1, "none": 0}[self.config.cell]
 
     def forward(
-        self, window: Float[Tensor, "B 15 M"], components: Float[Tensor, "B C"], memory: LstmState
-    ) -> tuple[Float[Tensor, "B D"], LstmState]:
+        self, window: Float[Tensor, "B 15 M"], components: Float[Tensor, "B C"], memory: Recurrent
+    ) -> tuple[Float[Tensor, "B D"], Recurrent]:
         """One epoch."""
-        y = self.squeeze(torch.cat((self.cnn(window).squeeze(1), components), -1))
-        hidden, cell = [], []
-        for layer, h, c in zip(self.lstm, *memory):
-            y, c = layer(y, (h, c))
-            hidden.append(y)
-            cell.append(c)
-        return self.dense(y), (torch.stack(hidden), torch.stack(cell))
+        seen = (self.cnn(window).squeeze(1), components) if self.config.window else (components,)
+        y = self.squeeze(torch.cat(seen, -1))
+        after = []
+        for layer, old in zip(self.lstm, zip(*memory)):
+            new = layer(y, old) if len(old) == 2 else (layer(y, old[0]),)
+            y = new[0]
+            after.append(new)
+        return self.dense(y), tuple(torch.stack(x) for x in zip(*after))

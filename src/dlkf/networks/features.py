@@ -1,16 +1,16 @@
 """What the network sees: the window for the CNN and the four components for the LSTM (R037–R044).
 
-Everything is divided by a fixed physical size; the components then pass asinh, which keeps sign and small
-signals and tames the innovations after an outage (paper.md 4.9). ``frame`` chooses the axes of every
-horizontal pair: ``ned`` is the paper's reading, ``heading`` turns them by the estimated yaw, which makes the
-network blind to the direction of driving.
+Everything is brought to a size of about one, by fixed physical sizes or by those that training pieces have
+(:class:`Scaling`); the components then pass asinh, which keeps sign and small signals and tames the innovations after
+an outage (paper.md 4.9). ``frame`` chooses the axes of every horizontal pair: ``ned`` is the paper's reading,
+``heading`` turns them by the estimated yaw, which makes the network blind to the direction of driving.
 """
 
 from __future__ import annotations
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from dlkf.navigation.attitude import rpy_from_rotation
 
@@ -38,6 +38,42 @@ def level_rotation(C_nb: Float[Tensor, "B 3 3"], frame: str) -> Float[Tensor, "B
     return torch.stack((c, s, o, -s, c, o, o, o, one), -1).unflatten(-1, (3, 3))
 
 
+class Scaling(nn.Module):
+    """Centre and size of every input; buffers, so that they are stored with the weights.
+
+    They start as the fixed sizes above and are set once to those of training pieces by :meth:`fit` (R067 speaks of
+    normalised losses only; that a network wants inputs of like size is paper.md 4.9).
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("window_centre", torch.zeros(CNN_CHANNELS))
+        self.register_buffer("window_size", torch.tensor(WINDOW_SCALE))
+        self.register_buffer("component_size", torch.tensor(COMPONENT_SCALE))
+
+    def forward(
+        self, window: Float[Tensor, "B M 15"], components: Float[Tensor, "B 30"]
+    ) -> tuple[Float[Tensor, "B 15 M"], Float[Tensor, "B 30"]]:
+        """Both in units of their size, channels first, components through asinh."""
+        x = (window - self.window_centre.to(window)) / self.window_size.to(window)
+        return x.mT, torch.asinh(components / self.component_size.to(components))
+
+    def fit(self, windows: Float[Tensor, "N M 15"], components: Float[Tensor, "N 30"]) -> None:
+        """Centre and spread of what a filter saw over training pieces, robust against the hours after a start.
+
+        A channel that hardly moves keeps a thousandth of its fixed size at least.
+        """
+        flat = windows.flatten(0, 1)
+        centre = flat.median(0).values
+        for size, x, fixed in (
+            (self.window_size, flat - centre, WINDOW_SCALE),
+            (self.component_size, components, COMPONENT_SCALE),
+        ):
+            spread = torch.maximum(1.4826 * x.abs().median(0).values, x.abs().quantile(0.9, 0) / 1.645)
+            size.copy_(torch.maximum(spread, 1e-3 * torch.tensor(fixed, dtype=x.dtype)))
+        self.window_centre.copy_(centre)
+
+
 def window_features(
     p: Float[Tensor, "B M 3"],
     v: Float[Tensor, "B M 3"],
@@ -45,18 +81,18 @@ def window_features(
     imu: Float[Tensor, "B M 6"],
     C_hn: Float[Tensor, "B 3 3"],
     frame: str,
-) -> Float[Tensor, "B 15 M"]:
+) -> Float[Tensor, "B M 15"]:
     """Channels over time: position, velocity, attitude of the INS and the raw IMU (R037).
 
-    In the ``heading`` frame the position counts from the window's first sample and yaw from its last.
+    ``p`` counts from where the filter started; in the ``heading`` frame from the window's first sample, and yaw from
+    its last.
     """
     rpy = rpy_from_rotation(C)
     if frame == "heading":
         p, v = (p - p[:, :1]) @ C_hn.mT, v @ C_hn.mT
         yaw = rpy[..., 2] - rpy[:, -1:, 2]
         rpy = torch.cat((rpy[..., :2], torch.atan2(torch.sin(yaw), torch.cos(yaw)).unsqueeze(-1)), -1)
-    x = torch.cat((p, v, rpy, imu), -1)
-    return (x / x.new_tensor(WINDOW_SCALE)).mT
+    return torch.cat((p, v, rpy, imu), -1)
 
 
 def component_features(
@@ -66,7 +102,6 @@ def component_features(
     innovation: Float[Tensor, "B 6"],
     C_hn: Float[Tensor, "B 3 3"],
 ) -> Float[Tensor, "B 30"]:
-    """The four components a–d of the paper (R040–R043); the two differences come per second (paper.md 4.2)."""
+    """The four components a–d of the paper (line 29); the two differences come per second (paper.md 4.2)."""
     x = torch.cat((posterior_rate, last_correction, gnss_rate, innovation), -1)
-    x = (x.unflatten(-1, (10, 3)) @ C_hn.mT).flatten(1)
-    return torch.asinh(x / x.new_tensor(COMPONENT_SCALE))
+    return (x.unflatten(-1, (10, 3)) @ C_hn.mT).flatten(1)

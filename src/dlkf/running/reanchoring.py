@@ -110,6 +110,7 @@ def _(memory: learned.Memory, change: FrameChange, fresh: learned.Memory) -> lea
     origin, which begins anew near zero, as in the pieces that the network was trained on.
     """
     return memory._replace(
+        origin=fresh.origin,
         posterior=change.state(memory.posterior),
         difference=change.vectors(memory.difference),
         correction=change.vectors(memory.correction),

@@ -31,7 +31,7 @@ from dlkf.tracking.runs import (
 PARENT_RUN, SWEPT = "DLKF_PARENT_RUN_ID", "DLKF_SWEPT_KEYS"  # read by the runs of the sweep, in any process
 NAMELESS = ("tracking", "hydra", "resume", "name")  # settings that say nothing about the result
 PRESETS = ("experiment", "profile")
-VALIDATION = "val/outage_position_rms"  # what training keeps the best weights by
+VALIDATION = "val/outage_end_m"  # what training keeps the best weights by
 COMPARED = ("outage_horizontal_rms_m", "position_rms_m")  # the first that the children have
 
 

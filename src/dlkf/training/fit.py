@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,21 +15,35 @@ from lightning.pytorch.loggers import Logger
 
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.errors import InputError
+from dlkf.filters.learned import LearnedFilter
 from dlkf.training.callbacks.checkpoints import BEST, LAST, BestWeights, ResumePoint
 from dlkf.training.callbacks.progress import TrainingProgress
 from dlkf.training.module import FilterTraining
+from dlkf.training.warm_start import warm_start
 
 
-def fit(config: Mapping[str, Any], data: DriveDataModule, folder: Path, logger: Logger | bool) -> Path:
+def fit(
+    config: Mapping[str, Any],
+    data: DriveDataModule,
+    folder: Path,
+    logger: Logger | bool,
+    *,
+    mean_imu_error: Sequence[float] | None = None,
+    notes: Mapping[str, Any] | None = None,
+) -> Path:
     """Train, going on from ``folder/last.ckpt`` if it is there; returns the folder of the best weights.
 
     ``config`` has ``model``, ``loss``, ``optimizer``, ``scheduler``, ``trainer``, ``callbacks`` and ``seed``.
-    Raises InputError where no epoch was validated.
+    ``mean_imu_error`` (6) of the training pieces is where a model with ``known_from=training`` starts; ``notes`` are
+    stored beside the weights. Raises InputError where no epoch was validated, or none had a finite ``monitor``.
     """
     settings = config["trainer"]
     module = FilterTraining(
         **{k: config[k] for k in ("model", "loss", "optimizer", "scheduler")}, seed=config["seed"]
     )
+    last = folder / LAST
+    if isinstance(module.filter, LearnedFilter) and not last.is_file():
+        warm_start(module.filter, data, mean_imu_error)
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="lightning")
@@ -40,7 +55,7 @@ def fit(config: Mapping[str, Any], data: DriveDataModule, folder: Path, logger: 
             callbacks=[
                 *(instantiate(c) for c in config["callbacks"].values() if c is not None),
                 TrainingProgress(),
-                BestWeights(str(folder), start_epoch=settings["best_from_epoch"]),
+                BestWeights(str(folder), _monitor(settings["monitor"], data), settings["best_from_epoch"], notes),
                 ResumePoint(str(folder), settings["checkpoint_every"]),
             ],
             gradient_clip_val=settings["gradient_clip"],
@@ -52,19 +67,24 @@ def fit(config: Mapping[str, Any], data: DriveDataModule, folder: Path, logger: 
             enable_model_summary=False,
             default_root_dir=folder,
         )
-        last = folder / LAST
-        try:
-            trainer.fit(module, datamodule=data, ckpt_path=str(last) if last.is_file() else None)
-        except SystemExit as end:  # what Lightning makes of Ctrl-C and SIGTERM
-            raise (end.__context__ if isinstance(end.__context__, KeyboardInterrupt) else end) from None
+        trainer.fit(module, datamodule=data, ckpt_path=str(last) if last.is_file() else None)
     if trainer.interrupted:
         raise KeyboardInterrupt
     loss = trainer.callback_metrics.get("train/loss")
     if not (folder / BEST).is_dir() and loss is not None and not bool(loss.isfinite()):
         raise InputError(f"the training diverged (its loss is {float(loss)}); give a smaller optimizer.lr")
     if not (folder / BEST).is_dir():
+        monitor = _monitor(settings["monitor"], data)
+        score = float(trainer.callback_metrics.get(monitor, 0.0))
+        if not math.isfinite(score):
+            raise InputError(f"no weights to keep: {monitor} is {score}, the training diverged; lower optimizer.lr")
         raise InputError(
             f"no epoch was validated: trainer.max_epochs={settings['max_epochs']} ends before "
             f"trainer.best_from_epoch={settings['best_from_epoch']} and validate_every={settings['validate_every']}"
         )
     return folder / BEST
+
+
+def _monitor(chosen: str | None, data: DriveDataModule) -> str:
+    """What the weights are kept by: the error at the end of validation outages, the loss where there are none."""
+    return chosen or ("val/loss" if data.eval_outage is None else "val/outage_end_m")

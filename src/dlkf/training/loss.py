@@ -18,20 +18,22 @@ TERMS = ("position", "velocity", "attitude")
 @dataclass(frozen=True)
 class LossConfig:
     """``scale`` [m, m/s, rad]: the error where smooth-L1 turns from square to linear; ``prior`` and
-    ``posterior``: how much the states before and after the update count (paper.md 2.8, 4.12)."""
+    ``posterior``: how much the states before and after the update count (paper.md 2.8, 4.12). A piece whose position
+    error passes ``diverged_m`` is left out of the batch's loss (paper.md 4.13)."""
 
     position_scale: float = 1.0
     velocity_scale: float = 0.1
     attitude_scale: float = 0.02
     prior: float = 1.0
     posterior: float = 1.0
+    diverged_m: float = 1e4
 
 
 def pva_losses(solution: Solution, batch: Batch, config: LossConfig) -> dict[str, Tensor]:
     """Mean smooth-L1 of the scaled errors of position, velocity and attitude, unweighted between the three.
 
     Attitude error is log(C_ref Ĉᵀ), never a difference of angles. Epochs without truth do not count; a batch
-    without any attitude truth has an attitude loss of 0.
+    without any attitude truth has an attitude loss of 0. Pieces that diverged do not count either.
     """
     losses = {}
     total = config.prior + config.posterior
@@ -43,10 +45,12 @@ def pva_losses(solution: Solution, batch: Batch, config: LossConfig) -> dict[str
         torch.nan_to_num(batch.truth.v_n),
         torch.where(batch.attitude_valid[..., None, None], batch.truth.C_nb, eye),
     )
+    off = (solution.posterior.p_n - truth.p_n).detach().abs().amax(-1)
+    sound = (torch.where(batch.truth_valid & batch.present, off, 0.0) < config.diverged_m).all(1, keepdim=True)
     errors = [(w, state.error_to(truth)) for w, state in
               ((config.prior, solution.prior), (config.posterior, solution.posterior)) if w]  # fmt: skip
     for i, (term, scale, mask) in enumerate(zip(TERMS, scales, masks)):
-        keep = (mask & batch.present)[..., None]
+        keep = (mask & batch.present & sound)[..., None]
         count = (3 * keep.sum()).clamp_min(1)
         value = batch.imu.new_zeros(())
         for weight, error in errors:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from typing import Any
 
 import lightning as L
+import numpy as np
 import torch
 from torch import Tensor
 
 from dlkf.data.drive import Batch
+from dlkf.evaluation.metrics import end_errors, mean_error
 from dlkf.filters.integration import integrate
 from dlkf.filters.saved import learned_filter
+from dlkf.networks.heads import IMU_ERROR_SIZE, INNOVATION_SIZE, STATE_SIZE
 from dlkf.training.callbacks.masking import BatchCallback
 from dlkf.training.loss import TERMS, LossConfig, pva_losses, weighted
+
+STATE, INNOVATION = torch.tensor(STATE_SIZE), torch.tensor(INNOVATION_SIZE)
 
 
 class FilterTraining(L.LightningModule):
@@ -65,25 +71,44 @@ class FilterTraining(L.LightningModule):
         self.log_dict({"train/loss": total.detach(), **values}, on_step=False, on_epoch=True, batch_size=batch.size[0])
         return total
 
+    def on_train_epoch_start(self) -> None:
+        """Rate and clock of the epoch."""
+        self._began = time.perf_counter()
+        self.log("train/learning_rate", self.optimizers().param_groups[0]["lr"])
+
+    def on_train_epoch_end(self) -> None:
+        """How long the epoch took."""
+        self.log("time/epoch_s", time.perf_counter() - self._began)
+
     def validation_step(self, batch: Batch, step: int) -> None:
-        """RMS over fixed outages, as it will be scored on test drives."""
+        """Errors at the ends of fixed outages, as they will be scored on test drives, and what the filter answers."""
         solution = integrate(batch, self.filter)
-        hidden = ~batch.available & batch.truth_valid & batch.present
-        square = ((solution.posterior.p_n - batch.truth.p_n) ** 2).sum(-1)
-        square = torch.where(hidden, square, torch.zeros_like(square))
-        horizontal = ((solution.posterior.p_n - batch.truth.p_n)[..., :2] ** 2).sum(-1)
-        horizontal = torch.where(hidden, horizontal, torch.zeros_like(horizontal))
-        self._sums += torch.stack((square.sum(), horizontal.sum(), hidden.sum())).double().cpu()
+        self._ends.append(end_errors(batch, solution.posterior))
+        used = solution.used.any(-1)
+        self._errors.append(solution.imu_error[:, -1].double().cpu())
+        if solution.gain is not None and bool(used.any()):
+            last = solution.used.long().cumsum(1).argmax(1)
+            self._gains.append(solution.gain[torch.arange(len(last)), last][used].double().cpu())
         losses = pva_losses(solution, batch, self.loss_config)
         plain = weighted(losses, dict.fromkeys(TERMS, 1.0))
         self.log("val/loss", plain, on_epoch=True, batch_size=batch.size[0])
 
     def on_validation_epoch_start(self) -> None:
-        """Reset the sums over the validation pieces."""
-        self._sums = torch.zeros(3, dtype=torch.float64)
+        """Collect over the validation pieces."""
+        self._ends, self._gains, self._errors = [], [], []
 
     def on_validation_epoch_end(self) -> None:
-        """Log the outage RMS over all validation pieces."""
-        full, horizontal, count = self._sums.tolist()
-        self.log("val/outage_position_rms", (full / max(count, 1)) ** 0.5)
-        self.log("val/outage_horizontal_rms", (horizontal / max(count, 1)) ** 0.5)
+        """Outage errors over all validation pieces, and the spread over pieces of the last gain and IMU error.
+
+        ``val/gain_std`` and ``val/imu_error_std`` are relative to the heads' physical sizes: near zero they say that
+        the network is a constant, whatever the errors are.
+        """
+        ends = np.concatenate(self._ends)
+        if len(ends):
+            self.log("val/outage_end_m", mean_error(ends, "log"))
+            self.log("val/outage_end_rms_m", mean_error(ends, "rms"))
+        if self._gains:
+            gain = torch.cat(self._gains).std(0) * INNOVATION / STATE[:, None]
+            self.log("val/gain_std", float(gain.square().mean().sqrt()))
+        error = torch.cat(self._errors).std(0) / torch.tensor(IMU_ERROR_SIZE)
+        self.log("val/imu_error_std", float(error.square().mean().sqrt()))

@@ -5,9 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from dlkf.data.store import dataset_digest
+from dlkf.errors import InputError
 
 STATE = "state.json"
 NOT_HASHED = ("tracking", "resume")
@@ -37,6 +40,18 @@ def read_state(folder: Path) -> dict[str, Any]:
     """The state file, empty where there is none."""
     path = folder / STATE
     return json.loads(path.read_text()) if path.is_file() else {}
+
+
+def checked_digests(datasets: Sequence[str], state: Mapping[str, Any]) -> dict[str, str]:
+    """Digest of every dataset; InputError where an unfinished run began on other data."""
+    digests = {str(d): dataset_digest(d) for d in datasets}
+    for dataset, before in state.get("data", {}).items():
+        if digests.get(dataset) != before:
+            raise InputError(
+                f"{dataset} is not what the unfinished run began with (digest {digests.get(dataset)}, was {before}): "
+                "bring the old data back, or start afresh with resume=false"
+            )
+    return digests
 
 
 def write_state(folder: Path, **values: Any) -> None:

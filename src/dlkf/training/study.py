@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -13,38 +13,41 @@ import torch
 from hydra.utils import instantiate
 from lightning.pytorch.loggers import Logger
 
-from dlkf.console import counting
+import dlkf
 from dlkf.data.datamodule import DriveDataModule
-from dlkf.data.drive import Batch
 from dlkf.data.kinds import drive_kinds
+from dlkf.data.store import dataset_digest, load_dataset
 from dlkf.errors import InputError
+from dlkf.evaluation.endurance import After, after_gnss, after_table, hour_table, without_outage
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Scenes
 from dlkf.evaluation.report import write_report
 from dlkf.evaluation.results import BASELINE, Results
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.study import study
-from dlkf.filters.build import build_filter, refuse_smoothed
+from dlkf.evaluation.table import Table
+from dlkf.filters.build import refuse_smoothed
 from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import load_filter
-from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.training.fit import fit
-from dlkf.tuning.search import FACTORS, factors_of, mean_imu_error, tuned, tuning_values
+from dlkf.tuning.baselines import Baselines, tuned_baselines
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a study leaves: scores, results per kind of data, the baselines' settings, the best weights."""
+    """What a study leaves: scores, results per kind of data, the baselines, the best weights, times, further tables."""
 
     scores: Scores
     results: list[Results]
-    tuning: dict[str, float]
-    prior: dict[str, list[float]]
+    baselines: Baselines
+    after: list[After]
+    hour: dict[str, dict[str, float]]
     weights: Path
     seconds: dict[str, float]
+    tables: list[Table]
 
 
 def load_data(config: Mapping[str, Any], say: Say) -> DriveDataModule:
@@ -61,79 +64,100 @@ def run_study(
     """Tune, train, score and write the report into ``folder/report``."""
     for name in config["baselines"]["models"]:
         refuse_smoothed(name, "the filters of this table do not")
-    spec, seconds = imu_spec(config["imu"]), {}
+    spec, scoring, seconds = imu_spec(config["imu"]), config["scoring"], {}
     if config["trainer"]["threads"]:
         torch.set_num_threads(config["trainer"]["threads"])
-    plan = OutagePlan(**{"offsets_s": (0.0,), **config["scoring"]["outage"]})
-    clock = time.perf_counter()
-    tuning, own, prior = _baseline_knowledge(config, spec, data, plan, say)
-    seconds["tuning"] = time.perf_counter() - clock
-    clock = time.perf_counter()
-    weights = fit(config, data, folder, logger)
-    seconds["training"] = time.perf_counter() - clock
-    clock = time.perf_counter()
-    filters: dict[str, Estimator] = {}
-    for name in config["baselines"]["models"]:
-        given = {"prior_mean": prior["mean"], "prior_std": prior["std"]} if "_prior" in name else {}
-        filters[name] = build_filter(name, spec, tuning=own.get(name, tuning), **given)
     learned = str(config["model"]["kind"])
-    if learned in filters:
+    names = config["baselines"]["models"]
+    if learned in names:
         raise InputError(f"baselines.models has {learned}, the name of the trained filter; take it out")
-    filters[learned] = load_filter(weights)
-    scenes = Scenes.of_split(data, "test", plan, config["scoring"]["seed"])
-    kinds: dict[str, str] = {}
-    for dataset in data.datasets:
-        kinds |= drive_kinds(dataset)
-    scores, made = study(
-        filters,
-        scenes,
-        kinds=kinds,
-        groups={d.name: d.group for d in data.stack},
-        settle_s=config["scoring"]["settle_s"],
-        injected_bias=config["scoring"]["slope"],
-        seed=config["scoring"]["seed"],
-    )
-    seconds["scoring"] = time.perf_counter() - clock
+    plan = None if scoring["outage"] is None else OutagePlan(**{"offsets_s": (0.0,), **scoring["outage"]})
+    with _timed(seconds, "tuning"):
+        baselines = _baselines(config, spec, data, plan, say)
+    with _timed(seconds, "training"):
+        card = model_card(config, data)
+        weights = fit(config, data, folder, logger, mean_imu_error=baselines.prior.mean, notes=card)
+    with _timed(seconds, "scoring"):
+        filters = {**baselines.build(), learned: load_filter(weights)}
+        scenes = Scenes.of_split(data, "test", plan, scoring["seed"])
+        kinds: dict[str, str] = {}
+        for dataset in data.datasets:
+            kinds |= drive_kinds(dataset)
+        baseline = BASELINE if BASELINE in filters else None
+        scores, made = study(
+            filters,
+            scenes,
+            kinds=kinds,
+            groups={d.name: d.group for d in data.stack},
+            settle_s=scoring["settle_s"],
+            injected_bias=scoring["slope"],
+            seed=scoring["seed"],
+        )
+        title = ", ".join(Path(d).name for d in data.datasets)
+        after, hour, tables = _endurance(filters, data, scoring, title, say)
     write_report(
         folder / "report",
-        ", ".join(Path(d).name for d in data.datasets),
+        title,
         scores,
         made,
-        protocol={"imu": spec.name, "tuning": tuning, "own_tuning": own, "prior": prior, **scenes.described()},
+        protocol={**baselines.described(), **scenes.described(), "trained on": card},
         by_time=True,
-        baseline=BASELINE if BASELINE in filters else None,
+        baseline=baseline,
+        more=tables,
     )
-    return Outcome(scores, made, tuning, prior, weights, seconds)
+    return Outcome(scores, made, baselines, after, hour, weights, seconds, tables)
 
 
-def _tuned(
-    spec: ImuSpec, pieces: Sequence[Batch], name: str, rounds: int, start: Tuning | None = None
-) -> tuple[Tuning, float]:
-    """The search under a bar of its own: it takes minutes on much data."""
-    most, done = rounds * sum(map(len, factors_of(name).values())), count(1)
-    with counting(f"Tuning {name}") as progress:
-        return tuned(spec, pieces, name=name, start=start, rounds=rounds, progress=lambda _: progress(next(done), most))
-
-
-def _baseline_knowledge(
-    config: Mapping[str, Any], spec: ImuSpec, data: DriveDataModule, plan: OutagePlan, say: Say
-) -> tuple[dict[str, float], dict[str, dict[str, float]], dict[str, list[float]]]:
-    """Over-bounding factors and mean IMU error, from training pieces alone.
-
-    The factors are those of ``mbkf15``, which all filters share, and beside them by name those of filters that have
-    more to tune, such as the noise of a constraint.
-    """
+def _baselines(
+    config: Mapping[str, Any], spec: ImuSpec, data: DriveDataModule, plan: OutagePlan | None, say: Say
+) -> Baselines:
+    """The classical filters, tuned on training pieces with outages: the scored ones, or 20 s where none are scored."""
     settings = config["baselines"]
+    plan = plan or OutagePlan(data.eval_length_s / 2, min(20.0, data.eval_length_s / 3), offsets_s=(0.0,))
     pieces = Scenes.of_split(data, "train", plan, config["scoring"]["seed"], settings["pieces"]).withheld()
     rounds = settings["rounds"] if settings["tune"] else 0
-    best, rms = _tuned(spec, pieces, "mbkf15", rounds)
-    how = "tuned" if settings["tune"] else "untuned"
-    say(f"mbkf15 {how}: {rms:.2f} m RMS in the outages of training pieces")
-    own = {}
-    for name in settings["models"]:
-        if set(factors_of(name)) > set(FACTORS) and "_prior" not in name:
-            found, rms = _tuned(spec, pieces, name, rounds, best)
-            own[name] = tuning_values(found)
-            say(f"{name} {how}: {rms:.2f} m")
-    mean, std = mean_imu_error(spec, best, pieces)
-    return tuning_values(best), own, {"mean": list(mean), "std": list(std)}
+    return tuned_baselines(settings["models"], spec, pieces, rounds=rounds, say=say)
+
+
+def _endurance(
+    filters: Mapping[str, Estimator], data: DriveDataModule, scoring: Mapping[str, Any], title: str, say: Say
+) -> tuple[list[After], dict[str, dict[str, float]], list[Table]]:
+    """Errors after longer GNSS, and over an hour without outage, where asked for."""
+    known = {n: f for n, f in filters.items() if n != "ins"}
+    after: list[After] = []
+    hour: dict[str, dict[str, float]] = {}
+    tables: list[Table] = []
+    if scoring["after_s"]:
+        after = after_gnss(known, data, scoring["after_s"], baseline=BASELINE, seed=scoring["seed"])
+        if after:
+            tables.append(after_table(title, after, BASELINE))
+        if left := sorted(set(map(float, scoring["after_s"])) - {a.seconds for a in after}):
+            say(f"no test drive has room for an outage after {', '.join(f'{s:g}' for s in left)} s of GNSS")
+    if scoring["hour"]:
+        drives = load_dataset(
+            scoring["hour"], rate_hz=data.rate_hz, epoch_s=data.epoch_s, dtype=torch.float64, progress=None
+        )
+        hour = without_outage(known, drives, data.start, seed=scoring["seed"])
+        tables.append(hour_table(Path(scoring["hour"]).name, hour))
+    return after, hour, tables
+
+
+def model_card(config: Mapping[str, Any], data: DriveDataModule) -> dict[str, Any]:
+    """What a model was made of: recordings it was trained and chosen on, the data's digests, IMU, seeds, version."""
+    return {
+        "trained_on": sorted({d.group for d in data.drives("train")}),
+        "chosen_on": sorted({d.group for d in data.drives("val")}),
+        "datasets": {Path(d).name: dataset_digest(d) for d in data.datasets},
+        "imu": config["imu"]["name"],
+        "experiment": config["name"],
+        "seed": config["seed"],
+        "max_epochs": config["trainer"]["max_epochs"],
+        "dlkf": dlkf.__version__,
+    }
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], what: str) -> Iterator[None]:
+    clock = time.perf_counter()
+    yield
+    seconds[what] = time.perf_counter() - clock

@@ -5,14 +5,17 @@ Nothing here looks at validation or test drives (R018; paper.md 4.6).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 
 from dlkf.data.drive import Batch
-from dlkf.filters.build import build_causal
+from dlkf.evaluation.metrics import end_errors, mean_error
+from dlkf.filters.build import build_causal, build_filter
 from dlkf.filters.integration import Estimator, integrate
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec
@@ -26,7 +29,6 @@ FACTORS: Mapping[str, tuple[float, ...]] = {
     "position_std": (0.5, 1.0, 2.0, 5.0),
 }
 
-
 # what a filter with these endings, or of this base, is told beside
 MORE_FACTORS: Mapping[str, Mapping[str, tuple[float, ...]]] = {
     "nhc": {"lateral_std": (0.05, 0.1, 0.2, 0.5, 1.0), "vertical_std": (0.05, 0.1, 0.2, 0.5, 1.0)},
@@ -34,7 +36,6 @@ MORE_FACTORS: Mapping[str, Mapping[str, tuple[float, ...]]] = {
     "gated": {"gate": (0.99, 0.999, 0.9999, 0.999999)},
     "aekf": {"forgetting": (0.3, 0.7, 0.9, 0.97, 0.99, 0.997)},
 }
-OBJECTIVES = ("rms", "median", "log")
 
 
 class Trial(NamedTuple):
@@ -53,28 +54,15 @@ def factors_of(name: str) -> dict[str, tuple[float, ...]]:
     return found
 
 
-def outage_error(estimator: Estimator, batches: Sequence[Batch], objective: str = "rms") -> float:
-    """Horizontal position error [m] over the epochs without GNSS of all batches; inf if the filter diverged.
-
-    ``rms`` over all epochs, which a few hard outages decide; or over each piece, and of these the ``median`` or
-    the geometric mean (``log``), to which every piece counts alike.
-    """
-    squares, counts = [], []
+def outage_error(estimator: Estimator, batches: Sequence[Batch], objective: str = "log") -> float:
+    """Horizontal error [m] at the end of the outages of all batches (:func:`dlkf.evaluation.metrics.mean_error`);
+    inf if the filter diverged or there is no outage."""
+    ends = []
     for batch in batches:
         with torch.inference_mode():
-            solution = integrate(batch, estimator)
-        hidden = ~batch.available & batch.truth_valid & batch.present
-        error = (solution.posterior.p_n - batch.truth.p_n)[..., :2].square().sum(-1)
-        squares.append(torch.where(hidden, error, 0.0).sum(-1))
-        counts.append(hidden.sum(-1))
-    square, count = torch.cat(squares), torch.cat(counts)
-    seen = count > 0
-    if not (bool(square.isfinite().all()) and bool(seen.any())):
-        return float("inf")
-    if objective == "rms":
-        return float(square.sum() / count.sum()) ** 0.5
-    pieces = (square[seen] / count[seen]).sqrt()
-    return float(pieces.quantile(0.5) if objective == "median" else pieces.clamp_min(1e-3).log().mean().exp())
+            ends.append(end_errors(batch, integrate(batch, estimator).posterior))
+    error = mean_error(np.concatenate(ends), objective)
+    return float("inf") if math.isnan(error) else error
 
 
 def tuned(
@@ -84,17 +72,20 @@ def tuned(
     name: str = "mbkf15",
     factors: Mapping[str, Sequence[float]] | None = None,
     start: Tuning | None = None,
-    objective: str = "rms",
+    objective: str = "log",
     rounds: int = 2,
+    prior: Prior | None = None,
     progress: Callable[[Trial], None] | None = None,
 ) -> tuple[Tuning, float]:
     """Over-bounding factors of a filter by coordinate search on training pieces with outages.
 
-    Returns the best factors and their :func:`outage_error` [m]; ``progress`` is told every trial.
+    ``prior`` is what a filter with ``_prior`` is told. Returns the best factors and their :func:`outage_error` [m];
+    ``progress`` is told every trial.
     """
+    told = prior.told(name) if prior else {}
 
     def judged(trial: Tuning) -> float:
-        return outage_error(build_causal(name, imu, "tuning does not", tuning=trial), batches, objective)
+        return outage_error(build_causal(name, imu, "tuning does not", tuning=trial, **told), batches, objective)
 
     best = start or Tuning()
     score = judged(best)
@@ -115,9 +106,22 @@ def tuned(
     return best, score
 
 
-def mean_imu_error(
-    imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch]
-) -> tuple[tuple[float, ...], tuple[float, ...]]:
+class Prior(NamedTuple):
+    """What is known of an IMU error before a drive (m/s² x 3, rad/s x 3): mean and 1σ."""
+
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+
+    def told(self, name: str) -> dict[str, tuple[float, ...]]:
+        """For ``build_filter``: nothing for a filter without ``_prior``."""
+        return {"prior_mean": self.mean, "prior_std": self.std} if "prior" in name.split("_") else {}
+
+    def surer(self, factor: float) -> Prior:
+        """The same mean with the spread times ``factor``."""
+        return Prior(self.mean, tuple(factor * s for s in self.std))
+
+
+def mean_imu_error(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch]) -> Prior:
     """Mean and spread of the IMU error over training pieces, as the 15-state filter estimates it with GNSS.
 
     No truth is used. The spread of the estimates about their mean is what a filter that starts from the mean
@@ -133,7 +137,17 @@ def mean_imu_error(
     estimates = torch.cat(last)
     floor = torch.tensor([1e-3] * 3 + [1e-5] * 3, dtype=estimates.dtype)
     mean, spread = estimates.mean(0), torch.maximum(estimates.std(0), floor)
-    return tuple(mean.tolist()), tuple(spread.tolist())
+    return Prior(tuple(mean.tolist()), tuple(spread.tolist()))
+
+
+def best_prior(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name: str = "mbkf15_prior") -> Prior:
+    """The mean IMU error with the spread, of three, that serves ``name`` best in the outages of training pieces.
+
+    The spread of the estimates is their estimator's scatter where all drives share one IMU, and then too wide.
+    """
+    prior = mean_imu_error(imu, tuning, batches)
+    tried = [prior.surer(factor) for factor in (1.0, 0.3, 0.1)]
+    return min(tried, key=lambda p: outage_error(build_filter(name, imu, tuning=tuning, **p.told(name)), batches))
 
 
 def tuning_values(tuning: Tuning) -> dict[str, float]:

@@ -17,13 +17,14 @@ from dlkf.data.drive import Batch, Drive
 from dlkf.data.splits import split_rows
 from dlkf.data.stack import DriveStack
 from dlkf.errors import InputError
+from dlkf.evaluation.metrics import OBJECTIVES
 from dlkf.evaluation.protocol import Protocol, Scenes
 from dlkf.evaluation.table import Table, as_markdown, number
 from dlkf.files import staged
 from dlkf.filters.build import build_filter, is_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.tuning.search import OBJECTIVES, Trial, factors_of, outage_error, tuned, tuning_values
+from dlkf.tuning.search import Trial, factors_of, outage_error, tuned, tuning_values
 
 
 @dataclass(frozen=True)
@@ -126,8 +127,8 @@ def tuning_table(result: Tuned, dataset: str) -> Table:
     factors = ", ".join(f"{k}={v:g}" for k, v in result.changed.items()) or "all as they were"
     return Table(
         title=f"{result.model} on {dataset}: {factors}",
-        note="Horizontal error over the epochs without GNSS [m]: RMS over all, median and geometric mean (log) over "
-        "the pieces. Fitted on the training drives alone.",
+        note="Horizontal error at the end of the outages [m]: geometric mean (log), RMS and median over them. Fitted "
+        "on the training drives alone.",
         columns=["Drives", "Objective", "Before", "After", "Ratio"],
         rows=rows,
     )

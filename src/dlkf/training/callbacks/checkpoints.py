@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 from lightning.pytorch.callbacks import Callback, Checkpoint
 
+from dlkf.errors import InputError
 from dlkf.filters.saved import save_filter
 
 LAST = "last.ckpt"
@@ -33,22 +36,30 @@ class ResumePoint(Checkpoint):
 
 
 class BestWeights(Callback):
-    """Keeps the weights of the epoch with the lowest ``monitor`` in ``best/`` (paper.md 4.14)."""
+    """Keeps the weights of the epoch with the lowest ``monitor`` in ``best/`` (paper.md 4.14).
 
-    def __init__(self, folder: str, monitor: str = "val/outage_position_rms", start_epoch: int = 0) -> None:
-        self.folder, self.monitor, self.start_epoch = Path(folder), monitor, start_epoch
+    A value that is not finite keeps nothing; InputError where the monitor is not among what was logged.
+    """
+
+    def __init__(
+        self, folder: str, monitor: str, start_epoch: int = 0, notes: Mapping[str, Any] | None = None
+    ) -> None:
+        self.folder, self.monitor, self.start_epoch, self.notes = Path(folder), monitor, start_epoch, notes
         self.score, self.epoch = float("inf"), -1
 
     def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Save when the validation improved."""
         if trainer.sanity_checking or trainer.current_epoch < self.start_epoch:
             return
+        if self.monitor not in trainer.callback_metrics:
+            known = ", ".join(sorted(k for k in trainer.callback_metrics if k.startswith("val/")))
+            raise InputError(f"trainer.monitor={self.monitor} is not logged; choose one of {known}")
         score = float(trainer.callback_metrics[self.monitor])
         if score < self.score:
             self.score, self.epoch = score, trainer.current_epoch
             beside, final = self.folder / f".{BEST}.{os.getpid()}", self.folder / BEST
             shutil.rmtree(beside, ignore_errors=True)
-            save_filter(module.filter, beside)
+            save_filter(module.filter, beside, self.notes)
             shutil.rmtree(final, ignore_errors=True)
             beside.rename(final)
 

@@ -1,8 +1,9 @@
-"""Guard against non-finite and exploding steps (R077; paper.md 4.13)."""
+"""Guard against non-finite and diverging steps (R077; paper.md 4.13)."""
 
 from __future__ import annotations
 
-import statistics
+import copy
+import math
 
 import lightning as L
 import torch
@@ -12,48 +13,72 @@ from dlkf.errors import InputError
 
 
 class StepGuard(Callback):
-    """Skips a step whose gradient norm is non-finite or beyond ``factor`` times the running median.
+    """Skips steps with a non-finite gradient; a large but finite one is harmless once its norm is clipped.
 
-    Skipped steps are counted and logged; ``limit`` skips in a row end the training with a clear error.
+    After ``patience`` skips in a row the weights go back to those of the last epoch that ended well, and the rate is
+    multiplied by ``slower``; after ``returns`` such returns training ends with a clear error. A skip, a return and the
+    gradient norm are logged.
     """
 
-    def __init__(self, factor: float = 100.0, window: int = 100, limit: int = 50) -> None:
-        if factor <= 1 or window < 1 or limit < 1:
-            raise InputError("callbacks.guard: need factor > 1, window ≥ 1, limit ≥ 1")
-        self.factor, self.window, self.limit = factor, window, limit
-        self.norms: list[float] = []
-        self.skipped = 0
-        self.in_a_row = 0
-
-    def accepts(self, norm: float) -> bool:
-        """Whether a step with this gradient norm may be taken; remembers what it saw."""
-        finite = norm == norm and norm != float("inf")
-        good = finite and (len(self.norms) < 10 or norm <= self.factor * statistics.median(self.norms))
-        if good:
-            self.norms = [*self.norms, norm][-self.window :]
-            self.in_a_row = 0
-        else:
-            self.skipped += 1
-            self.in_a_row += 1
-        return good
+    def __init__(self, patience: int = 5, slower: float = 0.5, returns: int = 5) -> None:
+        if patience < 1 or not 0 < slower <= 1 or returns < 0:
+            raise InputError("callbacks.guard: need patience ≥ 1, 0 < slower ≤ 1, returns ≥ 0")
+        self.patience, self.slower, self.returns = patience, slower, returns
+        self.skipped = self.in_a_row = self.returned = 0
+        self.good: dict[str, torch.Tensor] | None = None
 
     def on_before_optimizer_step(self, trainer: L.Trainer, module: L.LightningModule, optimizer) -> None:
-        """Drop the gradients of a bad step, before clipping."""
+        """Drop the gradients of a bad step, before clipping; go back where nothing else helps."""
         gradients = [p.grad for p in module.parameters() if p.grad is not None]
         norm = float(torch.nn.utils.get_total_norm(gradients)) if gradients else 0.0
-        if not self.accepts(norm):
+        if math.isfinite(norm):
+            self.in_a_row = 0
+            module.log("train/gradient_norm", norm, on_step=False, on_epoch=True)
+        else:
             optimizer.zero_grad(set_to_none=True)
-        if self.in_a_row >= self.limit:
-            raise InputError(
-                f"training stopped: {self.in_a_row} steps in a row had non-finite or exploding gradients; "
-                "lower optimizer.lr or check the data"
-            )
+            self.skipped += 1
+            self.in_a_row += 1
+            if self.in_a_row >= self.patience:
+                self._go_back(module, optimizer)
         module.log("train/skipped_steps", float(self.skipped))
 
+    def _go_back(self, module: L.LightningModule, optimizer) -> None:
+        if self.good is None or self.returned >= self.returns:
+            raise InputError(
+                f"training stopped: {self.in_a_row} steps in a row had non-finite gradients"
+                + (f", after {self.returned} returns to earlier weights" if self.returned else " in the first epoch")
+                + "; lower optimizer.lr or check the data"
+            )
+        module.load_state_dict(self.good)
+        self.returned, self.in_a_row = self.returned + 1, 0
+        optimizer.state.clear()
+
+    def rate_factor(self) -> float:
+        """What the returns so far made of the learning rate."""
+        return self.slower**self.returned
+
+    def on_train_batch_start(self, trainer: L.Trainer, module: L.LightningModule, batch, step: int) -> None:
+        """Apply the slower rate on top of the schedule."""
+        if self.returned:
+            scheduled = trainer.lr_scheduler_configs[0].scheduler.get_last_lr()
+            for group, base in zip(trainer.optimizers[0].param_groups, scheduled):
+                group["lr"] = base * self.rate_factor()
+
+    def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """Remember weights that are finite."""
+        state = module.state_dict()
+        if self.in_a_row == 0 and all(bool(x.isfinite().all()) for x in state.values() if x.is_floating_point()):
+            self.good = copy.deepcopy(state)
+
     def state_dict(self) -> dict:
-        """Running norms and counts."""
-        return {"norms": list(self.norms), "skipped": self.skipped, "in_a_row": self.in_a_row}
+        """Counts; the weights to go back to are those of the checkpoint itself."""
+        return {"skipped": self.skipped, "in_a_row": self.in_a_row, "returned": self.returned}
 
     def load_state_dict(self, state: dict) -> None:
-        """Running norms and counts of a checkpoint."""
-        self.norms, self.skipped, self.in_a_row = list(state["norms"]), state["skipped"], state["in_a_row"]
+        """Counts of a checkpoint."""
+        self.skipped, self.in_a_row, self.returned = state["skipped"], state["in_a_row"], state["returned"]
+
+    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """A run that goes on starts from good weights."""
+        if trainer.current_epoch:
+            self.good = copy.deepcopy(module.state_dict())

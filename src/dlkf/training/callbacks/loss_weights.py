@@ -1,43 +1,64 @@
-"""Adaptive weights of the position, velocity and attitude losses (R065, R066; paper.md 2.8)."""
+"""Adaptive weights of the position, velocity and attitude losses (R065–R067; paper.md 2.8)."""
 
 from __future__ import annotations
+
+import math
 
 import lightning as L
 from lightning.pytorch.callbacks import Callback
 
 from dlkf.errors import InputError
+from dlkf.training.loss import TERMS
+
+RULES = ("pilot", "ratio", "normalised")
 
 
 class AdaptiveLossWeights(Callback):
-    """w_p = 1, w_v = clip(L̄_p / L̄_v, 1, w_max), w_h likewise, from moving averages of past epochs.
+    """Weights of an epoch from the unweighted losses L̄ of those before, moving averages with ``memory``.
 
-    Velocity and attitude count more while the position loss is large and fall by themselves as the filter
-    converges (R066). ``memory`` is the share that an epoch leaves of the old average.
+    ``pilot`` (R065, R066): the first ``pilot_epochs`` run unweighted and show what the losses of velocity and attitude,
+    L₀; from then on w_v = L̄_p / L₀_v and w_h = L̄_p / L₀_h, w_p = 1. They are large while the position loss is, and
+    fall as the filter converges. ``ratio``: w_v = L̄_p / L̄_v, which keeps the three losses equal.
+    ``normalised``: w = 1 / L̄ for each (the alternative of R067). Every weight stays within 1/``w_max`` … ``w_max``.
     """
 
-    def __init__(self, w_max: float = 10.0, memory: float = 0.8) -> None:
-        if w_max < 1 or not 0 <= memory < 1:
-            raise InputError(f"callbacks.loss_weights: w_max ≥ 1 and 0 ≤ memory < 1, got {w_max}, {memory}")
-        self.w_max, self.memory = w_max, memory
+    def __init__(self, rule: str = "pilot", pilot_epochs: int = 1, w_max: float = 10.0, memory: float = 0.8) -> None:
+        if w_max < 1 or not 0 <= memory < 1 or pilot_epochs < 1:
+            raise InputError(
+                "callbacks.loss_weights: w_max ≥ 1, 0 ≤ memory < 1 and pilot_epochs ≥ 1, got "
+                f"{w_max}, {memory}, {pilot_epochs}"
+            )
+        if rule not in RULES:
+            raise InputError(f"callbacks.loss_weights: rule is {rule!r}; choose one of {', '.join(RULES)}")
+        self.rule, self.pilot_epochs, self.w_max, self.memory = rule, pilot_epochs, w_max, memory
         self.average: dict[str, float] = {}
+        self.pilot: dict[str, float] = {}
+        self.epochs = 0
 
     def update(self, losses: dict[str, float]) -> dict[str, float]:
         """Take in the unweighted losses of an epoch and return the weights for the next."""
         for term, value in losses.items():
-            if value == value and value != float("inf"):
+            if math.isfinite(value):
                 old = self.average.get(term, value)
                 self.average[term] = self.memory * old + (1 - self.memory) * value
+        self.epochs += 1
+        if self.epochs == self.pilot_epochs:
+            self.pilot = dict(self.average)
         return self.weights()
 
     def weights(self) -> dict[str, float]:
-        """Weights in force."""
-        position = self.average.get("position")
-        weights = {"position": 1.0}
-        for term in ("velocity", "attitude"):
-            loss = self.average.get(term)
-            ratio = position / loss if position is not None and loss else 1.0
-            weights[term] = min(max(ratio, 1.0), self.w_max)
-        return weights
+        """Weights in force; 1 while the pilot lasts."""
+        if not self.pilot:
+            return dict.fromkeys(TERMS, 1.0)
+        if self.rule == "normalised":
+            return {t: self._bounded(1.0, self.average.get(t)) for t in TERMS}
+        position, against = self.average.get("position"), self.pilot if self.rule == "pilot" else self.average
+        others = {t: self._bounded(position, against.get(t)) for t in TERMS if t != "position"}
+        return {"position": 1.0} | others
+
+    def _bounded(self, above: float | None, below: float | None) -> float:
+        ratio = above / below if above is not None and below else 1.0
+        return min(max(ratio, 1 / self.w_max), self.w_max)
 
     def on_train_epoch_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Set and log the weights of this epoch."""
@@ -47,12 +68,12 @@ class AdaptiveLossWeights(Callback):
     def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Take in this epoch's losses."""
         seen = trainer.callback_metrics
-        self.update({t: float(seen[f"train/{t}_loss"]) for t in ("position", "velocity", "attitude")})
+        self.update({t: float(seen[f"train/{t}_loss"]) for t in TERMS})
 
     def state_dict(self) -> dict:
-        """Moving averages."""
-        return {"average": dict(self.average)}
+        """Moving averages, and those of the pilot."""
+        return {"average": dict(self.average), "pilot": dict(self.pilot), "epochs": self.epochs}
 
     def load_state_dict(self, state: dict) -> None:
         """Moving averages of a checkpoint."""
-        self.average = dict(state["average"])
+        self.average, self.pilot, self.epochs = dict(state["average"]), dict(state["pilot"]), state["epochs"]

@@ -36,8 +36,8 @@ class TrainingProgress(Callback):
         """Advance."""
         done, seen = trainer.current_epoch + 1, trainer.callback_metrics
         text = f"loss {float(seen['train/loss']):.3f}"
-        if "val/outage_position_rms" in seen:
-            text += f"  val outage {float(seen['val/outage_position_rms']):.2f} m"
+        if "val/outage_end_m" in seen:
+            text += f"  val outage {float(seen['val/outage_end_m']):.2f} m"
         if self.bar is not None:
             self.bar.update(self.task, completed=done, description=text)
         elif done % self.every == 0 or done == trainer.max_epochs:

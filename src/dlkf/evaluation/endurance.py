@@ -1,0 +1,155 @@
+"""Does a filter that wins after a cold start still win after minutes of GNSS, and does it hold for an hour?
+
+The paper scores outages in pieces of a minute, where a Kalman filter is still converging when GNSS goes. Here the same
+outage comes after so many seconds with GNSS, and whole long pieces run without any outage (R124, R161).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dlkf.data.datamodule import DriveDataModule
+from dlkf.data.drive import Drive
+from dlkf.data.segments import StartLaw, cut_pieces
+from dlkf.errors import InputError
+from dlkf.evaluation.bootstrap import Comparison, compare
+from dlkf.evaluation.metrics import magnitudes, outage_end, summary
+from dlkf.evaluation.outages import OutagePlan
+from dlkf.evaluation.protocol import Protocol, Scenes
+from dlkf.evaluation.run import score_scenes
+from dlkf.evaluation.table import Table, number, with_interval
+from dlkf.filters.integration import Estimator
+
+OUTAGE_S = 40.0
+REST_S = 5.0  # of a piece behind its outage
+MINUTES = ((1, 10), (10, 30), (30, 60))
+
+
+@dataclass(frozen=True)
+class After:
+    """Errors at the end of an outage after ``seconds`` with GNSS, RMS and geometric mean; of heading at its start."""
+
+    seconds: float
+    pieces: int
+    groups: int
+    filters: dict[str, dict[str, float]]
+    ratios: dict[str, Comparison]  # geometric means against the baseline, with intervals
+
+
+def after_gnss(
+    filters: Mapping[str, Estimator],
+    data: DriveDataModule,
+    seconds: Sequence[float],
+    *,
+    baseline: str,
+    seed: int,
+    side: str = "test",
+    limit: int | None = 100,
+) -> list[After]:
+    """The same outage of 40 s after so many seconds with GNSS, over the test side's drives; a length that no drive
+    has room for is left out."""
+    out = []
+    for first in seconds:
+        length = first + OUTAGE_S + REST_S
+        pieces = cut_pieces(data.stack, length, span=data.spans[side])
+        if not pieces:
+            continue
+        plan = OutagePlan(float(first), OUTAGE_S, offsets_s=(0.0,))
+        protocol = Protocol("pieces", length, length, data.start, outage=plan, seed=seed)
+        scenes = Scenes(data.stack, protocol, pieces=pieces, limit=limit)
+        scores = score_scenes(filters, scenes, groups={d.name: d.group for d in data.stack})
+        w = scores.windows
+        groups = [scores.pieces[i].group for i in w.piece]
+        ends, rows = {}, {}
+        for name, run in scores.filters.items():
+            size = magnitudes(run.error)
+            ends[name] = outage_end(size["horizontal"], w)
+            before = size["heading"][w.piece, np.maximum(w.first - 1, 0)]
+            stats = summary(ends[name])
+            rows[name] = {
+                "rms_m": stats["rms"],
+                "geometric_m": geometric(ends[name]),
+                "heading_deg": math.degrees(summary(before)["rms"]),
+            }
+        ratios = {
+            name: compare(x, ends[baseline], statistic="geomean", groups=groups, seed=seed)
+            for name, x in ends.items()
+            if baseline in ends and name != baseline
+        }
+        out.append(After(float(first), len(w.piece), len(set(groups)), rows, ratios))
+    return out
+
+
+def geometric(x: np.ndarray) -> float:
+    """Geometric mean of errors [m]; NaN left out."""
+    x = x[~np.isnan(x)]
+    return float(np.exp(np.mean(np.log(np.maximum(x, 1e-3))))) if len(x) else math.nan
+
+
+def without_outage(
+    filters: Mapping[str, Estimator], drives: Sequence[Drive], start: StartLaw, *, seed: int, minutes: float = 60.0
+) -> dict[str, dict[str, float]]:
+    """RMS of position [m] and heading [°] over parts of a piece of an hour with GNSS throughout, per filter.
+
+    Raises InputError where no drive is that long.
+    """
+    length = 60.0 * minutes
+    pieces = cut_pieces(drives, length)
+    if not pieces:
+        raise InputError(f"no drive has {minutes:g} min of valid truth; simulate longer ones, dataset.drive_minutes=63")
+    scores = score_scenes(filters, Scenes(drives, Protocol("pieces", length, length, start, seed=seed), pieces=pieces))
+    out = {}
+    for name, run in scores.filters.items():
+        size = magnitudes(run.error)
+        row: dict[str, float] = {}
+        for low, high in MINUTES:
+            part = (scores.t > 60 * low) & (scores.t <= 60 * high)
+            if part.any():
+                row[f"heading_deg_{low}_{high}_min"] = math.degrees(summary(size["heading"][:, part].ravel())["rms"])
+                row[f"position_m_{low}_{high}_min"] = summary(size["position"][:, part].ravel())["rms"]
+        out[name] = row
+    return out
+
+
+def after_table(dataset: str, rows: Sequence[After], baseline: str) -> Table:
+    """One column per time with GNSS: geometric mean, RMS and the ratio of geometric means with its interval."""
+    names = list(rows[0].filters)
+    cells = []
+    for name in names:
+        row = [name]
+        for r in rows:
+            f = r.filters[name]
+            ratio = with_interval(r.ratios.get(name)) if baseline in r.filters else ""
+            row += [f"{number(f['geometric_m'])} / {number(f['rms_m'])}", ratio, number(f["heading_deg"])]
+        cells.append(row)
+    columns = ["Filter"]
+    for r in rows:
+        columns += [f"after {r.seconds:g} s\ngeo / RMS [m]", f"ratio to\n{baseline}", "heading\n[°]"]
+    counts = ", ".join(f"{r.pieces} outages of {r.groups} recordings after {r.seconds:g} s" for r in rows)
+    return Table(
+        title=f"{dataset}: outages of {OUTAGE_S:g} s after longer and longer GNSS",
+        note=f"{counts}. Horizontal error at the end, geometric mean and RMS; ratio of geometric means; heading: RMS "
+        "error when GNSS goes. A filter that wins in the first column alone has won a cold start.",
+        columns=columns,
+        rows=cells,
+    )
+
+
+def hour_table(dataset: str, rows: Mapping[str, Mapping[str, float]]) -> Table:
+    """Heading and position by part of the hour."""
+    keys = list(next(iter(rows.values())))
+
+    def heading(key: str) -> str:
+        what, unit, low, high, _ = key.split("_")
+        return f"{what}\n{low}–{high} min [{'°' if unit == 'deg' else unit}]"
+
+    return Table(
+        title=f"{dataset}: an hour with GNSS and no outage",
+        note="RMS over the part of the hour.",
+        columns=["Filter", *map(heading, keys)],
+        rows=[[name, *(number(row[k]) for k in keys)] for name, row in rows.items()],
+    )

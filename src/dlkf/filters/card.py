@@ -1,0 +1,61 @@
+"""What a learned filter was made of, stored beside its weights, and what that says about scoring it (paper.md 4.8)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from dlkf.data.drive import Drive
+from dlkf.errors import InputError
+
+CARD = "card.yaml"
+
+
+def read_card(folder: Path) -> dict[str, Any]:
+    """The card in a model's folder; empty where there is none."""
+    path = folder / CARD
+    if not path.is_file():
+        return {}
+    try:
+        values = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is not readable YAML: {str(error).splitlines()[0]}") from None
+    return values if isinstance(values, dict) else {}
+
+
+def recordings_seen(card: Mapping[str, Any], dataset: str, digest: str, groups: Iterable[str]) -> set[str]:
+    """Recordings among ``groups`` that a model was trained or chosen on.
+
+    They count where the dataset's name or its digest is one of the card's: recordings of other datasets may bear
+    the same names.
+    """
+    known = card.get("datasets") or {}
+    if dataset not in known and digest not in known.values():
+        return set()
+    return set(groups) & {*(card.get("trained_on") or ()), *(card.get("chosen_on") or ())}
+
+
+def without_seen(
+    cards: Mapping[str, Mapping[str, Any]], drives: Sequence[Drive], digest: str, *, leave_out: bool
+) -> tuple[list[Drive], list[str]]:
+    """The drives to score models on, and a line for each model that knows some of their recordings.
+
+    ``cards`` by the models' names; ``leave_out`` takes those recordings out, for all models alike. InputError where
+    none is left.
+    """
+    groups = {d.group for d in drives}
+    seen = {name: recordings_seen(card, drives[0].dataset, digest, groups) for name, card in cards.items()}
+    if leave_out:
+        kept = [d for d in drives if d.group not in set().union(*seen.values())]
+        if not kept:
+            raise InputError("unseen=true leaves no drive: every recording was in the training of one of the models")
+        return kept, []
+    return list(drives), [
+        f"{name} was trained or chosen on {len(which)} of these {len(groups)} recordings, which flatters it; "
+        "unseen=true leaves them out"
+        for name, which in seen.items()
+        if which
+    ]

@@ -1,0 +1,76 @@
+"""The classical filters of a study, each tuned itself on training pieces with outages (R018; paper.md 4.6)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import count
+from typing import Any
+
+from dlkf.console import counting
+from dlkf.data.drive import Batch
+from dlkf.filters.build import build_filter
+from dlkf.filters.integration import Estimator
+from dlkf.filters.tuning import Tuning
+from dlkf.navigation.imu_errors import ImuSpec
+from dlkf.tuning.search import Prior, best_prior, factors_of, outage_error, tuned, tuning_values
+
+FIRST = "mbkf15"  # where the others' search starts, and what the mean IMU error is estimated with
+
+
+@dataclass(frozen=True)
+class Baselines:
+    """Filters by name with the factors each was given, and what those with ``_prior`` are told."""
+
+    imu: ImuSpec
+    tunings: dict[str, Tuning]
+    prior: Prior
+
+    def build(self) -> dict[str, Estimator]:
+        """The filters."""
+        return {n: build_filter(n, self.imu, tuning=t, **self.prior.told(n)) for n, t in self.tunings.items()}
+
+    def described(self) -> dict[str, Any]:
+        """Plain values for a report."""
+        return {
+            "imu": self.imu.name,
+            "tuning": {n: tuning_values(t) for n, t in self.tunings.items() if n != "ins"},
+            "prior": {"mean": list(self.prior.mean), "std": list(self.prior.std)},
+        }
+
+
+def tuned_baselines(
+    names: Sequence[str], imu: ImuSpec, batches: Sequence[Batch], *, rounds: int, say: Callable[[str], None] = print
+) -> Baselines:
+    """Tune each of ``names`` on the outages of training pieces; 0 ``rounds`` leave the factors as they come.
+
+    All but ``ins`` start at those of ``mbkf15`` and search over their own (:func:`dlkf.tuning.search.factors_of`).
+    """
+    first, _ = _searched(imu, batches, FIRST, rounds)
+    prior = best_prior(imu, first, batches)
+    tunings: dict[str, Tuning] = {}
+    for name in names:
+        start = Tuning() if name == "ins" else first
+        if name in ("ins", FIRST):
+            tunings[name] = start
+            error = outage_error(build_filter(name, imu, tuning=start), batches)
+        else:
+            tunings[name], error = _searched(imu, batches, name, rounds, start, prior)
+        how = "tuned" if rounds and name != "ins" else "untuned"
+        say(f"{name} {how}: {error:.2f} m at the end of the outages of training pieces (geometric mean)")
+    return Baselines(imu, tunings, prior)
+
+
+def _searched(
+    imu: ImuSpec,
+    batches: Sequence[Batch],
+    name: str,
+    rounds: int,
+    start: Tuning | None = None,
+    prior: Prior | None = None,
+) -> tuple[Tuning, float]:
+    """A search under a bar of its own: it takes minutes on much data."""
+    most, done = rounds * sum(map(len, factors_of(name).values())), count(1)
+    with counting(f"Tuning {name}") as bar:
+        given = {"name": name, "rounds": rounds, "start": start, "prior": prior}
+        return tuned(imu, batches, **given, progress=lambda _: bar(next(done), most))
