@@ -220,7 +220,7 @@ def draw(path: Path, table: pd.DataFrame, names: Sequence[str]) -> None:
         axes.set_title(f"{speed}, {low:g}–{high:g} m/s", fontsize=10)
     for axes in panels[-1]:
         axes.set_xlabel("Frequency [Hz]")
-    panels[0, 0].legend(fontsize=7)
+    figure.legend(*panels[0, 1].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
 

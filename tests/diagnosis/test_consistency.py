@@ -80,6 +80,8 @@ def test_the_command_writes_table_picture_and_numbers(call):
     assert {p.name for p in Path("found").iterdir()} == {"table.md", "consistency.png", "consistency.json"}
     series = json.loads(Path("found/consistency.json").read_text())
     assert set(series) == {"mbkf15", "mbkf21_car"} and series["mbkf15"]["innovation"][20] is None
+    done = call("consistency", "chassis=wide", "model=mbkf15", "out=any", *size)  # cars drawn from ranges
+    assert done.code == 0, done.err
     done = call("consistency", "model=ins", "out=none", *size)
     assert done.code == 2 and "model ins has no covariance" in done.err and not Path("none").exists()
     done = call("consistency", "model=mbkf15", "out=none", "drives=1")

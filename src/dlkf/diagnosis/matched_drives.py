@@ -23,6 +23,7 @@ from dlkf.data.validate import DriveTables
 from dlkf.errors import InputError
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.navigation.state import ErrorStates
+from dlkf.ranges import draw, has_ranges, middle
 from dlkf.settings import built
 from dlkf.simulation.drive import sliced
 from dlkf.simulation.imu import corrupt, draw_unit, inverse_mechanisation
@@ -45,6 +46,7 @@ class MatchedDrives:
     chassis: ChassisConfig = field(default_factory=ChassisConfig)
     start: StartLaw = field(default_factory=StartLaw)
     seed: int = 0
+    cars: Mapping[str, Any] | None = None  # ranges that the chassis of each drive is drawn from, if any
 
     def __post_init__(self) -> None:
         if not (isinstance(self.drives, int) and self.drives >= 2):
@@ -60,7 +62,8 @@ class MatchedDrives:
 def matched_drives(config: Mapping[str, Any]) -> MatchedDrives:
     """Settings from the keys of ``conf/consistency.yaml``; InputError for unknown ones and odd values."""
     plain = {key: config[key] for key in ("drives", "minutes", "rate_hz", "vehicle", "chassis", "start", "seed")}
-    return built(MatchedDrives, plain | dict(config["gnss"]), "consistency")
+    settings = built(MatchedDrives, middle(plain) | dict(config["gnss"]), "consistency")
+    return replace(settings, cars=config["chassis"]) if has_ranges(config["chassis"]) else settings
 
 
 def matching(spec: ImuSpec, states: ErrorStates) -> ImuSpec:
@@ -110,8 +113,12 @@ def _drive(settings: MatchedDrives, spec: ImuSpec, index: int) -> tuple[Drive, n
     t = np.arange(round(settings.minutes * 60) * rate + 1) / rate
     route = random_route(motion, settings.vehicle, float(t[-1]))
     truth = follow(route, settings.vehicle, t)
-    if not settings.chassis.is_point:
-        truth = mounted(car_rng, draw_car(car_rng, settings.chassis), route, truth)
+    chassis = settings.chassis
+    if settings.cars is not None:
+        seed = np.random.SeedSequence(settings.seed, spawn_key=(index, 1))
+        chassis = built(ChassisConfig, draw(settings.cars, seed), "chassis")
+    if not chassis.is_point:
+        truth = mounted(car_rng, draw_car(car_rng, chassis), route, truth)
     exact, unit = inverse_mechanisation(truth), draw_unit(unit_rng, spec)
     measured, error = corrupt(imu_rng, exact, spec, unit, rate)
     bias = error - np.concatenate((exact[:, :3] @ unit.matrix[0].T, exact[:, 3:] @ unit.matrix[1].T), -1)

@@ -30,12 +30,13 @@ ENGINE_ORDERS = ((1.0, 0.6), (0.5, 0.25), (2.0, 0.15))  # of the firing frequenc
 WHEEL_ORDERS = ((1.0, 0.7), (2.0, 0.3))
 SOURCES = ("engine", "wheel", "hum", "rumble", "rattle")
 BURST_S = 0.1  # s
+LIMIT = 5.0  # m/s², RMS per axis of a source that nothing exceeds: a mount has stops, and a driver has ears
 NOISE_TURN_HZ = 15.0  # frequency at which noise turns the mount by ``turning``
 
 
 @dataclass(frozen=True)
 class Shaking:
-    """Sizes are RMS per axis on average [m/s²] before the mount amplifies them; 0 switches a source off.
+    """Sizes are RMS per axis on average [m/s²] before the mount amplifies them, to ``LIMIT`` at most; 0 switches off.
 
     ``loudness``: share of all sizes but ``sway`` that a car lets through, 0 for none.
     ``engine``: at a firing frequency of 50 Hz, growing in proportion to it; ``idle_hz`` is the firing frequency at
@@ -139,7 +140,8 @@ def shaken(
         _add_wheels(wheel_rng, kind, out, motion_at(t), coarse)
     if kind.rumble > 0 or kind.rattle > 0:
         nodes = np.arange(math.ceil(end * NODE_HZ) + 1) / NODE_HZ
-        envelope = kind.rumble * np.interp(nodes, coarse.t, np.abs(coarse.speed) / AT_SPEED * roughness(coarse.t))
+        rolling = np.abs(coarse.speed) / AT_SPEED * roughness(coarse.t)
+        envelope = limited(kind.rumble * np.interp(nodes, coarse.t, rolling))
         x = noise(noise_rng, kind, envelope)
         spline = make_interp_spline(nodes, x, k=5)
         at = spline(t)
@@ -210,7 +212,7 @@ def _add_tones(
     cycles, rate = turns.antiderivative()(t), turns(t)
     for order, share in orders:
         w = 2 * math.pi * order * frequency
-        spline = make_interp_spline(nodes, size * gain(kind, order * frequency) / w**2, k=3)
+        spline = make_interp_spline(nodes, limited(size * gain(kind, order * frequency)) / w**2, k=3)
         _add_tone(
             rng, kind, out, math.sqrt(2 * share), 2 * math.pi * order * cycles, 2 * math.pi * order * rate,
             spline(t), spline(t, nu=1),
@@ -224,7 +226,9 @@ def _add_wheels(
     per_metre = 2 * math.pi * kind.wheel_turns
     for order, share in WHEEL_ORDERS:
         size = kind.wheel / (order * per_metre * AT_SPEED) ** 2
-        strength = size * gain(kind, order * kind.wheel_turns * np.abs(coarse.speed))
+        f = order * kind.wheel_turns * np.abs(coarse.speed)
+        quick = (2 * math.pi * np.maximum(f, 0.1)) ** 2
+        strength = limited(size * gain(kind, f) * quick) / quick
         spline = make_interp_spline(coarse.t, _smoothed(strength, 4.0), k=3)
         _add_tone(
             rng, kind, out, math.sqrt(2 * share), order * per_metre * motion.distance, order * per_metre * motion.speed,
@@ -309,6 +313,11 @@ def sway(
     w, z = 2 * math.pi * kind.sway_hz, kind.sway_damping
     b, a = bilinear([w * w], [1.0, 2 * z * w, w * w], NODE_HZ / 2)
     return make_interp_spline(nodes, lfilter(b, a, asked, axis=0), k=5)
+
+
+def limited(size: Array) -> Array:
+    """A size x [m/s²] that saturates at ``LIMIT``, x/(1 + (x/LIMIT)⁴)^¼: within 2 % of it up to half of that."""
+    return size / (1 + (size / LIMIT) ** 4) ** 0.25
 
 
 def _smoothed(x: Array, nodes: float) -> Array:
