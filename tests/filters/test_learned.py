@@ -254,6 +254,47 @@ def test_mistakes_in_a_model_folder_are_one_clear_line(tmp_path):
     assert "no config.yaml" in complaint(lambda f: (f / "config.yaml").unlink())
 
 
+class Mean(torch.nn.Module):
+    """A network of one's own: one dense layer over the window's mean and the components, no memory."""
+
+    def __init__(self, flags: int, width: int = 8):
+        super().__init__()
+        self.width = width
+        self.layer = torch.nn.Linear(15 + 30 + flags, width)
+
+    def start(self, batch_size, like):
+        return ()
+
+    def forward(self, window, components, memory):
+        return torch.tanh(self.layer(torch.cat((window.mean(-1), components), -1))), ()
+
+
+def test_a_network_of_one_s_own_runs_is_saved_and_loaded(tmp_path):
+    target = f"{__name__}.Mean"
+    network = {"_target_": target, "width": 6, "kernel": 3}
+    config = LearnedConfig.from_mapping({"outage_mode": "run", "network": network})
+    model = LearnedFilter(config).eval()
+    assert model.network.layer.weight.shape == (6, 47)
+    save_filter(model, tmp_path / "model")
+    again = load_filter(tmp_path / "model")
+    batch = single(scene(2, 10, seed=7))
+    assert torch.equal(integrate(batch, model).posterior.p_n, integrate(batch, again).posterior.p_n)
+
+
+@pytest.mark.parametrize(
+    "network,words",
+    [
+        ({"_target_": "nowhere.Mean"}, "PYTHONPATH"),
+        ({"_target_": f"{__name__}.Nothing"}, "Nothing"),
+        ({"_target_": f"{__name__}.Mean", "colour": 3}, "takes no colour; it takes flags, width"),
+        ({"_target_": "torch.nn.Identity"}, "has no width"),
+    ],
+)
+def test_a_network_that_is_none_is_said_clearly(network, words):
+    with pytest.raises(InputError, match=words):
+        LearnedFilter(LearnedConfig.from_mapping({"network": network}))
+
+
 @pytest.mark.parametrize(
     "settings,words",
     [

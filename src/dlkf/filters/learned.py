@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 import torch
@@ -15,9 +15,10 @@ from dlkf.errors import InputError
 from dlkf.filters.integration import Correction, Epoch, integrate
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.state import ATTITUDE, NavState
-from dlkf.networks.cnn_lstm import CnnLstm, NetworkConfig, Recurrent
+from dlkf.networks.cnn_lstm import NetworkConfig, Recurrent
 from dlkf.networks.features import FRAMES, Scaling, component_features, level_rotation, window_features
 from dlkf.networks.heads import FORMS, GainHead, ImuErrorHead
+from dlkf.networks.own import OwnNetwork
 
 OUTAGE_MODES = ("hold", "run")
 KNOWN_FROM = ("nothing", "training")
@@ -37,7 +38,7 @@ class LearnedConfig:
     gradient at the network's inputs (paper.md 4.13). ``rate_hz``, ``epoch_s``: what it was trained on.
     """
 
-    network: NetworkConfig = field(default_factory=NetworkConfig)
+    network: NetworkConfig | OwnNetwork = field(default_factory=NetworkConfig)
     outage_mode: str = "hold"
     frame: str = "ned"
     detach_features: bool = True
@@ -68,7 +69,9 @@ class LearnedConfig:
         if not isinstance(network, Mapping):
             raise InputError(f"model.network is {network!r}; it must hold the network's settings")
         network = dict(network)
-        for given, target, where in ((values, cls, "model"), (network, NetworkConfig, "model.network")):
+        own = network.pop("_target_", None)
+        checked = [(values, cls, "model"), *([] if own else [(network, NetworkConfig, "model.network")])]
+        for given, target, where in checked:
             known = {f.name: f.default for f in fields(target) if f.name != "network"}
             for key, value in given.items():
                 if key not in known:
@@ -77,17 +80,17 @@ class LearnedConfig:
                     raise InputError(f"{where}.{key} is {value!r}; must be like {known[key]!r}")
         values.setdefault("rate_hz", cls.rate_hz)
         values.setdefault("epoch_s", cls.epoch_s)
-        network.setdefault("samples", round(values["rate_hz"] * values["epoch_s"]))
+        samples = network.pop("samples", round(values["rate_hz"] * values["epoch_s"]))
+        flags = 2 if values.get("outage_mode", cls.outage_mode) == "run" else 0
+        if own:
+            return cls(network=OwnNetwork(str(own), samples, flags, network), **values)
         network["dense"] = tuple(network.get("dense", NetworkConfig.dense))
-        network["flags"] = 2 if values.get("outage_mode", cls.outage_mode) == "run" else 0
-        return cls(network=NetworkConfig(**network), **values)
+        return cls(network=NetworkConfig(samples=samples, flags=flags, **network), **values)
 
     def plain(self) -> dict[str, Any]:
         """Plain values for a file."""
-        values = asdict(self)
-        values["network"]["dense"] = list(values["network"]["dense"])
-        values["network"].pop("flags")
-        return values
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return values | {"network": self.network.plain()}
 
 
 def _is_like(value: Any, default: Any) -> bool:
@@ -120,7 +123,7 @@ class LearnedFilter(nn.Module):
         super().__init__()
         self.config = config
         self.scaling = Scaling()
-        self.network = CnnLstm(config.network)
+        self.network = config.network.build()
         self.gain = GainHead(self.network.width, config.initial_gain)
         self.imu_error = ImuErrorHead(self.network.width, config.imu_error, config.imu_error_bound)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -55,6 +56,15 @@ class NetworkConfig:
             raise InputError("model.network: every size must be at least 1")
         if not 0 <= self.dropout < 1:
             raise InputError(f"model.network.dropout is {self.dropout}; it must be in [0, 1)")
+
+    def build(self) -> CnnLstm:
+        """The network."""
+        return CnnLstm(self)
+
+    def plain(self) -> dict[str, Any]:
+        """Plain values for a file; ``flags`` follow from the filter's mode."""
+        values = asdict(self) | {"dense": list(self.dense)}
+        return {k: v for k, v in values.items() if k != "flags"}
 
 
 Recurrent = tuple[Tensor, ...]  # each (layers, B, hidden); h and c of LSTM cells, h of GRU cells, empty without cells
