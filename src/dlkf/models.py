@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 from dlkf.errors import InputError
-from dlkf.filters.build import build_filter, is_filter, known_filters
+from dlkf.filters.build import OWN_SOURCE, build_filter, is_filter, known_filters
 from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import CONFIG, WEIGHTS, load_filter
 from dlkf.navigation.imu_errors import ImuSpec
@@ -25,7 +27,8 @@ def resolve_model(
     tuning: Mapping[str, float] | None = None,
     prior: Mapping[str, Sequence[float]] | None = None,
 ) -> Estimator:
-    """A filter by name, from a folder with weights and config, an MLflow run id, or ``models:/name@alias``.
+    """A filter by name, from a folder with weights and config, an MLflow run id, ``models:/name@alias``, or a class of
+    one's own, ``module:Class``.
 
     ``imu`` and ``tuning`` belong to the model-based filters, ``prior`` (``mean``, ``std``) to
     ``mbkf15_prior``. Raises InputError for anything else, listing what is known.
@@ -35,6 +38,8 @@ def resolve_model(
         if "_prior" in spec and prior:
             given |= {"prior_mean": prior.get("mean"), "prior_std": prior.get("std")}
         return build_filter(spec, imu, **given)
+    if OWN_SOURCE.fullmatch(spec):
+        return own_filter(spec, imu)
     if is_tracked(spec):
         from dlkf.tracking.registry import download_model  # MLflow takes seconds to import
 
@@ -48,8 +53,23 @@ def resolve_model(
         )
     raise InputError(
         f"unknown model {spec!r}: neither a known filter ({known_filters()}) nor a folder, "
-        "an MLflow run id or models:/name@alias"
+        "an MLflow run id, models:/name@alias or a class of your own, module:Class"
     )
+
+
+def own_filter(spec: str, imu: ImuSpec) -> Estimator:
+    """A user's estimator from ``module:Class``, told the IMU's preset if its class takes an argument ``imu``.
+
+    Raises InputError where there is none.
+    """
+    module, _, name = spec.partition(":")
+    try:
+        kind = getattr(import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"model={spec}: {error}; give module:Class, with the module's folder in PYTHONPATH") from None
+    if not (callable(kind) and hasattr(kind, "begin") and hasattr(kind, "step")):
+        raise InputError(f"model={spec} has no begin and step; dlkf.filters.integration.Estimator is what it takes")
+    return kind(imu=imu) if "imu" in signature(kind).parameters else kind()
 
 
 def grid_of(
@@ -91,6 +111,8 @@ def short_name(spec: str) -> str:
         return spec[:8]
     if spec.startswith("models:/"):
         return spec.removeprefix("models:/")
+    if OWN_SOURCE.fullmatch(spec):
+        return spec.partition(":")[2]
     folder = Path(spec).expanduser().resolve()
     if folder.name == BEST:  # outputs/train/<name>/<hash>/best
         return f"{folder.parents[1].name}-{folder.parent.name}"

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 
+from dlkf.config import config_dir
+from dlkf.errors import InputError
+from dlkf.models import resolve_model
+from dlkf.navigation.imu_errors import imu_spec
 from dlkf.tracking.runs import SQLITE, mlflow_module
 from tests.docs.conftest import Run
 from tests.docs.pages import ROOT, Block, blocks, commands
@@ -57,6 +63,23 @@ def test_a_recipe_is_short(recipe: str) -> None:
     for block in RECIPES[recipe]:
         code = [line for line in block.text.splitlines() if line.strip() and not line.startswith("#")]
         assert len(code) <= LONGEST, f"{recipe}: {len(code)} lines"
+
+
+def test_a_filter_and_a_source(desk: Path, run: Run) -> None:
+    followed("A filter", desk, run)
+    metrics = json.loads((desk / "outputs" / "blend" / "metrics.json").read_text())
+    assert "Blend" in json.dumps(metrics)
+    followed("A source of measurements", desk, run)
+    solved = {f: pd.read_parquet(next((desk / "outputs" / f).glob("drive=*"))) for f in ("limited", "blended")}
+    speed = {f: np.hypot(s["vel_n"], s["vel_e"]).max() for f, s in solved.items()}
+    assert speed["limited"] < speed["blended"]
+
+
+def test_mistakes_in_a_filter_of_ones_own() -> None:
+    imu = imu_spec(yaml.safe_load((config_dir() / "imu" / "consumer.yaml").read_text()))
+    for spec, said in (("no_such_module:Blend", "No module named"), ("json:dumps", "has no begin and step")):
+        with pytest.raises(InputError, match=said):
+            resolve_model(spec, imu)
 
 
 def test_an_imu(desk: Path, run: Run) -> None:
