@@ -11,12 +11,13 @@ import pytest
 SRC = Path(__file__).parents[1] / "src"
 FLOORS = (
     {"", "errors"},
-    {"settings", "files", "console", "config", "provenance", "ranges"},
+    {"settings", "files", "console", "config", "provenance", "ranges", "colours"},
     {"navigation"},
     {"data", "networks"},
     {"filters", "simulation"},
     {"running"},
     {"evaluation"},
+    {"report"},
     {"tuning", "diagnosis"},
     {"tracking"},
     {"training"},

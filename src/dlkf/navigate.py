@@ -1,12 +1,13 @@
 """Navigate whole drives: ``python -m dlkf.navigate model=mbkf15 dataset=data/town out=outputs/town``.
 
 From IMU and GNSS alone; ``reference/`` is never opened. Writes ``out/drive=<id>/solution.parquet`` for every
-drive, or nothing (columns: dlkf.running.solution).
+drive and ``out/report.html``, or nothing (columns: dlkf.running.solution).
 """
 
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -15,13 +16,15 @@ from omegaconf import DictConfig, OmegaConf
 from dlkf.command import command
 from dlkf.console import counting
 from dlkf.data.alignment import AlignConfig
-from dlkf.data.store import drive_rows, load_dataset
+from dlkf.data.store import dataset_digest, drive_rows, load_dataset
 from dlkf.errors import InputError
 from dlkf.files import staged, vacant
 from dlkf.filters.smoother import smoothed
-from dlkf.models import grid_of, resolve_model
+from dlkf.models import grid_of, resolve_model, short_name
 from dlkf.navigation.imu_errors import imu_spec
-from dlkf.running.offline import FixSpacing, epoch_for, navigate_drives
+from dlkf.provenance import provenance
+from dlkf.report.navigation import Course, answers, write_page
+from dlkf.running.offline import Fixes, epoch_for, navigate_drives
 from dlkf.running.replay import stream_drives
 from dlkf.running.solution import write_solution
 
@@ -41,7 +44,7 @@ def main(cfg: DictConfig) -> None:
         prior=config["prior"],
     )
     rows = drive_rows(config["dataset"], config["drives"])
-    spacings = {row.name: FixSpacing.of(config["dataset"], row.name) for row in rows}
+    spacings = {row.name: Fixes.of(config["dataset"], row.name) for row in rows}
     usual = epoch_for(spacings.values(), config["rate_hz"] or 50.0, model)
     grid = {"drives": config["drives"], **grid_of([model], config["rate_hz"], config["epoch_s"], usual)}
     skipped: dict[str, str] | None = {} if config["skip_unaligned"] else None
@@ -62,15 +65,20 @@ def main(cfg: DictConfig) -> None:
                 **grid,
             )
         navigated = partial(navigate_drives, drives, model, align=align, skipped=skipped)
-    lines = []
+    lines, courses = [], []
     with staged(config["out"]) as folder, counting("Navigating") as progress:
         for result in navigated(progress=progress):
             write_solution(folder / f"drive={result.drive}" / "solution.parquet", result.table)
             lines.append(result.summary(spacings[result.drive]))
+            courses.append(Course(result, spacings[result.drive]))
+        made = {**provenance(), **{k: config[k] for k in ("model", "dataset")}, **grid}
+        made |= {"digest": dataset_digest(config["dataset"]), "imu": config["imu"], "tuning": config["tuning"]}
+        write_page(folder, short_name(config["model"]), Path(config["dataset"]).resolve().name, courses, made)
     print("\n".join(sorted(lines)))
     for reason in (skipped or {}).values():
         print(f"left out: {reason}")
-    print(f"Solutions: {config['out']}/drive=*/solution.parquet")
+    print("\n".join(answers(short_name(config["model"]), courses)))
+    print(f"Solutions: {config['out']}/drive=*/solution.parquet; report: {config['out']}/report.html")
 
 
 if __name__ == "__main__":

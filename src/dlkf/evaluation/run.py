@@ -92,6 +92,7 @@ def score_scenes(
         truth_p_n=joined(truths, "p_n"),
         truth_v_n=joined(truths, "v_n"),
         true_imu_error=joined(truths, "imu_error"),
+        origin_e=np.concatenate([x.origin_e for x in truths]),
         filters={
             name: FilterRun(**{f.name: joined(rows, f.name) for f in fields(FilterRun)})
             for name, rows in runs.items()
@@ -109,6 +110,7 @@ class _Truth(NamedTuple):
     p_n: Array
     v_n: Array
     imu_error: Array
+    origin_e: Array
 
     @staticmethod
     def of(batch: Batch, mask: Tensor) -> _Truth:
@@ -116,7 +118,8 @@ class _Truth(NamedTuple):
         p, v = (torch.where(known, x.double(), torch.nan).cpu().numpy() for x in batch.truth[:2])
         error = batch.true_imu_error.double().cpu().numpy()
         outage = mask.cpu().numpy().astype(float)
-        return _Truth(batch.epoch_s, batch.drive, batch.t_start.tolist(), outage, p, v, error)
+        origin = batch.frame.origin_e.cpu().numpy()
+        return _Truth(batch.epoch_s, batch.drive, batch.t_start.tolist(), outage, p, v, error, origin)
 
 
 def _blank(batch: Batch) -> FilterRun:

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
+import torch
 
 from dlkf.evaluation.metrics import Array, Mask, Windows, windows
+from dlkf.navigation.earth import ned_axes
+from dlkf.navigation.geodetic import geodetic_from_ecef
 
 
 @dataclass(frozen=True)
@@ -39,12 +42,20 @@ class Scores:
     truth_p_n: Array  # (P, T, 3)
     truth_v_n: Array  # (P, T, 3)
     true_imu_error: Array  # (P, T, 6)
+    origin_e: Array  # (P, 3) ECEF of the tangent frames' origins
     filters: dict[str, FilterRun] = field(default_factory=dict)
 
     @property
     def t(self) -> Array:
         """Time since the start of a piece at the end of each epoch [s], (T,)."""
         return self.epoch_s * np.arange(1, self.outage.shape[1] + 1)
+
+    def geodetic(self, piece: int, p_n: Array) -> Array:
+        """Latitude and longitude [°] (…, 2) of positions (…, 3) in the tangent frame of a piece."""
+        origin = torch.from_numpy(self.origin_e[piece])
+        lat, lon, _ = geodetic_from_ecef(origin)
+        r_e = origin + torch.from_numpy(np.asarray(p_n, float)) @ ned_axes(lat, lon).mT
+        return np.degrees(np.stack([x.numpy() for x in geodetic_from_ecef(r_e)[:2]], -1))
 
     @property
     def windows(self) -> Windows:

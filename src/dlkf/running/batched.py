@@ -46,10 +46,15 @@ def chunks(batch: Batch, samples: int = CHUNK_SAMPLES) -> Iterator[Tensor]:
         start += size
 
 
-def run_filter(batch: Batch, estimator: Estimator | Smoothed) -> Solution:
-    """The filter loop, smoothed where asked for, without gradients, on the device of the estimator's parameters."""
+def run_filter(batch: Batch, estimator: Estimator | Smoothed, *, keep_covariances: bool = False) -> Solution:
+    """The filter loop, smoothed where asked for, without gradients, on the device of the estimator's parameters.
+
+    ``keep_covariances`` where the filter has some and is not smoothed.
+    """
     parameter = next(estimator.parameters(), None) if isinstance(estimator, torch.nn.Module) else None
     if parameter is not None:
         batch = batch.to(parameter.device)
     with torch.inference_mode():
-        return smooth(batch, estimator.filter) if isinstance(estimator, Smoothed) else integrate(batch, estimator)
+        if isinstance(estimator, Smoothed):
+            return smooth(batch, estimator.filter)
+        return integrate(batch, estimator, keep_covariances=keep_covariances)

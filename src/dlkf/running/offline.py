@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -16,24 +17,28 @@ from dlkf.data.segments import whole_drives
 from dlkf.data.tables import read_table
 from dlkf.data.validate import GNSS_QUALITIES
 from dlkf.errors import InputError
-from dlkf.filters.integration import Estimator
+from dlkf.filters.integration import Estimator, Solution
 from dlkf.running.batched import CHUNK_SAMPLES, run_filter
 from dlkf.running.solution import solution_table
 from dlkf.running.start import align_each
 
 
 @dataclass(frozen=True)
-class FixSpacing:
-    """Times of the fixes [s] in a drive's file that a filter could use, and how far apart they usually are."""
+class Fixes:
+    """The fixes in a drive's file that a filter could use: times [s], places [°], NMEA GGA quality."""
 
     t: np.ndarray
+    lat_deg: np.ndarray
+    lon_deg: np.ndarray
+    quality: np.ndarray
 
     @staticmethod
-    def of(folder: str | Path, drive: str) -> FixSpacing:
+    def of(folder: str | Path, drive: str) -> Fixes:
         """Of a drive of a dataset."""
         gnss = read_table(folder, "gnss", drive)
         assert gnss is not None  # read_table raises where there is none
-        return FixSpacing(gnss["t"][np.isin(gnss["quality"], GNSS_QUALITIES)])
+        usable = np.isin(gnss["quality"], GNSS_QUALITIES)
+        return Fixes(*(gnss[c][usable] for c in ("t", "lat_deg", "lon_deg", "quality")))
 
     @property
     def usual_s(self) -> float:
@@ -45,7 +50,7 @@ class FixSpacing:
         return int(((self.t > first + 1e-3) & (self.t <= last + 1e-3)).sum())
 
 
-def epoch_for(spacings: Iterable[FixSpacing], rate_hz: float, estimator: Estimator) -> float:
+def epoch_for(spacings: Iterable[Fixes], rate_hz: float, estimator: Estimator) -> float:
     """Update interval [s] that uses every fix: the closest usual spacing, at most 1 s.
 
     1 s where it is no whole number of IMU samples, and for filters with constraints, whose noise is meant for one a
@@ -57,6 +62,22 @@ def epoch_for(spacings: Iterable[FixSpacing], rate_hz: float, estimator: Estimat
     return closest if closest < 1.0 and whole and not getattr(estimator, "constrained", False) else 1.0
 
 
+class Innovation(NamedTuple):
+    """GNSS − prediction (T, 6) [m, m/s] in the tangent frame, NaN where no fix was used, and its 1σ as the filter says.
+
+    The 1σ is NaN where the filter has no covariance.
+    """
+
+    value: np.ndarray
+    std: np.ndarray
+
+    @property
+    def normalised_rms(self) -> float:
+        """RMS of innovation over 1σ: 1 for a filter that knows itself."""
+        ratio = self.value / self.std
+        return float(np.sqrt(np.nanmean(ratio**2))) if np.isfinite(ratio).any() else np.nan
+
+
 @dataclass(frozen=True)
 class Navigated:
     """A drive's solution: its table, and the time [s, file clock] at which the filter could start."""
@@ -64,8 +85,9 @@ class Navigated:
     drive: str
     aligned_at: float
     table: pd.DataFrame
+    innovation: Innovation | None = None
 
-    def summary(self, spacing: FixSpacing | None = None) -> str:
+    def summary(self, spacing: Fixes | None = None) -> str:
         """One line: rows, alignment, fixes used (of those in the file), and the filter's own 1σ at the end."""
         last, used = self.table.iloc[-1], int(self.table.gnss_used.sum())
         text = f"{self.drive}: aligned at t = {self.aligned_at:.1f} s, {len(self.table)} epochs, "
@@ -79,6 +101,8 @@ class Navigated:
         position = np.hypot(last.std_pos_n, last.std_pos_e)
         if np.isfinite(position):
             text += f", final 1σ {position:.2g} m horizontal, {np.degrees(last.std_yaw):.2g}° heading"
+        if self.innovation is not None and np.isfinite(spread := self.innovation.normalised_rms):
+            text += f", innovations {spread:.2g} × their σ"
         return text
 
 
@@ -113,7 +137,8 @@ def navigate_drives(
         at_once = max(1, CHUNK_SAMPLES // (first.epochs * first.imu.shape[1]))
         part = todo[done : done + at_once]
         batch = whole_drives([drives[k] for k in part], [starts[k] for k in part])
-        solution = run_filter(batch, estimator)
+        solution = run_filter(batch, estimator, keep_covariances=True)
+        innovation = _innovation(solution)
         for row, k in enumerate(part):
             n = int(batch.present[row].sum())
             state = type(solution.posterior)(*(x[row, :n] for x in solution.posterior))
@@ -128,7 +153,20 @@ def navigate_drives(
                 None if solution.std is None else solution.std[row, :n],
                 solution.used[row, :n],
             )
-            yield Navigated(drives[k].name, float(batch.t_start[row]), table)
+            found = Innovation(innovation.value[row, :n], innovation.std[row, :n])
+            yield Navigated(drives[k].name, float(batch.t_start[row]), table, found)
         done += len(part)
         if progress is not None:
             progress(done, len(todo))
+
+
+def _innovation(solution: Solution) -> Innovation:
+    """Of a whole batch, (B, T, 6); components that were not seen are NaN."""
+    value = solution.innovation.cpu().double()
+    seen = solution.used.cpu().unsqueeze(-1) & (value != 0)
+    std = torch.full_like(value, torch.nan)
+    if solution.covariances is not None:
+        c = solution.covariances
+        std = (((c.H @ c.predicted) * c.H).sum(-1) + c.R).clamp_min(0).sqrt().cpu().double()
+    nan = torch.tensor(torch.nan, dtype=torch.float64)
+    return Innovation(torch.where(seen, value, nan).numpy(), torch.where(seen, std, nan).numpy())

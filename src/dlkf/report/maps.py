@@ -1,0 +1,84 @@
+"""Tracks on a map: the page draws them in metres, without a network, and on OpenStreetMap's streets where one asks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from numpy.typing import NDArray
+
+from dlkf.report.plots import FONT
+
+Array = NDArray[np.float64]
+MOST = 6000  # points of all tracks of one kind on a map
+
+
+def track(lat: Array, lon: Array, name: str, colour: str, *, width: float = 2.5, visible: bool = True, **more: Any):
+    """A line; NaN breaks it."""
+    return go.Scattermap(
+        lat=lat, lon=lon, mode="lines", name=name, line={"color": colour, "width": width}, visible=visible, **more
+    )
+
+
+def dots(
+    lat: Array, lon: Array, name: str, colour: str | Array, *, size: float = 6, bar: str | None = None, **more: Any
+):
+    """Points of one colour, or coloured by a value with a bar."""
+    marker: dict[str, Any] = {"size": size, "color": colour}
+    if bar is not None:
+        marker |= {"colorscale": "Viridis", "colorbar": {"title": {"text": bar}, "thickness": 12, "len": 0.7}}
+    return go.Scattermap(lat=lat, lon=lon, mode="markers", name=name, marker=marker, **more)
+
+
+def chart(traces: Sequence[go.Scattermap], groups: Sequence[str] = ()) -> go.Figure:
+    """The map of some traces around all of them; with ``groups``, one a trace, buttons that show one group.
+
+    A trace whose group is empty is always shown.
+    """
+    figure = go.Figure(list(traces))
+    lat = np.concatenate([np.asarray(t.lat, float) for t in traces]) if traces else np.zeros(1)
+    lon = np.concatenate([np.asarray(t.lon, float) for t in traces]) if traces else np.zeros(1)
+    known = np.isfinite(lat) & np.isfinite(lon)
+    figure.update_layout(
+        map={"style": "white-bg", **view(lat[known], lon[known])}, height=520, font=FONT,
+        margin={"l": 0, "r": 0, "t": 40 if groups else 5, "b": 0},
+        legend={"orientation": "h", "yanchor": "top", "y": -0.02},
+    )  # fmt: skip
+    names = list(dict.fromkeys(g for g in groups if g))
+    if len(names) > 1:
+        buttons = [
+            {"label": n, "method": "restyle", "args": [{"visible": [g in ("", n) for g in groups]}]} for n in names
+        ]
+        figure.update_layout(
+            updatemenus=[
+                {"type": "buttons", "direction": "right", "buttons": buttons, "x": 0, "xanchor": "left", "y": 1.0,
+                 "yanchor": "bottom", "pad": {"t": 2, "b": 4}, "showactive": True}
+            ]
+        )  # fmt: skip
+        for trace, group in zip(figure.data, groups):
+            trace.visible = group in ("", names[0])
+    return figure
+
+
+def view(lat: Array, lon: Array) -> dict[str, Any]:
+    """Centre and zoom that show all points on a map of some 700 × 450 pixels (Web Mercator, 512-pixel tiles)."""
+    if not len(lat):
+        return {"center": {"lat": 0.0, "lon": 0.0}, "zoom": 1.0}
+    middle = {"lat": float((lat.min() + lat.max()) / 2), "lon": float((lon.min() + lon.max()) / 2)}
+    wide = max(float(np.ptp(lon)) * 512 / 360 / 650, 1e-7)
+    high = max(float(np.ptp(lat)) * 512 / 360 / math.cos(math.radians(middle["lat"])) / 420, 1e-7)
+    return {"center": middle, "zoom": min(18.0, max(1.0, -math.log2(max(wide, high)) - 0.15))}
+
+
+def joined(parts: Sequence[Array], most: int = MOST) -> Array:
+    """Tracks one after the other with NaN between them, evenly thinned to ``most`` points together."""
+    total = sum(len(p) for p in parts)
+    step = max(1, math.ceil(total / most))
+    out = []
+    for part in parts:
+        keep = np.unique(np.concatenate((np.arange(0, len(part), step), [len(part) - 1]))) if len(part) else []
+        out += [part[keep], np.full((1, *part.shape[1:]), np.nan)]
+    return np.concatenate(out) if out else np.empty((0, 2))

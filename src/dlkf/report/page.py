@@ -1,0 +1,104 @@
+"""One HTML page that works from a file without a network: plotly.js is inside once, figures draw as they come into view."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from typing import Any
+
+import plotly.graph_objects as go
+from plotly.offline import get_plotlyjs
+
+
+@dataclass
+class Page:
+    """A page as it grows: title, the answer on top (one line each), then what is added, in its order."""
+
+    title: str
+    answer: Sequence[str]
+    parts: list[str] = field(default_factory=list)
+
+    def heading(self, text: str, note: str = "") -> None:
+        """A section's title and a line about it."""
+        self.parts.append(f"<h2>{html.escape(text)}</h2>" + (f"<p class=note>{html.escape(note)}</p>" if note else ""))
+
+    def figure(self, name: str, figure: go.Figure) -> None:
+        """An interactive figure; ``name`` is its id in the page. A map brings its switch for streets."""
+        if any(trace.type == "scattermap" for trace in figure.data):
+            self.parts.append(
+                f'<label><input type=checkbox class=streets data-map="{name}"> streets '
+                "(loads tiles from openstreetmap.org)</label>"
+            )
+        height = figure.layout.height or 450
+        data = str(figure.to_json()).replace("</", "<\\/")
+        self.parts.append(
+            f'<div class=figure id="{name}" style="height:{height:.0f}px"><p class=waiting>…</p></div>'
+            f'<script type="application/json" id="data-{name}">{data}</script>'
+        )
+
+    def table(
+        self, columns: Sequence[str], rows: Sequence[Sequence[str]], *, marks: Sequence[str] = (), tall: bool = False
+    ) -> None:
+        """A table; ``marks`` are attributes of its rows (class, data-lat …), ``tall`` scrolls in a box of its own."""
+        head = "".join(f"<th>{html.escape(c).replace(chr(10), '<br>')}</th>" for c in columns)
+        attributes = list(marks) or [""] * len(rows)
+        body = "".join(
+            f"<tr {a}>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row, a in zip(rows, attributes)
+        )
+        box = "scroll tall" if tall else "scroll"
+        self.parts.append(f'<div class="{box}"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>')
+
+    def note(self, text: str) -> None:
+        """Small print."""
+        self.parts.append(f"<p class=note>{html.escape(text)}</p>")
+
+    def images(self, title: str, pictures: Sequence[tuple[str, str]]) -> None:
+        """Pictures (caption, data URI) behind a fold."""
+        shown = "".join(f'<h2>{html.escape(c)}</h2><img loading=lazy alt="{html.escape(c)}" src="{s}">' for c, s in pictures)
+        self.parts.append(f"<details><summary>{html.escape(title)}</summary>{shown}</details>")
+
+    def protocol(self, values: Mapping[str, Any]) -> None:
+        """How the numbers were made, as words: nested settings indented, numbers as they are written by hand."""
+        rows = "".join(
+            f"<tr><td>{'&emsp;' * depth}{html.escape(words(key))}</td><td><code>{html.escape(text)}</code></td></tr>"
+            for depth, key, text in flattened(values)
+        )
+        self.parts.append(f"<h2>How this was made</h2><div class=scroll><table class=protocol>{rows}</table></div>")
+
+    def html(self) -> str:
+        """The whole page."""
+        template = files("dlkf.report").joinpath("page.html").read_text(encoding="utf-8")
+        answer = "".join(f"<p>{html.escape(a)}</p>" for a in self.answer)
+        filled = template.replace("{{title}}", html.escape(self.title)).replace("{{answer}}", answer)
+        return filled.replace("{{body}}", "\n".join(self.parts)).replace("{{plotly}}", get_plotlyjs())
+
+
+def words(key: str) -> str:
+    """``noise_density`` → ``noise density``."""
+    return key.replace("_", " ")
+
+
+def flattened(values: Mapping[str, Any], depth: int = 0) -> list[tuple[int, str, str]]:
+    """(depth, key, text) of nested settings; lists and numbers in one line."""
+    out: list[tuple[int, str, str]] = []
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            out += [(depth, str(key), ""), *flattened(value, depth + 1)]
+        else:
+            out.append((depth, str(key), shown(value)))
+    return out
+
+
+def shown(value: Any) -> str:
+    """A value for a reader: – for none, numbers with six digits at most."""
+    if value is None or (isinstance(value, Mapping) and not value):
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, (list, tuple)):
+        return ", ".join(map(shown, value)) or "–"
+    return str(value)

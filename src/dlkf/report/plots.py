@@ -1,0 +1,101 @@
+"""Lines over time for a page: thinned so that nothing one can see is lost, small enough for ten hours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import plotly.graph_objects as go
+from numpy.typing import NDArray
+from plotly.subplots import make_subplots
+
+from dlkf.colours import SHADE
+
+Array = NDArray[np.float64]
+MOST = 2400  # points of a line: more than a screen has columns
+FONT = {"family": "system-ui, sans-serif", "size": 12}
+
+
+def extremes(y: Array, most: int = MOST) -> NDArray[np.int64]:
+    """Indices that keep the least and the largest value of each of ``most``/2 buckets: peaks survive."""
+    n = len(y)
+    if n <= most:
+        return np.arange(n)
+    edges = np.linspace(0, n, most // 2 + 1).astype(int)
+    filled = np.where(np.isfinite(y), y, np.nan)
+    found = {0, n - 1}
+    for a, b in zip(edges[:-1], edges[1:]):
+        part = filled[a:b]
+        if np.isnan(part).all():
+            found.add(int(a))
+        else:
+            found |= {int(a + np.nanargmin(part)), int(a + np.nanargmax(part))}
+    return np.array(sorted(found))
+
+
+def every(n: int, most: int = MOST) -> NDArray[np.int64]:
+    """Indices spread evenly, the last among them."""
+    if n <= most:
+        return np.arange(n)
+    return np.unique(np.linspace(0, n - 1, most).astype(int))
+
+
+def small(x: Sequence | Array) -> Array:
+    """As float32, which halves a page."""
+    return np.asarray(x, np.float32)
+
+
+def stacked(titles: Sequence[str], columns: int = 1, height: int = 190) -> go.Figure:
+    """Panels below each other with a common time axis."""
+    rows = -(-len(titles) // columns)
+    figure = make_subplots(
+        rows, columns, shared_xaxes=True, subplot_titles=titles, vertical_spacing=min(0.09, 0.4 / rows)
+    )
+    figure.update_layout(
+        height=height * rows + 90, margin={"l": 60, "r": 15, "t": 40, "b": 45}, font=FONT, template="plotly_white",
+        legend={"orientation": "h", "yanchor": "top", "y": -0.12 if rows > 1 else -0.2}, hovermode="x unified",
+    )  # fmt: skip
+    figure.update_annotations(font_size=12, xanchor="left", x=0) if columns == 1 else None
+    return figure
+
+
+def line(x: Array, y: Array, name: str, colour: str, *, legend: bool = True, dash: str = "solid", width: float = 1.5):
+    """A thinned line; a name stands in the legend once."""
+    i = extremes(np.asarray(y, float))
+    return go.Scatter(
+        x=small(x[i]), y=small(y[i]), name=name, legendgroup=name, showlegend=legend, mode="lines",
+        line={"color": colour, "width": width, "dash": dash},
+    )  # fmt: skip
+
+
+def band(x: Array, low: Array, high: Array, name: str, colour: str, *, legend: bool = False) -> go.Scatter:
+    """A shaded band; parts without a value are left out."""
+    i = every(len(x), MOST // 2)
+    i = i[np.isfinite(low[i]) & np.isfinite(high[i])]
+    r, g, b = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
+    return go.Scatter(
+        x=small(np.concatenate((x[i], x[i][::-1]))), y=small(np.concatenate((high[i], low[i][::-1]))), fill="toself",
+        fillcolor=f"rgba({r},{g},{b},0.18)", line={"width": 0}, mode="lines", name=name, legendgroup=name,
+        showlegend=legend, hoverinfo="skip",
+    )  # fmt: skip
+
+
+def shade(figure: go.Figure, spans: Sequence[tuple[float, float]], rows: int, columns: int = 1) -> None:
+    """Grey where there was no GNSS; at most 200 spans, the longest."""
+    longest = sorted(spans, key=lambda s: s[0] - s[1])[:200]
+    shapes = [
+        {
+            "type": "rect", "x0": a, "x1": b, "y0": 0, "y1": 1, "fillcolor": SHADE, "opacity": 0.6, "line": {"width": 0},
+            "layer": "below", "xref": f"x{k if k > 1 else ''}", "yref": f"y{k if k > 1 else ''} domain",
+        }
+        for k in range(1, rows * columns + 1)
+        for a, b in longest
+    ]  # fmt: skip
+    figure.update_layout(shapes=shapes)
+
+
+def spans(t: Array, flags: NDArray[np.bool_]) -> list[tuple[float, float]]:
+    """(from, to) of the runs of True; a run begins at the sample before it."""
+    edge = np.diff(np.concatenate(([0], flags.astype(np.int8), [0])))
+    first, last = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1) - 1
+    return [(float(t[max(a - 1, 0)]), float(t[b])) for a, b in zip(first, last)]
