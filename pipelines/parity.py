@@ -37,8 +37,7 @@ from dlkf.data.segments import StartLaw, cut_pieces, make_batch
 from dlkf.data.store import load_dataset
 from dlkf.data.tables import Columns
 from dlkf.evaluation.bootstrap import compare
-from dlkf.evaluation.figures import COLOURS
-from dlkf.evaluation.report import png
+from dlkf.evaluation.figures import COLOURS, png
 from dlkf.evaluation.table import Table, as_markdown, as_rich, number
 from dlkf.files import staged
 from dlkf.filters.build import build_filter

@@ -19,16 +19,16 @@ from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import dataset_digest, load_dataset
 from dlkf.errors import InputError
 from dlkf.evaluation.protocol import Scenes, protocol_from
-from dlkf.evaluation.report import all_tables, write_report
 from dlkf.evaluation.study import study
 from dlkf.evaluation.summary import answer, metrics_of
-from dlkf.evaluation.table import as_rich
+from dlkf.evaluation.table import all_tables, as_rich
 from dlkf.files import vacant
 from dlkf.filters.build import is_filter
 from dlkf.filters.card import without_seen
 from dlkf.models import grid_of, resolve_models
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.provenance import provenance
+from dlkf.report.evaluation import write_report
 from dlkf.tracking.evaluations import log_evaluation
 from dlkf.tracking.runs import tracking_uri
 

@@ -20,8 +20,7 @@ from dlkf.command import command
 from dlkf.config import config_dir
 from dlkf.data.store import dataset_digest
 from dlkf.errors import InputError
-from dlkf.evaluation.report import all_tables
-from dlkf.evaluation.table import as_rich
+from dlkf.evaluation.table import all_tables, as_rich
 from dlkf.tracking.grid import PARENT_RUN, run_name
 from dlkf.tracking.registry import check_registration, log_model
 from dlkf.tracking.runs import lightning_logger, start_run, tracking_uri

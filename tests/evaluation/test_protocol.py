@@ -17,8 +17,8 @@ from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Protocol, Scenes, protocol_from, spread
-from dlkf.evaluation.report import all_tables
 from dlkf.evaluation.study import study
+from dlkf.evaluation.table import all_tables
 from dlkf.filters.build import build_filter
 from dlkf.models import resolve_model, resolve_models
 from dlkf.running.offline import navigate_drives

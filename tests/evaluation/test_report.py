@@ -14,14 +14,15 @@ import torch
 from dlkf.data.kinds import drive_kind
 from dlkf.errors import InputError
 from dlkf.evaluation import figures
+from dlkf.evaluation.figures import png
 from dlkf.evaluation.metrics import QUANTITIES
 from dlkf.evaluation.outages import OutagePlan
-from dlkf.evaluation.report import png, write_report
 from dlkf.evaluation.results import IMU_AXES, Results, summarise_scores
 from dlkf.evaluation.run import score
 from dlkf.evaluation.table import as_csv, as_json, as_markdown, number, ratio_table, slope_table, tables, with_interval
 from dlkf.files import staged
 from dlkf.filters.build import build_filter
+from dlkf.report.evaluation import write_report
 from tests.evaluation.conftest import IMU
 
 FILTERS = {name: build_filter(name, IMU) for name in ("ins", "mbkf15")}
@@ -170,7 +171,8 @@ def test_report_is_complete_and_replaces_an_older_one(scores, tmp_path):
     assert {"metrics.json", "table.md", "table.csv", "report.html", "figures/tracks.png"} <= names
     assert not any("partial" in n for n in names)
     page = (out / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 5 and "http" not in page
+    assert page.count("<img loading=lazy") == 5 and "<script src" not in page and "<link" not in page
+    assert page.count("class=figure") == 4 and "After 20 s without GNSS: " in page.partition("<h2>")[0]
 
 
 def test_a_failed_write_leaves_nothing(tmp_path):

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from dlkf.colours import COLOURS
 from dlkf.diagnosis.allan import (
     Array,
     NoiseFit,
@@ -22,11 +23,12 @@ from dlkf.diagnosis.allan import (
     preset_yaml,
 )
 from dlkf.errors import InputError
-from dlkf.evaluation.figures import COLOURS
-from dlkf.evaluation.report import png, report_html
+from dlkf.evaluation.figures import png
 from dlkf.evaluation.table import Table, as_json, as_markdown, number
 from dlkf.files import staged
 from dlkf.navigation.imu_errors import DEG, MILLIGAL, ImuSpec
+from dlkf.provenance import provenance
+from dlkf.report.page import Page, embedded
 
 AXES = tuple(f"{sensor}_{axis}" for sensor in ("accel", "gyro") for axis in "xyz")
 TRIADS = ("accel", "gyro")
@@ -110,6 +112,15 @@ def figure(log: StaticLog) -> Figure:
     return out
 
 
+def _page(log: StaticLog, table: Table, picture: bytes, settings: dict[str, str]) -> str:
+    page = Page(f"Allan deviation of {log.drive}", [table.title])
+    page.table(table.columns, table.rows)
+    page.note(table.note)
+    page.picture("Overlapping Allan deviation (IEEE Std 952)", embedded(picture))
+    page.protocol(settings | provenance())
+    return page.html()
+
+
 def write_allan(out: str | Path, log: StaticLog, spec: ImuSpec) -> list[Path]:
     """Write imu/<name>.yaml, allan.png, allan.html, allan.csv and allan.json into ``out``, all or none."""
     picture, table = png(figure(log)), noise_table(log)
@@ -119,12 +130,7 @@ def write_allan(out: str | Path, log: StaticLog, spec: ImuSpec) -> list[Path]:
     files = {
         f"imu/{spec.name}.yaml": preset_yaml(spec).encode(),
         "allan.png": picture,
-        "allan.html": report_html(
-            f"Allan deviation of {log.drive}",
-            [table],
-            [("allan.png", "Overlapping Allan deviation (IEEE Std 952)", picture)],
-            settings,
-        ).encode(),
+        "allan.html": _page(log, table, picture, settings).encode(),
         "allan.md": as_markdown(table).encode(),
         "allan.csv": _csv(log).encode(),
         "allan.json": as_json(settings | {name: asdict(fit) for name, fit in log.fits.items()}).encode(),

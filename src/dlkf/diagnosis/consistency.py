@@ -24,8 +24,7 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
-from dlkf.evaluation.figures import SHADE
-from dlkf.evaluation.report import png
+from dlkf.evaluation.figures import SHADE, png
 from dlkf.evaluation.table import Table, as_json, as_markdown, number
 from dlkf.files import staged
 from dlkf.filters.integration import Estimator, Solution, integrate

@@ -6,24 +6,25 @@ Truth is black, an outage is shaded.
 
 from __future__ import annotations
 
+import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from dlkf.colours import COLOURS, SHADE
 from dlkf.evaluation.bootstrap import rms_band
 from dlkf.evaluation.metrics import QUANTITIES, Array, magnitudes, outage_at, rms_over_pieces, windows
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.table import number
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#6A3D9A", "#8C510A")
 STYLES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (7, 2)), (0, (3, 1, 1, 1)), (0, (2, 2)))
-SHADE = "#DDDDDD"
 OFF_SCALE = 20.0  # a filter this many times worse than the best does not set the scale
 LABELS = {
     "position": "3D position error [m]",
@@ -40,10 +41,43 @@ IMU_AXES = (
 )  # fmt: skip
 
 
+def png(figure: Figure, dpi: int = 130) -> bytes:
+    """A figure as PNG."""
+    FigureCanvasAgg(figure)
+    out = io.BytesIO()
+    figure.savefig(out, format="png", dpi=dpi, facecolor="white")
+    return out.getvalue()
+
+
+def all_figures(
+    scores: Scores, *, by_time: bool, baseline: str | None = None
+) -> Iterator[tuple[str, str, Figure]]:
+    """(file name, caption, figure) of one kind of data.
+
+    ``by_time``: the pieces are alike (same length, outage at the same time), so that an average over them at
+    each time means something; whole drives are shown one by one instead.
+    """
+    chosen = representative(scores, 4, baseline if baseline in scores.filters else None)
+    if not chosen:
+        return
+    middle = chosen[len(chosen) // 2]
+    if scores.outage.any():
+        yield "error_growth", "horizontal error against the time without GNSS", error_growth(scores)
+    yield (
+        "tracks",
+        "tracks of pieces from good to bad (quantiles of the error of the baseline)",
+        tracks(scores, chosen),
+    )
+    if by_time and len(scores.pieces) > 1:
+        yield "error_over_time", "errors over time, all pieces", error_over_time(scores)
+    yield "error_over_time_one", "errors over time, one piece", error_over_time(scores, [middle])
+    yield "imu_errors", "IMU-error estimates, one piece", imu_errors(scores, [middle])
+
+
 def line_of(scores: Scores, name: str) -> dict[str, object]:
     """Colour and style of a filter, the same in every figure of these scores."""
     k = list(scores.filters).index(name)
-    return {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[(k + k // len(COLOURS)) % len(STYLES)]}
+    return {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[k % len(STYLES)]}
 
 
 def representative(scores: Scores, n: int, filter_name: str | None = None) -> list[int]:

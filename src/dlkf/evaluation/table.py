@@ -154,6 +154,15 @@ def slope_table(dataset: str, result: Results) -> Table | None:
     )
 
 
+def all_tables(dataset: str, results: Sequence[Results]) -> list[Table]:
+    """The tables of every kind of data, one kind after the other."""
+    out = []
+    for r in results:
+        more = (ratio_table(dataset, r), slope_table(dataset, r))
+        out += tables(dataset, r) + [t for t in more if t is not None]
+    return out
+
+
 def as_rich(table: Table) -> RichTable:
     """For the terminal."""
     out = RichTable(title=Text(table.title), caption=Text(table.note), box=SIMPLE_HEAD, padding=(0, 1))

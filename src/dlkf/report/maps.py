@@ -33,16 +33,21 @@ def dots(
     return go.Scattermap(lat=lat, lon=lon, mode="markers", name=name, marker=marker, **more)
 
 
-def chart(traces: Sequence[go.Scattermap], groups: Sequence[str] = ()) -> go.Figure:
-    """The map of some traces around all of them; with ``groups``, one a trace, buttons that show one group.
+def chart(
+    traces: Sequence[go.Scattermap], groups: Sequence[str] = (), around: Sequence[go.Scattermap] | None = None
+) -> go.Figure:
+    """The map of some traces, seen so that ``around`` (by default all) fill it.
+
+    ``groups`` has one name a trace: buttons show one group at a time.
 
     A trace whose group is empty is always shown.
     """
     figure = go.Figure(list(traces))
-    lat = np.concatenate([np.asarray(t.lat, float) for t in traces]) if traces else np.zeros(1)
-    lon = np.concatenate([np.asarray(t.lon, float) for t in traces]) if traces else np.zeros(1)
+    lat, lon = (np.concatenate([np.asarray(t[k], float) for t in around or traces]) for k in ("lat", "lon"))
     known = np.isfinite(lat) & np.isfinite(lon)
+    reach = max(np.ptp(lat[known]) * 1.08, 2e-4) / 2 if known.any() else 1.0
     figure.update_layout(
+        meta={"half_lat": float(reach), "half_lon": float(np.ptp(lon[known]) * 0.54) if known.any() else 1.0},
         map={"style": "white-bg", **view(lat[known], lon[known])}, height=520, font=FONT,
         margin={"l": 0, "r": 0, "t": 40 if groups else 5, "b": 0},
         legend={"orientation": "h", "yanchor": "top", "y": -0.02},

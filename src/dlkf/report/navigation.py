@@ -186,7 +186,8 @@ def _plots(page: Page, k: int, course: Course) -> None:
 
 def _motion(course: Course, t: Array, gaps: Sequence[tuple[float, float]]) -> go.Figure:
     table = course.result.table
-    figure = stacked(["Speed [m/s]; standstills in orange", "Heading [°]", "Height [m]", "Horizontal 1σ [m]"], height=150)
+    panels = ["Speed [m/s]; standstills in orange", "Heading [°]", "Height [m]", "Horizontal 1σ [m]"]
+    figure = stacked(panels, height=150)
     v = speed(course)
     figure.add_trace(line(t, v, "speed", COLOURS[0], legend=False), 1, 1)
     standing = np.where(v < STANDING, v, np.nan)

@@ -1,7 +1,11 @@
-"""One HTML page that works from a file without a network: plotly.js is inside once, figures draw as they come into view."""
+"""One HTML page that works from a file without a network.
+
+plotly.js is inside once; a figure is drawn when it comes into view, so that a long page opens at once.
+"""
 
 from __future__ import annotations
 
+import base64
 import html
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -44,20 +48,26 @@ class Page:
         """A table; ``marks`` are attributes of its rows (class, data-lat …), ``tall`` scrolls in a box of its own."""
         head = "".join(f"<th>{html.escape(c).replace(chr(10), '<br>')}</th>" for c in columns)
         attributes = list(marks) or [""] * len(rows)
-        body = "".join(
-            f"<tr {a}>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row, a in zip(rows, attributes)
-        )
-        box = "scroll tall" if tall else "scroll"
-        self.parts.append(f'<div class="{box}"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>')
+        cells = ("".join(f"<td>{html.escape(c)}</td>" for c in row) for row in rows)
+        body = "".join(f"<tr {a}>{row}</tr>" for row, a in zip(cells, attributes))
+        table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        self.parts.append(f'<div class="{"scroll tall" if tall else "scroll"}">{table}</div>')
 
     def note(self, text: str) -> None:
         """Small print."""
         self.parts.append(f"<p class=note>{html.escape(text)}</p>")
 
+    def picture(self, caption: str, source: str) -> None:
+        """One picture (data URI)."""
+        words = html.escape(caption)
+        self.parts.append(f'<h2>{words}</h2><img loading=lazy alt="{words}" src="{source}">')
+
     def images(self, title: str, pictures: Sequence[tuple[str, str]]) -> None:
         """Pictures (caption, data URI) behind a fold."""
-        shown = "".join(f'<h2>{html.escape(c)}</h2><img loading=lazy alt="{html.escape(c)}" src="{s}">' for c, s in pictures)
-        self.parts.append(f"<details><summary>{html.escape(title)}</summary>{shown}</details>")
+        self.parts.append(f"<details><summary>{html.escape(title)}</summary>")
+        for caption, source in pictures:
+            self.picture(caption, source)
+        self.parts.append("</details>")
 
     def protocol(self, values: Mapping[str, Any]) -> None:
         """How the numbers were made, as words: nested settings indented, numbers as they are written by hand."""
@@ -72,7 +82,13 @@ class Page:
         template = files("dlkf.report").joinpath("page.html").read_text(encoding="utf-8")
         answer = "".join(f"<p>{html.escape(a)}</p>" for a in self.answer)
         filled = template.replace("{{title}}", html.escape(self.title)).replace("{{answer}}", answer)
-        return filled.replace("{{body}}", "\n".join(self.parts)).replace("{{plotly}}", get_plotlyjs())
+        drawing = get_plotlyjs() if any("class=figure" in part for part in self.parts) else ""
+        return filled.replace("{{body}}", "\n".join(self.parts)).replace("{{plotly}}", drawing)
+
+
+def embedded(png: bytes) -> str:
+    """A PNG as data URI."""
+    return f"data:image/png;base64,{base64.b64encode(png).decode()}"
 
 
 def words(key: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import plotly.graph_objects as go
@@ -24,7 +25,7 @@ def extremes(y: Array, most: int = MOST) -> NDArray[np.int64]:
     edges = np.linspace(0, n, most // 2 + 1).astype(int)
     filled = np.where(np.isfinite(y), y, np.nan)
     found = {0, n - 1}
-    for a, b in zip(edges[:-1], edges[1:]):
+    for a, b in pairwise(edges):
         part = filled[a:b]
         if np.isnan(part).all():
             found.add(int(a))
@@ -85,8 +86,8 @@ def shade(figure: go.Figure, spans: Sequence[tuple[float, float]], rows: int, co
     longest = sorted(spans, key=lambda s: s[0] - s[1])[:200]
     shapes = [
         {
-            "type": "rect", "x0": a, "x1": b, "y0": 0, "y1": 1, "fillcolor": SHADE, "opacity": 0.6, "line": {"width": 0},
-            "layer": "below", "xref": f"x{k if k > 1 else ''}", "yref": f"y{k if k > 1 else ''} domain",
+            "type": "rect", "x0": a, "x1": b, "y0": 0, "y1": 1, "fillcolor": SHADE, "opacity": 0.6,
+            "line": {"width": 0}, "layer": "below", "xref": f"x{k if k > 1 else ''}", "yref": f"y{k if k > 1 else ''} domain",
         }
         for k in range(1, rows * columns + 1)
         for a, b in longest

@@ -21,7 +21,6 @@ from dlkf.errors import InputError
 from dlkf.evaluation.endurance import After, after_gnss, after_table, hour_table, without_outage
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Scenes
-from dlkf.evaluation.report import write_report
 from dlkf.evaluation.results import BASELINE, Results
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.study import study
@@ -30,6 +29,7 @@ from dlkf.filters.build import refuse_smoothed
 from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import load_filter
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.report.evaluation import write_report
 from dlkf.training.fit import fit
 from dlkf.tuning.baselines import Baselines, tuned_baselines
 

@@ -6,9 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from dlkf.evaluation.report import all_tables
 from dlkf.evaluation.summary import metrics_of
-from dlkf.evaluation.table import as_markdown
+from dlkf.evaluation.table import all_tables, as_markdown
 from dlkf.training.study import Outcome
 from dlkf.tuning.search import factors_of, tuning_values
 
