@@ -23,7 +23,9 @@ FLOORS = (
     {"training"},
     {"models"},
     {"command"},
-    {"allan", "consistency", "evaluate", "ingest", "navigate", "register", "simulate", "train", "tune"},
+    {"allan", "compare", "consistency", "doctor", "evaluate", "ingest", "navigate", "register"}
+    | {"simulate", "train", "tune", "ui"},
+    {"__main__"},
 )
 FLOOR = {room: n for n, rooms in enumerate(FLOORS) for room in rooms}
 GLUE = {"hydra", "mlflow", "lightning", "omegaconf"}

@@ -17,6 +17,7 @@ from dlkf.command import command
 from dlkf.console import counting
 from dlkf.data.alignment import AlignConfig
 from dlkf.data.store import dataset_digest, drive_rows, load_dataset
+from dlkf.data.tables import time_zeros
 from dlkf.errors import InputError
 from dlkf.files import staged, vacant
 from dlkf.filters.smoother import smoothed
@@ -24,6 +25,7 @@ from dlkf.models import grid_of, resolve_model, short_name
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.provenance import provenance
 from dlkf.report.navigation import Course, answers, write_page
+from dlkf.running.exports import chosen, export, utc_times
 from dlkf.running.offline import Fixes, epoch_for, navigate_drives
 from dlkf.running.replay import stream_drives
 from dlkf.running.solution import write_solution
@@ -33,6 +35,7 @@ from dlkf.running.solution import write_solution
 def main(cfg: DictConfig) -> None:
     """Load, align, run, write; print a line per drive."""
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
+    formats = chosen(config["export"])
     vacant(config["out"], overwrite=config["overwrite"])
     if not isinstance(config["model"], str):
         raise InputError(f"navigate runs one model at a time, got model={config['model']}")
@@ -43,6 +46,7 @@ def main(cfg: DictConfig) -> None:
         tuning=config["tuning"],
         prior=config["prior"],
     )
+    zeros = time_zeros(config["dataset"])
     rows = drive_rows(config["dataset"], config["drives"])
     spacings = {row.name: Fixes.of(config["dataset"], row.name) for row in rows}
     usual = epoch_for(spacings.values(), config["rate_hz"] or 50.0, model)
@@ -69,6 +73,8 @@ def main(cfg: DictConfig) -> None:
     with staged(config["out"]) as folder, counting("Navigating") as progress:
         for result in navigated(progress=progress):
             write_solution(folder / f"drive={result.drive}" / "solution.parquet", result.table)
+            when = utc_times(result.table, zeros.get(result.drive), config["export_clock"])
+            export(folder / f"drive={result.drive}", result.table, formats, when, result.drive)
             lines.append(result.summary(spacings[result.drive]))
             courses.append(Course(result, spacings[result.drive]))
         made = {**provenance(), **{k: config[k] for k in ("model", "dataset")}, **grid}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import subprocess
 import sys
@@ -24,8 +25,7 @@ def version() -> str:
 
 def command_line() -> str:
     """What was typed, as a shell takes it."""
-    program = Path(sys.argv[0])
-    name = "dlkf" if program.name in ("dlkf", "__main__.py") else f"python -m dlkf.{program.stem}"
+    name = os.environ.get("DLKF_COMMAND") or f"python -m dlkf.{Path(sys.argv[0]).stem}"
     return shlex.join([*name.split(), *sys.argv[1:]])
 
 

@@ -23,6 +23,7 @@ GROUPS = {  # group of the defaults list: folder under conf/
     "navigate": {"imu": "imu", "tuning": "tuning"},
     "allan": {"imu": "imu"},
     "register": {},
+    "compare": {},
     "tune": {"imu": "imu", "tuning": "tuning"},
     "consistency": {"imu": "imu", "tuning": "tuning", "chassis": "chassis"},
     "train": {"imu": "imu", "data": "data", "filter@model": "filter"},

@@ -9,7 +9,7 @@ import sys
 import pyarrow.parquet as pq
 import pytest
 
-from dlkf.running.solution import SCHEMA
+from dlkf.running.solution import GEO_SCHEMA
 
 
 def run(folder, command, *arguments):
@@ -44,8 +44,8 @@ def test_navigate_writes_solutions_without_a_reference(town, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert "car-01: aligned at t = " in done.stdout
-    assert pq.read_schema(tmp_path / "solved" / "drive=car-01" / "solution.parquet").equals(SCHEMA)
-    assert [p.name for p in (tmp_path / "solved").iterdir()] == ["drive=car-01"]
+    assert pq.read_schema(tmp_path / "solved" / "drive=car-01" / "solution.parquet").equals(GEO_SCHEMA)
+    assert sorted(p.name for p in (tmp_path / "solved").iterdir()) == ["drive=car-01", "report.html"]
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import torch
 from dlkf.navigation.attitude import rotation_from_rpy, rpy_from_rotation
 from dlkf.navigation.earth import tangent_frame
 from dlkf.navigation.state import NavState
-from dlkf.running.solution import COLUMNS, SCHEMA, solution_table, write_solution
+from dlkf.running.solution import COLUMNS, GEO_SCHEMA, solution_table, write_solution
 
 LAT, LON, H = math.radians(60.0), math.radians(25.0), 80.0
 
@@ -77,7 +77,7 @@ def test_the_file_has_the_contract_columns_and_keeps_nan(tmp_path):
     table = solution_table(torch.arange(T), _frame(), state, torch.ones(T, 6), None, torch.arange(T) > 2)
     write_solution(tmp_path / "drive=a" / "solution.parquet", table)
     back = pq.read_table(tmp_path / "drive=a" / "solution.parquet")
-    assert back.schema.equals(SCHEMA) and back.column_names == [*COLUMNS, "gnss_used"]
+    assert back.schema.equals(GEO_SCHEMA) and back.column_names == [*COLUMNS, "gnss_used", "geometry"]
     assert back["std_yaw"].null_count == 0 and all(math.isnan(x) for x in back["std_yaw"].to_pylist())
     assert back["gnss_used"].to_pylist() == [False, False, False, True, True]
     assert [p.name for p in (tmp_path / "drive=a").iterdir()] == ["solution.parquet"]

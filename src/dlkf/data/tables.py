@@ -57,6 +57,15 @@ def read_drives(folder: str | Path) -> list[DriveRow]:
     return [DriveRow(n, g, (float(x), float(y), float(z))) for n, g, x, y, z in zip(names, groups, *arms)]
 
 
+def time_zeros(folder: str | Path) -> dict[str, float]:
+    """What is to be added to ``t`` of each drive for the clock of its log files [s], where it is known."""
+    path = Path(folder) / "drives.parquet"
+    if not path.is_file() or "time_zero_s" not in (table := pq.read_table(path)).column_names:
+        return {}
+    known = zip(table["drive"].to_pylist(), table["time_zero_s"].to_pylist())
+    return {str(drive): float(zero) for drive, zero in known if zero is not None}
+
+
 def read_table(folder: str | Path, kind: str, drive: str) -> Columns | None:
     """The contract's columns of a drive's table (``imu``, ``gnss`` or ``reference``) as numpy arrays.
 

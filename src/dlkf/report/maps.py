@@ -38,9 +38,7 @@ def chart(
 ) -> go.Figure:
     """The map of some traces, seen so that ``around`` (by default all) fill it.
 
-    ``groups`` has one name a trace: buttons show one group at a time.
-
-    A trace whose group is empty is always shown.
+    ``groups`` has one name a trace: buttons show one group at a time; a trace whose group is empty is always shown.
     """
     figure = go.Figure(list(traces))
     lat, lon = (np.concatenate([np.asarray(t[k], float) for t in around or traces]) for k in ("lat", "lon"))

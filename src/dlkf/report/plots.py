@@ -87,7 +87,8 @@ def shade(figure: go.Figure, spans: Sequence[tuple[float, float]], rows: int, co
     shapes = [
         {
             "type": "rect", "x0": a, "x1": b, "y0": 0, "y1": 1, "fillcolor": SHADE, "opacity": 0.6,
-            "line": {"width": 0}, "layer": "below", "xref": f"x{k if k > 1 else ''}", "yref": f"y{k if k > 1 else ''} domain",
+            "line": {"width": 0}, "layer": "below", "xref": f"x{k if k > 1 else ''}",
+            "yref": f"y{k if k > 1 else ''} domain",
         }
         for k in range(1, rows * columns + 1)
         for a, b in longest

@@ -9,8 +9,10 @@ filter has no value.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pyarrow as pa
 import torch
@@ -38,7 +40,13 @@ COLUMNS = (
     + IMU_COLUMNS
     + STD_COLUMNS
 )
+GEOMETRY = {  # geoparquet.org, version 1.1; without a crs it is longitude and latitude on WGS 84 (OGC:CRS84)
+    "version": "1.1.0",
+    "primary_column": "geometry",
+    "columns": {"geometry": {"encoding": "WKB", "geometry_types": ["Point Z"]}},
+}
 SCHEMA = pa.schema([pa.field(c, pa.float64()) for c in COLUMNS] + [pa.field("gnss_used", pa.bool_())])
+GEO_SCHEMA = SCHEMA.append(pa.field("geometry", pa.binary())).with_metadata({"geo": json.dumps(GEOMETRY)})
 
 
 def solution_table(
@@ -100,6 +108,19 @@ def _std_columns(std: Tensor | None, C_ln: Tensor, rpy: Tensor) -> Tensor:
 
 
 def write_solution(path: str | Path, table: pd.DataFrame) -> None:
-    """Write ``solution.parquet``: to a file beside, then renamed."""
+    """Write ``solution.parquet``: to a file beside, then renamed.
+
+    Behind the columns comes ``geometry``, points as GeoParquet has them, for QGIS, GeoPandas and DuckDB.
+    """
     arrays = [pa.array(table[f.name].to_numpy(), f.type, from_pandas=False) for f in SCHEMA]  # NaN stays NaN
-    write_parquet(Path(path), pa.Table.from_arrays(arrays, schema=SCHEMA))
+    place = table[["lon_deg", "lat_deg", "height_m"]].to_numpy()
+    write_parquet(Path(path), pa.Table.from_arrays([*arrays, points(place)], schema=GEO_SCHEMA))
+
+
+def points(place: np.ndarray) -> pa.Array:
+    """Longitude, latitude [°], height [m] (T, 3) as WKB of three-dimensional points (ISO 19125, little-endian)."""
+    wkb = np.zeros(len(place), dtype=[("order", "u1"), ("kind", "<u4"), ("xyz", "<f8", 3)])
+    wkb["order"], wkb["kind"], wkb["xyz"] = 1, 1001, place
+    return pa.FixedSizeBinaryArray.from_buffers(pa.binary(29), len(place), [None, pa.py_buffer(wkb.tobytes())]).cast(
+        pa.binary()
+    )

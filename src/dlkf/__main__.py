@@ -1,0 +1,101 @@
+"""``dlkf <command> key=value …``, the same as ``python -m dlkf.<command>``; ``dlkf`` alone says what there is.
+
+Completion in bash: ``eval "$(dlkf completion)"`` (commands, keys and presets; zsh reads it after ``bashcompinit``).
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from importlib import import_module
+
+import dlkf
+
+COMMANDS = {
+    "simulate": "drives with known truth, as a dataset",
+    "ingest": "foreign logs into a dataset",
+    "doctor": "what is good and bad about a dataset",
+    "navigate": "a filter over whole drives, from IMU and GNSS alone: solution, map, exports",
+    "evaluate": "filters against each other on drives with a reference: tables, report",
+    "train": "train a filter and score it against the classical ones",
+    "tune": "fit the noise of a classical filter to drives",
+    "allan": "noise of an IMU from a log at rest",
+    "consistency": "whether a filter's own 1σ are true",
+    "compare": "one page over several evaluations",
+    "register": "the model of a run into the registry",
+    "ui": "MLflow's pages over the runs of this folder",
+}
+COMPLETION = """_dlkf() {
+  local word="${COMP_WORDS[COMP_CWORD]}"
+  COMPREPLY=($(compgen -W "$(dlkf complete "${COMP_WORDS[1]}" "$word" 2>/dev/null)" -- "$word"))
+  [ ${#COMPREPLY[@]} -eq 1 ] && [[ ${COMPREPLY[0]} == *= ]] && compopt -o nospace
+}
+complete -o default -F _dlkf dlkf
+"""
+
+
+def main() -> None:
+    """Run a command; 2 for an unknown one, 130 after Ctrl-C, even while the libraries load."""
+    word, rest = (sys.argv[1] if len(sys.argv) > 1 else "help"), sys.argv[2:]
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    try:
+        if word in ("help", "--help", "-h"):
+            print(usage())
+        elif word in ("--version", "-V", "version"):
+            print(f"dlkf {dlkf.__version__}")
+        elif word == "completion":
+            print(COMPLETION, end="")
+        elif word == "complete":
+            print("\n".join(candidates(*(rest + ["", ""])[:2])))
+        elif word in COMMANDS:
+            sys.argv = [sys.argv[0].replace("__main__.py", "dlkf"), *rest]
+            os.environ["DLKF_COMMAND"] = f"dlkf {word}"
+            import_module(f"dlkf.{word}").main()
+        else:
+            print(f"dlkf: error: unknown command {word!r}; known: {', '.join(COMMANDS)}", file=sys.stderr)
+            sys.exit(2)
+    except KeyboardInterrupt:
+        print("dlkf: interrupted", file=sys.stderr)
+        sys.exit(130)
+
+
+def usage() -> str:
+    """What there is."""
+    width = max(map(len, COMMANDS))
+    lines = "\n".join(f"  {name.ljust(width)}  {what}" for name, what in COMMANDS.items())
+    return (
+        f"dlkf {dlkf.__version__}: Kalman filters for GNSS and IMU, and a learned one\n\n"
+        f"usage: dlkf <command> key=value …\n\n{lines}\n\n"
+        "dlkf <command> --help shows its settings, --cfg job prints them all with their values.\n"
+        'Completion: eval "$(dlkf completion)"'
+    )
+
+
+def candidates(command: str, word: str) -> list[str]:
+    """Words that may stand here: commands, keys of a command, presets of a key that has some."""
+    import yaml
+
+    from dlkf.config import config_dir
+
+    if command not in COMMANDS or command == word:
+        return [c for c in COMMANDS if c.startswith(word)]
+    key, equals, _ = word.partition("=")
+    file = config_dir() / f"{command}.yaml"
+    if not file.is_file():
+        return []
+    content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    groups: dict[str, str] = {}
+    for entry in content.pop("defaults", []):
+        for name in entry if isinstance(entry, dict) else {}:
+            if not name.startswith("override"):
+                folder, _, shown = name.partition("@")
+                groups[shown or folder] = folder
+    if equals:
+        folder = config_dir() / groups.get(key.lstrip("+"), key.lstrip("+"))
+        return sorted(f"{key}={p.stem}" for p in folder.glob("*.yaml")) if folder.is_dir() else []
+    return sorted(f"{k}=" for k in {*content, *groups} - {"hydra"})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,144 @@
+"""One page over several evaluations: which of them drifts how far, from the ``metrics.json`` that each left."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import plotly.graph_objects as go
+
+from dlkf.colours import colour
+from dlkf.errors import InputError
+from dlkf.evaluation.results import Results
+from dlkf.evaluation.summary import answer
+from dlkf.evaluation.table import number
+from dlkf.files import staged
+from dlkf.report.evaluation import best_of
+from dlkf.report.page import Page, flattened
+from dlkf.report.plots import FONT
+
+NOT_SETTINGS = ("command", "date", "digest", "skipped")  # differ always, or belong to no comparison
+
+
+class Report(NamedTuple):
+    """An evaluation as it lies in a folder."""
+
+    name: str
+    dataset: str
+    protocol: Mapping[str, Any]
+    results: list[Results]
+
+
+def read_reports(folders: Sequence[str | Path]) -> list[Report]:
+    """The evaluations in some folders, named by what tells the folders apart.
+
+    Raises InputError for a folder without a readable ``metrics.json`` and for fewer than two.
+    """
+    if len(folders) < 2:
+        raise InputError("give at least two folders that evaluate or train left, such as dlkf compare a b out=c")
+    paths = [Path(f).expanduser() for f in folders]
+    paths = [p / "report" if (p / "report" / "metrics.json").is_file() else p for p in paths]
+    reports = []
+    for path, name in zip(paths, distinct(paths)):
+        try:
+            content = json.loads((path / "metrics.json").read_text(encoding="utf-8"))
+            results = [Results.of(r) for r in content["results"]]
+            reports.append(Report(name, content["dataset"], content["protocol"], results))
+        except FileNotFoundError:
+            raise InputError(f"{path}: no metrics.json; give folders that evaluate or train left") from None
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{path}/metrics.json: not an evaluation of this version ({error!r})") from None
+    return reports
+
+
+def distinct(paths: Sequence[Path]) -> list[str]:
+    """Names of folders without what all have in common."""
+    parts = [p.absolute().parts for p in paths]
+    shared = 0
+    while all(len(p) > shared + 1 for p in parts) and len({p[shared] for p in parts}) == 1:
+        shared += 1
+    ends = 0
+    while all(len(p) > shared + ends + 1 for p in parts) and len({p[-1 - ends] for p in parts}) == 1:
+        ends += 1
+    return ["/".join(p[shared : len(p) - ends]) for p in parts]
+
+
+def write_comparison(out: str | Path, reports: Sequence[Report]) -> None:
+    """``compare.html`` in ``out``."""
+    page = comparison_page(reports)
+    with staged(out) as folder:
+        (folder / "compare.html").write_text(page, encoding="utf-8")
+
+
+def comparison_page(reports: Sequence[Report]) -> str:
+    """Answers, a table and the growth of the error over all of them, and in what they differ."""
+    lines = [f"{r.name}: {answer(result)}" for r in reports for result in r.results]
+    page = Page(f"{len(reports)} evaluations compared", lines)
+    columns, rows = end_table(reports)
+    page.heading("At the end of the outages", "Horizontal error; RMS over the pieces where there are no outages.")
+    page.table(columns, rows, marks=best_of(columns, rows))
+    page.heading("Horizontal error against the time without GNSS", "Solid: median; dotted: 95 % of the outages.")
+    page.figure("growth", growth(reports))
+    page.heading("In what they differ")
+    page.table(*differences(reports))
+    return page.html()
+
+
+def end_table(reports: Sequence[Report]) -> tuple[list[str], list[list[str]]]:
+    """Columns and rows: run, data, filter, number, errors."""
+    columns = ["Run", "Dataset", "Filter", "Number", "RMS\n[m]", "median\n[m]", "95 %\n[m]", "Drift\n[%]"]
+    rows = []
+    for report in reports:
+        for result in report.results:
+            out = result.count["outages"]
+            where = ("outages", "end", "horizontal") if out else ("pieces", "settled", "horizontal")
+            for name in result.filters:
+                errors = [number(result.value(name, *where, s)) for s in ("rms", "median", "p95")]
+                drift = number(result.value(name, "outages", "end", "drift", "median"), 100)
+                data = f"{report.dataset} ({result.kind})"
+                rows.append([report.name, data, name, str(out or result.count["pieces"]), *errors, drift])
+    return columns, rows
+
+
+def growth(reports: Sequence[Report]) -> go.Figure:
+    """Errors at round times into the outages, a colour for every run and filter."""
+    figure, k = go.Figure(), 0
+    for report in reports:
+        for result in report.results:
+            seconds = result.seconds_into_outage()
+            for name in result.filters if seconds else ():
+                label = f"{report.name}: {name}"
+                for statistic, dash in (("median", "solid"), ("p95", "dot")):
+                    y = [result.value(name, "outages", f"at {s} s", "horizontal", statistic) for s in seconds]
+                    figure.add_scatter(
+                        x=[float(s) for s in seconds], y=np.where(np.isfinite(y), y, np.nan), name=label,
+                        legendgroup=label, showlegend=statistic == "median", mode="lines+markers",
+                        line={"color": colour(k), "dash": dash},
+                    )  # fmt: skip
+                k += 1
+    figure.update_layout(
+        height=480, template="plotly_white", font=FONT, margin={"l": 60, "r": 15, "t": 20, "b": 45},
+        legend={"orientation": "h", "y": -0.18, "yanchor": "top"},
+    )  # fmt: skip
+    figure.update_xaxes(title_text="Time without GNSS [s]")
+    figure.update_yaxes(title_text="Horizontal error [m]", type="log")
+    return figure
+
+
+def differences(reports: Sequence[Report]) -> tuple[list[str], list[list[str]]]:
+    """Settings that are not the same in all reports."""
+    told = []
+    for report in reports:
+        path: list[str] = []
+        values = {}
+        for depth, key, text in flattened(report.protocol):
+            path[depth:] = [key]
+            values[".".join(path)] = text
+        told.append(values | {"dataset": report.dataset})
+    keys = [k for k in dict.fromkeys(k for t in told for k in t) if k.partition(".")[0] not in NOT_SETTINGS]
+    keys = [k for k in keys if len({t.get(k) for t in told}) > 1]
+    rows = [[key, *(t.get(key, "–") or "–" for t in told)] for key in keys]
+    return ["Setting", *(r.name for r in reports)], rows or [["nothing but the day", *("" for _ in reports)]]

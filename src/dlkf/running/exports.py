@@ -1,0 +1,220 @@
+"""A solution in the formats of other programs: maps (GeoJSON, KML, GPX), receivers (NMEA, RTKLIB .pos), evo, CSV.
+
+All functions take the rows of ``solution.parquet`` and write one file. ``when`` is the UTC time of every row
+(:func:`utc_times`); None where nobody knows the date: then tracks have no times, and NMEA and ``.pos``, which cannot do
+without, count seconds from midnight of 6 January 1980 (GPS week 0).
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pymap3d
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from dlkf.data.readers.units import GPS_EPOCH_UNIX, WEEK_S, leap_seconds
+from dlkf.errors import InputError
+
+Times = list[datetime] | None
+KNOTS = 1852 / 3600  # m/s
+UNIX_SINCE, GPS_SINCE = 1.55e9, 3e8  # s; a Unix second after January 2019; a GPS second after 1989
+NED_ENU = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])  # and Forward-Right-Down → Forward-Left-Up is diag(1, −1, −1)
+
+
+def utc_times(table: pd.DataFrame, time_zero_s: float | None, clock: str = "auto") -> Times:
+    """UTC of every row from the drive's clock and its zero; ``clock``: unix, gps, or auto, which tells by the size."""
+    if clock not in ("auto", "unix", "gps", "none"):
+        raise InputError(f"export_clock={clock} is none of auto, unix, gps, none")
+    if clock == "none" or time_zero_s is None or not np.isfinite(time_zero_s):
+        return None
+    seconds = time_zero_s + table["t"].to_numpy()
+    if clock == "auto":
+        clock = "unix" if seconds[0] > UNIX_SINCE else "gps" if seconds[0] > GPS_SINCE else "none"
+        if clock == "none":
+            return None
+    if clock == "gps":
+        seconds = seconds + GPS_EPOCH_UNIX
+        seconds = seconds - leap_seconds(seconds - leap_seconds(seconds))
+    start = datetime(1970, 1, 1, tzinfo=UTC)
+    return [start + timedelta(microseconds=round(s * 1e6)) for s in seconds]
+
+
+def write_geojson(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
+    """RFC 7946: the track as a line, and a point a row with time, speed, heading and horizontal 1σ."""
+    place = table[["lon_deg", "lat_deg", "height_m"]].to_numpy()
+    speed, course = _speed(table), np.degrees(table["yaw"].to_numpy()) % 360
+    sigma = np.hypot(table["std_pos_n"], table["std_pos_e"]).to_numpy()
+    line = {"type": "LineString", "coordinates": _rounded(place)}
+    features = [{"type": "Feature", "properties": {"name": name}, "geometry": line}]
+    for k, point in enumerate(_rounded(place)):
+        told = {"t": float(table["t"].iloc[k]), "speed_mps": round(float(speed[k]), 3)}
+        told |= {"heading_deg": round(float(course[k]), 2), "gnss_used": bool(table["gnss_used"].iloc[k])}
+        if np.isfinite(sigma[k]):
+            told["std_horizontal_m"] = round(float(sigma[k]), 4)
+        if when is not None:
+            told["time"] = when[k].isoformat().replace("+00:00", "Z")
+        features.append({"type": "Feature", "properties": told, "geometry": {"type": "Point", "coordinates": point}})
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}), encoding="utf-8")
+
+
+def write_kml(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
+    """For Google Earth: a track with times where the date is known, else a line."""
+    import simplekml
+
+    kml = simplekml.Kml(name=name)
+    places = [tuple(p) for p in table[["lon_deg", "lat_deg", "height_m"]].to_numpy()]
+    if when is not None:
+        track = kml.newgxtrack(name=name)
+        track.newwhen([w.isoformat().replace("+00:00", "Z") for w in when])
+        track.newgxcoord(places)
+    else:
+        track = kml.newlinestring(name=name, coords=places)
+    track.altitudemode = simplekml.AltitudeMode.clamptoground  # heights are above the ellipsoid, not above the sea
+    track.style.linestyle.width, track.style.linestyle.color = 4, simplekml.Color.rgb(0, 114, 178)
+    kml.save(str(path))
+
+
+def write_gpx(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
+    """GPX 1.1 track; its elevation is the ellipsoidal height."""
+    import gpxpy.gpx as gpx
+
+    segment = gpx.GPXTrackSegment()
+    for k, (lat, lon, height) in enumerate(table[["lat_deg", "lon_deg", "height_m"]].to_numpy()):
+        segment.points.append(gpx.GPXTrackPoint(round(lat, 9), round(lon, 9), round(height, 3), when and when[k]))
+    track = gpx.GPXTrack(name=name)
+    track.segments.append(segment)
+    content = gpx.GPX()
+    content.creator = "dlkf"
+    content.tracks.append(track)
+    path.write_text(content.to_xml(version="1.1"), encoding="utf-8")
+
+
+def write_nmea(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
+    """GGA, RMC and GST a row; quality 6 (dead reckoning) where no fix was used; the height is the ellipsoid's."""
+    from pynmeagps import GET, NMEAMessage
+
+    start = datetime(1980, 1, 6, tzinfo=UTC)
+    lines = []
+    course = np.degrees(np.arctan2(table["vel_e"], table["vel_n"])).to_numpy() % 360
+    speed = _speed(table) / KNOTS
+    for k, row in enumerate(table.itertuples()):
+        at = when[k] if when is not None else start + timedelta(seconds=float(row.t))
+        clock = f"{at:%H%M%S}.{at.microsecond // 10_000:02d}"
+        place = (*_dm(row.lat_deg, "NS", 2), *_dm(row.lon_deg, "EW", 3))
+        quality = "1" if row.gnss_used else "6"
+        gga = [clock, *place, quality, "00", "", f"{row.height_m:.3f}", "M", "0.000", "M", "", ""]
+        mode = "A" if row.gnss_used else "E"
+        rmc = [clock, "A", *place, f"{speed[k]:.3f}", f"{course[k]:.2f}", f"{at:%d%m%y}", "", "", mode]
+        sentences = [("GGA", gga), ("RMC", rmc)]
+        if np.isfinite(row.std_pos_n):
+            std = [f"{x:.4f}" for x in (row.std_pos_n, row.std_pos_e, row.std_pos_d)]
+            sentences.append(("GST", [clock, "", "", "", "", *std]))
+        for kind, payload in sentences:
+            lines.append(str(NMEAMessage("GN", kind, GET, payload=payload).serialize(), "ascii"))
+    path.write_text("".join(lines), encoding="ascii", newline="")
+
+
+def write_pos(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
+    """RTKLIB's solution file in GPS week and time of week; Q 1 with a fix, 6 (here: dead reckoning) without."""
+    if when is None:
+        gps = table["t"].to_numpy()
+    else:
+        unix = np.array([w.timestamp() for w in when])
+        gps = unix - GPS_EPOCH_UNIX + leap_seconds(unix)
+    week = np.floor(gps / WEEK_S)
+    std = [table[f"std_pos_{a}"].fillna(0).to_numpy() for a in "ned"]
+    head = "%  GPST               latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)"
+    head += "  sdne(m)  sdeu(m)  sdun(m) age(s)  ratio    vn(m/s)    ve(m/s)    vu(m/s)"
+    lines = [f"% program   : dlkf, {name}", "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,6:dead reckoning)", head]
+    for k, row in enumerate(table.itertuples()):
+        text = f"{week[k]:4.0f} {gps[k] - week[k] * WEEK_S:10.3f} {row.lat_deg:14.9f} {row.lon_deg:14.9f} "
+        text += f"{row.height_m:10.4f} {1 if row.gnss_used else 6:3d}   0"
+        text += f" {std[0][k]:8.4f} {std[1][k]:8.4f} {std[2][k]:8.4f}"
+        text += "   0.0000   0.0000   0.0000   0.00    0.0 "
+        lines.append(text + f"{row.vel_n:10.5f} {row.vel_e:10.5f} {-row.vel_d:10.5f}")
+    path.write_text("\n".join(lines) + "\n", encoding="ascii", errors="replace")
+
+
+def write_tum(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
+    """For evo: t x y z qx qy qz qw; East-North-Up from the first row, attitude of Forward-Left-Up axes in it."""
+    position, rotation = poses(table)
+    q = Rotation.from_matrix(rotation).as_quat()
+    t = table["t"].to_numpy() if when is None else np.array([w.timestamp() for w in when])
+    rows = np.column_stack((t, position, q))
+    np.savetxt(path, rows, fmt=["%.6f"] + ["%.5f"] * 3 + ["%.9f"] * 4)
+
+
+def write_kitti(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
+    """For evo: the upper three rows of the pose matrix a line, in the axes of :func:`write_tum`."""
+    position, rotation = poses(table)
+    np.savetxt(path, np.concatenate((rotation, position[..., None]), -1).reshape(-1, 12), fmt="%.9e")
+
+
+def write_csv(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
+    """All columns of ``solution.parquet``, and the UTC time first where the date is known."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow((["utc"] if when else []) + list(table))
+        for k, row in enumerate(table.itertuples(index=False)):
+            values = ["" if x != x else x if isinstance(x, (bool, np.bool_)) else f"{x:.12g}" for x in row]
+            writer.writerow(([when[k].isoformat().replace("+00:00", "Z")] if when else []) + values)
+
+
+def poses(table: pd.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Positions (T, 3) East-North-Up [m] from the first row, and rotations (T, 3, 3) of Forward-Left-Up into it."""
+    lat, lon, height = (table[c].to_numpy() for c in ("lat_deg", "lon_deg", "height_m"))
+    position = np.stack(pymap3d.geodetic2enu(lat, lon, height, lat[0], lon[0], height[0]), -1)
+    rpy = table[["yaw", "pitch", "roll"]].to_numpy()
+    C_nb = Rotation.from_euler("ZYX", rpy).as_matrix()
+    return position, NED_ENU @ C_nb @ np.diag([1.0, -1.0, -1.0])
+
+
+FORMATS: Mapping[str, tuple[str, Callable[[Path, pd.DataFrame, Times, str], None]]] = {
+    "geojson": ("solution.geojson", write_geojson),
+    "kml": ("solution.kml", write_kml),
+    "gpx": ("solution.gpx", write_gpx),
+    "nmea": ("solution.nmea", write_nmea),
+    "pos": ("solution.pos", write_pos),
+    "tum": ("solution.tum", write_tum),
+    "kitti": ("solution.kitti", write_kitti),
+    "csv": ("solution.csv", write_csv),
+}
+
+
+def chosen(export: str | list[str] | None) -> list[str]:
+    """Names of formats; ``all`` for every one. InputError for an unknown one."""
+    names = [] if export is None else [export] if isinstance(export, str) else list(export)
+    if names == ["all"]:
+        return list(FORMATS)
+    if unknown := [n for n in names if n not in FORMATS]:
+        raise InputError(f"export={unknown[0]}: unknown format; known: {', '.join(FORMATS)}, all")
+    return names
+
+
+def export(folder: Path, table: pd.DataFrame, names: list[str], when: Times, drive: str) -> None:
+    """One file a format beside ``solution.parquet``."""
+    for name in names:
+        file, write = FORMATS[name]
+        write(folder / file, table, when, drive)
+
+
+def _speed(table: pd.DataFrame) -> NDArray[np.float64]:
+    return np.hypot(table["vel_n"], table["vel_e"]).to_numpy()
+
+
+def _rounded(place: NDArray[np.float64]) -> list[list[float]]:
+    return [[round(lon, 9), round(lat, 9), round(height, 3)] for lon, lat, height in place.tolist()]
+
+
+def _dm(degrees: float, signs: str, digits: int) -> tuple[str, str]:
+    """Degrees and minutes as NMEA writes them: ``4807.0380000``, ``N``."""
+    size = round(abs(degrees) * 60, 7)
+    whole = int(size // 60)
+    return f"{whole:0{digits}d}{size - 60 * whole:010.7f}", signs[degrees < 0]
