@@ -29,7 +29,7 @@ FLOORS = (
 )
 FLOOR = {room: n for n, rooms in enumerate(FLOORS) for room in rooms}
 GLUE = {"hydra", "mlflow", "lightning", "omegaconf"}
-GLUED = {"command", "training", "tracking", *FLOORS[-1]}  # rooms that may import the glue
+GLUED = {"command", "training", "tracking", *FLOORS[-2]}  # rooms that may import the glue
 GLUE_FILES = {"dlkf.data.datamodule"}
 
 
