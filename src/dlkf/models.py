@@ -13,6 +13,7 @@ from dlkf.errors import InputError
 from dlkf.filters.build import OWN_SOURCE, build_filter, is_filter, known_filters
 from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import CONFIG, WEIGHTS, load_filter
+from dlkf.filters.shipped import shipped_folder
 from dlkf.navigation.imu_errors import ImuSpec
 
 BEST = "best"  # folder of the weights that a training keeps
@@ -40,6 +41,8 @@ def resolve_model(
         return build_filter(spec, imu, **given)
     if OWN_SOURCE.fullmatch(spec):
         return own_filter(spec, imu)
+    if folder := shipped_folder(spec):
+        return load_filter(folder)
     if is_tracked(spec):
         from dlkf.tracking.registry import download_model  # MLflow takes seconds to import
 
@@ -105,7 +108,7 @@ def short_name(spec: str) -> str:
 
     The folder ``best`` of a training is called after the training.
     """
-    if is_filter(spec):
+    if is_filter(spec) or shipped_folder(spec):
         return spec
     if RUN_ID.fullmatch(spec):
         return spec[:8]

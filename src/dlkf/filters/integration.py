@@ -85,6 +85,7 @@ class Correction(NamedTuple):
     std: Tensor | None = None  # (B, 15) 1σ after the update
     gain: Tensor | None = None  # (B, 9, 6)
     accepted: Tensor | None = None  # (B,) bool: a fix was used; None: all that might be
+    speed: Tensor | None = None  # (B, 2) m/s: a forward speed that a network tells, and its 1σ
     covariances: Covariances | None = None
 
 
@@ -125,6 +126,7 @@ class Solution:
     gain: Tensor | None  # (B, T, 9, 6)
     covariances: Covariances | None = None  # (B, T, …) where asked for and known
     error: ImuError | None = None  # (B, T, …) likewise: bias and sensor matrices apart
+    speed: Tensor | None = None  # (B, T, 2) m/s: forward speed that a network tells, and its 1σ
 
 
 def advance(
@@ -206,4 +208,5 @@ def gathered(steps: list[Step], offered: Tensor, *, keep_errors: bool = False) -
         gain=over_time([a.gain for a in answers]),
         covariances=None if covariances[0] is None else each(covariances, Covariances),
         error=each([s.error for s in steps], ImuError) if keep_errors else None,
+        speed=over_time([a.speed for a in answers]),
     )

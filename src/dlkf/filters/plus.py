@@ -173,6 +173,8 @@ class PlusFilter(nn.Module):
         heads = Heads(*(x.to(epoch.z.dtype) for x in heads))
         advice = self._advice(heads, memory)
         kalman, correction = self.kalman.step(memory.kalman, epoch._replace(advice=advice))
+        if "speed" in self.parts:
+            correction = correction._replace(speed=heads.speed)
         residual = memory.residual
         if "residual" in self.parts:
             error = correction.imu_error

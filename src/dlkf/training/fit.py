@@ -16,6 +16,7 @@ from lightning.pytorch.loggers import Logger
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.errors import InputError
 from dlkf.filters.learned import LearnedFilter
+from dlkf.filters.shipped import trained_filter
 from dlkf.training.callbacks.checkpoints import BEST, LAST, BestWeights, ResumePoint
 from dlkf.training.callbacks.progress import TrainingProgress
 from dlkf.training.module import FilterTraining
@@ -42,7 +43,9 @@ def fit(
         **{k: config[k] for k in ("model", "loss", "optimizer", "scheduler")}, seed=config["seed"]
     )
     last = folder / LAST
-    if isinstance(module.filter, LearnedFilter) and not last.is_file():
+    if config.get("finetune"):
+        module.filter = trained_filter(config["finetune"]).train()
+    elif isinstance(module.filter, LearnedFilter) and not last.is_file():
         warm_start(module.filter, data, mean_imu_error)
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     with warnings.catch_warnings():

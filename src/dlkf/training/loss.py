@@ -11,6 +11,7 @@ from torch.nn.functional import smooth_l1_loss
 from dlkf.data.drive import Batch
 from dlkf.filters.integration import Solution
 from dlkf.navigation.state import NavState
+from dlkf.training.outage_loss import likelihood_term, outage_term, speed_term
 
 TERMS = ("position", "velocity", "attitude")
 
@@ -19,7 +20,8 @@ TERMS = ("position", "velocity", "attitude")
 class LossConfig:
     """``scale`` [m, m/s, rad]: the error where smooth-L1 turns from square to linear; ``prior`` and
     ``posterior``: how much the states before and after the update count (paper.md 2.8, 4.12). A piece whose position
-    error passes ``diverged_m`` is left out of the batch's loss (paper.md 4.13)."""
+    error passes ``diverged_m`` is left out of the batch's loss (paper.md 4.13). ``outage``, ``likelihood``, ``speed``:
+    factors of the terms of :mod:`dlkf.training.outage_loss`."""
 
     position_scale: float = 1.0
     velocity_scale: float = 0.1
@@ -27,6 +29,9 @@ class LossConfig:
     prior: float = 1.0
     posterior: float = 1.0
     diverged_m: float = 1e4
+    outage: float = 0.0
+    likelihood: float = 0.0
+    speed: float = 0.0
 
 
 def pva_losses(solution: Solution, batch: Batch, config: LossConfig) -> dict[str, Tensor]:
@@ -36,7 +41,12 @@ def pva_losses(solution: Solution, batch: Batch, config: LossConfig) -> dict[str
     without any attitude truth has an attitude loss of 0. Pieces that diverged do not count either.
     """
     losses = {}
+    for term, of_term in (("outage", outage_term), ("likelihood", likelihood_term), ("speed", speed_term)):
+        if factor := getattr(config, term):
+            losses[term] = factor * of_term(solution, batch)
     total = config.prior + config.posterior
+    if not total:
+        return losses
     scales = (config.position_scale, config.velocity_scale, config.attitude_scale)
     masks = (batch.truth_valid, batch.truth_valid, batch.attitude_valid)
     eye = torch.eye(3, dtype=batch.imu.dtype, device=batch.imu.device)
@@ -62,5 +72,5 @@ def pva_losses(solution: Solution, batch: Batch, config: LossConfig) -> dict[str
 
 
 def weighted(losses: dict[str, Tensor], weights: dict[str, float]) -> Tensor:
-    """w_p L_p + w_v L_v + w_h L_h (paper eq 9)."""
-    return sum(weights[term] * losses[term] for term in TERMS)
+    """w_p L_p + w_v L_v + w_h L_h (paper eq 9), and the terms that have their own factors."""
+    return sum(weights.get(term, 1.0) * loss for term, loss in losses.items())

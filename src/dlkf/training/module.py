@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import end_errors, mean_error
-from dlkf.filters.integration import integrate
+from dlkf.filters.integration import Solution, integrate
 from dlkf.filters.saved import learned_filter
 from dlkf.networks.heads import IMU_ERROR_SIZE, INNOVATION_SIZE, STATE_SIZE
 from dlkf.training.callbacks.masking import BatchCallback
@@ -65,7 +65,7 @@ class FilterTraining(L.LightningModule):
         for callback in self.trainer.callbacks:
             if isinstance(callback, BatchCallback):
                 batch = callback.transform(batch, self.current_epoch, generator)
-        losses = pva_losses(integrate(batch, self.filter), batch, self.loss_config)
+        losses = pva_losses(self._run(batch), batch, self.loss_config)
         total = weighted(losses, self.loss_weights)
         values = {f"train/{k}_loss": v.detach() for k, v in losses.items()}
         self.log_dict({"train/loss": total.detach(), **values}, on_step=False, on_epoch=True, batch_size=batch.size[0])
@@ -80,9 +80,12 @@ class FilterTraining(L.LightningModule):
         """How long the epoch took."""
         self.log("time/epoch_s", time.perf_counter() - self._began)
 
+    def _run(self, batch: Batch) -> Solution:
+        return integrate(batch, self.filter, keep_covariances=self.loss_config.likelihood > 0)
+
     def validation_step(self, batch: Batch, step: int) -> None:
         """Errors at the ends of fixed outages, as they will be scored on test drives, and what the filter answers."""
-        solution = integrate(batch, self.filter)
+        solution = self._run(batch)
         self._ends.append(end_errors(batch, solution.posterior))
         used = solution.used.any(-1)
         self._errors.append(solution.imu_error[:, -1].double().cpu())

@@ -1,0 +1,22 @@
+"""Trained filters that come with the package, by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torch import nn
+
+from dlkf.filters.saved import load_filter
+
+WEIGHTS_FOLDER = Path(__file__).parents[1] / "weights"
+
+
+def shipped_folder(name: str) -> Path | None:
+    """Where the weights of a name lie, None for a name that does not come with the package."""
+    folder = WEIGHTS_FOLDER / name
+    return folder if name.isidentifier() and folder.is_dir() else None
+
+
+def trained_filter(name: str) -> nn.Module:
+    """A filter with its trained weights: one that comes with the package, or from a folder."""
+    return load_filter(shipped_folder(name) or Path(name).expanduser())

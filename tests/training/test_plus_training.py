@@ -1,0 +1,76 @@
+"""The experiment ``plus`` through the same trainer as any learned filter, and fine-tuning of trained weights."""
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from dlkf.config import config_dir
+from dlkf.data.drive import Batch
+from dlkf.errors import InputError
+from dlkf.filters.integration import integrate
+from dlkf.filters.plus import PlusConfig, PlusFilter
+from dlkf.filters.saved import load_filter
+from dlkf.training.callbacks.roughening import Roughening
+from dlkf.training.fit import fit
+from dlkf.training.loss import LossConfig, pva_losses, weighted
+
+from .test_resume import data, dataset  # noqa: F401
+
+
+def settings(*overrides: str) -> dict:
+    words = ["+experiment=plus", "data.datasets=[data/none]", "model.network.hidden=8", *overrides]
+    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
+        config = OmegaConf.to_container(compose("train", words), resolve=False)
+    config["trainer"]["best_from_epoch"] = 0
+    config = OmegaConf.to_container(OmegaConf.create({k: v for k, v in config.items() if k != "hydra"}), resolve=True)
+    keys = ("model", "loss", "optimizer", "scheduler", "trainer", "callbacks", "seed", "finetune")
+    config["trainer"] |= {"max_epochs": 2, "validate_every": 1, "accelerator": "cpu"}
+    config["callbacks"]["curriculum"] |= {"warm_s": 20.0, "full_s": 25.0}
+    config["callbacks"]["outage"] |= {"shortest_s": 3.0, "longest_s": 8.0, "before_s": 5.0}
+    return {k: config[k] for k in keys}
+
+
+def test_it_trains_is_saved_and_fine_tuned(dataset, tmp_path):  # noqa: F811
+    best = fit(settings(), data(dataset), tmp_path / "fresh", False)
+    model = load_filter(best)
+    assert isinstance(model, PlusFilter) and model.network.noise.weight.abs().sum() > 0
+    again = settings()
+    again["finetune"], again["trainer"]["max_epochs"] = str(best), 1
+    again["optimizer"]["lr"] = 0.0
+    tuned = load_filter(fit(again, data(dataset), tmp_path / "tuned", False))
+    assert all(torch.equal(a, b) for a, b in zip(model.state_dict().values(), tuned.state_dict().values(), strict=True))
+
+
+def test_its_loss_knows_outages_and_its_own_covariance(dataset):  # noqa: F811
+    """A filter surer than it is right is told so; an error in the outage costs as its logarithm does."""
+    module = data(dataset)
+    module.setup()
+    batch: Batch = module.batches("val")[0]
+    config = LossConfig(prior=0.0, posterior=0.0, outage=1.0, likelihood=1.0)
+    model = PlusFilter(_small()).eval()
+    with torch.no_grad():
+        solution = integrate(batch, model, keep_covariances=True)
+        losses = pva_losses(solution, batch, config)
+        assert set(losses) == {"outage", "likelihood"}
+        assert float(weighted(losses, {})) == pytest.approx(float(sum(losses.values())))
+        P = solution.covariances.updated
+        sure = solution.covariances._replace(updated=P / 1e4)
+        object.__setattr__(solution, "covariances", sure)
+        assert pva_losses(solution, batch, config)["likelihood"] > losses["likelihood"]
+
+
+def test_roughening_takes_its_own_keys_alone():
+    assert Roughening(share=0.1).rough.share == 0.1
+    with pytest.raises(InputError, match=r"callbacks\.roughening: unknown key shaar"):
+        Roughening(shaar=0.1)
+
+
+def test_without_its_own_weights_fine_tuning_says_so(dataset, tmp_path):  # noqa: F811
+    wrong = settings() | {"finetune": str(tmp_path / "none")}
+    with pytest.raises(InputError, match=r"config\.yaml"):
+        fit(wrong, data(dataset), tmp_path / "run", False)
+
+
+def _small() -> PlusConfig:
+    return PlusConfig.from_mapping({"network": {"hidden": 8}})
