@@ -26,7 +26,7 @@ def two_sample(increments: np.ndarray, step: np.ndarray, follows: np.ndarray) ->
     out = increments.copy()
     before, now = increments[:, :-1], increments[:, 1:]
     h0, h1 = step[:-1], step[1:]
-    out[:, 1:] += np.where(follows[1:], h1 * h1 / (6 * h0 * (h0 + h1)), 0.0) * _second_order(before, now)
+    out[:, 1:] += np.where(follows[1:], h1 * h1 / (6 * h0 * (h0 + h1)), 0.0) * second_order(before, now)
     return out
 
 
@@ -38,10 +38,10 @@ def merged(pieces: np.ndarray, first: np.ndarray) -> np.ndarray:
     total = np.cumsum(pieces, axis=1) - pieces
     count = np.diff(first, append=pieces.shape[1])
     before = total - np.repeat(total[:, first], count, axis=1)
-    return np.add.reduceat(pieces + 0.5 * _second_order(before, pieces), first, axis=1)
+    return np.add.reduceat(pieces + 0.5 * second_order(before, pieces), first, axis=1)
 
 
-def _second_order(before: np.ndarray, now: np.ndarray) -> np.ndarray:
+def second_order(before: np.ndarray, now: np.ndarray) -> np.ndarray:
     """α₀ × ν + ν₀ × α and α₀ × α of (6, n) increments ``before`` (index 0) and ``now``."""
     out = np.empty_like(now)
     for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):

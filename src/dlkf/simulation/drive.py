@@ -17,7 +17,7 @@ from dlkf.simulation.gnss.reporting import late
 from dlkf.simulation.gnss.satellite_fixes import receive
 from dlkf.simulation.gnss.surroundings import Surroundings, sky_along
 from dlkf.simulation.gnss.white import GnssConfig
-from dlkf.simulation.imu import ImuUnit, corrupt, inverse_mechanisation
+from dlkf.simulation.imu import ImuUnit, corrupt, interval_means, inverse_mechanisation
 from dlkf.simulation.motion.chassis import Car, ChassisConfig, draw_car, mounted, slip_angle
 from dlkf.simulation.motion.routes import VehicleConfig
 from dlkf.simulation.motion.vehicle import Route, Truth, follow, random_route
@@ -36,11 +36,15 @@ class Seeds(NamedTuple):
 
 @dataclass(frozen=True)
 class Rates:
-    """Sample rates [Hz]; the IMU's is a multiple of the other two."""
+    """Sample rates [Hz]; the IMU's is a multiple of the other two.
+
+    An IMU sample is the mean of ``imu_parts`` parts; 0 gives the constant rate and force that act like its interval.
+    """
 
     imu_hz: int
     gnss_hz: float
     reference_hz: int
+    imu_parts: int = 0
 
 
 @dataclass(frozen=True)
@@ -71,12 +75,14 @@ def simulate_drive(
 ) -> DriveTables:
     """One drive; each part has a seed of its own, so changing one leaves the others as they were."""
     motion_rng, imu_rng, gnss_rng, sky_rng, chassis_rng = (np.random.default_rng(seed) for seed in seeds)
-    t = np.arange(duration_s * rates.imu_hz + 1) / rates.imu_hz
+    parts = max(rates.imu_parts, 1)
+    t = np.arange(duration_s * rates.imu_hz * parts + 1) / (rates.imu_hz * parts)
     route = random_route(motion_rng, vehicle, float(duration_s))
     car = draw_car(chassis_rng, chassis)
     axle = follow(route, vehicle, t)
     truth = axle if chassis.is_point and not vehicle.is_banked else mounted(chassis_rng, car, route, axle)
-    true_imu = inverse_mechanisation(truth)
+    true_imu = interval_means(truth, parts) if rates.imu_parts else inverse_mechanisation(truth)
+    t, axle, truth = t[::parts], *(sliced(x, slice(None, None, parts)) for x in (axle, truth))
     measured, error = corrupt(imu_rng, true_imu, spec, unit, rates.imu_hz)
     fixes = np.arange(0, len(t), round(rates.imu_hz / rates.gnss_hz))
     rows = slice(None, None, rates.imu_hz // rates.reference_hz)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 from torch import Tensor
 
+from dlkf.data.increments import second_order
 from dlkf.navigation.attitude import rotation_from_rpy, rotation_from_vector, skew, vector_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, ecef_from_geodetic, ned_axes, normal_gravity
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
@@ -39,6 +40,22 @@ def inverse_mechanisation(truth: Truth) -> Array:
         parts = (truth.lat[rows], truth.lon[rows], truth.height[rows], truth.v_n[rows], truth.rpy[rows], dt)
         chunks.append(_sample_means(*map(torch.from_numpy, parts)))
     return torch.cat(chunks).numpy()
+
+
+def interval_means(truth: Truth, parts: int) -> Array:
+    """Mean specific force and rate over samples of ``parts`` intervals of the truth each, (N, 6): the data contract's.
+
+    What turns and pushes as the truth does (:func:`inverse_mechanisation`) less its coning and sculling inside every
+    interval, which loading adds again from what it sees of the samples (:mod:`dlkf.data.increments`): with α and ν the
+    increments and motion smooth through three intervals, α_k = φ_k − (φ_{k−1} × φ_k + φ_k × φ_{k+1})/24, ν likewise.
+    One part is a sensor that integrates its own coning; several leave in what vibrates too fast for the samples.
+    """
+    step = float(truth.t[1] - truth.t[0])
+    x = inverse_mechanisation(truth).T * step
+    inside = second_order(x[:, :-1], x[:, 1:]) / 24
+    x[:, 1:] -= inside
+    x[:, :-1] -= inside
+    return x.reshape(6, -1, parts).sum(-1).T / (step * parts)
 
 
 def _sample_means(
