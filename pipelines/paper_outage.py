@@ -40,7 +40,7 @@ def main() -> None:
     if not NEW_IMUS.exists():
         run("simulate", "dataset=per_drive", f"out={NEW_IMUS}")
     models = ",".join(["ins", "mbkf15", *(f"models:/outage@seed{seed}" for seed in seeds)])
-    outage = ["length_s=80", "stride_s=80", "outage.first_s=[20,25]", "outage.duration_s=[30,50]", "start.yaw_deg=2"]
+    outage = ["length_s=80", "stride_s=80", "outage.first_s=[20,25]", "outage.duration_s=[30,50]"]
     out = ("out=outputs/paper_outage/new_imus", "overwrite=true")
     run("evaluate", f"model=[{models}]", f"dataset={NEW_IMUS}", *out, *outage)
 

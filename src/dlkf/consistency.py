@@ -14,10 +14,10 @@ from rich.console import Console
 
 from dlkf.command import command
 from dlkf.console import counting
+from dlkf.data.masks import withhold
 from dlkf.diagnosis.consistency import Normalised, consistency, consistency_table, states_of, write_consistency
 from dlkf.diagnosis.matched_drives import matched_batch, matched_drives, matching
 from dlkf.errors import InputError
-from dlkf.evaluation.outages import with_outage
 from dlkf.evaluation.protocol import protocol_from
 from dlkf.evaluation.table import as_rich
 from dlkf.files import vacant
@@ -46,7 +46,7 @@ def main(cfg: DictConfig) -> None:
             mask = plan.masks(batch)[0]
             if not bool(mask.any()):
                 raise InputError(f"no outage fits into {settings.minutes:g} minutes; see outage.* and minutes")
-            batch, outage = with_outage(batch, mask), mask[0].numpy()
+            batch, outage = withhold(batch, mask), mask[0].numpy()
         with counting(f"Running {name}") as progress:
             filters = build_filter(name, spec, tuning=config["tuning"])
             results[name] = consistency(filters, batch, matrices, progress)

@@ -1,11 +1,15 @@
-"""Settings of a simulation from plain mappings: every key known, every number a finite number."""
+"""The one way from plain values to settings: every key known, every value of its field's type, one text for all.
+
+Settings are frozen dataclasses; the ranges of their values stand in ``__post_init__``, their units in the names.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import is_dataclass
-from typing import Any, ClassVar, Protocol, TypeVar, get_type_hints
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass
+from types import NoneType, UnionType
+from typing import Any, ClassVar, Literal, Protocol, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from dlkf.errors import InputError
 
@@ -19,10 +23,12 @@ class Settings(Protocol):
 T = TypeVar("T", bound=Settings)
 
 
-def built(kind: type[T], config: Any, where: str) -> T:
-    """A config dataclass from a mapping; fields that are dataclasses themselves take mappings.
+def settings_from(kind: type[T], config: Any, where: str) -> T:
+    """A settings dataclass from a mapping of its fields; fields that are dataclasses themselves take mappings.
 
-    InputError for an unknown key, and for a value that is not of the field's kind.
+    InputError for an unknown or missing key, and for a value that is not of the field's type: a number (finite), true
+    or false, a word, a list of numbers, one of the literals; ``None`` where the field may have none. ``where`` is what
+    a user calls the mapping. An instance is handed on as it is.
     """
     if isinstance(config, kind):
         return config
@@ -31,23 +37,53 @@ def built(kind: type[T], config: Any, where: str) -> T:
     known = {name: hint for name, hint in get_type_hints(kind).items() if name in kind.__dataclass_fields__}
     if unknown := sorted(str(key) for key in config if key not in known):
         raise InputError(f"{where}: unknown key {', '.join(unknown)}; known are {', '.join(known)}")
-    return kind(**{key: _value(known[key], value, key, where) for key, value in config.items()})
+    given = {key: _value(known[key], value, key, where) for key, value in config.items()}
+    try:
+        return kind(**given)
+    except TypeError:
+        optional = {f.name for f in fields(kind) if f.default is not MISSING or f.default_factory is not MISSING}
+        missing = ", ".join(key for key in known if key not in given and key not in optional)
+        raise InputError(f"{where}: {missing} missing") from None
 
 
-def _value(kind: Any, value: Any, key: str, where: str) -> Any:
-    if isinstance(kind, type) and is_dataclass(kind):
-        return built(kind, value, key)
-    if kind in (float, int):
-        if not _is_number(value) or not math.isfinite(value):
-            raise InputError(f"{where}: {key} is {value!r}, must be a number")
-    elif getattr(kind, "__origin__", None) is tuple:
-        if not isinstance(value, (list, tuple)) or not all(_is_number(x) for x in value):
-            raise InputError(f"{where}: {key} is {value!r}, must be a list of numbers")
-        return tuple(float(x) for x in value)
-    elif kind is str and not isinstance(value, str):
-        raise InputError(f"{where}: {key} is {value!r}, must be a word")
-    return value
+def _value(hint: Any, value: Any, key: str, where: str) -> Any:
+    options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    for option in options:
+        if isinstance(option, type) and is_dataclass(option):
+            if isinstance(value, (Mapping, option)):
+                return settings_from(option, value, key)
+        elif _fits(option, value):
+            return tuple(float(x) for x in value) if _is_list(option) else value
+    wanted = " or ".join(dict.fromkeys(_called(option) for option in options))
+    raise InputError(f"{where}: {key} is {value!r}, must be {wanted}")
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+def _fits(option: Any, value: Any) -> bool:
+    if option is NoneType:
+        return value is None
+    if option in (float, int):
+        return is_number(value)
+    if option in (bool, str):
+        return isinstance(value, option)
+    if get_origin(option) is Literal:
+        return value in get_args(option)
+    return isinstance(value, (list, tuple)) and all(map(is_number, value)) if _is_list(option) else True
+
+
+def _is_list(option: Any) -> bool:
+    return get_origin(option) in (tuple, list, Sequence) and set(get_args(option)) <= {float, int, ...}
+
+
+def _called(option: Any) -> str:
+    if get_origin(option) is Literal:
+        return f"one of {', '.join(map(str, get_args(option)))}"
+    if _is_list(option):
+        return "a list of numbers"
+    if isinstance(option, type) and is_dataclass(option):
+        return "a mapping"
+    return {NoneType: "null", bool: "true or false", str: "a word"}.get(option, "a number")
+
+
+def is_number(value: Any) -> bool:
+    """A finite number; true and false are none."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

@@ -19,19 +19,26 @@ CONF = config_dir()
 GROUPS = {  # group of the defaults list: folder under conf/
     "simulate": {"imu": "imu", "receiver": "receiver", "simulated@dataset": "simulated"},
     "ingest": {"reader": "reader"},
-    "evaluate": {"imu": "imu", "tuning": "tuning"},
+    "evaluate": {"imu": "imu", "tuning": "tuning", "start": "start", "outage": "outage"},
     "navigate": {"imu": "imu", "tuning": "tuning"},
     "allan": {"imu": "imu"},
     "register": {},
     "compare": {},
-    "tune": {"imu": "imu", "tuning": "tuning"},
-    "consistency": {"imu": "imu", "tuning": "tuning", "chassis": "chassis"},
-    "train": {"imu": "imu", "data": "data", "filter@model": "filter"},
+    "tune": {"imu": "imu", "tuning": "tuning", "start": "start", "outage": "outage"},
+    "consistency": {"imu": "imu", "tuning": "tuning", "chassis": "chassis", "start": "start", "outage": "outage"},
+    "train": {
+        "imu": "imu",
+        "data": "data",
+        "filter@model": "filter",
+        "start@data.start": "start",
+        "outage@scoring.outage": "outage",
+    },
 }
 
 
 def presets(folder: str) -> list[str]:
-    return sorted(path.stem for path in (CONF / folder).glob("*.yaml"))
+    """Those to choose from; what several share begins with an underscore."""
+    return sorted(path.stem for path in (CONF / folder).glob("[!_]*.yaml"))
 
 
 def composed(primary: str, *overrides: str) -> dict:
@@ -49,11 +56,11 @@ OPTIONS = {
     for primary, groups in GROUPS.items()
 }
 CASES = [(primary, option) for primary in GROUPS for option in OPTIONS[primary]]
-CASES += [  # an IMU preset replaces one node whole, so its composition alone is enough
+CASES += [  # a preset of the others replaces one node whole, so its composition alone is enough
     ("train", [*option, *experiment])
     for option in OPTIONS["train"]
     for experiment in EXPERIMENTS
-    if not option or not option[0].startswith("imu=")
+    if not option or option[0].startswith(("data=", "filter@"))
 ]
 
 

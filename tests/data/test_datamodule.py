@@ -11,7 +11,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 from dlkf.config import config_dir
 from dlkf.data.datamodule import DriveDataModule
-from dlkf.data.segments import inject_outage
+from dlkf.data.masks import withhold, within
 from dlkf.errors import InputError
 from tests.data.conftest import REAL, write_cars
 
@@ -92,8 +92,8 @@ def test_an_epoch_covers_the_training_time_once_from_random_starts(town):
 
 
 def test_batches_depend_on_seed_epoch_and_step_alone(town):
-    a, b = _module(town, turn_frames=True, bias_injection=(0.1, 0.3)), _module(
-        town, turn_frames=True, bias_injection=(0.1, 0.3)
+    a, b = _module(town, turn_frames=True, injected_bias={"accel_mps2": 0.1, "gyro_dps": 0.3}), _module(
+        town, turn_frames=True, injected_bias={"accel_mps2": 0.1, "gyro_dps": 0.3}
     )  # fmt: skip
     b.train_batch(0, 0), b.train_pieces(7)
     for epoch, step in ((0, 2), (3, 0)):
@@ -110,7 +110,7 @@ def test_scoring_batches_are_fixed(town):
     one, two = data.batches("test"), _module(town, eval_outage=(5, 10), eval_stride_s=10).batches("test")
     assert all(torch.equal(x.start.p_n, y.start.p_n) for x, y in zip(one, two))
     plain = _module(town, eval_stride_s=10).batches("test")
-    assert torch.equal(inject_outage(plain[0], 5, 10).available, one[0].available)
+    assert torch.equal(withhold(plain[0], within(plain[0], 5, 10)).available, one[0].available)
     assert (~one[0].available).sum(1).unique().tolist() == [10]
     assert len(data.describe().splitlines()) == 4
 
@@ -155,18 +155,17 @@ def test_a_resumed_run_sees_the_batches_of_an_uninterrupted_one(town, tmp_path):
     assert len(list(tmp_path.glob("*.ckpt"))) >= 4
 
 
-def test_the_presets_make_a_module(town):
-    """Every conf/data preset as Hydra gives it, lists and mappings of its own kind included."""
-    presets = sorted(p.stem for p in (config_dir() / "data").glob("*.yaml"))
-    assert "one_imu" in presets
+def test_the_config_makes_a_module(town):
+    """conf/data as Hydra gives it, lists and mappings of its own kind included."""
+    split = "data.split={train:rest,val:[day-1],test:[day-2]}"
+    overrides = ["+data=drives", f"data.datasets=[{town}]", split, "data.eval_outage=[10,5]"]
+    overrides += ["start@data.start=coarse", "data.injected_bias={accel_mps2:0.1,gyro_dps:0.3}"]
     with initialize_config_dir(str(config_dir()), version_base="1.3"):
-        for preset in presets:
-            split = "data.split={train:rest,val:[day-1],test:[day-2]}"
-            overrides = [f"+data={preset}", f"data.datasets=[{town}]", split, "data.eval_outage=[10,5]"]
-            config = compose(overrides=overrides)
-            data = instantiate(config.data, length_s=10, eval_length_s=20)
-            assert [row["drives"] for row in data.summary()] == [4, 1, 1]
-            assert data.train_batch(0, 0).size == (24, 10, 50)
+        data = instantiate(compose(overrides=overrides).data, length_s=10, eval_length_s=20)
+    assert [row["drives"] for row in data.summary()] == [4, 1, 1]
+    assert data.train_batch(0, 0).size == (24, 10, 50) and data.start.yaw_deg == 10
+    with pytest.raises(InputError, match=r"data\.injected_bias: unknown key gyro"):
+        _module(town, injected_bias={"gyro": 1.0})
 
 
 def test_real_drives_load():

@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from dlkf.data.augmentation import inject_bias, turn_frames
+from dlkf.data.augmentation import turn_frames
+from dlkf.data.masks import BiasLaw, every_nth, with_bias, withhold, within
 from dlkf.data.segments import (
     Piece,
     StartLaw,
     cut_pieces,
-    decimate,
-    inject_outage,
     make_batch,
-    select,
     whole_drives,
 )
 from dlkf.data.stack import DriveStack
@@ -140,18 +138,22 @@ def test_whole_drives_are_padded(drives):
     for mask in (batch.available, batch.truth_valid, batch.attitude_valid, batch.gnss_valid.any(-1)):
         assert not (mask & hidden).any()
     assert batch.imu.isfinite().all() and (batch.gnss[hidden] == 0).all()
-    alone = select(batch, torch.tensor([1]))
+    alone = batch.select(torch.tensor([1]))
     assert alone.drive == ("car-0",) and torch.equal(alone.imu, batch.imu[1:])
 
 
 def test_masks(drives):
     batch = make_batch(drives, [Piece(0, 0, 30)])
-    out = inject_outage(batch, 10, 15)
+    out = withhold(batch, within(batch, 10, 15))
     assert torch.nonzero(~out.available[0]).flatten().tolist() == list(
         range(10, 25)
     )  # ends of epochs 11 … 25 s
-    assert torch.nonzero(decimate(batch, 5).available[0]).flatten().tolist() == [4, 9, 14, 19, 24, 29]
+    assert torch.nonzero(every_nth(batch, 5).available[0]).flatten().tolist() == [4, 9, 14, 19, 24, 29]
+    both = every_nth(batch.select(torch.tensor([0, 0])), torch.tensor([2, 7])).available
+    assert [torch.nonzero(row).flatten().tolist()[:3] for row in both] == [[1, 3, 5], [6, 13, 20]]
     assert batch.available.all()
+    with pytest.raises(InputError, match="interval is 0"):
+        every_nth(batch, 0)
 
 
 def test_turned_frames_are_the_same_piece(drives):
@@ -179,7 +181,8 @@ def test_turned_frames_are_the_same_piece(drives):
 def test_injected_bias_is_in_the_imu_and_in_the_truth(drives):
     known = _masked(drives[0], ref_imu_error=(slice(None), 0.5))
     batch = make_batch([known], [Piece(0, 0, 20)] * 500, dtype=torch.float64)
-    biased = inject_bias(batch, 0.1, 0.3, torch.Generator().manual_seed(0))
+    noise = torch.randn(500, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    biased = with_bias(batch, BiasLaw(accel_mps2=0.1, gyro_dps=0.3).std * noise)
     bias = biased.imu[:, 0, 0] - batch.imu[:, 0, 0]
     assert torch.allclose(biased.imu - batch.imu, bias[:, None, None].expand_as(batch.imu))
     assert torch.allclose(biased.true_imu_error, 0.5 + bias[:, None].expand(-1, 20, 6))

@@ -12,10 +12,11 @@ import torch
 import yaml
 
 from dlkf.config import config_dir
+from dlkf.data.masks import withhold
 from dlkf.data.segments import StartLaw
 from dlkf.diagnosis.consistency import band, consistency, normalised_square
 from dlkf.diagnosis.matched_drives import MatchedDrives, matched_batch, matching
-from dlkf.evaluation.outages import OutagePlan, with_outage
+from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.navigation.imu_errors import imu_spec
 
@@ -46,7 +47,7 @@ def test_a_filter_with_matching_errors_knows_how_wrong_it_is(name):
     band is that of a single time."""
     spec = matching(CONSUMER, build_filter(name, CONSUMER).states)
     batch, matrices = matched_batch(DRIVES, spec)
-    batch = with_outage(batch, OutagePlan(80.0, 20.0).masks(batch)[0])
+    batch = withhold(batch, OutagePlan(80.0, 20.0).masks(batch)[0])
     result = consistency(build_filter(name, spec), batch, matrices)
     assert np.isnan(result.nis[:, 80:100]).all()  # nothing to compare in the outage
     for what, values, degrees in result.parts():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -74,26 +73,7 @@ def car_batch(
         true_imu_error=bias[:, None].expand(B, T, 6), present=yes,
         drive=tuple(f"car-{i:02d}" for i in range(B)), t_start=100.0 * torch.arange(B).double(),
     )  # fmt: skip
-    if dtype is torch.float64:
-        return batch
-    return in_precision(batch, dtype)
-
-
-def in_precision(batch: Batch, dtype: torch.dtype) -> Batch:
-    """The batch with its working fields in ``dtype``; file clock and ECEF origin stay float64."""
-    if batch.imu.dtype == dtype:
-        return batch
-    frame = batch.frame
-    working = ("axis_n", "earth_rate_n", "radius", "stretch", "height")
-    frame = replace(frame, **{name: getattr(frame, name).to(dtype) for name in working})
-    cast = {}
-    for f in fields(batch):
-        value = getattr(batch, f.name)
-        if isinstance(value, NavState):
-            cast[f.name] = NavState(*(x.to(dtype) for x in value))
-        elif isinstance(value, torch.Tensor) and value.is_floating_point() and f.name != "t_start":
-            cast[f.name] = value.to(dtype)
-    return replace(batch, frame=frame, **cast)
+    return batch if dtype is torch.float64 else batch.in_precision(dtype)
 
 
 @pytest.fixture(scope="session")

@@ -53,7 +53,7 @@ def test_navigate_writes_solutions_without_a_reference(town, tmp_path):
     [
         ("navigate", ["model=mbkf99"], "unknown model 'mbkf99'"),
         ("navigate", ["model=mbkf15", "imu=none_such"], "none_such"),
-        ("evaluate", ["model=mbkf15", "tuning.gyro_noise=-1"], "tuning factor gyro_noise is -1"),
+        ("evaluate", ["model=mbkf15", "tuning.gyro_noise=-1"], "tuning: gyro_noise is -1"),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(town, tmp_path, command, arguments, said):

@@ -5,9 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from dlkf.data.masks import withhold
 from dlkf.errors import InputError
 from dlkf.evaluation.metrics import windows
-from dlkf.evaluation.outages import OutagePlan, scorable, with_outage
+from dlkf.evaluation.outages import OutagePlan, scorable
 
 
 def _windows(mask):
@@ -18,7 +19,7 @@ def test_an_outage_withholds_the_fixes_after_its_start_up_to_its_end(cars):
     (mask,) = OutagePlan(first_s=20, duration_s=10).masks(cars)
     t = torch.arange(1, 61)
     assert all(t[row].tolist() == list(range(21, 31)) for row in mask)
-    masked = with_outage(cars, mask)
+    masked = withhold(cars, mask)
     assert not masked.available[mask].any() and masked.available[~mask].all() and cars.available.all()
 
 

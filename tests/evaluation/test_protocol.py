@@ -49,7 +49,7 @@ def tables_of(folder, **settings):
     data = DriveDataModule(folder, split={"train": ["g0"], "val": ["g1"], "test": ["g2"]}, **{**size, **settings})
     scenes = Scenes.of_split(data, "test", OutagePlan(first_s=(5, 10), duration_s=(5, 15)), seed=4)
     names = {"mbkf15": MBKF, "ins": build_filter("ins", IMU)}
-    made = study(names, scenes, kinds="simulated", injected_bias={"accel": 0.05, "gyro": 2e-3}, seed=4)[1]
+    made = study(names, scenes, kinds="simulated", injected_bias={"accel_mps2": 0.05, "gyro_dps": 0.1}, seed=4)[1]
     return json.dumps([r.as_dict() for r in made])
 
 
@@ -108,7 +108,7 @@ def test_study_reports_each_kind_apart_and_the_slope_of_an_injected_bias(drives)
     scenes = Scenes(drives, Protocol(length_s=50, stride_s=50))
     kinds = {d.name: "real" if i < 2 else "simulated" for i, d in enumerate(drives)}
     groups = {d.name: d.group for d in drives}
-    bias = {"accel": 0.03, "gyro": 1e-3}
+    bias = {"accel_mps2": 0.03, "gyro_dps": 0.06}
     _, made = study({"mbkf15": MBKF}, scenes, kinds=kinds, groups=groups, injected_bias=bias)
     assert [(r.kind, r.count["pieces"]) for r in made] == [("real", 2), ("simulated", 4)]
     for r in made:

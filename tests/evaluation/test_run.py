@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from dlkf.data.masks import BiasLaw
 from dlkf.errors import InputError
 from dlkf.evaluation.bias_slope import injected_response
 from dlkf.evaluation.metrics import magnitudes, rms_over_pieces, slope
@@ -15,8 +16,8 @@ from dlkf.evaluation.run import score
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Correction
 from dlkf.filters.model_based import Ins
-from dlkf.running.batched import chunks, take
-from tests.evaluation.conftest import IMU, in_precision
+from dlkf.running.batched import chunks
+from tests.evaluation.conftest import IMU
 
 FILTERS = {name: build_filter(name, IMU) for name in ("ins", "mbkf15")}
 
@@ -48,7 +49,7 @@ def test_chunks_cover_every_piece_once_and_drop_the_padding(cars):
     batch = _ragged(cars)
     found = list(chunks(batch, 2500))
     assert sorted(i for c in found for i in c.tolist()) == list(range(6))
-    shortest = take(batch, found[-1])
+    shortest = batch.select(found[-1]).trimmed()
     assert shortest.size[1] == int(batch.present[found[-1]].sum(-1).max())
     assert shortest.drive == tuple(batch.drive[i] for i in found[-1])
     assert torch.equal(shortest.frame.origin_e, batch.frame.origin_e[found[-1]])
@@ -78,9 +79,9 @@ def test_ins_runs_free_from_the_last_fix_not_from_the_start(cars):
 
 
 def test_several_batches_are_joined_and_named(cars):
-    short = take(cars, torch.tensor([1, 2]))
+    short = cars.select(torch.tensor([1, 2])).trimmed()
     short = replace(short, present=short.present.clone().index_fill_(1, torch.arange(40, 60), False))
-    short = take(short, torch.tensor([0, 1]))
+    short = short.select(torch.tensor([0, 1])).trimmed()
     scores = score({"ins": FILTERS["ins"]}, [cars, short], groups={"car-01": "g"}, kinds={"car-01": "real"})
     assert len(scores.pieces) == 8 and scores.filters["ins"].error.shape == (8, 60, 9)
     assert [p.group for p in scores.pieces][-2:] == ["g", "car-02"]
@@ -111,7 +112,7 @@ def test_a_network_is_scored_in_evaluation_mode_without_gradients(cars):
 
 
 def test_float32_agrees_with_float64(cars):
-    low = score({"mbkf15": FILTERS["mbkf15"]}, [in_precision(cars, torch.float32)])
+    low = score({"mbkf15": FILTERS["mbkf15"]}, [cars.in_precision(torch.float32)])
     high = score({"mbkf15": FILTERS["mbkf15"]}, [cars])
     gap = np.abs(low.filters["mbkf15"].error - high.filters["mbkf15"].error)[:, 10:, :3]
     assert gap.max() < 0.02  # a third of the filter's own 3 cm
@@ -120,7 +121,7 @@ def test_float32_agrees_with_float64(cars):
 def test_a_kalman_filter_follows_an_injected_bias_and_pure_inertial_does_not(cars):
     base = score(FILTERS, [cars])
     no_outage = torch.zeros(cars.size[:2], dtype=torch.bool)
-    cause, followed = injected_response(base, FILTERS, [(cars, no_outage)], accel=0.03, gyro=1e-3, seed=4)
+    cause, followed = injected_response(base, FILTERS, [(cars, no_outage)], law=BiasLaw(0.03, 0.06), seed=4)
     slopes = {name: slope(x, cause, intercept=False) for name, x in followed.items()}
     assert np.allclose(slopes["ins"], 0.0)
     assert np.allclose(slopes["mbkf15"][[2, 3, 4]], 1.0, atol=0.05)  # down and level rates: always seen

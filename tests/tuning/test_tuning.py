@@ -9,8 +9,9 @@ import pytest
 import torch
 import yaml
 
+from dlkf.data.masks import withhold
 from dlkf.errors import InputError
-from dlkf.evaluation.outages import OutagePlan, with_outage
+from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.tuning import Tuning
@@ -22,7 +23,7 @@ from tests.tracking.conftest import template, uri  # noqa: F401
 
 
 def hidden(batch):
-    return with_outage(batch, OutagePlan(30.0, 20.0).masks(batch)[0])
+    return withhold(batch, OutagePlan(30.0, 20.0).masks(batch)[0])
 
 
 def test_objectives_are_what_they_say(cars):  # noqa: F811

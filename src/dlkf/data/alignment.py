@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -22,6 +22,7 @@ from dlkf.navigation.attitude import prefix_rotations, rotation_from_rpy, rotati
 from dlkf.navigation.earth import EARTH_RATE, ned_axes, normal_gravity
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.state import NavState
+from dlkf.settings import settings_from
 
 SIDESLIP_STD = math.radians(1.5)  # course is not heading: sideslip, mounting yaw
 AXLE_STD = 0.7  # m, how far the IMU may sit before the rear axle; in a turn that is no small angle
@@ -47,24 +48,15 @@ class AlignConfig:
     def __post_init__(self) -> None:
         for name in ("min_speed", "window_s", "search_s"):
             value = getattr(self, name)
-            number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-            if not number or value < 0 or (value == 0 and name != "search_s"):
+            if value < 0 or (value == 0 and name != "search_s"):
                 above = "≥ 0" if name == "search_s" else "above 0"
                 raise InputError(f"align.{name} is {value!r}, must be a number {above}")
             object.__setattr__(self, name, float(value))
-        if not isinstance(self.from_rest, bool):
-            raise InputError(f"align.from_rest is {self.from_rest!r}, must be true or false")
 
     @staticmethod
     def of(config: AlignConfig | Mapping[str, Any] | None) -> AlignConfig:
         """From a mapping of its fields; InputError for unknown ones."""
-        if isinstance(config, AlignConfig):
-            return config
-        config = dict(config or {})
-        known = [f.name for f in fields(AlignConfig)]
-        if unknown := sorted(set(config) - set(known)):
-            raise InputError(f"align: unknown key {unknown[0]}; known are {', '.join(known)}")
-        return AlignConfig(**config)
+        return settings_from(AlignConfig, config or {}, "align")
 
 
 ALIGN = AlignConfig()

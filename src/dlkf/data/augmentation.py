@@ -61,18 +61,6 @@ def turn_frames(batch: Batch, generator: torch.Generator | None = None) -> Batch
     )
 
 
-def inject_bias(batch: Batch, accel_mps2: float, gyro_dps: float, generator: torch.Generator | None = None) -> Batch:
-    """Add to each piece's raw IMU a fresh constant drawn from N(0, σ²) per axis, and to its known IMU error.
-
-    σ is ``accel_mps2`` [m/s²] and ``gyro_dps`` [°/s]. Where the true error is unknown it stays NaN.
-    """
-    sigma = torch.tensor([accel_mps2] * 3 + [math.radians(gyro_dps)] * 3, dtype=torch.float64)
-    drawn = sigma * torch.randn(batch.size[0], 6, generator=generator, dtype=torch.float64)
-    bias = drawn.to(batch.imu)
-    imu = torch.where(batch.present[..., None, None], batch.imu + bias[:, None, None], batch.imu)
-    return replace(batch, imu=imu, true_imu_error=batch.true_imu_error + bias[:, None])
-
-
 @dataclass(frozen=True)
 class Rough:
     """IMUs and receivers worse than any preset, drawn anew for every piece; each pair is a log-uniform range.

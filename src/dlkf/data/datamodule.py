@@ -10,23 +10,23 @@ import lightning as L
 import numpy as np
 import torch
 
-from dlkf.data.augmentation import inject_bias, turn_frames
+from dlkf.data.augmentation import turn_frames
 from dlkf.data.drive import Batch, Drive
+from dlkf.data.masks import BiasLaw, with_bias, withhold, within
 from dlkf.data.segments import (
     Piece,
     StartLaw,
     cut_pieces,
     epochs_of,
-    inject_outage,
     make_batch,
     pieces_at,
     possible_starts,
-    select,
 )
 from dlkf.data.splits import SIDES, Split, split_rows
 from dlkf.data.stack import DriveStack
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
+from dlkf.settings import settings_from
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
@@ -43,8 +43,8 @@ class DriveDataModule(L.LightningDataModule):
     there. Lengths that change need ``Trainer(reload_dataloaders_every_n_epochs=1)``.
 
     Groups of the same name in several datasets count as one recording. ``split`` and ``fractions`` as in
-    :func:`dlkf.data.splits.split_rows`; ``turn_frames`` and ``bias_injection``
-    = (m/s², °/s) augment training.
+    :func:`dlkf.data.splits.split_rows`; ``turn_frames`` and
+    ``injected_bias`` (``accel_mps2``, ``gyro_dps``: 1σ) augment training.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class DriveDataModule(L.LightningDataModule):
         min_valid: float = 1.0,
         start: StartLaw | Mapping[str, float] | None = None,
         turn_frames: bool = False,
-        bias_injection: Sequence[float] | None = None,
+        injected_bias: Mapping[str, float] | None = None,
         seed: int = 0,
         eval_seed: int = 0,
         split_seed: int = 0,
@@ -81,7 +81,8 @@ class DriveDataModule(L.LightningDataModule):
         self.batch_size, self.train_length_s = batch_size, length_s
         self.eval_length_s, self.eval_stride_s, self.min_valid = eval_length_s, eval_stride_s, min_valid
         self.eval_outage = _pair(eval_outage, "eval_outage")
-        self.bias_injection = _pair(bias_injection, "bias_injection")
+        law = None if injected_bias is None else settings_from(BiasLaw, injected_bias, "data.injected_bias")
+        self.injected_bias = law
         self.start, self.turn_frames = StartLaw.of(start), turn_frames
         self.seed, self.eval_seed, self.split_seed, self.progress = seed, eval_seed, split_seed, progress
         self.length_law: Callable[[int], float] | None = None
@@ -146,10 +147,11 @@ class DriveDataModule(L.LightningDataModule):
         batch = make_batch(self.stack, pieces, dtype=self.dtype, start=self.start, generator=generator)
         if self.turn_frames:
             batch = turn_frames(batch, generator)
-        if self.bias_injection is not None:
-            batch = inject_bias(batch, *self.bias_injection, generator)
+        if self.injected_bias is not None:
+            noise = torch.randn(batch.size[0], 6, generator=generator, dtype=torch.float64)
+            batch = with_bias(batch, self.injected_bias.std * noise)
         k, n = share
-        return batch if n == 1 else select(batch, torch.arange(k, len(pieces) // n * n, n))
+        return batch if n == 1 else batch.select(torch.arange(k, len(pieces) // n * n, n))
 
     def pieces(self, side: str) -> list[Piece]:
         """The fixed pieces of a side, for scoring."""
@@ -174,7 +176,7 @@ class DriveDataModule(L.LightningDataModule):
         for k in range(0, len(pieces), self.batch_size):
             part = pieces[k : k + self.batch_size]
             batch = make_batch(self.stack, part, dtype=dtype or self.dtype, start=self.start, seed=self.eval_seed)
-            out.append(batch if self.eval_outage is None else inject_outage(batch, *self.eval_outage))
+            out.append(batch if self.eval_outage is None else withhold(batch, within(batch, *self.eval_outage)))
         return out
 
     def train_dataloader(self) -> TrainBatches:

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import NavState
+
+EPOCHWISE = (
+    "imu", "gnss", "gnss_std", "gnss_valid", "gnss_lag", "available", "truth", "truth_valid", "attitude_valid",
+    "true_imu_error", "present",
+)  # fields of Batch with a row for every epoch  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -95,6 +102,26 @@ class Batch:
     def epoch_s(self) -> float:
         """Length of an epoch [s]."""
         return self.dt * self.imu.shape[2]
+
+    def select(self, index: Int[Tensor, " b"]) -> Batch:
+        """Some pieces of the batch."""
+
+        def kept(x: Any) -> Any:
+            if isinstance(x, NavState):
+                return NavState(*(part[index] for part in x))
+            if isinstance(x, (Tensor, TangentFrame)):
+                return x[index]
+            return tuple(x[i] for i in index.tolist()) if isinstance(x, tuple) else x
+
+        return replace(self, **{f.name: kept(getattr(self, f.name)) for f in fields(self)})
+
+    def trimmed(self) -> Batch:
+        """The batch without the padding that none of its pieces needs."""
+        T = max(1, int(self.present.sum(-1).max()))
+        if self.size[1] == T:
+            return self
+        short = {name: getattr(self, name)[:, :T] for name in EPOCHWISE if name != "truth"}
+        return replace(self, truth=NavState(*(x[:, :T] for x in self.truth)), **short)
 
     def to(self, device: torch.device | str) -> Batch:
         """The same batch on another device."""

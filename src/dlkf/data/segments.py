@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import torch
@@ -18,6 +18,7 @@ from dlkf.data.stack import DriveStack, stacked
 from dlkf.errors import InputError
 from dlkf.navigation.earth import TangentFrame, tangent_frame
 from dlkf.navigation.state import NavState
+from dlkf.settings import settings_from
 
 REST = (0.0, 0.0, -9.8, 0.0, 0.0, 0.0)  # IMU in the padding after a piece's end
 
@@ -40,7 +41,7 @@ class StartLaw:
     position_m: float = 1.0
     velocity_mps: float = 0.1
     roll_pitch_deg: float = 1.0
-    yaw_deg: float = 10.0
+    yaw_deg: float = 2.0
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -51,13 +52,7 @@ class StartLaw:
     @staticmethod
     def of(law: StartLaw | Mapping[str, float] | None) -> StartLaw:
         """A law from a mapping of its fields; InputError for unknown ones."""
-        if isinstance(law, StartLaw):
-            return law
-        law = dict(law or {})
-        known = [f.name for f in fields(StartLaw)]
-        if unknown := sorted(set(law) - set(known)):
-            raise InputError(f"start: unknown key {unknown[0]}; known are {', '.join(known)}")
-        return StartLaw(**law)
+        return settings_from(StartLaw, law or {}, "start")
 
     @property
     def std(self) -> Float[Tensor, " 9"]:
@@ -280,32 +275,3 @@ def _assemble(
         drive=tuple(stack[d].name for d in drive.tolist()),
         t_start=stack.t0[drive] + first * stack.epoch_s,
     )
-
-
-def select(batch: Batch, index: Int[Tensor, " b"]) -> Batch:
-    """Some pieces of a batch."""
-    part = {}
-    for f in fields(batch):
-        value = getattr(batch, f.name)
-        if isinstance(value, NavState):
-            part[f.name] = NavState(*(x[index] for x in value))
-        elif isinstance(value, (Tensor, TangentFrame)):
-            part[f.name] = value[index]
-        elif isinstance(value, tuple):
-            part[f.name] = tuple(value[i] for i in index.tolist())
-    return replace(batch, **part)
-
-
-def inject_outage(batch: Batch, start_s: float, duration_s: float) -> Batch:
-    """The batch with fixes withheld at t in (start_s, start_s + duration_s] after each piece's start."""
-    end = torch.arange(1, batch.size[1] + 1, dtype=torch.float64) * batch.epoch_s
-    hidden = (end > start_s + 1e-6) & (end <= start_s + duration_s + 1e-6)
-    return replace(batch, available=batch.available & ~hidden.to(batch.available.device))
-
-
-def decimate(batch: Batch, interval: int) -> Batch:
-    """The batch with only every ``interval``-th epoch's fix, the first one after ``interval`` epochs."""
-    if interval < 1:
-        raise InputError(f"decimation interval is {interval}, must be ≥ 1 epoch")
-    kept = torch.arange(1, batch.size[1] + 1, device=batch.available.device) % interval == 0
-    return replace(batch, available=batch.available & kept)

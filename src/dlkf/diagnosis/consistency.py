@@ -30,7 +30,6 @@ from dlkf.files import staged
 from dlkf.filters.integration import Estimator, Solution, integrate
 from dlkf.filters.model_based import Analytic, has_covariance
 from dlkf.navigation.state import PVA, ErrorStates
-from dlkf.running.batched import take
 
 Array = NDArray[np.float64]
 AT_ONCE = 25  # drives: a covariance of 33 states takes 9 kB per epoch and drive
@@ -108,7 +107,7 @@ def consistency(
     """NEES and NIS of a filter over drives with errors as it models them (``matched_drives``)."""
     n, rows = estimator.states.navigation, []
     for index in torch.arange(batch.size[0]).split(AT_ONCE):
-        part = take(batch, index)
+        part = batch.select(index).trimmed()
         with torch.inference_mode():
             s = integrate(part, estimator, keep_covariances=True)
         assert s.covariances is not None

@@ -24,7 +24,7 @@ from dlkf.errors import InputError
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.navigation.state import ErrorStates
 from dlkf.ranges import draw, has_ranges, middle
-from dlkf.settings import built
+from dlkf.settings import settings_from
 from dlkf.simulation.drive import sliced
 from dlkf.simulation.imu import corrupt, draw_unit, inverse_mechanisation
 from dlkf.simulation.motion.chassis import ChassisConfig, draw_car, mounted
@@ -62,7 +62,7 @@ class MatchedDrives:
 def matched_drives(config: Mapping[str, Any]) -> MatchedDrives:
     """Settings from the keys of ``conf/consistency.yaml``; InputError for unknown ones and odd values."""
     plain = {key: config[key] for key in ("drives", "minutes", "rate_hz", "vehicle", "chassis", "start", "seed")}
-    settings = built(MatchedDrives, middle(plain) | dict(config["gnss"]), "consistency")
+    settings = settings_from(MatchedDrives, middle(plain) | dict(config["gnss"]), "consistency")
     return replace(settings, cars=config["chassis"]) if has_ranges(config["chassis"]) else settings
 
 
@@ -116,7 +116,7 @@ def _drive(settings: MatchedDrives, spec: ImuSpec, index: int) -> tuple[Drive, n
     chassis = settings.chassis
     if settings.cars is not None:
         seed = np.random.SeedSequence(settings.seed, spawn_key=(index, 1))
-        chassis = built(ChassisConfig, draw(settings.cars, seed), "chassis")
+        chassis = settings_from(ChassisConfig, draw(settings.cars, seed), "chassis")
     if not chassis.is_point:
         truth = mounted(car_rng, draw_car(car_rng, chassis), route, truth)
     exact, unit = inverse_mechanisation(truth), draw_unit(unit_rng, spec)

@@ -7,7 +7,7 @@ and the error of the last withheld epoch is the error after exactly d seconds wi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dlkf.data.draws import drawn_per_piece
 from dlkf.data.drive import Batch
+from dlkf.data.masks import within
 from dlkf.errors import InputError
 
 LAST_FIX_WITHIN_S = 2.0  # an outage counts from a fix: one must lie this close before its start
@@ -33,14 +34,14 @@ class OutagePlan:
     first_s: float | Sequence[float] = 60.0
     duration_s: float | Sequence[float] = 60.0
     every_s: float | None = None
-    offsets_s: Sequence[float] = ()
+    offsets_s: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
         low, high = _bounds("outage.duration_s", self.duration_s)
         _bounds("outage.first_s", self.first_s)
         if low <= 0:
             raise InputError(f"outage.duration_s is {low:g} s, must be above 0")
-        if min(self.offsets_s, default=0.0) < 0:
+        if min(self.offsets_s or (0.0,)) < 0:
             raise InputError("outage.offsets_s must be a list of numbers ≥ 0, such as [0]")
         if self.every_s is not None and self.every_s <= high:
             raise InputError(
@@ -70,13 +71,10 @@ class OutagePlan:
 
 def outage_mask(batch: Batch, start_s: Tensor, duration_s: Tensor) -> Tensor:
     """True where an epoch's end t has start < t ≤ start + duration (B,); all False where that leaves it."""
-    T, epoch_s = batch.size[1], batch.epoch_s
-    t = torch.arange(1, T + 1, dtype=torch.float64) * epoch_s
     start, stop = start_s.double()[:, None], (start_s + duration_s).double()[:, None]
-    slack = 1e-6 * epoch_s
-    inside = (t > start + slack) & (t <= stop + slack)
-    length = batch.present.cpu().sum(-1, keepdim=True) * epoch_s
-    return inside & (start > -slack) & (stop <= length + slack)
+    slack = 1e-6 * batch.epoch_s
+    length = batch.present.cpu().sum(-1, keepdim=True) * batch.epoch_s
+    return within(batch, start_s, duration_s) & (start > -slack) & (stop <= length + slack)
 
 
 def scorable(batch: Batch, outage: Tensor) -> Tensor:
@@ -93,11 +91,6 @@ def scorable(batch: Batch, outage: Tensor) -> Tensor:
     faulty = torch.zeros(outage.shape[0], int(window.max()) + 1, dtype=torch.long)
     faulty.scatter_add_(1, window, (outage & (~truth | bad_start)).long())
     return outage & (faulty.gather(1, window) == 0)
-
-
-def with_outage(batch: Batch, outage: Tensor) -> Batch:
-    """The batch with the fixes of the mask (B, T) withheld."""
-    return replace(batch, available=batch.available & ~outage.to(batch.available.device))
 
 
 def _bounds(name: str, value: float | Sequence[float]) -> tuple[float, float]:

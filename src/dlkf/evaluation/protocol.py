@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 
 from dlkf.data.alignment import ALIGN, AlignConfig, Start
 from dlkf.data.drive import Batch, Drive
+from dlkf.data.masks import withhold
 from dlkf.data.segments import Piece, StartLaw, cut_pieces, make_batch, whole_drives
 from dlkf.data.stack import DriveStack, stacked
 from dlkf.errors import InputError
-from dlkf.evaluation.outages import OutagePlan, with_outage
+from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.run import Scene
 from dlkf.running.batched import CHUNK_SAMPLES
 from dlkf.running.start import align_each
+from dlkf.settings import settings_from
 
 if TYPE_CHECKING:
     from dlkf.data.datamodule import DriveDataModule
@@ -122,7 +124,7 @@ class Scenes:
 
     def withheld(self) -> list[Batch]:
         """All batches with the outages applied."""
-        return [with_outage(batch, mask) for batch, mask in self]
+        return [withhold(batch, mask) for batch, mask in self]
 
     def described(self) -> dict[str, Any]:
         """The rules as plain values, for files."""
@@ -197,23 +199,9 @@ def _parts(items: Sequence, epochs: Sequence[int], stack: DriveStack) -> list[li
 
 
 def protocol_from(config: Mapping[str, Any]) -> Protocol:
-    """A protocol from plain values: the keys of ``conf/evaluate.yaml``; InputError for unknown ones."""
-    outage = config.get("outage")
-    if outage in ("none", "off", False):
-        outage = None
-    if outage is not None:
-        if not isinstance(outage, Mapping):
-            raise InputError(f"outage is {outage!r}, must be null, or have first_s, duration_s, every_s, offsets_s")
-        known = {"first_s", "duration_s", "every_s", "offsets_s"}
-        if unknown := sorted(set(outage) - known):
-            raise InputError(f"outage: unknown key {unknown[0]}; known are {', '.join(sorted(known))}")
-        outage = OutagePlan(**{**outage, "offsets_s": tuple(outage.get("offsets_s") or ())})
-    return Protocol(
-        mode=config.get("mode", "auto"),
-        length_s=config.get("length_s", 120.0),
-        stride_s=config.get("stride_s") or config.get("length_s", 120.0),
-        start=StartLaw.of(config.get("start")),
-        align=AlignConfig.of(config.get("align")),
-        outage=outage,
-        seed=config.get("seed", 0),
-    )
+    """A protocol from plain values: the keys of ``conf/evaluate.yaml`` that it has; InputError for odd ones."""
+    given = {f.name: config[f.name] for f in fields(Protocol) if config.get(f.name) is not None}
+    if given.get("outage") in ("none", "off", False):
+        del given["outage"]
+    given.setdefault("stride_s", given.get("length_s", Protocol.length_s))
+    return settings_from(Protocol, given, "protocol")

@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from dlkf.data.drive import Batch
+from dlkf.data.masks import withhold
 from dlkf.errors import InputError
 from dlkf.evaluation.metrics import Array, error_series
-from dlkf.evaluation.outages import with_outage
 from dlkf.evaluation.scores import FilterRun, Piece, Scores
 from dlkf.filters.integration import Estimator
 from dlkf.navigation.state import IMU, NavState
-from dlkf.running.batched import CHUNK_SAMPLES, chunks, run_filter, take
+from dlkf.running.batched import CHUNK_SAMPLES, chunks, run_filter
 
 Scene = tuple[Batch, Tensor]
 
@@ -68,11 +68,11 @@ def score_scenes(
         truths.append(_Truth.of(batch, mask))
         if abs(batch.epoch_s - truths[0].epoch_s) > 1e-9:
             raise InputError("the batches to be scored have different epoch lengths; score them one by one")
-        masked = with_outage(batch, mask)
+        masked = withhold(batch, mask)
         for name, estimator in filters.items():
             runs[name].append(_blank(batch))
             for index in chunks(batch, chunk_samples):
-                _fill(runs[name][-1], index, take(masked, index), estimator, state)
+                _fill(runs[name][-1], index, masked.select(index).trimmed(), estimator, state)
                 done += len(index)
                 if progress is not None:
                     progress(done, total and total * len(filters))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dlkf.console import counting
+from dlkf.data.masks import BiasLaw
 from dlkf.evaluation.bias_slope import injected_response
 from dlkf.evaluation.metrics import slope
 from dlkf.evaluation.protocol import Scenes
@@ -12,6 +13,7 @@ from dlkf.evaluation.results import BASELINE, SETTLE_S, Results, imu_error_value
 from dlkf.evaluation.run import score_scenes
 from dlkf.evaluation.scores import Scores
 from dlkf.filters.integration import Estimator
+from dlkf.settings import settings_from
 
 
 def study(
@@ -22,12 +24,12 @@ def study(
     groups: Mapping[str, str] | None = None,
     baseline: str = BASELINE,
     settle_s: float = SETTLE_S,
-    injected_bias: Mapping[str, float] | None = None,
+    injected_bias: BiasLaw | Mapping[str, float] | None = None,
     seed: int = 0,
 ) -> tuple[Scores, list[Results]]:
     """Scores of every filter, and the results of each kind of data.
 
-    With ``injected_bias`` (``accel`` m/s², ``gyro`` rad/s, 1σ) everything runs once more with biases added to
+    With ``injected_bias`` everything runs once more with biases added to
     the IMU, and the results carry the ``injected_slope`` of its IMU-error estimate per filter.
     """
     with counting("Running filters") as progress:
@@ -39,9 +41,10 @@ def study(
         for kind in scores.kinds
     ]
     if injected_bias:
+        law = settings_from(BiasLaw, injected_bias, "injected_bias")
         with counting("Running with injected biases") as progress:
             cause, followed = injected_response(
-                scores, filters, scenes, total=scenes.runs, progress=progress, seed=seed, **injected_bias
+                scores, filters, scenes, law=law, total=scenes.runs, progress=progress, seed=seed
             )
         for k, result in enumerate(made):
             rows = [i for i, p in enumerate(scores.pieces) if p.kind == result.kind]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
 from importlib import import_module
 from typing import Any
 
@@ -22,6 +21,7 @@ from dlkf.filters.sources import Source
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.state import ErrorStates
+from dlkf.settings import settings_from
 
 KALMAN: Mapping[str, str] = {"mbkf15": "none", "mbkf21": "scale", "mbkf33": "full", "aekf": "none"}
 ENDINGS: Mapping[str, str] = {
@@ -76,7 +76,7 @@ def build_filter(
         if len(prior_mean) != 6 or len(prior_std) != 6:
             raise InputError(f"prior.mean and prior.std of {name} must have 6 values (m/s² x3, rad/s x3)")
         given = {"prior_mean": tuple(map(float, prior_mean)), "prior_std": tuple(map(float, prior_std))}
-    factors = tuning if isinstance(tuning, Tuning) else _tuning(tuning or {})
+    factors = settings_from(Tuning, tuning or {}, "tuning")
     states = ErrorStates(KALMAN[base], structure="car" in endings)
     sources: list[Source] = []
     if {"nhc", "car"} & set(endings):
@@ -124,16 +124,3 @@ def own_source(spec: str) -> Callable[[ImuSpec, Tuning, ErrorStates], Source]:
 def known_filters() -> str:
     """What to write after ``model=``, for messages."""
     return f"{', '.join(MODEL_BASED)}; endings of a Kalman filter: {', '.join('_' + e for e in ENDINGS)}"
-
-
-def _tuning(factors: Mapping[str, float]) -> Tuning:
-    known = {f.name for f in fields(Tuning)}
-    for key, value in factors.items():
-        if key not in known:
-            raise InputError(f"unknown tuning factor {key!r}; known: {', '.join(sorted(known))}")
-        if not isinstance(value, (int, float)) or not value > 0:
-            raise InputError(f"tuning factor {key} is {value!r}, must be a number above 0")
-    for key in ("gate", "forgetting"):
-        if not factors.get(key, 0.5) < 1:
-            raise InputError(f"tuning factor {key} is {factors[key]!r}, must be below 1")
-    return Tuning(**factors)

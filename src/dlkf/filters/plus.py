@@ -31,7 +31,7 @@ from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.navigation.state import ATTITUDE, IMU, POSITION, VELOCITY, ErrorStates
 from dlkf.networks.features import level_rotation
 from dlkf.networks.plus import WINDOW_FEATURES, Heads, PlusNetwork, PlusNetworkConfig, window_features
-from dlkf.settings import built
+from dlkf.settings import settings_from
 
 PARTS = ("process", "fix", "across", "offset", "speed", "residual")
 ANY_MEMS: Mapping[str, Any] = {  # what is known of an IMU of which nothing is known
@@ -83,7 +83,7 @@ class PlusConfig:
         if "parts" in given:
             given["parts"] = tuple(given["parts"])
         if "network" in given:
-            given["network"] = built(PlusNetworkConfig, given["network"], "model.network")
+            given["network"] = settings_from(PlusNetworkConfig, given["network"], "model.network")
         return cls(**given)
 
     def plain(self) -> dict[str, Any]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+
+from dlkf.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -39,3 +41,11 @@ class Tuning:
     rest_gyro: float = 0.025
     gate: float = 0.9999
     forgetting: float = 0.995
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if not getattr(self, f.name) > 0:
+                raise InputError(f"tuning: {f.name} is {getattr(self, f.name)!r}, must be above 0")
+        for name in ("gate", "forgetting"):
+            if not getattr(self, name) < 1:
+                raise InputError(f"tuning: {name} is {getattr(self, name)!r}, must be below 1")

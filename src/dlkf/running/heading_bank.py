@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dlkf.data.alignment import Start, levelled
 from dlkf.data.drive import Batch, Drive
-from dlkf.data.segments import select, whole_drives
+from dlkf.data.segments import whole_drives
 from dlkf.filters.integration import Covariances, Solution, integrate
 from dlkf.filters.model_based import Mbkf
 from dlkf.navigation.attitude import prefix_rotations, rotation_from_rpy, vector_from_rotation
@@ -159,7 +159,7 @@ def _bank(cases: Sequence[Case], epochs: Sequence[int]) -> Batch:
     batch = whole_drives(drives, [c.start for c in cases])
     imu = batch.imu.clone()
     imu[..., 3:] -= torch.stack([c.gyro_error for c in cases])[:, None, None]
-    bank = select(replace(batch, imu=imu), torch.arange(len(cases)).repeat_interleave(len(turns)))
+    bank = replace(batch, imu=imu).select(torch.arange(len(cases)).repeat_interleave(len(turns)))
     turned = rotation_from_rpy(torch.stack((0 * turns, 0 * turns, turns), -1))
     C = torch.stack([levelled(turned @ x, c.force_b, x @ c.force_b) for c in cases for x in [c.start.state.C_nb]])
     less = batch.start.C_nb.unsqueeze(1) - C  # of the lever arm

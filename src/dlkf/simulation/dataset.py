@@ -22,7 +22,7 @@ from dlkf.data.schema import drive_file, new_dataset, write_drive, write_drives_
 from dlkf.errors import InputError
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.ranges import draw, has_ranges, middle
-from dlkf.settings import built
+from dlkf.settings import settings_from
 from dlkf.simulation.drive import DriveTables, Rates, Seeds, simulate_drive
 from dlkf.simulation.gnss.almanac import read_almanac
 from dlkf.simulation.gnss.receiver import Receiver, receiver_spec
@@ -125,7 +125,7 @@ def dataset_config(config: Mapping[str, Any]) -> DatasetConfig:
     fleet = config.get("fleet") or {}
     if not isinstance(fleet, Mapping):
         raise InputError(f"dataset: fleet is {fleet!r}, must be a mapping of IMU presets")
-    return built(DatasetConfig, {**config, "fleet": {key: imu_spec(fleet[key]) for key in fleet}}, "dataset")
+    return settings_from(DatasetConfig, {**config, "fleet": {key: imu_spec(fleet[key]) for key in fleet}}, "dataset")
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import load_filter
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.report.evaluation import write_report
+from dlkf.settings import settings_from
 from dlkf.training.fit import fit
 from dlkf.tuning.baselines import Baselines, tuned_baselines
 
@@ -71,7 +72,7 @@ def run_study(
     names = config["baselines"]["models"]
     if learned in names:
         raise InputError(f"baselines.models has {learned}, the name of the trained filter; take it out")
-    plan = None if scoring["outage"] is None else OutagePlan(**{"offsets_s": (0.0,), **scoring["outage"]})
+    plan = None if scoring["outage"] is None else settings_from(OutagePlan, scoring["outage"], "scoring.outage")
     with _timed(seconds, "tuning"):
         baselines = _baselines(config, spec, data, plan, say)
     with _timed(seconds, "training"):
@@ -90,7 +91,7 @@ def run_study(
             kinds=kinds,
             groups={d.name: d.group for d in data.stack},
             settle_s=scoring["settle_s"],
-            injected_bias=scoring["slope"],
+            injected_bias=scoring["injected_bias"],
             seed=scoring["seed"],
         )
         title = ", ".join(Path(d).name for d in data.datasets)

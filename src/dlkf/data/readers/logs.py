@@ -22,7 +22,7 @@ from dlkf.data.readers.frames import DriveFrames
 from dlkf.data.readers.mapping import SOURCE, Mapped, Spec, check_keys, respaced, selected
 from dlkf.data.readers.settling import AUTO, open_settings, placeholders, settle
 from dlkf.errors import InputError
-from dlkf.settings import built
+from dlkf.settings import settings_from
 
 TEXT = ("separator", "decimal", "header", "comment", "skip_rows", "encoding")
 NEAR_S = 0.05  # rows of two GNSS tables this close are of one fix
@@ -64,7 +64,7 @@ class LogReader:
         self.text = dict(zip(TEXT, (separator, decimal, header, comment, skip_rows, encoding)))
         self.time_zero, self.drive, self.group = time_zero, drive, group
         self.lever_arm_m = lever_arm_m if lever_arm_m == AUTO else _lever_arm(lever_arm_m)
-        self.meta, self.sure = dict(meta or {}), built(Sure, sure or {}, "reader.sure")
+        self.meta, self.sure = dict(meta or {}), settings_from(Sure, sure or {}, "reader.sure")
         self.wanted = open_settings(self.specs, lever_arm_m)
         self.neutral = placeholders(self.specs)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from dlkf.errors import InputError
-from dlkf.settings import built
+from dlkf.settings import settings_from
 
 Array = NDArray[np.float64]
 LOWEST = math.radians(3.0)  # mappings and noise grow without bound towards the horizon
@@ -83,7 +83,7 @@ def receiver_spec(config: Mapping | None) -> Receiver | None:
         return None
     if not isinstance(config, Mapping) or config.get("name") in (None, WHITE):
         raise InputError(f"receiver: is {config!r}; give one of conf/receiver/*.yaml, white has nothing to set")
-    return built(Receiver, config, "receiver")
+    return settings_from(Receiver, config, "receiver")
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from lightning.pytorch.callbacks import Callback
 
 from dlkf.data.drive import Batch
+from dlkf.data.masks import withhold, within
 from dlkf.errors import InputError
 
 
@@ -34,8 +33,7 @@ class GnssDecimation(BatchCallback):
         B, T, _ = batch.size
         interval = torch.randint(self.shortest_s, self.longest_s + 1, (B, 1), generator=generator)
         step = (torch.arange(1, T + 1) * batch.epoch_s).round().long()
-        keep = (step % interval == 0).to(batch.available.device)
-        return replace(batch, available=batch.available & keep)
+        return withhold(batch, step % interval != 0)
 
     def state_dict(self) -> dict:
         """Settings, so that a checkpoint tells what it was trained with."""
@@ -71,9 +69,7 @@ class OutageInjection(BatchCallback):
             return batch
         length = self.shortest_s + (longest - self.shortest_s) * torch.rand(B, 1, generator=generator)
         start = self.before_s + (room - length) * torch.rand(B, 1, generator=generator)
-        end_of_epoch = torch.arange(1, T + 1) * batch.epoch_s
-        hidden = (end_of_epoch > start) & (end_of_epoch <= start + length)
-        return replace(batch, available=batch.available & ~hidden.to(batch.available.device))
+        return withhold(batch, within(batch, start[:, 0], length[:, 0]))
 
     def state_dict(self) -> dict:
         """Settings, so that a checkpoint tells what it was trained with."""

@@ -9,7 +9,7 @@ import torch
 
 from dlkf.data.augmentation import Rough, roughen
 from dlkf.data.drive import Batch
-from dlkf.settings import built
+from dlkf.settings import settings_from
 from dlkf.training.callbacks.masking import BatchCallback
 
 
@@ -17,7 +17,7 @@ class Roughening(BatchCallback):
     """Draws for every piece anew; keys are those of :class:`dlkf.data.augmentation.Rough`."""
 
     def __init__(self, **rough: Any) -> None:
-        self.rough = built(Rough, rough, "callbacks.roughening")
+        self.rough = settings_from(Rough, rough, "callbacks.roughening")
 
     def transform(self, batch: Batch, epoch: int, generator: torch.Generator) -> Batch:
         """The same motion, felt by other sensors."""

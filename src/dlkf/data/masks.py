@@ -1,0 +1,61 @@
+"""What is kept from a filter, or added to what it sees: withheld fixes and IMU biases, Batch → Batch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dlkf.data.drive import Batch
+from dlkf.errors import InputError
+
+
+@dataclass(frozen=True)
+class BiasLaw:
+    """1σ of a constant that is added to the IMU of every piece, per axis [m/s², °/s]."""
+
+    accel_mps2: float = 0.05
+    gyro_dps: float = 0.15
+
+    def __post_init__(self) -> None:
+        for name in ("accel_mps2", "gyro_dps"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise InputError(f"injected_bias.{name} is {getattr(self, name)!r}, must be a number ≥ 0")
+
+    @property
+    def std(self) -> Float[Tensor, " 6"]:
+        """[m/s²] of three accelerometers, [rad/s] of three gyroscopes; float64."""
+        return torch.tensor([self.accel_mps2] * 3 + [math.radians(self.gyro_dps)] * 3, dtype=torch.float64)
+
+
+def withhold(batch: Batch, hidden: Bool[Tensor, "b t"]) -> Batch:
+    """The batch without the fixes of the mask."""
+    return replace(batch, available=batch.available & ~hidden.to(batch.available.device))
+
+
+def within(batch: Batch, start_s: float | Tensor, duration_s: float | Tensor) -> Bool[Tensor, "b t"]:
+    """True where an epoch's end has start < t ≤ start + duration, seconds from the start of a piece; each (B,)."""
+    B, T, _ = batch.size
+    t = torch.arange(1, T + 1, dtype=torch.float64) * batch.epoch_s
+    start, length = (torch.as_tensor(x, dtype=torch.float64).expand(B)[:, None] for x in (start_s, duration_s))
+    slack = 1e-6 * batch.epoch_s
+    return (t > start + slack) & (t <= start + length + slack)
+
+
+def every_nth(batch: Batch, n: int | Tensor) -> Batch:
+    """The batch with only every n-th epoch's fix, the first one after n epochs; ``n`` may be one a piece (B,)."""
+    B, T, _ = batch.size
+    interval = torch.as_tensor(n).expand(B)[:, None]
+    if bool((interval < 1).any()):
+        raise InputError(f"decimation interval is {int(interval.min())}, must be ≥ 1 epoch")
+    return withhold(batch, torch.arange(1, T + 1) % interval != 0)
+
+
+def with_bias(batch: Batch, bias: Float[Tensor, "b 6"]) -> Batch:
+    """The batch with a constant added to its raw IMU and to its true IMU error, which stays NaN where unknown."""
+    bias = bias.to(batch.imu)
+    imu = torch.where(batch.present[..., None, None], batch.imu + bias[:, None, None], batch.imu)
+    return replace(batch, imu=imu, true_imu_error=batch.true_imu_error + bias[:, None])
