@@ -44,7 +44,7 @@ lint: .venv/installed-dev
 	$(BIN)/pyright
 
 bench: .venv/installed
-	$(BIN)/python pipelines/benchmark.py $(ARGS)
+	$(BIN)/python -m pipelines.studies.benchmark $(ARGS)
 
 docs: .venv/installed-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet

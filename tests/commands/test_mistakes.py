@@ -17,8 +17,7 @@ import yaml
 from dlkf.data.schema import drive_file
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.saved import save_filter
-
-from .conftest import in_shell
+from tests.shell import in_shell
 
 DRIVE = "town-3-00001"  # the second of two: nothing of the first may be written either
 FAST = {

@@ -10,7 +10,7 @@ import pandas as pd
 import pymap3d
 
 from dlkf.data.readers.units import GPS_EPOCH_UNIX
-from tests.data.conftest import Tables
+from tests.cars import Tables
 
 WEEK, TOW = 2350, 345_600.0
 GPS = WEEK * 604_800 + int(TOW)

@@ -16,7 +16,7 @@ from dlkf.data.readers.units import rotation, seconds
 from dlkf.data.tables import read_drives, read_table
 from dlkf.data.validate import validate_dataset
 from dlkf.errors import InputError
-from tests.data.conftest import car
+from tests.cars import car
 
 PLAIN = {
     "imu": {

@@ -13,7 +13,7 @@ from dlkf.config import config_dir
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.masks import withhold, within
 from dlkf.errors import InputError
-from tests.data.conftest import REAL, write_cars
+from tests.cars import REAL, write_cars
 
 
 def _module(*folders, **kwargs) -> DriveDataModule:

@@ -14,8 +14,8 @@ from dlkf.config import config_dir
 from dlkf.data.intake import ingest_drives
 from dlkf.data.readers.frames import DriveFrames
 from dlkf.data.summary import drive_line
+from tests.cars import car
 from tests.data import logs
-from tests.data.conftest import car
 
 
 class Resolution(NamedTuple):

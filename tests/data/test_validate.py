@@ -12,7 +12,7 @@ from dlkf.data.schema import drive_file, write_drive, write_drives_table
 from dlkf.data.store import load_dataset
 from dlkf.data.validate import Limits, validate_dataset
 from dlkf.errors import InputError
-from tests.data.conftest import REAL, Tables
+from tests.cars import REAL, Tables
 
 NAME = "town-7"
 

@@ -1,5 +1,11 @@
-"""Commands as from a shell, on tiny simulated drives."""
+"""Commands run on simulated drives."""
 
-from tests.commands.conftest import call, town
+from pathlib import Path
 
-__all__ = ["call", "town"]
+import pytest
+
+
+@pytest.fixture(scope="session")
+def town(simulated: Path) -> Path:
+    """The world of this room."""
+    return simulated

@@ -22,7 +22,7 @@ from dlkf.evaluation.table import all_tables
 from dlkf.filters.build import build_filter
 from dlkf.models import resolve_model, resolve_models
 from dlkf.running.offline import navigate_drives
-from tests.evaluation.conftest import IMU
+from tests.cars import IMU
 
 MBKF = build_filter("mbkf15", IMU)
 

@@ -23,7 +23,7 @@ from dlkf.evaluation.table import as_csv, as_json, as_markdown, number, ratio_ta
 from dlkf.files import staged
 from dlkf.filters.build import build_filter
 from dlkf.report.evaluation import write_report
-from tests.evaluation.conftest import IMU
+from tests.cars import IMU
 
 FILTERS = {name: build_filter(name, IMU) for name in ("ins", "mbkf15")}
 

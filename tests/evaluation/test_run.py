@@ -17,7 +17,7 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Correction
 from dlkf.filters.model_based import Ins
 from dlkf.running.batched import chunks
-from tests.evaluation.conftest import IMU
+from tests.cars import IMU
 
 FILTERS = {name: build_filter(name, IMU) for name in ("ins", "mbkf15")}
 

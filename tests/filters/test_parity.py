@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pipelines import parity
+from pipelines.studies import parity
 
 STEP = 1.0  # s: theirs; at its default of 0.1 s the outages end nearer to ours, and take ten times as long
 

@@ -17,7 +17,7 @@ from dlkf.running.heading_bank import RING, Case, likeliest
 from dlkf.running.standstill import at_rest
 from dlkf.running.start import WORST_HEADING_STD, align, align_each
 from dlkf.simulation.dataset import simulate_from_config
-from tests.data.conftest import REAL
+from tests.cars import REAL
 
 SEARCH = AlignConfig(search_s=20.0)
 AROUND = AlignConfig(search_s=20.0, from_rest=True)

@@ -12,7 +12,7 @@ from dlkf.data.store import load_dataset
 from dlkf.navigation.attitude import vector_from_rotation
 from dlkf.navigation.earth import EARTH_RATE
 from dlkf.running.standstill import RATE_STD, at_rest, carried_back, carry_std, gyros_at_rest, rest_around, runs
-from tests.data.conftest import REAL
+from tests.cars import REAL
 
 
 @pytest.fixture(scope="module")

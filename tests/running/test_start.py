@@ -15,7 +15,7 @@ from dlkf.navigation.attitude import rotation_from_rpy, vector_from_rotation
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.running.start import align, aligned_drives
-from tests.data.conftest import REAL
+from tests.cars import REAL
 
 
 @pytest.fixture(scope="module")

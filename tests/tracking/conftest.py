@@ -1,8 +1,7 @@
-"""A store made once and copied for every test (a fresh one costs seconds), a small model, two drives."""
+"""A small model and two drives."""
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
@@ -10,31 +9,7 @@ import torch
 
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.saved import save_filter
-from dlkf.tracking.grid import PARENT_RUN, SWEPT
-from dlkf.tracking.runs import SQLITE, mlflow_module
-from tests.data.conftest import write_cars
-
-
-@pytest.fixture(scope="session")
-def template(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("store") / "mlflow.db"
-    mlflow_module().MlflowClient(SQLITE + str(path)).search_experiments()
-    return path
-
-
-@pytest.fixture
-def uri(template, tmp_path, monkeypatch) -> str:
-    """An empty store in the working folder of the test."""
-    for name in ("MLFLOW_TRACKING_URI", "MLFLOW_RUN_ID", PARENT_RUN, SWEPT):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.chdir(tmp_path)
-    shutil.copy(template, tmp_path / "mlflow.db")
-    return SQLITE + str(tmp_path / "mlflow.db")
-
-
-@pytest.fixture
-def client(uri):
-    return mlflow_module().MlflowClient(uri)
+from tests.cars import write_cars
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,7 @@ from dlkf.training.callbacks.roughening import Roughening
 from dlkf.training.fit import fit
 from dlkf.training.loss import LossConfig, pva_losses, weighted
 
-from .test_resume import data, dataset  # noqa: F401
+from .test_resume import data
 
 
 def settings(*overrides: str) -> dict:
@@ -31,7 +31,7 @@ def settings(*overrides: str) -> dict:
     return {k: config[k] for k in keys}
 
 
-def test_it_trains_is_saved_and_fine_tuned(dataset, tmp_path):  # noqa: F811
+def test_it_trains_is_saved_and_fine_tuned(dataset, tmp_path):
     best = fit(settings(), data(dataset), tmp_path / "fresh", False)
     model = load_filter(best)
     assert isinstance(model, PlusFilter) and model.network.noise.weight.abs().sum() > 0
@@ -42,7 +42,7 @@ def test_it_trains_is_saved_and_fine_tuned(dataset, tmp_path):  # noqa: F811
     assert all(torch.equal(a, b) for a, b in zip(model.state_dict().values(), tuned.state_dict().values(), strict=True))
 
 
-def test_its_loss_knows_outages_and_its_own_covariance(dataset):  # noqa: F811
+def test_its_loss_knows_outages_and_its_own_covariance(dataset):
     """A filter surer than it is right is told so; an error in the outage costs as its logarithm does."""
     module = data(dataset)
     module.setup()
@@ -66,7 +66,7 @@ def test_roughening_takes_its_own_keys_alone():
         Roughening(shaar=0.1)
 
 
-def test_without_its_own_weights_fine_tuning_says_so(dataset, tmp_path):  # noqa: F811
+def test_without_its_own_weights_fine_tuning_says_so(dataset, tmp_path):
     wrong = settings() | {"finetune": str(tmp_path / "none")}
     with pytest.raises(InputError, match=r"config\.yaml"):
         fit(wrong, data(dataset), tmp_path / "run", False)

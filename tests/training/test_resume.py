@@ -12,22 +12,12 @@ from safetensors.torch import load_file
 from dlkf.config import config_dir
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.errors import InputError
-from dlkf.simulation.dataset import simulate_from_config
 from dlkf.training.fit import fit
 from dlkf.training.run_folder import checked_digests, configuration_hash, read_state, run_folder, write_state
 
 
 def preset(path: str) -> dict:
     return yaml.safe_load((config_dir() / path).read_text())
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("data") / "tiny"
-    values = preset("simulated/one_imu.yaml") | {"hours": 0.25, "drive_minutes": 3.0}
-    values.pop("defaults")
-    config = {"dataset": values, "imu": preset("imu/automotive_mems.yaml"), "seed": 1}
-    return simulate_from_config(config, folder, progress=False)
 
 
 def data(dataset) -> DriveDataModule:

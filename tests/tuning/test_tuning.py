@@ -17,16 +17,14 @@ from dlkf.filters.integration import integrate
 from dlkf.filters.tuning import Tuning
 from dlkf.tuning.search import FACTORS, factors_of, outage_error, tuned
 from dlkf.tuning.study import check
-from tests.commands.conftest import call  # noqa: F401
-from tests.evaluation.conftest import IMU, cars, town, write_cars  # noqa: F401
-from tests.tracking.conftest import template, uri  # noqa: F401
+from tests.cars import IMU
 
 
 def hidden(batch):
     return withhold(batch, OutagePlan(30.0, 20.0).masks(batch)[0])
 
 
-def test_objectives_are_what_they_say(cars):  # noqa: F811
+def test_objectives_are_what_they_say(cars):
     batch = hidden(cars)
     solution = integrate(batch, build_filter("mbkf15", IMU))
     ends = (solution.posterior.p_n - batch.truth.p_n)[:, 49, :2].norm(dim=-1)
@@ -36,7 +34,7 @@ def test_objectives_are_what_they_say(cars):  # noqa: F811
     assert found["log"] == pytest.approx(float(ends.log().mean().exp()))
 
 
-def test_one_lost_piece_decides_rms_but_not_the_median(cars):  # noqa: F811
+def test_one_lost_piece_decides_rms_but_not_the_median(cars):
     batch = hidden(cars)
     imu = batch.imu.clone()
     imu[0, 30:] += torch.tensor([2.0, 2.0, 0, 0, 0, 0.1])
@@ -47,7 +45,7 @@ def test_one_lost_piece_decides_rms_but_not_the_median(cars):  # noqa: F811
     assert after[1] < 2 * before[1]
 
 
-def test_a_search_mends_noise_that_is_told_too_small(cars):  # noqa: F811
+def test_a_search_mends_noise_that_is_told_too_small(cars):
     small = replace(IMU, accel=replace(IMU.accel, noise_density=1e-5), gyro=replace(IMU.gyro, noise_density=1e-6))
     trials = []
     factors = {"accel_noise": (1.0, 100.0), "gyro_noise": (1.0, 100.0)}
@@ -71,7 +69,7 @@ def test_what_has_no_noise_of_its_own_is_refused(model):
         check(model, "rms")
 
 
-def test_the_command_writes_factors_that_evaluate_takes(uri, call, town):  # noqa: F811
+def test_the_command_writes_factors_that_evaluate_takes(uri, call, town):
     size = ("length_s=50", "outage.first_s=25", "outage.duration_s=20", "fractions=[0.5,0,0.5]", "rounds=1")
     done = call("tune", "model=mbkf15", f"dataset={town}", "imu=perfect", "name=cars", "out=found", *size)
     assert done.code == 0, done.err

@@ -1,6 +1,6 @@
 """The classical filters beside those of an independent public package, python-ins, on the same files in one run.
 
-    python pipelines/parity.py --drives 3 --out outputs/parity
+    python -m pipelines.studies.parity --drives 3 --out outputs/parity
 
 Car-like drives at 100 Hz whose IMU is made by python-ins' inverse mechanisation, with the errors of the preset
 ``consumer``, RTK at 1 Hz (0.02 m, 0.05 m/s) and outages of 60 s. Both filters start from the same wrong state with
@@ -15,7 +15,6 @@ import argparse
 import math
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,6 +31,7 @@ from rich.console import Console
 
 from dlkf.config import config_dir
 from dlkf.data.drive import Batch
+from dlkf.data.masks import withhold
 from dlkf.data.schema import ACCEL, GYRO, new_dataset, write_drive, write_drives_table
 from dlkf.data.segments import StartLaw, cut_pieces, make_batch
 from dlkf.data.store import load_dataset
@@ -127,7 +127,7 @@ def with_outages(batch: Batch) -> Batch:
     end = torch.arange(1, batch.size[1] + 1) * batch.epoch_s
     since = end - FIRST_S
     hidden = (since > 0) & ((since - 1e-6) % EVERY_S < OUTAGE_S)
-    return replace(batch, available=batch.available & ~hidden)
+    return withhold(batch, hidden)
 
 
 def start_of(batch: Batch) -> pd.Series:

@@ -1,4 +1,6 @@
-"""Coning and sculling, what they cost and what loading wins back: ``python -m pipelines.coning_sculling data/clean``.
+"""Coning and sculling, what they cost and what loading wins back.
+
+    python -m pipelines.studies.coning_sculling data/clean
 
 First motions with a closed form: coning of 1° half-angle (drift of the attitude), and a roll of 0.5° in step with a
 lateral push of 2 m/s² (drift of the velocity). *Plain* are the means that a sensor of that rate gives, *loaded* the

@@ -1,7 +1,7 @@
 """Pictures of the drives of any dataset, simulated or real.
 
-    python -m pipelines.drive_pictures data/lifelike --out outputs/pictures
-    python -m pipelines.drive_pictures ../shared/data/real/rtkx --drive <name of the drive>
+    python -m pipelines.studies.drive_pictures data/lifelike --out outputs/pictures
+    python -m pipelines.studies.drive_pictures ../shared/data/real/rtkx --drive <name of the drive>
 
 Draws a drive as in figure 4 of the paper (track, speed, specific force, rates, errors), the first one unless
 ``--drive`` says which, and for all drives the histograms of speed, accelerations and radii.

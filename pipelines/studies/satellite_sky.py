@@ -1,9 +1,9 @@
 """The sky over simulated or semi-real drives: what the fixes are worth, measured, and pictures.
 
     python -m dlkf.simulate dataset=city receiver=standalone raw=true out=data/city_standalone
-    python -m pipelines.satellite_sky data/city_standalone --figures docs/figures/satellites
-    python -m pipelines.satellite_sky --world --figures docs/figures/satellites
-    python -m pipelines.satellite_sky --accuracy 200000
+    python -m pipelines.studies.satellite_sky data/city_standalone --figures docs/figures/satellites
+    python -m pipelines.studies.satellite_sky --world --figures docs/figures/satellites
+    python -m pipelines.studies.satellite_sky --accuracy 200000
 
 For a dataset made with a satellite receiver: share of epochs with a fix, satellites, dilution, errors against
 their claimed covariance and against noise times dilution; pictures of one drive. ``--world``: satellites in view

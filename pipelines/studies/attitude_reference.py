@@ -1,7 +1,7 @@
 """An attitude reference for drives that have none: a Kalman filter over the whole drive, smoothed backwards.
 
-    python pipelines/attitude_reference.py data/town data/town_attitude --imu consumer
-    python pipelines/attitude_reference.py data/town --imu consumer          # check only, where attitude is known
+    python -m pipelines.studies.attitude_reference data/town data/town_attitude --imu consumer
+    python -m pipelines.studies.attitude_reference data/town --imu consumer    # check only, where attitude is known
 
 Roll, pitch and yaw of the reference are filled in where they are NaN; everything else is copied. The figures printed
 compare smoother and filter with the attitudes that the reference does have. Filter and smoother run on ``--epoch``

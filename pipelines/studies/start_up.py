@@ -1,4 +1,6 @@
-"""What starting from IMU and GNSS alone is worth: ``python -m pipelines.start_up data/city ../shared/data/real/kitti``.
+"""What starting from IMU and GNSS alone is worth.
+
+    python -m pipelines.studies.start_up data/city data/kitti
 
 For every dataset with a reference that has attitude: each drive started by the rule of a stream (first motion, course)
 and with ``align.search_s``, ``align.from_rest``; as recorded, in motion from its first second on, in reverse all along
@@ -25,6 +27,7 @@ from torch import Tensor
 from dlkf.config import config_dir
 from dlkf.data.alignment import ALIGN, AlignConfig, Start
 from dlkf.data.drive import Drive
+from dlkf.data.masks import withhold
 from dlkf.data.segments import whole_drives
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
@@ -125,7 +128,7 @@ def outages(recorded: Sequence[Drive], imu: ImuSpec, model: str, velocity_std: f
         for offset in range(0, 60, 10):
             phase = (since - 20 - offset) % 60
             hidden = (since > 20 + offset) & (phase > 0) & (phase <= 30)
-            end = run_filter(replace(batch, available=batch.available & ~hidden), estimator)
+            end = run_filter(withhold(batch, hidden), estimator)
             error = (end.posterior.p_n - batch.truth.p_n)[..., :2].norm(dim=-1)
             ends.append(error[hidden & (phase == 30) & batch.truth_valid])
         error = torch.cat(ends)

@@ -1,6 +1,6 @@
 """How cars move besides along their way, from any dataset with attitude: slip, arm, mounting, vibration.
 
-    python -m pipelines.car_motion ../shared/data/real/kitti data/lifelike --longest 20
+    python -m pipelines.studies.car_motion ../shared/data/real/kitti data/lifelike --longest 20
 
 Per dataset, over its longest drives: velocity to the right and down in the axes of the reference, RMS above 2 m/s;
 the least-squares fit v_right = arm · r − K v² r + yaw · v with r the yaw rate, and what it leaves, for all drives

@@ -1,6 +1,6 @@
 """What the simulated cars and IMUs are like, as Markdown tables: bounds, velocity across the car, exactness, noise.
 
-    python -m pipelines.simulation_report --hours 5
+    python -m pipelines.studies.simulation_report --hours 5
 
 For every profile of ``conf/simulated``: speed, accelerations and radii of the plans (R085-R088); the velocity across
 the car, RMS above 2 m/s; how far our strapdown of the error-free samples is from the truth during a minute at 50, 100

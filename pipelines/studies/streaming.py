@@ -1,7 +1,7 @@
 """The streaming filter on the road: time per call, and hours of driving with everything that goes wrong.
 
-    python pipelines/streaming.py latency [--minutes 7]
-    python pipelines/streaming.py road --model mbkf15_gated --hours 10 --faults
+    python -m pipelines.studies.streaming latency [--minutes 7]
+    python -m pipelines.studies.streaming road --model mbkf15_gated --hours 10 --faults
 
 ``road``: one simulated drive at 50 Hz; position error, memory, covariance, and with ``--faults`` 5 % of the fixes
 100 m off, half a minute of frozen fixes every half hour and ten minutes without any every two hours.

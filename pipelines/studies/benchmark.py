@@ -1,7 +1,7 @@
-"""Speed, all from one run: ``make bench`` or ``python pipelines/benchmark.py [--threads 2] [--hours 8]``.
+"""Speed, all from one run: ``make bench`` or ``python -m pipelines.studies.benchmark [--threads 2] [--hours 8]``.
 
 Windowed strapdown against a loop over samples, Kalman filters for one drive and for 64, one training epoch.
-The other half of the comparison, python-ins on the same files, is ``pipelines/parity.py``.
+The other half of the comparison, python-ins on the same files, is ``pipelines/studies/parity.py``.
 """
 
 from __future__ import annotations

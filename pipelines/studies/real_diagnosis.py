@@ -1,6 +1,6 @@
 """What limits a model-based filter on a real drive, from the drive itself and without any outage.
 
-    python -m pipelines.real_diagnosis ../shared/data/real/rtkx --imu roof_mems --velocity-std 2 --fit
+    python -m pipelines.studies.real_diagnosis ../shared/data/real/rtkx --imu roof_mems --velocity-std 2 --fit
 
 Innovation statistics of ``mbkf15`` (NIS), the clock of the IMU against that of GNSS, the delay of the GNSS
 velocity, what alignment is worth, the pitch that gyroscope and accelerometer see against the road's slope,

@@ -1,0 +1,102 @@
+"""What all rooms share: three small worlds, commands called as from a shell, an MLflow store made once.
+
+``town``: six exact drives of 60 s; ``noisy_town``: six pieces with noise and biases, also as the batch ``cars``;
+``simulated``: two drives as ``dlkf.simulate`` makes them. A room that means another of them by ``town`` says so in its
+conftest.
+"""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from dlkf.config import config_dir
+from dlkf.data.drive import Batch
+from dlkf.simulation.dataset import simulate_from_config
+from dlkf.tracking.grid import PARENT_RUN, SWEPT
+from dlkf.tracking.runs import SQLITE, mlflow_module
+from tests.cars import Tables, car, car_batch, write_cars, write_pieces
+from tests.shell import Ended
+
+SIZE = ("dataset.hours=0.05", "dataset.drive_minutes=1.5", "dataset.imu_rate_hz=50", "seed=3")
+
+
+@pytest.fixture(scope="session")
+def tables() -> Tables:
+    """One minute of the exact car."""
+    return car()
+
+
+@pytest.fixture(scope="session")
+def town(tmp_path_factory) -> Path:
+    """Six exact drives of 60 s in six groups."""
+    return write_cars(tmp_path_factory.mktemp("data") / "town", 6)
+
+
+@pytest.fixture(scope="session")
+def cars() -> Batch:
+    """Six pieces of 60 s with noise and biases."""
+    return car_batch(6, 60)
+
+
+@pytest.fixture(scope="session")
+def noisy_town(cars, tmp_path_factory) -> Path:
+    """The six pieces as a dataset in three groups."""
+    return write_pieces(tmp_path_factory.mktemp("data") / "town", cars)
+
+
+@pytest.fixture(scope="session")
+def simulated(tmp_path_factory) -> Path:
+    """Two drives of 90 s in a town."""
+    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
+        config = compose("simulate", ["simulated@dataset=per_drive", "dataset.name=town", *SIZE])
+    folder = tmp_path_factory.mktemp("data") / "town"
+    return simulate_from_config(OmegaConf.to_container(config, resolve=True), folder, progress=False)
+
+
+@pytest.fixture
+def call(tmp_path, monkeypatch, capfd):
+    """``call("evaluate", "model=ins", …)`` runs the command's main in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(command: str, *arguments: object) -> Ended:
+        main = importlib.import_module(f"dlkf.{command}").main
+        monkeypatch.setattr(sys, "argv", [f"dlkf.{command}", *map(str, arguments)])
+        capfd.readouterr()
+        code = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 1
+        out, err = capfd.readouterr()
+        return Ended(code, out, err)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def template(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("store") / "mlflow.db"
+    mlflow_module().MlflowClient(SQLITE + str(path)).search_experiments()
+    return path
+
+
+@pytest.fixture
+def uri(template, tmp_path, monkeypatch) -> str:
+    """An empty store in the working folder of the test."""
+    for name in ("MLFLOW_TRACKING_URI", "MLFLOW_RUN_ID", PARENT_RUN, SWEPT):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(template, tmp_path / "mlflow.db")
+    return SQLITE + str(tmp_path / "mlflow.db")
+
+
+@pytest.fixture
+def client(uri):
+    return mlflow_module().MlflowClient(uri)

@@ -1,0 +1,11 @@
+"""Noise is tuned on pieces with noise and biases."""
+
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def town(noisy_town: Path) -> Path:
+    """The world of this room."""
+    return noisy_town
