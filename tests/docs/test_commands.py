@@ -32,7 +32,7 @@ MINE = {
     "imu": ["my_imu", "shed"],
     "tuning": ["town"],
     "reader": ["xsens", "shed"],
-    "experiment": ["heading"],
+    "experiment": ["fresh_bias"],
     "simulated": ["van"],
 }
 # conf of one command has only what is chosen; these choices bring in the keys that others lack

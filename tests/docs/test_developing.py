@@ -13,6 +13,7 @@ import yaml
 
 from dlkf.config import config_dir
 from dlkf.errors import InputError
+from dlkf.filters.saved import load_filter
 from dlkf.models import resolve_model
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.tracking.runs import SQLITE, mlflow_module
@@ -105,15 +106,16 @@ def test_a_reader(desk: Path, run: Run) -> None:
     np.testing.assert_array_equal(read["accel_z"], tables["imu"]["accel_z"])
 
 
-def test_an_experiment_and_a_callback(desk: Path, run: Run) -> None:
-    """One training that both recipes ask for."""
-    written("An experiment", desk)
-    written("A callback", desk)
+def test_an_experiment_a_callback_and_a_network(desk: Path, run: Run) -> None:
+    """One training that all three recipes ask for; then its model is loaded again."""
     (experiment,) = lines("An experiment")
-    (callback,) = lines("A callback")
-    run([*experiment, *(word for word in callback if word.startswith("+callbacks"))])
-    (config,) = (desk / "outputs" / "train" / "heading").glob("*/best/config.yaml")
-    assert "frame: heading" in config.read_text()
+    own = [word for recipe in ("A callback", "A network") for word in lines(recipe)[0] if re.match(r"\+[cm]", word)]
+    assert len(own) == 3
+    for recipe in ("An experiment", "A callback", "A network"):
+        written(recipe, desk)
+    run([*experiment, *own])
+    (config,) = (desk / "outputs" / "train" / "fresh_bias").glob("*/best/config.yaml")
+    assert load_filter(config.parent).network.width == 32
     client = mlflow_module().MlflowClient(f"{SQLITE}{desk}/mlflow.db")
     (made,) = client.search_runs([e.experiment_id for e in client.search_experiments()])
     assert made.data.metrics["train/epoch_s"] > 0
