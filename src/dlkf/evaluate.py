@@ -6,7 +6,7 @@ Prints the results table and leaves metrics.json, table.md, table.csv, figures/ 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -15,6 +15,8 @@ from rich.console import Console
 
 from dlkf.command import command
 from dlkf.console import counting
+from dlkf.data.alignment import AlignConfig
+from dlkf.data.drive import Drive
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import dataset_digest, load_dataset
 from dlkf.errors import InputError
@@ -23,14 +25,17 @@ from dlkf.evaluation.study import study
 from dlkf.evaluation.summary import answer, metrics_of
 from dlkf.evaluation.table import all_tables, as_rich
 from dlkf.files import vacant
-from dlkf.filters.build import is_filter
+from dlkf.filters.build import build_filter
 from dlkf.filters.card import without_seen
-from dlkf.models import grid_of, resolve_models
+from dlkf.models import check_baseline, grid_of, resolve_models
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.provenance import provenance
 from dlkf.report.evaluation import write_report
+from dlkf.running.references import KINDS, referenced
 from dlkf.tracking.evaluations import log_evaluation
 from dlkf.tracking.runs import tracking_uri
+
+SMOOTHER = "mbkf21"  # makes a reference where there is none
 
 
 @command("evaluate")
@@ -43,12 +48,15 @@ def main(cfg: DictConfig) -> None:
     options = {"tuning": config["tuning"], "prior": config["prior"]}
     models = resolve_models(config["model"], imu_spec(config["imu"]), uri, **options)
     check_baseline(config["baseline"], models)
+    if config["reference"] not in KINDS:
+        raise InputError(f"reference={config['reference']} is none of {', '.join(KINDS)}")
     grid = grid_of(models.values(), config["rate_hz"], config["epoch_s"])
     with counting("Loading drives") as progress:
         drives = load_dataset(
             config["dataset"],
             dtype=torch.float64,
             drives=config["drives"],
+            reference=config["reference"] == "file",
             progress=lambda name, done, total: progress(done, total),
             **grid,
         )
@@ -56,6 +64,7 @@ def main(cfg: DictConfig) -> None:
     drives, seen = without_seen(cards, drives, dataset_digest(config["dataset"]), leave_out=config["unseen"])
     for line in seen:
         console.print(line, style="yellow")
+    drives, truth = with_truth(drives, config, console.print)
     scenes = Scenes(drives, protocol)
     for reason in scenes.skipped.values():
         console.print(f"left out: {reason}", style="yellow")
@@ -71,17 +80,7 @@ def main(cfg: DictConfig) -> None:
         injected_bias=config["injected_bias"],
         seed=config["seed"],
     )
-    made_how = {
-        **provenance(),
-        "models": config["model"],
-        "dataset": config["dataset"],
-        "digest": digest,
-        "imu": config["imu"]["name"],
-        "imu values": {k: v for k, v in config["imu"].items() if k in ("accel", "gyro")},
-        "tuning": config["tuning"],
-        **grid,
-        **scenes.described(),
-    }
+    made_how = {**provenance(), **settings_of(config), "digest": digest, **truth, **grid, **scenes.described()}
     by_time, baseline = scenes.mode == "pieces", config["baseline"]
     write_report(config["out"], name, scores, made, protocol=made_how, by_time=by_time, baseline=baseline)
     tables, run = all_tables(name, made), None
@@ -97,10 +96,26 @@ def main(cfg: DictConfig) -> None:
     console.print(f"Report: {config['out']}/report.html{where}", soft_wrap=True)
 
 
-def check_baseline(baseline: str, models: Mapping[str, Any]) -> None:
-    """InputError for a baseline that is neither among the models nor a filter's name."""
-    if baseline not in models and not is_filter(str(baseline)):
-        raise InputError(f"baseline={baseline} is none of the models {', '.join(models)}; see model=")
+def with_truth(drives: list[Drive], config: Mapping[str, Any], say: Callable) -> tuple[list[Drive], dict[str, str]]:
+    """The drives with the reference that is asked for, and what is to be said of it."""
+    if config["reference"] == "file":
+        return drives, {}
+    smoother = build_filter(SMOOTHER, imu_spec(config["imu"]), tuning=config["tuning"])
+    with counting("Making the reference") as progress:
+        made = referenced(drives, config["reference"], smoother, AlignConfig.of(config["align"]), progress)
+    for reason in made.skipped.values():
+        say(f"left out: {reason}", style="yellow")
+    sigma = f"1σ {made.horizontal_m:.2g} m horizontal, {made.vertical_m:.2g} m vertical (median, as it says itself)"
+    what = "smoothed solution with all fixes" if config["reference"] == "smoothed" else "good fixes"
+    say(f"No truth: errors are against the {what}, {sigma}.", style="bold")
+    return made.drives, {"reference": f"{what}, {sigma}"}
+
+
+def settings_of(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What decides the numbers, for the report."""
+    imu = {k: v for k, v in config["imu"].items() if k in ("accel", "gyro")}
+    told = {"models": config["model"], "dataset": config["dataset"], "imu": config["imu"]["name"], "imu values": imu}
+    return told | {"tuning": config["tuning"]}
 
 
 if __name__ == "__main__":

@@ -84,6 +84,12 @@ def grid_of(
     return {"rate_hz": own[0] if rate_hz is None else rate_hz, "epoch_s": own[1] if epoch_s is None else epoch_s}
 
 
+def check_baseline(baseline: str, models: Mapping[str, Estimator]) -> None:
+    """InputError for a baseline that is neither among the models nor a filter's name."""
+    if baseline not in models and not is_filter(str(baseline)):
+        raise InputError(f"baseline={baseline} is none of the models {', '.join(models)}; see model=")
+
+
 def is_tracked(spec: str) -> bool:
     """Whether a model is to be had from MLflow: a run id, ``runs:/…`` or ``models:/…``."""
     return bool(RUN_ID.fullmatch(spec)) or spec.startswith(("models:/", "runs:/"))

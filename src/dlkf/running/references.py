@@ -1,0 +1,125 @@
+"""A reference for drives that have none: their own smoothed solution with all fixes, or their own good fixes.
+
+Outages are withheld from the filters that are scored, not from the reference, so what is compared is the filter
+without a fix against what the fixes say of the same seconds. The reference is as good as they are: its 1σ is told
+beside the errors, and errors of that size mean nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dlkf.data.alignment import AlignConfig
+from dlkf.data.drive import Drive
+from dlkf.data.segments import whole_drives
+from dlkf.errors import InputError
+from dlkf.filters.model_based import Mbkf
+from dlkf.filters.smoother import Smoothed
+from dlkf.navigation.state import POSITION
+from dlkf.running.batched import run_filter
+from dlkf.running.start import align_each
+
+KINDS = ("file", "smoothed", "gnss")
+WORTH = (4, 5, 9, 3, 2, 1)  # NMEA GGA qualities, the best first
+ENOUGH = 0.2  # of the fixes: so many make a quality the one to believe
+UNSURE = 5.0  # times the usual 1σ: where the smoothed solution is no reference
+LATE_S = 0.2  # a fix that waits longer for its epoch's end is not carried there
+
+
+class Referenced(NamedTuple):
+    """Drives with another reference, and its horizontal and vertical 1σ [m], the median over what may be scored."""
+
+    drives: list[Drive]
+    horizontal_m: float
+    vertical_m: float
+    skipped: dict[str, str]
+
+
+def referenced(
+    drives: Sequence[Drive],
+    kind: str,
+    estimator: Mbkf,
+    align: AlignConfig,
+    progress: Callable[[int, int | None], None] | None = None,
+) -> Referenced:
+    """The drives with their smoothed solution (``smoothed``) or their good fixes (``gnss``) as reference.
+
+    ``smoothed``: position, velocity and attitude of ``estimator`` with all fixes, smoothed backwards
+    (:mod:`dlkf.filters.smoother`), where its 1σ is not far above the usual. ``gnss``: the fixes of the best quality
+    that is frequent, brought to the IMU by the smoothed attitude; no attitude. Drives that cannot be aligned are left
+    out and the reason told, unless none is left (InputError).
+    """
+    if kind not in KINDS[1:]:
+        raise InputError(f"reference={kind} is none of {', '.join(KINDS)}")
+    made, sigmas, skipped = [], [], {}
+    for k, (drive, start) in enumerate(zip(drives, align_each(drives, replace(align, from_rest=True)))):
+        if isinstance(start, InputError):
+            skipped[drive.name] = str(start)
+            continue
+        batch = whole_drives([drive], [start])
+        solution = run_filter(batch, Smoothed(estimator))
+        n, row = int(batch.present[0].sum()), start.first + 1
+        state, std = solution.posterior, solution.std
+        assert std is not None  # a smoothed filter has a covariance
+        frame = batch.frame
+        r_e = frame.to_ecef(state.p_n)[0, :n]
+        v_e = torch.einsum("ij,tj->ti", frame.C_en[0], state.v_n[0, :n])
+        C_eb = frame.C_en[0] @ state.C_nb[0, :n]
+        rows = slice(row, row + n)
+        found = _blank(drive)
+        found["ref_C_eb"][rows] = C_eb
+        if kind == "smoothed":
+            sigma = std[0, :n, POSITION]
+            sure = sigma.norm(dim=-1) <= UNSURE * sigma.norm(dim=-1).median()
+            found["ref_r_e"][rows], found["ref_v_e"][rows], found["ref_valid"][rows] = r_e, v_e, sure
+        else:
+            r_fix, v_fix, good = _at_imu(drive, rows, C_eb, v_e)
+            found["ref_r_e"][rows], found["ref_v_e"][rows], found["ref_valid"][rows] = r_fix, v_fix, good
+            sigma, sure = drive.gnss_std[rows, :3], good
+            found["ref_C_eb"][:] = torch.nan
+        sigmas.append(sigma[sure])
+        made.append(replace(drive, **found))
+        if progress is not None:
+            progress(k + 1, len(drives))
+    if not made:
+        raise InputError(f"reference={kind}: {next(iter(skipped.values()), 'no drives')}")
+    sigma = torch.cat(sigmas)
+    if not len(sigma):
+        raise InputError(f"reference={kind}: no fix is good enough to be one")
+    usual = sigma.median(0).values
+    return Referenced(made, float(usual[:2].norm()), float(usual[2]), skipped)
+
+
+def _blank(drive: Drive) -> dict[str, Tensor]:
+    """No reference at all; its rows are to be filled."""
+    return {
+        "ref_r_e": torch.full_like(drive.gnss_r_e, torch.nan),
+        "ref_v_e": torch.full_like(drive.gnss_r_e, torch.nan),
+        "ref_C_eb": torch.full((*drive.gnss_r_e.shape[:1], 3, 3), torch.nan, dtype=torch.float64),
+        "ref_valid": torch.zeros(len(drive.gnss_r_e), dtype=torch.bool),
+        "ref_imu_error": torch.full((len(drive.gnss_r_e), 6), torch.nan, dtype=torch.float64),
+    }
+
+
+def _at_imu(drive: Drive, rows: slice, C_eb: Tensor, v_e: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Good fixes brought from the antenna to the IMU and from their time to the boundary: r_e, v_e, good.
+
+    The velocity is the fix's where it has one, else the smoothed; the lever arm's swing ω × l is taken off.
+    """
+    quality, seen = drive.quality[rows], drive.gnss_valid[rows, :3].all(-1)
+    share = {q: float((quality[seen] == q).double().mean()) if bool(seen.any()) else 0.0 for q in WORTH}
+    worst = next((k for k, q in enumerate(WORTH) if share[q] >= ENOUGH), len(WORTH) - 1)
+    lag = drive.gnss_lag[rows, None]
+    good = seen & torch.isin(quality, torch.tensor(WORTH[: worst + 1])) & (lag[:, 0] <= LATE_S)
+    rate_b = drive.imu[rows.start - 1 : rows.stop - 1, -5:, 3:].double().mean(1)
+    arm = drive.lever_arm_b.expand_as(rate_b)
+    known = drive.gnss_valid[rows, 3:].all(-1, keepdim=True)
+    swing = torch.einsum("tij,tj->ti", C_eb, torch.linalg.cross(rate_b, arm))
+    velocity = torch.where(known, drive.gnss_v_e[rows] - swing, v_e)
+    place = drive.gnss_r_e[rows] - torch.einsum("tij,tj->ti", C_eb, arm) + lag * v_e
+    return place, velocity, good

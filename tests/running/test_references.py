@@ -1,0 +1,68 @@
+"""A drive without a reference, scored against itself: the same errors as against the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from dlkf.config import config_dir
+from dlkf.data.alignment import ALIGN
+from dlkf.data.store import load_dataset
+from dlkf.errors import InputError
+from dlkf.evaluation.metrics import magnitudes, outage_end
+from dlkf.evaluation.outages import OutagePlan
+from dlkf.evaluation.protocol import Protocol, Scenes
+from dlkf.evaluation.run import score_scenes
+from dlkf.filters.build import build_filter
+from dlkf.navigation.imu_errors import imu_spec
+from dlkf.running.references import referenced
+from dlkf.simulation.dataset import simulate_from_config
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """Two drives of four minutes, and what a filter is told about their IMU."""
+    size = ["dataset.hours=0.133", "dataset.drive_minutes=4", "dataset.imu_rate_hz=50", "seed=3"]
+    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
+        config = OmegaConf.to_container(compose("simulate", ["simulated@dataset=per_drive", *size]), resolve=True)
+    folder = simulate_from_config(config, tmp_path_factory.mktemp("data") / "town", progress=False)
+    spec = imu_spec(config["imu"])
+    return load_dataset(folder, rate_hz=25.0, dtype=torch.float64), build_filter("mbkf21", spec), spec
+
+
+def ends(drives, spec, seconds: float) -> np.ndarray:
+    """Horizontal error [m] at the end of every outage."""
+    plan = OutagePlan(first_s=40, duration_s=seconds)
+    scores = score_scenes({"mbkf15": build_filter("mbkf15", spec)}, Scenes(drives, Protocol("drives", outage=plan)))
+    return outage_end(magnitudes(scores.filters["mbkf15"].error)["horizontal"], scores.windows)
+
+
+@pytest.mark.parametrize("kind", ["smoothed", "gnss"])
+def test_errors_are_those_against_the_truth(world, kind):
+    """RMS at the end of outages of 30 and 60 s within 5 %: the references are centimetres off, the errors metres."""
+    drives, smoother, spec = world
+    made = referenced(drives, kind, smoother, ALIGN)
+    assert made.horizontal_m < 0.1 and not made.skipped
+    for seconds in (30.0, 60.0):
+        true, told = ends(drives, spec, seconds), ends(made.drives, spec, seconds)
+        assert len(true) == len(told) >= 2 and np.sqrt((true**2).mean()) > 1
+        assert np.sqrt((told**2).mean()) == pytest.approx(np.sqrt((true**2).mean()), rel=0.05)
+
+
+def test_the_reference_is_as_good_as_it_says(world):
+    """Errors of the smoothed solution over its 1σ: between half and one and a half, for 2 drives are few."""
+    drives, smoother, _ = world
+    made = referenced(drives, "smoothed", smoother, ALIGN)
+    off = torch.cat([(m.ref_r_e - d.ref_r_e)[m.ref_valid & d.ref_valid] for m, d in zip(made.drives, drives)])
+    rms = float(off.square().sum(-1).mean().sqrt())
+    assert 0.5 < rms / np.hypot(made.horizontal_m, made.vertical_m) < 1.5
+    assert all(bool(m.ref_C_eb[m.ref_valid].isfinite().all()) for m in made.drives)
+
+
+def test_no_file_is_needed_and_mistakes_are_told(world):
+    drives, smoother, _ = world
+    with pytest.raises(InputError, match="reference=best is none of file, smoothed, gnss"):
+        referenced(drives, "best", smoother, ALIGN)
