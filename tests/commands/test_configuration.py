@@ -24,6 +24,7 @@ GROUPS = {  # group of the defaults list: folder under conf/
     "allan": {"imu": "imu"},
     "register": {},
     "compare": {},
+    "doctor": {},
     "tune": {"imu": "imu", "tuning": "tuning", "start": "start", "outage": "outage"},
     "consistency": {"imu": "imu", "tuning": "tuning", "chassis": "chassis", "start": "start", "outage": "outage"},
     "train": {

@@ -1,0 +1,37 @@
+"""What is good and bad about a recording, before anything runs: ``dlkf doctor dataset=data/town``.
+
+Prints a line per finding and drive; exit code 0 where nothing is bad, 1 where something is, 2 where it cannot be read.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.text import Text
+
+from dlkf.command import command
+from dlkf.data.store import drive_rows
+from dlkf.diagnosis.checkup import GOOD, STYLES, checkup
+
+
+@command("doctor")
+def main(cfg: DictConfig) -> None:
+    """Read, look, print; the exit code tells whether something is bad."""
+    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
+    console = Console(width=None if sys.stdout.isatty() else 140, highlight=False)
+    bad = noted = 0
+    for row in drive_rows(config["dataset"], config["drives"]):
+        console.print(Text(row.name, style="bold"))
+        for finding in checkup(config["dataset"], row, discover_pose=config["discover"]):
+            console.print(Text(f"  {finding.grade:5}", style=STYLES[finding.grade]) + Text(f" {finding.text}"))
+            bad, noted = bad + (finding.grade == "BAD"), noted + (finding.grade not in (GOOD, "BAD"))
+    console.print(f"{bad} bad, {noted} to know" if bad or noted else "all good")
+    if bad:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

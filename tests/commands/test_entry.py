@@ -1,0 +1,137 @@
+"""``dlkf <command>``, what it offers, ``doctor`` and ``compare``."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import dlkf
+from dlkf.__main__ import COMMANDS, candidates, main
+from dlkf.command.arguments import readable
+from dlkf.config import config_dir
+from dlkf.data.schema import drive_file
+
+EVALUATE = ("rate_hz=10", "length_s=60", "outage.first_s=20", "outage.duration_s=20", "injected_bias=null")
+EVALUATE += ("tracking.log=false",)
+
+
+def typed(monkeypatch, capsys, *words: str) -> tuple[int, str, str]:
+    monkeypatch.setattr(sys, "argv", ["dlkf", *words])
+    code = 0
+    try:
+        main()
+    except SystemExit as end:
+        code = int(end.code or 0)
+    return code, *capsys.readouterr()
+
+
+def test_what_there_is(monkeypatch, capsys):
+    assert typed(monkeypatch, capsys, "--version") == (0, f"dlkf {dlkf.__version__}\n", "")
+    code, out, _ = typed(monkeypatch, capsys)
+    assert code == 0 and all(f"  {name}" in out for name in COMMANDS)
+    code, _, err = typed(monkeypatch, capsys, "fly")
+    assert code == 2 and err.startswith("dlkf: error: unknown command 'fly'; known: simulate") and err.count("\n") == 1
+
+
+def test_every_command_has_a_module_and_every_configured_one_is_listed():
+    here = Path(dlkf.__file__).parent
+    assert all((here / f"{name}.py").is_file() for name in COMMANDS)
+    assert {p.stem for p in config_dir().glob("*.yaml")} - {"hydra_output"} <= set(COMMANDS)
+
+
+def test_completion_knows_commands_keys_and_presets():
+    assert candidates("ev", "ev") == ["evaluate"]
+    assert {"model=", "imu=", "reference="} <= set(candidates("evaluate", ""))
+    assert "imu=consumer" in candidates("navigate", "imu=") and "dataset=city" in candidates("simulate", "dataset=")
+    assert candidates("navigate", "out=") == []
+
+
+@pytest.mark.parametrize(
+    ("given", "taken"),
+    [
+        ("out=outputs/town", "out=outputs/town"),
+        ("out=Straße", "out='Straße'"),
+        ("out=a b (1)", "out='a b (1)'"),
+        ("dataset=out/drive=7", "dataset='out/drive=7'"),
+        ("model=[mbkf15,out/drive=7/best]", "model=[mbkf15,'out/drive=7/best']"),
+        ("outage.first_s=[20,25]", "outage.first_s=[20,25]"),
+        ("imu=consumer,bmi270", "imu=consumer,bmi270"),
+        ("scoring.outage={first_s:10}", "scoring.outage={first_s:10}"),
+        ("out=it's here", "out='it\\'s here'"),
+        ("-m", "-m"),
+        ("~baseline", "~baseline"),
+    ],
+)
+def test_ordinary_paths_need_no_quotes(given, taken):
+    assert readable(given) == taken
+    assert readable("out=~/x") == f"out={Path.home()}/x"
+
+
+def test_in_a_shell(tmp_path, town):
+    """The same command as ``python -m dlkf.navigate``, with a folder that Hydra's grammar does not take."""
+    words = ["navigate", "model=ins", f"dataset={town}", "out=Straße (1)/drive=a", "rate_hz=10", "export=[gpx]"]
+    done = subprocess.run(
+        [sys.executable, "-m", "dlkf", *words], cwd=tmp_path, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    out = tmp_path / "Straße (1)" / "drive=a"
+    assert (out / "report.html").is_file() and len(list(out.glob("drive=*/solution.gpx"))) == 2
+    assert "dlkf navigate model=ins" in (out / "report.html").read_text()
+
+
+def test_doctor_likes_a_simulated_drive(town, call):
+    done = call("doctor", f"dataset={town}")
+    assert done.code == 0, done.err
+    assert "BAD" not in done.out and "100% RTK fixed" in done.out and "pose: the sensor is turned 0." in done.out
+
+
+def test_doctor_sees_what_is_wrong(town, call, tmp_path):
+    """A sensor turned by 90°, a saturated gyroscope."""
+    copy = Path(shutil.copytree(town, tmp_path / "town"))
+    first, second = sorted(p.name.removeprefix("drive=") for p in (copy / "imu").iterdir())
+
+    def change(kind, drive, edit):
+        path = drive_file(copy, kind, drive)
+        table = pd.read_parquet(path, partitioning=None)
+        edit(table)
+        table.to_parquet(path, index=False)
+
+    def turned(imu):
+        for s in ("accel", "gyro"):
+            imu[f"{s}_x"], imu[f"{s}_y"] = imu[f"{s}_y"].copy(), -imu[f"{s}_x"].copy()
+
+    def saturated(imu):
+        imu["gyro_z"] = np.clip(imu["gyro_z"], -0.05, 0.05)
+
+    change("imu", first, turned)
+    change("imu", second, saturated)
+    done = call("doctor", "dataset=town", f"drives={first}")
+    assert done.code == 1 and re.search(r"BAD +pose: the sensor is turned (89|90|91)\.", done.out), done.out
+    done = call("doctor", "dataset=town", f"drives={second}", "discover=false")
+    assert done.code == 1 and "gyro_z stays at 0.05" in done.out, done.out
+
+
+def test_compare(town, call, tmp_path):
+    for name, models, imu in (("a", "[ins,mbkf15]", "bmi270"), ("b", "[mbkf15]", "consumer")):
+        words = (f"model={models}", f"dataset={town}", f"out={name}", f"imu={imu}")
+        done = call("evaluate", *words, *EVALUATE)
+        assert done.code == 0, done.err
+    done = call("compare", "a", "b", "out=c")
+    assert done.code == 0, done.err
+    page = (tmp_path / "c" / "compare.html").read_text()
+    assert "2 evaluations compared" in page and "<td>imu</td><td>bmi270</td><td>consumer</td>" in page
+    assert page.count("class=figure") == 1
+    for words, said in (
+        (["a"], "at least two"),
+        (["a", str(town)], "no metrics.json"),
+        (["a", "b", "out=c"], "overwrite=true"),
+    ):
+        done = call("compare", *words, *([] if "out=c" in words else ["out=d"]))
+        assert done.code == 2 and said in done.err and done.err.count("\n") == 1
