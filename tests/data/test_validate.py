@@ -74,6 +74,17 @@ def _scale(names: list[str], factor):
     return change
 
 
+def _nowhere(frame: pd.DataFrame) -> pd.DataFrame:
+    """Three fixes before the receiver has a position."""
+    return frame.assign(**{c: frame[c].where(frame.index >= 3, 0.0) for c in ("lat_deg", "lon_deg")})
+
+
+def _quarter(frame: pd.DataFrame) -> pd.DataFrame:
+    """The sensor's x points right, its y back."""
+    turned = {f"{s}_x": frame[f"{s}_y"] for s in ("gyro", "accel")}
+    return frame.assign(**turned, **{f"{s}_y": -frame[f"{s}_x"] for s in ("gyro", "accel")})
+
+
 GYRO, ACCEL = ["gyro_x", "gyro_y", "gyro_z"], ["accel_x", "accel_y", "accel_z"]
 BAD = {
     "nan in the IMU": (_set("imu", "gyro_y", _at(17, np.nan)), "row 17: gyro_y is nan"),
@@ -86,7 +97,7 @@ BAD = {
     "no fixes": (_rows("gnss", lambda f: f.iloc[:0]), "has no rows"),
     "no fix at all": (_set("gnss", "quality", lambda q: 0 * q), "no GNSS fix at all"),
     "degrees per second": (_columns("imu", _scale(GYRO, 180 / np.pi)), "looks like degrees"),
-    "g": (_columns("imu", _scale(ACCEL, 1 / 9.80665)), "looks like g; multiply"),
+    "g": (_columns("imu", _scale(ACCEL, 1 / 9.80665)), "looks like g; reader.imu.accel.unit=g"),
     "no gravity": (_columns("imu", _scale(["accel_z"], 0.01)), "median specific force"),
     "z up": (_columns("imu", _scale(["accel_y", "accel_z", "gyro_y", "gyro_z"], -1)), "points up"),
     "gyro z up": (_columns("imu", _scale(["gyro_z"], -1)), "gyro_z turns against the course"),
@@ -96,6 +107,11 @@ BAD = {
     "radians": (_columns("gnss", _scale(["lat_deg", "lon_deg"], np.pi / 180)), "look like radians"),
     "swapped velocity": (_columns("gnss", _swap("vel_n", "vel_e")), "vel_n and vel_e look swapped"),
     "km/h": (_columns("gnss", _scale(["vel_n", "vel_e", "vel_d"], 3.6)), "km/h"),
+    "velocities divided by 3.6": (_columns("gnss", _scale(["vel_n", "vel_e", "vel_d"], 1 / 3.6)), "divided by 3.6"),
+    "no position yet": (_rows("gnss", _nowhere), "fix 0 is at 0°/0°, as 3 of .*reader.gnss.position.zero=none"),
+    "a jump": (_set("gnss", "lat_deg", _at(5, -40.0)), "fix 5 lies .* km from the rest"),
+    "leap seconds": (_set("gnss", "t", lambda t: t - 18), r"clocks of IMU and GNSS are 18.0 s apart.*offset_s=auto"),
+    "turned right": (_rows("imu", _quarter), r"turned by \+90° .*reader.imu.accel.axes"),
     "another clock": (_set("gnss", "t", lambda t: t + 1e5), "same clock"),
     "negative std": (_set("gnss", "std_pos_n", _at(2, -1.0)), "row 2: std_pos_n is -1.0"),
     "attitude in degrees": (_columns("reference", _scale(["yaw"], 180 / np.pi)), "yaw reaches .* degrees"),

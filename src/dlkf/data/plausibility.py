@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from dlkf.data.schema import ACCEL, ATTITUDE, GYRO
+from dlkf.data.discovery.clock import find_lag, known_offset
+from dlkf.data.discovery.motion import motion
+from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, VELOCITY
 from dlkf.data.tables import Columns
 from dlkf.errors import InputError
 from dlkf.navigation.earth import SEMI_MAJOR
@@ -17,6 +19,11 @@ STANDARD_GRAVITY = 9.80665  # m/s²
 FASTEST_RATE = 20.0  # rad/s: no car turns, and no bump shakes it, that fast for a thousandth of a drive
 CHUNK_S = 10.0  # way and course are compared over such stretches: metres of GNSS noise do not matter
 DISAGREES, AGREES = 0.5, 0.25  # relative residual of way against velocity
+NOWHERE_DEG = 1e-6  # what receivers write before they have a position
+FARTHEST_KM, KM_PER_DEG = 2000.0, 111.2
+SEARCH_S = 600.0  # clocks of logs that have time in common are hardly further apart
+APART_S = 1.0  # less is a delay, which the filters bear; dlkf.ingest measures it on request
+TURNED_DEG = (30.0, 150.0)  # backwards is found by the filters' own search
 
 
 def check_imu_units(imu: Columns, where: str) -> None:
@@ -25,29 +32,32 @@ def check_imu_units(imu: Columns, where: str) -> None:
     size = float(np.median(np.linalg.norm(force, axis=-1)))
     if 0.8 < size < 1.3:
         raise InputError(
-            f"{where}: median specific force is {size:.2f}: looks like g; multiply accel by 9.80665"
+            f"{where}: median specific force is {size:.2f}: looks like g; reader.imu.accel.unit=g, or multiply "
+            "accel by 9.80665"
         )
     if not 7.0 < size < 13.0:
         raise InputError(
-            f"{where}: median specific force is {size:.3g} m/s², must be near 9.8; check the unit, "
-            "and that gravity was not taken out"
+            f"{where}: median specific force is {size:.3g} m/s², must be near 9.8; reader.imu.accel.unit="
+            "auto finds it, if gravity was not taken out"
         )
     axes = np.median(force, axis=0)
     if axes[2] > 0.7 * size:
         raise InputError(
             f"{where}: accel_z is {axes[2]:+.2f} m/s² in the median, must be about −9.8 (Forward-Right-"
-            "Down); the z axis points up (FLU?): turn the signs of y and z of accel and gyro"
+            "Down); the z axis points up (FLU?): reader.imu.accel.axes=flu and gyro.axes=flu, or auto"
         )
     if axes[2] > -0.7 * size:
         k = int(np.abs(axes).argmax())
         raise InputError(
             f"{where}: gravity lies on {ACCEL[k]} ({axes[k]:+.2f} m/s² in the median), must be −9.8 on "
-            "accel_z (Forward-Right-Down); reorder the axes of accel and gyro"
+            "accel_z (Forward-Right-Down); reorder the axes of accel and gyro (reader.imu.accel.axes and gyro.axes, "
+            "or auto)"
         )
     rate = float(np.quantile(np.linalg.norm(np.stack([imu[c] for c in GYRO], -1), axis=-1), 0.999))
     if rate > FASTEST_RATE:
         raise InputError(
-            f"{where}: gyro reaches {rate:.0f} rad/s: looks like degrees; multiply gyro by π/180"
+            f"{where}: gyro reaches {rate:.0f} rad/s: looks like degrees; reader.imu.gyro.unit=deg/s, or "
+            "multiply gyro by π/180"
         )
 
 
@@ -62,7 +72,26 @@ def check_gnss_units(gnss: Columns, where: str) -> None:
     bad = np.flatnonzero(np.abs(lon) > 180)
     if len(bad):
         raise InputError(f"{where}: fix {bad[0]}: lon_deg is {lon[bad[0]]:.4f}; must lie within ±180 degrees")
+    _check_places(lat, lon, where)
     _check_way(gnss, where)
+
+
+def _check_places(lat: np.ndarray, lon: np.ndarray, where: str) -> None:
+    """No fix at 0°/0° in a drive elsewhere, and none a continent away from the rest."""
+    zero = np.flatnonzero((np.abs(lat) < NOWHERE_DEG) & (np.abs(lon) < NOWHERE_DEG))
+    if 0 < len(zero) < len(lat):
+        raise InputError(
+            f"{where}: fix {zero[0]} is at 0°/0°, as {len(zero)} of {len(lat)}: no position yet; "
+            "reader.gnss.position.zero=none, or quality 0"
+        )
+    middle, side = np.median(lat), np.median(np.cos(np.radians(lat)))
+    east = (lon - np.median(lon) + 180) % 360 - 180
+    far = np.hypot(lat - middle, east * side) * KM_PER_DEG
+    worst = int(far.argmax()) if len(far) else 0
+    if len(far) and far[worst] > FARTHEST_KM and np.mean(far > FARTHEST_KM) < 0.3:
+        raise InputError(
+            f"{where}: fix {worst} lies {far[worst]:.0f} km from the rest of the drive; give such fixes quality 0"
+        )
 
 
 def _check_way(gnss: Columns, where: str) -> None:
@@ -78,8 +107,7 @@ def _check_way(gnss: Columns, where: str) -> None:
     whole = np.isfinite(v_n) & np.isfinite(v_e)
     smooth = (step <= 2.0) & whole[1:] & whole[:-1]
     way_n, way_e = (
-        np.concatenate(([0.0], np.cumsum(np.where(smooth, step * (v[1:] + v[:-1]) / 2, 0.0))))
-        for v in (v_n, v_e)
+        np.concatenate(([0.0], np.cumsum(np.where(smooth, step * (v[1:] + v[:-1]) / 2, 0.0)))) for v in (v_n, v_e)
     )
     breaks = np.concatenate(([0], np.cumsum(~smooth)))
     first = np.arange(len(t))
@@ -105,14 +133,23 @@ def _check_way(gnss: Columns, where: str) -> None:
         return
     readings = {
         "latitude and longitude look swapped; exchange lat_deg and lon_deg": (lon, lat, moved),
-        "lat_deg and lon_deg look like radians; multiply them by 180/π": (
+        "lat_deg and lon_deg look like radians; reader.gnss.position.unit=rad, or multiply them by 180/π": (
             np.degrees(lat),
             np.degrees(lon),
             moved,
         ),
-        "vel_n and vel_e look swapped; exchange them": (lat, lon, moved[:, ::-1]),
-        "the velocities look like km/h; divide them by 3.6": (lat, lon, moved / 3.6),
-        "the velocities look like knots; multiply them by 0.5144": (lat, lon, moved * 0.514444),
+        "vel_n and vel_e look swapped; reader.gnss.velocity.frame=enu, or exchange them": (lat, lon, moved[:, ::-1]),
+        "the velocities look like km/h; reader.gnss.velocity.unit=km/h, or divide them by 3.6": (lat, lon, moved / 3.6),
+        "the velocities look like knots; reader.gnss.velocity.unit=knots, or multiply them by 0.5144": (
+            lat,
+            lon,
+            moved * 0.514444,
+        ),
+        "the velocities look divided by 3.6; multiply them by 3.6 (reader.gnss.velocity.unit=3.6)": (
+            lat,
+            lon,
+            moved * 3.6,
+        ),
         "the velocities have the wrong sign; negate them": (lat, lon, -moved),
     }
     fits = {text: residual(*reading) for text, reading in readings.items()}
@@ -141,7 +178,8 @@ def check_turns(imu: Columns, gnss: Columns, where: str) -> None:
         return
     if slope > 20:
         raise InputError(
-            f"{where}: gyro_z is {slope:.0f} times the turn of the course: looks like degrees; use rad/s"
+            f"{where}: gyro_z is {slope:.0f} times the turn of the course: looks like degrees; use rad/s "
+            "(reader.imu.gyro.unit=deg/s)"
         )
     if slope < -0.3:
         raise InputError(
@@ -150,14 +188,41 @@ def check_turns(imu: Columns, gnss: Columns, where: str) -> None:
         )
 
 
+def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
+    """The yaw rate and the horizontal force agree with GNSS as the clocks stand, or nowhere clearly better.
+
+    Then the force forward and right also tells whether the sensor looks along the car.
+    """
+    t, accel, gyro = imu["t"], np.stack([imu[c] for c in ACCEL], -1), np.stack([imu[c] for c in GYRO], -1)
+    moved = motion(gnss["t"], gnss["lat_deg"], gnss["lon_deg"], np.stack([gnss[c] for c in VELOCITY], -1))
+    best = find_lag(t, accel, gyro, moved, SEARCH_S)
+    if best is None or not best.clear or min(best.yaw, best.force) < 0.6 or max(best.yaw, best.force) < 0.85:
+        return
+    if abs(best.lag_s) > APART_S:
+        here = find_lag(t, accel, gyro, moved, APART_S / 2)
+        if here is not None and here.gain > 0.5 * best.gain:
+            return
+        as_is = "too little in common" if here is None else f"{max(here.yaw, here.force):.2f}"
+        raise InputError(
+            f"{where}: the clocks of IMU and GNSS are {abs(best.lag_s):.1f} s apart: yaw rate and course agree to "
+            f"{best.yaw:.2f} with {best.lag_s:+.1f} s on GNSS, as they stand {as_is}{known_offset(best.lag_s)}; "
+            "reader.gnss.time.offset_s=auto, or clock=unix for a file in UTC"
+        )
+    turned = np.degrees(best.angle)
+    if best.force > 0.85 and TURNED_DEG[0] < abs(turned) < TURNED_DEG[1]:
+        raise InputError(
+            f"{where}: accelerations agree with GNSS if the IMU is turned by {turned:+.0f}° about the vertical (to "
+            f"the {'right' if turned > 0 else 'left'}): x must point forward; reader.imu.accel.axes and "
+            f"gyro.axes=auto, or {{roll: 0, pitch: 0, yaw: {turned:.0f}}}"
+        )
+
+
 def check_attitude(reference: Columns, where: str) -> None:
     """Attitudes in radians, and yaw clockwise from North."""
     for name in ATTITUDE:
         largest = np.nanmax(np.abs(reference[name]), initial=0.0)
         if largest > 2 * np.pi + 0.01:
-            raise InputError(
-                f"{where}: {name} reaches {largest:.1f}: looks like degrees; multiply attitudes by π/180"
-            )
+            raise InputError(f"{where}: {name} reaches {largest:.1f}: looks like degrees; multiply attitudes by π/180")
     speed = np.hypot(reference["vel_n"], reference["vel_e"])
     with np.errstate(invalid="ignore"):
         fast = (speed > 3) & np.isfinite(reference["yaw"])

@@ -7,7 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from dlkf.data.plausibility import check_attitude, check_gnss_units, check_imu_units, check_turns
+from dlkf.data.plausibility import (
+    check_attitude,
+    check_clocks,
+    check_gnss_units,
+    check_imu_units,
+    check_turns,
+)
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY
 from dlkf.data.tables import Columns, DriveRow, read_drives, read_table
 from dlkf.errors import InputError
@@ -65,6 +71,8 @@ def read_checked(
     _check_imu(imu, _where(name, "imu"), limits)
     _check_gnss(gnss, imu, _where(name, "gnss"))
     check_turns(imu, gnss, _where(name, "imu"))
+    fixed = np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite(gnss["lat_deg"]) & np.isfinite(gnss["lon_deg"])
+    check_clocks(imu, {column: values[fixed] for column, values in gnss.items()}, _where(name, "imu"))
     if truth is not None:
         _check_reference(truth, _where(name, "reference"))
     return DriveTables(row, imu, gnss, truth)

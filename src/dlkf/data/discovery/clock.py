@@ -18,6 +18,7 @@ from dlkf.data.discovery.motion import MOVING, RESTING, Complex, Floats, Motion
 STEP_S = 0.25
 LEAST_S = 20.0  # of common time in intervals with a known course
 NEIGHBOUR_S = 3.0  # lags this close belong to one peak
+KNOWN_OFFSETS = {18.0: "leap seconds of GPS against UTC", 37.0: "TAI against UTC", 19.0: "TAI against GPS"}
 
 
 @dataclass(frozen=True)
@@ -31,16 +32,13 @@ class Lag:
     yaw: float  # correlation of the yaw rate with the course at the lag
     force: float  # of the horizontal force with the acceleration
     overlap_s: float
+    angle: float  # rad, by which the sensor's x axis points to the right of the direction of travel
 
     @property
     def clear(self) -> bool:
         """No other lag explains nearly as much."""
         strong = self.gain > 25.0 and (self.yaw > 0.5 or self.force > 0.5)
         return strong and self.rival < 0.6 * self.gain and self.gain - self.rival > 15.0
-
-    def at_zero(self) -> bool:
-        """Whether the clocks agree already, as far as a search in quarters of seconds tells."""
-        return abs(self.lag_s) < 1.0
 
 
 def find_lag(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, within_s: float | None = None) -> Lag | None:
@@ -61,7 +59,7 @@ def find_lag(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, within_s: flo
     n = int(cell[-1]) + 1
     weight, r, a = np.zeros(n), np.zeros(n), np.zeros(n, complex)
     weight[cell], r[cell], a[cell] = 1.0, rate[known], pull[known]
-    gain, yaws, forces, count = _scores(weight, r, a, there, yaw, force)
+    gain, yaws, forces, angles, count = _scores(weight, r, a, there, yaw, force)
     lags = (np.arange(len(gain)) - (n - 1)) * STEP_S + start - middle[0]
     allowed = count * usual >= LEAST_S
     if within_s is not None:
@@ -73,15 +71,23 @@ def find_lag(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, within_s: flo
     others = np.where(np.abs(lags - lags[best]) > NEIGHBOUR_S, gain, -np.inf)
     rival = int(others.argmax())
     other = float(others[rival]) if np.isfinite(others[rival]) else 0.0
-    numbers = (lags[best], gain[best], other, lags[rival], yaws[best], forces[best], count[best] * usual)
+    numbers = (lags[best], gain[best], other, lags[rival], yaws[best], forces[best], count[best] * usual, angles[best])
     return Lag(*(float(x) for x in numbers))
 
 
-def gain_at(lag: Lag | None, zero: Lag | None) -> float:
-    """By how much of its gain a lag is better than another."""
-    if lag is None or zero is None or lag.gain <= 0:
-        return 0.0
-    return 1 - max(zero.gain, 0.0) / lag.gain
+def known_offset(lag_s: float) -> str:
+    """What an offset is known for."""
+    for weeks in (round(lag_s / 604_800),):
+        if weeks and abs(lag_s - weeks * 604_800) < 40:
+            rest = lag_s - weeks * 604_800
+            return f"; {weeks} GPS weeks" + (f" and {rest:.1f} s" if abs(rest) > 0.5 else "")
+    for known, name in KNOWN_OFFSETS.items():
+        if abs(abs(lag_s) - known) < 0.5:
+            return f"; {name}"
+    hours = lag_s / 3600
+    if abs(hours) > 0.9 and abs(hours - round(hours * 4) / 4) * 3600 < 40:
+        return f"; a time zone of {round(hours * 4) / 4:+g} h"
+    return ""
 
 
 def _gnss_signals(gnss: Motion, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, Floats, Complex]:
@@ -101,7 +107,7 @@ def _imu_signals(t: Floats, accel: Floats, gyro: Floats, width_s: float) -> tupl
     """Yaw rate and horizontal force as means over ``width_s`` on a grid, where there are any, and the grid's start."""
     up = accel.mean(0)
     up = up / max(float(np.linalg.norm(up)), 1e-12)
-    helper = np.eye(3)[int(np.abs(up).argmin())]
+    helper = np.eye(3)[0 if abs(up[0]) < 0.9 else 1]  # x, so that angles count from it
     e1 = helper - up * (helper @ up)
     e1 /= np.linalg.norm(e1)
     e2 = np.cross(-up, e1)
@@ -124,8 +130,11 @@ def _imu_signals(t: Floats, accel: Floats, gyro: Floats, width_s: float) -> tupl
 
 def _scores(
     weight: Floats, r: Floats, a: Complex, there: Floats, yaw: Floats, force: Complex
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Λ, both correlations and the number of intervals of every lag; index 0 has the last fix on the first sample."""
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Λ, both correlations, the sensor's yaw and the number of intervals of every lag.
+
+    At index 0 the last fix lies on the first sample.
+    """
     size = fft.next_fast_len(len(weight) + len(there) - 1)
 
     def turned(x: np.ndarray) -> np.ndarray:
@@ -153,6 +162,7 @@ def _scores(
         return covariance / np.sqrt(np.maximum(power_a, least_a) * np.maximum(power_b, 1e-4))
 
     yaws = np.clip(correlation(r * weight, g).real, -0.9999, 0.9999)
-    forces = np.clip(np.abs(correlation(a * weight, f)), 0.0, 0.9999)
+    force = correlation(a * weight, f)
+    forces = np.clip(np.abs(force), 0.0, 0.9999)
     gain = -0.5 * n * np.log1p(-(np.maximum(yaws, 0.0) ** 2)) - n * np.log1p(-(forces**2))
-    return np.where(count > 3, gain, 0.0), yaws, forces, count
+    return np.where(count > 3, gain, 0.0), yaws, forces, -np.angle(force), count

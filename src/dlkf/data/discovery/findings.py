@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dlkf.data.discovery.clock import Lag, find_lag
+from dlkf.data.discovery.clock import Lag, find_lag, known_offset
 from dlkf.data.discovery.motion import MOVING, Floats, Motion, motion, position_delay
 from dlkf.data.discovery.orientation import Pose, find_pose
-from dlkf.data.discovery.units import G, accel_unit, nearest_unit
+from dlkf.data.discovery.units import G, accel_units, nearest_unit
 
 LEAST_EXPLAINED, AGREE = 0.8, (0.8, 1.25)
 FARTHEST_DOWN = math.radians(6.0)
-KNOWN_OFFSETS = {18.0: "leap seconds of GPS against UTC", 37.0: "TAI against UTC", 19.0: "TAI against GPS"}
 
 
 @dataclass(frozen=True)
@@ -25,7 +24,7 @@ class Sure:
     """What is sure enough: 2.5σ of the pose [deg] and of the clock offset [s] lie below."""
 
     angle_deg: float = 2.0
-    time_s: float = 0.02
+    time_s: float = 0.025
 
 
 @dataclass(frozen=True)
@@ -82,8 +81,8 @@ def discover(
     wanted: set[str],
     sure: Sure = Sure(),
     *,
-    accel_units: Mapping[str, float],
-    gyro_units: Mapping[str, float],
+    known_accel: Mapping[str, float],
+    known_gyro: Mapping[str, float],
     increments: bool = False,
 ) -> Findings:
     """Find the settings in ``wanted`` (as ``imu.accel.unit``, ``imu.axes``, ``time.offset_s``, ``lever_arm_m``, …)."""
@@ -91,10 +90,12 @@ def discover(
     size = float(np.median(np.linalg.norm(raw.accel, axis=-1)))
     factor = raw.accel_factor
     if factor is None:
-        unit = accel_unit(size, accel_units)
-        factor = accel_units[unit] if unit else G / size
-        out.add("imu.accel.unit", unit or round(factor, 9), size > 0 and (unit is not None or increments),
-                f"median force {size:.4g}" + ("" if unit else ": no known unit, taken for gravity"))  # fmt: skip
+        names = accel_units(size, known_accel)
+        unit = names[0] if len(names) == 1 else None
+        factor = known_accel[unit] if unit else G / size
+        taken = "" if unit else f": {' or '.join(names) or 'no known unit'}, so a number by gravity"
+        certain = size > 0 and (len(names) > 0 or increments)
+        out.add("imu.accel.unit", unit or float(f"{factor:.5g}"), certain, f"median force {size:.4g}{taken}")
     gnss = motion(raw.gnss_t, raw.lat_deg, raw.lon_deg, raw.v_ned)
     away = "imu.time.offset_s" in wanted or "gnss.time.offset_s" in wanted
     lag = find_lag(raw.t, raw.accel, raw.gyro, gnss, None if away else 2.0)
@@ -106,7 +107,7 @@ def discover(
     out.lag = lag
     pose = find_pose(raw.t, raw.accel * factor, raw.gyro, gnss, lag.lag_s) if lag is not None else None
     out.pose = pose
-    _gyro_unit(out, raw, pose, gyro_units, increments)
+    _gyro_unit(out, raw, pose, known_gyro, increments)
     sound = pose is not None and pose.explained > LEAST_EXPLAINED and AGREE[0] < pose.scale < AGREE[1]
     sound = sound and not (pose is not None and pose.down_apart > FARTHEST_DOWN)
     if away:
@@ -144,28 +145,13 @@ def _offset(out: Findings, lag: Lag | None, pose: Pose | None, wanted: set[str],
     certain = lag.clear and 2.5 * pose.lag_std <= sure.time_s
     value = 0.0 if abs(pose.lag_s) < max(3 * pose.lag_std, 0.01) and abs(pose.lag_s) < 0.05 else pose.lag_s
     told = f"{sign * pose.lag_s:+.3f} ± {pose.lag_std:.3f} s, delay of the velocities included; {_peak(lag)}"
-    out.add(setting, round(sign * value, 4), certain, told + _named(pose.lag_s))
+    out.add(setting, round(sign * value, 4), certain, told + known_offset(pose.lag_s))
 
 
 def _peak(lag: Lag) -> str:
     return (
         f"yaw rate {lag.yaw:.2f}, force {lag.force:.2f} alike, next best lag {100 * lag.rival / lag.gain:.0f} % as good"
     )
-
-
-def _named(lag_s: float) -> str:
-    """What an offset is known for."""
-    for weeks in (round(lag_s / 604_800),):
-        if weeks and abs(lag_s - weeks * 604_800) < 40:
-            rest = lag_s - weeks * 604_800
-            return f"; {weeks} GPS weeks" + (f" and {rest:.1f} s" if abs(rest) > 0.5 else "")
-    for known, name in KNOWN_OFFSETS.items():
-        if abs(abs(lag_s) - known) < 0.5:
-            return f"; {name}"
-    hours = lag_s / 3600
-    if abs(hours) > 0.9 and abs(hours - round(hours * 4) / 4) * 3600 < 40:
-        return f"; a time zone of {round(hours * 4) / 4:+g} h"
-    return ""
 
 
 def _axes(out: Findings, pose: Pose | None, sound: bool, gnss: Motion, sure: Sure) -> None:

@@ -32,9 +32,10 @@ SPAN_S, STEP_S = 0.6, 0.04  # of the first scan round the coarse lag; the next o
 BLOCKS = 8  # of the drive, left out one at a time (jackknife)
 SMOOTH_S = 4.0  # over which course minus turn is averaged: sideslip and noise, not the drift of a gyroscope
 FEWEST = 20  # intervals in motion
-SLOW_ROWS = 10.0  # intervals (of about a second), 1σ of the mean that is taken off
+SLOW_ROWS = 4.0  # intervals (of about a second), 1σ of the mean that is taken off
 LEVEL_STD = np.radians(0.8)  # of levelling: an accelerometer's bias of 0.1 m/s², the road's crown
 AXIS_STD = np.radians(3.0)  # of the axis of turning, over the root of the turn [rad]: slopes, bumps, rolling in turns
+YAW_FLOOR, LAG_FLOOR = np.radians(0.3), 0.003  # what leaving pieces out does not show: rolling in turns, sideslip
 SLIP_NOISE = 0.1  # m/s, of a change of course times speed: the weight of what is known of l and K
 
 
@@ -98,9 +99,11 @@ def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float
     if unit is None:
         return None
     lag, fit, level, slip = lag_s, None, None, (0.0, 0.0)
+    good = np.ones(len(parts.t0), bool)
     for span in (SPAN_S, 0.1, 0.04):
         level = levelled(t, accel, gyro * unit, down)
-        fit = _scan(level, gnss, parts, lag, span, np.ones(len(parts.t0), bool), slip)
+        good = _sound(level, gnss, parts, lag, slip)
+        fit = _scan(level, gnss, parts, lag, span, good, slip)
         if fit is None:
             return None
         lag, unit, slip = fit.lag_s, unit * fit.scale, fit.slip
@@ -118,6 +121,7 @@ def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float
     leave = []
     for block in range(BLOCKS):
         keep = parts.block != block
+        keep &= good
         if (keep & parts.moving).sum() >= FEWEST // 2 and (one := _scan(level, gnss, parts, lag, 0.06, keep, slip)):
             leave.append(one)
     if len(leave) < BLOCKS // 2:
@@ -132,11 +136,11 @@ def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float
     floor = LEVEL_STD * np.sqrt(1 - weight)
     return Pose(
         matrix=final,
-        yaw_std=yaw_std,
+        yaw_std=float(np.hypot(yaw_std, YAW_FLOOR)),
         tilt_std=float(np.hypot((1 - weight) * tilt_std, floor)),
         scale=abs(fit.alpha),
         lag_s=lag,
-        lag_std=_jackknife(np.array([one.lag_s for one in leave])),
+        lag_std=float(np.hypot(_jackknife(np.array([one.lag_s for one in leave])), LAG_FLOOR)),
         gyro_scale=float(unit),
         gyro_scale_std=float(scale_std),
         lever_arm=fit.arm,
@@ -196,18 +200,22 @@ def _scan(
     """The fit of the lag with the least residuals; a parabola through the best three."""
     step = STEP_S if span > 0.3 else STEP_S / 4
     lags = lag_s + np.arange(-round(span / step), round(span / step) + 1) * step
-    use = keep & (parts.t0 + lags[0] >= level.t[0]) & (parts.t1 + lags[-1] <= level.t[-1])
+    use = keep & _covered(level, parts, lags[0], lags[-1])
     if (use & parts.moving).sum() < FEWEST // 2:
         return None
-    good = _sound(level, gnss, parts, lag_s, use, slip)
-    costs = np.array([_fit(level, gnss, parts, lag, use & good, slip)[1] for lag in lags])
+    costs = np.array([_fit(level, gnss, parts, lag, use, slip)[1] for lag in lags])
     best = int(costs.argmin())
     lag = float(lags[best])
     if 0 < best < len(lags) - 1:
         a, b, c = costs[best - 1 : best + 2]
         lag += float(np.clip(0.5 * (a - c) / max(a - 2 * b + c, 1e-12), -1, 1)) * step
-    fit = _fit(level, gnss, parts, lag, use & good, slip)[0]
-    return replace(fit, bias=_bias(level, gnss, parts, lag, use & good, slip))
+    fit = _fit(level, gnss, parts, lag, use, slip)[0]
+    return replace(fit, bias=_bias(level, gnss, parts, lag, use, slip))
+
+
+def _covered(level: Levelled, parts: _Intervals, least: float, most: float) -> np.ndarray:
+    """Intervals that lie inside the IMU's time at all lags from ``least`` to ``most``."""
+    return (parts.t0 + least >= level.t[0]) & (parts.t1 + most <= level.t[-1])
 
 
 def _bias(
@@ -219,10 +227,11 @@ def _bias(
     return complex(x[1] / x[0]) if x[0] else 0j
 
 
-def _sound(
-    level: Levelled, gnss: Motion, parts: _Intervals, lag: float, use: np.ndarray, slip: tuple[float, float]
-) -> np.ndarray:
+def _sound(level: Levelled, gnss: Motion, parts: _Intervals, lag: float, slip: tuple[float, float]) -> np.ndarray:
     """Intervals without outliers of GNSS: residuals at most five medians, of a fit to all."""
+    use = _covered(level, parts, lag, lag)
+    if not use.any():
+        return use
     design, left = _design(level, gnss, parts, lag, slip, level.tilted, 0.0)
     A, y = _quick(design, use), _quick(left[:, None], use)[:, 0]
     x, *_ = np.linalg.lstsq(A[use], y[use], rcond=None)

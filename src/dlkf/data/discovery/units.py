@@ -13,11 +13,10 @@ NEAR = 0.06  # of gravity: a scale error, the road's curves, a cold sensor
 ALIKE = 0.12  # of a unit's size, of what is regressed
 
 
-def accel_unit(size: float, known: Mapping[str, float]) -> str | None:
-    """The unit in which ``size`` is gravity; None if none is."""
-    fits = {name: abs(size * factor / G - 1) for name, factor in known.items()}
-    best = min(fits, key=lambda name: fits[name])
-    return best if fits[best] < NEAR else None
+def accel_units(size: float, known: Mapping[str, float]) -> list[str]:
+    """The units in which ``size`` is gravity, one of each factor: mg and cm/s² are 2 % apart, as biases are."""
+    fits = {factor: name for name, factor in reversed(known.items()) if abs(size * factor / G - 1) < NEAR}
+    return list(fits.values())
 
 
 def nearest_unit(factor: float, std: float, known: Mapping[str, float]) -> str | None:

@@ -87,8 +87,8 @@ def settle(
         raw,
         asked,
         sure,
-        accel_units=units.ACCELERATION,
-        gyro_units=units.RATE,
+        known_accel=units.ACCELERATION,
+        known_gyro=units.RATE,
         increments=bool(mapped["imu"].spec.get("increments")),
     )
     found.found += more.found
