@@ -100,7 +100,7 @@ def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float
         return None
     lag, fit, level, slip = lag_s, None, None, (0.0, 0.0)
     good = np.ones(len(parts.t0), bool)
-    for span in (SPAN_S, 0.1, 0.04):
+    for span in (SPAN_S, 0.1, 0.06):
         level = levelled(t, accel, gyro * unit, down)
         good = _sound(level, gnss, parts, lag, slip)
         fit = _scan(level, gnss, parts, lag, span, good, slip)
@@ -122,7 +122,7 @@ def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float
     for block in range(BLOCKS):
         keep = parts.block != block
         keep &= good
-        if (keep & parts.moving).sum() >= FEWEST // 2 and (one := _scan(level, gnss, parts, lag, 0.06, keep, slip)):
+        if (keep & parts.moving).sum() >= FEWEST // 2 and (one := _scan(level, gnss, parts, lag, 0.07, keep, slip)):
             leave.append(one)
     if len(leave) < BLOCKS // 2:
         return None
@@ -197,18 +197,18 @@ def _scan(
     keep: np.ndarray,
     slip: tuple[float, float],
 ) -> _Fit | None:
-    """The fit of the lag with the least residuals; a parabola through the best three."""
+    """The fit of the lag with the least residuals, by a parabola round the best."""
     step = STEP_S if span > 0.3 else STEP_S / 4
     lags = lag_s + np.arange(-round(span / step), round(span / step) + 1) * step
     use = keep & _covered(level, parts, lags[0], lags[-1])
     if (use & parts.moving).sum() < FEWEST // 2:
         return None
     costs = np.array([_fit(level, gnss, parts, lag, use, slip)[1] for lag in lags])
-    best = int(costs.argmin())
-    lag = float(lags[best])
-    if 0 < best < len(lags) - 1:
-        a, b, c = costs[best - 1 : best + 2]
-        lag += float(np.clip(0.5 * (a - c) / max(a - 2 * b + c, 1e-12), -1, 1)) * step
+    lag = float(lags[costs.argmin()])
+    near = np.abs(lags - lag) < (2.5 * STEP_S if span > 0.3 else 0.035)
+    a, b, _ = np.polyfit(lags[near] - lag, costs[near], 2)  # shaking makes the residuals' minimum a ragged one
+    if near.sum() > 3 and a > 0:
+        lag += float(np.clip(-0.5 * b / a, -span, span))
     fit = _fit(level, gnss, parts, lag, use, slip)[0]
     return replace(fit, bias=_bias(level, gnss, parts, lag, use, slip))
 

@@ -194,9 +194,10 @@ def _joined(whole: Mapped, parts: Mapping[str, Mapped]) -> Mapped:
             nearest = np.where(np.abs(at[before] - t) <= np.abs(at[after] - t), before, after)
             near = np.abs(at[nearest] - t) <= NEAR_S
             frame = part.table.frame.iloc[nearest].reset_index(drop=True)
-            if key != "position":
-                frame = frame.astype(object).where(near[:, None]) if not near.all() else frame
-                near = np.ones(len(t), bool)
+            if key != "position" and not near.all():
+                frame = frame.astype(object)
+                frame.loc[~near] = np.nan
+                near = near | near.any()
         if not near.any():
             raise InputError(
                 f"{part.table.path}: no row within {NEAR_S:g} s of those of {whole.table.path.name}; both need one "

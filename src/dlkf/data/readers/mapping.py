@@ -136,10 +136,8 @@ class Mapped:
         week = self.column(time["week"], nan=False) if time.get("week") is not None else None
         if time.get("week_number") is not None:
             week = np.full(len(self), int(time["week_number"]))
-        whole, part = units.seconds(values, unit, week, time.get("clock"), f"{self.table.path}, {where}")
-        if time.get("day") is not None:
-            day = np.array([str(time["day"])])
-            whole = whole + units.seconds(day, units.ISO, None, time.get("clock"), f"{where}.day")[0]
+        day = None if time.get("day") is None else str(time["day"])
+        whole, part = units.seconds(values, unit, week, time.get("clock"), f"{self.table.path}, {where}", day)
         offset = _finite(time.get("offset_s") or 0.0, f"{where}.offset_s")
         jump = math.floor(offset)
         return whole + jump, part + (offset - jump)

@@ -73,13 +73,18 @@ def rotation(axes: str | Sequence[str] | Mapping[str, float], where: str) -> np.
 
 
 def seconds(
-    values: np.ndarray, unit: str, week: np.ndarray | None, clock: str | None, where: str
+    values: np.ndarray,
+    unit: str,
+    week: np.ndarray | None,
+    clock: str | None,
+    where: str,
+    day: str | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Whole seconds (int64) and the rest (float64) of stamps, so that nanoseconds since 1970 lose nothing.
 
-    With ``week`` the stamps are seconds of the GPS week. ``clock`` = unix or utc turns Unix time (calendar texts in
-    UTC) into GPS time, leap seconds of their day included, so that it can be mixed with GPS weeks; gps says that
-    calendar texts are GPS time already; numbers of a gps clock, and all of none, stay as they are.
+    With ``week`` the stamps are seconds of the GPS week, with ``day`` of that day. ``clock`` = unix or utc turns Unix
+    time (calendar texts in UTC) into GPS time, leap seconds of their day included, so that it can be mixed with GPS
+    weeks; gps says that calendar texts are GPS time already; numbers of a gps clock, and all of none, stay as they are.
     """
     if unit not in (*TIME, ISO):
         raise InputError(f"{where}: unknown time unit {unit!r}; known are {', '.join((*TIME, ISO))}")
@@ -87,10 +92,12 @@ def seconds(
         raise InputError(f"{where}: unknown clock {clock!r}; known are {', '.join(CLOCKS)}, or null")
     if unit == ISO:
         whole, part = _split(_calendar(values, where), TIME["ns"])
-        if clock == "gps":
-            return whole - GPS_EPOCH_UNIX, part
     else:
         whole, part = _split(values, TIME[unit])
+    if day is not None:
+        whole = whole + _split(_calendar(np.array([day]), f"{where}.day"), TIME["ns"])[0]
+    if clock == "gps" and (unit == ISO or day is not None):
+        return whole - GPS_EPOCH_UNIX, part
     if week is not None:
         whole = whole + WEEK_S * week.astype(np.int64)
     if clock in ("unix", "utc"):

@@ -30,10 +30,12 @@ ENCODINGS = ("utf-8-sig", "cp1252", "latin-1")  # tried in turn; the last one re
 def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> Table:
     """A text table; the frame's index is the number of each row's line in the file."""
     options = {**DEFAULTS, **{k: v for k, v in text.items() if v is not None}}
+    if len(options["separator"]) > 1:
+        _pattern(options["separator"], "separator")
     content = decoded(path, options["encoding"])
     lines = content.splitlines()
     comment, pattern = options["comment"], options["lines"]
-    chosen = _pattern(pattern) if pattern else None
+    chosen = _pattern(pattern, "lines") if pattern else None
     keep = [
         k
         for k in range(int(options["skip_rows"]), len(lines))
@@ -141,8 +143,8 @@ def _cut_off(lines: list[str], rows: list[int], ended: bool, options: Mapping[st
     return None
 
 
-def _pattern(pattern: str) -> re.Pattern[str]:
+def _pattern(pattern: str, name: str) -> re.Pattern[str]:
     try:
         return re.compile(pattern)
     except re.error as error:
-        raise InputError(f"lines={pattern!r} is no regular expression: {error}") from None
+        raise InputError(f"reader.{name}={pattern!r} is no regular expression: {error}") from None

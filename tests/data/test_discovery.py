@@ -1,0 +1,222 @@
+"""What a drive tells of its own log is right, and what it cannot tell is not given as sure."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from scipy.spatial.transform import Rotation
+
+from dlkf.config import config_dir
+from dlkf.data.discovery.clock import find_lag, known_offset
+from dlkf.data.discovery.motion import motion, position_delay
+from dlkf.data.discovery.orientation import find_pose
+from dlkf.data.discovery.units import accel_units, nearest_unit, time_unit
+from dlkf.data.intake import ingest_drives
+from dlkf.data.readers import units
+from dlkf.data.readers.auto import AutoReader
+from dlkf.data.readers.logs import LogReader
+from dlkf.data.schema import ACCEL, GYRO, VELOCITY
+from dlkf.data.tables import read_drives, read_table
+from dlkf.errors import InputError
+from dlkf.simulation.dataset import simulate_from_config
+from tests.data.conftest import car
+
+TURN = Rotation.from_euler("ZYX", [130.0, -35.0, 70.0], degrees=True).as_matrix()  # car → sensor
+UNIX = 1_751_760_000
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Three minutes of perfect sensors."""
+    return car(180)
+
+
+@pytest.fixture(scope="module")
+def streets(tmp_path_factory):
+    """Three simulated minutes with perfect sensors: no turn like the one before, as the analytic path has them."""
+    own = ["simulated@dataset=per_drive", "imu=perfect", "dataset.hours=0.05", "dataset.drive_minutes=3", "seed=5"]
+    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
+        config = OmegaConf.to_container(compose("simulate", own), resolve=True)
+    folder = simulate_from_config(config, tmp_path_factory.mktemp("data") / "streets", progress=False)
+    name = read_drives(folder)[0].name
+    return {kind: pd.DataFrame(read_table(folder, kind, name)) for kind in ("imu", "gnss")}
+
+
+def _arrays(tables, turn=TURN, offset=0.0):
+    imu, gnss = tables["imu"], tables["gnss"]
+    accel, gyro = (imu[list(c)].to_numpy() @ turn.T for c in (ACCEL, GYRO))
+    v = gnss[list(VELOCITY)].to_numpy()
+    return imu.t.to_numpy(), accel, gyro, motion(gnss.t.to_numpy() - offset, *_place(gnss), v)
+
+
+def _place(gnss):
+    return gnss.lat_deg.to_numpy(), gnss.lon_deg.to_numpy()
+
+
+@pytest.mark.parametrize("offset", [0.0, 18.0, -5123.4, 604_800.0 * 3 + 0.37])
+def test_any_clock_offset(drive, offset):
+    """To a quarter of a second by correlation, to a millisecond with the pose: the sensors are perfect."""
+    t, accel, gyro, gnss = _arrays(drive, offset=offset)
+    lag = find_lag(t, accel, gyro, gnss)
+    assert lag is not None and lag.clear and abs(lag.lag_s - offset) < 0.3
+    pose = find_pose(t, accel, gyro, gnss, lag.lag_s)
+    assert pose is not None and abs(pose.lag_s - offset) < 2e-3
+
+
+def test_any_pose_and_unit(drive):
+    """The car pitches and rolls not at all, so all that is left is a fit's rounding: a tenth of a degree."""
+    t, accel, gyro, gnss = _arrays(drive)
+    pose = find_pose(t, accel, np.degrees(gyro), gnss, 0.0)
+    assert pose is not None
+    assert math.degrees(Rotation.from_matrix(pose.matrix @ TURN).magnitude()) < 0.1
+    assert pose.gyro_scale == pytest.approx(np.pi / 180, rel=5e-3)
+    assert pose.scale == pytest.approx(1, abs=0.01) and pose.explained > 0.99
+    assert abs(pose.lever_arm) < 0.1
+
+
+def test_a_lever_arm_is_seen(drive):
+    """Antenna 1.2 m before and 0.5 m left of the IMU: velocities of the antenna are those of the IMU plus ω × l."""
+    imu, gnss = drive["imu"], drive["gnss"].copy()
+    yaw = drive["reference"]["yaw"].to_numpy()[::10][: len(gnss)]
+    rate = np.interp(gnss.t, imu.t, imu.gyro_z)
+    swing = np.stack((-rate * -0.5, rate * 1.2), -1)  # forward, right
+    gnss["vel_n"] += swing[:, 0] * np.cos(yaw) - swing[:, 1] * np.sin(yaw)
+    gnss["vel_e"] += swing[:, 0] * np.sin(yaw) + swing[:, 1] * np.cos(yaw)
+    t, accel, gyro, moved = _arrays({"imu": imu, "gnss": gnss})
+    pose = find_pose(t, accel, gyro, moved, 0.0)
+    assert pose is not None and abs(pose.lever_arm - (1.2 - 0.5j)) < 0.1
+
+
+def test_positions_older_than_velocities(drive):
+    """Fixes at 4 Hz, so that a position 0.2 s old is that of the row before by interpolation: 5 ms of curvature."""
+    gnss = car(120, gnss_hz=10)["gnss"]
+    late = gnss.copy()
+    late[["lat_deg", "lon_deg"]] = gnss[["lat_deg", "lon_deg"]].shift(2)
+    late = late.iloc[2:]
+    delay, std = position_delay(late.t.to_numpy(), *_place(late), late[list(VELOCITY)].to_numpy())
+    assert delay == pytest.approx(0.2, abs=5e-3) and std < 0.02
+
+
+def test_nothing_is_made_up():
+    """A car at rest, one that drives straight on at one speed, and noise: no pose, no clear clock."""
+    tables = car(120)
+    rng = np.random.default_rng(1)
+    t = tables["imu"].t.to_numpy()
+    noise = rng.normal(0, 0.3, (2, len(t), 3)) + np.array([[[0, 0, -9.8]], [[0, 0, 0]]])
+    gnss = tables["gnss"]
+    v = gnss[list(VELOCITY)].to_numpy()
+    for moved in (motion(gnss.t.to_numpy(), *_place(gnss), v), motion(gnss.t.to_numpy(), *_place(gnss), 0 * v)):
+        lag = find_lag(t, noise[0], noise[1], moved)
+        assert lag is None or not lag.clear
+        pose = find_pose(t, noise[0], noise[1], moved, 0.0)
+        assert pose is None or pose.explained < 0.8 or pose.yaw_std > math.radians(2)
+
+
+def test_units_by_size():
+    assert accel_units(9.9, units.ACCELERATION) == ["m/s2"]
+    assert accel_units(1.02, units.ACCELERATION) == ["g"]
+    assert set(accel_units(990.0, units.ACCELERATION)) == {"mg", "cm/s2"}  # 2 % apart, as biases are
+    assert accel_units(3.3, units.ACCELERATION) == []
+    assert nearest_unit(0.0176, 1e-4, units.RATE) == "deg/s"
+    assert nearest_unit(0.1, 1e-4, units.RATE) is None
+    assert time_unit(1.75e12 + 10.0 * np.arange(9), 0.2, 1e-4) == "ms"
+    assert time_unit(10.0 * np.arange(9), 0.21, 2e-4) == "ms"
+    assert "leap seconds" in known_offset(18.1) and "3 GPS weeks" in known_offset(3 * 604_800.0)
+    assert "time zone of +2 h" in known_offset(7200.0) and known_offset(-63.0) == ""
+
+
+def _hidden(folder, tables, offset=1234.5, header=True):
+    """Two files of odd units on clocks of their own."""
+    folder.mkdir(parents=True)
+    imu, gnss = tables["imu"], tables["gnss"]
+    odd = pd.DataFrame({"stamp": np.round(1000 * imu.t).astype(int)})
+    for name, columns, unit in (("acc", ACCEL, 9.80665), ("gyr", GYRO, np.pi / 180)):
+        values = imu[list(columns)].to_numpy() @ TURN.T / unit
+        odd[[f"{name}_{a}" for a in "xyz"]] = values
+    odd.to_csv(folder / "box.txt", index=False, sep=";", header=header)
+    fix = pd.DataFrame({"unix_time": UNIX + gnss.t - offset, "Latitude": gnss.lat_deg, "Longitude": gnss.lon_deg})
+    fix["Altitude"], fix["speed"] = gnss.height_m, 3.6 * np.hypot(gnss.vel_n, gnss.vel_e)
+    fix["course"] = np.degrees(np.arctan2(gnss.vel_e, gnss.vel_n)) % 360
+    fix.to_csv(folder / "receiver.csv", index=False)
+
+
+def test_logs_of_which_nothing_is_known(tmp_path, drive):
+    """Formats, columns, units, pose and clocks found; the written preset reads the logs to the same tables."""
+    _hidden(tmp_path / "logs" / "monday", drive)
+    (got,) = AutoReader().read(tmp_path / "logs")
+    found = "\n".join(got.notes)
+    for told in ("accel.unit=g", "gyro.unit=deg/s", "velocity.unit=km/h", "offset_s=", "axes={roll", "lever_arm_m"):
+        assert f"{told}" in found, told
+    assert "±" in found and got.name == "monday"
+    # half a percent of an axis: 0.1° of pose; the rates' unit is exact
+    for name in (*ACCEL, *GYRO):
+        np.testing.assert_allclose(got.imu[name], drive["imu"][name], atol=0.02, err_msg=name)
+    np.testing.assert_allclose(got.gnss.t, drive["gnss"].t, atol=3e-3)
+    ingest_drives([got], tmp_path / "out")
+    preset = yaml.safe_load((tmp_path / "out" / "reader" / "found.yaml").read_text())
+    assert preset.pop("_target_").endswith("LogReader")
+    (again,) = LogReader(**preset).read(tmp_path / "logs")
+    pd.testing.assert_frame_equal(again.imu, got.imu)
+    pd.testing.assert_frame_equal(again.gnss, got.gnss)
+    assert read_table(tmp_path / "out", "imu", "monday") is not None
+
+
+def test_what_is_not_sure_is_refused(tmp_path):
+    """Twenty seconds are too few for a pose within 2°."""
+    _hidden(tmp_path / "logs", car(20))
+    with pytest.raises(InputError, match=r"drive logs: not sure of reader\.") as error:
+        list(AutoReader().read(tmp_path / "logs"))
+    assert "\n" not in str(error.value)
+
+
+def test_kf_gins_files_by_their_numbers(tmp_path, drive):
+    """No header, increments, blanks: told by gravity and by what rises."""
+    folder = tmp_path / "a"
+    folder.mkdir()
+    imu, gnss = drive["imu"], drive["gnss"]
+    table = np.column_stack((345_600 + imu.t, imu[[*GYRO, *ACCEL]].to_numpy() * 0.01))
+    np.savetxt(folder / "box.txt", table, fmt="%.10g")
+    place = gnss[["lat_deg", "lon_deg", "height_m"]].to_numpy()
+    np.savetxt(folder / "rtk.txt", np.column_stack((345_600 + gnss.t, place)), fmt="%.12g")
+    (got,) = AutoReader().read(folder)
+    np.testing.assert_allclose(got.imu.gyro_z, imu.gyro_z, atol=0.003)
+    # velocities of positions: 1 s means, so a time of 20 ms is what can be asked
+    np.testing.assert_allclose(got.gnss.t, gnss.t, atol=0.02)
+    assert "with 4, 5, 6, 1, 2, 3" in got.notes[0]
+
+
+def test_an_opposite_accelerometer(tmp_path, streets):
+    """Some phones give the reaction's opposite: found by the turns, which then go the wrong way."""
+    drive = streets
+    tables = {**drive, "imu": drive["imu"].assign(**{c: -drive["imu"][c] for c in ACCEL})}
+    _hidden(tmp_path / "a", tables)
+    (got,) = AutoReader().read(tmp_path / "a")
+    assert got.mapping["imu"]["accel"]["unit"] == pytest.approx(-9.80665)
+    np.testing.assert_allclose(got.imu.accel_z, drive["imu"].accel_z, atol=0.02)
+
+
+def _twice(folder):
+    (folder / "other.txt").write_bytes((folder / "box.txt").read_bytes())
+
+
+MISTAKES = {
+    "two IMUs": (_twice, "box.txt, other.txt all hold IMU; choose one with reader.imu.file"),
+    "no IMU": (lambda f: (f / "box.txt").unlink(), "no IMU found in receiver.csv"),
+    "nothing": (lambda f: [p.unlink() for p in f.iterdir()], "holds no log that can be recognised"),
+}
+
+
+@pytest.mark.parametrize("case", MISTAKES)
+def test_mistakes(tmp_path, case):
+    spoil, told = MISTAKES[case]
+    _hidden(tmp_path / "a", car(20))
+    spoil(tmp_path / "a")
+    with pytest.raises(InputError, match=told) as error:
+        list(AutoReader().read(tmp_path / "a"))
+    assert "\n" not in str(error.value)
