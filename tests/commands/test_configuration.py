@@ -13,7 +13,7 @@ from dlkf.config import config_dir
 from dlkf.filters.saved import learned_filter
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.simulation.dataset import dataset_config
-from dlkf.training.loss import LossConfig
+from dlkf.training.loss import loss_of
 
 CONF = config_dir()
 GROUPS = {  # group of the defaults list: folder under conf/
@@ -85,7 +85,7 @@ def test_it_composes_and_builds(primary, overrides):
         get_class(settings.pop("_target_"))(**settings)
     if primary == "train":
         learned_filter(config["model"])
-        LossConfig(**config["loss"])
+        loss_of(config["loss"])
         assert all(
             instantiate(c).state_dict() is not None for c in config["callbacks"].values() if c is not None
         )

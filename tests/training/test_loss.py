@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
+from dlkf.errors import InputError
 from dlkf.filters.integration import integrate
 from dlkf.filters.model_based import Ins
 from dlkf.navigation.state import NavState
-from dlkf.training.loss import LossConfig, pva_losses, weighted
+from dlkf.training.loss import LossConfig, loss_of, pva_losses, weighted
 from tests.filters.scene import scene
 
 
@@ -57,3 +59,37 @@ def test_prior_and_posterior_shares():
     prior_only = pva_losses(mixed, batch, LossConfig(posterior=0.0))["position"]
     assert abs(float(half) * 2 - float(prior_only)) < 1e-9
     assert float(pva_losses(mixed, batch, LossConfig(prior=0.0))["position"]) < 1e-12
+
+
+class Late:
+    """A loss of one's own: the position error at the end of the piece alone."""
+
+    def __init__(self, scale: float = 1.0):
+        self.scale = scale
+
+    def __call__(self, solution, batch):
+        return {"late": ((solution.posterior.p_n - batch.truth.p_n)[:, -1] / self.scale).square().mean()}
+
+
+def test_a_loss_of_one_s_own_takes_its_settings_and_no_others():
+    batch = scene(2, 5)
+    solution = integrate(batch, Ins())
+    own = {"_target_": f"{__name__}.Late", "scale": 2.0, "position_scale": 1.0}
+    quarter, whole = (loss_of(own | {"scale": s})(solution, batch)["late"] for s in (2.0, 1.0))
+    assert float(whole) == pytest.approx(4 * float(quarter)) and float(whole) > 0
+    assert float(weighted({"late": whole}, {"position": 5.0})) == float(whole)
+    with pytest.raises(InputError, match="takes no colour"):
+        loss_of(own | {"colour": 1})
+    with pytest.raises(InputError, match="PYTHONPATH"):
+        loss_of({"_target_": "nowhere.Late"})
+    with pytest.raises(InputError, match="unknown key 'colour'"):
+        loss_of({"colour": 1})
+
+
+def test_one_of_the_three_losses_can_be_left_out():
+    """R124: training without an attitude reference."""
+    batch = scene(2, 5)
+    solution = integrate(batch, Ins())
+    whole, without = pva_losses(solution, batch, LossConfig()), pva_losses(solution, batch, LossConfig(attitude=0.0))
+    assert float(without["attitude"]) == 0.0 < float(whole["attitude"])
+    assert float(without["position"]) == float(whole["position"])

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from dlkf.data.augmentation import turn_frames
+from dlkf.data.degradation import GnssNoise
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.masks import BiasLaw, with_bias, withhold, within
 from dlkf.data.segments import (
@@ -64,6 +65,7 @@ class DriveDataModule(L.LightningDataModule):
         min_valid: float = 1.0,
         start: StartLaw | Mapping[str, float] | None = None,
         turn_frames: bool = False,
+        gnss_noise: Mapping[str, float] | None = None,
         injected_bias: Mapping[str, float] | None = None,
         seed: int = 0,
         eval_seed: int = 0,
@@ -85,6 +87,7 @@ class DriveDataModule(L.LightningDataModule):
         self.injected_bias = law
         self.start, self.turn_frames = StartLaw.of(start), turn_frames
         self.seed, self.eval_seed, self.split_seed, self.progress = seed, eval_seed, split_seed, progress
+        self.gnss_noise = None if gnss_noise is None else settings_from(GnssNoise, gnss_noise, "data.gnss_noise")
         self.length_law: Callable[[int], float] | None = None
         self._starts: dict[int, torch.Tensor] = {}
         self._latest: tuple[int, int, list[list[Piece]]] = (-1, -1, [])
@@ -98,6 +101,8 @@ class DriveDataModule(L.LightningDataModule):
             drives += load_dataset(
                 folder, rate_hz=self.rate_hz, epoch_s=self.epoch_s, dtype=self.dtype, progress=self.progress
             )
+        if self.gnss_noise is not None:
+            drives = [self.gnss_noise.added(d, self.eval_seed) for d in drives]
         self.stack = DriveStack(drives)
         self.spans = split_rows(self.stack, self.split, self.fractions, self.split_seed, self.eval_length_s)
 

@@ -115,28 +115,36 @@ def without_outage(
     return out
 
 
-def after_table(dataset: str, rows: Sequence[After], baseline: str) -> Table:
-    """One column per time with GNSS: geometric mean, RMS and the ratio of geometric means with its interval."""
-    names = list(rows[0].filters)
-    cells = []
+def after_tables(dataset: str, rows: Sequence[After], baseline: str) -> list[Table]:
+    """Errors at the end after each time with GNSS with the ratio of geometric means, and the heading when it goes."""
+    names, columns = list(rows[0].filters), ["Filter"]
+    for r in rows:
+        columns += [f"{r.seconds:g} s\ngeo / RMS [m]", f"ratio to\n{baseline}"]
+    errors, headings = [], []
     for name in names:
-        row = [name]
+        cells = [name]
         for r in rows:
             f = r.filters[name]
             ratio = with_interval(r.ratios.get(name)) if baseline in r.filters else ""
-            row += [f"{number(f['geometric_m'])} / {number(f['rms_m'])}", ratio, number(f["heading_deg"])]
-        cells.append(row)
-    columns = ["Filter"]
-    for r in rows:
-        columns += [f"after {r.seconds:g} s\ngeo / RMS [m]", f"ratio to\n{baseline}", "heading\n[°]"]
+            cells += [f"{number(f['geometric_m'], digits=2)} / {number(f['rms_m'], digits=2)}", ratio]
+        errors.append(cells)
+        headings.append([name, *(number(r.filters[name]["heading_deg"], digits=2) for r in rows)])
     counts = ", ".join(f"{r.pieces} outages of {r.groups} recordings after {r.seconds:g} s" for r in rows)
-    return Table(
-        title=f"{dataset}: outages of {OUTAGE_S:g} s after longer and longer GNSS",
-        note=f"{counts}. Horizontal error at the end, geometric mean and RMS; ratio of geometric means; heading: RMS "
-        "error when GNSS goes. A filter that wins in the first column alone has won a cold start.",
-        columns=columns,
-        rows=cells,
-    )
+    return [
+        Table(
+            title=f"{dataset}: outages of {OUTAGE_S:g} s after longer and longer GNSS",
+            note=f"{counts}. Horizontal error at the end, geometric mean and RMS; ratio of geometric means. A filter "
+            "that wins in the first column alone has won a cold start.",
+            columns=columns,
+            rows=errors,
+        ),
+        Table(
+            title=f"{dataset}: heading when GNSS goes",
+            note="RMS error [°] after so many seconds with GNSS.",
+            columns=["Filter", *(f"{r.seconds:g} s" for r in rows)],
+            rows=headings,
+        ),
+    ]
 
 
 def hour_table(dataset: str, rows: Mapping[str, Mapping[str, float]]) -> Table:

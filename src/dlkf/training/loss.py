@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from functools import partial
+from importlib import import_module
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
 
 from dlkf.data.drive import Batch
+from dlkf.errors import InputError
 from dlkf.filters.integration import Solution
 from dlkf.navigation.state import NavState
 from dlkf.training.outage_loss import likelihood_term, outage_term, speed_term
@@ -19,7 +25,8 @@ TERMS = ("position", "velocity", "attitude")
 @dataclass(frozen=True)
 class LossConfig:
     """``scale`` [m, m/s, rad]: the error where smooth-L1 turns from square to linear; ``prior`` and
-    ``posterior``: how much the states before and after the update count (paper.md 2.8, 4.12). A piece whose position
+    ``posterior``: how much the states before and after the update count (paper.md 2.8, 4.12); ``position``,
+    ``velocity``, ``attitude``: fixed factors of the three losses, 0 leaves one out (R124). A piece whose position
     error passes ``diverged_m`` is left out of the batch's loss (paper.md 4.13). ``outage``, ``likelihood``, ``speed``:
     factors of the terms of :mod:`dlkf.training.outage_loss`."""
 
@@ -28,10 +35,17 @@ class LossConfig:
     attitude_scale: float = 0.02
     prior: float = 1.0
     posterior: float = 1.0
+    position: float = 1.0
+    velocity: float = 1.0
+    attitude: float = 1.0
     diverged_m: float = 1e4
     outage: float = 0.0
     likelihood: float = 0.0
     speed: float = 0.0
+
+
+PAPERS = {f.name for f in fields(LossConfig)}  # settings that lie beside _target_ where a preset is the base
+Loss = Callable[[Solution, Batch], Mapping[str, Tensor]]
 
 
 def pva_losses(solution: Solution, batch: Batch, config: LossConfig) -> dict[str, Tensor]:
@@ -67,10 +81,35 @@ def pva_losses(solution: Solution, batch: Batch, config: LossConfig) -> dict[str
             e = error[..., 3 * i : 3 * i + 3] / scale
             each = smooth_l1_loss(e, torch.zeros_like(e), reduction="none")
             value = value + weight / total * torch.where(keep, each, torch.zeros_like(each)).sum() / count
-        losses[term] = value
+        losses[term] = getattr(config, term) * value
     return losses
 
 
-def weighted(losses: dict[str, Tensor], weights: dict[str, float]) -> Tensor:
+def loss_of(values: Mapping[str, Any]) -> Loss:
+    """The loss of plain settings: that of the paper, or with ``_target_: module.Class`` a user's own.
+
+    The class is called with the settings that it takes, and its object with (solution, batch); it gives a mapping of
+    named losses, of which position, velocity and attitude get the weights in force. InputError where it cannot be
+    found or takes other settings.
+    """
+    values = dict(values)
+    if (target := values.pop("_target_", None)) is None:
+        if unknown := sorted(set(values) - PAPERS):
+            raise InputError(f"loss: unknown key {unknown[0]!r}; known: {', '.join(sorted(PAPERS))}")
+        return partial(pva_losses, config=LossConfig(**values))
+    module, _, name = str(target).rpartition(".")
+    try:
+        made_by = getattr(import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InputError(
+            f"loss._target_={target}: {error}; give module.Class, its module's folder in PYTHONPATH"
+        ) from None
+    takes = inspect.signature(made_by).parameters
+    if unknown := sorted(set(values) - set(takes) - PAPERS):
+        raise InputError(f"loss: {target} takes no {unknown[0]}; it takes {', '.join(takes) or 'nothing'}")
+    return made_by(**{k: v for k, v in values.items() if k in takes})
+
+
+def weighted(losses: Mapping[str, Tensor], weights: dict[str, float]) -> Tensor:
     """w_p L_p + w_v L_v + w_h L_h (paper eq 9), and the terms that have their own factors."""
     return sum(weights.get(term, 1.0) * loss for term, loss in losses.items())

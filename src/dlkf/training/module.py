@@ -17,7 +17,7 @@ from dlkf.filters.integration import Solution, integrate
 from dlkf.filters.saved import learned_filter
 from dlkf.networks.heads import IMU_ERROR_SIZE, INNOVATION_SIZE, STATE_SIZE
 from dlkf.training.callbacks.masking import BatchCallback
-from dlkf.training.loss import TERMS, LossConfig, pva_losses, weighted
+from dlkf.training.loss import TERMS, loss_of, weighted
 
 STATE, INNOVATION = torch.tensor(STATE_SIZE), torch.tensor(INNOVATION_SIZE)
 
@@ -42,7 +42,8 @@ class FilterTraining(L.LightningModule):
         self.save_hyperparameters()
         torch.manual_seed(seed)
         self.filter = learned_filter(model)
-        self.loss_config = LossConfig(**loss)
+        self.loss = loss_of(loss)
+        self.covariances = loss.get("likelihood", 0.0) > 0
         self.loss_weights = dict.fromkeys(TERMS, 1.0)
         self.seed = seed
 
@@ -65,7 +66,7 @@ class FilterTraining(L.LightningModule):
         for callback in self.trainer.callbacks:
             if isinstance(callback, BatchCallback):
                 batch = callback.transform(batch, self.current_epoch, generator)
-        losses = pva_losses(self._run(batch), batch, self.loss_config)
+        losses = self.loss(self._run(batch), batch)
         total = weighted(losses, self.loss_weights)
         values = {f"train/{k}_loss": v.detach() for k, v in losses.items()}
         self.log_dict({"train/loss": total.detach(), **values}, on_step=False, on_epoch=True, batch_size=batch.size[0])
@@ -81,7 +82,7 @@ class FilterTraining(L.LightningModule):
         self.log("time/epoch_s", time.perf_counter() - self._began)
 
     def _run(self, batch: Batch) -> Solution:
-        return integrate(batch, self.filter, keep_covariances=self.loss_config.likelihood > 0)
+        return integrate(batch, self.filter, keep_covariances=self.covariances)
 
     def validation_step(self, batch: Batch, step: int) -> None:
         """Errors at the ends of fixed outages, as they will be scored on test drives, and what the filter answers."""
@@ -92,7 +93,7 @@ class FilterTraining(L.LightningModule):
         if solution.gain is not None and bool(used.any()):
             last = solution.used.long().cumsum(1).argmax(1)
             self._gains.append(solution.gain[torch.arange(len(last)), last][used].double().cpu())
-        losses = pva_losses(solution, batch, self.loss_config)
+        losses = self.loss(solution, batch)
         plain = weighted(losses, dict.fromkeys(TERMS, 1.0))
         self.log("val/loss", plain, on_epoch=True, batch_size=batch.size[0])
 

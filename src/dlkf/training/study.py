@@ -18,7 +18,8 @@ from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import dataset_digest, load_dataset
 from dlkf.errors import InputError
-from dlkf.evaluation.endurance import After, after_gnss, after_table, hour_table, without_outage
+from dlkf.evaluation.endurance import After, after_gnss, after_tables, hour_table, without_outage
+from dlkf.evaluation.gains import gains_of, write_gains
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Scenes
 from dlkf.evaluation.results import BASELINE, Results
@@ -96,6 +97,7 @@ def run_study(
         )
         title = ", ".join(Path(d).name for d in data.datasets)
         after, hour, tables = _endurance(filters, data, scoring, title, say)
+        gains = gains_of(filters, scenes, settle_s=scoring["settle_s"]) if scoring["gains"] else {}
     write_report(
         folder / "report",
         title,
@@ -106,6 +108,8 @@ def run_study(
         baseline=baseline,
         more=tables,
     )
+    if gains:
+        write_gains(folder / "report", gains, title)
     return Outcome(scores, made, baselines, after, hour, weights, seconds, tables)
 
 
@@ -131,7 +135,7 @@ def _endurance(
     if scoring["after_s"]:
         after = after_gnss(known, data, scoring["after_s"], baseline=BASELINE, seed=scoring["seed"])
         if after:
-            tables.append(after_table(title, after, BASELINE))
+            tables += after_tables(title, after, BASELINE)
         if left := sorted(set(map(float, scoring["after_s"])) - {a.seconds for a in after}):
             say(f"no test drive has room for an outage after {', '.join(f'{s:g}' for s in left)} s of GNSS")
     if scoring["hour"]:

@@ -1,0 +1,36 @@
+"""GNSS made worse on purpose (paper eqs 12, 13; R130): white noise on position and velocity of every fix."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from dlkf.data.draws import piece_generator
+from dlkf.data.drive import Drive
+from dlkf.errors import InputError
+
+
+@dataclass(frozen=True)
+class GnssNoise:
+    """1σ per axis of the noise that is added: ``s_p`` [m] and ``s_v`` [m/s]; the fixes' own stds grow with it."""
+
+    s_p: float = 0.0
+    s_v: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (self.s_p >= 0 and self.s_v >= 0):
+            raise InputError(f"gnss_noise: s_p and s_v must be numbers ≥ 0, got {self.s_p}, {self.s_v}")
+
+    def added(self, drive: Drive, seed: int = 0) -> Drive:
+        """The drive with noise of its own on every fix: p̃ = p + s_p n, ṽ = v + s_v n, n ~ N(0, I) (isotropic, so the
+        axes do not matter); std ← √(std² + s²), which a Kalman filter takes for R (R018)."""
+        generator = piece_generator(seed, "gnss_noise", drive.name, drive.t0)
+        n = torch.randn(len(drive.gnss_std), 6, generator=generator, dtype=torch.float64)
+        s = torch.tensor([self.s_p] * 3 + [self.s_v] * 3, dtype=torch.float64)
+        return replace(
+            drive,
+            gnss_r_e=drive.gnss_r_e + s[:3] * n[:, :3],
+            gnss_v_e=drive.gnss_v_e + s[3:] * n[:, 3:],
+            gnss_std=torch.hypot(drive.gnss_std.double(), s).to(drive.gnss_std),
+        )
