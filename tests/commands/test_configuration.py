@@ -51,7 +51,7 @@ EXPERIMENTS = [
     [f"+experiment={experiment}", *profile]
     for experiment in presets("experiment")
     for profile in ([], *([f"+profile={name}"] for name in presets("profile")))
-]
+] + [["+experiment=kalman_gain", f"+noise={name}"] for name in presets("noise")]
 OPTIONS = {
     primary: [[], *([f"{group}={name}"] for group, folder in groups.items() for name in presets(folder))]
     for primary, groups in GROUPS.items()
@@ -68,7 +68,7 @@ CASES += [  # a preset of the others replaces one node whole, so its composition
 def test_all_folders_are_covered():
     """A new folder of presets must be added to GROUPS."""
     folders = {path.name for path in CONF.iterdir() if path.is_dir()}
-    assert folders == {f for groups in GROUPS.values() for f in groups.values()} | {"experiment", "profile"}
+    assert folders == {f for groups in GROUPS.values() for f in groups.values()} | {"experiment", "noise", "profile"}
 
 
 @pytest.mark.parametrize(

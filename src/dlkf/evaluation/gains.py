@@ -16,8 +16,8 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from dlkf.data.masks import withhold
 from dlkf.evaluation.metrics import Array
-from dlkf.evaluation.outages import with_outage
 from dlkf.evaluation.run import Scene
 from dlkf.files import staged
 from dlkf.filters.integration import Estimator
@@ -47,7 +47,7 @@ def gains_of(filters: Mapping[str, Estimator], scenes: Iterable[Scene], *, settl
     last: dict[str, list[Array]] = {}
     used: dict[str, list[Array]] = {}
     for batch, mask in scenes:
-        masked = with_outage(batch, mask)
+        masked = withhold(batch, mask)
         for name, estimator in filters.items():
             solution = run_filter(masked, estimator)
             if solution.gain is None:
