@@ -55,7 +55,7 @@ def resolve_model(
             f"model={spec} is a file; give the folder with {WEIGHTS} and {CONFIG} (pickles are not read)"
         )
     raise InputError(
-        f"unknown model {spec!r}: neither a known filter ({known_filters()}) nor a folder, "
+        f"unknown model {spec!r}: neither a known filter (plus, {known_filters()}) nor a folder, "
         "an MLflow run id, models:/name@alias or a class of your own, module:Class"
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +29,7 @@ from dlkf.evaluation.table import Table
 from dlkf.filters.build import refuse_smoothed
 from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import load_filter
+from dlkf.filters.shipped import shipped_folder, trained_filter
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.report.evaluation import write_report
 from dlkf.settings import settings_from
@@ -80,7 +81,7 @@ def run_study(
         card = model_card(config, data)
         weights = fit(config, data, folder, logger, mean_imu_error=baselines.prior.mean, notes=card)
     with _timed(seconds, "scoring"):
-        filters = {**baselines.build(), learned: load_filter(weights)}
+        filters = {**baselines.build(), **_shipped(names), learned: load_filter(weights)}
         scenes = Scenes.of_split(data, "test", plan, scoring["seed"])
         kinds: dict[str, str] = {}
         for dataset in data.datasets:
@@ -113,6 +114,11 @@ def run_study(
     return Outcome(scores, made, baselines, after, hour, weights, seconds, tables)
 
 
+def _shipped(names: Sequence[str]) -> dict[str, Estimator]:
+    """Those of the names that come with the package trained."""
+    return {name: trained_filter(name) for name in names if shipped_folder(name)}
+
+
 def _baselines(
     config: Mapping[str, Any], spec: ImuSpec, data: DriveDataModule, plan: OutagePlan | None, say: Say
 ) -> Baselines:
@@ -121,7 +127,8 @@ def _baselines(
     plan = plan or OutagePlan(data.eval_length_s / 2, min(20.0, data.eval_length_s / 3), offsets_s=(0.0,))
     pieces = Scenes.of_split(data, "train", plan, config["scoring"]["seed"], settings["pieces"]).withheld()
     rounds = settings["rounds"] if settings["tune"] else 0
-    return tuned_baselines(settings["models"], spec, pieces, rounds=rounds, say=say)
+    classical = [name for name in settings["models"] if not shipped_folder(name)]
+    return tuned_baselines(classical, spec, pieces, rounds=rounds, say=say)
 
 
 def _endurance(

@@ -1,0 +1,164 @@
+"""``plus`` against classical filters with one set of factors, each tuned on the drives that ``plus`` was trained on.
+
+    python -m pipelines.studies.plus --train data/fleet data/wide --test data/val_fleet data/val_city \\
+        --real data/rtkx --semi data/kitti_consumer --out outputs/plus
+
+Pieces of 60 s with GNSS, an outage, and 5 s after it, from the truth plus an error of 0.1 m, 0.1 m/s, 1° and 2° (1σ);
+simulated and semi-real pieces end to end, real ones every 10 s. Nobody is told the IMU: the classical filters start
+from an automotive MEMS and have factors tuned by the geometric mean on pieces of the training drives, which are kept
+in <out>/factors.yaml. Prints, and writes into <out>, Markdown tables of the horizontal error at the end of the
+outages: all filters, then ``plus`` with parts of its network switched off.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import yaml
+
+from dlkf.data.drive import Batch
+from dlkf.data.masks import withhold, within
+from dlkf.data.segments import StartLaw, cut_pieces, make_batch
+from dlkf.data.stack import DriveStack
+from dlkf.data.store import load_dataset
+from dlkf.evaluation.bootstrap import compare
+from dlkf.evaluation.metrics import mean_error
+from dlkf.filters.build import build_causal
+from dlkf.filters.integration import Estimator
+from dlkf.filters.plus import ANY_MEMS, PlusConfig, PlusFilter
+from dlkf.filters.shipped import trained_filter
+from dlkf.filters.tuning import Tuning
+from dlkf.navigation.imu_errors import imu_spec
+from dlkf.running.batched import run_filter
+from dlkf.tuning.search import tuned, tuning_values
+
+CLASSICAL = ("mbkf21_nhc", "mbkf21_car", "mbkf33_car")
+START = StartLaw(position_m=0.1, velocity_mps=0.1, roll_pitch_deg=1.0, yaw_deg=2.0)
+BEFORE_S, AFTER_S, REAL_STRIDE_S = 60.0, 5.0, 10.0
+PARTS = ((), ("across",), ("across", "fix"), ("across", "fix", "process"), ("across", "fix", "process", "offset"))
+SEED = 7
+
+
+class Row(NamedTuple):
+    """Errors of every filter [m] and normalised squares of ``plus`` at the ends of the outages of one dataset."""
+
+    name: str
+    outage_s: float
+    groups: list[str]
+    errors: dict[str, np.ndarray]
+    nees: float
+
+
+def load(folders: Sequence[str]) -> DriveStack:
+    """Drives of datasets."""
+    return DriveStack([d for f in folders for d in load_dataset(f, rate_hz=50.0, epoch_s=1.0, dtype=torch.float64)])
+
+
+def outages(stack: DriveStack, outage_s: float, stride_s: float | None = None, most: int | None = None) -> Batch:
+    """Pieces with an outage, of at most so many, spread evenly."""
+    length = BEFORE_S + outage_s + AFTER_S
+    pieces = cut_pieces(stack, length, stride_s or length)
+    pieces = pieces[:: -(-len(pieces) // most)] if most else pieces
+    generator = torch.Generator().manual_seed(SEED)
+    batch = make_batch(stack, pieces, dtype=torch.float64, start=START, generator=generator)
+    return withhold(batch, within(batch, BEFORE_S, outage_s))
+
+
+def opponents(train: Sequence[str], out: Path) -> dict[str, Estimator]:
+    """Classical filters with the factors of ``out/factors.yaml``, found on training drives where it lacks them."""
+    file, spec = out / "factors.yaml", imu_spec(ANY_MEMS)
+    known: dict[str, dict[str, float]] = yaml.safe_load(file.read_text()) if file.is_file() else {}
+    pieces: list[Batch] = []
+    for name in CLASSICAL:
+        if name not in known:
+            pieces = pieces or [outages(load(train), 60.0, most=90)]
+            factors, error = tuned(spec, pieces, name=name, start=Tuning(), objective="log", rounds=2)
+            print(f"{name}: {error:.2f} m geometric mean on {pieces[0].size[0]} training pieces", flush=True)
+            known[name] = tuning_values(factors)
+            file.write_text(yaml.safe_dump(known))
+    return {name: build_causal(name, spec, "a stream cannot", tuning=known[name]) for name in CLASSICAL}
+
+
+def scored(
+    name: str, batch: Batch, outage_s: float, filters: Mapping[str, Estimator], groups: Mapping[str, str]
+) -> Row:
+    """Errors at the end of the outage; NEES of the horizontal position over it, of the last filter."""
+    end, nees, errors = round((BEFORE_S + outage_s) / batch.epoch_s) - 1, float("nan"), {}
+    first = round(BEFORE_S / batch.epoch_s)
+    for filter_name, estimator in filters.items():
+        solution = run_filter(batch, estimator)
+        e = (solution.posterior.p_n - batch.truth.p_n)[..., :2]
+        errors[filter_name] = e[:, end].norm(dim=-1).numpy()
+        if solution.std is not None:
+            square = 0.5 * (e / solution.std[..., :2]).square().sum(-1)[:, first : end + 1]
+            nees = float(square[batch.truth_valid[:, first : end + 1]].mean())
+    return Row(name, outage_s, [groups[d] for d in batch.drive], errors, nees)
+
+
+def markdown(rows: Sequence[Row], filters: Sequence[str], model: str) -> list[str]:
+    """RMS / median per filter; of ``plus`` over the best classical one by geometric mean also the ratios."""
+    head = ["data", "outage [s]", "pieces", *filters, "RMS ratio", "geometric ratio", "NEES"]
+    lines = [f"| {' | '.join(head)} |", f"|:--|{'--:|' * (len(head) - 1)}"]
+    for row in rows:
+        cells = [f"{mean_error(row.errors[f], 'rms'):.1f} / {np.median(row.errors[f]):.1f}" for f in filters]
+        best = min((f for f in filters if f != model), key=lambda f: mean_error(row.errors[f], "log"))
+        ratios = []
+        for statistic in ("rms", "geomean"):
+            c = compare(row.errors[model], row.errors[best], statistic=statistic, groups=row.groups)
+            band = "" if np.isnan(c.ratio_low) else f" [{c.ratio_low:.2f}, {c.ratio_high:.2f}]"
+            ratios.append(f"{c.ratio:.2f}{band}")
+        first = [row.name, f"{row.outage_s:g}", str(len(row.groups))]
+        lines.append(f"| {' | '.join([*first, *cells, *ratios, f'{row.nees:.1f}'])} |")
+    return lines
+
+
+def with_parts(model: PlusFilter, parts: Sequence[str]) -> PlusFilter:
+    """The same weights with only some parts in force."""
+    part = PlusFilter(PlusConfig.from_mapping(replace(model.config, parts=tuple(parts)).plain()))
+    part.load_state_dict(model.state_dict())
+    return part.eval()
+
+
+def main() -> None:
+    """Tune, score, print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--model", default="plus", help="weights: plus, or a folder")
+    parser.add_argument("--train", nargs="+", required=True, help="datasets that the classical filters are tuned on")
+    for kind in ("test", "semi", "real"):
+        parser.add_argument(f"--{kind}", nargs="*", default=[], help=f"{kind} datasets")
+    parser.add_argument("--outages", nargs="+", type=float, default=[30.0, 60.0])
+    parser.add_argument("--ablation", action="store_true", help="also plus with parts switched off")
+    parser.add_argument("--out", type=Path, default=Path("outputs/plus"))
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    args.out.mkdir(parents=True, exist_ok=True)
+    model = trained_filter(args.model)
+    filters = {**opponents(args.train, args.out), "plus": model}
+    rows, ablated = [], []
+    for folder in (*args.test, *args.semi, *args.real):
+        stack = load([folder])
+        groups = {d.name: d.group for d in stack}
+        stride = REAL_STRIDE_S if folder in args.real else None
+        for outage_s in args.outages:
+            batch = outages(stack, outage_s, stride)
+            rows.append(scored(Path(folder).name, batch, outage_s, filters, groups))
+            print(markdown(rows[-1:], list(filters), "plus")[-1], flush=True)
+            if args.ablation:
+                variants = {"+".join(p) or "none": with_parts(model, p) for p in PARTS}
+                ablated.append(scored(Path(folder).name, batch, outage_s, variants, groups))
+    lines = markdown(rows, list(filters), "plus")
+    if ablated:
+        names = list(ablated[0].errors)
+        lines += ["", *markdown(ablated, names, names[-1])]
+    (args.out / "table.md").write_text("\n".join(lines) + "\n")
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
