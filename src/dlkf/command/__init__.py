@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dlkf.command.arguments import checked_types, readable
 from dlkf.command.faults import fault
+from dlkf.command.help import help_text
 from dlkf.config import config_dir
 from dlkf.errors import InputError, Terminated
 
@@ -59,6 +60,9 @@ def command(
 
         @wraps(function)
         def main() -> None:
+            if {"--help", "-h"} & set(sys.argv[1:]):
+                print(help_text(name, GROUPS.get(name, {})))
+                return
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors reach us whole instead of Hydra's exit
             given = [_with_group(argument, GROUPS.get(name, {})) for argument in arguments(sys.argv[1:])]
             sys.argv[1:] = [readable(argument) for argument in given]

@@ -1,0 +1,38 @@
+"""``--help`` says what a command does, its presets, and the keys that matter most."""
+
+import pytest
+
+from dlkf.command import GROUPS
+from dlkf.command.help import MOST, described, groups_of, help_text, keys_of
+from dlkf.config import config_dir
+
+COMMANDS = sorted(path.stem for path in config_dir().glob("*.yaml") if path.stem != "hydra_output")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_a_page(name):
+    page = help_text(name, GROUPS.get(name, {}))
+    text = (config_dir() / f"{name}.yaml").read_text()
+    assert f"python -m dlkf.{name}" in page and max(map(len, page.splitlines())) < 160
+    for group in groups_of(text):
+        assert f"={group['choice']}" in page
+    for key in MOST.get(name, ()):
+        assert f"  {key}=" in page
+    assert len(MOST.get(name, ())) in (0, 5)
+
+
+def test_a_command_prints_it_and_does_nothing_else(call):
+    done = call("evaluate", "--help")
+    assert done.code == 0 and "model=…" in done.out and "aligned, coarse" in done.out and not done.err
+
+
+def test_keys_are_read_with_value_and_comment():
+    text = "defaults:\n  - start: aligned # how\n  - _self_\n\na: 1 # one\nb: # two\n  c: [1, 2] # three\n"
+    text += "d: {e: x, f: 2} # four\n"
+    assert keys_of(text) == {
+        "a": ("1", "one"), "b": ("", "two"), "b.c": ("[1, 2]", "three"), "d": ("{e: x, f: 2}", "four"),
+        "d.e": ("x", "four"), "d.f": ("2", "four"),
+    }  # fmt: skip
+    assert described(text, "start.yaw_deg")[0] == "2.0"
+    with pytest.raises(KeyError):
+        described(text, "none")
