@@ -51,8 +51,7 @@ docs: .venv/installed-dev
 	@echo "outputs/docs/index.html"
 
 ui: .venv/installed
-	MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false $(BIN)/mlflow ui --workers 1 --host 127.0.0.1 \
-		--backend-store-uri sqlite:///mlflow.db
+	$(BIN)/python -m dlkf.ui $(ARGS)
 
 clean:
 	rm -rf .venv build dist .pytest_cache .ruff_cache

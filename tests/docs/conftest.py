@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import importlib
 import shutil
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
 from dlkf.config import config_dir
 from dlkf.simulation.dataset import simulate_from_config
-from dlkf.tracking.runs import SQLITE, mlflow_module
+from tests.shell import Ended
 
 Run = Callable[[Sequence[str]], None]
 # what makes a command small; an override that is not wanted stands later in the line than the page's own
@@ -33,9 +33,6 @@ SMALL = {
 @pytest.fixture(scope="session")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five drives of 40 s, as ``simulate dataset=per_drive`` makes them."""
-    from hydra import compose, initialize_config_dir
-    from omegaconf import OmegaConf
-
     size = ["dataset.hours=0.0555", "dataset.drive_minutes=0.67", "dataset.imu_rate_hz=50", "seed=3"]
     with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
         config = compose("simulate", ["simulated@dataset=per_drive", *size])
@@ -43,40 +40,25 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulate_from_config(OmegaConf.to_container(config, resolve=True), folder, progress=False)
 
 
-@pytest.fixture(scope="session")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An empty MLflow store, made once: a fresh one costs seconds."""
-    path = tmp_path_factory.mktemp("store") / "mlflow.db"
-    mlflow_module().MlflowClient(SQLITE + str(path)).search_experiments()
-    return path
-
-
 @pytest.fixture
-def desk(drives: Path, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def desk(drives: Path, uri: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder that one stands in: data/consumer, an empty store, Python files importable."""
-    (tmp_path / "data").mkdir()
     shutil.copytree(drives, tmp_path / "data" / "consumer")
-    shutil.copy(store, tmp_path / "mlflow.db")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"{SQLITE}{tmp_path}/mlflow.db")  # MLflow sets it; back to what it was
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)  # MLflow sets it; so it becomes again what it was
     monkeypatch.syspath_prepend(str(tmp_path))
     return tmp_path
 
 
 @pytest.fixture
-def run(desk: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
+def run(desk: Path, call: Callable[..., Ended]) -> Run:
     """Runs ``python -m dlkf.<command> …`` of a page, small; fails unless it ends well."""
 
-    def call(words: Sequence[str]) -> None:
+    def ended_well(words: Sequence[str]) -> None:
         assert list(words[:2]) == ["python", "-m"], words
         command = words[2].removeprefix("dlkf.")
-        given = [w for w in words[3:] if not any(w.startswith(s.split("=")[0] + "=") for s in SMALL.get(command, []))]
-        monkeypatch.setattr(sys, "argv", [words[2], *given, *SMALL.get(command, [])])
-        code: object = 0
-        try:
-            importlib.import_module(f"dlkf.{command}").main()
-        except SystemExit as end:
-            code = end.code
-        assert not code, f"{' '.join(words)}: {capfd.readouterr().err}"
+        small = SMALL.get(command, [])
+        given = [w for w in words[3:] if not any(w.startswith(s.split("=")[0] + "=") for s in small)]
+        ended = call(command, *given, *small)
+        assert ended.code == 0, f"{' '.join(words)}: {ended.err}"
 
-    return call
+    return ended_well

@@ -16,7 +16,6 @@ from dlkf.errors import InputError
 from dlkf.filters.saved import load_filter
 from dlkf.models import resolve_model
 from dlkf.navigation.imu_errors import imu_spec
-from dlkf.tracking.runs import SQLITE, mlflow_module
 from tests.docs.conftest import Run
 from tests.docs.pages import ROOT, Block, blocks, commands
 from tests.test_imports import FLOORS, GLUED
@@ -85,7 +84,7 @@ def test_mistakes_in_a_filter_of_ones_own() -> None:
 
 def test_an_imu(desk: Path, run: Run) -> None:
     followed("An IMU", desk, run)
-    assert (desk / "outputs" / "shed" / "metrics.json").is_file()
+    assert next((desk / "outputs" / "shed").glob("drive=*/solution.parquet")).is_file()
 
 
 def test_a_car(desk: Path, run: Run) -> None:
@@ -106,7 +105,7 @@ def test_a_reader(desk: Path, run: Run) -> None:
     np.testing.assert_array_equal(read["accel_z"], tables["imu"]["accel_z"])
 
 
-def test_an_experiment_a_callback_and_a_network(desk: Path, run: Run) -> None:
+def test_an_experiment_a_callback_and_a_network(desk: Path, run: Run, client) -> None:
     """One training that all three recipes ask for; then its model is loaded again."""
     (experiment,) = lines("An experiment")
     own = [word for recipe in ("A callback", "A network") for word in lines(recipe)[0] if re.match(r"\+[cm]", word)]
@@ -116,6 +115,5 @@ def test_an_experiment_a_callback_and_a_network(desk: Path, run: Run) -> None:
     run([*experiment, *own])
     (config,) = (desk / "outputs" / "train" / "fresh_bias").glob("*/best/config.yaml")
     assert load_filter(config.parent).network.width == 32
-    client = mlflow_module().MlflowClient(f"{SQLITE}{desk}/mlflow.db")
     (made,) = client.search_runs([e.experiment_id for e in client.search_experiments()])
     assert made.data.metrics["train/epoch_s"] > 0
