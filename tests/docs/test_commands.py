@@ -41,6 +41,7 @@ VARIANTS = {
         ["simulated@dataset=city", "receiver=rtk"],
         ["simulated@dataset=paper_clean", "receiver=undisturbed"],
         ["simulated@dataset=fleet"],
+        ["simulated@dataset=wide"],
     ],
     "train": [["+experiment=outage"]],
 }
