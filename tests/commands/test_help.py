@@ -36,3 +36,11 @@ def test_keys_are_read_with_value_and_comment():
     assert described(text, "start.yaw_deg")[0] == "2.0"
     with pytest.raises(KeyError):
         described(text, "none")
+
+
+@pytest.mark.parametrize("word", ["null", "none", "off"])
+def test_no_outage_is_a_word_away(word, call, town):
+    """Hydra takes a preset out with ~outage alone; nobody has to know."""
+    size = ("model=ins", f"dataset={town}", "length_s=60", "stride_s=60", "injected_bias=null", "tracking.log=false")
+    done = call("evaluate", f"outage={word}", "out=seen", *size, "--cfg", "job")
+    assert done.code == 0 and "first_s" not in done.out and "length_s: 60" in done.out, done.err

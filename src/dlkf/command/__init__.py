@@ -98,6 +98,8 @@ def _terminate(*_: object) -> NoReturn:
 
 def _with_group(argument: str, groups: dict[str, str]) -> str:
     key, equals, value = argument.partition("=")
+    if equals and key == "outage" and value in ("null", "none", "off", "false"):
+        return "~outage"  # how Hydra takes a preset out
     return f"{groups[key]}@{key}={value}" if equals and key in groups else argument
 
 

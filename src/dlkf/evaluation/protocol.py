@@ -201,7 +201,5 @@ def _parts(items: Sequence, epochs: Sequence[int], stack: DriveStack) -> list[li
 def protocol_from(config: Mapping[str, Any]) -> Protocol:
     """A protocol from plain values: the keys of ``conf/evaluate.yaml`` that it has; InputError for odd ones."""
     given = {f.name: config[f.name] for f in fields(Protocol) if config.get(f.name) is not None}
-    if given.get("outage") in ("none", "off", False):
-        del given["outage"]
     given.setdefault("stride_s", given.get("length_s", Protocol.length_s))
     return settings_from(Protocol, given, "protocol")
