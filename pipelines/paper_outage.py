@@ -3,27 +3,23 @@
     python pipelines/paper_outage.py                    the paper's 500 epochs
     python pipelines/paper_outage.py --quick            some minutes on two cores
     python pipelines/paper_outage.py --seeds 0,1,2      several trainings, for the spread between them
+    python pipelines/paper_outage.py --models dlkf,dlkf_literal     beside it the paper to the letter
 
 Every seed is trained with ``+experiment=outage``, scored beside the classical filters on the test drives, and
 registered as ``models:/outage@seed<n>``. All of them then run over ``data/per_drive``, where each drive has an
-IMU that no filter has met: what is left of the advantage there is not knowledge of one IMU.
+IMU that no filter has met: what is left of the advantage there is not knowledge of one IMU. Finished trainings are
+kept: the same command goes on.
 """
 
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 from pathlib import Path
 
+from dlkf.tracking.chain import Study, run
+
+HOME = Path("outputs/paper/outage")
 NEW_IMUS = Path("data/per_drive")
-
-
-def run(command: str, *arguments: str) -> None:
-    """One command of dlkf; its failure ends the chain."""
-    print(f"\n$ python -m dlkf.{command} {' '.join(arguments)}", flush=True)
-    if code := subprocess.run([sys.executable, "-m", f"dlkf.{command}", *arguments]).returncode:
-        sys.exit(code)
 
 
 def main() -> None:
@@ -31,17 +27,24 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     arguments.add_argument("--quick", action="store_true", help="a few minutes of training instead of 500 epochs")
     arguments.add_argument("--seeds", default="0", help="one training for each; key=value goes to dlkf.train")
+    arguments.add_argument("--models", default="dlkf", help="dlkf, dlkf_literal (the paper to the letter), or both")
     options, overrides = arguments.parse_known_args()
     profile = ["+profile=quick"] if options.quick else []
     seeds = options.seeds.split(",")
-    for seed in seeds:
-        register = ["tracking.register=outage", f"tracking.alias=seed{seed}"]
-        run("train", "+experiment=outage", *profile, f"seed={seed}", *register, *overrides)
+    study = Study(HOME if not options.quick else HOME.with_name("outage_quick"))
+    with study.parent("outage", "paper 5.3"):
+        for seed in seeds:
+            for model in options.models.split(","):
+                register = ["tracking.register=outage", f"tracking.alias=seed{seed}"] if model == "dlkf" else []
+                given = ["+experiment=outage", *profile, f"model={model}", f"seed={seed}", *register, *overrides]
+                study.train(f"{model}/{seed}", *given)
     if not NEW_IMUS.exists():
         run("simulate", "dataset=per_drive", f"out={NEW_IMUS}")
+    if "dlkf" not in options.models.split(","):
+        return
     models = ",".join(["ins", "mbkf15", *(f"models:/outage@seed{seed}" for seed in seeds)])
     outage = ["length_s=80", "stride_s=80", "outage.first_s=[20,25]", "outage.duration_s=[30,50]"]
-    out = ("out=outputs/paper_outage/new_imus", "overwrite=true")
+    out = ("out=outputs/paper/new_imus", "overwrite=true")
     run("evaluate", f"model=[{models}]", f"dataset={NEW_IMUS}", *out, *outage)
 
 

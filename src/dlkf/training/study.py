@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -99,12 +99,13 @@ def run_study(
         title = ", ".join(Path(d).name for d in data.datasets)
         after, hour, tables = _endurance(filters, data, scoring, title, say)
         gains = gains_of(filters, scenes, settle_s=scoring["settle_s"]) if scoring["gains"] else {}
+    noise = None if data.gnss_noise is None else asdict(data.gnss_noise)
     write_report(
         folder / "report",
         title,
         scores,
         made,
-        protocol={**baselines.described(), **scenes.described(), "trained on": card},
+        protocol={**baselines.described(), **scenes.described(), "trained on": card, "gnss_noise": noise},
         by_time=True,
         baseline=baseline,
         more=tables,

@@ -1,0 +1,72 @@
+"""Trainings one after the other as one study: what is finished is not done again; in MLflow a parent with children."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from dlkf.tracking.grid import PARENT_RUN, parent_status
+from dlkf.tracking.runs import experiment_id, mlflow_module, tracking_uri
+
+
+class Study:
+    """A folder that remembers which of its trainings are finished and where their reports lie."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.file = folder / "trainings.json"
+        self.done: dict[str, str] = json.loads(self.file.read_text()) if self.file.is_file() else {}
+
+    def remember(self, key: str, value: str) -> None:
+        """Write beside and rename: safe against a kill."""
+        self.done[key] = value
+        self.folder.mkdir(parents=True, exist_ok=True)
+        beside = self.file.with_suffix(".part")
+        beside.write_text(json.dumps(self.done, indent=1))
+        beside.replace(self.file)
+
+    def train(self, key: str, *overrides: str) -> Path:
+        """Report folder of ``python -m dlkf.train`` with these overrides; a training that was killed goes on."""
+        if key in self.done and Path(self.done[key]).is_dir():
+            return Path(self.done[key])
+        said = run("train", *overrides)
+        report = next(line for line in reversed(said) if line.startswith("Report:"))
+        folder = Path(report.removeprefix("Report:").strip()).parent
+        self.remember(key, str(folder))
+        return folder
+
+    @contextmanager
+    def parent(self, experiment: str, name: str) -> Iterator[None]:
+        """One MLflow run above all trainings inside, the same one when the study goes on after a kill."""
+        uri = tracking_uri(None)
+        client = mlflow_module().MlflowClient(uri)
+        if "parent" not in self.done:
+            self.remember("parent", client.create_run(experiment_id(client, experiment), run_name=name).info.run_id)
+        os.environ[PARENT_RUN] = self.done["parent"]
+        try:
+            yield
+        except BaseException:
+            client.set_terminated(self.done["parent"], parent_status(["KILLED"], ended=False))
+            raise
+        finally:
+            os.environ.pop(PARENT_RUN, None)
+        client.set_terminated(self.done["parent"], "FINISHED")
+
+
+def run(command: str, *arguments: str) -> list[str]:
+    """One command of dlkf, shown as it goes; its lines. A failure ends the chain with the command's code."""
+    print(f"\n$ python -m dlkf.{command} {' '.join(arguments)}", flush=True)
+    lines = []
+    words = [sys.executable, "-m", f"dlkf.{command}", *arguments]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as p:
+        for line in p.stdout or ():
+            print(line, end="", flush=True)
+            lines.append(line.rstrip("\n"))
+    if p.returncode:
+        sys.exit(p.returncode)
+    return lines
