@@ -25,7 +25,7 @@ from dlkf.data.schema import ACCEL, GYRO, VELOCITY
 from dlkf.data.tables import read_drives, read_table
 from dlkf.errors import InputError
 from dlkf.simulation.dataset import simulate_from_config
-from tests.data.conftest import car
+from tests.cars import car
 
 TURN = Rotation.from_euler("ZYX", [130.0, -35.0, 70.0], degrees=True).as_matrix()  # car → sensor
 UNIX = 1_751_760_000

@@ -14,7 +14,7 @@ from dlkf.data.readers.logs import LogReader
 from dlkf.data.readers.mapping import respaced
 from dlkf.data.readers.units import degrees_minutes, leap_seconds, rotation, seconds, unwrapped
 from dlkf.errors import InputError
-from tests.data.conftest import car
+from tests.cars import car
 from tests.data.logs import GPS, UNIX, metres
 from tests.data.test_csv import PLAIN
 

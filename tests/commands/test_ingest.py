@@ -1,0 +1,77 @@
+"""``dlkf.ingest`` as from a shell: what it tells, and one line for each mistake."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.cars import car
+from tests.data.logs import STDS, nmea
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """Two drives as CSV files, one in NMEA."""
+    folder = tmp_path_factory.mktemp("logs")
+    tables = car(30)
+    for name in ("monday", "tuesday"):
+        (folder / "csv" / name).mkdir(parents=True)
+        for kind in ("imu", "gnss"):
+            tables[kind].to_csv(folder / "csv" / name / f"{kind}.csv", index=False)
+    (folder / "nmea").mkdir()
+    nmea(folder / "nmea", tables)
+    (folder / "bench").mkdir()
+    rest = np.random.default_rng(1).normal(0, 0.01, (3000, 7)) + [0, 0, 0, 0, 0, 0, -9.8]
+    names = ["t", "gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"]
+    pd.DataFrame(rest, columns=names).assign(t=np.arange(3000) / 100).to_csv(folder / "bench" / "imu.csv", index=False)
+    return folder
+
+
+def test_a_line_for_each_drive(call, logs):
+    done = call("ingest", "reader=csv", f"source={logs}/csv", "out=town", *STDS)
+    assert done.code == 0, done.err
+    for told in ("monday: 30.0 s, ", " km, IMU 100 Hz, largest gap 10 ms", "GNSS 1 Hz, 31 fixes (RTK fixed 100 %)"):
+        assert told in done.out
+    assert "town: 2 drives" in done.out
+
+
+def test_nmea_beside_an_imu_in_milliseconds(call, logs):
+    done = call("ingest", "reader=nmea", f"source={logs}/nmea", "out=town", "reader.imu.time.unit=ms")
+    assert done.code == 0, done.err
+
+
+def test_a_log_at_rest_needs_no_gnss(call, logs):
+    """The logs that dlkf.allan reads."""
+    done = call("ingest", "reader=csv", f"source={logs}/bench", "out=bench", "reader.gnss.file=null")
+    assert done.code == 0, done.err
+    assert "no GNSS" in done.out
+    done = call("navigate", "model=ins", "imu=consumer", "dataset=bench", "out=solved")
+    assert done.code == 2 and "no GNSS" in done.err
+
+
+def test_a_map_from_the_command_line(call, logs):
+    """A mapping of texts that no preset has."""
+    done = call("ingest", f"source={logs}/csv", "out=town", "reader.gnss.quality={column: quality, map: {four: 4}}")
+    assert done.code == 2 and "quality '4' is not in reader.gnss.quality.map" in done.err
+
+
+MISTAKES = {
+    "unknown key": (["reader.imu.acel.unit=g"], "reader.imu: unknown key acel"),
+    "unknown setting": (["reader.colour=red"], "unexpected keyword argument 'colour'"),
+    "module": (["reader._target_=mine.Reader"], "reader._target_=mine.Reader: cannot be imported"),
+    "lever arm": (["reader.lever_arm_m=0.5"], "reader.lever_arm_m=0.5: must be three numbers"),
+    "format": (["reader.gnss.format=gpx"], "reader.gnss.format=gpx: unknown"),
+    "not a UBX log": (["reader.gnss.format=ubx"], "has no NAV-PVT message"),
+    "axes": (["reader.imu.accel.axes=frx"], "axes 'frx' must be three letters"),
+    "too short for auto": (["reader=auto", "reader.sure.angle_deg=0.1"], "not sure of reader."),
+    "preset": (["reader=tape"], "reader/tape"),
+}
+
+
+@pytest.mark.parametrize("case", MISTAKES)
+def test_mistakes(call, logs, tmp_path, case):
+    given, told = MISTAKES[case]
+    done = call("ingest", f"source={logs}/csv", "out=made/town", *given)
+    assert done.code == 2 and told in done.err, done.err
+    assert done.err.count("\n") == 1 and not (tmp_path / "made").exists()
