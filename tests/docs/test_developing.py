@@ -105,15 +105,16 @@ def test_a_reader(desk: Path, run: Run) -> None:
     np.testing.assert_array_equal(read["accel_z"], tables["imu"]["accel_z"])
 
 
-def test_an_experiment_a_callback_and_a_network(desk: Path, run: Run, client) -> None:
-    """One training that all three recipes ask for; then its model is loaded again."""
+def test_an_experiment_a_callback_a_network_and_a_loss(desk: Path, run: Run, client) -> None:
+    """One training that all four recipes ask for; then its model is loaded again."""
     (experiment,) = lines("An experiment")
-    own = [word for recipe in ("A callback", "A network") for word in lines(recipe)[0] if re.match(r"\+[cm]", word)]
-    assert len(own) == 3
-    for recipe in ("An experiment", "A callback", "A network"):
+    recipes = ("A callback", "A network", "A loss")
+    own = [word for recipe in recipes for word in lines(recipe)[0] if re.match(r"\+?(callbacks|model|loss)\.", word)]
+    assert len(own) == 5
+    for recipe in ("An experiment", *recipes):
         written(recipe, desk)
     run([*experiment, *own])
     (config,) = (desk / "outputs" / "train" / "fresh_bias").glob("*/best/config.yaml")
     assert load_filter(config.parent).network.width == 32
     (made,) = client.search_runs([e.experiment_id for e in client.search_experiments()])
-    assert made.data.metrics["train/epoch_s"] > 0
+    assert made.data.metrics["train/epoch_s"] > 0 and made.data.params["loss._target_"] == "straight.Straight"
