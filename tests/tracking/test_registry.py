@@ -1,15 +1,24 @@
 """Models: logged without a pickle, fetched by run, version or alias, run as a pyfunc."""
 
+import json
 import os
 import shutil
+import signal
+import socket
 import subprocess
 import sys
+import time
+import urllib.request
+from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch
 from omegaconf import OmegaConf
 
+from dlkf.data.rows import example_drive
+from dlkf.data.schema import drive_file
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
 from dlkf.filters.saved import load_filter
@@ -69,11 +78,11 @@ def test_an_alias_moves_to_the_newer_version(logged, uri, client, weights):
 
 
 def test_the_pyfunc_gives_what_navigate_gives(logged, uri, weights, cars):
-    """Same rows to the last bit: the same code ran. A list, a table and one path mean the same."""
+    """Same rows to the last bit: the same code ran. Folders and a table of the drives mean the same."""
     mlflow = mlflow_module()
     mlflow.set_tracking_uri(uri)
     model = mlflow.pyfunc.load_model("models:/town@champion")
-    given = model.predict([str(cars)])
+    given = model.predict(pd.DataFrame({"dataset": [str(cars)]}))
     drives = load_dataset(cars, rate_hz=50.0, epoch_s=1.0, dtype=torch.float64, reference=False)
     wanted = {r.drive: r.table for r in navigate_drives(drives, load_filter(weights))}
     assert set(given.drive) == set(wanted) and set(given.dataset) == {str(cars)}
@@ -81,7 +90,49 @@ def test_the_pyfunc_gives_what_navigate_gives(logged, uri, weights, cars):
         pd.testing.assert_frame_equal(
             rows.drop(columns=["dataset", "drive"]).reset_index(drop=True), wanted[drive], check_exact=True
         )
-    pd.testing.assert_frame_equal(model.predict(pd.DataFrame({"dataset": [str(cars)]})), given)
+    table = pd.concat(
+        pd.read_parquet(drive_file(cars, kind, drive), partitioning=None).assign(drive=drive)
+        for drive in wanted
+        for kind in ("imu", "gnss")
+    )
+    pd.testing.assert_frame_equal(model.predict(table), given.drop(columns="dataset"), check_exact=True)
+    example = model.predict(model.input_example)
+    assert set(example.drive) == {"example"} and np.isfinite(example.vel_n).all() and len(example) >= 8
+    with pytest.raises(Exception, match="lacks accel_x"):
+        model.predict(table.drop(columns="accel_x"))
+
+
+@pytest.mark.served
+def test_it_is_served_and_called_over_http(logged, uri, cars):
+    """``mlflow models serve`` in the environment at hand: a table of a drive as JSON, its solution comes back."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "mlflow", "models", "serve", "-m", "models:/town@champion", "-p", str(port)]
+    path = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))  # MLflow calls uvicorn by name
+    environment = {**os.environ, "MLFLOW_TRACKING_URI": uri, "OMP_NUM_THREADS": "1", "PATH": path}
+    server = subprocess.Popen([*command, "--env-manager", "local"], env=environment, start_new_session=True)
+    try:
+        for _ in range(240):
+            try:
+                urllib.request.urlopen(f"http://127.0.0.1:{port}/ping", timeout=2)
+                break
+            except OSError:
+                time.sleep(0.5)
+        body = {"dataframe_split": json.loads(example_drive().to_json(orient="split", index=False))}
+        body["params"] = {"lever_arm_x_m": 0.0}
+        request = urllib.request.Request(
+            f"http://127.0.0.1:{port}/invocations", json.dumps(body).encode(), {"Content-Type": "application/json"}
+        )
+        answer = pd.DataFrame(json.load(urllib.request.urlopen(request, timeout=60))["predictions"])
+    finally:
+        os.killpg(server.pid, signal.SIGTERM)
+        server.wait(30)
+    assert set(answer.drive) == {"example"} and len(answer) >= 8
+    mlflow = mlflow_module()
+    mlflow.set_tracking_uri(uri)
+    here = mlflow.pyfunc.load_model("models:/town@champion").predict(example_drive())
+    assert np.allclose(answer[["lat_deg", "vel_n"]].astype(float), here[["lat_deg", "vel_n"]], atol=1e-9)
 
 
 def test_a_logged_model_brings_its_code_and_no_pickle(logged, uri, cars):
@@ -91,11 +142,11 @@ def test_a_logged_model_brings_its_code_and_no_pickle(logged, uri, cars):
     requirements = (folder / "requirements.txt").read_text().split()
     assert all("==" in line and "+" not in line for line in requirements) and len(requirements) == 10
     program = (
-        "import sys, mlflow\n"
+        "import sys, mlflow, pandas\n"
         "from mlflow.environment_variables import MLFLOW_ALLOW_PICKLE_DESERIALIZATION as allowed\n"
         "assert not allowed.get()\n"
         f"model = mlflow.pyfunc.load_model({str(folder)!r})\n"
-        f"assert len(model.predict([{str(cars)!r}])) > 20\n"
+        f"assert len(model.predict(pandas.DataFrame({{'dataset': [{str(cars)!r}]}}))) > 20\n"
         "import dlkf\n"
         f"assert dlkf.__file__.startswith({str(folder)!r}), dlkf.__file__\n"
         "assert not {'hydra', 'lightning', 'omegaconf'} & set(sys.modules)\n"

@@ -23,6 +23,8 @@ def readable(argument: str) -> str:
         return argument
     if value.startswith("~/"):
         value = str(Path(value).expanduser())
+    if value.lower() == "none" and "/" not in key:
+        value = "null"
     if _parses(f"{key}={value}"):
         return f"{key}={value}"
     if value.startswith("[") and value.endswith("]"):

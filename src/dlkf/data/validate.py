@@ -68,6 +68,12 @@ def read_checked(
     gnss = read_table(folder, "gnss", name)
     assert imu is not None and gnss is not None  # read_table raises for these two
     truth = read_table(folder, "reference", name) if reference else None
+    return checked(DriveTables(row, imu, gnss, truth), limits)
+
+
+def checked(tables: DriveTables, limits: Limits = LIMITS) -> DriveTables:
+    """The same tables; raises InputError for their first fault."""
+    name, imu, gnss, truth = tables.row.name, tables.imu, tables.gnss, tables.reference
     _check_imu(imu, _where(name, "imu"), limits)
     _check_gnss(gnss, imu, _where(name, "gnss"))
     check_turns(imu, gnss, _where(name, "imu"))
@@ -75,7 +81,7 @@ def read_checked(
     check_clocks(imu, {column: values[fixed] for column, values in gnss.items()}, _where(name, "imu"))
     if truth is not None:
         _check_reference(truth, _where(name, "reference"))
-    return DriveTables(row, imu, gnss, truth)
+    return tables
 
 
 def read_imu(folder: str | Path, drive: str, limits: Limits = LIMITS) -> Columns:

@@ -1,10 +1,17 @@
 """The code of a logged model: MLflow stores this file and loads it with the weights beside it (no pickle).
 
     model = mlflow.pyfunc.load_model("models:/town@champion")
-    model.predict(["data/town"])      # a row per drive and second, columns of solution.parquet
+    model.predict(rows)                                          # a table of a drive: IMU samples and fixes
+    model.predict(pandas.DataFrame({"dataset": ["data/town"]}))  # folders in the data contract
+    # a row per drive and second: columns of solution.parquet
+
+Served by ``mlflow models serve -m models:/town@champion --env-manager local``, it takes the same table as JSON.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
 
 import pandas as pd
 from mlflow.models import set_model
@@ -20,28 +27,37 @@ class NavigationFilter(PythonModel):
 
         self.filter = load_filter(context.artifacts["filter"])
 
-    def predict(self, model_input: list[str]) -> pd.DataFrame:
-        """Dataset folders to solutions: columns ``dataset``, ``drive``, then those of ``solution.parquet``.
+    def predict(self, context, model_input: pd.DataFrame, params: dict[str, Any] | None = None) -> pd.DataFrame:
+        """A table of drives, or of dataset folders, to solutions: ``drive``, then the columns of ``solution.parquet``.
 
-        Raises InputError for folders that are no dataset, and where no drive can be aligned.
+        With folders ``dataset`` comes first. ``params``: ``lever_arm_x_m``, ``_y_m``, ``_z_m``, from the IMU to the
+        antenna (Forward-Right-Down). Raises InputError for data that cannot be used, and where no drive can be aligned.
         """
-        import torch
-
-        from dlkf.data.store import load_dataset
         from dlkf.running.offline import navigate_drives
 
         tables = []
-        config = self.filter.config
-        for folder in model_input:
-            drives = load_dataset(
-                folder, rate_hz=config.rate_hz, epoch_s=config.epoch_s, dtype=torch.float64, reference=False
-            )
+        for folder, drives in self._loaded(model_input, params or {}):
             for result in navigate_drives(drives, self.filter, skipped={}):
-                table = result.table
-                table.insert(0, "drive", result.drive)
-                table.insert(0, "dataset", folder)
-                tables.append(table)
+                result.table.insert(0, "drive", result.drive)
+                if folder:
+                    result.table.insert(0, "dataset", folder)
+                tables.append(result.table)
         return pd.concat(tables, ignore_index=True)
+
+    def _loaded(self, given: pd.DataFrame, params: dict[str, Any]) -> Iterator[tuple[str, list]]:
+        import torch
+
+        from dlkf.data.rows import drives_of
+        from dlkf.data.store import drive_from_tables, load_dataset
+
+        grid = {"rate_hz": self.filter.config.rate_hz, "epoch_s": self.filter.config.epoch_s}
+        if "dataset" in given and given["dataset"].notna().any():
+            for folder in given["dataset"].dropna():
+                yield folder, load_dataset(folder, dtype=torch.float64, reference=False, **grid)
+            return
+        arm = [float(params.get(f"lever_arm_{a}_m", 0.0)) for a in "xyz"]
+        tables = drives_of(given, arm)
+        yield "", [drive_from_tables(t, "", dtype=torch.float64, **grid) for t in tables]
 
 
 set_model(NavigationFilter())

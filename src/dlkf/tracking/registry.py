@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import dlkf
+from dlkf.data.rows import GNSS_COLUMNS, IMU_COLUMNS, example_drive
 from dlkf.errors import InputError
 from dlkf.filters.saved import WEIGHTS
+from dlkf.running.solution import COLUMNS
 from dlkf.tracking.runs import (
     NOTE_TAG,
     Run,
@@ -72,12 +74,27 @@ def log_model(
         artifacts={"filter": str(folder)},
         code_paths=[str(Path(dlkf.__file__).parent)],
         pip_requirements=pinned_requirements(),
+        signature=signature(),
+        input_example=example_drive(),
         step=NO_STEP,
     )
     _log_model_metrics(run, info.model_id, metrics or {})
     if register:
         registered(client, run.id, register, alias)
     return info.model_uri
+
+
+def signature():
+    """What the model takes and gives: a table of a drive, or of dataset folders; the solution."""
+    from mlflow.models import ModelSignature
+    from mlflow.types import ColSpec, DataType, ParamSchema, ParamSpec, Schema
+
+    numbers = [ColSpec(DataType.double, c, required=False) for c in ("t", *IMU_COLUMNS, *GNSS_COLUMNS)]
+    words = [ColSpec(DataType.string, c, required=False) for c in ("drive", "dataset")]
+    solved = [ColSpec(DataType.string, "drive"), *(ColSpec(DataType.double, c) for c in COLUMNS)]
+    arm = [ParamSpec(f"lever_arm_{a}_m", DataType.double, 0.0) for a in "xyz"]
+    solution = Schema([*solved, ColSpec(DataType.boolean, "gnss_used")])
+    return ModelSignature(inputs=Schema([*words, *numbers]), outputs=solution, params=ParamSchema(arm))
 
 
 def registered(client: MlflowClient, run_id: str, name: str, alias: str | None = None) -> str:
