@@ -14,6 +14,7 @@ import pytest
 import torch
 import yaml
 
+from dlkf.command.faults import fault
 from dlkf.data.schema import drive_file
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.saved import save_filter
@@ -307,3 +308,89 @@ def test_of_making_data(command, arguments, said, copy, call, tmp_path):
 def test_in_a_shell(command, arguments, said, copy, tmp_path):
     FAULTS["NaN in the IMU"][0](copy)
     is_refused(in_shell(tmp_path, command, *arguments), said, folder=tmp_path)
+
+
+SCORED = ("model=mbkf15", "dataset=town", "out=made", *FAST["evaluate"])
+SOLVED = ("model=mbkf15", "dataset=town", "out=made", *FAST["navigate"])
+TRAINED = ("data=drives", "data.datasets=[town]")
+OF_ALL_COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
+    "a word for a seed": ("evaluate", (*SCORED, "seed=abc"), "seed is 'abc', must be a number"),
+    "a word for a length": ("evaluate", (*SCORED, "length_s=long"), "length_s is 'long', must be a number"),
+    "a word for a switch": ("evaluate", (*SCORED, "overwrite=maybe"), "overwrite is 'maybe', must be true or false"),
+    "a baseline that nobody knows": ("evaluate", (*SCORED, "baseline=foo"), "baseline=foo is none of the models"),
+    "a reference that nobody knows": ("evaluate", (*SCORED, "reference=best"), "reference=best is none of file"),
+    "an outage of a word": ("evaluate", (*SCORED, "outage.first_s=soon"), "outage.first_s is 'soon'"),
+    "a folder as store": ("evaluate", (*SCORED, "tracking.uri=runs"), "is a plain folder"),
+    "a piece longer than the drives": ("evaluate", (*SCORED, "mode=pieces", "length_s=1e4"), "no piece of 10000 s"),
+    "a drive that is not there": ("evaluate", (*SCORED, "drives=nobody"), "no drive nobody"),
+    "an export that nobody knows": ("navigate", (*SOLVED, "export=[kml,shp]"), "export=shp: unknown format"),
+    "a clock that nobody knows": ("navigate", (*SOLVED, "export_clock=tai"), "export_clock=tai is none of auto"),
+    "several models to navigate": ("navigate", (*SOLVED, "model=[ins,mbkf15]"), "one model at a time"),
+    "a smoother in a stream": ("navigate", (*SOLVED, "smoother=rts", "streaming=true"), "smoother or streaming"),
+    "a smoother of ins": ("navigate", ("model=ins", *SOLVED[1:], "smoother=rts"), "needs a filter with a covariance"),
+    "an epoch of no whole samples": ("navigate", (*SOLVED, "epoch_s=0.33"), "whole number of samples"),
+    "an unknown alias": ("navigate", ("model=models:/town@champion", *SOLVED[1:]), "no MLflow store"),
+    "an alias that MLflow refuses": ("train", (*TRAINED, "tracking.alias=latest"), "neither latest nor v<number>"),
+    "a name that MLflow refuses": ("train", (*TRAINED, "tracking.register=a/b"), "has none of / : @"),
+    "a rate of letters": ("train", (*TRAINED, "optimizer.lr=fast"), "optimizer.lr is 'fast', must be a number"),
+    "no data to train on": ("train", ("data=drives", "data.datasets=[nowhere]"), "no such folder"),
+    "too few recordings": ("train", TRAINED, "group"),
+    "a batch of nothing": ("train", (*TRAINED, "data.batch_size=0"), "batch_size"),
+    "a filter without noise": ("tune", ("model=ins", "dataset=town", "out=made"), "no noise to tune"),
+    "an objective that nobody knows": ("tune", ("model=mbkf15", "dataset=town", "out=made", "objective=q"), "none of"),
+    "a name that is no file's": ("tune", ("model=mbkf15", "dataset=town", "out=made", "name=a/b"), "letters, digits"),
+    "no run to register": ("register", ("run=" + "0" * 32, "name=town"), "no MLflow store"),
+    "no name to register": ("register", ("run=" + "0" * 32,), "name is missing"),
+    "one report alone": ("compare", ("runs=[town]", "out=made"), "at least two"),
+    "no report at all": ("compare", ("town", "logs", "out=made"), "no metrics.json"),
+    "a doctor without a patient": ("doctor", ("dataset=nowhere",), "no such folder"),
+    "a moving bench": ("allan", ("dataset=town", "out=made", f"drive={DRIVE}"), DRIVE),
+    "an allan of nobody": ("allan", ("dataset=town", "out=made", "drive=nobody"), "nobody"),
+    "a consistency of nothing": ("consistency", ("model=[]", "out=made"), "empty list"),
+    "a consistency without noise": ("consistency", ("model=ins", "out=made"), "ins"),
+    "a simulation of nothing": ("simulate", ("dataset.hours=0", "out=made"), "hours"),
+    "a lever arm of one number": ("ingest", ("reader.lever_arm_m=0.5", "source=logs", "out=made"), "lever_arm_m"),
+}
+
+
+@pytest.mark.parametrize("name", OF_ALL_COMMANDS)
+def test_of_all_commands(name, copy, call, tmp_path):
+    command, arguments, said = OF_ALL_COMMANDS[name]
+    (tmp_path / "logs").mkdir()
+    is_refused(call(command, *arguments), said, folder=tmp_path)
+
+
+@pytest.mark.parametrize("command", FAST)
+def test_an_older_result_is_not_written_over(command, copy, call, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "report.html").write_text("of last week")
+    done = call(command, "model=ins", "dataset=town", "out=mine", *FAST[command])
+    is_refused(done, "out=mine exists already", "overwrite=true", folder=tmp_path)
+    assert (tmp_path / "mine" / "report.html").read_text() == "of last week"
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (OSError(28, "No space left on device", "/data/x"), "the disk is full"),
+        (PermissionError(13, "Permission denied", "/data/x"), "/data/x: permission denied"),
+        (OSError(30, "Read-only file system", "/data/x"), "read-only"),
+        (RuntimeError("(sqlite3.OperationalError) database is locked"), "locked by another program"),
+        (RuntimeError("attempt to write a readonly database"), "cannot be written"),
+        (RuntimeError("file is not a database"), "damaged"),
+        (RuntimeError("Detected out-of-date database schema (found version a, but expected b)"), "another version"),
+        (RuntimeError("No supported gpu backend found!"), "trainer.accelerator=cpu"),
+        (RuntimeError("CUDA out of memory. Tried to allocate 2 GiB"), "smaller data.batch_size"),
+    ],
+)
+def test_faults_of_the_machine_are_one_line(error, said):
+    """Also from deep inside: what was raised is found in the chain of what it became."""
+    try:
+        try:
+            raise error
+        except Exception as inner:
+            raise ValueError("Error in call to target") from inner
+    except ValueError as outer:
+        line = fault(outer)
+    assert line is not None and said in line and "\n" not in line
+    assert fault(ValueError("a fault of ours")) is None

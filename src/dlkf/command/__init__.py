@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import sys
@@ -18,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from dlkf.command.arguments import checked_types, readable
 from dlkf.command.faults import fault
 from dlkf.command.help import help_text
-from dlkf.config import config_dir
+from dlkf.config import SWEPT, config_dir
 from dlkf.errors import InputError, Terminated
 
 MISTAKE, INTERRUPTED, TERMINATED = 2, 130, 143
@@ -88,8 +89,9 @@ def command(
 
 def point(hydra_config: DictConfig) -> str:
     """Folder of one point of a sweep: its number and what it changes, as ``0-imu=consumer``."""
-    words = str(hydra_config.job.override_dirname).replace("/", "-")
-    return f"{hydra_config.job.num}-{words}"[:100]
+    swept = json.loads(os.environ.get(SWEPT, "[]"))
+    words = [o for o in hydra_config.overrides.task if not swept or o.partition("=")[0] in swept]
+    return f"{hydra_config.job.num}-{','.join(words)}".replace("/", "-")[:100]
 
 
 def _terminate(*_: object) -> NoReturn:

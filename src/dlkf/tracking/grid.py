@@ -10,6 +10,7 @@ import json
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -17,7 +18,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
+from dlkf.config import SWEPT
 from dlkf.errors import InputError
+from dlkf.report.compare import read_reports, write_comparison
 from dlkf.tracking.registry import check_registration, registered
 from dlkf.tracking.runs import (
     NOTE_TAG,
@@ -28,7 +31,7 @@ from dlkf.tracking.runs import (
     tracking_uri,
 )
 
-PARENT_RUN, SWEPT = "DLKF_PARENT_RUN_ID", "DLKF_SWEPT_KEYS"  # read by the runs of the sweep, in any process
+PARENT_RUN = "DLKF_PARENT_RUN_ID"  # environment: read by the runs of the sweep, in any process
 NAMELESS = ("tracking", "hydra", "resume", "name")  # settings that say nothing about the result
 PRESETS = ("experiment", "profile")
 VALIDATION = "val/outage_end_m"  # what training keeps the best weights by
@@ -46,6 +49,7 @@ class GridParent(Callback):
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Make store, experiment and parent run; hand its id and the swept keys on by the environment."""
         swept = swept_overrides(config)
+        os.environ[SWEPT] = json.dumps(list(swept))
         if not config.tracking.get("log", True):
             return
         self.register, self.alias = (config.tracking.get(key) for key in ("register", "alias"))
@@ -63,12 +67,18 @@ class GridParent(Callback):
         self.run_id = run.info.run_id
         for key, values in swept.items():
             client.log_param(self.run_id, shown(key), values)
-        os.environ[PARENT_RUN], os.environ[SWEPT] = self.run_id, json.dumps(list(swept))
+        os.environ[PARENT_RUN] = self.run_id
         atexit.register(self.close, ended=False)
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        """All points ran."""
+        """All points ran; evaluations that lie together under ``out`` get a page that compares them."""
         self.close(ended=True)
+        os.environ.pop(SWEPT, None)
+        out = OmegaConf.select(config, "out")
+        folders = sorted(p.parent for p in Path(out).glob("*/metrics.json")) if out else []
+        if len(folders) > 1:
+            write_comparison(out, read_reports(folders))
+            print(f"Compared: {out}/compare.html")
 
     def close(self, ended: bool) -> None:
         """Final status and comparison table. ``ended=False``: the sweep broke off; runs still open failed."""
