@@ -8,7 +8,7 @@ import torch
 from dlkf.data.degradation import GnssNoise
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
-from tests.data.conftest import write_cars
+from tests.cars import write_cars
 
 
 def test_noise_is_white_of_its_size_and_in_the_stds(tmp_path):

@@ -15,7 +15,6 @@ from dlkf.data.tables import Columns
 from dlkf.errors import InputError
 from dlkf.navigation.earth import SEMI_MAJOR
 
-STANDARD_GRAVITY = 9.80665  # m/s²
 FASTEST_RATE = 20.0  # rad/s: no car turns, and no bump shakes it, that fast for a thousandth of a drive
 CHUNK_S = 10.0  # way and course are compared over such stretches: metres of GNSS noise do not matter
 DISAGREES, AGREES = 0.5, 0.25  # relative residual of way against velocity

@@ -15,6 +15,7 @@ from dlkf.data.schema import ACCEL, GYRO, POSITION, VELOCITY
 from dlkf.data.tables import Columns, DriveRow
 from dlkf.data.validate import GNSS_QUALITIES, DriveTables, read_checked
 from dlkf.errors import InputError
+from dlkf.navigation.earth import STANDARD_GRAVITY
 
 GOOD, NOTE, BAD = "good", "note", "BAD"
 STYLES = {GOOD: "green", NOTE: "yellow", BAD: "bold red"}
@@ -22,7 +23,6 @@ NAMES = {0: "no fix", 1: "single", 2: "DGNSS", 3: "PPS", 4: "RTK fixed", 5: "RTK
 FASTEST_MOVE = 2.0  # m/s, from which on course is heading
 STANDING = 0.15  # m/s
 OFFSET_S, DELAY_S, ANGLE_DEG = 0.05, 0.3, 3.0  # more is worth a word, is a wrong clock, is a turned sensor
-FREE_FALL = 9.80665
 
 
 class Seen(NamedTuple):
@@ -81,7 +81,7 @@ def imu_findings(imu: Columns) -> Iterator[Seen]:
             if np.ptp(x) == 0:
                 yield Seen(BAD, f"{name} never changes: {x[0]:.4g} {unit}")
     force = float(np.median(np.sqrt(sum(imu[n] ** 2 for n in ACCEL))))
-    near = abs(force / FREE_FALL - 1) < 0.03
+    near = abs(force / STANDARD_GRAVITY - 1) < 0.03
     yield Seen(GOOD if near else NOTE, f"IMU: median specific force {force:.4g} m/s² (gravity is 9.81)")
 
 

@@ -17,11 +17,10 @@ from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
 from dlkf.filters.sources import Believed, FixMemory, GnssFix, Measurement, Source
 from dlkf.filters.tuning import Tuning
+from dlkf.navigation.earth import STANDARD_GRAVITY
 from dlkf.navigation.error_model import PLAIN, WindowModel, masked, source_scale, window_model
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.state import PVA, STATES, ErrorStates
-
-STANDARD_GRAVITY = 9.80665
 
 
 @dataclass(frozen=True)

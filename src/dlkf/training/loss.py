@@ -17,6 +17,7 @@ from dlkf.data.drive import Batch
 from dlkf.errors import InputError
 from dlkf.filters.integration import Solution
 from dlkf.navigation.state import NavState
+from dlkf.settings import settings_from
 from dlkf.training.outage_loss import likelihood_term, outage_term, speed_term
 
 TERMS = ("position", "velocity", "attitude")
@@ -94,9 +95,7 @@ def loss_of(values: Mapping[str, Any]) -> Loss:
     """
     values = dict(values)
     if (target := values.pop("_target_", None)) is None:
-        if unknown := sorted(set(values) - PAPERS):
-            raise InputError(f"loss: unknown key {unknown[0]!r}; known: {', '.join(sorted(PAPERS))}")
-        return partial(pva_losses, config=LossConfig(**values))
+        return partial(pva_losses, config=settings_from(LossConfig, values, "loss"))
     module, _, name = str(target).rpartition(".")
     try:
         made_by = getattr(import_module(module), name)

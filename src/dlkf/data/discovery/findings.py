@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from dlkf.data.discovery.clock import Lag, find_lag, known_offset
 from dlkf.data.discovery.motion import MOVING, Floats, Motion, motion, position_delay
 from dlkf.data.discovery.orientation import Pose, find_pose
-from dlkf.data.discovery.units import G, accel_units, nearest_unit
+from dlkf.data.discovery.units import accel_units, nearest_unit
+from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
 LEAST_EXPLAINED, AGREE = 0.8, (0.8, 1.25)
 FARTHEST_DOWN = math.radians(6.0)

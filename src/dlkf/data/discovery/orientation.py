@@ -26,8 +26,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from dlkf.data.discovery.motion import MOVING, Complex, Floats, Levelled, Motion, levelled
+from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
-G = 9.80665
 SPAN_S, STEP_S = 0.6, 0.04  # of the first scan round the coarse lag; the next ones are in quarters of a step
 BLOCKS = 8  # of the drive, left out one at a time (jackknife)
 SMOOTH_S = 4.0  # over which course minus turn is averaged: sideslip and noise, not the drift of a gyroscope

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from dlkf.data.discovery.motion import EARTH_M, Floats
+from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
-G = 9.80665
 NEAR = 0.06  # of gravity: a scale error, the road's curves, a cold sensor
 ALIKE = 0.12  # of a unit's size, of what is regressed
 

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from dlkf.data.discovery.units import G, time_unit
+from dlkf.data.discovery.units import time_unit
 from dlkf.data.readers.frames import Table
+from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
 Spec = dict[str, Any]
 

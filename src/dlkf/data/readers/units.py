@@ -10,8 +10,9 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from dlkf.errors import InputError
+from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
-G, DEG = 9.80665, math.pi / 180
+DEG = math.pi / 180
 ACCELERATION = {"m/s2": 1.0, "m/s": 1.0, "g": G, "mg": G * 1e-3, "cm/s2": 0.01, "gal": 0.01}
 RATE = {"rad/s": 1.0, "rad": 1.0, "deg/s": DEG, "deg": DEG, "mdeg/s": DEG * 1e-3, "deg/h": DEG / 3600}
 ANGLE = {"rad": 1.0, "deg": DEG, "1e-7deg": DEG * 1e-7}

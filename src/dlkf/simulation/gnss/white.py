@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from dlkf.errors import InputError
 from dlkf.navigation.attitude import rotation_from_rpy
-from dlkf.navigation.earth import EARTH_RATE, ECCENTRICITY_SQ, transverse_radius
+from dlkf.navigation.earth import EARTH_RATE
 from dlkf.simulation.gnss.receiver import gauss_markov
 from dlkf.simulation.gnss.surroundings import Sky
-from dlkf.simulation.motion.vehicle import Truth
+from dlkf.simulation.motion.vehicle import Truth, radii_of_curvature
 from dlkf.simulation.tables import fix_columns
 
 QUALITIES = (1, 2, 4, 5)
@@ -153,8 +153,7 @@ def antenna(
 
 def shifted(truth: Truth, offset_n: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
     """Latitude, longitude [rad] and height [m] a few metres away; second order is below 1e-4 m at 30 m."""
-    transverse = transverse_radius(torch.from_numpy(truth.lat)).numpy()
-    meridian = (1 - ECCENTRICITY_SQ) * transverse / (1 - ECCENTRICITY_SQ * np.sin(truth.lat) ** 2)
+    meridian, transverse = radii_of_curvature(truth.lat)
     return (
         truth.lat + offset_n[:, 0] / (meridian + truth.height),
         truth.lon + offset_n[:, 1] / ((transverse + truth.height) * np.cos(truth.lat)),

@@ -159,6 +159,11 @@ def _walk(
 
 def radians_per_metre(lat: Array, height: Array) -> tuple[Array, Array]:
     """1/((R_E + h) cos L) and 1/(R_N + h) [rad/m]."""
-    transverse = transverse_radius(torch.from_numpy(lat)).numpy()
-    meridian = (1 - ECCENTRICITY_SQ) * transverse / (1 - ECCENTRICITY_SQ * np.sin(lat) ** 2)
+    meridian, transverse = radii_of_curvature(lat)
     return 1 / ((transverse + height) * np.cos(lat)), 1 / (meridian + height)
+
+
+def radii_of_curvature(lat: Array) -> tuple[Array, Array]:
+    """R_N of the meridian and R_E of the prime vertical [m] (Groves 2.105, 2.106); lat [rad]."""
+    transverse = transverse_radius(torch.from_numpy(lat)).numpy()
+    return (1 - ECCENTRICITY_SQ) * transverse / (1 - ECCENTRICITY_SQ * np.sin(lat) ** 2), transverse
