@@ -13,7 +13,7 @@ from plotly.subplots import make_subplots
 from dlkf.colours import SHADE
 
 Array = NDArray[np.float64]
-MOST = 2400  # points of a line: more than a screen has columns
+MOST = 1800  # points of a line: more than a screen has columns
 FONT = {"family": "system-ui, sans-serif", "size": 12}
 
 
