@@ -22,10 +22,12 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
+from dlkf.data.plausibility import check_clocks, check_gnss_units
 from dlkf.data.readers import units
 from dlkf.data.readers.auto import AutoReader
 from dlkf.data.readers.units import rotation
 from dlkf.data.schema import ACCEL, GYRO
+from dlkf.data.tables import Columns, read_drives, read_table
 from dlkf.errors import InputError
 from dlkf.files import staged
 
@@ -165,6 +167,47 @@ def summary(title: str, all_of_them: list[Outcome]) -> str:
     return "| " + " | ".join(str(c) for c in cells) + " |"
 
 
+def mistakes(title: str, dataset: Path) -> str:
+    """A row of the second table: drives in which a check tells each of four mistakes, and drives as they are."""
+    told = dict.fromkeys(("as they are", *SPOILT), 0)
+    drives = read_drives(dataset)
+    count = 0
+    for row in drives:
+        imu, gnss = read_table(dataset, "imu", row.name), read_table(dataset, "gnss", row.name)
+        assert imu is not None and gnss is not None
+        if imu["t"][-1] - imu["t"][0] < MOTION_S:
+            continue
+        count += 1
+        good = {name: values[gnss["quality"] > 0] for name, values in gnss.items()}
+        for name in told:
+            spoilt = SPOILT[name](dict(imu), dict(good)) if name in SPOILT else (imu, good)
+            try:
+                check_gnss_units(spoilt[1], row.name)
+                check_clocks(*spoilt, row.name)
+            except InputError:
+                told[name] += 1
+    return f"| {title} | {count} | " + " | ".join(str(n) for n in told.values()) + " |"
+
+
+def _early(imu: Columns, gnss: Columns) -> tuple[Columns, Columns]:
+    return imu, gnss | {"t": gnss["t"] - 18.0}
+
+
+def _quarter(imu: Columns, gnss: Columns) -> tuple[Columns, Columns]:
+    turned = {f"{s}_x": imu[f"{s}_y"] for s in ("gyro", "accel")}
+    return imu | turned | {f"{s}_y": -imu[f"{s}_x"] for s in ("gyro", "accel")}, gnss
+
+
+def _slow(imu: Columns, gnss: Columns) -> tuple[Columns, Columns]:
+    return imu, gnss | {f"vel_{a}": gnss[f"vel_{a}"] / 3.6 for a in "ned"}
+
+
+def _nowhere(imu: Columns, gnss: Columns) -> tuple[Columns, Columns]:
+    first = np.arange(len(gnss["t"])) < 3
+    return imu, gnss | {name: np.where(first, 0.0, gnss[name]) for name in ("lat_deg", "lon_deg")}
+
+
+SPOILT = {"18 s": _early, "turned 90°": _quarter, "velocities ÷ 3.6": _slow, "three fixes at 0°/0°": _nowhere}
 COLUMNS = (
     *("drives", "in all", "with 60 s of motion", "of these: given as sure"),
     *("pose within 2° / offset within 20 ms, sure or not", "pose error [°], median / largest"),
@@ -188,7 +231,13 @@ def main() -> None:
         if (given.real / name).is_dir():
             groups[name] = run(given.real / name, np.random.default_rng(given.seed), own=name != "kitti")
     rows = [summary(title, outcomes) for title, outcomes in groups.items()]
-    table = "\n".join((HEAD, *rows))
+    sets = {"simulated (lifelike)": given.simulated} if given.simulated else {}
+    sets |= {n: given.real / n for n in ("rtkx", "kitti") if given.real and (given.real / n).is_dir()}
+    names = ("drives of a minute or more, and in how many a check speaks up", "in all", "as they are", *SPOILT)
+    head = f"| {' | '.join(names)} |"
+    line = "|:--|" + "--:|" * (len(SPOILT) + 2)
+    checks = [mistakes(title, dataset) for title, dataset in sets.items()]
+    table = "\n".join((HEAD, *rows, "", head, line, *checks))
     print(table)
     with staged(given.page.parent) as folder:
         old = given.page.read_text() if given.page.exists() else "<!-- table -->\n<!-- end -->\n"
