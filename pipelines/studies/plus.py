@@ -127,11 +127,12 @@ def with_parts(model: PlusFilter, parts: Sequence[str]) -> PlusFilter:
 
 def main() -> None:
     """Tune, score, print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", default="plus", help="weights: plus, or a folder")
     parser.add_argument("--train", nargs="+", required=True, help="datasets that the classical filters are tuned on")
-    for kind in ("test", "semi", "real"):
-        parser.add_argument(f"--{kind}", nargs="*", default=[], help=f"{kind} datasets")
+    parser.add_argument("--test", nargs="*", default=[], help="simulated datasets")
+    parser.add_argument("--semi", nargs="*", default=[], help="datasets of real motion with injected errors")
+    parser.add_argument("--real", nargs="*", default=[], help="real datasets, cut every 10 s")
     parser.add_argument("--outages", nargs="+", type=float, default=[30.0, 60.0])
     parser.add_argument("--ablation", action="store_true", help="also plus with parts switched off")
     parser.add_argument("--out", type=Path, default=Path("outputs/plus"))

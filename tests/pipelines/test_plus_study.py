@@ -1,4 +1,4 @@
-"""The comparison of plus with tuned classical filters, on nine minutes of drives and factors found before."""
+"""The comparison of plus with tuned classical filters, on three minutes of drives and factors found before."""
 
 import sys
 
@@ -8,18 +8,16 @@ from pipelines.studies import plus
 from dlkf.filters.tuning import Tuning
 from dlkf.tuning.search import tuning_values
 
-from ..training.test_resume import dataset  # noqa: F401
 
-
-def test_it_scores_and_writes_its_tables(dataset, tmp_path, monkeypatch, capsys):  # noqa: F811
+def test_it_scores_and_writes_its_tables(simulated, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     out.mkdir()
     (out / "factors.yaml").write_text(yaml.safe_dump({name: tuning_values(Tuning()) for name in plus.CLASSICAL}))
-    words = ["--train", "none", "--test", str(dataset), "--outages", "20", "--ablation", "--out", str(out)]
+    words = ["--train", "none", "--test", str(simulated), "--outages", "20", "--ablation", "--out", str(out)]
     monkeypatch.setattr(sys, "argv", ["plus", *words])
     plus.main()
     table = (out / "table.md").read_text()
-    lines = [line for line in table.splitlines() if line.startswith(f"| {dataset.name} | 20 |")]
+    lines = [line for line in table.splitlines() if line.startswith(f"| {simulated.name} | 20 |")]
     assert len(lines) == 2 and table in capsys.readouterr().out + "\n"
     cells = [c.strip() for c in lines[0].split("|")[4:8]]
     assert all(0 < float(c.split(" / ")[0]) < 1e4 for c in cells)
