@@ -84,6 +84,20 @@ def _called(option: Any) -> str:
     return {NoneType: "null", bool: "true or false", str: "a word"}.get(option, "a number")
 
 
+def check_limits(settings: Settings, where: str, limits: Mapping[str, tuple[float, float]]) -> None:
+    """InputError for a field that is outside its limits."""
+    for name, (low, high) in limits.items():
+        if not low <= getattr(settings, name) <= high:
+            raise InputError(f"{where}: {name} {getattr(settings, name)} is outside {low:g} to {high:g}")
+
+
+def check_from_zero(settings: Settings, where: str) -> None:
+    """InputError for a field that is no finite number ≥ 0."""
+    for name in settings.__dataclass_fields__:
+        if not is_number(getattr(settings, name)) or getattr(settings, name) < 0:
+            raise InputError(f"{where}{name} is {getattr(settings, name)!r}, must be a finite number ≥ 0")
+
+
 def is_number(value: Any) -> bool:
     """A finite number; true and false are none."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,10 +1,7 @@
 """Real drives: load, navigate without a reference, evaluate. Skipped where the data are not at hand."""
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,20 +13,10 @@ from dlkf.data.alignment import align_boundaries
 from dlkf.data.store import load_dataset
 from dlkf.evaluation.results import Results
 from dlkf.navigation.attitude import vector_from_rotation
+from tests.shell import in_shell
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "real"
 pytestmark = pytest.mark.skipif(not REAL.is_dir(), reason="no real drives beside the checkout")
-
-
-def run(folder, command, *arguments):
-    return subprocess.run(
-        [sys.executable, "-m", f"dlkf.{command}", *map(str, arguments)],
-        cwd=folder,
-        env={**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120"},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
 
 
 def drives(name, **options):
@@ -63,8 +50,8 @@ def test_alignment_agrees_with_a_tactical_reference():
 )
 def test_navigate_needs_no_reference(tmp_path, name, chosen):
     shutil.copytree(REAL / name, tmp_path / name, ignore=shutil.ignore_patterns("reference"))
-    done = run(tmp_path, "navigate", "model=mbkf15", f"dataset={name}", "out=solved", *chosen)
-    assert done.returncode == 0, done.stderr
+    done = in_shell(tmp_path, "navigate", "model=mbkf15", f"dataset={name}", "out=solved", *chosen)
+    assert done.code == 0, done.err
     (solution,) = (tmp_path / "solved").glob("drive=*/solution.parquet")
     table = pq.read_table(solution).to_pandas()
     assert len(table) > 50 and np.isfinite(table.drop(columns="gnss_used").to_numpy(float)).all()
@@ -80,11 +67,11 @@ def test_navigate_needs_no_reference(tmp_path, name, chosen):
     ],
 )
 def test_outages_of_30_s_stay_where_they_were_measured(tmp_path, name, options, outages, low, high):
-    done = run(
+    done = in_shell(
         tmp_path, "evaluate", "model=mbkf15", f"dataset={REAL / name}", "mode=drives", "out=report",
         "outage.duration_s=30", "injected_bias=null", *options,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.err
     (content,) = json.loads((tmp_path / "report" / "metrics.json").read_text())["results"]
     result, end = Results.of(content), ("mbkf15", "outages", "end", "horizontal")
     assert result.count["outages"] == outages

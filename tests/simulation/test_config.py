@@ -15,9 +15,9 @@ from dlkf.simulation.dataset import dataset_config, simulate_from_config
 CONF = Path(__file__).parents[2] / "conf"
 PRESETS = sorted(path.stem for path in (CONF / "imu").glob("*.yaml"))
 BRINGS = {
-    "one_imu": "automotive_mems",
+    **dict.fromkeys(("one_imu", "one_imu_hour"), "automotive_mems"),
     "per_drive": "automotive_mems",
-    "paper_clean": "table3_standin",
+    **dict.fromkeys(("paper_clean", "paper_clean_hour", "paper_clean_units"), "table3_standin"),
     "paper_mems": "groves_consumer",
     "one_imu_hour": "automotive_mems",
     "paper_clean_hour": "table3_standin",

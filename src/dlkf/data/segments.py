@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -18,7 +18,7 @@ from dlkf.data.stack import DriveStack, stacked
 from dlkf.errors import InputError
 from dlkf.navigation.earth import TangentFrame, tangent_frame
 from dlkf.navigation.state import NavState
-from dlkf.settings import settings_from
+from dlkf.settings import check_from_zero, settings_from
 
 REST = (0.0, 0.0, -9.8, 0.0, 0.0, 0.0)  # IMU in the padding after a piece's end
 
@@ -44,10 +44,7 @@ class StartLaw:
     yaw_deg: float = 2.0
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if not isinstance(value, (int, float)) or not math.isfinite(value) or value < 0:
-                raise InputError(f"start.{f.name} is {value!r}, must be a finite number ≥ 0")
+        check_from_zero(self, "start.")
 
     @staticmethod
     def of(law: StartLaw | Mapping[str, float] | None) -> StartLaw:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, fields
 
 from dlkf.errors import InputError
 from dlkf.ranges import middle
+from dlkf.settings import check_from_zero
 
 DEG = math.pi / 180
 MILLIGAL = 1e-5  # m/s²
@@ -52,10 +53,7 @@ class SensorErrors:
     unevenness: float = 0.0
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if not isinstance(value, (int, float)) or not math.isfinite(value) or value < 0:
-                raise InputError(f"IMU preset: {f.name} is {value!r}, must be a finite number ≥ 0")
+        check_from_zero(self, "IMU preset: ")
         if self.correlation_time <= 0:
             raise InputError("IMU preset: correlation_time is 0, must be positive seconds")
         for name in ("warm_up", "wander"):

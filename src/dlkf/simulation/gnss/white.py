@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dlkf.errors import InputError
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.earth import EARTH_RATE
+from dlkf.settings import check_limits
 from dlkf.simulation.gnss.receiver import gauss_markov
 from dlkf.simulation.gnss.surroundings import Sky
 from dlkf.simulation.motion.vehicle import Truth, radii_of_curvature
@@ -68,9 +69,7 @@ class GnssConfig:
             "dropout_s": (0.1, 600), "wander": (0, 100), "wander_s": (0.1, 1e4), "float_share": (0, 1),
             "float_s": (1, 1e4), "float_std": (0, 100),
         }  # fmt: skip
-        for name, (low, high) in limits.items():
-            if not low <= getattr(self, name) <= high:
-                raise InputError(f"gnss: {name} {getattr(self, name)} is outside {low:g} to {high:g}")
+        check_limits(self, "gnss", limits)
         if self.quality not in QUALITIES:
             raise InputError(f"gnss: quality {self.quality} is none of {QUALITIES} (NMEA GGA codes)")
         if len(self.lever_arm_b) != 3 or not all(math.isfinite(x) and abs(x) < 100 for x in self.lever_arm_b):

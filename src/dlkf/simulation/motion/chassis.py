@@ -23,6 +23,7 @@ from scipy.signal import bilinear, lfilter, lfilter_zi
 
 from dlkf.errors import InputError
 from dlkf.navigation.attitude import rotation_from_rpy, rpy_from_rotation
+from dlkf.settings import check_limits
 from dlkf.simulation.motion.routes import Kinematics
 from dlkf.simulation.motion.shaking import Shaking, shaken
 from dlkf.simulation.motion.vehicle import Route, Truth, Waves, radians_per_metre, random_waves
@@ -93,9 +94,7 @@ class ChassisConfig:
             "body_hz": (0.5, 5), "body_damping": (0.05, 1), "wheel_hz": (5, 25), "wheel_damping": (0.05, 1),
             "wheelbase": (1, 8), "track": (0.5, 3), "roughness_length": (2, 1e5),
         }  # fmt: skip
-        for name, (low, high) in ranges.items():
-            if not low <= getattr(self, name) <= high:
-                raise InputError(f"chassis: {name} {getattr(self, name)} is outside {low:g} to {high:g}")
+        check_limits(self, "chassis", ranges)
         for name, limit in (("imu_arm", 10.0), ("mounting_deg", 45.0)):
             value = getattr(self, name)
             if len(value) != 3 or not all(abs(x) <= limit for x in value):

@@ -19,6 +19,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 from scipy.signal import bilinear, freqz, lfilter
 
 from dlkf.errors import InputError
+from dlkf.settings import check_limits
 from dlkf.simulation.motion.routes import Kinematics
 
 Array = NDArray[np.float64]
@@ -89,9 +90,7 @@ class Shaking:
             "rattle_hz": (5, 80), "mount_hz": (0, 80), "mount_damping": (0.02, 2), "turning": (0, 1),
             "sway": (0, 0.1), "sway_hz": (0.5, 20), "sway_damping": (0.02, 2),
         }  # fmt: skip
-        for name, (low, high) in limits.items():
-            if not low <= getattr(self, name) <= high:
-                raise InputError(f"shaking: {name} {getattr(self, name)} is outside {low:g} to {high:g}")
+        check_limits(self, "shaking", limits)
         if 0 < self.mount_hz < 3:
             raise InputError(f"shaking: mount_hz {self.mount_hz} is outside 3 to 80 (0 is rigid)")
         if self.gears != round(self.gears):
