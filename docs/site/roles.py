@@ -11,15 +11,30 @@ ROLE = re.compile(r":(?:func|class|meth|mod|data|attr):`~?([\w.]+)`")
 
 
 class Roles(griffe.Extension):
-    """Rewrites the roles of every docstring."""
+    """Rewrites the roles of every docstring, once all names are known."""
 
-    def on_object(self, *, obj: griffe.Object, **kwargs: Any) -> None:
-        """After an object was read."""
-        if obj.docstring:
-            obj.docstring.value = ROLE.sub(lambda found: link(found[1], obj), obj.docstring.value)
+    def on_package(self, *, pkg: griffe.Module, **kwargs: Any) -> None:
+        """After the package was read."""
+        rewrite(pkg)
+
+
+def rewrite(obj: griffe.Object) -> None:
+    """The docstrings of an object and of all that is in it."""
+    if obj.docstring:
+        obj.docstring.value = ROLE.sub(lambda found: link(found[1], obj), obj.docstring.value)
+    for member in obj.members.values():
+        if not member.is_alias:
+            rewrite(member)
 
 
 def link(name: str, obj: griffe.Object) -> str:
-    """A cross-reference to a full name, or to one in the same module."""
-    full = name if name.startswith("dlkf") else f"{obj.module.path}.{name}"
-    return f"[`{name}`][{full}]"
+    """A cross-reference to a full name, or to one in the same class or module, imported ones too; else code."""
+    if name.startswith("dlkf"):
+        return f"[`{name}`][{name}]"
+    first, _, rest = name.partition(".")
+    for scope in (obj, obj.parent, obj.module):
+        member = None if scope is None or scope.is_alias else scope.members.get(first)
+        if member is not None and not member.is_attribute:  # values have no place of their own
+            full = member.target_path if member.is_alias else member.path
+            return f"[`{name}`][{full}{'.' + rest if rest else ''}]"
+    return f"`{name}`"

@@ -102,6 +102,6 @@ def component_features(
     innovation: Float[Tensor, "B 6"],
     C_hn: Float[Tensor, "B 3 3"],
 ) -> Float[Tensor, "B 30"]:
-    """The four components a–d of the paper (line 29); the two differences come per second (paper.md 4.2)."""
+    """The four components a–d of the paper (R040–R043); the two differences come per second (paper.md 4.2)."""
     x = torch.cat((posterior_rate, last_correction, gnss_rate, innovation), -1)
     return (x.unflatten(-1, (10, 3)) @ C_hn.mT).flatten(1)
