@@ -16,6 +16,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -32,7 +33,7 @@ from dlkf.data.tables import Columns, read_drives
 from dlkf.data.validate import DriveTables, read_checked
 from dlkf.errors import InputError
 from dlkf.filters.build import build_filter
-from dlkf.filters.integration import integrate
+from dlkf.filters.integration import Estimator, integrate
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.running.start import align
@@ -85,7 +86,7 @@ def of_spectra(tables: DriveTables) -> dict[str, float]:
     if driving.sum() >= 4 * FEWEST:
         loud = np.log(np.sqrt(np.sum(level[driving][:, :3, 2:] ** 2, (1, 2))))
         if np.ptp(speed[driving]) > 5:
-            out["rank correlation of vibration and speed"] = float(spearmanr(loud, speed[driving]).statistic)
+            out["rank correlation of vibration and speed"] = float(spearmanr(loud, speed[driving])[0])
         out["spread of vibration from second to second, log-std"] = float(loud.std())
         out["kurtosis of accel above 6 Hz, median"] = float(np.median(peaked[driving][:, :3]))
         out["kurtosis of accel above 6 Hz, 95 %"] = float(np.quantile(peaked[driving][:, :3], 0.95))
@@ -122,7 +123,8 @@ def of_innovations(tables: DriveTables) -> dict[str, float]:
     if batch.size[1] < 2 * SETTLE:
         return {}
     with torch.inference_mode():
-        solution = integrate(batch, build_filter("mbkf15", spec), keep_covariances=True)
+        solution = integrate(batch, cast(Estimator, build_filter("mbkf15", spec)), keep_covariances=True)
+    assert solution.covariances is not None
     z, S = solution.innovation[0, SETTLE:], solution.covariances.innovation[0, SETTLE:]
     used = (batch.gnss_valid & batch.available.unsqueeze(-1))[0, SETTLE:].all(-1)
     unit = z / S.diagonal(dim1=-2, dim2=-1).sqrt()
@@ -181,7 +183,7 @@ def markdown(table: pd.DataFrame, names: Sequence[str]) -> str:
     for key, row in table[outside | ~is_spectrum].iterrows():
         cells = [" / ".join(f"{row[f'fleet {p:g} %']:.3g}" for p in (INSIDE[0], 50, INSIDE[1]))]
         for name in names:
-            value, below = row[name], row[f"{name}, fleet below [%]"]
+            value, below = float(row[name]), float(row[f"{name}, fleet below [%]"])
             star = "" if INSIDE[0] <= below <= INSIDE[1] else "**"
             cells.append("–" if np.isnan(value) else f"{star}{value:.3g}{star} ({below:.0f} %)")
         lines.append(f"| {key} | " + " | ".join(cells) + " |")

@@ -83,7 +83,7 @@ def test_the_command_writes_table_picture_and_numbers(call):
     assert set(series) == {"mbkf15", "mbkf21_car"} and series["mbkf15"]["innovation"][20] is None
     done = call("consistency", "chassis=wide", "model=mbkf15", "out=any", *size)  # cars drawn from ranges
     assert done.code == 0, done.err
-    done = call("consistency", "model=ins", "out=none", *size)
-    assert done.code == 2 and "model ins has no covariance" in done.err and not Path("none").exists()
-    done = call("consistency", "model=mbkf15", "out=none", "drives=1")
+    done = call("consistency", "model=ins", "out=nowhere", *size)
+    assert done.code == 2 and "model ins has no covariance" in done.err and not Path("nowhere").exists()
+    done = call("consistency", "model=mbkf15", "out=nowhere", "drives=1")
     assert done.code == 2 and "drives=1" in done.err

@@ -69,7 +69,7 @@ def matched_drives(config: Mapping[str, Any]) -> MatchedDrives:
 def matching(spec: ImuSpec, states: ErrorStates) -> ImuSpec:
     """The preset without the errors that a filter with these states does not model."""
     names = ("warm_up", "g_sensitivity", "quantisation", "full_scale", "wander", "unevenness")
-    left_out = dict.fromkeys(names, 0.0)
+    left_out: dict[str, float] = dict.fromkeys(names, 0.0)
     if states.matrix == "none":
         left_out["scale_factor"] = 0.0
     if states.matrix != "full":

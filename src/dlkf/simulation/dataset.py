@@ -164,7 +164,7 @@ def recipe(config: Mapping[str, Any]) -> Recipe:
     if not has_ranges(plain):
         return Recipe(settings, spec, seed)
     for key in OF_ALL_DRIVES:
-        if has_ranges(plain["dataset"].get(key)):
+        if has_ranges(config["dataset"].get(key)):
             raise InputError(f"dataset: {key} is a range, but all drives have the same; give a value")
     if has_ranges(plain["imu"]) and settings.imu_errors == "one":
         raise InputError("imu: is drawn for every drive, but dataset.imu_errors is one; set dataset.imu_errors=wide")
@@ -209,7 +209,7 @@ def simulate(
 
 def drive_of(made_by: Recipe, index: int, seconds: int) -> tuple[DriveTables, dict[str, Any]]:
     """Drive ``index`` of a dataset, ``seconds`` long: its tables, and its row of ``drives.parquet``."""
-    *seeds, unit_seed, surroundings, chassis, type_seed, ranges_seed = np.random.SeedSequence(
+    motion, imu, gnss, unit_seed, surroundings, chassis, type_seed, ranges_seed = np.random.SeedSequence(
         made_by.seed, spawn_key=(1, index)
     ).spawn(8)
     config, spec = made_by.of_drive(ranges_seed)
@@ -221,8 +221,8 @@ def drive_of(made_by: Recipe, index: int, seconds: int) -> tuple[DriveTables, di
         int(config.imu_rate_hz), config.gnss.rate_hz, int(config.reference_rate_hz), int(config.imu_parts)
     )
     tables = simulate_drive(
-        Seeds(*seeds, surroundings, chassis), seconds, rates, config.vehicle, config.chassis, config.surroundings,
-        kind, unit, config.gnss, config.receiver,
+        Seeds(motion, imu, gnss, surroundings, chassis), seconds, rates,
+        config.vehicle, config.chassis, config.surroundings, kind, unit, config.gnss, config.receiver,
     )  # fmt: skip
     name = f"{config.name}-{made_by.seed}-{index:05d}"
     row = {

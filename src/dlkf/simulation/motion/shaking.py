@@ -266,13 +266,13 @@ def noise(rng: np.random.Generator, kind: Shaking, envelope: Array) -> Array:
     white = envelope[:, None] * axes * rng.standard_normal((count, 6)) if kind.rumble > 0 else np.zeros((count, 6))
     w = 2 * math.pi * ROAD_HZ
     b, a = bilinear([1.0], [1.0, 2 * ROAD_DAMPING * w, w * w], NODE_HZ)
-    x = _through_mount(kind, lfilter(b, a, white, axis=0) / _acceleration_rms(b, a))
+    x = _through_mount(kind, np.asarray(lfilter(b, a, white, axis=0)) / _acceleration_rms(b, a))
     if kind.rattle > 0 and kind.rattle_per_minute > 0:
         knocks = rng.random(count) < kind.rattle_per_minute / 60 / NODE_HZ
         w, z = 2 * math.pi * kind.rattle_hz, 0.08
         b, a = bilinear([w * w], [1.0, 2 * z * w, w * w], NODE_HZ)
         height = kind.rattle / w**2 * np.exp(0.6 * rng.standard_normal((count, 6))) * rng.choice((-1, 1), (count, 6))
-        x += _through_mount(kind, lfilter(b, a, knocks[:, None] * height, axis=0) * NODE_HZ / w)
+        x += _through_mount(kind, np.asarray(lfilter(b, a, knocks[:, None] * height, axis=0)) * NODE_HZ / w)
     return x
 
 
@@ -287,7 +287,7 @@ def _through_mount(kind: Shaking, x: Array) -> Array:
         return x
     w, z = 2 * math.pi * kind.mount_hz, kind.mount_damping
     b, a = bilinear([2 * z * w, w * w], [1.0, 2 * z * w, w * w], NODE_HZ)
-    return lfilter(b, a, x, axis=0)
+    return np.asarray(lfilter(b, a, x, axis=0))
 
 
 def gain(kind: Shaking, f: Array) -> Array:
