@@ -65,6 +65,8 @@ def test_completion_knows_commands_keys_and_presets():
         ("imu=consumer,bmi270", "imu=consumer,bmi270"),
         ("scoring.outage={first_s:10}", "scoring.outage={first_s:10}"),
         ("out=it's here", "out='it\\'s here'"),
+        ("outage=none", "outage=null"),
+        ("out=none", "out=none"),
         ("-m", "-m"),
         ("~baseline", "~baseline"),
     ],

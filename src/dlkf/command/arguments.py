@@ -12,6 +12,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from dlkf.errors import InputError
 
+SWITCHED_OFF = ("outage", "injected_bias", "smoother", "export")  # where none means null
+
 
 def readable(argument: str) -> str:
     """An override that Hydra's grammar takes: a value that it does not is quoted, ``~/`` is the home folder.
@@ -23,7 +25,7 @@ def readable(argument: str) -> str:
         return argument
     if value.startswith("~/"):
         value = str(Path(value).expanduser())
-    if value.lower() == "none" and "/" not in key:
+    if value.lower() == "none" and key in SWITCHED_OFF:
         value = "null"
     if _parses(f"{key}={value}"):
         return f"{key}={value}"
