@@ -156,7 +156,7 @@ def discovered(tables: DriveTables) -> Iterator[Seen]:
         accel_factor=1.0, gyro_factor=1.0, gnss_t=gnss["t"][ok], lat_deg=gnss[POSITION[0]][ok],
         lon_deg=gnss[POSITION[1]][ok], v_ned=np.stack([gnss[c][ok] for c in VELOCITY], -1),
     )  # fmt: skip
-    for finding in discover(raw, {"imu.time.offset_s", "imu.axes"}).found:
+    for finding in discover(raw, {"imu.time.offset_s", "imu.axes"}, known_accel={}, known_gyro={}).found:
         if not finding.sure:
             yield Seen(NOTE, f"{finding.setting}: the motion does not tell ({finding.told})")
         elif finding.setting == "imu.time.offset_s":
