@@ -94,7 +94,7 @@ def apart(a: pd.DataFrame, b: pd.DataFrame) -> float:
     assert len(a) == len(b) > 0
     scale = {"lat_deg": np.radians(EARTH), "lon_deg": np.radians(EARTH)}
     return max(float((a[c].astype(float) - b[c].astype(float)).abs().mul(scale.get(c, 1.0)).max()) for c in a
-               if not a[c].isna().all())  # fmt: skip
+               if c != "geometry" and not a[c].isna().all())  # fmt: skip
 
 
 def table(stream: StreamingFilter, tables: DriveTables, **arrivals) -> pd.DataFrame:
@@ -389,13 +389,15 @@ def test_without_motion_it_goes_on_aligning(piece):
 
 
 def test_a_dataset_through_streams(town):
-    """As ``navigate``: both drives, and the same line of report; a drive that cannot be aligned is left out."""
+    """As ``navigate``: both drives, and the same line of report but for the innovations, which a stream does not keep;
+    a drive that cannot be aligned is left out."""
     filters = estimator("mbkf15")
     streamed = {r.drive: r for r in stream_drives(town, filters, rate_hz=50.0, epoch_s=1.0)}
     drives = [drive_from_tables(read_checked(town, row), "", 50.0, 1.0, torch.float64) for row in drive_rows(town)]
     for whole in navigate_drives(drives, filters):
         found = streamed[whole.drive]
-        assert found.summary() == whole.summary() and apart(found.table, whole.table) < ROUNDING
+        assert found.summary() == whole.summary().partition(", innovations")[0]
+        assert apart(found.table, whole.table) < ROUNDING
     tables = read_checked(town, drive_rows(town)[0])
     still = {**tables.gnss, **{f"vel_{a}": 0 * tables.gnss["t"] for a in "ned"}}
     with pytest.raises(InputError, match="never moves"):

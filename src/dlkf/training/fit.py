@@ -70,7 +70,10 @@ def fit(
             enable_model_summary=False,
             default_root_dir=folder,
         )
-        trainer.fit(module, datamodule=data, ckpt_path=str(last) if last.is_file() else None)
+        try:
+            trainer.fit(module, datamodule=data, ckpt_path=str(last) if last.is_file() else None)
+        except SystemExit as end:  # what Lightning makes of Ctrl-C and SIGTERM
+            raise (end.__context__ if isinstance(end.__context__, KeyboardInterrupt) else end) from None
     if trainer.interrupted:
         raise KeyboardInterrupt
     loss = trainer.callback_metrics.get("train/loss")

@@ -112,7 +112,7 @@ class FilterTraining(L.LightningModule):
             self.log("val/outage_end_m", mean_error(ends, "log"))
             self.log("val/outage_end_rms_m", mean_error(ends, "rms"))
         if self._gains:
-            gain = torch.cat(self._gains).std(0) * INNOVATION / STATE[:, None]
+            gain = torch.cat(self._gains).std(0, correction=0) * INNOVATION / STATE[:, None]
             self.log("val/gain_std", float(gain.square().mean().sqrt()))
-        error = torch.cat(self._errors).std(0) / torch.tensor(IMU_ERROR_SIZE)
+        error = torch.cat(self._errors).std(0, correction=0) / torch.tensor(IMU_ERROR_SIZE)
         self.log("val/imu_error_std", float(error.square().mean().sqrt()))
