@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
+from typing import cast
 
 from omegaconf import DictConfig, OmegaConf
 
+from dlkf.classes import made
 from dlkf.command import command
 from dlkf.data.intake import ingest_drives
 from dlkf.data.readers.frames import DriveFrames
 from dlkf.data.summary import drive_line
 from dlkf.data.validate import Limits
-from dlkf.errors import InputError
 
 
 def _open(arguments: list[str]) -> list[str]:
@@ -23,7 +22,7 @@ def _open(arguments: list[str]) -> list[str]:
 @command("ingest", arguments=_open)
 def main(cfg: DictConfig) -> None:
     """Read every drive under ``source``, check it and write the dataset ``out``."""
-    reader = _reader(OmegaConf.to_container(cfg.reader, resolve=True))
+    reader = made(cast(dict, OmegaConf.to_container(cfg.reader, resolve=True)), "reader")
     count = ingest_drives(
         reader.read(cfg.source),
         cfg.out,
@@ -34,22 +33,6 @@ def main(cfg: DictConfig) -> None:
         progress=_tell,
     )
     print(f"{cfg.out}: {count} drive{'s' if count != 1 else ''}")
-
-
-def _reader(settings: Any) -> Any:
-    """The reader that ``_target_`` names; InputError if it is not there or does not take these settings."""
-    target = settings.pop("_target_", None)
-    if not target:
-        raise InputError("reader has no _target_; it names the reader's class, as in conf/reader/csv.yaml")
-    module, _, name = str(target).rpartition(".")
-    try:
-        kind = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise InputError(f"reader._target_={target}: cannot be imported ({error}); put it on PYTHONPATH") from None
-    try:
-        return kind(**settings)
-    except TypeError as error:
-        raise InputError(f"reader: {str(error).rpartition('__init__() ')[2]}; --cfg job prints all keys") from None
 
 
 def _tell(drive: DriveFrames, done: int) -> None:

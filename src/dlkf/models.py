@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from importlib import import_module
 from inspect import signature
 from pathlib import Path
 from typing import Any
 
+from dlkf.classes import class_named
 from dlkf.errors import InputError
 from dlkf.filters.build import OWN_SOURCE, build_filter, is_filter, known_filters
 from dlkf.filters.integration import Estimator
@@ -65,13 +65,7 @@ def own_filter(spec: str, imu: ImuSpec) -> Estimator:
 
     Raises InputError where there is none.
     """
-    module, _, name = spec.partition(":")
-    try:
-        kind = getattr(import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise InputError(f"model={spec}: {error}; give module:Class, with the module's folder in PYTHONPATH") from None
-    if not (callable(kind) and hasattr(kind, "begin") and hasattr(kind, "step")):
-        raise InputError(f"model={spec} has no begin and step; dlkf.filters.integration.Estimator is what it takes")
+    kind = class_named(spec, "model", ("begin", "step"))
     return kind(imu=imu) if "imu" in signature(kind).parameters else kind()
 
 

@@ -58,8 +58,8 @@ def test_a_map_from_the_command_line(call, logs):
 
 MISTAKES = {
     "unknown key": (["reader.imu.acel.unit=g"], "reader.imu: unknown key acel"),
-    "unknown setting": (["reader.colour=red"], "unexpected keyword argument 'colour'"),
-    "module": (["reader._target_=mine.Reader"], "reader._target_=mine.Reader: cannot be imported"),
+    "unknown setting": (["reader.colour=red"], "takes no colour"),
+    "module": (["reader._target_=mine.Reader"], "reader._target_=mine.Reader: No module named"),
     "lever arm": (["reader.lever_arm_m=0.5"], "reader.lever_arm_m=0.5: must be three numbers"),
     "format": (["reader.gnss.format=gpx"], "reader.gnss.format=gpx: unknown"),
     "not a UBX log": (["reader.gnss.format=ubx"], "has no NAV-PVT message"),

@@ -7,10 +7,10 @@ PYTHONPATH and a class in it (:mod:`dlkf.filters.sources`).
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from importlib import import_module
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from dlkf.classes import class_named
 from dlkf.errors import InputError
 from dlkf.filters.adaptive import Adaptation
 from dlkf.filters.constraints import CarConstraints
@@ -81,7 +81,7 @@ def build_filter(
     sources: list[Source] = []
     if {"nhc", "car"} & set(endings):
         sources.append(CarConstraints(factors, states))
-    sources += [own_source(part)(imu, factors, states) for part in own]
+    sources += [class_named(part, "source", ("begin", "rows"))(imu, factors, states) for part in own]
     estimator = Mbkf(
         imu,
         factors,
@@ -107,18 +107,6 @@ def refuse_smoothed(name: str, why: str) -> None:
     """InputError for the name of a filter that is to be smoothed."""
     if "rts" in name.partition("+")[0].split("_"):
         raise InputError(f"model {name} is smoothed: it looks ahead, {why}; take {name.replace('_rts', '')}")
-
-
-def own_source(spec: str) -> Callable[[ImuSpec, Tuning, ErrorStates], Source]:
-    """A user's class of a source from ``module:Class``; InputError where there is none."""
-    module, _, name = spec.partition(":")
-    try:
-        found = getattr(import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise InputError(f"source {spec}: {error}; give module:Class, with the module's folder in PYTHONPATH") from None
-    if not (callable(found) and hasattr(found, "rows") and hasattr(found, "begin")):
-        raise InputError(f"source {spec} has no begin and rows; dlkf.filters.sources says what a source is")
-    return found
 
 
 def known_filters() -> str:

@@ -11,15 +11,13 @@ Its constructor is given the settings beside ``_target_``, and ``samples`` and `
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from importlib import import_module
 from typing import Any
 
 from torch import nn
 
-from dlkf.errors import InputError
+from dlkf.classes import TARGET, having, made
 from dlkf.networks.cnn_lstm import NetworkConfig
 
 PAPERS = {f.name for f in fields(NetworkConfig)}  # settings that lie beside _target_ where a preset is the base
@@ -36,22 +34,10 @@ class OwnNetwork:
 
     def build(self) -> nn.Module:
         """The network. InputError where it cannot be found, takes other settings, or lacks what a network has."""
-        module, _, name = self.target.rpartition(".")
-        try:
-            made_by = getattr(import_module(module), name)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise InputError(
-                f"model.network._target_={self.target}: {error}; give module.Class, its module's folder in PYTHONPATH"
-            ) from None
-        takes = inspect.signature(made_by).parameters
-        given = {"samples": self.samples, "flags": self.flags, **self.settings}
-        if unknown := sorted(set(self.settings) - set(takes) - PAPERS):
-            raise InputError(f"model.network: {self.target} takes no {unknown[0]}; it takes {', '.join(takes)}")
-        network = made_by(**{k: v for k, v in given.items() if k in takes})
-        if missing := [n for n in ("width", "start", "forward") if not hasattr(network, n)]:
-            raise InputError(f"model.network._target_={self.target} has no {missing[0]}; see dlkf.networks.own")
-        return network
+        offered = {"samples": self.samples, "flags": self.flags}
+        network = made({TARGET: self.target, **self.settings}, "model.network", offered=offered, spare=PAPERS)
+        return having(network, ("width", "start", "forward"), f"model.network.{TARGET}={self.target}")
 
     def plain(self) -> dict[str, Any]:
         """Plain values for a file."""
-        return {"_target_": self.target, "samples": self.samples, **self.settings}
+        return {TARGET: self.target, "samples": self.samples, **self.settings}

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
-from hydra.utils import instantiate
 from lightning.pytorch.loggers import Logger
 
+from dlkf.classes import made
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.errors import InputError
 from dlkf.filters.learned import LearnedFilter
@@ -56,7 +56,7 @@ def fit(
             devices=1,
             logger=logger,
             callbacks=[
-                *(instantiate(c) for c in config["callbacks"].values() if c is not None),
+                *(made(c, f"callbacks.{name}") for name, c in config["callbacks"].items() if c is not None),
                 TrainingProgress(),
                 BestWeights(str(folder), _monitor(settings["monitor"], data), settings["best_from_epoch"], notes),
                 ResumePoint(str(folder), settings["checkpoint_every"]),

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import partial
-from importlib import import_module
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
 
+from dlkf.classes import TARGET, made
 from dlkf.data.drive import Batch
-from dlkf.errors import InputError
 from dlkf.filters.integration import Solution
 from dlkf.navigation.state import NavState
 from dlkf.settings import settings_from
@@ -93,20 +91,9 @@ def loss_of(values: Mapping[str, Any]) -> Loss:
     named losses, of which position, velocity and attitude get the weights in force. InputError where it cannot be
     found or takes other settings.
     """
-    values = dict(values)
-    if (target := values.pop("_target_", None)) is None:
-        return partial(pva_losses, config=settings_from(LossConfig, values, "loss"))
-    module, _, name = str(target).rpartition(".")
-    try:
-        made_by = getattr(import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise InputError(
-            f"loss._target_={target}: {error}; give module.Class, its module's folder in PYTHONPATH"
-        ) from None
-    takes = inspect.signature(made_by).parameters
-    if unknown := sorted(set(values) - set(takes) - PAPERS):
-        raise InputError(f"loss: {target} takes no {unknown[0]}; it takes {', '.join(takes) or 'nothing'}")
-    return made_by(**{k: v for k, v in values.items() if k in takes})
+    if TARGET in values:
+        return made(values, "loss", spare=PAPERS)
+    return partial(pva_losses, config=settings_from(LossConfig, values, "loss"))
 
 
 def weighted(losses: Mapping[str, Tensor], weights: dict[str, float]) -> Tensor:

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra.utils import instantiate
 from lightning.pytorch.loggers import Logger
 
 import dlkf
+from dlkf.classes import made
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import dataset_digest, load_dataset
@@ -55,7 +55,7 @@ class Outcome:
 
 def load_data(config: Mapping[str, Any], say: Say) -> DriveDataModule:
     """The data module of ``config['data']``, loaded and split."""
-    data: DriveDataModule = instantiate(config["data"])
+    data: DriveDataModule = made(config["data"], "data")
     data.setup()
     say(data.describe())
     return data
