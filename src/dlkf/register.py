@@ -11,7 +11,7 @@ from dlkf.command import command
 from dlkf.errors import InputError
 from dlkf.tracking.grid import best_of
 from dlkf.tracking.registry import check_registration, registered
-from dlkf.tracking.runs import mlflow_module, reachable, run_exists, store_missing, tracking_uri
+from dlkf.tracking.runs import client_of, reachable, run_exists, store_missing, tracking_uri
 
 
 @command("register")
@@ -22,7 +22,7 @@ def main(cfg: DictConfig) -> None:
     if store_missing(uri):
         raise InputError(f"there is no MLflow store at {uri.removeprefix('sqlite:///')}; give tracking.uri=…")
     with reachable(uri):
-        client = mlflow_module().MlflowClient(uri)
+        client = client_of(uri)
         if not run_exists(client, run_id):
             raise InputError(f"run={run_id}: {uri} has no such run")
         best = best_of(client, run_id)

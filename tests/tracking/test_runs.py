@@ -1,6 +1,8 @@
 """Runs: where they go, what they hold, how they end, how they are gone on with."""
 
 import json
+import subprocess
+import sys
 import time
 
 import pytest
@@ -35,6 +37,15 @@ def test_the_store_is_here_by_default(tmp_path, monkeypatch):
     assert tracking_uri(None) == "http://other"
     with pytest.raises(InputError, match="plain folder"):
         tracking_uri("./mlruns")
+
+
+def test_trainings_that_begin_together_share_a_new_store(tmp_path):
+    begin = (
+        f"from dlkf.tracking.runs import client_of; client_of('sqlite:///{tmp_path}/mlflow.db').search_experiments()"
+    )
+    together = [subprocess.Popen([sys.executable, "-c", begin], stderr=subprocess.PIPE) for _ in range(3)]
+    said = [p.communicate()[1] for p in together]
+    assert [p.returncode for p in together] == [0, 0, 0], said
 
 
 def test_a_run_holds_what_was_logged(uri, client, tmp_path):

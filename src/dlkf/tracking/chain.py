@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from dlkf.tracking.grid import PARENT_RUN, parent_status
-from dlkf.tracking.runs import experiment_id, mlflow_module, tracking_uri
+from dlkf.tracking.runs import client_of, experiment_id, tracking_uri
 
 
 class Study:
@@ -44,7 +44,7 @@ class Study:
     def parent(self, experiment: str, name: str) -> Iterator[None]:
         """One MLflow run above all trainings inside, the same one when the study goes on after a kill."""
         uri = tracking_uri(None)
-        client = mlflow_module().MlflowClient(uri)
+        client = client_of(uri)
         if "parent" not in self.done:
             self.remember("parent", client.create_run(experiment_id(client, experiment), run_name=name).info.run_id)
         os.environ[PARENT_RUN] = self.done["parent"]

@@ -25,8 +25,8 @@ from dlkf.tracking.registry import check_registration, registered
 from dlkf.tracking.runs import (
     NOTE_TAG,
     PARENT_TAG,
+    client_of,
     experiment_id,
-    mlflow_module,
     reachable,
     tracking_uri,
 )
@@ -56,9 +56,8 @@ class GridParent(Callback):
         try:
             check_registration(self.register, self.alias)
             self.uri = tracking_uri(config.tracking.uri)
-            mlflow = mlflow_module()
             with reachable(self.uri):
-                client = mlflow.MlflowClient(self.uri)
+                client = client_of(self.uri)
                 name = "grid " + " × ".join(grid_name(key, values) for key, values in swept.items())
                 run = client.create_run(experiment_id(client, config.name), run_name=name[:250])
         except InputError as error:  # Hydra would make a warning of it and go on
@@ -88,7 +87,7 @@ class GridParent(Callback):
         parent, self.run_id = self.run_id, None
         os.environ.pop(PARENT_RUN, None)
         os.environ.pop(SWEPT, None)
-        client = mlflow_module().MlflowClient(self.uri)
+        client = client_of(self.uri)
         for run in children(client, parent):
             if run.info.status == "RUNNING":
                 client.set_terminated(run.info.run_id, "FAILED")

@@ -19,6 +19,7 @@ from dlkf.running.solution import COLUMNS
 from dlkf.tracking.runs import (
     NOTE_TAG,
     Run,
+    client_of,
     found_again,
     mlflow_module,
     reachable,
@@ -176,10 +177,9 @@ def download_model(spec: str, uri: str | None = None) -> Path:
             f"model={spec}: there is no MLflow store at {uri.removeprefix('sqlite:///')}; "
             "run from the folder of the training or give tracking.uri=…"
         )
-    mlflow = mlflow_module()
     found_again(uri)
     with reachable(uri):
-        client = mlflow.MlflowClient(uri)
+        client = client_of(uri)
         find = _registered if spec.startswith("models:/") else _of_run
         return _fetch(find(client, spec, uri), spec, uri)
 
@@ -192,9 +192,7 @@ def _of_run(client: MlflowClient, spec: str, uri: str) -> str:
     logged = run.outputs.model_outputs if run.outputs else []
     if logged:
         return client.get_logged_model(logged[-1].model_id).artifact_location
-    children = client.search_runs(
-        [run.info.experiment_id], f"tags.`mlflow.parentRunId` = '{run_id}'", max_results=1
-    )
+    children = client.search_runs([run.info.experiment_id], f"tags.`mlflow.parentRunId` = '{run_id}'", max_results=1)
     if children:
         raise InputError(f"model={spec} is the parent run of a grid search; name one of its children")
     raise InputError(f"model={spec}: the run logged no model (its status is {run.info.status})")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import logging
 import math
@@ -69,6 +70,22 @@ def found_again(uri: str) -> None:
     """The artifacts of an embedded store whose folder was moved."""
     if uri.startswith(SQLITE):
         follow(Path(uri.removeprefix(SQLITE)), ARTIFACTS)
+
+
+def client_of(uri: str) -> MlflowClient:
+    """A client of the store. An embedded store is made or brought up to date by one process at a time: MLflow does not
+    see to that, and of two trainings that begin together one would fail."""
+    mlflow = mlflow_module()
+    if not uri.startswith(SQLITE):
+        return mlflow.MlflowClient(uri)
+    folder = Path(uri.removeprefix(SQLITE)).parent
+    folder.mkdir(parents=True, exist_ok=True)
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        return mlflow.MlflowClient(uri)
+    finally:
+        os.close(held)
 
 
 @contextmanager
@@ -208,7 +225,7 @@ def start_run(
     mlflow.set_system_metrics_sampling_interval(SAMPLE_EVERY_S)
     mlflow.set_system_metrics_samples_before_logging(SAMPLES_PER_POINT)
     with reachable(uri):
-        client = mlflow.MlflowClient(uri)
+        client = client_of(uri)
         resumed = run_id is not None and run_exists(client, run_id)
         if resumed:
             active = mlflow.start_run(run_id, log_system_metrics=system_metrics)
