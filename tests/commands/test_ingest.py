@@ -7,7 +7,8 @@ import pandas as pd
 import pytest
 
 from tests.cars import car
-from tests.data.logs import STDS, nmea
+from tests.data.logs import nmea
+from tests.data.logs.arrays import STDS
 
 
 @pytest.fixture(scope="module")

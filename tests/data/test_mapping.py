@@ -15,7 +15,8 @@ from dlkf.data.readers.mapping import respaced
 from dlkf.data.readers.units import degrees_minutes, leap_seconds, rotation, seconds, unwrapped
 from dlkf.errors import InputError
 from tests.cars import car
-from tests.data.logs import GPS, UNIX, metres
+from tests.data.logs import metres
+from tests.data.logs.clock import GPS, UNIX
 from tests.data.test_csv import PLAIN
 
 

@@ -1,7 +1,8 @@
 """ROS 1 and 2 bags by rosbags: IMU, fixes, velocities, NMEA sentences and u-blox messages.
 
-Tables have the contract's columns and ``t_ns``: the header's stamp, the bag's where a message has none. The axes of an
-IMU are those of its frame; velocities of geometry_msgs are East-North-Up (REP 103).
+Tables have the contract's columns and ``t_ns``: the header's stamp; of NMEA and u-blox messages the UTC that they
+carry; else the bag's. The axes of an IMU are those of its frame; velocities of geometry_msgs are East-North-Up
+(REP 103).
 """
 
 from __future__ import annotations
@@ -61,7 +62,8 @@ def _read(reader: Any, path: Path, kind: str, table: str | None) -> Table:
     for stamp, message in messages:
         header = getattr(message, "header", None)
         own = 0 if header is None else header.stamp.sec * 10**9 + header.stamp.nanosec
-        rows.append({"t_ns": own or stamp, **every[name](message)})
+        row = every[name](message)
+        rows.append({"t_ns": own or row.pop("utc_ns", None) or stamp, **row})
     if not rows:
         raise InputError(f"{path}: topic {chosen[0].topic} has no messages; give another one")
     frame = pd.DataFrame(rows)
@@ -98,14 +100,18 @@ def _twist(m: Any) -> Row:
 
 
 def _nav_pvt(m: Any) -> Row:
-    """ublox_msgs/NavPVT: the fields of UBX-NAV-PVT, as whole numbers."""
-    field = {name.lower(): getattr(m, name) for name in dir(m) if not name.startswith("_")}
+    """ublox_msgs/NavPVT: UBX-NAV-PVT in whole numbers, fields as ``h_acc`` or (older) ``hAcc``; 3 is a valid UTC."""
+    field = {name.lower().replace("_", ""): getattr(m, name) for name in dir(m) if name[0].islower()}
     h, v, s = field["hacc"] / 1000 / np.sqrt(2), field["vacc"] / 1000, field["sacc"] / 1000 / np.sqrt(3)
     row: Row = {"lat_deg": field["lat"] * 1e-7, "lon_deg": field["lon"] * 1e-7, "height_m": field["height"] / 1000}
     row |= dict(zip(VELOCITY, (field["veln"] / 1000, field["vele"] / 1000, field["veld"] / 1000)))
     flags = int(field["flags"])
-    fixed = bool(flags & 1) and int(field.get("fixtype", field.get("fix_type", 3))) in (2, 3, 4)
+    fixed = bool(flags & 1) and int(field["fixtype"]) in (2, 3, 4)
     row["quality"] = {2: 4, 1: 5}.get(flags >> 6, 2 if flags & 2 else 1) if fixed else 0
+    if field["valid"] & 3 == 3:
+        year, month, day, hour, minute, second = (int(field[k]) for k in ("year", "month", "day", "hour", "min", "sec"))
+        date = np.datetime64(f"{year:04d}-{month:02d}-{day:02d}T{hour:02d}:{minute:02d}", "ns").astype(np.int64)
+        row["utc_ns"] = int(date) + second * 10**9 + int(field["nano"])
     return row | dict(zip(STD, (h, h, v, s, s, s)))
 
 

@@ -86,8 +86,9 @@ def _frame(cells: pd.DataFrame, names: list[str], clock: str, path: Path) -> pd.
         ecef = [column.get(f"v{a}", nan) for a in "xyz"]
         east, north, up = pymap3d.ecef2enuv(*ecef, out["lat_deg"], out["lon_deg"])
         out |= dict(zip(VELOCITY, (north, east, -up)))
-        out |= dict.fromkeys(STD, nan)
-        out |= dict.fromkeys(STD[:3], np.sqrt(sum(column[f"sd{a}"] ** 2 for a in "xyz") / 3))
+        for names, mark in ((STD[:3], "sd"), (STD[3:], "sdv")):
+            square = np.mean([column.get(f"{mark}{a}", nan) ** 2 for a in "xyz"], 0)
+            out |= dict.fromkeys(names, np.sqrt(square))
     else:
         out |= dict(zip(POSITION, (column["latitude"], column["longitude"], column["height"])))
         out |= dict(zip(VELOCITY, (column.get("vn", nan), column.get("ve", nan), -column.get("vu", nan))))
