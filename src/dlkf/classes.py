@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from importlib import import_module
 from inspect import Parameter, signature
-from typing import Any
+from typing import Any, get_type_hints
 
 from dlkf.errors import InputError
+from dlkf.settings import fitted
 
 TARGET = "_target_"  # the key that names a class among its settings
 
@@ -43,7 +44,7 @@ def made(
     """The object of the class that ``_target_`` names, made with the settings that stand beside it.
 
     What is ``offered`` is given where the class takes it; keys that are ``spare`` may stand there without being taken.
-    InputError for a class that is not there, a setting it does not take, and one that it misses.
+    InputError for a class that is not there, a setting it does not take or takes otherwise, and one that it misses.
     """
     target = f"{where}.{TARGET}"
     if not values.get(TARGET):
@@ -60,7 +61,16 @@ def made(
     needed = [k for k, p in takes.items() if p.default is Parameter.empty and p.kind not in VARIABLE]
     if missing := [k for k in needed if k not in given]:
         raise InputError(f"{where}: {', '.join(missing)} missing")
-    return kind(**given)
+    hints = _hints(kind)
+    return kind(**{k: fitted(hints.get(k, Any), v, f"{where}.{k}") for k, v in given.items()})
+
+
+def _hints(kind: Any) -> dict[str, Any]:
+    """The types of a constructor's arguments, none where they cannot be read."""
+    try:
+        return get_type_hints(kind.__init__)
+    except (AttributeError, NameError, TypeError):
+        return {}
 
 
 VARIABLE = (Parameter.VAR_KEYWORD, Parameter.VAR_POSITIONAL)

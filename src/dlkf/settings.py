@@ -26,62 +26,68 @@ T = TypeVar("T", bound=Settings)
 def settings_from(kind: type[T], config: Any, where: str) -> T:
     """A settings dataclass from a mapping of its fields; fields that are dataclasses themselves take mappings.
 
-    InputError for an unknown or missing key, and for a value that is not of the field's type: a number (finite), true
-    or false, a word, a list of numbers, one of the literals; ``None`` where the field may have none. ``where`` is what
-    a user calls the mapping. An instance is handed on as it is.
+    InputError for an unknown or missing key, and for a value that is not of the field's type: a number (finite), a
+    whole one, true or false, a word, a list of numbers or words, one of the literals; ``None`` where the field may have
+    none. ``where`` is what a user calls the mapping, empty for the whole of a command's. An instance is handed on as
+    it is.
     """
     if isinstance(config, kind):
         return config
     if not isinstance(config, Mapping):
         raise InputError(f"{where}: is {config!r}, must be a mapping")
     known = {name: hint for name, hint in get_type_hints(kind).items() if name in kind.__dataclass_fields__}
+    head = f"{where}: " if where else ""
     if unknown := sorted(str(key) for key in config if key not in known):
-        raise InputError(f"{where}: unknown key {', '.join(unknown)}; known are {', '.join(known)}")
-    given = {key: _value(known[key], value, key, where) for key, value in config.items()}
-    try:
-        return kind(**given)
-    except TypeError:
-        optional = {f.name for f in fields(kind) if f.default is not MISSING or f.default_factory is not MISSING}
-        missing = ", ".join(key for key in known if key not in given and key not in optional)
-        raise InputError(f"{where}: {missing} missing") from None
+        raise InputError(f"{head}unknown key {', '.join(unknown)}; known are {', '.join(known)}")
+    given = {key: fitted(known[key], value, f"{where}.{key}" if where else key) for key, value in config.items()}
+    optional = {f.name for f in fields(kind) if f.default is not MISSING or f.default_factory is not MISSING}
+    if missing := [key for key in known if key not in given and key not in optional]:
+        raise InputError(f"{head}{', '.join(missing)} missing")
+    return kind(**given)
 
 
-def _value(hint: Any, value: Any, key: str, where: str) -> Any:
+def fitted(hint: Any, value: Any, where: str) -> Any:
+    """A plain value as a field of this type has it; InputError where it is of another. Other types take anything."""
     options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     for option in options:
         if isinstance(option, type) and is_dataclass(option):
             if isinstance(value, (Mapping, option)):
-                return settings_from(option, value, key)
+                return settings_from(option, value, where)
         elif _fits(option, value):
-            return tuple(float(x) for x in value) if _is_list(option) else value
+            return tuple(float(x) if float in get_args(option) else x for x in value) if _is_list(option) else value
     wanted = " or ".join(dict.fromkeys(_called(option) for option in options))
-    raise InputError(f"{where}: {key} is {value!r}, must be {wanted}")
+    raise InputError(f"{where} is {value!r}, must be {wanted}")
 
 
 def _fits(option: Any, value: Any) -> bool:
     if option is NoneType:
         return value is None
-    if option in (float, int):
+    if option is int:
+        return is_number(value) and value == int(value)
+    if option is float:
         return is_number(value)
     if option in (bool, str):
         return isinstance(value, option)
     if get_origin(option) is Literal:
         return value in get_args(option)
-    return isinstance(value, (list, tuple)) and all(map(is_number, value)) if _is_list(option) else True
+    if _is_list(option):
+        kind = next(x for x in get_args(option) if x is not ...)
+        return isinstance(value, (list, tuple)) and all(_fits(kind, x) for x in value)
+    return isinstance(value, Mapping) if get_origin(option) is Mapping else True
 
 
 def _is_list(option: Any) -> bool:
-    return get_origin(option) in (tuple, list, Sequence) and set(get_args(option)) <= {float, int, ...}
+    return get_origin(option) in (tuple, list, Sequence) and set(get_args(option)) <= {float, int, str, ...}
 
 
 def _called(option: Any) -> str:
     if get_origin(option) is Literal:
         return f"one of {', '.join(map(str, get_args(option)))}"
     if _is_list(option):
-        return "a list of numbers"
-    if isinstance(option, type) and is_dataclass(option):
+        return "a list of words" if str in get_args(option) else "a list of numbers"
+    if get_origin(option) is Mapping or (isinstance(option, type) and is_dataclass(option)):
         return "a mapping"
-    return {NoneType: "null", bool: "true or false", str: "a word"}.get(option, "a number")
+    return {NoneType: "null", bool: "true or false", str: "a word", int: "a whole number"}.get(option, "a number")
 
 
 def check_limits(settings: Settings, where: str, limits: Mapping[str, tuple[float, float]]) -> None:

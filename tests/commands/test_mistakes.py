@@ -315,6 +315,15 @@ SOLVED = ("model=mbkf15", "dataset=town", "out=made", *FAST["navigate"])
 TRAINED = ("data=drives", "data.datasets=[town]")
 OF_ALL_COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "a word for a seed": ("evaluate", (*SCORED, "seed=abc"), "seed is 'abc', must be a number"),
+    "a seed below zero": ("evaluate", (*SCORED, "seed=-1"), "seed is -1, must be a whole number ≥ 0"),
+    "roads of a seed below zero": ("simulate", ("seed=-3", "out=made"), "seed is -3"),
+    "a test of a seed below zero": ("train", (*TRAINED, "scoring.seed=-3"), "scoring.seed is -3"),
+    "a key too many": ("evaluate", (*SCORED, "+colour=red"), "unknown config key 'colour'"),
+    "a key too many in a section": ("navigate", (*SOLVED, "+align.colour=red"), "align: unknown key colour"),
+    "a key too many beside the store": ("navigate", (*SOLVED, "+tracking.colour=red"), "key 'tracking.colour'"),
+    "a key too many of a training": ("train", (*TRAINED, "++colour=red"), "unknown config key 'colour'"),
+    "a key too many of the data": ("train", (*TRAINED, "+data.colour=red"), "takes no colour"),
+    "a preset that the command does not take": ("ingest", ("+tuning=untuned", "source=x", "out=made"), "key 'tuning'"),
     "a word for a length": ("evaluate", (*SCORED, "length_s=long"), "length_s is 'long', must be a number"),
     "a word for a switch": ("evaluate", (*SCORED, "overwrite=maybe"), "overwrite is 'maybe', must be true or false"),
     "a baseline that nobody knows": ("evaluate", (*SCORED, "baseline=foo"), "baseline=foo is none of the models"),

@@ -11,7 +11,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 from dlkf.config import config_dir
 from dlkf.data.datamodule import DriveDataModule
-from dlkf.data.masks import withhold, within
+from dlkf.data.masks import Outage, withhold, within
 from dlkf.errors import InputError
 from tests.cars import REAL, write_cars
 
@@ -106,8 +106,8 @@ def test_batches_depend_on_seed_epoch_and_step_alone(town):
 
 
 def test_scoring_batches_are_fixed(town):
-    data = _module(town, eval_outage=(5, 10), eval_stride_s=10)
-    one, two = data.batches("test"), _module(town, eval_outage=(5, 10), eval_stride_s=10).batches("test")
+    data = _module(town, eval_outage={"first_s": 5, "duration_s": 10}, eval_stride_s=10)
+    one, two = data.batches("test"), _module(town, eval_outage=Outage(5, 10), eval_stride_s=10).batches("test")
     assert all(torch.equal(x.start.p_n, y.start.p_n) for x, y in zip(one, two))
     plain = _module(town, eval_stride_s=10).batches("test")
     assert torch.equal(withhold(plain[0], within(plain[0], 5, 10)).available, one[0].available)
@@ -158,7 +158,7 @@ def test_a_resumed_run_sees_the_batches_of_an_uninterrupted_one(town, tmp_path):
 def test_the_config_makes_a_module(town):
     """conf/data as Hydra gives it, lists and mappings of its own kind included."""
     split = "data.split={train:rest,val:[day-1],test:[day-2]}"
-    overrides = ["+data=drives", f"data.datasets=[{town}]", split, "data.eval_outage=[10,5]"]
+    overrides = ["+data=drives", f"data.datasets=[{town}]", split, "data.eval_outage={first_s:10,duration_s:5}"]
     overrides += ["start@data.start=coarse", "data.injected_bias={accel_mps2:0.1,gyro_dps:0.3}"]
     with initialize_config_dir(str(config_dir()), version_base="1.3"):
         data = instantiate(compose(overrides=overrides).data, length_s=10, eval_length_s=20)

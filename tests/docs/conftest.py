@@ -21,7 +21,8 @@ SMALL = {
     "evaluate": ["outage.first_s=10", "outage.duration_s=10", "length_s=25", "stride_s=25", "injected_bias=null"],
     "train": [
         "data.datasets=[data/consumer]", "data.fractions=[0.5,0.25,0.25]", "data.length_s=20", "data.eval_length_s=30",
-        "data.eval_outage=[10,10]", "trainer.max_epochs=1", "trainer.validate_every=1", "trainer.best_from_epoch=0",
+        "data.eval_outage={first_s:10,duration_s:10}", "trainer.max_epochs=1", "trainer.validate_every=1",
+        "trainer.best_from_epoch=0",
         "scoring.outage={first_s:10,duration_s:10}", "baselines.models=[mbkf15]", "baselines.tune=false",
         "baselines.pieces=2", "scoring.after_s=[]", "scoring.hour=null",
         "callbacks.curriculum.warm_s=15", "callbacks.curriculum.full_s=20",

@@ -171,8 +171,8 @@ def test_heading_is_not_carried_further_than_it_is_worth(drives):
     ({"serch_s": 3}, "align: unknown key serch_s"),
     ({"min_speed": 0}, "align.min_speed is 0"),
     ({"search_s": -1}, "align.search_s is -1"),
-    ({"search_s": math.nan}, "align: search_s is nan"),
-    ({"from_rest": 1}, "align: from_rest is 1"),
+    ({"search_s": math.nan}, "align.search_s is nan"),
+    ({"from_rest": 1}, "align.from_rest is 1"),
 ])  # fmt: skip
 def test_settings_are_checked(fault, said):
     with pytest.raises(InputError, match=said):

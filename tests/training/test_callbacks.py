@@ -58,7 +58,7 @@ def test_weights_ignore_a_diverged_epoch():
 
 def test_decimation_keeps_every_nth_fix_per_piece():
     batch = scene(200, 60)
-    kept = GnssDecimation(2, 5).transform(batch, 0, generator()).available
+    kept = GnssDecimation((2, 5)).transform(batch, 0, generator()).available
     intervals = set()
     for row in kept:
         at = (row.nonzero().flatten() + 1).tolist()
@@ -66,7 +66,7 @@ def test_decimation_keeps_every_nth_fix_per_piece():
         assert len(gaps) == 1 and at[0] == next(iter(gaps))
         intervals |= gaps
     assert intervals == {2, 3, 4, 5}
-    assert GnssDecimation(2, 5, start_epoch=3).transform(batch, 2, generator()) is batch
+    assert GnssDecimation((2, 5), start_epoch=3).transform(batch, 2, generator()) is batch
 
 
 def test_outages_have_the_paper_s_lengths_and_leave_room():
@@ -138,8 +138,8 @@ def test_guard_goes_back_to_the_last_good_epoch_at_a_slower_rate_and_gives_up_at
         lambda: LengthCurriculum(60, 20),
         lambda: LengthCurriculum(20, 60, 40, 20),
         lambda: AdaptiveLossWeights(w_max=0.5),
-        lambda: GnssDecimation(5, 2),
-        lambda: OutageInjection(30, 10),
+        lambda: GnssDecimation((5, 2)),
+        lambda: OutageInjection((30, 10)),
         lambda: StepGuard(slower=2.0),
         lambda: AdaptiveLossWeights(rule="none"),
     ],

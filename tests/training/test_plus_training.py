@@ -27,7 +27,7 @@ def settings(*overrides: str) -> dict:
     keys = ("model", "loss", "optimizer", "scheduler", "trainer", "callbacks", "seed", "finetune")
     config["trainer"] |= {"max_epochs": 2, "validate_every": 1, "accelerator": "cpu"}
     config["callbacks"]["curriculum"] |= {"warm_s": 20.0, "full_s": 25.0}
-    config["callbacks"]["outage"] |= {"shortest_s": 3.0, "longest_s": 8.0, "before_s": 5.0}
+    config["callbacks"]["outage"] |= {"duration_s": [3.0, 8.0], "before_s": 5.0}
     return {k: config[k] for k in keys}
 
 

@@ -22,7 +22,8 @@ def preset(path: str) -> dict:
 
 def data(dataset) -> DriveDataModule:
     return DriveDataModule(
-        [dataset], batch_size=9, length_s=20.0, eval_length_s=30.0, eval_outage=(10.0, 10.0), fractions=(0.6, 0.2, 0.2)
+        [dataset], batch_size=9, length_s=20.0, eval_length_s=30.0, fractions=(0.6, 0.2, 0.2),
+        eval_outage={"first_s": 10.0, "duration_s": 10.0},
     )
 
 
@@ -30,7 +31,7 @@ def settings(**trainer) -> dict:
     train = preset("train.yaml")
     callbacks = train["callbacks"]
     callbacks["curriculum"] |= {"warm_s": 10.0, "full_s": 20.0, "warm_until": 1, "full_from": 3}
-    callbacks["outage"] |= {"shortest_s": 3.0, "longest_s": 6.0, "before_s": 5.0, "start_epoch": 2}
+    callbacks["outage"] |= {"duration_s": [3.0, 6.0], "before_s": 5.0, "start_epoch": 2}
     train["trainer"] |= {"max_epochs": 5, "validate_every": 2, "best_from_epoch": 0, "accelerator": "cpu", **trainer}
     train["scheduler"]["restart_epochs"] = 3
     model = preset("filter/dlkf.yaml")

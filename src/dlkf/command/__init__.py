@@ -16,7 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from dlkf.command.arguments import checked_types, readable
+from dlkf.command.arguments import checked_keys, checked_seeds, checked_types, readable
 from dlkf.command.faults import fault
 from dlkf.command.help import help_text
 from dlkf.config import SWEPT, config_dir
@@ -49,7 +49,10 @@ def command(
             try:
                 for key in sorted(OmegaConf.missing_keys(cfg)):
                     raise InputError(f"{key} is missing; give {key}=…")
-                checked_types(name, cfg, list(hydra_config.overrides.task))
+                given = list(hydra_config.overrides.task)
+                checked_types(name, cfg, given)
+                checked_keys(name, cfg, given)
+                checked_seeds(OmegaConf.to_container(cfg))
                 if sweep and cfg.get("out"):
                     with open_dict(cfg):
                         cfg.out = str(Path(cfg.out) / point(hydra_config))

@@ -13,7 +13,7 @@ import torch
 from dlkf.data.augmentation import turn_frames
 from dlkf.data.degradation import GnssNoise
 from dlkf.data.drive import Batch, Drive
-from dlkf.data.masks import BiasLaw, with_bias, withhold, within
+from dlkf.data.masks import BiasLaw, Outage, with_bias, withhold, within
 from dlkf.data.segments import (
     Piece,
     StartLaw,
@@ -40,7 +40,7 @@ class DriveDataModule(L.LightningDataModule):
     ``start``. Batches depend on (seed, epoch, step) alone, so a resumed run sees what an uninterrupted one
     sees; with several processes each takes its share of every batch. Validation and test pieces of
     ``eval_length_s`` every ``eval_stride_s`` have start errors drawn from ``eval_seed``, each piece its own, so that
-    they are the same for every ``seed`` and ``batch_size``; ``eval_outage`` = (start_s, duration_s) withholds GNSS
+    they are the same for every ``seed`` and ``batch_size``; ``eval_outage`` withholds GNSS
     there. Lengths that change need ``Trainer(reload_dataloaders_every_n_epochs=1)``.
 
     Groups of the same name in several datasets count as one recording. ``split`` and ``fractions`` as in
@@ -61,7 +61,7 @@ class DriveDataModule(L.LightningDataModule):
         length_s: float = 60.0,
         eval_length_s: float = 60.0,
         eval_stride_s: float | None = None,
-        eval_outage: Sequence[float] | None = None,
+        eval_outage: Outage | Mapping[str, float] | None = None,
         min_valid: float = 1.0,
         start: StartLaw | Mapping[str, float] | None = None,
         turn_frames: bool = False,
@@ -82,7 +82,7 @@ class DriveDataModule(L.LightningDataModule):
         self.split, self.fractions = split, tuple(fractions)
         self.batch_size, self.train_length_s = batch_size, length_s
         self.eval_length_s, self.eval_stride_s, self.min_valid = eval_length_s, eval_stride_s, min_valid
-        self.eval_outage = _pair(eval_outage, "eval_outage")
+        self.eval_outage = None if eval_outage is None else settings_from(Outage, eval_outage, "data.eval_outage")
         law = None if injected_bias is None else settings_from(BiasLaw, injected_bias, "data.injected_bias")
         self.injected_bias = law
         self.start, self.turn_frames = StartLaw.of(start), turn_frames
@@ -181,7 +181,9 @@ class DriveDataModule(L.LightningDataModule):
         for k in range(0, len(pieces), self.batch_size):
             part = pieces[k : k + self.batch_size]
             batch = make_batch(self.stack, part, dtype=dtype or self.dtype, start=self.start, seed=self.eval_seed)
-            out.append(batch if self.eval_outage is None else withhold(batch, within(batch, *self.eval_outage)))
+            if self.eval_outage is not None:
+                batch = withhold(batch, within(batch, self.eval_outage.first_s, self.eval_outage.duration_s))
+            out.append(batch)
         return out
 
     def train_dataloader(self) -> TrainBatches:
@@ -289,15 +291,6 @@ class FixedBatches:
 
     def __iter__(self) -> Iterator[Batch]:
         return iter(self.batches)
-
-
-def _pair(values: Sequence[float] | None, name: str) -> tuple[float, float] | None:
-    if values is None:
-        return None
-    pair = tuple(float(v) for v in values)
-    if len(pair) != 2:
-        raise InputError(f"{name}={list(values)}: must be two numbers or null")
-    return pair
 
 
 def _seed(*numbers: int) -> int:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
+from dlkf.settings import check_from_zero
 
 
 @dataclass(frozen=True)
@@ -21,14 +22,23 @@ class BiasLaw:
     gyro_dps: float = 0.15
 
     def __post_init__(self) -> None:
-        for name in ("accel_mps2", "gyro_dps"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise InputError(f"injected_bias.{name} is {getattr(self, name)!r}, must be a number ≥ 0")
+        check_from_zero(self, "injected_bias.")
 
     @property
     def std(self) -> Float[Tensor, " 6"]:
         """[m/s²] of three accelerometers, [rad/s] of three gyroscopes; float64."""
         return torch.tensor([self.accel_mps2] * 3 + [math.radians(self.gyro_dps)] * 3, dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class Outage:
+    """One stretch without GNSS in every piece, seconds from its start."""
+
+    first_s: float
+    duration_s: float
+
+    def __post_init__(self) -> None:
+        check_from_zero(self, "outage.")
 
 
 def withhold(batch: Batch, hidden: Bool[Tensor, "b t"]) -> Batch:
