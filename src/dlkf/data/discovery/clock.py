@@ -158,7 +158,7 @@ def _scores(
         covariance = against(A, B) / n - np.conj(mean_a) * mean_b
         power_a = against(turned(np.abs(ours) ** 2), M).real / n - np.abs(mean_a) ** 2
         power_b = against(W, turned(np.abs(theirs) ** 2)).real / n - np.abs(mean_b) ** 2
-        least_a = 1e-3 * float(np.sum(np.abs(ours) ** 2)) / max(float(weight.sum()), 1.0)
+        least_a = 1e-3 * max(float(np.sum(np.abs(ours) ** 2)), 1e-9) / max(float(weight.sum()), 1.0)
         return covariance / np.sqrt(np.maximum(power_a, least_a) * np.maximum(power_b, 1e-4))
 
     yaws = np.clip(correlation(r * weight, g).real, -0.9999, 0.9999)
