@@ -143,6 +143,19 @@ def test_prior_mean_starts_the_bias():
     assert (solution.std[:, -1, 9:] < 2e-3).all()
 
 
+@pytest.mark.parametrize("name,count", [("mbkf21_prior", 12), ("mbkf33_prior", 24)])
+def test_a_prior_of_more_states_starts_the_sensor_matrices(name, count):
+    batch = scene(3, 3, seed=8)
+    M = 0.01 * torch.arange(1, count - 5, dtype=torch.float64)
+    told = build_filter(name, IMU, prior_mean=[0.0] * 6 + M.tolist(), prior_std=[1e-9] * count)
+    start = told.begin(batch)[1]
+    diagonal = start.matrix if start.matrix.ndim == 2 else start.matrix.diagonal(dim1=-2, dim2=-1).flatten(1)
+    first = M[:6] if count == 12 else torch.cat((M[:3], M[9:12]))
+    assert torch.equal(diagonal, first.expand(3, 6))
+    solution = integrate(batch, told, keep_covariances=True)
+    assert (solution.error.matrix[:, -1] - start.matrix).abs().max() < 1e-6
+
+
 @pytest.mark.parametrize("name", MODEL_BASED)
 def test_every_filter_runs_in_float32(name):
     
@@ -159,6 +172,7 @@ def test_every_filter_runs_in_float32(name):
         ({"name": "mbkf15", "tuning": {"accel_noise": -1.0}}, "above 0"),
         ({"name": "mbkf15_prior"}, "prior.mean"),
         ({"name": "mbkf15_prior", "prior_mean": [0.0], "prior_std": [1.0]}, "6 values"),
+        ({"name": "mbkf33_prior", "prior_mean": [0.0] * 6, "prior_std": [1.0] * 6}, "24 values"),
     ],
 )
 def test_mistakes_are_one_clear_line(arguments, words):

@@ -15,7 +15,8 @@ from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.tuning import Tuning
-from dlkf.tuning.search import FACTORS, factors_of, outage_error, tuned
+from dlkf.tuning.baselines import tuned_baselines
+from dlkf.tuning.search import FACTORS, factors_of, mean_imu_error, outage_error, tuned
 from dlkf.tuning.study import check
 from tests.cars import IMU
 
@@ -61,6 +62,36 @@ def test_every_filter_has_the_factors_that_it_uses():
     known = set(Tuning.__dataclass_fields__)
     for name in ("mbkf15_nhc", "mbkf21_car", "mbkf15_gated", "aekf"):
         assert set(factors_of(name)) <= known
+
+
+def one_unit(batch):
+    """All pieces with the sensor matrices of one unit, 2 % of scale and misalignment, and an IMU that is told so."""
+    M = torch.zeros(2, 3, 3, dtype=torch.float64)
+    M[0, 0, 0], M[0, 1, 0], M[1, 2, 2] = 0.02, 0.02, -0.02
+    forces, rates = (batch.imu[..., :3] @ M[0].mT, batch.imu[..., 3:] @ M[1].mT)
+    wide = {"scale_factor": 0.02, "misalignment": 0.02}
+    told = replace(IMU, accel=replace(IMU.accel, **wide), gyro=replace(IMU.gyro, **wide))
+    return replace(batch, imu=batch.imu + torch.cat((forces, rates), -1)), told, M
+
+
+def test_many_pieces_together_show_the_sensor_matrices_of_their_unit(cars):
+    batch, told, M = one_unit(cars)
+    prior = mean_imu_error(told, Tuning(), [hidden(batch)], "mbkf33")
+    assert len(prior.mean) == len(prior.std) == 24
+    states = build_filter("mbkf33", told).states
+    of = {(s, e): 6 + 9 * s + k for s in range(2) for k, e in enumerate(states.elements)}
+    for place in ((0, (0, 0)), (0, (1, 1)), (1, (2, 2))):  # what speeding up and turning show
+        mean, std = (x[of[place]] for x in prior)
+        assert std < 0.004 and abs(mean - float(M[place[0]][place[1]])) < 4 * std
+    assert prior.std[of[1, (2, 0)]] > 0.015  # a car that does not roll shows nothing of this one
+
+
+def test_a_filter_that_is_told_its_unit_drifts_less(cars):
+    batch, told, _ = one_unit(cars)
+    found = tuned_baselines(["mbkf15_prior", "mbkf33", "mbkf33_prior"], told, [hidden(batch)], rounds=0, say=str)
+    assert len(found.priors["mbkf15_prior"].mean) == 6 and len(found.priors["mbkf33_prior"].mean) == 24
+    told, untold = (outage_error(found.build()[n], [hidden(batch)]) for n in ("mbkf33_prior", "mbkf33"))
+    assert told < 0.8 * untold
 
 
 @pytest.mark.parametrize("model", ["ins", "mbkf15_prior", "no_such"])

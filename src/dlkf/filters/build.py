@@ -55,7 +55,9 @@ def build_filter(
     prior_mean: Sequence[float] | None = None,
     prior_std: Sequence[float] | None = None,
 ) -> Estimator | Smoothed:
-    """A model-based filter for an IMU; ``prior_*`` (6 values, m/s² and rad/s) belong to names with ``_prior``.
+    """A model-based filter for an IMU; ``prior_*`` belong to names with ``_prior``.
+
+    They are 6 values (m/s², rad/s) and, with 21 or 33 states, the elements of the sensor matrices in their order.
 
     With the ending ``rts`` it is no estimator but a filter to be smoothed, which only looks back on whole drives.
     Raises InputError for an unknown name, an unknown tuning factor, a missing prior, or an own source that is missing.
@@ -67,17 +69,20 @@ def build_filter(
     kind, *own = name.split("+")
     base, *endings = kind.split("_")
     given = {}
+    states = ErrorStates(KALMAN[base], structure="car" in endings)
     if "prior" in endings:
         if prior_mean is None or prior_std is None:
             raise InputError(
                 f"model {name} needs the training set's mean IMU error: give prior.mean and prior.std "
-                "(6 values each, m/s² then rad/s) or let dlkf.train find them"
+                f"({states.imu} values each, m/s² then rad/s) or let dlkf.train find them"
             )
-        if len(prior_mean) != 6 or len(prior_std) != 6:
-            raise InputError(f"prior.mean and prior.std of {name} must have 6 values (m/s² x3, rad/s x3)")
+        if len(prior_mean) != states.imu or len(prior_std) != states.imu:
+            more = ", then the elements of both sensor matrices" if states.elements else ""
+            raise InputError(
+                f"prior.mean and prior.std of {name} must have {states.imu} values (m/s² x3, rad/s x3{more})"
+            )
         given = {"prior_mean": tuple(map(float, prior_mean)), "prior_std": tuple(map(float, prior_std))}
     factors = settings_from(Tuning, tuning or {}, "tuning")
-    states = ErrorStates(KALMAN[base], structure="car" in endings)
     sources: list[Source] = []
     if {"nhc", "car"} & set(endings):
         sources.append(CarConstraints(factors, states))

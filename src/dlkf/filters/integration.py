@@ -93,8 +93,9 @@ class Correction(NamedTuple):
 class Estimator(Protocol):
     """The part of a filter that differs from filter to filter."""
 
-    def begin(self, batch: Batch) -> tuple[Any, Tensor]:
-        """Memory at the start of a batch and the IMU error (B, 6) in force until the first epoch ends."""
+    def begin(self, batch: Batch) -> tuple[Any, Tensor | ImuError]:
+        """Memory at the start of a batch and the IMU error in force until the first epoch ends: (B, 6), or with the
+        sensor matrices."""
         ...
 
     def step(self, memory: Any, epoch: Epoch) -> tuple[Any, Correction]:
@@ -152,7 +153,7 @@ def advance(
     z = (fix.value - predicted) * fix.used
     epoch = Epoch(imu, corrected, error, state, window, at_fix, rate_b, z, fix, lever_arm_b, dt, frame)
     memory, answer = estimator.step(memory, epoch)
-    after = answer.imu_error if isinstance(answer.imu_error, ImuError) else ImuError(answer.imu_error)
+    after = ImuError.of(answer.imu_error)
     complete = after.bias if after.matrix is None else after.at(corrected.mean(1))
     return memory, Step(prior, prior.corrected(answer.dx), after, z, complete, answer)
 
@@ -161,7 +162,7 @@ def integrate(batch: Batch, estimator: Estimator, *, keep_covariances: bool = Fa
     """Run an estimator over a batch from its start state; differentiable where the estimator is."""
     state = batch.start
     memory, imu_error = estimator.begin(batch)
-    error = ImuError(imu_error)
+    error = ImuError.of(imu_error)
     usable = batch.gnss_valid & batch.available.unsqueeze(-1)
     late = bool(batch.gnss_lag.any())
     lever_arm_b = batch.lever_arm_b if bool(batch.lever_arm_b.any()) else None

@@ -17,6 +17,7 @@ from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
 from dlkf.filters.sources import Believed, FixMemory, GnssFix, Measurement, Source
 from dlkf.filters.tuning import Tuning
+from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import STANDARD_GRAVITY
 from dlkf.navigation.error_model import PLAIN, WindowModel, masked, source_scale, window_model
 from dlkf.navigation.imu_errors import ImuSpec
@@ -71,17 +72,17 @@ def bias_sigma(imu: ImuSpec, states: ErrorStates = PLAIN) -> Float[Tensor, " 6"]
 class Mbkf:
     """Error-state Kalman filter with position, velocity, attitude and IMU errors (paper eqs 1–6).
 
-    ``states`` gives 15 (the paper's), 21 or 33 of them. ``prior_mean`` and ``prior_std`` [m/s², rad/s] replace
-    zero and the preset's spread as the bias's initial knowledge: with a training set's mean error this is
-    ``mbkf15_prior`` (paper.md 4.6). ``gauss_markov`` lets the biases decay with the preset's correlation time
-    instead of walking. ``gated`` refuses outliers among the fixes, ``sources`` gives further measurements, ``noise``
-    adapts Q and R to the innovations.
+    ``states`` gives 15 (the paper's), 21 or 33 of them. ``prior_mean`` and ``prior_std`` [m/s², rad/s, then elements
+    of the sensor matrices as the states have them] replace zero and the preset's spread as the initial knowledge of
+    the IMU: with a training set's mean error these are ``mbkf15_prior``, ``mbkf33_prior`` (paper.md 4.6).
+    ``gauss_markov`` lets the biases decay with the preset's correlation time instead of walking. ``gated`` refuses
+    outliers among the fixes, ``sources`` gives further measurements, ``noise`` adapts Q and R to the innovations.
     """
 
     imu: ImuSpec
     tuning: Tuning = field(default_factory=Tuning)
     states: ErrorStates = PLAIN
-    prior_mean: tuple[float, ...] = (0.0,) * 6
+    prior_mean: tuple[float, ...] | None = None
     prior_std: tuple[float, ...] | None = None
     gauss_markov: bool = False
     gated: bool = False
@@ -94,8 +95,8 @@ class Mbkf:
         """Where GNSS comes in."""
         return GnssFix(self.tuning, self.states.count, self.gated)
 
-    def begin(self, batch: Batch) -> tuple[Memory, Tensor]:
-        """P₀ from the start's law and the preset; biases at their prior mean."""
+    def begin(self, batch: Batch) -> tuple[Memory, ImuError]:
+        """P₀ from the start's law and the preset; the IMU error at its prior mean."""
         like = {"dtype": batch.imu.dtype, "device": batch.imu.device}
         B, _, M = batch.size
         sigma = torch.cat((batch.start_std, self._imu_sigma().to(**like).expand(B, -1)), -1)
@@ -112,7 +113,11 @@ class Mbkf:
         )  # fmt: skip
         sources = tuple(source.begin(batch) for source in self.sources)
         memory = Memory(torch.diag_embed(sigma**2), windows, self.fix.begin(batch), sources, structure)
-        return memory, torch.tensor(self.prior_mean, **like).repeat(B, 1)
+        known = torch.zeros(B, 9, **like)
+        if self.prior_mean is None:
+            return memory, ImuError(known[:, :6])
+        mean = torch.tensor(self.prior_mean, **like).expand(B, -1)
+        return memory, ImuError(torch.zeros_like(known[:, :6])).updated(torch.cat((known, mean), -1), self.states)
 
     def psd(self) -> dict[str, float]:
         """Over-bounded power spectral densities of the noise sources (R016)."""
@@ -174,7 +179,9 @@ class Mbkf:
             return memory.windows.transition(epoch.start.detach(), window, epoch.corrected.detach(), epoch.frame)
 
     def _imu_sigma(self) -> Float[Tensor, " k"]:
-        bias = bias_sigma(self.imu, self.states) if self.prior_std is None else torch.tensor(self.prior_std).double()
+        if self.prior_std is not None:
+            return torch.tensor(self.prior_std, dtype=torch.float64)
+        bias = bias_sigma(self.imu, self.states)
         of_matrix = [
             sensor.scale_factor if i == j else sensor.misalignment
             for sensor in (self.imu.accel, self.imu.gyro)

@@ -144,7 +144,7 @@ class PlusFilter(nn.Module):
         yield from self.network.noise.parameters()
         yield from self.network.speed.parameters()
 
-    def begin(self, batch: Batch) -> tuple[Memory, Tensor]:
+    def begin(self, batch: Batch) -> tuple[Memory, Tensor | ImuError]:
         """Of the Kalman filter, and nothing seen yet."""
         kalman, error = self.kalman.begin(batch)
         zeros, B = batch.imu.new_zeros, batch.size[0]

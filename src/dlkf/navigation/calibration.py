@@ -20,6 +20,11 @@ class ImuError(NamedTuple):
     bias: Tensor
     matrix: Tensor | None = None
 
+    @classmethod
+    def of(cls, error: Tensor | ImuError) -> ImuError:
+        """Of an estimator's answer: biases (B, 6) alone, or all of it."""
+        return error if isinstance(error, ImuError) else cls(error)
+
     def corrected(self, raw: Float[Tensor, "B M 6"]) -> Float[Tensor, "B M 6"]:
         """The samples without the error: (I + M)⁻¹ (raw − bias)."""
         samples = raw - self.bias.unsqueeze(1)

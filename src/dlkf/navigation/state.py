@@ -54,6 +54,11 @@ class ErrorStates:
         return STATES + 2 * len(self.elements)
 
     @property
+    def imu(self) -> int:
+        """Number of states of the IMU error: biases and sensor matrices."""
+        return self.navigation - PVA.stop
+
+    @property
     def count(self) -> int:
         """Number of states."""
         return self.navigation + (len(STRUCTURE) if self.structure else 0)

@@ -332,7 +332,7 @@ class StreamingFilter:
             return None
         self._first = whole_drives([drive], [start]).to(self._device)
         memory, imu_error = self.estimator.begin(self._first)
-        return Running(memory, self._first.start, ImuError(imu_error), self._first.frame)
+        return Running(memory, self._first.start, ImuError.of(imu_error), self._first.frame)
 
     def _drive(self, epochs: Sequence[Closed]) -> Drive:
         """Closed epochs as a drive without reference."""

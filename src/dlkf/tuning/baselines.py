@@ -13,29 +13,43 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Estimator
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.tuning.search import Prior, best_prior, factors_of, outage_error, tuned, tuning_values
+from dlkf.tuning.search import (
+    Prior,
+    best_prior,
+    factors_of,
+    has_prior,
+    outage_error,
+    tuned,
+    tuning_values,
+    without_prior,
+)
 
 FIRST = "mbkf15"  # where the others' search starts, and what the mean IMU error is estimated with
 
 
 @dataclass(frozen=True)
 class Baselines:
-    """Filters by name with the factors each was given, and what those with ``_prior`` are told."""
+    """Filters by name with the factors each was given, the mean IMU error, and what each with ``_prior`` is told."""
 
     imu: ImuSpec
     tunings: dict[str, Tuning]
     prior: Prior
+    priors: dict[str, Prior]
 
     def build(self) -> dict[str, Estimator]:
         """The filters."""
-        return {n: build_filter(n, self.imu, tuning=t, **self.prior.told(n)) for n, t in self.tunings.items()}
+        return {n: build_filter(n, self.imu, tuning=t, **self.told(n)) for n, t in self.tunings.items()}
+
+    def told(self, name: str) -> dict[str, Any]:
+        """For ``build_filter``: nothing for a filter without ``_prior``."""
+        return self.priors[name].told(name) if name in self.priors else {}
 
     def described(self) -> dict[str, Any]:
         """Plain values for a report."""
         return {
             "imu": self.imu.name,
             "tuning": {n: tuning_values(t) for n, t in self.tunings.items() if n != "ins"},
-            "prior": {"mean": list(self.prior.mean), "std": list(self.prior.std)},
+            "prior": {n: {"mean": list(p.mean), "std": list(p.std)} for n, p in self.priors.items()},
         }
 
 
@@ -44,21 +58,25 @@ def tuned_baselines(
 ) -> Baselines:
     """Tune each of ``names`` on the outages of training pieces; 0 ``rounds`` leave the factors as they come.
 
-    All but ``ins`` start at those of ``mbkf15`` and search over their own (:func:`dlkf.tuning.search.factors_of`).
+    All but ``ins`` start at those of ``mbkf15``, one with ``_prior`` at those of the same filter without, and search
+    over their own (:func:`dlkf.tuning.search.factors_of`).
     """
     first, _ = _searched(imu, batches, FIRST, rounds)
     prior = best_prior(imu, first, batches)
+    priors: dict[str, Prior] = {}
     tunings: dict[str, Tuning] = {}
     for name in names:
-        start = Tuning() if name == "ins" else first
+        start = Tuning() if name == "ins" else tunings.get(without_prior(name), first)
+        if has_prior(name):
+            priors[name] = prior if name == f"{FIRST}_prior" else best_prior(imu, start, batches, name)
         if name in ("ins", FIRST):
             tunings[name] = start
             error = outage_error(build_filter(name, imu, tuning=start), batches)
         else:
-            tunings[name], error = _searched(imu, batches, name, rounds, start, prior)
+            tunings[name], error = _searched(imu, batches, name, rounds, start, priors.get(name))
         how = "tuned" if rounds and name != "ins" else "untuned"
         say(f"{name} {how}: {error:.2f} m at the end of the outages of training pieces (geometric mean)")
-    return Baselines(imu, tunings, prior)
+    return Baselines(imu, tunings, prior, priors)
 
 
 def _searched(

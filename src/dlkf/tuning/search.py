@@ -12,13 +12,18 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import end_errors, mean_error
 from dlkf.filters.build import build_causal, build_filter
 from dlkf.filters.integration import Estimator, integrate
+from dlkf.filters.model_based import Mbkf
 from dlkf.filters.tuning import Tuning
+from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.imu_errors import ImuSpec
+from dlkf.navigation.state import ErrorStates
 
 FACTORS: Mapping[str, tuple[float, ...]] = {
     "accel_noise": (1.0, 3.0, 10.0, 30.0, 100.0),
@@ -107,46 +112,90 @@ def tuned(
 
 
 class Prior(NamedTuple):
-    """What is known of an IMU error before a drive (m/s² x 3, rad/s x 3): mean and 1σ."""
+    """What is known of an IMU error before a drive: mean and 1σ.
+
+    m/s² x 3, rad/s x 3; of a filter with more states also the elements of both sensor matrices.
+    """
 
     mean: tuple[float, ...]
     std: tuple[float, ...]
 
     def told(self, name: str) -> dict[str, tuple[float, ...]]:
         """For ``build_filter``: nothing for a filter without ``_prior``."""
-        return {"prior_mean": self.mean, "prior_std": self.std} if "prior" in name.split("_") else {}
+        return {"prior_mean": self.mean, "prior_std": self.std} if has_prior(name) else {}
 
     def surer(self, factor: float) -> Prior:
         """The same mean with the spread times ``factor``."""
         return Prior(self.mean, tuple(factor * s for s in self.std))
 
 
-def mean_imu_error(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch]) -> Prior:
-    """Mean and spread of the IMU error over training pieces, as the 15-state filter estimates it with GNSS.
+def has_prior(name: str) -> bool:
+    """Whether a filter of this name is told an IMU error before the drive."""
+    return "prior" in name.partition("+")[0].split("_")
 
-    No truth is used. The spread of the estimates about their mean is what a filter that starts from the mean
-    still has to find: the estimator's own scatter where all drives share one IMU, the turn-on spread where
-    they do not.
+
+def without_prior(name: str) -> str:
+    """The name of the same filter that is told nothing."""
+    return "_".join(part for part in name.split("_") if part != "prior")
+
+
+def mean_imu_error(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name: str = "mbkf15") -> Prior:
+    """Mean and spread of the IMU error over training pieces, as a filter estimates it with GNSS.
+
+    No truth is used. Biases: mean and spread of the estimates. The spread is what a filter that starts from the mean
+    still has to find: the estimator's own scatter where all drives share one IMU, the turn-on spread where they do
+    not. Sensor matrices, which a piece of a minute or two hardly shows: all pieces together as measurements of one
+    unit, Λ = Λ₀ + Σ (Pᵢ⁻¹ − Λ₀) and mean Λ⁻¹ Σ Pᵢ⁻¹ xᵢ for estimates xᵢ, Pᵢ that began at zero and Λ₀⁻¹. (A turn of
+    all axes together is not told from attitude; it does no harm, but its spread comes out too small.)
     """
-    last = []
+    estimator = build_causal(name, imu, "a prior does not", tuning=tuning)
+    assert isinstance(estimator, Mbkf)
+    states = estimator.states
+    last, pulls, gains, before = [], [], [], None
     for batch in batches:
         seen = replace(batch, available=torch.ones_like(batch.available))
         with torch.inference_mode():
-            filtered = integrate(seen, build_causal("mbkf15", imu, "a prior does not", tuning=tuning))
-        last.append(filtered.imu_error[:, -1])
+            filtered = integrate(seen, estimator, keep_covariances=True)
+            before = _information(estimator.begin(seen)[0].P, states)[0]
+        assert filtered.covariances is not None and filtered.error is not None
+        known = _information(filtered.covariances.updated[:, -1], states)
+        last.append(_imu_states(filtered.error, states).double())
+        gains.append((known - before).sum(0))
+        pulls.append((known @ last[-1][:, 6:, None]).sum(0))
     estimates = torch.cat(last)
-    floor = torch.tensor([1e-3] * 3 + [1e-5] * 3, dtype=estimates.dtype)
-    mean, spread = estimates.mean(0), torch.maximum(estimates.std(0), floor)
-    return Prior(tuple(mean.tolist()), tuple(spread.tolist()))
+    floor = torch.tensor([1e-3] * 3 + [1e-5] * (states.imu - 3), dtype=estimates.dtype)
+    mean, spread = estimates.mean(0), estimates.std(0)
+    if states.elements:
+        together = torch.linalg.inv(before + torch.stack(gains).sum(0))
+        mean[6:] = (together @ torch.stack(pulls).sum(0))[:, 0]
+        spread[6:] = together.diagonal().sqrt()
+    return Prior(tuple(mean.tolist()), tuple(torch.maximum(spread, floor).tolist()))
+
+
+def _information(P: Float[Tensor, "B n n"], states: ErrorStates) -> Float[Tensor, "B m m"]:
+    """Inverse covariance of the sensor matrices, the other states unknown."""
+    return torch.linalg.inv(P[:, states.of_matrix, states.of_matrix].double())
+
+
+def _imu_states(error: ImuError, states: ErrorStates) -> Float[Tensor, "B k"]:
+    """Biases and elements of the sensor matrices at the end of a run, in the order of the states."""
+    bias = error.bias[:, -1]
+    if error.matrix is None:
+        return bias
+    matrix = error.matrix[:, -1]
+    if states.matrix == "full":
+        rows, columns = (list(x) for x in zip(*states.elements))
+        matrix = matrix[:, :, rows, columns].flatten(1)
+    return torch.cat((bias, matrix), -1)
 
 
 def best_prior(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name: str = "mbkf15_prior") -> Prior:
-    """The mean IMU error with the spread, of three, that serves ``name`` best in the outages of training pieces.
+    """The mean IMU error with the spread, of four, that serves ``name`` best in the outages of training pieces.
 
     The spread of the estimates is their estimator's scatter where all drives share one IMU, and then too wide.
     """
-    prior = mean_imu_error(imu, tuning, batches)
-    tried = [prior.surer(factor) for factor in (1.0, 0.3, 0.1)]
+    prior = mean_imu_error(imu, tuning, batches, without_prior(name))
+    tried = [prior.surer(factor) for factor in (3.0, 1.0, 0.3, 0.1)]
     return min(tried, key=lambda p: outage_error(build_filter(name, imu, tuning=tuning, **p.told(name)), batches))
 
 
