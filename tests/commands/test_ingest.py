@@ -61,7 +61,7 @@ MISTAKES = {
     "unknown key": (["reader.imu.acel.unit=g"], "reader.imu: unknown key acel"),
     "unknown setting": (["reader.colour=red"], "takes no colour"),
     "module": (["reader._target_=mine.Reader"], "reader._target_=mine.Reader: No module named"),
-    "lever arm": (["reader.lever_arm_m=0.5"], "reader.lever_arm_m=0.5: must be three numbers"),
+    "lever arm": (["reader.lever_arm_m=0.5"], "reader.lever_arm_m is 0.5, must be a list of numbers"),
     "format": (["reader.gnss.format=gpx"], "reader.gnss.format=gpx: unknown"),
     "not a UBX log": (["reader.gnss.format=ubx"], "has no NAV-PVT message"),
     "axes": (["reader.imu.accel.axes=frx"], "axes 'frx' must be three letters"),
