@@ -121,7 +121,11 @@ def test_float32_stays_within_centimetres_of_float64():
     assert vector_from_rotation(exact.C_nb @ rough.C_nb.double().mT).abs().max() < 3e-5
 
 
-def test_adjoint_agrees_with_finite_differences():
+@pytest.mark.parametrize("loops", [True, False])
+def test_adjoint_agrees_with_finite_differences(loops, monkeypatch):
+    """Both forms of the gradient: compiled loops and tensor operations."""
+    assert compiled.AVAILABLE
+    monkeypatch.setattr(compiled, "AVAILABLE", loops)
     frame, imu, base = frame_at(), lively_imu(1, 6), start(1)
 
     def states(p, v, turn, samples):
@@ -193,3 +197,26 @@ def test_compiled_form_is_the_tensor_form(dtype):
     eps = torch.finfo(dtype).eps
     for one, other in zip((*got[:3], *got.end), (*expected[:3], *expected.end)):
         assert (one - other).abs().max() < 50 * eps * other.abs().max()
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_compiled_gradient_is_that_of_the_tensor_form(dtype, monkeypatch):
+    """Of all samples' states and of the end's alone (as where no gradient goes through a network's inputs)."""
+    frame, imu, base = frame_at(batch=3, dtype=dtype), lively_imu(3, M).to(dtype), start(3)
+    base = NavState(*(x.to(dtype) for x in base))
+    g = torch.Generator().manual_seed(9)
+    weights = [torch.randn(3, M, *shape, generator=g, dtype=torch.float64).to(dtype) for shape in ((3,), (3,), (3, 3))]
+
+    def gradients(loops: bool, samples: bool) -> tuple[torch.Tensor, ...]:
+        monkeypatch.setattr(compiled, "AVAILABLE", loops)
+        inputs = [x.clone().requires_grad_() for x in (*base, imu)]
+        window = strapdown(NavState(*inputs[:3]), inputs[3], DT, frame)
+        value = sum((x * w[:, -1]).sum() for x, w in zip(window.end, weights))
+        if samples:
+            value = value + sum((x * w).sum() for x, w in zip(window[:3], weights))
+        return torch.autograd.grad(value, inputs)
+
+    for samples in (True, False):
+        for one, other in zip(gradients(True, samples), gradients(False, samples)):
+            # sums over 50 samples in another order
+            assert (one - other).abs().max() < 50 * torch.finfo(dtype).eps * other.abs().max()

@@ -13,7 +13,8 @@ S = Σ ΔV and P = Σ ΔP the velocity and position gained from specific force, 
     p(t) = p₀ + v₀ t + g t²/2 + P − ω × (t P + v₀ t² + g t³/3).
 
 The gradient is written out by hand (the adjoint of a prefix product is a suffix sum), which costs one
-forward pass instead of a graph of some hundred nodes.
+forward pass instead of a graph of some hundred nodes. Both are here for tensors on any device; with numba
+and on a CPU the loops of :mod:`dlkf.navigation.compiled` take their place.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dlkf.navigation import compiled
+from dlkf.navigation import compiled, compiled_adjoint
 from dlkf.navigation.attitude import orthonormalised, prefix_rotations, skew
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import NavState
@@ -68,7 +69,8 @@ def strapdown(
         half = 0.5 * dt * imu.shape[1]
         gravity = frame.gravity(torch.add(start.p_n, start.v_n, alpha=half))
     if torch.is_grad_enabled():
-        p, v, C, *end = _Strapdown.apply(
+        function = _CompiledStrapdown if compiled.AVAILABLE and imu.device.type == "cpu" else _Strapdown
+        p, v, C, *end = function.apply(
             start.p_n, start.v_n, start.C_nb, imu, dt, gravity, frame.gravity_gradient(), frame.earth_rate_n
         )
     elif compiled.fits(imu):
@@ -167,6 +169,38 @@ class _Strapdown(torch.autograd.Function):
         grad_phi = grad_phi + _cross(f, e1) + e2 * _dot(phi, f) + f * _dot(e2, phi) - 2 * phi * _dot(f, e2)
         grad_imu = torch.cat((grad_f, grad_phi * dt)).permute(1, 2, 0)
         return grad_p0, grad_v0, grad_C0, grad_imu, None, None, None, None
+
+
+class _CompiledStrapdown(torch.autograd.Function):
+    """The same by compiled loops, samples first and axes last as they come."""
+
+    @staticmethod
+    def forward(ctx, p0, v0, C0, imu, dt, g, gradient, earth_rate):
+        C0, imu = C0.detach(), imu.detach()
+        p, v, C = compiled.mechanised(p0.detach(), v0.detach(), C0, imu, dt, g, earth_rate)
+        ctx.save_for_backward(C0, imu, gradient, earth_rate)
+        ctx.dt = dt
+        ctx.set_materialize_grads(False)
+        return p, v, C, p[:, -1].clone(), v[:, -1].clone(), orthonormalised(C[:, -1])
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, Gp, Gv, GC, gp, gv, gC):
+        C0, imu, gradient, earth_rate = ctx.saved_tensors
+        vectors = imu[..., :3]
+        Gp, Gv = _ended(Gp, gp, vectors), _ended(Gv, gv, vectors)
+        if GC is not None or gC is not None:
+            GC = _ended(GC, gC, C0.unsqueeze(1).expand(-1, imu.shape[1], 3, 3))
+        p0, v0, turn, samples = compiled_adjoint.adjoint(C0, imu, ctx.dt, gradient, earth_rate, Gp, Gv, GC)
+        return p0, v0, 0.5 * skew(turn) @ C0, samples, None, None, None, None
+
+
+def _ended(samples: Tensor | None, end: Tensor | None, like: Tensor) -> Tensor:
+    """Gradient of all samples (B, M, …) with that of the end state added to the last."""
+    full = torch.zeros(like.shape, dtype=like.dtype) if samples is None else samples.clone()
+    if end is not None:
+        full[:, -1] += end
+    return full
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from dlkf.errors import InputError
 from dlkf.networks.features import CNN_CHANNELS, COMPONENTS
+from dlkf.networks.products import EpochLayers
 
 FUSIONS = ("concat", "strict30")
 CELLS = {"lstm": nn.LSTMCell, "gru": nn.GRUCell, "none": None}
@@ -103,6 +104,7 @@ class CnnLstm(nn.Module):
             layers += [nn.Linear(size, out), nn.LeakyReLU(slope)]
             size = out
         self.dense = nn.Sequential(*layers)
+        self._collected = EpochLayers()
         self._initialise()
 
     def _initialise(self) -> None:
@@ -126,6 +128,7 @@ class CnnLstm(nn.Module):
 
     def start(self, batch_size: int, like: Tensor) -> Recurrent:
         """Empty memory."""
+        self._collected.begin()
         zeros = like.new_zeros(self.config.lstm_layers, batch_size, self.config.lstm_hidden)
         return (zeros,) * {"lstm": 2, "gru": 1, "none": 0}[self.config.cell]
 
@@ -137,7 +140,20 @@ class CnnLstm(nn.Module):
         y = self.squeeze(torch.cat(seen, -1))
         after = []
         for layer, old in zip(self.lstm, zip(*memory)):
-            new = layer(y, old) if len(old) == 2 else (layer(y, old[0]),)
+            new = self._recur(layer, y, old)
             y = new[0]
             after.append(new)
-        return self.dense(y), tuple(torch.stack(x) for x in zip(*after))
+        for layer in self.dense:
+            y = self._collected.linear(layer, y) if isinstance(layer, nn.Linear) and _learning(layer) else layer(y)
+        return y, tuple(torch.stack(x) for x in zip(*after))
+
+    def _recur(self, cell: nn.Module, y: Tensor, old: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        """A cell's memory after an epoch, its output first."""
+        if isinstance(cell, nn.GRUCell):
+            return (cell(y, old[0]),)
+        return self._collected.lstm(cell, y, old) if _learning(cell) else cell(y, old)
+
+
+def _learning(layer: nn.Module) -> bool:
+    """Whether gradients of the layer's weights are wanted."""
+    return torch.is_grad_enabled() and all(p.requires_grad for p in layer.parameters())
