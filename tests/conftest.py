@@ -18,8 +18,9 @@ from omegaconf import OmegaConf
 
 from dlkf.config import config_dir
 from dlkf.data.drive import Batch
+from dlkf.points import SWEPT
 from dlkf.simulation.dataset import simulate_from_config
-from dlkf.tracking.grid import PARENT_RUN, SWEPT
+from dlkf.tracking.grid import PARENT_RUN
 from dlkf.tracking.runs import SQLITE, mlflow_module
 from tests.cars import Tables, car, car_batch, write_cars, write_pieces
 from tests.shell import Ended

@@ -6,8 +6,6 @@ from pathlib import Path
 
 from dlkf.errors import InputError
 
-SWEPT = "DLKF_SWEPT_KEYS"  # environment: the keys that a sweep goes over, as JSON, for its points in any process
-
 
 def config_dir() -> Path:
     """Absolute path of ``conf/``: the packaged copy if there is one, else the repository's."""

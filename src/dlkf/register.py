@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 
 from dlkf.command import command
 from dlkf.errors import InputError
-from dlkf.tracking.grid import best_of
+from dlkf.tracking.comparison import best_of
 from dlkf.tracking.registry import check_registration, registered
 from dlkf.tracking.runs import client_of, reachable, run_exists, store_missing, tracking_uri
 

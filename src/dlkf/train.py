@@ -43,7 +43,9 @@ def main(cfg: DictConfig) -> None:
     name = run_name(config["name"], HydraConfig.get().overrides.task)
     parent = os.environ.get(PARENT_RUN)
     uri = tracking_uri(config["tracking"]["uri"])
-    with start_run(uri, config["name"], name, parent_run_id=parent, run_id=state.get("run_id")) as run:
+    watched = config["tracking"]["system_metrics"]
+    begun = {"parent_run_id": parent, "run_id": state.get("run_id"), "system_metrics": watched}
+    with start_run(uri, config["name"], name, **begun) as run:
         write_state(folder, run_id=run.id, data=checked_digests(data.datasets, state))
         run.log_config(config)
         for dataset in data.datasets:

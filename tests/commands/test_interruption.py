@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 
 from dlkf.data.validate import validate_dataset
+from dlkf.errors import InputError
 
 SIMULATE = (
     "simulate",
@@ -36,12 +37,12 @@ def stopped(folder: Path, begun: str, how: signal.Signals, *command: str) -> int
         stderr=subprocess.DEVNULL,
         preexec_fn=_heed_interrupts,
     )
-    end = time.monotonic() + 60
+    end = time.monotonic() + 240  # of a machine that is busy
     while not any(folder.glob(begun)) and time.monotonic() < end and process.poll() is None:
         time.sleep(0.02)
     process.send_signal(how)
     try:
-        return process.wait(timeout=60)
+        return process.wait(timeout=240)
     finally:
         process.kill()
 
@@ -104,3 +105,22 @@ def test_train(town, tmp_path):
     assert stopped(tmp_path, "outputs/train/town/*/last.ckpt", signal.SIGTERM, *TRAIN) == 143
     with closing(sqlite3.connect(tmp_path / "mlflow.db")) as store:
         assert store.execute("select status from runs").fetchall() == [("KILLED",)]
+
+
+@pytest.mark.parametrize(("signal_", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupt_that_became_another_error_is_one(signal_, code, call, monkeypatch):
+    """pandas' reader calls back to Python for its bytes, and says "read failed" of what is raised there."""
+
+    def cut_off(*_):
+        os.kill(os.getpid(), signal_)
+        raise AssertionError("the handler has not raised")
+
+    def read(*_):
+        try:
+            cut_off()
+        except KeyboardInterrupt:
+            raise InputError("x.csv: cannot be read") from None
+
+    monkeypatch.setattr("dlkf.doctor.drive_rows", read)
+    ended = call("doctor", "dataset=x")
+    assert ended.code == code and "cannot be read" not in ended.err

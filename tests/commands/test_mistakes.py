@@ -403,3 +403,14 @@ def test_faults_of_the_machine_are_one_line(error, said):
         line = fault(outer)
     assert line is not None and said in line and "\n" not in line
     assert fault(ValueError("a fault of ours")) is None
+
+
+def test_a_point_that_fails_leaves_the_others(copy, call, tmp_path):
+    """It is named, twice: when it fails and at the end; the others have their folders and the page beside them."""
+    points = ("model=ins,mbkf99,mbkf15", "tracking.log=false")
+    done = call("evaluate", "-m", *points, "dataset=town", "out=made", *FAST["evaluate"])
+    assert done.code == 2, done.err
+    lines = [line for line in done.err.splitlines() if line.startswith("dlkf: error: ")]
+    assert lines[0].startswith("dlkf: error: model=mbkf99: unknown model 'mbkf99'")
+    assert lines[1] == "dlkf: error: 1 of the points failed: model=mbkf99"
+    assert {p.name for p in (tmp_path / "made").iterdir()} == {"0-model=ins", "2-model=mbkf15", "compare.html"}

@@ -1,13 +1,17 @@
 """Grid search: parent run, children, final status, comparison; with sweeps that take no training."""
 
+import json
 import os
+import re
 import subprocess
 import sys
 
 import pytest
 from omegaconf import OmegaConf
 
-from dlkf.tracking.grid import PARENT_RUN, SWEPT, GridParent, parent_status, run_name, swept_overrides
+from dlkf.points import SWEPT, Failure, listened, tell
+from dlkf.tracking.comparison import best_validation, monitored
+from dlkf.tracking.grid import PARENT_RUN, GridParent, parent_status, run_name, swept_overrides
 from dlkf.tracking.runs import mlflow_module, start_run
 
 TASK = ["+experiment=outage", "optimizer.lr=1e-3,1e-4", "filter@model=dlkf", "seed=range(2)", "data.x=[1,2]"]
@@ -20,13 +24,13 @@ def sweep_config(uri, task=TASK, params=None):
 
 def point(uri, name, rms=None, error=None, experiment="town"):
     """A child as the train command makes it."""
-    with start_run(uri, experiment, name, parent_run_id=os.environ[PARENT_RUN], system_metrics=False) as run:
+    with start_run(uri, experiment, name, parent_run_id=os.environ[PARENT_RUN]) as run:
         run.log_config({"optimizer": {"lr": name}, "seed": 0, "tracking": {"uri": uri + name}})
         if error:
             raise error
         run.log_metrics({"val/outage_end_m": 2 * rms}, step=1)
         run.log_metrics({"val/outage_end_m": 3 * rms}, step=2)
-        run.log_metrics({"test/dlkf/outage_horizontal_rms_m": rms, "test/mbkf15/outage_horizontal_rms_m": 9.0})
+        run.log_metrics({"test/dlkf/outage_end_horizontal_m": rms, "test/mbkf15/outage_end_horizontal_m": 9.0})
     return run
 
 
@@ -41,7 +45,7 @@ def test_a_sweep_that_finishes(uri, client, capsys):
     grid = GridParent()
     grid.on_multirun_start(sweep_config(uri))
     parent = os.environ[PARENT_RUN]
-    assert run_name("town", ["+experiment=outage", "optimizer.lr=0.001", "seed=1"]) == "optimizer.lr=0.001 seed=1"
+    assert run_name("town", ["+experiment=outage", "optimizer.lr=0.001", "seed=1"]) == "lr=0.001 seed=1"
     worse, better = point(uri, "worse", 5.0), point(uri, "better", 2.0)
     grid.on_multirun_end(OmegaConf.create())
     assert PARENT_RUN not in os.environ and SWEPT not in os.environ
@@ -55,8 +59,8 @@ def test_a_sweep_that_finishes(uri, client, capsys):
     printed = capsys.readouterr().out
     assert printed.index("better") < printed.index("worse") and parent in printed
     assert found.data.tags["best_run"] == "better"
-    assert found.data.metrics["test/dlkf/outage_horizontal_rms_m"] == 2.0, "scores of the best beside the grid"
-    assert "outage_horizontal_rms_m" in printed and "better" in found.data.tags["mlflow.note.content"]
+    assert found.data.metrics["test/dlkf/outage_end_horizontal_m"] == 2.0, "scores of the best beside the grid"
+    assert "outage_end_horizontal_m" in printed and "better" in found.data.tags["mlflow.note.content"]
     table = mlflow_module().artifacts.load_text(f"{found.info.artifact_uri}/comparison.csv").splitlines()
     assert table[0].startswith("run,run_id,status,optimizer.lr,val/outage_end_m,test/dlkf/")
     assert table[1] == f"worse,{worse.id},FINISHED,worse,10.0,5.0,9.0"
@@ -73,8 +77,8 @@ def test_a_failed_child_fails_the_parent_but_not_the_table(uri, client, capsys):
     grid.close(ended=False)
     assert client.get_run(parent).info.status == "FAILED"
     printed = capsys.readouterr().out
-    assert "| good | FINISHED | 10         | 5    | 9      |" in printed
-    assert "| bad  | FAILED   |            |" in printed
+    assert "| good | FINISHED | 10               | 5    | 9      |" in printed
+    assert "| bad  | FAILED   |                  |" in printed
     grid.close(ended=False)
     assert capsys.readouterr().out == "", "closed once"
 
@@ -97,6 +101,56 @@ def test_children_in_other_experiments_are_found(uri, client, capsys):
     point(uri, "elsewhere", 1.0, experiment="city")
     grid.on_multirun_end(OmegaConf.create())
     assert "elsewhere" in capsys.readouterr().out
+
+
+def test_a_point_that_never_began_a_run_is_named(uri, client, capsys):
+    """It failed on its settings; the parent says so, and the other is compared and its champion registered."""
+    grid = GridParent()
+    with listened():
+        grid.on_multirun_start(sweep_config(uri))
+        parent = os.environ[PARENT_RUN]
+        point(uri, "good", 5.0)
+        assert tell(Failure("lr=fast", "optimizer.lr is 'fast', must be a number", mistake=True), 1)
+        grid.on_multirun_end(OmegaConf.create())
+    found = client.get_run(parent)
+    assert found.info.status == "FAILED" and found.data.tags["best_run"] == "good"
+    assert "failed: lr=fast: optimizer.lr is 'fast'" in found.data.tags["mlflow.note.content"]
+    assert "failed: lr=fast" in capsys.readouterr().out
+
+
+def test_validation_is_what_kept_the_weights(uri, client):
+    """The loss where no outages were validated; epochs from which no weights are kept do not count."""
+    with start_run(uri, "town", "one") as run:
+        run.log_config({"trainer": {"monitor": None, "best_from_epoch": 2}})
+        for epoch, loss in enumerate((0.1, 0.2, 0.7, 0.5)):
+            run.log_metrics({"val/loss": loss}, step=epoch)
+    found = client.get_run(run.id)
+    assert monitored([found]) == "val/loss" and best_validation(client, found, "val/loss") == 0.5
+    with start_run(uri, "town", "two") as run:
+        run.log_config({"trainer": {"monitor": "val/gain_std"}})
+        run.log_metrics({"val/loss": 1.0, "val/outage_end_m": 1.0, "val/gain_std": 3.0})
+    assert monitored([client.get_run(run.id)]) == "val/gain_std"
+
+
+def test_keys_are_short_where_they_can_be(monkeypatch):
+    monkeypatch.setenv(PARENT_RUN, "x")
+    monkeypatch.setenv(SWEPT, '["optimizer.lr", "scoring.outage.first_s", "callbacks.outage.first_s"]')
+    words = ["optimizer.lr=1", "scoring.outage.first_s=2", "callbacks.outage.first_s=3", "seed=4"]
+    assert run_name("town", words) == "lr=1 scoring.outage.first_s=2 callbacks.outage.first_s=3"
+
+
+def test_the_page_of_a_grid(uri, client):
+    """The best first, an axis for each setting that was swept and for what came of it."""
+    grid = GridParent()
+    grid.on_multirun_start(sweep_config(uri))
+    parent = os.environ[PARENT_RUN]
+    point(uri, "worse", 5.0), point(uri, "better", 2.0)
+    grid.on_multirun_end(OmegaConf.create())
+    page = mlflow_module().artifacts.load_text(f"{client.get_run(parent).info.artifact_uri}/comparison.html")
+    assert "Best by validation: better, val/outage_end_m 4; on test dlkf 2." in page
+    drawn = json.loads(re.search(r'id="data-coordinates">(.*?)</script>', page, re.S)[1])
+    labels = [axis["label"] for axis in drawn["data"][0]["dimensions"]]
+    assert labels == ["lr", "val/outage_end_m", "test/dlkf/outage_end_horizontal_m"]
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,8 @@ from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
 from dlkf.filters.saved import load_filter
 from dlkf.running.offline import navigate_drives
-from dlkf.tracking.grid import PARENT_RUN, VALIDATION, GridParent, best_of
+from dlkf.tracking.comparison import best_of
+from dlkf.tracking.grid import PARENT_RUN, GridParent
 from dlkf.tracking.registry import check_registration, download_model, log_model, registered
 from dlkf.tracking.runs import mlflow_module, start_run
 
@@ -32,7 +33,7 @@ from dlkf.tracking.runs import mlflow_module, start_run
 def logged(uri, weights):
     """A finished run with a registered model; the folder it was logged from is gone."""
     folder = shutil.copytree(weights, "best")
-    with start_run(uri, "town", "one", system_metrics=False) as run:
+    with start_run(uri, "town", "one") as run:
         run.log_dataset("data/town", "0123", "training")
         run.log_metrics({"train/loss": 3.0}, step=0)
         log_model(run, folder, register="town", alias="champion", metrics={"test/dlkf/rms_m": 2.5})
@@ -68,11 +69,11 @@ def test_the_model_stands_with_its_scores_and_data(logged, client):
 
 
 def test_an_alias_moves_to_the_newer_version(logged, uri, client, weights):
-    with start_run(uri, "town", "two", system_metrics=False) as run:
+    with start_run(uri, "town", "two") as run:
         model_uri = log_model(run, weights, register="town", alias="champion")
     assert client.get_model_version_by_alias("town", "champion").version in (2, "2")
     assert same_weights(download_model(model_uri, uri), weights)
-    with start_run(uri, "village", "three", system_metrics=False) as run:
+    with start_run(uri, "village", "three") as run:
         log_model(run, weights, alias="candidate")  # registered under the experiment's name
     assert same_weights(download_model("models:/village@candidate", uri), weights)
 
@@ -179,11 +180,11 @@ def test_unknown_models_are_refused_in_one_line(logged, uri, spec, says):
 
 
 def test_runs_without_a_model(uri, client):
-    with pytest.raises(ValueError), start_run(uri, "town", "one", system_metrics=False) as run:
+    with pytest.raises(ValueError), start_run(uri, "town", "one") as run:
         raise ValueError
     with pytest.raises(InputError, match=r"logged no model.*FAILED"):
         download_model(run.id, uri)
-    with start_run(uri, "town", "child", parent_run_id=run.id, system_metrics=False):
+    with start_run(uri, "town", "child", parent_run_id=run.id):
         pass
     with pytest.raises(InputError, match="parent run of a grid search"):
         download_model(run.id, uri)
@@ -220,7 +221,7 @@ def test_a_moved_folder_keeps_its_models(logged, uri, weights, tmp_path):
         shutil.move(tmp_path / name, moved / name)
     there = f"sqlite:///{moved / 'mlflow.db'}"
     assert same_weights(download_model("models:/town@champion", there), weights)
-    with start_run(there, "town", "two", system_metrics=False) as run:
+    with start_run(there, "town", "two") as run:
         log_model(run, weights, register="town")
     assert same_weights(download_model("models:/town/2", there), weights)
     assert not (tmp_path / "mlruns").exists()
@@ -234,8 +235,8 @@ def test_the_best_of_a_grid_is_registered_at_its_end(uri, client, weights, capsy
     grid.on_multirun_start(OmegaConf.create(config | {"hydra": hydra}))
     parent, ids = os.environ[PARENT_RUN], []
     for rms in (5.0, 2.0, 3.0):
-        with start_run(uri, "town", f"rms {rms}", parent_run_id=parent, system_metrics=False) as run:
-            run.log_metrics({VALIDATION: rms})
+        with start_run(uri, "town", f"rms {rms}", parent_run_id=parent) as run:
+            run.log_metrics({"val/outage_end_m": rms})
             log_model(run, weights)
         ids.append(run.id)
     grid.on_multirun_end(OmegaConf.create())

@@ -24,7 +24,7 @@ CONFIG = {"name": "town", "seed": 1, "optimizer": {"lr": 1e-3}, "data": {"datase
 
 
 def open_run(uri, name="one", **kwargs):
-    return start_run(uri, "town", name, system_metrics=False, **kwargs)
+    return start_run(uri, "town", name, **kwargs)
 
 
 def test_the_store_is_here_by_default(tmp_path, monkeypatch):
@@ -121,17 +121,18 @@ def test_lightning_writes_into_the_run_and_does_not_end_it(uri, client):
     with open_run(uri) as run:
         logger = lightning_logger(run)
         logger.log_hyperparams({"lr": 1})
-        logger.log_metrics({"train/loss": 0.5}, step=3)
+        logger.log_metrics({"epoch": 7, "train/gradient_norm": 2.0, "train/loss": 0.5}, step=3)
         logger.finalize("success")
         assert client.get_run(run.id).info.status == "RUNNING"
     found = client.get_run(run.id)
-    assert found.data.metrics["train/loss"] == 0.5 and found.data.params == {}
+    assert list(found.data.metrics) == ["train/loss", "train/gradient_norm"] and found.data.params == {}
+    assert [(m.value, m.step) for m in client.get_metric_history(run.id, "train/loss")] == [(0.5, 7)]
 
 
 def test_system_metrics_are_sampled_every_second(uri, client, monkeypatch):
     """MLflow's own interval of ten seconds leaves short runs empty."""
     monkeypatch.setattr(tracking, "SAMPLES_PER_POINT", 1)
-    with start_run(uri, "town", "one") as run:
+    with start_run(uri, "town", "one", system_metrics=True) as run:
         time.sleep(1.3)
     assert "system/cpu_utilization_percentage" in client.get_run(run.id).data.metrics
 

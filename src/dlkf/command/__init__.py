@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import sys
@@ -16,13 +15,15 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from dlkf.command import sweeps
 from dlkf.command.arguments import checked_keys, checked_seeds, checked_types, readable
 from dlkf.command.faults import fault
 from dlkf.command.help import help_text
-from dlkf.config import SWEPT, config_dir
+from dlkf.config import config_dir
 from dlkf.errors import InputError, Terminated
 
 MISTAKE, INTERRUPTED, TERMINATED = 2, 130, 143
+stopped_by: list[int] = []  # signals that came while a command ran
 
 
 # ``dataset=`` and ``model=`` choose a preset in one command and name a folder in another. Hydra knows a group by
@@ -38,7 +39,7 @@ def command(
     A user's mistake (:class:`InputError`, an unknown key or preset, a malformed override) and a fault of the machine
     (a full disk, a locked store, no GPU) are one line on stderr and exit code 2; Ctrl-C is exit code 130, SIGTERM
     143; a fault of ours keeps its traceback. ``arguments`` may rewrite the command line first. The points of a
-    sweep write into folders of their own under ``out``.
+    sweep write into folders of their own under ``out``, and those that fail leave the others alone.
     """
 
     def decorate(function: Callable[[DictConfig], None]) -> Callable[[], None]:
@@ -55,12 +56,13 @@ def command(
                 checked_seeds(OmegaConf.to_container(cfg))
                 if sweep and cfg.get("out"):
                     with open_dict(cfg):
-                        cfg.out = str(Path(cfg.out) / point(hydra_config))
+                        cfg.out = str(Path(cfg.out) / sweeps.folder(hydra_config))
                 function(cfg)
             except Exception as error:
-                if sweep or fault(error) is None:
-                    raise  # a worker of a sweep must not exit: the sweep reports it
-                _refuse(error)
+                if sweep and not stopped_by:
+                    sweeps.set_down(error, hydra_config)
+                else:
+                    _end(error)
 
         @wraps(function)
         def main() -> None:
@@ -70,35 +72,43 @@ def command(
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors reach us whole instead of Hydra's exit
             given = [_with_group(argument, GROUPS.get(name, {})) for argument in arguments(sys.argv[1:])]
             sys.argv[1:] = [readable(argument) for argument in given]
-            before = signal.signal(signal.SIGTERM, _terminate)
+            stopped_by.clear()
+            # SIGINT is ignored by what a shell started in the background, and stays so
+            heeded = [n for n in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(n) is not signal.SIG_IGN]
+            before = {number: signal.signal(number, _stop) for number in heeded}
             try:
-                run = hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)
-                run(task)()
-            except Exception as error:
-                if fault(error) is None:
-                    raise
-                _refuse(error)
-            except KeyboardInterrupt as end:
-                terminated = isinstance(end, Terminated)
-                print(f"dlkf: {'terminated' if terminated else 'interrupted'}", file=sys.stderr)
-                sys.exit(TERMINATED if terminated else INTERRUPTED)
+                with sweeps.heard():
+                    run = hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)
+                    run(task)()
+            except (Exception, KeyboardInterrupt) as error:
+                _end(error)
             finally:
-                signal.signal(signal.SIGTERM, before)
+                for number, handler in before.items():
+                    signal.signal(number, handler)
 
         return main
 
     return decorate
 
 
-def point(hydra_config: DictConfig) -> str:
-    """Folder of one point of a sweep: its number and what it changes, as ``0-imu=consumer``."""
-    swept = json.loads(os.environ.get(SWEPT, "[]"))
-    words = [o for o in hydra_config.overrides.task if not swept or o.partition("=")[0] in swept]
-    return f"{hydra_config.job.num}-{','.join(words)}".replace("/", "-")[:100]
+def _end(error: BaseException) -> NoReturn:
+    """One line and an exit code for a stop, a mistake, or a fault of the machine; a fault of ours goes on up.
+
+    A reader written in C makes an error of its own of an interrupt in a call back to Python: the signal counts.
+    """
+    if stopped_by or isinstance(error, KeyboardInterrupt):
+        terminated = signal.SIGTERM in stopped_by or isinstance(error, Terminated)
+        print(f"dlkf: {'terminated' if terminated else 'interrupted'}", file=sys.stderr)
+        sys.exit(TERMINATED if terminated else INTERRUPTED)
+    if (said := fault(error)) is None:
+        raise error
+    print(f"dlkf: error: {said}", file=sys.stderr)
+    sys.exit(MISTAKE)
 
 
-def _terminate(*_: object) -> NoReturn:
-    raise Terminated
+def _stop(number: int, _: object) -> NoReturn:
+    stopped_by.append(number)
+    raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
 
 
 def _with_group(argument: str, groups: dict[str, str]) -> str:
@@ -106,8 +116,3 @@ def _with_group(argument: str, groups: dict[str, str]) -> str:
     if equals and key == "outage" and value in ("null", "none", "off", "false"):
         return "~outage"  # how Hydra takes a preset out
     return f"{groups[key]}@{key}={value}" if equals and key in groups else argument
-
-
-def _refuse(error: Exception) -> NoReturn:
-    print(f"dlkf: error: {fault(error)}", file=sys.stderr)
-    sys.exit(MISTAKE)

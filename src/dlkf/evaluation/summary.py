@@ -5,28 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from dlkf.evaluation.results import IMU_AXES, Results
+from dlkf.evaluation.results import Results
 from dlkf.evaluation.table import DEGREES, number
 
 ASKED_S = ("30", "60", "20", "10", "40", "50")  # times without GNSS, the first that the outages reach is told
 END = ("outages", "end", "horizontal")
 METRICS = {
-    "position_rms_m": ("pieces", "all", "position", "rms"),
-    "velocity_rms_mps": ("pieces", "all", "velocity", "rms"),
-    "attitude_rms_deg": ("pieces", "all", "attitude", "rms"),
-    "outage_position_rms_m": ("outages", "rms", "position", "rms"),
-    "outage_horizontal_rms_m": ("outages", "rms", "horizontal", "rms"),
     "outage_end_horizontal_m": (*END, "rms"),
-    "outage_end_horizontal_geomean_m": (*END, "geomean"),
     "outage_end_horizontal_median_m": (*END, "median"),
+    "position_rms_m": ("pieces", "all", "position", "rms"),
+    "attitude_rms_deg": ("pieces", "all", "attitude", "rms"),
 }
 
 
 def metrics_of(results: Sequence[Results]) -> dict[str, float]:
-    """``test/<filter>/…``: errors in outages and over the pieces, slope of the IMU-error estimate; finite ones.
+    """``test/<filter>/…``: the few numbers by which runs are compared, finite ones; the report has all.
 
-    ``ratio_…`` are to the baseline, of the error at the end of the outages, with the bounds of their interval. With
-    several kinds of data ``test/<kind>/<filter>/…``. The slopes are means over the three axes.
+    ``ratio_…`` are to the baseline, of the error at the end of the outages, RMS and geometric mean. With several kinds
+    of data ``test/<kind>/<filter>/…``.
     """
     metrics: dict[str, float] = {}
     for result in results:
@@ -34,18 +30,9 @@ def metrics_of(results: Sequence[Results]) -> dict[str, float]:
         for name in result.filters:
             flat = {key: result.value(name, *which) for key, which in METRICS.items()}
             flat["attitude_rms_deg"] *= DEGREES
-            for sensor in ("accel", "gyro"):
-                axes = [a for a in IMU_AXES if a.startswith(sensor)]
-                slopes = [result.value(name, "pieces", "last", a, "injected_slope") for a in axes]
-                known = [s for s in slopes if not math.isnan(s)]
-                flat[f"bias_slope_{sensor}"] = sum(known) / len(known) if known else math.nan
             for statistic in ("rms", "geomean"):
                 c = result.versus(name, *END, statistic)
-                bounds = {} if c is None else {"": c.ratio, "_low": c.ratio_low, "_high": c.ratio_high}
-                flat |= {f"ratio_{statistic}{bound}": x for bound, x in bounds.items()}
-            for q in ("position", "velocity", "attitude"):  # the paper's ratios, of the means over the pieces (R141)
-                c = result.versus(name, "pieces", "all", q, "mean")
-                flat |= {} if c is None else {f"ratio_mean_{q}": c.ratio}
+                flat |= {} if c is None else {f"ratio_{statistic}": c.ratio}
             metrics |= {f"{prefix}/{name}/{k}": v for k, v in flat.items()}
     return {k: v for k, v in metrics.items() if math.isfinite(v)}
 

@@ -19,7 +19,7 @@ def log_evaluation(
     """Config, dataset, metrics and everything in ``config["out"]``; returns the id of the run."""
     parent = os.environ.get(PARENT_RUN)
     named = run_name(name, HydraConfig.get().overrides.task) if parent else name
-    with start_run(uri, config["name"], named[:250], parent_run_id=parent, system_metrics=False) as run:
+    with start_run(uri, config["name"], named[:250], parent_run_id=parent) as run:
         run.log_config(config)
         run.log_dataset(config["dataset"], digest, "evaluation")
         run.log_metrics(metrics)

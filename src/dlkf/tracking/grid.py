@@ -18,13 +18,14 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from dlkf.config import SWEPT
 from dlkf.errors import InputError
+from dlkf.points import SWEPT, Failure, failures
 from dlkf.report.compare import read_reports, write_comparison
+from dlkf.report.grid import grid_page
+from dlkf.tracking.comparison import NAMELESS, as_text, best_child, cells, children, compared, comparison
 from dlkf.tracking.registry import check_registration, registered
 from dlkf.tracking.runs import (
     NOTE_TAG,
-    PARENT_TAG,
     client_of,
     experiment_id,
     reachable,
@@ -32,10 +33,7 @@ from dlkf.tracking.runs import (
 )
 
 PARENT_RUN = "DLKF_PARENT_RUN_ID"  # environment: read by the runs of the sweep, in any process
-NAMELESS = ("tracking", "hydra", "resume", "name")  # settings that say nothing about the result
 PRESETS = ("experiment", "profile")
-VALIDATION = "val/outage_end_m"  # what training keeps the best weights by
-COMPARED = ("outage_horizontal_rms_m", "position_rms_m")  # the first that the children have
 
 
 class GridParent(Callback):
@@ -80,7 +78,7 @@ class GridParent(Callback):
             print(f"Compared: {out}/compare.html")
 
     def close(self, ended: bool) -> None:
-        """Final status and comparison table. ``ended=False``: the sweep broke off; runs still open failed."""
+        """Final status, comparison and champion. ``ended=False``: the sweep broke off; runs still open failed."""
         if self.run_id is None:
             return
         atexit.unregister(self.close)
@@ -91,30 +89,39 @@ class GridParent(Callback):
         for run in children(client, parent):
             if run.info.status == "RUNNING":
                 client.set_terminated(run.info.run_id, "FAILED")
-        runs = children(client, parent)
-        table = comparison(runs, [best_validation(client, r) for r in runs])
+        runs, failed = children(client, parent), failures()
+        best = best_child(client, runs)
+        table = comparison(client, runs)
         if len(table):
-            metric, chosen = compared(table)
-            text = as_text(chosen)
-            client.log_text(parent, table.to_csv(index=False), "comparison.csv")
-            client.log_text(parent, text, "comparison.md")
-            title = f"{metric} of the test pieces; runs by their validation" if metric else "no run was scored"
-            client.set_tag(parent, NOTE_TAG, f"{title}\n\n{text}")
-            print(f"\n{title}\n{text}\nGrid search: MLflow run {parent} in {self.uri}")
-            self._show_best(client, parent, table, runs)
-        client.set_terminated(parent, parent_status([r.info.status for r in runs], ended))
-        if ended and (self.register or self.alias) and (best := best_child(client, runs)):
+            self._compare(client, parent, table, failed)
+        if best:
+            self._show_best(client, parent, best)
+        client.set_terminated(parent, parent_status([r.info.status for r in runs], ended and not failed))
+        if ended and (self.register or self.alias):
+            if best is None:
+                print("Registered nothing: no point was validated")
+                return
             name = self.register or client.get_experiment(best.info.experiment_id).name
             number = registered(client, best.info.run_id, name, self.alias)
             print(f"Registered the best, {best.info.run_name}: models:/{name}/{number}, alias {self.alias or 'none'}")
 
-    def _show_best(self, client, parent: str, table: pd.DataFrame, runs: Sequence) -> None:
+    def _compare(self, client, parent: str, table: pd.DataFrame, failed: Sequence[Failure]) -> None:
+        """The table of all points as text, CSV, page and note of the parent."""
+        metric, chosen = compared(table)
+        ordered = any(c.startswith("val/") for c in table)
+        title = f"{metric} of the test pieces" if metric else "no run was scored"
+        title += "; runs by their validation" if ordered else ""
+        text = as_text(chosen) + "".join(f"\nfailed: {f.point}: {f.why}\n" for f in failed)
+        client.log_text(parent, table.to_csv(index=False), "comparison.csv")
+        client.log_text(parent, text, "comparison.md")
+        client.log_text(parent, grid_page(title, table, chosen, cells(chosen)), "comparison.html")
+        client.set_tag(parent, NOTE_TAG, f"{title}\n\n{text}")
+        print(f"\n{title}\n{text}\nGrid search: MLflow run {parent} in {self.uri}")
+
+    def _show_best(self, client, parent: str, best) -> None:
         """The parent carries the scores of the point that validated best."""
         from mlflow.entities import Metric
 
-        if VALIDATION not in table:
-            return
-        best = runs[int(table[VALIDATION].astype(float).idxmin())]
         scores = {k: v for k, v in best.data.metrics.items() if k.startswith("test/")}
         now = best.info.end_time or best.info.start_time
         client.log_batch(parent, metrics=[Metric(k, v, now, 0) for k, v in scores.items()])
@@ -127,86 +134,6 @@ def parent_status(statuses: Sequence[str], ended: bool) -> str:
     if "KILLED" in statuses:
         return "KILLED"
     return "FINISHED" if ended and statuses and set(statuses) == {"FINISHED"} else "FAILED"
-
-
-def children(client, parent: str) -> list:
-    """The runs under a parent, oldest first, in all experiments (a sweep may go over their names)."""
-    experiments = [e.experiment_id for e in client.search_experiments()]
-    mine = f"tags.`{PARENT_TAG}` = '{parent}'"
-    return list(client.search_runs(experiments, mine, order_by=["attributes.start_time"], max_results=5000))
-
-
-def best_validation(client, run) -> float | None:
-    """The least validation error [m] of a run: that of its kept weights."""
-    history = client.get_metric_history(run.info.run_id, VALIDATION)
-    return min((m.value for m in history), default=None)
-
-
-def best_child(client, runs: Sequence):
-    """The finished run that validated best, None where none did."""
-    validated = [(best_validation(client, r), r) for r in runs if r.info.status == "FINISHED"]
-    known = [(value, run) for value, run in validated if value is not None]
-    return min(known, key=lambda pair: pair[0])[1] if known else None
-
-
-def best_of(client, run_id: str):
-    """A run, or of a grid search's parent its best child; InputError where none of them was validated."""
-    runs = children(client, run_id)
-    if not runs:
-        return client.get_run(run_id)
-    if (best := best_child(client, runs)) is None:
-        raise InputError(f"run={run_id}: no point of this grid search was validated")
-    return best
-
-
-def comparison(runs: Sequence, validated: Sequence[float | None]) -> pd.DataFrame:
-    """A row per run: name, status, the parameters that differ between runs, validation, ``test/`` metrics."""
-    given = pd.DataFrame([r.data.params for r in runs], dtype=object)
-    names = [key for key in sorted(given) if given[key].nunique(dropna=False) > 1]
-    names = [key for key in names if key.partition(".")[0] not in NAMELESS]
-    metrics = sorted({key for r in runs for key in r.data.metrics if key.startswith("test/")})
-    rows = []
-    for run, value in zip(runs, validated):
-        row = {"run": run.info.run_name, "run_id": run.info.run_id, "status": run.info.status}
-        row |= {key: run.data.params.get(key) for key in names}
-        if any(v is not None for v in validated):
-            row[VALIDATION] = value
-        rows.append(row | {key: run.data.metrics.get(key) for key in metrics})
-    return pd.DataFrame(rows)
-
-
-def compared(table: pd.DataFrame) -> tuple[str, pd.DataFrame]:
-    """The metric to compare by, and run, status, validation and its value for every filter.
-
-    Sorted by validation: test drives choose nothing (R018). Without ``test/`` metrics (all runs failed) the
-    name is empty.
-    """
-    first = [c for c in ("run", "status", VALIDATION) if c in table]
-    ordered = table.sort_values(VALIDATION, na_position="last") if VALIDATION in table else table
-    for metric in COMPARED:
-        columns = [c for c in table if c.startswith("test/") and c.endswith(f"/{metric}")]
-        if columns:
-            break
-    else:
-        return "", ordered[first]
-    names = {c: c.removeprefix("test/").removesuffix(f"/{metric}") for c in columns}
-    trained = [c for c in columns if names[c].rpartition("/")[2].startswith("dlkf")]
-    columns = trained + [c for c in columns if c not in trained]
-    return metric, ordered[[*first, *columns]].rename(columns=names | {VALIDATION: "validation"})
-
-
-def as_text(table: pd.DataFrame) -> str:
-    """A Markdown table with aligned columns; metrics with three digits, an empty cell where there is none."""
-
-    def cell(value: Any) -> str:
-        if isinstance(value, float):
-            return f"{value:.3g}" if value == value else ""
-        return "" if value is None else str(value).replace("|", "\\|")
-
-    rows = [list(table), *([cell(v) for v in row] for row in table.itertuples(index=False))]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(table.columns))]
-    rows.insert(1, ["-" * w for w in widths])
-    return "\n".join("| " + " | ".join(c.ljust(w) for c, w in zip(row, widths)) + " |" for row in rows) + "\n"
 
 
 def swept_overrides(config: DictConfig) -> dict[str, str]:
@@ -225,7 +152,7 @@ def run_name(name: str, overrides: Sequence[str]) -> str:
     """
     swept = json.loads(os.environ.get(SWEPT, "[]")) if os.environ.get(PARENT_RUN) else []
     if swept:
-        words = [f"{shown(o)}" for o in overrides if o.partition("=")[0] in swept]
+        words = points_words([o for o in overrides if o.partition("=")[0] in swept])
     else:
         words = [name]
         for override in overrides:
@@ -234,6 +161,13 @@ def run_name(name: str, overrides: Sequence[str]) -> str:
                 continue
             words.append(value if key in PRESETS else shown(override))
     return " ".join(words)[:250] or name
+
+
+def points_words(overrides: Sequence[str]) -> list[str]:
+    """Short, for a list: ``optimizer.lr=1e-3`` → ``lr=1e-3``, unless two keys end alike."""
+    pairs = [shown(o).partition("=")[::2] for o in overrides]
+    ends = [key.rpartition(".")[2] for key, _ in pairs]
+    return [f"{end if ends.count(end) == 1 else key}={value}" for end, (key, value) in zip(ends, pairs)]
 
 
 def grid_name(key: str, values: str) -> str:

@@ -211,7 +211,7 @@ def start_run(
     *,
     parent_run_id: str | None = None,
     run_id: str | None = None,
-    system_metrics: bool = True,
+    system_metrics: bool = False,
 ) -> Iterator[Run]:
     """Open a run, or go on with ``run_id`` if this store has it; its status at the end tells how it ended.
 
@@ -221,7 +221,8 @@ def start_run(
     mlflow = mlflow_module()
     found_again(uri)
     mlflow.set_tracking_uri(uri)
-    system_metrics = system_metrics and find_spec("psutil") is not None  # else MLflow refuses the run
+    if system_metrics and find_spec("psutil") is None:
+        raise InputError("tracking.system_metrics=true needs psutil; pip install psutil")
     mlflow.set_system_metrics_sampling_interval(SAMPLE_EVERY_S)
     mlflow.set_system_metrics_samples_before_logging(SAMPLES_PER_POINT)
     with reachable(uri):
@@ -262,10 +263,19 @@ def run_exists(client: MlflowClient, run_id: str) -> bool:
 
 
 def lightning_logger(run: Run) -> MLFlowLogger:
-    """Lightning's logger on this run. Parameters and the final status stay the run's own business."""
+    """Lightning's logger on this run. Parameters and the final status stay the run's own business.
+
+    Steps are epochs, so that curves of runs with other batch sizes lie over each other. Of what comes together the
+    loss is first: the page that compares runs starts with the metric that a run met first.
+    """
     from lightning.pytorch.loggers import MLFlowLogger
 
     class MetricsOnly(MLFlowLogger):
+        def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+            """With the epoch as step."""
+            rest = {k: metrics[k] for k in sorted(metrics, key=lambda k: (not k.endswith("/loss"), k)) if k != "epoch"}
+            super().log_metrics(rest, int(metrics.get("epoch", step or 0)))
+
         def log_hyperparams(self, params: Any) -> None:
             """The run has the whole config already, uncut."""
 

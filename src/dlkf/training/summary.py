@@ -6,16 +6,13 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from dlkf.evaluation.summary import metrics_of
+from dlkf.evaluation.summary import answer, metrics_of
 from dlkf.evaluation.table import all_tables, as_markdown
 from dlkf.training.study import Outcome
-from dlkf.tuning.search import factors_of, tuning_values
-
-AXES = ("ax", "ay", "az", "gx", "gy", "gz")
 
 
 def key_metrics(outcome: Outcome) -> dict[str, float]:
-    """``test/<filter>/…`` for the MLflow comparison: outage errors, RMS over the pieces, bias slopes, times."""
+    """``test/<filter>/…`` for the MLflow comparison, and times."""
     metrics = {f"time/{k}_s": v for k, v in outcome.seconds.items()} | metrics_of(outcome.results)
     for a in outcome.after:
         for name, row in a.filters.items():
@@ -25,15 +22,12 @@ def key_metrics(outcome: Outcome) -> dict[str, float]:
             metrics |= {f"test/{name}/after_{a.seconds:g}_s/ratio{k}": v for k, v in bounds.items()}
     for name, row in outcome.hour.items():
         metrics |= {f"test/{name}/hour/{k}": v for k, v in row.items()}
-    for name, tuning in outcome.baselines.tunings.items():
-        if name != "ins":
-            metrics |= {f"tuned/{name}/{k}": v for k, v in tuning_values(tuning).items() if k in factors_of(name)}
-    metrics |= {f"prior/{axis}": v for axis, v in zip(AXES, outcome.baselines.prior.mean)}
     return {k: v for k, v in metrics.items() if math.isfinite(v)}
 
 
 def note(config: Mapping[str, Any], outcome: Outcome) -> str:
-    """The tables as a Markdown note of the run."""
+    """The answer and the tables as a Markdown note of the run."""
     datasets = ", ".join(config["data"]["datasets"])
     tables = "\n".join(as_markdown(t) for t in (*all_tables(datasets, outcome.results), *outcome.tables))
-    return f"{config['name']}: {config['model']['kind']} on {datasets}, seed {config['seed']}\n\n{tables}"
+    told = "\n\n".join(f"**{answer(result)}**" for result in outcome.results)
+    return f"{told}\n\n{config['name']}: {config['model']['kind']} on {datasets}, seed {config['seed']}\n\n{tables}"

@@ -40,7 +40,7 @@ class StepGuard(Callback):
             self.in_a_row += 1
             if self.in_a_row >= self.patience:
                 self._go_back(module, optimizer)
-        module.log("train/skipped_steps", float(self.skipped))
+        module.log("train/skipped_steps", float(self.skipped), on_step=False, on_epoch=True, reduce_fx="max")
 
     def _go_back(self, module: L.LightningModule, optimizer) -> None:
         if self.good is None or self.returned >= self.returns:

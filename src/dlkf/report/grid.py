@@ -1,0 +1,69 @@
+"""The page of a grid search: its points, the best by validation on top, and parallel coordinates of what was swept."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import pandas as pd
+import plotly.graph_objects as go
+
+from dlkf.report.page import Page
+from dlkf.report.plots import FONT
+
+NAMES = ("run", "run_id", "status")
+
+
+def grid_page(title: str, table: pd.DataFrame, chosen: pd.DataFrame, rows: Sequence[Sequence[str]]) -> str:
+    """``table`` has all points: name, swept settings, ``val/…``, ``test/…``; ``chosen`` the few columns to read, the
+    best point first, ``rows`` its cells.
+    """
+    validated = next((c for c in table if c.startswith("val/")), None)
+    page = Page(f"{len(table)} points of a grid search", [_best(chosen, validated)])
+    page.heading(title)
+    page.table(list(chosen), rows, marks=["class=best" if validated and not k else "" for k in range(len(rows))])
+    settings = [c for c in table if c not in NAMES and "/" not in c]
+    seen = [c for c in (validated, *_scores(table, chosen)) if c is not None]
+    known = table.dropna(subset=seen)
+    if len(known) > 1 and settings and seen:
+        page.heading("What was swept, and what came of it", "A line is a point. Drag along an axis to choose some.")
+        page.figure("coordinates", coordinates(known, settings, seen))
+    return page.html()
+
+
+def _best(chosen: pd.DataFrame, validated: str | None) -> str:
+    best = chosen.iloc[0]
+    if validated is None or pd.isna(best[validated]):
+        return "No point was validated."
+    filters = [c for c in chosen if c not in (*NAMES, validated)]
+    told = f"; on test {filters[0]} {best[filters[0]]:.3g}" if filters else ""
+    return f"Best by validation: {best['run']}, {validated} {best[validated]:.3g}{told}."
+
+
+def _scores(table: pd.DataFrame, chosen: pd.DataFrame) -> list[str]:
+    """The column of ``table`` that ``chosen`` shows first of the filters."""
+    filters = [c for c in chosen if c not in NAMES and not c.startswith("val/")]
+    if not filters:
+        return []
+    shown = chosen[filters[0]].sort_index()
+    return [c for c in table if c.startswith(f"test/{filters[0]}/") and table[c].equals(shown)][:1]
+
+
+def coordinates(table: pd.DataFrame, settings: Sequence[str], scores: Sequence[str]) -> go.Figure:
+    """Parallel coordinates: a setting that is no number has its words along the axis."""
+    axes = [_axis(c.rpartition(".")[2], table[c]) for c in settings] + [_axis(c, table[c]) for c in scores]
+    lines = {"color": table[scores[0]].astype(float), "colorscale": "Viridis", "showscale": True}
+    figure = go.Figure(go.Parcoords(dimensions=axes, line=lines))
+    figure.update_layout(height=480, font=FONT, margin={"l": 80, "r": 60, "t": 60, "b": 30})
+    return figure
+
+
+def _axis(label: str, values: pd.Series) -> dict[str, Any]:
+    numbers = pd.to_numeric(values, errors="coerce")
+    if not numbers.isna().any():
+        few = sorted(set(numbers))
+        ticks = {"tickvals": few, "ticktext": [f"{x:g}" for x in few]} if len(few) < 8 else {}
+        return {"label": label, "values": numbers, **ticks}
+    words = sorted(set(values.astype(str)))
+    return {"label": label, "values": [words.index(v) for v in values.astype(str)],
+            "tickvals": list(range(len(words))), "ticktext": words}  # fmt: skip
