@@ -128,7 +128,7 @@ def test_kind_of_a_drive():
         drive_kind({"drive": "a", "kind": "fake"})
 
 
-@pytest.mark.parametrize("draw", ["tracks", "over_time", "one", "imu", "imu_all", "growth"])
+@pytest.mark.parametrize("draw", ["tracks", "over_time", "one", "imu", "imu_all", "growth", "spread"])
 def test_figures_have_content(scores, draw):
     figure = {
         "tracks": lambda: figures.tracks(scores, [0, 3]),
@@ -137,6 +137,7 @@ def test_figures_have_content(scores, draw):
         "imu": lambda: figures.imu_errors(scores, [1]),
         "imu_all": lambda: figures.imu_errors(scores, list(range(6))),
         "growth": lambda: figures.error_growth(scores, "attitude"),
+        "spread": lambda: figures.error_histograms(scores, list(scores.filters)[:2], 5.0),
     }[draw]()
     data = png(figure, dpi=40)
     assert data.startswith(b"\x89PNG") and len(data) > 5000

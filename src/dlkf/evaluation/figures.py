@@ -25,6 +25,7 @@ from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.table import number
 
 STYLES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (7, 2)), (0, (3, 1, 1, 1)), (0, (2, 2)))
+MANY = 20  # outages, from which on a histogram says something
 OFF_SCALE = 20.0  # a filter this many times worse than the best does not set the scale
 LABELS = {
     "position": "3D position error [m]",
@@ -63,6 +64,9 @@ def all_figures(
     middle = chosen[len(chosen) // 2]
     if scores.outage.any():
         yield "error_growth", "horizontal error against the time without GNSS", error_growth(scores)
+        pair = [baseline, list(scores.filters)[-1]]
+        if len(scores.windows.piece) >= MANY and baseline in scores.filters and pair[0] != pair[1]:
+            yield "error_histograms", "how the outages are spread, so long into them", error_histograms(scores, pair)
     yield (
         "tracks",
         "tracks of pieces from good to bad (quantiles of the error of the baseline)",
@@ -306,6 +310,37 @@ def error_growth(scores: Scores, quantity: str = "horizontal", *, seed: int = 0)
     ax.set_title(f"{len(w.piece)} outages, band: 95 % bootstrap interval of the RMS", fontsize=9, loc="left")
     _plain(ax)
     _legend(figure, ax.get_legend_handles_labels()[0])
+    return figure
+
+
+def error_histograms(scores: Scores, names: Sequence[str], every_s: float = 10.0) -> Figure:
+    """How the outages are spread: horizontal RMS since the outage began, 10, 20, … s into it (paper fig. 14, R148).
+
+    At most six times; the last bin holds what lies beyond.
+    """
+    w = scores.windows
+    times = np.arange(every_s, w.length.min() * scores.epoch_s + 1e-9, every_s)[:6]
+    counts = np.rint(times / scores.epoch_s).astype(int)
+    figure = Figure(figsize=(10, 1.2 + 1.9 * math.ceil(len(counts) / 2)), layout="constrained")
+    panels = figure.subplots(math.ceil(len(counts) / 2), 2, squeeze=False)
+    squares = {n: magnitudes(scores.filters[n].error)["horizontal"] ** 2 for n in names}
+    for ax, count in zip(panels.flat, counts):
+        found = {n: np.sqrt([x[i, a : a + count].mean() for i, a in zip(w.piece, w.first)]) for n, x in squares.items()}
+        top = max(float(np.nanquantile(x, 0.95)) for x in found.values())
+        for n, x in found.items():
+            heights, edges = np.histogram(np.minimum(x, top), bins=20, range=(0.0, top))
+            last = n == names[-1]
+            ax.stairs(heights, edges, lw=1.6, fill=last, alpha=0.7 if last else 1, **line_of(scores, n))
+        ax.set(xlim=(0, top))
+        ax.set_title(f"{count * scores.epoch_s:g} s without GNSS", fontsize=9)
+        _plain(ax)
+    for ax in panels.flat[len(counts) :]:
+        ax.set_visible(False)
+    for ax in panels[-1]:
+        ax.set_xlabel("Horizontal RMS since the outage began [m]", fontsize=9)
+    for ax in panels[:, 0]:
+        ax.set_ylabel("Outages", fontsize=9)
+    _legend(figure, [Line2D([], [], label=n, **line_of(scores, n)) for n in names])
     return figure
 
 

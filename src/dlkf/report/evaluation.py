@@ -59,7 +59,12 @@ def write_report(
             pictures.append((f"{name}{suffix}.png", f"{kind.capitalize()} data: {caption}", png(figure, dpi)))
     files: dict[str, bytes] = {
         "metrics.json": as_json(
-            {"dataset": dataset, "protocol": protocol, "results": [r.as_dict() for r in results]}
+            {
+                "dataset": dataset,
+                "protocol": protocol,
+                "results": [r.as_dict() for r in results],
+                "tables": [t._asdict() for t in more],
+            }
         ).encode(),
         "table.md": "\n".join(map(as_markdown, parts)).encode(),
         "table.csv": as_csv(dataset, results).encode(),

@@ -31,12 +31,12 @@ class Study:
         beside.replace(self.file)
 
     def train(self, key: str, *overrides: str) -> Path:
-        """Report folder of ``python -m dlkf.train`` with these overrides; a training that was killed goes on."""
+        """Run folder of ``python -m dlkf.train`` with these overrides; a training that was killed goes on."""
         if key in self.done and Path(self.done[key]).is_dir():
             return Path(self.done[key])
         said = run("train", *overrides)
         report = next(line for line in reversed(said) if line.startswith("Report:"))
-        folder = Path(report.removeprefix("Report:").strip()).parent
+        folder = Path(report.removeprefix("Report:").strip()).parents[1]  # of report/report.html
         self.remember(key, str(folder))
         return folder
 

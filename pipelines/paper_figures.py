@@ -1,0 +1,46 @@
+"""Figures 11 to 14 of the paper (R143-R148): real motion, and a minute without GNSS after a minute with it.
+
+    python pipelines/paper_figures.py --real data/kitti               the paper's 500 epochs
+    python pipelines/paper_figures.py --real data/kitti trainer.max_epochs=100
+
+Two trainings for each seed. ``minute``: outages from 60 to 120 s of simulated pieces (figures 13 and 14).
+``semi_real``, where ``--real`` names a dataset of real drives with a good IMU: their motion with the errors of one
+automotive MEMS unit injected, outages of 30 to 50 s (figures 11 and 12); split by recording, so with few recordings
+the intervals are wide. Finished trainings are kept: the same command goes on. What is where stands in
+``outputs/paper/figures``; ``python pipelines/paper_report.py`` makes the page of it. Further key=value go to
+``dlkf.train``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from dlkf.tracking.chain import Study, run
+
+HOME = Path("outputs/paper/figures")
+SEMI_REAL = Path("data/semi_real_one")
+
+
+def main() -> None:
+    """Both trainings of every seed under one parent run."""
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    arguments.add_argument("--seeds", default="0", help="both trainings for each")
+    arguments.add_argument("--real", help="dataset of real drives, whose motion is used")
+    options, overrides = arguments.parse_known_args()
+    if options.real and not SEMI_REAL.exists():
+        unit = ("dataset=semi_real", f"source={options.real}", "dataset.imu_errors=one")
+        run("simulate", *unit, f"out={SEMI_REAL}")
+    study = Study(HOME)
+    with study.parent("figures", "paper 5.3, figures 11 to 14"):
+        for seed in options.seeds.split(","):
+            study.train(f"minute/{seed}", "+experiment=minute", f"seed={seed}", *overrides)
+            if options.real:
+                data = (f"data.datasets=[{SEMI_REAL}]", "data.fractions=[0.55,0.15,0.3]", "scoring.hour=null")
+                pieces = ("data.eval_stride_s=20", "scoring.after_s=[22,60]")  # recordings are short
+                given = ("+experiment=outage", "name=semi_real", f"seed={seed}", *data, *pieces, *overrides)
+                study.train(f"semi_real/{seed}", *given)
+
+
+if __name__ == "__main__":
+    main()
