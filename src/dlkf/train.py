@@ -25,6 +25,7 @@ from dlkf.tracking.grid import PARENT_RUN, run_name
 from dlkf.tracking.registry import check_registration, log_model
 from dlkf.tracking.runs import lightning_logger, start_run, tracking_uri
 from dlkf.training.run_folder import checked_digests, run_folder, write_state
+from dlkf.training.settings import study_settings
 from dlkf.training.study import load_data, run_study
 from dlkf.training.summary import key_metrics, note
 
@@ -35,8 +36,9 @@ def main(cfg: DictConfig) -> None:
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
     console = Console(width=None if sys.stdout.isatty() else 110)
     check_registration(config["tracking"]["register"], config["tracking"]["alias"])
+    settings = study_settings(config)
     make_missing(config, console)
-    data = load_data(config, console.print)
+    data = load_data(config["data"], console.print)
     folder, state = run_folder(config)
     if state:
         console.print(f"going on with the unfinished run in {folder}")
@@ -50,12 +52,12 @@ def main(cfg: DictConfig) -> None:
         run.log_config(config)
         for dataset in data.datasets:
             run.log_dataset(dataset, dataset_digest(dataset), "training")
-        outcome = run_study(config, data, folder, lightning_logger(run), console.print)
+        outcome = run_study(settings, data, folder, lightning_logger(run), console.print)
         for table in (*all_tables(", ".join(Path(d).name for d in data.datasets), outcome.results), *outcome.tables):
             console.print(as_rich(table))
         metrics = key_metrics(outcome)
         run.log_files(folder / "report")
-        run.note(note(config, outcome))
+        run.note(note(settings, data.datasets, outcome))
         chosen = {} if parent else {key: config["tracking"][key] for key in ("register", "alias")}  # the grid's best is
         log_model(run, outcome.weights, metrics=metrics, **chosen)
         write_state(folder, finished=True)

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
-from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf
 
+from dlkf.classes import class_named, made
 from dlkf.config import config_dir
 from dlkf.filters.saved import learned_filter
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.simulation.dataset import dataset_config
-from dlkf.training.loss import loss_of
+from dlkf.training.settings import study_settings
 
 CONF = config_dir()
 GROUPS = {  # group of the defaults list: folder under conf/
@@ -81,15 +81,13 @@ def test_it_composes_and_builds(primary, overrides):
     if primary == "simulate":
         dataset_config(config["dataset"])
     if primary == "ingest":
-        settings = config["reader"]
-        get_class(settings.pop("_target_"))(**settings)
+        made(config["reader"], "reader")
     if primary == "train":
-        learned_filter(config["model"])
-        loss_of(config["loss"])
-        assert all(
-            instantiate(c).state_dict() is not None for c in config["callbacks"].values() if c is not None
-        )
-        get_class(config["data"]["_target_"])
+        config["baselines"]["models"] = ["mbkf15"]  # a study refuses the trained filter's name among them
+        settings = study_settings(config)
+        learned_filter(settings.fit.model)
+        assert all(callback.state_dict() is not None for callback in settings.fit.callbacks)
+        class_named(config["data"]["_target_"], "data._target_")
 
 
 @pytest.mark.parametrize("name", [*GROUPS, *(f"experiment/{name}" for name in presets("experiment"))])

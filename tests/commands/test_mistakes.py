@@ -229,7 +229,7 @@ def as_trap(model: Path) -> None:
 
 BROKEN = {
     "other width": (other_width, ("does not fit config.yaml", "in the config")),
-    "unknown key": (other_key, ("unknown key 'colour'",)),
+    "unknown key": (other_key, ("unknown key colour",)),
     "torch pickle": (as_pickle, ("not a safetensors file",)),
     "trap": (as_trap, ("not a safetensors file",)),
     "no weights": (lambda m: (m / "weights.safetensors").unlink(), ("has no weights.safetensors",)),

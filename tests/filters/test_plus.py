@@ -11,7 +11,7 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.model_based import has_covariance
 from dlkf.filters.plus import PARTS, PlusConfig, PlusFilter, speed_rms
-from dlkf.filters.saved import learned_filter, load_filter, save_filter
+from dlkf.filters.saved import learned_filter, learned_settings, load_filter, save_filter
 from dlkf.filters.smoother import smooth
 from dlkf.networks.plus import bounded, window_features
 
@@ -150,11 +150,11 @@ def test_it_can_be_smoothed():
     [
         ({"kind": "minus"}, "dlkf, plus"),
         ({"kind": "plus", "parts": ["speeed"]}, "unknown part 'speeed'"),
-        ({"kind": "plus", "hiden": 3}, "unknown key 'hiden'"),
+        ({"kind": "plus", "hiden": 3}, "unknown key hiden"),
         ({"kind": "plus", "base": "ins"}, "no Kalman filter"),
         ({"kind": "plus", "network": {"hidden": 1000}}, "between 8 and 256"),
     ],
 )
 def test_mistakes_are_one_line(settings, words):
     with pytest.raises(InputError, match=words):
-        learned_filter(settings)
+        learned_filter(learned_settings(settings))

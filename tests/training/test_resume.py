@@ -14,6 +14,7 @@ from dlkf.data.datamodule import DriveDataModule
 from dlkf.errors import InputError
 from dlkf.training.fit import fit
 from dlkf.training.run_folder import checked_digests, configuration_hash, read_state, run_folder, write_state
+from dlkf.training.settings import FitSettings, fit_settings
 
 
 def preset(path: str) -> dict:
@@ -40,6 +41,10 @@ def settings(**trainer) -> dict:
     return {k: train[k] for k in keys} | {"model": model, "seed": 3}
 
 
+def told(**trainer) -> FitSettings:
+    return fit_settings(settings(**trainer))
+
+
 def weights(folder) -> dict:
     return torch.load(folder / "last.ckpt", weights_only=True)["state_dict"]
 
@@ -57,20 +62,20 @@ KILLED = """
         return step(self, batch, index)
     FilterTraining.training_step = dying
     from pathlib import Path
-    t.fit(t.settings(), t.data({dataset!r}), Path({folder!r}), False)
+    t.fit(t.told(), t.data({dataset!r}), Path({folder!r}), False)
 """
 
 
 def test_kill_minus_nine_changes_nothing(dataset, tmp_path, request):
     """A real SIGKILL in the middle of an epoch against an uninterrupted run: equal bit by bit."""
     root = str(request.config.rootpath)
-    fit(settings(), data(dataset), tmp_path / "whole", False)
+    fit(told(), data(dataset), tmp_path / "whole", False)
     folder = tmp_path / "killed"
     for at in (5,):
         script = textwrap.dedent(KILLED.format(root=root, at=at, dataset=str(dataset), folder=str(folder)))
         died = subprocess.run([sys.executable, "-c", script], cwd=root, capture_output=True, text=True, check=False)
         assert died.returncode == -9, died.stderr[-2000:]
-    fit(settings(), data(dataset), folder, False)
+    fit(told(), data(dataset), folder, False)
     one, other = weights(tmp_path / "whole"), weights(folder)
     assert one.keys() == other.keys() and all(torch.equal(one[k], other[k]) for k in one)
     best = [load_file(f / "best" / "weights.safetensors") for f in (tmp_path / "whole", folder)]
@@ -88,7 +93,7 @@ def test_training_moves_towards_the_reference(dataset, tmp_path):
     before = LearnedFilter(LearnedConfig.from_mapping(settings()["model"])).eval()
     longer = settings(max_epochs=8)
     longer["optimizer"]["lr"] = 2e-2
-    after = load_filter(fit(longer, data(dataset), tmp_path / "run", False))
+    after = load_filter(fit(fit_settings(longer), data(dataset), tmp_path / "run", False))
     batch = data(dataset).batches("test")[0]
 
     def loss(model):
@@ -102,7 +107,7 @@ def test_without_outages_the_loss_chooses_the_weights(dataset, tmp_path):
     """No outage in validation: every better epoch is kept by val/loss, not the first one for ever."""
     plain = DriveDataModule([dataset], batch_size=9, length_s=20.0, eval_length_s=30.0, fractions=(0.6, 0.2, 0.2))
     chosen = settings(max_epochs=3, validate_every=1)
-    best = fit(chosen, plain, tmp_path / "run", False)
+    best = fit(fit_settings(chosen), plain, tmp_path / "run", False)
     state = torch.load(tmp_path / "run" / "last.ckpt", weights_only=True)["callbacks"]
     kept = next(v for k, v in state.items() if k.startswith("BestWeights"))
     assert best.is_dir() and kept["epoch"] > 0 and 0 < kept["score"] < float("inf")
@@ -110,7 +115,7 @@ def test_without_outages_the_loss_chooses_the_weights(dataset, tmp_path):
 
 def test_an_unknown_monitor_is_said_clearly(dataset, tmp_path):
     with pytest.raises(InputError, match="val/colour is not logged; choose one of val/gain_std"):
-        fit(settings(max_epochs=1, validate_every=1, monitor="val/colour"), data(dataset), tmp_path / "run", False)
+        fit(told(max_epochs=1, validate_every=1, monitor="val/colour"), data(dataset), tmp_path / "run", False)
 
 
 def test_other_data_than_the_unfinished_run_began_with_are_refused(dataset, tmp_path):
@@ -122,7 +127,7 @@ def test_other_data_than_the_unfinished_run_began_with_are_refused(dataset, tmp_
 
 def test_no_validated_epoch_is_said_clearly(dataset, tmp_path):
     with pytest.raises(InputError, match="no epoch was validated"):
-        fit(settings(max_epochs=1, validate_every=1, best_from_epoch=3), data(dataset), tmp_path / "run", False)
+        fit(told(max_epochs=1, validate_every=1, best_from_epoch=3), data(dataset), tmp_path / "run", False)
 
 
 def test_run_folder_is_found_again_until_it_is_finished(tmp_path):

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from dlkf.classes import TARGET
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
 from dlkf.filters.integration import Correction, Epoch, integrate
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.state import ATTITUDE, NavState
 from dlkf.networks.cnn_lstm import NetworkConfig, Recurrent
-from dlkf.networks.features import FRAMES, Scaling, component_features, level_rotation, window_features
-from dlkf.networks.heads import FORMS, GainHead, ImuErrorHead
+from dlkf.networks.features import Frame, Scaling, component_features, level_rotation, window_features
+from dlkf.networks.heads import Form, GainHead, ImuErrorHead
 from dlkf.networks.own import OwnNetwork
+from dlkf.settings import settings_from
 
-OUTAGE_MODES = ("hold", "run")
-KNOWN_FROM = ("nothing", "training")
 MAX_TRAINING_TURN = 0.2  # rad per correction, a guard in training only (paper.md 4.10)
 
 
@@ -39,66 +39,39 @@ class LearnedConfig:
     """
 
     network: NetworkConfig | OwnNetwork = field(default_factory=NetworkConfig)
-    outage_mode: str = "hold"
-    frame: str = "ned"
+    outage_mode: Literal["hold", "run"] = "hold"
+    frame: Frame = "ned"
     detach_features: bool = True
-    imu_error: str = "constant"
+    imu_error: Form = "constant"
     imu_error_bound: float = 0.0
-    known_from: str = "nothing"
+    known_from: Literal["nothing", "training"] = "nothing"
     initial_gain: float = 0.5
     rate_hz: float = 50.0
     epoch_s: float = 1.0
-    kind: str = "dlkf"
+    kind: Literal["dlkf"] = "dlkf"
 
     def __post_init__(self) -> None:
-        choices = {"outage_mode": OUTAGE_MODES, "frame": FRAMES, "imu_error": FORMS, "known_from": KNOWN_FROM}
-        for name, known in (choices | {"kind": ("dlkf",)}).items():
-            if getattr(self, name) not in known:
-                raise InputError(f"model.{name} is {getattr(self, name)!r}; choose one of {', '.join(known)}")
-        if round(self.rate_hz * self.epoch_s) != self.network.samples:
+        samples = round(self.rate_hz * self.epoch_s)
+        if self.network.samples not in (None, samples):
             raise InputError(
                 f"model.network.samples is {self.network.samples} but rate_hz · epoch_s is "
                 f"{self.rate_hz * self.epoch_s:g}; make them equal"
             )
+        flags = 2 if self.outage_mode == "run" else 0
+        object.__setattr__(self, "network", replace(self.network, samples=samples, flags=flags))
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> LearnedConfig:
-        """From plain values; raises InputError for a key it does not know or a value of another type."""
-        values = dict(values)
-        network = values.pop("network", {})
-        if not isinstance(network, Mapping):
-            raise InputError(f"model.network is {network!r}; it must hold the network's settings")
-        network = dict(network)
-        own = network.pop("_target_", None)
-        checked = [(values, cls, "model"), *([] if own else [(network, NetworkConfig, "model.network")])]
-        for given, target, where in checked:
-            known = {f.name: f.default for f in fields(target) if f.name != "network"}
-            for key, value in given.items():
-                if key not in known:
-                    raise InputError(f"{where}: unknown key {key!r}; known: {', '.join(sorted(known))}")
-                if not _is_like(value, known[key]):
-                    raise InputError(f"{where}.{key} is {value!r}; must be like {known[key]!r}")
-        values.setdefault("rate_hz", cls.rate_hz)
-        values.setdefault("epoch_s", cls.epoch_s)
-        samples = network.pop("samples", round(values["rate_hz"] * values["epoch_s"]))
-        flags = 2 if values.get("outage_mode", cls.outage_mode) == "run" else 0
-        if own:
-            return cls(network=OwnNetwork(str(own), samples, flags, network), **values)
-        network["dense"] = tuple(network.get("dense", NetworkConfig.dense))
-        return cls(network=NetworkConfig(samples=samples, flags=flags, **network), **values)
+        """From plain values; InputError for a key it does not know or a value of another type."""
+        network = values.get("network", {})
+        if isinstance(network, Mapping) and TARGET in network:
+            values = {**values, "network": OwnNetwork.from_mapping(network)}
+        return settings_from(cls, values, "model")
 
     def plain(self) -> dict[str, Any]:
         """Plain values for a file."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         return values | {"network": self.network.plain()}
-
-
-def _is_like(value: Any, default: Any) -> bool:
-    """Whether a setting has the type of its default; whole numbers may stand for floats."""
-    if isinstance(default, tuple):
-        return isinstance(value, (list, tuple)) and all(_is_like(v, default[0]) for v in value)
-    kinds = (int, float) if isinstance(default, float) else type(default)
-    return isinstance(value, kinds) and isinstance(value, bool) == isinstance(default, bool)
 
 
 class Memory(NamedTuple):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -62,7 +62,7 @@ OLDEST = 600.0  # s: times are told up to here
 class PlusConfig:
     """A ``plus`` filter: its classical filter, which parts of the network are in force, what it was trained on."""
 
-    kind: str = "plus"
+    kind: Literal["plus"] = "plus"
     base: str = "mbkf21_car"
     parts: tuple[str, ...] = PARTS[:4]
     network: PlusNetworkConfig = field(default_factory=PlusNetworkConfig)
@@ -76,15 +76,7 @@ class PlusConfig:
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> PlusConfig:
         """From plain values; InputError for unknown keys or values that do not fit."""
-        known = {"kind", "base", "parts", "network", "tuning", "imu"}
-        if unknown := sorted(set(values) - known):
-            raise InputError(f"model: unknown key {unknown[0]!r}; known: {', '.join(sorted(known))}")
-        given = {k: v for k, v in values.items() if v is not None}
-        if "parts" in given:
-            given["parts"] = tuple(given["parts"])
-        if "network" in given:
-            given["network"] = settings_from(PlusNetworkConfig, given["network"], "model.network")
-        return cls(**given)
+        return settings_from(cls, {k: v for k, v in values.items() if v is not None}, "model")
 
     def plain(self) -> dict[str, Any]:
         """Plain values for a file."""

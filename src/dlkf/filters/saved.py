@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from torch import nn
 
 from dlkf.errors import InputError
 from dlkf.filters.card import CARD, read_card
@@ -17,22 +16,25 @@ from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.plus import PlusConfig, PlusFilter
 
 WEIGHTS, CONFIG = "weights.safetensors", "config.yaml"
-KINDS: Mapping[str, tuple[type, Callable[..., nn.Module]]] = {
-    "dlkf": (LearnedConfig, LearnedFilter),
-    "plus": (PlusConfig, PlusFilter),
-}
+LearnedSettings = LearnedConfig | PlusConfig
+Learned = LearnedFilter | PlusFilter
+KINDS: Mapping[str, type[LearnedConfig] | type[PlusConfig]] = {"dlkf": LearnedConfig, "plus": PlusConfig}
 
 
-def learned_filter(values: Mapping[str, Any]) -> nn.Module:
-    """A filter with fresh weights from its settings; InputError for an unknown ``kind`` or setting."""
+def learned_settings(values: Mapping[str, Any]) -> LearnedSettings:
+    """Of a learned filter from plain values; InputError for an unknown ``kind`` or setting."""
     kind = values.get("kind", "dlkf")
     if kind not in KINDS:
         raise InputError(f"model.kind is {kind!r}; choose one of {', '.join(KINDS)}")
-    config, filter_type = KINDS[kind]
-    return filter_type(config.from_mapping(values))
+    return KINDS[kind].from_mapping(values)
 
 
-def save_filter(model: nn.Module, folder: Path | str, card: Mapping[str, Any] | None = None) -> None:
+def learned_filter(settings: LearnedSettings) -> Learned:
+    """A filter with fresh weights."""
+    return PlusFilter(settings) if isinstance(settings, PlusConfig) else LearnedFilter(settings)
+
+
+def save_filter(model: Learned, folder: Path | str, card: Mapping[str, Any] | None = None) -> None:
     """Write ``weights.safetensors`` and ``config.yaml``; what it was made of goes beside, as ``card.yaml``."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -42,7 +44,7 @@ def save_filter(model: nn.Module, folder: Path | str, card: Mapping[str, Any] | 
         (folder / CARD).write_text(yaml.safe_dump(dict(card), sort_keys=False, allow_unicode=True))
 
 
-def load_filter(folder: Path | str) -> nn.Module:
+def load_filter(folder: Path | str) -> Learned:
     """Read a saved filter, ready to run. Raises InputError for missing, foreign or unfitting files."""
     folder = Path(folder)
     for name in (CONFIG, WEIGHTS):
@@ -54,7 +56,7 @@ def load_filter(folder: Path | str) -> nn.Module:
         raise InputError(f"{folder / CONFIG} is not readable YAML: {str(error).splitlines()[0]}") from None
     if not isinstance(values, dict):
         raise InputError(f"{folder / CONFIG} holds no settings; expected the config.yaml that training wrote")
-    model = learned_filter(values)
+    model = learned_filter(learned_settings(values))
     try:
         weights = load_file(folder / WEIGHTS)
     except (SafetensorError, OSError):

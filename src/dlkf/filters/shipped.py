@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from torch import nn
-
-from dlkf.filters.saved import load_filter
+from dlkf.filters.saved import Learned, load_filter
 
 WEIGHTS_FOLDER = Path(__file__).parents[1] / "weights"
 
@@ -17,6 +15,6 @@ def shipped_folder(name: str) -> Path | None:
     return folder if name.isidentifier() and folder.is_dir() else None
 
 
-def trained_filter(name: str) -> nn.Module:
+def trained_filter(name: str) -> Learned:
     """A filter with its trained weights: one that comes with the package, or from a folder."""
     return load_filter(shipped_folder(name) or Path(name).expanduser())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -13,14 +13,12 @@ from dlkf.errors import InputError
 from dlkf.networks.features import CNN_CHANNELS, COMPONENTS
 from dlkf.networks.products import EpochLayers
 
-FUSIONS = ("concat", "strict30")
-CELLS = {"lstm": nn.LSTMCell, "gru": nn.GRUCell, "none": None}
-INITS = ("plain", "responsive")
+CELLS = {"lstm": nn.LSTMCell, "gru": nn.GRUCell}
 
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Sizes of the network; the defaults are the paper's.
+    """Sizes of the network; the defaults are the paper's. ``samples`` and ``flags`` are the filter's to say.
 
     ``fusion``: ``concat`` feeds CNN output and components to the recurrent cells side by side; ``strict30`` squeezes
     them into the 30 inputs that the paper names (paper.md 4.1). ``flags`` further inputs are appended.
@@ -32,28 +30,25 @@ class NetworkConfig:
     LeakyReLU behind the last convolution too, where it cuts off half of the one channel.
     """
 
-    samples: int = 50
+    samples: int | None = None
     window: bool = True
     cnn_channels: int = 32
     kernel: int = 3
-    cell: str = "lstm"
+    cell: Literal["lstm", "gru", "none"] = "lstm"
     lstm_hidden: int = 256
     lstm_layers: int = 4
     dense: tuple[int, ...] = (512, 256)
     dropout: float = 0.5
-    fusion: str = "concat"
+    fusion: Literal["concat", "strict30"] = "concat"
     leaky_slope: float = 0.01
-    init: str = "plain"
+    init: Literal["plain", "responsive"] = "plain"
     conv_activation: bool = True
     flags: int = 0
 
     def __post_init__(self) -> None:
-        for name, known in (("fusion", FUSIONS), ("cell", tuple(CELLS)), ("init", INITS)):
-            if getattr(self, name) not in known:
-                raise InputError(f"model.network.{name} is {getattr(self, name)!r}; choose one of {', '.join(known)}")
         if self.kernel % 2 == 0:
             raise InputError(f"model.network.kernel is {self.kernel}; it must be odd to keep the window's length")
-        if min(self.samples, self.cnn_channels, self.lstm_hidden, self.lstm_layers, *self.dense) < 1:
+        if min(self.samples or 1, self.cnn_channels, self.lstm_hidden, self.lstm_layers, *self.dense) < 1:
             raise InputError("model.network: every size must be at least 1")
         if not 0 <= self.dropout < 1:
             raise InputError(f"model.network.dropout is {self.dropout}; it must be in [0, 1)")
@@ -88,7 +83,7 @@ class CnnLstm(nn.Module):
                 *([nn.LeakyReLU(slope)] if config.conv_activation else []),
             ]
         self.cnn = nn.Sequential(*layers)
-        size = (config.samples if config.window else 0) + COMPONENTS + config.flags
+        size = (config.samples or 0 if config.window else 0) + COMPONENTS + config.flags
         self.squeeze: nn.Module = nn.Identity()
         if config.fusion == "strict30":
             self.squeeze, size = nn.Linear(size, COMPONENTS), COMPONENTS

@@ -8,13 +8,15 @@ an outage (paper.md 4.9). ``frame`` chooses the axes of every horizontal pair: `
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from dlkf.navigation.attitude import rpy_from_rotation
 
-FRAMES = ("ned", "heading")
+Frame = Literal["ned", "heading"]
 CNN_CHANNELS = 15
 COMPONENTS = 30
 

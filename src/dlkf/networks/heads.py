@@ -7,6 +7,7 @@ diagonal, IMU error 0 or what is known of it. Unscaled random heads would end in
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -18,7 +19,7 @@ STATE_SIZE = (1.0,) * 3 + (0.3,) * 3 + (0.02,) * 3  # m, m/s, rad
 INNOVATION_SIZE = (1.0,) * 3 + (0.3,) * 3  # m, m/s
 IMU_ERROR_SIZE = (0.1,) * 3 + (0.3 * torch.pi / 180,) * 3  # m/s², rad/s
 MATRIX_SIZE = 0.01  # scale factors and misalignments
-FORMS = ("constant", "affine")
+Form = Literal["constant", "affine"]
 _SHRINK = 0.01
 
 

@@ -28,9 +28,15 @@ class OwnNetwork:
     """Settings of a network by name of its class, ``module.Class``; its module is on ``PYTHONPATH``."""
 
     target: str
-    samples: int
+    samples: int | None = None
     flags: int = 0
     settings: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> OwnNetwork:
+        """From plain values with ``_target_``."""
+        settings = {k: v for k, v in values.items() if k not in (TARGET, "samples")}
+        return cls(str(values[TARGET]), values.get("samples"), settings=settings)
 
     def build(self) -> nn.Module:
         """The network. InputError where it cannot be found, takes other settings, or lacks what a network has."""

@@ -1,4 +1,4 @@
-"""Fit a filter: data module, callbacks and Lightning trainer from plain settings."""
+"""Fit a filter: Lightning's trainer with callbacks over a data module."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from typing import Any
 import lightning as L
 from lightning.pytorch.loggers import Logger
 
-from dlkf.classes import made
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.errors import InputError
 from dlkf.filters.learned import LearnedFilter
@@ -20,11 +19,12 @@ from dlkf.filters.shipped import trained_filter
 from dlkf.training.callbacks.checkpoints import BEST, LAST, BestWeights, ResumePoint
 from dlkf.training.callbacks.progress import TrainingProgress
 from dlkf.training.module import FilterTraining
+from dlkf.training.settings import FitSettings
 from dlkf.training.warm_start import warm_start
 
 
 def fit(
-    config: Mapping[str, Any],
+    settings: FitSettings,
     data: DriveDataModule,
     folder: Path,
     logger: Logger | bool,
@@ -34,35 +34,34 @@ def fit(
 ) -> Path:
     """Train, going on from ``folder/last.ckpt`` if it is there; returns the folder of the best weights.
 
-    ``config`` has ``model``, ``loss``, ``optimizer``, ``scheduler``, ``trainer``, ``callbacks`` and ``seed``.
     ``mean_imu_error`` (6) of the training pieces is where a model with ``known_from=training`` starts; ``notes`` are
     stored beside the weights. Raises InputError where no epoch was validated, or none had a finite ``monitor``.
     """
-    settings = config["trainer"]
+    plan = settings.trainer
     module = FilterTraining(
-        **{k: config[k] for k in ("model", "loss", "optimizer", "scheduler")}, seed=config["seed"]
+        settings.model, settings.loss, settings.optimizer, settings.scheduler, seed=settings.seed
     )
     last = folder / LAST
-    if config.get("finetune"):
-        module.filter = trained_filter(config["finetune"]).train()
+    if settings.finetune:
+        module.filter = trained_filter(settings.finetune).train()
     elif isinstance(module.filter, LearnedFilter) and not last.is_file():
         warm_start(module.filter, data, mean_imu_error)
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="lightning")
         trainer = L.Trainer(
-            max_epochs=settings["max_epochs"],
-            accelerator=settings["accelerator"],
+            max_epochs=plan.max_epochs,
+            accelerator=plan.accelerator,
             devices=1,
             logger=logger,
             callbacks=[
-                *(made(c, f"callbacks.{name}") for name, c in config["callbacks"].items() if c is not None),
+                *settings.callbacks,
                 TrainingProgress(),
-                BestWeights(str(folder), _monitor(settings["monitor"], data), settings["best_from_epoch"], notes),
-                ResumePoint(str(folder), settings["checkpoint_every"]),
+                BestWeights(str(folder), _monitor(plan.monitor, data), plan.best_from_epoch, notes),
+                ResumePoint(str(folder), plan.checkpoint_every),
             ],
-            gradient_clip_val=settings["gradient_clip"],
-            check_val_every_n_epoch=settings["validate_every"],
+            gradient_clip_val=plan.gradient_clip,
+            check_val_every_n_epoch=plan.validate_every,
             num_sanity_val_steps=0,
             log_every_n_steps=1,
             reload_dataloaders_every_n_epochs=1,
@@ -80,13 +79,13 @@ def fit(
     if not (folder / BEST).is_dir() and loss is not None and not bool(loss.isfinite()):
         raise InputError(f"the training diverged (its loss is {float(loss)}); give a smaller optimizer.lr")
     if not (folder / BEST).is_dir():
-        monitor = _monitor(settings["monitor"], data)
+        monitor = _monitor(plan.monitor, data)
         score = float(trainer.callback_metrics.get(monitor, 0.0))
         if not math.isfinite(score):
             raise InputError(f"no weights to keep: {monitor} is {score}, the training diverged; lower optimizer.lr")
         raise InputError(
-            f"no epoch was validated: trainer.max_epochs={settings['max_epochs']} ends before "
-            f"trainer.best_from_epoch={settings['best_from_epoch']} and validate_every={settings['validate_every']}"
+            f"no epoch was validated: trainer.max_epochs={plan.max_epochs} ends before "
+            f"trainer.best_from_epoch={plan.best_from_epoch} and validate_every={plan.validate_every}"
         )
     return folder / BEST
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from functools import partial
 from typing import Any
 
 import torch
@@ -41,6 +40,10 @@ class LossConfig:
     outage: float = 0.0
     likelihood: float = 0.0
     speed: float = 0.0
+
+    def __call__(self, solution: Solution, batch: Batch) -> Mapping[str, Tensor]:
+        """:func:`pva_losses` with these settings."""
+        return pva_losses(solution, batch, self)
 
 
 PAPERS = {f.name for f in fields(LossConfig)}  # settings that lie beside _target_ where a preset is the base
@@ -93,7 +96,7 @@ def loss_of(values: Mapping[str, Any]) -> Loss:
     """
     if TARGET in values:
         return made(values, "loss", spare=PAPERS)
-    return partial(pva_losses, config=settings_from(LossConfig, values, "loss"))
+    return settings_from(LossConfig, values, "loss")
 
 
 def weighted(losses: Mapping[str, Tensor], weights: dict[str, float]) -> Tensor:

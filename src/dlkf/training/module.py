@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from typing import Any
 
 import lightning as L
 import numpy as np
@@ -14,10 +12,11 @@ from torch import Tensor
 from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import end_errors, mean_error
 from dlkf.filters.integration import Solution, integrate
-from dlkf.filters.saved import learned_filter
+from dlkf.filters.saved import LearnedSettings, learned_filter
 from dlkf.networks.heads import IMU_ERROR_SIZE, INNOVATION_SIZE, STATE_SIZE
 from dlkf.training.callbacks.masking import BatchCallback
-from dlkf.training.loss import TERMS, loss_of, weighted
+from dlkf.training.loss import TERMS, Loss, weighted
+from dlkf.training.settings import OptimizerSettings, SchedulerSettings
 
 STATE, INNOVATION = torch.tensor(STATE_SIZE), torch.tensor(INNOVATION_SIZE)
 
@@ -25,37 +24,36 @@ STATE, INNOVATION = torch.tensor(STATE_SIZE), torch.tensor(INNOVATION_SIZE)
 class FilterTraining(L.LightningModule):
     """Trains a learned filter (``model.kind``) end to end on reference position, velocity and attitude (R060–R062).
 
-    ``model``, ``loss``, ``optimizer``, ``scheduler`` are plain mappings; ``loss_weights`` is set by the
-    adaptive-weights callback. Randomness of a step depends on (seed, step) alone, so that a resumed run
-    repeats an uninterrupted one.
+    ``loss_weights`` is set by the adaptive-weights callback. Randomness of a step depends on (seed, step) alone, so
+    that a resumed run repeats an uninterrupted one.
     """
 
     def __init__(
         self,
-        model: Mapping[str, Any],
-        loss: Mapping[str, float],
-        optimizer: Mapping[str, float],
-        scheduler: Mapping[str, float],
+        model: LearnedSettings,
+        loss: Loss,
+        optimizer: OptimizerSettings,
+        scheduler: SchedulerSettings,
         seed: int = 0,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters()
         torch.manual_seed(seed)
         self.filter = learned_filter(model)
-        self.loss = loss_of(loss)
-        self.covariances = loss.get("likelihood", 0.0) > 0
+        self.loss = loss
+        self.optimizer_settings, self.scheduler_settings = optimizer, scheduler
+        self.covariances = getattr(loss, "likelihood", 0.0) > 0
         self.loss_weights = dict.fromkeys(TERMS, 1.0)
         self.seed = seed
 
     def configure_optimizers(self):
         """AdamW, heads at their own rate, cosine annealing with warm restarts (R073; paper.md 4.13)."""
-        o, s = self.hparams["optimizer"], self.hparams["scheduler"]
+        o, s = self.optimizer_settings, self.scheduler_settings
         heads = list(self.filter.heads())
         body = [p for p in self.filter.parameters() if all(p is not h for h in heads)]
-        groups = [{"params": body, "lr": o["lr"]}, {"params": heads, "lr": o["lr"] * o["head_lr_factor"]}]
-        optimizer = torch.optim.AdamW(groups, weight_decay=o["weight_decay"])
+        groups = [{"params": body, "lr": o.lr}, {"params": heads, "lr": o.lr * o.head_lr_factor}]
+        optimizer = torch.optim.AdamW(groups, weight_decay=o.weight_decay)
         scheduler = torch.optim.lr_scheduler.CosineAnnealingWarmRestarts(
-            optimizer, T_0=s["restart_epochs"], T_mult=s["restart_factor"], eta_min=s["lr_min"]
+            optimizer, T_0=s.restart_epochs, T_mult=s.restart_factor, eta_min=s.lr_min
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "epoch"}}
 

@@ -17,7 +17,6 @@ from dlkf.classes import made
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import dataset_digest, load_dataset
-from dlkf.errors import InputError
 from dlkf.evaluation.endurance import After, after_gnss, after_tables, hour_table, without_outage
 from dlkf.evaluation.gains import gains_of, write_gains
 from dlkf.evaluation.outages import OutagePlan
@@ -30,10 +29,9 @@ from dlkf.filters.build import refuse_smoothed
 from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import load_filter
 from dlkf.filters.shipped import shipped_folder, trained_filter
-from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.report.evaluation import write_report
-from dlkf.settings import settings_from
 from dlkf.training.fit import fit
+from dlkf.training.settings import ScoringSettings, StudySettings
 from dlkf.tuning.baselines import Baselines, tuned_baselines
 
 Say = Callable[[str], None]
@@ -53,36 +51,32 @@ class Outcome:
     tables: list[Table]
 
 
-def load_data(config: Mapping[str, Any], say: Say) -> DriveDataModule:
-    """The data module of ``config['data']``, loaded and split."""
-    data: DriveDataModule = made(config["data"], "data")
+def load_data(values: Mapping[str, Any], say: Say) -> DriveDataModule:
+    """The data module of plain values (``conf/data``), loaded and split."""
+    data: DriveDataModule = made(values, "data")
     data.setup()
     say(data.describe())
     return data
 
 
 def run_study(
-    config: Mapping[str, Any], data: DriveDataModule, folder: Path, logger: Logger | bool, say: Say
+    settings: StudySettings, data: DriveDataModule, folder: Path, logger: Logger | bool, say: Say
 ) -> Outcome:
     """Tune, train, score and write the report into ``folder/report``."""
-    for name in config["baselines"]["models"]:
+    scoring, seconds = settings.scoring, {}
+    learned, names, plan = settings.fit.model.kind, settings.baselines.models, scoring.outage
+    for name in names:
         refuse_smoothed(name, "the filters of this table do not")
-    spec, scoring, seconds = imu_spec(config["imu"]), config["scoring"], {}
-    if config["trainer"]["threads"]:
-        torch.set_num_threads(config["trainer"]["threads"])
-    learned = str(config["model"]["kind"])
-    names = config["baselines"]["models"]
-    if learned in names:
-        raise InputError(f"baselines.models has {learned}, the name of the trained filter; take it out")
-    plan = None if scoring["outage"] is None else settings_from(OutagePlan, scoring["outage"], "scoring.outage")
+    if settings.fit.trainer.threads:
+        torch.set_num_threads(settings.fit.trainer.threads)
     with _timed(seconds, "tuning"):
-        baselines = _baselines(config, spec, data, plan, say)
+        baselines = _baselines(settings, data, say)
     with _timed(seconds, "training"):
-        card = model_card(config, data)
-        weights = fit(config, data, folder, logger, mean_imu_error=baselines.prior.mean, notes=card)
+        card = model_card(settings, data)
+        weights = fit(settings.fit, data, folder, logger, mean_imu_error=baselines.prior.mean, notes=card)
     with _timed(seconds, "scoring"):
         filters = {**baselines.build(), **_shipped(names), learned: load_filter(weights)}
-        scenes = Scenes.of_split(data, "test", plan, scoring["seed"])
+        scenes = Scenes.of_split(data, "test", plan, scoring.seed)
         kinds: dict[str, str] = {}
         for dataset in data.datasets:
             kinds |= drive_kinds(dataset)
@@ -92,13 +86,13 @@ def run_study(
             scenes,
             kinds=kinds,
             groups={d.name: d.group for d in data.stack},
-            settle_s=scoring["settle_s"],
-            injected_bias=scoring["injected_bias"],
-            seed=scoring["seed"],
+            settle_s=scoring.settle_s,
+            injected_bias=scoring.injected_bias,
+            seed=scoring.seed,
         )
         title = ", ".join(Path(d).name for d in data.datasets)
         after, hour, tables = _endurance(filters, data, scoring, title, say)
-        gains = gains_of(filters, scenes, settle_s=scoring["settle_s"]) if scoring["gains"] else {}
+        gains = gains_of(filters, scenes, settle_s=scoring.settle_s) if scoring.gains else {}
     noise = None if data.gnss_noise is None else asdict(data.gnss_noise)
     write_report(
         folder / "report",
@@ -120,51 +114,48 @@ def _shipped(names: Sequence[str]) -> dict[str, Estimator]:
     return {name: trained_filter(name) for name in names if shipped_folder(name)}
 
 
-def _baselines(
-    config: Mapping[str, Any], spec: ImuSpec, data: DriveDataModule, plan: OutagePlan | None, say: Say
-) -> Baselines:
+def _baselines(settings: StudySettings, data: DriveDataModule, say: Say) -> Baselines:
     """The classical filters, tuned on training pieces with outages: the scored ones, or 20 s where none are scored."""
-    settings = config["baselines"]
-    plan = plan or OutagePlan(data.eval_length_s / 2, min(20.0, data.eval_length_s / 3), offsets_s=(0.0,))
-    pieces = Scenes.of_split(data, "train", plan, config["scoring"]["seed"], settings["pieces"]).withheld()
-    rounds = settings["rounds"] if settings["tune"] else 0
-    classical = [name for name in settings["models"] if not shipped_folder(name)]
-    return tuned_baselines(classical, spec, pieces, rounds=rounds, say=say)
+    given, scoring = settings.baselines, settings.scoring
+    plan = scoring.outage or OutagePlan(data.eval_length_s / 2, min(20.0, data.eval_length_s / 3), offsets_s=(0.0,))
+    pieces = Scenes.of_split(data, "train", plan, scoring.seed, given.pieces).withheld()
+    classical = [name for name in given.models if not shipped_folder(name)]
+    return tuned_baselines(classical, settings.imu, pieces, rounds=given.rounds if given.tune else 0, say=say)
 
 
 def _endurance(
-    filters: Mapping[str, Estimator], data: DriveDataModule, scoring: Mapping[str, Any], title: str, say: Say
+    filters: Mapping[str, Estimator], data: DriveDataModule, scoring: ScoringSettings, title: str, say: Say
 ) -> tuple[list[After], dict[str, dict[str, float]], list[Table]]:
     """Errors after longer GNSS, and over an hour without outage, where asked for."""
     known = {n: f for n, f in filters.items() if n != "ins"}
     after: list[After] = []
     hour: dict[str, dict[str, float]] = {}
     tables: list[Table] = []
-    if scoring["after_s"]:
-        after = after_gnss(known, data, scoring["after_s"], baseline=BASELINE, seed=scoring["seed"])
+    if scoring.after_s:
+        after = after_gnss(known, data, scoring.after_s, baseline=BASELINE, seed=scoring.seed)
         if after:
             tables += after_tables(title, after, BASELINE)
-        if left := sorted(set(map(float, scoring["after_s"])) - {a.seconds for a in after}):
+        if left := sorted(set(map(float, scoring.after_s)) - {a.seconds for a in after}):
             say(f"no test drive has room for an outage after {', '.join(f'{s:g}' for s in left)} s of GNSS")
-    if scoring["hour"]:
+    if scoring.hour:
         drives = load_dataset(
-            scoring["hour"], rate_hz=data.rate_hz, epoch_s=data.epoch_s, dtype=torch.float64, progress=None
+            scoring.hour, rate_hz=data.rate_hz, epoch_s=data.epoch_s, dtype=torch.float64, progress=None
         )
-        hour = without_outage(known, drives, data.start, seed=scoring["seed"])
-        tables.append(hour_table(Path(scoring["hour"]).name, hour))
+        hour = without_outage(known, drives, data.start, seed=scoring.seed)
+        tables.append(hour_table(Path(scoring.hour).name, hour))
     return after, hour, tables
 
 
-def model_card(config: Mapping[str, Any], data: DriveDataModule) -> dict[str, Any]:
+def model_card(settings: StudySettings, data: DriveDataModule) -> dict[str, Any]:
     """What a model was made of: recordings it was trained and chosen on, the data's digests, IMU, seeds, version."""
     return {
         "trained_on": sorted({d.group for d in data.drives("train")}),
         "chosen_on": sorted({d.group for d in data.drives("val")}),
         "datasets": {Path(d).name: dataset_digest(d) for d in data.datasets},
-        "imu": config["imu"]["name"],
-        "experiment": config["name"],
-        "seed": config["seed"],
-        "max_epochs": config["trainer"]["max_epochs"],
+        "imu": settings.imu.name,
+        "experiment": settings.name,
+        "seed": settings.fit.seed,
+        "max_epochs": settings.fit.trainer.max_epochs,
         "dlkf": dlkf.__version__,
     }
 

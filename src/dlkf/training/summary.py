@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Sequence
 
 from dlkf.evaluation.summary import answer, metrics_of
 from dlkf.evaluation.table import all_tables, as_markdown
+from dlkf.training.settings import StudySettings
 from dlkf.training.study import Outcome
 
 
@@ -25,9 +25,10 @@ def key_metrics(outcome: Outcome) -> dict[str, float]:
     return {k: v for k, v in metrics.items() if math.isfinite(v)}
 
 
-def note(config: Mapping[str, Any], outcome: Outcome) -> str:
+def note(settings: StudySettings, datasets: Sequence[str], outcome: Outcome) -> str:
     """The answer and the tables as a Markdown note of the run."""
-    datasets = ", ".join(config["data"]["datasets"])
-    tables = "\n".join(as_markdown(t) for t in (*all_tables(datasets, outcome.results), *outcome.tables))
+    names = ", ".join(datasets)
+    tables = "\n".join(as_markdown(t) for t in (*all_tables(names, outcome.results), *outcome.tables))
     told = "\n\n".join(f"**{answer(result)}**" for result in outcome.results)
-    return f"{told}\n\n{config['name']}: {config['model']['kind']} on {datasets}, seed {config['seed']}\n\n{tables}"
+    about = f"{settings.name}: {settings.fit.model.kind} on {names}, seed {settings.fit.seed}"
+    return f"{told}\n\n{about}\n\n{tables}"

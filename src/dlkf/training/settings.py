@@ -1,0 +1,135 @@
+"""What a study is told, typed: ``conf/train.yaml`` as dataclasses, made once by the command."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from lightning.pytorch.callbacks import Callback
+
+from dlkf.classes import made
+from dlkf.data.masks import BiasLaw
+from dlkf.errors import InputError
+from dlkf.evaluation.outages import OutagePlan
+from dlkf.filters.saved import LearnedSettings, learned_settings
+from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.settings import check_limits, fitted, settings_from
+from dlkf.training.loss import Loss, loss_of
+
+MANY = 10**9
+
+
+@dataclass(frozen=True)
+class OptimizerSettings:
+    """AdamW; the output layers learn at ``head_lr_factor`` times the rate."""
+
+    lr: float
+    head_lr_factor: float
+    weight_decay: float
+
+    def __post_init__(self) -> None:
+        check_limits(self, "optimizer", {"lr": (0, 1e3), "head_lr_factor": (0, 1e3), "weight_decay": (0, 1e3)})
+
+
+@dataclass(frozen=True)
+class SchedulerSettings:
+    """Cosine annealing with warm restarts (R073), in epochs."""
+
+    restart_epochs: int
+    restart_factor: int
+    lr_min: float
+
+    def __post_init__(self) -> None:
+        limits = {"restart_epochs": (1, MANY), "restart_factor": (1, 1e3), "lr_min": (0, 1e3)}
+        check_limits(self, "scheduler", limits)
+
+
+@dataclass(frozen=True)
+class TrainerSettings:
+    """Epochs, validation and checkpoints, as the comments of ``conf/train.yaml`` say."""
+
+    max_epochs: int
+    gradient_clip: float | None
+    validate_every: int
+    checkpoint_every: int
+    monitor: str | None
+    best_from_epoch: int
+    threads: int | None
+    accelerator: str
+
+    def __post_init__(self) -> None:
+        limits = {name: (1, MANY) for name in ("max_epochs", "validate_every", "checkpoint_every")}
+        check_limits(self, "trainer", {**limits, "best_from_epoch": (0, MANY)})
+
+
+@dataclass(frozen=True)
+class BaselineSettings:
+    """Which filters are scored beside, and on how many training pieces they are tuned."""
+
+    models: Sequence[str]
+    tune: bool
+    pieces: int | None
+    rounds: int
+
+
+@dataclass(frozen=True)
+class ScoringSettings:
+    """The test: outages, rows after longer GNSS and over an hour, the bias that is injected."""
+
+    seed: int
+    outage: OutagePlan | None
+    after_s: Sequence[float]
+    hour: str | None
+    gains: bool
+    settle_s: float
+    injected_bias: BiasLaw | None
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """What decides the weights, beside the data; ``finetune``: weights to begin with instead of ``model``."""
+
+    model: LearnedSettings
+    loss: Loss
+    optimizer: OptimizerSettings
+    scheduler: SchedulerSettings
+    trainer: TrainerSettings
+    callbacks: Sequence[Callback]
+    seed: int = 0
+    finetune: str | None = None
+
+
+@dataclass(frozen=True)
+class StudySettings:
+    """A study: fit, the baselines, the test."""
+
+    name: str
+    imu: ImuSpec
+    fit: FitSettings
+    baselines: BaselineSettings
+    scoring: ScoringSettings
+
+
+def fit_settings(config: Mapping[str, Any]) -> FitSettings:
+    """From the sections of ``conf/train.yaml`` as plain values; InputError for unknown keys, types and ranges."""
+    return FitSettings(
+        model=learned_settings(config["model"]),
+        loss=loss_of(config["loss"]),
+        optimizer=settings_from(OptimizerSettings, config["optimizer"], "optimizer"),
+        scheduler=settings_from(SchedulerSettings, config["scheduler"], "scheduler"),
+        trainer=settings_from(TrainerSettings, config["trainer"], "trainer"),
+        callbacks=[made(c, f"callbacks.{name}") for name, c in config["callbacks"].items() if c is not None],
+        seed=fitted(int, config["seed"], "seed"),
+        finetune=config.get("finetune"),
+    )
+
+
+def study_settings(config: Mapping[str, Any]) -> StudySettings:
+    """From the whole of ``conf/train.yaml`` as plain values; InputError for what does not fit."""
+    fit = fit_settings(config)
+    baselines = settings_from(BaselineSettings, config["baselines"], "baselines")
+    if fit.model.kind in baselines.models:
+        raise InputError(f"baselines.models has {fit.model.kind}, the name of the trained filter; take it out")
+    scoring = settings_from(ScoringSettings, config["scoring"], "scoring")
+    return StudySettings(str(config["name"]), imu_spec(config["imu"]), fit, baselines, scoring)
