@@ -8,10 +8,12 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+Counted = Callable[[int, int | None], None]  # steps done, steps in all where that is known
+
 
 @contextmanager
-def counting(title: str) -> Iterator[Callable[[int, int | None], None]]:
-    """A function of (steps done, steps in all) that moves a bar on stderr; it vanishes at the end."""
+def counting(title: str) -> Iterator[Counted]:
+    """What moves a bar on stderr, told (steps done, steps in all); it vanishes at the end."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(title, total=None)

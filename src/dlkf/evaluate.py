@@ -19,7 +19,6 @@ from dlkf.data.alignment import AlignConfig
 from dlkf.data.drive import Drive
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import dataset_digest, load_dataset
-from dlkf.errors import InputError
 from dlkf.evaluation.protocol import Scenes, protocol_from
 from dlkf.evaluation.study import study
 from dlkf.evaluation.summary import answer, metrics_of
@@ -31,11 +30,9 @@ from dlkf.models import check_baseline, grid_of, resolve_models
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.provenance import provenance
 from dlkf.report.evaluation import write_report
-from dlkf.running.references import KINDS, referenced
+from dlkf.running.references import check_reference, referenced
 from dlkf.tracking.evaluations import log_evaluation
 from dlkf.tracking.runs import tracking_uri
-
-SMOOTHER = "mbkf21"  # makes a reference where there is none
 
 
 @command("evaluate")
@@ -48,74 +45,55 @@ def main(cfg: DictConfig) -> None:
     options = {"tuning": config["tuning"], "prior": config["prior"]}
     models = resolve_models(config["model"], imu_spec(config["imu"]), uri, **options)
     check_baseline(config["baseline"], models)
-    if config["reference"] not in KINDS:
-        raise InputError(f"reference={config['reference']} is none of {', '.join(KINDS)}")
+    check_reference(config["reference"])
     grid = grid_of(models.values(), config["rate_hz"], config["epoch_s"])
     with counting("Loading drives") as progress:
-        drives = load_dataset(
-            config["dataset"],
-            dtype=torch.float64,
-            drives=config["drives"],
-            reference=config["reference"] == "file",
-            progress=lambda name, done, total: progress(done, total),
-            **grid,
-        )
-    cards = {name: getattr(model, "card", {}) for name, model in models.items()}
-    drives, seen = without_seen(cards, drives, dataset_digest(config["dataset"]), leave_out=config["unseen"])
+        options = {"drives": config["drives"], "reference": config["reference"] == "file", **grid}
+        drives = load_dataset(config["dataset"], dtype=torch.float64, progress=progress, **options)
+    digest, name = dataset_digest(config["dataset"]), drives[0].dataset
+    cards = {model_name: getattr(model, "card", {}) for model_name, model in models.items()}
+    drives, seen = without_seen(cards, drives, digest, leave_out=config["unseen"])
     for line in seen:
         console.print(line, style="yellow")
     drives, truth = with_truth(drives, config, console.print)
     scenes = Scenes(drives, protocol)
     for reason in scenes.skipped.values():
         console.print(f"left out: {reason}", style="yellow")
-    name = drives[0].dataset
-    digest = dataset_digest(config["dataset"])
-    scores, made = study(
-        models,
-        scenes,
-        kinds=drive_kinds(config["dataset"]),
-        groups={d.name: d.group for d in drives},
-        baseline=config["baseline"],
-        settle_s=config["settle_s"],
-        injected_bias=config["injected_bias"],
-        seed=config["seed"],
-    )
+    told = {key: config[key] for key in ("baseline", "settle_s", "injected_bias", "seed")}
+    kinds, groups = drive_kinds(config["dataset"]), {d.name: d.group for d in drives}
+    scores, made = study(models, scenes, kinds=kinds, groups=groups, **told)
     made_how = {**provenance(), **settings_of(config), "digest": digest, **truth, **grid, **scenes.described()}
     by_time, baseline = scenes.mode == "pieces", config["baseline"]
     write_report(config["out"], name, scores, made, protocol=made_how, by_time=by_time, baseline=baseline)
-    tables, run = all_tables(name, made), None
-    if config["tracking"]["log"]:
-        run = log_evaluation(config, uri, f"{' '.join(models)} on {name}", digest, metrics_of(made), tables)
+    tables, title = all_tables(name, made), f"{' '.join(models)} on {name}"
+    run = config["tracking"]["log"] and log_evaluation(config, uri, title, digest, metrics_of(made), tables)
     for table in tables:
         console.print(as_rich(table))
     if scenes.outage and not scores.outage.any():
         console.print("no outage fits into the valid truth of these drives; see outage.*", style="yellow")
     for result in made:
         console.print(f"\n[bold]{answer(result)}[/bold]", highlight=False)
-    where = f"; MLflow: run {run}" if run else ""
-    console.print(f"Report: {config['out']}/report.html{where}", soft_wrap=True)
+    console.print(f"Report: {config['out']}/report.html{f'; MLflow: run {run}' if run else ''}", soft_wrap=True)
 
 
 def with_truth(drives: list[Drive], config: Mapping[str, Any], say: Callable) -> tuple[list[Drive], dict[str, str]]:
     """The drives with the reference that is asked for, and what is to be said of it."""
     if config["reference"] == "file":
         return drives, {}
-    smoother = build_filter(SMOOTHER, imu_spec(config["imu"]), tuning=config["tuning"])
+    smoother = build_filter("mbkf21", imu_spec(config["imu"]), tuning=config["tuning"])
     with counting("Making the reference") as progress:
         made = referenced(drives, config["reference"], smoother, AlignConfig.of(config["align"]), progress)
     for reason in made.skipped.values():
         say(f"left out: {reason}", style="yellow")
-    sigma = f"1σ {made.horizontal_m:.2g} m horizontal, {made.vertical_m:.2g} m vertical (median, as it says itself)"
-    what = "smoothed solution with all fixes" if config["reference"] == "smoothed" else "good fixes"
-    say(f"No truth: errors are against the {what}, {sigma}.", style="bold")
-    return made.drives, {"reference": f"{what}, {sigma}"}
+    say(f"No truth: errors are against the {made.described()}.", style="bold")
+    return made.drives, {"reference": made.described()}
 
 
 def settings_of(config: Mapping[str, Any]) -> dict[str, Any]:
     """What decides the numbers, for the report."""
-    imu = {k: v for k, v in config["imu"].items() if k in ("accel", "gyro")}
-    told = {"models": config["model"], "dataset": config["dataset"], "imu": config["imu"]["name"], "imu values": imu}
-    return told | {"tuning": config["tuning"]}
+    imu = {k: config["imu"][k] for k in ("accel", "gyro")}
+    told = {"models": config["model"], "dataset": config["dataset"], "imu": config["imu"]["name"]}
+    return told | {"imu values": imu, "tuning": config["tuning"]}
 
 
 if __name__ == "__main__":

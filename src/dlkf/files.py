@@ -1,4 +1,4 @@
-"""Whole files or none: write into a hidden folder beside the target, then move all into place."""
+"""Whole files or none: write beside the target, then move into place. A kill leaves the old one or the new one."""
 
 from __future__ import annotations
 
@@ -17,6 +17,38 @@ def vacant(folder: str | Path, *, overwrite: bool) -> None:
     target = Path(folder).expanduser()
     if not overwrite and target.is_dir() and any(target.iterdir()):
         raise InputError(f"out={folder} exists already and is not empty; give another out= or overwrite=true")
+
+
+@contextmanager
+def whole_file(path: str | Path) -> Iterator[Path]:
+    """A place beside ``path`` to write to; what lies there when the block ends well becomes the file."""
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    beside = target.with_name(f".{target.name}.{os.getpid()}")
+    try:
+        yield beside
+        os.replace(beside, target)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(path: str | Path) -> Iterator[Path]:
+    """A new folder beside ``path``; when the block ends well it takes its place, and that of all that lay there."""
+    target = Path(path).absolute()
+    beside, old = (target.with_name(f".{target.name}.{what}-{os.getpid()}") for what in ("partial", "old"))
+    try:
+        beside.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(f"out={path}: cannot write there ({error.strerror}); give another folder") from None
+    try:
+        yield beside
+        if target.exists():
+            target.rename(old)
+        beside.rename(target)
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
 
 
 @contextmanager

@@ -65,7 +65,7 @@ def main(cfg: DictConfig) -> None:
                 config["dataset"],
                 dtype=torch.float64,
                 reference=False,
-                progress=lambda name, done, total: progress(done, total),
+                progress=progress,
                 **grid,
             )
         navigated = partial(navigate_drives, drives, model, align=align, skipped=skipped)

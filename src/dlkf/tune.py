@@ -44,7 +44,7 @@ def main(cfg: DictConfig) -> None:
             epoch_s=config["epoch_s"],
             dtype=torch.float64,
             drives=config["drives"],
-            progress=lambda _, done, total: progress(done, total),
+            progress=progress,
         )
     parts, dataset = sides(drives, config), drives[0].dataset
     with start_run(uri, "tune", f"{model} {dataset}") as run:

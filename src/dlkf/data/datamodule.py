@@ -10,6 +10,7 @@ import lightning as L
 import numpy as np
 import torch
 
+from dlkf.console import Counted
 from dlkf.data.augmentation import turn_frames
 from dlkf.data.degradation import GnssNoise
 from dlkf.data.drive import Batch, Drive
@@ -70,7 +71,7 @@ class DriveDataModule(L.LightningDataModule):
         seed: int = 0,
         eval_seed: int = 0,
         split_seed: int = 0,
-        progress: Callable[[str, int, int], None] | None = None,
+        progress: Counted | None = None,
     ) -> None:
         super().__init__()
         if dtype not in DTYPES:

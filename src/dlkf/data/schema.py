@@ -15,8 +15,6 @@ NaN stands for what a source does not know. Any other column is carried along.
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,6 +26,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dlkf.errors import InputError
+from dlkf.files import whole_file, whole_folder
 
 F, I, B = pa.float64(), pa.int8(), pa.bool_()
 ACCEL = ("accel_x", "accel_y", "accel_z")
@@ -83,33 +82,14 @@ def new_dataset(folder: str | Path, overwrite: bool = False) -> Iterator[Path]:
         raise InputError(
             f"out={folder}: exists already; give another folder, or overwrite=true to replace it"
         )
-    beside = target.with_name(f".{target.name}.partial-{os.getpid()}")
-    try:
-        beside.mkdir(parents=True)
-    except OSError as error:
-        raise InputError(
-            f"out={folder}: cannot write there ({error.strerror}); give another folder"
-        ) from None
-    old = target.with_name(f".{target.name}.old-{os.getpid()}")
-    try:
+    with whole_folder(folder) as beside:
         yield beside
-        if target.exists():
-            target.rename(old)
-        beside.rename(target)
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
-        shutil.rmtree(old, ignore_errors=True)
 
 
 def write_parquet(path: Path, table: pa.Table) -> None:
     """Write a table beside its place, then rename it into place."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
+    with whole_file(path) as beside:
         pq.write_table(table, beside, compression="zstd")
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 def write_drive(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
+from dlkf.console import Counted
 from dlkf.data.drive import Drive
 from dlkf.data.resampling import assign_fixes, epoch_grid, reference_at, resample_imu
 from dlkf.data.tables import DriveRow, dataset_digest, read_drives
@@ -25,11 +26,11 @@ def load_dataset(
     reference: bool = True,
     drives: Sequence[str] | None = None,
     limits: Limits = LIMITS,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Counted | None = None,
 ) -> list[Drive]:
     """The drives of a dataset, or those named, on an epoch grid; IMU in ``dtype``, the rest float64.
 
-    With ``reference=False`` the folder ``reference/`` is not opened. ``progress(drive, done, all)`` is called
+    With ``reference=False`` the folder ``reference/`` is not opened. ``progress(drives done, in all)`` is called
     after each drive. Raises InputError for the first fault in the data or an unknown drive.
     """
     folder = Path(folder)
@@ -39,7 +40,7 @@ def load_dataset(
         tables = read_checked(folder, row, reference=reference, limits=limits)
         loaded.append(drive_from_tables(tables, folder.absolute().name, rate_hz, epoch_s, dtype))
         if progress is not None:
-            progress(row.name, len(loaded), len(rows))
+            progress(len(loaded), len(rows))
     return loaded
 
 

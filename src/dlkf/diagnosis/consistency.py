@@ -9,7 +9,7 @@ careful.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from torch import Tensor
 
+from dlkf.console import Counted
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
 from dlkf.evaluation.figures import SHADE, png
@@ -102,7 +103,7 @@ def consistency(
     estimator: Analytic,
     batch: Batch,
     matrices: Float[Tensor, "B 2 3 3"],
-    progress: Callable[[int, int], None] | None = None,
+    progress: Counted | None = None,
 ) -> Normalised:
     """NEES and NIS of a filter over drives with errors as it models them (``matched_drives``)."""
     n, rows = estimator.states.navigation, []

@@ -7,7 +7,7 @@ are white, its antenna is the IMU, and every drive has a new unit and a new car.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dlkf.console import Counted
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.segments import Piece, StartLaw, make_batch
 from dlkf.data.store import drive_from_tables
@@ -82,7 +83,7 @@ def matching(spec: ImuSpec, states: ErrorStates) -> ImuSpec:
 
 
 def matched_batch(
-    settings: MatchedDrives, spec: ImuSpec, progress: Callable[[int, int], None] | None = None
+    settings: MatchedDrives, spec: ImuSpec, progress: Counted | None = None
 ) -> tuple[Batch, Tensor]:
     """The drives as one batch, and the units' matrices M (B, 2, 3, 3).
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import torch
 from torch import Tensor
 
+from dlkf.console import Counted
 from dlkf.data.draws import piece_generator
 from dlkf.data.masks import BiasLaw, with_bias
 from dlkf.evaluation.metrics import Array
@@ -25,7 +26,7 @@ def injected_response(
     law: BiasLaw,
     seed: int = 0,
     total: int | None = None,
-    progress: Callable[[int, int | None], None] | None = None,
+    progress: Counted | None = None,
 ) -> tuple[Array, dict[str, Array]]:
     """A bias injected into every piece (P, 6), and how far each filter's last estimate followed it (P, 6).
 

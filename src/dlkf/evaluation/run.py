@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple
 
@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dlkf.console import Counted
 from dlkf.data.drive import Batch
 from dlkf.data.masks import withhold
 from dlkf.errors import InputError
@@ -48,7 +49,7 @@ def score_scenes(
     kinds: Mapping[str, str] | str = "unknown",
     state: str = "posterior",
     chunk_samples: int = CHUNK_SAMPLES,
-    progress: Callable[[int, int | None], None] | None = None,
+    progress: Counted | None = None,
 ) -> Scores:
     """Run every filter over the same scenes: batches, each with the mask (B, T) of its withheld fixes.
 

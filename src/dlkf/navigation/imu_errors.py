@@ -12,14 +12,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import Any
 
 from dlkf.errors import InputError
 from dlkf.ranges import middle
-from dlkf.settings import check_from_zero
+from dlkf.settings import check_from_zero, is_number, settings_from
 
 DEG = math.pi / 180
 MILLIGAL = 1e-5  # m/s²
+NEEDED = ("noise_density", "turn_on_bias", "instability", "correlation_time", "scale_factor", "misalignment")
 
 
 @dataclass(frozen=True)
@@ -94,33 +96,23 @@ def imu_spec(config: Mapping) -> ImuSpec:
     Raises InputError for a missing or unknown key or a value that is no number ≥ 0.
     """
     config = middle(config)
-    name = str(config.get("name", "unnamed")) if isinstance(config, Mapping) else repr(config)
-    _check_keys(config, {"name", "accel", "gyro"}, {"source"}, f"IMU preset {name}")
-    needed = {
-        "noise_density", "turn_on_bias", "instability", "correlation_time", "scale_factor", "misalignment",
-    }  # fmt: skip
-    optional = {f.name for f in fields(SensorErrors)} - needed
-    sensors = {}
-    for sensor in ("accel", "gyro"):
-        where = f"IMU preset {name}, {sensor}"
-        _check_keys(config[sensor], needed, optional, where)
-        for key, value in config[sensor].items():
-            if not isinstance(value, (int, float)) or isinstance(value, bool):
-                raise InputError(f"{where}: {key} is {value!r}, must be a finite number ≥ 0")
-        try:
-            sensors[sensor] = SensorErrors(**{key: float(value) for key, value in config[sensor].items()})
-        except InputError as error:
-            raise InputError(str(error).replace("IMU preset", where, 1)) from None
-    if sensors["accel"].g_sensitivity:
-        raise InputError(f"IMU preset {name}, accel: g_sensitivity is an error of gyroscopes alone, leave it out")
-    return ImuSpec(name=name, source=str(config.get("source", "")), **sensors)
-
-
-def _check_keys(config: object, needed: set[str], optional: set[str], where: str) -> None:
     if not isinstance(config, Mapping):
-        raise InputError(f"{where}: is {config!r}, must be a mapping with {', '.join(sorted(needed))}")
-    if missing := needed - set(config):
-        raise InputError(f"{where}: {', '.join(sorted(missing))} missing")
-    if unknown := {str(key) for key in config} - needed - optional:
-        known = ", ".join(sorted(needed | optional))
-        raise InputError(f"{where}: unknown key {', '.join(sorted(unknown))}; known are {known}")
+        raise InputError(f"IMU preset is {config!r}, must be a mapping with name, accel, gyro")
+    where = f"IMU preset {config.get('name', 'unnamed')}"
+    told = {key: str(config[key]) for key in ("name", "source") if key in config}
+    sensors = {key: _sensor(config[key], f"{where}, {key}") for key in ("accel", "gyro") if key in config}
+    spec = settings_from(ImuSpec, {**config, **told, **sensors}, where)
+    if spec.accel.g_sensitivity:
+        raise InputError(f"{where}, accel: g_sensitivity is an error of gyroscopes alone, leave it out")
+    return spec
+
+
+def _sensor(values: Any, where: str) -> SensorErrors:
+    if isinstance(values, Mapping):
+        if missing := [key for key in NEEDED if key not in values]:
+            raise InputError(f"{where}: {', '.join(missing)} missing")
+        values = {key: float(x) if is_number(x) else x for key, x in values.items()}
+    try:
+        return settings_from(SensorErrors, values, where)
+    except InputError as error:
+        raise InputError(str(error).replace("IMU preset:", f"{where}:", 1)) from None

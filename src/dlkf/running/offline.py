@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import torch
 
+from dlkf.console import Counted
 from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.drive import Drive
 from dlkf.data.segments import whole_drives
@@ -112,7 +113,7 @@ def navigate_drives(
     *,
     align: AlignConfig = ALIGN,
     skipped: dict[str, str] | None = None,
-    progress: Callable[[int, int | None], None] | None = None,
+    progress: Counted | None = None,
 ) -> Iterator[Navigated]:
     """Run a filter over whole drives, from the first moment at which each can be aligned as ``align`` says.
 

@@ -7,13 +7,14 @@ beside the errors, and errors of that size mean nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from dlkf.console import Counted
 from dlkf.data.alignment import AlignConfig
 from dlkf.data.drive import Drive
 from dlkf.data.segments import whole_drives
@@ -38,6 +39,19 @@ class Referenced(NamedTuple):
     horizontal_m: float
     vertical_m: float
     skipped: dict[str, str]
+    kind: str
+
+    def described(self) -> str:
+        """What errors against it are errors against."""
+        what = "smoothed solution with all fixes" if self.kind == "smoothed" else "good fixes"
+        sigma = f"{self.horizontal_m:.2g} m horizontal, {self.vertical_m:.2g} m vertical"
+        return f"{what}, 1σ {sigma} (median, as it says itself)"
+
+
+def check_reference(kind: str) -> None:
+    """InputError for a kind of reference that is none."""
+    if kind not in KINDS:
+        raise InputError(f"reference={kind} is none of {', '.join(KINDS)}")
 
 
 def referenced(
@@ -45,7 +59,7 @@ def referenced(
     kind: str,
     estimator: Mbkf,
     align: AlignConfig,
-    progress: Callable[[int, int | None], None] | None = None,
+    progress: Counted | None = None,
 ) -> Referenced:
     """The drives with their smoothed solution (``smoothed``) or their good fixes (``gnss``) as reference.
 
@@ -54,8 +68,7 @@ def referenced(
     that is frequent, brought to the IMU by the smoothed attitude; no attitude. Drives that cannot be aligned are left
     out and the reason told, unless none is left (InputError).
     """
-    if kind not in KINDS[1:]:
-        raise InputError(f"reference={kind} is none of {', '.join(KINDS)}")
+    check_reference(kind)
     made, sigmas, skipped = [], [], {}
     for k, (drive, start) in enumerate(zip(drives, align_each(drives, replace(align, from_rest=True)))):
         if isinstance(start, InputError):
@@ -92,7 +105,7 @@ def referenced(
     if not len(sigma):
         raise InputError(f"reference={kind}: no fix is good enough to be one")
     usual = sigma.median(0).values
-    return Referenced(made, float(usual[:2].norm()), float(usual[2]), skipped)
+    return Referenced(made, float(usual[:2].norm()), float(usual[2]), skipped, kind)
 
 
 def _blank(drive: Drive) -> dict[str, Tensor]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from dlkf.console import Counted
 from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
 from dlkf.data.store import drive_from_tables, drive_rows
@@ -100,7 +101,7 @@ def stream_drives(
     align: AlignConfig = ALIGN,
     drives: Sequence[str] | None = None,
     skipped: dict[str, str] | None = None,
-    progress: Callable[[int, int | None], None] | None = None,
+    progress: Counted | None = None,
 ) -> Iterator[Navigated]:
     """The drives of a dataset, or those named, each through a stream of its own; no reference is read.
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from dlkf.files import whole_file
 from dlkf.tracking.grid import PARENT_RUN, parent_status
 from dlkf.tracking.runs import client_of, experiment_id, tracking_uri
 
@@ -23,12 +24,10 @@ class Study:
         self.done: dict[str, str] = json.loads(self.file.read_text()) if self.file.is_file() else {}
 
     def remember(self, key: str, value: str) -> None:
-        """Write beside and rename: safe against a kill."""
+        """Safe against a kill."""
         self.done[key] = value
-        self.folder.mkdir(parents=True, exist_ok=True)
-        beside = self.file.with_suffix(".part")
-        beside.write_text(json.dumps(self.done, indent=1))
-        beside.replace(self.file)
+        with whole_file(self.file) as beside:
+            beside.write_text(json.dumps(self.done, indent=1))
 
     def train(self, key: str, *overrides: str) -> Path:
         """Run folder of ``python -m dlkf.train`` with these overrides; a training that was killed goes on."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from dlkf.data.store import dataset_digest
 from dlkf.errors import InputError
+from dlkf.files import whole_file
 
 STATE = "state.json"
 NOT_HASHED = ("tracking", "resume")
@@ -56,7 +56,5 @@ def checked_digests(datasets: Sequence[str], state: Mapping[str, Any]) -> dict[s
 
 def write_state(folder: Path, **values: Any) -> None:
     """Merge values into the state file, whole or not at all."""
-    folder.mkdir(parents=True, exist_ok=True)
-    beside = folder / f"{STATE}.{os.getpid()}"
-    beside.write_text(json.dumps(read_state(folder) | values, indent=1))
-    beside.replace(folder / STATE)
+    with whole_file(folder / STATE) as beside:
+        beside.write_text(json.dumps(read_state(folder) | values, indent=1))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ import lightning as L
 from lightning.pytorch.callbacks import Callback, Checkpoint
 
 from dlkf.errors import InputError
+from dlkf.files import whole_file, whole_folder
 from dlkf.filters.saved import save_filter
 
 LAST = "last.ckpt"
@@ -29,10 +28,8 @@ class ResumePoint(Checkpoint):
         epoch = trainer.current_epoch + 1
         if epoch % self.every and epoch != trainer.max_epochs:
             return
-        self.folder.mkdir(parents=True, exist_ok=True)
-        beside = self.folder / f"{LAST}.{os.getpid()}.part"
-        trainer.save_checkpoint(beside)
-        beside.replace(self.folder / LAST)
+        with whole_file(self.folder / LAST) as beside:
+            trainer.save_checkpoint(beside)
 
 
 class BestWeights(Callback):
@@ -57,11 +54,8 @@ class BestWeights(Callback):
         score = float(trainer.callback_metrics[self.monitor])
         if score < self.score:
             self.score, self.epoch = score, trainer.current_epoch
-            beside, final = self.folder / f".{BEST}.{os.getpid()}", self.folder / BEST
-            shutil.rmtree(beside, ignore_errors=True)
-            save_filter(module.filter, beside, self.notes)
-            shutil.rmtree(final, ignore_errors=True)
-            beside.rename(final)
+            with whole_folder(self.folder / BEST) as beside:
+                save_filter(module.filter, beside, self.notes)
 
     def state_dict(self) -> dict:
         """Best score so far."""
