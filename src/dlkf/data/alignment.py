@@ -166,7 +166,7 @@ def _velocity(
 ) -> tuple[Float[Tensor, "rows 3"], Float[Tensor, "rows 3"], Bool[Tensor, " rows"]]:
     """Antenna velocity in n with std, and where its horizontal part is known; an unknown v_d is zero."""
     known = drive.gnss_valid[:, 3:]
-    if bool(known[:, :2].any()):
+    if torch.compiler.is_compiling() or bool(known[:, :2].any()):
         v_n = (C_en.mT @ drive.gnss_v_e.unsqueeze(-1)).squeeze(-1)
         v_n = torch.where(known, v_n, torch.zeros_like(v_n))
         guess = UNKNOWN_VELOCITY_STD + UNKNOWN_SLOPE_STD * v_n[:, :2].norm(dim=-1, keepdim=True)

@@ -172,7 +172,7 @@ def fixes_at(gnss: Columns, rows: np.ndarray, boundaries: np.ndarray) -> Fixes:
     """Some rows of a GNSS table as fixes of the boundaries [s] given for them."""
     r_e, v_e, C_en = _ecef(gnss, rows)
     quality = gnss["quality"][rows].astype(np.int64)
-    default = np.array([_default_std(int(q)) for q in quality]).reshape(-1, 6)
+    default = np.array([default_std(int(q)) for q in quality]).reshape(-1, 6)
     std = np.stack([gnss[c][rows] for c in STD], -1)
     std = np.maximum(np.where(np.isnan(std), default, std), SMALLEST_STD)
     v_ned = np.stack([gnss[c][rows] for c in VELOCITY], -1)
@@ -246,7 +246,8 @@ def reference_at(reference: Columns | None, grid: Grid) -> Truth:
     )
 
 
-def _default_std(quality: int) -> tuple[float, ...]:
+def default_std(quality: int) -> tuple[float, ...]:
+    """1σ [m, m/s] of a fix of which nothing but its NMEA GGA quality is known."""
     position, velocity = DEFAULT_STD[quality]
     return (position, position, VERTICAL_FACTOR * position, velocity, velocity, velocity)
 

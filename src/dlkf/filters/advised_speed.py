@@ -28,7 +28,10 @@ class AdvisedSpeed:
     def rows(self, epoch: Epoch, memory: None, believed: Believed) -> tuple[Measurement | None, None]:
         """The row, or none where no piece is told a speed."""
         speed: Tensor | None = None if epoch.advice is None else epoch.advice.speed
-        if speed is None or not bool((used := speed[:, 1:] < ABSENT).any()):
+        if speed is None:
+            return None, None
+        used = speed[:, 1:] < ABSENT
+        if not (torch.compiler.is_compiling() or bool(used.any())):
             return None, None
         state = epoch.window.end
         forward = state.C_nb[:, :, :1].mT

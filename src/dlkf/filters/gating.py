@@ -105,7 +105,8 @@ class Gate:
         return near & (memory.refused > 0)
 
     def _fits(self, z: Tensor, S: Tensor, used: Tensor) -> Tensor:
-        nis = (z * torch.cholesky_solve(z.unsqueeze(-1), torch.linalg.cholesky(S)).squeeze(-1)).sum(-1)
+        factor = torch.linalg.cholesky_ex(S, check_errors=not torch.compiler.is_compiling())[0]
+        nis = (z * torch.cholesky_solve(z.unsqueeze(-1), factor).squeeze(-1)).sum(-1)
         return nis <= z.new_tensor(self._limits)[used.sum(-1)]
 
     @cached_property

@@ -103,6 +103,21 @@ class Estimator(Protocol):
         ...
 
 
+@runtime_checkable
+class WholeLoop(Protocol):
+    """An estimator that runs the loop itself, because it was compiled with it (:mod:`dlkf.onboard`)."""
+
+    def advance(
+        self, memory: Any, imu: Tensor, fix: Fix, frame: TangentFrame
+    ) -> tuple[Any, Step]:
+        """What :func:`advance` gives; state and error are in its memory."""
+        ...
+
+    def integrate(self, batch: Batch) -> Solution:
+        """What :func:`integrate` gives."""
+        ...
+
+
 class Step(NamedTuple):
     """One turn of the loop."""
 
@@ -128,6 +143,7 @@ class Solution:
     covariances: Covariances | None = None  # (B, T, …) where asked for and known
     error: ImuError | None = None  # (B, T, …) likewise: bias and sensor matrices apart
     speed: Tensor | None = None  # (B, T, 2) m/s: forward speed that a network tells, and its 1σ
+    innovation_std: Tensor | None = None  # (B, T, 6) where it is known without the covariances
 
 
 def advance(
@@ -143,6 +159,8 @@ def advance(
     lever_arm_b: Tensor | None,
 ) -> tuple[Any, Step]:
     """One epoch: strapdown over its samples (B, M, 6), innovation, the estimator's answer, feedback."""
+    if isinstance(estimator, WholeLoop):
+        return estimator.advance(memory, imu, fix, frame)
     corrected = error.corrected(imu)
     window = strapdown(state, corrected, dt, frame)
     prior = window.end
@@ -160,6 +178,8 @@ def advance(
 
 def integrate(batch: Batch, estimator: Estimator, *, keep_covariances: bool = False) -> Solution:
     """Run an estimator over a batch from its start state; differentiable where the estimator is."""
+    if isinstance(estimator, WholeLoop):
+        return estimator.integrate(batch)
     state = batch.start
     memory, imu_error = estimator.begin(batch)
     error = ImuError.of(imu_error)

@@ -131,7 +131,8 @@ class LearnedFilter(nn.Module):
         has_fix = epoch.used.any(-1)
         memory = memory._replace(elapsed=memory.elapsed + span, since_fix=memory.since_fix + span)
         hold = self.config.outage_mode == "hold"
-        rows = has_fix.nonzero().squeeze(-1) if hold else torch.arange(B, device=epoch.z.device)
+        exporting = torch.compiler.is_compiling()  # then all pieces run, and those without a fix keep what they had
+        rows = has_fix.nonzero().squeeze(-1) if hold and not exporting else torch.arange(B, device=epoch.z.device)
         dx = epoch.z.new_zeros(B, 9)
         gain = epoch.z.new_zeros(B, 9, 6)
         if len(rows) == 0:
@@ -143,13 +144,18 @@ class LearnedFilter(nn.Module):
             turn = part[:, ATTITUDE].norm(dim=-1, keepdim=True).detach()
             shrink = (MAX_TRAINING_TURN / turn.clamp_min(1e-9)).clamp(max=1.0)
             part = torch.cat((part[:, :6], part[:, ATTITUDE] * shrink), -1)
-        if whole:
+        if hold and exporting:
+            dx, gain = _chosen(has_fix, part, dx), _chosen(has_fix, K, gain)
+            error = ImuError(*(None if n is None else _chosen(has_fix, n, o) for n, o in zip(error, epoch.error)))
+            recurrent = tuple(torch.where(has_fix[:, None], new, o) for new, o in zip(recurrent, memory.recurrent))
+        elif whole:
             dx, gain = part, K
         else:
             dx, gain = dx.index_copy(0, rows, part), gain.index_copy(0, rows, K)
             error = _with_rows(epoch.error, rows, error)
             recurrent = tuple(old.index_copy(1, rows, new) for old, new in zip(memory.recurrent, recurrent))
-        return self._remember(memory, epoch, dx, has_fix, rows, recurrent), Correction(dx, error, gain=gain)
+        ran = has_fix if hold else torch.ones_like(has_fix)
+        return self._remember(memory, epoch, dx, has_fix, ran, recurrent), Correction(dx, error, gain=gain)
 
     def _run(
         self, memory: Memory, epoch: Epoch, rows: Tensor, whole: bool, has_fix: Tensor
@@ -195,25 +201,21 @@ class LearnedFilter(nn.Module):
         return window, components, C_hn
 
     def _remember(
-        self, memory: Memory, epoch: Epoch, dx: Tensor, has_fix: Tensor, rows: Tensor, recurrent: Recurrent
+        self, memory: Memory, epoch: Epoch, dx: Tensor, has_fix: Tensor, ran: Tensor, recurrent: Recurrent
     ) -> Memory:
-        """Memory after the network ran on ``rows``."""
-        ran = torch.zeros_like(has_fix).index_fill(0, rows, True)
+        """Memory after the network ran on some pieces."""
         posterior = epoch.window.end.detach().corrected(dx.detach())
         difference = memory.posterior.error_to(posterior)
-
-        def choose(new: Tensor, old: Tensor, which: Tensor = ran) -> Tensor:
-            return torch.where(which.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
         return Memory(
             recurrent=recurrent,
             origin=memory.origin,
-            elapsed=choose(torch.zeros_like(memory.elapsed), memory.elapsed),
-            since_fix=choose(torch.zeros_like(memory.since_fix), memory.since_fix, has_fix),
-            posterior=NavState(*(choose(n, o) for n, o in zip(posterior, memory.posterior))),
-            difference=choose(difference, memory.difference),
-            difference_s=choose(memory.elapsed, memory.difference_s),
-            correction=choose(dx.detach(), memory.correction),
+            elapsed=_chosen(ran, torch.zeros_like(memory.elapsed), memory.elapsed),
+            since_fix=_chosen(has_fix, torch.zeros_like(memory.since_fix), memory.since_fix),
+            posterior=NavState(*(_chosen(ran, n, o) for n, o in zip(posterior, memory.posterior))),
+            difference=_chosen(ran, difference, memory.difference),
+            difference_s=_chosen(ran, memory.elapsed, memory.difference_s),
+            correction=_chosen(ran, dx.detach(), memory.correction),
             fix=torch.where(epoch.used, epoch.fix.value, memory.fix),
             had_fix=memory.had_fix | epoch.used,
         )
@@ -235,6 +237,11 @@ class LearnedFilter(nn.Module):
                 integrate(batch, self)
         windows, components = (torch.cat(x).float() for x in zip(*seen))
         self.scaling.fit(windows.clone(), components.clone())
+
+
+def _chosen(which: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """``new`` for some pieces, ``old`` for the others."""
+    return torch.where(which.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
 
 def _with_rows(old: ImuError, rows: Tensor, new: ImuError) -> ImuError:

@@ -148,7 +148,7 @@ class Mbkf:
                 H, R = masked(told.H, told.R, told.used)
                 parts.append(Measurement(told.z * told.used, H, R, told.used))
         z, H, R = ((x[0] if len(x) == 1 else torch.cat(x, 1)) for x in ([m[k] for m in parts] for k in range(3)))
-        informative = any(bool(m.used.any()) for m in parts)
+        informative = torch.compiler.is_compiling() or any(bool(m.used.any()) for m in parts)
         P = fix.P
         prior = P
         if informative:

@@ -142,7 +142,7 @@ class PlusFilter(nn.Module):
         zeros, B = batch.imu.new_zeros, batch.size[0]
         memory = Memory(
             kalman, self.network.start(B), zeros(B), zeros(B), zeros(B, 4) + 1.0, zeros(B), zeros(B, 3), zeros(B, 6),
-            torch.rand(B, device=batch.imu.device) < (SILENT_SHARE if self.training else 0.0),
+            torch.rand(B, device=batch.imu.device) < SILENT_SHARE if self.training else zeros(B) > 0,
         )  # fmt: skip
         return memory, error
 

@@ -7,6 +7,8 @@ textbook writes them, for one drive as for many. Without numba, or on a GPU, the
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import no_type_check
 
@@ -15,11 +17,25 @@ import torch
 from torch import Tensor
 
 AVAILABLE = find_spec("numba") is not None
+_tensor_forms = False
 
 
 def fits(x: Tensor) -> bool:
     """Whether the compiled form may stand in for the tensor form: no gradient asked for, in main memory."""
-    return AVAILABLE and x.device.type == "cpu" and not torch.is_grad_enabled() and not x.requires_grad
+    if _tensor_forms or not AVAILABLE:
+        return False
+    return x.device.type == "cpu" and not torch.is_grad_enabled() and not x.requires_grad
+
+
+@contextmanager
+def tensor_forms() -> Iterator[None]:
+    """Inside the block the tensor forms are taken in any case, as an export needs them."""
+    global _tensor_forms
+    before, _tensor_forms = _tensor_forms, True
+    try:
+        yield
+    finally:
+        _tensor_forms = before
 
 
 if AVAILABLE:

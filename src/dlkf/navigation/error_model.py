@@ -197,9 +197,8 @@ def measurement_matrix(
     states: int = STATES,
 ) -> Float[Tensor, "B 6 n"]:
     """H of antenna position and velocity with the lever arm in it (paper.md 2.5)."""
-    H = _identity(states, rate_b.dtype, rate_b.device).expand(len(rate_b), 6, states)
+    H = _identity(states, rate_b.dtype, rate_b.device).repeat(len(rate_b), 1, 1)
     if lever_arm_b is not None:
-        H = H.clone()
         arm_n, swing_n = _arm(state, rate_b, lever_arm_b)
         H[:, :3, ATTITUDE] = -skew(arm_n)
         H[:, 3:, ATTITUDE] = -skew(swing_n) + skew(frame.earth_rate_n) @ skew(arm_n)

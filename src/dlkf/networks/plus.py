@@ -111,9 +111,12 @@ def window_features(samples: Float[Tensor, "B M 6"], dt: float) -> Float[Tensor,
     M = samples.shape[1]
     mean = samples.mean(1)
     taper = torch.hann_window(M, periodic=False, dtype=samples.dtype, device=samples.device)
-    power = torch.fft.rfft((samples - mean.unsqueeze(1)) * taper[:, None], dim=1).abs().square()
+    swing = (samples - mean.unsqueeze(1)) * taper[:, None]
+    waves = torch.arange(min(M // 2, math.ceil(BANDS_HZ[-1] * M * dt)) + 1, device=samples.device)
+    turns = 2 * torch.pi / M * (waves[:, None] * torch.arange(M, device=samples.device) % M).to(samples.dtype)
+    power = (torch.cos(turns) @ swing).square() + (torch.sin(turns) @ swing).square()  # Fourier, up to the last band
     power = power * (2 / (M * taper.square().sum()))  # sums over all frequencies to the variance
-    frequency = torch.arange(power.shape[1], device=samples.device) / (M * dt)
+    frequency = waves / (M * dt)
     edges = torch.tensor(BANDS_HZ, device=samples.device)
     inside = ((frequency >= edges[:-1, None]) & (frequency < edges[1:, None])).to(samples.dtype)
     bands = (inside @ power).mT  # (B, 6, bands)

@@ -165,7 +165,7 @@ def _innovation(solution: Solution) -> Innovation:
     """Of a whole batch, (B, T, 6); components that were not seen are NaN."""
     value = solution.innovation.cpu().double()
     seen = solution.used.cpu().unsqueeze(-1) & (value != 0)
-    std = torch.full_like(value, torch.nan)
+    std = torch.full_like(value, torch.nan) if solution.innovation_std is None else solution.innovation_std
     if solution.covariances is not None:
         c = solution.covariances
         std = (((c.H @ c.predicted) * c.H).sum(-1) + c.R).clamp_min(0).sqrt().cpu().double()

@@ -76,8 +76,10 @@ def solution_columns(
     δh = J δ(roll, pitch, yaw), J = [Rz Ry e₁, Rz e₂, e₃].
     """
     state = NavState(*(x.detach().cpu().double() for x in state))
-    lat, lon, height = geodetic_from_ecef(frame.to_ecef(state.p_n.unsqueeze(0))[0])
-    C_ln = ned_axes(lat, lon).mT @ frame.C_en[0].cpu().double()
+    C_en = frame.C_en.cpu().double()  # of one frame for all rows, or of one each
+    r_e = (C_en @ state.p_n.unsqueeze(-1)).squeeze(-1) + frame.origin_e.cpu()
+    lat, lon, height = geodetic_from_ecef(r_e)
+    C_ln = ned_axes(lat, lon).mT @ C_en
     rpy = rpy_from_rotation(C_ln @ state.C_nb)
     columns = {"t": t.double(), "lat_deg": torch.rad2deg(lat), "lon_deg": torch.rad2deg(lon)}
     columns["height_m"] = height
@@ -102,7 +104,7 @@ def _std_columns(std: Tensor | None, C_ln: Tensor, rpy: Tensor) -> Tensor:
     tilted = rotation_from_rpy(torch.stack((zero, rpy[:, 1], rpy[:, 2]), -1))
     down = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(rpy)
     J = torch.stack((tilted[..., 0], heading[..., 1], down), -1)
-    to_rpy = torch.linalg.inv(J) @ C_ln
+    to_rpy = torch.linalg.inv_ex(J)[0] @ C_ln
     parts = (turned(C_ln, POSITION), turned(C_ln, VELOCITY), turned(to_rpy, ATTITUDE))
     return torch.cat((*parts, variance[:, ACCEL], variance[:, GYRO]), -1).sqrt()
 

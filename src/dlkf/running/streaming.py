@@ -51,6 +51,7 @@ from dlkf.running.imu_stream import ImuStream, Row
 from dlkf.running.reanchoring import FrameChange, can_reanchor, frame_at, reanchored
 from dlkf.running.start import align
 
+ANCHOR_M = 50_000.0  # from its origin on, the tangent frame is laid anew
 SETTLE_S = 3.0  # fixes over so long lay the grid
 MOST_EARLY_FIXES = 1000
 NO_FIX = Fixes(
@@ -118,7 +119,7 @@ class StreamingFilter:
         history_s: float = 10.0,
         phase_s: float | None = None,
         imu_step_s: float | None = None,
-        anchor_m: float = 50_000.0,
+        anchor_m: float = ANCHOR_M,
         limits: Limits = LIMITS,
     ) -> None:
         if not 0 <= history_s < math.inf:

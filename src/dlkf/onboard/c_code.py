@@ -1,0 +1,174 @@
+"""An exported graph as one C function: no library but the C one's mathematics, no allocation, no branch on data.
+
+``torch.export`` gives a filter's step as a list of core ATen operations on tensors of known shapes. Views of a tensor
+are strides and offsets and cost nothing; an operation by elements is one loop nest, in which those that feed it alone
+are written out; what depends on constants alone is computed here. Everything in between lies in one block on the stack,
+in which what is no longer needed makes room (:class:`dlkf.onboard.c_memory.Block`).
+
+The equations stay where they are, in torch: this knows operations, not filters.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.export import ExportedProgram
+from torch.fx import Node
+
+from dlkf.errors import InputError
+from dlkf.onboard.c_memory import C_TYPES, Block, Buffer, View, Written
+from dlkf.onboard.c_operations import BY_ELEMENT, CONVERT, IN_PLACE, WHOLE, literal
+
+KEPT = {  # operations that are one in C, though core ATen has several for them
+    f"aten::{name}"
+    for name in ("linalg_cross", "linalg_solve_ex", "_linalg_solve_ex", "linalg_cholesky_ex", "cholesky_solve", "linalg_inv_ex")
+}
+
+
+class Translation:
+    """Walks a graph and writes it down."""
+
+    def __init__(self, program: ExportedProgram) -> None:
+        self.block = Block()
+        self.values: dict[Node, Any] = {}
+        self.inputs: list[Buffer] = []
+        self.outputs: list[View] = []
+        self._program = program
+        for node in program.graph.nodes:
+            getattr(self, f"_{node.op}")(node)
+
+    # every kind of node
+
+    def _placeholder(self, node: Node) -> None:
+        signature, program = self._program.graph_signature, self._program
+        name = node.name
+        for names in (signature.inputs_to_parameters, signature.inputs_to_buffers, signature.inputs_to_lifted_tensor_constants):
+            if name in names:
+                key = names[name]
+                value = program.state_dict.get(key)
+                self.values[node] = program.constants[key] if value is None else value
+                return
+        value = node.meta["val"]
+        buffer = Buffer(f"in{len(self.inputs)}", value.dtype, value.numel(), fixed=True)
+        self.inputs.append(buffer)
+        self.values[node] = View(buffer, torch.empty(value.shape, dtype=value.dtype, device="meta"))
+
+    def _get_attr(self, node: Node) -> None:
+        self.values[node] = self._program.constants[node.target]
+
+    def _call_function(self, node: Node) -> None:
+        target: Any = node.target
+        args, kwargs = self._known(node.args), self._known(node.kwargs)
+        if target.__name__ == "getitem":
+            self.values[node] = args[0][args[1]]
+            return
+        name = target._schema.name.removeprefix("aten::")
+        parts = [*_flat(args), *_flat(kwargs)]
+        if not any(isinstance(a, (View, Written)) for a in parts) and "val" in node.meta:
+            self.values[node] = target(*args, **kwargs)  # known here
+        elif name == "_assert_tensor_metadata":
+            return
+        elif _is_view(target):
+            self.values[node] = self._viewed(target, args, kwargs)
+        elif name in IN_PLACE:
+            self.values[node] = self._copied(node, name, args)
+        elif name in BY_ELEMENT or name in CONVERT:
+            self.values[node] = self._by_element(node, name, args, kwargs)
+        elif name in WHOLE:
+            self.values[node] = WHOLE[name](self, node, *args, **kwargs)
+        else:
+            raise InputError(f"this filter uses {target}, which the C form of an exported filter does not know")
+
+    def _output(self, node: Node) -> None:
+        kept = len(self._program.graph_signature.user_outputs)
+        self.outputs = [self.tensor(self.values[n]) for n in node.args[0]][-kept:]  # type: ignore[union-attr]
+
+    # operands
+
+    def _known(self, x: Any) -> Any:
+        if isinstance(x, Node):
+            return self.values[x]
+        if isinstance(x, (list, tuple)):
+            return [self._known(a) for a in x]
+        return {k: self._known(a) for k, a in x.items()} if isinstance(x, dict) else x
+
+    def tensor(self, x: Any) -> View:
+        """A value as a tensor in memory."""
+        if isinstance(x, Tensor):
+            return self.block.constant(x)
+        if isinstance(x, Written):
+            out = self.block.new(x.shape, x.dtype)
+            self.block.over(out, x.pattern, x.operands)
+            return out
+        return x
+
+    def dense(self, x: Any) -> View:
+        """A value as a tensor without gaps."""
+        view = self.tensor(x)
+        if view.meta.is_contiguous():
+            return view
+        out = self.block.new(view.meta.shape, view.meta.dtype)
+        self.block.over(out, "{0}", [view])
+        return out
+
+    # kinds of operation
+
+    def _viewed(self, target: Any, args: list, kwargs: dict) -> Any:
+        view = self.tensor(args[0])
+        try:
+            made = target(view.meta, *args[1:], **kwargs)
+        except RuntimeError:  # strides that do not allow it
+            view = self.dense(view)
+            made = target(view.meta, *args[1:], **kwargs)
+        return [View(view.buffer, m) for m in made] if isinstance(made, (list, tuple)) else View(view.buffer, made)
+
+    def _by_element(self, node: Node, name: str, args: list, kwargs: dict) -> Any:
+        value = node.meta["val"]
+        pattern, operands = (CONVERT if name in CONVERT else BY_ELEMENT)[name], []
+        if callable(pattern):
+            pattern, args = pattern(value.dtype, args, kwargs)
+        pieces = []
+        for x in args:
+            if isinstance(x, Written) and x.shape == value.shape:
+                first = len(operands)
+                inner = x.pattern.format(*(f"{{{first + k}}}" for k in range(len(x.operands))))
+                pieces.append(f"({inner})")
+                operands += x.operands
+            elif isinstance(x, (View, Written)) or (isinstance(x, Tensor) and x.numel() > 1):
+                view = self.tensor(x)
+                pieces.append(f"{{{len(operands)}}}")
+                operands.append(View(view.buffer, view.meta.expand(value.shape)))
+            else:
+                pieces.append(literal(x.item() if isinstance(x, Tensor) else x, value.dtype))
+        written = Written(value.shape, value.dtype, f"({C_TYPES[value.dtype]})({pattern.format(*pieces)})", operands)
+        alone = len(node.users) == 1 and len(operands) <= 12 and value.numel() > 0
+        return written if alone and _goes_on(next(iter(node.users))) else self.tensor(written)
+
+    def _copied(self, node: Node, name: str, args: list) -> View:
+        """An operation that changes a part: a copy, then the part."""
+        whole = self.tensor(args[0])
+        out = self.block.new(whole.meta.shape, whole.meta.dtype)
+        self.block.over(out, "{0}", [whole])
+        part = IN_PLACE[name](out.meta, *args[2:])
+        source = self.tensor(args[1])
+        self.block.over(View(out.buffer, part), f"({C_TYPES[out.meta.dtype]}){{0}}", [View(source.buffer, source.meta.expand(part.shape))])
+        return out
+
+
+def _is_view(target: Any) -> bool:
+    returns = target._schema.returns
+    return bool(returns) and returns[0].alias_info is not None and not returns[0].alias_info.is_write
+
+
+def _goes_on(user: Node) -> bool:
+    """Whether a value may stay an expression: its only user takes it element by element."""
+    schema = getattr(user.target, "_schema", None)
+    return schema is not None and schema.name.removeprefix("aten::") in {*BY_ELEMENT, *CONVERT}
+
+
+def _flat(x: Any) -> list:
+    if isinstance(x, (list, tuple)):
+        return [b for a in x for b in _flat(a)]
+    return _flat(list(x.values())) if isinstance(x, dict) else [x]

@@ -1,0 +1,132 @@
+"""Tensors of a C function: views of buffers, loops over them, and one block of memory in which they lie."""
+
+from __future__ import annotations
+
+from bisect import insort
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import count
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+C_TYPES = {
+    torch.float64: "double", torch.float32: "float", torch.int64: "int64_t", torch.int32: "int32_t",
+    torch.bool: "unsigned char",
+}  # fmt: skip
+CACHE_LINE = 64  # bytes
+
+
+@dataclass
+class Buffer:
+    """Memory of one tensor: where it begins in the block is not known before its last use is."""
+
+    name: str
+    dtype: torch.dtype
+    numbers: int
+    born: int = 0  # line
+    last: int = 0
+    fixed: bool = False  # an argument or a constant
+
+
+@dataclass
+class View:
+    """A tensor: a buffer, and a tensor without data (``meta``) that has its shape, strides and offset."""
+
+    buffer: Buffer
+    meta: Tensor
+
+    def at(self, index: Sequence[str]) -> str:
+        """The element at an index."""
+        terms = [f"{s}*{i}" if s != 1 else i for s, i in zip(self.meta.stride(), index) if s and i != "0"]
+        if self.meta.storage_offset() or not terms:
+            terms.append(str(self.meta.storage_offset()))
+        return f"{self.buffer.name}[{'+'.join(terms)}]"
+
+
+@dataclass
+class Written:
+    """Elements of a tensor that are not computed yet: a C expression over the elements of others."""
+
+    shape: torch.Size
+    dtype: torch.dtype
+    pattern: str  # with {0}, {1}, … for the operands
+    operands: list[View]
+
+
+@dataclass
+class Block:
+    """Lines of the function, and the buffers that they use."""
+
+    lines: list[str] = field(default_factory=list)
+    buffers: list[Buffer] = field(default_factory=list)
+    constants: list[tuple[Buffer, np.ndarray]] = field(default_factory=list)
+    places: dict[str, int] = field(default_factory=dict)
+    names: Any = field(default_factory=lambda: count(0))
+
+    def new(self, shape: torch.Size | tuple[int, ...], dtype: torch.dtype) -> View:
+        """A tensor to be written next."""
+        meta = torch.empty(shape, dtype=dtype, device="meta")
+        buffer = Buffer(f"x{next(self.names)}", dtype, max(1, meta.numel()), len(self.lines), len(self.lines))
+        self.buffers.append(buffer)
+        return View(buffer, meta)
+
+    def constant(self, value: Tensor) -> View:
+        """A tensor known here."""
+        value = value.detach().cpu().contiguous()
+        buffer = Buffer(f"c{next(self.names)}", value.dtype, max(1, value.numel()), fixed=True)
+        self.constants.append((buffer, value.reshape(-1).numpy()))
+        return View(buffer, value.to("meta"))
+
+    def write(self, line: str, *used: View) -> None:
+        """A line, and the tensors in it."""
+        for view in used:
+            view.buffer.last = len(self.lines)
+        self.lines.append(line)
+
+    def over(self, out: View, expression: str, operands: Sequence[View]) -> None:
+        """``out`` = expression at every index; operands have the shape of ``out``."""
+        metas = [out.meta, *(o.meta for o in operands)]
+        sizes, strides = collapsed(list(out.meta.shape), [list(m.stride()) for m in metas])
+        views = [View(v.buffer, _strided(v.meta, sizes, s)) for v, s in zip((out, *operands), strides)]
+        index = [f"i{k}" for k in range(len(sizes))]
+        elements = [v.at(index) for v in views[1:]]
+        loops = "".join(f"for (int {i} = 0; {i} < {n}; {i}++) " for i, n in zip(index, sizes))
+        self.write(f"{loops}{views[0].at(index)} = {expression.format(*elements)};", out, *operands)
+
+    def laid_out(self) -> int:
+        """Give every buffer that is on the stack its place; bytes in all. What lives together lies apart."""
+        alive: list[tuple[int, int, int]] = []  # start, end, last line
+        highest = CACHE_LINE
+        for b in sorted(self.buffers, key=lambda b: b.born):
+            size = -(-b.numbers * b.dtype.itemsize // CACHE_LINE) * CACHE_LINE
+            alive = [a for a in alive if a[2] >= b.born]
+            place = 0
+            for start, end, _ in alive:
+                if start >= place + size:
+                    break
+                place = max(place, end)
+            insort(alive, (place, place + size, b.last))
+            self.places[b.name] = place
+            highest = max(highest, place + size)
+        return highest
+
+
+def collapsed(sizes: list[int], strides: list[list[int]]) -> tuple[list[int], list[list[int]]]:
+    """A loop nest with as few loops as all operands allow; loops of one pass fall away."""
+    kept = [k for k, n in enumerate(sizes) if n != 1]
+    sizes, strides = [sizes[k] for k in kept], [[s[k] for k in kept] for s in strides]
+    k = len(sizes) - 1
+    while k > 0:
+        if all(s[k - 1] == s[k] * sizes[k] for s in strides):
+            sizes[k - 1 : k + 1] = [sizes[k - 1] * sizes[k]]
+            for s in strides:
+                s[k - 1 : k + 1] = [s[k]]
+        k -= 1
+    return sizes, strides
+
+
+def _strided(meta: Tensor, sizes: list[int], strides: list[int]) -> Tensor:
+    return torch.as_strided(meta, sizes, strides, meta.storage_offset())

@@ -1,0 +1,137 @@
+"""Everything that a running filter carries from epoch to epoch, as one vector of numbers with a layout."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dlkf.errors import InputError
+from dlkf.filters.sources import FixMemory
+from dlkf.navigation.error_model import WindowModel
+
+OF_THE_FRAME = {WindowModel: ("still",), FixMemory: ("gate",)}  # the rest of these is the same for ever
+RECURRENT = "recurrent"  # cells of a network: the batch is their second axis
+MEANING = {
+    "frame.origin_e": "origin of the tangent frame n, ECEF [m]",
+    "frame.C_en": "axes of n (North, East, Down at the origin) in ECEF",
+    "frame.axis_n": "axis of the Earth in n",
+    "frame.earth_rate_n": "rotation of the Earth in n [rad/s]",
+    "frame.radius": "transverse radius of curvature plus height at the origin [m]",
+    "frame.stretch": "ratio of the ellipsoid's normal to the radius there",
+    "frame.height": "height of the origin [m]",
+    "state.p_n": "position of the IMU in n [m]",
+    "state.v_n": "velocity in n [m/s]",
+    "state.C_nb": "attitude, body (forward, right, down) to n",
+    "error.bias": "accelerometer [m/s²] and gyroscope [rad/s] bias in force",
+    "error.matrix": "scale factors, or M of measured = (I + M) true + bias",
+    "P": "covariance of the error states: m, m/s, rad, m/s², rad/s, then elements of M, then the car",
+    "still": "transition of a window in which nothing moves",
+    "structure": "mounting yaw, pitch [rad], distance to the rear axle [m], sideslip [s²/m]",
+    "lever_arm_b": "IMU to antenna, forward, right, down [m]",
+}
+
+
+@dataclass(frozen=True)
+class Field:
+    """A tensor in the vector: ``shape`` of one drive, numbers from ``offset`` on."""
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: torch.dtype
+    offset: int
+
+    @property
+    def size(self) -> int:
+        """How many numbers."""
+        return torch.Size(self.shape).numel()
+
+    @property
+    def batch_axis(self) -> int:
+        """Where the drives are."""
+        return 1 if RECURRENT in self.name else 0
+
+    def plain(self) -> dict[str, Any]:
+        """For a file."""
+        meaning = MEANING.get(self.name) or MEANING.get(self.name.rpartition(".")[2])
+        return {
+            "name": self.name, "offset": self.offset, "shape": list(self.shape), "type": str(self.dtype)[6:],
+            **({"meaning": meaning} if meaning else {}),
+        }  # fmt: skip
+
+
+class Layout:
+    """Where each tensor of a nested structure lies in a vector of float64; ``like`` has all tensors that ever come.
+
+    Truth values are 0 and 1, what a filter does not have yet is 0. InputError for a memory of anything but tensors.
+    """
+
+    def __init__(self, like: Any) -> None:
+        self.like = like
+        self.fields: list[Field] = []
+        offset = 0
+        for name, x in _leaves(like):
+            if not isinstance(x, Tensor):
+                raise InputError(f"{name} of this filter's memory is a {type(x).__name__}; only tensors can be exported")
+            batch = 1 if RECURRENT in name else 0
+            shape = tuple(s for axis, s in enumerate(x.shape) if axis != batch)
+            self.fields.append(Field(name, shape, x.dtype, offset))
+            offset += self.fields[-1].size
+        self.size = offset
+
+    def pack(self, structure: Any) -> Float[Tensor, "B K"]:
+        """The vectors of a structure."""
+        given = dict(_leaves(structure))
+        drives = next(x.shape[f.batch_axis] for f in self.fields if (x := given.get(f.name)) is not None)
+        parts = []
+        for f in self.fields:
+            x = given.get(f.name)
+            if x is None:
+                parts.append(torch.zeros(drives, f.size, dtype=torch.float64))
+            else:
+                parts.append(x.movedim(f.batch_axis, 0).reshape(drives, f.size).double())
+        return torch.cat(parts, -1)
+
+    def unpack(self, vector: Float[Tensor, "B K"]) -> Any:
+        """The structure of vectors."""
+        parts = []
+        for f in self.fields:
+            x = vector[:, f.offset : f.offset + f.size].reshape(len(vector), *f.shape).movedim(0, f.batch_axis)
+            parts.append(x > 0.5 if f.dtype == torch.bool else x.to(f.dtype))
+        return _rebuilt(self.like, iter(parts))
+
+
+def _children(x: Any) -> list[tuple[str, Any]] | None:
+    """Named parts of a structure, None for a leaf."""
+    for kind, names in OF_THE_FRAME.items():
+        if isinstance(x, kind):
+            return [(name, getattr(x, name)) for name in names]
+    if isinstance(x, tuple):
+        return list(zip(getattr(x, "_fields", map(str, range(len(x)))), x))
+    if is_dataclass(x):
+        return [(f.name, getattr(x, f.name)) for f in fields(x)]
+    return None
+
+
+def _leaves(x: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    children = _children(x)
+    if children is None:
+        if x is not None:
+            yield name, x
+    else:
+        for child, part in children:
+            yield from _leaves(part, f"{name}.{child}" if name else child)
+
+
+def _rebuilt(x: Any, parts: Iterator[Tensor]) -> Any:
+    children = _children(x)
+    if children is None:
+        return None if x is None else next(parts)
+    new = {name: _rebuilt(part, parts) for name, part in children}
+    if isinstance(x, tuple) and not hasattr(x, "_fields"):
+        return tuple(new.values())
+    return x._replace(**new) if isinstance(x, tuple) else replace(x, **new)
