@@ -16,6 +16,7 @@ FLOORS = (
     {"data", "networks"},
     {"filters", "simulation"},
     {"running"},
+    {"onboard"},
     {"evaluation"},
     {"report"},
     {"tuning", "diagnosis"},
@@ -23,7 +24,7 @@ FLOORS = (
     {"training"},
     {"models"},
     {"command"},
-    {"allan", "compare", "consistency", "doctor", "evaluate", "ingest", "navigate", "register"}
+    {"allan", "compare", "consistency", "doctor", "evaluate", "export", "ingest", "navigate", "register"}
     | {"simulate", "train", "tune", "ui"},
     {"__main__"},
 )

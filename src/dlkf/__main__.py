@@ -18,6 +18,7 @@ COMMANDS = {
     "doctor": "what is good and bad about a dataset",
     "navigate": "a filter over whole drives, from IMU and GNSS alone: solution, map, exports",
     "evaluate": "filters against each other on drives with a reference: tables, report",
+    "export": "a filter for a vehicle, as C without libraries",
     "train": "train a filter and score it against the classical ones",
     "tune": "fit the noise of a classical filter to drives",
     "allan": "noise of an IMU from a log at rest",

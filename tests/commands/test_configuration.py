@@ -21,6 +21,7 @@ GROUPS = {  # group of the defaults list: folder under conf/
     "ingest": {"reader": "reader"},
     "evaluate": {"imu": "imu", "tuning": "tuning", "start": "start", "outage": "outage"},
     "navigate": {"imu": "imu", "tuning": "tuning"},
+    "export": {"imu": "imu", "tuning": "tuning"},
     "allan": {"imu": "imu"},
     "register": {},
     "compare": {},

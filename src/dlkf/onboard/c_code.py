@@ -18,20 +18,21 @@ from torch.export import ExportedProgram
 from torch.fx import Node
 
 from dlkf.errors import InputError
-from dlkf.onboard.c_memory import C_TYPES, Block, Buffer, View, Written
-from dlkf.onboard.c_operations import BY_ELEMENT, CONVERT, IN_PLACE, WHOLE, literal
+from dlkf.onboard.c_loops import UNKNOWN, WHOLE
+from dlkf.onboard.c_memory import C_TYPES, Buffer, Tensors, View, Written
+from dlkf.onboard.c_operations import BY_ELEMENT, PARTS, literal
 
 KEPT = {  # operations that are one in C, though core ATen has several for them
-    f"aten::{name}"
-    for name in ("linalg_cross", "linalg_solve_ex", "_linalg_solve_ex", "linalg_cholesky_ex", "cholesky_solve", "linalg_inv_ex")
-}
+    "aten::linalg_cross", "aten::linalg_solve_ex", "aten::_linalg_solve_ex", "aten::linalg_cholesky_ex",
+    "aten::cholesky_solve", "aten::linalg_inv_ex",
+}  # fmt: skip
 
 
-class Translation:
+class Translation(Tensors):
     """Walks a graph and writes it down."""
 
     def __init__(self, program: ExportedProgram) -> None:
-        self.block = Block()
+        super().__init__()
         self.values: dict[Node, Any] = {}
         self.inputs: list[Buffer] = []
         self.outputs: list[View] = []
@@ -44,7 +45,11 @@ class Translation:
     def _placeholder(self, node: Node) -> None:
         signature, program = self._program.graph_signature, self._program
         name = node.name
-        for names in (signature.inputs_to_parameters, signature.inputs_to_buffers, signature.inputs_to_lifted_tensor_constants):
+        for names in (
+            signature.inputs_to_parameters,
+            signature.inputs_to_buffers,
+            signature.inputs_to_lifted_tensor_constants,
+        ):
             if name in names:
                 key = names[name]
                 value = program.state_dict.get(key)
@@ -59,6 +64,8 @@ class Translation:
         self.values[node] = self._program.constants[node.target]
 
     def _call_function(self, node: Node) -> None:
+        if not node.users:
+            return
         target: Any = node.target
         args, kwargs = self._known(node.args), self._known(node.kwargs)
         if target.__name__ == "getitem":
@@ -72,14 +79,14 @@ class Translation:
             return
         elif _is_view(target):
             self.values[node] = self._viewed(target, args, kwargs)
-        elif name in IN_PLACE:
+        elif name in PARTS:
             self.values[node] = self._copied(node, name, args)
-        elif name in BY_ELEMENT or name in CONVERT:
+        elif name in BY_ELEMENT:
             self.values[node] = self._by_element(node, name, args, kwargs)
         elif name in WHOLE:
             self.values[node] = WHOLE[name](self, node, *args, **kwargs)
         else:
-            raise InputError(f"this filter uses {target}, which the C form of an exported filter does not know")
+            raise InputError(f"this filter uses {target}, which {UNKNOWN}")
 
     def _output(self, node: Node) -> None:
         kept = len(self._program.graph_signature.user_outputs)
@@ -94,25 +101,6 @@ class Translation:
             return [self._known(a) for a in x]
         return {k: self._known(a) for k, a in x.items()} if isinstance(x, dict) else x
 
-    def tensor(self, x: Any) -> View:
-        """A value as a tensor in memory."""
-        if isinstance(x, Tensor):
-            return self.block.constant(x)
-        if isinstance(x, Written):
-            out = self.block.new(x.shape, x.dtype)
-            self.block.over(out, x.pattern, x.operands)
-            return out
-        return x
-
-    def dense(self, x: Any) -> View:
-        """A value as a tensor without gaps."""
-        view = self.tensor(x)
-        if view.meta.is_contiguous():
-            return view
-        out = self.block.new(view.meta.shape, view.meta.dtype)
-        self.block.over(out, "{0}", [view])
-        return out
-
     # kinds of operation
 
     def _viewed(self, target: Any, args: list, kwargs: dict) -> Any:
@@ -122,11 +110,11 @@ class Translation:
         except RuntimeError:  # strides that do not allow it
             view = self.dense(view)
             made = target(view.meta, *args[1:], **kwargs)
-        return [View(view.buffer, m) for m in made] if isinstance(made, (list, tuple)) else View(view.buffer, made)
+        return [view.viewed(m) for m in made] if isinstance(made, (list, tuple)) else view.viewed(made)
 
     def _by_element(self, node: Node, name: str, args: list, kwargs: dict) -> Any:
         value = node.meta["val"]
-        pattern, operands = (CONVERT if name in CONVERT else BY_ELEMENT)[name], []
+        pattern, operands = BY_ELEMENT[name], []
         if callable(pattern):
             pattern, args = pattern(value.dtype, args, kwargs)
         pieces = []
@@ -139,7 +127,7 @@ class Translation:
             elif isinstance(x, (View, Written)) or (isinstance(x, Tensor) and x.numel() > 1):
                 view = self.tensor(x)
                 pieces.append(f"{{{len(operands)}}}")
-                operands.append(View(view.buffer, view.meta.expand(value.shape)))
+                operands.append(view.viewed(view.meta.expand(value.shape)))
             else:
                 pieces.append(literal(x.item() if isinstance(x, Tensor) else x, value.dtype))
         written = Written(value.shape, value.dtype, f"({C_TYPES[value.dtype]})({pattern.format(*pieces)})", operands)
@@ -151,9 +139,10 @@ class Translation:
         whole = self.tensor(args[0])
         out = self.block.new(whole.meta.shape, whole.meta.dtype)
         self.block.over(out, "{0}", [whole])
-        part = IN_PLACE[name](out.meta, *args[2:])
+        part = PARTS[name](out.meta, *args[2:])
         source = self.tensor(args[1])
-        self.block.over(View(out.buffer, part), f"({C_TYPES[out.meta.dtype]}){{0}}", [View(source.buffer, source.meta.expand(part.shape))])
+        told = source.viewed(source.meta.expand(part.shape))
+        self.block.over(out.viewed(part), f"({C_TYPES[out.meta.dtype]}){{0}}", [told])
         return out
 
 
@@ -165,7 +154,7 @@ def _is_view(target: Any) -> bool:
 def _goes_on(user: Node) -> bool:
     """Whether a value may stay an expression: its only user takes it element by element."""
     schema = getattr(user.target, "_schema", None)
-    return schema is not None and schema.name.removeprefix("aten::") in {*BY_ELEMENT, *CONVERT}
+    return schema is not None and schema.name.removeprefix("aten::") in BY_ELEMENT
 
 
 def _flat(x: Any) -> list:

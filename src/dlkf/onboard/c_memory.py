@@ -45,6 +45,10 @@ class View:
             terms.append(str(self.meta.storage_offset()))
         return f"{self.buffer.name}[{'+'.join(terms)}]"
 
+    def viewed(self, meta: Tensor) -> View:
+        """The same memory in another way."""
+        return View(self.buffer, meta)
+
 
 @dataclass
 class Written:
@@ -112,6 +116,32 @@ class Block:
             self.places[b.name] = place
             highest = max(highest, place + size)
         return highest
+
+
+class Tensors:
+    """Values of a graph as tensors in memory."""
+
+    def __init__(self) -> None:
+        self.block = Block()
+
+    def tensor(self, x: Any) -> View:
+        """A value as a tensor in memory."""
+        if isinstance(x, Tensor):
+            return self.block.constant(x)
+        if isinstance(x, Written):
+            out = self.block.new(x.shape, x.dtype)
+            self.block.over(out, x.pattern, x.operands)
+            return out
+        return x
+
+    def dense(self, x: Any) -> View:
+        """A value as a tensor without gaps."""
+        view = self.tensor(x)
+        if view.meta.is_contiguous():
+            return view
+        out = self.block.new(view.meta.shape, view.meta.dtype)
+        self.block.over(out, "{0}", [view])
+        return out
 
 
 def collapsed(sizes: list[int], strides: list[list[int]]) -> tuple[list[int], list[list[int]]]:

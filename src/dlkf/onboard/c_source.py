@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +16,7 @@ from dlkf.errors import InputError
 from dlkf.filters.integration import Estimator
 from dlkf.navigation import compiled
 from dlkf.onboard.c_code import KEPT, Translation
-from dlkf.onboard.c_memory import C_TYPES, Block, Buffer
+from dlkf.onboard.c_memory import C_TYPES, Block
 from dlkf.onboard.carried import Layout
 from dlkf.onboard.functions import FIX, ROW, TOLD, Anchor, Begin, Function, Grid, Read, Row, Turn, carried_by
 from dlkf.running.reanchoring import can_reanchor
@@ -41,7 +42,7 @@ def write_source(folder: Path, estimator: Estimator, grid: Grid, name: str, made
     parts.append((CPP / "step.c.in").read_text().replace("@TOLD@", str(sum(TOLD.values()))))
     header = (CPP / "step.h.in").read_text()
     values = {
-        "NAME": name, "MEMORY": layout.size, "SAMPLES": grid.samples, "RATE_HZ": f"{1 / grid.dt:.9g}",
+        "NAME": name, "MEMORY": layout.size, "SAMPLES": grid.samples, "RATE_HZ": repr(1 / grid.dt),
         "EPOCHS": Begin(estimator, grid, layout).epochs, "FIX": len(FIX), "ROW": len(ROW), "TOLD": sum(TOLD.values()),
         "ANCHOR_M": f"{ANCHOR_M if 'anchor' in functions else 1e12:g}",
         "FIX_COLUMNS": ", ".join(f"DLKF_FIX_{c.upper()}" for c in FIX),
@@ -75,9 +76,13 @@ def function_in_c(name: str, function: Function, folder: Path) -> str:
         dense = done.dense(view)
         arguments.append(f"{C_TYPES[view.meta.dtype]} *restrict out{k}")
         start = dense.meta.storage_offset()
-        block.write(f"for (int i = 0; i < {dense.meta.numel()}; i++) out{k}[i] = {dense.buffer.name}[{start}+i];", dense)
+        block.write(
+            f"for (int i = 0; i < {dense.meta.numel()}; i++) out{k}[i] = {dense.buffer.name}[{start}+i];", dense
+        )
     size = block.laid_out()
-    places = [f"{C_TYPES[b.dtype]} *{b.name} = ({C_TYPES[b.dtype]} *)(block + {block.places[b.name]});" for b in block.buffers]
+    places = [
+        f"{C_TYPES[b.dtype]} *{b.name} = ({C_TYPES[b.dtype]} *)(block + {block.places[b.name]});" for b in block.buffers
+    ]
     body = [f"unsigned char block[{size}] __attribute__((aligned(64)));", *places, *block.lines]
     head = f"void {name}({', '.join(arguments)}) {{"
     constants = list(_constants(name, block, folder))
@@ -110,5 +115,6 @@ def _number(x: np.generic) -> str:
 
 @contextmanager
 def _exporting() -> Iterator[None]:
-    with compiled.tensor_forms(), torch.no_grad():
+    with compiled.tensor_forms(), torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # of torch about torch
         yield

@@ -76,7 +76,9 @@ class Layout:
         offset = 0
         for name, x in _leaves(like):
             if not isinstance(x, Tensor):
-                raise InputError(f"{name} of this filter's memory is a {type(x).__name__}; only tensors can be exported")
+                raise InputError(
+                    f"{name} of this filter's memory is a {type(x).__name__}; only tensors can be exported"
+                )
             batch = 1 if RECURRENT in name else 0
             shape = tuple(s for axis, s in enumerate(x.shape) if axis != batch)
             self.fields.append(Field(name, shape, x.dtype, offset))
@@ -96,13 +98,18 @@ class Layout:
                 parts.append(x.movedim(f.batch_axis, 0).reshape(drives, f.size).double())
         return torch.cat(parts, -1)
 
+    def field(self, name: str, vector: Float[Tensor, "B K"]) -> Tensor | None:
+        """One tensor out of vectors, None where the filter has none of that name."""
+        found = next((f for f in self.fields if f.name == name), None)
+        return None if found is None else self._part(found, vector)
+
+    def _part(self, f: Field, vector: Tensor) -> Tensor:
+        x = vector[:, f.offset : f.offset + f.size].reshape(len(vector), *f.shape).movedim(0, f.batch_axis)
+        return x > 0.5 if f.dtype == torch.bool else x.to(f.dtype)
+
     def unpack(self, vector: Float[Tensor, "B K"]) -> Any:
         """The structure of vectors."""
-        parts = []
-        for f in self.fields:
-            x = vector[:, f.offset : f.offset + f.size].reshape(len(vector), *f.shape).movedim(0, f.batch_axis)
-            parts.append(x > 0.5 if f.dtype == torch.bool else x.to(f.dtype))
-        return _rebuilt(self.like, iter(parts))
+        return _rebuilt(self.like, iter([self._part(f, vector) for f in self.fields]))
 
 
 def _children(x: Any) -> list[tuple[str, Any]] | None:

@@ -33,7 +33,16 @@ from dlkf.running.solution import COLUMNS, solution_columns
 
 FIX = (*POSITION, *VELOCITY, *STD, "quality", "lag_s")  # NaN where a receiver says nothing; all NaN: no fix
 FIX_N = 19  # value (6), 1σ (6), used (6), lag
-TOLD = {"prior": 15, "posterior": 15, "error": 6, "std": 15, "innovation": 6, "innovation_std": 6, "used": 1, "speed": 2}
+TOLD = {
+    "prior": 15,
+    "posterior": 15,
+    "error": 6,
+    "std": 15,
+    "innovation": 6,
+    "innovation_std": 6,
+    "used": 1,
+    "speed": 2,
+}
 _PV = ("pos_n", "pos_e", "pos_d", "vel_n", "vel_e", "vel_d")
 ROW = (
     *COLUMNS[1:], "gnss_used", *(f"innovation_{x}" for x in _PV), *(f"innovation_std_{x}" for x in _PV),
@@ -91,7 +100,7 @@ def begun(
         drive=("",) * B, t_start=z(B),
     )  # fmt: skip
     memory, bias = estimator.begin(batch)
-    return Carried(memory, state, ImuError(bias), frame, lever_arm_b)
+    return Carried(memory, state, ImuError.of(bias), frame, lever_arm_b)
 
 
 def advanced(estimator: Estimator, x: Carried, imu: Tensor, fix: Fix, grid: Grid) -> tuple[Carried, Step]:
@@ -128,8 +137,8 @@ class Begin(Function):
 
     @property
     def epochs(self) -> int:
-        """W."""
-        return max(1, round(ALIGN.window_s / self.grid.epoch_s))
+        """W: those that are levelled over, and the one before, whose last samples tell the rate at their beginning."""
+        return max(1, round(ALIGN.window_s / self.grid.epoch_s)) + 1
 
     def example(self) -> tuple[Tensor, ...]:
         """As in the class."""
@@ -224,9 +233,9 @@ class Anchor(Function):
         return self.layout.pack(moved(self.estimator, self.layout.unpack(memory), self.grid))
 
 
-def moved(estimator: Estimator, x: Carried, grid: Grid) -> Carried:
-    """Everything in a tangent frame whose origin is the present position."""
-    change = FrameChange(x.frame, frame_at(x.state, x.frame))
+def moved(estimator: Estimator, x: Carried, grid: Grid, change: FrameChange | None = None) -> Carried:
+    """Everything in another tangent frame, by default one whose origin is the present position."""
+    change = change or FrameChange(x.frame, frame_at(x.state, x.frame))
     state = change.state(x.state)
     fresh = begun(estimator, change.new, state, state.p_n.new_ones(len(state.p_n), 9), x.lever_arm_b, grid)
     return Carried(reanchored(x.memory, change, fresh.memory), state, x.error, change.new, x.lever_arm_b)

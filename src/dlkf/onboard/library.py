@@ -26,17 +26,18 @@ def compiler() -> str | None:
     return next((found for name in (*given, "cc", "gcc", "clang") if (found := shutil.which(name))), None)
 
 
-def build(folder: Path) -> Path:
+def build(folder: Path, into: Path | None = None) -> Path:
     """Compile ``step.c`` in a folder. Raises InputError where there is no compiler, or it fails."""
     cc = compiler()
     if cc is None:
         raise InputError("no C compiler found (cc, gcc, clang, or $CC); install one, such as apt-get install gcc")
+    library = (into or folder).resolve() / LIBRARY
     made = subprocess.run(
-        [cc, *FLAGS, "-fPIC", "-shared", "step.c", "-o", LIBRARY, "-lm"], cwd=folder, capture_output=True, text=True
+        [cc, *FLAGS, "-fPIC", "-shared", "step.c", "-o", library, "-lm"], cwd=folder, capture_output=True, text=True
     )
     if made.returncode:
         raise InputError(f"{cc} cannot compile {folder / 'step.c'}: {made.stderr.strip().splitlines()[0]}")
-    return folder / LIBRARY
+    return library
 
 
 class Library:

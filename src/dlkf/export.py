@@ -1,0 +1,72 @@
+"""A filter for a vehicle, as C without libraries: ``python -m dlkf.export model=mbkf21_car out=outputs/onboard``.
+
+Writes ``step.c`` with its header and description, an example and a ROS 2 node that use it, and a drive for the
+example; then runs the exported filter and the original over that drive and says how far they are apart.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from dlkf.command import command
+from dlkf.data.store import drive_from_tables, drive_rows
+from dlkf.data.validate import read_checked
+from dlkf.errors import InputError
+from dlkf.files import staged, vacant
+from dlkf.filters.smoother import Smoothed
+from dlkf.models import grid_of, resolve_model, short_name
+from dlkf.navigation.imu_errors import imu_spec
+from dlkf.onboard.c_source import CPP, write_source
+from dlkf.onboard.check import checked, write_log
+from dlkf.onboard.functions import Grid
+from dlkf.onboard.library import compiler
+from dlkf.provenance import provenance
+from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
+from dlkf.simulation.gnss.white import GnssConfig
+
+EXAMPLES = ("navigate.cpp", "ros2_node.cpp", "CMakeLists.txt")
+ARM = (1.0, 0.3, -1.2)  # m, IMU to antenna of the simulated car
+
+
+@command("export")
+def main(cfg: DictConfig) -> None:
+    """Resolve, write, check, print."""
+    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
+    vacant(config["out"], overwrite=config["overwrite"])
+    imu = imu_spec(config["imu"])
+    model = resolve_model(
+        config["model"], imu, config["tracking"]["uri"], tuning=config["tuning"], prior=config["prior"]
+    )
+    if isinstance(model, Smoothed):
+        raise InputError(f"model={config['model']} looks ahead, which a vehicle cannot; take it without _rts")
+    given = grid_of([model], config["rate_hz"], config["epoch_s"])
+    grid = Grid(round(given["rate_hz"] * given["epoch_s"]), 1 / given["rate_hz"])
+    with staged(config["out"]) as folder, tempfile.TemporaryDirectory() as somewhere:
+        dataset = config["dataset"]
+        if dataset is None:
+            drive = DatasetConfig("check", hours=5 / 60, drive_minutes=5.0, gnss=GnssConfig(lever_arm_b=ARM))
+            dataset = simulate_dataset(drive, imu, 0, Path(somewhere) / "check", progress=False, workers=1)
+        tables = read_checked(dataset, drive_rows(dataset, config["drive"])[0], reference=False)
+        drive = drive_from_tables(tables, "", given["rate_hz"], given["epoch_s"], torch.float64)
+        layout = write_source(folder, model, grid, short_name(config["model"]), provenance())
+        for name in EXAMPLES:
+            (folder / name).write_text((CPP / name).read_text())
+        write_log(folder / "drive.csv", tables, drive)
+        if compiler() is None:
+            lines = ["not checked: no C compiler here (cc, gcc or clang)"]
+        else:
+            lines = checked(Path(somewhere), folder, model, grid, layout, tables, drive, config["latency"])
+    arm = " ".join(f"{x:g}" for x in tables.row.lever_arm_b)
+    print(f"{short_name(config['model'])} as C in {config['out']}: {layout.size} numbers of memory, step.h says how")
+    print("\n".join(lines))
+    print(f"Try it: cd {config['out']} && cmake -B build && cmake --build build "
+          f"&& build/navigate --arm {arm} < drive.csv > solution.csv")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

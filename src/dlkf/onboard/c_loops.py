@@ -1,0 +1,310 @@
+"""Core ATen operations that are loops of their own: sums, products, solutions, indexing.
+
+Each writes its lines and gives the tensor, or the list of them, that the operation returns.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch.fx import Node
+
+from dlkf.errors import InputError
+from dlkf.onboard.c_memory import C_TYPES, Tensors, View
+from dlkf.onboard.c_operations import literal, suffix
+
+UNKNOWN = "the C form of an exported filter does not know"
+
+
+def _new(t: Tensors, node: Node) -> tuple[View, Any]:
+    """The result's memory, and what torch says of it."""
+    value: Any = node.meta["val"]
+    return t.block.new(value.shape, value.dtype), value
+
+
+def _names(count: int) -> list[str]:
+    return [f"i{k}" for k in range(count)]
+
+
+def _loops(names: Sequence[str], sizes: Sequence[int]) -> str:
+    return "".join(f"for (int {i} = 0; {i} < {n}; {i}++) " for i, n in zip(names, sizes))
+
+
+def _axes(dims: Any, ndim: int) -> list[int]:
+    listed = range(ndim) if dims in (None, []) else [dims] if isinstance(dims, int) else dims
+    return [d % ndim for d in listed]
+
+
+def _joined(t: Tensors, node: Node, parts: list, dim: int = 0) -> View:
+    out, _ = _new(t, node)
+    start = 0
+    for view in map(t.tensor, parts):
+        if view.meta.numel():
+            size = view.meta.shape[dim]
+            t.block.over(out.viewed(out.meta.narrow(dim, start, size)), "{0}", [view])
+            start += size
+    return out
+
+
+def _reduced(first: str, each: str) -> Callable[..., View]:
+    """``first`` into the result, then ``each`` for every element: {0} the result so far, {1} the element."""
+
+    def made(t: Tensors, node: Node, x: Any, dims: Any = None, keepdim: bool = False, **_: Any) -> View:
+        view, (out, _value) = t.tensor(x), _new(t, node)
+        dims = _axes(dims, view.meta.ndim)
+        t.block.over(out, first, [])
+        target = out.meta
+        if not keepdim:
+            for d in sorted(dims):
+                target = target.unsqueeze(d)
+        kept = [d for d in range(view.meta.ndim) if d not in dims]
+        inside = view.meta.stride(-1) == 1 and view.meta.ndim - 1 in dims
+        order = kept + dims if inside else dims + kept  # along memory in the innermost loop
+        target = out.viewed(target.expand(view.meta.shape).permute(order))
+        t.block.over(target, each, [target, view.viewed(view.meta.permute(order))])
+        return out
+
+    return made
+
+
+def _norm(t: Tensors, node: Node, x: Any, ord: float = 2, dims: Any = None, keepdim: bool = False) -> View:
+    if ord != 2:
+        raise InputError(f"this filter uses a norm of order {ord}, which {UNKNOWN}")
+    out = _reduced("0", "{0} + {1} * {1}")(t, node, x, dims, keepdim)
+    t.block.over(out, f"sqrt{suffix(out.meta.dtype)}({{0}})", [out])
+    return out
+
+
+def _mean(t: Tensors, node: Node, x: Any, dims: Any = None, keepdim: bool = False, **_: Any) -> View:
+    out = _reduced("0", "{0} + {1}")(t, node, x, dims, keepdim)
+    t.block.over(out, f"{{0}} / {t.tensor(x).meta.numel() // max(1, out.meta.numel())}", [out])
+    return out
+
+
+def _variance(
+    t: Tensors, node: Node, x: Any, dims: Any = None, *, correction: Any = 1, keepdim: bool = False
+) -> View:
+    view = t.tensor(x)
+    dims = _axes(dims, view.meta.ndim)
+    mean = _mean(t, node, view, dims, keepdim)
+    wide = mean.meta
+    if not keepdim:
+        for d in sorted(dims):
+            wide = wide.unsqueeze(d)
+    swing = t.block.new(view.meta.shape, view.meta.dtype)
+    t.block.over(swing, "{0} - {1}", [view, mean.viewed(wide.expand(view.meta.shape))])
+    out = _reduced("0", "{0} + {1} * {1}")(t, node, swing, dims, keepdim)
+    n = math.prod(view.meta.shape[d] for d in dims)
+    t.block.over(out, f"{{0}} / {n - (1 if correction is None else correction)}", [out])
+    return out
+
+
+def _summed_up(t: Tensors, node: Node, x: Any, dim: int, **_: Any) -> View:
+    view, (out, value) = t.tensor(x), _new(t, node)
+    n = value.shape[dim]
+    first, source = (v.viewed(v.meta.narrow(dim, 0, 1)) for v in (out, view))
+    t.block.over(first, "{0}", [source])
+    now, before, each = (
+        v.viewed(v.meta.narrow(dim, start, n - 1).movedim(dim, 0)) for v, start in ((out, 1), (out, 0), (view, 1))
+    )
+    t.block.over(now, "{0} + {1}", [before, each])
+    return out
+
+
+def _product(t: Tensors, node: Node, A: Any, B: Any, begin: Any = None, beta: float = 1, alpha: float = 1) -> View:
+    """A B (b × m × k · k × n), on top of β · ``begin`` where there is one."""
+    a, b, (out, value) = t.tensor(A), t.tensor(B), _new(t, node)
+    m, k, n = a.meta.shape[-2], a.meta.shape[-1], b.meta.shape[-1]
+    lead = ["b"] if a.meta.ndim == 3 else []
+    kind, scale = C_TYPES[value.dtype], "" if alpha == 1 else f"{literal(alpha, value.dtype)} * "
+    at_a, at_b, at = a.at([*lead, "i", "k"]), b.at([*lead, "k", "j"]), out.at([*lead, "i", "j"])
+    start, used = "0", [a, b]
+    if begin is not None:
+        given = t.tensor(begin)
+        wide = given.viewed(given.meta.expand(value.shape))
+        start = ("" if beta == 1 else f"{literal(beta, value.dtype)} * ") + wide.at([*lead, "i", "j"])
+        used.append(given)
+    if b.meta.stride(-1) == 1 or (n > 1 and b.meta.stride(-2) != 1):  # along rows of B
+        body = (
+            f"{{ {kind} y[{n}]; for (int j = 0; j < {n}; j++) y[j] = {start}; "
+            f"for (int k = 0; k < {k}; k++) {{ {kind} w = {scale}{at_a}; "
+            f"for (int j = 0; j < {n}; j++) y[j] += w * {at_b}; }} for (int j = 0; j < {n}; j++) {at} = y[j]; }}"
+        )
+    else:  # along its columns
+        body = (
+            f"for (int j = 0; j < {n}; j++) {{ {kind} y = 0; for (int k = 0; k < {k}; k++) y += {at_a} * {at_b}; "
+            f"{at} = {start} + {scale}y; }}"
+        )
+    t.block.write(_loops(lead, a.meta.shape[:1]) + _loops(["i"], [m]) + body, out, *used)
+    return out
+
+
+def _added_product(t: Tensors, node: Node, c: Any, a: Any, b: Any, beta: float = 1, alpha: float = 1) -> View:
+    return _product(t, node, a, b, c, beta, alpha)
+
+
+def _each(t: Tensors, call: str, sizes: tuple[int, ...], *views: View) -> None:
+    """A function of algebra.h for every matrix of a batch; ``sizes`` are the numbers of each matrix."""
+    many = views[0].meta.shape[:-2].numel()
+    places = [f"&{v.buffer.name}[{v.meta.storage_offset()}+b*{n}]" for v, n in zip(views, sizes)]
+    t.block.write(f"for (int b = 0; b < {many}; b++) {call}{', '.join(places)});", *views)
+
+
+def _solved(t: Tensors, node: Node, A: Any, B: Any, **_: Any) -> list:
+    """A symmetric and positive definite."""
+    a, b = t.dense(A), t.dense(B)
+    out, work = t.block.new(b.meta.shape, b.meta.dtype), t.block.new(a.meta.shape, a.meta.dtype)
+    m, n = b.meta.shape[-2:]
+    _each(t, f"solve({m}, {n}, ", (m * m, m * n, m * m, m * n), a, b, work, out)
+    return [out, None, None, None]
+
+
+def _factored(t: Tensors, node: Node, A: Any, **_: Any) -> list:
+    a = t.dense(A)
+    out, m = t.block.new(a.meta.shape, a.meta.dtype), a.meta.shape[-1]
+    _each(t, f"factor({m}, ", (m * m, m * m), a, out)
+    return [out, None]
+
+
+def _solved_by_factor(t: Tensors, node: Node, B: Any, L: Any, upper: bool = False) -> View:
+    b, factor = t.dense(B), t.dense(L)
+    out = t.block.new(b.meta.shape, b.meta.dtype)
+    m, n = b.meta.shape[-2:]
+    _each(t, f"back({m}, {n}, ", (m * m, m * n, m * n), factor, b, out)
+    return out
+
+
+def _inverted(t: Tensors, node: Node, A: Any, **_: Any) -> list:
+    a = t.dense(A)
+    if a.meta.shape[-1] != 3:
+        raise InputError(f"this filter inverts other than 3x3 matrices, which {UNKNOWN}")
+    out = t.block.new(a.meta.shape, a.meta.dtype)
+    _each(t, "invert3(", (9, 9), a, out)
+    return [out, None]
+
+
+def _crossed(t: Tensors, node: Node, A: Any, B: Any, *, dim: int = -1) -> View:
+    out, value = _new(t, node)
+    a, b = (v.viewed(v.meta.expand(value.shape)) for v in (t.tensor(A), t.tensor(B)))
+    for k in range(3):
+        parts = [v.viewed(v.meta.select(dim, j % 3)) for v, j in ((a, k + 1), (b, k + 2), (a, k + 2), (b, k + 1))]
+        t.block.over(out.viewed(out.meta.select(dim, k)), "{0} * {1} - {2} * {3}", parts)
+    return out
+
+
+def _picked(t: Tensors, node: Node, x: Any, dim: int, index: Any) -> View:
+    return _indexed(t, node, x, [None] * (dim % t.tensor(x).meta.ndim) + [index])
+
+
+def _indexed(t: Tensors, node: Node, x: Any, indices: list) -> View:
+    """x[…, i, j, …] with tensors side by side that broadcast, None for a whole axis."""
+    view, (out, value) = t.tensor(x), _new(t, node)
+    names = _names(value.ndim)
+    source, given = _places(t, view, indices, names)
+    t.block.write(f"{_loops(names, value.shape)}{out.at(names)} = {view.at(source)};", out, view, *given)
+    return out
+
+
+def _put(t: Tensors, node: Node, x: Any, indices: list, values: Any, accumulate: bool = False) -> View:
+    """x[…, i, j, …] = values, or += of a copy."""
+    view, told, (out, _) = t.tensor(x), t.tensor(values), _new(t, node)
+    t.block.over(out, "{0}", [view])
+    chosen = [t.tensor(i).meta for i in indices if i is not None]
+    shape = torch.broadcast_shapes(*(i.shape for i in chosen))
+    first = next(k for k, i in enumerate(indices) if i is not None)
+    sizes = [*view.meta.shape[:first], *shape, *view.meta.shape[first + len(chosen) :]]
+    names = _names(len(sizes))
+    target, given = _places(t, view, indices, names)
+    wide = told.viewed(told.meta.expand(sizes))
+    sign = "+=" if accumulate else "="
+    t.block.write(f"{_loops(names, sizes)}{out.at(target)} {sign} {wide.at(names)};", out, told, *given)
+    return out
+
+
+def _places(t: Tensors, view: View, indices: list, names: list[str]) -> tuple[list[str], list[View]]:
+    """Where an element of x[indices] comes from, and the tensors that say so."""
+    given = {k: t.tensor(i) for k, i in enumerate(indices) if i is not None}
+    first = min(given)
+    if max(given) - first != len(given) - 1:
+        raise InputError(f"this filter indexes axes that are not neighbours, which {UNKNOWN}")
+    shape = torch.broadcast_shapes(*(i.meta.shape for i in given.values()))
+    inner = names[first : first + len(shape)]
+    rest = iter(names[:first] + names[first + len(shape) :])
+    chosen = {k: i.viewed(i.meta.expand(shape)).at(inner) for k, i in given.items()}
+    return [chosen[k] if k in chosen else next(rest) for k in range(view.meta.ndim)], list(given.values())
+
+
+def _gathered(t: Tensors, node: Node, x: Any, dim: int, index: Any, **_: Any) -> View:
+    view, rows, (out, value) = t.tensor(x), t.tensor(index), _new(t, node)
+    names = _names(value.ndim)
+    source = [rows.at(names) if k == dim % value.ndim else i for k, i in enumerate(names)]
+    t.block.write(f"{_loops(names, value.shape)}{out.at(names)} = {view.at(source)};", out, view, rows)
+    return out
+
+
+def _largest(t: Tensors, node: Node, x: Any, dim: int = -1, keepdim: bool = False) -> View:
+    """Where the largest element is."""
+    view, (out, _) = t.tensor(x), _new(t, node)
+    names, dim = _names(view.meta.ndim), dim % view.meta.ndim
+    outer = [k for k in range(view.meta.ndim) if k != dim]
+    at = out.at([("0" if k == dim else i) for k, i in enumerate(names)] if keepdim else [names[k] for k in outer])
+    best = view.at([("best" if k == dim else i) for k, i in enumerate(names)])
+    t.block.write(
+        f"{_loops([names[k] for k in outer], [view.meta.shape[k] for k in outer])}{{ int best = 0; "
+        f"{_loops([names[dim]], [view.meta.shape[dim]])}if ({view.at(names)} > {best}) best = {names[dim]}; "
+        f"{at} = best; }}",
+        out, view,
+    )  # fmt: skip
+    return out
+
+
+def _convolved(t: Tensors, node: Node, X: Any, W: Any, bias: Any, stride: list, padding: list, *_: Any) -> View:
+    """Over one axis, stride 1, zeros outside."""
+    x, w, (out, value) = t.tensor(X), t.tensor(W), _new(t, node)
+    (inward, M), (outward, _inward, taps), pad, n = x.meta.shape[1:], w.meta.shape, padding[0], value.shape[2]
+    b = [] if bias is None else [t.tensor(bias)]
+    start, at, source = b[0].at(["o"]) if b else "0", out.at(["0", "o", "n"]), x.at(["0", "c", f"(n + k - {pad})"])
+    t.block.write(
+        f"for (int o = 0; o < {outward}; o++) {{ for (int n = 0; n < {n}; n++) {at} = {start}; "
+        f"for (int c = 0; c < {inward}; c++) for (int k = 0; k < {taps}; k++) {{ "
+        f"int low = {pad} > k ? {pad} - k : 0, high = {M + pad} - k < {n} ? {M + pad} - k : {n}; "
+        f"for (int n = low; n < high; n++) {at} += {w.at(['o', 'c', 'k'])} * {source}; }} }}",
+        out, x, w, *b,
+    )  # fmt: skip
+    return out
+
+
+def _padded(t: Tensors, node: Node, x: Any, pad: list, fill: float = 0.0) -> View:
+    view, (out, value) = t.tensor(x), _new(t, node)
+    t.block.over(out, literal(fill, value.dtype), [])
+    part = out.meta
+    for k in range(len(pad) // 2):
+        axis = part.ndim - 1 - k
+        part = part.narrow(axis, pad[2 * k], view.meta.shape[axis])
+    t.block.over(out.viewed(part), "{0}", [view])
+    return out
+
+
+def _repeated(t: Tensors, node: Node, x: Any, times: list) -> View:
+    view, (out, _) = t.tensor(x), _new(t, node)
+    shape = (*(1,) * (len(times) - view.meta.ndim), *view.meta.shape)
+    place = out.meta.view([n for pair in zip(times, shape) for n in pair])
+    source = view.meta.reshape(shape)
+    for axis in range(len(times)):
+        source = source.unsqueeze(2 * axis)
+    t.block.over(out.viewed(place), "{0}", [view.viewed(source.expand(place.shape))])
+    return out
+
+
+WHOLE: dict[str, Callable[..., Any]] = {
+    "cat": _joined, "sum": _reduced("0", "{0} + {1}"), "any": _reduced("0", "{0} | ({1} != 0)"),
+    "amax": _reduced("-INFINITY", "{0} > {1} ? {0} : {1}"), "mean": _mean, "var": _variance,
+    "linalg_vector_norm": _norm, "cumsum": _summed_up, "mm": _product, "bmm": _product, "addmm": _added_product,
+    "baddbmm": _added_product, "_linalg_solve_ex": _solved, "linalg_solve_ex": _solved,
+    "linalg_cholesky_ex": _factored, "cholesky_solve": _solved_by_factor, "linalg_inv_ex": _inverted,
+    "linalg_cross": _crossed, "index_select": _picked, "index": _indexed, "index_put": _put, "gather": _gathered,
+    "argmax": _largest, "convolution": _convolved, "constant_pad_nd": _padded, "repeat": _repeated,
+}  # fmt: skip

@@ -1,0 +1,174 @@
+"""A filter whose whole epoch is compiled code, in the place of the one that it was made of.
+
+It is made once for a machine, a filter and a grid, and kept in the user's cache (``$XDG_CACHE_HOME/dlkf``). It takes
+part where estimators do: in a batch, in a stream, in ``navigate``. It knows no gradients, no covariances but their
+diagonals, and no device but the CPU.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+import dlkf
+from dlkf.data.drive import Batch
+from dlkf.errors import InputError
+from dlkf.filters.integration import Correction, Estimator, Fix, Solution, Step
+from dlkf.navigation.calibration import ImuError
+from dlkf.navigation.earth import TangentFrame
+from dlkf.navigation.state import NavState
+from dlkf.onboard.c_source import write_source
+from dlkf.onboard.carried import Layout
+from dlkf.onboard.functions import Carried, Grid, carried_by, moved, packed_fix, split
+from dlkf.onboard.library import FLAGS, LIBRARY, Library, build, compiler, machine
+from dlkf.running.reanchoring import FrameChange, can_reanchor, reanchored
+
+
+class Vector(NamedTuple):
+    """The memory of a compiled filter."""
+
+    numbers: Tensor  # (B, K)
+    filter: CompiledFilter
+
+
+class FixedVector(NamedTuple):
+    """The same of a filter whose memory cannot go to another tangent frame."""
+
+    numbers: Tensor
+    filter: CompiledFilter
+
+
+class CompiledFilter:
+    """An :class:`dlkf.filters.integration.Estimator` that runs the loop itself; :func:`compiled_filter` makes one."""
+
+    def __init__(self, estimator: Estimator, grid: Grid, layout: Layout, library: Library) -> None:
+        self.estimator, self.grid, self.layout, self.library = estimator, grid, layout, library
+        self._vector = Vector if can_reanchor(layout.like.memory) else FixedVector
+
+    def __reduce__(self) -> tuple[Callable, tuple]:
+        return compiled_filter, (self.estimator, 1 / self.grid.dt, self.grid.epoch_s)
+
+    def __getattr__(self, name: str) -> Any:
+        """``config``, ``imu`` and the like are those of the filter that it was made of."""
+        if name.startswith("__") or name in ("estimator", "states", "parameters"):
+            raise AttributeError(name)
+        return getattr(self.estimator, name)
+
+    def begin(self, batch: Batch) -> tuple[Vector | FixedVector, Tensor | ImuError]:
+        """That of the filter, packed. InputError for data on another grid."""
+        if batch.size[2] != self.grid.samples or abs(batch.dt - self.grid.dt) > 1e-9 * self.grid.dt:
+            raise InputError(
+                f"this filter was compiled for {self.grid.samples} samples an epoch at {1 / self.grid.dt:g} Hz, the "
+                f"data come with {batch.size[2]} at {1 / batch.dt:g} Hz"
+            )
+        batch = batch.in_precision(torch.float64)
+        memory, error = self.estimator.begin(batch)
+        x = Carried(memory, batch.start, ImuError.of(error), batch.frame, batch.lever_arm_b)
+        return self._vector(self.layout.pack(x).contiguous(), self), error
+
+    def step(self, memory: Any, epoch: Any) -> Any:
+        """Not of an epoch's end alone: :meth:`advance`."""
+        raise NotImplementedError
+
+    def advance(self, memory: Vector | FixedVector, imu: Tensor, fix: Fix, frame: TangentFrame) -> tuple[Any, Step]:
+        """One epoch of one drive."""
+        vector, told = self.library.turn(memory.numbers, imu.contiguous(), packed_fix(fix))
+        x = split(told)
+        error = ImuError(self.layout.field("error.bias", vector), self.layout.field("error.matrix", vector))
+        std = x["std"] if self._has_std else None
+        speed = None if bool(x["speed"][0, 0].isnan()) else x["speed"]
+        answer = Correction(x["prior"].new_zeros(1, 9), error, std=std, accepted=x["used"][:, 0] > 0.5, speed=speed)
+        step = Step(_state(x["prior"]), _state(x["posterior"]), error, x["innovation"], x["error"], answer)
+        return memory._replace(numbers=vector), step
+
+    def integrate(self, batch: Batch) -> Solution:
+        """Whole drives, as many at a time as torch has threads; in the precision of the batch."""
+        memory, _ = self.begin(batch)
+        usable = batch.gnss_valid & batch.available.unsqueeze(-1)
+        fixes = packed_fix(Fix(*(x.flatten(0, 1).double() for x in (batch.gnss, batch.gnss_std)), usable.flatten(0, 1),
+                               batch.gnss_lag.flatten().double()))  # fmt: skip
+        fixes, imu = fixes.unflatten(0, batch.size[:2]), batch.imu.double().contiguous()
+
+        def run(b: int) -> Tensor:
+            return self.library.run(memory.numbers[b : b + 1], imu[b], fixes[b])[1]
+
+        if len(imu) == 1 or torch.get_num_threads() == 1:
+            told = [run(b) for b in range(len(imu))]
+        else:
+            with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+                told = list(pool.map(run, range(len(imu))))
+        x = split(torch.stack(told).to(batch.imu.dtype))
+        return Solution(
+            prior=_state(x["prior"]), posterior=_state(x["posterior"]), imu_error=x["error"],
+            innovation=x["innovation"], used=x["used"][..., 0] > 0.5, std=x["std"] if self._has_std else None,
+            gain=None, speed=None if bool(x["speed"].isnan().all()) else x["speed"], innovation_std=x["innovation_std"],
+        )  # fmt: skip
+
+    @property
+    def _has_std(self) -> bool:
+        return any(f.name.endswith(".P") for f in self.layout.fields)
+
+
+@reanchored.register
+def _(memory: Vector, change: FrameChange, fresh: Vector) -> Vector:
+    """The whole memory."""
+    f = memory.filter
+    x = moved(f.estimator, f.layout.unpack(memory.numbers), f.grid, change)
+    return memory._replace(numbers=f.layout.pack(x))
+
+
+def compiled_filter(estimator: Estimator, rate_hz: float, epoch_s: float) -> CompiledFilter:
+    """A filter compiled for a grid; from the cache where it has been made before.
+
+    Raises InputError where there is no C compiler, or the filter cannot be exported.
+    """
+    grid = Grid(round(rate_hz * epoch_s), 1 / rate_hz)
+    folder = _cache() / _digest(estimator, grid)
+    if not (folder / LIBRARY).is_file():
+        if compiler() is None:
+            build(folder)  # says so
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        beside = Path(tempfile.mkdtemp(dir=folder.parent))
+        try:
+            write_source(beside, estimator, grid, type(estimator).__name__, {})
+            build(beside)
+            if not (folder / LIBRARY).is_file():
+                shutil.rmtree(folder, ignore_errors=True)
+                os.replace(beside, folder)
+        finally:
+            shutil.rmtree(beside, ignore_errors=True)
+    with torch.no_grad():
+        layout = carried_by(estimator, grid)
+    return CompiledFilter(estimator, grid, layout, Library(folder / LIBRARY, layout.size))
+
+
+def _cache() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dlkf" / "compiled"
+
+
+def _digest(estimator: Estimator, grid: Grid) -> str:
+    """Of everything that the code depends on: this package, torch, the filter and its weights, grid, machine."""
+    made_of = hashlib.sha256()
+    for file in sorted(Path(dlkf.__file__).parent.rglob("*")):
+        if file.suffix in (".py", ".h", ".in"):
+            made_of.update(file.read_bytes())
+    for part in (torch.__version__, machine(), str(compiler()), *FLAGS, repr(estimator), repr(grid)):
+        made_of.update(part.encode())
+    if isinstance(estimator, nn.Module):
+        made_of.update(repr(getattr(estimator, "config", "")).encode())
+        for name, x in sorted(estimator.state_dict().items()):
+            made_of.update(name.encode() + x.detach().cpu().contiguous().numpy().tobytes())
+    return made_of.hexdigest()[:32]
+
+
+def _state(x: Tensor) -> NavState:
+    return NavState(x[..., :3], x[..., 3:6], x[..., 6:].unflatten(-1, (3, 3)))

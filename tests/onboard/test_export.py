@@ -1,0 +1,216 @@
+"""An exported filter against the one it was made of: in C++, in a stream, in a batch."""
+
+from __future__ import annotations
+
+import pickle
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from dlkf.data.alignment import ALIGN
+from dlkf.data.store import drive_from_tables, drive_rows
+from dlkf.data.validate import read_checked
+from dlkf.errors import InputError
+from dlkf.filters.build import build_filter
+from dlkf.filters.learned import LearnedConfig, LearnedFilter
+from dlkf.filters.plus import PlusConfig, PlusFilter
+from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
+from dlkf.onboard import compiled_filter
+from dlkf.onboard.c_source import CPP, write_source
+from dlkf.onboard.check import boundary_fixes, difference, vehicle_run, write_log
+from dlkf.onboard.compiled_filter import CompiledFilter
+from dlkf.onboard.functions import ROW, Begin, Grid
+from dlkf.onboard.library import LIBRARY, Library, build, compiler
+from dlkf.running.batched import run_filter
+from dlkf.running.estimate import estimates_table
+from dlkf.running.replay import played
+from dlkf.running.solution import COLUMNS
+from dlkf.running.start import aligned_drives
+from dlkf.running.streaming import StreamingFilter
+from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
+from dlkf.simulation.gnss.white import GnssConfig
+
+pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+IMU = ImuSpec(
+    "mems", SensorErrors(2.5e-3, 0.02, 1e-3, 3600.0, 3e-3, 3e-3), SensorErrors(9e-5, 1e-3, 1e-4, 3600.0, 3e-3, 3e-3)
+)
+ARM = (1.0, 0.3, -1.2)
+GRID = Grid(50, 0.02)
+ROUNDING = 1e-6  # m, m/s, rad; sums in another order, and what a minute makes of that
+
+
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory):
+    """A minute; the car drives off after some seconds."""
+    folder = tmp_path_factory.mktemp("town")
+    config = DatasetConfig("town", hours=1 / 60, drive_minutes=1.0, gnss=GnssConfig(lever_arm_b=ARM))
+    dataset = simulate_dataset(config, IMU, 0, folder / "data", progress=False, workers=1)
+    return read_checked(dataset, drive_rows(dataset)[0], reference=False)
+
+
+@pytest.fixture(scope="module")
+def drive(tables):
+    """On the grid."""
+    return drive_from_tables(tables, "", 50.0, 1.0, torch.float64)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """A gated filter as C, compiled: folder, filter, layout, library."""
+    folder = tmp_path_factory.mktemp("exported")
+    estimator = build_filter("mbkf15_gated", IMU)
+    layout = write_source(folder, estimator, GRID, "mbkf15_gated", {})
+    return folder, estimator, layout, Library(build(folder), layout.size)
+
+
+@pytest.fixture
+def compiled(exported):
+    """The same in the place of an estimator."""
+    _, estimator, layout, library = exported
+    return CompiledFilter(estimator, GRID, layout, library)
+
+
+def test_the_exported_filter_is_the_original(exported, tables, drive):
+    _, estimator, layout, library = exported
+    found = difference(estimator, library, tables, drive, Begin(estimator, GRID, layout).epochs)
+    assert found.epochs > 40
+    assert max(*found.largest.values(), found.std) < ROUNDING
+
+
+def test_the_example_in_cpp_writes_the_same_solution(exported, tables, drive, tmp_path):
+    folder, estimator, layout, library = exported
+    cxx = shutil.which("c++") or shutil.which("g++")
+    if cxx is None:
+        pytest.skip("no C++ compiler here")
+    write_log(tmp_path / "drive.csv", tables, drive)
+    assert len((CPP / "navigate.cpp").read_text().splitlines()) < 150
+    command = [cxx, "-O2", "-Wall", "-Werror", f"-I{folder}", CPP / "navigate.cpp", folder / LIBRARY, "-o", tmp_path / "go"]
+    subprocess.run(command, check=True)
+    arm = [str(x) for x in ARM]
+
+    def run(log: str) -> np.ndarray:
+        done = subprocess.run(
+            [tmp_path / "go", "--arm", *arm], input=log, capture_output=True, text=True, check=True,
+            env={"LD_LIBRARY_PATH": str(folder)},
+        )  # fmt: skip
+        rows = np.array([[float(x) for x in line.split(",")] for line in done.stdout.splitlines()])
+        return rows[np.sort(len(rows) - 1 - np.unique(rows[::-1, 0], return_index=True)[1])]  # the last word on a time
+
+    lines = (tmp_path / "drive.csv").read_text().splitlines()
+    rows = run("\n".join(lines))
+    first, mine = vehicle_run(library, drive, boundary_fixes(tables, drive), Begin(estimator, GRID, layout).epochs)
+    np.testing.assert_allclose(rows[:, 0], drive.t0 + first + 1 + np.arange(len(mine)), atol=1e-6)
+    same = [ROW.index(c) for c in COLUMNS[1:]]
+    np.testing.assert_allclose(rows[:, 1 : len(COLUMNS)], mine[:, same], rtol=1e-9, atol=1e-9)
+    # fixes three seconds late give the same in the end
+    late = sorted(lines, key=lambda x: float(x.split(",")[1]) + (2.7 if x.startswith("gnss") else 0.0))
+    again = run("\n".join(late))
+    there = np.isin(rows[:, 0].round(3), again[:, 0].round(3))
+    np.testing.assert_allclose(again[:-3, 1:], rows[there][:-3, 1:], rtol=1e-7, atol=1e-7)
+
+
+def test_nothing_is_allocated(exported):
+    folder = exported[0]
+    listed = subprocess.run(["nm", "-D", "--undefined-only", folder / LIBRARY], capture_output=True, text=True, check=True)
+    needed = {line.split()[-1].partition("@")[0] for line in listed.stdout.splitlines()}
+    assert "sqrt" in needed or "sin" in needed  # it is the right list
+    assert not needed & {"malloc", "calloc", "realloc", "free", "_Znwm", "posix_memalign", "aligned_alloc"}
+
+
+def test_the_description_tells_every_number_of_the_memory(exported):
+    folder, _, layout, _ = exported
+    import json
+
+    described = json.loads((folder / "step.json").read_text())
+    assert sum(int(np.prod(f["shape"])) for f in described["memory"]["fields"]) == layout.size
+    assert described["row"] == list(ROW)
+    header = (folder / "step.h").read_text()
+    assert f"#define DLKF_MEMORY {layout.size}\n" in header and "@" not in header
+    assert re.search(r"DLKF_LAT_DEG, DLKF_LON_DEG", header)
+
+
+def test_a_batch_through_the_compiled_filter(compiled, drive):
+    torch.manual_seed(0)
+    batch = aligned_drives([drive], ALIGN).select(torch.zeros(3, dtype=torch.int64))
+    batch = replace(batch, available=torch.rand(batch.available.shape) < 0.7)
+    want, got = (run_filter(batch, f) for f in (compiled.estimator, compiled))
+    for name in ("imu_error", "innovation", "std"):
+        torch.testing.assert_close(getattr(got, name), getattr(want, name), atol=ROUNDING, rtol=ROUNDING)
+    for mine, theirs in zip((*got.prior, *got.posterior), (*want.prior, *want.posterior)):
+        torch.testing.assert_close(mine, theirs, atol=ROUNDING, rtol=0)
+    assert torch.equal(got.used, want.used)
+    assert run_filter(batch.in_precision(torch.float32), compiled).std.dtype == torch.float32
+
+
+def test_a_stream_through_the_compiled_filter_and_another_frame(compiled, tables, drive):
+    def solution(estimator) -> pd.DataFrame:
+        stream = StreamingFilter(estimator, lever_arm_b=ARM, phase_s=drive.t0, anchor_m=100.0)
+        return estimates_table([e for receipt in played(stream, tables.imu, tables.gnss) for e in receipt.estimates])
+
+    want, got = solution(compiled.estimator), solution(compiled)
+    assert len(want) > 40
+    np.testing.assert_allclose(got.to_numpy(float), want.to_numpy(float), rtol=1e-6, atol=ROUNDING)
+
+
+def test_it_is_made_once_and_can_be_put_away(exported, tmp_path, monkeypatch):
+    folder, estimator, _, _ = exported
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    kept = tmp_path / "dlkf" / "compiled" / compiled_filter._digest(estimator, GRID)
+    shutil.copytree(folder, kept)  # made before
+    made = compiled_filter.compiled_filter(estimator, 50.0, 1.0)
+    again = pickle.loads(pickle.dumps(made))
+    assert again.grid == made.grid and again.layout.size == made.layout.size
+    assert compiled_filter._digest(build_filter("mbkf15", IMU), GRID) != kept.name
+
+
+def test_what_does_not_fit_is_told(compiled, drive, monkeypatch, tmp_path):
+    with pytest.raises(InputError, match="compiled for 50 samples"):
+        compiled.begin(aligned_drives([drive_with(drive, 25)], ALIGN))
+    monkeypatch.setattr("dlkf.onboard.library.compiler", lambda: None)
+    with pytest.raises(InputError, match="no C compiler"):
+        build(tmp_path)
+
+
+def drive_with(drive, samples: int):
+    """Every second sample of a drive."""
+    return replace(drive, imu=drive.imu[:, ::2][:, :samples], rate_hz=25.0)
+
+
+def learned(**settings) -> LearnedFilter:
+    torch.manual_seed(0)
+    network = {"cnn_channels": 4, "lstm_hidden": 8, "lstm_layers": 2, "dense": [16, 8]}
+    return LearnedFilter(LearnedConfig.from_mapping({"network": network, **settings})).eval()
+
+
+def talkative_plus() -> PlusFilter:
+    """A network that says something."""
+    torch.manual_seed(0)
+    model = PlusFilter(PlusConfig(parts=("process", "fix", "across", "offset", "speed", "residual"))).eval()
+    for head in (model.network.noise, model.network.speed):
+        torch.nn.init.normal_(head.weight, std=0.05)
+    return model
+
+
+@pytest.mark.exports
+@pytest.mark.parametrize(
+    "estimator",
+    [
+        *(lambda n=n: build_filter(n, IMU) for n in ("ins", "aekf", "mbkf21_car", "mbkf33_nhc_gated_gm")),
+        learned,
+        lambda: learned(outage_mode="run", frame="heading", imu_error="affine", imu_error_bound=4.0),
+        talkative_plus,
+    ],
+    ids=["ins", "aekf", "mbkf21_car", "mbkf33_nhc_gated_gm", "dlkf_literal", "dlkf", "plus"],
+)
+def test_every_kind_of_filter(estimator, tables, drive, tmp_path):
+    model = estimator()
+    layout = write_source(tmp_path, model, GRID, "tested", {})
+    found = difference(model, Library(build(tmp_path), layout.size), tables, drive, Begin(model, GRID, layout).epochs)
+    single = isinstance(model, torch.nn.Module)  # a network's float32
+    assert max(found.largest.values()) < (1e-3 if single else ROUNDING)
