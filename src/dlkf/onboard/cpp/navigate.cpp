@@ -32,7 +32,7 @@ class Navigator {
   void imu(double t, const double* sample) {
     latest_ = t;
     if (std::isnan(start_)) return;  // the first fix lays the grid
-    if (t - start_ < samples_ / DLKF_RATE_HZ) return;  // before the grid
+    if (t - start_ < 0.5 / DLKF_RATE_HZ) return;  // before the grid
     Epoch& open = at(closed_);
     std::memcpy(open.imu + 6 * samples_, sample, 6 * sizeof(double));
     if (std::abs(t - start_ - (samples_ + 1) / DLKF_RATE_HZ) > 0.5 / DLKF_RATE_HZ) return restart("samples are missing", t);
@@ -47,8 +47,8 @@ class Navigator {
       if (start_ - line[0] < EPOCH_S) keep(before_, line, start_);
       return;
     }
-    const long late = std::max(0L, (long)std::ceil((start_ - ON_BOUNDARY_S - line[0]) / EPOCH_S + 1e-9));
-    if (late > std::min<long>(HISTORY, closed_)) return;
+    const long late = 1 - (long)std::ceil((line[0] - start_ - ON_BOUNDARY_S) / EPOCH_S);  // epochs
+    if (late < 0 || late > std::min<long>(HISTORY, closed_)) return;
     Epoch& epoch = at(closed_ - late);
     if (epoch.fix_t >= line[0]) return;
     keep(epoch, line, start_ + (1 - late) * EPOCH_S);
