@@ -91,8 +91,8 @@ def test_the_example_in_cpp_writes_the_same_solution(exported, tables, drive, tm
         pytest.skip("no C++ compiler here")
     write_log(tmp_path / "drive.csv", tables, drive)
     assert len((CPP / "navigate.cpp").read_text().splitlines()) < 150
-    command = [cxx, "-O2", "-Wall", "-Werror", f"-I{folder}", CPP / "navigate.cpp", folder / LIBRARY, "-o", tmp_path / "go"]
-    subprocess.run(command, check=True)
+    files = CPP / "navigate.cpp", folder / LIBRARY, "-o", tmp_path / "go"
+    subprocess.run([cxx, "-O2", "-Wall", "-Werror", f"-I{folder}", *files], check=True)
     arm = [str(x) for x in ARM]
 
     def run(log: str) -> np.ndarray:
@@ -116,7 +116,8 @@ def test_the_example_in_cpp_writes_the_same_solution(exported, tables, drive, tm
 
 def test_nothing_is_allocated(exported):
     folder = exported[0]
-    listed = subprocess.run(["nm", "-D", "--undefined-only", folder / LIBRARY], capture_output=True, text=True, check=True)
+    command = ["nm", "-D", "--undefined-only", folder / LIBRARY]
+    listed = subprocess.run(command, capture_output=True, text=True, check=True)
     needed = {line.split()[-1].partition("@")[0] for line in listed.stdout.splitlines()}
     assert "sqrt" in needed or "sin" in needed  # it is the right list
     assert not needed & {"malloc", "calloc", "realloc", "free", "_Znwm", "posix_memalign", "aligned_alloc"}

@@ -101,7 +101,8 @@ BY_ELEMENT: dict[str, Pattern] = {
     "eq": "{0} == {1}", "ne": "{0} != {1}", "lt": "{0} < {1}", "le": "{0} <= {1}", "gt": "{0} > {1}",
     "ge": "{0} >= {1}", "logical_not": "!{0}", "bitwise_not": "!{0}", "bitwise_and": "{0} & {1}",
     "bitwise_or": "{0} | {1}", "logical_and": "{0} && {1}", "logical_or": "{0} || {1}", "isnan": "isnan({0}) != 0",
-    "isinf": "isinf({0}) != 0", "full_like": _second, "ones_like": _first("1"), "zeros_like": _first("0"), "copy": _second,
+    "isinf": "isinf({0}) != 0",
+    "full_like": _second, "ones_like": _first("1"), "zeros_like": _first("0"), "copy": _second,
     "_to_copy": _first("{0}"), "clone": _first("{0}"), "lift_fresh_copy": _first("{0}"),
     "prims::copy_strided": _first("{0}"),
 }  # fmt: skip
