@@ -6,6 +6,7 @@ drive and ``out/report.html``, or nothing (columns: dlkf.running.solution).
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,14 +22,17 @@ from dlkf.data.tables import time_zeros
 from dlkf.errors import InputError
 from dlkf.files import staged, vacant
 from dlkf.filters.smoother import smoothed
+from dlkf.filters.tuning import Tuning
 from dlkf.models import grid_of, resolve_model, short_name
-from dlkf.navigation.imu_errors import imu_spec
+from dlkf.navigation.imu_errors import AUTO, imu_spec
 from dlkf.provenance import provenance
 from dlkf.report.navigation import Course, answers, write_page
 from dlkf.running.exports import chosen, export, utc_times
+from dlkf.running.likelihood import untold
 from dlkf.running.offline import Fixes, epoch_for, navigate_drives
 from dlkf.running.replay import stream_drives
 from dlkf.running.solution import write_solution
+from dlkf.settings import settings_from
 
 
 @command("navigate")
@@ -39,25 +43,18 @@ def main(cfg: DictConfig) -> None:
     vacant(config["out"], overwrite=config["overwrite"])
     if not isinstance(config["model"], str):
         raise InputError(f"navigate runs one model at a time, got model={config['model']}")
-    model = resolve_model(
-        config["model"],
-        imu_spec(config["imu"]),
-        config["tracking"]["uri"],
-        tuning=config["tuning"],
-        prior=config["prior"],
-    )
+    spec, tuning = imu_spec(config["imu"], auto=True), config["tuning"]
+    model = resolve_model(config["model"], spec, config["tracking"]["uri"], tuning=tuning, prior=config["prior"])
     zeros = time_zeros(config["dataset"])
     rows = drive_rows(config["dataset"], config["drives"])
     spacings = {row.name: Fixes.of(config["dataset"], row.name) for row in rows}
     usual = epoch_for(spacings.values(), config["rate_hz"] or 50.0, model)
     grid = {"drives": config["drives"], **grid_of([model], config["rate_hz"], config["epoch_s"], usual)}
     skipped: dict[str, str] | None = {} if config["skip_unaligned"] else None
-    if config["smoother"] is not None:
-        if config["streaming"]:
-            raise InputError("a smoother looks ahead, a stream cannot: give smoother or streaming, not both")
-        model = smoothed(model, config["smoother"])
     align = AlignConfig.of(config["align"])
     if config["streaming"]:
+        if config["smoother"] is not None or spec.name == AUTO:
+            raise InputError("smoother and imu=auto look ahead, a stream cannot: leave out streaming, or both of them")
         navigated = partial(stream_drives, config["dataset"], model, align=align, skipped=skipped, **grid)
     else:
         with counting("Loading drives") as progress:
@@ -68,6 +65,14 @@ def main(cfg: DictConfig) -> None:
                 progress=progress,
                 **grid,
             )
+        if spec.name == AUTO:
+            with counting("Finding the noise") as progress:
+                told = settings_from(Tuning, tuning, "tuning")
+                model, drives, found = untold(drives, config["model"], spec, told, align, progress=progress)
+            print("found: " + ", ".join(f"{k} {v:.2g}" for k, v in found.described().items()))
+            spec, tuning = found.imu, asdict(found.tuning)
+        if config["smoother"] is not None:
+            model = smoothed(model, config["smoother"])
         navigated = partial(navigate_drives, drives, model, align=align, skipped=skipped)
     lines, courses = [], []
     with staged(config["out"]) as folder, counting("Navigating") as progress:
@@ -78,7 +83,7 @@ def main(cfg: DictConfig) -> None:
             lines.append(result.summary(spacings[result.drive]))
             courses.append(Course(result, spacings[result.drive]))
         made = {**provenance(), **{k: config[k] for k in ("model", "dataset")}, **grid}
-        made |= {"digest": dataset_digest(config["dataset"]), "imu": config["imu"], "tuning": config["tuning"]}
+        made |= {"digest": dataset_digest(config["dataset"]), "imu": asdict(spec), "tuning": dict(tuning)}
         write_page(folder, short_name(config["model"]), Path(config["dataset"]).resolve().name, courses, made)
     print("\n".join(sorted(lines)))
     for reason in (skipped or {}).values():

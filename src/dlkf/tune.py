@@ -24,7 +24,8 @@ from dlkf.evaluation.table import as_markdown, as_rich
 from dlkf.filters.build import build_filter
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.tracking.runs import start_run, tracking_uri
-from dlkf.tuning.study import check, search, sides, tuning_table, write_tuning
+from dlkf.tuning.found import found_noise, noise_table, write_noise
+from dlkf.tuning.study import LIKELIHOOD, check, search, sides, tuning_table, write_tuning
 
 
 @command("tune")
@@ -44,23 +45,30 @@ def main(cfg: DictConfig) -> None:
             epoch_s=config["epoch_s"],
             dtype=torch.float64,
             drives=config["drives"],
+            reference=config["objective"] != LIKELIHOOD,
             progress=progress,
         )
-    parts, dataset = sides(drives, config), drives[0].dataset
+    dataset, out = drives[0].dataset, Path(config["out"])
     with start_run(uri, "tune", f"{model} {dataset}") as run:
         run.log_config(config)
         run.log_dataset(config["dataset"], dataset_digest(config["dataset"]), "tuning")
-        options = {key: config[key] for key in ("objective", "rounds", "pieces")}
-        result = search(model, spec, parts, protocol, start=start, **options)
-        table = tuning_table(result, dataset)
-        write_tuning(config["out"], name, result, table)
-        run.log_metrics(result.metrics())
-        run.log_metrics({f"tuned/{k}": v for k, v in result.changed.items()})
-        for file in (f"tuning/{name}.yaml", "search.csv", "table.md"):
-            run.log_files(Path(config["out"]) / file)
+        if config["objective"] == LIKELIHOOD:
+            found = found_noise(drives, model, spec, start, minutes=config["minutes"], name=name)
+            table = noise_table(model, dataset, spec, start, found)
+            files = write_noise(out, found, table)
+            run.log_metrics({f"found/{k}": v for k, v in found.described().items()})
+        else:
+            options = {key: config[key] for key in ("objective", "rounds", "pieces")}
+            result = search(model, spec, sides(drives, config), protocol, start=start, **options)
+            table = tuning_table(result, dataset)
+            files = write_tuning(out, name, result, table)
+            run.log_metrics(result.metrics())
+            run.log_metrics({f"tuned/{k}": v for k, v in result.changed.items()})
+        for file in files:
+            run.log_files(out / file)
         run.note(as_markdown(table))
     Console(width=None if sys.stdout.isatty() else 110).print(as_rich(table))
-    print(f"Factors: {config['out']}/tuning/{name}.yaml; MLflow: run {run.id}")
+    print(f"{out}/{files[0]}; for evaluate and navigate: --config-dir {out}; MLflow: run {run.id}")
 
 
 if __name__ == "__main__":

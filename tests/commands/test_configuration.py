@@ -57,7 +57,7 @@ OPTIONS = {
     primary: [[], *([f"{group}={name}"] for group, folder in groups.items() for name in presets(folder))]
     for primary, groups in GROUPS.items()
 }
-CASES = [(primary, option) for primary in GROUPS for option in OPTIONS[primary]]
+CASES = [(p, option) for p in GROUPS for option in OPTIONS[p] if option != ["imu=auto"] or p == "navigate"]
 CASES += [  # a preset of the others replaces one node whole, so its composition alone is enough
     ("train", [*option, *experiment])
     for option in OPTIONS["train"]
@@ -78,7 +78,7 @@ def test_all_folders_are_covered():
 def test_it_composes_and_builds(primary, overrides):
     config = composed(primary, *overrides)
     if "imu" in config:
-        imu_spec(config["imu"])
+        imu_spec(config["imu"], auto=True)
     if primary == "simulate":
         dataset_config(config["dataset"])
     if primary == "ingest":

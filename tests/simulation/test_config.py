@@ -13,7 +13,7 @@ from dlkf.navigation.imu_errors import imu_spec
 from dlkf.simulation.dataset import dataset_config, simulate_from_config
 
 CONF = Path(__file__).parents[2] / "conf"
-PRESETS = sorted(path.stem for path in (CONF / "imu").glob("*.yaml"))
+PRESETS = sorted(path.stem for path in (CONF / "imu").glob("*.yaml") if path.stem != "auto")  # auto is not known before
 BRINGS = {
     **dict.fromkeys(("one_imu", "one_imu_hour"), "automotive_mems"),
     "per_drive": "automotive_mems",

@@ -87,13 +87,17 @@ class ImuSpec:
     source: str = ""
 
 
-def imu_spec(config: Mapping) -> ImuSpec:
+AUTO = "auto"  # the preset that says: find it
+
+
+def imu_spec(config: Mapping, *, auto: bool = False) -> ImuSpec:
     """The preset that a mapping with the keys of a ``conf/imu/*.yaml`` file describes.
 
     Every number of both sensors but the optional ones has to be there, and no unknown one, so that a misspelt
     key cannot become a silent zero.
     Of a preset with ranges (``conf/imu/wide.yaml``) it is the middle: what a filter is told of an IMU that can be any.
-    Raises InputError for a missing or unknown key or a value that is no number ≥ 0.
+    Raises InputError for a missing or unknown key, a value that is no number ≥ 0, or the preset ``auto`` unless the
+    caller finds the noise by itself.
     """
     config = middle(config)
     if not isinstance(config, Mapping):
@@ -102,6 +106,11 @@ def imu_spec(config: Mapping) -> ImuSpec:
     told = {key: str(config[key]) for key in ("name", "source") if key in config}
     sensors = {key: _sensor(config[key], f"{where}, {key}") for key in ("accel", "gyro") if key in config}
     spec = settings_from(ImuSpec, {**config, **told, **sensors}, where)
+    if spec.name == AUTO and not auto:
+        raise InputError(
+            "imu=auto: only navigate finds the noise by itself; give a preset here, or have one written by "
+            "python -m dlkf.tune objective=likelihood"
+        )
     if spec.accel.g_sensitivity:
         raise InputError(f"{where}, accel: g_sensitivity is an error of gyroscopes alone, leave it out")
     return spec

@@ -26,6 +26,8 @@ from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.tuning.search import Trial, factors_of, outage_error, tuned, tuning_values
 
+LIKELIHOOD = "likelihood"  # the objective that needs no reference (dlkf.tuning.found)
+
 
 @dataclass(frozen=True)
 class Tuned:
@@ -60,8 +62,8 @@ def check(model: str, objective: str) -> None:
         raise InputError(f"model={model} is smoothed, its noise is that of the filter; tune it without _rts")
     if "prior" in model.split("_"):
         raise InputError(f"model={model}: the factors of a filter do not depend on its prior; tune it without _prior")
-    if objective not in OBJECTIVES:
-        raise InputError(f"objective={objective} is none of {', '.join(OBJECTIVES)}")
+    if objective not in (*OBJECTIVES, LIKELIHOOD):
+        raise InputError(f"objective={objective} is none of {', '.join((*OBJECTIVES, LIKELIHOOD))}")
 
 
 def sides(drives: Sequence[Drive], config: Mapping[str, Any]) -> dict[str, list[Drive]]:
@@ -134,8 +136,8 @@ def tuning_table(result: Tuned, dataset: str) -> Table:
     )
 
 
-def write_tuning(out: str | Path, name: str, result: Tuned, table: Table) -> None:
-    """Write tuning/<name>.yaml, table.md and search.csv into ``out``, all or none."""
+def write_tuning(out: str | Path, name: str, result: Tuned, table: Table) -> list[str]:
+    """Write tuning/<name>.yaml, table.md and search.csv into ``out``, all or none; their names."""
     factors = f"# {table.title}\n{yaml.safe_dump(tuning_values(result.after), sort_keys=False)}"
     trials = io.StringIO()
     writer = csv.writer(trials, lineterminator="\n")
@@ -147,3 +149,4 @@ def write_tuning(out: str | Path, name: str, result: Tuned, table: Table) -> Non
         (folder / "table.md").write_text(as_markdown(table))
         (folder / "search.csv").write_text(trials.getvalue())
         (folder / "errors.json").write_text(json.dumps(result.metrics(), indent=1) + "\n")
+    return [f"tuning/{name}.yaml", "table.md", "search.csv"]

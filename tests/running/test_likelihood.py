@@ -1,0 +1,116 @@
+"""Noise found from fixes alone: it is that which the drives have, whatever the search was told at the start."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from dlkf.data.segments import whole_drives
+from dlkf.errors import InputError
+from dlkf.filters.tuning import Tuning
+from dlkf.navigation.imu_errors import imu_spec
+from dlkf.running import likelihood
+from dlkf.running.likelihood import Evidence, find_noise
+from dlkf.running.start import align
+from tests.cars import IMU, car_batch, write_pieces
+
+
+@pytest.fixture(scope="module")
+def long_town(tmp_path_factory) -> Path:
+    """Three drives of 150 s whose IMU is that of tests.cars."""
+    return write_pieces(tmp_path_factory.mktemp("data") / "long", car_batch(3, 150))
+
+
+@pytest.fixture(scope="module")
+def drives(long_town):
+    from dlkf.data.store import load_dataset
+
+    return load_dataset(long_town, rate_hz=20, epoch_s=1.0, dtype=torch.float64, reference=False)
+
+
+def told(factor: float):
+    """The IMU with white noise told so many times too large."""
+    accel, gyro = (replace(s, noise_density=factor * s.noise_density) for s in (IMU.accel, IMU.gyro))
+    return replace(IMU, accel=accel, gyro=gyro)
+
+
+def test_the_density_is_that_of_student(drives):
+    z, S = torch.tensor([[0.3, -1.0]]).double(), torch.tensor([[[2.0, 0.3], [0.3, 0.5]]]).double()
+    t = torch.distributions.StudentT(likelihood.FREEDOM)
+    one = likelihood._density(z[:, :1], S[:, :1, :1], torch.tensor([1]))
+    scaled = -t.log_prob(z[:, 0] / S[:, 0, 0].sqrt()) + 0.5 * S[:, 0, 0].log()
+    zero = likelihood._density(torch.zeros(1, 1).double(), torch.ones(1, 1, 1).double(), torch.tensor([1]))
+    assert one - zero == pytest.approx(float(scaled + t.log_prob(torch.tensor(0.0))))
+    assert likelihood._density(z, S, torch.tensor([2])).shape == (1,)
+
+
+def test_gaps_are_withheld_and_scored(drives):
+    evidence = Evidence.of(drives)
+    B = len(drives) * (1 + len(likelihood.GAPS_S))
+    assert evidence.batch.size[0] == B
+    whole = evidence.batch.available[:: 1 + len(likelihood.GAPS_S)]
+    assert whole.all() and not evidence.batch.available[1].all()
+    assert not evidence.offered[:, : int(likelihood.SETTLE_S)].any()
+    start = whole_drives([drives[0]], [align(drives[0])])
+    assert torch.equal(evidence.batch.imu[0, : start.size[1]], start.imu[0])
+
+
+def test_noise_that_is_told_wrong_is_found(drives):
+    found = find_noise(Evidence.of(drives[:1]), "mbkf15", told(0.05), Tuning(), delay=False)
+    assert found.after < found.before - 0.1
+    for sensor in ("accel", "gyro"):  # seen through some 100 fixes
+        ratio = getattr(found.imu, sensor).noise_density / getattr(IMU, sensor).noise_density
+        assert 1 / 4 < ratio < 4
+    assert 0.5 <= found.tuning.position_std <= 2
+
+
+def test_fixes_that_are_late_are_found_out(drives):
+    d = drives[0]  # every fix tells where the car was, and how fast, 0.2 s before its stamp
+    pull = torch.gradient(d.gnss_v_e, dim=0)[0]
+    was = replace(d, gnss_r_e=d.gnss_r_e - 0.2 * d.gnss_v_e + 0.02 * pull, gnss_v_e=d.gnss_v_e - 0.2 * pull)
+    evidence = Evidence.of([was])
+    at = {late: evidence.surprise("mbkf15", IMU, Tuning(), late) for late in (0.0, 0.1, 0.2, 0.3)}
+    assert min(at, key=at.get) == 0.2
+
+
+@pytest.fixture
+def coarse(monkeypatch):
+    """A search in one step size, for what comes behind it."""
+    monkeypatch.setattr(likelihood, "STEPS", (4.0,))
+
+
+def test_the_command_writes_what_the_others_take(uri, call, long_town, coarse):
+    one = (f"dataset={long_town}", "drives=[car-00]", "rate_hz=20")
+    done = call("tune", "objective=likelihood", "model=mbkf15", *one, "imu=consumer", "name=ours", "out=found")
+    assert done.code == 0, done.err
+    preset = yaml.safe_load(Path("found/imu/ours.yaml").read_text())
+    assert imu_spec(preset).name == "ours" and Path("found/tuning/ours.yaml").is_file()
+    done = call("navigate", "--config-dir", "found", "model=mbkf15", *one, "imu=ours", "tuning=ours", "out=solved")
+    assert done.code == 0, done.err
+
+
+def test_navigate_finds_the_noise_by_itself(call, long_town, coarse):
+    one = (f"dataset={long_town}", "drives=[car-00]", "rate_hz=20", "out=solved")
+    done = call("navigate", "model=mbkf15", "imu=auto", *one)
+    assert done.code == 0 and "found: accel.noise_density" in done.out, done.err
+    assert Path("solved/drive=car-00/solution.parquet").is_file()
+
+
+@pytest.mark.parametrize("words,says", [
+    (("navigate", "model=plus", "imu=auto", "out=a"), "model=plus takes none"),
+    (("navigate", "model=mbkf15", "imu=auto", "streaming=true", "out=a"), "look ahead"),
+    (("evaluate", "model=mbkf15", "imu=auto", "out=a"), "only navigate finds the noise"),
+])  # fmt: skip
+def test_where_noise_cannot_be_found(call, long_town, words, says):
+    done = call(*words, f"dataset={long_town}")
+    assert done.code == 2 and says in done.err
+
+
+def test_drives_that_say_nothing_are_refused(drives):
+    short = [d.part(0, 15) for d in drives]
+    with pytest.raises(InputError, match="no noise can be found"):
+        find_noise(Evidence.of(short), "mbkf15", IMU, Tuning())
