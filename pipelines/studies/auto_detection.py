@@ -61,6 +61,7 @@ class Outcome:
     units_right: bool
     refused: str
     seconds: float
+    turn: np.ndarray | None = None  # rotation vector [rad] of the pose found against the nominal one
 
     @property
     def wrong(self) -> bool:
@@ -133,8 +134,9 @@ def tried(
     factors = [units.factor(unit, table, "") for unit, table in zip(said, tables)]
     real = [table[hidden.units[key]] for key, table in zip(("accel", "gyro", "speed"), tables)]
     right = bool(np.allclose(factors, real, rtol=UNIT_SHARE))
-    degrees = float(np.degrees(Rotation.from_matrix(pose).magnitude()))
-    return Outcome(name, motion, not refused, degrees, 1000 * offset - own_ms, right, refused, seconds)
+    turn = Rotation.from_matrix(pose).as_rotvec()
+    degrees = float(np.degrees(np.linalg.norm(turn)))
+    return Outcome(name, motion, not refused, degrees, 1000 * offset - own_ms, right, refused, seconds, turn)
 
 
 def run(dataset: Path, rng: np.random.Generator, own: bool = False) -> list[Outcome]:
@@ -165,6 +167,24 @@ def summary(title: str, all_of_them: list[Outcome]) -> str:
     cells += [f"{np.median(x):.2f} / {np.max(x):.2f}" if len(x) else "–" for x in (pose, offset)]
     cells += [sum(o.wrong for o in all_of_them), f"{np.median([o.seconds for o in all_of_them]):.1f}"]
     return "| " + " | ".join(str(c) for c in cells) + " |"
+
+
+def common_pose(title: str, all_of_them: list[Outcome]) -> str:
+    """How the poses of one and the same car lie about their mean: nominal axes need not be the car's."""
+    turns = [o.turn for o in all_of_them if o.motion_s >= MOTION_S and o.turn is not None]
+    if len(turns) < 3:
+        return ""
+    found = Rotation.from_rotvec(turns)
+    apart = [
+        np.degrees((found[k] * Rotation.concatenate([found[:k], found[k + 1 :]]).mean().inv()).magnitude())
+        for k in range(len(turns))
+    ]
+    roll, pitch, yaw = np.degrees(found.mean().as_rotvec())
+    return (
+        f"{title}: {len(turns)} poses about a common one of roll {roll:+.2f}°, pitch {pitch:+.2f}°, yaw {yaw:+.2f}° "
+        f"against the nominal axes; to the mean of the others {np.median(apart):.2f}° in the median, "
+        f"{max(apart):.2f}° at most"
+    )
 
 
 def mistakes(title: str, dataset: Path) -> str:
@@ -237,7 +257,8 @@ def main() -> None:
     head = f"| {' | '.join(names)} |"
     line = "|:--|" + "--:|" * (len(SPOILT) + 2)
     checks = [mistakes(title, dataset) for title, dataset in sets.items()]
-    table = "\n".join((HEAD, *rows, "", head, line, *checks))
+    of_one_car = common_pose("kitti", groups.get("kitti", []))
+    table = "\n".join((HEAD, *rows, "", of_one_car, "", head, line, *checks))
     print(table)
     with staged(given.page.parent) as folder:
         old = given.page.read_text() if given.page.exists() else "<!-- table -->\n<!-- end -->\n"

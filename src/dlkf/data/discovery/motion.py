@@ -15,18 +15,22 @@ Complex = NDArray[np.complex128]
 
 MOVING, RESTING = 2.0, 0.3  # m/s: above, the course is known; below, the car stands
 LONGEST_STEP_S = 2.5  # fixes further apart make no interval
-SHORTEST_STEP_S = 0.45  # faster fixes are thinned: the noise of a difference of velocities grows with its rate
+SHORTEST_STEP_S = 0.45  # of faster fixes intervals span several: the noise of a difference grows with its rate
 EARTH_M = 6_371_000.0
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Velocities [m/s] at times ``t`` [s] of the GNSS clock; ``climb`` is the slope of the way, 0 where not known."""
+    """Velocities [m/s] at times ``t`` [s] of the GNSS clock; ``climb`` is the slope of the way, 0 where not known.
+
+    An interval spans ``stride`` fixes.
+    """
 
     t: Floats
     v: Complex
     climb: Floats
     from_positions: bool = False
+    stride: int = 1
 
     @property
     def speed(self) -> Floats:
@@ -38,10 +42,11 @@ class Motion:
         """Course over ground [rad], clockwise from North."""
         return np.angle(self.v)
 
-    def intervals(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """First and last rows of the intervals between successive fixes."""
-        first = np.flatnonzero(np.diff(self.t) <= LONGEST_STEP_S)
-        return first, first + 1
+    def intervals(self, overlapping: bool = False) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """First and last rows of the intervals, end to end, or one from every fix."""
+        first = np.arange(0, max(len(self.t) - self.stride, 0), 1 if overlapping else self.stride)
+        first = first[self.t[first + self.stride] - self.t[first] <= LONGEST_STEP_S]
+        return first, first + self.stride
 
 
 def motion(t: Floats, lat_deg: Floats, lon_deg: Floats, v_ned: Floats) -> Motion:
@@ -50,19 +55,21 @@ def motion(t: Floats, lat_deg: Floats, lon_deg: Floats, v_ned: Floats) -> Motion
     known = np.isfinite(v_ned[:, :2]).all(-1)
     if known.sum() < 0.2 * len(t):
         return _from_positions(t[place], lat_deg[place], lon_deg[place])
-    rows = _thinned(t, known)
-    v = v_ned[rows, 0] + 1j * v_ned[rows, 1]
+    v = v_ned[known, 0] + 1j * v_ned[known, 1]
     speed = np.abs(v)
-    climb = np.where(speed > MOVING, -np.nan_to_num(v_ned[rows, 2]) / np.maximum(speed, 0.1), 0.0)
-    return Motion(t[rows], v, np.clip(climb, -0.3, 0.3))
+    climb = np.where(speed > MOVING, -np.nan_to_num(v_ned[known, 2]) / np.maximum(speed, 0.1), 0.0)
+    return Motion(t[known], v, np.clip(climb, -0.3, 0.3), stride=_stride(t[known]))
+
+
+def _stride(t: Floats) -> int:
+    """How many fixes an interval spans."""
+    step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
+    return max(1, int(np.ceil(SHORTEST_STEP_S / max(step, 1e-3) - 0.01)))
 
 
 def _thinned(t: Floats, good: NDArray[np.bool_]) -> NDArray[np.int64]:
     rows = np.flatnonzero(good)
-    if not len(rows):
-        return rows
-    step = float(np.median(np.diff(t[rows]))) if len(rows) > 1 else 1.0
-    return rows[:: max(1, int(np.ceil(SHORTEST_STEP_S / max(step, 1e-3) - 0.01)))]
+    return rows[:: _stride(t[rows])]
 
 
 def _from_positions(t: Floats, lat_deg: Floats, lon_deg: Floats) -> Motion:

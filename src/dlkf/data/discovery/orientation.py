@@ -70,6 +70,7 @@ class _Intervals:
     v1: Floats
     moving: np.ndarray
     block: np.ndarray
+    stride: int  # rows that overlap
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float
     None where the drive has too little motion to say anything.
     """
     parts = _intervals(gnss)
-    if parts.moving.sum() < FEWEST:
+    if parts.moving.sum() < FEWEST * parts.stride:
         return None
     down = -accel.mean(0)
     down = down / np.linalg.norm(down)
@@ -152,7 +153,7 @@ def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float
 
 
 def _intervals(gnss: Motion) -> _Intervals:
-    first, last = gnss.intervals()
+    first, last = gnss.intervals(overlapping=True)  # of fast fixes each one's noise is averaged over all phases
     t0, t1 = gnss.t[first], gnss.t[last]
     slow = np.minimum(gnss.speed[first], gnss.speed[last])
     moving = slow > MOVING
@@ -164,7 +165,7 @@ def _intervals(gnss: Motion) -> _Intervals:
     dv = gnss.v[last] - gnss.v[first]
     v0, v1 = gnss.speed[first], gnss.speed[last]
     slopes = np.where(moving, slope, 0.0)
-    return _Intervals(t0, t1, dv, slopes, turned, np.minimum(slow, 15.0), v0, v1, moving, block)
+    return _Intervals(t0, t1, dv, slopes, turned, np.minimum(slow, 15.0), v0, v1, moving, block, gnss.stride)
 
 
 def _gyro_scale(t: Floats, rate: Floats, parts: _Intervals, lag_s: float) -> float | None:
@@ -233,7 +234,7 @@ def _sound(level: Levelled, gnss: Motion, parts: _Intervals, lag: float, slip: t
     if not use.any():
         return use
     design, left = _design(level, gnss, parts, lag, slip, level.tilted, 0.0)
-    A, y = _quick(design, use), _quick(left[:, None], use)[:, 0]
+    A, y = _quick(design, use, parts.stride), _quick(left[:, None], use, parts.stride)[:, 0]
     x, *_ = np.linalg.lstsq(A[use], y[use], rcond=None)
     off = np.abs(y - A @ x)
     return off <= 5 * max(float(np.median(off[use])), 1e-3)
@@ -261,13 +262,13 @@ def _design(
     return design, parts.dv + slope * parts.slope
 
 
-def _quick(columns: Complex, use: np.ndarray) -> Complex:
+def _quick(columns: Complex, use: np.ndarray, stride: int) -> Complex:
     """Columns less their mean over ``SLOW_ROWS`` round each row, of the rows in use: tilt drifts, cars do not wait."""
-    weight = use.astype(float)
-    share = np.maximum(gaussian_filter1d(weight, SLOW_ROWS, mode="constant"), 1e-6)
+    weight, rows = use.astype(float), SLOW_ROWS * stride
+    share = np.maximum(gaussian_filter1d(weight, rows, mode="constant"), 1e-6)
     masked = columns * weight[:, None]
-    slow = gaussian_filter1d(masked.real, SLOW_ROWS, axis=0, mode="constant") + 1j * gaussian_filter1d(
-        masked.imag, SLOW_ROWS, axis=0, mode="constant"
+    slow = gaussian_filter1d(masked.real, rows, axis=0, mode="constant") + 1j * gaussian_filter1d(
+        masked.imag, rows, axis=0, mode="constant"
     )
     return columns - slow / share[:, None]
 
@@ -279,11 +280,12 @@ def _rates(level: Levelled, at: Floats) -> Floats:
 
 def _held(level: Levelled, gnss: Motion, lag: float, slip: tuple[float, float]):
     """Heading minus turn as a function of GNSS time: averaged over seconds, weighted by speed."""
-    moving = gnss.speed > MOVING
-    t, speed = gnss.t[moving], gnss.speed[moving]
+    rows = np.arange(len(gnss.t))[:: gnss.stride]
+    rows = rows[gnss.speed[rows] > MOVING]
+    t, speed = gnss.t[rows], gnss.speed[rows]
     beside = _rates(level, t + lag) * (slip[0] / speed + slip[1] * speed)
-    apart = np.exp(1j * (gnss.course[moving] - beside - np.interp(t + lag, level.t, level.turn)))
-    weight = np.minimum(gnss.speed[moving], 15.0) ** 2
+    apart = np.exp(1j * (gnss.course[rows] - beside - np.interp(t + lag, level.t, level.turn)))
+    weight = np.minimum(speed, 15.0) ** 2
     reach = max(1, round(2 * SMOOTH_S / max(float(np.median(np.diff(t))) if len(t) > 1 else 1.0, 0.1)))
     total = np.zeros(len(t), complex)
     for shift in range(-reach, reach + 1):
@@ -301,11 +303,11 @@ def _fit(
 ) -> tuple[_Fit, float]:
     """Least squares at a lag, and its residuals' squared sum."""
     design, left = _design(level, gnss, parts, lag, slip, level.tilted, 0.0)
-    A, y = _quick(design, use)[use], _quick(left[:, None], use)[use, 0]
+    A, y = _quick(design, use, parts.stride)[use], _quick(left[:, None], use, parts.stride)[use, 0]
     x, *_ = np.linalg.lstsq(A, y, rcond=None)
     rest = float(np.sum(np.abs(y - A @ x) ** 2)) + 1e-9
     inverse = np.linalg.pinv(A.conj().T @ A)
-    arm_std = float(np.sqrt(abs(inverse[2, 2]) * rest / max(len(y) - 3, 1)))
+    arm_std = float(np.sqrt(parts.stride * abs(inverse[2, 2]) * rest / max(len(y) - 3, 1)))
     turning = use & parts.moving
     turn = np.interp(parts.t1 + lag, level.t, level.turn) - np.interp(parts.t0 + lag, level.t, level.turn)
     rate0, rate1 = _rates(level, parts.t0 + lag), _rates(level, parts.t1 + lag)
