@@ -25,6 +25,7 @@ from dlkf.filters.smoother import smoothed
 from dlkf.filters.tuning import Tuning
 from dlkf.models import grid_of, resolve_model, short_name
 from dlkf.navigation.imu_errors import AUTO, imu_spec
+from dlkf.onboard.compiled_filter import compiled_filter
 from dlkf.provenance import provenance
 from dlkf.report.navigation import Course, answers, write_page
 from dlkf.running.exports import chosen, export, utc_times
@@ -55,15 +56,13 @@ def main(cfg: DictConfig) -> None:
     if config["streaming"]:
         if config["smoother"] is not None or spec.name == AUTO:
             raise InputError("smoother and imu=auto look ahead, a stream cannot: leave out streaming, or both of them")
+        if config["compiled"]:
+            model = compiled_filter(model, grid["rate_hz"], grid["epoch_s"])
         navigated = partial(stream_drives, config["dataset"], model, align=align, skipped=skipped, **grid)
     else:
         with counting("Loading drives") as progress:
             drives = load_dataset(
-                config["dataset"],
-                dtype=torch.float64,
-                reference=False,
-                progress=progress,
-                **grid,
+                config["dataset"], dtype=torch.float64, reference=False, progress=progress, **grid
             )
         if spec.name == AUTO:
             with counting("Finding the noise") as progress:
@@ -73,6 +72,8 @@ def main(cfg: DictConfig) -> None:
             spec, tuning = found.imu, asdict(found.tuning)
         if config["smoother"] is not None:
             model = smoothed(model, config["smoother"])
+        if config["compiled"]:
+            model = compiled_filter(model, grid["rate_hz"], grid["epoch_s"])
         navigated = partial(navigate_drives, drives, model, align=align, skipped=skipped)
     lines, courses = [], []
     with staged(config["out"]) as folder, counting("Navigating") as progress:

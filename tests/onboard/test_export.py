@@ -170,6 +170,8 @@ def test_it_is_made_once_and_can_be_put_away(exported, tmp_path, monkeypatch):
 def test_what_does_not_fit_is_told(compiled, drive, monkeypatch, tmp_path):
     with pytest.raises(InputError, match="compiled for 50 samples"):
         compiled.begin(aligned_drives([drive_with(drive, 25)], ALIGN))
+    with pytest.raises(InputError, match="smoothed"):
+        compiled_filter.compiled_filter(build_filter("mbkf15_rts", IMU), 50.0, 1.0)
     monkeypatch.setattr("dlkf.onboard.library.compiler", lambda: None)
     with pytest.raises(InputError, match="no C compiler"):
         build(tmp_path)

@@ -103,19 +103,16 @@ class Estimator(Protocol):
         ...
 
 
-@runtime_checkable
-class WholeLoop(Protocol):
+class WholeLoop:
     """An estimator that runs the loop itself, because it was compiled with it (:mod:`dlkf.onboard`)."""
 
-    def advance(
-        self, memory: Any, imu: Tensor, fix: Fix, frame: TangentFrame
-    ) -> tuple[Any, Step]:
+    def advance(self, memory: Any, imu: Tensor, fix: Fix, frame: TangentFrame) -> tuple[Any, Step]:
         """What :func:`advance` gives; state and error are in its memory."""
-        ...
+        raise NotImplementedError
 
     def integrate(self, batch: Batch) -> Solution:
         """What :func:`integrate` gives."""
-        ...
+        raise NotImplementedError
 
 
 class Step(NamedTuple):

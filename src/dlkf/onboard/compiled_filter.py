@@ -22,7 +22,8 @@ from torch import Tensor, nn
 import dlkf
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
-from dlkf.filters.integration import Correction, Estimator, Fix, Solution, Step
+from dlkf.filters.integration import Correction, Estimator, Fix, Solution, Step, WholeLoop
+from dlkf.filters.smoother import Smoothed
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import NavState
@@ -47,7 +48,7 @@ class FixedVector(NamedTuple):
     filter: CompiledFilter
 
 
-class CompiledFilter:
+class CompiledFilter(WholeLoop):
     """An :class:`dlkf.filters.integration.Estimator` that runs the loop itself; :func:`compiled_filter` makes one."""
 
     def __init__(self, estimator: Estimator, grid: Grid, layout: Layout, library: Library) -> None:
@@ -126,11 +127,13 @@ def _(memory: Vector, change: FrameChange, fresh: Vector) -> Vector:
     return memory._replace(numbers=f.layout.pack(x))
 
 
-def compiled_filter(estimator: Estimator, rate_hz: float, epoch_s: float) -> CompiledFilter:
+def compiled_filter(estimator: Estimator | Smoothed, rate_hz: float, epoch_s: float) -> CompiledFilter:
     """A filter compiled for a grid; from the cache where it has been made before.
 
-    Raises InputError where there is no C compiler, or the filter cannot be exported.
+    Raises InputError where there is no C compiler, or the filter is smoothed or cannot be exported.
     """
+    if isinstance(estimator, Smoothed):
+        raise InputError("a smoothed filter runs in torch, which keeps its covariances; leave compiled=true out")
     grid = Grid(round(rate_hz * epoch_s), 1 / rate_hz)
     folder = _cache() / _digest(estimator, grid)
     if not (folder / LIBRARY).is_file():
