@@ -152,6 +152,8 @@ def pitch_witnesses(tables: DriveTables, drive: Drive, bias: Sequence[float], fi
         if driving[k].mean() > 0.8 and yaw_rate[k].max() < 0.15:
             drifts.append((np.polyfit(t[k], (gyro - slope)[k], 1)[0], np.polyfit(t[k], (gyro - level)[k], 1)[0],
                            shake[k].mean()))  # fmt: skip
+    if not drifts:
+        return f"no {GROUP_S:g} s of driving straight on: nothing to tell the witnesses of pitch apart by"
     a, b, c = np.array(drifts).T
     calm = c < np.median(c)
     density = math.sqrt(5 / 6 * GROUP_S)  # a line through white noise of density √S has slopes of √S / density

@@ -44,3 +44,25 @@ def test_a_log_at_rest_and_the_motion_of_cars(town, tmp_path, monkeypatch, capsy
     assert (tmp_path / "bench" / "drives.parquet").is_file()
     assert started("car_motion", monkeypatch, town) == 0
     assert town.name in capsys.readouterr().out
+
+
+QUICK = {  # a study: its arguments beside the dataset, and what it says or leaves
+    "attitude_reference": (["{town}", "--imu", "consumer"], "yaw"),
+    "drive_pictures": (["{town}", "--out", "{tmp}/pictures"], "png"),
+    "fleet_realism": (["{town}", "{town}"], "|"),
+    "real_diagnosis": (["{town}", "--imu", "consumer"], "no 5 s of driving"),
+    "start_up": (["{town}"], "town"),
+    "coning_sculling": ([], "|"),
+    "satellite_sky": (["--accuracy", "20"], "χ² of position"),
+    "simulation_report": (["--hours", "0.05", "--seeds", "1", "--profiles", "city"], "| city |"),
+    "streaming": (["road", "--hours", "0.02", "--model", "mbkf15"], "good: 64 epochs"),
+}
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_a_study_runs_on_a_small_world(name, town, tmp_path, monkeypatch, capsys):
+    arguments, said = QUICK[name]
+    monkeypatch.chdir(tmp_path)
+    places = {"town": town, "tmp": tmp_path}
+    assert started(name, monkeypatch, *(a.format(**places) for a in arguments)) == 0
+    assert said in capsys.readouterr().out
