@@ -1,17 +1,22 @@
 """Speed, all from one run: ``make bench`` or ``python -m pipelines.studies.benchmark [--threads 2] [--hours 8]``.
 
-Windowed strapdown against a loop over samples, Kalman filters for one drive and for 64, one training epoch.
-The other half of the comparison, python-ins on the same files, is ``pipelines/studies/parity.py``.
+Windowed strapdown against a loop over samples, Kalman filters for one drive and for 64, training epochs of the learned
+filters, and how cost goes with drives, length and batch. Prints a table with bars and writes ``outputs/bench.json``:
+median and least of the repeats of every figure, the machine and the commit. The other half of the comparison,
+python-ins on the same files, is ``pipelines/studies/parity.py``.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
 import platform
 import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import torch
@@ -25,26 +30,97 @@ from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.drive import Batch
 from dlkf.data.segments import StartLaw, cut_pieces, make_batch
 from dlkf.data.store import load_dataset
+from dlkf.files import staged
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
-from dlkf.filters.learned import LearnedConfig, LearnedFilter
+from dlkf.filters.saved import learned_filter, learned_settings
 from dlkf.navigation.attitude import rotation_from_vector
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.navigation.strapdown import strapdown
+from dlkf.provenance import provenance
 from dlkf.simulation.dataset import simulate_from_config
 from dlkf.training.callbacks.masking import GnssDecimation, OutageInjection
 from dlkf.training.loss import TERMS, LossConfig, pva_losses, weighted
 
+KALMAN = ("mbkf15", "mbkf21", "mbkf21_nhc")
+LEARNED = ("dlkf_literal", "dlkf", "plus")
+BAR = 24
 
-def seconds(work: Callable[[], object], repeats: int = 5) -> float:
-    """Median wall time of a call after one warm-up."""
-    work()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
+
+@dataclass
+class Figure:
+    """A work's times by its repeats; with ``units`` what is told is units a second."""
+
+    group: str
+    work: str
+    seconds: list[float]
+    units: float = 0.0  # of work in a repeat, for a rate
+
+    @property
+    def median(self) -> float:
+        """Seconds, or units a second."""
+        middle = statistics.median(self.seconds)
+        return self.units / middle if self.units else middle
+
+    @property
+    def best(self) -> float:
+        """Of the least time."""
+        return self.units / min(self.seconds) if self.units else min(self.seconds)
+
+    def text(self, x: float) -> str:
+        """With its unit."""
+        return f"{x:,.0f} /s" if self.units else f"{x:.3f} s"
+
+
+@dataclass
+class Bench:
+    """Figures of a run."""
+
+    figures: list[Figure] = field(default_factory=list)
+
+    def time(self, group: str, work: str, call: Callable[[], object], repeats: int = 5, units: float = 0.0) -> Figure:
+        """Wall times of a call after one warm-up."""
+        call()
+        times = []
+        for _ in range(repeats):
+            start = time.perf_counter()
+            call()
+            times.append(time.perf_counter() - start)
+        self.figures.append(Figure(group, work, times, units))
+        return self.figures[-1]
+
+    def table(self, title: str) -> Table:
+        """Median, best and a bar against the largest of the group."""
+        table = Table("work", "median", "best", "", title=title)
+        for group in dict.fromkeys(f.group for f in self.figures):
+            rows = [f for f in self.figures if f.group == group]
+            table.add_section()
+            for f in rows:
+                bar = "█" * max(1, round(BAR * f.median / max(r.median for r in rows)))
+                table.add_row(f"{group}: {f.work}", f.text(f.median), f.text(f.best), bar)
+        return table
+
+    def write(self, folder: Path, machine: dict) -> None:
+        """``bench.json``, whole or not at all."""
+        rows = [asdict(f) | {"median": f.median, "best": f.best} for f in self.figures]
+        with staged(folder) as beside:
+            text = json.dumps({"machine": machine, **provenance(), "figures": rows}, indent=1)
+            (beside / "bench.json").write_text(text, encoding="utf-8")
+
+
+def machine(threads: int) -> dict:
+    """What the figures depend on."""
+    info = Path("/proc/cpuinfo")
+    models = [line for line in info.read_text().splitlines() if line.startswith("model name")] if info.is_file() else []
+    return {
+        "processor": models[0].partition(":")[2].strip() if models else platform.processor(),
+        "cores": os.cpu_count(),
+        "load_1_min": round(os.getloadavg()[0], 1),
+        "threads": threads,
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+        "system": platform.platform(),
+    }
 
 
 def sample_loop(batch: Batch) -> torch.Tensor:
@@ -74,29 +150,36 @@ def windows(batch: Batch) -> torch.Tensor:
     return state.p_n.detach()
 
 
-def filters(table: Table, dataset: Path, imu: ImuSpec) -> None:
-    """Rows for the Kalman filters over drives at the file's own 100 Hz, one and 64 at a time, and for one online."""
+def filters(bench: Bench, dataset: Path, imu: ImuSpec) -> None:
+    """The Kalman filters over drives at the file's own 100 Hz, and what drives and length cost."""
     drives = load_dataset(dataset, rate_hz=100, dtype=torch.float64, reference=True)
-    length = 300.0
-    pieces = (cut_pieces(drives, length) * 8)[:64]
-    for name in ("mbkf15", "mbkf21", "mbkf21_nhc"):
-        estimator, rates = build_filter(name, imu), {}
-        for n in (1, 64):
-            batch = make_batch(drives, pieces[:n], dtype=torch.float64)
-            with torch.inference_mode():
-                took = seconds(lambda batch=batch, estimator=estimator: integrate(batch, estimator), 3)
-            rates[n] = n * batch.size[1] * batch.size[2] / took
-            table.add_row(f"{name}, {n} drive{'s' * (n > 1)}, 100 Hz", f"{rates[n]:,.0f} IMU epochs/s")
-        table.add_row(f"{name}, 64 drives at once against one", f"{rates[64] / rates[1]:.1f} ×")
+    pieces = (cut_pieces(drives, 300.0) * 8)[:64]
+
+    def run(group: str, name: str, count: int, chosen: list) -> None:
+        batch, estimator = make_batch(drives, chosen[:count], dtype=torch.float64), build_filter(name, imu)
+        with torch.inference_mode():
+            samples = count * batch.size[1] * batch.size[2]
+            what = f"{name}, {count} drive{'s' * (count > 1)} of {batch.size[1] * batch.epoch_s:g} s"
+            bench.time(group, what, lambda: integrate(batch, estimator), 3, samples)
+
+    for name in KALMAN:
+        for count in (1, 64):
+            run("filter, IMU epochs", name, count, pieces)
+    for count in (1, 4, 16, 64):
+        run("over drives, IMU epochs", "mbkf15", count, pieces)
+    for length in (75.0, 150.0, 300.0):
+        run("over length, IMU epochs", "mbkf15", 8, cut_pieces(drives, length) * 8)
 
 
-def training_epoch(data: DriveDataModule, model: LearnedFilter) -> tuple[float, int]:
-    """Seconds and steps of one epoch with decimation, outages, backward pass and optimiser."""
+def training_epoch(data: DriveDataModule, name: str, steps: int | None = None) -> None:
+    """An epoch with decimation, outages, backward pass and optimiser, or so many steps of it."""
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        settings = OmegaConf.to_container(compose("train", overrides=[f"filter@model={name}"]), resolve=False)["model"]
+    torch.manual_seed(0)
+    model = learned_filter(learned_settings(settings)).train()
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4)
     transforms = (GnssDecimation(), OutageInjection(start_epoch=0))
-    steps = len(data.train_pieces(1))
-    start = time.perf_counter()
-    for step in range(steps):
+    for step in range(steps or len(data.train_pieces(1))):
         batch = data.train_batch(1, step)
         generator = torch.Generator().manual_seed(step)
         for transform in transforms:
@@ -106,41 +189,59 @@ def training_epoch(data: DriveDataModule, model: LearnedFilter) -> tuple[float, 
         weighted(losses, dict.fromkeys(TERMS, 1.0)).backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimizer.step()
-    return time.perf_counter() - start, steps
+
+
+def training(bench: Bench, folder: str, hours: float) -> None:
+    """Epochs of the learned filters, and what the batch costs."""
+    data = DriveDataModule([folder], fractions=(1.0, 0.0, 0.0), batch_size=50)
+    data.setup()
+    for name in LEARNED:
+        work = f"{name}, {hours:g} h, batch 50, {len(data.train_pieces(1))} steps"
+        bench.time("training epoch", work, lambda name=name: training_epoch(data, name), 2)
+    for size in (10, 25, 50, 100):
+        data.batch_size, data._latest = size, (-1, -1, [])
+        if len(data.train_pieces(1)[0]) == size:
+            work = f"dlkf_literal, batch {size}, pieces"
+            bench.time("over batch", work, lambda: training_epoch(data, "dlkf_literal", 1), 3, size)
+
+
+def mechanisation(bench: Bench, folder: str) -> float:
+    """Windows against the loop over samples, forward and backward; returns how far apart they end [m]."""
+    drives = load_dataset(folder, dtype=torch.float64)
+    pieces = cut_pieces(drives, 60.0)[:50]
+    what = f"{len(pieces)} × 60 s × 50 Hz, forward + backward"
+    batch, single = (
+        make_batch(drives, pieces, dtype=dtype, start=StartLaw(0.0, 0.0, 0.0, 0.0))
+        for dtype in (torch.float64, torch.float32)
+    )
+    bench.time("strapdown", f"sample loop, {what}, float64", lambda: sample_loop(batch), 1)
+    bench.time("strapdown", f"windows, {what}, float64", lambda: windows(batch))
+    bench.time("strapdown", f"windows, {what}, float32", lambda: windows(single))
+    return float((windows(batch) - sample_loop(batch)).norm(dim=-1).max())
 
 
 def main() -> None:
-    """Simulate, measure, print."""
+    """Simulate, measure, print, write."""
     arguments = argparse.ArgumentParser(description=__doc__)
     arguments.add_argument("--threads", type=int, default=2)
     arguments.add_argument("--hours", type=float, default=8.0)
+    arguments.add_argument("--out", type=Path, default=Path("outputs"))
     options = arguments.parse_args()
     torch.set_num_threads(options.threads)
     with initialize_config_dir(str(config_dir()), version_base="1.3"):
         preset = compose("simulate", overrides=["simulated@dataset=one_imu", f"dataset.hours={options.hours}"])
     config = OmegaConf.to_container(preset, resolve=True)
-    table = Table("work", "figure", title=f"{platform.machine()}, {options.threads} threads, torch {torch.__version__}")
+    bench, described = Bench(), machine(options.threads)
     with tempfile.TemporaryDirectory() as folder:
         simulate_from_config(config, Path(folder) / "drives")
-        data = DriveDataModule([f"{folder}/drives"], fractions=(1.0, 0.0, 0.0), batch_size=50)
-        data.setup()
-        pieces = cut_pieces(data.stack, 60.0)[:64]
-        exact = StartLaw(0.0, 0.0, 0.0, 0.0)
-        batch = make_batch(data.stack, pieces[:50], dtype=torch.float64, start=exact)
-        apart = (windows(batch) - sample_loop(batch)).norm(dim=-1).max()
-        slow, fast = seconds(lambda: sample_loop(batch), 1), seconds(lambda: windows(batch))
-        what = "50 × 60 s × 50 Hz, forward + backward"
-        table.add_row(f"sample loop, {what}, float64", f"{slow:.2f} s")
-        table.add_row(f"windowed strapdown, {what}, float64", f"{fast:.3f} s ({slow / fast:.1f} × faster)")
-        table.add_row("largest difference of the two after 60 s", f"{apart:.1e} m")
-        single = make_batch(data.stack, pieces[:50], dtype=torch.float32, start=exact)
-        table.add_row(f"windowed strapdown, {what}, float32", f"{seconds(lambda: windows(single)):.3f} s")
-        filters(table, Path(folder) / "drives", imu_spec(config["imu"]))
-        model = LearnedFilter(LearnedConfig()).train()
-        training_epoch(data, model)
-        took, steps = training_epoch(data, model)
-        table.add_row(f"training epoch, {options.hours:g} h, batch 50 ({steps} steps), literal dlkf", f"{took:.1f} s")
-    Console(width=110).print(table)
+        apart = mechanisation(bench, f"{folder}/drives")
+        filters(bench, Path(folder) / "drives", imu_spec(config["imu"]))
+        training(bench, f"{folder}/drives", options.hours)
+    console = Console(width=140)
+    console.print(bench.table(f"{described['processor']}, {options.threads} threads, torch {torch.__version__}"))
+    console.print(f"loop and windows end {apart:.1e} m apart after 60 s: the loop is first order")
+    bench.write(options.out, described)
+    console.print(f"{options.out}/bench.json")
 
 
 if __name__ == "__main__":

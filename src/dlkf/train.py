@@ -16,7 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from dlkf.command import command
+from dlkf.command import command, same_command
 from dlkf.config import config_dir
 from dlkf.data.store import dataset_digest
 from dlkf.errors import InputError
@@ -24,9 +24,10 @@ from dlkf.evaluation.table import all_tables, as_rich
 from dlkf.tracking.grid import PARENT_RUN, run_name
 from dlkf.tracking.registry import check_registration, log_model
 from dlkf.tracking.runs import lightning_logger, start_run, tracking_uri
+from dlkf.training.processes import is_further
 from dlkf.training.run_folder import checked_digests, run_folder, write_state
 from dlkf.training.settings import study_settings
-from dlkf.training.study import load_data, run_study
+from dlkf.training.study import load_data, run_study, train_along
 from dlkf.training.summary import key_metrics, note
 
 
@@ -37,6 +38,9 @@ def main(cfg: DictConfig) -> None:
     console = Console(width=None if sys.stdout.isatty() else 110)
     check_registration(config["tracking"]["register"], config["tracking"]["alias"])
     settings = study_settings(config)
+    if is_further():
+        train_along(settings, load_data(config["data"], lambda _: None), run_folder(config)[0])
+        return
     make_missing(config, console)
     data = load_data(config["data"], console.print)
     folder, state = run_folder(config)
@@ -52,7 +56,7 @@ def main(cfg: DictConfig) -> None:
         run.log_config(config)
         for dataset in data.datasets:
             run.log_dataset(dataset, dataset_digest(dataset), "training")
-        outcome = run_study(settings, data, folder, lightning_logger(run), console.print)
+        outcome = run_study(settings, data, folder, lightning_logger(run), console.print, same_command("train"))
         for table in (*all_tables(", ".join(Path(d).name for d in data.datasets), outcome.results), *outcome.tables):
             console.print(as_rich(table))
         metrics = key_metrics(outcome)

@@ -100,9 +100,20 @@ def test_batches_depend_on_seed_epoch_and_step_alone(town):
         x, y = a.train_batch(epoch, step), b.train_batch(epoch, step)
         assert torch.equal(x.imu, y.imu) and torch.equal(x.start.C_nb, y.start.C_nb) and x.drive == y.drive
     assert not torch.equal(a.train_batch(0, 2).imu, _module(town, seed=1).train_batch(0, 2).imu)
-    whole = a.train_batch(1, 0)
-    shares = [a.train_batch(1, 0, (k, 2)) for k in range(2)]
-    assert torch.equal(torch.stack([s.imu for s in shares], 1).flatten(0, 1), whole.imu)
+
+
+@pytest.mark.parametrize("processes", [2, 3])
+def test_processes_share_the_scoring_pieces(town, processes):
+    """Every piece once, in as many batches for every process: they wait for each other after each."""
+    data = _module(town, eval_stride_s=10)
+    shares = [data.batches("test", share=(k, processes)) for k in range(processes)]
+    assert len({len(batches) for batches in shares}) == 1
+    seen = [(d, float(t)) for batches in shares for b in batches for d, t in zip(b.drive, b.t_start)]
+    whole = [(d, float(t)) for b in data.batches("test") for d, t in zip(b.drive, b.t_start)]
+    assert sorted(seen) == sorted(whole)
+    assert max(b.size[0] for b in shares[0]) <= data.batch_size + 1
+    with pytest.raises(InputError, match="processes; give trainer"):
+        data.batches("test", share=(0, 1000))
 
 
 def test_scoring_batches_are_fixed(town):

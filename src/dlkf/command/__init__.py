@@ -91,6 +91,14 @@ def command(
     return decorate
 
 
+def same_command(name: str) -> list[str]:
+    """The command line that composes once more what Hydra composed here, for a point of a sweep too."""
+    config = HydraConfig.get()
+    folders = [s.path for s in config.runtime.config_sources if s.provider == "command-line"]
+    given = [word for folder in folders for word in ("--config-dir", folder)]
+    return [sys.executable, "-m", f"dlkf.{name}", *given, *config.overrides.task]
+
+
 def _end(error: BaseException) -> NoReturn:
     """One line and an exit code for a stop, a mistake, or a fault of the machine; a fault of ours goes on up.
 

@@ -39,7 +39,7 @@ class DriveDataModule(L.LightningDataModule):
     Training: in every epoch pieces of ``length_s`` (or ``length_law(epoch)`` where a curriculum sets
     that attribute) start at random, spread evenly over the training drives, with a start error drawn from
     ``start``. Batches depend on (seed, epoch, step) alone, so a resumed run sees what an uninterrupted one
-    sees; with several processes each takes its share of every batch. Validation and test pieces of
+    sees; with several processes each makes the whole batch. Validation and test pieces of
     ``eval_length_s`` every ``eval_stride_s`` have start errors drawn from ``eval_seed``, each piece its own, so that
     they are the same for every ``seed`` and ``batch_size``; ``eval_outage`` withholds GNSS
     there. Lengths that change need ``Trainer(reload_dataloaders_every_n_epochs=1)``.
@@ -146,8 +146,8 @@ class DriveDataModule(L.LightningDataModule):
         self._latest = (epoch, length, batches)
         return batches
 
-    def train_batch(self, epoch: int, step: int, share: tuple[int, int] = (0, 1)) -> Batch:
-        """The batch of a training step; ``share`` = (k, n) gives every n-th piece from k on."""
+    def train_batch(self, epoch: int, step: int) -> Batch:
+        """The batch of a training step."""
         generator = torch.Generator().manual_seed(_seed(self.seed, epoch, step))
         pieces = self.train_pieces(epoch)[step]
         batch = make_batch(self.stack, pieces, dtype=self.dtype, start=self.start, generator=generator)
@@ -156,8 +156,7 @@ class DriveDataModule(L.LightningDataModule):
         if self.injected_bias is not None:
             noise = torch.randn(batch.size[0], 6, generator=generator, dtype=torch.float64)
             batch = with_bias(batch, self.injected_bias.std * noise)
-        k, n = share
-        return batch if n == 1 else batch.select(torch.arange(k, len(pieces) // n * n, n))
+        return batch
 
     def pieces(self, side: str) -> list[Piece]:
         """The fixed pieces of a side, for scoring."""
@@ -176,11 +175,19 @@ class DriveDataModule(L.LightningDataModule):
             )
         return pieces
 
-    def batches(self, side: str, *, dtype: torch.dtype | None = None) -> list[Batch]:
-        """The fixed batches of a side, with the same start errors for every filter and in every run."""
-        pieces, out = self.pieces(side), []
-        for k in range(0, len(pieces), self.batch_size):
-            part = pieces[k : k + self.batch_size]
+    def batches(
+        self, side: str, *, dtype: torch.dtype | None = None, share: tuple[int, int] = (0, 1)
+    ) -> list[Batch]:
+        """The fixed batches of a side, with the same start errors for every filter and in every run.
+
+        ``share`` = (k, n) takes every n-th piece from k on, in as many batches for every k.
+        """
+        (k, n), pieces, out = share, self.pieces(side), []
+        if len(pieces) < n:
+            raise InputError(f"{len(pieces)} {side} pieces for {n} processes; give trainer.devices={len(pieces)}")
+        starts = range(0, len(pieces) - n + 1, n * self.batch_size)
+        for first, last in zip(starts, [*starts[1:], len(pieces)]):
+            part = pieces[first:last][k::n]
             batch = make_batch(self.stack, part, dtype=dtype or self.dtype, start=self.start, seed=self.eval_seed)
             if self.eval_outage is not None:
                 batch = withhold(batch, within(batch, self.eval_outage.first_s, self.eval_outage.duration_s))
@@ -200,7 +207,7 @@ class DriveDataModule(L.LightningDataModule):
         return self._fixed("test")
 
     def _fixed(self, side: str) -> FixedBatches:
-        return FixedBatches(self.batches(side)[self._rank :: self._world])
+        return FixedBatches(self.batches(side, share=(self._rank, self._world)))
 
     def summary(self) -> list[dict[str, Any]]:
         """Per side: drives, groups, minutes of driving, and pieces for scoring."""
@@ -267,10 +274,9 @@ class TrainBatches:
         if self._resume is not None and self._resume[0] == epoch:
             self.step = self._resume[1]
         self._resume = None
-        share = (self.module._rank, self.module._world)
         while self.step < self._steps(epoch):
             self.step += 1
-            yield self.module.train_batch(epoch, self.step - 1, share)
+            yield self.module.train_batch(epoch, self.step - 1)
 
     def state_dict(self) -> dict[str, int]:
         """Epoch and number of batches given out."""

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
-from typing import no_type_check
+from typing import Any, no_type_check
 
 import numpy as np
 import torch
@@ -42,7 +42,7 @@ if AVAILABLE:
     from numba import njit
 else:
 
-    def njit(**_):
+    def njit(**_) -> Any:
         """Leaves the function as it is; :func:`fits` keeps it from being called."""
         return lambda function: function
 
@@ -75,6 +75,13 @@ def rotations(phi: Tensor) -> Tensor:
     return out
 
 
+def rotation_vectors(C: Tensor) -> Tensor:
+    """log(C) of rotation matrices (…, 3, 3)."""
+    out = C.new_empty(C.shape[:-1])
+    _rotation_vectors(C.reshape(-1, 3, 3).numpy(), out.view(-1, 3).numpy())
+    return out
+
+
 def gravity(
     p_n: Tensor, stretching: Tensor, centre: Tensor, axis: Tensor, shape: Tensor, constants: tuple[float, ...]
 ) -> Tensor:
@@ -103,6 +110,32 @@ def _rotation(x, y, z, R):
 def _rotations(phi, out):
     for b in range(len(phi)):
         _rotation(phi[b, 0], phi[b, 1], phi[b, 2], out[b])
+
+
+@njit(cache=True)
+@no_type_check
+def _rotation_vectors(C, out):
+    q = np.empty(4)
+    for b in range(len(C)):
+        R = C[b]
+        trace = R[0, 0] + R[1, 1] + R[2, 2]
+        i = 0
+        for j in range(1, 3):
+            if R[j, j] > R[i, i]:
+                i = j
+        # unit quaternion from the largest of its four elements (Shepperd 1978)
+        if trace >= R[i, i]:
+            q[0], q[1], q[2], q[3] = 1 + trace, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+        else:
+            j, k = (i + 1) % 3, (i + 2) % 3
+            q[0], q[1 + i] = R[k, j] - R[j, k], 1 + 2 * R[i, i] - trace
+            q[1 + j], q[1 + k] = R[j, i] + R[i, j], R[k, i] + R[i, k]
+        norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+        sign = -1.0 if q[0] < 0 else 1.0
+        w, s = abs(q[0]) / norm, math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3]) / norm
+        scale = 2 / w * (1 - s * s / (3 * w * w)) if s < 1e-4 else 2 * math.atan2(s, w) / s
+        for j in range(3):
+            out[b, j] = sign * scale * q[1 + j] / norm
 
 
 @njit(cache=True)

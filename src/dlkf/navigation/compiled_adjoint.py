@@ -16,19 +16,17 @@ from dlkf.navigation.compiled import _rotation, njit
 
 def adjoint(
     C0: Tensor, imu: Tensor, dt: float, gradient: Tensor, earth_rate: Tensor,
-    Gp: Tensor, Gv: Tensor, GC: Tensor | None,
+    Gp: Tensor, Gv: Tensor, GC: Tensor, attitude_from: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients in p₀, v₀ (B, 3), C₀ (B, 3, 3) and the samples (B, M, 6).
 
-    From those in position, velocity (B, M, 3) and attitude (B, M, 3, 3; None: zero) at the end of every sample;
-    ``gradient`` (B, 3) is the diagonal of gravity's [1/s²].
+    From those in position, velocity (B, M, 3) and attitude (B, M, 3, 3) at the end of every sample, of attitude zero
+    before sample ``attitude_from``; ``gradient`` (B, 3) is the diagonal of gravity's [1/s²].
     """
     B = len(imu)
     p0, v0, turn, samples = imu.new_empty(B, 3), imu.new_empty(B, 3), imu.new_empty(B, 3), imu.new_empty(imu.shape)
-    attitude = GC is not None
-    inputs = (C0, imu, gradient.expand(B, 3), earth_rate, Gp, Gv, GC if attitude else C0.new_empty(0, 0, 3, 3))
-    arrays = (x.detach().contiguous().numpy() for x in inputs)
-    _adjoint(*arrays, attitude, dt, p0.numpy(), v0.numpy(), turn.numpy(), samples.numpy())
+    arrays = (x.detach().contiguous().numpy() for x in (C0, imu, gradient.expand(B, 3), earth_rate, Gp, Gv, GC))
+    _adjoint(*arrays, attitude_from, dt, p0.numpy(), v0.numpy(), turn.numpy(), samples.numpy())
     return p0, v0, turn, samples
 
 
@@ -47,13 +45,13 @@ def _rotate_back(C, u, out):
 
 @njit(cache=True)
 @no_type_check
-def _adjoint(C0, imu, gradient, w, Gp, Gv, GC, attitude, dt, grad_p0, grad_v0, turn, grad_imu):
+def _adjoint(C0, imu, gradient, w, Gp, Gv, GC, attitude_from, dt, grad_p0, grad_v0, turn, grad_imu):
     B, M, _ = imu.shape
     A = np.empty((M + 1, 3, 3), imu.dtype)  # C₀ R before the first sample and at the end of each
     gained, moved = np.empty((M, 3), imu.dtype), np.empty((M, 3), imu.dtype)
-    R, Ge = np.empty((3, 3), imu.dtype), np.empty((3, 3), imu.dtype)
-    vectors = np.empty((17, 3), imu.dtype)
-    phi, dv, c1, c2, Hv, Hp, at_end, r1, r2, e1, e2, twist, spin, spin2, a1, a2, a3 = vectors
+    R = np.empty((3, 3), imu.dtype)
+    vectors = np.empty((16, 3), imu.dtype)
+    phi, dv, c1, c2, Hv, Hp, r1, r2, e1, e2, twist, spin, spin2, a1, a2, a3 = vectors
     for b in range(B):
         A[0] = C0[b]
         for k in range(M):
@@ -82,22 +80,21 @@ def _adjoint(C0, imu, gradient, w, Gp, Gv, GC, attitude, dt, grad_p0, grad_v0, t
                 V[i] += gv + t * Hv[i] + dt * U[i]  # U of the samples after this one
                 U[i] += gp + Hv[i] + t * Hp[i]
             # what a turn at the sample's end is worth, and with the sample's own part one at its start
-            at_end[:] = 0
-            if attitude:
+            if k >= attitude_from:
                 for j in range(3):
                     _cross(w[b], GC[b, k, :, j], a1)
                     for i in range(3):
-                        Ge[i, j] = GC[b, k, i, j] + t * a1[i]
-                    _cross(A[k + 1, :, j], Ge[:, j], a2)
-                    at_end += a2
-            T += at_end
+                        a1[i] = GC[b, k, i, j] + t * a1[i]
+                    _cross(A[k + 1, :, j], a1, a2)
+                    for i in range(3):
+                        T[i] += a2[i]
             _rotate_back(A[k], V, r1)
             _rotate_back(A[k], U, r2)
             _rotate_back(A[k + 1], T, twist)
             _cross(gained[k], V, a1)
             _cross(moved[k], U, a2)
-            T += a1 + a2
             for i in range(3):
+                T[i] += a1[i] + a2[i]
                 phi[i] = imu[b, k, 3 + i] * dt
                 r1[i], r2[i] = r1[i] * dt, r2[i] * dt * dt
                 e1[i], e2[i] = r1[i] / 2 + r2[i] / 6, r1[i] / 6 + r2[i] / 24

@@ -189,9 +189,10 @@ class _CompiledStrapdown(torch.autograd.Function):
         C0, imu, gradient, earth_rate = ctx.saved_tensors
         vectors = imu[..., :3]
         Gp, Gv = _ended(Gp, gp, vectors), _ended(Gv, gv, vectors)
-        if GC is not None or gC is not None:
-            GC = _ended(GC, gC, C0.unsqueeze(1).expand(-1, imu.shape[1], 3, 3))
-        p0, v0, turn, samples = compiled_adjoint.adjoint(C0, imu, ctx.dt, gradient, earth_rate, Gp, Gv, GC)
+        M = imu.shape[1]
+        first = 0 if GC is not None else M - 1
+        GC = _ended(GC, gC, C0.unsqueeze(1).expand(-1, M, 3, 3))
+        p0, v0, turn, samples = compiled_adjoint.adjoint(C0, imu, ctx.dt, gradient, earth_rate, Gp, Gv, GC, first)
         return p0, v0, 0.5 * skew(turn) @ C0, samples, None, None, None, None
 
 

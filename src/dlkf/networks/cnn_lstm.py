@@ -142,7 +142,7 @@ class CnnLstm(nn.Module):
             y = self._collected.linear(layer, y) if isinstance(layer, nn.Linear) and _learning(layer) else layer(y)
         return y, tuple(torch.stack(x) for x in zip(*after))
 
-    def _recur(self, cell: nn.Module, y: Tensor, old: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    def _recur(self, cell: Any, y: Tensor, old: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
         """A cell's memory after an epoch, its output first."""
         if isinstance(cell, nn.GRUCell):
             return (cell(y, old[0]),)

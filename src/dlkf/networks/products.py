@@ -46,7 +46,7 @@ class EpochLayers:
             self._products[layer] = EpochProduct(layer.weight, layer.bias)
         return self._products[layer](x)
 
-    def lstm(self, cell: nn.LSTMCell, x: Float[Tensor, "B K"], memory: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    def lstm(self, cell: nn.LSTMCell, x: Float[Tensor, "B K"], memory: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         """h and c after an epoch: all gates in one product of (x, h) (Hochreiter and Schmidhuber 1997)."""
         if cell not in self._products:
             both = torch.cat((cell.weight_ih, cell.weight_hh), 1)

@@ -11,6 +11,8 @@ from typing import Any
 
 import lightning as L
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.plugins.environments import LightningEnvironment
+from lightning.pytorch.strategies import DDPStrategy
 
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.errors import InputError
@@ -19,6 +21,7 @@ from dlkf.filters.shipped import trained_filter
 from dlkf.training.callbacks.checkpoints import BEST, LAST, BestWeights, ResumePoint
 from dlkf.training.callbacks.progress import TrainingProgress
 from dlkf.training.module import FilterTraining
+from dlkf.training.processes import is_further, join, joined_by
 from dlkf.training.settings import FitSettings
 from dlkf.training.warm_start import warm_start
 
@@ -31,8 +34,11 @@ def fit(
     *,
     mean_imu_error: Sequence[float] | None = None,
     notes: Mapping[str, Any] | None = None,
+    further: Sequence[str] | None = None,
 ) -> Path:
     """Train, going on from ``folder/last.ckpt`` if it is there; returns the folder of the best weights.
+
+    With ``trainer.devices`` above 1 the command ``further`` is run for every further process; it calls this too.
 
     ``mean_imu_error`` (6) of the training pieces is where a model with ``known_from=training`` starts; ``notes`` are
     stored beside the weights. Raises InputError where no epoch was validated, or none had a finite ``monitor``.
@@ -46,13 +52,15 @@ def fit(
         module.filter = trained_filter(settings.finetune).train()
     elif isinstance(module.filter, LearnedFilter) and not last.is_file():
         warm_start(module.filter, data, mean_imu_error)
-    logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
-    with warnings.catch_warnings():
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    with warnings.catch_warnings(), joined_by(further, plan.devices):
         warnings.filterwarnings("ignore", module="lightning")
         trainer = L.Trainer(
             max_epochs=plan.max_epochs,
             accelerator=plan.accelerator,
-            devices=1,
+            devices=plan.devices,
+            strategy="auto" if plan.devices == 1 else _shared(),
             logger=logger,
             callbacks=[
                 *settings.callbacks,
@@ -69,12 +77,15 @@ def fit(
             enable_model_summary=False,
             default_root_dir=folder,
         )
+        join()
         try:
             trainer.fit(module, datamodule=data, ckpt_path=str(last) if last.is_file() else None)
         except SystemExit as end:  # what Lightning makes of Ctrl-C and SIGTERM
             raise (end.__context__ if isinstance(end.__context__, KeyboardInterrupt) else end) from None
     if trainer.interrupted:
         raise KeyboardInterrupt
+    if is_further():
+        return folder / BEST
     loss = trainer.callback_metrics.get("train/loss")
     if not (folder / BEST).is_dir() and loss is not None and not bool(loss.isfinite()):
         raise InputError(f"the training diverged (its loss is {float(loss)}); give a smaller optimizer.lr")
@@ -88,6 +99,11 @@ def fit(
             f"trainer.best_from_epoch={plan.best_from_epoch} and validate_every={plan.validate_every}"
         )
     return folder / BEST
+
+
+def _shared() -> DDPStrategy:
+    """Gradients averaged over the processes; weights that a batch did not need may miss one."""
+    return DDPStrategy(find_unused_parameters=True, cluster_environment=LightningEnvironment())
 
 
 def _monitor(chosen: str | None, data: DriveDataModule) -> str:

@@ -16,6 +16,7 @@ from dlkf.filters.integration import Solution
 from dlkf.navigation.state import NavState
 from dlkf.settings import settings_from
 from dlkf.training.outage_loss import likelihood_term, outage_term, speed_term
+from dlkf.training.processes import count_per_process
 
 TERMS = ("position", "velocity", "attitude")
 
@@ -77,7 +78,7 @@ def pva_losses(solution: Solution, batch: Batch, config: LossConfig) -> dict[str
               ((config.prior, solution.prior), (config.posterior, solution.posterior)) if w]  # fmt: skip
     for i, (term, scale, mask) in enumerate(zip(TERMS, scales, masks)):
         keep = (mask & batch.present & sound)[..., None]
-        count = (3 * keep.sum()).clamp_min(1)
+        count = count_per_process(3 * keep.sum())
         value = batch.imu.new_zeros(())
         for weight, error in errors:
             e = error[..., 3 * i : 3 * i + 3] / scale

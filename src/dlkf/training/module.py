@@ -16,6 +16,7 @@ from dlkf.filters.saved import LearnedSettings, learned_filter
 from dlkf.networks.heads import IMU_ERROR_SIZE, INNOVATION_SIZE, STATE_SIZE
 from dlkf.training.callbacks.masking import BatchCallback
 from dlkf.training.loss import TERMS, Loss, weighted
+from dlkf.training.processes import of_all
 from dlkf.training.settings import OptimizerSettings, SchedulerSettings
 
 STATE, INNOVATION = torch.tensor(STATE_SIZE), torch.tensor(INNOVATION_SIZE)
@@ -58,16 +59,22 @@ class FilterTraining(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "epoch"}}
 
     def training_step(self, batch: Batch, step: int) -> Tensor:
-        """Masked filter run and weighted loss of one batch."""
-        torch.manual_seed(hash((self.seed, self.global_step)) % 2**63)  # dropout
+        """Masked filter run and weighted loss of one batch, or of this process's pieces of it."""
+        rank, processes = self.trainer.global_rank, self.trainer.world_size
+        torch.manual_seed(hash((self.seed, self.global_step, *([rank] if rank else ()))) % 2**63)  # dropout
         generator = torch.Generator().manual_seed(hash((self.seed, self.current_epoch, step)) % 2**63)
         for callback in self.trainer.callbacks:
             if isinstance(callback, BatchCallback):
                 batch = callback.transform(batch, self.current_epoch, generator)
+        pieces = batch.size[0]
+        if processes > 1:
+            batch = batch.select(torch.arange(rank, pieces, processes))
+        batch = batch.to(self.device)
         losses = self.loss(self._run(batch), batch)
         total = weighted(losses, self.loss_weights)
         values = {f"train/{k}_loss": v.detach() for k, v in losses.items()}
-        self.log_dict({"train/loss": total.detach(), **values}, on_step=False, on_epoch=True, batch_size=batch.size[0])
+        values["train/loss"] = total.detach()
+        self.log_dict(values, on_step=False, on_epoch=True, batch_size=pieces, sync_dist=processes > 1)
         return total
 
     def on_train_epoch_start(self) -> None:
@@ -79,11 +86,16 @@ class FilterTraining(L.LightningModule):
         """How long the epoch took."""
         self.log("time/epoch_s", time.perf_counter() - self._began)
 
+    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
+        """As it is: a step moves it, after what is drawn on the CPU."""
+        return batch
+
     def _run(self, batch: Batch) -> Solution:
         return integrate(batch, self.filter, keep_covariances=self.covariances)
 
     def validation_step(self, batch: Batch, step: int) -> None:
         """Errors at the ends of fixed outages, as they will be scored on test drives, and what the filter answers."""
+        batch = batch.to(self.device)
         solution = self._run(batch)
         self._ends.append(end_errors(batch, solution.posterior))
         used = solution.used.any(-1)
@@ -93,7 +105,8 @@ class FilterTraining(L.LightningModule):
             self._gains.append(solution.gain[torch.arange(len(last)), last][used].double().cpu())
         losses = self.loss(solution, batch)
         plain = weighted(losses, dict.fromkeys(TERMS, 1.0))
-        self.log("val/loss", plain, on_epoch=True, batch_size=batch.size[0])
+        shared = self.trainer.world_size > 1
+        self.log("val/loss", plain, on_epoch=True, batch_size=batch.size[0], sync_dist=shared)
 
     def on_validation_epoch_start(self) -> None:
         """Collect over the validation pieces."""
@@ -105,12 +118,12 @@ class FilterTraining(L.LightningModule):
         ``val/gain_std`` and ``val/imu_error_std`` are relative to the heads' physical sizes: near zero they say that
         the network is a constant, whatever the errors are.
         """
-        ends = np.concatenate(self._ends)
+        ends, gains, errors = np.concatenate(of_all(self._ends)), of_all(self._gains), of_all(self._errors)
         if len(ends):
             self.log("val/outage_end_m", mean_error(ends, "log"))
             self.log("val/outage_end_rms_m", mean_error(ends, "rms"))
-        if self._gains:
-            gain = torch.cat(self._gains).std(0, correction=0) * INNOVATION / STATE[:, None]
+        if gains:
+            gain = torch.cat(gains).std(0, correction=0) * INNOVATION / STATE[:, None]
             self.log("val/gain_std", float(gain.square().mean().sqrt()))
-        error = torch.cat(self._errors).std(0, correction=0) / torch.tensor(IMU_ERROR_SIZE)
+        error = torch.cat(errors).std(0, correction=0) / torch.tensor(IMU_ERROR_SIZE)
         self.log("val/imu_error_std", float(error.square().mean().sqrt()))

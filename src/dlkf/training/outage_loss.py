@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.filters.integration import Solution
+from dlkf.training.processes import count_per_process
 
 FREEDOM = 8.0  # ν
 SMALLEST_VARIANCE = 1e-4  # m²
@@ -53,4 +54,4 @@ def _horizontal(solution: Solution, batch: Batch) -> Float[Tensor, "B T 2"]:
 
 
 def _mean(value: Float[Tensor, "B T"], where: Tensor) -> Tensor:
-    return torch.where(where, value, 0.0).sum() / where.sum().clamp_min(1)
+    return torch.where(where, value, 0.0).sum() / count_per_process(where.sum())

@@ -14,11 +14,14 @@ from dlkf.files import whole_file
 
 STATE = "state.json"
 NOT_HASHED = ("tracking", "resume")
+NOT_HASHED_OF_TRAINER = ("devices", "strategy")  # the same training on more processes
 
 
 def configuration_hash(config: Mapping[str, Any]) -> str:
     """Eight hex digits of everything that decides the weights and the scores."""
     kept = {k: v for k, v in config.items() if k not in NOT_HASHED}
+    if "trainer" in kept:
+        kept["trainer"] = {k: v for k, v in kept["trainer"].items() if k not in NOT_HASHED_OF_TRAINER}
     return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()[:8]
 
 

@@ -18,6 +18,7 @@ from dlkf.settings import check_limits, fitted, settings_from
 from dlkf.training.loss import Loss, loss_of
 
 MANY = 10**9
+STRATEGIES = ("auto", "ddp")
 
 
 @dataclass(frozen=True)
@@ -57,10 +58,14 @@ class TrainerSettings:
     best_from_epoch: int
     threads: int | None
     accelerator: str
+    devices: int
+    strategy: str
 
     def __post_init__(self) -> None:
-        limits = {name: (1, MANY) for name in ("max_epochs", "validate_every", "checkpoint_every")}
+        limits = {name: (1, MANY) for name in ("max_epochs", "validate_every", "checkpoint_every", "devices")}
         check_limits(self, "trainer", {**limits, "best_from_epoch": (0, MANY)})
+        if self.strategy not in STRATEGIES:
+            raise InputError(f"trainer.strategy is {self.strategy!r}; choose one of {', '.join(STRATEGIES)}")
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from dlkf.filters.saved import load_filter
 from dlkf.filters.shipped import shipped_folder, trained_filter
 from dlkf.report.evaluation import write_report
 from dlkf.training.fit import fit
-from dlkf.training.settings import ScoringSettings, StudySettings
+from dlkf.training.settings import FitSettings, ScoringSettings, StudySettings
 from dlkf.tuning.baselines import Baselines, tuned_baselines
 
 Say = Callable[[str], None]
@@ -60,20 +60,25 @@ def load_data(values: Mapping[str, Any], say: Say) -> DriveDataModule:
 
 
 def run_study(
-    settings: StudySettings, data: DriveDataModule, folder: Path, logger: Logger | bool, say: Say
+    settings: StudySettings,
+    data: DriveDataModule,
+    folder: Path,
+    logger: Logger | bool,
+    say: Say,
+    further: Sequence[str] | None = None,
 ) -> Outcome:
-    """Tune, train, score and write the report into ``folder/report``."""
+    """Tune, train, score and write the report into ``folder/report``; ``further`` as in :func:`fit`."""
     scoring, seconds = settings.scoring, {}
     learned, names, plan = settings.fit.model.kind, settings.baselines.models, scoring.outage
     for name in names:
         refuse_smoothed(name, "the filters of this table do not")
-    if settings.fit.trainer.threads:
-        torch.set_num_threads(settings.fit.trainer.threads)
+    set_threads(settings.fit)
     with _timed(seconds, "tuning"):
         baselines = _baselines(settings, data, say)
     with _timed(seconds, "training"):
         card = model_card(settings, data)
-        weights = fit(settings.fit, data, folder, logger, mean_imu_error=baselines.prior.mean, notes=card)
+        mean = baselines.prior.mean
+        weights = fit(settings.fit, data, folder, logger, mean_imu_error=mean, notes=card, further=further)
     with _timed(seconds, "scoring"):
         filters = {**baselines.build(), **_shipped(names), learned: load_filter(weights)}
         scenes = Scenes.of_split(data, "test", plan, scoring.seed)
@@ -107,6 +112,18 @@ def run_study(
     if gains:
         write_gains(folder / "report", gains, title)
     return Outcome(scores, made, baselines, after, hour, weights, seconds, tables)
+
+
+def train_along(settings: StudySettings, data: DriveDataModule, folder: Path) -> None:
+    """The part of a further process of the same training: it writes, logs and scores nothing."""
+    set_threads(settings.fit)
+    fit(settings.fit, data, folder, False)
+
+
+def set_threads(settings: FitSettings) -> None:
+    """CPU threads of this process, where they are set."""
+    if settings.trainer.threads:
+        torch.set_num_threads(settings.trainer.threads)
 
 
 def _shipped(names: Sequence[str]) -> dict[str, Estimator]:

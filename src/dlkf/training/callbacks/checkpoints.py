@@ -28,6 +28,9 @@ class ResumePoint(Checkpoint):
         epoch = trainer.current_epoch + 1
         if epoch % self.every and epoch != trainer.max_epochs:
             return
+        if not trainer.is_global_zero:
+            trainer.save_checkpoint(self.folder / LAST)  # all processes take part, the first writes
+            return
         with whole_file(self.folder / LAST) as beside:
             trainer.save_checkpoint(beside)
 
@@ -54,6 +57,8 @@ class BestWeights(Callback):
         score = float(trainer.callback_metrics[self.monitor])
         if score < self.score:
             self.score, self.epoch = score, trainer.current_epoch
+            if not trainer.is_global_zero:
+                return
             with whole_folder(self.folder / BEST) as beside:
                 save_filter(module.filter, beside, self.notes)
 

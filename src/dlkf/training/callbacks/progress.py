@@ -22,7 +22,8 @@ class TrainingProgress(Callback):
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Open the bar where training starts or resumes."""
         self.began, self.first = time.monotonic(), trainer.current_epoch
-        if not self.console.is_terminal:
+        self.silent = not trainer.is_global_zero
+        if self.silent or not self.console.is_terminal:
             return
         self.bar = Progress(
             TextColumn("epoch"), MofNCompleteColumn(), BarColumn(), TextColumn("{task.description}"),
@@ -40,7 +41,7 @@ class TrainingProgress(Callback):
             text += f"  val outage {float(seen['val/outage_end_m']):.2f} m"
         if self.bar is not None:
             self.bar.update(self.task, completed=done, description=text)
-        elif done % self.every == 0 or done == trainer.max_epochs:
+        elif not self.silent and (done % self.every == 0 or done == trainer.max_epochs):
             pace = (time.monotonic() - self.began) / (done - self.first)
             left = timedelta(seconds=round(pace * (trainer.max_epochs - done)))
             self.console.print(f"epoch {done}/{trainer.max_epochs}  {text}  {left} left", highlight=False)

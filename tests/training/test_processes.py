@@ -1,0 +1,70 @@
+"""The same training on two processes: ``trainer.devices=2 trainer.strategy=ddp``, nothing else changed."""
+
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+import torch
+
+from dlkf.errors import InputError
+from dlkf.evaluation.metrics import end_errors
+from dlkf.filters.integration import integrate
+from dlkf.filters.saved import load_filter
+from dlkf.training.fit import fit
+from dlkf.training.processes import joined_by
+
+from .test_resume import data, told
+
+EPOCHS = 3
+ALONG = """
+    import sys
+    sys.path.insert(0, {root!r})
+    from pathlib import Path
+    from tests.training import test_processes as t
+    t.fit(t.settings(2), t.data({dataset!r}), Path({folder!r}), False)
+"""
+
+
+def settings(devices: int):
+    return told(max_epochs=EPOCHS, validate_every=1, devices=devices, strategy="ddp")
+
+
+@pytest.fixture(scope="module")
+def trained(dataset, tmp_path_factory, request) -> list:
+    """Last state and best weights of one process and of two."""
+    root, out = str(request.config.rootpath), []
+    for devices in (1, 2):
+        folder = tmp_path_factory.mktemp("run") / "study"
+        script = textwrap.dedent(ALONG.format(root=root, dataset=str(dataset), folder=str(folder)))
+        best = fit(settings(devices), data(dataset), folder, False, further=[sys.executable, "-c", script])
+        out.append((torch.load(folder / "last.ckpt", weights_only=True), best))
+    return out
+
+
+def test_two_processes_learn_what_one_does(trained):
+    """Averaged gradients are sums in another order: rounding, which the steps of three epochs spread a little."""
+    (one, _), (two, _) = trained
+    assert one["global_step"] == two["global_step"] >= EPOCHS
+    for name, w in one["state_dict"].items():
+        assert (w - two["state_dict"][name]).abs().max() <= 1e-5 * max(1.0, float(w.abs().max())), name
+    states = [{k.partition("{")[0]: v for k, v in state["callbacks"].items()} for state in (one, two)]
+    assert states[0]["BestWeights"]["epoch"] == states[1]["BestWeights"]["epoch"]
+    assert states[0]["BestWeights"]["score"] == pytest.approx(states[1]["BestWeights"]["score"], rel=1e-5)
+    for term, loss in states[0]["AdaptiveLossWeights"]["average"].items():  # losses of all epochs
+        assert loss == pytest.approx(states[1]["AdaptiveLossWeights"]["average"][term], rel=1e-5)
+
+
+def test_their_best_weights_score_alike(trained, dataset):
+    (batch,) = data(dataset).batches("test")
+    with torch.inference_mode():
+        errors = [end_errors(batch, integrate(batch, load_filter(best)).posterior) for _, best in trained]
+    assert np.allclose(*errors, rtol=1e-4) and len(errors[0])
+    assert sorted(p.name for p in trained[0][1].parent.iterdir()) == sorted(
+        p.name for p in trained[1][1].parent.iterdir()
+    )
+
+
+def test_a_further_process_that_fails_is_said():
+    with pytest.raises(InputError, match="ended with code 3"), joined_by(("sh", "-c", "exit 3"), 2):
+        raise AssertionError("the block must not begin")
