@@ -71,6 +71,13 @@ def test_a_run_holds_what_was_logged(uri, client, tmp_path):
     assert found.info.artifact_uri.startswith(f"file://{tmp_path}/"), "artifacts lie beside the store"
 
 
+def test_a_registered_model_names_its_metrics(uri, client):
+    with open_run(uri) as run:
+        run.log_metrics({"test/outage@seed2/outage_end_horizontal_m": 3.0, "test/mbkf15+my:Limit/n": 1.0})
+    kept = client.get_run(run.id).data.metrics
+    assert kept == {"test/outage.seed2/outage_end_horizontal_m": 3.0, "test/mbkf15.my:Limit/n": 1.0}
+
+
 def test_parameters_are_cut_at_the_limits_of_mlflow(uri, client):
     """Also more parameters than fit into one request."""
     config = {"long": "x" * 10_000, "k" * 300: 1} | {f"p{i}": i for i in range(250)}

@@ -7,6 +7,7 @@ import json
 import logging
 import math
 import os
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ SQLITE = "sqlite:///"
 PARENT_TAG, NOTE_TAG = "mlflow.parentRunId", "mlflow.note.content"
 KIND = {"mlflow.experimentKind": "custom_model_development"}  # else the UI shows pages for language models
 KEY_LENGTH, VALUE_LENGTH, PARAMS_AT_ONCE, METRICS_AT_ONCE = 250, 6000, 100, 1000  # MLflow's limits
+NOT_IN_NAMES = re.compile(r"[^\w\-. :/]")  # of metrics
 SAMPLE_EVERY_S, SAMPLES_PER_POINT = 1, 5  # system metrics: MLflow's own 10 s leaves short runs empty
 
 
@@ -159,12 +161,15 @@ class Run:
         self.client.log_inputs(self.id, datasets=[given])
 
     def log_metrics(self, metrics: Mapping[str, float], step: int = 0) -> None:
-        """Many metrics in one transaction; those that are not finite are left out."""
+        """Many metrics in one transaction; those that are not finite are left out.
+
+        A name of a model may have what MLflow does not take in a metric's (``outage@champion``): a dot stands for it.
+        """
         from mlflow.entities import Metric
         from mlflow.utils.time import get_current_time_millis
 
         now = get_current_time_millis()
-        kept = [Metric(k, float(v), now, step) for k, v in metrics.items() if math.isfinite(v)]
+        kept = [Metric(NOT_IN_NAMES.sub(".", k), float(v), now, step) for k, v in metrics.items() if math.isfinite(v)]
         for first in range(0, len(kept), METRICS_AT_ONCE):
             self.client.log_batch(self.id, metrics=kept[first : first + METRICS_AT_ONCE])
 
