@@ -11,13 +11,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import DictConfig, OmegaConf
 
 from dlkf.command import command
 from dlkf.console import counting
 from dlkf.data.alignment import AlignConfig
-from dlkf.data.store import dataset_digest, drive_rows, load_dataset
+from dlkf.data.store import dataset_digest, drive_rows
 from dlkf.data.tables import time_zeros
 from dlkf.errors import InputError
 from dlkf.files import staged, vacant
@@ -30,7 +29,7 @@ from dlkf.provenance import provenance
 from dlkf.report.navigation import Course, answers, write_page
 from dlkf.running.exports import chosen, export, utc_times
 from dlkf.running.likelihood import untold
-from dlkf.running.offline import Fixes, epoch_for, navigate_drives
+from dlkf.running.offline import Fixes, epoch_for, in_shares, navigate_shares
 from dlkf.running.replay import stream_drives
 from dlkf.running.solution import write_solution
 from dlkf.settings import settings_from
@@ -60,21 +59,19 @@ def main(cfg: DictConfig) -> None:
             model = compiled_filter(model, grid["rate_hz"], grid["epoch_s"])
         navigated = partial(stream_drives, config["dataset"], model, align=align, skipped=skipped, **grid)
     else:
-        with counting("Loading drives") as progress:
-            drives = load_dataset(
-                config["dataset"], dtype=torch.float64, reference=False, progress=progress, **grid
-            )
+        shares = in_shares(config["dataset"], spacings, rate_hz=grid["rate_hz"], epoch_s=grid["epoch_s"])
         if spec.name == AUTO:
+            drives = [drive for share in shares for drive in share]
             with counting("Finding the noise") as progress:
                 told = settings_from(Tuning, tuning, "tuning")
                 model, drives, found = untold(drives, config["model"], spec, told, align, progress=progress)
             print("found: " + ", ".join(f"{k} {v:.2g}" for k, v in found.described().items()))
-            spec, tuning = found.imu, asdict(found.tuning)
+            spec, tuning, shares = found.imu, asdict(found.tuning), [drives]
         if config["smoother"] is not None:
             model = smoothed(model, config["smoother"])
         if config["compiled"]:
             model = compiled_filter(model, grid["rate_hz"], grid["epoch_s"])
-        navigated = partial(navigate_drives, drives, model, align=align, skipped=skipped)
+        navigated = partial(navigate_shares, shares, model, len(rows), align=align, skipped=skipped)
     lines, courses = [], []
     with staged(config["out"]) as folder, counting("Navigating") as progress:
         for result in navigated(progress=progress):

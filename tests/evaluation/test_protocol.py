@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pymap3d
 import pytest
@@ -13,7 +14,7 @@ import torch
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.segments import StartLaw
-from dlkf.data.store import load_dataset
+from dlkf.data.store import drive_rows, load_dataset
 from dlkf.errors import InputError
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Protocol, Scenes, protocol_from, spread
@@ -21,7 +22,7 @@ from dlkf.evaluation.study import study
 from dlkf.evaluation.table import all_tables
 from dlkf.filters.build import build_filter
 from dlkf.models import resolve_model, resolve_models
-from dlkf.running.offline import navigate_drives
+from dlkf.running.offline import Fixes, in_shares, navigate_drives, navigate_shares
 from tests.cars import IMU
 
 MBKF = build_filter("mbkf15", IMU)
@@ -180,6 +181,34 @@ def test_a_drive_that_cannot_be_aligned_is_named_or_left_out(drives):
     assert "car-00" in skipped["car-00"]
     with pytest.raises(InputError, match="car-00"):
         list(navigate_drives([lost], MBKF, skipped={}))
+
+
+def test_navigation_some_drives_at_a_time(town, tmp_path):
+    """Drives loaded one after the other give what they give together; a share of which none starts is left out."""
+    shutil.copytree(town, tmp_path / "town")
+    rows = drive_rows(tmp_path / "town")
+    fixes = {row.name: Fixes.of(tmp_path / "town", row.name) for row in rows}
+
+    def shares(**options):
+        return in_shares(tmp_path / "town", fixes, rate_hz=20, epoch_s=1.0, **options)
+
+    assert [len(share) for share in shares()] == [len(rows)]
+    together = {r.drive: r.table for r in navigate_shares(shares(), MBKF, len(rows))}
+    seen, counted = {}, []
+    for r in navigate_shares(shares(samples=1), MBKF, len(rows), progress=lambda *k: counted.append(k)):
+        seen[r.drive] = r.table
+    assert counted == [(k + 1, len(rows)) for k in range(len(rows))]
+    assert list(seen) == [row.name for row in rows] and set(together) == set(seen)
+    for name, table in seen.items():
+        assert np.allclose(table.to_numpy(float), together[name].to_numpy(float), rtol=0, atol=1e-9, equal_nan=True)
+    path = tmp_path / "town" / "gnss" / f"drive={rows[0].name}" / "part-0.parquet"
+    table = pq.read_table(path).to_pandas()
+    table["quality"] = np.where(table.index == 0, table["quality"], 0)  # a single fix: no start
+    pq.write_table(pa.Table.from_pandas(table, preserve_index=False), path)
+    fixes[rows[0].name] = Fixes.of(tmp_path / "town", rows[0].name)
+    skipped = {}
+    left = navigate_shares(shares(samples=1), MBKF, len(rows), skipped=skipped)
+    assert [r.drive for r in left] == [row.name for row in rows[1:]] and set(skipped) == {rows[0].name}
 
 
 def test_models_by_name_and_folder(tmp_path):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -15,6 +15,7 @@ from dlkf.console import Counted
 from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.drive import Drive
 from dlkf.data.segments import whole_drives
+from dlkf.data.store import load_dataset
 from dlkf.data.tables import read_table
 from dlkf.data.validate import GNSS_QUALITIES
 from dlkf.errors import InputError
@@ -22,6 +23,8 @@ from dlkf.filters.integration import Estimator, Solution
 from dlkf.running.batched import CHUNK_SAMPLES, run_filter
 from dlkf.running.solution import solution_table
 from dlkf.running.start import align_each
+
+SAMPLES_AT_ONCE = 4_000_000  # IMU samples of drives in memory, 22 h at 50 Hz
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,11 @@ class Fixes:
         assert gnss is not None  # read_table raises where there is none
         usable = np.isin(gnss["quality"], GNSS_QUALITIES)
         return Fixes(*(gnss[c][usable] for c in ("t", "lat_deg", "lon_deg", "quality")))
+
+    @property
+    def span_s(self) -> float:
+        """From the first to the last."""
+        return float(self.t[-1] - self.t[0]) if len(self.t) else 0.0
 
     @property
     def usual_s(self) -> float:
@@ -105,6 +113,58 @@ class Navigated:
         if self.innovation is not None and np.isfinite(spread := self.innovation.normalised_rms):
             text += f", innovations {spread:.2g} × their σ"
         return text
+
+
+def in_shares(
+    folder: str | Path,
+    fixes: Mapping[str, Fixes],
+    *,
+    rate_hz: float,
+    samples: int = SAMPLES_AT_ONCE,
+    **grid: Any,
+) -> Iterator[list[Drive]]:
+    """The drives of a dataset that ``fixes`` has, loaded without a reference some at a time: ``samples`` of the IMU."""
+    share, size = [], 0.0
+    for name, of_drive in fixes.items():
+        more = of_drive.span_s * rate_hz
+        if share and size + more > samples:
+            yield _loaded(folder, share, rate_hz, grid)
+            share, size = [], 0.0
+        share.append(name)
+        size += more
+    yield _loaded(folder, share, rate_hz, grid)
+
+
+def _loaded(folder: str | Path, names: list[str], rate_hz: float, grid: Mapping[str, Any]) -> list[Drive]:
+    return load_dataset(folder, dtype=torch.float64, reference=False, drives=names, rate_hz=rate_hz, **grid)
+
+
+def navigate_shares(
+    shares: Iterable[Sequence[Drive]],
+    estimator: Estimator,
+    count: int,
+    *,
+    align: AlignConfig = ALIGN,
+    skipped: dict[str, str] | None = None,
+    progress: Counted | None = None,
+) -> Iterator[Navigated]:
+    """As :func:`navigate_drives` for ``count`` drives in shares; where one is forgotten before the next is loaded,
+    memory does not grow with their number."""
+    done, any_ran = 0, False
+    for drives in shares:
+        try:
+            for result in navigate_drives(drives, estimator, align=align, skipped=skipped):
+                any_ran = True
+                yield result
+        except InputError:
+            if not {d.name for d in drives} <= set(skipped or {}):  # else drives of other shares may start
+                raise
+        done += len(drives)
+        del drives  # before the next are loaded
+        if progress is not None:
+            progress(done, count)
+    if not any_ran:
+        raise InputError(next(iter((skipped or {}).values()), "no drives: give a dataset with at least one"))
 
 
 def navigate_drives(
