@@ -113,9 +113,9 @@ def section(
             rows.append(cells)
         against = [result.versus("dlkf", "pieces", "all", q, "mean") for q in TERMS]
         ratios.append(f"{key}: " + " / ".join(number(c.ratio, digits=2) if c else "-" for c in against))
-        horizontal = result.versus("dlkf", "outages", "rms", "horizontal")
-        if only and horizontal:
-            ratios[-1] += f", horizontal RMS in the outages {with_interval(horizontal)}"
+        end = result.versus("dlkf", "outages", "end", "horizontal")
+        if only and end:
+            ratios[-1] += f", horizontal RMS at the end of the outages {with_interval(end)}"
     heads = [cell for t in TERMS.values() for cell in (t, f"{t}: ratio to {result.baseline}")]
     page.table(["training", "filter", *heads], rows)
     first = next(iter(runs.values()))

@@ -2,7 +2,7 @@
 
     begin(imu, fixes, lever_arm_b) → memory, ready    where a car can be aligned
     read(memory, fix)              → fix in n
-    turn(memory, imu, fix in n)    → memory, told     one epoch: :func:`dlkf.filters.integration.advance`
+    turn(memory, imu, fix in n)    → memory, told     one epoch: ``dlkf.filters.integration.advance``
     row(memory, told)              → row              latitude, longitude, …: a row of ``solution.parquet``
     anchor(memory)                 → memory           the tangent frame follows the car
 
