@@ -53,8 +53,8 @@ def main(cfg: DictConfig) -> None:
     skipped: dict[str, str] | None = {} if config["skip_unaligned"] else None
     align = AlignConfig.of(config["align"])
     if config["streaming"]:
-        if config["smoother"] is not None or spec.name == AUTO:
-            raise InputError("smoother and imu=auto look ahead, a stream cannot: leave out streaming, or both of them")
+        if ahead := "smoother" if config["smoother"] is not None else "imu=auto" if spec.name == AUTO else "":
+            raise InputError(f"{ahead} looks ahead, a stream cannot: give {ahead} or streaming, not both")
         if config["compiled"]:
             model = compiled_filter(model, grid["rate_hz"], grid["epoch_s"])
         navigated = partial(stream_drives, config["dataset"], model, align=align, skipped=skipped, **grid)

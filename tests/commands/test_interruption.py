@@ -122,5 +122,9 @@ def test_an_interrupt_that_became_another_error_is_one(signal_, code, call, monk
             raise InputError("x.csv: cannot be read") from None
 
     monkeypatch.setattr("dlkf.doctor.drive_rows", read)
-    ended = call("doctor", "dataset=x")
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+    try:
+        ended = call("doctor", "dataset=x")
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert ended.code == code and "cannot be read" not in ended.err

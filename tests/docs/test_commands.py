@@ -38,8 +38,8 @@ SHELL = [
 ]
 # presets that the pages tell a reader to write into mine/
 MINE = {
-    "imu": ["my_imu", "shed"],
-    "tuning": ["town"],
+    "imu": ["my_imu", "ours", "shed"],
+    "tuning": ["ours", "town"],
     "reader": ["xsens", "shed"],
     "experiment": ["fresh_bias"],
     "simulated": ["van"],

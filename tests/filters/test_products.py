@@ -57,7 +57,7 @@ def test_lstm_cell_over_epochs():
 def test_network_with_and_without_gradients(dtype):
     """Training and inference take different ways through the same network to the same values."""
     torch.manual_seed(1)
-    network = NetworkConfig(lstm_hidden=32, lstm_layers=2, dense=(24, 16), dropout=0.0).build().to(dtype)
+    network = NetworkConfig(samples=50, lstm_hidden=32, lstm_layers=2, dense=(24, 16), dropout=0.0).build().to(dtype)
     window, components = torch.randn(5, 15, 50, dtype=dtype), torch.randn(5, 30, dtype=dtype)
 
     def outputs() -> list[torch.Tensor]:
@@ -74,6 +74,6 @@ def test_network_with_and_without_gradients(dtype):
 
 
 def test_network_can_be_copied_in_the_middle_of_a_batch():
-    network = NetworkConfig(lstm_hidden=8, lstm_layers=1, dense=(8,)).build()
+    network = NetworkConfig(samples=50, lstm_hidden=8, lstm_layers=1, dense=(8,)).build()
     network(torch.randn(2, 15, 50), torch.randn(2, 30), network.start(2, torch.zeros(1)))
     copy.deepcopy(network)

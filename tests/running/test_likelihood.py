@@ -102,7 +102,7 @@ def test_navigate_finds_the_noise_by_itself(call, long_town, coarse):
 
 @pytest.mark.parametrize("words,says", [
     (("navigate", "model=plus", "imu=auto", "out=a"), "model=plus takes none"),
-    (("navigate", "model=mbkf15", "imu=auto", "streaming=true", "out=a"), "look ahead"),
+    (("navigate", "model=mbkf15", "imu=auto", "streaming=true", "out=a"), "looks ahead"),
     (("evaluate", "model=mbkf15", "imu=auto", "out=a"), "only navigate finds the noise"),
 ])  # fmt: skip
 def test_where_noise_cannot_be_found(call, long_town, words, says):
