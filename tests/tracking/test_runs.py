@@ -78,6 +78,13 @@ def test_a_registered_model_names_its_metrics(uri, client):
     assert kept == {"test/outage.seed2/outage_end_horizontal_m": 3.0, "test/mbkf15.my:Limit/n": 1.0}
 
 
+def test_a_long_note_ends_with_a_whole_line(uri, client):
+    with open_run(uri) as run:
+        run.note("a line\n" * 2000)
+    kept = client.get_run(run.id).data.tags["mlflow.note.content"]
+    assert len(kept) <= 8000 and kept.endswith("a line")
+
+
 def test_parameters_are_cut_at_the_limits_of_mlflow(uri, client):
     """Also more parameters than fit into one request."""
     config = {"long": "x" * 10_000, "k" * 300: 1} | {f"p{i}": i for i in range(250)}

@@ -29,7 +29,7 @@ STORE, ARTIFACTS = "mlflow.db", "mlruns"
 SQLITE = "sqlite:///"
 PARENT_TAG, NOTE_TAG = "mlflow.parentRunId", "mlflow.note.content"
 KIND = {"mlflow.experimentKind": "custom_model_development"}  # else the UI shows pages for language models
-KEY_LENGTH, VALUE_LENGTH, PARAMS_AT_ONCE, METRICS_AT_ONCE = 250, 6000, 100, 1000  # MLflow's limits
+KEY_LENGTH, VALUE_LENGTH, NOTE_LENGTH, PARAMS_AT_ONCE, METRICS_AT_ONCE = 250, 6000, 8000, 100, 1000  # MLflow's limits
 NOT_IN_NAMES = re.compile(r"[^\w\-. :/]")  # of metrics
 SAMPLE_EVERY_S, SAMPLES_PER_POINT = 1, 5  # system metrics: MLflow's own 10 s leaves short runs empty
 
@@ -182,7 +182,9 @@ class Run:
             self.client.log_artifact(self.id, str(path), under)
 
     def note(self, markdown: str) -> None:
-        """What the UI shows as the description of the run."""
+        """What the UI shows as the description of the run; whole lines up to MLflow's limit."""
+        if len(markdown) > NOTE_LENGTH:
+            markdown = markdown[:NOTE_LENGTH].rpartition("\n")[0]
         self.client.set_tag(self.id, NOTE_TAG, markdown)
 
 
