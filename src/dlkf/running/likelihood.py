@@ -170,7 +170,7 @@ def find_noise(
 
     before = best = judged(x, 0.0) if evidence.fixes else math.inf
     if not math.isfinite(best):
-        raise InputError("no noise can be found: there is no fix to score after the first 20 s, or the filter diverges")
+        raise InputError("no noise can be found: it takes two minutes with fixes, and a filter that does not diverge")
     late = 0.0
     for step in STEPS:
         moved = True

@@ -13,7 +13,7 @@ from dlkf.data.drive import Drive
 from dlkf.evaluation.table import Table, as_markdown, number
 from dlkf.files import staged
 from dlkf.filters.tuning import Tuning
-from dlkf.navigation.imu_errors import ImuSpec
+from dlkf.navigation.imu_errors import NEEDED, ImuSpec
 from dlkf.running.likelihood import Evidence, Found, find_noise
 from dlkf.tuning.search import tuning_values
 
@@ -45,7 +45,7 @@ def write_noise(out: str | Path, found: Found, table: Table) -> list[str]:
     name = found.imu.name
     usual = type(found.imu.accel)()
     sensors = {
-        s: {k: v for k, v in asdict(getattr(found.imu, s)).items() if k not in OPTIONAL or v != getattr(usual, k)}
+        s: {k: v for k, v in asdict(getattr(found.imu, s)).items() if k in NEEDED or v != getattr(usual, k)}
         for s in ("accel", "gyro")
     }
     preset = {"name": name, "source": found.imu.source, **sensors}
@@ -56,9 +56,3 @@ def write_noise(out: str | Path, found: Found, table: Table) -> list[str]:
             (folder / kind / f"{name}.yaml").write_text(text)
         (folder / "table.md").write_text(as_markdown(table))
     return [f"imu/{name}.yaml", f"tuning/{name}.yaml", "table.md"]
-
-
-OPTIONAL = (
-    "random_walk", "warm_up", "warm_up_time", "g_sensitivity", "quantisation", "full_scale", "wander", "wander_time",
-    "unevenness",
-)  # fmt: skip
