@@ -11,7 +11,7 @@ import pytest
 SRC = Path(__file__).parents[1] / "src"
 FLOORS = (
     {"", "errors"},
-    {"classes", "settings", "files", "console", "config", "points", "provenance", "ranges", "colours"},
+    {"classes", "settings", "files", "console", "config", "parallel", "points", "provenance", "ranges", "colours"},
     {"navigation"},
     {"data", "networks"},
     {"filters", "simulation"},

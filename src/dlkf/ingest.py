@@ -8,9 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from dlkf.classes import made
 from dlkf.command import command
-from dlkf.data.intake import ingest_drives
-from dlkf.data.readers.frames import DriveFrames
-from dlkf.data.summary import drive_line
+from dlkf.data.intake import Intake, Taken, ingest
 from dlkf.data.validate import Limits
 
 
@@ -23,22 +21,17 @@ def _open(arguments: list[str]) -> list[str]:
 def main(cfg: DictConfig) -> None:
     """Read every drive under ``source``, check it and write the dataset ``out``."""
     reader = made(cast(dict, OmegaConf.to_container(cfg.reader, resolve=True)), "reader")
-    count = ingest_drives(
-        reader.read(cfg.source),
-        cfg.out,
-        split_gaps=cfg.split_gaps,
-        shortest_s=cfg.shortest_s,
-        overwrite=cfg.overwrite,
-        limits=Limits(gap_s=cfg.gap_s, gap_samples=cfg.gap_samples),
-        progress=_tell,
-    )
+    how = Intake(cfg.split_gaps, cfg.shortest_s, Limits(gap_s=cfg.gap_s, gap_samples=cfg.gap_samples))
+    options = {"overwrite": cfg.overwrite, "parallel": cfg.parallel, "progress": _tell}
+    count = ingest(reader, cfg.source, cfg.out, how, **options)
     print(f"{cfg.out}: {count} drive{'s' if count != 1 else ''}")
 
 
-def _tell(drive: DriveFrames, done: int) -> None:
-    for note in drive.notes:
+def _tell(taken: Taken, done: int) -> None:
+    for note in taken.notes:
         print(f"       {note}", flush=True)
-    print(f"{done:5d}  {drive.name}: {drive_line(drive)}", flush=True)
+    for number, line in enumerate(taken.lines, done - len(taken.lines) + 1):
+        print(f"{number:5d}  {line}", flush=True)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 
 from dlkf.command import command
+from dlkf.files import readable
 from dlkf.simulation.dataset import simulate_from_config
 from dlkf.simulation.semi_real import semi_real_from_config
 
@@ -28,7 +29,7 @@ def main(cfg: DictConfig) -> None:
     config = cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True))
     make = semi_real_from_config if config["source"] else simulate_from_config
     out = make(config, config["out"], overwrite=config["overwrite"])
-    drives = pd.read_parquet(out / "drives.parquet")
+    drives = pd.read_parquet(readable(out / "drives.parquet"))
     hours = drives["duration_s"].sum() / 3600
     errors = config["dataset"]["imu_errors"]
     types = {"fleet": f"of {len(config['dataset'].get('fleet', ()))} types", "wide": "of a new type each"}

@@ -10,7 +10,7 @@ import pytest
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from dlkf.data.intake import ingest_drives
+from dlkf.data.intake import Intake, ingest_drives
 from dlkf.data.readers.logs import LogReader
 from dlkf.data.readers.units import rotation, seconds
 from dlkf.data.tables import read_drives, read_table
@@ -237,8 +237,8 @@ def test_drives_are_split_at_gaps(tmp_path, tables):
     count = ingest_drives(
         _reader().read(tmp_path / "logs"),
         tmp_path / "out",
-        split_gaps=True,
-        progress=lambda drive, done: seen.append(drive.name),
+        Intake(split_gaps=True),
+        progress=lambda taken, done: seen.extend(row["drive"] for row in taken.rows),
     )
     rows = validate_dataset(tmp_path / "out")
     assert count == 3 and seen == [r.name for r in rows] == ["a-s0", "a-s1", "b"]

@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pyarrow as pa
@@ -22,7 +23,8 @@ from dlkf.evaluation.study import study
 from dlkf.evaluation.table import all_tables
 from dlkf.filters.build import build_filter
 from dlkf.models import resolve_model, resolve_models
-from dlkf.running.offline import Fixes, in_shares, navigate_drives, navigate_shares
+from dlkf.parallel import each
+from dlkf.running.offline import Fixes, in_shares, navigate_dataset, navigate_drives, navigate_shares, share_of
 from tests.cars import IMU
 
 MBKF = build_filter("mbkf15", IMU)
@@ -189,13 +191,14 @@ def test_navigation_some_drives_at_a_time(town, tmp_path):
     rows = drive_rows(tmp_path / "town")
     fixes = {row.name: Fixes.of(tmp_path / "town", row.name) for row in rows}
 
-    def shares(**options):
-        return in_shares(tmp_path / "town", fixes, rate_hz=20, epoch_s=1.0, **options)
+    def shares(*samples, skip=False):
+        run = partial(navigate_dataset, tmp_path / "town", MBKF, rate_hz=20.0, epoch_s=1.0)
+        return each(partial(share_of, run, skip), in_shares(fixes, 20.0, *samples))
 
-    assert [len(share) for share in shares()] == [len(rows)]
-    together = {r.drive: r.table for r in navigate_shares(shares(), MBKF, len(rows))}
+    assert in_shares(fixes, 20.0) == [tuple(row.name for row in rows)]
+    together = {r.drive: r.table for r in navigate_shares(shares(), len(rows))}
     seen, counted = {}, []
-    for r in navigate_shares(shares(samples=1), MBKF, len(rows), progress=lambda *k: counted.append(k)):
+    for r in navigate_shares(shares(1), len(rows), progress=lambda *k: counted.append(k)):
         seen[r.drive] = r.table
     assert counted == [(k + 1, len(rows)) for k in range(len(rows))]
     assert list(seen) == [row.name for row in rows] and set(together) == set(seen)
@@ -207,7 +210,7 @@ def test_navigation_some_drives_at_a_time(town, tmp_path):
     pq.write_table(pa.Table.from_pandas(table, preserve_index=False), path)
     fixes[rows[0].name] = Fixes.of(tmp_path / "town", rows[0].name)
     skipped = {}
-    left = navigate_shares(shares(samples=1), MBKF, len(rows), skipped=skipped)
+    left = navigate_shares(shares(1, skip=True), len(rows), skipped=skipped)
     assert [r.drive for r in left] == [row.name for row in rows[1:]] and set(skipped) == {rows[0].name}
 
 

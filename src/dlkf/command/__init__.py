@@ -7,7 +7,6 @@ import signal
 import sys
 from collections.abc import Callable
 from functools import wraps
-from pathlib import Path
 from typing import NoReturn
 
 import hydra
@@ -21,6 +20,7 @@ from dlkf.command.faults import fault
 from dlkf.command.help import help_text
 from dlkf.config import config_dir
 from dlkf.errors import InputError, Terminated
+from dlkf.files import placed
 
 MISTAKE, INTERRUPTED, TERMINATED = 2, 130, 143
 stopped_by: list[int] = []  # signals that came while a command ran
@@ -56,7 +56,7 @@ def command(
                 checked_seeds(OmegaConf.to_container(cfg))
                 if sweep and cfg.get("out"):
                     with open_dict(cfg):
-                        cfg.out = str(Path(cfg.out) / sweeps.folder(hydra_config))
+                        cfg.out = str(placed(cfg.out) / sweeps.folder(hydra_config))
                 function(cfg)
             except Exception as error:
                 if sweep and not stopped_by:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pandas as pd
 
 from dlkf.errors import InputError
+from dlkf.files import placed, readable
 
 KINDS = ("simulated", "semi-real", "real", "unknown")
 
@@ -34,5 +35,5 @@ def drive_kind(row: Mapping[str, object]) -> str:
 
 def drive_kinds(dataset: str | Path) -> dict[str, str]:
     """Kind of every drive of a dataset."""
-    table = pd.read_parquet(Path(dataset) / "drives.parquet")
+    table = pd.read_parquet(readable(placed(dataset) / "drives.parquet"))
     return {str(row["drive"]): drive_kind(row) for row in table.to_dict("records")}

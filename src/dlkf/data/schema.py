@@ -26,7 +26,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dlkf.errors import InputError
-from dlkf.files import whole_file, whole_folder
+from dlkf.files import placed, whole_file, whole_folder
 
 F, I, B = pa.float64(), pa.int8(), pa.bool_()
 ACCEL = ("accel_x", "accel_y", "accel_z")
@@ -68,7 +68,7 @@ DRIVES_REQUIRED = ("drive", "group")
 
 def drive_file(folder: Path, kind: str, drive: str) -> Path:
     """Where a table of a drive is written; ``kind`` is imu, gnss or reference."""
-    return Path(folder) / kind / f"drive={drive}" / "part-0.parquet"
+    return placed(folder) / kind / f"drive={drive}" / "part-0.parquet"
 
 
 @contextmanager
@@ -77,7 +77,7 @@ def new_dataset(folder: str | Path, overwrite: bool = False) -> Iterator[Path]:
 
     Raises InputError if ``folder`` already holds something and ``overwrite`` is False.
     """
-    target = Path(folder).absolute()
+    target = placed(folder).absolute()
     if target.is_file() or (target.is_dir() and any(target.iterdir()) and not overwrite):
         raise InputError(
             f"out={folder}: exists already; give another folder, or overwrite=true to replace it"
@@ -107,7 +107,7 @@ def write_drive(
     """
     row = dict(meta)
     name = check_name(str(row["drive"]))
-    folder = Path(folder)
+    folder = placed(folder)
     for kind, frame in (("imu", imu), ("gnss", gnss), ("reference", reference)):
         if frame is not None:
             write_parquet(drive_file(folder, kind, name), contract_table(kind, frame, name))
@@ -130,7 +130,7 @@ def write_drives_table(folder: str | Path, rows: Sequence[Mapping[str, Any]]) ->
         default = 0.0 if name in LEVER_ARM else np.nan
         frame[name] = frame[name].astype(float).fillna(default) if name in frame else default
     ordered = frame[[*DRIVES.names, *(c for c in frame.columns if c not in DRIVES.names)]]
-    write_parquet(Path(folder) / "drives.parquet", pa.Table.from_pandas(ordered, preserve_index=False))
+    write_parquet(placed(folder) / "drives.parquet", pa.Table.from_pandas(ordered, preserve_index=False))
 
 
 def contract_table(kind: str, frame: pd.DataFrame, drive: str) -> pa.Table:

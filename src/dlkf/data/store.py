@@ -13,6 +13,7 @@ from dlkf.data.resampling import assign_fixes, epoch_grid, reference_at, resampl
 from dlkf.data.tables import DriveRow, dataset_digest, read_drives
 from dlkf.data.validate import GNSS_QUALITIES, LIMITS, DriveTables, Limits, read_checked
 from dlkf.errors import InputError
+from dlkf.files import name_of
 
 __all__ = ["dataset_digest", "drive_from_tables", "load_dataset"]
 
@@ -33,12 +34,11 @@ def load_dataset(
     With ``reference=False`` the folder ``reference/`` is not opened. ``progress(drives done, in all)`` is called
     after each drive. Raises InputError for the first fault in the data or an unknown drive.
     """
-    folder = Path(folder)
     rows = drive_rows(folder, drives)
     loaded = []
     for row in rows:
         tables = read_checked(folder, row, reference=reference, limits=limits)
-        loaded.append(drive_from_tables(tables, folder.absolute().name, rate_hz, epoch_s, dtype))
+        loaded.append(drive_from_tables(tables, name_of(folder), rate_hz, epoch_s, dtype))
         if progress is not None:
             progress(len(loaded), len(rows))
     return loaded

@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 
 from dlkf.data.schema import DRIVES, DRIVES_REQUIRED, LEVER_ARM, OPTIONAL, SCHEMAS, check_name
 from dlkf.errors import InputError
+from dlkf.files import placed, reached, readable, told
 
 Columns = dict[str, np.ndarray]
 
@@ -31,11 +32,14 @@ def read_drives(folder: str | Path) -> list[DriveRow]:
 
     Raises InputError if the folder, the file or a needed column is missing, or a name stands twice.
     """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError(f"dataset {folder}: no such folder; make one with dlkf.simulate or dlkf.ingest")
+    folder = placed(folder)
     path = folder / "drives.parquet"
-    if not path.is_file():
+    with told(folder):
+        there, whole = folder.is_dir(), path.is_file()
+    if not there:
+        reached(folder)
+        raise InputError(f"dataset {folder}: no such folder; make one with dlkf.simulate or dlkf.ingest")
+    if not whole:
         raise InputError(f"dataset {folder}: drives.parquet is missing; it holds one row per drive")
     table = _read(path, "drives.parquet")
     for name in DRIVES_REQUIRED:
@@ -59,8 +63,8 @@ def read_drives(folder: str | Path) -> list[DriveRow]:
 
 def time_zeros(folder: str | Path) -> dict[str, float]:
     """What is to be added to ``t`` of each drive for the clock of its log files [s], where it is known."""
-    path = Path(folder) / "drives.parquet"
-    if not path.is_file() or "time_zero_s" not in (table := pq.read_table(path)).column_names:
+    path = placed(folder) / "drives.parquet"
+    if not path.is_file() or "time_zero_s" not in (table := pq.ParquetFile(readable(path)).read()).column_names:
         return {}
     known = zip(table["drive"].to_pylist(), table["time_zero_s"].to_pylist())
     return {str(drive): float(zero) for drive, zero in known if zero is not None}
@@ -73,7 +77,7 @@ def read_table(folder: str | Path, kind: str, drive: str) -> Columns | None:
     damaged file, a missing column or a column of the wrong type.
     """
     place = Path(kind) / f"drive={drive}"
-    parts = sorted((Path(folder) / place).glob("*.parquet"))
+    parts = sorted((placed(folder) / place).glob("*.parquet"))
     if not parts:
         if kind == "reference":
             return None
@@ -104,7 +108,7 @@ def read_table(folder: str | Path, kind: str, drive: str) -> Columns | None:
 
 def dataset_digest(folder: str | Path) -> str:
     """Hash of the contents of a dataset's files, 32 hexadecimal digits; names count, dates do not."""
-    folder = Path(folder)
+    folder = placed(folder)
     digest = hashlib.blake2b(digest_size=16)
     for path in sorted(folder.rglob("*.parquet"), key=lambda p: p.relative_to(folder).as_posix()):
         digest.update(path.relative_to(folder).as_posix().encode() + b"\0")
@@ -115,7 +119,7 @@ def dataset_digest(folder: str | Path) -> str:
 
 def _read(path: Path, where: str) -> pa.Table:
     try:
-        return pq.ParquetFile(path).read()
+        return pq.ParquetFile(readable(path)).read()
     except (pa.ArrowInvalid, OSError) as error:
         reason = str(error).splitlines()[0][:100]
         raise InputError(f"{where}: not a whole Parquet file ({reason}); write or copy it again") from None

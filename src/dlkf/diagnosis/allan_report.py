@@ -25,7 +25,7 @@ from dlkf.diagnosis.allan import (
 from dlkf.errors import InputError
 from dlkf.evaluation.figures import png
 from dlkf.evaluation.table import Table, as_json, as_markdown, number
-from dlkf.files import staged
+from dlkf.files import placed, staged
 from dlkf.navigation.imu_errors import DEG, MILLIGAL, ImuSpec
 from dlkf.provenance import provenance
 from dlkf.report.page import Page, embedded
@@ -139,7 +139,7 @@ def write_allan(out: str | Path, log: StaticLog, spec: ImuSpec) -> list[Path]:
         (folder / "imu").mkdir()
         for name, data in files.items():
             (folder / name).write_bytes(data)
-    return [Path(out) / name for name in files]
+    return [placed(out) / name for name in files]
 
 
 def _csv(log: StaticLog) -> str:

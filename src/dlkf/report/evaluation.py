@@ -17,7 +17,7 @@ from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.summary import answer
 from dlkf.evaluation.table import DEGREES, Table, all_tables, as_csv, as_json, as_markdown, number
-from dlkf.files import staged
+from dlkf.files import placed, staged
 from dlkf.report.maps import chart, joined, track
 from dlkf.report.navigation import mark
 from dlkf.report.page import Page, embedded
@@ -75,7 +75,7 @@ def write_report(
         (folder / "figures").mkdir()
         for name, data in files.items():
             (folder / name).write_bytes(data)
-    return [Path(out) / name for name in files]
+    return [placed(out) / name for name in files]
 
 
 def evaluation_page(

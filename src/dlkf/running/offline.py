@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -115,56 +115,73 @@ class Navigated:
         return text
 
 
-def in_shares(
-    folder: str | Path,
-    fixes: Mapping[str, Fixes],
-    *,
-    rate_hz: float,
-    samples: int = SAMPLES_AT_ONCE,
-    **grid: Any,
-) -> Iterator[list[Drive]]:
-    """The drives of a dataset that ``fixes`` has, loaded without a reference some at a time: ``samples`` of the IMU."""
-    share, size = [], 0.0
+def in_shares(fixes: Mapping[str, Fixes], rate_hz: float, samples: int = SAMPLES_AT_ONCE) -> list[tuple[str, ...]]:
+    """The names of the drives, so many together as have ``samples`` of the IMU."""
+    shares: list[list[str]] = [[]]
+    size = 0.0
     for name, of_drive in fixes.items():
         more = of_drive.span_s * rate_hz
-        if share and size + more > samples:
-            yield _loaded(folder, share, rate_hz, grid)
-            share, size = [], 0.0
-        share.append(name)
+        if shares[-1] and size + more > samples:
+            shares.append([])
+            size = 0.0
+        shares[-1].append(name)
         size += more
-    yield _loaded(folder, share, rate_hz, grid)
+    return [tuple(share) for share in shares if share]
 
 
-def _loaded(folder: str | Path, names: list[str], rate_hz: float, grid: Mapping[str, Any]) -> list[Drive]:
-    return load_dataset(folder, dtype=torch.float64, reference=False, drives=names, rate_hz=rate_hz, **grid)
+class Share(NamedTuple):
+    """Drives that were navigated together, how many were to be, and why others were left out."""
+
+    results: list[Navigated]
+    count: int
+    skipped: dict[str, str]
+
+
+def share_of(run: Callable[..., Iterable[Navigated]], skip: bool, names: tuple[str, ...]) -> Share:
+    """``run(drives=names, skipped=…)``; with ``skip`` drives that cannot be aligned are left out, even if all are."""
+    skipped: dict[str, str] | None = {} if skip else None
+    try:
+        results = list(run(drives=names, skipped=skipped))
+    except InputError:
+        if not set(names) <= set(skipped or {}):
+            raise
+        results = []
+    return Share(results, len(names), skipped or {})
 
 
 def navigate_shares(
-    shares: Iterable[Sequence[Drive]],
-    estimator: Estimator,
+    shares: Iterable[Share],
     count: int,
     *,
-    align: AlignConfig = ALIGN,
     skipped: dict[str, str] | None = None,
     progress: Counted | None = None,
 ) -> Iterator[Navigated]:
-    """As :func:`navigate_drives` for ``count`` drives in shares; where one is forgotten before the next is loaded,
-    memory does not grow with their number."""
+    """The solutions of ``count`` drives, share by share; InputError where no drive of any could start."""
     done, any_ran = 0, False
-    for drives in shares:
-        try:
-            for result in navigate_drives(drives, estimator, align=align, skipped=skipped):
-                any_ran = True
-                yield result
-        except InputError:
-            if not {d.name for d in drives} <= set(skipped or {}):  # else drives of other shares may start
-                raise
-        done += len(drives)
-        del drives  # before the next are loaded
+    for share in shares:
+        if skipped is not None:
+            skipped |= share.skipped
+        any_ran |= bool(share.results)
+        yield from share.results
+        done += share.count
         if progress is not None:
             progress(done, count)
     if not any_ran:
         raise InputError(next(iter((skipped or {}).values()), "no drives: give a dataset with at least one"))
+
+
+def navigate_dataset(
+    folder: str | Path,
+    estimator: Estimator,
+    *,
+    align: AlignConfig = ALIGN,
+    drives: Sequence[str] | None = None,
+    skipped: dict[str, str] | None = None,
+    **grid: float,
+) -> Iterator[Navigated]:
+    """:func:`navigate_drives` of the drives of a dataset, or those named, loaded together without a reference."""
+    loaded = load_dataset(folder, dtype=torch.float64, reference=False, drives=drives, **grid)
+    yield from navigate_drives(loaded, estimator, align=align, skipped=skipped)
 
 
 def navigate_drives(

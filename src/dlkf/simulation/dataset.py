@@ -7,8 +7,9 @@ import math
 import os
 import re
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,9 @@ from rich.progress import track
 
 from dlkf.data.schema import drive_file, new_dataset, write_drive, write_drives_table, write_parquet
 from dlkf.errors import InputError
+from dlkf.files import absolute, is_url, placed
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.parallel import check, each
 from dlkf.ranges import draw, has_ranges, middle
 from dlkf.settings import settings_from
 from dlkf.simulation.drive import DriveTables, Rates, Seeds, simulate_drive
@@ -179,14 +182,15 @@ def _settings(plain: Mapping[str, Any]) -> tuple[DatasetConfig, ImuSpec]:
 def simulate_from_config(
     config: Mapping[str, Any], out: str | Path, *, overwrite: bool = False, progress: bool = True
 ) -> Path:
-    """Simulate what a mapping with ``dataset``, ``imu``, ``seed`` and perhaps ``workers`` says into ``out``.
+    """Simulate what a mapping with ``dataset``, ``imu``, ``seed``, perhaps ``workers``, ``parallel`` says into ``out``.
 
     InputError as of :func:`recipe` and :func:`simulate_dataset`.
     """
     workers = config.get("workers")
     if workers is not None and (not isinstance(workers, int) or workers < 1):
         raise InputError(f"simulation: workers {workers!r} must be a whole number ≥ 1")
-    return simulate(recipe(config), Path(out), overwrite=overwrite, workers=workers, progress=progress)
+    options = {"overwrite": overwrite, "workers": workers, "parallel": config.get("parallel"), "progress": progress}
+    return simulate(recipe(config), placed(out), **options)
 
 
 def simulate_dataset(config: DatasetConfig, spec: ImuSpec, seed: int, out: Path, **options: Any) -> Path:
@@ -195,15 +199,23 @@ def simulate_dataset(config: DatasetConfig, spec: ImuSpec, seed: int, out: Path,
 
 
 def simulate(
-    made_by: Recipe, out: Path, *, overwrite: bool = False, workers: int | None = None, progress: bool = True
+    made_by: Recipe,
+    out: Path,
+    *,
+    overwrite: bool = False,
+    workers: int | None = None,
+    parallel: int | str | None = None,
+    progress: bool = True,
 ) -> Path:
     """Write the dataset to ``out``, whole or not at all, and return its path.
 
     Drive k depends on the seed and k alone, whatever the number of ``workers`` (threads; by default one per
-    core). Memory is that of ``workers`` drives, whatever the hours. InputError if ``out`` exists.
+    core) or what is asked for by ``parallel`` in their place (:func:`dlkf.parallel.each`). Memory is that of
+    ``workers`` drives, whatever the hours. InputError if ``out`` exists.
     """
+    check(parallel, out)
     with new_dataset(out, overwrite) as folder:
-        _write_drives(made_by, folder, workers or os.cpu_count() or 1, progress)
+        _write_drives(made_by, folder, workers or os.cpu_count() or 1, parallel, progress)
     return out
 
 
@@ -244,31 +256,30 @@ def drive_of(made_by: Recipe, index: int, seconds: int) -> tuple[DriveTables, di
     return tables, row
 
 
-def _write_drives(made_by: Recipe, folder: Path, workers: int, progress: bool) -> None:
+def _write_drives(
+    made_by: Recipe, folder: Path, workers: int, parallel: int | str | None, progress: bool
+) -> None:
     config = made_by.dataset
-    durations = config.durations
-
-    def one(index: int) -> dict[str, Any]:
-        tables, row = drive_of(made_by, index, durations[index])
-        write_drive(folder, row, tables.imu, tables.gnss, tables.reference)
-        if config.raw:
-            write_raw(folder, row["drive"], tables.raw)
-        return row
-
-    with ThreadPoolExecutor(workers) as pool:
-        try:  # from here on, so that an interrupt never waits for drives that have not begun
-            jobs = [pool.submit(one, index) for index in range(len(durations))]
-            shown = track(
-                as_completed(jobs), f"simulating {config.name}", total=len(jobs),
-                disable=not progress, console=Console(stderr=True),
-            )  # fmt: skip
-            for job in shown:
-                job.result()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    write_drives_table(folder, [job.result() for job in jobs])
+    jobs = list(enumerate(config.durations))
+    written = each(partial(_written, made_by, absolute(folder)), jobs, parallel, threads=workers)
+    shown = track(
+        written, f"simulating {config.name}", total=len(jobs), disable=not progress, console=Console(stderr=True)
+    )
+    with closing(shown) as rows:  # type: ignore[type-var]
+        write_drives_table(folder, list(rows))
     (folder / "simulation.json").write_text(json.dumps(made_by.described, indent=2, ensure_ascii=False) + "\n")
+
+
+def _written(made_by: Recipe, out: str, job: tuple[int, int]) -> dict[str, Any]:
+    """A drive by its index and seconds, in its place; its row of ``drives.parquet``."""
+    tables, row = drive_of(made_by, *job)
+    folder = placed(out)
+    if not is_url(out) and not folder.is_dir():
+        raise InputError(f"{out} is not there: the worker does not share the folder, or nobody waits for the drive")
+    write_drive(folder, row, tables.imu, tables.gnss, tables.reference)
+    if made_by.dataset.raw:
+        write_raw(folder, row["drive"], tables.raw)
+    return row
 
 
 def gnss_text(config: DatasetConfig) -> str:

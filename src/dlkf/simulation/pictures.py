@@ -19,6 +19,7 @@ from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR
 from dlkf.data.tables import Columns, read_drives
 from dlkf.data.validate import DriveTables, read_checked
 from dlkf.errors import InputError
+from dlkf.files import name_of, placed, staged
 
 Array = NDArray[np.float64]
 AXES = (("x", "#0072B2"), ("y", "#D55E00"), ("z", "#009E73"))
@@ -157,18 +158,17 @@ def write_pictures(dataset: str | Path, out: str | Path, names: Sequence[str] = 
     rows = {row.name: row for row in read_drives(dataset)}
     if unknown := [name for name in names if name not in rows]:
         raise InputError(f"dataset {dataset}: no drive {', '.join(unknown)}; has {', '.join(list(rows)[:5])} …")
-    out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
-    paths, moved = [], []
-    for name, row in rows.items():
-        tables = read_checked(dataset, row)
-        moved.append(driving(tables).every(0.5))
-        if name in (names or list(rows)[:1]):
-            paths.append(out / f"{name}.png")
-            drive_figure(tables).savefig(paths[-1], dpi=90)
-    paths.append(out / "motion.png")
-    motion_figure(moved, Path(dataset).resolve().name).savefig(paths[-1], dpi=90)
-    return paths
+    files, moved = [], []
+    with staged(out) as folder:
+        for name, row in rows.items():
+            tables = read_checked(dataset, row)
+            moved.append(driving(tables).every(0.5))
+            if name in (names or list(rows)[:1]):
+                files.append(f"{name}.png")
+                drive_figure(tables).savefig(folder / files[-1], dpi=90)
+        files.append("motion.png")
+        motion_figure(moved, name_of(dataset)).savefig(folder / files[-1], dpi=90)
+    return [placed(out) / file for file in files]
 
 
 def _track(axes: Axes, figure: Figure, moved: Driving, tables: DriveTables) -> None:

@@ -25,6 +25,7 @@ from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR, VELOCITY, new_dataset, writ
 from dlkf.data.tables import Columns, read_drives
 from dlkf.data.validate import DriveTables, read_checked, validate_dataset
 from dlkf.errors import InputError
+from dlkf.files import placed, readable
 from dlkf.navigation.attitude import rpy_from_rotation
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
@@ -44,7 +45,7 @@ def semi_real_from_config(
     config: Mapping[str, Any], out: str | Path, *, overwrite: bool = False, progress: bool = True
 ) -> Path:
     """Semi-real drives as a mapping with ``source``, ``dataset``, ``imu``, ``seed`` and so on says, into ``out``."""
-    return simulate_semi_real(config["source"], recipe(config), Path(out), overwrite=overwrite, progress=progress)
+    return simulate_semi_real(config["source"], recipe(config), placed(out), overwrite=overwrite, progress=progress)
 
 
 def simulate_semi_real(
@@ -62,7 +63,7 @@ def simulate_semi_real(
     usable reference, or whose IMU errors are known already (it is no real drive).
     """
     rows = read_drives(source)
-    described = pq.read_table(Path(source) / "drives.parquet").to_pandas().to_dict("records")
+    described = pq.ParquetFile(readable(placed(source) / "drives.parquet")).read().to_pandas().to_dict("records")
     shown = track(rows, f"semi-real {made_by.dataset.name}", disable=not progress, console=Console(stderr=True))
     with closing(iter(shown)) as drives, new_dataset(out, overwrite) as folder:  # type: ignore[type-var]
         written = []

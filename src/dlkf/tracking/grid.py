@@ -10,7 +10,6 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -19,6 +18,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from dlkf.errors import InputError
+from dlkf.files import placed
 from dlkf.points import SWEPT, Failure, failures
 from dlkf.report.compare import read_reports, write_comparison
 from dlkf.report.grid import grid_page
@@ -72,7 +72,7 @@ class GridParent(Callback):
         self.close(ended=True)
         os.environ.pop(SWEPT, None)
         out = OmegaConf.select(config, "out")
-        folders = sorted(p.parent for p in Path(out).glob("*/metrics.json")) if out else []
+        folders = sorted(p.parent for p in placed(out).glob("*/metrics.json")) if out else []
         if len(folders) > 1:
             write_comparison(out, read_reports(folders))
             print(f"Compared: {out}/compare.html")

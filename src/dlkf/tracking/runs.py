@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from dlkf.errors import InputError
+from dlkf.files import at_hand, is_url, name_of
 from dlkf.tracking.moved import follow
 
 if TYPE_CHECKING:
@@ -175,11 +176,11 @@ class Run:
 
     def log_files(self, folder: Path | str, under: str | None = None) -> None:
         """Everything in a folder, or one file, as artifacts."""
-        path = Path(folder)
-        if path.is_dir():
-            self.client.log_artifacts(self.id, str(path), under)
-        else:
-            self.client.log_artifact(self.id, str(path), under)
+        with at_hand(folder) as path:
+            if path.is_dir():
+                self.client.log_artifacts(self.id, str(path), under)
+            else:
+                self.client.log_artifact(self.id, str(path), under)
 
     def note(self, markdown: str) -> None:
         """What the UI shows as the description of the run; whole lines up to MLflow's limit."""
@@ -192,9 +193,9 @@ def dataset_entity(folder: Path | str, digest: str):
     """A dataset folder as MLflow knows it: name, digest and place; the data stay where they are."""
     from mlflow.entities import Dataset
 
-    path = Path(folder).expanduser().resolve()
-    source = json.dumps({"uri": path.as_uri()})
-    return Dataset(name=path.name, digest=digest[:36], source_type="local", source=source)
+    url = str(folder) if is_url(folder) else Path(folder).expanduser().resolve().as_uri()
+    kind = url.partition(":")[0] if is_url(folder) else "local"
+    return Dataset(name_of(folder), digest[:36], kind, json.dumps({"uri": url}))
 
 
 def flattened(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:

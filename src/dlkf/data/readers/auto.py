@@ -15,7 +15,7 @@ import yaml
 from dlkf.config import config_dir
 from dlkf.data.readers import formats, recognise
 from dlkf.data.readers.formats import text
-from dlkf.data.readers.frames import DriveFrames, Table
+from dlkf.data.readers.frames import DriveFrames, Place, Table
 from dlkf.data.readers.logs import LogReader
 from dlkf.errors import InputError
 
@@ -64,6 +64,10 @@ class AutoReader:
 
     def read(self, source: str | Path) -> Iterator[DriveFrames]:
         """The drive in a folder or file, or the drives in its subfolders."""
+        return (self.drive_at(*place) for place in self.places(source))
+
+    def places(self, source: str | Path) -> list[Place]:
+        """Where the drives lie, for :meth:`drive_at`."""
         source = Path(source)
         if source.is_file():
             source, only = source.parent, source
@@ -72,15 +76,14 @@ class AutoReader:
         if not source.is_dir():
             raise InputError(f"source={source}: no such file or folder; it holds one drive, or one subfolder per drive")
         if only is not None or self._offers(source):
-            yield self._drive(source, self.drive or (only or source.absolute()).name.partition(".")[0], only)
-            return
+            return [(source, self.drive or (only or source.absolute()).name.partition(".")[0], only)]
         folders = sorted(p for p in source.iterdir() if p.is_dir() and not p.name.startswith("."))
         if not folders:
             raise InputError(f"source={source}: holds no log that can be recognised; name a reader and its columns")
-        for folder in folders:
-            yield self._drive(folder, folder.name, None)
+        return [(folder, folder.name, None) for folder in folders]
 
-    def _drive(self, folder: Path, name: str, only: Path | None) -> DriveFrames:
+    def drive_at(self, folder: Path, name: str, only: Path | None = None) -> DriveFrames:
+        """The drive of a place, by that name."""
         offers = [offer(only)] if only is not None else self._offers(folder)
         specs, told = {}, []
         for kind in ("imu", "gnss"):

@@ -8,6 +8,8 @@ from typing import Any
 
 import pandas as pd
 
+Place = tuple[Path, str, Path | None]  # of a drive: its folder, its name, the one file that counts if there is one
+
 
 @dataclass(frozen=True)
 class Table:

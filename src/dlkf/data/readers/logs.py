@@ -18,7 +18,7 @@ import pandas as pd
 from dlkf.data.discovery.findings import Sure
 from dlkf.data.readers import formats
 from dlkf.data.readers.contract import gnss_frame, imu_frame, reference_frame
-from dlkf.data.readers.frames import DriveFrames
+from dlkf.data.readers.frames import DriveFrames, Place
 from dlkf.data.readers.mapping import SOURCE, Mapped, Spec, check_keys, respaced, selected
 from dlkf.data.readers.settling import AUTO, open_settings, placeholders, settle
 from dlkf.errors import InputError
@@ -70,23 +70,25 @@ class LogReader:
 
     def read(self, source: str | Path) -> Iterator[DriveFrames]:
         """The drives of a folder, in the order of their names."""
+        return (self.drive_at(*place) for place in self.places(source))
+
+    def places(self, source: str | Path) -> list[Place]:
+        """Where the drives lie, for :meth:`drive_at`."""
         source = Path(source)
         if source.is_file():
-            yield self._drive(source.parent, self.drive or source.name.partition(".")[0], source)
-            return
+            return [(source.parent, self.drive or source.name.partition(".")[0], source)]
         if not source.is_dir():
             raise InputError(f"source={source}: no such file or folder; it holds one drive, or one subfolder per drive")
         patterns = self.specs["imu"].get("file")
         if _matching(source, patterns):
-            yield self._drive(source, self.drive or source.absolute().name)
-            return
+            return [(source, self.drive or source.absolute().name, None)]
         folders = sorted(p for p in source.iterdir() if p.is_dir() and not p.name.startswith("."))
         if not folders:
             raise InputError(f"source={source}: no file {_said(patterns)} and no subfolders; set reader.imu.file")
-        for folder in folders:
-            yield self._drive(folder, folder.name)
+        return [(folder, folder.name, None) for folder in folders]
 
-    def _drive(self, folder: Path, name: str, only: Path | None = None) -> DriveFrames:
+    def drive_at(self, folder: Path, name: str, only: Path | None = None) -> DriveFrames:
+        """The drive of a place, by that name."""
         kinds = [kind for kind, spec in self.specs.items() if spec.get("file") is not None]
         if "imu" not in kinds:
             raise InputError("reader.imu.file is null; a drive needs an IMU")
