@@ -24,6 +24,7 @@ from dlkf.evaluation.table import all_tables, as_rich
 from dlkf.tracking.grid import PARENT_RUN, run_name
 from dlkf.tracking.registry import check_registration, log_model
 from dlkf.tracking.runs import lightning_logger, start_run, tracking_uri
+from dlkf.training.fit import check_accelerator
 from dlkf.training.processes import is_further
 from dlkf.training.run_folder import checked_digests, run_folder, write_state
 from dlkf.training.settings import study_settings
@@ -41,6 +42,7 @@ def main(cfg: DictConfig) -> None:
     if is_further():
         train_along(settings, load_data(config["data"], lambda _: None), run_folder(config)[0])
         return
+    check_accelerator(settings.fit)
     make_missing(config, console)
     data = load_data(config["data"], console.print)
     folder, state = run_folder(config)

@@ -55,6 +55,7 @@ RESOLUTION = {
     "gnss_logger": Resolution(accel=5e-8, gyro=1e-9, down=False, velocity=2e-6),
     "sensor_logger": Resolution(down=False),
     "phyphox": Resolution(down=False, std=False),
+    "phyphox_android": Resolution(down=False, std=False),
     "novatel": Resolution(accel=8e-7, gyro=5e-8, velocity=5.1e-5, std=False),
     "novatel_x": Resolution(accel=8e-7, gyro=5e-8, velocity=5.1e-5, std=False),
     "ros1": Resolution(std=False),

@@ -52,8 +52,7 @@ def fit(
         module.filter = trained_filter(settings.finetune).train()
     elif isinstance(module.filter, LearnedFilter) and not last.is_file():
         warm_start(module.filter, data, mean_imu_error)
-    for name in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(name).setLevel(logging.ERROR)
+    _hush()
     with warnings.catch_warnings(), joined_by(further, plan.devices):
         warnings.filterwarnings("ignore", module="lightning")
         trainer = L.Trainer(
@@ -99,6 +98,20 @@ def fit(
             f"trainer.best_from_epoch={plan.best_from_epoch} and validate_every={plan.validate_every}"
         )
     return folder / BEST
+
+
+def check_accelerator(settings: FitSettings) -> None:
+    """Lightning's error for an accelerator that is unknown or not there, before any work is done for it."""
+    _hush()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module="lightning")
+        quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+        L.Trainer(accelerator=settings.trainer.accelerator, devices=1, enable_model_summary=False, **quiet)
+
+
+def _hush() -> None:
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.ERROR)
 
 
 def _shared() -> DDPStrategy:

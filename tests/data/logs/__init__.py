@@ -12,7 +12,7 @@ import pymap3d
 from tests.cars import Tables
 from tests.data.logs.arrays import csv, kfgins, kitti, matlab, navego, navego_73, parquet
 from tests.data.logs.bags import ros1, ros1_nmea, ros1_ublox, ros2, ros2_ublox
-from tests.data.logs.phones import gnss_logger, phyphox, sensor_logger
+from tests.data.logs.phones import gnss_logger, phyphox, phyphox_android, sensor_logger
 from tests.data.logs.receivers import (
     inertial_explorer,
     nmea,
@@ -28,7 +28,7 @@ from tests.data.logs.receivers import (
 WRITERS: tuple[Callable[[Path, Tables], list[str]], ...] = (
     *(csv, parquet, ubx, ubx_meas, nmea, ros1, ros2, ros1_nmea, ros1_ublox, ros2_ublox, navego, navego_73, matlab),
     *(kitti, kfgins, rtklib, rtklib_ecef, rtklib_dms, inertial_explorer, sensor_logger, gnss_logger, phyphox),
-    *(novatel, novatel_x),
+    *(phyphox_android, novatel, novatel_x),
 )
 
 

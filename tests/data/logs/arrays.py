@@ -93,10 +93,11 @@ def kitti(folder: Path, tables: Tables) -> list[str]:
 
 
 def kfgins(folder: Path, tables: Tables) -> list[str]:
-    """numpy: seconds of week, increments; degrees and stds."""
+    """As KF-GINS' own sample: blanks to fixed columns and at the end of a line; s of week, increments, degrees, stds."""
     imu, gnss = tables["imu"], tables["gnss"]
     values = imu[[*AXES[3:], *AXES[:3]]].to_numpy() * 0.01
-    np.savetxt(folder / "IMU.txt", np.column_stack((TOW + imu.t, values)), fmt="%.12g")
+    np.savetxt(folder / "Leador-A15.txt", np.column_stack((TOW + imu.t, values)), fmt="%14.6f" + " %20.13g" * 6 + " ")
     names = ["lat_deg", "lon_deg", "height_m", "std_pos_n", "std_pos_e", "std_pos_d"]
-    np.savetxt(folder / "GNSS.txt", np.column_stack((TOW + gnss.t, gnss[names])), fmt="%.12g")
+    form = "%.3f  %15.10f %16.10f %10.3f %8.3f %8.3f %8.3f "
+    np.savetxt(folder / "GNSS-RTK.txt", np.column_stack((TOW + gnss.t, gnss[names])), fmt=form)
     return ["reader=kfgins"]

@@ -171,12 +171,14 @@ def _quality(mapped: Mapped) -> np.ndarray:
     """NMEA GGA codes: through ``map`` where one is given, else the column as it is, else ``default``."""
     spec: Any = mapped.spec.get("quality") or {}
     name, default = spec.get("column"), spec.get("default")
+    if name is None and spec.get("map"):
+        raise InputError(f"reader.{mapped.kind}.quality.map needs the column that it is for: give quality.column")
     if name is None:
-        return np.full(len(mapped), 1 if default is None else int(default))
+        return np.full(len(mapped), 1 if default is None else _code(default, "default"))
     part = mapped.of("quality")
     if not spec.get("map"):
         return np.nan_to_num(part.column(name, nan=True)).astype(np.int64)
-    codes = {str(k): int(v) for k, v in spec["map"].items()}
+    codes = {str(k): _code(v, f"map.{k}") for k, v in spec["map"].items()}
     texts = part.texts(name)
     unknown = sorted(set(texts) - set(codes))
     if unknown and default is None:
@@ -184,7 +186,13 @@ def _quality(mapped: Mapped) -> np.ndarray:
             f"{part.table.path}: quality {unknown[0]!r} is not in reader.gnss.quality.map; add it, "
             f"or set reader.gnss.quality.default for all that are not"
         )
-    return texts.map(codes).fillna(int(default or 0)).to_numpy().astype(np.int64)
+    return texts.map(codes).fillna(_code(default or 0, "default")).to_numpy().astype(np.int64)
+
+
+def _code(value: Any, where: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 8:
+        raise InputError(f"reader.gnss.quality.{where} is {value!r}, must be a code of NMEA's GGA, 0 to 8")
+    return value
 
 
 def _attitudes(mapped: Mapped) -> np.ndarray:

@@ -159,7 +159,8 @@ class Mapped:
         raise InputError(f"{self.table.path}: {self.table.row} {number}: column {str(name)!r} {what}")
 
     def _cells(self, name: str | int) -> pd.Series:
-        name = str(name)
+        """A column; of alternatives (``A | B``) the first that is there."""
+        name = next((one for one in (str(name), *str(name).split(" | ")) if one in self.table.frame), str(name))
         if name not in self.table.frame:
             have = [str(c) for c in self.table.frame.columns]
             has = ", ".join(have[:24]) + (", …" if len(have) > 24 else "")
