@@ -93,7 +93,7 @@ def kitti(folder: Path, tables: Tables) -> list[str]:
 
 
 def kfgins(folder: Path, tables: Tables) -> list[str]:
-    """As KF-GINS' own sample: blanks to fixed columns and at the end of a line; s of week, increments, degrees, stds."""
+    """As KF-GINS' own sample: fixed columns, a blank at the end of a line; s of week, increments, degrees, stds."""
     imu, gnss = tables["imu"], tables["gnss"]
     values = imu[[*AXES[3:], *AXES[:3]]].to_numpy() * 0.01
     np.savetxt(folder / "Leador-A15.txt", np.column_stack((TOW + imu.t, values)), fmt="%14.6f" + " %20.13g" * 6 + " ")

@@ -40,7 +40,7 @@ def sensor_logger(folder: Path, tables: Tables) -> list[str]:
 
 def gnss_logger(folder: Path, tables: Tables) -> list[str]:
     """Lines of Google's GnssLogger 3: UncalAccel, UncalGyro, Fix."""
-    lines = ["# ", "# Header Description:", "# ", "# Version: v3.0.5.6 Platform: 13 Manufacturer: Google Model: Pixel 7"]
+    lines = ["# ", "# Header Description:", "# ", "# Version: v3.0.5.6 Platform: 13 Manufacturer: Google"]
     lines += [f"# {name},{','.join(columns)}" for name, columns in GNSS_LOGGER.items()]
     for r in tables["imu"].to_dict("records"):
         ms = UNIX * 1000 + round(1000 * r["t"])
