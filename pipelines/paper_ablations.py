@@ -11,13 +11,12 @@ the start and after minutes of GNSS. Finished trainings are kept: the same comma
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.table import number, with_interval
-from dlkf.tracking.chain import Study
+from dlkf.tracking.chain import Study, arguments
 
 HOME = Path("outputs/paper/ablations")
 ROWS: dict[str, tuple[str, ...]] = {
@@ -46,16 +45,15 @@ SCORED = ("baselines.models=[mbkf15]", "scoring.after_s=[22,120]", "scoring.hour
 
 def main() -> None:
     """Every row and seed under one parent run, then the table."""
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    arguments.add_argument("--seeds", default="0", help="one training of every row for each")
-    arguments.add_argument("--rows", help=f"of: {', '.join(ROWS)}")
-    options, overrides = arguments.parse_known_args()
+    parser = arguments(__doc__, "0", "one training of every row for each")
+    parser.add_argument("--rows", help=f"of: {', '.join(ROWS)}")
+    options, overrides = parser.parse_known_args()
     rows = options.rows.split(",") if options.rows else list(ROWS)
     if unknown := [row for row in rows if row not in ROWS]:
-        arguments.error(f"there is no row {unknown[0]!r}; there are {', '.join(ROWS)}")
+        parser.error(f"there is no row {unknown[0]!r}; there are {', '.join(ROWS)}")
     study = Study(HOME)
     with study.parent("ablations", "paper R050, R052, R063"):
-        for seed in options.seeds.split(","):
+        for seed in options.seeds:
             for row in rows:
                 change = ("+experiment=outage", "+profile=quick", "name=ablations", f"seed={seed}", *SCORED, *ROWS[row])
                 study.train(f"{row}/{seed}", *change, *overrides)

@@ -11,10 +11,9 @@ key=value go to ``dlkf.train``.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
-from dlkf.tracking.chain import Study
+from dlkf.tracking.chain import Study, arguments
 
 HOME = Path("outputs/paper/imu_error")
 VARIANTS = {
@@ -26,12 +25,10 @@ VARIANTS = {
 
 def main() -> None:
     """Every variant and seed under one parent run."""
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    arguments.add_argument("--seeds", default="0,1,2", help="one training of every variant for each")
-    options, overrides = arguments.parse_known_args()
+    options, overrides = arguments(__doc__, "0,1,2", "one training of every variant for each").parse_known_args()
     study = Study(HOME)
     with study.parent("imu_error", "paper 5.1"):
-        for seed in options.seeds.split(","):
+        for seed in options.seeds:
             for name, given in VARIANTS.items():
                 folder = study.train(f"{name}/{seed}", "+experiment=imu_error", f"seed={seed}", *given, *overrides)
                 print(f"{name}, seed {seed}: {folder / 'report' / 'report.html'}")

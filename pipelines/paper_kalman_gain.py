@@ -10,12 +10,11 @@ Further key=value go to ``dlkf.train``.
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 from pathlib import Path
 
-from dlkf.tracking.chain import Study
+from dlkf.tracking.chain import Study, arguments
 
 HOME = Path("outputs/paper/kalman_gain")
 SETS = ("set1", "set2", "set3", "set4", "set5", "set6")
@@ -23,12 +22,10 @@ SETS = ("set1", "set2", "set3", "set4", "set5", "set6")
 
 def main() -> int:
     """Every set and seed under one parent run, then what they say together."""
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    arguments.add_argument("--seeds", default="0", help="six trainings for each")
-    options, overrides = arguments.parse_known_args()
+    options, overrides = arguments(__doc__, "0", "six trainings for each").parse_known_args()
     study = Study(HOME)
     with study.parent("kalman_gain", "paper 5.2"):
-        for seed in options.seeds.split(","):
+        for seed in options.seeds:
             for noise in SETS:
                 study.train(
                     f"{noise}/{seed}", "+experiment=kalman_gain", f"+noise={noise}", f"seed={seed}", *overrides

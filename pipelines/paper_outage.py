@@ -13,10 +13,9 @@ kept: the same command goes on.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
-from dlkf.tracking.chain import Study, run
+from dlkf.tracking.chain import Study, arguments, run
 
 HOME = Path("outputs/paper/outage")
 NEW_IMUS = Path("data/per_drive")
@@ -24,16 +23,14 @@ NEW_IMUS = Path("data/per_drive")
 
 def main() -> None:
     """Train every seed, then evaluate all models together."""
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="a few minutes of training instead of 500 epochs")
-    arguments.add_argument("--seeds", default="0", help="one training for each; key=value goes to dlkf.train")
-    arguments.add_argument("--models", default="dlkf", help="dlkf, dlkf_literal (the paper to the letter), or both")
-    options, overrides = arguments.parse_known_args()
+    parser = arguments(__doc__, "0", "one training of every model for each")
+    parser.add_argument("--quick", action="store_true", help="a few minutes of training instead of 500 epochs")
+    parser.add_argument("--models", default="dlkf", help="dlkf, dlkf_literal (the paper to the letter), or both")
+    options, overrides = parser.parse_known_args()
     profile = ["+profile=quick"] if options.quick else []
-    seeds = options.seeds.split(",")
     study = Study(HOME if not options.quick else HOME.with_name("outage_quick"))
     with study.parent("outage", "paper 5.3"):
-        for seed in seeds:
+        for seed in options.seeds:
             for model in options.models.split(","):
                 register = ["tracking.register=outage", f"tracking.alias=seed{seed}"] if model == "dlkf" else []
                 given = ["+experiment=outage", *profile, f"model={model}", f"seed={seed}", *register, *overrides]
@@ -42,7 +39,7 @@ def main() -> None:
         run("simulate", "dataset=per_drive", f"out={NEW_IMUS}")
     if "dlkf" not in options.models.split(","):
         return
-    models = ",".join(["ins", "mbkf15", *(f"models:/outage@seed{seed}" for seed in seeds)])
+    models = ",".join(["ins", "mbkf15", *(f"models:/outage@seed{seed}" for seed in options.seeds)])
     outage = ["length_s=80", "stride_s=80", "outage.first_s=[20,25]", "outage.duration_s=[30,50]"]
     out = ("out=outputs/paper/new_imus", "overwrite=true")
     run("evaluate", f"model=[{models}]", f"dataset={NEW_IMUS}", *out, *outage)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import subprocess
@@ -13,6 +14,16 @@ from pathlib import Path
 from dlkf.files import whole_file
 from dlkf.tracking.grid import PARENT_RUN, parent_status
 from dlkf.tracking.runs import client_of, experiment_id, tracking_uri
+
+
+def arguments(doc: str | None, seeds: str, each: str) -> argparse.ArgumentParser:
+    """What every chain of trainings takes; words that it does not know are key=value for ``dlkf.train``.
+
+    ``seeds`` is the default, ``each`` says what one seed costs.
+    """
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--seeds", default=seeds, type=lambda given: given.split(","), help=each)
+    return parser
 
 
 class Study:
