@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,7 +36,7 @@ from dlkf.filters.shipped import trained_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.running.batched import run_filter
-from dlkf.tuning.search import tuned, tuning_values
+from dlkf.tuning.search import tuned
 
 CLASSICAL = ("mbkf21_nhc", "mbkf21_car", "mbkf33_car")
 START = StartLaw(position_m=0.1, velocity_mps=0.1, roll_pitch_deg=1.0, yaw_deg=2.0)
@@ -80,7 +80,7 @@ def opponents(train: Sequence[str], out: Path) -> dict[str, Estimator]:
             pieces = pieces or [outages(load(train), 60.0, most=90)]
             factors, error = tuned(spec, pieces, name=name, start=Tuning(), objective="log", rounds=2)
             print(f"{name}: {error:.2f} m geometric mean on {pieces[0].size[0]} training pieces", flush=True)
-            known[name] = tuning_values(factors)
+            known[name] = asdict(factors)
             file.write_text(yaml.safe_dump(known))
     return {name: build_causal(name, spec, "a stream cannot", tuning=known[name]) for name in CLASSICAL}
 
@@ -140,6 +140,7 @@ def main() -> None:
     torch.set_num_threads(1)
     args.out.mkdir(parents=True, exist_ok=True)
     model = trained_filter(args.model)
+    assert isinstance(model, PlusFilter)
     filters = {**opponents(args.train, args.out), "plus": model}
     rows, ablated = [], []
     for folder in (*args.test, *args.semi, *args.real):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dlkf.data.augmentation import turn_frames
-from dlkf.data.masks import BiasLaw, every_nth, with_bias, withhold, within
+from dlkf.data.masks import BiasLaw, with_bias, withhold, within
 from dlkf.data.segments import (
     Piece,
     StartLaw,
@@ -148,12 +148,7 @@ def test_masks(drives):
     assert torch.nonzero(~out.available[0]).flatten().tolist() == list(
         range(10, 25)
     )  # ends of epochs 11 … 25 s
-    assert torch.nonzero(every_nth(batch, 5).available[0]).flatten().tolist() == [4, 9, 14, 19, 24, 29]
-    both = every_nth(batch.select(torch.tensor([0, 0])), torch.tensor([2, 7])).available
-    assert [torch.nonzero(row).flatten().tolist()[:3] for row in both] == [[1, 3, 5], [6, 13, 20]]
     assert batch.available.all()
-    with pytest.raises(InputError, match="interval is 0"):
-        every_nth(batch, 0)
 
 
 def test_turned_frames_are_the_same_piece(drives):

@@ -1,18 +1,18 @@
 """The comparison of plus with tuned classical filters, on three minutes of drives and factors found before."""
 
 import sys
+from dataclasses import asdict
 
 import yaml
 from pipelines.studies import plus
 
 from dlkf.filters.tuning import Tuning
-from dlkf.tuning.search import tuning_values
 
 
 def test_it_scores_and_writes_its_tables(simulated, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     out.mkdir()
-    (out / "factors.yaml").write_text(yaml.safe_dump({name: tuning_values(Tuning()) for name in plus.CLASSICAL}))
+    (out / "factors.yaml").write_text(yaml.safe_dump({name: asdict(Tuning()) for name in plus.CLASSICAL}))
     words = ["--train", "none", "--test", str(simulated), "--outages", "20", "--ablation", "--out", str(out)]
     monkeypatch.setattr(sys, "argv", ["plus", *words])
     plus.main()

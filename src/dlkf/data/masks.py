@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dlkf.data.drive import Batch
-from dlkf.errors import InputError
 from dlkf.settings import check_from_zero
 
 
@@ -53,15 +52,6 @@ def within(batch: Batch, start_s: float | Tensor, duration_s: float | Tensor) ->
     start, length = (torch.as_tensor(x, dtype=torch.float64).expand(B)[:, None] for x in (start_s, duration_s))
     slack = 1e-6 * batch.epoch_s
     return (t > start + slack) & (t <= start + length + slack)
-
-
-def every_nth(batch: Batch, n: int | Tensor) -> Batch:
-    """The batch with only every n-th epoch's fix, the first one after n epochs; ``n`` may be one a piece (B,)."""
-    B, T, _ = batch.size
-    interval = torch.as_tensor(n).expand(B)[:, None]
-    if bool((interval < 1).any()):
-        raise InputError(f"decimation interval is {int(interval.min())}, must be ≥ 1 epoch")
-    return withhold(batch, torch.arange(1, T + 1) % interval != 0)
 
 
 def with_bias(batch: Batch, bias: Float[Tensor, "b 6"]) -> Batch:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import count
 from typing import Any
 
 from dlkf.console import counting
 from dlkf.data.drive import Batch
-from dlkf.filters.build import build_filter
-from dlkf.filters.integration import Estimator
+from dlkf.filters.build import build_causal, build_filter
+from dlkf.filters.smoother import Filter
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.tuning.search import (
@@ -20,7 +20,6 @@ from dlkf.tuning.search import (
     has_prior,
     outage_error,
     tuned,
-    tuning_values,
     without_prior,
 )
 
@@ -36,7 +35,7 @@ class Baselines:
     prior: Prior
     priors: dict[str, Prior]
 
-    def build(self) -> dict[str, Estimator]:
+    def build(self) -> dict[str, Filter]:
         """The filters."""
         return {n: build_filter(n, self.imu, tuning=t, **self.told(n)) for n, t in self.tunings.items()}
 
@@ -48,7 +47,7 @@ class Baselines:
         """Plain values for a report."""
         return {
             "imu": self.imu.name,
-            "tuning": {n: tuning_values(t) for n, t in self.tunings.items() if n != "ins"},
+            "tuning": {n: asdict(t) for n, t in self.tunings.items() if n != "ins"},
             "prior": {n: {"mean": list(p.mean), "std": list(p.std)} for n, p in self.priors.items()},
         }
 
@@ -71,7 +70,7 @@ def tuned_baselines(
             priors[name] = prior if name == f"{FIRST}_prior" else best_prior(imu, start, batches, name)
         if name in ("ins", FIRST):
             tunings[name] = start
-            error = outage_error(build_filter(name, imu, tuning=start), batches)
+            error = outage_error(build_causal(name, imu, "tuning does not", tuning=start), batches)
         else:
             tunings[name], error = _searched(imu, batches, name, rounds, start, priors.get(name))
         how = "tuned" if rounds and name != "ins" else "untuned"

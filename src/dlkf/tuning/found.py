@@ -15,7 +15,6 @@ from dlkf.files import staged
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import NEEDED, ImuSpec
 from dlkf.running.likelihood import Evidence, Found, find_noise
-from dlkf.tuning.search import tuning_values
 
 
 def found_noise(
@@ -50,7 +49,7 @@ def write_noise(out: str | Path, found: Found, table: Table) -> list[str]:
     }
     preset = {"name": name, "source": found.imu.source, **sensors}
     with staged(out) as folder:
-        for kind, values in (("imu", preset), ("tuning", tuning_values(found.tuning))):
+        for kind, values in (("imu", preset), ("tuning", asdict(found.tuning))):
             (folder / kind).mkdir()
             text = f"# {table.title}\n{yaml.safe_dump(values, sort_keys=False)}"
             (folder / kind / f"{name}.yaml").write_text(text)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import end_errors, mean_error
-from dlkf.filters.build import build_causal, build_filter
+from dlkf.filters.build import build_causal
 from dlkf.filters.integration import Estimator, integrate
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.tuning import Tuning
@@ -166,6 +166,7 @@ def mean_imu_error(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name:
     floor = torch.tensor([1e-3] * 3 + [1e-5] * (states.imu - 3), dtype=estimates.dtype)
     mean, spread = estimates.mean(0), estimates.std(0)
     if states.elements:
+        assert before is not None
         together = torch.linalg.inv(before + torch.stack(gains).sum(0))
         mean[6:] = (together @ torch.stack(pulls).sum(0))[:, 0]
         spread[6:] = together.diagonal().sqrt()
@@ -196,9 +197,9 @@ def best_prior(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name: str
     """
     prior = mean_imu_error(imu, tuning, batches, without_prior(name))
     tried = [prior.surer(factor) for factor in (3.0, 1.0, 0.3, 0.1)]
-    return min(tried, key=lambda p: outage_error(build_filter(name, imu, tuning=tuning, **p.told(name)), batches))
 
+    def error(tried: Prior) -> float:
+        told = tried.told(name)
+        return outage_error(build_causal(name, imu, "a prior does not", tuning=tuning, **told), batches)
 
-def tuning_values(tuning: Tuning) -> dict[str, float]:
-    """The factors as plain values for a config, a log or a report."""
-    return asdict(tuning)
+    return min(tried, key=error)

@@ -6,7 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,10 @@ from dlkf.evaluation.metrics import OBJECTIVES
 from dlkf.evaluation.protocol import Protocol, Scenes
 from dlkf.evaluation.table import Table, as_markdown, number
 from dlkf.files import staged
-from dlkf.filters.build import build_filter, is_filter
+from dlkf.filters.build import build_causal, is_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.tuning.search import Trial, factors_of, outage_error, tuned, tuning_values
+from dlkf.tuning.search import Trial, factors_of, outage_error, tuned
 
 LIKELIHOOD = "likelihood"  # the objective that needs no reference (dlkf.tuning.found)
 
@@ -42,7 +42,7 @@ class Tuned:
     @property
     def changed(self) -> dict[str, float]:
         """What is not as it comes."""
-        start, default = tuning_values(self.after), tuning_values(Tuning())
+        start, default = asdict(self.after), asdict(Tuning())
         return {k: v for k, v in start.items() if v != default[k]}
 
     def metrics(self) -> dict[str, float]:
@@ -113,7 +113,7 @@ def search(
     batches = {"train": training}
     if drives["test"]:
         batches["test"] = withheld(drives["test"], protocol)
-    old, new = (build_filter(model, imu, tuning=t) for t in (start, after))
+    old, new = (build_causal(model, imu, "tuning does not", tuning=t) for t in (start, after))
     errors = [
         (side, o, outage_error(old, b, o), outage_error(new, b, o)) for side, b in batches.items() for o in OBJECTIVES
     ]
@@ -138,7 +138,7 @@ def tuning_table(result: Tuned, dataset: str) -> Table:
 
 def write_tuning(out: str | Path, name: str, result: Tuned, table: Table) -> list[str]:
     """Write tuning/<name>.yaml, table.md and search.csv into ``out``, all or none; their names."""
-    factors = f"# {table.title}\n{yaml.safe_dump(tuning_values(result.after), sort_keys=False)}"
+    factors = f"# {table.title}\n{yaml.safe_dump(asdict(result.after), sort_keys=False)}"
     trials = io.StringIO()
     writer = csv.writer(trials, lineterminator="\n")
     writer.writerow(["factor", "value", "error_m"])

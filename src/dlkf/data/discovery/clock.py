@@ -28,10 +28,8 @@ class Lag:
     lag_s: float
     gain: float
     rival: float
-    rival_s: float
     yaw: float  # correlation of the yaw rate with the course at the lag
     force: float  # of the horizontal force with the acceleration
-    overlap_s: float
     angle: float  # rad, by which the sensor's x axis points to the right of the direction of travel
 
     @property
@@ -71,7 +69,7 @@ def find_lag(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, within_s: flo
     others = np.where(np.abs(lags - lags[best]) > NEIGHBOUR_S, gain, -np.inf)
     rival = int(others.argmax())
     other = float(others[rival]) if np.isfinite(others[rival]) else 0.0
-    numbers = (lags[best], gain[best], other, lags[rival], yaws[best], forces[best], count[best] * usual, angles[best])
+    numbers = (lags[best], gain[best], other, yaws[best], forces[best], angles[best])
     return Lag(*(float(x) for x in numbers))
 
 
@@ -115,7 +113,8 @@ def _imu_signals(t: Floats, accel: Floats, gyro: Floats, width_s: float) -> tupl
     w = gyro @ -up
     step = np.diff(t, prepend=t[0])
     step = np.where(step > 1.0, 0.0, step)
-    covered, angle, gained = np.cumsum(step), np.cumsum(w * step), np.cumsum(f * step)
+    covered, angle = np.cumsum(step), np.cumsum(w * step)
+    gained: Complex = np.cumsum(f * step)
     grid = np.arange(t[0] + width_s / 2, t[-1] - width_s / 2, STEP_S)
     if len(grid) < 2:
         grid = np.array([t[0], t[0] + STEP_S])
@@ -137,10 +136,10 @@ def _scores(
     """
     size = fft.next_fast_len(len(weight) + len(there) - 1)
 
-    def turned(x: np.ndarray) -> np.ndarray:
+    def turned(x: np.ndarray) -> Complex:
         return fft.fft(x, size)
 
-    def against(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    def against(left: Complex, right: Complex) -> Complex:
         out = fft.ifft(np.conj(left) * right)
         return np.concatenate((out[size - len(weight) + 1 :], out[: len(there)]))
 
@@ -152,7 +151,7 @@ def _scores(
     count = np.round(n)
     n = np.maximum(n, 1.0)
 
-    def correlation(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    def correlation(ours: np.ndarray, theirs: np.ndarray) -> Complex:
         A, B = turned(ours), turned(theirs)
         mean_a, mean_b = np.conj(against(A, M)) / n, against(W, B) / n
         covariance = against(A, B) / n - np.conj(mean_a) * mean_b

@@ -190,10 +190,3 @@ def _delay(out: Findings, raw: Raw) -> None:
         out.add("gnss.position.delay_s", 0.0, True, f"{seen}: none taken")
         return
     out.add("gnss.position.delay_s", round(late, 3), True, f"± {std:.3f} s, against the velocities")
-
-
-def resting_s(gnss: Motion) -> float:
-    """Seconds at rest by GNSS."""
-    first, last = gnss.intervals()
-    still = np.maximum(gnss.speed[first], gnss.speed[last]) < 0.15
-    return float(np.sum((gnss.t[last] - gnss.t[first])[still]))

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+Floats = NDArray[np.floating]
+Complex = NDArray[np.complexfloating]
 
 MOVING, RESTING = 2.0, 0.3  # m/s: above, the course is known; below, the car stands
 LONGEST_STEP_S = 2.5  # fixes further apart make no interval
@@ -29,7 +29,6 @@ class Motion:
     t: Floats
     v: Complex
     climb: Floats
-    from_positions: bool = False
     stride: int = 1
 
     @property
@@ -80,7 +79,7 @@ def _from_positions(t: Floats, lat_deg: Floats, lon_deg: Floats) -> Motion:
     fine = (step > 0) & (step <= LONGEST_STEP_S)
     z = EARTH_M * (np.diff(lat) + 1j * np.cos(lat[:-1]) * np.diff(lon))
     middle = 0.5 * (t[1:] + t[:-1])[fine]
-    return Motion(middle, z[fine] / step[fine], np.zeros(int(fine.sum())), from_positions=True)
+    return Motion(middle, z[fine] / step[fine], np.zeros(int(fine.sum())))
 
 
 def position_delay(t: Floats, lat_deg: Floats, lon_deg: Floats, v_ned: Floats) -> tuple[float, float]:

@@ -15,7 +15,7 @@ ALIKE = 0.12  # of a unit's size, of what is regressed
 
 def accel_units(size: float, known: Mapping[str, float]) -> list[str]:
     """The units in which ``size`` is gravity, one of each factor: mg and cm/s² are 2 % apart, as biases are."""
-    fits = {factor: name for name, factor in reversed(known.items()) if abs(size * factor / G - 1) < NEAR}
+    fits = {factor: name for name, factor in reversed(list(known.items())) if abs(size * factor / G - 1) < NEAR}
     return list(fits.values())
 
 

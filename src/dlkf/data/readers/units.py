@@ -21,7 +21,7 @@ LENGTH = {"m": 1.0, "mm": 1e-3, "cm": 0.01, "km": 1e3, "ft": 0.3048}
 TIME = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": 1_000_000_000}  # ticks per second
 ISO = "iso"  # calendar texts: 2025-07-05T23:57:12.7Z, 2025/07/05 23:57:12.700
 CLOCKS = ("gps", "unix", "utc")
-WEEK_S, DAY_S = 604_800, 86_400
+WEEK_S = 604_800
 GPS_EPOCH_UNIX = 315_964_800  # 1980-01-06 in Unix seconds
 # days from which GPS − UTC is one second more than before (IERS Bulletin C): 0 in 1980, 18 since 2017
 LEAP_DAYS = (
@@ -39,7 +39,7 @@ def factor(unit: str | float, table: Mapping[str, float], where: str) -> float:
     """SI per unit; ``unit`` is a name in the table or that number itself. InputError for unknown names."""
     if isinstance(unit, (int, float)) and not isinstance(unit, bool):
         return float(unit)
-    if unit not in table:
+    if not isinstance(unit, str) or unit not in table:
         raise InputError(f"{where}: unknown unit {unit!r}; known are {', '.join(table)}, or a number (SI per unit)")
     return float(table[unit])
 
