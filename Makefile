@@ -6,13 +6,14 @@ PROFILE ?= quick
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help install train test lint bench docs ui clean
+.PHONY: help install train test lint types bench docs ui clean
 
 help:
 	@echo "make install   what training, evaluating and navigating need, into .venv"
 	@echo "make train     train on simulated drives and score against the baselines, some minutes"
 	@echo "make test      all tests"
-	@echo "make lint      ruff and pyright"
+	@echo "make lint      ruff, then make types"
+	@echo "make types     pyright over src and pipelines, half a minute"
 	@echo "make bench     speed of the filters and of training"
 	@echo "make docs      the pages of docs/ with search, equations and the API, in outputs/docs"
 	@echo "make ui        MLflow's pages over the runs of this folder"
@@ -39,8 +40,10 @@ train: .venv/installed
 test: .venv/installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(ARGS)
 
-lint: .venv/installed-dev
+lint: .venv/installed-dev types
 	$(BIN)/ruff check src tests pipelines docs
+
+types: .venv/installed-dev
 	$(BIN)/pyright
 
 bench: .venv/installed

@@ -13,10 +13,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
-from dlkf.config import config_dir
+from dlkf.command.composing import composed
 from dlkf.data.drive import Batch
 from dlkf.points import SWEPT
 from dlkf.simulation.dataset import simulate_from_config
@@ -55,10 +53,8 @@ def noisy_town(cars, tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def simulated(tmp_path_factory) -> Path:
     """Two drives of 90 s in a town."""
-    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
-        config = compose("simulate", ["simulated@dataset=per_drive", "dataset.name=town", *SIZE])
-    folder = tmp_path_factory.mktemp("data") / "town"
-    return simulate_from_config(OmegaConf.to_container(config, resolve=True), folder, progress=False)
+    config = composed("simulate", "simulated@dataset=per_drive", "dataset.name=town", *SIZE)
+    return simulate_from_config(config, tmp_path_factory.mktemp("data") / "town", progress=False)
 
 
 @pytest.fixture

@@ -37,7 +37,8 @@ def attitude_at(solution: pd.DataFrame, t: np.ndarray) -> np.ndarray:
     """Roll, pitch, yaw [rad] of a solution at times inside it, NaN outside (n, 3)."""
     at = np.asarray(t, dtype=float)
     known = solution.t.to_numpy()
-    turns = Slerp(known, Rotation.from_euler("ZYX", solution[RPY[::-1]].to_numpy()))
+    angles = solution[RPY[::-1]].to_numpy()
+    turns = Slerp(known, Rotation.from_euler("ZYX", angles))  # pyright: ignore[reportArgumentType]  a stack of n
     inside = (at >= known[0]) & (at <= known[-1])
     out = np.full((len(at), 3), np.nan)
     out[inside] = turns(at[inside]).as_euler("ZYX")[:, ::-1]
@@ -109,7 +110,7 @@ def read(dataset: Path, kind: str, drive: str) -> pd.DataFrame:
 def report(found: dict[str, dict[str, pd.DataFrame]], frames: dict[str, pd.DataFrame]) -> None:
     """RMS of roll, pitch and yaw against the attitudes that are known."""
     for kind, tables in found.items():
-        rows = np.concatenate([errors(attitude_at(tables[d], f.t), f) for d, f in frames.items()])
+        rows = np.concatenate([errors(attitude_at(tables[d], f.t.to_numpy()), f) for d, f in frames.items()])
         if not len(rows):
             print("the reference knows no attitude to compare with")
             return
@@ -126,12 +127,12 @@ def write(options: argparse.Namespace, tables: dict[str, pd.DataFrame], frames: 
         for row in rows[rows.drive.isin(list(tables))].to_dict("records"):
             name = row["drive"]
             frame = frames[name]
-            made = attitude_at(tables[name], frame.t)
+            made = attitude_at(tables[name], frame.t.to_numpy())
             unknown = ~np.isfinite(frame[RPY].to_numpy(dtype=float)).all(1)
             frame.loc[unknown, list(ATTITUDE)] = made[unknown]
             row["reference"] += f"; attitude: {options.model} smoothed, IMU preset {options.imu}"
-            inputs = (read(options.dataset, kind, name) for kind in ("imu", "gnss"))
-            written.append(write_drive(folder, row, *inputs, frame))
+            imu, gnss = (read(options.dataset, kind, name) for kind in ("imu", "gnss"))
+            written.append(write_drive(folder, row, imu, gnss, frame))
         write_drives_table(folder, written)
     print(f"{options.out}: attitude filled in for {len(written)} drives")
 

@@ -110,7 +110,7 @@ def tried(
     ``own_ms`` is the offset that a log has without any disguise.
     """
     good = gnss[gnss["quality"] > 0]
-    speed = np.hypot(good["vel_n"], good["vel_e"]).to_numpy()
+    speed = np.hypot(good["vel_n"].to_numpy(), good["vel_e"].to_numpy())
     motion = float(np.sum(np.diff(good["t"])[speed[1:] > FAST]))
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)

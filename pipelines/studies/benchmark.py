@@ -20,18 +20,16 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 from rich.console import Console
 from rich.table import Table
 
-from dlkf.config import config_dir
+from dlkf.command.composing import composed
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.drive import Batch
 from dlkf.data.segments import StartLaw, cut_pieces, make_batch
 from dlkf.data.store import load_dataset
 from dlkf.files import staged
-from dlkf.filters.build import build_filter
+from dlkf.filters.build import build_causal
 from dlkf.filters.integration import integrate
 from dlkf.filters.saved import learned_filter, learned_settings
 from dlkf.navigation.attitude import rotation_from_vector
@@ -156,7 +154,8 @@ def filters(bench: Bench, dataset: Path, imu: ImuSpec) -> None:
     pieces = (cut_pieces(drives, 300.0) * 8)[:64]
 
     def run(group: str, name: str, count: int, chosen: list) -> None:
-        batch, estimator = make_batch(drives, chosen[:count], dtype=torch.float64), build_filter(name, imu)
+        batch = make_batch(drives, chosen[:count], dtype=torch.float64)
+        estimator = build_causal(name, imu, "the loop does not")
         with torch.inference_mode():
             samples = count * batch.size[1] * batch.size[2]
             what = f"{name}, {count} drive{'s' * (count > 1)} of {batch.size[1] * batch.epoch_s:g} s"
@@ -173,8 +172,7 @@ def filters(bench: Bench, dataset: Path, imu: ImuSpec) -> None:
 
 def training_epoch(data: DriveDataModule, name: str, steps: int | None = None) -> None:
     """An epoch with decimation, outages, backward pass and optimiser, or so many steps of it."""
-    with initialize_config_dir(str(config_dir()), version_base="1.3"):
-        settings = OmegaConf.to_container(compose("train", overrides=[f"filter@model={name}"]), resolve=False)["model"]
+    settings = composed("train", f"filter@model={name}")["model"]
     torch.manual_seed(0)
     model = learned_filter(learned_settings(settings)).train()
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4)
@@ -228,9 +226,7 @@ def main() -> None:
     arguments.add_argument("--out", type=Path, default=Path("outputs"))
     options = arguments.parse_args()
     torch.set_num_threads(options.threads)
-    with initialize_config_dir(str(config_dir()), version_base="1.3"):
-        preset = compose("simulate", overrides=["simulated@dataset=one_imu", f"dataset.hours={options.hours}"])
-    config = OmegaConf.to_container(preset, resolve=True)
+    config = composed("simulate", "simulated@dataset=one_imu", f"dataset.hours={options.hours}")
     bench, described = Bench(), machine(options.threads)
     with tempfile.TemporaryDirectory() as folder:
         simulate_from_config(config, Path(folder) / "drives")

@@ -30,7 +30,7 @@ IMU = ImuSpec("mems", SensorErrors(noise_density=2.5e-3, turn_on_bias=0.02), Sen
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--models", nargs="+", default=["mbkf15", "mbkf21", "mbkf21_car", "plus", "dlkf"])
     parser.add_argument("--rate", type=float, default=100.0, help="Hz")
     parser.add_argument("--minutes", type=float, default=10.0)

@@ -66,7 +66,8 @@ def band_levels(imu: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     bands = [power[..., (f > low - 0.1) & (f < high - 0.1)].sum(-1) for low, high in BANDS]
     quick = np.fft.irfft(np.where(f > BANDS[2][0], np.fft.rfft(x, axis=-1), 0), n, axis=-1)
     middle = imu["t"][: windows * n].reshape(windows, n).mean(-1)
-    return middle, np.sqrt(np.stack(bands, -1)).transpose(1, 0, 2), kurtosis(quick, axis=-1, fisher=False).T
+    peaked = np.asarray(kurtosis(quick, axis=-1, fisher=False))
+    return middle, np.sqrt(np.stack(bands, -1)).transpose(1, 0, 2), peaked.T
 
 
 def of_spectra(tables: DriveTables) -> dict[str, float]:

@@ -15,10 +15,8 @@ import time
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
-from dlkf.config import config_dir
+from dlkf.command.composing import imu_preset
 from dlkf.data.segments import StartLaw
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
@@ -29,7 +27,6 @@ from dlkf.evaluation.run import score_scenes
 from dlkf.evaluation.table import number, with_interval
 from dlkf.filters.build import build_causal
 from dlkf.filters.tuning import Tuning
-from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.running.likelihood import Evidence, find_noise
 
 START = StartLaw(position_m=0.1, velocity_mps=0.1, roll_pitch_deg=1.0, yaw_deg=2.0)
@@ -52,7 +49,7 @@ def main() -> None:
         unseen = [d.part(d.epochs // 2, d.epochs) for d in drives]
     else:
         seen, unseen = drives[::2], drives[1::2]
-    evidence, start, true = Evidence.of(seen), preset(options.start), preset(options.true)
+    evidence, start, true = Evidence.of(seen), imu_preset(options.start), imu_preset(options.true)
     for model in options.models:
         clock = time.perf_counter()
         found = find_noise(evidence, model, start, Tuning())
@@ -77,13 +74,6 @@ def main() -> None:
                 sizes = " / ".join(number(result.value(name, *end, s)) for s in ("rms", "median"))
                 both = " and ".join(with_interval(result.versus(name, *end, s)) for s in ("rms", "geomean"))
                 print(f"  {length:g} s, {result.count['outages']} outages, {name}: RMS / median {sizes}; ratios {both}")
-
-
-def preset(name: str) -> ImuSpec:
-    """Of conf/imu."""
-    with initialize_config_dir(str(config_dir()), version_base="1.3"):
-        chosen = compose("evaluate", overrides=[f"imu={name}", "model=mbkf15", "dataset=x"])
-    return imu_spec(OmegaConf.to_container(chosen.imu, resolve=True))
 
 
 if __name__ == "__main__":

@@ -40,9 +40,9 @@ from dlkf.evaluation.bootstrap import compare
 from dlkf.evaluation.figures import COLOURS, png
 from dlkf.evaluation.table import Table, as_markdown, as_rich, number
 from dlkf.files import staged
-from dlkf.filters.build import build_filter
+from dlkf.filters.build import build_causal, build_filter
 from dlkf.filters.integration import integrate
-from dlkf.filters.model_based import Ins
+from dlkf.filters.model_based import Ins, Mbkf
 from dlkf.navigation.attitude import rpy_from_rotation
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
@@ -53,7 +53,7 @@ from dlkf.simulation.motion.routes import VehicleConfig
 from dlkf.simulation.motion.vehicle import Truth, drive_vehicle
 from dlkf.simulation.tables import fix_columns, imu_columns, reference_columns
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 RATE, POSITION_STD, VELOCITY_STD = 100, 0.02, 0.05  # Hz, m, m/s
 START = StartLaw(position_m=1.0, velocity_mps=0.1, roll_pitch_deg=1.0, yaw_deg=3.0)
 EXACT = StartLaw(0.0, 0.0, 0.0, 0.0)
@@ -109,13 +109,14 @@ def write_drives(folder: Path, spec: ImuSpec, drives: int, minutes: float) -> No
 
 def _fixes(t: Array, lla: Array, v_n: Array) -> Columns:
     std = np.tile((POSITION_STD,) * 3 + (VELOCITY_STD,) * 3, (len(t), 1))
-    return fix_columns(t, *np.radians(lla[:, :2]).T, lla[:, 2], v_n, std, np.full(len(t), 4))
+    lat, lon = np.radians(lla[:, :2]).T
+    return fix_columns(t, lat, lon, lla[:, 2], v_n, std, np.full(len(t), 4))
 
 
 def _truth(at: pd.DataFrame) -> Truth:
     lla = at[LLA_COLS].to_numpy()
-    place = (*np.radians(lla[:, :2]).T, lla[:, 2])
-    return Truth(at.index.to_numpy(), *place, at[VEL_COLS].to_numpy(), np.radians(at[RPH_COLS].to_numpy()))
+    lat, lon = np.radians(lla[:, :2]).T
+    return Truth(at.index.to_numpy(), lat, lon, lla[:, 2], at[VEL_COLS].to_numpy(), np.radians(at[RPH_COLS].to_numpy()))
 
 
 def _at(error: Array, at: pd.DataFrame) -> Array:
@@ -155,13 +156,14 @@ def theirs(folder: Path, batch: Batch, spec: ImuSpec, states: int, step_s: float
     first = imu.iloc[:1].copy()  # by convention the sample before the first: the first itself
     first.index = first.index - 1 / RATE
     increments = strapdown.compute_increments_from_imu(pd.concat((first, imu)), "increment")
-    increments = increments[increments.index > start.name + 0.5 / RATE]
+    increments = increments[increments.index > float(str(start.name)) + 0.5 / RATE]
     end = float(batch.t_start[0]) + batch.epoch_s * np.arange(1, batch.size[1] + 1)
     shown = batch.available[0].numpy()
-    offered = gnss.loc[np.round(end[shown], 6)]
+    offered = gnss.loc[np.round(end[shown], 6).tolist()]
     offered.columns = [{"lat_deg": "lat", "lon_deg": "lon", "height_m": "alt", "vel_n": "VN", "vel_e": "VE",
                         "vel_d": "VD"}.get(c, c) for c in offered.columns]  # fmt: skip
     estimator = build_filter(FILTERS[states], spec)
+    assert isinstance(estimator, Mbkf)
     sigma = estimator.begin(batch)[0].P[0].diagonal().sqrt().numpy()
     psd, models = estimator.psd(), []
     for k, sensor, errors in ((9, "accel", spec.accel), (12, "gyro", spec.gyro)):
@@ -186,7 +188,7 @@ def theirs(folder: Path, batch: Batch, spec: ImuSpec, states: int, step_s: float
 
 def ours(batch: Batch, spec: ImuSpec, states: int, score: bool = True) -> tuple[Array, float]:
     """Horizontal error [m] of our filter at the ends of the epochs, and seconds."""
-    estimator = build_filter(FILTERS[states], spec)
+    estimator = build_causal(FILTERS[states], spec, "the loop does not")
     with torch.inference_mode():
         began = time.process_time()
         solution = integrate(batch, estimator)

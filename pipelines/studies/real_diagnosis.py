@@ -17,11 +17,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 from torch import Tensor
 
-from dlkf.config import config_dir
+from dlkf.command.composing import imu_preset
 from dlkf.data.alignment import align_boundaries
 from dlkf.data.drive import Drive
 from dlkf.data.segments import whole_drives
@@ -32,7 +30,7 @@ from dlkf.filters.integration import integrate
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import prefix_rotations, vector_from_rotation
-from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.running.start import align
 
 SETTLE = 2  # epochs whose innovations say more of the start than of the filter
@@ -46,6 +44,7 @@ def innovations(drive: Drive, imu: ImuSpec, tuning: Tuning) -> tuple[Tensor, Ten
     batch = whole_drives([drive], [align(drive)])
     with torch.inference_mode():
         solution = integrate(batch, Mbkf(imu, tuning), keep_covariances=True)
+        assert solution.covariances is not None
         z, S = solution.innovation[0, SETTLE:], solution.covariances.innovation[0, SETTLE:]
         used = (batch.gnss_valid & batch.available.unsqueeze(-1))[0, SETTLE:]
         nis = (z.unsqueeze(-2) @ torch.linalg.solve(S, z.unsqueeze(-1))).flatten()
@@ -119,6 +118,7 @@ def pitch_witnesses(tables: DriveTables, drive: Drive, bias: Sequence[float], fi
     integral from the alignment on. Neither witness knows of the other.
     """
     imu, ref = tables.imu, tables.reference
+    assert ref is not None
     p = track(ref)
     s = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(p[:, :2], axis=0).T))))
     start = align(drive)
@@ -221,7 +221,7 @@ def likely_noise(drive: Drive, imu: ImuSpec, tuning: Tuning, part: slice) -> tup
 
 def main() -> None:
     """Load, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("dataset", type=Path)
     parser.add_argument("--drive", help="name (default: the longest)")
     parser.add_argument("--imu", default="automotive_mems", help="preset of conf/imu")
@@ -231,9 +231,7 @@ def main() -> None:
     parser.add_argument("--figure", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    with initialize_config_dir(str(config_dir()), version_base="1.3"):
-        preset = compose("evaluate", overrides=[f"imu={options.imu}", "model=mbkf15", "dataset=x"])
-    imu = imu_spec(OmegaConf.to_container(preset.imu, resolve=True))
+    imu = imu_preset(options.imu)
     rows = read_drives(options.dataset)
     loaded = [read_checked(options.dataset, r, reference=True) for r in rows if options.drive in (None, r.name)]
     tables = max(loaded, key=lambda x: x.imu["t"][-1] - x.imu["t"][0])
@@ -242,6 +240,7 @@ def main() -> None:
     z, S, used, L = innovations(drive, imu, tuning)
     print(f"{drive.name}, {options.imu}, {options.rate_hz:g} Hz: {consistency(z, S, used)}")
     print(alignment_error(drive))
+    assert tables.reference is not None
     print(velocity_delay(tables.reference))
     print(clock_offset(tables, imu, tuning, options.rate_hz))
     with torch.inference_mode():

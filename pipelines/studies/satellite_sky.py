@@ -97,7 +97,8 @@ def above_horizon(raw: pd.DataFrame, reference: pd.DataFrame) -> pd.DataFrame:
     almanac, epoch = read_almanac(), raw.iloc[0]
     start = (epoch.gps_week - almanac.week) * 604800 + epoch.tow - almanac.toa
     t = start + np.linspace(0, raw.t.iloc[-1] - epoch.t, 60)
-    place = pymap3d.geodetic2ecef(*(reference[name].median() for name in POSITION))
+    lat, lon, height = (float(reference[name].median()) for name in POSITION)
+    place = pymap3d.geodetic2ecef(lat, lon, height)
     seen = signals(almanac, t, np.tile(place, (len(t), 1)), np.zeros((len(t), 3)))
     row, column = np.nonzero(seen.elevation > 0)
     columns = {"azimuth": seen.azimuth[row, column], "elevation": seen.elevation[row, column]}
@@ -132,7 +133,7 @@ def world(mask_deg: float, folder: Path | None) -> None:
     """Satellites in view and PDOP on a grid of 10 degrees, both poles and the date line included, over a day."""
     almanac = read_almanac()
     lat, lon = np.arange(-90.0, 91, 10), np.arange(-180.0, 181, 10)
-    places = np.stack(pymap3d.geodetic2ecef(*(x.ravel() for x in np.meshgrid(lat, lon, indexing="ij")), 0.0), -1)
+    places = np.stack(pymap3d.geodetic2ecef(*(x.ravel() for x in np.meshgrid(lat, lon, indexing="ij")), alt=0.0), -1)
     counts, pdops = [], []
     for t in np.arange(0, 86400.0, 600):
         seen = signals(almanac, np.full(len(places), t), places, np.zeros_like(places))

@@ -16,16 +16,14 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 from rich.console import Console
 from rich.progress import track
 
-from dlkf.config import config_dir
+from dlkf.command.composing import composed, imu_preset
 from dlkf.diagnosis.allan import allan_variance
 from dlkf.navigation.attitude import rotation_from_rpy, vector_from_rotation
 from dlkf.navigation.earth import ecef_from_geodetic, ned_axes, tangent_frame
-from dlkf.navigation.imu_errors import SensorErrors, imu_spec
+from dlkf.navigation.imu_errors import SensorErrors
 from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import strapdown
 from dlkf.simulation.dataset import DatasetConfig, dataset_config
@@ -40,11 +38,6 @@ PRESETS = ("consumer", "icm20602_i2nav", "adis16465_i2nav")
 RATES = (50, 100, 200)
 MINUTE = 60
 STATIC_HZ, STATIC_HOURS = 10, 6
-
-
-def composed(overrides: list[str]) -> dict:
-    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
-        return OmegaConf.to_container(compose("simulate", overrides), resolve=True)
 
 
 def drive(config: DatasetConfig, seed: int, seconds: int, rate: int) -> tuple[Truth, dict[str, np.ndarray]]:
@@ -133,7 +126,7 @@ def main() -> None:
 
 
 def motion_row(name: str, hours: float) -> str:
-    config = dataset_config(composed([f"simulated@dataset={name}"])["dataset"])
+    config = dataset_config(composed("simulate", f"simulated@dataset={name}")["dataset"])
     parts = [drive(config, seed, 600, 10)[1] for seed in range(math.ceil(hours * 6))]
     all_of = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     bounds = [f"{all_of[key].min():.4g} – {all_of[key].max():.4g}" for key in ("speed", "along", "radius", "lateral")]
@@ -141,12 +134,12 @@ def motion_row(name: str, hours: float) -> str:
 
 
 def exact_row(name: str, seeds: int) -> str:
-    worst, apart = exactness(dataset_config(composed([f"simulated@dataset={name}"])["dataset"]), seeds)
+    worst, apart = exactness(dataset_config(composed("simulate", f"simulated@dataset={name}")["dataset"]), seeds)
     return " | ".join([*(f"{1e3 * p:.2f}, {a:.0e}" for p, a in worst), f"{1e6 * apart:.2f}"])
 
 
 def allan_row(name: str) -> str:
-    spec, rng = imu_spec(composed([f"imu={name}"])["imu"]), np.random.default_rng(1)
+    spec, rng = imu_preset(name), np.random.default_rng(1)
     at_rest = np.broadcast_to((0.0, 0.0, -9.81, 0.0, 0.0, 0.0), (STATIC_HOURS * 3600 * STATIC_HZ, 6))
     log = corrupt(rng, at_rest, spec, draw_unit(rng, spec), STATIC_HZ)[0]
     taus = (1, 10, 100)

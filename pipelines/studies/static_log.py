@@ -13,12 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
-from dlkf.config import config_dir
+from dlkf.command.composing import imu_preset
 from dlkf.data.schema import new_dataset, write_drive, write_drives_table
-from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.simulation.imu import corrupt, draw_unit, inverse_mechanisation
 from dlkf.simulation.motion.vehicle import Truth
 from dlkf.simulation.tables import fix_columns, imu_columns
@@ -37,8 +35,8 @@ def write_static_log(folder: Path, spec: ImuSpec, hours: float, rate_hz: int, se
     t = np.arange(1, n + 1) / rate_hz
     fixes = t[rate_hz - 1 :: rate_hz]
     n_fixes = len(fixes)
-    place = (np.full(n_fixes, x) for x in (LAT, LON, HEIGHT))
-    fix = fix_columns(fixes, *place, np.zeros((n_fixes, 3)), np.full((n_fixes, 6), 0.02), np.full(n_fixes, 4))
+    lat, lon, height = (np.full(n_fixes, x) for x in (LAT, LON, HEIGHT))
+    fix = fix_columns(fixes, lat, lon, height, np.zeros((n_fixes, 3)), np.full((n_fixes, 6), 0.02), np.full(n_fixes, 4))
     row = {"drive": "static", "source": f"simulation, seed {seed}", "licence": "none: simulated", "imu": spec.name}
     with new_dataset(folder, overwrite) as beside:
         imu, gnss = pd.DataFrame(imu_columns(t, measured)), pd.DataFrame(fix)
@@ -55,9 +53,7 @@ def main() -> int:
     arguments.add_argument("--seed", type=int, default=0)
     arguments.add_argument("--overwrite", action="store_true")
     o = arguments.parse_args()
-    with initialize_config_dir(str(config_dir()), version_base="1.3"):
-        imu = OmegaConf.to_container(compose("allan", [f"imu={o.imu}"]), resolve=True)["imu"]
-    write_static_log(o.folder, imu_spec(imu), o.hours, o.rate_hz, o.seed, o.overwrite)
+    write_static_log(o.folder, imu_preset(o.imu), o.hours, o.rate_hz, o.seed, o.overwrite)
     print(f"{o.folder}: {o.hours:g} h of {o.imu} at rest, {o.rate_hz} Hz, seed {o.seed}")
     return 0
 

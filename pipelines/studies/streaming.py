@@ -13,6 +13,7 @@ import argparse
 import pickle
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,6 +25,7 @@ from dlkf.config import config_dir
 from dlkf.data.tables import Columns
 from dlkf.filters.build import build_filter
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
+from dlkf.filters.smoother import Filter
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.running.replay import played
@@ -48,7 +50,7 @@ def simulated(seconds: int, rate_hz: int, seed: int) -> tuple[Columns, Columns, 
         seeds, seconds, Rates(rate_hz, 1.0, 1), VehicleConfig(), ChassisConfig(), Surroundings(), SPEC, unit,
         GnssConfig(lever_arm_b=ARM),
     )  # fmt: skip
-    imu, gnss, reference = ({c: f[c].to_numpy() for c in f} for f in (tables.imu, tables.gnss, tables.reference))
+    imu, gnss, reference = ({str(c): f[c].to_numpy() for c in f} for f in (tables.imu, tables.gnss, tables.reference))
     return imu, gnss, reference
 
 
@@ -86,8 +88,9 @@ def road(model: str, hours: float, faults: bool, anchor_m: float, seed: int) -> 
             north, east = np.degrees(lat) - reference["lat_deg"][k], np.degrees(lon) - reference["lon_deg"][k]
             error[k] = METRES * np.hypot(north, east * np.cos(lat))
             frames.add(tuple(e.frame.origin_e[0].tolist()))
-            if k % 60 == 0 and hasattr(stream._running.memory, "P"):
-                P = stream._running.memory.P[0]
+            running: Any = stream._running
+            if k % 60 == 0 and hasattr(running.memory, "P"):
+                P = running.memory.P[0]
                 sigma = P.diagonal().sqrt()
                 asymmetry = max(asymmetry, float((P - P.T).abs().max()))
                 smallest = min(smallest, float(torch.linalg.eigvalsh(P / torch.outer(sigma, sigma))[0]))
@@ -110,13 +113,13 @@ def latency(minutes: float) -> Table:
     """Time of the calls, fixes on time and 150 ms late; the processor's time is free of other work's."""
     imu, gnss, _ = simulated(round(60 * minutes), 100, 0)
     table = Table("filter", "fixes", "call", "p50 [ms]", "p99 [ms]", "processor p50 [ms]", "p99 [ms]")
-    filters = {m: build_filter(m, SPEC) for m in ("mbkf15", "mbkf21_nhc", "mbkf15_gated")}
+    filters: dict[str, Filter] = {m: build_filter(m, SPEC) for m in ("mbkf15", "mbkf21_nhc", "mbkf15_gated")}
     filters["dlkf (2.2 M weights)"] = LearnedFilter(LearnedConfig()).eval()
     for name, estimator in filters.items():
         for late in (0.0, 0.15):
             stream = StreamingFilter(estimator, lever_arm_b=ARM)
             took = {"sample": [], "sample that ends an epoch": [], "fix": [], "fix after its epoch": [], "now()": []}
-            feed = played(stream, imu, gnss, gnss["t"] + late)
+            feed = played(stream, imu, gnss, (gnss["t"] + late).tolist())
             fixes = count = 0
             while True:
                 wall, own = time.perf_counter(), time.thread_time()

@@ -10,7 +10,6 @@ import re
 import sys
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from dlkf.command import command
@@ -24,9 +23,8 @@ from dlkf.navigation.imu_errors import imu_spec
 
 
 @command("allan")
-def main(cfg: DictConfig) -> None:
+def main(config: dict[str, Any]) -> None:
     """Read, check that the IMU is at rest, fit, write, print."""
-    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
     name, in_run, base = str(config["name"]), config["in_run"], imu_spec(config["imu"])
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):
         raise InputError(f"name={name} must be letters, digits, _ and -: it names a file")

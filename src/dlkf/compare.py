@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from omegaconf import DictConfig
+from typing import Any
 
 from dlkf.command import command
 from dlkf.files import vacant
@@ -18,12 +18,12 @@ def runs_of(arguments: list[str]) -> list[str]:
 
 
 @command("compare", runs_of)
-def main(cfg: DictConfig) -> None:
+def main(config: dict[str, Any]) -> None:
     """Read, write, print."""
-    vacant(cfg.out, overwrite=cfg.overwrite)
-    reports = read_reports([cfg.runs] if isinstance(cfg.runs, str) else list(cfg.runs))
-    write_comparison(cfg.out, reports)
-    print(f"Report: {cfg.out}/compare.html")
+    runs, out = config["runs"], config["out"]
+    vacant(out, overwrite=config["overwrite"])
+    write_comparison(out, read_reports([runs] if isinstance(runs, str) else runs))
+    print(f"Report: {out}/compare.html")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from dlkf.command import command
@@ -22,13 +21,13 @@ from dlkf.evaluation.protocol import protocol_from
 from dlkf.evaluation.table import as_rich
 from dlkf.files import vacant
 from dlkf.filters.build import build_filter
+from dlkf.filters.model_based import Mbkf
 from dlkf.navigation.imu_errors import imu_spec
 
 
 @command("consistency")
-def main(cfg: DictConfig) -> None:
+def main(config: dict[str, Any]) -> None:
     """Simulate, run, compare, write, print."""
-    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
     names = [config["model"]] if isinstance(config["model"], str) else list(config["model"])
     if not names:
         raise InputError("model is an empty list; give at least one Kalman filter, such as model=mbkf15")
@@ -48,8 +47,9 @@ def main(cfg: DictConfig) -> None:
                 raise InputError(f"no outage fits into {settings.minutes:g} minutes; see outage.* and minutes")
             batch, outage = withhold(batch, mask), mask[0].numpy()
         with counting(f"Running {name}") as progress:
-            filters = build_filter(name, spec, tuning=config["tuning"])
-            results[name] = consistency(filters, batch, matrices, progress)
+            kalman = build_filter(name, spec, tuning=config["tuning"])
+            assert isinstance(kalman, Mbkf)  # as ``states_of`` has seen
+            results[name] = consistency(kalman, batch, matrices, progress)
     title = f"{settings.drives} simulated drives of {settings.minutes:g} min, IMU {preset.name}, errors as modelled"
     table = consistency_table(results, config["settle_s"], title)
     write_consistency(config["out"], results, table, outage)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.text import Text
 
@@ -18,9 +17,8 @@ from dlkf.diagnosis.checkup import GOOD, STYLES, checkup
 
 
 @command("doctor")
-def main(cfg: DictConfig) -> None:
+def main(config: dict[str, Any]) -> None:
     """Read, look, print; the exit code tells whether something is bad."""
-    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
     console = Console(width=None if sys.stdout.isatty() else 140, highlight=False)
     bad = noted = 0
     for row in drive_rows(config["dataset"], config["drives"]):

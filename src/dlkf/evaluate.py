@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from dlkf.command import command
@@ -26,7 +25,9 @@ from dlkf.evaluation.table import all_tables, as_rich
 from dlkf.files import vacant
 from dlkf.filters.build import build_filter
 from dlkf.filters.card import without_seen
-from dlkf.models import check_baseline, grid_of, resolve_models
+from dlkf.filters.model_based import Mbkf
+from dlkf.filters.saved import grid_of
+from dlkf.models import check_baseline, resolve_models
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.provenance import provenance
 from dlkf.report.evaluation import write_report
@@ -36,9 +37,8 @@ from dlkf.tracking.runs import tracking_uri
 
 
 @command("evaluate")
-def main(cfg: DictConfig) -> None:
+def main(config: dict[str, Any]) -> None:
     """Load, run every model over the same scenes, score, write, print."""
-    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
     console = Console(width=None if sys.stdout.isatty() else 110)
     vacant(config["out"], overwrite=config["overwrite"])
     protocol, uri = protocol_from(config), tracking_uri(config["tracking"]["uri"])
@@ -81,6 +81,7 @@ def with_truth(drives: list[Drive], config: Mapping[str, Any], say: Callable) ->
     if config["reference"] == "file":
         return drives, {}
     smoother = build_filter("mbkf21", imu_spec(config["imu"]), tuning=config["tuning"])
+    assert isinstance(smoother, Mbkf)
     with counting("Making the reference") as progress:
         made = referenced(drives, config["reference"], smoother, AlignConfig.of(config["align"]), progress)
     for reason in made.skipped.values():

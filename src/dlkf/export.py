@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
 
 from dlkf.command import command
 from dlkf.data.store import drive_from_tables, drive_rows
 from dlkf.data.validate import read_checked
 from dlkf.errors import InputError
 from dlkf.files import staged, vacant
+from dlkf.filters.saved import grid_of
 from dlkf.filters.smoother import Smoothed
-from dlkf.models import grid_of, resolve_model, short_name
+from dlkf.models import resolve_model, short_name
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.onboard.c_source import CPP, write_source
 from dlkf.onboard.check import checked, write_log
@@ -34,9 +34,8 @@ ARM = (1.0, 0.3, -1.2)  # m, IMU to antenna of the simulated car
 
 
 @command("export")
-def main(cfg: DictConfig) -> None:
+def main(config: dict[str, Any]) -> None:
     """Resolve, write, check, print."""
-    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
     vacant(config["out"], overwrite=config["overwrite"])
     imu = imu_spec(config["imu"])
     model = resolve_model(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
-
-from omegaconf import DictConfig, OmegaConf
+from typing import Any
 
 from dlkf.classes import made
 from dlkf.command import command
@@ -18,13 +16,15 @@ def _open(arguments: list[str]) -> list[str]:
 
 
 @command("ingest", arguments=_open)
-def main(cfg: DictConfig) -> None:
+def main(config: dict[str, Any]) -> None:
     """Read every drive under ``source``, check it and write the dataset ``out``."""
-    reader = made(cast(dict, OmegaConf.to_container(cfg.reader, resolve=True)), "reader")
-    how = Intake(cfg.split_gaps, cfg.shortest_s, Limits(gap_s=cfg.gap_s, gap_samples=cfg.gap_samples))
-    options = {"overwrite": cfg.overwrite, "parallel": cfg.parallel, "progress": _tell}
-    count = ingest(reader, cfg.source, cfg.out, how, **options)
-    print(f"{cfg.out}: {count} drive{'s' if count != 1 else ''}")
+    reader = made(config["reader"], "reader")
+    how = Intake(
+        config["split_gaps"], config["shortest_s"], Limits(gap_s=config["gap_s"], gap_samples=config["gap_samples"])
+    )
+    options = {key: config[key] for key in ("overwrite", "parallel")}
+    count = ingest(reader, config["source"], config["out"], how, **options, progress=_tell)
+    print(f"{config['out']}: {count} drive{'s' if count != 1 else ''}")
 
 
 def _tell(taken: Taken, done: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from dlkf.filters.build import OWN_SOURCE, build_filter, is_filter, known_filter
 from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import CONFIG, WEIGHTS, load_filter
 from dlkf.filters.shipped import shipped_folder
+from dlkf.filters.smoother import Filter
 from dlkf.navigation.imu_errors import ImuSpec
 
 BEST = "best"  # folder of the weights that a training keeps
@@ -27,7 +28,7 @@ def resolve_model(
     *,
     tuning: Mapping[str, float] | None = None,
     prior: Mapping[str, Sequence[float]] | None = None,
-) -> Estimator:
+) -> Filter:
     """A filter by name, from a folder with weights and config, an MLflow run id, ``models:/name@alias``, or a class of
     one's own, ``module:Class``.
 
@@ -69,16 +70,7 @@ def own_filter(spec: str, imu: ImuSpec) -> Estimator:
     return kind(imu=imu) if "imu" in signature(kind).parameters else kind()
 
 
-def grid_of(
-    models: Iterable[Estimator], rate_hz: float | None, epoch_s: float | None, usual_epoch_s: float = 1.0
-) -> dict[str, float]:
-    """``rate_hz`` and ``epoch_s``: as given, else what a trained filter was trained on, else 50 Hz and the usual."""
-    trained = [m.config for m in models if hasattr(m, "config") and hasattr(m.config, "rate_hz")]
-    own = (trained[0].rate_hz, trained[0].epoch_s) if trained else (50.0, usual_epoch_s)
-    return {"rate_hz": own[0] if rate_hz is None else rate_hz, "epoch_s": own[1] if epoch_s is None else epoch_s}
-
-
-def check_baseline(baseline: str, models: Mapping[str, Estimator]) -> None:
+def check_baseline(baseline: str, models: Mapping[str, Filter]) -> None:
     """InputError for a baseline that is neither among the models nor a filter's name."""
     if baseline not in models and not is_filter(str(baseline)):
         raise InputError(f"baseline={baseline} is none of the models {', '.join(models)}; see model=")
@@ -89,12 +81,14 @@ def is_tracked(spec: str) -> bool:
     return bool(RUN_ID.fullmatch(spec)) or spec.startswith(("models:/", "runs:/"))
 
 
-def resolve_models(specs: str | Sequence[str], imu: ImuSpec, tracking_uri: str | None = None, **options: Any):
+def resolve_models(
+    specs: str | Sequence[str], imu: ImuSpec, tracking_uri: str | None = None, **options: Any
+) -> dict[str, Filter]:
     """``{name in tables: filter}`` for one spec or several, in their order; a repeated name gets a number."""
     listed = [specs] if isinstance(specs, str) else [str(s) for s in specs]
     if not listed:
         raise InputError("model is an empty list; give at least one model, such as model=mbkf15")
-    models: dict[str, Estimator] = {}
+    models: dict[str, Filter] = {}
     for spec in listed:
         name = short_name(spec)
         if name in models:

@@ -11,7 +11,6 @@ from functools import partial
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
 
 from dlkf.command import command
 from dlkf.console import counting
@@ -21,9 +20,10 @@ from dlkf.data.store import dataset_digest, drive_rows, load_dataset
 from dlkf.data.tables import time_zeros
 from dlkf.errors import InputError
 from dlkf.files import absolute, name_of, staged, vacant
+from dlkf.filters.saved import grid_of
 from dlkf.filters.smoother import smoothed
 from dlkf.filters.tuning import Tuning
-from dlkf.models import grid_of, resolve_model, short_name
+from dlkf.models import resolve_model, short_name
 from dlkf.navigation.imu_errors import AUTO, imu_spec
 from dlkf.onboard.compiled_filter import compiled_filter
 from dlkf.parallel import check, each
@@ -38,9 +38,8 @@ from dlkf.settings import settings_from
 
 
 @command("navigate")
-def main(cfg: DictConfig) -> None:
+def main(config: dict[str, Any]) -> None:
     """Load, align, run, write; print a line per drive."""
-    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
     formats = chosen(config["export"])
     vacant(config["out"], overwrite=config["overwrite"])
     check(config["parallel"], config["dataset"])

@@ -5,7 +5,7 @@ Of a grid search's parent run, the point that validated best.
 
 from __future__ import annotations
 
-from omegaconf import DictConfig
+from typing import Any
 
 from dlkf.command import command
 from dlkf.errors import InputError
@@ -15,10 +15,11 @@ from dlkf.tracking.runs import client_of, reachable, run_exists, store_missing, 
 
 
 @command("register")
-def main(cfg: DictConfig) -> None:
+def main(config: dict[str, Any]) -> None:
     """Look, choose, register, print."""
-    run_id, uri = str(cfg.run), tracking_uri(cfg.tracking.uri)
-    check_registration(cfg.name, cfg.alias)
+    run_id, name, alias = str(config["run"]), config["name"], config["alias"]
+    uri = tracking_uri(config["tracking"]["uri"])
+    check_registration(name, alias)
     if store_missing(uri):
         raise InputError(f"there is no MLflow store at {uri.removeprefix('sqlite:///')}; give tracking.uri=…")
     with reachable(uri):
@@ -26,9 +27,9 @@ def main(cfg: DictConfig) -> None:
         if not run_exists(client, run_id):
             raise InputError(f"run={run_id}: {uri} has no such run")
         best = best_of(client, run_id)
-        number = registered(client, best.info.run_id, cfg.name, cfg.alias)
-    alias = f", models:/{cfg.name}@{cfg.alias}" if cfg.alias else ""
-    print(f"{best.info.run_name}: models:/{cfg.name}/{number}{alias}")
+        number = registered(client, best.info.run_id, name, alias)
+    also = f", models:/{name}@{alias}" if alias else ""
+    print(f"{best.info.run_name}: models:/{name}/{number}{also}")
 
 
 if __name__ == "__main__":

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from omegaconf import DictConfig, OmegaConf
 
 from dlkf.command import command
 from dlkf.files import readable
@@ -23,10 +22,9 @@ def arguments_of_source(arguments: list[str]) -> list[str]:
 
 
 @command("simulate", arguments_of_source)
-def main(cfg: DictConfig) -> None:
+def main(config: dict[str, Any]) -> None:
     """Write the dataset to ``out`` (default ``data/<name>``) and say what it holds."""
     start = time.perf_counter()
-    config = cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True))
     make = semi_real_from_config if config["source"] else simulate_from_config
     out = make(config, config["out"], overwrite=config["overwrite"])
     drives = pd.read_parquet(readable(out / "drives.parquet"))

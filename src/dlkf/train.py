@@ -13,10 +13,10 @@ from typing import Any
 
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from dlkf.command import command, same_command
+from dlkf.command.composing import plain
 from dlkf.config import config_dir
 from dlkf.data.store import dataset_digest
 from dlkf.errors import InputError
@@ -33,9 +33,8 @@ from dlkf.training.summary import key_metrics, note
 
 
 @command("train")
-def main(cfg: DictConfig) -> None:
+def main(config: dict[str, Any]) -> None:
     """Data, run, study, table."""
-    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
     console = Console(width=None if sys.stdout.isatty() else 110)
     check_registration(config["tracking"]["register"], config["tracking"]["alias"])
     settings = study_settings(config)
@@ -88,7 +87,7 @@ def make_missing(config: dict[str, Any], console: Console) -> None:
         seed = HOUR_SEED if dataset in hour else 1
         preset = compose("simulate", overrides=[f"simulated@dataset={path.name}", f"seed={seed}"])
         try:
-            simulate_from_config(OmegaConf.to_container(preset, resolve=True), path)
+            simulate_from_config(plain(preset), path)
         except InputError:
             if not path.exists():  # else a run beside this one made the same drives first
                 raise

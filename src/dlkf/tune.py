@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from dlkf.command import command
@@ -22,6 +21,7 @@ from dlkf.errors import InputError
 from dlkf.evaluation.protocol import protocol_from
 from dlkf.evaluation.table import as_markdown, as_rich
 from dlkf.filters.build import build_filter
+from dlkf.filters.model_based import Mbkf
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.tracking.runs import start_run, tracking_uri
 from dlkf.tuning.found import found_noise, noise_table, write_noise
@@ -29,14 +29,15 @@ from dlkf.tuning.study import LIKELIHOOD, check, search, sides, tuning_table, wr
 
 
 @command("tune")
-def main(cfg: DictConfig) -> None:
+def main(config: dict[str, Any]) -> None:
     """Load, split, search, check, write, log, print."""
-    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)
     model, name, spec = str(config["model"]), str(config["name"]), imu_spec(config["imu"])
     check(model, config["objective"])
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):
         raise InputError(f"name={name} must be letters, digits, _ and -: it names a file")
-    start = build_filter(model, spec, tuning=config["tuning"]).tuning
+    untuned = build_filter(model, spec, tuning=config["tuning"])
+    assert isinstance(untuned, Mbkf)  # as ``check`` has seen
+    start = untuned.tuning
     protocol, uri = protocol_from(config), tracking_uri(config["tracking"]["uri"])
     with counting("Loading drives") as progress:
         drives = load_dataset(

@@ -17,7 +17,8 @@ PAGE = "/#/experiments?workflowType=machine_learning"
 
 def main() -> None:
     """Start the server, print the link, stay until Ctrl-C."""
-    given = dict(argument.partition("=")[::2] for argument in sys.argv[1:])
+    split = (argument.partition("=") for argument in sys.argv[1:])
+    given = {key: value for key, _, value in split}
     try:
         if unknown := sorted(set(given) - {"port", "host", "uri"}):
             raise InputError(f"ui: unknown key {unknown[0]}; known are port, host, uri")

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
 from dlkf.classes import class_named, made
+from dlkf.command.composing import composed
 from dlkf.config import config_dir
 from dlkf.filters.saved import learned_filter
 from dlkf.navigation.imu_errors import imu_spec
@@ -41,11 +40,6 @@ GROUPS = {  # group of the defaults list: folder under conf/
 def presets(folder: str) -> list[str]:
     """Those to choose from; what several share begins with an underscore."""
     return sorted(path.stem for path in (CONF / folder).glob("[!_]*.yaml"))
-
-
-def composed(primary: str, *overrides: str) -> dict:
-    with initialize_config_dir(config_dir=str(CONF), version_base="1.3"):
-        return OmegaConf.to_container(compose(primary, list(overrides)), resolve=True)
 
 
 EXPERIMENTS = [

@@ -8,11 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 from scipy.spatial.transform import Rotation
 
-from dlkf.config import config_dir
+from dlkf.command.composing import composed
 from dlkf.data.discovery.clock import find_lag, known_offset
 from dlkf.data.discovery.motion import motion, position_delay
 from dlkf.data.discovery.orientation import find_pose
@@ -41,9 +39,8 @@ def drive():
 def streets(tmp_path_factory):
     """Three simulated minutes with perfect sensors: no turn like the one before, as the analytic path has them."""
     own = ["simulated@dataset=per_drive", "imu=perfect", "dataset.hours=0.05", "dataset.drive_minutes=3", "seed=5"]
-    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
-        config = OmegaConf.to_container(compose("simulate", own), resolve=True)
-    folder = simulate_from_config(config, tmp_path_factory.mktemp("data") / "streets", progress=False)
+    streets = tmp_path_factory.mktemp("data") / "streets"
+    folder = simulate_from_config(composed("simulate", *own), streets, progress=False)
     name = read_drives(folder)[0].name
     return {kind: pd.DataFrame(read_table(folder, kind, name)) for kind in ("imu", "gnss")}
 

@@ -8,11 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
-from omegaconf import OmegaConf
 
-from dlkf.config import config_dir
+from dlkf.command.composing import composed
 from dlkf.data.intake import ingest_drives
 from dlkf.data.readers.frames import DriveFrames
 from dlkf.data.summary import drive_line
@@ -77,8 +75,7 @@ def drive():
 def read(folder, overrides: list[str]) -> list[DriveFrames]:
     """The drives of a folder, by overrides as on the command line."""
     own = [f"++{o}" if o.startswith("reader.") else o for o in overrides]
-    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
-        settings = OmegaConf.to_container(compose("ingest", own).reader, resolve=True)
+    settings = composed("ingest", *own)["reader"]
     return list(get_class(settings.pop("_target_"))(**settings).read(folder))
 
 

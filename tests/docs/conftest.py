@@ -7,10 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
-from dlkf.config import config_dir
+from dlkf.command.composing import composed
 from dlkf.simulation.dataset import simulate_from_config
 from tests.shell import Ended
 
@@ -35,10 +33,8 @@ SMALL = {
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five drives of 40 s, as ``simulate dataset=per_drive`` makes them."""
     size = ["dataset.hours=0.0555", "dataset.drive_minutes=0.67", "dataset.imu_rate_hz=50", "seed=3"]
-    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
-        config = compose("simulate", ["simulated@dataset=per_drive", *size])
-    folder = tmp_path_factory.mktemp("data") / "consumer"
-    return simulate_from_config(OmegaConf.to_container(config, resolve=True), folder, progress=False)
+    config = composed("simulate", "simulated@dataset=per_drive", *size)
+    return simulate_from_config(config, tmp_path_factory.mktemp("data") / "consumer", progress=False)
 
 
 @pytest.fixture

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
-from dlkf.config import config_dir
+from dlkf.command.composing import composed
 from dlkf.data.alignment import ALIGN
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
@@ -26,8 +24,7 @@ from dlkf.simulation.dataset import simulate_from_config
 def world(tmp_path_factory):
     """Two drives of four minutes, and what a filter is told about their IMU."""
     size = ["dataset.hours=0.133", "dataset.drive_minutes=4", "dataset.imu_rate_hz=50", "seed=3"]
-    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
-        config = OmegaConf.to_container(compose("simulate", ["simulated@dataset=per_drive", *size]), resolve=True)
+    config = composed("simulate", "simulated@dataset=per_drive", *size)
     folder = simulate_from_config(config, tmp_path_factory.mktemp("data") / "town", progress=False)
     spec = imu_spec(config["imu"])
     return load_dataset(folder, rate_hz=25.0, dtype=torch.float64), build_filter("mbkf21", spec), spec

@@ -8,13 +8,12 @@ import numpy as np
 import pandas as pd
 import pymap3d
 import pytest
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 from pyins.strapdown import Integrator
 from scipy.signal import welch
 from scipy.spatial.transform import Rotation
 from tests.simulation.oracle import attitude, axes, ecef, strapdown
 
+from dlkf.command.composing import composed
 from dlkf.errors import InputError
 from dlkf.simulation.dataset import dataset_config
 from dlkf.simulation.imu import inverse_mechanisation
@@ -27,9 +26,7 @@ LEVEL = VehicleConfig(slope_std=0.0, height_m=0.0)
 
 
 def preset(name: str):
-    with initialize_config_dir(config_dir=str(CONF), version_base="1.3"):
-        composed = OmegaConf.to_container(compose("simulate", [f"simulated@dataset={name}"]), resolve=True)
-    return dataset_config(composed["dataset"])
+    return dataset_config(composed("simulate", f"simulated@dataset={name}")["dataset"])
 
 
 def drive(vehicle: VehicleConfig, kind: ChassisConfig, seconds: int, rate: int, seed: int = 5) -> Truth:

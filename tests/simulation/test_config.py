@@ -5,9 +5,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import yaml
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
+from dlkf.command.composing import composed
 from dlkf.data.validate import validate_dataset
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.simulation.dataset import dataset_config, simulate_from_config
@@ -27,10 +26,7 @@ BRINGS = {
     **dict.fromkeys(("lifelike", "city", "highway", "car_park", "tunnel", "fleet"), "lifelike_mems"),
 }
 
-
-def composed(*overrides: str) -> dict:
-    with initialize_config_dir(config_dir=str(CONF), version_base="1.3"):
-        return OmegaConf.to_container(compose("simulate", list(overrides)), resolve=True)
+MINUTE = "dataset.drive_minutes=1"
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -59,11 +55,11 @@ def test_noise_densities_are_those_of_the_sources(name, accel, gyro):
 
 @pytest.mark.parametrize("name", BRINGS)
 def test_datasets_bring_their_imu_and_the_command_line_wins(name):
-    config = composed(f"simulated@dataset={name}")
+    config = composed("simulate", f"simulated@dataset={name}")
     assert dataset_config(config["dataset"]).name == name
     assert config["imu"]["name"] == BRINGS[name]
     assert config["out"] == f"data/{name}"
-    assert composed("imu=consumer", f"simulated@dataset={name}")["imu"]["name"] == "consumer"
+    assert composed("simulate", "imu=consumer", f"simulated@dataset={name}")["imu"]["name"] == "consumer"
 
 
 def test_every_dataset_is_listed_here():
@@ -71,22 +67,23 @@ def test_every_dataset_is_listed_here():
 
 
 def test_a_simulated_dataset_keeps_the_contract(tmp_path):
-    config = composed("simulated@dataset=per_drive", "dataset.hours=0.05", "dataset.drive_minutes=1", "seed=4")
+    config = composed("simulate", "simulated@dataset=per_drive", MINUTE, "dataset.hours=0.05", "seed=4")
     rows = validate_dataset(simulate_from_config(config, tmp_path / "toy", progress=False))
     assert [row.name for row in rows] == [f"per_drive-4-0000{k}" for k in range(3)]
 
 
 def test_any_dataset_can_have_another_car():
     """Both settings are presets: the paper's point, and a lifelike car."""
-    point = composed("simulated@dataset=lifelike", "chassis@dataset.chassis=point")
-    car = composed("simulated@dataset=one_imu", "chassis@dataset.chassis=lifelike")
+    point = composed("simulate", "simulated@dataset=lifelike", "chassis@dataset.chassis=point")
+    car = composed("simulate", "simulated@dataset=one_imu", "chassis@dataset.chassis=lifelike")
     assert dataset_config(point["dataset"]).chassis.is_point
     assert dataset_config(car["dataset"]).chassis.sideslip == 0.0075
-    assert dataset_config(composed("simulated@dataset=paper_clean")["dataset"]).chassis.is_point
+    assert dataset_config(composed("simulate", "simulated@dataset=paper_clean")["dataset"]).chassis.is_point
 
 
 def test_a_fleet_brings_its_types():
-    config = dataset_config(composed("simulated@dataset=fleet", "imu@dataset.fleet.consumer=roof_mems")["dataset"])
+    fleet = composed("simulate", "simulated@dataset=fleet", "imu@dataset.fleet.consumer=roof_mems")
+    config = dataset_config(fleet["dataset"])
     assert len(config.fleet) == 7 and config.fleet["consumer"].name == "roof_mems"
 
 
@@ -102,7 +99,7 @@ def test_a_fleet_brings_its_types():
 def test_a_seed_gives_the_drives_that_it_always_gave(name, row, tmp_path):
     """At 30 s, as of commit de03f96: what is new is drawn after the old, or by generators of its own. The tolerance
     leaves room for another machine's rounding."""
-    config = composed(f"simulated@dataset={name}", "dataset.hours=0.01", "dataset.drive_minutes=1", "seed=3")
+    config = composed("simulate", f"simulated@dataset={name}", MINUTE, "dataset.hours=0.01", "seed=3")
     folder = simulate_from_config(config, tmp_path / name, progress=False)
     imu, gnss, reference = (
         pd.read_parquet(folder / kind / f"drive={name}-3-00000" / "part-0.parquet").iloc[at]

@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from tests.simulation.test_config import composed
 
+from dlkf.command.composing import composed
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
 from dlkf.simulation.dataset import recipe, simulate
@@ -17,7 +17,7 @@ SHORT = ("dataset.hours=0.05", "dataset.drive_minutes=1", "seed=4")
 
 
 def wide(*overrides: str, name: str = "wide"):
-    return recipe(composed(f"simulated@dataset={name}", *SHORT, *overrides))
+    return recipe(composed("simulate", f"simulated@dataset={name}", *SHORT, *overrides))
 
 
 @pytest.fixture(scope="module")

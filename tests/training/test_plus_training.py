@@ -2,10 +2,8 @@
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
-from dlkf.config import config_dir
+from dlkf.command.composing import composed
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
 from dlkf.filters.integration import integrate
@@ -21,10 +19,7 @@ from .test_resume import data
 
 def settings(*overrides: str) -> dict:
     words = ["+experiment=plus", "data.datasets=[data/none]", "model.network.hidden=8", *overrides]
-    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
-        config = OmegaConf.to_container(compose("train", words), resolve=False)
-    config["trainer"]["best_from_epoch"] = 0
-    config = OmegaConf.to_container(OmegaConf.create({k: v for k, v in config.items() if k != "hydra"}), resolve=True)
+    config = composed("train", *words, "trainer.best_from_epoch=0")
     keys = ("model", "loss", "optimizer", "scheduler", "trainer", "callbacks", "seed", "finetune")
     config["trainer"] |= {"max_epochs": 2, "validate_every": 1, "accelerator": "cpu"}
     config["callbacks"]["curriculum"] |= {"warm_s": 20.0, "full_s": 25.0}

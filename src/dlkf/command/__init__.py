@@ -7,7 +7,7 @@ import signal
 import sys
 from collections.abc import Callable
 from functools import wraps
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dlkf.command import sweeps
 from dlkf.command.arguments import checked_keys, checked_seeds, checked_types, readable
+from dlkf.command.composing import plain
 from dlkf.command.faults import fault
 from dlkf.command.help import help_text
 from dlkf.config import config_dir
@@ -33,8 +34,8 @@ GROUPS = {"simulate": {"dataset": "simulated"}, "train": {"model": "filter"}}
 
 def command(
     name: str, arguments: Callable[[list[str]], list[str]] = list
-) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
-    """Make a function of the composed ``conf/<name>.yaml`` a command line program.
+) -> Callable[[Callable[[dict[str, Any]], None]], Callable[[], None]]:
+    """Make a function of the composed ``conf/<name>.yaml``, as plain values, a command line program.
 
     A user's mistake (:class:`InputError`, an unknown key or preset, a malformed override) and a fault of the machine
     (a full disk, a locked store, no GPU) are one line on stderr and exit code 2; Ctrl-C is exit code 130, SIGTERM
@@ -42,7 +43,7 @@ def command(
     sweep write into folders of their own under ``out``, and those that fail leave the others alone.
     """
 
-    def decorate(function: Callable[[DictConfig], None]) -> Callable[[], None]:
+    def decorate(function: Callable[[dict[str, Any]], None]) -> Callable[[], None]:
         @wraps(function)
         def task(cfg: DictConfig) -> None:
             hydra_config = HydraConfig.get()
@@ -57,7 +58,7 @@ def command(
                 if sweep and cfg.get("out"):
                     with open_dict(cfg):
                         cfg.out = str(placed(cfg.out) / sweeps.folder(hydra_config))
-                function(cfg)
+                function(plain(cfg))
             except Exception as error:
                 if sweep and not stopped_by:
                     sweeps.set_down(error, hydra_config)

@@ -7,7 +7,7 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from omegaconf import DictConfig
+from hydra.conf import HydraConf
 
 from dlkf.command.faults import fault
 from dlkf.points import Failure, changed, failures, listened, tell
@@ -15,12 +15,12 @@ from dlkf.points import Failure, changed, failures, listened, tell
 MISTAKES, FAULTS = 2, 1  # exit codes: all failed by mistakes of the user, some by faults of ours
 
 
-def folder(hydra_config: DictConfig) -> str:
+def folder(hydra_config: HydraConf) -> str:
     """Folder of a point: its number and what it changes, as ``0-imu=consumer``."""
     return f"{hydra_config.job.num}-{changed(hydra_config.overrides.task)}".replace("/", "-")[:100]
 
 
-def set_down(error: Exception, hydra_config: DictConfig) -> None:
+def set_down(error: Exception, hydra_config: HydraConf) -> None:
     """Say that a point failed and let the sweep go on; raises the error where nobody would hear of it."""
     said = fault(error)
     point = changed(hydra_config.overrides.task)

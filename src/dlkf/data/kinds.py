@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -13,7 +14,7 @@ from dlkf.files import placed, readable
 KINDS = ("simulated", "semi-real", "real", "unknown")
 
 
-def drive_kind(row: Mapping[str, object]) -> str:
+def drive_kind(row: Mapping[Any, Any]) -> str:
     """Kind of one drive by its row of ``drives.parquet``.
 
     A column ``kind`` decides where there is one. Otherwise: a source that says it is simulated is simulated;

@@ -46,7 +46,7 @@ IMU_ERROR = (
 LEVER_ARM = ("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m")
 
 
-def _schema(kinds: Mapping[str, pa.DataType]) -> pa.Schema:
+def _schema(kinds: Mapping[str, Any]) -> pa.Schema:
     return pa.schema([pa.field(name, kind) for name, kind in kinds.items()])
 
 
@@ -62,7 +62,7 @@ OPTIONAL: dict[str, pa.Schema] = {  # read where present
 }
 TEXTS = ("drive", "group", "source", "licence", "imu", "gnss", "reference")
 NUMBERS = ("imu_rate_hz", "gnss_rate_hz", "duration_s", "distance_m", *LEVER_ARM)
-DRIVES = _schema(dict.fromkeys(TEXTS, pa.string()) | dict.fromkeys(NUMBERS, F))
+DRIVES = _schema({**dict.fromkeys(TEXTS, pa.string()), **dict.fromkeys(NUMBERS, F)})
 DRIVES_REQUIRED = ("drive", "group")
 
 

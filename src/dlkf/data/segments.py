@@ -163,7 +163,7 @@ def make_batch(
         raise InputError("no pieces: the drives are shorter than the length asked for, or never valid")
     row = stack.first_row[drive] + first
     origin = stack.origin[row]
-    frame = tangent_frame(*origin.unbind(-1), dtype)
+    frame = tangent_frame(*origin.unbind(-1), dtype=dtype)
     truth = _state(frame, *(stack.rows[name][row] for name in ("ref_r_e", "ref_v_e", "ref_C_eb")))
     std = start.std.expand(len(drive), 9)
     if seed is None:
@@ -190,7 +190,7 @@ def whole_drives(
         raise InputError(f"{len(stack)} drives but {len(starts)} starts; give one start per drive")
     first = torch.tensor([s.first for s in starts])
     llh = torch.tensor([(s.lat, s.lon, s.height) for s in starts], dtype=torch.float64)
-    frame = tangent_frame(*llh.unbind(-1), dtype)
+    frame = tangent_frame(*llh.unbind(-1), dtype=dtype)
     state = NavState(*(torch.stack(x) for x in zip(*(s.state for s in starts))))
     std = torch.stack([s.std for s in starts])
     return _assemble(stack, torch.arange(len(stack)), first, stack.epochs - first, frame, state, std, dtype)

@@ -35,7 +35,7 @@ def _way(drive: DriveFrames) -> float:
     """Length of the way [m] from velocities, or between fixes at least 5 m apart."""
     gnss = drive.gnss
     assert gnss is not None
-    speed = np.hypot(gnss["vel_n"], gnss["vel_e"]).to_numpy()
+    speed = np.hypot(gnss["vel_n"].to_numpy(), gnss["vel_e"].to_numpy())
     if np.isfinite(speed).mean() > 0.5:
         return float(np.trapezoid(np.nan_to_num(speed), gnss["t"]))
     lat, lon = (np.radians(gnss[c].dropna().to_numpy()) for c in ("lat_deg", "lon_deg"))

@@ -27,7 +27,7 @@ from scipy.optimize import nnls
 from dlkf.errors import InputError
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 FLICKER = math.sqrt(2 * math.log(2) / math.pi)  # the floor of a curve over B
 CLUSTERS = 10  # at least so many at the longest cluster time: below, the curve is chance
 PER_DECADE = 15  # cluster times
@@ -96,7 +96,7 @@ def fit_noise(tau: Array, variance: Array, duration_s: float, correlation_time: 
         return rest, parts
 
     grid = np.geomspace(10 * tau[0], 100 * duration_s, 60)
-    T = float(min(grid, key=lambda T: fitted(T)[0]))
+    T = min((float(x) for x in grid), key=lambda T: fitted(T)[0])
     resolved = duration_s / RESOLVED >= T
     T = T if resolved else correlation_time
     parts = fitted(T)[1]

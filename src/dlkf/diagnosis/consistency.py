@@ -28,11 +28,12 @@ from dlkf.errors import InputError
 from dlkf.evaluation.figures import SHADE, png
 from dlkf.evaluation.table import Table, as_json, as_markdown, number
 from dlkf.files import staged
-from dlkf.filters.integration import Estimator, Solution, integrate
+from dlkf.filters.integration import Solution, integrate
 from dlkf.filters.model_based import Analytic, has_covariance
+from dlkf.filters.smoother import Filter
 from dlkf.navigation.state import PVA, ErrorStates
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 AT_ONCE = 25  # drives: a covariance of 33 states takes 9 kB per epoch and drive
 CONFIDENCE = 0.95
 KINDS = ("whole state", "position, velocity, attitude", "innovation")
@@ -92,7 +93,7 @@ def state_error(
     return torch.cat(parts, -1)
 
 
-def states_of(name: str, estimator: Estimator) -> ErrorStates:
+def states_of(name: str, estimator: Filter) -> ErrorStates:
     """The error states of a filter. Raises InputError for one without a covariance."""
     if not has_covariance(estimator):
         raise InputError(f"model {name} has no covariance to compare its errors with; give a Kalman filter")
@@ -130,7 +131,7 @@ def consistency(
 def band(degrees: int, count: int) -> tuple[float, float]:
     """Band of the mean of ``count`` independent χ² values, over its expectation."""
     tail = (1 - CONFIDENCE) / 2
-    low, high = chi2.ppf([tail, 1 - tail], degrees * count) / (degrees * count)
+    low, high = chi2.ppf(np.array([tail, 1 - tail]), degrees * count) / (degrees * count)
     return float(low), float(high)
 
 

@@ -15,12 +15,12 @@ from dlkf.evaluation.metrics import Array
 from dlkf.evaluation.results import last_known
 from dlkf.evaluation.run import Scene, score_scenes
 from dlkf.evaluation.scores import Scores
-from dlkf.filters.integration import Estimator
+from dlkf.filters.smoother import Filter
 
 
 def injected_response(
     base: Scores,
-    filters: Mapping[str, Estimator],
+    filters: Mapping[str, Filter],
     scenes: Iterable[Scene],
     *,
     law: BiasLaw,

@@ -111,7 +111,7 @@ def compare(
     b: Array,
     *,
     statistic: str = "rms",
-    groups: Sequence[str] | None = None,
+    groups: Sequence[str] | NDArray[np.str_] | None = None,
     resamples: int = 2000,
     confidence: float = 0.95,
     seed: int = 0,
@@ -147,7 +147,7 @@ def _numbered(groups: NDArray[np.str_]) -> NDArray[np.int64]:
 def rms_band(
     x: Array,
     *,
-    groups: Sequence[str] | None = None,
+    groups: Sequence[str] | NDArray[np.str_] | None = None,
     resamples: int = 500,
     confidence: float = 0.95,
     seed: int = 0,

@@ -22,7 +22,7 @@ from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Protocol, Scenes
 from dlkf.evaluation.run import score_scenes
 from dlkf.evaluation.table import Table, number, with_interval
-from dlkf.filters.integration import Estimator
+from dlkf.filters.smoother import Filter
 
 OUTAGE_S = 40.0
 REST_S = 5.0  # of a piece behind its outage
@@ -41,7 +41,7 @@ class After:
 
 
 def after_gnss(
-    filters: Mapping[str, Estimator],
+    filters: Mapping[str, Filter],
     data: DriveDataModule,
     seconds: Sequence[float],
     *,
@@ -91,7 +91,7 @@ def geometric(x: np.ndarray) -> float:
 
 
 def without_outage(
-    filters: Mapping[str, Estimator], drives: Sequence[Drive], start: StartLaw, *, seed: int, minutes: float = 60.0
+    filters: Mapping[str, Filter], drives: Sequence[Drive], start: StartLaw, *, seed: int, minutes: float = 60.0
 ) -> dict[str, dict[str, float]]:
     """RMS of position [m] and heading [°] over parts of a piece of an hour with GNSS throughout, per filter.
 

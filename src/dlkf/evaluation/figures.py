@@ -10,8 +10,10 @@ import io
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -78,7 +80,7 @@ def all_figures(
     yield "imu_errors", "IMU-error estimates, one piece", imu_errors(scores, [middle])
 
 
-def line_of(scores: Scores, name: str) -> dict[str, object]:
+def line_of(scores: Scores, name: str) -> dict[str, Any]:
     """Colour and style of a filter, the same in every figure of these scores."""
     k = list(scores.filters).index(name)
     return {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[k % len(STYLES)]}
@@ -259,9 +261,9 @@ def imu_errors(scores: Scores, pieces: Sequence[int]) -> Figure:
         if k >= 3:
             ax.set_xlabel("Time since the start [s]")
         _plain(ax)
-    handles = (
-        [Line2D([], [], color="black", lw=1.4, ls="-" if alone else ":", label="truth")] if known else []
-    )
+    handles: list[Artist] = []
+    if known:
+        handles.append(Line2D([], [], color="black", lw=1.4, ls="-" if alone else ":", label="truth"))
     for n, r in scores.filters.items():
         if np.nan_to_num(r.imu_error[list(pieces)]).any():
             handles.append(Line2D([], [], lw=1.7, label=n, **line_of(scores, n)))

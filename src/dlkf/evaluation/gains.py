@@ -20,7 +20,7 @@ from dlkf.data.masks import withhold
 from dlkf.evaluation.metrics import Array
 from dlkf.evaluation.run import Scene
 from dlkf.files import staged
-from dlkf.filters.integration import Estimator
+from dlkf.filters.smoother import Filter
 from dlkf.running.batched import run_filter
 
 BLOCKS = {"K_pp": (0, 0), "K_pv": (0, 3), "K_vp": (3, 0), "K_vv": (3, 3)}  # first row and column of their diagonals
@@ -42,7 +42,7 @@ class Gains:
         return float(np.mean([self.last[:, row + k, column + k] for k in range(3)]))
 
 
-def gains_of(filters: Mapping[str, Estimator], scenes: Iterable[Scene], *, settle_s: float = 10.0) -> dict[str, Gains]:
+def gains_of(filters: Mapping[str, Filter], scenes: Iterable[Scene], *, settle_s: float = 10.0) -> dict[str, Gains]:
     """Gains of those filters that have one."""
     last: dict[str, list[Array]] = {}
     used: dict[str, list[Array]] = {}
@@ -91,7 +91,7 @@ def heat_map(gains: Sequence[tuple[str, Array]], columns: int, title: str) -> Fi
         image = ax.imshow(K, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
         for (i, j), value in np.ndenumerate(K):
             shade = "white" if abs(value) > 0.6 else "black"
-            ax.text(j, i, _short(value), ha="center", va="center", fontsize=7, color=shade)
+            ax.text(j, i, _short(float(value)), ha="center", va="center", fontsize=7, color=shade)
         ax.set_title(name, fontsize=10)
         ax.set_xticks(range(6), COLUMNS, fontsize=8)
         ax.set_yticks(range(9), ROWS, fontsize=8)

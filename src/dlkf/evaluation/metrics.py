@@ -20,7 +20,7 @@ from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.state import NavState
 
 LEAST_LOG = -50.0  # what the logarithm of an exact zero counts as in a geometric mean
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
 # Quantity → unit in which it is stored; tables show radians as degrees.

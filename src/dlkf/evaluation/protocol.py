@@ -78,7 +78,7 @@ class Scenes:
         self.side: str | None = None
         self.mode = "pieces" if protocol.mode == "pieces" or pieces else "drives"
         self.skipped: dict[str, str] = {}
-        self._batches: list[tuple[Sequence[Drive], list[Piece] | list[Start]]]
+        self._batches: list[tuple[Sequence[Drive], list[Any]]]  # pieces or starts
         if self.mode == "pieces":
             if not pieces:
                 raise InputError(
@@ -95,7 +95,7 @@ class Scenes:
             self._batches = [([stack[d] for d in part], [starts[d] for d in part]) for part in parts]
             self.outage = protocol.outage and repeated(protocol.outage)
         self.protocol = protocol
-        offsets = len(self.outage.offsets_s) if self.outage else 1
+        offsets = len(self.outage.offsets_s or ()) if self.outage else 1
         self.runs = offsets * sum(len(part) for _, part in self._batches)
 
     def __iter__(self) -> Iterator[Scene]:
@@ -173,15 +173,15 @@ def repeated(plan: OutagePlan) -> OutagePlan:
 
 
 def _fitting(plan: OutagePlan, length_s: float) -> OutagePlan:
-    plan = replace(plan, offsets_s=plan.offsets_s or (0.0,))
+    offsets = plan.offsets_s or (0.0,)
     first, last = (x if isinstance(x, (int, float)) else max(x) for x in (plan.first_s, plan.duration_s))
-    end = first + last + max(plan.offsets_s)
+    end = first + last + max(offsets)
     if end > length_s + 1e-6:
         raise InputError(
             f"the outage ends after {end:g} s but pieces are {length_s:g} s long; "
             "give a larger length_s, or a smaller outage.first_s or outage.duration_s"
         )
-    return plan
+    return replace(plan, offsets_s=offsets)
 
 
 def _parts(items: Sequence, epochs: Sequence[int], stack: DriveStack) -> list[list]:

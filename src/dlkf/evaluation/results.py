@@ -13,11 +13,13 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dlkf.evaluation.bootstrap import Comparison, compare
 from dlkf.evaluation.metrics import (
     QUANTITIES,
     Array,
+    Mask,
     magnitudes,
     outage_at,
     outage_distance,
@@ -148,12 +150,12 @@ class Results:
         """Results as ``metrics.json`` has them: the inverse of :meth:`as_dict`."""
         comparisons, columns = [], content["comparisons"]["columns"]
         for row in content["comparisons"]["data"]:
-            named = {k: x if k in TEXT else _real(x) for k, x in zip(columns, row)}
+            named: dict[str, Any] = {k: x if k in TEXT else _real(x) for k, x in zip(columns, row)}
             against = Comparison(**{f.name: named.pop(f.name) for f in fields(Comparison)})
             comparisons.append(Versus(**named, against=against))
-        values = (Value(*row[:-2], _real(row[-2]), row[-1]) for row in content["values"]["data"])
+        values = (Value(*row[:-2], value=_real(row[-2]), unit=row[-1]) for row in content["values"]["data"])
         kept = {k: content[k] for k in ("kind", "count", "settle_s")}
-        lists = {k: tuple(content[k]) for k in ("per_piece", "per_outage")}
+        lists: dict[str, Any] = {k: tuple(content[k]) for k in ("per_piece", "per_outage")}
         return Results(**kept, values=tuple(values), comparisons=tuple(comparisons), **lists)
 
 
@@ -272,7 +274,7 @@ def _comparisons(
     scores: Scores,
     samples: Mapping[str, Mapping[tuple[str, str, str], Array]],
     baseline: str,
-    groups: Array,
+    groups: NDArray[np.str_],
     **options: Any,
 ) -> Iterator[Versus]:
     if baseline not in scores.filters:
@@ -300,7 +302,7 @@ def _imu_error_quality(scores: Scores, name: str) -> list[Value]:
     return imu_error_values(kind, name, "slope", slopes) + imu_error_values(kind, name, "rms", rms)
 
 
-def _phases(scores: Scores, settle_s: float) -> dict[str, Array]:
+def _phases(scores: Scores, settle_s: float) -> dict[str, Mask]:
     settled = np.broadcast_to(scores.t > settle_s + 1e-9, scores.outage.shape)
     phases = {"all": np.ones_like(scores.outage), "settled": settled}
     if scores.outage.any():

@@ -16,7 +16,7 @@ from dlkf.data.masks import withhold
 from dlkf.errors import InputError
 from dlkf.evaluation.metrics import Array, error_series
 from dlkf.evaluation.scores import FilterRun, Piece, Scores
-from dlkf.filters.integration import Estimator
+from dlkf.filters.smoother import Filter
 from dlkf.navigation.state import IMU, NavState
 from dlkf.running.batched import CHUNK_SAMPLES, chunks, run_filter
 
@@ -24,7 +24,7 @@ Scene = tuple[Batch, Tensor]
 
 
 def score(
-    filters: Mapping[str, Estimator],
+    filters: Mapping[str, Filter],
     batches: Sequence[Batch],
     *,
     outages: Sequence[Tensor] | None = None,
@@ -41,7 +41,7 @@ def score(
 
 
 def score_scenes(
-    filters: Mapping[str, Estimator],
+    filters: Mapping[str, Filter],
     scenes: Iterable[Scene],
     *,
     total: int | None = None,
@@ -128,7 +128,7 @@ def _blank(batch: Batch) -> FilterRun:
     return FilterRun(*(np.full((B, T, n), np.nan) for n in (9, 3, 6, 6)))
 
 
-def _fill(run: FilterRun, index: Tensor, batch: Batch, estimator: Estimator, state: str) -> None:
+def _fill(run: FilterRun, index: Tensor, batch: Batch, estimator: Filter, state: str) -> None:
     solution = run_filter(batch, estimator)
     scored: NavState = getattr(solution, state)
     rows, T = index.numpy(), batch.size[1]

@@ -12,12 +12,12 @@ from dlkf.evaluation.protocol import Scenes
 from dlkf.evaluation.results import BASELINE, SETTLE_S, Results, imu_error_values, summarise_scores
 from dlkf.evaluation.run import score_scenes
 from dlkf.evaluation.scores import Scores
-from dlkf.filters.integration import Estimator
+from dlkf.filters.smoother import Filter
 from dlkf.settings import settings_from
 
 
 def study(
-    filters: Mapping[str, Estimator],
+    filters: Mapping[str, Filter],
     scenes: Scenes,
     *,
     kinds: Mapping[str, str] | str,

@@ -16,7 +16,7 @@ from dlkf.filters.adaptive import Adaptation
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import Estimator
 from dlkf.filters.model_based import Ins, Mbkf
-from dlkf.filters.smoother import Smoothed
+from dlkf.filters.smoother import Filter, Smoothed
 from dlkf.filters.sources import Source
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec
@@ -54,7 +54,7 @@ def build_filter(
     tuning: Mapping[str, float] | Tuning | None = None,
     prior_mean: Sequence[float] | None = None,
     prior_std: Sequence[float] | None = None,
-) -> Estimator | Smoothed:
+) -> Filter:
     """A model-based filter for an IMU; ``prior_*`` belong to names with ``_prior``.
 
     They are 6 values (m/s², rad/s) and, with 21 or 33 states, the elements of the sensor matrices in their order.
@@ -68,7 +68,7 @@ def build_filter(
         return Ins()
     kind, *own = name.split("+")
     base, *endings = kind.split("_")
-    given = {}
+    given: dict[str, Any] = {}
     states = ErrorStates(KALMAN[base], structure="car" in endings)
     if "prior" in endings:
         if prior_mean is None or prior_std is None:

@@ -112,4 +112,4 @@ class Gate:
     @cached_property
     def _limits(self) -> tuple[float, ...]:
         """Highest normalised innovation squared by the number of components."""
-        return (0.0, *(float(x) for x in chi2.ppf(self.probability, [1, 2, 3])))
+        return (0.0, *(float(chi2.ppf(self.probability, components)) for components in (1, 2, 3)))

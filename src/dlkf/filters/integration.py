@@ -7,6 +7,7 @@ all, so that a comparison between filters compares their answers and nothing els
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -204,7 +205,7 @@ def gathered(steps: list[Step], offered: Tensor, *, keep_errors: bool = False) -
     def over_time(rows: list) -> Tensor | None:
         return None if rows[0] is None else torch.stack(rows, 1)
 
-    def each(rows: list[tuple], kind: type) -> Any:
+    def each(rows: Sequence[Any], kind: type) -> Any:
         """Named tuples field by field; a field that appears with the first update is zero before."""
         fields = []
         for column in zip(*rows):

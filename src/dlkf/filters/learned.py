@@ -92,6 +92,9 @@ class Memory(NamedTuple):
 class LearnedFilter(nn.Module):
     """Estimator whose gain and IMU error come from a CNN-LSTM trained end to end."""
 
+    network: Any  # the CNN-LSTM or one of a user's own
+    card: dict[str, Any]  # what the weights were made of; those of a file have it
+
     def __init__(self, config: LearnedConfig) -> None:
         super().__init__()
         self.config = config
@@ -146,7 +149,10 @@ class LearnedFilter(nn.Module):
             part = torch.cat((part[:, :6], part[:, ATTITUDE] * shrink), -1)
         if hold and exporting:
             dx, gain = _chosen(has_fix, part, dx), _chosen(has_fix, K, gain)
-            error = ImuError(*(None if n is None else _chosen(has_fix, n, o) for n, o in zip(error, epoch.error)))
+            matrix = None
+            if error.matrix is not None and epoch.error.matrix is not None:
+                matrix = _chosen(has_fix, error.matrix, epoch.error.matrix)
+            error = ImuError(_chosen(has_fix, error.bias, epoch.error.bias), matrix)
             recurrent = tuple(torch.where(has_fix[:, None], new, o) for new, o in zip(recurrent, memory.recurrent))
         elif whole:
             dx, gain = part, K
@@ -176,7 +182,8 @@ class LearnedFilter(nn.Module):
         recurrent = memory.recurrent if whole else tuple(x[:, rows] for x in memory.recurrent)
         h, recurrent = self.network(window.to(dtype), components.to(dtype), recurrent)
         K, error = self.gain(h).to(epoch.z.dtype), self.imu_error(h)
-        error = ImuError(*(x if x is None else x.to(epoch.z.dtype) for x in error))
+        matrix = error.matrix if error.matrix is None else error.matrix.to(epoch.z.dtype)
+        error = ImuError(error.bias.to(epoch.z.dtype), matrix)
         if self.config.frame == "heading":
             left, right = (torch.block_diag(*[torch.ones(3, 3)] * n).to(K) for n in (3, 2))
             K = (C_hn.mT.repeat(1, 3, 3) * left) @ K @ (C_hn.repeat(1, 2, 2) * right)

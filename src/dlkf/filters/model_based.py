@@ -200,7 +200,7 @@ class Analytic(Estimator, Protocol):
         ...
 
 
-def has_covariance(estimator: Estimator) -> TypeGuard[Analytic]:
+def has_covariance(estimator: object) -> TypeGuard[Analytic]:
     """Whether an estimator can be smoothed and its covariance compared with its errors."""
     return isinstance(estimator, Analytic)
 

@@ -102,6 +102,8 @@ class Memory(NamedTuple):
 class PlusFilter(nn.Module):
     """Estimator round a classical one."""
 
+    card: dict[str, Any]  # what the weights were made of; those of a file have it
+
     def __init__(self, config: PlusConfig) -> None:
         super().__init__()
         self.config = config

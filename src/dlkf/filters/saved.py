@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,15 @@ def save_filter(model: Learned, folder: Path | str, card: Mapping[str, Any] | No
     (folder / CONFIG).write_text(yaml.safe_dump(model.config.plain(), sort_keys=False))
     if card is not None:
         (folder / CARD).write_text(yaml.safe_dump(dict(card), sort_keys=False, allow_unicode=True))
+
+
+def grid_of(
+    models: Iterable[Any], rate_hz: float | None = None, epoch_s: float | None = None, usual_epoch_s: float = 1.0
+) -> dict[str, float]:
+    """``rate_hz`` and ``epoch_s``: as given, else what a trained filter was trained on, else 50 Hz and the usual."""
+    configs: list[Any] = [getattr(m, "config", None) for m in models]
+    own = next(((c.rate_hz, c.epoch_s) for c in configs if hasattr(c, "rate_hz")), (50.0, usual_epoch_s))
+    return {"rate_hz": own[0] if rate_hz is None else rate_hz, "epoch_s": own[1] if epoch_s is None else epoch_s}
 
 
 def load_filter(folder: Path | str) -> Learned:

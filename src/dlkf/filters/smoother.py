@@ -33,7 +33,10 @@ class Smoothed:
     filter: Estimator
 
 
-def smoothed(estimator: Estimator | Smoothed, smoother: str) -> Smoothed:
+Filter = Estimator | Smoothed  # what runs over whole drives
+
+
+def smoothed(estimator: Filter, smoother: str) -> Smoothed:
     """A filter to be smoothed by name (``rts``); InputError for another name or a filter without a covariance."""
     if smoother != "rts":
         raise InputError(f"unknown smoother {smoother!r}; known: rts")

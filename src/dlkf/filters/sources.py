@@ -64,7 +64,7 @@ class Source(Protocol):
         """Memory at the start of a batch."""
         ...
 
-    def rows(self, epoch: Epoch, memory: Any, believed: Believed) -> tuple[Measurement | None, Any]:
+    def rows(self, epoch: Epoch, memory: Any, believed: Believed, /) -> tuple[Measurement | None, Any]:
         """Rows of this epoch's update, None for none in any piece, and the memory after it."""
         ...
 

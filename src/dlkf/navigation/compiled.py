@@ -53,8 +53,8 @@ def mechanised(
     """Position (B, M, 3), velocity (B, M, 3) and attitude (B, M, 3, 3) at the end of every sample."""
     B, M, _ = imu.shape
     p, v, C = imu.new_empty(B, M, 3), imu.new_empty(B, M, 3), imu.new_empty(B, M, 3, 3)
-    inputs = (x.numpy() for x in (p0, v0, C0, imu, g, earth_rate))
-    _mechanise(*inputs, dt, p.numpy(), v.numpy(), C.numpy())
+    given = (p0.numpy(), v0.numpy(), C0.numpy(), imu.numpy(), g.numpy(), earth_rate.numpy())
+    _mechanise(*given, dt, p.numpy(), v.numpy(), C.numpy())
     return p, v, C
 
 
@@ -63,8 +63,8 @@ def sensor_columns(
 ) -> Tensor:
     """Columns of Φ (B, 9, 6 + 2 e) for the biases and the ``elements`` (e, 2) of the sensor matrices."""
     out = v.new_zeros(len(v), 9, 6 + 2 * len(elements))
-    inputs = (x.numpy() for x in (C0, v0, C, v, g, samples))
-    _sensor_columns(*inputs, dt, elements, out.numpy())
+    given = (C0.numpy(), v0.numpy(), C.numpy(), v.numpy(), g.numpy(), samples.numpy())
+    _sensor_columns(*given, dt, elements, out.numpy())
     return out
 
 
@@ -87,8 +87,8 @@ def gravity(
 ) -> Tensor:
     """Gravity (B, 3) of :class:`dlkf.navigation.earth.TangentFrame`; ``shape`` (B, 3) is height, 1/(2R), slope."""
     g = torch.empty_like(p_n)
-    inputs = (x.numpy() for x in (p_n, stretching, centre, axis, shape))
-    _gravity(*inputs, *constants, g.numpy())
+    given: Any = (*(x.numpy() for x in (p_n, stretching, centre, axis, shape)), *constants, g.numpy())
+    _gravity(*given)
     return g
 
 

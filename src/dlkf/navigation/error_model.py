@@ -226,7 +226,8 @@ def _identity(states: int, dtype: torch.dtype, device: torch.device) -> Tensor:
 def _arm(state: NavState, rate_b: Tensor, lever_arm_b: Tensor) -> tuple[Tensor, Tensor]:
     """The lever arm and its swing ω × l in n."""
     both = torch.stack((lever_arm_b, torch.linalg.cross(rate_b, lever_arm_b)), -1)
-    return (state.C_nb @ both).unbind(-1)
+    arm, swing = (state.C_nb @ both).unbind(-1)
+    return arm, swing
 
 
 def masked(

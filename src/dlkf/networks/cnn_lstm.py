@@ -119,7 +119,8 @@ class CnnLstm(nn.Module):
             for layer in (*self.cnn, *self.dense):
                 if isinstance(layer, (nn.Conv1d, nn.Linear)):
                     nn.init.kaiming_normal_(layer.weight, self.config.leaky_slope, nonlinearity="leaky_relu")
-                    nn.init.zeros_(layer.bias)
+                    if layer.bias is not None:
+                        nn.init.zeros_(layer.bias)
 
     def start(self, batch_size: int, like: Tensor) -> Recurrent:
         """Empty memory."""

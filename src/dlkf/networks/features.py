@@ -47,6 +47,10 @@ class Scaling(nn.Module):
     normalised losses only; that a network wants inputs of like size is paper.md 4.9).
     """
 
+    window_centre: Tensor
+    window_size: Tensor
+    component_size: Tensor
+
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("window_centre", torch.zeros(CNN_CHANNELS))

@@ -26,6 +26,8 @@ _SHRINK = 0.01
 class GainHead(nn.Module):
     """K = S_x · reshape(W h + b) · S_z⁻¹ (G0, the paper's free gain)."""
 
+    scale: Tensor
+
     def __init__(self, width: int, initial_gain: float = 0.5) -> None:
         super().__init__()
         self.linear = nn.Linear(width, 54)
@@ -47,6 +49,8 @@ class ImuErrorHead(nn.Module):
     matrices M of measured = (I + M) true + bias of both sensors (E4), so that one answer a second follows the motion
     at the rate of the samples. ``bound`` limits the bias to so many σ by bound · tanh(· / bound); 0 is no limit.
     """
+
+    scale: Tensor
 
     def __init__(self, width: int, form: str = "constant", bound: float = 0.0) -> None:
         super().__init__()

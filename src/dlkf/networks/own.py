@@ -15,8 +15,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from torch import nn
-
 from dlkf.classes import TARGET, having, made
 from dlkf.networks.cnn_lstm import NetworkConfig
 
@@ -38,7 +36,7 @@ class OwnNetwork:
         settings = {k: v for k, v in values.items() if k not in (TARGET, "samples")}
         return cls(str(values[TARGET]), values.get("samples"), settings=settings)
 
-    def build(self) -> nn.Module:
+    def build(self) -> Any:
         """The network. InputError where it cannot be found, takes other settings, or lacks what a network has."""
         offered = {"samples": self.samples, "flags": self.flags}
         network = made({TARGET: self.target, **self.settings}, "model.network", offered=offered, spare=PAPERS)

@@ -61,7 +61,7 @@ class Translation(Tensors):
         self.values[node] = View(buffer, torch.empty(value.shape, dtype=value.dtype, device="meta"))
 
     def _get_attr(self, node: Node) -> None:
-        self.values[node] = self._program.constants[node.target]
+        self.values[node] = self._program.constants[str(node.target)]
 
     def _call_function(self, node: Node) -> None:
         if not node.users:

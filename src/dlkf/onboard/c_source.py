@@ -68,7 +68,7 @@ def function_in_c(name: str, function: Function, folder: Path) -> str:
         program = torch.export.export(function, function.example(), strict=False)
     except Exception as error:
         raise InputError(f"this filter cannot be exported: {str(error).splitlines()[0]}") from error
-    table = torch.export.default_decompositions()
+    table: dict[Any, Any] = dict(torch.export.default_decompositions())
     done = Translation(program.run_decompositions({o: f for o, f in table.items() if o._schema.name not in KEPT}))
     block, inputs = done.block, done.inputs
     arguments = [f"const {C_TYPES[b.dtype]} *restrict {b.name}" for b in inputs]

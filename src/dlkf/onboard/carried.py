@@ -139,6 +139,6 @@ def _rebuilt(x: Any, parts: Iterator[Tensor]) -> Any:
     if children is None:
         return None if x is None else next(parts)
     new = {name: _rebuilt(part, parts) for name, part in children}
-    if isinstance(x, tuple) and not hasattr(x, "_fields"):
-        return tuple(new.values())
-    return x._replace(**new) if isinstance(x, tuple) else replace(x, **new)
+    if hasattr(x, "_replace"):
+        return x._replace(**new)
+    return tuple(new.values()) if isinstance(x, tuple) else replace(x, **new)

@@ -23,7 +23,7 @@ import dlkf
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
 from dlkf.filters.integration import Correction, Estimator, Fix, Solution, Step, WholeLoop
-from dlkf.filters.smoother import Smoothed
+from dlkf.filters.smoother import Filter, Smoothed
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import NavState
@@ -84,7 +84,9 @@ class CompiledFilter(WholeLoop):
         """One epoch of one drive."""
         vector, told = self.library.turn(memory.numbers, imu.contiguous(), packed_fix(fix))
         x = split(told)
-        error = ImuError(self.layout.field("error.bias", vector), self.layout.field("error.matrix", vector))
+        bias = self.layout.field("error.bias", vector)
+        assert bias is not None
+        error = ImuError(bias, self.layout.field("error.matrix", vector))
         std = x["std"] if self._has_std else None
         speed = None if bool(x["speed"][0, 0].isnan()) else x["speed"]
         answer = Correction(x["prior"].new_zeros(1, 9), error, std=std, accepted=x["used"][:, 0] > 0.5, speed=speed)
@@ -95,8 +97,8 @@ class CompiledFilter(WholeLoop):
         """Whole drives, as many at a time as torch has threads; in the precision of the batch."""
         memory, _ = self.begin(batch)
         usable = batch.gnss_valid & batch.available.unsqueeze(-1)
-        fixes = packed_fix(Fix(*(x.flatten(0, 1).double() for x in (batch.gnss, batch.gnss_std)), usable.flatten(0, 1),
-                               batch.gnss_lag.flatten().double()))  # fmt: skip
+        value, std = (x.flatten(0, 1).double() for x in (batch.gnss, batch.gnss_std))
+        fixes = packed_fix(Fix(value, std, usable.flatten(0, 1), batch.gnss_lag.flatten().double()))
         fixes, imu = fixes.unflatten(0, batch.size[:2]), batch.imu.double().contiguous()
 
         def run(b: int) -> Tensor:
@@ -127,7 +129,7 @@ def _(memory: Vector, change: FrameChange, fresh: Vector) -> Vector:
     return memory._replace(numbers=f.layout.pack(x))
 
 
-def compiled_filter(estimator: Estimator | Smoothed, rate_hz: float, epoch_s: float) -> CompiledFilter:
+def compiled_filter(estimator: Filter, rate_hz: float, epoch_s: float) -> CompiledFilter:
     """A filter compiled for a grid; from the cache where it has been made before.
 
     Raises InputError where there is no C compiler, or the filter is smoothed or cannot be exported.

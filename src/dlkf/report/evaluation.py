@@ -180,23 +180,23 @@ def outage_map(scores: Scores) -> go.Figure:
     windows = list(zip(w.piece, np.maximum(w.first - 1, 0), w.last))
     hidden = [scores.geodetic(i, scores.truth_p_n[i, a : b + 1]) for i, a, b in windows]
     traces = [
-        track(*joined(hidden, 8000).T, "outage", SHADE, width=9),
-        track(*joined(truth, 12_000).T, "truth", TRUTH, width=1.5),
+        track(joined(hidden, 8000), "outage", SHADE, width=9),
+        track(joined(truth, 12_000), "truth", TRUTH, width=1.5),
     ]
     for name, c in colours(scores).items():
         p = scores.filters[name].p_n
         ways = [scores.geodetic(i, p[i, a : b + 1]) for i, a, b in windows]
-        traces.append(track(*joined(ways, 8000).T, name, c, width=2))
+        traces.append(track(joined(ways, 8000), name, c, width=2))
     return chart(traces, around=traces[:2])
 
 
 def piece_map(scores: Scores, baseline: str | None) -> go.Figure:
     """Truth and every filter of up to eight pieces from good to bad."""
     chosen = representative(scores, 8, baseline if baseline in scores.filters else None)
-    traces = [track(*joined([scores.geodetic(i, scores.truth_p_n[i]) for i in chosen]).T, "truth", TRUTH, width=2)]
+    traces = [track(joined([scores.geodetic(i, scores.truth_p_n[i]) for i in chosen]), "truth", TRUTH, width=2)]
     for name, c in colours(scores).items():
         p = scores.filters[name].p_n
-        traces.append(track(*joined([scores.geodetic(i, p[i]) for i in chosen]).T, name, c, width=2))
+        traces.append(track(joined([scores.geodetic(i, p[i]) for i in chosen]), name, c, width=2))
     return chart(traces, around=traces[:1])
 
 
@@ -208,7 +208,7 @@ def outage_rows(scores: Scores, result: Results, figure: str) -> tuple[list[str]
     order = np.argsort(-np.where(np.isfinite(least), least, -1.0), kind="stable")[:MOST_OUTAGES]
     rows, marks = [], []
     for k in order:
-        o, i = result.per_outage[k], w.piece[k]
+        o, i = result.per_outage[k], int(w.piece[k])
         rows.append(
             [o["drive"], f"{o['t_start']:.0f}", f"{o['length_s']:g}", number(o["distance_m"])]
             + [number(x) for x in ends[k]]

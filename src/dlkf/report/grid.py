@@ -18,11 +18,12 @@ def grid_page(title: str, table: pd.DataFrame, chosen: pd.DataFrame, rows: Seque
     """``table`` has all points: name, swept settings, ``val/…``, ``test/…``; ``chosen`` the few columns to read, the
     best point first, ``rows`` its cells.
     """
-    validated = next((c for c in table if c.startswith("val/")), None)
+    validated = next((c for c in map(str, table) if c.startswith("val/")), None)
     page = Page(f"{len(table)} points of a grid search", [_best(chosen, validated)])
     page.heading(title)
-    page.table(list(chosen), rows, marks=["class=best" if validated and not k else "" for k in range(len(rows))])
-    settings = [c for c in table if c not in NAMES and "/" not in c]
+    marks = ["class=best" if validated and not k else "" for k in range(len(rows))]
+    page.table(list(map(str, chosen)), rows, marks=marks)
+    settings = [c for c in map(str, table) if c not in NAMES and "/" not in c]
     seen = [c for c in (validated, *_scores(table, chosen)) if c is not None]
     known = table.dropna(subset=seen)
     if len(known) > 1 and settings and seen:
@@ -35,18 +36,18 @@ def _best(chosen: pd.DataFrame, validated: str | None) -> str:
     best = chosen.iloc[0]
     if validated is None or pd.isna(best[validated]):
         return "No point was validated."
-    filters = [c for c in chosen if c not in (*NAMES, validated)]
+    filters = [c for c in map(str, chosen) if c not in (*NAMES, validated)]
     told = f"; on test {filters[0]} {best[filters[0]]:.3g}" if filters else ""
     return f"Best by validation: {best['run']}, {validated} {best[validated]:.3g}{told}."
 
 
 def _scores(table: pd.DataFrame, chosen: pd.DataFrame) -> list[str]:
     """The column of ``table`` that ``chosen`` shows first of the filters."""
-    filters = [c for c in chosen if c not in NAMES and not c.startswith("val/")]
+    filters = [c for c in map(str, chosen) if c not in NAMES and not c.startswith("val/")]
     if not filters:
         return []
     shown = chosen[filters[0]].sort_index()
-    return [c for c in table if c.startswith(f"test/{filters[0]}/") and table[c].equals(shown)][:1]
+    return [c for c in map(str, table) if c.startswith(f"test/{filters[0]}/") and table[c].equals(shown)][:1]
 
 
 def coordinates(table: pd.DataFrame, settings: Sequence[str], scores: Sequence[str]) -> go.Figure:

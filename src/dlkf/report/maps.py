@@ -12,21 +12,21 @@ from numpy.typing import NDArray
 
 from dlkf.report.plots import FONT
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 MOST = 6000  # points of all tracks of one kind on a map
 
 
-def track(lat: Array, lon: Array, name: str, colour: str, *, width: float = 2.5, visible: bool = True, **more: Any):
-    """A line; NaN breaks it."""
+def track(place: Array, name: str, colour: str, *, width: float = 2.5, visible: bool = True, **more: Any):
+    """A line through latitudes and longitudes (n, 2); NaN breaks it."""
+    lat, lon = place.T
     return go.Scattermap(
         lat=lat, lon=lon, mode="lines", name=name, line={"color": colour, "width": width}, visible=visible, **more
     )
 
 
-def dots(
-    lat: Array, lon: Array, name: str, colour: str | Array, *, size: float = 6, bar: str | None = None, **more: Any
-):
-    """Points of one colour, or coloured by a value with a bar."""
+def dots(place: Array, name: str, colour: str | Array, *, size: float = 6, bar: str | None = None, **more: Any):
+    """Points (n, 2) of one colour, or coloured by a value with a bar."""
+    lat, lon = place.T
     marker: dict[str, Any] = {"size": size, "color": colour}
     if bar is not None:
         marker |= {"colorscale": "Viridis", "colorbar": {"title": {"text": bar}, "thickness": 12, "len": 0.7}}
@@ -61,7 +61,8 @@ def chart(
                  "yanchor": "bottom", "pad": {"t": 2, "b": 4}, "showactive": True}
             ]
         )  # fmt: skip
-        for trace, group in zip(figure.data, groups):
+        shown: Any = figure.data
+        for trace, group in zip(shown, groups):
             trace.visible = group in ("", names[0])
     return figure
 

@@ -111,24 +111,24 @@ def route(courses: Sequence[Course]) -> go.Figure:
     share = max(200, 12_000 // len(courses))
     for k, course in enumerate(courses):
         place = joined([_place(course)], share)
-        add(track(*place.T, course.result.drive, COLOURS[k % len(COLOURS)], width=3), "drives")
+        add(track(place, course.result.drive, COLOURS[k % len(COLOURS)], width=3), "drives")
     hidden = [np.where((c.without > GAP_S)[:, None], _place(c), np.nan) for c in courses]
-    add(track(*joined([_place(c) for c in courses], 12_000).T, "with GNSS", "#0072B2", width=3), "outages")
+    add(track(joined([_place(c) for c in courses], 12_000), "with GNSS", "#0072B2", width=3), "outages")
     if any(np.isfinite(h).any() for h in hidden):
         gaps = np.concatenate([_with_breaks(h, share) for h in hidden])
-        add(track(*gaps.T, f"over {GAP_S:g} s without a fix", "#D55E00", width=5), "outages")
+        add(track(gaps, f"over {GAP_S:g} s without a fix", "#D55E00", width=5), "outages")
     for code, (name, colour) in QUALITY.items():
         seen = [np.stack((c.fixes.lat_deg, c.fixes.lon_deg), -1)[c.fixes.quality == code] for c in courses]
         points = np.concatenate([s[every(len(s), share)] for s in seen])
         if len(points):
-            add(dots(*points.T, name, colour, size=5), "fixes")
+            add(dots(points, name, colour, size=5), "fixes")
     index = [every(len(c.result.table), share) for c in courses]
     sigma = np.concatenate([horizontal_std(c)[i] for c, i in zip(courses, index)])
     if np.isfinite(sigma).any():
         place = np.concatenate([_place(c)[i] for c, i in zip(courses, index)])
         value = np.log10(np.maximum(np.nan_to_num(sigma, nan=1e-3), 1e-3))
         label = [f"{s:.2g} m" for s in sigma]
-        add(dots(*place.T, "horizontal 1σ", value.astype(np.float32), size=5, bar="log₁₀ 1σ [m]", text=label), "1σ")
+        add(dots(place, "horizontal 1σ", value.astype(np.float32), size=5, bar="log₁₀ 1σ [m]", text=label), "1σ")
     return chart(traces, groups)
 
 
@@ -159,7 +159,8 @@ def rows_of(courses: Sequence[Course]) -> tuple[list[str], list[list[str]], list
         )
         place = _place(course)
         half = 60_000 * max(float(np.ptp(place[:, 0])), float(np.ptp(place[:, 1])), 1e-3)
-        marks.append(mark("map", *place.mean(0), half))
+        lat, lon = place.mean(0)
+        marks.append(mark("map", lat, lon, half))
     return columns, rows, marks
 
 

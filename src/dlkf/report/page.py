@@ -30,7 +30,8 @@ class Page:
 
     def figure(self, name: str, figure: go.Figure) -> None:
         """An interactive figure; ``name`` is its id in the page. A map brings its switch for streets."""
-        if any(trace.type == "scattermap" for trace in figure.data):
+        traces: Any = figure.data
+        if any(trace.type == "scattermap" for trace in traces):
             self.parts.append(
                 f'<label><input type=checkbox class=streets data-map="{name}"> streets '
                 "(loads tiles from openstreetmap.org)</label>"

@@ -12,7 +12,7 @@ from plotly.subplots import make_subplots
 
 from dlkf.colours import SHADE
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 MOST = 1800  # points of a line: more than a screen has columns
 FONT = {"family": "system-ui, sans-serif", "size": 12}
 

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from dlkf.data.drive import Batch
-from dlkf.filters.integration import Estimator, Solution, integrate
-from dlkf.filters.smoother import Smoothed, smooth
+from dlkf.filters.integration import Solution, integrate
+from dlkf.filters.smoother import Filter, Smoothed, smooth
 
 CHUNK_SAMPLES = 1_500_000  # IMU samples integrated at a time: bounds the memory
 
@@ -25,7 +25,7 @@ def chunks(batch: Batch, samples: int = CHUNK_SAMPLES) -> Iterator[Tensor]:
         start += size
 
 
-def run_filter(batch: Batch, estimator: Estimator | Smoothed, *, keep_covariances: bool = False) -> Solution:
+def run_filter(batch: Batch, estimator: Filter, *, keep_covariances: bool = False) -> Solution:
     """The filter loop, smoothed where asked for, without gradients, on the device of the estimator's parameters.
 
     ``keep_covariances`` where the filter has some and is not smoothed.

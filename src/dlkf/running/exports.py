@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -50,11 +51,11 @@ def write_geojson(path: Path, table: pd.DataFrame, when: Times, name: str) -> No
     """RFC 7946: the track as a line, and a point a row with time, speed, heading and horizontal 1σ."""
     place = table[["lon_deg", "lat_deg", "height_m"]].to_numpy()
     speed, course = _speed(table), np.degrees(table["yaw"].to_numpy()) % 360
-    sigma = np.hypot(table["std_pos_n"], table["std_pos_e"]).to_numpy()
+    sigma = np.hypot(table["std_pos_n"].to_numpy(), table["std_pos_e"].to_numpy())
     line = {"type": "LineString", "coordinates": _rounded(place)}
     features = [{"type": "Feature", "properties": {"name": name}, "geometry": line}]
     for k, point in enumerate(_rounded(place)):
-        told = {"t": float(table["t"].iloc[k]), "speed_mps": round(float(speed[k]), 3)}
+        told: dict[str, Any] = {"t": float(table["t"].iloc[k]), "speed_mps": round(float(speed[k]), 3)}
         told |= {"heading_deg": round(float(course[k]), 2), "gnss_used": bool(table["gnss_used"].iloc[k])}
         if np.isfinite(sigma[k]):
             told["std_horizontal_m"] = round(float(sigma[k]), 4)
@@ -87,7 +88,8 @@ def write_gpx(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
 
     segment = gpx.GPXTrackSegment()
     for k, (lat, lon, height) in enumerate(table[["lat_deg", "lon_deg", "height_m"]].to_numpy()):
-        segment.points.append(gpx.GPXTrackPoint(round(lat, 9), round(lon, 9), round(height, 3), when and when[k]))
+        at = when[k] if when else None
+        segment.points.append(gpx.GPXTrackPoint(round(lat, 9), round(lon, 9), round(height, 3), at))
     track = gpx.GPXTrack(name=name)
     track.segments.append(segment)
     content = gpx.GPX()
@@ -102,9 +104,10 @@ def write_nmea(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
 
     start = datetime(1980, 1, 6, tzinfo=UTC)
     lines = []
-    course = np.degrees(np.arctan2(table["vel_e"], table["vel_n"])).to_numpy() % 360
+    course = np.degrees(np.arctan2(table["vel_e"].to_numpy(), table["vel_n"].to_numpy())) % 360
     speed = _speed(table) / KNOTS
-    for k, row in enumerate(table.itertuples()):
+    rows: Iterator[Any] = iter(table.itertuples())
+    for k, row in enumerate(rows):
         at = when[k] if when is not None else start + timedelta(seconds=float(row.t))
         clock = f"{at:%H%M%S}.{at.microsecond // 10_000:02d}"
         place = (*_dm(row.lat_deg, "NS", 2), *_dm(row.lon_deg, "EW", 3))
@@ -133,7 +136,8 @@ def write_pos(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
     head = "%  GPST               latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)"
     head += "  sdne(m)  sdeu(m)  sdun(m) age(s)  ratio    vn(m/s)    ve(m/s)    vu(m/s)"
     lines = [f"% program   : dlkf, {name}", "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,6:dead reckoning)", head]
-    for k, row in enumerate(table.itertuples()):
+    rows: Iterator[Any] = iter(table.itertuples())
+    for k, row in enumerate(rows):
         text = f"{week[k]:4.0f} {gps[k] - week[k] * WEEK_S:10.3f} {row.lat_deg:14.9f} {row.lon_deg:14.9f} "
         text += f"{row.height_m:10.4f} {1 if row.gnss_used else 6:3d}   0"
         text += f" {std[0][k]:8.4f} {std[1][k]:8.4f} {std[2][k]:8.4f}"
@@ -167,7 +171,7 @@ def write_csv(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
             writer.writerow(([when[k].isoformat().replace("+00:00", "Z")] if when else []) + values)
 
 
-def poses(table: pd.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def poses(table: pd.DataFrame) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """Positions (T, 3) East-North-Up [m] from the first row, and rotations (T, 3, 3) of Forward-Left-Up into it."""
     lat, lon, height = (table[c].to_numpy() for c in ("lat_deg", "lon_deg", "height_m"))
     position = np.stack(pymap3d.geodetic2enu(lat, lon, height, lat[0], lon[0], height[0]), -1)
@@ -205,11 +209,11 @@ def export(folder: Path, table: pd.DataFrame, names: list[str], when: Times, dri
         write(folder / file, table, when, drive)
 
 
-def _speed(table: pd.DataFrame) -> NDArray[np.float64]:
-    return np.hypot(table["vel_n"], table["vel_e"]).to_numpy()
+def _speed(table: pd.DataFrame) -> NDArray[np.floating]:
+    return np.hypot(table["vel_n"].to_numpy(), table["vel_e"].to_numpy())
 
 
-def _rounded(place: NDArray[np.float64]) -> list[list[float]]:
+def _rounded(place: NDArray[np.floating]) -> list[list[float]]:
     return [[round(lon, 9), round(lat, 9), round(height, 3)] for lon, lat, height in place.tolist()]
 
 

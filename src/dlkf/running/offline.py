@@ -19,7 +19,8 @@ from dlkf.data.store import load_dataset
 from dlkf.data.tables import read_table
 from dlkf.data.validate import GNSS_QUALITIES
 from dlkf.errors import InputError
-from dlkf.filters.integration import Estimator, Solution
+from dlkf.filters.integration import Solution
+from dlkf.filters.smoother import Filter
 from dlkf.running.batched import CHUNK_SAMPLES, run_filter
 from dlkf.running.solution import solution_table
 from dlkf.running.start import align_each
@@ -59,7 +60,7 @@ class Fixes:
         return int(((self.t > first + 1e-3) & (self.t <= last + 1e-3)).sum())
 
 
-def epoch_for(spacings: Iterable[Fixes], rate_hz: float, estimator: Estimator) -> float:
+def epoch_for(spacings: Iterable[Fixes], rate_hz: float, estimator: Filter) -> float:
     """Update interval [s] that uses every fix: the closest usual spacing, at most 1 s.
 
     1 s where it is no whole number of IMU samples, and for filters with constraints, whose noise is meant for one a
@@ -172,7 +173,7 @@ def navigate_shares(
 
 def navigate_dataset(
     folder: str | Path,
-    estimator: Estimator,
+    estimator: Filter,
     *,
     align: AlignConfig = ALIGN,
     drives: Sequence[str] | None = None,
@@ -186,7 +187,7 @@ def navigate_dataset(
 
 def navigate_drives(
     drives: Sequence[Drive],
-    estimator: Estimator,
+    estimator: Filter,
     *,
     align: AlignConfig = ALIGN,
     skipped: dict[str, str] | None = None,

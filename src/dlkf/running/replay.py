@@ -16,7 +16,7 @@ from dlkf.data.store import drive_from_tables, drive_rows
 from dlkf.data.tables import Columns
 from dlkf.data.validate import DriveTables, read_checked
 from dlkf.errors import InputError
-from dlkf.filters.integration import Estimator
+from dlkf.filters.smoother import Filter
 from dlkf.running import start
 from dlkf.running.estimate import Estimate, estimates_table
 from dlkf.running.offline import Navigated
@@ -58,7 +58,7 @@ def played(
 
 def stream_drive(
     tables: DriveTables,
-    estimator: Estimator,
+    estimator: Filter,
     *,
     rate_hz: float,
     epoch_s: float,
@@ -94,7 +94,7 @@ def stream_drive(
 
 def stream_drives(
     folder: str | Path,
-    estimator: Estimator,
+    estimator: Filter,
     *,
     rate_hz: float,
     epoch_s: float,

@@ -40,8 +40,8 @@ from dlkf.data.schema import POSITION, STD, VELOCITY
 from dlkf.data.segments import REST, whole_drives
 from dlkf.data.validate import LIMITS, Limits
 from dlkf.errors import InputError
-from dlkf.filters.integration import Estimator, Fix, advance
-from dlkf.filters.smoother import Smoothed
+from dlkf.filters.integration import Fix, advance
+from dlkf.filters.smoother import Filter, Smoothed
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import NavState
@@ -110,7 +110,7 @@ class StreamingFilter:
 
     def __init__(
         self,
-        estimator: Estimator,
+        estimator: Filter,
         *,
         rate_hz: float = 50.0,
         epoch_s: float = 1.0,

@@ -103,7 +103,7 @@ def sliced(truth: Truth, rows: slice) -> Truth:
     return Truth(*(getattr(truth, name)[rows] for name in Truth.__dataclass_fields__))
 
 
-def _rate_at_rows(rate: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rate_at_rows(rate: NDArray[np.floating]) -> NDArray[np.floating]:
     """Body rate at the N+1 truth rows from the N sample means between them: the mean of both neighbours."""
     padded = np.concatenate((rate[:1], rate, rate[-1:]))
     return 0.5 * (padded[1:] + padded[:-1])

@@ -34,13 +34,11 @@ def fresh_drives(
 
     A training that wants a new fleet every ten epochs makes, in a ``DriveDataModule``'s place of ``load_dataset``,
 
-        with initialize_config_dir(str(config_dir()), version_base="1.3"):
-            config = compose("simulate", ["simulated@dataset=wide", "seed=7"])
-        fleet = recipe(OmegaConf.to_container(config, resolve=True))
+        fleet = recipe(composed("simulate", "simulated@dataset=wide", "seed=7"))
         stack = DriveStack(fresh_drives(fleet, 48 * (epoch // 10), 48, seconds=600, rate_hz=50.0))
 
-    (:func:`dlkf.simulation.dataset.recipe`), and validates on drives of another seed. ``workers`` threads share the
-    drives. InputError as of a dataset's settings, and for a drive shorter than an epoch.
+    (:func:`dlkf.simulation.dataset.recipe`, ``dlkf.command.composing.composed``), and validates on other seeds.
+    ``workers`` threads share the drives. InputError as of a dataset's settings, and for a drive shorter than an epoch.
     """
     if count < 1 or first < 0 or (seconds is not None and seconds < 1):
         raise InputError(f"fresh drives: first {first}, count {count}, seconds {seconds} must be 0, 1, 1 or more")

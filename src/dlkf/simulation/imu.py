@@ -18,7 +18,7 @@ from dlkf.navigation.earth import EARTH_RATE, ecef_from_geodetic, ned_axes, norm
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.simulation.motion.vehicle import Truth
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 CHUNK = 65536  # samples at a time: memory independent of the length of a drive
 
 

@@ -21,7 +21,7 @@ from dlkf.data.validate import DriveTables, read_checked
 from dlkf.errors import InputError
 from dlkf.files import name_of, placed, staged
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 AXES = (("x", "#0072B2"), ("y", "#D55E00"), ("z", "#009E73"))
 INK, GREY, LIMIT = "#222222", "#BBBBBB", "#CC79A7"
 PAPER = {"speed": (0.0, 80.0), "along": (0.0, 2.0), "radius": (40.0, 150.0), "lateral": (0.5, 5.0)}  # R085-R088

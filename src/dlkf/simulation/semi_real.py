@@ -36,7 +36,7 @@ from dlkf.simulation.gnss.surroundings import Sky, sky_along
 from dlkf.simulation.imu import ImuUnit, corrupt, draw_unit
 from dlkf.simulation.motion.vehicle import Truth
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 KIND = "semi-real"
 INJECTED = "the injected part only: the source's own IMU errors remain and are not known"
 

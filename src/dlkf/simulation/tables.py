@@ -10,7 +10,7 @@ from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, IMU_ERROR, POSITION, STD, VE
 from dlkf.data.tables import Columns
 from dlkf.simulation.motion.vehicle import Truth
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 
 def imu_columns(t: Array, samples: Array) -> Columns:

@@ -59,7 +59,7 @@ def best_of(client, run_id: str):
 def comparison(client, runs: Sequence) -> pd.DataFrame:
     """A row per run: name, status, the parameters that differ between runs, validation, ``test/`` metrics."""
     given = pd.DataFrame([r.data.params for r in runs], dtype=object)
-    names = [key for key in sorted(given) if given[key].nunique(dropna=False) > 1]
+    names = [key for key in sorted(map(str, given)) if given[key].nunique(dropna=False) > 1]
     names = [key for key in names if key.partition(".")[0] not in NAMELESS]
     metrics = sorted({key for r in runs for key in r.data.metrics if key.startswith("test/")})
     monitor = monitored(runs)
@@ -79,11 +79,11 @@ def compared(table: pd.DataFrame) -> tuple[str, pd.DataFrame]:
     Sorted by validation: test drives choose nothing (R018). Without ``test/`` metrics (all runs failed) the
     name is empty.
     """
-    monitor = next((c for c in table if c.startswith("val/")), None)
+    monitor = next((c for c in map(str, table) if c.startswith("val/")), None)
     first = [c for c in ("run", "status", monitor) if c in table]
     ordered = table.sort_values(monitor, na_position="last") if monitor else table
     for metric in COMPARED:
-        columns = [c for c in table if c.startswith("test/") and c.endswith(f"/{metric}")]
+        columns = [c for c in map(str, table) if c.startswith("test/") and c.endswith(f"/{metric}")]
         if columns:
             break
     else:

@@ -108,7 +108,7 @@ class GridParent(Callback):
     def _compare(self, client, parent: str, table: pd.DataFrame, failed: Sequence[Failure]) -> None:
         """The table of all points as text, CSV, page and note of the parent."""
         metric, chosen = compared(table)
-        ordered = any(c.startswith("val/") for c in table)
+        ordered = any(c.startswith("val/") for c in map(str, table))
         title = f"{metric} of the test pieces" if metric else "no run was scored"
         title += "; runs by their validation" if ordered else ""
         text = as_text(chosen) + "".join(f"\nfailed: {f.point}: {f.why}\n" for f in failed)
@@ -138,11 +138,11 @@ def parent_status(statuses: Sequence[str], ended: bool) -> str:
 
 def swept_overrides(config: DictConfig) -> dict[str, str]:
     """``{key: values}`` of what the sweep goes over, from the command line and ``hydra.sweeper.params``."""
-    given = OmegaConf.to_container(config.hydra.sweeper.get("params") or OmegaConf.create({}))
+    given: Any = OmegaConf.to_container(config.hydra.sweeper.get("params") or OmegaConf.create({}))
     lines = [f"{k}={v}" for k, v in given.items()] + list(config.hydra.overrides.task)
     overrides = OverridesParser.create().parse_overrides(lines)
     swept = [o for o in overrides if o.is_sweep_override()]
-    return {o.get_key_element(): o.input_line.partition("=")[2] for o in swept}
+    return {o.get_key_element(): (o.input_line or "").partition("=")[2] for o in swept}
 
 
 def run_name(name: str, overrides: Sequence[str]) -> str:

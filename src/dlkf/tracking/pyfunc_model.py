@@ -15,7 +15,7 @@ from typing import Any
 
 import pandas as pd
 from mlflow.models import set_model
-from mlflow.pyfunc import PythonModel
+from mlflow.pyfunc.model import PythonModel
 
 
 class NavigationFilter(PythonModel):
@@ -49,15 +49,18 @@ class NavigationFilter(PythonModel):
 
         from dlkf.data.rows import drives_of
         from dlkf.data.store import drive_from_tables, load_dataset
+        from dlkf.filters.saved import grid_of
 
-        grid = {"rate_hz": self.filter.config.rate_hz, "epoch_s": self.filter.config.epoch_s}
+        grid = grid_of([self.filter])
+        rate_hz, epoch_s = grid["rate_hz"], grid["epoch_s"]
         if "dataset" in given and given["dataset"].notna().any():
             for folder in given["dataset"].dropna():
-                yield folder, load_dataset(folder, dtype=torch.float64, reference=False, **grid)
+                options: dict[str, Any] = {"rate_hz": rate_hz, "epoch_s": epoch_s, "reference": False}
+                yield folder, load_dataset(folder, dtype=torch.float64, **options)
             return
         arm = [float(params.get(f"lever_arm_{a}_m", 0.0)) for a in "xyz"]
         tables = drives_of(given, arm)
-        yield "", [drive_from_tables(t, "", dtype=torch.float64, **grid) for t in tables]
+        yield "", [drive_from_tables(t, "", rate_hz, epoch_s, torch.float64) for t in tables]
 
 
 set_model(NavigationFilter())

@@ -135,7 +135,8 @@ def _log_model_metrics(run: Run, model_id: str, metrics: Mapping[str, float]) ->
     from mlflow.entities import Metric
     from mlflow.utils.time import get_current_time_millis
 
-    inputs = run.client.get_run(run.id).inputs.dataset_inputs
+    given = run.client.get_run(run.id).inputs
+    inputs = given.dataset_inputs if given else []
     data = {}
     if len(inputs) == 1:
         data = {"dataset_name": inputs[0].dataset.name, "dataset_digest": inputs[0].dataset.digest}

@@ -127,6 +127,7 @@ def experiment_id(client: MlflowClient, name: str) -> str:
             if error.error_code != "RESOURCE_ALREADY_EXISTS":  # made by another process in the meantime
                 raise
             found = client.get_experiment_by_name(name)
+    assert found is not None
     if found.lifecycle_stage == "deleted":
         raise InputError(f"the MLflow experiment {name!r} was deleted; restore it or give another name=")
     return found.experiment_id
@@ -239,7 +240,7 @@ def start_run(
         if resumed:
             active = mlflow.start_run(run_id, log_system_metrics=system_metrics)
             if parent_run_id:
-                client.set_tag(run_id, PARENT_TAG, parent_run_id)  # a point of a grid search started again
+                client.set_tag(active.info.run_id, PARENT_TAG, parent_run_id)  # a point of a grid search started again
         else:
             active = mlflow.start_run(
                 experiment_id=experiment_id(client, experiment),

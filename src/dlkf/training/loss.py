@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from functools import reduce
 from typing import Any
 
 import torch
@@ -102,4 +103,4 @@ def loss_of(values: Mapping[str, Any]) -> Loss:
 
 def weighted(losses: Mapping[str, Tensor], weights: dict[str, float]) -> Tensor:
     """w_p L_p + w_v L_v + w_h L_h (paper eq 9), and the terms that have their own factors."""
-    return sum(weights.get(term, 1.0) * loss for term, loss in losses.items())
+    return reduce(torch.add, (weights.get(term, 1.0) * loss for term, loss in losses.items()))

@@ -43,7 +43,7 @@ class FilterTraining(L.LightningModule):
         self.loss = loss
         self.optimizer_settings, self.scheduler_settings = optimizer, scheduler
         self.covariances = getattr(loss, "likelihood", 0.0) > 0
-        self.loss_weights = dict.fromkeys(TERMS, 1.0)
+        self.loss_weights: dict[str, float] = dict.fromkeys(TERMS, 1.0)
         self.seed = seed
 
     def configure_optimizers(self):
@@ -63,7 +63,7 @@ class FilterTraining(L.LightningModule):
         rank, processes = self.trainer.global_rank, self.trainer.world_size
         torch.manual_seed(hash((self.seed, self.global_step, *([rank] if rank else ()))) % 2**63)  # dropout
         generator = torch.Generator().manual_seed(hash((self.seed, self.current_epoch, step)) % 2**63)
-        for callback in self.trainer.callbacks:
+        for callback in self.trainer.callbacks:  # pyright: ignore[reportAttributeAccessIssue]  set by Trainer()
             if isinstance(callback, BatchCallback):
                 batch = callback.transform(batch, self.current_epoch, generator)
         pieces = batch.size[0]
@@ -80,7 +80,7 @@ class FilterTraining(L.LightningModule):
     def on_train_epoch_start(self) -> None:
         """Rate and clock of the epoch."""
         self._began = time.perf_counter()
-        self.log("train/learning_rate", self.optimizers().param_groups[0]["lr"])
+        self.log("train/learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"])
 
     def on_train_epoch_end(self) -> None:
         """How long the epoch took."""

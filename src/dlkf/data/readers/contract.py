@@ -147,7 +147,7 @@ def _latitudes(mapped: Mapped, minutes: bool) -> tuple[np.ndarray, np.ndarray, n
 
 def _to_ned(vectors: np.ndarray, position: Mapping[str, np.ndarray]) -> np.ndarray:
     """ECEF vectors (rows, 3) in North-East-Down at the positions."""
-    east, north, up = pymap3d.ecef2enuv(*vectors.T, position["lat_deg"], position["lon_deg"])
+    east, north, up = pymap3d.ecef2enuv(*vectors.T, lat0=position["lat_deg"], lon0=position["lon_deg"])
     return np.stack((north, east, -up), -1)
 
 

@@ -68,8 +68,8 @@ def gnss_spec(table: Table) -> Spec | None:
     if found["north"] and found["east"]:
         third = found["down"] or found["up"]
         order = [found["north"], found["east"]] if found["down"] or not third else [found["east"], found["north"]]
-        out["velocity"] = {"columns": [*order, *([third] if third else [])]}
-        out["velocity"]["frame"] = "ned" if found["down"] or not third else "enu"
+        frame_of_it = "ned" if found["down"] or not third else "enu"
+        out["velocity"] = {"columns": [*order, *([third] if third else [])], "frame": frame_of_it}
     elif found["speed"] and found["course"]:
         out["velocity"] = {"columns": [found["speed"], found["course"]], "frame": "course"}
     for key, stem in (("std_position", "pos"), ("std_velocity", "vel")):

@@ -98,7 +98,8 @@ def settle(
         if value is not None:
             _set(specs, PLACES[name][0], value)
     lever = found.get("lever_arm_m") if "lever_arm_m" in wanted else arm
-    return Settled(specs, tuple(float(x) for x in lever), _told(found.found, wanted))
+    x, y, z = (float(a) for a in lever)
+    return Settled(specs, (x, y, z), _told(found.found, wanted))
 
 
 def _raw(imu: pd.DataFrame, gnss: pd.DataFrame, factors: Mapping[str, float | None]) -> Raw:

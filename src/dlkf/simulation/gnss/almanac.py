@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dlkf.errors import InputError
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 PACKAGED = Path(__file__).with_name("gps_week2429.alm")
 PACKAGED_WEEK = 2429
 FIELDS = {  # label of the YUMA format, without its unit, to name

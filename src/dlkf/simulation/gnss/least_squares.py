@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dlkf.simulation.gnss.satellites import SatelliteState, direction, light_time_factor, ned_at, range_rate
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 FEWEST = 4  # satellites for position and clock (R019)
 MOST_STEPS = 10

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dlkf.simulation.gnss.surroundings import Sky
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
 

@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 from dlkf.errors import InputError
 from dlkf.settings import settings_from
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 LOWEST = math.radians(3.0)  # mappings and noise grow without bound towards the horizon
 EARTH_RADIUS, IONOSPHERE = 6378.1363e3, 350e3  # m, radius and height of the thin shell (RTCA DO-229 A.4.4.10.4)
 QUALITIES = (1, 2, 4, 5)

@@ -10,7 +10,7 @@ from dlkf.data.schema import STD
 from dlkf.simulation.gnss.white import GnssConfig, antenna, episodes, shifted
 from dlkf.simulation.motion.vehicle import Truth
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 
 def late(

@@ -22,7 +22,7 @@ from dlkf.simulation.gnss.surroundings import Sky
 from dlkf.simulation.gnss.white import FLOAT, GnssConfig, antenna, observe, shifted
 from dlkf.simulation.motion.vehicle import Truth
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 WEEK = 604800  # s
 FOR_FIX = 5  # satellites that resolve carrier ambiguities
 

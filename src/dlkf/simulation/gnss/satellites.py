@@ -16,7 +16,7 @@ from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.simulation.gnss.almanac import Almanac
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 LIGHT = 299792458.0  # m/s
 GRAVITATION = 3.986005e14  # m³/s², μ of IS-GPS-200
 EARTH_SPIN = 7.2921151467e-5  # rad/s, Ω̇e of IS-GPS-200

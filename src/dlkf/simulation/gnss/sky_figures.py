@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from dlkf.navigation.earth import SEMI_MAJOR
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 BLUE, ORANGE, GREEN, SHADE = "#0072B2", "#D55E00", "#009E73", "#DDDDDD"
 COUNTS = np.arange(3.5, 13.5)  # limits of the colours of a number of satellites
 DPI = 110

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dlkf.errors import InputError
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 
 @dataclass(frozen=True)

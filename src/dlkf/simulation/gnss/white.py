@@ -76,7 +76,7 @@ class GnssConfig:
             raise InputError(f"gnss: lever_arm_b {self.lever_arm_b} must be 3 lengths in metres")
 
     @property
-    def std(self) -> NDArray[np.float64]:
+    def std(self) -> NDArray[np.floating]:
         """1σ of position and velocity in NED (6,)."""
         position = (self.std_horizontal, self.std_horizontal, self.std_vertical)
         return np.hypot((*position, *(self.std_velocity,) * 3), (self.s_p,) * 3 + (self.s_v,) * 3)
@@ -85,7 +85,7 @@ class GnssConfig:
 def observe(
     rng: np.random.Generator,
     truth: Truth,
-    rate_b: NDArray[np.float64],
+    rate_b: NDArray[np.floating],
     config: GnssConfig,
     sky: Sky | None = None,
 ) -> pd.DataFrame:
@@ -109,8 +109,8 @@ def observe(
 
 
 def _wandering(
-    rng: np.random.Generator, t: NDArray[np.float64], config: GnssConfig
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    rng: np.random.Generator, t: NDArray[np.floating], config: GnssConfig
+) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
     """Errors (N, 3) [m] in NED that last, by multipath and open ambiguities, and where the latter are open (N,)."""
     error, is_float = np.zeros((len(t), 3)), np.zeros(len(t), dtype=bool)
     dt = float(t[1] - t[0]) if len(t) > 1 else 1.0
@@ -123,7 +123,7 @@ def _wandering(
 
 
 def episodes(
-    rng: np.random.Generator, t: NDArray[np.float64], share: float, mean_s: float
+    rng: np.random.Generator, t: NDArray[np.floating], share: float, mean_s: float
 ) -> NDArray[np.bool_]:
     """Times (N,) that lie within random episodes of a mean length [s], exponential, which make a share of the time."""
     if share >= 1:
@@ -137,8 +137,8 @@ def episodes(
     return odd != starts_in
 
 def antenna(
-    truth: Truth, rate_b: NDArray[np.float64], lever_arm_b: tuple[float, float, float]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    truth: Truth, rate_b: NDArray[np.floating], lever_arm_b: tuple[float, float, float]
+) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """Offset of the antenna from the body C l [m] and its velocity v + C(ω_ib × l) − ω_ie × (C l) [m/s], (N, 3) NED.
 
     paper.md 2.5; ``lever_arm_b`` [m] in body axes, ``rate_b`` (N, 3) the body's ω_ib [rad/s].
@@ -150,7 +150,7 @@ def antenna(
     return arm, truth.v_n + swing
 
 
-def shifted(truth: Truth, offset_n: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
+def shifted(truth: Truth, offset_n: NDArray[np.floating]) -> tuple[NDArray, NDArray, NDArray]:
     """Latitude, longitude [rad] and height [m] a few metres away; second order is below 1e-4 m at 30 m."""
     meridian, transverse = radii_of_curvature(truth.lat)
     return (

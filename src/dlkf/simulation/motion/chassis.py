@@ -28,7 +28,7 @@ from dlkf.simulation.motion.routes import Kinematics
 from dlkf.simulation.motion.shaking import Shaking, shaken
 from dlkf.simulation.motion.vehicle import Route, Truth, Waves, radians_per_metre, random_waves
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 GRAVITY = 9.81  # m/s², for the load on the springs alone
 NODE_HZ = 100  # suspension is solved at this rate, whatever the IMU's, and a spline lies between
 ROUGHEST = 0.0115  # m³ · m/s, G_d(0.1/m) times speed, that a driver bears: about 3 m/s² RMS of the body

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from dlkf.errors import InputError
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 KMH = 1 / 3.6
 
 

@@ -22,7 +22,7 @@ from dlkf.errors import InputError
 from dlkf.settings import check_limits
 from dlkf.simulation.motion.routes import Kinematics
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 TONE_HZ, NODE_HZ = 20, 200  # nodes of amplitudes and frequencies, and of noise
 AT_SPEED, AT_HZ = 15.0, 50.0  # m/s at which wheels and road, Hz at which an engine has its stated size
 ROAD_HZ, ROAD_DAMPING = 6.0, 0.7  # the body's own springs keep road noise above this from the car

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dlkf.navigation.earth import ECCENTRICITY_SQ, transverse_radius
 from dlkf.simulation.motion.routes import Kinematics, Plan, VehicleConfig, along, random_plan
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import lightning as L
 from lightning.pytorch.callbacks import Callback, Checkpoint
@@ -12,6 +12,9 @@ from lightning.pytorch.callbacks import Callback, Checkpoint
 from dlkf.errors import InputError
 from dlkf.files import whole_file, whole_folder
 from dlkf.filters.saved import save_filter
+
+if TYPE_CHECKING:
+    from dlkf.training.module import FilterTraining
 
 LAST = "last.ckpt"
 BEST = "best"
@@ -47,7 +50,7 @@ class BestWeights(Callback):
         self.folder, self.monitor, self.start_epoch, self.notes = Path(folder), monitor, start_epoch, notes
         self.score, self.epoch = float("inf"), -1
 
-    def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+    def on_validation_end(self, trainer: L.Trainer, module: FilterTraining) -> None:
         """Save when the validation improved."""
         if trainer.sanity_checking or trainer.current_epoch < self.start_epoch:
             return

@@ -35,7 +35,7 @@ class LengthCurriculum(Callback):
     def setup(self, trainer: L.Trainer, module: L.LightningModule, stage: str) -> None:
         """Hand the law to the data module, which asks it when it cuts an epoch's pieces."""
         if stage == "fit":
-            trainer.datamodule.length_law = self.length_s
+            trainer.datamodule.length_law = self.length_s  # pyright: ignore[reportAttributeAccessIssue]  set by fit
 
     def state_dict(self) -> dict:
         """Settings, so that a checkpoint tells what it was trained with."""

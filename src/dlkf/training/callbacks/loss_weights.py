@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import lightning as L
 from lightning.pytorch.callbacks import Callback
 
 from dlkf.errors import InputError
 from dlkf.training.loss import TERMS
+
+if TYPE_CHECKING:
+    from dlkf.training.module import FilterTraining
 
 RULES = ("pilot", "ratio", "normalised")
 
@@ -60,7 +64,7 @@ class AdaptiveLossWeights(Callback):
         ratio = above / below if above is not None and below else 1.0
         return min(max(ratio, 1 / self.w_max), self.w_max)
 
-    def on_train_epoch_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+    def on_train_epoch_start(self, trainer: L.Trainer, module: FilterTraining) -> None:
         """Set and log the weights of this epoch."""
         module.loss_weights = self.weights()
         module.log_dict({f"train/{k}_weight": v for k, v in module.loss_weights.items()})

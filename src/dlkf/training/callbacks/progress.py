@@ -43,7 +43,7 @@ class TrainingProgress(Callback):
             self.bar.update(self.task, completed=done, description=text)
         elif not self.silent and (done % self.every == 0 or done == trainer.max_epochs):
             pace = (time.monotonic() - self.began) / (done - self.first)
-            left = timedelta(seconds=round(pace * (trainer.max_epochs - done)))
+            left = timedelta(seconds=round(pace * ((trainer.max_epochs or done) - done)))
             self.console.print(f"epoch {done}/{trainer.max_epochs}  {text}  {left} left", highlight=False)
 
     def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:

@@ -59,8 +59,9 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
 
 
 def _frame(cells: pd.DataFrame, names: list[str], clock: str, path: Path) -> pd.DataFrame:
-    one_cell = "/" in cells.iloc[0, 0] and " " in cells.iloc[0, 0]  # comma-separated: date and time in one
-    calendar = "/" in cells.iloc[0, 0]
+    first = str(cells.iloc[0, 0])
+    calendar = "/" in first
+    one_cell = calendar and " " in first  # comma-separated: date and time in one
     where = str(path)
     if calendar:
         texts = cells[0] if one_cell else cells[0].str.cat(cells[1], sep=" ")
@@ -81,14 +82,14 @@ def _frame(cells: pd.DataFrame, names: list[str], clock: str, path: Path) -> pd.
     out = {"gps_ns": whole * 10**9 + np.round(part * 1e9).astype(np.int64)}
     nan = np.full(len(cells), np.nan)
     if "x-ecef" in column:
-        xyz = [column[f"{a}-ecef"] for a in "xyz"]
-        out |= dict(zip(POSITION, pymap3d.ecef2geodetic(*xyz)))
+        x, y, z = (column[f"{a}-ecef"] for a in "xyz")
+        out |= dict(zip(POSITION, pymap3d.ecef2geodetic(x, y, z)))
         ecef = [column.get(f"v{a}", nan) for a in "xyz"]
-        east, north, up = pymap3d.ecef2enuv(*ecef, out["lat_deg"], out["lon_deg"])
+        east, north, up = pymap3d.ecef2enuv(*ecef, lat0=out["lat_deg"], lon0=out["lon_deg"])
         out |= dict(zip(VELOCITY, (north, east, -up)))
-        for names, mark in ((STD[:3], "sd"), (STD[3:], "sdv")):
+        for stds, mark in ((STD[:3], "sd"), (STD[3:], "sdv")):
             square = np.mean([column.get(f"{mark}{a}", nan) ** 2 for a in "xyz"], 0)
-            out |= dict.fromkeys(names, np.sqrt(square))
+            out |= dict.fromkeys(stds, np.sqrt(square))
     else:
         out |= dict(zip(POSITION, (column["latitude"], column["longitude"], column["height"])))
         out |= dict(zip(VELOCITY, (column.get("vn", nan), column.get("ve", nan), -column.get("vu", nan))))

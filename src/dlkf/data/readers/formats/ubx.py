@@ -76,7 +76,7 @@ def _fixes(messages: list[Any]) -> pd.DataFrame:
             stds[:3] = [float(np.sqrt(max(x, 0.0))) for x in (cov.posCovNN, cov.posCovEE, cov.posCovDD)]
             if cov.velCovValid:
                 stds[3:] = [float(np.sqrt(max(x, 0.0))) for x in (cov.velCovNN, cov.velCovEE, cov.velCovDD)]
-        row = dict(zip(POSITION, position))
+        row: dict[str, float] = dict(zip(POSITION, position))
         row |= dict(zip(VELOCITY, (m.velN / 1000, m.velE / 1000, m.velD / 1000)))
         row |= dict(zip(STD, stds)) | {"t_ns": _gps_ns(m), "quality": _quality(m)}
         rows[m.iTOW] = row
