@@ -60,7 +60,9 @@ def main(config: dict[str, Any]) -> None:
             run.log_metrics({f"found/{k}": v for k, v in found.described().items()})
         else:
             options = {key: config[key] for key in ("objective", "rounds", "pieces")}
-            result = search(model, spec, sides(drives, config), protocol, start=start, **options)
+            split = (config[key] for key in ("split", "fractions", "split_seed"))
+            parts = sides(drives, *split, length_s=protocol.length_s)
+            result = search(model, spec, parts, protocol, start=start, **options)
             table = tuning_table(result, dataset)
             files = write_tuning(out, name, result, table)
             run.log_metrics(result.metrics())

@@ -16,6 +16,7 @@ from dlkf.command.arguments import readable
 from dlkf.config import config_dir
 from tests.docs.pages import PAGES, ROOT, blocks, commands
 
+CHAIN = ROOT / "src" / "dlkf" / "tracking" / "chain.py"
 PRIMARIES = sorted(p.stem for p in config_dir().glob("*.yaml") if p.stem != "hydra_output")
 
 
@@ -113,6 +114,8 @@ def test_a_command_line_of_the_pages(page: Path, words: tuple[str, ...], mine: P
         script = given[2].replace(".", "/") + ".py" if given[1] == "-m" else given[1]
         assert (ROOT / script).is_file(), script
         text = (ROOT / script).read_text()
+        if "tracking.chain" in text:
+            text += CHAIN.read_text()
         unknown = [w for w in given[2:] if w.startswith("--") and f'"{w.partition("=")[0]}"' not in text]
         assert not unknown, f"{script} knows no {unknown}"
 

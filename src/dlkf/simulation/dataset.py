@@ -31,7 +31,7 @@ from dlkf.simulation.gnss.almanac import read_almanac
 from dlkf.simulation.gnss.receiver import Receiver, receiver_spec
 from dlkf.simulation.gnss.surroundings import Surroundings
 from dlkf.simulation.gnss.white import GnssConfig
-from dlkf.simulation.imu import draw_unit
+from dlkf.simulation.imu import ImuUnit, draw_unit
 from dlkf.simulation.motion.chassis import ChassisConfig
 from dlkf.simulation.motion.routes import VehicleConfig
 
@@ -219,16 +219,26 @@ def simulate(
     return out
 
 
+def drawn(
+    made_by: Recipe,
+    unit_seed: np.random.SeedSequence,
+    type_seed: np.random.SeedSequence,
+    ranges_seed: np.random.SeedSequence,
+) -> tuple[DatasetConfig, ImuSpec, ImuSpec, ImuUnit]:
+    """Of a drive: its settings and IMU preset out of the ranges, the type of its IMU, and the unit."""
+    config, spec = made_by.of_drive(ranges_seed)
+    kind = imu_type(config, spec, type_seed)
+    if config.imu_errors == "one":
+        unit_seed = np.random.SeedSequence(config.unit_seed, spawn_key=(0,))
+    return config, spec, kind, draw_unit(np.random.default_rng(unit_seed), kind)
+
+
 def drive_of(made_by: Recipe, index: int, seconds: int) -> tuple[DriveTables, dict[str, Any]]:
     """Drive ``index`` of a dataset, ``seconds`` long: its tables, and its row of ``drives.parquet``."""
     motion, imu, gnss, unit_seed, surroundings, chassis, type_seed, ranges_seed = np.random.SeedSequence(
         made_by.seed, spawn_key=(1, index)
     ).spawn(8)
-    config, spec = made_by.of_drive(ranges_seed)
-    kind = imu_type(config, spec, type_seed)
-    if config.imu_errors == "one":
-        unit_seed = np.random.SeedSequence(config.unit_seed, spawn_key=(0,))
-    unit = draw_unit(np.random.default_rng(unit_seed), kind)
+    config, spec, kind, unit = drawn(made_by, unit_seed, type_seed, ranges_seed)
     rates = Rates(
         int(config.imu_rate_hz), config.gnss.rate_hz, int(config.reference_rate_hz), int(config.imu_parts)
     )

@@ -30,10 +30,10 @@ from dlkf.navigation.attitude import rpy_from_rotation
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.simulation.dataset import DatasetConfig, Recipe, gnss_text, imu_type, recipe, write_raw
+from dlkf.simulation.dataset import DatasetConfig, Recipe, drawn, gnss_text, recipe, write_raw
 from dlkf.simulation.gnss.satellite_fixes import Received, receive
 from dlkf.simulation.gnss.surroundings import Sky, sky_along
-from dlkf.simulation.imu import ImuUnit, corrupt, draw_unit
+from dlkf.simulation.imu import ImuUnit, corrupt
 from dlkf.simulation.motion.vehicle import Truth
 
 Array = NDArray[np.floating]
@@ -72,11 +72,7 @@ def simulate_semi_real(
             *streams, unit_seed, type_seed, ranges_seed = np.random.SeedSequence(
                 made_by.seed, spawn_key=(2, index)
             ).spawn(6)
-            config, spec = made_by.of_drive(ranges_seed)
-            kind = imu_type(config, spec, type_seed)
-            if config.imu_errors == "one":
-                unit_seed = np.random.SeedSequence(config.unit_seed, spawn_key=(0,))
-            unit = draw_unit(np.random.default_rng(unit_seed), kind)
+            config, _, kind, unit = drawn(made_by, unit_seed, type_seed, ranges_seed)
             imu_rng, gnss_rng, sky_rng = (np.random.default_rng(stream) for stream in streams)
             imu, reference = injected(imu_rng, tables, kind, unit)
             received, rough = gnss_of_reference(gnss_rng, sky_rng, tables, config)

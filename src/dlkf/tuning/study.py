@@ -8,13 +8,12 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import yaml
 
 from dlkf.console import counting
 from dlkf.data.drive import Batch, Drive
-from dlkf.data.splits import split_rows
+from dlkf.data.splits import Split, split_rows
 from dlkf.data.stack import DriveStack
 from dlkf.errors import InputError
 from dlkf.evaluation.metrics import OBJECTIVES
@@ -66,10 +65,12 @@ def check(model: str, objective: str) -> None:
         raise InputError(f"objective={objective} is none of {', '.join((*OBJECTIVES, LIKELIHOOD))}")
 
 
-def sides(drives: Sequence[Drive], config: Mapping[str, Any]) -> dict[str, list[Drive]]:
+def sides(
+    drives: Sequence[Drive], split: Split, fractions: Sequence[float], seed: int, length_s: float
+) -> dict[str, list[Drive]]:
     """Training and test drives, whole recordings on one side; split as in :mod:`dlkf.data.splits`."""
     stack = DriveStack(drives)
-    labels = split_rows(stack, config["split"], config["fractions"], config["split_seed"], config["length_s"])
+    labels = split_rows(stack, split, fractions, seed, length_s)
     out = {}
     for side in ("train", "test"):
         rows = zip(stack.first_row.tolist(), stack.epochs.tolist())
