@@ -74,13 +74,14 @@ class Figure:
 class Bench:
     """Figures of a run."""
 
+    most_repeats: int = 9
     figures: list[Figure] = field(default_factory=list)
 
     def time(self, group: str, work: str, call: Callable[[], object], repeats: int = 5, units: float = 0.0) -> Figure:
         """Wall times of a call after one warm-up."""
         call()
         times = []
-        for _ in range(repeats):
+        for _ in range(min(repeats, self.most_repeats)):
             start = time.perf_counter()
             call()
             times.append(time.perf_counter() - start)
@@ -148,10 +149,10 @@ def windows(batch: Batch) -> torch.Tensor:
     return state.p_n.detach()
 
 
-def filters(bench: Bench, dataset: Path, imu: ImuSpec) -> None:
+def filters(bench: Bench, dataset: Path, imu: ImuSpec, length_s: float) -> None:
     """The Kalman filters over drives at the file's own 100 Hz, and what drives and length cost."""
     drives = load_dataset(dataset, rate_hz=100, dtype=torch.float64, reference=True)
-    pieces = (cut_pieces(drives, 300.0) * 8)[:64]
+    pieces = (cut_pieces(drives, length_s) * 8)[:64]
 
     def run(group: str, name: str, count: int, chosen: list) -> None:
         batch = make_batch(drives, chosen[:count], dtype=torch.float64)
@@ -166,7 +167,7 @@ def filters(bench: Bench, dataset: Path, imu: ImuSpec) -> None:
             run("filter, IMU epochs", name, count, pieces)
     for count in (1, 4, 16, 64):
         run("over drives, IMU epochs", "mbkf15", count, pieces)
-    for length in (75.0, 150.0, 300.0):
+    for length in (length_s / 4, length_s / 2, length_s):
         run("over length, IMU epochs", "mbkf15", 8, cut_pieces(drives, length) * 8)
 
 
@@ -223,15 +224,17 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__)
     arguments.add_argument("--threads", type=int, default=2)
     arguments.add_argument("--hours", type=float, default=8.0)
+    arguments.add_argument("--length-s", type=float, default=300.0, help="of the drives that filters run over")
+    arguments.add_argument("--repeats", type=int, default=9, help="at most, of every figure")
     arguments.add_argument("--out", type=Path, default=Path("outputs"))
     options = arguments.parse_args()
     torch.set_num_threads(options.threads)
     config = composed("simulate", "simulated@dataset=one_imu", f"dataset.hours={options.hours}")
-    bench, described = Bench(), machine(options.threads)
+    bench, described = Bench(options.repeats), machine(options.threads)
     with tempfile.TemporaryDirectory() as folder:
         simulate_from_config(config, Path(folder) / "drives")
         apart = mechanisation(bench, f"{folder}/drives")
-        filters(bench, Path(folder) / "drives", imu_spec(config["imu"]))
+        filters(bench, Path(folder) / "drives", imu_spec(config["imu"]), options.length_s)
         training(bench, f"{folder}/drives", options.hours)
     console = Console(width=140)
     console.print(bench.table(f"{described['processor']}, {options.threads} threads, torch {torch.__version__}"))
