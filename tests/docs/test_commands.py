@@ -147,4 +147,5 @@ def test_settings_named_in_the_text_exist(page: Path) -> None:
     named = {m[1] for code in re.findall(r"`([^`\n]+)`", text) for w in code.split() if (m := SETTING.match(w))}
     groups = {part for key in keys() for part in key.split(".")[:-1]}
     lost = sorted(n for n in named if n.partition(".")[0] in groups and not known(n))
+    lost += sorted(set(re.findall(r"`([a-z_]+)\.\*`", text)) - groups)
     assert not lost, lost
