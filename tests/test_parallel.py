@@ -11,10 +11,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
-from dlkf.config import config_dir
+from dlkf.command.composing import composed
 from dlkf.data.tables import dataset_digest, read_drives
 from dlkf.errors import InputError
 from dlkf.parallel import check, each
@@ -26,9 +24,7 @@ SHORT = (f"dataset.hours={DRIVES * 15 / 3600}", "dataset.drive_minutes=0.25", "d
 
 
 def recipe(**more):
-    with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
-        config = compose("simulate", ["simulated@dataset=per_drive", "dataset.name=many", *SHORT])
-    return {**OmegaConf.to_container(config, resolve=True), **more}
+    return {**composed("simulate", "simulated@dataset=per_drive", "dataset.name=many", *SHORT), **more}
 
 
 @pytest.fixture(scope="module")

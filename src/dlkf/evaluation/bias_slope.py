@@ -50,7 +50,7 @@ def injected_response(
             yield with_bias(batch, drawn[-1]), mask
 
     scores = score_scenes(filters, shifted(), total=total, progress=progress)
-    followed = {
+    followed: dict[str, Array] = {
         name: last_known(run.imu_error) - last_known(base.filters[name].imu_error)
         for name, run in scores.filters.items()
     }

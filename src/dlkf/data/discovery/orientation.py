@@ -130,7 +130,7 @@ def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float
     yaw_std = _jackknife(np.angle([one.alpha / fit.alpha for one in leave]))
     tilts = np.array([one.bias for one in leave], complex) / G
     tilt_std = float(np.hypot(_jackknife(tilts.real), _jackknife(tilts.imag)))
-    arms = np.array([one.arm for one in leave], complex)
+    arms: Complex = np.array([one.arm for one in leave], complex)
     arm_std = max(float(np.hypot(_jackknife(arms.real), _jackknife(arms.imag))), fit.arm_std)
     scale_std = unit * _jackknife(np.array([one.scale for one in leave]))
     explained = 1 - fit.rest / max(fit.total, 1e-9)
