@@ -19,8 +19,9 @@ from dlkf.data.store import load_dataset
 from dlkf.data.tables import read_table
 from dlkf.data.validate import GNSS_QUALITIES
 from dlkf.errors import InputError
+from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import Solution
-from dlkf.filters.smoother import Filter
+from dlkf.filters.smoother import Filter, Smoothed
 from dlkf.running.batched import CHUNK_SAMPLES, run_filter
 from dlkf.running.solution import solution_table
 from dlkf.running.start import align_each
@@ -69,7 +70,9 @@ def epoch_for(spacings: Iterable[Fixes], rate_hz: float, estimator: Filter) -> f
     closest = min((s.usual_s for s in spacings), default=1.0)
     samples = closest * rate_hz
     whole = samples >= 1 and abs(samples - round(samples)) < 1e-6
-    return closest if closest < 1.0 and whole and not getattr(estimator, "constrained", False) else 1.0
+    kalman = estimator.filter if isinstance(estimator, Smoothed) else getattr(estimator, "kalman", estimator)
+    constrained = any(isinstance(source, CarConstraints) for source in getattr(kalman, "sources", ()))
+    return closest if closest < 1.0 and whole and not constrained else 1.0
 
 
 class Innovation(NamedTuple):
