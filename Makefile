@@ -13,7 +13,7 @@ help:
 	@echo "make train     train on simulated drives and score against the baselines, some minutes"
 	@echo "make test      all tests"
 	@echo "make lint      ruff, then make types"
-	@echo "make types     pyright over src and pipelines, half a minute"
+	@echo "make types     pyright over src and pipelines, under a minute"
 	@echo "make bench     speed of the filters and of training"
 	@echo "make docs      the pages of docs/ with search, equations and the API, in outputs/docs"
 	@echo "make ui        MLflow's pages over the runs of this folder"

@@ -63,7 +63,7 @@ def _in_threads(function: Callable[[Item], Result], items: Iterable[Item], threa
 
 
 @contextmanager
-def _engine(where: int | str) -> Iterator[Callable[[Iterable[tuple]], Iterator[Any]]]:
+def _engine(where: int | str) -> Iterator[Any]:
     """What takes calls as joblib's ``delayed`` makes them (function, arguments, keywords) and yields results."""
     import joblib  # a tenth of a second that other commands do not wait for
     from joblib.externals.loky.process_executor import TerminatedWorkerError

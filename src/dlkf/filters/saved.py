@@ -46,7 +46,7 @@ def save_filter(model: Learned, folder: Path | str, card: Mapping[str, Any] | No
 
 def grid_of(
     models: Iterable[Any], rate_hz: float | None = None, epoch_s: float | None = None, usual_epoch_s: float = 1.0
-) -> dict[str, float]:
+) -> dict[str, Any]:
     """``rate_hz`` and ``epoch_s``: as given, else what a trained filter was trained on, else 50 Hz and the usual."""
     configs: list[Any] = [getattr(m, "config", None) for m in models]
     own = next(((c.rate_hz, c.epoch_s) for c in configs if hasattr(c, "rate_hz")), (50.0, usual_epoch_s))

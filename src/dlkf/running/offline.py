@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -181,7 +181,7 @@ def navigate_dataset(
     align: AlignConfig = ALIGN,
     drives: Sequence[str] | None = None,
     skipped: dict[str, str] | None = None,
-    **grid: float,
+    **grid: Any,
 ) -> Iterator[Navigated]:
     """:func:`navigate_drives` of the drives of a dataset, or those named, loaded together without a reference."""
     loaded = load_dataset(folder, dtype=torch.float64, reference=False, drives=drives, **grid)

@@ -105,8 +105,10 @@ def check_accelerator(settings: FitSettings) -> None:
     _hush()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="lightning")
-        quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
-        L.Trainer(accelerator=settings.trainer.accelerator, devices=1, enable_model_summary=False, **quiet)
+        L.Trainer(
+            accelerator=settings.trainer.accelerator, devices=1, logger=False, enable_checkpointing=False,
+            enable_progress_bar=False, enable_model_summary=False,
+        )  # fmt: skip
 
 
 def _hush() -> None:
