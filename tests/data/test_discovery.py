@@ -12,10 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from dlkf.command.composing import composed
 from dlkf.data.discovery.clock import find_lag, known_offset
+from dlkf.data.discovery.drift import find_drifting_pose, middle
 from dlkf.data.discovery.motion import motion, position_delay
 from dlkf.data.discovery.orientation import find_pose
 from dlkf.data.discovery.units import accel_units, nearest_unit, time_unit
 from dlkf.data.intake import ingest_drives
+from dlkf.data.plausibility import check_clocks
 from dlkf.data.readers import units
 from dlkf.data.readers.auto import AutoReader
 from dlkf.data.readers.logs import LogReader
@@ -75,6 +77,45 @@ def test_any_pose_and_unit(drive):
     assert pose.gyro_scale == pytest.approx(np.pi / 180, rel=5e-3)
     assert pose.scale == pytest.approx(1, abs=0.01) and pose.explained > 0.99
     assert abs(pose.lever_arm) < 0.1
+
+
+def test_clocks_that_drift_apart(drive):
+    """1000 ppm over three minutes are 0.18 s; with perfect sensors they are seen to some ppm, and none where none are.
+
+    The offset is that of the middle: 90 s of 1000 ppm. 20 ppm over 90 s are 2 ms.
+    """
+    imu, gnss = drive["imu"], drive["gnss"]
+    fast = {"imu": imu.assign(t=imu.t * 1.001), "gnss": gnss}
+    for tables, drift in ((fast, 1e-3), (drive, 0.0)):
+        t, accel, gyro, moved = _arrays(tables)
+        pose = find_drifting_pose(t, accel, gyro, moved, 0.0)
+        assert pose is not None and abs(pose.drift - drift) < 2e-5
+        assert abs(pose.lag_s - drift * middle(moved)) < 2e-3
+
+
+def test_a_drift_is_found_or_refused(tmp_path, drive):
+    """A reader that may find it writes it down, and reads with it; one that may not says it in one line."""
+    for kind, factor in (("imu", 1.001), ("gnss", 1.0)):
+        drive[kind].assign(t=drive[kind]["t"] * factor).to_csv(tmp_path / f"{kind}.csv", index=False)
+    spec = {"file": "imu.csv", "accel": {"columns": list(ACCEL)}, "gyro": {"columns": list(GYRO)}}
+    fixes = {"file": "gnss.csv", "position": {"columns": ["lat_deg", "lon_deg", "height_m"]}}
+    fixes["velocity"] = {"columns": list(VELOCITY)}
+    time = {"column": "t", "offset_s": "auto"}
+    with pytest.raises(InputError, match=r"clocks drift apart, 9\d\d|clocks drift apart, 10\d\d"):
+        list(LogReader({**spec, "time": {"column": "t"}}, {**fixes, "time": time}).read(tmp_path))
+    own = {**fixes, "time": {"column": "t", "drift_ppm": "auto"}}
+    (found,) = LogReader({**spec, "time": {"column": "t"}}, own).read(tmp_path)
+    assert found.mapping["gnss"]["time"]["drift_ppm"] == pytest.approx(1000, abs=20)
+    assert found.gnss is not None
+    np.testing.assert_allclose(found.gnss.t, 1.001 * drive["gnss"].t, atol=4e-3)
+
+
+def test_a_drift_over_a_long_drive_is_told(drive):
+    """Where a third of the drive is a second from another: no lag fits the whole."""
+    imu, gnss = ({k: v.to_numpy() for k, v in drive[kind].items()} for kind in ("imu", "gnss"))
+    check_clocks(imu, gnss, "drive")
+    with pytest.raises(InputError, match=r"drift apart, by about \d+ ppm"):
+        check_clocks(imu | {"t": imu["t"] * 1.02}, gnss, "drive")
 
 
 def test_a_lever_arm_is_seen(drive):

@@ -6,10 +6,12 @@ unusual drive does not raise an alarm.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from dlkf.data.discovery.clock import find_lag, known_offset
-from dlkf.data.discovery.motion import motion
+from dlkf.data.discovery.motion import Motion, motion
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, VELOCITY
 from dlkf.data.tables import Columns
 from dlkf.errors import InputError
@@ -21,6 +23,7 @@ DISAGREES, AGREES = 0.5, 0.25  # relative residual of way against velocity
 NOWHERE_DEG = 1e-6  # what receivers write before they have a position
 FARTHEST_KM, KM_PER_DEG = 2000.0, 111.2
 SEARCH_S = 600.0  # clocks of logs that have time in common are hardly further apart
+DRIFTED_S = 30.0  # as far may the ends of a drive be apart
 APART_S = 1.0  # less is a delay, which the filters bear; dlkf.ingest measures it on request
 TURNED_DEG = (30.0, 150.0)  # backwards is found by the filters' own search
 
@@ -194,6 +197,7 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
     """
     t, accel, gyro = imu["t"], np.stack([imu[c] for c in ACCEL], -1), np.stack([imu[c] for c in GYRO], -1)
     moved = motion(gnss["t"], gnss["lat_deg"], gnss["lon_deg"], np.stack([gnss[c] for c in VELOCITY], -1))
+    _check_drift(t, accel, gyro, moved, where)
     best = find_lag(t, accel, gyro, moved, SEARCH_S)
     if best is None or not best.clear or min(best.yaw, best.force) < 0.6 or max(best.yaw, best.force) < 0.85:
         return
@@ -213,6 +217,31 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
             f"{where}: accelerations agree with GNSS if the IMU is turned by {turned:+.0f}° about the vertical (to "
             f"the {'right' if turned > 0 else 'left'}): x must point forward; reader.imu.accel.axes and "
             f"gyro.axes=auto, or {{roll: 0, pitch: 0, yaw: {turned:.0f}}}"
+        )
+
+
+def _check_drift(t: np.ndarray, accel: np.ndarray, gyro: np.ndarray, gnss: Motion, where: str) -> None:
+    """The first and the last third of a drive have the same lag."""
+    if len(gnss.t) < 60:
+        return
+    edges = gnss.t[0] + (gnss.t[-1] - gnss.t[0]) * np.array([1 / 3, 2 / 3])
+    lags = []
+    for part in (gnss.t <= edges[0], gnss.t >= edges[1]):
+        middle = float(gnss.t[part].mean())
+        near = (t >= gnss.t[part][0] - DRIFTED_S) & (t <= gnss.t[part][-1] + DRIFTED_S)
+        some = replace(gnss, t=gnss.t[part], v=gnss.v[part], climb=gnss.climb[part])
+        lag = find_lag(t[near], accel[near], gyro[near], some, DRIFTED_S)
+        if lag is None or not lag.clear or min(lag.yaw, lag.force) < 0.6 or max(lag.yaw, lag.force) < 0.85:
+            return
+        lags.append((middle, lag.lag_s))
+    (begin, first), (end, last) = lags
+    if abs(last - first) > APART_S:
+        ppm = 1e6 * (last - first) / (end - begin)
+        raise InputError(
+            f"{where}: the clocks of IMU and GNSS drift apart, by about {ppm:.0f} ppm: {first:+.1f} s at the "
+            f"beginning, {last:+.1f} s at the end; reader.gnss.time.drift_ppm={ppm:.0f} and offset_s={first:.1f}, "
+            "then drift_ppm=auto on what is left" if abs(ppm) < 1e5 else
+            f"{where}: the clocks of IMU and GNSS have different seconds; mend reader.imu.time.unit"
         )
 
 

@@ -11,8 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlkf.data.discovery.clock import Lag, find_lag, known_offset
+from dlkf.data.discovery.drift import find_drifting_pose, middle
 from dlkf.data.discovery.motion import MOVING, Floats, Motion, motion, position_delay
-from dlkf.data.discovery.orientation import Pose, find_pose
+from dlkf.data.discovery.orientation import Pose
 from dlkf.data.discovery.units import accel_units, nearest_unit
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
@@ -106,13 +107,17 @@ def discover(
             lag, factor = other, -factor
             out.found[0] = Finding("imu.accel.unit", factor, True, out.found[0].told + ", its sign turned round")
     out.lag = lag
-    pose = find_pose(raw.t, raw.accel * factor, raw.gyro, gnss, lag.lag_s) if lag is not None else None
+    pose = None
+    if lag is not None:
+        pose = find_drifting_pose(raw.t, raw.accel * factor, raw.gyro, gnss, lag.lag_s)
     out.pose = pose
     _gyro_unit(out, raw, pose, known_gyro, increments)
     sound = pose is not None and pose.explained > LEAST_EXPLAINED and AGREE[0] < pose.scale < AGREE[1]
     sound = sound and not (pose is not None and pose.down_apart > FARTHEST_DOWN)
+    if away or "gnss.time.drift_ppm" in wanted:
+        _drift(out, pose if sound else None, wanted)
     if away:
-        _offset(out, lag, pose if sound else None, wanted, sure)
+        _offset(out, lag, pose if sound else None, wanted, sure, middle(gnss) - float(raw.gnss_t[0]))
     if "imu.axes" in wanted:
         _axes(out, pose, bool(sound) and lag is not None and lag.clear, gnss, sure)
     if "lever_arm_m" in wanted:
@@ -134,7 +139,22 @@ def _gyro_unit(out: Findings, raw: Raw, pose: Pose | None, known: Mapping[str, f
     out.add("imu.gyro.unit", unit or float(f"{pose.gyro_scale:.6g}"), unit is not None or counted, told)
 
 
-def _offset(out: Findings, lag: Lag | None, pose: Pose | None, wanted: set[str], sure: Sure) -> None:
+def _drift(out: Findings, pose: Pose | None, wanted: set[str]) -> None:
+    """How much faster the IMU's clock runs; a drift that nobody asked for is no answer."""
+    setting = "gnss.time.drift_ppm"
+    if pose is None or not pose.drift:
+        if setting in wanted:
+            seen = "" if pose is None or math.isnan(pose.drift_std) else f", ± {1e6 * pose.drift_std:.0f} ppm"
+            out.add(setting, 0.0, True, f"none to be seen{seen}")
+        return
+    told = f"± {1e6 * pose.drift_std:.0f} ppm: the clock of the IMU runs faster than that of GNSS"
+    out.add(setting, round(1e6 * pose.drift, 1), setting in wanted, told)
+
+
+def _offset(
+    out: Findings, lag: Lag | None, pose: Pose | None, wanted: set[str], sure: Sure, before_s: float
+) -> None:
+    """The offset of the first fix, ``before_s`` before the middle that the pose's lag is of."""
     setting = "gnss.time.offset_s" if "gnss.time.offset_s" in wanted else "imu.time.offset_s"
     sign = 1.0 if setting.startswith("gnss") else -1.0
     if lag is None or pose is None:
@@ -144,7 +164,8 @@ def _offset(out: Findings, lag: Lag | None, pose: Pose | None, wanted: set[str],
         )
         return
     certain = lag.clear and 2.5 * pose.lag_std <= sure.time_s
-    value = 0.0 if abs(pose.lag_s) < max(3 * pose.lag_std, 0.01) and abs(pose.lag_s) < 0.05 else pose.lag_s
+    hardly = abs(pose.lag_s) < max(3 * pose.lag_std, 0.01) and abs(pose.lag_s) < 0.05
+    value = 0.0 if hardly and not pose.drift else pose.lag_s - pose.drift * before_s
     told = f"{sign * pose.lag_s:+.3f} ± {pose.lag_std:.3f} s, delay of the velocities included; {_peak(lag)}"
     out.add(setting, round(sign * value, 4), certain, told + known_offset(pose.lag_s))
 

@@ -56,6 +56,8 @@ class Pose:
     explained: float  # share of the variance of Δv
     turned: float  # rad, sum of what the car turned
     down_apart: float  # rad between gravity and the axis about which the car turns; NaN where it turns too little
+    drift: float  # by which the IMU's clock runs faster than that of GNSS (1e-6: ppm), NaN where it cannot be seen
+    drift_std: float
 
 
 @dataclass(frozen=True)
@@ -119,14 +121,16 @@ def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float
         down = (1 - weight) * down + weight * axis
         down /= np.linalg.norm(down)
     final = _matrix(level, fit, down)
-    leave = []
+    leave, middles = [], []
     for block in range(BLOCKS):
         keep = parts.block != block
         keep &= good
         if (keep & parts.moving).sum() >= FEWEST // 2 and (one := _scan(level, gnss, parts, lag, 0.07, keep, slip)):
             leave.append(one)
+            middles.append(float(np.mean(parts.t0[~keep & good])) if (~keep & good).any() else np.nan)
     if len(leave) < BLOCKS // 2:
         return None
+    drift, drift_std = _drift(np.array(middles), np.array([one.lag_s for one in leave]), lag)
     yaw_std = _jackknife(np.angle([one.alpha / fit.alpha for one in leave]))
     tilts = np.array([one.bias for one in leave], complex) / G
     tilt_std = float(np.hypot(_jackknife(tilts.real), _jackknife(tilts.imag)))
@@ -149,7 +153,21 @@ def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float
         explained=float(explained),
         turned=turned,
         down_apart=apart,
+        drift=drift,
+        drift_std=drift_std,
     )
+
+
+def _drift(middles: Floats, left_out: Floats, lag_s: float) -> tuple[float, float]:
+    """Slope of the lag over time and its 1σ, by the jackknife's pseudo-values n θ − (n − 1) θ₋ₖ: each a block's."""
+    own = len(left_out) * lag_s - (len(left_out) - 1) * left_out
+    seen = np.isfinite(middles)
+    if seen.sum() < BLOCKS // 2:
+        return float("nan"), float("nan")
+    t = middles[seen] - middles[seen].mean()
+    slope = float(t @ own[seen] / (t @ t))
+    off = own[seen] - own[seen].mean() - slope * t
+    return slope, float(np.sqrt(off @ off / (len(t) - 2) / (t @ t)))
 
 
 def _intervals(gnss: Motion) -> _Intervals:

@@ -241,7 +241,7 @@ def _opened(specs: Mapping[str, Any]) -> tuple[dict[str, Any] | None, dict[str, 
         for key in ("accel", "gyro"):
             imu[key] = {**imu[key], "unit": "auto", "axes": "auto"}
     if gnss is not None:
-        gnss["time"] = {**gnss["time"], "offset_s": "auto"}
+        gnss["time"] = {**gnss["time"], "offset_s": "auto", "drift_ppm": "auto"}
         gnss["velocity"] = {**(gnss.get("velocity") or {}), "unit": "auto"}
         gnss["position"] = {**gnss["position"], "zero": "none", "delay_s": "auto"}
     return imu, gnss

@@ -16,7 +16,7 @@ from dlkf.errors import InputError
 
 Spec = Mapping[str, Any]
 SOURCE = ("format", "file", "table", "lines", "rows", "text", "time")
-TIME = ("column", "unit", "week", "week_number", "day", "wraps_s", "clock", "offset_s", "respace")
+TIME = ("column", "unit", "week", "week_number", "day", "wraps_s", "clock", "offset_s", "drift_ppm", "respace")
 GROUPS = {
     "imu": ("accel", "gyro", "increments", "stamp"),
     "gnss": ("position", "velocity", "std_position", "std_velocity", "quality", "every_s"),
@@ -139,6 +139,8 @@ class Mapped:
         day = None if time.get("day") is None else str(time["day"])
         whole, part = units.seconds(values, unit, week, time.get("clock"), f"{self.table.path}, {where}", day)
         offset = _finite(time.get("offset_s") or 0.0, f"{where}.offset_s")
+        if drift := _finite(time.get("drift_ppm") or 0.0, f"{where}.drift_ppm"):
+            part = part + 1e-6 * drift * ((whole - whole[0]) + (part - part[0]))
         jump = math.floor(offset)
         return whole + jump, part + (offset - jump)
 

@@ -27,6 +27,7 @@ PLACES: dict[str, tuple[tuple[str, ...], Any]] = {
     "imu.gyro.axes": (("imu", "gyro", "axes"), "frd"),
     "imu.time.offset_s": (("imu", "time", "offset_s"), 0.0),
     "gnss.time.offset_s": (("gnss", "time", "offset_s"), 0.0),
+    "gnss.time.drift_ppm": (("gnss", "time", "drift_ppm"), 0.0),
     "gnss.velocity.unit": (("gnss", "velocity", "unit"), 1.0),
     "gnss.position.delay_s": (("gnss", "position", "delay_s"), 0.0),
 }
@@ -139,6 +140,8 @@ def _refuse_doubt(found: Findings, where: str) -> None:
         return
     setting = doubt.setting.replace("imu.axes", "imu.accel.axes and .gyro.axes")
     best = "" if doubt.value is None else f"; the best guess is {_said(doubt.value)}"
+    if doubt.setting.endswith("drift_ppm"):
+        raise InputError(f"{where}: the clocks drift apart, {_said(doubt.value)} {doubt.told}; reader.{setting}=auto")
     raise InputError(
         f"{where}: not sure of reader.{setting} ({doubt.told}){best}; give it, a longer drive, or a wider reader.sure"
     )
