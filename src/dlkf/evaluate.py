@@ -6,32 +6,31 @@ Prints the results table and leaves metrics.json, table.md, table.csv, figures/ 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
-import torch
 from rich.console import Console
 
 from dlkf.command import command
-from dlkf.console import counting
 from dlkf.data.alignment import AlignConfig
-from dlkf.data.drive import Drive
 from dlkf.data.kinds import drive_kinds
-from dlkf.data.store import dataset_digest, load_dataset
-from dlkf.evaluation.protocol import Scenes, protocol_from
-from dlkf.evaluation.study import study
+from dlkf.data.store import dataset_digest, drive_rows
+from dlkf.evaluation.protocol import protocol_from
+from dlkf.evaluation.shares import Work, evaluate_shares
+from dlkf.evaluation.study import bias_law, results_of
 from dlkf.evaluation.summary import answer, metrics_of
 from dlkf.evaluation.table import all_tables, as_rich
-from dlkf.files import vacant
+from dlkf.files import absolute, name_of, vacant
 from dlkf.filters.build import build_filter
 from dlkf.filters.card import without_seen
-from dlkf.filters.model_based import Mbkf
 from dlkf.filters.saved import grid_of
 from dlkf.models import check_baseline, resolve_models
 from dlkf.navigation.imu_errors import imu_spec
+from dlkf.parallel import check
 from dlkf.provenance import provenance
 from dlkf.report.evaluation import write_report
-from dlkf.running.references import check_reference, referenced
+from dlkf.running.offline import SAMPLES_AT_ONCE, Fixes, in_shares
+from dlkf.running.references import check_reference
 from dlkf.tracking.evaluations import log_evaluation
 from dlkf.tracking.runs import tracking_uri
 
@@ -43,51 +42,45 @@ def main(config: dict[str, Any]) -> None:
     vacant(config["out"], overwrite=config["overwrite"])
     protocol, uri = protocol_from(config), tracking_uri(config["tracking"]["uri"])
     options = {"tuning": config["tuning"], "prior": config["prior"]}
-    models = resolve_models(config["model"], imu_spec(config["imu"]), uri, **options)
+    spec = imu_spec(config["imu"])
+    models = resolve_models(config["model"], spec, uri, **options)
     check_baseline(config["baseline"], models)
     check_reference(config["reference"])
     grid = grid_of(models.values(), config["rate_hz"], config["epoch_s"])
-    with counting("Loading drives") as progress:
-        options = {"drives": config["drives"], "reference": config["reference"] == "file", **grid}
-        drives = load_dataset(config["dataset"], dtype=torch.float64, progress=progress, **options)
-    digest, name = dataset_digest(config["dataset"]), drives[0].dataset
+    check(config["parallel"], config["dataset"])
+    rows, name = drive_rows(config["dataset"], config["drives"]), name_of(config["dataset"])
+    digest, kinds = dataset_digest(config["dataset"]), drive_kinds(config["dataset"])
     cards = {model_name: getattr(model, "card", {}) for model_name, model in models.items()}
-    drives, seen = without_seen(cards, drives, digest, leave_out=config["unseen"])
+    rows, seen = without_seen(cards, rows, name, digest, leave_out=config["unseen"])
     for line in seen:
         console.print(line, style="yellow")
-    drives, truth = with_truth(drives, config, console.print)
-    scenes = Scenes(drives, protocol)
-    for reason in scenes.skipped.values():
+    work = Work(
+        absolute(config["dataset"]), models, protocol, grid, kinds, {row.name: row.group for row in rows},
+        reference=config["reference"], smoother=build_filter("mbkf21", spec, tuning=config["tuning"]),
+        align=AlignConfig.of(config["align"]), law=bias_law(config["injected_bias"]), seed=config["seed"],
+        shown=config["parallel"] is None,
+    )  # fmt: skip
+    fixes = {row.name: Fixes.of(config["dataset"], row.name) for row in rows}
+    many = SAMPLES_AT_ONCE if config["parallel"] is None else SAMPLES_AT_ONCE // 4
+    done = evaluate_shares(work, in_shares(fixes, grid["rate_hz"], many), config["parallel"])
+    for reason in done.skipped.values():
         console.print(f"left out: {reason}", style="yellow")
-    told = {key: config[key] for key in ("baseline", "settle_s", "injected_bias", "seed")}
-    kinds, groups = drive_kinds(config["dataset"]), {d.name: d.group for d in drives}
-    scores, made = study(models, scenes, kinds=kinds, groups=groups, **told)
-    made_how = {**provenance(), **settings_of(config), "digest": digest, **truth, **grid, **scenes.described()}
-    by_time, baseline = scenes.mode == "pieces", config["baseline"]
+    if done.truth:
+        console.print(f"No truth: errors are against the {done.truth['reference']}.", style="bold")
+    scores = done.run.scores
+    made = results_of(done.run, **{key: config[key] for key in ("baseline", "settle_s", "seed")})
+    made_how = {**provenance(), **settings_of(config), "digest": digest, **done.truth, **grid, **done.rules}
+    by_time, baseline = done.mode == "pieces", config["baseline"]
     write_report(config["out"], name, scores, made, protocol=made_how, by_time=by_time, baseline=baseline)
     tables, title = all_tables(name, made), f"{' '.join(models)} on {name}"
     run = config["tracking"]["log"] and log_evaluation(config, uri, title, digest, metrics_of(made), tables)
     for table in tables:
         console.print(as_rich(table))
-    if scenes.outage and not scores.outage.any():
+    if done.rules["outage"] and not scores.outage.any():
         console.print("no outage fits into the valid truth of these drives; see outage.*", style="yellow")
     for result in made:
         console.print(f"\n[bold]{answer(result)}[/bold]", highlight=False)
     console.print(f"Report: {config['out']}/report.html{f'; MLflow: run {run}' if run else ''}", soft_wrap=True)
-
-
-def with_truth(drives: list[Drive], config: Mapping[str, Any], say: Callable) -> tuple[list[Drive], dict[str, str]]:
-    """The drives with the reference that is asked for, and what is to be said of it."""
-    if config["reference"] == "file":
-        return drives, {}
-    smoother = build_filter("mbkf21", imu_spec(config["imu"]), tuning=config["tuning"])
-    assert isinstance(smoother, Mbkf)
-    with counting("Making the reference") as progress:
-        made = referenced(drives, config["reference"], smoother, AlignConfig.of(config["align"]), progress)
-    for reason in made.skipped.values():
-        say(f"left out: {reason}", style="yellow")
-    say(f"No truth: errors are against the {made.described()}.", style="bold")
-    return made.drives, {"reference": made.described()}
 
 
 def settings_of(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,11 +14,13 @@ import torch
 
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.kinds import drive_kinds
+from dlkf.data.masks import BiasLaw
 from dlkf.data.segments import StartLaw
 from dlkf.data.store import drive_rows, load_dataset
 from dlkf.errors import InputError
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Protocol, Scenes, protocol_from, spread
+from dlkf.evaluation.shares import Work, evaluate_shares
 from dlkf.evaluation.study import study
 from dlkf.evaluation.table import all_tables
 from dlkf.filters.build import build_filter
@@ -212,6 +214,48 @@ def test_navigation_some_drives_at_a_time(town, tmp_path):
     skipped = {}
     left = navigate_shares(shares(1, skip=True), len(rows), skipped=skipped)
     assert [r.drive for r in left] == [row.name for row in rows[1:]] and set(skipped) == {rows[0].name}
+
+
+@pytest.mark.parametrize("mode", ["pieces", "drives"])
+def test_an_evaluation_share_by_share(town, mode):
+    """Drives scored two at a time and all together: the same pieces, outages and biases, errors to rounding."""
+    rows = drive_rows(town)
+    names = tuple(row.name for row in rows)
+    plan = OutagePlan(20.0, (5.0, 10.0))
+    work = Work(
+        str(town), {"mbkf15": MBKF, "ins": build_filter("ins", IMU)}, Protocol(mode, 40.0, 10.0, outage=plan, seed=3),
+        {"rate_hz": 20.0, "epoch_s": 1.0}, drive_kinds(town), {row.name: row.group for row in rows},
+        law=BiasLaw(0.05, 0.1), shown=False,
+    )  # fmt: skip
+    one, many = (evaluate_shares(work, shares) for shares in ([names], [names[:2], names[2:4], names[4:]]))
+    assert one.mode == many.mode == mode and one.rules == many.rules and one.run.scores.outage.any()
+    sorted_by = [[(p.drive, p.t_start, k) for k, p in enumerate(e.run.scores.pieces)] for e in (one, many)]
+    order = [sorted(range(len(pieces)), key=pieces.__getitem__) for pieces in sorted_by]
+    a, b = one.run.scores, many.run.scores
+    assert [a.pieces[k] for k in order[0]] == [b.pieces[k] for k in order[1]]
+    assert (a.outage[order[0]] == b.outage[order[1]]).all()
+    for name in work.filters:  # sums over a batch of another size
+        errors = [s.filters[name].error[o] for s, o in zip((a, b), order)]
+        assert np.allclose(*errors, rtol=0, atol=1e-8, equal_nan=True)
+        followed = [e.run.followed[name][o] for e, o in zip((one, many), order)]
+        assert np.allclose(*followed, rtol=0, atol=1e-8, equal_nan=True)
+    assert (one.run.cause[order[0]] == many.run.cause[order[1]]).all()
+
+
+def test_shares_of_which_one_has_nothing_to_score(town, tmp_path):
+    shutil.copytree(town, tmp_path / "town")
+    rows = drive_rows(town)
+    path = tmp_path / "town" / "reference" / f"drive={rows[0].name}" / "part-0.parquet"
+    table = pq.read_table(path).to_pandas().assign(valid=False)
+    pq.write_table(pa.Table.from_pandas(table, preserve_index=False), path)
+    work = Work(
+        str(tmp_path / "town"), {"ins": build_filter("ins", IMU)}, Protocol("pieces", 40.0, 10.0),
+        {"rate_hz": 20.0, "epoch_s": 1.0}, drive_kinds(town), {}, shown=False,
+    )  # fmt: skip
+    done = evaluate_shares(work, [(row.name,) for row in rows[:3]])
+    assert {piece.drive for piece in done.run.scores.pieces} == {row.name for row in rows[1:3]}
+    with pytest.raises(InputError, match="no piece of 40 s"):
+        evaluate_shares(work, [(rows[0].name,)])
 
 
 def test_models_by_name_and_folder(tmp_path):

@@ -2,18 +2,70 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from typing import NamedTuple
 
-from dlkf.console import counting
+from dlkf.console import Counted, counting
 from dlkf.data.masks import BiasLaw
 from dlkf.evaluation.bias_slope import injected_response
-from dlkf.evaluation.metrics import slope
+from dlkf.evaluation.metrics import Array, slope
 from dlkf.evaluation.protocol import Scenes
 from dlkf.evaluation.results import BASELINE, SETTLE_S, Results, imu_error_values, summarise_scores
 from dlkf.evaluation.run import score_scenes
 from dlkf.evaluation.scores import Scores
 from dlkf.filters.smoother import Filter
 from dlkf.settings import settings_from
+
+
+class Run(NamedTuple):
+    """Scores of every filter; with injected biases these (P, 6) and how far each filter's estimate followed them."""
+
+    scores: Scores
+    cause: Array | None = None
+    followed: Mapping[str, Array] | None = None
+
+
+def run_scenes(
+    filters: Mapping[str, Filter],
+    scenes: Scenes,
+    *,
+    kinds: Mapping[str, str] | str,
+    groups: Mapping[str, str] | None = None,
+    law: BiasLaw | None = None,
+    seed: int = 0,
+    counting: Callable[[str], AbstractContextManager[Counted | None]] = counting,
+) -> Run:
+    """Every filter over the scenes, with ``law`` once more with biases added to the IMU; ``counting`` shows how far."""
+    with counting("Running filters") as progress:
+        scores = score_scenes(
+            filters, scenes, total=scenes.runs, kinds=kinds, groups=groups, progress=progress
+        )
+    if law is None:
+        return Run(scores)
+    with counting("Running with injected biases") as progress:
+        told = injected_response(scores, filters, scenes, law=law, total=scenes.runs, progress=progress, seed=seed)
+    return Run(scores, *told)
+
+
+def results_of(
+    run: Run, *, baseline: str = BASELINE, settle_s: float = SETTLE_S, seed: int = 0
+) -> list[Results]:
+    """The results of each kind of data, with the ``injected_slope`` of each filter's IMU-error estimate where biases
+    were added."""
+    scores = run.scores
+    made = [
+        summarise_scores(scores.of_kind(kind), settle_s=settle_s, baseline=baseline, seed=seed)
+        for kind in scores.kinds
+    ]
+    if run.cause is None:
+        return made
+    for k, result in enumerate(made):
+        rows = [i for i, p in enumerate(scores.pieces) if p.kind == result.kind]
+        slopes = {n: slope(x[rows], run.cause[rows], intercept=False) for n, x in (run.followed or {}).items()}
+        values = (imu_error_values(result.kind, n, "injected_slope", six) for n, six in slopes.items())
+        made[k] = result.with_values([v for six in values for v in six])
+    return made
 
 
 def study(
@@ -27,28 +79,12 @@ def study(
     injected_bias: BiasLaw | Mapping[str, float] | None = None,
     seed: int = 0,
 ) -> tuple[Scores, list[Results]]:
-    """Scores of every filter, and the results of each kind of data.
+    """Scores of every filter over the scenes, and the results of each kind of data."""
+    law = bias_law(injected_bias)
+    run = run_scenes(filters, scenes, kinds=kinds, groups=groups, law=law, seed=seed)
+    return run.scores, results_of(run, baseline=baseline, settle_s=settle_s, seed=seed)
 
-    With ``injected_bias`` everything runs once more with biases added to
-    the IMU, and the results carry the ``injected_slope`` of its IMU-error estimate per filter.
-    """
-    with counting("Running filters") as progress:
-        scores = score_scenes(
-            filters, scenes, total=scenes.runs, kinds=kinds, groups=groups, progress=progress
-        )
-    made = [
-        summarise_scores(scores.of_kind(kind), settle_s=settle_s, baseline=baseline, seed=seed)
-        for kind in scores.kinds
-    ]
-    if injected_bias:
-        law = settings_from(BiasLaw, injected_bias, "injected_bias")
-        with counting("Running with injected biases") as progress:
-            cause, followed = injected_response(
-                scores, filters, scenes, law=law, total=scenes.runs, progress=progress, seed=seed
-            )
-        for k, result in enumerate(made):
-            rows = [i for i, p in enumerate(scores.pieces) if p.kind == result.kind]
-            slopes = {n: slope(x[rows], cause[rows], intercept=False) for n, x in followed.items()}
-            values = (imu_error_values(result.kind, n, "injected_slope", six) for n, six in slopes.items())
-            made[k] = result.with_values([v for six in values for v in six])
-    return scores, made
+
+def bias_law(given: BiasLaw | Mapping[str, float] | None) -> BiasLaw | None:
+    """A law from its settings; none where there are none."""
+    return settings_from(BiasLaw, given, "injected_bias") if given else None

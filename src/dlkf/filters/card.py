@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from dlkf.data.drive import Drive
+from dlkf.data.tables import DriveRow
 from dlkf.errors import InputError
 
 CARD = "card.yaml"
@@ -39,15 +39,20 @@ def recordings_seen(card: Mapping[str, Any], dataset: str, digest: str, groups: 
 
 
 def without_seen(
-    cards: Mapping[str, Mapping[str, Any]], drives: Sequence[Drive], digest: str, *, leave_out: bool
-) -> tuple[list[Drive], list[str]]:
-    """The drives to score models on, and a line for each model that knows some of their recordings.
+    cards: Mapping[str, Mapping[str, Any]],
+    drives: Sequence[DriveRow],
+    dataset: str,
+    digest: str,
+    *,
+    leave_out: bool,
+) -> tuple[list[DriveRow], list[str]]:
+    """The drives of a dataset to score models on, and a line for each model that knows some of their recordings.
 
     ``cards`` by the models' names; ``leave_out`` takes those recordings out, for all models alike. InputError where
     none is left.
     """
     groups = {d.group for d in drives}
-    seen = {name: recordings_seen(card, drives[0].dataset, digest, groups) for name, card in cards.items()}
+    seen = {name: recordings_seen(card, dataset, digest, groups) for name, card in cards.items()}
     if leave_out:
         kept = [d for d in drives if d.group not in set().union(*seen.values())]
         if not kept:

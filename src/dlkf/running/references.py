@@ -33,13 +33,22 @@ LATE_S = 0.2  # a fix that waits longer for its epoch's end is not carried there
 
 
 class Referenced(NamedTuple):
-    """Drives with another reference, and its horizontal and vertical 1σ [m], the median over what may be scored."""
+    """Drives with another reference, and its 1σ (n, 3) [m] in NED wherever it may be scored."""
 
     drives: list[Drive]
-    horizontal_m: float
-    vertical_m: float
+    sigma: Tensor
     skipped: dict[str, str]
     kind: str
+
+    @property
+    def horizontal_m(self) -> float:
+        """Median 1σ."""
+        return float(self.sigma.median(0).values[:2].norm())
+
+    @property
+    def vertical_m(self) -> float:
+        """Median 1σ."""
+        return float(self.sigma.median(0).values[2])
 
     def described(self) -> str:
         """What errors against it are errors against."""
@@ -104,8 +113,7 @@ def referenced(
     sigma = torch.cat(sigmas)
     if not len(sigma):
         raise InputError(f"reference={kind}: no fix is good enough to be one")
-    usual = sigma.median(0).values
-    return Referenced(made, float(usual[:2].norm()), float(usual[2]), skipped, kind)
+    return Referenced(made, sigma, skipped, kind)
 
 
 def _blank(drive: Drive) -> dict[str, Tensor]:

@@ -1,0 +1,123 @@
+"""What a long list of drives costs: ``python -m pipelines.studies.long_lists data/two --hours 42 100``.
+
+The drives of a dataset under new names (links: no room on the disk) until there are so many hours, and again cut into short
+drives. Each work runs in an interpreter of its own; told are its processor time, its time by the clock and the most memory
+it had, and the least of ``--repeats`` runs counts. Work is ``open`` (load, check, resample, cut into pieces) or a command.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import pandas as pd
+import pyarrow as pa
+
+from dlkf.data.schema import drive_file, write_drives_table, write_parquet
+from dlkf.data.tables import read_drives
+
+KINDS = ("imu", "gnss", "reference")
+OPEN = """
+import sys, torch
+from dlkf.data.segments import cut_pieces
+from dlkf.data.store import load_dataset
+drives = load_dataset(sys.argv[1])
+print(len(drives), "drives,", len(cut_pieces(drives, 120.0, 60.0, attitude=True)), "pieces")
+"""
+WORKS = {
+    "open": ["-c", OPEN, "{data}"],
+    "navigate": ["-m", "dlkf.navigate", "model=mbkf15", "dataset={data}", "out={out}"],
+    "parallel": ["-m", "dlkf.navigate", "model=mbkf15", "dataset={data}", "out={out}", "parallel=2"],
+    "compiled": ["-m", "dlkf.navigate", "model=mbkf15", "dataset={data}", "out={out}", "compiled=true"],
+    "evaluate": ["-m", "dlkf.evaluate", "model=mbkf15", "dataset={data}", "out={out}", "tracking.log=false"],
+}
+
+
+class Cost(NamedTuple):
+    """Seconds of processor and by the clock, and the most memory at a time [GB] (of the largest process)."""
+
+    processor_s: float
+    clock_s: float
+    memory_GB: float
+
+
+def listed(source: Path, out: Path, hours: float) -> int:
+    """The drives of ``source`` linked under new names until there are ``hours``; how many they are."""
+    known = pd.read_parquet(source / "drives.parquet").to_dict("records")
+    rows, seconds = [], 0.0
+    while seconds < hours * 3600 - 1:
+        row = known[len(rows) % len(known)]
+        name = f"{len(rows):06d}"
+        for kind in KINDS:
+            file = drive_file(out, kind, name)
+            file.parent.mkdir(parents=True)
+            os.link(drive_file(source, kind, row["drive"]), file)
+        rows.append({**row, "drive": name, "group": name})
+        seconds += row["duration_s"]
+    write_drives_table(out, rows)
+    return len(rows)
+
+
+def shortened(source: Path, out: Path, minutes: float) -> Path:
+    """Every drive of a dataset cut into drives of so many minutes."""
+    rows = []
+    known = {row["drive"]: row for row in pd.read_parquet(source / "drives.parquet").to_dict("records")}
+    for drive in read_drives(source):
+        tables = {k: pd.read_parquet(drive_file(source, k, drive.name), partitioning=None) for k in KINDS}
+        part = 0
+        while (first := part * 60 * minutes) + 60 * minutes <= known[drive.name]["duration_s"] + 1e-6:
+            name = f"{drive.name}-{part:03d}"
+            for kind, table in tables.items():
+                some = table[(table.t >= first) & (table.t <= first + 60 * minutes)]
+                write_parquet(drive_file(out, kind, name), pa.Table.from_pandas(some, preserve_index=False))
+            rows.append({**known[drive.name], "drive": name, "group": name, "duration_s": 60 * minutes})
+            part += 1
+    write_drives_table(out, rows)
+    return out
+
+
+def cost(work: list[str]) -> Cost:
+    """Of a command of Python in an interpreter of its own, and of the processes that it starts."""
+    start = time.monotonic()
+    child = subprocess.Popen([sys.executable, *work], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    _, status, used = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode:
+        raise SystemExit(f"{' '.join(work)} ended with code {child.returncode}")
+    return Cost(used.ru_utime + used.ru_stime, time.monotonic() - start, used.ru_maxrss / 1e6)
+
+
+def main() -> None:
+    """Link, measure, print."""
+    arguments = argparse.ArgumentParser(description=__doc__)
+    arguments.add_argument("dataset", type=Path)
+    arguments.add_argument("--hours", type=float, nargs="+", default=[42.0, 100.0])
+    arguments.add_argument("--minutes", type=float, help="of short drives of the same data, beside the dataset's own")
+    arguments.add_argument("--works", nargs="+", choices=WORKS, default=["open", "navigate"])
+    arguments.add_argument("--repeats", type=int, default=1)
+    o = arguments.parse_args()
+    with tempfile.TemporaryDirectory(dir=o.dataset.parent) as home:
+        sources = [o.dataset] + ([shortened(o.dataset, Path(home) / "short", o.minutes)] if o.minutes else [])
+        print("| work | hours | drives | processor [s] | clock [s] | memory [GB] |\n|:--|--:|--:|--:|--:|--:|")
+        for hours in o.hours:
+            for k, source in enumerate(sources):
+                data = Path(home) / f"{k}-{hours:g}"
+                count = listed(source, data, hours)
+                for work in o.works:
+                    runs = []
+                    for repeat in range(o.repeats):
+                        out = Path(home) / f"out-{work}-{data.name}-{repeat}"
+                        runs.append(cost([word.format(data=data, out=out) for word in WORKS[work]]))
+                    best = Cost(*(min(values) for values in zip(*runs)))
+                    figures = f"{best.processor_s:.1f} | {best.clock_s:.1f} | {best.memory_GB:.2f}"
+                    print(f"| {work} | {hours:g} | {count} | {figures} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+"""An evaluation share by share: drives of a dataset are loaded, scored and forgotten, here or on other processes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dlkf.console import Counted, counting
+from dlkf.data.alignment import ALIGN, AlignConfig
+from dlkf.data.masks import BiasLaw
+from dlkf.data.store import load_dataset
+from dlkf.errors import InputError
+from dlkf.evaluation.metrics import Array
+from dlkf.evaluation.protocol import Protocol, Scenes
+from dlkf.evaluation.scores import FilterRun, Scores
+from dlkf.evaluation.study import Run, run_scenes
+from dlkf.filters.model_based import Mbkf
+from dlkf.filters.smoother import Filter
+from dlkf.parallel import each
+from dlkf.running.references import Referenced, referenced
+
+
+@dataclass(frozen=True)
+class Work:
+    """What is done to a share: the filters, the rules, and whose truth the errors are against."""
+
+    dataset: str
+    filters: Mapping[str, Filter]
+    protocol: Protocol
+    grid: Mapping[str, float]
+    kinds: Mapping[str, str]
+    groups: Mapping[str, str]
+    reference: str = "file"
+    smoother: Filter | None = None
+    align: AlignConfig = ALIGN
+    law: BiasLaw | None = None
+    seed: int = 0
+    shown: bool = True  # bars on stderr
+
+
+class Part(NamedTuple):
+    """What became of a share: its run, or why nothing of it can be scored."""
+
+    run: Run | None
+    mode: str
+    rules: Mapping[str, Any]
+    skipped: Mapping[str, str]
+    sigma: Tensor | None  # (n, 3) of a made reference [m]
+
+
+class Evaluated(NamedTuple):
+    """All shares together; ``truth`` says what a made reference is."""
+
+    run: Run
+    mode: str
+    rules: dict[str, Any]
+    skipped: dict[str, str]
+    truth: dict[str, str]
+
+
+def evaluate_shares(work: Work, shares: Sequence[tuple[str, ...]], parallel: int | str | None = None) -> Evaluated:
+    """Every filter over every share. InputError where none has anything to score.
+
+    What is drawn for a piece depends on it alone (:mod:`dlkf.data.draws`), so it is the same however the drives are
+    shared out. Where one share has pieces, ``mode=auto`` means pieces for all.
+    """
+    parts = list(each(partial(scored, work), shares, parallel))
+    skipped = {drive: why for part in parts for drive, why in part.skipped.items()}
+    scorable = [part for part in parts if part.run is not None]
+    if not scorable:
+        raise InputError(next(iter(parts[0].skipped.values()), "no drives: give a dataset with at least one"))
+    mode = "pieces" if any(part.mode == "pieces" for part in scorable) else "drives"
+    kept = [part for part in scorable if part.mode == mode]
+    run = joined([part.run for part in kept if part.run is not None])
+    rules = {**kept[0].rules, "runs": sum(part.rules["runs"] for part in kept), "skipped": skipped}
+    sigmas = [part.sigma for part in kept if part.sigma is not None]
+    truth = {"reference": Referenced([], torch.cat(sigmas), {}, work.reference).described()} if sigmas else {}
+    return Evaluated(run, mode, rules, skipped, truth)
+
+
+def scored(work: Work, names: tuple[str, ...]) -> Part:
+    """One share."""
+    wanted = {"dtype": torch.float64, "reference": work.reference == "file", "drives": names}
+    with _bar(work, "Loading drives") as progress:
+        drives = load_dataset(work.dataset, progress=progress, **wanted, **work.grid)
+    sigma, left_out = None, {}
+    try:
+        if work.reference != "file":
+            assert isinstance(work.smoother, Mbkf)
+            with _bar(work, "Making the reference") as progress:
+                made = referenced(drives, work.reference, work.smoother, work.align, progress)
+            drives, sigma, left_out = made.drives, made.sigma, made.skipped
+        scenes = Scenes(drives, work.protocol)
+    except InputError as error:
+        return Part(None, "", {}, {names[0]: str(error)}, None)
+    bar: Callable[[str], Any] = partial(_bar, work)
+    run = run_scenes(
+        work.filters, scenes, kinds=work.kinds, groups=work.groups, law=work.law, seed=work.seed, counting=bar
+    )
+    return Part(run, scenes.mode, scenes.described(), {**left_out, **scenes.skipped}, sigma)
+
+
+def joined(runs: Sequence[Run]) -> Run:
+    """Pieces of several runs in their order, padded to the longest."""
+    if len(runs) == 1:
+        return runs[0]
+    all_scores = [run.scores for run in runs]
+    T = max(s.outage.shape[1] for s in all_scores)
+
+    def column(name: str) -> Array:
+        return np.concatenate([padded(getattr(s, name), T) for s in all_scores])
+
+    first = all_scores[0]
+    def of_filter(name: str) -> FilterRun:
+        rows = [s.filters[name] for s in all_scores]
+        return FilterRun(*(np.concatenate([padded(getattr(r, f.name), T) for r in rows]) for f in fields(FilterRun)))
+
+    scores = Scores(
+        epoch_s=first.epoch_s,
+        pieces=[piece for s in all_scores for piece in s.pieces],
+        outage=column("outage"),
+        truth_p_n=column("truth_p_n"),
+        truth_v_n=column("truth_v_n"),
+        true_imu_error=column("true_imu_error"),
+        origin_e=np.concatenate([s.origin_e for s in all_scores]),
+        filters={name: of_filter(name) for name in first.filters},
+    )
+    if runs[0].cause is None:
+        return Run(scores)
+    followed = {name: np.concatenate([(r.followed or {})[name] for r in runs]) for name in first.filters}
+    return Run(scores, np.concatenate([r.cause for r in runs if r.cause is not None]), followed)
+
+
+def padded(x: Array, T: int) -> Array:
+    """(P, t, …) to (P, T, …): no outage, NaN elsewhere."""
+    extra = [(0, 0)] * x.ndim
+    extra[1] = (0, T - x.shape[1])
+    return np.pad(x, extra, constant_values=False if x.dtype == bool else np.nan)
+
+
+@contextmanager
+def _bar(work: Work, title: str) -> Iterator[Counted | None]:
+    if not work.shown:
+        yield None
+        return
+    with counting(title) as progress:
+        yield progress
