@@ -8,9 +8,12 @@
 //
 // imu/data comes at DLKF_RATE_HZ in forward-left-up (REP 103) and is turned to forward-right-down; fix_velocity is the
 // receiver's velocity East-North-Up at the time of its fix. Fixes count at the end of the epoch in which they were taken.
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstring>
+#include <memory>
+#include <vector>
 
 #include <geometry_msgs/msg/twist_with_covariance_stamped.hpp>
 #include <nav_msgs/msg/odometry.hpp>
