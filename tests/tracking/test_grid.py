@@ -3,8 +3,14 @@
 import json
 import os
 import re
+import shutil
+import signal
+import socket
 import subprocess
 import sys
+import tempfile
+import time
+from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
@@ -211,17 +217,17 @@ hydra:
 """
 
 
-def test_a_real_sweep_with_a_failing_point(uri, client, tmp_path):
-    """Through Hydra: the parent's id reaches worker processes, all write into one SQLite store at once."""
-    (tmp_path / "sweep.py").write_text(PROGRAM)
-    (tmp_path / "conf.yaml").write_text(CONF)
+def swept(folder: Path, client, *launcher: str, **environment: str) -> None:
+    """Three points, the last of which fails: the parent's id reaches worker processes, all write into one store."""
+    (folder / "sweep.py").write_text(PROGRAM)
+    (folder / "conf.yaml").write_text(CONF)
     done = subprocess.run(
-        [sys.executable, "sweep.py", "-m", "x=1,2,3", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
-        cwd=tmp_path,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        [sys.executable, "sweep.py", "-m", "x=1,2,3", *launcher],
+        cwd=folder,
+        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=480,
     )
     assert done.returncode == 1 and "ValueError: three" in done.stderr
     experiment = client.get_experiment_by_name("town").experiment_id
@@ -233,3 +239,54 @@ def test_a_real_sweep_with_a_failing_point(uri, client, tmp_path):
     assert all(r.data.tags["mlflow.parentRunId"] == parent for n, r in runs.items() if n != "grid x 1,2,3")
     assert all(len(client.get_metric_history(runs[f"x={k}"].info.run_id, "train/loss")) == 20 for k in (1, 2, 3))
     assert "position_rms_m" in done.stdout and parent in done.stdout
+
+
+def test_a_real_sweep_with_a_failing_point(uri, client, tmp_path):
+    """Through Hydra into SQLite, at once from two processes."""
+    swept(tmp_path, client, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
+
+
+@pytest.fixture
+def postgresql():
+    """The URI of an empty PostgreSQL database of a server of this machine; no test where none is installed."""
+    pytest.importorskip("psycopg2")
+    programs = sorted(Path("/usr/lib/postgresql").glob("*/bin"))
+    where = str(programs[-1]) if programs else None
+    initdb, server = (shutil.which(name, path=where) or shutil.which(name) for name in ("initdb", "postgres"))
+    if not initdb or not server:
+        pytest.skip("no PostgreSQL here")
+    owner = {"user": "postgres"} if os.geteuid() == 0 else {}  # it does not run as root
+    with tempfile.TemporaryDirectory(dir="/tmp") as home, socket.socket() as free:  # a socket's path must be short
+        if owner:
+            shutil.chown(home, "postgres")
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+        free.close()
+        given = {"cwd": home, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, **owner}
+        subprocess.run([initdb, "-D", f"{home}/data", "-A", "trust", "-U", "mlflow"], check=True, **given)
+        options = ["-h", "127.0.0.1", "-p", str(port), "-k", home, "-c", "fsync=off"]
+        process = subprocess.Popen([server, "-D", f"{home}/data", *options], **given)
+        try:
+            end = time.monotonic() + 60
+            while time.monotonic() < end:
+                try:
+                    socket.create_connection(("127.0.0.1", port), 1).close()
+                    break
+                except OSError:
+                    time.sleep(0.2)
+            yield f"postgresql://mlflow@127.0.0.1:{port}/postgres"
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.wait(60)
+
+
+@pytest.mark.served
+def test_a_sweep_of_slurms_launcher_into_postgresql(postgresql, tmp_path, monkeypatch):
+    """``submitit_local``, which is ``submitit_slurm`` without Slurm: a process per point, into one real PostgreSQL."""
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv(PARENT_RUN, raising=False)
+    monkeypatch.delenv(SWEPT, raising=False)
+    client = mlflow_module().MlflowClient(postgresql)
+    client.search_experiments()  # makes the tables
+    swept(tmp_path, client, "hydra/launcher=submitit_local", MLFLOW_TRACKING_URI=postgresql)
