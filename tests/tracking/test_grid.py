@@ -274,7 +274,7 @@ def postgresql():
                     break
                 except OSError:
                     time.sleep(0.2)
-            yield f"postgresql://mlflow@127.0.0.1:{port}/postgres"
+            yield f"postgresql+psycopg2://mlflow@127.0.0.1:{port}/postgres"
         finally:
             process.send_signal(signal.SIGINT)
             process.wait(60)
