@@ -1,8 +1,9 @@
 """What a long list of drives costs: ``python -m pipelines.studies.long_lists data/two --hours 42 100``.
 
-The drives of a dataset under new names (links: no room on the disk) until there are so many hours, and again cut into short
-drives. Each work runs in an interpreter of its own; told are its processor time, its time by the clock and the most memory
-it had, and the least of ``--repeats`` runs counts. Work is ``open`` (load, check, resample, cut into pieces) or a command.
+The drives of a dataset under new names (links: no room on the disk) until there are so many hours, and again cut into
+short drives. Each work runs in an interpreter of its own; told are its processor time, its time by the clock and the
+most memory it had, and the least of ``--repeats`` runs counts. Work is ``open`` (load, check, resample, cut)
+or a command.
 """
 
 from __future__ import annotations
