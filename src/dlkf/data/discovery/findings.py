@@ -16,6 +16,7 @@ from dlkf.data.discovery.motion import MOVING, Floats, Motion, motion, position_
 from dlkf.data.discovery.orientation import Pose
 from dlkf.data.discovery.units import accel_units, nearest_unit
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
+from dlkf.settings import check_limits
 
 LEAST_EXPLAINED, AGREE = 0.8, (0.8, 1.25)
 FARTHEST_DOWN = math.radians(6.0)
@@ -27,6 +28,9 @@ class Sure:
 
     angle_deg: float = 2.0
     time_s: float = 0.025
+
+    def __post_init__(self) -> None:
+        check_limits(self, "reader.sure", {"angle_deg": (0, 1e6), "time_s": (0, 1e6)})
 
 
 @dataclass(frozen=True)

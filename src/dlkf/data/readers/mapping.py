@@ -166,7 +166,9 @@ class Mapped:
         if name not in self.table.frame:
             have = [str(c) for c in self.table.frame.columns]
             has = ", ".join(have[:24]) + (", …" if len(have) > 24 else "")
-            raise InputError(f"{self.table.path}: no column {name!r}; has {has}; set it in reader.{self.kind}")
+            other = next((m for m in (";", "\t") if len(have) == 1 and m in have[0]), None)
+            remedy = f"set it in reader.{self.kind}" if other is None else f"set reader.separator={other!r}"
+            raise InputError(f"{self.table.path}: no column {name!r}; has {has}; {remedy}")
         return self.table.frame[name]
 
 

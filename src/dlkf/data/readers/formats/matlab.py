@@ -41,7 +41,7 @@ def _variables(path: Path) -> dict[str, Any]:
         return {name: value for name, value in loaded.items() if not name.startswith("__")}
     except NotImplementedError:  # version 7.3 is HDF5
         pass
-    except (ValueError, OSError, TypeError, IndexError, KeyError) as error:
+    except (scipy.io.matlab.MatReadError, ValueError, OSError, TypeError, IndexError, KeyError) as error:
         raise InputError(f"{path}: cannot be read as a MATLAB file ({_first_line(error)}); save it again") from None
     h5py = library("h5py", "a MATLAB file of version 7.3")
     try:

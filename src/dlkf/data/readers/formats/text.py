@@ -6,6 +6,8 @@ import codecs
 import gzip
 import io
 import re
+import warnings
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -66,8 +68,8 @@ def decoded(path: Path, encoding: str | None) -> str:
     try:
         with opened(path, "rb") as file:
             raw = file.read()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
     if encoding is not None:
         try:
             return raw.decode(encoding)
@@ -87,16 +89,18 @@ def decoded(path: Path, encoding: str | None) -> str:
 
 def _parsed(path: Path, lines: list[str], numbers: list[int], options: Mapping[str, Any]) -> pd.DataFrame:
     try:
-        frame = pd.read_csv(
-            io.StringIO("\n".join(lines)),
-            sep=options["separator"],
-            decimal=options["decimal"],
-            header=0 if options["header"] else None,
-            comment=options["comment"],
-            skipinitialspace=True,
-            index_col=False,
-            low_memory=False,
-        )
+        with warnings.catch_warnings():  # of a separator at the end of every line; columns that are not there are told
+            warnings.simplefilter("ignore", pd.errors.ParserWarning)
+            frame = pd.read_csv(
+                io.StringIO("\n".join(lines)),
+                sep=options["separator"],
+                decimal=options["decimal"],
+                header=0 if options["header"] else None,
+                comment=options["comment"],
+                skipinitialspace=True,
+                index_col=False,
+                low_memory=False,
+            )
     except (pd.errors.ParserError, pd.errors.EmptyDataError, ValueError, re.error) as error:
         told = str(error).splitlines()[0].strip()
         if found := re.search(r"line (\d+)", told):

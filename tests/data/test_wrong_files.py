@@ -1,0 +1,77 @@
+"""Files that are not what their reader reads: one line that says which and why, without a warning beside it."""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from dlkf.errors import InputError
+from tests.cars import car
+from tests.data.test_formats import read
+
+
+def _text(folder: Path, **options) -> None:
+    tables = car(12)
+    for kind in ("imu", "gnss"):
+        tables[kind].to_csv(folder / f"{kind}.csv", index=False, **options)
+
+
+def _bytes(name: str, content: bytes) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        (folder / name).write_bytes(content)
+
+    return write
+
+
+def _parquet(folder: Path) -> None:
+    for kind in ("imu", "gnss"):
+        pd.DataFrame({"a": [1.0, 2.0]}).to_parquet(folder / f"{kind}.parquet")
+
+
+def _half_gzip(folder: Path) -> None:
+    _text(folder)
+    (folder / "imu.csv.gz").write_bytes(gzip.compress((folder / "imu.csv").read_bytes())[:500])
+
+
+GZ = "reader.imu.file=imu.csv.gz"
+WRONG: dict[str, tuple[Callable[[Path], None], list[str], str]] = {
+    "an empty file": (_bytes("imu.csv", b""), ["reader=csv"], "cannot be read as a table"),
+    "a folder": (lambda f: (f / "imu.csv").mkdir(), ["reader=csv"], "Is a directory"),
+    "semicolons": (lambda f: _text(f, sep=";"), ["reader=csv"], "set reader.separator=';'"),
+    "semicolons and commas": (lambda f: _text(f, sep=";", decimal=","), ["reader=csv"], "no column 't'"),
+    "no gzip": (_bytes("imu.csv.gz", b"t,gyro_x"), ["reader=csv", GZ], "Not a gzipped file"),
+    "half a gzip": (_half_gzip, ["reader=csv", GZ], "ended before"),
+    "a Parquet of other columns": (_parquet, ["reader=parquet"], "no column 't'; has a"),
+    "a MATLAB file of words": (_bytes("x.mat", b"nonsense"), ["reader=navego"], "cannot be read as a MATLAB file"),
+    "a bag of words": (_bytes("x.bag", b"nonsense"), ["reader=rosbag"], "cannot be read as a bag"),
+    "UBX of zeros": (_bytes("x.ubx", b"\0" * 99), ["reader=ubx"], "no NAV-PVT"),
+    "a map without its column": (_text, ["reader=csv", "reader.gnss.quality.map={RTK: 4}"], "give quality.column"),
+    "a quality of words": (_text, ["reader=csv", "reader.gnss.quality.default=best"], "must be a code of NMEA"),
+    "a drift of words": (_text, ["reader=csv", "reader.gnss.time.drift_ppm=fast"], "must be a number"),
+    "a misspelt key": (_text, ["reader=csv", "reader.gnss.time.dirft_ppm=3"], "unknown key dirft_ppm"),
+    "less than sure": (_text, ["reader=csv", "reader.sure.angle_deg=-2"], "angle_deg"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+@pytest.mark.filterwarnings("error::pandas.errors.ParserWarning")
+def test_a_wrong_file_is_one_line(name, tmp_path):
+    make, options, said = WRONG[name]
+    make(tmp_path)
+    source = next(iter(sorted(tmp_path.glob("x.*"))), tmp_path)
+    with pytest.raises(InputError) as refused:
+        read(source, options)
+    assert said in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_marks_and_letters_of_windows(tmp_path):
+    """A byte order mark, Windows' ends of lines, semicolons and decimal commas together."""
+    _text(tmp_path, sep=";", decimal=",")
+    for file in tmp_path.iterdir():
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_text().replace("\n", "\r\n").encode())
+    (drive,) = read(tmp_path, ["reader=csv", "reader.separator=';'", "reader.decimal=','"])
+    pd.testing.assert_frame_equal(drive.imu, car(12)["imu"], check_exact=False, atol=1e-9)
