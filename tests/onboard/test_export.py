@@ -193,8 +193,7 @@ def talkative_plus() -> PlusFilter:
     """A network that says something."""
     torch.manual_seed(0)
     model = PlusFilter(PlusConfig(parts=("process", "fix", "across", "offset", "speed", "residual"))).eval()
-    for head in (model.network.noise, model.network.speed):
-        torch.nn.init.normal_(head.weight, std=0.05)
+    torch.nn.init.normal_(model.network.noise.weight, std=0.05)
     return model
 
 

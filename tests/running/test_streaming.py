@@ -72,9 +72,8 @@ def plus() -> PlusFilter:
     """A small one with weights, whose speed takes part."""
     torch.manual_seed(0)
     model = PlusFilter(PlusConfig.from_mapping({"parts": PARTS, "network": {"hidden": 16}})).eval()
-    for p in model.heads():
+    for p in model.network.noise.parameters():
         torch.nn.init.normal_(p, std=0.2)
-    model.network.speed.bias.data[1] = -4.0
     return model.double()
 
 

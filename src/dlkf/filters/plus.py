@@ -2,9 +2,9 @@
 
 States, strapdown and Riccati recursion are those of a classical filter (``base``); the network says how far to trust
 what goes into them, in outages too: factors on the process noise of each axis, on GNSS standard deviations, on the
-constraints' standard deviations, velocities across the car beside those of its model, and a forward speed. It sees the
-samples, what the filter believes and how its innovations fit, and how wrong its own speed has been while GNSS was
-there. With weights of zero it is ``base`` to the bit.
+constraints' standard deviations, velocities across the car beside those of its model, and a forward speed that each
+drive calibrates while GNSS is there (:mod:`dlkf.filters.car_speed`). It sees the samples, what the filter believes and
+how its innovations and that speed fit. With weights of zero it is ``base`` to the bit.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from dlkf.errors import InputError
 from dlkf.filters.advice import ABSENT, Advice
 from dlkf.filters.advised_speed import AdvisedSpeed
 from dlkf.filters.build import build_filter
+from dlkf.filters.car_speed import Calibration, CarSpeed, Foretold
 from dlkf.filters.integration import Correction, Epoch
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.model_based import Memory as KalmanMemory
@@ -51,10 +52,7 @@ START_TUNING: Mapping[str, float] = {
     "position_std": 2.0, "velocity_std": 2.0, "lateral_std": 0.1,
 }  # fmt: skip
 SPREADS = (5.0, 60.0)  # s, memories of the normalised innovations
-SPEED_MEMORY = 60.0  # fixes over which the speed's errors are remembered
-SPEED_PRIOR, SPEED_PRIOR_WEIGHT = 8.0, 0.5  # m/s: how wrong it is taken to be before it was ever compared
-SPEED_DOUBT = 2.0  # its errors last: 1σ counts at least that many times its RMS so far, times the network's factor
-SILENT_SHARE = 0.5  # of the training pieces run without the speed, so that the rest learns to do without it
+SILENT_SHARE = 0.3  # of the training pieces run without the speed, so that the rest learns to do without it
 OLDEST = 600.0  # s: times are told up to here
 
 
@@ -93,7 +91,7 @@ class Memory(NamedTuple):
     since_fix: Tensor  # (B,) s
     surprise: Tensor  # (B, 4) running means of normalised squared innovations, position and velocity
     fix_speed: Tensor  # (B,) m/s forward at the last fix
-    wrong: Tensor  # (B, 3) of the speed: number of comparisons, sum and sum of squares of its errors, fading
+    car: Calibration  # what the drive has told of the car's speed
     residual: Tensor  # (B, 6) part of the IMU error that the network added
     silent: Tensor  # (B,) bool: pieces in which training withholds the speed
     seen: Heads | None = None  # of the last epoch, for training and pictures
@@ -116,6 +114,7 @@ class PlusFilter(nn.Module):
         now = 3 + 3 + 3 + 2
         features = WINDOW_FEATURES + count + (count - 9) + 2 + 4 + 6 + 4 + 3 + 5 + now
         self.network = PlusNetwork(PlusNetworkConfig(config.network.hidden, features), now)
+        self.car_speed = CarSpeed(WINDOW_FEATURES)
         self.parts = frozenset(config.parts)
 
     @property
@@ -136,14 +135,15 @@ class PlusFilter(nn.Module):
     def heads(self) -> Iterator[nn.Parameter]:
         """Weights of the output layers."""
         yield from self.network.noise.parameters()
-        yield from self.network.speed.parameters()
+        yield from self.network.trust.parameters()
 
     def begin(self, batch: Batch) -> tuple[Memory, Tensor | ImuError]:
         """Of the Kalman filter, and nothing seen yet."""
         kalman, error = self.kalman.begin(batch)
         zeros, B = batch.imu.new_zeros, batch.size[0]
         memory = Memory(
-            kalman, self.network.start(B), zeros(B), zeros(B), zeros(B, 4) + 1.0, zeros(B), zeros(B, 3), zeros(B, 6),
+            kalman, self.network.start(B), zeros(B), zeros(B), zeros(B, 4) + 1.0, zeros(B), self.car_speed.begin(B),
+            zeros(B, 6),
             torch.rand(B, device=batch.imu.device) < SILENT_SHARE if self.training else zeros(B) > 0,
         )  # fmt: skip
         return memory, error
@@ -161,35 +161,34 @@ class PlusFilter(nn.Module):
                 fix_speed=torch.where(fixed, forward, memory.fix_speed),
                 surprise=_faded(memory.surprise, normalised, epoch.used, span),
             )
-            features, now = self._features(memory, epoch, normalised, forward)
+            heard = window_features(epoch.corrected, epoch.dt)
         dtype = self.network.inward.weight.dtype
+        foretold = self.car_speed(heard.to(dtype), memory.car)
+        with torch.no_grad():
+            features, now = self._features(memory, epoch, normalised, forward, heard, foretold)
         heads, hidden = self.network(features.to(dtype), now.to(dtype), memory.hidden)
         heads = Heads(*(x.to(epoch.z.dtype) for x in heads))
-        advice = self._advice(heads, memory)
+        speed = torch.stack((foretold.speed, foretold.std), -1).to(epoch.z.dtype)
+        advice = self._advice(heads, speed, memory.silent)
         kalman, correction = self.kalman.step(memory.kalman, epoch._replace(advice=advice))
         if "speed" in self.parts:
-            correction = correction._replace(speed=heads.speed)
+            correction = correction._replace(speed=speed)
         residual = memory.residual
         if "residual" in self.parts:
             error = correction.imu_error
             assert isinstance(error, ImuError)
             correction = correction._replace(imu_error=error._replace(bias=error.bias + heads.residual - residual))
             residual = heads.residual
-        with torch.no_grad():
-            off = (heads.speed[:, 0] - forward) * fixed
-            fade = torch.where(fixed, 1 - 1 / SPEED_MEMORY, 1.0).unsqueeze(-1)
-            wrong = memory.wrong * fade + torch.stack((fixed.to(off.dtype), off, off * off), -1)
-        memory = memory._replace(kalman=kalman, hidden=hidden, wrong=wrong, residual=residual, seen=heads)
+        car = self.car_speed.learned(memory.car, foretold, forward.to(dtype), fixed)
+        memory = memory._replace(kalman=kalman, hidden=hidden, car=car, residual=residual, seen=heads)
         return memory, correction
 
-    def _advice(self, heads: Heads, memory: Memory) -> Advice:
-        """What of the network's answer is in force. A speed is no better than it was while GNSS was there."""
+    def _advice(self, heads: Heads, speed: Float[Tensor, "B 2"], silent: Tensor) -> Advice:
+        """What of the network's answer is in force."""
         given = {name: getattr(heads, name) for name in ("process", "fix", "across", "offset") if name in self.parts}
         if "speed" in self.parts:
-            doubt = SPEED_DOUBT * heads.doubt * speed_rms(memory.wrong)
-            std = (heads.speed[:, 1].square() + doubt.square()).sqrt()
-            std = torch.where(memory.silent, 2 * ABSENT, std)
-            given["speed"] = torch.stack((heads.speed[:, 0], std), -1)
+            std = torch.where(silent, 2 * ABSENT, speed[:, 1] * heads.doubt)
+            given["speed"] = torch.stack((speed[:, 0], std), -1)
         return Advice(**given)
 
     def _normalised(self, memory: Memory, epoch: Epoch) -> Float[Tensor, "B 6"]:
@@ -203,8 +202,9 @@ class PlusFilter(nn.Module):
         return z / (variance + R + 1e-4).sqrt()
 
     def _features(
-        self, memory: Memory, epoch: Epoch, normalised: Float[Tensor, "B 6"], forward: Float[Tensor, " B"]
-    ) -> tuple[Float[Tensor, "B F"], Float[Tensor, "B N"]]:
+        self, memory: Memory, epoch: Epoch, normalised: Float[Tensor, "B 6"], forward: Float[Tensor, " B"],
+        heard: Float[Tensor, "B K"], foretold: Foretold,
+    ) -> tuple[Float[Tensor, "B F"], Float[Tensor, "B N"]]:  # fmt: skip
         """What the network sees, each of order 1; the second part goes to the noise's heads directly as well."""
         P, C_nb = memory.kalman.P, epoch.window.end.C_nb
         fixed = epoch.used.any(-1, keepdim=True).to(P.dtype)
@@ -216,22 +216,21 @@ class PlusFilter(nn.Module):
         known = _flat(epoch.error, memory.kalman.structure, self.kalman.states)
         fix_std = torch.log(epoch.fix.std[:, [0, 2, 3, 5]].clamp(1e-3, 1e3)) / 3 * fixed
         age = torch.log1p(torch.stack((memory.since_fix, memory.elapsed), -1).clamp_max(OLDEST)) / 3
-        count, mean, rms = memory.wrong[:, 0], _mean_wrong(memory.wrong), speed_rms(memory.wrong)
-        spread = (rms.square() - mean.square()).clamp_min(1e-4).sqrt()
-        said = memory.seen.speed if memory.seen is not None else torch.zeros_like(age)
-        history = torch.stack(
-            (torch.log1p(count) / 3, torch.asinh(mean), torch.log(rms), said[:, 0] / 20, torch.log(spread)), -1
-        )
+        speed, std = foretold.speed.to(P.dtype), foretold.std.to(P.dtype)
+        car = torch.stack(
+            (torch.log1p(memory.car.count) / 3, torch.log(memory.car.squares / memory.car.count + 0.01) / 2,
+             torch.log1p(foretold.novelty), torch.asinh((speed - forward) / std), speed / 20), -1,
+        )  # fmt: skip
         now = torch.cat(
             (v_b / v_b.new_tensor((10.0, 1.0, 1.0)), torch.log(variance[:, 3:6]) / 6, v_b[:, :1] * rate[:, 2:] / 3,
              force[:, 1:2] / 3, rate[:, 2:] / 0.3, fixed, age[:, :1]), -1,
         )  # fmt: skip
         features = torch.cat(
             (
-                window_features(epoch.corrected, epoch.dt), torch.log(variance) / 4 - torch.log(size) / 2,
+                heard, torch.log(variance) / 4 - torch.log(size) / 2,
                 torch.asinh(known / size[9:]), age, fix_std, torch.asinh(normalised),
                 torch.log(memory.surprise + 0.01) / 2, fixed, fixed * forward.unsqueeze(-1) / 10,
-                memory.fix_speed.unsqueeze(-1) / 10, history, now,
+                memory.fix_speed.unsqueeze(-1) / 10, car, now,
             ), -1,
         )  # fmt: skip
         return features, now
@@ -243,16 +242,6 @@ class PlusFilter(nn.Module):
         return like.new_tensor(
             (1.0,) * 3 + (0.3,) * 3 + (0.02,) * 3 + (0.1,) * 3 + (0.005,) * 3 + (0.005,) * matrix + car
         )
-
-
-def speed_rms(wrong: Float[Tensor, "B 3"]) -> Float[Tensor, " B"]:
-    """How wrong the network's speed has been while GNSS was there [m/s]; at first, as wrong as it is taken to be."""
-    count, _, squares = wrong.unbind(-1)
-    return ((squares + SPEED_PRIOR_WEIGHT * SPEED_PRIOR**2) / (count + SPEED_PRIOR_WEIGHT)).sqrt()
-
-
-def _mean_wrong(wrong: Float[Tensor, "B 3"]) -> Float[Tensor, " B"]:
-    return wrong[:, 1] / (wrong[:, 0] + SPEED_PRIOR_WEIGHT)
 
 
 def _faded(mean: Tensor, normalised: Tensor, used: Tensor, span: float) -> Tensor:

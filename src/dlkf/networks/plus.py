@@ -26,9 +26,9 @@ PROCESS_REACH = (math.log(30.0), math.log(30.0), math.log(100.0), math.log(100.0
 FIX_REACH, ACROSS_REACH = math.log(30.0), math.log(30.0)
 OFFSET_REACH = 0.5  # m/s
 RESIDUAL_REACH = (0.02,) * 3 + (math.radians(0.02),) * 3  # m/s², rad/s
-SPEED_SIZE, SPEED_START_STD = 10.0, 40.0  # m/s: a network that knows nothing says 10 ± 40 m/s, which is not used
-SPEED_LEAST_STD = 0.05  # m/s
-DOUBT_REACH = math.log(5.0)
+UNTRUSTED = 100.0  # factor on the 1σ of a speed whose network says nothing: no speed is then used
+TRUST_REACH = math.log(UNTRUSTED)  # from 1 to the square of that
+TRUST_START = -TRUST_REACH  # where training begins: a factor of 3, for errors of a speed last
 NOISE_SIZES = {"process": 12, "fix": 4, "across": 2, "offset": 2, "residual": 6}
 
 
@@ -52,12 +52,11 @@ class Heads(NamedTuple):
     across: Tensor  # (B, 2) factors
     offset: Tensor  # (B, 2) m/s
     residual: Tensor  # (B, 6) m/s², rad/s
-    speed: Tensor  # (B, 2) m/s: forward speed, its 1σ
-    doubt: Tensor  # (B,) factor on how wrong the speed was so far
+    doubt: Tensor  # (B,) factor on the 1σ of the forward speed
 
 
 class PlusNetwork(nn.Module):
-    """Linear, GRU, linear heads that begin at zero."""
+    """Linear, GRU, linear heads; those of the noise begin at zero."""
 
     def __init__(self, config: PlusNetworkConfig, now: int) -> None:
         super().__init__()
@@ -65,16 +64,17 @@ class PlusNetwork(nn.Module):
         self.inward = nn.Linear(config.features, config.hidden)
         self.memory = nn.GRUCell(config.hidden, config.hidden)
         self.noise = nn.Linear(config.hidden + now, sum(NOISE_SIZES.values()))
-        self.speed = nn.Linear(config.hidden, 3)  # sees no speed of the filter but through its memory
+        self.trust = nn.Linear(config.hidden, 1)
         for gate in self.memory.weight_hh.data.chunk(3):
             nn.init.orthogonal_(gate)
         self.memory.bias_hh.data.zero_()
         # a slow memory: the update gate begins nearly shut
         self.memory.bias_ih.data.zero_()
         self.memory.bias_ih.data[config.hidden : 2 * config.hidden] = 1.0
-        for head in (self.noise, self.speed):
+        for head in (self.noise, self.trust):
             nn.init.zeros_(head.weight)
             nn.init.zeros_(head.bias)
+        nn.init.constant_(self.trust.bias, TRUST_START)
 
     def start(self, batch_size: int) -> Float[Tensor, "B h"]:
         """Empty memory."""
@@ -88,16 +88,13 @@ class PlusNetwork(nn.Module):
         process, fix, across, offset, residual = self.noise(torch.cat((h, now), -1)).split(
             list(NOISE_SIZES.values()), -1
         )
-        v, log_std, doubt = self.speed(h).unbind(-1)
-        std = SPEED_LEAST_STD + (SPEED_START_STD - SPEED_LEAST_STD) * torch.exp(log_std.clamp(-8.0, 1.0))
         return Heads(
             bounded(process.unflatten(-1, (4, 3)), process.new_tensor(PROCESS_REACH)[:, None]),
             bounded(fix, FIX_REACH),
             bounded(across, ACROSS_REACH),
             OFFSET_REACH * torch.tanh(offset),
             residual.new_tensor(RESIDUAL_REACH) * torch.tanh(residual),
-            torch.stack((SPEED_SIZE * (1 + v), std), -1),
-            bounded(doubt, DOUBT_REACH),
+            UNTRUSTED * bounded(self.trust(h).squeeze(-1), TRUST_REACH),
         ), h
 
 

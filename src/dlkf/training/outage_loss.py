@@ -2,7 +2,7 @@
 
     outage      mean of log(1 + |e|²/m²) of the horizontal error e over the epochs without GNSS
     likelihood  ½ log|P| + ½ (ν + 2) log(1 + eᵀP⁻¹e / ν), horizontal: Student's t with ν = 8 under the filter's own P
-    speed       log σ + |v̂ − v| / σ of a forward speed that a network tells, Laplace's
+    speed       log σ + ½ (κ + 1) log(1 + ((v̂ − v) / σ)² / κ) of a forward speed that a network tells, κ = 4
 
 The logarithms keep the few hardest pieces of a batch from deciding its gradient.
 """
@@ -17,7 +17,7 @@ from dlkf.data.drive import Batch
 from dlkf.filters.integration import Solution
 from dlkf.training.processes import count_per_process
 
-FREEDOM = 8.0  # ν
+FREEDOM, SPEED_FREEDOM = 8.0, 4.0  # ν, κ
 SMALLEST_VARIANCE = 1e-4  # m²
 
 
@@ -46,7 +46,9 @@ def speed_term(solution: Solution, batch: Batch) -> Tensor:
         return batch.imu.new_zeros(())
     truth = (torch.nan_to_num(batch.truth.C_nb)[..., 0] * torch.nan_to_num(batch.truth.v_n)).sum(-1)
     told, std = solution.speed.unbind(-1)
-    return _mean(std.log() + (told - truth).abs() / std, batch.attitude_valid & batch.present)
+    square = ((told - truth) / std).square()
+    value = std.log() + 0.5 * (SPEED_FREEDOM + 1) * torch.log1p(square / SPEED_FREEDOM)
+    return _mean(value, batch.attitude_valid & batch.present)
 
 
 def _horizontal(solution: Solution, batch: Batch) -> Float[Tensor, "B T 2"]:
