@@ -6,8 +6,10 @@
 Pieces of 60 s with GNSS, an outage, and 5 s after it, from the truth plus an error of 0.1 m, 0.1 m/s, 1° and 2° (1σ);
 simulated and semi-real pieces end to end, real ones every 10 s. Nobody is told the IMU: the classical filters start
 from an automotive MEMS and have factors tuned by the geometric mean on pieces of the training drives, which are kept
-in <out>/factors.yaml. Prints, and writes into <out>, Markdown tables of the horizontal error at the end of the
-outages: all filters, then ``plus`` with parts of its network switched off.
+in <out>/factors.yaml. Beside them stands ``mbkf33_car`` that is told the preset of the drive's IMU, where it has one,
+and has its tuned factors but those of the IMU: no rival, but what such knowledge is worth. Prints, and writes into
+<out>, Markdown tables of the horizontal error at the end of the outages: all filters, then ``plus`` with parts of its
+network switched off.
 """
 
 from __future__ import annotations
@@ -19,9 +21,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import torch
 import yaml
 
+from dlkf.config import config_dir
 from dlkf.data.drive import Batch
 from dlkf.data.masks import withhold, within
 from dlkf.data.segments import StartLaw, cut_pieces, make_batch
@@ -41,7 +45,8 @@ from dlkf.tuning.search import tuned
 CLASSICAL = ("mbkf21_nhc", "mbkf21_car", "mbkf33_car")
 START = StartLaw(position_m=0.1, velocity_mps=0.1, roll_pitch_deg=1.0, yaw_deg=2.0)
 BEFORE_S, AFTER_S, REAL_STRIDE_S = 60.0, 5.0, 10.0
-PARTS = ((), ("across",), ("across", "fix"), ("across", "fix", "process"), ("across", "fix", "process", "offset"))
+PARTS = tuple(("across", "fix", "process", "offset", "speed")[:k] for k in range(6))
+TOLD, OF_IMU = "mbkf33_car", ("accel_noise", "gyro_noise", "accel_walk", "gyro_walk")
 SEED = 7
 
 
@@ -53,6 +58,7 @@ class Row(NamedTuple):
     groups: list[str]
     errors: dict[str, np.ndarray]
     nees: float
+    told: np.ndarray | None = None
 
 
 def load(folders: Sequence[str]) -> DriveStack:
@@ -85,6 +91,26 @@ def opponents(train: Sequence[str], out: Path) -> dict[str, Estimator]:
     return {name: build_causal(name, spec, "a stream cannot", tuning=known[name]) for name in CLASSICAL}
 
 
+def told_errors(
+    batch: Batch, outage_s: float, imus: Mapping[str, str], factors: Mapping[str, float]
+) -> np.ndarray | None:
+    """Errors at the end of the outage [m] of a filter that knows each drive's IMU; None where that is no preset."""
+    kinds = [imus[d].split(" ")[0] for d in batch.drive]
+    files = {kind: config_dir() / "imu" / f"{kind}.yaml" for kind in set(kinds)}
+    if not all(file.is_file() for file in files.values()):
+        return None
+    out = np.empty(len(kinds))
+    end = round((BEFORE_S + outage_s) / batch.epoch_s) - 1
+    for kind, file in files.items():
+        known = build_causal(
+            TOLD, imu_spec(yaml.safe_load(file.read_text())), "a stream cannot",
+            tuning={k: v for k, v in factors.items() if k not in OF_IMU},
+        )  # fmt: skip
+        e = (run_filter(batch, known).posterior.p_n - batch.truth.p_n)[:, end, :2].norm(dim=-1).numpy()
+        out = np.where([k == kind for k in kinds], e, out)
+    return out
+
+
 def scored(
     name: str, batch: Batch, outage_s: float, filters: Mapping[str, Estimator], groups: Mapping[str, str]
 ) -> Row:
@@ -103,7 +129,9 @@ def scored(
 
 def markdown(rows: Sequence[Row], filters: Sequence[str], model: str) -> list[str]:
     """RMS / median per filter; of ``plus`` over the best classical one by geometric mean also the ratios."""
+    told = any(row.told is not None for row in rows)
     head = ["data", "outage [s]", "pieces", *filters, "RMS ratio", "geometric ratio", "NEES"]
+    head += [f"{TOLD}, told its IMU"] if told else []
     lines = [f"| {' | '.join(head)} |", f"|:--|{'--:|' * (len(head) - 1)}"]
     for row in rows:
         cells = [f"{mean_error(row.errors[f], 'rms'):.1f} / {np.median(row.errors[f]):.1f}" for f in filters]
@@ -114,7 +142,10 @@ def markdown(rows: Sequence[Row], filters: Sequence[str], model: str) -> list[st
             band = "" if np.isnan(c.ratio_low) else f" [{c.ratio_low:.2f}, {c.ratio_high:.2f}]"
             ratios.append(f"{c.ratio:.2f}{band}")
         first = [row.name, f"{row.outage_s:g}", str(len(row.groups))]
-        lines.append(f"| {' | '.join([*first, *cells, *ratios, f'{row.nees:.1f}'])} |")
+        last = [f"{row.nees:.1f}"]
+        if told:
+            last.append("" if row.told is None else f"{mean_error(row.told, 'rms'):.1f} / {np.median(row.told):.1f}")
+        lines.append(f"| {' | '.join([*first, *cells, *ratios, *last])} |")
     return lines
 
 
@@ -142,14 +173,18 @@ def main() -> None:
     model = trained_filter(args.model)
     assert isinstance(model, PlusFilter)
     filters = {**opponents(args.train, args.out), "plus": model}
+    factors = yaml.safe_load((args.out / "factors.yaml").read_text())[TOLD]
     rows, ablated = [], []
     for folder in (*args.test, *args.semi, *args.real):
         stack = load([folder])
         groups = {d.name: d.group for d in stack}
+        table = pd.read_parquet(Path(folder) / "drives.parquet", columns=["drive", "imu"])
+        imus = dict(zip(table.drive, table.imu, strict=True))
         stride = REAL_STRIDE_S if folder in args.real else None
         for outage_s in args.outages:
             batch = outages(stack, outage_s, stride)
-            rows.append(scored(Path(folder).name, batch, outage_s, filters, groups))
+            told = told_errors(batch, outage_s, imus, factors)
+            rows.append(scored(Path(folder).name, batch, outage_s, filters, groups)._replace(told=told))
             print(markdown(rows[-1:], list(filters), "plus")[-1], flush=True)
             if args.ablation:
                 variants = {"+".join(p) or "none": with_parts(model, p) for p in PARTS}

@@ -1,5 +1,6 @@
 """plus: at zero the classical filter, blind to the direction of driving, differentiable, and on disk."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -7,6 +8,7 @@ import torch
 
 from dlkf.data.augmentation import turn_frames
 from dlkf.errors import InputError
+from dlkf.filters import car_speed
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.model_based import has_covariance
@@ -70,10 +72,11 @@ def test_weights_matter_in_outages_too():
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_gradient_reaches_the_head_of_every_part(part):
+def test_gradient_reaches_the_head_of_every_part(part, monkeypatch):
     """From the position in the outage, by finite differences: Riccati recursion and state. Only biases, since what the
     network sees is cut by design; so is Φ in training, for speed, but not here. The speed that calibrates the car's is
     cut too, which is felt through the epochs before the outage."""
+    monkeypatch.setattr("dlkf.filters.plus.TELLING_STD", math.inf)  # an untrained network tells no speed
     batch, model = car(2, 14, seed=3), plus((part,), weights=0.05).double()
     model.kalman = replace(model.kalman, cut_transition=False)
     for layer in (model.network.noise, model.network.trust):
@@ -93,8 +96,21 @@ def test_gradient_reaches_the_head_of_every_part(part):
             head += sign * step * direction
             values.append(float(loss()))
             head -= sign * step * direction
+    near = 1e-3 if part == "speed" else 1e-4
     assert gradient.norm() > 0
-    assert (values[0] - values[1]) / (2 * step) == pytest.approx(float(gradient.norm()), rel=1e-3 if part == "speed" else 1e-4)
+    assert (values[0] - values[1]) / (2 * step) == pytest.approx(float(gradient.norm()), rel=near)
+
+
+@pytest.mark.parametrize(("heard", "used"), [(True, True), (False, False)])
+def test_a_car_that_does_not_tell_its_speed_gets_none(heard, used):
+    """Calibrated to 0.5 m/s it takes part in the outage; to 5 m/s it is left out."""
+    model, batch = plus(("speed",), weights=1e-9), car(2, 20)
+    model.car_speed.log_sizes.data[1] = 10.0  # the prior's σ stays
+    model.car_speed.log_sizes.data[0] = math.log((0.5 if heard else 5.0) / car_speed.PRIOR_STD)
+    with torch.no_grad():
+        a, b = integrate(batch, model), integrate(batch, plus((), weights=1e-9))
+    off = (a.posterior.v_n - b.posterior.v_n)[batch.available.logical_not()].norm(dim=-1)
+    assert (float(off.max()) > 0.01) == used
 
 
 def test_factors_are_bounded_and_begin_with_the_slope_of_exp():

@@ -22,4 +22,5 @@ def test_it_scores_and_writes_its_tables(simulated, tmp_path, monkeypatch, capsy
     cells = [c.strip() for c in lines[0].split("|")[4:8]]
     assert all(0 < float(c.split(" / ")[0]) < 1e4 for c in cells)
     head = table.splitlines()[0]
+    assert "told its IMU" in head and 0 < float(lines[0].split("|")[-2].split(" / ")[0]) < 1e4
     assert all(name in head for name in (*plus.CLASSICAL, "plus"))
