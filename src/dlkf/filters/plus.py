@@ -64,8 +64,8 @@ class PlusConfig:
     """A ``plus`` filter: its classical filter, which parts of the network are in force, what it was trained on."""
 
     kind: Literal["plus"] = "plus"
-    base: str = "mbkf21_car"
-    parts: tuple[str, ...] = PARTS[:4]
+    base: str = "mbkf33_car"
+    parts: tuple[str, ...] = PARTS[:5]
     network: PlusNetworkConfig = field(default_factory=PlusNetworkConfig)
     tuning: Mapping[str, float] = field(default_factory=lambda: dict(START_TUNING))
     imu: Mapping[str, Any] = field(default_factory=lambda: dict(ANY_MEMS))
@@ -110,7 +110,7 @@ class PlusFilter(nn.Module):
         self.config = config
         kalman = build_filter(config.base, imu_spec(config.imu), tuning=config.tuning)
         if not isinstance(kalman, Mbkf):
-            raise InputError(f"model.base={config.base} is no Kalman filter that plus can stand on; take mbkf21_car")
+            raise InputError(f"model.base={config.base} is no Kalman filter that plus can stand on; take mbkf33_car")
         speed = (AdvisedSpeed(kalman.states),) if "speed" in config.parts else ()
         self.kalman = replace(kalman, sources=(*kalman.sources, *speed), cut_transition=True)
         count = self.kalman.states.count
