@@ -45,7 +45,10 @@ def save_filter(model: Learned, folder: Path | str, card: Mapping[str, Any] | No
 
 
 def grid_of(
-    models: Iterable[Any], rate_hz: float | None = None, epoch_s: float | None = None, usual_epoch_s: float = 1.0
+    models: Iterable[Any],
+    rate_hz: int | float | None = None,
+    epoch_s: int | float | None = None,
+    usual_epoch_s: int | float = 1.0,
 ) -> dict[str, Any]:
     """``rate_hz`` and ``epoch_s``: as given, else what a trained filter was trained on, else 50 Hz and the usual."""
     configs: list[Any] = [getattr(m, "config", None) for m in models]
