@@ -34,7 +34,7 @@ class Work:
     dataset: str
     filters: Mapping[str, Filter]
     protocol: Protocol
-    grid: Mapping[str, float]
+    grid: Mapping[str, Any]
     kinds: Mapping[str, str]
     groups: Mapping[str, str]
     reference: str = "file"
@@ -125,7 +125,7 @@ def joined(runs: Sequence[Run]) -> Run:
     scores = Scores(
         epoch_s=first.epoch_s,
         pieces=[piece for s in all_scores for piece in s.pieces],
-        outage=column("outage"),
+        outage=column("outage").astype(np.bool_, copy=False),
         truth_p_n=column("truth_p_n"),
         truth_v_n=column("truth_v_n"),
         true_imu_error=column("true_imu_error"),
