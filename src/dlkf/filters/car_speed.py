@@ -1,13 +1,13 @@
 """Which speed a car's vibrations tell: a regression on what a network hears, learned on each drive while GNSS is there.
 
-The network makes K numbers φ out of a window's samples and never sees a speed; the forward speed is wᵀφ + v. What w is
-on this car with this IMU is learned from the filter's own speed at every fix, by Bayesian linear regression with a
+The network makes K numbers φ out of a window's samples and never sees a speed; the forward speed is v = wᵀφ + e. What w
+is on this car with this IMU is learned from the filter's own speed at every fix, by Bayesian linear regression with a
 normal-inverse-gamma prior (Bishop 2006, 3.3; a network's last layer so adapted: Harrison, Sharma and Pavone 2018,
 "Meta-learning priors for efficient online Bayesian regression"). So its 1σ says how well this car tells its speed: a
 car that tells nothing has one as large as its speeds differ, and an unheard sound has a larger one.
 
     σ² = (b / a)(1 + φᵀPφ),  e = v − wᵀφ                   foretold, and how wrong
-    k = Pφ / (ν + φᵀPφ),  w ← w + k e,  P ← P − k φᵀP      errors last: one epoch counts as 1 / ν of one
+    k = Pφ / (ν + φᵀPφ),  w ← w + k e,  P ← P − k φᵀP      errors last: one epoch counts as 1 / ν
     a ← a + 1,  b ← b + e² / (1 + φᵀPφ)                    all fade to the prior over MEMORY fixes
 """
 
