@@ -17,10 +17,10 @@ import pytest
 from dlkf.command.composing import composed
 from dlkf.data.drive import Batch
 from dlkf.points import SWEPT
-from dlkf.simulation.dataset import simulate_from_config
 from dlkf.tracking.grid import PARENT_RUN
 from dlkf.tracking.runs import SQLITE, mlflow_module
 from tests.cars import Tables, car, car_batch, write_cars, write_pieces
+from tests.drives import drives_in
 from tests.shell import Ended
 
 SIZE = ("dataset.hours=0.05", "dataset.drive_minutes=1.5", "dataset.imu_rate_hz=50", "seed=3")
@@ -54,7 +54,7 @@ def noisy_town(cars, tmp_path_factory) -> Path:
 def simulated(tmp_path_factory) -> Path:
     """Two drives of 90 s in a town."""
     config = composed("simulate", "simulated@dataset=per_drive", "dataset.name=town", *SIZE)
-    return simulate_from_config(config, tmp_path_factory.mktemp("data") / "town", progress=False)
+    return drives_in(config, tmp_path_factory.mktemp("data") / "town")
 
 
 @pytest.fixture

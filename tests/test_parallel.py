@@ -16,7 +16,7 @@ from dlkf.command.composing import composed
 from dlkf.data.tables import dataset_digest, read_drives
 from dlkf.errors import InputError
 from dlkf.parallel import check, each
-from dlkf.simulation.dataset import simulate_from_config
+from tests.drives import drives_in
 from tests.jobs import ended, half
 
 DRIVES = 16
@@ -29,7 +29,7 @@ def recipe(**more):
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory) -> Path:
-    return simulate_from_config(recipe(workers=1), tmp_path_factory.mktemp("data") / "many", progress=False)
+    return drives_in(recipe(workers=1), tmp_path_factory.mktemp("data") / "many")
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_a_dask_worker_is_killed_in_the_middle(alone, cluster, where, tmp_path):
     """What the lost worker had is done again by the other: the bytes of every file are those of one process."""
     done = []
     told = recipe(parallel=where)
-    work = threading.Thread(target=lambda: done.append(simulate_from_config(told, tmp_path / "many", progress=False)))
+    work = threading.Thread(target=lambda: done.append(drives_in(told, tmp_path / "many")))
     before = {worker.pid for worker in cluster.workers.values()}
     work.start()
     end = time.monotonic() + 120

@@ -27,6 +27,7 @@ from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
 from dlkf.filters.build import build_filter
 from dlkf.filters.smoother import smoothed
+from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.running.offline import navigate_drives
 
@@ -82,9 +83,8 @@ def solutions(options: argparse.Namespace) -> dict[str, dict[str, pd.DataFrame]]
     if not preset.is_file():
         raise InputError(f"unknown IMU preset {options.imu!r}; they are the files of conf/imu")
     spec = imu_spec(yaml.safe_load(preset.read_text()))
-    tuning = {"velocity_std": options.velocity_std}
     rules = options.epoch**-0.5  # a rule applied more often says no more about a drive
-    tuning |= {"lateral_std": 0.2 * rules, "vertical_std": 0.2 * rules}
+    tuning = Tuning(velocity_std=options.velocity_std, lateral_std=0.2 * rules, vertical_std=0.2 * rules)
     filter = build_filter(options.model, spec, tuning=tuning)
     drives = load_dataset(
         options.dataset, rate_hz=options.rate_hz, epoch_s=options.epoch, dtype=torch.float64, reference=False

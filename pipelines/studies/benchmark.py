@@ -24,6 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dlkf.command.composing import composed
+from dlkf.command.simulated import composed_recipe
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.drive import Batch
 from dlkf.data.segments import StartLaw, cut_pieces, make_batch
@@ -33,10 +34,10 @@ from dlkf.filters.build import build_causal
 from dlkf.filters.integration import integrate
 from dlkf.filters.saved import learned_filter, learned_settings
 from dlkf.navigation.attitude import rotation_from_vector
-from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.strapdown import strapdown
 from dlkf.provenance import provenance
-from dlkf.simulation.dataset import simulate_from_config
+from dlkf.simulation.dataset import simulate
 from dlkf.training.callbacks.masking import GnssDecimation, OutageInjection
 from dlkf.training.loss import TERMS, LossConfig, pva_losses, weighted
 
@@ -229,12 +230,12 @@ def main() -> None:
     arguments.add_argument("--out", type=Path, default=Path("outputs"))
     options = arguments.parse_args()
     torch.set_num_threads(options.threads)
-    config = composed("simulate", "simulated@dataset=one_imu", f"dataset.hours={options.hours}")
+    recipe = composed_recipe("simulated@dataset=one_imu", f"dataset.hours={options.hours}")
     bench, described = Bench(options.repeats), machine(options.threads)
     with tempfile.TemporaryDirectory() as folder:
-        simulate_from_config(config, Path(folder) / "drives")
+        simulate(recipe, Path(folder) / "drives")
         apart = mechanisation(bench, f"{folder}/drives")
-        filters(bench, Path(folder) / "drives", imu_spec(config["imu"]), options.length_s)
+        filters(bench, Path(folder) / "drives", recipe.imu, options.length_s)
         training(bench, f"{folder}/drives", options.hours)
     console = Console(width=140)
     console.print(bench.table(f"{described['processor']}, {options.threads} threads, torch {torch.__version__}"))

@@ -88,7 +88,7 @@ def opponents(train: Sequence[str], out: Path) -> dict[str, Estimator]:
             print(f"{name}: {error:.2f} m geometric mean on {pieces[0].size[0]} training pieces", flush=True)
             known[name] = asdict(factors)
             file.write_text(yaml.safe_dump(known))
-    return {name: build_causal(name, spec, "a stream cannot", tuning=known[name]) for name in CLASSICAL}
+    return {name: build_causal(name, spec, "a stream cannot", tuning=Tuning(**known[name])) for name in CLASSICAL}
 
 
 def told_errors(
@@ -104,7 +104,7 @@ def told_errors(
     for kind, file in files.items():
         known = build_causal(
             TOLD, imu_spec(yaml.safe_load(file.read_text())), "a stream cannot",
-            tuning={k: v for k, v in factors.items() if k not in OF_IMU},
+            tuning=Tuning(**{k: v for k, v in factors.items() if k not in OF_IMU}),
         )  # fmt: skip
         e = (run_filter(batch, known).posterior.p_n - batch.truth.p_n)[:, end, :2].norm(dim=-1).numpy()
         out = np.where([k == kind for k in kinds], e, out)

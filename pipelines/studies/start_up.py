@@ -32,6 +32,7 @@ from dlkf.data.segments import whole_drives
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
 from dlkf.filters.build import build_filter
+from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import vector_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, ned_axes
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
@@ -117,7 +118,7 @@ def heading_errors(drives: Sequence[Drive], starts: Sequence[Start | InputError]
 
 def outages(recorded: Sequence[Drive], imu: ImuSpec, model: str, velocity_std: float) -> None:
     """Horizontal error at the end of outages with every kind of start."""
-    estimator = build_filter(model, imu, tuning={"velocity_std": velocity_std})
+    estimator = build_filter(model, imu, tuning=Tuning(velocity_std=velocity_std))
     moving = [s for s in align_each(recorded) if isinstance(s, Start)]
     for name, config in CONFIGS.items():
         starts = [s for s in align_each(recorded, config) if isinstance(s, Start)]

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from dlkf.command import command
+from dlkf.command.settings import CompareSettings
 from dlkf.files import vacant
 from dlkf.report.compare import read_reports, write_comparison
 
@@ -17,11 +16,11 @@ def runs_of(arguments: list[str]) -> list[str]:
     return [*rest, f"runs=[{quoted}]"] if folders else rest
 
 
-@command("compare", runs_of)
-def main(config: dict[str, Any]) -> None:
+@command("compare", CompareSettings, runs_of)
+def main(told: CompareSettings) -> None:
     """Read, write, print."""
-    runs, out = config["runs"], config["out"]
-    vacant(out, overwrite=config["overwrite"])
+    runs, out = told.runs, told.out
+    vacant(out, overwrite=told.overwrite)
     write_comparison(out, read_reports([runs] if isinstance(runs, str) else runs))
     print(f"Report: {out}/compare.html")
 

@@ -7,34 +7,29 @@ consistency.json in ``out``.
 from __future__ import annotations
 
 import sys
-from typing import Any
 
 from rich.console import Console
 
 from dlkf.command import command
+from dlkf.command.scored import ConsistencySettings
 from dlkf.console import counting
 from dlkf.data.masks import withhold
 from dlkf.diagnosis.consistency import Normalised, consistency, consistency_table, states_of, write_consistency
-from dlkf.diagnosis.matched_drives import matched_batch, matched_drives, matching
+from dlkf.diagnosis.matched_drives import matched_batch, matching
 from dlkf.errors import InputError
-from dlkf.evaluation.protocol import protocol_from
 from dlkf.evaluation.table import as_rich
 from dlkf.files import vacant
 from dlkf.filters.build import build_filter
 from dlkf.filters.model_based import Mbkf
-from dlkf.navigation.imu_errors import imu_spec
 
 
-@command("consistency")
-def main(config: dict[str, Any]) -> None:
+@command("consistency", ConsistencySettings)
+def main(told: ConsistencySettings) -> None:
     """Simulate, run, compare, write, print."""
-    names = [config["model"]] if isinstance(config["model"], str) else list(config["model"])
-    if not names:
-        raise InputError("model is an empty list; give at least one Kalman filter, such as model=mbkf15")
-    vacant(config["out"], overwrite=config["overwrite"])
-    settings, preset = matched_drives(config), imu_spec(config["imu"])
-    plan = protocol_from(config).outage
-    states = {name: states_of(name, build_filter(name, preset, tuning=config["tuning"])) for name in names}
+    names = told.models
+    vacant(told.out, overwrite=told.overwrite)
+    settings, preset, plan = told.matched, told.spec, told.outage
+    states = {name: states_of(name, build_filter(name, preset, tuning=told.tuning)) for name in names}
     results: dict[str, Normalised] = {}
     outage = None
     for name in names:
@@ -47,14 +42,14 @@ def main(config: dict[str, Any]) -> None:
                 raise InputError(f"no outage fits into {settings.minutes:g} minutes; see outage.* and minutes")
             batch, outage = withhold(batch, mask), mask[0].numpy()
         with counting(f"Running {name}") as progress:
-            kalman = build_filter(name, spec, tuning=config["tuning"])
+            kalman = build_filter(name, spec, tuning=told.tuning)
             assert isinstance(kalman, Mbkf)  # as ``states_of`` has seen
             results[name] = consistency(kalman, batch, matrices, progress)
     title = f"{settings.drives} simulated drives of {settings.minutes:g} min, IMU {preset.name}, errors as modelled"
-    table = consistency_table(results, config["settle_s"], title)
-    write_consistency(config["out"], results, table, outage)
+    table = consistency_table(results, told.settle_s, title)
+    write_consistency(told.out, results, table, outage)
     Console(width=None if sys.stdout.isatty() else 110).print(as_rich(table))
-    print(f"Report: {config['out']}/consistency.png, table.md")
+    print(f"Report: {told.out}/consistency.png, table.md")
 
 
 if __name__ == "__main__":

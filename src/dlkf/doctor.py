@@ -6,24 +6,24 @@ Prints a line per finding and drive; exit code 0 where nothing is bad, 1 where s
 from __future__ import annotations
 
 import sys
-from typing import Any
 
 from rich.console import Console
 from rich.text import Text
 
 from dlkf.command import command
+from dlkf.command.settings import DoctorSettings
 from dlkf.data.store import drive_rows
 from dlkf.diagnosis.checkup import GOOD, STYLES, checkup
 
 
-@command("doctor")
-def main(config: dict[str, Any]) -> None:
+@command("doctor", DoctorSettings)
+def main(told: DoctorSettings) -> None:
     """Read, look, print; the exit code tells whether something is bad."""
     console = Console(width=None if sys.stdout.isatty() else 140, highlight=False)
     bad = noted = 0
-    for row in drive_rows(config["dataset"], config["drives"]):
+    for row in drive_rows(told.dataset, told.drives):
         console.print(Text(row.name, style="bold"))
-        for finding in checkup(config["dataset"], row, discover_pose=config["discover"]):
+        for finding in checkup(told.dataset, row, discover_pose=told.discover):
             console.print(Text(f"  {finding.grade:5}", style=STYLES[finding.grade]) + Text(f" {finding.text}"))
             bad, noted = bad + (finding.grade == "BAD"), noted + (finding.grade not in (GOOD, "BAD"))
     console.print(f"{bad} bad, {noted} to know" if bad or noted else "all good")

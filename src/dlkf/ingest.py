@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from dlkf.classes import made
 from dlkf.command import command
+from dlkf.command.settings import IngestSettings
 from dlkf.data.intake import Intake, Taken, ingest
 from dlkf.data.validate import Limits
 
@@ -15,16 +14,15 @@ def _open(arguments: list[str]) -> list[str]:
     return [f"++{a}" if a.startswith("reader.") else a for a in arguments]
 
 
-@command("ingest", arguments=_open)
-def main(config: dict[str, Any]) -> None:
+@command("ingest", IngestSettings, _open)
+def main(told: IngestSettings) -> None:
     """Read every drive under ``source``, check it and write the dataset ``out``."""
-    reader = made(config["reader"], "reader")
+    reader = made(told.reader, "reader")
     how = Intake(
-        config["split_gaps"], config["shortest_s"], Limits(gap_s=config["gap_s"], gap_samples=config["gap_samples"])
+        told.split_gaps, told.shortest_s, Limits(gap_s=told.gap_s, gap_samples=told.gap_samples)
     )
-    options = {key: config[key] for key in ("overwrite", "parallel")}
-    count = ingest(reader, config["source"], config["out"], how, **options, progress=_tell)
-    print(f"{config['out']}: {count} drive{'s' if count != 1 else ''}")
+    count = ingest(reader, told.source, told.out, how, overwrite=told.overwrite, parallel=told.parallel, progress=_tell)
+    print(f"{told.out}: {count} drive{'s' if count != 1 else ''}")
 
 
 def _tell(taken: Taken, done: int) -> None:

@@ -15,6 +15,7 @@ from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import CONFIG, WEIGHTS, load_filter
 from dlkf.filters.shipped import shipped_folder
 from dlkf.filters.smoother import Filter
+from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
 
 BEST = "best"  # folder of the weights that a training keeps
@@ -26,20 +27,17 @@ def resolve_model(
     imu: ImuSpec,
     tracking_uri: str | None = None,
     *,
-    tuning: Mapping[str, float] | None = None,
-    prior: Mapping[str, Sequence[float]] | None = None,
+    tuning: Tuning | None = None,
+    prior: Prior | None = None,
 ) -> Filter:
     """A filter by name, from a folder with weights and config, an MLflow run id, ``models:/name@alias``, or a class of
     one's own, ``module:Class``.
 
-    ``imu`` and ``tuning`` belong to the model-based filters, ``prior`` (``mean``, ``std``) to
-    ``mbkf15_prior``. Raises InputError for anything else, listing what is known.
+    ``imu`` and ``tuning`` belong to the model-based filters, ``prior`` to those with ``_prior``. Raises InputError for
+    anything else, listing what is known.
     """
     if is_filter(spec):
-        given: dict[str, Any] = {} if spec == "ins" else {"tuning": tuning}
-        if "_prior" in spec and prior:
-            given |= {"prior_mean": prior.get("mean"), "prior_std": prior.get("std")}
-        return build_filter(spec, imu, **given)
+        return build_filter(spec, imu, tuning=tuning, prior=prior)
     if OWN_SOURCE.fullmatch(spec):
         return own_filter(spec, imu)
     if folder := shipped_folder(spec):
@@ -82,14 +80,11 @@ def is_tracked(spec: str) -> bool:
 
 
 def resolve_models(
-    specs: str | Sequence[str], imu: ImuSpec, tracking_uri: str | None = None, **options: Any
+    specs: Sequence[str], imu: ImuSpec, tracking_uri: str | None = None, **options: Any
 ) -> dict[str, Filter]:
-    """``{name in tables: filter}`` for one spec or several, in their order; a repeated name gets a number."""
-    listed = [specs] if isinstance(specs, str) else [str(s) for s in specs]
-    if not listed:
-        raise InputError("model is an empty list; give at least one model, such as model=mbkf15")
+    """``{name in tables: filter}``, in the order of the specs; a repeated name gets a number."""
     models: dict[str, Filter] = {}
-    for spec in listed:
+    for spec in specs:
         name = short_name(spec)
         if name in models:
             name = f"{name}#{sum(n == name or n.startswith(name + '#') for n in models) + 1}"

@@ -5,20 +5,19 @@ Of a grid search's parent run, the point that validated best.
 
 from __future__ import annotations
 
-from typing import Any
-
 from dlkf.command import command
+from dlkf.command.settings import RegisterSettings
 from dlkf.errors import InputError
 from dlkf.tracking.comparison import best_of
 from dlkf.tracking.registry import check_registration, registered
 from dlkf.tracking.runs import client_of, reachable, run_exists, store_missing, tracking_uri
 
 
-@command("register")
-def main(config: dict[str, Any]) -> None:
+@command("register", RegisterSettings)
+def main(told: RegisterSettings) -> None:
     """Look, choose, register, print."""
-    run_id, name, alias = str(config["run"]), config["name"], config["alias"]
-    uri = tracking_uri(config["tracking"]["uri"])
+    run_id, name, alias = told.run, told.name, told.alias
+    uri = tracking_uri(told.tracking.uri)
     check_registration(name, alias)
     if store_missing(uri):
         raise InputError(f"there is no MLflow store at {uri.removeprefix('sqlite:///')}; give tracking.uri=…")

@@ -38,6 +38,8 @@ def settings_from(kind: type[T], config: Any, where: str) -> T:
     known = {name: hint for name, hint in get_type_hints(kind).items() if name in kind.__dataclass_fields__}
     head = f"{where}: " if where else ""
     if unknown := sorted(str(key) for key in config if key not in known):
+        if not where:
+            raise InputError(f"unknown config key {unknown[0]!r}; --cfg job prints all keys")
         raise InputError(f"{head}unknown key {', '.join(unknown)}; known are {', '.join(known)}")
     given = {key: fitted(known[key], value, f"{where}.{key}" if where else key) for key, value in config.items()}
     optional = {f.name for f in fields(kind) if f.default is not MISSING or f.default_factory is not MISSING}

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from dlkf.command import command
-from dlkf.files import readable
-from dlkf.simulation.dataset import simulate_from_config
-from dlkf.simulation.semi_real import semi_real_from_config
+from dlkf.command.simulated import SimulateSettings
+from dlkf.files import placed, readable
+from dlkf.simulation.dataset import simulate
+from dlkf.simulation.semi_real import simulate_semi_real
 
 
 def arguments_of_source(arguments: list[str]) -> list[str]:
@@ -21,25 +21,29 @@ def arguments_of_source(arguments: list[str]) -> list[str]:
     return [*arguments, "dataset=semi_real"] if "source" in given and "dataset" not in given else arguments
 
 
-@command("simulate", arguments_of_source)
-def main(config: dict[str, Any]) -> None:
+@command("simulate", SimulateSettings, arguments_of_source)
+def main(told: SimulateSettings) -> None:
     """Write the dataset to ``out`` (default ``data/<name>``) and say what it holds."""
     start = time.perf_counter()
-    make = semi_real_from_config if config["source"] else simulate_from_config
-    out = make(config, config["out"], overwrite=config["overwrite"])
+    out = placed(told.out)
+    if told.source:
+        simulate_semi_real(told.source, told.recipe, out, overwrite=told.overwrite)
+    else:
+        simulate(told.recipe, out, overwrite=told.overwrite, workers=told.workers, parallel=told.parallel)
     drives = pd.read_parquet(readable(out / "drives.parquet"))
     hours = drives["duration_s"].sum() / 3600
-    errors = config["dataset"]["imu_errors"]
-    types = {"fleet": f"of {len(config['dataset'].get('fleet', ()))} types", "wide": "of a new type each"}
-    imu = types.get(errors, config["imu"]["name"])
+    made_by = told.recipe
+    errors = made_by.dataset.imu_errors
+    types = {"fleet": f"of {len(made_by.dataset.fleet)} types", "wide": "of a new type each"}
+    imu = types.get(errors, made_by.imu.name)
     print(
-        f"{out}: {hours:.3g} h of {'semi-real ' if config['source'] else ''}drives with IMU {imu} "
-        f"({errors}), seed {config['seed']}, in {time.perf_counter() - start:.1f} s"
+        f"{out}: {hours:.3g} h of {'semi-real ' if told.source else ''}drives with IMU {imu} "
+        f"({errors}), seed {told.seed}, in {time.perf_counter() - start:.1f} s"
     )
     if "lateral_axle_mps" in drives:
         axle, at_imu = (math.sqrt(np.mean(drives[f"lateral_{at}_mps"].to_numpy() ** 2)) for at in ("axle", "imu"))
         print(f"velocity across the car, RMS above 2 m/s: {axle:.3f} m/s at the rear axle, {at_imu:.3f} m/s at the IMU")
-    if config["pictures"]:
+    if told.pictures:
         from dlkf.simulation.pictures import write_pictures  # matplotlib takes a second to load
 
         print("pictures: " + ", ".join(str(path) for path in write_pictures(out, out / "pictures")))

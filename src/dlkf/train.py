@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +16,24 @@ from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from rich.console import Console
 
+from dlkf.classes import made
 from dlkf.command import command, same_command
-from dlkf.command.composing import plain
+from dlkf.command.composing import configuration_hash, plain
+from dlkf.command.simulated import SimulateSettings
 from dlkf.config import config_dir
 from dlkf.data.store import dataset_digest
 from dlkf.errors import InputError
 from dlkf.evaluation.table import all_tables, as_rich
+from dlkf.settings import settings_from
+from dlkf.simulation.dataset import simulate
 from dlkf.tracking.grid import PARENT_RUN, run_name
 from dlkf.tracking.registry import check_registration, log_model
 from dlkf.tracking.runs import lightning_logger, start_run, tracking_uri
 from dlkf.training.fit import check_accelerator
 from dlkf.training.processes import is_further
 from dlkf.training.run_folder import checked_digests, run_folder, write_state
-from dlkf.training.settings import study_settings
-from dlkf.training.study import load_data, run_study, train_along
+from dlkf.training.settings import TrainSettings
+from dlkf.training.study import run_study, train_along
 from dlkf.training.summary import key_metrics, note
 
 
@@ -36,23 +41,24 @@ from dlkf.training.summary import key_metrics, note
 def main(config: dict[str, Any]) -> None:
     """Data, run, study, table."""
     console = Console(width=None if sys.stdout.isatty() else 110)
-    check_registration(config["tracking"]["register"], config["tracking"]["alias"])
-    settings = study_settings(config)
+    told = settings_from(TrainSettings, config, "")
+    tracking, settings, data = told.tracking, told.study, made(told.data, "data")
+    check_registration(tracking.register, tracking.alias)
+    folder, state = run_folder(told.name, configuration_hash(config), resume=told.resume)
     if is_further():
-        train_along(settings, load_data(config["data"], lambda _: None), run_folder(config)[0])
+        train_along(settings, data, folder)
         return
     check_accelerator(settings.fit)
-    make_missing(config, console)
-    data = load_data(config["data"], console.print)
-    folder, state = run_folder(config)
+    make_missing(data.datasets, told.scoring.hour, console)
+    data.setup()
+    console.print(data.describe())
     if state:
         console.print(f"going on with the unfinished run in {folder}")
-    name = run_name(config["name"], HydraConfig.get().overrides.task)
+    name = run_name(told.name, HydraConfig.get().overrides.task)
     parent = os.environ.get(PARENT_RUN)
-    uri = tracking_uri(config["tracking"]["uri"])
-    watched = config["tracking"]["system_metrics"]
-    begun = {"parent_run_id": parent, "run_id": state.get("run_id"), "system_metrics": watched}
-    with start_run(uri, config["name"], name, **begun) as run:
+    uri = tracking_uri(tracking.uri)
+    begun = {"parent_run_id": parent, "run_id": state.get("run_id"), "system_metrics": tracking.system_metrics}
+    with start_run(uri, told.name, name, **begun) as run:
         write_state(folder, run_id=run.id, data=checked_digests(data.datasets, state))
         run.log_config(config)
         for dataset in data.datasets:
@@ -63,7 +69,7 @@ def main(config: dict[str, Any]) -> None:
         metrics = key_metrics(outcome)
         run.log_files(folder / "report")
         run.note(note(settings, data.datasets, outcome))
-        chosen = {} if parent else {key: config["tracking"][key] for key in ("register", "alias")}  # the grid's best is
+        chosen = {} if parent else {"register": tracking.register, "alias": tracking.alias}  # of a grid the best is
         log_model(run, outcome.weights, metrics=metrics, **chosen)
         write_state(folder, finished=True)
     seconds = ", ".join(f"{k} {v:.0f} s" for k, v in outcome.seconds.items())
@@ -73,21 +79,18 @@ def main(config: dict[str, Any]) -> None:
 HOUR_SEED = 71  # the roads of the long drives are not those of the others
 
 
-def make_missing(config: dict[str, Any], console: Console) -> None:
+def make_missing(datasets: Sequence[str], hour: str | None, console: Console) -> None:
     """Simulate the datasets under ``data/`` that have a preset and are not there yet."""
-    from dlkf.simulation.dataset import simulate_from_config
-
-    hour = [config["scoring"]["hour"]] if config["scoring"]["hour"] else []
-    for dataset in [*config["data"]["datasets"], *hour]:
+    for dataset in [*datasets, *([hour] if hour else [])]:
         path = Path(dataset)
         preset_file = config_dir() / "simulated" / f"{path.name}.yaml"
         if path.exists() or path.parent != Path("data") or not preset_file.is_file():
             continue
         console.print(f"{dataset} is not there: simulating it")
-        seed = HOUR_SEED if dataset in hour else 1
+        seed = HOUR_SEED if dataset == hour else 1
         preset = compose("simulate", overrides=[f"simulated@dataset={path.name}", f"seed={seed}"])
         try:
-            simulate_from_config(plain(preset), path)
+            simulate(settings_from(SimulateSettings, plain(preset), "").recipe, path)
         except InputError:
             if not path.exists():  # else a run beside this one made the same drives first
                 raise

@@ -6,62 +6,51 @@ logs the search to MLflow.
 
 from __future__ import annotations
 
-import re
 import sys
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import torch
 from rich.console import Console
 
 from dlkf.command import command
+from dlkf.command.scored import TuneSettings
 from dlkf.console import counting
 from dlkf.data.store import dataset_digest, load_dataset
-from dlkf.errors import InputError
-from dlkf.evaluation.protocol import protocol_from
 from dlkf.evaluation.table import as_markdown, as_rich
-from dlkf.filters.build import build_filter
-from dlkf.filters.model_based import Mbkf
-from dlkf.navigation.imu_errors import imu_spec
 from dlkf.tracking.runs import start_run, tracking_uri
 from dlkf.tuning.found import found_noise, noise_table, write_noise
 from dlkf.tuning.study import LIKELIHOOD, check, search, sides, tuning_table, write_tuning
 
 
-@command("tune")
-def main(config: dict[str, Any]) -> None:
+@command("tune", TuneSettings)
+def main(told: TuneSettings) -> None:
     """Load, split, search, check, write, log, print."""
-    model, name, spec = str(config["model"]), str(config["name"]), imu_spec(config["imu"])
-    check(model, config["objective"])
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):
-        raise InputError(f"name={name} must be letters, digits, _ and -: it names a file")
-    untuned = build_filter(model, spec, tuning=config["tuning"])
-    assert isinstance(untuned, Mbkf)  # as ``check`` has seen
-    start = untuned.tuning
-    protocol, uri = protocol_from(config), tracking_uri(config["tracking"]["uri"])
+    model, name, spec, start = str(told.model), told.name, told.spec, told.tuning
+    check(model, told.objective)
+    protocol, uri = told.protocol(), tracking_uri(told.tracking.uri)
     with counting("Loading drives") as progress:
         drives = load_dataset(
-            config["dataset"],
-            rate_hz=config["rate_hz"],
-            epoch_s=config["epoch_s"],
+            told.dataset,
+            rate_hz=told.rate_hz,
+            epoch_s=told.epoch_s,
             dtype=torch.float64,
-            drives=config["drives"],
-            reference=config["objective"] != LIKELIHOOD,
+            drives=told.drives,
+            reference=told.objective != LIKELIHOOD,
             progress=progress,
         )
-    dataset, out = drives[0].dataset, Path(config["out"])
+    dataset, out = drives[0].dataset, Path(told.out)
     with start_run(uri, "tune", f"{model} {dataset}") as run:
-        run.log_config(config)
-        run.log_dataset(config["dataset"], dataset_digest(config["dataset"]), "tuning")
-        if config["objective"] == LIKELIHOOD:
-            found = found_noise(drives, model, spec, start, minutes=config["minutes"], name=name)
+        run.log_config(asdict(told))
+        run.log_dataset(told.dataset, dataset_digest(told.dataset), "tuning")
+        if told.objective == LIKELIHOOD:
+            found = found_noise(drives, model, spec, start, minutes=told.minutes, name=name)
             table = noise_table(model, dataset, spec, start, found)
             files = write_noise(out, found, table)
             run.log_metrics({f"found/{k}": v for k, v in found.described().items()})
         else:
-            options = {key: config[key] for key in ("objective", "rounds", "pieces")}
-            split = (config[key] for key in ("split", "fractions", "split_seed"))
-            parts = sides(drives, *split, length_s=protocol.length_s)
+            parts = sides(drives, told.split, told.fractions, told.split_seed, protocol.length_s)
+            options = {"objective": told.objective, "rounds": told.rounds, "pieces": told.pieces}
             result = search(model, spec, parts, protocol, start=start, **options)
             table = tuning_table(result, dataset)
             files = write_tuning(out, name, result, table)

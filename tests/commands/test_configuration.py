@@ -8,11 +8,22 @@ import pytest
 
 from dlkf.classes import class_named, made
 from dlkf.command.composing import composed
+from dlkf.command.scored import ConsistencySettings, EvaluateSettings, TuneSettings
+from dlkf.command.settings import (
+    AllanSettings,
+    CompareSettings,
+    DoctorSettings,
+    ExportSettings,
+    FilterSettings,
+    IngestSettings,
+    NavigateSettings,
+    RegisterSettings,
+)
+from dlkf.command.simulated import SimulateSettings
 from dlkf.config import config_dir
 from dlkf.filters.saved import learned_filter
-from dlkf.navigation.imu_errors import imu_spec
-from dlkf.simulation.dataset import dataset_config
-from dlkf.training.settings import study_settings
+from dlkf.settings import settings_from
+from dlkf.training.settings import TrainSettings
 
 CONF = config_dir()
 GROUPS = {  # group of the defaults list: folder under conf/
@@ -35,6 +46,20 @@ GROUPS = {  # group of the defaults list: folder under conf/
         "outage@scoring.outage": "outage",
     },
 }
+SETTINGS = {
+    "simulate": SimulateSettings,
+    "ingest": IngestSettings,
+    "evaluate": EvaluateSettings,
+    "navigate": NavigateSettings,
+    "export": ExportSettings,
+    "allan": AllanSettings,
+    "register": RegisterSettings,
+    "compare": CompareSettings,
+    "doctor": DoctorSettings,
+    "tune": TuneSettings,
+    "consistency": ConsistencySettings,
+    "train": TrainSettings,
+}
 
 
 def presets(folder: str) -> list[str]:
@@ -52,6 +77,7 @@ OPTIONS = {
     for primary, groups in GROUPS.items()
 }
 CASES = [(p, option) for p in GROUPS for option in OPTIONS[p] if option != ["imu=auto"] or p == "navigate"]
+CASES = [(p, [*o, "++dataset.imu_errors=wide"] if (p, o) == ("simulate", ["imu=wide"]) else o) for p, o in CASES]
 CASES += [  # a preset of the others replaces one node whole, so its composition alone is enough
     ("train", [*option, *experiment])
     for option in OPTIONS["train"]
@@ -70,19 +96,23 @@ def test_all_folders_are_covered():
     ("primary", "overrides"), CASES, ids=lambda x: x if isinstance(x, str) else " ".join(x)
 )
 def test_it_composes_and_builds(primary, overrides):
-    config = composed(primary, *overrides)
-    if "imu" in config:
-        imu_spec(config["imu"], auto=True)
-    if primary == "simulate":
-        dataset_config(config["dataset"])
-    if primary == "ingest":
-        made(config["reader"], "reader")
+    config = composed(primary, *overrides)  # what a user must give stays a word, ???
     if primary == "train":
         config["baselines"]["models"] = ["mbkf15"]  # a study refuses the trained filter's name among them
-        settings = study_settings(config)
-        learned_filter(settings.fit.model)
-        assert all(callback.state_dict() is not None for callback in settings.fit.callbacks)
-        class_named(config["data"]["_target_"], "data._target_")
+    told = settings_from(SETTINGS[primary], config, "")
+    if isinstance(told, FilterSettings):
+        assert told.spec.name == config["imu"]["name"]
+    if isinstance(told, ConsistencySettings):
+        assert told.matched.drives == 100
+    if isinstance(told, SimulateSettings):
+        assert told.recipe.dataset.name == config["dataset"]["name"]
+    if isinstance(told, IngestSettings):
+        made(told.reader, "reader")
+    if isinstance(told, TrainSettings):
+        fit = told.study.fit
+        learned_filter(fit.model)
+        assert all(callback.state_dict() is not None for callback in fit.callbacks)
+        class_named(told.data["_target_"], "data._target_")
 
 
 @pytest.mark.parametrize("name", [*GROUPS, *(f"experiment/{name}" for name in presets("experiment"))])

@@ -312,15 +312,16 @@ def test_in_a_shell(command, arguments, said, copy, tmp_path):
 
 SCORED = ("model=mbkf15", "dataset=town", "out=made", *FAST["evaluate"])
 SOLVED = ("model=mbkf15", "dataset=town", "out=made", *FAST["navigate"])
+NOWHERE = "tracking.uri=sqlite:///nowhere.db"
 TRAINED = ("data=drives", "data.datasets=[town]")
 OF_ALL_COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
-    "a word for a seed": ("evaluate", (*SCORED, "seed=abc"), "seed is 'abc', must be a number"),
+    "a word for a seed": ("evaluate", (*SCORED, "seed=abc"), "seed is 'abc', must be a whole number"),
     "a seed below zero": ("evaluate", (*SCORED, "seed=-1"), "seed is -1, must be a whole number ≥ 0"),
     "roads of a seed below zero": ("simulate", ("seed=-3", "out=made"), "seed is -3"),
     "a test of a seed below zero": ("train", (*TRAINED, "scoring.seed=-3"), "scoring.seed is -3"),
     "a key too many": ("evaluate", (*SCORED, "+colour=red"), "unknown config key 'colour'"),
     "a key too many in a section": ("navigate", (*SOLVED, "+align.colour=red"), "align: unknown key colour"),
-    "a key too many beside the store": ("navigate", (*SOLVED, "+tracking.colour=red"), "key 'tracking.colour'"),
+    "a key too many beside the store": ("navigate", (*SOLVED, "+tracking.colour=red"), "tracking: unknown key colour"),
     "a key too many of a training": ("train", (*TRAINED, "++colour=red"), "unknown config key 'colour'"),
     "a key too many of the data": ("train", (*TRAINED, "+data.colour=red"), "takes no colour"),
     "a preset that the command does not take": ("ingest", ("+tuning=untuned", "source=x", "out=made"), "key 'tuning'"),
@@ -338,7 +339,7 @@ OF_ALL_COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "a smoother in a stream": ("navigate", (*SOLVED, "smoother=rts", "streaming=true"), "smoother or streaming"),
     "a smoother of ins": ("navigate", ("model=ins", *SOLVED[1:], "smoother=rts"), "needs a filter with a covariance"),
     "an epoch of no whole samples": ("navigate", (*SOLVED, "epoch_s=0.33"), "whole number of samples"),
-    "an unknown alias": ("navigate", ("model=models:/town@champion", *SOLVED[1:]), "no MLflow store"),
+    "an unknown alias": ("navigate", ("model=models:/town@champion", *SOLVED[1:], NOWHERE), "no MLflow store"),
     "an alias that MLflow refuses": ("train", (*TRAINED, "tracking.alias=latest"), "neither latest nor v<number>"),
     "a name that MLflow refuses": ("train", (*TRAINED, "tracking.register=a/b"), "has none of / : @"),
     "a rate of letters": ("train", (*TRAINED, "optimizer.lr=fast"), "optimizer.lr is 'fast', must be a number"),
@@ -348,7 +349,7 @@ OF_ALL_COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "a filter without noise": ("tune", ("model=ins", "dataset=town", "out=made"), "no noise to tune"),
     "an objective that nobody knows": ("tune", ("model=mbkf15", "dataset=town", "out=made", "objective=q"), "none of"),
     "a name that is no file's": ("tune", ("model=mbkf15", "dataset=town", "out=made", "name=a/b"), "letters, digits"),
-    "no run to register": ("register", ("run=" + "0" * 32, "name=town"), "no MLflow store"),
+    "no run to register": ("register", ("run=" + "0" * 32, "name=town", NOWHERE), "no MLflow store"),
     "no name to register": ("register", ("run=" + "0" * 32,), "name is missing"),
     "one report alone": ("compare", ("runs=[town]", "out=made"), "at least two"),
     "no report at all": ("compare", ("town", "logs", "out=made"), "no metrics.json"),

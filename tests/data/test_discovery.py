@@ -24,8 +24,8 @@ from dlkf.data.readers.logs import LogReader
 from dlkf.data.schema import ACCEL, GYRO, VELOCITY
 from dlkf.data.tables import read_drives, read_table
 from dlkf.errors import InputError
-from dlkf.simulation.dataset import simulate_from_config
 from tests.cars import car
+from tests.drives import drives_in
 
 TURN = Rotation.from_euler("ZYX", [130.0, -35.0, 70.0], degrees=True).as_matrix()  # car → sensor
 UNIX = 1_751_760_000
@@ -42,7 +42,7 @@ def streets(tmp_path_factory):
     """Three simulated minutes with perfect sensors: no turn like the one before, as the analytic path has them."""
     own = ["simulated@dataset=per_drive", "imu=perfect", "dataset.hours=0.05", "dataset.drive_minutes=3", "seed=5"]
     streets = tmp_path_factory.mktemp("data") / "streets"
-    folder = simulate_from_config(composed("simulate", *own), streets, progress=False)
+    folder = drives_in(composed("simulate", *own), streets)
     name = read_drives(folder)[0].name
     return {kind: pd.DataFrame(read_table(folder, kind, name)) for kind in ("imu", "gnss")}
 

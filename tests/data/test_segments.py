@@ -100,8 +100,6 @@ def test_pieces_lie_where_the_reference_is_valid(drives):
         make_batch(drives, [])
     with pytest.raises(InputError, match="beyond its drive"):
         make_batch(drives, [Piece(0, 55, 10)])
-    with pytest.raises(InputError, match="start: unknown key yaw"):
-        StartLaw.of({"yaw": 3})
 
 
 def test_without_true_attitude_the_start_comes_from_imu_and_gnss(drives):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from dlkf.command.composing import composed
-from dlkf.simulation.dataset import simulate_from_config
+from tests.drives import drives_in
 from tests.shell import Ended
 
 Run = Callable[[Sequence[str]], None]
@@ -34,7 +34,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five drives of 40 s, as ``simulate dataset=per_drive`` makes them."""
     size = ["dataset.hours=0.0555", "dataset.drive_minutes=0.67", "dataset.imu_rate_hz=50", "seed=3"]
     config = composed("simulate", "simulated@dataset=per_drive", *size)
-    return simulate_from_config(config, tmp_path_factory.mktemp("data") / "consumer", progress=False)
+    return drives_in(config, tmp_path_factory.mktemp("data") / "consumer")
 
 
 @pytest.fixture

@@ -19,14 +19,16 @@ from dlkf.data.segments import StartLaw
 from dlkf.data.store import drive_rows, load_dataset
 from dlkf.errors import InputError
 from dlkf.evaluation.outages import OutagePlan
-from dlkf.evaluation.protocol import Protocol, Scenes, protocol_from, spread
+from dlkf.evaluation.protocol import Protocol, Scenes, spread
 from dlkf.evaluation.shares import Work, evaluate_shares
 from dlkf.evaluation.study import study
 from dlkf.evaluation.table import all_tables
 from dlkf.filters.build import build_filter
+from dlkf.filters.tuning import Prior, Tuning
 from dlkf.models import resolve_model, resolve_models
 from dlkf.parallel import each
 from dlkf.running.offline import Fixes, in_shares, navigate_dataset, navigate_drives, navigate_shares, share_of
+from dlkf.settings import settings_from
 from tests.cars import IMU
 
 MBKF = build_filter("mbkf15", IMU)
@@ -54,7 +56,7 @@ def tables_of(folder, **settings):
     data = DriveDataModule(folder, split={"train": ["g0"], "val": ["g1"], "test": ["g2"]}, **{**size, **settings})
     scenes = Scenes.of_split(data, "test", OutagePlan(first_s=(5, 10), duration_s=(5, 15)), seed=4)
     names = {"mbkf15": MBKF, "ins": build_filter("ins", IMU)}
-    made = study(names, scenes, kinds="simulated", injected_bias={"accel_mps2": 0.05, "gyro_dps": 0.1}, seed=4)[1]
+    made = study(names, scenes, kinds="simulated", injected_bias=BiasLaw(0.05, 0.1), seed=4)[1]
     return json.dumps([r.as_dict() for r in made])
 
 
@@ -133,7 +135,7 @@ def test_study_reports_each_kind_apart_and_the_slope_of_an_injected_bias(drives)
 )
 def test_impossible_protocols_are_refused(drives, settings, said):
     with pytest.raises(InputError, match=said):
-        Scenes(drives, protocol_from(settings))
+        Scenes(drives, settings_from(Protocol, {"stride_s": 60, **settings}, ""))
 
 
 def test_kinds_come_from_the_dataset(town):
@@ -259,10 +261,10 @@ def test_shares_of_which_one_has_nothing_to_score(town, tmp_path):
 
 
 def test_models_by_name_and_folder(tmp_path):
-    models = resolve_models(["ins", "mbkf15", "mbkf15"], IMU, tuning={"accel_noise": 2.0})
+    models = resolve_models(["ins", "mbkf15", "mbkf15"], IMU, tuning=Tuning(accel_noise=2.0))
     assert list(models) == ["ins", "mbkf15", "mbkf15#2"] and models["mbkf15"].tuning.accel_noise == 2.0
-    prior = {"mean": [0.0] * 6, "std": [1.0] * 6}
-    assert resolve_model("mbkf15_prior", IMU, prior=prior).prior_std == (1.0,) * 6
+    prior = Prior([0.0] * 6, [1.0] * 6)
+    assert resolve_model("mbkf15_prior", IMU, prior=prior).prior is prior
     for spec, said in (
         ("mbkf99", "ins, mbkf15"),
         (str(tmp_path), "no config.yaml"),

@@ -61,7 +61,7 @@ def outage(batch, first: int, last: int):
 
 
 def drift(batch, name: str, **tuning: float) -> torch.Tensor:
-    solution = integrate(batch, build_filter(name, IMU, tuning=tuning))
+    solution = integrate(batch, build_filter(name, IMU, tuning=Tuning(**tuning)))
     return (solution.posterior.p_n - batch.truth.p_n)[:, -1, :2].norm(dim=-1).square().mean().sqrt()
 
 
@@ -75,7 +75,7 @@ def test_structure_of_the_car_is_found_and_pays():
     """Mounting angles, rear axle and sideslip unknown: a filter that estimates them beats one that cannot."""
     true = (0.02, -0.015, 1.4, 0.004)
     batch = outage(slipping(30, 150, true), 105, 150)
-    estimator = build_filter("mbkf15_car", IMU, tuning={"lateral_std": 0.05, "vertical_std": 0.05})
+    estimator = build_filter("mbkf15_car", IMU, tuning=Tuning(lateral_std=0.05, vertical_std=0.05))
     memory = None
 
     class Watched(Mbkf):

@@ -10,6 +10,7 @@ from dlkf.errors import InputError
 from dlkf.filters.build import MODEL_BASED, build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.model_based import Ins, Mbkf, kalman_update
+from dlkf.filters.tuning import Prior
 from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import strapdown
 
@@ -137,7 +138,7 @@ def test_late_fix_is_compared_at_its_own_time():
 
 def test_prior_mean_starts_the_bias():
     batch = scene(5, 5, seed=8, bias=torch.full((5, 6), 0.01, dtype=torch.float64))
-    told = build_filter("mbkf15_prior", IMU, prior_mean=[0.01] * 6, prior_std=[1e-4] * 6)
+    told = build_filter("mbkf15_prior", IMU, prior=Prior([0.01] * 6, [1e-4] * 6))
     solution = integrate(batch, told)
     assert (solution.imu_error - 0.01).abs().max() < 1e-3
     assert (solution.std[:, -1, 9:] < 2e-3).all()
@@ -147,7 +148,7 @@ def test_prior_mean_starts_the_bias():
 def test_a_prior_of_more_states_starts_the_sensor_matrices(name, count):
     batch = scene(3, 3, seed=8)
     M = 0.01 * torch.arange(1, count - 5, dtype=torch.float64)
-    told = build_filter(name, IMU, prior_mean=[0.0] * 6 + M.tolist(), prior_std=[1e-9] * count)
+    told = build_filter(name, IMU, prior=Prior([0.0] * 6 + M.tolist(), [1e-9] * count))
     start = told.begin(batch)[1]
     diagonal = start.matrix if start.matrix.ndim == 2 else start.matrix.diagonal(dim1=-2, dim2=-1).flatten(1)
     first = M[:6] if count == 12 else torch.cat((M[:3], M[9:12]))
@@ -159,8 +160,8 @@ def test_a_prior_of_more_states_starts_the_sensor_matrices(name, count):
 @pytest.mark.parametrize("name", MODEL_BASED)
 def test_every_filter_runs_in_float32(name):
     
-    prior = {"prior_mean": [0.0] * 6, "prior_std": [0.1] * 6} if name == "mbkf15_prior" else {}
-    solution = integrate(scene(2, 10).in_precision(torch.float32), build_filter(name, IMU, **prior))
+    prior = Prior([0.0] * 6, [0.1] * 6)  # which the others leave aside
+    solution = integrate(scene(2, 10).in_precision(torch.float32), build_filter(name, IMU, prior=prior))
     assert solution.posterior.p_n.dtype == torch.float32 and solution.posterior.p_n.isfinite().all()
 
 
@@ -168,11 +169,9 @@ def test_every_filter_runs_in_float32(name):
     "arguments,words",
     [
         ({"name": "mbkf99"}, "known filters"),
-        ({"name": "mbkf15", "tuning": {"accel_nose": 2.0}}, "accel_noise"),
-        ({"name": "mbkf15", "tuning": {"accel_noise": -1.0}}, "above 0"),
         ({"name": "mbkf15_prior"}, "prior.mean"),
-        ({"name": "mbkf15_prior", "prior_mean": [0.0], "prior_std": [1.0]}, "6 values"),
-        ({"name": "mbkf33_prior", "prior_mean": [0.0] * 6, "prior_std": [1.0] * 6}, "24 values"),
+        ({"name": "mbkf15_prior", "prior": Prior([0.0], [1.0])}, "6 values"),
+        ({"name": "mbkf33_prior", "prior": Prior([0.0] * 6, [1.0] * 6)}, "24 values"),
     ],
 )
 def test_mistakes_are_one_clear_line(arguments, words):

@@ -9,6 +9,7 @@ from dlkf.errors import InputError
 from dlkf.filters.build import ENDINGS, KALMAN, build_filter, is_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.smoother import Smoothed
+from dlkf.filters.tuning import Tuning
 
 from .scene import IMU, scene
 from .test_constraints import slipping
@@ -17,7 +18,7 @@ D = torch.float64
 
 
 def error(batch, name: str, imu=IMU, **tuning: float) -> torch.Tensor:
-    solution = integrate(batch, build_filter(name, imu, tuning=tuning))
+    solution = integrate(batch, build_filter(name, imu, tuning=Tuning(**tuning)))
     return (solution.posterior.p_n - batch.truth.p_n).norm(dim=-1)
 
 
@@ -90,7 +91,7 @@ def test_adaptive_noise_learns_what_the_receiver_does_not_say():
     wrong = replace(said, gnss_std=said.gnss_std / 3)
 
     def adapted(batch):
-        filter = build_filter("aekf", IMU, tuning={"forgetting": 0.98})
+        filter = build_filter("aekf", IMU, tuning=Tuning(forgetting=0.98))
         with torch.no_grad():
             R = integrate(batch, filter, keep_covariances=True).covariances.R
         return R[:, -30:].mean().sqrt()
@@ -108,6 +109,6 @@ def test_names():
     with pytest.raises(InputError, match="_nhc"):
         build_filter("mbkf21_nch", IMU)
     with pytest.raises(InputError, match=r"gate is 1\.5, must be below 1"):
-        build_filter("mbkf21", IMU, tuning={"gate": 1.5})
+        build_filter("mbkf21", IMU, tuning=Tuning(gate=1.5))
     with pytest.raises(InputError, match=r"prior\.mean"):
         build_filter("mbkf21_prior_nhc", IMU)

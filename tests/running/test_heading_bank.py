@@ -16,8 +16,9 @@ from dlkf.navigation.earth import ned_axes
 from dlkf.running.heading_bank import RING, Case, likeliest
 from dlkf.running.standstill import at_rest
 from dlkf.running.start import WORST_HEADING_STD, align, align_each
-from dlkf.simulation.dataset import simulate_from_config
+from dlkf.settings import settings_from
 from tests.cars import REAL
+from tests.drives import drives_in
 
 SEARCH = AlignConfig(search_s=20.0)
 AROUND = AlignConfig(search_s=20.0, from_rest=True)
@@ -34,7 +35,7 @@ def drives(tmp_path_factory):
     dataset["gnss"] = {"lever_arm_b": [1.0, -0.3, -1.2]}
     imu = {"name": "mems", "accel": ACCEL | MATRIX, "gyro": GYRO | MATRIX}
     config = {"dataset": dataset, "imu": imu, "seed": 4, "workers": 1}
-    folder = simulate_from_config(config, tmp_path_factory.mktemp("start") / "toy", progress=False)
+    folder = drives_in(config, tmp_path_factory.mktemp("start") / "toy")
     return load_dataset(folder, dtype=torch.float64)
 
 
@@ -176,8 +177,8 @@ def test_heading_is_not_carried_further_than_it_is_worth(drives):
 ])  # fmt: skip
 def test_settings_are_checked(fault, said):
     with pytest.raises(InputError, match=said):
-        AlignConfig.of(fault)
-    assert AlignConfig.of(None) == AlignConfig() and AlignConfig.of({"search_s": 0}).search_s == 0
+        settings_from(AlignConfig, fault, "align")
+    assert settings_from(AlignConfig, {"search_s": 0}, "align").search_s == 0
     assert RING >= 12  # neighbours no further apart than a filter bears
 
 

@@ -17,7 +17,7 @@ from dlkf.evaluation.run import score_scenes
 from dlkf.filters.build import build_filter
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.running.references import referenced
-from dlkf.simulation.dataset import simulate_from_config
+from tests.drives import drives_in
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def world(tmp_path_factory):
     """Two drives of four minutes, and what a filter is told about their IMU."""
     size = ["dataset.hours=0.133", "dataset.drive_minutes=4", "dataset.imu_rate_hz=50", "seed=3"]
     config = composed("simulate", "simulated@dataset=per_drive", *size)
-    folder = simulate_from_config(config, tmp_path_factory.mktemp("data") / "town", progress=False)
+    folder = drives_in(config, tmp_path_factory.mktemp("data") / "town")
     spec = imu_spec(config["imu"])
     return load_dataset(folder, rate_hz=25.0, dtype=torch.float64), build_filter("mbkf21", spec), spec
 

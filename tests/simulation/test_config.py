@@ -5,11 +5,12 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import yaml
+from tests.drives import drives_in
 
 from dlkf.command.composing import composed
 from dlkf.data.validate import validate_dataset
 from dlkf.navigation.imu_errors import imu_spec
-from dlkf.simulation.dataset import dataset_config, simulate_from_config
+from dlkf.simulation.dataset import dataset_config
 
 CONF = Path(__file__).parents[2] / "conf"
 PRESETS = sorted(path.stem for path in (CONF / "imu").glob("*.yaml") if path.stem != "auto")  # auto is not known before
@@ -68,7 +69,7 @@ def test_every_dataset_is_listed_here():
 
 def test_a_simulated_dataset_keeps_the_contract(tmp_path):
     config = composed("simulate", "simulated@dataset=per_drive", MINUTE, "dataset.hours=0.05", "seed=4")
-    rows = validate_dataset(simulate_from_config(config, tmp_path / "toy", progress=False))
+    rows = validate_dataset(drives_in(config, tmp_path / "toy"))
     assert [row.name for row in rows] == [f"per_drive-4-0000{k}" for k in range(3)]
 
 
@@ -100,7 +101,7 @@ def test_a_seed_gives_the_drives_that_it_always_gave(name, row, tmp_path):
     """At 30 s, as of commit de03f96: what is new is drawn after the old, or by generators of its own. The tolerance
     leaves room for another machine's rounding."""
     config = composed("simulate", f"simulated@dataset={name}", MINUTE, "dataset.hours=0.01", "seed=3")
-    folder = simulate_from_config(config, tmp_path / name, progress=False)
+    folder = drives_in(config, tmp_path / name)
     imu, gnss, reference = (
         pd.read_parquet(folder / kind / f"drive={name}-3-00000" / "part-0.parquet").iloc[at]
         for kind, at in (("imu", 3000), ("gnss", 30), ("reference", 300))

@@ -5,11 +5,11 @@ import pandas as pd
 import pytest
 from pipelines.studies import fleet_realism as study
 
-from dlkf.command.composing import composed
+from dlkf.command.simulated import composed_recipe
 from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.tables import DriveRow
 from dlkf.data.validate import DriveTables
-from dlkf.simulation.dataset import drive_of, recipe, simulate
+from dlkf.simulation.dataset import drive_of, simulate
 from dlkf.simulation.tables import columns_of
 
 
@@ -29,7 +29,7 @@ def test_a_tone_has_its_level_in_its_band_and_nowhere_else():
 def test_the_delay_of_the_velocity_is_seen(lag):
     """Within 0.1 s, though an updating filter takes part of it for its own error."""
     late = f"+dataset.gnss.velocity_lag_s={lag}"
-    made_by = recipe(composed("simulate", "simulated@dataset=per_drive", late, "imu=consumer", "seed=3"))
+    made_by = composed_recipe("simulated@dataset=per_drive", late, "imu=consumer", "seed=3")
     tables, _ = drive_of(made_by, 0, 200)
     columns = (columns_of(table) for table in (tables.imu, tables.gnss, tables.reference))
     found = study.of_innovations(DriveTables(DriveRow("a", "a", (0.0, 0.0, 0.0)), *columns))
@@ -38,8 +38,8 @@ def test_the_delay_of_the_velocity_is_seen(lag):
 
 def test_what_lies_inside(tmp_path):
     """A fleet among itself: every number that drives share is its own median, and a stranger's is outside."""
-    config = composed("simulate", "simulated@dataset=wide", "dataset.hours=0.05", "dataset.drive_minutes=1", "seed=4")
-    fleet = study.numbers(simulate(recipe(config), tmp_path / "wide", progress=False, workers=1))
+    wide = composed_recipe("simulated@dataset=wide", "dataset.hours=0.05", "dataset.drive_minutes=1", "seed=4")
+    fleet = study.numbers(simulate(wide, tmp_path / "wide", progress=False, workers=1))
     assert len(fleet) == 3
     table = study.compared(fleet, {"same": fleet, "stranger": 1e3 * fleet.abs() + 1e3})
     assert study.is_inside(table, "same").dropna().mean() > 0.5

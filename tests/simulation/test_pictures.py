@@ -3,18 +3,18 @@
 import numpy as np
 import pandas as pd
 import pytest
+from tests.drives import drives_in
 from tests.simulation.test_dataset import config
 
 from dlkf.data.tables import read_drives
 from dlkf.data.validate import read_checked
 from dlkf.errors import InputError
-from dlkf.simulation.dataset import simulate_from_config
 from dlkf.simulation.pictures import driving, write_pictures
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    return simulate_from_config(config(hours=0.05), tmp_path_factory.mktemp("pictures") / "toy", progress=False)
+    return drives_in(config(hours=0.05), tmp_path_factory.mktemp("pictures") / "toy")
 
 
 def circled(tables, speed: float, radius: float):

@@ -5,6 +5,7 @@ import hashlib
 import numpy as np
 import pandas as pd
 import pytest
+from tests.drives import drives_in, recipe_of
 
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR, write_drive, write_drives_table
@@ -12,8 +13,7 @@ from dlkf.data.validate import validate_dataset
 from dlkf.errors import InputError
 from dlkf.navigation.imu_errors import SensorErrors
 from dlkf.simulate import arguments_of_source
-from dlkf.simulation.dataset import simulate_from_config
-from dlkf.simulation.semi_real import semi_real_from_config
+from dlkf.simulation.semi_real import simulate_semi_real
 
 QUIET = {**dict.fromkeys(SensorErrors.__dataclass_fields__, 0.0), "correlation_time": 3600.0}
 BIASED = {**QUIET, "turn_on_bias": 0.1, "scale_factor": 0.01, "misalignment": 0.01, "instability": 0.01}
@@ -40,7 +40,7 @@ def tables(folder, drive):
 @pytest.fixture(scope="module")
 def real(tmp_path_factory):
     """Two drives told as real ones: no IMU errors stated; the reference of the first has a hole and invalid rows."""
-    made = simulate_from_config(config(imu=QUIET), tmp_path_factory.mktemp("made") / "toy", progress=False)
+    made = drives_in(config(imu=QUIET), tmp_path_factory.mktemp("made") / "toy")
     folder = tmp_path_factory.mktemp("real") / "real"
     rows = []
     for k, drive in enumerate(pd.read_parquet(made / "drives.parquet").drive):
@@ -56,7 +56,7 @@ def real(tmp_path_factory):
 
 
 def semi(real, out, **change):
-    return semi_real_from_config(config(source=real, **change), out, progress=False)
+    return simulate_semi_real(real, recipe_of(config(**change)), out, progress=False)
 
 
 def test_measured_is_the_source_plus_the_stated_error(real, tmp_path):

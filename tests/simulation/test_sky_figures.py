@@ -4,11 +4,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from pipelines.studies.satellite_sky import above_horizon, fix_errors, summary, tables
+from tests.drives import drives_in
 
 from dlkf.data.tables import read_table
 from dlkf.data.validate import validate_dataset
 from dlkf.navigation.imu_errors import SensorErrors
-from dlkf.simulation.dataset import simulate_from_config
 from dlkf.simulation.gnss import sky_figures
 
 QUIET = {**dict.fromkeys(SensorErrors.__dataclass_fields__, 0.0), "correlation_time": 3600.0}
@@ -22,7 +22,7 @@ def make(out, workers=1, raw=True, receiver=None):
     receiver = receiver or {"name": "lone", "std_range": 0.5, "multipath": 0.5, "reacquire_s": 1.0}
     imu = {"name": "toy", "accel": QUIET, "gyro": QUIET}
     config = {"dataset": dataset, "imu": imu, "seed": 6, "receiver": receiver, "raw": raw, "workers": workers}
-    return simulate_from_config(config, out, progress=False)
+    return drives_in(config, out)
 
 
 @pytest.fixture(scope="module")

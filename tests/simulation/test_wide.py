@@ -7,17 +7,17 @@ import pandas as pd
 import pytest
 import torch
 
-from dlkf.command.composing import composed
+from dlkf.command.simulated import composed_recipe
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
-from dlkf.simulation.dataset import recipe, simulate
+from dlkf.simulation.dataset import simulate
 from dlkf.simulation.fresh import fresh_drives
 
 SHORT = ("dataset.hours=0.05", "dataset.drive_minutes=1", "seed=4")
 
 
 def wide(*overrides: str, name: str = "wide"):
-    return recipe(composed("simulate", f"simulated@dataset={name}", *SHORT, *overrides))
+    return composed_recipe(f"simulated@dataset={name}", *SHORT, *overrides)
 
 
 @pytest.fixture(scope="module")

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from dlkf.command.composing import composed
-from dlkf.simulation.dataset import simulate_from_config
+from tests.drives import drives_in
 
 
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory) -> Path:
     size = ["simulated@dataset=one_imu", "dataset.hours=0.25", "dataset.drive_minutes=3", "seed=1"]
-    return simulate_from_config(composed("simulate", *size), tmp_path_factory.mktemp("data") / "tiny", progress=False)
+    return drives_in(composed("simulate", *size), tmp_path_factory.mktemp("data") / "tiny")

@@ -12,7 +12,7 @@ from dlkf.filters.saved import load_filter
 from dlkf.training.callbacks.roughening import Roughening
 from dlkf.training.fit import fit
 from dlkf.training.loss import LossConfig, pva_losses, weighted
-from dlkf.training.settings import fit_settings
+from tests.training.test_resume import fit_of
 
 from .test_resume import data
 
@@ -20,21 +20,20 @@ from .test_resume import data
 def settings(*overrides: str) -> dict:
     words = ["+experiment=plus", "data.datasets=[data/none]", "model.network.hidden=8", *overrides]
     config = composed("train", *words, "trainer.best_from_epoch=0")
-    keys = ("model", "loss", "optimizer", "scheduler", "trainer", "callbacks", "seed", "finetune")
     config["trainer"] |= {"max_epochs": 2, "validate_every": 1, "accelerator": "cpu"}
     config["callbacks"]["curriculum"] |= {"warm_s": 20.0, "full_s": 25.0}
     config["callbacks"]["outage"] |= {"duration_s": [3.0, 8.0], "before_s": 5.0}
-    return {k: config[k] for k in keys}
+    return config
 
 
 def test_it_trains_is_saved_and_fine_tuned(dataset, tmp_path):
-    best = fit(fit_settings(settings()), data(dataset), tmp_path / "fresh", False)
+    best = fit(fit_of(settings()), data(dataset), tmp_path / "fresh", False)
     model = load_filter(best)
     assert isinstance(model, PlusFilter) and model.network.noise.weight.abs().sum() > 0
     again = settings()
     again["finetune"], again["trainer"]["max_epochs"] = str(best), 1
     again["optimizer"]["lr"] = 0.0
-    tuned = load_filter(fit(fit_settings(again), data(dataset), tmp_path / "tuned", False))
+    tuned = load_filter(fit(fit_of(again), data(dataset), tmp_path / "tuned", False))
     assert all(torch.equal(a, b) for a, b in zip(model.state_dict().values(), tuned.state_dict().values(), strict=True))
 
 
@@ -65,7 +64,7 @@ def test_roughening_takes_its_own_keys_alone():
 def test_without_its_own_weights_fine_tuning_says_so(dataset, tmp_path):
     wrong = settings() | {"finetune": str(tmp_path / "none")}
     with pytest.raises(InputError, match=r"config\.yaml"):
-        fit(fit_settings(wrong), data(dataset), tmp_path / "run", False)
+        fit(fit_of(wrong), data(dataset), tmp_path / "run", False)
 
 
 def _small() -> PlusConfig:

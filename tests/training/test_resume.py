@@ -6,43 +6,42 @@ import textwrap
 
 import pytest
 import torch
-import yaml
 from safetensors.torch import load_file
 
-from dlkf.config import config_dir
+from dlkf.command.composing import composed, configuration_hash
 from dlkf.data.datamodule import DriveDataModule
+from dlkf.data.masks import Outage
 from dlkf.errors import InputError
+from dlkf.settings import settings_from
 from dlkf.training.fit import fit
-from dlkf.training.run_folder import checked_digests, configuration_hash, read_state, run_folder, write_state
-from dlkf.training.settings import FitSettings, fit_settings
-
-
-def preset(path: str) -> dict:
-    return yaml.safe_load((config_dir() / path).read_text())
+from dlkf.training.run_folder import checked_digests, read_state, run_folder, write_state
+from dlkf.training.settings import FitSettings, TrainSettings
 
 
 def data(dataset) -> DriveDataModule:
     return DriveDataModule(
         [dataset], batch_size=9, length_s=20.0, eval_length_s=30.0, fractions=(0.6, 0.2, 0.2),
-        eval_outage={"first_s": 10.0, "duration_s": 10.0},
+        eval_outage=Outage(10.0, 10.0),
     )
 
 
 def settings(**trainer) -> dict:
-    train = preset("train.yaml")
+    train = composed("train", "seed=3")
     callbacks = train["callbacks"]
     callbacks["curriculum"] |= {"warm_s": 10.0, "full_s": 20.0, "warm_until": 1, "full_from": 3}
     callbacks["outage"] |= {"duration_s": [3.0, 6.0], "before_s": 5.0, "start_epoch": 2}
     train["trainer"] |= {"max_epochs": 5, "validate_every": 2, "best_from_epoch": 0, "accelerator": "cpu", **trainer}
     train["scheduler"]["restart_epochs"] = 3
-    model = preset("filter/dlkf.yaml")
-    model["network"] |= {"lstm_hidden": 16, "lstm_layers": 2, "dense": [16, 8]}
-    keys = ("loss", "optimizer", "scheduler", "trainer", "callbacks")
-    return {k: train[k] for k in keys} | {"model": model, "seed": 3}
+    train["model"]["network"] |= {"lstm_hidden": 16, "lstm_layers": 2, "dense": [16, 8]}
+    return train
+
+
+def fit_of(values: dict) -> FitSettings:
+    return settings_from(TrainSettings, values, "").fit
 
 
 def told(**trainer) -> FitSettings:
-    return fit_settings(settings(**trainer))
+    return fit_of(settings(**trainer))
 
 
 def weights(folder) -> dict:
@@ -93,7 +92,7 @@ def test_training_moves_towards_the_reference(dataset, tmp_path):
     before = LearnedFilter(LearnedConfig.from_mapping(settings()["model"])).eval()
     longer = settings(max_epochs=8)
     longer["optimizer"]["lr"] = 2e-2
-    after = load_filter(fit(fit_settings(longer), data(dataset), tmp_path / "run", False))
+    after = load_filter(fit(fit_of(longer), data(dataset), tmp_path / "run", False))
     batch = data(dataset).batches("test")[0]
 
     def loss(model):
@@ -107,7 +106,7 @@ def test_without_outages_the_loss_chooses_the_weights(dataset, tmp_path):
     """No outage in validation: every better epoch is kept by val/loss, not the first one for ever."""
     plain = DriveDataModule([dataset], batch_size=9, length_s=20.0, eval_length_s=30.0, fractions=(0.6, 0.2, 0.2))
     chosen = settings(max_epochs=3, validate_every=1)
-    best = fit(fit_settings(chosen), plain, tmp_path / "run", False)
+    best = fit(fit_of(chosen), plain, tmp_path / "run", False)
     state = torch.load(tmp_path / "run" / "last.ckpt", weights_only=True)["callbacks"]
     kept = next(v for k, v in state.items() if k.startswith("BestWeights"))
     assert best.is_dir() and kept["epoch"] > 0 and 0 < kept["score"] < float("inf")
@@ -132,12 +131,16 @@ def test_no_validated_epoch_is_said_clearly(dataset, tmp_path):
 
 def test_run_folder_is_found_again_until_it_is_finished(tmp_path):
     config = {"name": "a", "resume": True, "seed": 1, "tracking": {"uri": None}}
-    folder, state = run_folder(config, tmp_path)
+
+    def found(**change):
+        return run_folder("a", configuration_hash(config | change), resume=True, root=tmp_path)
+
+    folder, state = found()
     assert state == {} and folder == tmp_path / "a" / configuration_hash(config)
     write_state(folder, run_id="abc")
-    elsewhere = config | {"tracking": {"uri": "http://server"}}
-    assert run_folder(elsewhere, tmp_path) == (folder, {"run_id": "abc"})
-    assert run_folder(config | {"seed": 2}, tmp_path)[0] != folder
+    assert found(tracking={"uri": "http://server"}) == (folder, {"run_id": "abc"})
+    assert run_folder("a", configuration_hash(config), resume=False, root=tmp_path)[0].name == folder.name + "-2"
+    assert found(seed=2)[0] != folder
     write_state(folder, finished=True)
     assert read_state(folder) == {"run_id": "abc", "finished": True}
-    assert run_folder(config, tmp_path)[0].name == folder.name + "-2"
+    assert found()[0].name == folder.name + "-2"

@@ -81,7 +81,7 @@ def test_many_pieces_together_show_the_sensor_matrices_of_their_unit(cars):
     states = build_filter("mbkf33", told).states
     of = {(s, e): 6 + 9 * s + k for s in range(2) for k, e in enumerate(states.elements)}
     for place in ((0, (0, 0)), (0, (1, 1)), (1, (2, 2))):  # what speeding up and turning show
-        mean, std = (x[of[place]] for x in prior)
+        mean, std = (x[of[place]] for x in (prior.mean, prior.std))
         assert std < 0.004 and abs(mean - float(M[place[0]][place[1]])) < 4 * std
     assert prior.std[of[1, (2, 0)]] > 0.015  # a car that does not roll shows nothing of this one
 
@@ -105,7 +105,7 @@ def test_the_command_writes_factors_that_evaluate_takes(uri, call, town):
     done = call("tune", "model=mbkf15", f"dataset={town}", "imu=perfect", "name=cars", "out=found", *size)
     assert done.code == 0, done.err
     factors = yaml.safe_load(Path("found/tuning/cars.yaml").read_text())
-    assert build_filter("mbkf15", IMU, tuning=factors).tuning != Tuning()  # a perfect IMU's noise is too small here
+    assert build_filter("mbkf15", IMU, tuning=Tuning(**factors)).tuning != Tuning()  # a perfect IMU's noise is too small here
     assert "train" in done.out and "test" in done.out and Path("mlflow.db").is_file()
     cut = ("length_s=50", "outage.first_s=25", "outage.duration_s=20", "injected_bias=null")
     done = call(

@@ -15,13 +15,14 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dlkf.command import sweeps
-from dlkf.command.arguments import checked_keys, checked_seeds, checked_types, readable
+from dlkf.command.arguments import checked_seeds, readable
 from dlkf.command.composing import plain
 from dlkf.command.faults import fault
 from dlkf.command.help import help_text
 from dlkf.config import config_dir
 from dlkf.errors import InputError, Terminated
 from dlkf.files import placed
+from dlkf.settings import Settings, settings_from
 
 MISTAKE, INTERRUPTED, TERMINATED = 2, 130, 143
 stopped_by: list[int] = []  # signals that came while a command ran
@@ -33,9 +34,9 @@ GROUPS = {"simulate": {"dataset": "simulated"}, "train": {"model": "filter"}}
 
 
 def command(
-    name: str, arguments: Callable[[list[str]], list[str]] = list
-) -> Callable[[Callable[[dict[str, Any]], None]], Callable[[], None]]:
-    """Make a function of the composed ``conf/<name>.yaml``, as plain values, a command line program.
+    name: str, settings: type[Settings] | None = None, arguments: Callable[[list[str]], list[str]] = list
+) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
+    """Make a function of the composed ``conf/<name>.yaml``, as ``settings`` or plain values, a command line program.
 
     A user's mistake (:class:`InputError`, an unknown key or preset, a malformed override) and a fault of the machine
     (a full disk, a locked store, no GPU) are one line on stderr and exit code 2; Ctrl-C is exit code 130, SIGTERM
@@ -43,7 +44,7 @@ def command(
     sweep write into folders of their own under ``out``, and those that fail leave the others alone.
     """
 
-    def decorate(function: Callable[[dict[str, Any]], None]) -> Callable[[], None]:
+    def decorate(function: Callable[[Any], None]) -> Callable[[], None]:
         @wraps(function)
         def task(cfg: DictConfig) -> None:
             hydra_config = HydraConfig.get()
@@ -51,14 +52,12 @@ def command(
             try:
                 for key in sorted(OmegaConf.missing_keys(cfg)):
                     raise InputError(f"{key} is missing; give {key}=…")
-                given = list(hydra_config.overrides.task)
-                checked_types(name, cfg, given)
-                checked_keys(name, cfg, given)
-                checked_seeds(OmegaConf.to_container(cfg))
                 if sweep and cfg.get("out"):
                     with open_dict(cfg):
                         cfg.out = str(placed(cfg.out) / sweeps.folder(hydra_config))
-                function(plain(cfg))
+                checked_seeds(OmegaConf.to_container(cfg))
+                values = plain(cfg)
+                function(values if settings is None else settings_from(settings, values, ""))
             except Exception as error:
                 if sweep and not stopped_by:
                     sweeps.set_down(error, hydra_config)

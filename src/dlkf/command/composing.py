@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+from collections.abc import Mapping
 from typing import Any
 
 from hydra import compose, initialize_config_dir
@@ -9,6 +12,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from dlkf.config import config_dir
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+
+NOT_HASHED = ("tracking", "resume")
+NOT_HASHED_OF_TRAINER = ("devices", "strategy")  # the same training on more processes
 
 
 def composed(command: str, *overrides: str) -> dict[str, Any]:
@@ -20,6 +26,14 @@ def composed(command: str, *overrides: str) -> dict[str, Any]:
 def imu_preset(name: str) -> ImuSpec:
     """Of ``conf/imu``."""
     return imu_spec(composed("allan", f"imu={name}")["imu"])
+
+
+def configuration_hash(values: Mapping[str, Any]) -> str:
+    """Eight hex digits of everything that decides a training's weights and scores."""
+    kept = {k: v for k, v in values.items() if k not in NOT_HASHED}
+    if "trainer" in kept:
+        kept["trainer"] = {k: v for k, v in kept["trainer"].items() if k not in NOT_HASHED_OF_TRAINER}
+    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()[:8]
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

@@ -8,9 +8,7 @@ course, C_nb u_b = u_n is solved for roll and pitch in closed form (Groves sect.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -22,7 +20,6 @@ from dlkf.navigation.attitude import prefix_rotations, rotation_from_rpy, rotati
 from dlkf.navigation.earth import EARTH_RATE, ned_axes, normal_gravity
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.state import NavState
-from dlkf.settings import settings_from
 
 SIDESLIP_STD = math.radians(1.5)  # course is not heading: sideslip, mounting yaw
 AXLE_STD = 0.7  # m, how far the IMU may sit before the rear axle; in a turn that is no small angle
@@ -52,11 +49,6 @@ class AlignConfig:
                 above = "≥ 0" if name == "search_s" else "above 0"
                 raise InputError(f"align.{name} is {value!r}, must be a number {above}")
             object.__setattr__(self, name, float(value))
-
-    @staticmethod
-    def of(config: AlignConfig | Mapping[str, Any] | None) -> AlignConfig:
-        """From a mapping of its fields; InputError for unknown ones."""
-        return settings_from(AlignConfig, config or {}, "align")
 
 
 ALIGN = AlignConfig()

@@ -28,7 +28,6 @@ from dlkf.data.splits import SIDES, Split, split_rows
 from dlkf.data.stack import DriveStack
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
-from dlkf.settings import settings_from
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
@@ -62,12 +61,12 @@ class DriveDataModule(L.LightningDataModule):
         length_s: float = 60.0,
         eval_length_s: float = 60.0,
         eval_stride_s: float | None = None,
-        eval_outage: Outage | Mapping[str, float] | None = None,
+        eval_outage: Outage | None = None,
         min_valid: float = 1.0,
-        start: StartLaw | Mapping[str, float] | None = None,
+        start: StartLaw | None = None,
         turn_frames: bool = False,
-        gnss_noise: Mapping[str, float] | None = None,
-        injected_bias: Mapping[str, float] | None = None,
+        gnss_noise: GnssNoise | None = None,
+        injected_bias: BiasLaw | None = None,
         seed: int = 0,
         eval_seed: int = 0,
         split_seed: int = 0,
@@ -83,12 +82,9 @@ class DriveDataModule(L.LightningDataModule):
         self.split, self.fractions = split, tuple(fractions)
         self.batch_size, self.train_length_s = batch_size, length_s
         self.eval_length_s, self.eval_stride_s, self.min_valid = eval_length_s, eval_stride_s, min_valid
-        self.eval_outage = None if eval_outage is None else settings_from(Outage, eval_outage, "data.eval_outage")
-        law = None if injected_bias is None else settings_from(BiasLaw, injected_bias, "data.injected_bias")
-        self.injected_bias = law
-        self.start, self.turn_frames = StartLaw.of(start), turn_frames
+        self.eval_outage, self.injected_bias, self.gnss_noise = eval_outage, injected_bias, gnss_noise
+        self.start, self.turn_frames = start or StartLaw(), turn_frames
         self.seed, self.eval_seed, self.split_seed, self.progress = seed, eval_seed, split_seed, progress
-        self.gnss_noise = None if gnss_noise is None else settings_from(GnssNoise, gnss_noise, "data.gnss_noise")
         self.length_law: Callable[[int], float] | None = None
         self._starts: dict[int, torch.Tensor] = {}
         self._latest: tuple[int, int, list[list[Piece]]] = (-1, -1, [])

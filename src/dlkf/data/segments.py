@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from dlkf.data.stack import DriveStack, stacked
 from dlkf.errors import InputError
 from dlkf.navigation.earth import TangentFrame, tangent_frame
 from dlkf.navigation.state import NavState
-from dlkf.settings import check_from_zero, settings_from
+from dlkf.settings import check_from_zero
 
 REST = (0.0, 0.0, -9.8, 0.0, 0.0, 0.0)  # IMU in the padding after a piece's end
 
@@ -45,11 +45,6 @@ class StartLaw:
 
     def __post_init__(self) -> None:
         check_from_zero(self, "start.")
-
-    @staticmethod
-    def of(law: StartLaw | Mapping[str, float] | None) -> StartLaw:
-        """A law from a mapping of its fields; InputError for unknown ones."""
-        return settings_from(StartLaw, law or {}, "start")
 
     @property
     def std(self) -> Float[Tensor, " 9"]:

@@ -24,7 +24,7 @@ from dlkf.data.validate import DriveTables
 from dlkf.errors import InputError
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.navigation.state import ErrorStates
-from dlkf.ranges import draw, has_ranges, middle
+from dlkf.ranges import draw
 from dlkf.settings import settings_from
 from dlkf.simulation.drive import sliced
 from dlkf.simulation.imu import corrupt, draw_unit, inverse_mechanisation
@@ -58,13 +58,6 @@ class MatchedDrives:
             raise InputError(f"rate_hz={self.rate_hz} must be a whole number from 10 to 1000")
         if not (self.position_m > 0 and self.velocity_mps > 0):
             raise InputError("gnss.position_m and gnss.velocity_mps must be above 0")
-
-
-def matched_drives(config: Mapping[str, Any]) -> MatchedDrives:
-    """Settings from the keys of ``conf/consistency.yaml``; InputError for unknown ones and odd values."""
-    plain = {key: config[key] for key in ("drives", "minutes", "rate_hz", "vehicle", "chassis", "start", "seed")}
-    settings = settings_from(MatchedDrives, middle(plain) | dict(config["gnss"]), "consistency")
-    return replace(settings, cars=config["chassis"]) if has_ranges(config["chassis"]) else settings
 
 
 def matching(spec: ImuSpec, states: ErrorStates) -> ImuSpec:

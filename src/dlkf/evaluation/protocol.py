@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
@@ -18,7 +18,6 @@ from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.run import Scene
 from dlkf.running.batched import CHUNK_SAMPLES
 from dlkf.running.start import align_each
-from dlkf.settings import settings_from
 
 if TYPE_CHECKING:
     from dlkf.data.datamodule import DriveDataModule
@@ -196,10 +195,3 @@ def _parts(items: Sequence, epochs: Sequence[int], stack: DriveStack) -> list[li
             longest = n
         parts[-1].append(item)
     return parts
-
-
-def protocol_from(config: Mapping[str, Any]) -> Protocol:
-    """A protocol from plain values: the keys of ``conf/evaluate.yaml`` that it has; InputError for odd ones."""
-    given = {f.name: config[f.name] for f in fields(Protocol) if config.get(f.name) is not None}
-    given.setdefault("stride_s", given.get("length_s", Protocol.length_s))
-    return settings_from(Protocol, given, "protocol")

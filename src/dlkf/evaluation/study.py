@@ -15,7 +15,6 @@ from dlkf.evaluation.results import BASELINE, SETTLE_S, Results, imu_error_value
 from dlkf.evaluation.run import score_scenes
 from dlkf.evaluation.scores import Scores
 from dlkf.filters.smoother import Filter
-from dlkf.settings import settings_from
 
 
 class Run(NamedTuple):
@@ -76,15 +75,9 @@ def study(
     groups: Mapping[str, str] | None = None,
     baseline: str = BASELINE,
     settle_s: float = SETTLE_S,
-    injected_bias: BiasLaw | Mapping[str, float] | None = None,
+    injected_bias: BiasLaw | None = None,
     seed: int = 0,
 ) -> tuple[Scores, list[Results]]:
     """Scores of every filter over the scenes, and the results of each kind of data."""
-    law = bias_law(injected_bias)
-    run = run_scenes(filters, scenes, kinds=kinds, groups=groups, law=law, seed=seed)
+    run = run_scenes(filters, scenes, kinds=kinds, groups=groups, law=injected_bias, seed=seed)
     return run.scores, results_of(run, baseline=baseline, settle_s=settle_s, seed=seed)
-
-
-def bias_law(given: BiasLaw | Mapping[str, float] | None) -> BiasLaw | None:
-    """A law from its settings; none where there are none."""
-    return settings_from(BiasLaw, given, "injected_bias") if given else None

@@ -7,7 +7,7 @@ PYTHONPATH and a class in it (:mod:`dlkf.filters.sources`).
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from dlkf.classes import class_named
@@ -18,10 +18,9 @@ from dlkf.filters.integration import Estimator
 from dlkf.filters.model_based import Ins, Mbkf
 from dlkf.filters.smoother import Filter, Smoothed
 from dlkf.filters.sources import Source
-from dlkf.filters.tuning import Tuning
+from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.state import ErrorStates
-from dlkf.settings import settings_from
 
 KALMAN: Mapping[str, str] = {"mbkf15": "none", "mbkf21": "scale", "mbkf33": "full", "aekf": "none"}
 ENDINGS: Mapping[str, str] = {
@@ -51,16 +50,13 @@ def build_filter(
     name: str,
     imu: ImuSpec,
     *,
-    tuning: Mapping[str, float] | Tuning | None = None,
-    prior_mean: Sequence[float] | None = None,
-    prior_std: Sequence[float] | None = None,
+    tuning: Tuning | None = None,
+    prior: Prior | None = None,
 ) -> Filter:
-    """A model-based filter for an IMU; ``prior_*`` belong to names with ``_prior``.
-
-    They are 6 values (m/s², rad/s) and, with 21 or 33 states, the elements of the sensor matrices in their order.
+    """A model-based filter for an IMU; only names with ``_prior`` take the ``prior``.
 
     With the ending ``rts`` it is no estimator but a filter to be smoothed, which only looks back on whole drives.
-    Raises InputError for an unknown name, an unknown tuning factor, a missing prior, or an own source that is missing.
+    Raises InputError for an unknown name, a missing prior, or an own source that is missing.
     """
     if not is_filter(name):
         raise InputError(f"unknown model {name!r}; known filters: {known_filters()}")
@@ -68,21 +64,19 @@ def build_filter(
         return Ins()
     kind, *own = name.split("+")
     base, *endings = kind.split("_")
-    given: dict[str, Any] = {}
     states = ErrorStates(KALMAN[base], structure="car" in endings)
-    if "prior" in endings:
-        if prior_mean is None or prior_std is None:
+    if has_prior(name):
+        if prior is None:
             raise InputError(
                 f"model {name} needs the training set's mean IMU error: give prior.mean and prior.std "
                 f"({states.imu} values each, m/s² then rad/s) or let dlkf.train find them"
             )
-        if len(prior_mean) != states.imu or len(prior_std) != states.imu:
+        if len(prior.mean) != states.imu or len(prior.std) != states.imu:
             more = ", then the elements of both sensor matrices" if states.elements else ""
             raise InputError(
                 f"prior.mean and prior.std of {name} must have {states.imu} values (m/s² x3, rad/s x3{more})"
             )
-        given = {"prior_mean": tuple(map(float, prior_mean)), "prior_std": tuple(map(float, prior_std))}
-    factors = settings_from(Tuning, tuning or {}, "tuning")
+    factors = tuning or Tuning()
     sources: list[Source] = []
     if {"nhc", "car"} & set(endings):
         sources.append(CarConstraints(factors, states))
@@ -91,13 +85,18 @@ def build_filter(
         imu,
         factors,
         states,
+        prior=prior if has_prior(name) else None,
         gauss_markov="gm" in endings,
         gated="gated" in endings,
         sources=tuple(sources),
         noise=Adaptation(factors.forgetting) if base == "aekf" else None,
-        **given,
     )
     return Smoothed(estimator) if "rts" in endings else estimator
+
+
+def has_prior(name: str) -> bool:
+    """Whether a filter of this name is told an IMU error before the drive."""
+    return "prior" in name.partition("+")[0].split("_")
 
 
 def build_causal(name: str, imu: ImuSpec, why: str, **given: Any) -> Estimator:

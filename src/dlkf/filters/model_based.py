@@ -16,7 +16,7 @@ from dlkf.filters.adaptive import Adaptation, AdaptiveNoise
 from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
 from dlkf.filters.sources import Believed, FixMemory, GnssFix, Measurement, Source
-from dlkf.filters.tuning import Tuning
+from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import STANDARD_GRAVITY
 from dlkf.navigation.error_model import PLAIN, WindowModel, masked, source_scale, window_model
@@ -72,9 +72,9 @@ def bias_sigma(imu: ImuSpec, states: ErrorStates = PLAIN) -> Float[Tensor, " 6"]
 class Mbkf:
     """Error-state Kalman filter with position, velocity, attitude and IMU errors (paper eqs 1–6).
 
-    ``states`` gives 15 (the paper's), 21 or 33 of them. ``prior_mean`` and ``prior_std`` [m/s², rad/s, then elements
-    of the sensor matrices as the states have them] replace zero and the preset's spread as the initial knowledge of
-    the IMU: with a training set's mean error these are ``mbkf15_prior``, ``mbkf33_prior`` (paper.md 4.6).
+    ``states`` gives 15 (the paper's), 21 or 33 of them. A ``prior`` replaces zero and the preset's spread as the
+    initial knowledge of the IMU: with a training set's mean error these are ``mbkf15_prior``, ``mbkf33_prior``
+    (paper.md 4.6).
     ``gauss_markov`` lets the biases decay with the preset's correlation time instead of walking. ``gated`` refuses
     outliers among the fixes, ``sources`` gives further measurements, ``noise`` adapts Q and R to the innovations.
     """
@@ -82,8 +82,7 @@ class Mbkf:
     imu: ImuSpec
     tuning: Tuning = field(default_factory=Tuning)
     states: ErrorStates = PLAIN
-    prior_mean: tuple[float, ...] | None = None
-    prior_std: tuple[float, ...] | None = None
+    prior: Prior | None = None
     gauss_markov: bool = False
     gated: bool = False
     sources: tuple[Source, ...] = ()
@@ -114,9 +113,9 @@ class Mbkf:
         sources = tuple(source.begin(batch) for source in self.sources)
         memory = Memory(torch.diag_embed(sigma**2), windows, self.fix.begin(batch), sources, structure)
         known = torch.zeros(B, 9, **like)
-        if self.prior_mean is None:
+        if self.prior is None:
             return memory, ImuError(known[:, :6])
-        mean = torch.tensor(self.prior_mean, **like).expand(B, -1)
+        mean = torch.tensor(self.prior.mean, **like).expand(B, -1)
         return memory, ImuError(torch.zeros_like(known[:, :6])).updated(torch.cat((known, mean), -1), self.states)
 
     def psd(self) -> dict[str, float]:
@@ -179,8 +178,8 @@ class Mbkf:
             return memory.windows.transition(epoch.start.detach(), window, epoch.corrected.detach(), epoch.frame)
 
     def _imu_sigma(self) -> Float[Tensor, " k"]:
-        if self.prior_std is not None:
-            return torch.tensor(self.prior_std, dtype=torch.float64)
+        if self.prior is not None:
+            return torch.tensor(self.prior.std, dtype=torch.float64)
         bias = bias_sigma(self.imu, self.states)
         of_matrix = [
             sensor.scale_factor if i == j else sensor.misalignment

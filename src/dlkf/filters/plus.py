@@ -108,7 +108,7 @@ class PlusFilter(nn.Module):
     def __init__(self, config: PlusConfig) -> None:
         super().__init__()
         self.config = config
-        kalman = build_filter(config.base, imu_spec(config.imu), tuning=config.tuning)
+        kalman = build_filter(config.base, imu_spec(config.imu), tuning=settings_from(Tuning, config.tuning, "tuning"))
         if not isinstance(kalman, Mbkf):
             raise InputError(f"model.base={config.base} is no Kalman filter that plus can stand on; take mbkf33_car")
         speed = (AdvisedSpeed(kalman.states),) if "speed" in config.parts else ()

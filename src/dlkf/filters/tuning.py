@@ -1,7 +1,8 @@
-"""Factors and standard deviations of the model-based filters that are fitted on training drives."""
+"""What model-based filters are told: factors fitted on training drives, and an IMU error known beforehand."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 from dlkf.errors import InputError
@@ -49,3 +50,18 @@ class Tuning:
         for name in ("gate", "forgetting"):
             if not getattr(self, name) < 1:
                 raise InputError(f"tuning: {name} is {getattr(self, name)!r}, must be below 1")
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of an IMU error before a drive: mean and 1σ [m/s² x 3, rad/s x 3].
+
+    Of a filter with more states also the elements of both sensor matrices, in the order of the states.
+    """
+
+    mean: Sequence[float]
+    std: Sequence[float]
+
+    def surer(self, factor: float) -> Prior:
+        """The same mean with the spread times ``factor``."""
+        return Prior(self.mean, tuple(factor * s for s in self.std))

@@ -154,22 +154,25 @@ class Recipe:
         return {"seed": self.seed, **plain}
 
 
-def recipe(config: Mapping[str, Any]) -> Recipe:
-    """What a mapping with ``dataset``, ``imu``, ``seed``, perhaps ``receiver`` and ``raw`` says; InputError if odd."""
-    for key in ("dataset", "imu", "seed"):
-        if config.get(key) is None:
-            raise InputError(f"simulation: {key} is missing")
-    seed = config["seed"]
+def recipe(
+    dataset: Mapping[str, Any],
+    imu: Mapping[str, Any],
+    seed: int,
+    receiver: Mapping[str, Any] | None = None,
+    *,
+    raw: bool = False,
+) -> Recipe:
+    """Of the values of presets, in which ranges may stand; InputError for odd ones."""
     if not isinstance(seed, int) or seed < 0:
         raise InputError(f"simulation: seed {seed!r} must be a whole number ≥ 0")
-    plain = {key: config.get(key) for key in ("dataset", "imu", "receiver")} | {"raw": config.get("raw", False)}
+    plain = {"dataset": dataset, "imu": imu, "receiver": receiver, "raw": raw}
     settings, spec = _settings(middle(plain))
     if not has_ranges(plain):
         return Recipe(settings, spec, seed)
     for key in OF_ALL_DRIVES:
-        if has_ranges(config["dataset"].get(key)):
+        if has_ranges(dataset.get(key)):
             raise InputError(f"dataset: {key} is a range, but all drives have the same; give a value")
-    if has_ranges(plain["imu"]) and settings.imu_errors == "one":
+    if has_ranges(imu) and settings.imu_errors == "one":
         raise InputError("imu: is drawn for every drive, but dataset.imu_errors is one; set dataset.imu_errors=wide")
     return Recipe(settings, spec, seed, plain)
 
@@ -177,20 +180,6 @@ def recipe(config: Mapping[str, Any]) -> Recipe:
 def _settings(plain: Mapping[str, Any]) -> tuple[DatasetConfig, ImuSpec]:
     settings = dataset_config(plain["dataset"])
     return replace(settings, receiver=receiver_spec(plain["receiver"]), raw=plain["raw"]), imu_spec(plain["imu"])
-
-
-def simulate_from_config(
-    config: Mapping[str, Any], out: str | Path, *, overwrite: bool = False, progress: bool = True
-) -> Path:
-    """Simulate what a mapping with ``dataset``, ``imu``, ``seed``, perhaps ``workers``, ``parallel`` says into ``out``.
-
-    InputError as of :func:`recipe` and :func:`simulate_dataset`.
-    """
-    workers = config.get("workers")
-    if workers is not None and (not isinstance(workers, int) or workers < 1):
-        raise InputError(f"simulation: workers {workers!r} must be a whole number ≥ 1")
-    options = {"overwrite": overwrite, "workers": workers, "parallel": config.get("parallel"), "progress": progress}
-    return simulate(recipe(config), placed(out), **options)
 
 
 def simulate_dataset(config: DatasetConfig, spec: ImuSpec, seed: int, out: Path, **options: Any) -> Path:
@@ -214,6 +203,8 @@ def simulate(
     ``workers`` drives, whatever the hours. InputError if ``out`` exists.
     """
     check(parallel, out)
+    if workers is not None and workers < 1:
+        raise InputError(f"workers={workers} must be at least 1")
     with new_dataset(out, overwrite) as folder:
         _write_drives(made_by, folder, workers or os.cpu_count() or 1, parallel, progress)
     return out

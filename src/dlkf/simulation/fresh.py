@@ -34,10 +34,10 @@ def fresh_drives(
 
     A training that wants a new fleet every ten epochs makes, in a ``DriveDataModule``'s place of ``load_dataset``,
 
-        fleet = recipe(composed("simulate", "simulated@dataset=wide", "seed=7"))
+        fleet = composed_recipe("simulated@dataset=wide", "seed=7")
         stack = DriveStack(fresh_drives(fleet, 48 * (epoch // 10), 48, seconds=600, rate_hz=50.0))
 
-    (:func:`dlkf.simulation.dataset.recipe`, ``dlkf.command.composing.composed``), and validates on other seeds.
+    (``dlkf.command.simulated.composed_recipe``), and validates on other seeds.
     ``workers`` threads share the drives. InputError as of a dataset's settings, and for a drive shorter than an epoch.
     """
     if count < 1 or first < 0 or (seconds is not None and seconds < 1):

@@ -7,7 +7,6 @@ no more than the reference holds.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,7 @@ from dlkf.navigation.attitude import rpy_from_rotation
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.simulation.dataset import DatasetConfig, Recipe, drawn, gnss_text, recipe, write_raw
+from dlkf.simulation.dataset import DatasetConfig, Recipe, drawn, gnss_text, write_raw
 from dlkf.simulation.gnss.satellite_fixes import Received, receive
 from dlkf.simulation.gnss.surroundings import Sky, sky_along
 from dlkf.simulation.imu import ImuUnit, corrupt
@@ -39,13 +38,6 @@ from dlkf.simulation.motion.vehicle import Truth
 Array = NDArray[np.floating]
 KIND = "semi-real"
 INJECTED = "the injected part only: the source's own IMU errors remain and are not known"
-
-
-def semi_real_from_config(
-    config: Mapping[str, Any], out: str | Path, *, overwrite: bool = False, progress: bool = True
-) -> Path:
-    """Semi-real drives as a mapping with ``source``, ``dataset``, ``imu``, ``seed`` and so on says, into ``out``."""
-    return simulate_semi_real(config["source"], recipe(config), placed(out), overwrite=overwrite, progress=progress)
 
 
 def simulate_semi_real(

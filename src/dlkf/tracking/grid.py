@@ -10,9 +10,11 @@ import json
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import pandas as pd
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
@@ -26,9 +28,11 @@ from dlkf.tracking.comparison import NAMELESS, as_text, best_child, cells, child
 from dlkf.tracking.registry import check_registration, registered
 from dlkf.tracking.runs import (
     NOTE_TAG,
+    Run,
     client_of,
     experiment_id,
     reachable,
+    start_run,
     tracking_uri,
 )
 
@@ -179,3 +183,10 @@ def shown(override: str) -> str:
     """An override as one reads it: ``filter@model=dlkf`` → ``model=dlkf``, without Hydra's plus signs."""
     key, equals, value = override.partition("=")
     return f"{key.lstrip('+~').rpartition('@')[2]}{equals}{value}"
+
+
+def start_point(uri: str, experiment: str, name: str) -> AbstractContextManager[Run]:
+    """A run of its own, or in a sweep one of the points."""
+    parent = os.environ.get(PARENT_RUN)
+    named = run_name(name, HydraConfig.get().overrides.task) if parent else name
+    return start_run(uri, experiment, named[:250], parent_run_id=parent)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,28 +12,20 @@ from dlkf.errors import InputError
 from dlkf.files import whole_file
 
 STATE = "state.json"
-NOT_HASHED = ("tracking", "resume")
-NOT_HASHED_OF_TRAINER = ("devices", "strategy")  # the same training on more processes
 
 
-def configuration_hash(config: Mapping[str, Any]) -> str:
-    """Eight hex digits of everything that decides the weights and the scores."""
-    kept = {k: v for k, v in config.items() if k not in NOT_HASHED}
-    if "trainer" in kept:
-        kept["trainer"] = {k: v for k, v in kept["trainer"].items() if k not in NOT_HASHED_OF_TRAINER}
-    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()[:8]
-
-
-def run_folder(config: Mapping[str, Any], root: Path = Path("outputs/train")) -> tuple[Path, dict[str, Any]]:
-    """Folder and state of the unfinished run of this configuration, or a new one with an empty state."""
-    base = root / str(config["name"]) / configuration_hash(config)
+def run_folder(
+    name: str, digest: str, *, resume: bool, root: Path = Path("outputs/train")
+) -> tuple[Path, dict[str, Any]]:
+    """Folder and state of the unfinished run of a configuration's ``digest``, or a new one with an empty state."""
+    base = root / name / digest
     attempt = 1
     while True:
         folder = base.with_name(base.name if attempt == 1 else f"{base.name}-{attempt}")
         if not folder.exists():
             return folder, {}
         state = read_state(folder)
-        if config["resume"] and not state.get("finished"):
+        if resume and not state.get("finished"):
             return folder, state
         attempt += 1
 

@@ -1,4 +1,4 @@
-"""What a study is told, typed: ``conf/train.yaml`` as dataclasses, made once by the command."""
+"""What a training is told, typed: ``conf/train.yaml`` as dataclasses, and the study that they describe."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dlkf.errors import InputError
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.saved import LearnedSettings, learned_settings
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.settings import check_limits, fitted, settings_from
+from dlkf.settings import check_limits
 from dlkf.training.loss import Loss, loss_of
 
 MANY = 10**9
@@ -69,6 +69,16 @@ class TrainerSettings:
 
 
 @dataclass(frozen=True)
+class TrackingSettings:
+    """Where the run is kept, what is watched, and under which name the model is registered."""
+
+    uri: str | None
+    system_metrics: bool
+    register: str | None
+    alias: str | None
+
+
+@dataclass(frozen=True)
 class BaselineSettings:
     """Which filters are scored beside, and on how many training pieces they are tuned."""
 
@@ -116,25 +126,44 @@ class StudySettings:
     scoring: ScoringSettings
 
 
-def fit_settings(config: Mapping[str, Any]) -> FitSettings:
-    """From the sections of ``conf/train.yaml`` as plain values; InputError for unknown keys, types and ranges."""
-    return FitSettings(
-        model=learned_settings(config["model"]),
-        loss=loss_of(config["loss"]),
-        optimizer=settings_from(OptimizerSettings, config["optimizer"], "optimizer"),
-        scheduler=settings_from(SchedulerSettings, config["scheduler"], "scheduler"),
-        trainer=settings_from(TrainerSettings, config["trainer"], "trainer"),
-        callbacks=[made(c, f"callbacks.{name}") for name, c in config["callbacks"].items() if c is not None],
-        seed=fitted(int, config["seed"], "seed"),
-        finetune=config.get("finetune"),
-    )
+@dataclass(frozen=True)
+class TrainSettings:
+    """``conf/train.yaml``; a mapping stands where a class may be named."""
 
+    name: str
+    seed: int
+    finetune: str | None
+    resume: bool
+    imu: Mapping[str, Any]
+    data: Mapping[str, Any]
+    model: Mapping[str, Any]
+    loss: Mapping[str, Any]
+    callbacks: Mapping[str, Any]
+    optimizer: OptimizerSettings
+    scheduler: SchedulerSettings
+    trainer: TrainerSettings
+    baselines: BaselineSettings
+    scoring: ScoringSettings
+    tracking: TrackingSettings
 
-def study_settings(config: Mapping[str, Any]) -> StudySettings:
-    """From the whole of ``conf/train.yaml`` as plain values; InputError for what does not fit."""
-    fit = fit_settings(config)
-    baselines = settings_from(BaselineSettings, config["baselines"], "baselines")
-    if fit.model.kind in baselines.models:
-        raise InputError(f"baselines.models has {fit.model.kind}, the name of the trained filter; take it out")
-    scoring = settings_from(ScoringSettings, config["scoring"], "scoring")
-    return StudySettings(str(config["name"]), imu_spec(config["imu"]), fit, baselines, scoring)
+    @property
+    def fit(self) -> FitSettings:
+        """What decides the weights; InputError for a class that is not there or takes other settings."""
+        return FitSettings(
+            model=learned_settings(self.model),
+            loss=loss_of(self.loss),
+            optimizer=self.optimizer,
+            scheduler=self.scheduler,
+            trainer=self.trainer,
+            callbacks=[made(c, f"callbacks.{name}") for name, c in self.callbacks.items() if c is not None],
+            seed=self.seed,
+            finetune=self.finetune,
+        )
+
+    @property
+    def study(self) -> StudySettings:
+        """The whole study, as :attr:`fit`."""
+        fit = self.fit
+        if fit.model.kind in self.baselines.models:
+            raise InputError(f"baselines.models has {fit.model.kind}, the name of the trained filter; take it out")
+        return StudySettings(self.name, imu_spec(self.imu), fit, self.baselines, self.scoring)

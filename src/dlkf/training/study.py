@@ -13,7 +13,6 @@ import torch
 from lightning.pytorch.loggers import Logger
 
 import dlkf
-from dlkf.classes import made
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import dataset_digest, load_dataset
@@ -49,14 +48,6 @@ class Outcome:
     weights: Path
     seconds: dict[str, float]
     tables: list[Table]
-
-
-def load_data(values: Mapping[str, Any], say: Say) -> DriveDataModule:
-    """The data module of plain values (``conf/data``), loaded and split."""
-    data: DriveDataModule = made(values, "data")
-    data.setup()
-    say(data.describe())
-    return data
 
 
 def run_study(
@@ -116,6 +107,7 @@ def run_study(
 
 def train_along(settings: StudySettings, data: DriveDataModule, folder: Path) -> None:
     """The part of a further process of the same training: it writes, logs and scores nothing."""
+    data.setup()
     set_threads(settings.fit)
     fit(settings.fit, data, folder, False)
 

@@ -9,19 +9,11 @@ from typing import Any
 
 from dlkf.console import counting
 from dlkf.data.drive import Batch
-from dlkf.filters.build import build_causal, build_filter
+from dlkf.filters.build import build_causal, build_filter, has_prior
 from dlkf.filters.smoother import Filter
-from dlkf.filters.tuning import Tuning
+from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.tuning.search import (
-    Prior,
-    best_prior,
-    factors_of,
-    has_prior,
-    outage_error,
-    tuned,
-    without_prior,
-)
+from dlkf.tuning.search import best_prior, factors_of, outage_error, tuned, without_prior
 
 FIRST = "mbkf15"  # where the others' search starts, and what the mean IMU error is estimated with
 
@@ -37,11 +29,7 @@ class Baselines:
 
     def build(self) -> dict[str, Filter]:
         """The filters."""
-        return {n: build_filter(n, self.imu, tuning=t, **self.told(n)) for n, t in self.tunings.items()}
-
-    def told(self, name: str) -> dict[str, Any]:
-        """For ``build_filter``: nothing for a filter without ``_prior``."""
-        return self.priors[name].told(name) if name in self.priors else {}
+        return {n: build_filter(n, self.imu, tuning=t, prior=self.priors.get(n)) for n, t in self.tunings.items()}
 
     def described(self) -> dict[str, Any]:
         """Plain values for a report."""

@@ -20,7 +20,7 @@ from dlkf.evaluation.metrics import end_errors, mean_error
 from dlkf.filters.build import build_causal
 from dlkf.filters.integration import Estimator, integrate
 from dlkf.filters.model_based import Mbkf
-from dlkf.filters.tuning import Tuning
+from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.state import ErrorStates
@@ -87,10 +87,9 @@ def tuned(
     ``prior`` is what a filter with ``_prior`` is told. Returns the best factors and their :func:`outage_error` [m];
     ``progress`` is told every trial.
     """
-    told = prior.told(name) if prior else {}
 
     def judged(trial: Tuning) -> float:
-        return outage_error(build_causal(name, imu, "tuning does not", tuning=trial, **told), batches, objective)
+        return outage_error(build_causal(name, imu, "tuning does not", tuning=trial, prior=prior), batches, objective)
 
     best = start or Tuning()
     score = judged(best)
@@ -109,29 +108,6 @@ def tuned(
         if best == before:
             break
     return best, score
-
-
-class Prior(NamedTuple):
-    """What is known of an IMU error before a drive: mean and 1σ.
-
-    m/s² x 3, rad/s x 3; of a filter with more states also the elements of both sensor matrices.
-    """
-
-    mean: tuple[float, ...]
-    std: tuple[float, ...]
-
-    def told(self, name: str) -> dict[str, tuple[float, ...]]:
-        """For ``build_filter``: nothing for a filter without ``_prior``."""
-        return {"prior_mean": self.mean, "prior_std": self.std} if has_prior(name) else {}
-
-    def surer(self, factor: float) -> Prior:
-        """The same mean with the spread times ``factor``."""
-        return Prior(self.mean, tuple(factor * s for s in self.std))
-
-
-def has_prior(name: str) -> bool:
-    """Whether a filter of this name is told an IMU error before the drive."""
-    return "prior" in name.partition("+")[0].split("_")
 
 
 def without_prior(name: str) -> str:
@@ -199,7 +175,6 @@ def best_prior(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name: str
     tried = [prior.surer(factor) for factor in (3.0, 1.0, 0.3, 0.1)]
 
     def error(tried: Prior) -> float:
-        told = tried.told(name)
-        return outage_error(build_causal(name, imu, "a prior does not", tuning=tuning, **told), batches)
+        return outage_error(build_causal(name, imu, "a prior does not", tuning=tuning, prior=tried), batches)
 
     return min(tried, key=error)
