@@ -1,13 +1,13 @@
 """The one way from plain values to settings: every key known, every value of its field's type, one text for all.
 
-Settings are frozen dataclasses; the ranges of their values stand in ``__post_init__``, their units in the names.
+Settings are frozen dataclasses; the ranges of their values stand beside the defaults, their units in the names.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, field, fields, is_dataclass
 from types import NoneType, UnionType
 from typing import Any, ClassVar, Literal, Protocol, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -21,6 +21,7 @@ class Settings(Protocol):
 
 
 T = TypeVar("T", bound=Settings)
+RANGE = "range"  # of a field's metadata
 
 
 def settings_from(kind: type[T], config: Any, where: str) -> T:
@@ -92,18 +93,32 @@ def _called(option: Any) -> str:
     return {NoneType: "null", bool: "true or false", str: "a word", int: "a whole number"}.get(option, "a number")
 
 
-def check_limits(settings: Settings, where: str, limits: Mapping[str, tuple[float, float]]) -> None:
-    """InputError for a field that is outside its limits."""
-    for name, (low, high) in limits.items():
-        if not low <= getattr(settings, name) <= high:
-            raise InputError(f"{where}: {name} {getattr(settings, name)} is outside {low:g} to {high:g}")
+def within(default: Any, low: float, high: float) -> Any:
+    """A field of :class:`Ranged` settings: its default, and the least and the greatest value."""
+    return field(default=default, metadata={RANGE: (low, high)})
 
 
-def check_from_zero(settings: Settings, where: str) -> None:
-    """InputError for a field that is no finite number ≥ 0."""
-    for name in settings.__dataclass_fields__:
-        if not is_number(getattr(settings, name)) or getattr(settings, name) < 0:
-            raise InputError(f"{where}{name} is {getattr(settings, name)!r}, must be a finite number ≥ 0")
+class Ranged:
+    """Settings whose numbers are checked against their ranges: that of :func:`within`, else of the class, if any.
+
+    InputError for a value outside, or none that is finite; ``where`` is what a user calls the settings.
+    """
+
+    _where: ClassVar[str]
+    _range: ClassVar[tuple[float, float] | None]
+
+    def __init_subclass__(cls, where: str, least: float | None = None, greatest: float = math.inf) -> None:
+        cls._where, cls._range = where, None if least is None else (least, greatest)
+
+    def __post_init__(self) -> None:
+        for f in fields(self):  # type: ignore[arg-type]
+            value, limits = getattr(self, f.name), f.metadata.get(RANGE, self._range)
+            if limits is None or isinstance(value, (str, bool, list, tuple)) or value is None:
+                continue
+            if not is_number(value) or not limits[0] <= value <= limits[1]:
+                low, high = (f"{limit:g}" for limit in limits)
+                wanted = f"a finite number ≥ {low}" if high == "inf" else f"from {low} to {high}"
+                raise InputError(f"{self._where}: {f.name} is {value!r}, must be {wanted}")
 
 
 def is_number(value: Any) -> bool:

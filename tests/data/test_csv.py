@@ -45,7 +45,7 @@ def _plain(folder, tables) -> None:
         frame.to_csv(folder / f"{kind}.csv", index=False)
 
 
-def _reader(**changes) -> LogReader:
+def log_reader(**changes) -> LogReader:
     spec = copy.deepcopy(PLAIN)
     for path, value in changes.items():
         *nodes, last = path.split("__")
@@ -146,7 +146,7 @@ def test_increments_and_stamps_at_the_start(tmp_path, tables):
     imu.iloc[:, 1:] *= 0.01
     imu["t"] -= 0.01
     _plain(tmp_path / "a", {**tables, "imu": imu})
-    reader = _reader(imu__increments=True, imu__stamp="start", time_zero="keep")
+    reader = log_reader(imu__increments=True, imu__stamp="start", time_zero="keep")
     drive = next(iter(reader.read(tmp_path / "a")))
     assert drive.name == "a" and drive.reference is None
     for name in tables["imu"]:
@@ -158,7 +158,7 @@ def test_a_table_without_header(tmp_path, tables):
     folder.mkdir()
     for kind in ("imu", "gnss"):
         tables[kind].to_csv(folder / f"{kind}.csv", index=False, header=False, sep=" ")
-    reader = _reader(
+    reader = log_reader(
         header=False,
         separator=r"\s+",
         imu__time__column=0,
@@ -198,7 +198,7 @@ def test_mistakes_in_the_mapping(tmp_path, tables, path):
     value, told = MISTAKES[path]
     _plain(tmp_path / "a", tables)
     with pytest.raises(InputError) as error:
-        list(_reader(**{path: value}).read(tmp_path / "a"))
+        list(log_reader(**{path: value}).read(tmp_path / "a"))
     assert told in str(error.value) and "\n" not in str(error.value)
 
 
@@ -214,16 +214,16 @@ def test_mistakes_in_the_files(tmp_path, tables):
     ):
         path.write_text("\n".join([*lines[:line], cells, *lines[line + 1 :]]))
         with pytest.raises(InputError, match=told):
-            ingest_drives(_reader().read(tmp_path), tmp_path / "out")
+            ingest_drives(log_reader().read(tmp_path), tmp_path / "out")
         assert [p.name for p in tmp_path.iterdir()] == ["a"]  # whole or none
     path.write_text("")
     with pytest.raises(InputError, match="cannot be read as a table"):
-        list(_reader().read(tmp_path))
+        list(log_reader().read(tmp_path))
     path.write_text(lines[0] + "\n")
     with pytest.raises(InputError, match="has no rows"):
-        list(_reader().read(tmp_path))
+        list(log_reader().read(tmp_path))
     with pytest.raises(InputError, match="no such file or folder"):
-        list(_reader().read(tmp_path / "b"))
+        list(log_reader().read(tmp_path / "b"))
 
 
 def test_drives_are_split_at_gaps(tmp_path, tables):
@@ -232,10 +232,10 @@ def test_drives_are_split_at_gaps(tmp_path, tables):
     _plain(tmp_path / "logs" / "a", {**tables, "imu": holes})
     _plain(tmp_path / "logs" / "b", tables)
     with pytest.raises(InputError, match=r"drive a.*IMU gap of 1\.5.*split_gaps=true"):
-        ingest_drives(_reader().read(tmp_path / "logs"), tmp_path / "out")
+        ingest_drives(log_reader().read(tmp_path / "logs"), tmp_path / "out")
     seen = []
     count = ingest_drives(
-        _reader().read(tmp_path / "logs"),
+        log_reader().read(tmp_path / "logs"),
         tmp_path / "out",
         Intake(split_gaps=True),
         progress=lambda taken, done: seen.extend(row["drive"] for row in taken.rows),

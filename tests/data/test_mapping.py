@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import pandas as pd
 import pymap3d
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dlkf.data.readers.logs import LogReader
 from dlkf.data.readers.mapping import respaced
 from dlkf.data.readers.units import degrees_minutes, leap_seconds, rotation, seconds, unwrapped
 from dlkf.errors import InputError
 from tests.cars import car
 from tests.data.logs import metres
 from tests.data.logs.clock import GPS, UNIX
-from tests.data.test_csv import PLAIN
+from tests.data.test_csv import PLAIN, log_reader
 
 
 @pytest.fixture(scope="module")
@@ -31,14 +28,7 @@ def read(folder, tables, **changes):
     for kind in ("imu", "gnss"):
         if not (folder / f"{kind}.csv").exists():
             tables[kind].to_csv(folder / f"{kind}.csv", index=False)
-    spec = copy.deepcopy(PLAIN)
-    for path, value in changes.items():
-        *nodes, last = path.split("__")
-        node = spec
-        for name in nodes:
-            node = node.setdefault(name, {})
-        node[last] = value
-    (drive,) = LogReader(spec.pop("imu"), spec.pop("gnss"), spec.pop("reference", None), **spec).read(folder)
+    (drive,) = log_reader(**changes).read(folder)
     return drive
 
 

@@ -3,6 +3,9 @@
 import math
 
 import numpy as np
+import pandas as pd
+import pymap3d
+from pyins.strapdown import Integrator
 
 OMEGA, A, E2, GM = 7.292115e-5, 6378137.0, 6.69437999014e-3, 3.986004418e14
 
@@ -18,9 +21,7 @@ def gravity(lat, height):
 def ecef(lat, lon, height):
     radius = A / math.sqrt(1 - E2 * math.sin(lat) ** 2)
     flat = (radius + height) * math.cos(lat)
-    return np.array(
-        (flat * math.cos(lon), flat * math.sin(lon), ((1 - E2) * radius + height) * math.sin(lat))
-    )
+    return np.array((flat * math.cos(lon), flat * math.sin(lon), ((1 - E2) * radius + height) * math.sin(lat)))
 
 
 def axes(lat, lon):
@@ -84,3 +85,42 @@ def strapdown(truth, imu, rate):
         v = v + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         C = end
     return r, v, C
+
+
+def apart(truth, r, v, C):
+    """How far an ECEF state is from the end of a truth: m, m/s, and the norm of the difference of the attitudes."""
+    C_en = axes(truth.lat[-1], truth.lon[-1])
+    there = ecef(truth.lat[-1], truth.lon[-1], truth.height[-1])
+    return tuple(np.linalg.norm(x) for x in (r - there, v - C_en @ truth.v_n[-1], C - C_en @ attitude(*truth.rpy[-1])))
+
+
+def apart_of_python_ins(truth, imu, rate):
+    """The same of pyins' integration of IMU samples from the truth's start."""
+    theta = imu[:, 3:] / rate
+    turned = np.cross(theta, imu[:, :3])
+    dv = (imu[:, :3] + turned / 2 + np.cross(theta, turned) / 6) / rate
+    increments = pd.DataFrame(
+        np.hstack((np.full((len(imu), 1), 1 / rate), theta, dv)),
+        columns=["dt", "theta_x", "theta_y", "theta_z", "dv_x", "dv_y", "dv_z"],
+        index=truth.t[1:],
+    )
+    where = (*np.degrees((truth.lat[0], truth.lon[0])), truth.height[0])
+    start = pd.Series(
+        [*where, *truth.v_n[0], *np.degrees(truth.rpy[0])],
+        index=["lat", "lon", "alt", "VN", "VE", "VD", "roll", "pitch", "heading"],
+        name=truth.t[0],
+    )
+    end = Integrator(start).integrate(increments).iloc[-1]
+    lat, lon = math.radians(end.lat), math.radians(end.lon)
+    C_nb = attitude(*np.radians(end[["roll", "pitch", "heading"]].astype(float)))
+    C_en = axes(lat, lon)
+    return apart(truth, ecef(lat, lon, end.alt), C_en @ end[["VN", "VE", "VD"]].to_numpy(float), C_en @ C_nb)
+
+
+def positions_and_integral(truth, rate):
+    """ECEF positions (pymap3d) at every second row, and Simpson's rule over the ECEF velocities up to there."""
+    r_e = np.stack(pymap3d.geodetic2ecef(truth.lat, truth.lon, truth.height, deg=False), -1)
+    north, east, down = truth.v_n.T
+    v_e = np.stack(pymap3d.enu2uvw(east, north, -down, truth.lat, truth.lon, deg=False), -1)
+    moved = (v_e[:-2:2] + 4 * v_e[1:-1:2] + v_e[2::2]).cumsum(0) / (3 * rate)
+    return r_e[2::2], r_e[0] + moved

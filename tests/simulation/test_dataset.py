@@ -98,9 +98,7 @@ CAR = {"sideslip": 0.0075, "imu_arm": [-0.32, 0.0, -0.6], "roughness": 64e-6, "v
 
 def test_velocity_across_the_car_is_told_and_zero_for_a_point(tmp_path):
     point = pd.read_parquet(drives_in(config(), tmp_path / "point") / "drives.parquet")
-    car = pd.read_parquet(
-        drives_in(config(chassis=CAR), tmp_path / "car") / "drives.parquet"
-    )
+    car = pd.read_parquet(drives_in(config(chassis=CAR), tmp_path / "car") / "drives.parquet")
     for column in ("lateral_axle_mps", "lateral_imu_mps", "down_imu_mps"):
         assert point[column].max() < 1e-12
         assert car[column].max() > 0.01

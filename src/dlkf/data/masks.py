@@ -10,18 +10,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dlkf.data.drive import Batch
-from dlkf.settings import check_from_zero
+from dlkf.settings import Ranged
 
 
 @dataclass(frozen=True)
-class BiasLaw:
+class BiasLaw(Ranged, where="injected_bias", least=0):
     """1σ of a constant that is added to the IMU of every piece, per axis [m/s², °/s]."""
 
     accel_mps2: float = 0.05
     gyro_dps: float = 0.15
-
-    def __post_init__(self) -> None:
-        check_from_zero(self, "injected_bias.")
 
     @property
     def std(self) -> Float[Tensor, " 6"]:
@@ -30,14 +27,11 @@ class BiasLaw:
 
 
 @dataclass(frozen=True)
-class Outage:
+class Outage(Ranged, where="outage", least=0):
     """One stretch without GNSS in every piece, seconds from its start."""
 
     first_s: float
     duration_s: float
-
-    def __post_init__(self) -> None:
-        check_from_zero(self, "outage.")
 
 
 def withhold(batch: Batch, hidden: Bool[Tensor, "b t"]) -> Batch:

@@ -18,7 +18,7 @@ from dlkf.data.stack import DriveStack, stacked
 from dlkf.errors import InputError
 from dlkf.navigation.earth import TangentFrame, tangent_frame
 from dlkf.navigation.state import NavState
-from dlkf.settings import check_from_zero
+from dlkf.settings import Ranged
 
 REST = (0.0, 0.0, -9.8, 0.0, 0.0, 0.0)  # IMU in the padding after a piece's end
 
@@ -32,7 +32,7 @@ class Piece(NamedTuple):
 
 
 @dataclass(frozen=True)
-class StartLaw:
+class StartLaw(Ranged, where="start", least=0):
     """1σ of the initial error that every filter gets, truth ⊖ start ~ N(0, Σ₀) (paper.md 4.5).
 
     All zero starts from the exact truth.
@@ -42,9 +42,6 @@ class StartLaw:
     velocity_mps: float = 0.1
     roll_pitch_deg: float = 1.0
     yaw_deg: float = 2.0
-
-    def __post_init__(self) -> None:
-        check_from_zero(self, "start.")
 
     @property
     def std(self) -> Float[Tensor, " 9"]:

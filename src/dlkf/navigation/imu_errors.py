@@ -17,7 +17,7 @@ from typing import Any
 
 from dlkf.errors import InputError
 from dlkf.ranges import middle
-from dlkf.settings import check_from_zero, is_number, settings_from
+from dlkf.settings import Ranged, is_number, settings_from, within
 
 DEG = math.pi / 180
 MILLIGAL = 1e-5  # m/s²
@@ -25,7 +25,7 @@ NEEDED = ("noise_density", "turn_on_bias", "instability", "correlation_time", "s
 
 
 @dataclass(frozen=True)
-class SensorErrors:
+class SensorErrors(Ranged, where="IMU preset", least=0):
     """One sigma of every error of a triad (accelerometers in m/s², gyroscopes in rad/s).
 
     ``noise_density`` √S of the white noise [unit/√Hz]; ``turn_on_bias`` [unit]; ``instability`` σ of the
@@ -41,7 +41,7 @@ class SensorErrors:
     noise_density: float = 0.0
     turn_on_bias: float = 0.0
     instability: float = 0.0
-    correlation_time: float = 3600.0
+    correlation_time: float = within(3600.0, 1e-9, math.inf)
     scale_factor: float = 0.0
     misalignment: float = 0.0
     random_walk: float = 0.0
@@ -55,9 +55,7 @@ class SensorErrors:
     unevenness: float = 0.0
 
     def __post_init__(self) -> None:
-        check_from_zero(self, "IMU preset: ")
-        if self.correlation_time <= 0:
-            raise InputError("IMU preset: correlation_time is 0, must be positive seconds")
+        super().__post_init__()
         for name in ("warm_up", "wander"):
             if getattr(self, name) > 0 and getattr(self, f"{name}_time") <= 0:
                 raise InputError(f"IMU preset: {name}_time is 0, must be positive seconds")

@@ -76,9 +76,7 @@ class DatasetConfig:
         if not 0.005 <= self.hours <= 1e5:
             raise InputError(f"dataset: hours {self.hours} is outside 0.005 (18 s) to 100000")
         if not 0.25 <= self.drive_minutes <= LONGEST_DRIVE:
-            raise InputError(
-                f"dataset: drive_minutes {self.drive_minutes} is outside 0.25 to {LONGEST_DRIVE:g}"
-            )
+            raise InputError(f"dataset: drive_minutes {self.drive_minutes} is outside 0.25 to {LONGEST_DRIVE:g}")
         for name in ("imu_rate_hz", "reference_rate_hz"):
             rate = getattr(self, name)
             if rate != round(rate) or not 1 <= rate <= 2000:
@@ -89,9 +87,7 @@ class DatasetConfig:
         for name, rate in rates.items():
             samples = self.imu_rate_hz / rate if rate > 0 else 0.0
             if samples < 1 or abs(samples - round(samples)) > 1e-9:
-                raise InputError(
-                    f"dataset: imu_rate_hz {self.imu_rate_hz} is not a multiple of {name} {rate}"
-                )
+                raise InputError(f"dataset: imu_rate_hz {self.imu_rate_hz} is not a multiple of {name} {rate}")
         if self.imu_parts != round(self.imu_parts) or not 0 <= self.imu_parts <= 16:
             raise InputError(f"dataset: imu_parts {self.imu_parts} must be a whole number from 0 to 16")
         if self.imu_errors not in ("one", "per_drive", "fleet", "wide"):
@@ -230,9 +226,7 @@ def drive_of(made_by: Recipe, index: int, seconds: int) -> tuple[DriveTables, di
         made_by.seed, spawn_key=(1, index)
     ).spawn(8)
     config, spec, kind, unit = drawn(made_by, unit_seed, type_seed, ranges_seed)
-    rates = Rates(
-        int(config.imu_rate_hz), config.gnss.rate_hz, int(config.reference_rate_hz), int(config.imu_parts)
-    )
+    rates = Rates(int(config.imu_rate_hz), config.gnss.rate_hz, int(config.reference_rate_hz), int(config.imu_parts))
     tables = simulate_drive(
         Seeds(motion, imu, gnss, surroundings, chassis), seconds, rates,
         config.vehicle, config.chassis, config.surroundings, kind, unit, config.gnss, config.receiver,
@@ -257,9 +251,7 @@ def drive_of(made_by: Recipe, index: int, seconds: int) -> tuple[DriveTables, di
     return tables, row
 
 
-def _write_drives(
-    made_by: Recipe, folder: Path, workers: int, parallel: int | str | None, progress: bool
-) -> None:
+def _write_drives(made_by: Recipe, folder: Path, workers: int, parallel: int | str | None, progress: bool) -> None:
     config = made_by.dataset
     jobs = list(enumerate(config.durations))
     written = each(partial(_written, made_by, absolute(folder)), jobs, parallel, threads=workers)

@@ -133,9 +133,7 @@ def gnss_of_reference(
     v_n = (C_ne @ v_e[..., None])[..., 0].numpy()
     rpy = rpy_from_rotation(C_ne @ C_eb).numpy()
     if np.isnan(rpy).any() and any(gnss.lever_arm_b):
-        raise InputError(
-            f"drive {name}: its reference has no attitude, which gnss.lever_arm_b needs; give [0, 0, 0]"
-        )
+        raise InputError(f"drive {name}: its reference has no attitude, which gnss.lever_arm_b needs; give [0, 0, 0]")
     course = np.unwrap(np.arctan2(v_n[:, 1], v_n[:, 0]))
     rpy = np.where(np.isnan(rpy).any(-1, keepdims=True), np.stack((0 * course, 0 * course, course), -1), rpy)
     truth = Truth(t, lat.numpy(), lon.numpy(), height.numpy(), v_n, rpy)

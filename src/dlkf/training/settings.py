@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from lightning.pytorch.callbacks import Callback
 
@@ -14,58 +14,45 @@ from dlkf.errors import InputError
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.saved import LearnedSettings, learned_settings
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.settings import check_limits
+from dlkf.settings import Ranged, within
 from dlkf.training.loss import Loss, loss_of
 
 MANY = 10**9
-STRATEGIES = ("auto", "ddp")
 
 
 @dataclass(frozen=True)
-class OptimizerSettings:
+class OptimizerSettings(Ranged, where="optimizer", least=0, greatest=1e3):
     """AdamW; the output layers learn at ``head_lr_factor`` times the rate."""
 
     lr: float
     head_lr_factor: float
     weight_decay: float
 
-    def __post_init__(self) -> None:
-        check_limits(self, "optimizer", {"lr": (0, 1e3), "head_lr_factor": (0, 1e3), "weight_decay": (0, 1e3)})
-
 
 @dataclass(frozen=True)
-class SchedulerSettings:
+class SchedulerSettings(Ranged, where="scheduler"):
     """Cosine annealing with warm restarts (R073), in epochs."""
 
-    restart_epochs: int
-    restart_factor: int
-    lr_min: float
+    restart_epochs: int = within(100, 1, MANY)
+    restart_factor: int = within(1, 1, 1000)
+    lr_min: float = within(1e-5, 0, 1e3)
 
-    def __post_init__(self) -> None:
-        limits = {"restart_epochs": (1, MANY), "restart_factor": (1, 1e3), "lr_min": (0, 1e3)}
-        check_limits(self, "scheduler", limits)
 
 
 @dataclass(frozen=True)
-class TrainerSettings:
+class TrainerSettings(Ranged, where="trainer"):
     """Epochs, validation and checkpoints, as the comments of ``conf/train.yaml`` say."""
 
-    max_epochs: int
-    gradient_clip: float | None
-    validate_every: int
-    checkpoint_every: int
-    monitor: str | None
-    best_from_epoch: int
-    threads: int | None
-    accelerator: str
-    devices: int
-    strategy: str
-
-    def __post_init__(self) -> None:
-        limits = {name: (1, MANY) for name in ("max_epochs", "validate_every", "checkpoint_every", "devices")}
-        check_limits(self, "trainer", {**limits, "best_from_epoch": (0, MANY)})
-        if self.strategy not in STRATEGIES:
-            raise InputError(f"trainer.strategy is {self.strategy!r}; choose one of {', '.join(STRATEGIES)}")
+    max_epochs: int = within(500, 1, MANY)
+    gradient_clip: float | None = 1.0
+    validate_every: int = within(5, 1, MANY)
+    checkpoint_every: int = within(1, 1, MANY)
+    monitor: str | None = None
+    best_from_epoch: int = within(0, 0, MANY)
+    threads: int | None = within(1, 1, MANY)
+    accelerator: str = "auto"
+    devices: int = within(1, 1, MANY)
+    strategy: Literal["auto", "ddp"] = "auto"
 
 
 @dataclass(frozen=True)

@@ -16,21 +16,18 @@ from dlkf.data.discovery.motion import MOVING, Floats, Motion, motion, position_
 from dlkf.data.discovery.orientation import Pose
 from dlkf.data.discovery.units import accel_units, nearest_unit
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
-from dlkf.settings import check_limits
+from dlkf.settings import Ranged
 
 LEAST_EXPLAINED, AGREE = 0.8, (0.8, 1.25)
 FARTHEST_DOWN = math.radians(6.0)
 
 
 @dataclass(frozen=True)
-class Sure:
+class Sure(Ranged, where="reader.sure", least=0, greatest=1e6):
     """What is sure enough: 2.5σ of the pose [deg] and of the clock offset [s] lie below."""
 
     angle_deg: float = 2.0
     time_s: float = 0.025
-
-    def __post_init__(self) -> None:
-        check_limits(self, "reader.sure", {"angle_deg": (0, 1e6), "time_s": (0, 1e6)})
 
 
 @dataclass(frozen=True)

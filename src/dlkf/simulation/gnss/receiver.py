@@ -8,25 +8,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from dlkf.errors import InputError
-from dlkf.settings import settings_from
+from dlkf.settings import Ranged, settings_from, within
 
 Array = NDArray[np.floating]
 LOWEST = math.radians(3.0)  # mappings and noise grow without bound towards the horizon
 EARTH_RADIUS, IONOSPHERE = 6378.1363e3, 350e3  # m, radius and height of the thin shell (RTCA DO-229 A.4.4.10.4)
 QUALITIES = (1, 2, 4, 5)
-POSITIVE = ("std_range", "std_range_rate", "multipath_s", "orbit_s", "atmosphere_s", "ambiguity_s", "max_pdop")
 WHITE = "white"  # the receiver of a dataset without satellites
 
 
 @dataclass(frozen=True)
-class Receiver:
+class Receiver(Ranged, where="receiver", least=0, greatest=1e6):
     """1σ of the errors of one receiver, as a preset of ``conf/receiver/`` gives them; 0 switches an error off.
 
     White: ``std_range`` [m] and ``std_range_rate`` [m/s] towards the zenith, growing downwards (:func:`growth`).
@@ -41,37 +40,29 @@ class Receiver:
 
     name: str
     quality: int = 1
-    mask_deg: float = 10.0
-    std_range: float = 0.3
-    std_range_rate: float = 0.05
+    mask_deg: float = within(10.0, 0, 59.99)
+    std_range: float = within(0.3, 1e-6, 1e6)
+    std_range_rate: float = within(0.05, 1e-6, 1e6)
     multipath: float = 0.0
-    multipath_s: float = 20.0
+    multipath_s: float = within(20.0, 1e-6, 1e6)
     orbit: float = 0.0
-    orbit_s: float = 7200.0
+    orbit_s: float = within(7200.0, 1e-6, 1e6)
     iono: float = 0.0
     tropo: float = 0.0
-    atmosphere_s: float = 1800.0
+    atmosphere_s: float = within(1800.0, 1e-6, 1e6)
     ambiguity: float = 0.0
-    ambiguity_s: float = 30.0
+    ambiguity_s: float = within(30.0, 1e-6, 1e6)
     refix_s: float = 10.0
     reacquire_s: float = 0.0
-    max_pdop: float = 20.0
+    max_pdop: float = within(20.0, 1e-6, 1e6)
     clock_phase: float = 0.01
     clock_frequency: float = 0.04
     almanac: str = ""
 
     def __post_init__(self) -> None:
-        where = f"receiver {self.name}"
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if f.name not in ("name", "almanac") and not 0 <= value < 1e6:
-                raise InputError(f"{where}: {f.name} {value} is outside 0 to 1e6")
-            if f.name in POSITIVE and value == 0:
-                raise InputError(f"{where}: {f.name} is 0, must be positive")
+        super().__post_init__()
         if self.quality not in QUALITIES:
-            raise InputError(f"{where}: quality {self.quality} is none of {QUALITIES} (NMEA GGA codes)")
-        if self.mask_deg >= 60:
-            raise InputError(f"{where}: mask_deg {self.mask_deg:g} is not below 60")
+            raise InputError(f"receiver {self.name}: quality {self.quality} is none of {QUALITIES} (NMEA GGA codes)")
 
 
 def receiver_spec(config: Mapping | None) -> Receiver | None:

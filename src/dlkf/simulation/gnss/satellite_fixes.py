@@ -91,9 +91,7 @@ def observe_satellites(
     offset, drift = clock(rng, receiver, rows, dt)
     geometric = seen.distance + errors.range + offset[:, None]
     rate = seen.distance_rate + errors.rate + drift[:, None]
-    observed = Observations(
-        seen.satellite, geometric, rate, used, errors.variance, errors.rate_variance, errors.common
-    )
+    observed = Observations(seen.satellite, geometric, rate, used, errors.variance, errors.rate_variance, errors.common)
     solution = solve(observed)
     added = rng.standard_normal((rows, 6)) * np.repeat((config.s_p, config.s_v), 3)
     fix = solution.solved & (solution.dop.pdop <= receiver.max_pdop)

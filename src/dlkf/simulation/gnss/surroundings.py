@@ -6,12 +6,13 @@ sampled at another rate has the same buildings.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlkf.errors import InputError
+from dlkf.settings import Ranged, within
 
 Array = NDArray[np.floating]
 
@@ -31,7 +32,7 @@ class Sky:
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class Surroundings(Ranged, where="surroundings", least=0, greatest=1e6):
     """Statistics of what stands along a road; the defaults are open country.
 
     A side of the road is a row of fronts, ``front_length`` [m] long on average (exponential): with
@@ -42,21 +43,14 @@ class Surroundings:
     """
 
     building_height: float = 0.0
-    building_distance: float = 15.0
-    front_length: float = 25.0
-    built_share: float = 0.8
+    building_distance: float = within(15.0, 1, 1e6)
+    front_length: float = within(25.0, 1, 1e6)
+    built_share: float = within(0.8, 0, 1)
     tunnel_length: float = 0.0
-    tunnel_spacing: float = 1000.0
+    tunnel_spacing: float = within(1000.0, 1, 1e6)
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            if not 0 <= getattr(self, f.name) < 1e6:
-                raise InputError(f"surroundings: {f.name} {getattr(self, f.name)} is outside 0 to 1e6")
-        for name in ("building_distance", "front_length", "tunnel_spacing"):
-            if getattr(self, name) < 1:
-                raise InputError(f"surroundings: {name} {getattr(self, name)} m is below 1 m")
-        if self.built_share > 1:
-            raise InputError(f"surroundings: built_share {self.built_share} is above 1")
+        super().__post_init__()
         if 0 < self.tunnel_length < 5:
             raise InputError(f"surroundings: tunnel_length {self.tunnel_length} m is below 5 m (0 is none)")
 

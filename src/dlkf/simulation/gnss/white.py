@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dlkf.errors import InputError
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.earth import EARTH_RATE
-from dlkf.settings import check_limits
+from dlkf.settings import Ranged, within
 from dlkf.simulation.gnss.receiver import gauss_markov
 from dlkf.simulation.gnss.surroundings import Sky
 from dlkf.simulation.motion.vehicle import Truth, radii_of_curvature
@@ -25,7 +25,7 @@ AXES = np.array((1.0, 1.0, 1.5))  # of errors that last, north, east, down
 
 
 @dataclass(frozen=True)
-class GnssConfig:
+class GnssConfig(Ranged, where="gnss"):
     """One receiver: fix rate, 1σ per axis, and the scale factors s_p, s_v of added noise (paper eqs 12, 13).
 
     Std of a fix is √(σ² + s²), and is what the fix claims. ``quality`` is an NMEA GGA code;
@@ -40,36 +40,26 @@ class GnssConfig:
     """
 
     rate_hz: float = 1.0
-    std_horizontal: float = 0.02  # m
-    std_vertical: float = 0.02  # m
-    std_velocity: float = 0.02  # m/s
-    s_p: float = 0.0  # m
-    s_v: float = 0.0  # m/s
+    std_horizontal: float = within(0.02, 1e-9, 1e4)  # m
+    std_vertical: float = within(0.02, 1e-9, 1e4)  # m
+    std_velocity: float = within(0.02, 1e-9, 1e4)  # m/s
+    s_p: float = within(0.0, 0, 1e4)  # m
+    s_v: float = within(0.0, 0, 1e4)  # m/s
     quality: int = 4
     lever_arm_b: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    position_lag_s: float = 0.0
-    velocity_lag_s: float = 0.0
-    std_factor: float = 1.0
-    dropout_share: float = 0.0
-    dropout_s: float = 3.0
-    wander: float = 0.0
-    wander_s: float = 30.0
-    float_share: float = 0.0
-    float_s: float = 30.0
-    float_std: float = 0.3
+    position_lag_s: float = within(0.0, 0, 1)
+    velocity_lag_s: float = within(0.0, 0, 1)
+    std_factor: float = within(1.0, 0.05, 20)
+    dropout_share: float = within(0.0, 0, 0.9)
+    dropout_s: float = within(3.0, 0.1, 600)
+    wander: float = within(0.0, 0, 100)
+    wander_s: float = within(30.0, 0.1, 1e4)
+    float_share: float = within(0.0, 0, 1)
+    float_s: float = within(30.0, 1, 1e4)
+    float_std: float = within(0.3, 0, 100)
 
     def __post_init__(self) -> None:
-        for name in ("std_horizontal", "std_vertical", "std_velocity"):
-            if not 0 < getattr(self, name) < 1e4:
-                raise InputError(f"gnss: {name} {getattr(self, name)} must be positive")
-        if not (0 <= self.s_p < 1e4 and 0 <= self.s_v < 1e4):
-            raise InputError(f"gnss: s_p {self.s_p} and s_v {self.s_v} must not be negative")
-        limits = {
-            "position_lag_s": (0, 1), "velocity_lag_s": (0, 1), "std_factor": (0.05, 20), "dropout_share": (0, 0.9),
-            "dropout_s": (0.1, 600), "wander": (0, 100), "wander_s": (0.1, 1e4), "float_share": (0, 1),
-            "float_s": (1, 1e4), "float_std": (0, 100),
-        }  # fmt: skip
-        check_limits(self, "gnss", limits)
+        super().__post_init__()
         if self.quality not in QUALITIES:
             raise InputError(f"gnss: quality {self.quality} is none of {QUALITIES} (NMEA GGA codes)")
         if len(self.lever_arm_b) != 3 or not all(math.isfinite(x) and abs(x) < 100 for x in self.lever_arm_b):
@@ -122,9 +112,7 @@ def _wandering(
     return error, is_float
 
 
-def episodes(
-    rng: np.random.Generator, t: NDArray[np.floating], share: float, mean_s: float
-) -> NDArray[np.bool_]:
+def episodes(rng: np.random.Generator, t: NDArray[np.floating], share: float, mean_s: float) -> NDArray[np.bool_]:
     """Times (N,) that lie within random episodes of a mean length [s], exponential, which make a share of the time."""
     if share >= 1:
         return np.ones(len(t), dtype=bool)
@@ -135,6 +123,7 @@ def episodes(
     spans = rng.exponential((mean_s, between) if starts_in else (between, mean_s), (count, 2)).ravel()
     odd = np.searchsorted(np.cumsum(spans), t - (t[0] if len(t) else 0.0), side="right") % 2 == 1
     return odd != starts_in
+
 
 def antenna(
     truth: Truth, rate_b: NDArray[np.floating], lever_arm_b: tuple[float, float, float]

@@ -23,7 +23,7 @@ from scipy.signal import bilinear, lfilter, lfilter_zi
 
 from dlkf.errors import InputError
 from dlkf.navigation.attitude import rotation_from_rpy, rpy_from_rotation
-from dlkf.settings import check_limits
+from dlkf.settings import Ranged, within
 from dlkf.simulation.motion.routes import Kinematics
 from dlkf.simulation.motion.shaking import Shaking, shaken
 from dlkf.simulation.motion.vehicle import Route, Truth, Waves, radians_per_metre, random_waves
@@ -43,7 +43,7 @@ SHAPE = (  # of what moves, if anything does
 
 
 @dataclass(frozen=True)
-class ChassisConfig:
+class ChassisConfig(Ranged, where="chassis"):
     """A kind of car; the defaults are a point on the rear axle that slides along the road.
 
     ``sideslip`` K: the rear axle's slip angle per lateral acceleration [s²/m], so that on a level road its
@@ -62,39 +62,30 @@ class ChassisConfig:
     of slip and suspension.
     """
 
-    sideslip: float = 0.0
-    slip_noise: float = 0.0
-    roll_gradient: float = 0.0
-    pitch_gradient: float = 0.0
-    roughness: float = 0.0
-    vibration: float = 0.0
-    vibration_rate: float = 0.0
+    sideslip: float = within(0.0, 0, 0.05)
+    slip_noise: float = within(0.0, 0, 0.05)
+    roll_gradient: float = within(0.0, 0, 0.05)
+    pitch_gradient: float = within(0.0, 0, 0.05)
+    roughness: float = within(0.0, 0, 0.01)
+    vibration: float = within(0.0, 0, 20.0)
+    vibration_rate: float = within(0.0, 0, 0.5)
     imu_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    imu_arm_std: float = 0.0
+    imu_arm_std: float = within(0.0, 0, 2.0)
     mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    mounting_std_deg: float = 0.0
-    spread: float = 0.0
-    body_hz: float = 1.4
-    body_damping: float = 0.35
-    wheel_hz: float = 12.0
-    wheel_damping: float = 0.5
-    wheelbase: float = 2.7
-    track: float = 1.55
-    roughness_spread: float = 0.0
-    roughness_length: float = 300.0
+    mounting_std_deg: float = within(0.0, 0, 10.0)
+    spread: float = within(0.0, 0, 0.5)
+    body_hz: float = within(1.4, 0.5, 5)
+    body_damping: float = within(0.35, 0.05, 1)
+    wheel_hz: float = within(12.0, 5, 25)
+    wheel_damping: float = within(0.5, 0.05, 1)
+    wheelbase: float = within(2.7, 1, 8)
+    track: float = within(1.55, 0.5, 3)
+    roughness_spread: float = within(0.0, 0, 2.0)
+    roughness_length: float = within(300.0, 2, 100000.0)
     shaking: Shaking = field(default_factory=Shaking)
 
     def __post_init__(self) -> None:
-        limits = {
-            "sideslip": 0.05, "slip_noise": 0.05, "roll_gradient": 0.05, "pitch_gradient": 0.05, "roughness": 1e-2,
-            "vibration": 20.0, "vibration_rate": 0.5, "imu_arm_std": 2.0, "mounting_std_deg": 10.0, "spread": 0.5,
-            "roughness_spread": 2.0,
-        }  # fmt: skip
-        ranges = {name: (0, limit) for name, limit in limits.items()} | {
-            "body_hz": (0.5, 5), "body_damping": (0.05, 1), "wheel_hz": (5, 25), "wheel_damping": (0.05, 1),
-            "wheelbase": (1, 8), "track": (0.5, 3), "roughness_length": (2, 1e5),
-        }  # fmt: skip
-        check_limits(self, "chassis", ranges)
+        super().__post_init__()
         for name, limit in (("imu_arm", 10.0), ("mounting_deg", 45.0)):
             value = getattr(self, name)
             if len(value) != 3 or not all(abs(x) <= limit for x in value):

@@ -221,9 +221,7 @@ def random_plan(rng: np.random.Generator, config: VehicleConfig, duration: float
     speed_at[np.abs(speed_at) < 1e-9] = 0.0  # a standstill is exactly still
     course = rng.uniform(-math.pi, math.pi) + np.cumsum(turned) - turned
     driven = speed_at * length + 0.5 * faster * length  # the window is symmetric
-    return Plan(
-        np.cumsum(length) - length, length, ramp, speed_at, faster, course, turned, np.cumsum(driven) - driven
-    )
+    return Plan(np.cumsum(length) - length, length, ramp, speed_at, faster, course, turned, np.cumsum(driven) - driven)
 
 
 def along(plan: Plan, t: Array) -> Kinematics:

@@ -19,7 +19,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 from scipy.signal import bilinear, freqz, lfilter
 
 from dlkf.errors import InputError
-from dlkf.settings import check_limits
+from dlkf.settings import Ranged, within
 from dlkf.simulation.motion.routes import Kinematics
 
 Array = NDArray[np.floating]
@@ -36,7 +36,7 @@ NOISE_TURN_HZ = 15.0  # frequency at which noise turns the mount by ``turning``
 
 
 @dataclass(frozen=True)
-class Shaking:
+class Shaking(Ranged, where="shaking"):
     """Sizes are RMS per axis on average [m/s²] before the mount amplifies them, to ``LIMIT`` at most; 0 switches off.
 
     ``loudness``: share of all sizes but ``sway`` that a car lets through, 0 for none.
@@ -55,42 +55,34 @@ class Shaking:
     at ``sway_hz`` with ``sway_damping``.
     """
 
-    loudness: float = 1.0
-    engine: float = 0.0
-    idle_hz: float = 25.0
-    idling: float = 1.0
-    gears: int = 6
-    first_gear: float = 9.0
-    gear_step: float = 0.7
-    shift_hz: float = 80.0
-    wheel: float = 0.0
-    wheel_turns: float = 0.51
-    hum: float = 0.0
-    hum_hz: float = 24.0
-    hum_share: float = 0.5
-    wander: float = 0.0
-    rumble: float = 0.0
-    bursts: float = 0.0
-    rattle: float = 0.0
-    rattle_per_minute: float = 30.0
-    rattle_hz: float = 30.0
-    mount_hz: float = 0.0
-    mount_damping: float = 0.1
-    turning: float = 0.01
-    sway: float = 0.0
-    sway_hz: float = 3.0
-    sway_damping: float = 0.2
+    loudness: float = within(1.0, 0, 1)
+    engine: float = within(0.0, 0, 20)
+    idle_hz: float = within(25.0, 5, 60)
+    idling: float = within(1.0, 0, 5)
+    gears: int = within(6, 0, 12)
+    first_gear: float = within(9.0, 0.5, 40)
+    gear_step: float = within(0.7, 0.4, 0.95)
+    shift_hz: float = within(80.0, 30, 300)
+    wheel: float = within(0.0, 0, 20)
+    wheel_turns: float = within(0.51, 0.2, 1)
+    hum: float = within(0.0, 0, 20)
+    hum_hz: float = within(24.0, 5, 400)
+    hum_share: float = within(0.5, 0, 1)
+    wander: float = within(0.0, 0, 0.2)
+    rumble: float = within(0.0, 0, 20)
+    bursts: float = within(0.0, 0, 1.5)
+    rattle: float = within(0.0, 0, 100)
+    rattle_per_minute: float = within(30.0, 0, 600)
+    rattle_hz: float = within(30.0, 5, 80)
+    mount_hz: float = within(0.0, 0, 80)
+    mount_damping: float = within(0.1, 0.02, 2)
+    turning: float = within(0.01, 0, 1)
+    sway: float = within(0.0, 0, 0.1)
+    sway_hz: float = within(3.0, 0.5, 20)
+    sway_damping: float = within(0.2, 0.02, 2)
 
     def __post_init__(self) -> None:
-        limits = {
-            "loudness": (0, 1), "engine": (0, 20), "idle_hz": (5, 60), "idling": (0, 5), "gears": (0, 12),
-            "first_gear": (0.5, 40), "gear_step": (0.4, 0.95), "shift_hz": (30, 300), "wheel": (0, 20),
-            "wheel_turns": (0.2, 1), "hum": (0, 20), "hum_hz": (5, 400), "hum_share": (0, 1), "wander": (0, 0.2),
-            "rumble": (0, 20), "bursts": (0, 1.5), "rattle": (0, 100), "rattle_per_minute": (0, 600),
-            "rattle_hz": (5, 80), "mount_hz": (0, 80), "mount_damping": (0.02, 2), "turning": (0, 1),
-            "sway": (0, 0.1), "sway_hz": (0.5, 20), "sway_damping": (0.02, 2),
-        }  # fmt: skip
-        check_limits(self, "shaking", limits)
+        super().__post_init__()
         if 0 < self.mount_hz < 3:
             raise InputError(f"shaking: mount_hz {self.mount_hz} is outside 3 to 80 (0 is rigid)")
         if self.gears != round(self.gears):
@@ -218,9 +210,7 @@ def _add_tones(
         )  # fmt: skip
 
 
-def _add_wheels(
-    rng: np.random.Generator, kind: Shaking, out: Shaken, motion: Kinematics, coarse: Kinematics
-) -> None:
+def _add_wheels(rng: np.random.Generator, kind: Shaking, out: Shaken, motion: Kinematics, coarse: Kinematics) -> None:
     """An unbalanced mass: its displacement is the same at any speed, but for what the mount does to it."""
     per_metre = 2 * math.pi * kind.wheel_turns
     for order, share in WHEEL_ORDERS:
@@ -298,9 +288,7 @@ def gain(kind: Shaking, f: Array) -> Array:
     return np.sqrt((1 + (2 * z * r) ** 2) / ((1 - r**2) ** 2 + (2 * z * r) ** 2))
 
 
-def sway(
-    rng: np.random.Generator, kind: Shaking, end: float, load: Callable[[Array], tuple[Array, Array]]
-) -> BSpline:
+def sway(rng: np.random.Generator, kind: Shaking, end: float, load: Callable[[Array], tuple[Array, Array]]) -> BSpline:
     """Roll, pitch, yaw [rad] by which the mount swings out: ω²/(s² + 2ζωs + ω²) of what the load asks for.
 
     How it hangs is drawn: the share of each angle.
@@ -333,4 +321,3 @@ def _slow(rng: np.random.Generator, count: int, seconds: float) -> Array:
     first, steps = keep * rng.standard_normal(1), math.sqrt(1 - keep**2) * rng.standard_normal(count)
     drawn = lfilter([1.0], [1.0, -keep], steps, zi=first)[0]
     return _smoothed(np.clip(drawn, -2.5, 2.5), TONE_HZ / 2)
-
