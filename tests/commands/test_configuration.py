@@ -115,6 +115,14 @@ def test_it_composes_and_builds(primary, overrides):
         class_named(told.data["_target_"], "data._target_")
 
 
+def test_no_file_is_another_s_twin():
+    """What several presets share stands once, in one that they name in their defaults."""
+    told = {}
+    for file in CONF.rglob("*.yaml"):
+        kept = "\n".join(line for line in file.read_text().splitlines() if not line.startswith(("#", "name:")))
+        assert told.setdefault(kept, file) is file, f"{file} says what {told[kept]} says"
+
+
 @pytest.mark.parametrize("name", [*GROUPS, *(f"experiment/{name}" for name in presets("experiment"))])
 def test_it_opens_with_its_claim_and_command(name):
     text = (CONF / f"{name}.yaml").read_text()

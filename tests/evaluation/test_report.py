@@ -18,12 +18,12 @@ from dlkf.evaluation.figures import png
 from dlkf.evaluation.metrics import QUANTITIES
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.results import IMU_AXES, Results, summarise_scores
-from dlkf.evaluation.run import score
 from dlkf.evaluation.table import as_csv, as_json, as_markdown, number, ratio_table, slope_table, tables, with_interval
 from dlkf.files import staged
 from dlkf.filters.build import build_filter
 from dlkf.report.evaluation import write_report
 from tests.cars import IMU
+from tests.evaluation.scoring import score
 
 FILTERS = {name: build_filter(name, IMU) for name in ("ins", "mbkf15")}
 

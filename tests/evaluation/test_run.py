@@ -12,12 +12,12 @@ from dlkf.errors import InputError
 from dlkf.evaluation.bias_slope import injected_response
 from dlkf.evaluation.metrics import magnitudes, rms_over_pieces, slope
 from dlkf.evaluation.outages import OutagePlan
-from dlkf.evaluation.run import score
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Correction
 from dlkf.filters.model_based import Ins
 from dlkf.running.batched import chunks
 from tests.cars import IMU
+from tests.evaluation.scoring import score
 
 FILTERS = {name: build_filter(name, IMU) for name in ("ins", "mbkf15")}
 

@@ -11,9 +11,9 @@ from pipelines.studies import gain_trends
 
 from dlkf.evaluation.gains import gains_of, write_gains
 from dlkf.evaluation.results import summarise_scores
-from dlkf.evaluation.run import score
 from dlkf.evaluation.table import as_json
 from dlkf.filters.build import build_filter
+from tests.evaluation.scoring import score
 from tests.filters.scene import IMU, scene
 
 NOISE = {"set1": (0, 0), "set2": (1, 0), "set3": (5, 0), "set4": (0, 0.5), "set5": (0, 2), "set6": (2, 0.5)}

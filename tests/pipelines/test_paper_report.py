@@ -11,9 +11,9 @@ import torch
 
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.results import summarise_scores
-from dlkf.evaluation.run import score
 from dlkf.evaluation.table import as_json
 from dlkf.filters.build import build_filter
+from tests.evaluation.scoring import score
 from tests.filters.scene import IMU, scene
 
 SCRIPT = Path(__file__).parents[2] / "pipelines" / "paper_report.py"

@@ -21,6 +21,10 @@ MOST = {
     "tune": ("model", "dataset", "out", "objective", "outage.duration_s"),
     "allan": ("dataset", "name", "out", "drive", "from_s"),
     "consistency": ("model", "drives", "minutes", "outage.duration_s", "out"),
+    "export": ("model", "out", "dataset", "rate_hz", "latency"),
+    "doctor": ("dataset", "drives", "discover"),  # it has no more, as the next two
+    "compare": ("runs", "out", "overwrite"),
+    "register": ("run", "name", "alias", "tracking.uri"),
 }
 WIDTH = 118
 SILENT = ("hydra_output", "_self_")
@@ -44,9 +48,8 @@ def help_text(name: str, aliases: Mapping[str, str]) -> str:
         lines += [f"  +{folder}=…", *_wrapped(presets_of(folder))]
     if not groups_of(text):
         lines[-1] = "It has no presets."
-    most = MOST.get(name) or tuple(key for key, (value, _) in keys_of(text).items() if value == "???")[:5]
     lines += ["", "Keys that matter most (key=value):"]
-    for key in most:
+    for key in MOST[name]:
         value, says = described(text, key)
         lines.append(f"  {key}={'…' if value == '???' else value}" + (f"  {says}" if says else ""))
     more = "All keys with their values: --cfg job. Several values, one run each: -m key=a,b. Presets of your own: "

@@ -171,9 +171,7 @@ class DriveDataModule(L.LightningDataModule):
             )
         return pieces
 
-    def batches(
-        self, side: str, *, dtype: torch.dtype | None = None, share: tuple[int, int] = (0, 1)
-    ) -> list[Batch]:
+    def batches(self, side: str, *, share: tuple[int, int] = (0, 1)) -> list[Batch]:
         """The fixed batches of a side, with the same start errors for every filter and in every run.
 
         ``share`` = (k, n) takes every n-th piece from k on, in as many batches for every k.
@@ -184,7 +182,7 @@ class DriveDataModule(L.LightningDataModule):
         starts = range(0, len(pieces) - n + 1, n * self.batch_size)
         for first, last in zip(starts, [*starts[1:], len(pieces)]):
             part = pieces[first:last][k::n]
-            batch = make_batch(self.stack, part, dtype=dtype or self.dtype, start=self.start, seed=self.eval_seed)
+            batch = make_batch(self.stack, part, dtype=self.dtype, start=self.start, seed=self.eval_seed)
             if self.eval_outage is not None:
                 batch = withhold(batch, within(batch, self.eval_outage.first_s, self.eval_outage.duration_s))
             out.append(batch)

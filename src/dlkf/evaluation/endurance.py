@@ -17,14 +17,15 @@ from dlkf.data.drive import Drive
 from dlkf.data.segments import StartLaw, cut_pieces
 from dlkf.errors import InputError
 from dlkf.evaluation.bootstrap import Comparison, compare
-from dlkf.evaluation.metrics import magnitudes, outage_end, summary
+from dlkf.evaluation.metrics import magnitudes, mean_error, outage_end, summary
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Protocol, Scenes
 from dlkf.evaluation.run import score_scenes
 from dlkf.evaluation.table import Table, number, with_interval
 from dlkf.filters.smoother import Filter
 
-OUTAGE_S = 40.0
+OUTAGE_S, HOUR_S = 40.0, 3600.0
+MOST_PIECES = 100  # of a length, spread evenly
 REST_S = 5.0  # of a piece behind its outage
 MINUTES = ((1, 10), (10, 30), (30, 60))
 
@@ -47,20 +48,18 @@ def after_gnss(
     *,
     baseline: str,
     seed: int,
-    side: str = "test",
-    limit: int | None = 100,
 ) -> list[After]:
     """The same outage of 40 s after so many seconds with GNSS, over the test side's drives; a length that no drive
     has room for is left out."""
     out = []
     for first in seconds:
         length = first + OUTAGE_S + REST_S
-        pieces = cut_pieces(data.stack, length, span=data.spans[side])
+        pieces = cut_pieces(data.stack, length, span=data.spans["test"])
         if not pieces:
             continue
         plan = OutagePlan(float(first), OUTAGE_S, offsets_s=(0.0,))
         protocol = Protocol("pieces", length, length, data.start, outage=plan, seed=seed)
-        scenes = Scenes(data.stack, protocol, pieces=pieces, limit=limit)
+        scenes = Scenes(data.stack, protocol, pieces=pieces, limit=MOST_PIECES)
         scores = score_scenes(filters, scenes, groups={d.name: d.group for d in data.stack})
         w = scores.windows
         groups = [scores.pieces[i].group for i in w.piece]
@@ -72,7 +71,7 @@ def after_gnss(
             stats = summary(ends[name])
             rows[name] = {
                 "rms_m": stats["rms"],
-                "geometric_m": geometric(ends[name]),
+                "geometric_m": mean_error(ends[name][~np.isnan(ends[name])], "log"),
                 "heading_deg": math.degrees(summary(before)["rms"]),
             }
         ratios = {
@@ -84,24 +83,17 @@ def after_gnss(
     return out
 
 
-def geometric(x: np.ndarray) -> float:
-    """Geometric mean of errors [m]; NaN left out."""
-    x = x[~np.isnan(x)]
-    return float(np.exp(np.mean(np.log(np.maximum(x, 1e-3))))) if len(x) else math.nan
-
-
 def without_outage(
-    filters: Mapping[str, Filter], drives: Sequence[Drive], start: StartLaw, *, seed: int, minutes: float = 60.0
+    filters: Mapping[str, Filter], drives: Sequence[Drive], start: StartLaw, *, seed: int
 ) -> dict[str, dict[str, float]]:
     """RMS of position [m] and heading [°] over parts of a piece of an hour with GNSS throughout, per filter.
 
     Raises InputError where no drive is that long.
     """
-    length = 60.0 * minutes
-    pieces = cut_pieces(drives, length)
+    pieces = cut_pieces(drives, HOUR_S)
     if not pieces:
-        raise InputError(f"no drive has {minutes:g} min of valid truth; simulate longer ones, dataset.drive_minutes=63")
-    scores = score_scenes(filters, Scenes(drives, Protocol("pieces", length, length, start, seed=seed), pieces=pieces))
+        raise InputError("no drive has 60 min of valid truth; simulate longer ones, dataset.drive_minutes=63")
+    scores = score_scenes(filters, Scenes(drives, Protocol("pieces", HOUR_S, HOUR_S, start, seed=seed), pieces=pieces))
     out = {}
     for name, run in scores.filters.items():
         size = magnitudes(run.error)

@@ -63,11 +63,11 @@ def gains_of(filters: Mapping[str, Filter], scenes: Iterable[Scene], *, settle_s
     }
 
 
-def write_gains(out: Path, gains: Mapping[str, Gains], title: str, piece: int = 0) -> None:
+def write_gains(out: Path, gains: Mapping[str, Gains], title: str) -> None:
     """``gains.json`` (last gain of one piece, mean, spread, mean diagonals of the blocks) and ``figures/gains.png``."""
     content = {
         name: {
-            "last": g.last[piece].tolist(),
+            "last": g.last[0].tolist(),
             "mean": g.mean.tolist(),
             "std": g.std.tolist(),
             **{block: g.block(block) for block in BLOCKS},
@@ -77,7 +77,7 @@ def write_gains(out: Path, gains: Mapping[str, Gains], title: str, piece: int = 
     with staged(out) as folder:
         (folder / "gains.json").write_text(json.dumps(content, indent=1) + "\n")
         (folder / "figures").mkdir()
-        panels = [(name, g.last[piece]) for name, g in gains.items()]
+        panels = [(name, g.last[0]) for name, g in gains.items()]
         figure = heat_map(panels, len(panels), f"{title}: gain at the last fix of one piece")
         FigureCanvasAgg(figure).print_png(str(folder / "figures" / "gains.png"))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -70,13 +71,38 @@ class Scores:
     def of_kind(self, kind: str) -> Scores:
         """The pieces of one kind: simulated and real results are never mixed."""
         keep = [i for i, p in enumerate(self.pieces) if p.kind == kind]
-        part = {
-            f.name: getattr(self, f.name)[keep]
-            for f in fields(self)
-            if isinstance(getattr(self, f.name), np.ndarray)
-        }
-        runs = {
-            n: FilterRun(**{f.name: getattr(r, f.name)[keep] for f in fields(r)})
-            for n, r in self.filters.items()
-        }
+        part = {k: x[keep] for k, x in vars(self).items() if isinstance(x, np.ndarray)}
+        runs = {n: FilterRun(*(x[keep] for x in vars(r).values())) for n, r in self.filters.items()}
         return replace(self, pieces=[self.pieces[i] for i in keep], filters=runs, **part)
+
+
+def joined_scores(parts: Sequence[Scores]) -> Scores:
+    """The pieces of several scores of the same filters in their order, padded to the longest."""
+    if len(parts) == 1:
+        return parts[0]
+    T = max(s.outage.shape[1] for s in parts)
+
+    def rows(things: Sequence[object], name: str) -> Array:
+        return np.concatenate([_padded(getattr(x, name), T) for x in things])
+
+    def of_filter(name: str) -> FilterRun:
+        runs = [s.filters[name] for s in parts]
+        return FilterRun(*(rows(runs, f.name) for f in fields(FilterRun)))
+
+    return Scores(
+        epoch_s=parts[0].epoch_s,
+        pieces=[piece for s in parts for piece in s.pieces],
+        outage=rows(parts, "outage"),
+        truth_p_n=rows(parts, "truth_p_n"),
+        truth_v_n=rows(parts, "truth_v_n"),
+        true_imu_error=rows(parts, "true_imu_error"),
+        origin_e=np.concatenate([s.origin_e for s in parts]),
+        filters={name: of_filter(name) for name in parts[0].filters},
+    )
+
+
+def _padded(x: Array, T: int) -> Array:
+    """(P, t, …) to (P, T, …): no outage, NaN elsewhere."""
+    extra = [(0, 0)] * x.ndim
+    extra[1] = (0, T - x.shape[1])
+    return np.pad(x, extra, constant_values=False if x.dtype == bool else np.nan)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,9 +17,8 @@ from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.masks import BiasLaw
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
-from dlkf.evaluation.metrics import Array
 from dlkf.evaluation.protocol import Protocol, Scenes
-from dlkf.evaluation.scores import FilterRun, Scores
+from dlkf.evaluation.scores import joined_scores
 from dlkf.evaluation.study import Run, run_scenes
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.smoother import Filter
@@ -108,41 +107,14 @@ def scored(work: Work, names: tuple[str, ...]) -> Part:
 
 
 def joined(runs: Sequence[Run]) -> Run:
-    """Pieces of several runs in their order, padded to the longest."""
+    """The pieces of several runs in their order."""
     if len(runs) == 1:
         return runs[0]
-    all_scores = [run.scores for run in runs]
-    T = max(s.outage.shape[1] for s in all_scores)
-
-    def column(name: str) -> Array:
-        return np.concatenate([padded(getattr(s, name), T) for s in all_scores])
-
-    first = all_scores[0]
-    def of_filter(name: str) -> FilterRun:
-        rows = [s.filters[name] for s in all_scores]
-        return FilterRun(*(np.concatenate([padded(getattr(r, f.name), T) for r in rows]) for f in fields(FilterRun)))
-
-    scores = Scores(
-        epoch_s=first.epoch_s,
-        pieces=[piece for s in all_scores for piece in s.pieces],
-        outage=column("outage").astype(np.bool_, copy=False),
-        truth_p_n=column("truth_p_n"),
-        truth_v_n=column("truth_v_n"),
-        true_imu_error=column("true_imu_error"),
-        origin_e=np.concatenate([s.origin_e for s in all_scores]),
-        filters={name: of_filter(name) for name in first.filters},
-    )
+    scores = joined_scores([run.scores for run in runs])
     if runs[0].cause is None:
         return Run(scores)
-    followed = {name: np.concatenate([(r.followed or {})[name] for r in runs]) for name in first.filters}
+    followed = {name: np.concatenate([(r.followed or {})[name] for r in runs]) for name in scores.filters}
     return Run(scores, np.concatenate([r.cause for r in runs if r.cause is not None]), followed)
-
-
-def padded(x: Array, T: int) -> Array:
-    """(P, t, …) to (P, T, …): no outage, NaN elsewhere."""
-    extra = [(0, 0)] * x.ndim
-    extra[1] = (0, T - x.shape[1])
-    return np.pad(x, extra, constant_values=False if x.dtype == bool else np.nan)
 
 
 @contextmanager

@@ -56,9 +56,7 @@ def align(drive: Drive, config: AlignConfig = ALIGN, *, earliest: int = 0) -> St
     return start
 
 
-def align_each(
-    drives: Sequence[Drive], config: AlignConfig = ALIGN, *, earliest: int = 0
-) -> list[Start | InputError]:
+def align_each(drives: Sequence[Drive], config: AlignConfig = ALIGN, *, earliest: int = 0) -> list[Start | InputError]:
     """:func:`align` of many drives, their banks of headings in one batch; the error in place of a start."""
     found: list[Motion | InputError] = []
     for drive in drives:
@@ -72,11 +70,9 @@ def align_each(
     return [_started(x, config, earliest) if isinstance(x, Motion) else x for x in found]
 
 
-def aligned_drives(
-    drives: Sequence[Drive], config: AlignConfig = ALIGN, *, dtype: torch.dtype = torch.float64
-) -> Batch:
+def aligned_drives(drives: Sequence[Drive], config: AlignConfig = ALIGN) -> Batch:
     """Complete drives, each from its own :func:`align`, as one padded batch."""
-    return whole_drives(drives, [align(drive, config) for drive in drives], dtype=dtype)
+    return whole_drives(drives, [align(drive, config) for drive in drives], dtype=torch.float64)
 
 
 @dataclass(frozen=True)

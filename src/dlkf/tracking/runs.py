@@ -175,13 +175,13 @@ class Run:
         for first in range(0, len(kept), METRICS_AT_ONCE):
             self.client.log_batch(self.id, metrics=kept[first : first + METRICS_AT_ONCE])
 
-    def log_files(self, folder: Path | str, under: str | None = None) -> None:
+    def log_files(self, folder: Path | str) -> None:
         """Everything in a folder, or one file, as artifacts."""
         with at_hand(folder) as path:
             if path.is_dir():
-                self.client.log_artifacts(self.id, str(path), under)
+                self.client.log_artifacts(self.id, str(path))
             else:
-                self.client.log_artifact(self.id, str(path), under)
+                self.client.log_artifact(self.id, str(path))
 
     def note(self, markdown: str) -> None:
         """What the UI shows as the description of the run; whole lines up to MLflow's limit."""
