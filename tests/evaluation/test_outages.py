@@ -73,3 +73,12 @@ def test_one_bad_outage_of_several_leaves_the_others(cars):
 def test_impossible_schedules_are_refused(settings):
     with pytest.raises(InputError, match="outage"):
         OutagePlan(**settings)
+
+
+def test_a_fix_close_before_is_counted_in_seconds(cars):
+    """Two seconds are four epochs of half a second: a fix 2 s before is close enough, one 2.5 s before is not."""
+    available = cars.available.clone()
+    available[0, 17:20], available[1, 16:20] = False, False
+    batch = replace(cars, dt=cars.dt / 2, available=available)
+    (mask,) = OutagePlan(first_s=10, duration_s=5).masks(batch)
+    assert mask.any(-1).tolist() == [True, False, True, True, True, True]

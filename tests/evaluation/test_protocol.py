@@ -115,7 +115,7 @@ def test_study_reports_each_kind_apart_and_the_slope_of_an_injected_bias(drives)
     scenes = Scenes(drives, Protocol(length_s=50, stride_s=50))
     kinds = {d.name: "real" if i < 2 else "simulated" for i, d in enumerate(drives)}
     groups = {d.name: d.group for d in drives}
-    bias = {"accel_mps2": 0.03, "gyro_dps": 0.06}
+    bias = BiasLaw(accel_mps2=0.03, gyro_dps=0.06)
     _, made = study({"mbkf15": MBKF}, scenes, kinds=kinds, groups=groups, injected_bias=bias)
     assert [(r.kind, r.count["pieces"]) for r in made] == [("real", 2), ("simulated", 4)]
     for r in made:

@@ -313,3 +313,20 @@ def test_settings_that_make_no_sense(settings, words):
 def test_other_rate_than_trained_on_is_refused():
     with pytest.raises(InputError, match="rate_hz"):
         integrate(single(scene(1, 3)), small(rate_hz=100.0))
+
+
+def test_times_are_counted_in_seconds():
+    """Since the network last ran, and since the last fix, behind each epoch of a second."""
+    batch = single(scene(2, 6))
+    batch.available[0, 3:] = False
+    seen = []
+
+    class Watched(LearnedFilter):
+        def step(self, memory, epoch):
+            memory, correction = super().step(memory, epoch)
+            seen.append((memory.elapsed.tolist(), memory.since_fix.tolist()))
+            return memory, correction
+
+    with torch.no_grad():
+        integrate(batch, Watched(LearnedConfig.from_mapping(SMALL)).eval())
+    assert seen == [([k, 0], [k, 0]) for k in (0, 0, 0, 1, 2, 3)]

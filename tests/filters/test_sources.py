@@ -2,6 +2,7 @@
 
 import re
 import sys
+from dataclasses import replace
 from textwrap import dedent
 
 import pytest
@@ -9,6 +10,7 @@ import torch
 
 from dlkf.errors import InputError
 from dlkf.filters import sources
+from dlkf.filters.advice import Advice
 from dlkf.filters.build import build_filter, is_filter, refuse_smoothed
 from dlkf.filters.gating import Gate
 from dlkf.filters.integration import integrate
@@ -86,3 +88,29 @@ def test_what_needs_a_causal_filter_refuses_a_smoothed_one_in_one_line():
         StreamingFilter(build_filter("mbkf21_rts", IMU))
     with pytest.raises(InputError, match="tune it without _rts"):
         check("mbkf21_rts", "log")
+
+
+class Advised:
+    """A Kalman filter that is told factors on the stds of every fix: horizontal and down, position then velocity."""
+
+    def __init__(self, kalman, factors):
+        self.kalman, self.factors = kalman, torch.tensor([factors], dtype=torch.float64)
+
+    def begin(self, batch):
+        return self.kalman.begin(batch)
+
+    def step(self, memory, epoch):
+        advice = Advice(fix=self.factors.expand(len(epoch.z), 4))
+        return self.kalman.step(memory, epoch._replace(advice=advice))
+
+
+def test_advice_on_a_fix_is_a_factor_on_its_std():
+    """The same solution as of fixes that claim so much themselves."""
+    batch, kalman = scene(2, 20), build_filter("mbkf15", IMU)
+    claimed = batch.gnss_std * torch.tensor([2.0, 2.0, 0.5, 3.0, 3.0, 0.7], dtype=torch.float64)
+    with torch.no_grad():
+        told = integrate(batch, Advised(kalman, [2.0, 0.5, 3.0, 0.7]))
+        same = integrate(replace(batch, gnss_std=claimed), kalman)
+        plain = integrate(batch, kalman)
+    torch.testing.assert_close(told.posterior.p_n, same.posterior.p_n, rtol=0, atol=1e-9)
+    assert (told.posterior.p_n - plain.posterior.p_n).abs().max() > 1e-3

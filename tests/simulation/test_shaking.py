@@ -161,6 +161,8 @@ def test_loudness_scales_all_and_bursts_make_the_noise_uneven():
     assert np.mean(uneven**2) == pytest.approx(np.mean(even**2), rel=0.2)
     fourth = [np.mean(x[:, 0] ** 4) / np.mean(x[:, 0] ** 2) ** 2 for x in (even, uneven)]
     assert fourth[0] == pytest.approx(3, abs=0.3) and fourth[1] > 4
+    uneasy = [np.std(np.log(np.mean(x[:, 0].reshape(-1, RATE // 4) ** 2, -1))) for x in (even, uneven)]
+    assert uneasy[1] > 3 * uneasy[0]  # bursts last: quarters of a second differ, and not the samples alone
     assert Shaking(loudness=0.0, rumble=1.0).is_still
     wild = [force(shake(replace(Shaking(), **{name: 20.0}), 60.0)) for name in ("wheel", "rumble", "engine")]
     assert all(np.sqrt(np.mean(x**2)) < 2 * LIMIT for x in wild)  # twice: the axes' own shares
