@@ -146,13 +146,13 @@ def run(
 ) -> list[Outcome]:
     """All drives of a dataset, or the first; with ``own`` the offset that a log is found to have as it is, is no error.
 
-    The clock of the IMU is made to run faster by ``drift_ppm``.
+    The clock of the IMU is made to run faster by ``drift_ppm``, from the first fix on.
     """
     out = []
     for row in pd.read_parquet(dataset / "drives.parquet").to_dict("records")[:first]:
         name = str(row["drive"])
         imu, gnss = (pd.read_parquet(dataset / kind / f"drive={name}" / "part-0.parquet") for kind in ("imu", "gnss"))
-        imu["t"] *= 1 + 1e-6 * drift_ppm
+        imu["t"] += 1e-6 * drift_ppm * (imu["t"] - gnss["t"].iloc[0])
         turns = [float(row.get(f"mounting_{axis}_deg") or 0.0) for axis in ("yaw", "pitch", "roll")]
         mounting = Rotation.from_euler("ZYX", turns, degrees=True).as_matrix()
         plain = tried(name, imu, gnss, mounting, PLAIN).offset_ms if own else 0.0

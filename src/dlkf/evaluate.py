@@ -29,7 +29,7 @@ from dlkf.report.evaluation import write_report
 from dlkf.running.offline import SAMPLES_AT_ONCE, Fixes, in_shares
 from dlkf.running.references import check_reference
 from dlkf.tracking.grid import start_point
-from dlkf.tracking.runs import tracking_uri
+from dlkf.tracking.runs import check_store, tracking_uri
 
 
 @command("evaluate", EvaluateSettings)
@@ -38,6 +38,8 @@ def main(told: EvaluateSettings) -> None:
     console = Console(width=None if sys.stdout.isatty() else 110)
     vacant(told.out, overwrite=told.overwrite)
     protocol, uri, spec = told.protocol(told.align), tracking_uri(told.tracking.uri), told.spec
+    if told.tracking.log:
+        check_store(uri)
     models = resolve_models(told.models, spec, uri, **told.told)
     check_baseline(told.baseline, models)
     check_reference(told.reference)

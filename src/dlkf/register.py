@@ -10,7 +10,7 @@ from dlkf.command.settings import RegisterSettings
 from dlkf.errors import InputError
 from dlkf.tracking.comparison import best_of
 from dlkf.tracking.registry import check_registration, registered
-from dlkf.tracking.runs import client_of, reachable, run_exists, store_missing, tracking_uri
+from dlkf.tracking.runs import check_store, client_of, reachable, run_exists, store_missing, tracking_uri
 
 
 @command("register", RegisterSettings)
@@ -21,6 +21,7 @@ def main(told: RegisterSettings) -> None:
     check_registration(name, alias)
     if store_missing(uri):
         raise InputError(f"there is no MLflow store at {uri.removeprefix('sqlite:///')}; give tracking.uri=…")
+    check_store(uri)
     with reachable(uri):
         client = client_of(uri)
         if not run_exists(client, run_id):

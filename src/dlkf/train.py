@@ -28,7 +28,7 @@ from dlkf.settings import settings_from
 from dlkf.simulation.dataset import simulate
 from dlkf.tracking.grid import PARENT_RUN, run_name
 from dlkf.tracking.registry import check_registration, log_model
-from dlkf.tracking.runs import lightning_logger, start_run, tracking_uri
+from dlkf.tracking.runs import check_store, lightning_logger, start_run, tracking_uri
 from dlkf.training.fit import check_accelerator
 from dlkf.training.processes import is_further
 from dlkf.training.run_folder import checked_digests, run_folder, write_state
@@ -43,6 +43,7 @@ def main(config: dict[str, Any]) -> None:
     console = Console(width=None if sys.stdout.isatty() else 110)
     told = settings_from(TrainSettings, config, "")
     tracking, settings, data = told.tracking, told.study, made(told.data, "data")
+    check_store(uri := tracking_uri(tracking.uri))
     check_registration(tracking.register, tracking.alias)
     folder, state = run_folder(told.name, configuration_hash(config), resume=told.resume)
     if is_further():
@@ -56,7 +57,6 @@ def main(config: dict[str, Any]) -> None:
         console.print(f"going on with the unfinished run in {folder}")
     name = run_name(told.name, HydraConfig.get().overrides.task)
     parent = os.environ.get(PARENT_RUN)
-    uri = tracking_uri(tracking.uri)
     begun = {"parent_run_id": parent, "run_id": state.get("run_id"), "system_metrics": tracking.system_metrics}
     with start_run(uri, told.name, name, **begun) as run:
         write_state(folder, run_id=run.id, data=checked_digests(data.datasets, state))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pickle
 import shutil
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,7 @@ from dlkf.command.faults import fault
 from dlkf.data.schema import drive_file
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.saved import save_filter
+from dlkf.tracking import runs
 from tests.shell import in_shell
 
 DRIVE = "town-3-00001"  # the second of two: nothing of the first may be written either
@@ -368,6 +371,29 @@ def test_of_all_commands(name, copy, call, tmp_path):
     command, arguments, said = OF_ALL_COMMANDS[name]
     (tmp_path / "logs").mkdir()
     is_refused(call(command, *arguments), said, folder=tmp_path)
+
+
+@pytest.mark.parametrize("lock", ["IMMEDIATE", "EXCLUSIVE"])
+@pytest.mark.parametrize(
+    "given",
+    [
+        ("evaluate", *SCORED),
+        ("train", *TRAINED),
+        ("register", "run=" + "0" * 32, "name=town"),
+        ("evaluate", "-m", *SCORED, "model=ins,mbkf15"),
+    ],
+    ids=["evaluate", "train", "register", "sweep"],
+)
+def test_a_locked_store_is_told_before_any_work(given, lock, copy, call, tmp_path, monkeypatch):
+    """By another program that writes, as long as the command waits; and nothing was begun."""
+    monkeypatch.setattr(runs, "LOCKED_S", 0.2)
+    kept = tmp_path / "logs"
+    kept.mkdir()
+    store = kept / "store.db"
+    with closing(sqlite3.connect(store)) as other:
+        other.executescript(f"CREATE TABLE t (x); BEGIN {lock}")
+        ended = call(*given, f"tracking.uri=sqlite:///{store}")
+    is_refused(ended, "store.db is locked by another program", folder=tmp_path)
 
 
 @pytest.mark.parametrize("command", FAST)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from dlkf.command.composing import composed
 from dlkf.data.discovery.clock import find_lag, known_offset
-from dlkf.data.discovery.drift import find_drifting_pose, middle
+from dlkf.data.discovery.drift import ends_apart, find_drifting_pose, middle
 from dlkf.data.discovery.motion import motion, position_delay
 from dlkf.data.discovery.orientation import find_pose
 from dlkf.data.discovery.units import accel_units, nearest_unit, time_unit
@@ -20,9 +20,11 @@ from dlkf.data.intake import ingest_drives
 from dlkf.data.plausibility import check_clocks
 from dlkf.data.readers import units
 from dlkf.data.readers.auto import AutoReader
+from dlkf.data.readers.frames import DriveFrames
 from dlkf.data.readers.logs import LogReader
 from dlkf.data.schema import ACCEL, GYRO, VELOCITY
 from dlkf.data.tables import read_drives, read_table
+from dlkf.diagnosis.checkup import checkup
 from dlkf.errors import InputError
 from tests.cars import car
 from tests.drives import drives_in
@@ -108,6 +110,32 @@ def test_a_drift_is_found_or_refused(tmp_path, drive):
     assert found.mapping["gnss"]["time"]["drift_ppm"] == pytest.approx(1000, abs=20)
     assert found.gnss is not None
     np.testing.assert_allclose(found.gnss.t, 1.001 * drive["gnss"].t, atol=4e-3)
+
+
+def test_a_drift_that_no_lag_fits_is_found(streets):
+    """5000 ppm over three minutes, 0.9 s: the fit at one lag sees nothing of it, the drive's two ends do.
+
+    What is left is the car's: rolling in its turns, sideslip. They are in the 1σ, 100 ppm.
+    """
+    t, accel, gyro, moved = _arrays({"imu": streets["imu"].assign(t=1.005 * streets["imu"].t), "gnss": streets["gnss"]})
+    ends = ends_apart(t, accel, gyro, moved)
+    assert ends is not None and abs(ends.drift - 5e-3) < 1e-3
+    pose = find_drifting_pose(t, accel, gyro, moved, 0.0)
+    assert pose is not None and abs(pose.drift - 5e-3) < 3 * pose.drift_std < 4e-4
+
+
+def test_a_small_drift_is_told_with_its_remedy(tmp_path, streets):
+    """0.2 % over three minutes are 0.36 s: taken in, with a line; 200 ppm, 0.04 s, are no line's worth."""
+    for factor, told in ((1.002, True), (1.0002, False)):
+        folder = tmp_path / f"x{factor}"
+        imu = streets["imu"].assign(t=factor * streets["imu"].t)
+        frames = DriveFrames({"drive": "a", "group": "a"}, imu, streets["gnss"])
+        notes = []
+        ingest_drives([frames], folder, progress=lambda taken, _: notes.extend(taken.notes))
+        assert bool(notes) == told
+    (row,) = read_drives(tmp_path / "x1.002")
+    (seen,) = [seen for seen in checkup(tmp_path / "x1.002", row) if "ppm" in seen.text]
+    assert seen.grade == "note" and "drift_ppm=auto" in seen.text
 
 
 def test_a_drift_over_a_long_drive_is_told(drive):

@@ -13,11 +13,12 @@ import numpy as np
 import pandas as pd
 import yaml
 
+from dlkf.data.plausibility import drift_told
 from dlkf.data.readers.frames import DriveFrames
 from dlkf.data.schema import new_dataset, write_drive, write_drives_table
 from dlkf.data.summary import drive_line
 from dlkf.data.tables import DriveRow, read_drives
-from dlkf.data.validate import LIMITS, Limits, gap_rows, read_checked, read_imu
+from dlkf.data.validate import LIMITS, Limits, fixes, gap_rows, read_checked, read_imu
 from dlkf.errors import InputError
 from dlkf.files import absolute, whole_file
 from dlkf.parallel import check, each
@@ -43,15 +44,17 @@ class Intake:
 
     def taken(self, drive: DriveFrames, folder: str | Path) -> Taken:
         """Write a drive into a dataset's folder and check what lies there; InputError for the first fault."""
-        rows, lines = [], []
+        rows, lines, told = [], [], list(drive.notes)
         for part in split_at_gaps(drive, self.shortest_s, self.limits) if self.split_gaps else [drive]:
             rows.append(write_drive(folder, part.meta, part.imu, part.gnss, part.reference))
             if part.gnss is not None:
-                read_checked(folder, DriveRow(part.name, part.name, (0.0, 0.0, 0.0)), limits=self.limits)
+                tables = read_checked(folder, DriveRow(part.name, part.name, (0.0, 0.0, 0.0)), limits=self.limits)
+                if drifts := drift_told(tables.imu, fixes(tables.gnss)):
+                    told.append(f"{part.name}: {drifts}")
             else:
                 read_imu(folder, part.name, self.limits)
             lines.append(f"{part.name}: {drive_line(part)}")
-        return Taken(rows, lines, drive.notes, drive.mapping)
+        return Taken(rows, lines, tuple(told), drive.mapping)
 
 
 def ingest(

@@ -6,11 +6,10 @@ unusual drive does not raise an alarm.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from dlkf.data.discovery.clock import find_lag, known_offset
+from dlkf.data.discovery.drift import ROUGH_S, ends_apart, find_drifting_pose
 from dlkf.data.discovery.motion import Motion, motion
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, VELOCITY
 from dlkf.data.tables import Columns
@@ -23,8 +22,9 @@ DISAGREES, AGREES = 0.5, 0.25  # relative residual of way against velocity
 NOWHERE_DEG = 1e-6  # what receivers write before they have a position
 FARTHEST_KM, KM_PER_DEG = 2000.0, 111.2
 SEARCH_S = 600.0  # clocks of logs that have time in common are hardly further apart
-DRIFTED_S = 30.0  # as far may the ends of a drive be apart
 APART_S = 1.0  # less is a delay, which the filters bear; dlkf.ingest measures it on request
+DRIFTED_S = 0.1  # from a drive's first to its last second: worth a line
+SHORTEST_S = 60.0  # of a drive whose drift can be seen
 TURNED_DEG = (30.0, 150.0)  # backwards is found by the filters' own search
 
 
@@ -195,8 +195,7 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
 
     Then the force forward and right also tells whether the sensor looks along the car.
     """
-    t, accel, gyro = imu["t"], np.stack([imu[c] for c in ACCEL], -1), np.stack([imu[c] for c in GYRO], -1)
-    moved = motion(gnss["t"], gnss["lat_deg"], gnss["lon_deg"], np.stack([gnss[c] for c in VELOCITY], -1))
+    t, accel, gyro, moved = _signals(imu, gnss)
     _check_drift(t, accel, gyro, moved, where)
     best = find_lag(t, accel, gyro, moved, SEARCH_S)
     if best is None or not best.clear or min(best.yaw, best.force) < 0.6 or max(best.yaw, best.force) < 0.85:
@@ -222,27 +221,39 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
 
 def _check_drift(t: np.ndarray, accel: np.ndarray, gyro: np.ndarray, gnss: Motion, where: str) -> None:
     """The first and the last third of a drive have the same lag."""
-    if len(gnss.t) < 60:
+    ends = ends_apart(t, accel, gyro, gnss)
+    if ends is None or abs(ends.last_s - ends.first_s) <= APART_S:
         return
-    edges = gnss.t[0] + (gnss.t[-1] - gnss.t[0]) * np.array([1 / 3, 2 / 3])
-    lags = []
-    for part in (gnss.t <= edges[0], gnss.t >= edges[1]):
-        middle = float(gnss.t[part].mean())
-        near = (t >= gnss.t[part][0] - DRIFTED_S) & (t <= gnss.t[part][-1] + DRIFTED_S)
-        some = replace(gnss, t=gnss.t[part], v=gnss.v[part], climb=gnss.climb[part])
-        lag = find_lag(t[near], accel[near], gyro[near], some, DRIFTED_S)
-        if lag is None or not lag.clear or min(lag.yaw, lag.force) < 0.6 or max(lag.yaw, lag.force) < 0.85:
-            return
-        lags.append((middle, lag.lag_s))
-    (begin, first), (end, last) = lags
-    if abs(last - first) > APART_S:
-        ppm = 1e6 * (last - first) / (end - begin)
-        raise InputError(
-            f"{where}: the clocks of IMU and GNSS drift apart, by about {ppm:.0f} ppm: {first:+.1f} s at the "
-            f"beginning, {last:+.1f} s at the end; reader.gnss.time.drift_ppm={ppm:.0f} and offset_s={first:.1f}, "
-            "then drift_ppm=auto on what is left" if abs(ppm) < 1e5 else
-            f"{where}: the clocks of IMU and GNSS have different seconds; mend reader.imu.time.unit"
-        )
+    ppm = 1e6 * ends.drift
+    raise InputError(
+        f"{where}: the clocks of IMU and GNSS drift apart, by about {ppm:.0f} ppm: {ends.first_s:+.1f} s at the "
+        f"beginning, {ends.last_s:+.1f} s at the end; reader.gnss.time.drift_ppm={ppm:.0f} and "
+        f"offset_s={ends.first_s:.1f}, then drift_ppm=auto on what is left" if abs(ppm) < 1e5 else
+        f"{where}: the clocks of IMU and GNSS have different seconds; mend reader.imu.time.unit"
+    )
+
+
+def drift_told(imu: Columns, gnss: Columns) -> str | None:
+    """A line about clocks that drift apart, though by less than :func:`check_clocks` refuses; None where none is seen."""
+    t, accel, gyro, moved = _signals(imu, gnss)
+    ends = ends_apart(t, accel, gyro, moved)
+    span = float(moved.t[-1] - moved.t[0]) if len(moved.t) else 0.0
+    if span < SHORTEST_S or (ends is not None and abs(ends.drift) * span < DRIFTED_S - ROUGH_S):
+        return None
+    lag_s = 0.5 * (ends.first_s + ends.last_s) if ends is not None else 0.0
+    pose = find_drifting_pose(t, accel, gyro, moved, lag_s)
+    if pose is None or abs(pose.drift) * span < DRIFTED_S:
+        return None
+    return (
+        f"the clock of the IMU runs {'faster' if pose.drift > 0 else 'slower'} than that of GNSS by "
+        f"{1e6 * abs(pose.drift):.0f} ± {1e6 * pose.drift_std:.0f} ppm, {abs(pose.drift) * span:.2f} s over the drive; "
+        "reader.gnss.time.drift_ppm=auto and offset_s=auto take it out"
+    )
+
+
+def _signals(imu: Columns, gnss: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray, Motion]:
+    moved = motion(gnss["t"], gnss["lat_deg"], gnss["lon_deg"], np.stack([gnss[c] for c in VELOCITY], -1))
+    return imu["t"], np.stack([imu[c] for c in ACCEL], -1), np.stack([imu[c] for c in GYRO], -1), moved
 
 
 def check_attitude(reference: Columns, where: str) -> None:

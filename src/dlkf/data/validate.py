@@ -77,8 +77,7 @@ def checked(tables: DriveTables, limits: Limits = LIMITS) -> DriveTables:
     _check_imu(imu, _where(name, "imu"), limits)
     _check_gnss(gnss, imu, _where(name, "gnss"))
     check_turns(imu, gnss, _where(name, "imu"))
-    fixed = np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite(gnss["lat_deg"]) & np.isfinite(gnss["lon_deg"])
-    check_clocks(imu, {column: values[fixed] for column, values in gnss.items()}, _where(name, "imu"))
+    check_clocks(imu, fixes(gnss), _where(name, "imu"))
     if truth is not None:
         _check_reference(truth, _where(name, "reference"))
     return tables
@@ -90,6 +89,12 @@ def read_imu(folder: str | Path, drive: str, limits: Limits = LIMITS) -> Columns
     assert imu is not None  # read_table raises for this one
     _check_imu(imu, _where(drive, "imu"), limits)
     return imu
+
+
+def fixes(gnss: Columns) -> Columns:
+    """The rows with a position by satellites."""
+    fixed = np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite(gnss["lat_deg"]) & np.isfinite(gnss["lon_deg"])
+    return {column: values[fixed] for column, values in gnss.items()}
 
 
 def gap_rows(t: np.ndarray, limits: Limits = LIMITS) -> np.ndarray:

@@ -157,7 +157,9 @@ def discovered(tables: DriveTables) -> Iterator[Seen]:
         lon_deg=gnss[POSITION[1]][ok], v_ned=np.stack([gnss[c][ok] for c in VELOCITY], -1),
     )  # fmt: skip
     for finding in discover(raw, {"imu.time.offset_s", "imu.axes"}, known_accel={}, known_gyro={}).found:
-        if not finding.sure:
+        if finding.setting == "gnss.time.drift_ppm":
+            yield Seen(NOTE, f"clocks: {finding.value:+.0f} {finding.told}; ingest with reader.{finding.setting}=auto")
+        elif not finding.sure:
             yield Seen(NOTE, f"{finding.setting}: the motion does not tell ({finding.told})")
         elif finding.setting == "imu.time.offset_s":
             off = abs(finding.value)

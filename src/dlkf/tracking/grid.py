@@ -29,6 +29,7 @@ from dlkf.tracking.registry import check_registration, registered
 from dlkf.tracking.runs import (
     NOTE_TAG,
     Run,
+    check_store,
     client_of,
     experiment_id,
     reachable,
@@ -58,6 +59,7 @@ class GridParent(Callback):
         try:
             check_registration(self.register, self.alias)
             self.uri = tracking_uri(config.tracking.uri)
+            check_store(self.uri)
             with reachable(self.uri):
                 client = client_of(self.uri)
                 name = "grid " + " × ".join(grid_name(key, values) for key, values in swept.items())

@@ -8,8 +8,9 @@ import logging
 import math
 import os
 import re
+import sqlite3
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -32,6 +33,7 @@ PARENT_TAG, NOTE_TAG = "mlflow.parentRunId", "mlflow.note.content"
 KIND = {"mlflow.experimentKind": "custom_model_development"}  # else the UI shows pages for language models
 KEY_LENGTH, VALUE_LENGTH, NOTE_LENGTH, PARAMS_AT_ONCE, METRICS_AT_ONCE = 250, 6000, 8000, 100, 1000  # MLflow's limits
 NOT_IN_NAMES = re.compile(r"[^\w\-. :/]")  # of metrics
+LOCKED_S = 15.0  # a writer of many metrics holds the store for less
 SAMPLE_EVERY_S, SAMPLES_PER_POINT = 1, 5  # system metrics: MLflow's own 10 s leaves short runs empty
 
 
@@ -45,6 +47,7 @@ def mlflow_module() -> ModuleType:
 
     for name in ("mlflow", "alembic"):
         logging.getLogger(name).setLevel(logging.WARNING)
+    logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)  # it prints what it then raises
     return mlflow
 
 
@@ -83,12 +86,40 @@ def client_of(uri: str) -> MlflowClient:
         return mlflow.MlflowClient(uri)
     folder = Path(uri.removeprefix(SQLITE)).parent
     folder.mkdir(parents=True, exist_ok=True)
+    _unlocked(uri, "BEGIN; SELECT * FROM sqlite_master")
     held = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(held, fcntl.LOCK_EX)
         return mlflow.MlflowClient(uri)
     finally:
         os.close(held)
+
+
+def check_store(uri: str) -> None:
+    """Raises InputError for a store that runs cannot be written to: locked, or a server that does not answer."""
+    if uri.startswith(SQLITE):
+        _unlocked(uri, "BEGIN IMMEDIATE")
+    else:
+        with reachable(uri):
+            client_of(uri).search_experiments(max_results=1)
+
+
+def _unlocked(uri: str, lock: str) -> None:
+    """Waits for a lock of an embedded store, for a while: MLflow would try again for minutes."""
+    if store_missing(uri):
+        return
+    path = uri.removeprefix(SQLITE)
+    try:
+        with closing(sqlite3.connect(path, timeout=LOCKED_S)) as store:
+            store.executescript(f"{lock}; ROLLBACK")
+    except sqlite3.OperationalError as error:
+        if "locked" in str(error):  # of all else MLflow says itself whether it matters
+            raise InputError(
+                f"the MLflow store {path} is locked by another program; wait or close it, then give the same command "
+                "again, or another store (tracking.uri=sqlite:///<path>.db)"
+            ) from None
+    except sqlite3.DatabaseError:
+        pass
 
 
 @contextmanager
@@ -234,6 +265,7 @@ def start_run(
         raise InputError("tracking.system_metrics=true needs psutil; pip install psutil")
     mlflow.set_system_metrics_sampling_interval(SAMPLE_EVERY_S)
     mlflow.set_system_metrics_samples_before_logging(SAMPLES_PER_POINT)
+    check_store(uri)
     with reachable(uri):
         client = client_of(uri)
         resumed = run_id is not None and run_exists(client, run_id)

@@ -23,7 +23,10 @@ KNOWN_OFFSETS = {18.0: "leap seconds of GPS against UTC", 37.0: "TAI against UTC
 
 @dataclass(frozen=True)
 class Lag:
-    """``lag_s`` is added to GNSS stamps to give those of the IMU; ``gain`` its Λ, ``rival`` the next best peak's."""
+    """``lag_s`` is added to GNSS stamps to give those of the IMU; ``gain`` its Λ, ``rival`` the next best peak's.
+
+    ``peak_s`` is the same between the steps of the search, by a parabola through the peak of Λ.
+    """
 
     lag_s: float
     gain: float
@@ -31,6 +34,7 @@ class Lag:
     yaw: float  # correlation of the yaw rate with the course at the lag
     force: float  # of the horizontal force with the acceleration
     angle: float  # rad, by which the sensor's x axis points to the right of the direction of travel
+    peak_s: float
 
     @property
     def clear(self) -> bool:
@@ -69,8 +73,17 @@ def find_lag(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, within_s: flo
     others = np.where(np.abs(lags - lags[best]) > NEIGHBOUR_S, gain, -np.inf)
     rival = int(others.argmax())
     other = float(others[rival]) if np.isfinite(others[rival]) else 0.0
-    numbers = (lags[best], gain[best], other, yaws[best], forces[best], angles[best])
+    peak = lags[best] + STEP_S * _between(gain[best - 1 : best + 2])
+    numbers = (lags[best], gain[best], other, yaws[best], forces[best], angles[best], peak)
     return Lag(*(float(x) for x in numbers))
+
+
+def _between(three: Floats) -> float:
+    """Where the parabola through three values has its peak, in steps from the middle one."""
+    if len(three) < 3 or not np.isfinite(three).all():
+        return 0.0
+    bend = three[0] - 2 * three[1] + three[2]
+    return float(np.clip(0.5 * (three[0] - three[2]) / bend, -0.5, 0.5)) if bend < 0 else 0.0
 
 
 def known_offset(lag_s: float) -> str:

@@ -3,17 +3,49 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
+import numpy as np
+
+from dlkf.data.discovery.clock import find_lag
 from dlkf.data.discovery.motion import Floats, Motion
 from dlkf.data.discovery.orientation import Pose, find_pose
 
-WORTH_A_LOOK, CERTAIN = 1.5, 4.5  # σ; a lag that drifts blurs the fit, so the first look finds its σ too large
+WORTH_A_LOOK, DOUBTFUL, CERTAIN = 1.5, 2.0, 4.5  # σ; a lag that drifts blurs the fit, so the first look finds its σ too large
 LEAST_S = 0.008  # from the middle of the drive to its ends: less does not matter
-ROUNDS = 3
+ROUNDS = 6
+FEWEST = 60  # fixes of a drive whose ends are compared
+SEARCH_S = 30.0  # as far may the ends be from each other
+ROUGH_S = 0.05  # what comparing the ends is good to
+
+
+class Ends(NamedTuple):
+    """The lags of the first and the last third of a drive, and the drift between their middles."""
+
+    first_s: float
+    last_s: float
+    drift: float
+
+
+def ends_apart(t: Floats, accel: Floats, gyro: Floats, gnss: Motion) -> Ends | None:
+    """The drift by :func:`~dlkf.data.discovery.clock.find_lag` of both ends; None where one of them is not clear."""
+    if len(gnss.t) < FEWEST:
+        return None
+    edges = gnss.t[0] + (gnss.t[-1] - gnss.t[0]) * np.array([1 / 3, 2 / 3])
+    seen = []
+    for part in (gnss.t <= edges[0], gnss.t >= edges[1]):
+        some = replace(gnss, t=gnss.t[part], v=gnss.v[part], climb=gnss.climb[part])
+        near = (t >= some.t[0] - SEARCH_S) & (t <= some.t[-1] + SEARCH_S)
+        lag = find_lag(t[near], accel[near], gyro[near], some, SEARCH_S)
+        if lag is None or not lag.clear or min(lag.yaw, lag.force) < 0.6 or max(lag.yaw, lag.force) < 0.85:
+            return None
+        seen.append((float(some.t.mean()), lag.peak_s))
+    (begin, first), (end, last) = seen
+    return Ends(first, last, (last - first) / (end - begin))
 
 
 def find_drifting_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float) -> Pose | None:
-    """:func:`find_pose`, its ``lag_s`` that of the drive's middle; ``drift`` is zero unless it is certain.
+    """:func:`find_pose`, its ``lag_s`` that of the drive's middle; ``drift`` is zero unless it is certain, ``doubt`` what it may be.
 
     The time of the IMU is then t + lag + drift (t − t̄), with t the time of GNSS and t̄ :func:`middle`.
     """
@@ -21,20 +53,32 @@ def find_drifting_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag
     if first is None:
         return None
     reach = 0.5 * float(gnss.t[-1] - gnss.t[0])
-    if not abs(first.drift) > max(WORTH_A_LOOK * first.drift_std, LEAST_S / reach):
+    starts = []
+    if abs(first.drift) > max(WORTH_A_LOOK * first.drift_std, LEAST_S / reach):
+        starts.append((first.drift, first.lag_s))
+    ends = ends_apart(t - lag_s, accel, gyro, gnss)
+    if ends is not None and abs(ends.drift) * reach > ROUGH_S:  # so far that the fit may see nothing of it
+        starts.append((ends.drift, lag_s + 0.5 * (ends.first_s + ends.last_s)))
+    found = [_settled(t, accel, gyro, gnss, drift, lag) for drift, lag in starts]
+    best = max((pose for pose in found if pose is not None), key=lambda pose: pose.explained, default=None)
+    if best is None or best.explained < first.explained:
         return replace(first, drift=0.0)
-    drift, pose = first.drift, first
+    if abs(best.drift) > max(CERTAIN * best.drift_std, LEAST_S / reach):
+        return best
+    return replace(first, drift=0.0, doubt=best.drift if abs(best.drift) > DOUBTFUL * best.drift_std else 0.0)
+
+
+def _settled(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, drift: float, lag_s: float) -> Pose | None:
+    """The pose on a clock that runs faster by ``drift``, and what is left of that taken off again, until it is little."""
+    pose = None
     for _ in range(ROUNDS):
-        again = find_pose(t, accel, gyro, stretched(gnss, drift), pose.lag_s)
-        if again is None:
-            return replace(first, drift=0.0)
-        pose, drift = again, drift + again.drift
-        if abs(again.drift) < again.drift_std:
+        pose = find_pose(t, accel, gyro, stretched(gnss, drift), lag_s)
+        if pose is None:
+            return None
+        left, drift, lag_s = pose.drift, drift + pose.drift, pose.lag_s
+        if abs(left) < pose.drift_std:
             break
-    certain = abs(drift) > max(CERTAIN * pose.drift_std, LEAST_S / reach)
-    if not certain or pose.explained < first.explained:
-        return replace(first, drift=0.0)
-    return replace(pose, drift=drift)
+    return None if pose is None else replace(pose, drift=drift)
 
 
 def middle(gnss: Motion) -> float:

@@ -116,7 +116,7 @@ def discover(
     sound = pose is not None and pose.explained > LEAST_EXPLAINED and AGREE[0] < pose.scale < AGREE[1]
     sound = sound and not (pose is not None and pose.down_apart > FARTHEST_DOWN)
     if away or "gnss.time.drift_ppm" in wanted:
-        _drift(out, pose if sound else None, wanted)
+        _drift(out, pose if sound else None, wanted, sure, middle(gnss) - float(raw.gnss_t[0]))
     if away:
         _offset(out, lag, pose if sound else None, wanted, sure, middle(gnss) - float(raw.gnss_t[0]))
     if "imu.axes" in wanted:
@@ -140,9 +140,14 @@ def _gyro_unit(out: Findings, raw: Raw, pose: Pose | None, known: Mapping[str, f
     out.add("imu.gyro.unit", unit or float(f"{pose.gyro_scale:.6g}"), unit is not None or counted, told)
 
 
-def _drift(out: Findings, pose: Pose | None, wanted: set[str]) -> None:
-    """How much faster the IMU's clock runs; a drift that nobody asked for is no answer."""
+def _drift(out: Findings, pose: Pose | None, wanted: set[str], sure: Sure, reach_s: float) -> None:
+    """How much faster the IMU's clock runs; a drift that nobody asked for is no answer, nor is one that may be there
+    and would make the offset wrong ``reach_s`` from the drive's middle."""
     setting = "gnss.time.drift_ppm"
+    if pose is not None and abs(pose.doubt) * reach_s > sure.time_s:
+        told = f"± {1e6 * abs(pose.drift_std):.0f} ppm: {1000 * abs(pose.doubt) * reach_s:.0f} ms at the drive's ends"
+        out.add(setting, round(1e6 * pose.doubt, 1), False, told)
+        return
     if pose is None or not pose.drift:
         if setting in wanted:
             seen = "" if pose is None or math.isnan(pose.drift_std) else f", ± {1e6 * pose.drift_std:.0f} ppm"

@@ -58,6 +58,7 @@ class Pose:
     down_apart: float  # rad between gravity and the axis about which the car turns; NaN where it turns too little
     drift: float  # by which the IMU's clock runs faster than that of GNSS (1e-6: ppm), NaN where it cannot be seen
     drift_std: float
+    doubt: float = 0.0  # a drift that may be there, though it is not certain enough to be taken off
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ def settle(
     found = Findings()
     if "gnss.velocity.unit" in wanted:
         _speed_unit(found, mapped["gnss"], t["gnss"], where)
-        _refuse_doubt(found, where)
+        _refuse_doubt(found, wanted, where)
         specs["gnss"]["velocity"]["unit"] = found.get("gnss.velocity.unit")
     imu = imu_frame(mapped["imu"], t["imu"])
     gnss = gnss_frame(Mapped(mapped["gnss"].table, specs["gnss"], "gnss", mapped["gnss"].parts), t["gnss"])
@@ -93,7 +93,7 @@ def settle(
         increments=bool(mapped["imu"].spec.get("increments")),
     )
     found.found += more.found
-    _refuse_doubt(found, where)
+    _refuse_doubt(found, wanted, where)
     for name in wanted & set(PLACES):
         value = copy.deepcopy(found.get("imu.axes" if name.endswith("axes") else name))
         if value is not None:
@@ -134,13 +134,13 @@ def _speed_unit(found: Findings, gnss: Mapped, t: np.ndarray, where: str) -> Non
     found.add("gnss.velocity.unit", best, bool(certain), f"positions move {factor:.3g} ± {spread:.1g} m per unit")
 
 
-def _refuse_doubt(found: Findings, where: str) -> None:
+def _refuse_doubt(found: Findings, wanted: set[str], where: str) -> None:
     doubt = found.doubtful()
     if doubt is None:
         return
     setting = doubt.setting.replace("imu.axes", "imu.accel.axes and .gyro.axes")
     best = "" if doubt.value is None else f"; the best guess is {_said(doubt.value)}"
-    if doubt.setting.endswith("drift_ppm"):
+    if doubt.setting.endswith("drift_ppm") and doubt.setting not in wanted:
         raise InputError(f"{where}: the clocks drift apart, {_said(doubt.value)} {doubt.told}; reader.{setting}=auto")
     raise InputError(
         f"{where}: not sure of reader.{setting} ({doubt.told}){best}; give it, a longer drive, or a wider reader.sure"
