@@ -130,9 +130,9 @@ def test_a_small_drift_is_told_with_its_remedy(tmp_path, streets):
         folder = tmp_path / f"x{factor}"
         imu = streets["imu"].assign(t=factor * streets["imu"].t)
         frames = DriveFrames({"drive": "a", "group": "a"}, imu, streets["gnss"])
-        notes = []
-        ingest_drives([frames], folder, progress=lambda taken, _: notes.extend(taken.notes))
-        assert bool(notes) == told
+        taken = []
+        ingest_drives([frames], folder, progress=lambda one, _, into=taken: into.append(one))
+        assert bool(taken[0].notes) == told
     (row,) = read_drives(tmp_path / "x1.002")
     (seen,) = [seen for seen in checkup(tmp_path / "x1.002", row) if "ppm" in seen.text]
     assert seen.grade == "note" and "drift_ppm=auto" in seen.text

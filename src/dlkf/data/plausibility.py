@@ -234,7 +234,7 @@ def _check_drift(t: np.ndarray, accel: np.ndarray, gyro: np.ndarray, gnss: Motio
 
 
 def drift_told(imu: Columns, gnss: Columns) -> str | None:
-    """A line about clocks that drift apart, though by less than :func:`check_clocks` refuses; None where none is seen."""
+    """A line about clocks that drift apart by less than :func:`check_clocks` refuses; None where none is seen."""
     t, accel, gyro, moved = _signals(imu, gnss)
     ends = ends_apart(t, accel, gyro, moved)
     span = float(moved.t[-1] - moved.t[0]) if len(moved.t) else 0.0
