@@ -11,7 +11,7 @@ from dlkf.data.discovery.clock import find_lag
 from dlkf.data.discovery.motion import Floats, Motion
 from dlkf.data.discovery.orientation import Pose, find_pose
 
-WORTH_A_LOOK, DOUBTFUL, CERTAIN = 1.5, 2.0, 4.5  # σ; a lag that drifts blurs the fit, and the first look's σ is too large
+WORTH_A_LOOK, DOUBTFUL, CERTAIN = 1.5, 2.0, 4.5  # σ; a drift blurs the fit, so the first look's σ is too large
 LEAST_S = 0.008  # from the middle of the drive to its ends: less does not matter
 ROUNDS = 6
 FEWEST = 60  # fixes of a drive whose ends are compared
@@ -45,8 +45,8 @@ def ends_apart(t: Floats, accel: Floats, gyro: Floats, gnss: Motion) -> Ends | N
 
 
 def find_drifting_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float) -> Pose | None:
-    """:func:`find_pose`, its ``lag_s`` that of the drive's middle; ``drift`` is zero unless it is certain, ``doubt`` what it
-    may be instead.
+    """:func:`find_pose`, its ``lag_s`` that of the drive's middle; ``drift`` is zero unless it is certain, ``doubt``
+    what it may be instead.
 
     The time of the IMU is then t + lag + drift (t − t̄), with t the time of GNSS and t̄ :func:`middle`.
     """
