@@ -22,12 +22,12 @@ import pandas as pd
 import pymap3d
 import torch
 from matplotlib.figure import Figure
+from pipelines.studies import sky_figures
 from scipy.stats import chi2
 
 from dlkf.data.schema import ATTITUDE, POSITION, VELOCITY, drive_file
 from dlkf.data.tables import read_drives
 from dlkf.navigation.attitude import rotation_from_rpy
-from dlkf.simulation.gnss import sky_figures
 from dlkf.simulation.gnss.almanac import read_almanac
 from dlkf.simulation.gnss.least_squares import Observations, dilution, solve
 from dlkf.simulation.gnss.satellites import EARTH_SPIN, GRAVITATION, LIGHT, direction, satellite_state, signals

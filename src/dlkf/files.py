@@ -175,9 +175,7 @@ def staged(folder: str | Path) -> Iterator[Path]:
         target.mkdir(parents=True, exist_ok=True)
         beside = Path(tempfile.mkdtemp(prefix=".partial-", dir=target))
     except OSError as error:
-        raise InputError(
-            f"out={folder}: cannot write there ({error.strerror}); give another folder"
-        ) from None
+        raise InputError(f"out={folder}: cannot write there ({error.strerror}); give another folder") from None
     try:
         yield beside
         for source in sorted(p for p in beside.rglob("*") if p.is_file()):

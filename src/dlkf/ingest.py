@@ -18,9 +18,7 @@ def _open(arguments: list[str]) -> list[str]:
 def main(told: IngestSettings) -> None:
     """Read every drive under ``source``, check it and write the dataset ``out``."""
     reader = made(told.reader, "reader")
-    how = Intake(
-        told.split_gaps, told.shortest_s, Limits(gap_s=told.gap_s, gap_samples=told.gap_samples)
-    )
+    how = Intake(told.split_gaps, told.shortest_s, Limits(gap_s=told.gap_s, gap_samples=told.gap_samples))
     count = ingest(reader, told.source, told.out, how, overwrite=told.overwrite, parallel=told.parallel, progress=_tell)
     print(f"{told.out}: {count} drive{'s' if count != 1 else ''}")
 

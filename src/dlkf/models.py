@@ -50,9 +50,7 @@ def resolve_model(
     if folder.is_dir():
         return load_filter(folder)
     if folder.is_file():
-        raise InputError(
-            f"model={spec} is a file; give the folder with {WEIGHTS} and {CONFIG} (pickles are not read)"
-        )
+        raise InputError(f"model={spec} is a file; give the folder with {WEIGHTS} and {CONFIG} (pickles are not read)")
     raise InputError(
         f"unknown model {spec!r}: neither a known filter (plus, {known_filters()}) nor a folder, "
         "an MLflow run id, models:/name@alias or a class of your own, module:Class"

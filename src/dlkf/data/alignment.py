@@ -202,9 +202,7 @@ def _carried_force(
     return total, rate, turned
 
 
-def _level(
-    u_b: Float[Tensor, "*b 3"], u_h: Float[Tensor, "*b 3"]
-) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
+def _level(u_b: Float[Tensor, "*b 3"], u_h: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
     """Roll and pitch with Ry(pitch) Rx(roll) u_b = u_h, u_h in level axes along the heading."""
     x, y, z = u_b.unbind(-1)
     roll = torch.asin((u_h[..., 1] / torch.hypot(y, z)).clamp(-1, 1)) - torch.atan2(y, -z)

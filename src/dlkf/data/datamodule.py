@@ -208,9 +208,7 @@ class DriveDataModule(L.LightningDataModule):
         table = []
         for side in SIDES:
             drives, span = self.drives(side), self.spans[side]
-            pieces = cut_pieces(
-                self.stack, self.eval_length_s, self.eval_stride_s, min_valid=self.min_valid, span=span
-            )
+            pieces = cut_pieces(self.stack, self.eval_length_s, self.eval_stride_s, min_valid=self.min_valid, span=span)
             ends = self.stack.first_row + self.stack.epochs  # the last boundary begins no epoch
             epochs = int((span >= 0).sum() - (span[ends] >= 0).sum())
             table.append(
@@ -229,9 +227,7 @@ class DriveDataModule(L.LightningDataModule):
         rows = self.summary()
         lines = ["split   drives  groups  minutes  pieces"]
         for r in rows:
-            lines.append(
-                f"{r['split']:<6} {r['drives']:>7} {r['groups']:>7} {r['minutes']:>8.1f} {r['pieces']:>7}"
-            )
+            lines.append(f"{r['split']:<6} {r['drives']:>7} {r['groups']:>7} {r['minutes']:>8.1f} {r['pieces']:>7}")
         return "\n".join(lines)
 
     @property

@@ -56,9 +56,7 @@ def epoch_grid(t_imu: np.ndarray, t_fix: np.ndarray, rate_hz: float, epoch_s: fl
     t0 = phase + np.ceil((first - phase - slack) / epoch_s) * epoch_s
     epochs = int(np.floor((last - t0 + slack) / epoch_s))
     if epochs < 1:
-        raise InputError(
-            f"drive {drive}: only {last - first:.2f} s of IMU, shorter than an epoch of {epoch_s:g} s"
-        )
+        raise InputError(f"drive {drive}: only {last - first:.2f} s of IMU, shorter than an epoch of {epoch_s:g} s")
     return Grid(float(t0), epoch_s, epochs, samples)
 
 
@@ -66,9 +64,7 @@ def samples_per_epoch(rate_hz: float, epoch_s: float) -> int:
     """Samples in an epoch; InputError if that is no whole number."""
     samples = round(rate_hz * epoch_s)
     if samples < 1 or abs(samples - rate_hz * epoch_s) > 1e-6:
-        raise InputError(
-            f"rate_hz={rate_hz:g}, epoch_s={epoch_s:g}: an epoch must hold a whole number of samples"
-        )
+        raise InputError(f"rate_hz={rate_hz:g}, epoch_s={epoch_s:g}: an epoch must hold a whole number of samples")
     return samples
 
 
@@ -202,9 +198,7 @@ def reference_at(reference: Columns | None, grid: Grid) -> Truth:
     """
     rows = grid.epochs + 1
     nan3 = np.full((rows, 3), np.nan)
-    empty = Truth(
-        nan3, nan3.copy(), np.full((rows, 3, 3), np.nan), np.zeros(rows, bool), np.full((rows, 6), np.nan)
-    )
+    empty = Truth(nan3, nan3.copy(), np.full((rows, 3, 3), np.nan), np.zeros(rows, bool), np.full((rows, 6), np.nan))
     if reference is None:
         return empty
     known = reference["valid"] & np.isfinite(np.stack([reference[c] for c in (*POSITION, *VELOCITY)])).all(0)
@@ -258,9 +252,7 @@ def _spread(values: np.ndarray, at: np.ndarray, rows: int, fill: float | bool) -
     return out
 
 
-def _ecef(
-    table: Columns, rows: np.ndarray, attitude: bool = False
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _ecef(table: Columns, rows: np.ndarray, attitude: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """ECEF position and velocity, and C_en, or C_eb with ``attitude``, of some rows."""
     lat, lon = (torch.from_numpy(np.radians(table[c][rows])) for c in ("lat_deg", "lon_deg"))
     r_e = ecef_from_geodetic(lat, lon, torch.from_numpy(table["height_m"][rows]))

@@ -79,9 +79,7 @@ def new_dataset(folder: str | Path, overwrite: bool = False) -> Iterator[Path]:
     """
     target = placed(folder).absolute()
     if target.is_file() or (target.is_dir() and any(target.iterdir()) and not overwrite):
-        raise InputError(
-            f"out={folder}: exists already; give another folder, or overwrite=true to replace it"
-        )
+        raise InputError(f"out={folder}: exists already; give another folder, or overwrite=true to replace it")
     with whole_folder(folder) as beside:
         yield beside
 
@@ -140,9 +138,7 @@ def contract_table(kind: str, frame: pd.DataFrame, drive: str) -> pa.Table:
     """
     schema = SCHEMAS[kind]
     if missing := [name for name in schema.names if name not in frame]:
-        raise InputError(
-            f"drive {drive}, {kind}: column {', '.join(missing)} missing; has {', '.join(frame.columns)}"
-        )
+        raise InputError(f"drive {drive}, {kind}: column {', '.join(missing)} missing; has {', '.join(frame.columns)}")
     extra = [name for name in frame.columns if name not in schema.names]
     columns = [pa.array(frame[n].to_numpy(), type=schema.field(n).type) for n in schema.names]
     columns += [pa.array(frame[name]) for name in extra]
@@ -152,9 +148,7 @@ def contract_table(kind: str, frame: pd.DataFrame, drive: str) -> pa.Table:
 def check_name(drive: str) -> str:
     """The drive's name, if it can be part of a path ``drive=<name>``; InputError if not."""
     if not drive or drive.startswith(".") or any(c in drive for c in "/\\=") or drive != drive.strip():
-        raise InputError(
-            f"drive {drive!r}: a drive's name must be non-empty, without '/', '\\', '=' or a leading dot"
-        )
+        raise InputError(f"drive {drive!r}: a drive's name must be non-empty, without '/', '\\', '=' or a leading dot")
     return drive
 
 

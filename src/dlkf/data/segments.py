@@ -55,9 +55,7 @@ def epochs_of(length_s: float, epoch_s: float) -> int:
     """Whole epochs in a length; InputError if there is none."""
     epochs = round(length_s / epoch_s)
     if epochs < 1:
-        raise InputError(
-            f"length of {length_s:g} s is shorter than an epoch of {epoch_s:g} s; give a longer one"
-        )
+        raise InputError(f"length of {length_s:g} s is shorter than an epoch of {epoch_s:g} s; give a longer one")
     return epochs
 
 
@@ -173,9 +171,7 @@ def make_batch(
     return _assemble(stack, drive, first, epochs, frame, truth.corrected(-dx), std, dtype)
 
 
-def whole_drives(
-    drives: Sequence[Drive], starts: Sequence[Start], *, dtype: torch.dtype = torch.float64
-) -> Batch:
+def whole_drives(drives: Sequence[Drive], starts: Sequence[Start], *, dtype: torch.dtype = torch.float64) -> Batch:
     """Complete drives from the given starts on, as one batch padded to the longest."""
     stack = stacked(drives)
     if len(starts) != len(stack):

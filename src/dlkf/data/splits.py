@@ -36,9 +36,7 @@ def split_rows(
     elif isinstance(split, Mapping):
         sides = _named(stack, split)
     else:
-        raise InputError(
-            f"split={split}: must be group, random, or a mapping of train, val and test to groups"
-        )
+        raise InputError(f"split={split}: must be group, random, or a mapping of train, val and test to groups")
     labels = {}
     for side in SIDES:
         of_drive = torch.tensor([i if d.group in sides[side] else -1 for i, d in enumerate(stack)])
@@ -97,9 +95,7 @@ def _named(stack: DriveStack, split: Mapping[str, Sequence[str] | str]) -> dict[
             sides[side] = known - taken
     for a, b in (("train", "val"), ("train", "test"), ("val", "test")):
         if shared := sorted(sides[a] & sides[b]):
-            raise InputError(
-                f"split: group {shared[0]} is in {a} and in {b}; a recording may be on one side only"
-            )
+            raise InputError(f"split: group {shared[0]} is in {a} and in {b}; a recording may be on one side only")
     if empty := [side for side in split if not sides[side]]:
         raise InputError(f"split.{empty[0]}: has no group; name at least one or leave the side out")
     return sides
@@ -115,17 +111,13 @@ def _shuffled_blocks(
         labels[first : first + blocks * block] = count + torch.arange(blocks).repeat_interleave(block)
         count += blocks
     if count < 3:
-        raise InputError(
-            f"split=random: only {count} blocks of the piece length; use shorter pieces or more data"
-        )
+        raise InputError(f"split=random: only {count} blocks of the piece length; use shorter pieces or more data")
     order = np.random.default_rng(seed).permutation(count)
     edges = np.round(np.cumsum([0.0, *fractions]) * count).astype(int)
     sides = {}
     for side, low, high, fraction in zip(SIDES, edges[:-1], edges[1:], fractions):
         if fraction > 0 and high == low:
-            raise InputError(
-                f"split=random: {count} blocks leave none for {side}; use shorter pieces or more data"
-            )
+            raise InputError(f"split=random: {count} blocks leave none for {side}; use shorter pieces or more data")
         mine = torch.zeros(count + 1, dtype=torch.bool)
         mine[torch.from_numpy(order[low:high].copy())] = True
         sides[side] = torch.where(mine[labels], labels, -1)

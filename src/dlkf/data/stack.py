@@ -33,9 +33,7 @@ class DriveStack(Sequence[Drive]):
             raise InputError("no drives: give a dataset with at least one")
         for d in drives:
             if (d.rate_hz, d.epoch_s) != (drives[0].rate_hz, drives[0].epoch_s):
-                raise InputError(
-                    f"drive {d.name}: rate and epoch differ from those of {drives[0].name}; load alike"
-                )
+                raise InputError(f"drive {d.name}: rate and epoch differ from those of {drives[0].name}; load alike")
         lengths = torch.tensor([d.epochs for d in drives])
         self.epochs = lengths
         self.first_epoch = lengths.cumsum(0) - lengths
@@ -67,9 +65,7 @@ class DriveStack(Sequence[Drive]):
     def aligned(self) -> Aligned:
         """Attitude from IMU and GNSS at every boundary of every drive."""
         parts = [align_boundaries(d) for d in self.drives]
-        return Aligned(
-            *(torch.cat([getattr(a, f) for a in parts]) for f in ("ok", "r_e", "v_e", "C_eb", "std"))
-        )
+        return Aligned(*(torch.cat([getattr(a, f) for a in parts]) for f in ("ok", "r_e", "v_e", "C_eb", "std")))
 
     @cached_property
     def origin(self) -> Tensor:

@@ -57,9 +57,7 @@ def drive_rows(folder: str | Path, drives: Sequence[str] | str | None = None) ->
     return [known[name] for name in drives]
 
 
-def drive_from_tables(
-    tables: DriveTables, dataset: str, rate_hz: float, epoch_s: float, dtype: torch.dtype
-) -> Drive:
+def drive_from_tables(tables: DriveTables, dataset: str, rate_hz: float, epoch_s: float, dtype: torch.dtype) -> Drive:
     """One drive's checked tables on its epoch grid; raises InputError if it is shorter than an epoch."""
     imu, gnss = tables.imu, tables.gnss
     fix = torch.from_numpy(gnss["quality"])

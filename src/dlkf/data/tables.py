@@ -82,9 +82,7 @@ def read_table(folder: str | Path, kind: str, drive: str) -> Columns | None:
         if kind == "reference":
             return None
         if kind == "gnss":
-            raise InputError(
-                f"drive {drive}: no GNSS, {place}/ has no Parquet file; a filter needs position fixes"
-            )
+            raise InputError(f"drive {drive}: no GNSS, {place}/ has no Parquet file; a filter needs position fixes")
         raise InputError(f"drive {drive}: {place}/ has no Parquet file though drives.parquet lists the drive")
     pieces = []
     for part in parts:

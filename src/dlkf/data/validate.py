@@ -42,9 +42,7 @@ class DriveTables:
     reference: Columns | None
 
 
-def validate_dataset(
-    folder: str | Path, *, reference: bool = True, limits: Limits = LIMITS
-) -> list[DriveRow]:
+def validate_dataset(folder: str | Path, *, reference: bool = True, limits: Limits = LIMITS) -> list[DriveRow]:
     """Check every drive of a dataset and return their rows; raises InputError for the first fault.
 
     With ``reference=False`` the folder ``reference/`` is not opened.
@@ -112,17 +110,14 @@ def _where(drive: str, kind: str) -> str:
 def _check_time(t: np.ndarray, where: str) -> None:
     bad = np.flatnonzero(~np.isfinite(t))
     if len(bad):
-        raise InputError(
-            f"{where}: row {bad[0]}: t is {t[bad[0]]}; remove the row or give its time in seconds"
-        )
+        raise InputError(f"{where}: row {bad[0]}: t is {t[bad[0]]}; remove the row or give its time in seconds")
     back = np.flatnonzero(np.diff(t) <= 0)
     if len(back):
         k = int(back[0])
         if t[k + 1] == t[k]:
             raise InputError(f"{where}: row {k + 1}: t = {t[k]:.6f} stands twice; remove duplicate samples")
         raise InputError(
-            f"{where}: row {k + 1}: t goes back from {t[k]:.6f} to {t[k + 1]:.6f}; "
-            "sort the rows, or split the drive"
+            f"{where}: row {k + 1}: t goes back from {t[k]:.6f} to {t[k + 1]:.6f}; sort the rows, or split the drive"
         )
 
 
@@ -157,15 +152,11 @@ def _check_gnss(gnss: Columns, imu: Columns, where: str) -> None:
     _check_finite(gnss, (*POSITION, *VELOCITY, *STD), where, nan=True)
     fix = np.isin(gnss["quality"], GNSS_QUALITIES) & np.all([np.isfinite(gnss[c]) for c in POSITION], axis=0)
     if not fix.any():
-        raise InputError(
-            f"{where}: no GNSS fix at all (position NaN or quality 0 in every row); leave the drive out"
-        )
+        raise InputError(f"{where}: no GNSS fix at all (position NaN or quality 0 in every row); leave the drive out")
     for name in STD:
         bad = np.flatnonzero(gnss[name] < 0)
         if len(bad):
-            raise InputError(
-                f"{where}: row {bad[0]}: {name} is {gnss[name][bad[0]]}; must be ≥ 0, or NaN if unknown"
-            )
+            raise InputError(f"{where}: row {bad[0]}: {name} is {gnss[name][bad[0]]}; must be ≥ 0, or NaN if unknown")
     t, first, last = gnss["t"][fix], imu["t"][0], imu["t"][-1]
     if not ((t > first) & (t <= last + 1)).any():
         raise InputError(

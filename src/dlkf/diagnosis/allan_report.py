@@ -59,9 +59,7 @@ def analyse(drive: str, imu: Array, rate_hz: float, base: ImuSpec) -> StaticLog:
     tau, duration = sizes / rate_hz, len(imu) / rate_hz
     variance = np.stack([allan_variance(x, 1 / rate_hz, sizes) for x in imu.T], -1)
     times = {"accel": base.accel.correlation_time, "gyro": base.gyro.correlation_time}
-    fits = {
-        axis: fit_noise(tau, variance[:, k], duration, times[axis.split("_")[0]]) for k, axis in enumerate(AXES)
-    }
+    fits = {axis: fit_noise(tau, variance[:, k], duration, times[axis.split("_")[0]]) for k, axis in enumerate(AXES)}
     for k, triad in enumerate(TRIADS):
         fits[triad] = fit_noise(tau, variance[:, 3 * k : 3 * k + 3].mean(-1), duration, times[triad])
     return StaticLog(drive, duration, rate_hz, tau, np.sqrt(variance), fits)

@@ -75,9 +75,7 @@ def matching(spec: ImuSpec, states: ErrorStates) -> ImuSpec:
     return replace(spec, name=f"{spec.name}, {states.matrix}", accel=of(spec.accel), gyro=of(spec.gyro))
 
 
-def matched_batch(
-    settings: MatchedDrives, spec: ImuSpec, progress: Counted | None = None
-) -> tuple[Batch, Tensor]:
+def matched_batch(settings: MatchedDrives, spec: ImuSpec, progress: Counted | None = None) -> tuple[Batch, Tensor]:
     """The drives as one batch, and the units' matrices M (B, 2, 3, 3).
 
     ``true_imu_error`` of the batch is the bias b(t) alone, without M.

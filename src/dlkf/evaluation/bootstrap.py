@@ -80,9 +80,7 @@ def _dot(weights: Array, values: Array) -> Array:
     return np.where((weights[:, ~finite] > 0).any(-1), np.inf, total)
 
 
-def resampled_weights(
-    groups: NDArray[np.int64], resamples: int, generator: np.random.Generator
-) -> Iterator[Array]:
+def resampled_weights(groups: NDArray[np.int64], resamples: int, generator: np.random.Generator) -> Iterator[Array]:
     """Bootstrap weights (R, U) in blocks: draws of each unit's group; ``groups`` (U,) from 0 up."""
     G = int(groups.max()) + 1
     block = max(1, _CELLS // max(len(groups), 1))

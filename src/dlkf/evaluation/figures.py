@@ -52,9 +52,7 @@ def png(figure: Figure, dpi: int = 130) -> bytes:
     return out.getvalue()
 
 
-def all_figures(
-    scores: Scores, *, by_time: bool, baseline: str | None = None
-) -> Iterator[tuple[str, str, Figure]]:
+def all_figures(scores: Scores, *, by_time: bool, baseline: str | None = None) -> Iterator[tuple[str, str, Figure]]:
     """(file name, caption, figure) of one kind of data.
 
     ``by_time``: the pieces are alike (same length, outage at the same time), so that an average over them at
@@ -119,9 +117,7 @@ def tracks(scores: Scores, pieces: Sequence[int]) -> Figure:
         _absent(axes[0, k], [n for n, p in paths.items() if (np.abs(p - middle) > half).any()])
         known = truth[~np.isnan(truth[:, 0])]
         axes[0, k].plot(known[0, 1], known[0, 0], "o", color="black", ms=5, zorder=5)
-        axes[0, k].annotate(
-            "start", known[0, ::-1], xytext=(6, 6), textcoords="offset points", fontsize=8, zorder=6
-        )
+        axes[0, k].annotate("start", known[0, ::-1], xytext=(6, 6), textcoords="offset points", fontsize=8, zorder=6)
         axes[0, k].set_title(_name(scores, i), fontsize=9)
         if i in hidden:
             _outage_end(axes[1, k], scores, i)
@@ -242,9 +238,7 @@ def imu_errors(scores: Scores, pieces: Sequence[int]) -> Figure:
             style = line_of(scores, name)
             for i in pieces:
                 y = run.imu_error[i, :, k] * scale
-                ax.plot(
-                    scores.t, y, lw=1.7 if alone else 0.9, alpha=1.0 if alone else 0.65, zorder=3, **style
-                )
+                ax.plot(scores.t, y, lw=1.7 if alone else 0.9, alpha=1.0 if alone else 0.65, zorder=3, **style)
                 extent.append(y[settled])
                 if alone:
                     s = run.imu_std[i, :, k] * scale
@@ -295,14 +289,8 @@ def error_growth(scores: Scores, quantity: str = "horizontal", *, seed: int = 0)
         ax.fill_between(seconds, low, high, color=style["color"], alpha=0.15, lw=0, zorder=2)
         ends[name] = float(np.nanmax(rms, initial=0.0))
         tops[name] = max(float(np.nanmax(high, initial=0.0)), ends[name])
-    inside = [
-        n for n in ends if np.isfinite(ends[n]) and ends[n] <= OFF_SCALE * max(min(ends.values()), 1e-9)
-    ]
-    outside = [
-        f"{n} ({number(ends[n])} {'°' if scale > 1 else QUANTITIES[quantity]})"
-        for n in ends
-        if n not in inside
-    ]
+    inside = [n for n in ends if np.isfinite(ends[n]) and ends[n] <= OFF_SCALE * max(min(ends.values()), 1e-9)]
+    outside = [f"{n} ({number(ends[n])} {'°' if scale > 1 else QUANTITIES[quantity]})" for n in ends if n not in inside]
     ax.set_ylim(0, 1.05 * max((tops[n] for n in inside), default=1.0))
     if outside:
         note = f"off the scale at the end: {', '.join(outside)}"
@@ -375,9 +363,7 @@ def _name(scores: Scores, i: int) -> str:
 
 
 def _legend(figure: Figure, handles: Sequence) -> None:
-    figure.legend(
-        handles=handles, loc="outside lower center", ncols=min(len(handles), 6), frameon=False, fontsize=9
-    )
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 6), frameon=False, fontsize=9)
 
 
 def _plain(ax: Axes) -> None:

@@ -95,12 +95,7 @@ def scorable(batch: Batch, outage: Tensor) -> Tensor:
 
 def _bounds(name: str, value: float | Sequence[float]) -> tuple[float, float]:
     values = [value] if isinstance(value, (int, float)) else list(value)
-    if (
-        len(values) not in (1, 2)
-        or not np.isfinite(values).all()
-        or min(values) < 0
-        or values[0] > values[-1]
-    ):
+    if len(values) not in (1, 2) or not np.isfinite(values).all() or min(values) < 0 or values[0] > values[-1]:
         raise InputError(f"{name} is {value!r}, must be a number ≥ 0 or [low, high] in seconds")
     return float(values[0]), float(values[-1])
 

@@ -117,9 +117,7 @@ class Results:
         """One comparison; None for the baseline itself, or what is not compared."""
         wanted = (filter, over, part, quantity, statistic)
         same = (
-            c.against
-            for c in self.comparisons
-            if (c.filter, c.over, c.part, c.quantity, c.against.statistic) == wanted
+            c.against for c in self.comparisons if (c.filter, c.over, c.part, c.quantity, c.against.statistic) == wanted
         )
         return next(same, None)
 

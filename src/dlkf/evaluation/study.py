@@ -37,9 +37,7 @@ def run_scenes(
 ) -> Run:
     """Every filter over the scenes, with ``law`` once more with biases added to the IMU; ``counting`` shows how far."""
     with counting("Running filters") as progress:
-        scores = score_scenes(
-            filters, scenes, total=scenes.runs, kinds=kinds, groups=groups, progress=progress
-        )
+        scores = score_scenes(filters, scenes, total=scenes.runs, kinds=kinds, groups=groups, progress=progress)
     if law is None:
         return Run(scores)
     with counting("Running with injected biases") as progress:
@@ -47,15 +45,12 @@ def run_scenes(
     return Run(scores, *told)
 
 
-def results_of(
-    run: Run, *, baseline: str = BASELINE, settle_s: float = SETTLE_S, seed: int = 0
-) -> list[Results]:
+def results_of(run: Run, *, baseline: str = BASELINE, settle_s: float = SETTLE_S, seed: int = 0) -> list[Results]:
     """The results of each kind of data, with the ``injected_slope`` of each filter's IMU-error estimate where biases
     were added."""
     scores = run.scores
     made = [
-        summarise_scores(scores.of_kind(kind), settle_s=settle_s, baseline=baseline, seed=seed)
-        for kind in scores.kinds
+        summarise_scores(scores.of_kind(kind), settle_s=settle_s, baseline=baseline, seed=seed) for kind in scores.kinds
     ]
     if run.cause is None:
         return made

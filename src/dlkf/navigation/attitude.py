@@ -117,9 +117,7 @@ def rotation_from_rpy(rpy: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 def rpy_from_rotation(C: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     """Roll, pitch, yaw [rad] of C_nb, yaw in (−π, π] (Groves 2.23)."""
     pitch = torch.atan2(-C[..., 2, 0], torch.hypot(C[..., 2, 1], C[..., 2, 2]))
-    return torch.stack(
-        (torch.atan2(C[..., 2, 1], C[..., 2, 2]), pitch, torch.atan2(C[..., 1, 0], C[..., 0, 0])), -1
-    )
+    return torch.stack((torch.atan2(C[..., 2, 1], C[..., 2, 2]), pitch, torch.atan2(C[..., 1, 0], C[..., 0, 0])), -1)
 
 
 def orthonormalised(C: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:

@@ -84,9 +84,7 @@ def _mean(t: Tensors, node: Node, x: Any, dims: Any = None, keepdim: bool = Fals
     return out
 
 
-def _variance(
-    t: Tensors, node: Node, x: Any, dims: Any = None, *, correction: Any = 1, keepdim: bool = False
-) -> View:
+def _variance(t: Tensors, node: Node, x: Any, dims: Any = None, *, correction: Any = 1, keepdim: bool = False) -> View:
     view = t.tensor(x)
     dims = _axes(dims, view.meta.ndim)
     mean = _mean(t, node, view, dims, keepdim)

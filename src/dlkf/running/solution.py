@@ -33,13 +33,7 @@ STD_COLUMNS = (
     + tuple(f"std_{a}" for a in _RPY)
     + tuple(f"std_{c}" for c in IMU_COLUMNS)
 )
-COLUMNS = (
-    ("t", "lat_deg", "lon_deg", "height_m")
-    + tuple(f"vel_{a}" for a in _NED)
-    + _RPY
-    + IMU_COLUMNS
-    + STD_COLUMNS
-)
+COLUMNS = ("t", "lat_deg", "lon_deg", "height_m") + tuple(f"vel_{a}" for a in _NED) + _RPY + IMU_COLUMNS + STD_COLUMNS
 GEOMETRY = {  # geoparquet.org, version 1.1; without a crs it is longitude and latitude on WGS 84 (OGC:CRS84)
     "version": "1.1.0",
     "primary_column": "geometry",

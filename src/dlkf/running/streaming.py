@@ -227,9 +227,7 @@ class StreamingFilter:
         imu, dt = torch.from_numpy(tail[0]).to(self._device), tail[1]
         running = self._running
         window = strapdown(running.state, running.error.corrected(imu), dt, running.frame)
-        return replace(
-            self._latest, t=self._samples.latest, frame=running.frame, state=window.end, gnss_used=False
-        )
+        return replace(self._latest, t=self._samples.latest, frame=running.frame, state=window.end, gnss_used=False)
 
     def _answer(self, status: Status, reason: str = "", estimates: Sequence[Estimate] = ()) -> Receipt:
         self.counts[status] += 1

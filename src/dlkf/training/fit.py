@@ -44,9 +44,7 @@ def fit(
     stored beside the weights. Raises InputError where no epoch was validated, or none had a finite ``monitor``.
     """
     plan = settings.trainer
-    module = FilterTraining(
-        settings.model, settings.loss, settings.optimizer, settings.scheduler, seed=settings.seed
-    )
+    module = FilterTraining(settings.model, settings.loss, settings.optimizer, settings.scheduler, seed=settings.seed)
     last = folder / LAST
     if settings.finetune:
         module.filter = trained_filter(settings.finetune).train()

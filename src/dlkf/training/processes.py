@@ -72,9 +72,7 @@ def joined_by(command: Sequence[str] | None, count: int) -> Iterator[None]:
         }  # fmt: skip
         before = {key: os.environ.get(key) for key in ours}
         os.environ.update(ours)
-        others = [
-            subprocess.Popen(command, env=os.environ | {RANK: str(k), READY: ready}) for k in range(1, count)
-        ]
+        others = [subprocess.Popen(command, env=os.environ | {RANK: str(k), READY: ready}) for k in range(1, count)]
         try:
             while len(list(Path(ready).iterdir())) < len(others):
                 _check(others)

@@ -38,7 +38,6 @@ class SchedulerSettings(Ranged, where="scheduler"):
     lr_min: float = within(1e-5, 0, 1e3)
 
 
-
 @dataclass(frozen=True)
 class TrainerSettings(Ranged, where="trainer"):
     """Epochs, validation and checkpoints, as the comments of ``conf/train.yaml`` say."""

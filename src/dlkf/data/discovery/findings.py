@@ -157,9 +157,7 @@ def _drift(out: Findings, pose: Pose | None, wanted: set[str], sure: Sure, reach
     out.add(setting, round(1e6 * pose.drift, 1), setting in wanted, told)
 
 
-def _offset(
-    out: Findings, lag: Lag | None, pose: Pose | None, wanted: set[str], sure: Sure, before_s: float
-) -> None:
+def _offset(out: Findings, lag: Lag | None, pose: Pose | None, wanted: set[str], sure: Sure, before_s: float) -> None:
     """The offset of the first fix, ``before_s`` before the middle that the pose's lag is of."""
     setting = "gnss.time.offset_s" if "gnss.time.offset_s" in wanted else "imu.time.offset_s"
     sign = 1.0 if setting.startswith("gnss") else -1.0

@@ -44,9 +44,7 @@ class BestWeights(Callback):
     A value that is not finite keeps nothing; InputError where the monitor is not among what was logged.
     """
 
-    def __init__(
-        self, folder: str, monitor: str, start_epoch: int = 0, notes: Mapping[str, Any] | None = None
-    ) -> None:
+    def __init__(self, folder: str, monitor: str, start_epoch: int = 0, notes: Mapping[str, Any] | None = None) -> None:
         self.folder, self.monitor, self.start_epoch, self.notes = Path(folder), monitor, start_epoch, notes
         self.score, self.epoch = float("inf"), -1
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pandas as pd
 import pytest
+from pipelines.studies import sky_figures
 from pipelines.studies.satellite_sky import above_horizon, fix_errors, summary, tables
-from tests.drives import drives_in
 
 from dlkf.data.tables import read_table
 from dlkf.data.validate import validate_dataset
 from dlkf.navigation.imu_errors import SensorErrors
-from dlkf.simulation.gnss import sky_figures
+from tests.drives import drives_in
 
 QUIET = {**dict.fromkeys(SensorErrors.__dataclass_fields__, 0.0), "correlation_time": 3600.0}
 
