@@ -1,5 +1,7 @@
 """Plain values become settings in one way, and what is odd is told in one way."""
 
+import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -7,7 +9,7 @@ from typing import Literal
 import pytest
 
 from dlkf.errors import InputError
-from dlkf.settings import settings_from
+from dlkf.settings import Ranged, settings_from, within
 
 
 @dataclass(frozen=True)
@@ -54,3 +56,35 @@ def test_values_of_the_right_type_become_settings():
 def test_mistakes_have_one_text(given, told):
     with pytest.raises(InputError, match=told):
         settings_from(Outer, given, "outer")
+
+
+@dataclass(frozen=True)
+class Spring(Ranged, where="spring", least=0):
+    name: str = "soft"
+    length_m: float = 1.0
+    damping: float | None = within(0.2, 0.05, 2)
+
+
+@pytest.mark.parametrize("given", [{"length_m": 0}, {"damping": 0.05}, {"damping": 2}, {"damping": None}])
+def test_the_ends_of_a_range_belong_to_it(given):
+    assert Spring(**given)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"length_m": -1e-9}, "spring: length_m is -1e-09, must be a finite number ≥ 0"),
+        ({"length_m": math.inf}, "length_m is inf"),
+        ({"damping": 0.04}, "spring: damping is 0.04, must be from 0.05 to 2"),
+        ({"damping": 2.1}, "damping is 2.1"),
+        ({"damping": math.nan}, "damping is nan"),
+    ],
+)
+def test_what_is_out_of_range_has_one_text(given, told):
+    with pytest.raises(InputError, match=re.escape(told)):
+        Spring(**given)
+
+
+def test_the_whole_of_a_command_has_its_own_text_for_an_unknown_key():
+    with pytest.raises(InputError, match="unknown config key 'lenght_s'; --cfg job"):
+        settings_from(Outer, {"name": "x", "lenght_s": 1}, "")

@@ -86,4 +86,4 @@ def test_the_command_writes_table_picture_and_numbers(call):
     done = call("consistency", "model=ins", "out=nowhere", *size)
     assert done.code == 2 and "model ins has no covariance" in done.err and not Path("nowhere").exists()
     done = call("consistency", "model=mbkf15", "out=nowhere", "drives=1")
-    assert done.code == 2 and "drives=1" in done.err
+    assert done.code == 2 and "drives is 1" in done.err

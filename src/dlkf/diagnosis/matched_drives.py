@@ -21,11 +21,10 @@ from dlkf.data.segments import Piece, StartLaw, make_batch
 from dlkf.data.store import drive_from_tables
 from dlkf.data.tables import Columns, DriveRow
 from dlkf.data.validate import DriveTables
-from dlkf.errors import InputError
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.navigation.state import ErrorStates
 from dlkf.ranges import draw
-from dlkf.settings import settings_from
+from dlkf.settings import Ranged, settings_from, within
 from dlkf.simulation.drive import sliced
 from dlkf.simulation.imu import corrupt, draw_unit, inverse_mechanisation
 from dlkf.simulation.motion.chassis import ChassisConfig, draw_car, mounted
@@ -35,29 +34,19 @@ from dlkf.simulation.tables import fix_columns, imu_columns, reference_columns
 
 
 @dataclass(frozen=True)
-class MatchedDrives:
+class MatchedDrives(Ranged, where="consistency"):
     """How many drives, how long, and what a filter is given: 1 Hz GNSS and start errors, 1σ."""
 
-    drives: int = 100
-    minutes: float = 5.0
-    rate_hz: int = 50
-    position_m: float = 0.02
-    velocity_mps: float = 0.05
+    drives: int = within(100, 2, 10**6)
+    minutes: float = within(5.0, 0.5, 60)
+    rate_hz: int = within(50, 10, 1000)
+    position_m: float = within(0.02, 1e-9, 1e3)
+    velocity_mps: float = within(0.05, 1e-9, 1e3)
     vehicle: VehicleConfig = field(default_factory=VehicleConfig)
     chassis: ChassisConfig = field(default_factory=ChassisConfig)
     start: StartLaw = field(default_factory=StartLaw)
     seed: int = 0
     cars: Mapping[str, Any] | None = None  # ranges that the chassis of each drive is drawn from, if any
-
-    def __post_init__(self) -> None:
-        if not (isinstance(self.drives, int) and self.drives >= 2):
-            raise InputError(f"drives={self.drives} must be a whole number of at least 2")
-        if not 0.5 <= self.minutes <= 60:
-            raise InputError(f"minutes={self.minutes} is outside 0.5 to 60")
-        if not (isinstance(self.rate_hz, int) and 10 <= self.rate_hz <= 1000):
-            raise InputError(f"rate_hz={self.rate_hz} must be a whole number from 10 to 1000")
-        if not (self.position_m > 0 and self.velocity_mps > 0):
-            raise InputError("gnss.position_m and gnss.velocity_mps must be above 0")
 
 
 def matching(spec: ImuSpec, states: ErrorStates) -> ImuSpec:

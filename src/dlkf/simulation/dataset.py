@@ -11,7 +11,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -25,7 +25,7 @@ from dlkf.files import absolute, is_url, placed
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.parallel import check, each
 from dlkf.ranges import draw, has_ranges, middle
-from dlkf.settings import settings_from
+from dlkf.settings import Ranged, settings_from, within
 from dlkf.simulation.drive import DriveTables, Rates, Seeds, simulate_drive
 from dlkf.simulation.gnss.almanac import read_almanac
 from dlkf.simulation.gnss.receiver import Receiver, receiver_spec
@@ -41,7 +41,7 @@ OF_ALL_DRIVES = ("name", "hours", "drive_minutes", "imu_errors", "unit_seed")
 
 
 @dataclass(frozen=True)
-class DatasetConfig:
+class DatasetConfig(Ranged, where="dataset"):
     """What to simulate. ``imu_errors``: ``one`` unit for all drives, a new one ``per_drive``, a ``fleet``, or ``wide``.
 
     With ``one``, turn-on bias, scale factors and misalignment are drawn once, from ``unit_seed``: the same
@@ -55,13 +55,13 @@ class DatasetConfig:
     """
 
     name: str
-    hours: float = 5.0
-    drive_minutes: float = 10.0
-    imu_rate_hz: int = 100
-    reference_rate_hz: int = 10
-    imu_parts: int = 0
-    imu_errors: str = "one"
-    unit_seed: int = 0
+    hours: float = within(5.0, 0.005, 1e5)
+    drive_minutes: float = within(10.0, 0.25, LONGEST_DRIVE)
+    imu_rate_hz: int = within(100, 10, 2000)
+    reference_rate_hz: int = within(10, 1, 2000)
+    imu_parts: int = within(0, 0, 16)
+    imu_errors: Literal["one", "per_drive", "fleet", "wide"] = "one"
+    unit_seed: int = within(0, 0, 2**63)
     fleet: Mapping[str, ImuSpec] = field(default_factory=dict)
     vehicle: VehicleConfig = field(default_factory=VehicleConfig)
     chassis: ChassisConfig = field(default_factory=ChassisConfig)
@@ -73,30 +73,15 @@ class DatasetConfig:
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", self.name):
             raise InputError(f"dataset: name {self.name!r} must be letters, digits, _ . - ")
-        if not 0.005 <= self.hours <= 1e5:
-            raise InputError(f"dataset: hours {self.hours} is outside 0.005 (18 s) to 100000")
-        if not 0.25 <= self.drive_minutes <= LONGEST_DRIVE:
-            raise InputError(f"dataset: drive_minutes {self.drive_minutes} is outside 0.25 to {LONGEST_DRIVE:g}")
-        for name in ("imu_rate_hz", "reference_rate_hz"):
-            rate = getattr(self, name)
-            if rate != round(rate) or not 1 <= rate <= 2000:
-                raise InputError(f"dataset: {name} {rate} must be a whole number from 1 to 2000")
-        if self.imu_rate_hz < 10:
-            raise InputError(f"dataset: imu_rate_hz {self.imu_rate_hz} is below 10, too slow for a car")
+        super().__post_init__()
         rates = {"gnss.rate_hz": self.gnss.rate_hz, "reference_rate_hz": self.reference_rate_hz}
         for name, rate in rates.items():
             samples = self.imu_rate_hz / rate if rate > 0 else 0.0
             if samples < 1 or abs(samples - round(samples)) > 1e-9:
                 raise InputError(f"dataset: imu_rate_hz {self.imu_rate_hz} is not a multiple of {name} {rate}")
-        if self.imu_parts != round(self.imu_parts) or not 0 <= self.imu_parts <= 16:
-            raise InputError(f"dataset: imu_parts {self.imu_parts} must be a whole number from 0 to 16")
-        if self.imu_errors not in ("one", "per_drive", "fleet", "wide"):
-            raise InputError(f"dataset: imu_errors {self.imu_errors!r} must be one, per_drive, fleet or wide")
         if self.imu_errors == "fleet" and not self.fleet:
             raise InputError("dataset: imu_errors is fleet, but fleet names no IMU presets (see simulated/fleet.yaml)")
-        if not isinstance(self.unit_seed, int) or self.unit_seed < 0:
-            raise InputError(f"dataset: unit_seed {self.unit_seed!r} must be a whole number ≥ 0")
-        if not isinstance(self.raw, bool) or (self.raw and self.receiver is None):
+        if self.raw and self.receiver is None:
             raise InputError(f"raw={self.raw}: there are raw observations with a satellite receiver=<preset> only")
         epochs = self.gnss.rate_hz * self.drive_minutes * 60
         if self.receiver is not None and epochs > MOST_EPOCHS:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlkf.errors import InputError
+from dlkf.settings import Ranged, within
 
 Array = NDArray[np.floating]
 KMH = 1 / 3.6
@@ -66,7 +67,7 @@ class Manoeuvres:
 
 
 @dataclass(frozen=True)
-class VehicleConfig:
+class VehicleConfig(Ranged, where="vehicle"):
     """Bounds of the motion, where it starts, and the road.
 
     ``slope_std`` is the RMS grade, ``bank_std`` the RMS cross slope, 0 for a flat road; in a turn the road is
@@ -75,47 +76,33 @@ class VehicleConfig:
     """
 
     max_speed_kmh: float = 80.0
-    max_acceleration: float = 2.0  # m/s², along the road
+    max_acceleration: float = within(2.0, 0.2, 10)  # m/s², along the road
     min_radius: float = 40.0  # m
     max_radius: float = 150.0
     min_lateral: float = 0.5  # m/s², on the plateau of a turn
     max_lateral: float = 5.0
-    slope_std: float = 0.03
-    bank_std: float = 0.0
-    superelevation: float = 0.0
-    wander_deg: float = 0.0
-    lat_deg: float = 52.15
-    lon_deg: float = 9.95
-    height_m: float = 100.0
+    slope_std: float = within(0.03, 0, 0.1)
+    bank_std: float = within(0.0, 0, 0.1)
+    superelevation: float = within(0.0, 0, 0.1)
+    wander_deg: float = within(0.0, 0, 3)
+    lat_deg: float = within(52.15, -80, 80)
+    lon_deg: float = within(9.95, -180, 180)
+    height_m: float = within(100.0, -500, 9000)
     manoeuvres: Manoeuvres = field(default_factory=Manoeuvres)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for low, high in (("min_radius", "max_radius"), ("min_lateral", "max_lateral")):
             if not 0 < getattr(self, low) <= getattr(self, high):
                 raise InputError(
                     f"vehicle: {low} {getattr(self, low)} and {high} {getattr(self, high)} "
                     f"must be positive and in that order"
                 )
-        if not 0.2 <= self.max_acceleration <= 10:
-            raise InputError(f"vehicle: max_acceleration {self.max_acceleration} m/s² is outside 0.2 to 10")
-        if not 0 <= self.slope_std <= 0.1:
-            raise InputError(f"vehicle: slope_std {self.slope_std} is outside 0 to 0.1")
-        if not 0 <= self.bank_std <= 0.1:
-            raise InputError(f"vehicle: bank_std {self.bank_std} is outside 0 to 0.1")
-        if not 0 <= self.superelevation <= 0.1:
-            raise InputError(f"vehicle: superelevation {self.superelevation} rad/(m/s²) is outside 0 to 0.1")
-        if not 0 <= self.wander_deg <= 3:
-            raise InputError(f"vehicle: wander_deg {self.wander_deg} is outside 0 to 3")
         slowest = math.sqrt(self.min_lateral * self.min_radius) / KMH
         if not slowest <= self.max_speed_kmh <= 300:
             raise InputError(
                 f"vehicle: max_speed_kmh {self.max_speed_kmh} is outside {slowest:.1f} to 300: a turn of "
                 f"{self.min_radius} m radius with {self.min_lateral} m/s² lateral takes {slowest:.1f} km/h"
-            )
-        if not (abs(self.lat_deg) <= 80 and abs(self.lon_deg) <= 180 and -500 <= self.height_m <= 9000):
-            raise InputError(
-                f"vehicle: start at {self.lat_deg}°, {self.lon_deg}°, {self.height_m} m is outside "
-                f"±80°, ±180°, -500 to 9000 m"
             )
 
     @property
