@@ -19,6 +19,16 @@ def test_ecef_agrees_with_pyproj():
     assert np.abs(ecef_from_geodetic(lat, lon, height).numpy() - expected).max() < 1e-6  # rounding of 6.4e6 m
 
 
+def test_gravity_falls_with_height_as_bruns_says():
+    """−∂γ/∂h = γ (1/M + 1/N) + 2 ω² (Moritz, Physical Geodesy 2-148); ours is of first order in f, f² is 1e-5: 4e-5."""
+    lat = torch.linspace(-1.5, 1.5, 13, dtype=torch.float64)
+    low, here, high = (normal_gravity(torch.sin(lat), torch.full_like(lat, h)) for h in (-50.0, 0.0, 50.0))
+    a, e2, omega = 6378137.0, 6.69437999014e-3, 7.292115e-5
+    w = 1 - e2 * torch.sin(lat) ** 2
+    bruns = here * (w**1.5 / (a * (1 - e2)) + w**0.5 / a) + 2 * omega**2
+    assert ((low - high) / 100 / bruns - 1).abs().max() < 5e-5
+
+
 @pytest.mark.parametrize("height", [0.0, 300.0, 2000.0])
 def test_gravity_agrees_with_python_ins(height):
     lat = torch.linspace(-1.5, 1.5, 13, dtype=torch.float64)
