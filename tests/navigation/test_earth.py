@@ -20,7 +20,7 @@ def test_ecef_agrees_with_pyproj():
 
 
 def test_gravity_falls_with_height_as_bruns_says():
-    """−∂γ/∂h = γ (1/M + 1/N) + 2 ω² (Heiskanen & Moritz, Physical Geodesy); ours is of first order in f, f² is 1e-5: 4e-5."""
+    """−∂γ/∂h = γ (1/M + 1/N) + 2 ω² (Heiskanen & Moritz, Physical Geodesy); ours is of first order in f: 4e-5."""
     lat = torch.linspace(-1.5, 1.5, 13, dtype=torch.float64)
     low, here, high = (normal_gravity(torch.sin(lat), torch.full_like(lat, h)) for h in (-50.0, 0.0, 50.0))
     a, e2, omega = 6378137.0, 6.69437999014e-3, 7.292115e-5
