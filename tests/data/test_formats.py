@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime, timedelta
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import NamedTuple
@@ -12,8 +13,11 @@ from hydra.utils import get_class
 
 from dlkf.command.composing import composed
 from dlkf.data.intake import ingest_drives
+from dlkf.data.readers.formats import novatel
 from dlkf.data.readers.frames import DriveFrames
+from dlkf.data.readers.units import WEEK_S
 from dlkf.data.summary import drive_line
+from dlkf.errors import InputError
 from tests.cars import car
 from tests.data import logs
 
@@ -139,3 +143,60 @@ def test_kitti_as_its_own_tool_reads_it(drive, tmp_path):
         np.testing.assert_allclose(read[name], state[column], rtol=1e-11, atol=1e-9)
     np.testing.assert_allclose(read["vu"], -state["vel_d"], atol=1e-9)
     assert set(read["pos_accuracy"]) == {0.02} and set(read["posmode"]) == {4}
+
+
+def _utc(gps: float) -> datetime:
+    return datetime(1980, 1, 6) + timedelta(seconds=round(gps - 18, 3))
+
+
+def _sow(gps: float) -> str:
+    return f"{gps % WEEK_S:.3f}"
+
+
+IE_TIMES = {
+    "sow": ("Week GPSTime", "(weeks) (sec)", lambda gps: f"{gps // WEEK_S:.0f} {_sow(gps)}"),
+    "utc": ("UTCDate UTCTime", "(MDY) (HMS)", lambda gps: f"{_utc(gps):%m/%d/%Y %H:%M:%S.%f}"),
+    "utc, day first": ("UTCDate UTCTime", "(DMY) (HMS)", lambda gps: f"{_utc(gps):%d/%m/%Y %H:%M:%S.%f}"),
+    "utc, year first, no units": ("UTCDate UTCTime", "", lambda gps: f"{_utc(gps):%Y-%m-%d %H:%M:%S.%f}"),
+    "gps date": ("GPSDate GPSTime", "(YMD) (HMS)", lambda gps: f"{_utc(gps + 18):%Y/%m/%d %H:%M:%S.%f}"),
+    "date and week's seconds": ("UTCDate GPSTime", "(MDY) (sec)", lambda gps: f"{_utc(gps):%m/%d/%Y} {_sow(gps)}"),
+    "both": (
+        "UTCDate Week GPSTime",
+        "(MDY) (weeks) (sec)",
+        lambda gps: f"{_utc(gps):%m/%d/%Y} {gps // WEEK_S:.0f} {_sow(gps)}",
+    ),
+}
+
+
+@pytest.mark.parametrize("begin", [2350 * WEEK_S + 345_600, 2350 * WEEK_S - 5], ids=["midweek", "week's end"])
+@pytest.mark.parametrize("time", IE_TIMES)
+def test_an_export_of_inertial_explorer_in_any_time(time, begin, tmp_path):
+    """The same instants, under names in another order, whatever they are told by; over the end of a week, too."""
+    names, marks, cell = IE_TIMES[time]
+    stamps = begin + np.arange(20.0)
+    lines = [f" 1 48.{k:07d} {cell(t)} 11.5 500.0" for k, t in enumerate(stamps)]
+    head = f"Q Latitude {names} Longitude H-Ell"
+    below = "\n" + " ".join(["(1-6)", "(deg)", marks, "(deg)", "(m)"]) if marks else ""
+    top = "Project: town\nProgram: Inertial Explorer\n\n"
+    (tmp_path / "town.txt").write_text(f"{top}{head}{below}\n" + "\n".join(lines))
+    table = novatel.read(tmp_path / "town.txt", kind="gnss", table=None, text={}).frame
+    np.testing.assert_allclose(table["Week"] * WEEK_S + table["GPSTime"], stamps, atol=1e-6)
+    np.testing.assert_allclose(table["Latitude"], [float(f"48.{k:07d}") for k in range(20)])
+
+
+@pytest.mark.parametrize(
+    ("date", "said"), [("03/04/2025", "day or month first"), ("13/13/2025", "no day"), ("today", "must be a date")]
+)
+def test_a_date_that_says_not_which_is_refused(date, said, tmp_path):
+    (tmp_path / "town.txt").write_text(f"UTCDate UTCTime Latitude\n{date} 10:00:00 48.0\n{date} 10:00:01 48.0\n")
+    with pytest.raises(InputError, match=said):
+        novatel.read(tmp_path / "town.txt", kind="gnss", table=None, text={})
+
+
+def test_units_that_some_columns_lack_stand_under_their_names(tmp_path):
+    """Q and Name have none; the latitude's three cells are seen by the unit below it."""
+    head = "   Week      GPSTime  Name       Latitude  Q\n  (weeks)      (sec)        (+/-D M S)   \n"
+    (tmp_path / "town.txt").write_text(head + "   2350  1.0  a  -48 30 00.0 1\n   2350  2.0  b  -48 30 36.0 1\n")
+    table = novatel.read(tmp_path / "town.txt", kind="gnss", table=None, text={}).frame
+    np.testing.assert_allclose(table["Latitude"], [-48.5, -48.51])
+    assert list(table["Name"]) == ["a", "b"] and list(table["Q"]) == [1, 1]

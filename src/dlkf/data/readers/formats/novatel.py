@@ -1,6 +1,7 @@
 """NovAtel's texts: exports of Inertial Explorer, and ASCII logs of OEM receivers (#BESTPOSA, %RAWIMUSA, …).
 
-An export keeps the names of its own header; a latitude in degrees, minutes and seconds becomes degrees. Of the logs,
+An export keeps the names of its own header; a latitude in degrees, minutes and seconds becomes degrees, dates become
+GPS weeks. Of the logs,
 fixes have the contract's columns (BESTPOS with BESTVEL), INSPVA those of a reference, and an IMU's counts the names
 ``accel_x`` … ``gyro_z`` in counts, whose unit depends on the IMU. All have ``week`` and ``sow``.
 """
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from dlkf.data.readers import units
 from dlkf.data.readers.formats.text import decoded
 from dlkf.data.readers.frames import Table
 from dlkf.data.schema import POSITION, STD, VELOCITY
@@ -38,10 +40,10 @@ def _export(lines: list[str], path: Path) -> Table:
     if not heads or heads[0] + 2 >= len(lines):
         raise InputError(f"{path}: has no header with GPSTime or Latitude; export it with headers")
     names = lines[heads[0]].split()
-    marks = re.findall(r"\([^)]*\)", lines[heads[0] + 1])
-    first = heads[0] + (2 if marks else 1)
+    marks = _marks(lines[heads[0]], lines[heads[0] + 1])
+    first = heads[0] + (2 if any(marks) else 1)
     rows = [(k + 1, line.split()) for k, line in enumerate(lines) if k >= first and line.strip()]
-    widths = [3 if "D M S" in m else 1 for m in marks] if len(marks) == len(names) else [1] * len(names)
+    widths = [3 if "D M S" in m else 1 for m in marks]
     notes = ()
     if rows and len(rows[-1][1]) < sum(widths):
         notes = (f"{path.name}: line {rows[-1][0]}, the last, is cut off: left out",)
@@ -62,7 +64,67 @@ def _export(lines: list[str], path: Path) -> Table:
             numbers = pd.to_numeric(part.iloc[:, 0], errors="coerce")
             out[name] = part.iloc[:, 0].to_numpy() if bool(numbers.isna().any()) else numbers.to_numpy()
         at += width
-    return Table(pd.DataFrame(out, index=cells.index), path, "line", dict(zip(names, marks)), notes)
+    out |= _weeks(out, dict(zip(names, marks)), str(path))
+    return Table(pd.DataFrame(out, index=cells.index), path, "line", {n: m for n, m in zip(names, marks) if m}, notes)
+
+
+def _marks(names: str, units_of_them: str) -> list[str]:
+    """The unit of each name, ``""`` where it has none: in their order, or those that stand under the names."""
+    heads = [(m.start() + m.end(), m[0]) for m in re.finditer(r"\S+", names)]
+    below = [(m.start() + m.end(), m[0]) for m in re.finditer(r"\([^)]*\)", units_of_them)]
+    if len(below) == len(heads):
+        return [mark for _, mark in below]
+    marks = [""] * len(heads)
+    for place, mark in below:
+        marks[min(range(len(heads)), key=lambda k: abs(heads[k][0] - place))] = mark
+    return marks
+
+
+def _weeks(columns: Mapping[str, Any], marks: Mapping[str, str], where: str) -> dict[str, Any]:
+    """``Week`` and ``GPSTime`` [s of the week] of an export that has dates instead: of UTC, or of GPS time.
+
+    A date beside seconds of GPSTime tells their week; a time of day is HMS, or seconds of UTCTime.
+    """
+    date = next((n for n in ("GPSDate", "UTCDate", "Date") if n in columns), None)
+    if "Week" in columns or date is None:
+        return {}
+    day = _days(pd.Series(columns[date]).astype(str), marks.get(date, ""), f"{where}: {date}")
+    times = ("UTCTime", "GPSTime") if date == "UTCDate" else ("GPSTime", "UTCTime")
+    time = next((n for n in times if n in columns), None)
+    if time is None:
+        raise InputError(f"{where}: has {date} and neither UTCTime nor GPSTime beside it; export one of them")
+    texts = pd.Series(columns[time]).astype(str)
+    clock = bool(texts.str.contains(":").all())
+    if clock:
+        of_day = texts.str.split(":", expand=True).apply(pd.to_numeric, errors="coerce").to_numpy() @ [3600, 60, 1]
+    else:
+        of_day = pd.to_numeric(texts, errors="coerce").to_numpy()
+    if not np.isfinite(of_day).all():
+        raise InputError(f"{where}: {time} has {texts[~np.isfinite(of_day)].iloc[0]!r}, must be seconds or H:M:S")
+    if time == "GPSTime" and not clock:
+        week = np.round((day - units.GPS_EPOCH_UNIX + 43_200 - of_day) / units.WEEK_S).astype(np.int64)
+        return {"Week": week}
+    whole = day + np.floor(of_day).astype(np.int64)
+    gps = whole - units.GPS_EPOCH_UNIX + (units.leap_seconds(whole) if time == "UTCTime" else 0)
+    return {"Week": gps // units.WEEK_S, "GPSTime": gps % units.WEEK_S + of_day % 1}
+
+
+def _days(texts: pd.Series, mark: str, where: str) -> np.ndarray:
+    """Unix times of the days 11/14/2019 (MDY), 14/11/2019 (DMY), 2019/11/14 (YMD)."""
+    parts = texts.str.split(r"[/.-]", expand=True).apply(pd.to_numeric, errors="coerce")
+    if parts.shape[1] != 3 or bool(parts.isna().any(axis=None)):
+        raise InputError(f"{where} has {texts.iloc[0]!r}, must be a date such as 11/14/2019")
+    order = mark.strip("()").upper()
+    if order not in ("MDY", "DMY", "YMD"):
+        first, second = float(parts[0].max()), float(parts[1].max())
+        order = "YMD" if first > 31 else "DMY" if first > 12 else "MDY" if second > 12 else ""
+    if not order:
+        raise InputError(f"{where}: {texts.iloc[0]} may be day or month first; export it with its unit (MDY) or (DMY)")
+    named = {name: parts[order.index(letter)] for name, letter in (("year", "Y"), ("month", "M"), ("day", "D"))}
+    days = pd.to_datetime(pd.DataFrame(named), errors="coerce")
+    if bool(days.isna().any()):
+        raise InputError(f"{where} has {texts[days.isna()].iloc[0]!r}, which is no day ({order})")
+    return days.to_numpy().astype("datetime64[s]").astype(np.int64)
 
 
 def _logs(lines: list[str], path: Path, kind: str, table: str | None) -> Table:
