@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol, TypeGuard, runtime_checkable
 
 import torch
@@ -135,7 +135,7 @@ class Mbkf:
         Q = memory.windows.noise(Phi, None if process is None else source_scale(process, epoch.start.C_nb))
         if memory.noise is not None:
             Q = torch.where(memory.noise.settled[:, None, None], memory.noise.Q, Q)
-        predicted = torch.baddbmm(Q, torch.bmm(Phi, memory.P), Phi.mT)
+        predicted = torch.baddbmm(Q, Phi, torch.bmm(Phi, memory.P).mT)  # P is symmetric
         believed = Believed(predicted, memory.structure, memory.noise)
         fix, fix_memory = self.fix.rows(epoch, memory.fix, believed)
         believed = believed._replace(P=fix.P)
@@ -207,15 +207,14 @@ def has_covariance(estimator: object) -> TypeGuard[Analytic]:
 def kalman_update(
     P: Float[Tensor, "B n n"], H: Float[Tensor, "B m n"], R: Float[Tensor, "B m"]
 ) -> tuple[Float[Tensor, "B n m"], Float[Tensor, "B n n"]]:
-    """Gain K = P Hᵀ (H P Hᵀ + R)⁻¹ and Joseph-form covariance for diagonal R (paper eqs 4, 6)."""
+    """Gain K = P Hᵀ (H P Hᵀ + R)⁻¹ and Joseph-form covariance for diagonal R (paper eqs 4, 6).
+
+    (I − K H) P (I − K H)ᵀ + K R Kᵀ = X − K (H X − R Kᵀ) with X = P − (H P)ᵀ Kᵀ, for any K: P is symmetric, and there is
+    no product of n × n matrices.
+    """
     HP = torch.bmm(H, P)
     S = torch.baddbmm(torch.diag_embed(R), HP, H.mT)
-    K = torch.linalg.solve_ex(S, HP)[0].mT
-    A = torch.baddbmm(_identity(P.shape[-1], P.dtype, P.device), K, H, alpha=-1)
-    return K, torch.baddbmm(torch.bmm(K * R.unsqueeze(-2), K.mT), torch.bmm(A, P), A.mT)
-
-
-@lru_cache
-@torch.inference_mode(False)
-def _identity(n: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    return torch.eye(n, dtype=dtype, device=device).unsqueeze(0)
+    Kt = torch.linalg.solve_ex(S, HP)[0]
+    X = torch.baddbmm(P, HP.mT, Kt, alpha=-1)
+    surplus = torch.baddbmm(R.unsqueeze(-1) * Kt, H, X, beta=-1)
+    return Kt.mT, torch.baddbmm(X, Kt.mT, surplus, alpha=-1)

@@ -45,7 +45,7 @@ class WindowModel:
     dt: float
     still: Tensor  # (B, n, n) Φ of a window in which nothing moves: Earth rotation, gravity gradient, decay
     left: Tensor  # (2, M) time from each sample's middle to the end, and 1: integrates once and twice
-    spread: Tensor  # (4, n, n) S ∫ (1−τ/T)^(nᵢ+nⱼ) dτ of each noise source
+    spread: Tensor  # (4, 15, 15) S ∫ (1−τ/T)^(nᵢ+nⱼ) dτ of each noise source
     walk: Tensor  # (n,) variance that a window adds to the states of the car
 
     def transition(
@@ -82,12 +82,11 @@ class WindowModel:
         shrunk by (1−τ/T)ⁿ: exact while attitude and specific force are constant over the window.
         ``scale`` multiplies the standard deviations of the sources, in the axes of their columns of Φ.
         """
-        L = Phi[:, :, DRIVEN].unflatten(-1, (4, 3)).transpose(1, 2)
+        L = Phi[:, :STATES, DRIVEN].unflatten(-1, (4, 3)).transpose(1, 2)
         if scale is not None:
             L = L @ scale
-        Q = ((L @ L.mT) * self.spread).sum(1)
-        if self.states.structure:
-            Q = Q + self.walk.diag()
+        Q = self.walk.diag().repeat(len(L), 1, 1)
+        Q[:, :STATES, :STATES] = ((L @ L.mT) * self.spread).sum(1)
         return Q
 
     def _sensor_columns(
@@ -164,11 +163,11 @@ def window_model(
     for block, inverse in zip((ACCEL, GYRO), decay):
         still[:, block, block] *= torch.exp(torch.tensor(-T * inverse, **like))
     left = T - (torch.arange(samples, **like) + 0.5) * dt
-    spread = torch.zeros(4, n, n, **like)
+    spread = torch.zeros(4, STATES, STATES, **like)
     for k, (source, powers) in enumerate(SOURCES.items()):
         order = torch.tensor([float("inf") if p is None else float(p) for p in powers], **like)
         order = order.repeat_interleave(3)
-        spread[k, :STATES, :STATES] = psd[source] * T / (order[:, None] + order[None, :] + 1)
+        spread[k] = psd[source] * T / (order[:, None] + order[None, :] + 1)
     drift = torch.zeros(n, **like)
     if states.structure and walk is not None:
         drift[states.of_structure] = T * walk.to(**like)

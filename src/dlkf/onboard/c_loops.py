@@ -16,6 +16,8 @@ from dlkf.errors import InputError
 from dlkf.onboard.c_memory import C_TYPES, Tensors, View
 from dlkf.onboard.c_operations import literal, suffix
 
+SMALL = 4096  # numbers of a matrix that is copied to be read along its rows, rather than weights of a network
+WIDE = 8  # columns from which on a zero is worth asking for
 UNKNOWN = "the C form of an exported filter does not know"
 
 
@@ -116,9 +118,14 @@ def _product(t: Tensors, node: Node, A: Any, B: Any, begin: Any = None, beta: fl
     """A B (b × m × k · k × n), on top of β · ``begin`` where there is one."""
     a, b, (out, value) = t.tensor(A), t.tensor(B), _new(t, node)
     m, k, n = a.meta.shape[-2], a.meta.shape[-1], b.meta.shape[-1]
+    small = value[..., 0, 0].numel() * k * n <= SMALL
+    if small and n >= WIDE and m > 1 and b.meta.stride(-1) != 1:
+        b = t.dense(b)
     lead = ["b"] if a.meta.ndim == 3 else []
     kind, scale = C_TYPES[value.dtype], "" if alpha == 1 else f"{literal(alpha, value.dtype)} * "
     at_a, at_b, at = a.at([*lead, "i", "k"]), b.at([*lead, "k", "j"]), out.at([*lead, "i", "j"])
+    # H, K and Φ are mostly zeros; the empty statement keeps gcc 12 from making a wrong sum over k of the condition
+    sparse = 'if (w != 0) { __asm__ volatile(""); ' if small and n >= WIDE else "{ "
     start, used = "0", [a, b]
     if begin is not None:
         given = t.tensor(begin)
@@ -128,8 +135,8 @@ def _product(t: Tensors, node: Node, A: Any, B: Any, begin: Any = None, beta: fl
     if b.meta.stride(-1) == 1 or (n > 1 and b.meta.stride(-2) != 1):  # along rows of B
         body = (
             f"{{ {kind} y[{n}]; for (int j = 0; j < {n}; j++) y[j] = {start}; "
-            f"for (int k = 0; k < {k}; k++) {{ {kind} w = {scale}{at_a}; "
-            f"for (int j = 0; j < {n}; j++) y[j] += w * {at_b}; }} for (int j = 0; j < {n}; j++) {at} = y[j]; }}"
+            f"for (int k = 0; k < {k}; k++) {{ {kind} w = {scale}{at_a}; {sparse}"
+            f"for (int j = 0; j < {n}; j++) y[j] += w * {at_b}; }} }} for (int j = 0; j < {n}; j++) {at} = y[j]; }}"
         )
     else:  # along its columns
         body = (

@@ -24,13 +24,15 @@ static inline void back(const int m, const int n, const double *L, const double 
   for (int i = 0; i < m; i++) {
     for (int j = 0; j < n; j++) X[i * n + j] = B[i * n + j];
     for (int k = 0; k < i; k++)
-      for (int j = 0; j < n; j++) X[i * n + j] -= L[i * m + k] * X[k * n + j];
+      if (L[i * m + k] != 0) /* many are: rows of what was not measured */
+        for (int j = 0; j < n; j++) X[i * n + j] -= L[i * m + k] * X[k * n + j];
     const double r = 1 / L[i * m + i];
     for (int j = 0; j < n; j++) X[i * n + j] *= r;
   }
   for (int i = m - 1; i >= 0; i--) {
     for (int k = i + 1; k < m; k++)
-      for (int j = 0; j < n; j++) X[i * n + j] -= L[k * m + i] * X[k * n + j];
+      if (L[k * m + i] != 0)
+        for (int j = 0; j < n; j++) X[i * n + j] -= L[k * m + i] * X[k * n + j];
     const double r = 1 / L[i * m + i];
     for (int j = 0; j < n; j++) X[i * n + j] *= r;
   }
