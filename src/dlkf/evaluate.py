@@ -65,7 +65,8 @@ def main(told: EvaluateSettings) -> None:
         console.print(f"No truth: errors are against the {done.truth['reference']}.", style="bold")
     scores = done.run.scores
     made = results_of(done.run, baseline=told.baseline, settle_s=told.settle_s, seed=told.seed)
-    decided = {"models": told.model, "dataset": told.dataset, "imu": asdict(spec), "tuning": asdict(told.tuning)}
+    decided = {"models": told.model, "dataset": told.dataset, "imu": spec.name, "tuning": asdict(told.tuning)}
+    decided["imu values"] = {"accel": asdict(spec.accel), "gyro": asdict(spec.gyro)}
     made_how = {**provenance(), **decided, "digest": digest, **done.truth, **grid, **done.rules}
     by_time, baseline = done.mode == "pieces", told.baseline
     write_report(told.out, name, scores, made, protocol=made_how, by_time=by_time, baseline=baseline)

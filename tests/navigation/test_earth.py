@@ -7,6 +7,7 @@ import torch
 from pyins import earth as pyins_earth
 
 from dlkf.navigation.earth import ecef_from_geodetic, ned_axes, normal_gravity, tangent_frame
+from dlkf.navigation.geodetic import _bowring, geodetic_from_ecef
 
 PLACES = np.deg2rad([[52.1, 9.9], [-33.9, 151.2], [0.0, 0.0], [89.5, 179.9], [-75.0, -179.9]])
 
@@ -17,6 +18,16 @@ def test_ecef_agrees_with_pyproj():
     to_ecef = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978")
     expected = np.stack(to_ecef.transform(*np.rad2deg(PLACES.T), height.numpy()), -1)
     assert np.abs(ecef_from_geodetic(lat, lon, height).numpy() - expected).max() < 1e-6  # rounding of 6.4e6 m
+
+
+def test_geodetic_undoes_ecef_in_both_forms():
+    """By pymap3d, and in tensor operations as an exported filter has it; 1e-11 rad are 0.1 mm."""
+    lat, lon = torch.from_numpy(PLACES).T
+    for height in (-500.0, 80.0, 9000.0):
+        r_e = ecef_from_geodetic(lat, lon, torch.full_like(lat, height))
+        for found in (geodetic_from_ecef(r_e), _bowring(r_e)):
+            assert max((found[0] - lat).abs().max(), (found[1] - lon).abs().max()) < 1e-11
+            assert (found[2] - height).abs().max() < 1e-4
 
 
 def test_gravity_falls_with_height_as_bruns_says():

@@ -91,6 +91,11 @@ def test_open_ambiguities_and_multipath_last_and_are_claimed():
     assert north[~is_float].std() == pytest.approx(0.5, rel=0.1)
     assert north[is_float].std() == pytest.approx(math.hypot(0.5, 0.8), rel=0.1)
     assert fixes.std_pos_n[is_float].to_numpy() == pytest.approx(math.hypot(0.5, 0.8), rel=0.01)
+    up = fixes.height_m.to_numpy() - truth.height  # half as much again as level
+    assert [up[open_].std() for open_ in (~is_float, is_float)] == pytest.approx(
+        [0.75, 1.5 * math.hypot(0.5, 0.8)], rel=0.1
+    )
+    assert fixes.std_pos_d[is_float].to_numpy() == pytest.approx(1.5 * math.hypot(0.5, 0.8), rel=0.01)
     x = north[~is_float]
     assert np.corrcoef(x[1:], x[:-1])[0, 1] > 0.9
     assert set(np.round(fixes.std_vel_n, 9)) == {0.02}

@@ -40,9 +40,9 @@ class GnssConfig(Ranged, where="gnss"):
     """
 
     rate_hz: float = 1.0
-    std_horizontal: float = within(0.02, 1e-9, 1e4)  # m
-    std_vertical: float = within(0.02, 1e-9, 1e4)  # m
-    std_velocity: float = within(0.02, 1e-9, 1e4)  # m/s
+    std_horizontal: float = within(0.02, 1e-15, 1e4)  # m
+    std_vertical: float = within(0.02, 1e-15, 1e4)  # m
+    std_velocity: float = within(0.02, 1e-15, 1e4)  # m/s
     s_p: float = within(0.0, 0, 1e4)  # m
     s_v: float = within(0.0, 0, 1e4)  # m/s
     quality: int = 4
