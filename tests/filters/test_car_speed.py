@@ -66,3 +66,17 @@ def test_what_was_learned_long_ago_fades_to_the_prior():
         assert float(eigenvalues.min()) > 0 and float(eigenvalues.max()) < 1.01
         assert float(known.count) == pytest.approx(car_speed.MEMORY + 3, abs=5)
         assert float(listener(none, known).std) > 0.3
+
+
+def test_what_is_no_longer_heard_becomes_unknown_again():
+    """Λ → Λ₀ at a rate 1/MEMORY: half a MEMORY after 1/100 of the prior's spread it is 1/(99 e^-½ + 1) of it."""
+    listener = model()
+    prior = listener.begin(1)
+    known = prior._replace(spread=0.01 * prior.spread)
+    with torch.no_grad():
+        silent = listener(torch.zeros(1, 5).double(), prior)
+        silent = silent._replace(heard=torch.zeros_like(silent.heard), novelty=torch.zeros_like(silent.novelty))
+        for _ in range(round(0.5 * car_speed.MEMORY)):
+            known = listener.learned(known, silent, silent.speed, torch.tensor([True]))
+    share = (known.spread / prior.spread).diagonal(dim1=-2, dim2=-1)
+    assert share.tolist()[0] == pytest.approx([1 / (99 * math.exp(-0.5) + 1)] * 4, rel=0.02)  # first order in the step
