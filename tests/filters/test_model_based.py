@@ -1,5 +1,6 @@
 """The loop and the 15-state filter: consistency, the textbook update, outages, lever arm, late fixes."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -159,7 +160,7 @@ def test_a_prior_of_more_states_starts_the_sensor_matrices(name, count):
 
 @pytest.mark.parametrize("name", MODEL_BASED)
 def test_every_filter_runs_in_float32(name):
-    
+
     prior = Prior([0.0] * 6, [0.1] * 6)  # which the others leave aside
     solution = integrate(scene(2, 10).in_precision(torch.float32), build_filter(name, IMU, prior=prior))
     assert solution.posterior.p_n.dtype == torch.float32 and solution.posterior.p_n.isfinite().all()
@@ -178,3 +179,28 @@ def test_mistakes_are_one_clear_line(arguments, words):
     with pytest.raises(InputError, match=words) as error:
         build_filter(imu=IMU, **arguments)
     assert "\n" not in str(error.value)
+
+
+def test_gauss_markov_biases_forget_at_the_preset_s_rates():
+    """Φ over a second: exp(−1/τ) of each sensor, to second order."""
+    imu = replace(IMU, accel=replace(IMU.accel, correlation_time=50.0), gyro=replace(IMU.gyro, correlation_time=20.0))
+    solution = integrate(scene(2, 3), build_filter("mbkf15_gm", imu), keep_covariances=True)
+    kept = solution.covariances.Phi[:, -1].diagonal(dim1=-2, dim2=-1)[:, 9:15]
+    expected = torch.tensor([math.exp(-1 / 50)] * 3 + [math.exp(-1 / 20)] * 3, dtype=torch.float64)
+    assert (kept - expected).abs().max() < 2e-3
+    walking = integrate(scene(2, 3), build_filter("mbkf15", imu), keep_covariances=True)
+    assert (walking.covariances.Phi[:, -1].diagonal(dim1=-2, dim2=-1)[:, 9:15] == 1).all()
+
+
+def test_the_rate_at_the_fix_is_that_of_the_last_tenth_of_a_second():
+    """What turns the lever arm: five samples of 50 Hz, without the IMU error."""
+    batch, seen = scene(2, 3), []
+
+    class Watched(Ins):
+        def step(self, memory, epoch):
+            seen.append((epoch.rate_b, epoch.corrected))
+            return super().step(memory, epoch)
+
+    integrate(batch, Watched())
+    for rate_b, corrected in seen:
+        torch.testing.assert_close(rate_b, corrected[:, -5:, 3:].mean(1), rtol=0, atol=1e-15)

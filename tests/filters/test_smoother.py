@@ -72,3 +72,15 @@ def test_padding_and_names():
     assert torch.allclose(one.posterior.p_n[1, :20], other.posterior.p_n[1], atol=1e-9)
     with pytest.raises(InputError, match="needs a filter with a covariance"):
         smooth(batch, Ins())
+
+
+def test_scale_factors_of_the_whole_drive_are_taken_off_its_beginning():
+    """The complete error of the third second, gravity times the scale factor among it, as the end knows it."""
+    scale = torch.tensor([0.01, -0.008, 0.012, 0.01, -0.01, 0.005], dtype=torch.float64)
+    imu = replace(IMU, accel=replace(IMU.accel, scale_factor=0.01), gyro=replace(IMU.gyro, scale_factor=0.01))
+    batch = scene(20, 60, seed=5, imu=imu)
+    batch = replace(batch, imu=batch.imu + scale * batch.imu)
+    complete = batch.true_imu_error + scale * batch.imu.mean(2)
+    smoothed = smooth(batch, build_filter("mbkf21", imu))
+    off = (smoothed.imu_error - complete)[:, 2].square().mean(0).sqrt()
+    assert off[2] < 0.005 and off[3:].max() < 5e-4  # m/s² along gravity, of 0.12 that the factor makes; rad/s

@@ -8,7 +8,7 @@ import pytest
 
 from dlkf.errors import InputError
 from dlkf.simulation.gnss.reporting import late, reported
-from dlkf.simulation.gnss.white import GnssConfig, observe
+from dlkf.simulation.gnss.white import GnssConfig, episodes, observe
 from dlkf.simulation.imu import inverse_mechanisation
 from dlkf.simulation.motion.vehicle import Truth, VehicleConfig, drive_vehicle
 
@@ -130,3 +130,12 @@ def test_late_fixes_are_those_of_their_lag_before(place, moving):
             scale = 1.1e5 if name.endswith("_deg") else 1.0
             apart = (fixes[name].to_numpy() - on_time[name].to_numpy()[before]) * scale
             assert np.abs(apart).max() < 1e-5  # metres or m/s: QUIET's noise, and the second order of a metre's shift
+
+
+def test_episodes_know_no_beginning():
+    """A share of the time, wherever the clock begins; of 200 seeds the first moment lies in one as often as any."""
+    t = np.arange(2000.0)
+    for begin in (0.0, 5e4):
+        seeds = [episodes(np.random.default_rng(seed), begin + t, 0.3, 20.0) for seed in range(200)]
+        assert np.mean(seeds) == pytest.approx(0.3, abs=0.02)
+        assert np.mean([x[0] for x in seeds]) == pytest.approx(0.3, abs=0.1)

@@ -15,7 +15,15 @@ from dlkf.simulation.dataset import DatasetConfig
 from dlkf.simulation.gnss.almanac import read_almanac
 from dlkf.simulation.gnss.least_squares import Observations, solve
 from dlkf.simulation.gnss.obstruction import held, in_view
-from dlkf.simulation.gnss.receiver import Receiver, clock, gauss_markov, receiver_spec
+from dlkf.simulation.gnss.receiver import (
+    Receiver,
+    clock,
+    gauss_markov,
+    growth,
+    iono_mapping,
+    receiver_spec,
+    tropo_mapping,
+)
 from dlkf.simulation.gnss.satellite_fixes import observe_satellites
 from dlkf.simulation.gnss.satellites import LIGHT, signals
 from dlkf.simulation.gnss.surroundings import Sky
@@ -272,3 +280,13 @@ def test_datasets_that_cannot_be_are_one_clear_line(change, said):
     with pytest.raises(InputError) as caught:
         DatasetConfig("toy", **change)
     assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_errors_grow_towards_the_horizon_as_the_geometry_says():
+    """One at the zenith; 1/sin E of a flat layer at 45°, less of a shell 350 km up; noise by its own law."""
+    zenith, half = np.array([math.pi / 2]), np.array([math.pi / 4])
+    assert [float(f(zenith)[0]) for f in (growth, tropo_mapping, iono_mapping)] == pytest.approx([1, 1, 1], abs=1e-3)
+    assert float(tropo_mapping(half)[0]) == pytest.approx(math.sqrt(2), rel=2e-3)
+    shell = 1 / math.cos(math.asin(6378.1363 / 6728.1363 * math.cos(math.pi / 4)))
+    assert float(iono_mapping(half)[0]) == pytest.approx(shell)
+    assert float(growth(half)[0]) == pytest.approx(math.sqrt(1.5))
