@@ -5,13 +5,12 @@ from __future__ import annotations
 import lightning as L
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from dlkf.config import config_dir
+from dlkf.classes import made
+from dlkf.command.composing import composed
 from dlkf.data.datamodule import DriveDataModule
-from dlkf.data.masks import Outage, withhold, within
+from dlkf.data.masks import BiasLaw, Outage, withhold, within
 from dlkf.errors import InputError
 from tests.cars import REAL, write_cars
 
@@ -30,11 +29,7 @@ def test_no_group_is_on_two_sides(tmp_path):
         assert sum(row["drives"] for row in data.summary()) == 12
         pieces = {side: {p.drive for p in data.pieces(side)} for side in ("val", "test")}
         trained = {p.drive for batch in data.train_pieces(0) for p in batch}
-        assert (
-            not trained & pieces["val"]
-            and not trained & pieces["test"]
-            and not pieces["val"] & pieces["test"]
-        )
+        assert not trained & pieces["val"] and not trained & pieces["test"] and not pieces["val"] & pieces["test"]
 
 
 def test_the_same_recording_in_two_datasets_stays_on_one_side(town, tmp_path):
@@ -92,8 +87,8 @@ def test_an_epoch_covers_the_training_time_once_from_random_starts(town):
 
 
 def test_batches_depend_on_seed_epoch_and_step_alone(town):
-    a, b = _module(town, turn_frames=True, injected_bias={"accel_mps2": 0.1, "gyro_dps": 0.3}), _module(
-        town, turn_frames=True, injected_bias={"accel_mps2": 0.1, "gyro_dps": 0.3}
+    a, b = _module(town, turn_frames=True, injected_bias=BiasLaw(0.1, 0.3)), _module(
+        town, turn_frames=True, injected_bias=BiasLaw(0.1, 0.3)
     )  # fmt: skip
     b.train_batch(0, 0), b.train_pieces(7)
     for epoch, step in ((0, 2), (3, 0)):
@@ -117,7 +112,7 @@ def test_processes_share_the_scoring_pieces(town, processes):
 
 
 def test_scoring_batches_are_fixed(town):
-    data = _module(town, eval_outage={"first_s": 5, "duration_s": 10}, eval_stride_s=10)
+    data = _module(town, eval_outage=Outage(5.0, 10.0), eval_stride_s=10)
     one, two = data.batches("test"), _module(town, eval_outage=Outage(5, 10), eval_stride_s=10).batches("test")
     assert all(torch.equal(x.start.p_n, y.start.p_n) for x, y in zip(one, two))
     plain = _module(town, eval_stride_s=10).batches("test")
@@ -167,16 +162,21 @@ def test_a_resumed_run_sees_the_batches_of_an_uninterrupted_one(town, tmp_path):
 
 
 def test_the_config_makes_a_module(town):
-    """conf/data as Hydra gives it, lists and mappings of its own kind included."""
+    """conf/data with what a user changes; a mapping becomes the settings that it stands for."""
     split = "data.split={train:rest,val:[day-1],test:[day-2]}"
-    overrides = ["+data=drives", f"data.datasets=[{town}]", split, "data.eval_outage={first_s:10,duration_s:5}"]
-    overrides += ["start@data.start=coarse", "data.injected_bias={accel_mps2:0.1,gyro_dps:0.3}"]
-    with initialize_config_dir(str(config_dir()), version_base="1.3"):
-        data = instantiate(compose(overrides=overrides).data, length_s=10, eval_length_s=20)
+    overrides = [f"data.datasets=[{town}]", split, "data.eval_outage={first_s:10,duration_s:5}", "data.length_s=10"]
+    overrides += [
+        "start@data.start=coarse",
+        "data.injected_bias={accel_mps2:0.1,gyro_dps:0.3}",
+        "data.eval_length_s=20",
+    ]
+    values = composed("train", *overrides)["data"]
+    data = made(values, "data")
+    assert data.eval_outage == Outage(10.0, 5.0) and data.injected_bias == BiasLaw(0.1, 0.3)
     assert [row["drives"] for row in data.summary()] == [4, 1, 1]
     assert data.train_batch(0, 0).size == (24, 10, 50) and data.start.yaw_deg == 10
     with pytest.raises(InputError, match=r"data\.injected_bias: unknown key gyro"):
-        _module(town, injected_bias={"gyro": 1.0})
+        made({**values, "injected_bias": {"gyro": 1.0}}, "data")
 
 
 def test_real_drives_load():
