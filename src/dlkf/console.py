@@ -1,14 +1,30 @@
-"""A progress bar with a time to go, for work that counts its steps."""
+"""What a command says: a console whose lines are kept, and a progress bar for work that counts its steps."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from dlkf.files import whole_file
+
 Counted = Callable[[int, int | None], None]  # steps done, steps in all where that is known
+LOG = "log.txt"  # beside a report
+
+
+def talking() -> Console:
+    """A console as wide as the terminal, or 110 columns, that remembers what it said."""
+    return Console(width=None if sys.stdout.isatty() else 110, record=True)
+
+
+def keep_said(console: Console, folder: str | Path) -> None:
+    """What was said so far, as the folder's ``log.txt``."""
+    with whole_file(f"{folder}/{LOG}") as beside:
+        beside.write_text(console.export_text(clear=False))
 
 
 @contextmanager

@@ -1,17 +1,15 @@
 """Score filters on a dataset: ``python -m dlkf.evaluate model=[ins,mbkf15] dataset=data/town imu=consumer``.
 
-Prints the results table and leaves metrics.json, table.md, table.csv, figures/ and report.html in ``out``.
+Prints the results table and leaves metrics.json, table.md, table.csv, figures/, report.html and log.txt in ``out``.
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict
-
-from rich.console import Console
 
 from dlkf.command import command
 from dlkf.command.scored import EvaluateSettings
+from dlkf.console import keep_said, talking
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import dataset_digest, drive_rows
 from dlkf.evaluation.shares import Work, evaluate_shares
@@ -35,7 +33,7 @@ from dlkf.tracking.runs import check_store, tracking_uri
 @command("evaluate", EvaluateSettings)
 def main(told: EvaluateSettings) -> None:
     """Load, run every model over the same scenes, score, write, print."""
-    console = Console(width=None if sys.stdout.isatty() else 110)
+    console = talking()
     vacant(told.out, overwrite=told.overwrite)
     protocol, uri, spec = told.protocol(told.align), tracking_uri(told.tracking.uri), told.spec
     if told.tracking.log:
@@ -77,6 +75,7 @@ def main(told: EvaluateSettings) -> None:
         console.print("no outage fits into the valid truth of these drives; see outage.*", style="yellow")
     for result in made:
         console.print(f"\n[bold]{answer(result)}[/bold]", highlight=False)
+    keep_said(console, told.out)
     kept = ""
     if told.tracking.log:
         with start_point(uri, told.name, title) as run:

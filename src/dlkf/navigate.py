@@ -1,7 +1,7 @@
 """Navigate whole drives: ``python -m dlkf.navigate model=mbkf15 dataset=data/town out=outputs/town``.
 
 From IMU and GNSS alone; ``reference/`` is never opened. Writes ``out/drive=<id>/solution.parquet`` for every
-drive and ``out/report.html``, or nothing (columns: dlkf.running.solution).
+drive, ``out/report.html`` and ``log.txt``, or nothing (columns: dlkf.running.solution).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 
 from dlkf.command import command
 from dlkf.command.settings import NavigateSettings
-from dlkf.console import counting
+from dlkf.console import LOG, counting
 from dlkf.data.drive import Drive
 from dlkf.data.store import dataset_digest, drive_rows, load_dataset
 from dlkf.data.tables import time_zeros
@@ -83,10 +83,10 @@ def main(told: NavigateSettings) -> None:
         made = {**provenance(), "model": told.model, "dataset": told.dataset, "drives": told.drives, **grid}
         made |= {"digest": dataset_digest(told.dataset), "imu": asdict(spec), "tuning": asdict(tuning)}
         write_page(folder, short_name(told.model), name_of(told.dataset), courses, made)
-    print("\n".join(sorted(lines)))
-    for reason in (skipped or {}).values():
-        print(f"left out: {reason}")
-    print("\n".join(answers(short_name(told.model), courses)))
+        left_out = [f"left out: {reason}" for reason in (skipped or {}).values()]
+        said = "\n".join((*sorted(lines), *left_out, *answers(short_name(told.model), courses)))
+        (folder / LOG).write_text(f"{said}\n")
+    print(said)
     print(f"Solutions: {told.out}/drive=*/solution.parquet; report: {told.out}/report.html")
 
 

@@ -7,7 +7,6 @@ stopped, in the same MLflow run.
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from dlkf.command import command, same_command
 from dlkf.command.composing import configuration_hash, plain
 from dlkf.command.simulated import SimulateSettings
 from dlkf.config import config_dir
+from dlkf.console import keep_said, talking
 from dlkf.data.store import dataset_digest
 from dlkf.errors import InputError
 from dlkf.evaluation.table import all_tables, as_rich
@@ -40,7 +40,7 @@ from dlkf.training.summary import key_metrics, note
 @command("train")
 def main(config: dict[str, Any]) -> None:
     """Data, run, study, table."""
-    console = Console(width=None if sys.stdout.isatty() else 110)
+    console = talking()
     told = settings_from(TrainSettings, config, "")
     tracking, settings, data = told.tracking, told.study, made(told.data, "data")
     check_store(uri := tracking_uri(tracking.uri))
@@ -66,11 +66,11 @@ def main(config: dict[str, Any]) -> None:
         outcome = run_study(settings, data, folder, lightning_logger(run), console.print, same_command("train"))
         for table in (*all_tables(", ".join(Path(d).name for d in data.datasets), outcome.results), *outcome.tables):
             console.print(as_rich(table))
-        metrics = key_metrics(outcome)
+        keep_said(console, folder / "report")
         run.log_files(folder / "report")
         run.note(note(settings, data.datasets, outcome))
         chosen = {} if parent else {"register": tracking.register, "alias": tracking.alias}  # of a grid the best is
-        log_model(run, outcome.weights, metrics=metrics, **chosen)
+        log_model(run, outcome.weights, metrics=key_metrics(outcome), **chosen)
         write_state(folder, finished=True)
     seconds = ", ".join(f"{k} {v:.0f} s" for k, v in outcome.seconds.items())
     console.print(f"{seconds}\nReport: {folder}/report/report.html\nModel:  {outcome.weights}\nMLflow: run {run.id}")

@@ -362,6 +362,43 @@ OF_ALL_COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "a consistency of nothing": ("consistency", ("model=[]", "out=made"), "empty list"),
     "a consistency without noise": ("consistency", ("model=ins", "out=made"), "ins"),
     "a simulation of nothing": ("simulate", ("dataset.hours=0", "out=made"), "hours"),
+    "an export of nobody": ("export", ("model=mbkf99", "out=made"), "unknown model 'mbkf99'"),
+    "an export that looks ahead": ("export", ("model=mbkf21_rts", "out=made"), "looks ahead"),
+    "an export of several": ("export", ("model=[ins,mbkf15]", "out=made"), "unknown model"),
+    "an export without a rate": ("export", ("model=mbkf15", "out=made", "rate_hz=0"), "rate_hz is 0, must be above 0"),
+    "an export back in time": ("export", ("model=mbkf15", "out=made", "epoch_s=-1"), "epoch_s is -1, must be above 0"),
+    "an export of a third": ("export", ("model=mbkf15", "out=made", "epoch_s=0.33"), "whole number of samples"),
+    "an export checked nowhere": ("export", ("model=mbkf15", "out=made", "dataset=nowhere"), "no such folder"),
+    "an export checked on nobody": (
+        "export",
+        ("model=mbkf15", "out=made", "dataset=town", "drive=nobody"),
+        "no drive nobody",
+    ),
+    "an export over data": ("export", ("model=mbkf15", "out=town"), "out=town exists already"),
+    "an export of a word": ("export", ("model=mbkf15", "out=made", "latency=maybe"), "latency is 'maybe'"),
+    "compiled, perhaps": ("navigate", (*SOLVED, "compiled=maybe"), "compiled is 'maybe', must be true or false"),
+    "compiled and smoothed": ("navigate", (*SOLVED, "compiled=true", "smoother=rts"), "leave compiled=true out"),
+    "compiled smoother": ("navigate", ("model=mbkf15_rts", *SOLVED[1:], "compiled=true"), "leave compiled=true out"),
+    "noise of a network": ("navigate", ("model=plus", "dataset=town", "out=made", "imu=auto"), "takes none"),
+    "noise of no filter": (
+        "tune",
+        ("model=plus", "dataset=town", "out=made", "objective=likelihood"),
+        "no noise to tune",
+    ),
+    "noise in no time": (
+        "tune",
+        ("model=mbkf21", "dataset=town", "out=made", "objective=likelihood", "minutes=0"),
+        "minutes is 0",
+    ),
+    "factors in no rounds": ("tune", ("model=mbkf21", "dataset=town", "out=made", "rounds=0"), "rounds is 0, must be"),
+    "factors of no pieces": ("tune", ("model=mbkf21", "dataset=town", "out=made", "pieces=-2"), "pieces is -2, must"),
+    "a consistency of no drives": ("consistency", ("model=mbkf15", "out=made", "drives=0"), "drives is 0, must be"),
+    "a consistency of no time": ("consistency", ("model=mbkf15", "out=made", "minutes=-1"), "minutes is -1, must be"),
+    "noise in few minutes": (
+        "tune",
+        ("model=mbkf21", "dataset=town", "out=made", "objective=likelihood", "minutes=few"),
+        "minutes is 'few'",
+    ),
     "a lever arm of one number": ("ingest", ("reader.lever_arm_m=0.5", "source=logs", "out=made"), "lever_arm_m"),
 }
 
@@ -430,6 +467,32 @@ def test_faults_of_the_machine_are_one_line(error, said):
         line = fault(outer)
     assert line is not None and said in line and "\n" not in line
     assert fault(ValueError("a fault of ours")) is None
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [("export", ("model=mbkf15", "out=made", "dataset=town")), ("navigate", (*SOLVED, "compiled=true"))],
+    ids=["export", "compiled step"],
+)
+def test_without_a_c_compiler(command, arguments, copy, call, tmp_path, monkeypatch):
+    """A filter is exported unchecked, and says so; a compiled step cannot be made."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "logs"))
+    ended = call(command, *arguments)
+    if command == "navigate":
+        is_refused(ended, "no C compiler found", folder=tmp_path)
+    else:
+        assert ended.code == 0 and "not checked: no C compiler here" in ended.out, ended.err
+
+
+def test_what_was_said_lies_beside_the_report(copy, call, tmp_path):
+    """The answer, the tables, the drives, as they stood on the screen."""
+    for command in FAST:
+        ended = call(command, "model=mbkf15", "dataset=town", f"out={command}", *FAST[command])
+        assert ended.code == 0, ended.err
+        said = (tmp_path / command / "log.txt").read_text().splitlines()
+        assert len(said) > 3 and set(said) <= set(ended.out.splitlines())
 
 
 def test_a_point_that_fails_leaves_the_others(copy, call, tmp_path):

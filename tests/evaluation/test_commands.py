@@ -32,7 +32,7 @@ def test_navigate_writes_solutions_without_a_reference(town, tmp_path):
     assert done.code == 0, done.err
     assert "car-01: aligned at t = " in done.out
     assert pq.read_schema(tmp_path / "solved" / "drive=car-01" / "solution.parquet").equals(GEO_SCHEMA)
-    assert sorted(p.name for p in (tmp_path / "solved").iterdir()) == ["drive=car-01", "report.html"]
+    assert sorted(p.name for p in (tmp_path / "solved").iterdir()) == ["drive=car-01", "log.txt", "report.html"]
 
 
 @pytest.mark.parametrize(

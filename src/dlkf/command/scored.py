@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from dlkf.command.settings import FilterSettings, OnDrives, Store, check_file_name
+from dlkf.command.settings import FilterSettings, OnDrives, Store, check_above_zero, check_file_name
 from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.masks import BiasLaw
 from dlkf.data.segments import StartLaw
@@ -70,6 +70,7 @@ class TuneSettings(FilterSettings, OnDrives, Scored):
 
     def __post_init__(self) -> None:
         check_file_name(self.name)
+        check_above_zero(self, "minutes", "rounds", "pieces")
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,9 @@ class ConsistencySettings(FilterSettings):
     gnss: Fixes
     settle_s: float
     seed: int
+
+    def __post_init__(self) -> None:
+        check_above_zero(self, "drives", "minutes", "rate_hz")
 
     @property
     def matched(self) -> MatchedDrives:

@@ -50,9 +50,15 @@ def grid_of(
     epoch_s: int | float | None = None,
     usual_epoch_s: int | float = 1.0,
 ) -> dict[str, Any]:
-    """``rate_hz`` and ``epoch_s``: as given, else what a trained filter was trained on, else 50 Hz and the usual."""
+    """``rate_hz`` and ``epoch_s``: as given, else what a trained filter was trained on, else 50 Hz and the usual.
+
+    Raises InputError where one of them is not above 0.
+    """
     configs: list[Any] = [getattr(m, "config", None) for m in models]
     own = next(((c.rate_hz, c.epoch_s) for c in configs if hasattr(c, "rate_hz")), (50.0, usual_epoch_s))
+    for name, given in (("rate_hz", rate_hz), ("epoch_s", epoch_s)):
+        if given is not None and not given > 0:
+            raise InputError(f"{name} is {given!r}, must be above 0")
     return {"rate_hz": own[0] if rate_hz is None else rate_hz, "epoch_s": own[1] if epoch_s is None else epoch_s}
 
 
