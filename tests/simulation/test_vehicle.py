@@ -8,7 +8,7 @@ import pytest
 from tests.simulation.oracle import positions_and_integral
 
 from dlkf.errors import InputError
-from dlkf.simulation.motion.vehicle import VehicleConfig, drive_vehicle
+from dlkf.simulation.motion.vehicle import VehicleConfig, drive_vehicle, follow, random_route
 
 RATE = 100
 
@@ -67,6 +67,14 @@ def test_positions_are_the_integral_of_the_velocities():
     r_e, integral = positions_and_integral(drive(5, 600), RATE)
     assert np.abs(r_e - integral).max() < 2e-5
     assert np.linalg.norm(r_e - r_e[0], axis=1).max() > 500
+
+
+def test_a_drive_may_begin_anywhere_on_its_route():
+    """From the second minute on: positions are still the integral of the velocities."""
+    route = random_route(np.random.default_rng(2), VehicleConfig(), 200.0)
+    truth = follow(route, VehicleConfig(), 100 + np.arange(60 * RATE + 1) / RATE)
+    r_e, integral = positions_and_integral(truth, RATE)
+    assert np.abs(r_e - integral).max() < 2e-5
 
 
 def test_body_lies_along_the_motion():
