@@ -81,7 +81,7 @@ class DatasetConfig(Ranged, where="dataset"):
                 raise InputError(f"dataset: imu_rate_hz {self.imu_rate_hz} is not a multiple of {name} {rate}")
         if self.imu_errors == "fleet" and not self.fleet:
             raise InputError("dataset: imu_errors is fleet, but fleet names no IMU presets (see simulated/fleet.yaml)")
-        if self.raw and self.receiver is None:
+        if not isinstance(self.raw, bool) or (self.raw and self.receiver is None):
             raise InputError(f"raw={self.raw}: there are raw observations with a satellite receiver=<preset> only")
         epochs = self.gnss.rate_hz * self.drive_minutes * 60
         if self.receiver is not None and epochs > MOST_EPOCHS:
