@@ -26,7 +26,7 @@ from dlkf.navigation.imu_errors import AUTO
 from dlkf.onboard.compiled_filter import compiled_filter
 from dlkf.parallel import check, each
 from dlkf.provenance import provenance
-from dlkf.report.navigation import Course, answers, write_page
+from dlkf.report.navigation import MOST_DRIVES, Course, answers, write_page
 from dlkf.running import offline
 from dlkf.running.exports import chosen, export, utc_times
 from dlkf.running.likelihood import untold
@@ -79,7 +79,8 @@ def main(told: NavigateSettings) -> None:
             when = utc_times(result.table, zeros.get(result.drive), told.export_clock)
             export(folder / f"drive={result.drive}", result.table, formats, when, result.drive)
             lines.append(result.summary(spacings[result.drive]))
-            courses.append(Course(result, spacings[result.drive]))
+            course = Course(result, spacings[result.drive])
+            courses.append(course if len(courses) < MOST_DRIVES else course.for_the_map())
         made = {**provenance(), "model": told.model, "dataset": told.dataset, "drives": told.drives, **grid}
         made |= {"digest": dataset_digest(told.dataset), "imu": asdict(spec), "tuning": asdict(tuning)}
         write_page(folder, short_name(told.model), name_of(told.dataset), courses, made)

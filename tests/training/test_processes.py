@@ -1,5 +1,7 @@
 """The same training on two processes: ``trainer.devices=2 trainer.strategy=ddp``, nothing else changed."""
 
+import json
+import subprocess
 import sys
 import textwrap
 
@@ -68,3 +70,37 @@ def test_their_best_weights_score_alike(trained, dataset):
 def test_a_further_process_that_fails_is_said():
     with pytest.raises(InputError, match="ended with code 3"), joined_by(("sh", "-c", "exit 3"), 2):
         raise AssertionError("the block must not begin")
+
+
+SMALL = (
+    "data.batch_size=6", "data.length_s=20", "data.eval_length_s=80", "model.network.dropout=0",
+    "model.network.lstm_hidden=16", "model.network.lstm_layers=1", "model.network.dense=[16,8]", "trainer.max_epochs=2",
+    "trainer.validate_every=1", "trainer.best_from_epoch=0", "trainer.accelerator=cpu", "callbacks.curriculum=null",
+    "callbacks.outage={start_epoch:0,duration_s:[3,6],before_s:5,after_s:2}", "baselines.models=[ins]",
+    "baselines.tune=false", "baselines.pieces=6", "seed=2",
+)  # fmt: skip
+
+
+def numbers(x) -> list[float]:
+    """All numbers of a nested value, in their order."""
+    if isinstance(x, dict):
+        return [n for key in sorted(x) for n in numbers(x[key])]
+    if isinstance(x, list):
+        return [n for part in x for n in numbers(part)]
+    return [float(x)] if isinstance(x, (int, float)) and not isinstance(x, bool) else []
+
+
+@pytest.mark.commands
+def test_the_command_on_two_processes_leaves_the_same_table(dataset, tmp_path):
+    tables, losses = [], []
+    for name, more in (("one", ()), ("two", ("trainer.devices=2", "trainer.strategy=ddp"))):
+        words = [sys.executable, "-m", "dlkf.train", f"name={name}", f"data.datasets=[{dataset}]", *SMALL, *more]
+        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr[-2000:]
+        (report,) = (tmp_path / "outputs" / "train" / name).glob("*/report")
+        tables.append(numbers(json.loads((report / "metrics.json").read_text())["results"]))
+        state = torch.load(report.parent / "last.ckpt", weights_only=True)["callbacks"]
+        average = next(v["average"] for k, v in state.items() if k.startswith("AdaptiveLossWeights"))
+        losses.append([average[term] for term in sorted(average)])
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+    assert len(tables[0]) > 20 and tables[0] == pytest.approx(tables[1], rel=1e-5, abs=1e-9)

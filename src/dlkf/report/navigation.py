@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,9 +14,10 @@ from dlkf.colours import COLOURS, QUALITY
 from dlkf.report.maps import chart, dots, joined, track
 from dlkf.report.page import Page
 from dlkf.report.plots import Array, band, every, line, shade, spans, stacked
-from dlkf.running.offline import Fixes, Navigated
+from dlkf.running.offline import Fixes, Innovation, Navigated
 
 MOST_DRIVES = 12  # with plots of their own; all are on the map
+SHOWN = ("t", "lat_deg", "lon_deg", "vel_n", "vel_e", "std_pos_n", "std_pos_e", "gnss_used")  # of all drives
 GAP_S = 3.0  # longer without a fix is an outage
 STANDING = 0.15  # m/s
 R2D = 180 / np.pi
@@ -33,6 +35,15 @@ class Course(NamedTuple):
         t, used = self.result.table["t"].to_numpy(), self.result.table["gnss_used"].to_numpy()
         last = np.maximum.accumulate(np.where(used, t, -np.inf))
         return np.where(np.isfinite(last), t - last, t - t[0])
+
+    def for_the_map(self) -> Course:
+        """A fifth of it: what the map, the table and the answers show, without what plots of its own would."""
+        innovation = self.result.innovation
+        if innovation is not None:  # one whose RMS is that of all
+            innovation = Innovation(np.array([[innovation.normalised_rms]]), np.ones((1, 1)))
+        return self._replace(
+            result=replace(self.result, table=self.result.table[list(SHOWN)].copy(), innovation=innovation)
+        )
 
 
 def write_page(out: Path, model: str, dataset: str, courses: Sequence[Course], made: Mapping[str, Any]) -> None:

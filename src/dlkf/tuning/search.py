@@ -34,6 +34,8 @@ FACTORS: Mapping[str, tuple[float, ...]] = {
     "position_std": (0.5, 1.0, 2.0, 5.0),
 }
 
+PATIENCE = 2  # values in a row that are worse, before the rest on that side is left out
+
 # what a filter with these endings, or of this base, is told beside
 MORE_FACTORS: Mapping[str, Mapping[str, tuple[float, ...]]] = {
     "nhc": {"lateral_std": (0.05, 0.1, 0.2, 0.5, 1.0), "vertical_std": (0.05, 0.1, 0.2, 0.5, 1.0)},
@@ -84,27 +86,39 @@ def tuned(
 ) -> tuple[Tuning, float]:
     """Over-bounding factors of a filter by coordinate search on training pieces with outages.
 
-    ``prior`` is what a filter with ``_prior`` is told. Returns the best factors and their :func:`outage_error` [m];
-    ``progress`` is told every trial.
+    A factor goes up its values, or down them, until two in a row are worse; nothing is tried twice. ``prior`` is what
+    a filter with ``_prior`` is told. Returns the best factors and their :func:`outage_error` [m]; ``progress`` is told
+    every trial.
     """
+    known: dict[Tuning, float] = {}
 
     def judged(trial: Tuning) -> float:
-        return outage_error(build_causal(name, imu, "tuning does not", tuning=trial, prior=prior), batches, objective)
+        if trial not in known:
+            estimator = build_causal(name, imu, "tuning does not", tuning=trial, prior=prior)
+            known[trial] = outage_error(estimator, batches, objective)
+        return known[trial]
 
     best = start or Tuning()
     score = judged(best)
     for _ in range(rounds):
         before = best
         for factor, values in (factors or factors_of(name)).items():
-            for value in values:
-                if value == getattr(best, factor):
-                    continue
-                trial = replace(best, **{factor: value})
-                error = judged(trial)
-                if progress is not None:
-                    progress(Trial(factor, value, error))
-                if error < score:
-                    best, score = trial, error
+            now = getattr(best, factor)
+            up, down = sorted(v for v in values if v > now), sorted((v for v in values if v < now), reverse=True)
+            for side in (up, down):
+                worse = 0
+                for value in side:
+                    trial = replace(best, **{factor: value})
+                    error = judged(trial)
+                    if progress is not None:
+                        progress(Trial(factor, value, error))
+                    worse = 0 if error < score else worse + 1
+                    if error < score:
+                        best, score = trial, error
+                    elif worse == PATIENCE and math.isfinite(score):
+                        break
+                if getattr(best, factor) != now:
+                    break
         if best == before:
             break
     return best, score
