@@ -22,7 +22,7 @@ import pandas as pd
 import pymap3d
 import torch
 from matplotlib.figure import Figure
-from pipelines.studies import sky_figures
+from pipelines.studies.figures import sky_figures
 from scipy.stats import chi2
 
 from dlkf.data.schema import ATTITUDE, POSITION, VELOCITY, drive_file

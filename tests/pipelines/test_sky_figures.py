@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
-from pipelines.studies import sky_figures
+from pipelines.studies.figures import sky_figures
 from pipelines.studies.satellite_sky import above_horizon, fix_errors, summary, tables
 
 from dlkf.data.tables import read_table

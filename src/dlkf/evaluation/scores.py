@@ -92,7 +92,7 @@ def joined_scores(parts: Sequence[Scores]) -> Scores:
     return Scores(
         epoch_s=parts[0].epoch_s,
         pieces=[piece for s in parts for piece in s.pieces],
-        outage=rows(parts, "outage"),
+        outage=rows(parts, "outage").astype(np.bool_, copy=False),
         truth_p_n=rows(parts, "truth_p_n"),
         truth_v_n=rows(parts, "truth_v_n"),
         true_imu_error=rows(parts, "true_imu_error"),
