@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import threading
@@ -18,6 +19,7 @@ from dlkf.errors import InputError
 from dlkf.parallel import check, each
 from tests.drives import drives_in
 from tests.jobs import ended, half
+from tests.numbers_in import numbers_in
 
 DRIVES = 16
 SHORT = (f"dataset.hours={DRIVES * 15 / 3600}", "dataset.drive_minutes=0.25", "dataset.imu_rate_hz=50", "seed=5")
@@ -109,6 +111,23 @@ def test_navigated_by_workers(alone, where, call, tmp_path):
     one, other = (solutions(tmp_path / f"out-{k}") for k in range(2))
     assert len(one) == 3 and one.keys() == other.keys()
     assert all(np.array_equal(one[name], other[name], equal_nan=True) for name in one)
+
+
+def test_evaluated_by_workers_of_which_one_is_killed(alone, cluster, where, call, tmp_path, monkeypatch):
+    """Every drive a share of its own; pieces run by themselves, so the numbers are those of one process to rounding."""
+    monkeypatch.setattr("dlkf.evaluate.SAMPLES_AT_ONCE", 4)
+    given = ("model=mbkf15", f"dataset={alone}", "mode=pieces", "length_s=12", "stride_s=12", "outage.first_s=4")
+    given += ("outage.duration_s=5", "settle_s=2", "tracking.log=false")
+    results = []
+    for k, parallel in enumerate(("null", where)):
+        if k:
+            victim = min(worker.pid for worker in cluster.workers.values())
+            threading.Timer(0.5, os.kill, (victim, signal.SIGKILL)).start()
+        done = call("evaluate", *given, f"parallel={parallel}", f"out=out-{k}")
+        assert done.code == 0, done.err
+        results.append(json.loads((tmp_path / f"out-{k}" / "metrics.json").read_text())["results"])
+    assert numbers_in(results[0]) == pytest.approx(numbers_in(results[1]), rel=1e-9, abs=1e-12)
+    assert len(numbers_in(results[0])) > 20
 
 
 def test_ingested_by_workers(alone, where, call, tmp_path):

@@ -15,6 +15,7 @@ from dlkf.filters.integration import integrate
 from dlkf.filters.saved import load_filter
 from dlkf.training.fit import fit
 from dlkf.training.processes import joined_by
+from tests.numbers_in import numbers_in
 
 from .test_resume import data, told
 
@@ -81,15 +82,6 @@ SMALL = (
 )  # fmt: skip
 
 
-def numbers(x) -> list[float]:
-    """All numbers of a nested value, in their order."""
-    if isinstance(x, dict):
-        return [n for key in sorted(x) for n in numbers(x[key])]
-    if isinstance(x, list):
-        return [n for part in x for n in numbers(part)]
-    return [float(x)] if isinstance(x, (int, float)) and not isinstance(x, bool) else []
-
-
 @pytest.mark.commands
 def test_the_command_on_two_processes_leaves_the_same_table(dataset, tmp_path):
     tables, losses = [], []
@@ -98,7 +90,7 @@ def test_the_command_on_two_processes_leaves_the_same_table(dataset, tmp_path):
         done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr[-2000:]
         (report,) = (tmp_path / "outputs" / "train" / name).glob("*/report")
-        tables.append(numbers(json.loads((report / "metrics.json").read_text())["results"]))
+        tables.append(numbers_in(json.loads((report / "metrics.json").read_text())["results"]))
         state = torch.load(report.parent / "last.ckpt", weights_only=True)["callbacks"]
         average = next(v["average"] for k, v in state.items() if k.startswith("AdaptiveLossWeights"))
         losses.append([average[term] for term in sorted(average)])
