@@ -8,6 +8,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+PATIENCE_S = 900.0  # a command takes seconds; what a busy machine makes of it is no fault of its own
+
 
 @dataclass(frozen=True)
 class Ended:
@@ -26,6 +28,6 @@ def in_shell(folder: Path, command: str, *arguments: object) -> Ended:
         env={**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "200"},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE_S,
     )
     return Ended(done.returncode, done.stdout, done.stderr)

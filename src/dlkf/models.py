@@ -57,6 +57,15 @@ def resolve_model(
     )
 
 
+def model_folder(spec: str) -> Path:
+    """Where weights and config of ``plus`` or of a model's folder lie; InputError where they are not or do not load."""
+    folder = shipped_folder(spec) or Path(spec).expanduser()
+    if not folder.is_dir():
+        raise InputError(f"model={spec}: neither plus nor a folder with {WEIGHTS} and {CONFIG}")
+    load_filter(folder)
+    return folder
+
+
 def own_filter(spec: str, imu: ImuSpec) -> Estimator:
     """A user's estimator from ``module:Class``, told the IMU's preset if its class takes an argument ``imu``.
 

@@ -1,6 +1,6 @@
-"""A run's model into the registry: ``python -m dlkf.register run=<id> name=town alias=champion``.
+"""A model into the registry: ``python -m dlkf.register run=<id> name=town alias=champion``.
 
-Of a grid search's parent run, the point that validated best.
+Of a grid search's parent run, the point that validated best; with ``model=plus``, or the folder of a model, that one.
 """
 
 from __future__ import annotations
@@ -8,20 +8,31 @@ from __future__ import annotations
 from dlkf.command import command
 from dlkf.command.settings import RegisterSettings
 from dlkf.errors import InputError
+from dlkf.filters.card import CARD_TEXT
+from dlkf.models import model_folder
 from dlkf.tracking.comparison import best_of
-from dlkf.tracking.registry import check_registration, registered
-from dlkf.tracking.runs import check_store, client_of, reachable, run_exists, store_missing, tracking_uri
+from dlkf.tracking.registry import check_registration, log_model, registered
+from dlkf.tracking.runs import check_store, client_of, reachable, run_exists, start_run, store_missing, tracking_uri
 
 
 @command("register", RegisterSettings)
 def main(told: RegisterSettings) -> None:
     """Look, choose, register, print."""
-    run_id, name, alias = told.run, told.name, told.alias
+    name, alias = told.name, told.alias
     uri = tracking_uri(told.tracking.uri)
     check_registration(name, alias)
-    if store_missing(uri):
-        raise InputError(f"there is no MLflow store at {uri.removeprefix('sqlite:///')}; give tracking.uri=…")
-    check_store(uri)
+    if told.model is not None:
+        folder = model_folder(told.model)
+        with start_run(uri, "models", told.model) as run:
+            if (card := folder / CARD_TEXT).is_file():
+                run.note(card.read_text())
+            log_model(run, folder)
+        run_id = run.id
+    else:
+        run_id = str(told.run)
+        if store_missing(uri):
+            raise InputError(f"there is no MLflow store at {uri.removeprefix('sqlite:///')}; give tracking.uri=…")
+        check_store(uri)
     with reachable(uri):
         client = client_of(uri)
         if not run_exists(client, run_id):

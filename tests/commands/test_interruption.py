@@ -7,6 +7,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import tempfile
 import time
 from contextlib import closing
 from pathlib import Path
@@ -16,6 +17,7 @@ import pytest
 
 from dlkf.data.validate import validate_dataset
 from dlkf.errors import InputError
+from tests.shell import PATIENCE_S
 
 SIMULATE = (
     "simulate",
@@ -28,23 +30,30 @@ ENOUGH = "dataset.hours=100"  # hours of work that nobody waits for
 
 
 def stopped(folder: Path, begun: str, how: signal.Signals, *command: str) -> int:
-    """Start a command, send it a signal when a file like ``begun`` is there, and return its exit code."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", f"dlkf.{command[0]}", *command[1:]],
-        cwd=folder,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        preexec_fn=_heed_interrupts,
-    )
-    end = time.monotonic() + 240  # of a machine that is busy
-    while not any(folder.glob(begun)) and time.monotonic() < end and process.poll() is None:
-        time.sleep(0.02)
-    process.send_signal(how)
-    try:
-        return process.wait(timeout=240)
-    finally:
-        process.kill()
+    """Start a command, send it a signal when a file like ``begun`` is there, and return its exit code.
+
+    Only then: a signal that comes before it would test something else.
+    """
+    with tempfile.TemporaryFile() as said:
+        process = subprocess.Popen(
+            [sys.executable, "-m", f"dlkf.{command[0]}", *command[1:]],
+            cwd=folder,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            stdout=said,
+            stderr=said,
+            preexec_fn=_heed_interrupts,
+        )
+        try:
+            end = time.monotonic() + PATIENCE_S
+            while not any(folder.glob(begun)):
+                if process.poll() is not None or time.monotonic() > end:
+                    said.seek(0)
+                    pytest.fail(f"{begun} never came (exit code {process.poll()}): {said.read()[-2000:].decode()}")
+                time.sleep(0.02)
+            process.send_signal(how)
+            return process.wait(timeout=PATIENCE_S)
+        finally:
+            process.kill()
 
 
 def _heed_interrupts() -> None:

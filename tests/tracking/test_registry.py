@@ -103,13 +103,30 @@ def test_the_pyfunc_gives_what_navigate_gives(logged, uri, weights, cars):
         model.predict(table.drop(columns="accel_x"))
 
 
+def test_the_filter_that_comes_along_is_registered_with_its_card(uri, call):
+    """``model=plus``: a run of its own, a version with card, signature and example, and the same solution from it."""
+    done = call("register", "model=plus", "name=plus", "alias=champion", f"tracking.uri={uri}")
+    assert done.code == 0 and "models:/plus@champion" in done.out, done.err
+    mlflow = mlflow_module()
+    mlflow.set_tracking_uri(uri)
+    assert "65 h of simulated drives" in mlflow.MlflowClient(uri).get_model_version("plus", "1").description
+    model = mlflow.pyfunc.load_model("models:/plus@champion")
+    answer = model.predict(model.input_example)
+    assert len(answer) >= 8 and np.isfinite(answer.vel_n).all()
+    assert call("register", "model=nobody", "name=plus", f"tracking.uri={uri}").code == 2
+    assert call("register", "model=plus", "run=" + "0" * 32, "name=plus").code == 2
+
+
 @pytest.mark.served
-def test_it_is_served_and_called_over_http(logged, uri, cars):
+@pytest.mark.parametrize("name", ["town", "plus"])
+def test_it_is_served_and_called_over_http(name, logged, uri, call):
     """``mlflow models serve`` in the environment at hand: a table of a drive as JSON, its solution comes back."""
+    if name == "plus":
+        assert call("register", "model=plus", "name=plus", "alias=champion", f"tracking.uri={uri}").code == 0
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    command = [sys.executable, "-m", "mlflow", "models", "serve", "-m", "models:/town@champion", "-p", str(port)]
+    command = [sys.executable, "-m", "mlflow", "models", "serve", "-m", f"models:/{name}@champion", "-p", str(port)]
     path = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))  # MLflow calls uvicorn by name
     environment = {**os.environ, "MLFLOW_TRACKING_URI": uri, "OMP_NUM_THREADS": "1", "PATH": path}
     server = subprocess.Popen([*command, "--env-manager", "local"], env=environment, start_new_session=True)
@@ -132,7 +149,7 @@ def test_it_is_served_and_called_over_http(logged, uri, cars):
     assert set(answer.drive) == {"example"} and len(answer) >= 8
     mlflow = mlflow_module()
     mlflow.set_tracking_uri(uri)
-    here = mlflow.pyfunc.load_model("models:/town@champion").predict(example_drive())
+    here = mlflow.pyfunc.load_model(f"models:/{name}@champion").predict(example_drive())
     assert np.allclose(answer[["lat_deg", "vel_n"]].astype(float), here[["lat_deg", "vel_n"]], atol=1e-9)
 
 

@@ -162,10 +162,15 @@ class CompareSettings:
 class RegisterSettings:
     """``dlkf register``."""
 
-    run: str
+    run: str | None
+    model: str | None
     name: str
     alias: str | None
     tracking: Store
+
+    def __post_init__(self) -> None:
+        if (self.run is None) == (self.model is None):
+            raise InputError("give run=<id of a training>, or model=plus or a folder, one of them")
 
 
 def check_above_zero(settings: Any, *names: str) -> None:

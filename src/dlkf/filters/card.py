@@ -11,7 +11,7 @@ import yaml
 from dlkf.data.tables import DriveRow
 from dlkf.errors import InputError
 
-CARD = "card.yaml"
+CARD, CARD_TEXT = "card.yaml", "card.md"  # for programs, for people
 
 
 def read_card(folder: Path) -> dict[str, Any]:
