@@ -19,6 +19,8 @@ from dlkf.tracking.runs import check_store, client_of, reachable, run_exists, st
 def main(told: RegisterSettings) -> None:
     """Look, choose, register, print."""
     name, alias = told.name, told.alias
+    if (told.run is None) == (told.model is None):
+        raise InputError("give run=<id of a training>, or model=plus or a folder: one of the two")
     uri = tracking_uri(told.tracking.uri)
     check_registration(name, alias)
     if told.model is not None:

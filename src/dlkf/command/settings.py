@@ -168,10 +168,6 @@ class RegisterSettings:
     alias: str | None
     tracking: Store
 
-    def __post_init__(self) -> None:
-        if (self.run is None) == (self.model is None):
-            raise InputError("give run=<id of a training>, or model=plus or a folder, one of them")
-
 
 def check_above_zero(settings: Any, *names: str) -> None:
     """InputError for one of these settings that is 0 or less."""
