@@ -8,7 +8,7 @@ from dlkf.data.augmentation import Rough, roughen, wandering
 
 from .scene import RATE, scene
 
-QUIET = Rough(share=0.0, shaken=0.0, gnss=0.0)
+QUIET = Rough(share=0.0, shaken=0.0, rectified=0.0, gnss=0.0)
 
 
 def test_nothing_drawn_is_nothing_changed():
@@ -48,3 +48,16 @@ def test_a_receiver_is_wrong_by_about_what_it_says():
     assert torch.allclose(off[:3], torch.ones(3, dtype=off.dtype), atol=0.15) and float(off[3:].max()) < 0.11
     ratio = (after.gnss_std[:, 0, 0].log()).median()
     assert abs(float(ratio)) < 0.25
+
+
+def test_vibration_makes_an_error_of_the_axis_that_feels_it():
+    """A pitch axis that shakes ten times as much errs ten times as much; without vibration nothing errs."""
+    batch = scene(30, 40)
+    g = torch.Generator().manual_seed(1)
+    shake = torch.randn(batch.imu.shape, generator=g, dtype=batch.imu.dtype) * torch.tensor([0.0] * 4 + [0.1, 0.01])
+    rough = replace(QUIET, rectified=1.0, gyro_rectified=(0.02, 0.02))
+    shaken = replace(batch, imu=batch.imu + shake)
+    added = (roughen(shaken, rough, torch.Generator().manual_seed(0)).imu - shaken.imu)[..., 4:].mean(2)
+    size = added.square().mean(1).sqrt().log().mean(0)  # of each car the axis' own share, e^(normal)
+    assert abs(float(size[0] - size[1]) - 2.3) < 0.5
+    assert abs(float(size[0]) - torch.tensor(0.02 * 0.1).log()) < 0.5

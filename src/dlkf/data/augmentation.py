@@ -67,8 +67,10 @@ class Rough:
 
     ``share`` of the pieces get white noise [m/s²/√Hz, rad/s/√Hz], uneven over the axes by ``uneven`` (1σ of the
     logarithm), and an error that wanders with a correlation time of 1 to 20 s [m/s², rad/s]; ``shaken`` of them have
-    what is faster than some 3 Hz made weaker or stronger, from nothing to twice; ``gnss`` of them have further errors
-    of position [m] and velocity [m/s], half white and half lasting, which their stds tell only within a factor of two.
+    what is faster than some 3 Hz made weaker or stronger, from nothing to twice; ``rectified`` of them have sensors
+    that turn vibration into an error that wanders, axis by axis in proportion to what that axis feels; ``gnss`` of
+    them have further errors of position [m] and velocity [m/s], half white and half lasting, which their stds tell
+    only within a factor of two.
     """
 
     share: float = 0.6
@@ -77,8 +79,11 @@ class Rough:
     accel_wander: tuple[float, ...] = (3e-3, 0.15)
     gyro_wander: tuple[float, ...] = (1e-4, 5e-3)
     wander_s: tuple[float, ...] = (1.0, 20.0)
-    uneven: float = 0.7
+    uneven: float = 1.0
     shaken: float = 0.4
+    rectified: float = 0.4
+    accel_rectified: tuple[float, ...] = (3e-4, 1e-2)  # of the RMS of the vibration in a window
+    gyro_rectified: tuple[float, ...] = (1e-3, 5e-2)
     gnss: float = 0.5
     position: tuple[float, ...] = (0.01, 3.0)
     velocity: tuple[float, ...] = (0.01, 0.3)
@@ -112,9 +117,13 @@ def roughen(batch: Batch, rough: Rough, generator: torch.Generator | None = None
     slowly = torch.cat([drawn(b, B, 1).expand(B, 3) for b in (rough.accel_wander, rough.gyro_wander)], -1)
     slowly = slowly * torch.exp(rough.uneven * normal(B, 6))
     keep = torch.exp(-batch.epoch_s / drawn(rough.wander_s, B, 1))
-    wander = wandering(normal(B, T, 6), keep) * slowly[:, None]
-    noise = (white / batch.dt**0.5)[:, None] * normal(B, T * M, 6) + wander.repeat_interleave(M, 1)
-    flat = flat + (noise * hit[:, None, None]).to(imu)
+    of_loud = torch.cat([drawn(b, B, 1).expand(B, 3) for b in (rough.accel_rectified, rough.gyro_rectified)], -1)
+    of_loud = of_loud * torch.exp(normal(B, 6)) * chance(rough.rectified)[:, None]
+    loud = (flat - slow).unflatten(1, (T, M)).square().mean(2).sqrt().to(of_loud)
+    size = slowly[:, None] * hit[:, None, None] + loud * of_loud[:, None]
+    wander = (wandering(normal(B, T, 6), keep) * size).repeat_interleave(M, 1)
+    noise = (white / batch.dt**0.5 * hit[:, None])[:, None] * normal(B, T * M, 6) + wander
+    flat = flat + noise.to(imu)
     worse = chance(rough.gnss)[:, None, None]
     size = torch.cat([drawn(b, B, 1).expand(B, 3) for b in (rough.position, rough.velocity)], -1)[:, None]
     lasting = wandering(normal(B, T, 6), torch.exp(-batch.epoch_s / drawn((5.0, 60.0), B, 1)))

@@ -24,6 +24,7 @@ from dlkf.filters.advised_speed import AdvisedSpeed
 from dlkf.filters.build import build_filter
 from dlkf.filters.car_speed import Calibration, CarSpeed, Foretold
 from dlkf.filters.integration import Correction, Epoch
+from dlkf.filters.matching import LOG_FEATURES, Matching
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.model_based import Memory as KalmanMemory
 from dlkf.filters.tuning import Tuning
@@ -31,7 +32,7 @@ from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.navigation.state import ATTITUDE, IMU, POSITION, VELOCITY, ErrorStates
 from dlkf.networks.features import level_rotation
-from dlkf.networks.plus import WINDOW_FEATURES, Heads, PlusNetwork, PlusNetworkConfig, window_features
+from dlkf.networks.plus import WINDOW_FEATURES, Heads, PlusNetwork, PlusNetworkConfig, loudness, window_features
 from dlkf.settings import settings_from
 
 PARTS = ("process", "fix", "across", "offset", "speed", "residual")
@@ -51,7 +52,6 @@ START_TUNING: Mapping[str, float] = {
     "accel_noise": 30.0, "gyro_noise": 3.0, "accel_walk": 100.0, "gyro_walk": 10.0,
     "position_std": 2.0, "velocity_std": 2.0, "lateral_std": 0.1,
 }  # fmt: skip
-SPREADS = (5.0, 60.0)  # s, memories of the normalised innovations
 # m/s: a car whose sound tells its speed less well has next to nothing to say, for such errors last through an outage;
 # chosen between 0.7 and 2 on validation drives (docs/results/plus.md)
 TELLING_STD = 1.0
@@ -92,7 +92,7 @@ class Memory(NamedTuple):
     hidden: Tensor  # (B, h)
     elapsed: Tensor  # (B,) s since the start
     since_fix: Tensor  # (B,) s
-    surprise: Tensor  # (B, 4) running means of normalised squared innovations, position and velocity
+    matching: Matching  # what the fixes say of its noise
     fix_speed: Tensor  # (B,) m/s forward at the last fix
     car: Calibration  # what the drive has told of the car's speed
     residual: Tensor  # (B, 6) part of the IMU error that the network added
@@ -114,8 +114,8 @@ class PlusFilter(nn.Module):
         speed = (AdvisedSpeed(kalman.states),) if "speed" in config.parts else ()
         self.kalman = replace(kalman, sources=(*kalman.sources, *speed), cut_transition=True)
         count = self.kalman.states.count
-        now = 3 + 3 + 3 + 2
-        features = WINDOW_FEATURES + count + (count - 9) + 2 + 4 + 6 + 4 + 3 + 5 + now
+        now = 3 + 3 + 3 + 2 + 6
+        features = WINDOW_FEATURES + count + (count - 9) + 2 + 4 + 6 + LOG_FEATURES + 3 + 5 + now
         self.network = PlusNetwork(PlusNetworkConfig(config.network.hidden, features), now)
         self.car_speed = CarSpeed(WINDOW_FEATURES)
         self.parts = frozenset(config.parts)
@@ -145,8 +145,8 @@ class PlusFilter(nn.Module):
         kalman, error = self.kalman.begin(batch)
         zeros, B = batch.imu.new_zeros, batch.size[0]
         memory = Memory(
-            kalman, self.network.start(B), zeros(B), zeros(B), zeros(B, 4) + 1.0, zeros(B), self.car_speed.begin(B),
-            zeros(B, 6),
+            kalman, self.network.start(B), zeros(B), zeros(B), Matching.begin(batch.imu, B), zeros(B),
+            self.car_speed.begin(B), zeros(B, 6),
             torch.rand(B, device=batch.imu.device) < SILENT_SHARE if self.training else zeros(B) > 0,
         )  # fmt: skip
         return memory, error
@@ -161,8 +161,7 @@ class PlusFilter(nn.Module):
             memory = memory._replace(
                 elapsed=memory.elapsed + span,
                 since_fix=torch.where(fixed, 0.0, memory.since_fix + span),
-                fix_speed=torch.where(fixed, forward, memory.fix_speed),
-                surprise=_faded(memory.surprise, normalised, epoch.used, span),
+                matching=memory.matching.innovated(normalised, epoch.used),
             )
             heard = window_features(epoch.corrected, epoch.dt)
         dtype = self.network.inward.weight.dtype
@@ -182,8 +181,17 @@ class PlusFilter(nn.Module):
             assert isinstance(error, ImuError)
             correction = correction._replace(imu_error=error._replace(bias=error.bias + heads.residual - residual))
             residual = heads.residual
-        car = self.car_speed.learned(memory.car, foretold, forward.to(dtype), fixed)
-        memory = memory._replace(kalman=kalman, hidden=hidden, car=car, residual=residual, seen=heads)
+        with torch.no_grad():
+            after = epoch.window.end.corrected(correction.dx)
+            told = (after.C_nb[:, :, 0] * after.v_n).sum(-1)
+            matching = memory.matching
+            if (c := correction.covariances) is not None:
+                matching = matching.corrected(c.dx, c.predicted, c.updated, epoch.window.end.C_nb, fixed)
+        memory = memory._replace(
+            kalman=kalman, hidden=hidden, residual=residual, matching=matching, seen=heads,
+            fix_speed=torch.where(fixed, told, memory.fix_speed),
+            car=self.car_speed.learned(memory.car, foretold, told.to(dtype), fixed),
+        )  # fmt: skip
         return memory, correction
 
     def _advice(self, heads: Heads, speed: Float[Tensor, "B 2"], silent: Tensor) -> Advice:
@@ -227,13 +235,13 @@ class PlusFilter(nn.Module):
         )  # fmt: skip
         now = torch.cat(
             (v_b / v_b.new_tensor((10.0, 1.0, 1.0)), torch.log(variance[:, 3:6]) / 6, v_b[:, :1] * rate[:, 2:] / 3,
-             force[:, 1:2] / 3, rate[:, 2:] / 0.3, fixed, age[:, :1]), -1,
+             force[:, 1:2] / 3, rate[:, 2:] / 0.3, fixed, age[:, :1], loudness(heard)), -1,
         )  # fmt: skip
         features = torch.cat(
             (
                 heard, torch.log(variance) / 4 - torch.log(size) / 2,
                 torch.asinh(known / size[9:]), age, fix_std, torch.asinh(normalised),
-                torch.log(memory.surprise + 0.01) / 2, fixed, fixed * forward.unsqueeze(-1) / 10,
+                memory.matching.logarithms(), fixed, fixed * forward.unsqueeze(-1) / 10,
                 memory.fix_speed.unsqueeze(-1) / 10, car, now,
             ), -1,
         )  # fmt: skip
@@ -246,18 +254,6 @@ class PlusFilter(nn.Module):
         return like.new_tensor(
             (1.0,) * 3 + (0.3,) * 3 + (0.02,) * 3 + (0.1,) * 3 + (0.005,) * 3 + (0.005,) * matrix + car
         )
-
-
-def _faded(mean: Tensor, normalised: Tensor, used: Tensor, span: float) -> Tensor:
-    """Running means of the squares over :data:`SPREADS`, of position and velocity; unchanged without a fix."""
-    parts = []
-    for k, block in enumerate((slice(0, 3), slice(3, 6))):
-        n = used[:, block].sum(-1)
-        new = normalised[:, block].square().sum(-1) / n.clamp_min(1)
-        for j, memory_s in enumerate(SPREADS):
-            old = mean[:, 2 * k + j]
-            parts.append(torch.where(n > 0, torch.lerp(old, new.clamp_max(1e4), min(1.0, span / memory_s)), old))
-    return torch.stack(parts, -1)
 
 
 def _turned_variance(P: Float[Tensor, "B 3 3"], C_nb: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 3"]:

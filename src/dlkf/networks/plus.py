@@ -121,3 +121,8 @@ def window_features(samples: Float[Tensor, "B M 6"], dt: float) -> Float[Tensor,
     level = samples.new_tensor([-6.0] * 3 + [-13.0] * 3)[:, None]
     x = (mean - mean.new_tensor((0.0, 0.0, -9.8, 0.0, 0.0, 0.0))) / mean.new_tensor(MEAN_SIZE)
     return torch.cat((torch.asinh(x), ((torch.log(bands + least) - level) / 4).flatten(1)), -1)
+
+
+def loudness(heard: Float[Tensor, "B K"]) -> Float[Tensor, "B 6"]:
+    """How much each axis shakes faster than 3.5 Hz, of a window's features: mean logarithm of those bands."""
+    return heard[:, 6:].unflatten(-1, (6, len(BANDS_HZ) - 1))[..., 2:].mean(-1)

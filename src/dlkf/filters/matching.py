@@ -1,0 +1,77 @@
+"""Covariance matching: what the fixes say of a Kalman filter's noise (Mehra 1972, "Approaches to adaptive filtering").
+
+Where the noise is what the filter takes it for, an innovation's square is its variance, and the square of a correction
+what the covariance loses by it:
+
+    E[zᵢ²] = (H P Hᵀ + R)ᵢᵢ,    E[dxᵢ²] = (P⁻ − P⁺)ᵢᵢ
+
+Which noise is too small is told apart by axes, as far as the motion allows, so everything is kept per axis: innovations
+in heading axes, corrections in body axes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dlkf.navigation.state import ATTITUDE, IMU, VELOCITY
+
+MEMORIES = (10.0, 60.0)  # fixes
+LARGEST = 1e3  # of a ratio: one outlier says no more than this
+SIZES = (0.05,) * 3 + (2e-3,) * 3 + (5e-3,) * 3 + (1e-4,) * 3  # typical corrections: m/s, rad, m/s², rad/s
+LOG_FEATURES = 12 + 24 + 12
+
+
+class Matching(NamedTuple):
+    """Running means over the last fixes, short and long; one where nothing was seen."""
+
+    innovations: Tensor  # (B, 2, 6) z² over its variance; position, velocity; forward, right, down
+    ratios: Tensor  # (B, 2, 12) dx² over what P loses; velocity, attitude, accelerometer, gyroscope; body axes
+    sizes: Tensor  # (B, 12) dx² over SIZES², short
+    fixes: Tensor  # (B,)
+
+    @classmethod
+    def begin(cls, like: Tensor, size: int) -> Matching:
+        """Nothing seen."""
+        one = like.new_ones
+        return cls(one(size, 2, 6), one(size, 2, 12), one(size, 12), like.new_zeros(size))
+
+    def innovated(self, normalised: Float[Tensor, "B 6"], used: Bool[Tensor, "B 6"]) -> Matching:
+        """After an innovation over its 1σ, in heading axes."""
+        fixes = self.fixes + used.any(-1)
+        new = normalised.square().clamp_max(LARGEST).unsqueeze(1)
+        innovations = torch.where(used.unsqueeze(1), _blended(self.innovations, new, fixes), self.innovations)
+        return self._replace(innovations=innovations, fixes=fixes)
+
+    def corrected(
+        self, dx: Float[Tensor, "B n"], prior: Float[Tensor, "B n n"], posterior: Float[Tensor, "B n n"],
+        C_nb: Float[Tensor, "B 3 3"], fixed: Bool[Tensor, " B"],
+    ) -> Matching:  # fmt: skip
+        """After the correction of an epoch; unchanged without a fix."""
+        turned = [(C_nb.mT @ dx[:, b].unsqueeze(-1)).squeeze(-1) for b in (VELOCITY, ATTITUDE)]
+        squares = torch.cat((*turned, dx[:, IMU]), -1).square()
+        lost = [C_nb.mT @ (prior[:, b, b] - posterior[:, b, b]) @ C_nb for b in (VELOCITY, ATTITUDE)]
+        of_imu = (prior - posterior).diagonal(dim1=-2, dim2=-1)[:, IMU]
+        expected = torch.cat((*(x.diagonal(dim1=-2, dim2=-1) for x in lost), of_imu), -1)
+        size = squares.new_tensor(SIZES).square()
+        ratio = (squares / (expected.clamp_min(0.0) + 1e-9 * size)).clamp_max(LARGEST)
+        ratios = _blended(self.ratios, ratio.unsqueeze(1), self.fixes)
+        sizes = _blended(self.sizes.unsqueeze(1), (squares / size).clamp_max(LARGEST).unsqueeze(1), self.fixes)
+        return self._replace(
+            ratios=torch.where(fixed[:, None, None], ratios, self.ratios),
+            sizes=torch.where(fixed[:, None], sizes[:, 0], self.sizes),
+        )
+
+    def logarithms(self) -> Float[Tensor, "B L"]:
+        """What a network sees of it, each of order 1."""
+        parts = (self.innovations.flatten(1), self.ratios.flatten(1), self.sizes)
+        return torch.cat([torch.log(x + 1e-3) for x in parts], -1) / 2
+
+
+def _blended(mean: Float[Tensor, "B k m"], new: Float[Tensor, "B 1 m"], fixes: Float[Tensor, " B"]) -> Tensor:
+    """Running means: true ones over the first fixes, then fading."""
+    share = 1 / fixes[:, None].clamp_min(1).clamp_max(mean.new_tensor(MEMORIES[: mean.shape[1]]))
+    return torch.lerp(mean, new.expand_as(mean), share.unsqueeze(-1))
