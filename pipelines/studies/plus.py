@@ -8,8 +8,8 @@ simulated and semi-real pieces end to end, real ones every 10 s. Nobody is told 
 from an automotive MEMS and have factors tuned by the geometric mean on pieces of the training drives, which are kept
 in <out>/factors.yaml. Beside them stands ``mbkf33_car`` that is told the preset of the drive's IMU, where it has one,
 and has its tuned factors but those of the IMU: no rival, but what such knowledge is worth. Prints, and writes into
-<out>, Markdown tables of the horizontal error at the end of the outages: all filters, then ``plus`` with parts of its
-network switched off.
+<out>, Markdown tables of the horizontal error at the end of the outages: all filters, then trainings from other seeds
+(``--model`` takes several), then ``plus`` with parts of its network switched off.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ SEED = 7
 
 
 class Row(NamedTuple):
-    """Errors of every filter [m] and normalised squares of ``plus`` at the ends of the outages of one dataset."""
+    """Errors of every filter at the ends of the outages of one dataset [m], and NEES of those with a covariance."""
 
     name: str
     outage_s: float
     groups: list[str]
     errors: dict[str, np.ndarray]
-    nees: float
+    nees: dict[str, float]
     told: np.ndarray | None = None
 
 
@@ -114,8 +114,8 @@ def told_errors(
 def scored(
     name: str, batch: Batch, outage_s: float, filters: Mapping[str, Estimator], groups: Mapping[str, str]
 ) -> Row:
-    """Errors at the end of the outage; NEES of the horizontal position over it, of the last filter."""
-    end, nees, errors = round((BEFORE_S + outage_s) / batch.epoch_s) - 1, float("nan"), {}
+    """Errors at the end of the outage; NEES of the horizontal position over it."""
+    end, nees, errors = round((BEFORE_S + outage_s) / batch.epoch_s) - 1, {}, {}
     first = round(BEFORE_S / batch.epoch_s)
     for filter_name, estimator in filters.items():
         solution = run_filter(batch, estimator)
@@ -123,30 +123,56 @@ def scored(
         errors[filter_name] = e[:, end].norm(dim=-1).numpy()
         if solution.std is not None:
             square = 0.5 * (e / solution.std[..., :2]).square().sum(-1)[:, first : end + 1]
-            nees = float(square[batch.truth_valid[:, first : end + 1]].mean())
+            nees[filter_name] = float(square[batch.truth_valid[:, first : end + 1]].mean())
     return Row(name, outage_s, [groups[d] for d in batch.drive], errors, nees)
 
 
 def markdown(rows: Sequence[Row], filters: Sequence[str], model: str) -> list[str]:
-    """RMS / median per filter; of ``plus`` over the best classical one by geometric mean also the ratios."""
+    """RMS / median per filter; of ``model`` over the best other one by geometric mean also the ratios."""
     told = any(row.told is not None for row in rows)
     head = ["data", "outage [s]", "pieces", *filters, "RMS ratio", "geometric ratio", "NEES"]
     head += [f"{TOLD}, told its IMU"] if told else []
-    lines = [f"| {' | '.join(head)} |", f"|:--|{'--:|' * (len(head) - 1)}"]
+    lines = _head(head)
     for row in rows:
-        cells = [f"{mean_error(row.errors[f], 'rms'):.1f} / {np.median(row.errors[f]):.1f}" for f in filters]
-        best = min((f for f in filters if f != model), key=lambda f: mean_error(row.errors[f], "log"))
-        ratios = []
-        for statistic in ("rms", "geomean"):
-            c = compare(row.errors[model], row.errors[best], statistic=statistic, groups=row.groups)
-            band = "" if np.isnan(c.ratio_low) else f" [{c.ratio_low:.2f}, {c.ratio_high:.2f}]"
-            ratios.append(f"{c.ratio:.2f}{band}")
-        first = [row.name, f"{row.outage_s:g}", str(len(row.groups))]
-        last = [f"{row.nees:.1f}"]
+        cells = [*_first(row), str(len(row.groups)), *(_both(row.errors[f]) for f in filters)]
+        cells += [*_ratios(row, filters, model), f"{row.nees[model]:.1f}"]
         if told:
-            last.append("" if row.told is None else f"{mean_error(row.told, 'rms'):.1f} / {np.median(row.told):.1f}")
-        lines.append(f"| {' | '.join([*first, *cells, *ratios, *last])} |")
+            cells.append("" if row.told is None else _both(row.told))
+        lines.append(f"| {' | '.join(cells)} |")
     return lines
+
+
+def of_seeds(rows: Sequence[Row], models: Sequence[str]) -> list[str]:
+    """The same trainings from several seeds: RMS / median, and ratios to the best classical filter."""
+    lines = _head(["data", "outage [s]", *(x for m in models for x in (m, "RMS ratio", "geometric ratio", "NEES"))])
+    for row in rows:
+        cells = _first(row)
+        for m in models:
+            cells += [_both(row.errors[m]), *_ratios(row, [*CLASSICAL, m], m), f"{row.nees[m]:.1f}"]
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def _head(names: Sequence[str]) -> list[str]:
+    return [f"| {' | '.join(names)} |", f"|:--|{'--:|' * (len(names) - 1)}"]
+
+
+def _first(row: Row) -> list[str]:
+    return [row.name, f"{row.outage_s:g}"]
+
+
+def _both(errors: np.ndarray) -> str:
+    return f"{mean_error(errors, 'rms'):.1f} / {np.median(errors):.1f}"
+
+
+def _ratios(row: Row, filters: Sequence[str], model: str) -> list[str]:
+    best = min((f for f in filters if f != model), key=lambda f: mean_error(row.errors[f], "log"))
+    cells = []
+    for statistic in ("rms", "geomean"):
+        c = compare(row.errors[model], row.errors[best], statistic=statistic, groups=row.groups)
+        band = "" if np.isnan(c.ratio_low) else f" [{c.ratio_low:.2f}, {c.ratio_high:.2f}]"
+        cells.append(f"{c.ratio:.2f}{band}")
+    return cells
 
 
 def with_parts(model: PlusFilter, parts: Sequence[str]) -> PlusFilter:
@@ -159,7 +185,7 @@ def with_parts(model: PlusFilter, parts: Sequence[str]) -> PlusFilter:
 def main() -> None:
     """Tune, score, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--model", default="plus", help="weights: plus, or a folder")
+    parser.add_argument("--model", nargs="+", default=["plus"], help="weights: plus, or folders; the first is plus")
     parser.add_argument("--train", nargs="+", required=True, help="datasets that the classical filters are tuned on")
     parser.add_argument("--test", nargs="*", default=[], help="simulated datasets")
     parser.add_argument("--semi", nargs="*", default=[], help="datasets of real motion with injected errors")
@@ -170,9 +196,11 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     args.out.mkdir(parents=True, exist_ok=True)
-    model = trained_filter(args.model)
+    models = {f"plus, {k + 1}" if k else "plus": trained_filter(folder) for k, folder in enumerate(args.model)}
+    model = models["plus"]
     assert isinstance(model, PlusFilter)
-    filters = {**opponents(args.train, args.out), "plus": model}
+    filters = {**opponents(args.train, args.out), **models}
+    shown = [*CLASSICAL, "plus"]
     factors = yaml.safe_load((args.out / "factors.yaml").read_text())[TOLD]
     rows, ablated = [], []
     for folder in (*args.test, *args.semi, *args.real):
@@ -185,11 +213,13 @@ def main() -> None:
             batch = outages(stack, outage_s, stride)
             told = told_errors(batch, outage_s, imus, factors)
             rows.append(scored(Path(folder).name, batch, outage_s, filters, groups)._replace(told=told))
-            print(markdown(rows[-1:], list(filters), "plus")[-1], flush=True)
+            print(markdown(rows[-1:], shown, "plus")[-1], flush=True)
             if args.ablation:
                 variants = {"+".join(p) or "none": with_parts(model, p) for p in PARTS}
                 ablated.append(scored(Path(folder).name, batch, outage_s, variants, groups))
-    lines = markdown(rows, list(filters), "plus")
+    lines = markdown(rows, shown, "plus")
+    if len(models) > 1:
+        lines += ["", *of_seeds(rows, list(models))]
     if ablated:
         names = list(ablated[0].errors)
         lines += ["", *markdown(ablated, names, names[-1])]
