@@ -22,7 +22,7 @@ from dlkf.navigation.state import ATTITUDE, IMU, VELOCITY
 MEMORIES = (10.0, 60.0)  # fixes
 LARGEST = 1e3  # of a ratio: one outlier says no more than this
 SIZES = (0.05,) * 3 + (2e-3,) * 3 + (5e-3,) * 3 + (1e-4,) * 3  # typical corrections: m/s, rad, m/s², rad/s
-LOG_FEATURES = 12 + 24 + 12
+LOG_FEATURES, AXIS_FEATURES = 12 + 24 + 12, 8 + 4
 
 
 class Matching(NamedTuple):
@@ -69,6 +69,11 @@ class Matching(NamedTuple):
         """What a network sees of it, each of order 1."""
         parts = (self.innovations.flatten(1), self.ratios.flatten(1), self.sizes)
         return torch.cat([torch.log(x + 1e-3) for x in parts], -1) / 2
+
+    def by_axis(self) -> Float[Tensor, "B 3 12"]:
+        """What of the logarithms belongs to each body axis: ratios of both memories, sizes."""
+        ratios = self.ratios.unflatten(-1, (4, 3)).flatten(1, 2)
+        return torch.log(torch.cat((ratios, self.sizes.unflatten(-1, (4, 3))), 1) + 1e-3).mT / 2
 
 
 def _blended(mean: Float[Tensor, "B k m"], new: Float[Tensor, "B 1 m"], fixes: Float[Tensor, " B"]) -> Tensor:

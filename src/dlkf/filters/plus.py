@@ -24,7 +24,7 @@ from dlkf.filters.advised_speed import AdvisedSpeed
 from dlkf.filters.build import build_filter
 from dlkf.filters.car_speed import Calibration, CarSpeed, Foretold
 from dlkf.filters.integration import Correction, Epoch
-from dlkf.filters.matching import LOG_FEATURES, Matching
+from dlkf.filters.matching import AXIS_FEATURES, LOG_FEATURES, Matching
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.model_based import Memory as KalmanMemory
 from dlkf.filters.tuning import Tuning
@@ -116,7 +116,7 @@ class PlusFilter(nn.Module):
         count = self.kalman.states.count
         now = 3 + 3 + 3 + 2 + 6
         features = WINDOW_FEATURES + count + (count - 9) + 2 + 4 + 6 + LOG_FEATURES + 3 + 5 + now
-        self.network = PlusNetwork(PlusNetworkConfig(config.network.hidden, features), now)
+        self.network = PlusNetwork(PlusNetworkConfig(config.network.hidden, features, 2 + AXIS_FEATURES), now)
         self.car_speed = CarSpeed(WINDOW_FEATURES)
         self.parts = frozenset(config.parts)
 
@@ -136,7 +136,7 @@ class PlusFilter(nn.Module):
         return self.kalman.imu
 
     def heads(self) -> Iterator[nn.Parameter]:
-        """Weights of the output layers."""
+        """Weights of the output layers, but for that of the axes, which has to find what is small."""
         yield from self.network.noise.parameters()
         yield from self.network.trust.parameters()
 
@@ -168,7 +168,8 @@ class PlusFilter(nn.Module):
         foretold = self.car_speed(heard.to(dtype), memory.car)
         with torch.no_grad():
             features, now = self._features(memory, epoch, normalised, forward, heard, foretold)
-        heads, hidden = self.network(features.to(dtype), now.to(dtype), memory.hidden)
+            axes = torch.cat((loudness(heard).unflatten(-1, (2, 3)).mT, memory.matching.by_axis()), -1)
+        heads, hidden = self.network(features.to(dtype), now.to(dtype), axes.to(dtype), memory.hidden)
         heads = Heads(*(x.to(epoch.z.dtype) for x in heads))
         speed = torch.stack((foretold.speed, foretold.std), -1).to(epoch.z.dtype)
         advice = self._advice(heads, speed, memory.silent)

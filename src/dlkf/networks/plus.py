@@ -29,6 +29,7 @@ RESIDUAL_REACH = (0.02,) * 3 + (math.radians(0.02),) * 3  # m/s², rad/s
 UNTRUSTED = 100.0  # factor on the 1σ of a speed whose network says nothing: no speed is then used
 TRUST_REACH = math.log(UNTRUSTED)  # from 1 to the square of that
 TRUST_START = -TRUST_REACH  # where training begins: a factor of 3, for errors of a speed last
+AXIS_HIDDEN = 24
 NOISE_SIZES = {"process": 12, "fix": 4, "across": 2, "offset": 2, "residual": 6}
 
 
@@ -37,7 +38,8 @@ class PlusNetworkConfig:
     """Width of the recurrent layer and what goes into it."""
 
     hidden: int = 96
-    features: int = 0  # set by the filter
+    features: int = 0  # set by the filter, as the next
+    of_axis: int = 0
 
     def __post_init__(self) -> None:
         if not 8 <= self.hidden <= 256:
@@ -56,7 +58,10 @@ class Heads(NamedTuple):
 
 
 class PlusNetwork(nn.Module):
-    """Linear, GRU, linear heads; those of the noise begin at zero."""
+    """Linear, GRU, linear heads; those of the noise begin at zero.
+
+    What one axis' samples and corrections say goes also through a small network that is the same for all three.
+    """
 
     def __init__(self, config: PlusNetworkConfig, now: int) -> None:
         super().__init__()
@@ -65,13 +70,16 @@ class PlusNetwork(nn.Module):
         self.memory = nn.GRUCell(config.hidden, config.hidden)
         self.noise = nn.Linear(config.hidden + now, sum(NOISE_SIZES.values()))
         self.trust = nn.Linear(config.hidden, 1)
+        self.context = nn.Linear(config.hidden, AXIS_HIDDEN)
+        self.of_axis = nn.Linear(config.of_axis, AXIS_HIDDEN)
+        self.axis_noise = nn.Linear(AXIS_HIDDEN, len(PROCESS_REACH))
         for gate in self.memory.weight_hh.data.chunk(3):
             nn.init.orthogonal_(gate)
         self.memory.bias_hh.data.zero_()
         # a slow memory: the update gate begins nearly shut
         self.memory.bias_ih.data.zero_()
         self.memory.bias_ih.data[config.hidden : 2 * config.hidden] = 1.0
-        for head in (self.noise, self.trust):
+        for head in (self.noise, self.trust, self.axis_noise):
             nn.init.zeros_(head.weight)
             nn.init.zeros_(head.bias)
         nn.init.constant_(self.trust.bias, TRUST_START)
@@ -81,15 +89,17 @@ class PlusNetwork(nn.Module):
         return self.inward.weight.new_zeros(batch_size, self.config.hidden)
 
     def forward(
-        self, features: Float[Tensor, "B F"], now: Float[Tensor, "B N"], memory: Float[Tensor, "B h"]
-    ) -> tuple[Heads, Float[Tensor, "B h"]]:
-        """One epoch; ``now`` goes past the memory to the heads of the noise."""
+        self, features: Float[Tensor, "B F"], now: Float[Tensor, "B N"], axes: Float[Tensor, "B 3 A"],
+        memory: Float[Tensor, "B h"],
+    ) -> tuple[Heads, Float[Tensor, "B h"]]:  # fmt: skip
+        """One epoch; ``now`` goes past the memory to the heads of the noise, ``axes`` to that of each axis' own."""
         h = self.memory(nn.functional.silu(self.inward(features)), memory)
         process, fix, across, offset, residual = self.noise(torch.cat((h, now), -1)).split(
             list(NOISE_SIZES.values()), -1
         )
+        own = self.axis_noise(nn.functional.silu(self.of_axis(axes) + self.context(h).unsqueeze(1))).mT
         return Heads(
-            bounded(process.unflatten(-1, (4, 3)), process.new_tensor(PROCESS_REACH)[:, None]),
+            bounded(process.unflatten(-1, (4, 3)) + own, process.new_tensor(PROCESS_REACH)[:, None]),
             bounded(fix, FIX_REACH),
             bounded(across, ACROSS_REACH),
             OFFSET_REACH * torch.tanh(offset),
