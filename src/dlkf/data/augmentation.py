@@ -65,7 +65,7 @@ def turn_frames(batch: Batch, generator: torch.Generator | None = None) -> Batch
 class Rough:
     """IMUs and receivers worse than any preset, drawn anew for every piece; each pair is a log-uniform range.
 
-    ``share`` of the pieces get white noise [m/s²/√Hz, rad/s/√Hz], uneven over the axes by ``uneven`` (1σ of the
+    ``share`` of the sensors get white noise [m/s²/√Hz, rad/s/√Hz], uneven over the axes by ``uneven`` (1σ of the
     logarithm), and an error that wanders with a correlation time of 1 to 20 s [m/s², rad/s]; ``shaken`` of them have
     what is faster than some 3 Hz made weaker or stronger, from nothing to twice; ``rectified`` of them have sensors
     that turn vibration into an error that wanders, axis by axis in proportion to what that axis feels; ``gnss`` of
@@ -76,7 +76,7 @@ class Rough:
     share: float = 0.6
     accel_noise: tuple[float, ...] = (1e-3, 3e-2)
     gyro_noise: tuple[float, ...] = (1e-4, 5e-3)
-    accel_wander: tuple[float, ...] = (3e-3, 0.15)
+    accel_wander: tuple[float, ...] = (1e-3, 0.05)
     gyro_wander: tuple[float, ...] = (1e-4, 5e-3)
     wander_s: tuple[float, ...] = (1.0, 20.0)
     uneven: float = 1.0
@@ -111,7 +111,7 @@ def roughen(batch: Batch, rough: Rough, generator: torch.Generator | None = None
         torch.nn.functional.pad(flat.mT, (reach, reach), mode="replicate"), 2 * reach + 1, 1
     ).mT
     flat = torch.where((shaken != 1)[:, None, None], slow + shaken[:, None, None] * (flat - slow), flat)
-    hit = chance(rough.share)
+    hit = torch.stack([chance(rough.share) for _ in range(2)], -1).repeat_interleave(3, -1)  # each sensor by itself
     axes = torch.exp(rough.uneven * normal(B, 6))
     white = torch.cat([drawn(b, B, 1).expand(B, 3) for b in (rough.accel_noise, rough.gyro_noise)], -1) * axes
     slowly = torch.cat([drawn(b, B, 1).expand(B, 3) for b in (rough.accel_wander, rough.gyro_wander)], -1)
@@ -120,9 +120,9 @@ def roughen(batch: Batch, rough: Rough, generator: torch.Generator | None = None
     of_loud = torch.cat([drawn(b, B, 1).expand(B, 3) for b in (rough.accel_rectified, rough.gyro_rectified)], -1)
     of_loud = of_loud * torch.exp(normal(B, 6)) * chance(rough.rectified)[:, None]
     loud = (flat - slow).unflatten(1, (T, M)).square().mean(2).sqrt().to(of_loud)
-    size = slowly[:, None] * hit[:, None, None] + loud * of_loud[:, None]
+    size = (slowly * hit)[:, None] + loud * of_loud[:, None]
     wander = (wandering(normal(B, T, 6), keep) * size).repeat_interleave(M, 1)
-    noise = (white / batch.dt**0.5 * hit[:, None])[:, None] * normal(B, T * M, 6) + wander
+    noise = (white / batch.dt**0.5 * hit)[:, None] * normal(B, T * M, 6) + wander
     flat = flat + noise.to(imu)
     worse = chance(rough.gnss)[:, None, None]
     size = torch.cat([drawn(b, B, 1).expand(B, 3) for b in (rough.position, rough.velocity)], -1)[:, None]
