@@ -1,17 +1,21 @@
 """The weights that come with the package: whole, small, with a card, and a filter wherever a name is asked for."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import pytest
 import torch
 import yaml
 
+from dlkf.command.simulated import composed_recipe
 from dlkf.data.augmentation import Rough, roughen
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.plus import PlusFilter
 from dlkf.filters.shipped import WEIGHTS_FOLDER, shipped_folder, trained_filter
 from dlkf.models import resolve_model, short_name
+from dlkf.running.start import aligned_drives
+from dlkf.simulation.fresh import fresh_drives
 
 from .scene import IMU
 from .test_constraints import slipping
@@ -56,3 +60,27 @@ def test_any_rate(rate):
     with torch.no_grad():
         s = integrate(other, trained_filter("plus"))
     assert (s.posterior.p_n - batch.truth.p_n)[:, -1].norm(dim=-1).max() < 1.0
+
+
+def test_the_speed_it_hears_is_that_of_the_car_that_shakes():
+    """The same drive twice, five minutes each: its vibration tells the speed, with it gone nothing does, and the speed's
+    own 1σ says so. The network never saw a speed, so what it tells of a still car is that car's usual one."""
+    heard, silent = (_told(vibration) for vibration in ([], ["dataset.chassis.vibration=0",
+                                                             "dataset.chassis.vibration_rate=0"]))  # fmt: skip
+    assert heard.error < 0.6 * silent.error and heard.std < 0.7 * silent.std
+    assert 0.5 < heard.error / heard.std < 2.0
+
+
+class _Told(NamedTuple):
+    error: float  # m/s RMS over the last two minutes
+    std: float  # m/s
+
+
+def _told(words: list[str]) -> _Told:
+    made_by = composed_recipe("simulated@dataset=lifelike", "seed=5", *words)
+    (drive,) = fresh_drives(made_by, 0, 1, seconds=300, dtype=torch.float64)
+    batch = aligned_drives([drive])
+    with torch.no_grad():
+        speed = integrate(batch, trained_filter("plus")).speed[0, -120:]
+    truth = (batch.truth.C_nb[0, :, :, 0] * batch.truth.v_n[0]).sum(-1)[-120:]
+    return _Told(float((speed[:, 0] - truth).square().mean().sqrt()), float(speed[:, 1].square().mean().sqrt()))
