@@ -63,8 +63,8 @@ def test_any_rate(rate):
 
 
 def test_the_speed_it_hears_is_that_of_the_car_that_shakes():
-    """The same drive twice, five minutes each: its vibration tells the speed, with it gone nothing does, and the speed's
-    own 1σ says so. The network never saw a speed, so what it tells of a still car is that car's usual one."""
+    """The same drive twice, five minutes each: its vibration tells the speed, with it gone nothing does, and the 1σ of
+    the speed says so. The network never saw a speed, so what it tells of a still car is that car's usual one."""
     heard, silent = (_told(vibration) for vibration in ([], ["dataset.chassis.vibration=0",
                                                              "dataset.chassis.vibration_rate=0"]))  # fmt: skip
     assert heard.error < 0.6 * silent.error and heard.std < 0.7 * silent.std
