@@ -24,7 +24,7 @@ BRINGS = {
     "paper_clean_units": "table3_standin",
     "semi_real": "automotive_mems",
     **dict.fromkeys(("wide", "calm"), "wide"),
-    **dict.fromkeys(("lifelike", "city", "highway", "car_park", "tunnel", "fleet"), "lifelike_mems"),
+    **dict.fromkeys(("lifelike", "city", "highway", "car_park", "tunnel", "fleet", "other_imus"), "lifelike_mems"),
 }
 
 MINUTE = "dataset.drive_minutes=1"

@@ -24,7 +24,7 @@ MOST = {
     "export": ("model", "out", "dataset", "rate_hz", "latency"),
     "doctor": ("dataset", "drives", "discover"),  # it has no more, as the next two
     "compare": ("runs", "out", "overwrite"),
-    "register": ("run", "name", "alias", "tracking.uri"),
+    "register": ("run", "model", "name", "alias", "tracking.uri"),
 }
 WIDTH = 118
 SILENT = ("hydra_output", "_self_")
