@@ -149,8 +149,9 @@ def test_anywhere_on_earth_a_receiver_finds_enough_satellites():
         assert np.abs(solution.v_e).max() < 1e-6 and np.abs(solution.clock_rate + 50).max() < 1e-6
     count, pdop = np.array(count), np.array(pdop)
     assert count.min() >= 6 and count.max() <= 14 and 8.5 < count.mean() < 11
-    assert 1.5 < np.median(pdop) < 2.2 and np.quantile(pdop, 0.98) < 4  # the performance standard's 98 % is PDOP 6
-    assert np.median(vertical) > 1.3  # nothing is seen from below
+    # 31 satellites; the performance standard's PDOP of 6 in 98 % is for 24, and would not notice one that is misplaced
+    assert 1.5 < np.median(pdop) < 1.75 and 1.9 < np.quantile(pdop, 0.98) < 2.4
+    assert 1.5 < np.median(vertical) < 2  # nothing is seen from below
     assert np.max(error) < 1e-6  # without errors the solution is the truth, wherever it starts
 
 

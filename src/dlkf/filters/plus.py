@@ -53,7 +53,7 @@ START_TUNING: Mapping[str, float] = {
     "position_std": 2.0, "velocity_std": 2.0, "lateral_std": 0.1,
 }  # fmt: skip
 # m/s: a car whose sound tells its speed less well has next to nothing to say, for such errors last through an outage;
-# chosen between 0.7 and 2 on validation drives (docs/results/plus.md)
+# chosen between 0.7 and 2 on validation drives and with real ones in view (docs/results/plus.md)
 TELLING_STD = 1.0
 SILENT_SHARE = 0.3  # of the training pieces run without the speed, so that the rest learns to do without it
 OLDEST = 600.0  # s: times are told up to here
