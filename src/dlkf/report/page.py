@@ -44,14 +44,16 @@ class Page:
         )
 
     def table(
-        self, columns: Sequence[str], rows: Sequence[Sequence[str]], *, marks: Sequence[str] = (), tall: bool = False
-    ) -> None:
-        """A table; ``marks`` are attributes of its rows (class, data-lat …), ``tall`` scrolls in a box of its own."""
+        self, columns: Sequence[str], rows: Sequence[Sequence[str]], *, marks: Sequence[str] = (), tall: bool = False,
+        words: bool = False,
+    ) -> None:  # fmt: skip
+        """A table; ``marks`` are attributes of its rows (class, data-lat …), ``tall`` scrolls in a box of its own,
+        ``words`` are left-aligned and wrap."""
         head = "".join(f"<th>{html.escape(c).replace(chr(10), '<br>')}</th>" for c in columns)
         attributes = list(marks) or [""] * len(rows)
         cells = ("".join(f"<td>{html.escape(c)}</td>" for c in row) for row in rows)
         body = "".join(f"<tr {a}>{row}</tr>" for row, a in zip(cells, attributes))
-        table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        table = f"<table{' class=words' if words else ''}><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
         self.parts.append(f'<div class="{"scroll tall" if tall else "scroll"}">{table}</div>')
 
     def note(self, text: str) -> None:
