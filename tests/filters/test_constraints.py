@@ -112,7 +112,7 @@ def test_a_moving_car_is_not_taken_for_a_standing_one():
     P = torch.eye(15, dtype=D).expand(20, 15, 15) * 0.01
     rules = CarConstraints(Tuning(), ErrorStates())
     epoch = epoch_of(quiet, NavState(*(x[:, 30] for x in batch.truth)), ImuError(torch.zeros(20, 6, dtype=D)))
-    resting, _ = rules._at_rest(epoch, torch.full((20, 2), math.inf, dtype=D), P)
+    resting, _ = rules._at_rest(epoch, rules.begin(quiet), P)
     assert not resting.any()
 
 

@@ -7,7 +7,7 @@ import pickle
 import re
 import shutil
 import subprocess
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from dlkf.errors import InputError
 from dlkf.filters.build import build_filter
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.plus import PlusConfig, PlusFilter
+from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.onboard import compiled_filter
 from dlkf.onboard.c_source import CPP, write_source
@@ -31,6 +32,7 @@ from dlkf.onboard.functions import ROW, Begin, Grid
 from dlkf.onboard.library import LIBRARY, Library, build, compiler
 from dlkf.running.batched import run_filter
 from dlkf.running.estimate import estimates_table
+from dlkf.running.reanchoring import FrameChange, reanchored
 from dlkf.running.replay import played
 from dlkf.running.solution import COLUMNS
 from dlkf.running.start import aligned_drives
@@ -166,6 +168,30 @@ def test_it_is_made_once_and_can_be_put_away(exported, tmp_path, monkeypatch):
     again = pickle.loads(pickle.dumps(made))
     assert again.grid == made.grid and again.layout.size == made.layout.size
     assert compiled_filter._digest(build_filter("mbkf15", IMU), GRID) != kept.name
+
+
+def test_one_library_serves_every_preset_and_every_factor(tmp_path):
+    """What a filter is told in numbers is in its memory; a number of it in the code would make another filter."""
+    other = ImuSpec(
+        "b", SensorErrors(1e-3, 0.03, 2e-3, 600.0, 1e-3, 4e-3), SensorErrors(3e-5, 2e-3, 3e-4, 300.0, 0.0, 1e-3)
+    )
+    changed = Tuning(**{f.name: (0.9 if 0.9 <= f.default < 1 else 1.7) * f.default for f in fields(Tuning)})
+    written = []
+    for k, (imu, tuning) in enumerate(((IMU, Tuning()), (other, changed))):
+        estimator = build_filter("aekf_car_gated", imu, tuning=tuning)  # everything that has factors
+        (folder := tmp_path / str(k)).mkdir()
+        write_source(folder, estimator, GRID, "told", {}, loop_alone=True)
+        written.append(((folder / "step.c").read_text(), estimator.code, compiled_filter._digest(estimator, GRID)))
+    assert written[0] == written[1]
+
+
+def test_noise_goes_with_the_drive_into_another_frame(drive):
+    loud, quiet = (build_filter("mbkf15", IMU, tuning=Tuning(accel_noise=x)) for x in (9.0, 1.0))
+    batch = aligned_drives([drive], ALIGN)
+    memory, other = loud.begin(batch)[0], quiet.begin(batch)[0]
+    moved = reanchored(memory, FrameChange(batch.frame, batch.frame), other)
+    assert torch.equal(moved.windows.spread, memory.windows.spread)
+    assert not torch.equal(moved.windows.spread, other.windows.spread)
 
 
 def test_what_does_not_fit_is_told(compiled, drive, monkeypatch, tmp_path):

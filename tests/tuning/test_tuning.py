@@ -15,6 +15,7 @@ from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.tuning import Tuning
+from dlkf.onboard.library import compiler
 from dlkf.tuning.baselines import tuned_baselines
 from dlkf.tuning.search import FACTORS, factors_of, mean_imu_error, outage_error, tuned
 from dlkf.tuning.study import check
@@ -53,6 +54,22 @@ def test_a_search_mends_noise_that_is_told_too_small(cars):
     best, score = tuned(small, [hidden(cars)], factors=factors, rounds=1, progress=trials.append)
     assert (best.accel_noise, best.gyro_noise) != (1.0, 1.0)
     assert score == min(t.score for t in trials) < outage_error(build_filter("mbkf15", small), [hidden(cars)])
+
+
+@pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+def test_a_search_in_c_finds_what_one_in_torch_finds(cars, monkeypatch):
+    """Every trial, though C takes sums in another order."""
+    factors = {"accel_noise": (3.0, 10.0), "velocity_std": (2.0,), "lateral_std": (0.1,)}
+    found = []
+    for least in (10**9, 1):  # torch, C
+        monkeypatch.setattr("dlkf.tuning.search.IN_C", least)
+        trials = []
+        best, score = tuned(IMU, [hidden(cars)], name="mbkf15_nhc", factors=factors, rounds=1, progress=trials.append)
+        found.append((best, score, [t.score for t in trials]))
+    (best, score, scores), (best_c, score_c, scores_c) = found
+    assert best == best_c and len(set(scores)) == len(scores)
+    assert [score_c, *scores_c] == pytest.approx([score, *scores], rel=1e-9)
+    assert scores_c != scores  # it was C
 
 
 def test_every_filter_has_the_factors_that_it_uses():
@@ -108,9 +125,7 @@ def test_the_command_writes_factors_that_evaluate_takes(uri, call, town):
     assert Tuning(**factors) != Tuning()  # a perfect IMU's noise is too small here
     assert "train" in done.out and "test" in done.out and Path("mlflow.db").is_file()
     cut = ("length_s=50", "outage.first_s=25", "outage.duration_s=20", "injected_bias=null")
-    done = call(
-        "evaluate", "--config-dir", "found", "tuning=cars", "model=mbkf15", f"dataset={town}", "out=seen", *cut
-    )
+    done = call("evaluate", "--config-dir", "found", "tuning=cars", "model=mbkf15", f"dataset={town}", "out=seen", *cut)
     assert done.code == 0, done.err
     done = call("tune", "model=mbkf15", f"dataset={town}", "out=none", *size[:1], "outage.first_s=45", *size[2:])
     assert done.code == 2 and not Path("none").exists(), done.err

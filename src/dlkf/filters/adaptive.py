@@ -31,6 +31,7 @@ class AdaptiveNoise(NamedTuple):
     settled: Tensor  # (B,) bool
     fixes: Tensor  # (B,) so far
     epochs: Tensor  # (B,) since the last fix
+    forgetting: Tensor  # (1,) share of the past, the same for all drives
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,15 @@ class Adaptation:
 
     forgetting: float
 
+    def begin(self, like: Tensor, states: int) -> AdaptiveNoise:
+        """Nothing learned yet; ``like`` (B, …) gives batch and precision."""
+        B, zeros = len(like), like.new_zeros
+        noise = zeros(B, states, states), zeros(B, 6), zeros(B) > 0
+        return AdaptiveNoise(*noise, zeros(B), zeros(B), like.new_tensor([self.forgetting]))
+
     def learned(
         self,
-        noise: AdaptiveNoise | None,
+        noise: AdaptiveNoise,
         epoch: Epoch,
         used: Bool[Tensor, "B 6"],
         H: Float[Tensor, "B 6 n"],
@@ -51,14 +58,11 @@ class Adaptation:
         Q: Float[Tensor, "B n n"],
     ) -> AdaptiveNoise:
         """The noise after an epoch that ran with ``Q`` and ``R``; ``H`` has zero rows where nothing was used."""
-        if noise is None:
-            start = epoch.z.new_zeros(2, len(used))
-            noise = AdaptiveNoise(Q, R, torch.zeros_like(used[:, 0]), *start)
         epochs = noise.epochs + 1
         has_fix = used.any(-1)
         fixes = noise.fixes + has_fix
         learns = has_fix & (fixes > SETTLE_FIXES)
-        a = self.forgetting
+        a = noise.forgetting
         residual = epoch.z - (H @ dx.unsqueeze(-1)).squeeze(-1)
         seen = residual.square() + (H @ updated @ H.mT).diagonal(dim1=-2, dim2=-1)
         adapted_R = (a * R + (1 - a) * seen).clamp_min(SMALLEST_VARIANCE)
@@ -69,4 +73,5 @@ class Adaptation:
             noise.settled | learns,
             fixes,
             torch.where(has_fix, 0.0, epochs),
+            a,
         )

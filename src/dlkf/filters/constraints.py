@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -34,6 +35,14 @@ PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 2.0  # m/s, 1σ: a standstill must not 
 SLOWEST = 0.5  # m/s: below, course and yaw rate say nothing of the car's structure
 
 
+class CarMemory(NamedTuple):
+    """What the constraints carry from epoch to epoch."""
+
+    quietest: Tensor  # (B, 2) spread of the quietest second of standing so far
+    std: Tensor  # (1, 8) of the rows, the same for all drives
+    limits: Tensor  # (1, 2) likewise: highest spread of a standstill
+
+
 @dataclass(frozen=True)
 class CarConstraints:
     """Constraints on a car's motion for a filter with the given error states."""
@@ -41,28 +50,32 @@ class CarConstraints:
     tuning: Tuning
     states: ErrorStates
 
-    def begin(self, batch: Batch) -> Float[Tensor, "B 2"]:
-        """The quietest second of standing so far: none."""
-        return batch.imu.new_full((batch.size[0], 2), math.inf)
+    @property
+    def code(self) -> CarConstraints:
+        """Without the numbers that the memory carries."""
+        return CarConstraints(Tuning(), self.states)
 
-    def rows(
-        self, epoch: Epoch, quietest: Float[Tensor, "B 2"], believed: Believed
-    ) -> tuple[Measurement, Float[Tensor, "B 2"]]:
-        """NHC (2 rows), zero velocity (3), zero angular rate (3); and the quietest second of standing so far."""
-        t = self.tuning
-        resting, quietest = self._at_rest(epoch, quietest, believed.P)
+    def begin(self, batch: Batch) -> CarMemory:
+        """No standing so far, and how sure the rows are."""
+        t, new = self.tuning, batch.imu.new_tensor
+        std = [t.lateral_std, t.vertical_std] + [t.rest_velocity_std] * 3 + [t.rest_rate_std] * 3
+        quietest = batch.imu.new_full((batch.size[0], 2), math.inf)
+        return CarMemory(quietest, new([std]), new([[t.rest_accel, t.rest_gyro]]))
+
+    def rows(self, epoch: Epoch, memory: CarMemory, believed: Believed) -> tuple[Measurement, CarMemory]:
+        """NHC (2 rows), zero velocity (3), zero angular rate (3)."""
+        resting, memory = self._at_rest(epoch, memory, believed.P)
         zn, Hn, moving = self._across(epoch, believed.structure)
         zr, Hr = self._standing(epoch)
-        std = zn.new_tensor([t.lateral_std, t.vertical_std] + [t.rest_velocity_std] * 3 + [t.rest_rate_std] * 3)
         resting = resting.unsqueeze(-1)
         used = torch.cat(((moving.unsqueeze(-1) & ~resting).expand(-1, 2), resting.expand(-1, 6)), -1)
-        variance = (std * std).expand(len(zn), -1)
+        variance = memory.std.square().expand(len(zn), -1)
         if epoch.advice is not None and epoch.advice.across is not None:
             variance = torch.cat((variance[:, :2] * epoch.advice.across.square(), variance[:, 2:]), -1)
         if epoch.advice is not None and epoch.advice.offset is not None:
             zn = zn + epoch.advice.offset
         z = torch.cat((zn, zr), -1) * used
-        return Measurement(z, torch.cat((Hn, Hr), 1), variance, used), quietest
+        return Measurement(z, torch.cat((Hn, Hr), 1), variance, used), memory
 
     def _across(
         self, epoch: Epoch, structure: Float[Tensor, "B 4"] | None
@@ -104,8 +117,8 @@ class CarConstraints:
         return z, H
 
     def _at_rest(
-        self, epoch: Epoch, quietest: Float[Tensor, "B 2"], P: Float[Tensor, "B n n"]
-    ) -> tuple[Bool[Tensor, " B"], Float[Tensor, "B 2"]]:
+        self, epoch: Epoch, memory: CarMemory, P: Float[Tensor, "B n n"]
+    ) -> tuple[Bool[Tensor, " B"], CarMemory]:
         """Whether the samples of the window are as quiet as a standing car's.
 
         Their spread must be below a multiple of that of the quietest second in which the filter was sure to stand,
@@ -117,13 +130,9 @@ class CarConstraints:
         spread = variance.unflatten(-1, (2, 3)).sum(-1).sqrt()  # (B, 2) accelerometers, gyroscopes
         sigma = P.diagonal(dim1=-2, dim2=-1)[:, VELOCITY][:, :2].sum(-1).sqrt()
         speed = epoch.window.end.v_n[:, :2].norm(dim=-1)
-        sure = (speed + sigma < SURE_SPEED) & (spread < spread.new_tensor(self._limits)).all(-1)
+        quietest, limit = memory.quietest, memory.limits
+        sure = (speed + sigma < SURE_SPEED) & (spread < limit).all(-1)
         quietest = torch.where(sure.unsqueeze(-1), torch.minimum(quietest, spread), quietest)
-        limit = spread.new_tensor(self._limits)
         limit = torch.where(quietest.isinf(), limit / 3, torch.minimum(QUIET_FACTOR * quietest, limit))
         plausible = speed < PLAUSIBLE_SPEED + PLAUSIBLE_SIGMAS * sigma
-        return (spread <= limit).all(-1) & plausible, quietest
-
-    @property
-    def _limits(self) -> tuple[float, float]:
-        return self.tuning.rest_accel, self.tuning.rest_gyro
+        return (spread <= limit).all(-1) & plausible, memory._replace(quietest=quietest)

@@ -33,6 +33,7 @@ class GateMemory(NamedTuple):
     age: Tensor  # (B,) s since then
     fix: Tensor  # (B, 6) the last fix offered
     frozen: Tensor  # (B,) bool: it did not move with the car
+    limits: Tensor  # (1, 4) highest normalised innovation squared by the number of components, for all drives
 
 
 class Verdict(NamedTuple):
@@ -58,8 +59,10 @@ class Gate:
     def begin(self, like: Tensor) -> GateMemory:
         """Nothing refused yet; ``like`` (B, …) gives batch and precision."""
         zeros = like.new_zeros
-        B = len(like)
-        return GateMemory(zeros(B), zeros(B, 3), zeros(B), torch.full_like(zeros(B, 6), torch.nan), zeros(B) > 0)
+        B, limits = len(like), like.new_tensor([self._limits])
+        return GateMemory(
+            zeros(B), zeros(B, 3), zeros(B), torch.full_like(zeros(B, 6), torch.nan), zeros(B) > 0, limits
+        )
 
     def judge(
         self, memory: GateMemory, epoch: Epoch, S: Float[Tensor, "B 6 6"], variance: Float[Tensor, "B 6"]
@@ -73,7 +76,9 @@ class Gate:
         offered = position | velocity
         same = (epoch.fix.value == memory.fix)[:, :3].all(-1) & position
         frozen = same & (memory.frozen | (epoch.window.end.v_n.norm(dim=-1) > FROZEN_SPEED))
-        fits = torch.stack([self._fits(z[:, k], S[:, k, k], used[:, k]) for k in (slice(0, 3), slice(3, 6))], -1)
+        fits = torch.stack(
+            [self._fits(z[:, k], S[:, k, k], used[:, k], memory.limits) for k in (slice(0, 3), slice(3, 6))], -1
+        )
         age = memory.age + epoch.dt * epoch.imu.shape[1]
         wrong = position & ~fits[:, 0] & ~frozen
         refused = torch.where(self._agrees(memory, z, used, variance, age), memory.refused + 1, 1.0)
@@ -93,6 +98,7 @@ class Gate:
             torch.where(wrong, 0.0, age),
             torch.where(offered.unsqueeze(-1), epoch.fix.value, memory.fix),
             torch.where(position, frozen, memory.frozen),
+            memory.limits,
         ), verdict
 
     def _agrees(self, memory: GateMemory, z: Tensor, used: Tensor, variance: Tensor, age: Tensor) -> Tensor:
@@ -104,12 +110,11 @@ class Gate:
         near = (change.norm(dim=-1) < spread) | ((change - explained).norm(dim=-1) < spread)
         return near & (memory.refused > 0)
 
-    def _fits(self, z: Tensor, S: Tensor, used: Tensor) -> Tensor:
+    def _fits(self, z: Tensor, S: Tensor, used: Tensor, limits: Tensor) -> Tensor:
         factor = torch.linalg.cholesky_ex(S, check_errors=not torch.compiler.is_compiling())[0]
         nis = (z * torch.cholesky_solve(z.unsqueeze(-1), factor).squeeze(-1)).sum(-1)
-        return nis <= z.new_tensor(self._limits)[used.sum(-1)]
+        return nis <= limits[0, used.sum(-1)]
 
     @cached_property
     def _limits(self) -> tuple[float, ...]:
-        """Highest normalised innovation squared by the number of components."""
         return (0.0, *(float(chi2.ppf(self.probability, components)) for components in (1, 2, 3)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol, TypeGuard, runtime_checkable
 
@@ -13,15 +13,17 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.filters.adaptive import Adaptation, AdaptiveNoise
-from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD
+from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD, CarConstraints
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
 from dlkf.filters.sources import Believed, FixMemory, GnssFix, Measurement, Source
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import STANDARD_GRAVITY
 from dlkf.navigation.error_model import PLAIN, WindowModel, masked, source_scale, window_model
-from dlkf.navigation.imu_errors import ImuSpec
+from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.navigation.state import PVA, STATES, ErrorStates
+
+UNTOLD = ImuSpec("any", SensorErrors(), SensorErrors())
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,14 @@ class Mbkf:
         """Where GNSS comes in."""
         return GnssFix(self.tuning, self.states.count, self.gated)
 
+    @property
+    def code(self) -> Mbkf:
+        """The filter without what is told to it in numbers, which its memory carries: two of one code do the same."""
+        return replace(
+            self, imu=UNTOLD, tuning=Tuning(), prior=None, gauss_markov=False, noise=self.noise and Adaptation(0.5),
+            sources=tuple(s.code if isinstance(s, CarConstraints) else s for s in self.sources),
+        )  # fmt: skip
+
     def begin(self, batch: Batch) -> tuple[Memory, ImuError]:
         """P₀ from the start's law and the preset; the IMU error at its prior mean."""
         like = {"dtype": batch.imu.dtype, "device": batch.imu.device}
@@ -111,7 +121,8 @@ class Mbkf:
             walk=torch.tensor(STRUCTURE_WALK_STD) ** 2,
         )  # fmt: skip
         sources = tuple(source.begin(batch) for source in self.sources)
-        memory = Memory(torch.diag_embed(sigma**2), windows, self.fix.begin(batch), sources, structure)
+        noise = None if self.noise is None else self.noise.begin(batch.imu, self.states.count)
+        memory = Memory(torch.diag_embed(sigma**2), windows, self.fix.begin(batch), sources, structure, noise)
         known = torch.zeros(B, 9, **like)
         if self.prior is None:
             return memory, ImuError(known[:, :6])
@@ -157,7 +168,7 @@ class Mbkf:
             dx, K = P.new_zeros(P.shape[:2]), P.new_zeros(*P.shape[:2], H.shape[1])
         P = torch.lerp(P, P.mT, 0.5)
         noise = memory.noise
-        if self.noise is not None:
+        if self.noise is not None and noise is not None:
             noise = self.noise.learned(noise, epoch, fix.rows.used, H[:, :6], fix.variance, P, dx, Q)
         structure = memory.structure
         if structure is not None:

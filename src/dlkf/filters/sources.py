@@ -72,7 +72,7 @@ class Source(Protocol):
 class FixMemory(NamedTuple):
     """What belongs to the receiver."""
 
-    scale: Tensor  # (2, 6) factor and floor of the fixes' stds
+    scale: Tensor  # (1, 2, 6) factor and floor of the fixes' stds, the same for all drives
     gate: GateMemory | None = None
 
 
@@ -102,9 +102,9 @@ class GnssFix:
     def begin(self, batch: Batch) -> FixMemory:
         """Factors on the stds; nothing refused yet."""
         t = self.tuning
-        scale = [t.position_std] * 3 + [t.velocity_std] * 3, [t.position_floor] * 3 + [t.velocity_floor] * 3
+        scale = [[t.position_std] * 3 + [t.velocity_std] * 3, [t.position_floor] * 3 + [t.velocity_floor] * 3]
         gate = self.gate.begin(batch.imu) if self.gated else None
-        return FixMemory(torch.tensor(scale, dtype=batch.imu.dtype, device=batch.imu.device), gate)
+        return FixMemory(torch.tensor([scale], dtype=batch.imu.dtype, device=batch.imu.device), gate)
 
     def rows(self, epoch: Epoch, memory: FixMemory, believed: Believed) -> tuple[FixRows, FixMemory]:
         """Six rows, of which those count that the receiver offers and the gate lets pass."""
@@ -127,7 +127,7 @@ class GnssFix:
         return H
 
     def _variance(self, epoch: Epoch, memory: FixMemory, believed: Believed) -> Float[Tensor, "B 6"]:
-        scale, floor = memory.scale
+        scale, floor = memory.scale[0]
         R = torch.maximum(scale * epoch.fix.std, floor).square()
         if believed.noise is not None:
             R = torch.where(believed.noise.settled.unsqueeze(-1), believed.noise.R, R)

@@ -10,9 +10,10 @@ carries them the elements of the sensor matrices M (measured = (I + M) true + bi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -45,8 +46,16 @@ class WindowModel:
     dt: float
     still: Tensor  # (B, n, n) Φ of a window in which nothing moves: Earth rotation, gravity gradient, decay
     left: Tensor  # (2, M) time from each sample's middle to the end, and 1: integrates once and twice
-    spread: Tensor  # (4, 15, 15) S ∫ (1−τ/T)^(nᵢ+nⱼ) dτ of each noise source
+    density: Tensor  # (1, 4) S of each noise source, the same for all drives
     walk: Tensor  # (n,) variance that a window adds to the states of the car
+
+    @cached_property
+    def spread(self) -> Float[Tensor, "4 s s"]:
+        """S ∫ (1−τ/T)^(nᵢ+nⱼ) dτ of each noise source."""
+        powers = torch.tensor([[math.inf if p is None else p for p in n] for n in SOURCES.values()])
+        order = powers.to(self.density).repeat_interleave(3, -1)
+        T = self.left.shape[1] * self.dt
+        return (self.density[0] * T)[:, None, None] / (order.unsqueeze(2) + order.unsqueeze(1) + 1)
 
     def transition(
         self, start: NavState, window: Window, corrected: Float[Tensor, "B M 6"], frame: TangentFrame
@@ -163,15 +172,11 @@ def window_model(
     for block, inverse in zip((ACCEL, GYRO), decay):
         still[:, block, block] *= torch.exp(torch.tensor(-T * inverse, **like))
     left = T - (torch.arange(samples, **like) + 0.5) * dt
-    spread = torch.zeros(4, STATES, STATES, **like)
-    for k, (source, powers) in enumerate(SOURCES.items()):
-        order = torch.tensor([float("inf") if p is None else float(p) for p in powers], **like)
-        order = order.repeat_interleave(3)
-        spread[k] = psd[source] * T / (order[:, None] + order[None, :] + 1)
+    density = torch.tensor([[psd[source] for source in SOURCES]], **like)
     drift = torch.zeros(n, **like)
     if states.structure and walk is not None:
         drift[states.of_structure] = T * walk.to(**like)
-    return WindowModel(states, dt, still, torch.stack((left, torch.ones_like(left))), spread, drift)
+    return WindowModel(states, dt, still, torch.stack((left, torch.ones_like(left))), density, drift)
 
 
 def antenna(

@@ -26,20 +26,27 @@ CPP = Path(__file__).parent / "cpp"
 IN_A_FILE = 4096  # constants of more numbers than that lie beside the source
 
 
-def write_source(folder: Path, estimator: Estimator, grid: Grid, name: str, made: dict[str, Any]) -> Layout:
+def write_source(
+    folder: Path, estimator: Estimator, grid: Grid, name: str, made: dict[str, Any], *, loop_alone: bool = False
+) -> Layout:
     """``step.c``, ``step.h``, the large constants, and ``step.json``, which describes them.
 
+    ``loop_alone`` leaves out what turns fixes and solutions into those of a vehicle, which takes most of the time.
     Raises InputError for a filter that cannot be exported.
     """
     with _exporting():
         layout = carried_by(estimator, grid)
-        functions = {"begin": Begin, "read": Read, "turn": Turn, "row": Row}
-        if can_reanchor(layout.like.memory):
-            functions["anchor"] = Anchor
+        functions: dict[str, type[Function]] = {"turn": Turn}
+        if not loop_alone:
+            functions |= {"begin": Begin, "read": Read, "row": Row}
+            if can_reanchor(layout.like.memory):
+                functions["anchor"] = Anchor
         parts = [(CPP / "algebra.h").read_text()]
         for function, kind in functions.items():
             parts.append(function_in_c(f"dlkf_{function}", kind(estimator, grid, layout).eval(), folder))
-    parts.append((CPP / "step.c.in").read_text().replace("@TOLD@", str(sum(TOLD.values()))))
+    parts.append((CPP / "run.c.in").read_text())
+    if not loop_alone:
+        parts.append((CPP / "step.c.in").read_text())
     header = (CPP / "step.h.in").read_text()
     values = {
         "NAME": name, "MEMORY": layout.size, "SAMPLES": grid.samples, "RATE_HZ": repr(1 / grid.dt),

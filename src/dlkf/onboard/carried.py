@@ -11,10 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.errors import InputError
-from dlkf.filters.sources import FixMemory
 from dlkf.navigation.error_model import WindowModel
 
-OF_THE_FRAME = {WindowModel: ("still",), FixMemory: ("gate",)}  # the rest of these is the same for ever
+OF_THE_DRIVE = {WindowModel: ("still", "density")}  # the rest of it is the same for every drive of a filter
 RECURRENT = "recurrent"  # cells of a network: the batch is their second axis
 MEANING = {
     "frame.origin_e": "origin of the tangent frame n, ECEF [m]",
@@ -31,6 +30,10 @@ MEANING = {
     "error.matrix": "scale factors, or M of measured = (I + M) true + bias",
     "P": "covariance of the error states: m, m/s, rad, m/s², rad/s, then elements of M, then the car",
     "still": "transition of a window in which nothing moves",
+    "density": "S of the noise: accelerometers [m²/s³], gyroscopes [rad²/s], walks of their biases [m²/s⁵, rad²/s³]",
+    "scale": "factors on 1σ of a fix, and the least 1σ: position [m], velocity [m/s]",
+    "std": "1σ across the car [m/s], and at rest: velocity [m/s], rate [rad/s]",
+    "forgetting": "share of the past in the adapted noise",
     "structure": "mounting yaw, pitch [rad], distance to the rear axle [m], sideslip [s²/m]",
     "lever_arm_b": "IMU to antenna, forward, right, down [m]",
 }
@@ -88,14 +91,14 @@ class Layout:
     def pack(self, structure: Any) -> Float[Tensor, "B K"]:
         """The vectors of a structure."""
         given = dict(_leaves(structure))
-        drives = next(x.shape[f.batch_axis] for f in self.fields if (x := given.get(f.name)) is not None)
+        drives = max(x.shape[f.batch_axis] for f in self.fields if (x := given.get(f.name)) is not None)
         parts = []
         for f in self.fields:
             x = given.get(f.name)
             if x is None:
                 parts.append(torch.zeros(drives, f.size, dtype=torch.float64))
             else:
-                parts.append(x.movedim(f.batch_axis, 0).reshape(drives, f.size).double())
+                parts.append(x.movedim(f.batch_axis, 0).expand(drives, *f.shape).reshape(drives, f.size).double())
         return torch.cat(parts, -1)
 
     def field(self, name: str, vector: Float[Tensor, "B K"]) -> Tensor | None:
@@ -114,7 +117,7 @@ class Layout:
 
 def _children(x: Any) -> list[tuple[str, Any]] | None:
     """Named parts of a structure, None for a leaf."""
-    for kind, names in OF_THE_FRAME.items():
+    for kind, names in OF_THE_DRIVE.items():
         if isinstance(x, kind):
             return [(name, getattr(x, name)) for name in names]
     if isinstance(x, tuple):

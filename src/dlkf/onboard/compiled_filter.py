@@ -1,8 +1,9 @@
 """A filter whose whole epoch is compiled code, in the place of the one that it was made of.
 
-It is made once for a machine, a filter and a grid, and kept in the user's cache (``$XDG_CACHE_HOME/dlkf``). It takes
-part where estimators do: in a batch, in a stream, in ``navigate``. It knows no gradients, no covariances but their
-diagonals, and no device but the CPU.
+It is made once for a machine, a filter and a grid, and kept in the user's cache (``$XDG_CACHE_HOME/dlkf``). What a
+model-based filter is told, IMU preset and factors, is in its memory and not in the code, so that one library serves all
+of them. It takes part where estimators do: in a batch, in a stream, in ``navigate``. It knows no gradients, no
+covariances but their diagonals, and no device but the CPU.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import shutil
 import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +25,7 @@ import dlkf
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
 from dlkf.filters.integration import Correction, Estimator, Fix, Solution, Step, WholeLoop
+from dlkf.filters.model_based import Mbkf
 from dlkf.filters.smoother import Filter, Smoothed
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import TangentFrame
@@ -144,7 +147,7 @@ def compiled_filter(estimator: Filter, rate_hz: float, epoch_s: float) -> Compil
         folder.parent.mkdir(parents=True, exist_ok=True)
         beside = Path(tempfile.mkdtemp(dir=folder.parent))
         try:
-            write_source(beside, estimator, grid, type(estimator).__name__, {})
+            write_source(beside, estimator, grid, type(estimator).__name__, {}, loop_alone=True)
             build(beside)
             if not (folder / LIBRARY).is_file():
                 shutil.rmtree(folder, ignore_errors=True)
@@ -160,13 +163,21 @@ def _cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dlkf" / "compiled"
 
 
-def _digest(estimator: Estimator, grid: Grid) -> str:
-    """Of everything that the code depends on: this package, torch, the filter and its weights, grid, machine."""
+@cache
+def _package() -> Any:
+    """Digest of this package."""
     made_of = hashlib.sha256()
     for file in sorted(Path(dlkf.__file__).parent.rglob("*")):
         if file.suffix in (".py", ".h", ".in"):
             made_of.update(file.read_bytes())
-    for part in (torch.__version__, machine(), str(compiler()), *FLAGS, repr(estimator), repr(grid)):
+    return made_of
+
+
+def _digest(estimator: Estimator, grid: Grid) -> str:
+    """Of everything that the code depends on: this package, torch, the filter and its weights, grid, machine."""
+    made_of = _package().copy()
+    code = estimator.code if isinstance(estimator, Mbkf) else estimator
+    for part in (torch.__version__, machine(), str(compiler()), *FLAGS, repr(code), repr(grid)):
         made_of.update(part.encode())
     if isinstance(estimator, nn.Module):
         made_of.update(repr(getattr(estimator, "config", "")).encode())

@@ -7,7 +7,7 @@ blocks. The solution stays what it was, to rounding and the curvature that the l
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, singledispatch
 from typing import Any
 
@@ -91,13 +91,13 @@ def _(memory: model_based.Memory, change: FrameChange, fresh: model_based.Memory
     if gate is not None:  # NaN: equal to no other fix, so a frozen receiver shows one fix later
         gate = gate._replace(innovation=change.vectors(gate.innovation), fix=torch.full_like(gate.fix, torch.nan))
     if noise is not None:
-        Q = None if noise.Q is None else change.covariance(noise.Q)
-        noise = noise._replace(Q=Q, R=change.variances(noise.R))
+        noise = noise._replace(Q=change.covariance(noise.Q), R=change.variances(noise.R))
     sources = tuple(
         reanchored(old, change, new) if can_reanchor(old) else old for old, new in zip(memory.sources, fresh.sources)
     )
+    windows = replace(fresh.windows, density=memory.windows.density)
     return memory._replace(
-        P=change.covariance(memory.P), windows=fresh.windows, fix=memory.fix._replace(gate=gate), sources=sources,
+        P=change.covariance(memory.P), windows=windows, fix=memory.fix._replace(gate=gate), sources=sources,
         noise=noise,
     )  # fmt: skip
 

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.data.drive import Batch
+from dlkf.errors import InputError
 from dlkf.evaluation.metrics import end_errors, mean_error
 from dlkf.filters.build import build_causal
 from dlkf.filters.integration import Estimator, integrate
@@ -24,6 +25,8 @@ from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.state import ErrorStates
+from dlkf.onboard.compiled_filter import CompiledFilter, compiled_filter
+from dlkf.onboard.library import compiler
 
 FACTORS: Mapping[str, tuple[float, ...]] = {
     "accel_noise": (1.0, 3.0, 10.0, 30.0, 100.0),
@@ -34,6 +37,7 @@ FACTORS: Mapping[str, tuple[float, ...]] = {
     "position_std": (0.5, 1.0, 2.0, 5.0),
 }
 
+IN_C = 3600  # epochs of pieces from which on a search pays for the library that its filter has to be made into
 PATIENCE = 2  # values in a row that are worse, before the rest on that side is left out
 
 # what a filter with these endings, or of this base, is told beside
@@ -86,19 +90,25 @@ def tuned(
 ) -> tuple[Tuning, float]:
     """Over-bounding factors of a filter by coordinate search on training pieces with outages.
 
-    A factor goes up its values, or down them, until two in a row are worse; nothing is tried twice. ``prior`` is what
-    a filter with ``_prior`` is told. Returns the best factors and their :func:`outage_error` [m]; ``progress`` is told
-    every trial.
+    A factor goes up its values, or down them, until two in a row are worse; nothing is tried twice. From an hour of
+    pieces on, and where there is a C compiler, trials run compiled (:mod:`dlkf.onboard`), which is the same to
+    rounding. ``prior`` is what a filter with ``_prior`` is told. Returns the best factors and their
+    :func:`outage_error` [m]; ``progress`` is told every trial.
     """
     known: dict[Tuning, float] = {}
+    best = start or Tuning()
+
+    def told(trial: Tuning) -> Estimator:
+        return build_causal(name, imu, "tuning does not", tuning=trial, prior=prior)
+
+    in_c = _fits_c(told(best), batches)
 
     def judged(trial: Tuning) -> float:
         if trial not in known:
-            estimator = build_causal(name, imu, "tuning does not", tuning=trial, prior=prior)
+            estimator = _in_c(told(trial), batches[0]) if in_c else told(trial)
             known[trial] = outage_error(estimator, batches, objective)
         return known[trial]
 
-    best = start or Tuning()
     score = judged(best)
     for _ in range(rounds):
         before = best
@@ -122,6 +132,21 @@ def tuned(
         if best == before:
             break
     return best, score
+
+
+def _in_c(estimator: Estimator, batch: Batch) -> CompiledFilter:
+    return compiled_filter(estimator, 1 / batch.dt, batch.epoch_s)
+
+
+def _fits_c(estimator: Estimator, batches: Sequence[Batch]) -> bool:
+    """Whether trials run compiled: it pays, there is a compiler, and the filter, which may be one's own, fits."""
+    if compiler() is None or sum(int(b.present.sum()) for b in batches) < IN_C:
+        return False
+    try:
+        _in_c(estimator, batches[0])
+    except InputError:
+        return False
+    return True
 
 
 def without_prior(name: str) -> str:
