@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 from importlib import import_module
+from typing import NoReturn
 
 import dlkf
 
@@ -39,7 +40,7 @@ complete -o default -F _dlkf dlkf
 def main() -> None:
     """Run a command; 2 for an unknown one, 130 after Ctrl-C, even while the libraries load."""
     word, rest = (sys.argv[1] if len(sys.argv) > 1 else "help"), sys.argv[2:]
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    signal.signal(signal.SIGTERM, _terminated)
     try:
         if word in ("help", "--help", "-h"):
             print(usage())
@@ -59,6 +60,11 @@ def main() -> None:
     except KeyboardInterrupt:
         print("dlkf: interrupted", file=sys.stderr)
         sys.exit(130)
+
+
+def _terminated(*_: object) -> NoReturn:
+    print("dlkf: terminated", file=sys.stderr)
+    sys.exit(143)
 
 
 def usage() -> str:

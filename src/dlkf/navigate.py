@@ -15,10 +15,12 @@ from dlkf.command import command
 from dlkf.command.settings import NavigateSettings
 from dlkf.console import LOG, counting
 from dlkf.data.drive import Drive
+from dlkf.data.kinds import drive_imus
 from dlkf.data.store import dataset_digest, drive_rows, load_dataset
 from dlkf.data.tables import time_zeros
 from dlkf.errors import InputError
 from dlkf.files import absolute, name_of, staged, vacant
+from dlkf.filters.card import unmet_imus
 from dlkf.filters.saved import grid_of
 from dlkf.filters.smoother import smoothed
 from dlkf.models import resolve_model, short_name
@@ -45,7 +47,10 @@ def main(told: NavigateSettings) -> None:
     spec, tuning = told.spec, told.tuning
     model = resolve_model(told.model, spec, told.tracking.uri, **told.told)
     zeros = time_zeros(told.dataset)
-    rows = drive_rows(told.dataset, told.drives)
+    rows, named = drive_rows(told.dataset, told.drives), drive_imus(told.dataset)
+    card = {short_name(told.model): getattr(model, "card", {})}
+    for line in unmet_imus(card, {named.get(row.name, spec.name) for row in rows}):
+        print(line)
     spacings = {row.name: offline.Fixes.of(told.dataset, row.name) for row in rows}
     usual = offline.epoch_for(spacings.values(), told.rate_hz or 50.0, model)
     grid = grid_of([model], told.rate_hz, told.epoch_s, usual)

@@ -7,29 +7,24 @@ stopped, in the same MLflow run.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hydra import compose
 from hydra.core.hydra_config import HydraConfig
-from rich.console import Console
 
 from dlkf.classes import made
 from dlkf.command import command, same_command
-from dlkf.command.composing import configuration_hash, plain
-from dlkf.command.simulated import SimulateSettings
-from dlkf.config import config_dir
+from dlkf.command.composing import configuration_hash
+from dlkf.command.simulated import make_missing
 from dlkf.console import keep_said, talking
 from dlkf.data.store import dataset_digest
-from dlkf.errors import InputError
+from dlkf.evaluation.summary import answer
 from dlkf.evaluation.table import all_tables, as_rich
 from dlkf.settings import settings_from
-from dlkf.simulation.dataset import simulate
 from dlkf.tracking.grid import PARENT_RUN, run_name
 from dlkf.tracking.registry import check_registration, log_model
 from dlkf.tracking.runs import check_store, lightning_logger, start_run, tracking_uri
-from dlkf.training.fit import check_accelerator
+from dlkf.training.fit import check_fit
 from dlkf.training.processes import is_further
 from dlkf.training.run_folder import checked_digests, run_folder, write_state
 from dlkf.training.settings import TrainSettings
@@ -49,7 +44,7 @@ def main(config: dict[str, Any]) -> None:
     if is_further():
         train_along(settings, data, folder)
         return
-    check_accelerator(settings.fit)
+    check_fit(settings.fit)
     make_missing(data.datasets, told.scoring.hour, console)
     data.setup()
     console.print(data.describe())
@@ -72,28 +67,10 @@ def main(config: dict[str, Any]) -> None:
         chosen = {} if parent else {"register": tracking.register, "alias": tracking.alias}  # of a grid the best is
         log_model(run, outcome.weights, metrics=key_metrics(outcome), **chosen)
         write_state(folder, finished=True)
+    for result in outcome.results:
+        console.print(f"\n[bold]{answer(result)}[/bold]", highlight=False)
     seconds = ", ".join(f"{k} {v:.0f} s" for k, v in outcome.seconds.items())
     console.print(f"{seconds}\nReport: {folder}/report/report.html\nModel:  {outcome.weights}\nMLflow: run {run.id}")
-
-
-HOUR_SEED = 71  # the roads of the long drives are not those of the others
-
-
-def make_missing(datasets: Sequence[str], hour: str | None, console: Console) -> None:
-    """Simulate the datasets under ``data/`` that have a preset and are not there yet."""
-    for dataset in [*datasets, *([hour] if hour else [])]:
-        path = Path(dataset)
-        preset_file = config_dir() / "simulated" / f"{path.name}.yaml"
-        if path.exists() or path.parent != Path("data") or not preset_file.is_file():
-            continue
-        console.print(f"{dataset} is not there: simulating it")
-        seed = HOUR_SEED if dataset == hour else 1
-        preset = compose("simulate", overrides=[f"simulated@dataset={path.name}", f"seed={seed}"])
-        try:
-            simulate(settings_from(SimulateSettings, plain(preset), "").recipe, path)
-        except InputError:
-            if not path.exists():  # else a run beside this one made the same drives first
-                raise
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """MLflow's pages over the runs of this folder, opened where runs are: ``dlkf ui [port=5000]``.
 
-MLflow opens on pages for language models, empty here; the link that is printed goes to the trainings.
+MLflow opens on pages for language models, empty here, and so does a click in its list of experiments; the links
+that are printed go to the runs.
 """
 
 from __future__ import annotations
@@ -10,13 +11,13 @@ import subprocess
 import sys
 
 from dlkf.errors import InputError
-from dlkf.tracking.runs import store_missing, tracking_uri
+from dlkf.tracking.runs import client_of, found_again, store_missing, tracking_uri
 
-PAGE = "/#/experiments?workflowType=machine_learning"
+PAGE = "/#/experiments{of}?workflowType=machine_learning"
 
 
 def main() -> None:
-    """Start the server, print the link, stay until Ctrl-C."""
+    """Start the server, print the links, stay until Ctrl-C."""
     split = (argument.partition("=") for argument in sys.argv[1:])
     given = {key: value for key, _, value in split}
     try:
@@ -27,14 +28,25 @@ def main() -> None:
         uri = tracking_uri(given.get("uri"))
         if store_missing(uri):
             raise InputError(f"there is no MLflow store at {uri.removeprefix('sqlite:///')}; see tracking.uri")
+        found_again(uri)
+        host, port = given.get("host", "127.0.0.1"), given.get("port", "5000")
+        said = links(uri, f"http://{host}:{port}")
     except InputError as error:
         print(f"dlkf: error: {error}", file=sys.stderr)
         sys.exit(2)
-    host, port = given.get("host", "127.0.0.1"), given.get("port", "5000")
-    print(f"Runs: http://{host}:{port}{PAGE}", flush=True)
+    print("\n".join(said), flush=True)
     environment = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true"}
     command = [sys.executable, "-m", "mlflow", "ui", "--workers", "1", "--host", host, "--port", port]
     sys.exit(subprocess.run([*command, "--backend-store-uri", uri], env=environment).returncode)
+
+
+def links(uri: str, address: str) -> list[str]:
+    """A line for every experiment with runs, the latest first, with the page that has them."""
+    client = client_of(uri)
+    kept = [e for e in client.search_experiments() if client.search_runs([e.experiment_id], max_results=1)]
+    latest = sorted(kept, key=lambda e: e.last_update_time or 0, reverse=True)
+    pages = [(f"Runs of {e.name}", f"/{e.experiment_id}/runs") for e in latest] or [("Runs", "")]
+    return [f"{name}: {address}{PAGE.format(of=of)}" for name, of in pages]
 
 
 if __name__ == "__main__":

@@ -272,7 +272,7 @@ def test_a_pickle_as_model(command, copy, call, tmp_path):
 @pytest.mark.parametrize("command", FAST)
 def test_another_rate_than_the_models(command, model, copy, call, tmp_path):
     done = call(command, "model=mine", "dataset=town", "out=made", *FAST[command], "rate_hz=20")
-    is_refused(done, "set rate_hz=10", folder=tmp_path)
+    is_refused(done, "leave rate_hz and epoch_s to the model", folder=tmp_path)
 
 
 def test_a_sound_model_runs(model, copy, call, tmp_path):

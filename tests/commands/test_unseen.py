@@ -9,7 +9,7 @@ import pandas as pd
 import torch
 
 from dlkf.data.store import dataset_digest
-from dlkf.filters.card import recordings_seen
+from dlkf.filters.card import recordings_seen, unmet_imus
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.saved import save_filter
 
@@ -22,6 +22,13 @@ def test_recordings_count_by_name_or_digest_of_their_dataset():
     assert recordings_seen(card, "town", "999", ["a", "b", "c"]) == {"a", "b"}
     assert recordings_seen(card, "moved", "123", ["a", "c"]) == {"a"}
     assert recordings_seen(card, "other", "999", ["a"]) == set() == recordings_seen({}, "town", "123", ["a"])
+
+
+def test_an_imu_that_a_model_has_not_met_is_said_and_no_other():
+    cards = {"mine": {"imus": ["consumer"]}, "plus": {"imus": []}, "mbkf15": {}}
+    assert unmet_imus(cards, ["consumer"]) == []
+    (line,) = unmet_imus(cards, ["consumer", "bmi270"])
+    assert line.startswith("mine was trained on the IMU consumer and has not met bmi270")
 
 
 def test_evaluate_says_so_and_leaves_them_out(call, town, tmp_path):

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import textwrap
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.masks import Outage
 from dlkf.errors import InputError
 from dlkf.settings import settings_from
-from dlkf.training.fit import fit
+from dlkf.training.fit import check_fit, fit
 from dlkf.training.run_folder import checked_digests, read_state, run_folder, write_state
 from dlkf.training.settings import FitSettings, TrainSettings
 
@@ -124,9 +125,12 @@ def test_other_data_than_the_unfinished_run_began_with_are_refused(dataset, tmp_
         checked_digests([str(dataset)], {"data": {str(dataset): "0" * 32}})
 
 
-def test_no_validated_epoch_is_said_clearly(dataset, tmp_path):
-    with pytest.raises(InputError, match="no epoch was validated"):
-        fit(told(max_epochs=1, validate_every=1, best_from_epoch=3), data(dataset), tmp_path / "run", False)
+@pytest.mark.parametrize(("epochs", "every", "start", "some"), [(1, 1, 3, False), (4, 3, 3, False), (6, 3, 3, True)])
+def test_epochs_of_which_none_is_validated_are_refused_before_any_work(epochs, every, start, some):
+    """Validated are the 3rd and the 6th of six, of which the latter comes after three."""
+    plan = told(max_epochs=epochs, validate_every=every, best_from_epoch=start)
+    with nullcontext() if some else pytest.raises(InputError, match="no epoch would be validated"):
+        check_fit(plan)
 
 
 def test_run_folder_is_found_again_until_it_is_finished(tmp_path):

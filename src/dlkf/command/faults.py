@@ -79,8 +79,11 @@ def one_line(error: BaseException) -> str:
         return f"unknown config key {unknown[1]!r}; --cfg job prints all keys"
     if missing := re.search(r"Missing mandatory value: (\S+)", text):
         return f"{missing[1]} is missing; give {missing[1]}=…"
+    if bare := re.search(r"Error parsing override '([^'=]*)'", text):
+        return f"cannot read {bare[1]!r}; settings are key=value, such as dataset={bare[1]}; --help names them"
     if malformed := re.search(r"(?:LexerNoViableAltException|mismatched input|extraneous input)[\s\S]*", text):
-        words = " ".join(malformed[0].replace("LexerNoViableAltException:", "").replace("^", "").split())
+        said = malformed[0].partition("See https")[0]
+        words = " ".join(said.replace("LexerNoViableAltException:", "").replace("^", "").split())
         return f"cannot read {words!r}; quote a value with such signs: 'key=\"value\"'"
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     hints = ("full_key:", "object_type=", "reference_type=", "See https")

@@ -36,5 +36,13 @@ def drive_kind(row: Mapping[Any, Any]) -> str:
 
 def drive_kinds(dataset: str | Path) -> dict[str, str]:
     """Kind of every drive of a dataset."""
-    table = pd.read_parquet(readable(placed(dataset) / "drives.parquet"))
-    return {str(row["drive"]): drive_kind(row) for row in table.to_dict("records")}
+    return {str(row["drive"]): drive_kind(row) for row in _rows(dataset)}
+
+
+def drive_imus(dataset: str | Path) -> dict[str, str]:
+    """What ``drives.parquet`` calls the IMU of every drive, of those that it names one of."""
+    return {str(row["drive"]): row["imu"] for row in _rows(dataset) if isinstance(row.get("imu"), str) and row["imu"]}
+
+
+def _rows(dataset: str | Path) -> list[dict[Any, Any]]:
+    return pd.read_parquet(readable(placed(dataset) / "drives.parquet")).to_dict("records")

@@ -141,13 +141,13 @@ def _check_way(gnss: Columns, where: str) -> None:
             moved,
         ),
         "vel_n and vel_e look swapped; reader.gnss.velocity.frame=enu, or exchange them": (lat, lon, moved[:, ::-1]),
-        "the velocities look like km/h; reader.gnss.velocity.unit=km/h, or divide them by 3.6": (lat, lon, moved / 3.6),
-        "the velocities look like knots; reader.gnss.velocity.unit=knots, or multiply them by 0.5144": (
+        "the velocities look like km/h; reader.gnss.velocity.unit=auto, or divide them by 3.6": (lat, lon, moved / 3.6),
+        "the velocities look like knots; reader.gnss.velocity.unit=auto, or multiply them by 0.5144": (
             lat,
             lon,
             moved * 0.514444,
         ),
-        "the velocities look divided by 3.6; multiply them by 3.6 (reader.gnss.velocity.unit=3.6)": (
+        "the velocities look divided by 3.6; reader.gnss.velocity.unit=auto, or multiply them by 3.6": (
             lat,
             lon,
             moved * 3.6,
@@ -208,7 +208,7 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
         raise InputError(
             f"{where}: the clocks of IMU and GNSS are {abs(best.lag_s):.1f} s apart: yaw rate and course agree to "
             f"{best.yaw:.2f} with {best.lag_s:+.1f} s on GNSS, as they stand {as_is}{known_offset(best.lag_s)}; "
-            "reader.gnss.time.offset_s=auto, or clock=unix for a file in UTC"
+            f"reader.gnss.time.offset_s=auto, or {best.lag_s:.1f}"
         )
     turned = np.degrees(best.angle)
     if best.force > 0.85 and TURNED_DEG[0] < abs(turned) < TURNED_DEG[1]:

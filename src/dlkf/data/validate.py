@@ -19,6 +19,7 @@ from dlkf.data.tables import Columns, DriveRow, read_drives, read_table
 from dlkf.errors import InputError
 
 GNSS_QUALITIES = (1, 2, 3, 4, 5, 9)  # NMEA GGA codes that are a satellite fix; 6, 7, 8 are not
+UNIX_TO_GPS_S, EPOCHS_APART_S = 315_964_800.0, 86_400.0  # 1970 to 1980; as near is no chance
 
 
 @dataclass(frozen=True)
@@ -159,9 +160,11 @@ def _check_gnss(gnss: Columns, imu: Columns, where: str) -> None:
             raise InputError(f"{where}: row {bad[0]}: {name} is {gnss[name][bad[0]]}; must be ≥ 0, or NaN if unknown")
     t, first, last = gnss["t"][fix], imu["t"][0], imu["t"][-1]
     if not ((t > first) & (t <= last + 1)).any():
+        epochs = abs(abs(t[0] - first) - UNIX_TO_GPS_S) < EPOCHS_APART_S
         raise InputError(
             f"{where}: fixes from t = {t[0]:.3f} to {t[-1]:.3f} lie outside the IMU's {first:.3f} to "
             f"{last:.3f}; both need the same clock"
+            + (": one counts from 1970, the other from 1980; give time.clock to both or to neither" if epochs else "")
         )
     check_gnss_units({name: values[fix] for name, values in gnss.items()}, where)
 

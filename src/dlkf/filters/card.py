@@ -38,6 +38,22 @@ def recordings_seen(card: Mapping[str, Any], dataset: str, digest: str, groups: 
     return set(groups) & {*(card.get("trained_on") or ()), *(card.get("chosen_on") or ())}
 
 
+def unmet_imus(cards: Mapping[str, Mapping[str, Any]], imus: Iterable[str]) -> list[str]:
+    """A line for each model that knows the IMUs it was trained on alone, where ``imus`` are others.
+
+    ``cards`` by the models' names; one without ``imus`` says nothing.
+    """
+    lines = []
+    for name, card in cards.items():
+        known = set(card.get("imus") or ())
+        if known and (unmet := sorted(set(imus) - known)):
+            lines.append(
+                f"{name} was trained on the IMU {', '.join(sorted(known))} and has not met {', '.join(unmet)}: "
+                "it may be worse than any other filter here"
+            )
+    return lines
+
+
 def without_seen(
     cards: Mapping[str, Mapping[str, Any]],
     drives: Sequence[DriveRow],

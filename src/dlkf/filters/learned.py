@@ -112,9 +112,10 @@ class LearnedFilter(nn.Module):
         """Empty memory, no IMU error."""
         B, _, M = batch.size
         if self.config.network.samples != M:
+            c = self.config
             raise InputError(
-                f"this model was trained on windows of {self.config.network.samples} samples "
-                f"({self.config.rate_hz:g} Hz), the data come with {M}; set rate_hz={self.config.rate_hz:g}"
+                f"this model was trained on windows of {c.network.samples} samples ({c.rate_hz:g} Hz over epochs of "
+                f"{c.epoch_s:g} s), the data come with {M}; leave rate_hz and epoch_s to the model"
             )
         parameter = self.imu_error.linear.weight
         state = NavState(*(x.detach() for x in batch.start))

@@ -103,7 +103,7 @@ class Navigated:
     def summary(self, spacing: Fixes | None = None) -> str:
         """One line: rows, alignment, fixes used (of those in the file), and the filter's own 1σ at the end."""
         last, used = self.table.iloc[-1], int(self.table.gnss_used.sum())
-        text = f"{self.drive}: aligned at t = {self.aligned_at:.1f} s, {len(self.table)} epochs, "
+        text = f"{self.drive}: aligned at t = {round(self.aligned_at, 1) + 0.0:.1f} s, {len(self.table)} epochs, "
         if spacing is None:
             text += f"{used} fixes used"
         else:

@@ -41,10 +41,10 @@ def fit(
     With ``trainer.devices`` above 1 the command ``further`` is run for every further process; it calls this too.
 
     ``mean_imu_error`` (6) of the training pieces is where a model with ``known_from=training`` starts; ``notes`` are
-    stored beside the weights. Raises InputError where no epoch was validated, or none had a finite ``monitor``.
+    stored beside the weights. Raises InputError where no epoch had a finite ``monitor``.
     """
     plan = settings.trainer
-    module = FilterTraining(settings.model, settings.loss, settings.optimizer, settings.scheduler, seed=settings.seed)
+    module = FilterTraining(settings.model, settings.loss, settings.descent, seed=settings.seed)
     last = folder / LAST
     if settings.finetune:
         module.filter = trained_filter(settings.finetune).train()
@@ -88,23 +88,30 @@ def fit(
         raise InputError(f"the training diverged (its loss is {float(loss)}); give a smaller optimizer.lr")
     if not (folder / BEST).is_dir():
         monitor = _monitor(plan.monitor, data)
-        score = float(trainer.callback_metrics.get(monitor, 0.0))
-        if not math.isfinite(score):
-            raise InputError(f"no weights to keep: {monitor} is {score}, the training diverged; lower optimizer.lr")
-        raise InputError(
-            f"no epoch was validated: trainer.max_epochs={plan.max_epochs} ends before "
-            f"trainer.best_from_epoch={plan.best_from_epoch} and validate_every={plan.validate_every}"
-        )
+        score = float(trainer.callback_metrics.get(monitor, math.nan))
+        raise InputError(f"no weights to keep: {monitor} is {score}, the training diverged; lower optimizer.lr")
     return folder / BEST
 
 
-def check_accelerator(settings: FitSettings) -> None:
-    """Lightning's error for an accelerator that is unknown or not there, before any work is done for it."""
+def check_fit(settings: FitSettings) -> None:
+    """What a training would come upon after the tuning, before any work is done for it.
+
+    InputError for a class that is not there or takes other settings, and for epochs of which none is validated;
+    Lightning's error for an accelerator that is unknown or not there.
+    """
+    plan = settings.trainer
+    last = plan.max_epochs // plan.validate_every * plan.validate_every
+    if last < 1 or last - 1 < plan.best_from_epoch:
+        raise InputError(
+            f"no epoch would be validated: trainer.max_epochs={plan.max_epochs} ends before trainer.best_from_epoch="
+            f"{plan.best_from_epoch} and validate_every={plan.validate_every}"
+        )
+    FilterTraining(settings.model, settings.loss, settings.descent).configure_optimizers()
     _hush()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="lightning")
         L.Trainer(
-            accelerator=settings.trainer.accelerator, devices=1, logger=False, enable_checkpointing=False,
+            accelerator=plan.accelerator, devices=1, logger=False, enable_checkpointing=False,
             enable_progress_bar=False, enable_model_summary=False,
         )  # fmt: skip
 

@@ -16,8 +16,8 @@ from dlkf.filters.saved import LearnedSettings, learned_filter
 from dlkf.networks.heads import IMU_ERROR_SIZE, INNOVATION_SIZE, STATE_SIZE
 from dlkf.training.callbacks.masking import BatchCallback
 from dlkf.training.loss import TERMS, Loss, weighted
+from dlkf.training.optimization import Descent
 from dlkf.training.processes import of_all
-from dlkf.training.settings import OptimizerSettings, SchedulerSettings
 
 STATE, INNOVATION = torch.tensor(STATE_SIZE), torch.tensor(INNOVATION_SIZE)
 
@@ -33,29 +33,23 @@ class FilterTraining(L.LightningModule):
         self,
         model: LearnedSettings,
         loss: Loss,
-        optimizer: OptimizerSettings,
-        scheduler: SchedulerSettings,
+        descent: Descent,
         seed: int = 0,
     ) -> None:
         super().__init__()
         torch.manual_seed(seed)
         self.filter = learned_filter(model)
         self.loss = loss
-        self.optimizer_settings, self.scheduler_settings = optimizer, scheduler
+        self.descent = descent
         self.covariances = getattr(loss, "likelihood", 0.0) > 0
         self.loss_weights: dict[str, float] = dict.fromkeys(TERMS, 1.0)
         self.seed = seed
 
     def configure_optimizers(self):
-        """AdamW, heads at their own rate, cosine annealing with warm restarts (R073; paper.md 4.13)."""
-        o, s = self.optimizer_settings, self.scheduler_settings
+        """Those of the settings, a step of the schedule an epoch."""
         heads = list(self.filter.heads())
         body = [p for p in self.filter.parameters() if all(p is not h for h in heads)]
-        groups = [{"params": body, "lr": o.lr}, {"params": heads, "lr": o.lr * o.head_lr_factor}]
-        optimizer = torch.optim.AdamW(groups, weight_decay=o.weight_decay)
-        scheduler = torch.optim.lr_scheduler.CosineAnnealingWarmRestarts(
-            optimizer, T_0=s.restart_epochs, T_mult=s.restart_factor, eta_min=s.lr_min
-        )
+        optimizer, scheduler = self.descent.build(body, heads)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "epoch"}}
 
     def training_step(self, batch: Batch, step: int) -> Tensor:

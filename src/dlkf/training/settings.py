@@ -16,26 +16,7 @@ from dlkf.filters.saved import LearnedSettings, learned_settings
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.settings import Ranged, within
 from dlkf.training.loss import Loss, loss_of
-
-MANY = 10**9
-
-
-@dataclass(frozen=True)
-class OptimizerSettings(Ranged, where="optimizer", least=0, greatest=1e3):
-    """AdamW; the output layers learn at ``head_lr_factor`` times the rate."""
-
-    lr: float
-    head_lr_factor: float
-    weight_decay: float
-
-
-@dataclass(frozen=True)
-class SchedulerSettings(Ranged, where="scheduler"):
-    """Cosine annealing with warm restarts (R073), in epochs."""
-
-    restart_epochs: int = within(100, 1, MANY)
-    restart_factor: int = within(1, 1, 1000)
-    lr_min: float = within(1e-5, 0, 1e3)
+from dlkf.training.optimization import MANY, Descent
 
 
 @dataclass(frozen=True)
@@ -93,8 +74,7 @@ class FitSettings:
 
     model: LearnedSettings
     loss: Loss
-    optimizer: OptimizerSettings
-    scheduler: SchedulerSettings
+    descent: Descent
     trainer: TrainerSettings
     callbacks: Sequence[Callback]
     seed: int = 0
@@ -125,8 +105,8 @@ class TrainSettings:
     model: Mapping[str, Any]
     loss: Mapping[str, Any]
     callbacks: Mapping[str, Any]
-    optimizer: OptimizerSettings
-    scheduler: SchedulerSettings
+    optimizer: Mapping[str, Any]
+    scheduler: Mapping[str, Any]
     trainer: TrainerSettings
     baselines: BaselineSettings
     scoring: ScoringSettings
@@ -138,8 +118,7 @@ class TrainSettings:
         return FitSettings(
             model=learned_settings(self.model),
             loss=loss_of(self.loss),
-            optimizer=self.optimizer,
-            scheduler=self.scheduler,
+            descent=Descent.of(self.optimizer, self.scheduler),
             trainer=self.trainer,
             callbacks=[made(c, f"callbacks.{name}") for name, c in self.callbacks.items() if c is not None],
             seed=self.seed,

@@ -14,7 +14,7 @@ from lightning.pytorch.loggers import Logger
 
 import dlkf
 from dlkf.data.datamodule import DriveDataModule
-from dlkf.data.kinds import drive_kinds
+from dlkf.data.kinds import drive_imus, drive_kinds
 from dlkf.data.store import dataset_digest, load_dataset
 from dlkf.evaluation.endurance import After, after_gnss, after_tables, hour_table, without_outage
 from dlkf.evaluation.gains import gains_of, write_gains
@@ -67,7 +67,7 @@ def run_study(
     with _timed(seconds, "tuning"):
         baselines = _baselines(settings, data, say)
     with _timed(seconds, "training"):
-        card = model_card(settings, data)
+        card = model_card(settings, data, getattr(logger, "run_id", None))
         mean = baselines.prior.mean
         weights = fit(settings.fit, data, folder, logger, mean_imu_error=mean, notes=card, further=further)
     with _timed(seconds, "scoring"):
@@ -155,13 +155,22 @@ def _endurance(
     return after, hour, tables
 
 
-def model_card(settings: StudySettings, data: DriveDataModule) -> dict[str, Any]:
-    """What a model was made of: recordings it was trained and chosen on, the data's digests, IMU, seeds, version."""
+def model_card(settings: StudySettings, data: DriveDataModule, run: str | None = None) -> dict[str, Any]:
+    """What a model was made of: recordings it was trained and chosen on, the data's digests, IMU, run, seeds, version.
+
+    ``imus`` are those that it knows, of a filter that learns them by heart (paper.md 4.8), which ``plus`` does not.
+    """
+    drives, called = data.drives("train"), {}
+    for dataset in data.datasets:
+        called |= drive_imus(dataset)
+    by_heart = settings.fit.model.kind == "dlkf" and not settings.fit.finetune
     return {
-        "trained_on": sorted({d.group for d in data.drives("train")}),
+        "trained_on": sorted({d.group for d in drives}),
         "chosen_on": sorted({d.group for d in data.drives("val")}),
         "datasets": {Path(d).name: dataset_digest(d) for d in data.datasets},
         "imu": settings.imu.name,
+        "imus": sorted({called.get(d.name, settings.imu.name) for d in drives}) if by_heart else [],
+        "run": run,
         "experiment": settings.name,
         "seed": settings.fit.seed,
         "max_epochs": settings.fit.trainer.max_epochs,

@@ -153,7 +153,8 @@ def _drift(out: Findings, pose: Pose | None, wanted: set[str], sure: Sure, reach
             seen = "" if pose is None or math.isnan(pose.drift_std) else f", ± {1e6 * pose.drift_std:.0f} ppm"
             out.add(setting, 0.0, True, f"none to be seen{seen}")
         return
-    told = f"± {1e6 * pose.drift_std:.0f} ppm: the clock of the IMU runs faster than that of GNSS"
+    faster = "faster" if pose.drift > 0 else "slower"
+    told = f"± {1e6 * pose.drift_std:.0f} ppm: the clock of the IMU runs {faster} than that of GNSS"
     out.add(setting, round(1e6 * pose.drift, 1), setting in wanted, told)
 
 
