@@ -6,10 +6,11 @@
 Pieces of 60 s with GNSS, an outage, and 5 s after it, from the truth plus an error of 0.1 m, 0.1 m/s, 1° and 2° (1σ);
 simulated and semi-real pieces end to end, real ones every 10 s. Nobody is told the IMU: the classical filters start
 from an automotive MEMS and have factors tuned by the geometric mean on pieces of the training drives, which are kept
-in <out>/factors.yaml. Beside them stands ``mbkf33_car`` that is told the preset of the drive's IMU, where it has one,
-and has its tuned factors but those of the IMU: no rival, but what such knowledge is worth. Prints, and writes into
-<out>, Markdown tables of the horizontal error at the end of the outages: all filters, then trainings from other seeds
-(``--model`` takes several), then ``plus`` with parts of its network switched off.
+in <out>/factors.yaml; one of them a second time, by gradient instead of search (:mod:`pipelines.studies.descent`).
+Beside them stands ``mbkf33_car`` that is told the preset of the drive's IMU, where it has one, and has its tuned
+factors but those of the IMU: no rival, but what such knowledge is worth. Prints, and writes into <out>, Markdown tables
+of the horizontal error at the end of the outages: all filters, then trainings from other seeds (``--model`` takes
+several), then ``plus`` with parts of its network switched off.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import numpy as np
 import pandas as pd
 import torch
 import yaml
+from pipelines.studies.descent import descended
 
 from dlkf.config import config_dir
 from dlkf.data.drive import Batch
@@ -33,16 +35,18 @@ from dlkf.data.stack import DriveStack
 from dlkf.data.store import load_dataset
 from dlkf.evaluation.bootstrap import compare
 from dlkf.evaluation.metrics import mean_error
-from dlkf.filters.build import build_causal
+from dlkf.filters.build import build_causal, build_filter
 from dlkf.filters.integration import Estimator
+from dlkf.filters.model_based import Mbkf
 from dlkf.filters.plus import ANY_MEMS, PlusConfig, PlusFilter
 from dlkf.filters.shipped import trained_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.running.batched import run_filter
-from dlkf.tuning.search import tuned
+from dlkf.tuning.search import outage_error, tuned
 
-CLASSICAL = ("mbkf21_nhc", "mbkf21_car", "mbkf33_car")
+BY_GRADIENT = "mbkf33_car, by gradient"
+CLASSICAL = ("mbkf21_nhc", "mbkf21_car", "mbkf33_car", BY_GRADIENT)
 START = StartLaw(position_m=0.1, velocity_mps=0.1, roll_pitch_deg=1.0, yaw_deg=2.0)
 BEFORE_S, AFTER_S, REAL_STRIDE_S = 60.0, 5.0, 10.0
 PARTS = tuple(("across", "fix", "process", "offset", "speed")[:k] for k in range(6))
@@ -84,11 +88,29 @@ def opponents(train: Sequence[str], out: Path) -> dict[str, Estimator]:
     for name in CLASSICAL:
         if name not in known:
             pieces = pieces or [outages(load(train), 60.0, most=90)]
-            factors, error = tuned(spec, pieces, name=name, start=Tuning(), objective="log", rounds=2)
-            print(f"{name}: {error:.2f} m geometric mean on {pieces[0].size[0]} training pieces", flush=True)
+            if name == BY_GRADIENT:
+                kalman = build_filter(filter_of(name), spec, tuning=Tuning())
+                assert isinstance(kalman, Mbkf)
+                factors = descended(kalman, pieces[0], end_of(60.0, pieces[0]))
+            else:
+                factors, _ = tuned(spec, pieces, name=name, start=Tuning(), objective="log", rounds=2)
             known[name] = asdict(factors)
+            error = outage_error(build_filter(filter_of(name), spec, tuning=factors), pieces)
+            print(f"{name}: {error:.2f} m geometric mean on {pieces[0].size[0]} training pieces", flush=True)
             file.write_text(yaml.safe_dump(known))
-    return {name: build_causal(name, spec, "a stream cannot", tuning=Tuning(**known[name])) for name in CLASSICAL}
+    return {
+        name: build_causal(filter_of(name), spec, "a stream cannot", tuning=Tuning(**known[name])) for name in CLASSICAL
+    }
+
+
+def filter_of(name: str) -> str:
+    """Name of the filter of an opponent."""
+    return name.partition(",")[0]
+
+
+def end_of(outage_s: float, batch: Batch) -> int:
+    """The last epoch of the outage of such pieces."""
+    return round((BEFORE_S + outage_s) / batch.epoch_s) - 1
 
 
 def told_errors(
@@ -100,7 +122,7 @@ def told_errors(
     if not all(file.is_file() for file in files.values()):
         return None
     out = np.empty(len(kinds))
-    end = round((BEFORE_S + outage_s) / batch.epoch_s) - 1
+    end = end_of(outage_s, batch)
     for kind, file in files.items():
         known = build_causal(
             TOLD, imu_spec(yaml.safe_load(file.read_text())), "a stream cannot",
@@ -115,7 +137,7 @@ def scored(
     name: str, batch: Batch, outage_s: float, filters: Mapping[str, Estimator], groups: Mapping[str, str]
 ) -> Row:
     """Errors at the end of the outage; NEES of the horizontal position over it."""
-    end, nees, errors = round((BEFORE_S + outage_s) / batch.epoch_s) - 1, {}, {}
+    end, nees, errors = end_of(outage_s, batch), {}, {}
     first = round(BEFORE_S / batch.epoch_s)
     for filter_name, estimator in filters.items():
         solution = run_filter(batch, estimator)

@@ -20,7 +20,7 @@ def test_it_scores_and_writes_its_tables(simulated, tmp_path, monkeypatch, capsy
     table = (out / "table.md").read_text()
     lines = [line for line in table.splitlines() if line.startswith(f"| {simulated.name} | 20 |")]
     assert len(lines) == 3 and table in capsys.readouterr().out + "\n"
-    cells = [c.strip() for c in lines[0].split("|")[4:8]]
+    cells = [c.strip() for c in lines[0].split("|")[4:9]]
     assert all(0 < float(c.split(" / ")[0]) < 1e4 for c in cells)
     seeds = [c.strip() for c in lines[1].split("|")[3:-1]]
     assert seeds[:4] == seeds[4:] and seeds[0] == cells[-1]
