@@ -73,7 +73,7 @@ class Rough:
     only within a factor of two.
     """
 
-    share: float = 0.6
+    share: float = 0.4
     accel_noise: tuple[float, ...] = (1e-3, 3e-2)
     gyro_noise: tuple[float, ...] = (1e-4, 5e-3)
     accel_wander: tuple[float, ...] = (1e-3, 0.05)
