@@ -1,126 +1,58 @@
 """Speed, all from one run: ``make bench`` or ``python -m pipelines.studies.benchmark [--threads 2] [--hours 8]``.
 
-Windowed strapdown against a loop over samples, Kalman filters for one drive and for 64, training epochs of the learned
-filters, and how cost goes with drives, length and batch. Prints a table with bars and writes ``outputs/bench.json``:
-median and least of the repeats of every figure, the machine and the commit. The other half of the comparison,
-python-ins on the same files, is ``pipelines/studies/parity.py``.
+Windowed strapdown against a loop over samples, filters in torch and compiled for one drive and for 64, an epoch by
+itself, tuning, training epochs of the learned filters, and how cost goes with hours, drives, length, rate, batch and
+threads. Beside them python-ins on the same drive; on request the strapdown of PyPose (``--pypose``, where it is
+installed) and KF-GINS (``--kf-gins FOLDER``, a checkout). Prints a table with bars, writes ``outputs/bench.json``
+(median, least, 99th percentile of the repeats of every figure, the machine, the commit), draws ``outputs/bench.png``.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import platform
-import statistics
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import torch
+from pipelines.studies import kf_gins, parity
+from pipelines.studies.compiled_step import times_in_c
+from pipelines.studies.figures.bench_figures import Bench, Timing, machine
 from rich.console import Console
-from rich.table import Table
 
 from dlkf.command.composing import composed
 from dlkf.command.simulated import composed_recipe
+from dlkf.data.alignment import ALIGN
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.drive import Batch
 from dlkf.data.segments import StartLaw, cut_pieces, make_batch
 from dlkf.data.store import load_dataset
-from dlkf.files import staged
+from dlkf.evaluation.outages import OutagePlan
+from dlkf.evaluation.protocol import Protocol
 from dlkf.filters.build import build_causal
 from dlkf.filters.integration import integrate
 from dlkf.filters.saved import learned_filter, learned_settings
+from dlkf.models import resolve_model
 from dlkf.navigation.attitude import rotation_from_vector
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.strapdown import strapdown
-from dlkf.provenance import provenance
+from dlkf.onboard.check import epoch_times
+from dlkf.onboard.compiled_filter import compiled_filter
+from dlkf.onboard.library import compiler
+from dlkf.running.batched import run_filter
+from dlkf.running.start import aligned_drives
 from dlkf.simulation.dataset import simulate
 from dlkf.training.callbacks.masking import GnssDecimation, OutageInjection
 from dlkf.training.loss import TERMS, LossConfig, pva_losses, weighted
+from dlkf.tuning.search import factors_of, tuned
+from dlkf.tuning.study import withheld
 
-KALMAN = ("mbkf15", "mbkf21", "mbkf21_nhc")
+COMPILED = ("mbkf15", "mbkf21", "mbkf21_car", "plus")
 LEARNED = ("dlkf_literal", "dlkf", "plus")
-BAR = 24
-
-
-@dataclass
-class Figure:
-    """A work's times by its repeats; with ``units`` what is told is units a second."""
-
-    group: str
-    work: str
-    seconds: list[float]
-    units: float = 0.0  # of work in a repeat, for a rate
-
-    @property
-    def median(self) -> float:
-        """Seconds, or units a second."""
-        middle = statistics.median(self.seconds)
-        return self.units / middle if self.units else middle
-
-    @property
-    def best(self) -> float:
-        """Of the least time."""
-        return self.units / min(self.seconds) if self.units else min(self.seconds)
-
-    def text(self, x: float) -> str:
-        """With its unit."""
-        return f"{x:,.0f} /s" if self.units else f"{x:.3f} s"
-
-
-@dataclass
-class Bench:
-    """Figures of a run."""
-
-    most_repeats: int = 9
-    figures: list[Figure] = field(default_factory=list)
-
-    def time(self, group: str, work: str, call: Callable[[], object], repeats: int = 5, units: float = 0.0) -> Figure:
-        """Wall times of a call after one warm-up."""
-        call()
-        times = []
-        for _ in range(min(repeats, self.most_repeats)):
-            start = time.perf_counter()
-            call()
-            times.append(time.perf_counter() - start)
-        self.figures.append(Figure(group, work, times, units))
-        return self.figures[-1]
-
-    def table(self, title: str) -> Table:
-        """Median, best and a bar against the largest of the group."""
-        table = Table("work", "median", "best", "", title=title)
-        for group in dict.fromkeys(f.group for f in self.figures):
-            rows = [f for f in self.figures if f.group == group]
-            table.add_section()
-            for f in rows:
-                bar = "█" * max(1, round(BAR * f.median / max(r.median for r in rows)))
-                table.add_row(f"{group}: {f.work}", f.text(f.median), f.text(f.best), bar)
-        return table
-
-    def write(self, folder: Path, machine: dict) -> None:
-        """``bench.json``, whole or not at all."""
-        rows = [asdict(f) | {"median": f.median, "best": f.best} for f in self.figures]
-        with staged(folder) as beside:
-            text = json.dumps({"machine": machine, **provenance(), "figures": rows}, indent=1)
-            (beside / "bench.json").write_text(text, encoding="utf-8")
-
-
-def machine(threads: int) -> dict:
-    """What the figures depend on."""
-    info = Path("/proc/cpuinfo")
-    models = [line for line in info.read_text().splitlines() if line.startswith("model name")] if info.is_file() else []
-    return {
-        "processor": models[0].partition(":")[2].strip() if models else platform.processor(),
-        "cores": os.cpu_count(),
-        "load_1_min": round(os.getloadavg()[0], 1),
-        "threads": threads,
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-        "system": platform.platform(),
-    }
+PARTS = ("strapdown", "filters", "epochs", "peers", "tuning", "training", "scaling")
+RATE_HZ = 100.0  # of the files
+SECONDS = "IMU epochs a second"
 
 
 def sample_loop(batch: Batch) -> torch.Tensor:
@@ -150,26 +82,70 @@ def windows(batch: Batch) -> torch.Tensor:
     return state.p_n.detach()
 
 
-def filters(bench: Bench, dataset: Path, imu: ImuSpec, length_s: float) -> None:
-    """The Kalman filters over drives at the file's own 100 Hz, and what drives and length cost."""
-    drives = load_dataset(dataset, rate_hz=100, dtype=torch.float64, reference=True)
-    pieces = (cut_pieces(drives, length_s) * 8)[:64]
+def pypose_chunks(batch: Batch) -> torch.Tensor:
+    """PyPose's integrator over the same samples, a second at a time, on a flat Earth that does not turn."""
+    import pypose  # type: ignore[import-not-found]  # on request
 
-    def run(group: str, name: str, count: int, chosen: list) -> None:
-        batch = make_batch(drives, chosen[:count], dtype=torch.float64)
-        estimator = build_causal(name, imu, "the loop does not")
-        with torch.inference_mode():
-            samples = count * batch.size[1] * batch.size[2]
-            what = f"{name}, {count} drive{'s' * (count > 1)} of {batch.size[1] * batch.epoch_s:g} s"
-            bench.time(group, what, lambda: integrate(batch, estimator), 3, samples)
+    p, v, C = batch.start
+    error = torch.zeros(len(p), 6, dtype=p.dtype, requires_grad=True)
+    dt = torch.full((*batch.imu[:, 0, :, :1].shape,), batch.dt, dtype=p.dtype)
+    integrator = pypose.module.IMUPreintegrator(prop_cov=False, reset=True, gravity=-9.80665).to(p.dtype)
+    state = {"pos": p[:, None], "rot": pypose.mat2SO3(C, check=False)[:, None], "vel": v[:, None]}
+    for t in range(batch.size[1]):
+        imu = batch.imu[:, t] - error.unsqueeze(1)
+        out = integrator(dt=dt, gyro=imu[..., 3:], acc=imu[..., :3], init_state=state)
+        state = {name: out[name][:, -1:] for name in ("pos", "rot", "vel")}
+    (state["pos"].sum() + state["vel"].sum()).backward()
+    return state["pos"].detach()[:, 0]
 
-    for name in KALMAN:
+
+def filters(bench: Bench, dataset: Path, imu: ImuSpec, length_s: float, models: list[str]) -> None:
+    """Filters over drives at the files' own rate, one and 64 at once, in torch and compiled in turns."""
+    drives = load_dataset(dataset, rate_hz=RATE_HZ, dtype=torch.float64)
+    pieces = (cut_pieces(drives, length_s) * 64)[:64]
+    for name in models:
+        estimator = resolve_model(name, imu)
+        in_c = compiled_filter(estimator, RATE_HZ, 1.0) if compiler() else None
         for count in (1, 64):
-            run("filter, IMU epochs", name, count, pieces)
-    for count in (1, 4, 16, 64):
-        run("over drives, IMU epochs", "mbkf15", count, pieces)
-    for length in (length_s / 4, length_s / 2, length_s):
-        run("over length, IMU epochs", "mbkf15", 8, cut_pieces(drives, length) * 8)
+            batch = make_batch(drives, pieces[:count], dtype=torch.float64)
+            what = f"{name}, {count} drive{'s' * (count > 1)} of {batch.size[1] * batch.epoch_s:g} s"
+            calls = {f"{what}, torch": lambda batch=batch, f=estimator: run_filter(batch, f)}
+            if in_c is not None:
+                calls[f"{what}, compiled"] = lambda batch=batch, f=in_c: run_filter(batch, f)
+            bench.in_turns(f"filter, {SECONDS}", calls, 3, count * batch.size[1] * batch.size[2])
+
+
+def epochs(bench: Bench, dataset: Path, imu: ImuSpec, models: list[str]) -> None:
+    """One epoch with its fix by itself: in Python by torch and compiled, and the call in C."""
+    drive = load_dataset(dataset, rate_hz=RATE_HZ, dtype=torch.float64)[0]
+    batch = aligned_drives([drive], ALIGN)
+    for name in models if compiler() else ():
+        in_c = compiled_filter(resolve_model(name, imu), RATE_HZ, 1.0)
+        for kind, seconds in {**epoch_times(in_c, drive), "C": times_in_c(in_c, batch)}.items():
+            bench.add(Timing("an epoch", f"{name} in {kind}", seconds))
+
+
+def peers(bench: Bench, folder: Path, minutes: float, checkout: Path | None) -> None:
+    """python-ins on the same drive with the same states, and KF-GINS' engine where it is at hand."""
+    spec = parity.preset("consumer")
+    parity.write_drives(folder, spec, 1, minutes)
+    drives = load_dataset(folder, rate_hz=RATE_HZ, dtype=torch.float64)
+    batch = make_batch(drives, cut_pieces(drives, drives[0].epochs - 1.0)[:1], dtype=torch.float64, start=parity.START)
+    samples = batch.size[1] * batch.size[2]
+    _, seconds = parity.theirs(folder, batch, spec, 21, 0.1)
+    bench.add(Timing(f"peer, {SECONDS}", "python-ins, 21 states, 0.1 s", [seconds], samples))
+    bench.time(f"peer, {SECONDS}", "mbkf21, torch", lambda: parity.ours(batch, spec, 21, score=False), 3, samples)
+    if checkout is not None:
+        for name, (seconds, samples, _) in kf_gins.measured(checkout, list(COMPILED), 10.0, 3).items():
+            bench.add(Timing(f"beside KF-GINS, {SECONDS}", name, seconds, samples))
+
+
+def tuning(bench: Bench, dataset: Path, imu: ImuSpec) -> None:
+    """A search over all factors of a filter on sixty pieces of two minutes."""
+    drives = load_dataset(dataset, rate_hz=50.0, dtype=torch.float64)
+    pieces = withheld(drives, Protocol(outage=OutagePlan(60.0, 60.0)), 60)
+    work = f"mbkf21_car, {len(factors_of('mbkf21_car'))} factors, {sum(b.size[0] for b in pieces)} pieces of 120 s"
+    bench.time("tuning", work, lambda: tuned(imu, pieces, name="mbkf21_car"), 1)
 
 
 def training_epoch(data: DriveDataModule, name: str, steps: int | None = None) -> None:
@@ -198,14 +174,46 @@ def training(bench: Bench, folder: str, hours: float) -> None:
     for name in LEARNED:
         work = f"{name}, {hours:g} h, batch 50, {len(data.train_pieces(1))} steps"
         bench.time("training epoch", work, lambda name=name: training_epoch(data, name), 2)
+
+
+def scaling(bench: Bench, dataset: Path, imu: ImuSpec, length_s: float) -> None:
+    """What the cost of a work grows with; all but the batch of a training with ``mbkf15`` in torch."""
+    drives = load_dataset(dataset, rate_hz=RATE_HZ, dtype=torch.float64)
+    estimator, usual = build_causal("mbkf15", imu, "the loop does not"), torch.get_num_threads()
+
+    def run(over: str, at: float, what: str, count: int, chosen: list, of: list = drives) -> None:
+        batch = make_batch(of, (chosen * count)[:count], dtype=torch.float64)
+        with torch.inference_mode():
+            bench.time(f"over {over}", f"mbkf15, {what}", lambda: integrate(batch, estimator), 3, at=at)
+
+    for count in (1, 4, 16, 64):
+        run("drives at once", count, f"{count} × {length_s:g} s", count, cut_pieces(drives, length_s))
+    for length in (length_s / 4, length_s / 2, length_s):
+        run("length (s)", length, f"8 × {length:g} s", 8, cut_pieces(drives, length))
+    for rate in (25.0, 50.0, RATE_HZ):
+        slower = load_dataset(dataset, rate_hz=rate, dtype=torch.float64)
+        run("rate (Hz)", rate, f"8 × {length_s:g} s at {rate:g} Hz", 8, cut_pieces(slower, length_s), slower)
+    usual_clock, bench.clock = bench.clock, time.perf_counter  # threads that wait use a processor too
+    for threads in sorted({1, 2, os.cpu_count() or 1}):
+        torch.set_num_threads(threads)
+        run("threads", threads, f"64 × {length_s:g} s, {threads} threads", 64, cut_pieces(drives, length_s))
+    torch.set_num_threads(usual)
+    bench.clock = usual_clock
+    for count in sorted({max(1, len(drives) * part // 4) for part in (1, 2, 4)}):
+        some = [d.name for d in drives[:count]]
+        work = f"load, check and cut, {count} drives"
+        at = sum(d.epochs * d.epoch_s for d in drives[:count]) / 3600
+        bench.time("over hours", work, lambda some=some: cut_pieces(load_dataset(dataset, drives=some), 60.0), 3, at=at)
+    data = DriveDataModule([str(dataset)], fractions=(1.0, 0.0, 0.0), batch_size=50)
+    data.setup()
     for size in (10, 25, 50, 100):
         data.batch_size, data._latest = size, (-1, -1, [])
         if len(data.train_pieces(1)[0]) == size:
-            work = f"dlkf_literal, batch {size}, pieces"
-            bench.time("over batch", work, lambda: training_epoch(data, "dlkf_literal", 1), 3, size)
+            work = f"dlkf_literal, a step of {size} pieces"
+            bench.time("over batch", work, lambda: training_epoch(data, "dlkf_literal", 1), 3, at=size)
 
 
-def mechanisation(bench: Bench, folder: str) -> float:
+def mechanisation(bench: Bench, folder: str, pypose: bool) -> float:
     """Windows against the loop over samples, forward and backward; returns how far apart they end [m]."""
     drives = load_dataset(folder, dtype=torch.float64)
     pieces = cut_pieces(drives, 60.0)[:50]
@@ -217,6 +225,8 @@ def mechanisation(bench: Bench, folder: str) -> float:
     bench.time("strapdown", f"sample loop, {what}, float64", lambda: sample_loop(batch), 1)
     bench.time("strapdown", f"windows, {what}, float64", lambda: windows(batch))
     bench.time("strapdown", f"windows, {what}, float32", lambda: windows(single))
+    if pypose:
+        bench.time("strapdown", f"PyPose, 1 s chunks, {what}, float64", lambda: pypose_chunks(batch), 3)
     return float((windows(batch) - sample_loop(batch)).norm(dim=-1).max())
 
 
@@ -227,21 +237,40 @@ def main() -> None:
     arguments.add_argument("--hours", type=float, default=8.0)
     arguments.add_argument("--length-s", type=float, default=300.0, help="of the drives that filters run over")
     arguments.add_argument("--repeats", type=int, default=9, help="at most, of every figure")
+    arguments.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    arguments.add_argument("--models", nargs="+", default=list(COMPILED))
+    arguments.add_argument("--processor", action="store_true", help="time of the processor: for a machine that is busy")
+    arguments.add_argument("--pypose", action="store_true", help="its strapdown too; pip install --no-deps pypose")
+    arguments.add_argument("--kf-gins", type=Path, help="a checkout of KF-GINS, whose engine is compiled and run too")
     arguments.add_argument("--out", type=Path, default=Path("outputs"))
     options = arguments.parse_args()
     torch.set_num_threads(options.threads)
     recipe = composed_recipe("simulated@dataset=one_imu", f"dataset.hours={options.hours}")
-    bench, described = Bench(options.repeats), machine(options.threads)
-    with tempfile.TemporaryDirectory() as folder:
-        simulate(recipe, Path(folder) / "drives")
-        apart = mechanisation(bench, f"{folder}/drives")
-        filters(bench, Path(folder) / "drives", recipe.imu, options.length_s)
-        training(bench, f"{folder}/drives", options.hours)
+    bench = Bench(options.repeats, time.process_time if options.processor else time.perf_counter)
+    described = machine(options.threads) | {"clock": "processor" if options.processor else "wall"}
     console = Console(width=140)
-    console.print(bench.table(f"{described['processor']}, {options.threads} threads, torch {torch.__version__}"))
-    console.print(f"loop and windows end {apart:.1e} m apart after 60 s: the loop is first order")
+    with tempfile.TemporaryDirectory() as folder:
+        data, other = Path(folder) / "drives", Path(folder) / "parity"
+        simulate(recipe, data)
+        if "strapdown" in options.parts:
+            apart = mechanisation(bench, str(data), options.pypose)
+            console.print(f"loop and windows end {apart:.1e} m apart after 60 s: the loop is first order")
+        works = {
+            "filters": lambda: filters(bench, data, recipe.imu, options.length_s, options.models),
+            "epochs": lambda: epochs(bench, data, recipe.imu, options.models),
+            "peers": lambda: peers(bench, other, 1.0, options.kf_gins),
+            "tuning": lambda: tuning(bench, data, recipe.imu),
+            "training": lambda: training(bench, str(data), options.hours),
+            "scaling": lambda: scaling(bench, data, recipe.imu, options.length_s),
+        }
+        for part, work in works.items():
+            if part in options.parts:
+                console.print(f"{part} …")
+                work()
+    title = f"{described['processor']}, {options.threads} threads, {described['clock']} time, torch {torch.__version__}"
+    console.print(bench.table(title))
     bench.write(options.out, described)
-    console.print(f"{options.out}/bench.json")
+    console.print(f"{options.out}/bench.json, {options.out}/bench.png")
 
 
 if __name__ == "__main__":

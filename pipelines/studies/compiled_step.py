@@ -57,7 +57,7 @@ def report(name: str, data: Path, rate_hz: float, rounds: int) -> None:
         samples = drives * many.size[1] * many.size[2]
         print(f"{name}, {rate_hz:g} Hz, {drives} drives: {samples / old:,.0f} → {samples / new:,.0f} IMU epochs/s, "
               f"{old / new:.1f} ×", flush=True)  # fmt: skip
-    for kind, x in {**latencies(compiled, drive), "C": latency_in_c(compiled, batch)}.items():
+    for kind, x in {**latencies(compiled, drive), "C": Latency.of(times_in_c(compiled, batch))}.items():
         print(f"{name}, an epoch in {kind}: p50 {x.p50:.4f} ms, p99 {x.p99:.4f} ms", flush=True)
 
 
@@ -76,8 +76,8 @@ def processor_time(estimator, batch) -> float:
     return time.process_time() - began
 
 
-def latency_in_c(compiled: CompiledFilter, batch) -> Latency:
-    """The epoch's call alone, memory and samples at hand."""
+def times_in_c(compiled: CompiledFilter, batch) -> list[float]:
+    """Seconds of the epochs' calls alone, memory and samples at hand."""
     memory, _ = compiled.begin(batch)
     numbers, seconds = memory.numbers, []
     fix = torch.zeros(1, 19, dtype=torch.float64)
@@ -86,7 +86,7 @@ def latency_in_c(compiled: CompiledFilter, batch) -> Latency:
         began = time.perf_counter()
         numbers, _ = compiled.library.turn(numbers, imu, fix)
         seconds.append(time.perf_counter() - began)
-    return Latency.of(seconds)
+    return seconds
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -85,6 +86,33 @@ def off(batch: Batch, at: np.ndarray) -> float:
     return float(np.hypot(north, east))
 
 
+def measured(
+    checkout: Path, models: Sequence[str], minutes: float, rounds: int
+) -> dict[str, tuple[list[float], int, float]]:
+    """By name: processor seconds of the rounds, samples of the drive, horizontal error [m] at its end."""
+    with tempfile.TemporaryDirectory() as folder:
+        home, gnss = Path(folder), GnssConfig(lever_arm_b=(1.0, 0.3, -1.2))
+        config = DatasetConfig("one", hours=minutes / 60, drive_minutes=minutes, gnss=gnss)
+        data = simulate_dataset(config, IMU, 0, home / "data", progress=False, workers=1)
+        batch = aligned_drives([load_dataset(data, rate_hz=RATE_HZ, dtype=torch.float64)[0]], ALIGN)
+        mbkf = resolve_model("mbkf21", IMU)
+        assert isinstance(mbkf, Mbkf)
+        numbers(batch, mbkf).tofile(home / "drive.bin")
+        engine = built(checkout, home)
+        ours: dict[str, Estimator] = {n: compiled_filter(resolve_model(n, IMU), RATE_HZ, 1.0) for n in models}
+        spent: dict[str, list[float]] = {n: [] for n in ("KF-GINS", *ours)}
+        end = np.zeros(3)
+        for _ in range(rounds):
+            said = subprocess.run([engine, home / "drive.bin"], capture_output=True, text=True, check=True).stdout
+            seconds, *end = map(float, said.splitlines()[-1].split())
+            spent["KF-GINS"].append(seconds)
+            for name, estimator in ours.items():
+                spent[name].append(processor_time(estimator, batch))
+        ends = {n: _geodetic(batch, run_filter(batch, f).posterior.p_n[:, -1])[0] for n, f in ours.items()}
+        samples = batch.size[1] * batch.size[2]
+        return {n: (s, samples, off(batch, ends.get(n, np.array(end)))) for n, s in spent.items()}
+
+
 def main() -> None:
     """Build, run in turns, print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -94,32 +122,11 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    with tempfile.TemporaryDirectory() as folder:
-        home, minutes = Path(folder), options.minutes
-        config = DatasetConfig(
-            "one", hours=minutes / 60, drive_minutes=minutes, gnss=GnssConfig(lever_arm_b=(1.0, 0.3, -1.2))
-        )
-        data = simulate_dataset(config, IMU, 0, home / "data", progress=False, workers=1)
-        batch = aligned_drives([load_dataset(data, rate_hz=RATE_HZ, dtype=torch.float64)[0]], ALIGN)
-        mbkf = resolve_model("mbkf21", IMU)
-        assert isinstance(mbkf, Mbkf)
-        numbers(batch, mbkf).tofile(home / "drive.bin")
-        engine = built(options.checkout, home)
-        ours: dict[str, Estimator] = {n: compiled_filter(resolve_model(n, IMU), RATE_HZ, 1.0) for n in options.models}
-        spent: dict[str, list[float]] = {n: [] for n in ("KF-GINS", *ours)}
-        end = np.zeros(3)
-        for _ in range(options.rounds):
-            said = subprocess.run([engine, home / "drive.bin"], capture_output=True, text=True, check=True).stdout
-            seconds, *end = map(float, said.splitlines()[-1].split())
-            spent["KF-GINS"].append(seconds)
-            for name, estimator in ours.items():
-                spent[name].append(processor_time(estimator, batch))
-        samples, least = batch.size[1] * batch.size[2], {n: min(s) for n, s in spent.items()}
-        ends = {n: _geodetic(batch, run_filter(batch, f).posterior.p_n[:, -1])[0] for n, f in ours.items()}
-        print("| | IMU epochs/s | × KF-GINS | off at the end [m] |\n|:--|--:|--:|--:|")
-        for name, s in least.items():
-            distance = off(batch, ends.get(name, np.array(end)))
-            print(f"| {name} | {samples / s:,.0f} | {least['KF-GINS'] / s:.1f} | {distance:.2f} |")
+    found = measured(options.checkout, options.models, options.minutes, options.rounds)
+    print("| | IMU epochs/s | × KF-GINS | off at the end [m] |\n|:--|--:|--:|--:|")
+    for name, (seconds, samples, distance) in found.items():
+        ratio = min(found["KF-GINS"][0]) / min(seconds)
+        print(f"| {name} | {samples / min(seconds):,.0f} | {ratio:.1f} | {distance:.2f} |")
 
 
 if __name__ == "__main__":

@@ -136,8 +136,13 @@ def difference(estimator: Estimator, library: Library, tables: DriveTables, driv
     return Difference(len(rows), largest, float(np.nan_to_num(np.stack(relative)).max()))
 
 
-def latencies(compiled: CompiledFilter, drive: Drive, most: int = 600) -> dict[str, Latency]:
-    """An epoch in Python, as torch runs it and compiled, in turns over one drive; the first few left out."""
+def latencies(compiled: CompiledFilter, drive: Drive) -> dict[str, Latency]:
+    """:func:`epoch_times` in short."""
+    return {name: Latency.of(seconds) for name, seconds in epoch_times(compiled, drive).items()}
+
+
+def epoch_times(compiled: CompiledFilter, drive: Drive, most: int = 600) -> dict[str, list[float]]:
+    """Seconds of epochs in Python, as torch runs them and compiled, in turns over one drive; the first few left out."""
     batch = aligned_drives([drive], ALIGN)
     T = min(most, batch.size[1])
     usable = batch.gnss_valid & batch.available.unsqueeze(-1)
@@ -156,7 +161,7 @@ def latencies(compiled: CompiledFilter, drive: Drive, most: int = 600) -> dict[s
                 )  # fmt: skip
                 x[2], x[3] = step.posterior, step.error
                 x[4].append(time.perf_counter() - began)
-    return {name: Latency.of(x[4][WARM:]) for name, x in running.items()}
+    return {name: x[4][WARM:] for name, x in running.items()}
 
 
 def checked(
