@@ -49,7 +49,7 @@ def test_a_log_at_rest_and_the_motion_of_cars(town, tmp_path, monkeypatch, capsy
 QUICK = {  # a study: its arguments beside the dataset, and what it says or leaves
     "auto_detection": (["{tmp}/page.md", "--simulated", "{town}"], "| simulated (lifelike) |"),
     "benchmark": (["--threads", "1", "--hours", "0.1", "--length-s", "8", "--repeats", "1",
-                   "--parts", "strapdown", "training", "scaling"], "bench.json"),
+                   "--parts", "strapdown", "scaling"], "bench.json"),
     "attitude_reference": (["{town}", "--imu", "consumer"], "yaw"),
     "drive_pictures": (["{town}", "--out", "{tmp}/pictures"], "png"),
     "fleet_realism": (["{town}", "{town}"], "|"),
