@@ -36,6 +36,7 @@ WORKS = {
     "navigate": ["-m", "dlkf.navigate", "model=mbkf15", "dataset={data}", "out={out}"],
     "parallel": ["-m", "dlkf.navigate", "model=mbkf15", "dataset={data}", "out={out}", "parallel=2"],
     "compiled": ["-m", "dlkf.navigate", "model=mbkf15", "dataset={data}", "out={out}", "compiled=true"],
+    "both": ["-m", "dlkf.navigate", "model=mbkf15", "dataset={data}", "out={out}", "compiled=true", "parallel=2"],
     "evaluate": ["-m", "dlkf.evaluate", "model=mbkf15", "dataset={data}", "out={out}", "tracking.log=false"],
 }
 

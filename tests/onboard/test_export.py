@@ -28,7 +28,7 @@ from dlkf.onboard import compiled_filter
 from dlkf.onboard.c_source import CPP, write_source
 from dlkf.onboard.check import boundary_fixes, difference, vehicle_run, write_log
 from dlkf.onboard.compiled_filter import CompiledFilter
-from dlkf.onboard.functions import ROW, Begin, Grid
+from dlkf.onboard.functions import ROW, Begin, Grid, carried_by
 from dlkf.onboard.library import LIBRARY, Library, build, compiler
 from dlkf.running.batched import run_filter
 from dlkf.running.estimate import estimates_table
@@ -221,6 +221,19 @@ def talkative_plus() -> PlusFilter:
     model = PlusFilter(PlusConfig(parts=("process", "fix", "across", "offset", "speed", "residual"))).eval()
     torch.nn.init.normal_(model.network.noise.weight, std=0.05)
     return model
+
+
+def test_many_drives_through_a_large_network_go_through_torch(drive, monkeypatch):
+    model = learned()
+    layout = carried_by(model, GRID)
+    monkeypatch.setattr(compiled_filter, "LARGE", sum(p.numel() for p in model.parameters()) - 1)
+    in_c = CompiledFilter(model, GRID, layout, None)  # would be called for fewer
+    batch = aligned_drives([drive], ALIGN)
+    with pytest.raises(AttributeError, match="run"):
+        run_filter(batch, in_c)
+    many = batch.select(torch.zeros(compiled_filter.MANY, dtype=torch.int64))
+    want, got = (run_filter(many, f) for f in (model, in_c))
+    assert torch.equal(got.posterior.p_n, want.posterior.p_n)
 
 
 def test_ten_hours_allocate_nothing(exported, tmp_path):

@@ -14,7 +14,7 @@ import shutil
 import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ from torch import Tensor, nn
 import dlkf
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
-from dlkf.filters.integration import Correction, Estimator, Fix, Solution, Step, WholeLoop
+from dlkf.filters.integration import Correction, Estimator, Fix, Solution, Step, WholeLoop, integrate
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.smoother import Filter, Smoothed
 from dlkf.navigation.calibration import ImuError
@@ -35,6 +35,9 @@ from dlkf.onboard.carried import Layout
 from dlkf.onboard.functions import Carried, Grid, carried_by, moved, packed_fix, split
 from dlkf.onboard.library import FLAGS, LIBRARY, Library, build, compiler, machine
 from dlkf.running.reanchoring import FrameChange, can_reanchor, reanchored
+
+MANY = 16  # drives from which on torch is faster than C where a network is large: measured with dlkf at 1 and 64
+LARGE = 1_000_000  # weights: more than the cache of a core holds
 
 
 class Vector(NamedTuple):
@@ -97,7 +100,12 @@ class CompiledFilter(WholeLoop):
         return memory._replace(numbers=vector), step
 
     def integrate(self, batch: Batch) -> Solution:
-        """Whole drives, as many at a time as torch has threads; in the precision of the batch."""
+        """Whole drives, as many at a time as torch has threads; in the precision of the batch.
+
+        Many drives through a large network go through torch, which reads its weights once for all of them.
+        """
+        if len(batch.imu) >= MANY and self._is_large:
+            return integrate(batch, self.estimator)
         memory, _ = self.begin(batch)
         usable = batch.gnss_valid & batch.available.unsqueeze(-1)
         value, std = (x.flatten(0, 1).double() for x in (batch.gnss, batch.gnss_std))
@@ -118,6 +126,11 @@ class CompiledFilter(WholeLoop):
             innovation=x["innovation"], used=x["used"][..., 0] > 0.5, std=x["std"] if self._has_std else None,
             gain=None, speed=None if bool(x["speed"].isnan().all()) else x["speed"], innovation_std=x["innovation_std"],
         )  # fmt: skip
+
+    @cached_property
+    def _is_large(self) -> bool:
+        network = self.estimator
+        return isinstance(network, nn.Module) and sum(p.numel() for p in network.parameters()) > LARGE
 
     @property
     def _has_std(self) -> bool:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -48,6 +50,12 @@ def small(x: Sequence | Array) -> Array:
 
 def stacked(titles: Sequence[str], columns: int = 1, height: int = 190) -> go.Figure:
     """Panels below each other with a common time axis."""
+    return deepcopy(_panels(tuple(titles), columns, height))
+
+
+@cache
+def _panels(titles: tuple[str, ...], columns: int, height: int) -> go.Figure:
+    """Empty panels; to make them takes longer than to fill them, and a page has the same for every drive."""
     rows = -(-len(titles) // columns)
     figure = make_subplots(
         rows, columns, shared_xaxes=True, subplot_titles=titles, vertical_spacing=min(0.09, 0.4 / rows)
