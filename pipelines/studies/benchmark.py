@@ -31,7 +31,7 @@ from dlkf.data.store import load_dataset
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Protocol
 from dlkf.filters.build import build_causal
-from dlkf.filters.integration import integrate
+from dlkf.filters.integration import Estimator, integrate
 from dlkf.filters.saved import learned_filter, learned_settings
 from dlkf.models import resolve_model
 from dlkf.navigation.attitude import rotation_from_vector
@@ -177,9 +177,10 @@ def training(bench: Bench, folder: str, hours: float) -> None:
 
 
 def scaling(bench: Bench, dataset: Path, imu: ImuSpec, length_s: float) -> None:
-    """What the cost of a work grows with; all but the batch of a training with ``mbkf15`` in torch."""
+    """What the cost of a work grows with; ``mbkf15`` in torch, but compiled for threads."""
     drives = load_dataset(dataset, rate_hz=RATE_HZ, dtype=torch.float64)
-    estimator, usual = build_causal("mbkf15", imu, "the loop does not"), torch.get_num_threads()
+    estimator: Estimator = build_causal("mbkf15", imu, "the loop does not")
+    usual = torch.get_num_threads()
 
     def run(over: str, at: float, what: str, count: int, chosen: list, of: list = drives) -> None:
         batch = make_batch(of, (chosen * count)[:count], dtype=torch.float64)
@@ -193,12 +194,15 @@ def scaling(bench: Bench, dataset: Path, imu: ImuSpec, length_s: float) -> None:
     for rate in (25.0, 50.0, RATE_HZ):
         slower = load_dataset(dataset, rate_hz=rate, dtype=torch.float64)
         run("rate (Hz)", rate, f"8 × {length_s:g} s at {rate:g} Hz", 8, cut_pieces(slower, length_s), slower)
-    usual_clock, bench.clock = bench.clock, time.perf_counter  # threads that wait use a processor too
-    for threads in sorted({1, 2, os.cpu_count() or 1}):
-        torch.set_num_threads(threads)
-        run("threads", threads, f"64 × {length_s:g} s, {threads} threads", 64, cut_pieces(drives, length_s))
-    torch.set_num_threads(usual)
-    bench.clock = usual_clock
+    if compiler():  # whose threads share nothing; those of torch wait for each other, for minutes on a busy machine
+        usual_clock, bench.clock = bench.clock, time.perf_counter  # two threads use two processors
+        estimator = compiled_filter(estimator, RATE_HZ, 1.0)
+        for threads in sorted({1, 2, os.cpu_count() or 1}):
+            torch.set_num_threads(threads)
+            what = f"64 × {length_s:g} s, compiled, {threads} threads"
+            run("threads", threads, what, 64, cut_pieces(drives, length_s))
+        torch.set_num_threads(usual)
+        bench.clock = usual_clock
     for count in sorted({max(1, len(drives) * part // 4) for part in (1, 2, 4)}):
         some = [d.name for d in drives[:count]]
         work = f"load, check and cut, {count} drives"
