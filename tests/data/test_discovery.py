@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -19,9 +22,10 @@ from dlkf.data.discovery.units import accel_units, nearest_unit, time_unit
 from dlkf.data.intake import ingest_drives
 from dlkf.data.plausibility import check_clocks
 from dlkf.data.readers import units
-from dlkf.data.readers.auto import AutoReader
-from dlkf.data.readers.frames import DriveFrames
+from dlkf.data.readers.auto import AutoReader, _velocities_beside, offer
+from dlkf.data.readers.frames import DriveFrames, Table
 from dlkf.data.readers.logs import LogReader
+from dlkf.data.readers.recognise import gnss_spec, imu_spec
 from dlkf.data.schema import ACCEL, GYRO, VELOCITY
 from dlkf.data.tables import read_drives, read_table
 from dlkf.diagnosis.checkup import checkup
@@ -81,7 +85,8 @@ def test_any_pose_and_unit(drive):
     assert abs(pose.lever_arm) < 0.1
 
 
-def test_clocks_that_drift_apart(drive):
+@pytest.mark.parametrize("decades_s", [0.0, -1.457507878e9])  # a counter that began today, beside GPS time
+def test_clocks_that_drift_apart(drive, decades_s):
     """1000 ppm over three minutes are 0.18 s; with perfect sensors they are seen to some ppm, and none where none are.
 
     The offset is that of the middle: 90 s of 1000 ppm. 20 ppm over 90 s are 2 ms.
@@ -90,9 +95,10 @@ def test_clocks_that_drift_apart(drive):
     fast = {"imu": imu.assign(t=imu.t * 1.001), "gnss": gnss}
     for tables, drift in ((fast, 1e-3), (drive, 0.0)):
         t, accel, gyro, moved = _arrays(tables)
-        pose = find_drifting_pose(t, accel, gyro, moved, 0.0)
-        assert pose is not None and abs(pose.drift - drift) < 2e-5
-        assert abs(pose.lag_s - drift * middle(moved)) < 2e-3
+        lag_s = drift * middle(moved) + decades_s
+        pose = find_drifting_pose(t, accel, gyro, replace(moved, t=moved.t - decades_s), decades_s)
+        assert pose is not None and abs(pose.drift - drift) < 2e-5 and pose.drift_std < 1e-4
+        assert abs(pose.lag_s - lag_s) < 2e-3
 
 
 def test_a_drift_is_found_or_refused(tmp_path, drive):
@@ -231,6 +237,48 @@ def test_logs_of_which_nothing_is_known(tmp_path, drive):
     pd.testing.assert_frame_equal(again.imu, got.imu)
     pd.testing.assert_frame_equal(again.gnss, got.gnss)
     assert read_table(tmp_path / "out", "imu", "monday") is not None
+
+
+def _table(text, name="a.csv"):
+    return Table(pd.read_csv(io.StringIO(text)), Path(name))
+
+
+def test_a_receivers_table_with_km_h_in_its_names_and_words_for_its_quality():
+    spec = gnss_spec(
+        _table("time_ns,lat,lon,alt,speed_kmh,course,fix\n" + "1751760000000000000,50,8,9,36,0,RTK float\n" * 3)
+    )
+    assert spec["velocity"] == {"columns": ["speed_kmh", "course"], "frame": "course"}
+    assert spec["quality"] == {"column": "fix", "map": {"RTK float": 5}}
+    odd = gnss_spec(_table("t,lat,lon,alt,fix\n1751760000,50,8,9,rather good\n1751760001,50,8,9,RTK\n"))
+    assert "quality" not in odd
+
+
+def test_rows_of_imu_and_fixes_in_one_table():
+    """Each kind by its own rows: their stamps, and columns that are empty for most."""
+    fast = "".join(f"{0.01 * k:.2f},0,0,-9.8,0,0,0,,,\n" for k in range(40))
+    both = _table("t,ax,ay,az,gx,gy,gz,lat,lon,alt\n" + fast + "0.20,,,,,,,50,8,90\n0.40,,,,,,,50,8,90\n")
+    assert imu_spec(both)["time"] == gnss_spec(both)["time"] == {"column": "t", "unit": "s"}
+
+
+def test_velocities_in_a_file_beside_the_fixes(tmp_path):
+    """Of the same column of time, and none but they."""
+    for name, columns, row in (
+        ("pos", "t,lat,lon,alt", "1751760000,50,8,9"),
+        ("vel", "t,speed,course", "1751760000,9,45"),
+    ):
+        (tmp_path / f"{name}.csv").write_text(f"{columns}\n" + f"{row}\n" * 3)
+    chosen = offer(tmp_path / "pos.csv")
+    found = _velocities_beside(chosen, chosen.gnss, tmp_path.iterdir())
+    assert found == {"columns": ["speed", "course"], "frame": "course", "file": "vel.csv"}
+
+
+def test_a_table_beside_the_imu_of_which_nothing_is_known_is_no_log_at_rest(tmp_path):
+    (tmp_path / "imu.csv").write_text(
+        "t,ax,ay,az,gx,gy,gz\n" + "".join(f"{k / 100},0,0,-9.8,0,0,0\n" for k in range(9))
+    )
+    (tmp_path / "ecef.csv").write_text("t,x,y,z\n" + "".join(f"{k},4e6,6e5,5e6\n" for k in range(9)))
+    with pytest.raises(InputError, match=r"no fixes found in ecef\.csv"):
+        list(AutoReader().read(tmp_path))
 
 
 def test_what_is_not_sure_is_refused(tmp_path):

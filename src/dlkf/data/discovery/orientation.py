@@ -161,7 +161,7 @@ def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float
 
 def _drift(middles: Floats, left_out: Floats, lag_s: float) -> tuple[float, float]:
     """Slope of the lag over time and its 1σ, by the jackknife's pseudo-values n θ − (n − 1) θ₋ₖ: each a block's."""
-    own = len(left_out) * lag_s - (len(left_out) - 1) * left_out
+    own = (len(left_out) - 1) * (lag_s - left_out)  # from the whole's: a lag of decades has lost its microseconds
     seen = np.isfinite(middles)
     if seen.sum() < BLOCKS // 2:
         return float("nan"), float("nan")

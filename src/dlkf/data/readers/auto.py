@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ PRESETS = {"ubx": "ubx", "nmea": "nmea", "rosbag": "rosbag", "rtklib": "rtklib",
 PRESETS |= {"inertial_explorer": "inertial_explorer", "novatel": "novatel", "navego": "navego"}
 GNSS_ONLY = ("nmea", "rtklib", "inertial_explorer")
 LARGEST_PEEK = 400  # lines
+TABLES = (".csv", ".tsv", ".txt", ".dat")
 
 
 @dataclass(frozen=True)
@@ -93,8 +94,16 @@ class AutoReader:
                 continue
             specs[kind] = _merged(getattr(chosen, kind), self.known[kind])
             told.append(f"found the {kind} in {chosen.path.name}: {chosen.told}")
+            if kind == "gnss" and (more := _velocities_beside(chosen, specs[kind], [] if only else folder.iterdir())):
+                specs[kind]["velocity"] |= more
+                told.append(f"found velocities in {more['file']}: {', '.join(more['columns'])}")
         if (specs["gnss"].get("time") or {}).get("offset_s") is None and specs["gnss"].get("file"):
             specs["gnss"]["time"]["offset_s"] = "auto"
+        if not specs["gnss"].get("file") and (foreign := _foreign(folder, offers, only)):
+            raise InputError(
+                f"{folder}: no fixes found in {foreign}; name its columns (reader=csv reader.gnss.file={foreign} …), "
+                "or take it away where this is a log at rest"
+            )
         rest = dict(self.rest)
         if not specs["gnss"].get("file"):
             rest["lever_arm_m"] = [0.0, 0.0, 0.0]
@@ -207,13 +216,39 @@ def text_options(path: Path) -> dict[str, Any]:
         return options
     body = lines[1 : min(len(lines), 50)]
     counts = {s: len(text._cells(body[-1], s)) for s in (";", "\t", ",", r"\s+")}
-    separator = next((s for s in (";", "\t") if counts[s] > 3), "," if counts[","] > 3 else r"\s+")
+    separator = next((s for s in (";", "\t") if counts[s] > 3), "," if counts[","] > 2 else r"\s+")
     options["separator"] = separator
     if separator in (";", "\t", r"\s+") and any(re.search(r"\d,\d", line) for line in body):
         options["decimal"] = ","
     first = text._cells(lines[0].lstrip("#").strip(), separator)
     options["header"] = not any(text._is_number(c, options.get("decimal", ".")) for c in first)
     return options
+
+
+def _velocities_beside(chosen: Offer, gnss: Mapping[str, Any], files: Iterable[Path]) -> dict[str, Any] | None:
+    """Velocities for fixes without any, from the first text table of the same columns of time that has them alone."""
+    if gnss.get("format") != "csv" or gnss["velocity"].get("columns"):
+        return None
+    for path in sorted(files):
+        if path == chosen.path or not path.is_file() or path.name.startswith(".") or sniffed(path) != "csv":
+            continue
+        try:
+            options = text_options(path)
+            table = formats.read("csv", path, kind="gnss", table=None, text=options, where="reader")
+        except InputError:
+            continue
+        found = recognise.velocity_spec(table) if options == gnss["text"] else None
+        if found is not None and all(gnss["time"].get(key) == value for key, value in found[0].items()):
+            return {**found[1], "file": path.name}
+    return None
+
+
+def _foreign(folder: Path, offers: list[Offer | None], only: Path | None) -> str:
+    """A text table beside the IMU's file of which nothing is known; empty where there is none."""
+    known = {found.path for found in offers if found is not None}
+    beside = [] if only is not None else sorted(folder.iterdir())
+    tables = (p for p in beside if p.is_file() and not p.name.startswith(".") and p not in known)
+    return next((p.name for p in tables if p.suffix in TABLES and sniffed(p) == "csv"), "")
 
 
 def _preset(name: str) -> dict[str, Any]:

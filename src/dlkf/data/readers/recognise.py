@@ -27,13 +27,22 @@ ONE = {
     "east": r"(gps |gnss )?v(el)?(ocity)?( ?e| east)(ast)?( mps| m s)?",
     "down": r"(gps |gnss )?v(el)?(ocity)?( ?d| down)(own)?( mps| m s)?",
     "up": r"(gps |gnss )?v(el)?(ocity)?( ?u| up)(p)?( mps| m s)?",
-    "speed": r"(gps |gnss |ground )?(speed|sog|gspeed|ground ?speed|velocity|spd)( mps| m s| knots| kn| km h)?",
+    "speed": r"(gps |gnss |ground )?(speed|sog|g ?speed|velocity|spd)( mps| m s| kn\w*| kt| km ?h| kph| mph)?",
     "course": r"(gps |gnss )?(course|cog|bearing|track|heading|direction|head ?mot|course over ground)( deg)?",
     "quality": r"(gps |gnss )?(quality|fix ?quality|gga ?quality)",
     "geoid": r"(geoid|undulation|geoid ?sep\w*|sep|geoid ?height)( m)?",
 }
+QUALITY_TEXT = r"(gps |gnss )?(quality|fix|fix ?(type|quality|status|mode)|status|mode|sol(ution)?( ?type)?)"
+QUALITY_WORDS = {
+    0: ("", "none", "no fix", "nofix", "no solution", "invalid"),
+    1: ("single", "spp", "sps", "autonomous", "standalone", "3d", "3d fix"),
+    2: ("dgps", "dgnss", "sbas", "differential"),
+    4: ("rtk", "rtk fix", "rtk fixed", "fixed", "rtk int", "int"),
+    5: ("float", "rtk float"),
+}
 TIME = (
     r"#?(t|time|time ?stamp|tow|sow|gps ?(time|sow|tow)|unix ?(time)?|utc|stamp|epoch|secs?|seconds|date ?time"
+    r"|ms|us|ns|milli(s|seconds)?|micro(s|seconds)?|nano(s|seconds)?|ticks|sample ?time"
     r"|ros ?time|itow|utc ?time|seconds ?elapsed)( s| sec| ms| us| ns| unix| utc| gps)*"
 )
 
@@ -44,7 +53,7 @@ def imu_spec(table: Table) -> Spec | None:
     names = [str(c) for c in frame.columns]
     triads = {key: _triad(names, pattern) for key, pattern in SENSOR.items()}
     if triads["accel"] and triads["gyro"]:
-        time = _time(table, slowest=0.21, fastest=2e-4)
+        time = _time(table, frame[triads["accel"] + triads["gyro"]].notna().all(axis=1), slowest=0.21, fastest=2e-4)
         if time is None:
             return None
         return {"time": time, "accel": {"columns": triads["accel"]}, "gyro": {"columns": triads["gyro"]}}
@@ -58,27 +67,41 @@ def gnss_spec(table: Table) -> Spec | None:
     found = {key: _named(names, pattern) for key, pattern in ONE.items()}
     if found["lat"] is None or found["lon"] is None:
         return _gnss_by_numbers(frame) if all(n.isdigit() for n in names) else None
-    time = _time(table, slowest=12.0, fastest=0.02)
+    time = _time(table, frame[[found["lat"], found["lon"]]].notna().all(axis=1), slowest=12.0, fastest=0.02)
     if time is None or found["height"] is None:
         return None
     position: Spec = {"columns": [found["lat"], found["lon"], found["height"]], "unit": _angle_unit(frame, found)}
     if found["geoid"] is not None:
         position["geoid"] = found["geoid"]
-    out: Spec = {"time": time, "position": position, "velocity": {"columns": None}}
-    if found["north"] and found["east"]:
-        third = found["down"] or found["up"]
-        order = [found["north"], found["east"]] if found["down"] or not third else [found["east"], found["north"]]
-        frame_of_it = "ned" if found["down"] or not third else "enu"
-        out["velocity"] = {"columns": [*order, *([third] if third else [])], "frame": frame_of_it}
-    elif found["speed"] and found["course"]:
-        out["velocity"] = {"columns": [found["speed"], found["course"]], "frame": "course"}
+    out: Spec = {"time": time, "position": position, "velocity": _velocity(found) or {"columns": None}}
     for key, stem in (("std_position", "pos"), ("std_velocity", "vel")):
         stds = [_named(names, rf"(std|sd|sigma) ?{stem} ?{axis}( m| mps)?") for axis in "ned"]
         if all(stds):
             out[key] = {"columns": stds}
     if found["quality"] is not None and _is_codes(frame[found["quality"]]):
         out["quality"] = {"column": found["quality"]}
+    elif quality := _quality_in_words(table.frame):
+        out["quality"] = quality
     return out
+
+
+def velocity_spec(table: Table) -> tuple[Spec, Spec] | None:
+    """Time and velocities of a table that has these and no positions; None if it does not."""
+    names = [str(c) for c in _numeric(table.frame).columns]
+    velocity = _velocity({key: _named(names, pattern) for key, pattern in ONE.items()})
+    every = pd.Series(True, table.frame.index)
+    time = None if velocity is None else _time(table, every, slowest=12.0, fastest=0.02)
+    return None if velocity is None or time is None else (time, velocity)
+
+
+def _velocity(found: dict[str, str | None]) -> Spec | None:
+    north, east, third = found["north"], found["east"], found["down"] or found["up"]
+    if north and east:
+        if third is None or found["down"]:
+            return {"columns": [north, east, *([third] if third else [])], "frame": "ned"}
+        return {"columns": [east, north, third], "frame": "enu"}
+    both = [found["speed"], found["course"]]
+    return {"columns": both, "frame": "course"} if all(both) else None
 
 
 def _words(name: str) -> str:
@@ -106,19 +129,21 @@ def _numeric(frame: pd.DataFrame) -> pd.DataFrame:
     keep = {}
     for name in frame.columns:
         values = frame[name]
+        filled = values.notna()
         if not pd.api.types.is_numeric_dtype(values):
+            filled &= values.astype(str).str.strip() != ""
             values = pd.to_numeric(values, errors="coerce")
-        if values.notna().mean() > 0.5:
+        if values.notna().sum() > 0.5 * filled.sum():  # of what stands there: rows of another kind leave it empty
             keep[name] = values
     return pd.DataFrame(keep)
 
 
-def _time(table: Table, slowest: float, fastest: float) -> Spec | None:
-    frame = table.frame
+def _time(table: Table, rows: pd.Series, slowest: float, fastest: float) -> Spec | None:
+    frame = table.frame[rows]
     names = [str(c) for c in frame.columns]
     column = _named(names, TIME)
     week = _named(names, r"(gps )?(week|wn|week ?(number|no))")
-    if column is None:
+    if column is None or frame.empty:
         return None
     values = frame[column]
     if not pd.api.types.is_numeric_dtype(values):
@@ -165,6 +190,16 @@ def _moves_like_radians(frame: pd.DataFrame, found: dict[str, str | None]) -> bo
 def _is_codes(values: pd.Series) -> bool:
     known = values.dropna()
     return bool((known == known.round()).all() and known.between(0, 9).all())
+
+
+def _quality_in_words(frame: pd.DataFrame) -> Spec | None:
+    """GGA codes of the words of a column; None where there is none, one of them is not known, or they are numbers."""
+    column = _named([str(c) for c in frame.columns], QUALITY_TEXT)
+    if column is None:
+        return None
+    words = [str(word) for word in frame[column].dropna().unique()]
+    codes = {w: code for w in words for code, known in QUALITY_WORDS.items() if _words(w) in known}
+    return {"column": column, "map": codes} if len(codes) == len(words) and any(_words(w) for w in words) else None
 
 
 def _imu_by_numbers(frame: pd.DataFrame) -> Spec | None:
