@@ -58,7 +58,7 @@ def own_logs(desk: Path) -> Path:
 
 
 def test_your_own_drives(own_logs: Path, run: Run) -> None:
-    ours = [words for words in shell(README, "Your own drives") if "data/consumer" not in " ".join(words)]
+    ours = [words for words in shell(README, "Your own drives") if "data/town" in " ".join(words)]
     assert [words[2] for words in ours] == ["dlkf.ingest", "dlkf.navigate", "dlkf.evaluate"]
     for words in ours:
         run(words)

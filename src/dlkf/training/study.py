@@ -28,6 +28,7 @@ from dlkf.filters.build import refuse_smoothed
 from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import load_filter
 from dlkf.filters.shipped import shipped_folder, trained_filter
+from dlkf.provenance import provenance
 from dlkf.report.evaluation import write_report
 from dlkf.training.fit import fit
 from dlkf.training.settings import FitSettings, ScoringSettings, StudySettings
@@ -95,7 +96,13 @@ def run_study(
         title,
         scores,
         made,
-        protocol={**baselines.described(), **scenes.described(), "trained on": card, "gnss_noise": noise},
+        protocol={
+            **provenance(),
+            **baselines.described(),
+            **scenes.described(),
+            "trained on": card,
+            "gnss_noise": noise,
+        },
         by_time=True,
         baseline=baseline,
         more=tables,

@@ -153,7 +153,10 @@ def _file(folder: Path, spec: Spec, kind: str, where: str, only: Path | None) ->
     if len(found) != 1:
         have = ", ".join(sorted(p.name for p in folder.iterdir())[:8]) or "nothing"
         what = "no" if not found else f"{len(found)} files match, one must be"
-        raise InputError(f"{folder}: {what} {kind} file {_said(spec.get('file'))}; has {have}; set {where}.file")
+        without = ", or reader.reference=null" if kind == "reference" else ""
+        raise InputError(
+            f"{folder}: {what} {kind} file {_said(spec.get('file'))}; has {have}; set {where}.file{without}"
+        )
     return found[0]
 
 
