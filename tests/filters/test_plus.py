@@ -51,6 +51,17 @@ def test_with_weights_of_zero_it_is_the_classical_filter_to_the_bit(base, parts)
         assert torch.equal(one, other)
 
 
+def test_before_the_first_fix_it_is_the_classical_filter_to_the_bit():
+    batch, model = car(3, 16), plus(PARTS, weights=0.5)
+    available = torch.ones_like(batch.available)
+    available[:, :9] = False
+    batch = replace(batch, available=available)
+    with torch.no_grad():
+        a, b = integrate(batch, model), integrate(batch, build_filter("mbkf21_car", model.imu, tuning=model.tuning))
+    assert torch.equal(a.posterior.p_n[:, :9], b.posterior.p_n[:, :9]) and torch.equal(a.std[:, :9], b.std[:, :9])
+    assert not torch.equal(a.posterior.p_n[:, 12], b.posterior.p_n[:, 12])
+
+
 def test_it_does_not_know_where_north_is():
     """The same drive in a turned frame: the same solution, turned. 1e-6 of kilometres and radians is rounding."""
     batch, model = car(4, 24, seed=2), plus(weights=0.3).double()

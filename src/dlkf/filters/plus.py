@@ -4,7 +4,7 @@ States, strapdown and Riccati recursion are those of a classical filter (``base`
 what goes into them, in outages too: factors on the process noise of each axis, on GNSS standard deviations, on the
 constraints' standard deviations, velocities across the car beside those of its model, and a forward speed that each
 drive calibrates while GNSS is there (:mod:`dlkf.filters.car_speed`). It sees the samples, what the filter believes and
-how its innovations and that speed fit. With weights of zero it is ``base`` to the bit.
+how its innovations and that speed fit. With weights of zero, and before the first fix, it is ``base`` to the bit.
 """
 
 from __future__ import annotations
@@ -170,9 +170,10 @@ class PlusFilter(nn.Module):
             features, now = self._features(memory, epoch, normalised, forward, heard, foretold)
             axes = torch.cat((loudness(heard).unflatten(-1, (2, 3)).mT, memory.matching.by_axis()), -1)
         heads, hidden = self.network(features.to(dtype), now.to(dtype), axes.to(dtype), memory.hidden)
-        heads = Heads(*(x.to(epoch.z.dtype) for x in heads))
+        seen = memory.since_fix < memory.elapsed  # before the first fix there is nothing to adapt to
+        heads = Heads(*(x.to(epoch.z.dtype) for x in heads)).where(seen)
         speed = torch.stack((foretold.speed, foretold.std), -1).to(epoch.z.dtype)
-        advice = self._advice(heads, speed, memory.silent)
+        advice = self._advice(heads, speed, memory.silent | ~seen)
         kalman, correction = self.kalman.step(memory.kalman, epoch._replace(advice=advice))
         if "speed" in self.parts:
             correction = correction._replace(speed=speed)

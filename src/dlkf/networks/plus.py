@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from dlkf.errors import InputError
@@ -55,6 +55,12 @@ class Heads(NamedTuple):
     offset: Tensor  # (B, 2) m/s
     residual: Tensor  # (B, 6) m/s², rad/s
     doubt: Tensor  # (B,) factor on the 1σ of the forward speed
+
+    def where(self, told: Bool[Tensor, " B"]) -> Heads:
+        """Where ``told`` is false factors of 1 and offsets of 0 instead; the doubt stays."""
+        neutral = (1.0, 1.0, 1.0, 0.0, 0.0)
+        of = ((told[(..., *(None,) * (x.ndim - 1))], x, y) for x, y in zip(self[:5], neutral, strict=True))
+        return Heads(*(torch.where(*x) for x in of), self.doubt)
 
 
 class PlusNetwork(nn.Module):
