@@ -99,7 +99,7 @@ def test_ecef(tmp_path, tables):
     drive = read(
         tmp_path,
         tables,
-        gnss__position={"columns": ["x", "y", "z"], "frame": "ecef"},
+        gnss__position={"columns": ["x", "y", "z"], "frame": "ecef", "unit": "deg"},  # as csv.yaml leaves it
         gnss__velocity={"columns": ["vx", "vy", "vz"], "frame": "ecef"},
         gnss__std_position={"columns": ["s", "s", "s"], "frame": "ecef"},
         gnss__std_velocity=None,

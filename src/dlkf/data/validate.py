@@ -116,7 +116,10 @@ def _check_time(t: np.ndarray, where: str) -> None:
     if len(back):
         k = int(back[0])
         if t[k + 1] == t[k]:
-            raise InputError(f"{where}: row {k + 1}: t = {t[k]:.6f} stands twice; remove duplicate samples")
+            raise InputError(
+                f"{where}: row {k + 1}: t = {t[k]:.6f} stands twice; remove duplicate samples (of an IMU with a coarse "
+                "clock: reader.imu.time.respace=true)"
+            )
         raise InputError(
             f"{where}: row {k + 1}: t goes back from {t[k]:.6f} to {t[k + 1]:.6f}; sort the rows, or split the drive"
         )

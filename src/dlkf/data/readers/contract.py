@@ -82,7 +82,8 @@ def positions(mapped: Mapped) -> dict[str, np.ndarray]:
     if zero not in ("fix", "none"):
         raise InputError(f"{where}.zero={zero}: must be fix, or none where 0°/0° means no position")
     if frame == "ecef":
-        xyz = mapped.vector("position", (3,), nan=True) * mapped.scale("position", units.LENGTH)
+        metre = 1.0 if spec.get("unit") == "deg" else mapped.scale("position", units.LENGTH)  # csv's preset: no length
+        xyz = mapped.vector("position", (3,), nan=True) * metre
         lost = ~np.isfinite(xyz).all(-1) | (np.linalg.norm(xyz, axis=-1) < 1e6)
         with np.errstate(invalid="ignore"):
             lat, lon, height = pymap3d.ecef2geodetic(*np.where(lost[:, None], np.nan, xyz).T)
