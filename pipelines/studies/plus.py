@@ -95,7 +95,7 @@ def opponents(train: Sequence[str], out: Path) -> dict[str, Estimator]:
             else:
                 factors, _ = tuned(spec, pieces, name=name, start=Tuning(), objective="log", rounds=2)
             known[name] = asdict(factors)
-            error = outage_error(build_filter(filter_of(name), spec, tuning=factors), pieces)
+            error = outage_error(build_causal(filter_of(name), spec, "tuning does not", tuning=factors), pieces)
             print(f"{name}: {error:.2f} m geometric mean on {pieces[0].size[0]} training pieces", flush=True)
             file.write_text(yaml.safe_dump(known))
     return {

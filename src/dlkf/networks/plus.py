@@ -60,7 +60,7 @@ class Heads(NamedTuple):
         """Where ``told`` is false factors of 1 and offsets of 0 instead; the doubt stays."""
         neutral = (1.0, 1.0, 1.0, 0.0, 0.0)
         of = ((told[(..., *(None,) * (x.ndim - 1))], x, y) for x, y in zip(self[:5], neutral, strict=True))
-        return Heads(*(torch.where(*x) for x in of), self.doubt)
+        return Heads._make((*(torch.where(*x) for x in of), self.doubt))
 
 
 class PlusNetwork(nn.Module):

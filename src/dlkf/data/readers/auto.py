@@ -243,7 +243,7 @@ def _velocities_beside(chosen: Offer, gnss: Mapping[str, Any], files: Iterable[P
     return None
 
 
-def _foreign(folder: Path, offers: list[Offer | None], only: Path | None) -> str:
+def _foreign(folder: Path, offers: Iterable[Offer | None], only: Path | None) -> str:
     """A text table beside the IMU's file of which nothing is known; empty where there is none."""
     known = {found.path for found in offers if found is not None}
     beside = [] if only is not None else sorted(folder.iterdir())
