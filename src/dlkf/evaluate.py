@@ -12,6 +12,7 @@ from dlkf.command.scored import EvaluateSettings
 from dlkf.console import keep_said, talking
 from dlkf.data.kinds import drive_imus, drive_kinds
 from dlkf.data.store import dataset_digest, drive_rows
+from dlkf.evaluation.outages import check_outages
 from dlkf.evaluation.shares import Work, evaluate_shares
 from dlkf.evaluation.study import results_of
 from dlkf.evaluation.summary import answer, metrics_of
@@ -62,7 +63,11 @@ def main(told: EvaluateSettings) -> None:
         console.print(f"left out: {reason}", style="yellow")
     if done.truth:
         console.print(f"No truth: errors are against the {done.truth['reference']}.", style="bold")
+    if told.mode == "auto" and done.mode == "drives":
+        said = f"no piece of {told.length_s:g} s with a known attitude: whole drives, from their own alignment"
+        console.print(said, style="yellow")
     scores = done.run.scores
+    check_outages(protocol.outage, scores.outage)
     made = results_of(done.run, baseline=told.baseline, settle_s=told.settle_s, seed=told.seed)
     decided = {"models": told.model, "dataset": told.dataset, "imu": spec.name, "tuning": asdict(told.tuning)}
     decided["imu values"] = {"accel": asdict(spec.accel), "gyro": asdict(spec.gyro)}
@@ -72,8 +77,6 @@ def main(told: EvaluateSettings) -> None:
     tables, title = all_tables(name, made), f"{' '.join(models)} on {name}"
     for table in tables:
         console.print(as_rich(table))
-    if done.rules["outage"] and not scores.outage.any():
-        console.print("no outage fits into the valid truth of these drives; see outage.*", style="yellow")
     for result in made:
         console.print(f"\n[bold]{answer(result)}[/bold]", highlight=False)
     keep_said(console, told.out)

@@ -335,6 +335,12 @@ OF_ALL_COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "an outage of a word": ("evaluate", (*SCORED, "outage.first_s=soon"), "outage.first_s is 'soon'"),
     "a folder as store": ("evaluate", (*SCORED, "tracking.uri=runs"), "is a plain folder"),
     "a piece longer than the drives": ("evaluate", (*SCORED, "mode=pieces", "length_s=1e4"), "no piece of 10000 s"),
+    "an outage longer than a piece": ("evaluate", (*SCORED, "length_s=30"), "after 40 s but pieces are 30 s"),
+    "an outage after the end": (
+        "evaluate",
+        (*SCORED, "mode=drives", "outage.first_s=900", "outage.duration_s=20"),
+        "no outage fits into these drives: outage.first_s=900",
+    ),
     "a drive that is not there": ("evaluate", (*SCORED, "drives=nobody"), "no drive nobody"),
     "an export that nobody knows": ("navigate", (*SOLVED, "export=[kml,shp]"), "export=shp: unknown format"),
     "a clock that nobody knows": ("navigate", (*SOLVED, "export_clock=tai"), "export_clock=tai is none of auto"),

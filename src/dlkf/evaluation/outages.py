@@ -93,6 +93,15 @@ def scorable(batch: Batch, outage: Tensor) -> Tensor:
     return outage & (faulty.gather(1, window) == 0)
 
 
+def check_outages(plan: OutagePlan | None, withheld: Tensor) -> None:
+    """Raises InputError where a plan was given and nothing was ``withheld``: no outage could be scored."""
+    if plan is not None and not withheld.any():
+        raise InputError(
+            f"no outage fits into these drives: outage.first_s={plan.first_s} and outage.duration_s={plan.duration_s} "
+            "want a fix at its start and valid truth throughout; give smaller ones, or outage=null"
+        )
+
+
 def _bounds(name: str, value: float | Sequence[float]) -> tuple[float, float]:
     values = [value] if isinstance(value, (int, float)) else list(value)
     if len(values) not in (1, 2) or not np.isfinite(values).all() or min(values) < 0 or values[0] > values[-1]:
