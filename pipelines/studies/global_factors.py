@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 
 import torch
-from pipelines.studies.descent import FACTORS, descended
 from pipelines.studies.plus import end_of, load, outages
 
 from dlkf.filters.build import build_causal, build_filter
@@ -22,6 +21,7 @@ from dlkf.filters.model_based import Mbkf
 from dlkf.filters.plus import ANY_MEMS
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import imu_spec
+from dlkf.tuning.descent import FACTORS, descended
 from dlkf.tuning.search import outage_error, tuned
 
 NAME, OUTAGE_S = "mbkf33_car", 60.0
@@ -40,7 +40,7 @@ def main() -> None:
     kalman = build_filter(NAME, spec, tuning=Tuning())
     assert isinstance(kalman, Mbkf)
     search, _ = tuned(spec, [batch], name=NAME, start=Tuning(), objective="log", rounds=2)
-    gradient = descended(kalman, batch, end_of(OUTAGE_S, batch), args.steps)
+    gradient = descended(kalman, batch, end_of(OUTAGE_S, batch), steps=args.steps)
     found = {"start": Tuning(), "search": search, "gradient": gradient}
     tests = {folder: outages(load([folder]), OUTAGE_S) for folder in args.test}
     print(f"| factors | {' | '.join(FACTORS)} | training [m] |{''.join(f' {t} [m] |' for t in tests)}")

@@ -6,7 +6,7 @@
 Pieces of 60 s with GNSS, an outage, and 5 s after it, from the truth plus an error of 0.1 m, 0.1 m/s, 1° and 2° (1σ);
 simulated and semi-real pieces end to end, real ones every 10 s. Nobody is told the IMU: the classical filters start
 from an automotive MEMS and have factors tuned by the geometric mean on pieces of the training drives, which are kept
-in <out>/factors.yaml; one of them a second time, by gradient instead of search (:mod:`pipelines.studies.descent`).
+in <out>/factors.yaml; one of them a second time, by gradient instead of search (:mod:`dlkf.tuning.descent`).
 Beside them stands ``mbkf33_car`` that is told the preset of the drive's IMU, where it has one, and has its tuned
 factors but those of the IMU: no rival, but what such knowledge is worth. Prints, and writes into <out>, Markdown tables
 of the horizontal error at the end of the outages: all filters, then trainings from other seeds (``--model`` takes
@@ -25,7 +25,6 @@ import numpy as np
 import pandas as pd
 import torch
 import yaml
-from pipelines.studies.descent import descended
 
 from dlkf.config import config_dir
 from dlkf.data.drive import Batch
@@ -43,6 +42,7 @@ from dlkf.filters.shipped import trained_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.running.batched import run_filter
+from dlkf.tuning.descent import descended
 from dlkf.tuning.search import outage_error, tuned
 
 BY_GRADIENT = "mbkf33_car, by gradient"

@@ -2,13 +2,13 @@
 
 import pytest
 import torch
-from pipelines.studies.descent import FACTORS, Advised, descended
 
 from dlkf.data.masks import withhold
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.tuning import Tuning
+from dlkf.tuning.descent import FACTORS, Advised, descended
 from dlkf.tuning.search import outage_error
 from tests.filters.scene import IMU, scene
 

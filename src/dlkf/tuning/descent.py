@@ -6,6 +6,7 @@ The same gradient trains ``plus``; here every factor is one number for all epoch
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -52,8 +53,14 @@ class Advised(nn.Module):
         return replace(start, **{k: v * getattr(start, k) for k, v in values.items()})
 
 
-def descended(kalman: Mbkf, batch: Batch, end: int, steps: int = 60, rate: float = 0.15) -> Tuning:
-    """Factors with the least geometric mean of the horizontal error at epoch ``end``, on the way down (Adam)."""
+def descended(
+    kalman: Mbkf, batch: Batch, end: int, *, steps: int = 60, rate: float = 0.15,
+    progress: Callable[[int, float], None] | None = None,
+) -> Tuning:  # fmt: skip
+    """Factors with the least geometric mean of the horizontal error at epoch ``end``, on the way down (Adam).
+
+    ``progress`` is told every step and its error [m].
+    """
     filter = Advised(kalman)
     optimizer = torch.optim.Adam(filter.parameters(), lr=rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, rate / 20)
@@ -65,8 +72,8 @@ def descended(kalman: Mbkf, batch: Batch, end: int, steps: int = 60, rate: float
         value = float(loss.detach())
         if value < best:
             best, found = value, filter.tuning()
-        if step % 10 == 0:
-            print(f"step {step}: {math.exp(value):.3f} m", flush=True)
+        if progress is not None:
+            progress(step, math.exp(value))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
