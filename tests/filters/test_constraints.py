@@ -29,7 +29,8 @@ def epoch_of(batch, state: NavState, error: ImuError) -> Epoch:
     window = strapdown(state, corrected, batch.dt, batch.frame)._replace(end=state)
     none = torch.zeros(len(raw), 6, dtype=D)
     fix = Fix(none, none + 1, none > 0, None)
-    return Epoch(raw, corrected, error, state, window, state, corrected[:, -5:, 3:].mean(1), none, fix, None,
+    rate = corrected[:, -5:, 3:].mean(1)
+    return Epoch(raw, corrected, error, state, window, state, rate, rate, none, fix, None,
                  batch.dt, batch.frame)  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from dlkf.filters.build import MODEL_BASED, build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.model_based import Ins, Mbkf, kalman_update
 from dlkf.filters.tuning import Prior
+from dlkf.navigation.error_model import antenna
 from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import strapdown
 
@@ -135,6 +136,21 @@ def test_late_fix_is_compared_at_its_own_time():
     shifted = replace(shifted, gnss=torch.stack(rows, 1))
     solution = integrate(shifted, Mbkf(IMU))
     assert (solution.posterior.p_n - batch.truth.p_n).abs().max() < 5e-3  # linear between samples
+
+
+def test_the_antenna_of_a_late_fix_swings_with_the_rate_of_its_own_time():
+    """4 m of arm and a turn that changes by 0.1 rad/s²: the rate of 0.6 s later is 0.2 m/s off in velocity."""
+    batch = scene(8, 30, seed=7, noise=False, bias=torch.zeros(8, 6, dtype=torch.float64), lever_arm=(4.0, 0.5, -1.5))
+    late = replace(batch, gnss_lag=torch.full_like(batch.gnss_lag, 0.6))
+    rows, state, first = [], batch.start, 50 - 30 - 5
+    for t in range(batch.size[1]):
+        window = strapdown(state, batch.imu[:, t], batch.dt, batch.frame)
+        then = NavState(window.p_n[:, 19], window.v_n[:, 19], window.C_nb[:, 19])
+        rate = batch.imu[:, t, first : first + 5, 3:].mean(1)
+        rows.append(antenna(then, rate, batch.lever_arm_b, batch.frame))
+        state = window.end
+    late = replace(late, gnss=torch.stack(rows, 1))
+    assert integrate(late, Mbkf(IMU)).innovation.abs().max() < 1e-4  # what an orthonormal C loses by interpolation
 
 
 def test_prior_mean_starts_the_bias():

@@ -22,7 +22,7 @@ from dlkf.navigation.error_model import antenna
 from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import Window, strapdown
 
-RATE_AVERAGE_S = 0.1  # the lever arm's swing uses the mean rate over this last part of the window
+RATE_AVERAGE_S = 0.1  # the lever arm's swing uses the mean rate over so long before the fix
 
 
 class Fix(NamedTuple):
@@ -43,7 +43,8 @@ class Epoch(NamedTuple):
     start: NavState  # at the window's start, after the last correction
     window: Window
     at_fix: NavState  # the window's end, or where a late fix was taken
-    rate_b: Tensor  # (B, 3) corrected angular rate there
+    rate_b: Tensor  # (B, 3) corrected angular rate at the window's end
+    rate_at_fix_b: Tensor  # (B, 3) and where a late fix was taken
     z: Tensor  # (B, 6) GNSS − prediction, zero where not used
     fix: Fix
     lever_arm_b: Tensor | None  # (B, 3); None: the antenna is at the IMU
@@ -165,13 +166,23 @@ def advance(
     tail = max(1, min(imu.shape[1], round(RATE_AVERAGE_S / dt)))
     at_fix = prior if fix.lag is None else window.before(fix.lag, dt)
     rate_b = corrected[:, -tail:, 3:].sum(1) / tail
-    predicted = antenna(at_fix, rate_b, lever_arm_b, frame)
+    rate_at_fix_b = rate_b if fix.lag is None else _rate_before(corrected[..., 3:], fix.lag / dt, tail)
+    predicted = antenna(at_fix, rate_at_fix_b, lever_arm_b, frame)
     z = (fix.value - predicted) * fix.used
-    epoch = Epoch(imu, corrected, error, state, window, at_fix, rate_b, z, fix, lever_arm_b, dt, frame)
+    epoch = Epoch(imu, corrected, error, state, window, at_fix, rate_b, rate_at_fix_b, z, fix, lever_arm_b, dt, frame)
     memory, answer = estimator.step(memory, epoch)
     after = ImuError.of(answer.imu_error)
     complete = after.bias if after.matrix is None else after.at(corrected.mean(1))
     return memory, Step(prior, prior.corrected(answer.dx), after, z, complete, answer)
+
+
+def _rate_before(rates: Tensor, late: Tensor, count: int) -> Tensor:
+    """Mean of the ``count`` samples (B, M, 3) that end nearest to ``late`` (B,) samples before the window's end."""
+    M = rates.shape[1]
+    end = M - late.round().clamp(0, M - count).unsqueeze(-1)
+    sample = torch.arange(M, dtype=late.dtype, device=late.device)
+    counts = ((sample < end) & (sample >= end - count)).to(rates.dtype)
+    return torch.bmm(counts.unsqueeze(1), rates).squeeze(1) / count
 
 
 def integrate(batch: Batch, estimator: Estimator, *, keep_covariances: bool = False) -> Solution:

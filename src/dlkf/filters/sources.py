@@ -120,7 +120,7 @@ class GnssFix:
         return FixRows(rows, fix.R, offered, verdict.opened(P), verdict.used), memory._replace(gate=gate)
 
     def _matrix(self, epoch: Epoch) -> Float[Tensor, "B 6 n"]:
-        H = measurement_matrix(epoch.at_fix, epoch.rate_b, epoch.lever_arm_b, epoch.frame, self.states)
+        H = measurement_matrix(epoch.at_fix, epoch.rate_at_fix_b, epoch.lever_arm_b, epoch.frame, self.states)
         if epoch.fix.lag is not None:  # δp at the fix = δp at the window's end − lag · δv
             H = H.clone()
             H[:, 0, 3] = H[:, 1, 4] = H[:, 2, 5] = -epoch.fix.lag
