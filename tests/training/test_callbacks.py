@@ -1,6 +1,7 @@
 """Training strategy without a Trainer: curriculum, weights, decimation, outages, guard; all resume from state."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -54,6 +55,21 @@ def test_weights_ignore_a_diverged_epoch():
     weights = AdaptiveLossWeights()
     before = weights.update({"position": 4.0, "velocity": 2.0, "attitude": 1.0})
     assert weights.update({"position": math.inf, "velocity": math.nan, "attitude": math.inf}) == before
+
+
+def test_a_loss_of_one_s_own_may_leave_terms_out():
+    weights = AdaptiveLossWeights()
+    for value in (8.0, 4.0):
+        weights.on_train_epoch_end(SimpleNamespace(callback_metrics={"train/position_loss": torch.tensor(value)}), None)
+    assert weights.weights() == {"position": 1.0, "velocity": 1.0, "attitude": 1.0}
+
+
+@pytest.mark.parametrize("epoch_s", [0.5, 0.2])
+def test_decimation_counts_seconds_where_epochs_are_shorter(epoch_s):
+    batch = scene(1, 40)
+    batch = replace(batch, dt=epoch_s / batch.size[2])
+    at = GnssDecimation((2, 2)).transform(batch, 0, generator()).available[0].nonzero().flatten() + 1
+    assert (at * epoch_s).tolist() == pytest.approx([2.0 * (k + 1) for k in range(len(at))])
 
 
 def test_decimation_keeps_every_nth_fix_per_piece():

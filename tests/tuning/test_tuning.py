@@ -18,7 +18,7 @@ from dlkf.filters.tuning import Tuning
 from dlkf.onboard.library import compiler
 from dlkf.tuning.baselines import tuned_baselines
 from dlkf.tuning.search import FACTORS, factors_of, mean_imu_error, outage_error, tuned
-from dlkf.tuning.study import check
+from dlkf.tuning.study import check, sides
 from tests.cars import IMU
 
 
@@ -129,3 +129,9 @@ def test_the_command_writes_factors_that_evaluate_takes(uri, call, town):
     assert done.code == 0, done.err
     done = call("tune", "model=mbkf15", f"dataset={town}", "out=none", *size[:1], "outage.first_s=45", *size[2:])
     assert done.code == 2 and not Path("none").exists(), done.err
+
+
+def test_a_split_that_cuts_drives_is_refused():
+    """Pieces of one drive on both sides: what is tuned on would be tested on."""
+    with pytest.raises(InputError, match="split=group"):
+        sides([], "random", (0.7, 0.15, 0.15), 0, 60.0)

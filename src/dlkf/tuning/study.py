@@ -68,7 +68,12 @@ def check(model: str, objective: str) -> None:
 def sides(
     drives: Sequence[Drive], split: Split, fractions: Sequence[float], seed: int, length_s: float
 ) -> dict[str, list[Drive]]:
-    """Training and test drives, whole recordings on one side; split as in :mod:`dlkf.data.splits`."""
+    """Training and test drives, whole recordings on one side; split as in :mod:`dlkf.data.splits`.
+
+    Raises InputError for a split that cuts drives: the test would be of the drives that were tuned on.
+    """
+    if split == "random":
+        raise InputError("split=random puts parts of a drive on both sides; tune wants split=group, or groups by name")
     stack = DriveStack(drives)
     labels = split_rows(stack, split, fractions, seed, length_s)
     out = {}

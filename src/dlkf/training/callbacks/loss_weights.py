@@ -70,9 +70,9 @@ class AdaptiveLossWeights(Callback):
         module.log_dict({f"train/{k}_weight": v for k, v in module.loss_weights.items()})
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        """Take in this epoch's losses."""
-        seen = trainer.callback_metrics
-        self.update({t: float(seen[f"train/{t}_loss"]) for t in TERMS})
+        """Take in this epoch's losses; a loss of one's own may leave some out."""
+        seen = {t: trainer.callback_metrics.get(f"train/{t}_loss") for t in TERMS}
+        self.update({t: float(value) for t, value in seen.items() if value is not None})
 
     def state_dict(self) -> dict:
         """Moving averages, and those of the pilot."""

@@ -36,8 +36,8 @@ class GnssDecimation(BatchCallback):
             return batch
         B, T, _ = batch.size
         interval = torch.randint(self.every_s[0], self.every_s[1] + 1, (B, 1), generator=generator)
-        step = (torch.arange(1, T + 1) * batch.epoch_s).round().long()
-        return withhold(batch, step % interval != 0)
+        spacing = (interval / batch.epoch_s).round().long().clamp_min(1)  # epochs
+        return withhold(batch, torch.arange(1, T + 1) % spacing != 0)
 
     def state_dict(self) -> dict:
         """Settings, so that a checkpoint tells what it was trained with."""
