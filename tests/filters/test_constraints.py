@@ -10,6 +10,7 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import Epoch, Fix, integrate
 from dlkf.filters.model_based import Mbkf
+from dlkf.filters.sources import Believed
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.calibration import ImuError
@@ -114,8 +115,8 @@ def test_a_moving_car_is_not_taken_for_a_standing_one():
     P = torch.eye(15, dtype=D).expand(20, 15, 15) * 0.01
     rules = CarConstraints(Tuning(), ErrorStates())
     epoch = epoch_of(quiet, NavState(*(x[:, 30] for x in batch.truth)), ImuError(torch.zeros(20, 6, dtype=D)))
-    resting, _ = rules._at_rest(epoch, rules.begin(quiet), P)
-    assert not resting.any()
+    measured, _ = rules.rows(epoch, rules.begin(quiet), Believed(P))
+    assert not measured.used[:, 2:].any()
 
 
 def slipping(batch: int, epochs: int, structure: tuple[float, float, float, float], stop: float | None = None):

@@ -6,13 +6,12 @@ Non-holonomic constraint (NHC; Dissanayake et al. 2001). The velocity of the IMU
 
 with ψ, θ the direction in which the car moves seen from the IMU's axes (mounting), a how far ahead of the rear axle
 the IMU sits, and k the sideslip per lateral acceleration and speed (single-track model). Plain, all four are zero;
-with structure they are further states of the filter. A standstill, found from the IMU's samples alone, says v = 0
+with structure they are further states of the filter. A standstill (:mod:`dlkf.filters.standstill`) says v = 0
 (zero-velocity update) and ω_b = Earth rate (zero-angular-rate update).
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,24 +22,22 @@ from torch import Tensor
 from dlkf.data.drive import Batch
 from dlkf.filters.integration import Epoch
 from dlkf.filters.sources import Believed, Measurement
+from dlkf.filters.standstill import Liveliness, at_rest
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import skew
 from dlkf.navigation.state import ATTITUDE, GYRO, VELOCITY, ErrorStates
 
 STRUCTURE_STD = (0.05, 0.05, 1.5, 0.01)  # rad, rad, m, s²/m: what is known of a car before it moves
 STRUCTURE_WALK_STD = (2e-5, 2e-5, 1e-4, 1e-6)  # per √s
-QUIET_FACTOR = 2.5  # a standstill is at most so much livelier than the quietest second of standing so far
-SURE_SPEED = 0.3  # m/s: below, 1σ included, the filter is sure to stand
-PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 2.0  # m/s, 1σ: a standstill must not contradict the filter
 SLOWEST = 0.5  # m/s: below, course and yaw rate say nothing of the car's structure
 
 
 class CarMemory(NamedTuple):
     """What the constraints carry from epoch to epoch."""
 
-    quietest: Tensor  # (B, 2) spread of the quietest second of standing so far
     std: Tensor  # (1, 8) of the rows, the same for all drives
-    limits: Tensor  # (1, 2) likewise: highest spread of a standstill
+    liveliness: Liveliness  # of this car
+    prior: Tensor  # (1,) of the quietest second of motion, the same for all drives
 
 
 @dataclass(frozen=True)
@@ -59,14 +56,14 @@ class CarConstraints:
         """No standing so far, and how sure the rows are."""
         t, new = self.tuning, batch.imu.new_tensor
         std = [t.lateral_std, t.vertical_std] + [t.rest_velocity_std] * 3 + [t.rest_rate_std] * 3
-        quietest = batch.imu.new_full((batch.size[0], 2), math.inf)
-        return CarMemory(quietest, new([std]), new([[t.rest_accel, t.rest_gyro]]))
+        heard = Liveliness.unheard(batch.imu, batch.size[0])
+        return CarMemory(new([std]), heard, new([t.rest_accel * t.rest_gyro]))
 
     def rows(self, epoch: Epoch, memory: CarMemory, believed: Believed) -> tuple[Measurement, CarMemory]:
         """NHC (2 rows), zero velocity (3), zero angular rate (3)."""
-        resting, memory = self._at_rest(epoch, memory, believed.P)
         zn, Hn, moving = self._across(epoch, believed.structure)
         zr, Hr = self._standing(epoch)
+        resting, liveliness = at_rest(epoch, zr[:, 3:], believed.P, memory.liveliness, memory.prior)
         resting = resting.unsqueeze(-1)
         used = torch.cat(((moving.unsqueeze(-1) & ~resting).expand(-1, 2), resting.expand(-1, 6)), -1)
         variance = memory.std.square().expand(len(zn), -1)
@@ -75,7 +72,7 @@ class CarConstraints:
         if epoch.advice is not None and epoch.advice.offset is not None:
             zn = zn + epoch.advice.offset
         z = torch.cat((zn, zr), -1) * used
-        return Measurement(z, torch.cat((Hn, Hr), 1), variance, used), memory
+        return Measurement(z, torch.cat((Hn, Hr), 1), variance, used), memory._replace(liveliness=liveliness)
 
     def _across(
         self, epoch: Epoch, structure: Float[Tensor, "B 4"] | None
@@ -115,24 +112,3 @@ class CarConstraints:
         H[:, :3, VELOCITY] = eye
         H[:, 3:, GYRO] = eye
         return z, H
-
-    def _at_rest(
-        self, epoch: Epoch, memory: CarMemory, P: Float[Tensor, "B n n"]
-    ) -> tuple[Bool[Tensor, " B"], CarMemory]:
-        """Whether the samples of the window are as quiet as a standing car's.
-
-        Their spread must be below a multiple of that of the quietest second in which the filter was sure to stand,
-        since idling engines differ, and below fixed limits, of which a third counts until there was such a second.
-        And the filter must not know better.
-        """
-        swing = epoch.imu - epoch.imu.mean(1, keepdim=True)  # torch's var of a middle axis takes four times as long
-        variance = swing.square().sum(1) / (epoch.imu.shape[1] - 1)
-        spread = variance.unflatten(-1, (2, 3)).sum(-1).sqrt()  # (B, 2) accelerometers, gyroscopes
-        sigma = P.diagonal(dim1=-2, dim2=-1)[:, VELOCITY][:, :2].sum(-1).sqrt()
-        speed = epoch.window.end.v_n[:, :2].norm(dim=-1)
-        quietest, limit = memory.quietest, memory.limits
-        sure = (speed + sigma < SURE_SPEED) & (spread < limit).all(-1)
-        quietest = torch.where(sure.unsqueeze(-1), torch.minimum(quietest, spread), quietest)
-        limit = torch.where(quietest.isinf(), limit / 3, torch.minimum(QUIET_FACTOR * quietest, limit))
-        plausible = speed < PLAUSIBLE_SPEED + PLAUSIBLE_SIGMAS * sigma
-        return (spread <= limit).all(-1) & plausible, memory._replace(quietest=quietest)

@@ -19,7 +19,7 @@ class Tuning:
 
     Filters with constraints: ``lateral_std``, ``vertical_std`` [m/s] of the velocity across the car, once per
     epoch, ``rest_velocity_std`` [m/s], ``rest_rate_std`` [rad/s] of a standstill; ``rest_accel`` [m/s²] and
-    ``rest_gyro`` [rad/s] are the highest spread of the samples that may count as one.
+    ``rest_gyro`` [rad/s] are the spread of the samples in the quietest second of motion, until the drive tells.
     Filters with a gate: ``gate`` is the probability that a good fix passes. ``aekf``: ``forgetting`` is the share
     of the past in the adapted Q and R (0.3 in Akhlaghi et al. 2017, which lost wherever it was tried).
     """
