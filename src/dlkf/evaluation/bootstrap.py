@@ -7,6 +7,11 @@ narrow, so its levels are those of Student's t with as many degrees of freedom (
 Hesterberg, *What Teachers Should Know About the Bootstrap*, 2015, section 5.3), and with fewer than
 :data:`MIN_GROUPS` there is none. On log-normal errors of clustered pieces it covers 90 to 95 % where it says 95 %
 (tests/evaluation/test_bootstrap.py); the plain percentile interval covered 83 to 92 %, BCa 80 to 89 %.
+
+That is so where both filters' errors are about as skewed. The RMS of few, very skewed errors is as a rule too small,
+and so is its ratio to that of a filter with less skew: a filter with an RMS of six times its median against one with
+twice covered 76 % in 41 recordings of seven pieces, the truth above the interval in nearly all other cases. The
+interval of the geometric mean's ratio covered 93 to 96 % throughout.
 """
 
 from __future__ import annotations
