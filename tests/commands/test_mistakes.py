@@ -184,6 +184,8 @@ def test_a_faulty_reference_stops_evaluate_and_not_navigate(fault, copy, call, t
         (["model=mbkf15", "dataset=town", "imu.gyro.noise_density=low"], ("noise_density", "'low'")),
         (["model=mbkf15", "dataset=town", "rate_hz=0"], ("rate_hz",)),
         (["model=mbkf15", "dataset=town", "drives=[nobody]"], ("nobody",)),
+        (["model=mbkf15", "dataset=town", "drives=[]"], ("drives", "null")),
+        (["model=mbkf15", "dataset=town", "drives=[car-00,car-00]"], ("car-00", "twice")),
         (["model=mbkf15", "dataset"], ("dataset",)),
         (["model=mbkf15"], ("dataset is missing",)),
         (["dataset=town"], ("model is missing",)),

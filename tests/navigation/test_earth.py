@@ -1,5 +1,7 @@
 """Ellipsoid and gravity against pyproj and python-ins."""
 
+import math
+
 import numpy as np
 import pyproj
 import pytest
@@ -65,6 +67,18 @@ def test_plumb_line_tilts_with_the_vehicle(dtype, tolerance):
     assert (got - expected).abs().max() < tolerance
     # forgetting the tilt would be wrong by g · 25 km / R = 0.04 m/s²
     assert (got[:, :2].norm(dim=-1) > 0.03).all()
+
+
+@pytest.mark.parametrize(("km", "worst"), [(100, 7e-6), (200, 3e-5), (500, 3e-4)])
+def test_gravity_far_from_the_origin_is_as_good_as_is_said(km, worst):
+    one = torch.ones(3, dtype=torch.float64)
+    frame = tangent_frame(0.9 * one, 0.2 * one, 100 * one)
+    turn = km * 1e3 / 6.37e6 * torch.tensor([1.0, -1.0, 0.0], dtype=torch.float64)
+    lat, lon = 0.9 + turn, 0.2 + torch.tensor([0.0, 0.0, km * 1e3 / 6.37e6 / math.cos(0.9)], dtype=torch.float64)
+    p_n = frame.from_ecef(ecef_from_geodetic(lat, lon, 100 * one))
+    true = frame.rotate_from_ecef(normal_gravity(torch.sin(lat), 100 * one)[:, None] * ned_axes(lat, lon)[..., 2])
+    error = (frame.gravity(p_n) - true).norm(dim=-1).max()
+    assert 0.5 * worst < error < worst
 
 
 def test_gravity_gradient_matches_differences():

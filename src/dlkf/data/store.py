@@ -45,11 +45,15 @@ def load_dataset(
 
 
 def drive_rows(folder: str | Path, drives: Sequence[str] | str | None = None) -> list[DriveRow]:
-    """What ``drives.parquet`` says of all drives, or of those named; InputError for an unknown one."""
+    """Rows of ``drives.parquet``: all, or those named; InputError for none, or one unknown or named twice."""
     rows = read_drives(folder)
     if drives is None:
         return rows
     drives = [drives] if isinstance(drives, str) else list(drives)
+    if not drives:
+        raise InputError("drives=[] names no drive; null takes all")
+    if doubles := sorted({name for name in drives if drives.count(name) > 1}):
+        raise InputError(f"drives names {doubles[0]} twice; a drive counts once")
     known = {row.name: row for row in rows}
     if unknown := [name for name in drives if name not in known]:
         shown = ", ".join(list(known)[:8]) + (", …" if len(known) > 8 else "")
