@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from dlkf.networks.cnn_lstm import NetworkConfig
-from dlkf.networks.products import EpochLayers
+from dlkf.networks.products import EpochLinear, EpochLSTMCell, begin_batch
 
 ROUNDING = 1e-5  # relative to the largest element: sums of a thousand products in float32, in another order
 
@@ -17,39 +17,42 @@ def close(one: torch.Tensor, other: torch.Tensor) -> bool:
 
 
 def test_linear_layer_over_epochs_of_different_rows():
-    layer, plain = nn.Linear(40, 30), nn.Linear(40, 30)
+    layer, plain = EpochLinear(40, 30), nn.Linear(40, 30)
     plain.load_state_dict(layer.state_dict())
-    layers, inputs = EpochLayers(), [torch.randn(rows, 40) for rows in (7, 1, 50)]
+    inputs = [torch.randn(rows, 40) for rows in (7, 1, 50)]
     for _ in range(2):  # two batches: nothing of the first is left in the second
-        layers.begin()
-        total = sum((layers.linear(layer, x) * x[:, :30]).sum() for x in inputs)
-        expected = sum((plain(x) * x[:, :30]).sum() for x in inputs)
-        for one, value in ((layer, total), (plain, expected)):
+        begin_batch(layer)
+        got, expected = ([one(x) for x in inputs] for one in (layer, plain))
+        assert all(close(x, y) for x, y in zip(got, expected, strict=True))
+        for one, outputs in ((layer, got), (plain, expected)):
             one.zero_grad()
-            value.backward()
-        assert close(total, expected)
+            sum(y.square().sum() for y in outputs).backward()
         assert close(layer.weight.grad, plain.weight.grad)
         assert close(layer.bias.grad, plain.bias.grad)
+        with torch.no_grad():
+            for one in (layer, plain):
+                one.weight.mul_(1.1)
 
 
 def test_lstm_cell_over_epochs():
-    cell = nn.LSTMCell(40, 32)
-    plain = copy.deepcopy(cell)
-    x = torch.randn(20, 7, 40)
+    plain, cell = nn.LSTMCell(40, 32), EpochLSTMCell(40, 32)
+    cell.load_state_dict(plain.state_dict())
+    inputs = torch.randn(20, 7, 40), torch.randn(7, 32), torch.randn(7, 32)
 
-    def through(step) -> torch.Tensor:
-        memory, out = (torch.zeros(7, 32), torch.zeros(7, 32)), []
+    def through(step) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        x, h, c = given = [i.clone().requires_grad_() for i in inputs]
+        memory, out = (h, c), []
         for epoch in x:
             memory = step(epoch, memory)
-            out.append(memory[0])
-        return torch.stack(out)
+            out.extend(memory)
+        total = torch.stack(out)
+        total.square().sum().backward()
+        return total, [i.grad for i in given]
 
-    layers = EpochLayers()
-    got, expected = through(lambda e, m: layers.lstm(cell, e, m)), through(plain)
+    (got, of_inputs), (expected, of_plain) = through(cell), through(plain)
     assert close(got, expected)
-    for value in (got, expected):
-        value.square().sum().backward()
-    for one, other in zip(cell.parameters(), plain.parameters()):
+    assert all(close(x, y) for x, y in zip(of_inputs, of_plain, strict=True))
+    for one, other in zip(cell.parameters(), plain.parameters(), strict=True):
         assert close(one.grad, other.grad)
 
 

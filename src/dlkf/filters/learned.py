@@ -20,6 +20,7 @@ from dlkf.networks.cnn_lstm import NetworkConfig, Recurrent
 from dlkf.networks.features import Frame, Scaling, component_features, level_rotation, window_features
 from dlkf.networks.heads import Form, GainHead, ImuErrorHead
 from dlkf.networks.own import OwnNetwork
+from dlkf.networks.products import begin_batch
 from dlkf.settings import settings_from
 
 MAX_TRAINING_TURN = 0.2  # rad per correction, a guard in training only (paper.md 4.10)
@@ -117,6 +118,7 @@ class LearnedFilter(nn.Module):
                 f"this model was trained on windows of {c.network.samples} samples ({c.rate_hz:g} Hz over epochs of "
                 f"{c.epoch_s:g} s), the data come with {M}; leave rate_hz and epoch_s to the model"
             )
+        begin_batch(self)
         parameter = self.imu_error.linear.weight
         state = NavState(*(x.detach() for x in batch.start))
         zeros = batch.imu.new_zeros
@@ -173,8 +175,9 @@ class LearnedFilter(nn.Module):
             x = x.detach() if self.config.detach_features else x
             return x if whole else x[rows]
 
-        window, components, C_hn = self._features(memory, epoch, pick)
-        window, components = self.scaling(window, components)
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.config.detach_features):
+            window, components, C_hn = self._features(memory, epoch, pick)
+            window, components = self.scaling(window, components)
         if self.config.outage_mode == "run":
             fixed = pick(has_fix)
             age = torch.log1p(pick(memory.since_fix)) * ~fixed
@@ -208,11 +211,13 @@ class LearnedFilter(nn.Module):
         window = window_features(moved_n, v_n, C_nb, pick(epoch.imu), C_hn, self.config.frame)
         return window, components, C_hn
 
+    @torch.no_grad()
     def _remember(
         self, memory: Memory, epoch: Epoch, dx: Tensor, has_fix: Tensor, ran: Tensor, recurrent: Recurrent
     ) -> Memory:
         """Memory after the network ran on some pieces."""
-        posterior = epoch.window.end.detach().corrected(dx.detach())
+        dx = dx.detach()
+        posterior = epoch.window.end.detach().corrected(dx)
         difference = memory.posterior.error_to(posterior)
 
         return Memory(
@@ -223,7 +228,7 @@ class LearnedFilter(nn.Module):
             posterior=NavState(*(_chosen(ran, n, o) for n, o in zip(posterior, memory.posterior))),
             difference=_chosen(ran, difference, memory.difference),
             difference_s=_chosen(ran, memory.elapsed, memory.difference_s),
-            correction=_chosen(ran, dx.detach(), memory.correction),
+            correction=_chosen(ran, dx, memory.correction),
             fix=torch.where(epoch.used, epoch.fix.value, memory.fix),
             had_fix=memory.had_fix | epoch.used,
         )

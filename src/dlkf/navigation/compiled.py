@@ -92,24 +92,96 @@ def gravity(
     return g
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 @no_type_check
-def _rotation(x, y, z, R):
-    half = 0.5 * math.sqrt(x * x + y * y + z * z)
-    scale = 0.5 if half < 1e-8 else 0.5 * math.sin(half) / half
-    q0, q1, q2, q3 = math.cos(half), scale * x, scale * y, scale * z
-    R[0, 0], R[1, 1] = 1 - 2 * (q2 * q2 + q3 * q3), 1 - 2 * (q1 * q1 + q3 * q3)
-    R[2, 2] = 1 - 2 * (q1 * q1 + q2 * q2)
-    R[0, 1], R[1, 0] = 2 * (q1 * q2 - q0 * q3), 2 * (q1 * q2 + q0 * q3)
-    R[0, 2], R[2, 0] = 2 * (q1 * q3 + q0 * q2), 2 * (q1 * q3 - q0 * q2)
-    R[1, 2], R[2, 1] = 2 * (q2 * q3 - q0 * q1), 2 * (q2 * q3 + q0 * q1)
+def cross(a, b):
+    """a × b of three numbers each, which stay in registers, as those of the functions below do."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@njit(cache=True, inline="always")
+@no_type_check
+def dot(a, b):
+    """a · b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True, inline="always")
+@no_type_check
+def scaled(s, a):
+    """s a."""
+    return s * a[0], s * a[1], s * a[2]
+
+
+@njit(cache=True, inline="always")
+@no_type_check
+def plus(a, s, b):
+    """a + s b."""
+    return a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]
+
+
+@njit(cache=True, inline="always")
+@no_type_check
+def row(x, b, k):
+    """Vector x[b, k]."""
+    return x[b, k, 0], x[b, k, 1], x[b, k, 2]
+
+
+@njit(cache=True, inline="always")
+@no_type_check
+def rotation(phi):
+    """exp([φ×]), a row each; up to 0.2 rad by the first terms of sine and cosine, which is all that float64 has."""
+    x, y, z = phi
+    s = 0.25 * (x * x + y * y + z * z)  # (φ/2)²
+    if s < 0.01:
+        q0 = 1 - s / 2 * (1 - s / 12 * (1 - s / 30 * (1 - s / 56)))
+        scale = 0.5 * (1 - s / 6 * (1 - s / 20 * (1 - s / 42 * (1 - s / 72))))
+    else:
+        half = math.sqrt(s)
+        q0, scale = math.cos(half), 0.5 * math.sin(half) / half
+    q1, q2, q3 = scale * x, scale * y, scale * z
+    return (
+        (1 - 2 * (q2 * q2 + q3 * q3), 2 * (q1 * q2 - q0 * q3), 2 * (q1 * q3 + q0 * q2)),
+        (2 * (q1 * q2 + q0 * q3), 1 - 2 * (q1 * q1 + q3 * q3), 2 * (q2 * q3 - q0 * q1)),
+        (2 * (q1 * q3 - q0 * q2), 2 * (q2 * q3 + q0 * q1), 1 - 2 * (q1 * q1 + q2 * q2)),
+    )
+
+
+@njit(cache=True, inline="always")
+@no_type_check
+def times(a, R):
+    """aᵀ R of a row and a matrix."""
+    return (
+        a[0] * R[0][0] + a[1] * R[1][0] + a[2] * R[2][0],
+        a[0] * R[0][1] + a[1] * R[1][1] + a[2] * R[2][1],
+        a[0] * R[0][2] + a[1] * R[1][2] + a[2] * R[2][2],
+    )
+
+
+@njit(cache=True, inline="always")
+@no_type_check
+def gains(phi, f, dt):
+    """∫ exp(s φ) ds f dt over a sample, once for velocity and twice for position (over dt)."""
+    dv = f[0] * dt, f[1] * dt, f[2] * dt
+    turn = cross(phi, dv)
+    again = cross(phi, turn)
+    return (
+        (dv[0] + turn[0] / 2 + again[0] / 6, dv[1] + turn[1] / 2 + again[1] / 6, dv[2] + turn[2] / 2 + again[2] / 6),
+        (
+            dv[0] / 2 + turn[0] / 6 + again[0] / 24,
+            dv[1] / 2 + turn[1] / 6 + again[1] / 24,
+            dv[2] / 2 + turn[2] / 6 + again[2] / 24,
+        ),
+    )
 
 
 @njit(cache=True)
 @no_type_check
 def _rotations(phi, out):
     for b in range(len(phi)):
-        _rotation(phi[b, 0], phi[b, 1], phi[b, 2], out[b])
+        R = rotation((phi[b, 0], phi[b, 1], phi[b, 2]))
+        for i in range(3):
+            out[b, i, 0], out[b, i, 1], out[b, i, 2] = R[i]
 
 
 @njit(cache=True)
@@ -161,41 +233,33 @@ def _gravity(p, stretching, centre, axis, shape, equator, somigliana, eccentrici
 @no_type_check
 def _mechanise(p0, v0, C0, imu, g, w, dt, p, v, C):
     B, M, _ = imu.shape
+    zero = 0.0, 0.0, 0.0
     for b in range(B):
-        A = C0[b].copy()
-        new = np.empty_like(A)
-        S, P = np.zeros(3), np.zeros(3)
-        phi, dv = np.empty(3), np.empty(3)
-        R = np.empty((3, 3))
+        A = row(C0, b, 0), row(C0, b, 1), row(C0, b, 2)
+        start, speed = (p0[b, 0], p0[b, 1], p0[b, 2]), (v0[b, 0], v0[b, 1], v0[b, 2])
+        fall, earth = (g[b, 0], g[b, 1], g[b, 2]), (w[b, 0], w[b, 1], w[b, 2])
+        S, P = zero, zero
         for k in range(M):
-            for i in range(3):
-                dv[i], phi[i] = imu[b, k, i] * dt, imu[b, k, 3 + i] * dt
-            x, y, z = phi
-            turn0, turn1, turn2 = y * dv[2] - z * dv[1], z * dv[0] - x * dv[2], x * dv[1] - y * dv[0]
-            again0, again1, again2 = y * turn2 - z * turn1, z * turn0 - x * turn2, x * turn1 - y * turn0
-            once0, twice0 = dv[0] + turn0 / 2 + again0 / 6, dv[0] / 2 + turn0 / 6 + again0 / 24
-            once1, twice1 = dv[1] + turn1 / 2 + again1 / 6, dv[1] / 2 + turn1 / 6 + again1 / 24
-            once2, twice2 = dv[2] + turn2 / 2 + again2 / 6, dv[2] / 2 + turn2 / 6 + again2 / 24
-            for i in range(3):
-                P[i] += (A[i, 0] * twice0 + A[i, 1] * twice1 + A[i, 2] * twice2 + S[i]) * dt
-                S[i] += A[i, 0] * once0 + A[i, 1] * once1 + A[i, 2] * once2
-            _rotation(x, y, z, R)
-            for i in range(3):
-                for j in range(3):
-                    new[i, j] = A[i, 0] * R[0, j] + A[i, 1] * R[1, j] + A[i, 2] * R[2, j]
-            A, new = new, A
+            phi = imu[b, k, 3] * dt, imu[b, k, 4] * dt, imu[b, k, 5] * dt
+            once, twice = gains(phi, row(imu, b, k), dt)
+            P = plus(P, dt, plus(S, 1, (dot(A[0], twice), dot(A[1], twice), dot(A[2], twice))))
+            S = plus(S, 1, (dot(A[0], once), dot(A[1], once), dot(A[2], once)))
+            R = rotation(phi)
+            A = times(A[0], R), times(A[1], R), times(A[2], R)
             t = (k + 1) * dt
+            free = plus(speed, t, fall)  # v₀ + g t
+            swing_v = cross(earth, plus(P, t, plus(plus(S, 1, speed), 1, free)))
+            swing_p = cross(earth, plus(P, t, plus(speed, t / 3, fall)))
+            at_v = plus(plus(free, 1, S), -1, swing_v)
+            at_p = plus(plus(start, 1, P), t, plus(plus(speed, t / 2, fall), -1, swing_p))
+            turned = (
+                plus(A[0], t, plus(scaled(earth[2], A[1]), -earth[1], A[2])),
+                plus(A[1], t, plus(scaled(earth[0], A[2]), -earth[2], A[0])),
+                plus(A[2], t, plus(scaled(earth[1], A[0]), -earth[0], A[1])),
+            )
             for i in range(3):
-                i1, i2 = (i + 1) % 3, (i + 2) % 3
-                a1 = t * (S[i1] + 2 * v0[b, i1] + g[b, i1] * t) + P[i1]
-                a2 = t * (S[i2] + 2 * v0[b, i2] + g[b, i2] * t) + P[i2]
-                b1 = t * (v0[b, i1] + g[b, i1] * t / 3) + P[i1]
-                b2 = t * (v0[b, i2] + g[b, i2] * t / 3) + P[i2]
-                w1, w2 = w[b, i1], w[b, i2]
-                v[b, k, i] = v0[b, i] + g[b, i] * t + S[i] - (w1 * a2 - w2 * a1)
-                p[b, k, i] = p0[b, i] + t * (v0[b, i] + 0.5 * g[b, i] * t - (w1 * b2 - w2 * b1)) + P[i]
-                for j in range(3):
-                    C[b, k, i, j] = A[i, j] - t * (w1 * A[i2, j] - w2 * A[i1, j])
+                p[b, k, i], v[b, k, i] = at_p[i], at_v[i]
+                C[b, k, i, 0], C[b, k, i, 1], C[b, k, i, 2] = turned[i]
 
 
 @njit(cache=True)

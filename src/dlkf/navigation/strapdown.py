@@ -187,18 +187,16 @@ class _CompiledStrapdown(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, Gp, Gv, GC, gp, gv, gC):
         C0, imu, gradient, earth_rate = ctx.saved_tensors
-        vectors = imu[..., :3]
-        Gp, Gv = _ended(Gp, gp, vectors), _ended(Gv, gv, vectors)
-        M = imu.shape[1]
-        first = 0 if GC is not None else M - 1
-        GC = _ended(GC, gC, C0.unsqueeze(1).expand(-1, M, 3, 3))
-        p0, v0, turn, samples = compiled_adjoint.adjoint(C0, imu, ctx.dt, gradient, earth_rate, Gp, Gv, GC, first)
+        only_end = Gp is None and Gv is None and GC is None
+        shape = (len(imu), 1 if only_end else imu.shape[1], 3)
+        Gp, Gv, GC = _ended(Gp, gp, C0, shape), _ended(Gv, gv, C0, shape), _ended(GC, gC, C0, (*shape, 3))
+        p0, v0, turn, samples = compiled_adjoint.adjoint(C0, imu, ctx.dt, gradient, earth_rate, Gp, Gv, GC)
         return p0, v0, 0.5 * skew(turn) @ C0, samples, None, None, None, None
 
 
-def _ended(samples: Tensor | None, end: Tensor | None, like: Tensor) -> Tensor:
-    """Gradient of all samples (B, M, …) with that of the end state added to the last."""
-    full = torch.zeros(like.shape, dtype=like.dtype) if samples is None else samples.clone()
+def _ended(samples: Tensor | None, end: Tensor | None, like: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Gradient of the last samples (B, m, …) with that of the end state added to the last."""
+    full = like.new_zeros(shape) if samples is None else samples.clone()
     if end is not None:
         full[:, -1] += end
     return full

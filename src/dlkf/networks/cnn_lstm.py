@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from dlkf.errors import InputError
 from dlkf.networks.features import CNN_CHANNELS, COMPONENTS
-from dlkf.networks.products import EpochLayers
+from dlkf.networks.products import EpochLinear, EpochLSTMCell, begin_batch
 
-CELLS = {"lstm": nn.LSTMCell, "gru": nn.GRUCell}
+CELLS = {"lstm": EpochLSTMCell, "gru": nn.GRUCell}
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,17 @@ class NetworkConfig:
 Recurrent = tuple[Tensor, ...]  # each (layers, B, hidden); h and c of LSTM cells, h of GRU cells, empty without cells
 
 
+class Convolution(nn.Conv1d):
+    """Over time; in training as one over pictures a pixel high, for which torch takes samples as they lie."""
+
+    def forward(self, input: Float[Tensor, "B C M"]) -> Float[Tensor, "B N M"]:
+        """``torch.nn.Conv1d``."""
+        if not torch.is_grad_enabled():
+            return super().forward(input)
+        picture, weight = input.unsqueeze(2), self.weight.unsqueeze(2)
+        return nn.functional.conv2d(picture, weight, self.bias, padding=(0, int(self.padding[0]))).squeeze(2)
+
+
 class CnnLstm(nn.Module):
     """Window (B, 15, M) and components (B, 30 + flags) to a feature vector (B, width), with memory."""
 
@@ -77,16 +88,16 @@ class CnnLstm(nn.Module):
         layers: list[nn.Module] = []
         if config.window:
             layers = [
-                nn.Conv1d(CNN_CHANNELS, config.cnn_channels, config.kernel, padding=pad),
+                Convolution(CNN_CHANNELS, config.cnn_channels, config.kernel, padding=pad),
                 nn.LeakyReLU(slope),
-                nn.Conv1d(config.cnn_channels, 1, config.kernel, padding=pad),
+                Convolution(config.cnn_channels, 1, config.kernel, padding=pad),
                 *([nn.LeakyReLU(slope)] if config.conv_activation else []),
             ]
         self.cnn = nn.Sequential(*layers)
         size = (config.samples or 0 if config.window else 0) + COMPONENTS + config.flags
         self.squeeze: nn.Module = nn.Identity()
         if config.fusion == "strict30":
-            self.squeeze, size = nn.Linear(size, COMPONENTS), COMPONENTS
+            self.squeeze, size = EpochLinear(size, COMPONENTS), COMPONENTS
         cells = []
         for _ in range(config.lstm_layers if config.cell != "none" else 0):
             cells.append(CELLS[config.cell](size, config.lstm_hidden))
@@ -96,10 +107,9 @@ class CnnLstm(nn.Module):
         for i, out in enumerate(config.dense):
             if i:
                 layers.append(nn.Dropout(config.dropout))
-            layers += [nn.Linear(size, out), nn.LeakyReLU(slope)]
+            layers += [EpochLinear(size, out), nn.LeakyReLU(slope)]
             size = out
         self.dense = nn.Sequential(*layers)
-        self._collected = EpochLayers()
         self._initialise()
 
     def _initialise(self) -> None:
@@ -124,7 +134,7 @@ class CnnLstm(nn.Module):
 
     def start(self, batch_size: int, like: Tensor) -> Recurrent:
         """Empty memory."""
-        self._collected.begin()
+        begin_batch(self)
         zeros = like.new_zeros(self.config.lstm_layers, batch_size, self.config.lstm_hidden)
         return (zeros,) * {"lstm": 2, "gru": 1, "none": 0}[self.config.cell]
 
@@ -136,20 +146,7 @@ class CnnLstm(nn.Module):
         y = self.squeeze(torch.cat(seen, -1))
         after = []
         for layer, old in zip(self.lstm, zip(*memory)):
-            new = self._recur(layer, y, old)
+            new = (layer(y, old[0]),) if self.config.cell == "gru" else layer(y, old)
             y = new[0]
             after.append(new)
-        for layer in self.dense:
-            y = self._collected.linear(layer, y) if isinstance(layer, nn.Linear) and _learning(layer) else layer(y)
-        return y, tuple(torch.stack(x) for x in zip(*after))
-
-    def _recur(self, cell: Any, y: Tensor, old: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        """A cell's memory after an epoch, its output first."""
-        if isinstance(cell, nn.GRUCell):
-            return (cell(y, old[0]),)
-        return self._collected.lstm(cell, y, old) if _learning(cell) else cell(y, old)
-
-
-def _learning(layer: nn.Module) -> bool:
-    """Whether gradients of the layer's weights are wanted."""
-    return torch.is_grad_enabled() and all(p.requires_grad for p in layer.parameters())
+        return self.dense(y), tuple(torch.stack(x) for x in zip(*after))
