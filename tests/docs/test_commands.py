@@ -37,6 +37,20 @@ SHELL = [
     for words in map(spelt_out, commands(text))
     if words[0] in ("python", "make") and not re.search(r"dlkf\.[…<]|pipelines/…", " ".join(words))
 ]
+
+
+def commented(preset: Path) -> str:
+    """The commands among a preset's comments, without what stands beside them."""
+    comments = "\n".join(m[1] for m in re.finditer(r"^#(.*)$", preset.read_text(), re.M))
+    lines = re.findall(r"^   (python (?:[^\\\n]|\\\n)*)", comments, re.M)
+    return "\n".join(re.sub(r"(?<=[^\n ]) {4,}[^ ].*", "", line) for line in lines)
+
+
+SHELL += [
+    (preset, tuple(words))
+    for preset in sorted(config_dir().rglob("*.yaml"))
+    for words in map(spelt_out, commands(commented(preset)))
+]
 # presets that the pages tell a reader to write into mine/
 MINE = {
     "imu": ["my_imu", "ours", "shed"],
