@@ -61,6 +61,8 @@ def main(told: EvaluateSettings) -> None:
     done = evaluate_shares(work, in_shares(fixes, grid["rate_hz"], many), told.parallel)
     for reason in done.skipped.values():
         console.print(f"left out: {reason}", style="yellow")
+    if done.short:
+        console.print(f"left out: {done.short}", style="yellow", highlight=False)
     if done.truth:
         console.print(f"No truth: errors are against the {done.truth['reference']}.", style="bold")
     if told.mode == "auto" and done.mode == "drives":

@@ -28,7 +28,7 @@ from dlkf.training.fit import check_fit
 from dlkf.training.processes import is_further
 from dlkf.training.run_folder import checked_digests, run_folder, write_state
 from dlkf.training.settings import TrainSettings
-from dlkf.training.study import run_study, train_along
+from dlkf.training.study import left_out, run_study, train_along
 from dlkf.training.summary import key_metrics, note
 
 
@@ -48,6 +48,8 @@ def main(config: dict[str, Any]) -> None:
     make_missing(data.datasets, told.scoring.hour, console)
     data.setup()
     console.print(data.describe())
+    for line in left_out(settings, data):
+        console.print(f"left out: {line}", style="yellow", highlight=False)
     if state:
         console.print(f"going on with the unfinished run in {folder}")
     name = run_name(told.name, HydraConfig.get().overrides.task)

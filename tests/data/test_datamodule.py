@@ -121,6 +121,16 @@ def test_scoring_batches_are_fixed(town):
     assert len(data.describe().splitlines()) == 4
 
 
+def test_drives_too_short_for_their_side_are_named(town):
+    """Which drives, of how many, and the key that takes them in; nothing where all are long enough."""
+    data = _module(town)
+    assert data.left_out(data.train_length_s) == []
+    (line,) = data.left_out(1e4)
+    train = [d.name for d in data.drives("train")]
+    assert line.startswith(f"{len(train)} of {len(train)} drives, too short") and "a shorter data.length_s" in line
+    assert "train piece of 10000 s: " + ", ".join(train[:4]) in line
+
+
 class _Recorder(L.LightningModule):
     def __init__(self) -> None:
         super().__init__()

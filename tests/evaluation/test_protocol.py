@@ -256,8 +256,31 @@ def test_shares_of_which_one_has_nothing_to_score(town, tmp_path):
     )  # fmt: skip
     done = evaluate_shares(work, [(row.name,) for row in rows[:3]])
     assert {piece.drive for piece in done.run.scores.pieces} == {row.name for row in rows[1:3]}
+    assert done.short.startswith("1 of 3 drives, too short or") and f"a piece of 40 s: {rows[0].name};" in done.short
     with pytest.raises(InputError, match="no piece of 40 s"):
         evaluate_shares(work, [(rows[0].name,)])
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_drives_too_short_for_a_piece_are_named(town, tmp_path, together):
+    """Whatever they share the memory with: mode=auto leaves them out where others have pieces, and says so."""
+    shutil.copytree(town, tmp_path / "town")
+    names = [row.name for row in drive_rows(town)][:4]
+    for name in names[:2]:
+        path = tmp_path / "town" / "reference" / f"drive={name}" / "part-0.parquet"
+        table = pq.read_table(path).to_pandas()
+        table["valid"] = table["t"] < table["t"][0] + 30
+        pq.write_table(pa.Table.from_pandas(table, preserve_index=False), path)
+    work = Work(
+        str(tmp_path / "town"), {"ins": build_filter("ins", IMU)}, Protocol("auto", 40.0, 10.0),
+        {"rate_hz": 20.0, "epoch_s": 1.0}, drive_kinds(town), {}, shown=False,
+    )  # fmt: skip
+    done = evaluate_shares(work, [tuple(names)] if together else [(name,) for name in names])
+    assert done.mode == "pieces" and {piece.drive for piece in done.run.scores.pieces} == set(names[2:])
+    assert done.short == done.rules["too short"] and done.short.startswith("2 of 4 drives, too short or")
+    assert f"40 s with a known attitude: {names[0]}, {names[1]}; " in done.short and "mode=drives" in done.short
+    shorter = replace(work, protocol=Protocol("auto", 25.0, 10.0))
+    assert evaluate_shares(shorter, [tuple(names)]).short == ""
 
 
 def test_models_by_name_and_folder(tmp_path):

@@ -23,6 +23,8 @@ from dlkf.data.segments import (
     make_batch,
     pieces_at,
     possible_starts,
+    told_unused,
+    unused,
 )
 from dlkf.data.splits import SIDES, Split, split_rows
 from dlkf.data.stack import DriveStack
@@ -221,6 +223,23 @@ class DriveDataModule(L.LightningDataModule):
                 }
             )
         return table
+
+    def left_out(self, longest_s: float) -> list[str]:
+        """A line per side on its drives that give no piece on any; training pieces grow to ``longest_s``."""
+        fixed = ("data.eval_length_s", self.eval_length_s)
+        lengths = dict.fromkeys(SIDES, fixed) | {"train": ("data.length_s", longest_s)}
+        sides = {side: {d.name for d in self.drives(side)} for side in SIDES}
+        cut = [
+            cut_pieces(self.stack, length, min_valid=self.min_valid, span=self.spans[side])
+            for side, (_, length) in lengths.items()
+        ]
+        idle = unused(self.stack, [piece for pieces in cut for piece in pieces])
+        out = []
+        for side, (key, length) in lengths.items():
+            if names := [name for name in idle if name in sides[side]]:
+                piece = f"{side} piece of {length:g} s"
+                out.append(told_unused(names, len(sides[side]), piece, f"a shorter {key} takes more of them"))
+        return out
 
     def describe(self) -> str:
         """The summary as a small table."""

@@ -130,6 +130,19 @@ def cut_pieces(
     return pieces_at(stack, torch.tensor(chosen, dtype=torch.int64), epochs)
 
 
+def unused(drives: Sequence[Drive], pieces: Sequence[Piece]) -> list[str]:
+    """Names of the drives of which none of the pieces is cut."""
+    used = {piece.drive for piece in pieces}
+    return [drive.name for k, drive in enumerate(drives) if k not in used]
+
+
+def told_unused(names: Sequence[str], of: int, piece: str, mend: str) -> str:
+    """``3 of 10 drives, too short or not valid long enough for a piece of 120 s: a, b, c; …``: four names at most."""
+    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+    short = f"too short or not valid long enough for a {piece}"
+    return f"{len(names)} of {of} drives, {short}: {', '.join(names[:4])}{more}; {mend}"
+
+
 def make_batch(
     drives: Sequence[Drive],
     pieces: Sequence[Piece],

@@ -11,7 +11,7 @@ import torch
 from dlkf.data.alignment import ALIGN, AlignConfig, Start
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.masks import withhold
-from dlkf.data.segments import Piece, StartLaw, cut_pieces, make_batch, whole_drives
+from dlkf.data.segments import Piece, StartLaw, cut_pieces, make_batch, told_unused, unused, whole_drives
 from dlkf.data.stack import DriveStack, stacked
 from dlkf.errors import InputError
 from dlkf.evaluation.outages import OutagePlan
@@ -52,13 +52,18 @@ class Protocol:
                 raise InputError(f"{name}={getattr(self, name)} must be above 0 s")
 
 
+class NoPiece(InputError):
+    """Every drive is too short for a piece."""
+
+
 class Scenes:
     """The scenes of a protocol over some drives; iterating cuts them anew, a bounded part at a time.
 
     The same protocol gives the same scenes, whatever is scored on them: each piece has its own draws of start error
     and outage. ``pieces`` are those to use, else they are cut by the protocol; ``limit`` keeps so many, spread evenly
     over all. ``mode`` is the one chosen, ``runs`` the number of pieces over all scenes, ``skipped`` the drives that
-    cannot be used and why. Raises InputError where nothing can be scored or no outage fits into the pieces.
+    cannot be used and why, ``short`` those of which no piece could be cut though pieces are scored. Raises InputError
+    where nothing can be scored or no outage fits into the pieces.
     """
 
     def __init__(
@@ -70,9 +75,11 @@ class Scenes:
         limit: int | None = None,
     ) -> None:
         stack = stacked(drives)
+        self.short: tuple[str, ...] = ()
         if pieces is None and protocol.mode != "drives":
             attitude = protocol.mode == "auto"
             pieces = cut_pieces(stack, protocol.length_s, protocol.stride_s, attitude=attitude)
+            self.short = tuple(unused(stack, pieces)) if pieces else ()
         pieces = spread(pieces or (), limit)
         self.side: str | None = None
         self.mode = "pieces" if protocol.mode == "pieces" or pieces else "drives"
@@ -80,7 +87,7 @@ class Scenes:
         self._batches: list[tuple[Sequence[Drive], list[Any]]]  # pieces or starts
         if self.mode == "pieces":
             if not pieces:
-                raise InputError(
+                raise NoPiece(
                     f"no piece of {protocol.length_s:g} s lies within valid truth; give a shorter length_s, "
                     "or mode=drives"
                 )
@@ -153,6 +160,13 @@ class Scenes:
             more = f" (and {len(self.skipped) - 1} more)" if len(self.skipped) > 1 else ""
             raise InputError(f"no drive can be scored: {next(iter(self.skipped.values()))}{more}")
         return starts
+
+
+def told_short(names: Sequence[str], of: int, protocol: Protocol) -> str:
+    """One line on drives of which no piece could be cut."""
+    known = " with a known attitude" if protocol.mode == "auto" else ""
+    mend = "a shorter length_s takes more of them, mode=drives all"
+    return told_unused(names, of, f"piece of {protocol.length_s:g} s{known}", mend)
 
 
 def spread(items: Sequence[Item], limit: int | None) -> list[Item]:

@@ -17,7 +17,7 @@ from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.masks import BiasLaw
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
-from dlkf.evaluation.protocol import Protocol, Scenes
+from dlkf.evaluation.protocol import NoPiece, Protocol, Scenes, told_short
 from dlkf.evaluation.scores import joined_scores
 from dlkf.evaluation.study import Run, run_scenes
 from dlkf.filters.model_based import Mbkf
@@ -47,21 +47,25 @@ class Work:
 class Part(NamedTuple):
     """What became of a share: its run, or why nothing of it can be scored."""
 
+    names: tuple[str, ...]
     run: Run | None
     mode: str
     rules: Mapping[str, Any]
     skipped: Mapping[str, str]
     sigma: Tensor | None  # (n, 3) of a made reference [m]
+    short: Sequence[str] = ()  # drives of which no piece could be cut
+    refused: InputError | None = None
 
 
 class Evaluated(NamedTuple):
-    """All shares together; ``truth`` says what a made reference is."""
+    """All shares together; ``truth`` says what a made reference is, ``short`` which drives have no piece."""
 
     run: Run
     mode: str
     rules: dict[str, Any]
     skipped: dict[str, str]
     truth: dict[str, str]
+    short: str
 
 
 def evaluate_shares(work: Work, shares: Sequence[tuple[str, ...]], parallel: int | str | None = None) -> Evaluated:
@@ -74,14 +78,20 @@ def evaluate_shares(work: Work, shares: Sequence[tuple[str, ...]], parallel: int
     skipped = {drive: why for part in parts for drive, why in part.skipped.items()}
     scorable = [part for part in parts if part.run is not None]
     if not scorable:
-        raise InputError(next(iter(parts[0].skipped.values()), "no drives: give a dataset with at least one"))
+        raise parts[0].refused or InputError("no drives: give a dataset with at least one")
     mode = "pieces" if any(part.mode == "pieces" for part in scorable) else "drives"
     kept = [part for part in scorable if part.mode == mode]
     run = joined([part.run for part in kept if part.run is not None])
+    of_other_mode = [part for part in scorable if part.mode != mode]  # no piece, where others have some
+    lost = {name for part in parts for name in part.short} | {name for part in of_other_mode for name in part.names}
+    names = [name for part in parts for name in part.names]
+    unused = [name for name in names if name in lost - set(skipped)]
+    short = told_short(unused, len(names), work.protocol) if unused else ""
     rules = {**kept[0].rules, "runs": sum(part.rules["runs"] for part in kept), "skipped": skipped}
+    rules |= {"too short": short} if short else {}
     sigmas = [part.sigma for part in kept if part.sigma is not None]
     truth = {"reference": Referenced([], torch.cat(sigmas), {}, work.reference).described()} if sigmas else {}
-    return Evaluated(run, mode, rules, skipped, truth)
+    return Evaluated(run, mode, rules, skipped, truth, short)
 
 
 def scored(work: Work, names: tuple[str, ...]) -> Part:
@@ -97,13 +107,15 @@ def scored(work: Work, names: tuple[str, ...]) -> Part:
                 made = referenced(drives, work.reference, work.smoother, work.align, progress)
             drives, sigma, left_out = made.drives, made.sigma, made.skipped
         scenes = Scenes(drives, work.protocol)
+    except NoPiece as error:
+        return Part(names, None, "", {}, {}, None, names, error)
     except InputError as error:
-        return Part(None, "", {}, {names[0]: str(error)}, None)
+        return Part(names, None, "", {}, {names[0]: str(error)}, None, refused=error)
     bar: Callable[[str], Any] = partial(_bar, work)
     run = run_scenes(
         work.filters, scenes, kinds=work.kinds, groups=work.groups, law=work.law, seed=work.seed, counting=bar
     )
-    return Part(run, scenes.mode, scenes.described(), {**left_out, **scenes.skipped}, sigma)
+    return Part(names, run, scenes.mode, scenes.described(), {**left_out, **scenes.skipped}, sigma, scenes.short)
 
 
 def joined(runs: Sequence[Run]) -> Run:

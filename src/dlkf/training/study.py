@@ -30,6 +30,7 @@ from dlkf.filters.saved import load_filter
 from dlkf.filters.shipped import shipped_folder, trained_filter
 from dlkf.provenance import provenance
 from dlkf.report.evaluation import write_report
+from dlkf.training.callbacks.curriculum import LengthCurriculum
 from dlkf.training.fit import fit
 from dlkf.training.settings import FitSettings, ScoringSettings, StudySettings
 from dlkf.tuning.baselines import Baselines, tuned_baselines
@@ -102,6 +103,7 @@ def run_study(
             **scenes.described(),
             "trained on": card,
             "gnss_noise": noise,
+            "left out": left_out(settings, data),
         },
         by_time=True,
         baseline=baseline,
@@ -117,6 +119,12 @@ def train_along(settings: StudySettings, data: DriveDataModule, folder: Path) ->
     data.setup()
     set_threads(settings.fit)
     fit(settings.fit, data, folder, False)
+
+
+def left_out(settings: StudySettings, data: DriveDataModule) -> list[str]:
+    """A line for every side on drives that are too short for its pieces, at the full length of a curriculum."""
+    grown = [c.full_s for c in settings.fit.callbacks if isinstance(c, LengthCurriculum)]
+    return data.left_out(max(grown, default=data.train_length_s))
 
 
 def set_threads(settings: FitSettings) -> None:

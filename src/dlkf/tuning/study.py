@@ -17,7 +17,7 @@ from dlkf.data.splits import Split, split_rows
 from dlkf.data.stack import DriveStack
 from dlkf.errors import InputError
 from dlkf.evaluation.metrics import OBJECTIVES
-from dlkf.evaluation.protocol import Protocol, Scenes
+from dlkf.evaluation.protocol import Protocol, Scenes, told_short
 from dlkf.evaluation.table import Table, as_markdown, number
 from dlkf.files import staged
 from dlkf.filters.build import build_causal, is_filter
@@ -37,6 +37,7 @@ class Tuned:
     after: Tuning
     trials: tuple[Trial, ...]
     errors: tuple[tuple[str, str, float, float], ...]
+    left_out: tuple[str, ...] = ()  # drives, and why
 
     @property
     def changed(self) -> dict[str, float]:
@@ -83,12 +84,18 @@ def sides(
     return out
 
 
-def withheld(drives: Sequence[Drive], protocol: Protocol, pieces: int | None = None) -> list[Batch]:
+def withheld(
+    drives: Sequence[Drive], protocol: Protocol, pieces: int | None = None, left_out: list[str] | None = None
+) -> list[Batch]:
     """Batches of drives with their outages, of at most so many pieces, spread evenly.
 
-    Raises InputError if no outage fits.
+    What is left out of them, and why, is added to ``left_out``. Raises InputError if no outage fits.
     """
-    kept = Scenes(drives, protocol, limit=pieces).withheld()
+    scenes = Scenes(drives, protocol, limit=pieces)
+    kept = scenes.withheld()
+    if left_out is not None:
+        short = [told_short(scenes.short, len(drives), protocol)] if scenes.short else []
+        left_out += [*scenes.skipped.values(), *short]
     if not any(bool((~b.available & b.truth_valid & b.present).any()) for b in kept):
         raise InputError("no outage fits into the valid truth of the training drives; see outage.* and length_s")
     return kept
@@ -106,7 +113,8 @@ def search(
     pieces: int | None,
 ) -> Tuned:
     """Fit on ``drives["train"]``, then errors before and after on both sides."""
-    training = withheld(drives["train"], protocol, pieces)
+    left_out: list[str] = []
+    training = withheld(drives["train"], protocol, pieces, left_out)
     trials: list[Trial] = []
     most = rounds * sum(map(len, factors_of(model).values()))
     with counting(f"Tuning {model}") as progress:
@@ -118,12 +126,12 @@ def search(
         after, _ = tuned(imu, training, name=model, start=start, objective=objective, rounds=rounds, progress=tell)
     batches = {"train": training}
     if drives["test"]:
-        batches["test"] = withheld(drives["test"], protocol)
+        batches["test"] = withheld(drives["test"], protocol, left_out=left_out)
     old, new = (build_causal(model, imu, "tuning does not", tuning=t) for t in (start, after))
     errors = [
         (side, o, outage_error(old, b, o), outage_error(new, b, o)) for side, b in batches.items() for o in OBJECTIVES
     ]
-    return Tuned(model, start, after, tuple(trials), tuple(errors))
+    return Tuned(model, start, after, tuple(trials), tuple(errors), tuple(left_out))
 
 
 def tuning_table(result: Tuned, dataset: str) -> Table:
@@ -136,7 +144,7 @@ def tuning_table(result: Tuned, dataset: str) -> Table:
     return Table(
         title=f"{result.model} on {dataset}: {factors}",
         note="Horizontal error at the end of the outages [m]: geometric mean (log), RMS and median over them. Fitted "
-        "on the training drives alone.",
+        + "".join(["on the training drives alone.", *(f" Left out: {line}." for line in result.left_out)]),
         columns=["Drives", "Objective", "Before", "After", "Ratio"],
         rows=rows,
     )
