@@ -28,10 +28,14 @@ COMMANDS = {
     "register": "the model of a run into the registry",
     "ui": "MLflow's pages over the runs of this folder",
 }
-COMPLETION = """_dlkf() {
-  local word="${COMP_WORDS[COMP_CWORD]}"
-  COMPREPLY=($(compgen -W "$(dlkf complete "${COMP_WORDS[1]}" "$word" 2>/dev/null)" -- "$word"))
-  [ ${#COMPREPLY[@]} -eq 1 ] && [[ ${COMPREPLY[0]} == *= ]] && compopt -o nospace
+COMPLETION = r"""_dlkf() {
+  local line="${COMP_LINE:0:COMP_POINT}" word="" done="" words
+  read -ra words <<< "$line"
+  [[ $line == *[[:space:]] ]] || { word="${words[-1]}"; unset 'words[-1]'; }
+  [[ $COMP_WORDBREAKS == *=* && $word == *=* ]] && done="${word%=*}="
+  COMPREPLY=($(compgen -W "$(dlkf complete "$word" "${words[@]:1}" 2>/dev/null)" -- "$word"))
+  COMPREPLY=("${COMPREPLY[@]#"$done"}")
+  [[ ${#COMPREPLY[@]} -eq 1 && ${COMPREPLY[0]} == *[.=] ]] && compopt -o nospace
 }
 complete -o default -F _dlkf dlkf
 """
@@ -49,7 +53,7 @@ def main() -> None:
         elif word == "completion":
             print(COMPLETION, end="")
         elif word == "complete":
-            print("\n".join(candidates(*(rest + ["", ""])[:2])))
+            print("\n".join(candidates(*(rest or [""]))))
         elif word in COMMANDS:
             sys.argv = [sys.argv[0].replace("__main__.py", "dlkf"), *rest]
             os.environ["DLKF_COMMAND"] = f"dlkf {word}"
@@ -79,29 +83,17 @@ def usage() -> str:
     )
 
 
-def candidates(command: str, word: str) -> list[str]:
-    """Words that may stand here: commands, keys of a command, presets of a key that has some."""
-    import yaml
-
+def candidates(word: str, *before: str) -> list[str]:
+    """Words that may stand for this one: commands, keys of the command before it, nested ones, presets, values."""
+    if not before or before[0] not in COMMANDS:
+        return [c for c in COMMANDS if c.startswith(word)]
     from dlkf.config import config_dir
 
-    if command not in COMMANDS or command == word:
-        return [c for c in COMMANDS if c.startswith(word)]
-    key, equals, _ = word.partition("=")
-    file = config_dir() / f"{command}.yaml"
-    if not file.is_file():
+    if not (config_dir() / f"{before[0]}.yaml").is_file():
         return []
-    content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    groups: dict[str, str] = {}
-    for entry in content.pop("defaults", []):
-        for name in entry if isinstance(entry, dict) else {}:
-            if not name.startswith("override"):
-                folder, _, shown = name.partition("@")
-                groups[shown or folder] = folder
-    if equals:
-        folder = config_dir() / groups.get(key.lstrip("+"), key.lstrip("+"))
-        return sorted(f"{key}={p.stem}" for p in folder.glob("*.yaml")) if folder.is_dir() else []
-    return sorted(f"{k}=" for k in {*content, *groups} - {"hydra"})
+    from dlkf.command.completion import completed
+
+    return completed(before[0], word, before[1:])
 
 
 if __name__ == "__main__":

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import os
+import pty
 import re
+import select
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.core_plugins.bash_completion import BashCompletion
+from hydra._internal.utils import create_config_search_path
 
 import dlkf
-from dlkf.__main__ import COMMANDS, candidates, main
+from dlkf.__main__ import COMMANDS, COMPLETION, candidates, main
 from dlkf.command.arguments import readable
 from dlkf.config import config_dir
 from dlkf.data.schema import drive_file
+from tests.shell import PATIENCE_S
 
 EVALUATE = ("rate_hz=10", "length_s=60", "outage.first_s=20", "outage.duration_s=20", "injected_bias=null")
 EVALUATE += ("tracking.log=false",)
@@ -47,10 +56,58 @@ def test_every_command_has_a_module_and_every_configured_one_is_listed():
 
 
 def test_completion_knows_commands_keys_and_presets():
-    assert candidates("ev", "ev") == ["evaluate"]
-    assert {"model=", "imu=", "reference="} <= set(candidates("evaluate", ""))
-    assert "imu=consumer" in candidates("navigate", "imu=") and "dataset=city" in candidates("simulate", "dataset=")
-    assert candidates("navigate", "out=") == []
+    assert candidates("ev") == ["evaluate"] and candidates("") == list(COMMANDS)
+    assert {"model=", "imu=", "imu.", "outage.", "reference="} <= set(candidates("", "evaluate"))
+    assert candidates("imu=cons", "navigate") == ["imu=consumer"]
+    assert "dataset=city" in candidates("dataset=", "simulate") and "model=plus" in candidates("model=", "train")
+    assert candidates("out=", "navigate") == [] == candidates("", "ui")
+
+
+def test_completion_goes_into_nested_keys_as_hydra_does():
+    """And further: lists and switches get values, keys that presets of the same line bring are known."""
+    assert {"scoring.outage.", "scoring.after_s=", "scoring.seed="} <= set(candidates("scoring.", "train"))
+    assert candidates("scoring.outage.fir", "train") == ["scoring.outage.first_s="]
+    assert candidates("++trainer.acc", "train") == ["++trainer.accelerator="]
+    assert "+experiment=plus" in candidates("+experiment=", "train") and candidates("+exp", "train") == ["+experiment="]
+    assert candidates("align.from_rest=", "evaluate") == ["align.from_rest=false", "align.from_rest=true"]
+    assert "dataset.gnss." in candidates("dataset.", "simulate", "dataset=city")
+    assert candidates("outage.d", "evaluate", "imu=nonsense", "mode") == ["outage.duration_s="]  # a line in the making
+    loader = ConfigLoaderImpl(create_config_search_path(str(config_dir())))
+    for command, word in (("train", "scoring."), ("evaluate", "imu.accel."), ("ingest", "")):
+        theirs = BashCompletion(loader)._query(command, word)
+        ours = {w.rstrip(".=") for w in candidates(word, command)}
+        folders = {p.name for p in config_dir().iterdir() if p.is_dir()}  # of other commands: Hydra offers all
+        assert {w.rstrip(".=") for w in theirs} - folders - {"hydra"} <= ours
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
+@pytest.mark.parametrize(
+    ("typed_", "becomes"),
+    [
+        ("dlkf evaluate imu=cons", "imu=consumer "),
+        ("dlkf evaluate imu=consumer outage.dur", "outage.duration_s="),
+        ("dlkf train scoring.out", "scoring.outage"),
+        ("dlkf nav", "navigate "),
+    ],
+)
+def test_completion_in_bash(typed_, becomes, tmp_path):
+    """A key of Tab at a prompt; bash breaks words at an equals sign, and puts the rest in behind it."""
+    (tmp_path / "rc").write_text(f"dlkf() {{ {sys.executable} -m dlkf \"$@\"; }}\nPS1=ready\n{COMPLETION}")
+    child, screen = pty.fork()
+    if child == 0:
+        os.execlp("bash", "bash", "--noprofile", "--rcfile", str(tmp_path / "rc"), "-i")
+    seen, end, sent = "", time.monotonic() + PATIENCE_S, False
+    try:
+        while f"{typed_.rpartition(' ')[0]} {becomes}" not in seen and time.monotonic() < end:
+            if select.select([screen], [], [], 1.0)[0]:
+                seen += os.read(screen, 4096).decode(errors="replace").replace("\a", "")  # a bell for several matches
+            if not sent and "ready" in seen:
+                sent = os.write(screen, f"{typed_}\t".encode()) > 0
+        assert f"{typed_.rpartition(' ')[0]} {becomes}" in seen, seen
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        os.close(screen)
 
 
 @pytest.mark.parametrize(

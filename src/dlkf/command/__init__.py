@@ -70,7 +70,7 @@ def command(
                 print(help_text(name, GROUPS.get(name, {})))
                 return
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors reach us whole instead of Hydra's exit
-            given = [_with_group(argument, GROUPS.get(name, {})) for argument in arguments(sys.argv[1:])]
+            given = [with_group(argument, GROUPS.get(name, {})) for argument in arguments(sys.argv[1:])]
             sys.argv[1:] = [readable(argument) for argument in given]
             stopped_by.clear()
             # SIGINT is ignored by what a shell started in the background, and stays so
@@ -119,7 +119,7 @@ def _stop(number: int, _: object) -> NoReturn:
     raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
 
 
-def _with_group(argument: str, groups: dict[str, str]) -> str:
+def with_group(argument: str, groups: dict[str, str]) -> str:
     key, equals, value = argument.partition("=")
     if equals and key == "outage" and value in ("null", "none", "off", "false"):
         return "~outage"  # how Hydra takes a preset out

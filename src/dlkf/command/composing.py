@@ -17,10 +17,10 @@ NOT_HASHED = ("tracking", "resume")
 NOT_HASHED_OF_TRAINER = ("devices", "strategy")  # the same training on more processes
 
 
-def composed(command: str, *overrides: str) -> dict[str, Any]:
+def composed(command: str, *overrides: str, resolve: bool = True) -> dict[str, Any]:
     """What a command is given with these words, without running it."""
     with initialize_config_dir(str(config_dir()), version_base="1.3"):
-        return plain(compose(command, overrides=list(overrides)))
+        return plain(compose(command, overrides=list(overrides)), resolve=resolve)
 
 
 def imu_preset(name: str) -> ImuSpec:
@@ -36,8 +36,8 @@ def configuration_hash(values: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()[:8]
 
 
-def plain(config: DictConfig) -> dict[str, Any]:
+def plain(config: DictConfig, *, resolve: bool = True) -> dict[str, Any]:
     """Mappings, lists and values, with what refers to other keys filled in."""
-    made = OmegaConf.to_container(config, resolve=True)
+    made = OmegaConf.to_container(config, resolve=resolve)
     assert isinstance(made, dict)
     return {str(key): value for key, value in made.items()}
