@@ -6,7 +6,8 @@
 Pieces of 60 s with GNSS, an outage, and 5 s after it, from the truth plus an error of 0.1 m, 0.1 m/s, 1° and 2° (1σ);
 simulated and semi-real pieces end to end, real ones every 10 s. Nobody is told the IMU: the classical filters start
 from an automotive MEMS and have factors tuned by the geometric mean on pieces of the training drives, which are kept
-in <out>/factors.yaml; one of them a second time, by gradient instead of search (:mod:`dlkf.tuning.descent`).
+in <out>/factors.yaml: the best of the searches that begin with no factors and with those of the filters before it;
+one of them a second time, by gradient instead of search (:mod:`dlkf.tuning.descent`).
 Beside them stands ``mbkf33_car`` that is told the preset of the drive's IMU, where it has one, and has its tuned
 factors but those of the IMU: no rival, but what such knowledge is worth. Prints, and writes into <out>, Markdown tables
 of the horizontal error at the end of the outages: all filters, then trainings from other seeds (``--model`` takes
@@ -93,7 +94,10 @@ def opponents(train: Sequence[str], out: Path) -> dict[str, Estimator]:
                 assert isinstance(kalman, Mbkf)
                 factors = descended(kalman, pieces[0], end_of(60.0, pieces[0]))
             else:
-                factors, _ = tuned(spec, pieces, name=name, start=Tuning(), objective="log", rounds=2)
+                before = CLASSICAL[: CLASSICAL.index(name)]
+                starts = (Tuning(), *(Tuning(**known[n]) for n in before if n in known))
+                searches = (tuned(spec, pieces, name=name, start=s, objective="log", rounds=2) for s in starts)
+                factors, _ = min(searches, key=lambda found: found[1])
             known[name] = asdict(factors)
             error = outage_error(build_causal(filter_of(name), spec, "tuning does not", tuning=factors), pieces)
             print(f"{name}: {error:.2f} m geometric mean on {pieces[0].size[0]} training pieces", flush=True)
