@@ -37,10 +37,10 @@ class Watched(CarConstraints):
 
     found: ClassVar[list[torch.Tensor]] = []
 
-    def rows(self, epoch, memory, believed):
-        rows, memory = super().rows(epoch, memory, believed)
-        self.found.append(rows.used[:, 2])
-        return rows, memory
+    def resting(self, epoch, turning, P, memory):
+        resting, liveliness = super().resting(epoch, turning, P, memory)
+        self.found.append(resting)
+        return resting, liveliness
 
 
 def found(batch):

@@ -63,7 +63,7 @@ class CarConstraints:
         """NHC (2 rows), zero velocity (3), zero angular rate (3)."""
         zn, Hn, moving = self._across(epoch, believed.structure)
         zr, Hr = self._standing(epoch)
-        resting, liveliness = at_rest(epoch, zr[:, 3:], believed.P, memory.liveliness, memory.prior)
+        resting, liveliness = self.resting(epoch, zr[:, 3:], believed.P, memory)
         resting = resting.unsqueeze(-1)
         used = torch.cat(((moving.unsqueeze(-1) & ~resting).expand(-1, 2), resting.expand(-1, 6)), -1)
         variance = memory.std.square().expand(len(zn), -1)
@@ -73,6 +73,12 @@ class CarConstraints:
             zn = zn + epoch.advice.offset
         z = torch.cat((zn, zr), -1) * used
         return Measurement(z, torch.cat((Hn, Hr), 1), variance, used), memory._replace(liveliness=liveliness)
+
+    def resting(
+        self, epoch: Epoch, turning: Float[Tensor, "B 3"], P: Float[Tensor, "B n n"], memory: CarMemory
+    ) -> tuple[Bool[Tensor, " B"], Liveliness]:
+        """Whether the car stood in the window, and what has been heard of it since."""
+        return at_rest(epoch, turning, P, memory.liveliness, memory.prior)
 
     def _across(
         self, epoch: Epoch, structure: Float[Tensor, "B 4"] | None

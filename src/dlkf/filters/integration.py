@@ -179,7 +179,7 @@ def advance(
 def _rate_before(rates: Tensor, late: Tensor, count: int) -> Tensor:
     """Mean of the ``count`` samples (B, M, 3) that end nearest to ``late`` (B,) samples before the window's end."""
     M = rates.shape[1]
-    end = M - late.round().clamp(0, M - count).unsqueeze(-1)
+    end = M - (late + 0.5).floor().clamp(0, M - count).unsqueeze(-1)
     sample = torch.arange(M, dtype=late.dtype, device=late.device)
     counts = ((sample < end) & (sample >= end - count)).to(rates.dtype)
     return torch.bmm(counts.unsqueeze(1), rates).squeeze(1) / count
