@@ -10,10 +10,10 @@ from scipy.stats import chi2
 from dlkf.errors import InputError
 from dlkf.filters.build import MODEL_BASED, build_filter
 from dlkf.filters.integration import integrate
-from dlkf.filters.model_based import Ins, Mbkf, kalman_update
+from dlkf.filters.model_based import Ins, Mbkf, bias_sigma, kalman_update
 from dlkf.filters.tuning import Prior
 from dlkf.navigation.error_model import antenna
-from dlkf.navigation.state import NavState
+from dlkf.navigation.state import ErrorStates, NavState
 from dlkf.navigation.strapdown import strapdown
 
 from .scene import IMU, scene
@@ -166,6 +166,14 @@ def test_the_antenna_of_a_late_fix_swings_with_the_rate_of_its_own_time():
         state = window.end
     late = replace(late, gnss=torch.stack(rows, 1))
     assert integrate(late, Mbkf(IMU)).innovation.abs().max() < 1e-4  # what an orthonormal C loses by interpolation
+
+
+@pytest.mark.parametrize(("matrix", "level", "down"), [("none", 3, 4), ("scale", 3, 0), ("full", 0, 0)])
+def test_what_a_filter_has_no_states_for_is_a_bias_of_gravity(matrix, level, down):
+    """M f of a level car, f = (0, 0, −g): misalignment on the level axes, scale factor on the axis down."""
+    turned = replace(IMU.accel, turn_on_bias=0.0, instability=0.0, misalignment=3e-3, scale_factor=4e-3)
+    found = bias_sigma(replace(IMU, accel=turned), ErrorStates(matrix))[:3] / 9.80665e-3
+    assert found.tolist() == pytest.approx([level, level, down], abs=1e-9)
 
 
 def test_prior_mean_starts_the_bias():
