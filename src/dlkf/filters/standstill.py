@@ -42,11 +42,12 @@ class Liveliness(NamedTuple):
         nothing = like.new_full((batch_size,), math.inf)
         return cls(nothing, nothing, like.new_zeros(batch_size))
 
-    def limit(self, prior: Float[Tensor, " 1"]) -> Float[Tensor, " B"]:
-        """Half way, as logarithms, between standing and moving; near silence where the two sound alike."""
+    def limit(self, prior: Float[Tensor, " 1"]) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
+        """Half way, as logarithms, between standing and moving, near silence where they sound alike; do they not?"""
         moving = torch.where(self.moving.isinf(), prior, self.moving)
         standing = torch.where(self.standing.isinf(), moving / APART, self.standing)
-        return torch.where(moving > TELLING * standing, (standing * moving).sqrt(), prior / APART)
+        told = moving > TELLING * standing
+        return torch.where(told, (standing * moving).sqrt(), prior / APART), told
 
     def heard(self, now: Tensor, standing: Tensor, moving: Tensor, span: float) -> Liveliness:
         """After a window of ``span`` seconds in which the car surely stood, or moved, or neither."""
@@ -78,5 +79,7 @@ def at_rest(
     sure = fixed & (std < SURE_STD)
     after = before.heard(lively, sure & (speed + std < STANDING_SPEED), sure & (speed - std > MOVING_SPEED), span)
     alone = torch.where(fixed, 0.0, before.alone + span)
-    plausible = speed < PLAUSIBLE_SPEED + PLAUSIBLE_SIGMAS * torch.maximum(std, LEAST_STD_RATE * alone)
-    return (lively <= after.limit(prior)) & still & plausible, after._replace(alone=alone)
+    limit, told = after.limit(prior)
+    doubt = torch.where(told, torch.maximum(std, LEAST_STD_RATE * alone), std)
+    plausible = speed < PLAUSIBLE_SPEED + PLAUSIBLE_SIGMAS * doubt
+    return (lively <= limit) & still & plausible, after._replace(alone=alone)
