@@ -63,6 +63,7 @@ def main(told: NavigateSettings) -> None:
         with counting("Finding the noise") as progress:
             model, found_on, found = untold(drives, told.model, spec, tuning, told.align, progress=progress)
         print("found: " + ", ".join(f"{k} {v:.2g}" for k, v in found.described().items()))
+        print(found.told_of_fixes())
         spec, tuning = found.imu, found.tuning
     if told.smoother is not None:
         model = smoothed(model, told.smoother)

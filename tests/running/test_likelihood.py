@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import torch
 import yaml
 
 from dlkf.data.segments import whole_drives
+from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.running import likelihood
-from dlkf.running.likelihood import Evidence, find_noise
+from dlkf.running.likelihood import Evidence, Found, Placing, find_noise, placed
 from dlkf.running.start import align
 from tests.cars import IMU, car_batch, write_pieces
 
@@ -27,8 +30,6 @@ def long_town(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def drives(long_town):
-    from dlkf.data.store import load_dataset
-
     return load_dataset(long_town, rate_hz=20, epoch_s=1.0, dtype=torch.float64, reference=False)
 
 
@@ -73,7 +74,7 @@ def test_fixes_that_are_late_are_found_out(drives):
     pull = torch.gradient(d.gnss_v_e, dim=0)[0]
     was = replace(d, gnss_r_e=d.gnss_r_e - 0.2 * d.gnss_v_e + 0.02 * pull, gnss_v_e=d.gnss_v_e - 0.2 * pull)
     evidence = Evidence.of([was])
-    at = {late: evidence.surprise("mbkf15", IMU, Tuning(), late) for late in (0.0, 0.1, 0.2, 0.3)}
+    at = {late: evidence.surprise("mbkf15", IMU, Tuning(), Placing(late)) for late in (0.0, 0.1, 0.2, 0.3)}
     assert min(at, key=at.get) == 0.2
 
 
@@ -81,6 +82,29 @@ def test_fixes_that_are_late_are_found_out(drives):
 def coarse(monkeypatch):
     """A search in one step size, for what comes behind it."""
     monkeypatch.setattr(likelihood, "STEPS", (4.0,))
+
+
+@pytest.mark.parametrize(("delay_s", "arm_m", "near"), [
+    (0.0, 0.0, (0.04, 0.0)), (0.05, 0.0, (0.08, 0.0)), (0.2, 0.0, (0.16, 0.0)), (0.0, 0.5, (0.04, 0.0)),
+])  # fmt: skip
+def test_a_delay_is_told_from_a_wrong_lever_arm(long_town, tmp_path, delay_s, arm_m, near):
+    """The IMU's clock runs ``delay_s`` behind, so fixes come late by as much; the arm is told ``arm_m`` too long.
+
+    From where a search in steps of 0.08 s might have ended; 0.04 s is what 0.5 m look like at 12 m/s.
+    """
+    shutil.copytree(long_town, tmp_path / "town")
+    for path in (tmp_path / "town").glob("imu/*/*.parquet"):
+        table = pd.read_parquet(path, partitioning=None)
+        table.assign(t=table["t"] - delay_s).to_parquet(path, index=False)
+    drives = load_dataset(tmp_path / "town", rate_hz=20, epoch_s=1.0, dtype=torch.float64, reference=False)
+    arm = torch.tensor([arm_m, 0.0, 0.0])
+    told = [replace(d, lever_arm_b=d.lever_arm_b + arm).part(0, 110) for d in drives]
+    placing, std = placed(Evidence.of(told), "mbkf15", IMU, Tuning(), Placing(*near))
+    assert std.delay_s < 0.01 and std.ahead_m < 0.2  # 2 to 5 ms and 5 to 15 cm: five minutes of cm fixes
+    assert placing.delay_s == (pytest.approx(delay_s, abs=4 * std.delay_s) if delay_s else 0.0)
+    assert placing.ahead_m == (pytest.approx(-arm_m, abs=4 * std.ahead_m) if arm_m else 0.0)
+    said = Found(IMU, Tuning(), placing, std, 0.0, 0.0).told_of_fixes()
+    assert ("not late" in said) == (not delay_s) and ("further back" in said) == bool(arm_m)
 
 
 def test_the_command_writes_what_the_others_take(uri, call, long_town, coarse):

@@ -10,6 +10,12 @@ that a few wild fixes do not decide (Lange, Little & Taylor, JASA 84, 1989):
 
 averaged over the fixes that were used and over those that were withheld, half and half. A wide log-normal prior about
 the preset of the start keeps values that the drives say nothing of.
+
+Fixes that are late by τ and an antenna that sits a further forward than told are two explanations of nearly the same:
+the positions are τ v or a from where they should be; only the spread of the speeds and the velocities tell them
+apart. So both are sought, and one is taken only where it is surer than 3σ beside the other. σ² is the diagonal of the
+sandwich H⁻¹ J H⁻¹ (White, Econometrica 50, 1982; H the curvature, J the scatter of the slopes of spans of 30 s), which
+holds for neighbouring innovations that hang together.
 """
 
 from __future__ import annotations
@@ -22,6 +28,7 @@ from typing import Any, NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.drive import Batch, Drive
@@ -43,9 +50,36 @@ OF_GNSS = ("position_std", "velocity_std")
 OF_CAR = ("lateral_std", "vertical_std")
 STEPS = (4.0, 2.0, 1.4)  # factors by which a value is tried up and down, ever finer
 LONGEST_DELAY_S = 0.4
+DELAY_STEP_S = 0.02  # times STEPS
+SLIGHT_S = 0.005  # for slopes and curvature
+SPAN_S = 30.0  # of a drive, whose innovations count as one for the scatter
+WAYS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1))  # late, ahead, and one for the other
+SURE = 3.0  # σ from which on a delay or a place of the antenna is taken
 SURE_GAIN = 1e-3  # of the mean: less is no gain
 USUAL, USUAL_OF_CAR = math.log(30.0), math.log(3.0)  # 1σ of ln(value / that at the start): keeps what nothing shows
 LARGEST = {"accel.turn_on_bias": 1.0, "gyro.turn_on_bias": 0.1}  # m/s², rad/s
+
+
+class Placing(NamedTuple):
+    """Where in time and place the fixes are beside what the drives say."""
+
+    delay_s: float = 0.0  # by which the fixes are older than their stamps
+    ahead_m: float = 0.0  # by which the antenna sits further forward than told
+
+    def of(self, batch: Batch) -> Batch:
+        """The batch with fixes so placed."""
+        if not any(self):
+            return batch
+        lag = (batch.gnss_lag + self.delay_s).clamp(max=0.99 * batch.epoch_s)
+        return replace(batch, gnss_lag=lag, lever_arm_b=batch.lever_arm_b + _forward(self.ahead_m, batch.lever_arm_b))
+
+    def of_drive(self, drive: Drive) -> Drive:
+        """The drive with fixes so placed."""
+        lag = (drive.gnss_lag + self.delay_s).clamp(max=0.99 * drive.epoch_s)
+        return replace(drive, gnss_lag=lag, lever_arm_b=drive.lever_arm_b + _forward(self.ahead_m, drive.lever_arm_b))
+
+
+AS_TOLD = Placing()
 
 
 class Found(NamedTuple):
@@ -53,7 +87,8 @@ class Found(NamedTuple):
 
     imu: ImuSpec
     tuning: Tuning
-    delay_s: float  # by which the fixes are older than their stamps
+    placing: Placing  # zero where it is not sure
+    placing_std: Placing  # 1σ, also of what was not sure; NaN where none was sought
     before: float
     after: float
 
@@ -64,7 +99,19 @@ class Found(NamedTuple):
             for name, sensor in (("accel", self.imu.accel), ("gyro", self.imu.gyro))
             for key in OF_SENSORS
         }
-        return sensors | {key: getattr(self.tuning, key) for key in (*OF_GNSS, *OF_CAR)} | {"delay_s": self.delay_s}
+        factors = {key: getattr(self.tuning, key) for key in (*OF_GNSS, *OF_CAR)}
+        return sensors | factors | self.placing._asdict()
+
+    def told_of_fixes(self) -> str:
+        """One line on delay and antenna; empty where nothing was sought."""
+        (late, ahead), (late_std, ahead_std) = self.placing, self.placing_std
+        if math.isnan(late_std):
+            return ""
+        way = "forward" if ahead > 0 else "back"
+        far = f"{abs(ahead):.2f} m ± {ahead_std:.2f} m further {way} than lever_arm_m says"
+        when = f"{late:.3f} s ± {late_std:.3f} s late" if late else f"not late that one could tell (± {late_std:.3f} s)"
+        where = far if ahead else f"where lever_arm_m says (± {ahead_std:.2f} m along the car)"
+        return f"the fixes are {when}; the antenna sits {where}"
 
 
 @dataclass(frozen=True)
@@ -98,16 +145,33 @@ class Evidence:
         """How many are scored."""
         return int(self.offered.sum())
 
-    def surprise(self, name: str, imu: ImuSpec, tuning: Tuning, delay_s: float = 0.0) -> float:
+    @property
+    def pace(self) -> float:
+        """Mean speed of the fixes [m/s], 1 at least."""
+        speed = self.batch.gnss[..., 3:5].norm(dim=-1)
+        seen = speed[self.batch.gnss_valid[..., 3:5].all(-1) & self.batch.present]
+        return max(float(seen.mean()), 1.0) if len(seen) else 1.0
+
+    def surprise(self, name: str, imu: ImuSpec, tuning: Tuning, placing: Placing = AS_TOLD) -> float:
         """Mean −ln p of the fixes; infinite where the filter diverges."""
-        batch = self.batch
-        if delay_s:
-            batch = replace(batch, gnss_lag=(batch.gnss_lag + delay_s).clamp(max=0.99 * batch.epoch_s))
+        value = float(self.shares(name, imu, tuning, placing).sum())
+        return value if math.isfinite(value) else math.inf
+
+    def shares(self, name: str, imu: ImuSpec, tuning: Tuning, placing: Placing) -> Float[Tensor, "B T"]:
+        """What every fix adds to that mean; 0 without one."""
+        batch = placing.of(self.batch)
         solution = run_filter(batch, build_causal(name, imu, "this does not", tuning=tuning), keep_covariances=True)
-        used, withheld = _used(solution), _withheld(batch, solution, tuning)
-        told = self.offered & batch.available
-        value = 0.5 * (used[told].mean() + withheld[self.offered & ~batch.available].mean())
-        return float(value) if bool(value.isfinite()) else math.inf
+        told, kept = self.offered & batch.available, self.offered & ~batch.available
+        out = torch.zeros_like(batch.gnss_lag)
+        out[told] = 0.5 * _used(solution)[told] / told.sum()
+        out[kept] = 0.5 * _withheld(batch, solution, tuning)[kept] / kept.sum()
+        return out
+
+    def spans(self, shares: Float[Tensor, "B T"]) -> Float[Tensor, " n"]:
+        """Their sums over spans of a drive, the drive's copies together."""
+        kinds, long = 1 + len(GAPS_S), max(1, round(SPAN_S / self.batch.epoch_s))
+        per_drive = shares.unflatten(0, (-1, kinds)).sum(1)
+        return pad(per_drive, (0, -per_drive.shape[1] % long)).unflatten(1, (-1, long)).sum(-1).flatten()
 
 
 def _used(solution: Solution) -> Float[Tensor, "B T"]:
@@ -148,7 +212,7 @@ def find_noise(
 
     A search along one value after the other, from ``imu`` and ``tuning`` on, in ever finer steps. It begins with noise
     and biases of both sensors together, for a preset is as a rule wrong in all of them. ``delay``: the age of the fixes
-    too. Raises InputError where the drives have no fix to score.
+    and the antenna's place along the car too. Raises InputError where the drives have no fix to score.
     """
     sensors = [(s, k) for s in ("accel", "gyro") for k in OF_SENSORS]
     x = {f"{s}.{k}": max(float(getattr(getattr(imu, s), k)), 1e-7) for s, k in sensors}
@@ -156,54 +220,127 @@ def find_noise(
     x |= {k: float(getattr(tuning, k)) for k in (*OF_GNSS, *(OF_CAR if car else ()))}
     start, usual = dict(x), {k: USUAL_OF_CAR if k in OF_CAR else USUAL for k in x}
     directions = [tuple(k for k in x if k.startswith(s)) for s in ("accel", "gyro")] + [(k,) for k in x]
+    pace = evidence.pace
+    shifts = [Placing(DELAY_STEP_S * late, DELAY_STEP_S * pace * ahead) for late, ahead in WAYS]
     done, most = 0, 4 * len(STEPS) * len(directions)
 
-    def judged(values: Mapping[str, float], late: float) -> float:
+    def judged(values: Mapping[str, float], placing: Placing) -> float:
         nonlocal done
         done += 1
         if progress is not None:
             progress(min(done, most), most)
-        if any(values[k] > limit for k, limit in LARGEST.items()):
+        if any(values[k] > limit for k, limit in LARGEST.items()) or not 0 <= placing.delay_s <= LONGEST_DELAY_S:
             return math.inf
         away = sum(0.5 * (math.log(v / start[k]) / usual[k]) ** 2 for k, v in values.items())
-        return evidence.surprise(name, *_built(values, imu, tuning, called), late) + away / evidence.fixes
+        return evidence.surprise(name, *_built(values, imu, tuning, called), placing) + away / evidence.fixes
 
-    before = best = judged(x, 0.0) if evidence.fixes else math.inf
-    if not math.isfinite(best):
+    def sought(
+        x: Mapping[str, float], placing: Placing, best: float, steps: Sequence[float], shifts: Sequence[Placing]
+    ) -> tuple[Mapping[str, float], Placing, float]:
+        for step in steps:
+            moved = True
+            for _ in range(4):
+                if not moved:
+                    break
+                moved = False
+                for direction in directions:
+                    for factor in (step, 1 / step):
+                        tried = {k: factor * v if k in direction else v for k, v in x.items()}
+                        while (value := judged(tried, placing)) < best - SURE_GAIN:
+                            best, x, moved = value, tried, True
+                            tried = {k: factor * v if k in direction else v for k, v in x.items()}
+                for shift in shifts:
+                    while (value := judged(x, there := _moved(placing, shift, step))) < best - SURE_GAIN:
+                        best, placing, moved = value, there, True
+        return x, placing, best
+
+    before = judged(x, AS_TOLD) if evidence.fixes else math.inf
+    if not math.isfinite(before):
         raise InputError("no noise can be found: it takes two minutes with fixes, and a filter that does not diverge")
-    late = 0.0
-    for step in STEPS:
-        moved = True
-        for _ in range(4):
-            if not moved:
-                break
-            moved = False
-            for direction in directions:
-                for factor in (step, 1 / step):
-                    tried = x | {k: factor * x[k] for k in direction}
-                    while (value := judged(tried, late)) < best - SURE_GAIN:
-                        best, x, moved = value, tried, True
-                        tried = x | {k: factor * x[k] for k in direction}
-            if delay:
-                for shift in (0.02 * step, -0.02 * step):
-                    while 0 <= late + shift <= LONGEST_DELAY_S and judged(x, late + shift) < best - SURE_GAIN:
-                        late, moved = late + shift, True
-                        best = judged(x, late)
-    return Found(*_built(x, imu, tuning, called), late, before, best)
+    x, placing, best = sought(x, AS_TOLD, before, STEPS, shifts if delay else ())
+    unknown = Placing(math.nan, math.nan)
+    if not delay:
+        return Found(*_built(x, imu, tuning, called), placing, unknown, before, best)
+    coarse = placing
+    placing, std = placed(evidence, name, *_built(x, imu, tuning, called), coarse)
+    if placing != coarse:
+        best = judged(x, placing)
+        x, placing, best = sought(x, placing, best, STEPS[1:], ())
+    return Found(*_built(x, imu, tuning, called), placing, std, before, best)
 
 
 def untold(
     drives: Sequence[Drive], name: str, imu: ImuSpec, tuning: Tuning, align: AlignConfig, **given: Any
 ) -> tuple[Estimator, list[Drive], Found]:
-    """A Kalman filter that finds its noise on the drives themselves, and the drives with the age of their fixes.
+    """A Kalman filter that finds its noise on the drives themselves, and the drives with their fixes so placed.
 
     InputError for a filter that is told nothing anyway, or told more than noise.
     """
     if not is_filter(name) or name == "ins" or "prior" in name.split("_"):
         raise InputError(f"imu=auto finds the noise of a Kalman filter, model={name} takes none; leave imu out")
     found = find_noise(Evidence.of(drives, align=align), name, imu, tuning, **given)
-    late = [replace(d, gnss_lag=(d.gnss_lag + found.delay_s).clamp(max=0.99 * d.epoch_s)) for d in drives]
-    return build_causal(name, found.imu, "imu=auto does not", tuning=found.tuning), late, found
+    placed = [found.placing.of_drive(d) for d in drives]
+    return build_causal(name, found.imu, "imu=auto does not", tuning=found.tuning), placed, found
+
+
+def placed(
+    evidence: Evidence, name: str, imu: ImuSpec, tuning: Tuning, placing: Placing
+) -> tuple[Placing, Placing]:
+    """Delay and place to a fraction of their 1σ, zero where they are not sure beside each other, and their 1σ."""
+    unit = torch.tensor([1.0, evidence.pace], dtype=torch.float64)  # so that both are in seconds
+    at, std = torch.tensor(placing, dtype=torch.float64) / unit, torch.zeros(2, dtype=torch.float64)
+    free = [0, 1]
+
+    def spans(of: Tensor) -> Tensor:
+        return evidence.spans(evidence.shares(name, imu, tuning, Placing(*(of * unit).tolist())))
+
+    def bent(of: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """A point whose neighbours are no future fixes, slopes of the spans there (n, k) and curvature (k, k)."""
+        of = torch.stack((of[0].clamp_min(SLIGHT_S), of[1]))
+        e = SLIGHT_S * torch.eye(2, dtype=of.dtype)[free]
+        middle, up, down = spans(of), [spans(of + d) for d in e], [spans(of - d) for d in e]
+        slopes = torch.stack([(u - d) / (2 * SLIGHT_S) for u, d in zip(up, down)], -1)
+        H = torch.diag(torch.stack([(u - 2 * middle + d).sum() / SLIGHT_S**2 for u, d in zip(up, down)]))
+        if len(free) == 2:
+            same, other = spans(of + e.sum(0)) + spans(of - e.sum(0)), spans(of + e[0] - e[1]) + spans(of - e[0] + e[1])
+            H[0, 1] = H[1, 0] = (same - other).sum() / (4 * SLIGHT_S**2)
+        return of, slopes, H
+
+    value = float(spans(at).sum())
+    for step in (8 * SLIGHT_S, 4 * SLIGHT_S, 2 * SLIGHT_S):  # far off the density has no curvature to trust
+        for way in WAYS:
+            there = at + step * torch.tensor(way, dtype=at.dtype)
+            while 0 <= there[0] <= LONGEST_DELAY_S and (tried := float(spans(there).sum())) < value:
+                at, value = there, tried
+                there = at + step * torch.tensor(way, dtype=at.dtype)
+    while free:
+        value, (around, slopes, H) = float(spans(at).sum()), bent(at)
+        for _ in range(4):
+            if not bool((torch.linalg.eigvalsh(H) > 0).all()):
+                break
+            there = at.clone()
+            there[free] = (around[free] - torch.linalg.solve(H, slopes.sum(0))).clamp(-1.0, 1.0)
+            there[0] = there[0].clamp(0.0, LONGEST_DELAY_S)
+            if not (tried := float(spans(there).sum())) < value:
+                break
+            at, value, (around, slopes, H) = there, tried, bent(there)
+        back = torch.linalg.pinv(H)
+        convex = bool((torch.linalg.eigvalsh(H) > 0).all())
+        std[free] = (back @ (slopes.T @ slopes) @ back).diagonal().sqrt() if convex else math.inf
+        sure = [k for k in free if abs(at[k]) > SURE * std[k]]
+        at[[k for k in free if k not in sure]] = 0.0
+        if sure == free:
+            break
+        free = sure
+    return Placing(*(at * unit).tolist()), Placing(*(std * unit).tolist())
+
+
+def _moved(placing: Placing, shift: Placing, step: float) -> Placing:
+    return Placing(placing.delay_s + step * shift.delay_s, placing.ahead_m + step * shift.ahead_m)
+
+
+def _forward(metres: float, like: Tensor) -> Tensor:
+    return like.new_tensor([metres, 0.0, 0.0])
 
 
 def _built(values: Mapping[str, float], imu: ImuSpec, tuning: Tuning, called: str) -> tuple[ImuSpec, Tuning]:

@@ -14,7 +14,7 @@ from dlkf.evaluation.table import Table, as_markdown, number
 from dlkf.files import staged
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import NEEDED, ImuSpec
-from dlkf.running.likelihood import Evidence, Found, find_noise
+from dlkf.running.likelihood import AS_TOLD, Evidence, Found, find_noise
 
 
 def found_noise(
@@ -28,12 +28,12 @@ def found_noise(
 
 def noise_table(model: str, dataset: str, imu: ImuSpec, tuning: Tuning, found: Found) -> Table:
     """Every value before and after."""
-    before, after = Found(imu, tuning, 0.0, 0.0, 0.0).described(), found.described()
+    before, after = Found(imu, tuning, AS_TOLD, AS_TOLD, 0.0, 0.0).described(), found.described()
     rows = [[key, number(before[key]), number(after[key])] for key in after]
     return Table(
         title=f"{model} on {dataset}: noise under which the fixes are most likely",
         note=f"SI units; mean −ln p of a fix {number(found.before)} before, {number(found.after)} after. No reference "
-        "was used. delay_s: by so much the fixes are older than their stamps.",
+        f"was used. {found.told_of_fixes()}".strip(),
         columns=["Value", f"As {imu.name}", "Found"],
         rows=rows,
     )
