@@ -39,6 +39,26 @@ def test_it_is_the_regression_of_all_fixes_at_once(monkeypatch):
     assert torch.allclose(last.novelty, (phi[:, -1:] @ torch.linalg.inv(information) @ phi[:, -1:].mT)[:, 0, 0])
 
 
+def test_its_variance_is_that_of_all_fixes_at_once(monkeypatch):
+    """b = b₀ + |y − Φw|² + (w − w₀)ᵀΛ₀(w − w₀) of the normal-inverse-gamma law (Bishop 2006, 3.3), with ν = 1."""
+    monkeypatch.setattr(car_speed, "MEMORY", math.inf)
+    listener, count = model(), 40
+    listener.log_sizes.data[2] = -math.log(car_speed.PRIOR_REPEATS)
+    heard, speed = torch.randn(2, count, 5).double(), 10 + torch.randn(2, count).double()
+    with torch.no_grad():
+        prior = known = listener.begin(2)
+        phi = torch.stack([listener(heard[:, t], prior).heard for t in range(count)], 1)
+        for t in range(count):
+            known = listener.learned(known, listener(heard[:, t], known), speed[:, t], torch.ones(2).bool())
+        information = torch.linalg.inv(prior.spread)
+        pulled = phi.mT @ (speed.unsqueeze(-1) - phi @ prior.mean.unsqueeze(-1))
+        change = torch.linalg.solve(information + phi.mT @ phi, pulled)
+        residual = speed - (phi @ (prior.mean.unsqueeze(-1) + change))[..., 0]
+        b = prior.squares + residual.square().sum(-1) + (change.mT @ information @ change)[:, 0, 0]
+    assert torch.allclose(known.squares, b, rtol=1e-9)
+    assert torch.equal(known.count, prior.count + count)
+
+
 def test_a_car_that_tells_its_speed_is_believed_and_one_that_does_not_is_not():
     """Two minutes with GNSS, one without: one car's sound follows its speed, the other's is noise."""
     listener, steps = model(), 180

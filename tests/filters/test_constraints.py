@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dlkf.filters.build import build_filter
-from dlkf.filters.constraints import CarConstraints
+from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD, CarConstraints
 from dlkf.filters.integration import Epoch, Fix, integrate
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.sources import Believed
@@ -55,6 +55,34 @@ def test_jacobian_matches_finite_differences():
         numeric = -(innovation(dx) - innovation(-dx))[0] / 2e-6
         # left out on purpose: Earth rate turned by an attitude error (7e-5)
         assert (numeric - H[:, i]).abs().max() < 1e-4, i
+
+
+def test_a_car_at_rest_feels_the_earth_turn():
+    """Tilted, on error-free sensors: the innovation of the rate is zero to rounding, not the Earth's 7e-5 rad/s."""
+    batch = scene(3, 1, seed=4)
+    still = torch.zeros(3, 3, dtype=D)
+    C = rotation_from_rpy(torch.tensor([[0.3, -0.2, 1.0], [0.0, 0.1, -2.0], [-0.1, 0.0, 0.4]], dtype=D))
+    earth_b = (C.mT @ batch.frame.earth_rate_n.unsqueeze(-1)).mT
+    assert earth_b.norm(dim=-1).min() > 7e-5
+    raw = torch.cat((torch.zeros(3, M, 3, dtype=D), earth_b.expand(-1, M, -1)), -1)
+    at_rest = replace(batch, imu=raw.unsqueeze(1))
+    epoch = epoch_of(at_rest, NavState(still, still, C), ImuError(torch.zeros(3, 6, dtype=D)))
+    z, _ = CarConstraints(Tuning(), STATES)._standing(epoch)
+    assert z.abs().max() < 1e-15
+
+
+def test_what_is_known_of_a_car_grows_old():
+    """With nothing that tells of it, the variances of its states grow by the PSD of their random walks times time."""
+    batch = scene(2, 20, seed=5)
+    with torch.no_grad():
+        alone = Mbkf(IMU, states=ErrorStates(structure=True))
+        P = integrate(batch, alone, keep_covariances=True).covariances.updated
+    variance = P.diagonal(dim1=-2, dim2=-1)[..., alone.states.of_structure]
+    walk = torch.tensor(STRUCTURE_WALK_STD, dtype=D).square()
+    assert (walk > 0).all()
+    assert torch.allclose(variance[:, -1], torch.tensor(STRUCTURE_STD, dtype=D).square() + 20 * walk, rtol=1e-12)
+    # 1e-6: float64 beside the variance of the start, and the PSD comes as float32
+    assert torch.allclose(variance[:, -1] - variance[:, 9], (10 * walk).expand(2, 4), rtol=1e-5)
 
 
 def outage(batch, first: int, last: int):

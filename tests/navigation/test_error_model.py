@@ -56,6 +56,18 @@ def test_transition_matches_finite_differences(seed, matrix):
     assert ((Phi - numeric).abs() / size).max() < 3e-3
 
 
+def test_gravity_gradient_reaches_velocity_and_position():
+    """3e-6 m/s² per metre up or down, as the strapdown has it 100 m above and below; 0.5 % is the shape."""
+    state, raw, frame = scene()
+    up = torch.tensor([0.0, 0.0, 100.0], dtype=torch.float64)
+    Phi = model_of(frame).transition(state, strapdown(state, raw, DT, frame), raw, frame)[0]
+    above, below = (strapdown(state._replace(p_n=state.p_n + x), raw, DT, frame).end for x in (-up, up))
+    gained, moved = ((b - a)[0, 2] / 200 for a, b in ((above.v_n, below.v_n), (above.p_n, below.p_n)))
+    assert float(gained) == pytest.approx(3.08e-6 * M * DT, rel=0.01)  # 2 g / r
+    assert float(Phi[VELOCITY, POSITION][2, 2]) == pytest.approx(float(gained), rel=0.01)
+    assert float(Phi[POSITION, POSITION][2, 2] - 1) == pytest.approx(float(moved - 1), rel=0.01)
+
+
 def test_gauss_markov_biases_decay():
     frame = frame_at()
     model = model_of(frame, decay=(1 / 100.0, 0.0))
