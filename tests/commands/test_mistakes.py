@@ -9,6 +9,7 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
+import lightning as L
 import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
@@ -475,6 +476,18 @@ def test_faults_of_the_machine_are_one_line(error, said):
         line = fault(outer)
     assert line is not None and said in line and "\n" not in line
     assert fault(ValueError("a fault of ours")) is None
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
+@pytest.mark.parametrize(("accelerator", "said"), [("gpu", "there is no GPU"), ("tpux", "accelerator is unknown")])
+def test_a_gpu_that_is_not_there_is_one_line(accelerator, said):
+    """Whatever words this version of Lightning finds for it; ``auto`` takes the CPU instead."""
+    settings = {"devices": 1, "logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+    with pytest.raises(Exception) as raised:
+        L.Trainer(accelerator=accelerator, **settings)
+    line = fault(raised.value)
+    assert line is not None and said in line and "\n" not in line
+    assert L.Trainer(accelerator="auto", **settings).strategy.root_device.type == "cpu"
 
 
 @pytest.mark.parametrize(

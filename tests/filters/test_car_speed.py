@@ -31,7 +31,7 @@ def test_it_is_the_regression_of_all_fixes_at_once(monkeypatch):
         last = run(listener, heard, speed, torch.ones(2, count).bool())[-1]
         known = listener.begin(2)
         phi = torch.stack([listener(heard[:, t], known).heard for t in range(count)], 1)
-        before, repeats = phi[:, :-1], listener._sizes()[2]
+        before, repeats = phi[:, :-1], listener._known()[3]
         information = torch.linalg.inv(known.spread) + before.mT @ before / repeats
         pulled = before.mT @ (speed[:, :-1, None] - before @ known.mean.unsqueeze(-1)) / repeats
         w = known.mean.unsqueeze(-1) + torch.linalg.solve(information, pulled)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -10,7 +11,8 @@ from scipy.stats import chi2
 from dlkf.errors import InputError
 from dlkf.filters.build import MODEL_BASED, build_filter
 from dlkf.filters.integration import integrate
-from dlkf.filters.model_based import Ins, Mbkf, bias_sigma, kalman_update
+from dlkf.filters.kalman_update import _updated, kalman_update
+from dlkf.filters.model_based import Ins, Mbkf, bias_sigma
 from dlkf.filters.tuning import Prior
 from dlkf.navigation.error_model import antenna
 from dlkf.navigation.state import ErrorStates, NavState
@@ -36,11 +38,28 @@ def test_gain_is_the_brute_force_least_squares_solution():
     L = torch.randn(4, 15, 15, generator=g, dtype=torch.float64)
     P, H = L @ L.mT, torch.randn(4, 6, 15, generator=g, dtype=torch.float64)
     R, z = torch.rand(4, 6, generator=g, dtype=torch.float64) + 0.1, torch.randn(4, 6, generator=g, dtype=torch.float64)
-    K, updated = kalman_update(P, H, R)
+    _, K, updated = kalman_update(P, H, R, torch.zeros_like(R))
     information = torch.linalg.inv(P) + H.mT @ (H / R.unsqueeze(-1))
     expected = torch.linalg.solve(information, H.mT @ (z / R).unsqueeze(-1))
     assert torch.allclose(K @ z.unsqueeze(-1), expected, rtol=1e-6, atol=1e-8)
     assert torch.allclose(updated, torch.linalg.inv(information), rtol=1e-6, atol=1e-8)
+
+
+def test_gradient_of_the_update_is_that_of_its_steps():
+    """In closed form and by autograd through the Joseph form; P stays symmetric, so only that part of its is told."""
+    g = torch.Generator().manual_seed(1)
+    rand = partial(torch.randn, generator=g, dtype=torch.float64)
+    L, H, R, z = rand(5, 9, 9), rand(5, 4, 9), rand(5, 4).square() + 0.1, rand(5, 4)
+    given = [x.requires_grad_() for x in (L @ L.mT, H, R, z)]
+    of_dx, of_P = rand(5, 9), rand(5, 9, 9)
+
+    def gradients(update):
+        dx, _, P = update(*given)[:3]
+        (of_prior, *others) = torch.autograd.grad((dx * of_dx).sum() + (P * of_P).sum(), given)
+        return torch.lerp(of_prior, of_prior.mT, 0.5), *others
+
+    for got, expected in zip(gradients(kalman_update), gradients(_updated), strict=True):
+        assert torch.allclose(got, expected, rtol=1e-9, atol=1e-10)  # rounding: S is conditioned to some 1e3
 
 
 def test_normalised_errors_lie_in_the_chi_square_band():

@@ -59,9 +59,8 @@ class CarSpeed(nn.Module):
 
     def begin(self, batch_size: int) -> Calibration:
         """The prior."""
-        std, count, _ = self._sizes()
-        typical = nn.functional.pad(self.prior.new_full((1,), TYPICAL_SPEED), (len(self.prior) - 1, 0))
-        one = (self.prior + typical, torch.diag_embed(torch.exp(2 * self.log_spread)), count, count * std * std)
+        mean, count, squares, _ = self._known()
+        one = (mean, torch.diag_embed(torch.exp(2 * self.log_spread)), count, squares)
         return Calibration(*(x.expand(batch_size, *x.shape) for x in one))
 
     def forward(self, features: Float[Tensor, "B F"], known: Calibration) -> Foretold:
@@ -77,25 +76,27 @@ class CarSpeed(nn.Module):
     ) -> Calibration:
         """After the speed of an epoch with a fix; unchanged where there was none."""
         told = fixed.to(speed.dtype)
-        repeats = self._sizes()[2]
+        prior_mean, prior_count, prior_squares, repeats = self._known()
         error = (speed - foretold.speed) * told
         along = _times(known.spread, foretold.heard)
         gain = along * (told / (repeats + foretold.novelty)).unsqueeze(-1)
         mean = known.mean + gain * error.unsqueeze(-1)
         spread = known.spread - gain.unsqueeze(-1) * along.unsqueeze(-2)
-        prior, fade = self.begin(len(speed)), told / MEMORY
+        fade = told / MEMORY
         information = torch.exp(-2 * self.log_spread)  # Λ₀; the information fades to it, to first order in fade
         return Calibration(
-            mean + fade.unsqueeze(-1) * _times(spread, information * (prior.mean - mean)),
+            mean + fade.unsqueeze(-1) * _times(spread, information * (prior_mean - mean)),
             spread + fade[:, None, None] * (spread - torch.bmm(spread, information.unsqueeze(-1) * spread)),
-            torch.lerp(known.count + told, prior.count, fade),
-            torch.lerp(known.squares + error * error / (1 + foretold.novelty), prior.squares, fade),
+            torch.lerp(known.count + told, prior_count, fade),
+            torch.lerp(known.squares + error * error / (1 + foretold.novelty), prior_squares, fade),
         )
 
-    def _sizes(self) -> tuple[Tensor, Tensor, Tensor]:
+    def _known(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """w, a, b and ν before anything was learned."""
         typical = self.log_sizes.new_tensor([math.log(x) for x in (PRIOR_STD, PRIOR_COUNT, PRIOR_REPEATS)])
         std, count, repeats = torch.exp(self.log_sizes + typical).unbind()
-        return std, count, repeats
+        typical_speed = nn.functional.pad(self.prior.new_full((1,), TYPICAL_SPEED), (len(self.prior) - 1, 0))
+        return self.prior + typical_speed, count, count * std * std, repeats
 
 
 def _times(P: Float[Tensor, "B k k"], x: Float[Tensor, "B k"]) -> Float[Tensor, "B k"]:

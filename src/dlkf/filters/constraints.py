@@ -86,7 +86,7 @@ class CarConstraints:
         """Innovation and H of the velocity across the car at the window's end."""
         state, rate = epoch.window.end, epoch.rate_b
         C_bn = state.C_nb.mT
-        v_b = (C_bn @ state.v_n.unsqueeze(-1)).squeeze(-1)
+        v_b = torch.bmm(C_bn, state.v_n.unsqueeze(-1)).squeeze(-1)
         vx, w_y, w_z = v_b[:, 0], rate[:, 1], rate[:, 2]
         zero = torch.zeros_like(vx)
         yaw, pitch, axle, slip = (zero,) * 4 if structure is None else structure.unbind(-1)
@@ -98,7 +98,7 @@ class CarConstraints:
         H = torch.zeros(len(vx), 2, self.states.count, dtype=vx.dtype, device=vx.device)
         J = C_bn[:, 1:] - torch.stack((yaw + 2 * slip * vx * w_z, pitch), -1).unsqueeze(-1) * C_bn[:, :1]
         H[:, :, VELOCITY] = J
-        H[:, :, ATTITUDE] = J @ skew(state.v_n)
+        H[:, :, ATTITUDE] = torch.bmm(J, skew(state.v_n))
         # δω = −ζ: the model's rates are too large by the gyroscopes' remaining error
         H[:, 0, GYRO.start + 2] = axle + slip * vx * vx
         H[:, 1, GYRO.start + 1] = -axle
@@ -111,7 +111,7 @@ class CarConstraints:
     def _standing(self, epoch: Epoch) -> tuple[Float[Tensor, "B 6"], Float[Tensor, "B 6 n"]]:
         """Innovation and H of a standstill: zero velocity, and the Earth rate in body axes."""
         state = epoch.window.end
-        earth_b = (state.C_nb.mT @ epoch.frame.earth_rate_n.unsqueeze(-1)).squeeze(-1)
+        earth_b = torch.bmm(state.C_nb.mT, epoch.frame.earth_rate_n.unsqueeze(-1)).squeeze(-1)
         z = torch.cat((-state.v_n, epoch.corrected[..., 3:].mean(1) - earth_b), -1)
         H = z.new_zeros(len(z), 6, self.states.count)
         eye = torch.eye(3, dtype=z.dtype, device=z.device)

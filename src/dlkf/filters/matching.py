@@ -25,6 +25,13 @@ SIZES = (0.05,) * 3 + (2e-3,) * 3 + (5e-3,) * 3 + (1e-4,) * 3  # typical correct
 LOG_FEATURES, AXIS_FEATURES = 12 + 24 + 12, 8 + 4
 
 
+def variance_along(P: Float[Tensor, "B k k"], axes: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B k"]:
+    """Diagonal of Cᵀ P C for every 3 × 3 block on the diagonal of P; the columns of C are the axes."""
+    blocks = P.unflatten(-1, (-1, 3)).unflatten(-3, (-1, 3)).diagonal(dim1=1, dim2=3)  # (B, 3, 3, blocks)
+    along = torch.bmm(axes.mT, blocks.flatten(2)).unflatten(-1, (3, -1))
+    return (along * axes.mT.unsqueeze(-1)).sum(2).mT.flatten(1)
+
+
 class Matching(NamedTuple):
     """Running means over the last fixes, short and long; one where nothing was seen."""
 
@@ -51,11 +58,12 @@ class Matching(NamedTuple):
         C_nb: Float[Tensor, "B 3 3"], fixed: Bool[Tensor, " B"],
     ) -> Matching:  # fmt: skip
         """After the correction of an epoch; unchanged without a fix."""
-        turned = [(C_nb.mT @ dx[:, b].unsqueeze(-1)).squeeze(-1) for b in (VELOCITY, ATTITUDE)]
-        squares = torch.cat((*turned, dx[:, IMU]), -1).square()
-        lost = [C_nb.mT @ (prior[:, b, b] - posterior[:, b, b]) @ C_nb for b in (VELOCITY, ATTITUDE)]
-        of_imu = (prior - posterior).diagonal(dim1=-2, dim2=-1)[:, IMU]
-        expected = torch.cat((*(x.diagonal(dim1=-2, dim2=-1) for x in lost), of_imu), -1)
+        both = slice(VELOCITY.start, ATTITUDE.stop)
+        turned = torch.bmm(dx[:, both].unflatten(-1, (2, 3)), C_nb).flatten(1)
+        squares = torch.cat((turned, dx[:, IMU]), -1).square()
+        moving = slice(VELOCITY.start, IMU.stop)
+        lost = prior[:, moving, moving] - posterior[:, moving, moving]
+        expected = torch.cat((variance_along(lost[:, :6, :6], C_nb), lost.diagonal(dim1=-2, dim2=-1)[:, 6:]), -1)
         size = squares.new_tensor(SIZES).square()
         ratio = (squares / (expected.clamp_min(0.0) + 1e-9 * size)).clamp_max(LARGEST)
         ratios = _blended(self.ratios, ratio.unsqueeze(1), self.fixes)

@@ -15,6 +15,7 @@ from dlkf.data.drive import Batch
 from dlkf.filters.adaptive import Adaptation, AdaptiveNoise
 from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD, CarConstraints
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
+from dlkf.filters.kalman_update import kalman_update
 from dlkf.filters.sources import Believed, FixMemory, GnssFix, Measurement, Source
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.calibration import ImuError
@@ -162,11 +163,9 @@ class Mbkf:
         P = fix.P
         prior = P
         if informative:
-            K, P = kalman_update(P, H, R)
-            dx = torch.bmm(K, z.unsqueeze(-1)).squeeze(-1)
+            dx, K, P = kalman_update(P, H, R, z)
         else:
-            dx, K = P.new_zeros(P.shape[:2]), P.new_zeros(*P.shape[:2], H.shape[1])
-        P = torch.lerp(P, P.mT, 0.5)
+            dx, K, P = P.new_zeros(P.shape[:2]), P.new_zeros(*P.shape[:2], H.shape[1]), torch.lerp(P, P.mT, 0.5)
         noise = memory.noise
         if self.noise is not None and noise is not None:
             noise = self.noise.learned(noise, epoch, fix.rows.used, H[:, :6], fix.variance, P, dx, Q)
@@ -213,19 +212,3 @@ class Analytic(Estimator, Protocol):
 def has_covariance(estimator: object) -> TypeGuard[Analytic]:
     """Whether an estimator can be smoothed and its covariance compared with its errors."""
     return isinstance(estimator, Analytic)
-
-
-def kalman_update(
-    P: Float[Tensor, "B n n"], H: Float[Tensor, "B m n"], R: Float[Tensor, "B m"]
-) -> tuple[Float[Tensor, "B n m"], Float[Tensor, "B n n"]]:
-    """Gain K = P Hᵀ (H P Hᵀ + R)⁻¹ and Joseph-form covariance for diagonal R (paper eqs 4, 6).
-
-    (I − K H) P (I − K H)ᵀ + K R Kᵀ = X − K (H X − R Kᵀ) with X = P − (H P)ᵀ Kᵀ, for any K: P is symmetric, and there is
-    no product of n × n matrices.
-    """
-    HP = torch.bmm(H, P)
-    S = torch.baddbmm(torch.diag_embed(R), HP, H.mT)
-    Kt = torch.linalg.solve_ex(S, HP)[0]
-    X = torch.baddbmm(P, HP.mT, Kt, alpha=-1)
-    surplus = torch.baddbmm(R.unsqueeze(-1) * Kt, H, X, beta=-1)
-    return Kt.mT, torch.baddbmm(X, Kt.mT, surplus, alpha=-1)

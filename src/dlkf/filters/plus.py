@@ -24,13 +24,13 @@ from dlkf.filters.advised_speed import AdvisedSpeed
 from dlkf.filters.build import build_filter
 from dlkf.filters.car_speed import Calibration, CarSpeed, Foretold
 from dlkf.filters.integration import Correction, Epoch
-from dlkf.filters.matching import AXIS_FEATURES, LOG_FEATURES, Matching
+from dlkf.filters.matching import AXIS_FEATURES, LOG_FEATURES, Matching, variance_along
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.model_based import Memory as KalmanMemory
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.navigation.state import ATTITUDE, IMU, POSITION, VELOCITY, ErrorStates
+from dlkf.navigation.state import IMU, PV, PVA, ErrorStates
 from dlkf.networks.features import level_rotation
 from dlkf.networks.plus import WINDOW_FEATURES, Heads, PlusNetwork, PlusNetworkConfig, loudness, window_features
 from dlkf.settings import settings_from
@@ -171,7 +171,9 @@ class PlusFilter(nn.Module):
             axes = torch.cat((loudness(heard).unflatten(-1, (2, 3)).mT, memory.matching.by_axis()), -1)
         heads, hidden = self.network(features.to(dtype), now.to(dtype), axes.to(dtype), memory.hidden)
         seen = memory.since_fix < memory.elapsed  # before the first fix there is nothing to adapt to
-        heads = Heads(*(x.to(epoch.z.dtype) for x in heads)).where(seen)
+        heads = Heads(*(x.to(epoch.z.dtype) for x in heads))
+        if torch.compiler.is_compiling() or not bool(seen.all()):
+            heads = heads.where(seen)
         speed = torch.stack((foretold.speed, foretold.std), -1).to(epoch.z.dtype)
         advice = self._advice(heads, speed, memory.silent | ~seen)
         kalman, correction = self.kalman.step(memory.kalman, epoch._replace(advice=advice))
@@ -208,11 +210,9 @@ class PlusFilter(nn.Module):
     def _normalised(self, memory: Memory, epoch: Epoch) -> Float[Tensor, "B 6"]:
         """Innovations over their 1σ as the filter of the last epoch has it, in heading axes; zero without a fix."""
         C_hn = level_rotation(epoch.window.end.C_nb, "heading")
-        variance = torch.stack(
-            [(C_hn @ memory.kalman.P[:, b, b] @ C_hn.mT).diagonal(dim1=-2, dim2=-1) for b in (POSITION, VELOCITY)], 1
-        ).flatten(1)
-        R = (C_hn.unsqueeze(1).square() @ epoch.fix.std.square().unflatten(-1, (2, 3, 1))).squeeze(-1).flatten(1)
-        z = (C_hn.unsqueeze(1) @ epoch.z.unflatten(-1, (2, 3, 1))).squeeze(-1).flatten(1)
+        variance = variance_along(memory.kalman.P[:, PV, PV], C_hn.mT)
+        R = torch.bmm(epoch.fix.std.square().unflatten(-1, (2, 3)), C_hn.mT.square()).flatten(1)
+        z = torch.bmm(epoch.z.unflatten(-1, (2, 3)), C_hn.mT).flatten(1)
         return z / (variance + R + 1e-4).sqrt()
 
     def _features(
@@ -222,10 +222,11 @@ class PlusFilter(nn.Module):
         """What the network sees, each of order 1; the second part goes to the noise's heads directly as well."""
         P, C_nb = memory.kalman.P, epoch.window.end.C_nb
         fixed = epoch.used.any(-1, keepdim=True).to(P.dtype)
-        body = torch.cat([_turned_variance(P[:, b, b], C_nb) for b in (POSITION, VELOCITY, ATTITUDE)], -1)
-        variance = torch.cat((body, P.diagonal(dim1=-2, dim2=-1)[:, IMU.start :]), -1).clamp_min(1e-18)
+        variance = torch.cat(
+            (variance_along(P[:, PVA, PVA], C_nb), P.diagonal(dim1=-2, dim2=-1)[:, IMU.start :]), -1
+        ).clamp_min(1e-18)
         size = self._sizes(P)
-        v_b = (C_nb.mT @ epoch.window.end.v_n.unsqueeze(-1)).squeeze(-1)
+        v_b = torch.bmm(C_nb.mT, epoch.window.end.v_n.unsqueeze(-1)).squeeze(-1)
         rate, force = epoch.rate_b, epoch.corrected[..., :3].mean(1)
         known = _flat(epoch.error, memory.kalman.structure, self.kalman.states)
         fix_std = torch.log(epoch.fix.std[:, [0, 2, 3, 5]].clamp(1e-3, 1e3)) / 3 * fixed
@@ -256,10 +257,6 @@ class PlusFilter(nn.Module):
         return like.new_tensor(
             (1.0,) * 3 + (0.3,) * 3 + (0.02,) * 3 + (0.1,) * 3 + (0.005,) * 3 + (0.005,) * matrix + car
         )
-
-
-def _turned_variance(P: Float[Tensor, "B 3 3"], C_nb: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 3"]:
-    return (C_nb.mT @ P @ C_nb).diagonal(dim1=-2, dim2=-1)
 
 
 def _flat(error: ImuError, structure: Tensor | None, states: ErrorStates) -> Float[Tensor, "B k"]:

@@ -34,7 +34,7 @@ class ImuError(NamedTuple):
             return samples / (1 + self.matrix).unsqueeze(1)
         eye = torch.eye(3, dtype=raw.dtype, device=raw.device)
         undo = torch.linalg.inv_ex(eye + self.matrix)[0].mT
-        return torch.cat((samples[..., :3] @ undo[:, 0], samples[..., 3:] @ undo[:, 1]), -1)
+        return torch.cat((torch.bmm(samples[..., :3], undo[:, 0]), torch.bmm(samples[..., 3:], undo[:, 1])), -1)
 
     def updated(self, dx: Float[Tensor, "B n"], states: ErrorStates) -> ImuError:
         """The error after a correction of a filter's states: columns 9… of ``dx``."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -104,14 +105,26 @@ class PlusNetwork(nn.Module):
             list(NOISE_SIZES.values()), -1
         )
         own = self.axis_noise(nn.functional.silu(self.of_axis(axes) + self.context(h).unsqueeze(1))).mT
+        of_factors, of_residual = _reaches(h.dtype, h.device)
+        factors = bounded(torch.cat((process + own.flatten(1), fix, across, self.trust(h)), -1), of_factors)
+        process, fix, across, doubt = factors.split((12, 4, 2, 1), -1)
         return Heads(
-            bounded(process.unflatten(-1, (4, 3)) + own, process.new_tensor(PROCESS_REACH)[:, None]),
-            bounded(fix, FIX_REACH),
-            bounded(across, ACROSS_REACH),
+            process.unflatten(-1, (4, 3)),
+            fix,
+            across,
             OFFSET_REACH * torch.tanh(offset),
-            residual.new_tensor(RESIDUAL_REACH) * torch.tanh(residual),
-            UNTRUSTED * bounded(self.trust(h).squeeze(-1), TRUST_REACH),
+            of_residual * torch.tanh(residual),
+            UNTRUSTED * doubt.squeeze(-1),
         ), h
+
+
+@lru_cache
+@torch.inference_mode(False)
+def _reaches(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Of the logarithms of process (12), fix (4), across (2) and doubt; of the residual (6)."""
+    process = [reach for reach in PROCESS_REACH for _axis in range(3)]
+    factors = [*process, *[FIX_REACH] * 4, *[ACROSS_REACH] * 2, TRUST_REACH]
+    return torch.tensor(factors, dtype=dtype, device=device), torch.tensor(RESIDUAL_REACH, dtype=dtype, device=device)
 
 
 def bounded(x: Tensor, reach: Tensor | float) -> Tensor:
@@ -121,22 +134,36 @@ def bounded(x: Tensor, reach: Tensor | float) -> Tensor:
 
 def window_features(samples: Float[Tensor, "B M 6"], dt: float) -> Float[Tensor, "B K"]:
     """Means and logarithms of the variances in bands of frequency of a window's corrected samples, body axes."""
-    M = samples.shape[1]
+    waves, inside = _fourier(samples.shape[1], dt, samples.dtype, samples.device)
+    still, size, least, level = _sizes(samples.dtype, samples.device)
     mean = samples.mean(1)
-    taper = torch.hann_window(M, periodic=False, dtype=samples.dtype, device=samples.device)
-    swing = (samples - mean.unsqueeze(1)) * taper[:, None]
-    waves = torch.arange(min(M // 2, math.ceil(BANDS_HZ[-1] * M * dt)) + 1, device=samples.device)
-    turns = 2 * torch.pi / M * (waves[:, None] * torch.arange(M, device=samples.device) % M).to(samples.dtype)
-    power = (torch.cos(turns) @ swing).square() + (torch.sin(turns) @ swing).square()  # Fourier, up to the last band
-    power = power * (2 / (M * taper.square().sum()))  # sums over all frequencies to the variance
-    frequency = waves / (M * dt)
-    edges = torch.tensor(BANDS_HZ, device=samples.device)
-    inside = ((frequency >= edges[:-1, None]) & (frequency < edges[1:, None])).to(samples.dtype)
-    bands = (inside @ power).mT  # (B, 6, bands)
-    least = samples.new_tensor(SMALLEST_POWER).repeat_interleave(3)[:, None]
-    level = samples.new_tensor([-6.0] * 3 + [-13.0] * 3)[:, None]
-    x = (mean - mean.new_tensor((0.0, 0.0, -9.8, 0.0, 0.0, 0.0))) / mean.new_tensor(MEAN_SIZE)
-    return torch.cat((torch.asinh(x), ((torch.log(bands + least) - level) / 4).flatten(1)), -1)
+    swing = torch.matmul((samples - mean.unsqueeze(1)).mT, waves).square()  # (B, 6, cosines and sines)
+    bands = torch.matmul(swing, inside)
+    return torch.cat((torch.asinh((mean - still) / size), ((torch.log(bands + least) - level) / 4).flatten(1)), -1)
+
+
+@lru_cache
+@torch.inference_mode(False)
+def _fourier(M: int, dt: float, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """(M, 2 w): cosines, then sines, under a Hann window, up to the last band; (2 w, bands): which belong to a band,
+    scaled so that over all frequencies their squares sum to the variance."""
+    taper = torch.hann_window(M, periodic=False, dtype=dtype, device=device)
+    waves = torch.arange(min(M // 2, math.ceil(BANDS_HZ[-1] * M * dt)) + 1, device=device)
+    turns = 2 * torch.pi / M * (torch.arange(M, device=device)[:, None] * waves % M).to(dtype)
+    frequency = (waves / (M * dt))[:, None]
+    edges = torch.tensor(BANDS_HZ, device=device)
+    inside = ((frequency >= edges[:-1]) & (frequency < edges[1:])).to(dtype) * (2 / (M * taper.square().sum()))
+    return torch.cat((torch.cos(turns), torch.sin(turns)), 1) * taper[:, None], inside.repeat(2, 1)
+
+
+@lru_cache
+@torch.inference_mode(False)
+def _sizes(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Mean samples of a car at rest and their sizes (6,); least power and usual level of a band (6, 1)."""
+    like = {"dtype": dtype, "device": device}
+    still, size = torch.tensor((0.0, 0.0, -9.8, 0.0, 0.0, 0.0), **like), torch.tensor(MEAN_SIZE, **like)
+    least, level = (torch.tensor(x, **like).repeat_interleave(3)[:, None] for x in (SMALLEST_POWER, (-6.0, -13.0)))
+    return still, size, least, level
 
 
 def loudness(heard: Float[Tensor, "B K"]) -> Float[Tensor, "B 6"]:

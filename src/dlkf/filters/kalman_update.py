@@ -1,0 +1,69 @@
+"""The Kalman update, and its gradient in closed form.
+
+    S = H P Hᵀ + R    K = P Hᵀ S⁻¹    dx = K z    P⁺ = A P Aᵀ + K R Kᵀ,  A = I − K H      (paper eqs 4–6, Joseph form)
+
+At the optimal gain P⁺ does not change with K to first order, and A P = P⁺, so with u = S⁻¹ z
+
+    ∂P⁺ = A ∂P Aᵀ + K ∂R Kᵀ − K ∂H P⁺ − P⁺ ∂Hᵀ Kᵀ
+    ∂dx = A ∂P Hᵀ u − K ∂R u − K ∂H dx + P⁺ ∂Hᵀ u + K ∂z
+
+which is half of what autograd makes of the update step by step, and does not solve with S again.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def kalman_update(
+    P: Float[Tensor, "B n n"], H: Float[Tensor, "B m n"], R: Float[Tensor, "B m"], z: Float[Tensor, "B m"]
+) -> tuple[Float[Tensor, "B n"], Float[Tensor, "B n m"], Float[Tensor, "B n n"]]:
+    """Correction, gain and covariance for symmetric P and diagonal R; the gain is told without a gradient."""
+    if torch.is_grad_enabled() and any(x.requires_grad for x in (P, H, R, z)):
+        return _KalmanUpdate.apply(P, H, R, z)
+    return _updated(P, H, R, z)[:3]
+
+
+def _updated(P: Tensor, H: Tensor, R: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """dx, K, P⁺ and S. For any K, P⁺ = X − K (H X − R Kᵀ) with X = P − (H P)ᵀ Kᵀ: no product of n × n matrices."""
+    HP = torch.bmm(H, P)
+    S = torch.baddbmm(torch.diag_embed(R), HP, H.mT)
+    Kt = torch.linalg.solve_ex(S, HP)[0]
+    X = torch.baddbmm(P, HP.mT, Kt, alpha=-1)
+    surplus = torch.baddbmm(R.unsqueeze(-1) * Kt, H, X, beta=-1)
+    dx = torch.bmm(Kt.mT, z.unsqueeze(-1)).squeeze(-1)
+    P = torch.baddbmm(X, Kt.mT, surplus, alpha=-1)
+    return dx, Kt.mT, torch.lerp(P, P.mT, 0.5), S
+
+
+class _KalmanUpdate(torch.autograd.Function):
+    """Names as in the module's equations."""
+
+    @staticmethod
+    def forward(ctx, P, H, R, z):
+        dx, K, updated, S = _updated(P, H, R, z)
+        ctx.save_for_backward(H, z, dx, K, updated, S)
+        ctx.mark_non_differentiable(K)
+        return dx, K, updated
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, of_dx, _of_K, of_P):
+        H, z, dx, K, updated, S = ctx.saved_tensors
+        Kt, g = K.mT, of_dx.unsqueeze(-1)
+        u = torch.linalg.solve_ex(S, z.unsqueeze(-1))[0]
+        G = torch.lerp(of_P, of_P.mT, 0.5)
+        KG, Kg = torch.bmm(Kt, G), torch.bmm(Kt, g)
+        KGK = torch.bmm(KG, K)
+        # Aᵀ G A + Aᵀ g uᵀ H, without A
+        inner = torch.baddbmm(KG, KGK, H, alpha=-1)
+        of_P = torch.baddbmm(torch.baddbmm(G, H.mT, inner, alpha=-1), KG.mT, H, alpha=-1)
+        of_P = torch.baddbmm(of_P, g - torch.bmm(H.mT, Kg), torch.bmm(u.mT, H))
+        of_H = None
+        if ctx.needs_input_grad[1]:
+            of_H = torch.baddbmm(torch.bmm(u, torch.bmm(g.mT, updated)), KG, updated, alpha=-2)
+            of_H = torch.baddbmm(of_H, Kg, dx.unsqueeze(-2), alpha=-1)
+        of_R = KGK.diagonal(dim1=-2, dim2=-1) - (u * Kg).squeeze(-1)
+        return of_P, of_H, of_R, Kg.squeeze(-1)
