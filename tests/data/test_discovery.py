@@ -31,6 +31,7 @@ from dlkf.data.tables import read_drives, read_table
 from dlkf.diagnosis.checkup import checkup
 from dlkf.errors import InputError
 from tests.cars import car
+from tests.data.logs.bags import ros1, ros2, ros2_ublox
 from tests.drives import drives_in
 
 TURN = Rotation.from_euler("ZYX", [130.0, -35.0, 70.0], degrees=True).as_matrix()  # car → sensor
@@ -270,6 +271,20 @@ def test_velocities_in_a_file_beside_the_fixes(tmp_path):
     chosen = offer(tmp_path / "pos.csv")
     found = _velocities_beside(chosen, chosen.gnss, tmp_path.iterdir())
     assert found == {"columns": ["speed", "course"], "frame": "course", "file": "vel.csv"}
+
+
+@pytest.mark.parametrize("writer", [ros1, ros2])
+def test_velocities_of_a_bag_lie_in_a_topic_of_their_own(tmp_path, writer):
+    """NavSatFix has none; NavPVT has, so that nothing is looked for."""
+    tables = car(6)
+    writer(tmp_path, tables)
+    (path,) = (p for pattern in ("*.bag", "drive/metadata.yaml") for p in tmp_path.glob(pattern))
+    chosen = offer(path)
+    assert _velocities_beside(chosen, chosen.gnss, []) == {"table": "/gnss/vel"}
+    (tmp_path / "ublox").mkdir()
+    ros2_ublox(tmp_path / "ublox", tables)
+    other = offer(tmp_path / "ublox" / "drive" / "metadata.yaml")
+    assert _velocities_beside(other, other.gnss, []) is None
 
 
 def test_a_table_beside_the_imu_of_which_nothing_is_known_is_no_log_at_rest(tmp_path):

@@ -14,7 +14,7 @@ import yaml
 
 from dlkf.config import config_dir
 from dlkf.data.readers import formats, recognise
-from dlkf.data.readers.formats import text
+from dlkf.data.readers.formats import rosbag, text
 from dlkf.data.readers.frames import DriveFrames, Place, Table
 from dlkf.data.readers.logs import LogReader
 from dlkf.errors import InputError
@@ -96,7 +96,7 @@ class AutoReader:
             told.append(f"found the {kind} in {chosen.path.name}: {chosen.told}")
             if kind == "gnss" and (more := _velocities_beside(chosen, specs[kind], [] if only else folder.iterdir())):
                 specs[kind]["velocity"] |= more
-                told.append(f"found velocities in {more['file']}: {', '.join(more['columns'])}")
+                told.append(f"found velocities in {more.get('table') or more['file']}")
         if (specs["gnss"].get("time") or {}).get("offset_s") is None and specs["gnss"].get("file"):
             specs["gnss"]["time"]["offset_s"] = "auto"
         if not specs["gnss"].get("file") and (foreign := _foreign(folder, offers, only)):
@@ -226,7 +226,14 @@ def text_options(path: Path) -> dict[str, Any]:
 
 
 def _velocities_beside(chosen: Offer, gnss: Mapping[str, Any], files: Iterable[Path]) -> dict[str, Any] | None:
-    """Velocities for fixes without any, from the first text table of the same columns of time that has them alone."""
+    """Velocities for fixes without any: of the first text table of the same columns of time, or of the only topic."""
+    if gnss.get("format") == "rosbag" and not gnss["velocity"].get("table") and gnss.get("table") is None:
+        topics = rosbag.velocities_beside(chosen.path)
+        if len(topics) > 1:
+            raise InputError(
+                f"{chosen.path}: {', '.join(topics)} all hold velocities; choose one with reader.gnss.velocity.table"
+            )
+        return {"table": topics[0]} if topics else None
     if gnss.get("format") != "csv" or gnss["velocity"].get("columns"):
         return None
     for path in sorted(files):

@@ -121,10 +121,10 @@ def _raw(imu: pd.DataFrame, gnss: pd.DataFrame, factors: Mapping[str, float | No
 
 
 def _speed_unit(found: Findings, gnss: Mapped, t: np.ndarray, where: str) -> None:
-    if not gnss.has("velocity"):
+    v = gnss.vector("velocity", (2, 3), nan=True) if gnss.has("velocity") else np.full((1, 3), np.nan)
+    if not np.isfinite(v).any():
         found.add("gnss.velocity.unit", "m/s", True, "no velocities")
         return
-    v = gnss.vector("velocity", (2, 3), nan=True)
     speed = v[:, 0] if gnss.spec["velocity"].get("frame") == "course" else np.hypot(v[:, 0], v[:, 1])
     place = positions(gnss)
     factor, spread = speed_factor(t, place["lat_deg"], place["lon_deg"], speed)

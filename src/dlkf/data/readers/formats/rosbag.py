@@ -38,6 +38,16 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
         raise InputError(f"{path}: cannot be read as a bag ({_first_line(error)}); give a whole one") from None
 
 
+def velocities_beside(path: Path) -> list[str]:
+    """Topics with velocities alone, where the bag's fixes (one topic of NavSatFix) have none."""
+    highlevel, typesys = library("rosbags.highlevel", "a ROS bag"), library("rosbags.typesys", "a ROS bag")
+    bag = path.parent if path.name == "metadata.yaml" else path
+    with highlevel.AnyReader([bag], default_typestore=typesys.get_typestore(typesys.Stores.LATEST)) as reader:
+        kinds = {c.topic: _short(c.msgtype) for c in reader.connections}
+    bare = [kind for kind in kinds.values() if kind in (*FIX, SENTENCE)] == ["sensor_msgs/NavSatFix"]
+    return sorted(topic for topic, kind in kinds.items() if kind in VELOCITIES) if bare else []
+
+
 def _read(reader: Any, path: Path, kind: str, table: str | None) -> Table:
     known = {*IMU} if kind == "imu" else {*FIX, SENTENCE}
     topics = {c.topic: c for c in reader.connections}
