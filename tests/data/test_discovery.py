@@ -31,7 +31,7 @@ from dlkf.data.tables import read_drives, read_table
 from dlkf.diagnosis.checkup import checkup
 from dlkf.errors import InputError
 from tests.cars import car
-from tests.data.logs.bags import ros1, ros2, ros2_ublox
+from tests.data.logs.bags import _Bag, ros1, ros2, ros2_ublox
 from tests.drives import drives_in
 
 TURN = Rotation.from_euler("ZYX", [130.0, -35.0, 70.0], degrees=True).as_matrix()  # car → sensor
@@ -285,6 +285,23 @@ def test_velocities_of_a_bag_lie_in_a_topic_of_their_own(tmp_path, writer):
     ros2_ublox(tmp_path / "ublox", tables)
     other = offer(tmp_path / "ublox" / "drive" / "metadata.yaml")
     assert _velocities_beside(other, other.gnss, []) is None
+
+
+def test_a_bag_with_two_imus_or_cut_off_says_so(tmp_path):
+    """With reader=auto too: topics to choose from, or that the bag is not whole."""
+    tables = car(6)
+    with _Bag(tmp_path / "two", True) as bag:
+        for topic in ("/imu/roof", "/imu/seat"):
+            write = bag.write
+            bag.write = lambda _, *rest, write=write, topic=topic: write(topic, *rest)
+            bag.imu(tables, 0)
+            bag.write = write
+    with pytest.raises(InputError, match=r"2 topics with .*/imu/roof .*/imu/seat .*; set reader\.imu\.table"):
+        list(AutoReader().read(tmp_path / "two"))
+    (log,) = (tmp_path / "two").glob("*.db3")
+    log.write_bytes(log.read_bytes()[:5000])
+    with pytest.raises(InputError, match="cannot be read as a bag"):
+        list(AutoReader().read(tmp_path / "two"))
 
 
 def test_a_table_beside_the_imu_of_which_nothing_is_known_is_no_log_at_rest(tmp_path):

@@ -147,7 +147,8 @@ def offer(path: Path) -> Offer | None:
         base = _preset(PRESETS[name])
         specs = {}
         for kind in ("imu", "gnss"):
-            if kind == "imu" and (name in GNSS_ONLY or not _has_imu(path, name)):
+            there = rosbag.holds(path, kind) if name == "rosbag" else kind == "gnss" or _has_imu(path, name)
+            if not there:
                 continue
             specs[kind] = {**base[kind], "file": path.name, "text": _text_options(base)}
         return Offer(path, f"{name}, as reader={PRESETS[name]}", *_opened(specs))
@@ -295,6 +296,8 @@ def _columns(spec: Mapping[str, Any]) -> list[Any]:
 
 
 def _has_imu(path: Path, name: str) -> bool:
+    if name in GNSS_ONLY:
+        return False
     try:
         base = _preset(PRESETS[name])["imu"]
         options = {**_text_options(_preset(PRESETS[name])), "lines": base.get("lines")}

@@ -8,6 +8,7 @@ carry; else the bag's. The axes of an IMU are those of its frame; velocities of 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,28 +25,41 @@ Row = dict[str, Any]
 
 def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> Table:
     """The topic ``table``, or the only one whose type holds what ``kind`` needs; ROS 2: the bag's metadata.yaml."""
+    with _opened(path) as reader:
+        return _read(reader, path, kind, table)
+
+
+def holds(path: Path, kind: str) -> bool:
+    """Whether some topic holds an IMU (``imu``), or fixes (``gnss``)."""
+    return any(t in (IMU if kind == "imu" else (*FIX, SENTENCE)) for t in _topics(path).values())
+
+
+def velocities_beside(path: Path) -> list[str]:
+    """Topics with velocities alone, where the bag's fixes (one topic of NavSatFix) have none."""
+    topics = _topics(path)
+    bare = [kind for kind in topics.values() if kind in (*FIX, SENTENCE)] == ["sensor_msgs/NavSatFix"]
+    return sorted(topic for topic, kind in topics.items() if kind in VELOCITIES) if bare else []
+
+
+def _topics(path: Path) -> dict[str, str]:
+    with _opened(path) as reader:
+        return {c.topic: _short(c.msgtype) for c in reader.connections}
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
     highlevel = library("rosbags.highlevel", "a ROS bag")
     typesys = library("rosbags.typesys", "a ROS bag")
     bag = path.parent if path.name == "metadata.yaml" else path
     store = typesys.get_typestore(typesys.Stores.LATEST)
     try:
         with highlevel.AnyReader([bag], default_typestore=store) as reader:
-            return _read(reader, path, kind, table)
+            yield reader
     except InputError:
         raise
     except Exception as error:
         # rosbags raises errors of its own, of sqlite, lz4 and struct for damaged bags
         raise InputError(f"{path}: cannot be read as a bag ({_first_line(error)}); give a whole one") from None
-
-
-def velocities_beside(path: Path) -> list[str]:
-    """Topics with velocities alone, where the bag's fixes (one topic of NavSatFix) have none."""
-    highlevel, typesys = library("rosbags.highlevel", "a ROS bag"), library("rosbags.typesys", "a ROS bag")
-    bag = path.parent if path.name == "metadata.yaml" else path
-    with highlevel.AnyReader([bag], default_typestore=typesys.get_typestore(typesys.Stores.LATEST)) as reader:
-        kinds = {c.topic: _short(c.msgtype) for c in reader.connections}
-    bare = [kind for kind in kinds.values() if kind in (*FIX, SENTENCE)] == ["sensor_msgs/NavSatFix"]
-    return sorted(topic for topic, kind in kinds.items() if kind in VELOCITIES) if bare else []
 
 
 def _read(reader: Any, path: Path, kind: str, table: str | None) -> Table:
@@ -54,7 +68,7 @@ def _read(reader: Any, path: Path, kind: str, table: str | None) -> Table:
     have = ", ".join(f"{name} ({c.msgtype})" for name, c in sorted(topics.items()))
     if table is not None:
         if table not in topics:
-            raise InputError(f"{path}: no topic {table}; has {have}; set reader.{kind}.table")
+            raise InputError(f"{path}: no topic {table}; has {have}; name one of these")
         chosen = [topics[table]]
     else:
         chosen = [c for c in topics.values() if _short(c.msgtype) in known]
