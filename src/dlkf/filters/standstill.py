@@ -26,7 +26,7 @@ TELLING = 2.0  # below this ratio the samples do not tell standing from moving
 MEMORY_S = 100.0  # s of standing or moving in which what was heard of it grows by e: a wrong second is forgotten
 STILL_ACCEL, STILL_RATE = 0.2, 0.01  # m/s², rad/s: with less, beyond 2σ of what the filter knows, a car may stand
 PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 3.0  # m/s, 1σ: a standstill must not contradict the filter
-LEAST_STD_RATE = 0.05  # m/s²: how fast the 1σ of a speed grows without fixes at least, for filters are too sure of it
+LEAST_STD_RATE = 0.03  # m/s²: how fast the 1σ of a speed grows without fixes at least, for filters are too sure of it
 
 
 class Liveliness(NamedTuple):
