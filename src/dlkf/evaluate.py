@@ -10,7 +10,7 @@ from dataclasses import asdict
 from dlkf.command import command
 from dlkf.command.scored import EvaluateSettings
 from dlkf.console import keep_said, talking
-from dlkf.data.kinds import drive_imus, drive_kinds
+from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import dataset_digest, drive_rows
 from dlkf.evaluation.outages import check_outages
 from dlkf.evaluation.shares import Work, evaluate_shares
@@ -19,7 +19,7 @@ from dlkf.evaluation.summary import answer, metrics_of
 from dlkf.evaluation.table import all_tables, as_markdown, as_rich
 from dlkf.files import absolute, name_of, vacant
 from dlkf.filters.build import build_filter
-from dlkf.filters.card import unmet_imus, without_seen
+from dlkf.filters.card import strangers, without_seen
 from dlkf.filters.saved import grid_of
 from dlkf.models import check_baseline, resolve_models
 from dlkf.parallel import check
@@ -48,8 +48,8 @@ def main(told: EvaluateSettings) -> None:
     digest, kinds = dataset_digest(told.dataset), drive_kinds(told.dataset)
     cards = {model_name: getattr(model, "card", {}) for model_name, model in models.items()}
     rows, seen = without_seen(cards, rows, name, digest, leave_out=told.unseen)
-    named = drive_imus(told.dataset)
-    for line in (*seen, *unmet_imus(cards, {named.get(row.name, spec.name) for row in rows})):
+    strange = strangers(models, told.dataset, [row.name for row in rows], spec.name, grid["rate_hz"])
+    for line in (*seen, *strange):
         console.print(line, style="yellow")
     work = Work(
         absolute(told.dataset), models, protocol, grid, kinds, {row.name: row.group for row in rows},

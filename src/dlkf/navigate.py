@@ -15,12 +15,11 @@ from dlkf.command import command
 from dlkf.command.settings import NavigateSettings
 from dlkf.console import LOG, counting
 from dlkf.data.drive import Drive
-from dlkf.data.kinds import drive_imus
 from dlkf.data.store import dataset_digest, drive_rows, load_dataset
 from dlkf.data.tables import time_zeros
 from dlkf.errors import InputError
 from dlkf.files import absolute, name_of, staged, vacant
-from dlkf.filters.card import unmet_imus
+from dlkf.filters.card import strangers
 from dlkf.filters.saved import grid_of
 from dlkf.filters.smoother import smoothed
 from dlkf.models import resolve_model, short_name
@@ -47,13 +46,12 @@ def main(told: NavigateSettings) -> None:
     spec, tuning = told.spec, told.tuning
     model = resolve_model(told.model, spec, told.tracking.uri, **told.told)
     zeros = time_zeros(told.dataset)
-    rows, named = drive_rows(told.dataset, told.drives), drive_imus(told.dataset)
-    card = {short_name(told.model): getattr(model, "card", {})}
-    for line in unmet_imus(card, {named.get(row.name, spec.name) for row in rows}):
-        print(line)
+    rows, name = drive_rows(told.dataset, told.drives), short_name(told.model)
     spacings = {row.name: offline.Fixes.of(told.dataset, row.name) for row in rows}
     usual = offline.epoch_for(spacings.values(), told.rate_hz or 50.0, model)
     grid = grid_of([model], told.rate_hz, told.epoch_s, usual)
+    for line in strangers({name: model}, told.dataset, spacings, spec.name, grid["rate_hz"]):
+        print(line)
     skipped: dict[str, str] | None = {} if told.skip_unaligned else None
     if told.streaming and (ahead := "smoother" if told.smoother else "imu=auto" if spec.name == AUTO else ""):
         raise InputError(f"{ahead} looks ahead, a stream cannot: give {ahead} or streaming, not both")
@@ -89,9 +87,9 @@ def main(told: NavigateSettings) -> None:
             courses.append(course if len(courses) < MOST_DRIVES else course.for_the_map())
         made = {**provenance(), "model": told.model, "dataset": told.dataset, "drives": told.drives, **grid}
         made |= {"digest": dataset_digest(told.dataset), "imu": asdict(spec), "tuning": asdict(tuning)}
-        write_page(folder, short_name(told.model), name_of(told.dataset), courses, made)
+        write_page(folder, name, name_of(told.dataset), courses, made)
         left_out = [f"left out: {reason}" for reason in (skipped or {}).values()]
-        said = "\n".join((*sorted(lines), *left_out, *answers(short_name(told.model), courses)))
+        said = "\n".join((*sorted(lines), *left_out, *answers(name, courses)))
         (folder / LOG).write_text(f"{said}\n")
     print(said)
     print(f"Solutions: {told.out}/drive=*/solution.parquet; report: {told.out}/report.html")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pandas as pd
 import torch
 
 from dlkf.data.store import dataset_digest
-from dlkf.filters.card import recordings_seen, unmet_imus
+from dlkf.filters.card import recordings_seen, unheard_cars, unmet_imus
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.saved import save_filter
 
@@ -29,6 +30,30 @@ def test_an_imu_that_a_model_has_not_met_is_said_and_no_other():
     assert unmet_imus(cards, ["consumer"]) == []
     (line,) = unmet_imus(cards, ["consumer", "bmi270"])
     assert line.startswith("mine was trained on the IMU consumer and has not met bmi270")
+
+
+def test_a_filter_that_listens_says_that_samples_are_too_slow_for_it():
+    class Listening:
+        least_rate_hz = 50.0
+
+    models = {"plus": Listening(), "mbkf15": object()}
+    assert unheard_cars(models, [50.0, 100.0, 49.9]) == []
+    (line,) = unheard_cars(models, [100.0, 10.01, 1.0])
+    assert line.startswith("plus hears the car through samples at 50 Hz or more and these drives have 1 to 10 Hz")
+
+
+def test_navigate_and_evaluate_say_so_of_a_file_and_of_a_rate(call, town, tmp_path):
+    """The file's own rate counts, whatever the samples are brought to: what lies between them is not heard."""
+    slow = Path(shutil.copytree(town, tmp_path / "slow"))
+    table = pd.read_parquet(slow / "drives.parquet")
+    table.assign(imu_rate_hz=10.0).to_parquet(slow / "drives.parquet", index=False)
+    said = "plus hears the car through samples at 50 Hz or more and these drives have 10 Hz"
+    drive = f"drives=[{table['drive'][0]}]"
+    for k, (data, more, expected) in enumerate(((town, (), False), (slow, (), True), (town, ("rate_hz=10",), True))):
+        done = call("navigate", "model=plus", f"dataset={data}", f"out=navigated{k}", drive, *more)
+        assert done.code == 0 and (said in done.out) == expected, done
+    done = call("evaluate", "model=[mbkf15,plus]", f"dataset={slow}", "out=scored", drive, *SCORING)
+    assert done.code == 0 and said in " ".join(done.out.split()), done
 
 
 def test_evaluate_says_so_and_leaves_them_out(call, town, tmp_path):

@@ -10,6 +10,7 @@ import pandas as pd
 
 from dlkf.errors import InputError
 from dlkf.files import placed, readable
+from dlkf.settings import is_number
 
 KINDS = ("simulated", "semi-real", "real", "unknown")
 
@@ -42,6 +43,11 @@ def drive_kinds(dataset: str | Path) -> dict[str, str]:
 def drive_imus(dataset: str | Path) -> dict[str, str]:
     """What ``drives.parquet`` calls the IMU of every drive, of those that it names one of."""
     return {str(row["drive"]): row["imu"] for row in _rows(dataset) if isinstance(row.get("imu"), str) and row["imu"]}
+
+
+def drive_rates(dataset: str | Path) -> dict[str, float]:
+    """Samples a second [Hz] of every drive's IMU, of those that ``drives.parquet`` says it of."""
+    return {str(row["drive"]): float(rate) for row in _rows(dataset) if is_number(rate := row.get("imu_rate_hz"))}
 
 
 def _rows(dataset: str | Path) -> list[dict[Any, Any]]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import yaml
 
+from dlkf.data.kinds import drive_imus, drive_rates
 from dlkf.data.tables import DriveRow
 from dlkf.errors import InputError
 
@@ -52,6 +53,36 @@ def unmet_imus(cards: Mapping[str, Mapping[str, Any]], imus: Iterable[str]) -> l
                 "it may be worse than any other filter here"
             )
     return lines
+
+
+def unheard_cars(models: Mapping[str, object], rates: Iterable[float]) -> list[str]:
+    """A line for each model that hears the car through its samples, where ``rates`` [Hz] has one too slow for that.
+
+    ``models`` by their names; one without ``least_rate_hz`` does not listen. A clock a tenth slow is as good.
+    """
+    lines, met = [], list(rates)
+    for name, model in models.items():
+        least = getattr(model, "least_rate_hz", 0.0)
+        if slow := sorted({float(f"{rate:.2g}") for rate in met if rate < 0.9 * least}):
+            have = f"{slow[0]:g}" if len(slow) == 1 else f"{slow[0]:g} to {slow[-1]:g}"
+            lines.append(
+                f"{name} hears the car through samples at {least:g} Hz or more and these drives have {have} Hz: "
+                "it runs, but may be worse than any other filter here"
+            )
+    return lines
+
+
+def strangers(
+    models: Mapping[str, object], dataset: str | Path, drives: Iterable[str], preset: str, rate_hz: int | float
+) -> list[str]:
+    """Lines for models on drives that they were not made for: :func:`unmet_imus`, :func:`unheard_cars`.
+
+    The IMU is ``preset`` where the dataset names none; samples brought to ``rate_hz`` are as fast as they were at most.
+    """
+    drives, imus, rates = list(drives), drive_imus(dataset), drive_rates(dataset)
+    cards = {name: getattr(model, "card", {}) for name, model in models.items()}
+    unmet = unmet_imus(cards, {imus.get(drive, preset) for drive in drives})
+    return unmet + unheard_cars(models, [float(min(rate_hz, rates.get(drive, rate_hz))) for drive in drives])
 
 
 def without_seen(

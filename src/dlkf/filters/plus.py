@@ -32,7 +32,15 @@ from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.navigation.state import IMU, PV, PVA, ErrorStates
 from dlkf.networks.features import level_rotation
-from dlkf.networks.plus import WINDOW_FEATURES, Heads, PlusNetwork, PlusNetworkConfig, loudness, window_features
+from dlkf.networks.plus import (
+    LEAST_RATE_HZ,
+    WINDOW_FEATURES,
+    Heads,
+    PlusNetwork,
+    PlusNetworkConfig,
+    loudness,
+    window_features,
+)
 from dlkf.settings import settings_from
 
 PARTS = ("process", "fix", "across", "offset", "speed", "residual")
@@ -104,6 +112,7 @@ class PlusFilter(nn.Module):
     """Estimator round a classical one."""
 
     card: dict[str, Any]  # what the weights were made of; those of a file have it
+    least_rate_hz = LEAST_RATE_HZ  # of the samples that it hears the car through
 
     def __init__(self, config: PlusConfig) -> None:
         super().__init__()

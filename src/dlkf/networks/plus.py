@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from dlkf.errors import InputError
 
 BANDS_HZ = (0.5, 1.5, 3.5, 5.5, 8.5, 12.5, 16.5, 20.5, 25.5)  # edges; below 0.5 Hz is the car's own motion
+LEAST_RATE_HZ = 50.0  # of samples that have all bands
 SMALLEST_POWER = (1e-7, 1e-11)  # (m/s²)², (rad/s)²: added to the variance of a band
 MEAN_SIZE = (2.0, 2.0, 2.0, 0.1, 0.1, 0.2)  # m/s², rad/s
 WINDOW_FEATURES = 6 + 6 * (len(BANDS_HZ) - 1)
