@@ -164,9 +164,7 @@ def test_faulty_data(command, fault, copy, call, tmp_path):
 def test_a_faulty_reference_stops_evaluate_and_not_navigate(fault, copy, call, tmp_path):
     spoil, said = REFERENCE_FAULTS[fault]
     spoil(copy)
-    is_refused(
-        call("evaluate", "model=ins", "dataset=town", "out=made", *FAST["evaluate"]), *said, folder=tmp_path
-    )
+    is_refused(call("evaluate", "model=ins", "dataset=town", "out=made", *FAST["evaluate"]), *said, folder=tmp_path)
     done = call("navigate", "model=ins", "dataset=town", "out=made", *FAST["navigate"])
     assert done.code == 0, done.err
 
@@ -325,6 +323,22 @@ OF_ALL_COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "a seed below zero": ("evaluate", (*SCORED, "seed=-1"), "seed is -1, must be a whole number ≥ 0"),
     "roads of a seed below zero": ("simulate", ("seed=-3", "out=made"), "seed is -3"),
     "a test of a seed below zero": ("train", (*TRAINED, "scoring.seed=-3"), "scoring.seed is -3"),
+    "a score before the start": ("evaluate", (*SCORED, "settle_s=-5"), "settle_s is -5, must be 0 or more"),
+    "a test before the start": (
+        "train",
+        (*TRAINED, "scoring.settle_s=-5"),
+        "scoring.settle_s is -5, must be 0 or more",
+    ),
+    "a consistency before the start": (
+        "consistency",
+        ("model=mbkf15", "out=made", "settle_s=-5"),
+        "settle_s is -5, must",
+    ),
+    "a strategy that is none": (
+        "train",
+        (*TRAINED, "trainer.devices=2", "trainer.strategy=fsdp"),
+        "trainer.strategy is 'fsdp', must be",
+    ),
     "a key too many": ("evaluate", (*SCORED, "+colour=red"), "unknown config key 'colour'"),
     "a key too many in a section": ("navigate", (*SOLVED, "+align.colour=red"), "align: unknown key colour"),
     "a key too many beside the store": ("navigate", (*SOLVED, "+tracking.colour=red"), "tracking: unknown key colour"),

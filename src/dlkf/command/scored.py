@@ -6,7 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from dlkf.command.settings import FilterSettings, OnDrives, Store, check_above_zero, check_file_name
+from dlkf.command.settings import (
+    FilterSettings,
+    OnDrives,
+    Store,
+    check_above_zero,
+    check_file_name,
+    check_not_below_zero,
+)
 from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.masks import BiasLaw
 from dlkf.data.segments import StartLaw
@@ -50,6 +57,9 @@ class EvaluateSettings(FilterSettings, OnDrives, Scored):
     settle_s: float
     baseline: str
     tracking: Store
+
+    def __post_init__(self) -> None:
+        check_not_below_zero(self, "settle_s")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +108,7 @@ class ConsistencySettings(FilterSettings):
 
     def __post_init__(self) -> None:
         check_above_zero(self, "drives", "minutes", "rate_hz")
+        check_not_below_zero(self, "settle_s")
 
     @property
     def matched(self) -> MatchedDrives:

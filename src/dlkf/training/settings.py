@@ -32,7 +32,7 @@ class TrainerSettings(Ranged, where="trainer"):
     threads: int | None = within(1, 1, MANY)
     accelerator: str = "auto"
     devices: int = within(1, 1, MANY)
-    strategy: Literal["auto", "ddp"] = "auto"
+    strategy: Literal["auto", "ddp"] = "auto"  # the same: several processes average their gradients, one has its own
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,10 @@ class ScoringSettings:
     gains: bool
     settle_s: float
     injected_bias: BiasLaw | None
+
+    def __post_init__(self) -> None:
+        if self.settle_s < 0:
+            raise InputError(f"scoring.settle_s is {self.settle_s!r}, must be 0 or more")
 
 
 @dataclass(frozen=True)
