@@ -7,7 +7,7 @@ At the optimal gain P⁺ does not change with K to first order, and A P = P⁺, 
     ∂P⁺ = A ∂P Aᵀ + K ∂R Kᵀ − K ∂H P⁺ − P⁺ ∂Hᵀ Kᵀ
     ∂dx = A ∂P Hᵀ u − K ∂R u − K ∂H dx + P⁺ ∂Hᵀ u + K ∂z
 
-which is half of what autograd makes of the update step by step, and does not solve with S again.
+which takes fewer products than what autograd makes of the update step by step, and solves with S for one column.
 """
 
 from __future__ import annotations
