@@ -26,7 +26,6 @@ TELLING = 2.0  # below this ratio the samples do not tell standing from moving
 MEMORY_S = 100.0  # s of standing or moving in which what was heard of it grows by e: a wrong second is forgotten
 STILL_ACCEL, STILL_RATE = 0.2, 0.01  # m/s², rad/s: with less, beyond 2σ of what the filter knows, a car may stand
 PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 3.0  # m/s, 1σ: a standstill must not contradict the filter
-LEAST_STD_RATE = 0.03  # m/s²: how fast the 1σ of a speed grows without fixes at least, for filters are too sure of it
 
 
 class Liveliness(NamedTuple):
@@ -34,27 +33,25 @@ class Liveliness(NamedTuple):
 
     standing: Tensor  # (B,) of the quietest second
     moving: Tensor  # (B,) likewise
-    alone: Tensor  # (B,) s since the last velocity of GNSS
 
     @classmethod
     def unheard(cls, like: Tensor, batch_size: int) -> Liveliness:
         """Of a car that has not been heard."""
         nothing = like.new_full((batch_size,), math.inf)
-        return cls(nothing, nothing, like.new_zeros(batch_size))
+        return cls(nothing, nothing)
 
-    def limit(self, prior: Float[Tensor, " 1"]) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
-        """Half way, as logarithms, between standing and moving, near silence where they sound alike; do they not?"""
+    def limit(self, prior: Float[Tensor, " 1"]) -> Float[Tensor, " B"]:
+        """Half way, as logarithms, between standing and moving; near silence where the two sound alike."""
         moving = torch.where(self.moving.isinf(), prior, self.moving)
         standing = torch.where(self.standing.isinf(), moving / APART, self.standing)
-        told = moving > TELLING * standing
-        return torch.where(told, (standing * moving).sqrt(), prior / APART), told
+        return torch.where(moving > TELLING * standing, (standing * moving).sqrt(), prior / APART)
 
     def heard(self, now: Tensor, standing: Tensor, moving: Tensor, span: float) -> Liveliness:
         """After a window of ``span`` seconds in which the car surely stood, or moved, or neither."""
         fade = math.exp(span / MEMORY_S)
-        return self._replace(
-            standing=torch.where(standing, torch.minimum(fade * self.standing, now), self.standing),
-            moving=torch.where(moving, torch.minimum(fade * self.moving, now), self.moving),
+        return Liveliness(
+            torch.where(standing, torch.minimum(fade * self.standing, now), self.standing),
+            torch.where(moving, torch.minimum(fade * self.moving, now), self.moving),
         )
 
 
@@ -75,11 +72,7 @@ def at_rest(
     still = (gained < STILL_ACCEL + 2 * (GRAVITY**2 * tilt + accel).sqrt()) & (
         turning.norm(dim=-1) < STILL_RATE + 2 * diagonal[:, GYRO].sum(-1).sqrt()
     )
-    fixed = epoch.used[:, 3:5].all(-1)
-    sure = fixed & (std < SURE_STD)
+    sure = epoch.used[:, 3:5].all(-1) & (std < SURE_STD)
     after = before.heard(lively, sure & (speed + std < STANDING_SPEED), sure & (speed - std > MOVING_SPEED), span)
-    alone = torch.where(fixed, 0.0, before.alone + span)
-    limit, told = after.limit(prior)
-    doubt = torch.where(told, torch.maximum(std, LEAST_STD_RATE * alone), std)
-    plausible = speed < PLAUSIBLE_SPEED + PLAUSIBLE_SIGMAS * doubt
-    return (lively <= limit) & still & plausible, after._replace(alone=alone)
+    plausible = speed < PLAUSIBLE_SPEED + PLAUSIBLE_SIGMAS * std
+    return (lively <= after.limit(prior)) & still & plausible, after
