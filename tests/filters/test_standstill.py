@@ -66,6 +66,26 @@ def test_the_first_stop_is_found_however_the_engine_idles(idling):
     assert drift(batch, "mbkf15_nhc") < 0.2 * drift(batch, "mbkf15")
 
 
+def test_one_sample_an_epoch_has_no_spread():
+    """At 1 Hz in epochs of 1 s: no standstill, and nothing that is no number, neither told nor kept."""
+    batch = shaken((0.02, 2e-4), (0.04, 4e-4))
+    slow = replace(batch, imu=batch.imu.mean(2, keepdim=True), dt=batch.dt * batch.size[2])
+    heard: list[Liveliness] = []
+
+    class Hearing(CarConstraints):
+        def resting(self, epoch, turning, P, memory):
+            resting, liveliness = super().resting(epoch, turning, P, memory)
+            heard.append(liveliness)
+            assert not resting.any()
+            return resting, liveliness
+
+    kalman = build_filter("mbkf15_nhc", IMU)
+    sources = tuple(Hearing(s.tuning, s.states) if isinstance(s, CarConstraints) else s for s in kalman.sources)
+    solution = integrate(slow, replace(kalman, sources=sources))
+    assert len(heard) == 100 and solution.posterior.p_n.isfinite().all() and solution.std.isfinite().all()
+    assert not any(x.isnan().any() for x in heard[-1])
+
+
 def test_what_is_heard_sets_the_limit_half_way():
     nothing = Liveliness.unheard(torch.zeros(1, dtype=D), 3)
     prior = torch.tensor([3e-3], dtype=D)

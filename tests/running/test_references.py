@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -16,7 +18,7 @@ from dlkf.evaluation.protocol import Protocol, Scenes
 from dlkf.evaluation.run import score_scenes
 from dlkf.filters.build import build_filter
 from dlkf.navigation.imu_errors import imu_spec
-from dlkf.running.references import referenced
+from dlkf.running.references import _at_imu, referenced
 from tests.drives import drives_in
 
 
@@ -47,6 +49,24 @@ def test_errors_are_those_against_the_truth(world, kind):
         true, told = ends(drives, spec, seconds), ends(made.drives, spec, seconds)
         assert len(true) == len(told) >= 2 and np.sqrt((true**2).mean()) > 1
         assert np.sqrt((told**2).mean()) == pytest.approx(np.sqrt((true**2).mean()), rel=0.05)
+
+
+@pytest.mark.parametrize("rate_hz", [25.0, 200.0])
+def test_the_antenna_swings_with_the_rate_of_the_last_tenth_of_a_second(world, rate_hz):
+    """An antenna 1 m ahead of a car that turns ever faster: ω × l of its mean rate over 0.1 s, whatever the samples."""
+    drive, count = world[0][0], int(rate_hz)
+    rate = torch.linspace(0.0, 1.0, count + 1, dtype=torch.float64)[1:]  # rad/s at the samples of each second
+    imu = torch.zeros(drive.epochs, count, 6, dtype=torch.float64)
+    imu[..., 5] = rate
+    arm = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    turning = replace(drive, imu=imu, rate_hz=rate_hz, lever_arm_b=arm)
+    rows = slice(1, drive.epochs + 1)
+    C = torch.eye(3, dtype=torch.float64).expand(drive.epochs, 3, 3)
+    _, v, good = _at_imu(turning, rows, C, torch.zeros(drive.epochs, 3, dtype=torch.float64))
+    swing = (drive.gnss_v_e[rows] - v)[good & drive.gnss_valid[rows, 3:].all(-1)]
+    assert len(swing) > 60
+    # to the half sample by which 0.1 s is no whole number of them
+    assert (swing[:, 1] - 0.95).abs().max() < 1.0 / rate_hz
 
 
 def test_the_reference_is_as_good_as_it_says(world):

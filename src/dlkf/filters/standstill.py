@@ -59,7 +59,12 @@ def at_rest(
     epoch: Epoch, turning: Float[Tensor, "B 3"], P: Float[Tensor, "B n n"], before: Liveliness,
     prior: Float[Tensor, " 1"],
 ) -> tuple[Bool[Tensor, " B"], Liveliness]:  # fmt: skip
-    """Whether the car stood in the window, and what has been heard since; ``turning`` is its mean rate [rad/s]."""
+    """Whether the car stood in the window, and what has been heard since; ``turning`` is its mean rate [rad/s].
+
+    Of one sample there is no spread: nothing is heard, and no standstill is found.
+    """
+    if epoch.imu.shape[1] < 2:
+        return torch.zeros_like(before.standing) > 0, before
     swing = epoch.imu - epoch.imu.mean(1, keepdim=True)  # torch's var of a middle axis takes four times as long
     variance = swing.square().sum(1) / (epoch.imu.shape[1] - 1)
     force, rate = variance.unflatten(-1, (2, 3)).sum(-1).unbind(-1)

@@ -19,6 +19,7 @@ from dlkf.data.alignment import AlignConfig
 from dlkf.data.drive import Drive
 from dlkf.data.segments import whole_drives
 from dlkf.errors import InputError
+from dlkf.filters.integration import RATE_AVERAGE_S
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.smoother import Smoothed
 from dlkf.navigation.state import POSITION
@@ -137,7 +138,8 @@ def _at_imu(drive: Drive, rows: slice, C_eb: Tensor, v_e: Tensor) -> tuple[Tenso
     worst = next((k for k, q in enumerate(WORTH) if share[q] >= ENOUGH), len(WORTH) - 1)
     lag = drive.gnss_lag[rows, None]
     good = seen & torch.isin(quality, torch.tensor(WORTH[: worst + 1])) & (lag[:, 0] <= LATE_S)
-    rate_b = drive.imu[rows.start - 1 : rows.stop - 1, -5:, 3:].double().mean(1)
+    tail = max(1, round(RATE_AVERAGE_S * drive.rate_hz))
+    rate_b = drive.imu[rows.start - 1 : rows.stop - 1, -tail:, 3:].double().mean(1)
     arm = drive.lever_arm_b.expand_as(rate_b)
     known = drive.gnss_valid[rows, 3:].all(-1, keepdim=True)
     swing = torch.einsum("tij,tj->ti", C_eb, torch.linalg.cross(rate_b, arm))
