@@ -311,6 +311,10 @@ def test_a_table_beside_the_imu_of_which_nothing_is_known_is_no_log_at_rest(tmp_
     (tmp_path / "ecef.csv").write_text("t,x,y,z\n" + "".join(f"{k},4e6,6e5,5e6\n" for k in range(9)))
     with pytest.raises(InputError, match=r"no fixes found in ecef\.csv"):
         list(AutoReader().read(tmp_path))
+    (tmp_path / "ecef.csv").rename(tmp_path / "ecef.notes")
+    (tmp_path / "town.nmea").touch()
+    with pytest.raises(InputError, match=r"no fixes found in town\.nmea \(it is empty\)"):
+        list(AutoReader().read(tmp_path))
 
 
 def test_what_is_not_sure_is_refused(tmp_path):

@@ -124,7 +124,7 @@ def growth(reports: Sequence[Report]) -> go.Figure:
         legend={"orientation": "h", "y": -0.18, "yanchor": "top"},
     )  # fmt: skip
     figure.update_xaxes(title_text="Time without GNSS [s]")
-    figure.update_yaxes(title_text="Horizontal error [m]", type="log")
+    figure.update_yaxes(title_text="Horizontal error [m]", type="log", nticks=8)
     return figure
 
 

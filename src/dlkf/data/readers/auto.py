@@ -30,6 +30,7 @@ PRESETS |= {"inertial_explorer": "inertial_explorer", "novatel": "novatel", "nav
 GNSS_ONLY = ("nmea", "rtklib", "inertial_explorer")
 LARGEST_PEEK = 400  # lines
 TABLES = (".csv", ".tsv", ".txt", ".dat")
+RECEIVERS = (".ubx", ".nmea", ".pos", ".bag", ".mcap", ".asc")
 
 
 @dataclass(frozen=True)
@@ -252,11 +253,12 @@ def _velocities_beside(chosen: Offer, gnss: Mapping[str, Any], files: Iterable[P
 
 
 def _foreign(folder: Path, offers: Iterable[Offer | None], only: Path | None) -> str:
-    """A text table beside the IMU's file of which nothing is known; empty where there is none."""
+    """A text table or a receiver's log beside the IMU's file of which nothing is known; empty where there is none."""
     known = {found.path for found in offers if found is not None}
     beside = [] if only is not None else sorted(folder.iterdir())
-    tables = (p for p in beside if p.is_file() and not p.name.startswith(".") and p not in known)
-    return next((p.name for p in tables if p.suffix in TABLES and sniffed(p) == "csv"), "")
+    logs = (p for p in beside if p.is_file() and not p.name.startswith(".") and p not in known)
+    unread = (p for p in logs if p.suffix in RECEIVERS or (p.suffix in TABLES and sniffed(p) in ("csv", None)))
+    return next((f"{p.name} (it is empty)" if p.stat().st_size == 0 else p.name for p in unread), "")
 
 
 def _preset(name: str) -> dict[str, Any]:
