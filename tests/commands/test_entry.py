@@ -137,7 +137,7 @@ def test_in_a_shell(tmp_path, town):
     """The same command as ``python -m dlkf.navigate``, with a folder that Hydra's grammar does not take."""
     words = ["navigate", "model=ins", f"dataset={town}", "out=Straße (1)/drive=a", "rate_hz=10", "export=[gpx]"]
     done = subprocess.run(
-        [sys.executable, "-m", "dlkf", *words], cwd=tmp_path, capture_output=True, text=True, timeout=120
+        [sys.executable, "-m", "dlkf", *words], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S
     )
     assert done.returncode == 0, done.stderr
     out = tmp_path / "Straße (1)" / "drive=a"

@@ -39,6 +39,7 @@ from dlkf.running.start import aligned_drives
 from dlkf.running.streaming import StreamingFilter
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
+from tests.shell import PATIENCE_S
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
 IMU = ImuSpec(
@@ -242,7 +243,7 @@ def test_ten_hours_allocate_nothing(exported, tmp_path):
     files = Path(__file__).with_name("ten_hours.c"), folder / LIBRARY, "-o", tmp_path / "go", "-lm"
     subprocess.run([compiler(), "-O2", f"-I{folder}", *files], check=True)
     told = {"capture_output": True, "text": True, "check": True}
-    said = subprocess.run([tmp_path / "go"], env={"LD_LIBRARY_PATH": str(folder)}, timeout=300, **told).stdout
+    said = subprocess.run([tmp_path / "go"], env={"LD_LIBRARY_PATH": str(folder)}, timeout=PATIENCE_S, **told).stdout
     epochs, allocations, more_kB, off = (float(x) for x in re.findall(r"[\d.]+(?= )", said))
     assert epochs > 36_000 and allocations == 0
     assert more_kB <= 64  # pages of the stack that are touched late

@@ -19,6 +19,7 @@ from dlkf.points import SWEPT, Failure, listened, tell
 from dlkf.tracking.comparison import best_validation, monitored
 from dlkf.tracking.grid import PARENT_RUN, GridParent, parent_status, run_name, swept_overrides
 from dlkf.tracking.runs import mlflow_module, start_run
+from tests.shell import PATIENCE_S
 
 TASK = ["+experiment=outage", "optimizer.lr=1e-3,1e-4", "filter@model=dlkf", "seed=range(2)", "data.x=[1,2]"]
 
@@ -227,7 +228,7 @@ def swept(folder: Path, client, *launcher: str, **environment: str) -> None:
         env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
         capture_output=True,
         text=True,
-        timeout=480,
+        timeout=PATIENCE_S,
     )
     assert done.returncode == 1 and "ValueError: three" in done.stderr
     experiment = client.get_experiment_by_name("town").experiment_id

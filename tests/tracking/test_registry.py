@@ -27,6 +27,7 @@ from dlkf.tracking.comparison import best_of
 from dlkf.tracking.grid import PARENT_RUN, GridParent
 from dlkf.tracking.registry import check_registration, download_model, log_model, registered
 from dlkf.tracking.runs import mlflow_module, start_run
+from tests.shell import PATIENCE_S
 
 
 @pytest.fixture
@@ -131,7 +132,8 @@ def test_it_is_served_and_called_over_http(name, logged, uri, call):
     environment = {**os.environ, "MLFLOW_TRACKING_URI": uri, "OMP_NUM_THREADS": "1", "PATH": path}
     server = subprocess.Popen([*command, "--env-manager", "local"], env=environment, start_new_session=True)
     try:
-        for _ in range(240):
+        end = time.monotonic() + PATIENCE_S
+        while server.poll() is None and time.monotonic() < end:
             try:
                 urllib.request.urlopen(f"http://127.0.0.1:{port}/ping", timeout=2)
                 break
@@ -142,10 +144,10 @@ def test_it_is_served_and_called_over_http(name, logged, uri, call):
         request = urllib.request.Request(
             f"http://127.0.0.1:{port}/invocations", json.dumps(body).encode(), {"Content-Type": "application/json"}
         )
-        answer = pd.DataFrame(json.load(urllib.request.urlopen(request, timeout=60))["predictions"])
+        answer = pd.DataFrame(json.load(urllib.request.urlopen(request, timeout=PATIENCE_S))["predictions"])
     finally:
         os.killpg(server.pid, signal.SIGTERM)
-        server.wait(30)
+        server.wait(PATIENCE_S)
     assert set(answer.drive) == {"example"} and len(answer) >= 8
     mlflow = mlflow_module()
     mlflow.set_tracking_uri(uri)
