@@ -182,8 +182,10 @@ def test_compare(town, call, tmp_path):
         words = (f"model={models}", f"dataset={town}", f"out={name}", f"imu={imu}")
         done = call("evaluate", *words, *EVALUATE)
         assert done.code == 0, done.err
-    done = call("compare", "a", "b", "out=c")
+    (tmp_path / "b").rename(tmp_path / "1-imu=consumer")  # as a sweep names them
+    done = call("compare", "a", "1-imu=consumer", "out=c")
     assert done.code == 0, done.err
+    (tmp_path / "1-imu=consumer").rename(tmp_path / "b")
     page = (tmp_path / "c" / "compare.html").read_text()
     assert "2 evaluations compared" in page and "<td>imu</td><td>bmi270</td><td>consumer</td>" in page
     assert page.count("class=figure") == 1
