@@ -228,7 +228,7 @@ class DriveDataModule(L.LightningDataModule):
         """A line per side on its drives that give no piece on any; training pieces grow to ``longest_s``."""
         fixed = ("data.eval_length_s", self.eval_length_s)
         lengths = dict.fromkeys(SIDES, fixed) | {"train": ("data.length_s", longest_s)}
-        sides = {side: {d.name for d in self.drives(side)} for side in SIDES}
+        sides = {side: [d.name for d in self.drives(side)] for side in SIDES}  # of several datasets names may repeat
         cut = [
             cut_pieces(self.stack, length, min_valid=self.min_valid, span=self.spans[side])
             for side, (_, length) in lengths.items()
