@@ -47,7 +47,8 @@ def drive_imus(dataset: str | Path) -> dict[str, str]:
 
 def drive_rates(dataset: str | Path) -> dict[str, float]:
     """Samples a second [Hz] of every drive's IMU, of those that ``drives.parquet`` says it of."""
-    return {str(row["drive"]): float(rate) for row in _rows(dataset) if is_number(rate := row.get("imu_rate_hz"))}
+    told = ((row["drive"], row.get("imu_rate_hz")) for row in _rows(dataset))
+    return {str(drive): float(rate) for drive, rate in told if rate is not None and is_number(rate)}
 
 
 def _rows(dataset: str | Path) -> list[dict[Any, Any]]:

@@ -93,7 +93,7 @@ def scorable(batch: Batch, outage: Tensor) -> Tensor:
     return outage & (faulty.gather(1, window) == 0)
 
 
-def check_outages(plan: OutagePlan | None, withheld: Tensor) -> None:
+def check_outages(plan: OutagePlan | None, withheld: Tensor | np.ndarray) -> None:
     """Raises InputError where a plan was given and nothing was ``withheld``: no outage could be scored."""
     if plan is not None and not withheld.any():
         raise InputError(
