@@ -1,10 +1,11 @@
-"""What a command says: a console whose lines are kept, and a progress bar for work that counts its steps."""
+"""What is said: a console whose lines are kept, a progress bar for work that counts its steps, a warning."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 from rich.console import Console
@@ -25,6 +26,12 @@ def keep_said(console: Console, folder: str | Path) -> None:
     """What was said so far, as the folder's ``log.txt``."""
     with whole_file(f"{folder}/{LOG}") as beside:
         beside.write_text(console.export_text(clear=False))
+
+
+@cache
+def warned(line: str) -> None:
+    """A line on stderr, once a process: something goes on, in another way than it should."""
+    print(f"dlkf: warning: {line}", file=sys.stderr, flush=True)
 
 
 @contextmanager

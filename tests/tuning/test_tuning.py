@@ -9,6 +9,7 @@ import pytest
 import torch
 import yaml
 
+from dlkf.console import warned
 from dlkf.data.masks import withhold
 from dlkf.errors import InputError
 from dlkf.evaluation.outages import OutagePlan
@@ -70,6 +71,28 @@ def test_a_search_in_c_finds_what_one_in_torch_finds(cars, monkeypatch):
     assert best == best_c and len(set(scores)) == len(scores)
     assert [score_c, *scores_c] == pytest.approx([score, *scores], rel=1e-9)
     assert scores_c != scores  # it was C
+
+
+@pytest.mark.parametrize("wrong", ["no compiler", "a compiler that fails", "a cache that cannot be written"])
+def test_a_search_that_cannot_run_in_c_says_so_once(wrong, cars, monkeypatch, tmp_path, capfd):
+    """And finds in torch what it finds."""
+    cc, cache = tmp_path / "cc", tmp_path / "cache"
+    if wrong == "a compiler that fails":
+        cc.write_text("#!/bin/sh\nexit 1\n")
+        cc.chmod(0o755)
+    elif wrong == "a cache that cannot be written":
+        cache.write_text("a file where a folder should be")
+    if wrong != "a cache that cannot be written":
+        monkeypatch.setenv("PATH", str(tmp_path))
+        monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    monkeypatch.setattr("dlkf.tuning.search.IN_C", 1)
+    warned.cache_clear()
+    for _ in range(1 if wrong == "a compiler that fails" else 2):  # that one takes seconds to find out
+        tuned(IMU, [hidden(cars)], factors={"accel_noise": (3.0,)}, rounds=1)
+    lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("dlkf: warning: ")]
+    assert len(lines) == 1 and "trials run in torch, some 3 × slower: " in lines[0]
+    assert {"no compiler": "install one", "a compiler that fails": "it ended with 1"}.get(wrong, str(cache)) in lines[0]
 
 
 def test_every_filter_has_the_factors_that_it_uses():

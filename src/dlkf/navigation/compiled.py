@@ -7,24 +7,39 @@ textbook writes them, for one drive as for many. Without numba, or on a GPU, the
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from typing import Any, no_type_check
 
 import numpy as np
 import torch
 from torch import Tensor
 
-AVAILABLE = find_spec("numba") is not None
+from dlkf.console import warned
+
+try:
+    import numba
+except (ImportError, OSError) as error:  # not there, or not for this NumPy
+    numba = None
+    TROUBLE = (
+        f"numba cannot be loaded ({error}), so filters run up to 2 × slower; install one for this Python and NumPy"
+    )
+else:
+    TROUBLE = ""
+AVAILABLE = numba is not None
 _tensor_forms = False
 
 
 def fits(x: Tensor) -> bool:
-    """Whether the compiled form may stand in for the tensor form: no gradient asked for, in main memory."""
-    if _tensor_forms or not AVAILABLE:
+    """Whether the compiled form may stand in for the tensor form: no gradient asked for, in main memory.
+
+    Says once what stands in its way, if something does.
+    """
+    if _tensor_forms or x.device.type != "cpu" or torch.is_grad_enabled() or x.requires_grad:
         return False
-    return x.device.type == "cpu" and not torch.is_grad_enabled() and not x.requires_grad
+    if TROUBLE:
+        warned(TROUBLE)
+    return AVAILABLE
 
 
 @contextmanager
@@ -38,13 +53,23 @@ def tensor_forms() -> Iterator[None]:
         _tensor_forms = before
 
 
-if AVAILABLE:
-    from numba import njit
-else:
+def njit(**options: Any) -> Callable[[Callable], Any]:
+    """``numba.njit``, kept between processes where there is a folder for it; without numba the function as it is,
+    which :func:`fits` keeps from being called."""
 
-    def njit(**_) -> Any:
-        """Leaves the function as it is; :func:`fits` keeps it from being called."""
-        return lambda function: function
+    def made(function: Callable) -> Any:
+        global TROUBLE
+        if numba is None:
+            return function
+        try:
+            return numba.njit(cache=True, **options)(function)
+        except RuntimeError:  # numba's word for no folder that it may write into
+            TROUBLE = (
+                "compiled loops are made anew by every process, some 3 s each; set NUMBA_CACHE_DIR to a folder of yours"
+            )
+            return numba.njit(**options)(function)
+
+    return made
 
 
 def mechanised(
@@ -92,42 +117,42 @@ def gravity(
     return g
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 @no_type_check
 def cross(a, b):
     """a × b of three numbers each, which stay in registers, as those of the functions below do."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 @no_type_check
 def dot(a, b):
     """a · b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 @no_type_check
 def scaled(s, a):
     """s a."""
     return s * a[0], s * a[1], s * a[2]
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 @no_type_check
 def plus(a, s, b):
     """a + s b."""
     return a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 @no_type_check
 def row(x, b, k):
     """Vector x[b, k]."""
     return x[b, k, 0], x[b, k, 1], x[b, k, 2]
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 @no_type_check
 def rotation(phi):
     """exp([φ×]), a row each; up to 0.2 rad by the first terms of sine and cosine, which is all that float64 has."""
@@ -147,7 +172,7 @@ def rotation(phi):
     )
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 @no_type_check
 def times(a, R):
     """aᵀ R of a row and a matrix."""
@@ -158,7 +183,7 @@ def times(a, R):
     )
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 @no_type_check
 def gains(phi, f, dt):
     """∫ exp(s φ) ds f dt over a sample, once for velocity and twice for position (over dt)."""
@@ -175,7 +200,7 @@ def gains(phi, f, dt):
     )
 
 
-@njit(cache=True)
+@njit()
 @no_type_check
 def _rotations(phi, out):
     for b in range(len(phi)):
@@ -184,7 +209,7 @@ def _rotations(phi, out):
             out[b, i, 0], out[b, i, 1], out[b, i, 2] = R[i]
 
 
-@njit(cache=True)
+@njit()
 @no_type_check
 def _rotation_vectors(C, out):
     q = np.empty(4)
@@ -210,7 +235,7 @@ def _rotation_vectors(C, out):
             out[b, j] = sign * scale * q[1 + j] / norm
 
 
-@njit(cache=True)
+@njit()
 @no_type_check
 def _gravity(p, stretching, centre, axis, shape, equator, somigliana, eccentricity_sq, curvature, g):
     for b in range(len(p)):
@@ -229,7 +254,7 @@ def _gravity(p, stretching, centre, axis, shape, equator, somigliana, eccentrici
             g[b, i] *= factor
 
 
-@njit(cache=True)
+@njit()
 @no_type_check
 def _mechanise(p0, v0, C0, imu, g, w, dt, p, v, C):
     B, M, _ = imu.shape
@@ -262,7 +287,7 @@ def _mechanise(p0, v0, C0, imu, g, w, dt, p, v, C):
                 C[b, k, i, 0], C[b, k, i, 1], C[b, k, i, 2] = turned[i]
 
 
-@njit(cache=True)
+@njit()
 @no_type_check
 def _sensor_columns(C0, v0, C, v, g, samples, dt, elements, out):
     B, M = v.shape[:2]

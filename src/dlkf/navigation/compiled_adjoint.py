@@ -30,7 +30,7 @@ def adjoint(
     return p0, v0, turn, samples
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 @no_type_check
 def _rotated_back(A, k, u):
     """A[k]ᵀ u."""
@@ -41,7 +41,7 @@ def _rotated_back(A, k, u):
     )
 
 
-@njit(cache=True)
+@njit()
 @no_type_check
 def _adjoint(C0, imu, gradient, w, Gp, Gv, GC, dt, grad_p0, grad_v0, turn, grad_imu):
     B, M, _ = imu.shape

@@ -36,7 +36,8 @@ def build(folder: Path, into: Path | None = None) -> Path:
         [cc, *FLAGS, "-fPIC", "-shared", "step.c", "-o", library, "-lm"], cwd=folder, capture_output=True, text=True
     )
     if made.returncode:
-        raise InputError(f"{cc} cannot compile {folder / 'step.c'}: {made.stderr.strip().splitlines()[0]}")
+        said = (made.stderr.strip() or f"it ended with {made.returncode}").splitlines()[0]
+        raise InputError(f"{cc} cannot compile {folder / 'step.c'}: {said}")
     return library
 
 

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dlkf.console import warned
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
 from dlkf.evaluation.metrics import end_errors, mean_error
@@ -26,7 +27,6 @@ from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.state import ErrorStates
 from dlkf.onboard.compiled_filter import CompiledFilter, compiled_filter
-from dlkf.onboard.library import compiler
 
 FACTORS: Mapping[str, tuple[float, ...]] = {
     "accel_noise": (1.0, 3.0, 10.0, 30.0, 100.0),
@@ -91,8 +91,8 @@ def tuned(
     """Over-bounding factors of a filter by coordinate search on training pieces with outages.
 
     A factor goes up its values, or down them, until two in a row are worse; nothing is tried twice. From an hour of
-    pieces on, and where there is a C compiler, trials run compiled (:mod:`dlkf.onboard`), which is the same to
-    rounding. ``prior`` is what a filter with ``_prior`` is told. Returns the best factors and their
+    pieces on trials run compiled (:mod:`dlkf.onboard`), which is the same to rounding; where they cannot, a line
+    says why. ``prior`` is what a filter with ``_prior`` is told. Returns the best factors and their
     :func:`outage_error` [m]; ``progress`` is told every trial.
     """
     known: dict[Tuning, float] = {}
@@ -139,12 +139,13 @@ def _in_c(estimator: Estimator, batch: Batch) -> CompiledFilter:
 
 
 def _fits_c(estimator: Estimator, batches: Sequence[Batch]) -> bool:
-    """Whether trials run compiled: it pays, there is a compiler, and the filter, which may be one's own, fits."""
-    if compiler() is None or sum(int(b.present.sum()) for b in batches) < IN_C:
+    """Whether trials run compiled: it pays, and a library can be made of the filter, which may be one's own."""
+    if sum(int(b.present.sum()) for b in batches) < IN_C:
         return False
     try:
         _in_c(estimator, batches[0])
-    except InputError:
+    except (InputError, OSError) as error:  # OSError: a cache that cannot be written, a library that cannot be loaded
+        warned(f"trials run in torch, some 3 × slower: {error}")
         return False
     return True
 

@@ -1,0 +1,42 @@
+"""Where loops cannot be compiled, filters run all the same, and one line on stderr says what it costs."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+RUN = """
+import torch
+from dlkf.navigation import compiled
+from dlkf.navigation.attitude import rotation_from_vector
+
+phi = torch.tensor([[0.1, -0.2, 0.3]], dtype=torch.float64)
+with_gradient = rotation_from_vector(phi)  # asks for nothing compiled
+with torch.no_grad():
+    assert all(torch.allclose(rotation_from_vector(phi), with_gradient, rtol=0, atol=1e-14) for _ in range(3))
+print(compiled.AVAILABLE)
+"""
+WORLDS = {  # what is wrong before dlkf is loaded, whether loops are compiled then, what is said
+    "all well": ("", "True", None),
+    "no numba": ("import sys; sys.modules['numba'] = None", "False", "numba cannot be loaded .*, so filters run up to"),
+    "nowhere to keep it": (
+        "from numba.core.caching import CacheImpl; CacheImpl._locator_classes = []",
+        "True",
+        "made anew by every process.*NUMBA_CACHE_DIR",
+    ),
+}
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_what_is_wrong_is_said_once(world):
+    before, available, said = WORLDS[world]
+    done = subprocess.run([sys.executable, "-c", before + RUN], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [available]
+    lines = done.stderr.splitlines()
+    assert len(lines) == (0 if said is None else 1), done.stderr
+    if said is not None:
+        assert lines[0].startswith("dlkf: warning: ")
+        assert re.search(said, lines[0])
