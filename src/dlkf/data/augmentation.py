@@ -66,7 +66,9 @@ class Rough:
     """IMUs and receivers worse than any preset, drawn anew for every piece; each pair is a log-uniform range.
 
     ``share`` of the sensors get white noise [m/s²/√Hz, rad/s/√Hz], uneven over the axes by ``uneven`` (1σ of the
-    logarithm), and an error that wanders with a correlation time of 1 to 20 s [m/s², rad/s]; ``shaken`` of them have
+    logarithm), and an error that wanders with a correlation time of 1 to 20 s [m/s², rad/s]; ``muffled`` of them are
+    sensors whose own filter lets through the mean of their noise over ``muffled_s`` alone, so that it is as large over a
+    second and cannot be heard among the samples; ``shaken`` of the pieces have
     what is faster than some 3 Hz made weaker or stronger, from nothing to twice; ``rectified`` of them have sensors
     that turn vibration into an error that wanders, axis by axis in proportion to what that axis feels; ``gnss`` of
     them have further errors of position [m] and velocity [m/s], half white and half lasting, which their stds tell
@@ -80,6 +82,8 @@ class Rough:
     gyro_wander: tuple[float, ...] = (1e-4, 5e-3)
     wander_s: tuple[float, ...] = (1.0, 20.0)
     uneven: float = 1.0
+    muffled: float = 0.5
+    muffled_s: tuple[float, ...] = (0.02, 1.0)
     shaken: float = 0.4
     rectified: float = 0.4
     accel_rectified: tuple[float, ...] = (3e-4, 1e-2)  # of the RMS of the vibration in a window
@@ -122,8 +126,11 @@ def roughen(batch: Batch, rough: Rough, generator: torch.Generator | None = None
     loud = (flat - slow).unflatten(1, (T, M)).square().mean(2).sqrt().to(of_loud)
     size = (slowly * hit)[:, None] + loud * of_loud[:, None]
     wander = (wandering(normal(B, T, 6), keep) * size).repeat_interleave(M, 1)
-    noise = (white / batch.dt**0.5 * hit)[:, None] * normal(B, T * M, 6) + wander
-    flat = flat + noise.to(imu)
+    noise = (white / batch.dt**0.5 * hit)[:, None] * normal(B, T * M, 6)
+    for sensor in noise.split(3, -1):
+        muffled = chance(rough.muffled) & (sensor[:, 0] != 0).any(-1)
+        sensor[muffled] = _running_mean(sensor[muffled], drawn(rough.muffled_s, B)[muffled] / batch.dt)
+    flat = flat + (noise + wander).to(imu)
     worse = chance(rough.gnss)[:, None, None]
     size = torch.cat([drawn(b, B, 1).expand(B, 3) for b in (rough.position, rough.velocity)], -1)[:, None]
     lasting = wandering(normal(B, T, 6), torch.exp(-batch.epoch_s / drawn((5.0, 60.0), B, 1)))
@@ -132,6 +139,14 @@ def roughen(batch: Batch, rough: Rough, generator: torch.Generator | None = None
     gnss = torch.where(worse & batch.gnss_valid, batch.gnss + error.to(batch.gnss), batch.gnss)
     std = torch.where(worse, (batch.gnss_std.square() + told.square().to(imu)).sqrt(), batch.gnss_std)
     return replace(batch, imu=flat.unflatten(1, (T, M)), gnss=gnss, gnss_std=std)
+
+
+def _running_mean(x: Tensor, length: Tensor) -> Tensor:
+    """Mean of (B, N, k) over the last ``length`` (B,) rows, at least one."""
+    length = length.round().clamp(1, x.shape[1]).long()[:, None, None]
+    total = torch.nn.functional.pad(x.mT.cumsum(-1), (1, 0))
+    first = (torch.arange(1, x.shape[1] + 1) - length).clamp_min(0).expand_as(x.mT)
+    return ((total[..., 1:] - total.gather(-1, first)) / length).mT
 
 
 def wandering(white: Tensor, keep: Tensor) -> Tensor:

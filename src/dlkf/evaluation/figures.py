@@ -21,7 +21,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from dlkf.colours import COLOURS, SHADE
-from dlkf.evaluation.bootstrap import rms_band
+from dlkf.evaluation.bootstrap import MIN_GROUPS, rms_band
 from dlkf.evaluation.metrics import QUANTITIES, Array, magnitudes, outage_at, rms_over_pieces, windows
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.table import number
@@ -281,12 +281,14 @@ def error_growth(scores: Scores, quantity: str = "horizontal", *, seed: int = 0)
     ax = figure.subplots()
     ends: dict[str, float] = {}
     tops: dict[str, float] = {}
+    banded = False
     for name, run in scores.filters.items():
         x = outage_at(magnitudes(run.error)[quantity] * scale, w, seconds, scores.epoch_s)
         rms, low, high = rms_band(x, groups=groups, seed=seed)
         style = line_of(scores, name)
         ax.plot(seconds, np.where(np.isfinite(rms), rms, np.nan), lw=2, label=name, zorder=3, **style)
         ax.fill_between(seconds, low, high, color=style["color"], alpha=0.15, lw=0, zorder=2)
+        banded |= bool(np.isfinite(low).any())
         ends[name] = float(np.nanmax(rms, initial=0.0))
         tops[name] = max(float(np.nanmax(high, initial=0.0)), ends[name])
     inside = [n for n in ends if np.isfinite(ends[n]) and ends[n] <= OFF_SCALE * max(min(ends.values()), 1e-9)]
@@ -297,7 +299,8 @@ def error_growth(scores: Scores, quantity: str = "horizontal", *, seed: int = 0)
         ax.text(0.02, 0.96, note, transform=ax.transAxes, fontsize=8, color="#555555", va="top")
     ax.set_xlim(0, seconds[-1])
     ax.set(xlabel="Time without GNSS [s]", ylabel=LABELS[quantity].replace(" error", " error, RMS"))
-    ax.set_title(f"{len(w.piece)} outages, band: 95 % bootstrap interval of the RMS", fontsize=9, loc="left")
+    band = "band: 95 % bootstrap interval of the RMS" if banded else f"under {MIN_GROUPS} recordings: no intervals"
+    ax.set_title(f"{len(w.piece)} outages, {band}", fontsize=9, loc="left")
     _plain(ax)
     _legend(figure, ax.get_legend_handles_labels()[0])
     return figure
