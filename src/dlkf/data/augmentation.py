@@ -66,13 +66,12 @@ class Rough:
     """IMUs and receivers worse than any preset, drawn anew for every piece; each pair is a log-uniform range.
 
     ``share`` of the sensors get white noise [m/s²/√Hz, rad/s/√Hz], uneven over the axes by ``uneven`` (1σ of the
-    logarithm), and an error that wanders with a correlation time of 1 to 20 s [m/s², rad/s]; ``muffled`` of them are
-    sensors whose own filter lets through the mean of their noise over ``muffled_s`` alone, so that it is as large over a
-    second and cannot be heard among the samples; ``shaken`` of the pieces have
-    what is faster than some 3 Hz made weaker or stronger, from nothing to twice; ``rectified`` of them have sensors
-    that turn vibration into an error that wanders, axis by axis in proportion to what that axis feels; ``gnss`` of
-    them have further errors of position [m] and velocity [m/s], half white and half lasting, which their stds tell
-    only within a factor of two.
+    logarithm), and an error that wanders with a correlation time of 1 to 20 s [m/s², rad/s]; ``muffled`` of them
+    have a filter of their own that lets through the mean of that noise over ``muffled_s`` alone: as large over
+    seconds, not to be heard among the samples. ``shaken`` of the pieces have what is faster than some 3 Hz made
+    weaker or stronger, from nothing to twice; ``rectified`` of them have sensors that turn vibration into an error
+    that wanders, axis by axis in proportion to what that axis feels; ``gnss`` of them have further errors of position
+    [m] and velocity [m/s], half white and half lasting, which their stds tell only within a factor of two.
     """
 
     share: float = 0.4
@@ -82,7 +81,7 @@ class Rough:
     gyro_wander: tuple[float, ...] = (1e-4, 5e-3)
     wander_s: tuple[float, ...] = (1.0, 20.0)
     uneven: float = 1.0
-    muffled: float = 0.5
+    muffled: float = 0.0
     muffled_s: tuple[float, ...] = (0.02, 1.0)
     shaken: float = 0.4
     rectified: float = 0.4
