@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +63,7 @@ class Outcome:
     seconds: float
     drift_ppm: float = 0.0  # found between the clocks
     turn: np.ndarray | None = None  # rotation vector [rad] of the pose found against the nominal one
+    lean: np.ndarray | None = None  # that of the sensor against a level car, as the reference has it in the mean
 
     @property
     def wrong(self) -> bool:
@@ -156,13 +157,22 @@ def run(
         turns = [float(row.get(f"mounting_{axis}_deg") or 0.0) for axis in ("yaw", "pitch", "roll")]
         mounting = Rotation.from_euler("ZYX", turns, degrees=True).as_matrix()
         plain = tried(name, imu, gnss, mounting, PLAIN).offset_ms if own else 0.0
-        out.append(tried(name, imu, gnss, mounting, hide(rng), plain))
+        found = tried(name, imu, gnss, mounting, hide(rng), plain)
+        out.append(replace(found, lean=mean_lean(read_table(dataset, "reference", name))))
         if own:
             print(f"{name}: as it is {plain:+.1f} ms")
         one = out[-1]
         told = f"{one.pose_deg:.2f}°, {one.offset_ms:+.1f} ms, drift {one.drift_ppm:.0f} ppm {one.refused[:160]}"
         print(f"{name}: sure {one.sure}, {told}", flush=True)
     return out
+
+
+def mean_lean(reference: Columns | None) -> np.ndarray | None:
+    """Rotation vector from the sensor's axes to those of a level car, of the mean roll and pitch of a reference."""
+    if reference is None or not np.isfinite(reference["roll"]).any():
+        return None
+    roll, pitch = (float(np.nanmean(reference[angle])) for angle in ("roll", "pitch"))
+    return Rotation.from_euler("YX", [pitch, roll]).as_rotvec()
 
 
 def summary(title: str, all_of_them: list[Outcome]) -> str:
@@ -178,21 +188,22 @@ def summary(title: str, all_of_them: list[Outcome]) -> str:
     return "| " + " | ".join(str(c) for c in cells) + " |"
 
 
-def common_pose(title: str, all_of_them: list[Outcome]) -> str:
-    """How the poses of one and the same car lie about their mean: nominal axes need not be the car's."""
-    turns = [o.turn for o in all_of_them if o.motion_s >= MOTION_S and o.turn is not None]
-    if len(turns) < 3:
+def leaning(title: str, all_of_them: list[Outcome]) -> str:
+    """How far the poses lie from the reference's own mean roll and pitch: nominal axes need not be a level car's.
+
+    Gravity tells how a sensor sits in the horizon, the mean slope and camber of the roads included.
+    """
+    known = [o for o in all_of_them if o.motion_s >= MOTION_S and o.turn is not None and o.lean is not None]
+    if len(known) < 3:
         return ""
-    found = Rotation.from_rotvec(turns)
-    apart = [
-        np.degrees((found[k] * Rotation.concatenate([found[:k], found[k + 1 :]]).mean().inv()).magnitude())
-        for k in range(len(turns))
-    ]
-    roll, pitch, yaw = np.degrees(found.mean().as_rotvec())
+    lean = Rotation.from_rotvec([o.lean for o in known])
+    apart = np.degrees((Rotation.from_rotvec([o.turn for o in known]) * lean.inv()).magnitude())
+    roll, pitch, _ = np.degrees(lean.mean().as_rotvec())
     return (
-        f"{title}: {len(turns)} poses about a common one of roll {roll:+.2f}°, pitch {pitch:+.2f}°, yaw {yaw:+.2f}° "
-        f"against the nominal axes; to the mean of the others {np.median(apart):.2f}° in the median, "
-        f"{max(apart):.2f}° at most"
+        f"{title}: the reference itself leans by {np.degrees(lean.magnitude()).max():.2f}° at most in the mean of a "
+        f"drive, by roll {roll:+.2f}° and pitch {pitch:+.2f}° in that of all; of {len(known)} poses "
+        f"{int(np.sum(apart <= POSE_DEG))} lie within 2° of it, {np.median(apart):.2f}° in the median, "
+        f"{apart.max():.2f}° at most"
     )
 
 
@@ -269,8 +280,8 @@ def main() -> None:
     head = f"| {' | '.join(names)} |"
     line = "|:--|" + "--:|" * (len(SPOILT) + 2)
     checks = [mistakes(title, dataset) for title, dataset in sets.items()]
-    of_one_car = common_pose("kitti", groups.get("kitti", []))
-    table = "\n".join((HEAD, *rows, "", of_one_car, "", head, line, *checks))
+    lean = leaning("kitti", groups.get("kitti", []))
+    table = "\n".join((HEAD, *rows, "", lean, "", head, line, *checks))
     print(table)
     with staged(given.page.parent) as folder:
         old = given.page.read_text() if given.page.exists() else "<!-- table -->\n<!-- end -->\n"
