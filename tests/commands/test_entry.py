@@ -189,10 +189,13 @@ def test_compare(town, call, tmp_path):
     page = (tmp_path / "c" / "compare.html").read_text()
     assert "2 evaluations compared" in page and "<td>imu</td><td>bmi270</td><td>consumer</td>" in page
     assert page.count("class=figure") == 1
+    whole = f"{tmp_path / '1-imu=consumer'}"
+    assert f'<td title="{whole}">1-imu=consumer</td>' in page and f"<td>{whole}</td>" in page
     for words, said in (
         (["a"], "at least two"),
         (["a", str(town)], "no metrics.json"),
         (["a", "b", "out=c"], "overwrite=true"),
+        (["a", "b", str(tmp_path / "a")], "given twice"),
     ):
         done = call("compare", *words, *([] if "out=c" in words else ["out=d"]))
         assert done.code == 2 and said in done.err and done.err.count("\n") == 1

@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from dlkf.evaluation.results import IMU_AXES, Results, summarise_scores
 from dlkf.evaluation.table import as_csv, as_json, as_markdown, number, ratio_table, slope_table, tables, with_interval
 from dlkf.files import staged
 from dlkf.filters.build import build_filter
+from dlkf.report.compare import distinct
 from dlkf.report.evaluation import write_report
 from tests.cars import IMU
 from tests.evaluation.scoring import score
@@ -184,3 +186,16 @@ def test_a_failed_write_leaves_nothing(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write"), staged(tmp_path / "file" / "sub"):
         pass
+
+
+@pytest.mark.parametrize(
+    ("folders", "names"),
+    [
+        (("/a/outputs/x", "/b/home/y"), ["x", "y"]),
+        (("/a/outputs/x/report", "/b/home/y"), ["x", "y"]),
+        (("/a/town/x", "/a/city/x", "/a/city/y"), ["town/x", "city/x", "y"]),
+        (("/x", "/a/x", "/y"), ["/x", "a/x", "y"]),  # one is the end of the other
+    ],
+)
+def test_runs_are_named_by_the_least_that_tells_them_apart(folders, names):
+    assert distinct([Path(f) for f in folders]) == names

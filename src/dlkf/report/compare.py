@@ -24,9 +24,10 @@ NOT_SETTINGS = ("command", "date", "digest", "skipped")  # differ always, or bel
 
 
 class Report(NamedTuple):
-    """An evaluation as it lies in a folder."""
+    """An evaluation as it lies in a folder; ``name`` tells it from the others, ``path`` is the whole one."""
 
     name: str
+    path: str
     dataset: str
     protocol: Mapping[str, Any]
     results: list[Results]
@@ -35,18 +36,21 @@ class Report(NamedTuple):
 def read_reports(folders: Sequence[str | Path]) -> list[Report]:
     """The evaluations in some folders, named by what tells the folders apart.
 
-    Raises InputError for a folder without a readable ``metrics.json`` and for fewer than two.
+    Raises InputError for a folder without a readable ``metrics.json``, for one given twice, and for fewer than two.
     """
     if len(folders) < 2:
         raise InputError("give at least two folders that evaluate or train left, such as dlkf compare a b out=c")
     paths = [Path(f).expanduser() for f in folders]
     paths = [p / "report" if (p / "report" / "metrics.json").is_file() else p for p in paths]
+    real = [p.resolve() for p in paths]
+    if twice := next((p for k, p in enumerate(paths) if real[k] in real[:k]), None):
+        raise InputError(f"{twice} is given twice; a run is compared with others")
     reports = []
     for path, name in zip(paths, distinct(paths)):
         try:
             content = json.loads((path / "metrics.json").read_text(encoding="utf-8"))
             results = [Results.of(r) for r in content["results"]]
-            reports.append(Report(name, content["dataset"], content["protocol"], results))
+            reports.append(Report(name, str(path.absolute()), content["dataset"], content["protocol"], results))
         except FileNotFoundError:
             raise InputError(f"{path}: no metrics.json; give folders that evaluate or train left") from None
         except (KeyError, TypeError, ValueError) as error:
@@ -55,15 +59,14 @@ def read_reports(folders: Sequence[str | Path]) -> list[Report]:
 
 
 def distinct(paths: Sequence[Path]) -> list[str]:
-    """Names of folders without what all have in common."""
-    parts = [p.absolute().parts for p in paths]
-    shared = 0
-    while all(len(p) > shared + 1 for p in parts) and len({p[shared] for p in parts}) == 1:
-        shared += 1
-    ends = 0
-    while all(len(p) > shared + ends + 1 for p in parts) and len({p[-1 - ends] for p in parts}) == 1:
-        ends += 1
-    return ["/".join(p[shared : len(p) - ends]) for p in parts]
+    """The shortest tails that tell folders apart, without the ``report`` in which train leaves its evaluation."""
+    parts = [(p.parent if p.name == "report" else p).absolute().parts for p in paths]
+    return [Path(*p[-_needed(p, parts[:k] + parts[k + 1 :]) :]).as_posix() for k, p in enumerate(parts)]
+
+
+def _needed(path: tuple[str, ...], others: Sequence[tuple[str, ...]]) -> int:
+    """How many last parts of ``path`` no other has."""
+    return next((n for n in range(1, len(path)) if all(o[-n:] != path[-n:] for o in others)), len(path))
 
 
 def write_comparison(out: str | Path, reports: Sequence[Report]) -> None:
@@ -77,13 +80,16 @@ def comparison_page(reports: Sequence[Report]) -> str:
     """Answers, a table and the growth of the error over all of them, and in what they differ."""
     lines = [f"{r.name}: {answer(result)}" for r in reports for result in r.results]
     page = Page(f"{len(reports)} evaluations compared", lines)
+    whole = {r.name: r.path for r in reports}
     columns, rows = end_table(reports)
     page.heading("At the end of the outages", "Horizontal error; RMS over the pieces where there are no outages.")
-    page.table(columns, rows, marks=best_of(columns, rows))
+    page.table(columns, rows, marks=best_of(columns, rows), titles=whole)
     page.heading("Horizontal error against the time without GNSS", "Solid: median; dotted: 95 % of the outages.")
     page.figure("growth", growth(reports))
     page.heading("In what they differ")
-    page.table(*differences(reports))
+    page.table(*differences(reports), titles=whole)
+    page.heading("Where they lie")
+    page.table(["Run", "Folder"], list(whole.items()), words=True)
     return page.html()
 
 

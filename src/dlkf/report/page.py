@@ -10,6 +10,7 @@ import html
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
+from types import MappingProxyType
 from typing import Any
 
 import plotly.graph_objects as go
@@ -45,13 +46,14 @@ class Page:
 
     def table(
         self, columns: Sequence[str], rows: Sequence[Sequence[str]], *, marks: Sequence[str] = (), tall: bool = False,
-        words: bool = False,
+        words: bool = False, titles: Mapping[str, str] = MappingProxyType({}),
     ) -> None:  # fmt: skip
         """A table; ``marks`` are attributes of its rows (class, data-lat …), ``tall`` scrolls in a box of its own,
-        ``words`` are left-aligned and wrap."""
-        head = "".join(f"<th>{html.escape(c).replace(chr(10), '<br>')}</th>" for c in columns)
+        ``words`` are left-aligned and wrap; a text in ``titles`` shows its longer form under the pointer."""
+        more = {text: f' title="{html.escape(longer)}"' for text, longer in titles.items()}
+        head = "".join(f"<th{more.get(c, '')}>{html.escape(c).replace(chr(10), '<br>')}</th>" for c in columns)
         attributes = list(marks) or [""] * len(rows)
-        cells = ("".join(f"<td>{html.escape(c)}</td>" for c in row) for row in rows)
+        cells = ("".join(f"<td{more.get(c, '')}>{html.escape(c)}</td>" for c in row) for row in rows)
         body = "".join(f"<tr {a}>{row}</tr>" for row, a in zip(cells, attributes))
         table = f"<table{' class=words' if words else ''}><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
         self.parts.append(f'<div class="{"scroll tall" if tall else "scroll"}">{table}</div>')
