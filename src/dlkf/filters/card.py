@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -55,7 +56,13 @@ def unmet_imus(cards: Mapping[str, Mapping[str, Any]], imus: Iterable[str]) -> l
     return lines
 
 
-def unheard_cars(models: Mapping[str, object], rates: Iterable[float]) -> list[str]:
+class UnheardCar(UserWarning):
+    """What :func:`unheard_cars` says, of a filter that is used from Python."""
+
+
+def unheard_cars(
+    models: Mapping[str, object], rates: Iterable[float], having: str = "these drives have"
+) -> list[str]:
     """A line for each model that hears the car through its samples, where ``rates`` [Hz] has one too slow for that.
 
     ``models`` by their names; one without ``least_rate_hz`` does not listen. A clock a tenth slow is as good.
@@ -66,10 +73,18 @@ def unheard_cars(models: Mapping[str, object], rates: Iterable[float]) -> list[s
         if slow := sorted({float(f"{rate:.2g}") for rate in met if rate < 0.9 * least}):
             have = f"{slow[0]:g}" if len(slow) == 1 else f"{slow[0]:g} to {slow[-1]:g}"
             lines.append(
-                f"{name} hears the car through samples at {least:g} Hz or more and these drives have {have} Hz: "
+                f"{name} hears the car through samples at {least:g} Hz or more and {having} {have} Hz: "
                 "it runs, but may be worse than any other filter here"
             )
     return lines
+
+
+def warn_unheard(model: object, rate_hz: float) -> bool:
+    """Whether a stream is too slow for a filter, which is a warning (:class:`UnheardCar`)."""
+    lines = unheard_cars({"the filter": model}, [rate_hz], "this stream has")
+    for line in lines:
+        warnings.warn(line, UnheardCar, stacklevel=3)
+    return bool(lines)
 
 
 def strangers(

@@ -115,9 +115,14 @@ class ImuStream:
         return self.grid.t0 + number * self._epoch_s
 
     @property
+    def step_s(self) -> float:
+        """The usual interval between stamps [s]; that of the grid before one is laid."""
+        return self._step or self._epoch_s / self._samples
+
+    @property
     def slack_s(self) -> float:
         """How long before an epoch's end a drive may stop for the loader to count the epoch as whole [s]."""
-        return 0.5 * min(self._step or math.inf, self._epoch_s / self._samples)
+        return 0.5 * min(self.step_s, self._epoch_s / self._samples)
 
     def open(self) -> tuple[np.ndarray, float] | None:
         """Samples (1, m, 6) from the open epoch's beginning to the latest stamp, and their length [s]."""

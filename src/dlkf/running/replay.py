@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from dlkf.data.store import drive_from_tables, drive_rows
 from dlkf.data.tables import Columns
 from dlkf.data.validate import DriveTables, read_checked
 from dlkf.errors import InputError
+from dlkf.filters.card import UnheardCar
 from dlkf.filters.smoother import Filter
 from dlkf.running import start
 from dlkf.running.estimate import Estimate, estimates_table
@@ -113,7 +115,9 @@ def stream_drives(
     for k, row in enumerate(rows):
         tables = read_checked(folder, row, reference=False)
         try:
-            result = stream_drive(tables, estimator, rate_hz=rate_hz, epoch_s=epoch_s, align=align)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UnheardCar)  # commands say it once, of all drives
+                result = stream_drive(tables, estimator, rate_hz=rate_hz, epoch_s=epoch_s, align=align)
         except UnalignedError as error:
             if skipped is None:
                 raise

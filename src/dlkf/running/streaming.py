@@ -40,6 +40,7 @@ from dlkf.data.schema import POSITION, STD, VELOCITY
 from dlkf.data.segments import REST, whole_drives
 from dlkf.data.validate import LIMITS, Limits
 from dlkf.errors import InputError
+from dlkf.filters.card import warn_unheard
 from dlkf.filters.integration import Fix, advance
 from dlkf.filters.smoother import Filter, Smoothed
 from dlkf.navigation.calibration import ImuError
@@ -105,7 +106,8 @@ class StreamingFilter:
     ``rate_hz``, ``epoch_s``: the grid that the filter works on, as in training and in ``navigate``.
     ``lever_arm_b`` [m]: IMU → antenna, Forward-Right-Down. ``history_s``: how late a fix may be. ``counts`` tells how
     often each status was returned (samples that are taken do not count), and how often the state was no longer finite
-    (``diverged``). For one thread at a time. Raises InputError if the filter cannot work on such a grid.
+    (``diverged``). For one thread at a time. Raises InputError if the filter cannot work on such a grid, and warns
+    (UnheardCar) where it would hear the car through samples that come too seldom for that.
     """
 
     def __init__(
@@ -140,6 +142,7 @@ class StreamingFilter:
         self._device = torch.device("cpu") if parameter is None else parameter.device
         self._lever_arm_b = torch.tensor([lever_arm_b], dtype=torch.float64, device=self._device)
         self.counts: Counter[str] = Counter()
+        self._warned = warn_unheard(estimator, min(rate_hz, 1 / imu_step_s) if imu_step_s else rate_hz)
         self._clear()
         with torch.inference_mode():  # a model that does not fit must be told now, not on the road
             samples = round(rate_hz * epoch_s)
@@ -244,6 +247,8 @@ class StreamingFilter:
             if len(through) < 2 or np.ptp(through) < SETTLE_S - ON_BOUNDARY_S:
                 return
         if self._samples.begin(through):
+            rate_hz = min(self._rate_hz, 1 / self._samples.step_s)
+            self._warned = self._warned or warn_unheard(self.estimator, rate_hz)
             for fix in self._early:
                 self._file(fix)
             self._early.clear()
