@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import gzip
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
+from dlkf.data.readers.auto import AutoReader
 from dlkf.errors import InputError
 from tests.cars import car
+from tests.data.logs.receivers import ubx
 from tests.data.test_formats import read
 
 
@@ -75,3 +78,35 @@ def test_marks_and_letters_of_windows(tmp_path):
         file.write_bytes(b"\xef\xbb\xbf" + file.read_text().replace("\n", "\r\n").encode())
     (drive,) = read(tmp_path, ["reader=csv", "reader.separator=';'", "reader.decimal=','"])
     pd.testing.assert_frame_equal(drive.imu, car(12)["imu"], check_exact=False, atol=1e-9)
+
+
+def _ubx(folder: Path, keep: int) -> Path:
+    """A UBX log that ends at a byte, counted from the end where below zero, beside a table of its IMU."""
+    tables = car(90)
+    ubx(folder, tables)
+    log = folder / "drive.ubx"
+    log.write_bytes(log.read_bytes()[:keep])
+    tables["imu"].to_csv(folder / "imu.csv", index=False)
+    return log
+
+
+def test_a_ubx_log_without_its_last_bytes_says_so(tmp_path):
+    """It is read but for the last message: as the receiver leaves it when the power goes."""
+    (drive,) = read(_ubx(tmp_path, -5), ["reader=ubx"])
+    assert len(drive.gnss) == len(car(90)["gnss"])  # the last message is a NAV-COV
+    said = re.compile(r"drive.ubx: the last message is cut off or damaged: \d+ bytes left out")
+    assert any(map(said.fullmatch, drive.notes))
+
+
+@pytest.mark.parametrize(
+    ("keep", "said"),
+    [
+        (50, "drive.ubx: has no NAV-PVT message; .* message cut off, so copy the log again"),
+        (4000, "drive.ubx has [12] fix.*, which tell nothing of a drive; drive.ubx: the last message is cut off"),
+    ],
+)
+def test_hardly_anything_of_a_ubx_log_is_one_line(keep, said, tmp_path):
+    _ubx(tmp_path, keep)
+    with pytest.raises(InputError, match=said) as refused:
+        list(AutoReader(imu={"file": "imu.csv"}).read(tmp_path))
+    assert "\n" not in str(refused.value)

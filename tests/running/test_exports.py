@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import struct
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
+from xml.etree import ElementTree
 
 import gpxpy
 import numpy as np
@@ -21,6 +22,7 @@ from dlkf.errors import InputError
 from dlkf.running.exports import FORMATS, chosen, export, poses, utc_times
 from dlkf.running.solution import COLUMNS, SCHEMA, write_solution
 
+KML, GX = "{http://www.opengis.net/kml/2.2}", "{http://www.google.com/kml/ext/2.2}"
 MONDAY = datetime(2025, 7, 7, 12, 0, 0, tzinfo=UTC).timestamp()
 
 
@@ -66,10 +68,28 @@ def test_gpx(folder, table):
 
 
 def test_kml(folder, table):
-    text = (folder / "solution.kml").read_text()
-    assert text.count("<gx:coord>") == 60 == text.count("<when>") and "town &amp; country" in text
-    lon, lat, _ = text.partition("<gx:coord>")[2].partition("<")[0].split()
-    assert (float(lat), float(lon)) == pytest.approx((table.lat_deg[0], table.lon_deg[0]), abs=1e-9)
+    """A gx:Track as its schema has it: all <when> before all <gx:coord>, as many as rows, in UTC."""
+    root = ElementTree.parse(folder / "solution.kml").getroot()
+    (track,) = root.iter(f"{GX}Track")
+    kinds = [child.tag for child in track if child.tag in (f"{KML}when", f"{GX}coord")]
+    assert kinds == [f"{KML}when"] * 60 + [f"{GX}coord"] * 60
+    when = [datetime.fromisoformat(child.text) for child in track.iter(f"{KML}when")]
+    assert when == utc_times(table, MONDAY, "unix") and when[0].utcoffset() == timedelta(0)
+    found = np.array([[float(x) for x in child.text.split()] for child in track.iter(f"{GX}coord")])
+    assert np.allclose(found, table[["lon_deg", "lat_deg", "height_m"]], rtol=0, atol=1e-9)
+    assert [name.text for name in root.iter(f"{KML}name")].count("town & country") == 2
+
+
+def test_tenths_of_a_second_are_kept_in_dated_tracks(table, tmp_path):
+    """Rows every 0.1 s, across midnight."""
+    fast = table.assign(t=0.1 * np.arange(60))
+    when = utc_times(fast, datetime(2025, 7, 6, 23, 59, 57, tzinfo=UTC).timestamp(), "unix")
+    export(tmp_path, fast, ["kml", "gpx"], when, "town")
+    points = gpxpy.parse((tmp_path / "solution.gpx").read_text()).tracks[0].segments[0].points
+    assert [p.time for p in points] == when
+    stamps = ElementTree.parse(tmp_path / "solution.kml").getroot().iter(f"{KML}when")
+    assert [datetime.fromisoformat(s.text) for s in stamps] == when
+    assert when[-1].isoformat() == "2025-07-07T00:00:02.900000+00:00"
 
 
 def test_nmea(folder, table):

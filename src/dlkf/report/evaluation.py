@@ -89,14 +89,17 @@ def evaluation_page(
 ) -> str:
     """The page: answer, tables, and for every kind of data growth of the error, map, outages, errors over time."""
     many = len(results) > 1
-    page = Page(f"Evaluation on {dataset}", [f"{r.kind.capitalize()} data: {answer(r)}" for r in results])
+    answers = [f"{r.kind.capitalize()} data. {answer(r)}" if many else answer(r) for r in results]
+    own = protocol.get("reference")
+    truth = "reference" if own else "truth"
+    page = Page(f"Evaluation on {dataset}", answers + ([f"No truth: errors are against the {own}."] if own else []))
     outages_first = sorted(parts, key=lambda t: "outage" not in t.title)
     for table in outages_first:
         page.heading(table.title)
         page.table(table.columns, table.rows, marks=best_of(table.columns, table.rows))
         page.note(table.note)
     for result in results:
-        _sections(page, scores.of_kind(result.kind), result, f"{result.kind}: " if many else "", baseline)
+        _sections(page, scores.of_kind(result.kind), result, f"{result.kind}: " if many else "", baseline, truth)
     page.images("The figures for print", [(caption, embedded(data)) for _, caption, data in pictures])
     page.protocol(protocol)
     return page.html()
@@ -119,21 +122,21 @@ def _value(cell: str) -> float:
         return math.nan
 
 
-def _sections(page: Page, scores: Scores, result: Results, kind: str, baseline: str | None) -> None:
+def _sections(page: Page, scores: Scores, result: Results, kind: str, baseline: str | None, truth: str) -> None:
     name = kind.strip(": ") or "all"
     if scores.outage.any():
         page.heading(f"{kind}Error against the time without GNSS", "Median and 95 % of the outages that last so long.")
         page.figure(f"growth-{name}", growth(scores))
-        page.heading(f"{kind}Map", "Truth, the outages, and where every filter went in them; a row below goes there.")
-        page.figure(f"map-{name}", outage_map(scores))
+        page.heading(f"{kind}Map", f"The {truth}, the outages, and every filter's way in them; a row below goes there.")
+        page.figure(f"map-{name}", outage_map(scores, truth))
         page.heading(f"{kind}Outages", "Horizontal error at the end [m], the worst first; a click shows it on the map.")
         columns, rows, marks = outage_rows(scores, result, f"map-{name}")
         page.table(columns, rows, marks=marks, tall=True)
         if len(result.per_outage) > len(rows):
             page.note(f"The worst {len(rows)} of {len(result.per_outage)}; all are in metrics.json.")
     else:
-        page.heading(f"{kind}Map", "Truth and where every filter went.")
-        page.figure(f"map-{name}", piece_map(scores, baseline))
+        page.heading(f"{kind}Map", f"The {truth} and where every filter went.")
+        page.figure(f"map-{name}", piece_map(scores, baseline, truth))
     page.heading(f"{kind}Errors over time", f"RMS over {len(scores.pieces)} pieces; grey: outages of most pieces.")
     page.figure(f"errors-{name}", errors(scores))
     chosen = representative(scores, 3, baseline if baseline in scores.filters else None)
@@ -172,8 +175,8 @@ def growth(scores: Scores) -> go.Figure:
     return figure
 
 
-def outage_map(scores: Scores) -> go.Figure:
-    """Truth of all pieces, their outages, and every filter's way in them from the last fix on."""
+def outage_map(scores: Scores, named: str = "truth") -> go.Figure:
+    """Truth of all pieces (a reference is ``named`` so), outages, every filter's way in them from the last fix on."""
     w = scores.windows
     known = [~np.isnan(scores.truth_p_n[i, :, 0]) for i in range(len(scores.pieces))]
     truth = [scores.geodetic(i, scores.truth_p_n[i, known[i]]) for i in range(len(scores.pieces)) if known[i].any()]
@@ -181,7 +184,7 @@ def outage_map(scores: Scores) -> go.Figure:
     hidden = [scores.geodetic(i, scores.truth_p_n[i, a : b + 1]) for i, a, b in windows]
     traces = [
         track(joined(hidden, 8000), "outage", SHADE, width=9),
-        track(joined(truth, 12_000), "truth", TRUTH, width=1.5),
+        track(joined(truth, 12_000), named, TRUTH, width=1.5),
     ]
     for name, c in colours(scores).items():
         p = scores.filters[name].p_n
@@ -190,10 +193,10 @@ def outage_map(scores: Scores) -> go.Figure:
     return chart(traces, around=traces[:2])
 
 
-def piece_map(scores: Scores, baseline: str | None) -> go.Figure:
+def piece_map(scores: Scores, baseline: str | None, named: str = "truth") -> go.Figure:
     """Truth and every filter of up to eight pieces from good to bad."""
     chosen = representative(scores, 8, baseline if baseline in scores.filters else None)
-    traces = [track(joined([scores.geodetic(i, scores.truth_p_n[i]) for i in chosen]), "truth", TRUTH, width=2)]
+    traces = [track(joined([scores.geodetic(i, scores.truth_p_n[i]) for i in chosen]), named, TRUTH, width=2)]
     for name, c in colours(scores).items():
         p = scores.filters[name].p_n
         traces.append(track(joined([scores.geodetic(i, p[i]) for i in chosen]), name, c, width=2))

@@ -31,6 +31,7 @@ PLACES: dict[str, tuple[tuple[str, ...], Any]] = {
     "gnss.velocity.unit": (("gnss", "velocity", "unit"), 1.0),
     "gnss.position.delay_s": (("gnss", "position", "delay_s"), 0.0),
 }
+FEWEST_FIXES = 3  # below, no finding has a spread
 SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "knots": 1852 / 3600, "cm/s": 0.01, "mm/s": 1e-3, "mph": 0.44704}
 
 
@@ -73,6 +74,13 @@ def settle(
     specs = {kind: copy.deepcopy(_plain(part.spec)) for kind, part in mapped.items()}
     if "gnss" not in mapped:
         raise InputError(f"{where}: reader.{sorted(wanted)[0]}=auto needs GNSS to compare with; give the value")
+    if (count := len(t["gnss"])) < FEWEST_FIXES:
+        log = mapped["gnss"].table
+        why = "".join(f"; {note}" for note in log.notes)
+        raise InputError(
+            f"{where}: {log.path} has {count} {'fix' if count == 1 else 'fixes'}, which tell nothing of a drive{why}; "
+            "copy the log again, or leave the drive out"
+        )
     found = Findings()
     if "gnss.velocity.unit" in wanted:
         _speed_unit(found, mapped["gnss"], t["gnss"], where)

@@ -30,33 +30,43 @@ SENSORS = {
     18: ("accel_z", 2.0**-10),
 }
 TAG_WRAP = 2**32
+SYNC = b"\xb5b"  # every message begins so
 
 
 def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> Table:
     """Fixes (``kind`` gnss or reference) or IMU samples of a log; ``table`` ESF-RAW or ESF-MEAS chooses the IMU."""
-    messages = list(_messages(path))
+    messages, left = _messages(path)
+    notes = (f"{path.name}: the last message is cut off or damaged: {left} bytes left out",) if left else ()
+    cut = f"; its last {left} bytes are a message cut off, so copy the log again" if left else ""
     fixes = _fixes(messages)
     if not len(fixes):
-        raise InputError(f"{path}: has no NAV-PVT message; log UBX-NAV-PVT, or give GNSS from another file")
+        raise InputError(f"{path}: has no NAV-PVT message; log UBX-NAV-PVT, or give GNSS from another file{cut}")
     if kind != "imu":
-        return Table(fixes, path, "fix")
+        return Table(fixes, path, "fix", notes=notes)
     wanted = [table] if table else ["ESF-RAW", "ESF-MEAS"]
     for name in wanted:
         samples = _samples(messages, name)
         if len(samples):
-            return Table(samples, path, "sample")
+            return Table(samples, path, "sample", notes=notes)
     have = ", ".join(sorted({m.identity for m in messages}))
-    raise InputError(f"{path}: has no IMU in {' or '.join(wanted)}; has {have}; set reader.imu.format and file")
+    raise InputError(f"{path}: has no IMU in {' or '.join(wanted)}; has {have}; set reader.imu.format and file{cut}")
 
 
-def _messages(path: Path) -> Iterator[Any]:
+def _messages(path: Path) -> tuple[list[Any], int]:
+    """The messages of use, and how many bytes at the end belong to one that is cut off or damaged."""
     pyubx2 = library("pyubx2", "a UBX log")
+    found, end = [], 0
     with path.open("rb") as stream:
-        for _, message in pyubx2.UBXReader(
+        for raw, message in pyubx2.UBXReader(
             stream, protfilter=pyubx2.UBX_PROTOCOL, quitonerror=pyubx2.ERR_IGNORE, validate=pyubx2.VALCKSUM
         ):
+            if raw is not None:
+                end = stream.tell()
             if message is not None and getattr(message, "identity", "").startswith(("NAV-", "ESF-")):
-                yield message
+                found.append(message)
+        stream.seek(end)
+        rest = stream.read()
+    return found, len(rest) if rest.startswith(SYNC) else 0
 
 
 def _fixes(messages: list[Any]) -> pd.DataFrame:
