@@ -1,10 +1,11 @@
-"""How cars move besides along their way, from any dataset with attitude: slip, arm, mounting, vibration.
+"""How cars move besides along their way, from any dataset with attitude: slip, springs, arm, mounting, vibration.
 
     python -m pipelines.studies.car_motion ../shared/data/real/kitti data/lifelike --longest 20
 
 Per dataset, over its longest drives: velocity to the right and down in the axes of the reference, RMS above 2 m/s;
-the least-squares fit v_right = arm · r − K v² r + yaw · v with r the yaw rate, and what it leaves, for all drives
-together and for each by itself; and the RMS of the IMU's six channels in bands of frequency.
+the least-squares fits v_right = arm · r − K v² r + yaw · v with r the yaw rate and v_down = pitch · v − arm · q + s v f
+with q the pitch rate and f the specific force forward, and what they leave, for all drives together and for each by
+itself; and the RMS of the IMU's six channels in bands of frequency.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.ndimage import uniform_filter1d
 from scipy.signal import welch
 
 from dlkf.data.schema import ACCEL, GYRO
@@ -25,19 +27,31 @@ from dlkf.navigation.attitude import rotation_from_rpy
 
 BANDS = ((0.5, 3.0), (3.0, 10.0), (10.0, 20.0), (20.0, 45.0))  # Hz
 MOVING = 2.0  # m/s
+SPRINGS_S = 0.3  # the force forward is averaged over so long
 
 
-def across(tables: DriveTables) -> tuple[np.ndarray, np.ndarray]:
-    """Regressors (r, −v² r, v) and velocity to the right and down where the car moves, (N, 3) and (N, 2)."""
+def across(tables: DriveTables) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the car moves: (N, 3) regressors (r, −v² r, v) and (v, −q, v f), (N, 2) velocity to the right and down."""
     reference = tables.reference
     if reference is None or not np.isfinite(reference["yaw"]).any():
         raise InputError(f"drive {tables.row.name}: no attitude in its reference, so no velocity across the car")
     C_nb = rotation_from_rpy(torch.from_numpy(np.stack([reference[c] for c in ("roll", "pitch", "yaw")], -1))).numpy()
     v_b = np.einsum("tij,ti->tj", C_nb, np.stack([reference[c] for c in ("vel_n", "vel_e", "vel_d")], -1))
-    rate = np.interp(reference["t"], tables.imu["t"], tables.imu["gyro_z"])
+    t = tables.imu["t"]
+    count = max(1, round(SPRINGS_S / float(np.median(np.diff(t)))))
+    force = uniform_filter1d(tables.imu["accel_x"], count, origin=(count - 1) // 2)  # of the samples before
     moving = (v_b[:, 0] > MOVING) & reference["valid"].astype(bool)
-    v, r = v_b[moving, 0], rate[moving]
-    return np.stack((r, -(v**2) * r, v), -1), v_b[moving, 1:]
+    r, q, f = (np.interp(reference["t"], t, x)[moving] for x in (tables.imu["gyro_z"], tables.imu["gyro_y"], force))
+    v = v_b[moving, 0]
+    return np.stack((r, -(v**2) * r, v), -1), np.stack((v, -q, v * f), -1), v_b[moving, 1:]
+
+
+def fitted(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, float, float]:
+    """Coefficients for all drives together, RMS of what they leave, and of what coefficients for each drive leave."""
+    x, y = (np.concatenate(columns) for columns in zip(*parts))
+    fit = np.linalg.lstsq(x, y, rcond=None)[0]
+    alone = [b - a @ np.linalg.lstsq(a, b, rcond=None)[0] for a, b in parts]
+    return fit, rms(y - x @ fit), rms(np.concatenate(alone))
 
 
 def bands(imu: dict[str, np.ndarray]) -> dict[str, list[float]]:
@@ -60,13 +74,17 @@ def describe(folder: Path, longest: int) -> None:
     drives = [read_checked(folder, row) for row in read_drives(folder)]
     drives = sorted(drives, key=lambda tables: len(tables.imu["t"]))[-longest:]
     parts = [across(tables) for tables in drives]
-    x, v = (np.concatenate(columns) for columns in zip(*parts))
-    fit = np.linalg.lstsq(x, v[:, 0], rcond=None)[0]
-    alone = [y[:, 0] - a @ np.linalg.lstsq(a, y[:, 0], rcond=None)[0] for a, y in parts]
+    v = np.concatenate([part[2] for part in parts])
+    fit, left, alone = fitted([(p[0], p[2][:, 0]) for p in parts])
     print(f"\n{folder}: {len(drives)} drives, {sum(len(t.imu['t']) for t in drives)} samples")
     print(f"velocity to the right {rms(v[:, 0]):.3f} m/s, down {rms(v[:, 1]):.3f} m/s")
     print(f"arm {fit[0]:.2f} m, slip {fit[1]:.4f} s²/m, yaw {np.degrees(fit[2]):.2f}°; ", end="")
-    print(f"left {rms(v[:, 0] - x @ fit):.3f} m/s, fitted by drive {rms(np.concatenate(alone)):.3f} m/s")
+    print(f"left {left:.3f} m/s, fitted by drive {alone:.3f} m/s")
+    for stiff in (True, False):
+        fit, left, alone = fitted([(p[1][:, : 2 if stiff else 3], p[2][:, 1]) for p in parts])
+        print(f"pitch {np.degrees(fit[0]):.2f}°, arm {fit[1]:.2f} m", end=", ")
+        print("no springs; " if stiff else f"springs {fit[2]:.4f} s²·rad/m; ", end="")
+        print(f"left {left:.3f} m/s, fitted by drive {alone:.3f} m/s")
     print(f"| channel | {' | '.join(f'{low:g}–{high:g} Hz' for low, high in BANDS)} |\n|---|{'---|' * len(BANDS)}")
     for column, row in bands(drives[-1].imu).items():
         print(f"| {column} | {' | '.join(f'{value:.3f}' for value in row)} |")
