@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
 import statistics
@@ -124,11 +125,16 @@ class Bench:
             middle = np.array([statistics.median(f.seconds) for f in rows])
             axes.loglog(at, middle, "o-", color=BLUE, label="median")
             axes.loglog(at, [min(f.seconds) for f in rows], "_", color=BLUE, ms=10, label="least")
-            axes.loglog(at, middle[-1] * at / at[-1], ":", color="#777777", label="in proportion")
-            axes.set(title=rows[-1].work, xlabel=group.removeprefix(OVER))
+            size = group.removeprefix(OVER)
+            least, law = (at / at[-1], "in proportion") if size != "threads" else (at[0] / at, "shared evenly")
+            axes.loglog(at, middle[0 if size == "threads" else -1] * least, ":", color="#777777", label=law)
+            axes.set(title=f"largest: {rows[-1].work}", xlabel=size)
             axes.title.set_size(10)
             axes.set_xticks(at, [f"{x:.3g}" for x in at])
-            axes.set_yticks(middle, [f"{1e3 * s:.3g} ms" for s in middle])
+            low, high = (round(math.log10(x) + side) for x, side in ((min(middle), -0.5), (max(middle), 0.5)))
+            ticks = [m * 10.0**k for k in range(low, high + 1) for m in (1, 2, 5)]
+            axes.set_yticks(ticks, [f"{1e3 * s:g} ms" if s < 1 else f"{s:g} s" for s in ticks])
+            axes.set_ylim(0.7 * min(*middle, *(middle[-1] * least)), 1.4 * max(middle))
             axes.minorticks_off()
             axes.grid(color="#EEEEEE")
             axes.legend(frameon=False, fontsize=8)
