@@ -16,7 +16,7 @@ from dlkf.command.settings import NavigateSettings
 from dlkf.console import LOG, counting
 from dlkf.data.drive import Drive
 from dlkf.data.store import dataset_digest, drive_rows, load_dataset
-from dlkf.data.tables import time_zeros
+from dlkf.data.tables import drive_clocks
 from dlkf.errors import InputError
 from dlkf.files import absolute, name_of, staged, vacant
 from dlkf.filters.card import strangers
@@ -45,7 +45,7 @@ def main(told: NavigateSettings) -> None:
         raise InputError(f"navigate runs one model at a time, got model={told.model}")
     spec, tuning = told.spec, told.tuning
     model = resolve_model(told.model, spec, told.tracking.uri, **told.told)
-    zeros = time_zeros(told.dataset)
+    clocks = drive_clocks(told.dataset)
     rows, name = drive_rows(told.dataset, told.drives), short_name(told.model)
     spacings = {row.name: offline.Fixes.of(told.dataset, row.name) for row in rows}
     usual = offline.epoch_for(spacings.values(), told.rate_hz or 50.0, model)
@@ -80,7 +80,7 @@ def main(told: NavigateSettings) -> None:
     with staged(told.out) as folder, counting("Navigating") as progress:
         for result in navigated(progress=progress):
             write_solution(folder / f"drive={result.drive}" / "solution.parquet", result.table)
-            when = utc_times(result.table, zeros.get(result.drive), told.export_clock)
+            when = utc_times(result.table, clocks.get(result.drive), told.export_clock)
             export(folder / f"drive={result.drive}", result.table, formats, when, result.drive)
             lines.append(result.summary(spacings[result.drive]))
             course = Course(result, spacings[result.drive])

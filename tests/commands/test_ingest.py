@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
+
+import gpxpy
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,6 +12,8 @@ import pytest
 from tests.cars import car
 from tests.data.logs import nmea
 from tests.data.logs.arrays import STDS
+from tests.data.logs.clock import UNIX
+from tests.data.logs.receivers import ubx_fixes
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +54,35 @@ def test_a_log_at_rest_needs_no_gnss(call, logs):
     assert "no GNSS" in done.out
     done = call("navigate", "model=ins", "imu=consumer", "dataset=bench", "out=solved")
     assert done.code == 2 and "no GNSS" in done.err
+
+
+def test_dates_are_the_receivers_where_the_imu_counts_from_nothing(call, tmp_path):
+    """UBX beside an IMU that lay on its side, its clock 12.3 s at the receiver's zero: exports bear GPS's own dates.
+
+    The car's path is smooth, so the offset is found to 3 ms (:func:`tests.data.test_discovery.test_any_clock_offset`).
+    """
+    (tmp_path / "logs").mkdir()
+    tables = car(150)
+    ubx_fixes(tmp_path / "logs" / "town.ubx", tables)
+    imu = tables["imu"]
+    own = {"ms": np.round(1000 * (imu.t + 12.3)).astype(int)}
+    for s in ("accel", "gyro"):
+        own |= {f"{s}_x": imu[f"{s}_y"], f"{s}_y": -imu[f"{s}_x"], f"{s}_z": imu[f"{s}_z"]}
+    pd.DataFrame(own).to_csv(tmp_path / "logs" / "box.csv", index=False)
+    done = call("ingest", "reader=auto", "source=logs", "out=found")
+    assert done.code == 0, done.err
+    done = call("navigate", "model=mbkf15", "dataset=found", "imu=consumer", "export=[gpx,nmea,pos,kml]", "out=solved")
+    assert done.code == 0, done.err
+    folder = tmp_path / "solved" / "drive=logs"
+    t = pd.read_parquet(folder / "solution.parquet", columns=["t"])["t"].to_numpy()
+    points = gpxpy.parse((folder / "solution.gpx").read_text()).tracks[0].segments[0].points
+    seconds = np.array([p.time.timestamp() for p in points])
+    np.testing.assert_allclose(seconds - UNIX, t + 12 - 12.3, atol=3e-3)
+    day = datetime.fromtimestamp(UNIX, UTC)
+    assert f",{day:%d%m%y}," in (folder / "solution.nmea").read_text()
+    week, tow = (folder / "solution.pos").read_text().splitlines()[3].split()[:2]
+    assert int(week) * 604_800 + float(tow) == pytest.approx(seconds[0] - 315_964_800 + 18, abs=1e-3)
+    assert f"<when>{day:%Y-%m-%d}T" in (folder / "solution.kml").read_text()
 
 
 def test_a_map_from_the_command_line(call, logs):

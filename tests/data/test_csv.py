@@ -270,3 +270,33 @@ def test_the_preset_reads_the_contracts_own_columns(tmp_path):
     reader = instantiate(config, _convert_="all")
     assert ingest_drives(reader.read(tmp_path / "logs"), tmp_path / "out") == 1
     assert set(read_table(tmp_path / "out", "gnss", "logs")["quality"]) == {4}
+
+
+CLOCKS_OF_GNSS = {
+    "unix seconds": (UNIX, {}, True),
+    "unix, said": (UNIX, {"clock": "unix"}, True),
+    "gps seconds": (GPS_WEEK * 604_800 + TOW, {}, True),
+    "seconds of a week that is told": (TOW, {"week_number": GPS_WEEK}, True),
+    "seconds of some week": (TOW, {}, False),
+    "seconds of a week whose number has gone round": (TOW, {"week_number": GPS_WEEK - 2048}, False),
+}
+
+
+@pytest.mark.parametrize("case", CLOCKS_OF_GNSS)
+def test_gps_time_is_that_of_the_fixes_whatever_the_imu_counts(tmp_path, tables, case):
+    """Stamps of the receiver + 37.5 s, and 200 ppm more from the first on, are those of an IMU that counts from 0."""
+    base, told, known = CLOCKS_OF_GNSS[case]
+    own = tables["gnss"].t / (1 + 2e-4)
+    _plain(tmp_path / "a", {**tables, "gnss": tables["gnss"].assign(t=base - 37.5 + own)})
+    time = {"column": "t", **told, "offset_s": 37.5, "drift_ppm": 200.0}
+    probe = log_reader(gnss__time={**time, "offset_s": 0.0}, time_zero="keep")
+    (drive,) = probe.read(tmp_path / "a")
+    offset = -float(drive.gnss.t.iloc[0])
+    (drive,) = log_reader(gnss__time={**time, "offset_s": offset}).read(tmp_path / "a")
+    np.testing.assert_allclose(drive.gnss.t, tables["gnss"].t, atol=1e-6)  # a double of decades of seconds: 2⁻²² s
+    if not known:
+        assert "gps_zero_s" not in drive.meta
+        return
+    gps = drive.meta["gps_zero_s"] + drive.meta["gps_rate"] * drive.gnss.t
+    np.testing.assert_allclose(gps, GPS_WEEK * 604_800 + TOW - 37.5 + own, atol=2e-6)
+    assert drive.meta["time_zero_s"] == 0

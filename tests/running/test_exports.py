@@ -18,6 +18,8 @@ from evo.tools import file_interface
 from pynmeagps import NMEAReader
 from scipy.spatial.transform import Rotation
 
+from dlkf.data.readers.units import GPS_EPOCH_UNIX
+from dlkf.data.tables import DriveClock
 from dlkf.errors import InputError
 from dlkf.running.exports import FORMATS, chosen, export, poses, utc_times
 from dlkf.running.solution import COLUMNS, SCHEMA, write_solution
@@ -44,7 +46,7 @@ def table() -> pd.DataFrame:
 def folder(table, tmp_path_factory):
     """All formats, with a known date."""
     out = tmp_path_factory.mktemp("exports")
-    export(out, table, chosen("all"), utc_times(table, MONDAY, "unix"), "town & country")
+    export(out, table, chosen("all"), utc_times(table, DriveClock(MONDAY), "unix"), "town & country")
     return out
 
 
@@ -74,7 +76,7 @@ def test_kml(folder, table):
     kinds = [child.tag for child in track if child.tag in (f"{KML}when", f"{GX}coord")]
     assert kinds == [f"{KML}when"] * 60 + [f"{GX}coord"] * 60
     when = [datetime.fromisoformat(child.text) for child in track.iter(f"{KML}when")]
-    assert when == utc_times(table, MONDAY, "unix") and when[0].utcoffset() == timedelta(0)
+    assert when == utc_times(table, DriveClock(MONDAY), "unix") and when[0].utcoffset() == timedelta(0)
     found = np.array([[float(x) for x in child.text.split()] for child in track.iter(f"{GX}coord")])
     assert np.allclose(found, table[["lon_deg", "lat_deg", "height_m"]], rtol=0, atol=1e-9)
     assert [name.text for name in root.iter(f"{KML}name")].count("town & country") == 2
@@ -83,7 +85,7 @@ def test_kml(folder, table):
 def test_tenths_of_a_second_are_kept_in_dated_tracks(table, tmp_path):
     """Rows every 0.1 s, across midnight."""
     fast = table.assign(t=0.1 * np.arange(60))
-    when = utc_times(fast, datetime(2025, 7, 6, 23, 59, 57, tzinfo=UTC).timestamp(), "unix")
+    when = utc_times(fast, DriveClock(datetime(2025, 7, 6, 23, 59, 57, tzinfo=UTC).timestamp()), "unix")
     export(tmp_path, fast, ["kml", "gpx"], when, "town")
     points = gpxpy.parse((tmp_path / "solution.gpx").read_text()).tracks[0].segments[0].points
     assert [p.time for p in points] == when
@@ -151,7 +153,9 @@ def test_geoparquet(table, tmp_path):
 
 def test_without_a_date(table, tmp_path):
     """Tracks have no times; what cannot do without counts from the start of GPS time."""
-    assert utc_times(table, None) is None and utc_times(table, 0.0) is None and utc_times(table, MONDAY, "none") is None
+    dated = DriveClock(MONDAY)
+    for clock, counts in ((None, "auto"), (DriveClock(), "gps"), (DriveClock(0.0), "auto"), (dated, "none")):
+        assert utc_times(table, clock, counts) is None
     export(tmp_path, table, list(FORMATS), None, "town")
     assert gpxpy.parse((tmp_path / "solution.gpx").read_text()).tracks[0].segments[0].points[0].time is None
     assert "<LineString" in (tmp_path / "solution.kml").read_text()
@@ -159,12 +163,22 @@ def test_without_a_date(table, tmp_path):
 
 
 def test_gps_seconds_are_told_from_unix_seconds(table):
-    gps = MONDAY - 315964800 + 18
-    assert utc_times(table, gps) == utc_times(table, MONDAY) == utc_times(table, gps, "gps")
+    gps, unix = DriveClock(MONDAY - GPS_EPOCH_UNIX + 18), DriveClock(MONDAY)
+    assert utc_times(table, gps) == utc_times(table, unix) == utc_times(table, gps, "gps")
+
+
+def test_the_receivers_date_is_believed_before_that_of_the_files(table):
+    """An IMU whose computer thinks it is 2024, 1000 ppm fast: the receiver, unless one asks for the files' clock."""
+    clock = DriveClock(MONDAY - 366 * 86_400, MONDAY - GPS_EPOCH_UNIX + 18, 1 / 1.001)
+    when = utc_times(table, clock)
+    assert when is not None
+    late = [(w - datetime(2025, 7, 7, 12, tzinfo=UTC)).total_seconds() for w in when]
+    np.testing.assert_allclose(late, table["t"] / 1.001, atol=1e-6)  # a microsecond is what a date holds
+    assert utc_times(table, clock, "unix") == utc_times(table, DriveClock(clock.file_s))
 
 
 def test_mistakes():
     with pytest.raises(InputError, match="known: geojson, kml"):
         chosen(["kml", "shp"])
     with pytest.raises(InputError, match="export_clock"):
-        utc_times(pd.DataFrame({"t": [0.0]}), 0.0, "tai")
+        utc_times(pd.DataFrame({"t": [0.0]}), DriveClock(0.0), "tai")

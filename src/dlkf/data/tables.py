@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -61,13 +63,28 @@ def read_drives(folder: str | Path) -> list[DriveRow]:
     return [DriveRow(n, g, (float(x), float(y), float(z))) for n, g, x, y, z in zip(names, groups, *arms)]
 
 
-def time_zeros(folder: str | Path) -> dict[str, float]:
-    """What is to be added to ``t`` of each drive for the clock of its log files [s], where it is known."""
+class DriveClock(NamedTuple):
+    """What a drive's ``t`` counts: ``file_s`` + t is the time of its log files, ``gps_s`` + ``gps_rate`` t GPS time by
+    the receiver's own stamps [s since 1980]; NaN where it is not known."""
+
+    file_s: float = math.nan
+    gps_s: float = math.nan
+    gps_rate: float = 1.0
+
+
+def drive_clocks(folder: str | Path) -> dict[str, DriveClock]:
+    """The clocks of the drives of a dataset."""
     path = placed(folder) / "drives.parquet"
-    if not path.is_file() or "time_zero_s" not in (table := pq.ParquetFile(readable(path)).read()).column_names:
+    if not path.is_file():
         return {}
-    known = zip(table["drive"].to_pylist(), table["time_zero_s"].to_pylist())
-    return {str(drive): float(zero) for drive, zero in known if zero is not None}
+    table = pq.ParquetFile(readable(path)).read()
+    columns = []
+    for name, unknown in (("time_zero_s", math.nan), ("gps_zero_s", math.nan), ("gps_rate", 1.0)):
+        values = np.full(len(table), np.nan)
+        if name in table.column_names:
+            values = _column(table, name, pa.float64(), "drives.parquet")
+        columns.append(np.where(np.isfinite(values), values, unknown).tolist())
+    return {str(drive): DriveClock(*row) for drive, *row in zip(table["drive"].to_pylist(), *columns)}
 
 
 def read_table(folder: str | Path, kind: str, drive: str) -> Columns | None:

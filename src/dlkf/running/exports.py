@@ -20,27 +20,32 @@ import pymap3d
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dlkf.data.readers.units import GPS_EPOCH_UNIX, WEEK_S, leap_seconds
+from dlkf.data.readers.units import GPS_EPOCH_UNIX, WEEK_S, clock_by_size, leap_seconds
+from dlkf.data.tables import DriveClock
 from dlkf.errors import InputError
 
 Times = list[datetime] | None
 KNOTS = 1852 / 3600  # m/s
-UNIX_SINCE, GPS_SINCE = 1.55e9, 3e8  # s; a Unix second after January 2019; a GPS second after 1989
 NED_ENU = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])  # and Forward-Right-Down → Forward-Left-Up is diag(1, −1, −1)
 
 
-def utc_times(table: pd.DataFrame, time_zero_s: float | None, clock: str = "auto") -> Times:
-    """UTC of every row from the drive's clock and its zero; ``clock``: unix, gps, or auto, which tells by the size."""
-    if clock not in ("auto", "unix", "gps", "none"):
-        raise InputError(f"export_clock={clock} is none of auto, unix, gps, none")
-    if clock == "none" or time_zero_s is None or not np.isfinite(time_zero_s):
+def utc_times(table: pd.DataFrame, clock: DriveClock | None, counts: str = "auto") -> Times:
+    """UTC of every row. ``counts``: auto, by the receiver's own stamps where these tell the date, else by the clock of
+    the log files, whose size tells unix from gps; unix or gps says which that is, receiver or not."""
+    if counts not in ("auto", "unix", "gps", "none"):
+        raise InputError(f"export_clock={counts} is none of auto, unix, gps, none")
+    if counts == "none" or clock is None:
         return None
-    seconds = time_zero_s + table["t"].to_numpy()
-    if clock == "auto":
-        clock = "unix" if seconds[0] > UNIX_SINCE else "gps" if seconds[0] > GPS_SINCE else "none"
-        if clock == "none":
+    t = table["t"].to_numpy()
+    if counts == "auto" and np.isfinite(clock.gps_s):
+        counts, seconds = "gps", clock.gps_s + clock.gps_rate * t
+    else:
+        seconds = clock.file_s + t
+        known = clock_by_size(seconds[0]) if counts == "auto" else counts
+        if known is None or not np.isfinite(clock.file_s):
             return None
-    if clock == "gps":
+        counts = known
+    if counts == "gps":
         seconds = seconds + GPS_EPOCH_UNIX
         seconds = seconds - leap_seconds(seconds - leap_seconds(seconds))
     start = datetime(1970, 1, 1, tzinfo=UTC)

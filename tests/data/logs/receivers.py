@@ -55,6 +55,11 @@ def ubx(folder: Path, tables: Tables) -> list[str]:
     return ["reader=ubx"]
 
 
+def ubx_fixes(path: Path, tables: Tables) -> None:
+    """pyubx2, no IMU in it."""
+    _ubx(path, {**tables, "imu": tables["imu"][:0]}, lambda tag, words: None)
+
+
 def ubx_meas(folder: Path, tables: Tables) -> list[str]:
     """pyubx2, the IMU in ESF-MEAS."""
     from pyubx2 import GET, UBXMessage

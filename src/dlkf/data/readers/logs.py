@@ -102,7 +102,10 @@ class LogReader:
             arm, found = settled.lever_arm_m, settled.notes
             mapping = self._mapping({**self.neutral, **settled.specs}, arm)
         frames = {kind: FRAMES[kind](part, t[kind]) for kind, part in mapped.items()}
-        meta = {"drive": name, "group": self.group or name, "time_zero_s": float(zero), **self.meta}
+        meta = {"drive": name, "group": self.group or name, "time_zero_s": float(zero)}
+        if "gnss" in mapped:
+            meta |= _gps_time(mapped["gnss"], t["gnss"])
+        meta |= self.meta
         meta |= dict(zip(("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m"), arm))
         notes = [note for part in mapped.values() for one in (part, *part.parts.values()) for note in one.table.notes]
         told = (*dict.fromkeys(notes), *found)
@@ -212,6 +215,16 @@ def _joined(whole: Mapped, parts: Mapping[str, Mapped]) -> Mapped:
         brought[key] = replace(part, table=replace(part.table, frame=frame))
     joined = replace(whole, parts=brought)
     return joined if keep.all() else joined.rows(keep)
+
+
+def _gps_time(gnss: Mapped, t: np.ndarray) -> dict[str, float]:
+    """GPS time = ``gps_zero_s`` + ``gps_rate`` t by the fixes' own stamps, whatever clock t is on; empty where they
+    tell no date."""
+    first = gnss.first_gps_s()
+    if first is None:
+        return {}
+    rate = 1 / (1 + 1e-6 * float((gnss.spec.get("time") or {}).get("drift_ppm") or 0.0))
+    return {"gps_zero_s": first - rate * float(t[0]), "gps_rate": rate}
 
 
 def _interpolated(part: Mapped, key: str, at: np.ndarray, t: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:

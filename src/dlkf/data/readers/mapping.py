@@ -117,7 +117,30 @@ class Mapped:
         return entry.get("columns") is not None or entry.get("column") is not None
 
     def stamps(self) -> tuple[np.ndarray, np.ndarray]:
-        """Whole seconds and the rest of the rows' times, offset included."""
+        """Whole seconds and the rest of the rows' times, offset and drift included."""
+        time = self.spec.get("time") or {}
+        where = f"reader.{self.kind}.time"
+        whole, part = self.own_stamps()
+        offset = _finite(time.get("offset_s") or 0.0, f"{where}.offset_s")
+        if drift := _finite(time.get("drift_ppm") or 0.0, f"{where}.drift_ppm"):
+            part = part + 1e-6 * drift * ((whole - whole[0]) + (part - part[0]))
+        jump = math.floor(offset)
+        return whole + jump, part + (offset - jump)
+
+    def first_gps_s(self) -> float | None:
+        """GPS time of the first row [s since 1980] by the table's own clock; None where that tells no date."""
+        time = self.spec.get("time") or {}
+        whole, part = self.own_stamps()
+        first = float(whole[0]) + float(part[0])
+        known = units.clock_by_size(first)
+        if known is not None and (time.get("clock") or time.get("week") or time.get("week_number") is not None):
+            known = "gps"
+        if known == "unix":
+            first += float(units.leap_seconds(int(whole[0]))) - units.GPS_EPOCH_UNIX
+        return None if known is None else first
+
+    def own_stamps(self) -> tuple[np.ndarray, np.ndarray]:
+        """Whole seconds and the rest of the rows' times on the table's own clock, as GPS time where that is said."""
         time = self.spec.get("time") or {}
         where = f"reader.{self.kind}.time"
         name, unit = time.get("column"), time.get("unit") or "s"
@@ -137,12 +160,7 @@ class Mapped:
         if time.get("week_number") is not None:
             week = np.full(len(self), int(time["week_number"]))
         day = None if time.get("day") is None else str(time["day"])
-        whole, part = units.seconds(values, unit, week, time.get("clock"), f"{self.table.path}, {where}", day)
-        offset = _finite(time.get("offset_s") or 0.0, f"{where}.offset_s")
-        if drift := _finite(time.get("drift_ppm") or 0.0, f"{where}.drift_ppm"):
-            part = part + 1e-6 * drift * ((whole - whole[0]) + (part - part[0]))
-        jump = math.floor(offset)
-        return whole + jump, part + (offset - jump)
+        return units.seconds(values, unit, week, time.get("clock"), f"{self.table.path}, {where}", day)
 
     def scale(self, key: str, table: Mapping[str, float], name: str = "unit") -> float:
         """SI per unit of an entry; the first unit of the table if the entry has none."""

@@ -23,6 +23,7 @@ ISO = "iso"  # calendar texts: 2025-07-05T23:57:12.7Z, 2025/07/05 23:57:12.700
 CLOCKS = ("gps", "unix", "utc")
 WEEK_S = 604_800
 GPS_EPOCH_UNIX = 315_964_800  # 1980-01-06 in Unix seconds
+UNIX_SINCE, GPS_SINCE = 1.55e9, 3e8  # s; a Unix second after January 2019; a GPS second after 1989
 # days from which GPS − UTC is one second more than before (IERS Bulletin C): 0 in 1980, 18 since 2017
 LEAP_DAYS = (
     *("1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01", "1991-01-01"),
@@ -104,6 +105,11 @@ def seconds(
     if clock in ("unix", "utc"):
         whole = whole - GPS_EPOCH_UNIX + leap_seconds(whole)
     return whole, part
+
+
+def clock_by_size(seconds: float) -> str | None:
+    """Whether seconds count from 1970 (unix) or from 1980 (gps), by their size; None if neither can be."""
+    return "unix" if seconds > UNIX_SINCE else "gps" if seconds > GPS_SINCE else None
 
 
 def leap_seconds(unix: np.ndarray | int) -> np.ndarray:
