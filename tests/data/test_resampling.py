@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from dlkf.data import resampling
 from dlkf.data.resampling import Grid, assign_fixes, epoch_grid, fix_phase, reference_at, resample_imu
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, IMU_ERROR, POSITION, STD, VELOCITY
 from dlkf.errors import InputError
@@ -69,6 +70,19 @@ def test_a_gap_is_filled_from_both_sides():
     grid = epoch_grid(t[kept], np.array([1.0]), 50, 1.0, "a")
     whole, part = (resample_imu(_imu(t[k], x[k]), grid) for k in (np.arange(1000), kept))
     assert np.abs((whole - part).sum((0, 1)) * 0.02).max() < 0.2 * 0.01
+
+
+@pytest.mark.parametrize("block", [7, 64])
+def test_blocks_of_samples_do_not_matter(block, monkeypatch):
+    """Through jitter and gaps, at the first and the last sample: what a block needs of its neighbours it gets."""
+    rng = np.random.default_rng(2)
+    t = 3.0 + np.cumsum(rng.uniform(0.006, 0.014, 3000))
+    t, x = np.delete(t, slice(1000, 1040)), rng.standard_normal((2960, 6))
+    grid = epoch_grid(t, np.array([5.0]), 50, 1.0, "a")
+    whole = resample_imu(_imu(t, x), grid)
+    monkeypatch.setattr(resampling, "BLOCK", block)
+    # rounding of integrals of order 0.02
+    np.testing.assert_allclose(resample_imu(_imu(t, x), grid), whole, atol=1e-12)
 
 
 def test_the_phase_is_that_of_the_fixes():

@@ -35,10 +35,13 @@ def merged(pieces: np.ndarray, first: np.ndarray) -> np.ndarray:
 
     Sample j holds the pieces from ``first[j]`` (rising, ``first[0]`` = 0) to the next sample's first.
     """
-    total = np.cumsum(pieces, axis=1) - pieces
     count = np.diff(first, append=pieces.shape[1])
-    before = total - np.repeat(total[:, first], count, axis=1)
-    return np.add.reduceat(pieces + 0.5 * second_order(before, pieces), first, axis=1)
+    total, products = pieces.take(first, 1), np.zeros((6, len(first)))
+    for k in range(1, int(count.max())):  # the k-th piece of every sample that has so many
+        piece = pieces.take(first + k, 1, mode="clip") * (count > k)
+        products += second_order(total, piece)
+        total += piece
+    return total + 0.5 * products
 
 
 def second_order(before: np.ndarray, now: np.ndarray) -> np.ndarray:

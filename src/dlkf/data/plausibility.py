@@ -30,8 +30,7 @@ TURNED_DEG = (30.0, 150.0)  # backwards is found by the filters' own search
 
 def check_imu_units(imu: Columns, where: str) -> None:
     """Gravity must be about 9.8 m/s² and upwards along −z; rates must be those of a car in rad/s."""
-    force = np.stack([imu[c] for c in ACCEL], -1)
-    size = float(np.median(np.linalg.norm(force, axis=-1)))
+    size = float(np.median(_length(imu, ACCEL)))
     if 0.8 < size < 1.3:
         raise InputError(
             f"{where}: median specific force is {size:.2f}: looks like g; reader.imu.accel.unit=g, or multiply "
@@ -42,7 +41,7 @@ def check_imu_units(imu: Columns, where: str) -> None:
             f"{where}: median specific force is {size:.3g} m/s², must be near 9.8; reader.imu.accel.unit="
             "auto finds it, if gravity was not taken out"
         )
-    axes = np.median(force, axis=0)
+    axes = np.array([np.median(imu[c]) for c in ACCEL])
     if axes[2] > 0.7 * size:
         raise InputError(
             f"{where}: accel_z is {axes[2]:+.2f} m/s² in the median, must be about −9.8 (Forward-Right-"
@@ -55,12 +54,16 @@ def check_imu_units(imu: Columns, where: str) -> None:
             "accel_z (Forward-Right-Down); reorder the axes of accel and gyro (reader.imu.accel.axes and gyro.axes, "
             "or auto)"
         )
-    rate = float(np.quantile(np.linalg.norm(np.stack([imu[c] for c in GYRO], -1), axis=-1), 0.999))
+    rate = float(np.quantile(_length(imu, GYRO), 0.999))
     if rate > FASTEST_RATE:
         raise InputError(
             f"{where}: gyro reaches {rate:.0f} rad/s: looks like degrees; reader.imu.gyro.unit=deg/s, or "
             "multiply gyro by π/180"
         )
+
+
+def _length(imu: Columns, axes: tuple[str, ...]) -> np.ndarray:
+    return np.sqrt(sum(imu[c] * imu[c] for c in axes))
 
 
 def check_gnss_units(gnss: Columns, where: str) -> None:

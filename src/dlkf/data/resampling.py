@@ -17,6 +17,8 @@ from dlkf.navigation.earth import ecef_from_geodetic, ned_axes
 
 ON_BOUNDARY_S = 1e-3  # a fix this close to a boundary counts as on it
 LONGEST_BRIDGE_S = 1.1  # the reference is interpolated between samples no further apart
+BLOCK = 4000  # samples of the grid that are composed at a time: what they need stays in the processor's cache
+BEFORE = 3  # samples before the first that a block needs, for the interval before it and whether that is whole
 SMALLEST_STD = 1e-3  # m, m/s: what a source calls zero
 # horizontal position [m] and velocity [m/s] 1σ where a source gives none, by NMEA GGA quality
 DEFAULT_STD = {4: (0.02, 0.05), 5: (0.3, 0.1), 2: (1.0, 0.1), 3: (1.0, 0.1), 9: (1.0, 0.1), 1: (2.5, 0.2)}
@@ -99,27 +101,37 @@ def resample_imu(imu: Columns, grid: Grid, usual: float | None = None) -> np.nda
     interval over 1.5 ``usual`` ones [s], by default their median), the mean of the two neighbours fills the
     missing part.
     """
-    t = imu["t"]
-    values = np.stack([imu[c] for c in (*ACCEL, *GYRO)])
+    t, at = imu["t"], grid.sample_times
     if usual is None:
         usual = float(np.median(np.diff(t)))
+    out = np.empty((grid.epochs * grid.samples, 6))
+    for first in range(0, len(out), BLOCK):
+        last = min(first + BLOCK, len(out))
+        begin = max(0, int(np.searchsorted(t, at[first], side="right")) - BEFORE)
+        end = int(np.searchsorted(t, at[last])) + 1
+        part = np.stack([imu[c][begin:end] for c in (*ACCEL, *GYRO)])
+        out[first:last] = _composed(t[begin:end], part, at[first : last + 1], usual).T
+    out /= grid.epoch_s / grid.samples
+    return out.reshape(grid.epochs, grid.samples, 6)
+
+
+def _composed(t: np.ndarray, values: np.ndarray, at: np.ndarray, usual: float) -> np.ndarray:
+    """Increments (6, m) between the limits ``at`` (m + 1,) of samples (6, n) that end at ``t``."""
     step = np.diff(t, prepend=t[0] - usual)
     whole = step <= 1.5 * usual
-    missing = np.where(whole, 0.0, step - usual)
-    before = np.concatenate((values[:, :1], values[:, :-1]), 1)
-    integrals = values * (step - missing) + 0.5 * (values + before) * missing
+    integrals = values * np.where(whole, step, usual)
+    missing = np.flatnonzero(~whole)
+    integrals[:, missing] += 0.5 * (values[:, missing] + values[:, missing - 1]) * (step[missing] - usual)
     follows = whole & np.concatenate(([False], whole[:-1]))
     rates = two_sample(integrals, step, follows) / step
     # one interval more before the first, and one after the last, for the slack of the grid
     rates = np.concatenate((values[:, :1], rates, values[:, -1:]), 1)
     knots = np.concatenate((t[:1] - 2 * step[0], t[:1] - step[0], t, t[-1:] + step[-1]))
-    at = grid.sample_times
     times = np.concatenate((at, knots[(knots > at[0]) & (knots < at[-1])]))
     times.sort(kind="stable")
     place = np.searchsorted(knots, times[:-1], side="right") - 1
     pieces = rates.take(place, 1, mode="clip") * np.diff(times)
-    samples = merged(pieces, np.searchsorted(times, at[:-1])) / (grid.epoch_s / grid.samples)
-    return np.ascontiguousarray(samples.T).reshape(grid.epochs, grid.samples, 6)
+    return merged(pieces, np.searchsorted(times, at[:-1]))
 
 
 @dataclass(frozen=True)

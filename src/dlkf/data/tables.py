@@ -158,4 +158,4 @@ def _column(table: pa.Table, name: str, kind: pa.DataType, where: str) -> np.nda
     values = pc.cast(column, pa.float64()).to_numpy()
     if pa.types.is_integer(kind):
         return np.where(np.isfinite(values), values, 0).astype(np.int64)
-    return np.array(values, dtype=np.float64)
+    return np.asarray(values, dtype=np.float64)

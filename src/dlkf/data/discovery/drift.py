@@ -35,7 +35,7 @@ def ends_apart(t: Floats, accel: Floats, gyro: Floats, gnss: Motion) -> Ends | N
     seen = []
     for part in (gnss.t <= edges[0], gnss.t >= edges[1]):
         some = replace(gnss, t=gnss.t[part], v=gnss.v[part], climb=gnss.climb[part])
-        near = (t >= some.t[0] - SEARCH_S) & (t <= some.t[-1] + SEARCH_S)
+        near = slice(*np.searchsorted(t, (some.t[0] - SEARCH_S, some.t[-1] + SEARCH_S)))
         lag = find_lag(t[near], accel[near], gyro[near], some, SEARCH_S)
         if lag is None or not lag.clear or min(lag.yaw, lag.force) < 0.6 or max(lag.yaw, lag.force) < 0.85:
             return None
