@@ -36,9 +36,9 @@ def epoch_of(batch, state: NavState, error: ImuError) -> Epoch:
 
 
 def test_jacobian_matches_finite_differences():
-    """z(x̂) falls by H dx when the estimate moves by dx, state by state: navigation, gyroscopes, the car."""
+    """z(x̂) falls by H dx when the estimate moves by dx, state by state: navigation, the sensors, the car."""
     batch = scene(1, 1, seed=3)
-    structure = torch.tensor([[0.03, -0.02, 1.2, 0.008]], dtype=D)
+    structure = torch.tensor([[0.03, -0.02, 1.2, 0.008, 0.004]], dtype=D)
     error = ImuError(torch.zeros(1, 6, dtype=D))
     rules = CarConstraints(Tuning(), STATES)
 
@@ -49,7 +49,7 @@ def test_jacobian_matches_finite_differences():
 
     still = epoch_of(batch, batch.start, error)
     H = torch.cat((rules._across(still, structure)[1], rules._standing(still)[1]), 1)[0]
-    for i in (*range(3, 9), *range(12, 15), *range(21, 25)):
+    for i in (*range(3, 10), *range(12, 15), *range(21, 26)):
         dx = torch.zeros(1, STATES.count, dtype=D)
         dx[0, i] = 1e-6
         numeric = -(innovation(dx) - innovation(-dx))[0] / 2e-6
@@ -82,7 +82,7 @@ def test_what_is_known_of_a_car_grows_old():
     assert (walk > 0).all()
     assert torch.allclose(variance[:, -1], torch.tensor(STRUCTURE_STD, dtype=D).square() + 20 * walk, rtol=1e-12)
     # 1e-6: float64 beside the variance of the start, and the PSD comes as float32
-    assert torch.allclose(variance[:, -1] - variance[:, 9], (10 * walk).expand(2, 4), rtol=1e-5)
+    assert torch.allclose(variance[:, -1] - variance[:, 9], (10 * walk).expand(2, 5), rtol=1e-5)
 
 
 def outage(batch, first: int, last: int):
@@ -98,13 +98,13 @@ def drift(batch, name: str, **tuning: float) -> torch.Tensor:
 
 @pytest.mark.parametrize("base", ["mbkf15", "mbkf21"])
 def test_cars_that_do_not_slide_drift_less(base):
-    batch = outage(slipping(30, 90, (0.0, 0.0, 0.0, 0.0)), 45, 90)
+    batch = outage(slipping(30, 90, (0.0, 0.0, 0.0, 0.0, 0.0)), 45, 90)
     assert drift(batch, f"{base}_nhc", lateral_std=0.05, vertical_std=0.05) < 0.35 * drift(batch, base)
 
 
 def test_structure_of_the_car_is_found_and_pays():
-    """Mounting angles, rear axle and sideslip unknown: a filter that estimates them beats one that cannot."""
-    true = (0.02, -0.015, 1.4, 0.004)
+    """Mounting angles, rear axle, slip and springs unknown: a filter that estimates them beats one that cannot."""
+    true = (0.02, -0.015, 1.4, 0.004, 0.006)
     batch = outage(slipping(30, 150, true), 105, 150)
     estimator = build_filter("mbkf15_car", IMU, tuning=Tuning(lateral_std=0.05, vertical_std=0.05))
     memory = None
@@ -121,14 +121,14 @@ def test_structure_of_the_car_is_found_and_pays():
         integrate(batch, Watched(**vars(estimator)))
     assert watched is not None
     error = watched.mean(0) - torch.tensor(true, dtype=D)
-    assert (error.abs() < torch.tensor([2e-3, 2e-3, 0.15, 1e-3])).all(), error
+    assert (error.abs() < torch.tensor([2e-3, 2e-3, 0.15, 1e-3, 1e-3])).all(), error
     tuning = {"lateral_std": 0.05, "vertical_std": 0.05}
     assert drift(batch, "mbkf15_car", **tuning) < 0.6 * drift(batch, "mbkf15_nhc", **tuning)
 
 
 def test_a_standing_car_stays_where_it_is():
     """Stopped after 40 s, GNSS gone from then on: zero-velocity updates hold the position and find the gyro bias."""
-    batch = outage(slipping(10, 100, (0.0, 0.0, 0.0, 0.0), stop=40), 40, 100)
+    batch = outage(slipping(10, 100, (0.0, 0.0, 0.0, 0.0, 0.0), stop=40), 40, 100)
     held, free = drift(batch, "mbkf15_nhc"), drift(batch, "mbkf15")
     assert held < 0.3 and held < 0.02 * free
     solution = integrate(batch, build_filter("mbkf15_nhc", IMU))
@@ -147,13 +147,13 @@ def test_a_moving_car_is_not_taken_for_a_standing_one():
     assert not measured.used[:, 2:].any()
 
 
-def slipping(batch: int, epochs: int, structure: tuple[float, float, float, float], stop: float | None = None):
+def slipping(batch: int, epochs: int, structure: tuple[float, ...], stop: float | None = None):
     """Cars whose IMU moves as the constraint with these parameters says, and the truth that goes with it.
 
     Body velocity follows from speed and yaw rate; forces from its derivative, gravity and Earth rotation at the
     samples' middle; then the strapdown itself makes the truth, so that IMU and truth agree to rounding.
     """
-    yaw, pitch, axle, slip = structure
+    yaw, pitch, axle, slip, gradient = structure
     base = scene(batch, epochs, seed=12)
     t = torch.arange(epochs * M + 1, dtype=D) * base.dt
     g = torch.Generator().manual_seed(5)
@@ -163,8 +163,9 @@ def slipping(batch: int, epochs: int, structure: tuple[float, float, float, floa
     if stop is not None:
         fade = (1 - torch.cos(math.pi * ((stop - t) / 8).clamp(0, 1))) / 2
         vx, wz = vx * fade, wz * fade
-    v_b = torch.stack((vx, yaw * vx + (axle + slip * vx**2) * wz, pitch * vx), -1)
     dt = base.dt
+    ahead = torch.gradient(vx, spacing=dt, dim=1)[0]
+    v_b = torch.stack((vx, yaw * vx + (axle + slip * vx**2) * wz, (pitch + gradient * ahead) * vx), -1)
     rate = torch.zeros(batch, epochs * M, 3, dtype=D)
     rate[..., 2] = 0.5 * (wz[:, 1:] + wz[:, :-1])
     middle = 0.5 * (v_b[:, 1:] + v_b[:, :-1])
@@ -208,12 +209,12 @@ def driven(base, start: NavState, clean: torch.Tensor):
     )
 
 
-@pytest.mark.parametrize("name,states", [("mbkf21_car", 25), ("mbkf33_car", 37)])
+@pytest.mark.parametrize("name,states", [("mbkf21_car", 26), ("mbkf33_car", 38)])
 def test_ten_minutes_in_float32_are_those_in_float64(name, states):
     """Training runs in float32: rounding stays small beside what the filter does not know, in an outage too."""
     errors = {"scale_factor": 3e-3, "misalignment": 3e-3}
     imu = ImuSpec("all", SensorErrors(1e-3, 0.1, 1e-3, **errors), SensorErrors(7e-5, 5e-3, 5e-5, **errors))
-    batch = outage(slipping(2, 600, (0.03, -0.02, 1.2, 0.008)), 540, 600)
+    batch = outage(slipping(2, 600, (0.03, -0.02, 1.2, 0.008, 0.004)), 540, 600)
     with torch.inference_mode():
         both = (batch, batch.in_precision(torch.float32))
         double, single = (integrate(b, build_filter(name, imu), keep_covariances=True) for b in both)

@@ -69,7 +69,7 @@ def test_a_filter_with_a_wrong_velocity_is_not_locked_out():
 
 def test_a_receiver_that_froze_stays_frozen_while_the_car_stands():
     """Frozen on the move, then the car stops: the stale fix agrees with itself, and is still not believed."""
-    batch = slipping(5, 80, (0.0, 0.0, 0.0, 0.0), stop=50)
+    batch = slipping(5, 80, (0.0, 0.0, 0.0, 0.0, 0.0), stop=50)
     gnss = batch.gnss.clone()
     gnss[:, 38:] = gnss[:, 37:38]
     off = error(replace(batch, gnss=gnss), "mbkf15_nhc_gated")

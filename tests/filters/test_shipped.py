@@ -38,7 +38,7 @@ def test_it_finds_out_what_imu_it_has():
     """An IMU far noisier than it takes an unknown one for: in the outage it is told by its own σ, and is less wrong
     than its classical filter with the same beginning."""
     g = torch.Generator().manual_seed(0)
-    batch = slipping(24, 110, (0.02, -0.01, 0.8, 0.004))
+    batch = slipping(24, 110, (0.02, -0.01, 0.8, 0.004, 0.004))
     rough = Rough(share=1.0, accel_noise=(0.02, 0.03), gyro_noise=(3e-3, 5e-3), shaken=0.0, gnss=0.0)
     batch = roughen(batch, rough, g)
     batch.available[:, 60:] = False
@@ -53,7 +53,7 @@ def test_it_finds_out_what_imu_it_has():
 @pytest.mark.parametrize("rate", [25, 50, 200])
 def test_any_rate(rate):
     """The same drive at another rate of the IMU: much the same solution (the bands above 12 Hz are empty at 25 Hz)."""
-    batch = slipping(2, 20, (0.0, 0.0, 0.0, 0.0))
+    batch = slipping(2, 20, (0.0, 0.0, 0.0, 0.0, 0.0))
     x = batch.imu
     x = x.unflatten(2, (-1, 50 // rate)).mean(3) if rate < 50 else x.repeat_interleave(rate // 50, 2)
     other = replace(batch, imu=x, dt=1 / rate)

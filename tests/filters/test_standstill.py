@@ -23,7 +23,7 @@ STOP = 40.0  # s
 
 def shaken(idling: tuple[float, float], driving: tuple[float, float]):
     """Cars that stop after 40 s and shake at 9 to 18 Hz [m/s², rad/s, amplitudes] as told, with GNSS for 20 s."""
-    batch = slipping(8, 100, (0.0, 0.0, 0.0, 0.0), stop=STOP)
+    batch = slipping(8, 100, (0.0, 0.0, 0.0, 0.0, 0.0), stop=STOP)
     _, T, count = batch.size
     moving = batch.truth.v_n.norm(dim=-1)[..., None, None] > 0.01
     size = torch.where(moving, *(batch.imu.new_tensor(x).repeat_interleave(3) for x in (driving, idling)))

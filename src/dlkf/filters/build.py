@@ -26,7 +26,7 @@ KALMAN: Mapping[str, str] = {"mbkf15": "none", "mbkf21": "scale", "mbkf33": "ful
 ENDINGS: Mapping[str, str] = {
     "prior": "starts from the training set's mean IMU error",
     "nhc": "non-holonomic constraints and zero-velocity updates",
-    "car": "the same, with mounting angles, rear axle and sideslip as states",
+    "car": "the same, with mounting angles, rear axle, sideslip and pitch gradient as states",
     "gated": "refuses outliers",
     "gm": "biases as first-order Gauss-Markov processes",
     "rts": "smoothed backwards over the whole drive (Rauch-Tung-Striebel)",

@@ -2,11 +2,12 @@
 
 Non-holonomic constraint (NHC; Dissanayake et al. 2001). The velocity of the IMU in body axes is, across the car,
 
-    v_y = ψ v_x + a ω_z + k v_x² ω_z      v_z = θ v_x − a ω_y
+    v_y = ψ v_x + a ω_z + k v_x² ω_z      v_z = θ v_x − a ω_y + s v_x f_x
 
 with ψ, θ the direction in which the car moves seen from the IMU's axes (mounting), a how far ahead of the rear axle
-the IMU sits, and k the sideslip per lateral acceleration and speed (single-track model). Plain, all four are zero;
-with structure they are further states of the filter. A standstill (:mod:`dlkf.filters.standstill`) says v = 0
+the IMU sits, k the sideslip per lateral acceleration and speed (single-track model), and s how far its springs let the
+car pitch back per specific force f_x forward (pitch gradient; Gillespie 1992). Plain, all five are zero; with structure
+they are further states of the filter. A standstill (:mod:`dlkf.filters.standstill`) says v = 0
 (zero-velocity update) and ω_b = Earth rate (zero-angular-rate update).
 """
 
@@ -25,10 +26,11 @@ from dlkf.filters.sources import Believed, Measurement
 from dlkf.filters.standstill import Liveliness, at_rest
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import skew
-from dlkf.navigation.state import ATTITUDE, GYRO, VELOCITY, ErrorStates
+from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, VELOCITY, ErrorStates
 
-STRUCTURE_STD = (0.05, 0.05, 1.5, 0.01)  # rad, rad, m, s²/m: what is known of a car before it moves
-STRUCTURE_WALK_STD = (2e-5, 2e-5, 1e-4, 1e-6)  # per √s
+STRUCTURE_STD = (0.05, 0.05, 1.5, 0.01, 0.005)  # rad, rad, m, s²/m, s²·rad/m: what is known of a car before it moves
+STRUCTURE_WALK_STD = (2e-5, 2e-5, 1e-4, 1e-6, 1e-6)  # per √s
+SPRINGS_S = 0.3  # the springs follow the force so slowly: it is averaged over so long
 SLOWEST = 0.5  # m/s: below, course and yaw rate say nothing of the car's structure
 
 
@@ -81,7 +83,7 @@ class CarConstraints:
         return at_rest(epoch, turning, P, memory.liveliness, memory.prior)
 
     def _across(
-        self, epoch: Epoch, structure: Float[Tensor, "B 4"] | None
+        self, epoch: Epoch, structure: Float[Tensor, "B 5"] | None
     ) -> tuple[Float[Tensor, "B 2"], Float[Tensor, "B 2 n"], Bool[Tensor, " B"]]:
         """Innovation and H of the velocity across the car at the window's end."""
         state, rate = epoch.window.end, epoch.rate_b
@@ -89,22 +91,23 @@ class CarConstraints:
         v_b = torch.bmm(C_bn, state.v_n.unsqueeze(-1)).squeeze(-1)
         vx, w_y, w_z = v_b[:, 0], rate[:, 1], rate[:, 2]
         zero = torch.zeros_like(vx)
-        yaw, pitch, axle, slip = (zero,) * 4 if structure is None else structure.unbind(-1)
-        model = torch.stack(
-            (yaw * vx + (axle + slip * vx * vx) * w_z, pitch * vx - axle * w_y),
-            -1,
-        )
+        yaw, pitch, axle, slip, gradient = (zero,) * 5 if structure is None else structure.unbind(-1)
+        count = max(1, min(epoch.corrected.shape[1], round(SPRINGS_S / epoch.dt)))
+        force = epoch.corrected[:, -count:, 0].sum(1) / count
+        pitch = pitch + gradient * force
+        model = torch.stack((yaw * vx + (axle + slip * vx * vx) * w_z, pitch * vx - axle * w_y), -1)
         # h(x) = v_across − model = 0; the innovation is 0 − h(x̂)
         H = torch.zeros(len(vx), 2, self.states.count, dtype=vx.dtype, device=vx.device)
         J = C_bn[:, 1:] - torch.stack((yaw + 2 * slip * vx * w_z, pitch), -1).unsqueeze(-1) * C_bn[:, :1]
         H[:, :, VELOCITY] = J
         H[:, :, ATTITUDE] = torch.bmm(J, skew(state.v_n))
-        # δω = −ζ: the model's rates are too large by the gyroscopes' remaining error
+        # δω = −ζ, δf = −ε: the model's rates and forces are too large by the sensors' remaining errors
         H[:, 0, GYRO.start + 2] = axle + slip * vx * vx
         H[:, 1, GYRO.start + 1] = -axle
+        H[:, 1, ACCEL.start] = gradient * vx
         if self.states.structure:
-            lateral = torch.stack((vx, zero, w_z, vx * vx * w_z), -1)
-            vertical = torch.stack((zero, vx, -w_y, zero), -1)
+            lateral = torch.stack((vx, zero, w_z, vx * vx * w_z, zero), -1)
+            vertical = torch.stack((zero, vx, -w_y, zero, vx * force), -1)
             H[:, :, self.states.of_structure] = -torch.stack((lateral, vertical), 1)
         return model - v_b[:, 1:], H, vx.abs() > SLOWEST
 

@@ -54,7 +54,7 @@ class Memory(NamedTuple):
     windows: WindowModel
     fix: FixMemory
     sources: tuple[Any, ...] = ()  # one of each
-    structure: Tensor | None = None  # (B, 4) of the car
+    structure: Tensor | None = None  # (B, 5) of the car
     noise: AdaptiveNoise | None = None
 
 
@@ -112,7 +112,7 @@ class Mbkf:
         sigma = torch.cat((batch.start_std, self._imu_sigma().to(**like).expand(B, -1)), -1)
         structure = None
         if self.states.structure:
-            known = torch.tensor(STRUCTURE_STD, **like).expand(B, 4)
+            known = torch.tensor(STRUCTURE_STD, **like).expand(B, -1)
             sigma, structure = torch.cat((sigma, known), -1), torch.zeros_like(known)
         decay = (0.0, 0.0)
         if self.gauss_markov:

@@ -262,7 +262,7 @@ class PlusFilter(nn.Module):
     def _sizes(self, like: Tensor) -> Float[Tensor, " n"]:
         """Typical sizes of the states, for scaling."""
         states = self.kalman.states
-        matrix, car = 2 * len(states.elements), (0.05, 0.05, 1.0, 0.01) if states.structure else ()
+        matrix, car = 2 * len(states.elements), (0.05, 0.05, 1.0, 0.01, 0.005) if states.structure else ()
         return like.new_tensor(
             (1.0,) * 3 + (0.3,) * 3 + (0.02,) * 3 + (0.1,) * 3 + (0.005,) * 3 + (0.005,) * matrix + car
         )

@@ -52,7 +52,7 @@ class Believed(NamedTuple):
     """What the filter believes at the end of a window, before it updates."""
 
     P: Tensor  # (B, n, n)
-    structure: Tensor | None = None  # (B, 4) of the car, where it has such states
+    structure: Tensor | None = None  # (B, 5) of the car, where it has such states
     noise: AdaptiveNoise | None = None
 
 

@@ -151,7 +151,7 @@ def window_model(
     *,
     states: ErrorStates = PLAIN,
     decay: tuple[float, float] = (0.0, 0.0),
-    walk: Float[Tensor, " 4"] | None = None,
+    walk: Float[Tensor, " 5"] | None = None,
 ) -> WindowModel:
     """The common part of the windows of a batch of frames.
 

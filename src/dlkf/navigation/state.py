@@ -21,7 +21,7 @@ PV = slice(0, 6)
 IMU = slice(9, 15)
 STATES = 15
 MATRICES = ("none", "scale", "full")
-STRUCTURE = ("mounting_yaw", "mounting_pitch", "rear_axle", "sideslip")
+STRUCTURE = ("mounting_yaw", "mounting_pitch", "rear_axle", "sideslip", "pitch_gradient")
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class ErrorStates:
 
     ``matrix`` of M in measured = (I + M) true + bias: ``none`` (15 states), ``scale`` its diagonal (21), ``full``
     also the misalignments (33). Columns 15… hold the accelerometers' elements, then the gyroscopes', each the
-    diagonal first, then row by row. ``structure`` adds the four of :data:`STRUCTURE` at the end
+    diagonal first, then row by row. ``structure`` adds the five of :data:`STRUCTURE` at the end
     (:mod:`dlkf.filters.constraints`).
     """
 

@@ -34,7 +34,7 @@ MEANING = {
     "scale": "factors on 1σ of a fix, and the least 1σ: position [m], velocity [m/s]",
     "std": "1σ across the car [m/s], and at rest: velocity [m/s], rate [rad/s]",
     "forgetting": "share of the past in the adapted noise",
-    "structure": "mounting yaw, pitch [rad], distance to the rear axle [m], sideslip [s²/m]",
+    "structure": "mounting yaw, pitch [rad], distance to the rear axle [m], sideslip [s²/m], pitch gradient [rad s²/m]",
     "lever_arm_b": "IMU to antenna, forward, right, down [m]",
 }
 
