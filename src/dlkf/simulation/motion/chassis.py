@@ -50,7 +50,8 @@ class ChassisConfig(Ranged, where="chassis"):
     velocity to the right is −K v² χ' (single-track model with K = m l_f/(L C_r), exact, without a lag, where
     the dynamic index I_z/(m l_f l_r) is one); ``slip_noise`` [rad] is the RMS of what side wind and ruts add, in
     waves of 20 to 300 m. Suspension: the body rolls outwards by ``roll_gradient`` and
-    pitches back by ``pitch_gradient`` [rad per m/s² of specific force], with a second-order lag.
+    pitches back by ``pitch_gradient`` [rad per m/s² of specific force], with a second-order lag; ``pitch_noise`` [rad]
+    is the RMS by which it pitches besides, over the swells of a road, in waves of 20 to 300 m.
     ``body_hz``, ``body_damping``: sprung mass on its springs; ``wheel_hz``, ``wheel_damping``: unsprung mass on its
     tyres; ``wheelbase``, ``track`` [m].
     ``roughness``: ISO 8608 G_d(0.1/m) [m³] (classes A to E: 16, 64, 256, 1024, 4096 · 1e-6), which changes by stretches
@@ -66,6 +67,7 @@ class ChassisConfig(Ranged, where="chassis"):
     slip_noise: float = within(0.0, 0, 0.05)
     roll_gradient: float = within(0.0, 0, 0.05)
     pitch_gradient: float = within(0.0, 0, 0.05)
+    pitch_noise: float = within(0.0, 0, 0.05)
     roughness: float = within(0.0, 0, 0.01)
     vibration: float = within(0.0, 0, 20.0)
     vibration_rate: float = within(0.0, 0, 0.5)
@@ -109,6 +111,7 @@ class Car:
     imu_arm: Array  # (3,) m
     mounting: Array  # (3,) roll, pitch, yaw [rad]
     gusts: Waves  # what is added to the slip angle [rad]
+    swells: Waves  # what is added to the pitch [rad]
 
 
 def draw_car(rng: np.random.Generator, kind: ChassisConfig) -> Car:
@@ -118,7 +121,8 @@ def draw_car(rng: np.random.Generator, kind: ChassisConfig) -> Car:
     mounting = np.radians(np.asarray(kind.mounting_deg) + kind.mounting_std_deg * rng.standard_normal(3))
     slip, roll, pitch = (factors * (kind.sideslip, kind.roll_gradient, kind.pitch_gradient)).tolist()
     gusts = random_waves(rng, kind.slip_noise, (20.0, 300.0))
-    return Car(kind, slip, roll, pitch, arm, mounting, gusts)
+    swells = random_waves(rng, kind.pitch_noise, (20.0, 300.0))
+    return Car(kind, slip, roll, pitch, arm, mounting, gusts, swells)
 
 
 def slip_angle(car: Car, route: Route, motion: Kinematics) -> tuple[Array, Array]:
@@ -161,7 +165,8 @@ def mounted(rng: np.random.Generator, car: Car, route: Route, axle: Truth) -> Tr
         moved += mount.moved
         moved_rate += mount.moved_rate
     offset, change = _rotated(C, moved), _rotated(C, np.cross(rate, moved) + moved_rate)
-    C, rate = _turned(C, rate, 1, pitch + shake[:, 4], pitch_rate + shake_rate[:, 4])
+    swell, swell_rate = car.swells.at(motion)
+    C, rate = _turned(C, rate, 1, pitch + swell + shake[:, 4], pitch_rate + swell_rate + shake_rate[:, 4])
     C, rate = _turned(C, rate, 0, roll + shake[:, 3], roll_rate + shake_rate[:, 3])
     arm = np.broadcast_to(car.imu_arm, rate.shape)
     offset += _rotated(C, arm)
