@@ -51,7 +51,7 @@ class ChassisConfig(Ranged, where="chassis"):
     the dynamic index I_z/(m l_f l_r) is one); ``slip_noise`` [rad] is the RMS of what side wind and ruts add, in
     waves of 20 to 300 m. Suspension: the body rolls outwards by ``roll_gradient`` and
     pitches back by ``pitch_gradient`` [rad per m/s² of specific force], with a second-order lag; ``pitch_noise`` [rad]
-    is the RMS by which it pitches besides, over the swells of a road, in waves of 20 to 300 m.
+    is the RMS by which it pitches besides, over the swells of a road, in waves of 50 to 500 m.
     ``body_hz``, ``body_damping``: sprung mass on its springs; ``wheel_hz``, ``wheel_damping``: unsprung mass on its
     tyres; ``wheelbase``, ``track`` [m].
     ``roughness``: ISO 8608 G_d(0.1/m) [m³] (classes A to E: 16, 64, 256, 1024, 4096 · 1e-6), which changes by stretches
@@ -121,7 +121,7 @@ def draw_car(rng: np.random.Generator, kind: ChassisConfig) -> Car:
     mounting = np.radians(np.asarray(kind.mounting_deg) + kind.mounting_std_deg * rng.standard_normal(3))
     slip, roll, pitch = (factors * (kind.sideslip, kind.roll_gradient, kind.pitch_gradient)).tolist()
     gusts = random_waves(rng, kind.slip_noise, (20.0, 300.0))
-    swells = random_waves(rng, kind.pitch_noise, (20.0, 300.0))
+    swells = random_waves(rng, kind.pitch_noise, (50.0, 500.0))
     return Car(kind, slip, roll, pitch, arm, mounting, gusts, swells)
 
 
