@@ -66,12 +66,11 @@ class Rough:
     """IMUs and receivers worse than any preset, drawn anew for every piece; each pair is a log-uniform range.
 
     ``share`` of the sensors get white noise [m/s²/√Hz, rad/s/√Hz], uneven over the axes by ``uneven`` (1σ of the
-    logarithm), and an error that wanders with a correlation time of 1 to 20 s [m/s², rad/s]; ``muffled`` of them
-    have a filter of their own that lets through the mean of that noise over ``muffled_s`` alone: as large over
-    seconds, not to be heard among the samples. ``shaken`` of the pieces have what is faster than some 3 Hz made
-    weaker or stronger, from nothing to twice; ``rectified`` of them have sensors that turn vibration into an error
-    that wanders, axis by axis in proportion to what that axis feels; ``gnss`` of them have further errors of position
-    [m] and velocity [m/s], half white and half lasting, which their stds tell only within a factor of two.
+    logarithm), and an error that wanders with a correlation time of 1 to 20 s [m/s², rad/s]. ``shaken`` of the
+    pieces have what is faster than some 3 Hz made weaker or stronger, from nothing to twice; ``rectified`` of them
+    have sensors that turn vibration into an error that wanders, axis by axis in proportion to what that axis feels;
+    ``gnss`` of them have further errors of position [m] and velocity [m/s], half white and half lasting, which their
+    stds tell only within a factor of two.
     """
 
     share: float = 0.4
@@ -81,8 +80,6 @@ class Rough:
     gyro_wander: tuple[float, ...] = (1e-4, 5e-3)
     wander_s: tuple[float, ...] = (1.0, 20.0)
     uneven: float = 1.0
-    muffled: float = 0.0
-    muffled_s: tuple[float, ...] = (0.02, 1.0)
     shaken: float = 0.4
     rectified: float = 0.4
     accel_rectified: tuple[float, ...] = (3e-4, 1e-2)  # of the RMS of the vibration in a window
@@ -126,9 +123,6 @@ def roughen(batch: Batch, rough: Rough, generator: torch.Generator | None = None
     size = (slowly * hit)[:, None] + loud * of_loud[:, None]
     wander = (wandering(normal(B, T, 6), keep) * size).repeat_interleave(M, 1)
     noise = (white / batch.dt**0.5 * hit)[:, None] * normal(B, T * M, 6)
-    for sensor in noise.split(3, -1):
-        muffled = chance(rough.muffled) & (sensor[:, 0] != 0).any(-1)
-        sensor[muffled] = _running_mean(sensor[muffled], drawn(rough.muffled_s, B)[muffled] / batch.dt)
     flat = flat + (noise + wander).to(imu)
     worse = chance(rough.gnss)[:, None, None]
     size = torch.cat([drawn(b, B, 1).expand(B, 3) for b in (rough.position, rough.velocity)], -1)[:, None]
@@ -138,14 +132,6 @@ def roughen(batch: Batch, rough: Rough, generator: torch.Generator | None = None
     gnss = torch.where(worse & batch.gnss_valid, batch.gnss + error.to(batch.gnss), batch.gnss)
     std = torch.where(worse, (batch.gnss_std.square() + told.square().to(imu)).sqrt(), batch.gnss_std)
     return replace(batch, imu=flat.unflatten(1, (T, M)), gnss=gnss, gnss_std=std)
-
-
-def _running_mean(x: Tensor, length: Tensor) -> Tensor:
-    """Mean of (B, N, k) over the last ``length`` (B,) rows, at least one."""
-    length = length.round().clamp(1, x.shape[1]).long()[:, None, None]
-    total = torch.nn.functional.pad(x.mT.cumsum(-1), (1, 0))
-    first = (torch.arange(1, x.shape[1] + 1) - length).clamp_min(0).expand_as(x.mT)
-    return ((total[..., 1:] - total.gather(-1, first)) / length).mT
 
 
 def wandering(white: Tensor, keep: Tensor) -> Tensor:
