@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from dlkf.command.composing import composed
 from dlkf.data.discovery.clock import find_lag, known_offset
-from dlkf.data.discovery.drift import ends_apart, find_drifting_pose, middle
+from dlkf.data.discovery.drift import ends_apart, ends_std, find_drifting_pose, middle
 from dlkf.data.discovery.motion import levelled, motion, position_delay
 from dlkf.data.discovery.orientation import find_pose
 from dlkf.data.discovery.units import accel_units, nearest_unit, time_unit
@@ -146,6 +146,18 @@ def test_a_drift_that_no_lag_fits_is_found(streets):
     assert pose is not None and abs(pose.drift - 5e-3) < 3 * pose.drift_std < 4e-4
 
 
+def test_what_is_not_known_of_a_drift_grows_to_the_ends(drive):
+    """Perfect sensors: as sure in the middle as at the ends; ± 100 ppm where a drift was found, ± 30 (two crystals)
+    where none was seen, over 90 s."""
+    t, accel, gyro, moved = _arrays(drive)
+    pose = find_pose(t, accel, gyro, moved, 0.0)
+    assert pose is not None
+    unsure = replace(pose, lag_std=0.004, drift=5e-4, drift_std=1e-4)
+    assert ends_std(unsure, 90.0) == pytest.approx(math.hypot(0.004, 0.009))
+    assert ends_std(replace(unsure, drift=0.0), 90.0) == pytest.approx(math.hypot(0.004, 0.0027))
+    assert ends_std(replace(unsure, drift=0.0, drift_std=math.nan), 90.0) == pytest.approx(math.hypot(0.004, 0.0027))
+
+
 def test_a_small_drift_is_told_with_its_remedy(tmp_path, streets):
     """0.2 % over three minutes are 0.36 s: taken in, with a line; 200 ppm, 0.04 s, are no line's worth."""
     for factor, told in ((1.002, True), (1.0002, False)):
@@ -217,6 +229,7 @@ def test_units_by_size():
     assert time_unit(10.0 * np.arange(9), 0.21, 2e-4) == "ms"
     assert "leap seconds" in known_offset(18.1) and "3 GPS weeks" in known_offset(3 * 604_800.0)
     assert "time zone of +2 h" in known_offset(7200.0) and known_offset(-63.0) == ""
+    assert "tells no date" in known_offset(-1_421_625_596.8) and known_offset(20 * 3600.0) == ""
 
 
 def _hidden(folder, tables, offset=1234.5, header=True):

@@ -18,7 +18,10 @@ from dlkf.data.discovery.motion import MOVING, RESTING, Complex, Floats, Motion
 STEP_S = 0.25
 LEAST_S = 20.0  # of common time in intervals with a known course
 NEIGHBOUR_S = 3.0  # lags this close belong to one peak
+FARTHEST_ZONE_H = 14.1  # Kiribati's
+YEAR_S = 31_557_600.0
 KNOWN_OFFSETS = {18.0: "leap seconds of GPS against UTC", 37.0: "TAI against UTC", 19.0: "TAI against GPS"}
+KNOWN_OFFSETS |= {315_964_782.0: "seconds since 1970 in UTC against GPS seconds since 1980"}
 
 
 @dataclass(frozen=True)
@@ -96,7 +99,9 @@ def known_offset(lag_s: float) -> str:
         if abs(abs(lag_s) - known) < 0.5:
             return f"; {name}"
     hours = lag_s / 3600
-    if abs(hours) > 0.9 and abs(hours - round(hours * 4) / 4) * 3600 < 40:
+    if abs(lag_s) > YEAR_S:
+        return "; one of the clocks tells no date"
+    if 0.9 < abs(hours) < FARTHEST_ZONE_H and abs(hours - round(hours * 4) / 4) * 3600 < 40:
         return f"; a time zone of {round(hours * 4) / 4:+g} h"
     return ""
 

@@ -17,6 +17,7 @@ ROUNDS = 6
 FEWEST = 60  # fixes of a drive whose ends are compared
 SEARCH_S = 30.0  # as far may the ends be from each other
 ROUGH_S = 0.05  # what comparing the ends is good to
+CRYSTALS = 30e-6  # 1σ by which two clocks drift apart that keep 35 ppm each: of a drive that shows no drift
 
 
 class Ends(NamedTuple):
@@ -80,6 +81,12 @@ def _settled(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, drift: float,
         if abs(left) < pose.drift_std:
             break
     return None if pose is None else replace(pose, drift=drift)
+
+
+def ends_std(pose: Pose, reach_s: float) -> float:
+    """1σ of the lag ``reach_s`` from the drive's middle, where what is not known of the drift has grown."""
+    drift_std = pose.drift_std if pose.drift else float(np.fmin(pose.drift_std, CRYSTALS))
+    return float(np.hypot(pose.lag_std, drift_std * reach_s))
 
 
 def middle(gnss: Motion) -> float:

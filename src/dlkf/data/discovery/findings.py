@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlkf.data.discovery.clock import Lag, find_lag, known_offset
-from dlkf.data.discovery.drift import find_drifting_pose, middle
+from dlkf.data.discovery.drift import ends_std, find_drifting_pose, middle
 from dlkf.data.discovery.motion import MOVING, Floats, Motion, motion, position_delay
 from dlkf.data.discovery.orientation import Pose
 from dlkf.data.discovery.units import accel_units, nearest_unit
@@ -24,7 +24,7 @@ FARTHEST_DOWN = math.radians(6.0)
 
 @dataclass(frozen=True)
 class Sure(Ranged, where="reader.sure", least=0, greatest=1e6):
-    """What is sure enough: 2.5σ of the pose [deg] and of the clock offset [s] lie below."""
+    """What is sure enough: 2.5σ of the pose [deg] and of the clock offset at the drive's ends [s] lie below."""
 
     angle_deg: float = 2.0
     time_s: float = 0.025
@@ -168,10 +168,12 @@ def _offset(out: Findings, lag: Lag | None, pose: Pose | None, wanted: set[str],
             setting, value, False, "too little motion in the time that both logs have" if lag is None else _peak(lag)
         )
         return
-    certain = lag.clear and 2.5 * pose.lag_std <= sure.time_s
+    at_ends = ends_std(pose, before_s)
+    certain = lag.clear and 2.5 * at_ends <= sure.time_s
     hardly = abs(pose.lag_s) < max(3 * pose.lag_std, 0.01) and abs(pose.lag_s) < 0.05
     value = 0.0 if hardly and not pose.drift else pose.lag_s - pose.drift * before_s
-    told = f"{sign * pose.lag_s:+.3f} ± {pose.lag_std:.3f} s, delay of the velocities included; {_peak(lag)}"
+    told = f"{sign * pose.lag_s:+.3f} ± {pose.lag_std:.3f} s, at the ends ± {at_ends:.3f}, "
+    told += f"delay of the velocities included; {_peak(lag)}"
     out.add(setting, round(sign * value, 4), certain, told + known_offset(pose.lag_s))
 
 
