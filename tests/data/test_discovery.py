@@ -20,7 +20,7 @@ from dlkf.data.discovery.motion import levelled, motion, position_delay
 from dlkf.data.discovery.orientation import find_pose
 from dlkf.data.discovery.units import accel_units, nearest_unit, time_unit
 from dlkf.data.intake import ingest_drives
-from dlkf.data.plausibility import check_clocks
+from dlkf.data.plausibility import check_clocks, turned_told
 from dlkf.data.readers import units
 from dlkf.data.readers.auto import AutoReader, _velocities_beside, offer
 from dlkf.data.readers.frames import DriveFrames, Table
@@ -32,6 +32,8 @@ from dlkf.diagnosis.checkup import checkup
 from dlkf.errors import InputError
 from tests.cars import car
 from tests.data.logs.bags import _Bag, ros1, ros2, ros2_ublox
+from tests.data.logs.receivers import ubx_fixes
+from tests.data.test_formats import read
 from tests.drives import drives_in
 
 TURN = Rotation.from_euler("ZYX", [130.0, -35.0, 70.0], degrees=True).as_matrix()  # car → sensor
@@ -289,6 +291,42 @@ def test_rows_of_imu_and_fixes_in_one_table():
     assert imu_spec(both)["time"] == gnss_spec(both)["time"] == {"column": "t", "unit": "s"}
 
 
+def test_a_log_at_rest_in_units_of_its_own(tmp_path):
+    """Gravity tells the accelerometers' unit; what nothing tells is said, and what is given is kept."""
+    rest = np.random.default_rng(1).normal(0, 0.002, (1000, 7)) + [0, 0, 0, -1.0, 0, 0, 0]
+    names = ["t", "acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z"]
+    pd.DataFrame(rest, columns=names).assign(t=0.01 * np.arange(1000)).to_csv(tmp_path / "bench.csv", index=False)
+    (got,) = AutoReader().read(tmp_path)
+    assert got.gnss is None and got.imu.accel_z.mean() == pytest.approx(-9.80665, abs=1e-3)
+    assert any("took reader.imu.gyro.unit=rad/s" in note for note in got.notes)
+    (said,) = AutoReader(imu={"gyro": {"unit": "deg/s"}}).read(tmp_path)
+    np.testing.assert_allclose(said.imu.gyro_x, np.radians(got.imu.gyro_x))
+    assert not any("gyro.unit" in note for note in said.notes)
+
+
+def test_a_file_of_a_folder_says_what_is_missing(tmp_path):
+    """A receiver's log without its IMU; the part of a bag stands for the whole, where there is one."""
+    tables = car(6)
+    ubx_fixes(tmp_path / "town.ubx", tables)
+    with pytest.raises(InputError, match=r"town.ubx: no IMU found in it; give the folder"):
+        list(AutoReader().read(tmp_path / "town.ubx"))
+    (tmp_path / "lone.db3").touch()
+    with pytest.raises(InputError, match="ros2 bag reindex"):
+        AutoReader().places(tmp_path / "lone.db3")
+    ros2(tmp_path, tables)
+    (part,) = (tmp_path / "drive").glob("*.db3")
+    assert AutoReader().places(part) == [(tmp_path / "drive", "drive", tmp_path / "drive" / "metadata.yaml")]
+
+
+def test_a_sensor_that_seems_turned_gets_a_line(streets):
+    """By 75° about the vertical; the line asks for less than the check that refuses, none as the drive is."""
+    imu, gnss = ({k: v.to_numpy() for k, v in streets[kind].items()} for kind in ("imu", "gnss"))
+    assert turned_told(imu, gnss) is None
+    turn = Rotation.from_euler("Z", 75.0, degrees=True).as_matrix()
+    turned = {**imu, **dict(zip(ACCEL, turn @ np.stack([imu[c] for c in ACCEL])))}
+    assert "turned by" in (turned_told(turned, gnss) or "")
+
+
 def test_velocities_in_a_file_beside_the_fixes(tmp_path):
     """Of the same column of time, and none but they."""
     for name, columns, row in (
@@ -309,6 +347,8 @@ def test_velocities_of_a_bag_lie_in_a_topic_of_their_own(tmp_path, writer):
     (path,) = (p for pattern in ("*.bag", "drive/metadata.yaml") for p in tmp_path.glob(pattern))
     chosen = offer(path)
     assert _velocities_beside(chosen, chosen.gnss, []) == {"table": "/gnss/vel"}
+    (got,) = read(path.parent, ["reader=rosbag"])
+    assert any("reader.gnss.velocity.table=/gnss/vel" in note for note in got.notes)
     (tmp_path / "ublox").mkdir()
     ros2_ublox(tmp_path / "ublox", tables)
     other = offer(tmp_path / "ublox" / "drive" / "metadata.yaml")

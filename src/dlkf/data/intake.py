@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from dlkf.data.plausibility import drift_told
+from dlkf.data.plausibility import drift_told, turned_told
 from dlkf.data.readers.frames import DriveFrames
 from dlkf.data.schema import new_dataset, write_drive, write_drives_table
 from dlkf.data.summary import drive_line
@@ -49,8 +49,9 @@ class Intake:
             rows.append(write_drive(folder, part.meta, part.imu, part.gnss, part.reference))
             if part.gnss is not None:
                 tables = read_checked(folder, DriveRow(part.name, part.name, (0.0, 0.0, 0.0)), limits=self.limits)
-                if drifts := drift_told(tables.imu, fixes(tables.gnss)):
-                    told.append(f"{part.name}: {drifts}")
+                for check in (drift_told, turned_told):
+                    if line := check(tables.imu, fixes(tables.gnss)):
+                        told.append(f"{part.name}: {line}")
             else:
                 read_imu(folder, part.name, self.limits)
             lines.append(f"{part.name}: {drive_line(part)}")

@@ -255,6 +255,20 @@ def drift_told(imu: Columns, gnss: Columns) -> str | None:
     )
 
 
+def turned_told(imu: Columns, gnss: Columns) -> str | None:
+    """A line about a sensor that seems turned, where it is not so clear that :func:`check_clocks` refuses it."""
+    best = find_lag(*_signals(imu, gnss), APART_S)
+    if best is None or not best.clear or not min(best.yaw, best.force) > 0.6:
+        return None
+    turned = np.degrees(best.angle)
+    if not TURNED_DEG[0] < abs(turned) < TURNED_DEG[1]:
+        return None
+    return (
+        f"the IMU seems turned by {turned:+.0f}° about the vertical (accelerations and GNSS agree to {best.force:.2f} "
+        "then): dlkf doctor looks closer, reader.imu.accel.axes=auto and gyro.axes=auto find it"
+    )
+
+
 def _signals(imu: Columns, gnss: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray, Motion]:
     moved = motion(gnss["t"], gnss["lat_deg"], gnss["lon_deg"], np.stack([gnss[c] for c in VELOCITY], -1))
     return imu["t"], np.stack([imu[c] for c in ACCEL], -1), np.stack([imu[c] for c in GYRO], -1), moved

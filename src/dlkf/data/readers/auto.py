@@ -72,13 +72,14 @@ class AutoReader:
         """Where the drives lie, for :meth:`drive_at`."""
         source = Path(source)
         if source.is_file():
-            source, only = source.parent, source
+            source, only = source.parent, _whole_bag(source)
         else:
             only = None
         if not source.is_dir():
             raise InputError(f"source={source}: no such file or folder; it holds one drive, or one subfolder per drive")
         if only is not None or self._offers(source):
-            return [(source, self.drive or (only or source.absolute()).name.partition(".")[0], only)]
+            named = source.absolute() if only is None or only.name == "metadata.yaml" else only
+            return [(source, self.drive or named.name.partition(".")[0], only)]
         folders = sorted(p for p in source.iterdir() if p.is_dir() and not p.name.startswith("."))
         if not folders:
             raise InputError(f"source={source}: holds no log that can be recognised; name a reader and its columns")
@@ -89,7 +90,7 @@ class AutoReader:
         offers = [offer(only)] if only is not None else self._offers(folder)
         specs, told = {}, []
         for kind in ("imu", "gnss"):
-            chosen = self._chosen([o for o in offers if o is not None], kind, folder)
+            chosen = self._chosen([o for o in offers if o is not None], kind, folder, only)
             if chosen is None:
                 specs[kind] = {"file": None}
                 continue
@@ -109,7 +110,11 @@ class AutoReader:
         if not specs["gnss"].get("file"):
             rest["lever_arm_m"] = [0.0, 0.0, 0.0]
             for key in ("accel", "gyro"):
-                specs["imu"][key] |= {"unit": "m/s2" if key == "accel" else "rad/s", "axes": "frd"}
+                taken = {"unit": "auto" if key == "accel" else "rad/s", "axes": "frd"}
+                unsaid = {name: value for name, value in taken.items() if specs["imu"][key][name] == "auto"}
+                specs["imu"][key] |= unsaid
+                left = [f"reader.imu.{key}.{name}={value}" for name, value in unsaid.items() if value != "auto"]
+                told += [f"took {' and '.join(left)}: without fixes nothing tells"] if left else []
         reader = LogReader(specs["imu"], specs["gnss"], drive=name, **rest)
         (drive,) = reader.read(folder)
         notes = (*told, *drive.notes)
@@ -126,13 +131,15 @@ class AutoReader:
         files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
         return [found for path in files if (found := offer(path)) is not None]
 
-    def _chosen(self, offers: list[Offer], kind: str, folder: Path) -> Offer | None:
+    def _chosen(self, offers: list[Offer], kind: str, folder: Path, only: Path | None) -> Offer | None:
         fits = [o for o in offers if getattr(o, kind) is not None]
         if (file := self.known[kind].get("file")) is not None:
             fits = [o for o in fits if o.path.match(str(file))]
         if len(fits) > 1:
             names = ", ".join(o.path.name for o in fits)
             raise InputError(f"{folder}: {names} all hold {kind.upper()}; choose one with reader.{kind}.file")
+        if not fits and kind == "imu" and only is not None:
+            raise InputError(f"{only}: no IMU found in it; give the folder that holds the IMU's file too, or name both")
         if not fits and kind == "imu":
             have = ", ".join(p.name for p in sorted(folder.iterdir())[:8]) or "nothing"
             raise InputError(f"{folder}: no IMU found in {have}; name the reader and its columns (reader=csv …)")
@@ -225,6 +232,16 @@ def text_options(path: Path) -> dict[str, Any]:
     first = text._cells(lines[0].lstrip("#").strip(), separator)
     options["header"] = not any(text._is_number(c, options.get("decimal", ".")) for c in first)
     return options
+
+
+def _whole_bag(path: Path) -> Path:
+    """Of a part of a ROS 2 bag its metadata.yaml; any other file itself."""
+    if path.suffix != ".db3":
+        return path
+    whole = path.parent / "metadata.yaml"
+    if not whole.is_file():
+        raise InputError(f"{path}: its metadata.yaml is missing; ros2 bag reindex {path.parent} writes it again")
+    return whole
 
 
 def _velocities_beside(chosen: Offer, gnss: Mapping[str, Any], files: Iterable[Path]) -> dict[str, Any] | None:

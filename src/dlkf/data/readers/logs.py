@@ -18,6 +18,7 @@ import pandas as pd
 from dlkf.data.discovery.findings import Sure
 from dlkf.data.readers import formats
 from dlkf.data.readers.contract import gnss_frame, imu_frame, reference_frame
+from dlkf.data.readers.formats import rosbag
 from dlkf.data.readers.frames import DriveFrames, Place
 from dlkf.data.readers.mapping import SOURCE, Mapped, Spec, check_keys, respaced, selected
 from dlkf.data.readers.settling import AUTO, open_settings, placeholders, settle
@@ -108,7 +109,7 @@ class LogReader:
         meta |= self.meta
         meta |= dict(zip(("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m"), arm))
         notes = [note for part in mapped.values() for one in (part, *part.parts.values()) for note in one.table.notes]
-        told = (*dict.fromkeys(notes), *found)
+        told = (*dict.fromkeys(notes), *_velocities_left(mapped.get("gnss")), *found)
         return DriveFrames(meta, frames["imu"], frames.get("gnss"), frames.get("reference"), told, mapping)
 
     def _times(self, mapped: Mapping[str, Mapped]) -> tuple[int, dict[str, np.ndarray]]:
@@ -215,6 +216,14 @@ def _joined(whole: Mapped, parts: Mapping[str, Mapped]) -> Mapped:
         brought[key] = replace(part, table=replace(part.table, frame=frame))
     joined = replace(whole, parts=brought)
     return joined if keep.all() else joined.rows(keep)
+
+
+def _velocities_left(gnss: Mapped | None) -> list[str]:
+    """A line where the fixes of a bag have no velocities, and topics beside them do."""
+    if gnss is None or gnss.spec.get("format") != "rosbag" or "velocity" in gnss.parts:
+        return []
+    topics = rosbag.velocities_beside(gnss.table.path)
+    return [f"velocities lie in {' and '.join(topics)}: reader.gnss.velocity.table={topics[0]}"] if topics else []
 
 
 def _gps_time(gnss: Mapped, t: np.ndarray) -> dict[str, float]:

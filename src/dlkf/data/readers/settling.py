@@ -11,12 +11,13 @@ import numpy as np
 import pandas as pd
 
 from dlkf.data.discovery.findings import Finding, Findings, Raw, Sure, discover
-from dlkf.data.discovery.units import speed_factor
+from dlkf.data.discovery.units import accel_units, speed_factor
 from dlkf.data.readers import units
 from dlkf.data.readers.contract import gnss_frame, imu_frame, positions
 from dlkf.data.readers.mapping import Mapped
 from dlkf.data.schema import ACCEL, GYRO, VELOCITY
 from dlkf.errors import InputError
+from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
 AUTO = "auto"
 # settings that may be auto: where they stand in the mapping, and what stands there until they are known
@@ -72,6 +73,8 @@ def settle(
     ``t`` are the stamps of the tables. InputError where an answer is not sure.
     """
     specs = {kind: copy.deepcopy(_plain(part.spec)) for kind, part in mapped.items()}
+    if "gnss" not in mapped and wanted == {"imu.accel.unit"}:
+        return _by_gravity(specs, mapped["imu"], t["imu"], where, arm)
     if "gnss" not in mapped:
         raise InputError(f"{where}: reader.{sorted(wanted)[0]}=auto needs GNSS to compare with; give the value")
     if (count := len(t["gnss"])) < FEWEST_FIXES:
@@ -109,6 +112,19 @@ def settle(
     lever = found.get("lever_arm_m") if "lever_arm_m" in wanted else arm
     x, y, z = (float(a) for a in lever)
     return Settled(specs, (x, y, z), _told(found.found, wanted))
+
+
+def _by_gravity(specs: dict[str, Any], imu: Mapped, t: np.ndarray, where: str, arm: Any) -> Settled:
+    """The accelerometers' unit of a log without fixes."""
+    frame = imu_frame(imu, t)
+    size = float(np.median(np.linalg.norm(frame[list(ACCEL)].to_numpy(), axis=-1)))
+    names = accel_units(size, units.ACCELERATION)
+    found = Findings()
+    value = names[0] if len(names) == 1 else float(f"{G / size:.5g}") if size > 0 else None
+    found.add("imu.accel.unit", value, len(names) > 0, f"median force {size:.4g}")
+    _refuse_doubt(found, {"imu.accel.unit"}, where)
+    _set(specs, PLACES["imu.accel.unit"][0], value)
+    return Settled(specs, arm, found.found)
 
 
 def _raw(imu: pd.DataFrame, gnss: pd.DataFrame, factors: Mapping[str, float | None]) -> Raw:
