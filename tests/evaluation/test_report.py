@@ -19,6 +19,7 @@ from dlkf.evaluation.figures import png
 from dlkf.evaluation.metrics import QUANTITIES
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.results import IMU_AXES, Results, summarise_scores
+from dlkf.evaluation.summary import answer
 from dlkf.evaluation.table import as_csv, as_json, as_markdown, number, ratio_table, slope_table, tables, with_interval
 from dlkf.files import staged
 from dlkf.filters.build import build_filter
@@ -55,6 +56,8 @@ def test_tables_hold_the_summarise_scores(scores):
     assert ratio_table("town", summarise_scores(scores, baseline="none such")) is None
     assert len(r.comparisons) == 2 * 6 * 3 and r.baseline == "mbkf15"
     assert all(c.filter == "ins" and c.against.groups == 6 for c in r.comparisons)
+    assert answer(r).endswith(" (of 6 outages only).")
+    assert answer(replace(r, count={**r.count, "outages": 20})).endswith(" m.")
     few = r.versus("ins", "outages", "end", "horizontal")
     assert with_interval(replace(few, groups=8, ratio=0.7, ratio_low=0.6, ratio_high=0.8)) == "0.70 [0.60–0.80]"
     assert few.a == r.value("ins", "outages", "end", "horizontal")

@@ -9,6 +9,7 @@ from dlkf.evaluation.results import Results
 from dlkf.evaluation.table import DEGREES, number
 
 ASKED_S = ("30", "60", "20", "10", "40", "50")  # times without GNSS, the first that the outages reach is told
+FEW = 20  # outages; the 95 % of fewer is their worst
 END = ("outages", "end", "horizontal")
 METRICS = {
     "outage_end_horizontal_m": (*END, "rms"),
@@ -66,7 +67,12 @@ def answer(result: Results) -> str:
             text += f"; next {order[1]} {', '.join(told[order[1]])} m"
     elif classical is not None:
         text += f"; best classical ({classical}) {', '.join(told[classical])} m"
-    return text + "."
+    return text + ("." if seconds is None else _few(int(result.count.get("outages") or 0)))
+
+
+def _few(outages: int) -> str:
+    """So few have no 95 %: the largest error stands for it."""
+    return "." if outages >= FEW else f" (of {outages} outage{'' if outages == 1 else 's'} only)."
 
 
 def is_classical(name: str) -> bool:
