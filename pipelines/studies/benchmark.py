@@ -169,12 +169,13 @@ def training_epoch(data: DriveDataModule, name: str, steps: int | None = None) -
 
 
 def training(bench: Bench, folder: str, hours: float) -> None:
-    """Epochs of the learned filters, and what the batch costs."""
+    """Epochs of the learned filters in turns, on one thread as a training runs unless told otherwise."""
     data = DriveDataModule([folder], fractions=(1.0, 0.0, 0.0), batch_size=50)
     data.setup()
-    for name in LEARNED:
-        work = f"{name}, {hours:g} h, batch 50, {len(data.train_pieces(1))} steps"
-        bench.time("training epoch", work, lambda name=name: training_epoch(data, name), 2)
+    what = f"{hours:g} h, batch 50, {len(data.train_pieces(1))} steps"
+    with kf_gins.one_thread():
+        calls = {f"{name}, {what}": lambda name=name: training_epoch(data, name) for name in LEARNED}
+        bench.in_turns("training epoch, one thread", calls, 2)
 
 
 def scaling(bench: Bench, dataset: Path, imu: ImuSpec, length_s: float) -> None:

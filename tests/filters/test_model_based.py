@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from dlkf.errors import InputError
 from dlkf.filters.build import MODEL_BASED, build_filter
 from dlkf.filters.integration import integrate
-from dlkf.filters.kalman_update import _updated, kalman_update
+from dlkf.filters.kalman_update import _updated, kalman_prediction, kalman_update
 from dlkf.filters.model_based import Ins, Mbkf, bias_sigma
 from dlkf.filters.tuning import Prior
 from dlkf.navigation.error_model import antenna
@@ -60,6 +60,25 @@ def test_gradient_of_the_update_is_that_of_its_steps():
 
     for got, expected in zip(gradients(kalman_update), gradients(_updated), strict=True):
         assert torch.allclose(got, expected, rtol=1e-9, atol=1e-10)  # rounding: S is conditioned to some 1e3
+
+
+@pytest.mark.parametrize("learned_through", [False, True])
+def test_prediction_of_states_that_walk_is_the_dense_one(learned_through):
+    """Value and gradients, also where Φ has one; P stays symmetric, so only that part of its gradient is told."""
+    g = torch.Generator().manual_seed(2)
+    rand = partial(torch.randn, generator=g, dtype=torch.float64)
+    L, Phi = rand(5, 15, 15), torch.eye(15, dtype=torch.float64).repeat(5, 1, 1)
+    Phi[:, :9] += rand(5, 9, 15)
+    P, Q, of = (L @ L.mT).requires_grad_(), rand(5, 15, 15).requires_grad_(), rand(5, 15, 15)
+    given = [P, Q, Phi.requires_grad_()] if learned_through else [P, Q]
+
+    def gradients(walking):
+        predicted = kalman_prediction(P, Phi, Q, walking=walking)
+        of_P, *others = torch.autograd.grad((predicted * of).sum(), given)
+        return predicted, torch.lerp(of_P, of_P.mT, 0.5), *others
+
+    for got, expected in zip(gradients(True), gradients(False), strict=True):
+        assert torch.allclose(got, expected, rtol=1e-12, atol=1e-12)  # rounding
 
 
 def test_normalised_errors_lie_in_the_chi_square_band():

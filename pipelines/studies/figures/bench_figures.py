@@ -80,7 +80,9 @@ class Bench:
             times.append(self.clock() - start)
         return self.add(Timing(group, work, times, units, at))
 
-    def in_turns(self, group: str, calls: Mapping[str, Callable[[], object]], repeats: int, units: float) -> None:
+    def in_turns(
+        self, group: str, calls: Mapping[str, Callable[[], object]], repeats: int, units: float = 0.0
+    ) -> None:
         """The same of calls that are to be compared, round by round: a machine's speed wanders."""
         times: dict[str, list[float]] = {work: [] for work in calls}
         for k in range(1 + min(repeats, self.most_repeats)):

@@ -1,4 +1,4 @@
-"""The Kalman update, and its gradient in closed form.
+"""The Kalman prediction and update, and their gradients in closed form.
 
     S = H P Hᵀ + R    K = P Hᵀ S⁻¹    dx = K z    P⁺ = A P Aᵀ + K R Kᵀ,  A = I − K H      (paper eqs 4–6, Joseph form)
 
@@ -15,6 +15,22 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from dlkf.navigation.state import PVA
+
+
+def kalman_prediction(
+    P: Float[Tensor, "B n n"], Phi: Float[Tensor, "B n n"], Q: Float[Tensor, "B n n"], *, walking: bool
+) -> Float[Tensor, "B n n"]:
+    """Φ P Φᵀ + Q for symmetric P. ``walking``: below :data:`PVA` Φ is the identity, for what stands there walks.
+
+    Then with D the rows of Φ − I above, and a Φ that is not learned through, fewer products do:
+
+        Φ P Φᵀ = P + D P + P Dᵀ + D P Dᵀ,  ∂P = Φᵀ ∂P⁻ Φ = (I + D)ᵀ ∂P⁻ (I + D)
+    """
+    if walking and torch.is_grad_enabled() and P.requires_grad and not Phi.requires_grad:
+        return _KalmanPrediction.apply(P, Phi, Q)
+    return torch.baddbmm(Q, Phi, torch.bmm(Phi, P).mT)
 
 
 def kalman_update(
@@ -38,6 +54,29 @@ def _updated(P: Tensor, H: Tensor, R: Tensor, z: Tensor) -> tuple[Tensor, Tensor
     return dx, Kt.mT, torch.lerp(P, P.mT, 0.5), S
 
 
+class _KalmanPrediction(torch.autograd.Function):
+    """Names as in :func:`kalman_prediction`."""
+
+    @staticmethod
+    def forward(ctx, P, Phi, Q):
+        D = Phi[:, PVA].clone()
+        D.diagonal(dim1=-2, dim2=-1).sub_(1)
+        ctx.save_for_backward(D)
+        DP = torch.bmm(D, P)
+        out = P + Q
+        out[:, PVA].add_(DP)
+        out[:, :, PVA].add_(DP.mT)
+        out[:, PVA, PVA].add_(torch.bmm(DP, D.mT))
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, g):
+        (D,) = ctx.saved_tensors
+        of_P = torch.baddbmm(g, D.mT, g[:, PVA])
+        return of_P.baddbmm_(of_P[:, :, PVA].clone(), D), None, g
+
+
 class _KalmanUpdate(torch.autograd.Function):
     """Names as in the module's equations."""
 
@@ -59,8 +98,8 @@ class _KalmanUpdate(torch.autograd.Function):
         KGK = torch.bmm(KG, K)
         # Aᵀ G A + Aᵀ g uᵀ H, without A
         inner = torch.baddbmm(KG, KGK, H, alpha=-1)
-        of_P = torch.baddbmm(torch.baddbmm(G, H.mT, inner, alpha=-1), KG.mT, H, alpha=-1)
-        of_P = torch.baddbmm(of_P, g - torch.bmm(H.mT, Kg), torch.bmm(u.mT, H))
+        of_P = torch.baddbmm(G, H.mT, inner, alpha=-1).baddbmm_(KG.mT, H, alpha=-1)
+        of_P.baddbmm_(g - torch.bmm(H.mT, Kg), torch.bmm(u.mT, H))
         of_H = None
         if ctx.needs_input_grad[1]:
             of_H = torch.baddbmm(torch.bmm(u, torch.bmm(g.mT, updated)), KG, updated, alpha=-2)

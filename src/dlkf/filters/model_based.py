@@ -15,7 +15,7 @@ from dlkf.data.drive import Batch
 from dlkf.filters.adaptive import Adaptation, AdaptiveNoise
 from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD, CarConstraints
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
-from dlkf.filters.kalman_update import kalman_update
+from dlkf.filters.kalman_update import kalman_prediction, kalman_update
 from dlkf.filters.sources import Believed, FixMemory, GnssFix, Measurement, Source
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.calibration import ImuError
@@ -147,7 +147,7 @@ class Mbkf:
         Q = memory.windows.noise(Phi, None if process is None else source_scale(process, epoch.start.C_nb))
         if memory.noise is not None:
             Q = torch.where(memory.noise.settled[:, None, None], memory.noise.Q, Q)
-        predicted = torch.baddbmm(Q, Phi, torch.bmm(Phi, memory.P).mT)  # P is symmetric
+        predicted = kalman_prediction(memory.P, Phi, Q, walking=not self.gauss_markov)
         believed = Believed(predicted, memory.structure, memory.noise)
         fix, fix_memory = self.fix.rows(epoch, memory.fix, believed)
         believed = believed._replace(P=fix.P)
