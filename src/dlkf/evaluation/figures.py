@@ -294,13 +294,11 @@ def error_growth(scores: Scores, quantity: str = "horizontal", *, seed: int = 0)
     inside = [n for n in ends if np.isfinite(ends[n]) and ends[n] <= OFF_SCALE * max(min(ends.values()), 1e-9)]
     outside = [f"{n} ({number(ends[n])} {'°' if scale > 1 else QUANTITIES[quantity]})" for n in ends if n not in inside]
     ax.set_ylim(0, 1.05 * max((tops[n] for n in inside), default=1.0))
-    if outside:
-        note = f"off the scale at the end: {', '.join(outside)}"
-        ax.text(0.02, 0.96, note, transform=ax.transAxes, fontsize=8, color="#555555", va="top")
     ax.set_xlim(0, seconds[-1])
     ax.set(xlabel="Time without GNSS [s]", ylabel=LABELS[quantity].replace(" error", " error, RMS"))
     band = "band: 95 % bootstrap interval of the RMS" if banded else f"under {MIN_GROUPS} recordings: no intervals"
-    ax.set_title(f"{len(w.piece)} outages, {band}", fontsize=9, loc="left")
+    note = f"\noff the scale at the end: {', '.join(outside)}" if outside else ""
+    ax.set_title(f"{len(w.piece)} outages, {band}{note}", fontsize=9, loc="left")
     _plain(ax)
     _legend(figure, ax.get_legend_handles_labels()[0])
     return figure
