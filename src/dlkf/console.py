@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -15,6 +16,7 @@ from dlkf.files import whole_file
 
 Counted = Callable[[int, int | None], None]  # steps done, steps in all where that is known
 LOG = "log.txt"  # beside a report
+SAY_EVERY_S = 30.0  # in a file; a terminal has a bar
 
 
 def talking() -> Console:
@@ -34,9 +36,29 @@ def warned(line: str) -> None:
     print(f"dlkf: warning: {line}", file=sys.stderr, flush=True)
 
 
+def _lines(title: str) -> Counted:
+    """A line on stderr every ``SAY_EVERY_S``; nothing of work that is done before."""
+    began = said = time.monotonic()
+
+    def tell(done: int, total: int | None) -> None:
+        nonlocal said
+        now = time.monotonic()
+        if now - said < SAY_EVERY_S:
+            return
+        said = now
+        of = "" if total is None else f"/{total}"
+        left = "" if not (done and total) else f", {(now - began) * (total - done) / done:.0f} s left"
+        print(f"{title}: {done}{of} after {now - began:.0f} s{left}", file=sys.stderr, flush=True)
+
+    return tell
+
+
 @contextmanager
 def counting(title: str) -> Iterator[Counted]:
-    """What moves a bar on stderr, told (steps done, steps in all); it vanishes at the end."""
+    """What moves a bar on stderr, told (steps done, steps in all); it vanishes at the end. In a file: lines."""
+    if not sys.stderr.isatty():
+        yield _lines(title)
+        return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(title, total=None)

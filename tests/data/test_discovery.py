@@ -18,7 +18,7 @@ from dlkf.data.discovery.clock import find_lag, known_offset
 from dlkf.data.discovery.drift import ends_apart, ends_std, find_drifting_pose, middle
 from dlkf.data.discovery.motion import levelled, motion, position_delay
 from dlkf.data.discovery.orientation import find_pose
-from dlkf.data.discovery.units import accel_units, nearest_unit, time_unit
+from dlkf.data.discovery.units import accel_units, nearest_unit, time_unit, unit_left
 from dlkf.data.intake import ingest_drives
 from dlkf.data.plausibility import check_clocks, turned_told
 from dlkf.data.readers import units
@@ -26,6 +26,7 @@ from dlkf.data.readers.auto import AutoReader, _velocities_beside, offer
 from dlkf.data.readers.frames import DriveFrames, Table
 from dlkf.data.readers.logs import LogReader
 from dlkf.data.readers.recognise import gnss_spec, imu_spec
+from dlkf.data.readers.units import rotation
 from dlkf.data.schema import ACCEL, GYRO, VELOCITY
 from dlkf.data.tables import read_drives, read_table
 from dlkf.diagnosis.checkup import checkup
@@ -220,6 +221,34 @@ def test_nothing_is_made_up():
         assert pose is None or pose.explained < 0.8 or pose.yaw_std > math.radians(2)
 
 
+def test_a_straight_minute_is_refused_with_the_limits_that_would_take_it(tmp_path):
+    """Random throttle on a road that bends by ± 1°: the line names the way on, and that way is taken."""
+    t, rng = np.arange(1, 7001) * 0.01, np.random.default_rng(4)
+    pull = np.interp(t, np.arange(0, 80, 4.0), np.tile([1.0, -1.0], 10) * rng.uniform(0.1, 1.5, 20))
+    speed = 14 + np.concatenate(([0.0], np.cumsum(0.5 * (pull[1:] + pull[:-1]) * 0.01)))
+    course, rate = 0.02 * np.sin(0.2 * t), 0.004 * np.cos(0.2 * t)
+    imu = pd.DataFrame({"t": t, "ax": pull, "ay": speed * rate, "az": -9.81, "wx": 0.0, "wy": 0.0, "wz": rate})
+    imu.iloc[:, 1:4] += rng.normal(0, 0.3, (len(t), 3))
+    imu.iloc[:, 4:] += np.radians(rng.normal(0, 0.3, (len(t), 3)))
+    imu.iloc[:, 4:] = np.degrees(imu.iloc[:, 4:])
+    imu.to_csv(tmp_path / "imu.csv", index=False)
+    rows = slice(99, None, 100)
+    way = np.cumsum(speed) * 0.01
+    fix = {"t": t[rows], "lat": 48 + way[rows] / 111_200, "lon": 11.0, "alt": 500.0}
+    fix["ve"], fix["vn"] = (speed[rows] * x[rows] for x in (np.sin(course), np.cos(course)))
+    fixes = pd.DataFrame(fix)
+    fixes[["ve", "vn"]] += rng.normal(0, 0.05, (len(fixes), 2))
+    fixes.to_csv(tmp_path / "gnss.csv", index=False)
+    with pytest.raises(InputError, match=r"or take it as it is: reader\.sure\.") as error:
+        list(AutoReader(gnss={"file": "gnss.csv"}).read(tmp_path))
+    words = str(error.value).partition("take it as it is: ")[2].split()
+    sure = {name.removeprefix("reader.sure."): float(value) for name, _, value in (w.partition("=") for w in words)}
+    (got,) = AutoReader(gnss={"file": "gnss.csv"}, sure=sure).read(tmp_path)
+    assert got.mapping["imu"]["gyro"]["unit"] == "deg/s"
+    off = rotation(got.mapping["imu"]["accel"]["axes"], "")
+    assert math.degrees(Rotation.from_matrix(off).magnitude()) < sure.get("angle_deg", 2.0)
+
+
 def test_units_by_size():
     assert accel_units(9.9, units.ACCELERATION) == ["m/s2"]
     assert accel_units(1.02, units.ACCELERATION) == ["g"]
@@ -227,6 +256,9 @@ def test_units_by_size():
     assert accel_units(3.3, units.ACCELERATION) == []
     assert nearest_unit(0.0176, 1e-4, units.RATE) == "deg/s"
     assert nearest_unit(0.1, 1e-4, units.RATE) is None
+    # half unknown: °/s by elimination, as long as a car would not shake in m°/s or °/h too
+    assert unit_left(0.0204, 0.01, 1.2, units.RATE) == "deg/s"
+    assert unit_left(0.0204, 0.01, 5000.0, units.RATE) is None and unit_left(0.5, 0.05, 1.2, units.RATE) is None
     assert time_unit(1.75e12 + 10.0 * np.arange(9), 0.2, 1e-4) == "ms"
     assert time_unit(10.0 * np.arange(9), 0.21, 2e-4) == "ms"
     assert "leap seconds" in known_offset(18.1) and "3 GPS weeks" in known_offset(3 * 604_800.0)

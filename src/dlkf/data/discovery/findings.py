@@ -14,7 +14,7 @@ from dlkf.data.discovery.clock import Lag, find_lag, known_offset
 from dlkf.data.discovery.drift import ends_std, find_drifting_pose, middle
 from dlkf.data.discovery.motion import MOVING, Floats, Motion, motion, position_delay
 from dlkf.data.discovery.orientation import Pose
-from dlkf.data.discovery.units import accel_units, nearest_unit
+from dlkf.data.discovery.units import accel_units, nearest_unit, unit_left
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 from dlkf.settings import Ranged
 
@@ -32,12 +32,13 @@ class Sure(Ranged, where="reader.sure", least=0, greatest=1e6):
 
 @dataclass(frozen=True)
 class Finding:
-    """A ``setting`` of the reader with its value; ``told`` are the numbers behind it."""
+    """A ``setting`` of the reader with its value; ``told`` are the numbers behind it, ``wide`` would be sure enough."""
 
     setting: str
     value: Any
     sure: bool
     told: str
+    wide: str = ""
 
 
 @dataclass
@@ -48,17 +49,17 @@ class Findings:
     pose: Pose | None = None
     lag: Lag | None = None
 
-    def add(self, setting: str, value: Any, sure: bool, told: str) -> None:
+    def add(self, setting: str, value: Any, sure: bool, told: str, wide: str = "") -> None:
         """One more."""
-        self.found.append(Finding(setting, value, sure, told))
+        self.found.append(Finding(setting, value, sure, told, wide))
 
     def get(self, setting: str) -> Any:
         """The value of a setting, None if it was not looked for or not found."""
         return next((f.value for f in self.found if f.setting == setting), None)
 
-    def doubtful(self) -> Finding | None:
-        """The first that is not sure."""
-        return next((f for f in self.found if not f.sure), None)
+    def doubtful(self) -> list[Finding]:
+        """Those that are not sure."""
+        return [f for f in self.found if not f.sure]
 
 
 @dataclass(frozen=True)
@@ -136,6 +137,11 @@ def _gyro_unit(out: Findings, raw: Raw, pose: Pose | None, known: Mapping[str, f
         return
     told = f"{pose.gyro_scale:.4g} ± {pose.gyro_scale_std:.1g} rad per unit of {np.degrees(pose.turned):.0f}° of turns"
     unit = nearest_unit(pose.gyro_scale, pose.gyro_scale_std, known)
+    if unit is None:
+        shaking = float(np.sqrt(np.mean(np.var(raw.gyro, axis=0))))
+        unit = unit_left(pose.gyro_scale, pose.gyro_scale_std, shaking, known)
+        if unit is not None:
+            told += f"; no other is near, or lets it shake as cars do ({shaking * known[unit]:.2g} rad/s)"
     counted = unit is None and increments and pose.gyro_scale_std < 0.01 * pose.gyro_scale
     out.add("imu.gyro.unit", unit or float(f"{pose.gyro_scale:.6g}"), unit is not None or counted, told)
 
@@ -174,7 +180,8 @@ def _offset(out: Findings, lag: Lag | None, pose: Pose | None, wanted: set[str],
     value = 0.0 if hardly and not pose.drift else pose.lag_s - pose.drift * before_s
     told = f"{sign * pose.lag_s:+.3f} ± {pose.lag_std:.3f} s, at the ends ± {at_ends:.3f}, "
     told += f"delay of the velocities included; {_peak(lag)}"
-    out.add(setting, round(sign * value, 4), certain, told + known_offset(pose.lag_s))
+    wide = f"reader.sure.time_s={math.ceil(250 * at_ends + 1) / 100:g}" if lag.clear else ""
+    out.add(setting, round(sign * value, 4), certain, told + known_offset(pose.lag_s), wide)
 
 
 def _peak(lag: Lag) -> str:
@@ -198,7 +205,8 @@ def _axes(out: Findings, pose: Pose | None, sound: bool, gnss: Motion, sure: Sur
     )
     if not math.isnan(pose.down_apart):
         told += f", gravity and turns {math.degrees(pose.down_apart):.1f}° apart"
-    out.add("imu.axes", value, certain, told)
+    wide = f"reader.sure.angle_deg={math.ceil(2.5 * math.degrees(max(pose.yaw_std, pose.tilt_std)) + 0.1):d}"
+    out.add("imu.axes", value, certain, told, wide if sound else "")
 
 
 def _arm(out: Findings, pose: Pose | None) -> None:

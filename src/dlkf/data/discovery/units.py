@@ -11,6 +11,7 @@ from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
 NEAR = 0.06  # of gravity: a scale error, the road's curves, a cold sensor
 ALIKE = 0.12  # of a unit's size, of what is regressed
+SHAKES = np.radians((0.15, 8.0))  # rad/s RMS of a car on its way, noise and turns included; less wide than °/s in rad/s
 
 
 def accel_units(size: float, known: Mapping[str, float]) -> list[str]:
@@ -21,12 +22,27 @@ def accel_units(size: float, known: Mapping[str, float]) -> list[str]:
 
 def nearest_unit(factor: float, std: float, known: Mapping[str, float]) -> str | None:
     """The unit of about ``factor`` SI, if one is within 12 % and the others beyond four sigma."""
+    if not factor > 0:  # of noise alone
+        return None
     apart = {name: abs(np.log(factor / value)) for name, value in known.items()}
     best = min(apart, key=lambda name: apart[name])
     certain = std / factor < 0.25 * min(
         (abs(np.log(known[best] / value)) for value in known.values() if value != known[best]), default=1.0
     )
     return best if apart[best] < ALIKE and certain else None
+
+
+def unit_left(factor: float, std: float, shaking: float, known: Mapping[str, float]) -> str | None:
+    """The only unit of a gyroscope that is left for a car that hardly turns: within three sigma of ``factor``, the
+    others beyond five, or such that a car on its way would shake by more or less than cars do.
+
+    ``shaking`` is the rates' RMS in the log's unit.
+    """
+    left: dict[float, str] = {}
+    for name, value in known.items():
+        if abs(factor - value) <= 5 * std and SHAKES[0] <= shaking * value <= SHAKES[1]:
+            left.setdefault(value, name)
+    return next((name for value, name in left.items() if len(left) == 1 and abs(factor - value) <= 3 * std), None)
 
 
 def speed_factor(t: Floats, lat_deg: Floats, lon_deg: Floats, speed: Floats) -> tuple[float, float]:

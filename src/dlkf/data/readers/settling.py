@@ -159,16 +159,18 @@ def _speed_unit(found: Findings, gnss: Mapped, t: np.ndarray, where: str) -> Non
 
 
 def _refuse_doubt(found: Findings, wanted: set[str], where: str) -> None:
-    doubt = found.doubtful()
-    if doubt is None:
+    doubts = found.doubtful()
+    if not doubts:
         return
+    doubt = doubts[0]
     setting = doubt.setting.replace("imu.axes", "imu.accel.axes and .gyro.axes")
     best = "" if doubt.value is None else f"; the best guess is {_said(doubt.value)}"
     if doubt.setting.endswith("drift_ppm") and doubt.setting not in wanted:
         raise InputError(f"{where}: the clocks drift apart, {_said(doubt.value)} {doubt.told}; reader.{setting}=auto")
-    raise InputError(
-        f"{where}: not sure of reader.{setting} ({doubt.told}){best}; give it, a longer drive, or a wider reader.sure"
-    )
+    remedy = "give it, or a longer drive, with turns, starts and stops"
+    if all(one.wide for one in doubts):
+        remedy = f"give it, or a longer drive, or take it as it is: {' '.join(one.wide for one in doubts)}"
+    raise InputError(f"{where}: not sure of reader.{setting} ({doubt.told}){best}; {remedy}")
 
 
 def _told(found: list[Finding], wanted: set[str]) -> list[Finding]:
