@@ -3,9 +3,10 @@
     python -m pipelines.studies.car_motion ../shared/data/real/kitti data/lifelike --longest 20
 
 Per dataset, over its longest drives: velocity to the right and down in the axes of the reference, RMS above 2 m/s;
-the least-squares fits v_right = arm · r − K v² r + yaw · v with r the yaw rate and v_down = pitch · v − arm · q + s v f
-with q the pitch rate and f the specific force forward, and what they leave, for all drives together and for each by
-itself; and the RMS of the IMU's six channels in bands of frequency.
+the least-squares fits v_right = yaw · v + arm · r − K v² r with r the yaw rate and v_down = pitch · v − arm · q + s v f
+with q the pitch rate and f the specific force forward, the angles (mounting) of each drive its own, the rest one for
+all; what they leave, and what is left where every drive has a fit of its own; and the RMS of the IMU's six channels in
+bands of frequency.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ SPRINGS_S = 0.3  # the force forward is averaged over so long
 
 
 def across(tables: DriveTables) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the car moves: (N, 3) regressors (r, −v² r, v) and (v, −q, v f), (N, 2) velocity to the right and down."""
+    """Where the car moves: (N, 3) regressors (v, r, −v² r) and (v, −q, v f), (N, 2) velocity to the right and down."""
     reference = tables.reference
     if reference is None or not np.isfinite(reference["yaw"]).any():
         raise InputError(f"drive {tables.row.name}: no attitude in its reference, so no velocity across the car")
@@ -43,12 +44,21 @@ def across(tables: DriveTables) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     moving = (v_b[:, 0] > MOVING) & reference["valid"].astype(bool)
     r, q, f = (np.interp(reference["t"], t, x)[moving] for x in (tables.imu["gyro_z"], tables.imu["gyro_y"], force))
     v = v_b[moving, 0]
-    return np.stack((r, -(v**2) * r, v), -1), np.stack((v, -q, v * f), -1), v_b[moving, 1:]
+    return np.stack((v, r, -(v**2) * r), -1), np.stack((v, -q, v * f), -1), v_b[moving, 1:]
 
 
 def fitted(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, float, float]:
-    """Coefficients for all drives together, RMS of what they leave, and of what coefficients for each drive leave."""
-    x, y = (np.concatenate(columns) for columns in zip(*parts))
+    """Coefficients of all columns but the first, RMS of what is left, and of what each drive's own fit leaves.
+
+    The first column has a coefficient for every drive: what it explains is taken off the others and off y first
+    (Frisch & Waugh, Econometrica 1, 1933). A mounting angle that all drives shared would be mistaken for springs, since
+    f holds g times that angle.
+    """
+    rest = []
+    for x, y in parts:
+        own = x[:, 0] / (x[:, 0] @ x[:, 0])
+        rest.append((x[:, 1:] - np.outer(x[:, 0], own @ x[:, 1:]), y - x[:, 0] * (own @ y)))
+    x, y = (np.concatenate(columns) for columns in zip(*rest))
     fit = np.linalg.lstsq(x, y, rcond=None)[0]
     alone = [b - a @ np.linalg.lstsq(a, b, rcond=None)[0] for a, b in parts]
     return fit, rms(y - x @ fit), rms(np.concatenate(alone))
@@ -78,12 +88,12 @@ def describe(folder: Path, longest: int) -> None:
     fit, left, alone = fitted([(p[0], p[2][:, 0]) for p in parts])
     print(f"\n{folder}: {len(drives)} drives, {sum(len(t.imu['t']) for t in drives)} samples")
     print(f"velocity to the right {rms(v[:, 0]):.3f} m/s, down {rms(v[:, 1]):.3f} m/s")
-    print(f"arm {fit[0]:.2f} m, slip {fit[1]:.4f} s²/m, yaw {np.degrees(fit[2]):.2f}°; ", end="")
+    print(f"arm {fit[0]:.2f} m, slip {fit[1]:.4f} s²/m; ", end="")
     print(f"left {left:.3f} m/s, fitted by drive {alone:.3f} m/s")
     for stiff in (True, False):
         fit, left, alone = fitted([(p[1][:, : 2 if stiff else 3], p[2][:, 1]) for p in parts])
-        print(f"pitch {np.degrees(fit[0]):.2f}°, arm {fit[1]:.2f} m", end=", ")
-        print("no springs; " if stiff else f"springs {fit[2]:.4f} s²·rad/m; ", end="")
+        print(f"arm {fit[0]:.2f} m", end=", ")
+        print("no springs; " if stiff else f"springs {fit[1]:.4f} s²·rad/m; ", end="")
         print(f"left {left:.3f} m/s, fitted by drive {alone:.3f} m/s")
     print(f"| channel | {' | '.join(f'{low:g}–{high:g} Hz' for low, high in BANDS)} |\n|---|{'---|' * len(BANDS)}")
     for column, row in bands(drives[-1].imu).items():

@@ -132,6 +132,19 @@ def test_gusts_push_the_axle_by_the_stated_angle():
     assert np.abs((angle[2:] - angle[:-2]) * 500 - rate[1:-1]).max() < 1e-6
 
 
+def test_swells_pitch_the_body_by_the_stated_angle():
+    """RMS over 40 cars of the pitch of a car with nothing else on a level road; the velocity down is v sin(pitch)."""
+    route, t = circling(15.0, 0.0, 600), np.arange(6001) / 10
+    axle, rng = follow(route, LEVEL, t), np.random.default_rng(0)
+    cars = [draw_car(np.random.default_rng(k), ChassisConfig(pitch_noise=0.004)) for k in range(40)]
+    truths = [mounted(rng, car, route, axle) for car in cars]
+    pitch = [truth.rpy[200:, 1] for truth in truths]
+    assert np.std(pitch) == pytest.approx(0.004, rel=0.1)
+    assert np.abs(body_velocity(truths[0])[200:, 2] - 15.0 * np.sin(pitch[0])).max() < 1e-4  # m/s
+    per_second = np.abs(np.diff(pitch, axis=1)).max() * 10
+    assert per_second < 3 * 0.004 * 2 * np.pi * 15.0 / 50  # no wave is shorter than 50 m: some σ times its rate
+
+
 def test_lateral_velocity_at_the_imu_is_arm_times_yaw_rate():
     route = circling(15.0, 0.3, 60)
     rng = np.random.default_rng(0)

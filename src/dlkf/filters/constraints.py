@@ -30,7 +30,7 @@ from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, VELOCITY, ErrorStates
 
 STRUCTURE_STD = (0.05, 0.05, 1.5, 0.01, 0.005)  # rad, rad, m, s²/m, s²·rad/m: what is known of a car before it moves
 STRUCTURE_WALK_STD = (2e-5, 2e-5, 1e-4, 1e-6, 1e-6)  # per √s
-SPRINGS_S = 0.3  # the springs follow the force so slowly: it is averaged over so long
+SPRINGS_S = 0.3  # the springs follow the force so slowly: it is averaged over so long, at most an epoch
 SLOWEST = 0.5  # m/s: below, course and yaw rate say nothing of the car's structure
 
 

@@ -87,7 +87,8 @@ def load_filter(folder: Path | str) -> Learned:
             have = tuple(weights[name].shape) if name in weights else "nothing"
             want = tuple(expected[name].shape) if name in expected else "nothing"
             raise InputError(
-                f"{folder / WEIGHTS} does not fit {CONFIG}: {name} is {have} in the file, {want} in the config"
+                f"{folder / WEIGHTS} does not fit {CONFIG}: {name} is {have} in the file, {want} in the config; "
+                "weights of other settings, or of another version of dlkf: train them with this one"
             )
     model.load_state_dict(weights)
     model.card = read_card(folder)
