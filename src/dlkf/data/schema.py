@@ -93,7 +93,10 @@ def write_parquet(path: Path, table: pa.Table) -> None:
     floats = [field.name for field in table.schema if pa.types.is_floating(field.type)]
     others = [name for name in table.column_names if name not in floats]
     with whole_file(path) as beside:
-        pq.write_table(table, beside, compression="zstd", use_dictionary=others, use_byte_stream_split=floats)
+        pq.write_table(
+            table, beside, compression="zstd",
+            use_dictionary=others, use_byte_stream_split=floats,  # pyright: ignore[reportArgumentType]  names do as well
+        )  # fmt: skip
 
 
 def write_drive(

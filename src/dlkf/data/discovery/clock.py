@@ -9,6 +9,7 @@ plus −n ln(1 − |ρ|²) of the other is the gain in log-likelihood over no co
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import fft
@@ -170,7 +171,8 @@ def _scores(
     count = np.round(n)
     n = np.maximum(n, 1.0)
 
-    def correlation(ours: np.ndarray, theirs: np.ndarray) -> Complex:
+    def correlation(ours: np.ndarray, theirs: np.ndarray) -> Any:
+        """Real for real signals."""
         A, B = turned(ours), turned(theirs)
         W_, M_ = (turned(weight + 0j), turned(there + 0j)) if len(A) == size else (W, M)
         mean_a, mean_b = np.conj(against(A, M_)) / n, against(W_, B) / n
