@@ -87,7 +87,7 @@ def comparison_page(reports: Sequence[Report]) -> str:
     page.heading("Horizontal error against the time without GNSS", "Solid: median; dotted: 95 % of the outages.")
     page.figure("growth", growth(reports))
     page.heading("In what they differ")
-    page.table(*differences(reports), titles=whole)
+    page.table(*differences(reports), words=True, titles=whole)
     page.heading("Where they lie")
     page.table(["Run", "Folder"], list(whole.items()), words=True)
     return page.html()
