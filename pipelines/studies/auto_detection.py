@@ -196,8 +196,8 @@ def leaning(title: str, all_of_them: list[Outcome]) -> str:
     known = [o for o in all_of_them if o.motion_s >= MOTION_S and o.turn is not None and o.lean is not None]
     if len(known) < 3:
         return ""
-    lean = Rotation.from_rotvec([o.lean for o in known])
-    apart = np.degrees((Rotation.from_rotvec([o.turn for o in known]) * lean.inv()).magnitude())
+    lean = Rotation.from_rotvec(np.array([o.lean for o in known]))
+    apart = np.degrees((Rotation.from_rotvec(np.array([o.turn for o in known])) * lean.inv()).magnitude())
     roll, pitch, _ = np.degrees(lean.mean().as_rotvec())
     return (
         f"{title}: the reference itself leans by {np.degrees(lean.magnitude()).max():.2f}° at most in the mean of a "

@@ -169,8 +169,8 @@ def growth(scores: Scores) -> go.Figure:
             figure.add_trace(line(seconds, y, name, shade_of, legend=row == 1, width=2), row, 1)
     count = (w.length[:, None] * scores.epoch_s >= seconds[None]).sum(0)
     figure.add_trace(go.Bar(x=seconds, y=count, marker_color=SHADE, name="outages", showlegend=False), 3, 1)
-    figure.update_yaxes(type="log", nticks=8, row=1, col=1)
-    figure.update_yaxes(type="log", nticks=8, row=2, col=1)
+    figure.update_yaxes(type="log", nticks=6, row=1, col=1)
+    figure.update_yaxes(type="log", nticks=6, row=2, col=1)
     figure.update_xaxes(title_text="Time without GNSS [s]", row=3, col=1)
     return figure
 

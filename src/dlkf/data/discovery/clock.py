@@ -130,7 +130,7 @@ def _imu_signals(t: Floats, accel: Floats, gyro: Floats, width_s: float) -> tupl
     e2 = np.cross(-up, e1)
     step = np.diff(t, prepend=t[0])
     step = np.where(step > 1.0, 0.0, step)
-    gained = np.stack([np.cumsum(x * step) for x in (1.0, gyro @ -up, accel @ e1, accel @ e2)])
+    gained = np.stack([np.cumsum(x * step) for x in (1.0, gyro @ -up, accel @ e1, accel @ e2)], dtype=float)
     grid = np.arange(t[0] + width_s / 2, t[-1] - width_s / 2, STEP_S)
     if len(grid) < 2:
         grid = np.array([t[0], t[0] + STEP_S])
@@ -142,7 +142,8 @@ def _imu_signals(t: Floats, accel: Floats, gyro: Floats, width_s: float) -> tupl
         return gained[:, i] + share * (gained[:, i + 1] - gained[:, i])
 
     covered, yaw, forward, right = (reached(grid + width_s / 2) - reached(grid - width_s / 2)) / width_s
-    return yaw, forward + 1j * right, (covered > 0.9).astype(float), float(grid[0])
+    force: Complex = forward + 1j * right
+    return yaw, force, (covered > 0.9).astype(float), float(grid[0])
 
 
 def _scores(
