@@ -135,7 +135,7 @@ def _imu_signals(t: Floats, accel: Floats, gyro: Floats, width_s: float) -> tupl
     if len(grid) < 2:
         grid = np.array([t[0], t[0] + STEP_S])
 
-    def reached(at: Floats) -> Floats:
+    def reached(at: Floats) -> np.ndarray:
         """The four integrals at given times, linear between samples."""
         i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
         share = np.clip((at - t[i]) / (t[i + 1] - t[i]), 0.0, 1.0)
