@@ -117,7 +117,16 @@ def test_the_same_drive(writer, drive, tmp_path):
         np.testing.assert_allclose(gnss.std_vel_e, 0.05, rtol=fine.spread)
     assert set(gnss.quality) == {4}
     assert ingest_drives([got], tmp_path / "out") == 1
-    assert "IMU 100 Hz" in drive_line(got) and "RTK fixed 100 %" in drive_line(got)
+    assert "IMU 100 Hz" in drive_line(got) and "RTK fixed 100 %" in drive_line(got) and "stands" not in drive_line(got)
+
+
+def test_standstills_are_told(drive):
+    """Three seconds at the beginning and five in the middle; a second of creeping does not count."""
+    gnss = drive["gnss"].copy()
+    for first, last in ((0, 3), (8, 13), (16, 17)):
+        gnss.loc[first:last, ["vel_n", "vel_e"]] = 0.05
+    frames = DriveFrames({"drive": "a", "group": "a"}, drive["imu"], gnss)
+    assert drive_line(frames).endswith("stands 2 times for 8 s in all")
 
 
 def _pykitti():

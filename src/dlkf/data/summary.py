@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from dlkf.data.discovery.motion import RESTING
 from dlkf.data.readers.frames import DriveFrames
 
+STANDS_S = 2.0  # less is a creeping car
 QUALITIES = {0: "no fix", 1: "single", 2: "DGNSS", 3: "PPS", 4: "RTK fixed", 5: "RTK float", 9: "SBAS"}
 
 
@@ -25,10 +27,24 @@ def drive_line(drive: DriveFrames) -> str:
     told.append(f"GNSS {rate}, {len(fixed)} fixes ({', '.join(named)})")
     if len(gaps):
         told.append(f"largest gap {_short(gaps.max())}")
+    if count_and_time := _standstills(drive):
+        told.append("stands {} for {:.0f} s in all".format(*count_and_time))
     told.insert(1, f"{_way(drive) / 1000:.2f} km")
     if drive.reference is not None:
         told.append(f"reference {100 * float(drive.reference['valid'].mean()):.3g} % valid")
     return ", ".join(told)
+
+
+def _standstills(drive: DriveFrames) -> tuple[str, float] | None:
+    """How often and how long the fixes' speed rests for ``STANDS_S``; None where it never does, or is not known."""
+    gnss = drive.gnss
+    assert gnss is not None
+    t, speed = gnss["t"].to_numpy(), np.hypot(gnss["vel_n"].to_numpy(), gnss["vel_e"].to_numpy())
+    resting = speed < RESTING
+    edges = np.flatnonzero(np.diff(resting, prepend=False, append=False)).reshape(-1, 2)
+    spans = [float(t[last - 1] - t[first]) for first, last in edges]
+    long = [span for span in spans if span >= STANDS_S]
+    return ("once" if len(long) == 1 else f"{len(long)} times", sum(long)) if long else None
 
 
 def _way(drive: DriveFrames) -> float:
