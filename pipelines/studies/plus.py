@@ -1,17 +1,17 @@
 """``plus`` against classical filters with one set of factors, each tuned on the drives that ``plus`` was trained on.
 
     python -m pipelines.studies.plus --train data/fleet data/wide --test data/val_fleet data/val_city \\
-        --real data/rtkx --semi data/kitti_consumer --out outputs/plus
+        --real data/rtkx data/kitti_consumer --out outputs/plus
 
 Pieces of 60 s with GNSS, an outage, and 5 s after it, from the truth plus an error of 0.1 m, 0.1 m/s, 1° and 2° (1σ);
-simulated and semi-real pieces end to end, real ones every 10 s. Nobody is told the IMU: the classical filters start
+simulated pieces end to end, those of real motion every 10 s. Nobody is told the IMU: the classical filters start
 from an automotive MEMS and have factors tuned by the geometric mean on pieces of the training drives, which are kept
 in <out>/factors.yaml: the best of the searches that begin with no factors and with those of the filters before it;
 one of them a second time, by gradient instead of search (:mod:`dlkf.tuning.descent`).
 Beside them stands ``mbkf33_car`` that is told the preset of the drive's IMU, where it has one, and has its tuned
 factors but those of the IMU: no rival, but what such knowledge is worth. Prints, and writes into <out>, Markdown tables
 of the horizontal error at the end of the outages: all filters, then trainings from other seeds (``--model`` takes
-several), then ``plus`` with parts of its network switched off.
+several), then ``plus`` with parts of its network switched off; and a figure of its ratios to the best of the others.
 """
 
 from __future__ import annotations
@@ -26,14 +26,18 @@ import numpy as np
 import pandas as pd
 import torch
 import yaml
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
+from dlkf.colours import COLOURS
 from dlkf.config import config_dir
 from dlkf.data.drive import Batch
 from dlkf.data.masks import withhold, within
 from dlkf.data.segments import StartLaw, cut_pieces, make_batch
 from dlkf.data.stack import DriveStack
 from dlkf.data.store import load_dataset
-from dlkf.evaluation.bootstrap import compare
+from dlkf.evaluation.bootstrap import Comparison, compare
+from dlkf.evaluation.figures import png
 from dlkf.evaluation.metrics import mean_error
 from dlkf.filters.build import build_causal, build_filter
 from dlkf.filters.integration import Estimator
@@ -52,6 +56,7 @@ START = StartLaw(position_m=0.1, velocity_mps=0.1, roll_pitch_deg=1.0, yaw_deg=2
 BEFORE_S, AFTER_S, REAL_STRIDE_S = 60.0, 5.0, 10.0
 PARTS = tuple(("across", "fix", "process", "offset", "speed")[:k] for k in range(6))
 TOLD, OF_IMU = "mbkf33_car", ("accel_noise", "gyro_noise", "accel_walk", "gyro_walk")
+STATISTICS = ("rms", "geomean")
 SEED = 7
 
 
@@ -192,13 +197,42 @@ def _both(errors: np.ndarray) -> str:
 
 
 def _ratios(row: Row, filters: Sequence[str], model: str) -> list[str]:
-    best = min((f for f in filters if f != model), key=lambda f: mean_error(row.errors[f], "log"))
     cells = []
-    for statistic in ("rms", "geomean"):
-        c = compare(row.errors[model], row.errors[best], statistic=statistic, groups=row.groups)
+    for c in against_best(row, filters, model):
         band = "" if np.isnan(c.ratio_low) else f" [{c.ratio_low:.2f}, {c.ratio_high:.2f}]"
         cells.append(f"{c.ratio:.2f}{band}")
     return cells
+
+
+def against_best(row: Row, filters: Sequence[str], model: str) -> list[Comparison]:
+    """Of the RMS and of the geometric mean, to the best other filter by geometric mean."""
+    best = min((f for f in filters if f != model), key=lambda f: mean_error(row.errors[f], "log"))
+    return [compare(row.errors[model], row.errors[best], statistic=s, groups=row.groups) for s in STATISTICS]
+
+
+def forest(rows: Sequence[Row], filters: Sequence[str], model: str) -> Figure:
+    """Ratios to the best other filter with their 95 % intervals, a line per dataset and outage."""
+    figure = Figure(figsize=(7.2, 1.2 + 0.24 * len(rows)), layout="constrained")
+    ax = figure.add_subplot()
+    for k, (statistic, label, colour) in enumerate(zip(STATISTICS, ("RMS", "geometric mean"), COLOURS)):
+        c = [against_best(row, filters, model)[k] for row in rows]
+        ratio = np.array([x.ratio for x in c])
+        bounds = np.array([(x.ratio_low, x.ratio_high) for x in c])
+        y = np.arange(len(rows)) + (0.14 if statistic == "rms" else -0.14)
+        ax.hlines(y, bounds[:, 0], bounds[:, 1], color=colour, lw=1.2)
+        ax.plot(ratio, y, "o", ms=4, color=colour, label=label)
+    ax.axvline(1.0, color="black", lw=0.8)
+    ax.set_yticks(range(len(rows)), [f"{row.name}, {row.outage_s:g} s" for row in rows])
+    ax.invert_yaxis()
+    ax.set_xscale("log")
+    ticks = (0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)
+    ax.set_xticks(ticks, [f"{t:g}" for t in ticks], minor=False)
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.set_xlabel(f"error of {model} / error of the best tuned classical filter of that line")
+    ax.grid(axis="x", color="#EEEEEE")
+    ax.spines[["top", "right"]].set_visible(False)
+    figure.legend(loc="outside upper right", ncols=2, frameon=False)
+    return figure
 
 
 def with_parts(model: PlusFilter, parts: Sequence[str]) -> PlusFilter:
@@ -214,8 +248,7 @@ def main() -> None:
     parser.add_argument("--model", nargs="+", default=["plus"], help="weights: plus, or folders; the first is plus")
     parser.add_argument("--train", nargs="+", required=True, help="datasets that the classical filters are tuned on")
     parser.add_argument("--test", nargs="*", default=[], help="simulated datasets")
-    parser.add_argument("--semi", nargs="*", default=[], help="datasets of real motion with injected errors")
-    parser.add_argument("--real", nargs="*", default=[], help="real datasets, cut every 10 s")
+    parser.add_argument("--real", nargs="*", default=[], help="datasets of real motion, cut every 10 s")
     parser.add_argument("--outages", nargs="+", type=float, default=[30.0, 60.0])
     parser.add_argument("--ablation", action="store_true", help="also plus with parts switched off")
     parser.add_argument("--out", type=Path, default=Path("outputs/plus"))
@@ -229,7 +262,7 @@ def main() -> None:
     shown = [*CLASSICAL, "plus"]
     factors = yaml.safe_load((args.out / "factors.yaml").read_text())[TOLD]
     rows, ablated = [], []
-    for folder in (*args.test, *args.semi, *args.real):
+    for folder in (*args.test, *args.real):
         stack = load([folder])
         groups = {d.name: d.group for d in stack}
         table = pd.read_parquet(Path(folder) / "drives.parquet", columns=["drive", "imu"])
@@ -250,6 +283,7 @@ def main() -> None:
         names = list(ablated[0].errors)
         lines += ["", *markdown(ablated, names, names[-1])]
     (args.out / "table.md").write_text("\n".join(lines) + "\n")
+    (args.out / "ratios.png").write_bytes(png(forest(rows, shown, "plus")))
     print("\n".join(lines))
 
 

@@ -17,6 +17,7 @@ def test_it_scores_and_writes_its_tables(simulated, tmp_path, monkeypatch, capsy
     words += ["--model", "plus", "plus"]
     monkeypatch.setattr(sys, "argv", ["plus", *words])
     plus.main()
+    assert (out / "ratios.png").read_bytes()[:4] == b"\x89PNG"
     table = (out / "table.md").read_text()
     lines = [line for line in table.splitlines() if line.startswith(f"| {simulated.name} | 20 |")]
     assert len(lines) == 3 and table in capsys.readouterr().out + "\n"
