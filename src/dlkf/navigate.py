@@ -1,4 +1,4 @@
-"""Navigate whole drives: ``python -m dlkf.navigate model=mbkf15 dataset=data/town out=outputs/town``.
+"""Navigate whole drives: ``python -m dlkf.navigate dataset=data/town out=outputs/town``.
 
 From IMU and GNSS alone; ``reference/`` is never opened. Writes ``out/drive=<id>/solution.parquet`` for every
 drive, ``out/report.html`` and ``log.txt``, or nothing (columns: dlkf.running.solution).

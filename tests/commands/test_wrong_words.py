@@ -25,7 +25,6 @@ from tests.commands.refusals import DRIVE, FAST, SCORED, SOLVED, TRAINED, is_ref
         (["model=mbkf15", "dataset=town", "drives=[car-00,car-00]"], ("car-00", "twice")),
         (["model=mbkf15", "dataset"], ("dataset",)),
         (["model=mbkf15"], ("dataset is missing",)),
-        (["dataset=town"], ("model is missing",)),
     ],
     ids=lambda x: " ".join(x),
 )
@@ -37,6 +36,7 @@ def test_wrong_arguments(command, arguments, said, copy, call, tmp_path):
 @pytest.mark.parametrize(
     ("command", "arguments", "said"),
     [
+        ("evaluate", ["dataset=town", "out=made"], "model is missing"),
         ("simulate", ["dataset=mars"], "simulated/mars"),
         ("simulate", ["dataset.hours=-1", "out=made"], "hours"),
         ("simulate", ["dataset.vehicle.colour=red", "out=made"], "dataset.vehicle.colour"),

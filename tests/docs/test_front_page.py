@@ -72,6 +72,7 @@ def test_your_own_drives(own_logs: Path, run: Run) -> None:
     assert pd.read_parquet(town / "drives.parquet")["lever_arm_z_m"].tolist() == [-1.2, -1.2]
     solved = pd.read_parquet(own_logs / "outputs" / "town" / "drive=monday-1" / "solution.parquet")
     assert solved["gnss_used"].any()
+    assert "with plus." in (own_logs / "outputs" / "town" / "log.txt").read_text()  # the default
 
 
 def test_simulated_drives(desk: Path, run: Run, monkeypatch: pytest.MonkeyPatch, capfd) -> None:
