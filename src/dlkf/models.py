@@ -57,6 +57,11 @@ def resolve_model(
     )
 
 
+def is_told_noise(spec: str) -> bool:
+    """Whether a model's noise is told to it by ``imu`` and ``tuning``; a network has its own."""
+    return is_filter(spec) or OWN_SOURCE.fullmatch(spec) is not None
+
+
 def model_folder(spec: str) -> Path:
     """Where weights and config of ``plus`` or of a model's folder lie; InputError where they are not or do not load."""
     folder = shipped_folder(spec) or Path(spec).expanduser()

@@ -11,7 +11,7 @@ from functools import partial
 
 import torch
 
-from dlkf.command import command
+from dlkf.command import command, typed
 from dlkf.command.settings import NavigateSettings
 from dlkf.console import LOG, counting
 from dlkf.data.drive import Drive
@@ -22,7 +22,7 @@ from dlkf.files import absolute, name_of, staged, vacant
 from dlkf.filters.card import strangers
 from dlkf.filters.saved import grid_of
 from dlkf.filters.smoother import smoothed
-from dlkf.models import resolve_model, short_name
+from dlkf.models import is_told_noise, resolve_model, short_name
 from dlkf.navigation.imu_errors import AUTO
 from dlkf.onboard.compiled_filter import compiled_filter
 from dlkf.parallel import check, each
@@ -52,6 +52,8 @@ def main(told: NavigateSettings) -> None:
     grid = grid_of([model], told.rate_hz, told.epoch_s, usual)
     for line in strangers({name: model}, told.dataset, spacings, spec.name, grid["rate_hz"]):
         print(line)
+    if spec.name != AUTO and not is_told_noise(told.model) and (unused := typed("imu", "tuning")):
+        print(f"{name} is told no noise: {' '.join(unused)} changes nothing; a Kalman filter would take it")
     skipped: dict[str, str] | None = {} if told.skip_unaligned else None
     if told.streaming and (ahead := "smoother" if told.smoother else "imu=auto" if spec.name == AUTO else ""):
         raise InputError(f"{ahead} looks ahead, a stream cannot: give {ahead} or streaming, not both")

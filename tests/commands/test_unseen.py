@@ -52,6 +52,12 @@ def test_navigate_and_evaluate_say_so_of_a_file_and_of_a_rate(call, town, tmp_pa
     for k, (data, more, expected) in enumerate(((town, (), False), (slow, (), True), (town, ("rate_hz=10",), True))):
         done = call("navigate", "model=plus", f"dataset={data}", f"out=navigated{k}", drive, *more)
         assert done.code == 0 and (said in done.out) == expected, done
+        assert "told no noise" not in done.out
+    noise = ("imu=consumer", "tuning.gyro_noise=2.5")
+    done = call("navigate", f"dataset={town}", "out=untold", drive, *noise)
+    assert done.code == 0 and f"plus is told no noise: {' '.join(noise)} changes nothing" in done.out, done
+    done = call("navigate", "model=mbkf15", f"dataset={town}", "out=told", drive, *noise)
+    assert done.code == 0 and "told no noise" not in done.out, done
     done = call("evaluate", "model=[mbkf15,plus]", f"dataset={slow}", "out=scored", drive, *SCORING)
     assert done.code == 0 and said in " ".join(done.out.split()), done
 

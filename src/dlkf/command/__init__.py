@@ -91,6 +91,12 @@ def command(
     return decorate
 
 
+def typed(*keys: str) -> list[str]:
+    """What was typed for these keys or for parts of them: ``imu=consumer``, ``imu.gyro.noise_density=1e-4``."""
+    words = HydraConfig.get().overrides.task
+    return [word for word in words if word.partition("=")[0].lstrip("+").split(".")[0] in keys]
+
+
 def same_command(name: str) -> list[str]:
     """The command line that composes once more what Hydra composed here, for a point of a sweep too."""
     config = HydraConfig.get()

@@ -277,7 +277,8 @@ def untold(
     InputError for a filter that is told nothing anyway, or told more than noise.
     """
     if not is_filter(name) or name == "ins" or "prior" in name.split("_"):
-        raise InputError(f"imu=auto finds the noise of a Kalman filter, model={name} takes none; leave imu out")
+        what = "imu=auto finds the noise of a Kalman filter"
+        raise InputError(f"{what}, model={name} takes none; leave imu out, or take model=mbkf21_nhc")
     found = find_noise(Evidence.of(drives, align=align), name, imu, tuning, **given)
     placed = [found.placing.of_drive(d) for d in drives]
     return build_causal(name, found.imu, "imu=auto does not", tuning=found.tuning), placed, found
