@@ -323,6 +323,19 @@ def test_rows_of_imu_and_fixes_in_one_table():
     assert imu_spec(both)["time"] == gnss_spec(both)["time"] == {"column": "t", "unit": "s"}
 
 
+def test_stamps_under_a_name_of_their_own():
+    """The only column that rises all the way; a count of the rows tells no time, and of two clocks none is chosen."""
+    rows = [f"{4711000 + 10 * k},{k},{20 * k},0,0,-1,{k % 3},0,0\n" for k in range(40)]
+    table = _table("Zeit [ms],Nr,Odo,accX,accY,accZ,gyrX,gyrY,gyrZ\n" + "".join(rows))
+
+    def without(*names: str) -> Table:
+        return Table(table.frame.drop(columns=list(names)), table.path)
+
+    spec = imu_spec(without("Odo"))
+    assert spec is not None and spec["time"] == {"column": "Zeit [ms]", "unit": "ms"}
+    assert imu_spec(without("Odo", "Zeit [ms]")) is None is imu_spec(table)
+
+
 def test_a_log_at_rest_in_units_of_its_own(tmp_path):
     """Gravity tells the accelerometers' unit; what nothing tells is said, and what is given is kept."""
     rest = np.random.default_rng(1).normal(0, 0.002, (1000, 7)) + [0, 0, 0, -1.0, 0, 0, 0]

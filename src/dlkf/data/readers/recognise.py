@@ -141,7 +141,7 @@ def _numeric(frame: pd.DataFrame) -> pd.DataFrame:
 def _time(table: Table, rows: pd.Series, slowest: float, fastest: float) -> Spec | None:
     frame = table.frame[rows]
     names = [str(c) for c in frame.columns]
-    column = _named(names, TIME)
+    column = _named(names, TIME) or _only_rising(frame)
     week = _named(names, r"(gps )?(week|wn|week ?(number|no))")
     if column is None or frame.empty:
         return None
@@ -161,6 +161,15 @@ def _time(table: Table, rows: pd.Series, slowest: float, fastest: float) -> Spec
     elif float(np.nanmedian(values)) / ticks > 1.2e9:
         spec["clock"] = "unix"
     return spec
+
+
+def _only_rising(frame: pd.DataFrame) -> str | None:
+    """The column that rises all the way, whatever its name, where there is one and it does not merely count rows."""
+    numbers = _numeric(frame)
+    steps = {str(name): np.diff(numbers[name].to_numpy(float)) for name in numbers.columns}
+    rising = [name for name, step in steps.items() if len(step) > 1 and np.all(step >= 0) and np.median(step) > 0]
+    clocks = [name for name in rising if not np.all(steps[name] == 1)]
+    return clocks[0] if len(clocks) == 1 else None
 
 
 def _angle_unit(frame: pd.DataFrame, found: dict[str, str | None]) -> str:
