@@ -23,7 +23,7 @@ def main(told: CompareSettings) -> None:
     """Read, write, print."""
     runs, out = told.runs, told.out
     vacant(out, overwrite=told.overwrite)
-    write_comparison(out, read_reports([runs] if isinstance(runs, str) else runs))
+    write_comparison(out, read_reports([str(run) for run in (runs if isinstance(runs, (list, tuple)) else [runs])]))
     print(f"Report: {out}/compare.html")
 
 

@@ -15,7 +15,7 @@ from dlkf.data.store import dataset_digest, drive_rows
 from dlkf.evaluation.outages import check_outages
 from dlkf.evaluation.shares import Work, evaluate_shares
 from dlkf.evaluation.study import results_of
-from dlkf.evaluation.summary import answer, metrics_of
+from dlkf.evaluation.summary import FEW, answer, metrics_of
 from dlkf.evaluation.table import all_tables, as_markdown, as_rich
 from dlkf.files import absolute, name_of, vacant
 from dlkf.filters.build import build_filter
@@ -81,6 +81,8 @@ def main(told: EvaluateSettings) -> None:
         console.print(as_rich(table))
     for result in made:
         console.print(f"\n[bold]{answer(result)}[/bold]", highlight=False)
+    if done.mode == "pieces" and any(0 < int(r.count.get("outages") or 0) < FEW for r in made):
+        console.print("Few outages; mode=drives has them over all of every drive, about twice as many.", style="yellow")
     keep_said(console, told.out)
     kept = ""
     if told.tracking.log:

@@ -48,6 +48,12 @@ def check(where: Any, *places: object) -> None:
         return
     if not isinstance(where, str) or where in ("", DASK):
         raise InputError(f"parallel={where}: must be a number of processes, or {DASK}host:port of a scheduler")
+    if not where.startswith(DASK):
+        import joblib  # a tenth of a second that other commands do not wait for
+
+        if where not in joblib.parallel.BACKENDS:
+            known = f"a whole number, {DASK}host:port, or register one with joblib"
+            raise InputError(f"parallel={where}: no backend of joblib has that name; give {known}")
 
 
 def _in_threads(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
@@ -65,7 +71,7 @@ def _in_threads(function: Callable[[Item], Result], items: Iterable[Item], threa
 @contextmanager
 def _engine(where: int | str) -> Iterator[Any]:
     """What takes calls as joblib's ``delayed`` makes them (function, arguments, keywords) and yields results."""
-    import joblib  # a tenth of a second that other commands do not wait for
+    import joblib
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     check(where)
@@ -77,9 +83,6 @@ def _engine(where: int | str) -> Iterator[Any]:
             with _client(where) as backend:
                 yield joblib.Parallel(n_jobs=-1, backend=backend, **options)
         else:
-            if where not in joblib.parallel.BACKENDS:
-                known = f"a whole number, {DASK}host:port, or register one with joblib"
-                raise InputError(f"parallel={where}: no backend of joblib has that name; give {known}")
             yield joblib.Parallel(n_jobs=-1, backend=where, **options)
     except TerminatedWorkerError:
         raise InputError(

@@ -15,9 +15,10 @@ from hydra.core.hydra_config import HydraConfig
 from dlkf.classes import made
 from dlkf.command import command, same_command
 from dlkf.command.composing import configuration_hash
-from dlkf.command.simulated import make_missing
+from dlkf.command.simulated import HOUR_SEED, make_missing
 from dlkf.console import keep_said, talking
 from dlkf.data.store import dataset_digest
+from dlkf.evaluation.protocol import fitting
 from dlkf.evaluation.summary import answer
 from dlkf.evaluation.table import all_tables, as_rich
 from dlkf.settings import settings_from
@@ -39,14 +40,17 @@ def main(config: dict[str, Any]) -> None:
     told = settings_from(TrainSettings, config, "")
     tracking, settings, data = told.tracking, told.study, made(told.data, "data")
     check_store(uri := tracking_uri(tracking.uri))
-    check_registration(tracking.register, tracking.alias)
+    check_registration(tracking.register, tracking.alias, ("tracking.register", "tracking.alias"))
     folder, state = run_folder(told.name, configuration_hash(config), resume=told.resume)
     if is_further():
         train_along(settings, data, folder)
         return
     check_fit(settings.fit)
-    make_missing(data.datasets, told.scoring.hour, console)
+    if told.scoring.outage is not None:
+        fitting(told.scoring.outage, data.eval_length_s, "data.eval_length_s", "scoring.outage")
+    make_missing(data.datasets, console)
     data.setup()
+    make_missing([told.scoring.hour] if told.scoring.hour else [], console, HOUR_SEED)
     console.print(data.describe())
     for line in left_out(settings, data):
         console.print(f"left out: {line}", style="yellow", highlight=False)

@@ -40,6 +40,9 @@ def main(told: TuneSettings) -> None:
             progress=progress,
         )
     dataset, out = drives[0].dataset, Path(told.out)
+    parts = {}
+    if told.objective != LIKELIHOOD:
+        parts = sides(drives, told.split, told.fractions, told.split_seed, protocol.length_s)
     with start_run(uri, "tune", f"{model} {dataset}") as run:
         run.log_config(asdict(told))
         run.log_dataset(told.dataset, dataset_digest(told.dataset), "tuning")
@@ -49,7 +52,6 @@ def main(told: TuneSettings) -> None:
             files = write_noise(out, found, table)
             run.log_metrics({f"found/{k}": v for k, v in found.described().items()})
         else:
-            parts = sides(drives, told.split, told.fractions, told.split_seed, protocol.length_s)
             options = {"objective": told.objective, "rounds": told.rounds, "pieces": told.pieces}
             result = search(model, spec, parts, protocol, start=start, **options)
             table = tuning_table(result, dataset)

@@ -2,6 +2,7 @@
 
 import pytest
 
+import dlkf
 from dlkf.command import GROUPS
 from dlkf.command.help import MOST, described, groups_of, help_text, keys_of
 from dlkf.config import config_dir
@@ -25,6 +26,11 @@ def test_every_command_has_a_page(name):
 def test_a_command_prints_it_and_does_nothing_else(call):
     done = call("evaluate", "--help")
     assert done.code == 0 and "model=…" in done.out and "aligned, coarse" in done.out and not done.err
+
+
+def test_a_command_says_the_version_of_this_package(call):
+    done = call("evaluate", "--version")
+    assert done.code == 0 and done.out == f"dlkf {dlkf.__version__}\n"
 
 
 def test_keys_are_read_with_value_and_comment():

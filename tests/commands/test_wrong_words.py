@@ -156,6 +156,17 @@ OF_ALL_COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
         ("model=mbkf21", "dataset=town", "out=made", "objective=likelihood", "minutes=few"),
         "minutes is 'few'",
     ),
+    "an option that nobody knows": ("evaluate", (*SCORED, "--quick"), "unrecognized arguments: --quick"),
+    "a page that nobody knows": ("navigate", (*SOLVED, "--cfg", "all_of_it"), "--cfg/-c: invalid choice"),
+    "a store that nobody knows": ("evaluate", (*SCORED, "tracking.uri=ftp://x"), "no kind of MLflow store"),
+    "a comparison of a number": ("compare", ("runs=5", "out=made"), "at least two"),
+    "a test longer than its pieces": (
+        "train",
+        (*TRAINED, "data.eval_length_s=60"),
+        "after 75 s but pieces are 60 s long; give a larger data.eval_length_s",
+    ),
+    "a split that nobody knows": ("tune", ("model=mbkf15", "dataset=town", "out=made", "split=foo"), "split=foo"),
+    "workers that nobody knows": ("simulate", ("out=made", "parallel=grid"), "no backend of joblib"),
     "a lever arm of one number": ("ingest", ("reader.lever_arm_m=0.5", "source=logs", "out=made"), "lever_arm_m"),
 }
 

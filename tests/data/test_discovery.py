@@ -464,6 +464,12 @@ def test_an_opposite_accelerometer(tmp_path, streets):
     np.testing.assert_allclose(got.imu.accel_z, drive["imu"].accel_z, atol=0.02)
 
 
+def test_a_chosen_file_that_is_not_there(tmp_path):
+    _hidden(tmp_path / "a", car(20))
+    with pytest.raises(InputError, match=r"reader.imu.file=nope.csv: no such IMU here; found in box.txt"):
+        list(AutoReader(imu={"file": "nope.csv"}).read(tmp_path / "a"))
+
+
 def _twice(folder):
     (folder / "other.txt").write_bytes((folder / "box.txt").read_bytes())
 

@@ -55,6 +55,10 @@ WRONG: dict[str, tuple[Callable[[Path], None], list[str], str]] = {
     "a map without its column": (_text, ["reader=csv", "reader.gnss.quality.map={RTK: 4}"], "give quality.column"),
     "a quality of words": (_text, ["reader=csv", "reader.gnss.quality.default=best"], "must be a code of NMEA"),
     "a drift of words": (_text, ["reader=csv", "reader.gnss.time.drift_ppm=fast"], "must be a number"),
+    "a week of words": (_text, ["reader=csv", "reader.imu.time.week_number=last"], "time.week_number is 'last', must"),
+    "a thinning to nothing": (_text, ["reader=csv", "reader.gnss.every_s=0"], "every_s is 0, must be above 0"),
+    "a switch of words": (_text, ["reader=csv", "reader.imu.time.respace=often"], "respace is 'often', must be true"),
+    "rows before the first": (_text, ["reader=csv", "reader.skip_rows=-1"], "skip_rows is -1, must be"),
     "a misspelt key": (_text, ["reader=csv", "reader.gnss.time.dirft_ppm=3"], "unknown key dirft_ppm"),
     "less than sure": (_text, ["reader=csv", "reader.sure.angle_deg=-2"], "angle_deg"),
 }

@@ -24,7 +24,7 @@ from dlkf.evaluation.table import as_csv, as_json, as_markdown, number, ratio_ta
 from dlkf.files import staged
 from dlkf.filters.build import build_filter
 from dlkf.report.compare import distinct
-from dlkf.report.evaluation import write_report
+from dlkf.report.evaluation import least_error, outage_rows, write_report
 from tests.cars import IMU
 from tests.evaluation.scoring import score
 
@@ -179,6 +179,18 @@ def test_report_is_complete_and_replaces_an_older_one(scores, tmp_path):
     page = (out / "report.html").read_text()
     assert page.count("<img loading=lazy") == 5 and "<script src" not in page and "<link" not in page
     assert page.count("class=figure") == 4 and "After 20 s without GNSS: " in page.partition("<h2>")[0]
+
+
+def test_outages_stand_in_the_order_of_the_best_filter(scores):
+    result = summarise_scores(scores, resamples=50)
+    names = list(scores.filters)
+    medians = [result.value(name, "outages", "end", "horizontal", "median") for name in names]
+    best = least_error(scores, result)
+    assert medians[names.index(best)] == min(medians)
+    for name in names:
+        columns, rows, _ = outage_rows(scores, result, "map", name)
+        errors = [float(row[columns.index(name)]) for row in rows]
+        assert len(errors) > 2 and errors == sorted(errors, reverse=True)
 
 
 def test_a_failed_write_leaves_nothing(tmp_path):

@@ -1,5 +1,7 @@
 """How long the epochs of ``navigate`` are, and what it keeps of its drives."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -46,5 +48,9 @@ def test_drives_without_plots_of_their_own_are_kept_small_and_shown_the_same():
     whole = [driven(seed) for seed in range(3)]
     small = [course.for_the_map() for course in whole]
     assert rows_of(small) == rows_of(whole) and answers("mbkf15", small) == answers("mbkf15", whole)
+    assert "Longest time without a fix: 41 s (d0)." in answers("mbkf15", whole)[1]
+    with_all = whole[0]._replace(result=replace(whole[0].result, table=whole[0].result.table.assign(gnss_used=True)))
+    assert answers("mbkf15", [with_all])[1].startswith("A fix in every epoch. ")
+    assert {row[4] for row in rows_of(whole)[1]} == {"1199"}  # of those after the start
     assert route(small).to_json() == route(whole).to_json()
     assert sum(c.result.table.memory_usage().sum() for c in small) < 80 * 3600

@@ -14,8 +14,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+import dlkf
 from dlkf.command import sweeps
-from dlkf.command.arguments import checked_seeds, readable
+from dlkf.command.arguments import check_options, checked_seeds, readable
 from dlkf.command.composing import plain
 from dlkf.command.faults import fault
 from dlkf.command.help import help_text
@@ -69,6 +70,9 @@ def command(
             if {"--help", "-h"} & set(sys.argv[1:]):
                 print(help_text(name, GROUPS.get(name, {})))
                 return
+            if "--version" in sys.argv[1:]:
+                print(f"dlkf {dlkf.__version__}")
+                return
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors reach us whole instead of Hydra's exit
             given = [with_group(argument, GROUPS.get(name, {})) for argument in arguments(sys.argv[1:])]
             sys.argv[1:] = [readable(argument) for argument in given]
@@ -77,6 +81,7 @@ def command(
             heeded = [n for n in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(n) is not signal.SIG_IGN]
             before = {number: signal.signal(number, _stop) for number in heeded}
             try:
+                check_options(sys.argv[1:])
                 with sweeps.heard():
                     run = hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)
                     run(task)()

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
+from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
@@ -13,6 +14,17 @@ from dlkf.errors import InputError
 from dlkf.settings import is_number
 
 SWITCHED_OFF = ("outage", "injected_bias", "smoother", "export")  # where none means null
+
+
+def check_options(arguments: list[str]) -> None:
+    """InputError for an option (``--…``) that Hydra does not have, or a word that it does not take."""
+
+    def refuse(message: str) -> NoReturn:
+        raise InputError(f"{message}; settings are key=value, --help names them")
+
+    parser = get_args_parser()
+    parser.error = refuse
+    parser.parse_args([word for word in arguments if word.startswith("-") or "=" not in word])
 
 
 def readable(argument: str) -> str:

@@ -80,7 +80,7 @@ def one_line(error: BaseException) -> str:
     if missing := re.search(r"Missing mandatory value: (\S+)", text):
         return f"{missing[1]} is missing; give {missing[1]}=…"
     if bare := re.search(r"Error parsing override '([^'=]*)'", text):
-        return f"cannot read {bare[1]!r}; settings are key=value, such as dataset={bare[1]}; --help names them"
+        return f"cannot read {bare[1]!r}; settings are key=value, such as dataset=data/town; --help names them"
     if malformed := re.search(r"(?:LexerNoViableAltException|mismatched input|extraneous input)[\s\S]*", text):
         said = malformed[0].partition("See https")[0]
         words = " ".join(said.replace("LexerNoViableAltException:", "").replace("^", "").split())

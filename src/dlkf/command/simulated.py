@@ -47,15 +47,14 @@ def composed_recipe(*overrides: str) -> Recipe:
 HOUR_SEED = 71  # the roads of the long drives are not those of the others
 
 
-def make_missing(datasets: Sequence[str], hour: str | None, console: Console) -> None:
+def make_missing(datasets: Sequence[str], console: Console, seed: int = 1) -> None:
     """Simulate the datasets under ``data/`` that have a preset and are not there yet."""
-    for dataset in [*datasets, *([hour] if hour else [])]:
+    for dataset in datasets:
         path = Path(dataset)
         preset_file = config_dir() / "simulated" / f"{path.name}.yaml"
         if path.exists() or path.parent != Path("data") or not preset_file.is_file():
             continue
         console.print(f"{dataset} is not there: simulating it")
-        seed = HOUR_SEED if dataset == hour else 1
         preset = compose("simulate", overrides=[f"simulated@dataset={path.name}", f"seed={seed}"])
         try:
             simulate(settings_from(SimulateSettings, plain(preset), "").recipe, path)

@@ -19,6 +19,7 @@ from dlkf.navigation.earth import SEMI_MAJOR
 FASTEST_RATE = 20.0  # rad/s: no car turns, and no bump shakes it, that fast for a thousandth of a drive
 CHUNK_S = 10.0  # way and course are compared over such stretches: metres of GNSS noise do not matter
 DISAGREES, AGREES = 0.5, 0.25  # relative residual of way against velocity
+LEAST_SLOPE = 0.5  # of gyro_z against the course: a sensor that leans by 45° has 0.7
 NOWHERE_DEG = 1e-6  # what receivers write before they have a position
 FARTHEST_KM, KM_PER_DEG = 2000.0, 111.2
 SEARCH_S = 600.0  # clocks of logs that have time in common are hardly further apart
@@ -138,7 +139,8 @@ def _check_way(gnss: Columns, where: str) -> None:
         return
     readings = {
         "latitude and longitude look swapped; exchange lat_deg and lon_deg": (lon, lat, moved),
-        "lat_deg and lon_deg look like radians; reader.gnss.position.unit=rad, or multiply them by 180/π": (
+        "lat_deg and lon_deg look like radians (unit=rad), or like degrees that were read as ddmm (unit=deg); set "
+        "reader.gnss.position.unit": (
             np.degrees(lat),
             np.degrees(lon),
             moved,
@@ -186,7 +188,12 @@ def check_turns(imu: Columns, gnss: Columns, where: str) -> None:
             f"{where}: gyro_z is {slope:.0f} times the turn of the course: looks like degrees; use rad/s "
             "(reader.imu.gyro.unit=deg/s)"
         )
-    if slope < -0.3:
+    if not LEAST_SLOPE < abs(slope) < 1 / LEAST_SLOPE:
+        raise InputError(
+            f"{where}: gyro_z is {slope:.3g} times the turn of the course: not in rad/s; reader.imu.gyro.unit=auto "
+            "finds its unit"
+        )
+    if slope < 0:
         raise InputError(
             f"{where}: gyro_z turns against the course (slope {slope:.2f}): z must point down; "
             "turn the signs of y and z"

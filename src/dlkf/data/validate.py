@@ -19,6 +19,7 @@ from dlkf.data.tables import Columns, DriveRow, read_drives, read_table
 from dlkf.errors import InputError
 
 GNSS_QUALITIES = (1, 2, 3, 4, 5, 9)  # NMEA GGA codes that are a satellite fix; 6, 7, 8 are not
+RATES_HZ = {"imu": (1.0, 1e4), "gnss": (1e-3, 500.0)}
 UNIX_TO_GPS_S, EPOCHS_APART_S = 315_964_800.0, 86_400.0  # 1970 to 1980; as near is no chance
 
 
@@ -125,6 +126,17 @@ def _check_time(t: np.ndarray, where: str) -> None:
         )
 
 
+def _check_rate(t: np.ndarray, where: str, kind: str) -> None:
+    """Stamps in another unit make a rate that no device has."""
+    slowest, fastest = RATES_HZ[kind]
+    rate = 1 / float(np.median(np.diff(t))) if len(t) > 1 else fastest
+    if not slowest <= rate <= fastest:
+        raise InputError(
+            f"{where}: {rate:.3g} rows a second, {'an IMU' if kind == 'imu' else 'a receiver'} has {slowest:g} to "
+            f"{fastest:g}: t is not in seconds; reader.{kind}.time.unit"
+        )
+
+
 def _check_finite(table: Columns, names: tuple[str, ...], where: str, *, nan: bool) -> None:
     for name in names:
         values = table[name]
@@ -141,6 +153,7 @@ def _check_imu(imu: Columns, where: str, limits: Limits) -> None:
     _check_finite(imu, (*GYRO, *ACCEL), where, nan=False)
     if len(t) < 2:
         raise InputError(f"{where}: has a single sample; leave the drive out or give its data")
+    _check_rate(t, where, "imu")
     gaps = gap_rows(t, limits)
     if len(gaps):
         k = int(gaps[0])
@@ -153,6 +166,7 @@ def _check_imu(imu: Columns, where: str, limits: Limits) -> None:
 
 def _check_gnss(gnss: Columns, imu: Columns, where: str) -> None:
     _check_time(gnss["t"], where)
+    _check_rate(gnss["t"], where, "gnss")
     _check_finite(gnss, (*POSITION, *VELOCITY, *STD), where, nan=True)
     fix = np.isin(gnss["quality"], GNSS_QUALITIES) & np.all([np.isfinite(gnss[c]) for c in POSITION], axis=0)
     if not fix.any():

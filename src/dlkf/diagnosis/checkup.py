@@ -164,7 +164,8 @@ def discovered(tables: DriveTables) -> Iterator[Seen]:
         elif finding.setting == "imu.time.offset_s":
             off = abs(finding.value)
             fine = off < OFFSET_S
-            text = f"clocks: IMU stamps {finding.value:+.3f} s to be added ({finding.told})"
+            lead = "IMU and GNSS agree" if fine else f"add {finding.value:+.3f} s to the IMU's stamps"
+            text = f"clocks: {lead} ({finding.told})"
             grade = GOOD if fine else NOTE if off < DELAY_S else BAD  # receivers are late, clocks are wrong
             yield Seen(grade, text + ("" if fine else "; ingest with reader.imu.time.offset_s"))
         elif finding.setting == "imu.axes":

@@ -92,7 +92,7 @@ class Scenes:
                     "or mode=drives"
                 )
             self._batches = [(stack, part) for part in _parts(pieces, [p.epochs for p in pieces], stack)]
-            self.outage = protocol.outage and _fitting(protocol.outage, protocol.length_s)
+            self.outage = protocol.outage and fitting(protocol.outage, protocol.length_s)
         else:
             starts = self._aligned(stack, protocol.align)
             starts = {d: starts[d] for d in spread(list(starts), limit)}
@@ -186,14 +186,15 @@ def repeated(plan: OutagePlan) -> OutagePlan:
     return replace(plan, every_s=every, offsets_s=plan.offsets_s or (0.0, float(longest)))
 
 
-def _fitting(plan: OutagePlan, length_s: float) -> OutagePlan:
+def fitting(plan: OutagePlan, length_s: float, length: str = "length_s", outage: str = "outage") -> OutagePlan:
+    """The plan with its offsets; InputError, which names the settings, where pieces are too short for it."""
     offsets = plan.offsets_s or (0.0,)
     first, last = (x if isinstance(x, (int, float)) else max(x) for x in (plan.first_s, plan.duration_s))
     end = first + last + max(offsets)
     if end > length_s + 1e-6:
         raise InputError(
             f"the outage ends after {end:g} s but pieces are {length_s:g} s long; "
-            "give a larger length_s, or a smaller outage.first_s or outage.duration_s"
+            f"give a larger {length}, or a smaller {outage}.first_s or {outage}.duration_s"
         )
     return replace(plan, offsets_s=offsets)
 

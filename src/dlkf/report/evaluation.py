@@ -15,7 +15,7 @@ from dlkf.evaluation.figures import all_figures, png, representative
 from dlkf.evaluation.metrics import magnitudes, outage_at, rms_over_pieces
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import Scores
-from dlkf.evaluation.summary import answer
+from dlkf.evaluation.summary import END, answer
 from dlkf.evaluation.table import DEGREES, Table, all_tables, as_csv, as_json, as_markdown, number
 from dlkf.files import placed, staged
 from dlkf.report.maps import chart, joined, track
@@ -129,8 +129,10 @@ def _sections(page: Page, scores: Scores, result: Results, kind: str, baseline: 
         page.figure(f"growth-{name}", growth(scores))
         page.heading(f"{kind}Map", f"The {truth}, the outages, and every filter's way in them; a row below goes there.")
         page.figure(f"map-{name}", outage_map(scores, truth))
-        page.heading(f"{kind}Outages", "Horizontal error at the end [m], the worst first; a click shows it on the map.")
-        columns, rows, marks = outage_rows(scores, result, f"map-{name}")
+        best = least_error(scores, result)
+        about = f"Horizontal error at the end [m], the worst of {best} first; a click shows it on the map."
+        page.heading(f"{kind}Outages", about)
+        columns, rows, marks = outage_rows(scores, result, f"map-{name}", best)
         page.table(columns, rows, marks=marks, tall=True)
         if len(result.per_outage) > len(rows):
             page.note(f"The worst {len(rows)} of {len(result.per_outage)}; all are in metrics.json.")
@@ -203,12 +205,20 @@ def piece_map(scores: Scores, baseline: str | None, named: str = "truth") -> go.
     return chart(traces, around=traces[:1])
 
 
-def outage_rows(scores: Scores, result: Results, figure: str) -> tuple[list[str], list[list[str]], list[str]]:
-    """Columns, rows and marks of the table of outages, the worst of the best filter first."""
+def least_error(scores: Scores, result: Results) -> str:
+    """The filter of the least median at the end of the outages."""
+    medians = {name: result.value(name, *END, "median") for name in scores.filters}
+    return min(medians, key=lambda name: math.inf if math.isnan(medians[name]) else medians[name])
+
+
+def outage_rows(
+    scores: Scores, result: Results, figure: str, best: str
+) -> tuple[list[str], list[list[str]], list[str]]:
+    """Columns, rows and marks of the table of outages, the worst of the ``best`` filter first."""
     w, names = scores.windows, list(scores.filters)
     ends = np.array([[o["end"][n]["horizontal"] for n in names] for o in result.per_outage], float)
-    least = np.nanmin(np.where(np.isnan(ends), np.inf, ends), axis=1)
-    order = np.argsort(-np.where(np.isfinite(least), least, -1.0), kind="stable")[:MOST_OUTAGES]
+    of_best = ends[:, names.index(best)]
+    order = np.argsort(-np.nan_to_num(of_best, nan=-1.0), kind="stable")[:MOST_OUTAGES]
     rows, marks = [], []
     for k in order:
         o, i = result.per_outage[k], int(w.piece[k])

@@ -59,6 +59,10 @@ def navigation_page(model: str, dataset: str, courses: Sequence[Course], made: M
     page.heading("Drives", "A row shows its drive on the map.")
     columns, rows, marks = rows_of(courses)
     page.table(columns, rows, marks=marks, tall=len(courses) > 15)
+    page.note(
+        "Innovation / σ: what GNSS says less what the filter expects, over the filter's own 1σ of it (RMS). 1 is "
+        "right; above, the filter is surer than it should be: its noise is too small for this IMU and receiver."
+    )
     for k, course in enumerate(courses[:MOST_DRIVES]):
         _plots(page, k, course)
     if len(courses) > MOST_DRIVES:
@@ -74,8 +78,10 @@ def answers(model: str, courses: Sequence[Course]) -> list[str]:
     longest = max(courses, key=lambda c: c.without.max())
     sigma = np.concatenate([horizontal_std(c) for c in courses])
     lead = f"{len(courses)} drive{'s' if len(courses) != 1 else ''}, {duration(hours)}, {km:.3g} km with {model}."
-    text = f"Longest time without a fix: {longest.without.max():.3g} s"
-    text += f" ({longest.result.drive})." if len(courses) > 1 else "."
+    text = "A fix in every epoch."
+    if longest.without.max() > 0:
+        text = f"Longest time without a fix: {longest.without.max():.3g} s"
+        text += f" ({longest.result.drive})." if len(courses) > 1 else "."
     if np.isfinite(sigma).any():
         text += f" The filter's own horizontal 1σ: {np.nanmedian(sigma):.2g} m in half of the time, "
         text += f"{np.nanmax(sigma):.2g} m at worst."
@@ -161,9 +167,10 @@ def rows_of(courses: Sequence[Course]) -> tuple[list[str], list[list[str]], list
         step = float(np.median(np.diff(table["t"]))) if len(table) > 1 else 0.0
         innovation = course.result.innovation
         ratio = innovation.normalised_rms if innovation is not None else np.nan
+        offered = course.fixes.between(course.result.aligned_at, float(table["t"].iloc[-1]))
         rows.append(
             [course.result.drive, f"{np.ptp(table['t']):.0f}", f"{distance(course) / 1000:.2f}"]
-            + [str(int(table["gnss_used"].sum())), str(len(course.fixes.t)), f"{course.without.max():.3g}"]
+            + [str(int(table["gnss_used"].sum())), str(offered), f"{course.without.max():.3g}"]
             + [f"{(speed(course) < STANDING).sum() * step:.0f}"]
             + ([f"{np.nanmedian(sigma):.2g}", f"{np.nanmax(sigma):.2g}"] if known else ["–", "–"])
             + [f"{ratio:.2g}" if np.isfinite(ratio) else "–"]

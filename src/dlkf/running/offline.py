@@ -115,7 +115,7 @@ class Navigated:
         if np.isfinite(position):
             text += f", final 1σ {position:.2g} m horizontal, {np.degrees(last.std_yaw):.2g}° heading"
         if self.innovation is not None and np.isfinite(spread := self.innovation.normalised_rms):
-            text += f", innovations {spread:.2g} × their σ"
+            text += f", innovations {spread:.2g} of their 1σ (RMS; 1 is right)"
         return text
 
 

@@ -152,16 +152,16 @@ def pinned_requirements() -> list[str]:
     return [f"{name}=={version(name).partition('+')[0]}" for name in REQUIRED]
 
 
-def check_registration(register: str | None, alias: str | None) -> None:
-    """Raises InputError for a name or an alias that the model registry would refuse after training."""
+def check_registration(register: str | None, alias: str | None, keys: tuple[str, str] = ("name", "alias")) -> None:
+    """Raises InputError for a name or an alias that the model registry would refuse in the end, by the ``keys`` that
+    gave them."""
     if register is not None and not re.fullmatch(r"[^/:@]+", register):
-        raise InputError(f"tracking.register={register!r}: a name in the registry has none of / : @")
+        raise InputError(f"{keys[0]}={register}: a name in the registry has none of / : @")
     if alias is not None and (
         not re.fullmatch(r"[\w-]+", alias) or alias.lower() == "latest" or re.fullmatch(r"[vV]\d+", alias)
     ):
         raise InputError(
-            f"tracking.alias={alias!r}: letters, digits, _ and - only, and neither latest nor v<number>; "
-            "such as champion"
+            f"{keys[1]}={alias}: letters, digits, _ and - only, and neither latest nor v<number>; such as champion"
         )
 
 

@@ -33,6 +33,7 @@ PARENT_TAG, NOTE_TAG = "mlflow.parentRunId", "mlflow.note.content"
 KIND = {"mlflow.experimentKind": "custom_model_development"}  # else the UI shows pages for language models
 KEY_LENGTH, VALUE_LENGTH, NOTE_LENGTH, PARAMS_AT_ONCE, METRICS_AT_ONCE = 250, 6000, 8000, 100, 1000  # MLflow's limits
 NOT_IN_NAMES = re.compile(r"[^\w\-. :/]")  # of metrics
+SCHEMES = ("sqlite", "http", "https", "file", "postgresql", "mysql", "mssql", "databricks", "uc", "databricks-uc")
 LOCKED_S = 15.0  # a writer of many metrics holds the store for less
 SAMPLE_EVERY_S, SAMPLES_PER_POINT = 1, 5  # system metrics: MLflow's own 10 s leaves short runs empty
 
@@ -57,6 +58,8 @@ def tracking_uri(given: str | None = None) -> str:
     A relative SQLite path is made absolute. Raises InputError for a plain folder, which MLflow refuses.
     """
     uri = given or os.environ.get("MLFLOW_TRACKING_URI") or SQLITE + STORE
+    if "://" in uri and uri.partition("://")[0].partition("+")[0] not in SCHEMES:
+        raise InputError(f"tracking.uri={uri}: no kind of MLflow store; give sqlite:///<path>.db, or http://<server>")
     if uri.startswith(SQLITE):
         return SQLITE + str(Path(uri.removeprefix(SQLITE)).expanduser().resolve())
     if "://" not in uri or uri.startswith("file:"):

@@ -179,14 +179,15 @@ def _offset(out: Findings, lag: Lag | None, pose: Pose | None, wanted: set[str],
     hardly = abs(pose.lag_s) < max(3 * pose.lag_std, 0.01) and abs(pose.lag_s) < 0.05
     value = 0.0 if hardly and not pose.drift else pose.lag_s - pose.drift * before_s
     told = f"{sign * pose.lag_s:+.3f} ± {pose.lag_std:.3f} s, at the ends ± {at_ends:.3f}, "
-    told += f"delay of the velocities included; {_peak(lag)}"
+    told += f"a delay of GNSS's velocities included; {_peak(lag)}"
     wide = f"reader.sure.time_s={math.ceil(250 * at_ends + 1) / 100:g}" if lag.clear else ""
     out.add(setting, round(sign * value, 4), certain, told + known_offset(pose.lag_s), wide)
 
 
 def _peak(lag: Lag) -> str:
     return (
-        f"yaw rate {lag.yaw:.2f}, force {lag.force:.2f} alike, next best lag {100 * lag.rival / lag.gain:.0f} % as good"
+        f"turns agree to {lag.yaw:.2f}, accelerations to {lag.force:.2f}, of 1; the next best offset fits "
+        f"{100 * lag.rival / lag.gain:.0f} % as well"
     )
 
 
@@ -200,11 +201,11 @@ def _axes(out: Findings, pose: Pose | None, sound: bool, gnss: Motion, sure: Sur
     limit = math.radians(sure.angle_deg)
     certain = sound and 2.5 * pose.yaw_std <= limit and 2.5 * pose.tilt_std <= limit
     told = (
-        f"± {math.degrees(pose.yaw_std):.1f}° about the vertical, ± {math.degrees(pose.tilt_std):.1f}° level; forces "
-        f"{pose.scale:.2f} of GNSS', {100 * pose.explained:.0f} % explained"
+        f"± {math.degrees(pose.yaw_std):.1f}° about the vertical, ± {math.degrees(pose.tilt_std):.1f}° level; "
+        f"accelerations {pose.scale:.2f} of those of GNSS, {100 * pose.explained:.0f} % explained"
     )
     if not math.isnan(pose.down_apart):
-        told += f", gravity and turns {math.degrees(pose.down_apart):.1f}° apart"
+        told += f"; down by gravity and by the turns {math.degrees(pose.down_apart):.1f}° apart"
     wide = f"reader.sure.angle_deg={math.ceil(2.5 * math.degrees(max(pose.yaw_std, pose.tilt_std)) + 0.1):d}"
     out.add("imu.axes", value, certain, told, wide if sound else "")
 

@@ -135,6 +135,9 @@ class AutoReader:
         fits = [o for o in offers if getattr(o, kind) is not None]
         if (file := self.known[kind].get("file")) is not None:
             fits = [o for o in fits if o.path.match(str(file))]
+            if not fits:
+                have = ", ".join(o.path.name for o in offers if getattr(o, kind) is not None) or "no file"
+                raise InputError(f"{folder}: reader.{kind}.file={file}: no such {kind.upper()} here; found in {have}")
         if len(fits) > 1:
             names = ", ".join(o.path.name for o in fits)
             raise InputError(f"{folder}: {names} all hold {kind.upper()}; choose one with reader.{kind}.file")

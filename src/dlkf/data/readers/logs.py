@@ -59,6 +59,8 @@ class LogReader:
     ) -> None:
         if time_zero not in ("imu", "keep"):
             raise InputError(f"reader.time_zero={time_zero}: must be imu (count from the first sample) or keep")
+        if isinstance(skip_rows, bool) or not isinstance(skip_rows, int) or skip_rows < 0:
+            raise InputError(f"reader.skip_rows is {skip_rows!r}, must be a whole number ≥ 0")
         self.specs: dict[str, Spec] = {"imu": imu, "gnss": gnss, "reference": reference or {}}
         for kind, spec in self.specs.items():
             check_keys(spec, kind)

@@ -33,6 +33,9 @@ ENTRIES = {
     "attitude": ("columns", "unit", "convention", "order"),
     "valid": ("column", "values"),
 }
+NUMBERS = ("week_number", "wraps_s", "offset_s", "drift_ppm", "delay_s", "every_s")  # or auto, where that is allowed
+POSITIVE = ("week_number", "wraps_s", "every_s")
+SWITCHES = ("respace", "increments")
 
 
 def check_keys(spec: Spec, kind: str) -> None:
@@ -52,6 +55,12 @@ def _known(spec: Any, known: tuple[str, ...], where: str) -> None:
         raise InputError(f"{where} is {spec!r}, must be a mapping of {', '.join(known)}")
     if unknown := [str(key) for key in spec if key not in known]:
         raise InputError(f"{where}: unknown key {unknown[0]}; known are {', '.join(known)}")
+    for key in NUMBERS:
+        if spec.get(key) not in (None, "auto") and _finite(spec[key], f"{where}.{key}") <= 0 and key in POSITIVE:
+            raise InputError(f"{where}.{key} is {spec[key]}, must be above 0")
+    for key in SWITCHES:
+        if not isinstance(spec.get(key), (bool, type(None))):
+            raise InputError(f"{where}.{key} is {spec[key]!r}, must be true or false")
 
 
 @dataclass(frozen=True)

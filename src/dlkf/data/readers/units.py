@@ -151,7 +151,7 @@ def _calendar(values: np.ndarray, where: str) -> np.ndarray:
         if bool(stamps.isna().any()):
             bad = int(np.flatnonzero(stamps.isna())[0])
             raise InputError(
-                f"{where}: row {bad}: {values[bad]!r} is no date and time; must be like 2025-07-05T23:57:12.7Z"
+                f"{where}: row {bad}: {str(values[bad])!r} is no date and time; must be like 2025-07-05T23:57:12.7Z"
             ) from None
     return stamps.dt.as_unit("ns").astype(np.int64).to_numpy()
 
