@@ -47,7 +47,7 @@ def made(
     InputError for a class that is not there, a setting it does not take or takes otherwise, and one that it misses.
     """
     target = f"{where}.{TARGET}"
-    if not values.get(TARGET):
+    if not isinstance(values, Mapping) or not values.get(TARGET):
         raise InputError(f"{where} has no {TARGET}; it names the class, as module.Class")
     kind = class_named(str(values[TARGET]), target)
     takes = signature(kind).parameters

@@ -167,6 +167,12 @@ OF_ALL_COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     ),
     "a split that nobody knows": ("tune", ("model=mbkf15", "dataset=town", "out=made", "split=foo"), "split=foo"),
     "workers that nobody knows": ("simulate", ("out=made", "parallel=grid"), "no backend of joblib"),
+    "a model of a number": ("evaluate", (*SCORED, "model=5"), "model is 5, must be a name or a list"),
+    "a patient of a number": ("doctor", ("dataset=town", "drives=5"), "drives is 5, must be a name or a list"),
+    "an experiment of several, one unknown": ("train", ("+experiment=[outage,nope]",), "'experiment/nope'"),
+    "a callback of a number": ("train", (*TRAINED, "callbacks.guard=5"), "callbacks.guard has no _target_"),
+    "weights from nowhere": ("train", (*TRAINED, "finetune=nowhere"), "nowhere"),
+    "a baseline of nobody": ("train", (*TRAINED, "baselines.models=[mbkf99]"), "unknown filter 'mbkf99'"),
     "a lever arm of one number": ("ingest", ("reader.lever_arm_m=0.5", "source=logs", "out=made"), "lever_arm_m"),
 }
 

@@ -73,6 +73,8 @@ def one_line(error: BaseException) -> str:
         options = re.search(r"Available options in '([^']+)':\n((?:\t.*\n?)+)", text)
         hint = f"; available in {options[1]}: {', '.join(options[2].split())}" if options else ""
         return f"unknown preset or config {missing[1]!r}{hint}"
+    if missing := re.search(r"Could not load '([^']+)'", text):
+        return f"unknown preset or config {missing[1]!r}; --help names those that there are"
     if unknown := re.search(r"Could not override '([^']+)'|full_key: (\S+)[\s\S]*is not in struct", text):
         return f"unknown config key {unknown[1] or unknown[2]!r}; --cfg job prints all keys"
     if unknown := re.search(r"Key '([^']+)' is not in struct", text):

@@ -60,6 +60,8 @@ class FilterSettings:
     @property
     def models(self) -> list[str]:
         """One or several; InputError for none."""
+        if not isinstance(self.model, (str, list, tuple)):
+            raise InputError(f"model is {self.model!r}, must be a name or a list of names")
         names = [self.model] if isinstance(self.model, str) else [str(name) for name in self.model]
         if not names:
             raise InputError("model is an empty list; give at least one, such as model=mbkf15")

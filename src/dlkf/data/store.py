@@ -49,6 +49,8 @@ def drive_rows(folder: str | Path, drives: Sequence[str] | str | None = None) ->
     rows = read_drives(folder)
     if drives is None:
         return rows
+    if not isinstance(drives, (str, Sequence)):
+        raise InputError(f"drives is {drives!r}, must be a name or a list of names")
     drives = [drives] if isinstance(drives, str) else list(drives)
     if not drives:
         raise InputError("drives=[] names no drive; null takes all")

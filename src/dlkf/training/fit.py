@@ -96,8 +96,8 @@ def fit(
 def check_fit(settings: FitSettings) -> None:
     """What a training would come upon after the tuning, before any work is done for it.
 
-    InputError for a class that is not there or takes other settings, and for epochs of which none is validated;
-    Lightning's error for an accelerator that is unknown or not there.
+    InputError for weights to begin with or a class that are not there, other settings than it takes, and epochs of
+    which none is validated; Lightning's error for an accelerator that is unknown or not there.
     """
     plan = settings.trainer
     last = plan.max_epochs // plan.validate_every * plan.validate_every
@@ -106,6 +106,8 @@ def check_fit(settings: FitSettings) -> None:
             f"no epoch would be validated: trainer.max_epochs={plan.max_epochs} ends before trainer.best_from_epoch="
             f"{plan.best_from_epoch} and validate_every={plan.validate_every}"
         )
+    if settings.finetune:
+        trained_filter(settings.finetune)
     FilterTraining(settings.model, settings.loss, settings.descent).configure_optimizers()
     _hush()
     with warnings.catch_warnings():

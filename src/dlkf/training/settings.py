@@ -12,7 +12,9 @@ from dlkf.classes import made
 from dlkf.data.masks import BiasLaw
 from dlkf.errors import InputError
 from dlkf.evaluation.outages import OutagePlan
+from dlkf.filters.build import is_filter
 from dlkf.filters.saved import LearnedSettings, learned_settings
+from dlkf.filters.shipped import shipped_folder
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.settings import Ranged, within
 from dlkf.training.loss import Loss, loss_of
@@ -53,6 +55,11 @@ class BaselineSettings:
     tune: bool
     pieces: int | None
     rounds: int
+
+    def __post_init__(self) -> None:
+        for name in self.models:
+            if not (is_filter(name) or shipped_folder(name)):
+                raise InputError(f"baselines.models: unknown filter {name!r}; a Kalman filter's name, ins or plus")
 
 
 @dataclass(frozen=True)
