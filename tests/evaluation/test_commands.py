@@ -17,6 +17,7 @@ def test_evaluate_leaves_a_report(town, tmp_path):
     )  # fmt: skip
     assert done.code == 0, done.err
     assert "town (simulated): 6 pieces, 6 drives" in done.out and "ratio to" in done.out
+    assert "mode=drives has them over all of every drive" in " ".join(done.out.split())
     content = json.loads((tmp_path / "report" / "metrics.json").read_text())
     assert content["protocol"]["mode"] == "pieces" and content["protocol"]["imu"] == "consumer"
     assert content["results"][0]["count"]["outages"] == 6 == len(content["results"][0]["per_outage"])

@@ -19,7 +19,7 @@ from dlkf.navigation.earth import SEMI_MAJOR
 FASTEST_RATE = 20.0  # rad/s: no car turns, and no bump shakes it, that fast for a thousandth of a drive
 CHUNK_S = 10.0  # way and course are compared over such stretches: metres of GNSS noise do not matter
 DISAGREES, AGREES = 0.5, 0.25  # relative residual of way against velocity
-LEAST_SLOPE = 0.5  # of gyro_z against the course: a sensor that leans by 45° has 0.7
+LEAST_SLOPE = 0.1  # of gyro_z against the course; one that is at its limit in every turn may have 0.3
 NOWHERE_DEG = 1e-6  # what receivers write before they have a position
 FARTHEST_KM, KM_PER_DEG = 2000.0, 111.2
 SEARCH_S = 600.0  # clocks of logs that have time in common are hardly further apart

@@ -167,7 +167,7 @@ def discovered(tables: DriveTables) -> Iterator[Seen]:
             lead = "IMU and GNSS agree" if fine else f"add {finding.value:+.3f} s to the IMU's stamps"
             text = f"clocks: {lead} ({finding.told})"
             grade = GOOD if fine else NOTE if off < DELAY_S else BAD  # receivers are late, clocks are wrong
-            yield Seen(grade, text + ("" if fine else "; ingest with reader.imu.time.offset_s"))
+            yield Seen(grade, text + ("" if fine else "; ingest with reader.imu.time.offset_s=auto"))
         elif finding.setting == "imu.axes":
             angle = turned_deg(finding.value)
             fine = angle < ANGLE_DEG

@@ -178,7 +178,7 @@ def _offset(out: Findings, lag: Lag | None, pose: Pose | None, wanted: set[str],
     certain = lag.clear and 2.5 * at_ends <= sure.time_s
     hardly = abs(pose.lag_s) < max(3 * pose.lag_std, 0.01) and abs(pose.lag_s) < 0.05
     value = 0.0 if hardly and not pose.drift else pose.lag_s - pose.drift * before_s
-    told = f"{sign * pose.lag_s:+.3f} ± {pose.lag_std:.3f} s, at the ends ± {at_ends:.3f}, "
+    told = f"{sign * pose.lag_s:+.3f} ± {pose.lag_std:.3f} s in the middle of the drive, ± {at_ends:.3f} at its ends, "
     told += f"a delay of GNSS's velocities included; {_peak(lag)}"
     wide = f"reader.sure.time_s={math.ceil(250 * at_ends + 1) / 100:g}" if lag.clear else ""
     out.add(setting, round(sign * value, 4), certain, told + known_offset(pose.lag_s), wide)

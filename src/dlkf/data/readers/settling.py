@@ -155,7 +155,8 @@ def _speed_unit(found: Findings, gnss: Mapped, t: np.ndarray, where: str) -> Non
     apart = {name: abs(np.log(factor / f)) if factor > 0 else np.inf for name, f in SPEEDS.items()}
     best = min(apart, key=lambda name: apart[name])
     certain = apart[best] < 0.08 and spread < 0.2 * factor
-    found.add("gnss.velocity.unit", best, bool(certain), f"positions move {factor:.3g} ± {spread:.1g} m per unit")
+    told = f"positions move {factor:.3g} ± {spread:.1g} m per unit" if factor > 0 else "the car hardly moves"
+    found.add("gnss.velocity.unit", best, bool(certain), told)
 
 
 def _refuse_doubt(found: Findings, wanted: set[str], where: str) -> None:
