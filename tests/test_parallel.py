@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
+import sys
 import threading
 import time
 from pathlib import Path
@@ -16,7 +18,7 @@ import pytest
 from dlkf.command.composing import composed
 from dlkf.data.tables import dataset_digest, read_drives
 from dlkf.errors import InputError
-from dlkf.parallel import check, each
+from dlkf.parallel import REGISTERED_BY, check, each
 from tests.drives import drives_in
 from tests.jobs import ended, half
 from tests.numbers_in import numbers_in
@@ -48,7 +50,7 @@ def where(cluster) -> str:
 
 
 def test_results_come_in_order_and_a_mistake_ends_it():
-    for where in (None, 2):
+    for where in (None, 2, "multiprocessing"):  # the last gives no result before all are done, as Ray's and Spark's
         assert list(each(half, range(10), where)) == [x / 2 for x in range(10)]
         with pytest.raises(InputError, match="drive 13: no luck"):
             list(each(half, range(20), where))
@@ -68,10 +70,29 @@ def test_odd_engines(where):
 def test_engines_that_are_not_there(monkeypatch):
     with pytest.raises(InputError, match="no backend of joblib has that name"):
         check("grid")  # before anything runs
+    for name, (module, _, package) in REGISTERED_BY.items():
+        monkeypatch.setitem(sys.modules, module.partition(".")[0], None)
+        with pytest.raises(InputError, match=f"^parallel={name}: .*pip install {package}$"):
+            check(name)
+    with pytest.raises(InputError, match=r"parallel=multiprocessing: the engine failed \(\w+: .*; is there such a"):
+        list(each(lambda x: x, [1], "multiprocessing"))  # cannot be pickled
     pytest.importorskip("distributed")
     monkeypatch.setattr("dlkf.parallel.PATIENCE_S", 0.5)
     with pytest.raises(InputError, match="no scheduler answers"):
         list(each(half, [1], "dask://127.0.0.1:9"))
+
+
+@pytest.mark.served
+@pytest.mark.parametrize("where", REGISTERED_BY)
+def test_an_engine_that_makes_itself_known(where, monkeypatch):
+    """A cluster of this machine, where Ray or Spark with its Java is installed."""
+    pytest.importorskip(REGISTERED_BY[where][0])
+    if where == "spark" and shutil.which("java") is None:
+        pytest.skip("no Java here")
+    monkeypatch.setenv("PYSPARK_PYTHON", sys.executable)
+    assert list(each(half, range(6), where)) == [x / 2 for x in range(6)]
+    with pytest.raises(InputError, match="drive 13: no luck"):
+        list(each(half, range(20), where))
 
 
 def test_a_dask_worker_is_killed_in_the_middle(alone, cluster, where, tmp_path):
