@@ -19,7 +19,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 from torch import Tensor
 
 from dlkf.console import Counted
@@ -131,7 +131,7 @@ def consistency(
 def band(degrees: int, count: int) -> tuple[float, float]:
     """Band of the mean of ``count`` independent χ² values, over its expectation."""
     tail = (1 - CONFIDENCE) / 2
-    low, high = chi2.ppf(np.array([tail, 1 - tail]), degrees * count) / (degrees * count)
+    low, high = 2 * gammaincinv(degrees * count / 2, np.array([tail, 1 - tail])) / (degrees * count)
     return float(low), float(high)
 
 

@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import ndtr, stdtrit
 
 from dlkf.evaluation.metrics import LEAST_LOG, Array
 
@@ -96,8 +96,8 @@ def resampled_weights(groups: NDArray[np.int64], resamples: int, generator: np.r
 
 def levels(groups: int, confidence: float = 0.95) -> tuple[float, float]:
     """Percentiles of the resamples that bound the interval: Φ(√(G/(G−1)) t) with t of G − 1 degrees of freedom."""
-    t = stats.t.ppf(0.5 * (1 + confidence), groups - 1) * np.sqrt(groups / (groups - 1))
-    return 100 * float(stats.norm.cdf(-t)), 100 * float(stats.norm.cdf(t))
+    t = stdtrit(groups - 1, 0.5 * (1 + confidence)) * np.sqrt(groups / (groups - 1))
+    return 100 * float(ndtr(-t)), 100 * float(ndtr(t))
 
 
 def _interval(values: Array, groups: int, confidence: float) -> tuple[float, float]:

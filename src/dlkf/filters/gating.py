@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 from torch import Tensor
 
 from dlkf.filters.integration import Epoch
@@ -117,4 +117,4 @@ class Gate:
 
     @cached_property
     def _limits(self) -> tuple[float, ...]:
-        return (0.0, *(float(chi2.ppf(self.probability, components)) for components in (1, 2, 3)))
+        return (0.0, *(float(2 * gammaincinv(components / 2, self.probability)) for components in (1, 2, 3)))

@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 from torch import Tensor
 
 from dlkf.data.increments import second_order
@@ -178,4 +178,4 @@ def gauss_markov(rng: np.random.Generator, samples: int, sigma: float, time: flo
     step = -1 / (rate_hz * time)
     n = sigma * rng.standard_normal((samples, 3))
     n[1:] *= math.sqrt(-math.expm1(2 * step))
-    return np.asarray(lfilter([1.0], [1.0, -math.exp(step)], n, axis=0))
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -math.exp(step)], n, axis=0))

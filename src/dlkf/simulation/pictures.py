@@ -10,10 +10,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
+import scipy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from scipy.signal import savgol_filter
 
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR
 from dlkf.data.tables import Columns, read_drives
@@ -75,13 +75,13 @@ def driving(tables: DriveTables) -> Driving:
     t, lat, lon, v_n, v_e = (source[c][known] for c in ("t", "lat_deg", "lon_deg", "vel_n", "vel_e"))
     dt = float(np.median(np.diff(t)))
     width = max(3, 2 * round(0.5 * SMOOTH_S / dt) + 1)
-    a_n, a_e = (np.asarray(savgol_filter(v, width, 2, deriv=1, delta=dt)) for v in (v_n, v_e))
+    a_n, a_e = (np.asarray(scipy.signal.savgol_filter(v, width, 2, deriv=1, delta=dt)) for v in (v_n, v_e))
     speed = np.hypot(v_n, v_e)
     moving = speed > MOVING
     safe = np.where(moving, speed, 1.0)
     along = np.where(moving, (v_n * a_n + v_e * a_e) / safe, 0.0)
     yaw_rate = np.where(moving, (v_n * a_e - v_e * a_n) / safe**2, 0.0)
-    change = np.asarray(savgol_filter(yaw_rate, width, 2, deriv=1, delta=dt))
+    change = np.asarray(scipy.signal.savgol_filter(yaw_rate, width, 2, deriv=1, delta=dt))
     turning = np.abs(yaw_rate) > TURNING * np.maximum(speed, MOVING)
     north = METRES_PER_DEGREE * (lat - lat[0])
     east = METRES_PER_DEGREE * (lon - lon[0]) * np.cos(np.radians(lat[0]))

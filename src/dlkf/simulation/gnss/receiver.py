@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from dlkf.errors import InputError
 from dlkf.settings import Ranged, settings_from, within
@@ -139,7 +139,7 @@ def gauss_markov(rng: np.random.Generator, shape: tuple[int, int], time_constant
     """Stationary first-order Gauss-Markov processes of 1σ = 1, one per column (T, N), discretised exactly."""
     noise = rng.standard_normal(shape)
     noise[1:] *= math.sqrt(-math.expm1(-2 * dt / time_constant))
-    return lfilter([1.0], [1.0, -math.exp(-dt / time_constant)], noise, axis=0)
+    return scipy.signal.lfilter([1.0], [1.0, -math.exp(-dt / time_constant)], noise, axis=0)
 
 
 def clock(rng: np.random.Generator, receiver: Receiver, rows: int, dt: float) -> tuple[Array, Array]:

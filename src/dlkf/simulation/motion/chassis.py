@@ -16,10 +16,9 @@ import math
 from dataclasses import dataclass, field, fields
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline, make_interp_spline
-from scipy.signal import bilinear, lfilter, lfilter_zi
 
 from dlkf.errors import InputError
 from dlkf.navigation.attitude import rotation_from_rpy, rpy_from_rotation
@@ -211,7 +210,7 @@ def loads(route: Route, motion: Kinematics) -> tuple[Array, Array]:
 
 def suspension(
     rng: np.random.Generator, car: Car, route: Route, end: float, stretches: Stretches | None = None
-) -> BSpline:
+) -> scipy.interpolate.BSpline:
     """Roll, pitch [rad] and heave [m, up] of the body against the road, until ``end`` [s], as a spline.
 
     Each is a sprung mass: driven by the load it settles at gradient · specific force, H = ω²/(s² + 2ζωs + ω²);
@@ -228,7 +227,7 @@ def suspension(
         u, y = 2 * math.pi * car.kind.wheel_hz, car.kind.wheel_damping
         wheels = _filtered([u * u], [1, 2 * y * u, u * u], road)
         body += _filtered([2 * z * w, w * w], [1, 2 * z * w, w * w], wheels)
-    return make_interp_spline(nodes, body, k=5)
+    return scipy.interpolate.make_interp_spline(nodes, body, k=5)
 
 
 def rough_road(
@@ -247,7 +246,7 @@ def rough_road(
     if stretches is not None and len(stretches.factors) > 1:
         white *= stretches.at(PROFILE_STEP * np.arange(count))
     along, across = (
-        lfilter([1.0], [1.0, -math.exp(-2 * math.pi * wave * PROFILE_STEP)], x)
+        scipy.signal.lfilter([1.0], [1.0, -math.exp(-2 * math.pi * wave * PROFILE_STEP)], x)
         for wave, x in zip((FULL_WAVE, ROLL_WAVE), white)
     )
     at = PROFILE_STEP * np.arange(count)
@@ -275,8 +274,8 @@ def vibration(rng: np.random.Generator, kind: ChassisConfig, motion: Kinematics)
 
 def _filtered(numerator: list[float], denominator: list[float], x: Array) -> Array:
     """Columns of x (N, k) at the nodes through a transfer function in s, from the steady state of x₀."""
-    b, a = bilinear(numerator, denominator, NODE_HZ)
-    return lfilter(b, a, x, axis=0, zi=lfilter_zi(b, a)[:, None] * x[:1])[0]
+    b, a = scipy.signal.bilinear(numerator, denominator, NODE_HZ)
+    return scipy.signal.lfilter(b, a, x, axis=0, zi=scipy.signal.lfilter_zi(b, a)[:, None] * x[:1])[0]
 
 
 def _turned(C: Array, rate: Array, axis: int, angle: Array, angle_rate: Array) -> tuple[Array, Array]:

@@ -14,9 +14,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline, make_interp_spline
-from scipy.signal import bilinear, freqz, lfilter
 
 from dlkf.errors import InputError
 from dlkf.settings import Ranged, within
@@ -134,7 +133,7 @@ def shaken(
         rolling = np.abs(coarse.speed) / AT_SPEED * roughness(coarse.t)
         envelope = limited(kind.rumble * np.interp(nodes, coarse.t, rolling))
         x = noise(noise_rng, kind, envelope)
-        spline = make_interp_spline(nodes, x, k=5)
+        spline = scipy.interpolate.make_interp_spline(nodes, x, k=5)
         at = spline(t)
         out.moved[:] += at[:, :3]
         out.moved_rate[:] += spline(t, nu=1)[:, :3]
@@ -199,11 +198,11 @@ def _add_tones(
     orders: tuple[tuple[float, float], ...],
 ) -> None:
     """Tones at multiples of a frequency [Hz] with a size [m/s²] that both change slowly, given at nodes."""
-    turns = make_interp_spline(nodes, frequency, k=3)
+    turns = scipy.interpolate.make_interp_spline(nodes, frequency, k=3)
     cycles, rate = turns.antiderivative()(t), turns(t)
     for order, share in orders:
         w = 2 * math.pi * order * frequency
-        spline = make_interp_spline(nodes, limited(size * gain(kind, order * frequency)) / w**2, k=3)
+        spline = scipy.interpolate.make_interp_spline(nodes, limited(size * gain(kind, order * frequency)) / w**2, k=3)
         _add_tone(
             rng, kind, out, math.sqrt(2 * share), 2 * math.pi * order * cycles, 2 * math.pi * order * rate,
             spline(t), spline(t, nu=1),
@@ -218,7 +217,7 @@ def _add_wheels(rng: np.random.Generator, kind: Shaking, out: Shaken, motion: Ki
         f = order * kind.wheel_turns * np.abs(coarse.speed)
         quick = (2 * math.pi * np.maximum(f, 0.1)) ** 2
         strength = limited(size * gain(kind, f) * quick) / quick
-        spline = make_interp_spline(coarse.t, _smoothed(strength, 4.0), k=3)
+        spline = scipy.interpolate.make_interp_spline(coarse.t, _smoothed(strength, 4.0), k=3)
         _add_tone(
             rng, kind, out, math.sqrt(2 * share), order * per_metre * motion.distance, order * per_metre * motion.speed,
             spline(motion.t), spline(motion.t, nu=1),
@@ -251,24 +250,25 @@ def noise(rng: np.random.Generator, kind: Shaking, envelope: Array) -> Array:
     axes = np.exp(0.5 * rng.standard_normal(6) - 0.25)
     if kind.bursts > 0:
         keep = math.exp(-1 / (BURST_S * NODE_HZ))
-        level = lfilter([math.sqrt(1 - keep**2)], [1.0, -keep], rng.standard_normal(count))
+        level = scipy.signal.lfilter([math.sqrt(1 - keep**2)], [1.0, -keep], rng.standard_normal(count))
         envelope = envelope * np.exp(kind.bursts * level - kind.bursts**2)
     white = envelope[:, None] * axes * rng.standard_normal((count, 6)) if kind.rumble > 0 else np.zeros((count, 6))
     w = 2 * math.pi * ROAD_HZ
-    b, a = bilinear([1.0], [1.0, 2 * ROAD_DAMPING * w, w * w], NODE_HZ)
-    x = _through_mount(kind, np.asarray(lfilter(b, a, white, axis=0)) / _acceleration_rms(b, a))
+    b, a = scipy.signal.bilinear([1.0], [1.0, 2 * ROAD_DAMPING * w, w * w], NODE_HZ)
+    x = _through_mount(kind, np.asarray(scipy.signal.lfilter(b, a, white, axis=0)) / _acceleration_rms(b, a))
     if kind.rattle > 0 and kind.rattle_per_minute > 0:
         knocks = rng.random(count) < kind.rattle_per_minute / 60 / NODE_HZ
         w, z = 2 * math.pi * kind.rattle_hz, 0.08
-        b, a = bilinear([w * w], [1.0, 2 * z * w, w * w], NODE_HZ)
+        b, a = scipy.signal.bilinear([w * w], [1.0, 2 * z * w, w * w], NODE_HZ)
         height = kind.rattle / w**2 * np.exp(0.6 * rng.standard_normal((count, 6))) * rng.choice((-1, 1), (count, 6))
-        x += _through_mount(kind, np.asarray(lfilter(b, a, knocks[:, None] * height, axis=0)) * NODE_HZ / w)
+        hit = np.asarray(scipy.signal.lfilter(b, a, knocks[:, None] * height, axis=0))
+        x += _through_mount(kind, hit * NODE_HZ / w)
     return x
 
 
 def _acceleration_rms(b: Array, a: Array) -> float:
     """RMS of the second derivative of filtered white noise of size one at the nodes."""
-    f, H = freqz(b, a, worN=2048, fs=NODE_HZ)
+    f, H = scipy.signal.freqz(b, a, worN=2048, fs=NODE_HZ)
     return float(np.sqrt(np.mean(np.abs((2 * math.pi * f) ** 2 * H) ** 2)))
 
 
@@ -276,8 +276,8 @@ def _through_mount(kind: Shaking, x: Array) -> Array:
     if kind.mount_hz == 0:
         return x
     w, z = 2 * math.pi * kind.mount_hz, kind.mount_damping
-    b, a = bilinear([2 * z * w, w * w], [1.0, 2 * z * w, w * w], NODE_HZ)
-    return np.asarray(lfilter(b, a, x, axis=0))
+    b, a = scipy.signal.bilinear([2 * z * w, w * w], [1.0, 2 * z * w, w * w], NODE_HZ)
+    return np.asarray(scipy.signal.lfilter(b, a, x, axis=0))
 
 
 def gain(kind: Shaking, f: Array) -> Array:
@@ -288,7 +288,9 @@ def gain(kind: Shaking, f: Array) -> Array:
     return np.sqrt((1 + (2 * z * r) ** 2) / ((1 - r**2) ** 2 + (2 * z * r) ** 2))
 
 
-def sway(rng: np.random.Generator, kind: Shaking, end: float, load: Callable[[Array], tuple[Array, Array]]) -> BSpline:
+def sway(
+    rng: np.random.Generator, kind: Shaking, end: float, load: Callable[[Array], tuple[Array, Array]]
+) -> scipy.interpolate.BSpline:
     """Roll, pitch, yaw [rad] by which the mount swings out: ω²/(s² + 2ζωs + ω²) of what the load asks for.
 
     How it hangs is drawn: the share of each angle.
@@ -298,8 +300,8 @@ def sway(rng: np.random.Generator, kind: Shaking, end: float, load: Callable[[Ar
     share = rng.uniform(0.3, 1.0, 3) * (1, 1, 0.5)
     asked = kind.sway * share * np.stack((-right, forward, right), -1)
     w, z = 2 * math.pi * kind.sway_hz, kind.sway_damping
-    b, a = bilinear([w * w], [1.0, 2 * z * w, w * w], NODE_HZ / 2)
-    return make_interp_spline(nodes, lfilter(b, a, asked, axis=0), k=5)
+    b, a = scipy.signal.bilinear([w * w], [1.0, 2 * z * w, w * w], NODE_HZ / 2)
+    return scipy.interpolate.make_interp_spline(nodes, scipy.signal.lfilter(b, a, asked, axis=0), k=5)
 
 
 def limited(size: Array) -> Array:
@@ -311,7 +313,7 @@ def _smoothed(x: Array, nodes: float) -> Array:
     """Twice through a first-order lag of so many nodes, from the steady state of x₀: no corners, no overshoot."""
     keep = math.exp(-2 / max(nodes, 1e-9))
     for _ in range(2):
-        x = lfilter([1 - keep], [1, -keep], x, zi=keep * x[:1])[0]
+        x = scipy.signal.lfilter([1 - keep], [1, -keep], x, zi=keep * x[:1])[0]
     return x
 
 
@@ -319,5 +321,5 @@ def _slow(rng: np.random.Generator, count: int, seconds: float) -> Array:
     """A smooth random process of about size one at the coarse nodes, limited to ±2.5."""
     keep = math.exp(-1 / (seconds * TONE_HZ))
     first, steps = keep * rng.standard_normal(1), math.sqrt(1 - keep**2) * rng.standard_normal(count)
-    drawn = lfilter([1.0], [1.0, -keep], steps, zi=first)[0]
+    drawn = scipy.signal.lfilter([1.0], [1.0, -keep], steps, zi=first)[0]
     return _smoothed(np.clip(drawn, -2.5, 2.5), TONE_HZ / 2)
