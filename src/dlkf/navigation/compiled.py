@@ -257,6 +257,12 @@ def _gravity(p, stretching, centre, axis, shape, equator, somigliana, eccentrici
 @njit()
 @no_type_check
 def _mechanise(p0, v0, C0, imu, g, w, dt, p, v, C):
+    """Sample by sample what ``strapdown`` says of a window.
+
+    A = C₀ R, the attitude in axes that do not turn with the Earth; S, P velocity and position that the specific force
+    has given since the window's start; Coriolis' part of both (``swing``) follows from the motion without it, and
+    attitude turns back by the Earth's rotation since the start.
+    """
     B, M, _ = imu.shape
     zero = 0.0, 0.0, 0.0
     for b in range(B):
@@ -290,6 +296,11 @@ def _mechanise(p0, v0, C0, imu, g, w, dt, p, v, C):
 @njit()
 @no_type_check
 def _sensor_columns(C0, v0, C, v, g, samples, dt, elements, out):
+    """What a unit error of every sensor column c does to the window's end, sum over its samples.
+
+    An accelerometer's error f along C e_c changes velocity at once and position over what is ``left`` of the window;
+    a gyroscope's w has tilted the attitude by ``swept`` so far, which turns the velocity ``gained`` in a sample.
+    """
     B, M = v.shape[:2]
     e = len(elements)
     turned, swept = np.empty((3, 3)), np.zeros((3, 3 + e))
@@ -302,7 +313,7 @@ def _sensor_columns(C0, v0, C, v, g, samples, dt, elements, out):
                 gained[i] = v[b, k, i] - (v[b, k - 1, i] if k else v0[b, i]) - g[b, i] * dt
                 for j in range(3):
                     turned[i, j] = 0.5 * dt * ((C[b, k - 1, i, j] if k else C0[b, i, j]) + C[b, k, i, j])
-            for n in range(3 + e):
+            for n in range(3 + e):  # biases, whose errors are 1, then elements (c, d), whose are the samples of axis d
                 if n < 3:
                     c, f, w = n, 1.0, 1.0
                     to_f, to_w = n, 3 + n
@@ -311,7 +322,7 @@ def _sensor_columns(C0, v0, C, v, g, samples, dt, elements, out):
                     f, w = samples[b, k, elements[n - 3, 1]], samples[b, k, 3 + elements[n - 3, 1]]
                     to_f, to_w = 3 + n, 3 + e + n
                 for i in range(3):
-                    column[i] = swept[i, n] + 0.5 * w * turned[i, c]
+                    column[i] = swept[i, n] + 0.5 * w * turned[i, c]  # at the sample's middle
                     swept[i, n] += w * turned[i, c]
                 lever[0] = gained[1] * column[2] - gained[2] * column[1]
                 lever[1] = gained[2] * column[0] - gained[0] * column[2]

@@ -44,6 +44,8 @@ def _rotated_back(A, k, u):
 @njit()
 @no_type_check
 def _adjoint(C0, imu, gradient, w, Gp, Gv, GC, dt, grad_p0, grad_v0, turn, grad_imu):
+    """V, U: what velocity and position that a sample's force gives are worth to all later ends of samples; T: what a
+    small turn of the attitude is. Gp, Gv, GC with Coriolis' part (``Hp``, ``Hv``) add to them on the way back."""
     B, M, _ = imu.shape
     first = M - GC.shape[1]
     A = np.empty((M + 1, 3, 3))  # C₀ R before the first sample and at the end of each
