@@ -94,7 +94,7 @@ def _engine(where: int | str) -> Iterator[Any]:
                 yield joblib.Parallel(n_jobs=-1, backend=backend, **options)
         else:
             with _heard(where), joblib.parallel_config(where):
-                backend, _ = joblib.parallel.get_active_backend()
+                backend: Any = joblib.parallel.get_active_backend()[0]
             if backend.supports_return_generator:
                 yield joblib.Parallel(n_jobs=-1, backend=backend, **options)
             else:

@@ -281,13 +281,24 @@ def postgresql():
             process.wait(60)
 
 
+def slurm_nodes() -> list[str]:
+    """What this machine's Slurm has, one line a partition; none where there is no Slurm, or it does not answer."""
+    if shutil.which("sinfo") is None:
+        return []
+    return subprocess.run(["sinfo", "--noheader", "--states=idle"], capture_output=True, text=True).stdout.splitlines()
+
+
 @pytest.mark.served
-def test_a_sweep_of_slurms_launcher_into_postgresql(postgresql, tmp_path, monkeypatch):
-    """``submitit_local``, which is ``submitit_slurm`` without Slurm: a process per point, into one real PostgreSQL."""
+@pytest.mark.parametrize("launcher", ["submitit_local", "submitit_slurm"])
+def test_a_sweep_of_slurms_launcher_into_postgresql(launcher, postgresql, tmp_path, monkeypatch):
+    """A job per point, or a process in its place where there is no Slurm, into one real PostgreSQL."""
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    if launcher == "submitit_slurm" and not slurm_nodes():
+        pytest.skip("no Slurm with a free node here")
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv(PARENT_RUN, raising=False)
     monkeypatch.delenv(SWEPT, raising=False)
     client = mlflow_module().MlflowClient(postgresql)
     client.search_experiments()  # makes the tables
-    swept(tmp_path, client, "hydra/launcher=submitit_local", MLFLOW_TRACKING_URI=postgresql)
+    given = ("hydra.launcher.cpus_per_task=1",) if launcher == "submitit_slurm" else ()
+    swept(tmp_path, client, f"hydra/launcher={launcher}", *given, MLFLOW_TRACKING_URI=postgresql)

@@ -95,4 +95,5 @@ def test_the_command_on_two_processes_leaves_the_same_table(dataset, tmp_path):
         average = next(v["average"] for k, v in state.items() if k.startswith("AdaptiveLossWeights"))
         losses.append([average[term] for term in sorted(average)])
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)
-    assert len(tables[0]) > 20 and tables[0] == pytest.approx(tables[1], rel=1e-5, abs=1e-9)
+    # a slope near zero is a difference of larger numbers, of which 5e-8 has been seen
+    assert len(tables[0]) > 20 and tables[0] == pytest.approx(tables[1], rel=1e-5, abs=1e-7)
