@@ -12,6 +12,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import jaxtyping
 import pytest
 
 from dlkf.command.composing import composed
@@ -24,6 +25,23 @@ from tests.drives import drives_in
 from tests.shell import Ended
 
 SIZE = ("dataset.hours=0.05", "dataset.drive_minutes=1.5", "dataset.imu_rate_hz=50", "seed=3")
+
+
+SHAPES_CHECKED = {"data", "filters", "navigation", "running", "simulation"}  # rooms of pure functions and of the loop
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Shapes and types are checked where functions are tested one by one; studies and commands, which call the same
+    functions by the thousand, run as a user's do, in half of the time."""
+    room = item.path.relative_to(Path(__file__).parent).parts[0]
+    jaxtyping.config.update("jaxtyping_disable", room not in SHAPES_CHECKED)
+
+
+@pytest.fixture
+def without_shape_checks(monkeypatch):
+    """For a test that runs a filter for thousands of epochs."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.fixture(scope="session")

@@ -78,11 +78,12 @@ OPTIONS = {
 }
 CASES = [(p, option) for p in GROUPS for option in OPTIONS[p] if option != ["imu=auto"] or p == "navigate"]
 CASES = [(p, [*o, "++dataset.imu_errors=wide"] if (p, o) == ("simulate", ["imu=wide"]) else o) for p, o in CASES]
-CASES += [  # a preset of the others replaces one node whole, so its composition alone is enough
-    ("train", [*option, *experiment])
+CASES += [("train", experiment) for experiment in EXPERIMENTS]
+CASES += [  # profiles and noises set numbers only, and a preset of the others replaces one node whole
+    ("train", [*option, f"+experiment={experiment}"])
     for option in OPTIONS["train"]
-    for experiment in EXPERIMENTS
-    if not option or option[0].startswith(("data=", "filter@"))
+    for experiment in presets("experiment")
+    if option and option[0].startswith(("data=", "filter@"))
 ]
 
 

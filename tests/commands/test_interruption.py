@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -108,9 +109,10 @@ TRAIN = (
 )  # fmt: skip
 
 
-def test_train(town, tmp_path):
+def test_train(town, template, tmp_path):
     """SIGTERM in the middle of the training: the exit code says so, and MLflow's run is no longer running."""
     (tmp_path / "town").symlink_to(town)
+    shutil.copy(template, tmp_path / "mlflow.db")
     assert stopped(tmp_path, "outputs/train/town/*/last.ckpt", signal.SIGTERM, *TRAIN) == 143
     with closing(sqlite3.connect(tmp_path / "mlflow.db")) as store:
         assert store.execute("select status from runs").fetchall() == [("KILLED",)]

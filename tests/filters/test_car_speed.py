@@ -75,6 +75,7 @@ def test_a_car_that_tells_its_speed_is_believed_and_one_that_does_not_is_not():
     assert rms[0] < 2.0 < 3.0 < rms[1] and std[0].mean() < 2.5 and std[1].mean() > 3.5
 
 
+@pytest.mark.usefixtures("without_shape_checks")
 def test_what_was_learned_long_ago_fades_to_the_prior():
     listener = model()
     known = listener.begin(1)

@@ -21,6 +21,8 @@ from dlkf.running.likelihood import Evidence, Found, Placing, find_noise, placed
 from dlkf.running.start import align
 from tests.cars import IMU, car_batch, write_pieces
 
+pytestmark = pytest.mark.usefixtures("without_shape_checks")  # searches run the filters some hundred times
+
 
 @pytest.fixture(scope="module")
 def long_town(tmp_path_factory) -> Path:
@@ -85,7 +87,7 @@ def coarse(monkeypatch):
 
 
 @pytest.mark.parametrize(("delay_s", "arm_m", "near"), [
-    (0.0, 0.0, (0.04, 0.0)), (0.05, 0.0, (0.08, 0.0)), (0.2, 0.0, (0.16, 0.0)), (0.0, 0.5, (0.04, 0.0)),
+    (0.0, 0.0, (0.04, 0.0)), (0.05, 0.0, (0.08, 0.0)), (0.0, 0.5, (0.04, 0.0)),
 ])  # fmt: skip
 def test_a_delay_is_told_from_a_wrong_lever_arm(long_town, tmp_path, delay_s, arm_m, near):
     """The IMU's clock runs ``delay_s`` behind, so fixes come late by as much; the arm is told ``arm_m`` too long.

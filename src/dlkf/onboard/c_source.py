@@ -34,7 +34,7 @@ def write_source(
     ``loop_alone`` leaves out what turns fixes and solutions into those of a vehicle, which takes most of the time.
     Raises InputError for a filter that cannot be exported.
     """
-    with _exporting():
+    with exporting():
         layout = carried_by(estimator, grid)
         functions: dict[str, type[Function]] = {"turn": Turn}
         if not loop_alone:
@@ -121,7 +121,8 @@ def _number(x: np.generic) -> str:
 
 
 @contextmanager
-def _exporting() -> Iterator[None]:
+def exporting() -> Iterator[None]:
+    """Inside the block filters run as ``torch.export`` can record them."""
     with compiled.tensor_forms(), torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # of torch about torch
         yield
