@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -27,7 +28,8 @@ def ablations(folder: Path, *words: str) -> subprocess.CompletedProcess:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, env=os.environ | paths)
 
 
-def test_rows_are_trained_once_and_end_in_a_table(tmp_path):
+def test_rows_are_trained_once_and_end_in_a_table(template, tmp_path):
+    shutil.copy(template, tmp_path / "mlflow.db")
     write_cars(tmp_path / "town", 5, seconds=90.0)
     first = ablations(tmp_path, "--rows", "base", *SMALL)
     assert first.returncode == 0, first.stdout + first.stderr
