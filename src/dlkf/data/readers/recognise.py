@@ -240,7 +240,7 @@ def _imu_by_numbers(frame: pd.DataFrame) -> Spec | None:
         return None
     triads = {"accel": accel, "gyro": beside[0]}
     out: Spec = {key: {"columns": [str(frame.columns[k + j]) for j in range(3)]} for key, k in triads.items()}
-    return {"time": {"column": str(frame.columns[column]), "unit": unit}, "increments": apart(accel)[1], **out}
+    return {"time": {"column": str(frame.columns[column]), "unit": unit}, "increments": bool(apart(accel)[1]), **out}
 
 
 def _gnss_by_numbers(frame: pd.DataFrame) -> Spec | None:
