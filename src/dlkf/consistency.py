@@ -1,4 +1,4 @@
-"""NEES and NIS of Kalman filters: ``python -m dlkf.consistency 'model=[mbkf15,mbkf21]' imu=consumer drives=100``.
+"""NEES and NIS of filters with a covariance: ``python -m dlkf.consistency 'model=[mbkf15,mbkf21]' imu=consumer drives=100``.
 
 Simulates, for every filter, drives with the IMU errors that it models, and leaves table.md, consistency.png and
 consistency.json in ``out``.
@@ -19,20 +19,20 @@ from dlkf.diagnosis.matched_drives import matched_batch, matching
 from dlkf.errors import InputError
 from dlkf.evaluation.table import as_rich
 from dlkf.files import vacant
-from dlkf.filters.build import build_filter
-from dlkf.filters.model_based import Mbkf
+from dlkf.filters.model_based import has_covariance
+from dlkf.models import resolve_model, resolve_models
 
 
 @command("consistency", ConsistencySettings)
 def main(told: ConsistencySettings) -> None:
     """Simulate, run, compare, write, print."""
-    names = told.models
     vacant(told.out, overwrite=told.overwrite)
     settings, preset, plan = told.matched, told.spec, told.outage
-    states = {name: states_of(name, build_filter(name, preset, tuning=told.tuning)) for name in names}
+    asked = resolve_models(told.models, preset, tuning=told.tuning)
+    states = {name: states_of(name, model) for name, model in asked.items()}
     results: dict[str, Normalised] = {}
     outage = None
-    for name in names:
+    for name, model in zip(asked, told.models, strict=True):
         spec = matching(preset, states[name])
         with counting(f"Simulating for {name}") as progress:
             batch, matrices = matched_batch(settings, spec, progress)
@@ -42,9 +42,9 @@ def main(told: ConsistencySettings) -> None:
                 raise InputError(f"no outage fits into {settings.minutes:g} minutes; see outage.* and minutes")
             batch, outage = withhold(batch, mask), mask[0].numpy()
         with counting(f"Running {name}") as progress:
-            kalman = build_filter(name, spec, tuning=told.tuning)
-            assert isinstance(kalman, Mbkf)  # as ``states_of`` has seen
-            results[name] = consistency(kalman, batch, matrices, progress)
+            estimator = resolve_model(model, spec, tuning=told.tuning)
+            assert has_covariance(estimator)  # as ``states_of`` has seen
+            results[name] = consistency(estimator, batch, matrices, progress)
     title = f"{settings.drives} simulated drives of {settings.minutes:g} min, IMU {preset.name}, errors as modelled"
     table = consistency_table(results, told.settle_s, title)
     write_consistency(told.out, results, table, outage)

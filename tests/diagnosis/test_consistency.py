@@ -83,6 +83,8 @@ def test_the_command_writes_table_picture_and_numbers(call):
     assert set(series) == {"mbkf15", "mbkf21_car"} and series["mbkf15"]["innovation"][20] is None
     done = call("consistency", "chassis=wide", "model=mbkf15", "out=any", *size)  # cars drawn from ranges
     assert done.code == 0, done.err
+    done = call("consistency", "model=plus", "out=learned", *size)
+    assert done.code == 0 and "plus" in json.loads(Path("learned/consistency.json").read_text()), done.err
     done = call("consistency", "model=ins", "out=nowhere", *size)
     assert done.code == 2 and "model ins has no covariance" in done.err and not Path("nowhere").exists()
     done = call("consistency", "model=mbkf15", "out=nowhere", "drives=1")

@@ -124,3 +124,13 @@ def test_an_unknown_operation_is_named(tmp_path):
 
     with torch.no_grad(), pytest.raises(InputError, match=r"aten\.sort.*does not know"):
         function_in_c("tested", Sorted(), tmp_path)
+
+
+@pytest.mark.parametrize("other", [{"stride": 2}, {"dilation": 2}, {"groups": 2}])
+def test_a_convolution_that_is_not_the_plain_one_is_refused(other, tmp_path):
+    class Other(Layers):
+        def forward(self, x):
+            return nn.functional.conv1d(x, torch.ones(2, 4 // other.get("groups", 1), 3).double(), **other)
+
+    with torch.no_grad(), pytest.raises(InputError, match="stride, dilation and groups 1"):
+        function_in_c("tested", Other(), tmp_path)

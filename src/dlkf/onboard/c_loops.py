@@ -266,8 +266,13 @@ def _largest(t: Tensors, node: Node, x: Any, dim: int = -1, keepdim: bool = Fals
     return out
 
 
-def _convolved(t: Tensors, node: Node, X: Any, W: Any, bias: Any, stride: list, padding: list, *_: Any) -> View:
-    """Over one axis, stride 1, zeros outside."""
+def _convolved(
+    t: Tensors, node: Node, X: Any, W: Any, bias: Any,
+    stride: list, padding: list, dilation: list, transposed: bool, _: list, groups: int,
+) -> View:  # fmt: skip
+    """Over one axis, zeros outside. InputError for strides, dilation, groups, transposition."""
+    if not stride == dilation == [1] or transposed or groups != 1:
+        raise InputError(f"this network has a convolution other than of stride, dilation and groups 1, which {UNKNOWN}")
     x, w, (out, value) = t.tensor(X), t.tensor(W), _new(t, node)
     (inward, M), (outward, _inward, taps), pad, n = x.meta.shape[1:], w.meta.shape, padding[0], value.shape[2]
     b = [] if bias is None else [t.tensor(bias)]

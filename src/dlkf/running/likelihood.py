@@ -21,7 +21,7 @@ holds for neighbouring innovations that hang together.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -30,6 +30,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
+from dlkf.console import Counted
 from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.masks import withhold
@@ -206,7 +207,7 @@ def find_noise(
     *,
     delay: bool = True,
     called: str = "found",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Counted | None = None,
 ) -> Found:
     """The noise under which the fixes are most likely, for the Kalman filter of this name.
 
@@ -222,13 +223,13 @@ def find_noise(
     directions = [tuple(k for k in x if k.startswith(s)) for s in ("accel", "gyro")] + [(k,) for k in x]
     pace = evidence.pace
     shifts = [Placing(DELAY_STEP_S * late, DELAY_STEP_S * pace * ahead) for late, ahead in WAYS]
-    done, most = 0, 4 * len(STEPS) * len(directions)
+    done = 0
 
     def judged(values: Mapping[str, float], placing: Placing) -> float:
         nonlocal done
         done += 1
         if progress is not None:
-            progress(min(done, most), most)
+            progress(done, None)  # how many it takes is known at the end alone
         if any(values[k] > limit for k, limit in LARGEST.items()) or not 0 <= placing.delay_s <= LONGEST_DELAY_S:
             return math.inf
         away = sum(0.5 * (math.log(v / start[k]) / usual[k]) ** 2 for k, v in values.items())
