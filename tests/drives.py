@@ -1,11 +1,17 @@
-"""Simulated drives of a mapping with the keys of ``conf/simulate.yaml``."""
+"""Simulated drives, on disk or in memory."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-from dlkf.simulation.dataset import Recipe, recipe, simulate
+import torch
+
+from dlkf.data.drive import Drive
+from dlkf.data.store import drive_from_tables
+from dlkf.data.tables import DriveRow
+from dlkf.data.validate import DriveTables
+from dlkf.simulation.dataset import Recipe, drive_of, recipe, simulate
 
 
 def recipe_of(config: dict[str, Any]) -> Recipe:
@@ -18,3 +24,16 @@ def drives_in(config: dict[str, Any], out: Path, **options: Any) -> Path:
     """The dataset, in ``out``."""
     given = {key: config[key] for key in ("workers", "parallel") if key in config}
     return simulate(recipe_of(config), out, progress=False, **given, **options)
+
+
+def tables_in_memory(made_by: Recipe, index: int, seconds: int) -> DriveTables:
+    """Drive ``index`` of the dataset, never written."""
+    tables, row = drive_of(made_by, index, seconds)
+    columns = ({str(c): t[c].to_numpy(copy=True) for c in t} for t in (tables.imu, tables.gnss, tables.reference))
+    arm = tuple(row[f"lever_arm_{axis}_m"] for axis in "xyz")
+    return DriveTables(DriveRow(row["drive"], row["group"], arm), *columns)
+
+
+def drive_in_memory(made_by: Recipe, index: int, seconds: int, dtype: torch.dtype = torch.float32) -> Drive:
+    """The same at 50 Hz, in epochs of a second."""
+    return drive_from_tables(tables_in_memory(made_by, index, seconds), "memory", 50.0, 1.0, dtype)

@@ -1,4 +1,4 @@
-"""NEES and NIS of filters with a covariance: ``python -m dlkf.consistency 'model=[mbkf15,mbkf21]' imu=consumer drives=100``.
+"""NEES and NIS of filters: ``python -m dlkf.consistency 'model=[mbkf15,plus]' imu=consumer drives=100``.
 
 Simulates, for every filter, drives with the IMU errors that it models, and leaves table.md, consistency.png and
 consistency.json in ``out``.

@@ -15,7 +15,7 @@ from dlkf.filters.plus import PlusFilter
 from dlkf.filters.shipped import WEIGHTS_FOLDER, shipped_folder, trained_filter
 from dlkf.models import resolve_model, short_name
 from dlkf.running.start import aligned_drives
-from dlkf.simulation.fresh import fresh_drives
+from tests.drives import drive_in_memory
 
 from .scene import IMU
 from .test_constraints import slipping
@@ -78,8 +78,7 @@ class _Told(NamedTuple):
 
 def _told(words: list[str]) -> _Told:
     made_by = composed_recipe("simulated@dataset=lifelike", "seed=5", *words)
-    (drive,) = fresh_drives(made_by, 0, 1, seconds=300, dtype=torch.float64)
-    batch = aligned_drives([drive])
+    batch = aligned_drives([drive_in_memory(made_by, 0, 300, torch.float64)])
     with torch.no_grad():
         speed = integrate(batch, trained_filter("plus")).speed[0, -120:]
     truth = (batch.truth.C_nb[0, :, :, 0] * batch.truth.v_n[0]).sum(-1)[-120:]

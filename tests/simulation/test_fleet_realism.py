@@ -4,13 +4,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from pipelines.studies import fleet_realism as study
+from tests.drives import tables_in_memory
 
 from dlkf.command.simulated import composed_recipe
 from dlkf.data.schema import ACCEL, GYRO
-from dlkf.data.tables import DriveRow
-from dlkf.data.validate import DriveTables
-from dlkf.simulation.dataset import drive_of, simulate
-from dlkf.simulation.tables import columns_of
+from dlkf.simulation.dataset import simulate
 
 
 def test_a_tone_has_its_level_in_its_band_and_nowhere_else():
@@ -30,9 +28,7 @@ def test_the_delay_of_the_velocity_is_seen(lag):
     """Within 0.1 s, though an updating filter takes part of it for its own error."""
     late = f"+dataset.gnss.velocity_lag_s={lag}"
     made_by = composed_recipe("simulated@dataset=per_drive", late, "imu=consumer", "seed=3")
-    tables, _ = drive_of(made_by, 0, 200)
-    columns = (columns_of(table) for table in (tables.imu, tables.gnss, tables.reference))
-    found = study.of_innovations(DriveTables(DriveRow("a", "a", (0.0, 0.0, 0.0)), *columns))
+    found = study.of_innovations(tables_in_memory(made_by, 0, 200))
     assert found["velocity's delay by its innovations [s]"] == pytest.approx(lag, abs=0.1)
 
 

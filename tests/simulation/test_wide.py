@@ -1,4 +1,4 @@
-"""The wide fleet: each drive another world, fixed values leave the rest alone, drives in memory are those on disk."""
+"""The wide fleet: each drive another world, fixed values leave the rest alone."""
 
 import json
 
@@ -6,12 +6,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from tests.drives import drive_in_memory
 
 from dlkf.command.simulated import composed_recipe
 from dlkf.data.store import load_dataset
 from dlkf.errors import InputError
 from dlkf.simulation.dataset import simulate
-from dlkf.simulation.fresh import fresh_drives
 
 SHORT = ("dataset.hours=0.05", "dataset.drive_minutes=1", "seed=4")
 
@@ -39,19 +39,18 @@ def test_every_drive_is_a_world_of_its_own_and_says_which(fleet):
     assert len(load_dataset(fleet, drives=[drives["drive"][0]])) == 1  # passes the checks of the contract
 
 
-def test_drives_in_memory_are_those_of_the_dataset(fleet):
-    """To the bit: nothing but Parquet, which keeps float64, lies between them."""
-    loaded = load_dataset(fleet, rate_hz=50.0)
-    fresh = fresh_drives(wide(), 1, 2, workers=2)
-    for one, other in zip(loaded[1:], fresh, strict=True):
-        assert one.name == other.name and one.t0 == other.t0
-        for name in ("imu", "gnss_r_e", "gnss_std", "gnss_valid", "ref_C_eb", "ref_imu_error", "lever_arm_b"):
-            assert torch.equal(torch.nan_to_num(getattr(one, name)), torch.nan_to_num(getattr(other, name))), name
+def test_a_drive_depends_on_its_number_alone(fleet):
+    """Made by itself it is that of the whole dataset, to the bit: nothing but Parquet, which keeps float64, lies
+    between them."""
+    one, other = load_dataset(fleet, rate_hz=50.0)[2], drive_in_memory(wide(), 2, 60)
+    assert one.name == other.name and one.t0 == other.t0
+    for name in ("imu", "gnss_r_e", "gnss_std", "gnss_valid", "ref_C_eb", "ref_imu_error", "lever_arm_b"):
+        assert torch.equal(torch.nan_to_num(getattr(one, name)), torch.nan_to_num(getattr(other, name))), name
 
 
 def test_a_fixed_value_leaves_the_rest_of_the_fleet_alone():
     """The calm fleet has the same roads and units; only what vibrates is gone."""
-    shaken, calm = fresh_drives(wide(), 0, 2), fresh_drives(wide(name="calm"), 0, 2)
+    shaken, calm = ([drive_in_memory(made_by, k, 60) for k in range(2)] for made_by in (wide(), wide(name="calm")))
     for one, other in zip(shaken, calm, strict=True):
         known = one.ref_valid & other.ref_valid
         apart = (one.ref_r_e - other.ref_r_e)[known].norm(dim=-1)
@@ -100,5 +99,3 @@ def test_odd_ranges_are_one_clear_line(overrides, words):
         for k in range(20):
             made_by.of_drive(np.random.SeedSequence(0, spawn_key=(k,)))
     assert "\n" not in str(caught.value)
-    with pytest.raises(InputError, match="fresh drives"):
-        fresh_drives(wide(), 0, 0)

@@ -15,7 +15,7 @@ from dlkf.config import config_dir
 ADDS = ("++", "+", "~")  # before a key, to Hydra
 
 
-def completed(command: str, word: str, before: Sequence[str] = ()) -> list[str]:
+def completed(command: str, word: str, before: Sequence[str]) -> list[str]:
     """Whole words that begin with ``word``; ``before``: the words between the command and it, whose presets count.
 
     ``imu`` is both a group and a mapping, so it gives ``imu=`` and ``imu.``.

@@ -89,7 +89,7 @@ class Rough:
     velocity: tuple[float, ...] = (0.01, 0.3)
 
 
-def roughen(batch: Batch, rough: Rough, generator: torch.Generator | None = None) -> Batch:
+def roughen(batch: Batch, rough: Rough, generator: torch.Generator) -> Batch:
     """The batch with the IMU and the receiver of each piece made worse as ``rough`` says, by chance."""
     B, T, M = batch.size
 

@@ -64,7 +64,7 @@ def ingest(
     out: str | Path,
     how: Intake,
     *,
-    parallel: int | str | None = None,
+    parallel: int | str | None,
     **options: Any,
 ) -> int:
     """:func:`ingest_drives` of what a reader makes of ``source``; one that knows the places of its drives
@@ -139,7 +139,7 @@ def _agreed(values: Sequence[Any]) -> Any:
     return first if all(v == first for v in values) else "auto"
 
 
-def split_at_gaps(drive: DriveFrames, shortest_s: float, limits: Limits = LIMITS) -> Iterator[DriveFrames]:
+def split_at_gaps(drive: DriveFrames, shortest_s: float, limits: Limits) -> Iterator[DriveFrames]:
     """The parts of a drive between its IMU gaps; the drive itself where it has none."""
     t = drive.imu["t"].to_numpy()
     gaps = gap_rows(t, limits)

@@ -17,7 +17,7 @@ GNSS_COLUMNS = (*POSITION, *VELOCITY, *STD, "quality")
 NEEDED = ("t", *IMU_COLUMNS, *POSITION)
 
 
-def drives_of(rows: pd.DataFrame, lever_arm_b: Sequence[float] = (0.0, 0.0, 0.0)) -> Iterator[DriveTables]:
+def drives_of(rows: pd.DataFrame, lever_arm_b: Sequence[float]) -> Iterator[DriveTables]:
     """The checked tables of every ``drive`` in the rows (one drive where there is no such column).
 
     Columns are those of the data contract; ``vel_*``, ``std_*`` and ``quality`` (default 1, single) may be missing.
@@ -45,9 +45,9 @@ def _values(table: pd.DataFrame, column: str) -> np.ndarray:
     return table[column].to_numpy(dtype=np.float64, na_value=np.nan)
 
 
-def example_drive(rate_hz: float = 50.0, seconds: float = 12.0) -> pd.DataFrame:
-    """A car at a steady 10 m/s northwards, with a fix a second: what a table of a drive looks like, and works."""
-    t = np.arange(1, round(rate_hz * seconds) + 1) / rate_hz
+def example_drive() -> pd.DataFrame:
+    """What a table of a drive looks like, and works: 10 m/s northwards, 12 s at 50 Hz, a fix a second."""
+    t = np.arange(1, 601) / 50.0
     rows = pd.DataFrame({"drive": "example", "t": t} | dict.fromkeys(IMU_COLUMNS, 0.0))
     rows["accel_z"] = -9.806
     fixed = np.isclose(t % 1.0, 0.0) | np.isclose(t % 1.0, 1.0)

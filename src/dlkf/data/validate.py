@@ -97,7 +97,7 @@ def fixes(gnss: Columns) -> Columns:
     return {column: values[fixed] for column, values in gnss.items()}
 
 
-def gap_rows(t: np.ndarray, limits: Limits = LIMITS) -> np.ndarray:
+def gap_rows(t: np.ndarray, limits: Limits) -> np.ndarray:
     """Rows before which the IMU has a gap."""
     if len(t) < 2:
         return np.zeros(0, dtype=np.int64)

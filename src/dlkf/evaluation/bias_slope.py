@@ -24,7 +24,7 @@ def injected_response(
     scenes: Iterable[Scene],
     *,
     law: BiasLaw,
-    seed: int = 0,
+    seed: int,
     total: int | None = None,
     progress: Counted | None = None,
 ) -> tuple[Array, dict[str, Array]]:

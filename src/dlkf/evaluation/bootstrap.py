@@ -27,6 +27,7 @@ from dlkf.evaluation.metrics import LEAST_LOG, Array
 
 STATISTICS = ("rms", "mean", "median", "geomean")
 MIN_GROUPS = 8  # with fewer recordings, or independent pieces, than this there is no interval
+CONFIDENCE = 0.95  # of every interval
 _CELLS = 4_000_000  # weights held at a time
 
 
@@ -94,18 +95,18 @@ def resampled_weights(groups: NDArray[np.int64], resamples: int, generator: np.r
         yield generator.multinomial(G, np.full(G, 1 / G), size=rows)[:, groups].astype(float)
 
 
-def levels(groups: int, confidence: float = 0.95) -> tuple[float, float]:
+def levels(groups: int) -> tuple[float, float]:
     """Percentiles of the resamples that bound the interval: Φ(√(G/(G−1)) t) with t of G − 1 degrees of freedom."""
-    t = stdtrit(groups - 1, 0.5 * (1 + confidence)) * np.sqrt(groups / (groups - 1))
+    t = stdtrit(groups - 1, 0.5 * (1 + CONFIDENCE)) * np.sqrt(groups / (groups - 1))
     return 100 * float(ndtr(-t)), 100 * float(ndtr(t))
 
 
-def _interval(values: Array, groups: int, confidence: float) -> tuple[float, float]:
+def _interval(values: Array, groups: int) -> tuple[float, float]:
     known = values[~np.isnan(values)]
     if not known.size:
         return np.nan, np.nan
     method = "linear" if np.isfinite(known).all() else "nearest"
-    low, high = np.percentile(known, levels(groups, confidence), method=method)
+    low, high = np.percentile(known, levels(groups), method=method)
     return float(low), float(high)
 
 
@@ -116,7 +117,6 @@ def compare(
     statistic: str = "rms",
     groups: Sequence[str] | NDArray[np.str_] | None = None,
     resamples: int = 2000,
-    confidence: float = 0.95,
     seed: int = 0,
 ) -> Comparison:
     """Ratio a/b and difference a − b of a statistic over paired units (U,), with their intervals.
@@ -139,8 +139,8 @@ def compare(
                 ratios.append(ra / rb)
                 differences.append(ra - rb)
         ratio, difference = float(np.divide(sa, sb)), float(np.subtract(sa, sb))
-    (rl, rh), (dl, dh) = (_interval(np.concatenate(x), G, confidence) for x in (ratios, differences))
-    return Comparison(statistic, sa, sb, ratio, rl, rh, difference, dl, dh, len(a), G, confidence)
+    (rl, rh), (dl, dh) = (_interval(np.concatenate(x), G) for x in (ratios, differences))
+    return Comparison(statistic, sa, sb, ratio, rl, rh, difference, dl, dh, len(a), G, CONFIDENCE)
 
 
 def _numbered(groups: NDArray[np.str_]) -> NDArray[np.int64]:
@@ -152,7 +152,6 @@ def rms_band(
     *,
     groups: Sequence[str] | NDArray[np.str_] | None = None,
     resamples: int = 500,
-    confidence: float = 0.95,
     seed: int = 0,
 ) -> tuple[Array, Array, Array]:
     """RMS over units at each column of (U, K), and the bounds of its bootstrap interval; each (K,).
@@ -176,5 +175,5 @@ def rms_band(
             draws.append(np.sqrt((w @ square[:, sure]) / (w @ valid[:, sure].astype(float))))
     every = np.concatenate(draws)
     for k, column in enumerate(sure):
-        low[column], high[column] = _interval(every[:, k], int(counted[column]), confidence)
+        low[column], high[column] = _interval(every[:, k], int(counted[column]))
     return rms, low, high

@@ -52,7 +52,7 @@ def png(figure: Figure, dpi: int = 130) -> bytes:
     return out.getvalue()
 
 
-def all_figures(scores: Scores, *, by_time: bool, baseline: str | None = None) -> Iterator[tuple[str, str, Figure]]:
+def all_figures(scores: Scores, *, by_time: bool, baseline: str | None) -> Iterator[tuple[str, str, Figure]]:
     """(file name, caption, figure) of one kind of data.
 
     ``by_time``: the pieces are alike (same length, outage at the same time), so that an average over them at
@@ -84,7 +84,7 @@ def line_of(scores: Scores, name: str) -> dict[str, Any]:
     return {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[k % len(STYLES)]}
 
 
-def representative(scores: Scores, n: int, filter_name: str | None = None) -> list[int]:
+def representative(scores: Scores, n: int, filter_name: str | None) -> list[int]:
     """Up to n pieces from good to bad: even quantiles of the horizontal error in outages (or anywhere)."""
     run = scores.filters[filter_name or next(iter(scores.filters))]
     size = magnitudes(run.error)["horizontal"]
@@ -178,18 +178,14 @@ def _outage_end(ax: Axes, scores: Scores, i: int) -> None:
     ax.set_title(f"end of the outage, {w.length[k] * scores.epoch_s:g} s without GNSS", fontsize=9)
 
 
-def error_over_time(
-    scores: Scores,
-    pieces: Sequence[int] | None = None,
-    quantities: Sequence[str] = ("horizontal", "velocity", "attitude"),
-) -> Figure:
+def error_over_time(scores: Scores, pieces: Sequence[int] | None = None) -> Figure:
     """RMS over pieces at each time since their start, middle 80 % of the pieces as a band (figs 13, 14).
 
     One piece gives its error itself. Outages are shaded, darker where more pieces have one.
     """
     index = list(range(len(scores.pieces))) if pieces is None else list(pieces)
     sizes = {n: magnitudes(r.error[index]) for n, r in scores.filters.items()}
-    shown = [q for q in quantities if any(np.isfinite(s[q]).any() for s in sizes.values())]
+    shown = [q for q in ("horizontal", "velocity", "attitude") if any(np.isfinite(s[q]).any() for s in sizes.values())]
     figure = Figure(figsize=(9, 2.5 * max(len(shown), 1) + 0.9), layout="constrained")
     axes = figure.subplots(max(len(shown), 1), 1, sharex=True, squeeze=False).ravel()
     length = scores.t[np.flatnonzero(~np.isnan(scores.truth_p_n[index]).all((0, 2)))[-1]]
@@ -270,7 +266,7 @@ def imu_errors(scores: Scores, pieces: Sequence[int]) -> Figure:
     return figure
 
 
-def error_growth(scores: Scores, quantity: str = "horizontal", *, seed: int = 0) -> Figure:
+def error_growth(scores: Scores, quantity: str = "horizontal") -> Figure:
     """RMS over outages against the time without GNSS, with its 95 % bootstrap band."""
     w = scores.windows
     longest = int(w.length.max())
@@ -284,7 +280,7 @@ def error_growth(scores: Scores, quantity: str = "horizontal", *, seed: int = 0)
     banded = False
     for name, run in scores.filters.items():
         x = outage_at(magnitudes(run.error)[quantity] * scale, w, seconds, scores.epoch_s)
-        rms, low, high = rms_band(x, groups=groups, seed=seed)
+        rms, low, high = rms_band(x, groups=groups)
         style = line_of(scores, name)
         ax.plot(seconds, np.where(np.isfinite(rms), rms, np.nan), lw=2, label=name, zorder=3, **style)
         ax.fill_between(seconds, low, high, color=style["color"], alpha=0.15, lw=0, zorder=2)

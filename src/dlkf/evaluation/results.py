@@ -165,7 +165,6 @@ def summarise_scores(
     scores: Scores,
     *,
     settle_s: float = SETTLE_S,
-    into_outage_s: Sequence[float] = INTO_OUTAGE_S,
     baseline: str = BASELINE,
     resamples: int = 2000,
     seed: int = 0,
@@ -181,7 +180,7 @@ def summarise_scores(
     for name in scores.filters:
         samples[name] = _piece_samples(scores, name, settle_s)
         if len(w.piece):
-            samples[name] |= _outage_samples(scores, name, into_outage_s, distance)
+            samples[name] |= _outage_samples(scores, name, distance)
         for (over, part, quantity), x in samples[name].items():
             values += values_of(scores.kinds[0], name, over, part, quantity, summary(x))
         values += _imu_error_quality(scores, name)
@@ -253,11 +252,9 @@ def _piece_samples(scores: Scores, name: str, settle_s: float) -> dict[tuple[str
     return {("pieces", k, q): piece_rms(size[q], mask) for q in QUANTITIES for k, mask in phases.items()}
 
 
-def _outage_samples(
-    scores: Scores, name: str, into_outage_s: Sequence[float], distance: Array
-) -> dict[tuple[str, str, str], Array]:
+def _outage_samples(scores: Scores, name: str, distance: Array) -> dict[tuple[str, str, str], Array]:
     w, size = scores.windows, magnitudes(scores.filters[name].error)
-    seconds = np.asarray(into_outage_s, float)
+    seconds = np.asarray(INTO_OUTAGE_S)
     seconds = seconds[seconds <= w.length.max() * scores.epoch_s + 1e-9]
     at = {q: outage_at(size[q], w, seconds, scores.epoch_s) for q in QUANTITIES}
     end = {q: outage_end(size[q], w) for q in QUANTITIES}

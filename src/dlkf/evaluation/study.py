@@ -68,11 +68,10 @@ def study(
     *,
     kinds: Mapping[str, str] | str,
     groups: Mapping[str, str] | None = None,
-    baseline: str = BASELINE,
     settle_s: float = SETTLE_S,
     injected_bias: BiasLaw | None = None,
     seed: int = 0,
 ) -> tuple[Scores, list[Results]]:
     """Scores of every filter over the scenes, and the results of each kind of data."""
     run = run_scenes(filters, scenes, kinds=kinds, groups=groups, law=injected_bias, seed=seed)
-    return run.scores, results_of(run, baseline=baseline, settle_s=settle_s, seed=seed)
+    return run.scores, results_of(run, settle_s=settle_s, seed=seed)

@@ -210,7 +210,7 @@ def integrate(batch: Batch, estimator: Estimator, *, keep_covariances: bool = Fa
     return gathered(steps, usable.any(-1), keep_errors=keep_covariances)
 
 
-def gathered(steps: list[Step], offered: Tensor, *, keep_errors: bool = False) -> Solution:
+def gathered(steps: list[Step], offered: Tensor, *, keep_errors: bool) -> Solution:
     """The steps of a run as one solution; ``offered`` (B, T) tells where a fix might have been used."""
 
     def over_time(rows: list) -> Tensor | None:

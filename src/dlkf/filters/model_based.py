@@ -58,7 +58,7 @@ class Memory(NamedTuple):
     noise: AdaptiveNoise | None = None
 
 
-def bias_sigma(imu: ImuSpec, states: ErrorStates = PLAIN) -> Float[Tensor, " 6"]:
+def bias_sigma(imu: ImuSpec, states: ErrorStates) -> Float[Tensor, " 6"]:
     """1σ of the error that a constant-bias state has to carry at the start [m/s², rad/s].
 
     Turn-on bias and in-run part, plus what scale factor (down axis) and misalignment (level axes) make of

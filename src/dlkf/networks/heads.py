@@ -28,7 +28,7 @@ class GainHead(nn.Module):
 
     scale: Tensor
 
-    def __init__(self, width: int, initial_gain: float = 0.5) -> None:
+    def __init__(self, width: int, initial_gain: float) -> None:
         super().__init__()
         self.linear = nn.Linear(width, 54)
         scale = torch.tensor(STATE_SIZE)[:, None] / torch.tensor(INNOVATION_SIZE)[None, :]
@@ -52,7 +52,7 @@ class ImuErrorHead(nn.Module):
 
     scale: Tensor
 
-    def __init__(self, width: int, form: str = "constant", bound: float = 0.0) -> None:
+    def __init__(self, width: int, form: str, bound: float) -> None:
         super().__init__()
         self.form, self.bound = form, bound
         self.linear = nn.Linear(width, 6 if form == "constant" else 24)

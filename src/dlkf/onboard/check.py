@@ -30,7 +30,8 @@ from dlkf.running.solution import COLUMNS, solution_columns
 from dlkf.running.start import align, aligned_drives
 
 FARTHEST_M = 1e-3  # m: float32 of a network beside its own rounding over minutes
-WARM = 20  # epochs
+WARM = 20  # epochs that are not timed
+TIMED = 600  # epochs at most
 KINDS = {  # columns that have one unit
     "position [m]": ("lat_deg", "lon_deg", "height_m"),
     "velocity [m/s]": ("vel_n", "vel_e", "vel_d"),
@@ -141,10 +142,10 @@ def latencies(compiled: CompiledFilter, drive: Drive) -> dict[str, Latency]:
     return {name: Latency.of(seconds) for name, seconds in epoch_times(compiled, drive).items()}
 
 
-def epoch_times(compiled: CompiledFilter, drive: Drive, most: int = 600) -> dict[str, list[float]]:
+def epoch_times(compiled: CompiledFilter, drive: Drive) -> dict[str, list[float]]:
     """Seconds of epochs in Python, as torch runs them and compiled, in turns over one drive; the first few left out."""
     batch = aligned_drives([drive], ALIGN)
-    T = min(most, batch.size[1])
+    T = min(TIMED, batch.size[1])
     usable = batch.gnss_valid & batch.available.unsqueeze(-1)
     running = {}
     with torch.inference_mode():

@@ -41,7 +41,7 @@ def write_report(
     *,
     protocol: Mapping[str, Any],
     by_time: bool,
-    baseline: str | None = None,
+    baseline: str | None,
     more: Sequence[Table] = (),
     dpi: int = 110,
 ) -> list[Path]:
@@ -177,7 +177,7 @@ def growth(scores: Scores) -> go.Figure:
     return figure
 
 
-def outage_map(scores: Scores, named: str = "truth") -> go.Figure:
+def outage_map(scores: Scores, named: str) -> go.Figure:
     """Truth of all pieces (a reference is ``named`` so), outages, every filter's way in them from the last fix on."""
     w = scores.windows
     known = [~np.isnan(scores.truth_p_n[i, :, 0]) for i in range(len(scores.pieces))]
@@ -195,7 +195,7 @@ def outage_map(scores: Scores, named: str = "truth") -> go.Figure:
     return chart(traces, around=traces[:2])
 
 
-def piece_map(scores: Scores, baseline: str | None, named: str = "truth") -> go.Figure:
+def piece_map(scores: Scores, baseline: str | None, named: str) -> go.Figure:
     """Truth and every filter of up to eight pieces from good to bad."""
     chosen = representative(scores, 8, baseline if baseline in scores.filters else None)
     traces = [track(joined([scores.geodetic(i, scores.truth_p_n[i]) for i in chosen]), named, TRUTH, width=2)]

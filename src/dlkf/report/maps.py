@@ -16,12 +16,10 @@ Array = NDArray[np.floating]
 MOST = 6000  # points of all tracks of one kind on a map
 
 
-def track(place: Array, name: str, colour: str, *, width: float = 2.5, visible: bool = True, **more: Any):
+def track(place: Array, name: str, colour: str, *, width: float, **more: Any):
     """A line through latitudes and longitudes (n, 2); NaN breaks it."""
     lat, lon = place.T
-    return go.Scattermap(
-        lat=lat, lon=lon, mode="lines", name=name, line={"color": colour, "width": width}, visible=visible, **more
-    )
+    return go.Scattermap(lat=lat, lon=lon, mode="lines", name=name, line={"color": colour, "width": width}, **more)
 
 
 def dots(place: Array, name: str, colour: str | Array, *, size: float = 6, bar: str | None = None, **more: Any):

@@ -19,12 +19,12 @@ MOST = 1800  # points of a line: more than a screen has columns
 FONT = {"family": "system-ui, sans-serif", "size": 12}
 
 
-def extremes(y: Array, most: int = MOST) -> NDArray[np.int64]:
-    """Indices that keep the least and the largest value of each of ``most``/2 buckets: peaks survive."""
+def extremes(y: Array) -> NDArray[np.int64]:
+    """Indices that keep the least and the largest value of each of :data:`MOST`/2 buckets: peaks survive."""
     n = len(y)
-    if n <= most:
+    if n <= MOST:
         return np.arange(n)
-    edges = np.linspace(0, n, most // 2 + 1).astype(int)
+    edges = np.linspace(0, n, MOST // 2 + 1).astype(int)
     filled = np.where(np.isfinite(y), y, np.nan)
     found = {0, n - 1}
     for a, b in pairwise(edges):
@@ -36,7 +36,7 @@ def extremes(y: Array, most: int = MOST) -> NDArray[np.int64]:
     return np.array(sorted(found))
 
 
-def every(n: int, most: int = MOST) -> NDArray[np.int64]:
+def every(n: int, most: int) -> NDArray[np.int64]:
     """Indices spread evenly, the last among them."""
     if n <= most:
         return np.arange(n)
@@ -48,32 +48,30 @@ def small(x: Sequence | Array) -> Array:
     return np.asarray(x, np.float32)
 
 
-def stacked(titles: Sequence[str], columns: int = 1, height: int = 190) -> go.Figure:
+def stacked(titles: Sequence[str], *, height: int) -> go.Figure:
     """Panels below each other with a common time axis."""
-    return deepcopy(_panels(tuple(titles), columns, height))
+    return deepcopy(_panels(tuple(titles), height))
 
 
 @cache
-def _panels(titles: tuple[str, ...], columns: int, height: int) -> go.Figure:
+def _panels(titles: tuple[str, ...], height: int) -> go.Figure:
     """Empty panels; to make them takes longer than to fill them, and a page has the same for every drive."""
-    rows = -(-len(titles) // columns)
-    figure = make_subplots(
-        rows, columns, shared_xaxes=True, subplot_titles=titles, vertical_spacing=min(0.09, 0.4 / rows)
-    )
+    rows = len(titles)
+    figure = make_subplots(rows, 1, shared_xaxes=True, subplot_titles=titles, vertical_spacing=min(0.09, 0.4 / rows))
     figure.update_layout(
         height=height * rows + 90, margin={"l": 60, "r": 15, "t": 40, "b": 45}, font=FONT, template="plotly_white",
         legend={"orientation": "h", "yanchor": "top", "y": -0.12 if rows > 1 else -0.2}, hovermode="x unified",
     )  # fmt: skip
-    figure.update_annotations(font_size=12, xanchor="left", x=0) if columns == 1 else None
+    figure.update_annotations(font_size=12, xanchor="left", x=0)
     return figure
 
 
-def line(x: Array, y: Array, name: str, colour: str, *, legend: bool = True, dash: str = "solid", width: float = 1.5):
+def line(x: Array, y: Array, name: str, colour: str, *, legend: bool = True, width: float = 1.5):
     """A thinned line; a name stands in the legend once."""
     i = extremes(np.asarray(y, float))
     return go.Scatter(
         x=small(x[i]), y=small(y[i]), name=name, legendgroup=name, showlegend=legend, mode="lines",
-        line={"color": colour, "width": width, "dash": dash},
+        line={"color": colour, "width": width},
     )  # fmt: skip
 
 
@@ -89,7 +87,7 @@ def band(x: Array, low: Array, high: Array, name: str, colour: str, *, legend: b
     )  # fmt: skip
 
 
-def shade(figure: go.Figure, spans: Sequence[tuple[float, float]], rows: int, columns: int = 1) -> None:
+def shade(figure: go.Figure, spans: Sequence[tuple[float, float]], rows: int) -> None:
     """Grey where there was no GNSS; at most 200 spans, the longest."""
     longest = sorted(spans, key=lambda s: s[0] - s[1])[:200]
     shapes = [
@@ -98,7 +96,7 @@ def shade(figure: go.Figure, spans: Sequence[tuple[float, float]], rows: int, co
             "line": {"width": 0}, "layer": "below", "xref": f"x{k if k > 1 else ''}",
             "yref": f"y{k if k > 1 else ''} domain",
         }
-        for k in range(1, rows * columns + 1)
+        for k in range(1, rows + 1)
         for a, b in longest
     ]  # fmt: skip
     figure.update_layout(shapes=shapes)

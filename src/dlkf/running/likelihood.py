@@ -285,9 +285,7 @@ def untold(
     return build_causal(name, found.imu, "imu=auto does not", tuning=found.tuning), placed, found
 
 
-def placed(
-    evidence: Evidence, name: str, imu: ImuSpec, tuning: Tuning, placing: Placing
-) -> tuple[Placing, Placing]:
+def placed(evidence: Evidence, name: str, imu: ImuSpec, tuning: Tuning, placing: Placing) -> tuple[Placing, Placing]:
     """Delay and place to a fraction of their 1σ, zero where they are not sure beside each other, and their 1σ."""
     unit = torch.tensor([1.0, evidence.pace], dtype=torch.float64)  # so that both are in seconds
     at, std = torch.tensor(placing, dtype=torch.float64) / unit, torch.zeros(2, dtype=torch.float64)

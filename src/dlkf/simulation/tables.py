@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, IMU_ERROR, POSITION, STD, VELOCITY
@@ -37,8 +36,3 @@ def reference_columns(truth: Truth, error: Array) -> Columns:
         "valid": np.ones(len(truth.t), dtype=bool),
         **dict(zip(IMU_ERROR, error.T)),
     }
-
-
-def columns_of(table: pd.DataFrame) -> Columns:
-    """A table as columns."""
-    return {str(name): table[name].to_numpy(copy=True) for name in table}

@@ -58,7 +58,7 @@ def run_study(
     folder: Path,
     logger: Logger | bool,
     say: Say,
-    further: Sequence[str] | None = None,
+    further: Sequence[str] | None,
 ) -> Outcome:
     """Tune, train, score and write the report into ``folder/report``; ``further`` as in :func:`fit`."""
     scoring, seconds = settings.scoring, {}
@@ -170,7 +170,7 @@ def _endurance(
     return after, hour, tables
 
 
-def model_card(settings: StudySettings, data: DriveDataModule, run: str | None = None) -> dict[str, Any]:
+def model_card(settings: StudySettings, data: DriveDataModule, run: str | None) -> dict[str, Any]:
     """What a model was made of: recordings it was trained and chosen on, the data's digests, IMU, run, seeds, version.
 
     ``imus`` are those that it knows, of a filter that learns them by heart (paper.md 4.8), which ``plus`` does not.

@@ -41,7 +41,7 @@ class Baselines:
 
 
 def tuned_baselines(
-    names: Sequence[str], imu: ImuSpec, batches: Sequence[Batch], *, rounds: int, say: Callable[[str], None] = print
+    names: Sequence[str], imu: ImuSpec, batches: Sequence[Batch], *, rounds: int, say: Callable[[str], None]
 ) -> Baselines:
     """Tune each of ``names`` on the outages of training pieces; 0 ``rounds`` leave the factors as they come.
 

@@ -5,8 +5,6 @@ The same gradient trains ``plus``; here every factor is one number for all epoch
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -24,6 +22,7 @@ FACTORS = (
     "accel_noise", "gyro_noise", "accel_walk", "gyro_walk", "position_std", "velocity_std", "lateral_std",
     "vertical_std",
 )  # fmt: skip
+RATE = 0.15  # of Adam, at the start
 NEAR_M = 0.1  # errors below count as this, so that the logarithm has no pole
 
 
@@ -53,27 +52,19 @@ class Advised(nn.Module):
         return replace(start, **{k: v * getattr(start, k) for k, v in values.items()})
 
 
-def descended(
-    kalman: Mbkf, batch: Batch, end: int, *, steps: int = 60, rate: float = 0.15,
-    progress: Callable[[int, float], None] | None = None,
-) -> Tuning:  # fmt: skip
-    """Factors with the least geometric mean of the horizontal error at epoch ``end``, on the way down (Adam).
-
-    ``progress`` is told every step and its error [m].
-    """
+def descended(kalman: Mbkf, batch: Batch, end: int, *, steps: int = 60) -> Tuning:
+    """Factors with the least geometric mean of the horizontal error at epoch ``end``, on the way down (Adam)."""
     filter = Advised(kalman)
-    optimizer = torch.optim.Adam(filter.parameters(), lr=rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, rate / 20)
+    optimizer = torch.optim.Adam(filter.parameters(), lr=RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, RATE / 20)
     best, found = float("inf"), filter.tuning()
-    for step in range(steps):
+    for _ in range(steps):
         solution = integrate(batch, filter)
         error = (solution.posterior.p_n - batch.truth.p_n)[:, end, :2]
         loss = 0.5 * torch.log(error.square().sum(-1) + NEAR_M**2).mean()
         value = float(loss.detach())
         if value < best:
             best, found = value, filter.tuning()
-        if progress is not None:
-            progress(step, math.exp(value))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -48,7 +48,7 @@ def receive(
     rate_b: Array,
     config: GnssConfig,
     receiver: Receiver | None,
-    sky: Sky | None = None,
+    sky: Sky | None,
 ) -> Received:
     """GNSS at every row of ``truth``: white noise around the truth without a ``receiver``, else from satellites."""
     (reporting_rng,) = rng.spawn(1)
@@ -65,7 +65,7 @@ def observe_satellites(
     rate_b: Array,
     config: GnssConfig,
     receiver: Receiver,
-    sky: Sky | None = None,
+    sky: Sky | None,
 ) -> Received:
     """What a receiver makes of the satellites at every row of ``truth`` (uniform in time), by least squares.
 

@@ -209,7 +209,7 @@ def loads(route: Route, motion: Kinematics) -> tuple[Array, Array]:
 
 
 def suspension(
-    rng: np.random.Generator, car: Car, route: Route, end: float, stretches: Stretches | None = None
+    rng: np.random.Generator, car: Car, route: Route, end: float, stretches: Stretches | None
 ) -> scipy.interpolate.BSpline:
     """Roll, pitch [rad] and heave [m, up] of the body against the road, until ``end`` [s], as a spline.
 

@@ -18,6 +18,7 @@ from dlkf.navigation.earth import ECCENTRICITY_SQ, transverse_radius
 from dlkf.simulation.motion.routes import Kinematics, Plan, VehicleConfig, along, random_plan
 
 Array = NDArray[np.floating]
+WAVES = 6  # of an angle of the road
 
 
 @dataclass(frozen=True)
@@ -105,13 +106,11 @@ def random_route(rng: np.random.Generator, config: VehicleConfig, duration: floa
     return Route(plan, wander, slope, random_waves(cross_rng, config.bank_std), config.superelevation)
 
 
-def random_waves(
-    rng: np.random.Generator, rms: float, lengths: tuple[float, float] = (200, 1500), waves: int = 6
-) -> Waves:
+def random_waves(rng: np.random.Generator, rms: float, lengths: tuple[float, float] = (200, 1500)) -> Waves:
     """Waves with a given RMS on average, their wavelengths [m] log-uniform: hills, or the bank of a road."""
-    amplitude = rms * math.sqrt(2 / waves) * rng.uniform(0.5, 1.35, waves)
-    wavelength = np.exp(rng.uniform(math.log(lengths[0]), math.log(lengths[1]), waves))
-    return Waves(amplitude, 2 * math.pi / wavelength, rng.uniform(0, 2 * math.pi, waves))
+    amplitude = rms * math.sqrt(2 / WAVES) * rng.uniform(0.5, 1.35, WAVES)
+    wavelength = np.exp(rng.uniform(math.log(lengths[0]), math.log(lengths[1]), WAVES))
+    return Waves(amplitude, 2 * math.pi / wavelength, rng.uniform(0, 2 * math.pi, WAVES))
 
 
 def follow(route: Route, config: VehicleConfig, t: Array) -> Truth:

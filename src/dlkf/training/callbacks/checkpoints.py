@@ -23,7 +23,7 @@ BEST = "best"
 class ResumePoint(Checkpoint):
     """Writes ``last.ckpt`` at the end of every ``every`` epochs, beside and renamed: safe against kill -9."""
 
-    def __init__(self, folder: str, every: int = 1) -> None:
+    def __init__(self, folder: str, every: int) -> None:
         self.folder, self.every = Path(folder), every
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
@@ -44,7 +44,7 @@ class BestWeights(Callback):
     A value that is not finite keeps nothing; InputError where the monitor is not among what was logged.
     """
 
-    def __init__(self, folder: str, monitor: str, start_epoch: int = 0, notes: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, folder: str, monitor: str, start_epoch: int, notes: Mapping[str, Any] | None) -> None:
         self.folder, self.monitor, self.start_epoch, self.notes = Path(folder), monitor, start_epoch, notes
         self.score, self.epoch = float("inf"), -1
 

@@ -10,12 +10,13 @@ from lightning.pytorch.callbacks import Callback
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+EVERY = 10
+
 
 class TrainingProgress(Callback):
-    """Bar, epoch, losses and time to go; without a terminal a line every ``every`` epochs."""
+    """Bar, epoch, losses and time to go; without a terminal a line every :data:`EVERY` epochs."""
 
-    def __init__(self, every: int = 10) -> None:
-        self.every = every
+    def __init__(self) -> None:
         self.console = Console(stderr=True)
         self.bar: Progress | None = None
 
@@ -41,7 +42,7 @@ class TrainingProgress(Callback):
             text += f"  val outage {float(seen['val/outage_end_m']):.2f} m"
         if self.bar is not None:
             self.bar.update(self.task, completed=done, description=text)
-        elif not self.silent and (done % self.every == 0 or done == trainer.max_epochs):
+        elif not self.silent and (done % EVERY == 0 or done == trainer.max_epochs):
             pace = (time.monotonic() - self.began) / (done - self.first)
             left = timedelta(seconds=round(pace * ((trainer.max_epochs or done) - done)))
             self.console.print(f"epoch {done}/{trainer.max_epochs}  {text}  {left} left", highlight=False)
