@@ -90,3 +90,11 @@ def test_damaged_samples(accel, gyro, words):
 def test_an_epoch_must_hold_whole_samples():
     with pytest.raises(InputError, match="whole number"):
         ImuStream(50.5, 1.0)
+
+
+def test_before_the_first_fix_so_many_seconds_are_kept_and_no_more():
+    """A receiver may be silent for hours."""
+    stream = ImuStream(50, 1.0, keep_s=2.0)
+    for k in range(1, 1001):
+        assert stream.refused(k / 100, (0.0, 0.0, -9.8), (0.0, 0.0, 0.0)) == ""
+    assert stream._rows[-1][0] - stream._rows[0][0] == pytest.approx(2.0, abs=0.011)
