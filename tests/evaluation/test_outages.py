@@ -23,6 +23,14 @@ def test_an_outage_withholds_the_fixes_after_its_start_up_to_its_end(cars):
     assert not masked.available[mask].any() and masked.available[~mask].all() and cars.available.all()
 
 
+def test_times_are_seconds_whatever_an_epoch_lasts(cars):
+    """Sixty epochs of half a second: one outage fits to the last of them, the other leaves the piece."""
+    half = replace(cars, dt=cars.dt / 2)
+    (mask,) = OutagePlan(first_s=20, duration_s=10).masks(half)
+    assert _windows(mask)[0] == (0, 40, 20)
+    assert not OutagePlan(first_s=21, duration_s=10).masks(half)[0].any()
+
+
 def test_offsets_shift_the_whole_schedule_until_it_covers_the_drive(cars):
     masks = OutagePlan(first_s=5, duration_s=10, every_s=20, offsets_s=(0, 10)).masks(cars)
     assert _windows(masks[0])[:3] == [(0, 5, 10), (0, 25, 10), (0, 45, 10)]
