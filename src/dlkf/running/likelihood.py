@@ -112,7 +112,7 @@ class Found(NamedTuple):
         far = f"{abs(ahead):.2f} m ± {ahead_std:.2f} m further {way} than lever_arm_m says"
         when = f"{late:.3f} s ± {late_std:.3f} s late" if late else f"not late that one could tell (± {late_std:.3f} s)"
         where = far if ahead else f"where lever_arm_m says (± {ahead_std:.2f} m along the car)"
-        return f"the fixes are {when}; the antenna sits {where}"
+        return f"The fixes are {when}; the antenna sits {where}"
 
 
 @dataclass(frozen=True)
