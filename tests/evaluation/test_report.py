@@ -56,8 +56,11 @@ def test_tables_hold_the_summarise_scores(scores):
     assert ratio_table("town", summarise_scores(scores, baseline="none such")) is None
     assert len(r.comparisons) == 2 * 6 * 3 and r.baseline == "mbkf15"
     assert all(c.filter == "ins" and c.against.groups == 6 for c in r.comparisons)
-    assert answer(r).endswith(" (of 6 outages only).")
-    assert answer(replace(r, count={**r.count, "outages": 20})).endswith(" m.")
+    at_end = [number(r.value("mbkf15", "outages", "at 20 s", "horizontal", s)) for s in ("median", "max", "p95")]
+    assert f": {at_end[0]} m in half of 6 outages, {at_end[1]} m in the worst, with mbkf15; next ins " in answer(r)
+    many, one = (replace(r, count={**r.count, "outages": n}) for n in (20, 1))
+    assert f": {at_end[0]} m in half of the cases, {at_end[2]} m in 95 %, with mbkf15; next ins " in answer(many)
+    assert f": {at_end[0]} m in one outage, with mbkf15; next ins " in answer(one)
     few = r.versus("ins", "outages", "end", "horizontal")
     assert with_interval(replace(few, groups=8, ratio=0.7, ratio_low=0.6, ratio_high=0.8)) == "0.70 [0.60–0.80]"
     assert few.a == r.value("ins", "outages", "end", "horizontal")

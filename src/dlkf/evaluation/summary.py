@@ -9,7 +9,7 @@ from dlkf.evaluation.results import Results
 from dlkf.evaluation.table import DEGREES, number
 
 ASKED_S = ("30", "60", "20", "10", "40", "50")  # times without GNSS, the first that the outages reach is told
-FEW = 20  # outages; the 95 % of fewer is their worst
+FEW = 20  # outages or pieces; fewer have no 95 %: their worst is told instead
 END = ("outages", "end", "horizontal")
 METRICS = {
     "outage_end_horizontal_m": (*END, "rms"),
@@ -48,31 +48,37 @@ def answer(result: Results) -> str:
     """The answer to "how far does it drift?" in one sentence, of the best filter and of the best classical one.
 
     "After 30 s without GNSS: 10 m in half of the cases, 24 m in 95 %, with dlkf; best classical (mbkf21_car) 14, 31."
-    The best has the least median; of filters without outages, the least error over the pieces.
+    The best has the least median; of filters without outages, the least error over the pieces. Of few outages the worst
+    is told, of one just that.
     """
     seconds = asked(result)
     if seconds is None:
-        where, lead = ("pieces", "settled", "horizontal"), "With GNSS throughout"
+        where, lead, unit = ("pieces", "settled", "horizontal"), "With GNSS throughout", "piece"
     else:
-        where, lead = ("outages", f"at {seconds} s", "horizontal"), f"After {seconds} s without GNSS"
-    errors = {n: tuple(result.value(n, *where, s) for s in ("median", "p95")) for n in result.filters}
+        where, lead, unit = ("outages", f"at {seconds} s", "horizontal"), f"After {seconds} s without GNSS", "outage"
+    count = int(result.count.get(f"{unit}s") or 0)
+    statistics = ("median", "p95") if count >= FEW else ("median", "max") if count > 1 else ("median",)
+    errors = {n: tuple(result.value(n, *where, s) for s in statistics) for n in result.filters}
     order = sorted((n for n in errors if not math.isnan(errors[n][0])), key=lambda n: errors[n][0])
     if not order:
         return "No filter could be scored: there is no valid truth where it counts."
     told = {n: tuple(map(number, errors[n])) for n in order}
-    text = f"{lead}: {told[order[0]][0]} m in half of the cases, {told[order[0]][1]} m in 95 %, with {order[0]}"
+    text = f"{lead}: {_spread(told[order[0]], count, unit)}, with {order[0]}"
     classical = next((n for n in order if is_classical(n)), None)
     if is_classical(order[0]):
         if order[1:]:
             text += f"; next {order[1]} {', '.join(told[order[1]])} m"
     elif classical is not None:
         text += f"; best classical ({classical}) {', '.join(told[classical])} m"
-    return text + ("." if seconds is None else _few(int(result.count.get("outages") or 0)))
+    return f"{text}."
 
 
-def _few(outages: int) -> str:
-    """So few have no 95 %: the largest error stands for it."""
-    return "." if outages >= FEW else f" (of {outages} outage{'' if outages == 1 else 's'} only)."
+def _spread(told: tuple[str, ...], count: int, unit: str) -> str:
+    if count >= FEW:
+        return f"{told[0]} m in half of the cases, {told[1]} m in 95 %"
+    if count == 1:
+        return f"{told[0]} m in one {unit}"
+    return f"{told[0]} m in half of {count} {unit}s, {told[1]} m in the worst"
 
 
 def is_classical(name: str) -> bool:
