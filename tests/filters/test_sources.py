@@ -74,7 +74,7 @@ def test_a_smoothed_filter_is_no_estimator():
 
 def test_the_gate_s_limits_are_computed_once(monkeypatch):
     calls = []
-    monkeypatch.setattr("dlkf.filters.gating.chi2.ppf", lambda p, n: calls.append(n) or 1e9)
+    monkeypatch.setattr("dlkf.filters.gating.chi2_quantile", lambda p, n: calls.append(n) or 1e9)
     with torch.no_grad():
         integrate(scene(2, 5), build_filter("mbkf15_gated", IMU))
     assert calls == [1, 2, 3] and isinstance(build_filter("mbkf15_gated", IMU).fix.gate, Gate)

@@ -19,7 +19,6 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 from torch import Tensor
 
 from dlkf.console import Counted
@@ -28,6 +27,7 @@ from dlkf.errors import InputError
 from dlkf.evaluation.figures import SHADE, png
 from dlkf.evaluation.table import Table, as_json, as_markdown, number
 from dlkf.files import staged
+from dlkf.filters.gating import chi2_quantile
 from dlkf.filters.integration import Solution, integrate
 from dlkf.filters.model_based import Analytic, has_covariance
 from dlkf.filters.smoother import Filter
@@ -131,7 +131,7 @@ def consistency(
 def band(degrees: int, count: int) -> tuple[float, float]:
     """Band of the mean of ``count`` independent χ² values, over its expectation."""
     tail = (1 - CONFIDENCE) / 2
-    low, high = 2 * gammaincinv(degrees * count / 2, np.array([tail, 1 - tail])) / (degrees * count)
+    low, high = chi2_quantile(np.array([tail, 1 - tail]), degrees * count) / (degrees * count)
     return float(low), float(high)
 
 

@@ -25,6 +25,11 @@ AGREEMENT_SIGMAS, AGREEMENT_SPEED = 6.0, 2.0  # two refusals agree within 6σ of
 FROZEN_SPEED = 1.0  # m/s: above, a fix cannot be the same twice
 
 
+def chi2_quantile(probability, degrees: int):
+    """What χ² of ``degrees`` stays below with ``probability``; scipy.stats has it too and takes a second to load."""
+    return 2 * gammaincinv(degrees / 2, probability)
+
+
 class GateMemory(NamedTuple):
     """What the gate remembers between epochs."""
 
@@ -117,4 +122,4 @@ class Gate:
 
     @cached_property
     def _limits(self) -> tuple[float, ...]:
-        return (0.0, *(float(2 * gammaincinv(components / 2, self.probability)) for components in (1, 2, 3)))
+        return (0.0, *(float(chi2_quantile(self.probability, components)) for components in (1, 2, 3)))
