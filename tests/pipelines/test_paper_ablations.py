@@ -9,6 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.cars import write_cars
 
 ROOT = Path(__file__).parents[2]
@@ -28,6 +30,7 @@ def ablations(folder: Path, *words: str) -> subprocess.CompletedProcess:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, env=os.environ | paths)
 
 
+@pytest.mark.commands
 def test_rows_are_trained_once_and_end_in_a_table(template, tmp_path):
     shutil.copy(template, tmp_path / "mlflow.db")
     write_cars(tmp_path / "town", 5, seconds=90.0)
