@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dlkf.command import command
+from dlkf.command.arguments import at_home
 from dlkf.command.settings import CompareSettings
 from dlkf.files import vacant
 from dlkf.report.compare import read_reports, write_comparison
@@ -14,7 +15,7 @@ def runs_of(arguments: list[str]) -> list[str]:
     """Bare words are the folders; the points of a sweep have an equals sign in their names (``0-imu=consumer``)."""
     folders = [a for a in arguments if not a.startswith("-") and ("=" not in a or Path(a, "metrics.json").is_file())]
     rest = [a for a in arguments if a not in folders]
-    quoted = ",".join("'" + folder.replace("'", "\\'") + "'" for folder in folders)
+    quoted = ",".join("'" + at_home(folder).replace("'", "\\'") + "'" for folder in folders)
     return [*rest, f"runs=[{quoted}]"] if folders else rest
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import pwd
 import re
 import select
 import shutil
@@ -59,6 +60,8 @@ def test_completion_knows_commands_keys_and_presets():
     assert candidates("ev") == ["evaluate"] and candidates("") == list(COMMANDS)
     assert {"model=", "imu=", "imu.", "outage.", "reference="} <= set(candidates("", "evaluate"))
     assert candidates("imu=cons", "navigate") == ["imu=consumer"]
+    assert candidates("imu=aut", "navigate") == ["imu=auto", "imu=automotive_mems"]
+    assert candidates("imu=aut", "export") == ["imu=automotive_mems"]
     assert "dataset=city" in candidates("dataset=", "simulate") and "model=plus" in candidates("model=", "train")
     assert candidates("out=", "navigate") == [] == candidates("", "ui")
 
@@ -72,6 +75,7 @@ def test_completion_goes_into_nested_keys_as_hydra_does():
     assert candidates("align.from_rest=", "evaluate") == ["align.from_rest=false", "align.from_rest=true"]
     assert "dataset.gnss." in candidates("dataset.", "simulate", "dataset=city")
     assert candidates("outage.d", "evaluate", "imu=nonsense", "mode") == ["outage.duration_s="]  # a line in the making
+    assert candidates("outage.d", "evaluate", "out=~nobody-here/x") == ["outage.duration_s="]
     loader = ConfigLoaderImpl(create_config_search_path(str(config_dir())))
     for command, word in (("train", "scoring."), ("evaluate", "imu.accel."), ("ingest", "")):
         theirs = BashCompletion(loader)._query(command, word)
@@ -130,7 +134,11 @@ def test_completion_in_bash(typed_, becomes, tmp_path):
 )
 def test_ordinary_paths_need_no_quotes(given, taken):
     assert readable(given) == taken
-    assert readable("out=~/x") == f"out={Path.home()}/x"
+    home = Path.home()
+    assert readable("out=~/x") == f"out={home}/x" and readable("out=~") == f"out={home}"
+    assert readable("dataset=[~/a, b]") == f"dataset=[{home}/a,b]"
+    user = pwd.getpwuid(os.getuid())
+    assert readable(f"out=~{user.pw_name}/x") == f"out={user.pw_dir}/x"
 
 
 def test_in_a_shell(tmp_path, town):

@@ -23,6 +23,12 @@ def test_every_command_has_a_page(name):
     assert len(MOST[name]) == min(5, len(keys))
 
 
+def test_a_preset_of_one_command_is_on_no_other_page():
+    pages = {name: help_text(name, GROUPS.get(name, {})) for name in COMMANDS}
+    assert {name for name, page in pages.items() if " auto, automotive_mems" in page} == {"navigate"}
+    assert sum("automotive_mems, bmi" in page for page in pages.values()) > 5
+
+
 def test_a_command_prints_it_and_does_nothing_else(call):
     done = call("evaluate", "--help")
     assert done.code == 0 and "model=…" in done.out and "aligned, coarse" in done.out and not done.err

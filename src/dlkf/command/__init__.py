@@ -74,13 +74,13 @@ def command(
                 print(f"dlkf {dlkf.__version__}")
                 return
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors reach us whole instead of Hydra's exit
-            given = [with_group(argument, GROUPS.get(name, {})) for argument in arguments(sys.argv[1:])]
-            sys.argv[1:] = [readable(argument) for argument in given]
             stopped_by.clear()
             # SIGINT is ignored by what a shell started in the background, and stays so
             heeded = [n for n in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(n) is not signal.SIG_IGN]
             before = {number: signal.signal(number, _stop) for number in heeded}
             try:
+                given = [with_group(argument, GROUPS.get(name, {})) for argument in arguments(sys.argv[1:])]
+                sys.argv[1:] = [readable(argument) for argument in given]
                 check_options(sys.argv[1:])
                 with sweeps.heard():
                     run = hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)

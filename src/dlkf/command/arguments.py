@@ -31,23 +31,35 @@ def readable(argument: str) -> str:
     """An override that Hydra's grammar takes: a value that it does not is quoted, ``~/`` is the home folder.
 
     ``out=Straße (1)`` → ``out='Straße (1)'``; in a list every word by itself. What is in the grammar stays as it is.
+    InputError for the home of a user that is not there.
     """
     key, equals, value = argument.partition("=")
     if not equals or argument.startswith(("-", "~")):
         return argument
-    if value.startswith("~/"):
-        value = str(Path(value).expanduser())
+    listed = value.startswith("[") and value.endswith("]")
+    words = [at_home(word.strip()) for word in value[1:-1].split(",")] if listed else []
+    value = f"[{','.join(words)}]" if "~" in value and listed else at_home(value)
     if value.lower() == "none" and key in SWITCHED_OFF:
         value = "null"
     if _parses(f"{key}={value}"):
         return f"{key}={value}"
-    if value.startswith("[") and value.endswith("]"):
-        words = [word.strip() for word in value[1:-1].split(",")]
-        listed = ",".join(word if _parses(f"{key}={word}") else _quoted(word) for word in words)
-        if _parses(f"{key}=[{listed}]"):
-            return f"{key}=[{listed}]"
+    if listed:
+        inside = ",".join(word if _parses(f"{key}={word}") else _quoted(word) for word in words)
+        if _parses(f"{key}=[{inside}]"):
+            return f"{key}=[{inside}]"
     quoted = f"{key}={_quoted(value)}"
     return quoted if _parses(quoted) else argument
+
+
+def at_home(path: str) -> str:
+    """``~/…`` and ``~user/…`` written out, as shells do where they see a path. InputError for an unknown user."""
+    if not path.startswith("~"):
+        return path
+    try:
+        return str(Path(path).expanduser())
+    except RuntimeError:
+        user = path[1:].partition("/")[0]
+        raise InputError(f"{path}: there is no user {user} here; for a folder of that name write ./{path}") from None
 
 
 def _parses(override: str) -> bool:

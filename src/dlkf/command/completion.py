@@ -10,6 +10,7 @@ import yaml
 from dlkf.command import GROUPS, with_group
 from dlkf.command.arguments import readable
 from dlkf.command.composing import composed
+from dlkf.command.help import presets_of
 from dlkf.config import config_dir
 
 ADDS = ("++", "+", "~")  # before a key, to Hydra
@@ -23,23 +24,23 @@ def completed(command: str, word: str, before: Sequence[str]) -> list[str]:
     sign = next((s for s in ADDS if word.startswith(s)), "")
     key, equals, _ = word.removeprefix(sign).partition("=")
     groups = _groups(command)
-    if equals and (folder := config_dir() / groups.get(key, key)).is_dir():
-        found = [f"{key}={name}" for name in _presets(folder)]
+    if equals and (config_dir() / (folder := groups.get(key, key))).is_dir():
+        found = [f"{key}={name}" for name in presets_of(folder, command)]
     else:
         path = key.split(".") if equals else key.split(".")[:-1]
         values = _at(_settings(command, before), path)
         found = [f"{key}={v}" for v in _values(values)] if equals else _keys(values, ".".join(path), groups)
         if not equals and len(path) == 0 and sign:
-            found += [f"{p.name}=" for p in config_dir().iterdir() if p.is_dir() and _presets(p)]
+            found += [f"{p.name}=" for p in config_dir().iterdir() if presets_of(p.name, command)]
     return sorted(f"{sign}{w}" for w in set(found) if w.startswith(word.removeprefix(sign)))
 
 
 def _settings(command: str, before: Sequence[str]) -> Mapping[str, Any]:
     """The command's configuration with the words so far; without them where they do not fit together (yet)."""
-    words = [readable(with_group(w, GROUPS.get(command, {}))) for w in before if "=" in w or w.startswith("~")]
-    for tried in (words, []):
+    for tried in (before, ()):
         try:
-            return composed(command, *tried, resolve=False)
+            words = [readable(with_group(w, GROUPS.get(command, {}))) for w in tried if "=" in w or w.startswith("~")]
+            return composed(command, *words, resolve=False)
         except Exception:  # whatever Hydra says of a line that is not finished
             continue
     return {}
@@ -51,10 +52,6 @@ def _groups(command: str) -> dict[str, str]:
     names = [name for entry in content.get("defaults", []) if isinstance(entry, dict) for name in entry]
     pairs = [name.partition("@") for name in names if not name.startswith("override")]
     return {shown or folder: folder for folder, _, shown in pairs}
-
-
-def _presets(folder: Any) -> list[str]:
-    return [p.stem for p in folder.glob("*.yaml") if not p.stem.startswith("_")]
 
 
 def _at(values: Any, path: Sequence[str]) -> Any:

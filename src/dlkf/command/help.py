@@ -28,6 +28,7 @@ MOST = {
 }
 WIDTH = 118
 SILENT = ("hydra_output", "_self_")
+ALONE = {"imu": ("auto", "navigate")}  # a preset that one command takes
 OPTIONAL = {"train": ("experiment", "profile")}  # groups that the defaults list leaves empty
 GROUP = re.compile(
     r"  - (?!override )/?(?P<group>[\w/]+)(?:@(?P<package>[\w.]+))?: (?P<choice>\w+)(?:\s+# (?P<says>.*))?"
@@ -43,9 +44,9 @@ def help_text(name: str, aliases: Mapping[str, str]) -> str:
     for group in groups_of(text):
         key = _written(group, aliases)
         lines.append(f"  {key}={group['choice']}" + (f"  {group['says']}" if group["says"] else ""))
-        lines += _wrapped(presets_of(group["group"]))
+        lines += _wrapped(presets_of(group["group"], name))
     for folder in OPTIONAL.get(name, ()):
-        lines += [f"  +{folder}=…", *_wrapped(presets_of(folder))]
+        lines += [f"  +{folder}=…", *_wrapped(presets_of(folder, name))]
     if not groups_of(text):
         lines[-1] = "It has no presets."
     lines += ["", "Keys that matter most (key=value):"]
@@ -72,9 +73,11 @@ def groups_of(text: str) -> list[dict[str, str]]:
     return [g for g in found if g["group"] not in SILENT]
 
 
-def presets_of(group: str) -> list[str]:
+def presets_of(group: str, command: str) -> list[str]:
     """Names to choose from; what several share begins with an underscore."""
-    return sorted(path.stem for path in (config_dir() / group).glob("[!_]*.yaml"))
+    preset, taker = ALONE.get(group, ("", command))
+    found = sorted(path.stem for path in (config_dir() / group).glob("[!_]*.yaml"))
+    return [name for name in found if name != preset or command == taker]
 
 
 def keys_of(text: str) -> dict[str, tuple[str, str]]:

@@ -16,6 +16,7 @@ from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.plus import PlusConfig, PlusFilter
 
 WEIGHTS, CONFIG = "weights.safetensors", "config.yaml"
+FASTEST_HZ, LONGEST_S = 10_000.0, 60.0  # of an IMU, of an epoch: beyond these something was mistyped
 LearnedSettings = LearnedConfig | PlusConfig
 Learned = LearnedFilter | PlusFilter
 KINDS: Mapping[str, type[LearnedConfig] | type[PlusConfig]] = {"dlkf": LearnedConfig, "plus": PlusConfig}
@@ -52,13 +53,13 @@ def grid_of(
 ) -> dict[str, Any]:
     """``rate_hz`` and ``epoch_s``: as given, else what a trained filter was trained on, else 50 Hz and the usual.
 
-    Raises InputError where one of them is not above 0.
+    Raises InputError where one of them is not above 0, or beyond what there is.
     """
     configs: list[Any] = [getattr(m, "config", None) for m in models]
     own = next(((c.rate_hz, c.epoch_s) for c in configs if hasattr(c, "rate_hz")), (50.0, usual_epoch_s))
-    for name, given in (("rate_hz", rate_hz), ("epoch_s", epoch_s)):
-        if given is not None and not given > 0:
-            raise InputError(f"{name} is {given!r}, must be above 0")
+    for name, given, most in (("rate_hz", rate_hz, FASTEST_HZ), ("epoch_s", epoch_s, LONGEST_S)):
+        if given is not None and not 0 < given <= most:
+            raise InputError(f"{name} is {given!r}, must be above 0 and at most {most:g}")
     return {"rate_hz": own[0] if rate_hz is None else rate_hz, "epoch_s": own[1] if epoch_s is None else epoch_s}
 
 
