@@ -23,7 +23,7 @@ from dlkf.evaluation.summary import answer
 from dlkf.evaluation.table import as_csv, as_json, as_markdown, number, ratio_table, slope_table, tables, with_interval
 from dlkf.files import staged
 from dlkf.filters.build import build_filter
-from dlkf.report.compare import distinct
+from dlkf.report.compare import Report, best_of_each, distinct, end_table, scored_on
 from dlkf.report.evaluation import least_error, outage_rows, write_report
 from tests.cars import IMU
 from tests.evaluation.scoring import score
@@ -217,3 +217,16 @@ def test_a_failed_write_leaves_nothing(tmp_path):
 )
 def test_runs_are_named_by_the_least_that_tells_them_apart(folders, names):
     assert distinct([Path(f) for f in folders]) == names
+
+
+def test_the_best_is_marked_among_those_of_the_same_test(scores):
+    """Other data or other outages are another test, another IMU preset is not; one row alone is no comparison."""
+    results = [summarise_scores(scores, resamples=200)]
+    said = [("a", "town", {"seed": 0, "imu": "x"}), ("b", "town", {"seed": 0, "imu": "y"}), ("c", "city", {"seed": 0})]
+    reports = [Report(name, name, data, rules, results) for name, data, rules in (*said, ("d", "city", {"seed": 1}))]
+    columns, rows = end_table(reports)
+    by_test = scored_on(reports)
+    assert [by_test.index(t) for t in by_test[:: len(FILTERS)]] == [0, 0, 4, 6]
+    marked = [row[0] for row, mark in zip(rows, best_of_each(columns, rows, by_test)) if mark]
+    assert marked == ["a", "c", "d"]
+    assert best_of_each(columns, rows[:2], ["one", "another"]) == ["", ""]

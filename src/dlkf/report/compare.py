@@ -20,6 +20,7 @@ from dlkf.report.evaluation import best_of
 from dlkf.report.page import Page, flattened
 from dlkf.report.plots import FONT
 
+TEST = ("digest", "reference", "mode", "runs", "seed", "length_s", "stride_s", "start", "outage")  # of the protocol
 NOT_SETTINGS = ("command", "date", "digest", "skipped")  # differ always, or belong to no comparison
 
 
@@ -82,8 +83,9 @@ def comparison_page(reports: Sequence[Report]) -> str:
     page = Page(f"{len(reports)} evaluations compared", lines)
     whole = {r.name: r.path for r in reports}
     columns, rows = end_table(reports)
-    page.heading("At the end of the outages", "Horizontal error; RMS over the pieces where there are no outages.")
-    page.table(columns, rows, marks=best_of(columns, rows), titles=whole)
+    about = "Horizontal error; RMS over the pieces where there are no outages. Marked: the least median of a test."
+    page.heading("At the end of the outages", about)
+    page.table(columns, rows, marks=best_of_each(columns, rows, scored_on(reports)), titles=whole)
     page.heading("Horizontal error against the time without GNSS", "Solid: median; dotted: 95 % of the outages.")
     page.figure("growth", growth(reports))
     page.heading("In what they differ")
@@ -107,6 +109,27 @@ def end_table(reports: Sequence[Report]) -> tuple[list[str], list[list[str]]]:
                 data = f"{report.dataset} ({result.kind})"
                 rows.append([report.name, data, name, str(out or result.count["pieces"]), *errors, drift])
     return columns, rows
+
+
+def scored_on(reports: Sequence[Report]) -> list[str]:
+    """What each row of :func:`end_table` was scored on: equal where data and rules are the same."""
+    rules = [{key: report.protocol.get(key) for key in TEST} for report in reports]
+    return [
+        json.dumps([report.dataset, result.kind, rule], sort_keys=True, default=str)
+        for report, rule in zip(reports, rules)
+        for result in report.results
+        for _ in result.filters
+    ]
+
+
+def best_of_each(columns: Sequence[str], rows: Sequence[Sequence[str]], tests: Sequence[str]) -> list[str]:
+    """:func:`dlkf.report.evaluation.best_of` among the rows of each test that several share."""
+    marks = [""] * len(rows)
+    for test in dict.fromkeys(tests):
+        same = [k for k, other in enumerate(tests) if other == test]
+        for k, mark in zip(same, best_of(columns, [rows[k] for k in same]) if len(same) > 1 else ()):
+            marks[k] = mark
+    return marks
 
 
 def growth(reports: Sequence[Report]) -> go.Figure:
