@@ -28,8 +28,9 @@ from dlkf.onboard import compiled_filter
 from dlkf.onboard.c_source import CPP, exporting, write_source
 from dlkf.onboard.check import boundary_fixes, difference, vehicle_run, write_log
 from dlkf.onboard.compiled_filter import CompiledFilter
-from dlkf.onboard.functions import ROW, Begin, Grid, Turn, carried_by
+from dlkf.onboard.functions import FIX, ROW, Begin, Grid, Turn, carried_by
 from dlkf.onboard.library import LIBRARY, Library, build, compiler
+from dlkf.onboard.meanings import of_column
 from dlkf.running.batched import run_filter
 from dlkf.running.estimate import estimates_table
 from dlkf.running.reanchoring import FrameChange, reanchored
@@ -131,10 +132,25 @@ def test_the_description_tells_every_number_of_the_memory(exported):
     folder, _, layout, _ = exported
     described = json.loads((folder / "step.json").read_text())
     assert sum(int(np.prod(f["shape"])) for f in described["memory"]["fields"]) == layout.size
-    assert described["row"] == list(ROW)
+    assert [column["name"] for column in described["row"]] == list(ROW)
+    assert described["fix"][3] == {"name": "vel_n", "place": 3, "meaning": "velocity North [m/s]"}
     header = (folder / "step.h").read_text()
     assert f"#define DLKF_MEMORY {layout.size}\n" in header and "@" not in header
     assert re.search(r"DLKF_LAT_DEG, DLKF_LON_DEG", header)
+
+
+@pytest.mark.parametrize("kind", ["aekf_car_gated", "mbkf33_nhc_gated_gm", "dlkf", "plus"])
+def test_every_number_has_a_meaning(kind):
+    made = {"dlkf": learned, "plus": talkative_plus}
+    layout = carried_by(made[kind]() if kind in made else build_filter(kind, IMU), GRID)
+    assert [f.name for f in layout.fields if not f.plain().get("meaning")] == []
+
+
+def test_columns_say_axis_and_unit():
+    said = {c: of_column(c) for c in (*FIX, *ROW)}
+    assert said["std_gyro_error_z"] == "1σ of gyroscope error down, measured less true [rad/s]"
+    assert said["innovation_std_pos_d"] == "1σ of fix less expected: position Down [m]"
+    assert all(text.endswith("]") for c, text in said.items() if c not in ("quality", "gnss_used"))
 
 
 def test_a_batch_through_the_compiled_filter(compiled, drive):

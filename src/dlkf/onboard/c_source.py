@@ -19,6 +19,7 @@ from dlkf.onboard.c_code import KEPT, Translation
 from dlkf.onboard.c_memory import C_TYPES, Block
 from dlkf.onboard.carried import Layout
 from dlkf.onboard.functions import FIX, ROW, TOLD, Anchor, Begin, Function, Grid, Read, Row, Turn, carried_by
+from dlkf.onboard.meanings import of_column
 from dlkf.running.reanchoring import can_reanchor
 from dlkf.running.streaming import ANCHOR_M
 
@@ -61,8 +62,9 @@ def write_source(
         header = header.replace(f"@{key}@", str(value))
     (folder / "step.c").write_text("\n".join(parts))
     (folder / "step.h").write_text(header)
+    fix, row = ([{"name": c, "place": k, "meaning": of_column(c)} for k, c in enumerate(cs)] for cs in (FIX, ROW))
     described = {
-        "model": name, "rate_hz": 1 / grid.dt, "epoch_s": grid.epoch_s, "fix": list(FIX), "row": list(ROW),
+        "model": name, "rate_hz": 1 / grid.dt, "epoch_s": grid.epoch_s, "fix": fix, "row": row,
         "memory": {"numbers": layout.size, "type": "float64", "fields": [f.plain() for f in layout.fields]}, **made,
     }  # fmt: skip
     (folder / "step.json").write_text(json.dumps(described, indent=1, ensure_ascii=False) + "\n")

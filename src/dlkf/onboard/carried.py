@@ -12,31 +12,10 @@ from torch import Tensor
 
 from dlkf.errors import InputError
 from dlkf.navigation.error_model import WindowModel
+from dlkf.onboard.meanings import of_field
 
 OF_THE_DRIVE = {WindowModel: ("still", "density")}  # the rest of it is the same for every drive of a filter
 RECURRENT = "recurrent"  # cells of a network: the batch is their second axis
-MEANING = {
-    "frame.origin_e": "origin of the tangent frame n, ECEF [m]",
-    "frame.C_en": "axes of n (North, East, Down at the origin) in ECEF",
-    "frame.axis_n": "axis of the Earth in n",
-    "frame.earth_rate_n": "rotation of the Earth in n [rad/s]",
-    "frame.radius": "transverse radius of curvature plus height at the origin [m]",
-    "frame.stretch": "ratio of the ellipsoid's normal to the radius there",
-    "frame.height": "height of the origin [m]",
-    "state.p_n": "position of the IMU in n [m]",
-    "state.v_n": "velocity in n [m/s]",
-    "state.C_nb": "attitude, body (forward, right, down) to n",
-    "error.bias": "accelerometer [m/s²] and gyroscope [rad/s] bias in force",
-    "error.matrix": "scale factors, or M of measured = (I + M) true + bias",
-    "P": "covariance of the error states: m, m/s, rad, m/s², rad/s, then elements of M, then the car",
-    "still": "transition of a window in which nothing moves",
-    "density": "S of the noise: accelerometers [m²/s³], gyroscopes [rad²/s], walks of their biases [m²/s⁵, rad²/s³]",
-    "scale": "factors on 1σ of a fix, and the least 1σ: position [m], velocity [m/s]",
-    "std": "1σ across the car [m/s], and at rest: velocity [m/s], rate [rad/s]",
-    "forgetting": "share of the past in the adapted noise",
-    "structure": "mounting yaw, pitch [rad], distance to the rear axle [m], sideslip [s²/m], pitch gradient [rad s²/m]",
-    "lever_arm_b": "IMU to antenna, forward, right, down [m]",
-}
 
 
 @dataclass(frozen=True)
@@ -60,7 +39,7 @@ class Field:
 
     def plain(self) -> dict[str, Any]:
         """For a file."""
-        meaning = MEANING.get(self.name) or MEANING.get(self.name.rpartition(".")[2])
+        meaning = of_field(self.name)
         return {
             "name": self.name, "offset": self.offset, "shape": list(self.shape), "type": str(self.dtype)[6:],
             **({"meaning": meaning} if meaning else {}),
