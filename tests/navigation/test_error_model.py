@@ -151,7 +151,7 @@ def test_zero_lever_arm_is_the_paper_s_h():
 
 
 @pytest.mark.parametrize("matrix", ["none", "scale", "full"])
-def test_compiled_columns_are_the_tensor_form_s(matrix):
+def test_compiled_transition_is_the_tensor_form_s(matrix):
     state, imu, frame = scene(8)
     model = model_of(frame, ErrorStates(matrix))
     window = strapdown(state, imu, DT, frame)

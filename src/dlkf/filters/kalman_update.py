@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dlkf.navigation import compiled
 from dlkf.navigation.state import PVA
 
 
@@ -46,12 +47,17 @@ def _updated(P: Tensor, H: Tensor, R: Tensor, z: Tensor) -> tuple[Tensor, Tensor
     """dx, K, P⁺ and S. For any K, P⁺ = X − K (H X − R Kᵀ) with X = P − (H P)ᵀ Kᵀ: no product of n × n matrices."""
     HP = torch.bmm(H, P)
     S = torch.baddbmm(torch.diag_embed(R), HP, H.mT)
-    Kt = torch.linalg.solve_ex(S, HP)[0]
+    Kt = _solved(S, HP)
     X = torch.baddbmm(P, HP.mT, Kt, alpha=-1)
     surplus = torch.baddbmm(R.unsqueeze(-1) * Kt, H, X, beta=-1)
     dx = torch.bmm(Kt.mT, z.unsqueeze(-1)).squeeze(-1)
     P = torch.baddbmm(X, Kt.mT, surplus, alpha=-1)
     return dx, Kt.mT, torch.lerp(P, P.mT, 0.5), S
+
+
+def _solved(S: Float[Tensor, "B m m"], X: Float[Tensor, "B m n"]) -> Float[Tensor, "B m n"]:
+    """S⁻¹ X."""
+    return compiled.solved(S, X) if compiled.fits(S) else torch.linalg.solve_ex(S, X)[0]
 
 
 class _KalmanPrediction(torch.autograd.Function):
@@ -92,7 +98,7 @@ class _KalmanUpdate(torch.autograd.Function):
     def backward(ctx, of_dx, _of_K, of_P):
         H, z, dx, K, updated, S = ctx.saved_tensors
         Kt, g = K.mT, of_dx.unsqueeze(-1)
-        u = torch.linalg.solve_ex(S, z.unsqueeze(-1))[0]
+        u = _solved(S, z.unsqueeze(-1))
         G = torch.lerp(of_P, of_P.mT, 0.5)
         KG, Kg = torch.bmm(Kt, G), torch.bmm(Kt, g)
         KGK = torch.bmm(KG, K)

@@ -83,14 +83,15 @@ def mechanised(
     return p, v, C
 
 
-def sensor_columns(
-    C0: Tensor, v0: Tensor, C: Tensor, v: Tensor, g: Tensor, samples: Tensor, dt: float, elements: np.ndarray
+def transition(
+    still: Tensor, start: Any, window: Any, samples: Tensor, earth_rate: Tensor, dt: float, elements: np.ndarray
 ) -> Tensor:
-    """Columns of Φ (B, 9, 6 + 2 e) for the biases and the ``elements`` (e, 2) of the sensor matrices."""
-    out = v.new_zeros(len(v), 9, 6 + 2 * len(elements))
-    given = (C0.numpy(), v0.numpy(), C.numpy(), v.numpy(), g.numpy(), samples.numpy())
-    _sensor_columns(*given, dt, elements, out.numpy())
-    return out
+    """Φ (B, n, n) of :class:`dlkf.navigation.error_model.WindowModel`, with the ``elements`` (e, 2) of the sensor
+    matrices among the states."""
+    Phi = still.clone()
+    given = (*start, window.p_n, window.v_n, window.C_nb, window.gravity, samples, earth_rate)
+    _transition(*(x.numpy() for x in given), dt, elements, Phi.numpy())
+    return Phi
 
 
 def rotations(phi: Tensor) -> Tensor:
@@ -115,6 +116,13 @@ def gravity(
     given: Any = (*(x.numpy() for x in (p_n, stretching, centre, axis, shape)), *constants, g.numpy())
     _gravity(*given)
     return g
+
+
+def solved(S: Tensor, X: Tensor) -> Tensor:
+    """S⁻¹ X of symmetric positive definite matrices (B, m, m) and columns (B, m, n)."""
+    out = X.clone(memory_format=torch.contiguous_format)
+    _eliminate(S.numpy(), out.numpy())
+    return out
 
 
 @njit(inline="always")
@@ -150,6 +158,14 @@ def plus(a, s, b):
 def row(x, b, k):
     """Vector x[b, k]."""
     return x[b, k, 0], x[b, k, 1], x[b, k, 2]
+
+
+@njit(inline="always")
+@no_type_check
+def add(total, s, x):
+    """total ← total + s x of rows of any length."""
+    for r in range(len(x)):
+        total[r] += s * x[r]
 
 
 @njit(inline="always")
@@ -237,6 +253,26 @@ def _rotation_vectors(C, out):
 
 @njit()
 @no_type_check
+def _eliminate(S, X):
+    """Gauss and Jordan's elimination, for which positive definite matrices need no exchange of rows; X ← S⁻¹ X."""
+    B, m, n = X.shape
+    W, pivot = np.empty((m, m + n), S.dtype), np.empty(m + n, S.dtype)  # S beside X
+    for b in range(B):
+        W[:, :m], W[:, m:] = S[b], X[b]
+        for j in range(m):
+            inverse = 1 / W[j, j]
+            for c in range(m + n):
+                pivot[c] = inverse * W[j, c]
+            for i in range(m):
+                factor = W[i, j]
+                for c in range(m + n):
+                    W[i, c] -= factor * pivot[c]
+            W[j] = pivot
+        X[b] = W[:, m:]
+
+
+@njit()
+@no_type_check
 def _gravity(p, stretching, centre, axis, shape, equator, somigliana, eccentricity_sq, curvature, g):
     for b in range(len(p)):
         along, square = 0.0, 0.0
@@ -295,41 +331,67 @@ def _mechanise(p0, v0, C0, imu, g, w, dt, p, v, C):
 
 @njit()
 @no_type_check
-def _sensor_columns(C0, v0, C, v, g, samples, dt, elements, out):
-    """What a unit error of every sensor column c does to the window's end, sum over its samples.
+def _transition(p0, v0, C0, p, v, C, g, samples, earth_rate, dt, elements, Phi):
+    """What a window's motion adds to Φ of one in which nothing moves: what a tilt does to velocity and position, with
+    what the specific force gained (``s``) and Coriolis, and the sensors' columns."""
+    B, M = v.shape[:2]
+    T, last = M * dt, M - 1
+    for b in range(B):
+        fall, earth = (g[b, 0], g[b, 1], g[b, 2]), (earth_rate[b, 0], earth_rate[b, 1], earth_rate[b, 2])
+        speed = v0[b, 0], v0[b, 1], v0[b, 2]
+        moved = plus(row(p, b, last), -1, (p0[b, 0], p0[b, 1], p0[b, 2]))
+        s_p = plus(moved, -T, plus(speed, T / 2, fall))
+        s_v = plus(plus(row(v, b, last), -1, speed), -T, fall)
+        swept = plus(scaled(T / 3, moved), T * T / 6, speed)
+        for i, s in ((0, plus(s_p, 2, cross(earth, swept))), (3, plus(s_v, 2, cross(earth, moved)))):
+            Phi[b, i, 7], Phi[b, i + 1, 8], Phi[b, i + 2, 6] = s[2], s[0], s[1]  # −[s×]
+            Phi[b, i + 1, 6], Phi[b, i + 2, 7], Phi[b, i, 8] = -s[2], -s[0], -s[1]
+            Phi[b, i, 6] = Phi[b, i + 1, 7] = Phi[b, i + 2, 8] = 0.0
+    _sensor_columns(C0, v0, C, v, g, samples, dt, elements, Phi[:, :9, 9:])
 
-    An accelerometer's error f along C e_c changes velocity at once and position over what is ``left`` of the window;
-    a gyroscope's w has tilted the attitude by ``swept`` so far, which turns the velocity ``gained`` in a sample.
+
+@njit()
+@no_type_check
+def _sensor_columns(C0, v0, C, v, g, samples, dt, elements, out):
+    """What a unit error of every sensor column c does to the window's end, sum over its samples from the last to the
+    first, of a bias (1) and of an element (c, d) of M (the sample of axis d).
+
+    An accelerometer's error along C e_c changes velocity at once and position over what is ``left`` of the window; a
+    gyroscope's tilts the attitude by C e_c from then on, which turns all velocity gained from the sample's middle on
+    (``ahead``), and what that moves until the end (``far``).
     """
     B, M = v.shape[:2]
     e = len(elements)
-    turned, swept = np.empty((3, 3)), np.zeros((3, 3 + e))
-    gained, column, lever = np.empty(3), np.empty(3), np.empty(3)
+    kinds = 4 if e else 1
+    by_force, by_rate = np.empty(18), np.empty(27)  # of a sample: position, velocity; these and attitude, (i, c) each
+    of_force, of_rate = np.empty((4, 18)), np.empty((4, 27))
     for b in range(B):
-        swept[:] = 0.0
-        for k in range(M):
+        of_force[:], of_rate[:] = 0.0, 0.0
+        ahead, far = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        fall = g[b, 0], g[b, 1], g[b, 2]
+        for k in range(M - 1, -1, -1):
             left = (M - k - 0.5) * dt
-            for i in range(3):
-                gained[i] = v[b, k, i] - (v[b, k - 1, i] if k else v0[b, i]) - g[b, i] * dt
-                for j in range(3):
-                    turned[i, j] = 0.5 * dt * ((C[b, k - 1, i, j] if k else C0[b, i, j]) + C[b, k, i, j])
-            for n in range(3 + e):  # biases, whose errors are 1, then elements (c, d), whose are the samples of axis d
-                if n < 3:
-                    c, f, w = n, 1.0, 1.0
-                    to_f, to_w = n, 3 + n
-                else:
-                    c = elements[n - 3, 0]
-                    f, w = samples[b, k, elements[n - 3, 1]], samples[b, k, 3 + elements[n - 3, 1]]
-                    to_f, to_w = 3 + n, 3 + e + n
+            before = row(v, b, k - 1) if k else (v0[b, 0], v0[b, 1], v0[b, 2])
+            gained = plus(plus(row(v, b, k), -1, before), -dt, fall)
+            ahead, far = plus(ahead, 0.5, gained), plus(far, 0.5 * left, gained)
+            for c in range(3):
+                turned = (
+                    0.5 * dt * ((C[b, k - 1, 0, c] if k else C0[b, 0, c]) + C[b, k, 0, c]),
+                    0.5 * dt * ((C[b, k - 1, 1, c] if k else C0[b, 1, c]) + C[b, k, 1, c]),
+                    0.5 * dt * ((C[b, k - 1, 2, c] if k else C0[b, 2, c]) + C[b, k, 2, c]),
+                )
+                moved, sped = cross(far, turned), cross(ahead, turned)
                 for i in range(3):
-                    column[i] = swept[i, n] + 0.5 * w * turned[i, c]  # at the sample's middle
-                    swept[i, n] += w * turned[i, c]
-                lever[0] = gained[1] * column[2] - gained[2] * column[1]
-                lever[1] = gained[2] * column[0] - gained[0] * column[2]
-                lever[2] = gained[0] * column[1] - gained[1] * column[0]
-                for i in range(3):
-                    out[b, i, to_f] -= left * f * turned[i, c]
-                    out[b, 3 + i, to_f] -= f * turned[i, c]
-                    out[b, i, to_w] += left * lever[i]
-                    out[b, 3 + i, to_w] += lever[i]
-                    out[b, 6 + i, to_w] -= w * turned[i, c]
+                    by_force[3 * i + c], by_force[9 + 3 * i + c] = -left * turned[i], -turned[i]
+                    by_rate[3 * i + c], by_rate[9 + 3 * i + c], by_rate[18 + 3 * i + c] = moved[i], sped[i], -turned[i]
+            ahead, far = plus(ahead, 0.5, gained), plus(far, 0.5 * left, gained)
+            for d in range(kinds):
+                f, w = (samples[b, k, d - 1], samples[b, k, 2 + d]) if d else (1.0, 1.0)
+                add(of_force[d], f, by_force)
+                add(of_rate[d], w, by_rate)
+        for n in range(3 + e):
+            c, d, to = (n, 0, n) if n < 3 else (elements[n - 3, 0], elements[n - 3, 1] + 1, 3 + n)
+            for i in range(6):
+                out[b, i, to] = of_force[d, 3 * i + c]
+            for i in range(9):
+                out[b, i, to + (3 if n < 3 else e)] = of_rate[d, 3 * i + c]

@@ -69,6 +69,9 @@ class WindowModel:
 
         and once more integrated for position; Earth rotation, Coriolis and gravity gradient to first order in T.
         """
+        if compiled.fits(corrected):
+            elements = np.array(self.states.elements, dtype=np.int64).reshape(-1, 2)
+            return compiled.transition(self.still, start, window, corrected, frame.earth_rate_n, self.dt, elements)
         end, T = window.end, window.p_n.shape[1] * self.dt
         columns = self._sensor_columns(start, window, corrected)
         moved = end.p_n - start.p_n
@@ -102,11 +105,6 @@ class WindowModel:
         self, start: NavState, window: Window, corrected: Float[Tensor, "B M 6"]
     ) -> Float[Tensor, "B 9 k"]:
         """Columns of Φ of the biases and the elements of M."""
-        if compiled.fits(corrected):
-            elements = np.array(self.states.elements, dtype=np.int64).reshape(-1, 2)
-            return compiled.sensor_columns(
-                start.C_nb, start.v_n, window.C_nb, window.v_n, window.gravity, corrected, self.dt, elements
-            )
         dt = self.dt
         before = torch.cat((start.C_nb.unsqueeze(1), window.C_nb[:, :-1]), 1)
         turned = torch.add(before, window.C_nb).mul_(0.5 * dt)  # ∫C over each sample
