@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dlkf.filters.integration import Fix, advance
-from dlkf.filters.matching import LOG_FEATURES, Matching
+from dlkf.filters.matching import LOG_FEATURES, Matching, variance_along
 from dlkf.filters.plus import PlusFilter
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.calibration import ImuError
@@ -74,3 +74,14 @@ def test_without_a_fix_nothing_is_learned():
     kept = matched(blind, honest())
     assert torch.equal(kept.logarithms(), Matching.begin(batch.imu, 2).logarithms())
     assert kept.logarithms().shape == (2, LOG_FEATURES)
+
+
+def test_variance_along_axes_is_the_diagonal_of_the_turned_blocks():
+    """By tensor operations, where a gradient may be asked for, and by the compiled loop."""
+    g = torch.Generator().manual_seed(2)
+    P, C = (torch.randn(4, n, n, generator=g, dtype=torch.float64) for n in (9, 3))
+    blocks = [(C.mT @ P[:, k : k + 3, k : k + 3] @ C).diagonal(dim1=1, dim2=2) for k in (0, 3, 6)]
+    with torch.no_grad():
+        compiled = variance_along(P, C)
+    for given in (variance_along(P, C), compiled):
+        assert torch.allclose(given, torch.cat(blocks, -1), rtol=0, atol=1e-12)

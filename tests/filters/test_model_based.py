@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from dlkf.errors import InputError
 from dlkf.filters.build import MODEL_BASED, build_filter
 from dlkf.filters.integration import integrate
-from dlkf.filters.kalman_update import _updated, kalman_prediction, kalman_update
+from dlkf.filters.kalman_update import _solved, _updated, kalman_prediction, kalman_update
 from dlkf.filters.model_based import Ins, Mbkf, bias_sigma
 from dlkf.filters.tuning import Prior
 from dlkf.navigation.error_model import antenna
@@ -281,3 +281,12 @@ def test_the_rate_at_the_fix_is_that_of_the_last_tenth_of_a_second():
     integrate(batch, Watched())
     for rate_b, corrected in seen:
         torch.testing.assert_close(rate_b, corrected[:, -5:, 3:].mean(1), rtol=0, atol=1e-15)
+
+
+def test_compiled_solution_is_that_of_the_tensor_form():
+    g = torch.Generator().manual_seed(0)
+    A, X = (torch.randn(5, 7, n, generator=g, dtype=torch.float64) for n in (7, 3))
+    S = A @ A.mT + torch.eye(7, dtype=torch.float64)
+    with torch.no_grad():
+        assert torch.allclose(S @ _solved(S, X), X, rtol=0, atol=1e-12)
+    assert torch.allclose(S @ _solved(S, X), X, rtol=0, atol=1e-12)

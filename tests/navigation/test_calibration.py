@@ -31,3 +31,11 @@ def test_correcting_undoes_the_error_and_at_names_it(matrix):
     measured = true + torch.einsum("bij,bmj->bmi", M, true) + error.bias[:, None]
     torch.testing.assert_close(error.corrected(measured), true, rtol=0, atol=1e-12)
     torch.testing.assert_close(error.at(true.mean(1)), (measured - true).mean(1), rtol=0, atol=1e-12)
+
+
+def test_gradient_through_full_matrices_is_the_numerical_one():
+    """In closed form, for bias and elements."""
+    error, _ = errors("full")
+    raw = torch.randn(3, 5, 6, generator=torch.Generator().manual_seed(5), dtype=D)
+    given = [x.requires_grad_() for x in error if x is not None]
+    assert torch.autograd.gradcheck(lambda *parts: ImuError(*parts).corrected(raw), given)

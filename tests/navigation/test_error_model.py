@@ -159,3 +159,13 @@ def test_compiled_transition_is_the_tensor_form_s(matrix):
     with torch.no_grad():
         assert compiled.fits(imu)
         assert torch.allclose(model.transition(state, window, imu, frame), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_gradient_of_the_process_noise_in_its_scale_is_the_numerical_one():
+    """In closed form, where nothing is learned through Φ."""
+    state, imu, frame = scene(9)
+    model = model_of(frame, ErrorStates("full"))
+    Phi = model.transition(state, strapdown(state, imu, DT, frame), imu, frame)
+    scale = 1 + torch.randn(1, 4, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    size = model.noise(Phi).abs().amax((1, 2), keepdim=True)
+    assert torch.autograd.gradcheck(lambda W: model.noise(Phi, W) / size, scale.requires_grad_())

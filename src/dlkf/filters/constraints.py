@@ -14,6 +14,7 @@ they are further states of the filter. A standstill (:mod:`dlkf.filters.standsti
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -26,7 +27,7 @@ from dlkf.filters.sources import Believed, Measurement
 from dlkf.filters.standstill import Liveliness, at_rest
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import skew
-from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, VELOCITY, ErrorStates
+from dlkf.navigation.state import GYRO, STATES, VELOCITY, ErrorStates
 
 STRUCTURE_STD = (0.05, 0.05, 1.5, 0.01, 0.005)  # rad, rad, m, s²/m, s²·rad/m: what is known of a car before it moves
 STRUCTURE_WALK_STD = (2e-5, 2e-5, 1e-4, 1e-6, 1e-6)  # per √s
@@ -97,18 +98,17 @@ class CarConstraints:
         pitch = pitch + gradient * force
         model = torch.stack((yaw * vx + (axle + slip * vx * vx) * w_z, pitch * vx - axle * w_y), -1)
         # h(x) = v_across − model = 0; the innovation is 0 − h(x̂)
-        H = torch.zeros(len(vx), 2, self.states.count, dtype=vx.dtype, device=vx.device)
         J = C_bn[:, 1:] - torch.stack((yaw + 2 * slip * vx * w_z, pitch), -1).unsqueeze(-1) * C_bn[:, :1]
-        H[:, :, VELOCITY] = J
-        H[:, :, ATTITUDE] = torch.bmm(J, skew(state.v_n))
         # δω = −ζ, δf = −ε: the model's rates and forces are too large by the sensors' remaining errors
-        H[:, 0, GYRO.start + 2] = axle + slip * vx * vx
-        H[:, 1, GYRO.start + 1] = -axle
-        H[:, 1, ACCEL.start] = gradient * vx
+        lateral = [zero] * 5 + [axle + slip * vx * vx]
+        vertical = [gradient * vx, zero, zero, zero, -axle, zero]
         if self.states.structure:
-            lateral = torch.stack((vx, zero, w_z, vx * vx * w_z, zero), -1)
-            vertical = torch.stack((zero, vx, -w_y, zero, vx * force), -1)
-            H[:, :, self.states.of_structure] = -torch.stack((lateral, vertical), 1)
+            lateral += [-vx, zero, -w_z, -vx * vx * w_z, zero]
+            vertical += [zero, -vx, w_y, zero, -vx * force]
+        known = torch.stack(lateral + vertical, -1).unflatten(-1, (2, -1))
+        sensors, car = known.split((6, known.shape[-1] - 6), -1)
+        position, matrices = J.new_zeros(len(J), 2, 3), J.new_zeros(len(J), 2, self.states.navigation - STATES)
+        H = torch.cat((position, J, torch.bmm(J, skew(state.v_n)), sensors, matrices, car), -1)
         return model - v_b[:, 1:], H, vx.abs() > SLOWEST
 
     def _standing(self, epoch: Epoch) -> tuple[Float[Tensor, "B 6"], Float[Tensor, "B 6 n"]]:
@@ -116,8 +116,12 @@ class CarConstraints:
         state = epoch.window.end
         earth_b = torch.bmm(state.C_nb.mT, epoch.frame.earth_rate_n.unsqueeze(-1)).squeeze(-1)
         z = torch.cat((-state.v_n, epoch.corrected[..., 3:].mean(1) - earth_b), -1)
-        H = z.new_zeros(len(z), 6, self.states.count)
-        eye = torch.eye(3, dtype=z.dtype, device=z.device)
-        H[:, :3, VELOCITY] = eye
-        H[:, 3:, GYRO] = eye
-        return z, H
+        return z, _standing(self.states.count, z.dtype, z.device).expand(len(z), -1, -1)
+
+
+@lru_cache
+@torch.inference_mode(False)
+def _standing(states: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "6 n"]:
+    """H of velocity and of what the gyroscopes say."""
+    eye = torch.eye(states, dtype=dtype, device=device)
+    return torch.cat((eye[VELOCITY], eye[GYRO]))

@@ -104,8 +104,8 @@ class _KalmanUpdate(torch.autograd.Function):
         KGK = torch.bmm(KG, K)
         # Aᵀ G A + Aᵀ g uᵀ H, without A
         inner = torch.baddbmm(KG, KGK, H, alpha=-1)
-        of_P = torch.baddbmm(G, H.mT, inner, alpha=-1).baddbmm_(KG.mT, H, alpha=-1)
-        of_P.baddbmm_(g - torch.bmm(H.mT, Kg), torch.bmm(u.mT, H))
+        outer = torch.baddbmm(KG.mT, g - torch.bmm(H.mT, Kg), u.mT, beta=-1)
+        of_P = torch.baddbmm(G, H.mT, inner, alpha=-1).baddbmm_(outer, H)
         of_H = None
         if ctx.needs_input_grad[1]:
             of_H = torch.baddbmm(torch.bmm(u, torch.bmm(g.mT, updated)), KG, updated, alpha=-2)

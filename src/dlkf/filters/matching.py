@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dlkf.navigation import compiled
 from dlkf.navigation.state import ATTITUDE, IMU, VELOCITY
 
 MEMORIES = (10.0, 60.0)  # fixes
@@ -27,6 +28,8 @@ LOG_FEATURES, AXIS_FEATURES = 12 + 24 + 12, 8 + 4
 
 def variance_along(P: Float[Tensor, "B k k"], axes: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B k"]:
     """Diagonal of Cᵀ P C for every 3 × 3 block on the diagonal of P; the columns of C are the axes."""
+    if compiled.fits(P):
+        return compiled.variance_along(P, axes.detach())
     blocks = P.unflatten(-1, (-1, 3)).unflatten(-3, (-1, 3)).diagonal(dim1=1, dim2=3)  # (B, 3, 3, blocks)
     along = torch.bmm(axes.mT, blocks.flatten(2)).unflatten(-1, (3, -1))
     return (along * axes.mT.unsqueeze(-1)).sum(2).mT.flatten(1)
@@ -76,12 +79,12 @@ class Matching(NamedTuple):
     def logarithms(self) -> Float[Tensor, "B L"]:
         """What a network sees of it, each of order 1."""
         parts = (self.innovations.flatten(1), self.ratios.flatten(1), self.sizes)
-        return torch.cat([torch.log(x + 1e-3) for x in parts], -1) / 2
+        return torch.log(torch.cat(parts, -1) + 1e-3) / 2
 
-    def by_axis(self) -> Float[Tensor, "B 3 12"]:
-        """What of the logarithms belongs to each body axis: ratios of both memories, sizes."""
-        ratios = self.ratios.unflatten(-1, (4, 3)).flatten(1, 2)
-        return torch.log(torch.cat((ratios, self.sizes.unflatten(-1, (4, 3))), 1) + 1e-3).mT / 2
+
+def by_axis(logarithms: Float[Tensor, "B L"]) -> Float[Tensor, "B 3 12"]:
+    """What of the logarithms belongs to each body axis: ratios of both memories, sizes."""
+    return logarithms[:, 12:].unflatten(-1, (-1, 3)).mT
 
 
 def _blended(mean: Float[Tensor, "B k m"], new: Float[Tensor, "B 1 m"], fixes: Float[Tensor, " B"]) -> Tensor:

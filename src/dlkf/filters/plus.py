@@ -24,7 +24,7 @@ from dlkf.filters.advised_speed import AdvisedSpeed
 from dlkf.filters.build import build_filter
 from dlkf.filters.car_speed import Calibration, CarSpeed, Foretold
 from dlkf.filters.integration import Correction, Epoch
-from dlkf.filters.matching import AXIS_FEATURES, LOG_FEATURES, Matching, variance_along
+from dlkf.filters.matching import AXIS_FEATURES, LOG_FEATURES, Matching, by_axis, variance_along
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.model_based import Memory as KalmanMemory
 from dlkf.filters.tuning import Tuning
@@ -176,8 +176,9 @@ class PlusFilter(nn.Module):
         dtype = self.network.inward.weight.dtype
         foretold = self.car_speed(heard.to(dtype), memory.car)
         with torch.no_grad():
-            features, now = self._features(memory, epoch, normalised, forward, heard, foretold)
-            axes = torch.cat((loudness(heard).unflatten(-1, (2, 3)).mT, memory.matching.by_axis()), -1)
+            loud, matched = loudness(heard), memory.matching.logarithms()
+            features, now = self._features(memory, epoch, normalised, forward, heard, loud, matched, foretold)
+            axes = torch.cat((loud.unflatten(-1, (2, 3)).mT, by_axis(matched)), -1)
         heads, hidden = self.network(features.to(dtype), now.to(dtype), axes.to(dtype), memory.hidden)
         seen = memory.since_fix < memory.elapsed  # before the first fix there is nothing to adapt to
         heads = Heads(*(x.to(epoch.z.dtype) for x in heads))
@@ -226,7 +227,7 @@ class PlusFilter(nn.Module):
 
     def _features(
         self, memory: Memory, epoch: Epoch, normalised: Float[Tensor, "B 6"], forward: Float[Tensor, " B"],
-        heard: Float[Tensor, "B K"], foretold: Foretold,
+        heard: Float[Tensor, "B K"], loud: Float[Tensor, "B 6"], matched: Float[Tensor, "B L"], foretold: Foretold,
     ) -> tuple[Float[Tensor, "B F"], Float[Tensor, "B N"]]:  # fmt: skip
         """What the network sees, each of order 1; the second part goes to the noise's heads directly as well."""
         P, C_nb = memory.kalman.P, epoch.window.end.C_nb
@@ -247,13 +248,13 @@ class PlusFilter(nn.Module):
         )  # fmt: skip
         now = torch.cat(
             (v_b / v_b.new_tensor((10.0, 1.0, 1.0)), torch.log(variance[:, 3:6]) / 6, v_b[:, :1] * rate[:, 2:] / 3,
-             force[:, 1:2] / 3, rate[:, 2:] / 0.3, fixed, age[:, :1], loudness(heard)), -1,
+             force[:, 1:2] / 3, rate[:, 2:] / 0.3, fixed, age[:, :1], loud), -1,
         )  # fmt: skip
         features = torch.cat(
             (
                 heard, torch.log(variance) / 4 - torch.log(size) / 2,
                 torch.asinh(known / size[9:]), age, fix_std, torch.asinh(normalised),
-                memory.matching.logarithms(), fixed, fixed * forward.unsqueeze(-1) / 10,
+                matched, fixed, fixed * forward.unsqueeze(-1) / 10,
                 memory.fix_speed.unsqueeze(-1) / 10, car, now,
             ), -1,
         )  # fmt: skip

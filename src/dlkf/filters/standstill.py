@@ -55,6 +55,7 @@ class Liveliness(NamedTuple):
         )
 
 
+@torch.no_grad()
 def at_rest(
     epoch: Epoch, turning: Float[Tensor, "B 3"], P: Float[Tensor, "B n n"], before: Liveliness,
     prior: Float[Tensor, " 1"],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -27,28 +28,23 @@ class ImuError(NamedTuple):
 
     def corrected(self, raw: Float[Tensor, "B M 6"]) -> Float[Tensor, "B M 6"]:
         """The samples without the error: (I + M)⁻¹ (raw − bias)."""
+        if self.matrix is not None and self.matrix.ndim == 4:
+            if torch.is_grad_enabled() and not raw.requires_grad and self.matrix.requires_grad:
+                return _Corrected.apply(raw, self.bias, self.matrix)
+            return _corrected(raw, self.bias, self.matrix)[0]
         samples = raw - self.bias.unsqueeze(1)
-        if self.matrix is None:
-            return samples
-        if self.matrix.ndim == 2:
-            return samples / (1 + self.matrix).unsqueeze(1)
-        eye = torch.eye(3, dtype=raw.dtype, device=raw.device)
-        undo = torch.linalg.inv_ex(eye + self.matrix)[0].mT
-        return torch.cat((torch.bmm(samples[..., :3], undo[:, 0]), torch.bmm(samples[..., 3:], undo[:, 1])), -1)
+        return samples if self.matrix is None else samples / (1 + self.matrix).unsqueeze(1)
 
     def updated(self, dx: Float[Tensor, "B n"], states: ErrorStates) -> ImuError:
         """The error after a correction of a filter's states: columns 9… of ``dx``."""
         bias = self.bias + dx[:, 9:15]
-        elements = states.elements
-        if not elements:
+        if states.matrix == "none":
             return ImuError(bias, self.matrix)
-        change = dx[:, states.of_matrix]
         if states.matrix == "scale":
+            change = dx[:, states.of_matrix]
             return ImuError(bias, change if self.matrix is None else self.matrix + change)
-        rows, columns = (list(x) for x in zip(*elements))
-        matrix = dx.new_zeros(len(dx), 2, 3, 3) if self.matrix is None else self.matrix.clone()
-        matrix[:, :, rows, columns] += change.unflatten(-1, (2, -1))
-        return ImuError(bias, matrix)
+        change = torch.index_select(dx, 1, _by_rows(states, dx.device)).unflatten(-1, (2, 3, 3))
+        return ImuError(bias, change if self.matrix is None else self.matrix + change)
 
     def at(self, mean: Float[Tensor, "B 6"]) -> Float[Tensor, "B 6"]:
         """Complete error of samples whose corrected mean is ``mean``: bias + M · mean."""
@@ -57,3 +53,41 @@ class ImuError(NamedTuple):
         if self.matrix.ndim == 2:
             return self.bias + self.matrix * mean
         return self.bias + (self.matrix @ mean.unflatten(-1, (2, 3)).unsqueeze(-1)).flatten(1)
+
+
+@lru_cache
+@torch.inference_mode(False)
+def _by_rows(states: ErrorStates, device: torch.device) -> Tensor:
+    """Which states the elements of both full matrices are, row by row."""
+    place = {element: k for k, element in enumerate(states.elements)}
+    one = [states.of_matrix.start + place[i, j] for i in range(3) for j in range(3)]
+    return torch.tensor([*one, *(k + len(place) for k in one)], device=device)
+
+
+def _corrected(raw: Float[Tensor, "B M 6"], bias: Float[Tensor, "B 6"], matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """y = U (raw − bias) and U = (I + M)⁻¹ (B, 2, 3, 3)."""
+    U = torch.linalg.inv_ex(torch.eye(3, dtype=raw.dtype, device=raw.device) + matrix)[0]
+    return _by_sensor(raw - bias.unsqueeze(1), U.mT), U
+
+
+def _by_sensor(samples: Float[Tensor, "B M 6"], matrices: Float[Tensor, "B 2 3 3"]) -> Float[Tensor, "B M 6"]:
+    """Each sensor's samples, as rows, times its matrix."""
+    return torch.cat((torch.bmm(samples[..., :3], matrices[:, 0]), torch.bmm(samples[..., 3:], matrices[:, 1])), -1)
+
+
+class _Corrected(torch.autograd.Function):
+    """With its gradient in closed form: a = Uᵀ ∂y of every sample, ∂bias = −Σ a, ∂M = −Σ a yᵀ."""
+
+    @staticmethod
+    def forward(ctx, raw, bias, matrix):
+        y, U = _corrected(raw, bias, matrix)
+        ctx.save_for_backward(y, U)
+        return y
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, g):
+        y, U = ctx.saved_tensors
+        a = _by_sensor(g, U)
+        of_both = torch.bmm(a.mT, y)
+        return None, -a.sum(1), -torch.stack((of_both[:, :3, :3], of_both[:, 3:, 3:]), 1)

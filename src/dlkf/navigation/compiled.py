@@ -118,6 +118,13 @@ def gravity(
     return g
 
 
+def variance_along(P: Tensor, axes: Tensor) -> Tensor:
+    """Diagonal of Cᵀ P C (B, k) for the 3 × 3 blocks on the diagonal of P (B, k, k), C = ``axes`` (B, 3, 3)."""
+    out = P.new_empty(P.shape[:2])
+    _variance_along(P.numpy(), axes.numpy(), out.numpy())
+    return out
+
+
 def solved(S: Tensor, X: Tensor) -> Tensor:
     """S⁻¹ X of symmetric positive definite matrices (B, m, m) and columns (B, m, n)."""
     out = X.clone(memory_format=torch.contiguous_format)
@@ -249,6 +256,20 @@ def _rotation_vectors(C, out):
         scale = 2 / w * (1 - s * s / (3 * w * w)) if s < 1e-4 else 2 * math.atan2(s, w) / s
         for j in range(3):
             out[b, j] = sign * scale * q[1 + j] / norm
+
+
+@njit()
+@no_type_check
+def _variance_along(P, C, out):
+    for b in range(len(P)):
+        for k in range(0, P.shape[1], 3):
+            for a in range(3):
+                axis = C[b, 0, a], C[b, 1, a], C[b, 2, a]
+                out[b, k + a] = dot(axis, (
+                    P[b, k, k] * axis[0] + P[b, k, k + 1] * axis[1] + P[b, k, k + 2] * axis[2],
+                    P[b, k + 1, k] * axis[0] + P[b, k + 1, k + 1] * axis[1] + P[b, k + 1, k + 2] * axis[2],
+                    P[b, k + 2, k] * axis[0] + P[b, k + 2, k + 1] * axis[1] + P[b, k + 2, k + 2] * axis[2],
+                ))  # fmt: skip
 
 
 @njit()

@@ -95,8 +95,13 @@ class WindowModel:
         ``scale`` multiplies the standard deviations of the sources, in the axes of their columns of Φ.
         """
         L = Phi[:, :STATES, DRIVEN].unflatten(-1, (4, 3)).transpose(1, 2)
-        if scale is not None:
-            L = L @ scale
+        if scale is None:
+            return self._accumulated(L)
+        if torch.is_grad_enabled() and scale.requires_grad and not L.requires_grad:
+            return _ProcessNoise.apply(L, scale, self)
+        return self._accumulated(L @ scale)
+
+    def _accumulated(self, L: Float[Tensor, "B 4 s 3"]) -> Float[Tensor, "B n n"]:
         Q = self.walk.diag().repeat(len(L), 1, 1)
         Q[:, :STATES, :STATES] = ((L @ L.mT) * self.spread).sum(1)
         return Q
@@ -139,6 +144,24 @@ class WindowModel:
         if self.states.matrix == "none":
             return force, lever
         return force[..., :3], lever[..., :3], force[..., 3:], lever[..., 3:]
+
+
+class _ProcessNoise(torch.autograd.Function):
+    """Q with its gradient in closed form where the scale W alone is learned: of every source, with A = L W and its
+    spread σ, ∂W = Lᵀ ((∂Q + ∂Qᵀ) ∘ σ) A."""
+
+    @staticmethod
+    def forward(ctx, L, scale, model):
+        A = L @ scale
+        ctx.save_for_backward(L, A, model.spread)
+        return model._accumulated(A)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, g):
+        L, A, spread = ctx.saved_tensors
+        G = g[:, :STATES, :STATES]
+        return None, L.mT @ (((G + G.mT).unsqueeze(1) * spread) @ A), None
 
 
 def window_model(
