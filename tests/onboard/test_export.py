@@ -95,7 +95,7 @@ def test_the_example_in_cpp_writes_the_same_solution(exported, tables, drive, tm
     if cxx is None:
         pytest.skip("no C++ compiler here")
     write_log(tmp_path / "drive.csv", tables, drive)
-    assert len((CPP / "navigate.cpp").read_text().splitlines()) < 150
+    assert len((CPP / "navigate.cpp").read_text().splitlines()) < 170
     files = CPP / "navigate.cpp", folder / LIBRARY, "-o", tmp_path / "go"
     subprocess.run([cxx, "-O2", "-Wall", "-Werror", f"-I{folder}", *files], check=True)
     arm = [str(x) for x in ARM]
@@ -114,6 +114,19 @@ def test_the_example_in_cpp_writes_the_same_solution(exported, tables, drive, tm
     np.testing.assert_allclose(rows[:, 0], drive.t0 + first + 1 + np.arange(len(mine)), atol=1e-6)
     same = [ROW.index(c) for c in COLUMNS[1:]]
     np.testing.assert_allclose(rows[:, 1 : len(COLUMNS)], mine[:, same], rtol=1e-9, atol=1e-9)
+    for given, log, said in (
+        (["--arm", "1", "0.3"], lines[:0], "navigate: --arm: take [--arm x y z, in metres] [--latency]"),
+        (["--arm", "1", "0,3", "-1"], lines[:0], "navigate: -1: take [--arm"),
+        (["--latncy"], lines[:0], "navigate: --latncy: take"),
+        ([], lines[:3] + lines[3:400:2], "missing, or come at another rate than DLKF_RATE_HZ at t = "),
+        ([], ["t,x", *lines[:60], ""], "navigate: 2 of 62 lines are no sample and no fix, the first is line 1"),
+        ([], lines[:60], "navigate: nothing solved: the car must move under GNSS"),
+    ):
+        command = [tmp_path / "go", *given]
+        done = subprocess.run(
+            command, input="\n".join(log) + "\n", capture_output=True, text=True, env={"LD_LIBRARY_PATH": str(folder)}
+        )
+        assert done.returncode == 2 and said in done.stderr and not done.stdout, done.stderr
     # fixes that come late give the same in the end
     late = sorted(lines, key=lambda x: float(x.split(",")[1]) + (2.7 if x.startswith("gnss") else 0.0))
     np.testing.assert_allclose(run("\n".join(late)), rows, rtol=1e-9, atol=1e-9)

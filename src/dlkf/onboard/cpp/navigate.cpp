@@ -6,6 +6,7 @@
 //   gnss,t,lat,lon [deg],height [m],vel n e d [m/s],std of all six,quality (NMEA GGA)      nan where unknown
 //
 // Fixes may come late by up to HISTORY epochs: the filter goes back and comes again. Memory is fixed before it starts.
+// Exit code 2 for a wrong argument, and where no epoch could be solved.
 #include <algorithm>
 #include <chrono>
 #include <cmath>
@@ -27,6 +28,7 @@ class Navigator {
  public:
   double lever_arm_b[3] = {0, 0, 0};
   bool timing = false;
+  long epochs = 0;  // solved
   std::vector<double> milliseconds;
 
   void imu(double t, const double* sample) {
@@ -35,7 +37,7 @@ class Navigator {
     if (t - start_ < 0.5 / DLKF_RATE_HZ) return;  // before the grid
     Epoch& open = at(closed_);
     std::memcpy(open.imu + 6 * samples_, sample, 6 * sizeof(double));
-    if (std::abs(t - start_ - (samples_ + 1) / DLKF_RATE_HZ) > 0.5 / DLKF_RATE_HZ) return restart("samples are missing", t);
+    if (std::abs(t - start_ - (samples_ + 1) / DLKF_RATE_HZ) > 0.5 / DLKF_RATE_HZ) return restart("samples are missing, or come at another rate than DLKF_RATE_HZ", t);
     if (++samples_ == DLKF_SAMPLES) close();
   }
 
@@ -116,6 +118,7 @@ class Navigator {
     dlkf_step(epoch.memory, epoch.imu, epoch.fix, memory_, row);
     if (timing)
       milliseconds.push_back(std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now() - began).count());
+    epochs++;
     double* next = at(k + 1).memory;
     if (row[DLKF_FROM_ORIGIN_M] > DLKF_ANCHOR_M) dlkf_anchor(memory_, next);
     else std::memcpy(next, memory_, sizeof memory_);
@@ -129,20 +132,34 @@ class Navigator {
 int main(int argc, char** argv) {
   static Navigator navigator;
   for (int k = 1; k < argc; k++) {
-    if (!std::strcmp(argv[k], "--arm") && k + 3 < argc)
-      for (double& x : navigator.lever_arm_b) x = std::atof(argv[++k]);
-    else if (!std::strcmp(argv[k], "--latency")) navigator.timing = true;
+    bool known = !std::strcmp(argv[k], "--latency");
+    navigator.timing |= known;
+    if (!std::strcmp(argv[k], "--arm") && k + 3 < argc) {
+      known = true;
+      for (double& x : navigator.lever_arm_b) {
+        char* rest;
+        x = std::strtod(argv[++k], &rest);
+        known &= rest != argv[k] && !*rest && std::isfinite(x);
+      }
+    }
+    if (!known) return std::fprintf(stderr, "navigate: %s: take [--arm x y z, in metres] [--latency]\n", argv[k]), 2;
   }
   char line[1024];
   double x[FIX_NUMBERS];
+  long lines = 0, strange = 0, first = 0;
   while (std::fgets(line, sizeof line, stdin)) {
     int n = 0;
+    lines++;
     for (char* word = std::strchr(line, ','); word && n < FIX_NUMBERS; word = std::strchr(word + 1, ','))
       x[n++] = std::strtod(word + 1, nullptr);
     if (!std::strncmp(line, "imu,", 4) && n == 7) navigator.imu(x[0], x + 1);
-    if (!std::strncmp(line, "gnss,", 5) && n == FIX_NUMBERS) navigator.gnss(x);
+    else if (!std::strncmp(line, "gnss,", 5) && n == FIX_NUMBERS) navigator.gnss(x);
+    else if (!strange++) first = lines;
   }
+  if (strange) std::fprintf(stderr, "navigate: %ld of %ld lines are no sample and no fix, the first is line %ld\n", strange, lines, first);
   auto& ms = navigator.milliseconds;
   std::sort(ms.begin(), ms.end());
   if (!ms.empty()) std::fprintf(stderr, "%zu epochs, ms: p50 %.4f p99 %.4f\n", ms.size(), ms[ms.size() / 2], ms[ms.size() * 99 / 100]);
+  if (!navigator.epochs) std::fprintf(stderr, "navigate: nothing solved: the car must move under GNSS, with samples at DLKF_RATE_HZ\n");
+  return navigator.epochs ? 0 : 2;
 }
