@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.filters.advice import ABSENT
+from dlkf.filters.branches import may_branch
 from dlkf.filters.integration import Epoch
 from dlkf.filters.sources import Believed, Measurement
 from dlkf.navigation.attitude import skew
@@ -31,7 +32,7 @@ class AdvisedSpeed:
         if speed is None:
             return None, None
         used = speed[:, 1:] < ABSENT
-        if not (torch.compiler.is_compiling() or bool(used.any())):
+        if may_branch(used) and not bool(used.any()):
             return None, None
         state = epoch.window.end
         forward = state.C_nb[:, :, :1].mT

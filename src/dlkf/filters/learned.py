@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from dlkf.classes import TARGET
 from dlkf.data.drive import Batch
 from dlkf.errors import InputError
+from dlkf.filters.branches import may_branch
 from dlkf.filters.integration import Correction, Epoch, integrate
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.state import ATTITUDE, NavState
@@ -137,8 +138,8 @@ class LearnedFilter(nn.Module):
         has_fix = epoch.used.any(-1)
         memory = memory._replace(elapsed=memory.elapsed + span, since_fix=memory.since_fix + span)
         hold = self.config.outage_mode == "hold"
-        exporting = torch.compiler.is_compiling()  # then all pieces run, and those without a fix keep what they had
-        rows = has_fix.nonzero().squeeze(-1) if hold and not exporting else torch.arange(B, device=epoch.z.device)
+        picking = hold and may_branch(has_fix)  # if not, all pieces run, and those without a fix keep what they had
+        rows = has_fix.nonzero().squeeze(-1) if picking else torch.arange(B, device=epoch.z.device)
         dx = epoch.z.new_zeros(B, 9)
         gain = epoch.z.new_zeros(B, 9, 6)
         if len(rows) == 0:
@@ -150,7 +151,7 @@ class LearnedFilter(nn.Module):
             turn = part[:, ATTITUDE].norm(dim=-1, keepdim=True).detach()
             shrink = (MAX_TRAINING_TURN / turn.clamp_min(1e-9)).clamp(max=1.0)
             part = torch.cat((part[:, :6], part[:, ATTITUDE] * shrink), -1)
-        if hold and exporting:
+        if hold and not picking:
             dx, gain = _chosen(has_fix, part, dx), _chosen(has_fix, K, gain)
             matrix = None
             if error.matrix is not None and epoch.error.matrix is not None:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.filters.adaptive import Adaptation, AdaptiveNoise
+from dlkf.filters.branches import may_branch
 from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD, CarConstraints
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
 from dlkf.filters.kalman_update import kalman_prediction, kalman_update
@@ -159,7 +160,7 @@ class Mbkf:
                 H, R = masked(told.H, told.R, told.used)
                 parts.append(Measurement(told.z * told.used, H, R, told.used))
         z, H, R = ((x[0] if len(x) == 1 else torch.cat(x, 1)) for x in ([m[k] for m in parts] for k in range(3)))
-        informative = torch.compiler.is_compiling() or any(bool(m.used.any()) for m in parts)
+        informative = not may_branch(fix.P) or any(bool(m.used.any()) for m in parts)
         P = fix.P
         prior = P
         if informative:

@@ -21,6 +21,7 @@ from dlkf.data.drive import Batch
 from dlkf.errors import InputError
 from dlkf.filters.advice import ABSENT, Advice
 from dlkf.filters.advised_speed import AdvisedSpeed
+from dlkf.filters.branches import may_branch
 from dlkf.filters.build import build_filter
 from dlkf.filters.car_speed import Calibration, CarSpeed, Foretold
 from dlkf.filters.integration import Correction, Epoch
@@ -182,7 +183,7 @@ class PlusFilter(nn.Module):
         heads, hidden = self.network(features.to(dtype), now.to(dtype), axes.to(dtype), memory.hidden)
         seen = memory.since_fix < memory.elapsed  # before the first fix there is nothing to adapt to
         heads = Heads(*(x.to(epoch.z.dtype) for x in heads))
-        if torch.compiler.is_compiling() or not bool(seen.all()):
+        if not (may_branch(seen) and bool(seen.all())):
             heads = heads.where(seen)
         speed = torch.stack((foretold.speed, foretold.std), -1).to(epoch.z.dtype)
         advice = self._advice(heads, speed, memory.silent | ~seen)

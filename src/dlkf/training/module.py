@@ -96,7 +96,7 @@ class FilterTraining(L.LightningModule):
         self._errors.append(solution.imu_error[:, -1].double().cpu())
         if solution.gain is not None and bool(used.any()):
             last = solution.used.long().cumsum(1).argmax(1)
-            self._gains.append(solution.gain[torch.arange(len(last)), last][used].double().cpu())
+            self._gains.append(solution.gain[torch.arange(len(last), device=last.device), last][used].double().cpu())
         losses = self.loss(solution, batch)
         plain = weighted(losses, dict.fromkeys(TERMS, 1.0))
         shared = self.trainer.world_size > 1

@@ -1,0 +1,11 @@
+"""Branches on values: on a CPU they save work; a compiled or exported graph has none, and a GPU would be waited for."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def may_branch(on: Tensor) -> bool:
+    """Whether what is done next may depend on the values of ``on``; if not, all is done and ``torch.where`` chooses."""
+    return on.device.type == "cpu" and not torch.compiler.is_compiling()

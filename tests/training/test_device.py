@@ -1,0 +1,74 @@
+"""What a GPU would refuse, shown without one: the same training on a device that does not mix with the CPU's memory."""
+
+import lightning as L
+import pytest
+import torch
+from lightning.pytorch.accelerators import CPUAccelerator
+from lightning.pytorch.strategies import SingleDeviceStrategy
+
+from dlkf.filters.integration import integrate
+from dlkf.filters.saved import learned_filter, learned_settings, load_filter
+from dlkf.training.callbacks.checkpoints import ResumePoint
+from dlkf.training.fit import fit
+from dlkf.training.loss import LossConfig, weighted
+from tests.cars import car_batch
+from tests.elsewhere import DEVICE, Elsewhere
+
+from .test_resume import data, told
+
+
+class Pretended(CPUAccelerator):
+    """Lightning's word for :class:`Elsewhere`."""
+
+    def setup_device(self, device):
+        assert device == DEVICE
+
+
+LOSSES = {"dlkf": LossConfig(), "plus": LossConfig(prior=0.0, posterior=0.0, outage=1.0, likelihood=1.0, speed=1.0)}
+SIZES = {"dlkf": {"lstm_hidden": 16, "lstm_layers": 2, "dense": [16, 8], "dropout": 0.0}, "plus": {"hidden": 8}}
+
+
+@pytest.mark.parametrize(
+    ("kind", "more"),
+    [("dlkf", {}), ("dlkf", {"outage_mode": "run", "frame": "heading", "imu_error": "affine"}), ("plus", {})],
+)
+def test_loss_and_gradients_are_the_cpus_and_the_host_waits_for_nothing(kind, more):
+    """Through another form of every loop, so to rounding in float64; a wait would be one in every epoch."""
+    batch = car_batch(4, 12, 50)
+    batch.available[1::2, 4:9] = False
+
+    def step(batch, device):
+        torch.manual_seed(1)
+        filter_ = learned_filter(learned_settings({"kind": kind, "network": SIZES[kind], **more})).double().to(device)
+        loss = LOSSES[kind](integrate(batch, filter_, keep_covariances=kind == "plus"), batch)
+        weighted(loss, {}).backward()
+        return loss, {k: p.grad.to("cpu") for k, p in filter_.named_parameters() if p.grad is not None}
+
+    ours, gradients = step(batch, "cpu")
+    with Elsewhere() as device:
+        there = batch.to(DEVICE)
+        device.waits.clear()
+        losses, moved = step(there, DEVICE)
+        copied = len(moved)
+        assert sum(device.waits.values()) - copied == 2, device.waits  # late fixes? a lever arm?
+        for name, loss in losses.items():
+            assert float(loss.detach()) == pytest.approx(float(ours[name].detach()), rel=1e-9), name
+    assert moved.keys() == gradients.keys()
+    for name, gradient in gradients.items():
+        assert torch.allclose(moved[name], gradient, rtol=1e-6, atol=1e-9 * float(gradient.abs().max())), name
+
+
+def test_a_whole_training_runs_there(dataset, tmp_path, monkeypatch):
+    """Curriculum, masks, loss weights, validation and the kept weights, which are those of the CPU to rounding."""
+    trainer = L.Trainer
+    here = load_filter(fit(told(max_epochs=2, validate_every=1), data(dataset), tmp_path / "here", False))
+
+    def pretended(**given):
+        return trainer(**given | {"accelerator": "auto", "strategy": SingleDeviceStrategy(DEVICE, Pretended())})
+
+    monkeypatch.setattr("dlkf.training.fit.L.Trainer", pretended)
+    monkeypatch.setattr(ResumePoint, "on_train_epoch_end", lambda *_: None)  # torch.save does not know the device
+    with Elsewhere():
+        there = load_filter(fit(told(max_epochs=2, validate_every=1), data(dataset), tmp_path / "there", False))
+    for (name, a), b in zip(here.state_dict().items(), there.state_dict().values(), strict=True):
+        assert torch.allclose(a, b, rtol=0, atol=1e-3), name  # a tenth of how far twelve steps go
