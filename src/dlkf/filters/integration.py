@@ -7,7 +7,7 @@ all, so that a comparison between filters compares their answers and nothing els
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -185,11 +185,16 @@ def _rate_before(rates: Tensor, late: Tensor, count: int) -> Tensor:
     return torch.bmm(counts.unsqueeze(1), rates).squeeze(1) / count
 
 
-def integrate(batch: Batch, estimator: Estimator, *, keep_covariances: bool = False) -> Solution:
-    """Run an estimator over a batch from its start state; differentiable where the estimator is."""
+def integrate(
+    batch: Batch, estimator: Estimator, *, keep_covariances: bool = False, turn: Callable = advance
+) -> Solution:
+    """Run an estimator over a batch from its start state; differentiable where the estimator is.
+
+    ``turn`` is :func:`advance`, or a compiled form of it.
+    """
     if isinstance(estimator, WholeLoop):
         return estimator.integrate(batch)
-    state = batch.start
+    state, frame = batch.start, batch.frame.prepared()
     memory, imu_error = estimator.begin(batch)
     error = ImuError.of(imu_error)
     usable = batch.gnss_valid & batch.available.unsqueeze(-1)
@@ -199,9 +204,9 @@ def integrate(batch: Batch, estimator: Estimator, *, keep_covariances: bool = Fa
     lags = batch.gnss_lag.unbind(1) if late else [None] * batch.size[1]
     fixes = map(Fix, batch.gnss.unbind(1), batch.gnss_std.unbind(1), usable.unbind(1), lags)
     for imu, fix in zip(batch.imu.unbind(1), fixes):
-        memory, step = advance(
+        memory, step = turn(
             estimator, memory, state, error, imu, fix,
-            dt=batch.dt, frame=batch.frame, lever_arm_b=lever_arm_b,
+            dt=batch.dt, frame=frame, lever_arm_b=lever_arm_b,
         )  # fmt: skip
         if not keep_covariances:
             step = step._replace(answer=step.answer._replace(covariances=None))

@@ -30,12 +30,15 @@ AVAILABLE = numba is not None
 _tensor_forms = False
 
 
-def fits(x: Tensor) -> bool:
-    """Whether the compiled form may stand in for the tensor form: no gradient asked for, in main memory.
+def fits(x: Tensor, *, gradients: bool = False) -> bool:
+    """Whether the compiled form may stand in for the tensor form: in main memory, and no gradient asked for but by
+    one that has ``gradients``.
 
     Says once what stands in its way, if something does.
     """
-    if _tensor_forms or x.device.type != "cpu" or torch.is_grad_enabled() or x.requires_grad:
+    if _tensor_forms or x.device.type != "cpu" or torch.compiler.is_compiling():
+        return False
+    if not gradients and (torch.is_grad_enabled() or x.requires_grad):
         return False
     if TROUBLE:
         warned(TROUBLE)

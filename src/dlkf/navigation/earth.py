@@ -96,6 +96,11 @@ class TangentFrame:
         """The frames of some batch elements."""
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
+    def prepared(self) -> TangentFrame:
+        """Itself, with what all epochs share made now, for torch's compiler does not make it on the way."""
+        _ = self._normal, self._gradient
+        return self
+
     def gravity(self, p_n: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
         """Gravity vector in n [m/s²] at position ``p_n`` [m], plumb-line tilt and height included.
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -49,13 +49,11 @@ class WindowModel:
     density: Tensor  # (1, 4) S of each noise source, the same for all drives
     walk: Tensor  # (n,) variance that a window adds to the states of the car
 
-    @cached_property
+    @property
     def spread(self) -> Float[Tensor, "4 s s"]:
         """S ∫ (1−τ/T)^(nᵢ+nⱼ) dτ of each noise source."""
-        powers = torch.tensor([[math.inf if p is None else p for p in n] for n in SOURCES.values()])
-        order = powers.to(self.density).repeat_interleave(3, -1)
         T = self.left.shape[1] * self.dt
-        return (self.density[0] * T)[:, None, None] / (order.unsqueeze(2) + order.unsqueeze(1) + 1)
+        return (self.density[0] * T)[:, None, None] / _orders(self.density.dtype, self.density.device)
 
     def transition(
         self, start: NavState, window: Window, corrected: Float[Tensor, "B M 6"], frame: TangentFrame
@@ -162,6 +160,15 @@ class _ProcessNoise(torch.autograd.Function):
         L, A, spread = ctx.saved_tensors
         G = g[:, :STATES, :STATES]
         return None, L.mT @ (((G + G.mT).unsqueeze(1) * spread) @ A), None
+
+
+@lru_cache
+@torch.inference_mode(False)
+def _orders(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """nᵢ + nⱼ + 1 of each noise source (4, s, s)."""
+    powers = [[math.inf if p is None else p for p in n] for n in SOURCES.values()]
+    order = torch.tensor(powers, dtype=dtype, device=device).repeat_interleave(3, -1)
+    return order.unsqueeze(2) + order.unsqueeze(1) + 1
 
 
 def window_model(

@@ -69,7 +69,7 @@ def strapdown(
         half = 0.5 * dt * imu.shape[1]
         gravity = frame.gravity(torch.add(start.p_n, start.v_n, alpha=half))
     if torch.is_grad_enabled():
-        function = _CompiledStrapdown if compiled.AVAILABLE and imu.device.type == "cpu" else _Strapdown
+        function = _CompiledStrapdown if compiled.fits(imu, gradients=True) else _Strapdown
         p, v, C, *end = function.apply(
             start.p_n, start.v_n, start.C_nb, imu, dt, gravity, frame.gravity_gradient(), frame.earth_rate_n
         )

@@ -43,8 +43,8 @@ class EpochLayer(nn.Module):
     product: EpochProduct | None = None
 
     def learning(self) -> bool:
-        """Whether gradients of the layer's weights are wanted."""
-        if not torch.is_grad_enabled():
+        """Whether gradients of the layer's weights are wanted; a compiler has products of its own."""
+        if not torch.is_grad_enabled() or torch.compiler.is_compiling():
             return False
         return self.product is not None or all(p.requires_grad for p in self.parameters())
 

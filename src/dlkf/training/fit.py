@@ -44,7 +44,7 @@ def fit(
     stored beside the weights. Raises InputError where no epoch had a finite ``monitor``.
     """
     plan = settings.trainer
-    module = FilterTraining(settings.model, settings.loss, settings.descent, seed=settings.seed)
+    module = FilterTraining(settings.model, settings.loss, settings.descent, settings.seed, compiled=plan.compile)
     last = folder / LAST
     if settings.finetune:
         module.filter = trained_filter(settings.finetune).train()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 
 import lightning as L
 import numpy as np
@@ -11,10 +12,11 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import end_errors, mean_error
-from dlkf.filters.integration import Solution, integrate
+from dlkf.filters.integration import Solution, advance, integrate
 from dlkf.filters.saved import LearnedSettings, learned_filter
 from dlkf.networks.heads import IMU_ERROR_SIZE, INNOVATION_SIZE, STATE_SIZE
 from dlkf.training.callbacks.masking import BatchCallback
+from dlkf.training.compilation import Turn, compiled_turn
 from dlkf.training.loss import TERMS, Loss, weighted
 from dlkf.training.optimization import Descent
 from dlkf.training.processes import of_all
@@ -35,6 +37,8 @@ class FilterTraining(L.LightningModule):
         loss: Loss,
         descent: Descent,
         seed: int = 0,
+        *,
+        compiled: bool = False,
     ) -> None:
         super().__init__()
         torch.manual_seed(seed)
@@ -44,6 +48,7 @@ class FilterTraining(L.LightningModule):
         self.covariances = getattr(loss, "likelihood", 0.0) > 0
         self.loss_weights: dict[str, float] = dict.fromkeys(TERMS, 1.0)
         self.seed = seed
+        self.turn: Turn | None = None if compiled else advance  # None: to be compiled with the first batch
 
     def configure_optimizers(self):
         """Those of the settings, a step of the schedule an epoch."""
@@ -55,7 +60,6 @@ class FilterTraining(L.LightningModule):
     def training_step(self, batch: Batch, step: int) -> Tensor:
         """Masked filter run and weighted loss of one batch, or of this process's pieces of it."""
         rank, processes = self.trainer.global_rank, self.trainer.world_size
-        torch.manual_seed(hash((self.seed, self.global_step, *([rank] if rank else ()))) % 2**63)  # dropout
         generator = torch.Generator().manual_seed(hash((self.seed, self.current_epoch, step)) % 2**63)
         for callback in self.trainer.callbacks:  # pyright: ignore[reportAttributeAccessIssue]  set by Trainer()
             if isinstance(callback, BatchCallback):
@@ -64,7 +68,12 @@ class FilterTraining(L.LightningModule):
         if processes > 1:
             batch = batch.select(torch.arange(rank, pieces, processes))
         batch = batch.to(self.device)
-        losses = self.loss(self._run(batch), batch)
+        if self.turn is None:
+            self.turn = compiled_turn(
+                lambda turn: weighted(self._losses(batch, turn), self.loss_weights), self.filter.parameters()
+            )
+        torch.manual_seed(hash((self.seed, self.global_step, *([rank] if rank else ()))) % 2**63)  # dropout
+        losses = self._losses(batch, self.turn)
         total = weighted(losses, self.loss_weights)
         values = {f"train/{k}_loss": v.detach() for k, v in losses.items()}
         values["train/loss"] = total.detach()
@@ -84,8 +93,11 @@ class FilterTraining(L.LightningModule):
         """As it is: a step moves it, after what is drawn on the CPU."""
         return batch
 
-    def _run(self, batch: Batch) -> Solution:
-        return integrate(batch, self.filter, keep_covariances=self.covariances)
+    def _run(self, batch: Batch, turn: Turn = advance) -> Solution:
+        return integrate(batch, self.filter, keep_covariances=self.covariances, turn=turn)
+
+    def _losses(self, batch: Batch, turn: Turn) -> Mapping[str, Tensor]:
+        return self.loss(self._run(batch, turn), batch)
 
     def validation_step(self, batch: Batch, step: int) -> None:
         """Errors at the ends of fixed outages, as they will be scored on test drives, and what the filter answers."""

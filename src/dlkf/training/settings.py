@@ -33,6 +33,7 @@ class TrainerSettings(Ranged, where="trainer"):
     best_from_epoch: int = within(0, 0, MANY)
     threads: int | None = within(1, 1, MANY)
     accelerator: str = "auto"
+    compile: bool = False
     devices: int = within(1, 1, MANY)
     strategy: Literal["auto", "ddp"] = "auto"  # the same: several processes average their gradients, one has its own
 
