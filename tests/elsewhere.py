@@ -18,6 +18,10 @@ DEVICE = torch.device("meta")
 CPU = torch.device("cpu")
 WAITS = {"_local_scalar_dense", "is_nonzero", "nonzero", "masked_select", "unique", "equal"}
 COPIES = {"_to_copy", "copy_", "lift_fresh"}
+VIEWS = {  # no work for a device
+    "view", "_unsafe_view", "t", "transpose", "permute", "expand", "unsqueeze", "squeeze", "select", "slice", "split",
+    "split_with_sizes", "unbind", "alias", "detach", "as_strided", "diagonal",
+}  # fmt: skip
 
 
 class There(Tensor):
@@ -64,11 +68,13 @@ class FromNumbers(TorchFunctionMode):
 
 
 class Elsewhere(TorchDispatchMode):
-    """Inside, ``device="meta"`` means this device. ``waits`` counts what the host waited for, by operation."""
+    """Inside, ``device="meta"`` means this device. ``waits`` counts what the host waited for, by operation, and
+    ``work`` all that it had to begin there."""
 
     def __init__(self) -> None:
         super().__init__()
         self.waits: Counter[str] = Counter()
+        self.work = 0
         self.numbers = FromNumbers()
 
     def __enter__(self) -> Elsewhere:
@@ -95,6 +101,7 @@ class Elsewhere(TorchDispatchMode):
         to_cpu = asked is not None and torch.device(asked).type == "cpu"
         if there and (name in WAITS or (name == "_to_copy" and to_cpu)):
             self.waits[name] += 1
+        self.work += there and name not in VIEWS
         inner = tree_map(lambda x: x.values if isinstance(x, There) else x, (args, kwargs))
         given: dict[str, Any] = inner[1]
         if asked is not None:

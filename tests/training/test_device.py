@@ -58,6 +58,22 @@ def test_loss_and_gradients_are_the_cpus_and_the_host_waits_for_nothing(kind, mo
         assert torch.allclose(moved[name], gradient, rtol=1e-6, atol=1e-9 * float(gradient.abs().max())), name
 
 
+@pytest.mark.parametrize(("kind", "told"), [("dlkf", 620), ("plus", 1280)])
+def test_an_epoch_is_as_many_operations_as_the_docs_tell(kind, told):
+    """Forth and back, with the networks as they are by default; the difference of two lengths leaves out what is done
+    once a batch. A loop over samples or pieces would make them many."""
+    counts = []
+    for T in (4, 8):
+        with Elsewhere() as device:
+            filter_ = learned_filter(learned_settings({"kind": kind})).to(DEVICE)
+            batch = car_batch(2, T, 50, dtype=torch.float32).to(DEVICE)
+            device.work = 0
+            losses = LOSSES[kind](integrate(batch, filter_, keep_covariances=kind == "plus"), batch)
+            weighted(losses, {}).backward()
+            counts.append(device.work)
+    assert (counts[1] - counts[0]) / 4 == pytest.approx(told, rel=0.1)
+
+
 def test_a_whole_training_runs_there(dataset, tmp_path, monkeypatch):
     """Curriculum, masks, loss weights, validation and the kept weights, which are those of the CPU to rounding."""
     trainer = L.Trainer
