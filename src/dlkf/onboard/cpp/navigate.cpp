@@ -18,6 +18,7 @@
 #include "step.h"
 
 constexpr int HISTORY = 10, FIX_NUMBERS = 14;  // t and what a line of a fix holds
+constexpr int RING = HISTORY + DLKF_BEGIN_EPOCHS + 2;  // an alignment that a late fix allows looks back further
 constexpr double EPOCH_S = DLKF_SAMPLES / DLKF_RATE_HZ, ON_BOUNDARY_S = 1e-3;
 
 struct Epoch {
@@ -61,13 +62,13 @@ class Navigator {
   }
 
  private:
-  Epoch ring_[HISTORY + 1], before_;
+  Epoch ring_[RING], before_;
   double memory_[DLKF_MEMORY], start_ = NAN, latest_ = -INFINITY;  // of the open epoch; of the samples
   long closed_ = 0, first_ = 0;
   int samples_ = 0;
   bool running_ = false;
 
-  Epoch& at(long k) { return ring_[k % (HISTORY + 1)]; }
+  Epoch& at(long k) { return ring_[k % RING]; }
 
   void none(Epoch& epoch) {
     std::fill_n(epoch.fix, DLKF_FIX, NAN);
