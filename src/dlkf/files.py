@@ -20,6 +20,8 @@ from typing import Any, cast
 
 from dlkf.errors import InputError
 
+PARTIAL = ".partial-"  # how a folder begins in which files wait for the rest
+
 
 def is_url(place: object) -> bool:
     """Whether a place is in a store, and not a path of this machine."""
@@ -76,11 +78,12 @@ def at_hand(folder: str | Path) -> Iterator[Path]:
 def vacant(folder: str | Path, *, overwrite: bool) -> None:
     """InputError if ``folder`` holds something that a new result would lie among, unless ``overwrite``.
 
-    And if it is in a store that does not answer, or in a bucket that is not there.
+    What a killed command had not moved into place yet is no result. InputError, too, if it is in a store that does
+    not answer, or in a bucket that is not there.
     """
     reached(folder)
     target = placed(folder).expanduser()
-    if not overwrite and target.is_dir() and any(target.iterdir()):
+    if not overwrite and target.is_dir() and any(not p.name.startswith(PARTIAL) for p in target.iterdir()):
         raise InputError(f"out={folder} exists already and is not empty; give another out= or overwrite=true")
 
 
@@ -173,7 +176,7 @@ def staged(folder: str | Path) -> Iterator[Path]:
     created = [p for p in (target, *target.parents) if not p.exists()]
     try:
         target.mkdir(parents=True, exist_ok=True)
-        beside = Path(tempfile.mkdtemp(prefix=".partial-", dir=target))
+        beside = Path(tempfile.mkdtemp(prefix=PARTIAL, dir=target))
     except OSError as error:
         raise InputError(f"out={folder}: cannot write there ({error.strerror}); give another folder") from None
     try:

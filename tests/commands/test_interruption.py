@@ -18,6 +18,7 @@ import pytest
 
 from dlkf.data.validate import validate_dataset
 from dlkf.errors import InputError
+from dlkf.files import staged, vacant
 from tests.shell import PATIENCE_S
 
 SIMULATE = (
@@ -139,3 +140,18 @@ def test_an_interrupt_that_became_another_error_is_one(signal_, code, call, monk
     finally:
         signal.signal(signal.SIGINT, before)
     assert ended.code == code and "cannot be read" not in ended.err
+
+
+def test_what_a_kill_left_does_not_stand_in_the_way(tmp_path):
+    """Nobody cleans up after SIGKILL: the files that wait beside the folder's own are not a result."""
+    out = tmp_path / "made"
+    killed = f"from dlkf.files import staged; import os, signal\nwith staged({str(out)!r}) as f:\n"
+    killed += " (f / 'report.html').write_text('half'); os.kill(os.getpid(), signal.SIGKILL)"
+    assert subprocess.run([sys.executable, "-c", killed], timeout=PATIENCE_S).returncode == -signal.SIGKILL
+    assert len(list(out.iterdir())) == 1
+    vacant(out, overwrite=False)
+    with staged(out) as folder:
+        (folder / "report.html").write_text("whole")
+    assert (out / "report.html").read_text() == "whole"
+    with pytest.raises(InputError, match="exists already"):
+        vacant(out, overwrite=False)
