@@ -290,3 +290,9 @@ def test_compiled_solution_is_that_of_the_tensor_form():
     with torch.no_grad():
         assert torch.allclose(S @ _solved(S, X), X, rtol=0, atol=1e-12)
     assert torch.allclose(S @ _solved(S, X), X, rtol=0, atol=1e-12)
+
+
+def test_what_cannot_be_solved_is_not_finite_and_no_error():
+    S, X = torch.zeros(1, 2, 2, dtype=torch.float64), torch.ones(1, 2, 3, dtype=torch.float64)
+    with torch.no_grad():
+        assert not _solved(S, X).isfinite().any()

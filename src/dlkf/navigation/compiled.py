@@ -275,7 +275,7 @@ def _variance_along(P, C, out):
                 ))  # fmt: skip
 
 
-@njit()
+@njit(error_model="numpy")  # what cannot be solved is not finite, as with LAPACK, and no error
 @no_type_check
 def _eliminate(S, X):
     """Gauss and Jordan's elimination, for which positive definite matrices need no exchange of rows; X ← S⁻¹ X."""
