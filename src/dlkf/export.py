@@ -6,6 +6,7 @@ example; then runs the exported filter and the original over that drive and says
 
 from __future__ import annotations
 
+import shlex
 import tempfile
 from pathlib import Path
 
@@ -60,7 +61,7 @@ def main(told: ExportSettings) -> None:
     arm = " ".join(f"{x:g}" for x in tables.row.lever_arm_b)
     print(f"{short_name(told.model)} as C in {told.out}: {layout.size} numbers of memory, step.h says how")
     print("\n".join(lines))
-    print(f"Try it: cd {told.out} && cmake -B build && cmake --build build "
+    print(f"Try it: cd {shlex.quote(told.out)} && cmake -B build && cmake --build build "
           f"&& build/navigate --arm {arm} < drive.csv > solution.csv")  # fmt: skip
 
 

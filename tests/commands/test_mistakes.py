@@ -88,7 +88,7 @@ def test_a_gpu_that_is_not_there_is_one_line(accelerator, said):
 
 @pytest.mark.parametrize(
     ("command", "arguments"),
-    [("export", ("model=mbkf15", "out=made", "dataset=town")), ("navigate", (*SOLVED, "compiled=true"))],
+    [("export", ("model=mbkf15", "out=made here", "dataset=town")), ("navigate", (*SOLVED, "compiled=true"))],
     ids=["export", "compiled step"],
 )
 def test_without_a_c_compiler(command, arguments, copy, call, tmp_path, monkeypatch):
@@ -103,7 +103,9 @@ def test_without_a_c_compiler(command, arguments, copy, call, tmp_path, monkeypa
         is_refused(ended, "no C compiler found", folder=tmp_path)
     else:
         assert ended.code == 0 and "not checked: no C compiler here" in ended.out, ended.err
-        assert (tmp_path / "made" / "drive.csv").is_file() and (tmp_path / "made" / "CMakeLists.txt").is_file()
+        assert "Try it: cd 'made here' && cmake" in ended.out  # as a shell takes it
+        made = tmp_path / "made here"
+        assert (made / "drive.csv").is_file() and (made / "CMakeLists.txt").is_file()
 
 
 def test_what_was_said_lies_beside_the_report(copy, call, tmp_path):
