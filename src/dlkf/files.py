@@ -8,13 +8,16 @@ in between is no dataset.
 
 from __future__ import annotations
 
+import fcntl
+import glob
 import io
 import os
 import shutil
 import tempfile
+import time
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, cast
 
@@ -78,8 +81,8 @@ def at_hand(folder: str | Path) -> Iterator[Path]:
 def vacant(folder: str | Path, *, overwrite: bool) -> None:
     """InputError if ``folder`` holds something that a new result would lie among, unless ``overwrite``.
 
-    What a killed command had not moved into place yet is no result. InputError, too, if it is in a store that does
-    not answer, or in a bucket that is not there.
+    What a killed command had not moved into place yet is no result; the next one clears it away. InputError, too, if
+    it is in a store that does not answer, or in a bucket that is not there.
     """
     reached(folder)
     target = placed(folder).expanduser()
@@ -88,7 +91,9 @@ def vacant(folder: str | Path, *, overwrite: bool) -> None:
 
 
 def reached(folder: str | Path) -> None:
-    """InputError where a place is in a store that cannot be had, or in a bucket that is not there."""
+    """InputError where a place is no name at all, in a store that cannot be had, or in a bucket that is not there."""
+    if folder == "":
+        raise InputError("out= is empty; give a folder")
     place: Any = placed(folder)
     if not is_url(folder) or "memory" in place.fs.protocol:
         return
@@ -141,18 +146,22 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
             yield beside
         return
     target = Path(path).absolute()
+    if Path.cwd().is_relative_to(target.resolve()):
+        raise InputError(f"out={path} would take the place of the folder you stand in; give one below it")
     beside, old = (target.with_name(f".{target.name}.{what}-{os.getpid()}") for what in ("partial", "old"))
+    _cleared(target.parent, f".{target.name}{PARTIAL}")
     try:
         beside.mkdir(parents=True)
     except OSError as error:
         raise InputError(f"out={path}: cannot write there ({error.strerror}); give another folder") from None
     try:
-        yield beside
-        for left in beside.rglob(".*"):  # of a worker that was killed while it wrote
-            left.unlink()
-        if target.exists():
-            target.rename(old)
-        beside.rename(target)
+        with _alive(beside):
+            yield beside
+            for left in beside.rglob(".*"):  # of a worker that was killed while it wrote
+                left.unlink()
+            if target.exists():
+                target.rename(old)
+            beside.rename(target)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)
@@ -165,14 +174,15 @@ def staged(folder: str | Path) -> Iterator[Path]:
     Files of the same name are replaced, others in ``folder`` stay. Raises InputError if ``folder`` cannot be
     written to.
     """
+    reached(folder)
     if is_url(folder):
-        reached(folder)
         with tempfile.TemporaryDirectory(prefix="dlkf-") as here:
             yield Path(here)
             with told(folder):
                 _put(Path(here), placed(folder))
         return
     target = Path(folder)
+    _cleared(target, PARTIAL)
     created = [p for p in (target, *target.parents) if not p.exists()]
     try:
         target.mkdir(parents=True, exist_ok=True)
@@ -180,11 +190,12 @@ def staged(folder: str | Path) -> Iterator[Path]:
     except OSError as error:
         raise InputError(f"out={folder}: cannot write there ({error.strerror}); give another folder") from None
     try:
-        yield beside
-        for source in sorted(p for p in beside.rglob("*") if p.is_file()):
-            final = target / source.relative_to(beside)
-            final.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(source, final)
+        with _alive(beside):
+            yield beside
+            for source in sorted(p for p in beside.rglob("*") if p.is_file()):
+                final = target / source.relative_to(beside)
+                final.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(source, final)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
         for path in created:  # innermost first; a failed run leaves no empty folders behind
@@ -211,6 +222,34 @@ def _whole_prefix(path: str | Path) -> Iterator[Path]:
     finally:
         if beside.exists():
             fs.rm(beside.path, recursive=True)
+
+
+@contextmanager
+def _alive(folder: Path) -> Iterator[None]:
+    """Holds the kernel's lock of a folder for the block, which ends with the process however that ends."""
+    at = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # a file system without locks: then nobody takes it for dead either
+            fcntl.flock(at, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(at)
+
+
+def _cleared(parent: Path, begins: str) -> None:
+    """Removes folders that begin so and whose process was killed: nobody holds their lock.
+
+    Those of the last second stay, as they may be about to be locked.
+    """
+    for left in parent.glob(f"{glob.escape(begins)}*"):
+        with suppress(OSError):
+            at = os.open(left, os.O_RDONLY | os.O_DIRECTORY)
+            try:
+                fcntl.flock(at, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if time.time() - os.fstat(at).st_mtime > 1:
+                    shutil.rmtree(left)
+            finally:
+                os.close(at)
 
 
 def _made(file: Path) -> Path:

@@ -17,7 +17,9 @@ from dlkf.command import command
 from dlkf.command.scored import TuneSettings
 from dlkf.console import counting
 from dlkf.data.store import dataset_digest, load_dataset
+from dlkf.errors import InputError
 from dlkf.evaluation.table import as_markdown, as_rich
+from dlkf.files import is_url, reached
 from dlkf.tracking.runs import start_run, tracking_uri
 from dlkf.tuning.found import found_noise, noise_table, write_noise
 from dlkf.tuning.study import LIKELIHOOD, check, search, sides, tuning_table, write_tuning
@@ -28,6 +30,9 @@ def main(told: TuneSettings) -> None:
     """Load, split, search, check, write, log, print."""
     model, name, spec, start = str(told.model), told.name, told.spec, told.tuning
     check(model, told.objective)
+    if is_url(told.out):
+        raise InputError(f"out={told.out}: --config-dir takes folders of this machine alone; give one")
+    reached(told.out)
     protocol, uri = told.protocol(), tracking_uri(told.tracking.uri)
     with counting("Loading drives") as progress:
         drives = load_dataset(

@@ -18,7 +18,7 @@ import pytest
 
 from dlkf.data.validate import validate_dataset
 from dlkf.errors import InputError
-from dlkf.files import staged, vacant
+from dlkf.files import staged, vacant, whole_folder
 from tests.shell import PATIENCE_S
 
 SIMULATE = (
@@ -74,9 +74,12 @@ def test_simulate(how, call, tmp_path):
     if how != signal.SIGKILL:
         assert list((tmp_path / "made").iterdir()) == []
         return
+    (left,) = (tmp_path / "made").iterdir()
+    os.utime(left, (0, 0))  # as if it had been some seconds ago
     done = call(*SIMULATE, "dataset.hours=0.02")
     assert done.code == 0, done.err
     assert len(validate_dataset(tmp_path / "made" / "town")) == 2
+    assert [p.name for p in (tmp_path / "made").iterdir()] == ["town"]  # what the killed one had begun is gone
 
 
 def test_ingest(town, tmp_path):
@@ -148,10 +151,28 @@ def test_what_a_kill_left_does_not_stand_in_the_way(tmp_path):
     killed = f"from dlkf.files import staged; import os, signal\nwith staged({str(out)!r}) as f:\n"
     killed += " (f / 'report.html').write_text('half'); os.kill(os.getpid(), signal.SIGKILL)"
     assert subprocess.run([sys.executable, "-c", killed], timeout=PATIENCE_S).returncode == -signal.SIGKILL
-    assert len(list(out.iterdir())) == 1
+    (left,) = out.iterdir()
+    os.utime(left, (0, 0))  # as if it had been some seconds ago
     vacant(out, overwrite=False)
     with staged(out) as folder:
         (folder / "report.html").write_text("whole")
-    assert (out / "report.html").read_text() == "whole"
+    assert [p.name for p in out.iterdir()] == ["report.html"] and (out / "report.html").read_text() == "whole"
     with pytest.raises(InputError, match="exists already"):
         vacant(out, overwrite=False)
+
+
+def test_what_another_command_is_at_is_not_taken_for_dead(tmp_path):
+    """Two commands with one target at a time: neither clears the other's files away, however old they are."""
+    target = tmp_path / "town"
+    alive = f"from dlkf.files import whole_folder\nwith whole_folder({str(target)!r}) as f:\n"
+    alive += " (f / 'imu').write_text('other'); print('there', flush=True); input()"
+    other = subprocess.Popen([sys.executable, "-c", alive], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert other.stdout is not None and other.stdout.readline() == "there\n"
+    for beside in tmp_path.iterdir():
+        os.utime(beside, (0, 0))
+    with whole_folder(target) as folder:
+        (folder / "imu").write_text("this")
+    assert (target / "imu").read_text() == "this"
+    other.communicate("\n", timeout=PATIENCE_S)
+    assert other.returncode == 0 and (target / "imu").read_text() == "other"
+    assert [p.name for p in tmp_path.iterdir()] == ["town"]
