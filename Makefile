@@ -20,7 +20,10 @@ help:
 	@echo "make clean     remove what can be made again; data and runs stay"
 
 # A stamp is younger than what it was made from, so nothing is installed twice.
-# Without compiling everything ahead, installing takes half the time; Python compiles what it imports.
+# Without compiling everything ahead, installing takes half the time; Python compiles what it imports, once where it may
+# keep it: a process that compiles torch and its like anew takes twice as long to start.
+unexport PYTHONDONTWRITEBYTECODE
+
 .venv/pyvenv.cfg:
 	$(PYTHON) -m venv .venv
 

@@ -11,6 +11,7 @@ from dlkf.filters.saved import learned_filter, learned_settings, load_filter
 from dlkf.training.callbacks.checkpoints import ResumePoint
 from dlkf.training.fit import fit
 from dlkf.training.loss import LossConfig, weighted
+from dlkf.training.module import FilterTraining
 from tests.cars import car_batch
 from tests.elsewhere import DEVICE, Elsewhere
 
@@ -76,8 +77,13 @@ def test_an_epoch_is_as_many_operations_as_the_docs_tell(kind, told):
 
 def test_a_whole_training_runs_there(dataset, tmp_path, monkeypatch):
     """Curriculum, masks, loss weights, validation and the kept weights, which are those of the CPU to rounding."""
-    trainer = L.Trainer
-    here = load_filter(fit(told(max_epochs=2, validate_every=1), data(dataset), tmp_path / "here", False))
+
+    def trained(name: str):
+        pieces = data(dataset)
+        pieces.batch_size = 20
+        return load_filter(fit(told(max_epochs=2, validate_every=2), pieces, tmp_path / name, False)).state_dict()
+
+    trainer, here = L.Trainer, trained("here")
 
     def pretended(**given):
         return trainer(**given | {"accelerator": "auto", "strategy": SingleDeviceStrategy(DEVICE, Pretended())})
@@ -85,6 +91,9 @@ def test_a_whole_training_runs_there(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr("dlkf.training.fit.L.Trainer", pretended)
     monkeypatch.setattr(ResumePoint, "on_train_epoch_end", lambda *_: None)  # torch.save does not know the device
     with Elsewhere():
-        there = load_filter(fit(told(max_epochs=2, validate_every=1), data(dataset), tmp_path / "there", False))
-    for (name, a), b in zip(here.state_dict().items(), there.state_dict().values(), strict=True):
-        assert torch.allclose(a, b, rtol=0, atol=1e-3), name  # a tenth of how far twelve steps go
+        there = trained("there")
+    start = FilterTraining(told().model, told().loss, told().descent, seed=3).filter.state_dict()
+    for name, weight in here.items():
+        assert torch.allclose(weight, there[name], rtol=0, atol=3e-4), name
+    moved = max(float((here[name] - start[name]).abs().max()) for name in here if name.endswith("weight"))
+    assert moved > 3e-3  # ten times what rounding may do
