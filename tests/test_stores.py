@@ -127,6 +127,17 @@ def test_an_evaluation_in_a_store(town, bucket, call, uri):
     assert "report.html" in files(f"{bucket}/eval")
 
 
+def test_a_bucket_is_no_dataset(town, bucket):
+    """Nor are all buckets together: what replaced them would take everything away that lies there."""
+    copied(town, bucket)
+    before = files(bucket)
+    for whole in ("s3://", "s3://drives", "s3://drives/"):
+        said = f"^out={whole} is a whole bucket.*give a folder in it$"
+        with pytest.raises(InputError, match=said), whole_folder(whole):
+            pytest.fail("nothing is written there")
+    assert files(bucket) == before
+
+
 def test_one_line_where_a_store_cannot_be_had(server, monkeypatch):
     for wrong in (lambda: vacant("s3://nobody/x", overwrite=False), lambda: read_drives("s3://nobody/x")):
         with pytest.raises(InputError, match=r"^s3://nobody/x: there is no bucket nobody; make it first$"):

@@ -17,7 +17,7 @@ from dlkf.command.settings import ExportSettings
 from dlkf.data.store import drive_from_tables, drive_rows
 from dlkf.data.validate import read_checked
 from dlkf.errors import InputError
-from dlkf.files import staged, vacant
+from dlkf.files import is_url, staged, vacant
 from dlkf.filters.saved import grid_of
 from dlkf.filters.smoother import Smoothed
 from dlkf.models import resolve_model, short_name
@@ -61,8 +61,9 @@ def main(told: ExportSettings) -> None:
     arm = " ".join(f"{x:g}" for x in tables.row.lever_arm_b)
     print(f"{short_name(told.model)} as C in {told.out}: {layout.size} numbers of memory, step.h says how")
     print("\n".join(lines))
-    print(f"Try it: cd {shlex.quote(told.out)} && cmake -B build && cmake --build build "
-          f"&& build/navigate --arm {arm} < drive.csv > solution.csv")  # fmt: skip
+    if not is_url(told.out):
+        print(f"Try it: cd {shlex.quote(told.out)} && cmake -B build && cmake --build build "
+              f"&& build/navigate --arm {arm} < drive.csv > solution.csv")  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -208,6 +208,8 @@ def _whole_prefix(path: str | Path) -> Iterator[Path]:
     """:func:`whole_folder` in a store."""
     reached(path)
     target: Any = placed(path)
+    if "/" not in target.path.strip("/") and "memory" not in target.fs.protocol:
+        raise InputError(f"out={path} is a whole bucket, whose place it would take; give a folder in it")
     beside = target.with_name(f".{target.name}.partial-{uuid.uuid4().hex[:12]}")
     fs = target.fs
     try:
