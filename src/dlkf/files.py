@@ -8,10 +8,10 @@ in between is no dataset.
 
 from __future__ import annotations
 
-import fcntl
 import glob
 import io
 import os
+import platform
 import shutil
 import tempfile
 import time
@@ -23,7 +23,13 @@ from typing import Any, cast
 
 from dlkf.errors import InputError
 
+try:
+    import fcntl
+except ImportError:  # Windows: nothing is locked there, and nothing cleared
+    fcntl = None
+
 PARTIAL = ".partial-"  # how a folder begins in which files wait for the rest
+OURS = f"{PARTIAL}{platform.node()}-"  # of this machine, whose locks are seen from here on every file system
 
 
 def is_url(place: object) -> bool:
@@ -148,8 +154,8 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
     target = Path(path).absolute()
     if Path.cwd().is_relative_to(target.resolve()):
         raise InputError(f"out={path} would take the place of the folder you stand in; give one below it")
-    beside, old = (target.with_name(f".{target.name}.{what}-{os.getpid()}") for what in ("partial", "old"))
-    _cleared(target.parent, f".{target.name}{PARTIAL}")
+    beside, old = (target.with_name(f".{target.name}{what}{os.getpid()}") for what in (OURS, ".old-"))
+    _cleared(target.parent, f".{target.name}{OURS}")
     try:
         beside.mkdir(parents=True)
     except OSError as error:
@@ -182,11 +188,11 @@ def staged(folder: str | Path) -> Iterator[Path]:
                 _put(Path(here), placed(folder))
         return
     target = Path(folder)
-    _cleared(target, PARTIAL)
+    _cleared(target, OURS)
     created = [p for p in (target, *target.parents) if not p.exists()]
     try:
         target.mkdir(parents=True, exist_ok=True)
-        beside = Path(tempfile.mkdtemp(prefix=PARTIAL, dir=target))
+        beside = Path(tempfile.mkdtemp(prefix=OURS, dir=target))
     except OSError as error:
         raise InputError(f"out={folder}: cannot write there ({error.strerror}); give another folder") from None
     try:
@@ -210,7 +216,7 @@ def _whole_prefix(path: str | Path) -> Iterator[Path]:
     target: Any = placed(path)
     if "/" not in target.path.strip("/") and "memory" not in target.fs.protocol:
         raise InputError(f"out={path} is a whole bucket, whose place it would take; give a folder in it")
-    beside = target.with_name(f".{target.name}.partial-{uuid.uuid4().hex[:12]}")
+    beside = target.with_name(f".{target.name}{PARTIAL}{uuid.uuid4().hex[:12]}")
     fs = target.fs
     try:
         yield beside
@@ -229,6 +235,9 @@ def _whole_prefix(path: str | Path) -> Iterator[Path]:
 @contextmanager
 def _alive(folder: Path) -> Iterator[None]:
     """Holds the kernel's lock of a folder for the block, which ends with the process however that ends."""
+    if fcntl is None:
+        yield
+        return
     at = os.open(folder, os.O_RDONLY)
     try:
         with suppress(OSError):  # a file system without locks: then nobody takes it for dead either
@@ -239,10 +248,12 @@ def _alive(folder: Path) -> Iterator[None]:
 
 
 def _cleared(parent: Path, begins: str) -> None:
-    """Removes folders that begin so and whose process was killed: nobody holds their lock.
+    """Removes folders of this machine that begin so and whose process was killed: nobody holds their lock.
 
     Those of the last second stay, as they may be about to be locked.
     """
+    if fcntl is None:
+        return
     for left in parent.glob(f"{glob.escape(begins)}*"):
         with suppress(OSError):
             at = os.open(left, os.O_RDONLY | os.O_DIRECTORY)

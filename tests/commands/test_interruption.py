@@ -18,7 +18,7 @@ import pytest
 
 from dlkf.data.validate import validate_dataset
 from dlkf.errors import InputError
-from dlkf.files import staged, vacant, whole_folder
+from dlkf.files import PARTIAL, staged, vacant, whole_folder
 from tests.shell import PATIENCE_S
 
 SIMULATE = (
@@ -159,6 +159,16 @@ def test_what_a_kill_left_does_not_stand_in_the_way(tmp_path):
     assert [p.name for p in out.iterdir()] == ["report.html"] and (out / "report.html").read_text() == "whole"
     with pytest.raises(InputError, match="exists already"):
         vacant(out, overwrite=False)
+
+
+def test_what_another_machine_left_or_is_at_stays(tmp_path):
+    """Not every file system tells a machine of the locks of others."""
+    theirs = tmp_path / f"{PARTIAL}elsewhere-1234"
+    theirs.mkdir()
+    os.utime(theirs, (0, 0))
+    with staged(tmp_path) as folder:
+        (folder / "report.html").write_text("ours")
+    assert sorted(p.name for p in tmp_path.iterdir()) == [theirs.name, "report.html"]
 
 
 def test_what_another_command_is_at_is_not_taken_for_dead(tmp_path):

@@ -5,8 +5,10 @@ from __future__ import annotations
 import atexit
 import re
 import shutil
+import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -69,20 +71,31 @@ def log_model(
     if alias and not register:
         register = client.get_experiment(client.get_run(run.id).info.experiment_id).name
     check_registration(register, alias)
-    info = mlflow.pyfunc.log_model(
-        name=NAME,
-        python_model=str(CODE),
-        artifacts={"filter": str(folder)},
-        code_paths=[str(Path(dlkf.__file__).parent)],
-        pip_requirements=pinned_requirements(),
-        signature=signature(),
-        input_example=example_drive(),
-        step=NO_STEP,
-    )
+    with _without_bytecode():
+        info = mlflow.pyfunc.log_model(
+            name=NAME,
+            python_model=str(CODE),
+            artifacts={"filter": str(folder)},
+            code_paths=[str(Path(dlkf.__file__).parent)],
+            pip_requirements=pinned_requirements(),
+            signature=signature(),
+            input_example=example_drive(),
+            step=NO_STEP,
+        )
     _log_model_metrics(run, info.model_id, metrics or {})
     if register:
         registered(client, run.id, register, alias)
     return info.model_uri
+
+
+@contextmanager
+def _without_bytecode() -> Iterator[None]:
+    """MLflow imports the model's code from the folder that it is about to log, where Python would leave a cache."""
+    before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
+    try:
+        yield
+    finally:
+        sys.dont_write_bytecode = before
 
 
 def signature():
