@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dlkf.navigation import compiled
+from dlkf.navigation import compiled, compiled_transition
 from dlkf.navigation.attitude import rotation_from_vector, skew
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, POSITION, STATES, VELOCITY, ErrorStates, NavState
@@ -69,7 +69,9 @@ class WindowModel:
         """
         if compiled.fits(corrected):
             elements = np.array(self.states.elements, dtype=np.int64).reshape(-1, 2)
-            return compiled.transition(self.still, start, window, corrected, frame.earth_rate_n, self.dt, elements)
+            return compiled_transition.transition(
+                self.still, start, window, corrected, frame.earth_rate_n, self.dt, elements
+            )
         end, T = window.end, window.p_n.shape[1] * self.dt
         columns = self._sensor_columns(start, window, corrected)
         moved = end.p_n - start.p_n
