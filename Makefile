@@ -1,4 +1,4 @@
-# make train  the whole way from nothing to a results table; make test  the tests. Both set up .venv first.
+# make train  the whole way from nothing to a results table; make check, make test  the tests. All set up .venv first.
 PYTHON ?= python3
 BIN := .venv/bin
 EXPERIMENT ?= outage
@@ -6,12 +6,14 @@ PROFILE ?= quick
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help install train test lint types bench docs ui clean
+.PHONY: help install train check test mutants lint types bench docs ui clean
 
 help:
 	@echo "make install   what training, evaluating and navigating need, into .venv"
 	@echo "make train     train on simulated drives and score against the baselines, some minutes"
-	@echo "make test      all tests"
+	@echo "make check     tests of a developer, under three minutes on two cores: without trainings, MLflow, compilers"
+	@echo "make test      all tests, under seven minutes"
+	@echo "make mutants   whether the tests notice small faults of the core (tests/mutants.yaml)"
 	@echo "make lint      ruff, then make types"
 	@echo "make types     pyright over src and pipelines, under a minute"
 	@echo "make bench     speed of the filters and of training"
@@ -40,8 +42,17 @@ install: .venv/installed
 train: .venv/installed
 	$(BIN)/python -m dlkf.train +experiment=$(EXPERIMENT) +profile=$(PROFILE) $(ARGS)
 
+# worksteal: a worker keeps the tests of a file together, and takes from the other's end when its own are done
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
+
+check: .venv/installed-dev
+	$(PYTEST) -m "not whole and not served and not exports and not commands" $(ARGS)
+
 test: .venv/installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(ARGS)
+	$(PYTEST) $(ARGS)
+
+mutants: .venv/installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.mutants $(ARGS)
 
 lint: .venv/installed-dev types
 	$(BIN)/ruff check src tests pipelines docs

@@ -3,7 +3,7 @@
     python pipelines/paper_ablations.py                                  some minutes each, seed 0
     python pipelines/paper_ablations.py --seeds 0,1 --rows base,gru trainer.max_epochs=100
 
-Every row is ``+experiment=outage +profile=quick`` with one change, scored on the same pieces as the others. It ends
+Every row is ``+experiment=outage +profile=quick`` with one change, scored on the same segments as the others. It ends
 with ``outputs/paper/ablations/ablations.md``: end of the outages and ratios to the tuned 15-state filter, right after
 the start and after minutes of GNSS. Finished trainings are kept: the same command goes on. Further key=value go to
 ``dlkf.train``.
@@ -15,7 +15,7 @@ import json
 from pathlib import Path
 
 from dlkf.evaluation.results import Results
-from dlkf.evaluation.table import number, with_interval
+from dlkf.evaluation.table import format_interval, format_number
 from dlkf.tracking.chain import Study, arguments
 
 HOME = Path("outputs/paper/ablations")
@@ -31,12 +31,12 @@ ROWS: dict[str, tuple[str, ...]] = {
     "no start from the mean error": ("model.known_from=nothing",),
     "gain and error in North-East-Down": ("model.frame=ned",),
     "network at fixes only": ("model.outage_mode=hold",),
-    "six-axis IMU error (R047)": ("model.imu_error=constant",),
+    "six-axis IMU error (R033)": ("model.imu_error=constant",),
     "no curriculum (R071)": ("callbacks.curriculum.warm_s=60", "callbacks.outage.start_epoch=0"),
     "no decimation (R069)": ("callbacks.decimation=null",),
     "no outages in training (R070)": ("callbacks.outage=null",),
     "no adaptive weights (R066)": ("callbacks.loss_weights=null",),
-    "loss after the update only (R063)": ("loss.prior=0",),
+    "loss after the update only (paper.md 4.12)": ("loss.prior=0",),
     "no attitude in the loss (R124)": ("loss.attitude=0",),
     "the paper to the letter": ("model=dlkf_literal",),
 }
@@ -73,16 +73,16 @@ def table(study: Study) -> str:
         change, seed = key.rsplit("/", 1)
         content = json.loads((Path(folder) / "report" / "metrics.json").read_text())
         result = Results.of(content["results"][0])
-        three = (result.versus("dlkf", "pieces", "all", q, "mean") for q in ("position", "velocity", "attitude"))
+        three = (result.versus("dlkf", "segments", "all", q, "mean") for q in ("position", "velocity", "attitude"))
         cells = [
-            number(result.value("dlkf", *end)),
-            number(result.value("dlkf", *end, "median")),
-            with_interval(result.versus("dlkf", *end)),
-            with_interval(result.versus("dlkf", *end, "geomean")),
-            " / ".join(number(c.ratio, digits=2) if c else "-" for c in three),
+            format_number(result.value("dlkf", *end)),
+            format_number(result.value("dlkf", *end, "median")),
+            format_interval(result.versus("dlkf", *end)),
+            format_interval(result.versus("dlkf", *end, "geomean")),
+            " / ".join(format_number(c.ratio, digits=2) if c else "-" for c in three),
         ]
         lines.append(f"| {change} | {seed} | {' | '.join(cells)} | {later(content)} |")
-        itself = (number(result.value("mbkf15", *end, statistic)) for statistic in ("rms", "median"))
+        itself = (format_number(result.value("mbkf15", *end, statistic)) for statistic in ("rms", "median"))
         last = f"| `mbkf15` | | {' | '.join(itself)} | | | | |"
     return "\n".join([*lines, last]) + "\n"
 

@@ -3,9 +3,9 @@
     python pipelines/paper_figures.py --real data/kitti               the paper's 500 epochs
     python pipelines/paper_figures.py --real data/kitti trainer.max_epochs=100
 
-Two trainings for each seed. ``minute``: outages from 60 to 120 s of simulated pieces (figures 13 and 14).
+Two trainings for each seed. ``minute``: outages from 60 to 120 s of simulated segments (figures 13 and 14).
 ``semi_real``, where ``--real`` names a dataset of real drives with a good IMU: their motion with the errors of one
-automotive MEMS unit injected, split by recording (figures 11 and 12). Real recordings are short: pieces of 48 s with
+automotive MEMS unit injected, split by recording (figures 11 and 12). Real recordings are short: segments of 48 s with
 an outage of 25 to 28 s, where the paper has 30 to 50. Finished trainings are kept: the same command goes on. What is
 where stands in ``outputs/paper/figures``; ``python pipelines/paper_report.py`` makes the page of it. Further key=value
 go to ``dlkf.train``.

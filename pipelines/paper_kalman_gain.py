@@ -1,4 +1,4 @@
-"""Gains as in section 5.2 of the paper (R130-R137): six noises of GNSS, the network trained anew for each.
+"""Gains as in section 5.2 of the paper (R130-R137): six noises of GNSS, the network retrained for each.
 
     python pipelines/paper_kalman_gain.py                        seed 0, 250 epochs a set
     python pipelines/paper_kalman_gain.py --seeds 0,1 trainer.max_epochs=500
@@ -27,9 +27,7 @@ def main() -> int:
     with study.parent("kalman_gain", "paper 5.2"):
         for seed in options.seeds:
             for noise in SETS:
-                study.train(
-                    f"{noise}/{seed}", "+experiment=kalman_gain", f"+noise={noise}", f"seed={seed}", *overrides
-                )
+                study.train(f"{noise}/{seed}", "+experiment=kalman_gain", f"+noise={noise}", f"seed={seed}", *overrides)
     return subprocess.run([sys.executable, "-m", "pipelines.studies.gain_trends", str(HOME)]).returncode
 
 

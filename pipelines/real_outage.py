@@ -18,14 +18,14 @@ import sys
 from pathlib import Path
 
 from dlkf.evaluation.results import Results
-from dlkf.evaluation.table import with_interval
+from dlkf.evaluation.table import format_interval
 
 
 def main() -> int:
     """``dlkf.evaluate`` for every folder and length; 0 if all of them went well."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     arguments.add_argument("folders", nargs="+", help="datasets; key=value goes to dlkf.evaluate")
-    arguments.add_argument("--imu", default="automotive_mems", help="what the classical filters are told")
+    arguments.add_argument("--imu", default="automotive_mems", help="settings of the classical filters")
     arguments.add_argument("--models", nargs="+", default=["ins", "mbkf15"])
     arguments.add_argument("--name", help="of the folder of reports")
     arguments.add_argument("--lengths", type=float, nargs="+", default=[30, 60], help="of the outages, in seconds")
@@ -61,7 +61,7 @@ def summary(home: Path, lengths: list[float]) -> str:
         cells = []
         for _, result in made:
             cells.append(f"{result.value(name, *end):.3g} ({result.value(name, *end, 'median'):.3g})")
-            cells.append(with_interval(result.versus(name, *end)))
+            cells.append(format_interval(result.versus(name, *end)))
         lines.append(f"| `{name}` | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 

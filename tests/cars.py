@@ -1,7 +1,7 @@
-"""The cars that the tests share: one on an analytic path as files, and pieces with noise and biases as a batch.
+"""The cars that the tests share: one on an analytic path as files, and segments with noise and biases as a batch.
 
-``car``, ``write_cars``: perfect IMU, exact GNSS and reference, in closed form. ``car_batch``, ``write_pieces``: the
-truth is what the strapdown makes of a perfect IMU; white noise, a new bias in every piece, GNSS of some centimetres.
+``car``, ``write_cars``: perfect IMU, exact GNSS and reference, in closed form. ``car_batch``, ``write_segments``: the
+truth is what the strapdown makes of a perfect IMU; white noise, a new bias in every segment, GNSS of some centimetres.
 """
 
 from __future__ import annotations
@@ -77,44 +77,59 @@ def car(seconds: float = 60.0, rate: float = 100.0, gnss_hz: float = 1.0, t0: fl
     return {"imu": imu, "gnss": gnss, "reference": reference}
 
 
-def write_cars(folder: Path, count: int = 1, groups: int | None = None, **kwargs: float) -> Path:
-    """A dataset of ``count`` such drives in ``groups`` groups."""
+def car_aids(
+    tables: Tables, *, scale: float = 1.0, delay_s: float = 0.0, right_m: float = 0.0, rate: float = 20.0
+) -> Tables:
+    """A wheel at ``right_m`` of the exact car that turns ``scale`` as fast, stamped ``delay_s`` late, at ``rate``;
+    heading and a barometer with an offset of 30 m at a quarter of it."""
+    truth, imu = tables["reference"], tables["imu"]
+    first, last = truth["t"].iloc[0] + 1, truth["t"].iloc[-1] - 1
+    t, slow = np.arange(first, last, 1 / rate) + 0.013, np.arange(first, last, 4 / rate) + 0.007
+    north, east = (np.interp(t - delay_s, truth["t"], truth[c]) for c in ("vel_n", "vel_e"))
+    turn = np.interp(t - delay_s, imu["t"], imu["gyro_z"])
+    return {
+        "speed": pd.DataFrame({"t": t, "speed": scale * (np.hypot(north, east) - right_m * turn)}),
+        "heading": pd.DataFrame({"t": slow, "heading": np.interp(slow, truth["t"], np.unwrap(truth["yaw"]))}),
+        "baro": pd.DataFrame({"t": slow, "height_m": 30 + np.interp(slow, truth["t"], truth["height_m"])}),
+    }
+
+
+def write_cars(
+    folder: Path, count: int = 1, groups: int | None = None, aids: dict[str, float] | None = None, **kwargs: float
+) -> Path:
+    """A dataset of ``count`` such drives in ``groups`` groups, with the sensors of :func:`car_aids` where asked for."""
     rows = []
     for k in range(count):
         meta = {"drive": f"car-{k}", "group": f"day-{k % (groups or count)}"}
-        rows.append(write_drive(folder, meta, **car(**kwargs)))
+        tables = car(**kwargs)
+        further = None if aids is None else car_aids(tables, **aids)
+        rows.append(write_drive(folder, meta, **tables, aids=further))
     write_drives_table(folder, rows)
     return folder
 
 
 def car_batch(
-    B: int = 4, T: int = 60, M: int = 20, seed: int = 0, dtype: torch.dtype = torch.float64
+    B: int = 4, T: int = 60, M: int = 20, seed: int = 0, dtype: torch.dtype = torch.float64, epoch_s: float = 1.0
 ) -> Batch:
-    """B pieces of T s: speed and yaw rate vary smoothly, new IMU biases in every piece, cm GNSS."""
+    """B segments of T epochs: speed and yaw rate vary smoothly, new IMU biases in every segment, cm GNSS."""
     g = torch.Generator().manual_seed(seed)
 
     def draw(*size: int) -> torch.Tensor:
         return torch.randn(*size, generator=g, dtype=torch.float64)
 
     frame = tangent_frame(torch.full((B,), 0.7), torch.full((B,), 0.2), torch.full((B,), 300.0))
-    dt = 1.0 / M
+    dt = epoch_s / M
     t = torch.arange(T * M, dtype=torch.float64) * dt
     phase = draw(B, 4, 1)
     forward = 1.2 * torch.sin(2 * math.pi * t / 24 + phase[:, 0])
-    yaw_rate = (
-        0.12 * torch.sin(2 * math.pi * t / 31 + phase[:, 1]) * torch.sin(2 * math.pi * t / 13 + phase[:, 2])
-    )
+    yaw_rate = 0.12 * torch.sin(2 * math.pi * t / 31 + phase[:, 1]) * torch.sin(2 * math.pi * t / 13 + phase[:, 2])
     speed = 14 + (forward * dt).cumsum(-1)
     yaw = 3 * phase[:, 3, 0]
     zero = torch.zeros_like(forward)
     gravity = frame.gravity(torch.zeros(B, 3, dtype=torch.float64))[:, 2:].expand_as(forward)
-    perfect = torch.stack((forward, speed * yaw_rate, -gravity, zero, zero, yaw_rate), -1).unflatten(
-        1, (T, M)
-    )
+    perfect = torch.stack((forward, speed * yaw_rate, -gravity, zero, zero, yaw_rate), -1).unflatten(1, (T, M))
     v0 = 14 * torch.stack((torch.cos(yaw), torch.sin(yaw), 0 * yaw), -1)
-    start = NavState(
-        torch.zeros(B, 3).double(), v0, rotation_from_rpy(torch.stack((0 * yaw, 0 * yaw, yaw), -1))
-    )
+    start = NavState(torch.zeros(B, 3).double(), v0, rotation_from_rpy(torch.stack((0 * yaw, 0 * yaw, yaw), -1)))
     states, state = [], start
     for k in range(T):
         state = strapdown(state, perfect[:, k], dt, frame).end
@@ -124,9 +139,7 @@ def car_batch(
     white = torch.tensor([2e-3] * 3 + [1e-4] * 3, dtype=torch.float64) * math.sqrt(M)
     imu = perfect + bias[:, None, None] + white * draw(B, T, M, 6)
     std = torch.tensor([0.03] * 3 + [0.02] * 3, dtype=torch.float64).expand(B, T, 6)
-    law = torch.tensor(
-        [1.0] * 3 + [0.1] * 3 + [math.radians(1)] * 2 + [math.radians(10)], dtype=torch.float64
-    )
+    law = torch.tensor([1.0] * 3 + [0.1] * 3 + [math.radians(1)] * 2 + [math.radians(10)], dtype=torch.float64)
     yes = torch.ones(B, T, dtype=torch.bool)
     batch = Batch(
         imu=imu, dt=dt, frame=frame,
@@ -140,8 +153,8 @@ def car_batch(
     return batch if dtype is torch.float64 else batch.in_precision(dtype)
 
 
-def write_pieces(folder: Path, batch: Batch, kinds: Sequence[str] = ()) -> Path:
-    """The pieces of a batch as a dataset: IMU at its rate, GNSS and reference at 1 Hz, from t = 100 s on."""
+def write_segments(folder: Path, batch: Batch, kinds: Sequence[str] = ()) -> Path:
+    """The segments of a batch as a dataset: IMU at its rate, GNSS and reference at 1 Hz, from t = 100 s on."""
     B, T, M = batch.size
     rows = []
     for i in range(B):

@@ -1,26 +1,36 @@
 """What all rooms share: three small worlds, commands called as from a shell, an MLflow store made once.
 
-``town``: six exact drives of 60 s; ``noisy_town``: six pieces with noise and biases, also as the batch ``cars``;
+What takes long to make is made by the first worker that asks for it (``once``) and read by all. Tests that need a
+compiler, MLflow, a training or a process of their own are marked ``whole``, by hand or because they ask for a fixture
+that does: ``make check`` leaves them out.
+
+``town``: six exact drives of 60 s; ``noisy_town``: six segments with noise and biases, also as the batch ``cars``;
 ``simulated``: two drives as ``dlkf.simulate`` makes them. A room that means another of them by ``town`` says so in its
 conftest.
 """
 
 from __future__ import annotations
 
+import fcntl
+import gc
 import importlib
+import os
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import jaxtyping
 import pytest
 
-from dlkf.command.composing import composed
+from dlkf.base.points import SWEPT
+from dlkf.command.composing import compose_command
 from dlkf.data.drive import Batch
-from dlkf.points import SWEPT
+from dlkf.onboard import compiled_filter, library
+from dlkf.tracking.endings import TRACKING_URI
 from dlkf.tracking.grid import PARENT_RUN
 from dlkf.tracking.runs import SQLITE, mlflow_module
-from tests.cars import Tables, car, car_batch, write_cars, write_pieces
+from tests.cars import Tables, car, car_batch, write_cars, write_segments
 from tests.drives import drives_in
 from tests.shell import Ended
 
@@ -28,20 +38,90 @@ SIZE = ("dataset.hours=0.05", "dataset.drive_minutes=1.5", "dataset.imu_rate_hz=
 
 
 SHAPES_CHECKED = {"data", "filters", "navigation", "running", "simulation"}  # rooms of pure functions and of the loop
+FIRST_CASE = pytest.StashKey[bool]()
+SHIPPED_FLAGS = library.FLAGS  # of the compiler; rooms that only use a compiled filter need not wait for -O3
+LONG_ROOMS = ("training", "tuning", "tracking", "pipelines", "onboard", "docs")  # begin first, so that none ends last
+
+WHOLE_FIXTURES = {"uri", "exported", "site", "trained", "cluster", "alone", "server"}
+WHOLE_ROOMS = {"onboard", "pipelines"}
+
+
+def room(item: pytest.Item) -> str:
+    """The folder, or file, below tests/ that a test is in."""
+    return item.path.relative_to(Path(__file__).parent).parts[0]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What needs a compiler, MLflow, a server or a training by its fixtures or its room is ``whole``; rooms of long
+    tests come first."""
+    seen: set[tuple[Path, str]] = set()
+    for item in items:
+        if room(item) in WHOLE_ROOMS or WHOLE_FIXTURES.intersection(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.whole)
+        test = item.path, getattr(item, "originalname", item.name)
+        item.stash[FIRST_CASE] = test not in seen
+        seen.add(test)
+    rank = {name: k for k, name in enumerate(LONG_ROOMS)}
+    items.sort(key=lambda item: rank.get(room(item), len(rank)))
+
+
+def pytest_collection_finish() -> None:
+    """What the imports of all tests have made stays; the garbage collector need not look at it again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Shapes and types are checked where functions are tested one by one; studies and commands, which call the same
-    functions by the thousand, run as a user's do, in half of the time."""
-    room = item.path.relative_to(Path(__file__).parent).parts[0]
-    jaxtyping.config.update("jaxtyping_disable", room not in SHAPES_CHECKED)
+    """Shapes and types are checked where functions are tested one by one, in the first case of every test: the others
+    call the same functions with other numbers, and studies and commands by the thousand, in half of the time."""
+    checked = room(item) in SHAPES_CHECKED and item.stash[FIRST_CASE]
+    jaxtyping.config.update("jaxtyping_disable", not checked)
+    compiled_filter.FLAGS = library.FLAGS = SHIPPED_FLAGS if room(item) == "onboard" else ("-O1", *SHIPPED_FLAGS[1:])
 
 
 @pytest.fixture
 def without_shape_checks(monkeypatch):
     """For a test that runs a filter for thousands of epochs."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+@pytest.fixture(autouse=True)
+def mlflow_as_found():
+    """What MLflow and a grid search write into the environment ends with the test: a command that another test starts
+    would take it for its own store or parent."""
+    mine = (PARENT_RUN, SWEPT)
+    before = {name: value for name, value in os.environ.items() if name.startswith("MLFLOW_") or name in mine}
+    yield
+    if mlflow := sys.modules.get("mlflow"):
+        mlflow.set_tracking_uri(before.get(TRACKING_URI))
+    for name in [name for name in os.environ if name.startswith("MLFLOW_") or name in mine]:
+        del os.environ[name]
+    os.environ.update(before)
+
+
+Once = Callable[[str, Callable[[Path], object]], Path]
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory) -> Once:
+    """``once("town", make)`` gives a folder that ``make`` filled for the first worker to ask for that name."""
+    base = tmp_path_factory.getbasetemp()
+    home = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "once"
+    home.mkdir(exist_ok=True)
+
+    def made(name: str, make: Callable[[Path], object]) -> Path:
+        folder, partial = home / name, home / f"{name}.partial"
+        with (home / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not folder.exists():
+                shutil.rmtree(partial, ignore_errors=True)
+                partial.mkdir()
+                make(partial)
+                partial.rename(folder)
+        return folder
+
+    return made
 
 
 @pytest.fixture(scope="session")
@@ -58,21 +138,21 @@ def town(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def cars() -> Batch:
-    """Six pieces of 60 s with noise and biases."""
+    """Six segments of 60 s with noise and biases."""
     return car_batch(6, 60)
 
 
 @pytest.fixture(scope="session")
 def noisy_town(cars, tmp_path_factory) -> Path:
-    """The six pieces as a dataset in three groups."""
-    return write_pieces(tmp_path_factory.mktemp("data") / "town", cars)
+    """The six segments as a dataset in three groups."""
+    return write_segments(tmp_path_factory.mktemp("data") / "town", cars)
 
 
 @pytest.fixture(scope="session")
-def simulated(tmp_path_factory) -> Path:
+def simulated(once: Once) -> Path:
     """Two drives of 90 s in a town."""
-    config = composed("simulate", "simulated@dataset=per_drive", "dataset.name=town", *SIZE)
-    return drives_in(config, tmp_path_factory.mktemp("data") / "town")
+    config = compose_command("simulate", "simulated@dataset=per_drive", "dataset.name=town", *SIZE)
+    return once("simulated", lambda folder: drives_in(config, folder / "town")) / "town"
 
 
 @pytest.fixture
@@ -96,10 +176,13 @@ def call(tmp_path, monkeypatch, capfd):
 
 
 @pytest.fixture(scope="session")
-def template(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("store") / "mlflow.db"
-    mlflow_module().MlflowClient(SQLITE + str(path)).search_experiments()
-    return path
+def template(once: Once) -> Path:
+    """A store without a run: MLflow takes seconds to make its tables."""
+
+    def make(folder: Path) -> None:
+        mlflow_module().MlflowClient(f"{SQLITE}{folder / 'mlflow.db'}").search_experiments()
+
+    return once("store", make) / "mlflow.db"
 
 
 @pytest.fixture

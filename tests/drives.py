@@ -10,14 +10,14 @@ import torch
 from dlkf.data.drive import Drive
 from dlkf.data.store import drive_from_tables
 from dlkf.data.tables import DriveRow
-from dlkf.data.validate import DriveTables
-from dlkf.simulation.dataset import Recipe, drive_of, recipe, simulate
+from dlkf.data.validate import CheckedTables
+from dlkf.simulation.dataset import Recipe, drive_of, make_recipe, simulate
 
 
 def recipe_of(config: dict[str, Any]) -> Recipe:
     """What the drives are made by."""
     dataset, imu, seed = (config[key] for key in ("dataset", "imu", "seed"))
-    return recipe(dataset, imu, seed, config.get("receiver"), raw=config.get("raw", False))
+    return make_recipe(dataset, imu, seed, config.get("receiver"), raw=config.get("raw", False))
 
 
 def drives_in(config: dict[str, Any], out: Path, **options: Any) -> Path:
@@ -26,12 +26,12 @@ def drives_in(config: dict[str, Any], out: Path, **options: Any) -> Path:
     return simulate(recipe_of(config), out, progress=False, **given, **options)
 
 
-def tables_in_memory(made_by: Recipe, index: int, seconds: int) -> DriveTables:
+def tables_in_memory(made_by: Recipe, index: int, seconds: int) -> CheckedTables:
     """Drive ``index`` of the dataset, never written."""
     tables, row = drive_of(made_by, index, seconds)
     columns = ({str(c): t[c].to_numpy(copy=True) for c in t} for t in (tables.imu, tables.gnss, tables.reference))
     arm = tuple(row[f"lever_arm_{axis}_m"] for axis in "xyz")
-    return DriveTables(DriveRow(row["drive"], row["group"], arm), *columns)
+    return CheckedTables(DriveRow(row["drive"], row["group"], arm), *columns)
 
 
 def drive_in_memory(made_by: Recipe, index: int, seconds: int, dtype: torch.dtype = torch.float32) -> Drive:

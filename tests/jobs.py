@@ -3,7 +3,7 @@
 import os
 import signal
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 
 
 def half(x: int) -> float:

@@ -6,12 +6,9 @@ import ast
 from graphlib import TopologicalSorter
 from pathlib import Path
 
-import pytest
-
 SRC = Path(__file__).parents[1] / "src"
 FLOORS = (
-    {"", "errors"},
-    {"classes", "settings", "files", "console", "config", "parallel", "points", "provenance", "ranges", "colours"},
+    {"", "base"},
     {"navigation"},
     {"data", "networks"},
     {"filters", "simulation"},
@@ -22,15 +19,15 @@ FLOORS = (
     {"tuning", "diagnosis"},
     {"tracking"},
     {"training"},
-    {"models"},
     {"command"},
     {"allan", "compare", "consistency", "doctor", "evaluate", "export", "ingest", "navigate", "register"}
     | {"simulate", "train", "tune", "ui"},
+    {"frames"},
     {"__main__"},
 )
 FLOOR = {room: n for n, rooms in enumerate(FLOORS) for room in rooms}
 GLUE = {"hydra", "mlflow", "lightning", "omegaconf"}
-GLUED = {"command", "training", "tracking", *FLOORS[-2]}  # rooms that may import the glue
+GLUED = {"command", "training", "tracking", *FLOORS[-3]}  # rooms that may import the glue
 GLUE_FILES = {"dlkf.data.datamodule"}
 
 
@@ -65,15 +62,16 @@ def _room(module: str) -> str:
 IMPORTS = modules()
 
 
-@pytest.mark.parametrize("module", sorted(IMPORTS))
-def test_imports_from_below(module: str) -> None:
-    mine = FLOOR[_room(module)]
-    ours = [t for t in IMPORTS[module] if t.startswith("dlkf")]
-    above = [t for t in ours if FLOOR[_room(t)] > mine]
-    beside = [t for t in ours if FLOOR[_room(t)] == mine and _room(t) != _room(module)]
-    assert not above, f"{module} imports upward: {above}"
-    if mine > 1:
-        assert not beside, f"{module} imports from a room of its own floor: {beside}"
+def test_imports_from_below() -> None:
+    wrong = []
+    for module, targets in sorted(IMPORTS.items()):
+        mine = FLOOR[_room(module)]
+        for target in sorted(t for t in targets if t.startswith("dlkf")):
+            if FLOOR[_room(target)] > mine:
+                wrong.append(f"{module} imports upward: {target}")
+            elif mine and FLOOR[_room(target)] == mine and _room(target) != _room(module):
+                wrong.append(f"{module} imports from a room of its own floor: {target}")
+    assert not wrong, "\n".join(wrong)
 
 
 def test_no_circle_between_files() -> None:
@@ -82,9 +80,9 @@ def test_no_circle_between_files() -> None:
 
 
 def test_floors_below_the_glue_do_without_it() -> None:
-    for module, targets in IMPORTS.items():
-        if _room(module) not in GLUED and module not in GLUE_FILES:
-            assert not {t.partition(".")[0] for t in targets} & GLUE, module
+    plain = {m: t for m, t in IMPORTS.items() if _room(m) not in GLUED and m not in GLUE_FILES}
+    wrong = {m: glue for m, targets in plain.items() if (glue := {t.partition(".")[0] for t in targets} & GLUE)}
+    assert not wrong, wrong
 
 
 def test_navigating_needs_neither_scoring_nor_training() -> None:
@@ -96,3 +94,17 @@ def test_navigating_needs_neither_scoring_nor_training() -> None:
             todo += IMPORTS[module]
     rooms = {_room(m) for m in reached}
     assert not rooms & {"evaluation", "training", "tuning", "diagnosis", "simulation"}, rooms
+
+
+def test_what_reads_drives_loads_no_simulator() -> None:
+    """Lazy imports count too."""
+    simulating = {}
+    for command in ("evaluate", "tune", "navigate", "compare", "register"):
+        loaded, todo = set(), [f"dlkf.{command}"]
+        while todo:
+            module = todo.pop()
+            if module in IMPORTS and module not in loaded:
+                loaded.add(module)
+                todo += IMPORTS[module]
+        simulating[command] = [m for m in loaded if m.startswith("dlkf.simulation") or len(loaded) < 20]
+    assert not any(simulating.values()), simulating

@@ -27,6 +27,14 @@ def rewrite(obj: griffe.Object) -> None:
             rewrite(member)
 
 
+def _is_value(member: griffe.Object | griffe.Alias) -> bool:
+    """Whether a name stands for a value; an alias of another package's, or of what is not read yet, counts as one."""
+    try:
+        return member.is_attribute
+    except griffe.AliasResolutionError:
+        return True
+
+
 def link(name: str, obj: griffe.Object) -> str:
     """A cross-reference to a full name, or to one in the same class or module, imported ones too; else code."""
     if name.startswith("dlkf"):
@@ -34,7 +42,7 @@ def link(name: str, obj: griffe.Object) -> str:
     first, _, rest = name.partition(".")
     for scope in (obj, obj.parent, obj.module):
         member = None if scope is None or scope.is_alias else scope.members.get(first)
-        if member is not None and not member.is_attribute:  # values have no place of their own
+        if member is not None and not _is_value(member):  # values have no place of their own
             full = member.target_path if member.is_alias else member.path
             return f"[`{name}`][{full}{'.' + rest if rest else ''}]"
     return f"`{name}`"

@@ -21,32 +21,32 @@ from pipelines.studies.compiled_step import times_in_c
 from pipelines.studies.figures.bench_figures import Bench, Timing, machine
 from rich.console import Console
 
-from dlkf.command.composing import composed
-from dlkf.command.simulated import composed_recipe
+from dlkf.command.composing import compose_command
+from dlkf.command.simulated import compose_recipe
 from dlkf.data.alignment import ALIGN
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.drive import Batch
-from dlkf.data.segments import StartLaw, cut_pieces, make_batch
+from dlkf.data.segments import StartLaw, cut_segments, make_batch
 from dlkf.data.store import load_dataset
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Protocol
 from dlkf.filters.build import build_causal
 from dlkf.filters.integration import Estimator, integrate
 from dlkf.filters.saved import learned_filter, learned_settings
-from dlkf.models import resolve_model
 from dlkf.navigation.attitude import rotation_from_vector
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.strapdown import strapdown
 from dlkf.onboard.check import epoch_times
-from dlkf.onboard.compiled_filter import compiled_filter
+from dlkf.onboard.compiled_filter import compile_filter
 from dlkf.onboard.library import compiler
 from dlkf.running.batched import run_filter
 from dlkf.running.start import aligned_drives
 from dlkf.simulation.dataset import simulate
+from dlkf.tracking.models import resolve_model
 from dlkf.training.callbacks.masking import GnssDecimation, OutageInjection
-from dlkf.training.loss import TERMS, LossConfig, pva_losses, weighted
-from dlkf.tuning.search import factors_of, tuned
-from dlkf.tuning.study import withheld
+from dlkf.training.loss import TERMS, LossConfig, pva_losses, weighted_loss
+from dlkf.tuning.search import factors_of, tune_filter
+from dlkf.tuning.study import withhold_outages
 
 COMPILED = ("mbkf15", "mbkf21", "mbkf21_car", "plus")
 LEARNED = ("dlkf_literal", "dlkf", "plus")
@@ -100,14 +100,14 @@ def pypose_chunks(batch: Batch) -> torch.Tensor:
 
 
 def filters(bench: Bench, dataset: Path, imu: ImuSpec, length_s: float, models: list[str]) -> None:
-    """Filters over drives at the files' own rate, one and 64 at once, in torch and compiled in turns."""
+    """Filters over drives at the files' own rate, one and 64 at once, in torch and compiled, interleaved."""
     drives = load_dataset(dataset, rate_hz=RATE_HZ, dtype=torch.float64)
-    pieces = (cut_pieces(drives, length_s) * 64)[:64]
+    segments = (cut_segments(drives, length_s) * 64)[:64]
     for name in models:
         estimator = resolve_model(name, imu)
-        in_c = compiled_filter(estimator, RATE_HZ, 1.0) if compiler() else None
+        in_c = compile_filter(estimator, RATE_HZ, 1.0) if compiler() else None
         for count in (1, 64):
-            batch = make_batch(drives, pieces[:count], dtype=torch.float64)
+            batch = make_batch(drives, segments[:count], dtype=torch.float64)
             what = f"{name}, {count} drive{'s' * (count > 1)} of {batch.size[1] * batch.epoch_s:g} s"
             calls = {f"{what}, torch": lambda batch=batch, f=estimator: run_filter(batch, f)}
             if in_c is not None:
@@ -120,7 +120,7 @@ def epochs(bench: Bench, dataset: Path, imu: ImuSpec, models: list[str]) -> None
     drive = load_dataset(dataset, rate_hz=RATE_HZ, dtype=torch.float64)[0]
     batch = aligned_drives([drive], ALIGN)
     for name in models if compiler() else ():
-        in_c = compiled_filter(resolve_model(name, imu), RATE_HZ, 1.0)
+        in_c = compile_filter(resolve_model(name, imu), RATE_HZ, 1.0)
         for kind, seconds in {**epoch_times(in_c, drive), "C": times_in_c(in_c, batch)}.items():
             bench.add(Timing("an epoch", f"{name} in {kind}", seconds))
 
@@ -130,7 +130,9 @@ def peers(bench: Bench, folder: Path, minutes: float, checkout: Path | None) -> 
     spec = parity.preset("consumer")
     parity.write_drives(folder, spec, 1, minutes)
     drives = load_dataset(folder, rate_hz=RATE_HZ, dtype=torch.float64)
-    batch = make_batch(drives, cut_pieces(drives, drives[0].epochs - 1.0)[:1], dtype=torch.float64, start=parity.START)
+    batch = make_batch(
+        drives, cut_segments(drives, drives[0].epochs - 1.0)[:1], dtype=torch.float64, start=parity.START
+    )
     samples = batch.size[1] * batch.size[2]
     _, seconds = parity.theirs(folder, batch, spec, 21, 0.1)
     bench.add(Timing(f"peer, {SECONDS}", "python-ins, 21 states, 0.1 s", [seconds], samples))
@@ -142,37 +144,37 @@ def peers(bench: Bench, folder: Path, minutes: float, checkout: Path | None) -> 
 
 
 def tuning(bench: Bench, dataset: Path, imu: ImuSpec) -> None:
-    """A search over all factors of a filter on sixty pieces of two minutes."""
+    """A search over all factors of a filter on sixty segments of two minutes."""
     drives = load_dataset(dataset, rate_hz=50.0, dtype=torch.float64)
-    pieces = withheld(drives, Protocol(outage=OutagePlan(60.0, 60.0)), 60)
-    work = f"mbkf21_car, {len(factors_of('mbkf21_car'))} factors, {sum(b.size[0] for b in pieces)} pieces of 120 s"
-    bench.time("tuning", work, lambda: tuned(imu, pieces, name="mbkf21_car"), 1)
+    segments = withhold_outages(drives, Protocol(outage=OutagePlan(60.0, 60.0)), 60)
+    work = f"mbkf21_car, {len(factors_of('mbkf21_car'))} factors, {sum(b.size[0] for b in segments)} segments of 120 s"
+    bench.time("tuning", work, lambda: tune_filter(imu, segments, name="mbkf21_car"), 1)
 
 
 def training_epoch(data: DriveDataModule, name: str, steps: int | None = None) -> None:
     """An epoch with decimation, outages, backward pass and optimiser, or so many steps of it."""
-    settings = composed("train", f"filter@model={name}")["model"]
+    settings = compose_command("train", f"filter@model={name}")["model"]
     torch.manual_seed(0)
     model = learned_filter(learned_settings(settings)).train()
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4)
     transforms = (GnssDecimation(), OutageInjection(start_epoch=0))
-    for step in range(steps or len(data.train_pieces(1))):
+    for step in range(steps or len(data.train_segments(1))):
         batch = data.train_batch(1, step)
         generator = torch.Generator().manual_seed(step)
         for transform in transforms:
             batch = transform.transform(batch, 99, generator)
         losses = pva_losses(integrate(batch, model), batch, LossConfig())
         optimizer.zero_grad()
-        weighted(losses, dict.fromkeys(TERMS, 1.0)).backward()
+        weighted_loss(losses, dict.fromkeys(TERMS, 1.0)).backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimizer.step()
 
 
 def training(bench: Bench, folder: str, hours: float) -> None:
-    """Epochs of the learned filters in turns, on one thread as a training runs unless told otherwise."""
+    """Epochs of the learned filters, interleaved, on one thread as a training runs unless set otherwise."""
     data = DriveDataModule([folder], fractions=(1.0, 0.0, 0.0), batch_size=50)
     data.setup()
-    what = f"{hours:g} h, batch 50, {len(data.train_pieces(1))} steps"
+    what = f"{hours:g} h, batch 50, {len(data.train_segments(1))} steps"
     with kf_gins.one_thread():
         calls = {f"{name}, {what}": lambda name=name: training_epoch(data, name) for name in LEARNED}
         bench.in_turns("training epoch, one thread", calls, 2)
@@ -190,42 +192,44 @@ def scaling(bench: Bench, dataset: Path, imu: ImuSpec, length_s: float) -> None:
             bench.time(f"over {over}", f"mbkf15, {what}", lambda: integrate(batch, estimator), 3, at=at)
 
     for count in (1, 4, 16, 64):
-        run("drives at once", count, f"{count} × {length_s:g} s", count, cut_pieces(drives, length_s))
+        run("drives at once", count, f"{count} × {length_s:g} s", count, cut_segments(drives, length_s))
     for length in (length_s / 4, length_s / 2, length_s):
-        run("length (s)", length, f"8 × {length:g} s", 8, cut_pieces(drives, length))
+        run("length (s)", length, f"8 × {length:g} s", 8, cut_segments(drives, length))
     for rate in (25.0, 50.0, RATE_HZ):
         slower = load_dataset(dataset, rate_hz=rate, dtype=torch.float64)
-        run("rate (Hz)", rate, f"8 × {length_s:g} s at {rate:g} Hz", 8, cut_pieces(slower, length_s), slower)
+        run("rate (Hz)", rate, f"8 × {length_s:g} s at {rate:g} Hz", 8, cut_segments(slower, length_s), slower)
     if compiler():  # whose threads share nothing; those of torch wait for each other, for minutes on a busy machine
         usual_clock, bench.clock = bench.clock, time.perf_counter  # two threads use two processors
-        estimator = compiled_filter(estimator, RATE_HZ, 1.0)
+        estimator = compile_filter(estimator, RATE_HZ, 1.0)
         for threads in sorted({1, 2, os.cpu_count() or 1}):
             torch.set_num_threads(threads)
             what = f"64 × {length_s:g} s, compiled, {threads} threads"
-            run("threads", threads, what, 64, cut_pieces(drives, length_s))
+            run("threads", threads, what, 64, cut_segments(drives, length_s))
         torch.set_num_threads(usual)
         bench.clock = usual_clock
     for count in sorted({max(1, len(drives) * part // 4) for part in (1, 2, 4)}):
         some = [d.name for d in drives[:count]]
         work = f"load, check and cut, {count} drives"
         at = sum(d.epochs * d.epoch_s for d in drives[:count]) / 3600
-        bench.time("over hours", work, lambda some=some: cut_pieces(load_dataset(dataset, drives=some), 60.0), 3, at=at)
+        bench.time(
+            "over hours", work, lambda some=some: cut_segments(load_dataset(dataset, drives=some), 60.0), 3, at=at
+        )
     data = DriveDataModule([str(dataset)], fractions=(1.0, 0.0, 0.0), batch_size=50)
     data.setup()
     for size in (10, 25, 50, 100):
         data.batch_size, data._latest = size, (-1, -1, [])
-        if len(data.train_pieces(1)[0]) == size:
-            work = f"dlkf_literal, a step of {size} pieces"
+        if len(data.train_segments(1)[0]) == size:
+            work = f"dlkf_literal, a step of {size} segments"
             bench.time("over batch", work, lambda: training_epoch(data, "dlkf_literal", 1), 3, at=size)
 
 
-def mechanisation(bench: Bench, folder: str, pypose: bool) -> float:
+def mechanisation(bench: Bench, folder: str, length_s: float, pypose: bool) -> float:
     """Windows against the loop over samples, forward and backward; returns how far apart they end [m]."""
     drives = load_dataset(folder, dtype=torch.float64)
-    pieces = cut_pieces(drives, 60.0)[:50]
-    what = f"{len(pieces)} × 60 s × 50 Hz, forward + backward"
+    segments = cut_segments(drives, length_s)[:50]
+    what = f"{len(segments)} × {length_s:g} s × 50 Hz, forward + backward"
     batch, single = (
-        make_batch(drives, pieces, dtype=dtype, start=StartLaw(0.0, 0.0, 0.0, 0.0))
+        make_batch(drives, segments, dtype=dtype, start=StartLaw(0.0, 0.0, 0.0, 0.0))
         for dtype in (torch.float64, torch.float32)
     )
     bench.time("strapdown", f"sample loop, {what}, float64", lambda: sample_loop(batch), 1)
@@ -251,7 +255,7 @@ def main() -> None:
     arguments.add_argument("--out", type=Path, default=Path("outputs"))
     options = arguments.parse_args()
     torch.set_num_threads(options.threads)
-    recipe = composed_recipe("simulated@dataset=one_imu", f"dataset.hours={options.hours}")
+    recipe = compose_recipe("simulated@dataset=one_imu", f"dataset.hours={options.hours}")
     bench = Bench(options.repeats, time.process_time if options.processor else time.perf_counter)
     described = machine(options.threads) | {"clock": "processor" if options.processor else "wall"}
     console = Console(width=140)
@@ -259,8 +263,8 @@ def main() -> None:
         data, other = Path(folder) / "drives", Path(folder) / "parity"
         simulate(recipe, data)
         if "strapdown" in options.parts:
-            apart = mechanisation(bench, str(data), options.pypose)
-            console.print(f"loop and windows end {apart:.1e} m apart after 60 s: the loop is first order")
+            apart = mechanisation(bench, str(data), length_s := min(60.0, options.length_s), options.pypose)
+            console.print(f"loop and windows end {apart:.1e} m apart after {length_s:g} s: the loop is first order")
         works = {
             "filters": lambda: filters(bench, data, recipe.imu, options.length_s, options.models),
             "epochs": lambda: epochs(bench, data, recipe.imu, options.models),

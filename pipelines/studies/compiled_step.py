@@ -1,6 +1,6 @@
 """What the compiled epoch is worth: ``python -m pipelines.studies.compiled_step --models mbkf21_car plus``.
 
-Old and new run in turns in one process on a simulated drive, since the machine's speed wanders: processor time of one
+Old and new run interleaved in one process on a simulated drive, since the machine's speed varies: processor time of one
 thread, the best of some rounds. Then the time of one epoch: in Python by torch, in Python compiled, and the call in C.
 """
 
@@ -16,14 +16,14 @@ import torch
 from dlkf.data.alignment import ALIGN
 from dlkf.data.store import load_dataset
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
-from dlkf.models import resolve_model
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.onboard.check import Latency, latencies
-from dlkf.onboard.compiled_filter import CompiledFilter, compiled_filter
+from dlkf.onboard.compiled_filter import CompiledFilter, compile_filter
 from dlkf.running.batched import run_filter
 from dlkf.running.start import aligned_drives
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
+from dlkf.tracking.models import resolve_model
 
 IMU = ImuSpec("mems", SensorErrors(noise_density=2.5e-3, turn_on_bias=0.02), SensorErrors(9e-5, turn_on_bias=1e-3))
 
@@ -48,7 +48,7 @@ def main() -> None:
 def report(name: str, data: Path, rate_hz: float, rounds: int) -> None:
     """Three lines of one model."""
     drive = load_dataset(data, rate_hz=rate_hz, dtype=torch.float64)[0]
-    compiled = compiled_filter(model_of(name), rate_hz, 1.0)
+    compiled = compile_filter(model_of(name), rate_hz, 1.0)
     batch = aligned_drives([drive], ALIGN)
     for drives in (1, 64):
         many = batch.select(torch.zeros(drives, dtype=torch.int64)) if drives > 1 else batch

@@ -42,7 +42,7 @@ def main() -> int:
         known = [s for s in sets if (s, seeds[0]) in gains]
         panels = [(f"{f}, {s}", np.array(gains[s, seeds[0]][f]["last"])) for f in FILTERS for s in known]
         if panels:
-            title = f"Figure {number}: gain at the last fix of one piece"
+            title = f"Figure {number}: gain at the last fix of one segment"
             (home / f"figure{number}.png").write_bytes(png(heat_map(panels, len(known) if number < 9 else 2, title)))
     holds, text = trends(gains, seeds)
     (home / "trends.md").write_text(text)
@@ -81,13 +81,13 @@ def table4(runs: dict[tuple[str, str], Path]) -> str:
 
 
 def table5(runs: dict[tuple[str, str], Path]) -> str:
-    """Mean over the pieces of the RMS of position, velocity and attitude, every set, filter and seed."""
+    """Mean over the segments of the RMS of position, velocity and attitude, every set, filter and seed."""
     lines = ["| set | seed | filter | P [m] | V [m/s] | A [rad] |", "|:--|:--|:--|--:|--:|--:|"]
     for (name, seed), folder in sorted(runs.items()):
         (content,) = json.loads((folder / "metrics.json").read_text())["results"]
         result = Results.of(content)
         for f in FILTERS:
-            cells = [f"{result.value(f, 'pieces', 'all', q, 'mean'):.3g}" for q in QUANTITIES]
+            cells = [f"{result.value(f, 'segments', 'all', q, 'mean'):.3g}" for q in QUANTITIES]
             lines.append(f"| {name} | {seed} | {f} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 

@@ -25,16 +25,16 @@ from dlkf.data.drive import Batch
 from dlkf.data.store import load_dataset
 from dlkf.filters.integration import Estimator
 from dlkf.filters.model_based import Mbkf
-from dlkf.models import resolve_model
 from dlkf.navigation.attitude import rpy_from_rotation
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
-from dlkf.onboard.compiled_filter import compiled_filter
+from dlkf.onboard.compiled_filter import compile_filter
 from dlkf.running.batched import run_filter
 from dlkf.running.start import aligned_drives
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
+from dlkf.tracking.models import resolve_model
 
 RATE_HZ, MINUTES, ROUNDS = 100.0, 20.0, 5
 IMU = ImuSpec(
@@ -112,7 +112,7 @@ def measured(
         assert isinstance(mbkf, Mbkf)
         numbers(batch, mbkf).tofile(home / "drive.bin")
         engine = built(checkout, home)
-        ours: dict[str, Estimator] = {n: compiled_filter(resolve_model(n, IMU), RATE_HZ, 1.0) for n in models}
+        ours: dict[str, Estimator] = {n: compile_filter(resolve_model(n, IMU), RATE_HZ, 1.0) for n in models}
         spent: dict[str, list[float]] = {n: [] for n in ("KF-GINS", *ours)}
         end = np.zeros(3)
         for _ in range(rounds):
@@ -127,7 +127,7 @@ def measured(
 
 
 def main() -> None:
-    """Build, run in turns, print."""
+    """Build, run interleaved, print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("checkout", type=Path, help="git clone of KF-GINS")
     parser.add_argument("--models", nargs="+", default=["mbkf21", "mbkf21_car", "plus"])

@@ -1,7 +1,7 @@
 """What a long list of drives costs: ``python -m pipelines.studies.long_lists data/two --hours 42 100``.
 
 The drives of a dataset under new names (links: no room on the disk) until there are so many hours, and again cut into
-short drives. Each work runs in an interpreter of its own; told are its processor time, its time by the clock and the
+short drives. Each work runs in an interpreter of its own; printed are its processor time, its time by the clock and the
 most memory it had, and the least of ``--repeats`` runs counts. Work is ``open`` (load, check, resample, cut)
 or a command.
 """
@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,10 +27,10 @@ from dlkf.data.tables import read_drives
 KINDS = ("imu", "gnss", "reference")
 OPEN = """
 import sys, torch
-from dlkf.data.segments import cut_pieces
+from dlkf.data.segments import cut_segments
 from dlkf.data.store import load_dataset
 drives = load_dataset(sys.argv[1])
-print(len(drives), "drives,", len(cut_pieces(drives, 120.0, 60.0, attitude=True)), "pieces")
+print(len(drives), "drives,", len(cut_segments(drives, 120.0, 60.0, attitude=True)), "segments")
 """
 WORKS = {
     "open": ["-c", OPEN, "{data}"],
@@ -84,10 +85,10 @@ def shortened(source: Path, out: Path, minutes: float) -> Path:
     return out
 
 
-def cost(work: list[str]) -> Cost:
+def cost(work: list[str], environment: Mapping[str, str] | None = None) -> Cost:
     """Of a command of Python in an interpreter of its own, and of the processes that it starts."""
-    start = time.monotonic()
-    child = subprocess.Popen([sys.executable, *work], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    start, nothing = time.monotonic(), subprocess.DEVNULL
+    child = subprocess.Popen([sys.executable, *work], stdout=nothing, stderr=nothing, env=environment)
     _, status, used = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
     if child.returncode:

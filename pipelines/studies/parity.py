@@ -29,17 +29,17 @@ from pyins import filters, inertial_sensor, measurements, sim, strapdown
 from pyins.util import ACCEL_COLS, GYRO_COLS, LLA_COLS, RPH_COLS, VEL_COLS
 from rich.console import Console
 
-from dlkf.config import config_dir
+from dlkf.base.config import config_dir
+from dlkf.base.files import write_into
 from dlkf.data.drive import Batch
-from dlkf.data.masks import withhold
+from dlkf.data.masks import withhold_fixes
 from dlkf.data.schema import ACCEL, GYRO, new_dataset, write_drive, write_drives_table
-from dlkf.data.segments import StartLaw, cut_pieces, make_batch
+from dlkf.data.segments import StartLaw, cut_segments, make_batch
 from dlkf.data.store import load_dataset
 from dlkf.data.tables import Columns
 from dlkf.evaluation.bootstrap import compare
 from dlkf.evaluation.figures import COLOURS, png
-from dlkf.evaluation.table import Table, as_markdown, as_rich, number
-from dlkf.files import staged
+from dlkf.evaluation.table import ResultTable, as_markdown, as_rich, format_number
 from dlkf.filters.build import build_causal, build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.model_based import Ins, Mbkf
@@ -120,7 +120,7 @@ def _truth(at: pd.DataFrame) -> Truth:
 
 
 def _at(error: Array, at: pd.DataFrame) -> Array:
-    return np.concatenate((error[:1], error))[:: RATE][: len(at)]
+    return np.concatenate((error[:1], error))[::RATE][: len(at)]
 
 
 def with_outages(batch: Batch) -> Batch:
@@ -128,7 +128,7 @@ def with_outages(batch: Batch) -> Batch:
     end = torch.arange(1, batch.size[1] + 1) * batch.epoch_s
     since = end - FIRST_S
     hidden = (since > 0) & ((since - 1e-6) % EVERY_S < OUTAGE_S)
-    return withhold(batch, hidden)
+    return withhold_fixes(batch, hidden)
 
 
 def start_of(batch: Batch) -> pd.Series:
@@ -211,19 +211,19 @@ def outage_ends(hidden: NDArray[np.bool_]) -> NDArray[np.int64]:
 def perfect_drift(folder: Path, rate_hz: float) -> float:
     """Largest horizontal error [m] after 60 s of strapdown of an error-free IMU from the exact start."""
     drives = load_dataset(folder, rate_hz=rate_hz, dtype=torch.float64)
-    batch = make_batch(drives, cut_pieces(drives, float(OUTAGE_S)), dtype=torch.float64, start=EXACT)
+    batch = make_batch(drives, cut_segments(drives, float(OUTAGE_S)), dtype=torch.float64, start=EXACT)
     with torch.inference_mode():
         solution = integrate(batch, Ins(free=True))
     return float((solution.posterior.p_n - batch.truth.p_n)[:, -1, :2].norm(dim=-1).max())
 
 
 def rates(folder: Path, spec: ImuSpec, states: int) -> tuple[float, float]:
-    """IMU epochs per second of ours: one piece of five minutes, and 64 at once; best of three."""
+    """IMU epochs per second of ours: one segment of five minutes, and 64 at once; best of three."""
     drives = load_dataset(folder, rate_hz=float(RATE), dtype=torch.float64)
-    pieces = cut_pieces(drives, 300.0)
+    segments = cut_segments(drives, 300.0)
     out = []
     for n in (1, 64):
-        batch = make_batch(drives, (pieces * n)[:n], dtype=torch.float64, start=START)
+        batch = make_batch(drives, (segments * n)[:n], dtype=torch.float64, start=START)
         best = min(ours(batch, spec, states, score=False)[1] for _ in range(3))
         out.append(n * 300 * RATE / best)
     return out[0], out[1]
@@ -232,13 +232,13 @@ def rates(folder: Path, spec: ImuSpec, states: int) -> tuple[float, float]:
 def run(folder: Path, kept: Path, drive: int, spec: ImuSpec, states: int, step_s: float) -> Result:
     """Both filters over one drive; theirs from what is kept of an earlier run, where it was run."""
     loaded = load_dataset(folder, rate_hz=float(RATE), dtype=torch.float64, drives=[f"parity-{drive:02d}"])
-    whole = cut_pieces(loaded, loaded[0].epochs - 1.0)[:1]
+    whole = cut_segments(loaded, loaded[0].epochs - 1.0)[:1]
     generator = torch.Generator().manual_seed(drive)
     batch = with_outages(make_batch(loaded, whole, dtype=torch.float64, start=START, generator=generator))
     file = kept / f"drive={drive:02d}-states={states}-step={step_s:g}.npz"
     if not file.is_file():
         error, seconds = theirs(folder, batch, spec, states, step_s)
-        with staged(kept) as beside:
+        with write_into(kept) as beside:
             np.savez(beside / file.name, error=error, seconds=seconds)
     with np.load(file) as x:
         error, seconds = x["error"], float(x["seconds"])
@@ -250,7 +250,7 @@ def rms(x: Array) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
 
-def table_of(results: dict[int, list[Result]], minutes: float) -> Table:
+def table_of(results: dict[int, list[Result]], minutes: float) -> ResultTable:
     """Errors in the outages of all drives, ours and theirs, and their ratio with its interval."""
     drives, outages = 0, 0
     rows = []
@@ -263,11 +263,12 @@ def table_of(results: dict[int, list[Result]], minutes: float) -> Table:
         samples = RATE * sum(len(r.hidden) for r in runs)
         speed = [samples / sum(getattr(r, x) for r in runs) for x in ("ours_s", "theirs_s")]
         rows.append(
-            [f"{states}", number(c.a), number(c.b), f"{c.ratio:.3f} [{c.ratio_low:.3f}, {c.ratio_high:.3f}]"]
-            + [number(float(np.median(x))) for x in (a, b)] + [number(x) for x in inside]
+            [f"{states}", format_number(c.a), format_number(c.b), 
+             f"{c.ratio:.3f} [{c.ratio_low:.3f}, {c.ratio_high:.3f}]"]
+            + [format_number(float(np.median(x))) for x in (a, b)] + [format_number(x) for x in inside]
             + [f"{x:,.0f}" for x in speed] + [f"{speed[0] / speed[1]:.0f}"]
         )  # fmt: skip
-    return Table(
+    return ResultTable(
         title=f"{drives} drives of {minutes:g} min, {outages} outages of {OUTAGE_S} s: horizontal error",
         note="End: RMS and median at the end of the outages; inside: RMS over their epochs. Ratio of the RMS at the "
         "end with its 95 % interval by paired bootstrap over outages. Speed: IMU epochs per second of one processor.",
@@ -334,14 +335,14 @@ def main() -> int:
             )
     table = table_of(results, o.minutes)
     columns = ["States", "one drive", "64 at once", "times"]
-    speed = Table("Ours, 5 minutes at 100 Hz, IMU epochs per second", "", columns, [])
+    speed = ResultTable("Ours, 5 minutes at 100 Hz, IMU epochs per second", "", columns, [])
     for states in o.states:
         one, many = rates(folder, spec, states)
         speed.rows.append([f"{states}", f"{one:,.0f}", f"{many:,.0f}", f"{many / one:.1f}"])
     text = "\n".join(map(as_markdown, (table, speed)))
     drift = " and ".join(f"{perfect_drift(perfect, hz):.4f} m at {hz} Hz" for hz in (50, 100))
     text += f"\nError-free IMU, exact start, 60 s without GNSS: at most {drift}, horizontal.\n"
-    with staged(o.out) as beside:
+    with write_into(o.out) as beside:
         (beside / "table.md").write_text(text)
         (beside / "parity.png").write_bytes(png(figure(results)))
     for shown in (table, speed):

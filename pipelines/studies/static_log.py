@@ -1,7 +1,7 @@
 """A simulated IMU at rest as a dataset: a log for ``dlkf.allan`` whose noise is known.
 
-    python -m pipelines.studies.static_log data/bench --imu consumer --hours 6
-    python -m dlkf.allan dataset=data/bench imu=consumer name=bench out=outputs/allan
+python -m pipelines.studies.static_log data/bench --imu consumer --hours 6
+python -m dlkf.allan dataset=data/bench imu=consumer name=bench out=outputs/allan
 """
 
 from __future__ import annotations

@@ -21,14 +21,14 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
-from dlkf.config import config_dir
+from dlkf.base.config import config_dir
 from dlkf.data.tables import Columns
 from dlkf.filters.build import build_filter
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.smoother import Filter
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.imu_errors import imu_spec
-from dlkf.running.replay import played
+from dlkf.running.replay import replay_drive
 from dlkf.running.streaming import Status, StreamingFilter
 from dlkf.simulation.drive import Rates, Seeds, simulate_drive
 from dlkf.simulation.gnss.surroundings import Surroundings
@@ -81,14 +81,14 @@ def road(model: str, hours: float, faults: bool, anchor_m: float, seed: int) -> 
     stream = StreamingFilter(build_filter(model, SPEC), rate_hz=50.0, lever_arm_b=ARM, anchor_m=anchor_m)
     error = np.full(len(fault), np.nan)
     frames, asymmetry, smallest = set(), 0.0, np.inf
-    for receipt in played(stream, imu, heard):
+    for receipt in replay_drive(stream, imu, heard):
         for e in receipt.estimates:
             lat, lon, _ = (float(x) for x in geodetic_from_ecef(e.frame.to_ecef(e.state.p_n)))
             k = round(e.t)
             north, east = np.degrees(lat) - reference["lat_deg"][k], np.degrees(lon) - reference["lon_deg"][k]
             error[k] = METRES * np.hypot(north, east * np.cos(lat))
             frames.add(tuple(e.frame.origin_e[0].tolist()))
-            running: Any = stream._running
+            running: Any = stream._epochs.running
             if k % 60 == 0 and hasattr(running.memory, "P"):
                 P = running.memory.P[0]
                 sigma = P.diagonal().sqrt()
@@ -119,7 +119,7 @@ def latency(minutes: float) -> Table:
         for late in (0.0, 0.15):
             stream = StreamingFilter(estimator, lever_arm_b=ARM)
             took = {"sample": [], "sample that ends an epoch": [], "fix": [], "fix after its epoch": [], "now()": []}
-            feed = played(stream, imu, gnss, (gnss["t"] + late).tolist())
+            feed = replay_drive(stream, imu, gnss, (gnss["t"] + late).tolist())
             fixes = count = 0
             while True:
                 wall, own = time.perf_counter(), time.thread_time()

@@ -18,10 +18,56 @@ Errors
 Units
     SI and radians. Degrees only in columns named ``_deg``. Quaternions scalar-first.
 Shapes
-    (batch, epoch, sample, axis). An epoch is one update interval, 1 s unless said otherwise.
+    (batch, epoch, sample, axis). An epoch is one update interval, 1 s by default: the IMU samples between two
+    boundaries, then at most one fix and one measurement of each aid.
+Data
+    drive       one continuous recording;  group: the recording it is part of, the unit of every split
+    segment     a stretch of a drive with its own start state and tangent frame, as filters are trained and scored on
+    outage      an interval in which GNSS fixes are withheld
+    reference   the solution that errors are measured against (truth, in simulated drives)
+Filters
+    ins         strapdown from the last fix
+    mbkf15      error-state Kalman filter: position, velocity, attitude, biases;  mbkf21, mbkf33: also scale
+                factors, also misalignments;  aekf: with adaptive Q and R
+    _prior      starts from the training drives' mean IMU error
+    _nhc        non-holonomic constraints: no velocity across and down, zero velocity while stationary
+    _car        these with mounting angles, rear-axle distance, sideslip and pitch gradient as states
+    _gm         biases as Gauss-Markov processes;  _gated: χ² gate on fixes;  _rts: smoothed backwards
+    plus        _car whose process noise a network adapts;  dlkf: a network gives the gain and the IMU error
+    module:Class a filter of your own;  filter+module:Class: a Kalman filter with a measurement source of your own
+Tables
+    30 s, 60 s  horizontal error so long after the outage began, RMS over outages [m];  end: at its end
+    P / V / A   mean over segments of the RMS of position [m], velocity [m/s], attitude [rad] (the paper's measure)
+    ratio       to the baseline, in [ ] the 95 % interval of a paired bootstrap over groups
+    slope       change of the estimated IMU error per injected bias: 1 estimates it, 0 ignores it
+    NEES, NIS   squared error, squared innovation over their covariance, divided by their size: 1 is consistent
 Citations
     R085 (what the paper asks for, by number) and "paper.md 4.10" (how it was read) are in docs/paper.md; "paper eq 9"
     is the paper itself. The equations from the sample to the solution are in docs/algorithm.md.
 """
 
-__version__ = "0.1.0"
+from __future__ import annotations
+
+from typing import Any
+
+__version__ = "0.2.0"
+
+PUBLIC = {  # imported when first used: torch takes seconds
+    **dict.fromkeys(("navigate", "smooth", "evaluate", "load", "Stream", "simulate", "read_logs"), "dlkf.frames"),
+    "Solution": "dlkf.frames",
+    "Evaluation": "dlkf.frames",
+    "InputError": "dlkf.base.errors",
+}
+__all__ = ["__version__", *PUBLIC]  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in PUBLIC:
+        raise AttributeError(f"module 'dlkf' has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(PUBLIC[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

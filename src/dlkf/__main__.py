@@ -1,17 +1,20 @@
-"""``dlkf <command> key=value …``, the same as ``python -m dlkf.<command>``; ``dlkf`` alone says what there is.
+"""``dlkf <command> key=value …``, the same as ``python -m dlkf.<command>``; ``dlkf`` alone lists the commands.
 
-Completion in bash: ``eval "$(dlkf completion)"`` (commands, keys and presets; zsh reads it after ``bashcompinit``).
+Modules of one's own are found in the current folder, after all that is installed.
 """
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
+from collections.abc import Callable
 from importlib import import_module
 from typing import NoReturn
 
 import dlkf
+from dlkf.base.errors import did_you_mean
 
 COMMANDS = {
     "simulate": "drives with known truth, as a dataset",
@@ -28,42 +31,47 @@ COMMANDS = {
     "register": "the model of a run into the registry",
     "ui": "MLflow's pages over the runs of this folder",
 }
-COMPLETION = r"""_dlkf() {
-  local line="${COMP_LINE:0:COMP_POINT}" word="" done="" words
-  read -ra words <<< "$line"
-  [[ $line == *[[:space:]] ]] || { word="${words[-1]}"; unset 'words[-1]'; }
-  [[ $COMP_WORDBREAKS == *=* && $word == *=* ]] && done="${word%=*}="
-  COMPREPLY=($(compgen -W "$(dlkf complete "$word" "${words[@]:1}" 2>/dev/null)" -- "$word"))
-  COMPREPLY=("${COMPREPLY[@]#"$done"}")
-  [[ ${#COMPREPLY[@]} -eq 1 && ${COMPREPLY[0]} == *[.=] ]] && compopt -o nospace
-}
-complete -o default -F _dlkf dlkf
-"""
 
 
 def main() -> None:
     """Run a command; 2 for an unknown one, 130 after Ctrl-C, even while the libraries load."""
     word, rest = (sys.argv[1] if len(sys.argv) > 1 else "help"), sys.argv[2:]
-    signal.signal(signal.SIGTERM, _terminated)
+    before = signal.signal(signal.SIGTERM, _terminated)
     try:
         if word in ("help", "--help", "-h"):
             print(usage())
         elif word in ("--version", "-V", "version"):
             print(f"dlkf {dlkf.__version__}")
-        elif word == "completion":
-            print(COMPLETION, end="")
-        elif word == "complete":
-            print("\n".join(candidates(*(rest or [""]))))
         elif word in COMMANDS:
             sys.argv = [sys.argv[0].replace("__main__.py", "dlkf"), *rest]
             os.environ["DLKF_COMMAND"] = f"dlkf {word}"
-            import_module(f"dlkf.{word}").main()
+            if not sys.flags.safe_path and os.getcwd() not in sys.path:
+                sys.path.append(os.getcwd())  # where python -m finds modules too, but before all others
+            if {"--help", "-h"} & set(rest) and word != "ui":
+                from dlkf.command import print_help  # the command itself loads torch, which takes seconds
+
+                print_help(word)
+            else:
+                _load(word)()
         else:
-            print(f"dlkf: error: unknown command {word!r}; known: {', '.join(COMMANDS)}", file=sys.stderr)
+            near = did_you_mean(word, COMMANDS) or ";"
+            print(f"dlkf: error: unknown command {word!r}{near} known: {', '.join(COMMANDS)}", file=sys.stderr)
             sys.exit(2)
     except KeyboardInterrupt:
         print("dlkf: interrupted", file=sys.stderr)
         sys.exit(130)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _load(command: str) -> Callable[[], None]:
+    """The function of a command. What is loaded stays, so that to look for garbage in it is a fifth of the time."""
+    gc.disable()
+    try:
+        return import_module(f"dlkf.{command}").main
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def _terminated(*_: object) -> NoReturn:
@@ -78,22 +86,8 @@ def usage() -> str:
     return (
         f"dlkf {dlkf.__version__}: Kalman filters for GNSS and IMU, and a learned one\n\n"
         f"usage: dlkf <command> key=value …\n\n{lines}\n\n"
-        "dlkf <command> --help shows its settings, --cfg job prints them all with their values.\n"
-        'Completion: eval "$(dlkf completion)"'
+        "dlkf <command> --help shows its settings, --cfg job prints them all with their values."
     )
-
-
-def candidates(word: str, *before: str) -> list[str]:
-    """Words that may stand for this one: commands, keys of the command before it, nested ones, presets, values."""
-    if not before or before[0] not in COMMANDS:
-        return [c for c in COMMANDS if c.startswith(word)]
-    from dlkf.config import config_dir
-
-    if not (config_dir() / f"{before[0]}.yaml").is_file():
-        return []
-    from dlkf.command.completion import completed
-
-    return completed(before[0], word, before[1:])
 
 
 if __name__ == "__main__":

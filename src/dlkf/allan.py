@@ -14,24 +14,24 @@ from dlkf.command import command
 from dlkf.command.settings import AllanSettings
 from dlkf.data.tables import read_drives
 from dlkf.data.validate import read_imu
-from dlkf.diagnosis.allan import preset
+from dlkf.diagnosis.allan import noise_preset
 from dlkf.diagnosis.allan_report import analyse, chosen, noise_table, part, write_allan
 from dlkf.evaluation.table import as_rich
 from dlkf.navigation.imu_errors import imu_spec
 
 
 @command("allan", AllanSettings)
-def main(told: AllanSettings) -> None:
+def main(settings: AllanSettings) -> None:
     """Read, check that the IMU is at rest, fit, write, print."""
-    name, base = told.name, imu_spec(told.imu)
-    drive = chosen([row.name for row in read_drives(told.dataset)], told.drive)
-    imu, rate = part(read_imu(told.dataset, drive), told.from_s, told.to_s)
+    name, base = settings.name, imu_spec(settings.imu)
+    drive = chosen([row.name for row in read_drives(settings.dataset)], settings.drive)
+    imu, rate = part(read_imu(settings.dataset, drive), settings.from_s, settings.to_s)
     log = analyse(drive, imu, rate, base)
     source = f"Allan deviation of {drive}, {log.duration_s / 3600:.3g} h at rest; all else from {base.name}"
-    spec = preset(name, (log.fits["accel"], log.fits["gyro"]), base, source, in_run=told.in_run)
-    write_allan(told.out, log, spec)
+    spec = noise_preset(name, (log.fits["accel"], log.fits["gyro"]), base, source, in_run=settings.in_run)
+    write_allan(settings.out, log, spec)
     Console(width=None if sys.stdout.isatty() else 110).print(as_rich(noise_table(log)))
-    print(f"Preset: {told.out}/imu/{name}.yaml; report: {told.out}/allan.html")
+    print(f"Preset: {settings.out}/imu/{name}.yaml; report: {settings.out}/allan.html")
 
 
 if __name__ == "__main__":

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dlkf.base.files import require_empty
 from dlkf.command import command
-from dlkf.command.arguments import at_home
+from dlkf.command.arguments import expand_home
 from dlkf.command.settings import CompareSettings
-from dlkf.files import vacant
 from dlkf.report.compare import read_reports, write_comparison
 
 
@@ -15,15 +15,15 @@ def runs_of(arguments: list[str]) -> list[str]:
     """Bare words are the folders; the points of a sweep have an equals sign in their names (``0-imu=consumer``)."""
     folders = [a for a in arguments if not a.startswith("-") and ("=" not in a or Path(a, "metrics.json").is_file())]
     rest = [a for a in arguments if a not in folders]
-    quoted = ",".join("'" + at_home(folder).replace("'", "\\'") + "'" for folder in folders)
+    quoted = ",".join("'" + expand_home(folder).replace("'", "\\'") + "'" for folder in folders)
     return [*rest, f"runs=[{quoted}]"] if folders else rest
 
 
 @command("compare", CompareSettings, runs_of)
-def main(told: CompareSettings) -> None:
+def main(settings: CompareSettings) -> None:
     """Read, write, print."""
-    runs, out = told.runs, told.out
-    vacant(out, overwrite=told.overwrite)
+    runs, out = settings.runs, settings.out
+    require_empty(out, overwrite=settings.overwrite)
     write_comparison(out, read_reports([str(run) for run in (runs if isinstance(runs, (list, tuple)) else [runs])]))
     print(f"Report: {out}/compare.html")
 

@@ -10,46 +10,52 @@ import sys
 
 from rich.console import Console
 
+from dlkf.base.console import show_progress
+from dlkf.base.errors import InputError
+from dlkf.base.files import require_empty
 from dlkf.command import command
-from dlkf.command.scored import ConsistencySettings
-from dlkf.console import counting
-from dlkf.data.masks import withhold
-from dlkf.diagnosis.consistency import Normalised, consistency, consistency_table, states_of, write_consistency
-from dlkf.diagnosis.matched_drives import matched_batch, matching
-from dlkf.errors import InputError
+from dlkf.command.matched import ConsistencySettings
+from dlkf.data.masks import withhold_fixes
+from dlkf.diagnosis.consistency import (
+    NormalisedSquares,
+    consistency_table,
+    measure_consistency,
+    states_of,
+    write_consistency,
+)
+from dlkf.diagnosis.matched_drives import make_matched_drives, matched_batch
 from dlkf.evaluation.table import as_rich
-from dlkf.files import vacant
 from dlkf.filters.model_based import has_covariance
-from dlkf.models import resolve_model, resolve_models
+from dlkf.tracking.models import resolve_model, resolve_models
 
 
 @command("consistency", ConsistencySettings)
-def main(told: ConsistencySettings) -> None:
+def main(settings: ConsistencySettings) -> None:
     """Simulate, run, compare, write, print."""
-    vacant(told.out, overwrite=told.overwrite)
-    settings, preset, plan = told.matched, told.spec, told.outage
-    asked = resolve_models(told.models, preset, tuning=told.tuning)
+    require_empty(settings.out, overwrite=settings.overwrite)
+    matched, preset, plan = settings.matched, settings.spec, settings.outage
+    asked = resolve_models(settings.models, preset, tuning=settings.tuning)
     states = {name: states_of(name, model) for name, model in asked.items()}
-    results: dict[str, Normalised] = {}
+    results: dict[str, NormalisedSquares] = {}
     outage = None
-    for name, model in zip(asked, told.models, strict=True):
-        spec = matching(preset, states[name])
-        with counting(f"Simulating for {name}") as progress:
-            batch, matrices = matched_batch(settings, spec, progress)
+    for name, model in zip(asked, settings.models, strict=True):
+        spec = make_matched_drives(preset, states[name])
+        with show_progress(f"Simulating for {name}") as progress:
+            batch, matrices = matched_batch(matched, spec, progress)
         if plan is not None:
             mask = plan.masks(batch)[0]
             if not bool(mask.any()):
-                raise InputError(f"no outage fits into {settings.minutes:g} minutes; see outage.* and minutes")
-            batch, outage = withhold(batch, mask), mask[0].numpy()
-        with counting(f"Running {name}") as progress:
-            estimator = resolve_model(model, spec, tuning=told.tuning)
+                raise InputError(f"no outage fits into {matched.minutes:g} minutes; see outage.* and minutes")
+            batch, outage = withhold_fixes(batch, mask), mask[0].numpy()
+        with show_progress(f"Running {name}") as progress:
+            estimator = resolve_model(model, spec, tuning=settings.tuning)
             assert has_covariance(estimator)  # as ``states_of`` has seen
-            results[name] = consistency(estimator, batch, matrices, progress)
-    title = f"{settings.drives} simulated drives of {settings.minutes:g} min, IMU {preset.name}, errors as modelled"
-    table = consistency_table(results, told.settle_s, title)
-    write_consistency(told.out, results, table, outage)
+            results[name] = measure_consistency(estimator, batch, matrices, progress)
+    title = f"{matched.drives} simulated drives of {matched.minutes:g} min, IMU {preset.name}, errors as modelled"
+    table = consistency_table(results, settings.settle_s, title)
+    write_consistency(settings.out, results, table, outage)
     Console(width=None if sys.stdout.isatty() else 110).print(as_rich(table))
-    print(f"Report: {told.out}/consistency.png, table.md")
+    print(f"Report: {settings.out}/consistency.png, table.md")
 
 
 if __name__ == "__main__":

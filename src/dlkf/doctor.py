@@ -17,13 +17,13 @@ from dlkf.diagnosis.checkup import GOOD, STYLES, checkup
 
 
 @command("doctor", DoctorSettings)
-def main(told: DoctorSettings) -> None:
-    """Read, look, print; the exit code tells whether something is bad."""
+def main(settings: DoctorSettings) -> None:
+    """Read, look, print; the exit code is not 0 where something is bad."""
     console = Console(width=None if sys.stdout.isatty() else 140, highlight=False)
     bad = noted = 0
-    for row in drive_rows(told.dataset, told.drives):
+    for row in drive_rows(settings.dataset, settings.drives):
         console.print(Text(row.name, style="bold"))
-        for finding in checkup(told.dataset, row, discover_pose=told.discover):
+        for finding in checkup(settings.dataset, row, discover_pose=settings.discover):
             console.print(Text(f"  {finding.grade:5}", style=STYLES[finding.grade]) + Text(f" {finding.text}"))
             bad, noted = bad + (finding.grade == "BAD"), noted + (finding.grade not in (GOOD, "BAD"))
     console.print(f"{bad} bad, {noted} to know" if bad or noted else "all good")

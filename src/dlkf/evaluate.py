@@ -5,95 +5,146 @@ Prints the results table and leaves metrics.json, table.md, table.csv, figures/,
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
+from typing import Any, NamedTuple
 
+from rich.console import Console
+
+from dlkf.base.callable_module import make_callable
+from dlkf.base.console import make_console, save_log
+from dlkf.base.files import absolute_place, folder_name, require_empty
+from dlkf.base.parallel import check_engine
+from dlkf.base.provenance import describe_provenance
 from dlkf.command import command
 from dlkf.command.scored import EvaluateSettings
-from dlkf.console import keep_said, talking
 from dlkf.data.kinds import drive_kinds
-from dlkf.data.store import dataset_digest, drive_rows
+from dlkf.data.store import choose_aids, dataset_digest, drive_rows
 from dlkf.evaluation.outages import check_outages
-from dlkf.evaluation.shares import Work, evaluate_shares
+from dlkf.evaluation.protocol import REFUSED
+from dlkf.evaluation.results import Results
+from dlkf.evaluation.scores import Scores
+from dlkf.evaluation.sensors import sensor_table
+from dlkf.evaluation.shares import EvaluationJob, evaluate_chunks
 from dlkf.evaluation.study import results_of
-from dlkf.evaluation.summary import FEW, answer, metrics_of
-from dlkf.evaluation.table import all_tables, as_markdown, as_rich
-from dlkf.files import absolute, name_of, vacant
+from dlkf.evaluation.summary import FEW, headline, metrics_of, sigma_warnings
+from dlkf.evaluation.table import ResultTable, all_tables, as_markdown, as_rich, result_tables
+from dlkf.filters.aids.attach import aid_columns, describe_aids, tables_of, with_aids
 from dlkf.filters.build import build_filter
-from dlkf.filters.card import strangers, without_seen
+from dlkf.filters.card import domain_warnings, without_training_recordings
 from dlkf.filters.saved import grid_of
-from dlkf.models import check_baseline, resolve_models
-from dlkf.parallel import check
-from dlkf.provenance import provenance
 from dlkf.report.evaluation import write_report
-from dlkf.running.offline import SAMPLES_AT_ONCE, Fixes, in_shares
+from dlkf.running.offline import SAMPLES_AT_ONCE, UsableFixes, chunk_drives
 from dlkf.running.references import check_reference
 from dlkf.tracking.grid import start_point
+from dlkf.tracking.models import check_baseline, resolve_models
 from dlkf.tracking.runs import check_store, tracking_uri
 
 
-@command("evaluate", EvaluateSettings)
-def main(told: EvaluateSettings) -> None:
-    """Load, run every model over the same scenes, score, write, print."""
-    console = talking()
-    vacant(told.out, overwrite=told.overwrite)
-    protocol, uri, spec = told.protocol(told.align), tracking_uri(told.tracking.uri), told.spec
-    if told.tracking.log:
-        check_store(uri)
-    models = resolve_models(told.models, spec, uri, **told.told)
-    check_baseline(told.baseline, models)
-    check_reference(told.reference)
-    grid = grid_of(models.values(), told.rate_hz, told.epoch_s)
-    check(told.parallel, told.dataset)
-    rows, name = drive_rows(told.dataset, told.drives), name_of(told.dataset)
-    digest, kinds = dataset_digest(told.dataset), drive_kinds(told.dataset)
+class EvaluationRun(NamedTuple):
+    """Scores of an evaluation, its results per kind of data, the filters' names, how it was done and on which data."""
+
+    scores: Scores
+    results: list[Results]
+    models: list[str]
+    mode: str
+    protocol: Mapping[str, Any]
+    digest: str
+    sensors: ResultTable | None = None
+
+
+def evaluate_dataset(settings: EvaluateSettings, console: Console) -> EvaluationRun:
+    """Load, run every model over the same scenes, score; messages on the way go to ``console``."""
+    protocol, spec = settings.protocol(settings.align), settings.spec
+    models = resolve_models(settings.models, spec, tracking_uri(settings.tracking.uri), **settings.filter_options)
+    check_baseline(settings.baseline, models)
+    check_reference(settings.reference)
+    chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
+    models = {model_name: with_aids(model, chosen) for model_name, model in models.items()}
+    taken = dict.fromkeys(table for model in models.values() for table in tables_of(model))
+    step = grid_of(models.values(), settings.rate_hz, settings.epoch_s)
+    grid = {**step, "aids": tuple(taken)}
+    check_engine(settings.parallel, settings.dataset)
+    rows, name = drive_rows(settings.dataset, settings.drives), folder_name(settings.dataset)
+    digest, kinds = dataset_digest(settings.dataset), drive_kinds(settings.dataset)
     cards = {model_name: getattr(model, "card", {}) for model_name, model in models.items()}
-    rows, seen = without_seen(cards, rows, name, digest, leave_out=told.unseen)
-    strange = strangers(models, told.dataset, [row.name for row in rows], spec.name, grid["rate_hz"])
+    rows, seen = without_training_recordings(cards, rows, name, digest, leave_out=settings.unseen)
+    strange = domain_warnings(models, settings.dataset, [row.name for row in rows], spec.name, grid["rate_hz"])
     for line in (*seen, *strange):
         console.print(line, style="yellow")
-    work = Work(
-        absolute(told.dataset), models, protocol, grid, kinds, {row.name: row.group for row in rows},
-        reference=told.reference, smoother=build_filter("mbkf21", spec, tuning=told.tuning),
-        align=told.align, law=told.injected_bias, seed=told.seed, shown=told.parallel is None,
+    for line in describe_aids(models, chosen):
+        console.print(line, highlight=False)
+    work = EvaluationJob(
+        absolute_place(settings.dataset), models, protocol, grid, kinds, {row.name: row.group for row in rows},
+        reference=settings.reference, smoother=build_filter("mbkf21", spec, tuning=settings.tuning),
+        align=settings.align, law=settings.injected_bias, seed=settings.seed,
+        shown=settings.parallel is None and not console.quiet,
     )  # fmt: skip
-    fixes = {row.name: Fixes.of(told.dataset, row.name) for row in rows}
-    many = SAMPLES_AT_ONCE if told.parallel is None else SAMPLES_AT_ONCE // 4
-    done = evaluate_shares(work, in_shares(fixes, grid["rate_hz"], many), told.parallel)
+    fixes = {row.name: UsableFixes.of(settings.dataset, row.name) for row in rows}
+    many = SAMPLES_AT_ONCE if settings.parallel is None else SAMPLES_AT_ONCE // 4
+    done = evaluate_chunks(work, chunk_drives(fixes, grid["rate_hz"], many), settings.parallel)
     for reason in done.skipped.values():
         console.print(f"left out: {reason}", style="yellow")
+    for drive, said in done.rules.get(REFUSED, {}).items():
+        console.print(f"drive {drive}: {said} beyond physical limits refused", style="yellow", highlight=False)
     if done.short:
         console.print(f"left out: {done.short}", style="yellow", highlight=False)
     if done.truth:
         console.print(f"No truth: errors are against the {done.truth['reference']}.", style="bold")
-    if told.mode == "auto" and done.mode == "drives":
-        said = f"no piece of {told.length_s:g} s with a known attitude: whole drives, from their own alignment"
+    if settings.mode == "auto" and done.mode == "drives":
+        said = f"no segment of {settings.length_s:g} s with a known attitude: whole drives, from their own alignment"
         console.print(said, style="yellow")
     scores = done.run.scores
     check_outages(protocol.outage, scores.outage)
-    made = results_of(done.run, baseline=told.baseline, settle_s=told.settle_s, seed=told.seed)
-    decided = {"models": told.model, "dataset": told.dataset, "imu": spec.name, "tuning": asdict(told.tuning)}
+    results = results_of(done.run, baseline=settings.baseline, settle_s=settings.settle_s, seed=settings.seed)
+    decided = {
+        "models": settings.model,
+        "dataset": settings.dataset,
+        "imu": spec.name,
+        "tuning": asdict(settings.tuning),
+    }
     decided["imu values"] = {"accel": asdict(spec.accel), "gyro": asdict(spec.gyro)}
-    made_how = {**provenance(), **decided, "digest": digest, **done.truth, **grid, **done.rules}
-    by_time, baseline = done.mode == "pieces", told.baseline
-    write_report(told.out, name, scores, made, protocol=made_how, by_time=by_time, baseline=baseline)
-    tables, title = all_tables(name, made), f"{' '.join(models)} on {name}"
-    for table in tables:
-        console.print(as_rich(table))
-    for result in made:
-        console.print(f"\n[bold]{answer(result)}[/bold]", highlight=False)
-    if done.mode == "pieces" and any(0 < int(r.count.get("outages") or 0) < FEW for r in made):
+    made_how = {**describe_provenance(), **decided, "digest": digest, **done.truth, **step, **done.rules}
+    made_how["aids"] = [table.name for table in taken]
+    sensors = sensor_table(scores, {model_name: aid_columns(model) for model_name, model in models.items()})
+    return EvaluationRun(scores, results, list(models), done.mode, made_how, digest, sensors)
+
+
+@command("evaluate", EvaluateSettings)
+def main(settings: EvaluateSettings) -> None:
+    """Score, write, print."""
+    console = make_console()
+    require_empty(settings.out, overwrite=settings.overwrite)
+    uri, name = tracking_uri(settings.tracking.uri), folder_name(settings.dataset)
+    if settings.tracking.log:
+        check_store(uri)
+    done = evaluate_dataset(settings, console)
+    results, segments = done.results, done.mode == "segments"
+    write_report(
+        settings.out, name, done.scores, results, protocol=done.protocol, by_time=segments, baseline=settings.baseline,
+        more=[done.sensors] if done.sensors else (),
+    )  # fmt: skip
+    for result in results:
+        console.print(as_rich(result_tables(name, result)[-1]))
+        console.print(f"[bold]{headline(result)}[/bold]", highlight=False)
+    for line in sigma_warnings(done.scores):
+        console.print(line, style="yellow", highlight=False, soft_wrap=True)
+    if segments and any(0 < int(r.count.get("outages") or 0) < FEW for r in results):
         console.print("Few outages; mode=drives has them over all of every drive, about twice as many.", style="yellow")
-    keep_said(console, told.out)
+    save_log(console, settings.out)
     kept = ""
-    if told.tracking.log:
-        with start_point(uri, told.name, title) as run:
-            run.log_config(asdict(told))
-            run.log_dataset(told.dataset, digest, "evaluation")
-            run.log_metrics(metrics_of(made))
-            run.log_files(told.out)
-            run.note("\n".join(as_markdown(t) for t in tables))
+    if settings.tracking.log:
+        with start_point(uri, settings.name, f"{' '.join(done.models)} on {name}") as run:
+            run.log_config(asdict(settings))
+            run.log_dataset(settings.dataset, done.digest, "evaluation")
+            run.log_metrics(metrics_of(results))
+            run.log_files(settings.out)
+            run.note("\n".join(as_markdown(t) for t in all_tables(name, results)))
         kept = f"; MLflow: run {run.id}"
-    console.print(f"Report: {told.out}/report.html{kept}", soft_wrap=True)
+    console.print(f"Report: {settings.out}/report.html{kept}", soft_wrap=True, markup=False)
+
+
+make_callable(__name__, "dlkf.frames:evaluate")
 
 
 if __name__ == "__main__":

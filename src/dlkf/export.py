@@ -1,7 +1,7 @@
 """A filter for a vehicle, as C without libraries: ``python -m dlkf.export model=mbkf21_car out=outputs/onboard``.
 
-Writes ``step.c`` with its header and description, an example and a ROS 2 node that use it, and a drive for the
-example; then runs the exported filter and the original over that drive and says how far they are apart.
+Writes the filter (``step.c``), the core round it (``dlkf.h``), an example and a ROS 2 node that use it, and a drive for
+the example; then runs the core and the original over that drive and says how far they are apart.
 """
 
 from __future__ import annotations
@@ -12,57 +12,66 @@ from pathlib import Path
 
 import torch
 
+from dlkf.base.errors import InputError
+from dlkf.base.files import is_url, require_empty, write_into
+from dlkf.base.provenance import describe_provenance
 from dlkf.command import command
 from dlkf.command.settings import ExportSettings
+from dlkf.data.aid_tables import standard_tables
 from dlkf.data.store import drive_from_tables, drive_rows
 from dlkf.data.validate import read_checked
-from dlkf.errors import InputError
-from dlkf.files import is_url, staged, vacant
+from dlkf.filters.aids.attach import tables_of, with_aids
 from dlkf.filters.saved import grid_of
-from dlkf.filters.smoother import Smoothed
-from dlkf.models import resolve_model, short_name
-from dlkf.onboard.c_source import CPP, write_source
-from dlkf.onboard.check import checked, write_log
+from dlkf.filters.smoother import SmoothedSolution
+from dlkf.onboard.c_source import EXAMPLES, write_source
+from dlkf.onboard.check import check_export, write_log
 from dlkf.onboard.functions import Grid
 from dlkf.onboard.library import compiler
-from dlkf.provenance import provenance
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
+from dlkf.simulation.sensors import BaroConfig, HeadingConfig, SensorsConfig, WheelConfig
+from dlkf.tracking.models import resolve_model, short_name
 
-EXAMPLES = ("navigate.cpp", "ros2_node.cpp", "CMakeLists.txt")
+COPIED = ("navigate.c", "ros2_node.cpp", "CMakeLists.txt")
 ARM = (1.0, 0.3, -1.2)  # m, IMU to antenna of the simulated car
+SENSORS = SensorsConfig(WheelConfig(scale=0.02, delay_s=0.1), HeadingConfig(), BaroConfig())  # of its
 
 
 @command("export", ExportSettings)
-def main(told: ExportSettings) -> None:
+def main(settings: ExportSettings) -> None:
     """Resolve, write, check, print."""
-    vacant(told.out, overwrite=told.overwrite)
-    imu = told.spec
-    model = resolve_model(str(told.model), imu, told.tracking.uri, **told.told)
-    if isinstance(model, Smoothed):
-        raise InputError(f"model={told.model} looks ahead, which a vehicle cannot; take it without _rts")
-    given = grid_of([model], told.rate_hz, told.epoch_s)
-    grid = Grid(round(given["rate_hz"] * given["epoch_s"]), 1 / given["rate_hz"])
-    with staged(told.out) as folder, tempfile.TemporaryDirectory() as somewhere:
-        dataset = told.dataset
+    require_empty(settings.out, overwrite=settings.overwrite)
+    imu = settings.spec
+    model = resolve_model(str(settings.model), imu, settings.tracking.uri, **settings.filter_options)
+    aids = [settings.aids] if isinstance(settings.aids, str) else list(settings.aids or ())
+    model = with_aids(model, standard_tables(aids))
+    if isinstance(model, SmoothedSolution):
+        raise InputError(f"model={settings.model} looks ahead, which a vehicle cannot; take it without _rts")
+    given = grid_of([model], settings.rate_hz, settings.epoch_s)
+    dtype = {"double": torch.float64, "float": torch.float32}[settings.precision]
+    grid = Grid(round(given["rate_hz"] * given["epoch_s"]), 1 / given["rate_hz"], dtype)
+    with write_into(settings.out) as folder, tempfile.TemporaryDirectory() as somewhere:
+        dataset = settings.dataset
         if dataset is None:
-            drive = DatasetConfig("check", hours=5 / 60, drive_minutes=5.0, gnss=GnssConfig(lever_arm_b=ARM))
+            sensors = SENSORS if tables_of(model) else None
+            gnss = GnssConfig(lever_arm_b=ARM)
+            drive = DatasetConfig("check", hours=5 / 60, drive_minutes=5.0, gnss=gnss, sensors=sensors)
             dataset = simulate_dataset(drive, imu, 0, Path(somewhere) / "check", progress=False, workers=1)
-        tables = read_checked(dataset, drive_rows(dataset, told.drive)[0], reference=False)
-        drive = drive_from_tables(tables, "", given["rate_hz"], given["epoch_s"], torch.float64)
-        layout = write_source(folder, model, grid, short_name(told.model), provenance())
-        for name in EXAMPLES:
-            (folder / name).write_text((CPP / name).read_text())
-        write_log(folder / "drive.csv", tables, drive)
+        tables = read_checked(dataset, drive_rows(dataset, settings.drive)[0], reference=False)
+        drive = drive_from_tables(tables, "", given["rate_hz"], given["epoch_s"], torch.float64, tables_of(model))
+        layout = write_source(folder, model, grid, short_name(settings.model), describe_provenance())
+        for name in COPIED:
+            (folder / name).write_text((EXAMPLES / name).read_text())
+        write_log(folder / "drive.csv", tables)
         if compiler() is None:
             lines = ["not checked: no C compiler here (cc, gcc or clang)"]
         else:
-            lines = checked(Path(somewhere), folder, model, grid, layout, tables, drive, told.latency)
+            lines = check_export(Path(somewhere), folder, model, grid, layout, tables, drive, settings.latency)
     arm = " ".join(f"{x:g}" for x in tables.row.lever_arm_b)
-    print(f"{short_name(told.model)} as C in {told.out}: {layout.size} numbers of memory, step.h says how")
+    print(f"{short_name(settings.model)} as C in {settings.out}: dlkf.h says how")
     print("\n".join(lines))
-    if not is_url(told.out):
-        print(f"Try it: cd {shlex.quote(told.out)} && cmake -B build && cmake --build build "
+    if not is_url(settings.out):
+        print(f"Try it: cd {shlex.quote(settings.out)} && cmake -B build && cmake --build build "
               f"&& build/navigate --arm {arm} < drive.csv > solution.csv")  # fmt: skip
 
 

@@ -2,28 +2,39 @@
 
 from __future__ import annotations
 
-from dlkf.classes import made
+from dlkf.base.classes import instantiate
 from dlkf.command import command
 from dlkf.command.settings import IngestSettings
-from dlkf.data.intake import Intake, Taken, ingest
+from dlkf.data.intake import IngestOptions, IngestResult, ingest
 from dlkf.data.validate import Limits
 
 
 def _open(arguments: list[str]) -> list[str]:
-    """Keys of a reader that its preset leaves out can be given too; the reader itself knows which there are."""
+    """Keys of a reader that its preset leaves out can be given too; the reader itself defines them."""
     return [f"++{a}" if a.startswith("reader.") else a for a in arguments]
 
 
 @command("ingest", IngestSettings, _open)
-def main(told: IngestSettings) -> None:
+def main(settings: IngestSettings) -> None:
     """Read every drive under ``source``, check it and write the dataset ``out``."""
-    reader = made(told.reader, "reader")
-    how = Intake(told.split_gaps, told.shortest_s, Limits(gap_s=told.gap_s, gap_samples=told.gap_samples))
-    count = ingest(reader, told.source, told.out, how, overwrite=told.overwrite, parallel=told.parallel, progress=_tell)
-    print(f"{told.out}: {count} drive{'s' if count != 1 else ''}")
+    reader = instantiate(settings.reader, "reader", ("read",))
+    how = IngestOptions(
+        settings.split_gaps, settings.shortest_s, Limits(gap_s=settings.gap_s, gap_samples=settings.gap_samples)
+    )
+    count = ingest(
+        reader,
+        settings.source,
+        settings.out,
+        how,
+        overwrite=settings.overwrite,
+        parallel=settings.parallel,
+        skip_unsure=settings.skip_unsure,
+        progress=_tell,
+    )
+    print(f"{settings.out}: {count} drive{'s' if count != 1 else ''}")
 
 
-def _tell(taken: Taken, done: int) -> None:
+def _tell(taken: IngestResult, done: int) -> None:
     for note in taken.notes:
         print(f"       {note}", flush=True)
     for number, line in enumerate(taken.lines, done - len(taken.lines) + 1):

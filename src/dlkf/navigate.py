@@ -11,91 +11,117 @@ from functools import partial
 
 import torch
 
-from dlkf.command import command, typed
+from dlkf.base.callable_module import make_callable
+from dlkf.base.console import LOG, show_progress
+from dlkf.base.errors import InputError
+from dlkf.base.files import absolute_place, folder_name, require_empty, write_into
+from dlkf.base.parallel import check_engine, parallel_map
+from dlkf.base.provenance import describe_provenance
+from dlkf.command import command, typed_words
 from dlkf.command.settings import NavigateSettings
-from dlkf.console import LOG, counting
 from dlkf.data.drive import Drive
-from dlkf.data.store import dataset_digest, drive_rows, load_dataset
+from dlkf.data.store import choose_aids, dataset_digest, drive_rows, load_dataset
 from dlkf.data.tables import drive_clocks
-from dlkf.errors import InputError
-from dlkf.files import absolute, name_of, staged, vacant
-from dlkf.filters.card import strangers
+from dlkf.filters.aids.attach import describe_aids, tables_of, with_aids
+from dlkf.filters.card import domain_warnings
 from dlkf.filters.saved import grid_of
-from dlkf.filters.smoother import smoothed
-from dlkf.models import is_told_noise, resolve_model, short_name
+from dlkf.filters.smoother import run_smoother
 from dlkf.navigation.imu_errors import AUTO
-from dlkf.onboard.compiled_filter import compiled_filter
-from dlkf.parallel import check, each
-from dlkf.provenance import provenance
-from dlkf.report.navigation import MOST_DRIVES, Course, answers, write_page
+from dlkf.onboard.compiled_filter import compile_filter, compile_or_keep
+from dlkf.onboard.core_drives import core_drive, runs_in_core
+from dlkf.report.navigation import MOST_DRIVES, TrackOnMap, summary_lines, write_page
 from dlkf.running import offline
-from dlkf.running.exports import chosen, export, utc_times
-from dlkf.running.likelihood import untold
+from dlkf.running.exports import chosen_formats, export, utc_times
+from dlkf.running.innovations import OF_NETWORK, REMEDY
+from dlkf.running.likelihood import generic_filter
 from dlkf.running.replay import stream_drives
 from dlkf.running.solution import write_solution
+from dlkf.tracking.models import resolve_model, short_name, takes_imu_preset
 
 
 @command("navigate", NavigateSettings)
-def main(told: NavigateSettings) -> None:
+def main(settings: NavigateSettings) -> None:
     """Load, align, run, write; print a line per drive."""
-    formats = chosen(told.export)
-    vacant(told.out, overwrite=told.overwrite)
-    check(told.parallel, told.dataset)
-    if not isinstance(told.model, str):
-        raise InputError(f"navigate runs one model at a time, got model={told.model}")
-    spec, tuning = told.spec, told.tuning
-    model = resolve_model(told.model, spec, told.tracking.uri, **told.told)
-    clocks = drive_clocks(told.dataset)
-    rows, name = drive_rows(told.dataset, told.drives), short_name(told.model)
-    spacings = {row.name: offline.Fixes.of(told.dataset, row.name) for row in rows}
-    usual = offline.epoch_for(spacings.values(), told.rate_hz or 50.0, model)
-    grid = grid_of([model], told.rate_hz, told.epoch_s, usual)
-    for line in strangers({name: model}, told.dataset, spacings, spec.name, grid["rate_hz"]):
+    formats = chosen_formats(settings.export)
+    require_empty(settings.out, overwrite=settings.overwrite)
+    check_engine(settings.parallel, settings.dataset)
+    if not isinstance(settings.model, str):
+        raise InputError(f"navigate runs one model at a time, got model={settings.model}")
+    spec, tuning = settings.spec, settings.tuning
+    model = resolve_model(settings.model, spec, settings.tracking.uri, **settings.filter_options)
+    clocks = drive_clocks(settings.dataset)
+    rows, name = drive_rows(settings.dataset, settings.drives), short_name(settings.model)
+    spacings = {row.name: offline.UsableFixes.of(settings.dataset, row.name) for row in rows}
+    usual = offline.epoch_for(spacings.values(), settings.rate_hz or 50.0, model)
+    step = grid_of([model], settings.rate_hz, settings.epoch_s, usual)
+    chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
+    model = with_aids(model, chosen)
+    grid = {**step, "aids": tables_of(model)}
+    for line in describe_aids({name: model}, chosen):
         print(line)
-    if spec.name != AUTO and not is_told_noise(told.model) and (unused := typed("imu", "tuning")):
-        print(f"{name} is told no noise: {' '.join(unused)} changes nothing; a Kalman filter would take it")
-    skipped: dict[str, str] | None = {} if told.skip_unaligned else None
-    if told.streaming and (ahead := "smoother" if told.smoother else "imu=auto" if spec.name == AUTO else ""):
+    for line in domain_warnings({name: model}, settings.dataset, spacings, spec.name, grid["rate_hz"]):
+        print(line)
+    if spec.name != AUTO and not takes_imu_preset(settings.model) and (unused := typed_words("imu", "tuning")):
+        print(f"{name} takes no noise: {' '.join(unused)} changes nothing; a Kalman filter would take it")
+    skipped: dict[str, str] | None = {} if settings.skip_unaligned else None
+    if settings.streaming and (ahead := "smoother" if settings.smoother else "imu=auto" if spec.name == AUTO else ""):
         raise InputError(f"{ahead} looks ahead, a stream cannot: give {ahead} or streaming, not both")
     found_on: list[Drive] | None = None
     if spec.name == AUTO:
-        drives = load_dataset(told.dataset, dtype=torch.float64, reference=False, drives=told.drives, **grid)
-        with counting("Finding the noise") as progress:
-            model, found_on, found = untold(drives, told.model, spec, tuning, told.align, progress=progress)
+        drives = load_dataset(settings.dataset, dtype=torch.float64, reference=False, drives=settings.drives, **grid)
+        with show_progress("Finding the noise") as progress:
+            model, found_on, found = generic_filter(
+                drives, settings.model, spec, tuning, settings.align, chosen,
+                progress=progress, compiler=compile_or_keep,
+            )  # fmt: skip
         print("found: " + ", ".join(f"{k} {v:.2g}" for k, v in found.described().items()))
-        print(found.told_of_fixes())
+        print(found.describe_offset())
         spec, tuning = found.imu, found.tuning
-    if told.smoother is not None:
-        model = smoothed(model, told.smoother)
-    if told.compiled:
-        model = compiled_filter(model, **grid)
+    if settings.smoother is not None:
+        model = run_smoother(model, settings.smoother)
+    if settings.compiled:
+        model = compile_filter(model, **step, whole=settings.streaming and runs_in_core(settings.align))
     if found_on is not None:
-        navigated = partial(offline.navigate_drives, found_on, model, align=told.align, skipped=skipped)
+        navigated = partial(offline.navigate_drives, found_on, model, align=settings.align, skipped=skipped)
     else:
-        run = stream_drives if told.streaming else offline.navigate_dataset
-        run = partial(run, absolute(told.dataset), model, align=told.align, **grid)
-        many = offline.SAMPLES_AT_ONCE if told.parallel is None else offline.SAMPLES_AT_ONCE // 4
-        shares = offline.in_shares(spacings, grid["rate_hz"], 1 if told.streaming else many)
-        done = each(partial(offline.share_of, run, skipped is not None), shares, told.parallel)
-        navigated = partial(offline.navigate_shares, done, len(rows), skipped=skipped)
+        run = stream_drives if settings.streaming else offline.navigate_dataset
+        if settings.streaming and settings.compiled:
+            run = partial(stream_drives, through=core_drive)
+        run = partial(run, absolute_place(settings.dataset), model, align=settings.align, **grid)
+        many = offline.SAMPLES_AT_ONCE if settings.parallel is None else offline.SAMPLES_AT_ONCE // 4
+        shares = offline.chunk_drives(spacings, grid["rate_hz"], 1 if settings.streaming else many)
+        done = parallel_map(partial(offline.load_chunk, run, skipped is not None), shares, settings.parallel)
+        navigated = partial(offline.navigate_chunks, done, len(rows), skipped=skipped)
     lines, courses = [], []
-    with staged(told.out) as folder, counting("Navigating") as progress:
+    with write_into(settings.out) as folder, show_progress("Navigating") as progress:
         for result in navigated(progress=progress):
             write_solution(folder / f"drive={result.drive}" / "solution.parquet", result.table)
-            when = utc_times(result.table, clocks.get(result.drive), told.export_clock)
+            when = utc_times(result.table, clocks.get(result.drive), settings.export_clock)
             export(folder / f"drive={result.drive}", result.table, formats, when, result.drive)
             lines.append(result.summary(spacings[result.drive]))
-            course = Course(result, spacings[result.drive])
+            course = TrackOnMap(result, spacings[result.drive])
             courses.append(course if len(courses) < MOST_DRIVES else course.for_the_map())
-        made = {**provenance(), "model": told.model, "dataset": told.dataset, "drives": told.drives, **grid}
-        made |= {"digest": dataset_digest(told.dataset), "imu": asdict(spec), "tuning": asdict(tuning)}
-        write_page(folder, name, name_of(told.dataset), courses, made)
+        made = {
+            **describe_provenance(),
+            "model": settings.model,
+            "dataset": settings.dataset,
+            "drives": settings.drives,
+            **step,
+            "aids": [table.name for table in grid["aids"]],
+        }
+        made |= {"digest": dataset_digest(settings.dataset), "imu": asdict(spec), "tuning": asdict(tuning)}
+        remedy = REMEDY if takes_imu_preset(settings.model) else OF_NETWORK
+        doubt = offline.sigma_warning((course.result for course in courses), name, remedy)
+        warnings = [doubt] if doubt else []
+        write_page(folder, name, folder_name(settings.dataset), courses, made, warnings)
         left_out = [f"left out: {reason}" for reason in (skipped or {}).values()]
-        said = "\n".join((*sorted(lines), *left_out, *answers(name, courses)))
+        said = "\n".join((*sorted(lines), *left_out, *summary_lines(name, courses), *warnings))
         (folder / LOG).write_text(f"{said}\n")
     print(said)
-    print(f"Solutions: {told.out}/drive=*/solution.parquet; report: {told.out}/report.html")
+    print(f"Solutions: {settings.out}/drive=*/solution.parquet; report: {settings.out}/report.html")
 
+
+make_callable(__name__, "dlkf.frames:navigate")
 
 if __name__ == "__main__":
     main()

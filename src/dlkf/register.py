@@ -5,33 +5,33 @@ Of a grid search's parent run, the point that validated best; with ``model=plus`
 
 from __future__ import annotations
 
+from dlkf.base.errors import InputError
 from dlkf.command import command
 from dlkf.command.settings import RegisterSettings
-from dlkf.errors import InputError
 from dlkf.filters.card import CARD_TEXT
-from dlkf.models import model_folder
 from dlkf.tracking.comparison import best_of
-from dlkf.tracking.registry import check_registration, log_model, registered
+from dlkf.tracking.models import model_folder
+from dlkf.tracking.registry import check_registration, log_model, register_model
 from dlkf.tracking.runs import check_store, client_of, reachable, run_exists, start_run, store_missing, tracking_uri
 
 
 @command("register", RegisterSettings)
-def main(told: RegisterSettings) -> None:
+def main(settings: RegisterSettings) -> None:
     """Look, choose, register, print."""
-    name, alias = told.name, told.alias
-    if (told.run is None) == (told.model is None):
+    name, alias = settings.name, settings.alias
+    if (settings.run is None) == (settings.model is None):
         raise InputError("give run=<id of a training>, or model=plus or a folder: one of the two")
-    uri = tracking_uri(told.tracking.uri)
+    uri = tracking_uri(settings.tracking.uri)
     check_registration(name, alias)
-    if told.model is not None:
-        folder = model_folder(told.model)
-        with start_run(uri, "models", told.model) as run:
+    if settings.model is not None:
+        folder = model_folder(settings.model)
+        with start_run(uri, "models", settings.model) as run:
             if (card := folder / CARD_TEXT).is_file():
                 run.note(card.read_text())
             log_model(run, folder)
         run_id = run.id
     else:
-        run_id = str(told.run)
+        run_id = str(settings.run)
         if store_missing(uri):
             raise InputError(f"there is no MLflow store at {uri.removeprefix('sqlite:///')}; give tracking.uri=…")
         check_store(uri)
@@ -40,7 +40,7 @@ def main(told: RegisterSettings) -> None:
         if not run_exists(client, run_id):
             raise InputError(f"run={run_id}: {uri} has no such run")
         best = best_of(client, run_id)
-        number = registered(client, best.info.run_id, name, alias)
+        number = register_model(client, best.info.run_id, name, alias)
     also = f", models:/{name}@{alias}" if alias else ""
     print(f"{best.info.run_name}: models:/{name}/{number}{also}")
 

@@ -8,10 +8,11 @@ import time
 import numpy as np
 import pandas as pd
 
+from dlkf.base.callable_module import make_callable
+from dlkf.base.errors import InputError
+from dlkf.base.files import open_parquet, resolve_place
 from dlkf.command import command
-from dlkf.command.simulated import SimulateSettings
-from dlkf.files import placed, readable
-from dlkf.simulation.dataset import simulate
+from dlkf.simulation.dataset import SimulateSettings, simulate
 from dlkf.simulation.semi_real import simulate_semi_real
 
 
@@ -22,32 +23,38 @@ def arguments_of_source(arguments: list[str]) -> list[str]:
 
 
 @command("simulate", SimulateSettings, arguments_of_source)
-def main(told: SimulateSettings) -> None:
-    """Write the dataset to ``out`` (default ``data/<name>``) and say what it holds."""
+def main(settings: SimulateSettings) -> None:
+    """Write the dataset to ``out`` (default ``data/<name>``) and print what it holds."""
     start = time.perf_counter()
-    out = placed(told.out)
-    if told.source:
-        simulate_semi_real(told.source, told.recipe, out, overwrite=told.overwrite)
+    out = resolve_place(settings.out)
+    if settings.source and settings.recipe.dataset.sensors:
+        raise InputError("sensors= belongs to simulated drives; leave it out with source=")
+    if settings.source:
+        simulate_semi_real(settings.source, settings.recipe, out, overwrite=settings.overwrite)
     else:
-        simulate(told.recipe, out, overwrite=told.overwrite, workers=told.workers, parallel=told.parallel)
-    drives = pd.read_parquet(readable(out / "drives.parquet"))
+        simulate(
+            settings.recipe, out, overwrite=settings.overwrite, workers=settings.workers, parallel=settings.parallel
+        )
+    drives = pd.read_parquet(open_parquet(out / "drives.parquet"))
     hours = drives["duration_s"].sum() / 3600
-    made_by = told.recipe
+    made_by = settings.recipe
     errors = made_by.dataset.imu_errors
     types = {"fleet": f"of {len(made_by.dataset.fleet)} types", "wide": "of a new type each"}
     imu = types.get(errors, made_by.imu.name)
     print(
-        f"{out}: {hours:.3g} h of {'semi-real ' if told.source else ''}drives with IMU {imu} "
-        f"({errors}), seed {told.seed}, in {time.perf_counter() - start:.1f} s"
+        f"{out}: {hours:.3g} h of {'semi-real ' if settings.source else ''}drives with IMU {imu} "
+        f"({errors}), seed {settings.seed}, in {time.perf_counter() - start:.1f} s"
     )
     if "lateral_axle_mps" in drives:
         axle, at_imu = (math.sqrt(np.mean(drives[f"lateral_{at}_mps"].to_numpy() ** 2)) for at in ("axle", "imu"))
         print(f"velocity across the car, RMS above 2 m/s: {axle:.3f} m/s at the rear axle, {at_imu:.3f} m/s at the IMU")
-    if told.pictures:
+    if settings.pictures:
         from dlkf.simulation.pictures import write_pictures  # matplotlib takes a second to load
 
         print("pictures: " + ", ".join(str(path) for path in write_pictures(out, out / "pictures")))
 
+
+make_callable(__name__, "dlkf.frames:simulate")
 
 if __name__ == "__main__":
     main()

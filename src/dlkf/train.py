@@ -12,69 +12,71 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 
-from dlkf.classes import made
+from dlkf.base.classes import instantiate
+from dlkf.base.console import make_console, save_log
+from dlkf.base.settings import settings_from
 from dlkf.command import command, same_command
 from dlkf.command.composing import configuration_hash
-from dlkf.command.simulated import HOUR_SEED, make_missing
-from dlkf.console import keep_said, talking
+from dlkf.command.simulated import HOUR_SEED, simulate_missing
 from dlkf.data.store import dataset_digest
-from dlkf.evaluation.protocol import fitting
-from dlkf.evaluation.summary import answer
-from dlkf.evaluation.table import all_tables, as_rich
-from dlkf.settings import settings_from
+from dlkf.evaluation.protocol import drives_that_fit
+from dlkf.evaluation.summary import describe_verdict, headline
+from dlkf.evaluation.table import as_rich, result_tables
 from dlkf.tracking.grid import PARENT_RUN, run_name
 from dlkf.tracking.registry import check_registration, log_model
 from dlkf.tracking.runs import check_store, lightning_logger, start_run, tracking_uri
 from dlkf.training.fit import check_fit
-from dlkf.training.processes import is_further
+from dlkf.training.processes import is_worker
 from dlkf.training.run_folder import checked_digests, run_folder, write_state
 from dlkf.training.settings import TrainSettings
-from dlkf.training.study import left_out, run_study, train_along
+from dlkf.training.study import left_out_drives, run_study, train_with_baselines
 from dlkf.training.summary import key_metrics, note
 
 
 @command("train")
 def main(config: dict[str, Any]) -> None:
     """Data, run, study, table."""
-    console = talking()
-    told = settings_from(TrainSettings, config, "")
-    tracking, settings, data = told.tracking, told.study, made(told.data, "data")
+    console = make_console()
+    given = settings_from(TrainSettings, config, "")
+    tracking, settings, data = given.tracking, given.study, instantiate(given.data, "data", ("setup", "describe"))
     check_store(uri := tracking_uri(tracking.uri))
     check_registration(tracking.register, tracking.alias, ("tracking.register", "tracking.alias"))
-    folder, state = run_folder(told.name, configuration_hash(config), resume=told.resume)
-    if is_further():
-        train_along(settings, data, folder)
+    folder, state = run_folder(given.name, configuration_hash(config), resume=given.resume)
+    if is_worker():
+        train_with_baselines(settings, data, folder)
         return
     check_fit(settings.fit)
-    if told.scoring.outage is not None:
-        fitting(told.scoring.outage, data.eval_length_s, "data.eval_length_s", "scoring.outage")
-    make_missing(data.datasets, console)
+    if given.scoring.outage is not None:
+        drives_that_fit(given.scoring.outage, data.eval_length_s, "data.eval_length_s", "scoring.outage")
+    simulate_missing(data.datasets, console)
     data.setup()
-    make_missing([told.scoring.hour] if told.scoring.hour else [], console, HOUR_SEED)
+    simulate_missing([given.scoring.hour] if given.scoring.hour else [], console, HOUR_SEED)
     console.print(data.describe())
-    for line in left_out(settings, data):
+    for line in left_out_drives(settings, data):
         console.print(f"left out: {line}", style="yellow", highlight=False)
     if state:
         console.print(f"going on with the unfinished run in {folder}")
-    name = run_name(told.name, HydraConfig.get().overrides.task)
+    name = run_name(given.name, HydraConfig.get().overrides.task)
     parent = os.environ.get(PARENT_RUN)
     begun = {"parent_run_id": parent, "run_id": state.get("run_id"), "system_metrics": tracking.system_metrics}
-    with start_run(uri, told.name, name, **begun) as run:
+    with start_run(uri, given.name, name, **begun) as run:
         write_state(folder, run_id=run.id, data=checked_digests(data.datasets, state))
         run.log_config(config)
         for dataset in data.datasets:
             run.log_dataset(dataset, dataset_digest(dataset), "training")
-        outcome = run_study(settings, data, folder, lightning_logger(run), console.print, same_command("train"))
-        for table in (*all_tables(", ".join(Path(d).name for d in data.datasets), outcome.results), *outcome.tables):
-            console.print(as_rich(table))
-        keep_said(console, folder / "report")
+        logger = lightning_logger(run, given.trainer.monitor)
+        outcome = run_study(settings, data, folder, logger, console.print, same_command("train"))
+        for result in outcome.results:
+            console.print(as_rich(result_tables(", ".join(Path(d).name for d in data.datasets), result)[-1]))
+        save_log(console, folder / "report")
         run.log_files(folder / "report")
         run.note(note(settings, data.datasets, outcome))
         chosen = {} if parent else {"register": tracking.register, "alias": tracking.alias}  # of a grid the best is
         log_model(run, outcome.weights, metrics=key_metrics(outcome), **chosen)
         write_state(folder, finished=True)
     for result in outcome.results:
-        console.print(f"\n[bold]{answer(result)}[/bold]", highlight=False)
+        verdict = describe_verdict(result, outcome.name) or headline(result)
+        console.print(f"[bold]{verdict}[/bold]", highlight=False)
     seconds = ", ".join(f"{k} {v:.0f} s" for k, v in outcome.seconds.items())
     console.print(f"{seconds}\nReport: {folder}/report/report.html\nModel:  {outcome.weights}\nMLflow: run {run.id}")
 

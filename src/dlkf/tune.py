@@ -13,51 +13,55 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
+from dlkf.base.console import show_progress
+from dlkf.base.errors import InputError
+from dlkf.base.files import is_url, require_store
 from dlkf.command import command
 from dlkf.command.scored import TuneSettings
-from dlkf.console import counting
-from dlkf.data.store import dataset_digest, load_dataset
-from dlkf.errors import InputError
+from dlkf.data.store import choose_aids, dataset_digest, load_dataset
 from dlkf.evaluation.table import as_markdown, as_rich
-from dlkf.files import is_url, reached
+from dlkf.filters.aids.attach import aided_name
 from dlkf.tracking.runs import start_run, tracking_uri
-from dlkf.tuning.found import found_noise, noise_table, write_noise
-from dlkf.tuning.study import LIKELIHOOD, check, search, sides, tuning_table, write_tuning
+from dlkf.tuning.found import find_dataset_noise, noise_table, write_noise
+from dlkf.tuning.study import LIKELIHOOD, check_settings, search, train_test_drives, tuning_table, write_tuning
 
 
 @command("tune", TuneSettings)
-def main(told: TuneSettings) -> None:
+def main(settings: TuneSettings) -> None:
     """Load, split, search, check, write, log, print."""
-    model, name, spec, start = str(told.model), told.name, told.spec, told.tuning
-    check(model, told.objective)
-    if is_url(told.out):
-        raise InputError(f"out={told.out}: --config-dir takes folders of this machine alone; give one")
-    reached(told.out)
-    protocol, uri = told.protocol(), tracking_uri(told.tracking.uri)
-    with counting("Loading drives") as progress:
+    chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
+    model = aided_name(str(settings.model), [table.name for table in chosen])
+    name, spec, start = settings.name, settings.spec, settings.tuning
+    check_settings(model, settings.objective)
+    if is_url(settings.out):
+        raise InputError(f"out={settings.out}: --config-dir takes folders of this machine alone; give one")
+    require_store(settings.out)
+    protocol, uri = settings.protocol(), tracking_uri(settings.tracking.uri)
+    with show_progress("Loading drives") as progress:
         drives = load_dataset(
-            told.dataset,
-            rate_hz=told.rate_hz,
-            epoch_s=told.epoch_s,
+            settings.dataset,
+            rate_hz=settings.rate_hz,
+            epoch_s=settings.epoch_s,
             dtype=torch.float64,
-            drives=told.drives,
-            reference=told.objective != LIKELIHOOD,
+            drives=settings.drives,
+            aids=chosen,
+            reference=settings.objective != LIKELIHOOD,
             progress=progress,
         )
-    dataset, out = drives[0].dataset, Path(told.out)
+    dataset, out = drives[0].dataset, Path(settings.out)
     parts = {}
-    if told.objective != LIKELIHOOD:
-        parts = sides(drives, told.split, told.fractions, told.split_seed, protocol.length_s)
+    if settings.objective != LIKELIHOOD:
+        parts = train_test_drives(drives, settings.split, settings.fractions, settings.split_seed, protocol.length_s)
     with start_run(uri, "tune", f"{model} {dataset}") as run:
-        run.log_config(asdict(told))
-        run.log_dataset(told.dataset, dataset_digest(told.dataset), "tuning")
-        if told.objective == LIKELIHOOD:
-            found = found_noise(drives, model, spec, start, minutes=told.minutes, name=name)
+        run.log_config(asdict(settings))
+        run.log_dataset(settings.dataset, dataset_digest(settings.dataset), "tuning")
+        if settings.objective == LIKELIHOOD:
+            found = find_dataset_noise(drives, model, spec, start, minutes=settings.minutes, name=name)
             table = noise_table(model, dataset, spec, start, found)
             files = write_noise(out, found, table)
             run.log_metrics({f"found/{k}": v for k, v in found.described().items()})
         else:
-            options = {"objective": told.objective, "rounds": told.rounds, "pieces": told.pieces}
+            options = {"objective": settings.objective, "rounds": settings.rounds, "segments": settings.segments}
             result = search(model, spec, parts, protocol, start=start, **options)
             table = tuning_table(result, dataset)
             files = write_tuning(out, name, result, table)

@@ -10,8 +10,8 @@ import os
 import subprocess
 import sys
 
-from dlkf.errors import InputError
-from dlkf.tracking.runs import client_of, found_again, store_missing, tracking_uri
+from dlkf.base.errors import InputError
+from dlkf.tracking.runs import client_of, store_missing, tracking_uri
 
 PAGE = "/#/experiments{of}?workflowType=machine_learning"
 
@@ -28,7 +28,6 @@ def main() -> None:
         uri = tracking_uri(given.get("uri"))
         if store_missing(uri):
             raise InputError(f"there is no MLflow store at {uri.removeprefix('sqlite:///')}; see tracking.uri")
-        found_again(uri)
         host, port = given.get("host", "127.0.0.1"), given.get("port", "5000")
         said = links(uri, f"http://{host}:{port}")
     except InputError as error:

@@ -6,9 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from dlkf.classes import class_named, made
-from dlkf.command.composing import composed
-from dlkf.command.scored import ConsistencySettings, EvaluateSettings, TuneSettings
+from dlkf.base.classes import find_class, instantiate
+from dlkf.base.config import config_dir
+from dlkf.base.settings import settings_from
+from dlkf.command.composing import compose_command
+from dlkf.command.matched import ConsistencySettings
+from dlkf.command.scored import EvaluateSettings, TuneSettings
 from dlkf.command.settings import (
     AllanSettings,
     CompareSettings,
@@ -19,15 +22,13 @@ from dlkf.command.settings import (
     NavigateSettings,
     RegisterSettings,
 )
-from dlkf.command.simulated import SimulateSettings
-from dlkf.config import config_dir
 from dlkf.filters.saved import learned_filter
-from dlkf.settings import settings_from
+from dlkf.simulation.dataset import SimulateSettings
 from dlkf.training.settings import TrainSettings
 
 CONF = config_dir()
 GROUPS = {  # group of the defaults list: folder under conf/
-    "simulate": {"imu": "imu", "receiver": "receiver", "simulated@dataset": "simulated"},
+    "simulate": {"imu": "imu", "receiver": "receiver", "sensors": "sensors", "simulated@dataset": "simulated"},
     "ingest": {"reader": "reader"},
     "evaluate": {"imu": "imu", "tuning": "tuning", "start": "start", "outage": "outage"},
     "navigate": {"imu": "imu", "tuning": "tuning"},
@@ -93,45 +94,66 @@ def test_all_folders_are_covered():
     assert folders == {f for groups in GROUPS.values() for f in groups.values()} | {"experiment", "noise", "profile"}
 
 
-@pytest.mark.parametrize(
-    ("primary", "overrides"), CASES, ids=lambda x: x if isinstance(x, str) else " ".join(x)
-)
-def test_it_composes_and_builds(primary, overrides):
-    config = composed(primary, *overrides)  # what a user must give stays a word, ???
+BY_GROUP: dict[str, list[tuple[str, list[str]]]] = {}  # "train data": what chooses a preset of one folder
+for command, words in CASES:
+    chooses = words[0].partition("=")[0] if words else ""
+    BY_GROUP.setdefault(f"{command} {chooses}".rstrip(), []).append((command, words))
+
+
+SLOW = [group for group in BY_GROUP if group.startswith("train ") and "experiment" not in group]  # 0.2 s each preset
+
+
+@pytest.mark.parametrize("group", [pytest.param(g, marks=[pytest.mark.whole] * (g in SLOW)) for g in BY_GROUP])
+def test_every_preset_composes_and_builds(group):
+    wrong = []
+    for primary, overrides in BY_GROUP[group]:
+        try:
+            compose_and_build(primary, overrides)
+        except Exception as error:
+            wrong.append(f"{primary} {' '.join(overrides)}: {type(error).__name__}: {error}")
+    assert not wrong, "\n".join(wrong)
+
+
+def compose_and_build(primary: str, overrides: list[str]) -> None:
+    """Fails unless a command's configuration composes with these words and makes its settings."""
+    config = compose_command(primary, *overrides)  # what a user must give stays a word, ???
     if primary == "train":
         config["baselines"]["models"] = ["mbkf15"]  # a study refuses the trained filter's name among them
-    told = settings_from(SETTINGS[primary], config, "")
-    if isinstance(told, FilterSettings):
-        assert told.spec.name == config["imu"]["name"]
-    if isinstance(told, ConsistencySettings):
-        assert told.matched.drives == 100
-    if isinstance(told, SimulateSettings):
-        assert told.recipe.dataset.name == config["dataset"]["name"]
-    if isinstance(told, IngestSettings):
-        made(told.reader, "reader")
-    if isinstance(told, TrainSettings):
-        fit = told.study.fit
+    settings = settings_from(SETTINGS[primary], config, "")
+    if isinstance(settings, FilterSettings):
+        assert settings.spec.name == config["imu"]["name"]
+    if isinstance(settings, ConsistencySettings):
+        assert settings.matched.drives == 100
+    if isinstance(settings, SimulateSettings):
+        assert settings.recipe.dataset.name == config["dataset"]["name"]
+    if isinstance(settings, IngestSettings):
+        instantiate(settings.reader, "reader", ("read",))
+    if isinstance(settings, TrainSettings):
+        fit = settings.study.fit
         learned_filter(fit.model)
         assert all(callback.state_dict() is not None for callback in fit.callbacks)
-        class_named(told.data["_target_"], "data._target_")
+        find_class(settings.data["_target_"], "data._target_", ("setup", "describe"))
 
 
 def test_no_file_is_another_s_twin():
     """What several presets share stands once, in one that they name in their defaults."""
-    told = {}
+    settings = {}
     for file in CONF.rglob("*.yaml"):
         kept = "\n".join(line for line in file.read_text().splitlines() if not line.startswith(("#", "name:")))
-        assert told.setdefault(kept, file) is file, f"{file} says what {told[kept]} says"
+        assert not kept.strip() or settings.setdefault(kept, file) is file, f"{file} says what {settings[kept]} says"
 
 
-@pytest.mark.parametrize("name", [*GROUPS, *(f"experiment/{name}" for name in presets("experiment"))])
-def test_it_opens_with_its_claim_and_command(name):
-    text = (CONF / f"{name}.yaml").read_text()
-    lead = text[: text.index("\n", text.rindex("#   python") if "#   python" in text else 0)]
-    command = name.split("/")[0] if "/" not in name else "train"
-    assert f"python -m dlkf.{command}" in lead
+def test_every_command_and_experiment_opens_with_its_command():
+    silent = []
+    for name in (*GROUPS, *(f"experiment/{name}" for name in presets("experiment"))):
+        text = (CONF / f"{name}.yaml").read_text()
+        lead = text[: text.index("\n", text.rindex("#   python") if "#   python" in text else 0)]
+        command = "train" if "/" in name else name
+        silent += [] if f"python -m dlkf.{command}" in lead else [name]
+    assert not silent, silent
 
 
+@pytest.mark.whole
 def test_a_users_own_presets_are_found(tmp_path, call, town):
     """``--config-dir`` adds to every group of a command."""
     mine = tmp_path / "mine"

@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 import os
-import pty
 import pwd
 import re
-import select
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.core_plugins.bash_completion import BashCompletion
-from hydra._internal.utils import create_config_search_path
 
 import dlkf
-from dlkf.__main__ import COMMANDS, COMPLETION, candidates, main
-from dlkf.command.arguments import readable
-from dlkf.config import config_dir
+from dlkf.__main__ import COMMANDS, main
+from dlkf.base.config import config_dir
+from dlkf.command.arguments import quote_argument
 from dlkf.data.schema import drive_file
 from tests.shell import PATIENCE_S
 
@@ -50,68 +44,27 @@ def test_what_there_is(monkeypatch, capsys):
     assert code == 2 and err.startswith("dlkf: error: unknown command 'fly'; known: simulate") and err.count("\n") == 1
 
 
+def test_handlers_of_signals_are_as_before(monkeypatch, capsys):
+    before = signal.getsignal(signal.SIGTERM)
+    typed(monkeypatch, capsys, "--version")
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
 def test_every_command_has_a_module_and_every_configured_one_is_listed():
     here = Path(dlkf.__file__).parent
     assert all((here / f"{name}.py").is_file() for name in COMMANDS)
     assert {p.stem for p in config_dir().glob("*.yaml")} - {"hydra_output"} <= set(COMMANDS)
 
 
-def test_completion_knows_commands_keys_and_presets():
-    assert candidates("ev") == ["evaluate"] and candidates("") == list(COMMANDS)
-    assert {"model=", "imu=", "imu.", "outage.", "reference="} <= set(candidates("", "evaluate"))
-    assert candidates("imu=cons", "navigate") == ["imu=consumer"]
-    assert candidates("imu=aut", "navigate") == ["imu=auto", "imu=automotive_mems"]
-    assert candidates("imu=aut", "export") == ["imu=automotive_mems"]
-    assert "dataset=city" in candidates("dataset=", "simulate") and "model=plus" in candidates("model=", "train")
-    assert candidates("out=", "navigate") == [] == candidates("", "ui")
-
-
-def test_completion_goes_into_nested_keys_as_hydra_does():
-    """And further: lists and switches get values, keys that presets of the same line bring are known."""
-    assert {"scoring.outage.", "scoring.after_s=", "scoring.seed="} <= set(candidates("scoring.", "train"))
-    assert candidates("scoring.outage.fir", "train") == ["scoring.outage.first_s="]
-    assert candidates("++trainer.acc", "train") == ["++trainer.accelerator="]
-    assert "+experiment=plus" in candidates("+experiment=", "train") and candidates("+exp", "train") == ["+experiment="]
-    assert candidates("align.from_rest=", "evaluate") == ["align.from_rest=false", "align.from_rest=true"]
-    assert "dataset.gnss." in candidates("dataset.", "simulate", "dataset=city")
-    assert candidates("outage.d", "evaluate", "imu=nonsense", "mode") == ["outage.duration_s="]  # a line in the making
-    assert candidates("outage.d", "evaluate", "out=~nobody-here/x") == ["outage.duration_s="]
-    loader = ConfigLoaderImpl(create_config_search_path(str(config_dir())))
-    for command, word in (("train", "scoring."), ("evaluate", "imu.accel."), ("ingest", "")):
-        theirs = BashCompletion(loader)._query(command, word)
-        ours = {w.rstrip(".=") for w in candidates(word, command)}
-        folders = {p.name for p in config_dir().iterdir() if p.is_dir()}  # of other commands: Hydra offers all
-        assert {w.rstrip(".=") for w in theirs} - folders - {"hydra"} <= ours
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
-@pytest.mark.parametrize(
-    ("typed_", "becomes"),
-    [
-        ("dlkf evaluate imu=cons", "imu=consumer "),
-        ("dlkf evaluate imu=consumer outage.dur", "outage.duration_s="),
-        ("dlkf train scoring.out", "scoring.outage"),
-        ("dlkf nav", "navigate "),
-    ],
-)
-def test_completion_in_bash(typed_, becomes, tmp_path):
-    """A key of Tab at a prompt; bash breaks words at an equals sign, and puts the rest in behind it."""
-    (tmp_path / "rc").write_text(f"dlkf() {{ {sys.executable} -m dlkf \"$@\"; }}\nPS1=ready\n{COMPLETION}")
-    child, screen = pty.fork()
-    if child == 0:
-        os.execlp("bash", "bash", "--noprofile", "--rcfile", str(tmp_path / "rc"), "-i")
-    seen, end, sent = "", time.monotonic() + PATIENCE_S, False
-    try:
-        while f"{typed_.rpartition(' ')[0]} {becomes}" not in seen and time.monotonic() < end:
-            if select.select([screen], [], [], 1.0)[0]:
-                seen += os.read(screen, 4096).decode(errors="replace").replace("\a", "")  # a bell for several matches
-            if not sent and "ready" in seen:
-                sent = os.write(screen, f"{typed_}\t".encode()) > 0
-        assert f"{typed_.rpartition(' ')[0]} {becomes}" in seen, seen
-    finally:
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-        os.close(screen)
+def test_modules_of_the_current_folder_are_found(tmp_path):
+    """As ``python -m dlkf.evaluate`` finds them; one with the name of a library does not take its place."""
+    (tmp_path / "blend.py").write_text("class Blend:\n    begin = 1\n")
+    (tmp_path / "yaml.py").write_text("raise SystemExit('somebody else's file')")
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "dlkf").write_text("from dlkf.__main__ import main\nmain()\n")  # as pip makes it
+    command = [sys.executable, "bin/dlkf", "navigate", "model=blend:Blend", "dataset=nowhere", "out=made"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert done.returncode == 2 and "model=blend:Blend has no begin and step" in done.stderr, done.stderr
 
 
 @pytest.mark.parametrize(
@@ -133,14 +86,15 @@ def test_completion_in_bash(typed_, becomes, tmp_path):
     ],
 )
 def test_ordinary_paths_need_no_quotes(given, taken):
-    assert readable(given) == taken
+    assert quote_argument(given) == taken
     home = Path.home()
-    assert readable("out=~/x") == f"out={home}/x" and readable("out=~") == f"out={home}"
-    assert readable("dataset=[~/a, b]") == f"dataset=[{home}/a,b]"
+    assert quote_argument("out=~/x") == f"out={home}/x" and quote_argument("out=~") == f"out={home}"
+    assert quote_argument("dataset=[~/a, b]") == f"dataset=[{home}/a,b]"
     user = pwd.getpwuid(os.getuid())
-    assert readable(f"out=~{user.pw_name}/x") == f"out={user.pw_dir}/x"
+    assert quote_argument(f"out=~{user.pw_name}/x") == f"out={user.pw_dir}/x"
 
 
+@pytest.mark.whole
 def test_in_a_shell(tmp_path, town):
     """The same command as ``python -m dlkf.navigate``, with a folder that Hydra's grammar does not take."""
     words = ["navigate", "model=ins", f"dataset={town}", "out=Straße (1)/drive=a", "rate_hz=10", "export=[gpx]"]
@@ -185,6 +139,7 @@ def test_doctor_sees_what_is_wrong(town, call, tmp_path):
     assert done.code == 1 and "gyro_z stays at 0.05" in done.out, done.out
 
 
+@pytest.mark.whole
 def test_compare(town, call, tmp_path):
     for name, models, imu in (("a", "[ins,mbkf15]", "bmi270"), ("b", "[mbkf15]", "consumer")):
         words = (f"model={models}", f"dataset={town}", f"out={name}", f"imu={imu}")

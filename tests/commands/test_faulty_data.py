@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 
 from dlkf.data.schema import drive_file
 from tests.commands.refusals import DRIVE, FAST, is_refused
-from tests.shell import in_shell
 
 
 def change(kind: str, edit: Callable[[pd.DataFrame], pd.DataFrame | None]) -> Callable[[Path], None]:
@@ -71,6 +72,35 @@ def no_bytes(folder: Path) -> None:
     drive_file(folder, "imu", DRIVE).write_bytes(b"")
 
 
+def as_pipe(kind: str) -> Callable[[Path], None]:
+    """A fault: a table from which nothing ever comes."""
+
+    def apply(folder: Path) -> None:
+        path = drive_file(folder, kind, DRIVE)
+        path.unlink()
+        os.mkfifo(path)
+
+    return apply
+
+
+def column_twice(folder: Path) -> None:
+    path = drive_file(folder, "imu", DRIVE)
+    table = pq.ParquetFile(path).read()
+    pq.write_table(table.append_column("gyro_x", table["gyro_x"]), path)
+
+
+def in_drives(column: str, value: object) -> Callable[[Path], None]:
+    """A fault of ``drives.parquet``."""
+
+    def apply(folder: Path) -> None:
+        table = pd.read_parquet(folder / "drives.parquet")
+        table[column] = table[column].astype(object) if column in table else None
+        table.loc[table["drive"] == DRIVE, column] = value
+        table.to_parquet(folder / "drives.parquet", index=False)
+
+    return apply
+
+
 def drop(*parts: str) -> Callable[[Path], None]:
     """A fault: a file or folder that is not there."""
 
@@ -104,6 +134,10 @@ FAULTS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "accelerations in g": (change("imu", scale("accel_", 1 / 9.80665)), (DRIVE, "looks like g", "9.80665")),
     "latitude and longitude swapped": (change("gnss", swapped), (DRIVE, "swapped")),
     "no fix at all": (change("gnss", no_fix), (DRIVE, "no GNSS fix")),
+    "a pipe": (as_pipe("imu"), (DRIVE, "is no file")),
+    "a pipe in the reference": (as_pipe("reference"), (DRIVE, "is no file")),
+    "a column twice": (column_twice, (DRIVE, "gyro_x stands twice")),
+    "a name of 300 letters": (in_drives("drive", "x" * 300), ("at most 200 bytes",)),
     "another clock": (change("gnss", lambda t: t.assign(t=t["t"] + 1e6)), (DRIVE, "same clock")),
 }
 
@@ -131,13 +165,6 @@ def test_a_faulty_reference_stops_evaluate_and_not_navigate(fault, copy, call, t
     is_refused(call("evaluate", "model=ins", "dataset=town", "out=made", *FAST["evaluate"]), *said, folder=tmp_path)
     done = call("navigate", "model=ins", "dataset=town", "out=made", *FAST["navigate"])
     assert done.code == 0, done.err
-
-
-def test_in_a_shell(copy, tmp_path):
-    """What ``call`` does elsewhere, in an interpreter of its own."""
-    FAULTS["NaN in the IMU"][0](copy)
-    done = in_shell(tmp_path, "navigate", "model=mbkf15", "dataset=town", "out=made", "rate_hz=10")
-    is_refused(done, "gyro_z", folder=tmp_path)
 
 
 def test_an_unknown_key(copy, call, tmp_path):

@@ -1,11 +1,14 @@
 """``--help`` says what a command does, its presets, and the keys that matter most."""
 
+import subprocess
+import sys
+
 import pytest
 
 import dlkf
+from dlkf.base.config import config_dir
 from dlkf.command import GROUPS
-from dlkf.command.help import MOST, described, groups_of, help_text, keys_of
-from dlkf.config import config_dir
+from dlkf.command.help import MOST, describe_key, groups_of, help_text, keys_of
 
 COMMANDS = sorted(path.stem for path in config_dir().glob("*.yaml") if path.stem != "hydra_output")
 
@@ -46,9 +49,9 @@ def test_keys_are_read_with_value_and_comment():
         "a": ("1", "one"), "b": ("", "two"), "b.c": ("[1, 2]", "three"), "d": ("{e: x, f: 2}", "four"),
         "d.e": ("x", "four"), "d.f": ("2", "four"),
     }  # fmt: skip
-    assert described(text, "start.yaw_deg")[0] == "2.0"
+    assert describe_key(text, "start.yaw_deg")[0] == "2.0"
     with pytest.raises(KeyError):
-        described(text, "none")
+        describe_key(text, "none")
 
 
 @pytest.mark.parametrize("word", ["null", "none", "off"])
@@ -57,3 +60,12 @@ def test_no_outage_is_a_word_away(word, call, town):
     size = ("model=ins", f"dataset={town}", "length_s=60", "stride_s=60", "injected_bias=null", "tracking.log=false")
     done = call("evaluate", f"outage={word}", "out=seen", *size, "--cfg", "job")
     assert done.code == 0 and "first_s" not in done.out and "length_s: 60" in done.out, done.err
+
+
+@pytest.mark.whole
+def test_help_of_a_command_loads_no_torch():
+    """Torch takes seconds to load; ``dlkf train --help`` answers at once."""
+    asks = "import sys; from dlkf.__main__ import main; sys.argv = ['dlkf', 'train', '--help']; main(); "
+    heavy = "print(sorted({'torch', 'pandas', 'numba', 'lightning', 'mlflow'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", asks + heavy], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]" and "trainer.max_epochs" in done.stdout

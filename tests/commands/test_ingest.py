@@ -37,8 +37,12 @@ def logs(tmp_path_factory):
 def test_a_line_for_each_drive(call, logs):
     done = call("ingest", "reader=csv", f"source={logs}/csv", "out=town", *STDS)
     assert done.code == 0, done.err
-    for told in ("monday: 30.0 s, ", " km, IMU 100 Hz, largest gap 10 ms", "GNSS 1 Hz, 31 fixes (RTK fixed 100 %)"):
-        assert told in done.out
+    for expected in (
+        "monday: 30.0 s, ",
+        " km, IMU 100 Hz, largest gap 10 ms",
+        "GNSS 1 Hz, 31 fixes (RTK fixed 100 %)",
+    ):
+        assert expected in done.out
     assert "town: 2 drives" in done.out
 
 
@@ -106,8 +110,8 @@ MISTAKES = {
 
 @pytest.mark.parametrize("case", MISTAKES)
 def test_mistakes(call, logs, tmp_path, case):
-    given, told = MISTAKES[case]
+    given, expected = MISTAKES[case]
     done = call("ingest", f"source={logs}/csv", "out=town", *given)
-    assert done.code == 2 and told in done.err, done.err
+    assert done.code == 2 and expected in done.err, done.err
     assert done.err.count("\n") == 1
     assert not [p.name for p in tmp_path.iterdir() if "town" in p.name]  # whole or none

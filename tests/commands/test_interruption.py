@@ -8,19 +8,21 @@ import signal
 import sqlite3
 import subprocess
 import sys
-import tempfile
 import time
 from contextlib import closing
+from multiprocessing.context import ForkProcess
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
+from dlkf.base.errors import InputError
+from dlkf.base.files import PARTIAL, replace_folder, require_empty, restore_folder, write_into
+from dlkf.data.tables import read_drives
 from dlkf.data.validate import validate_dataset
-from dlkf.errors import InputError
-from dlkf.files import PARTIAL, staged, vacant, whole_folder
-from tests.shell import PATIENCE_S
+from tests.shell import PATIENCE_S, start_command
 
+pytestmark = pytest.mark.whole
 SIMULATE = (
     "simulate",
     "dataset=one_imu",
@@ -31,36 +33,26 @@ SIMULATE = (
 ENOUGH = "dataset.hours=100"  # hours of work that nobody waits for
 
 
-def stopped(folder: Path, begun: str, how: signal.Signals, *command: str) -> int:
-    """Start a command, send it a signal when a file like ``begun`` is there, and return its exit code.
+def stopped(folder: Path, begun: str, how: signal.Signals, process: ForkProcess | subprocess.Popen, said: Path) -> int:
+    """Send a process a signal when a file like ``begun`` is there, and return its exit code.
 
     Only then: a signal that comes before it would test something else.
     """
-    with tempfile.TemporaryFile() as said:
-        process = subprocess.Popen(
-            [sys.executable, "-m", f"dlkf.{command[0]}", *command[1:]],
-            cwd=folder,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-            stdout=said,
-            stderr=said,
-            preexec_fn=_heed_interrupts,
-        )
-        try:
-            end = time.monotonic() + PATIENCE_S
-            while not any(folder.glob(begun)):
-                if process.poll() is not None or time.monotonic() > end:
-                    said.seek(0)
-                    pytest.fail(f"{begun} never came (exit code {process.poll()}): {said.read()[-2000:].decode()}")
-                time.sleep(0.02)
-            process.send_signal(how)
-            return process.wait(timeout=PATIENCE_S)
-        finally:
-            process.kill()
-
-
-def _heed_interrupts() -> None:
-    """A shell's background job, and all that it starts, ignores SIGINT; a command at a prompt does not."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    ended = process.poll if isinstance(process, subprocess.Popen) else lambda: process.exitcode
+    try:
+        end = time.monotonic() + PATIENCE_S
+        while not any(folder.glob(begun)):
+            if ended() is not None or time.monotonic() > end:
+                pytest.fail(f"{begun} never came (exit code {ended()}): {said.read_text()[-2000:]}")
+            time.sleep(0.02)
+        assert process.pid is not None
+        os.kill(process.pid, how)
+        process.wait(PATIENCE_S) if isinstance(process, subprocess.Popen) else process.join(PATIENCE_S)
+        code = ended()
+        assert code is not None
+        return code
+    finally:
+        process.kill()
 
 
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -signal.SIGKILL}
@@ -68,14 +60,15 @@ CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -signal.SIGKIL
 
 @pytest.mark.parametrize("how", CODES)
 def test_simulate(how, call, tmp_path):
-    code = stopped(tmp_path, "made/.town.partial*/imu/*", how, *SIMULATE, ENOUGH)
+    process = start_command(tmp_path, said := tmp_path / "said", *SIMULATE, ENOUGH)
+    code = stopped(tmp_path, "made/.town.partial*/imu/*", how, process, said)
     assert code == CODES[how]
     assert not (tmp_path / "made" / "town").exists()
     if how != signal.SIGKILL:
         assert list((tmp_path / "made").iterdir()) == []
         return
     (left,) = (tmp_path / "made").iterdir()
-    os.utime(left, (0, 0))  # as if it had been some seconds ago
+    assert left.name.startswith(".town.partial-")
     done = call(*SIMULATE, "dataset.hours=0.02")
     assert done.code == 0, done.err
     assert len(validate_dataset(tmp_path / "made" / "town")) == 2
@@ -92,15 +85,8 @@ def test_ingest(town, tmp_path):
         (tmp_path / "logs" / f"drive-{k}").mkdir(parents=True)
         for kind in ("imu", "gnss"):
             os.link(tmp_path / f"{kind}.csv", tmp_path / "logs" / f"drive-{k}" / f"{kind}.csv")
-    code = stopped(
-        tmp_path,
-        "made/.town.partial*/imu/*",
-        signal.SIGINT,
-        "ingest",
-        "reader=csv",
-        "source=logs",
-        "out=made/town",
-    )
+    process = start_command(tmp_path, said := tmp_path / "said", "ingest", "reader=csv", "source=logs", "out=made/town")
+    code = stopped(tmp_path, "made/.town.partial*/imu/*", signal.SIGINT, process, said)
     assert code == 130
     assert list((tmp_path / "made").iterdir()) == []
 
@@ -108,16 +94,20 @@ def test_ingest(town, tmp_path):
 TRAIN = (
     "train", "name=town", "data=drives", "data.datasets=[town]", "data.batch_size=2", "data.length_s=20",
     "data.eval_length_s=24", "data.split=random", "model.network.lstm_hidden=4", "model.network.lstm_layers=1",
-    "model.network.dense=[4,4]", "baselines.tune=false", "baselines.models=[mbkf15]", "baselines.pieces=2",
+    "model.network.dense=[4,4]", "baselines.tune=false", "baselines.models=[mbkf15]", "baselines.segments=2",
     "trainer.max_epochs=100000", "trainer.accelerator=cpu", "scoring.outage={first_s:10,duration_s:10}",
 )  # fmt: skip
 
 
 def test_train(town, template, tmp_path):
-    """SIGTERM in the middle of the training: the exit code says so, and MLflow's run is no longer running."""
+    """SIGTERM in the middle of a training in an interpreter of its own: the exit code says so, and MLflow's run is no
+    longer running."""
     (tmp_path / "town").symlink_to(town)
     shutil.copy(template, tmp_path / "mlflow.db")
-    assert stopped(tmp_path, "outputs/train/town/*/last.ckpt", signal.SIGTERM, *TRAIN) == 143
+    with (said := tmp_path / "said").open("w") as says:
+        words = [sys.executable, "-m", f"dlkf.{TRAIN[0]}", *TRAIN[1:]]
+        process = subprocess.Popen(words, cwd=tmp_path, stdout=says, stderr=says)
+    assert stopped(tmp_path, "outputs/train/town/*/last.ckpt", signal.SIGTERM, process, said) == 143
     with closing(sqlite3.connect(tmp_path / "mlflow.db")) as store:
         assert store.execute("select status from runs").fetchall() == [("KILLED",)]
 
@@ -145,44 +135,87 @@ def test_an_interrupt_that_became_another_error_is_one(signal_, code, call, monk
     assert ended.code == code and "cannot be read" not in ended.err
 
 
-def test_what_a_kill_left_does_not_stand_in_the_way(tmp_path):
-    """Nobody cleans up after SIGKILL: the files that wait beside the folder's own are not a result."""
+def killed(program: str) -> None:
+    """Run a program that ends itself by SIGKILL."""
+    done = subprocess.run([sys.executable, "-c", f"import os, pathlib, signal\n{program}"], timeout=PATIENCE_S)
+    assert done.returncode == -signal.SIGKILL
+
+
+DIES = "os.kill(os.getpid(), signal.SIGKILL)"
+
+
+def two_files(program: str, out: Path) -> str:
+    """A program that puts two files into a folder by ``write_into``, of which ``program`` changes the means."""
+    writes = f"with write_into({str(out)!r}) as f:\n (f / 'a').write_text('new')\n (f / 'b').write_text('new')\n"
+    return f"from dlkf.base.files import write_into, replace_folder\n{program}\n{writes}"
+
+
+@pytest.mark.parametrize("at", ["in the block", "as it moves"])
+def test_what_a_kill_left_does_not_stand_in_the_way(at, tmp_path):
+    """Nobody cleans up after SIGKILL: none or all of the files are there, and the same command goes through at once."""
     out = tmp_path / "made"
-    killed = f"from dlkf.files import staged; import os, signal\nwith staged({str(out)!r}) as f:\n"
-    killed += " (f / 'report.html').write_text('half'); os.kill(os.getpid(), signal.SIGKILL)"
-    assert subprocess.run([sys.executable, "-c", killed], timeout=PATIENCE_S).returncode == -signal.SIGKILL
-    (left,) = out.iterdir()
-    os.utime(left, (0, 0))  # as if it had been some seconds ago
-    vacant(out, overwrite=False)
-    with staged(out) as folder:
+    moves = f"os.replace = pathlib.Path.rename = lambda *_: {DIES}"
+    killed(two_files(moves, out) if at == "as it moves" else two_files("", out) + f" {DIES}")
+    assert not out.exists() and len(list(tmp_path.iterdir())) == 1
+    require_empty(out, overwrite=False)
+    with write_into(out) as folder:
         (folder / "report.html").write_text("whole")
-    assert [p.name for p in out.iterdir()] == ["report.html"] and (out / "report.html").read_text() == "whole"
+    assert [p.name for p in tmp_path.iterdir()] == ["made"] and [p.name for p in out.iterdir()] == ["report.html"]
     with pytest.raises(InputError, match="exists already"):
-        vacant(out, overwrite=False)
+        require_empty(out, overwrite=False)
+
+
+def test_what_a_kill_left_in_a_folder_is_cleared(tmp_path):
+    """Where other things lie, files move one by one: the same command, with overwrite=true, makes it whole."""
+    (tmp_path / "other").write_text("stays")
+    killed(two_files("", tmp_path) + f" {DIES}")
+    assert len(list(tmp_path.iterdir())) == 2
+    with write_into(tmp_path) as folder:
+        (folder / "a").write_text("new")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "other"]
+
+
+def test_a_kill_between_two_renames_loses_nothing(tmp_path):
+    """The old dataset waits beside; whoever writes or reads there next puts it back."""
+    town = tmp_path / "town"
+    program = "import sys\nfrom dlkf.base.files import replace_folder\nrename = pathlib.Path.rename\n"
+    program += "def once(self, other):\n rename(self, other)\n " + DIES + "\n"
+    program += f"pathlib.Path.rename = once\nwith replace_folder({str(town)!r}) as f:\n (f / 'x').write_text('new')"
+    for reads in (False, True):
+        town.mkdir(exist_ok=True)
+        (town / "x").write_text("old")
+        killed(program)
+        assert not town.exists()
+        if reads:
+            with pytest.raises(InputError, match="is missing"):
+                read_drives(town)
+        else:
+            restore_folder(town)
+        assert (town / "x").read_text() == "old" and [p.name for p in tmp_path.iterdir()] == ["town"]
+    with replace_folder(town) as folder:
+        (folder / "x").write_text("new")
+    assert (town / "x").read_text() == "new" and [p.name for p in tmp_path.iterdir()] == ["town"]
 
 
 def test_what_another_machine_left_or_is_at_stays(tmp_path):
-    """Not every file system tells a machine of the locks of others."""
-    theirs = tmp_path / f"{PARTIAL}elsewhere-1234"
+    theirs = tmp_path / f"{PARTIAL}elsewhere-1234-5"
     theirs.mkdir()
-    os.utime(theirs, (0, 0))
-    with staged(tmp_path) as folder:
+    with write_into(tmp_path) as folder:
         (folder / "report.html").write_text("ours")
     assert sorted(p.name for p in tmp_path.iterdir()) == [theirs.name, "report.html"]
 
 
-def test_what_another_command_is_at_is_not_taken_for_dead(tmp_path):
-    """Two commands with one target at a time: neither clears the other's files away, however old they are."""
+def test_of_two_commands_with_one_folder_the_second_is_refused(tmp_path):
+    """Neither clears the other's files away, and what is there first stays."""
     target = tmp_path / "town"
-    alive = f"from dlkf.files import whole_folder\nwith whole_folder({str(target)!r}) as f:\n"
+    alive = f"from dlkf.base.files import replace_folder\nwith replace_folder({str(target)!r}) as f:\n"
     alive += " (f / 'imu').write_text('other'); print('there', flush=True); input()"
-    other = subprocess.Popen([sys.executable, "-c", alive], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    pipe = subprocess.PIPE
+    other = subprocess.Popen([sys.executable, "-c", alive], stdin=pipe, stdout=pipe, stderr=pipe, text=True)
     assert other.stdout is not None and other.stdout.readline() == "there\n"
-    for beside in tmp_path.iterdir():
-        os.utime(beside, (0, 0))
-    with whole_folder(target) as folder:
+    with replace_folder(target) as folder:
         (folder / "imu").write_text("this")
     assert (target / "imu").read_text() == "this"
-    other.communicate("\n", timeout=PATIENCE_S)
-    assert other.returncode == 0 and (target / "imu").read_text() == "other"
-    assert [p.name for p in tmp_path.iterdir()] == ["town"]
+    _, said = other.communicate("\n", timeout=PATIENCE_S)
+    assert other.returncode == 1 and "another command wrote there in the meantime" in said
+    assert (target / "imu").read_text() == "this" and [p.name for p in tmp_path.iterdir()] == ["town"]

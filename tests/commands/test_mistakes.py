@@ -9,7 +9,7 @@ import lightning as L
 import pytest
 import torch
 
-from dlkf.command.faults import fault
+from dlkf.command.faults import describe_fault
 from dlkf.onboard.carried import Layout
 from dlkf.tracking import runs
 from tests.commands.refusals import FAST, SCORED, SOLVED, TRAINED, is_refused
@@ -53,6 +53,9 @@ def test_an_older_result_is_not_written_over(command, copy, call, tmp_path):
         (OSError(28, "No space left on device", "/data/x"), "the disk is full"),
         (PermissionError(13, "Permission denied", "/data/x"), "/data/x: permission denied"),
         (OSError(30, "Read-only file system", "/data/x"), "read-only"),
+        (OSError(27, "File too large", "/data/x"), "larger than is allowed here"),
+        (MemoryError(), "the memory of this machine is full"),
+        (RuntimeError("linalg.cholesky: The input is not positive-definite"), "the filter diverged"),
         (RuntimeError("(sqlite3.OperationalError) database is locked"), "locked by another program"),
         (RuntimeError("attempt to write a readonly database"), "cannot be written"),
         (RuntimeError("file is not a database"), "damaged"),
@@ -69,9 +72,9 @@ def test_faults_of_the_machine_are_one_line(error, said):
         except Exception as inner:
             raise ValueError("Error in call to target") from inner
     except ValueError as outer:
-        line = fault(outer)
+        line = describe_fault(outer)
     assert line is not None and said in line and "\n" not in line
-    assert fault(ValueError("a fault of ours")) is None
+    assert describe_fault(ValueError("a fault of ours")) is None
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
@@ -81,7 +84,7 @@ def test_a_gpu_that_is_not_there_is_one_line(accelerator, said):
     settings = {"devices": 1, "logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
     with pytest.raises(Exception) as raised:
         L.Trainer(accelerator=accelerator, **settings)
-    line = fault(raised.value)
+    line = describe_fault(raised.value)
     assert line is not None and said in line and "\n" not in line
     assert L.Trainer(accelerator="auto", **settings).strategy.root_device.type == "cpu"
 
@@ -108,6 +111,7 @@ def test_without_a_c_compiler(command, arguments, copy, call, tmp_path, monkeypa
         assert (made / "drive.csv").is_file() and (made / "CMakeLists.txt").is_file()
 
 
+@pytest.mark.whole
 def test_what_was_said_lies_beside_the_report(copy, call, tmp_path):
     """The answer, the tables, the drives, as they stood on the screen."""
     for command in FAST:
@@ -117,6 +121,7 @@ def test_what_was_said_lies_beside_the_report(copy, call, tmp_path):
         assert len(said) > 3 and set(said) <= set(ended.out.splitlines())
 
 
+@pytest.mark.whole
 def test_a_point_that_fails_leaves_the_others(copy, call, tmp_path):
     """It is named, twice: when it fails and at the end; the others have their folders and the page beside them."""
     points = ("model=ins,mbkf99,mbkf15", "tracking.log=false")

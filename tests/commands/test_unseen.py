@@ -7,10 +7,11 @@ import shutil
 from pathlib import Path
 
 import pandas as pd
+import pytest
 import torch
 
 from dlkf.data.store import dataset_digest
-from dlkf.filters.card import recordings_seen, unheard_cars, unmet_imus
+from dlkf.filters.card import recordings_seen, slow_drives, unseen_imus
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.saved import save_filter
 
@@ -27,8 +28,8 @@ def test_recordings_count_by_name_or_digest_of_their_dataset():
 
 def test_an_imu_that_a_model_has_not_met_is_said_and_no_other():
     cards = {"mine": {"imus": ["consumer"]}, "plus": {"imus": []}, "mbkf15": {}}
-    assert unmet_imus(cards, ["consumer"]) == []
-    (line,) = unmet_imus(cards, ["consumer", "bmi270"])
+    assert unseen_imus(cards, ["consumer"]) == []
+    (line,) = unseen_imus(cards, ["consumer", "bmi270"])
     assert line.startswith("mine was trained on the IMU consumer and has not met bmi270")
 
 
@@ -37,17 +38,18 @@ def test_a_filter_that_listens_says_that_samples_are_too_slow_for_it():
         least_rate_hz = 50.0
 
     models = {"plus": Listening(), "mbkf15": object()}
-    assert unheard_cars(models, [50.0, 100.0, 49.9]) == []
-    (line,) = unheard_cars(models, [100.0, 10.01, 1.0])
-    assert line.startswith("plus hears the car through samples at 50 Hz or more and these drives have 1 to 10 Hz")
+    assert slow_drives(models, [50.0, 100.0, 49.9]) == []
+    (line,) = slow_drives(models, [100.0, 10.01, 1.0])
+    assert line.startswith("plus needs samples at 50 Hz or more and these drives have 1 to 10 Hz")
 
 
+@pytest.mark.whole
 def test_navigate_and_evaluate_say_so_of_a_file_and_of_a_rate(call, town, tmp_path):
     """The file's own rate counts, whatever the samples are brought to: what lies between them is not heard."""
     slow = Path(shutil.copytree(town, tmp_path / "slow"))
     table = pd.read_parquet(slow / "drives.parquet")
     table.assign(imu_rate_hz=10.0).to_parquet(slow / "drives.parquet", index=False)
-    said = "plus hears the car through samples at 50 Hz or more and these drives have 10 Hz"
+    said = "plus needs samples at 50 Hz or more and these drives have 10 Hz"
     drive = f"drives=[{table['drive'][0]}]"
     for k, (data, more, expected) in enumerate(((town, (), False), (slow, (), True), (town, ("rate_hz=10",), True))):
         done = call("navigate", "model=plus", f"dataset={data}", f"out=navigated{k}", drive, *more)
@@ -55,13 +57,14 @@ def test_navigate_and_evaluate_say_so_of_a_file_and_of_a_rate(call, town, tmp_pa
         assert "told no noise" not in done.out
     noise = ("imu=consumer", "tuning.gyro_noise=2.5")
     done = call("navigate", f"dataset={town}", "out=untold", drive, *noise)
-    assert done.code == 0 and f"plus is told no noise: {' '.join(noise)} changes nothing" in done.out, done
+    assert done.code == 0 and f"plus takes no noise: {' '.join(noise)} changes nothing" in done.out, done
     done = call("navigate", "model=mbkf15", f"dataset={town}", "out=told", drive, *noise)
     assert done.code == 0 and "told no noise" not in done.out, done
     done = call("evaluate", "model=[mbkf15,plus]", f"dataset={slow}", "out=scored", drive, *SCORING)
     assert done.code == 0 and said in " ".join(done.out.split()), done
 
 
+@pytest.mark.whole
 def test_evaluate_says_so_and_leaves_them_out(call, town, tmp_path):
     groups = list(pd.read_parquet(town / "drives.parquet")["group"])
     torch.manual_seed(0)

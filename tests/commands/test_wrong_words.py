@@ -85,8 +85,12 @@ OF_ALL_COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "a reference that nobody knows": ("evaluate", (*SCORED, "reference=best"), "reference=best is none of file"),
     "an outage of a word": ("evaluate", (*SCORED, "outage.first_s=soon"), "outage.first_s is 'soon'"),
     "a folder as store": ("evaluate", (*SCORED, "tracking.uri=runs"), "is a plain folder"),
-    "a piece longer than the drives": ("evaluate", (*SCORED, "mode=pieces", "length_s=1e4"), "no piece of 10000 s"),
-    "an outage longer than a piece": ("evaluate", (*SCORED, "length_s=30"), "after 40 s but pieces are 30 s"),
+    "a segment longer than the drives": (
+        "evaluate",
+        (*SCORED, "mode=segments", "length_s=1e4"),
+        "no segment of 10000 s",
+    ),
+    "an outage longer than a segment": ("evaluate", (*SCORED, "length_s=30"), "after 40 s but segments are 30 s"),
     "an outage after the end": (
         "evaluate",
         (*SCORED, "mode=drives", "outage.first_s=900", "outage.duration_s=20"),
@@ -164,7 +168,11 @@ OF_ALL_COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
         "minutes is 0",
     ),
     "factors in no rounds": ("tune", ("model=mbkf21", "dataset=town", "out=made", "rounds=0"), "rounds is 0, must be"),
-    "factors of no pieces": ("tune", ("model=mbkf21", "dataset=town", "out=made", "pieces=-2"), "pieces is -2, must"),
+    "factors of no segments": (
+        "tune",
+        ("model=mbkf21", "dataset=town", "out=made", "segments=-2"),
+        "segments is -2, must",
+    ),
     "a consistency of no drives": ("consistency", ("model=mbkf15", "out=made", "drives=0"), "drives is 0, must be"),
     "a consistency of no time": ("consistency", ("model=mbkf15", "out=made", "minutes=-1"), "minutes is -1, must be"),
     "noise in few minutes": (
@@ -176,13 +184,13 @@ OF_ALL_COMMANDS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "a page that nobody knows": ("navigate", (*SOLVED, "--cfg", "all_of_it"), "--cfg/-c: invalid choice"),
     "a store that nobody knows": ("evaluate", (*SCORED, "tracking.uri=ftp://x"), "no kind of MLflow store"),
     "a comparison of a number": ("compare", ("runs=5", "out=made"), "at least two"),
-    "a test longer than its pieces": (
+    "a test longer than its segments": (
         "train",
         (*TRAINED, "data.eval_length_s=60"),
-        "after 75 s but pieces are 60 s long; give a larger data.eval_length_s",
+        "after 75 s but segments are 60 s long; give a larger data.eval_length_s",
     ),
     "a split that nobody knows": ("tune", ("model=mbkf15", "dataset=town", "out=made", "split=foo"), "split=foo"),
-    "workers that nobody knows": ("simulate", ("out=made", "parallel=grid"), "no backend of joblib"),
+    "workers that nobody knows": ("simulate", ("out=made", "parallel=grid"), "must be a number of processes"),
     "a model of a number": ("evaluate", (*SCORED, "model=5"), "model is 5, must be a name or a list"),
     "a patient of a number": ("doctor", ("dataset=town", "drives=5"), "drives is 5, must be a name or a list"),
     "an experiment of several, one unknown": ("train", ("+experiment=[outage,nope]",), "'experiment/nope'"),

@@ -10,14 +10,15 @@ import pandas as pd
 import pytest
 import yaml
 
+from dlkf.base.errors import InputError
 from dlkf.data.intake import ingest_drives
-from dlkf.data.readers.auto import AutoReader, _velocities_beside, offer
-from dlkf.data.readers.frames import Table
+from dlkf.data.readers.auto import AutoReader, _velocities_beside
+from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.logs import LogReader
+from dlkf.data.readers.offers import offer
 from dlkf.data.readers.recognise import gnss_spec, imu_spec
 from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.tables import read_table
-from dlkf.errors import InputError
 from tests.cars import car
 from tests.data.logs.bags import _Bag, ros1, ros2, ros2_ublox
 from tests.data.logs.receivers import ubx_fixes
@@ -47,8 +48,15 @@ def test_logs_of_which_nothing_is_known(tmp_path, drive):
     _hidden(tmp_path / "logs" / "monday", drive)
     (got,) = AutoReader().read(tmp_path / "logs")
     found = "\n".join(got.notes)
-    for told in ("accel.unit=g", "gyro.unit=deg/s", "velocity.unit=km/h", "offset_s=", "axes={roll", "lever_arm_m"):
-        assert f"{told}" in found, told
+    for expected in (
+        "accel.unit=g",
+        "gyro.unit=deg/s",
+        "velocity.unit=km/h",
+        "offset_s=",
+        "axes={roll",
+        "lever_arm_m",
+    ):
+        assert f"{expected}" in found, expected
     assert "±" in found and got.name == "monday"
     # half a percent of an axis: 0.1° of pose; the rates' unit is exact
     for name in (*ACCEL, *GYRO):
@@ -64,37 +72,36 @@ def test_logs_of_which_nothing_is_known(tmp_path, drive):
 
 
 def _table(text, name="a.csv"):
-    return Table(pd.read_csv(io.StringIO(text)), Path(name))
+    return LogTable(pd.read_csv(io.StringIO(text)), Path(name))
 
 
 def test_a_receivers_table_with_km_h_in_its_names_and_words_for_its_quality():
-    spec = gnss_spec(
-        _table("time_ns,lat,lon,alt,speed_kmh,course,fix\n" + "1751760000000000000,50,8,9,36,0,RTK float\n" * 3)
-    )
+    rows = "1751760000000000000,50,8,9,36,0,RTK float\n" * 3
+    spec = gnss_spec(_table("time_ns,lat,lon,alt,speed_kmh,course,fix\n" + rows)).spec
     assert spec["velocity"] == {"columns": ["speed_kmh", "course"], "frame": "course"}
     assert spec["quality"] == {"column": "fix", "map": {"RTK float": 5}}
     odd = gnss_spec(_table("t,lat,lon,alt,fix\n1751760000,50,8,9,rather good\n1751760001,50,8,9,RTK\n"))
-    assert "quality" not in odd
+    assert "quality" not in odd.spec and "rather good" in odd.notes[0]
 
 
 def test_rows_of_imu_and_fixes_in_one_table():
     """Each kind by its own rows: their stamps, and columns that are empty for most."""
     fast = "".join(f"{0.01 * k:.2f},0,0,-9.8,0,0,0,,,\n" for k in range(40))
     both = _table("t,ax,ay,az,gx,gy,gz,lat,lon,alt\n" + fast + "0.20,,,,,,,50,8,90\n0.40,,,,,,,50,8,90\n")
-    assert imu_spec(both)["time"] == gnss_spec(both)["time"] == {"column": "t", "unit": "s"}
+    assert imu_spec(both).spec["time"] == gnss_spec(both).spec["time"] == {"column": "t", "unit": "s"}
 
 
 def test_stamps_under_a_name_of_their_own():
     """The only column that rises all the way; a count of the rows tells no time, and of two clocks none is chosen."""
     rows = [f"{4711000 + 10 * k},{k},{20 * k},0,0,-1,{k % 3},0,0\n" for k in range(40)]
-    table = _table("Zeit [ms],Nr,Odo,accX,accY,accZ,gyrX,gyrY,gyrZ\n" + "".join(rows))
+    table = _table("Stand [ms],Nr,Odo,accX,accY,accZ,gyrX,gyrY,gyrZ\n" + "".join(rows))
 
-    def without(*names: str) -> Table:
-        return Table(table.frame.drop(columns=list(names)), table.path)
+    def without(*names: str) -> LogTable:
+        return LogTable(table.frame.drop(columns=list(names)), table.path)
 
     spec = imu_spec(without("Odo"))
-    assert spec is not None and spec["time"] == {"column": "Zeit [ms]", "unit": "ms"}
-    assert imu_spec(without("Odo", "Zeit [ms]")) is None is imu_spec(table)
+    assert spec is not None and spec.spec["time"] == {"column": "Stand [ms]", "unit": "ms"}
+    assert imu_spec(without("Odo", "Stand [ms]")) is None is imu_spec(table)
 
 
 def test_a_log_at_rest_in_units_of_its_own(tmp_path):
@@ -114,7 +121,9 @@ def test_a_file_of_a_folder_says_what_is_missing(tmp_path):
     """A receiver's log without its IMU; the part of a bag stands for the whole, where there is one."""
     tables = car(6)
     ubx_fixes(tmp_path / "town.ubx", tables)
-    with pytest.raises(InputError, match=r"town.ubx: no IMU found in it; give the folder"):
+    with pytest.raises(
+        InputError, match=r"no IMU found in town.ubx \(ubx, no IMU \(has no IMU in ESF-RAW .*; give the folder"
+    ):
         list(AutoReader().read(tmp_path / "town.ubx"))
     (tmp_path / "lone.db3").touch()
     with pytest.raises(InputError, match="ros2 bag reindex"):
@@ -235,9 +244,9 @@ MISTAKES = {
 
 @pytest.mark.parametrize("case", MISTAKES)
 def test_mistakes(tmp_path, case):
-    spoil, told = MISTAKES[case]
+    spoil, expected = MISTAKES[case]
     _hidden(tmp_path / "a", car(20))
     spoil(tmp_path / "a")
-    with pytest.raises(InputError, match=told) as error:
+    with pytest.raises(InputError, match=expected) as error:
         list(AutoReader().read(tmp_path / "a"))
     assert "\n" not in str(error.value)

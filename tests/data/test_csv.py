@@ -10,12 +10,12 @@ import pytest
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from dlkf.data.intake import Intake, ingest_drives
+from dlkf.base.errors import InputError
+from dlkf.data.intake import IngestOptions, ingest_drives
 from dlkf.data.readers.logs import LogReader
 from dlkf.data.readers.units import rotation, seconds
 from dlkf.data.tables import read_drives, read_table
 from dlkf.data.validate import validate_dataset
-from dlkf.errors import InputError
 from tests.cars import car
 
 PLAIN = {
@@ -118,10 +118,7 @@ def test_an_odd_log_round_trips(tmp_path, tables):
     assert (row.name, row.group, row.lever_arm_b) == ("monday", "day-1", (1.0, 0.5, -1.2))
     back = {kind: read_table(tmp_path / "out", kind, "monday") for kind in ("imu", "gnss", "reference")}
     shift = 5.0  # counted from the whole second of the first IMU stamp
-    assert (
-        pd.read_parquet(tmp_path / "out" / "drives.parquet").time_zero_s[0]
-        == GPS_WEEK * 604_800 + TOW + shift
-    )
+    assert pd.read_parquet(tmp_path / "out" / "drives.parquet").time_zero_s[0] == GPS_WEEK * 604_800 + TOW + shift
     for name in imu:
         tolerance = 1e-9 if name == "t" else 1e-12
         np.testing.assert_allclose(back["imu"][name], imu[name], atol=tolerance, err_msg=name)
@@ -133,9 +130,7 @@ def test_an_odd_log_round_trips(tmp_path, tables):
         np.testing.assert_allclose(back["gnss"][name], expected, rtol=1e-12, atol=1e-12, err_msg=name)
     assert np.isnan(back["gnss"]["std_vel_n"]).all()
     assert back["gnss"]["quality"].tolist()[:6] == [4, 4, 4, 0, 5, 4]
-    np.testing.assert_allclose(
-        back["reference"]["t"], reference.t, atol=3e-7
-    )  # Unix seconds as floats: 2⁻²² s
+    np.testing.assert_allclose(back["reference"]["t"], reference.t, atol=3e-7)  # Unix seconds as floats: 2⁻²² s
     for name in ("vel_n", "vel_e", "vel_d", "roll", "pitch", "yaw"):
         np.testing.assert_allclose(back["reference"][name], reference[name], atol=1e-9, err_msg=name)
     assert np.flatnonzero(~back["reference"]["valid"]).tolist() == [7]
@@ -195,25 +190,25 @@ MISTAKES = {
 
 @pytest.mark.parametrize("path", MISTAKES)
 def test_mistakes_in_the_mapping(tmp_path, tables, path):
-    value, told = MISTAKES[path]
+    value, message = MISTAKES[path]
     _plain(tmp_path / "a", tables)
     with pytest.raises(InputError) as error:
         list(log_reader(**{path: value}).read(tmp_path / "a"))
-    assert told in str(error.value) and "\n" not in str(error.value)
+    assert message in str(error.value) and "\n" not in str(error.value)
 
 
 def test_mistakes_in_the_files(tmp_path, tables):
     _plain(tmp_path / "a", tables)
     path = tmp_path / "a" / "imu.csv"
     lines = path.read_text().splitlines()
-    for line, cells, told in (
+    for line, cells, message in (
         (41, "0.4,0,0,oops,0,0,-9.8", "line 42: column 'gyro_z' is 'oops', not a number"),
         (41, "0.4,0,0,,0,0,-9.8", "line 42: column 'gyro_z' is empty"),
         (41, "0.4,0,0,0,0,0,-9.8,7,7", "cannot be read as a table"),
         (41, "0.39,0,0,0,0,0,-9.8", "row 40: t = 0.390000 stands twice|row 40: t"),
     ):
         path.write_text("\n".join([*lines[:line], cells, *lines[line + 1 :]]))
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             ingest_drives(log_reader().read(tmp_path), tmp_path / "out")
         assert [p.name for p in tmp_path.iterdir()] == ["a"]  # whole or none
     path.write_text("")
@@ -237,7 +232,7 @@ def test_drives_are_split_at_gaps(tmp_path, tables):
     count = ingest_drives(
         log_reader().read(tmp_path / "logs"),
         tmp_path / "out",
-        Intake(split_gaps=True),
+        IngestOptions(split_gaps=True),
         progress=lambda taken, done: seen.extend(row["drive"] for row in taken.rows),
     )
     rows = validate_dataset(tmp_path / "out")
@@ -285,10 +280,10 @@ CLOCKS_OF_GNSS = {
 @pytest.mark.parametrize("case", CLOCKS_OF_GNSS)
 def test_gps_time_is_that_of_the_fixes_whatever_the_imu_counts(tmp_path, tables, case):
     """Stamps of the receiver + 37.5 s, and 200 ppm more from the first on, are those of an IMU that counts from 0."""
-    base, told, known = CLOCKS_OF_GNSS[case]
+    base, message, known = CLOCKS_OF_GNSS[case]
     own = tables["gnss"].t / (1 + 2e-4)
     _plain(tmp_path / "a", {**tables, "gnss": tables["gnss"].assign(t=base - 37.5 + own)})
-    time = {"column": "t", **told, "offset_s": 37.5, "drift_ppm": 200.0}
+    time = {"column": "t", **message, "offset_s": 37.5, "drift_ppm": 200.0}
     probe = log_reader(gnss__time={**time, "offset_s": 0.0}, time_zero="keep")
     (drive,) = probe.read(tmp_path / "a")
     offset = -float(drive.gnss.t.iloc[0])

@@ -7,11 +7,11 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from dlkf.classes import made
-from dlkf.command.composing import composed
+from dlkf.base.classes import instantiate
+from dlkf.base.errors import InputError
+from dlkf.command.composing import compose_command
 from dlkf.data.datamodule import DriveDataModule
-from dlkf.data.masks import BiasLaw, Outage, withhold, within
-from dlkf.errors import InputError
+from dlkf.data.masks import BiasLaw, Outage, outage_within, withhold_fixes
 from tests.cars import REAL, write_cars
 
 
@@ -27,9 +27,11 @@ def test_no_group_is_on_two_sides(tmp_path):
         groups = {side: {d.group for d in data.drives(side)} for side in ("train", "val", "test")}
         assert all(groups.values()) and sum(len(g) for g in groups.values()) == 5
         assert sum(row["drives"] for row in data.summary()) == 12
-        pieces = {side: {p.drive for p in data.pieces(side)} for side in ("val", "test")}
-        trained = {p.drive for batch in data.train_pieces(0) for p in batch}
-        assert not trained & pieces["val"] and not trained & pieces["test"] and not pieces["val"] & pieces["test"]
+        segments = {side: {p.drive for p in data.segments(side)} for side in ("val", "test")}
+        trained = {p.drive for batch in data.train_segments(0) for p in batch}
+        assert (
+            not trained & segments["val"] and not trained & segments["test"] and not segments["val"] & segments["test"]
+        )
 
 
 def test_the_same_recording_in_two_datasets_stays_on_one_side(town, tmp_path):
@@ -46,51 +48,51 @@ def test_named_groups_and_their_mistakes(town):
     assert [len(data.drives(s)) for s in ("train", "val", "test")] == [3, 1, 2]
     everything = _module(town, split={"test": "all"})
     assert len(everything.drives("test")) == 6 and everything.val_dataloader() == []
-    for split, told in (
+    for split, expected in (
         ({"train": ["day-9"]}, "split.train: no group day-9; has day-0"),
         ({"train": "rest", "test": "all"}, "on one side only"),
         ({"learn": ["day-1"]}, "unknown side learn"),
         ("by_hand", "split=by_hand"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=expected):
             _module(town, split=split).setup()
     with pytest.raises(InputError, match="needs a group for each of train, val, test, but there are only 1"):
         _module(write_cars(town.parent / "single", 1, seconds=20)).setup()
     with pytest.raises(InputError, match="fractions"):
         _module(town, fractions=(0.5, 0.1, 0.1)).setup()
-    with pytest.raises(InputError, match="no training piece of 90 s"):
-        _module(town, length_s=90).train_pieces(0)
+    with pytest.raises(InputError, match="no training segment of 90 s"):
+        _module(town, length_s=90).train_segments(0)
 
 
 def test_the_papers_split_shuffles_blocks(town):
     data = _module(town, split="random", fractions=(0.5, 0.25, 0.25))
-    assert [row["pieces"] for row in data.summary()] == [9, 5, 4]
+    assert [row["segments"] for row in data.summary()] == [9, 5, 4]
     assert [row["minutes"] for row in data.summary()] == pytest.approx([3.0, 1.7, 1.3], abs=0.05)
     used = {side: set() for side in ("train", "val", "test")}
     for side in ("val", "test"):
-        used[side] = {(p.drive, p.first + k) for p in data.pieces(side) for k in range(p.epochs)}
+        used[side] = {(p.drive, p.first + k) for p in data.segments(side) for k in range(p.epochs)}
     for epoch in range(5):
-        pieces = [p for batch in data.train_pieces(epoch) for p in batch]
-        used["train"] |= {(p.drive, p.first + k) for p in pieces for k in range(p.epochs)}
+        segments = [p for batch in data.train_segments(epoch) for p in batch]
+        used["train"] |= {(p.drive, p.first + k) for p in segments for k in range(p.epochs)}
     assert not used["train"] & used["val"] and not used["train"] & used["test"]
 
 
 def test_an_epoch_covers_the_training_time_once_from_random_starts(town):
     data = _module(town, split={"train": "all"})
-    first = [[p for b in data.train_pieces(e) for p in b] for e in range(30)]
-    assert {len(pieces) for pieces in first} == {36}  # 6 drives · 60 s / 10 s
-    assert len({tuple(pieces) for pieces in first}) == 30
-    starts = {(p.drive, p.first) for pieces in first for p in pieces}
+    first = [[p for b in data.train_segments(e) for p in b] for e in range(30)]
+    assert {len(segments) for segments in first} == {36}  # 6 drives · 60 s / 10 s
+    assert len({tuple(segments) for segments in first}) == 30
+    starts = {(p.drive, p.first) for segments in first for p in segments}
     assert len(starts) > 0.9 * 6 * 51  # nearly every possible start has come up
     data.length_law = lambda epoch: 10.0 + 10 * epoch
-    assert {p.epochs for b in data.train_pieces(2) for p in b} == {30}
+    assert {p.epochs for b in data.train_segments(2) for p in b} == {30}
 
 
 def test_batches_depend_on_seed_epoch_and_step_alone(town):
     a, b = _module(town, turn_frames=True, injected_bias=BiasLaw(0.1, 0.3)), _module(
         town, turn_frames=True, injected_bias=BiasLaw(0.1, 0.3)
     )  # fmt: skip
-    b.train_batch(0, 0), b.train_pieces(7)
+    b.train_batch(0, 0), b.train_segments(7)
     for epoch, step in ((0, 2), (3, 0)):
         x, y = a.train_batch(epoch, step), b.train_batch(epoch, step)
         assert torch.equal(x.imu, y.imu) and torch.equal(x.start.C_nb, y.start.C_nb) and x.drive == y.drive
@@ -98,8 +100,8 @@ def test_batches_depend_on_seed_epoch_and_step_alone(town):
 
 
 @pytest.mark.parametrize("processes", [2, 3])
-def test_processes_share_the_scoring_pieces(town, processes):
-    """Every piece once, in as many batches for every process: they wait for each other after each."""
+def test_processes_share_the_scoring_segments(town, processes):
+    """Every segment once, in as many batches for every process: they wait for each other after each."""
     data = _module(town, eval_stride_s=10)
     shares = [data.batches("test", share=(k, processes)) for k in range(processes)]
     assert len({len(batches) for batches in shares}) == 1
@@ -116,7 +118,7 @@ def test_scoring_batches_are_fixed(town):
     one, two = data.batches("test"), _module(town, eval_outage=Outage(5, 10), eval_stride_s=10).batches("test")
     assert all(torch.equal(x.start.p_n, y.start.p_n) for x, y in zip(one, two))
     plain = _module(town, eval_stride_s=10).batches("test")
-    assert torch.equal(withhold(plain[0], within(plain[0], 5, 10)).available, one[0].available)
+    assert torch.equal(withhold_fixes(plain[0], outage_within(plain[0], 5, 10)).available, one[0].available)
     assert (~one[0].available).sum(1).unique().tolist() == [10]
     assert len(data.describe().splitlines()) == 4
 
@@ -128,7 +130,7 @@ def test_drives_too_short_for_their_side_are_named(town):
     (line,) = data.left_out(1e4)
     train = [d.name for d in data.drives("train")]
     assert line.startswith(f"{len(train)} of {len(train)} drives, too short") and "a shorter data.length_s" in line
-    assert "train piece of 10000 s: " + ", ".join(train[:4]) in line
+    assert "train segment of 10000 s: " + ", ".join(train[:4]) in line
 
 
 class _Recorder(L.LightningModule):
@@ -180,13 +182,13 @@ def test_the_config_makes_a_module(town):
         "data.injected_bias={accel_mps2:0.1,gyro_dps:0.3}",
         "data.eval_length_s=20",
     ]
-    values = composed("train", *overrides)["data"]
-    data = made(values, "data")
+    values = compose_command("train", *overrides)["data"]
+    data = instantiate(values, "data", ("setup", "describe"))
     assert data.eval_outage == Outage(10.0, 5.0) and data.injected_bias == BiasLaw(0.1, 0.3)
     assert [row["drives"] for row in data.summary()] == [4, 1, 1]
     assert data.train_batch(0, 0).size == (24, 10, 50) and data.start.yaw_deg == 10
     with pytest.raises(InputError, match=r"data\.injected_bias: unknown key gyro"):
-        made({**values, "injected_bias": {"gyro": 1.0}}, "data")
+        instantiate({**values, "injected_bias": {"gyro": 1.0}}, "data", ("setup", "describe"))
 
 
 def test_real_drives_load():

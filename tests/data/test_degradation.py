@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from dlkf.base.errors import InputError
 from dlkf.data.degradation import GnssNoise
 from dlkf.data.store import load_dataset
-from dlkf.errors import InputError
 from tests.cars import write_cars
 
 

@@ -10,13 +10,14 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import find_lag, known_offset
 from dlkf.data.discovery.drift import ends_apart, ends_std, find_drifting_pose, middle
 from dlkf.data.discovery.motion import levelled, motion, position_delay
 from dlkf.data.discovery.orientation import find_pose
 from dlkf.data.discovery.units import accel_units, nearest_unit, time_unit, unit_left
 from dlkf.data.intake import ingest_drives
-from dlkf.data.plausibility import check_clocks, turned_told
+from dlkf.data.plausibility import check_clocks, describe_rotation
 from dlkf.data.readers import units
 from dlkf.data.readers.auto import AutoReader
 from dlkf.data.readers.frames import DriveFrames
@@ -25,7 +26,6 @@ from dlkf.data.readers.units import rotation
 from dlkf.data.schema import ACCEL, GYRO, VELOCITY
 from dlkf.data.tables import read_drives
 from dlkf.diagnosis.checkup import checkup
-from dlkf.errors import InputError
 from tests.cars import car
 
 TURN = Rotation.from_euler("ZYX", [130.0, -35.0, 70.0], degrees=True).as_matrix()  # car → sensor
@@ -79,6 +79,7 @@ def test_any_pose_and_unit(drive):
 
 
 @pytest.mark.parametrize("decades_s", [0.0, -1.457507878e9])  # a counter that began today, beside GPS time
+@pytest.mark.whole
 def test_clocks_that_drift_apart(drive, decades_s):
     """1000 ppm over three minutes are 0.18 s; with perfect sensors they are seen to some ppm, and none where none are.
 
@@ -94,6 +95,7 @@ def test_clocks_that_drift_apart(drive, decades_s):
         assert abs(pose.lag_s - lag_s) < 2e-3
 
 
+@pytest.mark.whole
 def test_a_drift_is_found_or_refused(tmp_path, drive):
     """A reader that may find it writes it down, and reads with it; one that may not says it in one line."""
     for kind, factor in (("imu", 1.001), ("gnss", 1.0)):
@@ -137,13 +139,13 @@ def test_what_is_not_known_of_a_drift_grows_to_the_ends(drive):
 
 def test_a_small_drift_is_told_with_its_remedy(tmp_path, streets):
     """0.2 % over three minutes are 0.36 s: taken in, with a line; 200 ppm, 0.04 s, are no line's worth."""
-    for factor, told in ((1.002, True), (1.0002, False)):
+    for factor, expected in ((1.002, True), (1.0002, False)):
         folder = tmp_path / f"x{factor}"
         imu = streets["imu"].assign(t=factor * streets["imu"].t)
         frames = DriveFrames({"drive": "a", "group": "a"}, imu, streets["gnss"])
         taken = []
         ingest_drives([frames], folder, progress=lambda one, _, into=taken: into.append(one))
-        assert bool(taken[0].notes) == told
+        assert bool(taken[0].notes) == expected
     (row,) = read_drives(tmp_path / "x1.002")
     (seen,) = [seen for seen in checkup(tmp_path / "x1.002", row) if "ppm" in seen.text]
     assert seen.grade == "note" and "drift_ppm=auto" in seen.text
@@ -237,13 +239,13 @@ def test_units_by_size():
     assert time_unit(10.0 * np.arange(9), 0.21, 2e-4) == "ms"
     assert "leap seconds" in known_offset(18.1) and "3 GPS weeks" in known_offset(3 * 604_800.0)
     assert "time zone of +2 h" in known_offset(7200.0) and known_offset(-63.0) == ""
-    assert "tells no date" in known_offset(-1_421_625_596.8) and known_offset(20 * 3600.0) == ""
+    assert "has no date" in known_offset(-1_421_625_596.8) and known_offset(20 * 3600.0) == ""
 
 
 def test_a_sensor_that_seems_turned_gets_a_line(streets):
     """By 75° about the vertical; the line asks for less than the check that refuses, none as the drive is."""
     imu, gnss = ({k: v.to_numpy() for k, v in streets[kind].items()} for kind in ("imu", "gnss"))
-    assert turned_told(imu, gnss) is None
+    assert describe_rotation(imu, gnss) is None
     turn = Rotation.from_euler("Z", 75.0, degrees=True).as_matrix()
     turned = {**imu, **dict(zip(ACCEL, turn @ np.stack([imu[c] for c in ACCEL])))}
-    assert "turned by" in (turned_told(turned, gnss) or "")
+    assert "turned by" in (describe_rotation(turned, gnss) or "")

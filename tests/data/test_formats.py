@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from hydra.utils import get_class
 
-from dlkf.command.composing import composed
+from dlkf.base.errors import InputError
+from dlkf.command.composing import compose_command
 from dlkf.data.intake import ingest_drives
 from dlkf.data.readers.formats import novatel
 from dlkf.data.readers.frames import DriveFrames
 from dlkf.data.readers.units import WEEK_S
 from dlkf.data.summary import drive_line
-from dlkf.errors import InputError
 from tests.cars import car
 from tests.data import logs
 
@@ -79,7 +79,7 @@ def drive():
 def read(folder, overrides: list[str]) -> list[DriveFrames]:
     """The drives of a folder, by overrides as on the command line."""
     own = [f"++{o}" if o.startswith("reader.") else o for o in overrides]
-    settings = composed("ingest", *own)["reader"]
+    settings = compose_command("ingest", *own)["reader"]
     return list(get_class(settings.pop("_target_"))(**settings).read(folder))
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dlkf.data.increments import merged, two_sample
-from dlkf.data.resampling import Grid, resample_imu
+from dlkf.data.increments import merge_increments, two_sample
+from dlkf.data.resampling import SampleGrid, resample_imu
 from dlkf.data.schema import ACCEL, GYRO
 
 SECONDS = 20
@@ -36,7 +36,7 @@ def _plain(imu: dict, rate: int, native: int) -> np.ndarray:
 
 
 def _loaded(imu: dict, rate: int) -> np.ndarray:
-    return resample_imu(imu, Grid(0.0, 1.0, SECONDS, rate)).reshape(-1, 6)
+    return resample_imu(imu, SampleGrid(0.0, 1.0, SECONDS, rate)).reshape(-1, 6)
 
 
 def _residuals(wh: float) -> tuple[float, float]:
@@ -102,13 +102,13 @@ def test_a_lower_rate_drifts_no_more_than_the_native_one(native):
 def test_merging_is_exact_to_second_order():
     """Halving the turns and pushes leaves an eighth of the error; of plain sums a quarter."""
     rng = np.random.default_rng(0)
-    pieces = np.concatenate((rng.standard_normal((3, 40)), 0.1 * rng.standard_normal((3, 40))))
+    segments = np.concatenate((rng.standard_normal((3, 40)), 0.1 * rng.standard_normal((3, 40))))
     first = np.array([0, 4, 5, 12, 20, 33])
     last = np.append(first[1:], 40)
     errors = []
     for scale in (1.0, 0.5):
-        part = scale * pieces
-        whole, sums = merged(part, first), np.add.reduceat(part, first, axis=1)
+        part = scale * segments
+        whole, sums = merge_increments(part, first), np.add.reduceat(part, first, axis=1)
         for one in (whole, sums):
             worst = np.zeros(2)
             for j, (i, k) in enumerate(zip(first, last)):
@@ -119,8 +119,8 @@ def test_merging_is_exact_to_second_order():
     ours, plain, ours_halved, plain_halved = errors
     np.testing.assert_allclose(ours_halved / ours, 1 / 8, rtol=0.15)
     np.testing.assert_allclose(plain_halved / plain, 1 / 4, rtol=0.15)
-    single = merged(pieces, np.arange(40))
-    np.testing.assert_allclose(single, pieces, rtol=0, atol=1e-14)
+    single = merge_increments(segments, np.arange(40))
+    np.testing.assert_allclose(single, segments, rtol=0, atol=1e-14)
 
 
 def test_uneven_steps_and_gaps():
@@ -143,7 +143,7 @@ def test_noise_is_not_amplified():
     mean = np.array([1.0, 3.0, -9.8, 0.1, -0.1, 0.5])
     noise = np.concatenate((0.025 * rng.standard_normal((n, 3)), 9e-4 * rng.standard_normal((n, 3))), -1)
     imu = {"t": np.arange(1, n + 1) / rate, **dict(zip((*ACCEL, *GYRO), (mean + noise).T))}
-    ours = resample_imu(imu, Grid(0.0, 1.0, n // rate, 50)).reshape(-1, 6)
+    ours = resample_imu(imu, SampleGrid(0.0, 1.0, n // rate, 50)).reshape(-1, 6)
     averages = (mean + noise).reshape(-1, 2, 6).mean(1)
     np.testing.assert_allclose(ours.std(0) / averages.std(0), 1, atol=1e-3)
     # over a second it adds half a hundredth of the random walk at most, in quadrature

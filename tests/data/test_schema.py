@@ -7,9 +7,9 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
+from dlkf.base.errors import InputError
 from dlkf.data.schema import SCHEMAS, drive_file, new_dataset, write_drive, write_drives_table
 from dlkf.data.tables import dataset_digest, read_drives, read_table
-from dlkf.errors import InputError
 
 
 def test_tables_come_back_with_the_contracts_columns_and_types(tmp_path, tables):
@@ -35,9 +35,7 @@ def test_other_engines_read_the_dataset_as_it_is(town):
     import pyarrow.dataset as ds
 
     imu = ds.dataset(town / "imu", partitioning="hive").to_table(columns=["drive", "t"])
-    assert imu.num_rows == 6 * 6000 and set(imu["drive"].unique().to_pylist()) == {
-        f"car-{k}" for k in range(6)
-    }
+    assert imu.num_rows == 6 * 6000 and set(imu["drive"].unique().to_pylist()) == {f"car-{k}" for k in range(6)}
 
 
 def test_a_missing_column_is_named(tmp_path, tables):

@@ -1,4 +1,4 @@
-"""Pieces cut by one gather are what cutting by hand gives."""
+"""Segments cut by one gather are what cutting by hand gives."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 import torch
 
+from dlkf.base.errors import InputError
 from dlkf.data.augmentation import turn_frames
-from dlkf.data.masks import BiasLaw, with_bias, withhold, within
+from dlkf.data.masks import BiasLaw, add_bias, outage_within, withhold_fixes
 from dlkf.data.segments import (
-    Piece,
+    Segment,
     StartLaw,
-    cut_pieces,
+    cut_segments,
     make_batch,
     whole_drives,
 )
 from dlkf.data.stack import DriveStack
 from dlkf.data.store import load_dataset
-from dlkf.errors import InputError
 from dlkf.navigation.attitude import vector_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, tangent_frame
 from dlkf.navigation.state import NavState
@@ -44,12 +44,12 @@ def _masked(drive, **rows):
     return replace(drive, **changed)
 
 
-def test_a_piece_is_the_drives_own_rows_in_its_tangent_frame(drives):
-    pieces = [Piece(2, 10, 20), Piece(0, 40, 20), Piece(5, 0, 20)]
-    batch = make_batch(drives, pieces, dtype=torch.float64, start=EXACT)
+def test_a_segment_is_the_drives_own_rows_in_its_tangent_frame(drives):
+    segments = [Segment(2, 10, 20), Segment(0, 40, 20), Segment(5, 0, 20)]
+    batch = make_batch(drives, segments, dtype=torch.float64, start=EXACT)
     assert batch.size == (3, 20, 50) and batch.dt == 0.02 and batch.drive == ("car-2", "car-0", "car-5")
     assert batch.t_start.tolist() == [10.0, 40.0, 0.0]
-    for i, (d, first, epochs) in enumerate(pieces):
+    for i, (d, first, epochs) in enumerate(segments):
         drive, rows = drives[d], slice(first + 1, first + 1 + epochs)
         assert torch.equal(batch.imu[i], drive.imu[first : first + epochs])
         C_ne, r0 = batch.frame.C_en[i].T, drive.ref_r_e[first]
@@ -67,7 +67,7 @@ def test_a_piece_is_the_drives_own_rows_in_its_tangent_frame(drives):
 
 def test_strapdown_from_the_exact_start_follows_the_truth(drives):
     """A perfect IMU over 20 s: averaging to 50 Hz leaves ω f' dt²/12 = 3e-6 m/s² of sculling, 0.6 mm."""
-    batch = make_batch(drives, [Piece(0, 5, 20)], dtype=torch.float64, start=EXACT)
+    batch = make_batch(drives, [Segment(0, 5, 20)], dtype=torch.float64, start=EXACT)
     state = batch.start
     for t in range(20):
         state = strapdown(state, batch.imu[:, t], batch.dt, batch.frame).end
@@ -77,10 +77,10 @@ def test_strapdown_from_the_exact_start_follows_the_truth(drives):
 
 def test_start_errors_follow_the_law(drives):
     law = StartLaw(2.0, 0.2, 1.0, 5.0)
-    pieces = [Piece(0, k % 30, 5) for k in range(4000)]
+    segments = [Segment(0, k % 30, 5) for k in range(4000)]
     g = torch.Generator().manual_seed(3)
-    batch = make_batch(DriveStack(drives), pieces, dtype=torch.float64, start=law, generator=g)
-    exact = make_batch(drives, pieces, dtype=torch.float64, start=EXACT)
+    batch = make_batch(DriveStack(drives), segments, dtype=torch.float64, start=law, generator=g)
+    exact = make_batch(drives, segments, dtype=torch.float64, start=EXACT)
     dx = batch.start.error_to(exact.start)  # truth ⊖ start, what a filter has to find
     expected = law.std
     assert torch.allclose(batch.start_std[0], expected)
@@ -88,32 +88,32 @@ def test_start_errors_follow_the_law(drives):
     assert ((dx.std(0) / expected - 1).abs() < 0.05).all() and ((dx.mean(0) / expected).abs() < 0.07).all()
 
 
-def test_pieces_lie_where_the_reference_is_valid(drives):
+def test_segments_lie_where_the_reference_is_valid(drives):
     holes = _masked(drives[0], ref_valid=([20, 21, 40], False))
-    rows = [(p.first, p.first + p.epochs) for p in cut_pieces([holes], 10)]
+    rows = [(p.first, p.first + p.epochs) for p in cut_segments([holes], 10)]
     assert rows == [(0, 10), (22, 32), (41, 51)]
-    assert [p.first for p in cut_pieces([holes], 10, 5)] == [0, 5, 22, 27, 41, 46]
-    loose = cut_pieces([holes], 30, min_valid=0.9)
+    assert [p.first for p in cut_segments([holes], 10, 5)] == [0, 5, 22, 27, 41, 46]
+    loose = cut_segments([holes], 30, min_valid=0.9)
     assert [p.first for p in loose] == [0, 30]
-    assert not cut_pieces([holes], 61) and len(cut_pieces(drives, 60)) == 6
-    with pytest.raises(InputError, match="no pieces"):
+    assert not cut_segments([holes], 61) and len(cut_segments(drives, 60)) == 6
+    with pytest.raises(InputError, match="no segments"):
         make_batch(drives, [])
     with pytest.raises(InputError, match="beyond its drive"):
-        make_batch(drives, [Piece(0, 55, 10)])
+        make_batch(drives, [Segment(0, 55, 10)])
 
 
 def test_without_true_attitude_the_start_comes_from_imu_and_gnss(drives):
     blind = _masked(drives[0], ref_C_eb=(slice(None), torch.nan))
-    batch = make_batch([blind], [Piece(0, 10, 20)], dtype=torch.float64, start=StartLaw(0.0, 0.0, 9.0, 9.0))
-    truth = make_batch(drives, [Piece(0, 10, 20)], dtype=torch.float64, start=EXACT)
+    batch = make_batch([blind], [Segment(0, 10, 20)], dtype=torch.float64, start=StartLaw(0.0, 0.0, 9.0, 9.0))
+    truth = make_batch(drives, [Segment(0, 10, 20)], dtype=torch.float64, start=EXACT)
     error = vector_from_rotation(truth.start.C_nb @ batch.start.C_nb.mT)
     assert error.norm() < np.radians(0.5) and not batch.attitude_valid.any() and batch.truth_valid.all()
     assert torch.allclose(batch.start.v_n, truth.start.v_n)  # position and velocity from the reference
     assert (batch.start_std[0, 6:] < np.radians(4)).all() and not batch.truth.C_nb.isfinite().any()
     stopped = _masked(blind, gnss_v_e=(slice(None), 0.0))
-    assert not cut_pieces([stopped], 20)
+    assert not cut_segments([stopped], 20)
     with pytest.raises(InputError, match=r"drive car-0: no start state at t = 10\.0"):
-        make_batch([stopped], [Piece(0, 10, 20)])
+        make_batch([stopped], [Segment(0, 10, 20)])
 
 
 def test_whole_drives_are_padded(drives):
@@ -141,31 +141,25 @@ def test_whole_drives_are_padded(drives):
 
 
 def test_masks(drives):
-    batch = make_batch(drives, [Piece(0, 0, 30)])
-    out = withhold(batch, within(batch, 10, 15))
-    assert torch.nonzero(~out.available[0]).flatten().tolist() == list(
-        range(10, 25)
-    )  # ends of epochs 11 … 25 s
+    batch = make_batch(drives, [Segment(0, 0, 30)])
+    out = withhold_fixes(batch, outage_within(batch, 10, 15))
+    assert torch.nonzero(~out.available[0]).flatten().tolist() == list(range(10, 25))  # ends of epochs 11 … 25 s
     assert batch.available.all()
 
 
-def test_turned_frames_are_the_same_piece(drives):
+def test_turned_frames_are_the_same_segment(drives):
     """Strapdown in the turned frame ends at the same place: Earth rotation and gravity turn too."""
-    plain = make_batch(drives, [Piece(0, 0, 30), Piece(1, 7, 30)], dtype=torch.float64, start=EXACT)
+    plain = make_batch(drives, [Segment(0, 0, 30), Segment(1, 7, 30)], dtype=torch.float64, start=EXACT)
     turned = turn_frames(plain, torch.Generator().manual_seed(0))
     assert not torch.allclose(turned.start.v_n, plain.start.v_n)
-    assert torch.allclose(
-        turned.frame.earth_rate_n.norm(dim=-1), torch.tensor(EARTH_RATE, dtype=torch.float64)
-    )
+    assert torch.allclose(turned.frame.earth_rate_n.norm(dim=-1), torch.tensor(EARTH_RATE, dtype=torch.float64))
     ends = []
     for batch in (plain, turned):
         state = batch.start
         for t in range(30):
             state = strapdown(state, batch.imu[:, t], batch.dt, batch.frame).end
         ends.append((batch.frame.to_ecef(state.p_n), batch.frame.C_en @ state.C_nb))
-    assert torch.allclose(ends[0][0], ends[1][0], atol=1e-6) and torch.allclose(
-        ends[0][1], ends[1][1], atol=1e-9
-    )
+    assert torch.allclose(ends[0][0], ends[1][0], atol=1e-6) and torch.allclose(ends[0][1], ends[1][1], atol=1e-9)
     for a, b in ((plain.truth.p_n, turned.truth.p_n), (plain.gnss[..., :3], turned.gnss[..., :3])):
         assert torch.allclose(plain.frame.to_ecef(a), turned.frame.to_ecef(b), atol=1e-8)
     assert torch.allclose(plain.gnss_std, turned.gnss_std)  # equal in North and East here
@@ -173,9 +167,9 @@ def test_turned_frames_are_the_same_piece(drives):
 
 def test_injected_bias_is_in_the_imu_and_in_the_truth(drives):
     known = _masked(drives[0], ref_imu_error=(slice(None), 0.5))
-    batch = make_batch([known], [Piece(0, 0, 20)] * 500, dtype=torch.float64)
+    batch = make_batch([known], [Segment(0, 0, 20)] * 500, dtype=torch.float64)
     noise = torch.randn(500, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    biased = with_bias(batch, BiasLaw(accel_mps2=0.1, gyro_dps=0.3).std * noise)
+    biased = add_bias(batch, BiasLaw(accel_mps2=0.1, gyro_dps=0.3).std * noise)
     bias = biased.imu[:, 0, 0] - batch.imu[:, 0, 0]
     assert torch.allclose(biased.imu - batch.imu, bias[:, None, None].expand_as(batch.imu))
     assert torch.allclose(biased.true_imu_error, 0.5 + bias[:, None].expand(-1, 20, 6))

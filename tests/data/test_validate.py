@@ -8,10 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from dlkf.base.errors import InputError
+from dlkf.data.plausibility import check_imu_units
 from dlkf.data.schema import drive_file, write_drive, write_drives_table
 from dlkf.data.store import load_dataset
-from dlkf.data.validate import Limits, validate_dataset
-from dlkf.errors import InputError
+from dlkf.data.validate import LIMITS, Limits, gap_rows, validate_dataset
 from tests.cars import REAL, Tables
 
 NAME = "town-7"
@@ -114,7 +115,7 @@ BAD = {
     "km/h": (_columns("gnss", _scale(["vel_n", "vel_e", "vel_d"], 3.6)), "km/h"),
     "velocities divided by 3.6": (_columns("gnss", _scale(["vel_n", "vel_e", "vel_d"], 1 / 3.6)), "divided by 3.6"),
     "no position yet": (_rows("gnss", _nowhere), "fix 0 is at 0°/0°, as 3 of .*reader.gnss.position.zero=none"),
-    "a jump": (_set("gnss", "lat_deg", _at(5, -40.0)), "fix 5 lies .* km from the rest"),
+    "jumps": (_set("gnss", "lat_deg", _at([5, 9, 13], -40.0)), "fix 5 lies .* km from the rest"),
     "leap seconds": (_set("gnss", "t", lambda t: t - 18), r"clocks of IMU and GNSS are 18.0 s apart.*offset_s=auto"),
     "turned right": (_rows("imu", _quarter), r"turned by \+90° .*reader.imu.accel.axes"),
     "another clock": (_set("gnss", "t", lambda t: t + 1e5), "same clock"),
@@ -126,13 +127,13 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_bad_numbers(tmp_path, tables, case):
-    change, told = BAD[case]
+    change, expected = BAD[case]
     _write(tmp_path, change(tables))
     text = _complaint(tmp_path)
     assert NAME in text
     import re
 
-    assert re.search(told, text), text
+    assert re.search(expected, text), text
 
 
 @pytest.mark.parametrize("kind", ["imu", "gnss", "reference"])
@@ -219,3 +220,32 @@ def test_real_drives_pass(name):
     if not (REAL / name).is_dir():
         pytest.skip("real drives are not here")
     assert validate_dataset(REAL / name)
+
+
+@pytest.mark.parametrize("n", [2, 3, 100, 101])
+def test_shortcuts_of_the_checks_say_what_medians_and_quantiles_say(n):
+    """Drives about the limits of force, tilt and rate: refused exactly where the median, or the quantile, is."""
+    rng = np.random.default_rng(n)
+    refused = 0
+    for force, tilt, rate in rng.uniform((6.5, 0.6, 1.0), (13.5, 1.0, 30.0), (200, 3)):
+        z = -force * tilt * rng.uniform(0.99, 1.01, n)
+        x = force * np.sqrt(1 - tilt**2) * rng.uniform(0.99, 1.01, n)
+        gyro = rng.uniform(0, rate, n)
+        zero = np.zeros(n)
+        imu = {"accel_x": x, "accel_y": zero, "accel_z": z, "gyro_x": gyro, "gyro_y": zero, "gyro_z": zero}
+        size = np.median(np.hypot(x, z))
+        good = 7 < size < 13 and np.median(z) <= -0.7 * size and np.quantile(gyro, 0.999) <= 20
+        refused += not good
+        if good:
+            check_imu_units(imu, "imu")
+        else:
+            with pytest.raises(InputError):
+                check_imu_units(imu, "imu")
+    assert 50 < refused < 190
+
+
+def test_gaps_are_found_where_a_step_is_long():
+    t = np.arange(0, 10, 0.01)
+    assert len(gap_rows(t, LIMITS)) == 0 and len(gap_rows(t[:1], LIMITS)) == 0
+    assert gap_rows(np.delete(t, slice(500, 530)), LIMITS).tolist() == [500]
+    assert len(gap_rows(np.arange(0.0, 10.0, 0.5), LIMITS)) == 0  # slow, without a gap

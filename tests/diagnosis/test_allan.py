@@ -11,11 +11,11 @@ import pandas as pd
 import pytest
 import yaml
 
-from dlkf.config import config_dir
+from dlkf.base.config import config_dir
+from dlkf.base.errors import InputError
 from dlkf.data.schema import ACCEL, GYRO, new_dataset, write_drive, write_drives_table
-from dlkf.diagnosis.allan import allan_variance, cluster_sizes, fit_noise, preset, preset_yaml
+from dlkf.diagnosis.allan import allan_variance, cluster_sizes, fit_noise, noise_preset, preset_yaml
 from dlkf.diagnosis.allan_report import analyse
-from dlkf.errors import InputError
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors, imu_spec
 from dlkf.simulation.imu import corrupt, draw_unit
 
@@ -48,7 +48,7 @@ def test_a_preset_is_recovered_from_six_hours_at_rest(name):
     put_in = spec_of(name)
     base = spec_of("automotive_mems")
     log = analyse("bench", at_rest(put_in, 6.0), RATE, base)
-    found = preset("bench", (log.fits["accel"], log.fits["gyro"]), base, "a test")
+    found = noise_preset("bench", (log.fits["accel"], log.fits["gyro"]), base, "a test")
     for a, b in ((found.accel, put_in.accel), (found.gyro, put_in.gyro)):
         assert a.noise_density == pytest.approx(b.noise_density, rel=0.01)
         assert math.sqrt(a.walk_psd) == pytest.approx(math.sqrt(b.walk_psd), rel=0.10)
@@ -89,8 +89,8 @@ def test_a_log_that_is_too_short_is_refused():
     log = analyse("bench", at_rest(base, 0.1), RATE, base)
     fits = (log.fits["accel"], log.fits["gyro"])
     with pytest.raises(InputError, match="too short for the in-run bias of the accelerometers"):
-        preset("bench", fits, base, "")
-    kept = preset("bench", fits, spec_of("bmi270"), "", in_run="keep")
+        noise_preset("bench", fits, base, "")
+    kept = noise_preset("bench", fits, spec_of("bmi270"), "", in_run="keep")
     assert kept.gyro.instability == spec_of("bmi270").gyro.instability
     assert kept.gyro.noise_density == pytest.approx(base.gyro.noise_density, rel=0.1)
 

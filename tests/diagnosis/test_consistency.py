@@ -11,11 +11,11 @@ import pytest
 import torch
 import yaml
 
-from dlkf.config import config_dir
-from dlkf.data.masks import withhold
+from dlkf.base.config import config_dir
+from dlkf.data.masks import withhold_fixes
 from dlkf.data.segments import StartLaw
-from dlkf.diagnosis.consistency import band, consistency, normalised_square
-from dlkf.diagnosis.matched_drives import MatchedDrives, matched_batch, matching
+from dlkf.diagnosis.consistency import chi2_band, measure_consistency, normalised_square
+from dlkf.diagnosis.matched_drives import MatchedDrives, make_matched_drives, matched_batch
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.navigation.imu_errors import imu_spec
@@ -37,7 +37,7 @@ def test_it_is_the_quadratic_form_whatever_the_scales():
 
 def test_the_band_holds_the_mean_of_chi_square_draws():
     draws = np.random.default_rng(0).chisquare(15, (4000, 50)).mean(1) / 15
-    low, high = band(15, 50)
+    low, high = chi2_band(15, 50)
     assert ((draws >= low) & (draws <= high)).mean() == pytest.approx(0.95, abs=0.01)
 
 
@@ -45,33 +45,33 @@ def test_the_band_holds_the_mean_of_chi_square_draws():
 def test_a_filter_with_matching_errors_knows_how_wrong_it_is(name):
     """The mean over 24 drives and the last 40 s, of which 20 s without GNSS; errors are correlated in time, so the
     band is that of a single time."""
-    spec = matching(CONSUMER, build_filter(name, CONSUMER).states)
+    spec = make_matched_drives(CONSUMER, build_filter(name, CONSUMER).states)
     batch, matrices = matched_batch(DRIVES, spec)
-    batch = withhold(batch, OutagePlan(80.0, 20.0).masks(batch)[0])
-    result = consistency(build_filter(name, spec), batch, matrices)
+    batch = withhold_fixes(batch, OutagePlan(80.0, 20.0).masks(batch)[0])
+    result = measure_consistency(build_filter(name, spec), batch, matrices)
     assert np.isnan(result.nis[:, 80:100]).all()  # nothing to compare in the outage
     for what, values, degrees in result.parts():
-        low, high = band(degrees, DRIVES.drives)
+        low, high = chi2_band(degrees, DRIVES.drives)
         assert low <= np.nanmean(values[:, 80:]) / degrees <= high, what
 
 
 def test_a_filter_that_is_told_too_little_noise_is_found_out():
-    spec = matching(CONSUMER, build_filter("mbkf15", CONSUMER).states)
+    spec = make_matched_drives(CONSUMER, build_filter("mbkf15", CONSUMER).states)
     batch, matrices = matched_batch(replace(DRIVES, drives=8, minutes=1.0), spec)
     sure = replace(
         spec,
         accel=replace(spec.accel, noise_density=0.3 * spec.accel.noise_density, turn_on_bias=0.005),
         gyro=replace(spec.gyro, noise_density=0.3 * spec.gyro.noise_density),
     )
-    result = consistency(build_filter("mbkf15", sure), batch, matrices)
+    result = measure_consistency(build_filter("mbkf15", sure), batch, matrices)
     for what, values, degrees in result.parts()[:2]:
-        assert np.nanmean(values[:, 20:]) / degrees > band(degrees, 8)[1], what
+        assert np.nanmean(values[:, 20:]) / degrees > chi2_band(degrees, 8)[1], what
 
 
 def test_errors_beyond_the_states_are_switched_off():
-    spec = matching(CONSUMER, build_filter("mbkf21", CONSUMER).states)
+    spec = make_matched_drives(CONSUMER, build_filter("mbkf21", CONSUMER).states)
     assert spec.accel.scale_factor == CONSUMER.accel.scale_factor and spec.accel.misalignment == 0
-    assert matching(CONSUMER, build_filter("mbkf33", CONSUMER).states).gyro == CONSUMER.gyro
+    assert make_matched_drives(CONSUMER, build_filter("mbkf33", CONSUMER).states).gyro == CONSUMER.gyro
 
 
 def test_the_command_writes_table_picture_and_numbers(call):

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from dlkf.command.composing import composed
+from dlkf.command.composing import compose_command
+from tests.conftest import Once
 from tests.drives import drives_in
 from tests.shell import Ended
 
@@ -22,7 +23,7 @@ SMALL = {
         "data.eval_outage={first_s:10,duration_s:10}", "trainer.max_epochs=1", "trainer.validate_every=1",
         "trainer.best_from_epoch=0",
         "scoring.outage={first_s:10,duration_s:10}", "baselines.models=[mbkf15]", "baselines.tune=false",
-        "baselines.pieces=2", "scoring.after_s=[]", "scoring.hour=null",
+        "baselines.segments=2", "scoring.after_s=[]", "scoring.hour=null",
         "callbacks.curriculum.warm_s=15", "callbacks.curriculum.full_s=20",
         "model.network.lstm_hidden=8", "model.network.lstm_layers=1", "model.network.dense=[8,8]",
     ],
@@ -30,11 +31,11 @@ SMALL = {
 
 
 @pytest.fixture(scope="session")
-def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def drives(once: Once) -> Path:
     """Five drives of 40 s, as ``simulate dataset=per_drive`` makes them."""
     size = ["dataset.hours=0.0555", "dataset.drive_minutes=0.67", "dataset.imu_rate_hz=50", "seed=3"]
-    config = composed("simulate", "simulated@dataset=per_drive", *size)
-    return drives_in(config, tmp_path_factory.mktemp("data") / "consumer")
+    config = compose_command("simulate", "simulated@dataset=per_drive", *size)
+    return once("consumer", lambda folder: drives_in(config, folder / "consumer")) / "consumer"
 
 
 @pytest.fixture

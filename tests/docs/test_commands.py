@@ -9,11 +9,13 @@ from typing import Any
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
+from dlkf.base.config import config_dir
 from dlkf.command import GROUPS
-from dlkf.command.arguments import readable
-from dlkf.config import config_dir
+from dlkf.command.arguments import quote_argument
 from tests.docs.pages import PAGES, ROOT, blocks, commands
 
 CHAIN = ROOT / "src" / "dlkf" / "tracking" / "chain.py"
@@ -46,7 +48,7 @@ def commented(preset: Path) -> str:
     return "\n".join(re.sub(r"(?<=[^\n ]) {4,}[^ ].*", "", line) for line in lines)
 
 
-SHELL += [
+PRESETS = [
     (preset, tuple(words))
     for preset in sorted(config_dir().rglob("*.yaml"))
     for words in map(spelt_out, commands(commented(preset)))
@@ -56,7 +58,7 @@ MINE = {
     "imu": ["my_imu", "ours", "shed"],
     "tuning": ["ours", "town"],
     "reader": ["xsens", "shed"],
-    "experiment": ["fresh_bias"],
+    "experiment": ["fresh_bias", "idea"],
     "simulated": ["van"],
 }
 # conf of one command has only what is chosen; these choices bring in the keys that others lack
@@ -98,21 +100,53 @@ def as_hydra_takes_it(command: str, word: str) -> str:
     key, equals, value = word.partition("=")
     groups = GROUPS.get(command, {})
     if command == "ingest" and key.startswith("reader."):
-        return readable(f"++{word}")
-    return readable(f"{groups[key]}@{key}={value}" if equals and key in groups else word)
+        return quote_argument(f"++{word}")
+    return quote_argument(f"{groups[key]}@{key}={value}" if equals and key in groups else word)
 
 
-@pytest.mark.parametrize(("page", "words"), SHELL, ids=[f"{p.stem}: {' '.join(w)[:60]}" for p, w in SHELL])
-def test_a_command_line_of_the_pages(page: Path, words: tuple[str, ...], mine: Path) -> None:
+@pytest.mark.parametrize("lines", [SHELL, PRESETS], ids=["pages", "presets"])
+def test_every_command_line_exists(lines: list[tuple[Path, tuple[str, ...]]], mine: Path) -> None:
+    assert len(lines) > 50
+    wrong = []
+    for words in {words: None for _, words in lines}:
+        try:
+            check(words, mine)
+        except (AssertionError, HydraException, OmegaConfBaseException, ValueError) as error:
+            places = sorted({str(page.relative_to(ROOT)) for page, line in lines if line == words})
+            wrong.append(f"{', '.join(places)}: {' '.join(words)}: {error}")
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "make tea",
+        "python -m dlkf.brew dataset=data/town",
+        "python -m dlkf.evaluate modle=mbkf15",
+        "python -m dlkf.evaluate imu=best",
+        "python -m dlkf.train -m seed=0,1 optimizer.speed=1,2",
+        "python -m pytest tests/nowhere",
+        "python -m pipelines.nowhere",
+        "python -m pipelines.studies.benchmark --colour=red",
+    ],
+)
+def test_a_wrong_line_would_be_found(line: str, mine: Path) -> None:
+    with pytest.raises((AssertionError, HydraException, OmegaConfBaseException)):
+        check(tuple(line.split()), mine)
+
+
+def check(words: tuple[str, ...], mine: Path) -> None:
+    """Fails unless a command line composes, or calls a script with options that stand in it."""
     given = [w for w in words if w != "…" and "<" not in w]
     if given[0] == "make":
         targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.M)
-        assert set(w for w in given[1:] if "=" not in w) <= set(targets)
+        unknown = {w for w in given[1:] if "=" not in w} - set(targets)
+        assert not unknown, f"no target {unknown}"
     elif given[1] == "-m" and given[2].startswith("dlkf"):
         command = given[2].removeprefix("dlkf.")
         rest = given[3:]
         if command not in PRIMARIES:  # not Hydra's
-            assert (ROOT / "src" / "dlkf" / f"{command}.py").is_file()
+            assert (ROOT / "src" / "dlkf" / f"{command}.py").is_file(), "no such command"
             return
         if "--config-dir" in rest:
             k = rest.index("--config-dir")
@@ -120,10 +154,10 @@ def test_a_command_line_of_the_pages(page: Path, words: tuple[str, ...], mine: P
         sweep = "-m" in rest
         overrides = [as_hydra_takes_it(command, w) for w in rest if "=" in w]  # compare takes bare folders
         if sweep:  # a point of it
-            overrides = [re.sub(r"=([^\[,]+),.*$", r"=\1", o) for o in overrides]
+            overrides = [re.sub(r"=(\[[^\]]*\]|[^\[,]+),.*$", r"=\1", o) for o in overrides]
         composed(command, overrides)
     elif given[1:3] == ["-m", "pytest"]:
-        assert all((ROOT / w).exists() for w in given[3:])
+        assert all((ROOT / w).exists() for w in given[3:]), "no such tests"
     else:
         script = given[2].replace(".", "/") + ".py" if given[1] == "-m" else given[1]
         assert (ROOT / script).is_file(), script
@@ -155,11 +189,13 @@ def dotted(values: Any, prefix: str = "") -> set[str]:
     return {f"{prefix}{key}" for key in values}.union(*(dotted(v, f"{prefix}{k}.") for k, v in values.items()))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_settings_named_in_the_text_exist(page: Path) -> None:
-    text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.M | re.S)
-    named = {m[1] for code in re.findall(r"`([^`\n]+)`", text) for w in code.split() if (m := SETTING.match(w))}
+def test_settings_named_in_the_text_exist() -> None:
     groups = {part for key in keys() for part in key.split(".")[:-1]}
-    lost = sorted(n for n in named if n.partition(".")[0] in groups and not known(n))
-    lost += sorted(set(re.findall(r"`([a-z_]+)\.\*`", text)) - groups)
-    assert not lost, lost
+    lost = []
+    for page in PAGES:
+        text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.M | re.S)
+        named = {m[1] for code in re.findall(r"`([^`\n]+)`", text) for w in code.split() if (m := SETTING.match(w))}
+        unknown = {n for n in named if not n.endswith((".c", ".h")) and n.partition(".")[0] in groups and not known(n)}
+        unknown |= set(re.findall(r"`([a-z_]+)\.\*`", text)) - groups
+        lost += [f"{page.relative_to(ROOT)}: {name}" for name in sorted(unknown)]
+    assert not lost, "\n".join(lost)

@@ -13,7 +13,7 @@ from tests.docs.conftest import Run
 from tests.docs.pages import ROOT, blocks, commands
 
 README = ROOT / "README.md"
-LONGEST = 150  # lines
+LONGEST = 100  # lines
 
 
 def shell(page: Path, heading: str) -> list[list[str]]:

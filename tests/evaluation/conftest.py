@@ -1,4 +1,4 @@
-"""Scores are made of pieces with noise and biases."""
+"""Scores are made of segments with noise and biases."""
 
 from pathlib import Path
 

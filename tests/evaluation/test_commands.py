@@ -3,34 +3,57 @@
 import json
 import shutil
 
+import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
+from dlkf.data.schema import drive_file
 from dlkf.running.solution import GEO_SCHEMA
-from tests.shell import in_shell
+from tests.shell import PATIENCE_S, start_command
 
 
-def test_evaluate_leaves_a_report(town, template, tmp_path):
-    shutil.copy(template, tmp_path / "mlflow.db")
-    done = in_shell(
-        tmp_path, "evaluate", "model=[ins,mbkf15]", f"dataset={town}", "out=report", "imu=consumer",
-        "rate_hz=20", "length_s=50", "outage.first_s=20", "outage.duration_s=[10,20]", "injected_bias=null",
+@pytest.fixture
+def own_town(town, tmp_path):
+    """The town as ``town`` here, with a fix of one drive at 0°/0°."""
+    shutil.copytree(town, tmp_path / "town")
+    path = drive_file(tmp_path / "town", "gnss", "car-01")
+    fixes = pd.read_parquet(path, partitioning=None)
+    fixes.loc[35, ["lat_deg", "lon_deg"]] = 0.0
+    fixes.to_parquet(path, index=False)
+
+
+@pytest.mark.whole
+@pytest.mark.usefixtures("own_town")
+def test_evaluate_leaves_a_report(uri, tmp_path, monkeypatch):
+    """The page too says which fix was refused."""
+    monkeypatch.setenv("COLUMNS", "200")
+    process = start_command(
+        tmp_path, said := tmp_path / "said", "evaluate", "model=[ins,mbkf15]", "dataset=town", "out=report",
+        "imu=consumer", "rate_hz=20", "length_s=50", "outage.first_s=20", "outage.duration_s=[10,20]",
+        "injected_bias=null",
     )  # fmt: skip
-    assert done.code == 0, done.err
-    assert "town (simulated): 6 pieces, 6 drives" in done.out and "ratio to" in done.out
-    assert "mode=drives has them over all of every drive" in " ".join(done.out.split())
+    process.join(PATIENCE_S)
+    out = said.read_text()
+    assert process.exitcode == 0, out
+    assert "town (simulated): 6 outages of 10 to 20 s, 6 drives" in out
+    assert " without GNSS, 6 outages: " in out
+    assert "mode=drives has them over all of every drive" in " ".join(out.split())
     content = json.loads((tmp_path / "report" / "metrics.json").read_text())
-    assert content["protocol"]["mode"] == "pieces" and content["protocol"]["imu"] == "consumer"
+    assert content["protocol"]["mode"] == "segments" and content["protocol"]["imu"] == "consumer"
+    assert content["protocol"]["refused beyond physical limits"] == {"car-01": "1 fix"}
+    assert "drive car-01: 1 fix beyond physical limits refused" in out
+    assert "refused beyond physical limits" in (tmp_path / "report" / "report.html").read_text()
     assert content["results"][0]["count"]["outages"] == 6 == len(content["results"][0]["per_outage"])
     assert (tmp_path / "report" / "figures" / "error_over_time.png").stat().st_size > 10_000
 
 
-def test_navigate_writes_solutions_without_a_reference(town, call, tmp_path):
-    shutil.copytree(town, tmp_path / "town")
+@pytest.mark.usefixtures("own_town")
+def test_navigate_writes_solutions_without_a_reference(call, tmp_path):
     shutil.rmtree(tmp_path / "town" / "reference")
     done = call("navigate", "model=mbkf15", "dataset=town", "out=solved", "rate_hz=20", "drives=[car-01]")
     assert done.code == 0, done.err
     assert "car-01: aligned at t = " in done.out
+    assert "Refused beyond physical limits: 1 fix of car-01." in (tmp_path / "solved" / "report.html").read_text()
     assert pq.read_schema(tmp_path / "solved" / "drive=car-01" / "solution.parquet").equals(GEO_SCHEMA)
     assert sorted(p.name for p in (tmp_path / "solved").iterdir()) == ["drive=car-01", "log.txt", "report.html"]
 

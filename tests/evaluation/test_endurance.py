@@ -1,4 +1,4 @@
-"""Errors after longer GNSS and over long pieces are those of the same scores, taken at the right times."""
+"""Errors after longer GNSS and over long segments are those of the same scores, taken at the right times."""
 
 import math
 
@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from dlkf.base.errors import InputError
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.segments import StartLaw
 from dlkf.data.store import load_dataset
-from dlkf.errors import InputError
 from dlkf.evaluation import endurance
-from dlkf.evaluation.endurance import after_gnss, after_tables, hour_table, without_outage
+from dlkf.evaluation.endurance import after_tables, hour_table, score_after_gnss, score_without_outage
 from dlkf.evaluation.protocol import Protocol, Scenes
 from dlkf.evaluation.run import score_scenes
 from dlkf.filters.build import build_filter
@@ -24,14 +24,14 @@ def test_parts_of_an_hour_hold_their_own_epochs(town, monkeypatch):
     """An hour of 50 s here: RMS over the epochs of each part, written out; the start's 2° of heading fade with GNSS."""
     drives, start = load_dataset(town, rate_hz=20, dtype=torch.float64), StartLaw()
     with pytest.raises(InputError, match="no drive has 60 min"):
-        without_outage(FILTERS, drives, start, seed=1)
+        score_without_outage(FILTERS, drives, start, seed=1)
     monkeypatch.setattr(endurance, "HOUR_S", 50.0)
     monkeypatch.setattr(endurance, "MINUTES", ((0, 0.5), (0.5, 1), (1, 2)))
-    found = without_outage(FILTERS, drives, start, seed=1)
+    found = score_without_outage(FILTERS, drives, start, seed=1)
     assert list(found["mbkf15"]) == [
         f"{q}_{part}_min" for part in ("0_0.5", "0.5_1") for q in ("heading_deg", "position_m")
     ]
-    scores = score_scenes(FILTERS, Scenes(drives, Protocol("pieces", 50.0, 50.0, start, seed=1)))
+    scores = score_scenes(FILTERS, Scenes(drives, Protocol("segments", 50.0, 50.0, start, seed=1)))
     position = np.linalg.norm(scores.filters["mbkf15"].error[:, 30:, :3], axis=-1)
     assert found["mbkf15"]["position_m_0.5_1_min"] == pytest.approx(math.sqrt(np.mean(position**2)))
     assert found["mbkf15"]["heading_deg_0.5_1_min"] < 0.8 * found["mbkf15"]["heading_deg_0_0.5_min"]
@@ -42,8 +42,8 @@ def test_a_filter_is_better_after_more_gnss(town):
     """Outages of 40 s after 3 and 10 s; 60 s of drive have no room for one after 30 s."""
     data = DriveDataModule(town, split={"train": ["g0"], "val": ["g1"], "test": ["g2"]}, eval_length_s=50.0, rate_hz=20)
     data.setup()
-    rows = after_gnss(FILTERS, data, [3, 10, 30], baseline="mbkf15", seed=2)
-    assert [(r.seconds, r.pieces, r.groups) for r in rows] == [(3.0, 2, 1), (10.0, 2, 1)]
+    rows = score_after_gnss(FILTERS, data, [3, 10, 30], baseline="mbkf15", seed=2)
+    assert [(r.seconds, r.segments, r.groups) for r in rows] == [(3.0, 2, 1), (10.0, 2, 1)]
     early, late = (r.filters["mbkf15"] for r in rows)
     assert late["rms_m"] < early["rms_m"] and late["geometric_m"] <= late["rms_m"] < rows[1].filters["ins"]["rms_m"]
     assert list(rows[0].ratios) == ["ins"] and rows[0].ratios["ins"].a == pytest.approx(

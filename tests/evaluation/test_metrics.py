@@ -50,10 +50,10 @@ def test_unknown_truth_is_nan_and_a_broken_filter_is_inf(cars):
     assert np.isnan(error[..., 6:]).all()
     assert np.isinf(error[2, 5, :3]).all() and np.isfinite(error[2, 5, 3:6]).all()
     size = m.magnitudes(error)
-    rms = m.piece_rms(size["position"])
+    rms = m.segment_rms(size["position"])
     assert np.isinf(rms[2]) and np.isfinite(np.delete(rms, 2)).all()
-    assert m.summary(rms)["nonfinite"] == 1 and m.summary(rms)["rms"] == math.inf
-    assert m.summary(m.piece_rms(size["attitude"]))["n"] == 0
+    assert m.summarise_errors(rms)["nonfinite"] == 1 and m.summarise_errors(rms)["rms"] == math.inf
+    assert m.summarise_errors(m.segment_rms(size["attitude"]))["n"] == 0
 
 
 def test_attitude_error_is_the_rotation_angle(cars):
@@ -63,7 +63,7 @@ def test_attitude_error_is_the_rotation_angle(cars):
     assert np.allclose(size["attitude"], phi.norm().item(), atol=1e-9)
 
 
-def test_piece_rms_equals_a_loop_over_valid_epochs():
+def test_segment_rms_equals_a_loop_over_valid_epochs():
     rng = np.random.default_rng(0)
     x = rng.normal(size=(5, 40))
     x[rng.random(x.shape) < 0.3] = np.nan
@@ -71,14 +71,28 @@ def test_piece_rms_equals_a_loop_over_valid_epochs():
     mask = rng.random(x.shape) < 0.7
     for i in range(4):
         kept = [v for v, k in zip(x[i], mask[i]) if k and not math.isnan(v)]
-        assert m.piece_rms(x, mask)[i] == pytest.approx(math.sqrt(sum(v * v for v in kept) / len(kept)))
-    assert math.isnan(m.piece_rms(x, mask)[4])
+        assert m.segment_rms(x, mask)[i] == pytest.approx(math.sqrt(sum(v * v for v in kept) / len(kept)))
+    assert math.isnan(m.segment_rms(x, mask)[4])
 
 
 def test_summary_of_known_numbers():
-    s = m.summary(np.array([3.0, 4.0, np.nan, 0.0]))
+    s = m.summarise_errors(np.array([3.0, 4.0, np.nan, 0.0]))
     assert (s["n"], s["nonfinite"], s["median"], s["max"]) == (3, 0, 3.0, 4.0)
     assert s["rms"] == pytest.approx(math.sqrt(25 / 3)) and s["mean"] == pytest.approx(7 / 3)
+
+
+def test_summary_in_closed_form():
+    s = m.summarise_errors(np.arange(101.0))
+    assert s["p95"] == pytest.approx(95.0)
+    assert m.summarise_errors(np.array([1.0, 4.0, 16.0]))["geomean"] == pytest.approx(4.0)
+    assert m.summarise_errors(np.array([1.0, 1.0, 8.0]))["geomean"] == pytest.approx(2.0)
+
+
+def test_magnitudes_are_lengths_of_their_axes():
+    error = np.array([3.0, 4.0, -12.0, 1.0, -2.0, 2.0, 0.02, 0.03, -0.06])
+    assert m.magnitudes(error) == pytest.approx(
+        {"position": 13.0, "horizontal": 5.0, "vertical": 12.0, "velocity": 3.0, "attitude": 0.07, "heading": 0.06}
+    )
 
 
 def test_outage_values_equal_a_loop():
@@ -86,7 +100,7 @@ def test_outage_values_equal_a_loop():
     outage = np.zeros((3, 50), bool)
     outage[0, 10:20] = outage[0, 30:50] = outage[2, 0:5] = True
     x = rng.normal(size=outage.shape) ** 2
-    w = m.windows(outage)
+    w = m.outage_intervals(outage)
     assert list(zip(*(a.tolist() for a in w))) == [(0, 10, 10), (0, 30, 20), (2, 0, 5)]
     assert m.outage_end(x, w).tolist() == [x[0, 19], x[0, 49], x[2, 4]]
     at = m.outage_at(x, w, np.array([5.0, 10.0, 20.0]), epoch_s=1.0)
@@ -104,8 +118,17 @@ def test_distance_in_an_outage_at_constant_speed():
     outage = np.zeros((2, 30), bool)
     outage[:, 5:20] = True
     v[1, 7] = np.nan
-    distance = m.outage_distance(v, m.windows(outage), epoch_s=1.0)
+    distance = m.outage_distance(v, m.outage_intervals(outage), epoch_s=1.0)
     assert distance[0] == pytest.approx(150.0) and math.isnan(distance[1])
+
+
+def test_distance_in_an_outage_at_constant_acceleration():
+    """Speed 2 t at the epochs' ends, t = 0.5 … 15 s: the trapezoid is exact, ∫ from 2.5 to 10 s is 10² − 2.5²."""
+    v = np.zeros((1, 30, 3))
+    v[0, :, 1] = 2 * 0.5 * np.arange(1, 31)
+    outage = np.zeros((1, 30), bool)
+    outage[:, 5:20] = True
+    assert m.outage_distance(v, m.outage_intervals(outage), epoch_s=0.5)[0] == pytest.approx(93.75)
 
 
 def test_slope_tells_an_estimator_from_a_memoriser():

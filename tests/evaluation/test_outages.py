@@ -5,26 +5,26 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dlkf.data.masks import withhold
-from dlkf.errors import InputError
-from dlkf.evaluation.metrics import windows
-from dlkf.evaluation.outages import OutagePlan, scorable
+from dlkf.base.errors import InputError
+from dlkf.data.masks import withhold_fixes
+from dlkf.evaluation.metrics import outage_intervals
+from dlkf.evaluation.outages import OutagePlan, scorable_outages
 
 
 def _windows(mask):
-    return list(zip(*(a.tolist() for a in windows(mask.numpy()))))
+    return list(zip(*(a.tolist() for a in outage_intervals(mask.numpy()))))
 
 
 def test_an_outage_withholds_the_fixes_after_its_start_up_to_its_end(cars):
     (mask,) = OutagePlan(first_s=20, duration_s=10).masks(cars)
     t = torch.arange(1, 61)
     assert all(t[row].tolist() == list(range(21, 31)) for row in mask)
-    masked = withhold(cars, mask)
+    masked = withhold_fixes(cars, mask)
     assert not masked.available[mask].any() and masked.available[~mask].all() and cars.available.all()
 
 
 def test_times_are_seconds_whatever_an_epoch_lasts(cars):
-    """Sixty epochs of half a second: one outage fits to the last of them, the other leaves the piece."""
+    """Sixty epochs of half a second: one outage fits to the last of them, the other leaves the segment."""
     half = replace(cars, dt=cars.dt / 2)
     (mask,) = OutagePlan(first_s=20, duration_s=10).masks(half)
     assert _windows(mask)[0] == (0, 40, 20)
@@ -63,7 +63,7 @@ def test_one_bad_outage_of_several_leaves_the_others(cars):
     truth[0, 30] = False
     mask = torch.zeros(6, 60, dtype=torch.bool)
     mask[:, 5:10] = mask[:, 25:35] = mask[:, 50:60] = True
-    kept = scorable(replace(cars, truth_valid=truth), mask)
+    kept = scorable_outages(replace(cars, truth_valid=truth), mask)
     assert [w[1:] for w in _windows(kept) if w[0] == 0] == [(5, 5), (50, 10)]
     assert torch.equal(kept[1:], mask[1:])
 

@@ -12,23 +12,30 @@ import pymap3d
 import pytest
 import torch
 
+from dlkf.base.errors import InputError
+from dlkf.base.parallel import parallel_map
+from dlkf.base.settings import settings_from
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.masks import BiasLaw
 from dlkf.data.segments import StartLaw
 from dlkf.data.store import drive_rows, load_dataset
-from dlkf.errors import InputError
 from dlkf.evaluation.outages import OutagePlan
-from dlkf.evaluation.protocol import Protocol, Scenes, spread
-from dlkf.evaluation.shares import Work, evaluate_shares
-from dlkf.evaluation.study import study
+from dlkf.evaluation.protocol import Protocol, Scenes, spread_evenly
+from dlkf.evaluation.shares import EvaluationJob, evaluate_chunks
+from dlkf.evaluation.study import run_comparison
 from dlkf.evaluation.table import all_tables
 from dlkf.filters.build import build_filter
 from dlkf.filters.tuning import Prior, Tuning
-from dlkf.models import resolve_model, resolve_models
-from dlkf.parallel import each
-from dlkf.running.offline import Fixes, in_shares, navigate_dataset, navigate_drives, navigate_shares, share_of
-from dlkf.settings import settings_from
+from dlkf.running.offline import (
+    UsableFixes,
+    chunk_drives,
+    load_chunk,
+    navigate_chunks,
+    navigate_dataset,
+    navigate_drives,
+)
+from dlkf.tracking.models import resolve_model, resolve_models
 from tests.cars import IMU
 
 MBKF = build_filter("mbkf15", IMU)
@@ -39,11 +46,11 @@ def drives(town):
     return load_dataset(town, rate_hz=20, dtype=torch.float64)
 
 
-def test_pieces_are_cut_where_truth_allows_and_outages_put_in(drives):
+def test_segments_are_cut_where_truth_allows_and_outages_put_in(drives):
     protocol = Protocol(length_s=25, stride_s=25, outage=OutagePlan(first_s=10, duration_s=10), seed=1)
     scenes = Scenes(drives, protocol)
     (batch, mask), again = next(iter(scenes)), next(iter(scenes))
-    assert scenes.mode == "pieces" and scenes.runs == batch.size[0] == 12 and batch.size[1] == 25
+    assert scenes.mode == "segments" and scenes.runs == batch.size[0] == 12 and batch.size[1] == 25
     assert mask[:, 10:20].all() and mask.sum() == 12 * 10
     assert torch.equal(batch.start.p_n, again[0].start.p_n)  # iterating again is the same experiment
     other = next(iter(Scenes(drives, replace(protocol, seed=2))))[0]
@@ -56,7 +63,7 @@ def tables_of(folder, **settings):
     data = DriveDataModule(folder, split={"train": ["g0"], "val": ["g1"], "test": ["g2"]}, **{**size, **settings})
     scenes = Scenes.of_split(data, "test", OutagePlan(first_s=(5, 10), duration_s=(5, 15)), seed=4)
     names = {"mbkf15": MBKF, "ins": build_filter("ins", IMU)}
-    made = study(names, scenes, kinds="simulated", injected_bias=BiasLaw(0.05, 0.1), seed=4)[1]
+    made = run_comparison(names, scenes, kinds="simulated", injected_bias=BiasLaw(0.05, 0.1), seed=4)[1]
     return json.dumps([r.as_dict() for r in made])
 
 
@@ -76,24 +83,26 @@ def test_the_test_is_the_same_for_every_batch_size_and_training_seed(town):
         assert len(batches) == 3 and torch.equal(alone, together)
 
 
-def test_start_errors_and_outages_do_not_know_the_imu_rate_nor_the_pieces_beside(town):
+def test_start_errors_and_outages_do_not_know_the_imu_rate_nor_the_segments_beside(town):
     plan = OutagePlan(first_s=(5, 10), duration_s=(5, 15))
     law = Protocol(length_s=25, stride_s=25, outage=plan, seed=1)
     both = [load_dataset(town, rate_hz=rate, dtype=torch.float64) for rate in (10, 20)]
     (slow, mask), (fast, other) = (next(iter(Scenes(drives, law))) for drives in both)
     assert torch.equal(mask, other) and torch.equal(slow.start.p_n, fast.start.p_n)
     part, few = next(iter(Scenes(both[1][2:4][::-1], law)))
-    where = [list(zip(fast.drive, fast.t_start)).index(piece) for piece in zip(part.drive, part.t_start)]
+    where = [list(zip(fast.drive, fast.t_start)).index(segment) for segment in zip(part.drive, part.t_start)]
     assert torch.equal(few, other[where]) and torch.equal(part.start.v_n, fast.start.v_n[where])
 
 
-def test_a_limit_keeps_pieces_of_all_drives(drives):
+def test_a_limit_keeps_segments_of_all_drives(drives):
     law = Protocol(length_s=10, stride_s=10)
     ((batch, _),) = Scenes(drives, law, limit=6)
     assert sorted(batch.drive) == sorted(d.name for d in drives)
-    assert spread(range(10), 3) == [1, 5, 8] and spread(range(10), None) == list(range(10)) == spread(range(10), 99)
-    with pytest.raises(InputError, match="pieces=0"):
-        spread(range(10), 0)
+    assert spread_evenly(range(10), 3) == [1, 5, 8] and spread_evenly(range(10), None) == list(
+        range(10)
+    ) == spread_evenly(range(10), 99)
+    with pytest.raises(InputError, match="segments=0"):
+        spread_evenly(range(10), 0)
 
 
 def test_truth_without_attitude_means_whole_drives_from_their_own_alignment(drives):
@@ -104,8 +113,8 @@ def test_truth_without_attitude_means_whole_drives_from_their_own_alignment(driv
     masks = torch.stack([mask for _, mask in scenes])
     t = torch.arange(1, masks.shape[-1] + 1)
     assert masks.any(0)[:, (t > 10) & (t <= 50)].all() and not masks.all(0).any()  # covered, once each
-    _, (result,) = study({"mbkf15": MBKF}, scenes, kinds="real")
-    counted = {q: result.value("mbkf15", "pieces", "all", q, "n") for q in ("attitude", "position")}
+    _, (result,) = run_comparison({"mbkf15": MBKF}, scenes, kinds="real")
+    counted = {q: result.value("mbkf15", "segments", "all", q, "n") for q in ("attitude", "position")}
     assert counted == {"attitude": 0, "position": 12}
     assert result.value("mbkf15", "outages", "end", "horizontal") < 5
     assert len(all_tables("town", [result])) == 2
@@ -116,18 +125,18 @@ def test_study_reports_each_kind_apart_and_the_slope_of_an_injected_bias(drives)
     kinds = {d.name: "real" if i < 2 else "simulated" for i, d in enumerate(drives)}
     groups = {d.name: d.group for d in drives}
     bias = BiasLaw(accel_mps2=0.03, gyro_dps=0.06)
-    _, made = study({"mbkf15": MBKF}, scenes, kinds=kinds, groups=groups, injected_bias=bias)
-    assert [(r.kind, r.count["pieces"]) for r in made] == [("real", 2), ("simulated", 4)]
+    _, made = run_comparison({"mbkf15": MBKF}, scenes, kinds=kinds, groups=groups, injected_bias=bias)
+    assert [(r.kind, r.count["segments"]) for r in made] == [("real", 2), ("simulated", 4)]
     for r in made:
         for axis in ("accel_z", "gyro_x"):
-            assert r.value("mbkf15", "pieces", "last", axis, "injected_slope") == pytest.approx(1, abs=0.1)
+            assert r.value("mbkf15", "segments", "last", axis, "injected_slope") == pytest.approx(1, abs=0.1)
 
 
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"mode": "piece"}, "mode=piece"),
-        ({"mode": "pieces", "length_s": 500}, "no piece of 500 s"),
+        ({"mode": "segment"}, "mode=segment"),
+        ({"mode": "segments", "length_s": 500}, "no segment of 500 s"),
         ({"length_s": 40, "outage": {"first_s": 30, "duration_s": 20}}, "outage ends after 50 s"),
         ({"outage": {"start": 3}}, "unknown key start"),
         ({"length_s": -1}, "length_s"),
@@ -193,16 +202,16 @@ def test_navigation_some_drives_at_a_time(town, tmp_path):
     """Drives loaded one after the other give what they give together; a share of which none starts is left out."""
     shutil.copytree(town, tmp_path / "town")
     rows = drive_rows(tmp_path / "town")
-    fixes = {row.name: Fixes.of(tmp_path / "town", row.name) for row in rows}
+    fixes = {row.name: UsableFixes.of(tmp_path / "town", row.name) for row in rows}
 
     def shares(*samples, skip=False):
         run = partial(navigate_dataset, tmp_path / "town", MBKF, rate_hz=20.0, epoch_s=1.0)
-        return each(partial(share_of, run, skip), in_shares(fixes, 20.0, *samples))
+        return parallel_map(partial(load_chunk, run, skip), chunk_drives(fixes, 20.0, *samples))
 
-    assert in_shares(fixes, 20.0) == [tuple(row.name for row in rows)]
-    together = {r.drive: r.table for r in navigate_shares(shares(), len(rows))}
+    assert chunk_drives(fixes, 20.0) == [tuple(row.name for row in rows)]
+    together = {r.drive: r.table for r in navigate_chunks(shares(), len(rows))}
     seen, counted = {}, []
-    for r in navigate_shares(shares(1), len(rows), progress=lambda *k: counted.append(k)):
+    for r in navigate_chunks(shares(1), len(rows), progress=lambda *k: counted.append(k)):
         seen[r.drive] = r.table
     assert counted == [(k + 1, len(rows)) for k in range(len(rows))]
     assert list(seen) == [row.name for row in rows] and set(together) == set(seen)
@@ -212,29 +221,29 @@ def test_navigation_some_drives_at_a_time(town, tmp_path):
     table = pq.read_table(path).to_pandas()
     table["quality"] = np.where(table.index == 0, table["quality"], 0)  # a single fix: no start
     pq.write_table(pa.Table.from_pandas(table, preserve_index=False), path)
-    fixes[rows[0].name] = Fixes.of(tmp_path / "town", rows[0].name)
+    fixes[rows[0].name] = UsableFixes.of(tmp_path / "town", rows[0].name)
     skipped = {}
-    left = navigate_shares(shares(1, skip=True), len(rows), skipped=skipped)
+    left = navigate_chunks(shares(1, skip=True), len(rows), skipped=skipped)
     assert [r.drive for r in left] == [row.name for row in rows[1:]] and set(skipped) == {rows[0].name}
 
 
-@pytest.mark.parametrize("mode", ["pieces", "drives"])
+@pytest.mark.parametrize("mode", ["segments", "drives"])
 def test_an_evaluation_share_by_share(town, mode):
-    """Drives scored two at a time and all together: the same pieces, outages and biases, errors to rounding."""
+    """Drives scored two at a time and all together: the same segments, outages and biases, errors to rounding."""
     rows = drive_rows(town)
     names = tuple(row.name for row in rows)
     plan = OutagePlan(20.0, (5.0, 10.0))
-    work = Work(
+    work = EvaluationJob(
         str(town), {"mbkf15": MBKF, "ins": build_filter("ins", IMU)}, Protocol(mode, 40.0, 10.0, outage=plan, seed=3),
         {"rate_hz": 20.0, "epoch_s": 1.0}, drive_kinds(town), {row.name: row.group for row in rows},
         law=BiasLaw(0.05, 0.1), shown=False,
     )  # fmt: skip
-    one, many = (evaluate_shares(work, shares) for shares in ([names], [names[:2], names[2:4], names[4:]]))
+    one, many = (evaluate_chunks(work, shares) for shares in ([names], [names[:2], names[2:4], names[4:]]))
     assert one.mode == many.mode == mode and one.rules == many.rules and one.run.scores.outage.any()
-    sorted_by = [[(p.drive, p.t_start, k) for k, p in enumerate(e.run.scores.pieces)] for e in (one, many)]
-    order = [sorted(range(len(pieces)), key=pieces.__getitem__) for pieces in sorted_by]
+    sorted_by = [[(p.drive, p.t_start, k) for k, p in enumerate(e.run.scores.segments)] for e in (one, many)]
+    order = [sorted(range(len(segments)), key=segments.__getitem__) for segments in sorted_by]
     a, b = one.run.scores, many.run.scores
-    assert [a.pieces[k] for k in order[0]] == [b.pieces[k] for k in order[1]]
+    assert [a.segments[k] for k in order[0]] == [b.segments[k] for k in order[1]]
     assert (a.outage[order[0]] == b.outage[order[1]]).all()
     for name in work.filters:  # sums over a batch of another size
         errors = [s.filters[name].error[o] for s, o in zip((a, b), order)]
@@ -250,20 +259,20 @@ def test_shares_of_which_one_has_nothing_to_score(town, tmp_path):
     path = tmp_path / "town" / "reference" / f"drive={rows[0].name}" / "part-0.parquet"
     table = pq.read_table(path).to_pandas().assign(valid=False)
     pq.write_table(pa.Table.from_pandas(table, preserve_index=False), path)
-    work = Work(
-        str(tmp_path / "town"), {"ins": build_filter("ins", IMU)}, Protocol("pieces", 40.0, 10.0),
+    work = EvaluationJob(
+        str(tmp_path / "town"), {"ins": build_filter("ins", IMU)}, Protocol("segments", 40.0, 10.0),
         {"rate_hz": 20.0, "epoch_s": 1.0}, drive_kinds(town), {}, shown=False,
     )  # fmt: skip
-    done = evaluate_shares(work, [(row.name,) for row in rows[:3]])
-    assert {piece.drive for piece in done.run.scores.pieces} == {row.name for row in rows[1:3]}
-    assert done.short.startswith("1 of 3 drives, too short or") and f"a piece of 40 s: {rows[0].name};" in done.short
-    with pytest.raises(InputError, match="no piece of 40 s"):
-        evaluate_shares(work, [(rows[0].name,)])
+    done = evaluate_chunks(work, [(row.name,) for row in rows[:3]])
+    assert {segment.drive for segment in done.run.scores.segments} == {row.name for row in rows[1:3]}
+    assert done.short.startswith("1 of 3 drives, too short or") and f"a segment of 40 s: {rows[0].name};" in done.short
+    with pytest.raises(InputError, match="no segment of 40 s"):
+        evaluate_chunks(work, [(rows[0].name,)])
 
 
 @pytest.mark.parametrize("together", [True, False])
-def test_drives_too_short_for_a_piece_are_named(town, tmp_path, together):
-    """Whatever they share the memory with: mode=auto leaves them out where others have pieces, and says so."""
+def test_drives_too_short_for_a_segment_are_named(town, tmp_path, together):
+    """Whatever they share the memory with: mode=auto leaves them out where others have segments, and says so."""
     shutil.copytree(town, tmp_path / "town")
     names = [row.name for row in drive_rows(town)][:4]
     for name in names[:2]:
@@ -271,16 +280,16 @@ def test_drives_too_short_for_a_piece_are_named(town, tmp_path, together):
         table = pq.read_table(path).to_pandas()
         table["valid"] = table["t"] < table["t"][0] + 30
         pq.write_table(pa.Table.from_pandas(table, preserve_index=False), path)
-    work = Work(
+    work = EvaluationJob(
         str(tmp_path / "town"), {"ins": build_filter("ins", IMU)}, Protocol("auto", 40.0, 10.0),
         {"rate_hz": 20.0, "epoch_s": 1.0}, drive_kinds(town), {}, shown=False,
     )  # fmt: skip
-    done = evaluate_shares(work, [tuple(names)] if together else [(name,) for name in names])
-    assert done.mode == "pieces" and {piece.drive for piece in done.run.scores.pieces} == set(names[2:])
+    done = evaluate_chunks(work, [tuple(names)] if together else [(name,) for name in names])
+    assert done.mode == "segments" and {segment.drive for segment in done.run.scores.segments} == set(names[2:])
     assert done.short == done.rules["too short"] and done.short.startswith("2 of 4 drives, too short or")
     assert f"40 s with a known attitude: {names[0]}, {names[1]}; " in done.short and "mode=drives" in done.short
     shorter = replace(work, protocol=Protocol("auto", 25.0, 10.0))
-    assert evaluate_shares(shorter, [tuple(names)]).short == ""
+    assert evaluate_chunks(shorter, [tuple(names)]).short == ""
 
 
 def test_models_by_name_and_folder(tmp_path):

@@ -12,20 +12,30 @@ import numpy as np
 import pytest
 import torch
 
+from dlkf.base.errors import InputError
+from dlkf.base.files import write_into
 from dlkf.data.kinds import drive_kind
-from dlkf.errors import InputError
 from dlkf.evaluation import figures
 from dlkf.evaluation.figures import png
 from dlkf.evaluation.metrics import QUANTITIES
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.results import IMU_AXES, Results, summarise_scores
-from dlkf.evaluation.summary import answer
-from dlkf.evaluation.table import as_csv, as_json, as_markdown, number, ratio_table, slope_table, tables, with_interval
-from dlkf.files import staged
+from dlkf.evaluation.summary import describe_verdict, headline
+from dlkf.evaluation.table import (
+    as_csv,
+    as_json,
+    as_markdown,
+    format_interval,
+    format_number,
+    ratio_table,
+    result_tables,
+    slope_table,
+)
 from dlkf.filters.build import build_filter
-from dlkf.report.compare import Report, best_of_each, distinct, end_table, scored_on
+from dlkf.report.compare import StoredReport, best_of_each, end_table, scored_on, shorten_names
 from dlkf.report.evaluation import least_error, outage_rows, write_report
 from tests.cars import IMU
+from tests.evaluation.drawn import figures_of
 from tests.evaluation.scoring import score
 
 FILTERS = {name: build_filter(name, IMU) for name in ("ins", "mbkf15")}
@@ -38,31 +48,39 @@ def scores(cars):
 
 
 def test_numbers_are_plain():
-    assert [number(x) for x in (math.nan, math.inf, 0.0, 0.99961, 12.345, 1234.5, 0.01234)] == [
+    assert [format_number(x) for x in (math.nan, math.inf, 0.0, 0.99961, 12.345, 1234.5, 0.01234)] == [
         "–", "∞", "0", "1.00", "12.3", "1234", "0.0123",
     ]  # fmt: skip
 
 
 def test_tables_hold_the_summarise_scores(scores):
     r = summarise_scores(scores, resamples=200)
-    whole, outages = tables("town", r)
-    assert whole.title == "town (simulated): 6 pieces, 6 drives"
+    whole, outages = result_tables("town", r)
+    assert whole.title == "town (simulated): 6 segments, 6 drives"
     assert outages.title == "town (simulated): 6 outages of 20 s, 6 drives"
     end = {s: r.value("mbkf15", "outages", "end", "horizontal", s) for s in ("rms", "median", "p95")}
-    assert outages.rows[1][:4] == ["mbkf15", *map(number, end.values())]
+    assert outages.rows[1][:4] == ["mbkf15", *map(format_number, end.values())]
     ratios = ratio_table("town", r)
     assert ratios.title.endswith("ratio to mbkf15, 6 recordings") and [row[0] for row in ratios.rows] == ["ins"]
     assert len(ratios.columns) == 6 and all(cell.endswith(" (n<8)") for cell in ratios.rows[0][1:])
     assert ratio_table("town", summarise_scores(scores, baseline="none such")) is None
     assert len(r.comparisons) == 2 * 6 * 3 and r.baseline == "mbkf15"
     assert all(c.filter == "ins" and c.against.groups == 6 for c in r.comparisons)
-    at_end = [number(r.value("mbkf15", "outages", "at 20 s", "horizontal", s)) for s in ("median", "max", "p95")]
-    assert f": {at_end[0]} m in half of 6 outages, {at_end[1]} m in the worst, with mbkf15; next ins " in answer(r)
+    at_end = [format_number(r.value("mbkf15", "outages", "end", "horizontal", s)) for s in ("median", "max", "p95")]
+    few = headline(r)
+    assert few.startswith(f"20 s without GNSS, 6 outages: mbkf15 ends {at_end[0]} m from the reference in the median, ")
+    assert f"{at_end[1]} m in the largest (" in few and " % of the distance driven); next ins " in few
+    assert few.endswith(" With 6 outages, expect larger errors too.")
     many, one = (replace(r, count={**r.count, "outages": n}) for n in (20, 1))
-    assert f": {at_end[0]} m in half of the cases, {at_end[2]} m in 95 %, with mbkf15; next ins " in answer(many)
-    assert f": {at_end[0]} m in one outage, with mbkf15; next ins " in answer(one)
+    assert f"mbkf15 ends {at_end[0]} m from the reference in the median and {at_end[2]} m in 95 % (" in headline(many)
+    assert headline(one).startswith(f"20 s without GNSS, 1 outage: mbkf15 ends {at_end[0]} m from the reference (")
+    longer = replace(r, count={**r.count, "outage_s": [30.0, 50.0]})
+    assert headline(longer).startswith("30 to 50 s without GNSS, ")
+    verdict = describe_verdict(r, "ins")
+    assert "too few recordings for an interval" in verdict and verdict.startswith("ins: ") and "; mbkf15 " in verdict
+    assert describe_verdict(r, "none such") is None
     few = r.versus("ins", "outages", "end", "horizontal")
-    assert with_interval(replace(few, groups=8, ratio=0.7, ratio_low=0.6, ratio_high=0.8)) == "0.70 [0.60–0.80]"
+    assert format_interval(replace(few, groups=8, ratio=0.7, ratio_low=0.6, ratio_high=0.8)) == "0.70 [0.60–0.80]"
     assert few.a == r.value("ins", "outages", "end", "horizontal")
     assert r.versus("mbkf15", "outages", "end", "heading") is None
     last = r.seconds_into_outage()[-1]
@@ -81,8 +99,7 @@ def test_csv_and_json_carry_every_value(scores):
     (value,) = (
         row["value"]
         for row in rows
-        if (row["filter"], row["part"], row["quantity"], row["statistic"])
-        == ("ins", "at 10 s", "velocity", "p95")
+        if (row["filter"], row["part"], row["quantity"], row["statistic"]) == ("ins", "at 10 s", "velocity", "p95")
     )
     assert float(value) == r.value("ins", "outages", "at 10 s", "velocity", "p95") and len(rows) == len(r.values)
     again = Results.of(json.loads(as_json(r.as_dict())))
@@ -91,7 +108,7 @@ def test_csv_and_json_carry_every_value(scores):
     content = json.loads(
         as_json({"r": r.as_dict(), "nan": math.nan, "inf": np.float64(-np.inf)}), parse_constant=pytest.fail
     )
-    assert content["nan"] is None and content["inf"] == "-inf" and len(content["r"]["per_piece"]) == 6
+    assert content["nan"] is None and content["inf"] == "-inf" and len(content["r"]["per_segment"]) == 6
 
 
 def test_missing_attitude_is_a_dash_and_a_broken_filter_infinite(cars):
@@ -99,28 +116,26 @@ def test_missing_attitude_is_a_dash_and_a_broken_filter_infinite(cars):
     scores = score(FILTERS, [batch], kinds="real")
     scores.filters["ins"].error[0, 20, :3] = np.inf
     r = summarise_scores(scores, resamples=50)
-    (whole,) = tables("town", r)
+    (whole,) = result_tables("town", r)
     column = {c: i for i, c in enumerate(whole.columns)}
-    assert all(
-        row[column["Attitude\n[°]"]] == "–" and row[column["Heading\n[°]"]] == "–" for row in whole.rows
-    )
-    assert whole.rows[0][column["3D\n[m]"]] == "∞" and whole.rows[0][column["Not\nfinite"]] == "1 piece"
+    assert all(row[column["Attitude\n[°]"]] == "–" and row[column["Heading\n[°]"]] == "–" for row in whole.rows)
+    assert whole.rows[0][column["3D\n[m]"]] == "∞" and whole.rows[0][column["Not\nfinite"]] == "1 segment"
     assert float(whole.rows[1][column["3D\n[m]"]]) < 1
     content = json.loads(as_json(r.as_dict()))
-    assert ["real", "ins", "pieces", "all", "position", "rms", "inf", "m"] in content["values"]["data"]
-    assert Results.of(content).value("ins", "pieces", "all", "position") == math.inf
+    assert ["real", "ins", "segments", "all", "position", "rms", "inf", "m"] in content["values"]["data"]
+    assert Results.of(content).value("ins", "segments", "all", "position") == math.inf
 
 
 def test_kinds_of_data_are_never_mixed(cars):
     mixed = score(FILTERS, [cars], kinds={"car-00": "real"})
     with pytest.raises(ValueError, match="must not be mixed"):
         summarise_scores(mixed)
-    assert [summarise_scores(mixed.of_kind(k)).count["pieces"] for k in mixed.kinds] == [1, 5]
+    assert [summarise_scores(mixed.of_kind(k)).count["segments"] for k in mixed.kinds] == [1, 5]
 
 
 def test_slope_over_drives_of_known_error(scores, cars):
     r = summarise_scores(scores, resamples=50)
-    slopes = {n: [r.value(n, "pieces", "last", axis, "slope") for axis in IMU_AXES] for n in FILTERS}
+    slopes = {n: [r.value(n, "segments", "last", axis, "slope") for axis in IMU_AXES] for n in FILTERS}
     assert np.allclose(slopes["mbkf15"][2:5], 1.0, atol=0.1) and np.allclose(slopes["ins"], 0.0)
     assert slope_table("town", r).rows[0][1:] == ["0"] * 6
     unknown = replace(cars, true_imu_error=torch.full_like(cars.true_imu_error, math.nan))
@@ -144,7 +159,7 @@ def test_figures_have_content(scores, draw):
         "one": lambda: figures.error_over_time(scores, [2]),
         "imu": lambda: figures.imu_errors(scores, [1]),
         "imu_all": lambda: figures.imu_errors(scores, list(range(6))),
-        "growth": lambda: figures.error_growth(scores, "attitude"),
+        "growth": lambda: figures.error_growth(scores),
         "spread": lambda: figures.error_histograms(scores, list(scores.filters)[:2], 5.0),
     }[draw]()
     data = png(figure, dpi=40)
@@ -160,19 +175,20 @@ def test_figures_survive_missing_truth_and_broken_filters(cars):
     s = score(FILTERS, [batch], outages=outages, kinds="real")
     for run in s.filters.values():
         run.error[1, 15:], run.p_n[1, 15:], run.imu_error[1, 15:] = np.inf, np.nan, np.nan
-    pieces = figures.representative(s, 4, "mbkf15")
-    for figure in (figures.tracks(s, pieces), figures.error_over_time(s), figures.error_growth(s)):
+    segments = figures.representative(s, 4, "mbkf15")
+    for figure in (figures.tracks(s, segments), figures.error_over_time(s), figures.error_growth(s)):
         assert len(png(figure, dpi=30)) > 4000
     assert len(png(figures.imu_errors(s, [1]), dpi=30)) > 4000
 
 
+@pytest.mark.whole
 def test_report_is_complete_and_replaces_an_older_one(scores, tmp_path):
     out = tmp_path / "a" / "b"
     out.mkdir(parents=True)
     (out / "table.md").write_text("old")
     paths = write_report(
         out, "town", scores, [summarise_scores(scores, resamples=50)],
-        protocol={"mode": "pieces"}, by_time=True, baseline="mbkf15", dpi=30,
+        protocol={"mode": "segments"}, by_time=True, baseline="mbkf15", dpi=30,
     )  # fmt: skip
     assert (out / "table.md").read_text().startswith("**town (simulated)")
     assert all(p.is_file() and p.stat().st_size > 100 for p in paths)
@@ -180,8 +196,9 @@ def test_report_is_complete_and_replaces_an_older_one(scores, tmp_path):
     assert {"metrics.json", "table.md", "table.csv", "report.html", "figures/tracks.png"} <= names
     assert not any("partial" in n for n in names)
     page = (out / "report.html").read_text()
+    assert len(figures_of(page)) >= 4
     assert page.count("<img loading=lazy") == 5 and "<script src" not in page and "<link" not in page
-    assert page.count("class=figure") == 4 and "After 20 s without GNSS: " in page.partition("<h2>")[0]
+    assert page.count("class=figure") == 4 and "20 s without GNSS, " in page.partition("<h2>")[0]
 
 
 def test_outages_stand_in_the_order_of_the_best_filter(scores):
@@ -197,12 +214,12 @@ def test_outages_stand_in_the_order_of_the_best_filter(scores):
 
 
 def test_a_failed_write_leaves_nothing(tmp_path):
-    with pytest.raises(RuntimeError), staged(tmp_path / "new" / "deep") as folder:
+    with pytest.raises(RuntimeError), write_into(tmp_path / "new" / "deep") as folder:
         (folder / "x").write_text("half")
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot write"), staged(tmp_path / "file" / "sub"):
+    with pytest.raises(InputError, match="cannot write"), write_into(tmp_path / "file" / "sub"):
         pass
 
 
@@ -216,14 +233,16 @@ def test_a_failed_write_leaves_nothing(tmp_path):
     ],
 )
 def test_runs_are_named_by_the_least_that_tells_them_apart(folders, names):
-    assert distinct([Path(f) for f in folders]) == names
+    assert shorten_names([Path(f) for f in folders]) == names
 
 
 def test_the_best_is_marked_among_those_of_the_same_test(scores):
     """Other data or other outages are another test, another IMU preset is not; one row alone is no comparison."""
     results = [summarise_scores(scores, resamples=200)]
     said = [("a", "town", {"seed": 0, "imu": "x"}), ("b", "town", {"seed": 0, "imu": "y"}), ("c", "city", {"seed": 0})]
-    reports = [Report(name, name, data, rules, results) for name, data, rules in (*said, ("d", "city", {"seed": 1}))]
+    reports = [
+        StoredReport(name, name, data, rules, results) for name, data, rules in (*said, ("d", "city", {"seed": 1}))
+    ]
     columns, rows = end_table(reports)
     by_test = scored_on(reports)
     assert [by_test.index(t) for t in by_test[:: len(FILTERS)]] == [0, 0, 4, 6]

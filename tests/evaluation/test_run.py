@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from dlkf.base.errors import InputError
 from dlkf.data.masks import BiasLaw
-from dlkf.errors import InputError
 from dlkf.evaluation.bias_slope import injected_response
-from dlkf.evaluation.metrics import magnitudes, rms_over_pieces, slope
+from dlkf.evaluation.metrics import magnitudes, rms_over_segments, slope
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Correction
@@ -29,7 +29,7 @@ def _ragged(batch):
     return replace(batch, present=present)
 
 
-def test_chunked_equals_whole_with_pieces_of_different_length(cars):
+def test_chunked_equals_whole_with_segments_of_different_length(cars):
     batch = _ragged(cars)
     seen = []
     whole = score(FILTERS, [batch], kinds="real")
@@ -38,14 +38,11 @@ def test_chunked_equals_whole_with_pieces_of_different_length(cars):
         for field in ("error", "p_n", "imu_error", "imu_std"):
             a, b = getattr(whole.filters[name], field), getattr(parts.filters[name], field)
             assert np.allclose(a, b, rtol=1e-9, atol=1e-9, equal_nan=True), field  # batched matmul rounding
-    assert (
-        np.isnan(whole.filters["ins"].error[4, 12:]).all()
-        and np.isfinite(whole.filters["ins"].error[4, :12]).all()
-    )
+    assert np.isnan(whole.filters["ins"].error[4, 12:]).all() and np.isfinite(whole.filters["ins"].error[4, :12]).all()
     assert len(seen) > 2 * len(FILTERS) and seen[-1] == (12, 12)
 
 
-def test_chunks_cover_every_piece_once_and_drop_the_padding(cars):
+def test_chunks_cover_every_segment_once_and_drop_the_padding(cars):
     batch = _ragged(cars)
     found = list(chunks(batch, 2500))
     assert sorted(i for c in found for i in c.tolist()) == list(range(6))
@@ -58,7 +55,7 @@ def test_chunks_cover_every_piece_once_and_drop_the_padding(cars):
 def test_outage_errors_grow_until_gnss_is_back(cars):
     (mask,) = OutagePlan(first_s=30, duration_s=20).masks(cars)
     scores = score(FILTERS, [cars], outages=[mask])
-    rms = rms_over_pieces(magnitudes(scores.filters["mbkf15"].error)["horizontal"])
+    rms = rms_over_segments(magnitudes(scores.filters["mbkf15"].error)["horizontal"])
     assert (np.diff(rms[32:50]) > 0).all() and rms[49] > 10 * rms[29] and rms[50] < 0.1 * rms[49]
     free = score(FILTERS, [cars])
     inside = free.filters["mbkf15"].error[:, 49]
@@ -83,16 +80,12 @@ def test_several_batches_are_joined_and_named(cars):
     short = replace(short, present=short.present.clone().index_fill_(1, torch.arange(40, 60), False))
     short = short.select(torch.tensor([0, 1])).trimmed()
     scores = score({"ins": FILTERS["ins"]}, [cars, short], groups={"car-01": "g"}, kinds={"car-01": "real"})
-    assert len(scores.pieces) == 8 and scores.filters["ins"].error.shape == (8, 60, 9)
-    assert [p.group for p in scores.pieces][-2:] == ["g", "car-02"]
-    assert [p.kind for p in scores.pieces][-2:] == ["real", "unknown"]
+    assert len(scores.segments) == 8 and scores.filters["ins"].error.shape == (8, 60, 9)
+    assert [p.group for p in scores.segments][-2:] == ["g", "car-02"]
+    assert [p.kind for p in scores.segments][-2:] == ["real", "unknown"]
     assert np.isnan(scores.truth_p_n[6:, 40:]).all()
     one = scores.of_kind("real")
-    assert (
-        len(one.pieces) == 2
-        and one.filters["ins"].error.shape[0] == 2
-        and scores.kinds == ["real", "unknown"]
-    )
+    assert len(one.segments) == 2 and one.filters["ins"].error.shape[0] == 2 and scores.kinds == ["real", "unknown"]
 
 
 def test_a_network_is_scored_in_evaluation_mode_without_gradients(cars):

@@ -21,8 +21,15 @@ IMU = ImuSpec(
 
 
 def scene(
-    batch: int, epochs: int, seed: int = 0, imu: ImuSpec = IMU, lever_arm=(0.0, 0.0, 0.0), noise: bool = True,
-    position_std: float = 0.05, velocity_std: float = 0.05, bias: torch.Tensor | None = None,
+    batch: int,
+    epochs: int,
+    seed: int = 0,
+    imu: ImuSpec = IMU,
+    lever_arm=(0.0, 0.0, 0.0),
+    noise: bool = True,
+    position_std: float = 0.05,
+    velocity_std: float = 0.05,
+    bias: torch.Tensor | None = None,
 ) -> Batch:
     """B cars for T seconds; ``bias`` (B, 6) overrides the drawn turn-on biases; ``noise=False`` is a clean world."""
     g = torch.Generator().manual_seed(seed)

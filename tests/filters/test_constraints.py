@@ -10,7 +10,7 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD, CarConstraints
 from dlkf.filters.integration import Epoch, Fix, integrate
 from dlkf.filters.model_based import Mbkf
-from dlkf.filters.sources import Believed
+from dlkf.filters.sources import Predicted
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.calibration import ImuError
@@ -102,6 +102,7 @@ def test_cars_that_do_not_slide_drift_less(base):
     assert drift(batch, f"{base}_nhc", lateral_std=0.05, vertical_std=0.05) < 0.35 * drift(batch, base)
 
 
+@pytest.mark.whole
 def test_structure_of_the_car_is_found_and_pays():
     """Mounting angles, rear axle, slip and springs unknown: a filter that estimates them beats one that cannot."""
     true = (0.02, -0.015, 1.4, 0.004, 0.006)
@@ -143,7 +144,7 @@ def test_a_moving_car_is_not_taken_for_a_standing_one():
     P = torch.eye(15, dtype=D).expand(20, 15, 15) * 0.01
     rules = CarConstraints(Tuning(), ErrorStates())
     epoch = epoch_of(quiet, NavState(*(x[:, 30] for x in batch.truth)), ImuError(torch.zeros(20, 6, dtype=D)))
-    measured, _ = rules.rows(epoch, rules.begin(quiet), Believed(P))
+    measured, _ = rules.rows(epoch, rules.begin(quiet), Predicted(P))
     assert not measured.used[:, 2:].any()
 
 
@@ -211,6 +212,7 @@ def driven(base, start: NavState, clean: torch.Tensor):
 
 @pytest.mark.usefixtures("without_shape_checks")
 @pytest.mark.parametrize("name,states", [("mbkf21_car", 26), ("mbkf33_car", 38)])
+@pytest.mark.whole
 def test_ten_minutes_in_float32_are_those_in_float64(name, states):
     """Training runs in float32: rounding stays small beside what the filter does not know, in an outage too."""
     errors = {"scale_factor": 3e-3, "misalignment": 3e-3}

@@ -7,7 +7,7 @@ import torch
 import yaml
 from safetensors.torch import load_file, save_file
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 from dlkf.filters.integration import integrate
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.saved import load_filter, save_filter
@@ -65,8 +65,23 @@ def test_hold_keeps_the_imu_error_between_fixes_and_run_does_not():
     assert torch.equal(ran.prior.p_n[:, 10:20], ran.posterior.p_n[:, 10:20])
 
 
-def test_pieces_of_a_batch_do_not_touch_each_other():
-    """Different fixes are missing in each piece; alone or together, the solution is the same."""
+@pytest.mark.parametrize("limit", [0.05, 0.0])
+def test_an_attitude_correction_is_limited_in_training_alone(limit):
+    batch = single(scene(3, 2, seed=4))
+    model = small(training_turn=limit, outage_mode="run")
+    with torch.no_grad():
+        model.gain.linear.bias[36:].fill_(10.0)  # rows of the attitude: degrees for a metre
+    turns = []
+    for mode in (True, False):
+        first = integrate(batch, model.train(mode))
+        between = first.posterior.C_nb[:, 0] @ first.prior.C_nb[:, 0].mT
+        turns.append(torch.rad2deg(((between.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1).acos()))
+    assert (turns[1] > 3.0).all()
+    assert torch.allclose(turns[0], torch.full((3,), 2.865), atol=0.01) if limit else torch.allclose(*turns, rtol=0.01)
+
+
+def test_segments_of_a_batch_do_not_touch_each_other():
+    """Different fixes are missing in each segment; alone or together, the solution is the same."""
     batch = single(scene(5, 25, seed=3))
     g = torch.Generator().manual_seed(0)
     batch = replace(batch, available=torch.rand(5, 25, generator=g) < 0.4)
@@ -118,6 +133,7 @@ def test_gradient_reaches_every_parameter(network):
         assert parameter.grad is not None and parameter.grad.isfinite().all() and parameter.grad.any(), name
 
 
+@pytest.mark.whole
 def test_gradient_of_the_whole_loop_agrees_with_finite_differences():
     """End to end through strapdown, feedback and network; features attached, as detaching would break it."""
     batch = scene(1, 4, seed=6)
@@ -156,7 +172,7 @@ def test_an_affine_error_takes_off_what_a_sensor_matrix_puts_on():
     assert torch.allclose(solution.imu_error[:, 1:].double(), from_second, atol=2e-4)
 
 
-def test_features_take_the_sizes_of_training_pieces_and_keep_them(tmp_path):
+def test_features_take_the_sizes_of_training_segments_and_keep_them(tmp_path):
     """After learning sizes every input is of size one; the sizes are stored with the weights."""
     batches = [single(scene(20, 30, seed=9))]
     model = small(frame="heading", outage_mode="run")
@@ -286,7 +302,7 @@ def test_a_network_of_one_s_own_runs_is_saved_and_loaded(tmp_path):
         ({"_target_": "nowhere.Mean"}, "PYTHONPATH"),
         ({"_target_": f"{__name__}.Nothing"}, "Nothing"),
         ({"_target_": f"{__name__}.Mean", "colour": 3}, "takes no colour; it takes flags, width"),
-        ({"_target_": "torch.nn.Identity"}, "has no width"),
+        ({"_target_": "torch.nn.Identity"}, "has no start"),
     ],
 )
 def test_a_network_that_is_none_is_said_clearly(network, words):
@@ -303,6 +319,7 @@ def test_a_network_that_is_none_is_said_clearly(network, words):
         ({"network": {"dropout": 1.5}}, "dropout"),
         ({"network": {"samples": 20}}, "rate_hz"),
         ({"network": {"layers": 3}}, "lstm_layers"),
+        ({"training_turn": -0.1}, "training_turn"),
     ],
 )
 def test_settings_that_make_no_sense(settings, words):

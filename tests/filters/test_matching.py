@@ -35,7 +35,7 @@ def matched(batch, model) -> Matching:
 
 def honest() -> PlusFilter:
     """The plain filter with 15 states, told the IMU of the scene, with no factor on anything."""
-    model = plus((), base="mbkf15")
+    model = plus(base="mbkf15")
     model.kalman = replace(model.kalman, imu=IMU, tuning=Tuning())
     return model
 

@@ -8,13 +8,14 @@ import pytest
 import torch
 from scipy.stats import chi2
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 from dlkf.filters.build import MODEL_BASED, build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.kalman_update import _solved, _updated, kalman_prediction, kalman_update
 from dlkf.filters.model_based import Ins, Mbkf, bias_sigma
-from dlkf.filters.tuning import Prior
+from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.error_model import antenna
+from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.navigation.state import ErrorStates, NavState
 from dlkf.navigation.strapdown import strapdown
 
@@ -216,8 +217,8 @@ def test_what_a_filter_has_no_states_for_is_a_bias_of_gravity(matrix, level, dow
 
 def test_prior_mean_starts_the_bias():
     batch = scene(5, 5, seed=8, bias=torch.full((5, 6), 0.01, dtype=torch.float64))
-    told = build_filter("mbkf15_prior", IMU, prior=Prior([0.01] * 6, [1e-4] * 6))
-    solution = integrate(batch, told)
+    message = build_filter("mbkf15_prior", IMU, prior=Prior([0.01] * 6, [1e-4] * 6))
+    solution = integrate(batch, message)
     assert (solution.imu_error - 0.01).abs().max() < 1e-3
     assert (solution.std[:, -1, 9:] < 2e-3).all()
 
@@ -226,12 +227,12 @@ def test_prior_mean_starts_the_bias():
 def test_a_prior_of_more_states_starts_the_sensor_matrices(name, count):
     batch = scene(3, 3, seed=8)
     M = 0.01 * torch.arange(1, count - 5, dtype=torch.float64)
-    told = build_filter(name, IMU, prior=Prior([0.0] * 6 + M.tolist(), [1e-9] * count))
-    start = told.begin(batch)[1]
+    message = build_filter(name, IMU, prior=Prior([0.0] * 6 + M.tolist(), [1e-9] * count))
+    start = message.begin(batch)[1]
     diagonal = start.matrix if start.matrix.ndim == 2 else start.matrix.diagonal(dim1=-2, dim2=-1).flatten(1)
     first = M[:6] if count == 12 else torch.cat((M[:3], M[9:12]))
     assert torch.equal(diagonal, first.expand(3, 6))
-    solution = integrate(batch, told, keep_covariances=True)
+    solution = integrate(batch, message, keep_covariances=True)
     assert (solution.error.matrix[:, -1] - start.matrix).abs().max() < 1e-6
 
 
@@ -267,6 +268,22 @@ def test_gauss_markov_biases_forget_at_the_preset_s_rates():
     assert (kept - expected).abs().max() < 2e-3
     walking = integrate(scene(2, 3), build_filter("mbkf15", imu), keep_covariances=True)
     assert (walking.covariances.Phi[:, -1].diagonal(dim1=-2, dim2=-1)[:, 9:15] == 1).all()
+
+
+def test_noise_is_the_preset_s_times_the_squared_factors():
+    """White noise S = (f √S)²; a bias in the run 2σ²/τ + K² (Gauss-Markov while t ≪ τ), or the floor, times f²."""
+    accel = SensorErrors(noise_density=2e-3, instability=3e-3, correlation_time=100.0, random_walk=1e-4)
+    tuning = Tuning(accel_noise=3.0, gyro_noise=5.0, accel_walk=2.0, gyro_walk=4.0)
+    psd = Mbkf(ImuSpec("made up", accel, SensorErrors(noise_density=1e-4)), tuning).psd()
+    assert psd == pytest.approx(
+        {
+            "accel_noise": 9 * 4e-6,
+            "gyro_noise": 25 * 1e-8,
+            "accel_walk": 4 * (2 * 9e-6 / 100 + 1e-8),
+            "gyro_walk": (4 * tuning.walk_floor_gyro) ** 2,
+        },
+        rel=1e-12,
+    )
 
 
 def test_the_rate_at_the_fix_is_that_of_the_last_tenth_of_a_second():

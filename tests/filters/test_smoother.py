@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy.stats import chi2
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.model_based import Ins, Mbkf

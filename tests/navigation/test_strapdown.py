@@ -183,20 +183,25 @@ def test_python_ins_agrees_on_a_minute_of_driving():
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_compiled_form_is_the_tensor_form(dtype):
-    """Without gradients on a CPU the samples are summed by a compiled loop: the same to rounding."""
+    """On a CPU the samples are summed by a compiled loop, with gradients and without: the same to rounding."""
     frame = frame_at(batch=3, dtype=dtype)
     g = torch.Generator().manual_seed(8)
     p, v, a = (s * torch.randn(3, 3, generator=g, dtype=torch.float64) for s in (300.0, 20.0, 1.0))
     start = NavState(*(x.to(dtype) for x in (p, v, rotation_from_rpy(a))))
     imu = lively_imu(3, 100, 9).to(dtype)
     imu[1, :, 3:] = 0.0  # no turn at all
-    expected = strapdown(start, imu, 0.01, frame)
+    with compiled.tensor_forms():
+        assert not compiled.fits(imu, gradients=True)
+        expected = strapdown(start, imu, 0.01, frame)
     with torch.no_grad():
         assert compiled.fits(imu)
-        got = strapdown(start, imu, 0.01, frame)
+        plain = strapdown(start, imu, 0.01, frame)
+    assert compiled.fits(imu, gradients=True)
+    with_gradients = strapdown(start, imu, 0.01, frame)
     eps = torch.finfo(dtype).eps
-    for one, other in zip((*got[:3], *got.end), (*expected[:3], *expected.end)):
-        assert (one - other).abs().max() < 50 * eps * other.abs().max()
+    for got in (plain, with_gradients):
+        for one, other in zip((*got[:3], *got.end), (*expected[:3], *expected.end)):
+            assert (one - other).abs().max() < 50 * eps * other.abs().max()
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])

@@ -20,6 +20,8 @@ struct Twist { Vector3 linear, angular; };
 struct PoseWithCovariance { Pose pose; std::array<double, 36> covariance; };
 struct TwistWithCovariance { Twist twist; std::array<double, 36> covariance; };
 struct TwistWithCovarianceStamped { MESSAGE(TwistWithCovarianceStamped); TwistWithCovariance twist; };
+struct TwistStamped { MESSAGE(TwistStamped); Twist twist; };
+struct QuaternionStamped { MESSAGE(QuaternionStamped); Quaternion quaternion; };
 }
 namespace nav_msgs::msg {
 struct Odometry {
@@ -31,6 +33,7 @@ struct Odometry {
 }
 namespace sensor_msgs::msg {
 struct Imu { MESSAGE(Imu); geometry_msgs::msg::Quaternion orientation; geometry_msgs::msg::Vector3 angular_velocity, linear_acceleration; };
+struct FluidPressure { MESSAGE(FluidPressure); double fluid_pressure, variance; };
 struct NavSatStatus { signed char status; unsigned short service; };
 struct NavSatFix {
   MESSAGE(NavSatFix);

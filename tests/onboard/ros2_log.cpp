@@ -1,8 +1,9 @@
-// The ROS 2 node over the lines of navigate.cpp, turned to ROS 2's axes: ./go arm_x arm_y arm_z < drive.csv > odometry.csv
+// The ROS 2 node over the lines of navigate.c, turned to ROS 2's axes: ./go arm_x arm_y arm_z < drive.csv > odometry.csv
 #include "ros2_node.cpp"
 
 #include <cstdio>
 #include <cstdlib>
+#include <cstring>
 
 namespace {
 builtin_interfaces::msg::Time stamp(double t) { return {(int)std::floor(t), (unsigned)std::lround(1e9 * (t - std::floor(t)))}; }
@@ -33,6 +34,21 @@ void rclcpp::spin(std::shared_ptr<Node>) {
       m.linear_acceleration = {x[1], -x[2], -x[3]};
       m.angular_velocity = {x[4], -x[5], -x[6]};
       tell("imu/data", m);
+    } else if (line[0] == 's') {
+      geometry_msgs::msg::TwistStamped m{};
+      m.header.stamp = stamp(x[0]);
+      m.twist.linear.x = x[1];
+      tell("wheel", m);
+    } else if (line[0] == 'h') {
+      geometry_msgs::msg::QuaternionStamped m{};
+      m.header.stamp = stamp(x[0]);
+      m.quaternion = {0, 0, std::sin((M_PI / 2 - x[1]) / 2), std::cos((M_PI / 2 - x[1]) / 2)};
+      tell("heading", m);
+    } else if (line[0] == 'b') {
+      sensor_msgs::msg::FluidPressure m{};
+      m.header.stamp = stamp(x[0]);
+      m.fluid_pressure = 101325 * std::pow(1 - x[1] / 44330.77, 1 / 0.190263);
+      tell("pressure", m);
     } else {
       sensor_msgs::msg::NavSatFix fix{};
       geometry_msgs::msg::TwistWithCovarianceStamped velocity{};

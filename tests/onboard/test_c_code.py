@@ -8,9 +8,10 @@ import pytest
 import torch
 from torch import nn
 
-from dlkf.errors import InputError
-from dlkf.onboard.c_source import CPP, function_in_c
+from dlkf.base.errors import InputError
+from dlkf.onboard.c_source import function_in_c, heading
 from dlkf.onboard.library import build, compiler
+from tests.onboard.conftest import QUICK
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
 HEADER = "#include <stdint.h>\n"
@@ -28,10 +29,11 @@ class Sums(nn.Module):
         X = torch.linalg.solve_ex(S, B)[0]
         L = torch.linalg.cholesky_ex(S)[0]
         Y = torch.cholesky_solve(B, L)
+        F = torch.linalg.solve_triangular(L, B, upper=False)
         R = torch.linalg.inv_ex(S[:, 1:4, 1:4])[0]
         P = torch.baddbmm(S, B, B.mT, beta=0.5, alpha=-2.0)
         parts = (
-            X, Y, L, R, P, S.cumsum(1), S.cumsum(-1), B.mT @ S, S.mean((0, 2)), S.var(1), S.amax(1), B.norm(dim=1),
+            X, Y, F, L, R, P, S.cumsum(1), S.cumsum(-1), B.mT @ S, S.mean((0, 2)), S.var(1), S.amax(1), B.norm(dim=1),
             B.sum(1, keepdim=True),
         )  # fmt: skip
         return torch.cat([x.flatten() for x in parts])
@@ -89,7 +91,7 @@ class Layers(nn.Module):
         super().__init__()
         torch.manual_seed(3)
         self.cnn = nn.Sequential(nn.Conv1d(4, 3, 3, padding=1), nn.LeakyReLU(0.01), nn.Conv1d(3, 1, 3, padding=1))
-        self.lstm, self.gru = nn.LSTMCell(10, 8), nn.GRUCell(8, 70)  # 70 · 210 weights go into a file
+        self.lstm, self.gru = nn.LSTMCell(10, 8), nn.GRUCell(8, 70)  # 70 · 210 weights go into weights.c
         self.dense = nn.Linear(70, 5)
 
     def example(self):
@@ -106,31 +108,32 @@ def test_c_does_what_torch_does(module, tmp_path):
     example = module.example()
     with torch.no_grad():
         want = module(*example).reshape(-1)
-        code = function_in_c("tested", module.eval(), tmp_path)
+        code, weights, work = function_in_c("tested", module.eval())
     (tmp_path / "step.h").write_text(HEADER)
-    (tmp_path / "step.c").write_text((CPP / "algebra.h").read_text() + code)
-    got = torch.empty_like(want)
-    library = ctypes.CDLL(str(build(tmp_path)))
-    library.tested(*(ctypes.c_void_p(x.contiguous().data_ptr()) for x in (*example, got)))
+    (tmp_path / "step.c").write_text(heading() + code)
+    (tmp_path / "weights.c").write_text(HEADER + weights)
+    got, room = torch.empty_like(want), torch.empty(work)
+    library = ctypes.CDLL(str(build(tmp_path, flags=QUICK)))
+    library.tested(*(ctypes.c_void_p(x.contiguous().data_ptr()) for x in (*example, got, room)))
     # sums in another order; float32 inside the network
     tolerance = 1e-5 if isinstance(module, Layers) else 1e-6 if isinstance(module, Elements) else 1e-12
     torch.testing.assert_close(got, want, rtol=tolerance, atol=tolerance, equal_nan=True)
 
 
-def test_an_unknown_operation_is_named(tmp_path):
+def test_an_unknown_operation_is_named():
     class Sorted(Places):
         def forward(self, x):
             return torch.sort(x)[0]
 
     with torch.no_grad(), pytest.raises(InputError, match=r"aten\.sort.*does not know"):
-        function_in_c("tested", Sorted(), tmp_path)
+        function_in_c("tested", Sorted())
 
 
 @pytest.mark.parametrize("other", [{"stride": 2}, {"dilation": 2}, {"groups": 2}])
-def test_a_convolution_that_is_not_the_plain_one_is_refused(other, tmp_path):
+def test_a_convolution_that_is_not_the_plain_one_is_refused(other):
     class Other(Layers):
         def forward(self, x):
             return nn.functional.conv1d(x, torch.ones(2, 4 // other.get("groups", 1), 3).double(), **other)
 
     with torch.no_grad(), pytest.raises(InputError, match="stride, dilation and groups 1"):
-        function_in_c("tested", Other(), tmp_path)
+        function_in_c("tested", Other())

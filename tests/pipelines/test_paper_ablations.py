@@ -19,7 +19,7 @@ SMALL = (
     "data.eval_length_s=40", "data.eval_outage={first_s: 15, duration_s: 20}", "scoring.after_s=[]",
     "scoring.outage.first_s=15", "scoring.outage.duration_s=20", "callbacks.curriculum.full_s=30",
     "callbacks.curriculum.warm_until=0", "callbacks.curriculum.full_from=0", "trainer.max_epochs=1",
-    "trainer.validate_every=1", "baselines.tune=false", "baselines.pieces=3", "model.network.lstm_hidden=8",
+    "trainer.validate_every=1", "baselines.tune=false", "baselines.segments=3", "model.network.lstm_hidden=8",
     "model.network.lstm_layers=1", "model.network.dense=[8,8]",
 )  # fmt: skip
 

@@ -9,8 +9,9 @@ from pathlib import Path
 
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.results import summarise_scores
-from dlkf.evaluation.table import as_json, number
+from dlkf.evaluation.table import as_json, format_number
 from dlkf.filters.build import build_filter
+from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from tests.evaluation.scoring import score
 from tests.filters.scene import IMU, scene
 
@@ -20,6 +21,7 @@ SCRIPT = Path(__file__).parents[2] / "pipelines" / "paper_report.py"
 def paper_report(monkeypatch, *arguments: object) -> int:
     spec = importlib.util.spec_from_file_location("paper_report", SCRIPT)
     module = importlib.util.module_from_spec(spec)
+    monkeypatch.syspath_prepend(SCRIPT.parent)
     spec.loader.exec_module(module)
     monkeypatch.setattr(sys, "argv", ["paper_report", *map(str, arguments)])
     return module.main()
@@ -38,13 +40,25 @@ def test_what_was_run_and_what_was_not(tmp_path, monkeypatch, capsys):
     (tmp_path / "paper" / "outage" / "trainings.json").write_text(json.dumps(done))
     assert paper_report(monkeypatch, "--home", tmp_path / "paper") == 0
     said, page = capsys.readouterr().out, (tmp_path / "paper" / "report.html").read_text()
-    ratios = [results.versus("dlkf", "pieces", "all", q, "mean").ratio for q in ("position", "velocity", "attitude")]
+    ratios = [results.versus("dlkf", "segments", "all", q, "mean").ratio for q in ("position", "velocity", "attitude")]
     met = sum(r <= mark for r, mark in zip(ratios, (0.63 / 1.43, 0.13 / 0.23, 0.17 / 0.23)))
     (line,) = [line for line in said.splitlines() if "Outages of 30 to 50 s" in line]
-    assert line.split(" | ")[1:3] == ["0.44 / 0.57 / 0.74", " / ".join(number(r, digits=2) for r in ratios)]
+    assert line.split(" | ")[1:3] == ["0.44 / 0.57 / 0.74", " / ".join(format_number(r, digits=2) for r in ratios)]
     assert line.endswith({0: "no", 3: "yes"}.get(met, f"in part: {met} of 3"))
     assert "1.43 m" in page and "Not run yet: python pipelines/paper_kalman_gain.py" in page
     assert "python pipelines/paper_imu_error.py | not run" in said
+    assert all(f"Figure {n} (drawn anew" in page for n in (1, 2, 3, 5)) and page.count("data:image/png") == 4
+
+
+def test_the_network_is_drawn_with_its_own_sizes(monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPT.parent)
+    from paper_diagrams import network_figure
+
+    small = {"lstm_hidden": 24, "lstm_layers": 2, "dense": [20, 12], "cnn_channels": 7}
+    (axes,) = network_figure(LearnedFilter(LearnedConfig.from_mapping({"network": small}))).axes
+    said = [text.get_text() for text in axes.texts]
+    assert "LSTM\n2 layers of 24" in said and "dense\n24 → 20\n20 → 12\ndropout 0.5" in said
+    assert any(x.startswith("Conv1d 15 → 7, kernel 3\nConv1d 7 → 1") for x in said)
 
 
 def test_seeds_share_the_rows_of_classical_filters(tmp_path, monkeypatch, capsys):

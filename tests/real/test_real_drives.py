@@ -13,7 +13,6 @@ from dlkf.data.alignment import align_boundaries
 from dlkf.data.store import load_dataset
 from dlkf.evaluation.results import Results
 from dlkf.navigation.attitude import vector_from_rotation
-from tests.shell import in_shell
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "real"
 pytestmark = pytest.mark.skipif(not REAL.is_dir(), reason="no real drives beside the checkout")
@@ -48,9 +47,9 @@ def test_alignment_agrees_with_a_tactical_reference():
     ("name", "chosen"),
     [("rtkx", []), ("kitti", ["drives=[kitti-2011-10-03-0042-s0]"]), ("comma2k19", [])],
 )
-def test_navigate_needs_no_reference(tmp_path, name, chosen):
+def test_navigate_needs_no_reference(call, tmp_path, name, chosen):
     shutil.copytree(REAL / name, tmp_path / name, ignore=shutil.ignore_patterns("reference"))
-    done = in_shell(tmp_path, "navigate", "model=mbkf15", f"dataset={name}", "out=solved", *chosen)
+    done = call("navigate", "model=mbkf15", f"dataset={name}", "out=solved", *chosen)
     assert done.code == 0, done.err
     (solution,) = (tmp_path / "solved").glob("drive=*/solution.parquet")
     table = pq.read_table(solution).to_pandas()
@@ -66,9 +65,9 @@ def test_navigate_needs_no_reference(tmp_path, name, chosen):
         ("kitti", ["imu=tactical_oxts", "outage.first_s=20", "drives=[kitti-2011-10-03-0042-s0]"], 3, 1.2, 3.6),
     ],
 )
-def test_outages_of_30_s_stay_where_they_were_measured(tmp_path, name, options, outages, low, high):
-    done = in_shell(
-        tmp_path, "evaluate", "model=mbkf15", f"dataset={REAL / name}", "mode=drives", "out=report",
+def test_outages_of_30_s_stay_where_they_were_measured(call, tmp_path, name, options, outages, low, high):
+    done = call(
+        "evaluate", "model=mbkf15", f"dataset={REAL / name}", "mode=drives", "out=report",
         "outage.duration_s=30", "injected_bias=null", *options,
     )  # fmt: skip
     assert done.code == 0, done.err

@@ -9,14 +9,14 @@ import pandas as pd
 import torch
 
 from dlkf.data.store import drive_from_tables
-from dlkf.data.validate import DriveTables
+from dlkf.data.validate import CheckedTables
 from dlkf.filters.build import build_filter
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
-from dlkf.filters.plus import PARTS, PlusConfig, PlusFilter
+from dlkf.filters.plus import PlusConfig, PlusFilter
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.running.estimate import estimates_table
 from dlkf.running.offline import navigate_drives
-from dlkf.running.replay import played
+from dlkf.running.replay import replay_drive
 from dlkf.running.streaming import StreamingFilter
 
 IMU = ImuSpec(
@@ -38,9 +38,9 @@ def network(**settings) -> LearnedFilter:
 
 
 def plus() -> PlusFilter:
-    """A small one with weights, whose speed takes part."""
+    """A small one with weights."""
     torch.manual_seed(0)
-    model = PlusFilter(PlusConfig.from_mapping({"parts": PARTS, "network": {"hidden": 16}})).eval()
+    model = PlusFilter(PlusConfig.from_mapping({"network": {"hidden": 16}})).eval()
     for p in model.network.noise.parameters():
         torch.nn.init.normal_(p, std=0.2)
     return model.double()
@@ -52,7 +52,7 @@ def estimator(name: str):
     return network(outage_mode=name[4:]) if name.startswith("net_") else build_filter(name, IMU)
 
 
-def batch(tables: DriveTables, name: str) -> pd.DataFrame:
+def batch(tables: CheckedTables, name: str) -> pd.DataFrame:
     whole = drive_from_tables(tables, "", 50.0, 1.0, torch.float64)
     return next(iter(navigate_drives([whole], estimator(name)))).table
 
@@ -65,19 +65,19 @@ def apart(a: pd.DataFrame, b: pd.DataFrame) -> float:
                if c != "geometry" and not a[c].isna().all())  # fmt: skip
 
 
-def table(stream: StreamingFilter, tables: DriveTables, **arrivals) -> pd.DataFrame:
+def table(stream: StreamingFilter, tables: CheckedTables, **arrivals) -> pd.DataFrame:
     """All that a stream said of a drive, late fixes included."""
     found = {}
-    for receipt in played(stream, tables.imu, tables.gnss, **arrivals):
+    for receipt in replay_drive(stream, tables.imu, tables.gnss, **arrivals):
         found.update((e.t, e) for e in receipt.estimates)
     return estimates_table(found[t] for t in sorted(found))
 
 
-def some(tables: DriveTables, keep: np.ndarray, kind: str) -> DriveTables:
+def some(tables: CheckedTables, keep: np.ndarray, kind: str) -> CheckedTables:
     return replace(tables, **{kind: {name: x[keep] for name, x in getattr(tables, kind).items()}})
 
 
-def until(tables: DriveTables, t: float) -> DriveTables:
+def until(tables: CheckedTables, t: float) -> CheckedTables:
     for kind in ("imu", "gnss", "reference"):
         tables = some(tables, getattr(tables, kind)["t"] <= t + 1e-6, kind)
     return tables

@@ -18,10 +18,10 @@ from evo.tools import file_interface
 from pynmeagps import NMEAReader
 from scipy.spatial.transform import Rotation
 
+from dlkf.base.errors import InputError
 from dlkf.data.readers.units import GPS_EPOCH_UNIX
 from dlkf.data.tables import DriveClock
-from dlkf.errors import InputError
-from dlkf.running.exports import FORMATS, chosen, export, poses, utc_times
+from dlkf.running.exports import FORMATS, chosen_formats, export, poses, utc_times
 from dlkf.running.solution import COLUMNS, SCHEMA, write_solution
 
 KML, GX = "{http://www.opengis.net/kml/2.2}", "{http://www.google.com/kml/ext/2.2}"
@@ -46,7 +46,7 @@ def table() -> pd.DataFrame:
 def folder(table, tmp_path_factory):
     """All formats, with a known date."""
     out = tmp_path_factory.mktemp("exports")
-    export(out, table, chosen("all"), utc_times(table, DriveClock(MONDAY), "unix"), "town & country")
+    export(out, table, chosen_formats("all"), utc_times(table, DriveClock(MONDAY), "unix"), "town & country")
     return out
 
 
@@ -134,6 +134,38 @@ def test_trajectories_for_evo(folder, table):
     assert np.allclose(Rotation.from_quat([x, y, z, w]).as_matrix(), rotation[5], atol=1e-8)
 
 
+def test_mcap(folder, table):
+    """By mcap's own decoder of ROS 2; the way, the heading and the speed along the car are the solution's."""
+    from mcap_ros2.reader import read_ros2_messages
+
+    read = list(read_ros2_messages(folder / "solution.mcap"))
+    fixes = [m.ros_msg for m in read if m.channel.topic == "/dlkf/fix"]
+    odometry = [m.ros_msg for m in read if m.channel.topic == "/dlkf/odometry"]
+    assert len(fixes) == len(odometry) == 60
+    np.testing.assert_allclose([f.latitude for f in fixes], table.lat_deg, atol=0)
+    np.testing.assert_allclose([f.altitude for f in fixes], table.height_m, atol=0)
+    assert fixes[9].position_covariance[0] == pytest.approx(0.25) and fixes[9].position_covariance_type == 2
+    stamp = fixes[9].header.stamp
+    assert stamp.sec + 1e-9 * stamp.nanosec == pytest.approx(MONDAY + 10, abs=1e-6)
+    position, rotation = poses(table)
+    place = [[getattr(o.pose.pose.position, a) for a in "xyz"] for o in odometry]
+    np.testing.assert_allclose(place, position, atol=1e-9)
+    turn = [[getattr(o.pose.pose.orientation, a) for a in "xyzw"] for o in odometry]
+    np.testing.assert_allclose(Rotation.from_quat(turn).as_matrix(), rotation, atol=1e-9)
+    # the car looks along its way, but for 0.01 and 0.02 rad of pitch and roll
+    np.testing.assert_allclose([o.twist.twist.linear.x for o in odometry], 10.0, atol=0.01)
+
+
+def test_ros1_bag(folder, table):
+    from rosbags.highlevel import AnyReader
+
+    with AnyReader([folder / "solution.bag"]) as reader:
+        kinds = {c.topic: c.msgtype for c in reader.connections}
+        count = sum(1 for _ in reader.messages())
+    assert kinds == {"/dlkf/fix": "sensor_msgs/msg/NavSatFix", "/dlkf/odometry": "nav_msgs/msg/Odometry"}
+    assert count == 120
+
+
 def test_csv(folder, table):
     rows = pd.read_csv(folder / "solution.csv")
     assert list(rows) == ["utc", *table] and rows.utc[0] == "2025-07-07T12:00:01Z"
@@ -179,6 +211,6 @@ def test_the_receivers_date_is_believed_before_that_of_the_files(table):
 
 def test_mistakes():
     with pytest.raises(InputError, match="known: geojson, kml"):
-        chosen(["kml", "shp"])
+        chosen_formats(["kml", "shp"])
     with pytest.raises(InputError, match="export_clock"):
         utc_times(pd.DataFrame({"t": [0.0]}), DriveClock(0.0), "tai")

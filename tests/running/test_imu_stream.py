@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dlkf.base.errors import InputError
 from dlkf.data.resampling import epoch_grid, resample_imu
-from dlkf.errors import InputError
 from dlkf.running.imu_stream import COLUMNS, ImuStream
 
 
@@ -49,7 +49,7 @@ def test_the_open_epoch_reaches_to_the_latest_sample():
     x = np.ones((len(t), 6)) * t[:, None]
     _fed(stream, t, x, 0.0)
     samples, dt = stream.open()
-    assert samples.shape == (1, 18, 6) and dt == pytest.approx(0.02)
+    assert samples.shape == (1, 50, 6) and dt == pytest.approx(0.36 / 50)
     assert (samples.sum(1) * dt)[0] == pytest.approx(x[400:].sum(0) / 100, rel=1e-4)  # sculling of such a ramp
 
 
@@ -79,7 +79,8 @@ def test_what_is_out_of_line_is_refused_and_believed_when_it_goes_on():
     [
         ((0.0, np.nan, 0.0), (0.0,) * 3, "finite"),
         ((0.0,) * 3, (np.inf, 0.0, 0.0), "finite"),
-        ((1e5, 0.0, 0.0), (0.0,) * 3, "beyond"),
+        ((401.0, 0.0, 0.0), (0.0,) * 3, "beyond"),
+        ((0.0,) * 3, (0.0, -41.0, 0.0), "beyond"),
         ((0.0, 0.0), (0.0,) * 3, "3 and 3"),
     ],
 )

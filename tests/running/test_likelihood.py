@@ -11,15 +11,19 @@ import pytest
 import torch
 import yaml
 
+from dlkf.base.errors import InputError
+from dlkf.data.aid_tables import STANDARD
+from dlkf.data.alignment import ALIGN
 from dlkf.data.segments import whole_drives
 from dlkf.data.store import load_dataset
-from dlkf.errors import InputError
+from dlkf.filters.aids.attach import tables_of
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import imu_spec
+from dlkf.onboard.compiled_filter import compile_or_keep
 from dlkf.running import likelihood
-from dlkf.running.likelihood import Evidence, Found, Placing, find_noise, placed
+from dlkf.running.likelihood import Evidence, FixOffset, NoiseFit, find_noise, generic_filter, search_fix_offset
 from dlkf.running.start import align
-from tests.cars import IMU, car_batch, write_pieces
+from tests.cars import IMU, car_batch, write_segments
 
 pytestmark = pytest.mark.usefixtures("without_shape_checks")  # searches run the filters some hundred times
 
@@ -27,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("without_shape_checks")  # searches run the
 @pytest.fixture(scope="module")
 def long_town(tmp_path_factory) -> Path:
     """Three drives of 150 s whose IMU is that of tests.cars."""
-    return write_pieces(tmp_path_factory.mktemp("data") / "long", car_batch(3, 150))
+    return write_segments(tmp_path_factory.mktemp("data") / "long", car_batch(3, 150))
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +39,7 @@ def drives(long_town):
     return load_dataset(long_town, rate_hz=20, epoch_s=1.0, dtype=torch.float64, reference=False)
 
 
-def told(factor: float):
+def known_noise(factor: float):
     """The IMU with white noise told so many times too large."""
     accel, gyro = (replace(s, noise_density=factor * s.noise_density) for s in (IMU.accel, IMU.gyro))
     return replace(IMU, accel=accel, gyro=gyro)
@@ -63,7 +67,7 @@ def test_gaps_are_withheld_and_scored(drives):
 
 
 def test_noise_that_is_told_wrong_is_found(drives):
-    found = find_noise(Evidence.of(drives), "mbkf15", told(0.05), Tuning(), delay=False)
+    found = find_noise(Evidence.of(drives), "mbkf15", known_noise(0.05), Tuning(), delay=False)
     assert found.after < found.before - 1
     for sensor, ratio in (("accel", 1.6), ("gyro", 0.8)):  # within 0.8 to 1.6 with three seeds; one drive 0.15 to 3.2
         density = getattr(found.imu, sensor).noise_density / getattr(IMU, sensor).noise_density
@@ -71,12 +75,26 @@ def test_noise_that_is_told_wrong_is_found(drives):
     assert found.tuning.position_std == 1
 
 
+@pytest.mark.parametrize("name", ["mbkf15", "mbkf21_car"])
+def test_trials_in_c_are_those_in_torch(name, drives):
+    """Used and withheld fixes alike; 1e-6 of densities around 10 is rounding."""
+    evidence = Evidence.of([d.part(0, 100) for d in drives])
+    a, b = (
+        replace(evidence, compiler=c).shares(name, known_noise(2.0), Tuning(), FixOffset(0.02))
+        for c in (None, compile_or_keep)
+    )
+    assert (a != 0).any() and (a - b).abs().max() * evidence.fixes < 1e-6
+
+
 def test_fixes_that_are_late_are_found_out(drives):
     d = drives[0]  # every fix tells where the car was, and how fast, 0.2 s before its stamp
     pull = torch.gradient(d.gnss_v_e, dim=0)[0]
     was = replace(d, gnss_r_e=d.gnss_r_e - 0.2 * d.gnss_v_e + 0.02 * pull, gnss_v_e=d.gnss_v_e - 0.2 * pull)
     evidence = Evidence.of([was])
-    at = {late: evidence.surprise("mbkf15", IMU, Tuning(), Placing(late)) for late in (0.0, 0.1, 0.2, 0.3)}
+    at = {
+        late: evidence.negative_log_likelihood("mbkf15", IMU, Tuning(), FixOffset(late))
+        for late in (0.0, 0.1, 0.2, 0.3)
+    }
     assert min(at, key=at.get) == 0.2
 
 
@@ -89,6 +107,7 @@ def coarse(monkeypatch):
 @pytest.mark.parametrize(("delay_s", "arm_m", "near"), [
     (0.0, 0.0, (0.04, 0.0)), (0.05, 0.0, (0.08, 0.0)), (0.0, 0.5, (0.04, 0.0)),
 ])  # fmt: skip
+@pytest.mark.whole
 def test_a_delay_is_told_from_a_wrong_lever_arm(long_town, tmp_path, delay_s, arm_m, near):
     """The IMU's clock runs ``delay_s`` behind, so fixes come late by as much; the arm is told ``arm_m`` too long.
 
@@ -100,12 +119,12 @@ def test_a_delay_is_told_from_a_wrong_lever_arm(long_town, tmp_path, delay_s, ar
         table.assign(t=table["t"] - delay_s).to_parquet(path, index=False)
     drives = load_dataset(tmp_path / "town", rate_hz=20, epoch_s=1.0, dtype=torch.float64, reference=False)
     arm = torch.tensor([arm_m, 0.0, 0.0])
-    told = [replace(d, lever_arm_b=d.lever_arm_b + arm).part(0, 110) for d in drives]
-    placing, std = placed(Evidence.of(told), "mbkf15", IMU, Tuning(), Placing(*near))
+    known_noise = [replace(d, lever_arm_b=d.lever_arm_b + arm).part(0, 110) for d in drives]
+    placing, std = search_fix_offset(Evidence.of(known_noise), "mbkf15", IMU, Tuning(), FixOffset(*near))
     assert std.delay_s < 0.01 and std.ahead_m < 0.2  # 2 to 5 ms and 5 to 15 cm: five minutes of cm fixes
     assert placing.delay_s == (pytest.approx(delay_s, abs=4 * std.delay_s) if delay_s else 0.0)
     assert placing.ahead_m == (pytest.approx(-arm_m, abs=4 * std.ahead_m) if arm_m else 0.0)
-    said = Found(IMU, Tuning(), placing, std, 0.0, 0.0).told_of_fixes()
+    said = NoiseFit(IMU, Tuning(), placing, std, 0.0, 0.0).describe_offset()
     assert ("not late" in said) == (not delay_s) and ("further back" in said) == bool(arm_m)
 
 
@@ -119,6 +138,7 @@ def test_the_command_writes_what_the_others_take(uri, call, long_town, coarse):
     assert done.code == 0, done.err
 
 
+@pytest.mark.whole
 def test_navigate_finds_the_noise_by_itself(call, long_town, coarse):
     one = (f"dataset={long_town}", "drives=[car-00]", "rate_hz=20", "out=solved")
     done = call("navigate", "model=mbkf15", "imu=auto", *one)
@@ -140,3 +160,17 @@ def test_drives_that_say_nothing_are_refused(drives):
     short = [d.part(0, 15) for d in drives]
     with pytest.raises(InputError, match="no noise can be found"):
         find_noise(Evidence.of(short), "mbkf15", IMU, Tuning())
+
+
+def test_noise_is_found_with_the_sensors_that_a_drive_has(drives, monkeypatch):
+    names = []
+
+    def found(evidence, name, imu, tuning):
+        names.append(name)
+        return NoiseFit(imu, tuning, FixOffset(), FixOffset(), 0.0, 0.0)
+
+    monkeypatch.setattr(likelihood, "find_noise", found)
+    for name, tables in (("mbkf21_car", ["speed"]), ("mbkf21_car", []), ("mbkf15", ["speed"])):
+        estimator, _, _ = generic_filter(drives, name, IMU, Tuning(), ALIGN, [STANDARD[t] for t in tables])
+        assert [t.name for t in tables_of(estimator)] == (tables if "car" in name else [])
+    assert names == ["mbkf21_car+speed", "mbkf21_car", "mbkf15"]

@@ -9,12 +9,12 @@ import pytest
 from dlkf.filters.build import build_filter
 from dlkf.filters.saved import grid_of
 from dlkf.filters.shipped import trained_filter
-from dlkf.report.navigation import Course, answers, route, rows_of
-from dlkf.running.offline import Fixes, Innovation, Navigated, epoch_for
+from dlkf.report.navigation import TrackOnMap, route_map, rows_of, summary_lines
+from dlkf.running.offline import Innovation, Navigated, UsableFixes, epoch_for
 from dlkf.running.solution import COLUMNS
 from tests.cars import IMU
 
-FIVE_A_SECOND = Fixes(*(np.arange(0.0, 10.0, 0.2) for _ in range(4)))
+FIVE_A_SECOND = UsableFixes(*(np.arange(0.0, 10.0, 0.2) for _ in range(4)))
 
 
 @pytest.mark.parametrize(
@@ -33,24 +33,24 @@ def test_a_network_round_a_filter_with_constraints_keeps_its_second():
     assert epoch_for([FIVE_A_SECOND], 50.0, plus) == 1.0
 
 
-def driven(seed: int) -> Course:
+def driven(seed: int) -> TrackOnMap:
     """A drive of twenty minutes with a gap, of made-up numbers."""
     draw = np.random.default_rng(seed)
     table = pd.DataFrame({c: draw.uniform(0.1, 1.0, 1200) for c in COLUMNS} | {"gnss_used": True})
     table["t"] = np.arange(1200.0)
     table.loc[300:340, "gnss_used"] = False
     innovation = Innovation(draw.normal(size=(1200, 6)), draw.uniform(0.5, 2.0, (1200, 6)))
-    fixes = Fixes(table.t.to_numpy(), table.lat_deg.to_numpy(), table.lon_deg.to_numpy(), np.ones(1200))
-    return Course(Navigated(f"d{seed}", 0.0, table, innovation), fixes)
+    fixes = UsableFixes(table.t.to_numpy(), table.lat_deg.to_numpy(), table.lon_deg.to_numpy(), np.ones(1200))
+    return TrackOnMap(Navigated(f"d{seed}", 0.0, table, innovation), fixes)
 
 
 def test_drives_without_plots_of_their_own_are_kept_small_and_shown_the_same():
     whole = [driven(seed) for seed in range(3)]
     small = [course.for_the_map() for course in whole]
-    assert rows_of(small) == rows_of(whole) and answers("mbkf15", small) == answers("mbkf15", whole)
-    assert "Longest time without a fix: 41 s (d0)." in answers("mbkf15", whole)[1]
+    assert rows_of(small) == rows_of(whole) and summary_lines("mbkf15", small) == summary_lines("mbkf15", whole)
+    assert "Longest time without a fix: 41 s (d0)." in summary_lines("mbkf15", whole)[1]
     with_all = whole[0]._replace(result=replace(whole[0].result, table=whole[0].result.table.assign(gnss_used=True)))
-    assert answers("mbkf15", [with_all])[1].startswith("A fix in every epoch. ")
+    assert summary_lines("mbkf15", [with_all])[1].startswith("A fix in every epoch. ")
     assert {row[4] for row in rows_of(whole)[1]} == {"1199"}  # of those after the start
-    assert route(small).to_json() == route(whole).to_json()
+    assert route_map(small).to_json() == route_map(whole).to_json()
     assert sum(c.result.table.memory_usage().sum() for c in small) < 80 * 3600

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import torch
 
-from dlkf.command.composing import composed
+from dlkf.base.errors import InputError
+from dlkf.command.composing import compose_command
 from dlkf.data.alignment import ALIGN
 from dlkf.data.store import load_dataset
-from dlkf.errors import InputError
 from dlkf.evaluation.metrics import magnitudes, outage_end
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Protocol, Scenes
 from dlkf.evaluation.run import score_scenes
 from dlkf.filters.build import build_filter
 from dlkf.navigation.imu_errors import imu_spec
-from dlkf.running.references import _at_imu, referenced
+from dlkf.running.references import _at_imu, make_reference
 from tests.drives import drives_in
 
 
@@ -26,7 +26,7 @@ from tests.drives import drives_in
 def world(tmp_path_factory):
     """Two drives of four minutes, and what a filter is told about their IMU."""
     size = ["dataset.hours=0.133", "dataset.drive_minutes=4", "dataset.imu_rate_hz=50", "seed=3"]
-    config = composed("simulate", "simulated@dataset=per_drive", *size)
+    config = compose_command("simulate", "simulated@dataset=per_drive", *size)
     folder = drives_in(config, tmp_path_factory.mktemp("data") / "town")
     spec = imu_spec(config["imu"])
     return load_dataset(folder, rate_hz=25.0, dtype=torch.float64), build_filter("mbkf21", spec), spec
@@ -43,12 +43,12 @@ def ends(drives, spec, seconds: float) -> np.ndarray:
 def test_errors_are_those_against_the_truth(world, kind):
     """RMS at the end of outages of 30 and 60 s within 5 %: the references are centimetres off, the errors metres."""
     drives, smoother, spec = world
-    made = referenced(drives, kind, smoother, ALIGN)
+    made = make_reference(drives, kind, smoother, ALIGN)
     assert made.horizontal_m < 0.1 and not made.skipped
     for seconds in (30.0, 60.0):
-        true, told = ends(drives, spec, seconds), ends(made.drives, spec, seconds)
-        assert len(true) == len(told) >= 2 and np.sqrt((true**2).mean()) > 1
-        assert np.sqrt((told**2).mean()) == pytest.approx(np.sqrt((true**2).mean()), rel=0.05)
+        true, expected = ends(drives, spec, seconds), ends(made.drives, spec, seconds)
+        assert len(true) == len(expected) >= 2 and np.sqrt((true**2).mean()) > 1
+        assert np.sqrt((expected**2).mean()) == pytest.approx(np.sqrt((true**2).mean()), rel=0.05)
 
 
 @pytest.mark.parametrize("rate_hz", [25.0, 200.0])
@@ -72,7 +72,7 @@ def test_the_antenna_swings_with_the_rate_of_the_last_tenth_of_a_second(world, r
 def test_the_reference_is_as_good_as_it_says(world):
     """Half of the errors lie within 2.5 times what a 1σ of centimetres gives; tails (turns, the start) are longer."""
     drives, smoother, _ = world
-    made = referenced(drives, "smoothed", smoother, ALIGN)
+    made = make_reference(drives, "smoothed", smoother, ALIGN)
     off = torch.cat([(m.ref_r_e - d.ref_r_e)[m.ref_valid & d.ref_valid] for m, d in zip(made.drives, drives)])
     middle = float(off.norm(dim=-1).median())
     assert 0.4 < middle / np.hypot(made.horizontal_m, made.vertical_m) < 2.5 and float(off.norm(dim=-1).max()) < 1.0
@@ -82,4 +82,4 @@ def test_the_reference_is_as_good_as_it_says(world):
 def test_no_file_is_needed_and_mistakes_are_told(world):
     drives, smoother, _ = world
     with pytest.raises(InputError, match="reference=best is none of file, smoothed, gnss"):
-        referenced(drives, "best", smoother, ALIGN)
+        make_reference(drives, "best", smoother, ALIGN)

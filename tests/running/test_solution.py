@@ -36,9 +36,7 @@ def test_positions_velocities_and_attitude_are_in_true_local_ned():
     assert np.allclose(np.radians(table.lat_deg), lat, atol=1e-12)
     assert np.allclose(np.radians(table.lon_deg), lon, atol=1e-12)
     assert np.allclose(table.height_m, h, atol=1e-6)
-    u = pymap3d.enu2uvw(
-        state.v_n[:, 1].numpy(), state.v_n[:, 0].numpy(), -state.v_n[:, 2].numpy(), LAT, LON, deg=False
-    )
+    u = pymap3d.enu2uvw(state.v_n[:, 1].numpy(), state.v_n[:, 0].numpy(), -state.v_n[:, 2].numpy(), LAT, LON, deg=False)
     east, north, up = pymap3d.uvw2enu(*u, lat, lon, deg=False)
     assert np.allclose(table[["vel_n", "vel_e", "vel_d"]], np.stack((north, east, -up), -1), atol=1e-9)
     # meridians converge: the heading in local NED is the frame's plus Δλ sin φ, to first order
@@ -54,9 +52,7 @@ def test_stds_are_those_of_drawn_errors():
     """Monte Carlo over 40000 draws; 1σ is known to 1/√80000 = 0.35 %, tested to 5 σ."""
     frame, n = _frame(), 40_000
     one = NavState(*(x[:1] for x in _state()))
-    std = torch.tensor(
-        [1.0, 3.0, 2.0, 0.1, 0.2, 0.3, 1e-3, 2e-3, 4e-3] + [0.02] * 3 + [1e-4] * 3, dtype=torch.float64
-    )
+    std = torch.tensor([1.0, 3.0, 2.0, 0.1, 0.2, 0.3, 1e-3, 2e-3, 4e-3] + [0.02] * 3 + [1e-4] * 3, dtype=torch.float64)
     g = torch.Generator().manual_seed(1)
     dx = std[:9] * torch.randn(n, 9, generator=g, dtype=torch.float64)
     many = NavState(*(x.expand(n, *x.shape[1:]) for x in one)).corrected(dx)

@@ -9,32 +9,32 @@ import numpy as np
 import pytest
 import torch
 
+from dlkf.base.errors import InputError
 from dlkf.data.alignment import AlignConfig
-from dlkf.errors import InputError
 from dlkf.filters.build import build_filter
-from dlkf.filters.card import UnheardCar
+from dlkf.filters.card import LowSampleRateWarning
 from dlkf.running.estimate import estimates_table
-from dlkf.running.replay import played
+from dlkf.running.replay import replay_drive
 from dlkf.running.streaming import Status, StreamingFilter
 from tests.running.streams import ARM, EARTH, IMU, ROUNDING, apart, batch, estimator, network, plus, some, table, until
 
 
-def test_a_long_wait_for_the_first_fix_costs_no_memory(piece):
+def test_a_long_wait_for_the_first_fix_costs_no_memory(segment):
     """Nothing for 20 s, then regular fixes: as the batch run, which starts as soon as it has two."""
-    tables = some(piece, piece.gnss["t"] > 19.5, "gnss")
+    tables = some(segment, segment.gnss["t"] > 19.5, "gnss")
     stream = StreamingFilter(estimator("mbkf15"), lever_arm_b=ARM)
-    for _ in played(stream, until(tables, 19.9).imu, {c: x[:0] for c, x in tables.gnss.items()}):
+    for _ in replay_drive(stream, until(tables, 19.9).imu, {c: x[:0] for c, x in tables.gnss.items()}):
         assert len(stream._samples._rows) <= 1002
     rest = some(tables, tables.imu["t"] > 19.9, "imu")
     assert apart(table(stream, rest), batch(tables, "mbkf15")) < ROUNDING
 
 
-def test_bad_packets_are_refused_and_change_nothing(piece):
+def test_bad_packets_are_refused_and_change_nothing(segment):
     stream = StreamingFilter(estimator("mbkf15"), lever_arm_b=ARM)
     still, turn = (0.0, 0.0, -9.8), (0.0, 0.0, 0.0)
-    here = [float(piece.gnss[c][25]) for c in ("lat_deg", "lon_deg", "height_m")]
+    here = [float(segment.gnss[c][25]) for c in ("lat_deg", "lon_deg", "height_m")]
     reasons, found = [], []
-    for receipt in played(stream, piece.imu, piece.gnss):
+    for receipt in replay_drive(stream, segment.imu, segment.gnss):
         found += receipt.estimates
         t = stream._samples.latest
         if abs(t - 25.5) > 0.001 or reasons:
@@ -52,7 +52,7 @@ def test_bad_packets_are_refused_and_change_nothing(piece):
     assert len(reasons) == 15 and stream.counts["refused"] == 15
     for words in ("again", "goes back", "gap", "finite", "no fix", "±90", "std", "late", "ahead"):
         assert any(words in r for r in reasons), words
-    assert apart(estimates_table(found), batch(piece, "mbkf15")) < ROUNDING
+    assert apart(estimates_table(found), batch(segment, "mbkf15")) < ROUNDING
 
 
 def test_a_fix_later_than_the_history_is_refused(drive):
@@ -97,7 +97,7 @@ def test_after_a_long_gap_or_a_new_clock_it_starts_over(drive, jump):
 
 
 @pytest.mark.parametrize("fault", ["nan", "singular"])
-def test_a_diverged_filter_starts_over(piece, fault):
+def test_a_diverged_filter_starts_over(segment, fault):
     """The 15th epoch's answer is not finite, or its innovation covariance cannot be factored."""
 
     class Failing(type(estimator("mbkf15"))):
@@ -112,7 +112,7 @@ def test_a_diverged_filter_starts_over(piece, fault):
 
     calls: list[int] = []
     stream = StreamingFilter(Failing(IMU), lever_arm_b=ARM)
-    found = [e.t for r in played(stream, piece.imu, piece.gnss) for e in r.estimates]
+    found = [e.t for r in replay_drive(stream, segment.imu, segment.gnss) for e in r.estimates]
     assert stream.counts["diverged"] == 1 and np.diff(found).max() == 2.0 and found[-1] == 35.0
     assert np.isfinite(stream.latest.row["lat_deg"])
 
@@ -147,16 +147,16 @@ def test_a_filter_that_does_not_fit_is_told_at_once():
         StreamingFilter(estimator("ins"), history_s=-1.0)
 
 
-def test_a_filter_that_listens_warns_of_samples_too_slow_for_it(piece):
+def test_a_filter_that_listens_warns_of_samples_too_slow_for_it(segment):
     """As the commands do: of the rate it is given, and of that at which samples come; no other filter does."""
-    said = "the filter hears the car through samples at 50 Hz or more and this stream has 10 Hz"
-    with pytest.warns(UnheardCar, match=said):
+    said = "the filter needs samples at 50 Hz or more and this stream has 10 Hz"
+    with pytest.warns(LowSampleRateWarning, match=said):
         StreamingFilter(plus(), rate_hz=10.0)
-    tenth = np.arange(len(piece.imu["t"])) % 10 == 9
-    slow = some(piece, tenth, "imu")
+    tenth = np.arange(len(segment.imu["t"])) % 10 == 9
+    slow = some(segment, tenth, "imu")
     stream = StreamingFilter(plus(), lever_arm_b=ARM)
-    with pytest.warns(UnheardCar, match=said) as heard:
-        for _ in played(stream, slow.imu, slow.gnss):
+    with pytest.warns(LowSampleRateWarning, match=said) as heard:
+        for _ in replay_drive(stream, slow.imu, slow.gnss):
             pass
     assert len(heard) == 1
     with warnings.catch_warnings():
@@ -165,7 +165,7 @@ def test_a_filter_that_listens_warns_of_samples_too_slow_for_it(piece):
         StreamingFilter(build_filter("mbkf15", IMU), rate_hz=10.0)
 
 
-def test_without_motion_it_goes_on_aligning(piece):
+def test_without_motion_it_goes_on_aligning(segment):
     stream = StreamingFilter(estimator("ins"), lever_arm_b=ARM, align=AlignConfig(min_speed=1000.0))
-    assert not any(r.estimates for r in played(stream, piece.imu, piece.gnss))
+    assert not any(r.estimates for r in replay_drive(stream, segment.imu, segment.gnss))
     assert stream.aligning and stream.now() is None and len(stream._samples._rows) < 200

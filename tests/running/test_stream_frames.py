@@ -56,3 +56,12 @@ def test_a_change_of_frame_keeps_position_velocity_and_attitude_in_ecef():
     turned = torch.cat((change.vectors(x[:, :9]), x[:, 9:]), -1)
     a, b = ((y * torch.linalg.solve(Q, y)).sum(-1) for y, Q in ((x, P), (turned, change.covariance(P))))
     assert torch.allclose(a, b, rtol=1e-6)
+
+
+def test_variances_of_components_turn_with_the_axes():
+    """The diagonal of C R Cᵀ for a diagonal R, three components at a time, half the Earth's way apart."""
+    places = ((0.9, 0.2), (-0.3, 1.7))
+    old, new = (tangent_frame(*(torch.tensor([x], dtype=torch.float64) for x in (*place, 0.0))) for place in places)
+    change, R = FrameChange(old, new), torch.tensor([[1.0, 4.0, 9.0, 0.25, 16.0, 2.0]], dtype=torch.float64)
+    turned = [(change.turn @ R[:, k : k + 3].diag_embed() @ change.turn.mT).diagonal(dim1=1, dim2=2) for k in (0, 3)]
+    assert torch.allclose(change.variances(R), torch.cat(turned, -1), rtol=1e-12)

@@ -10,27 +10,27 @@ from scipy.signal import welch
 from scipy.spatial.transform import Rotation
 from tests.simulation.oracle import apart, apart_of_python_ins, positions_and_integral, strapdown
 
-from dlkf.command.composing import composed
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
+from dlkf.command.composing import compose_command
 from dlkf.simulation.dataset import dataset_config
 from dlkf.simulation.imu import inverse_mechanisation
-from dlkf.simulation.motion.chassis import ChassisConfig, draw_car, mounted, rough_road, slip_angle, vibration
+from dlkf.simulation.motion.chassis import ChassisConfig, apply_mounting, draw_car, rough_road, slip_angle, vibration
 from dlkf.simulation.motion.routes import Kinematics, Plan, VehicleConfig
-from dlkf.simulation.motion.vehicle import Route, Truth, follow, random_route, random_waves
+from dlkf.simulation.motion.vehicle import Route, Truth, follow_route, random_route, random_waves
 
 CONF = Path(__file__).parents[2] / "conf"
 LEVEL = VehicleConfig(slope_std=0.0, height_m=0.0)
 
 
 def preset(name: str):
-    return dataset_config(composed("simulate", f"simulated@dataset={name}")["dataset"])
+    return dataset_config(compose_command("simulate", f"simulated@dataset={name}")["dataset"])
 
 
 def drive(vehicle: VehicleConfig, kind: ChassisConfig, seconds: int, rate: int, seed: int = 5) -> Truth:
     t = np.arange(seconds * rate + 1) / rate
     route = random_route(np.random.default_rng(seed), vehicle, float(seconds))
     rng = np.random.default_rng(seed + 1)
-    return mounted(rng, draw_car(rng, kind), route, follow(route, vehicle, t))
+    return apply_mounting(rng, draw_car(rng, kind), route, follow_route(route, vehicle, t))
 
 
 def later(truth: Truth, first: int) -> Truth:
@@ -100,9 +100,9 @@ def test_any_sample_rate_sees_the_same_motion():
 
 def test_without_chassis_the_imu_is_the_point():
     route = random_route(np.random.default_rng(2), VehicleConfig(), 60.0)
-    axle = follow(route, VehicleConfig(), np.arange(6001) / 100)
+    axle = follow_route(route, VehicleConfig(), np.arange(6001) / 100)
     rng = np.random.default_rng(3)
-    car = mounted(rng, draw_car(rng, ChassisConfig()), route, axle)
+    car = apply_mounting(rng, draw_car(rng, ChassisConfig()), route, axle)
     for name in Truth.__dataclass_fields__:
         assert np.allclose(getattr(car, name), getattr(axle, name), rtol=0, atol=1e-12), name
 
@@ -113,7 +113,7 @@ def test_the_rear_axle_slips_by_the_single_track_model():
     motion = route.motion(np.arange(6001) / 100)
     rng = np.random.default_rng(0)
     kind = ChassisConfig(sideslip=0.0075)
-    truth = mounted(rng, draw_car(rng, kind), route, follow(route, LEVEL, motion.t))
+    truth = apply_mounting(rng, draw_car(rng, kind), route, follow_route(route, LEVEL, motion.t))
     v_b = body_velocity(truth)
     slip = 0.0075 * motion.speed * motion.yaw_rate
     assert np.abs(v_b[:, 1] + motion.speed * np.sin(slip)).max() < 1e-12
@@ -135,9 +135,9 @@ def test_gusts_push_the_axle_by_the_stated_angle():
 def test_swells_pitch_the_body_by_the_stated_angle():
     """RMS over 40 cars of the pitch of a car with nothing else on a level road; the velocity down is v sin(pitch)."""
     route, t = circling(15.0, 0.0, 600), np.arange(6001) / 10
-    axle, rng = follow(route, LEVEL, t), np.random.default_rng(0)
+    axle, rng = follow_route(route, LEVEL, t), np.random.default_rng(0)
     cars = [draw_car(np.random.default_rng(k), ChassisConfig(pitch_noise=0.004)) for k in range(40)]
-    truths = [mounted(rng, car, route, axle) for car in cars]
+    truths = [apply_mounting(rng, car, route, axle) for car in cars]
     pitch = [truth.rpy[200:, 1] for truth in truths]
     assert np.std(pitch) == pytest.approx(0.004, rel=0.1)
     assert np.abs(body_velocity(truths[0])[200:, 2] - 15.0 * np.sin(pitch[0])).max() < 1e-4  # m/s
@@ -148,11 +148,11 @@ def test_swells_pitch_the_body_by_the_stated_angle():
 def test_lateral_velocity_at_the_imu_is_arm_times_yaw_rate():
     route = circling(15.0, 0.3, 60)
     rng = np.random.default_rng(0)
-    truth = mounted(
+    truth = apply_mounting(
         rng,
         draw_car(rng, ChassisConfig(imu_arm=(-0.32, 0.1, -0.6))),
         route,
-        follow(route, LEVEL, np.arange(6001) / 100),
+        follow_route(route, LEVEL, np.arange(6001) / 100),
     )
     v_b = body_velocity(truth)
     assert v_b[3000] == pytest.approx([15.0 - 0.1 * 0.3, -0.32 * 0.3, 0.0], abs=2e-5)  # transport rate 2e-6 m/s
@@ -164,7 +164,7 @@ def test_the_body_leans_out_of_turns_and_back_under_power():
     t = np.arange(6001) / 100
     rng = np.random.default_rng(0)
     kind = ChassisConfig(roll_gradient=0.008, pitch_gradient=0.004)
-    truth = mounted(rng, draw_car(rng, kind), route, follow(route, LEVEL, t))
+    truth = apply_mounting(rng, draw_car(rng, kind), route, follow_route(route, LEVEL, t))
     assert truth.rpy[3000:4000, 0] == pytest.approx(-0.008 * 15 * 0.3, abs=1e-5)
     accelerating = slice(400, 800)
     assert truth.rpy[accelerating, 1] == pytest.approx(0.004 * route.motion(t[accelerating]).acceleration, abs=2e-4)
@@ -174,10 +174,10 @@ def test_the_body_leans_out_of_turns_and_back_under_power():
 
 def test_mounting_turns_the_imu_in_the_car():
     route = random_route(np.random.default_rng(2), VehicleConfig(), 30.0)
-    axle = follow(route, VehicleConfig(), np.arange(3001) / 100)
+    axle = follow_route(route, VehicleConfig(), np.arange(3001) / 100)
     rng = np.random.default_rng(3)
     angles = (1.0, -2.0, 3.0)
-    truth = mounted(rng, draw_car(rng, ChassisConfig(mounting_deg=angles)), route, axle)
+    truth = apply_mounting(rng, draw_car(rng, ChassisConfig(mounting_deg=angles)), route, axle)
     car, imu = (Rotation.from_euler("ZYX", x.rpy[:, ::-1]) for x in (axle, truth))
     assert np.abs((car.inv() * imu).as_euler("ZYX", degrees=True) - angles[::-1]).max() < 1e-9
 

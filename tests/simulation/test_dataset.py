@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from tests.drives import drives_in
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 from dlkf.navigation.imu_errors import SensorErrors
 from dlkf.simulation.dataset import DatasetConfig, dataset_config
 

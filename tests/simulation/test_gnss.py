@@ -6,8 +6,8 @@ import numpy as np
 import pymap3d
 import pytest
 
-from dlkf.errors import InputError
-from dlkf.simulation.gnss.reporting import late, reported
+from dlkf.base.errors import InputError
+from dlkf.simulation.gnss.reporting import delay_fixes, report_fixes
 from dlkf.simulation.gnss.white import GnssConfig, episodes, observe
 from dlkf.simulation.imu import inverse_mechanisation
 from dlkf.simulation.motion.vehicle import Truth, VehicleConfig, drive_vehicle
@@ -104,12 +104,12 @@ def test_open_ambiguities_and_multipath_last_and_are_claimed():
 def test_reports_are_biased_and_drop_out():
     fixes = observe(np.random.default_rng(3), still(20_000), np.zeros((20_000, 3)), GnssConfig())
     config = GnssConfig(std_factor=0.5, dropout_share=0.1, dropout_s=4.0)
-    seen = reported(np.random.default_rng(1), fixes, config)
+    seen = report_fixes(np.random.default_rng(1), fixes, config)
     assert len(seen) / len(fixes) == pytest.approx(0.9, abs=0.015)  # 500 gaps
     gaps = np.diff(seen.t.to_numpy())
     assert gaps[gaps > 1.5].mean() - 1 == pytest.approx(4.5, abs=0.7)  # of those that hold a fix at all
     assert np.all(seen.std_pos_n == 0.01) and np.all(seen.lat_deg == fixes.lat_deg[fixes.t.isin(seen.t)].to_numpy())
-    assert reported(np.random.default_rng(1), fixes, GnssConfig()) is fixes
+    assert report_fixes(np.random.default_rng(1), fixes, GnssConfig()) is fixes
 
 
 @pytest.mark.parametrize(("place", "moving"), [(0.2, 0.2), (0.1, 0.3), (0.0, 0.25)])
@@ -120,7 +120,7 @@ def test_late_fixes_are_those_of_their_lag_before(place, moving):
     rate_b = np.random.default_rng(5).uniform(-0.3, 0.3, (len(truth.t), 3))
     rows = np.arange(0, len(truth.t), rate)
     config = GnssConfig(lever_arm_b=arm, position_lag_s=place, velocity_lag_s=moving, **QUIET)
-    seen, swing = late(truth, rate_b, rows, config, rate)
+    seen, swing = delay_fixes(truth, rate_b, rows, config, rate)
     fixes = observe(np.random.default_rng(0), seen, swing, config)
     on_time = observe(np.random.default_rng(0), truth, rate_b, GnssConfig(lever_arm_b=arm, **QUIET))
     assert np.array_equal(fixes.t, truth.t[rows])

@@ -18,7 +18,7 @@ from tests.simulation.oracle import (
     strapdown,
 )
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors, imu_spec
 from dlkf.simulation.imu import (
     ImuUnit,
@@ -27,7 +27,7 @@ from dlkf.simulation.imu import (
     draw_unit,
     gauss_markov,
     inverse_mechanisation,
-    put_out,
+    quantise,
 )
 from dlkf.simulation.motion.vehicle import Truth, VehicleConfig, drive_vehicle
 
@@ -209,9 +209,9 @@ def test_rate_random_walk_grows_with_the_root_of_time():
 
 def test_output_has_steps_and_an_end():
     x = np.array((-7.0, -0.26, 0.1, 0.14, 3.0))
-    assert put_out(x, SensorErrors(quantisation=0.25)).tolist() == [-7.0, -0.25, 0.0, 0.25, 3.0]
-    assert put_out(x, SensorErrors(full_scale=2.0)).tolist() == [-2.0, -0.26, 0.1, 0.14, 2.0]
-    assert put_out(x, SensorErrors()).tolist() == x.tolist()
+    assert quantise(x, SensorErrors(quantisation=0.25)).tolist() == [-7.0, -0.25, 0.0, 0.25, 3.0]
+    assert quantise(x, SensorErrors(full_scale=2.0)).tolist() == [-2.0, -0.26, 0.1, 0.14, 2.0]
+    assert quantise(x, SensorErrors()).tolist() == x.tolist()
     spec = ImuSpec("steps", SensorErrors(1e-3, quantisation=1e-2), SensorErrors(1e-4, full_scale=1.0))
     true = np.random.default_rng(1).normal(size=(500, 6))
     measured, error = corrupt(np.random.default_rng(2), true, spec, NO_UNIT, 100)

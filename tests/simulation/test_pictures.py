@@ -6,9 +6,9 @@ import pytest
 from tests.drives import drives_in
 from tests.simulation.test_dataset import config
 
+from dlkf.base.errors import InputError
 from dlkf.data.tables import read_drives
 from dlkf.data.validate import read_checked
-from dlkf.errors import InputError
 from dlkf.simulation.pictures import driving, write_pictures
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.simulation.test_chassis import preset
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 from dlkf.simulation.motion.routes import Manoeuvres, VehicleConfig, along, random_plan
 from dlkf.simulation.motion.vehicle import drive_vehicle, random_route
 

@@ -9,18 +9,18 @@ import yaml
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from dlkf.config import config_dir
-from dlkf.errors import InputError
+from dlkf.base.config import config_dir
+from dlkf.base.errors import InputError
 from dlkf.simulation.dataset import DatasetConfig
 from dlkf.simulation.gnss.almanac import read_almanac
 from dlkf.simulation.gnss.least_squares import Observations, solve
-from dlkf.simulation.gnss.obstruction import held, in_view
+from dlkf.simulation.gnss.obstruction import hold_visibility, in_view
 from dlkf.simulation.gnss.receiver import (
     Receiver,
     clock,
     gauss_markov,
-    growth,
     iono_mapping,
+    multipath_growth,
     receiver_spec,
     tropo_mapping,
 )
@@ -182,9 +182,23 @@ def test_a_wall_hides_what_is_below_its_edge():
 
 def test_held_waits_after_every_break():
     condition = np.array([1, 1, 1, 0, 1, 1, 1, 0, 0, 1, 1], bool)
-    assert held(condition, 0).tolist() == condition.tolist()
-    assert held(condition, 2).tolist() == [True, True, True, False, False, False, True, False, False, False, False]
-    assert np.array_equal(held(np.stack((condition, ~condition), -1), 1)[:, 1], held(~condition, 1))
+    assert hold_visibility(condition, 0).tolist() == condition.tolist()
+    assert hold_visibility(condition, 2).tolist() == [
+        True,
+        True,
+        True,
+        False,
+        False,
+        False,
+        True,
+        False,
+        False,
+        False,
+        False,
+    ]
+    assert np.array_equal(
+        hold_visibility(np.stack((condition, ~condition), -1), 1)[:, 1], hold_visibility(~condition, 1)
+    )
 
 
 def test_tunnels_are_outages_and_a_street_costs_geometry():
@@ -285,8 +299,10 @@ def test_datasets_that_cannot_be_are_one_clear_line(change, said):
 def test_errors_grow_towards_the_horizon_as_the_geometry_says():
     """One at the zenith; 1/sin E of a flat layer at 45°, less of a shell 350 km up; noise by its own law."""
     zenith, half = np.array([math.pi / 2]), np.array([math.pi / 4])
-    assert [float(f(zenith)[0]) for f in (growth, tropo_mapping, iono_mapping)] == pytest.approx([1, 1, 1], abs=1e-3)
+    assert [float(f(zenith)[0]) for f in (multipath_growth, tropo_mapping, iono_mapping)] == pytest.approx(
+        [1, 1, 1], abs=1e-3
+    )
     assert float(tropo_mapping(half)[0]) == pytest.approx(math.sqrt(2), rel=2e-3)
     shell = 1 / math.cos(math.asin(6378.1363 / 6728.1363 * math.cos(math.pi / 4)))
     assert float(iono_mapping(half)[0]) == pytest.approx(shell)
-    assert float(growth(half)[0]) == pytest.approx(math.sqrt(1.5))
+    assert float(multipath_growth(half)[0]) == pytest.approx(math.sqrt(1.5))

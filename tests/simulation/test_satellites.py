@@ -7,7 +7,7 @@ import pymap3d
 import pytest
 from scipy.optimize import brentq
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 from dlkf.simulation.gnss.almanac import ELEMENTS, PACKAGED, Almanac, read_almanac
 from dlkf.simulation.gnss.least_squares import Observations, solve
 from dlkf.simulation.gnss.satellites import EARTH_SPIN, GRAVITATION, LIGHT, satellite_state, signals

@@ -7,10 +7,10 @@ import pandas as pd
 import pytest
 from tests.drives import drives_in, recipe_of
 
+from dlkf.base.errors import InputError
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR, write_drive, write_drives_table
 from dlkf.data.validate import validate_dataset
-from dlkf.errors import InputError
 from dlkf.navigation.imu_errors import SensorErrors
 from dlkf.simulate import arguments_of_source
 from dlkf.simulation.semi_real import simulate_semi_real

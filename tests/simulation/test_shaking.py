@@ -9,11 +9,11 @@ from scipy.signal import welch
 from tests.simulation.oracle import apart, strapdown
 from tests.simulation.test_chassis import drive, later
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 from dlkf.simulation.imu import interval_means, inverse_mechanisation
 from dlkf.simulation.motion.chassis import ChassisConfig
 from dlkf.simulation.motion.routes import Kinematics, VehicleConfig
-from dlkf.simulation.motion.shaking import LIMIT, Shaken, Shaking, engine, gain, hum, limited, shaken
+from dlkf.simulation.motion.shaking import LIMIT, Shaken, Shaking, engine, gain, hum, limit_amplitude, shake_mount
 
 ALL = Shaking(
     engine=1.0, wheel=0.3, hum=0.4, wander=0.03, rumble=0.8, rattle=6.0, mount_hz=14.0, mount_damping=0.08,
@@ -30,10 +30,12 @@ def steady(speed: float):
     return motion
 
 
-def shake(kind: Shaking, speed: float, seconds: float = 60.0, seed: int = 0, right: float = 0.0) -> Shaken:
+def shake_body(kind: Shaking, speed: float, seconds: float = 60.0, seed: int = 0, right: float = 0.0) -> Shaken:
     t = np.arange(round(seconds * RATE) + 1) / RATE
     rng = np.random.default_rng(seed)
-    return shaken(rng, kind, steady(speed), t, np.ones_like, lambda t: (np.zeros_like(t), right + np.zeros_like(t)))
+    return shake_mount(
+        rng, kind, steady(speed), t, np.ones_like, lambda t: (np.zeros_like(t), right + np.zeros_like(t))
+    )
 
 
 def force(out: Shaken) -> np.ndarray:
@@ -84,7 +86,7 @@ def test_any_sample_rate_sees_the_same_shaking():
 def test_velocity_is_the_derivative_of_displacement(source):
     """Central differences at 1 kHz: their error is a''' dt²/6, below 3 % of the velocity of a 60 Hz tone."""
     kind = replace(Shaking(mount_hz=20.0, wander=0.02), **{source: 1.0})
-    out = shake(kind, 12.0)
+    out = shake_body(kind, 12.0)
     change = (out.moved[2:] - out.moved[:-2]) * RATE / 2
     assert out.moved_rate.std() > 0
     assert np.abs(change - out.moved_rate[1:-1]).max() < 0.05 * np.abs(out.moved_rate).max()
@@ -96,17 +98,17 @@ def test_the_stated_size_on_average_over_cars(source):
     """RMS over 40 cars' axes on a rigid mount; each axis has a log-normal share, so 1σ of the mean square is 13 %."""
     kind = replace(Shaking(hum_share=1.0, gears=0, shift_hz=75.0), **{source: 0.5})
     at = 15.0  # m/s, and 50 Hz of an engine between 25 and 75 Hz
-    squares = [np.mean(force(shake(kind, at, 20.0, seed)) ** 2) for seed in range(40)]
+    squares = [np.mean(force(shake_body(kind, at, 20.0, seed)) ** 2) for seed in range(40)]
     expected = 0.5 * (0.7 if source == "engine" else 1.0)  # an engine that only holds the speed pulls at 0.7
     assert math.sqrt(np.mean(squares)) == pytest.approx(expected, rel=0.2)
 
 
 def test_wheels_tell_the_speed_and_fans_do_not():
     for speed in (8.0, 16.0):
-        assert peak(force(shake(Shaking(wheel=0.5), speed))[:, 0]) == pytest.approx(0.51 * speed, abs=0.2)
+        assert peak(force(shake_body(Shaking(wheel=0.5), speed))[:, 0]) == pytest.approx(0.51 * speed, abs=0.2)
         fan = Shaking(hum=0.5, hum_hz=31.0, hum_share=1.0)
-        assert peak(force(shake(fan, speed))[:, 0]) == pytest.approx(31, abs=0.2)
-    fast, slow = (force(shake(Shaking(wheel=0.5), speed)).std() for speed in (16.0, 8.0))
+        assert peak(force(shake_body(fan, speed))[:, 0]) == pytest.approx(31, abs=0.2)
+    fast, slow = (force(shake_body(Shaking(wheel=0.5), speed)).std() for speed in (16.0, 8.0))
     assert fast / slow == pytest.approx(4, rel=0.02)
 
 
@@ -144,7 +146,9 @@ def test_a_soft_mount_amplifies_its_band():
     assert gain(kind, np.array([0.0])) == pytest.approx(1)
     assert gain(kind, np.array([20.0])) == pytest.approx(math.sqrt(1 + 0.01) / 0.1)
     assert gain(kind, np.array([20 * math.sqrt(2)])) == pytest.approx(1)
-    soft, rigid = (force(shake(Shaking(rumble=1.0, mount_hz=f, mount_damping=0.05), 15.0))[:, 0] for f in (20.0, 0.0))
+    soft, rigid = (
+        force(shake_body(Shaking(rumble=1.0, mount_hz=f, mount_damping=0.05), 15.0))[:, 0] for f in (20.0, 0.0)
+    )
     (f, through), (_, bare) = (welch(x, RATE, nperseg=4000) for x in (soft, rigid))
     ratio = through / bare
     highest = f[np.argmax(np.where((f > 8) & (f < 60), ratio, 0))]
@@ -155,23 +159,23 @@ def test_a_soft_mount_amplifies_its_band():
 def test_loudness_scales_all_and_bursts_make_the_noise_uneven():
     """Linear far from the limit; the mean square of bursts is that without them, within 2 · 10 % of its sampling."""
     kind = Shaking(rumble=1.0, rattle=5.0, wheel=0.5)
-    loud, low = (force(shake(replace(kind, loudness=x), 15.0)) for x in (1.0, 0.1))
+    loud, low = (force(shake_body(replace(kind, loudness=x), 15.0)) for x in (1.0, 0.1))
     assert np.abs(0.1 * loud - low).max() < 1e-3 * np.abs(loud).max()
-    even, uneven = (force(shake(Shaking(rumble=1.0, bursts=x), 15.0, 200.0)) for x in (0.0, 0.7))
+    even, uneven = (force(shake_body(Shaking(rumble=1.0, bursts=x), 15.0, 200.0)) for x in (0.0, 0.7))
     assert np.mean(uneven**2) == pytest.approx(np.mean(even**2), rel=0.2)
     fourth = [np.mean(x[:, 0] ** 4) / np.mean(x[:, 0] ** 2) ** 2 for x in (even, uneven)]
     assert fourth[0] == pytest.approx(3, abs=0.3) and fourth[1] > 4
     uneasy = [np.std(np.log(np.mean(x[:, 0].reshape(-1, RATE // 4) ** 2, -1))) for x in (even, uneven)]
     assert uneasy[1] > 3 * uneasy[0]  # bursts last: quarters of a second differ, and not the samples alone
     assert Shaking(loudness=0.0, rumble=1.0).is_still
-    wild = [force(shake(replace(Shaking(), **{name: 20.0}), 60.0)) for name in ("wheel", "rumble", "engine")]
+    wild = [force(shake_body(replace(Shaking(), **{name: 20.0}), 60.0)) for name in ("wheel", "rumble", "engine")]
     assert all(np.sqrt(np.mean(x**2)) < 2 * LIMIT for x in wild)  # twice: the axes' own shares
-    assert limited(np.array([0.5, 500.0])) == pytest.approx([0.5, LIMIT], rel=1e-4)
+    assert limit_amplitude(np.array([0.5, 500.0])) == pytest.approx([0.5, LIMIT], rel=1e-4)
 
 
 def test_knocks_do_not_depend_on_the_speed():
     kind = Shaking(rattle=10.0, rattle_per_minute=60.0)
-    still, fast = (force(shake(kind, v, 120.0)) for v in (0.0, 30.0))
+    still, fast = (force(shake_body(kind, v, 120.0)) for v in (0.0, 30.0))
     assert np.array_equal(still, fast)
     assert 3 < np.quantile(np.abs(still).max(0), 0.5) < 60
     kurtosis = np.mean(still**4) / np.mean(still**2) ** 2
@@ -179,7 +183,7 @@ def test_knocks_do_not_depend_on_the_speed():
 
 
 def test_a_swinging_mount_settles_where_the_load_holds_it():
-    out = shake(Shaking(sway=0.004, sway_hz=2.0, sway_damping=0.3), 10.0, right=3.0)
+    out = shake_body(Shaking(sway=0.004, sway_hz=2.0, sway_damping=0.3), 10.0, right=3.0)
     assert np.all(out.turned[-1, 0] < 0) and 0.3 * 0.012 <= -out.turned[-1, 0] <= 0.012
     assert np.abs(out.turned[-1] - out.turned[-2000]).max() < 1e-9 and out.turned[-1, 1] == pytest.approx(0)
     assert not out.moved.any()

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 from dlkf.simulation.gnss.surroundings import Surroundings, sky_along
 
 DISTANCE = np.arange(0.0, 200_000.0, 1.0)

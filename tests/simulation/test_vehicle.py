@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from tests.simulation.oracle import positions_and_integral
 
-from dlkf.errors import InputError
-from dlkf.simulation.motion.vehicle import VehicleConfig, drive_vehicle, follow, random_route
+from dlkf.base.errors import InputError
+from dlkf.simulation.motion.vehicle import VehicleConfig, drive_vehicle, follow_route, random_route
 
 RATE = 100
 
@@ -72,7 +72,7 @@ def test_positions_are_the_integral_of_the_velocities():
 def test_a_drive_may_begin_anywhere_on_its_route():
     """From the second minute on: positions are still the integral of the velocities."""
     route = random_route(np.random.default_rng(2), VehicleConfig(), 200.0)
-    truth = follow(route, VehicleConfig(), 100 + np.arange(60 * RATE + 1) / RATE)
+    truth = follow_route(route, VehicleConfig(), 100 + np.arange(60 * RATE + 1) / RATE)
     r_e, integral = positions_and_integral(truth, RATE)
     assert np.abs(r_e - integral).max() < 2e-5
 

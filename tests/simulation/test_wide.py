@@ -8,16 +8,16 @@ import pytest
 import torch
 from tests.drives import drive_in_memory
 
-from dlkf.command.simulated import composed_recipe
+from dlkf.base.errors import InputError
+from dlkf.command.simulated import compose_recipe
 from dlkf.data.store import load_dataset
-from dlkf.errors import InputError
 from dlkf.simulation.dataset import simulate
 
 SHORT = ("dataset.hours=0.05", "dataset.drive_minutes=1", "seed=4")
 
 
 def wide(*overrides: str, name: str = "wide"):
-    return composed_recipe(f"simulated@dataset={name}", *SHORT, *overrides)
+    return compose_recipe(f"simulated@dataset={name}", *SHORT, *overrides)
 
 
 @pytest.fixture(scope="module")

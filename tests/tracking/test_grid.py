@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from dlkf.points import SWEPT, Failure, listened, tell
-from dlkf.tracking.comparison import best_validation, monitored
+from dlkf.base.points import SWEPT, Failure, collect_failures, report_failure
+from dlkf.tracking.comparison import best_validation, monitored_metric
 from dlkf.tracking.grid import PARENT_RUN, GridParent, parent_status, run_name, swept_overrides
 from dlkf.tracking.runs import mlflow_module, start_run
 from tests.shell import PATIENCE_S
@@ -113,11 +113,11 @@ def test_children_in_other_experiments_are_found(uri, client, capsys):
 def test_a_point_that_never_began_a_run_is_named(uri, client, capsys):
     """It failed on its settings; the parent says so, and the other is compared and its champion registered."""
     grid = GridParent()
-    with listened():
+    with collect_failures():
         grid.on_multirun_start(sweep_config(uri))
         parent = os.environ[PARENT_RUN]
         point(uri, "good", 5.0)
-        assert tell(Failure("lr=fast", "optimizer.lr is 'fast', must be a number", mistake=True), 1)
+        assert report_failure(Failure("lr=fast", "optimizer.lr is 'fast', must be a number", mistake=True), 1)
         grid.on_multirun_end(OmegaConf.create())
     found = client.get_run(parent)
     assert found.info.status == "FAILED" and found.data.tags["best_run"] == "good"
@@ -132,11 +132,11 @@ def test_validation_is_what_kept_the_weights(uri, client):
         for epoch, loss in enumerate((0.1, 0.2, 0.7, 0.5)):
             run.log_metrics({"val/loss": loss}, step=epoch)
     found = client.get_run(run.id)
-    assert monitored([found]) == "val/loss" and best_validation(client, found, "val/loss") == 0.5
+    assert monitored_metric([found]) == "val/loss" and best_validation(client, found, "val/loss") == 0.5
     with start_run(uri, "town", "two") as run:
         run.log_config({"trainer": {"monitor": "val/gain_std"}})
         run.log_metrics({"val/loss": 1.0, "val/outage_end_m": 1.0, "val/gain_std": 3.0})
-    assert monitored([client.get_run(run.id)]) == "val/gain_std"
+    assert monitored_metric([client.get_run(run.id)]) == "val/gain_std"
 
 
 def test_keys_are_short_where_they_can_be(monkeypatch):
@@ -177,7 +177,7 @@ def test_the_parent_ends_as_its_children_do(statuses, ended, status):
 def test_a_single_run_is_named_by_what_was_changed(monkeypatch):
     monkeypatch.delenv(PARENT_RUN, raising=False)
     overrides = ["+experiment=outage", "+profile=quick", "seed=1", "tracking.uri=x", "filter@model=dlkf_literal"]
-    assert run_name("outage", overrides) == "outage quick seed=1 model=dlkf_literal"
+    assert run_name("outage", overrides) == "seed=1 model=dlkf_literal outage quick"
     assert run_name("town", ["name=town"]) == "town"
 
 
@@ -192,13 +192,10 @@ PROGRAM = """
 import os, sys
 from hydra import main
 from dlkf.tracking.runs import start_run, tracking_uri
-from dlkf.tracking.grid import PARENT_RUN, run_name
-from hydra.core.hydra_config import HydraConfig
 
 @main(version_base="1.3", config_path=".", config_name="conf")
 def task(cfg):
-    name = run_name(cfg.name, HydraConfig.get().overrides.task)
-    with start_run(tracking_uri(), cfg.name, name, parent_run_id=os.environ[PARENT_RUN]) as run:
+    with start_run(tracking_uri(), cfg.name, f"x={cfg.x}", parent_run_id=os.environ["DLKF_PARENT_RUN_ID"]) as run:
         for step in range(20):
             run.log_metrics({"train/loss": 1.0 / (step + 1)}, step)
         if cfg.x == 3:

@@ -17,15 +17,15 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from dlkf.base.errors import InputError
 from dlkf.data.rows import example_drive
 from dlkf.data.schema import drive_file
 from dlkf.data.store import load_dataset
-from dlkf.errors import InputError
 from dlkf.filters.saved import load_filter
 from dlkf.running.offline import navigate_drives
 from dlkf.tracking.comparison import best_of
 from dlkf.tracking.grid import PARENT_RUN, GridParent
-from dlkf.tracking.registry import check_registration, download_model, log_model, registered
+from dlkf.tracking.registry import REQUIRED, check_registration, download_model, log_model, register_model
 from dlkf.tracking.runs import mlflow_module, start_run
 from tests.shell import PATIENCE_S
 
@@ -155,14 +155,44 @@ def test_it_is_served_and_called_over_http(name, logged, uri, call):
     assert np.allclose(answer[["lat_deg", "vel_n"]].astype(float), here[["lat_deg", "vel_n"]], atol=1e-9)
 
 
+# Nothing but what a logged model's requirements bring, with what those require themselves, can be imported after this.
+ONLY_REQUIRED = f"""
+import sys
+from importlib.metadata import PackageNotFoundError, packages_distributions, requires
+from packaging.requirements import Requirement
+there, wanted = set(), {list(REQUIRED)!r}
+while wanted:
+    name = wanted.pop().lower().replace("_", "-").replace(".", "-")
+    if name in there:
+        continue
+    try:
+        needs = [Requirement(text) for text in requires(name) or ()]
+    except PackageNotFoundError:
+        continue
+    there.add(name)
+    wanted += [need.name for need in needs if need.marker is None or need.marker.evaluate({{"extra": ""}})]
+foreign = {{
+    module
+    for module, brought_by in packages_distributions().items()
+    if not {{d.lower().replace("_", "-").replace(".", "-") for d in brought_by}} & there
+}} - {{"dlkf"}}
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in foreign:
+            raise ModuleNotFoundError(f"No module named {{name!r}}: no requirement of the model brings it")
+sys.meta_path.insert(0, Refuse())
+assert {{"rich", "hydra", "lightning"}} <= foreign and "torch" not in foreign
+"""
+
+
 def test_a_logged_model_brings_its_code_and_no_pickle(logged, uri, cars):
-    """Loaded in an interpreter where pickles are refused; neither Hydra nor Lightning are needed to run it."""
+    """Loaded in an interpreter where pickles are refused and its requirements alone can be imported."""
     folder = download_model("models:/town/1", uri).parents[1]
     assert not [p for p in folder.rglob("*") if p.suffix in (".pkl", ".pickle", ".pt", ".ckpt", ".pyc")]
     requirements = (folder / "requirements.txt").read_text().split()
     assert all("==" in line and "+" not in line for line in requirements) and len(requirements) == 10
     program = (
-        "import sys, mlflow, pandas\n"
+        f"{ONLY_REQUIRED}import sys, mlflow, pandas\n"
         "from mlflow.environment_variables import MLFLOW_ALLOW_PICKLE_DESERIALIZATION as allowed\n"
         "assert not allowed.get()\n"
         f"model = mlflow.pyfunc.load_model({str(folder)!r})\n"
@@ -232,18 +262,21 @@ def test_names_the_registry_would_refuse(name, alias):
     check_registration(None, None)
 
 
-def test_a_moved_folder_keeps_its_models(logged, uri, weights, tmp_path):
-    """The store names absolute places: they follow it, and new runs do not go to where it was."""
-    moved = tmp_path / "moved here"
-    moved.mkdir()
-    for name in ("mlflow.db", "mlruns"):
-        shutil.move(tmp_path / name, moved / name)
-    there = f"sqlite:///{moved / 'mlflow.db'}"
-    assert same_weights(download_model("models:/town@champion", there), weights)
-    with start_run(there, "town", "two") as run:
+def test_a_store_that_was_moved_says_so(logged, uri, weights, tmp_path):
+    """It names absolute places; a new run would write to where it was."""
+    old, new = tmp_path / "here", tmp_path / "there"
+    old.mkdir()
+    with start_run(f"sqlite:///{old}/mlflow.db", "town", "one") as run:
         log_model(run, weights, register="town")
-    assert same_weights(download_model("models:/town/2", there), weights)
-    assert not (tmp_path / "mlruns").exists()
+    old.rename(new)
+    there = f"sqlite:///{new}/mlflow.db"
+    with pytest.raises(InputError, match="move its folder back"):
+        download_model("models:/town/1", there)
+    with pytest.raises(InputError, match="move the folder back"), start_run(there, "town", "two"):
+        pass
+    assert not old.exists()
+    new.rename(old)
+    assert same_weights(download_model("models:/town/1", f"sqlite:///{old}/mlflow.db"), weights)
 
 
 def test_the_best_of_a_grid_is_registered_at_its_end(uri, client, weights, capsys):
@@ -262,7 +295,7 @@ def test_the_best_of_a_grid_is_registered_at_its_end(uri, client, weights, capsy
     assert client.get_model_version_by_alias("town", "champion").run_id == ids[1]
     assert "Registered the best, rms 2.0: models:/town/1" in capsys.readouterr().out
     assert best_of(client, parent).info.run_id == ids[1] and best_of(client, ids[2]).info.run_id == ids[2]
-    version = client.get_model_version("town", registered(client, ids[0], "town"))
+    version = client.get_model_version("town", register_model(client, ids[0], "town"))
     assert version.run_id == ids[0] and "rms 5.0" in version.description
 
 

@@ -1,24 +1,32 @@
 """Runs: where they go, what they hold, how they end, how they are gone on with."""
 
+import gc
 import json
-import subprocess
-import sys
+import os
+import signal
 import time
+from contextlib import nullcontext
+from multiprocessing import Pipe
 
 import pytest
 import yaml
+from sqlalchemy.engine.default import DefaultDialect
+from sqlalchemy.orm import loading
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError, Terminated
 from dlkf.tracking import runs as tracking
+from dlkf.tracking.endings import PROCESS_TAG, TRACKING_URI, delay_signals
 from dlkf.tracking.runs import (
     VALUE_LENGTH,
-    flattened,
+    client_of,
+    flatten_config,
     lightning_logger,
     mlflow_module,
     start_run,
     store_missing,
     tracking_uri,
 )
+from tests.shell import PATIENCE_S, start_fork
 
 CONFIG = {"name": "town", "seed": 1, "optimizer": {"lr": 1e-3}, "data": {"datasets": ["a", "b"]}, "none": None}
 
@@ -39,13 +47,15 @@ def test_the_store_is_here_by_default(tmp_path, monkeypatch):
         tracking_uri("./mlruns")
 
 
+@pytest.mark.whole
 def test_trainings_that_begin_together_share_a_new_store(tmp_path):
-    begin = (
-        f"from dlkf.tracking.runs import client_of; client_of('sqlite:///{tmp_path}/mlflow.db').search_experiments()"
-    )
-    together = [subprocess.Popen([sys.executable, "-c", begin], stderr=subprocess.PIPE) for _ in range(3)]
-    said = [p.communicate()[1] for p in together]
-    assert [p.returncode for p in together] == [0, 0, 0], said
+    def begin():
+        client_of(f"sqlite:///{tmp_path}/mlflow.db").search_experiments()
+
+    together = [start_fork(tmp_path, tmp_path / f"said {k}", begin) for k in range(2)]
+    for k, process in enumerate(together):
+        process.join(PATIENCE_S)
+        assert process.exitcode == 0, (tmp_path / f"said {k}").read_text()
 
 
 def test_a_run_holds_what_was_logged(uri, client, tmp_path):
@@ -88,7 +98,7 @@ def test_a_long_note_ends_with_a_whole_line(uri, client):
 def test_parameters_are_cut_at_the_limits_of_mlflow(uri, client):
     """Also more parameters than fit into one request."""
     config = {"long": "x" * 10_000, "k" * 300: 1} | {f"p{i}": i for i in range(250)}
-    assert len(flattened(config)["long"]) == VALUE_LENGTH
+    assert len(flatten_config(config)["long"]) == VALUE_LENGTH
     with open_run(uri) as run:
         run.log_config(config)
     assert len(client.get_run(run.id).data.params) == 252
@@ -102,6 +112,115 @@ def test_the_status_tells_how_a_run_ended(uri, client, error, status):
     with pytest.raises(error), open_run(uri) as run:
         raise error
     assert client.get_run(run.id).info.status == status
+
+
+@pytest.mark.parametrize("given", [None, "http://127.0.0.1:9"])
+def test_the_store_of_a_run_is_that_of_what_it_starts_and_of_nothing_later(given, uri, monkeypatch):
+    """``mlflow.set_tracking_uri`` alone writes the store into the environment of all that this process ever starts."""
+    if given:
+        monkeypatch.setenv(TRACKING_URI, given)
+    before = mlflow_module().get_tracking_uri()
+    for ends in (nullcontext(), pytest.raises(KeyboardInterrupt)):
+        with ends, open_run(uri):
+            assert os.environ[TRACKING_URI] == mlflow_module().get_tracking_uri() == uri
+            if not isinstance(ends, nullcontext):
+                raise KeyboardInterrupt
+        assert os.environ.get(TRACKING_URI) == given and mlflow_module().get_tracking_uri() == before
+
+
+@pytest.mark.parametrize("statement", ["INSERT", "UPDATE"])
+def test_a_signal_inside_a_write_of_mlflow_ends_the_run(statement, uri, client, monkeypatch):
+    """The frames of the exception hold SQLite's cursor, and so the lock that the last write of the run waits for."""
+    armed = []
+
+    def interrupted(write):
+        def run(self, cursor, text, *rest, **more):
+            write(self, cursor, text, *rest, **more)
+            if armed and text.lstrip().startswith(statement):
+                armed.clear()
+                raise Terminated
+
+        return run
+
+    for name in ("do_execute", "do_executemany"):
+        monkeypatch.setattr(DefaultDialect, name, interrupted(getattr(DefaultDialect, name)))
+    with pytest.raises(Terminated), open_run(uri) as run:
+        run.log_metrics({"loss": 2.0})
+        armed.append(True)
+        run.log_metrics({"loss": 1.0, "rms": 3.0}, step=1)
+    assert armed == [] and client.get_run(run.id).info.status == "KILLED"
+
+
+def test_a_signal_between_rows_that_mlflow_reads_ends_the_run_at_once(uri, client, monkeypatch):
+    """An open cursor in a cycle of objects: its lock would keep the end of the run waiting for 20 s, or for ever."""
+    armed, processor = [], loading._instance_processor
+
+    def interrupted(*given, **more):
+        if armed:
+            armed.clear()
+            raise Terminated
+        return processor(*given, **more)
+
+    monkeypatch.setattr(loading, "_instance_processor", interrupted)
+    tries, end = [], mlflow_module().end_run
+
+    def counted(status):
+        tries.append(status)
+        end(status)
+        tries.append("done")
+
+    monkeypatch.setattr(mlflow_module(), "end_run", counted)
+    gc.disable()
+    try:
+        with pytest.raises(Terminated), open_run(uri) as run:
+            run.log_metrics({"loss": 2.0})
+            armed.append(True)
+            run.log_metrics({"loss": 1.0}, step=1)
+    finally:
+        gc.enable()
+    assert armed == [] and tries == ["KILLED", "done"], "the first try met a lock"
+    assert client.get_run(run.id).info.status == "KILLED"
+
+
+def test_the_run_of_a_process_that_was_killed_is_closed_by_the_next(uri, client, tmp_path):
+    """One that still runs, here or on another machine, is let be."""
+    ours, theirs = Pipe()
+
+    def dies_in_a_run():
+        with open_run(uri) as run:
+            theirs.send(run.id)
+            theirs.recv()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    other = start_fork(tmp_path, tmp_path / "said", dies_in_a_run)
+    assert ours.poll(PATIENCE_S), (tmp_path / "said").read_text()
+    killed = ours.recv()
+    with open_run(uri) as run:
+        elsewhere = client.create_run(client.get_run(run.id).info.experiment_id, tags={PROCESS_TAG: "elsewhere 1 2"})
+        assert client.get_run(killed).info.status == "RUNNING"
+    ours.send("now")
+    other.join(PATIENCE_S)
+    assert client.get_run(killed).info.status == "RUNNING", "nobody was there to say so"
+    with open_run(uri) as again:
+        assert client.get_run(killed).info.status == "KILLED"
+        assert client.get_run(again.id).info.status == client.get_run(elsewhere.info.run_id).info.status == "RUNNING"
+
+
+def test_a_signal_waits_for_a_block_and_a_second_one_does_not(monkeypatch):
+    before = signal.signal(signal.SIGTERM, lambda *_: done.append("handled"))
+    done: list[str] = []
+    try:
+        with delay_signals():
+            signal.raise_signal(signal.SIGTERM)
+            done.append("block")
+        assert done == ["block", "handled"]
+        with delay_signals():
+            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)
+            done.append("late")
+        assert done == ["block", "handled", "handled", "late"]
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def test_going_on_continues_the_same_run(uri, client):
@@ -136,10 +255,13 @@ def test_lightning_writes_into_the_run_and_does_not_end_it(uri, client):
         logger = lightning_logger(run)
         logger.log_hyperparams({"lr": 1})
         logger.log_metrics({"epoch": 7, "train/gradient_norm": 2.0, "train/loss": 0.5}, step=3)
+        logger.log_metrics({"epoch": 8, "val/a": 1.0, "val/loss": 0.5, "val/outage_end_m": 3.0}, step=4)
         logger.finalize("success")
         assert client.get_run(run.id).info.status == "RUNNING"
     found = client.get_run(run.id)
-    assert list(found.data.metrics) == ["train/loss", "train/gradient_norm"] and found.data.params == {}
+    # in the order in which they came: what chooses the best of a grid is what MLflow compares runs by first
+    kept = ["train/loss", "train/gradient_norm", "val/outage_end_m", "val/loss", "val/a"]
+    assert list(found.data.metrics) == kept and found.data.params == {}
     assert [(m.value, m.step) for m in client.get_metric_history(run.id, "train/loss")] == [(0.5, 7)]
 
 
@@ -163,4 +285,4 @@ def test_mistakes_are_one_line(uri, client, monkeypatch):
 
 
 def test_names_survive_as_json():
-    assert json.loads(flattened(CONFIG)["data.datasets"]) == ["a", "b"]
+    assert json.loads(flatten_config(CONFIG)["data.datasets"]) == ["a", "b"]

@@ -1,14 +1,15 @@
-"""A quarter of an hour with one IMU, in drives of three minutes."""
+"""Seven minutes with one IMU, in drives of a minute and a half."""
 
 from pathlib import Path
 
 import pytest
 
-from dlkf.command.composing import composed
+from dlkf.command.composing import compose_command
 from tests.drives import drives_in
 
 
 @pytest.fixture(scope="session")
-def dataset(tmp_path_factory) -> Path:
-    size = ["simulated@dataset=one_imu", "dataset.hours=0.25", "dataset.drive_minutes=3", "seed=1"]
-    return drives_in(composed("simulate", *size), tmp_path_factory.mktemp("data") / "tiny")
+def dataset(once) -> Path:
+    size = ["simulated@dataset=one_imu", "dataset.hours=0.125", "dataset.drive_minutes=1.5", "dataset.imu_rate_hz=50"]
+    config = compose_command("simulate", *size, "seed=1")
+    return once("tiny", lambda folder: drives_in(config, folder / "tiny")) / "tiny"

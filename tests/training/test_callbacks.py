@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 from dlkf.training.callbacks.curriculum import LengthCurriculum
 from dlkf.training.callbacks.guard import StepGuard
 from dlkf.training.callbacks.loss_weights import AdaptiveLossWeights
@@ -27,6 +27,14 @@ def test_curriculum_is_the_paper_s():
     data = SimpleNamespace(length_law=None)
     LengthCurriculum(20, 60, 1, 2).setup(SimpleNamespace(datamodule=data), None, "fit")
     assert data.length_law(0) == 20 and data.length_law(2) == 60
+
+
+def test_callbacks_hand_their_rules_to_the_module():
+    module, masks = SimpleNamespace(transforms=[], loss_weights=None), [GnssDecimation(), OutageInjection()]
+    for callback in (*masks, weights := AdaptiveLossWeights()):
+        callback.setup(None, module, "validate")
+        callback.setup(None, module, "fit")
+    assert module.transforms == [mask.transform for mask in masks] and module.loss_weights == weights.weights
 
 
 def test_weights_are_large_early_and_fall_with_the_position_loss():
@@ -72,7 +80,7 @@ def test_decimation_counts_seconds_where_epochs_are_shorter(epoch_s):
     assert (at * epoch_s).tolist() == pytest.approx([2.0 * (k + 1) for k in range(len(at))])
 
 
-def test_decimation_keeps_every_nth_fix_per_piece():
+def test_decimation_keeps_every_nth_fix_per_segment():
     batch = scene(200, 60)
     kept = GnssDecimation((2, 5)).transform(batch, 0, generator()).available
     intervals = set()

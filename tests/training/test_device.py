@@ -1,21 +1,27 @@
 """What a GPU would refuse, shown without one: the same training on a device that does not mix with the CPU's memory."""
 
+from pathlib import Path
+
 import lightning as L
 import pytest
 import torch
 from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.strategies import SingleDeviceStrategy
 
+from dlkf.command.composing import compose_command
+from dlkf.data.datamodule import DriveDataModule
+from dlkf.data.masks import Outage
 from dlkf.filters.integration import integrate
 from dlkf.filters.saved import learned_filter, learned_settings, load_filter
 from dlkf.training.callbacks.checkpoints import ResumePoint
 from dlkf.training.fit import fit
-from dlkf.training.loss import LossConfig, weighted
+from dlkf.training.loss import LossConfig, weighted_loss
 from dlkf.training.module import FilterTraining
 from tests.cars import car_batch
+from tests.drives import drives_in
 from tests.elsewhere import DEVICE, Elsewhere
 
-from .test_resume import data, told
+from .test_resume import fit_of, make_settings, settings
 
 
 class Pretended(CPUAccelerator):
@@ -25,7 +31,7 @@ class Pretended(CPUAccelerator):
         assert device == DEVICE
 
 
-LOSSES = {"dlkf": LossConfig(), "plus": LossConfig(prior=0.0, posterior=0.0, outage=1.0, likelihood=1.0, speed=1.0)}
+LOSSES = {"dlkf": LossConfig(), "plus": LossConfig(prior=0.0, posterior=0.0, outage=1.0, likelihood=1.0)}
 SIZES = {"dlkf": {"lstm_hidden": 16, "lstm_layers": 2, "dense": [16, 8], "dropout": 0.0}, "plus": {"hidden": 8}}
 
 
@@ -33,6 +39,7 @@ SIZES = {"dlkf": {"lstm_hidden": 16, "lstm_layers": 2, "dense": [16, 8], "dropou
     ("kind", "more"),
     [("dlkf", {}), ("dlkf", {"outage_mode": "run", "frame": "heading", "imu_error": "affine"}), ("plus", {})],
 )
+@pytest.mark.whole
 def test_loss_and_gradients_are_the_cpus_and_the_host_waits_for_nothing(kind, more):
     """Through another form of every loop, so to rounding in float64; a wait would be one in every epoch."""
     batch = car_batch(4, 12, 50)
@@ -42,7 +49,7 @@ def test_loss_and_gradients_are_the_cpus_and_the_host_waits_for_nothing(kind, mo
         torch.manual_seed(1)
         filter_ = learned_filter(learned_settings({"kind": kind, "network": SIZES[kind], **more})).double().to(device)
         loss = LOSSES[kind](integrate(batch, filter_, keep_covariances=kind == "plus"), batch)
-        weighted(loss, {}).backward()
+        weighted_loss(loss, {}).backward()
         return loss, {k: p.grad.to("cpu") for k, p in filter_.named_parameters() if p.grad is not None}
 
     ours, gradients = step(batch, "cpu")
@@ -59,10 +66,10 @@ def test_loss_and_gradients_are_the_cpus_and_the_host_waits_for_nothing(kind, mo
         assert torch.allclose(moved[name], gradient, rtol=1e-6, atol=1e-9 * float(gradient.abs().max())), name
 
 
-@pytest.mark.parametrize(("kind", "told"), [("dlkf", 620), ("plus", 1280)])
-def test_an_epoch_is_as_many_operations_as_the_docs_tell(kind, told):
+@pytest.mark.parametrize(("kind", "operations"), [("dlkf", 620), ("plus", 1120)])
+def test_an_epoch_is_as_many_operations_as_the_docs_tell(kind, operations):
     """Forth and back, with the networks as they are by default; the difference of two lengths leaves out what is done
-    once a batch. A loop over samples or pieces would make them many."""
+    once a batch. A loop over samples or segments would make them many."""
     counts = []
     for T in (4, 8):
         with Elsewhere() as device:
@@ -70,18 +77,32 @@ def test_an_epoch_is_as_many_operations_as_the_docs_tell(kind, told):
             batch = car_batch(2, T, 50, dtype=torch.float32).to(DEVICE)
             device.work = 0
             losses = LOSSES[kind](integrate(batch, filter_, keep_covariances=kind == "plus"), batch)
-            weighted(losses, {}).backward()
+            weighted_loss(losses, {}).backward()
             counts.append(device.work)
-    assert (counts[1] - counts[0]) / 4 == pytest.approx(told, rel=0.1)
+    assert (counts[1] - counts[0]) / 4 == pytest.approx(operations, rel=0.1)
 
 
+@pytest.fixture(scope="module")
+def dataset(once) -> Path:
+    """A quarter of an hour: of less, a weight may have a gradient of rounding's size, whose sign decides its step."""
+    size = ["simulated@dataset=one_imu", "dataset.hours=0.25", "dataset.drive_minutes=3", "seed=1"]
+    config = compose_command("simulate", *size)
+    return once("quarter", lambda folder: drives_in(config, folder / "quarter")) / "quarter"
+
+
+@pytest.mark.whole
 def test_a_whole_training_runs_there(dataset, tmp_path, monkeypatch):
     """Curriculum, masks, loss weights, validation and the kept weights, which are those of the CPU to rounding."""
+    given = settings(max_epochs=2, validate_every=2)
+    given["callbacks"]["curriculum"] |= {"warm_s": 10.0, "full_s": 20.0}
+    given["callbacks"]["outage"] |= {"duration_s": [3.0, 6.0], "before_s": 5.0}
 
     def trained(name: str):
-        pieces = data(dataset)
-        pieces.batch_size = 20
-        return load_filter(fit(told(max_epochs=2, validate_every=2), pieces, tmp_path / name, False)).state_dict()
+        segments = DriveDataModule(
+            [dataset], batch_size=20, length_s=20.0, eval_length_s=30.0, fractions=(0.6, 0.2, 0.2),
+            eval_outage=Outage(10.0, 10.0),
+        )  # fmt: skip
+        return load_filter(fit(fit_of(given), segments, tmp_path / name, False)).state_dict()
 
     trainer, here = L.Trainer, trained("here")
 
@@ -92,7 +113,9 @@ def test_a_whole_training_runs_there(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(ResumePoint, "on_train_epoch_end", lambda *_: None)  # torch.save does not know the device
     with Elsewhere():
         there = trained("there")
-    start = FilterTraining(told().model, told().loss, told().descent, seed=3).filter.state_dict()
+    start = FilterTraining(
+        make_settings().model, make_settings().loss, make_settings().descent, seed=3
+    ).filter.state_dict()
     for name, weight in here.items():
         assert torch.allclose(weight, there[name], rtol=0, atol=3e-4), name
     moved = max(float((here[name] - start[name]).abs().max()) for name in here if name.endswith("weight"))

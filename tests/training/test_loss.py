@@ -5,12 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
+from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.model_based import Ins
+from dlkf.navigation.attitude import rotation_from_vector
 from dlkf.navigation.state import NavState
-from dlkf.training.loss import LossConfig, loss_of, pva_losses, weighted
-from tests.filters.scene import scene
+from dlkf.training.loss import LossConfig, loss_of, pva_losses, weighted_loss
+from dlkf.training.outage_loss import likelihood_term
+from tests.filters.scene import IMU, scene
 
 
 def shifted(batch, solution, metres: float):
@@ -29,7 +32,44 @@ def test_smooth_l1_in_closed_form():
         losses = pva_losses(shifted(batch, solution, metres), batch, LossConfig(position_scale=scale))
         assert abs(float(losses["position"]) - expected) < 1e-9
         assert abs(float(losses["velocity"])) < 1e-12 and abs(float(losses["attitude"])) < 1e-12
-    assert float(weighted(losses, {"position": 2.0, "velocity": 1.0, "attitude": 1.0})) == 2 * float(losses["position"])
+    assert float(weighted_loss(losses, {"position": 2.0, "velocity": 1.0, "attitude": 1.0})) == 2 * float(
+        losses["position"]
+    )
+
+
+def test_velocity_and_attitude_in_closed_form():
+    """At the default scales, 0.1 m/s and 0.02 rad: e − 0.5 for 0.5 m/s along one axis, 0.5 e² for 0.01 rad."""
+    batch = scene(2, 5)
+    v = batch.truth.v_n.clone()
+    v[..., 1] += 0.5
+    turn = torch.zeros_like(v)
+    turn[..., 2] = 0.01
+    state = NavState(batch.truth.p_n, v, rotation_from_vector(turn) @ batch.truth.C_nb)
+    losses = pva_losses(replace(integrate(batch, Ins()), prior=state, posterior=state), batch, LossConfig())
+    assert float(losses["position"]) == 0.0
+    assert float(losses["velocity"]) == pytest.approx(4.5 / 3, rel=1e-9)
+    assert float(losses["attitude"]) == pytest.approx(0.5 * 0.25 / 3, rel=1e-6)
+
+
+def test_likelihood_is_that_of_students_t():
+    """½ log|P| + ½ (ν + 2) log(1 + eᵀP⁻¹e / ν), ν = 8, of a horizontal error with correlated components."""
+    batch = scene(1, 4)
+    batch = replace(batch, available=torch.tensor([[True, True, False, False]]))
+    solution = shifted(batch, integrate(batch, build_filter("mbkf15", IMU), keep_covariances=True), 3.0)
+    p = solution.posterior.p_n.clone()
+    p[..., 1] += 2.0
+    P = torch.tensor([[4.0, 1.5], [1.5, 9.0]], dtype=torch.float64)
+    updated = solution.covariances.updated.clone()
+    updated[..., :2, :2] = P
+    solution = replace(
+        solution,
+        posterior=solution.posterior._replace(p_n=p),
+        covariances=solution.covariances._replace(updated=updated),
+    )
+    e = torch.tensor([-3.0, 2.0], dtype=torch.float64)
+    expected = 0.5 * P.logdet() + 5 * torch.log1p(e @ torch.linalg.solve(P, e) / 8)
+    # the floor of 1e-4 m² under the variances shifts it by some 1e-5
+    assert float(likelihood_term(solution, batch)) == pytest.approx(float(expected), abs=1e-4)
 
 
 def test_unknown_truth_does_not_count_and_gives_no_nan():
@@ -41,12 +81,10 @@ def test_unknown_truth_does_not_count_and_gives_no_nan():
     known = torch.ones(3, 8, dtype=torch.bool)
     attitude, position = known.clone(), known.clone()
     attitude[0], position[1, 4:] = False, False
-    holed = replace(
-        batch, truth=NavState(p, batch.truth.v_n, C), attitude_valid=attitude, truth_valid=position
-    )
+    holed = replace(batch, truth=NavState(p, batch.truth.v_n, C), attitude_valid=attitude, truth_valid=position)
     imu = batch.imu.clone().requires_grad_()
     losses = pva_losses(integrate(replace(holed, imu=imu), Ins()), holed, LossConfig())
-    weighted(losses, dict.fromkeys(losses, 1.0)).backward()
+    weighted_loss(losses, dict.fromkeys(losses, 1.0)).backward()
     assert all(v.isfinite() for v in losses.values()) and imu.grad.isfinite().all()
 
 
@@ -62,7 +100,7 @@ def test_prior_and_posterior_shares():
 
 
 class Late:
-    """A loss of one's own: the position error at the end of the piece alone."""
+    """A loss of one's own: the position error at the end of the segment alone."""
 
     def __init__(self, scale: float = 1.0):
         self.scale = scale
@@ -77,7 +115,7 @@ def test_a_loss_of_one_s_own_takes_its_settings_and_no_others():
     own = {"_target_": f"{__name__}.Late", "scale": 2.0, "position_scale": 1.0}
     quarter, whole = (loss_of(own | {"scale": s})(solution, batch)["late"] for s in (2.0, 1.0))
     assert float(whole) == pytest.approx(4 * float(quarter)) and float(whole) > 0
-    assert float(weighted({"late": whole}, {"position": 5.0})) == float(whole)
+    assert float(weighted_loss({"late": whole}, {"position": 5.0})) == float(whole)
     with pytest.raises(InputError, match="takes no colour"):
         loss_of(own | {"colour": 1})
     with pytest.raises(InputError, match="PYTHONPATH"):

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from dlkf.errors import InputError
-from dlkf.training.optimization import Descent
+from dlkf.base.errors import InputError
+from dlkf.training.optimization import OptimizationPlan
 
 ADAMW = {"lr": 1e-3, "head_lr_factor": 0.3, "weight_decay": 1e-4}
 COSINE = {"restart_epochs": 10, "restart_factor": 1, "lr_min": 1e-5}
@@ -12,7 +12,7 @@ COSINE = {"restart_epochs": 10, "restart_factor": 1, "lr_min": 1e-5}
 
 def built(optimizer=ADAMW, scheduler=COSINE):
     body, heads = (torch.nn.Parameter(torch.ones(2)) for _ in range(2))
-    return Descent.of(optimizer, scheduler).build([body], [heads])
+    return OptimizationPlan.of(optimizer, scheduler).build([body], [heads])
 
 
 def test_without_a_name_it_is_adamw_with_cosine_restarts():

@@ -3,15 +3,15 @@
 import pytest
 import torch
 
-from dlkf.command.composing import composed
+from dlkf.base.errors import InputError
+from dlkf.command.composing import compose_command
 from dlkf.data.drive import Batch
-from dlkf.errors import InputError
 from dlkf.filters.integration import integrate
 from dlkf.filters.plus import PlusConfig, PlusFilter
 from dlkf.filters.saved import load_filter
-from dlkf.training.callbacks.roughening import Roughening
+from dlkf.training.callbacks.sensor_degradation import SensorDegradationCallback
 from dlkf.training.fit import fit
-from dlkf.training.loss import LossConfig, pva_losses, weighted
+from dlkf.training.loss import LossConfig, pva_losses, weighted_loss
 from tests.training.test_resume import fit_of
 
 from .test_resume import data
@@ -19,13 +19,14 @@ from .test_resume import data
 
 def settings(*overrides: str) -> dict:
     words = ["+experiment=plus", "data.datasets=[data/none]", "model.network.hidden=8", *overrides]
-    config = composed("train", *words, "trainer.best_from_epoch=0")
+    config = compose_command("train", *words, "trainer.best_from_epoch=0")
     config["trainer"] |= {"max_epochs": 2, "validate_every": 1, "accelerator": "cpu"}
-    config["callbacks"]["curriculum"] |= {"warm_s": 20.0, "full_s": 25.0}
-    config["callbacks"]["outage"] |= {"duration_s": [3.0, 8.0], "before_s": 5.0}
+    config["callbacks"]["curriculum"] |= {"warm_s": 14.0, "full_s": 16.0}
+    config["callbacks"]["outage"] |= {"duration_s": [2.0, 5.0], "before_s": 5.0}
     return config
 
 
+@pytest.mark.whole
 def test_it_trains_is_saved_and_fine_tuned(dataset, tmp_path):
     best = fit(fit_of(settings()), data(dataset), tmp_path / "fresh", False)
     model = load_filter(best)
@@ -48,17 +49,17 @@ def test_its_loss_knows_outages_and_its_own_covariance(dataset):
         solution = integrate(batch, model, keep_covariances=True)
         losses = pva_losses(solution, batch, config)
         assert set(losses) == {"outage", "likelihood"}
-        assert float(weighted(losses, {})) == pytest.approx(float(sum(losses.values())))
+        assert float(weighted_loss(losses, {})) == pytest.approx(float(sum(losses.values())))
         P = solution.covariances.updated
         sure = solution.covariances._replace(updated=P / 1e4)
         object.__setattr__(solution, "covariances", sure)
         assert pva_losses(solution, batch, config)["likelihood"] > losses["likelihood"]
 
 
-def test_roughening_takes_its_own_keys_alone():
-    assert Roughening(share=0.1).rough.share == 0.1
-    with pytest.raises(InputError, match=r"callbacks\.roughening: unknown key shaar"):
-        Roughening(shaar=0.1)
+def test_sensor_degradation_takes_its_own_keys_alone():
+    assert SensorDegradationCallback(share=0.1).rough.share == 0.1
+    with pytest.raises(InputError, match=r"callbacks\.sensor_degradation: unknown key shaar"):
+        SensorDegradationCallback(shaar=0.1)
 
 
 def test_without_its_own_weights_fine_tuning_says_so(dataset, tmp_path):

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 from dlkf.evaluation.metrics import end_errors
 from dlkf.filters.integration import integrate
 from dlkf.filters.saved import load_filter
 from dlkf.training.fit import fit
-from dlkf.training.processes import joined_by
+from dlkf.training.processes import with_workers
 from tests.numbers_in import numbers_in
 
-from .test_resume import data, told
+from .test_resume import data, make_settings
 
-EPOCHS = 3
+EPOCHS = 2
 ALONG = """
     import sys
     sys.path.insert(0, {root!r})
@@ -30,7 +30,7 @@ ALONG = """
 
 
 def settings(devices: int):
-    return told(max_epochs=EPOCHS, validate_every=1, devices=devices, strategy="ddp")
+    return make_settings(max_epochs=EPOCHS, validate_every=1, devices=devices, strategy="ddp")
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def trained(dataset, tmp_path_factory, request) -> list:
 
 
 def test_two_processes_learn_what_one_does(trained):
-    """Averaged gradients are sums in another order: rounding, which the steps of three epochs spread a little."""
+    """Averaged gradients are sums in another order: rounding, which the steps of two epochs spread a little."""
     (one, _), (two, _) = trained
     assert one["global_step"] == two["global_step"] >= EPOCHS
     for name, w in one["state_dict"].items():
@@ -69,7 +69,7 @@ def test_their_best_weights_score_alike(trained, dataset):
 
 
 def test_a_further_process_that_fails_is_said():
-    with pytest.raises(InputError, match="ended with code 3"), joined_by(("sh", "-c", "exit 3"), 2):
+    with pytest.raises(InputError, match="ended with code 3"), with_workers(("sh", "-c", "exit 3"), 2):
         raise AssertionError("the block must not begin")
 
 
@@ -78,7 +78,7 @@ SMALL = (
     "model.network.lstm_hidden=16", "model.network.lstm_layers=1", "model.network.dense=[16,8]", "trainer.max_epochs=2",
     "trainer.validate_every=1", "trainer.best_from_epoch=0", "trainer.accelerator=cpu", "callbacks.curriculum=null",
     "callbacks.outage={start_epoch:0,duration_s:[3,6],before_s:5,after_s:2}", "baselines.models=[ins]",
-    "baselines.tune=false", "baselines.pieces=6", "seed=2",
+    "baselines.tune=false", "baselines.segments=6", "seed=2",
 )  # fmt: skip
 
 

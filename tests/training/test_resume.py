@@ -1,36 +1,41 @@
 """Killed at any moment and started again, training ends with the same weights as if nothing had happened."""
 
-import subprocess
-import sys
-import textwrap
+import os
+import signal
 from contextlib import nullcontext
 
 import pytest
 import torch
 from safetensors.torch import load_file
 
-from dlkf.command.composing import composed, configuration_hash
+from dlkf.base.errors import InputError
+from dlkf.base.settings import settings_from
+from dlkf.command.composing import compose_command, configuration_hash
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.masks import Outage
-from dlkf.errors import InputError
-from dlkf.settings import settings_from
 from dlkf.training.fit import check_fit, fit
+from dlkf.training.module import FilterTraining
 from dlkf.training.run_folder import checked_digests, read_state, run_folder, write_state
 from dlkf.training.settings import FitSettings, TrainSettings
+from tests.shell import PATIENCE_S, start_fork
 
 
 def data(dataset) -> DriveDataModule:
     return DriveDataModule(
-        [dataset], batch_size=9, length_s=20.0, eval_length_s=30.0, fractions=(0.6, 0.2, 0.2),
-        eval_outage=Outage(10.0, 10.0),
+        [dataset],
+        batch_size=9,
+        length_s=12.0,
+        eval_length_s=18.0,
+        fractions=(0.6, 0.2, 0.2),
+        eval_outage=Outage(8.0, 6.0),
     )
 
 
 def settings(**trainer) -> dict:
-    train = composed("train", "seed=3")
+    train = compose_command("train", "seed=3")
     callbacks = train["callbacks"]
-    callbacks["curriculum"] |= {"warm_s": 10.0, "full_s": 20.0, "warm_until": 1, "full_from": 3}
-    callbacks["outage"] |= {"duration_s": [3.0, 6.0], "before_s": 5.0, "start_epoch": 2}
+    callbacks["curriculum"] |= {"warm_s": 8.0, "full_s": 12.0, "warm_until": 1, "full_from": 3}
+    callbacks["outage"] |= {"duration_s": [2.0, 4.0], "before_s": 4.0, "start_epoch": 2}
     train["trainer"] |= {"max_epochs": 5, "validate_every": 2, "best_from_epoch": 0, "accelerator": "cpu", **trainer}
     train["scheduler"]["restart_epochs"] = 3
     train["model"]["network"] |= {"lstm_hidden": 16, "lstm_layers": 2, "dense": [16, 8]}
@@ -41,7 +46,7 @@ def fit_of(values: dict) -> FitSettings:
     return settings_from(TrainSettings, values, "").fit
 
 
-def told(**trainer) -> FitSettings:
+def make_settings(**trainer) -> FitSettings:
     return fit_of(settings(**trainer))
 
 
@@ -49,39 +54,32 @@ def weights(folder) -> dict:
     return torch.load(folder / "last.ckpt", weights_only=True)["state_dict"]
 
 
-KILLED = """
-    import os, sys, pickle
-    import lightning as L
-    from dlkf.training.module import FilterTraining
-    sys.path.insert(0, {root!r})
-    from tests.training import test_resume as t
-    step = FilterTraining.training_step
-    def dying(self, batch, index):
-        if self.global_step >= {at}:
-            os.kill(os.getpid(), 9)
-        return step(self, batch, index)
-    FilterTraining.training_step = dying
-    from pathlib import Path
-    t.fit(t.told(), t.data({dataset!r}), Path({folder!r}), False)
-"""
-
-
-def test_kill_minus_nine_changes_nothing(dataset, tmp_path, request):
+@pytest.mark.whole
+def test_kill_minus_nine_changes_nothing(dataset, tmp_path):
     """A real SIGKILL in the middle of an epoch against an uninterrupted run: equal bit by bit."""
-    root = str(request.config.rootpath)
-    fit(told(), data(dataset), tmp_path / "whole", False)
-    folder = tmp_path / "killed"
-    for at in (5,):
-        script = textwrap.dedent(KILLED.format(root=root, at=at, dataset=str(dataset), folder=str(folder)))
-        died = subprocess.run([sys.executable, "-c", script], cwd=root, capture_output=True, text=True, check=False)
-        assert died.returncode == -9, died.stderr[-2000:]
-    fit(told(), data(dataset), folder, False)
+    fit(make_settings(), data(dataset), tmp_path / "whole", False)
+    folder, step = tmp_path / "killed", FilterTraining.training_step
+
+    def dies():
+        def dying(self, batch, index):
+            if self.global_step >= 5:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return step(self, batch, index)
+
+        FilterTraining.training_step = dying
+        fit(make_settings(), data(dataset), folder, False)
+
+    process = start_fork(tmp_path, tmp_path / "said", dies)
+    process.join(PATIENCE_S)
+    assert process.exitcode == -signal.SIGKILL, (tmp_path / "said").read_text()
+    fit(make_settings(), data(dataset), folder, False)
     one, other = weights(tmp_path / "whole"), weights(folder)
     assert one.keys() == other.keys() and all(torch.equal(one[k], other[k]) for k in one)
     best = [load_file(f / "best" / "weights.safetensors") for f in (tmp_path / "whole", folder)]
     assert all(torch.equal(best[0][k], best[1][k]) for k in best[0])
 
 
+@pytest.mark.whole
 def test_training_moves_towards_the_reference(dataset, tmp_path):
     """The loss falls on a tiny network in a few epochs."""
     from dlkf.filters.integration import integrate
@@ -103,9 +101,10 @@ def test_training_moves_towards_the_reference(dataset, tmp_path):
     assert loss(after) < 0.9 * loss(before)
 
 
+@pytest.mark.whole
 def test_without_outages_the_loss_chooses_the_weights(dataset, tmp_path):
     """No outage in validation: every better epoch is kept by val/loss, not the first one for ever."""
-    plain = DriveDataModule([dataset], batch_size=9, length_s=20.0, eval_length_s=30.0, fractions=(0.6, 0.2, 0.2))
+    plain = DriveDataModule([dataset], batch_size=9, length_s=12.0, eval_length_s=18.0, fractions=(0.6, 0.2, 0.2))
     chosen = settings(max_epochs=3, validate_every=1)
     best = fit(fit_of(chosen), plain, tmp_path / "run", False)
     state = torch.load(tmp_path / "run" / "last.ckpt", weights_only=True)["callbacks"]
@@ -115,9 +114,10 @@ def test_without_outages_the_loss_chooses_the_weights(dataset, tmp_path):
 
 def test_an_unknown_monitor_is_said_clearly(dataset, tmp_path):
     with pytest.raises(InputError, match="val/colour is not logged; choose one of val/gain_std"):
-        fit(told(max_epochs=1, validate_every=1, monitor="val/colour"), data(dataset), tmp_path / "run", False)
+        fit(make_settings(max_epochs=1, validate_every=1, monitor="val/colour"), data(dataset), tmp_path / "run", False)
 
 
+@pytest.mark.whole
 def test_other_data_than_the_unfinished_run_began_with_are_refused(dataset, tmp_path):
     digests = checked_digests([str(dataset)], {})
     assert checked_digests([str(dataset)], {"data": digests}) == digests
@@ -128,7 +128,7 @@ def test_other_data_than_the_unfinished_run_began_with_are_refused(dataset, tmp_
 @pytest.mark.parametrize(("epochs", "every", "start", "some"), [(1, 1, 3, False), (4, 3, 3, False), (6, 3, 3, True)])
 def test_epochs_of_which_none_is_validated_are_refused_before_any_work(epochs, every, start, some):
     """Validated are the 3rd and the 6th of six, of which the latter comes after three."""
-    plan = told(max_epochs=epochs, validate_every=every, best_from_epoch=start)
+    plan = make_settings(max_epochs=epochs, validate_every=every, best_from_epoch=start)
     with nullcontext() if some else pytest.raises(InputError, match="no epoch would be validated"):
         check_fit(plan)
 

@@ -1,4 +1,4 @@
-"""Noise is tuned on pieces with noise and biases."""
+"""Noise is tuned on segments with noise and biases."""
 
 from pathlib import Path
 

@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from dlkf.data.masks import withhold
+from dlkf.data.masks import withhold_fixes
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.tuning import Tuning
-from dlkf.tuning.descent import FACTORS, Advised, descended
+from dlkf.tuning.descent import FACTORS, ScaledFilter, tune_by_gradient
 from dlkf.tuning.search import outage_error
 from tests.filters.scene import IMU, scene
 
@@ -16,24 +16,22 @@ from tests.filters.scene import IMU, scene
 @pytest.fixture(scope="module")
 def batch():
     whole = scene(4, 40, seed=3)
-    return withhold(whole, OutagePlan(20.0, 15.0).masks(whole)[0])
+    return withhold_fixes(whole, OutagePlan(20.0, 15.0).masks(whole)[0])
 
 
 def test_a_factor_by_advice_is_a_factor_by_tuning(batch):
-    advised = Advised(build_filter("mbkf33_car", IMU, tuning=Tuning()))
+    advised = ScaledFilter(build_filter("mbkf33_car", IMU, tuning=Tuning()))
     with torch.no_grad():
         advised.logarithms.copy_(torch.linspace(-0.5, 1.0, len(FACTORS)))
         there = integrate(batch, advised).posterior.p_n
-    told = integrate(batch, build_filter("mbkf33_car", IMU, tuning=advised.tuning())).posterior.p_n
+    expected = integrate(batch, build_filter("mbkf33_car", IMU, tuning=advised.tuning())).posterior.p_n
     plain = integrate(batch, build_filter("mbkf33_car", IMU, tuning=Tuning())).posterior.p_n
-    assert (there - told).abs().max() < 1e-9  # m: rounding
+    assert (there - expected).abs().max() < 1e-9  # m: rounding
     assert (there - plain).abs().max() > 1
 
 
 def test_it_descends(batch):
     kalman = build_filter("mbkf33_car", IMU, tuning=Tuning(accel_noise=30.0, lateral_std=2.0))
-    found = descended(kalman, batch, 34, steps=6)
-    before, after = (
-        outage_error(build_filter("mbkf33_car", IMU, tuning=t), [batch]) for t in (kalman.tuning, found)
-    )
+    found = tune_by_gradient(kalman, batch, 34, steps=6)
+    before, after = (outage_error(build_filter("mbkf33_car", IMU, tuning=t), [batch]) for t in (kalman.tuning, found))
     assert after < 0.97 * before

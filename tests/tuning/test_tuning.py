@@ -9,22 +9,22 @@ import pytest
 import torch
 import yaml
 
-from dlkf.console import warned
-from dlkf.data.masks import withhold
-from dlkf.errors import InputError
+from dlkf.base.console import warn_once
+from dlkf.base.errors import InputError
+from dlkf.data.masks import withhold_fixes
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.tuning import Tuning
 from dlkf.onboard.library import compiler
 from dlkf.tuning.baselines import tuned_baselines
-from dlkf.tuning.search import FACTORS, factors_of, mean_imu_error, outage_error, tuned
-from dlkf.tuning.study import check, sides
+from dlkf.tuning.search import FACTORS, factors_of, mean_imu_error, outage_error, tune_filter
+from dlkf.tuning.study import check_settings, train_test_drives
 from tests.cars import IMU
 
 
 def hidden(batch):
-    return withhold(batch, OutagePlan(30.0, 20.0).masks(batch)[0])
+    return withhold_fixes(batch, OutagePlan(30.0, 20.0).masks(batch)[0])
 
 
 def test_objectives_are_what_they_say(cars):
@@ -37,7 +37,7 @@ def test_objectives_are_what_they_say(cars):
     assert found["log"] == pytest.approx(float(ends.log().mean().exp()))
 
 
-def test_one_lost_piece_decides_rms_but_not_the_median(cars):
+def test_one_lost_segment_decides_rms_but_not_the_median(cars):
     batch = hidden(cars)
     imu = batch.imu.clone()
     imu[0, 30:] += torch.tensor([2.0, 2.0, 0, 0, 0, 0.1])
@@ -52,12 +52,13 @@ def test_a_search_mends_noise_that_is_told_too_small(cars):
     small = replace(IMU, accel=replace(IMU.accel, noise_density=1e-5), gyro=replace(IMU.gyro, noise_density=1e-6))
     trials = []
     factors = {"accel_noise": (1.0, 100.0), "gyro_noise": (1.0, 100.0)}
-    best, score = tuned(small, [hidden(cars)], factors=factors, rounds=1, progress=trials.append)
+    best, score = tune_filter(small, [hidden(cars)], factors=factors, rounds=1, progress=trials.append)
     assert (best.accel_noise, best.gyro_noise) != (1.0, 1.0)
     assert score == min(t.score for t in trials) < outage_error(build_filter("mbkf15", small), [hidden(cars)])
 
 
 @pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+@pytest.mark.whole
 def test_a_search_in_c_finds_what_one_in_torch_finds(cars, monkeypatch):
     """Every trial, though C takes sums in another order."""
     factors = {"accel_noise": (3.0, 10.0), "velocity_std": (2.0,), "lateral_std": (0.1,)}
@@ -65,7 +66,9 @@ def test_a_search_in_c_finds_what_one_in_torch_finds(cars, monkeypatch):
     for least in (10**9, 1):  # torch, C
         monkeypatch.setattr("dlkf.tuning.search.IN_C", least)
         trials = []
-        best, score = tuned(IMU, [hidden(cars)], name="mbkf15_nhc", factors=factors, rounds=1, progress=trials.append)
+        best, score = tune_filter(
+            IMU, [hidden(cars)], name="mbkf15_nhc", factors=factors, rounds=1, progress=trials.append
+        )
         found.append((best, score, [t.score for t in trials]))
     (best, score, scores), (best_c, score_c, scores_c) = found
     assert best == best_c and len(set(scores)) == len(scores)
@@ -87,9 +90,9 @@ def test_a_search_that_cannot_run_in_c_says_so_once(wrong, cars, monkeypatch, tm
         monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
     monkeypatch.setattr("dlkf.tuning.search.IN_C", 1)
-    warned.cache_clear()
+    warn_once.cache_clear()
     for _ in range(1 if wrong == "a compiler that fails" else 2):  # that one takes seconds to find out
-        tuned(IMU, [hidden(cars)], factors={"accel_noise": (3.0,)}, rounds=1)
+        tune_filter(IMU, [hidden(cars)], factors={"accel_noise": (3.0,)}, rounds=1)
     lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("dlkf: warning: ")]
     assert len(lines) == 1 and "trials run in torch, some 3 × slower: " in lines[0]
     assert {"no compiler": "install one", "a compiler that fails": "it ended with 1"}.get(wrong, str(cache)) in lines[0]
@@ -105,20 +108,20 @@ def test_every_filter_has_the_factors_that_it_uses():
 
 
 def one_unit(batch):
-    """All pieces with the sensor matrices of one unit, 2 % of scale and misalignment, and an IMU that is told so."""
+    """All segments with the sensor matrices of one unit, 2 % of scale and misalignment, and an IMU that is told so."""
     M = torch.zeros(2, 3, 3, dtype=torch.float64)
     M[0, 0, 0], M[0, 1, 0], M[1, 2, 2] = 0.02, 0.02, -0.02
     forces, rates = (batch.imu[..., :3] @ M[0].mT, batch.imu[..., 3:] @ M[1].mT)
     wide = {"scale_factor": 0.02, "misalignment": 0.02}
-    told = replace(IMU, accel=replace(IMU.accel, **wide), gyro=replace(IMU.gyro, **wide))
-    return replace(batch, imu=batch.imu + torch.cat((forces, rates), -1)), told, M
+    expected = replace(IMU, accel=replace(IMU.accel, **wide), gyro=replace(IMU.gyro, **wide))
+    return replace(batch, imu=batch.imu + torch.cat((forces, rates), -1)), expected, M
 
 
-def test_many_pieces_together_show_the_sensor_matrices_of_their_unit(cars):
-    batch, told, M = one_unit(cars)
-    prior = mean_imu_error(told, Tuning(), [hidden(batch)], "mbkf33")
+def test_many_segments_together_show_the_sensor_matrices_of_their_unit(cars):
+    batch, expected, M = one_unit(cars)
+    prior = mean_imu_error(expected, Tuning(), [hidden(batch)], "mbkf33")
     assert len(prior.mean) == len(prior.std) == 24
-    states = build_filter("mbkf33", told).states
+    states = build_filter("mbkf33", expected).states
     of = {(s, e): 6 + 9 * s + k for s in range(2) for k, e in enumerate(states.elements)}
     for place in ((0, (0, 0)), (0, (1, 1)), (1, (2, 2))):  # what speeding up and turning show
         mean, std = (x[of[place]] for x in (prior.mean, prior.std))
@@ -127,17 +130,23 @@ def test_many_pieces_together_show_the_sensor_matrices_of_their_unit(cars):
 
 
 def test_a_filter_that_is_told_its_unit_drifts_less(cars):
-    batch, told, _ = one_unit(cars)
-    found = tuned_baselines(["mbkf15_prior", "mbkf33", "mbkf33_prior"], told, [hidden(batch)], rounds=0, say=str)
+    batch, expected, _ = one_unit(cars)
+    found = tuned_baselines(["mbkf15_prior", "mbkf33", "mbkf33_prior"], expected, [hidden(batch)], rounds=0, say=str)
     assert len(found.priors["mbkf15_prior"].mean) == 6 and len(found.priors["mbkf33_prior"].mean) == 24
-    told, untold = (outage_error(found.build()[n], [hidden(batch)]) for n in ("mbkf33_prior", "mbkf33"))
-    assert told < 0.8 * untold
+    expected, untold = (outage_error(found.build()[n], [hidden(batch)]) for n in ("mbkf33_prior", "mbkf33"))
+    assert expected < 0.8 * untold
+
+
+def test_untuned_baselines_keep_the_factors_that_they_begin_with(cars):
+    coarse = Tuning(position_std=25.0, velocity_std=2.5)
+    found = tuned_baselines(["ins", "mbkf15", "mbkf21"], IMU, [hidden(cars)], rounds=0, say=str, start=coarse)
+    assert found.tunings == {"ins": Tuning(), "mbkf15": coarse, "mbkf21": coarse}
 
 
 @pytest.mark.parametrize("model", ["ins", "mbkf15_prior", "no_such"])
 def test_what_has_no_noise_of_its_own_is_refused(model):
     with pytest.raises(InputError, match=f"model={model}"):
-        check(model, "rms")
+        check_settings(model, "rms")
 
 
 def test_the_command_writes_factors_that_evaluate_takes(uri, call, town):
@@ -155,6 +164,6 @@ def test_the_command_writes_factors_that_evaluate_takes(uri, call, town):
 
 
 def test_a_split_that_cuts_drives_is_refused():
-    """Pieces of one drive on both sides: what is tuned on would be tested on."""
+    """Segments of one drive on both sides: what is tuned on would be tested on."""
     with pytest.raises(InputError, match="split=group"):
-        sides([], "random", (0.7, 0.15, 0.15), 0, 60.0)
+        train_test_drives([], "random", (0.7, 0.15, 0.15), 0, 60.0)

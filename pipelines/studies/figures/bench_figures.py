@@ -17,9 +17,9 @@ import torch
 from matplotlib.figure import Figure
 from rich.table import Table
 
+from dlkf.base.files import write_into
+from dlkf.base.provenance import describe_provenance
 from dlkf.evaluation.figures import png
-from dlkf.files import staged
-from dlkf.provenance import provenance
 
 BAR = 24
 OVER = "over "  # groups that begin so are drawn
@@ -28,7 +28,7 @@ BLUE = "#0072B2"
 
 @dataclass
 class Timing:
-    """A work's times by its repeats; with ``units`` what is told are units a second."""
+    """A work's times by its repeats; with ``units`` units a second are printed."""
 
     group: str
     work: str
@@ -80,9 +80,7 @@ class Bench:
             times.append(self.clock() - start)
         return self.add(Timing(group, work, times, units, at))
 
-    def in_turns(
-        self, group: str, calls: Mapping[str, Callable[[], object]], repeats: int, units: float = 0.0
-    ) -> None:
+    def in_turns(self, group: str, calls: Mapping[str, Callable[[], object]], repeats: int, units: float = 0.0) -> None:
         """The same of calls that are to be compared, round by round: a machine's speed wanders."""
         times: dict[str, list[float]] = {work: [] for work in calls}
         for k in range(1 + min(repeats, self.most_repeats)):
@@ -148,10 +146,10 @@ class Bench:
         """``bench.json`` and ``bench.png``, whole or not at all."""
         rows = []
         for f in self.figures:
-            told = {"median": f.median, "best": f.best, "p99_s": f.p99, "repeats": len(f.seconds)}
-            rows.append(asdict(f) | {"seconds": f.seconds[:20]} | told)
-        with staged(folder) as beside:
-            text = json.dumps({"machine": machine, **provenance(), "figures": rows}, indent=1)
+            expected = {"median": f.median, "best": f.best, "p99_s": f.p99, "repeats": len(f.seconds)}
+            rows.append(asdict(f) | {"seconds": f.seconds[:20]} | expected)
+        with write_into(folder) as beside:
+            text = json.dumps({"machine": machine, **describe_provenance(), "figures": rows}, indent=1)
             (beside / "bench.json").write_text(text, encoding="utf-8")
             if (picture := self.picture()) is not None:
                 (beside / "bench.png").write_bytes(png(picture))

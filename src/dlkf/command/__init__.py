@@ -15,22 +15,22 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 import dlkf
+from dlkf.base.config import config_dir
+from dlkf.base.errors import InputError, Terminated
+from dlkf.base.files import resolve_place
+from dlkf.base.settings import Settings, settings_from
 from dlkf.command import sweeps
-from dlkf.command.arguments import check_options, checked_seeds, readable
-from dlkf.command.composing import plain
-from dlkf.command.faults import fault
+from dlkf.command.arguments import check_options, check_out, check_presets, check_seeds, quote_argument, with_near_key
+from dlkf.command.composing import to_plain
+from dlkf.command.faults import describe_fault
 from dlkf.command.help import help_text
-from dlkf.config import config_dir
-from dlkf.errors import InputError, Terminated
-from dlkf.files import placed
-from dlkf.settings import Settings, settings_from
 
 MISTAKE, INTERRUPTED, TERMINATED = 2, 130, 143
 stopped_by: list[int] = []  # signals that came while a command ran
 
 
-# ``dataset=`` and ``model=`` choose a preset in one command and name a folder in another. Hydra knows a group by
-# its folder alone, so the presets lie in folders of other names and the first kind of command says which.
+# ``dataset=`` and ``model=`` choose a preset in one command and name a folder in another. Hydra identifies a group by
+# its folder alone, so the presets lie in folders of other names and the first type of command says which.
 GROUPS = {"simulate": {"dataset": "simulated"}, "train": {"model": "filter"}}
 
 
@@ -55,20 +55,21 @@ def command(
                     raise InputError(f"{key} is missing; give {key}=…")
                 if sweep and cfg.get("out"):
                     with open_dict(cfg):
-                        cfg.out = str(placed(cfg.out) / sweeps.folder(hydra_config))
-                checked_seeds(OmegaConf.to_container(cfg))
-                values = plain(cfg)
+                        cfg.out = str(resolve_place(cfg.out) / sweeps.job_folder(hydra_config))
+                check_seeds(OmegaConf.to_container(cfg))
+                values = to_plain(cfg)
+                check_out(values)
                 function(values if settings is None else settings_from(settings, values, ""))
             except Exception as error:
                 if sweep and not stopped_by:
-                    sweeps.set_down(error, hydra_config)
+                    sweeps.record_failure(error, hydra_config)
                 else:
-                    _end(error)
+                    _end(error, name)
 
         @wraps(function)
         def main() -> None:
             if {"--help", "-h"} & set(sys.argv[1:]):
-                print(help_text(name, GROUPS.get(name, {})))
+                print_help(name)
                 return
             if "--version" in sys.argv[1:]:
                 print(f"dlkf {dlkf.__version__}")
@@ -80,13 +81,14 @@ def command(
             before = {number: signal.signal(number, _stop) for number in heeded}
             try:
                 given = [with_group(argument, GROUPS.get(name, {})) for argument in arguments(sys.argv[1:])]
-                sys.argv[1:] = [readable(argument) for argument in given]
+                sys.argv[1:] = [quote_argument(argument) for argument in given]
                 check_options(sys.argv[1:])
-                with sweeps.heard():
+                check_presets(given)
+                with sweeps.collect_job_failures():
                     run = hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)
                     run(task)()
             except (Exception, KeyboardInterrupt) as error:
-                _end(error)
+                _end(error, name)
             finally:
                 for number, handler in before.items():
                     signal.signal(number, handler)
@@ -96,7 +98,12 @@ def command(
     return decorate
 
 
-def typed(*keys: str) -> list[str]:
+def print_help(name: str) -> None:
+    """The page of a command."""
+    print(help_text(name, GROUPS.get(name, {})))
+
+
+def typed_words(*keys: str) -> list[str]:
     """What was typed for these keys or for parts of them: ``imu=consumer``, ``imu.gyro.noise_density=1e-4``."""
     words = HydraConfig.get().overrides.task
     return [word for word in words if word.partition("=")[0].lstrip("+").split(".")[0] in keys]
@@ -110,7 +117,7 @@ def same_command(name: str) -> list[str]:
     return [sys.executable, "-m", f"dlkf.{name}", *given, *config.overrides.task]
 
 
-def _end(error: BaseException) -> NoReturn:
+def _end(error: BaseException, name: str) -> NoReturn:
     """One line and an exit code for a stop, a mistake, or a fault of the machine; a fault of ours goes on up.
 
     A reader written in C makes an error of its own of an interrupt in a call back to Python: the signal counts.
@@ -119,9 +126,9 @@ def _end(error: BaseException) -> NoReturn:
         terminated = signal.SIGTERM in stopped_by or isinstance(error, Terminated)
         print(f"dlkf: {'terminated' if terminated else 'interrupted'}", file=sys.stderr)
         sys.exit(TERMINATED if terminated else INTERRUPTED)
-    if (said := fault(error)) is None:
+    if (said := describe_fault(error)) is None:
         raise error
-    print(f"dlkf: error: {said}", file=sys.stderr)
+    print(f"dlkf: error: {with_near_key(said, name)}", file=sys.stderr)
     sys.exit(MISTAKE)
 
 

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from hydra._internal.utils import get_args_parser
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
-from dlkf.errors import InputError
-from dlkf.settings import is_number
+from dlkf.base.config import config_dir
+from dlkf.base.documents import read_yaml
+from dlkf.base.errors import InputError, did_you_mean
+from dlkf.base.files import is_url
+from dlkf.base.settings import is_number
 
 SWITCHED_OFF = ("outage", "injected_bias", "smoother", "export")  # where none means null
 
@@ -27,7 +32,33 @@ def check_options(arguments: list[str]) -> None:
     parser.parse_args([word for word in arguments if word.startswith("-") or "=" not in word])
 
 
-def readable(argument: str) -> str:
+def check_presets(arguments: Sequence[str]) -> None:
+    """InputError for a preset of a ``--config-dir`` folder that Hydra could not read, or that names what Hydra calls.
+
+    Such a folder may have come with a dataset.
+    """
+    folders, words = get_args_parser().parse_known_args(list(arguments))[0].config_dir, []
+    for word in arguments if folders else ():
+        key, equals, value = word.lstrip("+").partition("=")
+        if equals and not word.startswith("-"):
+            names = value.strip("[]'\"").split(",")
+            words += [(key.partition("@")[0], name.strip("'\" ")) for name in names]
+    for group, name in words:
+        file = Path(folders) / group / f"{name}.yaml"
+        if group and name and file.is_file():
+            values = read_yaml(file)
+            if isinstance(values, Mapping) and _names_calls(values.get("hydra")):
+                raise InputError(f"{file}: names under hydra what Hydra is to call; a preset of yours must not")
+
+
+def _names_calls(values: Any) -> bool:
+    """Whether a class or function is named for Hydra or for its logging to call."""
+    if isinstance(values, Mapping):
+        return bool({"_target_", "()"} & set(values)) or any(map(_names_calls, values.values()))
+    return isinstance(values, list) and any(map(_names_calls, values))
+
+
+def quote_argument(argument: str) -> str:
     """An override that Hydra's grammar takes: a value that it does not is quoted, ``~/`` is the home folder.
 
     ``out=Straße (1)`` → ``out='Straße (1)'``; in a list every word by itself. What is in the grammar stays as it is.
@@ -37,8 +68,8 @@ def readable(argument: str) -> str:
     if not equals or argument.startswith(("-", "~")):
         return argument
     listed = value.startswith("[") and value.endswith("]")
-    words = [at_home(word.strip()) for word in value[1:-1].split(",")] if listed else []
-    value = f"[{','.join(words)}]" if "~" in value and listed else at_home(value)
+    words = [expand_home(word.strip()) for word in value[1:-1].split(",")] if listed else []
+    value = f"[{','.join(words)}]" if "~" in value and listed else expand_home(value)
     if value.lower() == "none" and key in SWITCHED_OFF:
         value = "null"
     if _parses(f"{key}={value}"):
@@ -51,7 +82,7 @@ def readable(argument: str) -> str:
     return quoted if _parses(quoted) else argument
 
 
-def at_home(path: str) -> str:
+def expand_home(path: str) -> str:
     """``~/…`` and ``~user/…`` written out, as shells do where they see a path. InputError for an unknown user."""
     if not path.startswith("~"):
         return path
@@ -74,10 +105,51 @@ def _quoted(value: str) -> str:
     return "'" + value.replace("'", "\\'") + "'"
 
 
-def checked_seeds(values: Any, where: str = "") -> None:
+def check_seeds(values: Any, where: str = "") -> None:
     """InputError for a seed, at any depth, that no generator of random numbers takes."""
     for key, value in values.items() if isinstance(values, Mapping) else ():
         path = f"{where}{key}"
         if (key == "seed" or str(key).endswith("_seed")) and is_number(value) and not 0 <= value < 2**63:
             raise InputError(f"{path} is {value!r}, must be a whole number ≥ 0")
-        checked_seeds(value, f"{path}.")
+        check_seeds(value, f"{path}.")
+
+
+def check_out(values: Mapping[str, Any]) -> None:
+    """InputError for an ``out`` that is what the command reads, lies in its dataset, or would take it away."""
+    out = values.get("out")
+    if not isinstance(out, str) or not out or is_url(out):
+        return
+    place = Path(out).expanduser().resolve()
+    for key in ("dataset", "source"):
+        read = values.get(key)
+        for name in read if isinstance(read, list) else [read]:
+            if not isinstance(name, str) or not name or is_url(name):
+                continue
+            folder = Path(name).expanduser().resolve()
+            if place == folder:
+                raise InputError(f"out={out} is the {key} itself; give another folder")
+            if key == "dataset" and folder in place.parents:
+                raise InputError(f"out={out} lies in the dataset {name}; give a folder outside it")
+            if values.get("overwrite") and place in folder.parents:
+                raise InputError(f"out={out} holds the {key} {name}, which overwrite=true would remove")
+
+
+def with_near_key(line: str, command: str) -> str:
+    """A line about an unknown key with the key of the command that is meant, where one is close."""
+    if not (unknown := re.match(r"unknown config key '([^']+)'; ", line)) or GlobalHydra.instance().is_initialized():
+        return line  # within a command: a key that was added on purpose
+    from dlkf.command.composing import compose_command
+
+    key, rest = unknown[1], line[unknown.end() :]
+    if (config_dir() / key).is_dir():
+        return f"{line[: unknown.end()]}a preset is chosen with a plus: +{key}=…; {rest}"
+    known = list(_paths(compose_command(command, resolve=False)))
+    return line[: unknown.end() - 2] + (did_you_mean(key, known) or ";") + " " + rest
+
+
+def _paths(values: Mapping[str, Any], above: str = "") -> Iterator[str]:
+    """All keys, with those above them."""
+    for key, value in values.items():
+        yield above + str(key)
+        if isinstance(value, Mapping):
+            yield from _paths(value, f"{above}{key}.")

@@ -10,22 +10,22 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from dlkf.config import config_dir
+from dlkf.base.config import config_dir
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 
 NOT_HASHED = ("tracking", "resume")
 NOT_HASHED_OF_TRAINER = ("devices", "strategy")  # the same training on more processes
 
 
-def composed(command: str, *overrides: str, resolve: bool = True) -> dict[str, Any]:
+def compose_command(command: str, *overrides: str, resolve: bool = True) -> dict[str, Any]:
     """What a command is given with these words, without running it."""
     with initialize_config_dir(str(config_dir()), version_base="1.3"):
-        return plain(compose(command, overrides=list(overrides)), resolve=resolve)
+        return to_plain(compose(command, overrides=list(overrides)), resolve=resolve)
 
 
 def imu_preset(name: str) -> ImuSpec:
     """Of ``conf/imu``."""
-    return imu_spec(composed("allan", f"imu={name}")["imu"])
+    return imu_spec(compose_command("allan", f"imu={name}")["imu"])
 
 
 def configuration_hash(values: Mapping[str, Any]) -> str:
@@ -36,7 +36,7 @@ def configuration_hash(values: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()[:8]
 
 
-def plain(config: DictConfig, *, resolve: bool = True) -> dict[str, Any]:
+def to_plain(config: DictConfig, *, resolve: bool = True) -> dict[str, Any]:
     """Mappings, lists and values, with what refers to other keys filled in."""
     made = OmegaConf.to_container(config, resolve=resolve)
     assert isinstance(made, dict)

@@ -9,12 +9,13 @@ from collections.abc import Iterator
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError, did_you_mean
 
 AGAIN = "then give the same command again"
 OF_THE_DISK = {
     errno.ENOSPC: f"the disk is full; make room, {AGAIN}",
     errno.EDQUOT: f"the quota of the disk is used up; make room, {AGAIN}",
+    errno.EFBIG: f"the file would be larger than is allowed here; raise the limit (ulimit -f), {AGAIN}",
     errno.EROFS: "the disk is read-only; run from a folder that can be written to",
     errno.EACCES: "permission denied; run from a folder that can be written to, or mend its permissions",
     errno.EPERM: "permission denied; run from a folder that can be written to, or mend its permissions",
@@ -32,11 +33,15 @@ SAID = {
     r"CUDA out of memory|MPS backend out of memory": "the memory of the GPU is full; give a smaller data.batch_size",
     r"No supported gpu backend|CUDAAccelerator. can not run|MPSAccelerator. can not run": "there is no GPU that "
     "PyTorch can use; give trainer.accelerator=cpu",
+    r"not positive-definite|input matrix is singular": "the filter diverged: its covariance is none any more; see "
+    "whether dlkf doctor finds faulty samples or fixes, and whether imu= fits the IMU",
+    r"can't allocate memory|Unable to allocate|not enough memory": "the memory of this machine is full; give fewer or "
+    "shorter drives, or a smaller model",
     r"invalid accelerator name|[Yy]ou selected an invalid": "trainer.accelerator is unknown; known: auto, cpu, gpu",
 }
 
 
-def fault(error: BaseException) -> str | None:
+def describe_fault(error: BaseException) -> str | None:
     """One line: what a user or the machine did wrong, where, and how to mend it."""
     chain = list(_chain(error))
     for link in chain:
@@ -46,6 +51,8 @@ def fault(error: BaseException) -> str | None:
         if isinstance(link, OSError) and link.errno in OF_THE_DISK:
             where = f"{link.filename}: " if link.filename else ""
             return f"{where}{OF_THE_DISK[link.errno]}"
+    if any(isinstance(link, MemoryError) for link in chain):
+        return "the memory of this machine is full; give fewer or shorter drives, or look for a file that is no log"
     for link in chain:
         for pattern, meaning in SAID.items():
             if re.search(pattern, str(link)):
@@ -71,7 +78,8 @@ def one_line(error: BaseException) -> str:
     text = str(error)
     if missing := re.search(r"Could not find '([^']+)'", text):
         options = re.search(r"Available options in '([^']+)':\n((?:\t.*\n?)+)", text)
-        hint = f"; available in {options[1]}: {', '.join(options[2].split())}" if options else ""
+        near = did_you_mean(missing[1].rpartition("/")[2], options[2].split()) if options else ""
+        hint = f"{near or ';'} available in {options[1]}: {', '.join(options[2].split())}" if options else ""
         return f"unknown preset or config {missing[1]!r}{hint}"
     if missing := re.search(r"Could not load '([^']+)'", text):
         return f"unknown preset or config {missing[1]!r}; --help names those that there are"

@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 
-from dlkf.config import config_dir
+from dlkf.base.config import config_dir
 
 MOST = {
     "simulate": ("dataset.hours", "dataset.drive_minutes", "seed", "out", "pictures"),
@@ -51,7 +51,7 @@ def help_text(name: str, aliases: Mapping[str, str]) -> str:
         lines[-1] = "It has no presets."
     lines += ["", "Keys that matter most (key=value):"]
     for key in MOST[name]:
-        value, says = described(text, key)
+        value, says = describe_key(text, key)
         lines.append(f"  {key}={'…' if value == '???' else value}" + (f"  {says}" if says else ""))
     more = "All keys with their values: --cfg job. Several values, one run each: -m key=a,b. Presets of your own: "
     more += "--config-dir <folder>, laid out as conf/ is (imu/mine.yaml, then imu=mine)."
@@ -97,7 +97,7 @@ def keys_of(text: str) -> dict[str, tuple[str, str]]:
     return found
 
 
-def described(text: str, key: str) -> tuple[str, str]:
+def describe_key(text: str, key: str) -> tuple[str, str]:
     """Value and comment of a key, from the file itself or from the preset that its defaults list takes."""
     own = keys_of(text)
     if key in own:

@@ -1,15 +1,14 @@
-"""What the commands are told that take GNSS away and measure: evaluate, tune, consistency."""
+"""Settings of the commands that take GNSS away and score against a reference: evaluate, tune."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from dlkf.command.settings import (
+    DriveSelection,
     FilterSettings,
-    OnDrives,
-    Store,
+    StoreSettings,
     check_above_zero,
     check_file_name,
     check_not_below_zero,
@@ -18,17 +17,12 @@ from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.masks import BiasLaw
 from dlkf.data.segments import StartLaw
 from dlkf.data.splits import Split
-from dlkf.diagnosis.matched_drives import MatchedDrives
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Protocol
-from dlkf.ranges import has_ranges, middle
-from dlkf.settings import settings_from
-from dlkf.simulation.motion.chassis import ChassisConfig
-from dlkf.simulation.motion.routes import VehicleConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scored:
+class ScoringSettingsBase:
     """The scenes, and what is taken away in them."""
 
     mode: str
@@ -45,7 +39,7 @@ class Scored:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateSettings(FilterSettings, OnDrives, Scored):
+class EvaluateSettings(FilterSettings, DriveSelection, ScoringSettingsBase):
     """``dlkf evaluate``."""
 
     name: str
@@ -56,72 +50,28 @@ class EvaluateSettings(FilterSettings, OnDrives, Scored):
     unseen: bool
     settle_s: float
     baseline: str
-    tracking: Store
+    tracking: StoreSettings
 
     def __post_init__(self) -> None:
         check_not_below_zero(self, "settle_s")
 
 
 @dataclass(frozen=True, kw_only=True)
-class TuneSettings(FilterSettings, OnDrives, Scored):
+class TuneSettings(FilterSettings, DriveSelection, ScoringSettingsBase):
     """``dlkf tune``."""
 
     name: str
     objective: str
     minutes: float
     rounds: int
-    pieces: int | None
+    segments: int | None
     split: Split
     fractions: Sequence[float]
     split_seed: int
     rate_hz: float
     epoch_s: float
-    tracking: Store
+    tracking: StoreSettings
 
     def __post_init__(self) -> None:
         check_file_name(self.name)
-        check_above_zero(self, "minutes", "rounds", "pieces")
-
-
-@dataclass(frozen=True)
-class Fixes:
-    """White noise of the fixes, 1σ per axis."""
-
-    position_m: float
-    velocity_mps: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class ConsistencySettings(FilterSettings):
-    """``dlkf consistency``; ``vehicle`` and ``chassis`` may hold ranges."""
-
-    chassis: Mapping[str, Any]
-    vehicle: Mapping[str, Any]
-    start: StartLaw
-    outage: OutagePlan | None = None
-    drives: int
-    minutes: float
-    rate_hz: int
-    gnss: Fixes
-    settle_s: float
-    seed: int
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "drives", "minutes", "rate_hz")
-        check_not_below_zero(self, "settle_s")
-
-    @property
-    def matched(self) -> MatchedDrives:
-        """The drives to simulate."""
-        return MatchedDrives(
-            drives=self.drives,
-            minutes=self.minutes,
-            rate_hz=self.rate_hz,
-            position_m=self.gnss.position_m,
-            velocity_mps=self.gnss.velocity_mps,
-            vehicle=settings_from(VehicleConfig, middle(self.vehicle), "vehicle"),
-            chassis=settings_from(ChassisConfig, middle(self.chassis), "chassis"),
-            start=self.start,
-            seed=self.seed,
-            cars=self.chassis if has_ranges(self.chassis) else None,
-        )
+        check_above_zero(self, "minutes", "rounds", "segments")

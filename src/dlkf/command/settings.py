@@ -1,7 +1,7 @@
-"""What each command is told, typed: the keys of ``conf/<command>.yaml``, whose comments say what they mean.
+"""Settings of each command, typed: the keys of ``conf/<command>.yaml``, whose comments explain them.
 
-Of the commands that score in :mod:`dlkf.command.scored`, of ``simulate`` in :mod:`dlkf.command.simulated`, of ``train``
-in :mod:`dlkf.training.settings`. A mapping stands where a class of one's own or ranges may be named.
+Of the commands that score in :mod:`dlkf.command.scored`, of ``simulate`` in :mod:`dlkf.simulation.dataset`, of
+``train`` in :mod:`dlkf.training.settings`. A mapping stands where a class of one's own or ranges may be named.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from dlkf.base.errors import InputError
 from dlkf.data.alignment import AlignConfig
-from dlkf.errors import InputError
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 
@@ -20,7 +20,7 @@ Names = Any  # a word or a list of words, of which some may be numbers to YAML: 
 
 
 @dataclass(frozen=True)
-class Store:
+class StoreSettings:
     """An MLflow store, and what of this command is to be kept there."""
 
     uri: str | None
@@ -28,8 +28,8 @@ class Store:
 
 
 @dataclass(frozen=True)
-class Known:
-    """What filters with ``_prior`` are told, if anything."""
+class PriorSettings:
+    """Prior information of filters with ``_prior``, if any."""
 
     mean: Sequence[float] | None
     std: Sequence[float] | None
@@ -37,18 +37,18 @@ class Known:
 
 @dataclass(frozen=True, kw_only=True)
 class FilterSettings:
-    """Of the commands that take filters: which, and what they are told."""
+    """Of the commands that take filters: which, and their settings."""
 
     model: Names
     imu: Mapping[str, Any]
     tuning: Tuning
-    prior: Known = Known(None, None)
+    prior: PriorSettings = PriorSettings(None, None)
     out: str
     overwrite: bool = False
 
     @property
-    def told(self) -> dict[str, Any]:
-        """For :func:`dlkf.models.resolve_model`, beside the preset."""
+    def filter_options(self) -> dict[str, Any]:
+        """For :func:`dlkf.tracking.models.resolve_model`, beside the preset."""
         mean, std = self.prior.mean, self.prior.std
         return {"tuning": self.tuning, "prior": None if mean is None or std is None else Prior(mean, std)}
 
@@ -69,17 +69,18 @@ class FilterSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnDrives:
+class DriveSelection:
     """Of the commands that read drives of a dataset."""
 
     dataset: str
     drives: Names
     rate_hz: float | None
     epoch_s: float | None
+    aids: Names = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class NavigateSettings(FilterSettings, OnDrives):
+class NavigateSettings(FilterSettings, DriveSelection):
     """``dlkf navigate``, which alone finds the noise itself with ``imu=auto``."""
 
     export: Names
@@ -90,11 +91,11 @@ class NavigateSettings(FilterSettings, OnDrives):
     compiled: bool
     align: AlignConfig
     skip_unaligned: bool
-    tracking: Store
+    tracking: StoreSettings
 
     @property
     def spec(self) -> ImuSpec:
-        """The preset of ``imu=``, or the one that says: find it."""
+        """The preset of ``imu=``, or that of ``imu=auto``."""
         return imu_spec(self.imu, auto=True)
 
 
@@ -104,10 +105,12 @@ class ExportSettings(FilterSettings):
 
     rate_hz: float | None
     epoch_s: float | None
+    precision: Literal["double", "float"]
     dataset: str | None
     drive: Names
+    aids: Names = None
     latency: bool
-    tracking: Store
+    tracking: StoreSettings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,6 +125,7 @@ class IngestSettings:
     shortest_s: float
     gap_s: float
     gap_samples: float
+    skip_unsure: bool
     parallel: int | str | None
 
 
@@ -168,7 +172,7 @@ class RegisterSettings:
     model: str | None
     name: str
     alias: str | None
-    tracking: Store
+    tracking: StoreSettings
 
 
 def check_above_zero(settings: Any, *names: str) -> None:

@@ -1,53 +1,29 @@
-"""What ``dlkf simulate`` is told, and the recipe that its presets make."""
+"""Datasets by the presets of ``dlkf simulate``: a recipe, and those of a training that are not there yet."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from hydra import compose
 from rich.console import Console
 
-from dlkf.command.composing import composed, plain
-from dlkf.config import config_dir
-from dlkf.errors import InputError
-from dlkf.settings import settings_from
-from dlkf.simulation.dataset import Recipe, recipe, simulate
+from dlkf.base.config import config_dir
+from dlkf.base.errors import InputError
+from dlkf.base.settings import settings_from
+from dlkf.command.composing import compose_command, to_plain
+from dlkf.simulation.dataset import Recipe, SimulateSettings, simulate
 
 
-@dataclass(frozen=True, kw_only=True)
-class SimulateSettings:
-    """``dlkf simulate``; the presets may hold ranges."""
-
-    dataset: Mapping[str, Any]
-    imu: Mapping[str, Any]
-    receiver: Mapping[str, Any] | None
-    seed: int
-    out: str
-    raw: bool
-    source: str | None
-    pictures: bool
-    overwrite: bool
-    workers: int | None
-    parallel: int | str | None
-
-    @property
-    def recipe(self) -> Recipe:
-        """What the drives are made by."""
-        return recipe(self.dataset, self.imu, self.seed, self.receiver, raw=self.raw)
-
-
-def composed_recipe(*overrides: str) -> Recipe:
+def compose_recipe(*overrides: str) -> Recipe:
     """What ``dlkf simulate`` makes drives by with these words."""
-    return settings_from(SimulateSettings, composed("simulate", *overrides), "").recipe
+    return settings_from(SimulateSettings, compose_command("simulate", *overrides), "").recipe
 
 
 HOUR_SEED = 71  # the roads of the long drives are not those of the others
 
 
-def make_missing(datasets: Sequence[str], console: Console, seed: int = 1) -> None:
+def simulate_missing(datasets: Sequence[str], console: Console, seed: int = 1) -> None:
     """Simulate the datasets under ``data/`` that have a preset and are not there yet."""
     for dataset in datasets:
         path = Path(dataset)
@@ -57,7 +33,7 @@ def make_missing(datasets: Sequence[str], console: Console, seed: int = 1) -> No
         console.print(f"{dataset} is not there: simulating it")
         preset = compose("simulate", overrides=[f"simulated@dataset={path.name}", f"seed={seed}"])
         try:
-            simulate(settings_from(SimulateSettings, plain(preset), "").recipe, path)
+            simulate(settings_from(SimulateSettings, to_plain(preset), "").recipe, path)
         except InputError:
             if not path.exists():  # else a run beside this one made the same drives first
                 raise

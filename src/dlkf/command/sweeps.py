@@ -9,23 +9,23 @@ from contextlib import contextmanager
 
 from hydra.conf import HydraConf
 
-from dlkf.command.faults import fault
-from dlkf.points import Failure, changed, failures, listened, tell
+from dlkf.base.points import Failure, collect_failures, failures, report_failure, swept_overrides_of
+from dlkf.command.faults import describe_fault
 
 MISTAKES, FAULTS = 2, 1  # exit codes: all failed by mistakes of the user, some by faults of ours
 
 
-def folder(hydra_config: HydraConf) -> str:
+def job_folder(hydra_config: HydraConf) -> str:
     """Folder of a point: its number and what it changes, as ``0-imu=consumer``."""
-    return f"{hydra_config.job.num}-{changed(hydra_config.overrides.task)}".replace("/", "-")[:100]
+    return f"{hydra_config.job.num}-{swept_overrides_of(hydra_config.overrides.task)}".replace("/", "-")[:100]
 
 
-def set_down(error: Exception, hydra_config: HydraConf) -> None:
-    """Say that a point failed and let the sweep go on; raises the error where nobody would hear of it."""
-    said = fault(error)
-    point = changed(hydra_config.overrides.task)
+def record_failure(error: Exception, hydra_config: HydraConf) -> None:
+    """Record that a job failed and continue the sweep; raises the error where no sweep collects it."""
+    said = describe_fault(error)
+    point = swept_overrides_of(hydra_config.overrides.task)
     failure = Failure(point, said or f"{type(error).__name__}: {error}", mistake=said is not None)
-    if not tell(failure, hydra_config.job.num):
+    if not report_failure(failure, hydra_config.job.num):
         raise error
     if said is None:
         traceback.print_exception(error)
@@ -33,9 +33,9 @@ def set_down(error: Exception, hydra_config: HydraConf) -> None:
 
 
 @contextmanager
-def heard() -> Iterator[None]:
-    """Round a command that may be a sweep: a last line names the points that failed, the exit code says so."""
-    with listened():
+def collect_job_failures() -> Iterator[None]:
+    """Round a command that may be a sweep: a last line names the points that failed, the exit code is then not 0."""
+    with collect_failures():
         yield
         failed = failures()
     if failed:

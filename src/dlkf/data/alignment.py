@@ -1,8 +1,17 @@
 """Attitude at every epoch boundary from IMU and GNSS alone: course for yaw, levelling for roll and pitch.
 
 Over a window that ends at the boundary the gyroscopes carry the specific force to the boundary's body axes,
-u_b = mean(C_b(end)b(t) f_b(t)), and GNSS tells the same vector in n, u_n = Δv/Δt − g. With yaw ψ from the
+u_b = mean(C_b(end)b(t) f_b(t)), and GNSS gives the same vector in n, u_n = Δv/Δt − g. With yaw ψ from the
 course, C_nb u_b = u_n is solved for roll and pitch in closed form (Groves sect. 5.6.2, with motion).
+
+A receiver without velocities has them fitted to the positions of :data:`FIT_S`. With north + i east as one complex
+number and α(t) the yaw from the boundary back to t by the gyroscopes, a car that does not slip has the velocity
+v(t) = e^{iα(t)} (z − w τ), τ = t_end − t, so
+
+    p(t) = p_end − z ∫ e^{iα} dτ + w ∫ τ e^{iα} dτ,
+
+which is linear in position, velocity z and acceleration w at the boundary; w has a prior of :data:`ACCELERATION_STD`,
+so that coarse positions are fitted by a constant speed and fine ones by an accelerated motion.
 """
 
 from __future__ import annotations
@@ -14,10 +23,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dlkf.base.errors import InputError
 from dlkf.data.drive import Drive
-from dlkf.errors import InputError
 from dlkf.navigation.attitude import prefix_rotations, rotation_from_rpy, rotation_from_vector, rpy_from_rotation
-from dlkf.navigation.earth import EARTH_RATE, ned_axes, normal_gravity
+from dlkf.navigation.earth import EARTH_RATE, STANDARD_GRAVITY, ned_axes, normal_gravity
+from dlkf.navigation.error_model import RATE_AVERAGE_S
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.state import NavState
 
@@ -26,6 +36,10 @@ AXLE_STD = 0.7  # m, how far the IMU may sit before the rear axle; in a turn tha
 ACCEL_BIAS_STD = 0.1  # m/s²; tilts the level by bias / g
 UNKNOWN_VELOCITY_STD, UNKNOWN_SLOPE_STD = 0.2, 0.05  # m/s and slope of the road, where v_d is not measured
 JERK_STD = 0.7  # m/s³, of a car
+FIT_S = 5.0  # of positions to which a velocity is fitted
+ACCELERATION_STD = 1.0  # m/s², of a car
+GYRO_BIAS_STD = 0.01  # rad/s, that turns the positions of a window about its end
+FIT_STD = 0.1  # m: how far a car keeps from the fit's motion
 SPREAD_STD = math.radians(0.5)  # lever arm to the rear axle, vibration
 
 
@@ -33,8 +47,9 @@ SPREAD_STD = math.radians(0.5)  # lever arm to the rear axle, vibration
 class AlignConfig:
     """``min_speed`` [m/s] below which course is no heading; ``window_s`` [s] over which f is levelled.
 
-    ``search_s`` [s] of motion over which headings are weighed against each other, 0 to believe the course;
-    ``from_rest``: start with the first fix, not with first motion (both look ahead: :mod:`dlkf.running.start`).
+    ``search_s`` [s] of motion over which headings are weighed against each other, until one has won; 0 takes the
+    course. ``from_rest``: start with the first fix, which looks ahead; else with the epoch at which the heading is
+    good, as in a vehicle (:mod:`dlkf.running.start`).
     """
 
     min_speed: float = 2.0
@@ -51,7 +66,8 @@ class AlignConfig:
             object.__setattr__(self, name, float(value))
 
 
-ALIGN = AlignConfig()
+ALIGN = AlignConfig()  # the course
+SEARCH = AlignConfig(search_s=20.0)
 
 
 @dataclass(frozen=True)
@@ -71,7 +87,8 @@ class Aligned:
 @dataclass(frozen=True)
 class Start:
     """Where a filter starts on a drive: epoch ``first``, tangent origin [rad, rad, m], state there (one
-    element, float64, in the tangent frame of that origin) and its 1σ (9)."""
+    element, float64, in the tangent frame of that origin), its 1σ (9), and the probability that the car faces
+    another way."""
 
     first: int
     lat: float
@@ -79,19 +96,21 @@ class Start:
     height: float
     state: NavState
     std: Float[Tensor, " 9"]
+    doubt: float = 0.0
 
 
 def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     """Align at every boundary that has a fix with velocity faster than ``min_speed`` and one a window before.
 
-    A source without any velocity has it taken from three successive positions. Reads no reference.
+    A source without any velocity has it fitted to its positions. Reads no reference.
     """
     rows = drive.epochs + 1
     back = max(1, round(config.window_s / drive.epoch_s))
     lat, lon, height = geodetic_from_ecef(torch.nan_to_num(drive.gnss_r_e, nan=1e6))
     C_en = ned_axes(lat, lon)
     position = drive.gnss_valid[:, :3].all(-1)
-    v_n, v_std, moving = _velocity(drive, C_en, position)
+    u_b, rate_b, turned = _carried_force(drive, back)
+    v_n, v_std, moving = _velocity(drive, C_en, position, -u_b / u_b.norm(dim=-1, keepdim=True).clamp_min(1.0))
 
     then = torch.arange(rows) - back
     ok = position & moving & (then >= 0)
@@ -101,7 +120,6 @@ def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     ok &= span > 0.5 * drive.epoch_s
     span = span.clamp_min(0.5 * drive.epoch_s)
 
-    u_b, rate_b, turned = _carried_force(drive, back)
     # velocity of the IMU in n at both ends: the antenna's less the swing of the lever arm
     swing_b = torch.linalg.cross(rate_b, drive.lever_arm_b.expand_as(rate_b))
     speed = v_n[:, :2].norm(dim=-1)
@@ -124,7 +142,7 @@ def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     noise = v_std[:, :2].amax(-1)
     shift = torch.maximum(drive.gnss_lag, drive.gnss_lag[then])  # of the velocities' window against the IMU's
     pull = (1.41 * noise / span) ** 2 + (JERK_STD * shift) ** 2 + ACCEL_BIAS_STD**2  # (m/s²)²
-    tilt = torch.sqrt(pull / 9.8**2 + SPREAD_STD**2)
+    tilt = torch.sqrt(pull / STANDARD_GRAVITY**2 + SPREAD_STD**2)
     turning = AXLE_STD * rate_b[:, 2]  # m/s across the car
     heading = torch.sqrt(SIDESLIP_STD**2 + (noise**2 + turning**2) / speed.clamp_min(0.1) ** 2)
     attitude_std = torch.stack((tilt, tilt, heading), -1)
@@ -141,7 +159,7 @@ def mean_force(drive: Drive, row: int, config: AlignConfig = ALIGN) -> Float[Ten
     return _carried_force(drive.part(row - back, row), back)[0][-1]
 
 
-def levelled(
+def level_attitude(
     C_nb: Float[Tensor, "*k 3 3"], force_b: Float[Tensor, " 3"], force_n: Float[Tensor, " 3"]
 ) -> Float[Tensor, "*k 3 3"]:
     """Attitudes with the yaw of ``C_nb`` under which ``force_b`` is ``force_n`` [m/s²]."""
@@ -154,7 +172,7 @@ def levelled(
 
 
 def _velocity(
-    drive: Drive, C_en: Float[Tensor, "rows 3 3"], position: Bool[Tensor, " rows"]
+    drive: Drive, C_en: Float[Tensor, "rows 3 3"], position: Bool[Tensor, " rows"], down_b: Float[Tensor, "rows 3"]
 ) -> tuple[Float[Tensor, "rows 3"], Float[Tensor, "rows 3"], Bool[Tensor, " rows"]]:
     """Antenna velocity in n with std, and where its horizontal part is known; an unknown v_d is zero."""
     known = drive.gnss_valid[:, 3:]
@@ -163,14 +181,53 @@ def _velocity(
         v_n = torch.where(known, v_n, torch.zeros_like(v_n))
         guess = UNKNOWN_VELOCITY_STD + UNKNOWN_SLOPE_STD * v_n[:, :2].norm(dim=-1, keepdim=True)
         return v_n, torch.where(known, drive.gnss_std[:, 3:], guess), known[:, :2].all(-1)
-    r, h = drive.gnss_r_e, drive.epoch_s
-    v_e = torch.full_like(r, torch.nan)
-    v_e[2:] = (3 * r[2:] - 4 * r[1:-1] + r[:-2]) / (2 * h)  # backward difference, second order
-    v_n = torch.nan_to_num((C_en.mT @ v_e.unsqueeze(-1)).squeeze(-1))
-    usable = position & position.roll(1) & position.roll(2) & (drive.gnss_lag == 0)
-    usable[:2] = False
-    usable &= (drive.gnss_lag.roll(1) == 0) & (drive.gnss_lag.roll(2) == 0)
-    return v_n, drive.gnss_std[:, :3] * (math.sqrt(26) / (2 * h)), usable
+    return _fitted_velocity(drive, C_en, position & (drive.gnss_lag == 0), down_b)
+
+
+def _fitted_velocity(
+    drive: Drive, C_en: Float[Tensor, "rows 3 3"], usable: Bool[Tensor, " rows"], down_b: Float[Tensor, "rows 3"]
+) -> tuple[Float[Tensor, "rows 3"], Float[Tensor, "rows 3"], Bool[Tensor, " rows"]]:
+    """Velocity at boundaries from the positions of ``FIT_S`` before them, with std; usable with three fixes.
+
+    Its std grows with what an unknown gyroscope bias turns the fit by.
+    """
+    h, rows = drive.epoch_s, len(usable)
+    count = max(2, min(round(FIT_S / h), rows - 1))
+    before = torch.arange(rows)[:, None] - torch.arange(count + 1)  # boundary, epochs back
+    fixed = usable[before.clamp_min(0)] & (before >= 0)
+    turned = (drive.imu[..., 3:].double().mean(1) * down_b[1:]).sum(-1) * h  # yaw of every epoch
+    yaw = torch.nn.functional.pad(turned.cumsum(0), (1, 0))[before.clamp_min(0)]
+    heading = torch.polar(torch.ones_like(yaw), yaw - yaw[:, :1])
+    tau = h * torch.arange(count + 1, dtype=torch.float64)
+    middle, pad = 0.5 * (heading[:, 1:] + heading[:, :-1]) * h, torch.nn.functional.pad
+    way = pad(middle.cumsum(-1), (1, 0))
+    slowed = pad((middle * 0.5 * (tau[1:] + tau[:-1])).cumsum(-1), (1, 0))
+    r_n = (C_en.mT.unsqueeze(1) @ (drive.gnss_r_e[before.clamp_min(0)] - drive.gnss_r_e.unsqueeze(1)).unsqueeze(-1))[
+        ..., 0
+    ]
+    r_n = torch.where(fixed[..., None], r_n, 0.0)
+    weight = fixed / torch.hypot(drive.gnss_std[:, :3].amax(-1), torch.tensor(FIT_STD))[:, None].square()
+    weight = torch.where(fixed[:, :1], weight.nan_to_num(), 0.0)
+
+    def solve(x: Tensor, y: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
+        """Weighted least squares of y (rows, n) by x (rows, n, k): solution and its covariance."""
+        weighted = x.mH * weight.unsqueeze(1)
+        cov = torch.linalg.inv(weighted @ x + torch.diag_embed(prior).to(x.dtype))
+        return (cov @ (weighted @ y.unsqueeze(-1)))[..., 0], cov.diagonal(dim1=-2, dim2=-1).real
+
+    # 1e-9: boundaries without fixes, whose matrix would be singular
+    prior = torch.tensor([1e-9, 1e-9, ACCELERATION_STD**-2], dtype=torch.float64).expand(rows, -1)
+    x = torch.stack((torch.ones_like(way), -way, slowed), -1)
+    level, variance = solve(x, torch.complex(r_n[..., 0], r_n[..., 1]), prior)
+    v_n, v_std = torch.zeros(rows, 3, dtype=torch.float64), torch.zeros(rows, 3, dtype=torch.float64)
+    v_n[:, 0], v_n[:, 1] = level[:, 1].real, level[:, 1].imag
+    span = (tau * fixed).amax(-1)
+    v_std[:, :2] = torch.hypot(variance[:, 1].sqrt(), 0.5 * GYRO_BIAS_STD * span * level[:, 1].abs())[:, None]
+    x = torch.stack((torch.ones_like(fixed, dtype=torch.float64), -tau.expand(rows, -1)), -1)
+    slope = UNKNOWN_VELOCITY_STD + UNKNOWN_SLOPE_STD * v_n[:, :2].norm(dim=-1)
+    down, variance = solve(x, r_n[..., 2], torch.stack((torch.full_like(slope, 1e-9), slope**-2), -1))
+    v_n[:, 2], v_std[:, 2] = down[:, 1], variance[:, 1].sqrt()
+    return v_n, v_std, fixed[:, 0] & (fixed.sum(-1) >= 3)
 
 
 def _carried_force(
@@ -178,7 +235,8 @@ def _carried_force(
 ) -> tuple[Float[Tensor, "rows 3"], Float[Tensor, "rows 3"], Float[Tensor, "rows 3 3"]]:
     """Mean specific force of the ``back`` epochs before each boundary in the boundary's body axes.
 
-    Also the rate there (mean of the last 0.2 s) and C_b(boundary)b(window's start). Rows < ``back`` repeat.
+    Also the rate there (mean of the last :data:`RATE_AVERAGE_S`) and C_b(boundary)b(window's start). Rows
+    < ``back`` repeat.
     """
     imu = drive.imu.double()
     N, M = imu.shape[:2]
@@ -195,7 +253,7 @@ def _carried_force(
         epoch = slice(back - 1 - j, N - j)
         turned = turned @ to_end[epoch]
         total = total + (turned @ force[epoch, :, None])[..., 0]
-    tail = max(1, min(M, round(0.2 * drive.rate_hz)))
+    tail = max(1, min(M, round(RATE_AVERAGE_S * drive.rate_hz)))
     rate = torch.cat((imu[:1, :tail, 3:], imu[:, -tail:, 3:])).mean(1)
     total = torch.cat((total[:1].expand(back, 3), total)) / (back * M)
     turned = torch.cat((turned[:1].expand(back, 3, 3), turned))

@@ -1,4 +1,4 @@
-"""Augmentation of training pieces: turned frames and fresh IMU biases (paper.md 4.7, 4.9)."""
+"""Augmentation of training segments: turned frames and fresh IMU biases (paper.md 4.7, 4.9)."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from dlkf.navigation.state import NavState
 
 
 def turn_frames(batch: Batch, generator: torch.Generator | None = None) -> Batch:
-    """Express each piece in a tangent frame turned about down by a random angle ψ: u ← Rz(ψ) u.
+    """Express each segment in a tangent frame turned about down by a random angle ψ: u ← Rz(ψ) u.
 
     Truth, GNSS and start turn together, and so do the frame's own axes and the Earth's rotation in them, so
-    that the piece stays physically exact; its n is then no longer North-East. The stds take the diagonal of
+    that the segment stays physically exact; its n is then no longer North-East. The stds take the diagonal of
     the turned covariance.
     """
     B = batch.size[0]
@@ -62,15 +62,15 @@ def turn_frames(batch: Batch, generator: torch.Generator | None = None) -> Batch
 
 
 @dataclass(frozen=True)
-class Rough:
-    """IMUs and receivers worse than any preset, drawn anew for every piece; each pair is a log-uniform range.
+class SensorDegradation:
+    """IMUs and receivers worse than any preset, drawn for every segment; each pair is a log-uniform range.
 
     ``share`` of the sensors get white noise [m/s²/√Hz, rad/s/√Hz], uneven over the axes by ``uneven`` (1σ of the
     logarithm), and an error that wanders with a correlation time of 1 to 20 s [m/s², rad/s]. ``shaken`` of the
-    pieces have what is faster than some 3 Hz made weaker or stronger, from nothing to twice; ``rectified`` of them
-    have sensors that turn vibration into an error that wanders, axis by axis in proportion to what that axis feels;
+    segments have what is faster than some 3 Hz made weaker or stronger, from nothing to twice; ``rectified`` of them
+    have sensors that turn vibration into an error that wanders, axis by axis in proportion to its vibration;
     ``gnss`` of them have further errors of position [m] and velocity [m/s], half white and half lasting, which their
-    stds tell only within a factor of two.
+    stds are good only within a factor of two.
     """
 
     share: float = 0.4
@@ -89,8 +89,8 @@ class Rough:
     velocity: tuple[float, ...] = (0.01, 0.3)
 
 
-def roughen(batch: Batch, rough: Rough, generator: torch.Generator) -> Batch:
-    """The batch with the IMU and the receiver of each piece made worse as ``rough`` says, by chance."""
+def degrade_sensors(batch: Batch, rough: SensorDegradation, generator: torch.Generator) -> Batch:
+    """The batch with the IMU and the receiver of each segment degraded by random draws from ``rough``."""
     B, T, M = batch.size
 
     def chance(share: float) -> Tensor:
@@ -121,20 +121,20 @@ def roughen(batch: Batch, rough: Rough, generator: torch.Generator) -> Batch:
     of_loud = of_loud * torch.exp(normal(B, 6)) * chance(rough.rectified)[:, None]
     loud = (flat - slow).unflatten(1, (T, M)).square().mean(2).sqrt().to(of_loud)
     size = (slowly * hit)[:, None] + loud * of_loud[:, None]
-    wander = (wandering(normal(B, T, 6), keep) * size).repeat_interleave(M, 1)
+    wander = (draw_correlated_noise(normal(B, T, 6), keep) * size).repeat_interleave(M, 1)
     noise = (white / batch.dt**0.5 * hit)[:, None] * normal(B, T * M, 6)
     flat = flat + (noise + wander).to(imu)
     worse = chance(rough.gnss)[:, None, None]
     size = torch.cat([drawn(b, B, 1).expand(B, 3) for b in (rough.position, rough.velocity)], -1)[:, None]
-    lasting = wandering(normal(B, T, 6), torch.exp(-batch.epoch_s / drawn((5.0, 60.0), B, 1)))
+    lasting = draw_correlated_noise(normal(B, T, 6), torch.exp(-batch.epoch_s / drawn((5.0, 60.0), B, 1)))
     error = size * (0.5**0.5) * (normal(B, T, 6) + lasting * torch.tensor([1.0] * 3 + [0.3] * 3))
-    told = size * torch.exp(0.7 * normal(B, 1, 1))
+    detail = size * torch.exp(0.7 * normal(B, 1, 1))
     gnss = torch.where(worse & batch.gnss_valid, batch.gnss + error.to(batch.gnss), batch.gnss)
-    std = torch.where(worse, (batch.gnss_std.square() + told.square().to(imu)).sqrt(), batch.gnss_std)
+    std = torch.where(worse, (batch.gnss_std.square() + detail.square().to(imu)).sqrt(), batch.gnss_std)
     return replace(batch, imu=flat.unflatten(1, (T, M)), gnss=gnss, gnss_std=std)
 
 
-def wandering(white: Tensor, keep: Tensor) -> Tensor:
+def draw_correlated_noise(white: Tensor, keep: Tensor) -> Tensor:
     """First-order Gauss-Markov of unit variance along the second axis of white noise (B, T, k); ``keep`` (B, 1)."""
     state, rows, fresh = white[:, 0], [], (1 - keep.square()).sqrt()
     for now in white.unbind(1):

@@ -10,38 +10,39 @@ import lightning as L
 import numpy as np
 import torch
 
-from dlkf.console import Counted
+from dlkf.base.console import ProgressCallback
+from dlkf.base.errors import InputError
 from dlkf.data.augmentation import turn_frames
 from dlkf.data.degradation import GnssNoise
+from dlkf.data.draws import combined_seed
 from dlkf.data.drive import Batch, Drive
-from dlkf.data.masks import BiasLaw, Outage, with_bias, withhold, within
+from dlkf.data.masks import BiasLaw, Outage, add_bias, outage_within, withhold_fixes
 from dlkf.data.segments import (
-    Piece,
+    Segment,
     StartLaw,
-    cut_pieces,
+    cut_segments,
+    describe_unused_drives,
     epochs_of,
+    find_unused_drives,
     make_batch,
-    pieces_at,
     possible_starts,
-    told_unused,
-    unused,
+    segments_at,
 )
 from dlkf.data.splits import SIDES, Split, split_rows
 from dlkf.data.stack import DriveStack
 from dlkf.data.store import load_dataset
-from dlkf.errors import InputError
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 class DriveDataModule(L.LightningDataModule):
-    """Pieces of any number of datasets, split by recording (paper.md 4.8), as :class:`Batch` objects.
+    """Segments of any number of datasets, split by recording (paper.md 4.8), as :class:`Batch` objects.
 
-    Training: in every epoch pieces of ``length_s`` (or ``length_law(epoch)`` where a curriculum sets
+    Training: in every epoch segments of ``length_s`` (or ``length_law(epoch)`` where a curriculum sets
     that attribute) start at random, spread evenly over the training drives, with a start error drawn from
-    ``start``. Batches depend on (seed, epoch, step) alone, so a resumed run sees what an uninterrupted one
-    sees; with several processes each makes the whole batch. Validation and test pieces of
-    ``eval_length_s`` every ``eval_stride_s`` have start errors drawn from ``eval_seed``, each piece its own, so that
+    ``start``. Batches depend on (seed, epoch, step) alone, so a resumed run gets the batches that an uninterrupted one
+    gets; with several processes each makes the whole batch. Validation and test segments of
+    ``eval_length_s`` every ``eval_stride_s`` have start errors drawn from ``eval_seed``, each segment its own, so that
     they are the same for every ``seed`` and ``batch_size``; ``eval_outage`` withholds GNSS
     there. Lengths that change need ``Trainer(reload_dataloaders_every_n_epochs=1)``.
 
@@ -72,7 +73,7 @@ class DriveDataModule(L.LightningDataModule):
         seed: int = 0,
         eval_seed: int = 0,
         split_seed: int = 0,
-        progress: Counted | None = None,
+        progress: ProgressCallback | None = None,
     ) -> None:
         super().__init__()
         if dtype not in DTYPES:
@@ -89,7 +90,7 @@ class DriveDataModule(L.LightningDataModule):
         self.seed, self.eval_seed, self.split_seed, self.progress = seed, eval_seed, split_seed, progress
         self.length_law: Callable[[int], float] | None = None
         self._starts: dict[int, torch.Tensor] = {}
-        self._latest: tuple[int, int, list[list[Piece]]] = (-1, -1, [])
+        self._latest: tuple[int, int, list[list[Segment]]] = (-1, -1, [])
 
     def setup(self, stage: str | None = None) -> None:
         """Load, stack and split the drives; does nothing when that is done."""
@@ -113,12 +114,12 @@ class DriveDataModule(L.LightningDataModule):
         return [d for d, (row, n) in zip(self.stack, ends) if bool((spans[row : row + n] >= 0).any())]
 
     def length_s(self, epoch: int) -> float:
-        """Length of the training pieces in an epoch [s]."""
+        """Length of the training segments in an epoch [s]."""
         return self.train_length_s if self.length_law is None else self.length_law(epoch)
 
-    def train_pieces(self, epoch: int) -> list[list[Piece]]:
-        """The pieces of an epoch, batch by batch: one start drawn from each of as many equal parts of all
-        possible starts as pieces fit into the training time, in random order."""
+    def train_segments(self, epoch: int) -> list[list[Segment]]:
+        """The segments of an epoch, batch by batch: one start drawn from each of as many equal parts of all
+        possible starts as segments fit into the training time, in random order."""
         self.setup()
         length = epochs_of(self.length_s(epoch), self.epoch_s)
         if self._latest[:2] == (epoch, length):
@@ -129,64 +130,66 @@ class DriveDataModule(L.LightningDataModule):
         starts = self._starts[length]
         if not len(starts):
             raise InputError(
-                f"no training piece of {length * self.epoch_s:g} s: the drives are shorter or not valid that "
+                f"no training segment of {length * self.epoch_s:g} s: the drives are shorter or not valid that "
                 "long; choose a shorter data.length_s"
             )
         change = torch.zeros(len(self.spans["train"]) + 1, dtype=torch.int64)
         change[starts] += 1
         change[starts + length] -= 1
-        count = max(1, int((change.cumsum(0) > 0).sum()) // length)  # epochs that some piece covers
+        count = max(1, int((change.cumsum(0) > 0).sum()) // length)  # epochs that some segment covers
         rng = np.random.default_rng((self.seed, epoch))
         part = (np.arange(count) + rng.random(count)) / count
         rows = starts[torch.from_numpy((part * len(starts)).astype(np.int64))]
-        pieces = pieces_at(self.stack, rows[torch.from_numpy(rng.permutation(count))], length)
-        batches = [pieces[k : k + self.batch_size] for k in range(0, count, self.batch_size)]
+        segments = segments_at(self.stack, rows[torch.from_numpy(rng.permutation(count))], length)
+        batches = [segments[k : k + self.batch_size] for k in range(0, count, self.batch_size)]
         self._latest = (epoch, length, batches)
         return batches
 
     def train_batch(self, epoch: int, step: int) -> Batch:
         """The batch of a training step."""
-        generator = torch.Generator().manual_seed(_seed(self.seed, epoch, step))
-        pieces = self.train_pieces(epoch)[step]
-        batch = make_batch(self.stack, pieces, dtype=self.dtype, start=self.start, generator=generator)
+        generator = torch.Generator().manual_seed(combined_seed(self.seed, epoch, step))
+        segments = self.train_segments(epoch)[step]
+        batch = make_batch(self.stack, segments, dtype=self.dtype, start=self.start, generator=generator)
         if self.turn_frames:
             batch = turn_frames(batch, generator)
         if self.injected_bias is not None:
             noise = torch.randn(batch.size[0], 6, generator=generator, dtype=torch.float64)
-            batch = with_bias(batch, self.injected_bias.std * noise)
+            batch = add_bias(batch, self.injected_bias.std * noise)
         return batch
 
-    def pieces(self, side: str) -> list[Piece]:
-        """The fixed pieces of a side, for scoring."""
+    def segments(self, side: str) -> list[Segment]:
+        """The fixed segments of a side, for scoring."""
         self.setup()
-        pieces = cut_pieces(
+        segments = cut_segments(
             self.stack,
             self.eval_length_s,
             self.eval_stride_s,
             min_valid=self.min_valid,
             span=self.spans[side],
         )
-        if not pieces:
+        if not segments:
             raise InputError(
-                f"no {side} piece of {self.eval_length_s:g} s: its drives are shorter or not valid "
+                f"no {side} segment of {self.eval_length_s:g} s: its drives are shorter or not valid "
                 "that long; choose a shorter data.eval_length_s or another split"
             )
-        return pieces
+        return segments
 
     def batches(self, side: str, *, share: tuple[int, int] = (0, 1)) -> list[Batch]:
         """The fixed batches of a side, with the same start errors for every filter and in every run.
 
-        ``share`` = (k, n) takes every n-th piece from k on, in as many batches for every k.
+        ``share`` = (k, n) takes every n-th segment from k on, in as many batches for every k.
         """
-        (k, n), pieces, out = share, self.pieces(side), []
-        if len(pieces) < n:
-            raise InputError(f"{len(pieces)} {side} pieces for {n} processes; give trainer.devices={len(pieces)}")
-        starts = range(0, len(pieces) - n + 1, n * self.batch_size)
-        for first, last in zip(starts, [*starts[1:], len(pieces)]):
-            part = pieces[first:last][k::n]
+        (k, n), segments, out = share, self.segments(side), []
+        if len(segments) < n:
+            raise InputError(f"{len(segments)} {side} segments for {n} processes; give trainer.devices={len(segments)}")
+        starts = range(0, len(segments) - n + 1, n * self.batch_size)
+        for first, last in zip(starts, [*starts[1:], len(segments)]):
+            part = segments[first:last][k::n]
             batch = make_batch(self.stack, part, dtype=self.dtype, start=self.start, seed=self.eval_seed)
             if self.eval_outage is not None:
-                batch = withhold(batch, within(batch, self.eval_outage.first_s, self.eval_outage.duration_s))
+                batch = withhold_fixes(
+                    batch, outage_within(batch, self.eval_outage.first_s, self.eval_outage.duration_s)
+                )
             out.append(batch)
         return out
 
@@ -206,11 +209,13 @@ class DriveDataModule(L.LightningDataModule):
         return FixedBatches(self.batches(side, share=(self._rank, self._world)))
 
     def summary(self) -> list[dict[str, Any]]:
-        """Per side: drives, groups, minutes of driving, and pieces for scoring."""
+        """Per side: drives, groups, minutes of driving, and segments for scoring."""
         table = []
         for side in SIDES:
             drives, span = self.drives(side), self.spans[side]
-            pieces = cut_pieces(self.stack, self.eval_length_s, self.eval_stride_s, min_valid=self.min_valid, span=span)
+            segments = cut_segments(
+                self.stack, self.eval_length_s, self.eval_stride_s, min_valid=self.min_valid, span=span
+            )
             ends = self.stack.first_row + self.stack.epochs  # the last boundary begins no epoch
             epochs = int((span >= 0).sum() - (span[ends] >= 0).sum())
             table.append(
@@ -219,34 +224,36 @@ class DriveDataModule(L.LightningDataModule):
                     "drives": len(drives),
                     "groups": len({d.group for d in drives}),
                     "minutes": round(epochs * self.epoch_s / 60, 1),
-                    "pieces": len(pieces),
+                    "segments": len(segments),
                 }
             )
         return table
 
     def left_out(self, longest_s: float) -> list[str]:
-        """A line per side on its drives that give no piece on any; training pieces grow to ``longest_s``."""
+        """A line per side on its drives that give no segment on any; training segments grow to ``longest_s``."""
         fixed = ("data.eval_length_s", self.eval_length_s)
         lengths = dict.fromkeys(SIDES, fixed) | {"train": ("data.length_s", longest_s)}
         sides = {side: [d.name for d in self.drives(side)] for side in SIDES}  # of several datasets names may repeat
         cut = [
-            cut_pieces(self.stack, length, min_valid=self.min_valid, span=self.spans[side])
+            cut_segments(self.stack, length, min_valid=self.min_valid, span=self.spans[side])
             for side, (_, length) in lengths.items()
         ]
-        idle = unused(self.stack, [piece for pieces in cut for piece in pieces])
+        idle = find_unused_drives(self.stack, [segment for segments in cut for segment in segments])
         out = []
         for side, (key, length) in lengths.items():
             if names := [name for name in idle if name in sides[side]]:
-                piece = f"{side} piece of {length:g} s"
-                out.append(told_unused(names, len(sides[side]), piece, f"a shorter {key} takes more of them"))
+                segment = f"{side} segment of {length:g} s"
+                out.append(
+                    describe_unused_drives(names, len(sides[side]), segment, f"a shorter {key} takes more of them")
+                )
         return out
 
     def describe(self) -> str:
         """The summary as a small table."""
         rows = self.summary()
-        lines = ["split   drives  groups  minutes  pieces"]
+        lines = ["split   drives  groups  minutes  segments"]
         for r in rows:
-            lines.append(f"{r['split']:<6} {r['drives']:>7} {r['groups']:>7} {r['minutes']:>8.1f} {r['pieces']:>7}")
+            lines.append(f"{r['split']:<6} {r['drives']:>7} {r['groups']:>7} {r['minutes']:>8.1f} {r['segments']:>7}")
         return "\n".join(lines)
 
     @property
@@ -273,7 +280,7 @@ class TrainBatches:
 
     def _steps(self, epoch: int) -> int:
         world = self.module._world
-        return sum(len(batch) >= world for batch in self.module.train_pieces(epoch))
+        return sum(len(batch) >= world for batch in self.module.train_segments(epoch))
 
     def __len__(self) -> int:
         return self._steps(self.epoch)
@@ -307,8 +314,3 @@ class FixedBatches:
 
     def __iter__(self) -> Iterator[Batch]:
         return iter(self.batches)
-
-
-def _seed(*numbers: int) -> int:
-    """One seed from several numbers, the same on every machine."""
-    return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0]) >> 1

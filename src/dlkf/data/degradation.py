@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from dlkf.data.draws import piece_generator
+from dlkf.base.errors import InputError
+from dlkf.data.draws import segment_generator
 from dlkf.data.drive import Drive
-from dlkf.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class GnssNoise:
     def added(self, drive: Drive, seed: int = 0) -> Drive:
         """The drive with noise of its own on every fix: p̃ = p + s_p n, ṽ = v + s_v n, n ~ N(0, I) (isotropic, so the
         axes do not matter); std ← √(std² + s²), which a Kalman filter takes for R (R018)."""
-        generator = piece_generator(seed, "gnss_noise", drive.name, drive.t0)
+        generator = segment_generator(seed, "gnss_noise", drive.name, drive.t0)
         n = torch.randn(len(drive.gnss_std), 6, generator=generator, dtype=torch.float64)
         s = torch.tensor([self.s_p] * 3 + [self.s_v] * 3, dtype=torch.float64)
         return replace(

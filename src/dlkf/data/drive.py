@@ -1,14 +1,16 @@
-"""A drive as tensors on an epoch grid, and the batch of pieces that a filter runs on."""
+"""A drive as tensors on an epoch grid, and the batch of segments that a filter runs on."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from dlkf.data.limits import NONE_REFUSED, Refused
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import NavState
 
@@ -45,8 +47,10 @@ class Drive:
     ref_v_e: Tensor  # (N+1, 3) float64
     ref_C_eb: Tensor  # (N+1, 3, 3) float64, NaN where the source has no full attitude
     ref_valid: Tensor  # (N+1,) bool: position and velocity may be scored
-    ref_imu_error: Tensor  # (N+1, 6) float64, NaN unless the source (a simulation) knows it
+    ref_imu_error: Tensor  # (N+1, 6) float64, NaN unless the source (a simulation) has it
     lever_arm_b: Tensor  # (3,) m, IMU → antenna
+    refused: Refused = NONE_REFUSED  # rows of its tables that lie beyond physical limits and were left out
+    aids: Mapping[str, Tensor] = field(default_factory=dict)  # (N+1, 5) of further sensors, see dlkf.data.aids.ROW
 
     @property
     def epochs(self) -> int:
@@ -61,16 +65,17 @@ class Drive:
             self,
             t0=self.t0 + first * self.epoch_s,
             imu=self.imu[first:last],
+            aids={name: x[rows] for name, x in self.aids.items()},
             **{name: getattr(self, name)[rows] for name in of_boundaries},
         )
 
 
 @dataclass(frozen=True)
 class Batch:
-    """B pieces of T epochs of M samples, ready for the filter loop. Row t belongs to the *end* of epoch t.
+    """B segments of T epochs of M samples, ready for the filter loop. Row t belongs to the *end* of epoch t.
 
-    Tensors have the working precision (float32 in training) in the tangent frame of each piece's start;
-    ``start`` and ``start_std`` (position, velocity, attitude; 1σ) are what a filter is told at t = 0.
+    Tensors have the working precision (float32 in training) in the tangent frame of each segment's start;
+    ``start`` and ``start_std`` (position, velocity, attitude; 1σ) are what a filter is given at t = 0.
     ``available`` marks epochs whose fix a filter may use: outages and decimation switch it off.
     """
 
@@ -90,8 +95,9 @@ class Batch:
     attitude_valid: Tensor  # (B, T) bool
     true_imu_error: Tensor  # (B, T, 6) NaN unless simulated
     present: Tensor  # (B, T) bool: False in the padding of shorter drives
-    drive: tuple[str, ...]  # name per piece
+    drive: tuple[str, ...]  # name per segment
     t_start: Tensor  # (B,) float64 s, file clock
+    aids: Mapping[str, Tensor] = field(default_factory=dict)  # (B, T, 5) of further sensors, see dlkf.data.aids.ROW
 
     @property
     def size(self) -> tuple[int, int, int]:
@@ -104,24 +110,27 @@ class Batch:
         return self.dt * self.imu.shape[2]
 
     def select(self, index: Int[Tensor, " b"]) -> Batch:
-        """Some pieces of the batch."""
+        """Some segments of the batch."""
 
         def kept(x: Any) -> Any:
             if isinstance(x, NavState):
                 return NavState(*(part[index] for part in x))
             if isinstance(x, (Tensor, TangentFrame)):
                 return x[index]
+            if isinstance(x, Mapping):
+                return {name: part[index] for name, part in x.items()}
             return tuple(x[i] for i in index.tolist()) if isinstance(x, tuple) else x
 
         return replace(self, **{f.name: kept(getattr(self, f.name)) for f in fields(self)})
 
     def trimmed(self) -> Batch:
-        """The batch without the padding that none of its pieces needs."""
+        """The batch without the padding that none of its segments needs."""
         T = max(1, int(self.present.sum(-1).max()))
         if self.size[1] == T:
             return self
         short = {name: getattr(self, name)[:, :T] for name in EPOCHWISE if name != "truth"}
-        return replace(self, truth=NavState(*(x[:, :T] for x in self.truth)), **short)
+        aids = {name: x[:, :T] for name, x in self.aids.items()}
+        return replace(self, truth=NavState(*(x[:, :T] for x in self.truth)), aids=aids, **short)
 
     def to(self, device: torch.device | str) -> Batch:
         """The same batch on another device."""
@@ -132,6 +141,8 @@ class Batch:
                 moved[f.name] = value.to(device)
             elif isinstance(value, NavState):
                 moved[f.name] = NavState(*(x.to(device) for x in value))
+            elif isinstance(value, Mapping):
+                moved[f.name] = {name: x.to(device) for name, x in value.items()}
         return replace(self, **moved)
 
     def in_precision(self, dtype: torch.dtype) -> Batch:
@@ -143,4 +154,5 @@ class Batch:
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         tensors = {k: cast(v) for k, v in values.items() if isinstance(v, Tensor) and k != "t_start"}
         states = {k: NavState(*map(cast, v)) for k, v in values.items() if isinstance(v, NavState)}
-        return replace(self, frame=self.frame.in_precision(dtype), **tensors, **states)
+        aids = {name: cast(x) for name, x in self.aids.items()}
+        return replace(self, frame=self.frame.in_precision(dtype), aids=aids, **tensors, **states)

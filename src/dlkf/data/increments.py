@@ -30,17 +30,17 @@ def two_sample(increments: np.ndarray, step: np.ndarray, follows: np.ndarray) ->
     return out
 
 
-def merged(pieces: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Equivalent constant increments of m samples from those of the n pieces that they consist of, (6, n) → (6, m).
+def merge_increments(segments: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Equivalent constant increments of m samples from those of the n segments that they consist of, (6, n) → (6, m).
 
-    Sample j holds the pieces from ``first[j]`` (rising, ``first[0]`` = 0) to the next sample's first.
+    Sample j holds the segments from ``first[j]`` (rising, ``first[0]`` = 0) to the next sample's first.
     """
-    count = np.diff(first, append=pieces.shape[1])
-    total, products = pieces.take(first, 1), np.zeros((6, len(first)))
-    for k in range(1, int(count.max())):  # the k-th piece of every sample that has so many
-        piece = pieces.take(first + k, 1, mode="clip") * (count > k)
-        products += second_order(total, piece)
-        total += piece
+    count = np.diff(first, append=segments.shape[1])
+    total, products = segments.take(first, 1), np.zeros((6, len(first)))
+    for k in range(1, int(count.max())):  # the k-th segment of every sample that has so many
+        segment = segments.take(first + k, 1, mode="clip") * (count > k)
+        products += second_order(total, segment)
+        total += segment
     return total + 0.5 * products
 
 

@@ -13,19 +13,21 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from dlkf.data.plausibility import drift_told, turned_told
+from dlkf.base.errors import InputError
+from dlkf.base.files import absolute_place, is_url, replace_file
+from dlkf.base.parallel import check_engine, parallel_map
+from dlkf.data.plausibility import describe_drift, describe_rotation
 from dlkf.data.readers.frames import DriveFrames
+from dlkf.data.readers.settling import Unsure
+from dlkf.data.readers.sharing import agrees, layout, list_settings, pool_settings
 from dlkf.data.schema import new_dataset, write_drive, write_drives_table
 from dlkf.data.summary import drive_line
 from dlkf.data.tables import DriveRow, read_drives
-from dlkf.data.validate import LIMITS, Limits, fixes, gap_rows, read_checked, read_imu
-from dlkf.errors import InputError
-from dlkf.files import absolute, whole_file
-from dlkf.parallel import check, each
+from dlkf.data.validate import LIMITS, Limits, gap_rows, read_checked, read_fixes, read_imu
 
 
-class Taken(NamedTuple):
-    """What became of a log: its parts' rows of ``drives.parquet`` with a line each, what was met on the way, and the
+class IngestResult(NamedTuple):
+    """What became of a log: its parts' rows of ``drives.parquet`` with a line each, notes on the way, and the
     mapping that was found out."""
 
     rows: list[dict[str, Any]]
@@ -35,57 +37,115 @@ class Taken(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Intake:
+class IngestOptions:
     """How a drive is taken in: cut at its gaps or not, what is left out, what is accepted."""
 
     split_gaps: bool = False
     shortest_s: float = 10.0
     limits: Limits = LIMITS
 
-    def taken(self, drive: DriveFrames, folder: str | Path) -> Taken:
+    def taken(self, drive: DriveFrames, folder: str | Path) -> IngestResult:
         """Write a drive into a dataset's folder and check what lies there; InputError for the first fault."""
-        rows, lines, told = [], [], list(drive.notes)
+        rows, lines, detail = [], [], list(drive.notes)
         for part in split_at_gaps(drive, self.shortest_s, self.limits) if self.split_gaps else [drive]:
-            rows.append(write_drive(folder, part.meta, part.imu, part.gnss, part.reference))
+            rows.append(write_drive(folder, part.meta, part.imu, part.gnss, part.reference, part.aids))
             if part.gnss is not None:
                 tables = read_checked(folder, DriveRow(part.name, part.name, (0.0, 0.0, 0.0)), limits=self.limits)
-                for check in (drift_told, turned_told):
-                    if line := check(tables.imu, fixes(tables.gnss)):
-                        told.append(f"{part.name}: {line}")
+                for check in (describe_drift, describe_rotation):
+                    if line := check(tables.imu, read_fixes(tables.gnss)):
+                        detail.append(f"{part.name}: {line}")
             else:
                 read_imu(folder, part.name, self.limits)
             lines.append(f"{part.name}: {drive_line(part)}")
-        return Taken(rows, lines, tuple(told), drive.mapping)
+        return IngestResult(rows, lines, tuple(detail), drive.mapping)
 
 
 def ingest(
     reader: Any,
     source: str | Path,
     out: str | Path,
-    how: Intake,
+    how: IngestOptions,
     *,
     parallel: int | str | None,
+    skip_unsure: bool = False,
     **options: Any,
 ) -> int:
-    """:func:`ingest_drives` of what a reader makes of ``source``; one that knows the places of its drives
-    (``places``, ``drive_at``) reads them on ``parallel`` engines (:func:`dlkf.parallel.each`)."""
-    check(parallel, out)
-    if parallel is None or not hasattr(reader, "places"):
-        return ingest_drives(reader.read(source), out, how, **options)
-    places = [(absolute(folder), name, only and absolute(only)) for folder, name, only in reader.places(source)]
+    """:func:`ingest_drives` of what a reader makes of ``source``; one that has the places of its drives
+    (``places``, ``drive_at``) reads them on ``parallel`` engines (:func:`dlkf.base.parallel.parallel_map`).
 
-    def taking(folder: str) -> Iterable[Taken]:
-        return each(partial(_read_there, reader, how, absolute(folder)), places, parallel)
+    Drives that are not sure of a setting are read again with what the others of the same IMU found. One that still is
+    not raises its InputError, or is left out with ``skip_unsure``.
+    """
+    check_engine(parallel, out)
+    if not is_url(source) and (Path(source) / "drives.parquet").is_file():
+        raise InputError(f"source={source}: is a dataset already; navigate and evaluate take dataset={source}")
+    if not hasattr(reader, "places"):
+        return ingest_drives(reader.read(source), out, how, **options)
+    places = [
+        (absolute_place(folder), name, only and absolute_place(only)) for folder, name, only in reader.places(source)
+    ]
+
+    def taking(folder: str) -> Iterable[IngestResult]:
+        return _read_together(reader, how, absolute_place(folder), places, parallel, skip_unsure)
 
     return _ingested(taking, out, how, **options)
 
 
-def _read_there(reader: Any, how: Intake, out: str, place: tuple[str, str, str | None]) -> Taken:
+Located = tuple[str, str, str | None]
+
+
+def _read_together(
+    reader: Any, how: IngestOptions, out: str, places: Sequence[Located], parallel: int | str | None, skip_unsure: bool
+) -> Iterator[IngestResult]:
+    """The drives that are sure, then those that are with what these found, then lines on those that disagree."""
+    doubts: dict[Located, Unsure] = {}
+    mappings: list[dict[str, Any]] = []
+
+    def read_all(reader: Any, places: Sequence[Located]) -> Iterator[tuple[Located, IngestResult]]:
+        for place, result in zip(places, parallel_map(partial(_read_there, reader, how, out), places, parallel)):
+            doubts.pop(place, None)
+            if isinstance(result, Unsure):
+                doubts[place] = result
+            else:
+                yield place, result
+
+    for _, result in read_all(reader, places):
+        mappings += [result.mapping] if result.mapping else []
+        yield result
+    kinds = {layout(mapping): [m for m in mappings if layout(m) == layout(mapping)] for mapping in mappings}
+    for kind, alike in kinds.items():
+        settings, apart = pool_settings(alike, offsets=False)
+        if apart:
+            yield IngestResult([], [], tuple(apart), {})
+        for offsets in (False, True) if hasattr(reader, "sharing") else ():
+            settings, _ = pool_settings(alike, offsets=offsets)
+            again = [place for place, doubt in doubts.items() if doubt.layout == kind]
+            if offsets:
+                again = [place for place in again if agrees(settings, *doubts[place].offset_s)]
+            shared = f"not sure by itself: took {list_settings(settings)}, found in other drives ({len(alike)})"
+            for (_, name, _), result in read_all(reader.sharing(settings), again):
+                yield result._replace(notes=(f"{name}: {shared}", *result.notes))
+    if doubts and not skip_unsure:
+        first = next(iter(doubts.values()))
+        raise first if len(places) == 1 else InputError(f"{first}; or skip_unsure=true leaves such drives out")
+    for doubt in doubts.values():
+        yield IngestResult([], [], (f"left out: {doubt}",), {})
+
+
+def _read_there(reader: Any, how: IngestOptions, out: str, place: Located) -> IngestResult | Unsure:
     folder, name, only = place
-    return how.taken(reader.drive_at(Path(folder), name, only and Path(only)), out)
+    try:
+        drive = reader.drive_at(Path(folder), name, only and Path(only))
+    except Unsure as doubt:
+        return doubt
+    except MemoryError:
+        raise InputError(f"drive {name}: its logs do not fit into memory; split them, or write Parquet") from None
+    return how.taken(drive, out)
 
 
-def ingest_drives(drives: Iterable[DriveFrames], out: str | Path, how: Intake = Intake(), **options: Any) -> int:
+def ingest_drives(
+    drives: Iterable[DriveFrames], out: str | Path, how: IngestOptions = IngestOptions(), **options: Any
+) -> int:
     """Write drives as a dataset at ``out`` and return how many there are.
 
     With ``split_gaps`` a drive with IMU gaps becomes parts ``<drive>-s0``, ``-s1``, … of one group; parts
@@ -98,12 +158,12 @@ def ingest_drives(drives: Iterable[DriveFrames], out: str | Path, how: Intake = 
 
 
 def _ingested(
-    taking: Callable[[str], Iterable[Taken]],
+    taking: Callable[[str], Iterable[IngestResult]],
     out: str | Path,
-    how: Intake,
+    how: IngestOptions,
     *,
     overwrite: bool = False,
-    progress: Callable[[Taken, int], None] | None = None,
+    progress: Callable[[IngestResult, int], None] | None = None,
 ) -> int:
     rows: list[dict[str, Any]] = []
     mappings: list[dict[str, Any]] = []
@@ -128,7 +188,7 @@ def write_found(path: Path, mappings: Sequence[dict[str, Any]]) -> None:
         "# Found out by dlkf.ingest. Correct it where it is wrong, then read the logs again:\n"
         "#   python -m dlkf.ingest --config-dir <this dataset> reader=found source=<the logs> out=<another dataset>\n"
     )
-    with whole_file(path) as beside:
+    with replace_file(path) as beside:
         beside.write_text(head + yaml.safe_dump(_agreed(mappings), sort_keys=False, allow_unicode=True))
 
 
@@ -156,12 +216,14 @@ def split_at_gaps(drive: DriveFrames, shortest_s: float, limits: Limits) -> Iter
         reference = None if drive.reference is None else _between(drive.reference, begin, end)
         if reference is not None and not len(reference):
             reference = None
+        aids = {kind: _between(table, begin, end) for kind, table in drive.aids.items()}
         yield replace(
             drive,
             meta={**drive.meta, "drive": f"{drive.name}-s{count}"},
             imu=drive.imu.iloc[first:last].reset_index(drop=True),
             gnss=gnss,
             reference=reference,
+            aids={kind: table for kind, table in aids.items() if len(table)},
         )
         count += 1
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import pandas as pd
 
-from dlkf.errors import InputError
-from dlkf.files import placed, readable
-from dlkf.settings import is_number
+from dlkf.base.errors import InputError
+from dlkf.base.files import open_parquet, resolve_place
+from dlkf.base.settings import is_number
 
 KINDS = ("simulated", "semi-real", "real", "unknown")
 
@@ -18,7 +18,7 @@ KINDS = ("simulated", "semi-real", "real", "unknown")
 def drive_kind(row: Mapping[Any, Any]) -> str:
     """Kind of one drive by its row of ``drives.parquet``.
 
-    A column ``kind`` decides where there is one. Otherwise: a source that says it is simulated is simulated;
+    A column ``kind`` decides where there is one. Otherwise: a source marked as simulated is simulated;
     a synthetic or simulated GNSS or IMU on a real drive makes it semi-real; all else is real.
     """
     stated = row.get("kind")
@@ -46,10 +46,10 @@ def drive_imus(dataset: str | Path) -> dict[str, str]:
 
 
 def drive_rates(dataset: str | Path) -> dict[str, float]:
-    """Samples a second [Hz] of every drive's IMU, of those that ``drives.parquet`` says it of."""
-    told = ((row["drive"], row.get("imu_rate_hz")) for row in _rows(dataset))
-    return {str(drive): float(rate) for drive, rate in told if rate is not None and is_number(rate)}
+    """Samples a second [Hz] of every drive's IMU, where ``drives.parquet`` has it."""
+    detail = ((row["drive"], row.get("imu_rate_hz")) for row in _rows(dataset))
+    return {str(drive): float(rate) for drive, rate in detail if rate is not None and is_number(rate)}
 
 
 def _rows(dataset: str | Path) -> list[dict[Any, Any]]:
-    return pd.read_parquet(readable(placed(dataset) / "drives.parquet")).to_dict("records")
+    return pd.read_parquet(open_parquet(resolve_place(dataset) / "drives.parquet")).to_dict("records")

@@ -1,4 +1,4 @@
-"""What is kept from a filter, or added to what it sees: withheld fixes and IMU biases, Batch → Batch."""
+"""Changes of a filter's input: withheld fixes and added IMU biases, Batch → Batch."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dlkf.base.settings import Ranged
 from dlkf.data.drive import Batch
-from dlkf.settings import Ranged
 
 
 @dataclass(frozen=True)
 class BiasLaw(Ranged, where="injected_bias", least=0):
-    """1σ of a constant that is added to the IMU of every piece, per axis [m/s², °/s]."""
+    """1σ of a constant that is added to the IMU of every segment, per axis [m/s², °/s]."""
 
     accel_mps2: float = 0.05
     gyro_dps: float = 0.15
@@ -28,19 +28,19 @@ class BiasLaw(Ranged, where="injected_bias", least=0):
 
 @dataclass(frozen=True)
 class Outage(Ranged, where="outage", least=0):
-    """One stretch without GNSS in every piece, seconds from its start."""
+    """One stretch without GNSS in every segment, seconds from its start."""
 
     first_s: float
     duration_s: float
 
 
-def withhold(batch: Batch, hidden: Bool[Tensor, "b t"]) -> Batch:
+def withhold_fixes(batch: Batch, hidden: Bool[Tensor, "b t"]) -> Batch:
     """The batch without the fixes of the mask."""
     return replace(batch, available=batch.available & ~hidden.to(batch.available.device))
 
 
-def within(batch: Batch, start_s: float | Tensor, duration_s: float | Tensor) -> Bool[Tensor, "b t"]:
-    """True where an epoch's end has start < t ≤ start + duration, seconds from the start of a piece; each (B,)."""
+def outage_within(batch: Batch, start_s: float | Tensor, duration_s: float | Tensor) -> Bool[Tensor, "b t"]:
+    """True where an epoch's end has start < t ≤ start + duration, seconds from the start of a segment; each (B,)."""
     B, T, _ = batch.size
     t = torch.arange(1, T + 1, dtype=torch.float64) * batch.epoch_s
     start, length = (torch.as_tensor(x, dtype=torch.float64).expand(B)[:, None] for x in (start_s, duration_s))
@@ -48,7 +48,7 @@ def within(batch: Batch, start_s: float | Tensor, duration_s: float | Tensor) ->
     return (t > start + slack) & (t <= start + length + slack)
 
 
-def with_bias(batch: Batch, bias: Float[Tensor, "b 6"]) -> Batch:
+def add_bias(batch: Batch, bias: Float[Tensor, "b 6"]) -> Batch:
     """The batch with a constant added to its raw IMU and to its true IMU error, which stays NaN where unknown."""
     bias = bias.to(batch.imu)
     imu = torch.where(batch.present[..., None, None], batch.imu + bias[:, None, None], batch.imu)

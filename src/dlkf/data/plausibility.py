@@ -1,6 +1,6 @@
 """Plausibility of a drive's numbers: wrong units, axes that do not point Forward-Right-Down, swapped columns.
 
-Each check compares with something else that the drive knows (gravity, the velocities, the course), so that an
+Each check compares with other data of the drive (gravity, the velocities, the course), so that an
 unusual drive does not raise an alarm.
 """
 
@@ -8,47 +8,54 @@ from __future__ import annotations
 
 import numpy as np
 
+from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import find_lag, known_offset
 from dlkf.data.discovery.drift import ROUGH_S, ends_apart, find_drifting_pose
 from dlkf.data.discovery.motion import Motion, motion
+from dlkf.data.limits import NOWHERE_DEG
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, VELOCITY
 from dlkf.data.tables import Columns
-from dlkf.errors import InputError
 from dlkf.navigation.earth import SEMI_MAJOR
 
+FORCE, UPRIGHT = (7.0, 13.0), 0.7  # m/s², the median specific force; the share of it along −z
 FASTEST_RATE = 20.0  # rad/s: no car turns, and no bump shakes it, that fast for a thousandth of a drive
 CHUNK_S = 10.0  # way and course are compared over such stretches: metres of GNSS noise do not matter
 DISAGREES, AGREES = 0.5, 0.25  # relative residual of way against velocity
 LEAST_SLOPE = 0.1  # of gyro_z against the course; one that is at its limit in every turn may have 0.3
-NOWHERE_DEG = 1e-6  # what receivers write before they have a position
+FEW = 2  # single fixes at 0°/0° or a continent away are refused by themselves (dlkf.data.limits)
 FARTHEST_KM, KM_PER_DEG = 2000.0, 111.2
 SEARCH_S = 600.0  # clocks of logs that have time in common are hardly further apart
 APART_S = 1.0  # less is a delay, which the filters bear; dlkf.ingest measures it on request
 DRIFTED_S = 0.1  # from a drive's first to its last second: worth a line
-SHORTEST_S = 60.0  # of a drive whose drift can be seen
+SHORTEST_S = 60.0  # of a drive whose drift is observable
 TURNED_DEG = (30.0, 150.0)  # backwards is found by the filters' own search
 
 
 def check_imu_units(imu: Columns, where: str) -> None:
     """Gravity must be about 9.8 m/s² and upwards along −z; rates must be those of a car in rad/s."""
-    size = float(np.median(_length(imu, ACCEL)))
+    force = _length(imu, ACCEL)
+    down, largest = -imu["accel_z"], float(_length(imu, GYRO).max())
+    usual = _most(force > FORCE[0]) and _most(force < FORCE[1]) and _most(down > UPRIGHT * FORCE[1])
+    if usual and largest <= FASTEST_RATE:
+        return  # the medians and the quantile below, which cost more than all else, would say the same
+    size = float(np.median(force))
     if 0.8 < size < 1.3:
         raise InputError(
             f"{where}: median specific force is {size:.2f}: looks like g; reader.imu.accel.unit=g, or multiply "
             "accel by 9.80665"
         )
-    if not 7.0 < size < 13.0:
+    if not FORCE[0] < size < FORCE[1]:
         raise InputError(
             f"{where}: median specific force is {size:.3g} m/s², must be near 9.8; reader.imu.accel.unit="
             "auto finds it, if gravity was not taken out"
         )
     axes = np.array([np.median(imu[c]) for c in ACCEL])
-    if axes[2] > 0.7 * size:
+    if axes[2] > UPRIGHT * size:
         raise InputError(
             f"{where}: accel_z is {axes[2]:+.2f} m/s² in the median, must be about −9.8 (Forward-Right-"
             "Down); the z axis points up (FLU?): reader.imu.accel.axes=flu and gyro.axes=flu, or auto"
         )
-    if axes[2] > -0.7 * size:
+    if axes[2] > -UPRIGHT * size:
         k = int(np.abs(axes).argmax())
         raise InputError(
             f"{where}: gravity lies on {ACCEL[k]} ({axes[k]:+.2f} m/s² in the median), must be −9.8 on "
@@ -63,6 +70,11 @@ def check_imu_units(imu: Columns, where: str) -> None:
         )
 
 
+def _most(holds: np.ndarray) -> bool:
+    """Whether more than half hold, and so the median."""
+    return 2 * int(np.count_nonzero(holds)) > len(holds) + 1
+
+
 def _length(imu: Columns, axes: tuple[str, ...]) -> np.ndarray:
     return np.sqrt(sum(imu[c] * imu[c] for c in axes))
 
@@ -74,6 +86,7 @@ def check_gnss_units(gnss: Columns, where: str) -> None:
     if len(bad):
         swapped = np.abs(lon).max() <= 90
         remedy = "latitude and longitude look swapped" if swapped else "must lie within ±90 degrees"
+        remedy += "" if swapped else _other_degrees(lat)
         raise InputError(f"{where}: fix {bad[0]}: lat_deg is {lat[bad[0]]:.4f}; {remedy}")
     bad = np.flatnonzero(np.abs(lon) > 180)
     if len(bad):
@@ -82,10 +95,18 @@ def check_gnss_units(gnss: Columns, where: str) -> None:
     _check_way(gnss, where)
 
 
+def _other_degrees(lat: np.ndarray) -> str:
+    """What latitudes beyond 90 may be instead."""
+    largest = float(np.nanmax(np.abs(lat)))
+    if largest <= 9000.0 and np.nanmax(np.abs(lat) % 100.0) < 60.0:
+        return ": looks like degrees and minutes (ddmm.mmmm); reader.gnss.position.unit=ddmm, or change them to degrees"
+    return ": looks like 1e-7 degrees; multiply by 1e-7" if 1e5 < largest <= 9e8 else ""
+
+
 def _check_places(lat: np.ndarray, lon: np.ndarray, where: str) -> None:
-    """No fix at 0°/0° in a drive elsewhere, and none a continent away from the rest."""
+    """No fixes at 0°/0° in a drive elsewhere, and none a continent away from the rest, but for very few."""
     zero = np.flatnonzero((np.abs(lat) < NOWHERE_DEG) & (np.abs(lon) < NOWHERE_DEG))
-    if 0 < len(zero) < len(lat):
+    if FEW < len(zero) < len(lat):
         raise InputError(
             f"{where}: fix {zero[0]} is at 0°/0°, as {len(zero)} of {len(lat)}: no position yet; "
             "reader.gnss.position.zero=none, or quality 0"
@@ -94,7 +115,7 @@ def _check_places(lat: np.ndarray, lon: np.ndarray, where: str) -> None:
     east = (lon - np.median(lon) + 180) % 360 - 180
     far = np.hypot(lat - middle, east * side) * KM_PER_DEG
     worst = int(far.argmax()) if len(far) else 0
-    if len(far) and far[worst] > FARTHEST_KM and np.mean(far > FARTHEST_KM) < 0.3:
+    if (far > FARTHEST_KM).sum() > FEW and np.mean(far > FARTHEST_KM) < 0.3:
         raise InputError(
             f"{where}: fix {worst} lies {far[worst]:.0f} km from the rest of the drive; give such fixes quality 0"
         )
@@ -103,7 +124,7 @@ def _check_places(lat: np.ndarray, lon: np.ndarray, where: str) -> None:
 def _check_way(gnss: Columns, where: str) -> None:
     """Displacements over stretches of ten seconds against the integral of the velocities.
 
-    Speaks up only if another reading of the columns explains the way where the given one does not.
+    A fault only if another reading of the columns explains the way where the given one does not.
     """
     t, lat, lon = gnss["t"], np.radians(gnss["lat_deg"]), np.radians(gnss["lon_deg"])
     v_n, v_e = gnss["vel_n"], gnss["vel_e"]
@@ -166,7 +187,7 @@ def _check_way(gnss: Columns, where: str) -> None:
 
 
 def check_turns(imu: Columns, gnss: Columns, where: str) -> None:
-    """Integrated gyro_z against the change of course between fixes, where the drive turns enough to tell."""
+    """Integrated gyro_z against the change of course between fixes, where the drive turns enough."""
     t, course = gnss["t"], np.arctan2(gnss["vel_e"], gnss["vel_n"])
     speed = np.hypot(gnss["vel_n"], gnss["vel_e"])
     angle = np.concatenate(([0.0], np.cumsum(imu["gyro_z"][1:] * np.diff(imu["t"]))))
@@ -201,9 +222,9 @@ def check_turns(imu: Columns, gnss: Columns, where: str) -> None:
 
 
 def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
-    """The yaw rate and the horizontal force agree with GNSS as the clocks stand, or nowhere clearly better.
+    """The yaw rate and the horizontal force agree with GNSS as the clocks stand, or at no offset clearly better.
 
-    Then the force forward and right also tells whether the sensor looks along the car.
+    Then the force forward and right also shows whether the sensor looks along the car.
     """
     t, accel, gyro, moved = _signals(imu, gnss)
     _check_drift(t, accel, gyro, moved, where)
@@ -244,8 +265,8 @@ def _check_drift(t: np.ndarray, accel: np.ndarray, gyro: np.ndarray, gnss: Motio
     )
 
 
-def drift_told(imu: Columns, gnss: Columns) -> str | None:
-    """A line about clocks that drift apart by less than :func:`check_clocks` refuses; None where none is seen."""
+def describe_drift(imu: Columns, gnss: Columns) -> str | None:
+    """A line about clocks that drift apart by less than :func:`check_clocks` refuses; None where none is found."""
     t, accel, gyro, moved = _signals(imu, gnss)
     ends = ends_apart(t, accel, gyro, moved)
     span = float(moved.t[-1] - moved.t[0]) if len(moved.t) else 0.0
@@ -262,7 +283,7 @@ def drift_told(imu: Columns, gnss: Columns) -> str | None:
     )
 
 
-def turned_told(imu: Columns, gnss: Columns) -> str | None:
+def describe_rotation(imu: Columns, gnss: Columns) -> str | None:
     """A line about a sensor that seems turned, where it is not so clear that :func:`check_clocks` refuses it."""
     best = find_lag(*_signals(imu, gnss), APART_S)
     if best is None or not best.clear or not min(best.yaw, best.force) > 0.6:

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from dlkf.data.increments import merged, two_sample
+from dlkf.base.errors import InputError
+from dlkf.data.increments import merge_increments, two_sample
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, IMU_ERROR, POSITION, STD, VELOCITY
 from dlkf.data.tables import Columns
 from dlkf.data.validate import GNSS_QUALITIES
-from dlkf.errors import InputError
 from dlkf.navigation.attitude import rotation_from_rpy, rotation_from_vector, vector_from_rotation
 from dlkf.navigation.earth import ecef_from_geodetic, ned_axes
 
@@ -26,7 +26,7 @@ VERTICAL_FACTOR = 1.5  # of the default position std
 
 
 @dataclass(frozen=True)
-class Grid:
+class SampleGrid:
     """N epochs of M samples from ``t0``; boundary k is at ``t0 + k·epoch_s``."""
 
     t0: float
@@ -45,7 +45,7 @@ class Grid:
         return self.t0 + self.epoch_s / self.samples * np.arange(self.epochs * self.samples + 1)
 
 
-def epoch_grid(t_imu: np.ndarray, t_fix: np.ndarray, rate_hz: float, epoch_s: float, drive: str) -> Grid:
+def epoch_grid(t_imu: np.ndarray, t_fix: np.ndarray, rate_hz: float, epoch_s: float, drive: str) -> SampleGrid:
     """The grid inside the IMU's time whose boundaries the fixes fall on.
 
     Raises InputError if an epoch is no whole number of samples, or the drive is shorter than an epoch.
@@ -59,7 +59,7 @@ def epoch_grid(t_imu: np.ndarray, t_fix: np.ndarray, rate_hz: float, epoch_s: fl
     epochs = int(np.floor((last - t0 + slack) / epoch_s))
     if epochs < 1:
         raise InputError(f"drive {drive}: only {last - first:.2f} s of IMU, shorter than an epoch of {epoch_s:g} s")
-    return Grid(float(t0), epoch_s, epochs, samples)
+    return SampleGrid(float(t0), epoch_s, epochs, samples)
 
 
 def samples_per_epoch(rate_hz: float, epoch_s: float) -> int:
@@ -91,12 +91,12 @@ def fix_phase(t: np.ndarray, epoch_s: float) -> float:
     return float(centre + np.median(around[np.abs(around - best) <= ON_BOUNDARY_S]))
 
 
-def resample_imu(imu: Columns, grid: Grid, usual: float | None = None) -> np.ndarray:
+def resample_imu(imu: Columns, grid: SampleGrid, usual: float | None = None) -> np.ndarray:
     """Specific force and rate (N, M, 6), constant within each of the grid's samples, that act like the file's.
 
     A sample of the file is the mean over the interval that ends at its stamp. Its integral is corrected for coning
     and sculling from the interval before (:mod:`dlkf.data.increments`) and spread evenly over the interval; the grid's
-    samples are composed of the pieces of intervals inside them. So their integral is exact for whole ratios and
+    samples are composed of the segments of intervals inside them. So their integral is exact for whole ratios and
     unbiased for any other, and their rectified motion is that of the file's rate. Where stamps are missing (an
     interval over 1.5 ``usual`` ones [s], by default their median), the mean of the two neighbours fills the
     missing part.
@@ -130,12 +130,12 @@ def _composed(t: np.ndarray, values: np.ndarray, at: np.ndarray, usual: float) -
     times = np.concatenate((at, knots[(knots > at[0]) & (knots < at[-1])]))
     times.sort(kind="stable")
     place = np.searchsorted(knots, times[:-1], side="right") - 1
-    pieces = rates.take(place, 1, mode="clip") * np.diff(times)
-    return merged(pieces, np.searchsorted(times, at[:-1]))
+    segments = rates.take(place, 1, mode="clip") * np.diff(times)
+    return merge_increments(segments, np.searchsorted(times, at[:-1]))
 
 
 @dataclass(frozen=True)
-class Fixes:
+class FixRows:
     """GNSS at the N+1 boundaries; the columns of :class:`dlkf.data.drive.Drive`."""
 
     r_e: np.ndarray
@@ -150,7 +150,7 @@ class Fixes:
 BLANK = {"r_e": np.nan, "v_e": np.nan, "std": np.nan, "valid": False, "lag": 0.0, "quality": 0}
 
 
-def assign_fixes(gnss: Columns, grid: Grid) -> Fixes:
+def assign_fixes(gnss: Columns, grid: SampleGrid) -> FixRows:
     """Each fix to the first boundary at or after it; the latest in an epoch wins.
 
     Unknown stds take the defaults of ``DEFAULT_STD``; components that are NaN are not valid.
@@ -162,7 +162,7 @@ def assign_fixes(gnss: Columns, grid: Grid) -> Fixes:
     chosen[place[inside]] = inside  # rows are in order of time: the last assignment stays
     at = np.flatnonzero(chosen >= 0)
     found = fixes_at(gnss, chosen[at], grid.boundaries[at])
-    return Fixes(*(_spread(getattr(found, name), at, rows, blank) for name, blank in BLANK.items()))
+    return FixRows(*(_spread(getattr(found, name), at, rows, blank) for name, blank in BLANK.items()))
 
 
 def usable_fixes(gnss: Columns) -> np.ndarray:
@@ -171,12 +171,12 @@ def usable_fixes(gnss: Columns) -> np.ndarray:
     return np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite(position).all(0)
 
 
-def boundary_after(t: np.ndarray, grid: Grid) -> np.ndarray:
+def boundary_after(t: np.ndarray, grid: SampleGrid) -> np.ndarray:
     """Number of the first boundary at or after times [s]; it may lie outside the grid."""
     return np.ceil((t - grid.t0 - ON_BOUNDARY_S) / grid.epoch_s).astype(np.int64)
 
 
-def fixes_at(gnss: Columns, rows: np.ndarray, boundaries: np.ndarray) -> Fixes:
+def fixes_at(gnss: Columns, rows: np.ndarray, boundaries: np.ndarray) -> FixRows:
     """Some rows of a GNSS table as fixes of the boundaries [s] given for them."""
     r_e, v_e, C_en = _ecef(gnss, rows)
     quality = gnss["quality"][rows].astype(np.int64)
@@ -188,11 +188,11 @@ def fixes_at(gnss: Columns, rows: np.ndarray, boundaries: np.ndarray) -> Fixes:
     v_e = (C_en @ np.where(known, v_ned, 0.0)[..., None])[..., 0]
     lag = np.clip(boundaries - gnss["t"][rows], 0.0, None)
     lag[lag <= ON_BOUNDARY_S] = 0.0
-    return Fixes(r_e, v_e, std, np.concatenate((np.ones_like(known), known), -1), lag, quality)
+    return FixRows(r_e, v_e, std, np.concatenate((np.ones_like(known), known), -1), lag, quality)
 
 
 @dataclass(frozen=True)
-class Truth:
+class ReferenceStates:
     """Reference at the N+1 boundaries; the columns of :class:`dlkf.data.drive.Drive`."""
 
     r_e: np.ndarray
@@ -202,7 +202,7 @@ class Truth:
     imu_error: np.ndarray
 
 
-def reference_at(reference: Columns | None, grid: Grid) -> Truth:
+def reference_at(reference: Columns | None, grid: SampleGrid) -> ReferenceStates:
     """The reference interpolated to the boundaries, from samples that are both valid and close.
 
     Position by cubic Hermite with the velocities (linear where samples are dense), velocity and IMU error
@@ -210,7 +210,9 @@ def reference_at(reference: Columns | None, grid: Grid) -> Truth:
     """
     rows = grid.epochs + 1
     nan3 = np.full((rows, 3), np.nan)
-    empty = Truth(nan3, nan3.copy(), np.full((rows, 3, 3), np.nan), np.zeros(rows, bool), np.full((rows, 6), np.nan))
+    empty = ReferenceStates(
+        nan3, nan3.copy(), np.full((rows, 3, 3), np.nan), np.zeros(rows, bool), np.full((rows, 6), np.nan)
+    )
     if reference is None:
         return empty
     known = reference["valid"] & np.isfinite(np.stack([reference[c] for c in (*POSITION, *VELOCITY)])).all(0)
@@ -243,7 +245,7 @@ def reference_at(reference: Columns | None, grid: Grid) -> Truth:
     if all(c in reference for c in IMU_ERROR):
         e = np.stack([reference[c] for c in IMU_ERROR], -1)
         error = np.where(s == 0, e[i], np.where(s == 1, e[i + 1], e[i] + s * (e[i + 1] - e[i])))
-    return Truth(
+    return ReferenceStates(
         r_e=_spread(r_e, rows_at, rows, np.nan),
         v_e=_spread(v_e, rows_at, rows, np.nan),
         C_eb=_spread(C_eb, rows_at, rows, np.nan),

@@ -7,21 +7,21 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pandas as pd
 
+from dlkf.base.errors import InputError
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
 from dlkf.data.tables import DriveRow
-from dlkf.data.validate import DriveTables, checked
-from dlkf.errors import InputError
+from dlkf.data.validate import CheckedTables, check_tables
 
 IMU_COLUMNS = (*ACCEL, *GYRO)
 GNSS_COLUMNS = (*POSITION, *VELOCITY, *STD, "quality")
 NEEDED = ("t", *IMU_COLUMNS, *POSITION)
 
 
-def drives_of(rows: pd.DataFrame, lever_arm_b: Sequence[float]) -> Iterator[DriveTables]:
+def drives_of(rows: pd.DataFrame, lever_arm_b: Sequence[float]) -> Iterator[CheckedTables]:
     """The checked tables of every ``drive`` in the rows (one drive where there is no such column).
 
     Columns are those of the data contract; ``vel_*``, ``std_*`` and ``quality`` (default 1, single) may be missing.
-    Raises InputError for a missing column and whatever is wrong with the data.
+    Raises InputError for a missing column and for faulty data.
     """
     if missing := [c for c in NEEDED if c not in rows or rows[c].isna().all()]:
         raise InputError(f"the table lacks {', '.join(missing)}; it needs {', '.join(NEEDED)}")
@@ -36,7 +36,7 @@ def drives_of(rows: pd.DataFrame, lever_arm_b: Sequence[float]) -> Iterator[Driv
         gnss["quality"] = np.where(np.isnan(gnss["quality"]), 1, gnss["quality"]).astype(np.int64)
         x, y, z = map(float, lever_arm_b)
         row = DriveRow(str(drive), str(drive), (x, y, z))
-        yield checked(DriveTables(row, {c: _values(imu, c) for c in ("t", *IMU_COLUMNS)}, gnss, None))
+        yield check_tables(CheckedTables(row, {c: _values(imu, c) for c in ("t", *IMU_COLUMNS)}, gnss, None))
 
 
 def _values(table: pd.DataFrame, column: str) -> np.ndarray:
@@ -51,8 +51,8 @@ def example_drive() -> pd.DataFrame:
     rows = pd.DataFrame({"drive": "example", "t": t} | dict.fromkeys(IMU_COLUMNS, 0.0))
     rows["accel_z"] = -9.806
     fixed = np.isclose(t % 1.0, 0.0) | np.isclose(t % 1.0, 1.0)
-    told = {"lat_deg": 48.0 + 10 * t / 111_200, "lon_deg": 11.0, "height_m": 500.0, "vel_n": 10.0, "vel_e": 0.0}
-    told |= {"vel_d": 0.0, "quality": 4.0} | dict.fromkeys(STD[:3], 0.02) | dict.fromkeys(STD[3:], 0.02)
+    detail = {"lat_deg": 48.0 + 10 * t / 111_200, "lon_deg": 11.0, "height_m": 500.0, "vel_n": 10.0, "vel_e": 0.0}
+    detail |= {"vel_d": 0.0, "quality": 4.0} | dict.fromkeys(STD[:3], 0.02) | dict.fromkeys(STD[3:], 0.02)
     for column in GNSS_COLUMNS:
-        rows[column] = np.where(fixed, told[column], np.nan)
+        rows[column] = np.where(fixed, detail[column], np.nan)
     return rows.round(9)

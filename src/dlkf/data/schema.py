@@ -7,10 +7,13 @@
                                                    interval that ends at t, FRD, −g on z at rest
     <dataset>/gnss/drive=<id>/part-0.parquet       antenna, instantaneous at t; quality = NMEA GGA code
     <dataset>/reference/drive=<id>/part-0.parquet  optional; instantaneous at t
+    <dataset>/speed/drive=<id>/part-0.parquet      optional; t, speed [m/s, forward positive or never negative], std
+    <dataset>/heading/drive=<id>/part-0.parquet    optional; t, heading [rad] of the car from North over East, std
+    <dataset>/baro/drive=<id>/part-0.parquet       optional; t, pressure [Pa] or height_m, std of height_m
     <dataset>/raw/drive=<id>/part-0.parquet        optional; satellite observations, see
                                                    dlkf.simulation.gnss.satellite_fixes.Received
 
-NaN stands for what a source does not know. Any other column is carried along.
+NaN stands for unknown values. Any other column is carried along.
 """
 
 from __future__ import annotations
@@ -25,8 +28,8 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dlkf.errors import InputError
-from dlkf.files import placed, whole_file, whole_folder
+from dlkf.base.errors import InputError
+from dlkf.base.files import replace_file, replace_folder, require_empty, resolve_place
 
 F, I, B = pa.float64(), pa.int8(), pa.bool_()
 ACCEL = ("accel_x", "accel_y", "accel_z")
@@ -43,6 +46,7 @@ IMU_ERROR = (
     "gyro_error_y",
     "gyro_error_z",
 )
+LONGEST_NAME = 200  # bytes of a drive's name: a file system takes 255 with what stands before it
 LEVER_ARM = ("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m")
 
 
@@ -55,10 +59,18 @@ SCHEMAS: dict[str, pa.Schema] = {
     "gnss": _schema(dict.fromkeys(("t", *POSITION, *VELOCITY, *STD), F) | {"quality": I}),
     "reference": _schema(dict.fromkeys(("t", *POSITION, *VELOCITY, *ATTITUDE), F) | {"valid": B}),
 }
+AIDS: dict[str, pa.Schema] = {  # tables that a drive may have: of other sensors than IMU and GNSS
+    "speed": _schema(dict.fromkeys(("t", "speed"), F)),
+    "heading": _schema(dict.fromkeys(("t", "heading"), F)),
+    "baro": _schema({"t": F}),
+}
 OPTIONAL: dict[str, pa.Schema] = {  # read where present
     "imu": pa.schema([]),
     "gnss": pa.schema([]),
     "reference": _schema(dict.fromkeys(IMU_ERROR, F)),
+    "speed": _schema({"std": F}),
+    "heading": _schema({"std": F}),
+    "baro": _schema(dict.fromkeys(("pressure", "height_m", "std"), F)),
 }
 TEXTS = ("drive", "group", "source", "licence", "imu", "gnss", "reference")
 NUMBERS = ("imu_rate_hz", "gnss_rate_hz", "duration_s", "distance_m", *LEVER_ARM)
@@ -66,9 +78,14 @@ DRIVES = _schema({**dict.fromkeys(TEXTS, pa.string()), **dict.fromkeys(NUMBERS, 
 DRIVES_REQUIRED = ("drive", "group")
 
 
+def own_schema(column: str = "") -> pa.Schema:
+    """Of a table of a user's own: time and a column of values."""
+    return _schema(dict.fromkeys(("t", column) if column else ("t",), F))
+
+
 def drive_file(folder: Path, kind: str, drive: str) -> Path:
-    """Where a table of a drive is written; ``kind`` is imu, gnss or reference."""
-    return placed(folder) / kind / f"drive={drive}" / "part-0.parquet"
+    """Where a table of a drive is written; ``kind`` is imu, gnss, reference or one of :data:`AIDS`."""
+    return resolve_place(folder) / kind / f"drive={drive}" / "part-0.parquet"
 
 
 @contextmanager
@@ -77,10 +94,8 @@ def new_dataset(folder: str | Path, overwrite: bool = False) -> Iterator[Path]:
 
     Raises InputError if ``folder`` already holds something and ``overwrite`` is False.
     """
-    target = placed(folder).absolute()
-    if target.is_file() or (target.is_dir() and any(target.iterdir()) and not overwrite):
-        raise InputError(f"out={folder}: exists already; give another folder, or overwrite=true to replace it")
-    with whole_folder(folder) as beside:
+    require_empty(folder, overwrite=overwrite)
+    with replace_folder(folder) as beside:
         yield beside
 
 
@@ -92,9 +107,9 @@ def write_parquet(path: Path, table: pa.Table) -> None:
     """
     floats = [field.name for field in table.schema if pa.types.is_floating(field.type)]
     others = [name for name in table.column_names if name not in floats]
-    with whole_file(path) as beside:
+    with replace_file(path) as beside:
         pq.write_table(
-            table, beside, compression="zstd",
+            table, beside, compression="zstd", write_page_checksum=True,
             use_dictionary=others, use_byte_stream_split=floats,  # pyright: ignore[reportArgumentType]  names do as well
         )  # fmt: skip
 
@@ -105,8 +120,11 @@ def write_drive(
     imu: pd.DataFrame,
     gnss: pd.DataFrame | None,
     reference: pd.DataFrame | None = None,
+    aids: Mapping[str, pd.DataFrame] | None = None,
 ) -> dict[str, Any]:
     """Write the tables of a drive and return its completed row for :func:`write_drives_table`.
+
+    ``aids`` are tables of :data:`AIDS`, or of one's own, by name.
 
     ``meta`` needs ``drive``; ``group`` defaults to it, rates, duration and distance are filled in from the
     tables where absent; a log for :mod:`dlkf.allan` needs no GNSS. Columns beyond the contract are kept. Raises
@@ -114,8 +132,8 @@ def write_drive(
     """
     row = dict(meta)
     name = check_name(str(row["drive"]))
-    folder = placed(folder)
-    for kind, frame in (("imu", imu), ("gnss", gnss), ("reference", reference)):
+    folder = resolve_place(folder)
+    for kind, frame in {"imu": imu, "gnss": gnss, "reference": reference, **(aids or {})}.items():
         if frame is not None:
             write_parquet(drive_file(folder, kind, name), contract_table(kind, frame, name))
     row.setdefault("group", name)
@@ -137,7 +155,7 @@ def write_drives_table(folder: str | Path, rows: Sequence[Mapping[str, Any]]) ->
         default = 0.0 if name in LEVER_ARM else np.nan
         frame[name] = frame[name].astype(float).fillna(default) if name in frame else default
     ordered = frame[[*DRIVES.names, *(c for c in frame.columns if c not in DRIVES.names)]]
-    write_parquet(placed(folder) / "drives.parquet", pa.Table.from_pandas(ordered, preserve_index=False))
+    write_parquet(resolve_place(folder) / "drives.parquet", pa.Table.from_pandas(ordered, preserve_index=False))
 
 
 def contract_table(kind: str, frame: pd.DataFrame, drive: str) -> pa.Table:
@@ -145,7 +163,7 @@ def contract_table(kind: str, frame: pd.DataFrame, drive: str) -> pa.Table:
 
     Raises InputError naming the drive and what is missing.
     """
-    schema = SCHEMAS[kind]
+    schema = {**SCHEMAS, **AIDS}.get(kind, own_schema())
     if missing := [name for name in schema.names if name not in frame]:
         raise InputError(f"drive {drive}, {kind}: column {', '.join(missing)} missing; has {', '.join(frame.columns)}")
     extra = [name for name in frame.columns if name not in schema.names]
@@ -158,6 +176,8 @@ def check_name(drive: str) -> str:
     """The drive's name, if it can be part of a path ``drive=<name>``; InputError if not."""
     if not drive or drive.startswith(".") or any(c in drive for c in "/\\=") or drive != drive.strip():
         raise InputError(f"drive {drive!r}: a drive's name must be non-empty, without '/', '\\', '=' or a leading dot")
+    if len(drive.encode(errors="replace")) > LONGEST_NAME:
+        raise InputError(f"drive {drive[:40]!r}…: a drive's name names a folder, with at most {LONGEST_NAME} bytes")
     return drive
 
 

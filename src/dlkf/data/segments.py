@@ -1,4 +1,4 @@
-"""Pieces of drives as batches: where they may be cut, cutting by one gather, starts with drawn errors."""
+"""Segments of drives as batches: where they may be cut, cutting by one gather, starts with drawn errors."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dlkf.base.errors import InputError
+from dlkf.base.settings import Ranged
 from dlkf.data.alignment import Start
-from dlkf.data.draws import drawn_per_piece
+from dlkf.data.draws import draw_per_segment
 from dlkf.data.drive import Batch, Drive
-from dlkf.data.stack import DriveStack, stacked
-from dlkf.errors import InputError
+from dlkf.data.stack import DriveStack, stack_drives
 from dlkf.navigation.earth import TangentFrame, tangent_frame
 from dlkf.navigation.state import NavState
-from dlkf.settings import Ranged
 
-REST = (0.0, 0.0, -9.8, 0.0, 0.0, 0.0)  # IMU in the padding after a piece's end
+REST = (0.0, 0.0, -9.8, 0.0, 0.0, 0.0)  # IMU in the padding after a segment's end
 
 
-class Piece(NamedTuple):
+class Segment(NamedTuple):
     """``epochs`` epochs of drive number ``drive`` from boundary ``first`` on."""
 
     drive: int
@@ -71,10 +71,10 @@ def possible_starts(
 
     The reference must be valid at the start and at ``min_valid`` of the boundaries after it, and a whole
     start state known, from the reference or, unless ``attitude`` asks for true attitude, from IMU and GNSS.
-    With ``span`` (a label per boundary, that of the epoch it begins; −1 belongs to none) a piece must stay
+    With ``span`` (a label per boundary, that of the epoch it begins; −1 belongs to none) a segment must stay
     inside one span.
     """
-    stack = stacked(drives)
+    stack = stack_drives(drives)
     truth = stack.start_from_truth
     valid = truth if attitude else stack.rows["ref_valid"]
     start = truth
@@ -93,14 +93,14 @@ def possible_starts(
     return ok
 
 
-def pieces_at(stack: DriveStack, rows: Int[Tensor, " p"], epochs: int) -> list[Piece]:
-    """Pieces that start at rows of the stack."""
+def segments_at(stack: DriveStack, rows: Int[Tensor, " p"], epochs: int) -> list[Segment]:
+    """Segments that start at rows of the stack."""
     drive = torch.searchsorted(stack.first_row, rows, right=True) - 1
     first = rows - stack.first_row[drive]
-    return [Piece(d, f, epochs) for d, f in zip(drive.tolist(), first.tolist())]
+    return [Segment(d, f, epochs) for d, f in zip(drive.tolist(), first.tolist())]
 
 
-def cut_pieces(
+def cut_segments(
     drives: Sequence[Drive],
     length_s: float,
     stride_s: float | None = None,
@@ -108,13 +108,13 @@ def cut_pieces(
     attitude: bool = False,
     min_valid: float = 1.0,
     span: Int[Tensor, " rows"] | None = None,
-) -> list[Piece]:
-    """Pieces of ``length_s`` every ``stride_s`` (default: end to end), only where the reference is valid.
+) -> list[Segment]:
+    """Segments of ``length_s`` every ``stride_s`` (default: end to end), only where the reference is valid.
 
     Where it is not, cutting goes on with the first boundary from which it can. Options as in
     :func:`possible_starts`.
     """
-    stack = stacked(drives)
+    stack = stack_drives(drives)
     epochs = epochs_of(length_s, stack.epoch_s)
     stride = epochs if stride_s is None else epochs_of(stride_s, stack.epoch_s)
     allowed = possible_starts(stack, epochs, attitude=attitude, min_valid=min_valid, span=span)
@@ -127,43 +127,43 @@ def cut_pieces(
         if row >= free:
             chosen.append(row)
             free = row + stride
-    return pieces_at(stack, torch.tensor(chosen, dtype=torch.int64), epochs)
+    return segments_at(stack, torch.tensor(chosen, dtype=torch.int64), epochs)
 
 
-def unused(drives: Sequence[Drive], pieces: Sequence[Piece]) -> list[str]:
-    """Names of the drives of which none of the pieces is cut."""
-    used = {piece.drive for piece in pieces}
+def find_unused_drives(drives: Sequence[Drive], segments: Sequence[Segment]) -> list[str]:
+    """Names of the drives of which none of the segments is cut."""
+    used = {segment.drive for segment in segments}
     return [drive.name for k, drive in enumerate(drives) if k not in used]
 
 
-def told_unused(names: Sequence[str], of: int, piece: str, mend: str) -> str:
-    """``3 of 10 drives, too short or not valid long enough for a piece of 120 s: a, b, c; …``: four names at most."""
+def describe_unused_drives(names: Sequence[str], of: int, segment: str, mend: str) -> str:
+    """``3 of 10 drives, too short or not valid long enough for a segment of 120 s: a, b, c; …``: four names at most."""
     more = f" and {len(names) - 4} more" if len(names) > 4 else ""
-    short = f"too short or not valid long enough for a {piece}"
+    short = f"too short or not valid long enough for a {segment}"
     return f"{len(names)} of {of} drives, {short}: {', '.join(names[:4])}{more}; {mend}"
 
 
 def make_batch(
     drives: Sequence[Drive],
-    pieces: Sequence[Piece],
+    segments: Sequence[Segment],
     *,
     dtype: torch.dtype = torch.float32,
     start: StartLaw = StartLaw(),
     seed: int | None = None,
     generator: torch.Generator | None = None,
 ) -> Batch:
-    """Cut pieces out of drives; the tangent frame of each lies at its true (else GNSS) start.
+    """Cut segments out of drives; the tangent frame of each lies at its true (else GNSS) start.
 
-    start = truth ⊞ (−δ), δ ~ N(0, Σ₀) of the law. With a ``seed`` it is drawn for each piece by itself
+    start = truth ⊞ (−δ), δ ~ N(0, Σ₀) of the law. With a ``seed`` it is drawn for each segment by itself
     (:mod:`dlkf.data.draws`), as a test needs it, else for the batch from ``generator``. Where the reference has no
     attitude, attitude and its std come from IMU and GNSS instead (the law's are then not added), and so does
-    everything where there is no reference at all. Pieces of different lengths are padded (``present``).
+    everything where there is no reference at all. Segments of different lengths are padded (``present``).
     Pass a :class:`DriveStack` where many batches are cut from the same drives.
     """
-    stack = stacked(drives)
-    drive, first, epochs = torch.tensor(pieces, dtype=torch.int64).reshape(-1, 3).T
+    stack = stack_drives(drives)
+    drive, first, epochs = torch.tensor(segments, dtype=torch.int64).reshape(-1, 3).T
     if not len(drive):
-        raise InputError("no pieces: the drives are shorter than the length asked for, or never valid")
+        raise InputError("no segments: the drives are shorter than the length asked for, or never valid")
     row = stack.first_row[drive] + first
     origin = stack.origin[row]
     frame = tangent_frame(*origin.unbind(-1), dtype=dtype)
@@ -174,7 +174,7 @@ def make_batch(
     else:
         t_start = stack.t0[drive] + first * stack.epoch_s
         names = [stack[d].name for d in drive.tolist()]
-        noise = drawn_per_piece(
+        noise = draw_per_segment(
             lambda g: torch.randn(9, generator=g, dtype=torch.float64), seed, "start", names, t_start
         )
     dx = std * noise
@@ -186,7 +186,7 @@ def make_batch(
 
 def whole_drives(drives: Sequence[Drive], starts: Sequence[Start], *, dtype: torch.dtype = torch.float64) -> Batch:
     """Complete drives from the given starts on, as one batch padded to the longest."""
-    stack = stacked(drives)
+    stack = stack_drives(drives)
     if len(starts) != len(stack):
         raise InputError(f"{len(stack)} drives but {len(starts)} starts; give one start per drive")
     first = torch.tensor([s.first for s in starts])
@@ -200,7 +200,7 @@ def whole_drives(drives: Sequence[Drive], starts: Sequence[Start], *, dtype: tor
 def _with_alignment(
     stack: DriveStack, row: Tensor, frame: TangentFrame, truth: NavState, std: Tensor, dx: Tensor
 ) -> tuple[NavState, Tensor, Tensor]:
-    """Fill in what the reference does not know of the start from IMU and GNSS; no drawn error there."""
+    """Fill in what the reference lacks of the start from IMU and GNSS; no drawn error there."""
     a = stack.aligned
     guess = _state(frame, a.r_e[row], a.v_e[row], a.C_eb[row])
     no_reference = ~stack.rows["ref_valid"][row]
@@ -238,7 +238,7 @@ def _assemble(
     dtype: torch.dtype,
 ) -> Batch:
     if bool((first < 0).any() | (epochs < 1).any() | (first + epochs > stack.epochs[drive]).any()):
-        raise InputError("a piece reaches beyond its drive; cut it with cut_pieces")
+        raise InputError("a segment reaches beyond its drive; cut it with cut_segments")
     T = int(epochs.max())
     step = torch.arange(T)
     present = step < epochs[:, None]
@@ -249,6 +249,7 @@ def _assemble(
     if not bool(present.all()):
         imu[~present] = torch.tensor(REST, dtype=dtype)
     at = {name: values[row] for name, values in stack.rows.items()}
+    aids = {name: (values[row] * present[..., None]).to(dtype) for name, values in stack.aids.items()}
     valid = at["gnss_valid"] & present[..., None]
     gnss = torch.cat((frame.from_ecef(at["gnss_r_e"]), frame.rotate_from_ecef(at["gnss_v_e"])), -1)
     truth = _state(frame, at["ref_r_e"], at["ref_v_e"], at["ref_C_eb"])
@@ -272,4 +273,5 @@ def _assemble(
         present=present,
         drive=tuple(stack[d].name for d in drive.tolist()),
         t_start=stack.t0[drive] + first * stack.epoch_s,
+        aids=aids,
     )

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from dlkf.base.errors import InputError
 from dlkf.data.segments import epochs_of
 from dlkf.data.stack import DriveStack
-from dlkf.errors import InputError
 
 SIDES = ("train", "val", "test")
 Split = str | Mapping[str, Sequence[str] | str]
@@ -22,7 +22,7 @@ def split_rows(
 ) -> dict[str, Int[Tensor, " rows"]]:
     """For each side a label per boundary, that of the epoch it begins; −1 belongs to none.
 
-    Pieces of a side stay inside one label.
+    Segments of a side stay inside one label.
 
     ``split``: "group" assigns whole groups by ``fractions`` of the driving time; a mapping names the groups
     of each side ("all" and "rest" may stand for lists); "random" shuffles blocks of ``block_s``, as the paper
@@ -111,13 +111,13 @@ def _shuffled_blocks(
         labels[first : first + blocks * block] = count + torch.arange(blocks).repeat_interleave(block)
         count += blocks
     if count < 3:
-        raise InputError(f"split=random: only {count} blocks of the piece length; use shorter pieces or more data")
+        raise InputError(f"split=random: only {count} blocks of the segment length; use shorter segments or more data")
     order = np.random.default_rng(seed).permutation(count)
     edges = np.round(np.cumsum([0.0, *fractions]) * count).astype(int)
     sides = {}
     for side, low, high, fraction in zip(SIDES, edges[:-1], edges[1:], fractions):
         if fraction > 0 and high == low:
-            raise InputError(f"split=random: {count} blocks leave none for {side}; use shorter pieces or more data")
+            raise InputError(f"split=random: {count} blocks leave none for {side}; use shorter segments or more data")
         mine = torch.zeros(count + 1, dtype=torch.bool)
         mine[torch.from_numpy(order[low:high].copy())] = True
         sides[side] = torch.where(mine[labels], labels, -1)

@@ -1,4 +1,4 @@
-"""All drives end to end in one tensor per column, so that cutting pieces is a single gather."""
+"""All drives end to end in one tensor per column, so that cutting segments is a single gather."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from dlkf.base.errors import InputError
+from dlkf.data.aids import ROW
 from dlkf.data.alignment import Aligned, align_boundaries
 from dlkf.data.drive import Drive
-from dlkf.errors import InputError
 from dlkf.navigation.geodetic import geodetic_from_ecef
 
-ROWS = (
+BOUNDARY_COLUMNS = (
     "gnss_r_e", "gnss_v_e", "gnss_std", "gnss_valid", "gnss_lag",
     "ref_r_e", "ref_v_e", "ref_C_eb", "ref_valid", "ref_imu_error",
 )  # fmt: skip
@@ -24,7 +25,8 @@ class DriveStack(Sequence[Drive]):
     """A sequence of drives whose tensors are views into the stack's; epochs and boundaries keep their order.
 
     ``imu`` (ΣN, M, 6); ``rows[name]`` (Σ(N+1), …) for every per-boundary column of :class:`Drive`;
-    ``first_epoch`` and ``first_row`` (drives,) say where a drive begins. Raises InputError if there is no
+    ``aids[name]`` (Σ(N+1), 5) likewise, of a sensor that at least one drive has, with counts of 0 where one has none.
+    ``first_epoch`` and ``first_row`` (drives,) are where a drive begins. Raises InputError if there is no
     drive or their rates or epochs differ.
     """
 
@@ -39,7 +41,12 @@ class DriveStack(Sequence[Drive]):
         self.first_epoch = lengths.cumsum(0) - lengths
         self.first_row = (lengths + 1).cumsum(0) - (lengths + 1)
         self.imu = torch.cat([d.imu for d in drives])
-        self.rows: dict[str, Tensor] = {name: torch.cat([getattr(d, name) for d in drives]) for name in ROWS}
+        self.rows: dict[str, Tensor] = {
+            name: torch.cat([getattr(d, name) for d in drives]) for name in BOUNDARY_COLUMNS
+        }
+        names = sorted({name for d in drives for name in d.aids})
+        none = [torch.zeros(d.epochs + 1, len(ROW), dtype=torch.float64) for d in drives]
+        self.aids = {n: torch.cat([d.aids.get(n, blank) for d, blank in zip(drives, none)]) for n in names}
         self.t0 = torch.tensor([d.t0 for d in drives], dtype=torch.float64)
         self.lever_arm_b = torch.stack([d.lever_arm_b.double() for d in drives])
         self.rate_hz, self.epoch_s = drives[0].rate_hz, drives[0].epoch_s
@@ -47,7 +54,7 @@ class DriveStack(Sequence[Drive]):
             replace(
                 d,
                 imu=self.imu[e : e + d.epochs],
-                **{name: self.rows[name][r : r + d.epochs + 1] for name in ROWS},
+                **{name: self.rows[name][r : r + d.epochs + 1] for name in BOUNDARY_COLUMNS},
             )
             for d, e, r in zip(drives, self.first_epoch.tolist(), self.first_row.tolist())
         ]
@@ -95,6 +102,6 @@ class DriveStack(Sequence[Drive]):
         return self.aligned.ok & ~self.start_from_truth
 
 
-def stacked(drives: Sequence[Drive]) -> DriveStack:
+def stack_drives(drives: Sequence[Drive]) -> DriveStack:
     """The drives as a stack; a stack is returned as it is."""
     return drives if isinstance(drives, DriveStack) else DriveStack(drives)

@@ -7,13 +7,15 @@ from pathlib import Path
 
 import torch
 
-from dlkf.console import Counted
+from dlkf.base.console import ProgressCallback
+from dlkf.base.errors import InputError
+from dlkf.base.files import folder_name, resolve_place
+from dlkf.data.aid_tables import STANDARD, AidTable, standard_tables
+from dlkf.data.aids import aid_rows
 from dlkf.data.drive import Drive
 from dlkf.data.resampling import assign_fixes, epoch_grid, reference_at, resample_imu
 from dlkf.data.tables import DriveRow, dataset_digest, read_drives
-from dlkf.data.validate import GNSS_QUALITIES, LIMITS, DriveTables, Limits, read_checked
-from dlkf.errors import InputError
-from dlkf.files import name_of
+from dlkf.data.validate import GNSS_QUALITIES, LIMITS, CheckedTables, Limits, read_checked
 
 __all__ = ["dataset_digest", "drive_from_tables", "load_dataset"]
 
@@ -26,19 +28,21 @@ def load_dataset(
     dtype: torch.dtype = torch.float32,
     reference: bool = True,
     drives: Sequence[str] | None = None,
+    aids: Sequence[AidTable] | None = None,
     limits: Limits = LIMITS,
-    progress: Counted | None = None,
+    progress: ProgressCallback | None = None,
 ) -> list[Drive]:
     """The drives of a dataset, or those named, on an epoch grid; IMU in ``dtype``, the rest float64.
 
+    ``aids`` are the tables of further sensors that count, None: all of the contract that a drive has.
     With ``reference=False`` the folder ``reference/`` is not opened. ``progress(drives done, in all)`` is called
     after each drive. Raises InputError for the first fault in the data or an unknown drive.
     """
     rows = drive_rows(folder, drives)
     loaded = []
     for row in rows:
-        tables = read_checked(folder, row, reference=reference, limits=limits)
-        loaded.append(drive_from_tables(tables, name_of(folder), rate_hz, epoch_s, dtype))
+        tables = read_checked(folder, row, reference=reference, aids=aids, limits=limits)
+        loaded.append(drive_from_tables(tables, folder_name(folder), rate_hz, epoch_s, dtype, aids or ()))
         if progress is not None:
             progress(len(loaded), len(rows))
     return loaded
@@ -63,8 +67,41 @@ def drive_rows(folder: str | Path, drives: Sequence[str] | str | None = None) ->
     return [known[name] for name in drives]
 
 
-def drive_from_tables(tables: DriveTables, dataset: str, rate_hz: float, epoch_s: float, dtype: torch.dtype) -> Drive:
-    """One drive's checked tables on its epoch grid; raises InputError if it is shorter than an epoch."""
+def choose_aids(
+    folder: str | Path, aids: Sequence[str] | str | None, drives: Sequence[str] | None = None
+) -> tuple[AidTable, ...]:
+    """The further sensors that count: those named, None: all of the contract that at least one of the drives has.
+
+    Raises InputError for an unknown name, or one that no drive has.
+    """
+    names = [row.name for row in drive_rows(folder, drives)]
+    place = resolve_place(folder)
+
+    def is_there(kind: str) -> bool:
+        return any(any((place / kind / f"drive={name}").glob("*.parquet")) for name in names)
+
+    if aids is None:
+        return tuple(table for kind, table in STANDARD.items() if is_there(kind))
+    tables = standard_tables([aids] if isinstance(aids, str) else list(aids))
+    for table in tables:
+        if not is_there(table.name):
+            raise InputError(f"aids: no drive of {folder} has {table.name}/; leave it out, or null for all there are")
+    return tables
+
+
+def drive_from_tables(
+    tables: CheckedTables,
+    dataset: str,
+    rate_hz: float,
+    epoch_s: float,
+    dtype: torch.dtype,
+    aids: Sequence[AidTable] = (),
+) -> Drive:
+    """One drive's checked tables on its epoch grid; raises InputError if it is shorter than an epoch.
+
+    ``aids`` explains those of its further tables that are not in the contract.
+    """
+    kinds = {**STANDARD, **{aid.name: aid for aid in aids}}
     imu, gnss = tables.imu, tables.gnss
     fix = torch.from_numpy(gnss["quality"])
     usable = torch.isin(fix, torch.tensor(GNSS_QUALITIES)).numpy()
@@ -91,4 +128,6 @@ def drive_from_tables(tables: DriveTables, dataset: str, rate_hz: float, epoch_s
         ref_valid=torch.from_numpy(truth.valid),
         ref_imu_error=torch.from_numpy(truth.imu_error),
         lever_arm_b=torch.tensor(tables.row.lever_arm_b, dtype=torch.float64),
+        refused=tables.refused,
+        aids={name: torch.from_numpy(aid_rows(kinds[name], x, grid)) for name, x in tables.aids.items()},
     )

@@ -1,12 +1,14 @@
-"""A drive in one line: what makes one trust an import, or not."""
+"""A drive in one line: what shows whether an import is right."""
 
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 
 from dlkf.data.discovery.motion import RESTING
 from dlkf.data.readers.frames import DriveFrames
 
+AIDS = {"speed": "wheel speed", "heading": "heading", "baro": "barometer"}
 STANDS_S = 2.0  # less is a creeping car
 QUALITIES = {0: "no fix", 1: "single", 2: "DGNSS", 3: "PPS", 4: "RTK fixed", 5: "RTK float", 9: "SBAS"}
 
@@ -15,24 +17,32 @@ def drive_line(drive: DriveFrames) -> str:
     """Duration, rates, distance, share of fixes by quality, largest gaps of a drive."""
     t = drive.imu["t"].to_numpy()
     step = np.diff(t)
-    told = [_duration(t[-1] - t[0]), f"IMU {1 / np.median(step):.4g} Hz, largest gap {_short(step.max())}"]
+    detail = [_duration(t[-1] - t[0]), f"IMU {1 / np.median(step):.4g} Hz, largest gap {_short(step.max())}"]
     if drive.gnss is None or not len(drive.gnss):
-        return ", ".join((*told, "no GNSS"))
+        return ", ".join((*detail, "no GNSS"))
     at, quality = drive.gnss["t"].to_numpy(), drive.gnss["quality"].to_numpy()
     shares = {int(q): float(np.mean(quality == q)) for q in np.unique(quality)}
     named = (f"{QUALITIES.get(q, f'quality {q}')} {100 * share:.3g} %" for q, share in shares.items())
     fixed = at[quality > 0]
     gaps = np.diff(fixed)
     rate = f"{1 / np.median(np.diff(at)):.3g} Hz" if len(at) > 1 else "a single row"
-    told.append(f"GNSS {rate}, {len(fixed)} fixes ({', '.join(named)})")
+    detail.append(f"GNSS {rate}, {len(fixed)} fixes ({', '.join(named)})")
     if len(gaps):
-        told.append(f"largest gap {_short(gaps.max())}")
+        detail.append(f"largest gap {_short(gaps.max())}")
     if count_and_time := _standstills(drive):
-        told.append("stands {} for {:.0f} s in all".format(*count_and_time))
-    told.insert(1, f"{_way(drive) / 1000:.2f} km")
+        detail.append("stands {} for {:.0f} s in all".format(*count_and_time))
+    detail.insert(1, f"{_way(drive) / 1000:.2f} km")
+    detail += [_aid(name, table) for name, table in drive.aids.items()]
     if drive.reference is not None:
-        told.append(f"reference {100 * float(drive.reference['valid'].mean()):.3g} % valid")
-    return ", ".join(told)
+        detail.append(f"reference {100 * float(drive.reference['valid'].mean()):.3g} % valid")
+    return ", ".join(detail)
+
+
+def _aid(name: str, table: pd.DataFrame) -> str:
+    """The name and the rate of a further sensor."""
+    step = np.diff(table["t"].to_numpy())
+    rate = f" {1 / np.median(step):.3g} Hz" if len(step) else ""
+    return f"{AIDS[name]}{rate}"
 
 
 def _standstills(drive: DriveFrames) -> tuple[str, float] | None:

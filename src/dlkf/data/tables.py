@@ -13,20 +13,50 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from dlkf.data.schema import DRIVES, DRIVES_REQUIRED, LEVER_ARM, OPTIONAL, SCHEMAS, check_name
-from dlkf.errors import InputError
-from dlkf.files import placed, reached, readable, told
+from dlkf.base.errors import InputError, did_you_mean
+from dlkf.base.files import (
+    is_url,
+    open_parquet,
+    require_store,
+    resolve_place,
+    restore_folder,
+    store_errors_as_input_error,
+)
+from dlkf.data.limits import LEVER_ARM_M
+from dlkf.data.schema import (
+    AIDS,
+    DRIVES,
+    DRIVES_REQUIRED,
+    LEVER_ARM,
+    OPTIONAL,
+    POSITION,
+    SCHEMAS,
+    check_name,
+    own_schema,
+)
 
 Columns = dict[str, np.ndarray]
+CONTRACT = {**SCHEMAS, **AIDS}
 
 
 @dataclass(frozen=True)
 class DriveRow:
-    """What ``drives.parquet`` says of a drive that a filter or a split needs."""
+    """The columns of ``drives.parquet`` that a filter or a split needs."""
 
     name: str
     group: str
     lever_arm_b: tuple[float, float, float]  # m, IMU → antenna, FRD
+
+
+def path_is_file(path: Path) -> bool:
+    """Whether it is a file of this machine."""
+    return not is_url(str(path)) and path.is_file()
+
+
+def neighbours(folder: Path) -> list[str]:
+    """Folders of this machine beside one that is not there."""
+    above = folder.parent
+    return [p.name for p in above.iterdir() if p.is_dir()] if not is_url(str(folder)) and above.is_dir() else []
 
 
 def read_drives(folder: str | Path) -> list[DriveRow]:
@@ -34,15 +64,22 @@ def read_drives(folder: str | Path) -> list[DriveRow]:
 
     Raises InputError if the folder, the file or a needed column is missing, or a name stands twice.
     """
-    folder = placed(folder)
+    if not is_url(folder) and not Path(folder).exists():
+        restore_folder(Path(folder).absolute())
+    folder = resolve_place(folder)
     path = folder / "drives.parquet"
-    with told(folder):
+    with store_errors_as_input_error(folder):
         there, whole = folder.is_dir(), path.is_file()
     if not there:
-        reached(folder)
-        raise InputError(f"dataset {folder}: no such folder; make one with dlkf.simulate or dlkf.ingest")
+        require_store(folder)
+        if path_is_file(folder):
+            raise InputError(f"dataset {folder}: is a file; give its folder, {folder.parent}")
+        near = did_you_mean(folder.name, neighbours(folder)) or "; make one with dlkf.simulate or dlkf.ingest"
+        raise InputError(f"dataset {folder}: no such folder{near}")
     if not whole:
-        raise InputError(f"dataset {folder}: drives.parquet is missing; it holds one row per drive")
+        above = folder.parent
+        place = f"it lies in {above}" if path_is_file(above / "drives.parquet") else "it holds one row per drive"
+        raise InputError(f"dataset {folder}: drives.parquet is missing; {place}")
     table = _read(path, "drives.parquet")
     for name in DRIVES_REQUIRED:
         if name not in table.column_names:
@@ -59,8 +96,17 @@ def read_drives(folder: str | Path) -> list[DriveRow]:
             arms.append(np.nan_to_num(_column(table, column, kind, "drives.parquet").astype(float)))
         else:
             arms.append(np.zeros(len(names)))
+    for name, arm in zip(names, zip(*arms)):
+        if not math.hypot(*arm) <= LEVER_ARM_M:
+            raise InputError(
+                f"drives.parquet: drive {name}: a lever arm of {math.hypot(*arm):.3g} m; no antenna is further than "
+                f"{LEVER_ARM_M:g} m from its IMU: lever_arm_x_m, _y_m, _z_m are in metres"
+            )
     groups = [str(g) if g else name for g, name in zip(table["group"].to_pylist(), names)]
     return [DriveRow(n, g, (float(x), float(y), float(z))) for n, g, x, y, z in zip(names, groups, *arms)]
+
+
+LATEST_S = 1e11  # of a clock that counts seconds from 1970, 1980 or when a logger was started
 
 
 class DriveClock(NamedTuple):
@@ -74,58 +120,65 @@ class DriveClock(NamedTuple):
 
 def drive_clocks(folder: str | Path) -> dict[str, DriveClock]:
     """The clocks of the drives of a dataset."""
-    path = placed(folder) / "drives.parquet"
+    path = resolve_place(folder) / "drives.parquet"
     if not path.is_file():
         return {}
-    table = pq.ParquetFile(readable(path)).read()
+    table = _read(path, "drives.parquet")
     columns = []
     for name, unknown in (("time_zero_s", math.nan), ("gps_zero_s", math.nan), ("gps_rate", 1.0)):
         values = np.full(len(table), np.nan)
         if name in table.column_names:
             values = _column(table, name, pa.float64(), "drives.parquet")
+        if (beyond := values[np.abs(values) > LATEST_S]).size:
+            raise InputError(f"drives.parquet: {name} is {beyond[0]:g}, no time in seconds; mend it or leave it out")
         columns.append(np.where(np.isfinite(values), values, unknown).tolist())
     return {str(drive): DriveClock(*row) for drive, *row in zip(table["drive"].to_pylist(), *columns)}
 
 
-def read_table(folder: str | Path, kind: str, drive: str) -> Columns | None:
-    """The contract's columns of a drive's table (``imu``, ``gnss`` or ``reference``) as numpy arrays.
+def read_table(folder: str | Path, kind: str, drive: str, column: str = "") -> Columns | None:
+    """The contract's columns of a drive's table (``imu``, ``gnss``, ``reference`` or an aid) as numpy arrays.
 
-    A missing reference gives None. Raises InputError, naming drive and file, for a missing or empty table, a
+    Of a table that is not in the contract, ``t``, ``column`` and ``std`` if it has one. A missing reference or aid
+    gives None. Raises InputError, naming drive and file, for a missing or empty table, a
     damaged file, a missing column or a column of the wrong type.
     """
+    own = own_schema(column)
     place = Path(kind) / f"drive={drive}"
-    parts = sorted((placed(folder) / place).glob("*.parquet"))
+    parts = sorted((resolve_place(folder) / place).glob("*.parquet"))
     if not parts:
-        if kind == "reference":
+        if kind == "reference" or kind not in SCHEMAS:
             return None
         if kind == "gnss":
             raise InputError(f"drive {drive}: no GNSS, {place}/ has no Parquet file; a filter needs position fixes")
         raise InputError(f"drive {drive}: {place}/ has no Parquet file though drives.parquet lists the drive")
-    pieces = []
+    segments = []
     for part in parts:
         where = f"drive {drive}, {place / part.name}"
         table = _read(part, where)
         columns = {}
-        for field in SCHEMAS[kind]:
+        for field in CONTRACT.get(kind, own):
             if field.name not in table.column_names:
                 has = ", ".join(table.column_names)
                 raise InputError(f"{where}: column {field.name} missing; has {has}")
             columns[field.name] = _column(table, field.name, field.type, where)
-        for field in OPTIONAL[kind]:
+        for field in OPTIONAL.get(kind, OPTIONAL["speed"]):
             if field.name in table.column_names:
                 columns[field.name] = _column(table, field.name, field.type, where)
-        pieces.append(columns)
-    rows = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+        segments.append(columns)
+    rows = {name: np.concatenate([segment[name] for segment in segments]) for name in segments[0]}
     if len(rows["t"]) == 0 and kind != "reference":
-        raise InputError(f"drive {drive}, {place}: has no rows; leave the drive out or give its data")
+        remedy = "leave the drive out" if kind in SCHEMAS else "remove the table"
+        raise InputError(f"drive {drive}, {place}: has no rows; {remedy} or give its data")
     return rows if len(rows["t"]) else None
 
 
 def dataset_digest(folder: str | Path) -> str:
     """Hash of the contents of a dataset's files, 32 hexadecimal digits; names count, dates do not."""
-    folder = placed(folder)
+    folder = resolve_place(folder)
     digest = hashlib.blake2b(digest_size=16)
     for path in sorted(folder.rglob("*.parquet"), key=lambda p: p.relative_to(folder).as_posix()):
+        if not path.is_file():
+            raise InputError(f"{path}: is no file; take it away or copy it again")
         digest.update(path.relative_to(folder).as_posix().encode() + b"\0")
         with path.open("rb") as file:
             digest.update(hashlib.file_digest(file, "blake2b").digest())
@@ -133,11 +186,16 @@ def dataset_digest(folder: str | Path) -> str:
 
 
 def _read(path: Path, where: str) -> pa.Table:
+    if not path.is_file():
+        raise InputError(f"{where}: is no file; write or copy it again")
     try:
-        return pq.ParquetFile(readable(path)).read()
-    except (pa.ArrowInvalid, OSError) as error:
-        reason = str(error).splitlines()[0][:100]
+        table = pq.ParquetFile(open_parquet(path), page_checksum_verification=True).read()
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:100]
         raise InputError(f"{where}: not a whole Parquet file ({reason}); write or copy it again") from None
+    if doubles := sorted({name for name in table.column_names if table.column_names.count(name) > 1}):
+        raise InputError(f"{where}: column {doubles[0]} stands twice; leave one")
+    return table
 
 
 def _column(table: pa.Table, name: str, kind: pa.DataType, where: str) -> np.ndarray:
@@ -155,7 +213,9 @@ def _column(table: pa.Table, name: str, kind: pa.DataType, where: str) -> np.nda
         raise InputError(f"{where}: column {name} is {have}, must be {kind}; convert it")
     if pa.types.is_boolean(kind):
         return pc.fill_null(pc.cast(column, pa.bool_()), False).to_numpy().astype(bool)
-    values = pc.cast(column, pa.float64()).to_numpy()
+    if name in POSITION[:2] and pa.types.is_integer(have):
+        raise InputError(f"{where}: column {name} is {have}: whole degrees are 100 km apart; write it as double")
+    values = pc.cast(column, pa.float64(), safe=False).to_numpy()
     if pa.types.is_integer(kind):
         return np.where(np.isfinite(values), values, 0).astype(np.int64)
     return np.asarray(values, dtype=np.float64)

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from dlkf.base.errors import InputError
+from dlkf.data.aid_checks import check_aid
+from dlkf.data.aid_tables import STANDARD, AidTable
+from dlkf.data.discovery.motion import motion
+from dlkf.data.limits import FULL_SCALE, NONE_REFUSED, Refused, screen_fixes, within_full_scale
 from dlkf.data.plausibility import (
     check_attitude,
     check_clocks,
@@ -16,10 +22,11 @@ from dlkf.data.plausibility import (
 )
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY
 from dlkf.data.tables import Columns, DriveRow, read_drives, read_table
-from dlkf.errors import InputError
 
 GNSS_QUALITIES = (1, 2, 3, 4, 5, 9)  # NMEA GGA codes that are a satellite fix; 6, 7, 8 are not
 RATES_HZ = {"imu": (1.0, 1e4), "gnss": (1e-3, 500.0)}
+MOST_REFUSED = (0.01, 0.2)  # of the samples, of the fixes; more are no accident
+MOST_SWITCH_M = 10_000.0  # m: fixes that go on so far off make two drives of one
 UNIX_TO_GPS_S, EPOCHS_APART_S = 315_964_800.0, 86_400.0  # 1970 to 1980; as near is no chance
 
 
@@ -35,13 +42,15 @@ LIMITS = Limits()
 
 
 @dataclass(frozen=True)
-class DriveTables:
+class CheckedTables:
     """The checked tables of one drive."""
 
     row: DriveRow
     imu: Columns
     gnss: Columns
     reference: Columns | None
+    aids: Mapping[str, Columns] = field(default_factory=dict)  # of further sensors, by name
+    refused: Refused = NONE_REFUSED  # samples and fixes that were left out because they are beyond physical limits
 
 
 def validate_dataset(folder: str | Path, *, reference: bool = True, limits: Limits = LIMITS) -> list[DriveRow]:
@@ -60,26 +69,44 @@ def read_checked(
     row: DriveRow,
     *,
     reference: bool = True,
+    aids: Collection[AidTable] | None = None,
     limits: Limits = LIMITS,
-) -> DriveTables:
-    """Read and check the tables of one drive; raises InputError for the first fault."""
+) -> CheckedTables:
+    """Read and check the tables of one drive; raises InputError for the first fault.
+
+    ``aids`` are those of further sensors that count, None: all of the contract that the drive has. Others are not
+    opened.
+    """
     name = row.name
     imu = read_table(folder, "imu", name)
     gnss = read_table(folder, "gnss", name)
     assert imu is not None and gnss is not None  # read_table raises for these two
     truth = read_table(folder, "reference", name) if reference else None
-    return checked(DriveTables(row, imu, gnss, truth), limits)
+    wanted = STANDARD.values() if aids is None else aids
+    others = {aid.name: read_table(folder, aid.name, name, aid.column) for aid in wanted}
+    found = {kind: table for kind, table in others.items() if table is not None}
+    return check_tables(CheckedTables(row, imu, gnss, truth, found), limits)
 
 
-def checked(tables: DriveTables, limits: Limits = LIMITS) -> DriveTables:
-    """The same tables; raises InputError for their first fault."""
+def check_tables(tables: CheckedTables, limits: Limits = LIMITS) -> CheckedTables:
+    """The same tables without what is beyond physical limits; raises InputError for their first fault."""
     name, imu, gnss, truth = tables.row.name, tables.imu, tables.gnss, tables.reference
-    _check_imu(imu, _where(name, "imu"), limits)
-    _check_gnss(gnss, imu, _where(name, "gnss"))
+    imu = _check_imu(imu, _where(name, "imu"), limits)
+    gnss = _check_gnss(gnss, imu, _where(name, "gnss"))
+    refused = Refused(len(tables.imu["t"]) - len(imu["t"]), len(tables.gnss["t"]) - len(gnss["t"]))
+    if any(refused):
+        tables = replace(tables, imu=imu, gnss=gnss, refused=refused)
     check_turns(imu, gnss, _where(name, "imu"))
-    check_clocks(imu, fixes(gnss), _where(name, "imu"))
+    check_clocks(imu, read_fixes(gnss), _where(name, "imu"))
     if truth is not None:
         _check_reference(truth, _where(name, "reference"))
+    if tables.aids:
+        fixes = read_fixes(gnss)
+        velocity = np.stack([fixes[c] for c in VELOCITY], -1)
+        moved = motion(fixes["t"], fixes["lat_deg"], fixes["lon_deg"], velocity)
+        for kind, table in tables.aids.items():
+            _check_time(table["t"], _where(name, kind))
+            check_aid(kind, table, imu, moved, _where(name, kind))
     return tables
 
 
@@ -87,11 +114,10 @@ def read_imu(folder: str | Path, drive: str, limits: Limits = LIMITS) -> Columns
     """Read and check the IMU of a drive alone, with GNSS or without; raises InputError for the first fault."""
     imu = read_table(folder, "imu", drive)
     assert imu is not None  # read_table raises for this one
-    _check_imu(imu, _where(drive, "imu"), limits)
-    return imu
+    return _check_imu(imu, _where(drive, "imu"), limits)
 
 
-def fixes(gnss: Columns) -> Columns:
+def read_fixes(gnss: Columns) -> Columns:
     """The rows with a position by satellites."""
     fixed = np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite(gnss["lat_deg"]) & np.isfinite(gnss["lon_deg"])
     return {column: values[fixed] for column, values in gnss.items()}
@@ -102,6 +128,8 @@ def gap_rows(t: np.ndarray, limits: Limits) -> np.ndarray:
     if len(t) < 2:
         return np.zeros(0, dtype=np.int64)
     step = np.diff(t)
+    if step.max() <= limits.gap_s:
+        return np.zeros(0, dtype=np.int64)
     return np.flatnonzero(step > max(limits.gap_s, limits.gap_samples * float(np.median(step)))) + 1
 
 
@@ -147,24 +175,43 @@ def _check_finite(table: Columns, names: tuple[str, ...], where: str, *, nan: bo
             raise InputError(f"{where}: row {k}: {name} is {values[k]}; {remedy}")
 
 
-def _check_imu(imu: Columns, where: str, limits: Limits) -> None:
+def _check_imu(imu: Columns, where: str, limits: Limits) -> Columns:
+    """The samples within full scale, where the others are few."""
     t = imu["t"]
     _check_time(t, where)
     _check_finite(imu, (*GYRO, *ACCEL), where, nan=False)
     if len(t) < 2:
         raise InputError(f"{where}: has a single sample; leave the drive out or give its data")
     _check_rate(t, where, "imu")
-    gaps = gap_rows(t, limits)
-    if len(gaps):
-        k = int(gaps[0])
+    check_imu_units(imu, where)
+    keep = _in_scale(imu)
+    beyond = np.flatnonzero(~keep)
+    if len(beyond) > max(MOST_REFUSED[0] * len(t), 2):
         raise InputError(
-            f"{where}: row {k}: IMU gap of {t[k] - t[k - 1]:.3f} s after t = {t[k - 1]:.3f}; split the drive "
+            f"{where}: {len(beyond)} of {len(t)} samples, the first in row {beyond[0]}, are beyond "
+            f"{FULL_SCALE[0]:g} m/s², {FULL_SCALE[1]:g} rad/s: damaged, or in another unit; remove them"
+        )
+    gaps = gap_rows(t[keep], limits)
+    if len(gaps):
+        k = int(np.flatnonzero(keep)[gaps[0]])
+        before = t[keep][gaps[0] - 1]
+        left_out = "" if not len(beyond) else f" ({len(beyond)} samples beyond full scale are left out)"
+        raise InputError(
+            f"{where}: row {k}: IMU gap of {t[k] - before:.3f} s after t = {before:.3f}{left_out}; split the drive "
             "there (dlkf.ingest split_gaps=true)"
         )
-    check_imu_units(imu, where)
+    return imu if not len(beyond) else {column: values[keep] for column, values in imu.items()}
 
 
-def _check_gnss(gnss: Columns, imu: Columns, where: str) -> None:
+def _in_scale(imu: Columns) -> np.ndarray:
+    """Samples within full scale; usually all are, which their extremes show."""
+    if all(np.abs((imu[c].min(), imu[c].max())).max() <= most for s, most in zip((ACCEL, GYRO), FULL_SCALE) for c in s):
+        return np.ones(len(imu["t"]), bool)
+    return within_full_scale(*(np.stack([imu[c] for c in sensor], -1) for sensor in (ACCEL, GYRO)))
+
+
+def _check_gnss(gnss: Columns, imu: Columns, where: str) -> Columns:
+    """All rows but the fixes that no car can have reached, where those are few."""
     _check_time(gnss["t"], where)
     _check_rate(gnss["t"], where, "gnss")
     _check_finite(gnss, (*POSITION, *VELOCITY, *STD), where, nan=True)
@@ -183,7 +230,26 @@ def _check_gnss(gnss: Columns, imu: Columns, where: str) -> None:
             f"{last:.3f}; both need the same clock"
             + (": one counts from 1970, the other from 1980; give time.clock to both or to neither" if epochs else "")
         )
-    check_gnss_units({name: values[fix] for name, values in gnss.items()}, where)
+    fixes = {name: values[fix] for name, values in gnss.items()}
+    check_gnss_units(fixes, where)
+    screened = screen_fixes(fixes)
+    count = int((~screened.keep).sum())
+    if count > max(MOST_REFUSED[1] * len(screened.keep), 2):
+        raise InputError(
+            f"{where}: {count} of {len(screened.keep)} fixes cannot be, the first at {screened.first}; give them "
+            "quality 0, or mend units and columns"
+        )
+    far = [(t, way) for t, way in screened.switched if way > MOST_SWITCH_M]
+    if far:
+        raise InputError(
+            f"{where}: positions jump by {far[0][1] / 1000:.0f} km before t = {far[0][0]:.1f} s and stay there; split "
+            "the drive there, or give the wrong fixes quality 0"
+        )
+    if not count:
+        return gnss
+    keep = np.ones(len(fix), bool)
+    keep[np.flatnonzero(fix)[~screened.keep]] = False
+    return {name: values[keep] for name, values in gnss.items()}
 
 
 def _check_reference(reference: Columns, where: str) -> None:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 
 Array = NDArray[np.floating]
@@ -32,18 +32,18 @@ FLICKER = math.sqrt(2 * math.log(2) / math.pi)  # the floor of a curve over B
 CLUSTERS = 10  # at least so many at the longest cluster time: below, the curve is chance
 PER_DECADE = 15  # cluster times
 WHITE_S = 100.0  # a log must be so long for the white noise
-RISE = 1.5  # the curve must end so far above its white part for the in-run bias to be seen
-RESOLVED = 20.0  # correlation times that a log must hold for one to be believed
+RISE = 1.5  # the curve must end so far above its white part for the bias instability to be resolved
+RESOLVED = 20.0  # correlation times that a log must hold for one to be used
 FIRST = ("noise_density", "turn_on_bias", "instability", "correlation_time", "scale_factor", "misalignment")
 STILL_RATE, STILL_FORCE = math.radians(1.0), 0.3  # rad/s, m/s²: a second's mean away from the log's median
 
 
 @dataclass(frozen=True)
-class NoiseFit:
+class AllanFit:
     """Noise of a sensor [unit: m/s² or rad/s]: ``density`` N [unit/√Hz], ``floor`` B [unit] at ``floor_s`` [s],
     ``walk`` K [unit/√s], Gauss-Markov ``sigma`` s [unit] and ``time`` T [s], ``quantisation`` Q [unit·s].
 
-    ``rises`` tells whether the log is long enough to see the in-run bias, ``resolved`` whether T is the log's own.
+    ``rises``: the log is long enough to resolve the bias instability, ``resolved`` whether T is the log's own.
     """
 
     density: float
@@ -78,11 +78,11 @@ def allan_variance(samples: Array, dt: float, sizes: Sequence[int] | NDArray[np.
     return out
 
 
-def fit_noise(tau: Array, variance: Array, duration_s: float, correlation_time: float) -> NoiseFit:
+def fit_noise(tau: Array, variance: Array, duration_s: float, correlation_time: float) -> AllanFit:
     """The noise model whose Allan variance is nearest to a measured one, in relative terms.
 
     Least squares over non-negative Q², N², s² for every T of a logarithmic grid; a point weighs as much as its
-    number of independent clusters. A log cannot tell correlation times above a twentieth of its length:
+    number of independent clusters. A log cannot resolve correlation times above a twentieth of its length:
     there T is ``correlation_time`` [s], and s follows, so that K is the log's all the same.
     """
     weight = np.sqrt(np.maximum(duration_s / tau - 1, 0.1))
@@ -103,7 +103,7 @@ def fit_noise(tau: Array, variance: Array, duration_s: float, correlation_time: 
     Q, N, s = np.sqrt(parts)
     low = int(variance.argmin())
     rises = variance[-3:].mean() > RISE * N**2 / tau[-3:].mean()
-    return NoiseFit(
+    return AllanFit(
         float(N), math.sqrt(variance[low]) / FLICKER, float(tau[low]), float(s * math.sqrt(2 / T)), float(s), T,
         float(Q), bool(rises and s > 0), bool(resolved),
     )  # fmt: skip
@@ -129,10 +129,10 @@ def check_static(imu: Array, rate_hz: float, where: str) -> None:
         )
 
 
-def preset(name: str, triads: Sequence[NoiseFit], base: ImuSpec, source: str, *, in_run: str = "fit") -> ImuSpec:
+def noise_preset(name: str, triads: Sequence[AllanFit], base: ImuSpec, source: str, *, in_run: str = "fit") -> ImuSpec:
     """An IMU preset of the fits of accelerometers and gyroscopes.
 
-    A log at rest tells nothing of turn-on bias, scale factor and misalignment: those are ``base``'s, and with
+    A log at rest does not show turn-on bias, scale factor and misalignment: those are ``base``'s, and with
     ``in_run="keep"`` the in-run bias is so too. Raises InputError where the log is too short to see it.
     """
     sensors = []

@@ -12,22 +12,22 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from dlkf.colours import COLOURS
+from dlkf.base.colours import COLOURS
+from dlkf.base.errors import InputError
+from dlkf.base.files import resolve_place, write_into
+from dlkf.base.provenance import describe_provenance
 from dlkf.diagnosis.allan import (
+    AllanFit,
     Array,
-    NoiseFit,
     allan_variance,
     check_static,
     cluster_sizes,
     fit_noise,
     preset_yaml,
 )
-from dlkf.errors import InputError
 from dlkf.evaluation.figures import png
-from dlkf.evaluation.table import Table, as_json, as_markdown, number
-from dlkf.files import placed, staged
+from dlkf.evaluation.table import ResultTable, as_json, as_markdown, format_number
 from dlkf.navigation.imu_errors import DEG, MILLIGAL, ImuSpec
-from dlkf.provenance import provenance
 from dlkf.report.page import Page, embedded
 
 AXES = tuple(f"{sensor}_{axis}" for sensor in ("accel", "gyro") for axis in "xyz")
@@ -45,7 +45,7 @@ class StaticLog:
     rate_hz: float
     tau: Array  # (K,) s
     deviation: Array  # (K, 6)
-    fits: dict[str, NoiseFit]  # by axis, and by triad: "accel", "gyro"
+    fits: dict[str, AllanFit]  # by axis, and by triad: "accel", "gyro"
 
 
 def analyse(drive: str, imu: Array, rate_hz: float, base: ImuSpec) -> StaticLog:
@@ -65,18 +65,23 @@ def analyse(drive: str, imu: Array, rate_hz: float, base: ImuSpec) -> StaticLog:
     return StaticLog(drive, duration, rate_hz, tau, np.sqrt(variance), fits)
 
 
-def noise_table(log: StaticLog) -> Table:
+def noise_table(log: StaticLog) -> ResultTable:
     """N, B, K and the Gauss-Markov bias, by axis and by triad, in the units that data sheets use."""
     rows = []
     for name, fit in log.fits.items():
         accel = name.startswith("accel")
         walk, bias = (60.0, 1 / MILLIGAL) if accel else (60 / DEG, 3600 / DEG)
-        time = number(fit.time) + ("" if fit.resolved else "*")
-        row = [number(fit.density * walk), number(fit.floor * bias), number(fit.floor_s), number(fit.walk * bias * 60)]
-        row += [number(fit.sigma * bias), time] if fit.rises else ["–", "–"]
+        time = format_number(fit.time) + ("" if fit.resolved else "*")
+        row = [
+            format_number(fit.density * walk),
+            format_number(fit.floor * bias),
+            format_number(fit.floor_s),
+            format_number(fit.walk * bias * 60),
+        ]
+        row += [format_number(fit.sigma * bias), time] if fit.rises else ["–", "–"]
         rows.append([f"{NAMES[name]}, all axes" if name in TRIADS else name.replace("_", " "), *row])
     order = [0, 1, 2, 6, 3, 4, 5, 7]
-    return Table(
+    return ResultTable(
         title=f"{log.drive}: {log.duration_s / 3600:.3g} h at rest, {log.rate_hz:g} Hz",
         note=(
             "Accelerometers: N in m/s/√h, B and bias in mGal, K in mGal/√h. Gyroscopes: N in °/√h, B and bias in °/h, "
@@ -110,12 +115,12 @@ def figure(log: StaticLog) -> Figure:
     return out
 
 
-def _page(log: StaticLog, table: Table, picture: bytes, settings: dict[str, str]) -> str:
+def _page(log: StaticLog, table: ResultTable, picture: bytes, settings: dict[str, str]) -> str:
     page = Page(f"Allan deviation of {log.drive}", [table.title])
     page.table(table.columns, table.rows)
     page.note(table.note)
     page.picture("Overlapping Allan deviation (IEEE Std 952)", embedded(picture))
-    page.protocol(settings | provenance())
+    page.protocol(settings | describe_provenance())
     return page.html()
 
 
@@ -133,11 +138,11 @@ def write_allan(out: str | Path, log: StaticLog, spec: ImuSpec) -> list[Path]:
         "allan.csv": _csv(log).encode(),
         "allan.json": as_json(settings | {name: asdict(fit) for name, fit in log.fits.items()}).encode(),
     }
-    with staged(out) as folder:
+    with write_into(out) as folder:
         (folder / "imu").mkdir()
         for name, data in files.items():
             (folder / name).write_bytes(data)
-    return [placed(out) / name for name in files]
+    return [resolve_place(out) / name for name in files]
 
 
 def _csv(log: StaticLog) -> str:

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dlkf.base.errors import InputError
 from dlkf.data.discovery.findings import Raw, discover
 from dlkf.data.schema import ACCEL, GYRO, POSITION, VELOCITY
 from dlkf.data.tables import Columns, DriveRow
-from dlkf.data.validate import GNSS_QUALITIES, DriveTables, read_checked
-from dlkf.errors import InputError
+from dlkf.data.validate import GNSS_QUALITIES, CheckedTables, read_checked
 from dlkf.navigation.earth import STANDARD_GRAVITY
 
 GOOD, NOTE, BAD = "good", "note", "BAD"
@@ -25,14 +25,14 @@ STANDING = 0.15  # m/s
 OFFSET_S, DELAY_S, ANGLE_DEG = 0.05, 0.3, 3.0  # more is worth a word, is a wrong clock, is a turned sensor
 
 
-class Seen(NamedTuple):
-    """One finding: good, note or BAD, and what was seen, with the remedy where there is one."""
+class CheckupResult(NamedTuple):
+    """One finding: good, note or BAD, and what was found, with the remedy where there is one."""
 
     grade: str
     text: str
 
 
-def checkup(folder: str | Path, row: DriveRow, *, discover_pose: bool = True) -> Iterator[Seen]:
+def checkup(folder: str | Path, row: DriveRow, *, discover_pose: bool = True) -> Iterator[CheckupResult]:
     """The findings about a drive; one that cannot be read is a single bad one.
 
     ``discover_pose`` also estimates clock offset, sensor pose and lever arm from the motion
@@ -41,23 +41,25 @@ def checkup(folder: str | Path, row: DriveRow, *, discover_pose: bool = True) ->
     try:
         tables = read_checked(folder, row, reference=True)
     except InputError as error:
-        yield Seen(BAD, str(error))
+        yield CheckupResult(BAD, str(error))
         return
     yield from imu_findings(tables.imu)
     yield from gnss_findings(tables.imu, tables.gnss)
     yield from motion_findings(tables.gnss)
     if tables.reference is None:
-        yield Seen(NOTE, "no reference: evaluate reference=smoothed scores against the drive's own smoothed solution")
+        yield CheckupResult(
+            NOTE, "no reference: evaluate reference=smoothed scores against the drive's own smoothed solution"
+        )
     else:
         share = float(np.mean(tables.reference["valid"]))
         attitude = bool(np.isfinite(tables.reference["roll"]).any())
         text = f"reference: {share:.0%} of its rows valid, {'with' if attitude else 'without'} attitude"
-        yield Seen(GOOD if share > 0.5 and attitude else NOTE, text)
+        yield CheckupResult(GOOD if share > 0.5 and attitude else NOTE, text)
     if discover_pose:
-        yield from discovered(tables)
+        yield from discover_findings(tables)
 
 
-def imu_findings(imu: Columns) -> Iterator[Seen]:
+def imu_findings(imu: Columns) -> Iterator[CheckupResult]:
     """Rate, jitter, gaps, resolution, saturation, force at rest."""
     step = np.diff(imu["t"])
     usual = float(np.median(step))
@@ -66,59 +68,65 @@ def imu_findings(imu: Columns) -> Iterator[Seen]:
     rate = 1 / usual
     text = f"IMU: {duration:.0f} s at {rate:.4g} Hz, jitter {jitter:.1%}"
     slow = "" if rate >= 49 else "; 50 Hz or more is better"
-    yield Seen(GOOD if rate >= 49 and jitter < 0.05 else NOTE, text + slow)
+    yield CheckupResult(GOOD if rate >= 49 and jitter < 0.05 else NOTE, text + slow)
     gaps = step[step > 1.5 * usual]
     if len(gaps):
         lost = float((gaps - usual).sum())
         text = f"IMU: {len(gaps)} gaps, the longest {gaps.max():.3g} s, {lost:.3g} s lost"
-        yield Seen(NOTE if gaps.max() < 0.25 else BAD, text)
+        yield CheckupResult(NOTE if gaps.max() < 0.25 else BAD, text)
     for names, unit in ((ACCEL, "m/s²"), (GYRO, "rad/s")):
         for name in names:
             x = imu[name]
             top = np.abs(x).max()
             if top > 0 and np.sum(np.abs(x) == top) > max(10, 0.001 * len(x)) and np.ptp(x) > 0:
-                yield Seen(BAD, f"{name} stays at {top:.4g} {unit}: the sensor saturates; choose a larger range")
+                yield CheckupResult(
+                    BAD, f"{name} stays at {top:.4g} {unit}: the sensor saturates; choose a larger range"
+                )
             if np.ptp(x) == 0:
-                yield Seen(BAD, f"{name} never changes: {x[0]:.4g} {unit}")
+                yield CheckupResult(BAD, f"{name} never changes: {x[0]:.4g} {unit}")
     force = float(np.median(np.sqrt(sum(imu[n] ** 2 for n in ACCEL))))
     near = abs(force / STANDARD_GRAVITY - 1) < 0.03
-    yield Seen(GOOD if near else NOTE, f"IMU: median specific force {force:.4g} m/s² (gravity is 9.81)")
+    yield CheckupResult(GOOD if near else NOTE, f"IMU: median specific force {force:.4g} m/s² (gravity is 9.81)")
 
 
-def gnss_findings(imu: Columns, gnss: Columns) -> Iterator[Seen]:
+def gnss_findings(imu: Columns, gnss: Columns) -> Iterator[CheckupResult]:
     """Rate, gaps, shares of quality, velocities, 1σ, overlap with the IMU, jumps."""
     usable = np.isin(gnss["quality"], GNSS_QUALITIES)
     t = gnss["t"][usable]
     if len(t) < 2:
-        yield Seen(BAD, f"GNSS: {len(t)} usable fixes")
+        yield CheckupResult(BAD, f"GNSS: {len(t)} usable fixes")
         return
     usual = float(np.median(np.diff(t)))
-    yield Seen(GOOD, f"GNSS: {len(t)} usable fixes, one every {usual:.3g} s" + _fast(usual))
+    yield CheckupResult(GOOD, f"GNSS: {len(t)} usable fixes, one every {usual:.3g} s" + _fast(usual))
     codes, counts = np.unique(gnss["quality"], return_counts=True)
     shares = ", ".join(f"{c / len(gnss['t']):.0%} {NAMES.get(int(q), f'quality {q}')}" for q, c in zip(codes, counts))
     best = float(np.mean(np.isin(gnss["quality"], (4, 5, 2, 9))))
-    yield Seen(GOOD if best > 0.5 else NOTE, f"GNSS: {shares}")
+    yield CheckupResult(GOOD if best > 0.5 else NOTE, f"GNSS: {shares}")
     gaps = np.diff(t)
     holes = gaps[gaps > max(3 * usual, 2.0)]
     if len(holes):
-        yield Seen(NOTE, f"GNSS: {len(holes)} gaps over {max(3 * usual, 2.0):.3g} s, the longest {holes.max():.4g} s")
+        yield CheckupResult(
+            NOTE, f"GNSS: {len(holes)} gaps over {max(3 * usual, 2.0):.3g} s, the longest {holes.max():.4g} s"
+        )
     overlap = (min(t[-1], imu["t"][-1]) - max(t[0], imu["t"][0])) / max(imu["t"][-1] - imu["t"][0], 1e-9)
     if overlap < 0.9:
         text = f"GNSS and IMU have only {max(overlap, 0):.0%} of the IMU's time in common"
-        yield Seen(NOTE if overlap > 0.5 else BAD, text)
+        yield CheckupResult(NOTE if overlap > 0.5 else BAD, text)
     known = np.isfinite(gnss["vel_n"][usable]).mean()
     if known < 0.9:
-        yield Seen(NOTE, f"GNSS: {known:.0%} of the fixes have a velocity; alignment and outages are better with it")
+        yield CheckupResult(
+            NOTE, f"GNSS: {known:.0%} of the fixes have a velocity; alignment and outages are better with it"
+        )
     std = np.hypot(gnss["std_pos_n"], gnss["std_pos_e"])[usable]
     text = "GNSS: no 1σ in the file; the filter takes usual ones of the quality"
     if np.isfinite(std).any():
         text = f"GNSS: horizontal 1σ {np.nanmedian(std):.2g} m in the median, {np.nanmax(std):.2g} m at worst"
-    yield Seen(GOOD if np.isfinite(std).any() else NOTE, text)
+    yield CheckupResult(GOOD if np.isfinite(std).any() else NOTE, text)
     v = np.hypot(*_horizontal_steps(gnss, usable)) / np.maximum(gaps, 1e-3)
     if (fast := v > 100).any():
         k = int(np.argmax(v))
         text = f"GNSS: {fast.sum()} jumps; at t = {t[k + 1]:.1f} s it moves {v[k] * gaps[k]:.3g} m in {gaps[k]:.3g} s"
-        yield Seen(BAD, text)
+        yield CheckupResult(BAD, text)
 
 
 def _fast(usual: float) -> str:
@@ -131,7 +139,7 @@ def _horizontal_steps(gnss: Columns, usable: np.ndarray) -> tuple[np.ndarray, np
     return np.diff(lat) * 6.37e6, east * 6.37e6 * np.cos(lat[:-1])
 
 
-def motion_findings(gnss: Columns) -> Iterator[Seen]:
+def motion_findings(gnss: Columns) -> Iterator[CheckupResult]:
     """Speed and standstills: a filter needs motion to find its heading, and gains from rest."""
     usable = np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite(gnss["vel_n"]) & np.isfinite(gnss["vel_e"])
     if not usable.any():
@@ -141,14 +149,14 @@ def motion_findings(gnss: Columns) -> Iterator[Seen]:
     moving = float(step[v > FASTEST_MOVE].sum())
     rest = float(step[v < STANDING].sum())
     if moving < 10:
-        yield Seen(BAD, f"motion: {moving:.0f} s faster than {FASTEST_MOVE:g} m/s; a filter finds no heading")
+        yield CheckupResult(BAD, f"motion: {moving:.0f} s faster than {FASTEST_MOVE:g} m/s; a filter finds no heading")
     else:
         text = f"motion: {moving:.0f} s faster than {FASTEST_MOVE:g} m/s, up to {v.max() * 3.6:.0f} km/h"
-        yield Seen(GOOD, f"{text}; {rest:.0f} s at rest")
+        yield CheckupResult(GOOD, f"{text}; {rest:.0f} s at rest")
 
 
-def discovered(tables: DriveTables) -> Iterator[Seen]:
-    """Clock offset, pose of the sensor in the car, and lever arm as the motion tells them, against what is stored."""
+def discover_findings(tables: CheckedTables) -> Iterator[CheckupResult]:
+    """Clock offset, pose of the sensor in the car, and lever arm estimated from the motion, against what is stored."""
     imu, gnss = tables.imu, tables.gnss
     ok = np.isin(gnss["quality"], GNSS_QUALITIES)
     raw = Raw(
@@ -158,21 +166,25 @@ def discovered(tables: DriveTables) -> Iterator[Seen]:
     )  # fmt: skip
     for finding in discover(raw, {"imu.time.offset_s", "imu.axes"}, known_accel={}, known_gyro={}).found:
         if finding.setting == "gnss.time.drift_ppm":
-            yield Seen(NOTE, f"clocks: {finding.value:+.0f} {finding.told}; ingest with reader.{finding.setting}=auto")
+            yield CheckupResult(
+                NOTE, f"clocks: {finding.value:+.0f} {finding.detail}; ingest with reader.{finding.setting}=auto"
+            )
         elif not finding.sure:
-            yield Seen(NOTE, f"{finding.setting}: the motion does not tell ({finding.told})")
+            yield CheckupResult(NOTE, f"{finding.setting}: the motion does not show it ({finding.detail})")
         elif finding.setting == "imu.time.offset_s":
             off = abs(finding.value)
             fine = off < OFFSET_S
             lead = "IMU and GNSS agree" if fine else f"add {finding.value:+.3f} s to the IMU's stamps"
-            text = f"clocks: {lead} ({finding.told})"
+            text = f"clocks: {lead} ({finding.detail})"
             grade = GOOD if fine else NOTE if off < DELAY_S else BAD  # receivers are late, clocks are wrong
-            yield Seen(grade, text + ("" if fine else "; ingest with reader.imu.time.offset_s=auto"))
+            yield CheckupResult(grade, text + ("" if fine else "; ingest with reader.imu.time.offset_s=auto"))
         elif finding.setting == "imu.axes":
             angle = turned_deg(finding.value)
             fine = angle < ANGLE_DEG
-            text = f"pose: the sensor is turned {angle:.1f}° against the car ({finding.told})"
-            yield Seen(GOOD if fine else BAD, text + ("" if fine else "; ingest with reader=auto or reader.imu.axes"))
+            text = f"pose: the sensor is turned {angle:.1f}° against the car ({finding.detail})"
+            yield CheckupResult(
+                GOOD if fine else BAD, text + ("" if fine else "; ingest with reader=auto or reader.imu.axes")
+            )
 
 
 def turned_deg(angles: Mapping[str, float]) -> float:

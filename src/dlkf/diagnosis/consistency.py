@@ -1,4 +1,4 @@
-"""Does a filter know how wrong it is? Normalised errors against their χ² bands (Bar-Shalom et al. 2001, 5.4.2).
+"""Consistency of a filter's covariance: normalised errors against their χ² bands (Bar-Shalom et al. 2001, 5.4.2).
 
     NEES = eᵀ P⁻¹ e,  e = truth − estimate after the update, n states        NIS = zᵀ S⁻¹ z,  S = H P⁻ Hᵀ + R
 
@@ -21,15 +21,15 @@ from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dlkf.console import Counted
+from dlkf.base.console import ProgressCallback
+from dlkf.base.errors import InputError
+from dlkf.base.files import write_into
 from dlkf.data.drive import Batch
-from dlkf.errors import InputError
 from dlkf.evaluation.figures import SHADE, png
-from dlkf.evaluation.table import Table, as_json, as_markdown, number
-from dlkf.files import staged
+from dlkf.evaluation.table import ResultTable, as_json, as_markdown, format_number
 from dlkf.filters.gating import chi2_quantile
 from dlkf.filters.integration import Solution, integrate
-from dlkf.filters.model_based import Analytic, has_covariance
+from dlkf.filters.model_based import CovarianceEstimator, has_covariance
 from dlkf.filters.smoother import Filter
 from dlkf.navigation.state import PVA, ErrorStates
 
@@ -40,7 +40,7 @@ KINDS = ("whole state", "position, velocity, attitude", "innovation")
 
 
 @dataclass(frozen=True)
-class Normalised:
+class NormalisedSquares:
     """NEES of the whole state and of position, velocity, attitude, and NIS; (drives, epochs), NaN where unknown.
 
     ``states`` is the number of states, innovations have six components.
@@ -100,12 +100,12 @@ def states_of(name: str, estimator: Filter) -> ErrorStates:
     return estimator.states
 
 
-def consistency(
-    estimator: Analytic,
+def measure_consistency(
+    estimator: CovarianceEstimator,
     batch: Batch,
     matrices: Float[Tensor, "B 2 3 3"],
-    progress: Counted | None = None,
-) -> Normalised:
+    progress: ProgressCallback | None = None,
+) -> NormalisedSquares:
     """NEES and NIS of a filter over drives with errors as it models them (``matched_drives``)."""
     n, rows = estimator.states.navigation, []
     for index in torch.arange(batch.size[0]).split(AT_ONCE):
@@ -125,28 +125,28 @@ def consistency(
         )
         if progress is not None:
             progress(int(index[-1]) + 1, batch.size[0])
-    return Normalised(n, batch.epoch_s, *(torch.cat(x).numpy() for x in zip(*rows)))
+    return NormalisedSquares(n, batch.epoch_s, *(torch.cat(x).numpy() for x in zip(*rows)))
 
 
-def band(degrees: int, count: int) -> tuple[float, float]:
+def chi2_band(degrees: int, count: int) -> tuple[float, float]:
     """Band of the mean of ``count`` independent χ² values, over its expectation."""
     tail = (1 - CONFIDENCE) / 2
     low, high = chi2_quantile(np.array([tail, 1 - tail]), degrees * count) / (degrees * count)
     return float(low), float(high)
 
 
-def consistency_table(results: Mapping[str, Normalised], settle_s: float, title: str) -> Table:
+def consistency_table(results: Mapping[str, NormalisedSquares], settle_s: float, title: str) -> ResultTable:
     """Mean over expectation, and the share of epochs whose mean over the drives lies in the band."""
     rows = []
     for name, result in results.items():
         for what, values, degrees in result.parts():
             over = result.mean(values, degrees)[int(settle_s / result.epoch_s) :]
             over = over[~np.isnan(over)]
-            low, high = band(degrees, len(values))
+            low, high = chi2_band(degrees, len(values))
             share = f"{100 * float(((over >= low) & (over <= high)).mean()):.0f}" if len(over) else "–"
-            mean = number(float(over.mean()) if len(over) else float("nan"))
+            mean = format_number(float(over.mean()) if len(over) else float("nan"))
             rows.append([name, what, str(degrees), mean, f"{low:.3f} – {high:.3f}", share])
-    return Table(
+    return ResultTable(
         title=title,
         note="Normalised error squared over its expectation: 1 is consistent, above 1 too sure, below 1 too careful. "
         f"Band: 95 % of the means over the drives at one time. After {settle_s:g} s.",
@@ -155,14 +155,14 @@ def consistency_table(results: Mapping[str, Normalised], settle_s: float, title:
     )
 
 
-def figure(results: Mapping[str, Normalised], outage: NDArray[np.bool_] | None = None) -> Figure:
-    """Means over the drives through time with their bands: a column per filter, a row per kind of error."""
+def draw_consistency(results: Mapping[str, NormalisedSquares], outage: NDArray[np.bool_] | None = None) -> Figure:
+    """Means over the drives through time with their bands: a column per filter, a row per type of error."""
     out = Figure(figsize=(1.2 + 3.2 * len(results), 7.2), layout="constrained")
     axes = out.subplots(len(KINDS), len(results), squeeze=False, sharex=True, sharey=True)
     for column, (name, result) in enumerate(results.items()):
         for ax, (what, values, degrees) in zip(axes[:, column], result.parts()):
             t = result.epoch_s * np.arange(1, values.shape[1] + 1)
-            low, high = band(degrees, len(values))
+            low, high = chi2_band(degrees, len(values))
             ax.axhspan(low, high, color="#009E73", alpha=0.18, lw=0)
             if outage is not None and outage.any():
                 hidden = t[outage]
@@ -184,14 +184,14 @@ def figure(results: Mapping[str, Normalised], outage: NDArray[np.bool_] | None =
 
 
 def write_consistency(
-    out: str | Path, results: Mapping[str, Normalised], table: Table, outage: NDArray[np.bool_] | None
+    out: str | Path, results: Mapping[str, NormalisedSquares], table: ResultTable, outage: NDArray[np.bool_] | None
 ) -> None:
     """Write table.md, consistency.png and consistency.json (the means through time) into ``out``, all or none."""
     series = {
         name: {what: r.mean(values, degrees).tolist() for what, values, degrees in r.parts()}
         for name, r in results.items()
     }
-    with staged(out) as folder:
+    with write_into(out) as folder:
         (folder / "table.md").write_text(as_markdown(table))
-        (folder / "consistency.png").write_bytes(png(figure(results, outage)))
+        (folder / "consistency.png").write_bytes(png(draw_consistency(results, outage)))
         (folder / "consistency.json").write_text(as_json(series))

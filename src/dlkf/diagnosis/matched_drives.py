@@ -1,7 +1,7 @@
 """Simulated drives whose IMU errs exactly as a filter models it: what a test of consistency needs (R020, R090).
 
-A filter of 15 states knows biases alone, one of 21 also scale factors, one of 33 also misalignment; so each has
-drives of its own, with the errors that it does not model switched off, and is told the same preset. GNSS errors
+A filter of 15 states models biases alone, one of 21 also scale factors, one of 33 also misalignment; so each has
+drives of its own, with the errors that it does not model switched off, and is given the same preset. GNSS errors
 are white, its antenna is the IMU, and every drive has a new unit and a new car.
 """
 
@@ -15,21 +15,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dlkf.console import Counted
+from dlkf.base.console import ProgressCallback
+from dlkf.base.ranges import draw_ranges
+from dlkf.base.settings import Ranged, bounded_field, settings_from
 from dlkf.data.drive import Batch, Drive
-from dlkf.data.segments import Piece, StartLaw, make_batch
+from dlkf.data.segments import Segment, StartLaw, make_batch
 from dlkf.data.store import drive_from_tables
 from dlkf.data.tables import Columns, DriveRow
-from dlkf.data.validate import DriveTables
+from dlkf.data.validate import CheckedTables
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.navigation.state import ErrorStates
-from dlkf.ranges import draw
-from dlkf.settings import Ranged, settings_from, within
-from dlkf.simulation.drive import sliced
+from dlkf.simulation.drive import slice_tables
 from dlkf.simulation.imu import corrupt, draw_unit, inverse_mechanisation
-from dlkf.simulation.motion.chassis import ChassisConfig, draw_car, mounted
+from dlkf.simulation.motion.chassis import ChassisConfig, apply_mounting, draw_car
 from dlkf.simulation.motion.routes import VehicleConfig
-from dlkf.simulation.motion.vehicle import Truth, follow, radians_per_metre, random_route
+from dlkf.simulation.motion.vehicle import Truth, follow_route, radians_per_metre, random_route
 from dlkf.simulation.tables import fix_columns, imu_columns, reference_columns
 
 
@@ -37,11 +37,11 @@ from dlkf.simulation.tables import fix_columns, imu_columns, reference_columns
 class MatchedDrives(Ranged, where="consistency"):
     """How many drives, how long, and what a filter is given: 1 Hz GNSS and start errors, 1σ."""
 
-    drives: int = within(100, 2, 10**6)
-    minutes: float = within(5.0, 0.5, 60)
-    rate_hz: int = within(50, 10, 1000)
-    position_m: float = within(0.02, 1e-15, 1e3)
-    velocity_mps: float = within(0.05, 1e-15, 1e3)
+    drives: int = bounded_field(100, 2, 10**6)
+    minutes: float = bounded_field(5.0, 0.5, 60)
+    rate_hz: int = bounded_field(50, 10, 1000)
+    position_m: float = bounded_field(0.02, 1e-15, 1e3)
+    velocity_mps: float = bounded_field(0.05, 1e-15, 1e3)
     vehicle: VehicleConfig = field(default_factory=VehicleConfig)
     chassis: ChassisConfig = field(default_factory=ChassisConfig)
     start: StartLaw = field(default_factory=StartLaw)
@@ -49,7 +49,7 @@ class MatchedDrives(Ranged, where="consistency"):
     cars: Mapping[str, Any] | None = None  # ranges that the chassis of each drive is drawn from, if any
 
 
-def matching(spec: ImuSpec, states: ErrorStates) -> ImuSpec:
+def make_matched_drives(spec: ImuSpec, states: ErrorStates) -> ImuSpec:
     """The preset without the errors that a filter with these states does not model."""
     names = ("warm_up", "g_sensitivity", "quantisation", "full_scale", "wander", "unevenness")
     left_out: dict[str, float] = dict.fromkeys(names, 0.0)
@@ -64,7 +64,9 @@ def matching(spec: ImuSpec, states: ErrorStates) -> ImuSpec:
     return replace(spec, name=f"{spec.name}, {states.matrix}", accel=of(spec.accel), gyro=of(spec.gyro))
 
 
-def matched_batch(settings: MatchedDrives, spec: ImuSpec, progress: Counted | None = None) -> tuple[Batch, Tensor]:
+def matched_batch(
+    settings: MatchedDrives, spec: ImuSpec, progress: ProgressCallback | None = None
+) -> tuple[Batch, Tensor]:
     """The drives as one batch, and the units' matrices M (B, 2, 3, 3).
 
     ``true_imu_error`` of the batch is the bias b(t) alone, without M.
@@ -79,7 +81,7 @@ def matched_batch(settings: MatchedDrives, spec: ImuSpec, progress: Counted | No
     epochs = min(d.epochs for d in drives)
     batch = make_batch(
         drives,
-        [Piece(k, 0, epochs) for k in range(len(drives))],
+        [Segment(k, 0, epochs) for k in range(len(drives))],
         dtype=torch.float64,
         start=settings.start,
         generator=torch.Generator().manual_seed(settings.seed),
@@ -93,21 +95,21 @@ def _drive(settings: MatchedDrives, spec: ImuSpec, index: int) -> tuple[Drive, n
     rate = settings.rate_hz
     t = np.arange(round(settings.minutes * 60) * rate + 1) / rate
     route = random_route(motion, settings.vehicle, float(t[-1]))
-    truth = follow(route, settings.vehicle, t)
+    truth = follow_route(route, settings.vehicle, t)
     chassis = settings.chassis
     if settings.cars is not None:
         seed = np.random.SeedSequence(settings.seed, spawn_key=(index, 1))
-        chassis = settings_from(ChassisConfig, draw(settings.cars, seed), "chassis")
+        chassis = settings_from(ChassisConfig, draw_ranges(settings.cars, seed), "chassis")
     if not chassis.is_point:
-        truth = mounted(car_rng, draw_car(car_rng, chassis), route, truth)
+        truth = apply_mounting(car_rng, draw_car(car_rng, chassis), route, truth)
     exact, unit = inverse_mechanisation(truth), draw_unit(unit_rng, spec)
     measured, error = corrupt(imu_rng, exact, spec, unit, rate)
     bias = error - np.concatenate((exact[:, :3] @ unit.matrix[0].T, exact[:, 3:] @ unit.matrix[1].T), -1)
-    tables = DriveTables(
+    tables = CheckedTables(
         DriveRow(f"matched-{index:03d}", f"matched-{index:03d}", (0.0, 0.0, 0.0)),
         imu_columns(t[1:], measured),
         _gnss(settings, gnss_rng, truth, rate),
-        reference_columns(sliced(truth, slice(None, None, rate)), np.concatenate((bias[:1], bias))[::rate]),
+        reference_columns(slice_tables(truth, slice(None, None, rate)), np.concatenate((bias[:1], bias))[::rate]),
     )
     return drive_from_tables(tables, "matched", float(rate), 1.0, torch.float64), unit.matrix
 

@@ -1,16 +1,16 @@
-"""Paired bootstrap: how sure is it that one filter is better than another on the same pieces?
+"""Paired bootstrap: how sure is it that one filter is better than another on the same segments?
 
-Both filters are resampled with the same weights, so that a piece that is hard for both does not widen the interval
-(Efron & Tibshirani, *An Introduction to the Bootstrap*, ch. 13). Pieces or outages of one recording are not
+Both filters are resampled with the same weights, so that a segment that is hard for both does not widen the interval
+(Efron & Tibshirani, *An Introduction to the Bootstrap*, ch. 13). Segments or outages of one recording are not
 independent: give their recordings as ``groups``, and these are drawn. Few of them make a percentile interval too
 narrow, so its levels are those of Student's t with as many degrees of freedom (the expanded percentile interval:
 Hesterberg, *What Teachers Should Know About the Bootstrap*, 2015, section 5.3), and with fewer than
-:data:`MIN_GROUPS` there is none. On log-normal errors of clustered pieces it covers 90 to 95 % where it says 95 %
+:data:`MIN_GROUPS` there is none. On log-normal errors of clustered segments it covers 90 to 95 % where it says 95 %
 (tests/evaluation/test_bootstrap.py); the plain percentile interval covered 83 to 92 %, BCa 80 to 89 %.
 
 That is so where both filters' errors are about as skewed. The RMS of few, very skewed errors is as a rule too small,
 and so is its ratio to that of a filter with less skew: a filter with an RMS of six times its median against one with
-twice covered 76 % in 41 recordings of seven pieces, the truth above the interval in nearly all other cases. The
+twice covered 76 % in 41 recordings of seven segments, the truth above the interval in nearly all other cases. The
 interval of the geometric mean's ratio covered 93 to 96 % throughout.
 """
 
@@ -26,7 +26,7 @@ from scipy.special import ndtr, stdtrit
 from dlkf.evaluation.metrics import LEAST_LOG, Array
 
 STATISTICS = ("rms", "mean", "median", "geomean")
-MIN_GROUPS = 8  # with fewer recordings, or independent pieces, than this there is no interval
+MIN_GROUPS = 8  # with fewer recordings, or independent segments, than this there is no interval
 CONFIDENCE = 0.95  # of every interval
 _CELLS = 4_000_000  # weights held at a time
 
@@ -56,7 +56,7 @@ class Comparison:
         return asdict(self)
 
 
-def weighted(values: Array, weights: Array, statistic: str) -> Array:
+def weighted_means(values: Array, weights: Array, statistic: str) -> Array:
     """A statistic of ``values`` (U,) under each row of non-negative ``weights`` (R, U): (R,).
 
     The geometric mean counts every unit's ratio alike, where RMS is decided by the few largest.
@@ -130,12 +130,12 @@ def compare(
     drawn = np.arange(len(a)) if groups is None else _numbered(np.asarray(groups, dtype=str)[keep])
     G = int(drawn.max()) + 1 if len(a) else 0
     one = np.ones((1, len(a)))
-    sa, sb = ((float(weighted(x, one, statistic)[0]) if len(a) else np.nan) for x in (a, b))
+    sa, sb = ((float(weighted_means(x, one, statistic)[0]) if len(a) else np.nan) for x in (a, b))
     ratios, differences = [np.empty(0)], [np.empty(0)]
     with np.errstate(invalid="ignore", divide="ignore"):
         if G >= MIN_GROUPS:
             for w in resampled_weights(drawn, resamples, np.random.default_rng(seed)):
-                ra, rb = weighted(a, w, statistic), weighted(b, w, statistic)
+                ra, rb = weighted_means(a, w, statistic), weighted_means(b, w, statistic)
                 ratios.append(ra / rb)
                 differences.append(ra - rb)
         ratio, difference = float(np.divide(sa, sb)), float(np.subtract(sa, sb))

@@ -1,6 +1,6 @@
 """Figures of an evaluation; every function returns a matplotlib Figure and touches no global state.
 
-Colours are Okabe & Ito's, which colour-blind readers tell apart; each filter also has its own line style.
+Colours are Okabe & Ito's, which colour-blind readers can distinguish; each filter also has its own line style.
 Truth is black, an outage is shaded.
 """
 
@@ -20,22 +20,19 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from dlkf.colours import COLOURS, SHADE
+from dlkf.base.colours import COLOURS, SHADE
 from dlkf.evaluation.bootstrap import MIN_GROUPS, rms_band
-from dlkf.evaluation.metrics import QUANTITIES, Array, magnitudes, outage_at, rms_over_pieces, windows
+from dlkf.evaluation.metrics import Array, magnitudes, outage_at, outage_intervals, rms_over_segments
 from dlkf.evaluation.scores import Scores
-from dlkf.evaluation.table import number
+from dlkf.evaluation.table import format_number
 
 STYLES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (7, 2)), (0, (3, 1, 1, 1)), (0, (2, 2)))
-MANY = 20  # outages, from which on a histogram says something
+MANY = 20  # outages, from which on a histogram is drawn
 OFF_SCALE = 20.0  # a filter this many times worse than the best does not set the scale
 LABELS = {
-    "position": "3D position error [m]",
-    "horizontal": "Horizontal error [m]",
-    "vertical": "Vertical error [m]",
-    "velocity": "Velocity error [m/s]",
-    "attitude": "Attitude error [°]",
-    "heading": "Heading error [°]",
+    "horizontal": ("Horizontal error [m]", 1.0),
+    "velocity": ("Velocity error [m/s]", 1.0),
+    "attitude": ("Attitude error [°]", 180 / math.pi),
 }
 IMU_AXES = (
     ("Accelerometer x", "m/s²", 1.0), ("Accelerometer y", "m/s²", 1.0), ("Accelerometer z", "m/s²", 1.0),
@@ -55,7 +52,7 @@ def png(figure: Figure, dpi: int = 130) -> bytes:
 def all_figures(scores: Scores, *, by_time: bool, baseline: str | None) -> Iterator[tuple[str, str, Figure]]:
     """(file name, caption, figure) of one kind of data.
 
-    ``by_time``: the pieces are alike (same length, outage at the same time), so that an average over them at
+    ``by_time``: the segments are alike (same length, outage at the same time), so that an average over them at
     each time means something; whole drives are shown one by one instead.
     """
     chosen = representative(scores, 4, baseline if baseline in scores.filters else None)
@@ -65,17 +62,17 @@ def all_figures(scores: Scores, *, by_time: bool, baseline: str | None) -> Itera
     if scores.outage.any():
         yield "error_growth", "horizontal error against the time without GNSS", error_growth(scores)
         pair = [baseline, list(scores.filters)[-1]]
-        if len(scores.windows.piece) >= MANY and baseline in scores.filters and pair[0] != pair[1]:
+        if len(scores.windows.segment) >= MANY and baseline in scores.filters and pair[0] != pair[1]:
             yield "error_histograms", "how the outages are spread, so long into them", error_histograms(scores, pair)
     yield (
         "tracks",
-        "tracks of pieces from good to bad (quantiles of the error of the baseline)",
+        "tracks of segments from good to bad (quantiles of the error of the baseline)",
         tracks(scores, chosen),
     )
-    if by_time and len(scores.pieces) > 1:
-        yield "error_over_time", "errors over time, all pieces", error_over_time(scores)
-    yield "error_over_time_one", "errors over time, one piece", error_over_time(scores, [middle])
-    yield "imu_errors", "IMU-error estimates, one piece", imu_errors(scores, [middle])
+    if by_time and len(scores.segments) > 1:
+        yield "error_over_time", "errors over time, all segments", error_over_time(scores)
+    yield "error_over_time_one", "errors over time, one segment", error_over_time(scores, [middle])
+    yield "imu_errors", "IMU-error estimates, one segment", imu_errors(scores, [middle])
 
 
 def line_of(scores: Scores, name: str) -> dict[str, Any]:
@@ -85,7 +82,7 @@ def line_of(scores: Scores, name: str) -> dict[str, Any]:
 
 
 def representative(scores: Scores, n: int, filter_name: str | None) -> list[int]:
-    """Up to n pieces from good to bad: even quantiles of the horizontal error in outages (or anywhere)."""
+    """Up to n segments from good to bad: even quantiles of the horizontal error in outages (or anywhere)."""
     run = scores.filters[filter_name or next(iter(scores.filters))]
     size = magnitudes(run.error)["horizontal"]
     if scores.outage.any():
@@ -97,16 +94,16 @@ def representative(scores: Scores, n: int, filter_name: str | None) -> list[int]
     return [order[round(q * (len(order) - 1))] for q in (np.arange(n) + 0.5) / n]
 
 
-def tracks(scores: Scores, pieces: Sequence[int]) -> Figure:
-    """2D track of some pieces: truth, every filter's path, outages marked on the truth (figs 10, 12).
+def tracks(scores: Scores, segments: Sequence[int]) -> Figure:
+    """2D track of some segments: truth, every filter's path, outages marked on the truth (figs 10, 12).
 
     Below each track its outage of median error, zoomed to where GNSS comes back.
     """
-    hidden = [i for i in pieces if scores.outage[i].any()]
+    hidden = [i for i in segments if scores.outage[i].any()]
     rows = 2 if hidden else 1
-    figure = Figure(figsize=(max(4.1 * len(pieces), 6), 4.3 * rows + 0.5), layout="constrained")
-    axes = figure.subplots(rows, len(pieces), squeeze=False)
-    for k, i in enumerate(pieces):
+    figure = Figure(figsize=(max(4.1 * len(segments), 6), 4.3 * rows + 0.5), layout="constrained")
+    axes = figure.subplots(rows, len(segments), squeeze=False)
+    for k, i in enumerate(segments):
         truth = scores.truth_p_n[i, :, :2]
         low, high = np.nanmin(truth, 0), np.nanmax(truth, 0)
         middle = 0.5 * (low + high)
@@ -132,7 +129,7 @@ def tracks(scores: Scores, pieces: Sequence[int]) -> Figure:
 
 
 def _track(ax: Axes, scores: Scores, i: int, middle: Array, half: float) -> None:
-    """Truth, outages and filters of a piece in a square of 2·half around ``middle`` (north, east)."""
+    """Truth, outages and filters of a segment in a square of 2·half around ``middle`` (north, east)."""
     truth, outage = scores.truth_p_n[i, :, :2], scores.outage[i]
     before = np.roll(outage, -1)
     before[-1] = False  # an outage is drawn from the last fix on
@@ -157,8 +154,8 @@ def _absent(ax: Axes, names: Sequence[str]) -> None:
 
 
 def _outage_end(ax: Axes, scores: Scores, i: int) -> None:
-    """The end of a piece's outage of median error; a ring is the last position without GNSS."""
-    w = windows(scores.outage[i : i + 1])
+    """The end of a segment's outage of median error; a ring is the last position without GNSS."""
+    w = outage_intervals(scores.outage[i : i + 1])
     ends = {n: magnitudes(r.error[i, w.last])["horizontal"] for n, r in scores.filters.items()}
     best = np.min([np.where(np.isfinite(e), e, np.inf) for e in ends.values()], 0)
     k = int(np.argsort(best)[len(best) // 2])
@@ -178,61 +175,61 @@ def _outage_end(ax: Axes, scores: Scores, i: int) -> None:
     ax.set_title(f"end of the outage, {w.length[k] * scores.epoch_s:g} s without GNSS", fontsize=9)
 
 
-def error_over_time(scores: Scores, pieces: Sequence[int] | None = None) -> Figure:
-    """RMS over pieces at each time since their start, middle 80 % of the pieces as a band (figs 13, 14).
+def error_over_time(scores: Scores, segments: Sequence[int] | None = None) -> Figure:
+    """RMS over segments at each time since their start, middle 80 % of the segments as a band (figs 13, 14).
 
-    One piece gives its error itself. Outages are shaded, darker where more pieces have one.
+    One segment gives its error itself. Outages are shaded, darker where more segments have one.
     """
-    index = list(range(len(scores.pieces))) if pieces is None else list(pieces)
+    index = list(range(len(scores.segments))) if segments is None else list(segments)
     sizes = {n: magnitudes(r.error[index]) for n, r in scores.filters.items()}
-    shown = [q for q in ("horizontal", "velocity", "attitude") if any(np.isfinite(s[q]).any() for s in sizes.values())]
+    shown = [q for q in LABELS if any(np.isfinite(s[q]).any() for s in sizes.values())]
     figure = Figure(figsize=(9, 2.5 * max(len(shown), 1) + 0.9), layout="constrained")
     axes = figure.subplots(max(len(shown), 1), 1, sharex=True, squeeze=False).ravel()
     length = scores.t[np.flatnonzero(~np.isnan(scores.truth_p_n[index]).all((0, 2)))[-1]]
     for ax, q in zip(axes, shown):
-        scale = 180 / math.pi if q in ("attitude", "heading") else 1.0
+        label, scale = LABELS[q]
         _shade(ax, scores, index)
         for name in scores.filters:
             x = sizes[name][q] * scale
             finite = np.where(np.isfinite(x), x, np.nan)
             style = line_of(scores, name)
-            ax.plot(scores.t, rms_over_pieces(np.where(np.isinf(x), np.nan, x)), lw=1.8, zorder=3, **style)
+            ax.plot(scores.t, rms_over_segments(np.where(np.isinf(x), np.nan, x)), lw=1.8, zorder=3, **style)
             if len(index) > 4:
                 some = (~np.isnan(finite)).sum(0) > 4
                 band = np.nanpercentile(finite[:, some], [10, 90], axis=0)
                 ax.fill_between(scores.t[some], *band, color=style["color"], alpha=0.13, lw=0, zorder=2)
         ax.set_yscale("log")
-        ax.set_ylabel(LABELS[q])
+        ax.set_ylabel(label)
         ax.set_xlim(0, length)
         _plain(ax)
     axes[len(shown) - 1].set_xlabel(
-        "Time since the start [s]" if len(index) == 1 else "Time since the start of the piece [s]"
+        "Time since the start [s]" if len(index) == 1 else "Time since the start of the segment [s]"
     )
-    what = _name(scores, index[0]) if len(index) == 1 else f"RMS over {len(index)} pieces"
+    what = _name(scores, index[0]) if len(index) == 1 else f"RMS over {len(index)} segments"
     if len(index) > 4:
-        what += ", band: middle 80 % of the pieces"
+        what += ", band: middle 80 % of the segments"
     axes[0].set_title(what, fontsize=9, loc="left")
     handles = [Line2D([], [], lw=1.8, label=n, **line_of(scores, n)) for n in scores.filters]
     _legend(figure, handles + _outage_handle(scores, index))
     return figure
 
 
-def imu_errors(scores: Scores, pieces: Sequence[int]) -> Figure:
-    """IMU-error estimates over time, six axes; truth in black, ±1σ as a band for one piece (figs 6, 11)."""
+def imu_errors(scores: Scores, segments: Sequence[int]) -> Figure:
+    """IMU-error estimates over time, six axes; truth in black, ±1σ as a band for one segment (figs 6, 11)."""
     figure = Figure(figsize=(12, 6.4), layout="constrained")
     axes = figure.subplots(2, 3, sharex=True)
-    known = ~np.isnan(scores.true_imu_error[list(pieces)]).all()
-    alone = len(pieces) == 1
-    last = np.flatnonzero(~np.isnan(scores.truth_p_n[list(pieces)]).all((0, 2)))[-1]
+    known = ~np.isnan(scores.true_imu_error[list(segments)]).all()
+    alone = len(segments) == 1
+    last = np.flatnonzero(~np.isnan(scores.truth_p_n[list(segments)]).all((0, 2)))[-1]
     settled = scores.t > 0.2 * scores.t[last]
     for k, (ax, (label, unit, scale)) in enumerate(zip(axes.ravel(), IMU_AXES)):
-        _shade(ax, scores, pieces)
+        _shade(ax, scores, segments)
         extent: list[Array] = []
         for name, run in scores.filters.items():
-            if not np.nan_to_num(run.imu_error[list(pieces)]).any():
+            if not np.nan_to_num(run.imu_error[list(segments)]).any():
                 continue  # a filter that estimates none
             style = line_of(scores, name)
-            for i in pieces:
+            for i in segments:
                 y = run.imu_error[i, :, k] * scale
                 ax.plot(scores.t, y, lw=1.7 if alone else 0.9, alpha=1.0 if alone else 0.65, zorder=3, **style)
                 extent.append(y[settled])
@@ -240,7 +237,7 @@ def imu_errors(scores: Scores, pieces: Sequence[int]) -> Figure:
                     s = run.imu_std[i, :, k] * scale
                     ax.fill_between(scores.t, y - s, y + s, color=style["color"], alpha=0.15, lw=0, zorder=2)
                     extent += [(y - s)[settled], (y + s)[settled]]
-        for i in pieces if known else ():
+        for i in segments if known else ():
             y = scores.true_imu_error[i, :, k] * scale
             ax.plot(scores.t, y, color="black", lw=1.4 if alone else 0.7, ls="-" if alone else ":", zorder=4)
             extent.append(y[settled])
@@ -255,31 +252,30 @@ def imu_errors(scores: Scores, pieces: Sequence[int]) -> Figure:
     if known:
         handles.append(Line2D([], [], color="black", lw=1.4, ls="-" if alone else ":", label="truth"))
     for n, r in scores.filters.items():
-        if np.nan_to_num(r.imu_error[list(pieces)]).any():
+        if np.nan_to_num(r.imu_error[list(segments)]).any():
             handles.append(Line2D([], [], lw=1.7, label=n, **line_of(scores, n)))
-    stds = any(np.isfinite(r.imu_std[list(pieces)]).any() for r in scores.filters.values())
+    stds = any(np.isfinite(r.imu_std[list(segments)]).any() for r in scores.filters.values())
     if alone and stds:
-        handles.append(Patch(color=COLOURS[1], alpha=0.2, label="±1σ, as the filter says"))
-    title = _name(scores, pieces[0]) if alone else f"{len(pieces)} pieces"
+        handles.append(Patch(color=COLOURS[1], alpha=0.2, label="±1σ of the filter"))
+    title = _name(scores, segments[0]) if alone else f"{len(segments)} segments"
     figure.suptitle(f"IMU-error estimates, {title}", fontsize=10)
-    _legend(figure, handles + _outage_handle(scores, pieces))
+    _legend(figure, handles + _outage_handle(scores, segments))
     return figure
 
 
-def error_growth(scores: Scores, quantity: str = "horizontal") -> Figure:
-    """RMS over outages against the time without GNSS, with its 95 % bootstrap band."""
+def error_growth(scores: Scores) -> Figure:
+    """RMS of the horizontal error over outages against the time without GNSS, with its 95 % bootstrap band."""
     w = scores.windows
     longest = int(w.length.max())
     seconds = scores.epoch_s * np.arange(1, longest + 1)
-    groups = [scores.pieces[i].group for i in w.piece]
-    scale = 180 / math.pi if quantity in ("attitude", "heading") else 1.0
+    groups = [scores.segments[i].group for i in w.segment]
     figure = Figure(figsize=(8, 5), layout="constrained")
     ax = figure.subplots()
     ends: dict[str, float] = {}
     tops: dict[str, float] = {}
     banded = False
     for name, run in scores.filters.items():
-        x = outage_at(magnitudes(run.error)[quantity] * scale, w, seconds, scores.epoch_s)
+        x = outage_at(magnitudes(run.error)["horizontal"], w, seconds, scores.epoch_s)
         rms, low, high = rms_band(x, groups=groups)
         style = line_of(scores, name)
         ax.plot(seconds, np.where(np.isfinite(rms), rms, np.nan), lw=2, label=name, zorder=3, **style)
@@ -288,13 +284,13 @@ def error_growth(scores: Scores, quantity: str = "horizontal") -> Figure:
         ends[name] = float(np.nanmax(rms, initial=0.0))
         tops[name] = max(float(np.nanmax(high, initial=0.0)), ends[name])
     inside = [n for n in ends if np.isfinite(ends[n]) and ends[n] <= OFF_SCALE * max(min(ends.values()), 1e-9)]
-    outside = [f"{n} ({number(ends[n])} {'°' if scale > 1 else QUANTITIES[quantity]})" for n in ends if n not in inside]
+    outside = [f"{n} ({format_number(ends[n])} m)" for n in ends if n not in inside]
     ax.set_ylim(0, 1.05 * max((tops[n] for n in inside), default=1.0))
     ax.set_xlim(0, seconds[-1])
-    ax.set(xlabel="Time without GNSS [s]", ylabel=LABELS[quantity].replace(" error", " error, RMS"))
+    ax.set(xlabel="Time without GNSS [s]", ylabel="Horizontal error, RMS [m]")
     band = "band: 95 % bootstrap interval of the RMS" if banded else f"under {MIN_GROUPS} recordings: no intervals"
     note = f"\noff the scale at the end: {', '.join(outside)}" if outside else ""
-    ax.set_title(f"{len(w.piece)} outages, {band}{note}", fontsize=9, loc="left")
+    ax.set_title(f"{len(w.segment)} outages, {band}{note}", fontsize=9, loc="left")
     _plain(ax)
     _legend(figure, ax.get_legend_handles_labels()[0])
     return figure
@@ -312,7 +308,9 @@ def error_histograms(scores: Scores, names: Sequence[str], every_s: float = 10.0
     panels = figure.subplots(math.ceil(len(counts) / 2), 2, squeeze=False)
     squares = {n: magnitudes(scores.filters[n].error)["horizontal"] ** 2 for n in names}
     for ax, count in zip(panels.flat, counts):
-        found = {n: np.sqrt([x[i, a : a + count].mean() for i, a in zip(w.piece, w.first)]) for n, x in squares.items()}
+        found = {
+            n: np.sqrt([x[i, a : a + count].mean() for i, a in zip(w.segment, w.first)]) for n, x in squares.items()
+        }
         top = max(float(np.nanquantile(x, 0.95)) for x in found.values())
         for n, x in found.items():
             heights, edges = np.histogram(np.minimum(x, top), bins=20, range=(0.0, top))
@@ -331,8 +329,8 @@ def error_histograms(scores: Scores, names: Sequence[str], every_s: float = 10.0
     return figure
 
 
-def _shade(ax: Axes, scores: Scores, pieces: Iterable[int]) -> None:
-    share = scores.outage[list(pieces)].mean(0)
+def _shade(ax: Axes, scores: Scores, segments: Iterable[int]) -> None:
+    share = scores.outage[list(segments)].mean(0)
     edges = np.concatenate(([0.0], scores.t))
     change = np.flatnonzero(np.diff(share, prepend=-1.0, append=-1.0))
     for a, b in pairwise(change):
@@ -340,8 +338,8 @@ def _shade(ax: Axes, scores: Scores, pieces: Iterable[int]) -> None:
             ax.axvspan(edges[a], edges[b], color=SHADE, alpha=0.25 + 0.75 * share[a], lw=0, zorder=0)
 
 
-def _outage_handle(scores: Scores, pieces: Sequence[int]) -> list[Patch]:
-    return [Patch(color=SHADE, label="outage")] if scores.outage[list(pieces)].any() else []
+def _outage_handle(scores: Scores, segments: Sequence[int]) -> list[Patch]:
+    return [Patch(color=SHADE, label="outage")] if scores.outage[list(segments)].any() else []
 
 
 def _limits(ax: Axes, extent: list[Array]) -> None:
@@ -355,7 +353,7 @@ def _limits(ax: Axes, extent: list[Array]) -> None:
 
 
 def _name(scores: Scores, i: int) -> str:
-    p = scores.pieces[i]
+    p = scores.segments[i]
     return f"{p.drive}, from t = {p.t_start:.0f} s"
 
 

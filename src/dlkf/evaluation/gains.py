@@ -16,10 +16,10 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from dlkf.data.masks import withhold
+from dlkf.base.files import write_into
+from dlkf.data.masks import withhold_fixes
 from dlkf.evaluation.metrics import Array
 from dlkf.evaluation.run import Scene
-from dlkf.files import staged
 from dlkf.filters.smoother import Filter
 from dlkf.running.batched import run_filter
 
@@ -30,14 +30,14 @@ COLUMNS = ROWS[:6]
 
 @dataclass(frozen=True)
 class Gains:
-    """Gain of one filter at the last fix of every piece (P, 9, 6), and mean and spread over all its fixes."""
+    """Gain of one filter at the last fix of every segment (P, 9, 6), and mean and spread over all its fixes."""
 
     last: Array
-    mean: Array  # (9, 6) over the fixes of all pieces, the first ``settle_s`` of each left out
+    mean: Array  # (9, 6) over the fixes of all segments, the first ``settle_s`` of each left out
     std: Array  # (9, 6) likewise
 
     def block(self, name: str) -> float:
-        """Mean of the diagonal of a block of :data:`BLOCKS`, over the pieces' last fixes."""
+        """Mean of the diagonal of a block of :data:`BLOCKS`, over the segments' last fixes."""
         row, column = BLOCKS[name]
         return float(np.mean([self.last[:, row + k, column + k] for k in range(3)]))
 
@@ -47,7 +47,7 @@ def gains_of(filters: Mapping[str, Filter], scenes: Iterable[Scene], *, settle_s
     last: dict[str, list[Array]] = {}
     used: dict[str, list[Array]] = {}
     for batch, mask in scenes:
-        masked = withhold(batch, mask)
+        masked = withhold_fixes(batch, mask)
         for name, estimator in filters.items():
             solution = run_filter(masked, estimator)
             if solution.gain is None:
@@ -64,7 +64,7 @@ def gains_of(filters: Mapping[str, Filter], scenes: Iterable[Scene], *, settle_s
 
 
 def write_gains(out: Path, gains: Mapping[str, Gains], title: str) -> None:
-    """``gains.json`` (last gain of one piece, mean, spread, mean diagonals of the blocks) and ``figures/gains.png``."""
+    """``gains.json`` (last gain of one segment, mean, spread, mean block diagonals) and ``figures/gains.png``."""
     content = {
         name: {
             "last": g.last[0].tolist(),
@@ -74,11 +74,11 @@ def write_gains(out: Path, gains: Mapping[str, Gains], title: str) -> None:
         }
         for name, g in gains.items()
     }
-    with staged(out) as folder:
+    with write_into(out) as folder:
         (folder / "gains.json").write_text(json.dumps(content, indent=1) + "\n")
         (folder / "figures").mkdir()
         panels = [(name, g.last[0]) for name, g in gains.items()]
-        figure = heat_map(panels, len(panels), f"{title}: gain at the last fix of one piece")
+        figure = heat_map(panels, len(panels), f"{title}: gain at the last fix of one segment")
         FigureCanvasAgg(figure).print_png(str(folder / "figures" / "gains.png"))
 
 

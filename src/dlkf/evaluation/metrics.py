@@ -1,6 +1,6 @@
 """What is measured: errors of a filter against the truth, and the numbers made of them.
 
-All functions are pure and work on numpy arrays with P pieces (rows), T epochs and, after the last update
+All functions are pure and work on numpy arrays with P segments (rows), T epochs and, after the last update
 that an outage allows, W outages. Two marks have a meaning everywhere: **NaN** = there is no truth to compare
 with (it is left out), **inf** = the filter's own output was not finite (it counts, and shows).
 """
@@ -69,21 +69,21 @@ def magnitudes(error: Array) -> dict[str, Array]:
     }
 
 
-def piece_rms(x: Array, mask: Mask | None = None) -> Array:
-    """RMS over the epochs of each piece, √(Σ x²/n): (P, T) → (P,), NaN where a piece has no valid epoch."""
+def segment_rms(x: Array, mask: Mask | None = None) -> Array:
+    """RMS over the epochs of each segment, √(Σ x²/n): (P, T) → (P,), NaN where a segment has no valid epoch."""
     valid = ~np.isnan(x) if mask is None else mask & ~np.isnan(x)
     n = valid.sum(-1)
     total = np.where(valid, x, 0.0) ** 2
     return np.where(n > 0, np.sqrt(total.sum(-1) / np.maximum(n, 1)), np.nan)
 
 
-def rms_over_pieces(x: Array) -> Array:
-    """RMS over pieces at each epoch: (P, T) → (T,), NaN where no piece has truth."""
-    return piece_rms(x.T)
+def rms_over_segments(x: Array) -> Array:
+    """RMS over segments at each epoch: (P, T) → (T,), NaN where no segment has truth."""
+    return segment_rms(x.T)
 
 
-def summary(values: Array) -> dict[str, float]:
-    """n, RMS, mean, geometric mean, median, 95 % and maximum over pieces or outages; NaN left out, inf counted."""
+def summarise_errors(values: Array) -> dict[str, float]:
+    """n, RMS, mean, geometric mean, median, 95 % and maximum over segments or outages; NaN left out, inf counted."""
     x = np.asarray(values, float)
     x = x[~np.isnan(x)]
     if x.size == 0:
@@ -109,10 +109,10 @@ def geometric_mean(x: Array) -> float:
         return float(np.exp(np.mean(np.maximum(np.log(np.abs(x)), LEAST_LOG))))
 
 
-class Windows(NamedTuple):
-    """W outages: piece, first epoch without a fix, number of epochs without one; each (W,)."""
+class OutageIntervals(NamedTuple):
+    """W outages: segment, first epoch without a fix, number of epochs without one; each (W,)."""
 
-    piece: NDArray[np.int64]
+    segment: NDArray[np.int64]
     first: NDArray[np.int64]
     length: NDArray[np.int64]
 
@@ -122,18 +122,18 @@ class Windows(NamedTuple):
         return self.first + self.length - 1
 
 
-def windows(outage: Mask) -> Windows:
+def outage_intervals(outage: Mask) -> OutageIntervals:
     """Runs of True in each row of an outage mask (P, T), in row order."""
     padded = np.pad(np.asarray(outage, np.int8), ((0, 0), (1, 1)))
     change = np.diff(padded, axis=-1)
-    piece, first = np.nonzero(change == 1)
+    segment, first = np.nonzero(change == 1)
     _, stop = np.nonzero(change == -1)
-    return Windows(piece, first, stop - first)
+    return OutageIntervals(segment, first, stop - first)
 
 
-def outage_end(x: Array, w: Windows) -> Array:
+def outage_end(x: Array, w: OutageIntervals) -> Array:
     """Value at the end of each outage, before GNSS is back: (P, T) → (W,)."""
-    return x[w.piece, w.last]
+    return x[w.segment, w.last]
 
 
 def end_errors(batch: Batch, state: NavState) -> Array:
@@ -144,7 +144,7 @@ def end_errors(batch: Batch, state: NavState) -> Array:
     """
     hidden = (~batch.available & batch.truth_valid & batch.present).cpu().numpy()
     off = (state.p_n.detach().double() - batch.truth.p_n.to(state.p_n.device).double())[..., :2].norm(dim=-1)
-    return outage_end(np.nan_to_num(off.cpu().numpy(), nan=np.inf), windows(hidden))
+    return outage_end(np.nan_to_num(off.cpu().numpy(), nan=np.inf), outage_intervals(hidden))
 
 
 OBJECTIVES = ("log", "rms", "median")
@@ -157,25 +157,25 @@ def mean_error(errors: Array, objective: str) -> float:
         return float("inf") if len(errors) else float("nan")
     if objective == "rms":
         return float(np.sqrt(np.mean(errors**2)))
-    return float(np.median(errors) if objective == "median" else np.exp(np.mean(np.log(np.maximum(errors, 1e-3)))))
+    return float(np.median(errors)) if objective == "median" else geometric_mean(errors)
 
 
-def outage_at(x: Array, w: Windows, seconds: Array, epoch_s: float) -> Array:
+def outage_at(x: Array, w: OutageIntervals, seconds: Array, epoch_s: float) -> Array:
     """Value ``seconds`` (K,) after the last fix: (P, T) → (W, K), NaN where the outage is shorter."""
     steps = np.rint(np.asarray(seconds, float) / epoch_s).astype(int)
     column = w.first[:, None] + steps - 1
     inside = (steps >= 1) & (steps <= w.length[:, None])
-    return np.where(inside, x[w.piece[:, None], np.clip(column, 0, x.shape[1] - 1)], np.nan)
+    return np.where(inside, x[w.segment[:, None], np.clip(column, 0, x.shape[1] - 1)], np.nan)
 
 
-def outage_rms(x: Array, w: Windows) -> Array:
+def outage_rms(x: Array, w: OutageIntervals) -> Array:
     """RMS over the epochs of each outage: (P, T) → (W,)."""
     epoch = np.arange(x.shape[1])
     inside = (epoch >= w.first[:, None]) & (epoch <= w.last[:, None])
-    return piece_rms(x[w.piece], inside)
+    return segment_rms(x[w.segment], inside)
 
 
-def outage_distance(v_truth: Array, w: Windows, epoch_s: float) -> Array:
+def outage_distance(v_truth: Array, w: OutageIntervals, epoch_s: float) -> Array:
     """Horizontal distance driven in each outage [m] from the true velocity (P, T, 3) at the epochs' ends.
 
     Trapezoid over the outage's epochs; a missing true velocity makes the distance NaN.
@@ -185,8 +185,8 @@ def outage_distance(v_truth: Array, w: Windows, epoch_s: float) -> Array:
     step = 0.5 * (speed + before) * epoch_s
     cumulative = np.concatenate((np.zeros((len(step), 1)), np.cumsum(np.nan_to_num(step), -1)), -1)
     missing = np.concatenate((np.zeros((len(step), 1)), np.cumsum(np.isnan(step), -1)), -1)
-    gaps = missing[w.piece, w.last + 1] - missing[w.piece, w.first]
-    return np.where(gaps > 0, np.nan, cumulative[w.piece, w.last + 1] - cumulative[w.piece, w.first])
+    gaps = missing[w.segment, w.last + 1] - missing[w.segment, w.first]
+    return np.where(gaps > 0, np.nan, cumulative[w.segment, w.last + 1] - cumulative[w.segment, w.first])
 
 
 def slope(estimate: Array, cause: Array, *, intercept: bool) -> Array:

@@ -13,21 +13,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dlkf.data.draws import drawn_per_piece
+from dlkf.base.errors import InputError
+from dlkf.data.draws import draw_per_segment
 from dlkf.data.drive import Batch
-from dlkf.data.masks import within
-from dlkf.errors import InputError
+from dlkf.data.masks import outage_within
 
 LAST_FIX_WITHIN_S = 2.0  # an outage counts from a fix: one must lie this close before its start
 
 
 @dataclass(frozen=True)
 class OutagePlan:
-    """When GNSS is taken away [s since the start of a piece].
+    """When GNSS is taken away [s since the start of a segment].
 
-    ``first_s`` and ``duration_s`` are numbers, or (low, high): drawn for each piece, uniformly, in whole
-    epochs. ``every_s`` repeats the outage to the end of the piece (None: one outage). Each of ``offsets_s``
-    gives one run over the same pieces with the whole schedule shifted, so that the windows cover a drive
+    ``first_s`` and ``duration_s`` are numbers, or (low, high): drawn for each segment, uniformly, in whole
+    epochs. ``every_s`` repeats the outage to the end of the segment (None: one outage). Each of ``offsets_s``
+    gives one run over the same segments with the whole schedule shifted, so that the windows cover a drive
     (none: one run, not shifted).
     """
 
@@ -52,7 +52,7 @@ class OutagePlan:
     def masks(self, batch: Batch, seed: int = 0) -> list[Tensor]:
         """One mask (B, T) per offset, True where a fix is withheld; only outages that can be scored stay.
 
-        What is drawn for a piece depends on ``seed`` and on the piece alone (:mod:`dlkf.data.draws`).
+        What is drawn for a segment depends on ``seed`` and on the segment alone (:mod:`dlkf.data.draws`).
         """
         B, T, _ = batch.size
         epoch_s = batch.epoch_s
@@ -65,7 +65,7 @@ class OutagePlan:
             for k in range(repeats):
                 start = first + offset + k * (self.every_s or 0.0)
                 mask |= outage_mask(batch, start, duration)
-            out.append(scorable(batch, mask))
+            out.append(scorable_outages(batch, mask))
         return out
 
 
@@ -74,10 +74,10 @@ def outage_mask(batch: Batch, start_s: Tensor, duration_s: Tensor) -> Tensor:
     start, stop = start_s.double()[:, None], (start_s + duration_s).double()[:, None]
     slack = 1e-6 * batch.epoch_s
     length = batch.present.cpu().sum(-1, keepdim=True) * batch.epoch_s
-    return within(batch, start_s, duration_s) & (start > -slack) & (stop <= length + slack)
+    return outage_within(batch, start_s, duration_s) & (start > -slack) & (stop <= length + slack)
 
 
-def scorable(batch: Batch, outage: Tensor) -> Tensor:
+def scorable_outages(batch: Batch, outage: Tensor) -> Tensor:
     """The mask without the outages whose truth is not known throughout, or that no fix precedes closely."""
     truth = batch.truth_valid.cpu() & batch.present.cpu()
     position = batch.gnss_valid[..., :3].all(-1).cpu() & batch.available.cpu()
@@ -98,7 +98,7 @@ def check_outages(plan: OutagePlan | None, withheld: Tensor | np.ndarray) -> Non
     if plan is not None and not withheld.any():
         raise InputError(
             f"no outage fits into these drives: outage.first_s={plan.first_s} and outage.duration_s={plan.duration_s} "
-            "want a fix at its start and valid truth throughout; give smaller ones, or outage=null"
+            "need a fix at its start and valid truth throughout; give smaller ones, or outage=null"
         )
 
 
@@ -118,5 +118,5 @@ def _drawn(value: float | Sequence[float], batch: Batch, seed: int, name: str) -
     def whole_epochs(generator: torch.Generator) -> Tensor:
         return torch.randint(0, steps + 1, (), generator=generator)
 
-    draws = drawn_per_piece(whole_epochs, seed, f"outage.{name}", batch.drive, batch.t_start)
+    draws = draw_per_segment(whole_epochs, seed, f"outage.{name}", batch.drive, batch.t_start)
     return low + draws.double() * batch.epoch_s

@@ -1,4 +1,4 @@
-"""How drives become scenes: pieces from the truth, or whole drives from their own alignment, with outages."""
+"""How drives become scenes: segments from the truth, or whole drives from their own alignment, with outages."""
 
 from __future__ import annotations
 
@@ -8,12 +8,20 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 
+from dlkf.base.errors import InputError
 from dlkf.data.alignment import ALIGN, AlignConfig, Start
 from dlkf.data.drive import Batch, Drive
-from dlkf.data.masks import withhold
-from dlkf.data.segments import Piece, StartLaw, cut_pieces, make_batch, told_unused, unused, whole_drives
-from dlkf.data.stack import DriveStack, stacked
-from dlkf.errors import InputError
+from dlkf.data.masks import withhold_fixes
+from dlkf.data.segments import (
+    Segment,
+    StartLaw,
+    cut_segments,
+    describe_unused_drives,
+    find_unused_drives,
+    make_batch,
+    whole_drives,
+)
+from dlkf.data.stack import DriveStack, stack_drives
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.run import Scene
 from dlkf.running.batched import CHUNK_SAMPLES
@@ -23,17 +31,18 @@ if TYPE_CHECKING:
     from dlkf.data.datamodule import DriveDataModule
 
 Item = TypeVar("Item")
-MODES = ("auto", "pieces", "drives")
+MODES = ("auto", "segments", "drives")
+REFUSED = "refused beyond physical limits"  # of the rules: what was left out of drives
 
 
 @dataclass(frozen=True)
 class Protocol:
     """The rules of a comparison, the same for every filter (paper.md 4.5, 4.8).
 
-    ``pieces``: ``length_s`` every ``stride_s`` wherever the truth is valid, from the truth plus an error
+    ``segments``: ``length_s`` every ``stride_s`` wherever the truth is valid, from the truth plus an error
     drawn from ``start``. ``drives``: whole drives from their own alignment (``align``), the outage repeated every
     ``every_s`` (default twice its length) in one run per offset (default 0 and its length: covers the drive).
-    ``auto``: pieces where the truth has attitude and is long enough, else drives.
+    ``auto``: segments where the truth has attitude and is long enough, else drives.
     """
 
     mode: str = "auto"
@@ -52,18 +61,18 @@ class Protocol:
                 raise InputError(f"{name}={getattr(self, name)} must be above 0 s")
 
 
-class NoPiece(InputError):
-    """Every drive is too short for a piece."""
+class NoSegment(InputError):
+    """Every drive is too short for a segment."""
 
 
 class Scenes:
-    """The scenes of a protocol over some drives; iterating cuts them anew, a bounded part at a time.
+    """The scenes of a protocol over some drives; iterating cuts them again, a bounded part at a time.
 
-    The same protocol gives the same scenes, whatever is scored on them: each piece has its own draws of start error
-    and outage. ``pieces`` are those to use, else they are cut by the protocol; ``limit`` keeps so many, spread evenly
-    over all. ``mode`` is the one chosen, ``runs`` the number of pieces over all scenes, ``skipped`` the drives that
-    cannot be used and why, ``short`` those of which no piece could be cut though pieces are scored. Raises InputError
-    where nothing can be scored or no outage fits into the pieces.
+    The same protocol gives the same scenes for all filters: each segment has its own draws of start error
+    and outage. ``segments`` are those to use, else they are cut by the protocol; ``limit`` keeps so many, spread evenly
+    over all. ``mode`` is the one chosen, ``runs`` the number of segments over all scenes, ``skipped`` the drives that
+    cannot be used and why, ``short`` those of which no segment could be cut although segments are scored. InputError
+    where nothing can be scored or no outage fits into the segments.
     """
 
     def __init__(
@@ -71,31 +80,32 @@ class Scenes:
         drives: Sequence[Drive],
         protocol: Protocol,
         *,
-        pieces: Sequence[Piece] | None = None,
+        segments: Sequence[Segment] | None = None,
         limit: int | None = None,
     ) -> None:
-        stack = stacked(drives)
+        stack = stack_drives(drives)
         self.short: tuple[str, ...] = ()
-        if pieces is None and protocol.mode != "drives":
+        self.refused = {drive.name: str(drive.refused) for drive in drives if any(drive.refused)}
+        if segments is None and protocol.mode != "drives":
             attitude = protocol.mode == "auto"
-            pieces = cut_pieces(stack, protocol.length_s, protocol.stride_s, attitude=attitude)
-            self.short = tuple(unused(stack, pieces)) if pieces else ()
-        pieces = spread(pieces or (), limit)
+            segments = cut_segments(stack, protocol.length_s, protocol.stride_s, attitude=attitude)
+            self.short = tuple(find_unused_drives(stack, segments)) if segments else ()
+        segments = spread_evenly(segments or (), limit)
         self.side: str | None = None
-        self.mode = "pieces" if protocol.mode == "pieces" or pieces else "drives"
+        self.mode = "segments" if protocol.mode == "segments" or segments else "drives"
         self.skipped: dict[str, str] = {}
-        self._batches: list[tuple[Sequence[Drive], list[Any]]]  # pieces or starts
-        if self.mode == "pieces":
-            if not pieces:
-                raise NoPiece(
-                    f"no piece of {protocol.length_s:g} s lies within valid truth; give a shorter length_s, "
+        self._batches: list[tuple[Sequence[Drive], list[Any]]]  # segments or starts
+        if self.mode == "segments":
+            if not segments:
+                raise NoSegment(
+                    f"no segment of {protocol.length_s:g} s lies within valid truth; give a shorter length_s, "
                     "or mode=drives"
                 )
-            self._batches = [(stack, part) for part in _parts(pieces, [p.epochs for p in pieces], stack)]
-            self.outage = protocol.outage and fitting(protocol.outage, protocol.length_s)
+            self._batches = [(stack, part) for part in _parts(segments, [p.epochs for p in segments], stack)]
+            self.outage = protocol.outage and drives_that_fit(protocol.outage, protocol.length_s)
         else:
             starts = self._aligned(stack, protocol.align)
-            starts = {d: starts[d] for d in spread(list(starts), limit)}
+            starts = {d: starts[d] for d in spread_evenly(list(starts), limit)}
             order = sorted(starts, key=lambda d: -stack[d].epochs)  # like lengths together: little padding
             parts = _parts(order, [stack[d].epochs for d in order], stack)
             self._batches = [([stack[d] for d in part], [starts[d] for d in part]) for part in parts]
@@ -107,7 +117,7 @@ class Scenes:
     def __iter__(self) -> Iterator[Scene]:
         seed = self.protocol.seed
         for drives, part in self._batches:
-            if self.mode == "pieces":
+            if self.mode == "segments":
                 batch = make_batch(drives, part, dtype=torch.float64, start=self.protocol.start, seed=seed)
             else:
                 batch = whole_drives(drives, part)
@@ -121,16 +131,16 @@ class Scenes:
     def of_split(
         cls, data: DriveDataModule, side: str, outage: OutagePlan | None, seed: int, limit: int | None = None
     ) -> Scenes:
-        """The scenes of the pieces on one side of a split (``train``, ``val``, ``test``), of at most ``limit``."""
-        pieces, stride = data.pieces(side), data.eval_stride_s or data.eval_length_s
-        protocol = Protocol("pieces", data.eval_length_s, stride, data.start, outage=outage, seed=seed)
-        scenes = cls(data.stack, protocol, pieces=pieces, limit=limit)
+        """The scenes of the segments on one side of a split (``train``, ``val``, ``test``), of at most ``limit``."""
+        segments, stride = data.segments(side), data.eval_stride_s or data.eval_length_s
+        protocol = Protocol("segments", data.eval_length_s, stride, data.start, outage=outage, seed=seed)
+        scenes = cls(data.stack, protocol, segments=segments, limit=limit)
         scenes.side = side
         return scenes
 
     def withheld(self) -> list[Batch]:
         """All batches with the outages applied."""
-        return [withhold(batch, mask) for batch, mask in self]
+        return [withhold_fixes(batch, mask) for batch, mask in self]
 
     def described(self) -> dict[str, Any]:
         """The rules as plain values, for files."""
@@ -138,11 +148,12 @@ class Scenes:
         common: dict[str, Any] = {"mode": self.mode, "runs": self.runs, "seed": p.seed}
         if self.side is not None:
             common["split"] = self.side
-        if self.mode == "pieces":
+        if self.mode == "segments":
             common |= {"length_s": p.length_s, "stride_s": p.stride_s, "start": asdict(p.start)}
         else:
             common["start"] = "alignment from GNSS and levelling"
             common["align"] = asdict(p.align)
+        common |= {REFUSED: self.refused} if self.refused else {}
         return common | {"outage": asdict(self.outage) if self.outage else None, "skipped": self.skipped}
 
     def _aligned(self, drives: Sequence[Drive], config: AlignConfig) -> dict[int, Start]:
@@ -162,20 +173,20 @@ class Scenes:
         return starts
 
 
-def told_short(names: Sequence[str], of: int, protocol: Protocol) -> str:
-    """One line on drives of which no piece could be cut."""
+def describe_short(names: Sequence[str], of: int, protocol: Protocol) -> str:
+    """One line on drives of which no segment could be cut."""
     known = " with a known attitude" if protocol.mode == "auto" else ""
     mend = "a shorter length_s takes more of them, mode=drives all"
-    return told_unused(names, of, f"piece of {protocol.length_s:g} s{known}", mend)
+    return describe_unused_drives(names, of, f"segment of {protocol.length_s:g} s{known}", mend)
 
 
-def spread(items: Sequence[Item], limit: int | None) -> list[Item]:
+def spread_evenly(items: Sequence[Item], limit: int | None) -> list[Item]:
     """At most ``limit`` items (None: all), at even distances over the whole sequence."""
     n = len(items)
     if limit is None or limit >= n:
         return list(items)
     if limit < 1:
-        raise InputError(f"pieces={limit} must be at least 1, or null for all")
+        raise InputError(f"segments={limit} must be at least 1, or null for all")
     return [items[(2 * k + 1) * n // (2 * limit)] for k in range(limit)]
 
 
@@ -186,14 +197,14 @@ def repeated(plan: OutagePlan) -> OutagePlan:
     return replace(plan, every_s=every, offsets_s=plan.offsets_s or (0.0, float(longest)))
 
 
-def fitting(plan: OutagePlan, length_s: float, length: str = "length_s", outage: str = "outage") -> OutagePlan:
-    """The plan with its offsets; InputError, which names the settings, where pieces are too short for it."""
+def drives_that_fit(plan: OutagePlan, length_s: float, length: str = "length_s", outage: str = "outage") -> OutagePlan:
+    """The plan with its offsets; InputError, which names the settings, where segments are too short for it."""
     offsets = plan.offsets_s or (0.0,)
     first, last = (x if isinstance(x, (int, float)) else max(x) for x in (plan.first_s, plan.duration_s))
     end = first + last + max(offsets)
     if end > length_s + 1e-6:
         raise InputError(
-            f"the outage ends after {end:g} s but pieces are {length_s:g} s long; "
+            f"the outage ends after {end:g} s but segments are {length_s:g} s long; "
             f"give a larger {length}, or a smaller {outage}.first_s or {outage}.duration_s"
         )
     return replace(plan, offsets_s=offsets)

@@ -1,6 +1,6 @@
 """From scores to the numbers that are printed, written and compared: one tidy frame.
 
-Every number is a row (:class:`Value`): of which filter, on which kind of data, over pieces or outages, which part of
+Every number is a row (:class:`Value`): of which filter, on which kind of data, over segments or outages, which part of
 them, which quantity and statistic. Tables, CSV, ``metrics.json``, MLflow's keys and sentences are selections from it.
 """
 
@@ -25,30 +25,32 @@ from dlkf.evaluation.metrics import (
     outage_distance,
     outage_end,
     outage_rms,
-    piece_rms,
+    segment_rms,
     slope,
-    summary,
+    summarise_errors,
 )
+from dlkf.evaluation.own_sigma import innovation_rms, sigma_samples
 from dlkf.evaluation.scores import Scores
 
-SETTLE_S = 10.0  # "settled" leaves out this much of every piece, where the initial error dominates
+SETTLE_S = 10.0  # "settled" leaves out this much of every segment, where the initial error dominates
 INTO_OUTAGE_S = (10.0, 20.0, 30.0, 40.0, 50.0, 60.0)
 BASELINE = "mbkf15"
 COMPARED = ("rms", "mean", "geomean")  # statistics of which ratios to the baseline are given
 IMU_AXES = {f"{sensor}_{axis}": unit for sensor, unit in (("accel", "m/s²"), ("gyro", "rad/s")) for axis in "xyz"}
-UNITS = {**QUANTITIES, "drift": "1", **IMU_AXES}
+UNITS = {**QUANTITIES, "drift": "1", "sigma": "m", "innovation": "1", **IMU_AXES}
 COUNTS = ("n", "nonfinite", "slope", "injected_slope")  # statistics without a unit
 TEXT = ("kind", "filter", "baseline", "over", "part", "quantity", "statistic")  # columns that are no numbers
 
 
 class Value(NamedTuple):
-    """One number. ``over``: pieces or outages.
+    """One number. ``over``: segments or outages.
 
-    ``part`` of pieces: ``all``; ``settled`` = without the first ``settle_s`` seconds; ``with_gnss`` = settled and
+    ``part`` of segments: ``all``; ``settled`` = without the first ``settle_s`` seconds; ``with_gnss`` = settled and
     outside the outages (each the RMS over that part); ``last`` = the last estimate, of the IMU error. Of outages:
     the error at their ``end``, the ``rms`` over them, or the error ``at 10 s`` after the last fix.
     ``quantity``: those of :data:`dlkf.evaluation.metrics.QUANTITIES`, ``drift`` = horizontal error at the end per
-    distance driven in the outage, ``accel_x`` … ``gyro_z`` = the IMU-error estimate.
+    distance driven in the outage, ``sigma`` = the filter's own horizontal 1σ at the end, ``innovation`` = innovations
+    over their 1σ, ``accel_x`` … ``gyro_z`` = the IMU-error estimate.
     """
 
     kind: str
@@ -62,7 +64,7 @@ class Value(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Versus:
+class PairedRatio:
     """A filter against the baseline in one quantity; ``over`` and ``part`` as in :class:`Value`."""
 
     kind: str
@@ -82,17 +84,17 @@ class Versus:
 
 @dataclass(frozen=True)
 class Results:
-    """What is said about one kind of data: values, comparisons with the baseline, and how much they rest on.
+    """The results of one kind of data: values, comparisons with the baseline, and how much they rest on.
 
-    ``per_piece`` and ``per_outage`` have one row each per piece and outage, with the error of every filter.
+    ``per_segment`` and ``per_outage`` have one row each per segment and outage, with the error of every filter.
     """
 
     kind: str
     count: Mapping[str, Any]
     settle_s: float
     values: tuple[Value, ...]
-    comparisons: tuple[Versus, ...]
-    per_piece: tuple[Mapping[str, Any], ...] = ()
+    comparisons: tuple[PairedRatio, ...]
+    per_segment: tuple[Mapping[str, Any], ...] = ()
     per_outage: tuple[Mapping[str, Any], ...] = ()
 
     @cached_property
@@ -139,7 +141,7 @@ class Results:
             "settle_s": self.settle_s,
             "values": {"columns": Value._fields, "data": [list(v) for v in self.values]},
             "comparisons": {"columns": list(rows[0]) if rows else [], "data": [list(r.values()) for r in rows]},
-            "per_piece": list(self.per_piece),
+            "per_segment": list(self.per_segment),
             "per_outage": list(self.per_outage),
         }
 
@@ -150,10 +152,10 @@ class Results:
         for row in content["comparisons"]["data"]:
             named: dict[str, Any] = {k: x if k in TEXT else _real(x) for k, x in zip(columns, row)}
             against = Comparison(**{f.name: named.pop(f.name) for f in fields(Comparison)})
-            comparisons.append(Versus(**named, against=against))
+            comparisons.append(PairedRatio(**named, against=against))
         values = (Value(*row[:-2], value=_real(row[-2]), unit=row[-1]) for row in content["values"]["data"])
         kept = {k: content[k] for k in ("kind", "count", "settle_s")}
-        lists: dict[str, Any] = {k: tuple(content[k]) for k in ("per_piece", "per_outage")}
+        lists: dict[str, Any] = {k: tuple(content[k]) for k in ("per_segment", "per_outage")}
         return Results(**kept, values=tuple(values), comparisons=tuple(comparisons), **lists)
 
 
@@ -172,54 +174,56 @@ def summarise_scores(
     """The results of one kind of data. Raises ValueError for scores of several kinds (split them first)."""
     if len(scores.kinds) > 1:
         raise ValueError(f"results of {' and '.join(scores.kinds)} data must not be mixed: use of_kind")
-    w, groups = scores.windows, np.array([p.group for p in scores.pieces])
+    w, groups = scores.windows, np.array([p.group for p in scores.segments])
     lengths = w.length * scores.epoch_s
     distance = outage_distance(scores.truth_v_n, w, scores.epoch_s)
     samples: dict[str, dict[tuple[str, str, str], Array]] = {}  # filter → (over, part, quantity) → one per unit
     values: list[Value] = []
     for name in scores.filters:
-        samples[name] = _piece_samples(scores, name, settle_s)
-        if len(w.piece):
-            samples[name] |= _outage_samples(scores, name, distance)
+        samples[name] = _segment_samples(scores, name, settle_s)
+        if len(w.segment):
+            samples[name] |= _outage_samples(scores, name, distance) | sigma_samples(scores, name)
         for (over, part, quantity), x in samples[name].items():
-            values += values_of(scores.kinds[0], name, over, part, quantity, summary(x))
+            values += values_of(scores.kinds[0], name, over, part, quantity, summarise_errors(x))
+        spread = {"rms": innovation_rms(scores.filters[name])}
+        values += values_of(scores.kinds[0], name, "segments", "with_gnss", "innovation", spread)
         values += _imu_error_quality(scores, name)
     return Results(
         kind=scores.kinds[0],
         count={
-            "pieces": len(scores.pieces),
-            "drives": len({p.drive for p in scores.pieces}),
+            "segments": len(scores.segments),
+            "drives": len({p.drive for p in scores.segments}),
             "groups": len(set(groups)),
-            "repeated": len({(p.drive, p.t_start) for p in scores.pieces}) < len(scores.pieces),
-            "outages": len(w.piece),
-            "outage_drives": len({scores.pieces[i].drive for i in w.piece}),
+            "repeated": len({(p.drive, p.t_start) for p in scores.segments}) < len(scores.segments),
+            "outages": len(w.segment),
+            "outage_drives": len({scores.segments[i].drive for i in w.segment}),
             "outage_s": [float(lengths.min()), float(lengths.max())] if len(lengths) else None,
             "scored_s": float((~np.isnan(scores.truth_p_n[..., 0])).sum() * scores.epoch_s),
         },
         settle_s=settle_s,
         values=tuple(values),
         comparisons=tuple(_comparisons(scores, samples, baseline, groups, resamples=resamples, seed=seed)),
-        per_piece=tuple(
+        per_segment=tuple(
             {
                 "drive": p.drive,
                 "group": p.group,
                 "t_start": p.t_start,
-                "rms": {n: {q: float(x["pieces", "all", q][i]) for q in QUANTITIES} for n, x in samples.items()},
+                "rms": {n: {q: float(x["segments", "all", q][i]) for q in QUANTITIES} for n, x in samples.items()},
             }
-            for i, p in enumerate(scores.pieces)
+            for i, p in enumerate(scores.segments)
         ),
         per_outage=tuple(
             {
-                "drive": scores.pieces[i].drive,
-                "group": scores.pieces[i].group,
-                "t_start": scores.pieces[i].t_start + float(w.first[k]) * scores.epoch_s,
+                "drive": scores.segments[i].drive,
+                "group": scores.segments[i].group,
+                "t_start": scores.segments[i].t_start + float(w.first[k]) * scores.epoch_s,
                 "length_s": float(lengths[k]),
                 "distance_m": float(distance[k]),
                 "end": {
                     n: {q: float(x["outages", "end", q][k]) for q in (*QUANTITIES, "drift")} for n, x in samples.items()
                 },
             }
-            for k, i in enumerate(w.piece)
+            for k, i in enumerate(w.segment)
         ),
     )
 
@@ -235,21 +239,21 @@ def values_of(
 
 
 def imu_error_values(kind: str, filter: str, statistic: str, six: Array) -> list[Value]:
-    """Rows of one statistic of the six axes of the IMU-error estimate at the end of a piece."""
-    rows = (values_of(kind, filter, "pieces", "last", q, {statistic: float(x)}) for q, x in zip(IMU_AXES, six))
+    """Rows of one statistic of the six axes of the IMU-error estimate at the end of a segment."""
+    rows = (values_of(kind, filter, "segments", "last", q, {statistic: float(x)}) for q, x in zip(IMU_AXES, six))
     return [row for one in rows for row in one]
 
 
-def last_known(x: Array) -> Array:
-    """The last value of each piece and axis that is not NaN: (P, T, n) → (P, n)."""
+def last_finite(x: Array) -> Array:
+    """The last value of each segment and axis that is not NaN: (P, T, n) → (P, n)."""
     known = ~np.isnan(x)
     last = x.shape[1] - 1 - np.argmax(known[:, ::-1], axis=1)
     return np.take_along_axis(x, last[:, None], axis=1)[:, 0]
 
 
-def _piece_samples(scores: Scores, name: str, settle_s: float) -> dict[tuple[str, str, str], Array]:
+def _segment_samples(scores: Scores, name: str, settle_s: float) -> dict[tuple[str, str, str], Array]:
     size, phases = magnitudes(scores.filters[name].error), _phases(scores, settle_s)
-    return {("pieces", k, q): piece_rms(size[q], mask) for q in QUANTITIES for k, mask in phases.items()}
+    return {("segments", k, q): segment_rms(size[q], mask) for q in QUANTITIES for k, mask in phases.items()}
 
 
 def _outage_samples(scores: Scores, name: str, distance: Array) -> dict[tuple[str, str, str], Array]:
@@ -271,28 +275,28 @@ def _comparisons(
     baseline: str,
     groups: NDArray[np.str_],
     **options: Any,
-) -> Iterator[Versus]:
+) -> Iterator[PairedRatio]:
     if baseline not in scores.filters:
         return
-    units = {("pieces", "all"): groups}
-    if len(scores.windows.piece):
-        units["outages", "end"] = groups[scores.windows.piece]
+    units = {("segments", "all"): groups}
+    if len(scores.windows.segment):
+        units["outages", "end"] = groups[scores.windows.segment]
     for name in samples:
         for ((over, part), g), q, s in product(units.items(), QUANTITIES, COMPARED):
             if name != baseline:
                 a, b = (samples[n][over, part, q] for n in (name, baseline))
                 compared = compare(a, b, statistic=s, groups=g, **options)
-                yield Versus(scores.kinds[0], name, baseline, over, part, q, compared)
+                yield PairedRatio(scores.kinds[0], name, baseline, over, part, q, compared)
 
 
 def _imu_error_quality(scores: Scores, name: str) -> list[Value]:
-    """Slope over the pieces of the last estimate against the true IMU error, and its RMS error; six axes.
+    """Slope over the segments of the last estimate against the true IMU error, and its RMS error; six axes.
 
-    NaN where the truth is unknown (a real drive), or the same in every piece (slope).
+    NaN where the truth is unknown (a real drive), or the same in every segment (slope).
     """
-    truth = last_known(scores.true_imu_error)
-    estimate = last_known(scores.filters[name].imu_error)
-    slopes, rms = slope(estimate, truth, intercept=True), piece_rms((estimate - truth).T)
+    truth = last_finite(scores.true_imu_error)
+    estimate = last_finite(scores.filters[name].imu_error)
+    slopes, rms = slope(estimate, truth, intercept=True), segment_rms((estimate - truth).T)
     kind = scores.kinds[0]
     return imu_error_values(kind, name, "slope", slopes) + imu_error_values(kind, name, "rms", rms)
 

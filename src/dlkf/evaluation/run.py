@@ -8,12 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dlkf.console import Counted
+from dlkf.base.console import ProgressCallback
+from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
-from dlkf.data.masks import withhold
-from dlkf.errors import InputError
+from dlkf.data.masks import withhold_fixes
 from dlkf.evaluation.metrics import Array, error_series
-from dlkf.evaluation.scores import FilterRun, Piece, Scores, joined_scores
+from dlkf.evaluation.scores import FilterRun, Scores, SegmentSource, join_scores
+from dlkf.filters.aids.attach import aid_columns
 from dlkf.filters.smoother import Filter
 from dlkf.navigation.state import IMU
 from dlkf.running.batched import CHUNK_SAMPLES, chunks, run_filter
@@ -29,12 +30,12 @@ def score_scenes(
     groups: Mapping[str, str] | None = None,
     kinds: Mapping[str, str] | str = "unknown",
     chunk_samples: int = CHUNK_SAMPLES,
-    progress: Counted | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Scores:
     """Run every filter over the same scenes: batches, each with the mask (B, T) of its withheld fixes.
 
     ``groups`` and ``kinds`` map a drive's name to its recording and its kind. ``progress(done, of all)`` counts
-    a piece once per filter; ``total`` is the number of pieces where it is known. A filter with parameters of
+    a segment once per filter; ``total`` is the number of segments where it is known. A filter with parameters of
     its own runs on their device. Scenes are consumed one by one, so they may be cut as they are needed.
     Raises InputError if there is nothing to score or the epochs differ in length.
     """
@@ -47,27 +48,29 @@ def score_scenes(
         if parts and abs(batch.epoch_s - parts[0].epoch_s) > 1e-9:
             raise InputError("the batches to be scored have different epoch lengths; score them one by one")
         parts.append(_unscored(batch, mask, groups or {}, kinds))
-        masked = withhold(batch, mask)
+        masked = withhold_fixes(batch, mask)
         for name, estimator in filters.items():
-            parts[-1].filters[name] = _blank(batch)
+            parts[-1].filters[name] = _blank(batch, len(aid_columns(estimator)))
             for index in chunks(batch, chunk_samples):
                 _fill(parts[-1].filters[name], index, masked.select(index).trimmed(), estimator)
                 done += len(index)
                 if progress is not None:
                     progress(done, total and total * len(filters))
     if not filters or not parts:
-        raise InputError("nothing to score: give at least one filter and one piece of a drive")
-    return joined_scores(parts)
+        raise InputError("nothing to score: give at least one filter and one segment of a drive")
+    return join_scores(parts)
 
 
 def _unscored(batch: Batch, mask: Tensor, groups: Mapping[str, str], kinds: Mapping[str, str] | str) -> Scores:
-    """The pieces of a scene and their truth, before any filter ran."""
+    """The segments of a scene and their truth, before any filter ran."""
     known = (batch.truth_valid & batch.present).unsqueeze(-1)
     p, v = (torch.where(known, x.double(), torch.nan).cpu().numpy() for x in batch.truth[:2])
     kind_of = (lambda d: kinds) if isinstance(kinds, str) else (lambda d: kinds.get(d, "unknown"))
     return Scores(
         epoch_s=batch.epoch_s,
-        pieces=[Piece(d, groups.get(d, d), kind_of(d), t) for d, t in zip(batch.drive, batch.t_start.tolist())],
+        segments=[
+            SegmentSource(d, groups.get(d, d), kind_of(d), t) for d, t in zip(batch.drive, batch.t_start.tolist())
+        ],
         outage=mask.cpu().numpy(),
         truth_p_n=p,
         truth_v_n=v,
@@ -76,13 +79,13 @@ def _unscored(batch: Batch, mask: Tensor, groups: Mapping[str, str], kinds: Mapp
     )
 
 
-def _blank(batch: Batch) -> FilterRun:
+def _blank(batch: Batch, aids: int) -> FilterRun:
     B, T, _ = batch.size
-    return FilterRun(*(np.full((B, T, n), np.nan) for n in (9, 3, 6, 6)))
+    return FilterRun(*(np.full((B, T, n), np.nan) for n in (9, 3, 6, 6, 3, 6, aids)))
 
 
 def _fill(run: FilterRun, index: Tensor, batch: Batch, estimator: Filter) -> None:
-    solution = run_filter(batch, estimator)
+    solution = run_filter(batch, estimator, keep_innovations=True)
     rows, T = index.numpy(), batch.size[1]
     here = batch.present.cpu().numpy()[..., None]
 
@@ -94,3 +97,10 @@ def _fill(run: FilterRun, index: Tensor, batch: Batch, estimator: Filter) -> Non
     run.imu_error[rows, :T] = kept(solution.imu_error)
     if solution.std is not None:
         run.imu_std[rows, :T] = kept(solution.std[..., IMU])
+        run.position_std[rows, :T] = kept(solution.std[..., :3])
+    if (S := solution.innovation_covariance) is not None:
+        sigma = S.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+        seen = solution.used.unsqueeze(-1) & (solution.innovation != 0)
+        run.innovation[rows, :T] = kept(torch.where(seen, solution.innovation / sigma, torch.nan))
+    if solution.aids is not None:
+        run.aids[rows, :T] = kept(solution.aids)

@@ -1,4 +1,4 @@
-"""What every filter made of the same pieces: the raw material of tables and figures."""
+"""What every filter made of the same segments: the raw material of tables and figures."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 import torch
 
-from dlkf.evaluation.metrics import Array, Mask, Windows, windows
+from dlkf.evaluation.metrics import Array, Mask, OutageIntervals, outage_intervals
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
 
 
 @dataclass(frozen=True)
-class Piece:
+class SegmentSource:
     """Where a row of the scores comes from. ``kind``: simulated, semi-real or real."""
 
     drive: str
@@ -25,20 +25,23 @@ class Piece:
 
 @dataclass
 class FilterRun:
-    """One filter over all P pieces; rows as in :class:`Scores`."""
+    """One filter over all P segments; rows as in :class:`Scores`."""
 
     error: Array  # (P, T, 9) truth − estimate, see metrics.error_series
-    p_n: Array  # (P, T, 3) estimated position in the piece's tangent frame
+    p_n: Array  # (P, T, 3) estimated position in the segment's tangent frame
     imu_error: Array  # (P, T, 6) estimate
     imu_std: Array  # (P, T, 6) its 1σ, NaN where the filter has none
+    position_std: Array  # (P, T, 3) 1σ of the position, likewise
+    innovation: Array  # (P, T, 6) innovation over its 1σ, NaN where no fix was used or the filter has no covariance
+    aids: Array  # (P, T, A) of further sensors, columns of dlkf.filters.aids.attach.aid_columns
 
 
 @dataclass
 class Scores:
-    """P pieces of up to T epochs (NaN-padded) and what each filter made of them."""
+    """P segments of up to T epochs (NaN-padded) and what each filter made of them."""
 
     epoch_s: float
-    pieces: list[Piece]
+    segments: list[SegmentSource]
     outage: Mask  # (P, T) fix withheld
     truth_p_n: Array  # (P, T, 3)
     truth_v_n: Array  # (P, T, 3)
@@ -48,36 +51,36 @@ class Scores:
 
     @property
     def t(self) -> Array:
-        """Time since the start of a piece at the end of each epoch [s], (T,)."""
+        """Time since the start of a segment at the end of each epoch [s], (T,)."""
         return self.epoch_s * np.arange(1, self.outage.shape[1] + 1)
 
-    def geodetic(self, piece: int, p_n: Array) -> Array:
-        """Latitude and longitude [°] (…, 2) of positions (…, 3) in the tangent frame of a piece."""
-        origin = torch.from_numpy(self.origin_e[piece])
+    def geodetic(self, segment: int, p_n: Array) -> Array:
+        """Latitude and longitude [°] (…, 2) of positions (…, 3) in the tangent frame of a segment."""
+        origin = torch.from_numpy(self.origin_e[segment])
         lat, lon, _ = geodetic_from_ecef(origin)
         r_e = origin + torch.from_numpy(np.asarray(p_n, float)) @ ned_axes(lat, lon).mT
         return np.degrees(np.stack([x.numpy() for x in geodetic_from_ecef(r_e)[:2]], -1))
 
     @property
-    def windows(self) -> Windows:
+    def windows(self) -> OutageIntervals:
         """All outages."""
-        return windows(self.outage)
+        return outage_intervals(self.outage)
 
     @property
     def kinds(self) -> list[str]:
-        """Kinds of data among the pieces, sorted."""
-        return sorted({p.kind for p in self.pieces})
+        """Kinds of data among the segments, sorted."""
+        return sorted({p.kind for p in self.segments})
 
     def of_kind(self, kind: str) -> Scores:
-        """The pieces of one kind: simulated and real results are never mixed."""
-        keep = [i for i, p in enumerate(self.pieces) if p.kind == kind]
+        """The segments of one kind: simulated and real results are never mixed."""
+        keep = [i for i, p in enumerate(self.segments) if p.kind == kind]
         part = {k: x[keep] for k, x in vars(self).items() if isinstance(x, np.ndarray)}
         runs = {n: FilterRun(*(x[keep] for x in vars(r).values())) for n, r in self.filters.items()}
-        return replace(self, pieces=[self.pieces[i] for i in keep], filters=runs, **part)
+        return replace(self, segments=[self.segments[i] for i in keep], filters=runs, **part)
 
 
-def joined_scores(parts: Sequence[Scores]) -> Scores:
-    """The pieces of several scores of the same filters in their order, padded to the longest."""
+def join_scores(parts: Sequence[Scores]) -> Scores:
+    """The segments of several scores of the same filters in their order, padded to the longest."""
     if len(parts) == 1:
         return parts[0]
     T = max(s.outage.shape[1] for s in parts)
@@ -91,7 +94,7 @@ def joined_scores(parts: Sequence[Scores]) -> Scores:
 
     return Scores(
         epoch_s=parts[0].epoch_s,
-        pieces=[piece for s in parts for piece in s.pieces],
+        segments=[segment for s in parts for segment in s.segments],
         outage=rows(parts, "outage").astype(np.bool_, copy=False),
         truth_p_n=rows(parts, "truth_p_n"),
         truth_v_n=rows(parts, "truth_v_n"),

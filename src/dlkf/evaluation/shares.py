@@ -12,22 +12,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dlkf.console import Counted, counting
+from dlkf.base.console import ProgressCallback, show_progress
+from dlkf.base.errors import InputError
+from dlkf.base.parallel import parallel_map
 from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.masks import BiasLaw
 from dlkf.data.store import load_dataset
-from dlkf.errors import InputError
-from dlkf.evaluation.protocol import NoPiece, Protocol, Scenes, told_short
-from dlkf.evaluation.scores import joined_scores
-from dlkf.evaluation.study import Run, run_scenes
+from dlkf.evaluation.protocol import REFUSED, NoSegment, Protocol, Scenes, describe_short
+from dlkf.evaluation.scores import join_scores
+from dlkf.evaluation.study import ScoredRun, run_scenes
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.smoother import Filter
-from dlkf.parallel import each
-from dlkf.running.references import Referenced, referenced
+from dlkf.running.references import ReferencedDrives, make_reference
 
 
 @dataclass(frozen=True)
-class Work:
+class EvaluationJob:
     """What is done to a share: the filters, the rules, and whose truth the errors are against."""
 
     dataset: str
@@ -44,23 +44,23 @@ class Work:
     shown: bool = True  # bars on stderr
 
 
-class Part(NamedTuple):
+class ChunkResult(NamedTuple):
     """What became of a share: its run, or why nothing of it can be scored."""
 
     names: tuple[str, ...]
-    run: Run | None
+    run: ScoredRun | None
     mode: str
     rules: Mapping[str, Any]
     skipped: Mapping[str, str]
     sigma: Tensor | None  # (n, 3) of a made reference [m]
-    short: Sequence[str] = ()  # drives of which no piece could be cut
+    short: Sequence[str] = ()  # drives of which no segment could be cut
     refused: InputError | None = None
 
 
 class Evaluated(NamedTuple):
-    """All shares together; ``truth`` says what a made reference is, ``short`` which drives have no piece."""
+    """All shares together; ``truth`` describes a made reference, ``short`` which drives have no segment."""
 
-    run: Run
+    run: ScoredRun
     mode: str
     rules: dict[str, Any]
     skipped: dict[str, str]
@@ -68,33 +68,37 @@ class Evaluated(NamedTuple):
     short: str
 
 
-def evaluate_shares(work: Work, shares: Sequence[tuple[str, ...]], parallel: int | str | None = None) -> Evaluated:
+def evaluate_chunks(
+    work: EvaluationJob, shares: Sequence[tuple[str, ...]], parallel: int | str | None = None
+) -> Evaluated:
     """Every filter over every share. InputError where none has anything to score.
 
-    What is drawn for a piece depends on it alone (:mod:`dlkf.data.draws`), so it is the same however the drives are
-    shared out. Where one share has pieces, ``mode=auto`` means pieces for all.
+    What is drawn for a segment depends on it alone (:mod:`dlkf.data.draws`), so it is the same however the drives are
+    shared out. Where one share has segments, ``mode=auto`` means segments for all.
     """
-    parts = list(each(partial(scored, work), shares, parallel))
+    parts = list(parallel_map(partial(score_chunk, work), shares, parallel))
     skipped = {drive: why for part in parts for drive, why in part.skipped.items()}
     scorable = [part for part in parts if part.run is not None]
     if not scorable:
         raise parts[0].refused or InputError("no drives: give a dataset with at least one")
-    mode = "pieces" if any(part.mode == "pieces" for part in scorable) else "drives"
+    mode = "segments" if any(part.mode == "segments" for part in scorable) else "drives"
     kept = [part for part in scorable if part.mode == mode]
-    run = joined([part.run for part in kept if part.run is not None])
-    of_other_mode = [part for part in scorable if part.mode != mode]  # no piece, where others have some
+    run = join_chunks([part.run for part in kept if part.run is not None])
+    of_other_mode = [part for part in scorable if part.mode != mode]  # no segment, where others have some
     lost = {name for part in parts for name in part.short} | {name for part in of_other_mode for name in part.names}
     names = [name for part in parts for name in part.names]
     unused = [name for name in names if name in lost - set(skipped)]
-    short = told_short(unused, len(names), work.protocol) if unused else ""
+    short = describe_short(unused, len(names), work.protocol) if unused else ""
     rules = {**kept[0].rules, "runs": sum(part.rules["runs"] for part in kept), "skipped": skipped}
     rules |= {"too short": short} if short else {}
+    refused = {drive: said for part in kept for drive, said in part.rules.get(REFUSED, {}).items()}
+    rules |= {REFUSED: refused} if refused else {}
     sigmas = [part.sigma for part in kept if part.sigma is not None]
-    truth = {"reference": Referenced([], torch.cat(sigmas), {}, work.reference).described()} if sigmas else {}
+    truth = {"reference": ReferencedDrives([], torch.cat(sigmas), {}, work.reference).described()} if sigmas else {}
     return Evaluated(run, mode, rules, skipped, truth, short)
 
 
-def scored(work: Work, names: tuple[str, ...]) -> Part:
+def score_chunk(work: EvaluationJob, names: tuple[str, ...]) -> ChunkResult:
     """One share."""
     wanted = {"dtype": torch.float64, "reference": work.reference == "file", "drives": names}
     with _bar(work, "Loading drives") as progress:
@@ -104,35 +108,35 @@ def scored(work: Work, names: tuple[str, ...]) -> Part:
         if work.reference != "file":
             assert isinstance(work.smoother, Mbkf)
             with _bar(work, "Making the reference") as progress:
-                made = referenced(drives, work.reference, work.smoother, work.align, progress)
+                made = make_reference(drives, work.reference, work.smoother, work.align, progress)
             drives, sigma, left_out = made.drives, made.sigma, made.skipped
         scenes = Scenes(drives, work.protocol)
-    except NoPiece as error:
-        return Part(names, None, "", {}, {}, None, names, error)
+    except NoSegment as error:
+        return ChunkResult(names, None, "", {}, {}, None, names, error)
     except InputError as error:
-        return Part(names, None, "", {}, {names[0]: str(error)}, None, refused=error)
+        return ChunkResult(names, None, "", {}, {names[0]: str(error)}, None, refused=error)
     bar: Callable[[str], Any] = partial(_bar, work)
     run = run_scenes(
         work.filters, scenes, kinds=work.kinds, groups=work.groups, law=work.law, seed=work.seed, counting=bar
     )
-    return Part(names, run, scenes.mode, scenes.described(), {**left_out, **scenes.skipped}, sigma, scenes.short)
+    return ChunkResult(names, run, scenes.mode, scenes.described(), {**left_out, **scenes.skipped}, sigma, scenes.short)
 
 
-def joined(runs: Sequence[Run]) -> Run:
-    """The pieces of several runs in their order."""
+def join_chunks(runs: Sequence[ScoredRun]) -> ScoredRun:
+    """The segments of several runs in their order."""
     if len(runs) == 1:
         return runs[0]
-    scores = joined_scores([run.scores for run in runs])
+    scores = join_scores([run.scores for run in runs])
     if runs[0].cause is None:
-        return Run(scores)
+        return ScoredRun(scores)
     followed = {name: np.concatenate([(r.followed or {})[name] for r in runs]) for name in scores.filters}
-    return Run(scores, np.concatenate([r.cause for r in runs if r.cause is not None]), followed)
+    return ScoredRun(scores, np.concatenate([r.cause for r in runs if r.cause is not None]), followed)
 
 
 @contextmanager
-def _bar(work: Work, title: str) -> Iterator[Counted | None]:
+def _bar(work: EvaluationJob, title: str) -> Iterator[ProgressCallback | None]:
     if not work.shown:
         yield None
         return
-    with counting(title) as progress:
+    with show_progress(title) as progress:
         yield progress

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from typing import NamedTuple
 
-from dlkf.console import Counted, counting
+from dlkf.base.console import ProgressCallback, show_progress
 from dlkf.data.masks import BiasLaw
 from dlkf.evaluation.bias_slope import injected_response
 from dlkf.evaluation.metrics import Array, slope
@@ -17,7 +17,7 @@ from dlkf.evaluation.scores import Scores
 from dlkf.filters.smoother import Filter
 
 
-class Run(NamedTuple):
+class ScoredRun(NamedTuple):
     """Scores of every filter; with injected biases these (P, 6) and how far each filter's estimate followed them."""
 
     scores: Scores
@@ -33,19 +33,19 @@ def run_scenes(
     groups: Mapping[str, str] | None = None,
     law: BiasLaw | None = None,
     seed: int = 0,
-    counting: Callable[[str], AbstractContextManager[Counted | None]] = counting,
-) -> Run:
+    counting: Callable[[str], AbstractContextManager[ProgressCallback | None]] = show_progress,
+) -> ScoredRun:
     """Every filter over the scenes, with ``law`` once more with biases added to the IMU; ``counting`` shows how far."""
     with counting("Running filters") as progress:
         scores = score_scenes(filters, scenes, total=scenes.runs, kinds=kinds, groups=groups, progress=progress)
     if law is None:
-        return Run(scores)
+        return ScoredRun(scores)
     with counting("Running with injected biases") as progress:
-        told = injected_response(scores, filters, scenes, law=law, total=scenes.runs, progress=progress, seed=seed)
-    return Run(scores, *told)
+        response = injected_response(scores, filters, scenes, law=law, total=scenes.runs, progress=progress, seed=seed)
+    return ScoredRun(scores, *response)
 
 
-def results_of(run: Run, *, baseline: str = BASELINE, settle_s: float = SETTLE_S, seed: int = 0) -> list[Results]:
+def results_of(run: ScoredRun, *, baseline: str = BASELINE, settle_s: float = SETTLE_S, seed: int = 0) -> list[Results]:
     """The results of each kind of data, with the ``injected_slope`` of each filter's IMU-error estimate where biases
     were added."""
     scores = run.scores
@@ -55,14 +55,14 @@ def results_of(run: Run, *, baseline: str = BASELINE, settle_s: float = SETTLE_S
     if run.cause is None:
         return made
     for k, result in enumerate(made):
-        rows = [i for i, p in enumerate(scores.pieces) if p.kind == result.kind]
+        rows = [i for i, p in enumerate(scores.segments) if p.kind == result.kind]
         slopes = {n: slope(x[rows], run.cause[rows], intercept=False) for n, x in (run.followed or {}).items()}
         values = (imu_error_values(result.kind, n, "injected_slope", six) for n, six in slopes.items())
         made[k] = result.with_values([v for six in values for v in six])
     return made
 
 
-def study(
+def run_comparison(
     filters: Mapping[str, Filter],
     scenes: Scenes,
     *,

@@ -1,7 +1,7 @@
 """Results as tables (terminal, markdown, CSV) and as ``metrics.json``.
 
 Every kind of data has its own table. A dash is "no truth to compare with"; ∞ is a filter whose output was
-not finite in at least one piece, never left out.
+not finite in at least one segment, never left out.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ DASH = "–"
 DEGREES = 180 / math.pi
 
 
-class Table(NamedTuple):
+class ResultTable(NamedTuple):
     """A titled table of text; the first column is the filter, a heading may hold a line break."""
 
     title: str
@@ -34,7 +34,7 @@ class Table(NamedTuple):
     rows: list[list[str]]
 
 
-def number(x: float, scale: float = 1.0, digits: int = 3) -> str:
+def format_number(x: float, scale: float = 1.0, digits: int = 3) -> str:
     """Three (or so many) significant digits, – for NaN, ∞ for inf."""
     if math.isnan(x):
         return DASH
@@ -47,24 +47,24 @@ def number(x: float, scale: float = 1.0, digits: int = 3) -> str:
     return f"{x:.{min(decimals, 6)}f}" if abs(x) < 1e5 else f"{x:.2e}"
 
 
-def with_interval(c: Comparison | None) -> str:
+def format_interval(c: Comparison | None) -> str:
     """Ratio with its interval: ``0.71 [0.62–0.83]``, ``0.71 (n<8)`` of too few recordings; 1 of the baseline."""
     if c is None:
         return "1"
-    ratio, low, high = (number(x, digits=2) for x in (c.ratio, c.ratio_low, c.ratio_high))
+    ratio, low, high = (format_number(x, digits=2) for x in (c.ratio, c.ratio_low, c.ratio_high))
     if c.groups < MIN_GROUPS:
         return ratio if ratio == DASH else f"{ratio} (n<{MIN_GROUPS})"
     return f"{ratio} [{low}–{high}]"
 
 
-def tables(dataset: str, result: Results) -> list[Table]:
-    """The tables of one kind of data: whole pieces, then outages if there are any."""
+def result_tables(dataset: str, result: Results) -> list[ResultTable]:
+    """The tables of one kind of data: whole segments, then outages if there are any."""
     n = result.count
     what = f"{dataset} ({result.kind})"
-    unit = "run" if n["repeated"] else "piece"
+    unit = "run" if n["repeated"] else "segment"
     settled = f"after {result.settle_s:g} s"
-    whole = Table(
-        title=f"{what}: {_count(n['pieces'], unit)}, {_count(n['drives'], 'drive')}",
+    whole = ResultTable(
+        title=f"{what}: {_count(n['segments'], unit)}, {_count(n['drives'], 'drive')}",
         note=f"RMS over each {unit}, then RMS over the {unit}s; median and 95 % over the {unit}s.",
         columns=[
             "Filter", "3D\n[m]", f"3D, {settled}\n[m]", f"Horiz., {settled}\n[m]", "median\n[m]", "95 %\n[m]",
@@ -73,12 +73,15 @@ def tables(dataset: str, result: Results) -> list[Table]:
         rows=[],
     )  # fmt: skip
     for name in result.filters:
-        of = partial(result.value, name, "pieces")
-        row = [name, number(of("all", "position")), number(of("settled", "position"))]
-        row += [number(of("settled", "horizontal", s)) for s in ("rms", "median", "p95")]
-        row += [number(of("all", "velocity")), *(number(of("all", q), DEGREES) for q in ("attitude", "heading"))]
+        of = partial(result.value, name, "segments")
+        row = [name, format_number(of("all", "position")), format_number(of("settled", "position"))]
+        row += [format_number(of("settled", "horizontal", s)) for s in ("rms", "median", "p95")]
+        row += [
+            format_number(of("all", "velocity")),
+            *(format_number(of("all", q), DEGREES) for q in ("attitude", "heading")),
+        ]
         whole.rows.append(row)
-    broken = [int(result.value(n, "pieces", "all", "position", "nonfinite")) for n in result.filters]
+    broken = [int(result.value(n, "segments", "all", "position", "nonfinite")) for n in result.filters]
     if any(broken):
         whole.columns.append("Not\nfinite")
         for row, count in zip(whole.rows, broken):
@@ -86,84 +89,88 @@ def tables(dataset: str, result: Results) -> list[Table]:
     return [whole] if not n["outages"] else [whole, outage_table(what, result)]
 
 
-def outage_table(what: str, result: Results) -> Table:
+def outage_table(what: str, result: Results) -> ResultTable:
     """Errors at the end of the outages and at round times into them."""
     n, low, high = result.count, *result.count["outage_s"]
     length = f"{low:g} s" if low == high else f"{low:g} to {high:g} s"
-    at = [s for s in result.seconds_into_outage() if float(s) < high][-3:]
-    table = Table(
+    at = [s for s in result.seconds_into_outage() if float(s) < high][-2:]
+    table = ResultTable(
         title=f"{what}: {_count(n['outages'], 'outage')} of {length}, {_count(n['outage_drives'], 'drive')}",
         note="Horizontal error at the end (RMS, median, 95 % over the outages), at times into it (RMS); velocity and "
-        "attitude at the end (RMS); drift: horizontal error per distance driven (median).",
+        "attitude at the end (RMS); drift: horizontal error per distance driven (median); own 1σ: what the filter says "
+        "of its horizontal error at the end (median); innov. / σ: innovations over the 1σ that it expects (RMS).",
         columns=["Filter", "End, RMS\n[m]", "median\n[m]", "95 %\n[m]"]
         + [f"{s} s\n[m]" for s in at]
-        + ["Velocity\n[m/s]", "Attitude\n[°]", "Drift\n[%]"],
+        + ["Velocity\n[m/s]", "Attitude\n[°]", "Drift\n[%]", "Own 1σ\n[m]", "Innov.\n/ σ"],
         rows=[],
     )
     for name in result.filters:
         of = partial(result.value, name, "outages")
-        row = [name] + [number(of("end", "horizontal", s)) for s in ("rms", "median", "p95")]
-        row += [number(of(f"at {s} s", "horizontal")) for s in at]
-        row += [number(of("end", "velocity")), number(of("end", "attitude"), DEGREES)]
-        table.rows.append([*row, number(of("end", "drift", "median"), 100)])
+        row = [name] + [format_number(of("end", "horizontal", s)) for s in ("rms", "median", "p95")]
+        row += [format_number(of(f"at {s} s", "horizontal")) for s in at]
+        row += [format_number(of("end", "velocity")), format_number(of("end", "attitude"), DEGREES)]
+        row += [format_number(of("end", "drift", "median"), 100), format_number(of("end", "sigma", "median"))]
+        innovation = result.value(name, "segments", "with_gnss", "innovation")
+        table.rows.append([*row, format_number(innovation, digits=2)])
     return table
 
 
 RATIOS = {
     "end of outages,\nRMS": ("outages", "end", "horizontal", "rms"),
     "end of outages,\ngeom. mean": ("outages", "end", "horizontal", "geomean"),
-    "position,\nmean": ("pieces", "all", "position", "mean"),
-    "velocity,\nmean": ("pieces", "all", "velocity", "mean"),
-    "attitude,\nmean": ("pieces", "all", "attitude", "mean"),
+    "position,\nmean": ("segments", "all", "position", "mean"),
+    "velocity,\nmean": ("segments", "all", "velocity", "mean"),
+    "attitude,\nmean": ("segments", "all", "attitude", "mean"),
 }
 
 
-def ratio_table(dataset: str, result: Results) -> Table | None:
+def ratio_table(dataset: str, result: Results) -> ResultTable | None:
     """Every filter against the baseline, with intervals; None where there is nothing to compare."""
     names = [n for n in result.filters if n != result.baseline]
     heads = {h: which for h, which in RATIOS.items() if any(result.versus(n, *which) for n in names)}
     if not heads:
         return None
     groups = result.comparisons[0].against.groups
-    return Table(
+    return ResultTable(
         title=f"{dataset} ({result.kind}): ratio to {result.baseline}, {_count(groups, 'recording')}",
         note="Below 1: better than it. Of the horizontal error at the end of the outages: RMS, which the largest "
-        "errors decide, and geometric mean, to which every outage counts alike. Of the pieces' RMS (3D): mean over the "
-        "pieces, as in the paper. In brackets the 95 % interval by paired bootstrap over the recordings; "
+        "errors decide, and geometric mean, to which every outage counts alike. Of the segments' RMS (3D): mean over "
+        "the segments, as in the paper. In brackets the 95 % interval by paired bootstrap over the recordings; "
         f"n<{MIN_GROUPS}: too few recordings for one.",
         columns=["Filter", *heads],
-        rows=[[n, *(with_interval(result.versus(n, *which)) for which in heads.values())] for n in names],
+        rows=[[n, *(format_interval(result.versus(n, *which)) for which in heads.values())] for n in names],
     )
 
 
-def slope_table(dataset: str, result: Results) -> Table | None:
+def slope_table(dataset: str, result: Results) -> ResultTable | None:
     """Slope of the IMU-error estimate against the true or the injected error; None where neither is known."""
     injected = any(v.statistic == "injected_slope" for v in result.values)
     statistic = "injected_slope" if injected else "slope"
     rows = [
-        [n, *(number(result.value(n, "pieces", "last", axis, statistic)) for axis in IMU_AXES)] for n in result.filters
+        [n, *(format_number(result.value(n, "segments", "last", axis, statistic)) for axis in IMU_AXES)]
+        for n in result.filters
     ]
     if all(cell == DASH for row in rows for cell in row[1:]):
         return None
-    cause = "an injected bias" if injected else "the true error, over the pieces"
-    return Table(
+    cause = "an injected bias" if injected else "the true error, over the segments"
+    return ResultTable(
         title=f"{dataset} ({result.kind}): does the filter estimate the IMU error?",
-        note=f"Slope of the estimate at the end of a piece against {cause}: 1 = estimates it, 0 = memorised.",
+        note=f"Slope of the estimate at the end of a segment against {cause}: 1 = estimates it, 0 = memorised.",
         columns=["Filter", *(axis.replace("_", "\n") for axis in IMU_AXES)],
         rows=rows,
     )
 
 
-def all_tables(dataset: str, results: Sequence[Results]) -> list[Table]:
+def all_tables(dataset: str, results: Sequence[Results]) -> list[ResultTable]:
     """The tables of every kind of data, one kind after the other."""
     out = []
     for r in results:
         more = (ratio_table(dataset, r), slope_table(dataset, r))
-        out += tables(dataset, r) + [t for t in more if t is not None]
+        out += result_tables(dataset, r) + [t for t in more if t is not None]
     return out
 
 
-def as_rich(table: Table) -> RichTable:
+def as_rich(table: ResultTable) -> RichTable:
     """For the terminal."""
     out = RichTable(title=Text(table.title), caption=Text(table.note), box=SIMPLE_HEAD, padding=(0, 1))
     out.title_justify, out.caption_justify, out.title_style = "left", "left", "bold"
@@ -174,7 +181,7 @@ def as_rich(table: Table) -> RichTable:
     return out
 
 
-def as_markdown(table: Table) -> str:
+def as_markdown(table: ResultTable) -> str:
     """A markdown table under its title."""
     head = "| " + " | ".join(c.replace("\n", " ") for c in table.columns) + " |"
     rule = "|" + "|".join([":--"] + ["--:"] * (len(table.columns) - 1)) + "|"
@@ -191,12 +198,12 @@ def as_csv(dataset: str, results: Sequence[Results]) -> str:
     return out.getvalue()
 
 
-def plain(x: Any) -> Any:
+def plain_text(x: Any) -> Any:
     """The same value in strict JSON: NaN becomes null, infinities the strings "inf" and "-inf"."""
     if isinstance(x, dict):
-        return {str(k): plain(v) for k, v in x.items()}
+        return {str(k): plain_text(v) for k, v in x.items()}
     if isinstance(x, (list, tuple)):
-        return [plain(v) for v in x]
+        return [plain_text(v) for v in x]
     if hasattr(x, "item"):
         x = x.item()
     if isinstance(x, float) and not math.isfinite(x):
@@ -206,7 +213,7 @@ def plain(x: Any) -> Any:
 
 def as_json(content: dict[str, Any]) -> str:
     """The text of ``metrics.json``."""
-    return json.dumps(plain(content), ensure_ascii=False, allow_nan=False) + "\n"
+    return json.dumps(plain_text(content), ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def _count(n: int, noun: str) -> str:

@@ -20,7 +20,7 @@ from torch import Tensor
 from dlkf.filters.integration import Epoch
 
 SMALLEST_VARIANCE = 1e-6  # m², (m/s)²
-SETTLE_FIXES = 30  # the first corrections are of the start's errors and say nothing of noise
+SETTLE_FIXES = 30  # the first corrections are of the start's errors and not of noise
 
 
 class AdaptiveNoise(NamedTuple):

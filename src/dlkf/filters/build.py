@@ -1,7 +1,8 @@
 """Filters by name: ``ins``, or a Kalman filter with endings for what it carries, as in ``mbkf21_nhc_gated``.
 
-A source of measurements of one's own stands behind a plus, as in ``mbkf21_nhc+my_sources:SpeedLimit``: a module on
-PYTHONPATH and a class in it (:mod:`dlkf.filters.sources`).
+A sensor stands behind a plus, as in ``mbkf15+speed`` (:data:`dlkf.filters.aids.attach.SENSORS`), and so does a source
+of measurements of one's own, as in ``mbkf21_nhc+my_sources:SpeedLimit``: a module on PYTHONPATH and a class in it
+(:mod:`dlkf.filters.sources`).
 """
 
 from __future__ import annotations
@@ -10,13 +11,14 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from dlkf.classes import class_named
-from dlkf.errors import InputError
+from dlkf.base.classes import find_class
+from dlkf.base.errors import InputError
 from dlkf.filters.adaptive import Adaptation
+from dlkf.filters.aids.attach import SENSORS, add_sources
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import Estimator
 from dlkf.filters.model_based import Ins, Mbkf
-from dlkf.filters.smoother import Filter, Smoothed
+from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.filters.sources import Source
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
@@ -41,7 +43,7 @@ def is_filter(name: str) -> bool:
     base, *endings = name.split("_")
     if name == "ins":
         return not own
-    if not all(OWN_SOURCE.fullmatch(part) for part in own):
+    if not all(part in SENSORS or OWN_SOURCE.fullmatch(part) for part in own):
         return False
     return base in KALMAN and len(set(endings)) == len(endings) and set(endings) <= set(ENDINGS)
 
@@ -80,7 +82,6 @@ def build_filter(
     sources: list[Source] = []
     if {"nhc", "car"} & set(endings):
         sources.append(CarConstraints(factors, states))
-    sources += [class_named(part, "source", ("begin", "rows"))(imu, factors, states) for part in own]
     estimator = Mbkf(
         imu,
         factors,
@@ -91,11 +92,13 @@ def build_filter(
         sources=tuple(sources),
         noise=Adaptation(factors.forgetting) if base == "aekf" else None,
     )
-    return Smoothed(estimator) if "rts" in endings else estimator
+    kinds = [SENSORS.get(part) or find_class(part, "source", ("begin", "rows")) for part in own]
+    estimator = add_sources(estimator, kinds)
+    return SmoothedSolution(estimator) if "rts" in endings else estimator
 
 
 def has_prior(name: str) -> bool:
-    """Whether a filter of this name is told an IMU error before the drive."""
+    """Whether a filter of this name is given an IMU error before the drive."""
     return "prior" in name.partition("+")[0].split("_")
 
 
@@ -103,7 +106,7 @@ def build_causal(name: str, imu: ImuSpec, why: str, **given: Any) -> Estimator:
     """As :func:`build_filter`, for what needs an estimator; InputError with ``why`` for a smoothed one."""
     refuse_smoothed(name, why)
     built = build_filter(name, imu, **given)
-    assert not isinstance(built, Smoothed)
+    assert not isinstance(built, SmoothedSolution)
     return built
 
 
@@ -111,6 +114,11 @@ def refuse_smoothed(name: str, why: str) -> None:
     """InputError for the name of a filter that is to be smoothed."""
     if "rts" in name.partition("+")[0].split("_"):
         raise InputError(f"model {name} is smoothed: it looks ahead, {why}; take {name.replace('_rts', '')}")
+
+
+def filter_names() -> list[str]:
+    """Names that are close to what somebody mistyped: every filter with no ending or one, and ``plus``."""
+    return ["plus", *MODEL_BASED, *(f"{name}_{end}" for name in MODEL_BASED for end in ENDINGS)]
 
 
 def known_filters() -> str:

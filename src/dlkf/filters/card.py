@@ -1,4 +1,4 @@
-"""What a learned filter was made of, stored beside its weights, and what that says about scoring it (paper.md 4.8)."""
+"""What a learned filter was made of, stored beside its weights, and what follows for scoring it (paper.md 4.8)."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from dlkf.base.documents import read_yaml
+from dlkf.base.errors import InputError
 from dlkf.data.kinds import drive_imus, drive_rates
 from dlkf.data.tables import DriveRow
-from dlkf.errors import InputError
 
 CARD, CARD_TEXT = "card.yaml", "card.md"  # for programs, for people
+LISTS = ("trained_on", "chosen_on", "imus")  # of names, on a card
 
 
 def read_card(folder: Path) -> dict[str, Any]:
@@ -21,11 +21,17 @@ def read_card(folder: Path) -> dict[str, Any]:
     path = folder / CARD
     if not path.is_file():
         return {}
-    try:
-        values = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is not readable YAML: {str(error).splitlines()[0]}") from None
-    return values if isinstance(values, dict) else {}
+    values = read_yaml(path)
+    if not isinstance(values, dict):
+        return {}
+    for key in LISTS:
+        names = values.get(key) or []
+        if not isinstance(names, list) or not all(isinstance(name, (str, int, float)) for name in names):
+            raise InputError(f"{path}: {key} must be a list of names; take the card of this model again")
+    datasets = values.get("datasets") or {}
+    if not isinstance(datasets, dict) or not all(isinstance(x, str) for pair in datasets.items() for x in pair):
+        raise InputError(f"{path}: datasets must be names with their digests; take the card of this model again")
+    return values
 
 
 def recordings_seen(card: Mapping[str, Any], dataset: str, digest: str, groups: Iterable[str]) -> set[str]:
@@ -40,10 +46,10 @@ def recordings_seen(card: Mapping[str, Any], dataset: str, digest: str, groups: 
     return set(groups) & {*(card.get("trained_on") or ()), *(card.get("chosen_on") or ())}
 
 
-def unmet_imus(cards: Mapping[str, Mapping[str, Any]], imus: Iterable[str]) -> list[str]:
-    """A line for each model that knows the IMUs it was trained on alone, where ``imus`` are others.
+def unseen_imus(cards: Mapping[str, Mapping[str, Any]], imus: Iterable[str]) -> list[str]:
+    """A line for each model that works with its training IMUs alone, where ``imus`` are others.
 
-    ``cards`` by the models' names; one without ``imus`` says nothing.
+    ``cards`` by the models' names; none for a card without ``imus``.
     """
     lines = []
     for name, card in cards.items():
@@ -56,16 +62,14 @@ def unmet_imus(cards: Mapping[str, Mapping[str, Any]], imus: Iterable[str]) -> l
     return lines
 
 
-class UnheardCar(UserWarning):
-    """What :func:`unheard_cars` says, of a filter that is used from Python."""
+class LowSampleRateWarning(UserWarning):
+    """The warning of :func:`slow_drives`, for a filter that is used from Python."""
 
 
-def unheard_cars(
-    models: Mapping[str, object], rates: Iterable[float], having: str = "these drives have"
-) -> list[str]:
-    """A line for each model that hears the car through its samples, where ``rates`` [Hz] has one too slow for that.
+def slow_drives(models: Mapping[str, object], rates: Iterable[float], having: str = "these drives have") -> list[str]:
+    """A line for each model that uses frequency bands of the samples, where ``rates`` [Hz] has one too slow.
 
-    ``models`` by their names; one without ``least_rate_hz`` does not listen. A clock a tenth slow is as good.
+    ``models`` by their names; one without ``least_rate_hz`` takes any rate. A clock a tenth slow is as good.
     """
     lines, met = [], list(rates)
     for name, model in models.items():
@@ -73,34 +77,34 @@ def unheard_cars(
         if slow := sorted({float(f"{rate:.2g}") for rate in met if rate < 0.9 * least}):
             have = f"{slow[0]:g}" if len(slow) == 1 else f"{slow[0]:g} to {slow[-1]:g}"
             lines.append(
-                f"{name} hears the car through samples at {least:g} Hz or more and {having} {have} Hz: "
+                f"{name} needs samples at {least:g} Hz or more and {having} {have} Hz: "
                 "it runs, but may be worse than any other filter here"
             )
     return lines
 
 
-def warn_unheard(model: object, rate_hz: float) -> bool:
-    """Whether a stream is too slow for a filter, which is a warning (:class:`UnheardCar`)."""
-    lines = unheard_cars({"the filter": model}, [rate_hz], "this stream has")
+def warn_slow_drives(model: object, rate_hz: float) -> bool:
+    """Whether a stream is too slow for a filter, which is a warning (:class:`LowSampleRateWarning`)."""
+    lines = slow_drives({"the filter": model}, [rate_hz], "this stream has")
     for line in lines:
-        warnings.warn(line, UnheardCar, stacklevel=3)
+        warnings.warn(line, LowSampleRateWarning, stacklevel=3)
     return bool(lines)
 
 
-def strangers(
+def domain_warnings(
     models: Mapping[str, object], dataset: str | Path, drives: Iterable[str], preset: str, rate_hz: int | float
 ) -> list[str]:
-    """Lines for models on drives that they were not made for: :func:`unmet_imus`, :func:`unheard_cars`.
+    """Lines for models on drives that they were not made for: :func:`unseen_imus`, :func:`slow_drives`.
 
     The IMU is ``preset`` where the dataset names none; samples brought to ``rate_hz`` are as fast as they were at most.
     """
     drives, imus, rates = list(drives), drive_imus(dataset), drive_rates(dataset)
     cards = {name: getattr(model, "card", {}) for name, model in models.items()}
-    unmet = unmet_imus(cards, {imus.get(drive, preset) for drive in drives})
-    return unmet + unheard_cars(models, [float(min(rate_hz, rates.get(drive, rate_hz))) for drive in drives])
+    unmet = unseen_imus(cards, {imus.get(drive, preset) for drive in drives})
+    return unmet + slow_drives(models, [float(min(rate_hz, rates.get(drive, rate_hz))) for drive in drives])
 
 
-def without_seen(
+def without_training_recordings(
     cards: Mapping[str, Mapping[str, Any]],
     drives: Sequence[DriveRow],
     dataset: str,
@@ -108,7 +112,7 @@ def without_seen(
     *,
     leave_out: bool,
 ) -> tuple[list[DriveRow], list[str]]:
-    """The drives of a dataset to score models on, and a line for each model that knows some of their recordings.
+    """The drives of a dataset to score models on, and a line for each model trained on some of their recordings.
 
     ``cards`` by the models' names; ``leave_out`` takes those recordings out, for all models alike. InputError where
     none is left.

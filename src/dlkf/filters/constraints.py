@@ -4,10 +4,10 @@ Non-holonomic constraint (NHC; Dissanayake et al. 2001). The velocity of the IMU
 
     v_y = ψ v_x + a ω_z + k v_x² ω_z      v_z = θ v_x − a ω_y + s v_x f_x
 
-with ψ, θ the direction in which the car moves seen from the IMU's axes (mounting), a how far ahead of the rear axle
+with ψ, θ the direction in which the car moves relative to the IMU's axes (mounting), a how far ahead of the rear axle
 the IMU sits, k the sideslip per lateral acceleration and speed (single-track model), and s how far its springs let the
 car pitch back per specific force f_x forward (pitch gradient; Gillespie 1992). Plain, all five are zero; with structure
-they are further states of the filter. A standstill (:mod:`dlkf.filters.standstill`) says v = 0
+they are further states of the filter. A standstill (:mod:`dlkf.filters.stationarity`) measures v = 0
 (zero-velocity update) and ω_b = Earth rate (zero-angular-rate update).
 """
 
@@ -23,8 +23,8 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.filters.integration import Epoch
-from dlkf.filters.sources import Believed, Measurement
-from dlkf.filters.standstill import Liveliness, at_rest
+from dlkf.filters.sources import Measurement, Predicted
+from dlkf.filters.stationarity import VibrationLevel, WheelMotion, detect_stationary
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import skew
 from dlkf.navigation.state import GYRO, STATES, VELOCITY, ErrorStates
@@ -32,15 +32,15 @@ from dlkf.navigation.state import GYRO, STATES, VELOCITY, ErrorStates
 STRUCTURE_STD = (0.05, 0.05, 1.5, 0.01, 0.005)  # rad, rad, m, s²/m, s²·rad/m: what is known of a car before it moves
 STRUCTURE_WALK_STD = (2e-5, 2e-5, 1e-4, 1e-6, 1e-6)  # per √s
 SPRINGS_S = 0.3  # the springs follow the force so slowly: it is averaged over so long, at most an epoch
-SLOWEST = 0.5  # m/s: below, course and yaw rate say nothing of the car's structure
+SLOWEST = 0.5  # m/s: below, course and yaw rate do not show the vehicle parameters
 
 
 class CarMemory(NamedTuple):
     """What the constraints carry from epoch to epoch."""
 
     std: Tensor  # (1, 8) of the rows, the same for all drives
-    liveliness: Liveliness  # of this car
-    prior: Tensor  # (1,) of the quietest second of motion, the same for all drives
+    liveliness: VibrationLevel  # of this car
+    prior: Tensor  # (1,) prior least level of a second of motion, the same for all drives
 
 
 @dataclass(frozen=True)
@@ -56,32 +56,33 @@ class CarConstraints:
         return CarConstraints(Tuning(), self.states)
 
     def begin(self, batch: Batch) -> CarMemory:
-        """No standing so far, and how sure the rows are."""
+        """No standstill so far, and the 1σ of the rows."""
         t, new = self.tuning, batch.imu.new_tensor
         std = [t.lateral_std, t.vertical_std] + [t.rest_velocity_std] * 3 + [t.rest_rate_std] * 3
-        heard = Liveliness.unheard(batch.imu, batch.size[0])
+        heard = VibrationLevel.unheard(batch.imu, batch.size[0])
         return CarMemory(new([std]), heard, new([t.rest_accel * t.rest_gyro]))
 
-    def rows(self, epoch: Epoch, memory: CarMemory, believed: Believed) -> tuple[Measurement, CarMemory]:
+    def rows(self, epoch: Epoch, memory: CarMemory, prediction: Predicted) -> tuple[Measurement, CarMemory]:
         """NHC (2 rows), zero velocity (3), zero angular rate (3)."""
-        zn, Hn, moving = self._across(epoch, believed.structure)
+        zn, Hn, moving = self._across(epoch, prediction.structure)
         zr, Hr = self._standing(epoch)
-        resting, liveliness = self.resting(epoch, zr[:, 3:], believed.P, memory)
+        resting, liveliness = self.resting(epoch, zr[:, 3:], prediction, memory)
         resting = resting.unsqueeze(-1)
         used = torch.cat(((moving.unsqueeze(-1) & ~resting).expand(-1, 2), resting.expand(-1, 6)), -1)
         variance = memory.std.square().expand(len(zn), -1)
         if epoch.advice is not None and epoch.advice.across is not None:
             variance = torch.cat((variance[:, :2] * epoch.advice.across.square(), variance[:, 2:]), -1)
-        if epoch.advice is not None and epoch.advice.offset is not None:
-            zn = zn + epoch.advice.offset
         z = torch.cat((zn, zr), -1) * used
         return Measurement(z, torch.cat((Hn, Hr), 1), variance, used), memory._replace(liveliness=liveliness)
 
     def resting(
-        self, epoch: Epoch, turning: Float[Tensor, "B 3"], P: Float[Tensor, "B n n"], memory: CarMemory
-    ) -> tuple[Bool[Tensor, " B"], Liveliness]:
-        """Whether the car stood in the window, and what has been heard of it since."""
-        return at_rest(epoch, turning, P, memory.liveliness, memory.prior)
+        self, epoch: Epoch, turning: Float[Tensor, "B 3"], prediction: Predicted, memory: CarMemory
+    ) -> tuple[Bool[Tensor, " B"], VibrationLevel]:
+        """Whether the car was stationary in the window, and the vibration levels after it."""
+        wheel = None
+        if prediction.rolling is not None and prediction.stopped is not None:
+            wheel = WheelMotion(prediction.rolling, prediction.stopped)
+        return detect_stationary(epoch, turning, prediction.P, memory.liveliness, memory.prior, wheel)
 
     def _across(
         self, epoch: Epoch, structure: Float[Tensor, "B 5"] | None
@@ -108,7 +109,8 @@ class CarConstraints:
         known = torch.stack(lateral + vertical, -1).unflatten(-1, (2, -1))
         sensors, car = known.split((6, known.shape[-1] - 6), -1)
         position, matrices = J.new_zeros(len(J), 2, 3), J.new_zeros(len(J), 2, self.states.navigation - STATES)
-        H = torch.cat((position, J, torch.bmm(J, skew(state.v_n)), sensors, matrices, car), -1)
+        others = J.new_zeros(len(J), 2, len(self.states.others))
+        H = torch.cat((position, J, torch.bmm(J, skew(state.v_n)), sensors, matrices, car, others), -1)
         return model - v_b[:, 1:], H, vx.abs() > SLOWEST
 
     def _standing(self, epoch: Epoch) -> tuple[Float[Tensor, "B 6"], Float[Tensor, "B 6 n"]]:
@@ -122,6 +124,6 @@ class CarConstraints:
 @lru_cache
 @torch.inference_mode(False)
 def _standing(states: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "6 n"]:
-    """H of velocity and of what the gyroscopes say."""
+    """H of velocity and of the gyroscopes' rate."""
     eye = torch.eye(states, dtype=dtype, device=device)
     return torch.cat((eye[VELOCITY], eye[GYRO]))

@@ -7,35 +7,35 @@ all, so that a comparison between filters compares their answers and nothing els
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import repeat
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from dlkf.data.drive import Batch
-from dlkf.filters.advice import Advice
+from dlkf.filters.advice import NetworkOutput
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import TangentFrame
-from dlkf.navigation.error_model import antenna
+from dlkf.navigation.error_model import RATE_AVERAGE_S, antenna
 from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import Window, strapdown
 
-RATE_AVERAGE_S = 0.1  # the lever arm's swing uses the mean rate over so long before the fix
-
 
 class Fix(NamedTuple):
-    """GNSS of one epoch: what a receiver said, and which of it may be used."""
+    """GNSS of one epoch: values, which of them may be used, and the rows of further sensors."""
 
     value: Tensor  # (B, 6) antenna position and velocity in n
     std: Tensor  # (B, 6)
     used: Tensor  # (B, 6) bool
     lag: Tensor | None  # (B,) s before the epoch's end; None: all on it
+    aids: Mapping[str, Tensor] | None = None  # (B, 5) of further sensors by name, see dlkf.data.aids.ROW
 
 
 class Epoch(NamedTuple):
-    """What an estimator sees at the end of a window; nothing here comes from a reference."""
+    """Input of an estimator at the end of a window; nothing here comes from a reference."""
 
     imu: Tensor  # (B, M, 6) raw samples
     corrected: Tensor  # (B, M, 6) without the IMU error
@@ -50,7 +50,7 @@ class Epoch(NamedTuple):
     lever_arm_b: Tensor | None  # (B, 3); None: the antenna is at the IMU
     dt: float
     frame: TangentFrame
-    advice: Advice | None = None  # of a network round the filter
+    advice: NetworkOutput | None = None  # of a network round the filter
 
     @property
     def imu_error(self) -> Tensor:
@@ -64,7 +64,7 @@ class Epoch(NamedTuple):
 
 
 class Covariances(NamedTuple):
-    """What a Kalman filter knows of an epoch: for smoothing and for tests of consistency."""
+    """Covariances of a Kalman filter in an epoch: for smoothing and for tests of consistency."""
 
     Phi: Tensor  # (B, n, n) of the window
     predicted: Tensor  # (B, n, n) P before the update
@@ -80,15 +80,15 @@ class Covariances(NamedTuple):
 
 
 class Correction(NamedTuple):
-    """An estimator's answer: correction (B, 9), IMU error, and what it can tell about itself."""
+    """An estimator's output: correction (B, 9), IMU error, and diagnostics where it has them."""
 
     dx: Tensor
     imu_error: Tensor | ImuError  # (B, 6), or with the sensor matrices
     std: Tensor | None = None  # (B, 15) 1σ after the update
     gain: Tensor | None = None  # (B, 9, 6)
     accepted: Tensor | None = None  # (B,) bool: a fix was used; None: all that might be
-    speed: Tensor | None = None  # (B, 2) m/s: a forward speed that a network tells, and its 1σ
     covariances: Covariances | None = None
+    aids: Tensor | None = None  # (B, A) of further sensors, see dlkf.filters.aids.report.aid_columns
 
 
 @runtime_checkable
@@ -118,7 +118,7 @@ class WholeLoop:
 
 
 class Step(NamedTuple):
-    """One turn of the loop."""
+    """One filter step."""
 
     prior: NavState
     posterior: NavState
@@ -141,8 +141,9 @@ class Solution:
     gain: Tensor | None  # (B, T, 9, 6)
     covariances: Covariances | None = None  # (B, T, …) where asked for and known
     error: ImuError | None = None  # (B, T, …) likewise: bias and sensor matrices apart
-    speed: Tensor | None = None  # (B, T, 2) m/s: forward speed that a network tells, and its 1σ
-    innovation_std: Tensor | None = None  # (B, T, 6) where it is known without the covariances
+    innovation_covariance: Tensor | None = None  # (B, T, 6, 6) H P Hᵀ + R before gating, kept with the covariances
+    position_covariance: Tensor | None = None  # (B, T, 2, 2) horizontal, before the update, likewise
+    aids: Tensor | None = None  # (B, T, A) of further sensors, see dlkf.filters.aids.report.aid_columns
 
 
 def advance(
@@ -186,12 +187,9 @@ def _rate_before(rates: Tensor, late: Tensor, count: int) -> Tensor:
 
 
 def integrate(
-    batch: Batch, estimator: Estimator, *, keep_covariances: bool = False, turn: Callable = advance
+    batch: Batch, estimator: Estimator, *, keep_covariances: bool = False, keep_innovations: bool = False
 ) -> Solution:
-    """Run an estimator over a batch from its start state; differentiable where the estimator is.
-
-    ``turn`` is :func:`advance`, or a compiled form of it.
-    """
+    """Run an estimator over a batch from its start state; differentiable where the estimator is."""
     if isinstance(estimator, WholeLoop):
         return estimator.integrate(batch)
     state, frame = batch.start, batch.frame.prepared()
@@ -201,22 +199,29 @@ def integrate(
     late = bool(batch.gnss_lag.any())
     lever_arm_b = batch.lever_arm_b if bool(batch.lever_arm_b.any()) else None
     steps: list[Step] = []
+    spreads: list[Tensor] = []
     lags = batch.gnss_lag.unbind(1) if late else [None] * batch.size[1]
-    fixes = map(Fix, batch.gnss.unbind(1), batch.gnss_std.unbind(1), usable.unbind(1), lags)
+    aids: Iterable[Mapping[str, Tensor] | None] = repeat(None)
+    if batch.aids:
+        aids = (dict(zip(batch.aids, rows)) for rows in zip(*(x.unbind(1) for x in batch.aids.values())))
+    fixes = map(Fix, batch.gnss.unbind(1), batch.gnss_std.unbind(1), usable.unbind(1), lags, aids)
     for imu, fix in zip(batch.imu.unbind(1), fixes):
-        memory, step = turn(
+        memory, step = advance(
             estimator, memory, state, error, imu, fix,
             dt=batch.dt, frame=frame, lever_arm_b=lever_arm_b,
         )  # fmt: skip
+        if keep_innovations and step.answer.covariances is not None:
+            spreads.append(step.answer.covariances.innovation)
         if not keep_covariances:
             step = step._replace(answer=step.answer._replace(covariances=None))
         state, error = step.posterior, step.error
         steps.append(step)
-    return gathered(steps, usable.any(-1), keep_errors=keep_covariances)
+    solution = stack_steps(steps, usable.any(-1), keep_errors=keep_covariances)
+    return replace(solution, innovation_covariance=torch.stack(spreads, 1)) if spreads else solution
 
 
-def gathered(steps: list[Step], offered: Tensor, *, keep_errors: bool) -> Solution:
-    """The steps of a run as one solution; ``offered`` (B, T) tells where a fix might have been used."""
+def stack_steps(steps: list[Step], offered: Tensor, *, keep_errors: bool) -> Solution:
+    """The steps of a run as one solution; ``offered`` (B, T): where a fix might have been used."""
 
     def over_time(rows: list) -> Tensor | None:
         return None if rows[0] is None else torch.stack(rows, 1)
@@ -232,7 +237,8 @@ def gathered(steps: list[Step], offered: Tensor, *, keep_errors: bool) -> Soluti
 
     answers = [s.answer for s in steps]
     accepted = over_time([a.accepted for a in answers])
-    covariances = [a.covariances for a in answers]
+    each_covariances = [a.covariances for a in answers]
+    covariances = None if each_covariances[0] is None else each(each_covariances, Covariances)
     return Solution(
         prior=each([s.prior for s in steps], NavState),
         posterior=each([s.posterior for s in steps], NavState),
@@ -241,7 +247,9 @@ def gathered(steps: list[Step], offered: Tensor, *, keep_errors: bool) -> Soluti
         used=offered if accepted is None else offered & accepted,
         std=over_time([a.std for a in answers]),
         gain=over_time([a.gain for a in answers]),
-        covariances=None if covariances[0] is None else each(covariances, Covariances),
+        covariances=covariances,
         error=each([s.error for s in steps], ImuError) if keep_errors else None,
-        speed=over_time([a.speed for a in answers]),
+        innovation_covariance=None if covariances is None else covariances.innovation,
+        position_covariance=None if covariances is None else covariances.predicted[..., :2, :2],
+        aids=over_time([a.aids for a in answers]),
     )

@@ -37,7 +37,7 @@ def kalman_prediction(
 def kalman_update(
     P: Float[Tensor, "B n n"], H: Float[Tensor, "B m n"], R: Float[Tensor, "B m"], z: Float[Tensor, "B m"]
 ) -> tuple[Float[Tensor, "B n"], Float[Tensor, "B n m"], Float[Tensor, "B n n"]]:
-    """Correction, gain and covariance for symmetric P and diagonal R; the gain is told without a gradient."""
+    """Correction, gain and covariance for symmetric P and diagonal R; the gain is returned without a gradient."""
     if torch.is_grad_enabled() and any(x.requires_grad for x in (P, H, R, z)):
         return _KalmanUpdate.apply(P, H, R, z)
     return _updated(P, H, R, z)[:3]
@@ -57,7 +57,7 @@ def _updated(P: Tensor, H: Tensor, R: Tensor, z: Tensor) -> tuple[Tensor, Tensor
 
 def _solved(S: Float[Tensor, "B m m"], X: Float[Tensor, "B m n"]) -> Float[Tensor, "B m n"]:
     """S⁻¹ X."""
-    return compiled.solved(S, X) if compiled.fits(S) else torch.linalg.solve_ex(S, X)[0]
+    return compiled.solve(S, X) if compiled.fits(S) else torch.linalg.solve_ex(S, X)[0]
 
 
 class _KalmanPrediction(torch.autograd.Function):

@@ -10,9 +10,10 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from dlkf.classes import TARGET
+from dlkf.base.classes import TARGET
+from dlkf.base.errors import InputError
+from dlkf.base.settings import settings_from
 from dlkf.data.drive import Batch
-from dlkf.errors import InputError
 from dlkf.filters.branches import may_branch
 from dlkf.filters.integration import Correction, Epoch, integrate
 from dlkf.navigation.calibration import ImuError
@@ -22,9 +23,6 @@ from dlkf.networks.features import Frame, Scaling, component_features, level_rot
 from dlkf.networks.heads import Form, GainHead, ImuErrorHead
 from dlkf.networks.own import OwnNetwork
 from dlkf.networks.products import begin_batch
-from dlkf.settings import settings_from
-
-MAX_TRAINING_TURN = 0.2  # rad per correction, a guard in training only (paper.md 4.10)
 
 
 @dataclass(frozen=True)
@@ -36,14 +34,16 @@ class LearnedConfig:
     inputs (paper.md 4.3). ``frame``: axes of features and gain. ``imu_error``: ``constant`` through an epoch, or
     ``affine`` in the samples, with sensor matrices (paper.md 4.11 E0, E4); ``imu_error_bound`` [σ] limits its bias,
     0 does not. ``known_from``: with ``training``, features have the sizes and the IMU error starts at the mean that
-    training pieces have (no truth is used); with ``nothing``, fixed sizes and zero. ``detach_features`` stops the
-    gradient at the network's inputs (paper.md 4.13). ``rate_hz``, ``epoch_s``: what it was trained on.
+    training segments have (no truth is used); with ``nothing``, fixed sizes and zero. ``detach_features`` stops the
+    gradient at the network's inputs (paper.md 4.13). ``training_turn`` [rad] limits the attitude correction of an
+    update in training alone (paper.md 4.10); 0 does not. ``rate_hz``, ``epoch_s``: what it was trained on.
     """
 
     network: NetworkConfig | OwnNetwork = field(default_factory=NetworkConfig)
     outage_mode: Literal["hold", "run"] = "hold"
     frame: Frame = "ned"
     detach_features: bool = True
+    training_turn: float = 0.2
     imu_error: Form = "constant"
     imu_error_bound: float = 0.0
     known_from: Literal["nothing", "training"] = "nothing"
@@ -59,12 +59,14 @@ class LearnedConfig:
                 f"model.network.samples is {self.network.samples} but rate_hz · epoch_s is "
                 f"{self.rate_hz * self.epoch_s:g}; make them equal"
             )
+        if self.training_turn < 0:
+            raise InputError(f"model.training_turn is {self.training_turn!r}, must be 0 (no limit) or more")
         flags = 2 if self.outage_mode == "run" else 0
         object.__setattr__(self, "network", replace(self.network, samples=samples, flags=flags))
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> LearnedConfig:
-        """From plain values; InputError for a key it does not know or a value of another type."""
+        """From plain values; InputError for an unknown key or a value of another type."""
         network = values.get("network", {})
         if isinstance(network, Mapping) and TARGET in network:
             values = {**values, "network": OwnNetwork.from_mapping(network)}
@@ -76,7 +78,7 @@ class LearnedConfig:
         return values | {"network": self.network.plain()}
 
 
-class Memory(NamedTuple):
+class LearnedMemory(NamedTuple):
     """What the filter carries from epoch to epoch; the last six belong to the last network run."""
 
     recurrent: Recurrent
@@ -110,7 +112,7 @@ class LearnedFilter(nn.Module):
         yield from self.gain.parameters()
         yield from self.imu_error.parameters()
 
-    def begin(self, batch: Batch) -> tuple[Memory, Tensor]:
+    def begin(self, batch: Batch) -> tuple[LearnedMemory, Tensor]:
         """Empty memory, no IMU error."""
         B, _, M = batch.size
         if self.config.network.samples != M:
@@ -123,7 +125,7 @@ class LearnedFilter(nn.Module):
         parameter = self.imu_error.linear.weight
         state = NavState(*(x.detach() for x in batch.start))
         zeros = batch.imu.new_zeros
-        memory = Memory(
+        memory = LearnedMemory(
             recurrent=self.network.start(B, parameter), origin=state.p_n,
             elapsed=zeros(B), since_fix=zeros(B), posterior=state, difference=zeros(B, 9),
             difference_s=batch.imu.new_ones(B), correction=zeros(B, 9), fix=zeros(B, 6),
@@ -131,14 +133,14 @@ class LearnedFilter(nn.Module):
         )  # fmt: skip
         return memory, zeros(B, 6)
 
-    def step(self, memory: Memory, epoch: Epoch) -> tuple[Memory, Correction]:
-        """Run the network for the pieces that have a fix (``hold``) or for all (``run``)."""
+    def step(self, memory: LearnedMemory, epoch: Epoch) -> tuple[LearnedMemory, Correction]:
+        """Run the network for the segments that have a fix (``hold``) or for all (``run``)."""
         B = len(epoch.z)
         span = epoch.dt * epoch.imu.shape[1]
         has_fix = epoch.used.any(-1)
         memory = memory._replace(elapsed=memory.elapsed + span, since_fix=memory.since_fix + span)
         hold = self.config.outage_mode == "hold"
-        picking = hold and may_branch(has_fix)  # if not, all pieces run, and those without a fix keep what they had
+        picking = hold and may_branch(has_fix)  # if not, all segments run, and those without a fix keep what they had
         rows = has_fix.nonzero().squeeze(-1) if picking else torch.arange(B, device=epoch.z.device)
         dx = epoch.z.new_zeros(B, 9)
         gain = epoch.z.new_zeros(B, 9, 6)
@@ -147,9 +149,9 @@ class LearnedFilter(nn.Module):
         whole = len(rows) == B
         K, error, recurrent = self._run(memory, epoch, rows, whole, has_fix)
         part = (K @ epoch.z[rows].unsqueeze(-1)).squeeze(-1)
-        if self.training:
+        if self.training and self.config.training_turn:
             turn = part[:, ATTITUDE].norm(dim=-1, keepdim=True).detach()
-            shrink = (MAX_TRAINING_TURN / turn.clamp_min(1e-9)).clamp(max=1.0)
+            shrink = (self.config.training_turn / turn.clamp_min(1e-9)).clamp(max=1.0)
             part = torch.cat((part[:, :6], part[:, ATTITUDE] * shrink), -1)
         if hold and not picking:
             dx, gain = _chosen(has_fix, part, dx), _chosen(has_fix, K, gain)
@@ -168,9 +170,9 @@ class LearnedFilter(nn.Module):
         return self._remember(memory, epoch, dx, has_fix, ran, recurrent), Correction(dx, error, gain=gain)
 
     def _run(
-        self, memory: Memory, epoch: Epoch, rows: Tensor, whole: bool, has_fix: Tensor
+        self, memory: LearnedMemory, epoch: Epoch, rows: Tensor, whole: bool, has_fix: Tensor
     ) -> tuple[Tensor, ImuError, Recurrent]:
-        """Gain in n, IMU error and new state of the cells for the pieces in ``rows``."""
+        """Gain in n, IMU error and new state of the cells for the segments in ``rows``."""
 
         def pick(x: Tensor) -> Tensor:
             x = x.detach() if self.config.detach_features else x
@@ -195,7 +197,7 @@ class LearnedFilter(nn.Module):
         return K, error, recurrent
 
     def _features(
-        self, memory: Memory, epoch: Epoch, pick: Callable[[Tensor], Tensor]
+        self, memory: LearnedMemory, epoch: Epoch, pick: Callable[[Tensor], Tensor]
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Window (b, M, 15), components (b, 30) in physical units, and the rotation into their axes (b, 3, 3)."""
         p_n, v_n, C_nb = (pick(x) for x in epoch.window[:3])
@@ -214,14 +216,14 @@ class LearnedFilter(nn.Module):
 
     @torch.no_grad()
     def _remember(
-        self, memory: Memory, epoch: Epoch, dx: Tensor, has_fix: Tensor, ran: Tensor, recurrent: Recurrent
-    ) -> Memory:
-        """Memory after the network ran on some pieces."""
+        self, memory: LearnedMemory, epoch: Epoch, dx: Tensor, has_fix: Tensor, ran: Tensor, recurrent: Recurrent
+    ) -> LearnedMemory:
+        """Memory after the network ran on some segments."""
         dx = dx.detach()
         posterior = epoch.window.end.detach().corrected(dx)
         difference = memory.posterior.error_to(posterior)
 
-        return Memory(
+        return LearnedMemory(
             recurrent=recurrent,
             origin=memory.origin,
             elapsed=_chosen(ran, torch.zeros_like(memory.elapsed), memory.elapsed),
@@ -245,7 +247,7 @@ class LearnedFilter(nn.Module):
             hook.remove()
 
     def learn_sizes(self, batches: Sequence[Batch]) -> None:
-        """Set the sizes of the features to those of these pieces, as the filter stands."""
+        """Set the sizes of the features to those of these segments, as the filter stands."""
         with torch.inference_mode(), self.recording() as seen:
             for batch in batches:
                 integrate(batch, self)
@@ -254,12 +256,12 @@ class LearnedFilter(nn.Module):
 
 
 def _chosen(which: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """``new`` for some pieces, ``old`` for the others."""
+    """``new`` for some segments, ``old`` for the others."""
     return torch.where(which.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
 
 def _with_rows(old: ImuError, rows: Tensor, new: ImuError) -> ImuError:
-    """The errors of all pieces after those in ``rows`` got new ones."""
+    """The errors of all segments after those in ``rows`` got new ones."""
     bias = old.bias.index_copy(0, rows, new.bias)
     if new.matrix is None:
         return ImuError(bias)

@@ -1,11 +1,11 @@
-"""Covariance matching: what the fixes say of a Kalman filter's noise (Mehra 1972, "Approaches to adaptive filtering").
+"""Covariance matching: a Kalman filter's noise judged by the fixes (Mehra 1972, "Approaches to adaptive filtering").
 
 Where the noise is what the filter takes it for, an innovation's square is its variance, and the square of a correction
 what the covariance loses by it:
 
     E[zᵢ²] = (H P Hᵀ + R)ᵢᵢ,    E[dxᵢ²] = (P⁻ − P⁺)ᵢᵢ
 
-Which noise is too small is told apart by axes, as far as the motion allows, so everything is kept per axis: innovations
+Which noise is too small is separated by axes, as far as the motion allows, so everything is kept per axis: innovations
 in heading axes, corrections in body axes.
 """
 
@@ -21,7 +21,7 @@ from dlkf.navigation import compiled
 from dlkf.navigation.state import ATTITUDE, IMU, VELOCITY
 
 MEMORIES = (10.0, 60.0)  # fixes
-LARGEST = 1e3  # of a ratio: one outlier says no more than this
+LARGEST = 1e3  # of a ratio: the most that one outlier counts
 SIZES = (0.05,) * 3 + (2e-3,) * 3 + (5e-3,) * 3 + (1e-4,) * 3  # typical corrections: m/s, rad, m/s², rad/s
 LOG_FEATURES, AXIS_FEATURES = 12 + 24 + 12, 8 + 4
 
@@ -36,7 +36,7 @@ def variance_along(P: Float[Tensor, "B k k"], axes: Float[Tensor, "B 3 3"]) -> F
 
 
 class Matching(NamedTuple):
-    """Running means over the last fixes, short and long; one where nothing was seen."""
+    """Running means over the last fixes, short and long; one before the first fix."""
 
     innovations: Tensor  # (B, 2, 6) z² over its variance; position, velocity; forward, right, down
     ratios: Tensor  # (B, 2, 12) dx² over what P loses; velocity, attitude, accelerometer, gyroscope; body axes
@@ -45,7 +45,7 @@ class Matching(NamedTuple):
 
     @classmethod
     def begin(cls, like: Tensor, size: int) -> Matching:
-        """Nothing seen."""
+        """Memory before the first fix."""
         one = like.new_ones
         return cls(one(size, 2, 6), one(size, 2, 12), one(size, 12), like.new_zeros(size))
 
@@ -77,12 +77,12 @@ class Matching(NamedTuple):
         )
 
     def logarithms(self) -> Float[Tensor, "B L"]:
-        """What a network sees of it, each of order 1."""
+        """Network features of it, each of order 1."""
         parts = (self.innovations.flatten(1), self.ratios.flatten(1), self.sizes)
         return torch.log(torch.cat(parts, -1) + 1e-3) / 2
 
 
-def by_axis(logarithms: Float[Tensor, "B L"]) -> Float[Tensor, "B 3 12"]:
+def ratio_by_axis(logarithms: Float[Tensor, "B L"]) -> Float[Tensor, "B 3 12"]:
     """What of the logarithms belongs to each body axis: ratios of both memories, sizes."""
     return logarithms[:, 12:].unflatten(-1, (-1, 3)).mT
 

@@ -14,23 +14,24 @@ from torch import Tensor
 from dlkf.data.drive import Batch
 from dlkf.filters.adaptive import Adaptation, AdaptiveNoise
 from dlkf.filters.branches import may_branch
-from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD, CarConstraints
+from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD
+from dlkf.filters.gating import CoarseGate
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
 from dlkf.filters.kalman_update import kalman_prediction, kalman_update
-from dlkf.filters.sources import Believed, FixMemory, GnssFix, Measurement, Source
+from dlkf.filters.sources import FixMemory, GnssFix, Measurement, Parameter, Predicted, Source, describe_aid
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import STANDARD_GRAVITY
-from dlkf.navigation.error_model import PLAIN, WindowModel, masked, source_scale, window_model
+from dlkf.navigation.error_model import PLAIN, WindowModel, mask_rows, source_scale, window_model
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.navigation.state import PVA, STATES, ErrorStates
 
-UNTOLD = ImuSpec("any", SensorErrors(), SensorErrors())
+GENERIC_IMU = ImuSpec("any", SensorErrors(), SensorErrors())
 
 
 @dataclass(frozen=True)
 class Ins:
-    """Inertial navigation from the last fix (R012): the raw IMU is believed, and no error of it is estimated.
+    """Inertial navigation from the last fix (R012): the raw IMU is used, and no error of it is estimated.
 
     A fix sets position and velocity, so that an outage begins where those of the Kalman filters begin; attitude runs
     from the start, for nothing corrects it. ``free``: nothing is set, pure strapdown from the start.
@@ -39,16 +40,16 @@ class Ins:
     free: bool = False
 
     def begin(self, batch: Batch) -> tuple[None, Tensor]:
-        """No memory; the raw IMU is believed."""
+        """No memory; the raw IMU is used."""
         return None, batch.imu.new_zeros(batch.size[0], 6)
 
     def step(self, memory: None, epoch: Epoch) -> tuple[None, Correction]:
-        """The innovation itself, as far as position and velocity are seen."""
+        """The innovation itself, of the components of the fix."""
         dx = torch.nn.functional.pad(torch.zeros_like(epoch.z) if self.free else epoch.z, (0, 3))
         return None, Correction(dx, epoch.error)
 
 
-class Memory(NamedTuple):
+class KalmanMemory(NamedTuple):
     """What a Kalman filter carries from epoch to epoch."""
 
     P: Tensor  # (B, n, n)
@@ -57,6 +58,7 @@ class Memory(NamedTuple):
     sources: tuple[Any, ...] = ()  # one of each
     structure: Tensor | None = None  # (B, 5) of the car
     noise: AdaptiveNoise | None = None
+    parameters: Tensor | None = None  # (B, k) of the sources, in the order of ``states.others``
 
 
 def bias_sigma(imu: ImuSpec, states: ErrorStates) -> Float[Tensor, " 6"]:
@@ -100,13 +102,14 @@ class Mbkf:
 
     @property
     def code(self) -> Mbkf:
-        """The filter without what is told to it in numbers, which its memory carries: two of one code do the same."""
+        """The filter without its numeric settings, which its memory carries: two of one code do the same."""
         return replace(
-            self, imu=UNTOLD, tuning=Tuning(), prior=None, gauss_markov=False, noise=self.noise and Adaptation(0.5),
-            sources=tuple(s.code if isinstance(s, CarConstraints) else s for s in self.sources),
+            self, imu=GENERIC_IMU, tuning=Tuning(), prior=None, gauss_markov=False,
+            noise=self.noise and Adaptation(0.5),
+            sources=tuple(getattr(s, "code", s) for s in self.sources),
         )  # fmt: skip
 
-    def begin(self, batch: Batch) -> tuple[Memory, ImuError]:
+    def begin(self, batch: Batch) -> tuple[KalmanMemory, ImuError]:
         """P₀ from the start's law and the preset; the IMU error at its prior mean."""
         like = {"dtype": batch.imu.dtype, "device": batch.imu.device}
         B, _, M = batch.size
@@ -115,21 +118,33 @@ class Mbkf:
         if self.states.structure:
             known = torch.tensor(STRUCTURE_STD, **like).expand(B, -1)
             sigma, structure = torch.cat((sigma, known), -1), torch.zeros_like(known)
+        parameters, walk = None, [*(STRUCTURE_WALK_STD if self.states.structure else ())]
+        if self.states.others:
+            of_sources = [self.parameters[name] for name in self.states.others]
+            sigma = torch.cat((sigma, torch.tensor([p.std for p in of_sources], **like).expand(B, -1)), -1)
+            parameters = torch.tensor([p.start for p in of_sources], **like).expand(B, -1)
+            walk += [p.walk for p in of_sources]
         decay = (0.0, 0.0)
         if self.gauss_markov:
             decay = (1 / self.imu.accel.correlation_time, 1 / self.imu.gyro.correlation_time)
         windows = window_model(
             batch.frame, batch.dt, M, self.psd(), states=self.states, decay=decay,
-            walk=torch.tensor(STRUCTURE_WALK_STD) ** 2,
+            walk=torch.tensor(walk) ** 2 if walk else None,
         )  # fmt: skip
         sources = tuple(source.begin(batch) for source in self.sources)
         noise = None if self.noise is None else self.noise.begin(batch.imu, self.states.count)
-        memory = Memory(torch.diag_embed(sigma**2), windows, self.fix.begin(batch), sources, structure, noise)
+        P, fix = torch.diag_embed(sigma**2), self.fix.begin(batch)
+        memory = KalmanMemory(P, windows, fix, sources, structure, noise, parameters)
         known = torch.zeros(B, 9, **like)
         if self.prior is None:
             return memory, ImuError(known[:, :6])
         mean = torch.tensor(self.prior.mean, **like).expand(B, -1)
         return memory, ImuError(torch.zeros_like(known[:, :6])).updated(torch.cat((known, mean), -1), self.states)
+
+    @cached_property
+    def parameters(self) -> dict[str, Parameter]:
+        """What the sources estimate, by name."""
+        return {name: p for source in self.sources for name, p in getattr(source, "parameters", {}).items()}
 
     def psd(self) -> dict[str, float]:
         """Over-bounded power spectral densities of the noise sources (R016)."""
@@ -141,7 +156,20 @@ class Mbkf:
             "gyro_walk": t.gyro_walk**2 * max(g.walk_psd, t.walk_floor_gyro**2),
         }
 
-    def step(self, memory: Memory, epoch: Epoch) -> tuple[Memory, Correction]:
+    def step(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Correction]:
+        """:meth:`update` with what the coarse gate leaves of the fix."""
+        return self.update(*self.screened(memory, epoch))
+
+    def screened(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Epoch]:
+        """Memory and epoch after the coarse gate; filters with a gate of their own have none."""
+        if memory.fix.coarse is None:
+            return memory, epoch
+        coarse, epoch, P = CoarseGate().screened(memory.fix.coarse, epoch, memory.P)
+        if coarse is memory.fix.coarse:
+            return memory, epoch
+        return memory._replace(P=P, fix=memory.fix._replace(coarse=coarse)), epoch
+
+    def update(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Correction]:
         """Propagate P over the window, update where there is something to learn (paper eqs 2–6, Joseph form)."""
         Phi = self._transition(memory, epoch)
         process = None if epoch.advice is None else epoch.advice.process
@@ -149,16 +177,23 @@ class Mbkf:
         if memory.noise is not None:
             Q = torch.where(memory.noise.settled[:, None, None], memory.noise.Q, Q)
         predicted = kalman_prediction(memory.P, Phi, Q, walking=not self.gauss_markov)
-        believed = Believed(predicted, memory.structure, memory.noise)
-        fix, fix_memory = self.fix.rows(epoch, memory.fix, believed)
-        believed = believed._replace(P=fix.P)
-        parts, sources = [fix.rows], []
+        prediction = Predicted(predicted, memory.structure, memory.noise)
+        fix, fix_memory = self.fix.rows(epoch, memory.fix, prediction)
+        prediction = prediction._replace(P=fix.P)
+        if memory.parameters is not None:
+            named = dict(zip(self.states.others, memory.parameters.unbind(-1)))
+            prediction = prediction._replace(parameters=named)
+        parts, sources, said = [fix.rows], [], []
         for source, of_source in zip(self.sources, memory.sources, strict=True):
-            told, of_source = source.rows(epoch, of_source, believed)
+            rows, of_source = source.rows(epoch, of_source, prediction)
             sources.append(of_source)
-            if told is not None:
-                H, R = masked(told.H, told.R, told.used)
-                parts.append(Measurement(told.z * told.used, H, R, told.used))
+            if (rolling := getattr(of_source, "rolling", None)) is not None:
+                prediction = prediction._replace(rolling=rolling, stopped=getattr(of_source, "stopped", None))
+            if (table := getattr(source, "table", None)) is not None:
+                said.append(describe_aid(epoch, table.name, rows, prediction.P))
+            if rows is not None:
+                H, R = mask_rows(rows.H, rows.R, rows.used)
+                parts.append(Measurement(rows.z * rows.used, H, R, rows.used))
         z, H, R = ((x[0] if len(x) == 1 else torch.cat(x, 1)) for x in ([m[k] for m in parts] for k in range(3)))
         informative = not may_branch(fix.P) or any(bool(m.used.any()) for m in parts)
         P = fix.P
@@ -174,13 +209,18 @@ class Mbkf:
         if structure is not None:
             structure = structure + dx[:, self.states.of_structure]
         std = P.diagonal(dim1=-2, dim2=-1)[:, :STATES].clamp_min(0).sqrt()
-        memory = Memory(P, memory.windows, fix_memory, tuple(sources), structure, noise)
+        parameters = memory.parameters
+        if parameters is not None:
+            parameters = parameters + dx[:, self.states.of_others]
+            said += [parameters, P.diagonal(dim1=-2, dim2=-1)[:, self.states.of_others].clamp_min(0).sqrt()]
+        memory = KalmanMemory(P, memory.windows, fix_memory, tuple(sources), structure, noise, parameters)
         return memory, Correction(
-            dx[:, PVA], epoch.error.updated(dx, self.states), std=std, gain=K[:, PVA, :6], accepted=fix.accepted,
-            covariances=Covariances(Phi, prior, P, *fix.offered, dx),
+            dx[:, PVA], epoch.error.updated(dx, self.states), std=std, gain=K[:, PVA, :6],
+            accepted=epoch.used.any(-1) if fix.accepted is None else fix.accepted,
+            covariances=Covariances(Phi, prior, P, *fix.offered, dx), aids=torch.cat(said, -1) if said else None,
         )  # fmt: skip
 
-    def _transition(self, memory: Memory, epoch: Epoch) -> Float[Tensor, "B n n"]:
+    def _transition(self, memory: KalmanMemory, epoch: Epoch) -> Float[Tensor, "B n n"]:
         if not (self.cut_transition and torch.is_grad_enabled()):
             return memory.windows.transition(epoch.start, epoch.window, epoch.corrected, epoch.frame)
         with torch.no_grad():
@@ -201,7 +241,7 @@ class Mbkf:
 
 
 @runtime_checkable
-class Analytic(Estimator, Protocol):
+class CovarianceEstimator(Estimator, Protocol):
     """An estimator that carries error states and their covariance: a Kalman filter, or one with a network round it."""
 
     @property
@@ -210,6 +250,6 @@ class Analytic(Estimator, Protocol):
         ...
 
 
-def has_covariance(estimator: object) -> TypeGuard[Analytic]:
+def has_covariance(estimator: object) -> TypeGuard[CovarianceEstimator]:
     """Whether an estimator can be smoothed and its covariance compared with its errors."""
-    return isinstance(estimator, Analytic)
+    return isinstance(estimator, CovarianceEstimator)

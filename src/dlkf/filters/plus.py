@@ -1,10 +1,11 @@
-"""``plus``: the analytic Kalman filter whose noise and pseudo-measurements a recurrent network sets every epoch.
+"""``plus``: the analytic Kalman filter that finds the white noise of its IMU while it runs.
 
-States, strapdown and Riccati recursion are those of a classical filter (``base``); the network says how far to trust
-what goes into them, in outages too: factors on the process noise of each axis, on GNSS standard deviations, on the
-constraints' standard deviations, velocities across the car beside those of its model, and a forward speed that each
-drive calibrates while GNSS is there (:mod:`dlkf.filters.car_speed`). It sees the samples, what the filter believes and
-how its innovations and that speed fit. With weights of zero, and before the first fix, it is ``base`` to the bit.
+States, strapdown, sources and Riccati recursion are those of a classical filter (``base``). Two factors act on its
+white noise. The level of accelerometers and of gyroscopes is slow: virtual outages of 10 to 30 s in the recent past
+show it (:mod:`dlkf.filters.virtual_outages`), and it holds through an outage. A recurrent network adds what is fast, a
+factor for each gyroscope every epoch, in outages too; it sees the samples, the filter's covariance and how well its
+innovations and corrections fit (:mod:`dlkf.filters.matching`). Before the first fix, and with weights of zero until the
+first virtual outage was scored, it is ``base`` to the bit.
 """
 
 from __future__ import annotations
@@ -17,34 +18,32 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from dlkf.base.errors import InputError
+from dlkf.base.settings import settings_from
 from dlkf.data.drive import Batch
-from dlkf.errors import InputError
-from dlkf.filters.advice import ABSENT, Advice
-from dlkf.filters.advised_speed import AdvisedSpeed
+from dlkf.filters.advice import NetworkOutput
 from dlkf.filters.branches import may_branch
 from dlkf.filters.build import build_filter
-from dlkf.filters.car_speed import Calibration, CarSpeed, Foretold
 from dlkf.filters.integration import Correction, Epoch
-from dlkf.filters.matching import AXIS_FEATURES, LOG_FEATURES, Matching, by_axis, variance_along
+from dlkf.filters.matching import AXIS_FEATURES, LOG_FEATURES, Matching, ratio_by_axis, variance_along
+from dlkf.filters.model_based import KalmanMemory as KalmanMemory
 from dlkf.filters.model_based import Mbkf
-from dlkf.filters.model_based import Memory as KalmanMemory
 from dlkf.filters.tuning import Tuning
+from dlkf.filters.virtual_outages import VirtualOutage
 from dlkf.navigation.calibration import ImuError
+from dlkf.navigation.error_model import source_scale
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.navigation.state import IMU, PV, PVA, ErrorStates
 from dlkf.networks.features import level_rotation
 from dlkf.networks.plus import (
     LEAST_RATE_HZ,
     WINDOW_FEATURES,
-    Heads,
     PlusNetwork,
     PlusNetworkConfig,
-    loudness,
+    band_level,
     window_features,
 )
-from dlkf.settings import settings_from
 
-PARTS = ("process", "fix", "across", "offset", "speed", "residual")
 ANY_MEMS: Mapping[str, Any] = {  # what is known of an IMU of which nothing is known
     "name": "any MEMS",
     "accel": {
@@ -56,32 +55,23 @@ ANY_MEMS: Mapping[str, Any] = {  # what is known of an IMU of which nothing is k
         "scale_factor": 5e-3, "misalignment": 5.236e-3,
     },
 }  # fmt: skip
-# by python -m dlkf.tune objective=log on simulated cars; where training begins
+# chosen on simulated and real drives (docs/results/plus.md): where the network's factors begin
 START_TUNING: Mapping[str, float] = {
-    "accel_noise": 30.0, "gyro_noise": 3.0, "accel_walk": 100.0, "gyro_walk": 10.0,
-    "position_std": 2.0, "velocity_std": 2.0, "lateral_std": 0.1,
+    "accel_noise": 25.0, "gyro_noise": 4.0, "accel_walk": 5.0, "gyro_walk": 5.0,
+    "position_std": 2.0, "velocity_std": 2.0, "lateral_std": 0.1, "vertical_std": 0.15,
 }  # fmt: skip
-# m/s: a car whose sound tells its speed less well has next to nothing to say, for such errors last through an outage;
-# chosen between 0.7 and 2 on validation drives and with real ones in view (docs/results/plus.md)
-TELLING_STD = 1.0
-SILENT_SHARE = 0.3  # of the training pieces run without the speed, so that the rest learns to do without it
-OLDEST = 600.0  # s: times are told up to here
+OLDEST = 600.0  # s, fixes: times and counts are given up to here
 
 
 @dataclass(frozen=True)
 class PlusConfig:
-    """A ``plus`` filter: its classical filter, which parts of the network are in force, what it was trained on."""
+    """A ``plus`` filter: its classical filter and the size of its network."""
 
     kind: Literal["plus"] = "plus"
     base: str = "mbkf33_car"
-    parts: tuple[str, ...] = PARTS[:5]
     network: PlusNetworkConfig = field(default_factory=PlusNetworkConfig)
     tuning: Mapping[str, float] = field(default_factory=lambda: dict(START_TUNING))
     imu: Mapping[str, Any] = field(default_factory=lambda: dict(ANY_MEMS))
-
-    def __post_init__(self) -> None:
-        if unknown := sorted(set(self.parts) - set(PARTS)):
-            raise InputError(f"model.parts: unknown part {unknown[0]!r}; known: {', '.join(PARTS)}")
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> PlusConfig:
@@ -90,11 +80,11 @@ class PlusConfig:
 
     def plain(self) -> dict[str, Any]:
         """Plain values for a file."""
-        values = asdict(self) | {"parts": list(self.parts), "network": {"hidden": self.network.hidden}}
+        values = asdict(self) | {"network": {"hidden": self.network.hidden}}
         return {**values, "tuning": dict(self.tuning), "imu": _plain(self.imu)}
 
 
-class Memory(NamedTuple):
+class PlusMemory(NamedTuple):
     """What the filter carries from epoch to epoch; nothing of it but the Kalman filter's part has axes in n."""
 
     kalman: KalmanMemory
@@ -103,17 +93,15 @@ class Memory(NamedTuple):
     since_fix: Tensor  # (B,) s
     matching: Matching  # what the fixes say of its noise
     fix_speed: Tensor  # (B,) m/s forward at the last fix
-    car: Calibration  # what the drive has told of the car's speed
-    residual: Tensor  # (B, 6) part of the IMU error that the network added
-    silent: Tensor  # (B,) bool: pieces in which training withholds the speed
-    seen: Heads | None = None  # of the last epoch, for training and pictures
+    outage: VirtualOutage  # how much white noise there is
+    gyro_noise: Tensor | None = None  # (B, 3) the last factors, for pictures
 
 
 class PlusFilter(nn.Module):
-    """Estimator round a classical one."""
+    """Estimator round a classical one: levels by virtual outages, factors of a network."""
 
     card: dict[str, Any]  # what the weights were made of; those of a file have it
-    least_rate_hz = LEAST_RATE_HZ  # of the samples that it hears the car through
+    least_rate_hz = LEAST_RATE_HZ  # of samples that have all bands of frequency that it sees
 
     def __init__(self, config: PlusConfig) -> None:
         super().__init__()
@@ -121,14 +109,11 @@ class PlusFilter(nn.Module):
         kalman = build_filter(config.base, imu_spec(config.imu), tuning=settings_from(Tuning, config.tuning, "tuning"))
         if not isinstance(kalman, Mbkf):
             raise InputError(f"model.base={config.base} is no Kalman filter that plus can stand on; take mbkf33_car")
-        speed = (AdvisedSpeed(kalman.states),) if "speed" in config.parts else ()
-        self.kalman = replace(kalman, sources=(*kalman.sources, *speed), cut_transition=True)
-        count = self.kalman.states.count
+        self.kalman = replace(kalman, cut_transition=True)
+        count = self.kalman.states.base.count
         now = 3 + 3 + 3 + 2 + 6
-        features = WINDOW_FEATURES + count + (count - 9) + 2 + 4 + 6 + LOG_FEATURES + 3 + 5 + now
+        features = WINDOW_FEATURES + count + (count - 9) + 2 + 4 + 6 + LOG_FEATURES + 4 + now
         self.network = PlusNetwork(PlusNetworkConfig(config.network.hidden, features, 2 + AXIS_FEATURES), now)
-        self.car_speed = CarSpeed(WINDOW_FEATURES)
-        self.parts = frozenset(config.parts)
 
     @property
     def states(self):
@@ -146,79 +131,59 @@ class PlusFilter(nn.Module):
         return self.kalman.imu
 
     def heads(self) -> Iterator[nn.Parameter]:
-        """Weights of the output layers, but for that of the axes, which has to find what is small."""
+        """Weights of the output layer, but for that of the axes, which has to find what is small."""
         yield from self.network.noise.parameters()
-        yield from self.network.trust.parameters()
 
-    def begin(self, batch: Batch) -> tuple[Memory, Tensor | ImuError]:
+    def begin(self, batch: Batch) -> tuple[PlusMemory, Tensor | ImuError]:
         """Of the Kalman filter, and nothing seen yet."""
         kalman, error = self.kalman.begin(batch)
         zeros, B = batch.imu.new_zeros, batch.size[0]
-        memory = Memory(
-            kalman, self.network.start(B), zeros(B), zeros(B), Matching.begin(batch.imu, B), zeros(B),
-            self.car_speed.begin(B), zeros(B, 6),
-            torch.rand(B, device=batch.imu.device) < SILENT_SHARE if self.training else zeros(B) > 0,
-        )  # fmt: skip
+        zero = zeros(B)
+        outage = VirtualOutage.begin(kalman.P)
+        memory = PlusMemory(kalman, self.network.start(B), zero, zero, Matching.begin(batch.imu, B), zero, outage)
         return memory, error
 
-    def step(self, memory: Memory, epoch: Epoch) -> tuple[Memory, Correction]:
-        """Network, then the Kalman filter with its advice."""
+    def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
+        """Network, the Kalman filter with the noise of both, then the virtual outage beside it."""
+        kalman, epoch = self.kalman.screened(memory.kalman, epoch)
+        memory = memory._replace(kalman=kalman)
         span = epoch.dt * epoch.imu.shape[1]
         fixed = epoch.used.any(-1)
         with torch.no_grad():
-            forward = (epoch.window.end.C_nb[:, :, 0] * epoch.window.end.v_n).sum(-1)
             normalised = self._normalised(memory, epoch)
             memory = memory._replace(
                 elapsed=memory.elapsed + span,
                 since_fix=torch.where(fixed, 0.0, memory.since_fix + span),
                 matching=memory.matching.innovated(normalised, epoch.used),
             )
-            heard = window_features(epoch.corrected, epoch.dt)
+            bands = window_features(epoch.corrected, epoch.dt)
+            levels, matched = band_level(bands), memory.matching.logarithms()
+            features, now = self._features(memory, epoch, normalised, bands, levels, matched)
+            axes = torch.cat((levels.unflatten(-1, (2, 3)).mT, ratio_by_axis(matched)), -1)
         dtype = self.network.inward.weight.dtype
-        foretold = self.car_speed(heard.to(dtype), memory.car)
-        with torch.no_grad():
-            loud, matched = loudness(heard), memory.matching.logarithms()
-            features, now = self._features(memory, epoch, normalised, forward, heard, loud, matched, foretold)
-            axes = torch.cat((loud.unflatten(-1, (2, 3)).mT, by_axis(matched)), -1)
-        heads, hidden = self.network(features.to(dtype), now.to(dtype), axes.to(dtype), memory.hidden)
+        gyro_noise, hidden = self.network(features.to(dtype), now.to(dtype), axes.to(dtype), memory.hidden)
+        gyro_noise = gyro_noise.to(epoch.z.dtype)
         seen = memory.since_fix < memory.elapsed  # before the first fix there is nothing to adapt to
-        heads = Heads(*(x.to(epoch.z.dtype) for x in heads))
         if not (may_branch(seen) and bool(seen.all())):
-            heads = heads.where(seen)
-        speed = torch.stack((foretold.speed, foretold.std), -1).to(epoch.z.dtype)
-        advice = self._advice(heads, speed, memory.silent | ~seen)
-        kalman, correction = self.kalman.step(memory.kalman, epoch._replace(advice=advice))
-        if "speed" in self.parts:
-            correction = correction._replace(speed=speed)
-        residual = memory.residual
-        if "residual" in self.parts:
-            error = correction.imu_error
-            assert isinstance(error, ImuError)
-            correction = correction._replace(imu_error=error._replace(bias=error.bias + heads.residual - residual))
-            residual = heads.residual
+            gyro_noise = torch.where(seen.unsqueeze(-1), gyro_noise, 1.0)
+        levels, same = memory.outage.levels(), torch.ones_like(gyro_noise)
+        of_network = torch.stack((same, gyro_noise, same, same), 1)
+        process = of_network * torch.cat((levels, torch.ones_like(levels)), -1).unsqueeze(-1)
+        kalman, correction = self.kalman.update(memory.kalman, epoch._replace(advice=NetworkOutput(process)))
         with torch.no_grad():
             after = epoch.window.end.corrected(correction.dx)
-            told = (after.C_nb[:, :, 0] * after.v_n).sum(-1)
-            matching = memory.matching
+            forward = (after.C_nb[:, :, 0] * after.v_n).sum(-1)
+            matching, outage = memory.matching, memory.outage
             if (c := correction.covariances) is not None:
+                scale = source_scale(of_network, epoch.start.C_nb)
+                outage = outage.after(epoch, c, memory.kalman.windows, scale)
                 matching = matching.corrected(c.dx, c.predicted, c.updated, epoch.window.end.C_nb, fixed)
-        memory = memory._replace(
-            kalman=kalman, hidden=hidden, residual=residual, matching=matching, seen=heads,
-            fix_speed=torch.where(fixed, told, memory.fix_speed),
-            car=self.car_speed.learned(memory.car, foretold, told.to(dtype), fixed),
-        )  # fmt: skip
-        return memory, correction
+        return memory._replace(
+            kalman=kalman, hidden=hidden, matching=matching, outage=outage, gyro_noise=gyro_noise,
+            fix_speed=torch.where(fixed, forward, memory.fix_speed),
+        ), correction  # fmt: skip
 
-    def _advice(self, heads: Heads, speed: Float[Tensor, "B 2"], silent: Tensor) -> Advice:
-        """What of the network's answer is in force."""
-        given = {name: getattr(heads, name) for name in ("process", "fix", "across", "offset") if name in self.parts}
-        if "speed" in self.parts:
-            mute = 1 + (speed[:, 1] / TELLING_STD).square().square()
-            std = torch.where(silent, 2 * ABSENT, speed[:, 1] * heads.doubt * mute)
-            given["speed"] = torch.stack((speed[:, 0], std), -1)
-        return Advice(**given)
-
-    def _normalised(self, memory: Memory, epoch: Epoch) -> Float[Tensor, "B 6"]:
+    def _normalised(self, memory: PlusMemory, epoch: Epoch) -> Float[Tensor, "B 6"]:
         """Innovations over their 1σ as the filter of the last epoch has it, in heading axes; zero without a fix."""
         C_hn = level_rotation(epoch.window.end.C_nb, "heading")
         variance = variance_along(memory.kalman.P[:, PV, PV], C_hn.mT)
@@ -227,14 +192,14 @@ class PlusFilter(nn.Module):
         return z / (variance + R + 1e-4).sqrt()
 
     def _features(
-        self, memory: Memory, epoch: Epoch, normalised: Float[Tensor, "B 6"], forward: Float[Tensor, " B"],
-        heard: Float[Tensor, "B K"], loud: Float[Tensor, "B 6"], matched: Float[Tensor, "B L"], foretold: Foretold,
+        self, memory: PlusMemory, epoch: Epoch, normalised: Float[Tensor, "B 6"], bands: Float[Tensor, "B K"],
+        levels: Float[Tensor, "B 6"], matched: Float[Tensor, "B L"],
     ) -> tuple[Float[Tensor, "B F"], Float[Tensor, "B N"]]:  # fmt: skip
         """What the network sees, each of order 1; the second part goes to the noise's heads directly as well."""
-        P, C_nb = memory.kalman.P, epoch.window.end.C_nb
+        P, C_nb, states = memory.kalman.P, epoch.window.end.C_nb, self.kalman.states
         fixed = epoch.used.any(-1, keepdim=True).to(P.dtype)
         variance = torch.cat(
-            (variance_along(P[:, PVA, PVA], C_nb), P.diagonal(dim1=-2, dim2=-1)[:, IMU.start :]), -1
+            (variance_along(P[:, PVA, PVA], C_nb), P.diagonal(dim1=-2, dim2=-1)[:, IMU.start : states.base.count]), -1
         ).clamp_min(1e-18)
         size = self._sizes(P)
         v_b = torch.bmm(C_nb.mT, epoch.window.end.v_n.unsqueeze(-1)).squeeze(-1)
@@ -242,21 +207,16 @@ class PlusFilter(nn.Module):
         known = _flat(epoch.error, memory.kalman.structure, self.kalman.states)
         fix_std = torch.log(epoch.fix.std[:, [0, 2, 3, 5]].clamp(1e-3, 1e3)) / 3 * fixed
         age = torch.log1p(torch.stack((memory.since_fix, memory.elapsed), -1).clamp_max(OLDEST)) / 3
-        speed, std = foretold.speed.to(P.dtype), foretold.std.to(P.dtype)
-        car = torch.stack(
-            (torch.log1p(memory.car.count) / 3, torch.log(memory.car.squares / memory.car.count + 0.01) / 2,
-             torch.log1p(foretold.novelty), torch.asinh((speed - forward) / std), speed / 20), -1,
-        )  # fmt: skip
+        fixes = torch.log(4 + memory.matching.fixes.clamp_max(OLDEST)) / 3
         now = torch.cat(
             (v_b / v_b.new_tensor((10.0, 1.0, 1.0)), torch.log(variance[:, 3:6]) / 6, v_b[:, :1] * rate[:, 2:] / 3,
-             force[:, 1:2] / 3, rate[:, 2:] / 0.3, fixed, age[:, :1], loud), -1,
+             force[:, 1:2] / 3, rate[:, 2:] / 0.3, fixed, age[:, :1], levels), -1,
         )  # fmt: skip
         features = torch.cat(
             (
-                heard, torch.log(variance) / 4 - torch.log(size) / 2,
+                bands, torch.log(variance) / 4 - torch.log(size) / 2,
                 torch.asinh(known / size[9:]), age, fix_std, torch.asinh(normalised),
-                matched, fixed, fixed * forward.unsqueeze(-1) / 10,
-                memory.fix_speed.unsqueeze(-1) / 10, car, now,
+                matched, fixed, fixed * v_b[:, :1] / 10, memory.fix_speed.unsqueeze(-1) / 10, fixes.unsqueeze(-1), now,
             ), -1,
         )  # fmt: skip
         return features, now

@@ -1,4 +1,4 @@
-"""Learned filters on disk: ``weights.safetensors`` beside a ``config.yaml`` whose ``kind`` says which filter it is."""
+"""Learned filters on disk: ``weights.safetensors`` beside a ``config.yaml`` whose ``kind`` names the filter."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import yaml
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from dlkf.errors import InputError
+from dlkf.base.documents import read_yaml
+from dlkf.base.errors import InputError
 from dlkf.filters.card import CARD, read_card
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.plus import PlusConfig, PlusFilter
@@ -25,7 +26,7 @@ KINDS: Mapping[str, type[LearnedConfig] | type[PlusConfig]] = {"dlkf": LearnedCo
 def learned_settings(values: Mapping[str, Any]) -> LearnedSettings:
     """Of a learned filter from plain values; InputError for an unknown ``kind`` or setting."""
     kind = values.get("kind", "dlkf")
-    if kind not in KINDS:
+    if not isinstance(kind, str) or kind not in KINDS:
         raise InputError(f"model.kind is {kind!r}; choose one of {', '.join(KINDS)}")
     return KINDS[kind].from_mapping(values)
 
@@ -69,10 +70,7 @@ def load_filter(folder: Path | str) -> Learned:
     for name in (CONFIG, WEIGHTS):
         if not (folder / name).is_file():
             raise InputError(f"model folder {folder} has no {name}; a model is {WEIGHTS} beside {CONFIG}")
-    try:
-        values = yaml.safe_load((folder / CONFIG).read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{folder / CONFIG} is not readable YAML: {str(error).splitlines()[0]}") from None
+    values = read_yaml(folder / CONFIG)
     if not isinstance(values, dict):
         raise InputError(f"{folder / CONFIG} holds no settings; expected the config.yaml that training wrote")
     model = learned_filter(learned_settings(values))
@@ -91,6 +89,11 @@ def load_filter(folder: Path | str) -> Learned:
                 f"{folder / WEIGHTS} does not fit {CONFIG}: {name} is {have} in the file, {want} in the config; "
                 "weights of other settings, or of another version of dlkf: train them with this one"
             )
+        if weights[name].is_floating_point() != expected[name].is_floating_point():
+            kinds = f"{weights[name].dtype} in the file, {expected[name].dtype} in the filter"
+            raise InputError(f"{folder / WEIGHTS}: {name} is {kinds}; export the model again")
+        if weights[name].is_floating_point() and not bool(weights[name].isfinite().all()):
+            raise InputError(f"{folder / WEIGHTS}: {name} holds values that are not finite; export the model again")
     model.load_state_dict(weights)
     model.card = read_card(folder)
     return model.eval()

@@ -1,6 +1,6 @@
 """Rauch-Tung-Striebel smoother over a closed-loop error-state filter: the best use of a whole drive (Groves 3.4.3).
 
-A closed-loop filter starts every epoch with a zero error state, so what the future knows of epoch k beyond its
+A closed-loop filter starts every epoch with a zero error state, so what future fixes add to epoch k beyond its
 filtered state is δₖ, the smoothed error of that state:
 
     δₖ = Gₖ (dxₖ₊₁ + δₖ₊₁)     Gₖ = Pₖ⁺ Φₖ₊₁ᵀ (Pₖ₊₁⁻)⁻¹     Pₖˢ = Pₖ⁺ + Gₖ (Pₖ₊₁ˢ − Pₖ₊₁⁻) Gₖᵀ
@@ -16,8 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
-from dlkf.errors import InputError
 from dlkf.filters.integration import Estimator, Solution, integrate
 from dlkf.filters.model_based import has_covariance
 from dlkf.navigation.state import IMU, PVA, STATES, NavState
@@ -27,28 +27,28 @@ ROUNDING = 1e-13  # added to unit variances
 
 
 @dataclass(frozen=True)
-class Smoothed:
-    """A filter whose solution is to be smoothed: no estimator, since what it says of an epoch needs those after it."""
+class SmoothedSolution:
+    """A filter whose solution is to be smoothed: no estimator, since its output at an epoch needs those after it."""
 
     filter: Estimator
 
 
-Filter = Estimator | Smoothed  # what runs over whole drives
+Filter = Estimator | SmoothedSolution  # what runs over whole drives
 
 
-def smoothed(estimator: Filter, smoother: str) -> Smoothed:
+def run_smoother(estimator: Filter, smoother: str) -> SmoothedSolution:
     """A filter to be smoothed by name (``rts``); InputError for another name or a filter without a covariance."""
     if smoother != "rts":
         raise InputError(f"unknown smoother {smoother!r}; known: rts")
-    if not (isinstance(estimator, Smoothed) or has_covariance(estimator)):
+    if not (isinstance(estimator, SmoothedSolution) or has_covariance(estimator)):
         raise InputError(NO_COVARIANCE)
-    return estimator if isinstance(estimator, Smoothed) else Smoothed(estimator)
+    return estimator if isinstance(estimator, SmoothedSolution) else SmoothedSolution(estimator)
 
 
 def smooth(batch: Batch, estimator: Estimator) -> Solution:
     """Filter a batch forwards and smooth it backwards; the solution's posterior, IMU error and std are smoothed.
 
-    Epochs in the padding after a piece's end carry nothing back. Raises InputError for a filter without a
+    Epochs in the padding after a segment's end carry nothing back. Raises InputError for a filter without a
     covariance (``ins``, a learned filter).
     """
     filtered = integrate(batch, estimator, keep_covariances=True)

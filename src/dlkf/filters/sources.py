@@ -9,20 +9,23 @@ A source is a class with two methods, in a file of its own; it needs no change o
         states: ErrorStates
 
         def begin(self, batch: Batch) -> None:
-            return None                                  # nothing to remember
+            return None                                  # no memory
 
-        def rows(self, epoch: Epoch, memory: None, believed: Believed) -> tuple[Measurement | None, None]:
+        def rows(self, epoch: Epoch, memory: None, prediction: Predicted) -> tuple[Measurement | None, None]:
             v = epoch.window.end.v_n
-            speed = v[:, :2].norm(dim=-1, keepdim=True)
+            speed = v.norm(dim=-1, keepdim=True)
             H = v.new_zeros(len(v), 1, self.states.count)
-            H[:, 0, 3:5] = v[:, :2] / speed.clamp_min(1.0)
+            H[:, 0, self.states.velocity] = v / speed.clamp_min(1.0)
             return Measurement(36.0 - speed, H, torch.full_like(speed, 1.0), speed > 36.0), None
 
-and every command takes it behind a filter's name: ``model=mbkf21_nhc+speed_limit:SpeedLimit``.
+and every command takes it behind a filter's name: ``model=mbkf21_nhc+speed_limit:SpeedLimit``. One that belongs to a
+sensor names its table of the dataset (``table``) and the error states that it adds (``parameters``), as wheel speed,
+heading and barometer do (:mod:`dlkf.filters.aids`); ``docs/developing.md`` has an example.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -33,10 +36,11 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.filters.adaptive import AdaptiveNoise
-from dlkf.filters.gating import Gate, GateMemory
+from dlkf.filters.gating import CoarseGate, CoarseMemory, Gate, GateMemory
 from dlkf.filters.integration import Epoch
 from dlkf.filters.tuning import Tuning
-from dlkf.navigation.error_model import masked, measurement_matrix
+from dlkf.navigation.error_model import mask_rows, measurement_matrix
+from dlkf.navigation.state import VELOCITY
 
 
 class Measurement(NamedTuple):
@@ -48,12 +52,34 @@ class Measurement(NamedTuple):
     used: Tensor  # (B, m) bool
 
 
-class Believed(NamedTuple):
-    """What the filter believes at the end of a window, before it updates."""
+class Parameter(NamedTuple):
+    """A quantity that a source estimates as an error state of its own: its value and 1σ at the start, and the 1σ of
+    its random walk per √s."""
+
+    std: float
+    walk: float = 0.0
+    start: float = 0.0
+
+
+class Predicted(NamedTuple):
+    """The filter's estimates at the end of a window, before it updates."""
 
     P: Tensor  # (B, n, n)
     structure: Tensor | None = None  # (B, 5) of the car, where it has such states
     noise: AdaptiveNoise | None = None
+    parameters: Mapping[str, Tensor] = {}  # (B,) each, of the sources by name
+    rolling: Tensor | None = None  # (B,) bool: a wheel that agrees with the filter turns; None: no wheel
+    stopped: Tensor | None = None  # (B,) bool: it agrees and does not turn
+
+
+def predicted_variance(P: Float[Tensor, "B n n"], H: Float[Tensor, "B m n"]) -> Float[Tensor, "B m"]:
+    """Variance of a source's prediction, the diagonal of H P Hᵀ."""
+    return ((H @ P) * H).sum(-1)
+
+
+def aid_of(epoch: Epoch, name: str) -> Float[Tensor, "B 5"] | None:
+    """The row of a further sensor in the epoch (:data:`dlkf.data.aids.ROW`), None where no drive has it."""
+    return None if epoch.fix.aids is None else epoch.fix.aids.get(name)
 
 
 @runtime_checkable
@@ -64,9 +90,19 @@ class Source(Protocol):
         """Memory at the start of a batch."""
         ...
 
-    def rows(self, epoch: Epoch, memory: Any, believed: Believed, /) -> tuple[Measurement | None, Any]:
-        """Rows of this epoch's update, None for none in any piece, and the memory after it."""
+    def rows(self, epoch: Epoch, memory: Any, prediction: Predicted, /) -> tuple[Measurement | None, Any]:
+        """Rows of this epoch's update, None for none in any segment, and the memory after it."""
         ...
+
+
+def describe_aid(epoch: Epoch, name: str, rows: Measurement | None, P: Float[Tensor, "B n n"]) -> Float[Tensor, "B 3"]:
+    """Of a further sensor's first row: innovation, its 1σ (NaN where there was no sample), whether it counted."""
+    seen = aid_of(epoch, name)
+    if rows is None or seen is None:
+        return epoch.z.new_tensor([[torch.nan, torch.nan, 0.0]]).expand(len(epoch.z), -1)
+    std = (predicted_variance(P, rows.H[:, :1]) + rows.R[:, :1]).sqrt()
+    said = torch.where(seen[:, 4:] > 0, torch.cat((rows.z[:, :1], std), -1), torch.nan)
+    return torch.cat((said, rows.used[:, :1].to(said.dtype)), -1)
 
 
 class FixMemory(NamedTuple):
@@ -74,15 +110,16 @@ class FixMemory(NamedTuple):
 
     scale: Tensor  # (1, 2, 6) factor and floor of the fixes' stds, the same for all drives
     gate: GateMemory | None = None
+    coarse: CoarseMemory | None = None  # of filters without that gate
 
 
-class FixRows(NamedTuple):
+class GatedFix(NamedTuple):
     """The six rows of GNSS and what its gate made of them and of the filter's covariance."""
 
     rows: Measurement
     variance: Tensor  # (B, 6) of all components, used or not
     offered: tuple[Tensor, Tensor]  # H and R before the gate
-    P: Tensor  # (B, n, n), opened where the filter gives in
+    P: Tensor  # (B, n, n), inflated where the filter recovers
     accepted: Tensor | None  # (B,) bool; None: without a gate
 
 
@@ -104,32 +141,34 @@ class GnssFix:
         t = self.tuning
         scale = [[t.position_std] * 3 + [t.velocity_std] * 3, [t.position_floor] * 3 + [t.velocity_floor] * 3]
         gate = self.gate.begin(batch.imu) if self.gated else None
-        return FixMemory(torch.tensor([scale], dtype=batch.imu.dtype, device=batch.imu.device), gate)
+        coarse = None if self.gated else CoarseGate().begin(batch.imu)
+        return FixMemory(torch.tensor([scale], dtype=batch.imu.dtype, device=batch.imu.device), gate, coarse)
 
-    def rows(self, epoch: Epoch, memory: FixMemory, believed: Believed) -> tuple[FixRows, FixMemory]:
+    def rows(self, epoch: Epoch, memory: FixMemory, prediction: Predicted) -> tuple[GatedFix, FixMemory]:
         """Six rows, of which those count that the receiver offers and the gate lets pass."""
-        P, R = believed.P, self._variance(epoch, memory, believed)
+        P, R = prediction.P, self._variance(epoch, memory, prediction)
         fix = Measurement(epoch.z, self._matrix(epoch), R, epoch.used)
-        H, R = offered = masked(fix.H, fix.R, fix.used)
+        H, R = offered = mask_rows(fix.H, fix.R, fix.used)
         if memory.gate is None:
-            return FixRows(Measurement(fix.z * fix.used, H, R, fix.used), fix.R, offered, P, None), memory
+            return GatedFix(Measurement(fix.z * fix.used, H, R, fix.used), fix.R, offered, P, None), memory
         S = H @ P @ H.mT + torch.diag_embed(R)
         gate, verdict = self.gate.judge(memory.gate, epoch, S, fix.R)
-        H, R = masked(fix.H, fix.R, verdict.passed)
+        H, R = mask_rows(fix.H, fix.R, verdict.passed)
         rows = Measurement(fix.z * verdict.passed, H, R, verdict.passed)
-        return FixRows(rows, fix.R, offered, verdict.opened(P), verdict.used), memory._replace(gate=gate)
+        return GatedFix(rows, fix.R, offered, verdict.opened(P), verdict.used), memory._replace(gate=gate)
 
     def _matrix(self, epoch: Epoch) -> Float[Tensor, "B 6 n"]:
         H = measurement_matrix(epoch.at_fix, epoch.rate_at_fix_b, epoch.lever_arm_b, epoch.frame, self.states)
         if epoch.fix.lag is not None:  # δp at the fix = δp at the window's end − lag · δv
             H = H.clone()
-            H[:, 0, 3] = H[:, 1, 4] = H[:, 2, 5] = -epoch.fix.lag
+            v = VELOCITY.start
+            H[:, 0, v] = H[:, 1, v + 1] = H[:, 2, v + 2] = -epoch.fix.lag
         return H
 
-    def _variance(self, epoch: Epoch, memory: FixMemory, believed: Believed) -> Float[Tensor, "B 6"]:
+    def _variance(self, epoch: Epoch, memory: FixMemory, prediction: Predicted) -> Float[Tensor, "B 6"]:
         scale, floor = memory.scale[0]
         R = torch.maximum(scale * epoch.fix.std, floor).square()
-        if believed.noise is not None:
-            R = torch.where(believed.noise.settled.unsqueeze(-1), believed.noise.R, R)
+        if prediction.noise is not None:
+            R = torch.where(prediction.noise.settled.unsqueeze(-1), prediction.noise.R, R)
         factors = None if epoch.advice is None else epoch.advice.fix_std
         return R if factors is None else R * factors.square()

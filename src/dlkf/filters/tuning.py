@@ -1,11 +1,11 @@
-"""What model-based filters are told: factors fitted on training drives, and an IMU error known beforehand."""
+"""Settings of model-based filters: factors fitted on training drives, and a prior IMU error."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,9 @@ class Tuning:
 
     Filters with constraints: ``lateral_std``, ``vertical_std`` [m/s] of the velocity across the car, once per
     epoch, ``rest_velocity_std`` [m/s], ``rest_rate_std`` [rad/s] of a standstill; ``rest_accel`` [m/s²] and
-    ``rest_gyro`` [rad/s] are the spread of the samples in the quietest second of motion, until the drive tells.
+    ``rest_gyro`` [rad/s] are the spread of the samples in the least shaken second of motion, until learned.
+    Filters with further sensors: ``wheel_std`` [m/s] and ``baro_std`` [m] of an update interval's measurement where the
+    file gives none, ``heading_std`` a factor on that of the heading.
     Filters with a gate: ``gate`` is the probability that a good fix passes. ``aekf``: ``forgetting`` is the share
     of the past in the adapted Q and R (0.3 in Akhlaghi et al. 2017, which lost wherever it was tried).
     """
@@ -40,6 +42,9 @@ class Tuning:
     rest_rate_std: float = 2e-3
     rest_accel: float = 0.12
     rest_gyro: float = 0.025
+    wheel_std: float = 0.1
+    heading_std: float = 1.0
+    baro_std: float = 0.5
     gate: float = 0.9999
     forgetting: float = 0.995
 

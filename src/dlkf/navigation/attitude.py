@@ -120,7 +120,7 @@ def rpy_from_rotation(C: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     return torch.stack((torch.atan2(C[..., 2, 1], C[..., 2, 2]), pitch, torch.atan2(C[..., 1, 0], C[..., 0, 0])), -1)
 
 
-def orthonormalised(C: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
+def orthonormalise(C: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
     """One Newton step towards the nearest rotation, C(3I − CᵀC)/2: enough for rounding errors."""
     flat = C.reshape(-1, 3, 3)
     return torch.baddbmm(flat, flat, torch.bmm(flat.mT, flat), beta=1.5, alpha=-0.5).reshape(C.shape)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dlkf.console import warned
+from dlkf.base.console import warn_once
 
 try:
     import numba
@@ -34,14 +34,14 @@ def fits(x: Tensor, *, gradients: bool = False) -> bool:
     """Whether the compiled form may stand in for the tensor form: in main memory, and no gradient asked for but by
     one that has ``gradients``.
 
-    Says once what stands in its way, if something does.
+    Warns once if something prevents it.
     """
     if _tensor_forms or x.device.type != "cpu" or torch.compiler.is_compiling():
         return False
     if not gradients and (torch.is_grad_enabled() or x.requires_grad):
         return False
     if TROUBLE:
-        warned(TROUBLE)
+        warn_once(TROUBLE)
     return AVAILABLE
 
 
@@ -67,15 +67,13 @@ def njit(**options: Any) -> Callable[[Callable], Any]:
         try:
             return numba.njit(cache=True, **options)(function)
         except RuntimeError:  # numba's word for no folder that it may write into
-            TROUBLE = (
-                "compiled loops are made anew by every process, some 3 s each; set NUMBA_CACHE_DIR to a folder of yours"
-            )
+            TROUBLE = "every process compiles the loops again, some 3 s each; set NUMBA_CACHE_DIR to a folder of yours"
             return numba.njit(**options)(function)
 
     return made
 
 
-def mechanised(
+def mechanise(
     p0: Tensor, v0: Tensor, C0: Tensor, imu: Tensor, dt: float, g: Tensor, earth_rate: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Position (B, M, 3), velocity (B, M, 3) and attitude (B, M, 3, 3) at the end of every sample."""
@@ -117,7 +115,7 @@ def variance_along(P: Tensor, axes: Tensor) -> Tensor:
     return out
 
 
-def solved(S: Tensor, X: Tensor) -> Tensor:
+def solve(S: Tensor, X: Tensor) -> Tensor:
     """S⁻¹ X of symmetric positive definite matrices (B, m, m) and columns (B, m, n)."""
     out = X.clone(memory_format=torch.contiguous_format)
     _eliminate(S.numpy(), out.numpy())
@@ -140,7 +138,7 @@ def dot(a, b):
 
 @njit(inline="always")
 @no_type_check
-def scaled(s, a):
+def scale(s, a):
     """s a."""
     return s * a[0], s * a[1], s * a[2]
 
@@ -298,7 +296,7 @@ def _gravity(p, stretching, centre, axis, shape, equator, somigliana, eccentrici
 @njit()
 @no_type_check
 def _mechanise(p0, v0, C0, imu, g, w, dt, p, v, C):
-    """Sample by sample what ``strapdown`` says of a window.
+    """Sample by sample the result of ``strapdown`` for a window.
 
     A = C₀ R, the attitude in axes that do not turn with the Earth; S, P velocity and position that the specific force
     has given since the window's start; Coriolis' part of both (``swing``) follows from the motion without it, and
@@ -325,9 +323,9 @@ def _mechanise(p0, v0, C0, imu, g, w, dt, p, v, C):
             at_v = plus(plus(free, 1, S), -1, swing_v)
             at_p = plus(plus(start, 1, P), t, plus(plus(speed, t / 2, fall), -1, swing_p))
             turned = (
-                plus(A[0], t, plus(scaled(earth[2], A[1]), -earth[1], A[2])),
-                plus(A[1], t, plus(scaled(earth[0], A[2]), -earth[2], A[0])),
-                plus(A[2], t, plus(scaled(earth[1], A[0]), -earth[0], A[1])),
+                plus(A[0], t, plus(scale(earth[2], A[1]), -earth[1], A[2])),
+                plus(A[1], t, plus(scale(earth[0], A[2]), -earth[2], A[0])),
+                plus(A[2], t, plus(scale(earth[1], A[0]), -earth[0], A[1])),
             )
             for i in range(3):
                 p[b, k, i], v[b, k, i] = at_p[i], at_v[i]

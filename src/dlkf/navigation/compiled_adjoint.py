@@ -11,7 +11,7 @@ from typing import no_type_check
 import numpy as np
 from torch import Tensor
 
-from dlkf.navigation.compiled import cross, dot, gains, njit, plus, rotation, row, scaled, times
+from dlkf.navigation.compiled import cross, dot, gains, njit, plus, rotation, row, scale, times
 
 
 def adjoint(
@@ -82,7 +82,7 @@ def _adjoint(C0, imu, gradient, w, Gp, Gv, GC, dt, grad_p0, grad_v0, turn, grad_
             ends = (gained[k, 0], gained[k, 1], gained[k, 2]), (moved[k, 0], moved[k, 1], moved[k, 2])
             T = plus(plus(T, 1, cross(ends[0], V)), 1, cross(ends[1], U))
             phi, f = (imu[b, k, 3] * dt, imu[b, k, 4] * dt, imu[b, k, 5] * dt), row(imu, b, k)
-            e1, e2 = scaled(dt / 2, plus(r1, dt / 3, r2)), scaled(dt / 6, plus(r1, dt / 4, r2))
+            e1, e2 = scale(dt / 2, plus(r1, dt / 3, r2)), scale(dt / 6, plus(r1, dt / 4, r2))
             back = plus(cross(e1, phi), 1, cross(phi, cross(phi, e2)))
             spin = cross(phi, twist)
             spin2 = cross(phi, spin)

@@ -7,7 +7,7 @@ from typing import Any, no_type_check
 import numpy as np
 from torch import Tensor
 
-from dlkf.navigation.compiled import cross, njit, plus, row, scaled
+from dlkf.navigation.compiled import cross, njit, plus, row, scale
 
 
 def transition(
@@ -42,7 +42,7 @@ def _transition(p0, v0, C0, p, v, C, g, samples, earth_rate, dt, elements, Phi):
         moved = plus(row(p, b, last), -1, (p0[b, 0], p0[b, 1], p0[b, 2]))
         s_p = plus(moved, -T, plus(speed, T / 2, fall))
         s_v = plus(plus(row(v, b, last), -1, speed), -T, fall)
-        swept = plus(scaled(T / 3, moved), T * T / 6, speed)
+        swept = plus(scale(T / 3, moved), T * T / 6, speed)
         for i, s in ((0, plus(s_p, 2, cross(earth, swept))), (3, plus(s_v, 2, cross(earth, moved)))):
             Phi[b, i, 7], Phi[b, i + 1, 8], Phi[b, i + 2, 6] = s[2], s[0], s[1]  # −[s×]
             Phi[b, i + 1, 6], Phi[b, i + 2, 7], Phi[b, i, 8] = -s[2], -s[0], -s[1]

@@ -36,6 +36,7 @@ SOURCES = {
 }
 DRIVEN = slice(VELOCITY.start, GYRO.stop)  # four blocks of three columns of Φ, one per source
 PLAIN = ErrorStates()
+RATE_AVERAGE_S = 0.1  # the lever-arm velocity uses the mean rate over so long before the fix
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class WindowModel:
     still: Tensor  # (B, n, n) Φ of a window in which nothing moves: Earth rotation, gravity gradient, decay
     left: Tensor  # (2, M) time from each sample's middle to the end, and 1: integrates once and twice
     density: Tensor  # (1, 4) S of each noise source, the same for all drives
-    walk: Tensor  # (n,) variance that a window adds to the states of the car
+    walk: Tensor  # (n,) variance that a window adds to the states of the car and of further sensors
 
     @property
     def spread(self) -> Float[Tensor, "4 s s"]:
@@ -100,6 +101,13 @@ class WindowModel:
         if torch.is_grad_enabled() and scale.requires_grad and not L.requires_grad:
             return _ProcessNoise.apply(L, scale, self)
         return self._accumulated(L @ scale)
+
+    def noise_of_sources(
+        self, Phi: Float[Tensor, "B n n"], scale: Float[Tensor, "B 4 3 3"]
+    ) -> Float[Tensor, "B 4 s s"]:
+        """What each source adds to :meth:`noise`."""
+        L = Phi[:, :STATES, DRIVEN].unflatten(-1, (4, 3)).transpose(1, 2) @ scale
+        return (L @ L.mT) * self.spread
 
     def _accumulated(self, L: Float[Tensor, "B 4 s 3"]) -> Float[Tensor, "B n n"]:
         Q = self.walk.diag().repeat(len(L), 1, 1)
@@ -181,13 +189,14 @@ def window_model(
     *,
     states: ErrorStates = PLAIN,
     decay: tuple[float, float] = (0.0, 0.0),
-    walk: Float[Tensor, " 5"] | None = None,
+    walk: Float[Tensor, " w"] | None = None,
 ) -> WindowModel:
     """The common part of the windows of a batch of frames.
 
     ``psd`` gives S of ``accel_noise`` [m²/s³], ``gyro_noise`` [rad²/s], ``accel_walk`` [m²/s⁵] and
     ``gyro_walk`` [rad²/s³]. ``decay`` is 1/τ [1/s] of first-order Gauss-Markov biases (accelerometers,
-    gyroscopes), 0 for random walks. ``walk`` is the PSD of the random walks of the states of the car.
+    gyroscopes), 0 for random walks. ``walk`` is the PSD of the random walks of the states of the car, and of those of
+    further sensors after them.
     """
     T, n = samples * dt, states.count
     like = {"dtype": frame.earth_rate_n.dtype, "device": frame.earth_rate_n.device}
@@ -204,8 +213,8 @@ def window_model(
     left = T - (torch.arange(samples, **like) + 0.5) * dt
     density = torch.tensor([[psd[source] for source in SOURCES]], **like)
     drift = torch.zeros(n, **like)
-    if states.structure and walk is not None:
-        drift[states.of_structure] = T * walk.to(**like)
+    if walk is not None:
+        drift[states.navigation :] = T * walk.to(**like)
     return WindowModel(states, dt, still, torch.stack((left, torch.ones_like(left))), density, drift)
 
 
@@ -264,7 +273,7 @@ def _arm(state: NavState, rate_b: Tensor, lever_arm_b: Tensor) -> tuple[Tensor, 
     return arm, swing
 
 
-def masked(
+def mask_rows(
     H: Float[Tensor, "B m n"], R: Float[Tensor, "B m"], used: Bool[Tensor, "B m"]
 ) -> tuple[Float[Tensor, "B m n"], Float[Tensor, "B m"]]:
     """H and diagonal R in which unused components have no effect: zero row, unit variance."""

@@ -1,4 +1,4 @@
-"""IMU error model: what a sensor adds to the truth, and what a filter is told about it.
+"""IMU error model: what a sensor adds to the truth, and what a filter assumes about it.
 
 Model (paper.md 2.7, paper eqs 7, 8): measured = (I + M) true + b + w, with M's diagonal the scale factors
 and its off-diagonal the misalignments, b a turn-on bias plus an in-run part that is first-order
@@ -15,9 +15,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from dlkf.errors import InputError
-from dlkf.ranges import middle
-from dlkf.settings import Ranged, is_number, settings_from, within
+from dlkf.base.errors import InputError
+from dlkf.base.ranges import range_middle
+from dlkf.base.settings import Ranged, bounded_field, is_number, settings_from
 
 DEG = math.pi / 180
 MILLIGAL = 1e-5  # m/s²
@@ -34,14 +34,14 @@ class SensorErrors(Ranged, where="IMU preset", least=0):
     Optional: ``random_walk`` K of the bias [unit/√s]; ``warm_up`` σ of the drift c (1 − exp(−t/``warm_up_time``))
     as the unit warms up after switching on [unit, s]; ``g_sensitivity`` of a gyroscope, σ of the entries of
     G [rad/s per m/s²]; ``quantisation`` step of the output [unit], and its ``full_scale`` [unit], 0 for none;
-    ``wander`` σ of a part of the bias that forgets itself within ``wander_time`` [unit, s], as of a MEMS that feels its
+    ``wander`` σ of a part of the bias that decays within ``wander_time`` [unit, s], as of a MEMS under
     supply and its mount; ``unevenness`` log-std of the factors by which the axes' white noise differs [–].
     """
 
     noise_density: float = 0.0
     turn_on_bias: float = 0.0
     instability: float = 0.0
-    correlation_time: float = within(3600.0, 1e-9, math.inf)
+    correlation_time: float = bounded_field(3600.0, 1e-9, math.inf)
     scale_factor: float = 0.0
     misalignment: float = 0.0
     random_walk: float = 0.0
@@ -77,7 +77,7 @@ class SensorErrors(Ranged, where="IMU preset", least=0):
 
 @dataclass(frozen=True)
 class ImuSpec:
-    """An IMU as a preset of ``conf/imu/`` describes it; ``source`` says where the numbers come from."""
+    """An IMU as a preset of ``conf/imu/`` describes it; ``source`` is where the numbers come from."""
 
     name: str
     accel: SensorErrors
@@ -85,7 +85,7 @@ class ImuSpec:
     source: str = ""
 
 
-AUTO = "auto"  # the preset that says: find it
+AUTO = "auto"  # the preset of imu=auto
 
 
 def imu_spec(config: Mapping, *, auto: bool = False) -> ImuSpec:
@@ -93,17 +93,17 @@ def imu_spec(config: Mapping, *, auto: bool = False) -> ImuSpec:
 
     Every number of both sensors but the optional ones has to be there, and no unknown one, so that a misspelt
     key cannot become a silent zero.
-    Of a preset with ranges (``conf/imu/wide.yaml``) it is the middle: what a filter is told of an IMU that can be any.
+    Of a preset with ranges (``conf/imu/wide.yaml``) it is the middle: what a filter assumes of an IMU drawn from it.
     Raises InputError for a missing or unknown key, a value that is no number ≥ 0, or the preset ``auto`` unless the
     caller finds the noise by itself.
     """
-    config = middle(config)
+    config = range_middle(config)
     if not isinstance(config, Mapping):
         raise InputError(f"IMU preset is {config!r}, must be a mapping with name, accel, gyro")
     where = f"IMU preset {config.get('name', 'unnamed')}"
-    told = {key: str(config[key]) for key in ("name", "source") if key in config}
+    texts = {key: str(config[key]) for key in ("name", "source") if key in config}
     sensors = {key: _sensor(config[key], f"{where}, {key}") for key in ("accel", "gyro") if key in config}
-    spec = settings_from(ImuSpec, {**config, **told, **sensors}, where)
+    spec = settings_from(ImuSpec, {**config, **texts, **sensors}, where)
     if spec.name == AUTO and not auto:
         raise InputError(
             "imu=auto: only navigate finds the noise by itself; give a preset here, or have one written by "

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -30,16 +30,42 @@ class ErrorStates:
 
     ``matrix`` of M in measured = (I + M) true + bias: ``none`` (15 states), ``scale`` its diagonal (21), ``full``
     also the misalignments (33). Columns 15… hold the accelerometers' elements, then the gyroscopes', each the
-    diagonal first, then row by row. ``structure`` adds the five of :data:`STRUCTURE` at the end
-    (:mod:`dlkf.filters.constraints`).
+    diagonal first, then row by row. ``structure`` adds the five of :data:`STRUCTURE`
+    (:mod:`dlkf.filters.constraints`), ``others`` at the end those of further sensors by name
+    (:class:`dlkf.filters.sources.Parameter`).
+
+    ``position``, ``velocity``, ``attitude``, ``accel``, ``gyro`` and ``of(name)`` are the places of states, so that a
+    measurement's H is written as ``H[..., states.velocity] = …``.
     """
 
     matrix: str = "none"
     structure: bool = False
+    others: tuple[str, ...] = ()
+
+    position: ClassVar[slice] = POSITION
+    velocity: ClassVar[slice] = VELOCITY
+    attitude: ClassVar[slice] = ATTITUDE
+    accel: ClassVar[slice] = ACCEL
+    gyro: ClassVar[slice] = GYRO
 
     def __post_init__(self) -> None:
         if self.matrix not in MATRICES:
             raise ValueError(f"matrix {self.matrix!r} is none of {MATRICES}")
+        if len(set(self.others)) < len(self.others) or set(self.others) & set(STRUCTURE):
+            raise ValueError(f"names of states stand twice: {', '.join(self.others)}")
+
+    def of(self, name: str) -> slice:
+        """The state of the car or of a further sensor by its name; KeyError if the filter has none."""
+        named = (*(STRUCTURE if self.structure else ()), *self.others)
+        if name not in named:
+            raise KeyError(f"this filter has no state {name!r}, but {', '.join(named) or 'none of a car or a sensor'}")
+        first = self.navigation + named.index(name)
+        return slice(first, first + 1)
+
+    @property
+    def base(self) -> ErrorStates:
+        """Without those of further sensors."""
+        return replace(self, others=())
 
     @property
     def elements(self) -> tuple[tuple[int, int], ...]:
@@ -50,7 +76,7 @@ class ErrorStates:
 
     @property
     def navigation(self) -> int:
-        """Number of states without those of the car."""
+        """Number of states without those of the car and of further sensors."""
         return STATES + 2 * len(self.elements)
 
     @property
@@ -61,7 +87,7 @@ class ErrorStates:
     @property
     def count(self) -> int:
         """Number of states."""
-        return self.navigation + (len(STRUCTURE) if self.structure else 0)
+        return self.of_structure.stop + len(self.others)
 
     @property
     def of_matrix(self) -> slice:
@@ -71,7 +97,12 @@ class ErrorStates:
     @property
     def of_structure(self) -> slice:
         """The states of the car."""
-        return slice(self.navigation, self.count)
+        return slice(self.navigation, self.navigation + (len(STRUCTURE) if self.structure else 0))
+
+    @property
+    def of_others(self) -> slice:
+        """The states of further sensors."""
+        return slice(self.of_structure.stop, self.count)
 
 
 class NavState(NamedTuple):

@@ -27,7 +27,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.navigation import compiled, compiled_adjoint
-from dlkf.navigation.attitude import orthonormalised, prefix_rotations, skew
+from dlkf.navigation.attitude import orthonormalise, prefix_rotations, skew
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import NavState
 
@@ -52,7 +52,7 @@ class Window(NamedTuple):
         p = torch.lerp(self.p_n[row, low], self.p_n[row, high], part)
         v = torch.lerp(self.v_n[row, low], self.v_n[row, high], part)
         C = torch.lerp(self.C_nb[row, low], self.C_nb[row, high], part[..., None])
-        return NavState(p, v, orthonormalised(C))
+        return NavState(p, v, orthonormalise(C))
 
 
 def strapdown(
@@ -74,8 +74,8 @@ def strapdown(
             start.p_n, start.v_n, start.C_nb, imu, dt, gravity, frame.gravity_gradient(), frame.earth_rate_n
         )
     elif compiled.fits(imu):
-        p, v, C = compiled.mechanised(*start, imu, dt, gravity, frame.earth_rate_n)
-        end = p[:, -1], v[:, -1], orthonormalised(C[:, -1])
+        p, v, C = compiled.mechanise(*start, imu, dt, gravity, frame.earth_rate_n)
+        end = p[:, -1], v[:, -1], orthonormalise(C[:, -1])
     else:
         (p, v, C, *end), _ = _mechanised(*start, imu, dt, gravity, frame.earth_rate_n)
     return Window(p, v, C, NavState(*end), gravity)
@@ -119,7 +119,7 @@ def _mechanised(p0: Tensor, v0: Tensor, C0: Tensor, imu: Tensor, dt: float, g: T
     p_n = p + t * (torch.add(v, fallen, alpha=0.5) - swing[0]) + P
     C_nb = A - t * torch.linalg.cross(w.unsqueeze(1), A, dim=0)
     p_n, v_n, C_nb = p_n.permute(1, 2, 0), v_n.permute(1, 2, 0), C_nb.permute(2, 3, 0, 1)
-    states = p_n, v_n, C_nb, p_n[:, -1].clone(), v_n[:, -1].clone(), orthonormalised(C_nb[:, -1])
+    states = p_n, v_n, C_nb, p_n[:, -1].clone(), v_n[:, -1].clone(), orthonormalise(C_nb[:, -1])
     return states, (f, phi, A, A_before, gained, moved)
 
 
@@ -172,16 +172,16 @@ class _Strapdown(torch.autograd.Function):
 
 
 class _CompiledStrapdown(torch.autograd.Function):
-    """The same by compiled loops, samples first and axes last as they come."""
+    """The same by compiled loops, samples first and axes last."""
 
     @staticmethod
     def forward(ctx, p0, v0, C0, imu, dt, g, gradient, earth_rate):
         C0, imu = C0.detach(), imu.detach()
-        p, v, C = compiled.mechanised(p0.detach(), v0.detach(), C0, imu, dt, g, earth_rate)
+        p, v, C = compiled.mechanise(p0.detach(), v0.detach(), C0, imu, dt, g, earth_rate)
         ctx.save_for_backward(C0, imu, gradient, earth_rate)
         ctx.dt = dt
         ctx.set_materialize_grads(False)
-        return p, v, C, p[:, -1].clone(), v[:, -1].clone(), orthonormalised(C[:, -1])
+        return p, v, C, p[:, -1].clone(), v[:, -1].clone(), orthonormalise(C[:, -1])
 
     @staticmethod
     @torch.autograd.function.once_differentiable

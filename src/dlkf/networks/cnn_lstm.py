@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 from dlkf.networks.features import CNN_CHANNELS, COMPONENTS
 from dlkf.networks.products import EpochLinear, EpochLSTMCell, begin_batch
 
@@ -18,7 +18,7 @@ CELLS = {"lstm": EpochLSTMCell, "gru": nn.GRUCell}
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Sizes of the network; the defaults are the paper's. ``samples`` and ``flags`` are the filter's to say.
+    """Sizes of the network; the defaults are the paper's. ``samples`` and ``flags`` are set by the filter.
 
     ``fusion``: ``concat`` feeds CNN output and components to the recurrent cells side by side; ``strict30`` squeezes
     them into the 30 inputs that the paper names (paper.md 4.1). ``flags`` further inputs are appended.

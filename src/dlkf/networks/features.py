@@ -1,6 +1,6 @@
-"""What the network sees: the window for the CNN and the four components for the LSTM (R037–R044).
+"""Features of the network: the window for the CNN and the four components for the LSTM (R037–R044).
 
-Everything is brought to a size of about one, by fixed physical sizes or by those that training pieces have
+Everything is brought to a size of about one, by fixed physical sizes or by those that training segments have
 (:class:`Scaling`); the components then pass asinh, which keeps sign and small signals and tames the innovations after
 an outage (paper.md 4.9). ``frame`` chooses the axes of every horizontal pair: ``ned`` is the paper's reading,
 ``heading`` turns them by the estimated yaw, which makes the network blind to the direction of driving.
@@ -43,8 +43,8 @@ def level_rotation(C_nb: Float[Tensor, "B 3 3"], frame: str) -> Float[Tensor, "B
 class Scaling(nn.Module):
     """Centre and size of every input; buffers, so that they are stored with the weights.
 
-    They start as the fixed sizes above and are set once to those of training pieces by :meth:`fit` (R067 speaks of
-    normalised losses only; that a network wants inputs of like size is paper.md 4.9).
+    They start as the fixed sizes above and are set once to those of training segments by :meth:`fit` (R067 asks for
+    normalised losses only; inputs of like size are paper.md 4.9).
     """
 
     window_centre: Tensor
@@ -65,7 +65,7 @@ class Scaling(nn.Module):
         return x.mT, torch.asinh(components / self.component_size.to(components))
 
     def fit(self, windows: Float[Tensor, "N M 15"], components: Float[Tensor, "N 30"]) -> None:
-        """Centre and spread of what a filter saw over training pieces, robust against the hours after a start.
+        """Centre and spread of what a filter saw over training segments, robust against the hours after a start.
 
         A channel that hardly moves keeps a thousandth of its fixed size at least.
         """

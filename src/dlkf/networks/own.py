@@ -15,10 +15,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from dlkf.classes import TARGET, having, made
+from dlkf.base.classes import TARGET, instantiate, require_attributes
 from dlkf.networks.cnn_lstm import NetworkConfig
 
-PAPERS = {f.name for f in fields(NetworkConfig)}  # settings that lie beside _target_ where a preset is the base
+NETWORK = ("start", "forward", "state_dict")  # methods of a network
+PAPER_FIELDS = {f.name for f in fields(NetworkConfig)}  # settings that lie beside _target_ where a preset is the base
 
 
 @dataclass(frozen=True)
@@ -39,8 +40,9 @@ class OwnNetwork:
     def build(self) -> Any:
         """The network. InputError where it cannot be found, takes other settings, or lacks what a network has."""
         offered = {"samples": self.samples, "flags": self.flags}
-        network = made({TARGET: self.target, **self.settings}, "model.network", offered=offered, spare=PAPERS)
-        return having(network, ("width", "start", "forward"), f"model.network.{TARGET}={self.target}")
+        values = {TARGET: self.target, **self.settings}
+        network = instantiate(values, "model.network", NETWORK, offered=offered, spare=PAPER_FIELDS)
+        return require_attributes(network, ("width",), f"model.network.{TARGET}={self.target}")
 
     def plain(self) -> dict[str, Any]:
         """Plain values for a file."""

@@ -32,13 +32,13 @@ class EpochProduct:
         return _product(x, self.forth, self.bias.detach())
 
     def gradient(self, x: Float[Tensor, "B K"], g: Float[Tensor, "B N"]) -> Float[Tensor, "B K"]:
-        """g W, the gradient in x; that in W and b is told once x and g of all epochs are there."""
+        """g W, the gradient in x; that in W and b is computed once x and g of all epochs are there."""
         self.seen.append((x, g))
         return _product(g, self.back)
 
 
 class EpochLayer(nn.Module):
-    """A layer with the product of the batch at hand, made when it first runs; :func:`begin_batch` forgets it."""
+    """A layer with the product of the current batch, made when it first runs; :func:`begin_batch` drops it."""
 
     product: EpochProduct | None = None
 
@@ -92,7 +92,7 @@ def _by_onednn(x: Tensor) -> bool:
 
 
 def _in_order(weight: Tensor) -> Tensor:
-    """A matrix as oneDNN wants it for many products."""
+    """A matrix in oneDNN's layout for many products."""
     return torch.ops.mkldnn._reorder_linear_weight(weight) if _by_onednn(weight) else weight
 
 

@@ -17,14 +17,14 @@ from torch import Tensor
 from torch.export import ExportedProgram
 from torch.fx import Node
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 from dlkf.onboard.c_loops import UNKNOWN, WHOLE
 from dlkf.onboard.c_memory import C_TYPES, Buffer, Tensors, View, Written
 from dlkf.onboard.c_operations import BY_ELEMENT, PARTS, literal
 
 KEPT = {  # operations that are one in C, though core ATen has several for them
     "aten::linalg_cross", "aten::linalg_solve_ex", "aten::_linalg_solve_ex", "aten::linalg_cholesky_ex",
-    "aten::cholesky_solve", "aten::linalg_inv_ex",
+    "aten::cholesky_solve", "aten::linalg_inv_ex", "aten::linalg_solve_triangular",
 }  # fmt: skip
 
 
@@ -117,20 +117,20 @@ class Translation(Tensors):
         pattern, operands = BY_ELEMENT[name], []
         if callable(pattern):
             pattern, args = pattern(value.dtype, args, kwargs)
-        pieces = []
+        segments = []
         for x in args:
             if isinstance(x, Written) and x.shape == value.shape:
                 first = len(operands)
                 inner = x.pattern.format(*(f"{{{first + k}}}" for k in range(len(x.operands))))
-                pieces.append(f"({inner})")
+                segments.append(f"({_cast(x.dtype, value.dtype)}({inner}))")
                 operands += x.operands
             elif isinstance(x, (View, Written)) or (isinstance(x, Tensor) and x.numel() > 1):
                 view = self.tensor(x)
-                pieces.append(f"{{{len(operands)}}}")
+                segments.append(f"{_cast(view.meta.dtype, value.dtype)}{{{len(operands)}}}")
                 operands.append(view.viewed(view.meta.expand(value.shape)))
             else:
-                pieces.append(literal(x.item() if isinstance(x, Tensor) else x, value.dtype))
-        written = Written(value.shape, value.dtype, f"({C_TYPES[value.dtype]})({pattern.format(*pieces)})", operands)
+                segments.append(literal(x.item() if isinstance(x, Tensor) else x, value.dtype))
+        written = Written(value.shape, value.dtype, f"({C_TYPES[value.dtype]})({pattern.format(*segments)})", operands)
         alone = len(node.users) == 1 and len(operands) <= 12 and value.numel() > 0
         return written if alone and _goes_on(next(iter(node.users))) else self.tensor(written)
 
@@ -141,9 +141,14 @@ class Translation(Tensors):
         self.block.over(out, "{0}", [whole])
         part = PARTS[name](out.meta, *args[2:])
         source = self.tensor(args[1])
-        told = source.viewed(source.meta.expand(part.shape))
-        self.block.over(out.viewed(part), f"({C_TYPES[out.meta.dtype]}){{0}}", [told])
+        values = source.viewed(source.meta.expand(part.shape))
+        self.block.over(out.viewed(part), f"({C_TYPES[out.meta.dtype]}){{0}}", [values])
         return out
+
+
+def _cast(given: torch.dtype, wanted: torch.dtype) -> str:
+    """What makes the conversion of a wide integer to a floating number a visible one."""
+    return "(double)" if wanted.is_floating_point and given == torch.int64 else ""
 
 
 def _is_view(target: Any) -> bool:

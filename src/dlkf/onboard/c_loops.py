@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch.fx import Node
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 from dlkf.onboard.c_memory import C_TYPES, Tensors, View
 from dlkf.onboard.c_operations import literal, suffix
 
@@ -124,8 +124,6 @@ def _product(t: Tensors, node: Node, A: Any, B: Any, begin: Any = None, beta: fl
     lead = ["b"] if a.meta.ndim == 3 else []
     kind, scale = C_TYPES[value.dtype], "" if alpha == 1 else f"{literal(alpha, value.dtype)} * "
     at_a, at_b, at = a.at([*lead, "i", "k"]), b.at([*lead, "k", "j"]), out.at([*lead, "i", "j"])
-    # H, K and Φ are mostly zeros; the empty statement keeps gcc 12 from making a wrong sum over k of the condition
-    sparse = 'if (w != 0) { __asm__ volatile(""); ' if small and n >= WIDE else "{ "
     start, used = "0", [a, b]
     if begin is not None:
         given = t.tensor(begin)
@@ -133,10 +131,15 @@ def _product(t: Tensors, node: Node, A: Any, B: Any, begin: Any = None, beta: fl
         start = ("" if beta == 1 else f"{literal(beta, value.dtype)} * ") + wide.at([*lead, "i", "j"])
         used.append(given)
     if b.meta.stride(-1) == 1 or (n > 1 and b.meta.stride(-2) != 1):  # along rows of B
+        # H, K and Φ are mostly zeros: which they are not is listed first, so that the sum has no condition
+        listed = f"int list[{k}], listed = 0; for (int k = 0; k < {k}; k++) if ({at_a} != 0) list[listed++] = k; "
+        each = "for (int q = 0; q < listed; q++) { const int k = list[q]; "
+        if not small or n < WIDE:
+            listed, each = "", f"for (int k = 0; k < {k}; k++) {{ "
         body = (
-            f"{{ {kind} y[{n}]; for (int j = 0; j < {n}; j++) y[j] = {start}; "
-            f"for (int k = 0; k < {k}; k++) {{ {kind} w = {scale}{at_a}; {sparse}"
-            f"for (int j = 0; j < {n}; j++) y[j] += w * {at_b}; }} }} for (int j = 0; j < {n}; j++) {at} = y[j]; }}"
+            f"{{ {kind} y[{n}]; {listed}for (int j = 0; j < {n}; j++) y[j] = {start}; "
+            f"{each}{kind} w = {scale}{at_a}; for (int j = 0; j < {n}; j++) y[j] += w * {at_b}; }} "
+            f"for (int j = 0; j < {n}; j++) {at} = y[j]; }}"
         )
     else:  # along its columns
         body = (
@@ -153,7 +156,7 @@ def _added_product(t: Tensors, node: Node, c: Any, a: Any, b: Any, beta: float =
 
 def _each(t: Tensors, call: str, sizes: tuple[int, ...], *views: View) -> None:
     """A function of algebra.h for every matrix of a batch; ``sizes`` are the numbers of each matrix."""
-    many = views[0].meta.shape[:-2].numel()
+    many, call = views[0].meta.shape[:-2].numel(), call.replace("(", f"{suffix(views[0].meta.dtype)}(", 1)
     places = [f"&{v.buffer.name}[{v.meta.storage_offset()}+b*{n}]" for v, n in zip(views, sizes)]
     t.block.write(f"for (int b = 0; b < {many}; b++) {call}{', '.join(places)});", *views)
 
@@ -179,6 +182,19 @@ def _solved_by_factor(t: Tensors, node: Node, B: Any, L: Any, upper: bool = Fals
     out = t.block.new(b.meta.shape, b.meta.dtype)
     m, n = b.meta.shape[-2:]
     _each(t, f"back({m}, {n}, ", (m * m, m * n, m * n), factor, b, out)
+    return out
+
+
+def _solved_triangle(
+    t: Tensors, node: Node, L: Any, B: Any, *, upper: bool, left: bool = True, unitriangular: bool = False
+) -> View:
+    """L X = B, L lower triangular. InputError for another form."""
+    if upper or not left or unitriangular:
+        raise InputError(f"this filter solves a triangular system other than L X = B, which {UNKNOWN}")
+    factor, b = t.dense(L), t.dense(B)
+    out = t.block.new(b.meta.shape, b.meta.dtype)
+    m, n = b.meta.shape[-2:]
+    _each(t, f"forward({m}, {n}, ", (m * m, m * n, m * n), factor, b, out)
     return out
 
 
@@ -215,7 +231,7 @@ def _indexed(t: Tensors, node: Node, x: Any, indices: list) -> View:
 
 def _put(t: Tensors, node: Node, x: Any, indices: list, values: Any, accumulate: bool = False) -> View:
     """x[…, i, j, …] = values, or += of a copy."""
-    view, told, (out, _) = t.tensor(x), t.tensor(values), _new(t, node)
+    view, outputs, (out, _) = t.tensor(x), t.tensor(values), _new(t, node)
     t.block.over(out, "{0}", [view])
     chosen = [t.tensor(i).meta for i in indices if i is not None]
     shape = torch.broadcast_shapes(*(i.shape for i in chosen))
@@ -223,9 +239,9 @@ def _put(t: Tensors, node: Node, x: Any, indices: list, values: Any, accumulate:
     sizes = [*view.meta.shape[:first], *shape, *view.meta.shape[first + len(chosen) :]]
     names = _names(len(sizes))
     target, given = _places(t, view, indices, names)
-    wide = told.viewed(told.meta.expand(sizes))
+    wide = outputs.viewed(outputs.meta.expand(sizes))
     sign = "+=" if accumulate else "="
-    t.block.write(f"{_loops(names, sizes)}{out.at(target)} {sign} {wide.at(names)};", out, told, *given)
+    t.block.write(f"{_loops(names, sizes)}{out.at(target)} {sign} {wide.at(names)};", out, outputs, *given)
     return out
 
 
@@ -315,6 +331,7 @@ WHOLE: dict[str, Callable[..., Any]] = {
     "linalg_vector_norm": _norm, "cumsum": _summed_up, "mm": _product, "bmm": _product, "addmm": _added_product,
     "baddbmm": _added_product, "_linalg_solve_ex": _solved, "linalg_solve_ex": _solved,
     "linalg_cholesky_ex": _factored, "cholesky_solve": _solved_by_factor, "linalg_inv_ex": _inverted,
+    "linalg_solve_triangular": _solved_triangle,
     "linalg_cross": _crossed, "index_select": _picked, "index": _indexed, "index_put": _put, "gather": _gathered,
     "argmax": _largest, "convolution": _convolved, "constant_pad_nd": _padded, "repeat": _repeated,
 }  # fmt: skip

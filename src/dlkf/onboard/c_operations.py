@@ -20,7 +20,7 @@ def literal(x: Any, dtype: torch.dtype) -> str:
     if isinstance(x, bool):
         return str(int(x))
     if isinstance(x, int):
-        return f"{x}.0" if dtype.is_floating_point else str(x)
+        return f"{x}.0{suffix(dtype)}" if dtype.is_floating_point else str(x)
     if math.isnan(x):
         return "NAN"
     if math.isinf(x):
@@ -65,12 +65,16 @@ def _clamped(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
 def _power(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
     x, n = args[:2]
     if not isinstance(n, Tensor) and n in (2, 3):
-        return "square({0})" if n == 2 else "cube({0})", [x]
-    return "pow({0}, {1})", [x, n]
+        return f"{'square' if n == 2 else 'cube'}{suffix(dtype)}({{0}})", [x]
+    return f"pow{suffix(dtype)}({{0}}, {{1}})", [x, n]
 
 
 def _sigmoid(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
     return f"1 / (1 + exp{suffix(dtype)}(-{{0}}))", args
+
+
+def _root(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
+    return f"1 / sqrt{suffix(dtype)}({{0}})", args
 
 
 def _leaky(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
@@ -91,8 +95,9 @@ def _first(pattern: str) -> Pattern:
 
 BY_ELEMENT: dict[str, Pattern] = {
     "add": _scaled("+"), "sub": _scaled("-"), "mul": "{0} * {1}", "div": "{0} / {1}", "neg": "-{0}",
-    "reciprocal": "1 / {0}", "pow": _power, "square": "square({0})", "rsqrt": "1 / sqrt({0})",
-    "sqrt": _function("sqrt"), "exp": _function("exp"), "log": _function("log"), "log1p": _function("log1p"),
+    "reciprocal": "1 / {0}", "pow": _power, "square": _function("square"), "rsqrt": _root,
+    "sqrt": _function("sqrt"), "exp": _function("exp"), "erf": _function("erf"), "log": _function("log"),
+    "log1p": _function("log1p"),
     "sin": _function("sin"), "cos": _function("cos"), "asin": _function("asin"), "asinh": _function("asinh"),
     "atan2": _function("atan2"), "tanh": _function("tanh"), "hypot": _function("hypot"), "floor": _function("floor"),
     "abs": _function("fabs"), "sigmoid": _sigmoid, "leaky_relu": _leaky, "relu": "({0} > 0 ? {0} : 0)",

@@ -1,78 +1,222 @@
-"""A filter as C: the functions of :mod:`dlkf.onboard.functions` in one file, its header, and what made them."""
+"""A filter as C: the functions of :mod:`dlkf.onboard.functions`, Python's constants for the core, a description.
+
+The core itself (``core/``) is written by hand and the same for every filter; ``step.c``, ``weights.c``, ``step.h`` and
+``constants.h`` are generated.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 import warnings
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
+from dlkf.data import aids, alignment, limits, resampling
+from dlkf.data.aid_tables import LAST
+from dlkf.data.validate import LIMITS
+from dlkf.filters.aids.attach import aid_columns, tables_of
 from dlkf.filters.integration import Estimator
-from dlkf.navigation import compiled
+from dlkf.navigation import compiled, earth
 from dlkf.onboard.c_code import KEPT, Translation
 from dlkf.onboard.c_memory import C_TYPES, Block
 from dlkf.onboard.carried import Layout
-from dlkf.onboard.functions import FIX, ROW, TOLD, Anchor, Begin, Function, Grid, Read, Row, Turn, carried_by
+from dlkf.onboard.functions import (
+    OUTPUTS,
+    ROW,
+    START,
+    Anchor,
+    Carry,
+    Function,
+    Grid,
+    Row,
+    Start,
+    Turn,
+    carried_state,
+    fix_numbers,
+    output_numbers,
+)  # fmt: skip
+from dlkf.onboard.headings import Headings, heading_functions
 from dlkf.onboard.meanings import of_column
+from dlkf.running import imu_stream, streaming
 from dlkf.running.reanchoring import can_reanchor
-from dlkf.running.streaming import ANCHOR_M
+from dlkf.running.start import LOOKBACK_S, bank, standstill
 
-CPP = Path(__file__).parent / "cpp"
-IN_A_FILE = 4096  # constants of more numbers than that lie beside the source
+CORE = Path(__file__).parent / "core"
+EXAMPLES = Path(__file__).parent / "examples"
+CORE_FILES = ("dlkf.h", "dlkf.c", "samples.c", "align.c", "search.c", "aids.c", "limits.c", "geometry.h")
+IN_A_FILE = 4096  # constants of more numbers than that go to weights.c
+COLUMNS = ("t", "revised", *ROW)  # of a row of the core; then those of further sensors
+ANCHOR_M = {torch.float64: streaming.ANCHOR_M, torch.float32: 1000.0}  # where float resolves 0.1 mm
+
+
+class Written(NamedTuple):
+    """C of one function, its large constants, and the bytes that it works in."""
+
+    code: str
+    weights: str
+    work: int
+
+
+UNUSED = """#if defined(__GNUC__)
+#define DLKF_UNUSED __attribute__((unused)) /* of helpers and constants that this filter does without */
+#else
+#define DLKF_UNUSED
+#endif"""
 
 
 def write_source(
     folder: Path, estimator: Estimator, grid: Grid, name: str, made: dict[str, Any], *, loop_alone: bool = False
 ) -> Layout:
-    """``step.c``, ``step.h``, the large constants, and ``step.json``, which describes them.
+    """``step.c``, ``weights.c``, ``step.h``, and with them the core and ``step.json``, which describes the numbers.
 
     ``loop_alone`` leaves out what turns fixes and solutions into those of a vehicle, which takes most of the time.
     Raises InputError for a filter that cannot be exported.
     """
     with exporting():
-        layout = carried_by(estimator, grid)
+        layout = carried_state(estimator, grid)
         functions: dict[str, type[Function]] = {"turn": Turn}
         if not loop_alone:
-            functions |= {"begin": Begin, "read": Read, "row": Row}
+            functions |= {"start": Start, "row": Row, "carry": Carry}
             if can_reanchor(layout.like.memory):
                 functions["anchor"] = Anchor
-        parts = [(CPP / "algebra.h").read_text()]
-        for function, kind in functions.items():
-            parts.append(function_in_c(f"dlkf_{function}", kind(estimator, grid, layout).eval(), folder))
-    parts.append((CPP / "run.c.in").read_text())
-    if not loop_alone:
-        parts.append((CPP / "step.c.in").read_text())
-    header = (CPP / "step.h.in").read_text()
-    values = {
-        "NAME": name, "MEMORY": layout.size, "SAMPLES": grid.samples, "RATE_HZ": repr(1 / grid.dt),
-        "EPOCHS": Begin(estimator, grid, layout).epochs, "FIX": len(FIX), "ROW": len(ROW), "TOLD": sum(TOLD.values()),
-        "ANCHOR_M": f"{ANCHOR_M if 'anchor' in functions else 1e12:g}",
-        "FIX_COLUMNS": ", ".join(f"DLKF_FIX_{c.upper()}" for c in FIX),
-        "ROW_COLUMNS": ", ".join(f"DLKF_{c.upper()}" for c in ROW),
-        "ANCHOR": "void dlkf_anchor(const double *memory, double *memory_out);" if "anchor" in functions else
-        "static inline void dlkf_anchor(const double *memory, double *memory_out) { (void)memory; (void)memory_out; }",
-    }  # fmt: skip
-    for key, value in values.items():
-        header = header.replace(f"@{key}@", str(value))
+        done = {f: function_in_c(f"dlkf_{f}", kind(estimator, grid, layout).eval()) for f, kind in functions.items()}
+    anchor = "" if "anchor" in done else (CORE / "no_anchor.c.in").read_text()
+    loop = (CORE / "run.c.in").read_text()
+    parts = [heading(), *(x.code for x in done.values()), loop, anchor]
     (folder / "step.c").write_text("\n".join(parts))
-    (folder / "step.h").write_text(header)
-    fix, row = ([{"name": c, "place": k, "meaning": of_column(c)} for k, c in enumerate(cs)] for cs in (FIX, ROW))
+    large = "".join(x.weights for x in done.values())
+    (folder / "weights.c").write_text(f"/* Weights of the filter, made by dlkf.export. */\n#include <math.h>\n{large}")
+    of_search = Headings.none() if loop_alone else _headings(grid.samples, grid.dt)
+    values = _sizes(estimator, layout, grid, name, max(x.work for x in done.values()), "anchor" in done)
+    room = max(int(values["WORK"]), -(-of_search.work // 8) + 2 * of_search.size)
+    values |= {"WORK": room, **of_search.sizes(), **_aids(estimator)}
+    (folder / "step.h").write_text(_filled((CORE / "step.h.in").read_text(), values))
+    if loop_alone:
+        return layout
+    (folder / "heading.c").write_text(heading() + of_search.code)
+    (folder / "constants.h").write_text(constants())
+    for file in CORE_FILES:
+        (folder / file).write_text((CORE / file).read_text())
     described = {
-        "model": name, "rate_hz": 1 / grid.dt, "epoch_s": grid.epoch_s, "fix": fix, "row": row,
+        "model": name, "rate_hz": 1 / grid.dt, "epoch_s": grid.epoch_s,
+        "row": [{"name": c, "place": k, "meaning": of_column(c)} for k, c in enumerate(columns_of(estimator))],
         "memory": {"numbers": layout.size, "type": "float64", "fields": [f.plain() for f in layout.fields]}, **made,
     }  # fmt: skip
     (folder / "step.json").write_text(json.dumps(described, indent=1, ensure_ascii=False) + "\n")
     return layout
 
 
-def function_in_c(name: str, function: Function, folder: Path) -> str:
-    """C of a function; its large constants become files in ``folder``."""
+@lru_cache
+def _headings(samples: int, dt: float) -> Headings:
+    """``heading.c``, which is the same for every filter of a grid."""
+    with exporting():
+        layout, functions = heading_functions(Grid(samples, dt))
+        done = [function_in_c(f"dlkf_heading_{name}", x) for name, x in functions.items()]
+    return Headings.of(layout, "\n".join(x.code for x in done), max(x.work for x in done))
+
+
+def heading() -> str:
+    """What stands before the functions of ``step.c``."""
+    algebra = (CORE / "algebra.c.in").read_text()
+    kinds = ({"REAL": "double", "F": ""}, {"REAL": "float", "F": "f"})
+    include = "\n".join(f"#include {name}" for name in ("<math.h>", "<stdint.h>", "<string.h>", '"step.h"'))
+    made = "/* Made by dlkf.export; do not edit: the equations are in the Python package. */"
+    return "\n".join((made, include, UNUSED, "", *(_filled(algebra, kind) for kind in kinds)))
+
+
+def _sizes(estimator: Estimator, layout: Layout, grid: Grid, name: str, work: int, can_anchor: bool) -> dict[str, Any]:
+    """What ``step.h`` is filled with."""
+    place = {f.name: f.offset for f in layout.fields}
+    window_s, columns = alignment.SEARCH.window_s, columns_of(estimator)
+    lookback = math.ceil(max(LOOKBACK_S, window_s + alignment.FIT_S) / grid.epoch_s) + 2
+    layout_of = f"{name} {grid} {layout.size} {[(f.name, f.shape) for f in layout.fields]} {columns}"
+    return {
+        "NAME": name, "MEMORY": layout.size, "SAMPLES": grid.samples, "RATE_HZ": repr(1 / grid.dt),
+        "RATE_MILLIHZ": round(1e3 / grid.dt), "LOOKBACK": lookback,
+        "LEVELLED": max(1, round(window_s / grid.epoch_s)), "FITTED": max(2, round(alignment.FIT_S / grid.epoch_s)),
+        "REST": round(LOOKBACK_S / grid.epoch_s), "STILL": max(1, round(standstill.SHORTEST_REST_S / grid.epoch_s)),
+        "TAIL": max(1, min(grid.samples, round(alignment.RATE_AVERAGE_S / grid.dt))),
+        "FIX": fix_numbers(estimator), "START": START, "OUTPUTS": output_numbers(estimator),
+        "POSTERIOR": OUTPUTS["prior"], "COLUMNS": len(columns),
+        "WORK": -(-work // 8) + max(layout.size, 6 * grid.samples),
+        "INNOVATION": sum(OUTPUTS[k] for k in ("prior", "posterior", "error", "std")),
+        "AT_ORIGIN": place["frame.origin_e"], "AT_AXES": place["frame.C_en"], "AT_HEIGHT": place["frame.height"],
+        "ANCHOR_M": f"{ANCHOR_M[grid.dtype] if can_anchor else 1e12:g}",
+        "FINGERPRINT": f"0x{zlib.crc32(layout_of.encode()):08x}u",
+        "STRINGS": ", ".join(f'"{c}"' for c in columns),
+        "NAMES": ", ".join(f"DLKF_{c.upper()}" for c in columns),
+    }  # fmt: skip
+
+
+def columns_of(estimator: Estimator) -> tuple[str, ...]:
+    """Of a row: :data:`COLUMNS`, and what the filter says of further sensors."""
+    return (*COLUMNS, *aid_columns(estimator))
+
+
+def _aids(estimator: Estimator) -> dict[str, object]:
+    """What ``step.h`` says of further sensors."""
+    tables = tables_of(estimator)
+    return {
+        "AIDS": len(tables), "AID_NAMES": ", ".join(f'"{t.name}"' for t in tables) or '""',
+        "AID_LAST": ", ".join(str(int(t.reduce == LAST)) for t in tables) or "0",
+    }  # fmt: skip
+
+
+def constants() -> str:
+    """``constants.h``: what the core shares with the Python stream, from there."""
+    rows = []
+    for quality in range(max(resampling.DEFAULT_STD) + 1):
+        std = resampling.default_std(quality) if quality in resampling.DEFAULT_STD else (0.0,) * 6
+        rows.append("{" + ", ".join(map(repr, std)) + "}")
+    values: dict[str, float] = {
+        "PI": math.pi,
+        "GAP_S": LIMITS.gap_s, "GAP_SAMPLES": LIMITS.gap_samples,
+        "FULL_SCALE_ACCEL": limits.FULL_SCALE[0], "FULL_SCALE_GYRO": limits.FULL_SCALE[1],
+        "LOWEST_M": limits.HEIGHTS_M[0], "HIGHEST_M": limits.HEIGHTS_M[1],
+        "ESTIMATE_LOWEST_M": limits.ESTIMATE_HEIGHTS_M[0], "ESTIMATE_HIGHEST_M": limits.ESTIMATE_HEIGHTS_M[1],
+        "ASTRAY_S": imu_stream.ASTRAY_S, "BEFORE": imu_stream.BEFORE, "SETTLE_S": streaming.SETTLE_S,
+        "ON_BOUNDARY_S": resampling.ON_BOUNDARY_S, "SMALLEST_STD": resampling.SMALLEST_STD,
+        "MIN_SPEED": alignment.SEARCH.min_speed, "RATE_AVERAGE_S": alignment.RATE_AVERAGE_S,
+    }  # fmt: skip
+    values |= {"REST_SPREAD_ACCEL": standstill.REST_SPREAD[0], "REST_SPREAD_GYRO": standstill.REST_SPREAD[1]}
+    for module, names in (
+        (aids, ("SEA_LEVEL_PA", "SCALE_M", "EXPONENT")),
+        (bank, ("RING", "REVERSE_PRIOR", "REVERSE_SPEED", "RING_PRIOR", "COARSE", "NIS_CAP", "DECIDED", "OTHER",
+                "READY_STD", "OVERBOUND")),
+        (standstill, ("REST_RATE", "REST_SPEED", "REST_POSITION_STD", "RATE_STD", "RATE_DRIFT_STD", "RATE_SCALE_STD")),
+        (alignment, ("SIDESLIP_STD", "AXLE_STD", "ACCEL_BIAS_STD", "UNKNOWN_VELOCITY_STD", "UNKNOWN_SLOPE_STD",
+                     "JERK_STD", "SPREAD_STD", "ACCELERATION_STD", "GYRO_BIAS_STD", "FIT_STD", "FIT_S")),
+        (earth, ("SEMI_MAJOR", "SEMI_MINOR", "ECCENTRICITY_SQ", "EARTH_RATE", "GRAVITY_EQUATOR", "SOMIGLIANA",
+                 "GRAVITATIONAL_CONSTANT", "STANDARD_GRAVITY")),
+        (limits, ("FASTEST_M_S", "STEEPEST_M_S", "JUMP_M", "JUMP_SIGMAS", "MOST_JUMP_STD_M", "LARGEST_STD",
+                  "NOWHERE_DEG", "FROZEN_SPEED_M_S", "FROZEN_M", "AGREEING_FIXES", "AGREEING_S", "ESTIMATE_M_S",
+                  "LOST_M", "LOST_SIGMAS", "LOST_FIXES", "LOST_S", "EARTH_M")),
+    ):  # fmt: skip
+        values |= {name: getattr(module, name) for name in names}
+    lines = [f"#define {name} ({value!r})" for name, value in values.items()]
+    said = "/* Constants of the Python package, made by dlkf.export; do not edit. */"
+    head = f"{said}\n#ifndef DLKF_CONSTANTS_H\n#define DLKF_CONSTANTS_H\n"
+    table = f"#define QUALITIES {len(rows)}\n#define DEFAULT_STD_ROWS {{{', '.join(rows)}}}"
+    return "\n".join((head, *lines, table, "\n#endif\n"))
+
+
+def _filled(text: str, values: Mapping[str, object]) -> str:
+    for key, value in values.items():
+        text = text.replace(f"@{key}@", str(value))
+    return text
+
+
+def function_in_c(name: str, function: Function) -> Written:
+    """C of a function that works in memory it is given."""
     try:
         program = torch.export.export(function, function.example(), strict=False)
     except Exception as error:
@@ -89,37 +233,39 @@ def function_in_c(name: str, function: Function, folder: Path) -> str:
             f"for (int i = 0; i < {dense.meta.numel()}; i++) out{k}[i] = {dense.buffer.name}[{start}+i];", dense
         )
     size = block.laid_out()
-    places = [
-        f"{C_TYPES[b.dtype]} *{b.name} = ({C_TYPES[b.dtype]} *)(block + {block.places[b.name]});" for b in block.buffers
-    ]
-    body = [f"unsigned char block[{size}] __attribute__((aligned(64)));", *places, *block.lines]
-    head = f"void {name}({', '.join(arguments)}) {{"
-    constants = list(_constants(name, block, folder))
+    places = [f"{C_TYPES[b.dtype]} *{b.name} = (void *)(block + {block.places[b.name]});" for b in block.buffers]
+    body = ["unsigned char *block = (unsigned char *)work;", *places, *block.lines]
+    head = f"void {name}({', '.join([*arguments, 'double *restrict work'])}) {{"
+    own, large = _constants(name, block)
+    unused = [f"(void){b.name};" for b in inputs]
     forget = [f"#undef {buffer.name}" for buffer, _ in block.constants]
-    return "\n".join((*constants, head, *(f"  {line}" for line in body), "}", *forget, ""))
+    code = "\n".join((*own, head, *(f"  {line}" for line in (*unused, *body)), "}", *forget, ""))
+    return Written(code, "".join(f"{line}\n" for line in large), size)
 
 
-def _constants(name: str, block: Block, folder: Path) -> Iterator[str]:
+def _constants(name: str, block: Block) -> tuple[list[str], list[str]]:
+    """Those that stand beside the function, and those that are weights."""
+    own, large = [], []
     for buffer, values in block.constants:
-        kind, own = C_TYPES[buffer.dtype], f"{name}_{buffer.name}"
+        kind, label = C_TYPES[buffer.dtype], f"{name}_{buffer.name}"
+        head = f"const {kind} {label}[{max(1, values.size)}]"
+        numbers = ", ".join(map(_number, values)) or "0"
         if values.size > IN_A_FILE:
-            values.tofile(folder / f"{own}.bin")
-            yield f"extern const {kind} {own}[{values.size}];"
-            yield (
-                f'__asm__(".section .rodata\\n.balign 64\\n.hidden {own}\\n.globl {own}\\n{own}:\\n'
-                f'.incbin \\"{own}.bin\\"\\n.previous\\n");'
-            )
+            own.append(f"extern {head};")
+            large += [f"extern {head};", f"{head} = {{{numbers}}};"]
         else:
-            numbers = ", ".join(map(_number, values)) or "0"
-            yield f"static const {kind} {own}[{max(1, values.size)}] = {{{numbers}}};"
-        yield f"#define {buffer.name} {own}"
+            own.append(f"DLKF_UNUSED static {head} = {{{numbers}}};")
+        own.append(f"#define {buffer.name} {label}")
+    return own, large
 
 
 def _number(x: np.generic) -> str:
-    if isinstance(x, (np.bool_, np.integer)):
+    if x.dtype.kind in "biu":
         return str(int(x))
     value = float(x)
-    return repr(value) if np.isfinite(value) else "NAN" if np.isnan(value) else f"{'-' if value < 0 else ''}INFINITY"
+    if not np.isfinite(value):
+        return "NAN" if np.isnan(value) else f"{'-' if value < 0 else ''}INFINITY"
+    return f"{x!s}f" if x.dtype == np.float32 else repr(value)
 
 
 @contextmanager

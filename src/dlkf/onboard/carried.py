@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 from dlkf.navigation.error_model import WindowModel
 from dlkf.onboard.meanings import of_field
 

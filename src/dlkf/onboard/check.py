@@ -9,27 +9,31 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from dlkf.data.alignment import ALIGN
+from dlkf.base.errors import InputError
+from dlkf.data.aid_tables import STANDARD
+from dlkf.data.aids import aid_values
+from dlkf.data.alignment import SEARCH
 from dlkf.data.drive import Drive
-from dlkf.data.resampling import ON_BOUNDARY_S, Grid, boundary_after, usable_fixes
-from dlkf.data.schema import POSITION, STD, VELOCITY
+from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
 from dlkf.data.segments import whole_drives
-from dlkf.data.validate import DriveTables
-from dlkf.errors import InputError
+from dlkf.data.validate import CheckedTables
 from dlkf.filters.integration import Estimator, Fix, advance
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import SEMI_MAJOR
 from dlkf.navigation.state import NavState
+from dlkf.onboard.c_source import COLUMNS as CORE_COLUMNS
 from dlkf.onboard.carried import Layout
 from dlkf.onboard.compiled_filter import CompiledFilter
-from dlkf.onboard.functions import FIX, ROW, Begin
-from dlkf.onboard.functions import Grid as Samples
+from dlkf.onboard.core import Core
+from dlkf.onboard.functions import Grid, output_numbers
 from dlkf.onboard.library import Library, build
 from dlkf.running.batched import run_filter
+from dlkf.running.replay import replay_drive
 from dlkf.running.solution import COLUMNS, solution_columns
 from dlkf.running.start import align, aligned_drives
 
-FARTHEST_M = 1e-3  # m: float32 of a network beside its own rounding over minutes
+# m: float32 of a network beside its own rounding over minutes; of everything
+FARTHEST_M = {torch.float64: 1e-3, torch.float32: 0.05}
 WARM = 20  # epochs that are not timed
 TIMED = 600  # epochs at most
 KINDS = {  # columns that have one unit
@@ -66,67 +70,54 @@ class Latency(NamedTuple):
         return cls(*(1e3 * float(np.quantile(seconds, q)) for q in (0.5, 0.99)))
 
 
-def vehicle_run(library: Library, drive: Drive, fixes: np.ndarray, epochs: int) -> tuple[int, np.ndarray]:
-    """A drive as a vehicle runs it, through ``step.h`` alone: the first epoch, and its rows (T, :data:`ROW`).
+def core_run(core: Core, tables: CheckedTables) -> np.ndarray:
+    """The rows of the core over a drive, fixes and further sensors at their own times (T, columns of the core).
 
-    ``fixes`` (N + 1, :data:`FIX`) are those of the boundaries, ``epochs`` what an alignment takes.
+    InputError where there are none.
     """
-    imu, told = drive.imu.double().contiguous(), torch.from_numpy(fixes)
-    memory, rows, first = None, [], 0
-    for k in range(drive.epochs):
-        if memory is None:
-            if k >= epochs:
-                memory, ready = library.begin(
-                    imu[None, k - epochs : k].contiguous(), told[None, k - epochs : k + 1].contiguous(),
-                    drive.lever_arm_b[None].contiguous(),
-                )  # fmt: skip
-                memory, first = (memory, k) if ready else (None, 0)
-            if memory is None:
-                continue
-        memory, row = library.step(memory, imu[k : k + 1], told[k + 1 : k + 2])
-        rows.append(row[0].numpy())
+    sent = replay_drive(core, tables.imu, tables.gnss, None, tables.aids)
+    rows = [row for receipt in sent for row in receipt.rows]
     if not rows:
-        raise InputError(f"drive {drive.name}: never moves under GNSS, so nothing can be checked on it")
-    return first, np.stack(rows)
+        raise InputError(f"drive {tables.row.name}: never gives a filter a start, so nothing can be checked on it")
+    return np.stack(rows)
 
 
-def boundary_fixes(tables: DriveTables, drive: Drive) -> np.ndarray:
-    """(N + 1, :data:`FIX`) what a receiver said for each boundary; NaN for nothing."""
-    gnss, grid = tables.gnss, Grid(drive.t0, drive.epoch_s, drive.epochs, drive.imu.shape[1])
-    rows = np.full((drive.epochs + 1, len(FIX)), np.nan)
-    place = boundary_after(gnss["t"], grid)
-    good = np.flatnonzero(usable_fixes(gnss) & (place >= 0) & (place <= drive.epochs))
-    values = np.stack([gnss[c] for c in (*POSITION, *VELOCITY, *STD, "quality")], -1).astype(float)
-    lag = grid.boundaries[place[good]] - gnss["t"][good]
-    rows[place[good]] = np.column_stack((values[good], np.where(lag <= ON_BOUNDARY_S, 0.0, lag)))
-    return rows
+def core_of(library: Library, tables: CheckedTables, drive: Drive) -> Core:
+    """A core on the grid of a loaded drive."""
+    step_s = float(np.median(np.diff(tables.imu["t"])))
+    return Core(library.path, tables.row.lever_arm_b, phase_s=drive.t0, imu_step_s=step_s)
 
 
-def write_log(path: Path, tables: DriveTables, drive: Drive) -> None:
-    """A drive as lines for the example: ``imu,t,accel (3),gyro (3)`` and ``gnss,t,…`` in order of time."""
-    samples = drive.imu.flatten(0, 1).numpy()
-    t = drive.t0 + np.arange(1, len(samples) + 1) / drive.rate_hz
-    lines = [(s, 1, "imu", [s, *x]) for s, x in zip(t.tolist(), samples.tolist())]
-    gnss = tables.gnss
-    values = np.stack([gnss[c] for c in ("t", *POSITION, *VELOCITY, *STD, "quality")], -1)
-    inside = usable_fixes(gnss) & (gnss["t"] >= drive.t0 - ON_BOUNDARY_S)
-    lines += [(x[0], 0, "gnss", x) for x in values[inside].tolist()]  # before the sample that ends an epoch
-    lines.sort(key=lambda line: (line[0] - ON_BOUNDARY_S * (1 - line[1]), line[1]))
-    path.write_text("".join(f"{kind},{','.join(f'{v:.17g}' for v in x)}\n" for *_, kind, x in lines))
+def write_log(path: Path, tables: CheckedTables) -> None:
+    """A drive as lines for the example: ``imu,t,accel (3),gyro (3)``, ``gnss,t,…``, ``speed,t,…`` in order of time."""
+    imu, gnss = tables.imu, tables.gnss
+    samples = np.stack([imu[c] for c in ("t", *ACCEL, *GYRO)], -1)
+    fixes = np.stack([gnss[c] for c in ("t", *POSITION, *VELOCITY, *STD, "quality")], -1)
+    lines = [(x[0], kind, x) for kind, rows in (("gnss", fixes), ("imu", samples)) for x in rows.tolist()]
+    for name, columns in tables.aids.items():
+        value = aid_values(STANDARD[name], columns)
+        std = columns.get("std", np.full(len(value), np.nan))
+        lines += [(x[0], "aid", (name, *x)) for x in zip(columns["t"].tolist(), value.tolist(), std.tolist())]
+    lines.sort(key=lambda line: line[:2])  # a fix before a sample of the same time
+    named = ((x[0], x[1:]) if kind == "aid" else (kind, x) for _, kind, x in lines)
+    path.write_text("".join(f"{kind},{','.join(f'{v:.17g}' for v in x)}\n" for kind, x in named))
 
 
-def difference(estimator: Estimator, library: Library, tables: DriveTables, drive: Drive, epochs: int) -> Difference:
-    """The exported filter against a batch run of the original on one drive, each from its own alignment.
+def difference(estimator: Estimator, library: Library, tables: CheckedTables, drive: Drive) -> Difference:
+    """The core over a drive as it is against a batch run of the original, each from its own alignment.
 
     Raises InputError where the drive never moves under GNSS.
     """
-    first, rows = vehicle_run(library, drive, boundary_fixes(tables, drive), epochs)
-    batch = whole_drives([drive], [align(drive, ALIGN, earliest=first)])
+    rows = core_run(core_of(library, tables, drive), tables)
+    batch = whole_drives([drive], [align(drive, SEARCH)])
     found = run_filter(batch, estimator)
     state = NavState(*(x[0] for x in found.posterior))
     std = None if found.std is None else found.std[0]
     table = solution_columns(torch.arange(len(rows)), batch.frame, state, found.imu_error[0], std)
-    mine = dict(zip(ROW, rows.T))
+    later = len(rows) - found.posterior.p_n.shape[1]
+    if later:
+        raise InputError(f"drive {tables.row.name}: the core starts {abs(later)} update intervals from the original")
+    mine = dict(zip(CORE_COLUMNS, rows.T))
     apart = {c: np.abs(mine[c] - table[c].numpy()) for c in COLUMNS[1:]}
     apart["lat_deg"] = np.radians(apart["lat_deg"]) * SEMI_MAJOR
     apart["lon_deg"] = np.radians(apart["lon_deg"]) * SEMI_MAJOR * np.cos(np.radians(mine["lat_deg"]))
@@ -143,8 +134,8 @@ def latencies(compiled: CompiledFilter, drive: Drive) -> dict[str, Latency]:
 
 
 def epoch_times(compiled: CompiledFilter, drive: Drive) -> dict[str, list[float]]:
-    """Seconds of epochs in Python, as torch runs them and compiled, in turns over one drive; the first few left out."""
-    batch = aligned_drives([drive], ALIGN)
+    """Seconds of epochs in Python, as torch runs them and compiled, interleaved; without the first few."""
+    batch = aligned_drives([drive])
     T = min(TIMED, batch.size[1])
     usable = batch.gnss_valid & batch.available.unsqueeze(-1)
     running = {}
@@ -165,18 +156,18 @@ def epoch_times(compiled: CompiledFilter, drive: Drive) -> dict[str, list[float]
     return {name: x[4][WARM:] for name, x in running.items()}
 
 
-def checked(
-    work: Path, folder: Path, estimator: Estimator, grid: Samples, layout: Layout, tables: DriveTables, drive: Drive,
+def check_export(
+    work: Path, folder: Path, estimator: Estimator, grid: Grid, layout: Layout, tables: CheckedTables, drive: Drive,
     latency: bool,
 ) -> list[str]:  # fmt: skip
     """Compile what was exported, run it beside the original; the findings as lines.
 
-    Raises InputError where they are farther apart than rounding.
+    Raises InputError where they are further apart than rounding.
     """
-    library = Library(build(folder, work), layout.size)
-    found = difference(estimator, library, tables, drive, Begin(estimator, grid, layout).epochs)
+    library = Library(build(folder, work), layout.size, output_numbers(estimator))
+    found = difference(estimator, library, tables, drive)
     lines = [f"against the original {found.text()}"]
-    if found.largest["position [m]"] > FARTHEST_M:
+    if found.largest["position [m]"] > FARTHEST_M[grid.dtype]:
         raise InputError(f"the exported filter is not the original: {found.text()}")
     if latency:
         for name, x in latencies(CompiledFilter(estimator, grid, layout, library), drive).items():

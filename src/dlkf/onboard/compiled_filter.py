@@ -1,7 +1,7 @@
 """A filter whose whole epoch is compiled code, in the place of the one that it was made of.
 
 It is made once for a machine, a filter and a grid, and kept in the user's cache (``$XDG_CACHE_HOME/dlkf``). What a
-model-based filter is told, IMU preset and factors, is in its memory and not in the code, so that one library serves all
+model-based filter is given, IMU preset and factors, is in its memory and not in the code, so one library serves all
 of them. It takes part where estimators do: in a batch, in a stream, in ``navigate``. It knows no gradients, no
 covariances but their diagonals, and no device but the CPU.
 """
@@ -22,19 +22,21 @@ import torch
 from torch import Tensor, nn
 
 import dlkf
+from dlkf.base.console import warn_once
+from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
-from dlkf.errors import InputError
+from dlkf.filters.aids.attach import tables_of
 from dlkf.filters.integration import Correction, Estimator, Fix, Solution, Step, WholeLoop, integrate
 from dlkf.filters.model_based import Mbkf
-from dlkf.filters.smoother import Filter, Smoothed
+from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import NavState
 from dlkf.onboard.c_source import write_source
 from dlkf.onboard.carried import Layout
-from dlkf.onboard.functions import Carried, Grid, carried_by, moved, packed_fix, split
+from dlkf.onboard.functions import Carried, Grid, carried_state, move_anchor, output_numbers, packed_fix, split
 from dlkf.onboard.library import FLAGS, LIBRARY, Library, build, compiler, machine
-from dlkf.running.reanchoring import FrameChange, can_reanchor, reanchored
+from dlkf.running.reanchoring import FrameChange, can_reanchor, reanchor
 
 MANY = 16  # drives from which on torch is faster than C where a network is large: measured with dlkf at 1 and 64
 LARGE = 1_000_000  # weights: more than the cache of a core holds
@@ -55,14 +57,17 @@ class FixedVector(NamedTuple):
 
 
 class CompiledFilter(WholeLoop):
-    """An :class:`dlkf.filters.integration.Estimator` that runs the loop itself; :func:`compiled_filter` makes one."""
+    """An :class:`dlkf.filters.integration.Estimator` that runs the loop itself; :func:`compile_filter` makes one."""
 
-    def __init__(self, estimator: Estimator, grid: Grid, layout: Layout, library: Library) -> None:
-        self.estimator, self.grid, self.layout, self.library = estimator, grid, layout, library
+    def __init__(
+        self, estimator: Estimator, grid: Grid, layout: Layout, library: Library, *, whole: bool = False
+    ) -> None:
+        self.estimator, self.grid, self.layout, self.library, self.whole = estimator, grid, layout, library, whole
+        self._aids = tables_of(estimator)
         self._vector = Vector if can_reanchor(layout.like.memory) else FixedVector
 
     def __reduce__(self) -> tuple[Callable, tuple]:
-        return compiled_filter, (self.estimator, 1 / self.grid.dt, self.grid.epoch_s)
+        return compile_filter, (self.estimator, 1 / self.grid.dt, self.grid.epoch_s, self.whole)
 
     def __getattr__(self, name: str) -> Any:
         """``config``, ``imu`` and the like are those of the filter that it was made of."""
@@ -88,43 +93,51 @@ class CompiledFilter(WholeLoop):
 
     def advance(self, memory: Vector | FixedVector, imu: Tensor, fix: Fix, frame: TangentFrame) -> tuple[Any, Step]:
         """One epoch of one drive."""
-        vector, told = self.library.turn(memory.numbers, imu.contiguous(), packed_fix(fix))
-        x = split(told)
+        vector, outputs = self.library.turn(memory.numbers, imu.contiguous(), packed_fix(fix, self._aids))
+        x = split(outputs)
         bias = self.layout.field("error.bias", vector)
         assert bias is not None
         error = ImuError(bias, self.layout.field("error.matrix", vector))
         std = x["std"] if self._has_std else None
-        speed = None if bool(x["speed"][0, 0].isnan()) else x["speed"]
-        answer = Correction(x["prior"].new_zeros(1, 9), error, std=std, accepted=x["used"][:, 0] > 0.5, speed=speed)
+        answer = Correction(x["prior"].new_zeros(1, 9), error, std=std, accepted=x["used"][:, 0] > 0.5)
+        answer = answer._replace(aids=x["aids"] if self._aids else None)
         step = Step(_state(x["prior"]), _state(x["posterior"]), error, x["innovation"], x["error"], answer)
         return memory._replace(numbers=vector), step
 
     def integrate(self, batch: Batch) -> Solution:
         """Whole drives, as many at a time as torch has threads; in the precision of the batch.
 
-        Many drives through a large network go through torch, which reads its weights once for all of them.
+        Beyond a drive's end its last state is repeated, without a fix. Many drives through a large network go through
+        torch, which reads its weights once for all of them.
         """
         if len(batch.imu) >= MANY and self._is_large:
             return integrate(batch, self.estimator)
         memory, _ = self.begin(batch)
         usable = batch.gnss_valid & batch.available.unsqueeze(-1)
         value, std = (x.flatten(0, 1).double() for x in (batch.gnss, batch.gnss_std))
-        fixes = packed_fix(Fix(value, std, usable.flatten(0, 1), batch.gnss_lag.flatten().double()))
+        aids = {name: x.flatten(0, 1).double() for name, x in batch.aids.items()}
+        fixes = packed_fix(Fix(value, std, usable.flatten(0, 1), batch.gnss_lag.flatten().double(), aids), self._aids)
         fixes, imu = fixes.unflatten(0, batch.size[:2]), batch.imu.double().contiguous()
 
+        epochs = batch.present.sum(1).tolist()
+
         def run(b: int) -> Tensor:
-            return self.library.run(memory.numbers[b : b + 1], imu[b], fixes[b])[1]
+            outputs = self.library.run(memory.numbers[b : b + 1], imu[b, : epochs[b]], fixes[b, : epochs[b]])[1]
+            return torch.cat((outputs, outputs[-1:].expand(imu.shape[1] - epochs[b], -1)))
 
         if len(imu) == 1 or torch.get_num_threads() == 1:
-            told = [run(b) for b in range(len(imu))]
+            outputs = [run(b) for b in range(len(imu))]
         else:
             with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-                told = list(pool.map(run, range(len(imu))))
-        x = split(torch.stack(told).to(batch.imu.dtype))
+                outputs = list(pool.map(run, range(len(imu))))
+        x = split(torch.stack(outputs).to(batch.imu.dtype))
         return Solution(
             prior=_state(x["prior"]), posterior=_state(x["posterior"]), imu_error=x["error"],
-            innovation=x["innovation"], used=x["used"][..., 0] > 0.5, std=x["std"] if self._has_std else None,
-            gain=None, speed=None if bool(x["speed"].isnan().all()) else x["speed"], innovation_std=x["innovation_std"],
+            innovation=x["innovation"] * batch.present.unsqueeze(-1), used=(x["used"][..., 0] > 0.5) & batch.present,
+            std=x["std"] if self._has_std else None, gain=None,
+            innovation_covariance=x["innovation_covariance"].unflatten(-1, (6, 6)),
+            position_covariance=x["position_covariance"].unflatten(-1, (2, 2)),
+            aids=x["aids"] if self._aids else None,
         )  # fmt: skip
 
     @cached_property
@@ -137,30 +150,31 @@ class CompiledFilter(WholeLoop):
         return any(f.name.endswith(".P") for f in self.layout.fields)
 
 
-@reanchored.register
+@reanchor.register
 def _(memory: Vector, change: FrameChange, fresh: Vector) -> Vector:
     """The whole memory."""
     f = memory.filter
-    x = moved(f.estimator, f.layout.unpack(memory.numbers), f.grid, change)
+    x = move_anchor(f.estimator, f.layout.unpack(memory.numbers), f.grid, change)
     return memory._replace(numbers=f.layout.pack(x))
 
 
-def compiled_filter(estimator: Filter, rate_hz: float, epoch_s: float) -> CompiledFilter:
+def compile_filter(estimator: Filter, rate_hz: float, epoch_s: float, whole: bool = False) -> CompiledFilter:
     """A filter compiled for a grid; from the cache where it has been made before.
 
-    Raises InputError where there is no C compiler, or the filter is smoothed or cannot be exported.
+    ``whole``: with the core of a vehicle round it (:mod:`dlkf.onboard.core`), which takes longer to make. Raises
+    InputError where there is no C compiler, or the filter is smoothed or cannot be exported.
     """
-    if isinstance(estimator, Smoothed):
+    if isinstance(estimator, SmoothedSolution):
         raise InputError("a smoothed filter runs in torch, which keeps its covariances; leave compiled=true out")
     grid = Grid(round(rate_hz * epoch_s), 1 / rate_hz)
-    folder = _cache() / _digest(estimator, grid)
+    folder = _cache() / (_digest(estimator, grid) + ("-core" if whole else ""))
     if not (folder / LIBRARY).is_file():
         if compiler() is None:
             build(folder)  # says so
         folder.parent.mkdir(parents=True, exist_ok=True)
         beside = Path(tempfile.mkdtemp(dir=folder.parent))
         try:
-            write_source(beside, estimator, grid, type(estimator).__name__, {}, loop_alone=True)
+            write_source(beside, estimator, grid, type(estimator).__name__, {}, loop_alone=not whole)
             build(beside)
             if not (folder / LIBRARY).is_file():
                 shutil.rmtree(folder, ignore_errors=True)
@@ -168,8 +182,18 @@ def compiled_filter(estimator: Filter, rate_hz: float, epoch_s: float) -> Compil
         finally:
             shutil.rmtree(beside, ignore_errors=True)
     with torch.no_grad():
-        layout = carried_by(estimator, grid)
-    return CompiledFilter(estimator, grid, layout, Library(folder / LIBRARY, layout.size))
+        layout = carried_state(estimator, grid)
+    library = Library(folder / LIBRARY, layout.size, output_numbers(estimator))
+    return CompiledFilter(estimator, grid, layout, library, whole=whole)
+
+
+def compile_or_keep(estimator: Estimator, rate_hz: float, epoch_s: float) -> Estimator:
+    """:func:`compile_filter`, or the filter itself where it cannot be compiled, with a line that says why."""
+    try:
+        return compile_filter(estimator, rate_hz, epoch_s)
+    except (InputError, OSError) as error:  # OSError: a cache that cannot be written, a library that cannot be loaded
+        warn_once(f"trials run in torch, some 3 × slower: {error}")
+        return estimator
 
 
 def _cache() -> Path:
@@ -181,7 +205,7 @@ def _package() -> Any:
     """Digest of this package."""
     made_of = hashlib.sha256()
     for file in sorted(Path(dlkf.__file__).parent.rglob("*")):
-        if file.suffix in (".py", ".h", ".in"):
+        if file.suffix in (".py", ".c", ".h", ".in"):
             made_of.update(file.read_bytes())
     return made_of
 
@@ -190,7 +214,8 @@ def _digest(estimator: Estimator, grid: Grid) -> str:
     """Of everything that the code depends on: this package, torch, the filter and its weights, grid, machine."""
     made_of = _package().copy()
     code = estimator.code if isinstance(estimator, Mbkf) else estimator
-    for part in (torch.__version__, machine(), str(compiler()), *FLAGS, repr(code), repr(grid)):
+    aids = tables_of(estimator)
+    for part in (torch.__version__, machine(), str(compiler()), *FLAGS, repr(code), repr(grid), repr(aids)):
         made_of.update(part.encode())
     if isinstance(estimator, nn.Module):
         made_of.update(repr(getattr(estimator, "config", "")).encode())

@@ -1,10 +1,10 @@
-"""A filter as functions of vectors, which is all that a vehicle needs of it.
+"""A filter as functions of vectors: the part of a vehicle's core that differs from filter to filter.
 
-    begin(imu, fixes, lever_arm_b) → memory, ready    where a car can be aligned
-    read(memory, fix)              → fix in n
-    turn(memory, imu, fix in n)    → memory, told     one epoch: ``dlkf.filters.integration.advance``
-    row(memory, told)              → row              latitude, longitude, …: a row of ``solution.parquet``
-    anchor(memory)                 → memory           the tangent frame follows the car
+    start(start, lever_arm_b)          → memory        a filter at a known position, velocity and attitude
+    turn(memory, imu, fix)             → memory, outputs  one update interval: ``dlkf.filters.integration.advance``
+    carry(memory, imu, share, outputs)    → outputs          the state within the next one
+    row(memory, outputs)                  → row           latitude, longitude, …: a row of ``solution.parquet``
+    anchor(memory)                     → memory        the tangent frame follows the car
 
 They call the same code as :class:`dlkf.running.streaming.StreamingFilter`, and nothing in them depends on data but
 through tensors, so that ``torch.export`` can take them. All numbers are float64, the first axis is that of drives.
@@ -12,36 +12,39 @@ through tensors, so that ``torch.export`` can take them. All numbers are float64
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from dlkf.data.alignment import ALIGN, align_boundaries
-from dlkf.data.drive import Batch, Drive
-from dlkf.data.resampling import DEFAULT_STD, SMALLEST_STD, default_std
-from dlkf.data.schema import POSITION, STD, VELOCITY
+from dlkf.data.aid_tables import AidTable
+from dlkf.data.aids import ROW as AID_ROW
+from dlkf.data.drive import Batch
+from dlkf.filters.aids.attach import aid_columns, tables_of
 from dlkf.filters.integration import Estimator, Fix, Step, advance
 from dlkf.navigation.calibration import ImuError
-from dlkf.navigation.earth import TangentFrame, ecef_from_geodetic, ned_axes, tangent_frame
-from dlkf.navigation.geodetic import geodetic_from_ecef
+from dlkf.navigation.earth import TangentFrame, tangent_frame
 from dlkf.navigation.state import NavState
+from dlkf.navigation.strapdown import strapdown
 from dlkf.onboard.carried import Layout
-from dlkf.running.reanchoring import FrameChange, frame_at, reanchored
+from dlkf.running.reanchoring import FrameChange, frame_at, reanchor
 from dlkf.running.solution import COLUMNS, solution_columns
 
-FIX = (*POSITION, *VELOCITY, *STD, "quality", "lag_s")  # NaN where a receiver says nothing; all NaN: no fix
-FIX_N = 19  # value (6), 1σ (6), used (6), lag
-TOLD = {
+START = 24  # latitude, longitude [rad], height [m], velocity (3), attitude (9), 1σ of position, velocity, attitude (9)
+FIX_N = 19  # value (6), 1σ (6), used (6), lag; then of each further sensor AID_N
+AID_N = len(AID_ROW)
+OUTPUTS = {
     "prior": 15,
     "posterior": 15,
     "error": 6,
     "std": 15,
     "innovation": 6,
-    "innovation_std": 6,
+    "innovation_covariance": 36,
+    "position_covariance": 4,
     "used": 1,
-    "speed": 2,
 }
 _PV = ("pos_n", "pos_e", "pos_d", "vel_n", "vel_e", "vel_d")
 ROW = (
@@ -51,10 +54,15 @@ ROW = (
 
 
 class Grid(NamedTuple):
-    """Samples of an epoch, and seconds of a sample."""
+    """Samples of an epoch, seconds of a sample, and the type that the filter computes in.
+
+    Memories, samples, fixes and rows are float64 in any case. In float32 positions are metres from an origin that is
+    never far (:data:`dlkf.onboard.c_source.ANCHOR_M`), and that origin, the axes there and rows stay float64.
+    """
 
     samples: int
     dt: float
+    dtype: torch.dtype = torch.float64
 
     @property
     def epoch_s(self) -> float:
@@ -72,20 +80,21 @@ class Carried(NamedTuple):
     lever_arm_b: Tensor
 
 
-def carried_by(estimator: Estimator, grid: Grid) -> Layout:
+def carried_state(estimator: Estimator, grid: Grid) -> Layout:
     """The layout of a filter's memory, from two epochs somewhere."""
-    ones = torch.ones(1, 9, dtype=torch.float64)
-    frame = tangent_frame(0.8 * ones[0, :1], 0.2 * ones[0, :1], 300 * ones[0, :1])
-    state = NavState(0 * ones[:, :3], ones[:, :3], torch.eye(3, dtype=torch.float64)[None])
+    ones = torch.ones(1, 9, dtype=grid.dtype)
+    frame = tangent_frame(0.8 * ones[0, :1], 0.2 * ones[0, :1], 300 * ones[0, :1], grid.dtype)
+    state = NavState(0 * ones[:, :3], ones[:, :3], torch.eye(3, dtype=grid.dtype)[None])
     imu = ones.new_tensor([0.0, 0.0, -9.81, 0.0, 0.0, 0.0]).expand(1, grid.samples, 6)
-    x = begun(estimator, frame, state, ones, ones[:, :3], grid)
+    x = begin_filter(estimator, frame, state, ones, ones[:, :3], grid)
     for _ in range(2):
-        fix = Fix(torch.cat((x.state.p_n, x.state.v_n), -1), ones[:, :6], ones[:, :6] > 0, 0 * ones[:, 0])
-        x, _ = advanced(estimator, x, imu, fix, grid)
+        aids = {table.name: ones[:, :AID_N] for table in tables_of(estimator)}
+        fix = Fix(torch.cat((x.state.p_n, x.state.v_n), -1), ones[:, :6], ones[:, :6] > 0, 0 * ones[:, 0], aids)
+        x, _ = advance_filter(estimator, x, imu, fix, grid)
     return Layout(x)
 
 
-def begun(
+def begin_filter(
     estimator: Estimator, frame: TangentFrame, state: NavState, std: Float[Tensor, "B 9"],
     lever_arm_b: Float[Tensor, "B 3"], grid: Grid,
 ) -> Carried:  # fmt: skip
@@ -103,8 +112,8 @@ def begun(
     return Carried(memory, state, ImuError.of(bias), frame, lever_arm_b)
 
 
-def advanced(estimator: Estimator, x: Carried, imu: Tensor, fix: Fix, grid: Grid) -> tuple[Carried, Step]:
-    """One turn of the loop."""
+def advance_filter(estimator: Estimator, x: Carried, imu: Tensor, fix: Fix, grid: Grid) -> tuple[Carried, Step]:
+    """One filter step."""
     memory, step = advance(
         estimator, x.memory, x.state, x.error, imu, fix, dt=grid.dt, frame=x.frame, lever_arm_b=x.lever_arm_b
     )
@@ -131,94 +140,114 @@ class Function(nn.Module):
         return self.layout.pack(self.layout.like)
 
 
-class Begin(Function):
-    """(1, W, M, 6) samples of the epochs that levelling takes, (1, W + 1, 14) fixes at their boundaries,
-    (1, 3) → memory at the last boundary, and whether the filter may start from it."""
-
-    @property
-    def epochs(self) -> int:
-        """W: those that are levelled over, and the one before, whose last samples tell the rate at their beginning."""
-        return max(1, round(ALIGN.window_s / self.grid.epoch_s)) + 1
+class Start(Function):
+    """(1, :data:`START`), (1, 3) → (1, K): the filter at a start."""
 
     def example(self) -> tuple[Tensor, ...]:
         """As in the class."""
-        shapes = (1, self.epochs, self.grid.samples, 6), (1, self.epochs + 1, len(FIX)), (1, 3)
-        return tuple(torch.ones(s, dtype=torch.float64) for s in shapes)
+        return torch.ones(1, START, dtype=torch.float64), torch.ones(1, 3, dtype=torch.float64)
 
-    def forward(self, imu: Tensor, fixes: Tensor, lever_arm_b: Tensor) -> tuple[Tensor, Tensor]:
-        """Align as :func:`dlkf.data.alignment.align_boundaries` does, and start there."""
-        r_e, v_e, std, known, lag = ecef(fixes[0])
-        unknown = torch.full_like(r_e, torch.nan)
-        drive = Drive(
-            name="", group="", dataset="", t0=0.0, epoch_s=self.grid.epoch_s, rate_hz=1 / self.grid.dt, imu=imu[0],
-            gnss_r_e=r_e, gnss_v_e=v_e, gnss_std=std, gnss_valid=known, gnss_lag=lag, quality=fixes[0, :, 12],
-            ref_r_e=unknown, ref_v_e=unknown, ref_C_eb=unknown, ref_valid=known[:, 0], ref_imu_error=unknown,
-            lever_arm_b=lever_arm_b[0],
-        )  # fmt: skip
-        found = align_boundaries(drive, ALIGN)
-        ok, r_e, v_e, C_eb, std = (x[-1:] for x in (found.ok, found.r_e, found.v_e, found.C_eb, found.std))
-        frame = tangent_frame(*geodetic_from_ecef(torch.where(ok.unsqueeze(-1), r_e, 3.7e6)))
-        C_ne = frame.C_en.mT
-        state = NavState(torch.zeros_like(r_e), (C_ne @ v_e.unsqueeze(-1)).squeeze(-1), C_ne @ C_eb)
-        return self.layout.pack(begun(self.estimator, frame, state, std, lever_arm_b, self.grid)), ok.double()
-
-
-class Read(Function):
-    """(1, K), (1, 14) :data:`FIX` → (1, 19) the fix in the tangent frame."""
-
-    def example(self) -> tuple[Tensor, ...]:
-        """As in the class."""
-        return self.somewhere(), torch.ones(1, len(FIX), dtype=torch.float64)
-
-    def forward(self, memory: Tensor, fix: Tensor) -> Tensor:
-        """As :class:`dlkf.running.streaming.StreamingFilter` reads one."""
-        frame = self.layout.unpack(memory).frame
-        r_e, v_e, std, used, lag = ecef(fix)
-        value = torch.cat((frame.from_ecef(r_e), frame.rotate_from_ecef(v_e)), -1)
-        return packed_fix(Fix(torch.where(used, value, 0.0), torch.where(used, std, 1.0), used, lag))
+    def forward(self, start: Tensor, lever_arm_b: Tensor) -> Tensor:
+        """Its tangent frame has its origin there."""
+        lat, lon, height = start[:, :3].unbind(-1)
+        frame = tangent_frame(lat, lon, height, self.grid.dtype)
+        start, arm = start.to(self.grid.dtype), lever_arm_b.to(self.grid.dtype)
+        v_n, C_nb, std = start[:, 3:6], start[:, 6:15].unflatten(-1, (3, 3)), start[:, 15:]
+        state = NavState(torch.zeros_like(v_n), v_n, C_nb)
+        return self.layout.pack(begin_filter(self.estimator, frame, state, std, arm, self.grid))
 
 
 class Turn(Function):
-    """(1, K), (1, M, 6), (1, 19) → (1, K), (1, sum of :data:`TOLD`)."""
+    """(1, K), (1, M, 6), (1, :func:`fix_numbers`) → (1, K), (1, :func:`output_numbers`)."""
 
     def example(self) -> tuple[Tensor, ...]:
         """As in the class."""
         ones = torch.ones(1, self.grid.samples, 6, dtype=torch.float64)
-        return self.somewhere(), ones, ones.new_ones(1, FIX_N)
+        return self.somewhere(), ones, ones.new_ones(1, fix_numbers(self.estimator))
 
     def forward(self, memory: Tensor, imu: Tensor, fix: Tensor) -> tuple[Tensor, Tensor]:
         """The loop's turn, and what a :class:`dlkf.filters.integration.Solution` holds of it."""
-        given = Fix(fix[:, :6], fix[:, 6:12], fix[:, 12:18] > 0.5, fix[:, 18])
-        after, step = advanced(self.estimator, self.layout.unpack(memory), imu, given, self.grid)
+        imu, fix = imu.to(self.grid.dtype), fix.to(self.grid.dtype)
+        names = [table.name for table in tables_of(self.estimator)]
+        aids = {name: fix[:, FIX_N + AID_N * k : FIX_N + AID_N * (k + 1)] for k, name in enumerate(names)}
+        given = Fix(fix[:, :6], fix[:, 6:12], fix[:, 12:18] > 0.5, fix[:, 18], aids or None)
+        after, step = advance_filter(self.estimator, self.layout.unpack(memory), imu, given, self.grid)
         answer, z = step.answer, step.innovation
         used = given.used.any(-1) if answer.accepted is None else given.used.any(-1) & answer.accepted
-        innovation_std = torch.full_like(z, torch.nan)
+        S, P = z.new_full((len(z), 36), torch.nan), z.new_full((len(z), 4), torch.nan)
         if (c := answer.covariances) is not None:
-            innovation_std = (((c.H @ c.predicted) * c.H).sum(-1) + c.R).clamp_min(0).sqrt()
+            S, P = c.innovation.flatten(1), c.predicted[:, :2, :2].flatten(1)
         std = z.new_full((len(z), 15), torch.nan) if answer.std is None else answer.std
-        speed = z.new_full((len(z), 2), torch.nan) if answer.speed is None else answer.speed
-        told = (
-            *flat(step.prior), *flat(step.posterior), step.complete_error, std, z, innovation_std,
-            used.double().unsqueeze(-1), speed,
+        said = z.new_zeros(len(z), 0) if answer.aids is None else answer.aids
+        outputs = (
+            *flat(step.prior), *flat(step.posterior), step.complete_error, std, z, S, P,
+            used.double().unsqueeze(-1), said,
         )  # fmt: skip
-        return self.layout.pack(after), torch.cat([x.double() for x in told], -1)
+        return self.layout.pack(after), torch.cat([x.double() for x in outputs], -1)
 
 
-class Row(Function):
-    """(1, K), (1, :data:`TOLD`) → (1, :data:`ROW`)."""
+@dataclass(frozen=True)
+class _OtherTime:
+    """A tangent frame whose second is ``share`` of one: rates are ω s, gravity is g s²."""
+
+    frame: TangentFrame
+    share: Tensor
+
+    @property
+    def earth_rate_n(self) -> Tensor:
+        return self.frame.earth_rate_n * self.share
+
+    def gravity(self, p_n: Tensor) -> Tensor:
+        return self.frame.gravity(p_n) * self.share**2
+
+
+class Carry(Function):
+    """(1, K), (1, M, 6), (1, 1), (1, :data:`OUTPUTS`) → (1, :data:`OUTPUTS`): a ``share`` of an interval later.
+
+    The samples are M of equal length over that share. The strapdown takes an interval of full length, in which time
+    runs ``share`` as fast: v s, f s², ω s and g s² give the same positions and attitudes.
+    """
 
     def example(self) -> tuple[Tensor, ...]:
         """As in the class."""
-        return self.somewhere(), torch.ones(1, sum(TOLD.values()), dtype=torch.float64)
+        ones = torch.ones(1, self.grid.samples, 6, dtype=torch.float64)
+        return self.somewhere(), ones, 0.5 * ones[:, 0, :1], ones.new_ones(1, output_numbers(self.estimator))
 
-    def forward(self, memory: Tensor, told: Tensor) -> Tensor:
-        """Geodetic position, velocity and attitude in the axes there, IMU error, all 1σ, innovation."""
+    def forward(self, memory: Tensor, imu: Tensor, share: Tensor, outputs: Tensor) -> Tensor:
+        """What was said of the last epoch, with another posterior."""
         x = self.layout.unpack(memory)
-        part = split(told)
-        columns = solution_columns(told[:, 0], x.frame, x.state, part["error"], part["std"])
-        away = x.state.p_n[:, :2].norm(dim=-1, keepdim=True)
+        error, state = ImuError(*_doubled(x.error)), NavState(*_doubled(x.state))
+        force, rate = error.corrected(imu).split(3, -1)
+        s = share.unsqueeze(-1)
+        begin, scaled = state._replace(v_n=state.v_n * share), torch.cat((force * s**2, rate * s), -1)
+        frame: Any = _OtherTime(x.frame.in_precision(torch.float64), share)
+        end = strapdown(begin, scaled, self.grid.dt, frame).end
+        first = OUTPUTS["prior"]
+        carried = torch.cat(flat(end._replace(v_n=end.v_n / share)), -1)
+        return torch.cat((outputs[:, :first], carried, outputs[:, first + OUTPUTS["posterior"] :]), -1)
+
+
+def _doubled(parts: Iterable[Tensor | None]) -> list[Any]:
+    return [None if x is None else x.double() for x in parts]
+
+
+class Row(Function):
+    """(1, K), (1, :data:`OUTPUTS`) → (1, :data:`ROW`), then what is said of further sensors."""
+
+    def example(self) -> tuple[Tensor, ...]:
+        """As in the class."""
+        return self.somewhere(), torch.ones(1, output_numbers(self.estimator), dtype=torch.float64)
+
+    def forward(self, memory: Tensor, outputs: Tensor) -> Tensor:
+        """Geodetic position, velocity and attitude in the axes there, IMU error, all 1σ, innovation."""
+        x, part = self.layout.unpack(memory), split(outputs)
+        state = NavState(*part["posterior"].split([3, 3, 9], -1))
+        state = state._replace(C_nb=state.C_nb.unflatten(-1, (3, 3)))
+        columns = solution_columns(outputs[:, 0], x.frame, state, part["error"], part["std"])
+        away = state.p_n[:, :2].norm(dim=-1, keepdim=True)
         solution = torch.stack([columns[c] for c in COLUMNS[1:]], -1)
-        return torch.cat((solution, part["used"], part["innovation"], part["innovation_std"], away), -1)
+        innovation_std = part["innovation_covariance"][:, ::7].clamp_min(0).sqrt()
+        return torch.cat((solution, part["used"], part["innovation"], innovation_std, away, part["aids"]), -1)
 
 
 class Anchor(Function):
@@ -230,40 +259,30 @@ class Anchor(Function):
 
     def forward(self, memory: Tensor) -> Tensor:
         """As :class:`dlkf.running.streaming.StreamingFilter` does every 50 km."""
-        return self.layout.pack(moved(self.estimator, self.layout.unpack(memory), self.grid))
+        return self.layout.pack(move_anchor(self.estimator, self.layout.unpack(memory), self.grid))
 
 
-def moved(estimator: Estimator, x: Carried, grid: Grid, change: FrameChange | None = None) -> Carried:
+def move_anchor(estimator: Estimator, x: Carried, grid: Grid, change: FrameChange | None = None) -> Carried:
     """Everything in another tangent frame, by default one whose origin is the present position."""
     change = change or FrameChange(x.frame, frame_at(x.state, x.frame))
     state = change.state(x.state)
-    fresh = begun(estimator, change.new, state, state.p_n.new_ones(len(state.p_n), 9), x.lever_arm_b, grid)
-    return Carried(reanchored(x.memory, change, fresh.memory), state, x.error, change.new, x.lever_arm_b)
+    change = FrameChange(change.old, change.new.in_precision(grid.dtype))
+    fresh = begin_filter(estimator, change.new, state, state.p_n.new_ones(len(state.p_n), 9), x.lever_arm_b, grid)
+    return Carried(reanchor(x.memory, change, fresh.memory), state, x.error, change.new, x.lever_arm_b)
 
 
-def ecef(fix: Float[Tensor, "B 14"]) -> tuple[Tensor, Tensor, Tensor, Bool[Tensor, "B 6"], Tensor]:
-    """ECEF position and velocity of fixes, 1σ, which components are known, lag.
-
-    As :func:`dlkf.data.resampling.fixes_at` has them.
-    """
-    lat, lon = torch.deg2rad(fix[:, 0]), torch.deg2rad(fix[:, 1])
-    r_e, C_en = ecef_from_geodetic(lat, lon, fix[:, 2]), ned_axes(lat, lon)
-    quality = fix[:, 12:13]
-    std, satellites = fix[:, 6:12], torch.zeros_like(quality) > 0
-    for q in DEFAULT_STD:
-        std = torch.where(std.isnan() & (quality == q), fix.new_tensor(default_std(q)), std)
-        satellites = satellites | (quality == q)
-    known = fix[:, 3:6].isfinite()
-    v_e = (C_en @ torch.where(known, fix[:, 3:6], 0.0).unsqueeze(-1)).squeeze(-1)
-    position = (satellites & fix[:, :3].isfinite().all(-1, keepdim=True)).expand(-1, 3)
-    lag = torch.where(position[:, 0], fix[:, 13], 0.0)
-    return r_e, v_e, std.clamp_min(SMALLEST_STD), torch.cat((position, position & known), -1), lag
+def fix_numbers(estimator: Any) -> int:
+    """How many numbers a turn takes beside the samples: those of a fix, then of each further sensor."""
+    return FIX_N + AID_N * len(tables_of(estimator))
 
 
-def packed_fix(fix: Fix) -> Float[Tensor, "B 19"]:
-    """A fix in n as numbers."""
-    lag = fix.value.new_zeros(len(fix.value)) if fix.lag is None else fix.lag
-    return torch.cat((fix.value, fix.std, fix.used.double(), lag.unsqueeze(-1)), -1)
+def packed_fix(fix: Fix, aids: Sequence[AidTable] = ()) -> Float[Tensor, "B f"]:
+    """A fix in n, and what ``aids`` said, as numbers."""
+    value = fix.value
+    lag = value.new_zeros(len(value)) if fix.lag is None else fix.lag
+    said = fix.aids or {}
+    others = [said[a.name].to(value) if a.name in said else value.new_zeros(len(value), AID_N) for a in aids]
+    return torch.cat((value, fix.std, fix.used.double(), lag.unsqueeze(-1), *others), -1)
 
 
 def flat(state: NavState) -> tuple[Tensor, Tensor, Tensor]:
@@ -271,6 +290,12 @@ def flat(state: NavState) -> tuple[Tensor, Tensor, Tensor]:
     return state.p_n, state.v_n, state.C_nb.flatten(-2)
 
 
-def split(told: Float[Tensor, "*b told"]) -> dict[str, Tensor]:
-    """The parts of :data:`TOLD` by name."""
-    return dict(zip(TOLD, told.split(list(TOLD.values()), -1)))
+def output_numbers(estimator: Any) -> int:
+    """How many numbers a turn gives beside the memory: :data:`OUTPUTS`, then what is said of further sensors."""
+    return sum(OUTPUTS.values()) + len(aid_columns(estimator))
+
+
+def split(outputs: Float[Tensor, "*b outputs"]) -> dict[str, Tensor]:
+    """The parts of :data:`OUTPUTS` by name, and ``aids``, which may be empty."""
+    last = outputs.shape[-1] - sum(OUTPUTS.values())
+    return dict(zip((*OUTPUTS, "aids"), outputs.split([*OUTPUTS.values(), last], -1)))

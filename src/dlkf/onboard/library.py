@@ -7,16 +7,20 @@ import os
 import shutil
 import subprocess
 import sysconfig
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from dlkf.errors import InputError
-from dlkf.onboard.functions import ROW, TOLD
+from dlkf.base.errors import InputError
+from dlkf.onboard.functions import OUTPUTS
 
-# NaN and infinity keep their meaning, sums may be taken in another order
+# NaN and infinity keep their meaning, sums may be taken in another order; of the filter, not of the core round it
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math")
+CORE_FLAGS = ("-O2",)
+FILTER = ("step.c", "weights.c", "heading.c")
+CORE = ("dlkf.c", "samples.c", "align.c", "search.c", "aids.c", "limits.c")
 LIBRARY = "step.so"
 
 
@@ -26,52 +30,57 @@ def compiler() -> str | None:
     return next((found for name in (*given, "cc", "gcc", "clang") if (found := shutil.which(name))), None)
 
 
-def build(folder: Path, into: Path | None = None) -> Path:
-    """Compile ``step.c`` in a folder. Raises InputError where there is no compiler, or it fails."""
+def build(folder: Path, into: Path | None = None, flags: Sequence[str] = FLAGS) -> Path:
+    """Compile what was exported to a folder, the filter with ``flags``.
+
+    Raises InputError where there is no compiler, or it fails.
+    """
     cc = compiler()
     if cc is None:
         raise InputError("no C compiler found (cc, gcc, clang, or $CC); install one, such as apt-get install gcc")
-    library = (into or folder).resolve() / LIBRARY
-    made = subprocess.run(
-        [cc, *FLAGS, "-fPIC", "-shared", "step.c", "-o", library, "-lm"], cwd=folder, capture_output=True, text=True
-    )
+    into = (into or folder).resolve()
+    objects = []
+    for names, own in ((FILTER, flags), (CORE, CORE_FLAGS)):
+        for name in names:
+            if (folder / name).is_file():
+                objects.append(into / f"{name}.o")
+                _run([cc, "-std=c99", *own, "-fPIC", "-c", name, "-o", objects[-1]], folder, name)
+    _run([cc, "-shared", *objects, "-o", into / LIBRARY, "-lm"], folder, LIBRARY)
+    for path in objects:
+        path.unlink()
+    return into / LIBRARY
+
+
+def _run(command: list, folder: Path, name: str) -> None:
+    made = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     if made.returncode:
         said = (made.stderr.strip() or f"it ended with {made.returncode}").splitlines()[0]
-        raise InputError(f"{cc} cannot compile {folder / 'step.c'}: {said}")
-    return library
+        raise InputError(f"{command[0]} cannot compile {folder / name}: {said}")
 
 
 class Library:
     """``step.h`` on float64 tensors without gaps; calls let other threads run."""
 
-    def __init__(self, path: Path, memory: int) -> None:
-        self._library, self.memory = ctypes.CDLL(str(path.resolve())), memory
-        self._told = sum(TOLD.values())
+    def __init__(self, path: Path, memory: int, outputs: int = sum(OUTPUTS.values())) -> None:
+        self.path = path.resolve()
+        self._library, self.memory = ctypes.CDLL(str(self.path)), memory
+        self._outputs = outputs
+        self._work = ctypes.c_int64.in_dll(self._library, "dlkf_work_numbers").value
 
     def turn(self, memory: Tensor, imu: Tensor, fix: Tensor) -> tuple[Tensor, Tensor]:
-        """One epoch of one drive: memory after it (1, K), what it told (1, T)."""
-        after, told = torch.empty_like(memory), memory.new_empty(1, self._told)
-        self._library.dlkf_turn(*map(_pointer, (memory, imu, fix, after, told)))
-        return after, told
+        """One epoch of one drive: memory after it (1, K), what it outputs (1, T)."""
+        after, outputs = torch.empty_like(memory), memory.new_empty(1, self._outputs)
+        work = memory.new_empty(self._work)
+        self._library.dlkf_turn(*map(_pointer, (memory, imu, fix, after, outputs, work)))
+        return after, outputs
 
     def run(self, memory: Tensor, imu: Tensor, fixes: Tensor) -> tuple[Tensor, Tensor]:
-        """Epochs (T, M, 6) with fixes (T, 19) of one drive from a memory (1, K): memory at the end, told (T, …)."""
-        after, told = memory.clone(), memory.new_empty(len(imu), self._told)
+        """Epochs (T, M, 6) with fixes (T, …) of one drive from a memory (1, K): memory at the end, outputs (T, …)."""
+        after, outputs = memory.clone(), memory.new_empty(len(imu), self._outputs)
+        other, work = torch.empty_like(memory), memory.new_empty(self._work)
         epochs = ctypes.c_int64(len(imu))
-        self._library.dlkf_run(epochs, *map(_pointer, (after, imu, fixes, told)))
-        return after, told
-
-    def step(self, memory: Tensor, imu: Tensor, fix: Tensor) -> tuple[Tensor, Tensor]:
-        """One epoch with a fix as a receiver gives it: memory after it and the row of the solution."""
-        after, row = torch.empty_like(memory), memory.new_empty(1, len(ROW))
-        self._library.dlkf_step(*map(_pointer, (memory, imu, fix, after, row)))
-        return after, row
-
-    def begin(self, imu: Tensor, fixes: Tensor, lever_arm_b: Tensor) -> tuple[Tensor, bool]:
-        """A memory from a few epochs, and whether it may be used."""
-        memory, ready = imu.new_empty(1, self.memory), imu.new_empty(1)
-        self._library.dlkf_begin(*map(_pointer, (imu, fixes, lever_arm_b, memory, ready)))
-        return memory, bool(ready)
+        self._library.dlkf_run(epochs, *map(_pointer, (after, imu, fixes, outputs, other, work)))
+        return after, outputs
 
 
 def _pointer(x: Tensor) -> ctypes.c_void_p:

@@ -1,14 +1,14 @@
-"""What the numbers of an exported filter are, in words, with their units: of its memory, of a fix, of a row."""
+"""What the numbers of an exported filter are, in words, with their units: of its memory and of a row."""
 
 from __future__ import annotations
 
 AXES = {"n": "North", "e": "East", "d": "Down", "x": "forward", "y": "right", "z": "down"}
-COLUMNS = {  # of a fix (at the antenna) and of a row (at the IMU); before the last part of a name that is an axis
+COLUMNS = {  # of a row, at the IMU; before the last part of a name that is an axis
+    "t": "time of the row on the clock of the samples [s]",
+    "revised": "1 where a late fix changed a row that was there before, else 0",
     "lat_deg": "latitude [deg]",
     "lon_deg": "longitude [deg]",
     "height_m": "height above the ellipsoid [m]",
-    "quality": "NMEA GGA: 0 none, 1 single, 2 differential, 4 RTK fixed, 5 RTK float",
-    "lag_s": "how long before the epoch's end it was taken [s]",
     "gnss_used": "1 where the epoch's fix was used, else 0",
     "from_origin_m": "horizontal distance from the origin of the tangent frame [m]",
     "roll": "roll [rad]",
@@ -18,6 +18,11 @@ COLUMNS = {  # of a fix (at the antenna) and of a row (at the IMU); before the l
     "vel": "velocity {} [m/s]",
     "accel_error": "accelerometer error {}, measured less true [m/s²]",
     "gyro_error": "gyroscope error {}, measured less true [rad/s]",
+}
+SENSOR = {  # of a further sensor, after its name
+    "_innovation": "sample of the sensor {} less expected, in its unit",
+    "_innovation_std": "1σ of that of the sensor {}, in its unit",
+    "_used": "1 where a sample of the sensor {} was used, else 0",
 }
 MEMORY = {  # by the last parts of a field's name
     "frame.origin_e": "origin of the tangent frame n, ECEF [m]",
@@ -38,10 +43,22 @@ MEMORY = {  # by the last parts of a field's name
     "density": "S of the noise: accelerometers [m²/s³], gyroscopes [rad²/s], walks of their biases [m²/s⁵, rad²/s³]",
     "fix.scale": "factors on 1σ of a fix, and the least 1σ: position [m], velocity [m/s]",
     "std": "1σ across the car [m/s], and at rest: velocity [m/s], rate [rad/s]",
-    "liveliness.standing": "quietest second of standing: spread of force times that of rate [m/s² rad/s]; inf: none",
-    "liveliness.moving": "quietest second of motion, likewise",
-    "prior": "quietest second of motion before one was heard, likewise",
+    "liveliness.standing": "least level of a stationary second: spread of force × that of rate [m/s² rad/s]; inf: none",
+    "liveliness.moving": "least level of a second of motion, likewise",
+    "prior": "prior least level of a second of motion, likewise",
     "structure": "mounting yaw, pitch [rad], distance to the rear axle [m], sideslip [s²/m], pitch gradient [rad s²/m]",
+    "parameters": "estimates of what further sensors add to the states, in their order",
+    "trust.refused": "measurements of a further sensor refused in a row",
+    "trust.doubted": "1 where the sensor is not used until it agrees again",
+    "trust.agreed": "measurements that agreed in a row since",
+    "factor": "factor on the 1σ of a further sensor",
+    "last": "last speed of the wheel [m/s]",
+    "repeats": "how often that speed came again",
+    "whole": "share of its speeds that were whole km/h",
+    "signed": "1 where it has been negative",
+    "calmest": "least shaking in motion: spread of force times that of rate [m/s² rad/s]",
+    "rolling": "1 where the wheel turned and counted",
+    "stopped": "1 where it did not turn and counted",
     "noise.Q": "adapted covariance of an epoch's process noise, units of P",
     "noise.R": "adapted variance of a fix: position [m²], velocity [m²/s²]",
     "noise.settled": "1 where the adapted noise is in force",
@@ -53,6 +70,10 @@ MEMORY = {  # by the last parts of a field's name
     "gate.age": "time since then [s]",
     "gate.fix": "the last fix offered, in n [m, m/s]",
     "gate.frozen": "1 where fixes stay while the car moves",
+    "coarse.refused": "grossly wrong fixes refused in a row that agree with each other",
+    "coarse.fix": "the last such fix, in n [m, m/s]",
+    "coarse.moves": "1 where it had a velocity",
+    "coarse.age": "time since then [s]",
     "gate.limits": "greatest normalised innovation squared, by the number of components",
     "recurrent.0": "cells of the LSTM: hidden, by layer",
     "recurrent.1": "cells of the LSTM: memory, by layer",
@@ -73,18 +94,13 @@ MEMORY = {  # by the last parts of a field's name
     "matching.sizes": "corrections² over typical ones, remembered short",
     "matching.fixes": "fixes so far",
     "fix_speed": "forward speed at the last fix [m/s]",
-    "car.mean": "speed from vibrations: weights w of speed = wᵀφ, φ heard by the network and 1 [m/s]",
-    "car.spread": "covariance P of w, over the variance b / a of a speed",
-    "car.count": "a of that variance",
-    "car.squares": "b of it [m²/s²]",
-    "memory.residual": "part of the IMU error that the network added [m/s², rad/s]",
-    "silent": "1 where the speed is withheld; always 0 in a vehicle",
-    "seen.process": "the network's last factors on the noise: both sensors, their walks; forward, right, down",
-    "seen.fix": "its factors on 1σ of a fix: position horizontal and down, velocity horizontal and down",
-    "seen.across": "its factors on 1σ of the constraints: to the right, down",
-    "seen.offset": "its velocity to the right and down beside the car's model [m/s]",
-    "seen.residual": "its part of the IMU error [m/s², rad/s]",
-    "seen.doubt": "its factor on 1σ of the speed from vibrations",
+    "outage.drift": "estimates less those of the trajectory without corrections (virtual outage), in the order of P",
+    "outage.P": "covariance of that trajectory but for white noise, units of P",
+    "outage.white": "what the white noise of accelerometers and gyroscopes adds to it at level 1, units of P",
+    "outage.age": "time since the virtual outage began [s]",
+    "outage.due": "age from which on the next fix is scored [s]",
+    "outage.evidence": "logarithm of the density of the scored fixes by levels of accelerometers and gyroscopes",
+    "memory.gyro_noise": "the network's last factors on the gyroscopes' noise; forward, right, down",
 }
 
 
@@ -96,7 +112,7 @@ def of_field(name: str) -> str | None:
 
 
 def of_column(name: str) -> str:
-    """Of a column of a fix or of a row.
+    """Of a column of a row.
 
     ``std_vel_n`` → 1σ of velocity North [m/s], ``innovation_pos_d`` → fix less expected: position Down [m].
     """
@@ -107,5 +123,10 @@ def of_column(name: str) -> str:
         return "1σ of " + of_column(name.removeprefix("std_"))
     if name in COLUMNS:
         return COLUMNS[name]
+    for tail, said in SENSOR.items():
+        if name.endswith(tail):
+            return said.format(name.removesuffix(tail))
     quantity, _, axis = name.rpartition("_")
-    return COLUMNS[quantity].format(AXES[axis])
+    if quantity in COLUMNS and axis in AXES:
+        return COLUMNS[quantity].format(AXES[axis])
+    return f"{name} as the filter estimates it, in the unit of its sensor"

@@ -8,23 +8,23 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import plotly.graph_objects as go
 
-from dlkf.colours import colour
-from dlkf.errors import InputError
+from dlkf.base.colours import filter_colour
+from dlkf.base.errors import InputError
+from dlkf.base.files import write_into
 from dlkf.evaluation.results import Results
-from dlkf.evaluation.summary import answer
-from dlkf.evaluation.table import number
-from dlkf.files import staged
+from dlkf.evaluation.summary import headline
+from dlkf.evaluation.table import format_number
+from dlkf.report.drawing import Figure
 from dlkf.report.evaluation import best_of
-from dlkf.report.page import Page, flattened
+from dlkf.report.page import Page, flatten_html
 from dlkf.report.plots import FONT
 
 TEST = ("digest", "reference", "mode", "runs", "seed", "length_s", "stride_s", "start", "outage")  # of the protocol
 NOT_SETTINGS = ("command", "date", "digest", "skipped")  # differ always, or belong to no comparison
 
 
-class Report(NamedTuple):
+class StoredReport(NamedTuple):
     """An evaluation as it lies in a folder; ``name`` tells it from the others, ``path`` is the whole one."""
 
     name: str
@@ -32,9 +32,10 @@ class Report(NamedTuple):
     dataset: str
     protocol: Mapping[str, Any]
     results: list[Results]
+    warnings: Sequence[str] = ()  # of filters that are too sure of themselves
 
 
-def read_reports(folders: Sequence[str | Path]) -> list[Report]:
+def read_reports(folders: Sequence[str | Path]) -> list[StoredReport]:
     """The evaluations in some folders, named by what tells the folders apart.
 
     Raises InputError for a folder without a readable ``metrics.json``, for one given twice, and for fewer than two.
@@ -47,11 +48,12 @@ def read_reports(folders: Sequence[str | Path]) -> list[Report]:
     if twice := next((p for k, p in enumerate(paths) if real[k] in real[:k]), None):
         raise InputError(f"{twice} is given twice; a run is compared with others")
     reports = []
-    for path, name in zip(paths, distinct(paths)):
+    for path, name in zip(paths, shorten_names(paths)):
         try:
             content = json.loads((path / "metrics.json").read_text(encoding="utf-8"))
             results = [Results.of(r) for r in content["results"]]
-            reports.append(Report(name, str(path.absolute()), content["dataset"], content["protocol"], results))
+            about = (content["dataset"], content["protocol"], results, content.get("warnings", []))
+            reports.append(StoredReport(name, str(path.absolute()), *about))
         except FileNotFoundError:
             raise InputError(f"{path}: no metrics.json; give folders that evaluate or train left") from None
         except (KeyError, TypeError, ValueError) as error:
@@ -59,7 +61,7 @@ def read_reports(folders: Sequence[str | Path]) -> list[Report]:
     return reports
 
 
-def distinct(paths: Sequence[Path]) -> list[str]:
+def shorten_names(paths: Sequence[Path]) -> list[str]:
     """The shortest tails that tell folders apart, without the ``report`` in which train leaves its evaluation."""
     parts = [(p.parent if p.name == "report" else p).absolute().parts for p in paths]
     return [Path(*p[-_needed(p, parts[:k] + parts[k + 1 :]) :]).as_posix() for k, p in enumerate(parts)]
@@ -70,24 +72,26 @@ def _needed(path: tuple[str, ...], others: Sequence[tuple[str, ...]]) -> int:
     return next((n for n in range(1, len(path)) if all(o[-n:] != path[-n:] for o in others)), len(path))
 
 
-def write_comparison(out: str | Path, reports: Sequence[Report]) -> None:
+def write_comparison(out: str | Path, reports: Sequence[StoredReport]) -> None:
     """``compare.html`` in ``out``."""
     page = comparison_page(reports)
-    with staged(out) as folder:
+    with write_into(out) as folder:
         (folder / "compare.html").write_text(page, encoding="utf-8")
 
 
-def comparison_page(reports: Sequence[Report]) -> str:
+def comparison_page(reports: Sequence[StoredReport]) -> str:
     """Answers, a table and the growth of the error over all of them, and in what they differ."""
-    lines = [f"{r.name}: {answer(result)}" for r in reports for result in r.results]
-    page = Page(f"{len(reports)} evaluations compared", lines)
+    lines = [f"{r.name}: {headline(result)}" for r in reports for result in r.results]
+    warnings = [f"{r.name}: {line}" for r in reports for line in r.warnings]
+    page = Page(f"{len(reports)} evaluations compared", lines, warnings=warnings)
     whole = {r.name: r.path for r in reports}
     columns, rows = end_table(reports)
-    about = "Horizontal error; RMS over the pieces where there are no outages. Marked: the least median of a test."
+    about = "Horizontal error; RMS over the segments where there are no outages. Marked: the least median of a test. "
+    about += "Own 1σ: what the filter says of its error (median); innovation / σ: 1 is right, more is too sure."
     page.heading("At the end of the outages", about)
     page.table(columns, rows, marks=best_of_each(columns, rows, scored_on(reports)), titles=whole)
     page.heading("Horizontal error against the time without GNSS", "Solid: median; dotted: 95 % of the outages.")
-    page.figure("growth", growth(reports))
+    page.figure("growth", growth_figure(reports))
     page.heading("In what they differ")
     page.table(*differences(reports), words=True, titles=whole)
     page.heading("Where they lie")
@@ -95,23 +99,27 @@ def comparison_page(reports: Sequence[Report]) -> str:
     return page.html()
 
 
-def end_table(reports: Sequence[Report]) -> tuple[list[str], list[list[str]]]:
+def end_table(reports: Sequence[StoredReport]) -> tuple[list[str], list[list[str]]]:
     """Columns and rows: run, data, filter, number, errors."""
     columns = ["Run", "Dataset", "Filter", "Number", "RMS\n[m]", "median\n[m]", "95 %\n[m]", "Drift\n[%]"]
+    columns += ["Own 1σ\n[m]", "Innovation\n/ σ"]
     rows = []
     for report in reports:
         for result in report.results:
             out = result.count["outages"]
-            where = ("outages", "end", "horizontal") if out else ("pieces", "settled", "horizontal")
+            where = ("outages", "end", "horizontal") if out else ("segments", "settled", "horizontal")
             for name in result.filters:
-                errors = [number(result.value(name, *where, s)) for s in ("rms", "median", "p95")]
-                drift = number(result.value(name, "outages", "end", "drift", "median"), 100)
+                errors = [format_number(result.value(name, *where, s)) for s in ("rms", "median", "p95")]
+                drift = format_number(result.value(name, "outages", "end", "drift", "median"), 100)
                 data = f"{report.dataset} ({result.kind})"
-                rows.append([report.name, data, name, str(out or result.count["pieces"]), *errors, drift])
+                own = format_number(result.value(name, "outages", "end", "sigma", "median"))
+                innovation = format_number(result.value(name, "segments", "with_gnss", "innovation"), digits=2)
+                count = str(out or result.count["segments"])
+                rows.append([report.name, data, name, count, *errors, drift, own, innovation])
     return columns, rows
 
 
-def scored_on(reports: Sequence[Report]) -> list[str]:
+def scored_on(reports: Sequence[StoredReport]) -> list[str]:
     """What each row of :func:`end_table` was scored on: equal where data and rules are the same."""
     rules = [{key: report.protocol.get(key) for key in TEST} for report in reports]
     return [
@@ -132,9 +140,9 @@ def best_of_each(columns: Sequence[str], rows: Sequence[Sequence[str]], tests: S
     return marks
 
 
-def growth(reports: Sequence[Report]) -> go.Figure:
+def growth_figure(reports: Sequence[StoredReport]) -> Figure:
     """Errors at round times into the outages, a colour for every run and filter."""
-    figure, k = go.Figure(), 0
+    figure, k = Figure(), 0
     for report in reports:
         for result in report.results:
             seconds = result.seconds_into_outage()
@@ -142,32 +150,35 @@ def growth(reports: Sequence[Report]) -> go.Figure:
                 label = f"{report.name}: {name}"
                 for statistic, dash in (("median", "solid"), ("p95", "dot")):
                     y = [result.value(name, "outages", f"at {s} s", "horizontal", statistic) for s in seconds]
-                    figure.add_scatter(
-                        x=[float(s) for s in seconds], y=np.where(np.isfinite(y), y, np.nan), name=label,
-                        legendgroup=label, showlegend=statistic == "median", mode="lines+markers",
-                        line={"color": colour(k), "dash": dash},
+                    y = np.array([v if v is not None and np.isfinite(v) else np.nan for v in y])
+                    figure.add_trace(
+                        {
+                            "type": "scatter", "x": [float(s) for s in seconds], "y": y, "name": label,
+                            "legendgroup": label, "showlegend": statistic == "median", "mode": "lines+markers",
+                            "line": {"color": filter_colour(k), "dash": dash},
+                        }
                     )  # fmt: skip
                 k += 1
     figure.update_layout(
-        height=480, template="plotly_white", font=FONT, margin={"l": 60, "r": 15, "t": 20, "b": 45},
+        height=480, font=FONT, margin={"l": 60, "r": 15, "t": 20, "b": 45},
         legend={"orientation": "h", "y": -0.18, "yanchor": "top"},
     )  # fmt: skip
-    figure.update_xaxes(title_text="Time without GNSS [s]")
-    figure.update_yaxes(title_text="Horizontal error [m]", type="log", nticks=8)
+    figure.update_xaxis(title={"text": "Time without GNSS [s]"})
+    figure.update_yaxis(title={"text": "Horizontal error [m]"}, type="log", nticks=8)
     return figure
 
 
-def differences(reports: Sequence[Report]) -> tuple[list[str], list[list[str]]]:
+def differences(reports: Sequence[StoredReport]) -> tuple[list[str], list[list[str]]]:
     """Settings that are not the same in all reports."""
-    told = []
+    values_of_all = []
     for report in reports:
         path: list[str] = []
         values = {}
-        for depth, key, text in flattened(report.protocol):
+        for depth, key, text in flatten_html(report.protocol):
             path[depth:] = [key]
             values[".".join(path)] = text
-        told.append(values | {"dataset": report.dataset})
-    keys = [k for k in dict.fromkeys(k for t in told for k in t) if k.partition(".")[0] not in NOT_SETTINGS]
-    keys = [k for k in keys if len({t.get(k) for t in told}) > 1]
-    rows = [[key, *(t.get(key, "–") or "–" for t in told)] for key in keys]
+        values_of_all.append(values | {"dataset": report.dataset})
+    keys = [k for k in dict.fromkeys(k for t in values_of_all for k in t) if k.partition(".")[0] not in NOT_SETTINGS]
+    keys = [k for k in keys if len({t.get(k) for t in values_of_all}) > 1]
+    rows = [[key, *(t.get(key, "–") or "–" for t in values_of_all)] for key in keys]
     return ["Setting", *(r.name for r in reports)], rows or [["nothing but the day", *("" for _ in reports)]]

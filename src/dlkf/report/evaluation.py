@@ -8,21 +8,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
 
-from dlkf.colours import SHADE, TRUTH, colour
-from dlkf.evaluation.figures import all_figures, png, representative
-from dlkf.evaluation.metrics import magnitudes, outage_at, rms_over_pieces
+from dlkf.base.colours import SHADE, TRUTH, filter_colour
+from dlkf.base.files import resolve_place, write_into
+from dlkf.evaluation.figures import OFF_SCALE, all_figures, png, representative
+from dlkf.evaluation.metrics import magnitudes, outage_at, outage_end, rms_over_segments
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import Scores
-from dlkf.evaluation.summary import END, answer
-from dlkf.evaluation.table import DEGREES, Table, all_tables, as_csv, as_json, as_markdown, number
-from dlkf.files import placed, staged
-from dlkf.report.maps import chart, joined, track
-from dlkf.report.navigation import mark
+from dlkf.evaluation.sensors import TITLE as SENSORS_TITLE
+from dlkf.evaluation.summary import END, headline, sigma_warnings
+from dlkf.evaluation.table import DEGREES, ResultTable, all_tables, as_csv, as_json, as_markdown, format_number
+from dlkf.report.drawing import Figure
+from dlkf.report.maps import add_track, chart, join_tracks
+from dlkf.report.navigation import mark_outages
 from dlkf.report.page import Page, embedded
-from dlkf.report.plots import Array, band, line, shade, spans, stacked
+from dlkf.report.plots import Array, band, line, shade, spans, stack_panels
 
+MAP = (
+    "The {truth}, the outages, and every filter's way in them (of one that is far off by a click on its name); a row "
+    "below goes there."
+)
 MOST_OUTAGES = 300  # rows of the table of outages: the worst of them
 SENSORS = (("Accelerometer", "m/s²", 1.0), ("Gyroscope", "°/s", DEGREES))
 IMU = [(f"{name} {axis} error [{unit}]", scale) for name, unit, scale in SENSORS for axis in "xyz"]
@@ -42,7 +47,7 @@ def write_report(
     protocol: Mapping[str, Any],
     by_time: bool,
     baseline: str | None,
-    more: Sequence[Table] = (),
+    more: Sequence[ResultTable] = (),
     dpi: int = 110,
 ) -> list[Path]:
     """Write the whole report into ``out``, all files or none; returns their paths.
@@ -64,6 +69,7 @@ def write_report(
                 "protocol": protocol,
                 "results": [r.as_dict() for r in results],
                 "tables": [t._asdict() for t in more],
+                "warnings": sigma_warnings(scores),
             }
         ).encode(),
         "table.md": "\n".join(map(as_markdown, parts)).encode(),
@@ -71,38 +77,49 @@ def write_report(
         "report.html": evaluation_page(dataset, parts, scores, results, pictures, protocol, baseline).encode(),
         **{f"figures/{name}": data for name, _, data in pictures},
     }
-    with staged(out) as folder:
+    with write_into(out) as folder:
         (folder / "figures").mkdir()
         for name, data in files.items():
             (folder / name).write_bytes(data)
-    return [placed(out) / name for name in files]
+    return [resolve_place(out) / name for name in files]
 
 
 def evaluation_page(
     dataset: str,
-    parts: Sequence[Table],
+    parts: Sequence[ResultTable],
     scores: Scores,
     results: Sequence[Results],
     pictures: Sequence[tuple[str, str, bytes]],
     protocol: Mapping[str, Any],
     baseline: str | None,
 ) -> str:
-    """The page: answer, tables, and for every kind of data growth of the error, map, outages, errors over time."""
+    """The page: answer; for every kind of data map, growth, tables of the outages and of further sensors, every outage;
+    then what is for research: errors over time, IMU errors, the other tables."""
     many = len(results) > 1
-    answers = [f"{r.kind.capitalize()} data. {answer(r)}" if many else answer(r) for r in results]
+    answers = [f"{r.kind.capitalize()} data. {headline(r)}" if many else headline(r) for r in results]
     own = protocol.get("reference")
     truth = "reference" if own else "truth"
-    page = Page(f"Evaluation on {dataset}", answers + ([f"No truth: errors are against the {own}."] if own else []))
-    outages_first = sorted(parts, key=lambda t: "outage" not in t.title)
-    for table in outages_first:
-        page.heading(table.title)
-        page.table(table.columns, table.rows, marks=best_of(table.columns, table.rows))
-        page.note(table.note)
+    answers += [f"No truth: errors are against the {own}."] if own else []
+    page = Page(f"Evaluation on {dataset}", answers, warnings=sigma_warnings(scores))
+    first = [t for t in parts if "outage" in t.title or t.title == SENSORS_TITLE]
     for result in results:
-        _sections(page, scores.of_kind(result.kind), result, f"{result.kind}: " if many else "", baseline, truth)
+        kind = f"{result.kind}: " if many else ""
+        tables = [t for t in first if not many or f"({result.kind})" in t.title]
+        _answer(page, scores.of_kind(result.kind), result, kind, baseline, truth, tables)
+    _add_tables(page, [t for t in first if many and not any(f"({r.kind})" in t.title for r in results)])
+    for result in results:
+        _research(page, scores.of_kind(result.kind), f"{result.kind}: " if many else "", baseline)
+    _add_tables(page, [t for t in parts if t not in first])
     page.images("The figures for print", [(caption, embedded(data)) for _, caption, data in pictures])
     page.protocol(protocol)
     return page.html()
+
+
+def _add_tables(page: Page, tables: Sequence[ResultTable]) -> None:
+    for table in tables:
+        page.heading(table.title)
+        page.table(table.columns, table.rows, marks=best_of(table.columns, table.rows))
+        page.note(table.note)
 
 
 def best_of(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
@@ -122,13 +139,18 @@ def _value(cell: str) -> float:
         return math.nan
 
 
-def _sections(page: Page, scores: Scores, result: Results, kind: str, baseline: str | None, truth: str) -> None:
+def _answer(
+    page: Page, scores: Scores, result: Results, kind: str, baseline: str | None, truth: str,
+    tables: Sequence[ResultTable],
+) -> None:  # fmt: skip
+    """Map, growth, tables, every outage."""
     name = kind.strip(": ") or "all"
     if scores.outage.any():
-        page.heading(f"{kind}Error against the time without GNSS", "Median and 95 % of the outages that last so long.")
-        page.figure(f"growth-{name}", growth(scores))
-        page.heading(f"{kind}Map", f"The {truth}, the outages, and every filter's way in them; a row below goes there.")
+        page.heading(f"{kind}Map", MAP.format(truth=truth))
         page.figure(f"map-{name}", outage_map(scores, truth))
+        page.heading(f"{kind}Error against the time without GNSS", "Median and 95 % of the outages that last so long.")
+        page.figure(f"growth-{name}", growth_chart(scores))
+        _add_tables(page, tables)
         best = least_error(scores, result)
         about = f"Horizontal error at the end [m], the worst of {best} first; a click shows it on the map."
         page.heading(f"{kind}Outages", about)
@@ -138,28 +160,36 @@ def _sections(page: Page, scores: Scores, result: Results, kind: str, baseline: 
             page.note(f"The worst {len(rows)} of {len(result.per_outage)}; all are in metrics.json.")
     else:
         page.heading(f"{kind}Map", f"The {truth} and where every filter went.")
-        page.figure(f"map-{name}", piece_map(scores, baseline, truth))
-    page.heading(f"{kind}Errors over time", f"RMS over {len(scores.pieces)} pieces; grey: outages of most pieces.")
-    page.figure(f"errors-{name}", errors(scores))
+        page.figure(f"map-{name}", segment_map(scores, baseline, truth))
+        _add_tables(page, tables)
+
+
+def _research(page: Page, scores: Scores, kind: str, baseline: str | None) -> None:
+    """Errors over time, IMU errors."""
+    name = kind.strip(": ") or "all"
+    page.heading(
+        f"{kind}Errors over time", f"RMS over {len(scores.segments)} segments; grey: outages of most segments."
+    )
+    page.figure(f"errors-{name}", error_charts(scores))
     chosen = representative(scores, 3, baseline if baseline in scores.filters else None)
     if chosen:
         i = chosen[len(chosen) // 2]
-        piece = scores.pieces[i]
-        about = f"{piece.drive} from t = {piece.t_start:.0f} s, a middling piece; black: truth; bands: ±3σ."
+        segment = scores.segments[i]
+        about = f"{segment.drive} from t = {segment.t_start:.0f} s, a middling segment; black: truth; bands: ±3σ."
         page.heading(f"{kind}IMU errors", about)
-        page.figure(f"imu-{name}", imu_errors(scores, i))
+        page.figure(f"imu-{name}", imu_error_charts(scores, i))
 
 
 def colours(scores: Scores) -> dict[str, str]:
     """Filter → colour."""
-    return {n: colour(k) for k, n in enumerate(scores.filters)}
+    return {n: filter_colour(k) for k, n in enumerate(scores.filters)}
 
 
-def growth(scores: Scores) -> go.Figure:
+def growth_chart(scores: Scores) -> Figure:
     """Median and 95 % of the horizontal error against the time since the last fix, and how many outages reach it."""
     w = scores.windows
     seconds = scores.epoch_s * np.arange(1, int(w.length.max()) + 1)
-    figure = stacked(["Median [m]", "95 % [m]", "Outages that last so long"], height=230)
+    figure = stack_panels(["Median [m]", "95 % [m]", "Outages that last so long"], height=230)
     for name, shade_of in colours(scores).items():
         x = outage_at(magnitudes(scores.filters[name].error)["horizontal"], w, seconds, scores.epoch_s)
         x = np.where(np.isinf(x), 1e9, x)  # a filter that broke counts
@@ -168,40 +198,50 @@ def growth(scores: Scores) -> go.Figure:
             y = np.full(len(seconds), np.nan)
             y[known] = np.nanpercentile(x[:, known], q, axis=0)
             y[y > 1e8] = np.nan
-            figure.add_trace(line(seconds, y, name, shade_of, legend=row == 1, width=2), row, 1)
+            figure.add_trace(line(seconds, y, name, shade_of, legend=row == 1, width=2), row)
     count = (w.length[:, None] * scores.epoch_s >= seconds[None]).sum(0)
-    figure.add_trace(go.Bar(x=seconds, y=count, marker_color=SHADE, name="outages", showlegend=False), 3, 1)
-    figure.update_yaxes(type="log", nticks=6, row=1, col=1)
-    figure.update_yaxes(type="log", nticks=6, row=2, col=1)
-    figure.update_xaxes(title_text="Time without GNSS [s]", row=3, col=1)
+    bars = {"type": "bar", "x": seconds, "y": count, "marker": {"color": SHADE}, "name": "outages"}
+    figure.add_trace(bars | {"showlegend": False}, 3)
+    figure.update_yaxis(1, type="log", nticks=6)
+    figure.update_yaxis(2, type="log", nticks=6)
+    figure.update_xaxis(3, title={"text": "Time without GNSS [s]"})
     return figure
 
 
-def outage_map(scores: Scores, named: str) -> go.Figure:
-    """Truth of all pieces (a reference is ``named`` so), outages, every filter's way in them from the last fix on."""
+def outage_map(scores: Scores, named: str) -> Figure:
+    """Truth of all segments (a reference is ``named`` so), outages, every filter's way in them from the last fix on."""
     w = scores.windows
-    known = [~np.isnan(scores.truth_p_n[i, :, 0]) for i in range(len(scores.pieces))]
-    truth = [scores.geodetic(i, scores.truth_p_n[i, known[i]]) for i in range(len(scores.pieces)) if known[i].any()]
-    windows = list(zip(w.piece, np.maximum(w.first - 1, 0), w.last))
+    known = [~np.isnan(scores.truth_p_n[i, :, 0]) for i in range(len(scores.segments))]
+    truth = [scores.geodetic(i, scores.truth_p_n[i, known[i]]) for i in range(len(scores.segments)) if known[i].any()]
+    windows, far = list(zip(w.segment, np.maximum(w.first - 1, 0), w.last)), far_off(scores)
     hidden = [scores.geodetic(i, scores.truth_p_n[i, a : b + 1]) for i, a, b in windows]
     traces = [
-        track(joined(hidden, 8000), "outage", SHADE, width=9),
-        track(joined(truth, 12_000), named, TRUTH, width=1.5),
+        add_track(join_tracks(hidden, 8000), "outage", SHADE, width=9),
+        add_track(join_tracks(truth, 12_000), named, TRUTH, width=1.5),
     ]
     for name, c in colours(scores).items():
         p = scores.filters[name].p_n
         ways = [scores.geodetic(i, p[i, a : b + 1]) for i, a, b in windows]
-        traces.append(track(joined(ways, 8000), name, c, width=2))
+        more = {"visible": "legendonly"} if name in far else {}
+        traces.append(add_track(join_tracks(ways, 8000), name, c, width=2, **more))
     return chart(traces, around=traces[:2])
 
 
-def piece_map(scores: Scores, baseline: str | None, named: str) -> go.Figure:
-    """Truth and every filter of up to eight pieces from good to bad."""
+def far_off(scores: Scores) -> list[str]:
+    """Filters whose median error at the end of the outages is twenty times that of the best: their ways would cover the
+    map, so that they are shown where somebody asks for them."""
+    end = {n: outage_end(magnitudes(r.error)["horizontal"], scores.windows) for n, r in scores.filters.items()}
+    median = {n: float(np.nanmedian(x)) if np.isfinite(x).any() else math.inf for n, x in end.items()}
+    return [n for n, m in median.items() if m > OFF_SCALE * min(median.values())]
+
+
+def segment_map(scores: Scores, baseline: str | None, named: str) -> Figure:
+    """Truth and every filter of up to eight segments from good to bad."""
     chosen = representative(scores, 8, baseline if baseline in scores.filters else None)
-    traces = [track(joined([scores.geodetic(i, scores.truth_p_n[i]) for i in chosen]), named, TRUTH, width=2)]
+    traces = [add_track(join_tracks([scores.geodetic(i, scores.truth_p_n[i]) for i in chosen]), named, TRUTH, width=2)]
     for name, c in colours(scores).items():
         p = scores.filters[name].p_n
-        traces.append(track(joined([scores.geodetic(i, p[i]) for i in chosen]), name, c, width=2))
+        traces.append(add_track(join_tracks([scores.geodetic(i, p[i]) for i in chosen]), name, c, width=2))
     return chart(traces, around=traces[:1])
 
 
@@ -221,36 +261,37 @@ def outage_rows(
     order = np.argsort(-np.nan_to_num(of_best, nan=-1.0), kind="stable")[:MOST_OUTAGES]
     rows, marks = [], []
     for k in order:
-        o, i = result.per_outage[k], int(w.piece[k])
+        o, i = result.per_outage[k], int(w.segment[k])
         rows.append(
-            [o["drive"], f"{o['t_start']:.0f}", f"{o['length_s']:g}", number(o["distance_m"])]
-            + [number(x) for x in ends[k]]
+            [o["drive"], f"{o['t_start']:.0f}", f"{o['length_s']:g}", format_number(o["distance_m"])]
+            + [format_number(x) for x in ends[k]]
         )
         part = scores.truth_p_n[i, max(w.first[k] - 1, 0) : w.last[k] + 1]
         lat, lon = scores.geodetic(i, np.nanmean(part, 0))
         half = 0.7 * max(float(np.ptp(part[:, 0])), float(np.ptp(part[:, 1])), 20.0)
-        marks.append(mark(figure, lat, lon, half))
+        marks.append(mark_outages(figure, lat, lon, half))
     return ["Drive", "from t\n[s]", "Length\n[s]", "Distance\n[m]", *names], rows, marks
 
 
-def errors(scores: Scores) -> go.Figure:
-    """RMS over the pieces of the horizontal, velocity and attitude error at each time."""
-    figure = stacked([title for title, _ in OVER_TIME.values()], height=180)
+def error_charts(scores: Scores) -> Figure:
+    """RMS over the segments of the horizontal, velocity and attitude error at each time."""
+    figure = stack_panels([title for title, _ in OVER_TIME.values()], height=180)
     for name, c in colours(scores).items():
         size = magnitudes(scores.filters[name].error)
         for row, (quantity, (_, scale)) in enumerate(OVER_TIME.items(), 1):
-            y = rms_over_pieces(np.where(np.isinf(size[quantity]), np.nan, size[quantity])) * scale
+            y = rms_over_segments(np.where(np.isinf(size[quantity]), np.nan, size[quantity])) * scale
             if np.isfinite(y).any():
-                figure.add_trace(line(scores.t, y, name, c, legend=row == 1), row, 1)
-    figure.update_yaxes(type="log")
-    figure.update_xaxes(title_text="Time since the start of a piece [s]", row=len(OVER_TIME), col=1)
+                figure.add_trace(line(scores.t, y, name, c, legend=row == 1), row)
+    for row in range(1, len(OVER_TIME) + 1):
+        figure.update_yaxis(row, type="log", nticks=6)
+    figure.update_xaxis(len(OVER_TIME), title={"text": "Time since the start of a segment [s]"})
     shade(figure, spans(scores.t, scores.outage.mean(0) > 0.5), len(OVER_TIME))
     return figure
 
 
-def imu_errors(scores: Scores, i: int) -> go.Figure:
-    """Estimates of one piece with their ±3σ, and the truth where it is known."""
-    figure = stacked([title for title, _ in IMU], height=120)
+def imu_error_charts(scores: Scores, i: int) -> Figure:
+    """Estimates of one segment with their ±3σ, and the truth where it is known."""
+    figure = stack_panels([title for title, _ in IMU], height=120)
     for k, (_, scale) in enumerate(IMU):
         truth = scores.true_imu_error[i, :, k] * scale
         for name, c in colours(scores).items():
@@ -259,17 +300,17 @@ def imu_errors(scores: Scores, i: int) -> go.Figure:
             if not np.nan_to_num(run.imu_error[i]).any():
                 continue
             if np.isfinite(sigma).any():
-                figure.add_trace(band(scores.t, y - sigma, y + sigma, name, c), k + 1, 1)
-            figure.add_trace(line(scores.t, y, name, c, legend=k == 0), k + 1, 1)
+                figure.add_trace(band(scores.t, y - sigma, y + sigma, name, c), k + 1)
+            figure.add_trace(line(scores.t, y, name, c, legend=k == 0), k + 1)
         if np.isfinite(truth).any():
-            figure.add_trace(line(scores.t, truth, "truth", TRUTH, legend=k == 0), k + 1, 1)
+            figure.add_trace(line(scores.t, truth, "truth", TRUTH, legend=k == 0), k + 1)
         _settled(figure, scores, i, k, scale)
-    figure.update_xaxes(title_text="Time since the start of the piece [s]", row=6, col=1)
+    figure.update_xaxis(6, title={"text": "Time since the start of the segment [s]"})
     shade(figure, spans(scores.t, scores.outage[i]), 6)
     return figure
 
 
-def _settled(figure: go.Figure, scores: Scores, i: int, k: int, scale: float) -> None:
+def _settled(figure: Figure, scores: Scores, i: int, k: int, scale: float) -> None:
     """Limits by the last four fifths of the lines: the first swings may leave the panel."""
     late = scores.t > 0.2 * scores.t[-1]
     lines: list[Array] = [r.imu_error[i, late, k] for r in scores.filters.values()]
@@ -277,4 +318,4 @@ def _settled(figure: go.Figure, scores: Scores, i: int, k: int, scale: float) ->
     values = values[np.isfinite(values)]
     if values.size:
         margin = 0.6 * float(np.ptp(values)) or 1e-6
-        figure.update_yaxes(range=[float(values.min()) - margin, float(values.max()) + margin], row=k + 1, col=1)
+        figure.update_yaxis(k + 1, range=[float(values.min()) - margin, float(values.max()) + margin])

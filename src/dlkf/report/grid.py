@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import pandas as pd
-import plotly.graph_objects as go
 
+from dlkf.report.drawing import Figure
 from dlkf.report.page import Page
 from dlkf.report.plots import FONT
 
@@ -37,8 +37,8 @@ def _best(chosen: pd.DataFrame, validated: str | None) -> str:
     if validated is None or pd.isna(best[validated]):
         return "No point was validated."
     filters = [c for c in map(str, chosen) if c not in (*NAMES, validated)]
-    told = f"; on test {filters[0]} {best[filters[0]]:.3g}" if filters else ""
-    return f"Best by validation: {best['run']}, {validated} {best[validated]:.3g}{told}."
+    on_test = f"; on test {filters[0]} {best[filters[0]]:.3g}" if filters else ""
+    return f"Best by validation: {best['run']}, {validated} {best[validated]:.3g}{on_test}."
 
 
 def _scores(table: pd.DataFrame, chosen: pd.DataFrame) -> list[str]:
@@ -50,11 +50,11 @@ def _scores(table: pd.DataFrame, chosen: pd.DataFrame) -> list[str]:
     return [c for c in map(str, table) if c.startswith(f"test/{filters[0]}/") and table[c].equals(shown)][:1]
 
 
-def coordinates(table: pd.DataFrame, settings: Sequence[str], scores: Sequence[str]) -> go.Figure:
+def coordinates(table: pd.DataFrame, settings: Sequence[str], scores: Sequence[str]) -> Figure:
     """Parallel coordinates: a setting that is no number has its words along the axis."""
     axes = [_axis(c.rpartition(".")[2], table[c]) for c in settings] + [_axis(c, table[c]) for c in scores]
-    lines = {"color": table[scores[0]].astype(float), "colorscale": "Viridis", "showscale": True}
-    figure = go.Figure(go.Parcoords(dimensions=axes, line=lines))
+    lines = {"color": table[scores[0]].to_numpy(float), "colorscale": "Viridis", "showscale": True}
+    figure = Figure([{"type": "parcoords", "dimensions": axes, "line": lines}])
     figure.update_layout(height=480, font=FONT, margin={"l": 80, "r": 60, "t": 60, "b": 30})
     return figure
 
@@ -64,7 +64,7 @@ def _axis(label: str, values: pd.Series) -> dict[str, Any]:
     if not numbers.isna().any():
         few = sorted(set(numbers))
         ticks = {"tickvals": few, "ticktext": [f"{x:g}" for x in few]} if len(few) < 8 else {}
-        return {"label": label, "values": numbers, **ticks}
+        return {"label": label, "values": numbers.to_numpy(float), **ticks}
     words = sorted(set(values.astype(str)))
     return {"label": label, "values": [words.index(v) for v in values.astype(str)],
             "tickvals": list(range(len(words))), "ticktext": words}  # fmt: skip

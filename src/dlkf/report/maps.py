@@ -7,38 +7,41 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
 from numpy.typing import NDArray
 
+from dlkf.report.drawing import Figure, Trace
 from dlkf.report.plots import FONT
 
 Array = NDArray[np.floating]
 MOST = 6000  # points of all tracks of one kind on a map
 
 
-def track(place: Array, name: str, colour: str, *, width: float, **more: Any):
+def add_track(place: Array, name: str, colour: str, *, width: float, **more: Any) -> Trace:
     """A line through latitudes and longitudes (n, 2); NaN breaks it."""
-    lat, lon = place.T
-    return go.Scattermap(lat=lat, lon=lon, mode="lines", name=name, line={"color": colour, "width": width}, **more)
+    return _trace(place, name, mode="lines", line={"color": colour, "width": width}, **more)
 
 
-def dots(place: Array, name: str, colour: str | Array, *, size: float = 6, bar: str | None = None, **more: Any):
+def dots(
+    place: Array, name: str, colour: str | Array, *, size: float = 6, bar: str | None = None, **more: Any
+) -> Trace:
     """Points (n, 2) of one colour, or coloured by a value with a bar."""
-    lat, lon = place.T
     marker: dict[str, Any] = {"size": size, "color": colour}
     if bar is not None:
         marker |= {"colorscale": "Viridis", "colorbar": {"title": {"text": bar}, "thickness": 12, "len": 0.7}}
-    return go.Scattermap(lat=lat, lon=lon, mode="markers", name=name, marker=marker, **more)
+    return _trace(place, name, mode="markers", marker=marker, **more)
 
 
-def chart(
-    traces: Sequence[go.Scattermap], groups: Sequence[str] = (), around: Sequence[go.Scattermap] | None = None
-) -> go.Figure:
+def _trace(place: Array, name: str, **more: Any) -> Trace:
+    lat, lon = np.ascontiguousarray(place.T)
+    return {"type": "scattermap", "lat": lat, "lon": lon, "name": name, **more}
+
+
+def chart(traces: Sequence[Trace], groups: Sequence[str] = (), around: Sequence[Trace] | None = None) -> Figure:
     """The map of some traces, seen so that ``around`` (by default all) fill it.
 
     ``groups`` has one name a trace: buttons show one group at a time; a trace whose group is empty is always shown.
     """
-    figure = go.Figure(list(traces))
+    figure = Figure(list(traces))
     lat, lon = (np.concatenate([np.asarray(t[k], float) for t in around or traces]) for k in ("lat", "lon"))
     known = np.isfinite(lat) & np.isfinite(lon)
     reach = max(np.ptp(lat[known]) * 1.08, 2e-4) / 2 if known.any() else 1.0
@@ -59,9 +62,8 @@ def chart(
                  "yanchor": "bottom", "pad": {"t": 2, "b": 4}, "showactive": True}
             ]
         )  # fmt: skip
-        shown: Any = figure.data
-        for trace, group in zip(shown, groups):
-            trace.visible = group in ("", names[0])
+        for trace, group in zip(figure.data, groups):
+            trace["visible"] = group in ("", names[0])
     return figure
 
 
@@ -75,7 +77,7 @@ def view(lat: Array, lon: Array) -> dict[str, Any]:
     return {"center": middle, "zoom": min(18.0, max(1.0, -math.log2(max(wide, high)) - 0.15))}
 
 
-def joined(parts: Sequence[Array], most: int = MOST) -> Array:
+def join_tracks(parts: Sequence[Array], most: int = MOST) -> Array:
     """Tracks one after the other with NaN between them, evenly thinned to ``most`` points together."""
     total = sum(len(p) for p in parts)
     step = max(1, math.ceil(total / most))

@@ -1,4 +1,4 @@
-"""The page of ``navigate``: where the car went and what the filter believes of itself; no truth is needed."""
+"""The page of ``navigate``: where the car went and the filter's own 1σ; no truth is needed."""
 
 from __future__ import annotations
 
@@ -8,26 +8,28 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import plotly.graph_objects as go
 
-from dlkf.colours import COLOURS, QUALITY
-from dlkf.report.maps import chart, dots, joined, track
+from dlkf.base.colours import COLOURS, QUALITY
+from dlkf.report.drawing import Figure
+from dlkf.report.maps import add_track, chart, dots, join_tracks
 from dlkf.report.page import Page
-from dlkf.report.plots import Array, band, every, line, shade, spans, stacked
-from dlkf.running.offline import Fixes, Innovation, Navigated
+from dlkf.report.plots import Array, band, every, line, shade, spans, stack_panels
+from dlkf.running.innovations import Innovation
+from dlkf.running.offline import Navigated, UsableFixes
 
 MOST_DRIVES = 12  # with plots of their own; all are on the map
 SHOWN = ("t", "lat_deg", "lon_deg", "vel_n", "vel_e", "std_pos_n", "std_pos_e", "gnss_used")  # of all drives
+FEW_NAMED = 3  # drives in a sentence
 GAP_S = 3.0  # longer without a fix is an outage
 STANDING = 0.15  # m/s
 R2D = 180 / np.pi
 
 
-class Course(NamedTuple):
+class TrackOnMap(NamedTuple):
     """A drive for the page: its solution and the fixes it came from."""
 
     result: Navigated
-    fixes: Fixes
+    fixes: UsableFixes
 
     @property
     def without(self) -> Array:
@@ -36,26 +38,34 @@ class Course(NamedTuple):
         last = np.maximum.accumulate(np.where(used, t, -np.inf))
         return np.where(np.isfinite(last), t - last, t - t[0])
 
-    def for_the_map(self) -> Course:
+    def for_the_map(self) -> TrackOnMap:
         """A fifth of it: what the map, the table and the answers show, without what plots of its own would."""
         innovation = self.result.innovation
-        if innovation is not None:  # one whose RMS is that of all
-            innovation = Innovation(np.array([[innovation.normalised_rms]]), np.ones((1, 1)))
-        return self._replace(
-            result=replace(self.result, table=self.result.table[list(SHOWN)].copy(), innovation=innovation)
-        )
+        if innovation is not None:
+            innovation = Innovation(innovation.ratio.astype(np.float32), np.ones((1, 1), np.float32))
+        table = self.result.table[[*SHOWN, *self.result.sensor_columns]].copy()
+        return self._replace(result=replace(self.result, table=table, innovation=innovation))
 
 
-def write_page(out: Path, model: str, dataset: str, courses: Sequence[Course], made: Mapping[str, Any]) -> None:
+def write_page(
+    out: Path,
+    model: str,
+    dataset: str,
+    courses: Sequence[TrackOnMap],
+    made: Mapping[str, Any],
+    warnings: Sequence[str] = (),
+) -> None:
     """``report.html`` in ``out``."""
-    (out / "report.html").write_text(navigation_page(model, dataset, courses, made), encoding="utf-8")
+    (out / "report.html").write_text(navigation_page(model, dataset, courses, made, warnings), encoding="utf-8")
 
 
-def navigation_page(model: str, dataset: str, courses: Sequence[Course], made: Mapping[str, Any]) -> str:
+def navigation_page(
+    model: str, dataset: str, courses: Sequence[TrackOnMap], made: Mapping[str, Any], warnings: Sequence[str] = ()
+) -> str:
     """The page of some drives; the first dozen have plots of their own."""
-    page = Page(f"{model} on {dataset}", answers(model, courses))
+    page = Page(f"{model} on {dataset}", summary_lines(model, courses), warnings=warnings)
     page.heading("Map", "Coloured by drive, time without GNSS, quality of the fixes, or the filter's own 1σ.")
-    page.figure("map", route(courses))
+    page.figure("map", route_map(courses))
     page.heading("Drives", "A row shows its drive on the map.")
     columns, rows, marks = rows_of(courses)
     page.table(columns, rows, marks=marks, tall=len(courses) > 15)
@@ -63,6 +73,11 @@ def navigation_page(model: str, dataset: str, courses: Sequence[Course], made: M
         "Innovation / σ: what GNSS says less what the filter expects, over the filter's own 1σ of it (RMS). 1 is "
         "right; above, the filter is surer than it should be: its noise is too small for this IMU and receiver."
     )
+    sensors = [course.result.sensors() for course in courses]
+    if names := list(dict.fromkeys(name for found in sensors for name in found)):
+        page.heading("Further sensors", "Updates that used them, and what was found of them at the end of the drive.")
+        values = [[c.result.drive, *(x.get(n, "–") for n in names)] for c, x in zip(courses, sensors)]
+        page.table(["Drive", *names], values, words=True, tall=len(courses) > 15)
     for k, course in enumerate(courses[:MOST_DRIVES]):
         _plots(page, k, course)
     if len(courses) > MOST_DRIVES:
@@ -71,7 +86,7 @@ def navigation_page(model: str, dataset: str, courses: Sequence[Course], made: M
     return page.html()
 
 
-def answers(model: str, courses: Sequence[Course]) -> list[str]:
+def summary_lines(model: str, courses: Sequence[TrackOnMap]) -> list[str]:
     """What a person wants to know first: how much was driven, how much of it with GNSS, and how sure the filter is."""
     hours = sum(float(np.ptp(c.result.table["t"])) for c in courses) / 3600
     km = sum(distance(c) for c in courses) / 1000
@@ -87,7 +102,10 @@ def answers(model: str, courses: Sequence[Course]) -> list[str]:
         text += f"{np.nanmax(sigma):.2g} m at worst."
     else:
         text += " This filter does not tell its own 1σ."
-    return [lead, text]
+    refused = [f"{c.result.refused} of {c.result.drive}" for c in courses if any(c.result.refused)]
+    more = f" and of {len(refused) - FEW_NAMED} more drives" if len(refused) > FEW_NAMED else ""
+    said = [f"Refused beyond physical limits: {', '.join(refused[:FEW_NAMED])}{more}."] if refused else []
+    return [lead, text, *said]
 
 
 def duration(hours: float) -> str:
@@ -96,28 +114,28 @@ def duration(hours: float) -> str:
     return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{hours * 60:.3g} min"
 
 
-def speed(course: Course) -> Array:
+def speed(course: TrackOnMap) -> Array:
     """Horizontal [m/s]."""
     return np.hypot(course.result.table["vel_n"].to_numpy(), course.result.table["vel_e"].to_numpy())
 
 
-def distance(course: Course) -> float:
+def distance(course: TrackOnMap) -> float:
     """Driven [m]."""
     t = course.result.table["t"].to_numpy()
     return float(np.sum(speed(course)[1:] * np.diff(t))) if len(t) > 1 else 0.0
 
 
-def horizontal_std(course: Course) -> Array:
+def horizontal_std(course: TrackOnMap) -> Array:
     """√(σn² + σe²) [m]."""
     table = course.result.table
     return np.hypot(table["std_pos_n"].to_numpy(), table["std_pos_e"].to_numpy())
 
 
-def _place(course: Course) -> Array:
+def _place(course: TrackOnMap) -> Array:
     return course.result.table[["lat_deg", "lon_deg"]].to_numpy()
 
 
-def route(courses: Sequence[Course]) -> go.Figure:
+def route_map(courses: Sequence[TrackOnMap]) -> Figure:
     """All drives on one map, in four ways of colouring."""
     traces, groups = [], []
 
@@ -127,13 +145,13 @@ def route(courses: Sequence[Course]) -> go.Figure:
 
     share = max(200, 12_000 // len(courses))
     for k, course in enumerate(courses):
-        place = joined([_place(course)], share)
-        add(track(place, course.result.drive, COLOURS[k % len(COLOURS)], width=3), "drives")
+        place = join_tracks([_place(course)], share)
+        add(add_track(place, course.result.drive, COLOURS[k % len(COLOURS)], width=3), "drives")
     hidden = [np.where((c.without > GAP_S)[:, None], _place(c), np.nan) for c in courses]
-    add(track(joined([_place(c) for c in courses], 12_000), "with GNSS", "#0072B2", width=3), "outages")
+    add(add_track(join_tracks([_place(c) for c in courses], 12_000), "with GNSS", "#0072B2", width=3), "outages")
     if any(np.isfinite(h).any() for h in hidden):
         gaps = np.concatenate([_with_breaks(h, share) for h in hidden])
-        add(track(gaps, f"over {GAP_S:g} s without a fix", "#D55E00", width=5), "outages")
+        add(add_track(gaps, f"over {GAP_S:g} s without a fix", "#D55E00", width=5), "outages")
     for code, (name, colour) in QUALITY.items():
         seen = [np.stack((c.fixes.lat_deg, c.fixes.lon_deg), -1)[c.fixes.quality == code] for c in courses]
         points = np.concatenate([s[every(len(s), share)] for s in seen])
@@ -153,10 +171,10 @@ def _with_breaks(place: Array, most: int) -> Array:
     """Runs of known positions, thinned each, with a NaN after each."""
     known = np.isfinite(place[:, 0])
     edge = np.flatnonzero(np.diff(np.concatenate(([0], known.astype(np.int8), [0]))))
-    return joined([place[max(a - 1, 0) : b] for a, b in zip(edge[::2], edge[1::2])], most)
+    return join_tracks([place[max(a - 1, 0) : b] for a, b in zip(edge[::2], edge[1::2])], most)
 
 
-def rows_of(courses: Sequence[Course]) -> tuple[list[str], list[list[str]], list[str]]:
+def rows_of(courses: Sequence[TrackOnMap]) -> tuple[list[str], list[list[str]], list[str]]:
     """Columns, rows and marks of the table of drives."""
     columns = ["Drive", "Duration\n[s]", "Distance\n[km]", "Fixes\nused", "of", "Longest gap\n[s]", "Standing\n[s]"]
     columns += ["1σ, median\n[m]", "1σ, worst\n[m]", "Innovation\n/ σ"]
@@ -178,16 +196,16 @@ def rows_of(courses: Sequence[Course]) -> tuple[list[str], list[list[str]], list
         place = _place(course)
         half = 60_000 * max(float(np.ptp(place[:, 0])), float(np.ptp(place[:, 1])), 1e-3)
         lat, lon = place.mean(0)
-        marks.append(mark("map", lat, lon, half))
+        marks.append(mark_outages("map", lat, lon, half))
     return columns, rows, marks
 
 
-def mark(figure: str, lat: float, lon: float, half_m: float) -> str:
+def mark_outages(figure: str, lat: float, lon: float, half_m: float) -> str:
     """Attributes of a row that jumps to a place on a map."""
     return f'data-map="{figure}" data-lat="{lat:.7f}" data-lon="{lon:.7f}" data-half="{half_m:.0f}"'
 
 
-def _plots(page: Page, k: int, course: Course) -> None:
+def _plots(page: Page, k: int, course: TrackOnMap) -> None:
     table = course.result.table
     t = table["t"].to_numpy() - table["t"].iloc[0]
     gaps = spans(t, course.without > GAP_S)
@@ -203,56 +221,56 @@ def _plots(page: Page, k: int, course: Course) -> None:
         page.figure(f"{name}-{k}", figure)
 
 
-def _motion(course: Course, t: Array, gaps: Sequence[tuple[float, float]]) -> go.Figure:
+def _motion(course: TrackOnMap, t: Array, gaps: Sequence[tuple[float, float]]) -> Figure:
     table = course.result.table
     panels = ["Speed [m/s]; standstills in orange", "Heading [°]", "Height [m]", "Horizontal 1σ [m]"]
-    figure = stacked(panels, height=150)
+    figure = stack_panels(panels, height=150)
     v = speed(course)
-    figure.add_trace(line(t, v, "speed", COLOURS[0], legend=False), 1, 1)
+    figure.add_trace(line(t, v, "speed", COLOURS[0], legend=False), 1)
     standing = np.where(v < STANDING, v, np.nan)
     if np.isfinite(standing).any():
-        figure.add_trace(line(t, standing, "standing", COLOURS[1], legend=False, width=4), 1, 1)
+        figure.add_trace(line(t, standing, "standing", COLOURS[1], legend=False, width=4), 1)
     heading = table["yaw"].to_numpy() * R2D % 360
     jump = np.abs(np.diff(heading, prepend=heading[0])) > 180
-    figure.add_trace(line(t, np.where(jump, np.nan, heading), "heading", COLOURS[2], legend=False), 2, 1)
-    figure.add_trace(line(t, table["height_m"].to_numpy(), "height", COLOURS[3], legend=False), 3, 1)
-    figure.add_trace(line(t, horizontal_std(course), "1σ", COLOURS[5], legend=False), 4, 1)
-    figure.update_yaxes(type="log", row=4, col=1)
-    figure.update_xaxes(title_text="Time [s]", row=4, col=1)
+    figure.add_trace(line(t, np.where(jump, np.nan, heading), "heading", COLOURS[2], legend=False), 2)
+    figure.add_trace(line(t, table["height_m"].to_numpy(), "height", COLOURS[3], legend=False), 3)
+    figure.add_trace(line(t, horizontal_std(course), "1σ", COLOURS[5], legend=False), 4)
+    figure.update_yaxis(4, type="log", nticks=4)
+    figure.update_xaxis(4, title={"text": "Time [s]"})
     shade(figure, gaps, 4)
     return figure
 
 
-def _innovations(course: Course, t: Array, gaps: Sequence[tuple[float, float]]) -> go.Figure:
+def _innovations(course: TrackOnMap, t: Array, gaps: Sequence[tuple[float, float]]) -> Figure:
     innovation = course.result.innovation
     assert innovation is not None
     names = [f"Innovation {q} {a} [{u}], ±3σ" for q, u in (("position", "m"), ("velocity", "m/s")) for a in "NED"]
-    figure = stacked(names, height=120)
+    figure = stack_panels(names, height=120)
     for k in range(6):
         seen = np.isfinite(innovation.value[:, k])
         if not seen.any():
             continue
         sigma = 3 * innovation.std[seen, k]
         if np.isfinite(sigma).any():
-            figure.add_trace(band(t[seen], -sigma, sigma, "±3σ", COLOURS[5], legend=k == 0), k + 1, 1)
+            figure.add_trace(band(t[seen], -sigma, sigma, "±3σ", COLOURS[5], legend=k == 0), k + 1)
         y = innovation.value[seen, k]
-        figure.add_trace(line(t[seen], y, "innovation", COLOURS[0], legend=k == 0, width=1), k + 1, 1)
-    figure.update_xaxes(title_text="Time [s]", row=6, col=1)
+        figure.add_trace(line(t[seen], y, "innovation", COLOURS[0], legend=k == 0, width=1), k + 1)
+    figure.update_xaxis(6, title={"text": "Time [s]"})
     shade(figure, gaps, 6)
     return figure
 
 
-def _imu(course: Course, t: Array, gaps: Sequence[tuple[float, float]]) -> go.Figure:
+def _imu(course: TrackOnMap, t: Array, gaps: Sequence[tuple[float, float]]) -> Figure:
     table = course.result.table
     sensors = (("accel", "Accelerometer", "m/s²", 1.0), ("gyro", "Gyroscope", "°/s", R2D))
     axes = [(s, n, u, f, a) for s, n, u, f in sensors for a in "xyz"]
-    figure = stacked([f"{n} {a} error [{u}], ±3σ" for _, n, u, _, a in axes], height=120)
+    figure = stack_panels([f"{n} {a} error [{u}], ±3σ" for _, n, u, _, a in axes], height=120)
     for k, (sensor, _, _, factor, a) in enumerate(axes):
         y = table[f"{sensor}_error_{a}"].to_numpy() * factor
         sigma = 3 * table[f"std_{sensor}_error_{a}"].to_numpy() * factor
         if np.isfinite(sigma).any():
-            figure.add_trace(band(t, y - sigma, y + sigma, "±3σ", COLOURS[2], legend=k == 0), k + 1, 1)
-        figure.add_trace(line(t, y, "estimate", COLOURS[2], legend=k == 0), k + 1, 1)
-    figure.update_xaxes(title_text="Time [s]", row=6, col=1)
+            figure.add_trace(band(t, y - sigma, y + sigma, "±3σ", COLOURS[2], legend=k == 0), k + 1)
+        figure.add_trace(line(t, y, "estimate", COLOURS[2], legend=k == 0), k + 1)
+    figure.update_xaxis(6, title={"text": "Time [s]"})
     shade(figure, gaps, 6)
     return figure

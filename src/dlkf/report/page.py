@@ -13,8 +13,7 @@ from importlib.resources import files
 from types import MappingProxyType
 from typing import Any
 
-import plotly.graph_objects as go
-from plotly.offline import get_plotlyjs
+from dlkf.report.drawing import Figure, library, template
 
 
 @dataclass
@@ -24,21 +23,21 @@ class Page:
     title: str
     answer: Sequence[str]
     parts: list[str] = field(default_factory=list)
+    warnings: Sequence[str] = ()  # below the answer
 
     def heading(self, text: str, note: str = "") -> None:
         """A section's title and a line about it."""
         self.parts.append(f"<h2>{html.escape(text)}</h2>" + (f"<p class=note>{html.escape(note)}</p>" if note else ""))
 
-    def figure(self, name: str, figure: go.Figure) -> None:
+    def figure(self, name: str, figure: Figure) -> None:
         """An interactive figure; ``name`` is its id in the page. A map brings its switch for streets."""
-        traces: Any = figure.data
-        if any(trace.type == "scattermap" for trace in traces):
+        if any(trace["type"] == "scattermap" for trace in figure.data):
             self.parts.append(
                 f'<label><input type=checkbox class=streets data-map="{name}"> streets '
                 "(loads tiles from openstreetmap.org)</label>"
             )
-        height = figure.layout.height or 450
-        data = str(figure.to_json()).replace("</", "<\\/")
+        height = figure.layout.get("height", 450)
+        data = figure.to_json().replace("</", "<\\/")
         self.parts.append(
             f'<div class=figure id="{name}" style="height:{height:.0f}px"><p class=waiting>…</p></div>'
             f'<script type="application/json" id="data-{name}">{data}</script>'
@@ -78,17 +77,19 @@ class Page:
         """How the numbers were made, as words: nested settings indented, numbers as they are written by hand."""
         rows = "".join(
             f"<tr><td>{'&emsp;' * depth}{html.escape(words(key))}</td><td><code>{html.escape(text)}</code></td></tr>"
-            for depth, key, text in flattened(values)
+            for depth, key, text in flatten_html(values)
         )
         self.parts.append(f"<h2>How this was made</h2><div class=scroll><table class=protocol>{rows}</table></div>")
 
     def html(self) -> str:
         """The whole page."""
-        template = files("dlkf.report").joinpath("page.html").read_text(encoding="utf-8")
+        form = files("dlkf.report").joinpath("page.html").read_text(encoding="utf-8")
         answer = "".join(f"<p>{html.escape(a)}</p>" for a in self.answer)
-        filled = template.replace("{{title}}", html.escape(self.title)).replace("{{answer}}", answer)
-        drawing = get_plotlyjs() if any("class=figure" in part for part in self.parts) else ""
-        return filled.replace("{{body}}", "\n".join(self.parts)).replace("{{plotly}}", drawing)
+        answer += "".join(f"<p class=warning>{html.escape(w)}</p>" for w in self.warnings)
+        filled = form.replace("{{title}}", html.escape(self.title)).replace("{{answer}}", answer)
+        drawn = any("class=figure" in part for part in self.parts)
+        filled = filled.replace("{{template}}", template() if drawn else "{}")
+        return filled.replace("{{body}}", "\n".join(self.parts)).replace("{{plotly}}", library() if drawn else "")
 
 
 def embedded(png: bytes) -> str:
@@ -101,18 +102,18 @@ def words(key: str) -> str:
     return key.replace("_", " ")
 
 
-def flattened(values: Mapping[str, Any], depth: int = 0) -> list[tuple[int, str, str]]:
+def flatten_html(values: Mapping[str, Any], depth: int = 0) -> list[tuple[int, str, str]]:
     """(depth, key, text) of nested settings; lists and numbers in one line."""
     out: list[tuple[int, str, str]] = []
     for key, value in values.items():
         if isinstance(value, Mapping) and value:
-            out += [(depth, str(key), ""), *flattened(value, depth + 1)]
+            out += [(depth, str(key), ""), *flatten_html(value, depth + 1)]
         else:
-            out.append((depth, str(key), shown(value)))
+            out.append((depth, str(key), is_shown(value)))
     return out
 
 
-def shown(value: Any) -> str:
+def is_shown(value: Any) -> str:
     """A value for a reader: – for none, numbers with six digits at most."""
     if value is None or (isinstance(value, Mapping) and not value):
         return "–"
@@ -121,5 +122,5 @@ def shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, (list, tuple)):
-        return ", ".join(map(shown, value)) or "–"
+        return ", ".join(map(is_shown, value)) or "–"
     return str(value)

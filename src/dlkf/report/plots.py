@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import deepcopy
-from functools import cache
-from itertools import pairwise
 
 import numpy as np
-import plotly.graph_objects as go
 from numpy.typing import NDArray
-from plotly.subplots import make_subplots
 
-from dlkf.colours import SHADE
+from dlkf.base.colours import SHADE
+from dlkf.report.drawing import Figure, Trace, panels
 
 Array = NDArray[np.floating]
 MOST = 1800  # points of a line: more than a screen has columns
@@ -25,15 +21,14 @@ def extremes(y: Array) -> NDArray[np.int64]:
     if n <= MOST:
         return np.arange(n)
     edges = np.linspace(0, n, MOST // 2 + 1).astype(int)
-    filled = np.where(np.isfinite(y), y, np.nan)
-    found = {0, n - 1}
-    for a, b in pairwise(edges):
-        part = filled[a:b]
-        if np.isnan(part).all():
-            found.add(int(a))
-        else:
-            found |= {int(a + np.nanargmin(part)), int(a + np.nanargmax(part))}
-    return np.array(sorted(found))
+    first, count = edges[:-1, None], np.diff(edges)[:, None]
+    place = np.arange(count.max())
+    inside = place < count
+    bucket = y[np.minimum(first + place, n - 1)]
+    known = inside & np.isfinite(bucket)  # a bucket without a value gives its first place twice
+    least = np.where(known, bucket, np.inf).argmin(1)
+    most = np.where(known, bucket, -np.inf).argmax(1)
+    return np.unique(np.concatenate(([0, n - 1], edges[:-1] + least, edges[:-1] + most)))
 
 
 def every(n: int, most: int) -> NDArray[np.int64]:
@@ -48,46 +43,40 @@ def small(x: Sequence | Array) -> Array:
     return np.asarray(x, np.float32)
 
 
-def stacked(titles: Sequence[str], *, height: int) -> go.Figure:
+def stack_panels(titles: Sequence[str], *, height: int) -> Figure:
     """Panels below each other with a common time axis."""
-    return deepcopy(_panels(tuple(titles), height))
-
-
-@cache
-def _panels(titles: tuple[str, ...], height: int) -> go.Figure:
-    """Empty panels; to make them takes longer than to fill them, and a page has the same for every drive."""
     rows = len(titles)
-    figure = make_subplots(rows, 1, shared_xaxes=True, subplot_titles=titles, vertical_spacing=min(0.09, 0.4 / rows))
+    figure = panels(titles, min(0.09, 0.4 / rows))
     figure.update_layout(
-        height=height * rows + 90, margin={"l": 60, "r": 15, "t": 40, "b": 45}, font=FONT, template="plotly_white",
+        height=height * rows + 90, margin={"l": 60, "r": 15, "t": 40, "b": 45}, font=FONT,
         legend={"orientation": "h", "yanchor": "top", "y": -0.12 if rows > 1 else -0.2}, hovermode="x unified",
     )  # fmt: skip
-    figure.update_annotations(font_size=12, xanchor="left", x=0)
     return figure
 
 
-def line(x: Array, y: Array, name: str, colour: str, *, legend: bool = True, width: float = 1.5):
+def line(x: Array, y: Array, name: str, colour: str, *, legend: bool = True, width: float = 1.5) -> Trace:
     """A thinned line; a name stands in the legend once."""
     i = extremes(np.asarray(y, float))
-    return go.Scatter(
-        x=small(x[i]), y=small(y[i]), name=name, legendgroup=name, showlegend=legend, mode="lines",
-        line={"color": colour, "width": width},
-    )  # fmt: skip
+    return {
+        "type": "scatter", "x": small(x[i]), "y": small(y[i]), "name": name, "legendgroup": name, "showlegend": legend,
+        "mode": "lines", "line": {"color": colour, "width": width},
+    }  # fmt: skip
 
 
-def band(x: Array, low: Array, high: Array, name: str, colour: str, *, legend: bool = False) -> go.Scatter:
+def band(x: Array, low: Array, high: Array, name: str, colour: str, *, legend: bool = False) -> Trace:
     """A shaded band; parts without a value are left out."""
     i = every(len(x), MOST // 2)
     i = i[np.isfinite(low[i]) & np.isfinite(high[i])]
     r, g, b = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
-    return go.Scatter(
-        x=small(np.concatenate((x[i], x[i][::-1]))), y=small(np.concatenate((high[i], low[i][::-1]))), fill="toself",
-        fillcolor=f"rgba({r},{g},{b},0.18)", line={"width": 0}, mode="lines", name=name, legendgroup=name,
-        showlegend=legend, hoverinfo="skip",
-    )  # fmt: skip
+    return {
+        "type": "scatter", "x": small(np.concatenate((x[i], x[i][::-1]))),
+        "y": small(np.concatenate((high[i], low[i][::-1]))), "fill": "toself",
+        "fillcolor": f"rgba({r},{g},{b},0.18)", "line": {"width": 0}, "mode": "lines", "name": name,
+        "legendgroup": name, "showlegend": legend, "hoverinfo": "skip",
+    }  # fmt: skip
 
 
-def shade(figure: go.Figure, spans: Sequence[tuple[float, float]], rows: int) -> None:
+def shade(figure: Figure, spans: Sequence[tuple[float, float]], rows: int) -> None:
     """Grey where there was no GNSS; at most 200 spans, the longest."""
     longest = sorted(spans, key=lambda s: s[0] - s[1])[:200]
     shapes = [

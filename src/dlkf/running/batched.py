@@ -1,4 +1,4 @@
-"""Run a filter over a large batch a few pieces at a time, without gradients."""
+"""Run a filter over a large batch a few segments at a time, without gradients."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.filters.integration import Solution, integrate
-from dlkf.filters.smoother import Filter, Smoothed, smooth
+from dlkf.filters.smoother import Filter, SmoothedSolution, smooth
 
 CHUNK_SAMPLES = 1_500_000  # IMU samples integrated at a time: bounds the memory
 
 
 def chunks(batch: Batch, samples: int = CHUNK_SAMPLES) -> Iterator[Tensor]:
-    """Indices of pieces of like length, as many at a time as ``samples`` IMU samples allow (at least one)."""
+    """Indices of segments of like length, as many at a time as ``samples`` IMU samples allow (at least one)."""
     length = batch.present.sum(-1).cpu()
     order = torch.argsort(length, descending=True, stable=True)
     start = 0
@@ -25,15 +25,17 @@ def chunks(batch: Batch, samples: int = CHUNK_SAMPLES) -> Iterator[Tensor]:
         start += size
 
 
-def run_filter(batch: Batch, estimator: Filter, *, keep_covariances: bool = False) -> Solution:
+def run_filter(
+    batch: Batch, estimator: Filter, *, keep_covariances: bool = False, keep_innovations: bool = False
+) -> Solution:
     """The filter loop, smoothed where asked for, without gradients, on the device of the estimator's parameters.
 
-    ``keep_covariances`` where the filter has some and is not smoothed.
+    ``keep_covariances``, or those of the innovations alone, where the filter has some and is not smoothed.
     """
     parameter = next(estimator.parameters(), None) if isinstance(estimator, torch.nn.Module) else None
     if parameter is not None:
         batch = batch.to(parameter.device)
     with torch.inference_mode():
-        if isinstance(estimator, Smoothed):
+        if isinstance(estimator, SmoothedSolution):
             return smooth(batch, estimator.filter)
-        return integrate(batch, estimator, keep_covariances=keep_covariances)
+        return integrate(batch, estimator, keep_covariances=keep_covariances, keep_innovations=keep_innovations)

@@ -1,8 +1,8 @@
-"""What a filter says at one moment, in the units of ``solution.parquet``."""
+"""A filter's output at one moment, in the units of ``solution.parquet``."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
@@ -31,13 +31,17 @@ class Estimate:
     imu_error: Tensor
     std: Tensor | None
     gnss_used: bool
+    aids: Mapping[str, float] | None = None  # of further sensors, see dlkf.filters.aids.attach.aid_columns
 
     @cached_property
     def row(self) -> dict[str, float | bool]:
         """The row of ``solution.parquet`` (:mod:`dlkf.running.solution`): geodetic position, NED, roll-pitch-yaw."""
         t = torch.tensor([self.t], dtype=torch.float64)
         columns = solution_columns(t, self.frame, self.state, self.imu_error, self.std)
-        return {name: float(value) for name, value in columns.items()} | {"gnss_used": self.gnss_used}
+        return {name: float(value) for name, value in columns.items()} | {
+            "gnss_used": self.gnss_used,
+            **(self.aids or {}),
+        }
 
 
 def estimates_table(estimates: Iterable[Estimate]) -> pd.DataFrame:
@@ -49,5 +53,7 @@ def estimates_table(estimates: Iterable[Estimate]) -> pd.DataFrame:
         std = None if rows[0].std is None else torch.cat([e.std for e in rows if e.std is not None])
         t = torch.tensor([e.t for e in rows], dtype=torch.float64)
         used = torch.tensor([e.gnss_used for e in rows])
-        parts.append(solution_table(t, rows[0].frame, state, torch.cat([e.imu_error for e in rows]), std, used))
+        error = torch.cat([e.imu_error for e in rows])
+        aids = pd.DataFrame([dict(e.aids or {}) for e in rows])
+        parts.append(solution_table(t, rows[0].frame, state, error, std, used).join(aids))
     return pd.concat(parts, ignore_index=True)

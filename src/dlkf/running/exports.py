@@ -1,7 +1,7 @@
 """A solution in the formats of other programs: maps (GeoJSON, KML, GPX), receivers (NMEA, RTKLIB .pos), evo, CSV.
 
 All functions take the rows of ``solution.parquet`` and write one file. ``when`` is the UTC time of every row
-(:func:`utc_times`); None where nobody knows the date: then tracks have no times, and NMEA and ``.pos``, which cannot do
+(:func:`utc_times`); None where the date is unknown: then tracks have no times, and NMEA and ``.pos``, which cannot do
 without, count seconds from midnight of 6 January 1980 (GPS week 0).
 """
 
@@ -11,6 +11,7 @@ import csv
 import json
 from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,11 @@ import numpy as np
 import pandas as pd
 import pymap3d
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from dlkf.base.errors import InputError
 from dlkf.data.readers.units import GPS_EPOCH_UNIX, WEEK_S, clock_by_size, leap_seconds
 from dlkf.data.tables import DriveClock
-from dlkf.errors import InputError
+from dlkf.running.bag_exports import write_bag
 
 Times = list[datetime] | None
 KNOTS = 1852 / 3600  # m/s
@@ -30,8 +31,8 @@ NED_ENU = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])  # and Forward-Right-Do
 
 
 def utc_times(table: pd.DataFrame, clock: DriveClock | None, counts: str = "auto") -> Times:
-    """UTC of every row. ``counts``: auto, by the receiver's own stamps where these tell the date, else by the clock of
-    the log files, whose size tells unix from gps; unix or gps says which that is, receiver or not."""
+    """UTC of every row. ``counts``: auto, by the receiver's own stamps where these have the date, else by the clock of
+    the log files, whose size separates unix from gps; unix or gps forces one, receiver or not."""
     if counts not in ("auto", "unix", "gps", "none"):
         raise InputError(f"export_clock={counts} is none of auto, unix, gps, none")
     if counts == "none" or clock is None:
@@ -60,13 +61,15 @@ def write_geojson(path: Path, table: pd.DataFrame, when: Times, name: str) -> No
     line = {"type": "LineString", "coordinates": _rounded(place)}
     features = [{"type": "Feature", "properties": {"name": name}, "geometry": line}]
     for k, point in enumerate(_rounded(place)):
-        told: dict[str, Any] = {"t": float(table["t"].iloc[k]), "speed_mps": round(float(speed[k]), 3)}
-        told |= {"heading_deg": round(float(course[k]), 2), "gnss_used": bool(table["gnss_used"].iloc[k])}
+        properties: dict[str, Any] = {"t": float(table["t"].iloc[k]), "speed_mps": round(float(speed[k]), 3)}
+        properties |= {"heading_deg": round(float(course[k]), 2), "gnss_used": bool(table["gnss_used"].iloc[k])}
         if np.isfinite(sigma[k]):
-            told["std_horizontal_m"] = round(float(sigma[k]), 4)
+            properties["std_horizontal_m"] = round(float(sigma[k]), 4)
         if when is not None:
-            told["time"] = when[k].isoformat().replace("+00:00", "Z")
-        features.append({"type": "Feature", "properties": told, "geometry": {"type": "Point", "coordinates": point}})
+            properties["time"] = when[k].isoformat().replace("+00:00", "Z")
+        features.append(
+            {"type": "Feature", "properties": properties, "geometry": {"type": "Point", "coordinates": point}}
+        )
     path.write_text(json.dumps({"type": "FeatureCollection", "features": features}), encoding="utf-8")
 
 
@@ -153,6 +156,8 @@ def write_pos(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
 
 def write_tum(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
     """For evo: t x y z qx qy qz qw; East-North-Up from the first row, attitude of Forward-Left-Up axes in it."""
+    from scipy.spatial.transform import Rotation
+
     position, rotation = poses(table)
     q = Rotation.from_matrix(rotation).as_quat()
     t = table["t"].to_numpy() if when is None else np.array([w.timestamp() for w in when])
@@ -176,8 +181,15 @@ def write_csv(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
             writer.writerow(([when[k].isoformat().replace("+00:00", "Z")] if when else []) + values)
 
 
+def write_ros(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
+    """MCAP for Foxglove and ROS 2, or a bag of ROS 1: NavSatFix and Odometry (extra ``readers``)."""
+    write_bag(path, table, when, poses(table))
+
+
 def poses(table: pd.DataFrame) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """Positions (T, 3) East-North-Up [m] from the first row, and rotations (T, 3, 3) of Forward-Left-Up into it."""
+    from scipy.spatial.transform import Rotation
+
     lat, lon, height = (table[c].to_numpy() for c in ("lat_deg", "lon_deg", "height_m"))
     position = np.stack(pymap3d.geodetic2enu(lat, lon, height, lat[0], lon[0], height[0]), -1)
     rpy = table[["yaw", "pitch", "roll"]].to_numpy()
@@ -194,14 +206,17 @@ FORMATS: Mapping[str, tuple[str, Callable[[Path, pd.DataFrame, Times, str], None
     "tum": ("solution.tum", write_tum),
     "kitti": ("solution.kitti", write_kitti),
     "csv": ("solution.csv", write_csv),
+    "mcap": ("solution.mcap", write_ros),
+    "bag": ("solution.bag", write_ros),
 }
+OF_EXTRA = ("mcap", "bag")  # formats that need the extra ``readers``
 
 
-def chosen(export: str | list[str] | None) -> list[str]:
+def chosen_formats(export: str | list[str] | None) -> list[str]:
     """Names of formats; ``all`` for every one. InputError for an unknown one."""
     names = [] if export is None else [export] if isinstance(export, str) else list(export)
     if names == ["all"]:
-        return list(FORMATS)
+        return [n for n in FORMATS if n not in OF_EXTRA or find_spec("rosbags") is not None]
     if unknown := [n for n in names if n not in FORMATS]:
         raise InputError(f"export={unknown[0]}: unknown format; known: {', '.join(FORMATS)}, all")
     return names

@@ -8,14 +8,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dlkf.data.resampling import Grid, epoch_grid, resample_imu, samples_per_epoch
+from dlkf.base.errors import InputError
+from dlkf.data.limits import FULL_SCALE
+from dlkf.data.resampling import SampleGrid, epoch_grid, resample_imu, samples_per_epoch
 from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.validate import LIMITS, Limits
-from dlkf.errors import InputError
 
 Row = Sequence[float] | np.ndarray
 COLUMNS = ("t", *ACCEL, *GYRO)
-FULL_SCALE = (400.0, 40.0)  # m/s², rad/s: beyond any IMU of a car, so a damaged packet
 BEFORE = 3  # stamps kept before the open epoch: an interval is resampled with the one before it
 ASTRAY_S = 1.0  # samples out of line that go on for so long are the truth, and the line before was not
 
@@ -43,12 +43,12 @@ class ImuStream:
         self.clear()
 
     def clear(self) -> None:
-        """Forget all samples and the grid."""
+        """Drop all samples and the grid."""
         self._rows: deque[tuple[float, ...]] = deque()
         self._astray: tuple[float, float] | None = None  # first and last stamp of a run out of line
         self._step = self._given
         self._longest = self._longest_step(self._given)
-        self.grid: Grid | None = None
+        self.grid: SampleGrid | None = None
         self.epochs = 0  # closed
         self.end = math.inf  # of the open epoch [s]
 
@@ -59,12 +59,15 @@ class ImuStream:
 
     @property
     def lost(self) -> bool:
-        """Samples out of line have gone on for longer than an accident does: the stream must begin anew."""
+        """Samples out of line have gone on for longer than an accident does: the stream must begin again."""
         return self._astray is not None and self._astray[1] - self._astray[0] >= ASTRAY_S
 
     def refused(self, t: float, accel: Row, gyro: Row) -> str:
         """Take a sample (s, m/s², rad/s); a reason if it cannot be, else nothing."""
-        row = (float(t), *map(float, accel), *map(float, gyro))
+        try:
+            row = (float(t), *map(float, accel), *map(float, gyro))
+        except (TypeError, ValueError, OverflowError):
+            return "t, accel or gyro holds what is no number"
         if len(row) != 7:
             return f"accel and gyro have {len(row) - 1} values together, must be 3 and 3"
         if not math.isfinite(sum(row)):
@@ -89,7 +92,7 @@ class ImuStream:
             grid = epoch_grid(t, t_fix, self._rate_hz, self._epoch_s, "stream")
         except InputError:
             return False
-        self.grid = Grid(grid.t0, grid.epoch_s, 1, grid.samples)
+        self.grid = SampleGrid(grid.t0, grid.epoch_s, 1, grid.samples)
         self._step = float(np.median(np.diff(t))) if self._given is None else self._given
         self._longest = self._longest_step(self._step)
         self.end = grid.t0 + self._epoch_s
@@ -102,7 +105,7 @@ class ImuStream:
         """
         done = []
         while self.latest >= self.end - max(slack_s, 4 * math.ulp(self.end)):
-            done.append(self._resampled(Grid(self.boundary(self.epochs), self._epoch_s, 1, self._samples)))
+            done.append(self._resampled(SampleGrid(self.boundary(self.epochs), self._epoch_s, 1, self._samples)))
             self.epochs += 1
             self.end = self.boundary(self.epochs + 1)
             while len(self._rows) > BEFORE and self._rows[BEFORE][0] <= self.boundary(self.epochs):
@@ -125,17 +128,16 @@ class ImuStream:
         return 0.5 * min(self.step_s, self._epoch_s / self._samples)
 
     def open(self) -> tuple[np.ndarray, float] | None:
-        """Samples (1, m, 6) from the open epoch's beginning to the latest stamp, and their length [s]."""
+        """As many samples (1, M, 6) as an epoch has, from its beginning to the latest stamp, and their length [s]."""
         if self.grid is None:
             return None
         begin = self.boundary(self.epochs)
         span = self.latest - begin
         if span <= 4 * math.ulp(begin):
             return None
-        m = max(1, math.ceil(span * self._rate_hz - 1e-6))
-        return self._resampled(Grid(begin, span, 1, m)), span / m
+        return self._resampled(SampleGrid(begin, span, 1, self._samples)), span / self._samples
 
-    def _resampled(self, grid: Grid) -> np.ndarray:
+    def _resampled(self, grid: SampleGrid) -> np.ndarray:
         table = np.array(self._rows)
         return resample_imu(dict(zip(COLUMNS, table.T)), grid, self._step)
 

@@ -1,7 +1,7 @@
 """Noise of an IMU, of its receiver and of the car, found on drives without a reference: what makes their fixes likely.
 
-A filter predicts every fix, with a covariance S. With noise that is told too small the innovations z are larger than S
-says, with noise told too large S is larger than they are; the density of z is greatest between the two. A fix a second
+A filter predicts every fix, with a covariance S. With noise set too small the innovations z are larger than S
+predicts, with noise set too large smaller; the density of z is greatest between the two. A fix a second
 shows the short-term noise alone, so the drive is also run with fixes withheld, and those are scored as they would have
 come in: they show how fast a drift grows, which is what matters in an outage. The density is Student's t with ν = 8, so
 that a few wild fixes do not decide (Lange, Little & Taylor, JASA 84, 1989):
@@ -9,11 +9,11 @@ that a few wild fixes do not decide (Lange, Little & Taylor, JASA 84, 1989):
     −ln p(z) = ½ ln|S| + ½ (ν + d) ln(1 + zᵀ S⁻¹ z / ν) + const., d components
 
 averaged over the fixes that were used and over those that were withheld, half and half. A wide log-normal prior about
-the preset of the start keeps values that the drives say nothing of.
+the preset of the start keeps values that the drives do not determine.
 
-Fixes that are late by τ and an antenna that sits a further forward than told are two explanations of nearly the same:
-the positions are τ v or a from where they should be; only the spread of the speeds and the velocities tell them
-apart. So both are sought, and one is taken only where it is surer than 3σ beside the other. σ² is the diagonal of the
+Fixes that are late by τ and an antenna that sits a further forward than stated are two explanations of nearly the same:
+the positions are τ v or a from where they should be; only the spread of the speeds and the velocities separate
+them. So both are estimated, and one is taken only where it exceeds 3σ with the other free. σ² is the diagonal of the
 sandwich H⁻¹ J H⁻¹ (White, Econometrica 50, 1982; H the curvature, J the scatter of the slopes of spans of 30 s), which
 holds for neighbouring innovations that hang together.
 """
@@ -21,7 +21,7 @@ holds for neighbouring innovations that hang together.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -30,12 +30,14 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from dlkf.console import Counted
+from dlkf.base.console import ProgressCallback
+from dlkf.base.errors import InputError
+from dlkf.data.aid_tables import AidTable
 from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.drive import Batch, Drive
-from dlkf.data.masks import withhold
+from dlkf.data.masks import withhold_fixes
 from dlkf.data.segments import whole_drives
-from dlkf.errors import InputError
+from dlkf.filters.aids.attach import aided_name
 from dlkf.filters.build import build_causal, is_filter
 from dlkf.filters.integration import Estimator, Solution
 from dlkf.filters.tuning import Tuning
@@ -45,7 +47,9 @@ from dlkf.running.start import align_each
 
 FREEDOM = 8.0  # ν
 GAPS_S = ((30.0, 45.0), (30.0, 60.0), (60.0, 90.0))  # s withheld at the end of every so many
-SETTLE_S = 20.0  # whose innovations say more of the start than of the filter
+Compiler = Callable[[Estimator, float, float], Estimator]  # filter, IMU rate [Hz], update interval [s]
+IN_C = 600  # epochs of evidence from which on the search, some 150 trials, pays for a library of its filter
+SETTLE_S = 20.0  # whose innovations depend more on the start than on the filter
 OF_SENSORS = ("noise_density", "turn_on_bias", "instability")
 OF_GNSS = ("position_std", "velocity_std")
 OF_CAR = ("lateral_std", "vertical_std")
@@ -61,11 +65,11 @@ USUAL, USUAL_OF_CAR = math.log(30.0), math.log(3.0)  # 1σ of ln(value / that at
 LARGEST = {"accel.turn_on_bias": 1.0, "gyro.turn_on_bias": 0.1}  # m/s², rad/s
 
 
-class Placing(NamedTuple):
-    """Where in time and place the fixes are beside what the drives say."""
+class FixOffset(NamedTuple):
+    """Delay and lever-arm offset of the fixes against those stored."""
 
     delay_s: float = 0.0  # by which the fixes are older than their stamps
-    ahead_m: float = 0.0  # by which the antenna sits further forward than told
+    ahead_m: float = 0.0  # by which the antenna sits further forward than stated
 
     def of(self, batch: Batch) -> Batch:
         """The batch with fixes so placed."""
@@ -80,16 +84,16 @@ class Placing(NamedTuple):
         return replace(drive, gnss_lag=lag, lever_arm_b=drive.lever_arm_b + _forward(self.ahead_m, drive.lever_arm_b))
 
 
-AS_TOLD = Placing()
+NO_OFFSET = FixOffset()
 
 
-class Found(NamedTuple):
+class NoiseFit(NamedTuple):
     """What was found, and how likely the fixes were before and after (mean −ln p of a fix, smaller is better)."""
 
     imu: ImuSpec
     tuning: Tuning
-    placing: Placing  # zero where it is not sure
-    placing_std: Placing  # 1σ, also of what was not sure; NaN where none was sought
+    placing: FixOffset  # zero where it is not sure
+    placing_std: FixOffset  # 1σ, also where not significant; NaN where none was estimated
     before: float
     after: float
 
@@ -103,8 +107,8 @@ class Found(NamedTuple):
         factors = {key: getattr(self.tuning, key) for key in (*OF_GNSS, *OF_CAR)}
         return sensors | factors | self.placing._asdict()
 
-    def told_of_fixes(self) -> str:
-        """One line on delay and antenna; empty where nothing was sought."""
+    def describe_offset(self) -> str:
+        """One line on delay and antenna; empty where nothing was estimated."""
         (late, ahead), (late_std, ahead_std) = self.placing, self.placing_std
         if math.isnan(late_std):
             return ""
@@ -117,10 +121,11 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True)
 class Evidence:
-    """Drives as one batch: every drive with all its fixes, and once for each kind of gap without some."""
+    """Drives as one batch: every drive with all its fixes, and once for each type of gap without some."""
 
     batch: Batch
     offered: Tensor  # (B, T) bool: fixes that a filter might have used before any were withheld
+    compiler: Compiler | None = None  # of the filters of the trials
 
     @staticmethod
     def of(drives: Sequence[Drive], minutes: float = 20.0, align: AlignConfig = ALIGN) -> Evidence:
@@ -139,7 +144,7 @@ class Evidence:
         hidden = torch.zeros_like(batch.available)
         for k, (length, every) in enumerate(GAPS_S, start=1):
             hidden[k::kinds] = (t % every > every - length) & (t > every)
-        return Evidence(withhold(batch, hidden), offered & (t > SETTLE_S))
+        return Evidence(withhold_fixes(batch, hidden), offered & (t > SETTLE_S))
 
     @property
     def fixes(self) -> int:
@@ -153,18 +158,21 @@ class Evidence:
         seen = speed[self.batch.gnss_valid[..., 3:5].all(-1) & self.batch.present]
         return max(float(seen.mean()), 1.0) if len(seen) else 1.0
 
-    def surprise(self, name: str, imu: ImuSpec, tuning: Tuning, placing: Placing = AS_TOLD) -> float:
+    def negative_log_likelihood(self, name: str, imu: ImuSpec, tuning: Tuning, placing: FixOffset = NO_OFFSET) -> float:
         """Mean −ln p of the fixes; infinite where the filter diverges."""
         value = float(self.shares(name, imu, tuning, placing).sum())
         return value if math.isfinite(value) else math.inf
 
-    def shares(self, name: str, imu: ImuSpec, tuning: Tuning, placing: Placing) -> Float[Tensor, "B T"]:
+    def shares(self, name: str, imu: ImuSpec, tuning: Tuning, placing: FixOffset) -> Float[Tensor, "B T"]:
         """What every fix adds to that mean; 0 without one."""
         batch = placing.of(self.batch)
-        solution = run_filter(batch, build_causal(name, imu, "this does not", tuning=tuning), keep_covariances=True)
-        told, kept = self.offered & batch.available, self.offered & ~batch.available
+        estimator = build_causal(name, imu, "this does not", tuning=tuning)
+        if self.compiler is not None:
+            estimator = self.compiler(estimator, 1 / batch.dt, batch.epoch_s)
+        solution = run_filter(batch, estimator, keep_covariances=True)
+        scored, kept = self.offered & batch.available, self.offered & ~batch.available
         out = torch.zeros_like(batch.gnss_lag)
-        out[told] = 0.5 * _used(solution)[told] / told.sum()
+        out[scored] = 0.5 * _used(batch, solution)[scored] / scored.sum()
         out[kept] = 0.5 * _withheld(batch, solution, tuning)[kept] / kept.sum()
         return out
 
@@ -175,22 +183,21 @@ class Evidence:
         return pad(per_drive, (0, -per_drive.shape[1] % long)).unflatten(1, (-1, long)).sum(-1).flatten()
 
 
-def _used(solution: Solution) -> Float[Tensor, "B T"]:
+def _used(batch: Batch, solution: Solution) -> Float[Tensor, "B T"]:
     """Of the innovations of fixes that the filter was offered; a component without one adds nothing."""
-    assert solution.covariances is not None
-    S = solution.covariances.innovation
-    components = (solution.covariances.H != 0).any(-1).sum(-1)
-    return _density(solution.innovation, S, components)
+    assert solution.innovation_covariance is not None
+    components = (batch.gnss_valid & batch.available.unsqueeze(-1)).sum(-1)
+    return _density(solution.innovation, solution.innovation_covariance, components)
 
 
 def _withheld(batch: Batch, solution: Solution, tuning: Tuning) -> Float[Tensor, "B T"]:
     """Of horizontal positions that the filter did not see, under its own covariance and that of the fix."""
-    assert solution.covariances is not None
+    assert solution.position_covariance is not None
     state = solution.prior
     antenna = state.p_n + (state.C_nb @ batch.lever_arm_b[:, None, :, None]).squeeze(-1)
     z = batch.gnss[..., :3] - (antenna - batch.gnss_lag[..., None] * state.v_n)
     R = (tuning.position_std * batch.gnss_std[..., :2]).clamp_min(tuning.position_floor).square()
-    S = solution.covariances.predicted[..., :2, :2] + torch.diag_embed(R)
+    S = solution.position_covariance + torch.diag_embed(R)
     return _density(torch.nan_to_num(z[..., :2]), S, torch.full(z.shape[:2], 2))
 
 
@@ -207,14 +214,21 @@ def find_noise(
     *,
     delay: bool = True,
     called: str = "found",
-    progress: Counted | None = None,
-) -> Found:
+    progress: ProgressCallback | None = None,
+    compiler: Compiler | None = None,
+) -> NoiseFit:
     """The noise under which the fixes are most likely, for the Kalman filter of this name.
 
     A search along one value after the other, from ``imu`` and ``tuning`` on, in ever finer steps. It begins with noise
     and biases of both sensors together, for a preset is as a rule wrong in all of them. ``delay``: the age of the fixes
-    and the antenna's place along the car too. Raises InputError where the drives have no fix to score.
+    and the antenna's place along the car too. From ten minutes of evidence on trials run through
+    ``compiler`` (:func:`dlkf.onboard.compiled_filter.compile_or_keep`). Raises InputError where the drives have no fix
+    to score.
     """
+    if compiler is not None and int(evidence.batch.present.sum()) >= IN_C:
+        first = build_causal(name, imu, "this does not", tuning=tuning)
+        if compiler(first, 1 / evidence.batch.dt, evidence.batch.epoch_s) is not first:
+            evidence = replace(evidence, compiler=compiler)
     sensors = [(s, k) for s in ("accel", "gyro") for k in OF_SENSORS]
     x = {f"{s}.{k}": max(float(getattr(getattr(imu, s), k)), 1e-7) for s, k in sensors}
     car = {"nhc", "car"} & set(name.partition("+")[0].split("_"))
@@ -222,10 +236,10 @@ def find_noise(
     start, usual = dict(x), {k: USUAL_OF_CAR if k in OF_CAR else USUAL for k in x}
     directions = [tuple(k for k in x if k.startswith(s)) for s in ("accel", "gyro")] + [(k,) for k in x]
     pace = evidence.pace
-    shifts = [Placing(DELAY_STEP_S * late, DELAY_STEP_S * pace * ahead) for late, ahead in WAYS]
+    shifts = [FixOffset(DELAY_STEP_S * late, DELAY_STEP_S * pace * ahead) for late, ahead in WAYS]
     done = 0
 
-    def judged(values: Mapping[str, float], placing: Placing) -> float:
+    def judged(values: Mapping[str, float], placing: FixOffset) -> float:
         nonlocal done
         done += 1
         if progress is not None:
@@ -233,11 +247,14 @@ def find_noise(
         if any(values[k] > limit for k, limit in LARGEST.items()) or not 0 <= placing.delay_s <= LONGEST_DELAY_S:
             return math.inf
         away = sum(0.5 * (math.log(v / start[k]) / usual[k]) ** 2 for k, v in values.items())
-        return evidence.surprise(name, *_built(values, imu, tuning, called), placing) + away / evidence.fixes
+        return (
+            evidence.negative_log_likelihood(name, *_built(values, imu, tuning, called), placing)
+            + away / evidence.fixes
+        )
 
-    def sought(
-        x: Mapping[str, float], placing: Placing, best: float, steps: Sequence[float], shifts: Sequence[Placing]
-    ) -> tuple[Mapping[str, float], Placing, float]:
+    def search(
+        x: Mapping[str, float], placing: FixOffset, best: float, steps: Sequence[float], shifts: Sequence[FixOffset]
+    ) -> tuple[Mapping[str, float], FixOffset, float]:
         for step in steps:
             moved = True
             for _ in range(4):
@@ -255,44 +272,49 @@ def find_noise(
                         best, placing, moved = value, there, True
         return x, placing, best
 
-    before = judged(x, AS_TOLD) if evidence.fixes else math.inf
+    before = judged(x, NO_OFFSET) if evidence.fixes else math.inf
     if not math.isfinite(before):
         raise InputError("no noise can be found: it takes two minutes with fixes, and a filter that does not diverge")
-    x, placing, best = sought(x, AS_TOLD, before, STEPS, shifts if delay else ())
-    unknown = Placing(math.nan, math.nan)
+    x, placing, best = search(x, NO_OFFSET, before, STEPS, shifts if delay else ())
+    unknown = FixOffset(math.nan, math.nan)
     if not delay:
-        return Found(*_built(x, imu, tuning, called), placing, unknown, before, best)
+        return NoiseFit(*_built(x, imu, tuning, called), placing, unknown, before, best)
     coarse = placing
-    placing, std = placed(evidence, name, *_built(x, imu, tuning, called), coarse)
+    placing, std = search_fix_offset(evidence, name, *_built(x, imu, tuning, called), coarse)
     if placing != coarse:
         best = judged(x, placing)
-        x, placing, best = sought(x, placing, best, STEPS[1:], ())
-    return Found(*_built(x, imu, tuning, called), placing, std, before, best)
+        x, placing, best = search(x, placing, best, STEPS[1:], ())
+    return NoiseFit(*_built(x, imu, tuning, called), placing, std, before, best)
 
 
-def untold(
-    drives: Sequence[Drive], name: str, imu: ImuSpec, tuning: Tuning, align: AlignConfig, **given: Any
-) -> tuple[Estimator, list[Drive], Found]:
+def generic_filter(
+    drives: Sequence[Drive], name: str, imu: ImuSpec, tuning: Tuning, align: AlignConfig,
+    aids: Sequence[AidTable] = (), **given: Any,
+) -> tuple[Estimator, list[Drive], NoiseFit]:  # fmt: skip
     """A Kalman filter that finds its noise on the drives themselves, and the drives with their fixes so placed.
 
-    InputError for a filter that is told nothing anyway, or told more than noise.
+    One with vehicle constraints also takes ``aids``, sensors that the drives have, while the noise is found. InputError
+    for a filter that takes no noise, or more than noise.
     """
     if not is_filter(name) or name == "ins" or "prior" in name.split("_"):
         what = "imu=auto finds the noise of a Kalman filter"
         raise InputError(f"{what}, model={name} takes none; leave imu out, or take model=mbkf21_nhc")
+    name = aided_name(name, [table.name for table in aids])
     found = find_noise(Evidence.of(drives, align=align), name, imu, tuning, **given)
     placed = [found.placing.of_drive(d) for d in drives]
     return build_causal(name, found.imu, "imu=auto does not", tuning=found.tuning), placed, found
 
 
-def placed(evidence: Evidence, name: str, imu: ImuSpec, tuning: Tuning, placing: Placing) -> tuple[Placing, Placing]:
+def search_fix_offset(
+    evidence: Evidence, name: str, imu: ImuSpec, tuning: Tuning, placing: FixOffset
+) -> tuple[FixOffset, FixOffset]:
     """Delay and place to a fraction of their 1σ, zero where they are not sure beside each other, and their 1σ."""
     unit = torch.tensor([1.0, evidence.pace], dtype=torch.float64)  # so that both are in seconds
     at, std = torch.tensor(placing, dtype=torch.float64) / unit, torch.zeros(2, dtype=torch.float64)
     free = [0, 1]
 
     def spans(of: Tensor) -> Tensor:
-        return evidence.spans(evidence.shares(name, imu, tuning, Placing(*(of * unit).tolist())))
+        return evidence.spans(evidence.shares(name, imu, tuning, FixOffset(*(of * unit).tolist())))
 
     def bent(of: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """A point whose neighbours are no future fixes, slopes of the spans there (n, k) and curvature (k, k)."""
@@ -307,7 +329,7 @@ def placed(evidence: Evidence, name: str, imu: ImuSpec, tuning: Tuning, placing:
         return of, slopes, H
 
     value = float(spans(at).sum())
-    for step in (8 * SLIGHT_S, 4 * SLIGHT_S, 2 * SLIGHT_S):  # far off the density has no curvature to trust
+    for step in (8 * SLIGHT_S, 4 * SLIGHT_S, 2 * SLIGHT_S):  # far off the density's curvature is not usable
         for way in WAYS:
             there = at + step * torch.tensor(way, dtype=at.dtype)
             while 0 <= there[0] <= LONGEST_DELAY_S and (tried := float(spans(there).sum())) < value:
@@ -332,11 +354,11 @@ def placed(evidence: Evidence, name: str, imu: ImuSpec, tuning: Tuning, placing:
         if sure == free:
             break
         free = sure
-    return Placing(*(at * unit).tolist()), Placing(*(std * unit).tolist())
+    return FixOffset(*(at * unit).tolist()), FixOffset(*(std * unit).tolist())
 
 
-def _moved(placing: Placing, shift: Placing, step: float) -> Placing:
-    return Placing(placing.delay_s + step * shift.delay_s, placing.ahead_m + step * shift.ahead_m)
+def _moved(placing: FixOffset, shift: FixOffset, step: float) -> FixOffset:
+    return FixOffset(placing.delay_s + step * shift.delay_s, placing.ahead_m + step * shift.ahead_m)
 
 
 def _forward(metres: float, like: Tensor) -> Tensor:

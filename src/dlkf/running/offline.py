@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,26 +12,31 @@ import numpy as np
 import pandas as pd
 import torch
 
-from dlkf.console import Counted
-from dlkf.data.alignment import ALIGN, AlignConfig
-from dlkf.data.drive import Drive
+from dlkf.base.console import ProgressCallback
+from dlkf.base.errors import InputError
+from dlkf.data.alignment import SEARCH, AlignConfig, Start
+from dlkf.data.drive import Batch, Drive
+from dlkf.data.limits import NONE_REFUSED, Refused
 from dlkf.data.segments import whole_drives
 from dlkf.data.store import load_dataset
 from dlkf.data.tables import read_table
 from dlkf.data.validate import GNSS_QUALITIES
-from dlkf.errors import InputError
+from dlkf.filters.aids.attach import aid_columns
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import Solution
-from dlkf.filters.smoother import Filter, Smoothed
+from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.running.batched import CHUNK_SAMPLES, run_filter
-from dlkf.running.solution import solution_table
+from dlkf.running.innovations import Innovation, fit_sigma
+from dlkf.running.loss import first_loss
+from dlkf.running.solution import SCHEMA, solution_table
 from dlkf.running.start import align_each
 
+WORTH_SAYING = 0.01  # probability of another heading
 SAMPLES_AT_ONCE = 4_000_000  # IMU samples of drives in memory, 22 h at 50 Hz
 
 
 @dataclass(frozen=True)
-class Fixes:
+class UsableFixes:
     """The fixes in a drive's file that a filter could use: times [s], places [°], NMEA GGA quality."""
 
     t: np.ndarray
@@ -39,12 +45,12 @@ class Fixes:
     quality: np.ndarray
 
     @staticmethod
-    def of(folder: str | Path, drive: str) -> Fixes:
+    def of(folder: str | Path, drive: str) -> UsableFixes:
         """Of a drive of a dataset."""
         gnss = read_table(folder, "gnss", drive)
         assert gnss is not None  # read_table raises where there is none
         usable = np.isin(gnss["quality"], GNSS_QUALITIES)
-        return Fixes(*(gnss[c][usable] for c in ("t", "lat_deg", "lon_deg", "quality")))
+        return UsableFixes(*(gnss[c][usable] for c in ("t", "lat_deg", "lon_deg", "quality")))
 
     @property
     def span_s(self) -> float:
@@ -61,49 +67,40 @@ class Fixes:
         return int(((self.t > first + 1e-3) & (self.t <= last + 1e-3)).sum())
 
 
-def epoch_for(spacings: Iterable[Fixes], rate_hz: float, estimator: Filter) -> float:
+def epoch_for(spacings: Iterable[UsableFixes], rate_hz: float, estimator: Filter) -> float:
     """Update interval [s] that uses every fix: the closest usual spacing, at most 1 s.
 
     1 s where it is no whole number of IMU samples, and for filters with constraints, whose noise is meant for one a
     second.
     """
     closest = min((s.usual_s for s in spacings), default=1.0)
-    samples = closest * rate_hz
+    samples = closest * rate_hz if math.isfinite(closest) else 0.0  # no drive has two fixes: any grid will do
     whole = samples >= 1 and abs(samples - round(samples)) < 1e-6
-    kalman = estimator.filter if isinstance(estimator, Smoothed) else getattr(estimator, "kalman", estimator)
+    kalman = estimator.filter if isinstance(estimator, SmoothedSolution) else getattr(estimator, "kalman", estimator)
     constrained = any(isinstance(source, CarConstraints) for source in getattr(kalman, "sources", ()))
     return closest if closest < 1.0 and whole and not constrained else 1.0
 
 
-class Innovation(NamedTuple):
-    """GNSS − prediction (T, 6) [m, m/s] in the tangent frame, NaN where no fix was used, and its 1σ as the filter says.
-
-    The 1σ is NaN where the filter has no covariance.
-    """
-
-    value: np.ndarray
-    std: np.ndarray
-
-    @property
-    def normalised_rms(self) -> float:
-        """RMS of innovation over 1σ: 1 for a filter that knows itself."""
-        ratio = self.value / self.std
-        return float(np.sqrt(np.nanmean(ratio**2))) if np.isfinite(ratio).any() else np.nan
-
-
 @dataclass(frozen=True)
 class Navigated:
-    """A drive's solution: its table, and the time [s, file clock] at which the filter could start."""
+    """A drive's solution: its table, the time [s, file clock] at which the filter could start, and the probability
+    that it then faced another way."""
 
     drive: str
     aligned_at: float
     table: pd.DataFrame
     innovation: Innovation | None = None
+    refused: Refused = NONE_REFUSED  # samples and fixes beyond physical limits, which were left out
+    restarts: tuple[float, ...] = ()  # times [s] at which the filter was lost and restarted
+    doubt: float = 0.0
 
-    def summary(self, spacing: Fixes | None = None) -> str:
+    def summary(self, spacing: UsableFixes | None = None) -> str:
         """One line: rows, alignment, fixes used (of those in the file), and the filter's own 1σ at the end."""
         last, used = self.table.iloc[-1], int(self.table.gnss_used.sum())
-        text = f"{self.drive}: aligned at t = {round(self.aligned_at, 1) + 0.0:.1f} s, {len(self.table)} epochs, "
+        text = f"{self.drive}: aligned at t = {round(self.aligned_at, 1) + 0.0:.1f} s, "
+        if self.doubt > WORTH_SAYING:
+            text += f"heading in doubt (another way round with probability {self.doubt:.2g}), "
+        text += f"{len(self.table)} epochs, "
         if spacing is None:
             text += f"{used} fixes used"
         else:
@@ -116,10 +113,43 @@ class Navigated:
             text += f", final 1σ {position:.2g} m horizontal, {np.degrees(last.std_yaw):.2g}° heading"
         if self.innovation is not None and np.isfinite(spread := self.innovation.normalised_rms):
             text += f", innovations {spread:.2g} of their 1σ (RMS; 1 is right)"
+        text += "".join(f", {name} {found}" for name, found in self.sensors().items())
+        if any(self.refused):
+            text += f", {self.refused} beyond physical limits refused"
+        if self.restarts:
+            text += ", lost and started over at t = " + ", ".join(f"{t:.0f}" for t in self.restarts[:5]) + " s"
         return text
 
+    @property
+    def sensor_columns(self) -> list[str]:
+        """Columns of the table that further sensors added."""
+        return [column for column in self.table.columns if column not in SCHEMA.names]
 
-def in_shares(fixes: Mapping[str, Fixes], rate_hz: float, samples: int = SAMPLES_AT_ONCE) -> list[tuple[str, ...]]:
+    def sensors(self) -> dict[str, str]:
+        """Of further sensors: how many updates used them, how they fit, and what was found of them at the end."""
+        said, table = {}, self.table
+        for used in (column for column in self.sensor_columns if column.endswith("_used")):
+            name = used.removesuffix("_used")
+            ratio = table[f"{name}_innovation"] / table[f"{name}_innovation_std"]
+            seen = int(ratio.notna().sum())
+            said[name] = f"in {int(table[used].sum())} of {seen} updates"
+            if seen:
+                said[name] += f" (innovations {np.sqrt((ratio**2).mean()):.2g} of their 1σ)"
+        for std in (column for column in self.sensor_columns if column.startswith("std_")):
+            name, last = std.removeprefix("std_"), table.iloc[-1]
+            said[name] = f"{last[name]:.4g} ± {last[std]:.2g}"
+        return said
+
+
+def sigma_warning(drives: Iterable[Navigated], model: str, remedy: str) -> str | None:
+    """One line where a filter's 1σ is smaller than its innovations in these drives allow, else None."""
+    fit = fit_sigma(*(drive.innovation.ratio for drive in drives if drive.innovation is not None))
+    return fit.warning(model, remedy) if fit is not None and fit.too_small else None
+
+
+def chunk_drives(
+    fixes: Mapping[str, UsableFixes], rate_hz: float, samples: int = SAMPLES_AT_ONCE
+) -> list[tuple[str, ...]]:
     """The names of the drives, so many together as have ``samples`` of the IMU."""
     shares: list[list[str]] = [[]]
     size = 0.0
@@ -133,7 +163,7 @@ def in_shares(fixes: Mapping[str, Fixes], rate_hz: float, samples: int = SAMPLES
     return [tuple(share) for share in shares if share]
 
 
-class Share(NamedTuple):
+class DriveChunk(NamedTuple):
     """Drives that were navigated together, how many were to be, and why others were left out."""
 
     results: list[Navigated]
@@ -141,7 +171,7 @@ class Share(NamedTuple):
     skipped: dict[str, str]
 
 
-def share_of(run: Callable[..., Iterable[Navigated]], skip: bool, names: tuple[str, ...]) -> Share:
+def load_chunk(run: Callable[..., Iterable[Navigated]], skip: bool, names: tuple[str, ...]) -> DriveChunk:
     """``run(drives=names, skipped=…)``; with ``skip`` drives that cannot be aligned are left out, even if all are."""
     skipped: dict[str, str] | None = {} if skip else None
     try:
@@ -150,15 +180,15 @@ def share_of(run: Callable[..., Iterable[Navigated]], skip: bool, names: tuple[s
         if not set(names) <= set(skipped or {}):
             raise
         results = []
-    return Share(results, len(names), skipped or {})
+    return DriveChunk(results, len(names), skipped or {})
 
 
-def navigate_shares(
-    shares: Iterable[Share],
+def navigate_chunks(
+    shares: Iterable[DriveChunk],
     count: int,
     *,
     skipped: dict[str, str] | None = None,
-    progress: Counted | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Iterator[Navigated]:
     """The solutions of ``count`` drives, share by share; InputError where no drive of any could start."""
     done, any_ran = 0, False
@@ -178,7 +208,7 @@ def navigate_dataset(
     folder: str | Path,
     estimator: Filter,
     *,
-    align: AlignConfig = ALIGN,
+    align: AlignConfig = SEARCH,
     drives: Sequence[str] | None = None,
     skipped: dict[str, str] | None = None,
     **grid: Any,
@@ -192,11 +222,11 @@ def navigate_drives(
     drives: Sequence[Drive],
     estimator: Filter,
     *,
-    align: AlignConfig = ALIGN,
+    align: AlignConfig = SEARCH,
     skipped: dict[str, str] | None = None,
-    progress: Counted | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Iterator[Navigated]:
-    """Run a filter over whole drives, from the first moment at which each can be aligned as ``align`` says.
+    """Run a filter over whole drives, from the first moment at which each can be aligned by ``align``.
 
     Drives of like length run together, a bounded number at a time. A drive that cannot be aligned raises
     InputError; with ``skipped`` it is left out and the reason put there, unless none is left. Raises
@@ -219,36 +249,93 @@ def navigate_drives(
         at_once = max(1, CHUNK_SAMPLES // (first.epochs * first.imu.shape[1]))
         part = todo[done : done + at_once]
         batch = whole_drives([drives[k] for k in part], [starts[k] for k in part])
-        solution = run_filter(batch, estimator, keep_covariances=True)
-        innovation = _innovation(solution)
+        solution = _run(batch, estimator)
         for row, k in enumerate(part):
-            n = int(batch.present[row].sum())
-            state = type(solution.posterior)(*(x[row, :n] for x in solution.posterior))
-            if not all(bool(x.isfinite().all()) for x in state):
-                raise InputError(f"drive {drives[k].name}: the filter diverged (its output is not finite)")
-            t = batch.t_start[row] + batch.epoch_s * torch.arange(1, n + 1, dtype=torch.float64)
-            table = solution_table(
-                t,
-                batch.frame[row : row + 1],
-                state,
-                solution.imu_error[row, :n],
-                None if solution.std is None else solution.std[row, :n],
-                solution.used[row, :n],
-            )
-            found = Innovation(innovation.value[row, :n], innovation.std[row, :n])
-            yield Navigated(drives[k].name, float(batch.t_start[row]), table, found)
+            yield _navigated(drives[k], starts[k], batch, row, solution, estimator, align)
         done += len(part)
         if progress is not None:
             progress(done, len(todo))
 
 
-def _innovation(solution: Solution) -> Innovation:
-    """Of a whole batch, (B, T, 6); components that were not seen are NaN."""
-    value = solution.innovation.cpu().double()
-    seen = solution.used.cpu().unsqueeze(-1) & (value != 0)
-    std = torch.full_like(value, torch.nan) if solution.innovation_std is None else solution.innovation_std
-    if solution.covariances is not None:
-        c = solution.covariances
-        std = (((c.H @ c.predicted) * c.H).sum(-1) + c.R).clamp_min(0).sqrt().cpu().double()
+def _run(batch: Batch, estimator: Filter) -> Solution:
+    try:
+        return run_filter(batch, estimator, keep_covariances=True)
+    except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage]
+        names = ", ".join(batch.drive[:3]) + (", …" if len(batch.drive) > 3 else "")
+        which = f"drive {names}" if len(batch.drive) == 1 else f"one of the drives {names}"
+        raise InputError(
+            f"{which}: the filter diverged (a covariance is no longer positive definite); its 1σ and tuning must be "
+            "numbers of a car's"
+        ) from None
+
+
+def _navigated(
+    drive: Drive, start: Start, batch: Batch, row: int, solution: Solution, estimator: Filter, align: AlignConfig
+) -> Navigated:
+    """One drive of a batch; where the filter was lost (:mod:`dlkf.running.loss`) it is aligned and run again.
+
+    As in a stream the epoch at whose end it was lost has no row, nor have those until it is aligned again.
+    """
+    tables, found, restarts = [], [], []
+    aligned_at, doubt = float(batch.t_start[row]), start.doubt
+    while True:
+        end = first_loss(batch, row, solution)
+        if end is not None and isinstance(estimator, SmoothedSolution) and end > 0:
+            short = drive.part(0, start.first + end)  # what came after would be smoothed into what was before
+            batch, row = whole_drives([short], [start]), 0
+            solution = _run(batch, estimator)
+        table, innovation = _rows(drive.name, batch, row, solution, end, aid_columns(estimator))
+        tables.append(table)
+        found.append(innovation)
+        if end is None:
+            break
+        restarts.append(float(batch.t_start[row]) + (end + 1) * batch.epoch_s)
+        try:
+            again = align_each([drive], align, earliest=start.first + end + 1)[0]
+        except IndexError:  # nothing is left of the drive
+            break
+        if isinstance(again, InputError):
+            break
+        start = again
+        batch, row = whole_drives([drive], [start]), 0
+        solution = _run(batch, estimator)
+    table = pd.concat([t for t in tables if len(t)] or tables[:1], ignore_index=True)
+    if not len(table):
+        raise InputError(f"drive {drive.name}: the filter diverged from its first update on")
+    innovation = Innovation(*(np.concatenate(x) for x in zip(*found)))
+    return Navigated(drive.name, aligned_at, table, innovation, drive.refused, tuple(restarts), doubt)
+
+
+def _rows(
+    drive: str, batch: Batch, row: int, solution: Solution, end: int | None, aids: Sequence[str]
+) -> tuple[pd.DataFrame, Innovation]:
+    """The solution of one drive of a batch up to epoch ``end``, with columns ``aids`` of further sensors; InputError
+    where it is not finite."""
+    n = int(batch.present[row].sum()) if end is None else min(end, int(batch.present[row].sum()))
+    state = type(solution.posterior)(*(x[row, :n] for x in solution.posterior))
+    if not all(bool(x.isfinite().all()) for x in state):
+        raise InputError(f"drive {drive}: the filter diverged (its output is not finite)")
+    t = batch.t_start[row] + batch.epoch_s * torch.arange(1, n + 1, dtype=torch.float64)
+    table = solution_table(
+        t,
+        batch.frame[row : row + 1],
+        state,
+        solution.imu_error[row, :n],
+        None if solution.std is None else solution.std[row, :n],
+        solution.used[row, :n],
+    )
+    if solution.aids is not None:
+        table = table.join(pd.DataFrame(solution.aids[row, :n].cpu().double().numpy(), columns=list(aids)))
+    innovation = _innovation(solution, row)
+    return table, Innovation(innovation.value[:n], innovation.std[:n])
+
+
+def _innovation(solution: Solution, row: int) -> Innovation:
+    """Of one drive of a batch, (T, 6); components without a measurement are NaN."""
+    value = solution.innovation[row].cpu().double()
+    seen = solution.used[row].cpu().unsqueeze(-1) & (value != 0)
+    std = torch.full_like(value, torch.nan)
+    if (S := solution.innovation_covariance) is not None:
+        std = S[row].diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt().cpu().double()
     nan = torch.tensor(torch.nan, dtype=torch.float64)
     return Innovation(torch.where(seen, value, nan).numpy(), torch.where(seen, std, nan).numpy())

@@ -1,7 +1,7 @@
 """The tangent frame follows the car: state and memory of a filter, from one frame to another.
 
 Gravity in a tangent frame is exact within some 100 km of its origin. On longer drives the origin is moved, and
-whatever has axes or an origin in n goes with it: vectors by C_new←old, positions through ECEF, covariances by
+everything with axes or an origin in n goes with it: vectors by C_new←old, positions through ECEF, covariances by
 blocks. The solution stays what it was, to rounding and the curvature that the linear model of a window leaves out.
 """
 
@@ -67,7 +67,7 @@ def frame_at(state: NavState, frame: TangentFrame) -> TangentFrame:
 
 
 @singledispatch
-def reanchored(memory: Any, change: FrameChange, fresh: Any) -> Any:
+def reanchor(memory: Any, change: FrameChange, fresh: Any) -> Any:
     """A filter's memory in the new frame; ``fresh`` is what its ``begin`` gives there.
 
     TypeError for a memory whose axes are not known here (:func:`can_reanchor`).
@@ -77,37 +77,41 @@ def reanchored(memory: Any, change: FrameChange, fresh: Any) -> Any:
 
 def can_reanchor(memory: Any) -> bool:
     """Whether a memory can go to another frame; a filter that cannot keeps the frame it started in."""
-    return reanchored.dispatch(type(memory)) is not reanchored.dispatch(object)
+    return reanchor.dispatch(type(memory)) is not reanchor.dispatch(object)
 
 
-@reanchored.register
+@reanchor.register
 def _(memory: None, change: FrameChange, fresh: None) -> None:
     return None
 
 
-@reanchored.register
-def _(memory: model_based.Memory, change: FrameChange, fresh: model_based.Memory) -> model_based.Memory:
-    gate, noise = memory.fix.gate, memory.noise
+@reanchor.register
+def _(
+    memory: model_based.KalmanMemory, change: FrameChange, fresh: model_based.KalmanMemory
+) -> model_based.KalmanMemory:
+    gate, coarse, noise = memory.fix.gate, memory.fix.coarse, memory.noise
+    if coarse is not None:
+        coarse = coarse._replace(fix=change.fixes(coarse.fix))
     if gate is not None:  # NaN: equal to no other fix, so a frozen receiver shows one fix later
         gate = gate._replace(innovation=change.vectors(gate.innovation), fix=torch.full_like(gate.fix, torch.nan))
     if noise is not None:
         noise = noise._replace(Q=change.covariance(noise.Q), R=change.variances(noise.R))
     sources = tuple(
-        reanchored(old, change, new) if can_reanchor(old) else old for old, new in zip(memory.sources, fresh.sources)
+        reanchor(old, change, new) if can_reanchor(old) else old for old, new in zip(memory.sources, fresh.sources)
     )
     windows = replace(fresh.windows, density=memory.windows.density)
     return memory._replace(
-        P=change.covariance(memory.P), windows=windows, fix=memory.fix._replace(gate=gate), sources=sources,
-        noise=noise,
+        P=change.covariance(memory.P), windows=windows, fix=memory.fix._replace(gate=gate, coarse=coarse),
+        sources=sources, noise=noise,
     )  # fmt: skip
 
 
-@reanchored.register
-def _(memory: learned.Memory, change: FrameChange, fresh: learned.Memory) -> learned.Memory:
-    """What the filter remembers of states and fixes; what the network does stays.
+@reanchor.register
+def _(memory: learned.LearnedMemory, change: FrameChange, fresh: learned.LearnedMemory) -> learned.LearnedMemory:
+    """The filter's memory of states and fixes; the network's stays.
 
     In the heading frame that is the same solution. The features of the frame ``ned`` hold the position from the
-    origin, which begins anew near zero, as in the pieces that the network was trained on.
+    origin, which begins again near zero, as in the segments that the network was trained on.
     """
     return memory._replace(
         origin=fresh.origin,
@@ -118,7 +122,11 @@ def _(memory: learned.Memory, change: FrameChange, fresh: learned.Memory) -> lea
     )
 
 
-@reanchored.register
-def _(memory: plus.Memory, change: FrameChange, fresh: plus.Memory) -> plus.Memory:
-    """The Kalman filter's part; what the network remembers has axes of the body."""
-    return memory._replace(kalman=reanchored(memory.kalman, change, fresh.kalman))
+@reanchor.register
+def _(memory: plus.PlusMemory, change: FrameChange, fresh: plus.PlusMemory) -> plus.PlusMemory:
+    """The Kalman filter's part and its virtual outage; the network's memory has axes of the body."""
+    outage = memory.outage
+    drift = torch.cat((change.vectors(outage.drift[:, PVA]), outage.drift[:, PVA.stop :]), -1)
+    white = torch.stack([change.covariance(Q) for Q in outage.white.unbind(1)], 1)
+    outage = outage._replace(drift=drift, P=change.covariance(outage.P), white=white)
+    return memory._replace(kalman=reanchor(memory.kalman, change, fresh.kalman), outage=outage)

@@ -1,7 +1,7 @@
 """A reference for drives that have none: their own smoothed solution with all fixes, or their own good fixes.
 
 Outages are withheld from the filters that are scored, not from the reference, so what is compared is the filter
-without a fix against what the fixes say of the same seconds. The reference is as good as they are: its 1σ is told
+without a fix against the fixes of the same seconds. The reference is as good as they are: its 1σ is given
 beside the errors, and errors of that size mean nothing.
 """
 
@@ -14,26 +14,26 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dlkf.console import Counted
+from dlkf.base.console import ProgressCallback
+from dlkf.base.errors import InputError
 from dlkf.data.alignment import AlignConfig
 from dlkf.data.drive import Drive
 from dlkf.data.segments import whole_drives
-from dlkf.errors import InputError
-from dlkf.filters.integration import RATE_AVERAGE_S
 from dlkf.filters.model_based import Mbkf
-from dlkf.filters.smoother import Smoothed
+from dlkf.filters.smoother import SmoothedSolution
+from dlkf.navigation.error_model import RATE_AVERAGE_S
 from dlkf.navigation.state import POSITION
 from dlkf.running.batched import run_filter
 from dlkf.running.start import align_each
 
 KINDS = ("file", "smoothed", "gnss")
 WORTH = (4, 5, 9, 3, 2, 1)  # NMEA GGA qualities, the best first
-ENOUGH = 0.2  # of the fixes: so many make a quality the one to believe
+ENOUGH = 0.2  # of the fixes: so many make a quality the one to use
 UNSURE = 5.0  # times the usual 1σ: where the smoothed solution is no reference
 LATE_S = 0.2  # a fix that waits longer for its epoch's end is not carried there
 
 
-class Referenced(NamedTuple):
+class ReferencedDrives(NamedTuple):
     """Drives with another reference, and its 1σ (n, 3) [m] in NED wherever it may be scored."""
 
     drives: list[Drive]
@@ -55,28 +55,28 @@ class Referenced(NamedTuple):
         """What errors against it are errors against."""
         what = "smoothed solution with all fixes" if self.kind == "smoothed" else "good fixes"
         sigma = f"{self.horizontal_m:.2g} m horizontal, {self.vertical_m:.2g} m vertical"
-        return f"{what}, 1σ {sigma} (median, as it says itself)"
+        return f"{what}, 1σ {sigma} (median, its own)"
 
 
 def check_reference(kind: str) -> None:
-    """InputError for a kind of reference that is none."""
+    """InputError for an unknown reference."""
     if kind not in KINDS:
         raise InputError(f"reference={kind} is none of {', '.join(KINDS)}")
 
 
-def referenced(
+def make_reference(
     drives: Sequence[Drive],
     kind: str,
     estimator: Mbkf,
     align: AlignConfig,
-    progress: Counted | None = None,
-) -> Referenced:
+    progress: ProgressCallback | None = None,
+) -> ReferencedDrives:
     """The drives with their smoothed solution (``smoothed``) or their good fixes (``gnss``) as reference.
 
     ``smoothed``: position, velocity and attitude of ``estimator`` with all fixes, smoothed backwards
     (:mod:`dlkf.filters.smoother`), where its 1σ is not far above the usual. ``gnss``: the fixes of the best quality
     that is frequent, brought to the IMU by the smoothed attitude; no attitude. Drives that cannot be aligned are left
-    out and the reason told, unless none is left (InputError).
+    out and the reason reported, unless none is left (InputError).
     """
     check_reference(kind)
     made, sigmas, skipped = [], [], {}
@@ -85,7 +85,7 @@ def referenced(
             skipped[drive.name] = str(start)
             continue
         batch = whole_drives([drive], [start])
-        solution = run_filter(batch, Smoothed(estimator))
+        solution = run_filter(batch, SmoothedSolution(estimator))
         n, row = int(batch.present[0].sum()), start.first + 1
         state, std = solution.posterior, solution.std
         assert std is not None  # a smoothed filter has a covariance
@@ -114,7 +114,7 @@ def referenced(
     sigma = torch.cat(sigmas)
     if not len(sigma):
         raise InputError(f"reference={kind}: no fix is good enough to be one")
-    return Referenced(made, sigma, skipped, kind)
+    return ReferencedDrives(made, sigma, skipped, kind)
 
 
 def _blank(drive: Drive) -> dict[str, Tensor]:

@@ -3,39 +3,74 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Protocol, TypeVar
 
 import numpy as np
 import torch
 
-from dlkf.console import Counted
-from dlkf.data.alignment import ALIGN, AlignConfig
+from dlkf.base.console import ProgressCallback
+from dlkf.base.errors import InputError
+from dlkf.data.aid_tables import STANDARD, AidTable
+from dlkf.data.aids import aid_values
+from dlkf.data.alignment import SEARCH, AlignConfig
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
 from dlkf.data.store import drive_from_tables, drive_rows
 from dlkf.data.tables import Columns
-from dlkf.data.validate import DriveTables, read_checked
-from dlkf.errors import InputError
-from dlkf.filters.card import UnheardCar
+from dlkf.data.validate import CheckedTables, read_checked
+from dlkf.filters.aids.attach import tables_of
+from dlkf.filters.card import LowSampleRateWarning
 from dlkf.filters.smoother import Filter
 from dlkf.running import start
 from dlkf.running.estimate import Estimate, estimates_table
 from dlkf.running.offline import Navigated
-from dlkf.running.streaming import Receipt, Status, StreamingFilter
+from dlkf.running.streaming import Status, StreamingFilter
+
+R = TypeVar("R", covariant=True)  # its receipts
+
+
+class Receiver(Protocol[R]):
+    """What takes samples and fixes one by one: :class:`StreamingFilter`, or the core of a vehicle."""
+
+    def imu(self, t: float, accel: Sequence[float], gyro: Sequence[float], /) -> R:
+        """A sample [s, m/s², rad/s]."""
+        ...
+
+    def gnss(
+        self, t: float, lat_deg: float, lon_deg: float, height_m: float, velocity: Sequence[float],
+        std: Sequence[float], quality: int, /,
+    ) -> R:  # fmt: skip
+        """A fix."""
+        ...
+
+    def aid(self, name: str, t: float, value: float, std: float, /) -> R:
+        """A sample of a further sensor."""
+        ...
+
+    def finish(self) -> R:
+        """Nothing follows."""
+        ...
 
 
 class UnalignedError(InputError):
     """The drive never gives a filter a start."""
 
 
-def played(
-    stream: StreamingFilter, imu: Columns, gnss: Columns, arrival: Sequence[float] | None = None
-) -> Iterator[Receipt]:
+def replay_drive(
+    stream: Receiver[R], imu: Columns, gnss: Columns, arrival: Sequence[float] | None = None,
+    aids: Mapping[str, Columns] | None = None, tables: Sequence[AidTable] = (), late_s: float = 0.0,
+) -> Iterator[R]:  # fmt: skip
     """Feed the tables of a drive to a stream in order of time; the receipts.
 
-    ``arrival`` [s] is when each fix comes, by default at its own time, before a sample of the same time.
+    ``arrival`` [s] is when each fix comes, by default at its own time, before a sample of the same time. ``aids`` are
+    tables of further sensors, which ``tables`` explain where they are not in the contract; their samples come
+    ``late_s`` after their time.
     """
+    others = sorted(_aid_samples(aids or {}, tables), key=lambda sample: sample[1])
+    arrived = np.searchsorted(imu["t"], [sample[1] + late_s for sample in others], side="left")
+    fed = 0
     when = gnss["t"] if arrival is None else np.asarray(arrival)
     samples = np.stack([imu[c] for c in ("t", *ACCEL, *GYRO)], -1)
     fixes = np.stack([gnss[c] for c in ("t", *POSITION, *VELOCITY, *STD)], -1)
@@ -43,7 +78,7 @@ def played(
     before = np.searchsorted(imu["t"], when[order], side="left")
     done = 0
 
-    def fix(j: int) -> Receipt:
+    def fix(j: int) -> R:
         x = fixes[j].tolist()
         return stream.gnss(x[0], x[1], x[2], x[3], x[4:7], x[7:], int(gnss["quality"][j]))
 
@@ -51,35 +86,54 @@ def played(
         while done < len(order) and before[done] <= k:
             yield fix(order[done])
             done += 1
+        while fed < len(others) and arrived[fed] <= k:
+            yield stream.aid(*others[fed])
+            fed += 1
         x = row.tolist()
         yield stream.imu(x[0], x[1:4], x[4:])
     yield stream.finish()
+    for sample in others[fed:]:
+        yield stream.aid(*sample)
     for j in order[done:]:
         yield fix(j)
 
 
+def _aid_samples(aids: Mapping[str, Columns], tables: Sequence[AidTable]) -> Iterator[tuple[str, float, float, float]]:
+    """Sensor, time, value and std of every sample that has a value."""
+    kinds = {**STANDARD, **{table.name: table for table in tables}}
+    for name, columns in aids.items():
+        value = aid_values(kinds[name], columns)
+        std = columns.get("std", np.full(len(value), np.nan))
+        good = np.isfinite(value)
+        yield from zip([name] * int(good.sum()), columns["t"][good].tolist(), value[good].tolist(), std[good].tolist())
+
+
 def stream_drive(
-    tables: DriveTables,
+    tables: CheckedTables,
     estimator: Filter,
     *,
     rate_hz: float,
     epoch_s: float,
-    align: AlignConfig = ALIGN,
+    align: AlignConfig = SEARCH,
     arrival: Sequence[float] | None = None,
+    late_s: float = 0.0,
 ) -> Navigated:
     """One drive through a stream, on the grid that the loader gives it: the same solution as its batch run.
 
-    Of ``align`` what looks ahead is left out, in a batch run ``search_s=0`` and ``from_rest=False``.
+    Samples of further sensors come ``late_s`` after their time. Of ``align`` what looks ahead is left out, in a batch
+    run ``from_rest=False``.
     Raises UnalignedError if the drive cannot be aligned, InputError if the filter diverges.
     """
-    drive = drive_from_tables(tables, "", rate_hz, epoch_s, torch.float64)
-    causal = replace(align, search_s=0.0, from_rest=False)
+    kinds = tables_of(estimator)
+    drive = drive_from_tables(tables, "", rate_hz, epoch_s, torch.float64, kinds)
+    causal = replace(align, from_rest=False)
     stream = StreamingFilter(
         estimator, rate_hz=rate_hz, epoch_s=epoch_s, lever_arm_b=tables.row.lever_arm_b, align=causal,
         phase_s=drive.t0, imu_step_s=float(np.median(np.diff(tables.imu["t"]))),
     )  # fmt: skip
     found: dict[float, Estimate] = {}
-    for receipt in played(stream, tables.imu, tables.gnss, arrival):
+    taken = {table.name: tables.aids[table.name] for table in kinds if table.name in tables.aids}
+    for receipt in replay_drive(stream, tables.imu, tables.gnss, arrival, taken, kinds, late_s):
         found.update((e.t, e) for e in receipt.estimates)
         if receipt.status is Status.RESTARTED or stream.counts["diverged"]:
             reason = receipt.reason or "the filter diverged (its output is not finite)"
@@ -91,7 +145,15 @@ def stream_drive(
             raise UnalignedError(str(error)) from None
         raise UnalignedError(f"drive {tables.row.name}: ends before a filter could start")
     estimates = [found[t] for t in sorted(found)]
-    return Navigated(tables.row.name, estimates[0].t - epoch_s, estimates_table(estimates))
+    table = estimates_table(estimates)
+    return Navigated(
+        tables.row.name,
+        estimates[0].t - epoch_s,
+        table,
+        refused=tables.refused,
+        restarts=tuple(stream.lost_at),
+        doubt=stream.doubt,
+    )
 
 
 def stream_drives(
@@ -100,12 +162,14 @@ def stream_drives(
     *,
     rate_hz: float,
     epoch_s: float,
-    align: AlignConfig = ALIGN,
+    align: AlignConfig = SEARCH,
     drives: Sequence[str] | None = None,
+    aids: Sequence[AidTable] | None = None,
     skipped: dict[str, str] | None = None,
-    progress: Counted | None = None,
+    progress: ProgressCallback | None = None,
+    through: Callable[..., Navigated] = stream_drive,
 ) -> Iterator[Navigated]:
-    """The drives of a dataset, or those named, each through a stream of its own; no reference is read.
+    """The drives of a dataset, or those named, each ``through`` a stream of its own; no reference is read.
 
     As :func:`dlkf.running.offline.navigate_drives` does, a drive that cannot be aligned raises InputError or goes
     to ``skipped``, unless none is left. ``progress(drives done, drives in all)``.
@@ -113,11 +177,11 @@ def stream_drives(
     rows = drive_rows(folder, drives)
     solved = 0
     for k, row in enumerate(rows):
-        tables = read_checked(folder, row, reference=False)
+        tables = read_checked(folder, row, reference=False, aids=aids)
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UnheardCar)  # commands say it once, of all drives
-                result = stream_drive(tables, estimator, rate_hz=rate_hz, epoch_s=epoch_s, align=align)
+                warnings.simplefilter("ignore", LowSampleRateWarning)  # commands say it once, of all drives
+                result = through(tables, estimator, rate_hz=rate_hz, epoch_s=epoch_s, align=align)
         except UnalignedError as error:
             if skipped is None:
                 raise

@@ -4,7 +4,9 @@ One row per epoch. ``t`` [s] is the drive's own clock; position is geodetic (WGS
 are in true local NED at the vehicle; ``accel_error``, ``gyro_error`` [m/s², rad/s] are what the filter takes
 off the IMU, body axes; ``std_*`` are 1σ: ``std_pos_n|e|d`` [m], ``std_vel_n|e|d`` [m/s],
 ``std_roll|pitch|yaw`` [rad], and of the IMU errors. ``gnss_used``: a fix corrected this row. NaN where the
-filter has no value.
+filter has no value. Further sensors add ``<name>_innovation``, its 1σ ``<name>_innovation_std`` and
+``<name>_used`` (1 or 0), and what the filter estimates of them with its 1σ, such as ``wheel_scale`` and
+``std_wheel_scale``.
 """
 
 from __future__ import annotations
@@ -108,9 +110,12 @@ def write_solution(path: str | Path, table: pd.DataFrame) -> None:
 
     Behind the columns comes ``geometry``, points as GeoParquet has them, for QGIS, GeoPandas and DuckDB.
     """
-    arrays = [pa.array(table[f.name].to_numpy(), f.type, from_pandas=False) for f in SCHEMA]  # NaN stays NaN
+    further = [pa.field(name, pa.float64()) for name in table.columns if name not in SCHEMA.names]
+    schema = pa.schema([*SCHEMA, *further])
+    arrays = [pa.array(table[f.name].to_numpy(), f.type, from_pandas=False) for f in schema]  # NaN stays NaN
     place = table[["lon_deg", "lat_deg", "height_m"]].to_numpy()
-    write_parquet(Path(path), pa.Table.from_arrays([*arrays, points(place)], schema=GEO_SCHEMA))
+    full = schema.append(GEO_SCHEMA.field("geometry")).with_metadata(GEO_SCHEMA.metadata)
+    write_parquet(Path(path), pa.Table.from_arrays([*arrays, points(place)], schema=full))
 
 
 def points(place: np.ndarray) -> pa.Array:

@@ -1,21 +1,24 @@
 """A filter in a vehicle: fed one IMU sample and one GNSS fix at a time, with bounded latency and memory.
 
-Every epoch is one :func:`dlkf.filters.integration.advance`, the turn of the loop that a batch run consists of, on
+Every epoch is one :func:`dlkf.filters.integration.advance`, the filter step of a batch run, on
 samples and fixes that come to the epoch grid as those of a logged drive do. So stream and batch give the same
-solution to rounding, whatever the order in which fixes arrive:
+solution to rounding, for any order in which fixes arrive:
 
-* **Epochs** close with the first IMU sample at or after their end; what GNSS has said by then is used.
+* **Epochs** close with the first IMU sample at or after their end; the fixes that have come by then are used.
 * **Fixes** that come later, as they do from every receiver, roll the filter back to the epoch they belong to and
   replay it, if that lies within ``history_s``. Of several fixes in an epoch the latest counts.
 * **The grid** is laid through the fixes of the first ``SETTLE_S``; a stream does not know those to come. It differs
   from a log's by what those fixes scatter; ``phase_s`` (and ``imu_step_s``, the usual interval between samples)
   give it from outside.
-* **Alignment** is the rule of :func:`dlkf.running.start.align`, applied to the epochs as they come. Until the car
-  moves under GNSS there are no estimates.
+* **The start** is the rule of :func:`dlkf.running.start.align` without look-ahead, applied to the epochs as they
+  come. Until the car moves under GNSS, and while it is in doubt which way it faces (``doubt``), there are no estimates.
 * **Bad packets** (not finite, out of range, time that runs back, twice the same, too late) are refused with a reason
   and counted; nothing is raised. Missing IMU samples are bridged as in a log. A gap longer than ``limits`` allows, or
-  a clock that has been set anew, is believed after one second of it: then the filter starts over with an alignment,
-  and with the IMU error that it started from. It also starts over if its state is no longer finite.
+  a clock that has been set again, is accepted after one second of it: then the filter starts over with an alignment,
+  and with the IMU error that it started from. It also starts over if its state is no longer finite, is that of no
+  car, or stays far from fixes that agree with each other (:mod:`dlkf.running.loss`).
+* **Physical limits**: samples beyond full scale and fixes that no car can have reached since the last good one are
+  refused and counted before any filter sees them (:mod:`dlkf.data.limits`).
 * **The tangent frame** follows the car: beyond ``anchor_m`` from its origin state and memory go over to a new one
   (:mod:`dlkf.running.reanchoring`).
 """
@@ -25,50 +28,44 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from dlkf.data.alignment import ALIGN, AlignConfig, Start
-from dlkf.data.drive import Batch, Drive
-from dlkf.data.resampling import BLANK, ON_BOUNDARY_S, Fixes, boundary_after, fixes_at, usable_fixes
+from dlkf.base.errors import InputError
+from dlkf.data.aids import pressure_height
+from dlkf.data.alignment import SEARCH, AlignConfig
+from dlkf.data.limits import FixScreen
+from dlkf.data.resampling import ON_BOUNDARY_S, boundary_after, fixes_at
 from dlkf.data.schema import POSITION, STD, VELOCITY
-from dlkf.data.segments import REST, whole_drives
 from dlkf.data.validate import LIMITS, Limits
-from dlkf.errors import InputError
-from dlkf.filters.card import warn_unheard
-from dlkf.filters.integration import Fix, advance
-from dlkf.filters.smoother import Filter, Smoothed
-from dlkf.navigation.calibration import ImuError
-from dlkf.navigation.earth import TangentFrame
-from dlkf.navigation.state import NavState
+from dlkf.filters.aids.attach import tables_of
+from dlkf.filters.card import warn_slow_drives
+from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.strapdown import strapdown
+from dlkf.running.epoch_filter import EpochFilter, Running
 from dlkf.running.estimate import Estimate
 from dlkf.running.imu_stream import ImuStream, Row
-from dlkf.running.reanchoring import FrameChange, can_reanchor, frame_at, reanchored
-from dlkf.running.start import align
+from dlkf.running.measurement_buffer import MeasurementBuffer, checked_fix
+from dlkf.running.start import Search
 
-ANCHOR_M = 50_000.0  # from its origin on, the tangent frame is laid anew
+ANCHOR_M = 50_000.0  # from its origin, beyond which the tangent frame moves
 SETTLE_S = 3.0  # fixes over so long lay the grid
 MOST_EARLY_FIXES = 1000
-NO_FIX = Fixes(
-    np.full((1, 3), BLANK["r_e"]), np.full((1, 3), BLANK["v_e"]), np.full((1, 6), BLANK["std"]),
-    np.full((1, 6), BLANK["valid"]), np.full(1, BLANK["lag"]), np.full(1, BLANK["quality"]),
-)  # fmt: skip
+MOST_EARLY_SAMPLES = 10_000  # of further sensors
 
 
 class Status(StrEnum):
     """What became of a sample or a fix."""
 
     TAKEN = "taken"  # counts at the end of its epoch
-    REPLAYED = "replayed"  # its epoch was over: the filter went back and came again
+    REPLAYED = "replayed"  # its epoch was over: the filter was rewound and replayed
     SUPERSEDED = "superseded"  # a later fix of the same epoch is there already
     REFUSED = "refused"  # see the reason
-    RESTARTED = "restarted"  # the stream was lost (see the reason) and begins anew
+    RESTARTED = "restarted"  # the stream was lost (see the reason) and restarts
 
 
 class Receipt(NamedTuple):
@@ -79,24 +76,6 @@ class Receipt(NamedTuple):
     reason: str = ""
 
 
-class Running(NamedTuple):
-    """Everything that a running filter carries from one epoch to the next."""
-
-    memory: Any
-    state: NavState
-    error: ImuError
-    frame: TangentFrame
-
-
-@dataclass
-class Closed:
-    """A closed epoch: samples (1, M, 6), and the filter at its start (None: not yet aligned)."""
-
-    number: int
-    imu: Tensor
-    before: Running | None = None
-
-
 TAKEN = Receipt(Status.TAKEN)
 
 
@@ -104,10 +83,11 @@ class StreamingFilter:
     """A filter fed sample by sample and fix by fix.
 
     ``rate_hz``, ``epoch_s``: the grid that the filter works on, as in training and in ``navigate``.
-    ``lever_arm_b`` [m]: IMU → antenna, Forward-Right-Down. ``history_s``: how late a fix may be. ``counts`` tells how
-    often each status was returned (samples that are taken do not count), and how often the state was no longer finite
-    (``diverged``). For one thread at a time. Raises InputError if the filter cannot work on such a grid, and warns
-    (UnheardCar) where it would hear the car through samples that come too seldom for that.
+    ``lever_arm_b`` [m]: IMU → antenna, Forward-Right-Down. ``history_s``: how late a fix may be. ``counts`` has how
+    often each status was returned (samples that are taken do not count), how often the state was no longer finite
+    (``diverged``), and how often the filter was lost (``lost``, at the times ``lost_at``). For one thread at a time.
+    Raises InputError if the filter cannot work on such a grid, and warns (LowSampleRateWarning) where it would take
+    features from samples that come too seldom for that.
     """
 
     def __init__(
@@ -117,7 +97,7 @@ class StreamingFilter:
         rate_hz: float = 50.0,
         epoch_s: float = 1.0,
         lever_arm_b: Sequence[float] = (0.0, 0.0, 0.0),
-        align: AlignConfig = ALIGN,
+        align: AlignConfig = SEARCH,
         history_s: float = 10.0,
         phase_s: float | None = None,
         imu_step_s: float | None = None,
@@ -126,46 +106,55 @@ class StreamingFilter:
     ) -> None:
         if not 0 <= history_s < math.inf:
             raise InputError(f"history_s is {history_s!r}, must be a finite number ≥ 0")
-        if align.search_s > 0 or align.from_rest:
-            raise InputError("align.search_s and align.from_rest look ahead, which a stream cannot; leave them out")
-        if isinstance(estimator, Smoothed):
+        if align.from_rest:
+            raise InputError("align.from_rest looks ahead, which a stream cannot; leave it out")
+        if isinstance(estimator, SmoothedSolution):
             raise InputError("a smoothed filter looks ahead, which a stream cannot; take it without _rts")
-        self.estimator, self._align = estimator, align
-        self._rate_hz, self._epoch_s, self._anchor_m = rate_hz, epoch_s, anchor_m
+        self.estimator, self._rate_hz = estimator, rate_hz
         self._phase_s, self._history_s = phase_s, history_s
         self._samples = ImuStream(
             rate_hz, epoch_s, step_s=imu_step_s, limits=limits, keep_s=max(history_s, 2 * SETTLE_S)
         )
-        self._lookback = max(1, round(align.window_s / epoch_s)) + 2  # epochs that an alignment reads
         self._rewind = math.ceil(history_s / epoch_s) + 1  # epochs that may be replayed
-        parameter = next(estimator.parameters(), None) if isinstance(estimator, torch.nn.Module) else None
-        self._device = torch.device("cpu") if parameter is None else parameter.device
-        self._lever_arm_b = torch.tensor([lever_arm_b], dtype=torch.float64, device=self._device)
         self.counts: Counter[str] = Counter()
-        self._warned = warn_unheard(estimator, min(rate_hz, 1 / imu_step_s) if imu_step_s else rate_hz)
+        self._buffer = MeasurementBuffer(tables_of(estimator), epoch_s)
+        self._epochs = EpochFilter(
+            estimator, self._buffer, self._samples.boundary, rate_hz=rate_hz, epoch_s=epoch_s, lever_arm_b=lever_arm_b,
+            align=align, rewind=self._rewind, anchor_m=anchor_m, counts=self.counts,
+        )  # fmt: skip
+        self._warned = warn_slow_drives(estimator, min(rate_hz, 1 / imu_step_s) if imu_step_s else rate_hz)
+        self._screen = FixScreen()
         self._clear()
-        with torch.inference_mode():  # a model that does not fit must be told now, not on the road
-            samples = round(rate_hz * epoch_s)
-            still = Closed(0, torch.tensor(REST, dtype=torch.float64).expand(1, samples, 6))
-            estimator.begin(whole_drives([self._drive([still])], [_anywhere()]).to(self._device))
 
     def _clear(self) -> None:
         self._early: deque[dict[str, np.ndarray]] = deque(maxlen=MOST_EARLY_FIXES)  # before there is a grid
-        self._fixes: dict[int, tuple[float, Fixes]] = {}  # time and fix by boundary
-        self._closed: list[Closed] = []
-        self._running: Running | None = None
-        self._first: Batch | None = None  # what the filter began with
-        self._latest: Estimate | None = None
+        self._early_aids: deque[tuple[str, float, float, float]] = deque(maxlen=MOST_EARLY_SAMPLES)
+        self._buffer.clear()
+        self._epochs.clear()
 
     @property
     def aligning(self) -> bool:
-        """Whether the filter still waits for the car to move under GNSS; then there are no estimates."""
-        return self._running is None
+        """Whether the filter still waits for the car to move under GNSS and for a heading; then there are no
+        estimates."""
+        return not isinstance(self._epochs.running, Running)
+
+    @property
+    def doubt(self) -> float:
+        """Probability that the best heading is wrong while the filter waits for one: 1 before the car moves; once the
+        filter runs, what was left when it began."""
+        if isinstance(self._epochs.running, Search):
+            return self._epochs.running.doubt
+        return 1.0 if self.aligning else self._epochs.start_doubt
+
+    @property
+    def lost_at(self) -> deque[float]:
+        """Times [s] at which the filter was lost."""
+        return self._epochs.lost_at
 
     @property
     def latest(self) -> Estimate | None:
         """The last closed epoch's estimate, late fixes included; None while aligning."""
-        return self._latest
+        return self._epochs.latest
 
     def imu(self, t: float, accel: Row, gyro: Row) -> Receipt:
         """Take a sample: mean specific force [m/s²] and rate [rad/s] over the interval that ends at ``t`` [s].
@@ -177,6 +166,7 @@ class StreamingFilter:
             if not self._samples.lost:
                 return self._answer(Status.REFUSED, reason)
             self._samples.clear()
+            self._screen.clear()  # the clock may be another
             self._clear()
             return self._answer(Status.RESTARTED, reason)
         if self._samples.grid is None:
@@ -203,34 +193,57 @@ class StreamingFilter:
 
         ``velocity_ned`` [m/s] and ``std`` (6: position n, e, d [m], velocity [m/s]) are None or NaN where unknown;
         unknown stds follow from the ``quality`` (NMEA GGA) as in a log. The receipt of a fix that came after its
-        epoch's end holds the estimates of all epochs since, anew.
+        epoch's end holds the recomputed estimates of all epochs since.
         """
-        velocity_ned = [math.nan] * 3 if velocity_ned is None else velocity_ned
-        std = [math.nan] * 6 if std is None else std
-        values = (t, lat_deg, lon_deg, height_m, *velocity_ned, *std)
-        if len(velocity_ned) != 3 or len(std) != 6:
-            return self._answer(Status.REFUSED, "velocity_ned must have 3 values, std 6")
-        fix = {name: np.array([float(x)]) for name, x in zip(("t", *POSITION, *VELOCITY, *STD), values)}
-        fix["quality"] = np.array([quality])
-        if reason := _fault(fix):
-            return self._answer(Status.REFUSED, reason)
+        fix = checked_fix(t, (lat_deg, lon_deg, height_m), velocity_ned, std, quality)
+        if isinstance(fix, str):
+            return self._answer(Status.REFUSED, fix)
         if self._samples.grid is not None:
             return self._file(fix)
         self._early.append(fix)
         return self._answer(Status.TAKEN)
 
+    def speed(self, t: float, speed: float, std: float = math.nan) -> Receipt:
+        """Take a wheel speed [m/s], forward positive or never negative, at ``t`` [s, clock of the samples]."""
+        return self.aid("speed", t, speed, std)
+
+    def heading(self, t: float, heading: float, std: float = math.nan) -> Receipt:
+        """Take the car's heading [rad], from North over East, of a dual-antenna receiver at ``t`` [s]."""
+        return self.aid("heading", t, heading, std)
+
+    def baro(
+        self, t: float, height_m: float = math.nan, std: float = math.nan, *, pressure: float = math.nan
+    ) -> Receipt:
+        """Take a barometric height [m], or a ``pressure`` [Pa], at ``t`` [s]."""
+        value = height_m if math.isfinite(height_m) else float(pressure_height(np.asarray(pressure)))
+        return self.aid("baro", t, value, std)
+
+    def aid(self, name: str, t: float, value: float, std: float = math.nan) -> Receipt:
+        """Take a sample of the sensor ``name`` of the filter, in the unit of its table.
+
+        It may come late, as a fix may. Refused are a sensor that the filter does not take, and values that are not
+        finite.
+        """
+        if name not in self._buffer.tables:
+            known = ", ".join(self._buffer.tables) or "none"
+            return self._answer(Status.REFUSED, f"this filter takes no {name} (it takes {known})")
+        sample = (name, float(t), float(value), float(std))
+        if not (math.isfinite(sample[1]) and math.isfinite(sample[2])) or std < 0:
+            return self._answer(Status.REFUSED, f"{name}: t or value is not a finite number, or std is below 0")
+        if self._samples.grid is not None:
+            return self._file_aid(*sample)
+        self._early_aids.append(sample)
+        return TAKEN
+
     @torch.inference_mode()
     def now(self) -> Estimate | None:
         """The last epoch's state carried to the latest sample; IMU error and 1σ are that epoch's. None: aligning."""
-        if self._running is None or self._latest is None:
-            return None
-        tail = self._samples.open()
-        if tail is None:
-            return self._latest
-        imu, dt = torch.from_numpy(tail[0]).to(self._device), tail[1]
-        running = self._running
+        running, latest, tail = self._epochs.running, self._epochs.latest, self._samples.open()
+        if not isinstance(running, Running) or latest is None or tail is None:
+            return latest
+        imu, dt = torch.from_numpy(tail[0]).to(self._epochs.device), tail[1]
         window = strapdown(running.state, running.error.corrected(imu), dt, running.frame)
-        return replace(self._latest, t=self._samples.latest, frame=running.frame, state=window.end, gnss_used=False)
+        return replace(latest, t=self._samples.latest, frame=running.frame, state=window.end, gnss_used=False)
 
     def _answer(self, status: Status, reason: str = "", estimates: Sequence[Estimate] = ()) -> Receipt:
         self.counts[status] += 1
@@ -248,144 +261,64 @@ class StreamingFilter:
                 return
         if self._samples.begin(through):
             rate_hz = min(self._rate_hz, 1 / self._samples.step_s)
-            self._warned = self._warned or warn_unheard(self.estimator, rate_hz)
+            self._warned = self._warned or warn_slow_drives(self.estimator, rate_hz)
             for fix in self._early:
                 self._file(fix)
             self._early.clear()
+            for sample in self._early_aids:
+                self._file_aid(*sample)
+            self._early_aids.clear()
 
     @torch.inference_mode()
     def _close(self, slack_s: float) -> Receipt:
-        estimates = []
-        for imu in self._samples.closed(slack_s):
-            number = self._closed[-1].number + 1 if self._closed else 0
-            self._closed.append(Closed(number, torch.from_numpy(imu).to(self._device)))
-            estimates += self._run(len(self._closed) - 1)
-            if len(self._closed) > self._rewind + self._lookback:
-                self._fixes.pop(self._closed.pop(0).number, None)
+        estimates = [e for imu in self._samples.closed(slack_s) for e in self._epochs.close(imu)]
         return Receipt(Status.TAKEN, tuple(estimates))
 
-    @torch.inference_mode()
     def _file(self, fix: dict[str, np.ndarray]) -> Receipt:
         """Put a fix to its boundary; replay where that is over."""
-        grid, done, t = self._samples.grid, self._samples.epochs, float(fix["t"][0])
-        assert grid is not None
-        row = int(boundary_after(fix["t"], grid)[0])
-        if row < 0 or max(row - 1, 0) < done - self._rewind:
-            return self._answer(Status.REFUSED, f"fix at t = {t:.3f} is more than {self._history_s:g} s late")
-        if row > done + self._rewind:
-            return self._answer(Status.REFUSED, f"fix at t = {t:.3f} is ahead of the IMU; both need one clock")
-        held = self._fixes.get(row)
-        if held is not None and held[0] >= t:
-            if held[0] == t:
-                return self._answer(Status.REFUSED, f"fix at t = {t:.3f} again")
+        t = float(fix["t"][0])
+        row = self._boundary_of(t)
+        if reason := self._untimely("fix", t, row, least=0):
+            return self._answer(Status.REFUSED, reason)
+        if self._buffer.fix_time(row) == t:
+            return self._answer(Status.REFUSED, f"fix at t = {t:.3f} again")
+        if self._buffer.fix_time(row) > t:
             return self._answer(Status.SUPERSEDED)
-        boundary = np.array([self._samples.boundary(row)])
-        self._fixes[row] = (t, fixes_at(fix, np.zeros(1, np.int64), boundary))
-        if row > done or not self._closed:
-            return self._answer(Status.TAKEN)
-        start = max(0, row - 1 - self._closed[0].number)
-        self._running = self._closed[start].before
-        estimates = [e for k in range(start, len(self._closed)) for e in self._run(k)]
-        return self._answer(Status.REPLAYED, estimates=estimates)
+        if reason := self._implausible(fix):
+            return self._answer(Status.REFUSED, reason)
+        self._buffer.put_fix(row, t, fixes_at(fix, np.zeros(1, np.int64), np.array([self._samples.boundary(row)])))
+        return self._replay(row) or self._answer(Status.TAKEN)
 
-    def _run(self, k: int) -> list[Estimate]:
-        """The filter over closed epoch ``k`` of those held: align at its start if need be, then one turn."""
-        epoch = self._closed[k]
-        epoch.before = self._running
-        running = self._running or self._aligned(k)
-        if running is None:
-            return []
-        _, held = self._fixes.get(epoch.number + 1, (0.0, NO_FIX))
-        fix = self._fix(held, running.frame)
-        try:
-            memory, step = advance(
-                self.estimator, running.memory, running.state, running.error, epoch.imu, fix,
-                dt=1 / self._rate_hz, frame=running.frame, lever_arm_b=self._lever_arm_b,
-            )  # fmt: skip
-            finite = all(bool(x.isfinite().all()) for x in step.posterior)
-        except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage]
-            finite = False
-        if not finite:
-            self.counts["diverged"] += 1
-            self._running = self._latest = None
-            return []
-        self._running = self._anchored(Running(memory, step.posterior, step.error, running.frame))
-        accepted = step.answer.accepted
-        used = bool(fix.used.any()) and (accepted is None or bool(accepted.any()))
-        t = self._samples.boundary(epoch.number + 1)
-        self._latest = Estimate(t, running.frame, step.posterior, step.complete_error, step.answer.std, used)
-        return [self._latest]
+    def _file_aid(self, name: str, t: float, value: float, std: float) -> Receipt:
+        """Put a sample of a further sensor to the others of its interval; replay where that is over."""
+        row = self._boundary_of(t)
+        if reason := self._untimely(name, t, row, least=1):
+            return self._answer(Status.REFUSED, reason)
+        if not self._buffer.put_aid(row, name, t, value, std):
+            return self._answer(Status.REFUSED, f"{name} at t = {t:.3f} again")
+        return self._replay(row) or TAKEN
 
-    def _fix(self, held: Fixes, frame: TangentFrame) -> Fix:
-        """A held fix as the loop takes it."""
-        r_e, v_e, std = (torch.from_numpy(x).to(self._device) for x in (held.r_e, held.v_e, held.std))
-        used = torch.from_numpy(held.valid).to(self._device)
-        value = torch.cat((frame.from_ecef(r_e), frame.rotate_from_ecef(v_e)), -1)
-        lag = torch.from_numpy(held.lag).to(self._device) if held.lag[0] > 0 else None
-        return Fix(torch.where(used, value, 0.0), torch.nan_to_num(std, nan=1.0), used, lag)
+    def _boundary_of(self, t: float) -> int:
+        assert self._samples.grid is not None
+        return int(boundary_after(np.array([t]), self._samples.grid)[0])
 
-    def _aligned(self, k: int) -> Running | None:
-        """The filter at the start of closed epoch ``k``, if it can be aligned there."""
-        epochs = self._closed[max(0, k - self._lookback) : k + 1]
-        if epochs[-1].number not in self._fixes:
+    def _untimely(self, what: str, t: float, row: int, least: int) -> str:
+        """Why a measurement cannot count at boundary ``row``, or nothing; the first that can is ``least``."""
+        if row < least or max(row - 1, 0) < self._samples.epochs - self._rewind:
+            return f"{what} at t = {t:.3f} is more than {self._history_s:g} s late"
+        if row > self._samples.epochs + self._rewind:
+            return f"{what} at t = {t:.3f} is ahead of the IMU; both need one clock"
+        return ""
+
+    @torch.inference_mode()
+    def _replay(self, row: int) -> Receipt | None:
+        """The receipt with all epochs since boundary ``row`` recomputed; None where that is still to come."""
+        if row > self._samples.epochs or not self._epochs.closed:
             return None
-        drive = self._drive(epochs)
-        try:
-            start = align(drive, self._align, earliest=len(epochs) - 1)
-        except InputError:
-            return None
-        self._first = whole_drives([drive], [start]).to(self._device)
-        memory, imu_error = self.estimator.begin(self._first)
-        return Running(memory, self._first.start, ImuError.of(imu_error), self._first.frame)
+        return self._answer(Status.REPLAYED, estimates=self._epochs.replay(row))
 
-    def _drive(self, epochs: Sequence[Closed]) -> Drive:
-        """Closed epochs as a drive without reference."""
-        numbers = range(epochs[0].number, epochs[-1].number + 2)
-        fixes = [self._fixes[n][1] if n in self._fixes else NO_FIX for n in numbers]
-        found = {name: torch.from_numpy(np.concatenate([getattr(f, name) for f in fixes])) for name in BLANK}
-        rows = len(fixes)
-
-        def unknown(*shape: int) -> Tensor:
-            return torch.full((rows, *shape), torch.nan, dtype=torch.float64)
-
-        return Drive(
-            name="stream", group="stream", dataset="", t0=0.0, epoch_s=self._epoch_s, rate_hz=self._rate_hz,
-            imu=torch.cat([e.imu for e in epochs]).cpu(),
-            gnss_r_e=found["r_e"], gnss_v_e=found["v_e"], gnss_std=found["std"], gnss_valid=found["valid"],
-            gnss_lag=found["lag"], quality=found["quality"],
-            ref_r_e=unknown(3), ref_v_e=unknown(3), ref_C_eb=unknown(3, 3),
-            ref_valid=torch.zeros(rows, dtype=torch.bool), ref_imu_error=unknown(6),
-            lever_arm_b=self._lever_arm_b[0].cpu(),
-        )  # fmt: skip
-
-    def _anchored(self, running: Running) -> Running:
-        """The filter in a frame whose origin is near the car."""
-        away = float(running.state.p_n[0, :2].norm())
-        if away <= self._anchor_m or self._first is None or not can_reanchor(running.memory):
-            return running
-        change = FrameChange(running.frame, frame_at(running.state, running.frame))
-        state = change.state(running.state)
-        fresh, _ = self.estimator.begin(replace(self._first, frame=change.new, start=state))
-        return Running(reanchored(running.memory, change, fresh), state, running.error, change.new)
-
-
-def _anywhere() -> Start:
-    """A start at rest, for a trial."""
-    zero = torch.zeros(3, dtype=torch.float64)
-    level = torch.eye(3, dtype=torch.float64)
-    return Start(0, 0.0, 0.0, 0.0, NavState(zero, zero, level), torch.ones(9, dtype=torch.float64))
-
-
-def _fault(fix: dict[str, np.ndarray]) -> str:
-    """What is wrong with a fix, or nothing."""
-    for name, value in fix.items():
-        if np.isinf(value[0]) or (name == "t" and np.isnan(value[0])):
-            return f"{name} is {value[0]}"
-    if not usable_fixes(fix)[0]:
-        return f"no fix: quality {fix['quality'][0]}, or a position that is not a number"
-    lat, lon = fix["lat_deg"][0], fix["lon_deg"][0]
-    if abs(lat) > 90 or abs(lon) > 180:
-        return f"lat_deg {lat:.4f}, lon_deg {lon:.4f} lie outside ±90, ±180"
-    if any(fix[name][0] < 0 for name in STD):
-        return "a std is below 0; NaN if unknown"
-    return ""
+    def _implausible(self, fix: dict[str, np.ndarray]) -> str:
+        """Why no car can have reached a fix, or nothing."""
+        t, *place = (float(fix[name][0]) for name in ("t", *POSITION))
+        speed = math.hypot(*(float(fix[name][0]) for name in VELOCITY))
+        return self._screen.refused(t, (place[0], place[1], place[2]), speed, np.array([fix[c][0] for c in STD]))

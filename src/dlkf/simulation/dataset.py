@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+import sys
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
@@ -19,14 +20,14 @@ import pyarrow as pa
 from rich.console import Console
 from rich.progress import track
 
+from dlkf.base.errors import InputError
+from dlkf.base.files import absolute_place, is_url, resolve_place
+from dlkf.base.parallel import check_engine, parallel_map
+from dlkf.base.ranges import draw_ranges, has_ranges, range_middle
+from dlkf.base.settings import Ranged, bounded_field, settings_from
 from dlkf.data.schema import drive_file, new_dataset, write_drive, write_drives_table, write_parquet
-from dlkf.errors import InputError
-from dlkf.files import absolute, is_url, placed
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.parallel import check, each
-from dlkf.ranges import draw, has_ranges, middle
-from dlkf.settings import Ranged, settings_from, within
-from dlkf.simulation.drive import DriveTables, Rates, Seeds, simulate_drive
+from dlkf.simulation.drive import Rates, Seeds, SimulatedTables, simulate_drive
 from dlkf.simulation.gnss.almanac import read_almanac
 from dlkf.simulation.gnss.receiver import Receiver, receiver_spec
 from dlkf.simulation.gnss.surroundings import Surroundings
@@ -34,6 +35,7 @@ from dlkf.simulation.gnss.white import GnssConfig
 from dlkf.simulation.imu import ImuUnit, draw_unit
 from dlkf.simulation.motion.chassis import ChassisConfig
 from dlkf.simulation.motion.routes import VehicleConfig
+from dlkf.simulation.sensors import SensorsConfig
 
 LONGEST_DRIVE = 240.0  # minutes; a drive is held in memory as a whole
 MOST_EPOCHS = 100_000  # of a drive with satellites, 2 GB
@@ -49,19 +51,19 @@ class DatasetConfig(Ranged, where="dataset"):
     each drive either way. With ``fleet``, each drive has a new unit of a type drawn from ``fleet``; with ``wide``, of
     a type of its own, drawn from the ranges of the IMU preset.
     An IMU sample is the mean over its interval, taken of ``imu_parts`` parts; 0 gives the constant rate and force that
-    act like the interval, which loading corrects for coning a second time (millimetres in a minute for a quiet car).
-    Fixes come from the satellites that a ``receiver`` sees, or have white noise without one; ``raw`` keeps its
+    act like the interval, which loading corrects for coning a second time (some mm in a minute with little vibration).
+    Fixes come from the satellites in view of a ``receiver``, or have white noise without one; ``raw`` keeps its
     observations as well.
     """
 
     name: str
-    hours: float = within(5.0, 0.005, 1e5)
-    drive_minutes: float = within(10.0, 0.25, LONGEST_DRIVE)
-    imu_rate_hz: int = within(100, 10, 2000)
-    reference_rate_hz: int = within(10, 1, 2000)
-    imu_parts: int = within(0, 0, 16)
+    hours: float = bounded_field(5.0, 0.005, 1e5)
+    drive_minutes: float = bounded_field(10.0, 0.25, LONGEST_DRIVE)
+    imu_rate_hz: int = bounded_field(100, 10, 2000)
+    reference_rate_hz: int = bounded_field(10, 1, 2000)
+    imu_parts: int = bounded_field(0, 0, 16)
     imu_errors: Literal["one", "per_drive", "fleet", "wide"] = "one"
-    unit_seed: int = within(0, 0, 2**63)
+    unit_seed: int = bounded_field(0, 0, 2**63)
     fleet: Mapping[str, ImuSpec] = field(default_factory=dict)
     vehicle: VehicleConfig = field(default_factory=VehicleConfig)
     chassis: ChassisConfig = field(default_factory=ChassisConfig)
@@ -69,6 +71,7 @@ class DatasetConfig(Ranged, where="dataset"):
     gnss: GnssConfig = field(default_factory=GnssConfig)
     receiver: Receiver | None = None
     raw: bool = False
+    sensors: SensorsConfig | None = None
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", self.name):
@@ -103,7 +106,7 @@ def dataset_config(config: Mapping[str, Any]) -> DatasetConfig:
 
     InputError for unknown keys and odd values.
     """
-    config = middle(config)
+    config = range_middle(config)
     if not isinstance(config, Mapping) or not isinstance(config.get("name"), str):
         raise InputError("dataset: name is missing, give it as in conf/simulated/*.yaml")
     fleet = config.get("fleet") or {}
@@ -114,9 +117,9 @@ def dataset_config(config: Mapping[str, Any]) -> DatasetConfig:
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a dataset is made by: settings of the whole, and those of a drive, which ranges may draw anew for each.
+    """What a dataset is made by: settings of the whole, and those of a drive, which ranges may draw for each.
 
-    ``ranges``: a mapping with ``dataset``, ``imu`` and ``receiver`` as :mod:`dlkf.ranges` has them, or none.
+    ``ranges``: a mapping with ``dataset``, ``imu`` and ``receiver`` as :mod:`dlkf.base.ranges` has them, or none.
     """
 
     dataset: DatasetConfig
@@ -126,28 +129,31 @@ class Recipe:
 
     def of_drive(self, seed: np.random.SeedSequence) -> tuple[DatasetConfig, ImuSpec]:
         """The settings of one drive. InputError where what was drawn is impossible."""
-        return (self.dataset, self.imu) if self.ranges is None else _settings(draw(self.ranges, seed))
+        return (self.dataset, self.imu) if self.ranges is None else _settings(draw_ranges(self.ranges, seed))
 
     @property
     def described(self) -> dict[str, Any]:
         """All of it as plain values, ranges as ranges."""
-        plain = self.ranges or {"dataset": asdict(self.dataset), "imu": asdict(self.imu)}
+        plain = self.ranges or {"dataset": _plain(self.dataset), "imu": asdict(self.imu)}
         return {"seed": self.seed, **plain}
 
 
-def recipe(
+def make_recipe(
     dataset: Mapping[str, Any],
     imu: Mapping[str, Any],
     seed: int,
     receiver: Mapping[str, Any] | None = None,
+    sensors: Mapping[str, Any] | None = None,
     *,
     raw: bool = False,
 ) -> Recipe:
     """Of the values of presets, in which ranges may stand; InputError for odd ones."""
     if not isinstance(seed, int) or seed < 0:
         raise InputError(f"simulation: seed {seed!r} must be a whole number ≥ 0")
-    plain = {"dataset": dataset, "imu": imu, "receiver": receiver, "raw": raw}
-    settings, spec = _settings(middle(plain))
+    plain: dict[str, Any] = {"dataset": dataset, "imu": imu, "receiver": receiver, "raw": raw}
+    if sensors and any(sensors.values()):
+        plain["sensors"] = sensors
+    settings, spec = _settings(range_middle(plain))
     if not has_ranges(plain):
         return Recipe(settings, spec, seed)
     for key in OF_ALL_DRIVES:
@@ -158,9 +164,40 @@ def recipe(
     return Recipe(settings, spec, seed, plain)
 
 
+@dataclass(frozen=True, kw_only=True)
+class SimulateSettings:
+    """``dlkf simulate``; the presets may hold ranges."""
+
+    dataset: Mapping[str, Any]
+    imu: Mapping[str, Any]
+    receiver: Mapping[str, Any] | None
+    seed: int
+    out: str
+    raw: bool
+    source: str | None
+    pictures: bool
+    overwrite: bool
+    workers: int | None
+    parallel: int | str | None
+    sensors: Mapping[str, Any] | None = None
+
+    @property
+    def recipe(self) -> Recipe:
+        """What the drives are made by."""
+        return make_recipe(self.dataset, self.imu, self.seed, self.receiver, self.sensors, raw=self.raw)
+
+
 def _settings(plain: Mapping[str, Any]) -> tuple[DatasetConfig, ImuSpec]:
     settings = dataset_config(plain["dataset"])
-    return replace(settings, receiver=receiver_spec(plain["receiver"]), raw=plain["raw"]), imu_spec(plain["imu"])
+    sensors = settings_from(SensorsConfig, plain["sensors"], "sensors") if "sensors" in plain else None
+    settings = replace(settings, receiver=receiver_spec(plain["receiver"]), raw=plain["raw"], sensors=sensors)
+    return settings, imu_spec(plain["imu"])
+
+
+def _plain(config: DatasetConfig) -> dict[str, Any]:
+    """For a file; a dataset without further sensors is described as it was before there were any."""
+    values = asdict(config)
+    return values if config.sensors else {key: value for key, value in values.items() if key != "sensors"}
 
 
 def simulate_dataset(config: DatasetConfig, spec: ImuSpec, seed: int, out: Path, **options: Any) -> Path:
@@ -179,11 +216,11 @@ def simulate(
 ) -> Path:
     """Write the dataset to ``out``, whole or not at all, and return its path.
 
-    Drive k depends on the seed and k alone, whatever the number of ``workers`` (threads; by default one per
-    core) or what is asked for by ``parallel`` in their place (:func:`dlkf.parallel.each`). Memory is that of
+    Drive k depends on the seed and k alone, not on the number of ``workers`` (threads; by default one per
+    core) or what ``parallel`` asks for (:func:`dlkf.base.parallel.parallel_map`). Memory is that of
     ``workers`` drives, whatever the hours. InputError if ``out`` exists.
     """
-    check(parallel, out)
+    check_engine(parallel, out)
     if workers is not None and workers < 1:
         raise InputError(f"workers={workers} must be at least 1")
     with new_dataset(out, overwrite) as folder:
@@ -191,7 +228,7 @@ def simulate(
     return out
 
 
-def drawn(
+def draw_presets(
     made_by: Recipe,
     unit_seed: np.random.SeedSequence,
     type_seed: np.random.SeedSequence,
@@ -205,16 +242,17 @@ def drawn(
     return config, spec, kind, draw_unit(np.random.default_rng(unit_seed), kind)
 
 
-def drive_of(made_by: Recipe, index: int, seconds: int) -> tuple[DriveTables, dict[str, Any]]:
+def drive_of(made_by: Recipe, index: int, seconds: int) -> tuple[SimulatedTables, dict[str, Any]]:
     """Drive ``index`` of a dataset, ``seconds`` long: its tables, and its row of ``drives.parquet``."""
     motion, imu, gnss, unit_seed, surroundings, chassis, type_seed, ranges_seed = np.random.SeedSequence(
         made_by.seed, spawn_key=(1, index)
     ).spawn(8)
-    config, spec, kind, unit = drawn(made_by, unit_seed, type_seed, ranges_seed)
+    config, spec, kind, unit = draw_presets(made_by, unit_seed, type_seed, ranges_seed)
     rates = Rates(int(config.imu_rate_hz), config.gnss.rate_hz, int(config.reference_rate_hz), int(config.imu_parts))
     tables = simulate_drive(
         Seeds(motion, imu, gnss, surroundings, chassis), seconds, rates,
         config.vehicle, config.chassis, config.surroundings, kind, unit, config.gnss, config.receiver,
+        config.sensors, np.random.SeedSequence(made_by.seed, spawn_key=(2, index)),
     )  # fmt: skip
     name = f"{config.name}-{made_by.seed}-{index:05d}"
     row = {
@@ -232,17 +270,17 @@ def drive_of(made_by: Recipe, index: int, seconds: int) -> tuple[DriveTables, di
         **tables.facts,
     }
     if made_by.ranges is not None:
-        row["drawn"] = json.dumps({"dataset": asdict(config), "imu": asdict(spec)}, ensure_ascii=False)
+        row["drawn"] = json.dumps({"dataset": _plain(config), "imu": asdict(spec)}, ensure_ascii=False)
     return tables, row
 
 
 def _write_drives(made_by: Recipe, folder: Path, workers: int, parallel: int | str | None, progress: bool) -> None:
     config = made_by.dataset
     jobs = list(enumerate(config.durations))
-    written = each(partial(_written, made_by, absolute(folder)), jobs, parallel, threads=workers)
-    shown = track(
-        written, f"simulating {config.name}", total=len(jobs), disable=not progress, console=Console(stderr=True)
-    )
+    written = parallel_map(partial(_written, made_by, absolute_place(folder)), jobs, parallel, threads=workers)
+    console = Console(stderr=True)
+    unseen = not (progress and sys.stderr.isatty())
+    shown = track(written, f"simulating {config.name}", total=len(jobs), disable=unseen, console=console)
     with closing(shown) as rows:  # type: ignore[type-var]
         write_drives_table(folder, list(rows))
     (folder / "simulation.json").write_text(json.dumps(made_by.described, indent=2, ensure_ascii=False) + "\n")
@@ -251,10 +289,10 @@ def _write_drives(made_by: Recipe, folder: Path, workers: int, parallel: int | s
 def _written(made_by: Recipe, out: str, job: tuple[int, int]) -> dict[str, Any]:
     """A drive by its index and seconds, in its place; its row of ``drives.parquet``."""
     tables, row = drive_of(made_by, *job)
-    folder = placed(out)
+    folder = resolve_place(out)
     if not is_url(out) and not folder.is_dir():
         raise InputError(f"{out} is not there: the worker does not share the folder, or nobody waits for the drive")
-    write_drive(folder, row, tables.imu, tables.gnss, tables.reference)
+    write_drive(folder, row, tables.imu, tables.gnss, tables.reference, tables.aids)
     if made_by.dataset.raw:
         write_raw(folder, row["drive"], tables.raw)
     return row

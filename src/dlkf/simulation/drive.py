@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.simulation.gnss.receiver import Receiver
-from dlkf.simulation.gnss.reporting import late
+from dlkf.simulation.gnss.reporting import delay_fixes
 from dlkf.simulation.gnss.satellite_fixes import receive
 from dlkf.simulation.gnss.surroundings import Surroundings, sky_along
 from dlkf.simulation.gnss.white import GnssConfig
 from dlkf.simulation.imu import ImuUnit, corrupt, interval_means, inverse_mechanisation
-from dlkf.simulation.motion.chassis import Car, ChassisConfig, draw_car, mounted, slip_angle
+from dlkf.simulation.motion.chassis import Car, ChassisConfig, apply_mounting, draw_car, slip_angle
 from dlkf.simulation.motion.routes import VehicleConfig
-from dlkf.simulation.motion.vehicle import Route, Truth, follow, random_route
+from dlkf.simulation.motion.vehicle import Route, Truth, follow_route, random_route
+from dlkf.simulation.sensors import SensorsConfig, sense
 from dlkf.simulation.tables import imu_columns, reference_columns
 
 
@@ -48,7 +49,7 @@ class Rates:
 
 
 @dataclass(frozen=True)
-class DriveTables:
+class SimulatedTables:
     """The tables of one drive, and what is worth knowing of it: a row of ``drives.parquet``.
 
     The IMU error in a row of the reference is that of the sample which ends there, without white noise.
@@ -59,6 +60,7 @@ class DriveTables:
     reference: pd.DataFrame
     raw: pd.DataFrame | None  # GNSS observations, where fixes come from satellites
     facts: dict[str, float]
+    aids: dict[str, pd.DataFrame] = field(default_factory=dict)  # of further sensors
 
 
 def simulate_drive(
@@ -72,33 +74,38 @@ def simulate_drive(
     unit: ImuUnit,
     gnss: GnssConfig,
     receiver: Receiver | None = None,
-) -> DriveTables:
+    sensors: SensorsConfig | None = None,
+    sensor_seed: np.random.SeedSequence | None = None,
+) -> SimulatedTables:
     """One drive; each part has a seed of its own, so changing one leaves the others as they were."""
     motion_rng, imu_rng, gnss_rng, sky_rng, chassis_rng = (np.random.default_rng(seed) for seed in seeds)
     parts = max(rates.imu_parts, 1)
     t = np.arange(duration_s * rates.imu_hz * parts + 1) / (rates.imu_hz * parts)
     route = random_route(motion_rng, vehicle, float(duration_s))
     car = draw_car(chassis_rng, chassis)
-    axle = follow(route, vehicle, t)
-    truth = axle if chassis.is_point and not vehicle.is_banked else mounted(chassis_rng, car, route, axle)
+    axle = follow_route(route, vehicle, t)
+    truth = axle if chassis.is_point and not vehicle.is_banked else apply_mounting(chassis_rng, car, route, axle)
     true_imu = interval_means(truth, parts) if rates.imu_parts else inverse_mechanisation(truth)
-    t, axle, truth = t[::parts], *(sliced(x, slice(None, None, parts)) for x in (axle, truth))
+    t, axle, truth = t[::parts], *(slice_tables(x, slice(None, None, parts)) for x in (axle, truth))
     measured, error = corrupt(imu_rng, true_imu, spec, unit, rates.imu_hz)
     fixes = np.arange(0, len(t), round(rates.imu_hz / rates.gnss_hz))
     rows = slice(None, None, rates.imu_hz // rates.reference_hz)
     sky = sky_along(sky_rng, surroundings, route.motion(t[fixes]).distance)
-    seen, rate_b = late(truth, _rate_at_rows(true_imu[:, 3:]), fixes, gnss, rates.imu_hz)
+    seen, rate_b = delay_fixes(truth, _rate_at_rows(true_imu[:, 3:]), fixes, gnss, rates.imu_hz)
     received = receive(gnss_rng, seen, rate_b, gnss, receiver, sky)
-    return DriveTables(
+    return SimulatedTables(
         imu=pd.DataFrame(imu_columns(t[1:], measured)),
         gnss=received.fixes,
-        reference=pd.DataFrame(reference_columns(sliced(truth, rows), np.concatenate((error[:1], error))[rows])),
+        reference=pd.DataFrame(reference_columns(slice_tables(truth, rows), np.concatenate((error[:1], error))[rows])),
         raw=received.raw,
         facts=_facts(car, route, axle, truth, rates.imu_hz),
+        aids={}
+        if sensors is None
+        else sense(sensor_seed or np.random.SeedSequence(0), sensors, axle, route.motion(axle.t).yaw_rate),
     )
 
 
-def sliced(truth: Truth, rows: slice) -> Truth:
+def slice_tables(truth: Truth, rows: slice) -> Truth:
     """Some rows of the truth."""
     return Truth(*(getattr(truth, name)[rows] for name in Truth.__dataclass_fields__))
 

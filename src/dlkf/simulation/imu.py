@@ -46,7 +46,7 @@ def interval_means(truth: Truth, parts: int) -> Array:
     """Mean specific force and rate over samples of ``parts`` intervals of the truth each, (N, 6): the data contract's.
 
     What turns and pushes as the truth does (:func:`inverse_mechanisation`) less its coning and sculling inside every
-    interval, which loading adds again from what it sees of the samples (:mod:`dlkf.data.increments`): with α and ν the
+    interval, which loading adds again from the samples (:mod:`dlkf.data.increments`): with α and ν the
     increments and motion smooth through three intervals, α_k = φ_k − (φ_{k−1} × φ_k + φ_k × φ_{k+1})/24, ν likewise.
     One part is a sensor that integrates its own coning; several leave in what vibrates too fast for the samples.
     """
@@ -157,11 +157,11 @@ def corrupt(
             error[:, part] += gauss_markov(rng, len(true_imu), sensor.wander, sensor.wander_time, rate_hz)
     measured = true_imu + error + noise
     for part, sensor in zip((slice(0, 3), slice(3, 6)), sensors):
-        measured[:, part] = put_out(measured[:, part], sensor)
+        measured[:, part] = quantise(measured[:, part], sensor)
     return measured, error
 
 
-def put_out(x: Array, sensor: SensorErrors) -> Array:
+def quantise(x: Array, sensor: SensorErrors) -> Array:
     """What a sensor's output register holds of x: within ± its full scale, in whole steps."""
     if sensor.full_scale > 0:
         x = np.clip(x, -sensor.full_scale, sensor.full_scale)

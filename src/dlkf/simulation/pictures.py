@@ -1,6 +1,6 @@
 """Pictures of drives, simulated or real: one drive as in the paper's figure 4, and how a dataset moves.
 
-Colours are Okabe & Ito's, which colour-blind readers tell apart.
+Colours are Okabe & Ito's, which colour-blind readers can distinguish.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from dlkf.base.errors import InputError
+from dlkf.base.files import folder_name, resolve_place, write_into
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR
 from dlkf.data.tables import Columns, read_drives
-from dlkf.data.validate import DriveTables, read_checked
-from dlkf.errors import InputError
-from dlkf.files import name_of, placed, staged
+from dlkf.data.validate import CheckedTables, read_checked
 
 Array = NDArray[np.floating]
 AXES = (("x", "#0072B2"), ("y", "#D55E00"), ("z", "#009E73"))
@@ -56,12 +56,12 @@ class Driving:
         return np.abs(self.yaw_rate) > TURNING * np.maximum(self.speed, MOVING)
 
     def every(self, seconds: float) -> Driving:
-        """Thinned out to about one row in so many seconds."""
+        """Decimated to about one row in so many seconds."""
         step = max(1, round(seconds / float(np.median(np.diff(self.t)))))
         return Driving(*(getattr(self, f.name)[::step] for f in fields(self)))
 
 
-def driving(tables: DriveTables) -> Driving:
+def driving(tables: CheckedTables) -> Driving:
     """Speed, acceleration and yaw rate over the ground; derivatives by a sliding parabola of half a second.
 
     InputError for a drive with less than ten rows that have a velocity.
@@ -88,7 +88,7 @@ def driving(tables: DriveTables) -> Driving:
     return Driving(t, north, east, speed, along, yaw_rate, turning & (np.abs(change) < STEADY))
 
 
-def drive_figure(tables: DriveTables) -> Figure:
+def drive_figure(tables: CheckedTables) -> Figure:
     """One drive: track, speed, specific force, rates, and the IMU's errors where they are known (paper, figure 4)."""
     moved = driving(tables)
     errors = _known_errors(tables.reference)
@@ -159,7 +159,7 @@ def write_pictures(dataset: str | Path, out: str | Path, names: Sequence[str] = 
     if unknown := [name for name in names if name not in rows]:
         raise InputError(f"dataset {dataset}: no drive {', '.join(unknown)}; has {', '.join(list(rows)[:5])} …")
     files, moved = [], []
-    with staged(out) as folder:
+    with write_into(out) as folder:
         for name, row in rows.items():
             tables = read_checked(dataset, row)
             moved.append(driving(tables).every(0.5))
@@ -167,11 +167,11 @@ def write_pictures(dataset: str | Path, out: str | Path, names: Sequence[str] = 
                 files.append(f"{name}.png")
                 drive_figure(tables).savefig(folder / files[-1], dpi=90)
         files.append("motion.png")
-        motion_figure(moved, name_of(dataset)).savefig(folder / files[-1], dpi=90)
-    return [placed(out) / file for file in files]
+        motion_figure(moved, folder_name(dataset)).savefig(folder / files[-1], dpi=90)
+    return [resolve_place(out) / file for file in files]
 
 
-def _track(axes: Axes, figure: Figure, moved: Driving, tables: DriveTables) -> None:
+def _track(axes: Axes, figure: Figure, moved: Driving, tables: CheckedTables) -> None:
     drawn = axes.scatter(moved.east, moved.north, c=3.6 * moved.speed, s=2, cmap="viridis", linewidths=0)
     axes.plot(moved.east[0], moved.north[0], "o", color=INK, markersize=5, label="start")
     fixes = tables.gnss["t"][tables.gnss["quality"] > 0]

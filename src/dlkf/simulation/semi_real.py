@@ -1,4 +1,4 @@
-"""Semi-real drives: a real car's motion and its high-grade IMU, with the errors of another IMU and GNSS made anew.
+"""Semi-real drives: a real car's motion and its high-grade IMU, with the errors of another IMU and GNSS simulated.
 
 Truth stays the source's reference. GNSS exists only where the reference is known: a fix is made of it, and claims
 no more than the reference holds.
@@ -19,17 +19,17 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from dlkf.data.resampling import Grid, reference_at
+from dlkf.base.errors import InputError
+from dlkf.base.files import open_parquet, resolve_place
+from dlkf.data.resampling import SampleGrid, reference_at
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR, VELOCITY, new_dataset, write_drive, write_drives_table
 from dlkf.data.tables import Columns, read_drives
-from dlkf.data.validate import DriveTables, read_checked, validate_dataset
-from dlkf.errors import InputError
-from dlkf.files import placed, readable
+from dlkf.data.validate import CheckedTables, read_checked, validate_dataset
 from dlkf.navigation.attitude import rpy_from_rotation
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.simulation.dataset import DatasetConfig, Recipe, drawn, gnss_text, write_raw
+from dlkf.simulation.dataset import DatasetConfig, Recipe, draw_presets, gnss_text, write_raw
 from dlkf.simulation.gnss.satellite_fixes import Received, receive
 from dlkf.simulation.gnss.surroundings import Sky, sky_along
 from dlkf.simulation.imu import ImuUnit, corrupt
@@ -48,14 +48,16 @@ def simulate_semi_real(
     overwrite: bool = False,
     progress: bool = True,
 ) -> Path:
-    """Write every drive of the dataset ``source`` to ``out`` with IMU errors injected and GNSS made anew.
+    """Write every drive of the dataset ``source`` to ``out`` with IMU errors injected and GNSS simulated.
 
     Of the recipe the IMU errors, surroundings, gnss, receiver and raw count; motion, rates and lengths are the
     source's. The columns of the true IMU error hold the injected part only. InputError for a drive without a
     usable reference, or whose IMU errors are known already (it is no real drive).
     """
     rows = read_drives(source)
-    described = pq.ParquetFile(readable(placed(source) / "drives.parquet")).read().to_pandas().to_dict("records")
+    described = (
+        pq.ParquetFile(open_parquet(resolve_place(source) / "drives.parquet")).read().to_pandas().to_dict("records")
+    )
     shown = track(rows, f"semi-real {made_by.dataset.name}", disable=not progress, console=Console(stderr=True))
     with closing(iter(shown)) as drives, new_dataset(out, overwrite) as folder:  # type: ignore[type-var]
         written = []
@@ -64,9 +66,9 @@ def simulate_semi_real(
             *streams, unit_seed, type_seed, ranges_seed = np.random.SeedSequence(
                 made_by.seed, spawn_key=(2, index)
             ).spawn(6)
-            config, _, kind, unit = drawn(made_by, unit_seed, type_seed, ranges_seed)
+            config, _, kind, unit = draw_presets(made_by, unit_seed, type_seed, ranges_seed)
             imu_rng, gnss_rng, sky_rng = (np.random.default_rng(stream) for stream in streams)
-            imu, reference = injected(imu_rng, tables, kind, unit)
+            imu, reference = inject_errors(imu_rng, tables, kind, unit)
             received, rough = gnss_of_reference(gnss_rng, sky_rng, tables, config)
             row = _row(described[index], config, kind, rough)
             written.append(write_drive(folder, row, imu, received.fixes, reference))
@@ -79,8 +81,8 @@ def simulate_semi_real(
     return out
 
 
-def injected(
-    rng: np.random.Generator, tables: DriveTables, spec: ImuSpec, unit: ImuUnit
+def inject_errors(
+    rng: np.random.Generator, tables: CheckedTables, spec: ImuSpec, unit: ImuUnit
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """IMU table with the errors of a unit added to the source's samples, and the reference with those errors.
 
@@ -105,20 +107,20 @@ def injected(
 
 
 def gnss_of_reference(
-    rng: np.random.Generator, sky_rng: np.random.Generator, tables: DriveTables, config: DatasetConfig
+    rng: np.random.Generator, sky_rng: np.random.Generator, tables: CheckedTables, config: DatasetConfig
 ) -> tuple[Received, Array]:
     """GNSS at whole multiples of 1/rate where the reference is known, and the reference's roughness (3,) [m].
 
     Known is between valid samples close enough to interpolate; elsewhere there is no fix, as under a roof. The
     :func:`roughness` is added in square to the position's std. Late fixes (``position_lag_s``, ``velocity_lag_s``) are
-    of the reference that long before, the lever arm as at the velocity's time. InputError if it is known nowhere, or
+    of the reference that long before, the lever arm as at the velocity's time. InputError if it is never known, or
     has no attitude while the configuration asks for a lever arm.
     """
     name, reference, gnss = tables.row.name, tables.reference, config.gnss
-    assert reference is not None  # :func:`injected` raises for that
+    assert reference is not None  # :func:`inject_errors` raises for that
     t = _epochs(tables.imu["t"], reference["t"], gnss.rate_hz, name)
     at, moving = (
-        reference_at(reference, Grid(t[0] - lag, 1 / gnss.rate_hz, len(t) - 1, 1))
+        reference_at(reference, SampleGrid(t[0] - lag, 1 / gnss.rate_hz, len(t) - 1, 1))
         for lag in (gnss.position_lag_s, gnss.velocity_lag_s)
     )
     valid = at.valid & moving.valid

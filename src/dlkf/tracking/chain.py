@@ -11,15 +11,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from dlkf.files import whole_file
+from dlkf.base.files import replace_file
 from dlkf.tracking.grid import PARENT_RUN, parent_status
 from dlkf.tracking.runs import client_of, experiment_id, tracking_uri
 
 
 def arguments(doc: str | None, seeds: str, each: str) -> argparse.ArgumentParser:
-    """What every chain of trainings takes; words that it does not know are key=value for ``dlkf.train``.
+    """What every chain of trainings takes; other words are key=value for ``dlkf.train``.
 
-    ``seeds`` is the default, ``each`` says what one seed costs.
+    ``seeds`` is the default, ``each`` is the cost of one seed.
     """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--seeds", default=seeds, type=lambda given: given.split(","), help=each)
@@ -27,7 +27,7 @@ def arguments(doc: str | None, seeds: str, each: str) -> argparse.ArgumentParser
 
 
 class Study:
-    """A folder that remembers which of its trainings are finished and where their reports lie."""
+    """A folder with a record of its finished trainings and their reports."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -37,7 +37,7 @@ class Study:
     def remember(self, key: str, value: str) -> None:
         """Safe against a kill."""
         self.done[key] = value
-        with whole_file(self.file) as beside:
+        with replace_file(self.file) as beside:
             beside.write_text(json.dumps(self.done, indent=1))
 
     def train(self, key: str, *overrides: str) -> Path:

@@ -7,11 +7,10 @@ from typing import Any
 
 import pandas as pd
 
-from dlkf.errors import InputError
-from dlkf.tracking.runs import PARENT_TAG
+from dlkf.base.errors import InputError
+from dlkf.tracking.runs import MONITORS, PARENT_TAG
 
-NAMELESS = ("tracking", "hydra", "resume", "name", "out")  # settings that say nothing about the result
-MONITORS = ("val/outage_end_m", "val/loss")  # what training keeps the best weights by, unless it is told otherwise
+NAMELESS = ("tracking", "hydra", "resume", "name", "out")  # settings that do not affect the result
 COMPARED = ("outage_end_horizontal_m", "position_rms_m")  # the first that the children have
 
 
@@ -22,7 +21,7 @@ def children(client, parent: str) -> list:
     return list(client.search_runs(experiments, mine, order_by=["attributes.start_time"], max_results=5000))
 
 
-def monitored(runs: Sequence) -> str | None:
+def monitored_metric(runs: Sequence) -> str | None:
     """The metric by which the runs kept their best weights; None where nothing was validated."""
     chosen = [r.data.params.get("trainer.monitor", "null") for r in runs]
     known = [*(name for name in chosen if name != "null"), *MONITORS]
@@ -40,7 +39,7 @@ def best_validation(client, run, monitor: str | None) -> float | None:
 
 def best_child(client, runs: Sequence):
     """The finished run that validated best, None where none did."""
-    monitor = monitored(runs)
+    monitor = monitored_metric(runs)
     validated = [(best_validation(client, r, monitor), r) for r in runs if r.info.status == "FINISHED"]
     known = [(value, run) for value, run in validated if value is not None]
     return min(known, key=lambda pair: pair[0])[1] if known else None
@@ -62,7 +61,7 @@ def comparison(client, runs: Sequence) -> pd.DataFrame:
     names = [key for key in sorted(map(str, given)) if given[key].nunique(dropna=False) > 1]
     names = [key for key in names if key.partition(".")[0] not in NAMELESS]
     metrics = sorted({key for r in runs for key in r.data.metrics if key.startswith("test/")})
-    monitor = monitored(runs)
+    monitor = monitored_metric(runs)
     rows = []
     for run in runs:
         row = {"run": run.info.run_name, "run_id": run.info.run_id, "status": run.info.status}
@@ -73,7 +72,7 @@ def comparison(client, runs: Sequence) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def compared(table: pd.DataFrame) -> tuple[str, pd.DataFrame]:
+def compare_children(table: pd.DataFrame) -> tuple[str, pd.DataFrame]:
     """The metric to compare by, and run, status, validation and its value for every filter.
 
     Sorted by validation: test drives choose nothing (R018). Without ``test/`` metrics (all runs failed) the

@@ -19,16 +19,16 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from dlkf.errors import InputError
-from dlkf.files import placed
-from dlkf.points import SWEPT, Failure, failures
+from dlkf.base.errors import InputError
+from dlkf.base.files import resolve_place
+from dlkf.base.points import SWEPT, Failure, failures
 from dlkf.report.compare import read_reports, write_comparison
 from dlkf.report.grid import grid_page
-from dlkf.tracking.comparison import NAMELESS, as_text, best_child, cells, children, compared, comparison
-from dlkf.tracking.registry import check_registration, registered
+from dlkf.tracking.comparison import NAMELESS, as_text, best_child, cells, children, compare_children, comparison
+from dlkf.tracking.registry import check_registration, register_model
 from dlkf.tracking.runs import (
     NOTE_TAG,
-    Run,
+    TrackedRun,
     check_store,
     client_of,
     experiment_id,
@@ -69,7 +69,7 @@ class GridParent(Callback):
             raise SystemExit(2) from None
         self.run_id = run.info.run_id
         for key, values in swept.items():
-            client.log_param(self.run_id, shown(key), values)
+            client.log_param(self.run_id, format_value(key), values)
         os.environ[PARENT_RUN] = self.run_id
         atexit.register(self.close, ended=False)
 
@@ -78,7 +78,7 @@ class GridParent(Callback):
         self.close(ended=True)
         os.environ.pop(SWEPT, None)
         out = OmegaConf.select(config, "out")
-        folders = sorted(p.parent for p in placed(out).glob("*/metrics.json")) if out else []
+        folders = sorted(p.parent for p in resolve_place(out).glob("*/metrics.json")) if out else []
         if len(folders) > 1:
             write_comparison(out, read_reports(folders))
             print(f"Compared: {out}/compare.html")
@@ -108,14 +108,14 @@ class GridParent(Callback):
                 print("Registered nothing: no point was validated")
                 return
             name = self.register or client.get_experiment(best.info.experiment_id).name
-            number = registered(client, best.info.run_id, name, self.alias)
+            number = register_model(client, best.info.run_id, name, self.alias)
             print(f"Registered the best, {best.info.run_name}: models:/{name}/{number}, alias {self.alias or 'none'}")
 
     def _compare(self, client, parent: str, table: pd.DataFrame, failed: Sequence[Failure]) -> None:
         """The table of all points as text, CSV, page and note of the parent."""
-        metric, chosen = compared(table)
+        metric, chosen = compare_children(table)
         ordered = any(c.startswith("val/") for c in map(str, table))
-        title = f"{metric} of the test pieces" if metric else "no run was scored"
+        title = f"{metric} of the test segments" if metric else "no run was scored"
         title += "; runs by their validation" if ordered else ""
         text = as_text(chosen) + "".join(f"\nfailed: {f.point}: {f.why}\n" for f in failed)
         client.log_text(parent, table.to_csv(index=False), "comparison.csv")
@@ -152,42 +152,48 @@ def swept_overrides(config: DictConfig) -> dict[str, str]:
 
 
 def run_name(name: str, overrides: Sequence[str]) -> str:
-    """What a run is called: in a grid its own point, else ``name`` with what was changed about it.
+    """What a run is called: in a grid its own point, else what was changed about it, then its ``name`` and profile.
 
-    ``outage`` and ``["+experiment=outage", "+profile=quick", "seed=1"]`` give ``outage quick seed=1``.
+    ``outage`` and ``["+experiment=outage", "+profile=quick", "seed=1"]`` give ``seed=1 outage quick``: lists of runs
+    cut names at their ends, and two runs differ by what was changed.
     """
     swept = json.loads(os.environ.get(SWEPT, "[]")) if os.environ.get(PARENT_RUN) else []
     if swept:
         words = points_words([o for o in overrides if o.partition("=")[0] in swept])
     else:
-        words = [name]
-        for override in overrides:
-            key, _, value = shown(override).partition("=")
-            if key.split(".")[0] in NAMELESS or (key == "experiment" and value == name):
-                continue
-            words.append(value if key in PRESETS else shown(override))
+        pairs = [format_value(o).partition("=")[::2] for o in overrides]
+        changed = [o for o, (key, _) in zip(overrides, pairs) if key.split(".")[0] not in (*NAMELESS, *PRESETS)]
+        chosen = [value for key, value in pairs if key in PRESETS and (key, value) != ("experiment", name)]
+        words = [*points_words(changed), name, *chosen]
     return " ".join(words)[:250] or name
 
 
 def points_words(overrides: Sequence[str]) -> list[str]:
-    """Short, for a list: ``optimizer.lr=1e-3`` → ``lr=1e-3``, unless two keys end alike."""
-    pairs = [shown(o).partition("=")[::2] for o in overrides]
+    """Short, for a list: ``optimizer.lr=1e-3`` → ``lr=1e-3``, unless two keys end alike; ``loss._target_=own.Huber`` →
+    ``loss=Huber``."""
+    pairs = [_without_target(*format_value(o).partition("=")[::2]) for o in overrides]
     ends = [key.rpartition(".")[2] for key, _ in pairs]
     return [f"{end if ends.count(end) == 1 else key}={value}" for end, (key, value) in zip(ends, pairs)]
 
 
+def _without_target(key: str, value: str) -> tuple[str, str]:
+    """``loss._target_``, ``my_loss.Huber`` → ``loss``, ``Huber``."""
+    owner, dot, last = key.rpartition(".")
+    return (owner, value.rpartition(".")[2]) if dot and last == "_target_" else (key, value)
+
+
 def grid_name(key: str, values: str) -> str:
-    """A swept key and its values, short enough to be told apart in a list: ``lstm_hidden 8,64``."""
-    return f"{shown(key).rpartition('.')[2]} {values if len(values) <= 24 else values[:23] + '…'}"
+    """A swept key and its values, short enough for a list: ``lstm_hidden 8,64``."""
+    return f"{format_value(key).rpartition('.')[2]} {values if len(values) <= 24 else values[:23] + '…'}"
 
 
-def shown(override: str) -> str:
+def format_value(override: str) -> str:
     """An override as one reads it: ``filter@model=dlkf`` → ``model=dlkf``, without Hydra's plus signs."""
     key, equals, value = override.partition("=")
     return f"{key.lstrip('+~').rpartition('@')[2]}{equals}{value}"
 
 
-def start_point(uri: str, experiment: str, name: str) -> AbstractContextManager[Run]:
+def start_point(uri: str, experiment: str, name: str) -> AbstractContextManager[TrackedRun]:
     """A run of its own, or in a sweep one of the points."""
     parent = os.environ.get(PARENT_RUN)
     named = run_name(name, HydraConfig.get().overrides.task) if parent else name

@@ -14,15 +14,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import dlkf
+from dlkf.base.errors import InputError
 from dlkf.data.rows import GNSS_COLUMNS, IMU_COLUMNS, example_drive
-from dlkf.errors import InputError
 from dlkf.filters.saved import WEIGHTS
 from dlkf.running.solution import COLUMNS
+from dlkf.tracking.endings import use_store
 from dlkf.tracking.runs import (
     NOTE_TAG,
-    Run,
+    RUN_ID,
+    TrackedRun,
     client_of,
-    found_again,
     mlflow_module,
     reachable,
     run_exists,
@@ -48,12 +49,11 @@ REQUIRED = (
     "pymap3d",
     "jaxtyping",
 )
-RUN_ID = re.compile(r"[0-9a-f]{32}")
 SPEC = re.compile(r"(?P<name>[^/:@]+)(?:@(?P<alias>[^/@]+)|/(?P<version>\d+|latest))?")
 
 
 def log_model(
-    run: Run,
+    run: TrackedRun,
     folder: Path | str,
     *,
     register: str | None = None,
@@ -84,7 +84,7 @@ def log_model(
         )
     _log_model_metrics(run, info.model_id, metrics or {})
     if register:
-        registered(client, run.id, register, alias)
+        register_model(client, run.id, register, alias)
     return info.model_uri
 
 
@@ -111,7 +111,7 @@ def signature():
     return ModelSignature(inputs=Schema([*words, *numbers]), outputs=solution, params=ParamSchema(arm))
 
 
-def registered(client: MlflowClient, run_id: str, name: str, alias: str | None = None) -> str:
+def register_model(client: MlflowClient, run_id: str, name: str, alias: str | None = None) -> str:
     """Make the model of a run a version of ``name`` and let ``alias`` point there; returns the version.
 
     The version carries a card: the run's note, its parameters and scores. Raises InputError where the run logged no
@@ -122,28 +122,27 @@ def registered(client: MlflowClient, run_id: str, name: str, alias: str | None =
     logged = run.outputs.model_outputs if run.outputs else []
     if not logged:
         raise InputError(f"run {run_id} logged no model (its status is {run.info.status})")
-    mlflow = mlflow_module()
-    mlflow.set_tracking_uri(client.tracking_uri)
     scores = {k: f"{v:.4g}" for k, v in run.data.metrics.items() if k.startswith(("test/", "val/"))}
-    made = mlflow.register_model(
-        f"models:/{logged[-1].model_id}", name, await_registration_for=0, tags={"run": run.info.run_name, **scores}
-    )
-    client.update_model_version(name, made.version, card(run))
+    with use_store(client.tracking_uri):
+        made = mlflow_module().register_model(
+            f"models:/{logged[-1].model_id}", name, await_registration_for=0, tags={"run": run.info.run_name, **scores}
+        )
+    client.update_model_version(name, made.version, model_card_text(run))
     if alias:
         client.set_registered_model_alias(name, alias, made.version)
     return str(made.version)
 
 
-def card(run) -> str:
-    """What a registered version says of itself, in Markdown: where it comes from, how to use it, how good it is."""
+def model_card_text(run) -> str:
+    """The description of a registered version, in Markdown: where it comes from, how to use it, how good it is."""
     params = run.data.params
-    told = {key: params[key] for key in ("data.datasets", "imu.name", "seed", "trainer.max_epochs") if key in params}
-    rows = "\n".join(f"- {key}: `{value}`" for key, value in told.items())
+    shown = {key: params[key] for key in ("data.datasets", "imu.name", "seed", "trainer.max_epochs") if key in params}
+    rows = "\n".join(f"- {key}: `{value}`" for key, value in shown.items())
     how = "`predict` takes a table of a drive (IMU and GNSS rows), or folders of datasets; see the input example."
     return f"# {run.info.run_name}\n\nRun `{run.info.run_id}`. {how}\n\n{rows}\n\n{run.data.tags.get(NOTE_TAG, '')}"
 
 
-def _log_model_metrics(run: Run, model_id: str, metrics: Mapping[str, float]) -> None:
+def _log_model_metrics(run: TrackedRun, model_id: str, metrics: Mapping[str, float]) -> None:
     """Metrics of the run that stand beside the model and its dataset in the UI."""
     from mlflow.entities import Metric
     from mlflow.utils.time import get_current_time_millis
@@ -161,7 +160,7 @@ def _log_model_metrics(run: Run, model_id: str, metrics: Mapping[str, float]) ->
 
 
 def pinned_requirements() -> list[str]:
-    """What a logged model needs, in the versions at hand; without build tags: ``2.13.0+cpu`` → ``2.13.0``."""
+    """What a logged model needs, in the installed versions; without build tags: ``2.13.0+cpu`` → ``2.13.0``."""
     return [f"{name}=={version(name).partition('+')[0]}" for name in REQUIRED]
 
 
@@ -191,7 +190,6 @@ def download_model(spec: str, uri: str | None = None) -> Path:
             f"model={spec}: there is no MLflow store at {uri.removeprefix('sqlite:///')}; "
             "run from the folder of the training or give tracking.uri=…"
         )
-    found_again(uri)
     with reachable(uri):
         client = client_of(uri)
         find = _registered if spec.startswith("models:/") else _of_run
@@ -263,7 +261,8 @@ def _fetch(source: str, spec: str, uri: str) -> Path:
         folder = Path(download_artifacts(artifact_uri=source, dst_path=there, tracking_uri=uri))
     except (OSError, MlflowException) as error:
         reason = str(error).splitlines()[0]
-        raise InputError(f"model={spec}: its files cannot be had from {source}: {reason}") from None
+        hint = "; a store has absolute places: move its folder back" if there is None else ""
+        raise InputError(f"model={spec}: its files cannot be had from {source}: {reason}{hint}") from None
     found = sorted(folder.rglob(WEIGHTS))
     if not found:
         raise InputError(f"model={spec}: {source} holds no {WEIGHTS}; was this model logged by dlkf?")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import json
-import logging
 import math
 import os
 import re
@@ -14,14 +13,22 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote, urlsplit
 
 import yaml
 
-from dlkf.errors import InputError
-from dlkf.files import at_hand, is_url, name_of
-from dlkf.tracking.moved import follow
+from dlkf.base.errors import InputError
+from dlkf.base.files import folder_name, is_url, local_copy
+from dlkf.base.processes import process_label
+from dlkf.tracking.endings import (
+    PROCESS_TAG,
+    close_killed_runs,
+    delay_signals,
+    end_run,
+    mlflow_module,
+    use_store,
+)
 
 if TYPE_CHECKING:
     from lightning.pytorch.loggers import MLFlowLogger
@@ -29,27 +36,15 @@ if TYPE_CHECKING:
 
 STORE, ARTIFACTS = "mlflow.db", "mlruns"
 SQLITE = "sqlite:///"
+RUN_ID = re.compile(r"[0-9a-f]{32}")
 PARENT_TAG, NOTE_TAG = "mlflow.parentRunId", "mlflow.note.content"
 KIND = {"mlflow.experimentKind": "custom_model_development"}  # else the UI shows pages for language models
 KEY_LENGTH, VALUE_LENGTH, NOTE_LENGTH, PARAMS_AT_ONCE, METRICS_AT_ONCE = 250, 6000, 8000, 100, 1000  # MLflow's limits
+MONITORS = ("val/outage_end_m", "val/loss")  # what training keeps the best weights by, unless it is given another
 NOT_IN_NAMES = re.compile(r"[^\w\-. :/]")  # of metrics
 SCHEMES = ("sqlite", "http", "https", "file", "postgresql", "mysql", "mssql", "databricks", "uc", "databricks-uc")
 LOCKED_S = 15.0  # a writer of many metrics holds the store for less
 SAMPLE_EVERY_S, SAMPLES_PER_POINT = 1, 5  # system metrics: MLflow's own 10 s leaves short runs empty
-
-
-def mlflow_module() -> ModuleType:
-    """MLflow, quiet, without usage reports, unable to load a pickle. Imported on use: it takes seconds."""
-    os.environ["MLFLOW_ALLOW_PICKLE_DESERIALIZATION"] = "false"
-    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
-    os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
-    import mlflow
-
-    for name in ("mlflow", "alembic"):
-        logging.getLogger(name).setLevel(logging.WARNING)
-    logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)  # it prints what it then raises
-    return mlflow
 
 
 def tracking_uri(given: str | None = None) -> str:
@@ -73,12 +68,6 @@ def tracking_uri(given: str | None = None) -> str:
 def store_missing(uri: str) -> bool:
     """Whether the URI is an embedded store that does not exist yet."""
     return uri.startswith(SQLITE) and not Path(uri.removeprefix(SQLITE)).is_file()
-
-
-def found_again(uri: str) -> None:
-    """The artifacts of an embedded store whose folder was moved."""
-    if uri.startswith(SQLITE):
-        follow(Path(uri.removeprefix(SQLITE)), ARTIFACTS)
 
 
 def client_of(uri: str) -> MlflowClient:
@@ -116,7 +105,7 @@ def _unlocked(uri: str, lock: str) -> None:
         with closing(sqlite3.connect(path, timeout=LOCKED_S)) as store:
             store.executescript(f"{lock}; ROLLBACK")
     except sqlite3.OperationalError as error:
-        if "locked" in str(error):  # of all else MLflow says itself whether it matters
+        if "locked" in str(error):  # for all else MLflow has its own checks
             raise InputError(
                 f"the MLflow store {path} is locked by another program; wait or close it, then give the same command "
                 "again, or another store (tracking.uri=sqlite:///<path>.db)"
@@ -144,7 +133,7 @@ def reachable(uri: str) -> Iterator[None]:
 def experiment_id(client: MlflowClient, name: str) -> str:
     """The experiment of this name, made if need be; artifacts of an embedded store lie beside it.
 
-    Raises InputError if the experiment was deleted.
+    Raises InputError if the experiment was deleted, or the store moved away from its artifacts.
     """
     from mlflow.exceptions import MlflowException
 
@@ -164,11 +153,19 @@ def experiment_id(client: MlflowClient, name: str) -> str:
     assert found is not None
     if found.lifecycle_stage == "deleted":
         raise InputError(f"the MLflow experiment {name!r} was deleted; restore it or give another name=")
+    place = found.artifact_location
+    if location is not None and place != location and place.startswith("file:") and ARTIFACTS in place:
+        old = Path(unquote(urlsplit(place).path)).parents[1]
+        if not old.is_dir():
+            raise InputError(
+                f"the MLflow store {uri.removeprefix(SQLITE)} has its files in {old}, which is not there: move the "
+                "folder back, or begin a new store (tracking.uri=sqlite:///<path>.db)"
+            )
     return found.experiment_id
 
 
 @dataclass(frozen=True)
-class Run:
+class TrackedRun:
     """One MLflow run that is being written."""
 
     id: str
@@ -184,7 +181,7 @@ class Run:
         from mlflow.entities import Param
 
         there = self.client.get_run(self.id).data.params
-        params = [Param(k, v) for k, v in flattened(config).items() if k not in there]
+        params = [Param(k, v) for k, v in flatten_config(config).items() if k not in there]
         for first in range(0, len(params), PARAMS_AT_ONCE):
             self.client.log_batch(self.id, params=params[first : first + PARAMS_AT_ONCE])
         self.client.log_text(self.id, yaml.safe_dump(dict(config), sort_keys=False), "config.yaml")
@@ -211,7 +208,7 @@ class Run:
 
     def log_files(self, folder: Path | str) -> None:
         """Everything in a folder, or one file, as artifacts."""
-        with at_hand(folder) as path:
+        with local_copy(folder) as path:
             if path.is_dir():
                 self.client.log_artifacts(self.id, str(path))
             else:
@@ -225,21 +222,21 @@ class Run:
 
 
 def dataset_entity(folder: Path | str, digest: str):
-    """A dataset folder as MLflow knows it: name, digest and place; the data stay where they are."""
+    """A dataset folder as MLflow has it: name, digest and place; the data stay where they are."""
     from mlflow.entities import Dataset
 
     url = str(folder) if is_url(folder) else Path(folder).expanduser().resolve().as_uri()
     kind = url.partition(":")[0] if is_url(folder) else "local"
-    return Dataset(name_of(folder), digest[:36], kind, json.dumps({"uri": url}))
+    return Dataset(folder_name(folder), digest[:36], kind, json.dumps({"uri": url}))
 
 
-def flattened(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+def flatten_config(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     """``{"optimizer.lr": "0.001", …}``: names joined by dots, values as JSON, cut at MLflow's limits."""
     params: dict[str, str] = {}
     for key, value in config.items():
         name = f"{prefix}{key}"
         if isinstance(value, Mapping) and value:
-            params |= flattened(value, f"{name}.")
+            params |= flatten_config(value, f"{name}.")
         else:
             text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
             params[name[:KEY_LENGTH]] = text[:VALUE_LENGTH]
@@ -255,43 +252,40 @@ def start_run(
     parent_run_id: str | None = None,
     run_id: str | None = None,
     system_metrics: bool = False,
-) -> Iterator[Run]:
-    """Open a run, or go on with ``run_id`` if this store has it; its status at the end tells how it ended.
+) -> Iterator[TrackedRun]:
+    """Open a run, or go on with ``run_id`` if this store has it; its status at the end is how it ended.
 
-    ``parent_run_id`` makes it a child. Status: FINISHED, FAILED after an exception, KILLED after Ctrl-C.
-    Raises InputError where the server does not answer or the experiment was deleted.
+    ``parent_run_id`` makes it a child. Status: FINISHED, FAILED after an exception, KILLED after Ctrl-C or SIGTERM.
+    Runs of this experiment whose process was killed on this machine are closed as KILLED first. Raises InputError
+    where the server does not answer or the experiment was deleted.
     """
     mlflow = mlflow_module()
-    found_again(uri)
-    mlflow.set_tracking_uri(uri)
-    if system_metrics and find_spec("psutil") is None:
-        raise InputError("tracking.system_metrics=true needs psutil; pip install psutil")
-    mlflow.set_system_metrics_sampling_interval(SAMPLE_EVERY_S)
-    mlflow.set_system_metrics_samples_before_logging(SAMPLES_PER_POINT)
-    check_store(uri)
-    with reachable(uri):
-        client = client_of(uri)
-        resumed = run_id is not None and run_exists(client, run_id)
-        if resumed:
-            active = mlflow.start_run(run_id, log_system_metrics=system_metrics)
-            if parent_run_id:
-                client.set_tag(active.info.run_id, PARENT_TAG, parent_run_id)  # a point of a grid search started again
-        else:
-            active = mlflow.start_run(
-                experiment_id=experiment_id(client, experiment),
-                run_name=name,
-                tags={PARENT_TAG: parent_run_id} if parent_run_id else None,
-                log_system_metrics=system_metrics,
-            )
-    try:
-        yield Run(active.info.run_id, uri, resumed, client)
-    except KeyboardInterrupt:
-        mlflow.end_run("KILLED")
-        raise
-    except BaseException:
-        mlflow.end_run("FAILED")
-        raise
-    mlflow.end_run("FINISHED")
+    with use_store(uri):
+        if system_metrics and find_spec("psutil") is None:
+            raise InputError("tracking.system_metrics=true needs psutil; pip install psutil")
+        mlflow.set_system_metrics_sampling_interval(SAMPLE_EVERY_S)
+        mlflow.set_system_metrics_samples_before_logging(SAMPLES_PER_POINT)
+        check_store(uri)
+        tags = {PROCESS_TAG: process_label()} | ({PARENT_TAG: parent_run_id} if parent_run_id else {})
+        try:
+            with reachable(uri), delay_signals():
+                client = client_of(uri)
+                group = experiment_id(client, experiment)
+                close_killed_runs(client, group)
+                resumed = run_id is not None and run_exists(client, run_id)
+                if resumed:
+                    active = mlflow.start_run(run_id, log_system_metrics=system_metrics)
+                    for key, value in tags.items():  # a point of a grid search started again has another parent
+                        client.set_tag(active.info.run_id, key, value)
+                else:
+                    active = mlflow.start_run(
+                        experiment_id=group, run_name=name, tags=tags, log_system_metrics=system_metrics
+                    )
+            yield TrackedRun(active.info.run_id, uri, resumed, client)
+        except BaseException as error:
+            end_run("KILLED" if isinstance(error, KeyboardInterrupt) else "FAILED", error)
+            raise
+        end_run("FINISHED")
 
 
 def run_exists(client: MlflowClient, run_id: str) -> bool:
@@ -306,18 +300,24 @@ def run_exists(client: MlflowClient, run_id: str) -> bool:
         return False
 
 
-def lightning_logger(run: Run) -> MLFlowLogger:
+def lightning_logger(run: TrackedRun, monitor: str | None = None) -> MLFlowLogger:
     """Lightning's logger on this run. Parameters and the final status stay the run's own business.
 
     Steps are epochs, so that curves of runs with other batch sizes lie over each other. Of what comes together the
-    loss is first: the page that compares runs starts with the metric that a run met first.
+    metric that chooses the weights, ``monitor``, is first, then what chooses them by default: the page that compares
+    runs starts with the metric that a run logged first, which should be the one by which a grid's best is chosen.
     """
     from lightning.pytorch.loggers import MLFlowLogger
+
+    first = [name for name in (monitor, *MONITORS) if name]
+
+    def rank(name: str) -> tuple[int, bool, str]:
+        return first.index(name) if name in first else len(first), not name.endswith("/loss"), name
 
     class MetricsOnly(MLFlowLogger):
         def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
             """With the epoch as step."""
-            rest = {k: metrics[k] for k in sorted(metrics, key=lambda k: (not k.endswith("/loss"), k)) if k != "epoch"}
+            rest = {k: metrics[k] for k in sorted(metrics, key=rank) if k != "epoch"}
             super().log_metrics(rest, int(metrics.get("epoch", step or 0)))
 
         def log_hyperparams(self, params: Any) -> None:

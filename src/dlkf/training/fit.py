@@ -14,14 +14,14 @@ from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.strategies import DDPStrategy
 
+from dlkf.base.errors import InputError
 from dlkf.data.datamodule import DriveDataModule
-from dlkf.errors import InputError
 from dlkf.filters.learned import LearnedFilter
 from dlkf.filters.shipped import trained_filter
 from dlkf.training.callbacks.checkpoints import BEST, LAST, BestWeights, ResumePoint
 from dlkf.training.callbacks.progress import TrainingProgress
 from dlkf.training.module import FilterTraining
-from dlkf.training.processes import is_further, join, joined_by
+from dlkf.training.processes import is_worker, join, with_workers
 from dlkf.training.settings import FitSettings
 from dlkf.training.warm_start import warm_start
 
@@ -40,18 +40,18 @@ def fit(
 
     With ``trainer.devices`` above 1 the command ``further`` is run for every further process; it calls this too.
 
-    ``mean_imu_error`` (6) of the training pieces is where a model with ``known_from=training`` starts; ``notes`` are
+    ``mean_imu_error`` (6) of the training segments is where a model with ``known_from=training`` starts; ``notes`` are
     stored beside the weights. Raises InputError where no epoch had a finite ``monitor``.
     """
     plan = settings.trainer
-    module = FilterTraining(settings.model, settings.loss, settings.descent, settings.seed, compiled=plan.compile)
+    module = FilterTraining(settings.model, settings.loss, settings.descent, settings.seed)
     last = folder / LAST
     if settings.finetune:
         module.filter = trained_filter(settings.finetune).train()
     elif isinstance(module.filter, LearnedFilter) and not last.is_file():
         warm_start(module.filter, data, mean_imu_error)
     _hush()
-    with warnings.catch_warnings(), joined_by(further, plan.devices):
+    with warnings.catch_warnings(), with_workers(further, plan.devices):
         warnings.filterwarnings("ignore", module="lightning")
         trainer = L.Trainer(
             max_epochs=plan.max_epochs,
@@ -81,7 +81,7 @@ def fit(
             raise (end.__context__ if isinstance(end.__context__, KeyboardInterrupt) else end) from None
     if trainer.interrupted:
         raise KeyboardInterrupt
-    if is_further():
+    if is_worker():
         return folder / BEST
     loss = trainer.callback_metrics.get("train/loss")
     if not (folder / BEST).is_dir() and loss is not None and not bool(loss.isfinite()):

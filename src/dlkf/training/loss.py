@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
 
-from dlkf.classes import TARGET, made
+from dlkf.base.classes import TARGET, instantiate
+from dlkf.base.settings import settings_from
 from dlkf.data.drive import Batch
 from dlkf.filters.integration import Solution
 from dlkf.navigation.state import NavState
-from dlkf.settings import settings_from
-from dlkf.training.outage_loss import likelihood_term, outage_term, speed_term
+from dlkf.training.outage_loss import likelihood_term, outage_term
 from dlkf.training.processes import count_per_process
 
 TERMS = ("position", "velocity", "attitude")
@@ -26,9 +26,9 @@ TERMS = ("position", "velocity", "attitude")
 class LossConfig:
     """``scale`` [m, m/s, rad]: the error where smooth-L1 turns from square to linear; ``prior`` and
     ``posterior``: how much the states before and after the update count (paper.md 2.8, 4.12); ``position``,
-    ``velocity``, ``attitude``: fixed factors of the three losses, 0 leaves one out (R124). A piece whose position
-    error passes ``diverged_m`` is left out of the batch's loss (paper.md 4.13). ``outage``, ``likelihood``, ``speed``:
-    factors of the terms of :mod:`dlkf.training.outage_loss`."""
+    ``velocity``, ``attitude``: fixed factors of the three losses, 0 leaves one out (R124). A segment whose position
+    error passes ``diverged_m`` is left out of the batch's loss (paper.md 4.13). ``outage``, ``likelihood``: factors
+    of the terms of :mod:`dlkf.training.outage_loss`."""
 
     position_scale: float = 1.0
     velocity_scale: float = 0.1
@@ -41,14 +41,13 @@ class LossConfig:
     diverged_m: float = 1e4
     outage: float = 0.0
     likelihood: float = 0.0
-    speed: float = 0.0
 
     def __call__(self, solution: Solution, batch: Batch) -> Mapping[str, Tensor]:
         """:func:`pva_losses` with these settings."""
         return pva_losses(solution, batch, self)
 
 
-PAPERS = {f.name for f in fields(LossConfig)}  # settings that lie beside _target_ where a preset is the base
+PAPER_FIELDS = {f.name for f in fields(LossConfig)}  # settings that lie beside _target_ where a preset is the base
 Loss = Callable[[Solution, Batch], Mapping[str, Tensor]]
 
 
@@ -56,10 +55,10 @@ def pva_losses(solution: Solution, batch: Batch, config: LossConfig) -> dict[str
     """Mean smooth-L1 of the scaled errors of position, velocity and attitude, unweighted between the three.
 
     Attitude error is log(C_ref Ĉᵀ), never a difference of angles. Epochs without truth do not count; a batch
-    without any attitude truth has an attitude loss of 0. Pieces that diverged do not count either.
+    without any attitude truth has an attitude loss of 0. Segments that diverged do not count either.
     """
     losses = {}
-    for term, of_term in (("outage", outage_term), ("likelihood", likelihood_term), ("speed", speed_term)):
+    for term, of_term in (("outage", outage_term), ("likelihood", likelihood_term)):
         if factor := getattr(config, term):
             losses[term] = factor * of_term(solution, batch)
     total = config.prior + config.posterior
@@ -97,10 +96,15 @@ def loss_of(values: Mapping[str, Any]) -> Loss:
     found or takes other settings.
     """
     if TARGET in values:
-        return made(values, "loss", spare=PAPERS)
+        return instantiate(values, "loss", ("__call__",), spare=PAPER_FIELDS)
     return settings_from(LossConfig, values, "loss")
 
 
-def weighted(losses: Mapping[str, Tensor], weights: dict[str, float]) -> Tensor:
+def unit_weights() -> dict[str, float]:
+    """Weights of 1."""
+    return dict.fromkeys(TERMS, 1.0)
+
+
+def weighted_loss(losses: Mapping[str, Tensor], weights: dict[str, float]) -> Tensor:
     """w_p L_p + w_v L_v + w_h L_h (paper eq 9), and the terms that have their own factors."""
     return reduce(torch.add, (weights.get(term, 1.0) * loss for term, loss in losses.items()))

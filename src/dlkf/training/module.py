@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import lightning as L
 import numpy as np
 import torch
 from torch import Tensor
 
+from dlkf.data.draws import step_seed
 from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import end_errors, mean_error
-from dlkf.filters.integration import Solution, advance, integrate
+from dlkf.filters.integration import Solution, integrate
 from dlkf.filters.saved import LearnedSettings, learned_filter
 from dlkf.networks.heads import IMU_ERROR_SIZE, INNOVATION_SIZE, STATE_SIZE
-from dlkf.training.callbacks.masking import BatchCallback
-from dlkf.training.compilation import Turn, compiled_turn
-from dlkf.training.loss import TERMS, Loss, weighted
-from dlkf.training.optimization import Descent
+from dlkf.training.loss import Loss, unit_weights, weighted_loss
+from dlkf.training.optimization import OptimizationPlan
 from dlkf.training.processes import of_all
 
 STATE, INNOVATION = torch.tensor(STATE_SIZE), torch.tensor(INNOVATION_SIZE)
@@ -27,18 +26,17 @@ STATE, INNOVATION = torch.tensor(STATE_SIZE), torch.tensor(INNOVATION_SIZE)
 class FilterTraining(L.LightningModule):
     """Trains a learned filter (``model.kind``) end to end on reference position, velocity and attitude (R060–R062).
 
-    ``loss_weights`` is set by the adaptive-weights callback. Randomness of a step depends on (seed, step) alone, so
-    that a resumed run repeats an uninterrupted one.
+    A callback hands its rule over in ``setup``: changes of the batch to ``transforms``, weights of the losses to
+    ``loss_weights``, lengths of the segments to the data module's ``length_law``. Randomness of a step depends on
+    (seed, step) alone, so that a resumed run repeats an uninterrupted one.
     """
 
     def __init__(
         self,
         model: LearnedSettings,
         loss: Loss,
-        descent: Descent,
+        descent: OptimizationPlan,
         seed: int = 0,
-        *,
-        compiled: bool = False,
     ) -> None:
         super().__init__()
         torch.manual_seed(seed)
@@ -46,9 +44,9 @@ class FilterTraining(L.LightningModule):
         self.loss = loss
         self.descent = descent
         self.covariances = getattr(loss, "likelihood", 0.0) > 0
-        self.loss_weights: dict[str, float] = dict.fromkeys(TERMS, 1.0)
+        self.loss_weights: Callable[[], dict[str, float]] = unit_weights
+        self.transforms: list[Callable[[Batch, int, torch.Generator], Batch]] = []
         self.seed = seed
-        self.turn: Turn | None = None if compiled else advance  # None: to be compiled with the first batch
 
     def configure_optimizers(self):
         """Those of the settings, a step of the schedule an epoch."""
@@ -58,26 +56,21 @@ class FilterTraining(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "epoch"}}
 
     def training_step(self, batch: Batch, step: int) -> Tensor:
-        """Masked filter run and weighted loss of one batch, or of this process's pieces of it."""
+        """Masked filter run and weighted loss of one batch, or of this process's segments of it."""
         rank, processes = self.trainer.global_rank, self.trainer.world_size
-        generator = torch.Generator().manual_seed(hash((self.seed, self.current_epoch, step)) % 2**63)
-        for callback in self.trainer.callbacks:  # pyright: ignore[reportAttributeAccessIssue]  set by Trainer()
-            if isinstance(callback, BatchCallback):
-                batch = callback.transform(batch, self.current_epoch, generator)
-        pieces = batch.size[0]
+        generator = torch.Generator().manual_seed(step_seed(self.seed, self.current_epoch, step))
+        for transform in self.transforms:
+            batch = transform(batch, self.current_epoch, generator)
+        segments = batch.size[0]
         if processes > 1:
-            batch = batch.select(torch.arange(rank, pieces, processes))
+            batch = batch.select(torch.arange(rank, segments, processes))
         batch = batch.to(self.device)
-        if self.turn is None:
-            self.turn = compiled_turn(
-                lambda turn: weighted(self._losses(batch, turn), self.loss_weights), self.filter.parameters()
-            )
-        torch.manual_seed(hash((self.seed, self.global_step, *([rank] if rank else ()))) % 2**63)  # dropout
-        losses = self._losses(batch, self.turn)
-        total = weighted(losses, self.loss_weights)
+        torch.manual_seed(step_seed(self.seed, self.global_step, *([rank] if rank else ())))  # dropout
+        losses = self._losses(batch)
+        total = weighted_loss(losses, self.loss_weights())
         values = {f"train/{k}_loss": v.detach() for k, v in losses.items()}
         values["train/loss"] = total.detach()
-        self.log_dict(values, on_step=False, on_epoch=True, batch_size=pieces, sync_dist=processes > 1)
+        self.log_dict(values, on_step=False, on_epoch=True, batch_size=segments, sync_dist=processes > 1)
         return total
 
     def on_train_epoch_start(self) -> None:
@@ -93,11 +86,11 @@ class FilterTraining(L.LightningModule):
         """As it is: a step moves it, after what is drawn on the CPU."""
         return batch
 
-    def _run(self, batch: Batch, turn: Turn = advance) -> Solution:
-        return integrate(batch, self.filter, keep_covariances=self.covariances, turn=turn)
+    def _run(self, batch: Batch) -> Solution:
+        return integrate(batch, self.filter, keep_covariances=self.covariances)
 
-    def _losses(self, batch: Batch, turn: Turn) -> Mapping[str, Tensor]:
-        return self.loss(self._run(batch, turn), batch)
+    def _losses(self, batch: Batch) -> Mapping[str, Tensor]:
+        return self.loss(self._run(batch), batch)
 
     def validation_step(self, batch: Batch, step: int) -> None:
         """Errors at the ends of fixed outages, as they will be scored on test drives, and what the filter answers."""
@@ -110,19 +103,19 @@ class FilterTraining(L.LightningModule):
             last = solution.used.long().cumsum(1).argmax(1)
             self._gains.append(solution.gain[torch.arange(len(last), device=last.device), last][used].double().cpu())
         losses = self.loss(solution, batch)
-        plain = weighted(losses, dict.fromkeys(TERMS, 1.0))
+        plain = weighted_loss(losses, unit_weights())
         shared = self.trainer.world_size > 1
         self.log("val/loss", plain, on_epoch=True, batch_size=batch.size[0], sync_dist=shared)
 
     def on_validation_epoch_start(self) -> None:
-        """Collect over the validation pieces."""
+        """Collect over the validation segments."""
         self._ends, self._gains, self._errors = [], [], []
 
     def on_validation_epoch_end(self) -> None:
-        """Outage errors over all validation pieces, and the spread over pieces of the last gain and IMU error.
+        """Outage errors over all validation segments, and the spread over segments of the last gain and IMU error.
 
-        ``val/gain_std`` and ``val/imu_error_std`` are relative to the heads' physical sizes: near zero they say that
-        the network is a constant, whatever the errors are.
+        ``val/gain_std`` and ``val/imu_error_std`` are relative to the heads' physical sizes: near zero they show that
+        the network is a constant, for any errors.
         """
         ends, gains, errors = np.concatenate(of_all(self._ends)), of_all(self._gains), of_all(self._errors)
         if len(ends):

@@ -11,10 +11,11 @@ from torch import nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import CosineAnnealingWarmRestarts
 
-from dlkf.classes import TARGET, class_named, made
-from dlkf.settings import Ranged, settings_from, within
+from dlkf.base.classes import TARGET, find_class, instantiate
+from dlkf.base.settings import Ranged, bounded_field, settings_from
 
 MANY = 10**9
+OPTIMIZER, SCHEDULER = ("step", "zero_grad", "state_dict"), ("step", "state_dict")  # their methods
 
 
 @dataclass(frozen=True)
@@ -30,13 +31,13 @@ class OptimizerSettings(Ranged, where="optimizer", least=0, greatest=1e3):
 class SchedulerSettings(Ranged, where="scheduler"):
     """Cosine annealing with warm restarts (R073), in epochs."""
 
-    restart_epochs: int = within(100, 1, MANY)
-    restart_factor: int = within(1, 1, 1000)
-    lr_min: float = within(1e-5, 0, 1e3)
+    restart_epochs: int = bounded_field(100, 1, MANY)
+    restart_factor: int = bounded_field(1, 1, 1000)
+    lr_min: float = bounded_field(1e-5, 0, 1e3)
 
 
 @dataclass(frozen=True)
-class Descent:
+class OptimizationPlan:
     """Both, as plain values were read; ``own_*`` are the settings beside a ``_target_``, None where there is none."""
 
     optimizer: OptimizerSettings
@@ -45,10 +46,10 @@ class Descent:
     own_scheduler: Mapping[str, Any] | None = None
 
     @classmethod
-    def of(cls, optimizer: Mapping[str, Any], scheduler: Mapping[str, Any]) -> Descent:
+    def of(cls, optimizer: Mapping[str, Any], scheduler: Mapping[str, Any]) -> OptimizationPlan:
         """From plain values. InputError for an unknown key, or a class that is not there."""
-        ours, own_optimizer = _parted(OptimizerSettings, optimizer, "optimizer")
-        law, own_scheduler = _parted(SchedulerSettings, scheduler, "scheduler")
+        ours, own_optimizer = _parted(OptimizerSettings, optimizer, "optimizer", OPTIMIZER)
+        law, own_scheduler = _parted(SchedulerSettings, scheduler, "scheduler", SCHEDULER)
         return cls(ours, law, own_optimizer, own_scheduler)
 
     def build(self, body: Sequence[nn.Parameter], heads: Sequence[nn.Parameter]) -> tuple[Optimizer, Any]:
@@ -62,22 +63,28 @@ class Descent:
         if self.own_optimizer is None:
             optimizer: Optimizer = torch.optim.AdamW(groups, weight_decay=o.weight_decay)
         else:
-            optimizer = made(self.own_optimizer, "optimizer", offered={"params": groups}, spare=_names(o))
+            optimizer = instantiate(
+                self.own_optimizer, "optimizer", OPTIMIZER, offered={"params": groups}, spare=_names(o)
+            )
         if self.own_scheduler is None:
             return optimizer, CosineAnnealingWarmRestarts(
                 optimizer, T_0=s.restart_epochs, T_mult=s.restart_factor, eta_min=s.lr_min
             )
-        return optimizer, made(self.own_scheduler, "scheduler", offered={"optimizer": optimizer}, spare=_names(s))
+        return optimizer, instantiate(
+            self.own_scheduler, "scheduler", SCHEDULER, offered={"optimizer": optimizer}, spare=_names(s)
+        )
 
 
 def _names(settings: Any) -> set[str]:
     return {f.name for f in fields(settings)}
 
 
-def _parted(kind: type[Any], values: Mapping[str, Any], where: str) -> tuple[Any, Mapping[str, Any] | None]:
+def _parted(
+    kind: type[Any], values: Mapping[str, Any], where: str, needs: Sequence[str]
+) -> tuple[Any, Mapping[str, Any] | None]:
     """Our settings, and all of them where a class of one's own is named."""
     if not values.get(TARGET):
         return settings_from(kind, values, where), None
-    class_named(str(values[TARGET]), f"{where}.{TARGET}")
+    find_class(str(values[TARGET]), f"{where}.{TARGET}", needs)
     known = {k: v for k, v in values.items() if k in _names(kind)}
     return settings_from(kind, known, where), values

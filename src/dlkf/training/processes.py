@@ -1,6 +1,6 @@
 """One training on several processes of this machine, each with its part of every batch (Lightning's DDP).
 
-Every process makes the whole batch with its outages, keeps every n-th piece, and the gradients are averaged. So that
+Every process makes the whole batch with its outages, keeps every n-th segment, and the gradients are averaged. So that
 the average of the processes' losses is the loss of the whole batch, a mean divides by :func:`count_per_process`.
 """
 
@@ -20,13 +20,13 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 
 RANK = "LOCAL_RANK"  # torch's and Lightning's word for a process's number
-READY = "DLKF_READY"  # folder where a further process says that it is about to join
+READY = "DLKF_READY"  # folder where a further process records that it is about to join
 
 
-def is_further() -> bool:
+def is_worker() -> bool:
     """Whether this process was started to train along."""
     return int(os.environ.get(RANK, "0")) > 0
 
@@ -55,12 +55,12 @@ def of_all(items: list) -> list:
 
 
 @contextmanager
-def joined_by(command: Sequence[str] | None, count: int) -> Iterator[None]:
+def with_workers(command: Sequence[str] | None, count: int) -> Iterator[None]:
     """``count`` − 1 further processes of ``command`` while the block runs; in a further process itself only the block.
 
     InputError where one ends before its time: its own message stands on stderr.
     """
-    if count == 1 or is_further():
+    if count == 1 or is_worker():
         yield
         return
     if command is None:
@@ -96,7 +96,7 @@ def joined_by(command: Sequence[str] | None, count: int) -> Iterator[None]:
 
 
 def join() -> None:
-    """Tell the first process that this further one has its data and is about to train."""
+    """Signal to the first process that this further one has its data and is about to train."""
     if folder := os.environ.get(READY):
         (Path(folder) / os.environ[RANK]).touch()
 

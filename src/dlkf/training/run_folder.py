@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from dlkf.base.errors import InputError
+from dlkf.base.files import replace_file
 from dlkf.data.store import dataset_digest
-from dlkf.errors import InputError
-from dlkf.files import whole_file
 
 STATE = "state.json"
 
@@ -50,5 +50,5 @@ def checked_digests(datasets: Sequence[str], state: Mapping[str, Any]) -> dict[s
 
 def write_state(folder: Path, **values: Any) -> None:
     """Merge values into the state file, whole or not at all."""
-    with whole_file(folder / STATE) as beside:
+    with replace_file(folder / STATE) as beside:
         beside.write_text(json.dumps(read_state(folder) | values, indent=1))

@@ -1,40 +1,42 @@
-"""What a training is told, typed: ``conf/train.yaml`` as dataclasses, and the study that they describe."""
+"""Settings of a training, typed: ``conf/train.yaml`` as dataclasses, and the study that they describe."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from lightning.pytorch.callbacks import Callback
 
-from dlkf.classes import made
+from dlkf.base.classes import instantiate
+from dlkf.base.errors import InputError
+from dlkf.base.settings import Ranged, bounded_field
 from dlkf.data.masks import BiasLaw
-from dlkf.errors import InputError
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import is_filter
 from dlkf.filters.saved import LearnedSettings, learned_settings
 from dlkf.filters.shipped import shipped_folder
+from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.settings import Ranged, within
 from dlkf.training.loss import Loss, loss_of
-from dlkf.training.optimization import MANY, Descent
+from dlkf.training.optimization import MANY, OptimizationPlan
+
+CALLBACK = ("setup", "on_train_epoch_start", "state_dict")  # of Lightning's methods those that every callback has
 
 
 @dataclass(frozen=True)
 class TrainerSettings(Ranged, where="trainer"):
-    """Epochs, validation and checkpoints, as the comments of ``conf/train.yaml`` say."""
+    """Epochs, validation and checkpoints, explained in the comments of ``conf/train.yaml``."""
 
-    max_epochs: int = within(500, 1, MANY)
+    max_epochs: int = bounded_field(500, 1, MANY)
     gradient_clip: float | None = 1.0
-    validate_every: int = within(5, 1, MANY)
-    checkpoint_every: int = within(1, 1, MANY)
+    validate_every: int = bounded_field(5, 1, MANY)
+    checkpoint_every: int = bounded_field(1, 1, MANY)
     monitor: str | None = None
-    best_from_epoch: int = within(0, 0, MANY)
-    threads: int | None = within(1, 1, MANY)
+    best_from_epoch: int = bounded_field(0, 0, MANY)
+    threads: int | None = bounded_field(1, 1, MANY)
     accelerator: str = "auto"
-    compile: bool = False
-    devices: int = within(1, 1, MANY)
+    devices: int = bounded_field(1, 1, MANY)
     strategy: Literal["auto", "ddp"] = "auto"  # the same: several processes average their gradients, one has its own
 
 
@@ -50,12 +52,13 @@ class TrackingSettings:
 
 @dataclass(frozen=True)
 class BaselineSettings:
-    """Which filters are scored beside, and on how many training pieces they are tuned."""
+    """Which filters are scored beside, on how many training segments they are tuned, and from which factors on."""
 
     models: Sequence[str]
     tune: bool
-    pieces: int | None
+    segments: int | None
     rounds: int
+    tuning: Tuning = field(default_factory=Tuning)
 
     def __post_init__(self) -> None:
         for name in self.models:
@@ -86,7 +89,7 @@ class FitSettings:
 
     model: LearnedSettings
     loss: Loss
-    descent: Descent
+    descent: OptimizationPlan
     trainer: TrainerSettings
     callbacks: Sequence[Callback]
     seed: int = 0
@@ -130,9 +133,11 @@ class TrainSettings:
         return FitSettings(
             model=learned_settings(self.model),
             loss=loss_of(self.loss),
-            descent=Descent.of(self.optimizer, self.scheduler),
+            descent=OptimizationPlan.of(self.optimizer, self.scheduler),
             trainer=self.trainer,
-            callbacks=[made(c, f"callbacks.{name}") for name, c in self.callbacks.items() if c is not None],
+            callbacks=[
+                instantiate(c, f"callbacks.{name}", CALLBACK) for name, c in self.callbacks.items() if c is not None
+            ],
             seed=self.seed,
             finetune=self.finetune,
         )

@@ -13,22 +13,22 @@ import torch
 from lightning.pytorch.loggers import Logger
 
 import dlkf
+from dlkf.base.provenance import describe_provenance
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.kinds import drive_imus, drive_kinds
 from dlkf.data.store import dataset_digest, load_dataset
-from dlkf.evaluation.endurance import After, after_gnss, after_tables, hour_table, without_outage
+from dlkf.evaluation.endurance import OutageErrors, after_tables, hour_table, score_after_gnss, score_without_outage
 from dlkf.evaluation.gains import gains_of, write_gains
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Scenes
 from dlkf.evaluation.results import BASELINE, Results
 from dlkf.evaluation.scores import Scores
-from dlkf.evaluation.study import study
-from dlkf.evaluation.table import Table
+from dlkf.evaluation.study import run_comparison
+from dlkf.evaluation.table import ResultTable
 from dlkf.filters.build import refuse_smoothed
 from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import load_filter
 from dlkf.filters.shipped import shipped_folder, trained_filter
-from dlkf.provenance import provenance
 from dlkf.report.evaluation import write_report
 from dlkf.training.callbacks.curriculum import LengthCurriculum
 from dlkf.training.fit import fit
@@ -39,17 +39,19 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What a study leaves: scores, results per kind of data, the baselines, the best weights, times, further tables."""
+class TrainingOutcome:
+    """What a study leaves: the filter's name, scores, results per kind of data, the baselines, the best weights, times,
+    further tables."""
 
+    name: str  # of the trained filter in the tables
     scores: Scores
     results: list[Results]
     baselines: Baselines
-    after: list[After]
+    after: list[OutageErrors]
     hour: dict[str, dict[str, float]]
     weights: Path
     seconds: dict[str, float]
-    tables: list[Table]
+    tables: list[ResultTable]
 
 
 def run_study(
@@ -59,7 +61,7 @@ def run_study(
     logger: Logger | bool,
     say: Say,
     further: Sequence[str] | None,
-) -> Outcome:
+) -> TrainingOutcome:
     """Tune, train, score and write the report into ``folder/report``; ``further`` as in :func:`fit`."""
     scoring, seconds = settings.scoring, {}
     learned, names, plan = settings.fit.model.kind, settings.baselines.models, scoring.outage
@@ -79,7 +81,7 @@ def run_study(
         for dataset in data.datasets:
             kinds |= drive_kinds(dataset)
         baseline = BASELINE if BASELINE in filters else None
-        scores, made = study(
+        scores, made = run_comparison(
             filters,
             scenes,
             kinds=kinds,
@@ -98,12 +100,12 @@ def run_study(
         scores,
         made,
         protocol={
-            **provenance(),
+            **describe_provenance(),
             **baselines.described(),
             **scenes.described(),
             "trained on": card,
             "gnss_noise": noise,
-            "left out": left_out(settings, data),
+            "left out": left_out_drives(settings, data),
         },
         by_time=True,
         baseline=baseline,
@@ -111,18 +113,18 @@ def run_study(
     )
     if gains:
         write_gains(folder / "report", gains, title)
-    return Outcome(scores, made, baselines, after, hour, weights, seconds, tables)
+    return TrainingOutcome(learned, scores, made, baselines, after, hour, weights, seconds, tables)
 
 
-def train_along(settings: StudySettings, data: DriveDataModule, folder: Path) -> None:
+def train_with_baselines(settings: StudySettings, data: DriveDataModule, folder: Path) -> None:
     """The part of a further process of the same training: it writes, logs and scores nothing."""
     data.setup()
     set_threads(settings.fit)
     fit(settings.fit, data, folder, False)
 
 
-def left_out(settings: StudySettings, data: DriveDataModule) -> list[str]:
-    """A line for every side on drives that are too short for its pieces, at the full length of a curriculum."""
+def left_out_drives(settings: StudySettings, data: DriveDataModule) -> list[str]:
+    """A line for every side on drives that are too short for its segments, at the full length of a curriculum."""
     grown = [c.full_s for c in settings.fit.callbacks if isinstance(c, LengthCurriculum)]
     return data.left_out(max(grown, default=data.train_length_s))
 
@@ -139,24 +141,25 @@ def _shipped(names: Sequence[str]) -> dict[str, Estimator]:
 
 
 def _baselines(settings: StudySettings, data: DriveDataModule, say: Say) -> Baselines:
-    """The classical filters, tuned on training pieces with outages: the scored ones, or 20 s where none are scored."""
+    """The classical filters, tuned on training segments with outages: those scored, or 20 s where none are."""
     given, scoring = settings.baselines, settings.scoring
     plan = scoring.outage or OutagePlan(data.eval_length_s / 2, min(20.0, data.eval_length_s / 3), offsets_s=(0.0,))
-    pieces = Scenes.of_split(data, "train", plan, scoring.seed, given.pieces).withheld()
+    segments = Scenes.of_split(data, "train", plan, scoring.seed, given.segments).withheld()
     classical = [name for name in given.models if not shipped_folder(name)]
-    return tuned_baselines(classical, settings.imu, pieces, rounds=given.rounds if given.tune else 0, say=say)
+    rounds = given.rounds if given.tune else 0
+    return tuned_baselines(classical, settings.imu, segments, rounds=rounds, say=say, start=given.tuning)
 
 
 def _endurance(
     filters: Mapping[str, Estimator], data: DriveDataModule, scoring: ScoringSettings, title: str, say: Say
-) -> tuple[list[After], dict[str, dict[str, float]], list[Table]]:
+) -> tuple[list[OutageErrors], dict[str, dict[str, float]], list[ResultTable]]:
     """Errors after longer GNSS, and over an hour without outage, where asked for."""
     known = {n: f for n, f in filters.items() if n != "ins"}
-    after: list[After] = []
+    after: list[OutageErrors] = []
     hour: dict[str, dict[str, float]] = {}
-    tables: list[Table] = []
+    tables: list[ResultTable] = []
     if scoring.after_s:
-        after = after_gnss(known, data, scoring.after_s, baseline=BASELINE, seed=scoring.seed)
+        after = score_after_gnss(known, data, scoring.after_s, baseline=BASELINE, seed=scoring.seed)
         if after:
             tables += after_tables(title, after, BASELINE)
         if left := sorted(set(map(float, scoring.after_s)) - {a.seconds for a in after}):
@@ -165,7 +168,7 @@ def _endurance(
         drives = load_dataset(
             scoring.hour, rate_hz=data.rate_hz, epoch_s=data.epoch_s, dtype=torch.float64, progress=None
         )
-        hour = without_outage(known, drives, data.start, seed=scoring.seed)
+        hour = score_without_outage(known, drives, data.start, seed=scoring.seed)
         tables.append(hour_table(Path(scoring.hour).name, hour))
     return after, hour, tables
 
@@ -173,18 +176,18 @@ def _endurance(
 def model_card(settings: StudySettings, data: DriveDataModule, run: str | None) -> dict[str, Any]:
     """What a model was made of: recordings it was trained and chosen on, the data's digests, IMU, run, seeds, version.
 
-    ``imus`` are those that it knows, of a filter that learns them by heart (paper.md 4.8), which ``plus`` does not.
+    ``imus`` are those that it was trained on, of a filter that overfits to them (paper.md 4.8; not ``plus``).
     """
     drives, called = data.drives("train"), {}
     for dataset in data.datasets:
         called |= drive_imus(dataset)
-    by_heart = settings.fit.model.kind == "dlkf" and not settings.fit.finetune
+    overfitted = settings.fit.model.kind == "dlkf" and not settings.fit.finetune
     return {
         "trained_on": sorted({d.group for d in drives}),
         "chosen_on": sorted({d.group for d in data.drives("val")}),
         "datasets": {Path(d).name: dataset_digest(d) for d in data.datasets},
         "imu": settings.imu.name,
-        "imus": sorted({called.get(d.name, settings.imu.name) for d in drives}) if by_heart else [],
+        "imus": sorted({called.get(d.name, settings.imu.name) for d in drives}) if overfitted else [],
         "run": run,
         "experiment": settings.name,
         "seed": settings.fit.seed,

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from dlkf.evaluation.summary import answer, metrics_of
+from dlkf.evaluation.summary import headline, metrics_of
 from dlkf.evaluation.table import all_tables, as_markdown
 from dlkf.training.settings import StudySettings
-from dlkf.training.study import Outcome
+from dlkf.training.study import TrainingOutcome
 
 
-def key_metrics(outcome: Outcome) -> dict[str, float]:
+def key_metrics(outcome: TrainingOutcome) -> dict[str, float]:
     """``test/<filter>/…`` for the MLflow comparison, and times."""
     metrics = {f"time/{k}_s": v for k, v in outcome.seconds.items()} | metrics_of(outcome.results)
     for a in outcome.after:
@@ -25,10 +25,10 @@ def key_metrics(outcome: Outcome) -> dict[str, float]:
     return {k: v for k, v in metrics.items() if math.isfinite(v)}
 
 
-def note(settings: StudySettings, datasets: Sequence[str], outcome: Outcome) -> str:
+def note(settings: StudySettings, datasets: Sequence[str], outcome: TrainingOutcome) -> str:
     """The answer and the tables as a Markdown note of the run."""
     names = ", ".join(datasets)
     tables = "\n".join(as_markdown(t) for t in (*all_tables(names, outcome.results), *outcome.tables))
-    told = "\n\n".join(f"**{answer(result)}**" for result in outcome.results)
+    headlines = "\n\n".join(f"**{headline(result)}**" for result in outcome.results)
     about = f"{settings.name}: {settings.fit.model.kind} on {names}, seed {settings.fit.seed}"
-    return f"{told}\n\n{about}\n\n{tables}"
+    return f"{headlines}\n\n{about}\n\n{tables}"

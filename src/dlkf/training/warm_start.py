@@ -1,7 +1,7 @@
-"""What a learned filter may know before its first step: the training pieces' mean IMU error and feature sizes.
+"""Values that a learned filter may start from: the training segments' mean IMU error and feature sizes.
 
 Neither uses the truth. The mean error is what the tuned 15-state filter estimates with GNSS, as ``mbkf15_prior`` is
-told it; without it the cheapest descent moves the mean of everything inside the network, and what is learned is a
+given to it; without it the cheapest descent moves the mean of everything inside the network, and what is learned is a
 constant (paper.md 4.11).
 """
 
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.filters.learned import LearnedFilter
 
-PIECES = 60
+SEGMENTS = 60
 
 
 def warm_start(model: LearnedFilter, data: DriveDataModule, mean_imu_error: Sequence[float] | None) -> None:
@@ -25,10 +25,10 @@ def warm_start(model: LearnedFilter, data: DriveDataModule, mean_imu_error: Sequ
     if mean_imu_error is not None:
         model.imu_error.start_at(mean_imu_error)
     batches, seen = [], 0
-    for step in range(len(data.train_pieces(0))):
+    for step in range(len(data.train_segments(0))):
         batches.append(data.train_batch(0, step))
         seen += batches[-1].size[0]
-        if seen >= PIECES:
+        if seen >= SEGMENTS:
             break
     was = model.training
     model.eval().learn_sizes(batches)

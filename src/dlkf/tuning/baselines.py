@@ -1,4 +1,4 @@
-"""The classical filters of a study, each tuned itself on training pieces with outages (R018; paper.md 4.6)."""
+"""The classical filters of a study, each tuned itself on training segments with outages (R018; paper.md 4.6)."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from dataclasses import asdict, dataclass
 from itertools import count
 from typing import Any
 
-from dlkf.console import counting
+from dlkf.base.console import show_progress
 from dlkf.data.drive import Batch
 from dlkf.filters.build import build_causal, build_filter, has_prior
 from dlkf.filters.smoother import Filter
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.tuning.search import best_prior, factors_of, outage_error, tuned, without_prior
+from dlkf.tuning.search import best_prior, drop_prior, factors_of, outage_error, tune_filter
 
 FIRST = "mbkf15"  # where the others' search starts, and what the mean IMU error is estimated with
 
 
 @dataclass(frozen=True)
 class Baselines:
-    """Filters by name with the factors each was given, the mean IMU error, and what each with ``_prior`` is told."""
+    """Filters by name with the factors each was given, the mean IMU error, and the prior of each with ``_prior``."""
 
     imu: ImuSpec
     tunings: dict[str, Tuning]
@@ -41,28 +41,34 @@ class Baselines:
 
 
 def tuned_baselines(
-    names: Sequence[str], imu: ImuSpec, batches: Sequence[Batch], *, rounds: int, say: Callable[[str], None]
+    names: Sequence[str],
+    imu: ImuSpec,
+    batches: Sequence[Batch],
+    *,
+    rounds: int,
+    say: Callable[[str], None],
+    start: Tuning | None = None,
 ) -> Baselines:
-    """Tune each of ``names`` on the outages of training pieces; 0 ``rounds`` leave the factors as they come.
+    """Tune each of ``names`` on the outages of training segments; 0 ``rounds`` leave the factors at ``start``.
 
-    All but ``ins`` start at those of ``mbkf15``, one with ``_prior`` at those of the same filter without, and search
-    over their own (:func:`dlkf.tuning.search.factors_of`).
+    The search for ``mbkf15`` begins at ``start``. All others but ``ins`` begin at the factors of ``mbkf15``, one with
+    ``_prior`` at those of the same filter without, and search over their own (:func:`dlkf.tuning.search.factors_of`).
     """
-    first, _ = _searched(imu, batches, FIRST, rounds)
+    first, _ = _searched(imu, batches, FIRST, rounds, start)
     prior = best_prior(imu, first, batches)
     priors: dict[str, Prior] = {}
     tunings: dict[str, Tuning] = {}
     for name in names:
-        start = Tuning() if name == "ins" else tunings.get(without_prior(name), first)
+        begun = Tuning() if name == "ins" else tunings.get(drop_prior(name), first)
         if has_prior(name):
-            priors[name] = prior if name == f"{FIRST}_prior" else best_prior(imu, start, batches, name)
+            priors[name] = prior if name == f"{FIRST}_prior" else best_prior(imu, begun, batches, name)
         if name in ("ins", FIRST):
-            tunings[name] = start
-            error = outage_error(build_causal(name, imu, "tuning does not", tuning=start), batches)
+            tunings[name] = begun
+            error = outage_error(build_causal(name, imu, "tuning does not", tuning=begun), batches)
         else:
-            tunings[name], error = _searched(imu, batches, name, rounds, start, priors.get(name))
+            tunings[name], error = _searched(imu, batches, name, rounds, begun, priors.get(name))
         how = "tuned" if rounds and name != "ins" else "untuned"
-        say(f"{name} {how}: {error:.2f} m at the end of the outages of training pieces (geometric mean)")
+        say(f"{name} {how}: {error:.2f} m at the end of the outages of training segments (geometric mean)")
     return Baselines(imu, tunings, prior, priors)
 
 
@@ -76,6 +82,6 @@ def _searched(
 ) -> tuple[Tuning, float]:
     """A search under a bar of its own: it takes minutes on much data."""
     most, done = rounds * sum(map(len, factors_of(name).values())), count(1)
-    with counting(f"Tuning {name}") as bar:
+    with show_progress(f"Tuning {name}") as bar:
         given = {"name": name, "rounds": rounds, "start": start, "prior": prior}
-        return tuned(imu, batches, **given, progress=lambda _: bar(next(done), most))
+        return tune_filter(imu, batches, **given, progress=lambda _: bar(next(done), most))

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from dlkf.data.drive import Batch
-from dlkf.filters.advice import Advice
+from dlkf.filters.advice import NetworkOutput
 from dlkf.filters.integration import Correction, Epoch, integrate
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.tuning import Tuning
@@ -26,7 +26,7 @@ RATE = 0.15  # of Adam, at the start
 NEAR_M = 0.1  # errors below count as this, so that the logarithm has no pole
 
 
-class Advised(nn.Module):
+class ScaledFilter(nn.Module):
     """A Kalman filter whose factors are parameters, as logarithms; 0: as the filter has them."""
 
     def __init__(self, kalman: Mbkf) -> None:
@@ -42,19 +42,19 @@ class Advised(nn.Module):
         """Of the Kalman filter with the factors in force."""
         of = self.logarithms.exp().expand(len(epoch.z), -1)
         fix = of[:, [4, 4, 5, 5]]
-        advice = Advice(of[:, :4, None].expand(-1, 4, 3), fix, of[:, 6:8])
+        advice = NetworkOutput(of[:, :4, None].expand(-1, 4, 3), fix, of[:, 6:8])
         return self.kalman.step(memory, epoch._replace(advice=advice))
 
     def tuning(self) -> Tuning:
-        """What a filter without advice has to be told to be the same."""
+        """Settings with which a filter without advice is the same."""
         values = dict(zip(FACTORS, self.logarithms.detach().exp().tolist(), strict=True))
         start = self.kalman.tuning
         return replace(start, **{k: v * getattr(start, k) for k, v in values.items()})
 
 
-def descended(kalman: Mbkf, batch: Batch, end: int, *, steps: int = 60) -> Tuning:
+def tune_by_gradient(kalman: Mbkf, batch: Batch, end: int, *, steps: int = 60) -> Tuning:
     """Factors with the least geometric mean of the horizontal error at epoch ``end``, on the way down (Adam)."""
-    filter = Advised(kalman)
+    filter = ScaledFilter(kalman)
     optimizer = torch.optim.Adam(filter.parameters(), lr=RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, RATE / 20)
     best, found = float("inf"), filter.tuning()

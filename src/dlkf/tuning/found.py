@@ -8,38 +8,39 @@ from pathlib import Path
 
 import yaml
 
-from dlkf.console import counting
+from dlkf.base.console import show_progress
+from dlkf.base.files import write_into
 from dlkf.data.drive import Drive
-from dlkf.evaluation.table import Table, as_markdown, number
-from dlkf.files import staged
+from dlkf.evaluation.table import ResultTable, as_markdown, format_number
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import NEEDED, ImuSpec
-from dlkf.running.likelihood import AS_TOLD, Evidence, Found, find_noise
+from dlkf.onboard.compiled_filter import compile_or_keep
+from dlkf.running.likelihood import NO_OFFSET, Evidence, NoiseFit, find_noise
 
 
-def found_noise(
+def find_dataset_noise(
     drives: Sequence[Drive], model: str, imu: ImuSpec, tuning: Tuning, *, minutes: float, name: str
-) -> Found:
+) -> NoiseFit:
     """:func:`dlkf.running.likelihood.find_noise` on drives, under a bar."""
     evidence = Evidence.of(drives, minutes)
-    with counting(f"Noise for {model}") as progress:
-        return find_noise(evidence, model, imu, tuning, called=name, progress=progress)
+    with show_progress(f"Noise for {model}") as progress:
+        return find_noise(evidence, model, imu, tuning, called=name, progress=progress, compiler=compile_or_keep)
 
 
-def noise_table(model: str, dataset: str, imu: ImuSpec, tuning: Tuning, found: Found) -> Table:
+def noise_table(model: str, dataset: str, imu: ImuSpec, tuning: Tuning, found: NoiseFit) -> ResultTable:
     """Every value before and after."""
-    before, after = Found(imu, tuning, AS_TOLD, AS_TOLD, 0.0, 0.0).described(), found.described()
-    rows = [[key, number(before[key]), number(after[key])] for key in after]
-    return Table(
+    before, after = NoiseFit(imu, tuning, NO_OFFSET, NO_OFFSET, 0.0, 0.0).described(), found.described()
+    rows = [[key, format_number(before[key]), format_number(after[key])] for key in after]
+    return ResultTable(
         title=f"{model} on {dataset}: noise under which the fixes are most likely",
-        note=f"SI units; mean −ln p of a fix {number(found.before)} before, {number(found.after)} after. No reference "
-        f"was used. {found.told_of_fixes()}".strip(),
+        note=f"SI units; mean −ln p of a fix {format_number(found.before)} before, {format_number(found.after)} after. "
+        f"No reference was used. {found.describe_offset()}".strip(),
         columns=["Value", f"As {imu.name}", "Found"],
         rows=rows,
     )
 
 
-def write_noise(out: str | Path, found: Found, table: Table) -> list[str]:
+def write_noise(out: str | Path, found: NoiseFit, table: ResultTable) -> list[str]:
     """Write imu/<name>.yaml, tuning/<name>.yaml and table.md into ``out``, all or none; their names."""
     name = found.imu.name
     usual = type(found.imu.accel)()
@@ -48,7 +49,7 @@ def write_noise(out: str | Path, found: Found, table: Table) -> list[str]:
         for s in ("accel", "gyro")
     }
     preset = {"name": name, "source": found.imu.source, **sensors}
-    with staged(out) as folder:
+    with write_into(out) as folder:
         for kind, values in (("imu", preset), ("tuning", asdict(found.tuning))):
             (folder / kind).mkdir()
             text = f"# {table.title}\n{yaml.safe_dump(values, sort_keys=False)}"

@@ -15,9 +15,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dlkf.console import warned
+from dlkf.base.console import warn_once
+from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
-from dlkf.errors import InputError
 from dlkf.evaluation.metrics import end_errors, mean_error
 from dlkf.filters.build import build_causal
 from dlkf.filters.integration import Estimator, integrate
@@ -26,7 +26,7 @@ from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.state import ErrorStates
-from dlkf.onboard.compiled_filter import CompiledFilter, compiled_filter
+from dlkf.onboard.compiled_filter import CompiledFilter, compile_filter
 
 FACTORS: Mapping[str, tuple[float, ...]] = {
     "accel_noise": (1.0, 3.0, 10.0, 30.0, 100.0),
@@ -37,14 +37,17 @@ FACTORS: Mapping[str, tuple[float, ...]] = {
     "position_std": (0.5, 1.0, 2.0, 5.0),
 }
 
-IN_C = 3600  # epochs of pieces from which on a search pays for the library that its filter has to be made into
+IN_C = 3600  # epochs of segments from which on a search pays for the library that its filter has to be made into
 PATIENCE = 2  # values in a row that are worse, before the rest on that side is left out
 
-# what a filter with these endings, or of this base, is told beside
+# what a filter with these endings, or of this base, takes besides
 MORE_FACTORS: Mapping[str, Mapping[str, tuple[float, ...]]] = {
     "nhc": {"lateral_std": (0.05, 0.1, 0.2, 0.5, 1.0), "vertical_std": (0.05, 0.1, 0.2, 0.5, 1.0)},
     "car": {"lateral_std": (0.02, 0.05, 0.1, 0.2, 0.5), "vertical_std": (0.02, 0.05, 0.1, 0.2, 0.5)},
     "gated": {"gate": (0.99, 0.999, 0.9999, 0.999999)},
+    "speed": {"wheel_std": (0.03, 0.05, 0.1, 0.2, 0.5)},
+    "heading": {"heading_std": (0.5, 1.0, 2.0, 5.0)},
+    "baro": {"baro_std": (0.2, 0.5, 1.0, 2.0)},
     "aekf": {"forgetting": (0.3, 0.7, 0.9, 0.97, 0.99, 0.997)},
 }
 
@@ -60,7 +63,8 @@ class Trial(NamedTuple):
 def factors_of(name: str) -> dict[str, tuple[float, ...]]:
     """The factors of a filter that a search tries, and their values."""
     found = dict(FACTORS)
-    for part in name.partition("+")[0].split("_"):
+    kind, *aids = name.split("+")
+    for part in (*kind.split("_"), *aids):
         found |= MORE_FACTORS.get(part, {})
     return found
 
@@ -76,7 +80,7 @@ def outage_error(estimator: Estimator, batches: Sequence[Batch], objective: str 
     return float("inf") if math.isnan(error) else error
 
 
-def tuned(
+def tune_filter(
     imu: ImuSpec,
     batches: Sequence[Batch],
     *,
@@ -88,12 +92,12 @@ def tuned(
     prior: Prior | None = None,
     progress: Callable[[Trial], None] | None = None,
 ) -> tuple[Tuning, float]:
-    """Over-bounding factors of a filter by coordinate search on training pieces with outages.
+    """Over-bounding factors of a filter by coordinate search on training segments with outages.
 
     A factor goes up its values, or down them, until two in a row are worse; nothing is tried twice. From an hour of
-    pieces on trials run compiled (:mod:`dlkf.onboard`), which is the same to rounding; where they cannot, a line
-    says why. ``prior`` is what a filter with ``_prior`` is told. Returns the best factors and their
-    :func:`outage_error` [m]; ``progress`` is told every trial.
+    segments on trials run compiled (:mod:`dlkf.onboard`), which is the same to rounding; where they cannot, a line
+    has the reason. ``prior`` is given to a filter with ``_prior``. Returns the best factors and their
+    :func:`outage_error` [m]; ``progress`` is called at every trial.
     """
     known: dict[Tuning, float] = {}
     best = start or Tuning()
@@ -135,7 +139,7 @@ def tuned(
 
 
 def _in_c(estimator: Estimator, batch: Batch) -> CompiledFilter:
-    return compiled_filter(estimator, 1 / batch.dt, batch.epoch_s)
+    return compile_filter(estimator, 1 / batch.dt, batch.epoch_s)
 
 
 def _fits_c(estimator: Estimator, batches: Sequence[Batch]) -> bool:
@@ -145,24 +149,24 @@ def _fits_c(estimator: Estimator, batches: Sequence[Batch]) -> bool:
     try:
         _in_c(estimator, batches[0])
     except (InputError, OSError) as error:  # OSError: a cache that cannot be written, a library that cannot be loaded
-        warned(f"trials run in torch, some 3 × slower: {error}")
+        warn_once(f"trials run in torch, some 3 × slower: {error}")
         return False
     return True
 
 
-def without_prior(name: str) -> str:
-    """The name of the same filter that is told nothing."""
+def drop_prior(name: str) -> str:
+    """The name of the same filter without prior information."""
     return "_".join(part for part in name.split("_") if part != "prior")
 
 
 def mean_imu_error(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name: str = "mbkf15") -> Prior:
-    """Mean and spread of the IMU error over training pieces, as a filter estimates it with GNSS.
+    """Mean and spread of the IMU error over training segments, as a filter estimates it with GNSS.
 
     No truth is used. Biases: mean and spread of the estimates. The spread is what a filter that starts from the mean
     still has to find: the estimator's own scatter where all drives share one IMU, the turn-on spread where they do
-    not. Sensor matrices, which a piece of a minute or two hardly shows: all pieces together as measurements of one
+    not. Sensor matrices, which a segment of a minute or two hardly shows: all segments together as measurements of one
     unit, Λ = Λ₀ + Σ (Pᵢ⁻¹ − Λ₀) and mean Λ⁻¹ Σ Pᵢ⁻¹ xᵢ for estimates xᵢ, Pᵢ that began at zero and Λ₀⁻¹. (A turn of
-    all axes together is not told from attitude; it does no harm, but its spread comes out too small.)
+    all axes together is not separable from attitude; it does no harm, but its spread comes out too small.)
     """
     estimator = build_causal(name, imu, "a prior does not", tuning=tuning)
     assert isinstance(estimator, Mbkf)
@@ -207,11 +211,11 @@ def _imu_states(error: ImuError, states: ErrorStates) -> Float[Tensor, "B k"]:
 
 
 def best_prior(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name: str = "mbkf15_prior") -> Prior:
-    """The mean IMU error with the spread, of four, that serves ``name`` best in the outages of training pieces.
+    """The mean IMU error with the spread, of four, that serves ``name`` best in the outages of training segments.
 
     The spread of the estimates is their estimator's scatter where all drives share one IMU, and then too wide.
     """
-    prior = mean_imu_error(imu, tuning, batches, without_prior(name))
+    prior = mean_imu_error(imu, tuning, batches, drop_prior(name))
     tried = [prior.surer(factor) for factor in (3.0, 1.0, 0.3, 0.1)]
 
     def error(tried: Prior) -> float:

@@ -11,25 +11,25 @@ from pathlib import Path
 
 import yaml
 
-from dlkf.console import counting
+from dlkf.base.console import show_progress
+from dlkf.base.errors import InputError
+from dlkf.base.files import write_into
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.splits import Split, split_rows
 from dlkf.data.stack import DriveStack
-from dlkf.errors import InputError
 from dlkf.evaluation.metrics import OBJECTIVES
-from dlkf.evaluation.protocol import Protocol, Scenes, told_short
-from dlkf.evaluation.table import Table, as_markdown, number
-from dlkf.files import staged
+from dlkf.evaluation.protocol import Protocol, Scenes, describe_short
+from dlkf.evaluation.table import ResultTable, as_markdown, format_number
 from dlkf.filters.build import build_causal, is_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.tuning.search import Trial, factors_of, outage_error, tuned
+from dlkf.tuning.search import Trial, factors_of, outage_error, tune_filter
 
 LIKELIHOOD = "likelihood"  # the objective that needs no reference (dlkf.tuning.found)
 
 
 @dataclass(frozen=True)
-class Tuned:
+class TuningResult:
     """Factors before and after, the trials, and errors in outages [m]: (side, objective, before, after)."""
 
     model: str
@@ -41,7 +41,7 @@ class Tuned:
 
     @property
     def changed(self) -> dict[str, float]:
-        """What is not as it comes."""
+        """Settings that are not the defaults."""
         start, default = asdict(self.after), asdict(Tuning())
         return {k: v for k, v in start.items() if v != default[k]}
 
@@ -54,7 +54,7 @@ class Tuned:
         }
 
 
-def check(model: str, objective: str) -> None:
+def check_settings(model: str, objective: str) -> None:
     """Raises InputError for a name that is no Kalman filter to be tuned, or an unknown objective."""
     if not is_filter(model) or model == "ins":
         raise InputError(f"model={model} has no noise to tune; give the name of a Kalman filter, such as mbkf21")
@@ -66,7 +66,7 @@ def check(model: str, objective: str) -> None:
         raise InputError(f"objective={objective} is none of {', '.join((*OBJECTIVES, LIKELIHOOD))}")
 
 
-def sides(
+def train_test_drives(
     drives: Sequence[Drive], split: Split, fractions: Sequence[float], seed: int, length_s: float
 ) -> dict[str, list[Drive]]:
     """Training and test drives, whole recordings on one side; split as in :mod:`dlkf.data.splits`.
@@ -74,7 +74,7 @@ def sides(
     Raises InputError for a split that cuts drives: the test would be of the drives that were tuned on.
     """
     if split == "random":
-        raise InputError("split=random puts parts of a drive on both sides; tune wants split=group, or groups by name")
+        raise InputError("split=random puts parts of a drive on both sides; tune needs split=group, or groups by name")
     stack = DriveStack(drives)
     labels = split_rows(stack, split, fractions, seed, length_s)
     out = {}
@@ -84,17 +84,17 @@ def sides(
     return out
 
 
-def withheld(
-    drives: Sequence[Drive], protocol: Protocol, pieces: int | None = None, left_out: list[str] | None = None
+def withhold_outages(
+    drives: Sequence[Drive], protocol: Protocol, segments: int | None = None, left_out: list[str] | None = None
 ) -> list[Batch]:
-    """Batches of drives with their outages, of at most so many pieces, spread evenly.
+    """Batches of drives with their outages, of at most so many segments, spread evenly.
 
     What is left out of them, and why, is added to ``left_out``. Raises InputError if no outage fits.
     """
-    scenes = Scenes(drives, protocol, limit=pieces)
+    scenes = Scenes(drives, protocol, limit=segments)
     kept = scenes.withheld()
     if left_out is not None:
-        short = [told_short(scenes.short, len(drives), protocol)] if scenes.short else []
+        short = [describe_short(scenes.short, len(drives), protocol)] if scenes.short else []
         left_out += [*scenes.skipped.values(), *short]
     if not any(bool((~b.available & b.truth_valid & b.present).any()) for b in kept):
         raise InputError("no outage fits into the valid truth of the training drives; see outage.* and length_s")
@@ -110,38 +110,40 @@ def search(
     start: Tuning,
     objective: str,
     rounds: int,
-    pieces: int | None,
-) -> Tuned:
+    segments: int | None,
+) -> TuningResult:
     """Fit on ``drives["train"]``, then errors before and after on both sides."""
     left_out: list[str] = []
-    training = withheld(drives["train"], protocol, pieces, left_out)
+    training = withhold_outages(drives["train"], protocol, segments, left_out)
     trials: list[Trial] = []
     most = rounds * sum(map(len, factors_of(model).values()))
-    with counting(f"Tuning {model}") as progress:
+    with show_progress(f"Tuning {model}") as progress:
 
         def tell(trial: Trial) -> None:
             trials.append(trial)
             progress(len(trials), most)
 
-        after, _ = tuned(imu, training, name=model, start=start, objective=objective, rounds=rounds, progress=tell)
+        after, _ = tune_filter(
+            imu, training, name=model, start=start, objective=objective, rounds=rounds, progress=tell
+        )
     batches = {"train": training}
     if drives["test"]:
-        batches["test"] = withheld(drives["test"], protocol, left_out=left_out)
+        batches["test"] = withhold_outages(drives["test"], protocol, left_out=left_out)
     old, new = (build_causal(model, imu, "tuning does not", tuning=t) for t in (start, after))
     errors = [
         (side, o, outage_error(old, b, o), outage_error(new, b, o)) for side, b in batches.items() for o in OBJECTIVES
     ]
-    return Tuned(model, start, after, tuple(trials), tuple(errors), tuple(left_out))
+    return TuningResult(model, start, after, tuple(trials), tuple(errors), tuple(left_out))
 
 
-def tuning_table(result: Tuned, dataset: str) -> Table:
+def tuning_table(result: TuningResult, dataset: str) -> ResultTable:
     """Errors in outages before and after, on both sides."""
     rows = [
-        [side, objective, number(before), number(after), number(after / before)]
+        [side, objective, format_number(before), format_number(after), format_number(after / before)]
         for side, objective, before, after in result.errors
     ]
     factors = ", ".join(f"{k}={v:g}" for k, v in result.changed.items()) or "all as they were"
-    return Table(
+    return ResultTable(
         title=f"{result.model} on {dataset}: {factors}",
         note="Horizontal error at the end of the outages [m]: geometric mean (log), RMS and median over them. Fitted "
         + "".join(["on the training drives alone.", *(f" Left out: {line}." for line in result.left_out)]),
@@ -150,14 +152,14 @@ def tuning_table(result: Tuned, dataset: str) -> Table:
     )
 
 
-def write_tuning(out: str | Path, name: str, result: Tuned, table: Table) -> list[str]:
+def write_tuning(out: str | Path, name: str, result: TuningResult, table: ResultTable) -> list[str]:
     """Write tuning/<name>.yaml, table.md and search.csv into ``out``, all or none; their names."""
     factors = f"# {table.title}\n{yaml.safe_dump(asdict(result.after), sort_keys=False)}"
     trials = io.StringIO()
     writer = csv.writer(trials, lineterminator="\n")
     writer.writerow(["factor", "value", "error_m"])
     writer.writerows(result.trials)
-    with staged(out) as folder:
+    with write_into(out) as folder:
         (folder / "tuning").mkdir()
         (folder / "tuning" / f"{name}.yaml").write_text(factors)
         (folder / "table.md").write_text(as_markdown(table))

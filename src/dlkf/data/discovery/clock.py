@@ -1,8 +1,8 @@
-"""The offset between the clocks of an IMU and of GNSS, whatever it is: yaw rate and horizontal force against GNSS.
+"""The offset between the clocks of an IMU and of GNSS, of any size: yaw rate and horizontal force against GNSS.
 
 The yaw rate about the vertical against the change of course, and the horizontal force as a complex number (whose
 argument in the sensor's axes is not known) against the acceleration along and across the course, are correlated over
-all lags at which the logs overlap, by FFT. Neither needs to know units or pose. Then Λ = −n/2 ln(1 − ρ²) of the one
+all lags at which the logs overlap, by FFT. Neither needs units or pose. Then Λ = −n/2 ln(1 − ρ²) of the one
 plus −n ln(1 − |ρ|²) of the other is the gain in log-likelihood over no connection at all.
 """
 
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import fft
 
 from dlkf.data.discovery.motion import MOVING, RESTING, Complex, Floats, Motion
+from dlkf.navigation.earth import STANDARD_GRAVITY
 
 STEP_S = 0.25
 LEAST_S = 20.0  # of common time in intervals with a known course
@@ -101,7 +101,7 @@ def known_offset(lag_s: float) -> str:
             return f"; {name}"
     hours = lag_s / 3600
     if abs(lag_s) > YEAR_S:
-        return "; one of the clocks tells no date"
+        return "; one of the clocks has no date"
     if 0.9 < abs(hours) < FARTHEST_ZONE_H and abs(hours - round(hours * 4) / 4) * 3600 < 40:
         return f"; a time zone of {round(hours * 4) / 4:+g} h"
     return ""
@@ -116,7 +116,8 @@ def _gnss_signals(gnss: Motion, first: np.ndarray, last: np.ndarray) -> tuple[np
     rate = np.where(moving, turned / span, 0.0)
     mean = gnss.v[first] + gnss.v[last]
     along = np.where(np.abs(mean) > 0.5, mean / np.maximum(np.abs(mean), 1e-9), 1.0)
-    pull = (gnss.v[last] - gnss.v[first]) / span * np.conj(along) + 9.81 * 0.5 * (gnss.climb[first] + gnss.climb[last])
+    slope = 0.5 * (gnss.climb[first] + gnss.climb[last])
+    pull = (gnss.v[last] - gnss.v[first]) / span * np.conj(along) + STANDARD_GRAVITY * slope
     return moving | resting, rate, np.where(moving, pull, 0.0)
 
 
@@ -153,6 +154,8 @@ def _scores(
 
     At index 0 the last fix lies on the first sample.
     """
+    from scipy import fft
+
     size = fft.next_fast_len(len(weight) + len(there) - 1)
 
     def turned(x: np.ndarray) -> Complex:

@@ -1,22 +1,21 @@
-"""What a drive tells of its own log: units, pose, clock offset, delays, lever arm, each with how sure it is."""
+"""Units, pose, clock offset, delays and lever arm of a log, estimated from a drive, each with its 1σ."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from dlkf.base.settings import Ranged
 from dlkf.data.discovery.clock import Lag, find_lag, known_offset
 from dlkf.data.discovery.drift import ends_std, find_drifting_pose, middle
 from dlkf.data.discovery.motion import MOVING, Floats, Motion, motion, position_delay
 from dlkf.data.discovery.orientation import Pose
 from dlkf.data.discovery.units import accel_units, nearest_unit, unit_left
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
-from dlkf.settings import Ranged
 
 LEAST_EXPLAINED, AGREE = 0.8, (0.8, 1.25)
 FARTHEST_DOWN = math.radians(6.0)
@@ -32,13 +31,16 @@ class Sure(Ranged, where="reader.sure", least=0, greatest=1e6):
 
 @dataclass(frozen=True)
 class Finding:
-    """A ``setting`` of the reader with its value; ``told`` are the numbers behind it, ``wide`` would be sure enough."""
+    """A ``setting`` of the reader with its value; ``detail`` are the numbers behind it, ``wide`` would be sure enough,
+    ``remedy`` is what else mends it, ``std`` the 1σ of a number."""
 
     setting: str
     value: Any
     sure: bool
-    told: str
+    detail: str
     wide: str = ""
+    remedy: str = ""
+    std: float = math.nan
 
 
 @dataclass
@@ -49,9 +51,11 @@ class Findings:
     pose: Pose | None = None
     lag: Lag | None = None
 
-    def add(self, setting: str, value: Any, sure: bool, told: str, wide: str = "") -> None:
+    def add(
+        self, setting: str, value: Any, sure: bool, detail: str, wide: str = "", remedy: str = "", std: float = math.nan
+    ) -> None:
         """One more."""
-        self.found.append(Finding(setting, value, sure, told, wide))
+        self.found.append(Finding(setting, value, sure, detail, wide, remedy, std))
 
     def get(self, setting: str) -> Any:
         """The value of a setting, None if it was not looked for or not found."""
@@ -88,8 +92,12 @@ def discover(
     known_accel: Mapping[str, float],
     known_gyro: Mapping[str, float],
     increments: bool = False,
+    drift_given: bool = False,
 ) -> Findings:
-    """Find the settings in ``wanted`` (as ``imu.accel.unit``, ``imu.axes``, ``time.offset_s``, ``lever_arm_m``, …)."""
+    """Find the settings in ``wanted`` (as ``imu.accel.unit``, ``imu.axes``, ``time.offset_s``, ``lever_arm_m``, …).
+
+    With ``drift_given`` the stamps have the clocks' drift taken out: a rest of it does not count as doubtful.
+    """
     out = Findings()
     size = float(np.median(np.linalg.norm(raw.accel, axis=-1)))
     factor = raw.accel_factor
@@ -107,8 +115,13 @@ def discover(
         other = find_lag(raw.t, -raw.accel, raw.gyro, gnss, None if away else 2.0)
         if other is not None and (lag is None or other.gain > 1.5 * lag.gain) and other.yaw > 0.7:
             lag, factor = other, -factor
-            out.found[0] = Finding("imu.accel.unit", factor, True, out.found[0].told + ", its sign turned round")
+            out.found[0] = Finding("imu.accel.unit", factor, True, out.found[0].detail + ", its sign turned round")
     out.lag = lag
+    if lag is not None and away and _is_mirrored(raw, lag, gnss):
+        detail = f"turns agree to {lag.yaw:.2f}, accelerations to {lag.force:.2f}, well with the y axis turned round"
+        remedy = "give it as the sensor's axis that counts the other way (x, y or z), the gyroscope's too if need be"
+        out.add("imu.accel.mirror", "y", False, f"the axes seem left-handed: {detail}", remedy=remedy)
+        return out
     pose = None
     if lag is not None:
         pose = find_drifting_pose(raw.t, raw.accel * factor, raw.gyro, gnss, lag.lag_s)
@@ -117,6 +130,8 @@ def discover(
     sound = pose is not None and pose.explained > LEAST_EXPLAINED and AGREE[0] < pose.scale < AGREE[1]
     sound = sound and not (pose is not None and pose.down_apart > FARTHEST_DOWN)
     if away or "gnss.time.drift_ppm" in wanted:
+        if drift_given and pose is not None:
+            pose = replace(pose, doubt=0.0)
         _drift(out, pose if sound else None, wanted, sure, middle(gnss) - float(raw.gnss_t[0]))
     if away:
         _offset(out, lag, pose if sound else None, wanted, sure, middle(gnss) - float(raw.gnss_t[0]))
@@ -129,21 +144,31 @@ def discover(
     return out
 
 
+def _is_mirrored(raw: Raw, lag: Lag, gnss: Motion) -> bool:
+    """Whether accelerations agree with GNSS where the turns do only in a left-handed triad."""
+    if lag.yaw < 0.8 or lag.force > 0.9:
+        return False
+    other = find_lag(raw.t, raw.accel * [1.0, -1.0, 1.0], raw.gyro, gnss, None)
+    return other is not None and 1 - other.force < 0.5 * (1 - lag.force) and other.gain > 1.1 * lag.gain
+
+
 def _gyro_unit(out: Findings, raw: Raw, pose: Pose | None, known: Mapping[str, float], increments: bool) -> None:
     if raw.gyro_factor is not None:
         return
     if pose is None:
         out.add("imu.gyro.unit", None, False, "no turn to compare with the course")
         return
-    told = f"{pose.gyro_scale:.4g} ± {pose.gyro_scale_std:.1g} rad per unit of {np.degrees(pose.turned):.0f}° of turns"
+    detail = (
+        f"{pose.gyro_scale:.4g} ± {pose.gyro_scale_std:.1g} rad per unit of {np.degrees(pose.turned):.0f}° of turns"
+    )
     unit = nearest_unit(pose.gyro_scale, pose.gyro_scale_std, known)
     if unit is None:
         shaking = float(np.sqrt(np.mean(np.var(raw.gyro, axis=0))))
         unit = unit_left(pose.gyro_scale, pose.gyro_scale_std, shaking, known)
         if unit is not None:
-            told += f"; no other is near, or lets it shake as cars do ({shaking * known[unit]:.2g} rad/s)"
+            detail += f"; no other is near, or gives it the vibration of cars ({shaking * known[unit]:.2g} rad/s)"
     counted = unit is None and increments and pose.gyro_scale_std < 0.01 * pose.gyro_scale
-    out.add("imu.gyro.unit", unit or float(f"{pose.gyro_scale:.6g}"), unit is not None or counted, told)
+    out.add("imu.gyro.unit", unit or float(f"{pose.gyro_scale:.6g}"), unit is not None or counted, detail)
 
 
 def _drift(out: Findings, pose: Pose | None, wanted: set[str], sure: Sure, reach_s: float) -> None:
@@ -151,8 +176,8 @@ def _drift(out: Findings, pose: Pose | None, wanted: set[str], sure: Sure, reach
     and would make the offset wrong ``reach_s`` from the drive's middle."""
     setting = "gnss.time.drift_ppm"
     if pose is not None and abs(pose.doubt) * reach_s > sure.time_s:
-        told = f"± {1e6 * abs(pose.drift_std):.0f} ppm: {1000 * abs(pose.doubt) * reach_s:.0f} ms at the drive's ends"
-        out.add(setting, round(1e6 * pose.doubt, 1), False, told)
+        detail = f"± {1e6 * abs(pose.drift_std):.0f} ppm: {1000 * abs(pose.doubt) * reach_s:.0f} ms at the drive's ends"
+        out.add(setting, round(1e6 * pose.doubt, 1), False, detail)
         return
     if pose is None or not pose.drift:
         if setting in wanted:
@@ -160,8 +185,8 @@ def _drift(out: Findings, pose: Pose | None, wanted: set[str], sure: Sure, reach
             out.add(setting, 0.0, True, f"none to be seen{seen}")
         return
     faster = "faster" if pose.drift > 0 else "slower"
-    told = f"± {1e6 * pose.drift_std:.0f} ppm: the clock of the IMU runs {faster} than that of GNSS"
-    out.add(setting, round(1e6 * pose.drift, 1), setting in wanted, told)
+    detail = f"± {1e6 * pose.drift_std:.0f} ppm: the clock of the IMU runs {faster} than that of GNSS"
+    out.add(setting, round(1e6 * pose.drift, 1), setting in wanted, detail)
 
 
 def _offset(out: Findings, lag: Lag | None, pose: Pose | None, wanted: set[str], sure: Sure, before_s: float) -> None:
@@ -178,10 +203,12 @@ def _offset(out: Findings, lag: Lag | None, pose: Pose | None, wanted: set[str],
     certain = lag.clear and 2.5 * at_ends <= sure.time_s
     hardly = abs(pose.lag_s) < max(3 * pose.lag_std, 0.01) and abs(pose.lag_s) < 0.05
     value = 0.0 if hardly and not pose.drift else pose.lag_s - pose.drift * before_s
-    told = f"{sign * pose.lag_s:+.3f} ± {pose.lag_std:.3f} s in the middle of the drive, ± {at_ends:.3f} at its ends, "
-    told += f"a delay of GNSS's velocities included; {_peak(lag)}"
+    detail = (
+        f"{sign * pose.lag_s:+.3f} ± {pose.lag_std:.3f} s in the middle of the drive, ± {at_ends:.3f} at its ends, "
+    )
+    detail += f"a delay of GNSS's velocities included; {_peak(lag)}"
     wide = f"reader.sure.time_s={math.ceil(250 * at_ends + 1) / 100:g}" if lag.clear else ""
-    out.add(setting, round(sign * value, 4), certain, told + known_offset(pose.lag_s), wide)
+    out.add(setting, round(sign * value, 4), certain, detail + known_offset(pose.lag_s), wide, std=at_ends)
 
 
 def _peak(lag: Lag) -> str:
@@ -192,6 +219,8 @@ def _peak(lag: Lag) -> str:
 
 
 def _axes(out: Findings, pose: Pose | None, sound: bool, gnss: Motion, sure: Sure) -> None:
+    from scipy.spatial.transform import Rotation
+
     if pose is None:
         moved = float(np.mean(gnss.speed > MOVING)) if len(gnss.t) else 0.0
         out.add("imu.axes", None, False, f"too little motion: {100 * moved:.0f} % of {len(gnss.t)} fixes above 2 m/s")
@@ -200,18 +229,18 @@ def _axes(out: Findings, pose: Pose | None, sound: bool, gnss: Motion, sure: Sur
     value = {"roll": round(float(roll), 2), "pitch": round(float(pitch), 2), "yaw": round(float(yaw), 2)}
     limit = math.radians(sure.angle_deg)
     certain = sound and 2.5 * pose.yaw_std <= limit and 2.5 * pose.tilt_std <= limit
-    told = (
+    detail = (
         f"± {math.degrees(pose.yaw_std):.1f}° about the vertical, ± {math.degrees(pose.tilt_std):.1f}° level; "
         f"accelerations {pose.scale:.2f} of those of GNSS, {100 * pose.explained:.0f} % explained"
     )
     if not math.isnan(pose.down_apart):
-        told += f"; down by gravity and by the turns {math.degrees(pose.down_apart):.1f}° apart"
+        detail += f"; down by gravity and by the turns {math.degrees(pose.down_apart):.1f}° apart"
     wide = f"reader.sure.angle_deg={math.ceil(2.5 * math.degrees(max(pose.yaw_std, pose.tilt_std)) + 0.1):d}"
-    out.add("imu.axes", value, certain, told, wide if sound else "")
+    out.add("imu.axes", value, certain, detail, wide if sound else "")
 
 
 def _arm(out: Findings, pose: Pose | None) -> None:
-    """The horizontal lever arm, where it can be seen to 0.3 m (1σ); else zero, said so."""
+    """The horizontal lever arm, where it is observable to 0.3 m (1σ); else zero, with a line."""
     if pose is None or pose.lever_arm_std > 0.3:
         seen = "not at all" if pose is None else f"only to {pose.lever_arm_std:.1f} m"
         out.add("lever_arm_m", [0.0, 0.0, 0.0], True, f"can be seen {seen}: zero kept, measure it")

@@ -1,4 +1,4 @@
-"""What GNSS tells of a car's motion, and an IMU's integrals to compare it with.
+"""A car's motion by GNSS, and an IMU's integrals to compare it with.
 
 Horizontal vectors are complex numbers: North + i East, or forward + i right.
 """
@@ -83,7 +83,7 @@ def _from_positions(t: Floats, lat_deg: Floats, lon_deg: Floats) -> Motion:
 
 
 def position_delay(t: Floats, lat_deg: Floats, lon_deg: Floats, v_ned: Floats) -> tuple[float, float]:
-    """Seconds by which positions are older than the velocities beside them, and 1σ; NaN where it cannot be seen.
+    """Seconds by which positions are older than the velocities beside them, and 1σ; NaN where it is not observable.
 
     Δp − ∫v dt = −δ Δv: what a turn or a braking car leaves between them.
     """
@@ -125,7 +125,7 @@ class Levelled:
 
     ``turn`` is the angle about down, ``force`` and ``ones`` the integrals of e^{i turn} times the horizontal force
     and 1, ``swing`` = i ω e^{i turn}, each at the limits of the samples ``t``. ``tilted`` is ``force`` with what the
-    gyroscopes tell of pitch and roll: q = ∫ e^{i turn} (ω₂ − i ω₁) dt is the horizontal part of the sensor's third
+    gyroscopes give of pitch and roll: q = ∫ e^{i turn} (ω₂ − i ω₁) dt is the horizontal part of the sensor's third
     axis, and f_z q its share of gravity (small angles; q drifts slowly).
     """
 
@@ -139,7 +139,7 @@ class Levelled:
 
 
 def _without_turn(across: Floats, about: Floats) -> Floats:
-    """What the gyroscopes across (n, 2) say where the car does not turn ``about`` down: their biases.
+    """Means of the gyroscopes across (n, 2) where the car does not turn ``about`` down: their biases.
 
     Their means are not: a car that leans in its turns, or is not quite level, turns about them too, and a loop of
     360° under 3° within two minutes is 0.15 °/s.

@@ -7,7 +7,7 @@ complex horizontal vectors, every interval between two fixes has
 
 s the slope of the way, f the horizontal force in the sensor's axes: the argument of α turns these into forward and
 right, |α| is one, b is what levelling by the mean left over, and λ the lever arm from IMU to antenna. This is linear
-in (α, α b, λ); the clock offset is scanned for the least residuals. The course would tell of it too, yet it is no
+in (α, α b, λ); the clock offset is scanned for the least residuals. The course shows it too, yet it is no
 heading:
 
     course = h + ω (l / v + K v),
@@ -23,7 +23,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
 from dlkf.data.discovery.motion import MOVING, Complex, Floats, Levelled, Motion, levelled
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
@@ -34,14 +33,14 @@ SMOOTH_S = 4.0  # over which course minus turn is averaged: sideslip and noise, 
 FEWEST = 20  # intervals in motion
 SLOW_ROWS = 4.0  # intervals (of about a second), 1σ of the mean that is taken off
 LEVEL_STD = np.radians(0.8)  # of levelling: an accelerometer's bias of 0.1 m/s², the road's crown
-AXIS_STD = np.radians(3.0)  # of the axis of turning, over the root of the turn [rad]: slopes, bumps, rolling in turns
-YAW_FLOOR, LAG_FLOOR = np.radians(0.3), 0.003  # what leaving pieces out does not show: rolling in turns, sideslip
+AXIS_STD = np.radians(3.0)  # of the axis of turning, over the root of the turn [rad]: slopes, bumps, rolling in bends
+YAW_FLOOR, LAG_FLOOR = np.radians(0.3), 0.003  # what leaving segments out does not show: rolling in bends, sideslip
 SLIP_NOISE = 0.1  # m/s, of a change of course times speed: the weight of what is known of l and K
 
 
 @dataclass(frozen=True)
 class Pose:
-    """``matrix`` takes the sensor's axes to Forward-Right-Down; stds by a jackknife over pieces of the drive."""
+    """``matrix`` takes the sensor's axes to Forward-Right-Down; stds by a jackknife over segments of the drive."""
 
     matrix: Floats
     yaw_std: float  # rad
@@ -56,7 +55,7 @@ class Pose:
     explained: float  # share of the variance of Δv
     turned: float  # rad, sum of what the car turned
     down_apart: float  # rad between gravity and the axis about which the car turns; NaN where it turns too little
-    drift: float  # by which the IMU's clock runs faster than that of GNSS (1e-6: ppm), NaN where it cannot be seen
+    drift: float  # by which the IMU's clock runs faster than that of GNSS (1e-6: ppm), NaN where it is not observable
     drift_std: float
     doubt: float = 0.0  # a drift that may be there, though it is not certain enough to be taken off
 
@@ -92,7 +91,7 @@ class _Fit:
 def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float) -> Pose | None:
     """Pose of a sensor with ``accel`` in m/s², ``gyro`` in any unit (n, 3), near a clock offset ``lag_s`` [s].
 
-    None where the drive has too little motion to say anything.
+    None where the drive has too little motion.
     """
     parts = _intervals(gnss)
     if parts.moving.sum() < FEWEST * parts.stride:
@@ -283,6 +282,8 @@ def _design(
 
 def _quick(columns: Complex, use: np.ndarray, stride: int) -> Complex:
     """Columns less their mean over ``SLOW_ROWS`` round each row, of the rows in use: tilt drifts, cars do not wait."""
+    from scipy.ndimage import gaussian_filter1d
+
     weight, rows = use.astype(float), SLOW_ROWS * stride
     share = np.maximum(gaussian_filter1d(weight, rows, mode="constant"), 1e-6)
     masked = columns * weight[:, None]

@@ -71,7 +71,7 @@ def speed_factor(t: Floats, lat_deg: Floats, lon_deg: Floats, speed: Floats) -> 
 
 
 def time_unit(values: Floats, slowest_s: float, fastest_s: float) -> str | None:
-    """Unit of stamps: by their size where they count from 1970, else by their usual step; None if in doubt."""
+    """Unit of stamps: by their size where they count from 1970, else by their usual step; None if ambiguous."""
     numbers = np.asarray(values, dtype=float)
     size = float(np.nanmedian(np.abs(numbers)))
     for unit, ticks in (("ns", 1e9), ("us", 1e6), ("ms", 1e3), ("s", 1.0)):

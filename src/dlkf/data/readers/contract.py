@@ -10,10 +10,10 @@ import pandas as pd
 import pymap3d
 from scipy.spatial.transform import Rotation
 
+from dlkf.base.errors import InputError
 from dlkf.data.readers import units
 from dlkf.data.readers.mapping import Mapped
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY
-from dlkf.errors import InputError
 
 LATE = {"end": 0.0, "middle": 0.5, "start": 1.0}  # of the interval, by which a stamp is early
 ANGLES = {"deg": 1.0, "rad": 1 / units.DEG, "1e-7deg": 1e-7, "ddmm": 1.0}  # degrees per unit
@@ -28,6 +28,7 @@ def imu_frame(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
     out: dict[str, np.ndarray] = {}
     for key, names, known in (("gyro", GYRO, units.RATE), ("accel", ACCEL, units.ACCELERATION)):
         values = mapped.vector(key, (3,), nan=False) * mapped.scale(key, known)
+        values = values * units.mirror(mapped.spec[key].get("mirror"), f"reader.imu.{key}.mirror")
         turn = units.rotation(mapped.spec[key].get("axes", "frd"), f"reader.imu.{key}.axes")
         if mapped.spec.get("increments"):
             with np.errstate(divide="ignore"):  # stamps that stand twice are refused with their row later
@@ -40,7 +41,7 @@ def imu_frame(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
 
 
 def gnss_frame(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
-    """Fixes; thinned where ``every_s`` asks for it."""
+    """Fixes; decimated where ``every_s`` asks for it."""
     position = positions(mapped)
     frame = {"t": t, **position, **velocities(mapped, position)}
     stds = _stds(mapped, "std_position", units.LENGTH, position) + _stds(mapped, "std_velocity", units.SPEED, position)
@@ -157,7 +158,7 @@ def _stds(mapped: Mapped, key: str, known: Mapping[str, float], position: Mappin
     if not mapped.has(key):
         return [np.full(len(mapped), np.nan)] * 3
     s = mapped.vector(key, (1, 2, 3), nan=True) * mapped.scale(key, known)
-    s = np.where(s < 0, np.nan, s)  # phones and receivers write −1 for what they do not know
+    s = np.where(s < 0, np.nan, s)  # phones and receivers write −1 for unknown values
     frame = mapped.spec[key].get("frame") or "ned"
     if frame not in ("ned", "enu", "ecef"):
         raise InputError(f"reader.{mapped.kind}.{key}.frame={frame}: must be ned, enu or ecef")

@@ -12,11 +12,11 @@ Place = tuple[Path, str, Path | None]  # of a drive: its folder, its name, the o
 
 
 @dataclass(frozen=True)
-class Table:
+class LogTable:
     """A table of a log file in the file's own columns and units.
 
     The index of ``frame`` numbers its rows as ``row`` calls them (line of a text file, row, message), for messages to
-    the user; ``units`` are those that the file states, by column; ``notes`` what was met on the way.
+    the user; ``units`` are those that the file states, by column; ``notes`` messages of the reader.
     """
 
     frame: pd.DataFrame
@@ -30,7 +30,8 @@ class Table:
 class DriveFrames:
     """A drive in contract units, axes and columns; ``meta`` is its row of ``drives.parquet``.
 
-    ``notes`` tell what the reader met and found out; ``mapping`` explains the log so that it reads the same again.
+    ``notes`` are what the reader reports; ``mapping`` explains the log so that it reads the same again;
+    ``aids`` are tables of further sensors by name (:data:`dlkf.data.schema.AIDS`).
     """
 
     meta: dict[str, Any]
@@ -39,6 +40,7 @@ class DriveFrames:
     reference: pd.DataFrame | None = field(default=None)
     notes: tuple[str, ...] = ()
     mapping: dict[str, Any] = field(default_factory=dict)
+    aids: dict[str, pd.DataFrame] = field(default_factory=dict)
 
     @property
     def name(self) -> str:

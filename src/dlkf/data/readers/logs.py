@@ -1,12 +1,13 @@
 """Drives from log files of any format: the one way from a folder of logs to the contract's tables.
 
 A file of some format gives a table in its own columns (:mod:`dlkf.data.readers.formats`); the mapping of the reader's
-configuration (``conf/reader/csv.yaml`` explains every key) says what the columns are; the result is a drive in the
+configuration (``conf/reader/csv.yaml`` explains every key) defines the columns; the result is a drive in the
 contract's units, axes and clock.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,15 +16,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from dlkf.base.errors import InputError
+from dlkf.base.settings import settings_from
 from dlkf.data.discovery.findings import Sure
 from dlkf.data.readers import formats
+from dlkf.data.readers.aids import read_aids
+from dlkf.data.readers.archives import drive_name, drive_places, is_archive, unpacked
 from dlkf.data.readers.contract import gnss_frame, imu_frame, reference_frame
 from dlkf.data.readers.formats import rosbag
 from dlkf.data.readers.frames import DriveFrames, Place
-from dlkf.data.readers.mapping import SOURCE, Mapped, Spec, check_keys, respaced, selected
-from dlkf.data.readers.settling import AUTO, open_settings, placeholders, settle
-from dlkf.errors import InputError
-from dlkf.settings import settings_from
+from dlkf.data.readers.mapping import SOURCE, Mapped, Spec, check_keys, respaced, selected, unused
+from dlkf.data.readers.settling import AUTO, Unsure, open_settings, placeholders, settle
+from dlkf.data.readers.sharing import layout
+from dlkf.data.readers.stamps import epoch_note
 
 TEXT = ("separator", "decimal", "header", "comment", "skip_rows", "encoding")
 NEAR_S = 0.05  # rows of two GNSS tables this close are of one fix
@@ -33,9 +38,9 @@ FRAMES = {"imu": imu_frame, "gnss": gnss_frame, "reference": reference_frame}
 class LogReader:
     """Reads a file, a folder with one drive's files, or a folder with one subfolder per drive.
 
-    ``imu``, ``gnss`` and ``reference`` say format, file, columns, units, axes and clock as the comments of
-    ``conf/reader/csv.yaml`` explain; the other arguments are the format of text files and the drive's row in
-    ``drives.parquet``. All errors are InputErrors with file, and column or line.
+    ``imu``, ``gnss``, ``reference``, ``speed``, ``heading`` and ``baro`` give format, file, columns, units, axes and
+    clock as the comments of ``conf/reader/csv.yaml`` explain; the other arguments are the format of text files and the
+    drive's row in ``drives.parquet``. All errors are InputErrors with file, and column or line.
     """
 
     def __init__(
@@ -44,6 +49,9 @@ class LogReader:
         gnss: Spec,
         reference: Spec | None = None,
         *,
+        speed: Spec | None = None,
+        heading: Spec | None = None,
+        baro: Spec | None = None,
         separator: str = ",",
         decimal: str = ".",
         header: bool = True,
@@ -62,6 +70,7 @@ class LogReader:
         if isinstance(skip_rows, bool) or not isinstance(skip_rows, int) or skip_rows < 0:
             raise InputError(f"reader.skip_rows is {skip_rows!r}, must be a whole number ≥ 0")
         self.specs: dict[str, Spec] = {"imu": imu, "gnss": gnss, "reference": reference or {}}
+        self.specs |= {name: spec or {} for name, spec in (("speed", speed), ("heading", heading), ("baro", baro))}
         for kind, spec in self.specs.items():
             check_keys(spec, kind)
         self.text = dict(zip(TEXT, (separator, decimal, header, comment, skip_rows, encoding)))
@@ -78,6 +87,8 @@ class LogReader:
     def places(self, source: str | Path) -> list[Place]:
         """Where the drives lie, for :meth:`drive_at`."""
         source = Path(source)
+        if is_archive(source):
+            return [(source, self.drive or drive_name(source), None)]
         if source.is_file():
             return [(source.parent, self.drive or source.name.partition(".")[0], source)]
         if not source.is_dir():
@@ -85,34 +96,57 @@ class LogReader:
         patterns = self.specs["imu"].get("file")
         if _matching(source, patterns):
             return [(source, self.drive or source.absolute().name, None)]
-        folders = sorted(p for p in source.iterdir() if p.is_dir() and not p.name.startswith("."))
-        if not folders:
+        if not (places := drive_places(source)):
             raise InputError(f"source={source}: no file {_said(patterns)} and no subfolders; set reader.imu.file")
-        return [(folder, folder.name, None) for folder in folders]
+        return [(place, drive_name(place), None) for place in places]
+
+    def sharing(self, settings: Mapping[str, Any]) -> LogReader:
+        """The same reader, with settings that other drives found in the place of ``auto``."""
+        other = copy.copy(self)
+        known = {kind: _filled(spec, settings.get(kind, {})) for kind, spec in self.specs.items()}
+        other.specs, other.wanted = known, open_settings(known, self.lever_arm_m)
+        other.neutral = placeholders(known)
+        return other
 
     def drive_at(self, folder: Path, name: str, only: Path | None = None) -> DriveFrames:
         """The drive of a place, by that name."""
+        with unpacked(folder) as inside:
+            return self._drive(inside, name, only)
+
+    def _drive(self, folder: Path, name: str, only: Path | None) -> DriveFrames:
         kinds = [kind for kind, spec in self.specs.items() if spec.get("file") is not None]
         if "imu" not in kinds:
             raise InputError("reader.imu.file is null; a drive needs an IMU")
-        mapped = {kind: self._mapped(folder, self.neutral[kind], kind, only) for kind in kinds}
+        every = {kind: self._mapped(folder, self.neutral[kind], kind, only) for kind in kinds}
+        mapped = {kind: part for kind, part in every.items() if kind in FRAMES}
         zero, t = self._times(mapped)
         arm, found, mapping = self.lever_arm_m, (), {}
         if self.wanted:
-            settled = settle(mapped, t, self.wanted, self.sure, f"drive {name}", arm)
+            try:
+                settled = settle(mapped, t, self.wanted, self.sure, f"drive {name}", arm)
+            except Unsure as unsure:
+                unsure.layout = layout(self.neutral)
+                raise
             mapped = {kind: replace(part, spec=settled.specs[kind]) for kind, part in mapped.items()}
             zero, t = self._times(mapped)
             arm, found = settled.lever_arm_m, settled.notes
-            mapping = self._mapping({**self.neutral, **settled.specs}, arm)
         frames = {kind: FRAMES[kind](part, t[kind]) for kind, part in mapped.items()}
+        others = {kind: part for kind, part in every.items() if kind not in FRAMES}
+        aids, specs, of_aids = read_aids(others, zero, mapped.get("gnss"), frames.get("gnss"), f"drive {name}")
+        if self.wanted or of_aids:
+            assert not isinstance(arm, str)  # auto is wanted, and found above
+            mapping = self._mapping(
+                {**self.neutral, **{k: dict(part.spec) for k, part in mapped.items()}, **specs}, arm
+            )
         meta = {"drive": name, "group": self.group or name, "time_zero_s": float(zero)}
         if "gnss" in mapped:
             meta |= _gps_time(mapped["gnss"], t["gnss"])
         meta |= self.meta
         meta |= dict(zip(("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m"), arm))
-        notes = [note for part in mapped.values() for one in (part, *part.parts.values()) for note in one.table.notes]
-        told = (*dict.fromkeys(notes), *_velocities_left(mapped.get("gnss")), *found)
-        return DriveFrames(meta, frames["imu"], frames.get("gnss"), frames.get("reference"), told, mapping)
+        notes = [note for part in every.values() for one in (part, *part.parts.values()) for note in one.table.notes]
+        notes += [note for part in mapped.values() if (note := epoch_note(part)) is not None]
+        said = (*dict.fromkeys((*notes, *unused(every))), *_velocities_left(mapped.get("gnss")), *found, *of_aids)
+        return DriveFrames(meta, frames["imu"], frames.get("gnss"), frames.get("reference"), said, mapping, aids)
 
     def _times(self, mapped: Mapping[str, Mapped]) -> tuple[int, dict[str, np.ndarray]]:
         """The second that a drive's times count from, and those of its tables."""
@@ -229,8 +263,8 @@ def _velocities_left(gnss: Mapped | None) -> list[str]:
 
 
 def _gps_time(gnss: Mapped, t: np.ndarray) -> dict[str, float]:
-    """GPS time = ``gps_zero_s`` + ``gps_rate`` t by the fixes' own stamps, whatever clock t is on; empty where they
-    tell no date."""
+    """GPS time = ``gps_zero_s`` + ``gps_rate`` t by the fixes' own stamps, independent of t's clock; empty where they
+    have no date."""
     first = gnss.first_gps_s()
     if first is None:
         return {}
@@ -249,6 +283,13 @@ def _interpolated(part: Mapped, key: str, at: np.ndarray, t: np.ndarray) -> tupl
     near = (t >= at[0] - usual) & (t <= at[-1] + usual) & bridged
     names = [str(n) for n in part.spec[key]["columns"]]
     return pd.DataFrame({n: np.interp(t, at, v) for n, v in zip(names, values.T)}), near
+
+
+def _filled(spec: Any, settings: Any) -> Any:
+    """A mapping with settings in the place of every ``auto`` for which there is one."""
+    if not isinstance(spec, Mapping) or not isinstance(settings, Mapping):
+        return settings if spec == AUTO and settings else spec
+    return {key: _filled(value, settings[key]) if key in settings else value for key, value in spec.items()}
 
 
 def _lever_arm(arm: Any) -> tuple[float, float, float]:

@@ -3,28 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from dlkf.base.errors import InputError
 from dlkf.data.readers import units
-from dlkf.data.readers.frames import Table
-from dlkf.errors import InputError
+from dlkf.data.readers.frames import LogTable
 
 Spec = Mapping[str, Any]
+TABULAR = (None, "csv", "parquet", "feather", "matlab")  # formats whose columns are a user's own
+MOST_NAMED = 24
 SOURCE = ("format", "file", "table", "lines", "rows", "text", "time")
-TIME = ("column", "unit", "week", "week_number", "day", "wraps_s", "clock", "offset_s", "drift_ppm", "respace")
+TIME = ("column", "unit", "week", "week_number", "day", "order", "wraps_s", "clock", "offset_s", "drift_ppm", "respace")
 GROUPS = {
     "imu": ("accel", "gyro", "increments", "stamp"),
     "gnss": ("position", "velocity", "std_position", "std_velocity", "quality", "every_s"),
     "reference": ("position", "velocity", "attitude", "valid"),
+    "speed": ("value", "std"),
+    "heading": ("value", "std"),
+    "baro": ("pressure", "height", "std"),
 }
 ENTRIES = {
-    "accel": ("columns", "unit", "axes"),
-    "gyro": ("columns", "unit", "axes"),
+    "accel": ("columns", "unit", "axes", "mirror"),
+    "gyro": ("columns", "unit", "axes", "mirror"),
     "position": ("columns", "unit", "height_unit", "frame", "geoid", "hemispheres", "zero", "delay_s"),
     "velocity": ("columns", "unit", "frame"),
     "std_position": ("columns", "unit", "frame"),
@@ -32,10 +37,15 @@ ENTRIES = {
     "quality": ("column", "map", "default"),
     "attitude": ("columns", "unit", "convention", "order"),
     "valid": ("column", "values"),
+    "value": ("columns", "unit", "counts", "per_metre", "per_turn", "radius_m", "convention", "antennas_deg"),
+    "pressure": ("columns", "unit"),
+    "height": ("columns", "unit"),
+    "std": ("columns",),
 }
-NUMBERS = ("week_number", "wraps_s", "offset_s", "drift_ppm", "delay_s", "every_s")  # or auto, where that is allowed
-POSITIVE = ("week_number", "wraps_s", "every_s")
-SWITCHES = ("respace", "increments")
+NUMBERS = ("week_number", "wraps_s", "offset_s", "drift_ppm", "delay_s", "every_s", "per_metre", "per_turn")
+NUMBERS += ("radius_m", "antennas_deg")  # or auto, where that is allowed
+POSITIVE = ("week_number", "wraps_s", "every_s", "per_metre", "per_turn", "radius_m")
+SWITCHES = ("respace", "increments", "counts")
 
 
 def check_keys(spec: Spec, kind: str) -> None:
@@ -70,7 +80,7 @@ class Mapped:
     ``parts`` are entries that come from another table, its rows already brought to the rows of this one.
     """
 
-    table: Table
+    table: LogTable
     spec: Spec
     kind: str
     parts: Mapping[str, Mapped] = field(default_factory=dict)
@@ -137,7 +147,7 @@ class Mapped:
         return whole + jump, part + (offset - jump)
 
     def first_gps_s(self) -> float | None:
-        """GPS time of the first row [s since 1980] by the table's own clock; None where that tells no date."""
+        """GPS time of the first row [s since 1980] by the table's own clock; None where that has no date."""
         time = self.spec.get("time") or {}
         whole, part = self.own_stamps()
         first = float(whole[0]) + float(part[0])
@@ -149,7 +159,7 @@ class Mapped:
         return None if known is None else first
 
     def own_stamps(self) -> tuple[np.ndarray, np.ndarray]:
-        """Whole seconds and the rest of the rows' times on the table's own clock, as GPS time where that is said."""
+        """Whole seconds and the rest of the rows' times on the table's own clock, as GPS time where that is given."""
         time = self.spec.get("time") or {}
         where = f"reader.{self.kind}.time"
         name, unit = time.get("column"), time.get("unit") or "s"
@@ -169,7 +179,8 @@ class Mapped:
         if time.get("week_number") is not None:
             week = np.full(len(self), int(time["week_number"]))
         day = None if time.get("day") is None else str(time["day"])
-        return units.seconds(values, unit, week, time.get("clock"), f"{self.table.path}, {where}", day)
+        order = None if time.get("order") is None else str(time["order"])
+        return units.seconds(values, unit, week, time.get("clock"), f"{self.table.path}, {where}", day, order)
 
     def scale(self, key: str, table: Mapping[str, float], name: str = "unit") -> float:
         """SI per unit of an entry; the first unit of the table if the entry has none."""
@@ -206,7 +217,9 @@ def selected(mapped: Mapped) -> Mapped:
     if rows is None:
         return mapped
     if rows == "filled":
-        names = {str(n) for key in ("accel", "gyro", "position") for n in _names(mapped, key)}
+        names = {
+            str(n) for key in ("accel", "gyro", "position", "value", "pressure", "height") for n in _names(mapped, key)
+        }
         time = (mapped.spec.get("time") or {}).get("column")
         names |= {str(n) for n in ([time] if isinstance(time, (str, int)) else time or [])}
         frame = mapped.table.frame
@@ -232,6 +245,40 @@ def respaced(t: np.ndarray) -> np.ndarray:
     since = np.concatenate(([usual * count[0]], np.minimum(steps, 3 * usual * count[1:]))) if len(first) else steps
     place = np.arange(len(t)) - np.repeat(first, count) + 1
     return t - np.repeat(since, count) * (1 - place / np.repeat(count, count))
+
+
+def unused(mapped: Mapping[str, Mapped]) -> list[str]:
+    """A line for each text table, matrix or file of columns on those that no entry of the mapping takes."""
+    used: dict[str, set[str]] = {}
+    there: dict[str, list[str]] = {}
+    for whole in mapped.values():
+        for part in (whole, *whole.parts.values()):
+            if part.spec.get("format") not in TABULAR:
+                continue
+            name = f"{part.table.path.name}{'' if not part.spec.get('table') else ': ' + str(part.spec['table'])}"
+            there.setdefault(name, [str(c) for c in part.table.frame.columns])
+            used.setdefault(name, set()).update(_mentioned(part.spec))
+    left = {name: [c for c in columns if c not in used[name]] for name, columns in there.items()}
+    return [f"columns of {name} that are not used: {_some(columns)}" for name, columns in left.items() if columns]
+
+
+def _mentioned(spec: Any) -> set[str]:
+    """Every name of a column in a mapping, alternatives (``A | B``) apart."""
+    if not isinstance(spec, Mapping):
+        return set()
+    found: set[str] = set()
+    for key, value in spec.items():
+        if key in ("columns", "column", "week", "geoid", "hemispheres") and value is not None:
+            for name in [value] if isinstance(value, (str, int)) else value:
+                found |= {str(name), *str(name).split(" | ")}
+        else:
+            found |= _mentioned(value)
+    return found
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return ", ".join(names[:MOST_NAMED]) + more
 
 
 def _names(mapped: Mapped, key: str) -> list[Any]:

@@ -2,96 +2,179 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from dlkf.data.discovery.units import time_unit
-from dlkf.data.readers.frames import Table
+from dlkf.data.readers import by_numbers, stamps, units, vocabulary
+from dlkf.data.readers.frames import LogTable
+from dlkf.data.readers.qualities import quality_spec
+from dlkf.data.resampling import DEFAULT_STD
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
 Spec = dict[str, Any]
-
-SENSOR = {
-    "accel": r"((total |linear )?acc(el(eration|erometer)?)?|specific ?force|force|f|a|fb)",
-    "gyro": r"(gyro?(scope)?|omega|w|g|ang(ular)? ?(velocity|vel|rate)|rate|(rotation|turn) ?rate|wb)",
-}
-ONE = {
-    "lat": r"(gps |gnss )?lat(itude)?( deg| rad)?",
-    "lon": r"(gps |gnss )?(lon|lng|long)(gitude)?( deg| rad)?",
-    "height": r"(gps |gnss )?(h|hgt|height|alt|altitude|ellip\w*|h ell|height ell\w*)( m)?",
-    "north": r"(gps |gnss )?v(el)?(ocity)?( ?n| north)(orth)?( mps| m s)?",
-    "east": r"(gps |gnss )?v(el)?(ocity)?( ?e| east)(ast)?( mps| m s)?",
-    "down": r"(gps |gnss )?v(el)?(ocity)?( ?d| down)(own)?( mps| m s)?",
-    "up": r"(gps |gnss )?v(el)?(ocity)?( ?u| up)(p)?( mps| m s)?",
-    "speed": r"(gps |gnss |ground )?(speed|sog|g ?speed|velocity|spd)( mps| m s| kn\w*| kt| km ?h| kph| mph)?",
-    "course": r"(gps |gnss )?(course|cog|bearing|track|heading|direction|head ?mot|course over ground)( deg)?",
-    "quality": r"(gps |gnss )?(quality|fix ?quality|gga ?quality)",
-    "geoid": r"(geoid|undulation|geoid ?sep\w*|sep|geoid ?height)( m)?",
-}
-QUALITY_TEXT = r"(gps |gnss )?(quality|fix|fix ?(type|quality|status|mode)|status|mode|sol(ution)?( ?type)?)"
-QUALITY_WORDS = {
-    0: ("", "none", "no fix", "nofix", "no solution", "invalid"),
-    1: ("single", "spp", "sps", "autonomous", "standalone", "3d", "3d fix"),
-    2: ("dgps", "dgnss", "sbas", "differential"),
-    4: ("rtk", "rtk fix", "rtk fixed", "fixed", "rtk int", "int"),
-    5: ("float", "rtk float"),
-}
-TIME = (
-    r"#?(t|time|time ?stamp|tow|sow|gps ?(time|sow|tow)|unix ?(time)?|utc|stamp|epoch|secs?|seconds|date ?time"
-    r"|ms|us|ns|milli(s|seconds)?|micro(s|seconds)?|nano(s|seconds)?|ticks|sample ?time"
-    r"|ros ?time|itow|utc ?time|seconds ?elapsed)( s| sec| ms| us| ns| unix| utc| gps)*"
-)
+SLOWEST_IMU_S, FASTEST_IMU_S = 0.21, 2e-4
+SLOWEST_FIX_S, FASTEST_FIX_S = 12.0, 0.02
+MOST_COLUMNS = 500  # no log of a car has more; each is looked at in many ways
+NEAR_GRAVITY = 0.08
 
 
-def imu_spec(table: Table) -> Spec | None:
+class Recognised(NamedTuple):
+    """The mapping of a table, and lines on what was taken for what."""
+
+    spec: Spec
+    notes: tuple[str, ...] = ()
+
+
+def imu_spec(table: LogTable) -> Recognised | None:
     """The mapping of a table that holds an IMU; None if it does not."""
-    frame = _numeric(table.frame)
+    frame = numeric(table.frame)
     names = [str(c) for c in frame.columns]
-    triads = {key: _triad(names, pattern) for key, pattern in SENSOR.items()}
+    triads = {key: vocabulary.triad(names, stem) for key, stem in vocabulary.SENSORS.items()}
     if triads["accel"] and triads["gyro"]:
-        time = _time(table, frame[triads["accel"] + triads["gyro"]].notna().all(axis=1), slowest=0.21, fastest=2e-4)
+        known = frame[triads["accel"] + triads["gyro"]].notna().all(axis=1)
+        time = stamps.time_spec(_of(table, frame), known, SLOWEST_IMU_S, FASTEST_IMU_S)
         if time is None:
             return None
-        return {"time": time, "accel": {"columns": triads["accel"]}, "gyro": {"columns": triads["gyro"]}}
-    return _imu_by_numbers(frame) if all(n.isdigit() for n in names) else None
-
-
-def gnss_spec(table: Table) -> Spec | None:
-    """The mapping of a table that holds fixes; None if it does not."""
-    frame = _numeric(table.frame)
-    names = [str(c) for c in frame.columns]
-    found = {key: _named(names, pattern) for key, pattern in ONE.items()}
-    if found["lat"] is None or found["lon"] is None:
-        return _gnss_by_numbers(frame) if all(n.isdigit() for n in names) else None
-    time = _time(table, frame[[found["lat"], found["lon"]]].notna().all(axis=1), slowest=12.0, fastest=0.02)
-    if time is None or found["height"] is None:
+        sensors = {key: {"columns": columns} for key, columns in triads.items() if columns}
+        sensors["accel"] |= _stated_unit(frame, triads["accel"])
+        return Recognised({"time": time, **sensors})
+    if any(triads.values()) or vocabulary.named(names, "lat"):
         return None
-    position: Spec = {"columns": [found["lat"], found["lon"], found["height"]], "unit": _angle_unit(frame, found)}
+    spec = by_numbers.imu_spec(frame)
+    if spec is None:
+        return None
+    columns = [*spec["accel"]["columns"], *spec["gyro"]["columns"]]
+    notes = () if _unnamed(names) else (f"took {', '.join(columns[:3])} for the accelerometers by gravity, "
+                                        f"{', '.join(columns[3:])} for the gyroscopes",)  # fmt: skip
+    return Recognised(spec, notes)
+
+
+def sensor_spec(table: LogTable, called: str) -> tuple[str, Recognised] | None:
+    """``accel`` or ``gyro`` and the mapping of a table that holds that sensor alone; ``called`` is the table's name,
+    which counts where the columns are plain x, y, z."""
+    frame = numeric(table.frame)
+    names = [str(c) for c in frame.columns]
+    for key, stem in vocabulary.SENSORS.items():
+        columns = vocabulary.triad(names, stem)
+        if columns is None and vocabulary.has(called, rf"\b{stem}\b"):
+            columns = vocabulary.triad(names, "(?:)") or vocabulary.triad(names, r"\w*")
+        if columns is None:
+            continue
+        known = frame[columns].notna().all(axis=1)
+        time = stamps.time_spec(_of(table, frame), known, SLOWEST_IMU_S, FASTEST_IMU_S)
+        if time is not None:
+            return key, Recognised({"time": time, key: {"columns": columns}})
+    return None
+
+
+def gnss_spec(table: LogTable) -> Recognised | None:
+    """The mapping of a table that holds fixes; None if it does not."""
+    frame = numeric(table.frame)
+    names = [str(c) for c in frame.columns]
+    found = {key: vocabulary.named(names, key) for key in vocabulary.QUANTITIES}
+    lat, lon, height = (found[key] for key in ("lat", "lon", "height"))
+    if (lat is None or lon is None) and any(vocabulary.triad(names, stem) for stem in vocabulary.SENSORS.values()):
+        return None
+    if lat is None or lon is None:
+        spec = by_numbers.gnss_spec(_of(table, frame))
+        if spec is None:
+            return None
+        columns = ", ".join(spec["position"]["columns"])
+        more = "; found others by the way between the positions" if spec["velocity"].get("columns") else ""
+        return Recognised(spec, () if _unnamed(names) else (f"took {columns} for latitude, longitude, height{more}",))
+    known = frame[[lat, lon]].notna().all(axis=1)
+    time = stamps.time_spec(_of(table, frame), known, SLOWEST_FIX_S, FASTEST_FIX_S)
+    if time is None or height is None:
+        return None
+    position: Spec = {"columns": [lat, lon, height], "unit": _angle_unit(frame, found)}
+    if (unit := vocabulary.unit_of(height)) in units.LENGTH:
+        position["height_unit"] = unit
     if found["geoid"] is not None:
         position["geoid"] = found["geoid"]
     out: Spec = {"time": time, "position": position, "velocity": _velocity(found) or {"columns": None}}
-    for key, stem in (("std_position", "pos"), ("std_velocity", "vel")):
-        stds = [_named(names, rf"(std|sd|sigma) ?{stem} ?{axis}( m| mps)?") for axis in "ned"]
-        if all(stds):
-            out[key] = {"columns": stds}
-    if found["quality"] is not None and _is_codes(frame[found["quality"]]):
-        out["quality"] = {"column": found["quality"]}
-    elif quality := _quality_in_words(table.frame):
+    out |= _accuracies(frame, found)
+    quality, notes = quality_spec(table.frame[known], _quality_column(table.frame), _accuracy_m(frame, out))
+    if quality is not None:
         out["quality"] = quality
-    return out
+    if "std_position" not in out and found["hdop"] is not None:
+        spec, note = _dilutions(frame[known], found, quality)
+        out, notes = out | spec, [*notes, note]
+    return Recognised(out, tuple(notes))
 
 
-def velocity_spec(table: Table) -> tuple[Spec, Spec] | None:
+def velocity_spec(table: LogTable) -> tuple[Spec, Spec] | None:
     """Time and velocities of a table that has these and no positions; None if it does not."""
-    names = [str(c) for c in _numeric(table.frame).columns]
-    velocity = _velocity({key: _named(names, pattern) for key, pattern in ONE.items()})
+    frame = numeric(table.frame)
+    names = [str(c) for c in frame.columns]
+    velocity = _velocity({key: vocabulary.named(names, key) for key in vocabulary.QUANTITIES})
+    if velocity is None:
+        return None
     every = pd.Series(True, table.frame.index)
-    time = None if velocity is None else _time(table, every, slowest=12.0, fastest=0.02)
-    return None if velocity is None or time is None else (time, velocity)
+    time = stamps.time_spec(_of(table, frame), every, SLOWEST_FIX_S, FASTEST_FIX_S)
+    return None if time is None else (time, velocity)
+
+
+def missing(table: LogTable) -> str:
+    """What a table has and what it lacks, in words, for a line that refuses it."""
+    frame = numeric(table.frame)
+    names = [str(c) for c in frame.columns]
+    has = [key for key, stem in vocabulary.SENSORS.items() if vocabulary.triad(names, stem)]
+    has += [name for key, name in (("lat", "positions"),) if vocabulary.named(names, key)]
+    columns = [str(c) for c in table.frame.columns]
+    text = f"columns {', '.join(columns[:12])}{', …' if len(columns) > 12 else ''}"
+    if not has:
+        return f"{text}, of which none is known"
+    lacks = [] if len(has) > 1 or "positions" in has else [{"accel": "a gyroscope", "gyro": "an accelerometer"}[has[0]]]
+    if "positions" in has:
+        lacks += [] if vocabulary.named(names, "lon") else ["a longitude"]
+        lacks += [] if vocabulary.named(names, "height") else ["a height"]
+    rows = pd.Series(True, table.frame.index)
+    if stamps.time_spec(_of(table, frame), rows, SLOWEST_FIX_S, FASTEST_IMU_S) is None:
+        lacks.append("stamps that can be read")
+    return f"{text}: has {' and '.join(has)}" + (f", lacks {' and '.join(lacks)}" if lacks else "")
+
+
+def numeric(frame: pd.DataFrame) -> pd.DataFrame:
+    """The columns whose cells are numbers for the most part."""
+    keep = {}
+    for name in list(frame.columns)[:MOST_COLUMNS]:
+        values = frame[name]
+        filled = values.notna()
+        if not pd.api.types.is_numeric_dtype(values):
+            filled &= values.astype(str).str.strip() != ""
+            values = pd.to_numeric(values, errors="coerce")
+        if values.notna().sum() > 0.5 * filled.sum():  # of what stands there: rows of another kind leave it empty
+            keep[name] = values
+    return pd.DataFrame(keep, index=frame.index)
+
+
+def with_numbers(table: LogTable) -> LogTable:
+    """The table with its numbers as such."""
+    return _of(table, numeric(table.frame))
+
+
+def _of(table: LogTable, frame: pd.DataFrame) -> LogTable:
+    """The table with its numbers as such."""
+    whole = table.frame.iloc[:, :MOST_COLUMNS].copy(deep=False)
+    for name in frame.columns:
+        whole[name] = frame[name]
+    return LogTable(whole, table.path, table.row, table.units, table.notes)
+
+
+def _unnamed(names: list[str]) -> bool:
+    return all(name.isdigit() for name in names)
+
+
+def _stated_unit(frame: pd.DataFrame, columns: list[str]) -> Spec:
+    """The accelerometers' unit where the header states it and gravity does not object."""
+    unit = vocabulary.unit_of(columns[0])
+    if unit not in units.ACCELERATION:
+        return {}
+    size = float(np.median(np.linalg.norm(frame[columns].dropna().to_numpy(), axis=1)))
+    near = size > 0 and abs(np.log(size * units.ACCELERATION[unit] / G)) < NEAR_GRAVITY
+    return {"unit": unit} if near else {}
 
 
 def _velocity(found: dict[str, str | None]) -> Spec | None:
@@ -101,75 +184,51 @@ def _velocity(found: dict[str, str | None]) -> Spec | None:
             return {"columns": [north, east, *([third] if third else [])], "frame": "ned"}
         return {"columns": [east, north, third], "frame": "enu"}
     both = [found["speed"], found["course"]]
-    return {"columns": both, "frame": "course"} if all(both) else None
+    return {"columns": [*both, *([found["up"]] if found["up"] else [])], "frame": "course"} if all(both) else None
 
 
-def _words(name: str) -> str:
-    """``Accel X [m/s^2]`` → ``accel x``; ``accX`` → ``acc x``; ``vel_n_mps`` → ``vel n mps``."""
-    bare = re.sub(r"[\[(].*?[\])]", " ", name)
-    bare = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", bare)
-    return re.sub(r"[^a-z0-9#]+", " ", bare.lower()).strip()
+def _accuracies(frame: pd.DataFrame, found: dict[str, str | None]) -> Spec:
+    """1σ of positions and velocities: of each axis, or horizontal and vertical; of velocities one for all axes."""
+    out: Spec = {}
+    for key, stem, others in (
+        ("std_position", "pos", [found["hacc"], found["vacc"]]),
+        ("std_velocity", "vel", [found["sacc"]]),
+    ):
+        axes = [found[f"std_{stem}_{axis}"] for axis in "ned"]
+        columns = [str(c) for c in (axes if all(axes) else [c for c in others if c is not None])]
+        if not columns or (not all(axes) and others[0] is None):
+            continue
+        known = units.LENGTH if stem == "pos" else units.SPEED
+        out[key] = {"columns": columns} | ({"unit": u} if (u := vocabulary.unit_of(columns[0])) in known else {})
+        if float(frame[columns[0]].median()) > 500 and "unit" not in out[key]:  # half a kilometre is no accuracy
+            out[key]["unit"] = "mm" if stem == "pos" else "mm/s"  # as u-blox has them
+    return out
 
 
-def _named(names: Sequence[str], pattern: str) -> str | None:
-    """The only column whose name fits; the first of several."""
-    return next((n for n in names if re.fullmatch(pattern, _words(n))), None)
+def _accuracy_m(frame: pd.DataFrame, spec: Spec) -> float:
+    """The median of the horizontal accuracy [m], NaN where there is none."""
+    if (std := spec.get("std_position")) is None:
+        return float("nan")
+    return float(frame[std["columns"][0]].median()) * units.LENGTH[std.get("unit", "m")]
 
 
-def _triad(names: Sequence[str], stem: str) -> list[str] | None:
-    for axes in ("xyz", "012"):
-        unit = r"( mps2| m s2| g| mg| rps| rad s| rad| dps| deg s| deg)?"
-        found = [_named(names, rf"(imu )?{stem} ?{a}{unit}") for a in axes]
-        if all(found):
-            return [str(f) for f in found]
-    return None
+def _quality_column(frame: pd.DataFrame) -> str | None:
+    names = [str(c) for c in frame.columns[:MOST_COLUMNS]]
+    return vocabulary.named(names, "quality")
 
 
-def _numeric(frame: pd.DataFrame) -> pd.DataFrame:
-    keep = {}
-    for name in frame.columns:
-        values = frame[name]
-        filled = values.notna()
-        if not pd.api.types.is_numeric_dtype(values):
-            filled &= values.astype(str).str.strip() != ""
-            values = pd.to_numeric(values, errors="coerce")
-        if values.notna().sum() > 0.5 * filled.sum():  # of what stands there: rows of another kind leave it empty
-            keep[name] = values
-    return pd.DataFrame(keep)
-
-
-def _time(table: Table, rows: pd.Series, slowest: float, fastest: float) -> Spec | None:
-    frame = table.frame[rows]
-    names = [str(c) for c in frame.columns]
-    column = _named(names, TIME) or _only_rising(frame)
-    week = _named(names, r"(gps )?(week|wn|week ?(number|no))")
-    if column is None or frame.empty:
-        return None
-    values = frame[column]
-    if not pd.api.types.is_numeric_dtype(values):
-        texts = values.astype(str)
-        if not bool(texts.str.match(r"^\s*\d{4}[-/]\d{1,2}[-/]\d{1,2}[T ]").iloc[:20].all()):
-            return None
-        return {"column": column, "unit": "iso", "clock": "utc"}
-    unit = time_unit(values.to_numpy(), slowest, fastest)
-    if unit is None:
-        return None
-    ticks = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[unit]
-    spec: Spec = {"column": column, "unit": unit}
-    if week is not None:
-        spec["week"] = week
-    elif float(np.nanmedian(values)) / ticks > 1.2e9:
-        spec["clock"] = "unix"
-    return spec
-
-
-def _only_rising(frame: pd.DataFrame) -> str | None:
-    """The column that rises all the way, whatever its name, where there is one and it does not merely count rows."""
-    numbers = _numeric(frame)
-    steps = {str(name): np.diff(numbers[name].to_numpy(float)) for name in numbers.columns}
-    rising = [name for name, step in steps.items() if len(step) > 1 and np.all(step >= 0) and np.median(step) > 0]
-    clocks = [name for name in rising if not np.all(steps[name] == 1)]
-    return clocks[0] if len(clocks) == 1 else None
+def _dilutions(frame: pd.DataFrame, found: dict[str, str | None], quality: Spec | None) -> tuple[Spec, str]:
+    """Standard deviations of dilutions of precision: of a fix of that quality times the dilution."""
+    columns = [str(c) for c in (found["hdop"], found["vdop"]) if c is not None]
+    code = 1
+    if quality is not None:
+        seen = frame[quality["column"]].mode().iloc[0]
+        code = quality.get("map", {}).get(str(int(seen)) if isinstance(seen, (int, float)) else str(seen), seen)
+    std = DEFAULT_STD.get(int(code), DEFAULT_STD[1])[0]
+    if len(columns) == 1:
+        columns = columns * 2
+    said = f"1σ of positions: {std:g} m times {' and '.join(dict.fromkeys(columns))}; reader.gnss.std_position.unit=…"
+    return {"std_position": {"columns": columns, "unit": std}}, said
 
 
 def _angle_unit(frame: pd.DataFrame, found: dict[str, str | None]) -> str:
@@ -179,7 +238,7 @@ def _angle_unit(frame: pd.DataFrame, found: dict[str, str | None]) -> str:
         return "1e-7deg"
     if largest > 180.5:
         return "ddmm"
-    named_deg = any("deg" in _words(str(found[k])) for k in ("lat", "lon"))
+    named_deg = any(vocabulary.unit_of(str(found[k])) == "deg" for k in ("lat", "lon"))
     # a car covers more than 10 km within a drive only rarely, and no pole or meridian has it this near by chance
     small = largest <= np.pi + 1e-9 and lat.max() <= np.pi / 2
     return "rad" if small and not named_deg and _moves_like_radians(frame, found) else "deg"
@@ -194,71 +253,3 @@ def _moves_like_radians(frame: pd.DataFrame, found: dict[str, str | None]) -> bo
     name = found["north"] or found["speed"]
     way = float(np.nansum(np.abs(frame[name].to_numpy(float))))
     return spread > 0 and way > 0 and abs(np.log(spread * 6.37e6 / way)) < abs(np.log(spread * 1.11e5 / way))
-
-
-def _is_codes(values: pd.Series) -> bool:
-    known = values.dropna()
-    return bool((known == known.round()).all() and known.between(0, 9).all())
-
-
-def _quality_in_words(frame: pd.DataFrame) -> Spec | None:
-    """GGA codes of the words of a column; None where there is none, one of them is not known, or they are numbers."""
-    column = _named([str(c) for c in frame.columns], QUALITY_TEXT)
-    if column is None:
-        return None
-    words = [str(word) for word in frame[column].dropna().unique()]
-    codes = {w: code for w in words for code, known in QUALITY_WORDS.items() if _words(w) in known}
-    return {"column": column, "map": codes} if len(codes) == len(words) and any(_words(w) for w in words) else None
-
-
-def _imu_by_numbers(frame: pd.DataFrame) -> Spec | None:
-    """No header: stamps rise, three neighbours have gravity's size, three beside them are rates."""
-    values = frame.to_numpy(float)
-    rising = [k for k in range(values.shape[1]) if np.all(np.diff(values[:, k]) > 0)]
-    if not rising or values.shape[1] < 7:
-        return None
-    column = rising[0]
-    unit = time_unit(values[:, column], 0.21, 2e-4)
-    if unit is None:
-        return None
-    step = float(np.median(np.diff(values[:, column]))) / {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[unit]
-    starts = [k for k in range(values.shape[1] - 2) if not {column} & {k, k + 1, k + 2}]
-
-    def apart(k: int) -> tuple[float, bool]:
-        size = np.linalg.norm(values[:, k : k + 3], axis=1)
-        middle = float(np.median(size))
-        spread = float(np.median(np.abs(size - middle))) / max(middle, 1e-12)
-        whole = min(abs(np.log(max(middle, 1e-12) / g)) for g in (G, 1.0, 1000.0, 100 * G))
-        gained = min(abs(np.log(max(middle / step, 1e-12) / g)) for g in (G, 1.0))
-        return (spread if min(whole, gained) < 0.08 else np.inf), gained < whole
-
-    accel = min(starts, key=lambda k: apart(k)[0])
-    if not np.isfinite(apart(accel)[0]) or apart(accel)[0] > 0.2:
-        return None
-    beside = [k for k in (accel - 3, accel + 3) if k in starts and np.ptp(values[:, k : k + 3]) > 0]
-    if not beside:
-        return None
-    triads = {"accel": accel, "gyro": beside[0]}
-    out: Spec = {key: {"columns": [str(frame.columns[k + j]) for j in range(3)]} for key, k in triads.items()}
-    return {"time": {"column": str(frame.columns[column]), "unit": unit}, "increments": bool(apart(accel)[1]), **out}
-
-
-def _gnss_by_numbers(frame: pd.DataFrame) -> Spec | None:
-    """No header: stamps, then latitude, longitude and height as neighbours."""
-    values = frame.to_numpy(float)
-    rising = [k for k in range(values.shape[1]) if np.all(np.diff(values[:, k]) > 0)]
-    if not rising or values.shape[1] < 4:
-        return None
-    column = rising[0]
-    unit = time_unit(values[:, column], 12.0, 0.02)
-    k = column + 1
-    if unit is None or k + 2 >= values.shape[1]:
-        return None
-    lat, lon, height = values[:, k], values[:, k + 1], values[:, k + 2]
-    near = np.nanmax(np.abs(lat)) <= 90 and np.nanmax(np.abs(lon)) <= 180 and np.nanmax(np.abs(height)) < 9000
-    still = max(np.nanmax(np.abs(np.diff(lat))), np.nanmax(np.abs(np.diff(lon)))) < 0.01
-    if not (near and still and np.ptp(lat) > 0):
-        return None
-    names = [str(frame.columns[k + j]) for j in range(3)]
-    time = {"column": str(frame.columns[column]), "unit": unit}
-    return {"time": time, "position": {"columns": names, "unit": "deg"}, "velocity": {"columns": None}}

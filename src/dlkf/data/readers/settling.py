@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,13 +11,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from dlkf.base.errors import InputError
 from dlkf.data.discovery.findings import Finding, Findings, Raw, Sure, discover
 from dlkf.data.discovery.units import accel_units, speed_factor
 from dlkf.data.readers import units
 from dlkf.data.readers.contract import gnss_frame, imu_frame, positions
 from dlkf.data.readers.mapping import Mapped
 from dlkf.data.schema import ACCEL, GYRO, VELOCITY
-from dlkf.errors import InputError
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
 AUTO = "auto"
@@ -36,6 +37,16 @@ FEWEST_FIXES = 3  # below, no finding has a spread
 SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "knots": 1852 / 3600, "cm/s": 0.01, "mm/s": 1e-3, "mph": 0.44704}
 
 
+class Unsure(InputError):
+    """What was left open cannot be estimated from a drive; others of the same IMU, with the same ``layout``, may do.
+
+    ``offset_s`` and its 1σ are its own estimate of the clocks.
+    """
+
+    layout: str = ""
+    offset_s: tuple[float, float] = (math.nan, math.nan)
+
+
 @dataclass(frozen=True)
 class Settled:
     """Specs without ``auto``, the lever arm, and what was found."""
@@ -47,7 +58,7 @@ class Settled:
     @property
     def notes(self) -> tuple[str, ...]:
         """A line per finding."""
-        return tuple(f"found reader.{f.setting}={_said(f.value)}  ({f.told})" for f in self.findings)
+        return tuple(f"found reader.{f.setting}={_said(f.value)}  ({f.detail})" for f in self.findings)
 
 
 def open_settings(specs: Mapping[str, Any], lever_arm_m: Any) -> set[str]:
@@ -81,7 +92,7 @@ def settle(
         log = mapped["gnss"].table
         why = "".join(f"; {note}" for note in log.notes)
         raise InputError(
-            f"{where}: {log.path} has {count} {'fix' if count == 1 else 'fixes'}, which tell nothing of a drive{why}; "
+            f"{where}: {log.path} has {count} {'fix' if count == 1 else 'fixes'}, which are no motion of a car{why}; "
             "copy the log again, or leave the drive out"
         )
     found = Findings()
@@ -102,6 +113,7 @@ def settle(
         known_accel=units.ACCELERATION,
         known_gyro=units.RATE,
         increments=bool(mapped["imu"].spec.get("increments")),
+        drift_given="gnss.time.drift_ppm" not in wanted and _at(specs, PLACES["gnss.time.drift_ppm"][0]) is not None,
     )
     found.found += more.found
     _refuse_doubt(found, wanted, where)
@@ -111,7 +123,7 @@ def settle(
             _set(specs, PLACES[name][0], value)
     lever = found.get("lever_arm_m") if "lever_arm_m" in wanted else arm
     x, y, z = (float(a) for a in lever)
-    return Settled(specs, (x, y, z), _told(found.found, wanted))
+    return Settled(specs, (x, y, z), _reported(found.found, wanted))
 
 
 def _by_gravity(specs: dict[str, Any], imu: Mapped, t: np.ndarray, where: str, arm: Any) -> Settled:
@@ -155,8 +167,8 @@ def _speed_unit(found: Findings, gnss: Mapped, t: np.ndarray, where: str) -> Non
     apart = {name: abs(np.log(factor / f)) if factor > 0 else np.inf for name, f in SPEEDS.items()}
     best = min(apart, key=lambda name: apart[name])
     certain = apart[best] < 0.08 and spread < 0.2 * factor
-    told = f"positions move {factor:.3g} ± {spread:.1g} m per unit" if factor > 0 else "the car hardly moves"
-    found.add("gnss.velocity.unit", best, bool(certain), told)
+    detail = f"positions move {factor:.3g} ± {spread:.1g} m per unit" if factor > 0 else "the car hardly moves"
+    found.add("gnss.velocity.unit", best, bool(certain), detail)
 
 
 def _refuse_doubt(found: Findings, wanted: set[str], where: str) -> None:
@@ -164,22 +176,31 @@ def _refuse_doubt(found: Findings, wanted: set[str], where: str) -> None:
     if not doubts:
         return
     doubt = doubts[0]
+    offsets = [
+        (float(one.value), one.std) for one in found.found if "offset_s" in one.setting and one.value is not None
+    ]
     setting = doubt.setting.replace("imu.axes", "imu.accel.axes and .gyro.axes")
     best = "" if doubt.value is None else f"; the best guess is {_said(doubt.value)}"
     if doubt.setting.endswith("drift_ppm") and doubt.setting not in wanted:
-        raise InputError(f"{where}: the clocks drift apart, {_said(doubt.value)} {doubt.told}; reader.{setting}=auto")
+        raise InputError(f"{where}: the clocks drift apart, {_said(doubt.value)} {doubt.detail}; reader.{setting}=auto")
     remedy = "give it, or a longer drive, with turns, starts and stops"
-    if all(one.wide for one in doubts):
+    if doubt.remedy:
+        remedy = doubt.remedy
+    elif all(one.wide for one in doubts):
         remedy = f"give it, or a longer drive, or take it as it is: {' '.join(one.wide for one in doubts)}"
-    raise InputError(f"{where}: not sure of reader.{setting} ({doubt.told}){best}; {remedy}")
+    unsure = Unsure(f"{where}: not sure of reader.{setting} ({doubt.detail}){best}; {remedy}")
+    unsure.offset_s = offsets[0] if offsets else unsure.offset_s
+    raise unsure
 
 
-def _told(found: list[Finding], wanted: set[str]) -> list[Finding]:
+def _reported(found: list[Finding], wanted: set[str]) -> list[Finding]:
     """Findings by the settings they answer."""
     out = []
     for one in found:
         names = sorted(wanted & {"imu.accel.axes", "imu.gyro.axes"}) if one.setting == "imu.axes" else [one.setting]
-        out += [Finding(name, one.value, one.sure, one.told if k == 0 else "the same") for k, name in enumerate(names)]
+        out += [
+            Finding(name, one.value, one.sure, one.detail if k == 0 else "the same") for k, name in enumerate(names)
+        ]
     return out
 
 

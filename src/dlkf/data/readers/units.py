@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
 DEG = math.pi / 180
@@ -19,6 +20,7 @@ ANGLE = {"rad": 1.0, "deg": DEG, "1e-7deg": DEG * 1e-7}
 SPEED = {"m/s": 1.0, "km/h": 1 / 3.6, "knots": 1852 / 3600, "cm/s": 0.01, "mm/s": 1e-3, "mph": 0.44704}
 LENGTH = {"m": 1.0, "mm": 1e-3, "cm": 0.01, "km": 1e3, "ft": 0.3048}
 TIME = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": 1_000_000_000}  # ticks per second
+ORDERS = ("ymd", "dmy", "mdy")  # of a date in numbers
 ISO = "iso"  # calendar texts: 2025-07-05T23:57:12.7Z, 2025/07/05 23:57:12.700
 CLOCKS = ("gps", "unix", "utc")
 WEEK_S = 604_800
@@ -48,7 +50,7 @@ def factor(unit: str | float, table: Mapping[str, float], where: str) -> float:
 def rotation(axes: str | Sequence[str] | Mapping[str, float], where: str) -> np.ndarray:
     """Matrix (3, 3) from the sensor's axes to Forward-Right-Down.
 
-    ``axes`` is three letters that say where the sensor's x, y, z point (``frd``, ``flu``, ``rfu``, …), or the sensor's
+    ``axes`` is three letters for where the sensor's x, y, z point (``frd``, ``flu``, ``rfu``, …), or the sensor's
     axes that make Forward, Right, Down (``[x, -y, -z]``), or the sensor's ``{roll, pitch, yaw}`` in the car [deg].
     InputError if they make no right-handed triad.
     """
@@ -74,6 +76,15 @@ def rotation(axes: str | Sequence[str] | Mapping[str, float], where: str) -> np.
     return matrix
 
 
+def mirror(axis: object, where: str) -> np.ndarray:
+    """Factors (3,) that turn round the ``axis`` (x, y, z) in which a left-handed sensor counts the other way."""
+    if axis is None:
+        return np.ones(3)
+    if axis not in ("x", "y", "z"):
+        raise InputError(f"{where}={axis}: must be x, y or z, or null for a right-handed sensor")
+    return np.where([axis == a for a in "xyz"], -1.0, 1.0)
+
+
 def seconds(
     values: np.ndarray,
     unit: str,
@@ -81,19 +92,21 @@ def seconds(
     clock: str | None,
     where: str,
     day: str | None = None,
+    order: str | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Whole seconds (int64) and the rest (float64) of stamps, so that nanoseconds since 1970 lose nothing.
 
     With ``week`` the stamps are seconds of the GPS week, with ``day`` of that day. ``clock`` = unix or utc turns Unix
     time (calendar texts in UTC) into GPS time, leap seconds of their day included, so that it can be mixed with GPS
-    weeks; gps says that calendar texts are GPS time already; numbers of a gps clock, and all of none, stay as they are.
+    weeks; with gps calendar texts are GPS time already; numbers of a gps clock, and all of none, stay as they are.
+    ``order`` (dmy, mdy) is that of days and months in calendar texts that do not begin with the year.
     """
     if unit not in (*TIME, ISO):
         raise InputError(f"{where}: unknown time unit {unit!r}; known are {', '.join((*TIME, ISO))}")
     if clock not in (None, *CLOCKS):
         raise InputError(f"{where}: unknown clock {clock!r}; known are {', '.join(CLOCKS)}, or null")
     if unit == ISO:
-        whole, part = _split(_calendar(values, where), TIME["ns"])
+        whole, part = _split(_calendar(values, where, order), TIME["ns"])
     else:
         whole, part = _split(values, TIME[unit])
     if day is not None:
@@ -109,7 +122,13 @@ def seconds(
 
 def clock_by_size(seconds: float) -> str | None:
     """Whether seconds count from 1970 (unix) or from 1980 (gps), by their size; None if neither can be."""
-    return "unix" if seconds > UNIX_SINCE else "gps" if seconds > GPS_SINCE else None
+    newest_gps = min(UNIX_SINCE, now() - GPS_EPOCH_UNIX + 86_400)
+    return "unix" if seconds > newest_gps else "gps" if seconds > GPS_SINCE else None
+
+
+def now() -> float:
+    """Unix time [s]; no log is newer."""
+    return time.time()
 
 
 def leap_seconds(unix: np.ndarray | int) -> np.ndarray:
@@ -141,9 +160,34 @@ def _split(values: np.ndarray, ticks: int) -> tuple[np.ndarray, np.ndarray]:
     return whole, value - whole
 
 
-def _calendar(values: np.ndarray, where: str) -> np.ndarray:
+def day_order(texts: pd.Series) -> str | None:
+    """The order of day and month in dates that begin with neither a year nor a name, by a day above 12 or by points
+    (5.7.2025, day first); empty where both are possible, None where the year comes first."""
+    parts = texts.str.extract(r"^\s*(\d{1,2})([./-])(\d{1,2})[./-]\d{2,4}")
+    if bool(parts[0].isna().any()):
+        return None
+    first, second = (pd.to_numeric(parts[k]).max() for k in (0, 2))
+    if first > 12 or second > 12:
+        return "dmy" if first > 12 else "mdy"
+    return "dmy" if bool((parts[1] == ".").all()) else ""
+
+
+def _calendar(values: np.ndarray, where: str, order: str | None = None) -> np.ndarray:
     """Nanoseconds since 1970 of calendar texts; InputError names the first that is none."""
-    texts = pd.Series(values).astype(str).str.strip().str.replace("/", "-", regex=False)
+    if order not in (None, *ORDERS):
+        raise InputError(f"{where}.order={order}: must be {', '.join(ORDERS)}, or null")
+    texts = pd.Series(values).astype(str).str.strip().str.replace(r"[年月](?=\d)", "-", regex=True)
+    texts = texts.str.replace(r"(:\d{2}),(\d)", r"\1.\2", regex=True).str.replace("日", "", regex=False)
+    order = day_order(texts) if order in (None, "ymd") else order
+    if order == "":
+        setting = where.split(", ")[-1]
+        raise InputError(f"{where}: {texts.iloc[0]!r} may have day or month first; set {setting}.order=dmy or mdy")
+    if order is not None:
+        year, month, day = (r"\3", r"\2", r"\1") if order == "dmy" else (r"\3", r"\1", r"\2")
+        texts = texts.str.replace(r"^(\d{1,2})[./-](\d{1,2})[./-](\d{4})", f"{year}-{month}-{day}", regex=True)
+        texts = texts.str.replace(r"^(\d{4})-(\d)-", r"\1-0\2-", regex=True)
+        texts = texts.str.replace(r"^(\d{4}-\d\d)-(\d)(?!\d)", r"\1-0\2", regex=True)
+    texts = texts.str.replace(r"^(\d{4})[./](\d{1,2})[./]", r"\1-\2-", regex=True)
     try:
         stamps = pd.to_datetime(texts, utc=True, format="ISO8601")
     except ValueError:

@@ -1,6 +1,6 @@
 """The GPS constellation as an almanac states it: orbital elements and clocks, read from a YUMA file.
 
-The package carries one real almanac, ``gps_week2429.alm``; its first lines say where it comes from.
+The package carries one real almanac, ``gps_week2429.alm``; its first lines give its source.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 
 Array = NDArray[np.floating]
 PACKAGED = Path(__file__).with_name("gps_week2429.alm")

@@ -47,7 +47,7 @@ class Dop:
 
 
 @dataclass(frozen=True)
-class Solution:
+class LeastSquaresFix:
     """Least-squares solution of T epochs; where not ``solved`` the numbers mean nothing.
 
     ``r_e`` [m], ``v_e`` [m/s] (T, 3) in ECEF; ``clock`` [m], ``clock_rate`` [m/s] (T,) of the receiver;
@@ -65,7 +65,7 @@ class Solution:
     solved: Mask
 
 
-def solve(observed: Observations) -> Solution:
+def solve(observed: Observations) -> LeastSquaresFix:
     """Weighted least squares of every epoch (Groves 9.4.1, 9.4.3).
 
     Gauss-Newton from the Earth's centre for the epoch with the most satellites; from there for all others.
@@ -86,7 +86,7 @@ def solve(observed: Observations) -> Solution:
     rate_gain = _gain(rate_geometry, observed.used / observed.rate_variance)
     at_rest = range_rate(unit, observed.satellite.v_e, np.zeros_like(r_e), r_e)
     rate = _apply(rate_gain, observed.pseudorange_rate - at_rest)
-    return Solution(
+    return LeastSquaresFix(
         r_e,
         rate[:, :3],
         state[:, 3],

@@ -22,7 +22,7 @@ def in_view(sky: Sky, course: Array, elevation: Array, azimuth: Array) -> Mask:
     return (np.tan(elevation) >= wall * np.abs(across)) & ~sky.blocked[:, None]
 
 
-def held(condition: Mask, rows: int) -> Mask:
+def hold_visibility(condition: Mask, rows: int) -> Mask:
     """Where ``condition`` (T, …) is true and has been for the ``rows`` rows before; before the first it is taken to be.
 
     A receiver tracks a satellite again only some time after it has come back into view.

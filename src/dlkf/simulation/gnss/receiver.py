@@ -14,8 +14,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from dlkf.errors import InputError
-from dlkf.settings import Ranged, settings_from, within
+from dlkf.base.errors import InputError
+from dlkf.base.settings import Ranged, bounded_field, settings_from
 
 Array = NDArray[np.floating]
 LOWEST = math.radians(3.0)  # mappings and noise grow without bound towards the horizon
@@ -28,7 +28,7 @@ WHITE = "white"  # the receiver of a dataset without satellites
 class Receiver(Ranged, where="receiver", least=0, greatest=1e6):
     """1σ of the errors of one receiver, as a preset of ``conf/receiver/`` gives them; 0 switches an error off.
 
-    White: ``std_range`` [m] and ``std_range_rate`` [m/s] towards the zenith, growing downwards (:func:`growth`).
+    White: ``std_range`` [m] and ``std_range_rate`` [m/s] at the zenith, growing downwards (:func:`multipath_growth`).
     First-order Gauss-Markov with a time constant [s]: ``multipath`` (per satellite, grows likewise),
     ``orbit`` (per satellite: what broadcast orbit and clock leave), ``iono`` and ``tropo`` (what the models leave
     of the vertical delay, shared by all satellites). ``ambiguity`` [m] per satellite while carrier ambiguities are
@@ -40,21 +40,21 @@ class Receiver(Ranged, where="receiver", least=0, greatest=1e6):
 
     name: str
     quality: int = 1
-    mask_deg: float = within(10.0, 0, 59.99)
-    std_range: float = within(0.3, 1e-6, 1e6)
-    std_range_rate: float = within(0.05, 1e-6, 1e6)
+    mask_deg: float = bounded_field(10.0, 0, 59.99)
+    std_range: float = bounded_field(0.3, 1e-6, 1e6)
+    std_range_rate: float = bounded_field(0.05, 1e-6, 1e6)
     multipath: float = 0.0
-    multipath_s: float = within(20.0, 1e-6, 1e6)
+    multipath_s: float = bounded_field(20.0, 1e-6, 1e6)
     orbit: float = 0.0
-    orbit_s: float = within(7200.0, 1e-6, 1e6)
+    orbit_s: float = bounded_field(7200.0, 1e-6, 1e6)
     iono: float = 0.0
     tropo: float = 0.0
-    atmosphere_s: float = within(1800.0, 1e-6, 1e6)
+    atmosphere_s: float = bounded_field(1800.0, 1e-6, 1e6)
     ambiguity: float = 0.0
-    ambiguity_s: float = within(30.0, 1e-6, 1e6)
+    ambiguity_s: float = bounded_field(30.0, 1e-6, 1e6)
     refix_s: float = 10.0
     reacquire_s: float = 0.0
-    max_pdop: float = within(20.0, 1e-6, 1e6)
+    max_pdop: float = bounded_field(20.0, 1e-6, 1e6)
     clock_phase: float = 0.01
     clock_frequency: float = 0.04
     almanac: str = ""
@@ -66,7 +66,7 @@ class Receiver(Ranged, where="receiver", least=0, greatest=1e6):
 
 
 def receiver_spec(config: Mapping | None) -> Receiver | None:
-    """The receiver of a mapping like ``conf/receiver/*.yaml``; None for ``white``, which knows no satellites.
+    """The receiver of a mapping like ``conf/receiver/*.yaml``; None for ``white``, which has no satellites.
 
     InputError for an unknown key or an impossible value.
     """
@@ -79,7 +79,7 @@ def receiver_spec(config: Mapping | None) -> Receiver | None:
 
 @dataclass(frozen=True)
 class RangeErrors:
-    """Errors of T epochs × S satellites and what a receiver knows of their size.
+    """Errors of T epochs × S satellites and a receiver's own estimate of their size.
 
     ``range`` [m], ``rate`` [m/s]; ``variance`` and ``rate_variance`` of what is independent between satellites;
     ``common`` (K, T, S) 1σ [m] of what all satellites of an epoch share.
@@ -97,7 +97,7 @@ def range_errors(
 ) -> RangeErrors:
     """Errors at elevations (T, S) [rad], ``dt`` [s] apart; ``is_float`` (T,): carrier ambiguities are open."""
     shape = elevation.shape
-    lowered = growth(elevation)
+    lowered = multipath_growth(elevation)
     white, rate = rng.standard_normal((2, *shape))
     multipath = gauss_markov(rng, shape, receiver.multipath_s, dt)
     orbit = gauss_markov(rng, shape, receiver.orbit_s, dt)
@@ -120,7 +120,7 @@ def range_errors(
     )
 
 
-def growth(elevation: Array) -> Array:
+def multipath_growth(elevation: Array) -> Array:
     """1σ of noise against its zenith value, √((1 + 1/sin² E)/2) (the a² + b²/sin² E of RTKLIB, a = b)."""
     return np.sqrt(0.5 + 0.5 / np.sin(np.maximum(elevation, LOWEST)) ** 2)
 

@@ -7,13 +7,13 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from dlkf.data.schema import STD
-from dlkf.simulation.gnss.white import GnssConfig, antenna, episodes, shifted
+from dlkf.simulation.gnss.white import GnssConfig, antenna_states, episodes, shift_positions
 from dlkf.simulation.motion.vehicle import Truth
 
 Array = NDArray[np.floating]
 
 
-def late(
+def delay_fixes(
     truth: Truth, rate_b: Array, rows: NDArray[np.int64], config: GnssConfig, rate_hz: float
 ) -> tuple[Truth, Array]:
     """The truth of which the fixes stamped with the times of ``rows`` are made, and the body's rate there (N, 3).
@@ -27,12 +27,12 @@ def late(
     if config.position_lag_s == config.velocity_lag_s:
         where = place.lat, place.lon, place.height
     else:
-        arms = [antenna(x, rate_b[k], config.lever_arm_b)[0] for x, k in zip((place, moving), earlier)]
-        where = shifted(place, arms[0] - arms[1])
+        arms = [antenna_states(x, rate_b[k], config.lever_arm_b)[0] for x, k in zip((place, moving), earlier)]
+        where = shift_positions(place, arms[0] - arms[1])
     return Truth(truth.t[rows], *where, moving.v_n, moving.rpy), swing
 
 
-def reported(rng: np.random.Generator, fixes: pd.DataFrame, config: GnssConfig) -> pd.DataFrame:
+def report_fixes(rng: np.random.Generator, fixes: pd.DataFrame, config: GnssConfig) -> pd.DataFrame:
     """The fixes with stds of ``std_factor`` times what they are, and gaps of ``dropout_s`` on average (exponential)
     that make ``dropout_share`` of the time."""
     if config.std_factor != 1:

@@ -13,13 +13,13 @@ from dlkf.data.schema import POSITION, STD, VELOCITY
 from dlkf.navigation.earth import ecef_from_geodetic, ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.simulation.gnss.almanac import Almanac, read_almanac
-from dlkf.simulation.gnss.least_squares import Observations, Solution, solve
-from dlkf.simulation.gnss.obstruction import held, in_view
+from dlkf.simulation.gnss.least_squares import LeastSquaresFix, Observations, solve
+from dlkf.simulation.gnss.obstruction import hold_visibility, in_view
 from dlkf.simulation.gnss.receiver import Receiver, clock, range_errors
-from dlkf.simulation.gnss.reporting import reported
+from dlkf.simulation.gnss.reporting import report_fixes
 from dlkf.simulation.gnss.satellites import L1, LIGHT, Signals, ned_at, signals
 from dlkf.simulation.gnss.surroundings import Sky
-from dlkf.simulation.gnss.white import FLOAT, GnssConfig, antenna, observe, shifted
+from dlkf.simulation.gnss.white import FLOAT, GnssConfig, antenna_states, observe, shift_positions
 from dlkf.simulation.motion.vehicle import Truth
 
 Array = NDArray[np.floating]
@@ -56,7 +56,7 @@ def receive(
         received = Received(observe(rng, truth, rate_b, config, sky), None)
     else:
         received = observe_satellites(rng, truth, rate_b, config, receiver, sky)
-    return Received(reported(reporting_rng, received.fixes, config), received.raw)
+    return Received(report_fixes(reporting_rng, received.fixes, config), received.raw)
 
 
 def observe_satellites(
@@ -76,16 +76,16 @@ def observe_satellites(
     rows = len(truth.t)
     dt = float(truth.t[1] - truth.t[0]) if rows > 1 else 1.0
     start = float(rng.integers(WEEK))
-    offset_n, v_n = antenna(truth, rate_b, config.lever_arm_b)
-    lat, lon, height = (torch.from_numpy(x) for x in shifted(truth, offset_n))
+    offset_n, v_n = antenna_states(truth, rate_b, config.lever_arm_b)
+    lat, lon, height = (torch.from_numpy(x) for x in shift_positions(truth, offset_n))
     r_e = ecef_from_geodetic(lat, lon, height).numpy()
     v_e = (ned_axes(lat, lon).numpy() @ v_n[..., None])[..., 0]
     seen = signals(almanac, start - almanac.toa + truth.t - truth.t[0], r_e, v_e)
     view = seen.elevation > np.radians(receiver.mask_deg)
     if sky is not None:
         view &= in_view(sky, truth.rpy[:, 2], seen.elevation, seen.azimuth)
-    used = held(view, round(receiver.reacquire_s / dt))
-    fixed = held(used.sum(-1) >= FOR_FIX, round(receiver.refix_s / dt))
+    used = hold_visibility(view, round(receiver.reacquire_s / dt))
+    fixed = hold_visibility(used.sum(-1) >= FOR_FIX, round(receiver.refix_s / dt))
     is_float = ~fixed & (receiver.ambiguity > 0)
     errors = range_errors(rng, receiver, seen.elevation, is_float, dt)
     offset, drift = clock(rng, receiver, rows, dt)
@@ -101,7 +101,7 @@ def observe_satellites(
 
 
 def _fixes(
-    t: Array, solution: Solution, quality: NDArray[np.int64], added_n: Array, scale: tuple[float, float]
+    t: Array, solution: LeastSquaresFix, quality: NDArray[np.int64], added_n: Array, scale: tuple[float, float]
 ) -> pd.DataFrame:
     """The table of fixes in latitude, longitude, height and NED, with noise ``added_n`` (T, 6) of ``scale`` on top."""
     fix = quality > 0

@@ -133,7 +133,7 @@ def signals(almanac: Almanac, t: Array, r_e: Array, v_e: Array) -> Signals:
 def range_rate(unit: Array, satellite_v_e: Array, v_e: Array, r_e: Array) -> Array:
     """d/dt of the distance [m/s] (T, S) by the line of sight ``unit`` (T, S, 3) from antenna to satellite.
 
-    With cτ the distance, ρ̇ (1 + u·v_s/c) = u·(v_s − v): the satellite is seen at t − τ, which changes as well.
+    With cτ the distance, ρ̇ (1 + u·v_s/c) = u·(v_s − v): the satellite is that of t − τ, which changes as well.
     In the axes of reception the Earth's rotation cancels out of the right-hand side, and u·v_s is inertial.
     """
     closing = np.einsum("tsi,tsi->ts", unit, satellite_v_e - v_e[:, None])

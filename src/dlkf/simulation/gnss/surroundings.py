@@ -1,6 +1,6 @@
 """What stands around the road and hides the sky: buildings on both sides, tunnels, bridges, garages.
 
-Everything is a function of the distance driven, so a car that stands sees the same sky, and the same road
+Everything is a function of the distance driven, so a stationary car has the same sky, and the same road
 sampled at another rate has the same buildings.
 """
 
@@ -11,15 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dlkf.errors import InputError
-from dlkf.settings import Ranged, within
+from dlkf.base.errors import InputError
+from dlkf.base.settings import Ranged, bounded_field
 
 Array = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
 class Sky:
-    """What a receiver on the car sees of the sky at each of N times.
+    """The sky that a receiver on the car has at each of N times.
 
     ``mask_left``, ``mask_right``: elevation [rad] up to which buildings hide the sky across the road, to the
     left and to the right of the course (right = course + 90°); along the road the sky is open.
@@ -37,17 +37,17 @@ class Surroundings(Ranged, where="surroundings", least=0, greatest=1e6):
 
     A side of the road is a row of fronts, ``front_length`` [m] long on average (exponential): with
     probability ``built_share`` a building of log-normal height (median ``building_height`` [m], 40 %), whose
-    face is ``building_distance`` [m] from the car (0.7 to 1.5 times), else open. Tunnels, or whatever covers
+    face is ``building_distance`` [m] from the car (0.7 to 1.5 times), else open. Tunnels, or whatever else covers
     the road, are ``tunnel_length`` [m] long (uniform in 0.5 to 1.5 times) and leave ``tunnel_spacing`` [m] of
     open road in between (uniform in 0.5 to 1.5 times); 0 is none.
     """
 
     building_height: float = 0.0
-    building_distance: float = within(15.0, 1, 1e6)
-    front_length: float = within(25.0, 1, 1e6)
-    built_share: float = within(0.8, 0, 1)
+    building_distance: float = bounded_field(15.0, 1, 1e6)
+    front_length: float = bounded_field(25.0, 1, 1e6)
+    built_share: float = bounded_field(0.8, 0, 1)
     tunnel_length: float = 0.0
-    tunnel_spacing: float = within(1000.0, 1, 1e6)
+    tunnel_spacing: float = bounded_field(1000.0, 1, 1e6)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -10,10 +10,10 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
+from dlkf.base.settings import Ranged, bounded_field
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.earth import EARTH_RATE
-from dlkf.settings import Ranged, within
 from dlkf.simulation.gnss.receiver import gauss_markov
 from dlkf.simulation.gnss.surroundings import Sky
 from dlkf.simulation.motion.vehicle import Truth, radii_of_curvature
@@ -40,23 +40,23 @@ class GnssConfig(Ranged, where="gnss"):
     """
 
     rate_hz: float = 1.0
-    std_horizontal: float = within(0.02, 1e-15, 1e4)  # m
-    std_vertical: float = within(0.02, 1e-15, 1e4)  # m
-    std_velocity: float = within(0.02, 1e-15, 1e4)  # m/s
-    s_p: float = within(0.0, 0, 1e4)  # m
-    s_v: float = within(0.0, 0, 1e4)  # m/s
+    std_horizontal: float = bounded_field(0.02, 1e-15, 1e4)  # m
+    std_vertical: float = bounded_field(0.02, 1e-15, 1e4)  # m
+    std_velocity: float = bounded_field(0.02, 1e-15, 1e4)  # m/s
+    s_p: float = bounded_field(0.0, 0, 1e4)  # m
+    s_v: float = bounded_field(0.0, 0, 1e4)  # m/s
     quality: int = 4
     lever_arm_b: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    position_lag_s: float = within(0.0, 0, 1)
-    velocity_lag_s: float = within(0.0, 0, 1)
-    std_factor: float = within(1.0, 0.05, 20)
-    dropout_share: float = within(0.0, 0, 0.9)
-    dropout_s: float = within(3.0, 0.1, 600)
-    wander: float = within(0.0, 0, 100)
-    wander_s: float = within(30.0, 0.1, 1e4)
-    float_share: float = within(0.0, 0, 1)
-    float_s: float = within(30.0, 1, 1e4)
-    float_std: float = within(0.3, 0, 100)
+    position_lag_s: float = bounded_field(0.0, 0, 1)
+    velocity_lag_s: float = bounded_field(0.0, 0, 1)
+    std_factor: float = bounded_field(1.0, 0.05, 20)
+    dropout_share: float = bounded_field(0.0, 0, 0.9)
+    dropout_s: float = bounded_field(3.0, 0.1, 600)
+    wander: float = bounded_field(0.0, 0, 100)
+    wander_s: float = bounded_field(30.0, 0.1, 1e4)
+    float_share: float = bounded_field(0.0, 0, 1)
+    float_s: float = bounded_field(30.0, 1, 1e4)
+    float_std: float = bounded_field(0.3, 0, 100)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -83,7 +83,7 @@ def observe(
 
     ``rate_b`` (N, 3): the body's ω_ib [rad/s] at those times, for the velocity of the antenna.
     """
-    arm, antenna_v_n = antenna(truth, rate_b, config.lever_arm_b)
+    arm, antenna_v_n = antenna_states(truth, rate_b, config.lever_arm_b)
     error = config.std * rng.standard_normal((len(truth.t), 6))
     wandering, is_float = _wandering(rng.spawn(1)[0], truth.t, config)
     error[:, :3] += wandering
@@ -91,7 +91,7 @@ def observe(
     if config.wander > 0 or config.float_share > 0:
         sizes = np.hypot(config.wander, config.float_std * is_float)[:, None] * AXES
         std[:, :3] = np.hypot(std[:, :3], sizes)
-    lat, lon, height = shifted(truth, arm + error[:, :3])
+    lat, lon, height = shift_positions(truth, arm + error[:, :3])
     velocity = antenna_v_n + error[:, 3:]
     quality = np.where(is_float, FLOAT, config.quality).astype(np.int64)
     table = pd.DataFrame(fix_columns(truth.t, lat, lon, height, velocity, std, quality))
@@ -125,7 +125,7 @@ def episodes(rng: np.random.Generator, t: NDArray[np.floating], share: float, me
     return odd != starts_in
 
 
-def antenna(
+def antenna_states(
     truth: Truth, rate_b: NDArray[np.floating], lever_arm_b: tuple[float, float, float]
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """Offset of the antenna from the body C l [m] and its velocity v + C(ω_ib × l) − ω_ie × (C l) [m/s], (N, 3) NED.
@@ -139,7 +139,7 @@ def antenna(
     return arm, truth.v_n + swing
 
 
-def shifted(truth: Truth, offset_n: NDArray[np.floating]) -> tuple[NDArray, NDArray, NDArray]:
+def shift_positions(truth: Truth, offset_n: NDArray[np.floating]) -> tuple[NDArray, NDArray, NDArray]:
     """Latitude, longitude [rad] and height [m] a few metres away; second order is below 1e-4 m at 30 m."""
     meridian, transverse = radii_of_curvature(truth.lat)
     return (

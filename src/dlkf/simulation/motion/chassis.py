@@ -20,16 +20,16 @@ import scipy
 import torch
 from numpy.typing import NDArray
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
+from dlkf.base.settings import Ranged, bounded_field
 from dlkf.navigation.attitude import rotation_from_rpy, rpy_from_rotation
-from dlkf.settings import Ranged, within
 from dlkf.simulation.motion.routes import Kinematics
-from dlkf.simulation.motion.shaking import Shaking, shaken
+from dlkf.simulation.motion.shaking import Shaking, shake_mount
 from dlkf.simulation.motion.vehicle import Route, Truth, Waves, radians_per_metre, random_waves
 
 Array = NDArray[np.floating]
 GRAVITY = 9.81  # m/s², for the load on the springs alone
-NODE_HZ = 100  # suspension is solved at this rate, whatever the IMU's, and a spline lies between
+NODE_HZ = 100  # suspension is solved at this rate, for any rate of the IMU, and a spline lies between
 ROUGHEST = 0.0115  # m³ · m/s, G_d(0.1/m) times speed, that a driver bears: about 3 m/s² RMS of the body
 PROFILE_STEP = 0.25  # m, about the length of a tyre's contact
 FULL_WAVE, ROLL_WAVE = 0.01, 0.1  # cycles/m below which the rough road is flat, for heave and across
@@ -43,7 +43,7 @@ SHAPE = (  # of what moves, if anything does
 
 @dataclass(frozen=True)
 class ChassisConfig(Ranged, where="chassis"):
-    """A kind of car; the defaults are a point on the rear axle that slides along the road.
+    """A type of car; the defaults are a point on the rear axle that slides along the road.
 
     ``sideslip`` K: the rear axle's slip angle per lateral acceleration [s²/m], so that on a level road its
     velocity to the right is −K v² χ' (single-track model with K = m l_f/(L C_r), exact, without a lag, where
@@ -56,33 +56,33 @@ class ChassisConfig(Ranged, where="chassis"):
     ``roughness``: ISO 8608 G_d(0.1/m) [m³] (classes A to E: 16, 64, 256, 1024, 4096 · 1e-6), which changes by stretches
     of ``roughness_length`` [m] on average (exponential) by a log-normal factor of the amplitude, log-std
     ``roughness_spread`` (0.7 is one class). ``vibration`` [m/s²] and ``vibration_rate`` [rad/s]: RMS per axis at
-    15 m/s of tones that follow the speed; ``shaking``: what does not tell it.
+    15 m/s of tones that follow the speed; ``shaking``: what does not depend on it.
     ``imu_arm``: rear axle → IMU, forward, right, down [m]. ``mounting_deg``: roll, pitch, yaw of the IMU in the car.
     Each drive has a car of its own: 1σ ``imu_arm_std`` [m] and ``mounting_std_deg`` per axis, and ``spread``, relative,
     of slip and suspension.
     """
 
-    sideslip: float = within(0.0, 0, 0.05)
-    slip_noise: float = within(0.0, 0, 0.05)
-    roll_gradient: float = within(0.0, 0, 0.05)
-    pitch_gradient: float = within(0.0, 0, 0.05)
-    pitch_noise: float = within(0.0, 0, 0.05)
-    roughness: float = within(0.0, 0, 0.01)
-    vibration: float = within(0.0, 0, 20.0)
-    vibration_rate: float = within(0.0, 0, 0.5)
+    sideslip: float = bounded_field(0.0, 0, 0.05)
+    slip_noise: float = bounded_field(0.0, 0, 0.05)
+    roll_gradient: float = bounded_field(0.0, 0, 0.05)
+    pitch_gradient: float = bounded_field(0.0, 0, 0.05)
+    pitch_noise: float = bounded_field(0.0, 0, 0.05)
+    roughness: float = bounded_field(0.0, 0, 0.01)
+    vibration: float = bounded_field(0.0, 0, 20.0)
+    vibration_rate: float = bounded_field(0.0, 0, 0.5)
     imu_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    imu_arm_std: float = within(0.0, 0, 2.0)
+    imu_arm_std: float = bounded_field(0.0, 0, 2.0)
     mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    mounting_std_deg: float = within(0.0, 0, 10.0)
-    spread: float = within(0.0, 0, 0.5)
-    body_hz: float = within(1.4, 0.5, 5)
-    body_damping: float = within(0.35, 0.05, 1)
-    wheel_hz: float = within(12.0, 5, 25)
-    wheel_damping: float = within(0.5, 0.05, 1)
-    wheelbase: float = within(2.7, 1, 8)
-    track: float = within(1.55, 0.5, 3)
-    roughness_spread: float = within(0.0, 0, 2.0)
-    roughness_length: float = within(300.0, 2, 100000.0)
+    mounting_std_deg: float = bounded_field(0.0, 0, 10.0)
+    spread: float = bounded_field(0.0, 0, 0.5)
+    body_hz: float = bounded_field(1.4, 0.5, 5)
+    body_damping: float = bounded_field(0.35, 0.05, 1)
+    wheel_hz: float = bounded_field(12.0, 5, 25)
+    wheel_damping: float = bounded_field(0.5, 0.05, 1)
+    wheelbase: float = bounded_field(2.7, 1, 8)
+    track: float = bounded_field(1.55, 0.5, 3)
+    roughness_spread: float = bounded_field(0.0, 0, 2.0)
+    roughness_length: float = bounded_field(300.0, 2, 100000.0)
     shaking: Shaking = field(default_factory=Shaking)
 
     def __post_init__(self) -> None:
@@ -101,7 +101,7 @@ class ChassisConfig(Ranged, where="chassis"):
 
 @dataclass(frozen=True)
 class Car:
-    """One car of a kind, as drawn: what its sensors are not told."""
+    """One car as drawn; its sensors have no access to it."""
 
     kind: ChassisConfig
     sideslip: float
@@ -136,7 +136,7 @@ def slip_angle(car: Car, route: Route, motion: Kinematics) -> tuple[Array, Array
     return gust - car.sideslip * load, gust_rate - car.sideslip * (change - GRAVITY * bank_rate)
 
 
-def mounted(rng: np.random.Generator, car: Car, route: Route, axle: Truth) -> Truth:
+def apply_mounting(rng: np.random.Generator, car: Car, route: Route, axle: Truth) -> Truth:
     """Truth of the IMU in a car whose rear axle moves as ``axle`` does along ``route``."""
     ride_rng, tone_rng, stretch_rng, shaking_rng = rng.spawn(4)
     motion = route.motion(axle.t)
@@ -157,7 +157,7 @@ def mounted(rng: np.random.Generator, car: Car, route: Route, axle: Truth) -> Tr
     moved_rate[:, 2] -= heave_rate
     mount = None
     if not car.kind.shaking.is_still:
-        mount = shaken(
+        mount = shake_mount(
             shaking_rng, car.kind.shaking, route.motion, axle.t, lambda t: stretches.at(route.motion(t).distance),
             lambda t: loads(route, route.motion(t)),
         )  # fmt: skip

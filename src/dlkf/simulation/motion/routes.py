@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from dlkf.errors import InputError
-from dlkf.settings import Ranged, within
+from dlkf.base.errors import InputError
+from dlkf.base.settings import Ranged, bounded_field
 
 Array = NDArray[np.floating]
 KMH = 1 / 3.6
@@ -53,7 +53,7 @@ class Manoeuvres:
                 f"must be shares that sum to 1"
             )
         if self.shares[0] == 0:
-            raise InputError("manoeuvres: stretch is 0, must be positive, or a standing car would never set off")
+            raise InputError("manoeuvres: stretch is 0, must be positive, or a stationary car would never set off")
         if not 0 < self.slowest <= 1:
             raise InputError(f"manoeuvres: slowest {self.slowest} is outside 0 to 1")
         for name in ("stretch_s", "turn_deg", "after_turn_s", "lane_deg", "stop_s"):
@@ -76,18 +76,18 @@ class VehicleConfig(Ranged, where="vehicle"):
     """
 
     max_speed_kmh: float = 80.0
-    max_acceleration: float = within(2.0, 0.2, 10)  # m/s², along the road
+    max_acceleration: float = bounded_field(2.0, 0.2, 10)  # m/s², along the road
     min_radius: float = 40.0  # m
     max_radius: float = 150.0
     min_lateral: float = 0.5  # m/s², on the plateau of a turn
     max_lateral: float = 5.0
-    slope_std: float = within(0.03, 0, 0.1)
-    bank_std: float = within(0.0, 0, 0.1)
-    superelevation: float = within(0.0, 0, 0.1)
-    wander_deg: float = within(0.0, 0, 3)
-    lat_deg: float = within(52.15, -80, 80)
-    lon_deg: float = within(9.95, -180, 180)
-    height_m: float = within(100.0, -500, 9000)
+    slope_std: float = bounded_field(0.03, 0, 0.1)
+    bank_std: float = bounded_field(0.0, 0, 0.1)
+    superelevation: float = bounded_field(0.0, 0, 0.1)
+    wander_deg: float = bounded_field(0.0, 0, 3)
+    lat_deg: float = bounded_field(52.15, -80, 80)
+    lon_deg: float = bounded_field(9.95, -180, 180)
+    height_m: float = bounded_field(100.0, -500, 9000)
     manoeuvres: Manoeuvres = field(default_factory=Manoeuvres)
 
     def __post_init__(self) -> None:

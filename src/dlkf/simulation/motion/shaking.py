@@ -1,5 +1,5 @@
-"""What shakes an IMU in a car and does not tell the speed: engine and gears, fans, road noise through a soft mount,
-rattling; and wheels, which do tell it.
+"""Vibration of an IMU in a car that does not follow the speed: engine and gears, fans, road noise through a soft mount,
+rattling; and wheels, which do.
 
 Every source is a displacement of the IMU along the three axes of the car [m] and a rotation of it on its mount [rad],
 in closed form or as a spline, with its exact rate: tones are A(t) sin φ(t) with the phase φ = 2π ∫f dt integrated
@@ -17,8 +17,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from dlkf.errors import InputError
-from dlkf.settings import Ranged, within
+from dlkf.base.errors import InputError
+from dlkf.base.settings import Ranged, bounded_field
 from dlkf.simulation.motion.routes import Kinematics
 
 Array = NDArray[np.floating]
@@ -42,7 +42,7 @@ class Shaking(Ranged, where="shaking"):
     ``engine``: at a firing frequency of 50 Hz, growing in proportion to it; ``idle_hz`` is the firing frequency at
     standstill, ``idling`` the size there against what it would be in motion (0 for an engine that stops).
     First gear fires ``first_gear`` times a metre, each of the ``gears`` ``gear_step`` times as often as the one below;
-    it changes up at ``shift_hz``, to which ``gears`` 0 holds it whatever the speed, as a variable transmission does.
+    it changes up at ``shift_hz``, to which ``gears`` 0 holds it at any speed, as a variable transmission does.
     ``wheel``: at 15 m/s, with the square of the speed, ``wheel_turns`` per metre. ``hum``: fans and compressors at
     ``hum_hz``, on for ``hum_share`` of the time. ``wander``: relative, slow, of the frequencies of engine and hum.
     ``rumble``: road noise above 6 Hz, at 15 m/s, in proportion to speed and the road's roughness; it comes in bursts,
@@ -54,31 +54,31 @@ class Shaking(Ranged, where="shaking"):
     at ``sway_hz`` with ``sway_damping``.
     """
 
-    loudness: float = within(1.0, 0, 1)
-    engine: float = within(0.0, 0, 20)
-    idle_hz: float = within(25.0, 5, 60)
-    idling: float = within(1.0, 0, 5)
-    gears: int = within(6, 0, 12)
-    first_gear: float = within(9.0, 0.5, 40)
-    gear_step: float = within(0.7, 0.4, 0.95)
-    shift_hz: float = within(80.0, 30, 300)
-    wheel: float = within(0.0, 0, 20)
-    wheel_turns: float = within(0.51, 0.2, 1)
-    hum: float = within(0.0, 0, 20)
-    hum_hz: float = within(24.0, 5, 400)
-    hum_share: float = within(0.5, 0, 1)
-    wander: float = within(0.0, 0, 0.2)
-    rumble: float = within(0.0, 0, 20)
-    bursts: float = within(0.0, 0, 1.5)
-    rattle: float = within(0.0, 0, 100)
-    rattle_per_minute: float = within(30.0, 0, 600)
-    rattle_hz: float = within(30.0, 5, 80)
-    mount_hz: float = within(0.0, 0, 80)
-    mount_damping: float = within(0.1, 0.02, 2)
-    turning: float = within(0.01, 0, 1)
-    sway: float = within(0.0, 0, 0.1)
-    sway_hz: float = within(3.0, 0.5, 20)
-    sway_damping: float = within(0.2, 0.02, 2)
+    loudness: float = bounded_field(1.0, 0, 1)
+    engine: float = bounded_field(0.0, 0, 20)
+    idle_hz: float = bounded_field(25.0, 5, 60)
+    idling: float = bounded_field(1.0, 0, 5)
+    gears: int = bounded_field(6, 0, 12)
+    first_gear: float = bounded_field(9.0, 0.5, 40)
+    gear_step: float = bounded_field(0.7, 0.4, 0.95)
+    shift_hz: float = bounded_field(80.0, 30, 300)
+    wheel: float = bounded_field(0.0, 0, 20)
+    wheel_turns: float = bounded_field(0.51, 0.2, 1)
+    hum: float = bounded_field(0.0, 0, 20)
+    hum_hz: float = bounded_field(24.0, 5, 400)
+    hum_share: float = bounded_field(0.5, 0, 1)
+    wander: float = bounded_field(0.0, 0, 0.2)
+    rumble: float = bounded_field(0.0, 0, 20)
+    bursts: float = bounded_field(0.0, 0, 1.5)
+    rattle: float = bounded_field(0.0, 0, 100)
+    rattle_per_minute: float = bounded_field(30.0, 0, 600)
+    rattle_hz: float = bounded_field(30.0, 5, 80)
+    mount_hz: float = bounded_field(0.0, 0, 80)
+    mount_damping: float = bounded_field(0.1, 0.02, 2)
+    turning: float = bounded_field(0.01, 0, 1)
+    sway: float = bounded_field(0.0, 0, 0.1)
+    sway_hz: float = bounded_field(3.0, 0.5, 20)
+    sway_damping: float = bounded_field(0.2, 0.02, 2)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -102,7 +102,7 @@ class Shaken:
     turned: Array
 
 
-def shaken(
+def shake_mount(
     rng: np.random.Generator,
     kind: Shaking,
     motion_at: Callable[[Array], Kinematics],
@@ -131,7 +131,7 @@ def shaken(
     if kind.rumble > 0 or kind.rattle > 0:
         nodes = np.arange(math.ceil(end * NODE_HZ) + 1) / NODE_HZ
         rolling = np.abs(coarse.speed) / AT_SPEED * roughness(coarse.t)
-        envelope = limited(kind.rumble * np.interp(nodes, coarse.t, rolling))
+        envelope = limit_amplitude(kind.rumble * np.interp(nodes, coarse.t, rolling))
         x = noise(noise_rng, kind, envelope)
         spline = scipy.interpolate.make_interp_spline(nodes, x, k=5)
         at = spline(t)
@@ -202,7 +202,9 @@ def _add_tones(
     cycles, rate = turns.antiderivative()(t), turns(t)
     for order, share in orders:
         w = 2 * math.pi * order * frequency
-        spline = scipy.interpolate.make_interp_spline(nodes, limited(size * gain(kind, order * frequency)) / w**2, k=3)
+        spline = scipy.interpolate.make_interp_spline(
+            nodes, limit_amplitude(size * gain(kind, order * frequency)) / w**2, k=3
+        )
         _add_tone(
             rng, kind, out, math.sqrt(2 * share), 2 * math.pi * order * cycles, 2 * math.pi * order * rate,
             spline(t), spline(t, nu=1),
@@ -216,7 +218,7 @@ def _add_wheels(rng: np.random.Generator, kind: Shaking, out: Shaken, motion: Ki
         size = kind.wheel / (order * per_metre * AT_SPEED) ** 2
         f = order * kind.wheel_turns * np.abs(coarse.speed)
         quick = (2 * math.pi * np.maximum(f, 0.1)) ** 2
-        strength = limited(size * gain(kind, f) * quick) / quick
+        strength = limit_amplitude(size * gain(kind, f) * quick) / quick
         spline = scipy.interpolate.make_interp_spline(coarse.t, _smoothed(strength, 4.0), k=3)
         _add_tone(
             rng, kind, out, math.sqrt(2 * share), order * per_metre * motion.distance, order * per_metre * motion.speed,
@@ -304,7 +306,7 @@ def sway(
     return scipy.interpolate.make_interp_spline(nodes, scipy.signal.lfilter(b, a, asked, axis=0), k=5)
 
 
-def limited(size: Array) -> Array:
+def limit_amplitude(size: Array) -> Array:
     """A size x [m/s²] that saturates at ``LIMIT``, x/(1 + (x/LIMIT)⁴)^¼: within 2 % of it up to half of that."""
     return size / (1 + (size / LIMIT) ** 4) ** 0.25
 

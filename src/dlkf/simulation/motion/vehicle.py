@@ -94,7 +94,7 @@ class Route:
 
 def drive_vehicle(rng: np.random.Generator, config: VehicleConfig, t: Array) -> Truth:
     """One random drive of a point at the uniformly spaced times ``t`` [s], which start at 0."""
-    return follow(random_route(rng, config, float(t[-1])), config, t)
+    return follow_route(random_route(rng, config, float(t[-1])), config, t)
 
 
 def random_route(rng: np.random.Generator, config: VehicleConfig, duration: float) -> Route:
@@ -113,7 +113,7 @@ def random_waves(rng: np.random.Generator, rms: float, lengths: tuple[float, flo
     return Waves(amplitude, 2 * math.pi / wavelength, rng.uniform(0, 2 * math.pi, WAVES))
 
 
-def follow(route: Route, config: VehicleConfig, t: Array) -> Truth:
+def follow_route(route: Route, config: VehicleConfig, t: Array) -> Truth:
     """Truth of a point that moves along a route, at uniform times ``t`` [s]; it has no roll.
 
     Positions are the integral of the velocities by the trapezoid rule with end correction,

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import lightning as L
 from lightning.pytorch.callbacks import Callback, Checkpoint
 
-from dlkf.errors import InputError
-from dlkf.files import whole_file, whole_folder
+from dlkf.base.errors import InputError
+from dlkf.base.files import replace_file, replace_folder
 from dlkf.filters.saved import save_filter
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class ResumePoint(Checkpoint):
         if not trainer.is_global_zero:
             trainer.save_checkpoint(self.folder / LAST)  # all processes take part, the first writes
             return
-        with whole_file(self.folder / LAST) as beside:
+        with replace_file(self.folder / LAST) as beside:
             trainer.save_checkpoint(beside)
 
 
@@ -60,7 +60,7 @@ class BestWeights(Callback):
             self.score, self.epoch = score, trainer.current_epoch
             if not trainer.is_global_zero:
                 return
-            with whole_folder(self.folder / BEST) as beside:
+            with replace_folder(self.folder / BEST) as beside:
                 save_filter(module.filter, beside, self.notes)
 
     def state_dict(self) -> dict:

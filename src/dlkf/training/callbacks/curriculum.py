@@ -5,7 +5,7 @@ from __future__ import annotations
 import lightning as L
 from lightning.pytorch.callbacks import Callback
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 
 
 class LengthCurriculum(Callback):
@@ -33,10 +33,10 @@ class LengthCurriculum(Callback):
         module.log("train/length_s", self.length_s(trainer.current_epoch))
 
     def setup(self, trainer: L.Trainer, module: L.LightningModule, stage: str) -> None:
-        """Hand the law to the data module, which asks it when it cuts an epoch's pieces."""
+        """Hand the law to the data module, which asks it when it cuts an epoch's segments."""
         if stage == "fit":
             trainer.datamodule.length_law = self.length_s  # pyright: ignore[reportAttributeAccessIssue]  set by fit
 
     def state_dict(self) -> dict:
-        """Settings, so that a checkpoint tells what it was trained with."""
+        """Settings, recorded in a checkpoint."""
         return {k: getattr(self, k) for k in ("warm_s", "full_s", "warm_until", "full_from")}

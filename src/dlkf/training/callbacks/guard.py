@@ -9,7 +9,7 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback
 
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
 
 
 class StepGuard(Callback):
@@ -65,7 +65,7 @@ class StepGuard(Callback):
                 group["lr"] = base * self.rate_factor()
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        """Remember weights that are finite."""
+        """Keep weights that are finite."""
         state = module.state_dict()
         if self.in_a_row == 0 and all(bool(x.isfinite().all()) for x in state.values() if x.is_floating_point()):
             self.good = copy.deepcopy(state)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import lightning as L
 from lightning.pytorch.callbacks import Callback
 
-from dlkf.errors import InputError
-from dlkf.training.loss import TERMS
+from dlkf.base.errors import InputError
+from dlkf.training.loss import TERMS, unit_weights
 
 if TYPE_CHECKING:
     from dlkf.training.module import FilterTraining
@@ -53,7 +53,7 @@ class AdaptiveLossWeights(Callback):
     def weights(self) -> dict[str, float]:
         """Weights in force; 1 while the pilot lasts."""
         if not self.pilot:
-            return dict.fromkeys(TERMS, 1.0)
+            return unit_weights()
         if self.rule == "normalised":
             return {t: self._bounded(1.0, self.average.get(t)) for t in TERMS}
         position, against = self.average.get("position"), self.pilot if self.rule == "pilot" else self.average
@@ -64,10 +64,14 @@ class AdaptiveLossWeights(Callback):
         ratio = above / below if above is not None and below else 1.0
         return min(max(ratio, 1 / self.w_max), self.w_max)
 
-    def on_train_epoch_start(self, trainer: L.Trainer, module: FilterTraining) -> None:
-        """Set and log the weights of this epoch."""
-        module.loss_weights = self.weights()
-        module.log_dict({f"train/{k}_weight": v for k, v in module.loss_weights.items()})
+    def setup(self, trainer: L.Trainer, module: FilterTraining, stage: str) -> None:  # type: ignore[override]
+        """Hand the rule to the module, which asks it at every step."""
+        if stage == "fit":
+            module.loss_weights = self.weights
+
+    def on_train_epoch_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """Log the weights of this epoch."""
+        module.log_dict({f"train/{k}_weight": v for k, v in self.weights().items()})
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Take in this epoch's losses; a loss of one's own may leave some out."""

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
+import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback
 
+from dlkf.base.errors import InputError
+from dlkf.base.settings import is_number
 from dlkf.data.drive import Batch
-from dlkf.data.masks import withhold, within
-from dlkf.errors import InputError
-from dlkf.settings import is_number
+from dlkf.data.masks import outage_within, withhold_fixes
+
+if TYPE_CHECKING:
+    from dlkf.training.module import FilterTraining
 
 
 class BatchCallback(Callback):
-    """A callback that changes the batch before the filter sees it; random numbers come from the step."""
+    """A callback that changes the batch before the filter runs; random numbers come from the step."""
+
+    def setup(self, trainer: L.Trainer, module: FilterTraining, stage: str) -> None:  # type: ignore[override]
+        """Hand :meth:`transform` to the module."""
+        if stage == "fit":
+            module.transforms.append(self.transform)
 
     def transform(self, batch: Batch, epoch: int, generator: torch.Generator) -> Batch:
         """The batch of this epoch and step."""
@@ -31,16 +41,16 @@ class GnssDecimation(BatchCallback):
         self.every_s, self.start_epoch = (int(low), int(high)), start_epoch
 
     def transform(self, batch: Batch, epoch: int, generator: torch.Generator) -> Batch:
-        """Keep every n-th fix, n per piece."""
+        """Keep every n-th fix, n per segment."""
         if epoch < self.start_epoch:
             return batch
         B, T, _ = batch.size
         interval = torch.randint(self.every_s[0], self.every_s[1] + 1, (B, 1), generator=generator)
         spacing = (interval / batch.epoch_s).round().long().clamp_min(1)  # epochs
-        return withhold(batch, torch.arange(1, T + 1) % spacing != 0)
+        return withhold_fixes(batch, torch.arange(1, T + 1) % spacing != 0)
 
     def state_dict(self) -> dict:
-        """Settings, so that a checkpoint tells what it was trained with."""
+        """Settings, recorded in a checkpoint."""
         return {"every_s": self.every_s, "start_epoch": self.start_epoch}
 
 
@@ -48,7 +58,7 @@ class OutageInjection(BatchCallback):
     """One outage of ``duration_s`` (low, high) in every sub-trajectory, after the warm-up (R070, R072; paper.md 4.14).
 
     The outage leaves ``before_s`` seconds with GNSS at the start and ``after_s`` at the end, so that
-    re-convergence is trained too; pieces too short for the shortest outage get none.
+    re-convergence is trained too; segments too short for the shortest outage get none.
     """
 
     def __init__(
@@ -70,10 +80,10 @@ class OutageInjection(BatchCallback):
             return batch
         length = shortest + (longest - shortest) * torch.rand(B, 1, generator=generator)
         start = self.before_s + (room - length) * torch.rand(B, 1, generator=generator)
-        return withhold(batch, within(batch, start[:, 0], length[:, 0]))
+        return withhold_fixes(batch, outage_within(batch, start[:, 0], length[:, 0]))
 
     def state_dict(self) -> dict:
-        """Settings, so that a checkpoint tells what it was trained with."""
+        """Settings, recorded in a checkpoint."""
         return {k: getattr(self, k) for k in ("duration_s", "before_s", "after_s", "start_epoch")}
 
 

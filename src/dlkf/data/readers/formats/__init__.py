@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dlkf.data.readers.frames import Table
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
+from dlkf.data.readers.frames import LogTable
 
 FORMATS = {
     "csv": "text",
@@ -21,10 +21,11 @@ FORMATS = {
     "kitti": "oxts",
     "rtklib": "rtklib",
     "novatel": "novatel",
+    "autopilot": "autopilot",
 }
 
 
-def read(format: str, path: Path, *, kind: str, table: str | None, text: Mapping[str, Any], where: str) -> Table:
+def read(format: str, path: Path, *, kind: str, table: str | None, text: Mapping[str, Any], where: str) -> LogTable:
     """The table of a file that holds ``kind`` (imu, gnss, reference), the one called ``table`` if there are several.
 
     ``text`` holds the options of text files. InputError if the format is unknown, its library is not there, or the
@@ -37,7 +38,7 @@ def read(format: str, path: Path, *, kind: str, table: str | None, text: Mapping
 
 
 def library(name: str, what: str) -> Any:
-    """A third-party module of the extra ``readers``, or an InputError that says how to install it."""
+    """A third-party module of the extra ``readers``, or an InputError with how to install it."""
     try:
         return importlib.import_module(name)
     except ImportError:

@@ -11,11 +11,11 @@ import pyarrow as pa
 import pyarrow.feather as feather
 import pyarrow.parquet as pq
 
-from dlkf.data.readers.frames import Table
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
+from dlkf.data.readers.frames import LogTable
 
 
-def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> Table:
+def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
     """A file of columns; time stamps become whole nanoseconds since 1970."""
     try:
         if path.suffix in (".feather", ".arrow", ".ipc"):
@@ -33,4 +33,4 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
     frame.columns = [str(c) for c in frame.columns]
     if not len(frame):
         raise InputError(f"{path}: has no rows; leave the drive out or give its data")
-    return Table(frame, path)
+    return LogTable(frame, path)

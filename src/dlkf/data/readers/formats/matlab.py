@@ -1,7 +1,8 @@
-"""MATLAB files: scipy for versions 4 to 7, h5py for 7.3; NaveGo's structures and plain matrices.
+"""MATLAB files: scipy for versions 4 to 7, h5py for 7.3; structures, plain matrices, vectors of one length.
 
 A structure gives a column for each of its vectors and, of matrices with as many rows, ``name_0``, ``name_1``, …; a
-plain matrix gives columns ``0``, ``1``, …
+plain matrix gives columns ``0``, ``1``, …; vectors of one length that stand by themselves are the table ``vectors``.
+Serial date numbers (days since the year 0) become nanoseconds since 1970.
 """
 
 from __future__ import annotations
@@ -14,59 +15,118 @@ import numpy as np
 import pandas as pd
 import scipy.io
 
+from dlkf.base.errors import InputError
 from dlkf.data.readers.formats import library
-from dlkf.data.readers.frames import Table
-from dlkf.errors import InputError
+from dlkf.data.readers.frames import LogTable
+
+DATENUM_1970 = 719_529.0
+DATENUMS = (723_000.0, 767_000.0)  # 1979 to 2099
+LARGEST_BYTES = 4 << 30
+DEEPEST = 6  # of structures in structures
+VECTORS = "vectors"
 
 
-def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> Table:
+def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
     """The variable ``table``; without a name the one called like ``kind``, or the only one of its size."""
-    variables = _variables(path)
+    tables = variables(path)
     usual = (kind, kind.upper(), "ref" if kind == "reference" else kind)
-    name = table or next((n for n in usual if n in variables), None)
-    if name is None and len(variables) == 1:
-        name = next(iter(variables))
-    if name is None or name not in variables:
-        have = ", ".join(variables) or "nothing"
+    name = table or next((n for n in usual if n in tables), None)
+    if name is None and len(tables) == 1:
+        name = next(iter(tables))
+    if name is None or name not in tables:
+        have = ", ".join(tables) or "nothing"
         raise InputError(f"{path}: no variable {name or kind}; has {have}; set reader.{kind}.table")
-    frame = _frame(variables[name])
+    frame = tables[name] if isinstance(tables[name], pd.DataFrame) else _frame(tables[name], f"{path}: {name}")
     if not len(frame):
         raise InputError(f"{path}: {name} has no rows; give a structure of vectors or a matrix")
-    return Table(frame, path)
+    return LogTable(frame, path)
 
 
-def _variables(path: Path) -> dict[str, Any]:
+def frames(path: Path) -> dict[str, pd.DataFrame]:
+    """The variables that are tables of more than one row, by name."""
+    out = {}
+    for name, value in variables(path).items():
+        frame = value if isinstance(value, pd.DataFrame) else _frame(value, f"{path}: {name}", strict=False)
+        if len(frame) > 1:
+            out[name] = frame
+    return out
+
+
+def variables(path: Path) -> dict[str, Any]:
+    """What a file holds, by name; InputError for one that cannot be read."""
+    found = _loaded(path)
+    vectors = {n: np.squeeze(v) for n, v in found.items() if isinstance(v, np.ndarray) and v.dtype.kind in "fiub"}
+    vectors = {n: v for n, v in vectors.items() if v.ndim == 1 and v.size > 1}
+    length = max((v.size for v in vectors.values()), default=0)
+    alike = {n: v for n, v in vectors.items() if v.size == length}
+    return found | ({VECTORS: _dated(pd.DataFrame(alike))} if len(alike) > 3 and VECTORS not in found else {})
+
+
+def _loaded(path: Path) -> dict[str, Any]:
     try:
         loaded = scipy.io.loadmat(path, simplify_cells=True)
-        return {name: value for name, value in loaded.items() if not name.startswith("__")}
+        found = {name: value for name, value in loaded.items() if not name.startswith("__")}
     except NotImplementedError:  # version 7.3 is HDF5
-        pass
-    except (scipy.io.matlab.MatReadError, ValueError, OSError, TypeError, IndexError, KeyError) as error:
+        return _hdf5_variables(path)
+    except (scipy.io.matlab.MatReadError, ValueError, OSError, TypeError, IndexError, KeyError, MemoryError) as error:
         raise InputError(f"{path}: cannot be read as a MATLAB file ({_first_line(error)}); save it again") from None
+    objects = [n for n, v in found.items() if isinstance(v, scipy.io.matlab.MatlabOpaque)]
+    if objects and len(objects) == len(found):
+        name = objects[0]
+        raise InputError(
+            f"{path}: {', '.join(objects)} are objects (timetables?) that MATLAB alone reads; save structures there: "
+            f"{name} = table2struct(timetable2table({name}), 'ToScalar', true)"
+        )
+    return found
+
+
+def _hdf5_variables(path: Path) -> dict[str, Any]:
     h5py = library("h5py", "a MATLAB file of version 7.3")
     try:
         with h5py.File(path) as file:
-            return {name: _hdf5(h5py, node) for name, node in file.items() if not name.startswith("#")}
-    except OSError as error:
+            _check_size(h5py, file, path)
+            return {name: _hdf5(h5py, node, DEEPEST) for name, node in file.items() if not name.startswith("#")}
+    except (OSError, KeyError, RuntimeError, MemoryError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path}: cannot be read as a MATLAB file ({_first_line(error)}); save it again") from None
 
 
-def _hdf5(h5py: Any, node: Any) -> Any:
-    """MATLAB keeps columns together, so HDF5 has its matrices transposed."""
+def _check_size(h5py: Any, file: Any, path: Path) -> None:
+    """No variable is larger than memory is: a file of some bytes may claim terabytes."""
+
+    def size(_: str, node: Any) -> int | None:
+        return node.nbytes if isinstance(node, h5py.Dataset) and node.nbytes > LARGEST_BYTES else None
+
+    if (large := file.visititems(size)) is not None:  # visits every object once, whatever links lead to it
+        raise InputError(f"{path}: holds a variable of {large / 2**30:.0f} GiB, which no log is; save the log alone")
+
+
+def _hdf5(h5py: Any, node: Any, depth: int) -> Any:
+    """MATLAB keeps columns together, so HDF5 has its matrices transposed; groups that hold themselves end somewhere."""
     if isinstance(node, h5py.Group):
-        return {name: _hdf5(h5py, part) for name, part in node.items()}
-    value = np.asarray(node)
-    return value.T if value.dtype.kind in "fiub" else None
+        return {name: _hdf5(h5py, part, depth - 1) for name, part in node.items()} if depth else None
+    if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "fiub":
+        return None
+    return np.asarray(node).T
 
 
-def _frame(value: Any) -> pd.DataFrame:
+def _frame(value: Any, where: str, strict: bool = True) -> pd.DataFrame:
     if not isinstance(value, Mapping):
-        matrix = np.atleast_2d(np.asarray(value, dtype=float))
+        try:
+            matrix = np.atleast_2d(np.asarray(value, dtype=float))
+        except (TypeError, ValueError):
+            if strict:
+                raise InputError(f"{where} is no matrix of numbers and no structure of vectors") from None
+            return pd.DataFrame()
+        if matrix.ndim > 2:
+            return pd.DataFrame()
         if matrix.shape[0] < matrix.shape[1] and matrix.shape[0] <= 30 < matrix.shape[1]:
             matrix = matrix.T  # a series per row
         return pd.DataFrame(matrix, columns=[str(k) for k in range(matrix.shape[1])])
     arrays = {n: np.squeeze(np.asarray(v)) for n, v in value.items() if _is_numeric(v)}
     rows = max((a.shape[0] for a in arrays.values() if a.ndim == 1), default=0)
+    rows = rows or max((a.shape[0] for a in arrays.values() if a.ndim == 2), default=0)
     out: dict[str, np.ndarray] = {}
     for name, array in arrays.items():
         if array.ndim == 2 and array.shape[0] != rows and array.shape[1] == rows:
@@ -77,11 +137,26 @@ def _frame(value: Any) -> pd.DataFrame:
             out |= {f"{name}_{k}": column for k, column in enumerate(array.T)}
         elif array.ndim == 1 and array.size == 3 and name in ("stdm", "stdv"):  # NaveGo: one 1σ for all rows
             out |= {f"{name}_{k}": np.full(rows, x) for k, x in enumerate(array)}
-    return pd.DataFrame(out)
+    return _dated(pd.DataFrame(out))
+
+
+def _dated(frame: pd.DataFrame) -> pd.DataFrame:
+    """Serial date numbers, which have 10 µs at best, as nanoseconds since 1970."""
+    for name in frame.columns:
+        values = frame[name].to_numpy(float)
+        within = len(values) > 1 and DATENUMS[0] < values.min() and values.max() < DATENUMS[1] and np.ptp(values) < 30
+        if within and np.all(np.diff(values) >= 0) and np.any(values != np.round(values)):
+            frame[name] = np.round((values - DATENUM_1970) * 86_400e6).astype(np.int64) * 1000
+    return frame
 
 
 def _is_numeric(value: Any) -> bool:
-    return value is not None and not isinstance(value, (Mapping, str)) and np.asarray(value).dtype.kind in "fiub"
+    if value is None or isinstance(value, (Mapping, str)):
+        return False
+    try:
+        return np.asarray(value).dtype.kind in "fiub"
+    except ValueError:  # a list of vectors of several lengths
+        return False
 
 
 def _first_line(error: Exception) -> str:

@@ -1,8 +1,9 @@
-"""NMEA 0183 logs by pynmeagps: GGA for position, RMC or VTG for speed and course, GST for the accuracy."""
+"""NMEA 0183 logs by pynmeagps: GGA or GNS for position, RMC or VTG for speed and course, GST for the accuracy."""
 
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,25 +11,56 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from dlkf.base.errors import InputError
 from dlkf.data.readers.formats import library
-from dlkf.data.readers.frames import Table
+from dlkf.data.readers.frames import LogTable
 from dlkf.data.schema import POSITION, STD, VELOCITY
-from dlkf.errors import InputError
 
 KNOTS, KMH = 1852 / 3600, 1 / 3.6
 DAY_NS = 86_400 * 10**9
+MODES = {"N": 0, "A": 1, "D": 2, "P": 2, "R": 4, "F": 5}  # of GNS, a letter a constellation; the best one counts
+HEADINGS = re.compile(rb"\$[A-Z]{2}(HDT|THS),\d")
+BEST = (4, 5, 2, 1, 0)
 COLUMNS = (*POSITION, *VELOCITY, *STD, "quality")
 
 
-def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> Table:
+def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
     """One row per epoch, with the contract's columns and ``utc_ns`` since 1970."""
     with path.open("rb") as stream:
         content = stream.read()
-    return Table(fixes(sentences(content), str(path)), path, "fix")
+    if kind == "heading":
+        return LogTable(headings(sentences(content), str(path)), path, "sentence")
+    return LogTable(fixes(sentences(content), str(path)), path, "fix")
+
+
+def aids(path: Path) -> tuple[str, ...]:
+    """Which further sensors a log has: heading."""
+    return ("heading",) if HEADINGS.search(path.read_bytes()) else ()
+
+
+def headings(messages: Iterator[Any], where: str) -> pd.DataFrame:
+    """HDT and THS, which have no time: each is of the sentence with one before it."""
+    rows: list[dict[str, Any]] = []
+    date: int | None = None
+    of_day: int | None = None
+    for m in messages:
+        if m.msgID in ("RMC", "ZDA"):
+            date = _day(m) or date
+        of_day = of_day if (stamp := _of_day(getattr(m, "time", None))) is None else stamp
+        if m.msgID not in ("HDT", "THS") or of_day is None or getattr(m, "mi", "A") not in ("A", "E"):
+            continue
+        angle = _float(getattr(m, "headingT", getattr(m, "headt", "")))
+        if np.isfinite(angle) and not (rows and rows[-1]["of_day"] == of_day):
+            rows.append({"of_day": of_day, "date": date, "heading_deg": angle})
+    frame = pd.DataFrame(rows)
+    if frame.empty or frame["date"].isna().all():
+        raise InputError(f"{where}: has no HDT or THS sentence with a date (RMC or ZDA); set reader.heading.file=null")
+    frame["utc_ns"] = _stamps(frame["of_day"].to_numpy(np.int64), frame["date"])
+    return frame[["utc_ns", "heading_deg"]]
 
 
 def sentences(content: bytes) -> Iterator[Any]:
-    """The sentences in a log, with whatever else is in it left out."""
+    """The sentences in a log, with everything else left out."""
     pynmeagps = library("pynmeagps", "an NMEA log")
     for line in content.splitlines():
         start = line.find(b"$")
@@ -66,17 +98,21 @@ def fixes(messages: Iterator[Any], where: str) -> pd.DataFrame:
         if m.msgID == "GGA" and m.lat not in ("", None):
             row |= {"lat_deg": m.lat, "lon_deg": m.lon, "quality": int(m.quality)}
             row["height_m"] = _float(m.alt) + np.nan_to_num(_float(m.sep))
+        elif m.msgID == "GNS" and m.lat not in ("", None) and "lat_deg" not in row:
+            codes = {MODES.get(letter, 0) for letter in str(m.posMode)}
+            row |= {"lat_deg": m.lat, "lon_deg": m.lon, "quality": next(code for code in BEST if code in codes | {0})}
+            row["height_m"] = _float(m.alt) + np.nan_to_num(_float(m.sep))
         elif m.msgID == "RMC":
             _set_velocity(row, m.spd, m.cog)
         elif m.msgID == "GST":
             row |= dict(zip(STD[:3], (_float(m.stdLat), _float(m.stdLong), _float(m.stdAlt))))
     if seen is None:
-        raise InputError(f"{where}: has no GGA, RMC or GST sentence; give an NMEA log")
+        raise InputError(f"{where}: has no GGA, GNS, RMC or GST sentence; give an NMEA log")
     frame = pd.DataFrame(rows)
     if "lat_deg" not in frame:
-        raise InputError(f"{where}: has no GGA sentence with a position; log GGA beside RMC")
+        raise InputError(f"{where}: has no GGA or GNS sentence with a position; log GGA beside RMC")
     if frame["date"].isna().all():
-        raise InputError(f"{where}: has no date (RMC or ZDA); log RMC beside GGA")
+        raise InputError(f"{where}: has no date (RMC or ZDA); log RMC beside GGA or GNS")
     for name in COLUMNS:
         if name not in frame:
             frame[name] = np.nan

@@ -16,18 +16,18 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from dlkf.base.errors import InputError
 from dlkf.data.readers import units
 from dlkf.data.readers.formats.text import decoded
-from dlkf.data.readers.frames import Table
+from dlkf.data.readers.frames import LogTable
 from dlkf.data.schema import POSITION, STD, VELOCITY
-from dlkf.errors import InputError
 
 LOG = re.compile(r"^[#%](\w+?)A?,([^;]*);(.*?)(\*[0-9a-fA-F]{8})?$")
 IMUS = ("RAWIMUS", "RAWIMU", "RAWIMUSX", "RAWIMUX")
 SIZES = {"RAWIMUSX": 2, "RAWIMUX": 2}  # IMU info and type stand before week and seconds
 
 
-def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> Table:
+def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
     """An export's table, or the logs of a ``kind``; ``table`` names the IMU's log, or INSPVA."""
     lines = decoded(path, None).splitlines()
     if any(LOG.match(line) for line in lines[:200]):
@@ -35,7 +35,7 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
     return _export(lines, path)
 
 
-def _export(lines: list[str], path: Path) -> Table:
+def _export(lines: list[str], path: Path) -> LogTable:
     heads = [k for k, line in enumerate(lines) if re.search(r"\b(GPSTime|UTCTime|Latitude)\b", line)]
     if not heads or heads[0] + 2 >= len(lines):
         raise InputError(f"{path}: has no header with GPSTime or Latitude; export it with headers")
@@ -65,7 +65,9 @@ def _export(lines: list[str], path: Path) -> Table:
             out[name] = part.iloc[:, 0].to_numpy() if bool(numbers.isna().any()) else numbers.to_numpy()
         at += width
     out |= _weeks(out, dict(zip(names, marks)), str(path))
-    return Table(pd.DataFrame(out, index=cells.index), path, "line", {n: m for n, m in zip(names, marks) if m}, notes)
+    return LogTable(
+        pd.DataFrame(out, index=cells.index), path, "line", {n: m for n, m in zip(names, marks) if m}, notes
+    )
 
 
 def _marks(names: str, units_of_them: str) -> list[str]:
@@ -83,7 +85,7 @@ def _marks(names: str, units_of_them: str) -> list[str]:
 def _weeks(columns: Mapping[str, Any], marks: Mapping[str, str], where: str) -> dict[str, Any]:
     """``Week`` and ``GPSTime`` [s of the week] of an export that has dates instead: of UTC, or of GPS time.
 
-    A date beside seconds of GPSTime tells their week; a time of day is HMS, or seconds of UTCTime.
+    A date beside seconds of GPSTime gives their week; a time of day is HMS, or seconds of UTCTime.
     """
     date = next((n for n in ("GPSDate", "UTCDate", "Date") if n in columns), None)
     if "Week" in columns or date is None:
@@ -127,7 +129,7 @@ def _days(texts: pd.Series, mark: str, where: str) -> np.ndarray:
     return days.to_numpy().astype("datetime64[s]").astype(np.int64)
 
 
-def _logs(lines: list[str], path: Path, kind: str, table: str | None) -> Table:
+def _logs(lines: list[str], path: Path, kind: str, table: str | None) -> LogTable:
     logs: dict[str, list[tuple[int, float, list[str]]]] = {}
     for line in lines:
         if not (found := LOG.match(line)):
@@ -140,10 +142,10 @@ def _logs(lines: list[str], path: Path, kind: str, table: str | None) -> Table:
         name = table or next((n for n in IMUS if n in logs), None)
         if name is None or name not in logs:
             raise InputError(f"{path}: no log {name or ', '.join(IMUS)}; has {have}; set reader.imu.table")
-        return Table(_imu(logs[name], SIZES.get(name, 0)), path, "log")
+        return LogTable(_imu(logs[name], SIZES.get(name, 0)), path, "log")
     if table == "INSPVA" or (kind == "reference" and "INSPVA" in logs):
-        return Table(_inspva(logs.get("INSPVA") or _absent(path, "INSPVA", have)), path, "log")
-    return Table(_best(logs.get("BESTPOS") or _absent(path, "BESTPOS", have), logs.get("BESTVEL", [])), path, "log")
+        return LogTable(_inspva(logs.get("INSPVA") or _absent(path, "INSPVA", have)), path, "log")
+    return LogTable(_best(logs.get("BESTPOS") or _absent(path, "BESTPOS", have), logs.get("BESTVEL", [])), path, "log")
 
 
 def _absent(path: Path, name: str, have: str) -> Any:

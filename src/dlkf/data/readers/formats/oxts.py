@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from dlkf.data.readers.frames import Table
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
+from dlkf.data.readers.frames import LogTable
 
 NAMES = (
     *("lat", "lon", "alt", "roll", "pitch", "yaw", "vn", "ve", "vf", "vl", "vu", "ax", "ay", "az", "af", "al", "au"),
@@ -22,7 +22,7 @@ NAMES = (
 )
 
 
-def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> Table:
+def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
     """The rows beside ``path``, the timestamps.txt; rows without a stamp or a file are left out."""
     stamps = path.read_text().splitlines()
     files = sorted((path.parent / "data").glob("*.txt"))
@@ -47,4 +47,4 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
     again = frame["t"].duplicated()
     if bool(again.any()):
         notes.append(f"{path.parent.name}: {int(again.sum())} rows with the stamp of the row before, left out")
-    return Table(frame[~again], path, "row", {}, tuple(notes[:3]))
+    return LogTable(frame[~again], path, "row", {}, tuple(notes[:3]))

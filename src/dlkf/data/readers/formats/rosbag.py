@@ -7,6 +7,7 @@ carry; else the bag's. The axes of an IMU are those of its frame; velocities of 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,15 +16,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from dlkf.data.readers.formats import library, nmea
-from dlkf.data.readers.frames import Table
+from dlkf.base.errors import InputError
+from dlkf.data.readers.formats import foxglove, library, nmea
+from dlkf.data.readers.frames import LogTable
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
-from dlkf.errors import InputError
 
 Row = dict[str, Any]
 
 
-def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> Table:
+def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
     """The topic ``table``, or the only one whose type holds what ``kind`` needs; ROS 2: the bag's metadata.yaml."""
     with _opened(path) as reader:
         return _read(reader, path, kind, table)
@@ -34,9 +35,26 @@ def holds(path: Path, kind: str) -> bool:
     return any(t in (IMU if kind == "imu" else (*FIX, SENTENCE)) for t in _topics(path).values())
 
 
+def listed(path: Path) -> str:
+    """The topics of a bag and their types."""
+    return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(_topics(path).items())) or "none"
+
+
+def aids(path: Path) -> tuple[str, ...]:
+    """Which further sensors a bag has: speed, where one topic is of the wheels."""
+    return ("speed",) if len(_wheel_topics(_topics(path))) == 1 else ()
+
+
+def _wheel_topics(topics: Mapping[str, str]) -> list[str]:
+    """Topics of the wheels: twists and odometries that are called so, and not by GNSS or a filter's output."""
+    kinds = (*VELOCITIES, *ODOMETRY)
+    return sorted(t for t, kind in topics.items() if kind in kinds and WHEEL.search(t) and not NO_WHEEL.search(t))
+
+
 def velocities_beside(path: Path) -> list[str]:
     """Topics with velocities alone, where the bag's fixes (one topic of NavSatFix) have none."""
     topics = _topics(path)
+    topics = {topic: kind for topic, kind in topics.items() if topic not in _wheel_topics(topics)}
     bare = [kind for kind in topics.values() if kind in (*FIX, SENTENCE)] == ["sensor_msgs/NavSatFix"]
     return sorted(topic for topic, kind in topics.items() if kind in VELOCITIES) if bare else []
 
@@ -51,6 +69,9 @@ def _opened(path: Path) -> Iterator[Any]:
     highlevel = library("rosbags.highlevel", "a ROS bag")
     typesys = library("rosbags.typesys", "a ROS bag")
     bag = path.parent if path.name == "metadata.yaml" else path
+    if path.suffix == ".mcap" and foxglove.is_json(path):
+        yield foxglove.JsonBag(path)
+        return
     store = typesys.get_typestore(typesys.Stores.LATEST)
     try:
         with highlevel.AnyReader([bag], default_typestore=store) as reader:
@@ -62,8 +83,8 @@ def _opened(path: Path) -> Iterator[Any]:
         raise InputError(f"{path}: cannot be read as a bag ({_first_line(error)}); give a whole one") from None
 
 
-def _read(reader: Any, path: Path, kind: str, table: str | None) -> Table:
-    known = {*IMU} if kind == "imu" else {*FIX, SENTENCE}
+def _read(reader: Any, path: Path, kind: str, table: str | None) -> LogTable:
+    known = {"imu": {*IMU}, "speed": {*ODOMETRY, *VELOCITIES}}.get(kind, {*FIX, SENTENCE})
     topics = {c.topic: c for c in reader.connections}
     have = ", ".join(f"{name} ({c.msgtype})" for name, c in sorted(topics.items()))
     if table is not None:
@@ -72,16 +93,19 @@ def _read(reader: Any, path: Path, kind: str, table: str | None) -> Table:
         chosen = [topics[table]]
     else:
         chosen = [c for c in topics.values() if _short(c.msgtype) in known]
+        if kind == "speed":
+            wheels = _wheel_topics({topic: _short(c.msgtype) for topic, c in topics.items()})
+            chosen = [topics[topic] for topic in wheels] or chosen
         if len(chosen) != 1:
             what = "no topic" if not chosen else f"{len(chosen)} topics"
             raise InputError(f"{path}: {what} with {', '.join(sorted(known))}; has {have}; set reader.{kind}.table")
     name = _short(chosen[0].msgtype)
-    every = IMU if kind == "imu" else {**FIX, **VELOCITIES}
+    every = {"imu": IMU, "speed": {**ODOMETRY, **dict.fromkeys(VELOCITIES, _forward)}}.get(kind, {**FIX, **VELOCITIES})
     if name not in (*every, SENTENCE):
         raise InputError(f"{path}: {chosen[0].topic} is {chosen[0].msgtype}; must be {', '.join(every)}")
     messages = ((stamp, reader.deserialize(raw, c.msgtype)) for c, stamp, raw in reader.messages(connections=chosen))
     if name == SENTENCE:
-        return Table(_sentences(messages, f"{path}, {chosen[0].topic}"), path, "message")
+        return LogTable(_sentences(messages, f"{path}, {chosen[0].topic}"), path, "message")
     rows = []
     for stamp, message in messages:
         header = getattr(message, "header", None)
@@ -91,11 +115,11 @@ def _read(reader: Any, path: Path, kind: str, table: str | None) -> Table:
     if not rows:
         raise InputError(f"{path}: topic {chosen[0].topic} has no messages; give another one")
     frame = pd.DataFrame(rows)
-    if kind != "imu":
+    if kind in ("gnss", "reference"):
         for column in (*POSITION, *VELOCITY, *STD):
             if column not in frame:
                 frame[column] = np.nan
-    return Table(frame, path, "message")
+    return LogTable(frame, path, "message")
 
 
 def _imu(m: Any) -> Row:
@@ -109,7 +133,7 @@ def _nav_sat_fix(m: Any) -> Row:
     if m.position_covariance_type > 0:
         east, north, up = (float(np.sqrt(max(x, 0.0))) for x in np.asarray(m.position_covariance)[[0, 4, 8]])
         row |= dict(zip(STD[:3], (north, east, up)))
-    row["quality"] = {-1: 0, 0: 1, 1: 2, 2: 2}.get(int(m.status.status), 1)
+    row["quality"] = {-1: 0, 0: 1, 1: 2, 2: 2}.get(int(m.status.status), 1) if hasattr(m, "status") else 1
     return row
 
 
@@ -121,6 +145,13 @@ def _twist(m: Any) -> Row:
         east, north, up = (float(np.sqrt(max(x, 0.0))) for x in np.asarray(m.twist.covariance)[[0, 7, 14]])
         row |= dict(zip(STD[3:], (north, east, up)))
     return row
+
+
+def _forward(m: Any) -> Row:
+    """Speed along the x axis of the car's frame (REP 105: child_frame_id), and its 1σ where there is one."""
+    twist = m.twist.twist if hasattr(m.twist, "twist") else m.twist
+    variance = float(np.asarray(m.twist.covariance)[0]) if hasattr(m.twist, "covariance") else 0.0
+    return {"speed": twist.linear.x, "std": float(np.sqrt(variance)) if variance > 0 else np.nan}
 
 
 def _nav_pvt(m: Any) -> Row:
@@ -153,13 +184,17 @@ def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0][:120]
 
 
+WHEEL = re.compile(r"wheel|odom|vehicle|can|chassis|encoder|speed", re.IGNORECASE)
+NO_WHEEL = re.compile(r"gnss|gps|fix|ublox|filter|ekf|slam|visual|lidar|imu", re.IGNORECASE)
 SENTENCE = "nmea_msgs/Sentence"  # several make a fix
 IMU: dict[str, Callable[[Any], Row]] = {"sensor_msgs/Imu": _imu}
 FIX: dict[str, Callable[[Any], Row]] = {
     "sensor_msgs/NavSatFix": _nav_sat_fix,
+    "foxglove.LocationFix": _nav_sat_fix,
     "ublox_msgs/NavPVT": _nav_pvt,
     "ublox_msgs/NavPVT7": _nav_pvt,
 }
+ODOMETRY: dict[str, Callable[[Any], Row]] = {"nav_msgs/Odometry": _forward}
 VELOCITIES: dict[str, Callable[[Any], Row]] = {
     "geometry_msgs/TwistStamped": _twist,
     "geometry_msgs/TwistWithCovarianceStamped": _twist,

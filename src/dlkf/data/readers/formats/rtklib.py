@@ -15,17 +15,17 @@ import numpy as np
 import pandas as pd
 import pymap3d
 
+from dlkf.base.errors import InputError
 from dlkf.data.readers import units
 from dlkf.data.readers.formats.text import decoded
-from dlkf.data.readers.frames import Table
+from dlkf.data.readers.frames import LogTable
 from dlkf.data.schema import POSITION, STD, VELOCITY
-from dlkf.errors import InputError
 
 QUALITY = {1: 4, 2: 5, 3: 2, 4: 2, 5: 1, 6: 2}  # fix, float, SBAS, DGPS, single, PPP
 ZONES = {"GPST": "gps", "UTC": "utc"}
 
 
-def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> Table:
+def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
     """The solution's rows; InputError for a solution of baselines, which has no place on the Earth."""
     lines = decoded(path, None).splitlines()
     heads = [k for k, line in enumerate(lines) if line.startswith("%") and re.search(r"\bQ\b", line)]
@@ -55,7 +55,9 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
     short = [n for row, n in zip(rows, numbers) if len(row) != usual]
     if short:
         raise InputError(f"{path}: line {short[0]}: has another number of cells than line {numbers[0]}")
-    return Table(_frame(pd.DataFrame(rows, index=pd.Index(numbers)), names, ZONES[zone], path), path, "line", {}, notes)
+    return LogTable(
+        _frame(pd.DataFrame(rows, index=pd.Index(numbers)), names, ZONES[zone], path), path, "line", {}, notes
+    )
 
 
 def _frame(cells: pd.DataFrame, names: list[str], clock: str, path: Path) -> pd.DataFrame:

@@ -8,14 +8,15 @@ import io
 import re
 import warnings
 import zlib
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from dlkf.data.readers.frames import Table
-from dlkf.errors import InputError
+from dlkf.base.errors import InputError
+from dlkf.data.readers.frames import LogTable
 
 DEFAULTS = {
     "separator": ",",
@@ -26,10 +27,12 @@ DEFAULTS = {
     "encoding": None,
     "lines": None,
 }
+LARGEST_BYTES = 2 << 30  # unpacked: a day of an IMU at 100 Hz is a third
+LARGEST_RATIO, SMALL_BYTES = 100, 64 << 20  # of unpacked to packed size: text of sensors packs tenfold
 ENCODINGS = ("utf-8-sig", "cp1252", "latin-1")  # tried in turn; the last one reads anything
 
 
-def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> Table:
+def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
     """A text table; the frame's index is the number of each row's line in the file."""
     options = {**DEFAULTS, **{k: v for k, v in text.items() if v is not None}}
     if len(options["separator"]) > 1:
@@ -46,28 +49,30 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
     head = keep[:1] if options["header"] else []
     rows = keep[len(head) :]
     if chosen is not None:
-        rows = [k for k in rows if chosen.search(lines[k])]
+        every, rows = rows, [k for k in rows if chosen.search(lines[k])]
+        if not rows:
+            raise InputError(f"{path}: no line matches {pattern}; {_beginnings(lines, every, pattern, kind)}")
     units, notes = {}, []
     if head and len(rows) > 1 and _is_units(lines[rows[0]], lines[rows[1]], options):
         names, cells = (_cells(lines[k], options["separator"]) for k in (head[0], rows[0]))
         units = {n.strip().strip('"'): u.strip().strip('"') for n, u in zip(names, cells)}
         rows = rows[1:]
-    if len(rows) > 1 and (told := _cut_off(lines, rows, content.endswith(("\n", "\r")), options)):
-        notes.append(f"{path.name}: line {rows[-1] + 1}, the last, {told}: left out, the log seems cut off there")
+    if len(rows) > 1 and (detail := _cut_off(lines, rows, content.endswith(("\n", "\r")), options)):
+        notes.append(f"{path.name}: line {rows[-1] + 1}, the last, {detail}: left out, the log seems cut off there")
         rows = rows[:-1]
     frame = _parsed(path, [lines[k] for k in (*head, *rows)], [k + 1 for k in (*head, *rows)], options)
     if not len(frame):
         raise InputError(f"{path}: has no rows; leave the drive out or give its data")
     frame.index = pd.Index([k + 1 for k in rows][: len(frame)])
-    return Table(frame, path, "line", units, tuple(notes))
+    return LogTable(frame, path, "line", units, tuple(notes))
 
 
 def decoded(path: Path, encoding: str | None) -> str:
     """A text file, gzip or not; without an ``encoding`` the first that fits of UTF-8, UTF-16 by its mark, Windows."""
-    opened = gzip.open if path.suffix == ".gz" else open
     try:
-        with opened(path, "rb") as file:
-            raw = file.read()
+        if path.is_file() and path.stat().st_size > LARGEST_BYTES:
+            raise InputError(f"{path}: is {path.stat().st_size / 2**30:.1f} GiB of text; split it, or write Parquet")
+        raw = _unpacked(path) if path.suffix == ".gz" else path.read_bytes()
     except (OSError, EOFError, zlib.error) as error:
         raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
     if encoding is not None:
@@ -87,12 +92,25 @@ def decoded(path: Path, encoding: str | None) -> str:
     raise AssertionError("latin-1 reads any byte")
 
 
+def _unpacked(path: Path) -> bytes:
+    """A gzip file's content; InputError for one that unpacks to more than a log can be."""
+    most = min(LARGEST_BYTES, max(SMALL_BYTES, LARGEST_RATIO * path.stat().st_size))
+    with gzip.open(path, "rb") as file:
+        raw = file.read(most + 1)
+    if len(raw) > most:
+        raise InputError(
+            f"{path}: unpacks to more than {most / 2**30:.2g} GiB, which no log of its size does; split it"
+        )
+    return raw
+
+
 def _parsed(path: Path, lines: list[str], numbers: list[int], options: Mapping[str, Any]) -> pd.DataFrame:
     try:
-        with warnings.catch_warnings():  # of a separator at the end of every line; columns that are not there are told
+        with warnings.catch_warnings():  # of a separator at the end of every line; missing columns are reported
             warnings.simplefilter("ignore", pd.errors.ParserWarning)
             frame = pd.read_csv(
-                io.StringIO("\n".join(lines)),
+                io.BytesIO("\n".join(lines).encode()),  # a StringIO has four bytes a letter
+                encoding="utf-8",
                 sep=options["separator"],
                 decimal=options["decimal"],
                 header=0 if options["header"] else None,
@@ -102,13 +120,24 @@ def _parsed(path: Path, lines: list[str], numbers: list[int], options: Mapping[s
                 low_memory=False,
             )
     except (pd.errors.ParserError, pd.errors.EmptyDataError, ValueError, re.error) as error:
-        told = str(error).splitlines()[0].strip()
-        if found := re.search(r"line (\d+)", told):
+        detail = str(error).splitlines()[0].strip()
+        if found := re.search(r"line (\d+)", detail):
             place = min(int(found[1]), len(numbers)) - 1
-            told = told.replace(found[0], f"line {numbers[place]}")
-        raise InputError(f"{path}: cannot be read as a table: {told}") from None
+            detail = detail.replace(found[0], f"line {numbers[place]}")
+        raise InputError(f"{path}: cannot be read as a table: {detail}") from None
     frame.columns = [str(c).strip() for c in frame.columns]
     return frame
+
+
+def _beginnings(lines: list[str], rows: list[int], pattern: str, kind: str) -> str:
+    """What lines begin with, words before the first number, the most frequent first, and what takes them."""
+    words = (re.match(r"[^\d.+-]*", lines[k][:60]) for k in rows)
+    counts = Counter((found[0] if found else "").strip(" ,;\t") for found in words)
+    said = [f"{word or 'numbers'} ({count})" for word, count in counts.most_common(5)]
+    if not said:
+        return "it has no lines"
+    alike = next((word for word in counts if word and word.split(",")[0] in pattern), next(iter(counts)))
+    return f"its lines begin with {', '.join(said)}; reader.{kind}.lines='^{alike}' takes others"
 
 
 def _cells(line: str, separator: str) -> list[str]:

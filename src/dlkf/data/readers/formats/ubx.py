@@ -1,4 +1,5 @@
-"""u-blox UBX logs by pyubx2: fixes from NAV-PVT, NAV-HPPOSLLH and NAV-COV, an IMU from ESF-RAW or ESF-MEAS.
+"""u-blox UBX logs by pyubx2: fixes from NAV-PVT, NAV-HPPOSLLH and NAV-COV, an IMU from ESF-RAW or ESF-MEAS, speed or
+ticks of wheels from these too, heading from NAV-RELPOSNED.
 
 Both tables have the contract's columns. Stamps are nanoseconds of GPS time: of a fix its iTOW with the week of its
 date; of an IMU sample the sensor's own time tags, brought to iTOW by the time tags' rate (least squares) and the
@@ -7,18 +8,20 @@ earliest arrival between fixes. A constant latency of the IMU remains: ``reader.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import struct
+from collections.abc import Container, Iterable, Iterator, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from dlkf.base.errors import InputError
 from dlkf.data.readers.formats import library
-from dlkf.data.readers.frames import Table
+from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.units import DEG, GPS_EPOCH_UNIX, WEEK_S, leap_seconds
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
-from dlkf.errors import InputError
 
 # dataType of ESF-MEAS and ESF-RAW: contract column, SI per step (u-blox F9 interface description, "External sensor")
 SENSORS = {
@@ -29,39 +32,69 @@ SENSORS = {
     17: ("accel_y", 2.0**-10),
     18: ("accel_z", 2.0**-10),
 }
+SPEED = (11,)  # mm/s
+TICKS = ((8, 9), (10,), (6, 7))  # rear left and right, single, front
+BACKWARD = 1 << 23  # of ticks, whose count has the bits below
+FEWEST = 10
+MESSAGES = ("ESF-RAW", "ESF-MEAS")
 TAG_WRAP = 2**32
 SYNC = b"\xb5b"  # every message begins so
 
 
-def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> Table:
+def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
     """Fixes (``kind`` gnss or reference) or IMU samples of a log; ``table`` ESF-RAW or ESF-MEAS chooses the IMU."""
-    messages, left = _messages(path)
+    messages, left = _messages(path, path.stat().st_mtime_ns)
     notes = (f"{path.name}: the last message is cut off or damaged: {left} bytes left out",) if left else ()
     cut = f"; its last {left} bytes are a message cut off, so copy the log again" if left else ""
     fixes = _fixes(messages)
     if not len(fixes):
         raise InputError(f"{path}: has no NAV-PVT message; log UBX-NAV-PVT, or give GNSS from another file{cut}")
+    wanted = [table] if table else list(MESSAGES)
+    if kind in ("speed", "heading"):
+        found = _headings(messages) if kind == "heading" else _first(_wheels(messages, name) for name in wanted)
+        if not len(found):
+            what = "NAV-RELPOSNED with a valid heading" if kind == "heading" else "speed or ticks of wheels in ESF-MEAS"
+            raise InputError(f"{path}: has no {what}; set reader.{kind}.file=null")
+        return LogTable(found, path, "message", notes=notes)
     if kind != "imu":
-        return Table(fixes, path, "fix", notes=notes)
-    wanted = [table] if table else ["ESF-RAW", "ESF-MEAS"]
+        return LogTable(fixes, path, "fix", notes=notes)
     for name in wanted:
         samples = _samples(messages, name)
         if len(samples):
-            return Table(samples, path, "sample", notes=notes)
+            return LogTable(samples, path, "sample", notes=notes)
     have = ", ".join(sorted({m.identity for m in messages}))
     raise InputError(f"{path}: has no IMU in {' or '.join(wanted)}; has {have}; set reader.imu.format and file{cut}")
 
 
-def _messages(path: Path) -> tuple[list[Any], int]:
+def aids(path: Path) -> tuple[str, ...]:
+    """Which further sensors a log has: speed, heading."""
+    messages, _ = _messages(path, path.stat().st_mtime_ns)
+    found = {"speed": _first(_wheels(messages, name) for name in MESSAGES), "heading": _headings(messages)}
+    return tuple(name for name, table in found.items() if len(table))
+
+
+def _first(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
+    """The first that has rows."""
+    return next((table for table in tables if len(table)), pd.DataFrame())
+
+
+@lru_cache(maxsize=1)  # the IMU, the fixes and the wheels of a log are read one after the other
+def _messages(path: Path, changed: int) -> tuple[list[Any], int]:
     """The messages of use, and how many bytes at the end belong to one that is cut off or damaged."""
     pyubx2 = library("pyubx2", "a UBX log")
     found, end = [], 0
     with path.open("rb") as stream:
-        for raw, message in pyubx2.UBXReader(
+        reader = pyubx2.UBXReader(
             stream, protfilter=pyubx2.UBX_PROTOCOL, quitonerror=pyubx2.ERR_IGNORE, validate=pyubx2.VALCKSUM
-        ):
-            if raw is not None:
-                end = stream.tell()
+        )
+        while True:
+            try:
+                raw, message = reader.read()
+            except (ValueError, TypeError, KeyError, IndexError, struct.error):  # UBX is not all that looks like it
+                continue
+            if raw is None:
+                break
+            end = stream.tell()
             if message is not None and getattr(message, "identity", "").startswith(("NAV-", "ESF-")):
                 found.append(message)
         stream.seek(end)
@@ -75,7 +108,7 @@ def _fixes(messages: list[Any]) -> pd.DataFrame:
     fine = {m.iTOW: m for m in messages if m.identity == "NAV-HPPOSLLH" and not m.invalidLlh}
     spread = {m.iTOW: m for m in messages if m.identity == "NAV-COV"}
     for m in messages:
-        if m.identity != "NAV-PVT" or not (m.validDate and m.validTime):
+        if m.identity != "NAV-PVT" or not (m.validDate and m.validTime) or (stamp := _gps_ns(m)) is None:
             continue
         position = (m.lat, m.lon, m.height / 1000)
         if (hp := fine.get(m.iTOW)) is not None:  # pyubx2 scales: degrees, mm, the high-precision part added
@@ -88,14 +121,19 @@ def _fixes(messages: list[Any]) -> pd.DataFrame:
                 stds[3:] = [float(np.sqrt(max(x, 0.0))) for x in (cov.velCovNN, cov.velCovEE, cov.velCovDD)]
         row: dict[str, float] = dict(zip(POSITION, position))
         row |= dict(zip(VELOCITY, (m.velN / 1000, m.velE / 1000, m.velD / 1000)))
-        row |= dict(zip(STD, stds)) | {"t_ns": _gps_ns(m), "quality": _quality(m)}
+        row |= dict(zip(STD, stds)) | {"t_ns": stamp, "quality": _quality(m)}
         rows[m.iTOW] = row
     return pd.DataFrame(list(rows.values()))
 
 
-def _gps_ns(m: Any) -> int:
-    """GPS time of a NAV-PVT: iTOW in the week of its date."""
-    date = np.datetime64(f"{m.year:04d}-{m.month:02d}-{m.day:02d}T{m.hour:02d}:{m.min:02d}:{min(m.second, 59):02d}")
+def _gps_ns(m: Any) -> int | None:
+    """GPS time of a NAV-PVT: iTOW in the week of its date; None for a date that is none."""
+    try:
+        date = np.datetime64(f"{m.year:04d}-{m.month:02d}-{m.day:02d}T{m.hour:02d}:{m.min:02d}:{min(m.second, 59):02d}")
+    except ValueError:
+        return None
+    if not 1980 <= m.year < 2100:
+        return None
     unix = int(date.astype("datetime64[s]").astype(np.int64))
     gps = unix - GPS_EPOCH_UNIX + int(leap_seconds(unix))
     week = round((gps - m.iTOW / 1000) / WEEK_S)
@@ -111,30 +149,66 @@ def _quality(m: Any) -> int:
 
 def _samples(messages: list[Any], name: str) -> pd.DataFrame:
     """IMU samples: values of one time tag, complete where all six axes are there."""
-    tags: dict[int, dict[str, float]] = {}
-    arrived: dict[int, int] = {}  # tag: GPS time of the last fix before its message
+    tags, arrived = _tagged(messages, name, SENSORS)
+    whole = {tag: values for tag, values in tags.items() if len(values) == len(SENSORS)}
+    if len(whole) < FEWEST:
+        return pd.DataFrame()
+    at = np.array(sorted(whole))
+    rows = [{column: _signed(whole[tag][k]) * step for k, (column, step) in SENSORS.items()} for tag in at]
+    return pd.DataFrame(rows)[[*GYRO, *ACCEL]].assign(t_ns=_on_gps_time(at, np.array([arrived[t] for t in at])))
+
+
+def _wheels(messages: list[Any], name: str) -> pd.DataFrame:
+    """Speed [m/s] of the car's own sensor, else ticks counted on: the mean of the rear wheels, the single tick, the
+    mean of the front ones, whichever there is."""
+    for kinds in (SPEED, *TICKS):
+        tags, arrived = _tagged(messages, name, kinds)
+        whole = {tag: values for tag, values in tags.items() if len(values) == len(kinds)}
+        if len(whole) < FEWEST:
+            continue
+        at = np.array(sorted(whole))
+        stamps = _on_gps_time(at, np.array([arrived[t] for t in at]))
+        values = np.array([[whole[tag][k] for k in kinds] for tag in at])
+        if kinds == SPEED:
+            return pd.DataFrame({"t_ns": stamps, "speed": [1e-3 * _signed(v) for v in values[:, 0]]})
+        backward, count = values & BACKWARD > 0, values & (BACKWARD - 1)
+        step = np.diff(count, axis=0, prepend=count[:1])
+        step = (step + BACKWARD // 2) % BACKWARD - BACKWARD // 2
+        moved = np.where(backward, -np.abs(step), np.abs(step))
+        return pd.DataFrame({"t_ns": stamps, "ticks": np.cumsum(moved, axis=0).mean(1)})
+    return pd.DataFrame()
+
+
+def _headings(messages: list[Any]) -> pd.DataFrame:
+    """NAV-RELPOSNED of a moving base: where its heading is valid, with the week of the NAV-PVT before."""
+    rows, week = [], None
+    for m in messages:
+        if m.identity == "NAV-PVT" and (stamp := _gps_ns(m)) is not None:
+            week = stamp // (WEEK_S * 10**9)
+        if m.identity == "NAV-RELPOSNED" and week is not None and getattr(m, "relPosHeadingValid", 0):
+            stamp = week * WEEK_S * 10**9 + m.iTOW * 10**6
+            rows.append({"t_ns": stamp, "heading_deg": m.relPosHeading, "std_deg": m.accHeading})
+    return pd.DataFrame(rows)
+
+
+def _tagged(messages: list[Any], name: str, wanted: Container[int]) -> tuple[dict[int, dict[int, int]], dict[int, int]]:
+    """Values by time tag and data type, and of every tag the GPS time of the last fix before its message."""
+    tags: dict[int, dict[int, int]] = {}
+    arrived: dict[int, int] = {}
     now, last, turns = None, None, 0
     for m in messages:
         if m.identity == "NAV-PVT":
-            now = _gps_ns(m)
+            now = _gps_ns(m) or now
         if m.identity != name or now is None:
             continue
         for value, sensor, tag in _values(m, name):
-            if sensor not in SENSORS:
+            if sensor not in wanted:
                 continue
             turns += last is not None and tag < last - TAG_WRAP // 2
             last = tag
-            column, step = SENSORS[sensor]
-            unwrapped = tag + turns * TAG_WRAP
-            tags.setdefault(unwrapped, {})[column] = _signed(value) * step
-            arrived[unwrapped] = now
-    whole = {tag: row for tag, row in tags.items() if len(row) == 6}
-    if len(whole) < 10:
-        return pd.DataFrame()
-    at = np.array(sorted(whole))
-    stamps = _on_gps_time(at, np.array([arrived[t] for t in at]))
-    frame = pd.DataFrame([whole[t] for t in at])
-    return frame[[*GYRO, *ACCEL]].assign(t_ns=stamps)
+            tags.setdefault(tag + turns * TAG_WRAP, {})[sensor] = value
+            arrived[tag + turns * TAG_WRAP] = now
+    return tags, arrived
 
 
 def _values(m: Any, name: str) -> Iterator[tuple[int, int, int]]:

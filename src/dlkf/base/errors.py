@@ -1,0 +1,30 @@
+"""A user's mistake, and the end that a signal asks for."""
+
+import difflib
+from collections.abc import Iterable
+
+CLOSE = 0.7  # difflib's ratio from which on another name is worth naming
+
+
+class InputError(ValueError):
+    """Something the user gave is wrong: the message names what, where (drive, row), and the remedy.
+
+    Commands print it as one line and exit with code 2.
+    """
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """``; did you mean x?`` where a known name is close to this one, else nothing; of several as close the one that
+    begins alike, then the first."""
+
+    def closeness(other: str) -> tuple[float, int]:
+        alike = next((k for k, (a, b) in enumerate(zip(other, name)) if a != b), min(len(other), len(name)))
+        return difflib.SequenceMatcher(None, other, name).ratio(), alike
+
+    name = str(name)
+    best = max(known, key=closeness, default="")
+    return f"; did you mean {best}?" if best and closeness(best)[0] >= CLOSE else ""
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM: the command ends as after Ctrl-C, with exit code 143."""

@@ -1,0 +1,105 @@
+"""Unit and clock offset of a wheel speed, from the speed of GNSS.
+
+Both speeds lie on a grid of half a second and are correlated over all lags at which the logs overlap, by FFT
+(normalised correlation with masks, Padfield 2012); then the offset between the steps is that of the least sum of
+squares of scale · wheel(t − lag) − GNSS(t), its 1σ from the residuals over the accelerations:
+σ² = s² / Σ (dv/dt)².
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dlkf.data.discovery.motion import Floats, Motion
+
+STEP_S = 0.5
+LEAST_S = 30.0  # of common time
+NEIGHBOUR_S = 5.0  # lags this close belong to one peak
+FINE_S, REACH_S = 0.02, 1.0  # of the search between the steps
+MOVING = 2.0  # m/s
+LEAST_ALIKE, LEAST_GAIN = 0.9, 15.0
+WHITE_S = 1.0  # residuals of a receiver's speed are alike over so long
+
+
+class Wheel(NamedTuple):
+    """``lag_s`` ± ``lag_std`` is added to the wheel's stamps to give those of GNSS; ``scale`` is m/s per unit."""
+
+    lag_s: float
+    lag_std: float
+    scale: float
+    scale_std: float
+    alike: float  # correlation of the two speeds at the lag
+    clear: bool  # no other lag explains nearly as much
+
+
+def find_wheel(t: Floats, speed: Floats, gnss: Motion) -> Wheel | None:
+    """The lag and scale of the best agreement, of speeds without their sign; None where the logs have too little in
+    common, or the car keeps its speed."""
+    good = np.isfinite(speed)
+    t, speed = t[good], np.abs(speed[good])
+    if len(t) < 20 or len(gnss.t) < 20 or np.ptp(speed) == 0 or np.ptp(gnss.speed) < MOVING:
+        return None
+    wheel, here = _gridded(t, speed)
+    ground, there = _gridded(gnss.t, gnss.speed)
+    alike, count = _correlations(wheel, here, ground, there)
+    lags = (np.arange(len(alike)) - (len(wheel) - 1)) * STEP_S + gnss.t[0] - t[0]
+    allowed = count * STEP_S >= min(LEAST_S, 0.5 * min(np.ptp(t), np.ptp(gnss.t)))
+    if not allowed.any():
+        return None
+    gain = np.where(allowed, -0.5 * count * np.log1p(-(np.clip(alike, 0.0, 0.9999) ** 2)), -np.inf)
+    best = int(gain.argmax())
+    rival = np.where(np.abs(lags - lags[best]) > NEIGHBOUR_S, gain, -np.inf).max()
+    clear = alike[best] > LEAST_ALIKE and gain[best] - rival > LEAST_GAIN
+    return _between(t, speed, gnss, float(lags[best]), bool(clear))
+
+
+def _gridded(t: Floats, v: Floats) -> tuple[Floats, Floats]:
+    """Speeds on the grid from the first stamp on, and 1 where there are samples near."""
+    grid = np.arange(t[0], t[-1] + STEP_S / 2, STEP_S)
+    nearest = np.abs(t[np.clip(np.searchsorted(t, grid), 0, len(t) - 1)] - grid)
+    usual = float(np.median(np.diff(t)))
+    return np.interp(grid, t, v), (nearest <= max(2 * usual, STEP_S)).astype(float)
+
+
+def _correlations(a: Floats, a_there: Floats, b: Floats, b_there: Floats) -> tuple[Floats, Floats]:
+    """Normalised correlation of b with a, which begins ``k − (len(a) − 1)`` steps after b does, and the overlap."""
+    from scipy import fft
+
+    size = fft.next_fast_len(len(a) + len(b) - 1)
+
+    def against(x: Floats, y: Floats) -> Floats:
+        out = fft.irfft(np.conj(fft.rfft(x, size)) * fft.rfft(y, size), size)
+        return np.concatenate((out[size - len(a) + 1 :], out[: len(b)]))
+
+    a, b = (a - np.average(a, weights=a_there)) * a_there, (b - np.average(b, weights=b_there)) * b_there
+    count = np.maximum(np.round(against(a_there, b_there)), 1.0)
+    mean_a, mean_b = against(a, b_there) / count, against(a_there, b) / count
+    covariance = against(a, b) / count - mean_a * mean_b
+    power = [against(a * a, b_there) / count - mean_a**2, against(a_there, b * b) / count - mean_b**2]
+    least = [1e-3 * float((x * x).mean()) + 1e-12 for x in (a, b)]
+    return covariance / np.sqrt(np.maximum(power[0], least[0]) * np.maximum(power[1], least[1])), count
+
+
+def _between(t: Floats, speed: Floats, gnss: Motion, lag_s: float, clear: bool) -> Wheel | None:
+    """The offset between the steps of the search."""
+    lags = lag_s + np.arange(-REACH_S, REACH_S + FINE_S / 2, FINE_S)
+    inside = (gnss.t > t[0] + lags[-1]) & (gnss.t < t[-1] + lags[0]) & np.isfinite(gnss.speed)
+    if inside.sum() < 10:
+        return None
+    at, ground = gnss.t[inside], gnss.speed[inside]
+    shifted = np.interp(at[:, None] - lags, t, speed)
+    scale = (shifted * ground[:, None]).sum(0) / np.maximum((shifted * shifted).sum(0), 1e-12)
+    left = np.mean((scale * shifted - ground[:, None]) ** 2, 0)
+    best = int(left.argmin())
+    if 0 < best < len(lags) - 1 and (bend := left[best - 1] - 2 * left[best] + left[best + 1]) > 0:
+        lag = lags[best] + FINE_S * 0.5 * (left[best - 1] - left[best + 1]) / bend
+    else:
+        lag, clear = lags[best], False
+    slope = np.gradient(scale[best] * shifted[:, best], at)
+    apart = max(1.0, WHITE_S / max(float(np.median(np.diff(at))), 1e-3))
+    std = np.sqrt(apart * left[best] / max(float((slope * slope).sum()), 1e-12))
+    scale_std = np.sqrt(apart * left[best] / max(float((shifted[:, best] ** 2).sum()), 1e-12))
+    alike = float(np.corrcoef(shifted[:, best], ground)[0, 1]) if np.ptp(shifted[:, best]) > 0 else 0.0
+    return Wheel(float(lag), float(std), float(scale[best]), float(scale_std), alike, clear)

@@ -1,0 +1,190 @@
+"""Physical limits of samples, fixes and estimates: what no car and no sensor of one can give.
+
+They stand in front of every filter, in batch runs, in streams and in the exported C (which takes the numbers from
+here). A sample beyond full scale, or a fix that no car can have reached since the last good one, is refused and
+counted. A receiver that was right all along is not refused for ever: fixes in a row that agree with each other replace
+the good one (:class:`FixScreen`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from dlkf.data.schema import POSITION, STD, VELOCITY
+
+FULL_SCALE = (400.0, 40.0)  # m/s², rad/s: beyond any IMU of a car, so a damaged packet
+FASTEST_M_S, STEEPEST_M_S = 120.0, 30.0  # m/s, horizontally and vertically: beyond any road car
+JUMP_M, JUMP_SIGMAS = 100.0, 6.0  # two good fixes differ by the way between them, this, and so many of their 1σ
+MOST_JUMP_STD_M = 500.0  # m: of a 1σ so much counts there
+HEIGHTS_M = (-1000.0, 10_000.0)  # of a road above the ellipsoid
+LARGEST_STD = 1e4  # m, m/s: a fix with a larger 1σ is not used
+NOWHERE_DEG = 1e-6  # °, both: what receivers write before they have a position
+FROZEN_SPEED_M_S, FROZEN_M = 2.0, 10.0  # a position that stays while its own velocity makes such a way
+AGREEING_FIXES, AGREEING_S = 5, 10.0  # refused fixes that agree with each other for so long replace the good one
+LEVER_ARM_M = 30.0  # no antenna of a car is further from its IMU
+ESTIMATE_M_S, ESTIMATE_HEIGHTS_M = 200.0, (-2000.0, 20_000.0)  # an estimate beyond is that of a diverged filter
+# a filter whose position is off by so much and by so many 1σ of the fix, in so many fixes in a row that take so long
+LOST_M, LOST_SIGMAS, LOST_FIXES, LOST_S = 25.0, 10.0, 10, 10.0
+EARTH_M = 6_371_000.0  # m, mean radius: distances to 0.5 %
+
+
+class Refused(NamedTuple):
+    """How many samples and fixes of a drive lie beyond the limits and were left out."""
+
+    samples: int = 0
+    fixes: int = 0
+
+    def __str__(self) -> str:
+        """As a part of a sentence; empty where nothing was refused."""
+        words = (("sample", "samples"), ("fix", "fixes"))
+        return " and ".join(f"{n} {one if n == 1 else many}" for n, (one, many) in zip(self, words) if n)
+
+
+NONE_REFUSED = Refused()
+
+
+class GoodFix(NamedTuple):
+    """A fix as far as the next one is compared with it."""
+
+    t: float  # s
+    lat_deg: float
+    lon_deg: float
+    height_m: float
+    std_m: float  # horizontal and vertical 1σ together
+    since: float  # s: the first fix in a row at exactly this place
+
+
+def within_full_scale(accel: np.ndarray, gyro: np.ndarray) -> np.ndarray:
+    """Rows (n,) of specific force and rate (n, 3) [m/s², rad/s] that a sensor can give; NaN is none."""
+    return np.all(np.abs(accel) <= FULL_SCALE[0], -1) & np.all(np.abs(gyro) <= FULL_SCALE[1], -1)
+
+
+def horizontal_distance(lat_a, lon_a, lat_b, lon_b):
+    """Great-circle distance [m] between places [°] on a sphere (haversine), element by element."""
+    a, b = np.radians(lat_a), np.radians(lat_b)
+    half = np.sin((b - a) / 2) ** 2 + np.cos(a) * np.cos(b) * np.sin(np.radians(lon_b - lon_a) / 2) ** 2
+    return 2 * EARTH_M * np.arcsin(np.sqrt(np.clip(half, 0.0, 1.0)))
+
+
+def _spread(std: np.ndarray) -> np.ndarray:
+    """1σ (n,) [m] of positions from their three components (n, 3); NaN counts as zero."""
+    return np.minimum(np.sqrt((np.nan_to_num(std, nan=0.0) ** 2).sum(-1)), MOST_JUMP_STD_M)
+
+
+def reachable(dt, way_m, climb_m, std_m):
+    """Whether a car can have moved so far [m] in ``dt`` [s]; ``std_m`` is the sum of both fixes' 1σ."""
+    slack = JUMP_M + JUMP_SIGMAS * std_m
+    return (way_m <= FASTEST_M_S * dt + slack) & (np.abs(climb_m) <= STEEPEST_M_S * dt + slack)
+
+
+class FixScreen:
+    """Fixes one at a time, each compared with the last good one; those that no car can have reached are refused.
+
+    ``switched`` holds time [s] and length [m] of the jumps that were accepted in the end, because ``AGREEING_FIXES``
+    fixes in a row over ``AGREEING_S`` seconds agreed with each other, against as many good ones before. Where fewer
+    were good than now agree, these replace them at once: a first fix that was wrong refuses no second.
+    """
+
+    def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all fixes."""
+        self._good: GoodFix | None = None
+        self._count = 0  # good fixes in a row, up to AGREEING_FIXES
+        self._other: GoodFix | None = None  # the last refused one
+        self._others, self._others_since = 0, 0.0
+        self.switched: list[tuple[float, float]] = []
+
+    def refused(self, t: float, place: tuple[float, float, float], speed: float, std: np.ndarray) -> str:
+        """Why a fix cannot be: time [s], lat [°], lon [°], height [m], speed [m/s] or NaN, 1σ (6); empty if it can."""
+        lat, lon, height = place
+        if reason := implausible(lat, lon, height, speed, std):
+            return reason
+        fix = GoodFix(t, lat, lon, height, float(_spread(std[:3])), t)
+        if self._good is None:
+            return self._take(fix)
+        if self._reaches(self._good, fix):
+            same = self._good.lat_deg == lat and self._good.lon_deg == lon
+            since = self._good.since if same else t
+            if same and speed > FROZEN_SPEED_M_S and speed * (t - since) > FROZEN_M:
+                return f"the position stays while the velocity is {speed:.1f} m/s: a frozen receiver"
+            self._others, self._other = 0, None
+            return self._take(fix._replace(since=since)) if t >= self._good.t else ""
+        agrees = self._other is not None and self._reaches(self._other, fix)
+        self._others = self._others + 1 if agrees else 1
+        self._others_since = self._others_since if agrees else t
+        self._other = fix
+        enough = self._others >= AGREEING_FIXES and t - self._others_since >= AGREEING_S
+        way = float(horizontal_distance(self._good.lat_deg, self._good.lon_deg, lat, lon))
+        if enough or self._count < min(self._others, AGREEING_FIXES):
+            if self._count >= AGREEING_FIXES:
+                self.switched.append((t, max(way, abs(height - self._good.height_m))))
+            self._count = self._others - 1
+            self._others, self._other = 0, None
+            return self._take(fix)
+        climb, dt = height - self._good.height_m, abs(t - self._good.t)
+        return f"{way:.0f} m off and {climb:+.0f} m up in {dt:.1f} s: no car moves so far"
+
+    def _take(self, fix: GoodFix) -> str:
+        self._good = fix
+        self._count = min(self._count + 1, AGREEING_FIXES)
+        return ""
+
+    @staticmethod
+    def _reaches(a: GoodFix, b: GoodFix) -> bool:
+        way = horizontal_distance(a.lat_deg, a.lon_deg, b.lat_deg, b.lon_deg)
+        return bool(reachable(abs(b.t - a.t), way, b.height_m - a.height_m, a.std_m + b.std_m))
+
+
+def implausible(lat: float, lon: float, height: float, speed: float, std: np.ndarray) -> str:
+    """What is beyond the limits in one fix by itself, or nothing."""
+    if abs(lat) < NOWHERE_DEG and abs(lon) < NOWHERE_DEG:
+        return "at 0°/0°: no position yet"
+    if not HEIGHTS_M[0] <= height <= HEIGHTS_M[1]:
+        return f"height {height:.4g} m lies outside {HEIGHTS_M[0]:g} to {HEIGHTS_M[1]:g} m"
+    if speed > FASTEST_M_S:
+        return f"a velocity of {speed:.4g} m/s is beyond any car"
+    if (np.nan_to_num(std, nan=0.0) > LARGEST_STD).any():
+        return f"a 1σ beyond {LARGEST_STD:g} m or m/s"
+    return ""
+
+
+class Screened(NamedTuple):
+    """What a screen made of a table of fixes."""
+
+    keep: np.ndarray  # (n,) bool
+    first: str  # the first row that was refused and why; empty if none was
+    switched: list[tuple[float, float]]  # FixScreen.switched
+
+
+def screen_fixes(gnss: dict[str, np.ndarray]) -> Screened:
+    """A table of usable fixes in order of time through a :class:`FixScreen`; no loop where no two contradict."""
+    t, (lat, lon, height) = gnss["t"], (gnss[c] for c in POSITION)
+    std = np.stack([gnss[c] for c in STD], -1)
+    speed = np.sqrt(sum(gnss[c] ** 2 for c in VELOCITY))
+    spread = _spread(std[:, :3])
+    keep = np.ones(len(t), bool)
+    way = horizontal_distance(lat[:-1], lon[:-1], lat[1:], lon[1:])
+    still = (np.diff(lat) == 0) & (np.diff(lon) == 0)
+    with np.errstate(invalid="ignore"):
+        alone = (
+            ((np.abs(lat) < NOWHERE_DEG) & (np.abs(lon) < NOWHERE_DEG))
+            | (height < HEIGHTS_M[0]) | (height > HEIGHTS_M[1]) | (speed > FASTEST_M_S)
+            | (np.nan_to_num(std, nan=0.0) > LARGEST_STD).any(-1)
+        )  # fmt: skip
+        frozen = still & (speed[1:] > FROZEN_SPEED_M_S)
+    apart = ~reachable(np.diff(t), way, np.diff(height), spread[:-1] + spread[1:])
+    if not (alone.any() or apart.any() or frozen.any()):
+        return Screened(keep, "", [])
+    screen, first = FixScreen(), ""
+    for k in range(len(t)):
+        speed_k = float(speed[k]) if math.isfinite(speed[k]) else math.nan
+        reason = screen.refused(float(t[k]), (float(lat[k]), float(lon[k]), float(height[k])), speed_k, std[k])
+        if reason:
+            keep[k] = False
+            first = first or f"t = {t[k]:.3f}: {reason}"
+    return Screened(keep, first, screen.switched)

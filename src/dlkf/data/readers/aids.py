@@ -1,0 +1,199 @@
+"""Further sensors of a drive as tables of the contract: wheel speed, heading, barometer; and their clocks and units."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from dlkf.base.errors import InputError
+from dlkf.data.discovery.clock import known_offset
+from dlkf.data.discovery.motion import Motion, motion
+from dlkf.data.discovery.wheel import Wheel, find_wheel
+from dlkf.data.readers import units
+from dlkf.data.readers.mapping import Mapped
+from dlkf.data.schema import VELOCITY
+
+AUTO = "auto"
+PRESSURE = {"pa": 1.0, "hpa": 100.0, "mbar": 100.0, "kpa": 1000.0}
+TURNS = {"rpm": 1 / 60, "turns": 1.0}  # turns (a second), with radius_m
+COUNTS = ("ticks", "turns", "m")  # what has been gained since the beginning; its rate is the speed
+NEAR = 0.15  # of a wheel's scale from a known unit: tyres differ by some per cent
+KNOWN = {**units.SPEED, "cm/s": 0.01, "mm/s": 1e-3}
+
+
+def aid_frame(name: str, mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
+    """The contract's table of an aid at times ``t``; rows without a value are left out."""
+    frame = {"speed": _speed, "heading": _heading, "baro": _baro}[name](mapped, t)
+    values = [c for c in frame if c not in ("t", "std")]
+    known = frame[values].notna().any(axis=1) & (frame["t"].diff().fillna(1.0) > 0)
+    return frame[known].reset_index(drop=True)
+
+
+def read_aids(
+    mapped: Mapping[str, Mapped], zero: int, gnss: Mapped | None, fixes: pd.DataFrame | None, where: str
+) -> tuple[dict[str, pd.DataFrame], dict[str, Any], list[str]]:
+    """Tables, specs without ``auto``, and what was found, of the aids of a drive that counts from the second ``zero``.
+
+    ``gnss`` and ``fixes`` are the fixes' mapping and table on the drive's clock, by which a wheel's clock and unit are
+    found. InputError where they are not clear.
+    """
+    frames, specs, notes = {}, {}, []
+    moved = None if fixes is None or len(fixes) < 3 else _motion(fixes)
+    for name, part in mapped.items():
+        spec, found = _settled(name, part, zero, gnss, moved, f"{where}: {part.table.path.name}")
+        done = Mapped(part.table, spec, name, part.parts)
+        frames[name], specs[name] = aid_frame(name, done, _times(done, zero)), spec
+        if not len(frames[name]):
+            raise InputError(f"{where}: {part.table.path.name} has no value of {name}; set reader.{name}.file=null")
+        notes += found
+    return frames, specs, notes
+
+
+def _times(mapped: Mapped, zero: int) -> np.ndarray:
+    """Seconds on the drive's clock, with what is left ``auto`` as zero."""
+    time = dict(mapped.spec.get("time") or {})
+    time["offset_s"] = None if time.get("offset_s") == AUTO else time.get("offset_s")
+    whole, part = Mapped(mapped.table, {**mapped.spec, "time": time}, mapped.kind, mapped.parts).stamps()
+    return (whole - zero) + part
+
+
+def _motion(fixes: pd.DataFrame) -> Motion:
+    good = fixes[(fixes["quality"] > 0) & fixes["lat_deg"].notna()]
+    t, lat, lon = (good[c].to_numpy() for c in ("t", "lat_deg", "lon_deg"))
+    return motion(t, lat, lon, good[list(VELOCITY)].to_numpy())
+
+
+def _settled(
+    name: str, mapped: Mapped, zero: int, gnss: Mapped | None, moved: Motion | None, where: str
+) -> tuple[dict[str, Any], list[str]]:
+    """Offset and unit that are left ``auto``: of a table beside the fixes as those have it, of a wheel by its speed."""
+    spec: dict[str, Any] = copy.deepcopy(dict(mapped.spec))
+    time, notes = dict(spec.get("time") or {}), []
+    spec["time"] = time
+    if time.get("offset_s") == AUTO and gnss is not None and gnss.table.path == mapped.table.path:
+        said = gnss.spec.get("time") or {}
+        drift = float(said.get("drift_ppm") or 0.0)
+        (whole, part), (first, rest) = (one.own_stamps() for one in (mapped, gnss))
+        later = float(whole[0] - first[0]) + float(part[0] - rest[0])
+        time |= {"offset_s": float(said.get("offset_s") or 0.0) + 1e-6 * drift * later, "drift_ppm": drift}
+    elif time.get("offset_s") == AUTO and name != "speed":
+        time["offset_s"] = 0.0
+        notes.append(f"took reader.{name}.time.offset_s=0: nothing relates its clock to that of the IMU")
+    value = spec.get("value") if name == "speed" else None
+    if value is None or AUTO not in (time.get("offset_s"), value.get("unit")):
+        return spec, notes
+    if moved is None:
+        raise InputError(f"{where}: reader.speed.…=auto needs GNSS to compare with; give value.unit and time.offset_s")
+    value = spec["value"] = dict(value)
+    one = {**value, "unit": 1.0} if value.get("unit") == AUTO else value
+    neutral = Mapped(mapped.table, {**spec, "value": one}, name, mapped.parts)
+    raw = aid_frame(name, neutral, _times(neutral, zero))
+    wheel = find_wheel(raw["t"].to_numpy(), raw["speed"].to_numpy(), moved)
+    if wheel is None or not wheel.clear:
+        why = "too little in common" if wheel is None else f"they agree to {wheel.alike:.2f} of 1 at best"
+        raise InputError(
+            f"{where}: not sure that this is the speed of a wheel: against the speed of GNSS {why}; give "
+            "reader.speed.time.offset_s and reader.speed.value.unit, or leave it out with reader.speed.file=null"
+        )
+    if time.get("offset_s") == AUTO:
+        found = 0.0 if abs(wheel.lag_s) < 3 * wheel.lag_std else round(wheel.lag_s, 4)
+        time["offset_s"] = found
+        detail = f"{wheel.lag_s:+.3f} ± {wheel.lag_std:.3f} s, speeds agree to {wheel.alike:.3f} of 1"
+        notes.append(f"found reader.speed.time.offset_s={found}  ({detail}{known_offset(wheel.lag_s)})")
+    if value.get("unit") == AUTO:
+        value["unit"], detail = _unit(wheel, _counts(neutral))
+        notes.append(f"found reader.speed.value.unit={value['unit']}  ({detail})")
+    return spec, notes
+
+
+def _unit(wheel: Wheel, counts: bool) -> tuple[str | float, str]:
+    """The unit of about a scale; a number where it is none of those known: of ticks, whose scale is lost so."""
+    detail = f"{wheel.scale:.4g} ± {wheel.scale_std:.1g} m/s of GNSS per unit"
+    near = {name: abs(np.log(wheel.scale / value)) for name, value in KNOWN.items()} if wheel.scale > 0 else {}
+    best = min(near, key=lambda name: near[name], default=None)
+    if best is not None and near[best] < NEAR and not counts:
+        return best, detail
+    return float(f"{wheel.scale:.5g}"), f"{detail}: no unit that is known, so a number by GNSS"
+
+
+def _speed(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
+    """Forward speed [m/s]: the mean of the columns (wheels of one axle), or of what they gained between two rows,
+    which is the speed in the middle between them."""
+    entry = mapped.spec["value"]
+    values = np.nanmean(mapped.vector("value", tuple(range(1, 9)), nan=True), axis=1)
+    unit = entry.get("unit") or "m/s"
+    if _counts(mapped):
+        values = _gained(values)
+        t, values = (t[1:] + t[:-1]) / 2, values / np.maximum(np.diff(t), 1e-9)
+    out = pd.DataFrame({"t": t, "speed": values * _metres(entry, unit)})
+    if mapped.has("std") and len(out) == len(mapped):
+        out["std"] = mapped.vector("std", (1,), nan=True)[:, 0] * _metres(entry, unit)
+    return out
+
+
+def _counts(mapped: Mapped) -> bool:
+    """Whether the columns count on, by the unit, by ``counts``, or as a reader's own column of ticks does."""
+    entry = mapped.spec["value"]
+    if entry.get("counts") is not None or entry.get("unit") in COUNTS:
+        return bool(entry.get("counts", True)) or entry.get("unit") in COUNTS
+    first = str(entry["columns"][0]).split(" | ")
+    return next((name for name in first if name in mapped.table.frame), "") == "ticks"
+
+
+def _gained(values: np.ndarray) -> np.ndarray:
+    """Differences of counters, which begin again at a power of two."""
+    step = np.diff(values)
+    top = float(np.nanmax(np.abs(values), initial=1.0))
+    wrap = 2.0 ** np.ceil(np.log2(max(top, 2.0)))
+    return np.where(step < -wrap / 2, step + wrap, np.where(step > wrap / 2, step - wrap, step))
+
+
+def _metres(entry: Mapping[str, Any], unit: Any) -> float:
+    """Metres (a second) per unit: of ticks by ``per_metre``, or by ``per_turn`` and ``radius_m``; of turns by the
+    radius."""
+    where = "reader.speed.value"
+    if unit == "m":
+        return 1.0
+    if unit == "ticks" and entry.get("per_metre"):
+        return 1.0 / float(entry["per_metre"])
+    if unit == "ticks" or unit in TURNS:
+        needed = ("radius_m", "per_turn") if unit == "ticks" else ("radius_m",)
+        if missing := [key for key in needed if not entry.get(key)]:
+            more = " (or per_metre)" if unit == "ticks" else ""
+            raise InputError(
+                f"{where}.{missing[0]} is missing; unit={unit} needs {' and '.join(needed)}{more}, or auto"
+            )
+        around = 2 * np.pi * float(entry["radius_m"])
+        return around * TURNS[unit] if unit in TURNS else around / float(entry["per_turn"])
+    return units.factor(unit, {**units.SPEED, "ticks": 1.0, "turns": 1.0, "rpm": 1.0}, f"{where}.unit")
+
+
+def _heading(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
+    """Heading of the car [rad] clockwise from North, ``antennas_deg`` (their bearing in the car) taken off."""
+    entry = mapped.spec["value"]
+    angle = mapped.vector("value", (1,), nan=True)[:, 0] * mapped.scale("value", units.ANGLE)
+    if (entry.get("convention") or "ned") == "enu":
+        angle = np.pi / 2 - angle
+    angle = angle - units.DEG * float(entry.get("antennas_deg") or 0.0)
+    out = pd.DataFrame({"t": t, "heading": np.mod(angle + np.pi, 2 * np.pi) - np.pi})
+    if mapped.has("std"):
+        out["std"] = mapped.vector("std", (1,), nan=True)[:, 0] * mapped.scale("value", units.ANGLE)
+    return out
+
+
+def _baro(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
+    """Pressure [Pa], or height [m]."""
+    out = pd.DataFrame({"t": t})
+    if mapped.has("pressure"):
+        out["pressure"] = mapped.vector("pressure", (1,), nan=True)[:, 0] * mapped.scale("pressure", PRESSURE)
+    if mapped.has("height"):
+        out["height_m"] = mapped.vector("height", (1,), nan=True)[:, 0] * mapped.scale("height", units.LENGTH)
+    if len(out.columns) == 1:
+        raise InputError("reader.baro has neither pressure nor height; name one's columns")
+    if mapped.has("std"):
+        out["std"] = mapped.vector("std", (1,), nan=True)[:, 0]
+    return out

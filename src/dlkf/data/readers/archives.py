@@ -1,0 +1,68 @@
+"""An app's export as it leaves the phone: a .zip in the place of a drive's folder."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from dlkf.base.errors import InputError
+
+LARGEST_BYTES = 8 << 30  # unpacked: a day of a phone's sensors is a tenth
+LARGEST_RATIO, SMALL_BYTES = 200, 64 << 20  # of unpacked to packed size: text of sensors packs tenfold
+
+
+def is_archive(path: Path) -> bool:
+    """Whether a file is a .zip (of any name but an office document's or a NumPy archive's)."""
+    return path.suffix.lower() == ".zip" and path.is_file() and zipfile.is_zipfile(path)
+
+
+@contextmanager
+def unpacked(path: Path) -> Iterator[Path]:
+    """A folder as it is; of a .zip a folder with its files, gone afterwards, past folders that hold one folder alone.
+
+    InputError for a damaged archive, and one that unpacks to more than a log can be.
+    """
+    if path.is_dir():
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="dlkf-zip-") as name:
+        folder = Path(name)
+        try:
+            with zipfile.ZipFile(path) as archive:
+                size = sum(info.file_size for info in archive.infolist())
+                if size > LARGEST_BYTES or size > max(SMALL_BYTES, LARGEST_RATIO * path.stat().st_size):
+                    raise InputError(f"{path}: unpacks to {size / 2**30:.1f} GiB, which no log of its size does")
+                for info in archive.infolist():
+                    _extract(archive, info, folder)
+        except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError) as error:
+            raise InputError(f"{path}: cannot be unpacked ({error}); unpack it yourself and give the folder") from None
+        while len(inside := [p for p in folder.iterdir() if p.name != "__MACOSX"]) == 1 and inside[0].is_dir():
+            folder = inside[0]
+        yield folder
+
+
+def _extract(archive: zipfile.ZipFile, info: zipfile.ZipInfo, folder: Path) -> None:
+    """One file, never above the folder, never more than its header states."""
+    place = (folder / info.filename).resolve()
+    if info.is_dir() or not place.is_relative_to(folder.resolve()):
+        return
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with archive.open(info) as packed, place.open("wb") as file:
+        shutil.copyfileobj(packed, file)
+        if file.tell() > info.file_size:
+            raise InputError(f"{archive.filename}: {info.filename} is larger than its header states")
+
+
+def drive_places(source: Path) -> list[Path]:
+    """What may each be a drive in a folder: its subfolders and archives."""
+    found = (p for p in source.iterdir() if not p.name.startswith(".") and (p.is_dir() or is_archive(p)))
+    return sorted(found)
+
+
+def drive_name(path: Path) -> str:
+    """Of a folder its name, of an archive its name without .zip."""
+    return path.stem if path.suffix.lower() == ".zip" and not path.is_dir() else path.name

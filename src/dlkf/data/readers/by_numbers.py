@@ -1,0 +1,140 @@
+"""What the columns of a table without usable names are: gravity, what rises, what looks like degrees, what moves so."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from dlkf.data.discovery.motion import EARTH_M
+from dlkf.data.discovery.units import time_unit
+from dlkf.data.readers import stamps, units
+from dlkf.data.readers.frames import LogTable
+from dlkf.navigation.earth import STANDARD_GRAVITY as G
+
+Spec = dict[str, Any]
+FARTHEST_STEP_DEG = 0.01  # of a car between two fixes
+FARTHEST_WAY_DEG = 5.0  # of a drive
+SPEED_AGREES = 0.97  # correlation of a column with the speed between positions
+COURSE_AGREES_DEG = 8.0
+SLOWEST_COURSE = 3.0  # m/s: below, positions give no course
+FASTEST_S = 0.04  # between fixes; what comes faster is an IMU's
+SMALL_M = 100.0  # standard deviations are smaller
+
+
+def imu_spec(frame: pd.DataFrame) -> Spec | None:
+    """Stamps rise, three neighbours have gravity's size, three beside them are rates."""
+    values = frame.to_numpy(float)
+    rising = [k for k in range(values.shape[1]) if np.all(np.diff(values[:, k]) > 0)]
+    if not rising or values.shape[1] < 7:
+        return None
+    fits = [(k, unit) for k in rising if (unit := time_unit(values[:, k], 0.21, 2e-4)) is not None]
+    fits = [(k, u) for k, u in fits if not np.all(np.diff(values[:, k]) == 1) or len(fits) == 1]
+    if not fits:
+        return None
+    column, unit = fits[0]
+    step = float(np.median(np.diff(values[:, column]))) / units.TIME[unit]
+    starts = [k for k in range(values.shape[1] - 2) if not {column} & {k, k + 1, k + 2}]
+
+    def apart(k: int) -> tuple[float, bool]:
+        size = np.linalg.norm(values[:, k : k + 3], axis=1)
+        middle = float(np.median(size))
+        spread = float(np.median(np.abs(size - middle))) / max(middle, 1e-12)
+        whole = min(abs(np.log(max(middle, 1e-12) / g)) for g in (G, 1.0, 1000.0, 100 * G))
+        gained = min(abs(np.log(max(middle / step, 1e-12) / g)) for g in (G, 1.0))
+        return (spread if min(whole, gained) < 0.08 else np.inf), gained < whole
+
+    # a level drive's (ay, az, gx) has gravity's size too, and is steadier: triads follow each other from the stamps on
+    accel = min(starts, key=lambda k: (not apart(k)[0] < 0.2, (k - column - 1) % 3 != 0, apart(k)[0]))
+    if not np.isfinite(apart(accel)[0]) or apart(accel)[0] > 0.2:
+        return None
+    beside = [k for k in (accel - 3, accel + 3) if k in starts and np.ptp(values[:, k : k + 3]) > 0]
+    if not beside:
+        return None
+    triads = {"accel": accel, "gyro": beside[0]}
+    out: Spec = {key: {"columns": [str(frame.columns[k + j]) for j in range(3)]} for key, k in triads.items()}
+    return {"time": {"column": str(frame.columns[column]), "unit": unit}, "increments": bool(apart(accel)[1]), **out}
+
+
+def gnss_spec(table: LogTable) -> Spec | None:
+    """Stamps, then latitude, longitude and height as neighbours; then velocities that agree with the way between."""
+    frame = table.frame.select_dtypes("number")
+    time = stamps.time_spec(table, pd.Series(True, table.frame.index), 12.0, FASTEST_S) or _first_rising(frame)
+    if time is None or len(frame) < 5:
+        return None
+    taken = time["column"] if isinstance(time["column"], list) else [time["column"]]
+    names = [str(c) for c in frame.columns if str(c) not in taken]
+    values = frame[names].to_numpy(float)
+    place = next((k for k in range(len(names) - 2) if _are_places(values[:, k : k + 3])), None)
+    if place is None:
+        return None
+    spec: Spec = {"time": time, "position": {"columns": names[place : place + 3], "unit": "deg"}}
+    spec["velocity"] = {"columns": None}
+    rest = [k for k in range(len(names)) if not place <= k < place + 3]
+    if not isinstance(time["column"], list) and time["unit"] in units.TIME:
+        t = frame[taken[0]].to_numpy(float) / units.TIME[time["unit"]]
+        spec["velocity"] = _velocities(t, values[:, place], values[:, place + 1], names, values, rest)
+    after = range(place + 3, place + 6)
+    if all(k in rest for k in after) and not set(spec["velocity"]["columns"] or ()) & {names[k] for k in after}:
+        stds = values[:, after.start : after.stop]
+        if np.nanmin(stds) > 0 and np.nanmax(stds) < SMALL_M and np.all(np.abs(np.diff(stds, axis=0)) < SMALL_M / 10):
+            spec["std_position"] = {"columns": [names[k] for k in after]}  # as KF-GINS and others write them
+    return spec
+
+
+def _first_rising(frame: pd.DataFrame) -> Spec | None:
+    """Stamps in the first column that rises with every row: a car may go North all the way too."""
+    for name in frame.columns:
+        values = frame[name].to_numpy(float)
+        if np.all(np.diff(values) > 0) and (unit := time_unit(values, 12.0, FASTEST_S)) is not None:
+            return {"column": str(name), "unit": unit}
+    return None
+
+
+def _are_places(three: np.ndarray) -> bool:
+    """Whether three columns are latitude, longitude and height of a car on its way."""
+    lat, lon, height = three.T
+    if not np.isfinite(three).mean() > 0.5:
+        return False
+    near = np.nanmax(np.abs(lat)) <= 90 and np.nanmax(np.abs(lon)) <= 180 and np.nanmax(np.abs(height)) < 9000
+    steps = [np.abs(np.diff(x)) for x in (lat, lon)]
+    still = max(np.nanmax(s) for s in steps) < FARTHEST_STEP_DEG and max(np.nanmax(s) for s in steps) > 0
+    within = max(np.nanmax(x) - np.nanmin(x) for x in (lat, lon)) < FARTHEST_WAY_DEG
+    whole = all(np.array_equal(x[np.isfinite(x)], np.round(x[np.isfinite(x)])) for x in (lat, lon))
+    somewhere = abs(np.nanmedian(lat)) > 0.01 or abs(np.nanmedian(lon)) > 0.01
+    return bool(near and still and within and not whole and somewhere and (np.abs(lat) > 1).any())
+
+
+def _velocities(
+    t: np.ndarray, lat: np.ndarray, lon: np.ndarray, names: list[str], values: np.ndarray, rest: list[int]
+) -> Spec:
+    """Columns that agree with the way between positions: North and East, or speed and course [deg]."""
+    span = t[2:] - t[:-2]
+    north = EARTH_M * np.radians(lat[2:] - lat[:-2]) / span
+    east = EARTH_M * np.cos(np.radians(lat[1:-1])) * np.radians(lon[2:] - lon[:-2]) / span
+    speed, course = np.hypot(north, east), np.degrees(np.arctan2(east, north))
+    moving = np.isfinite(speed) & (speed > SLOWEST_COURSE)
+
+    def alike(k: int, with_what: np.ndarray) -> float:
+        good = np.isfinite(values[1:-1, k]) & np.isfinite(with_what)
+        if good.sum() < 10 or np.ptp(values[1:-1, k][good]) == 0 or np.ptp(with_what[good]) == 0:
+            return 0.0
+        return float(np.corrcoef(values[1:-1, k][good], with_what[good])[0, 1])
+
+    by = {name: max(rest, key=lambda k: alike(k, what), default=None) for name, what in
+          (("north", north), ("east", east), ("speed", speed))}  # fmt: skip
+    k, j = by["north"], by["east"]
+    if k is not None and j not in (None, k) and min(alike(k, north), alike(j, east)) > SPEED_AGREES:
+        return {"columns": [names[k], names[j]], "frame": "ned"}
+
+    def turned(k: int) -> float:
+        apart = (values[1:-1, k] - course + 180) % 360 - 180
+        apart = np.abs(apart[moving & np.isfinite(apart)])
+        return float(np.median(apart)) if len(apart) > 10 else np.inf
+
+    heading = min((k for k in rest if k != by["speed"]), key=turned, default=None)
+    k = by["speed"]
+    if k is None or heading is None or alike(k, speed) < SPEED_AGREES or turned(heading) > COURSE_AGREES_DEG:
+        return {"columns": None}
+    return {"columns": [names[k], names[heading]], "frame": "course"}

@@ -1,0 +1,254 @@
+"""What a file can give to a drive, and what stands in one that gives nothing."""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from dlkf.base.config import config_dir
+from dlkf.base.errors import InputError
+from dlkf.data.readers import formats, recognise, vocabulary
+from dlkf.data.readers.aid_columns import aid_specs
+from dlkf.data.readers.formats import autopilot, matlab, nmea, rosbag, text, ubx
+from dlkf.data.readers.frames import LogTable
+from dlkf.data.readers.sharing import merged
+
+PRESETS = {"ubx": "ubx", "nmea": "nmea", "rosbag": "rosbag", "rtklib": "rtklib", "gnss_logger": "gnss_logger"}
+PRESETS |= {"inertial_explorer": "inertial_explorer", "novatel": "novatel", "navego": "navego"}
+PRESETS |= {"px4": "px4", "ardupilot": "ardupilot"}
+GNSS_ONLY = ("nmea", "rtklib", "inertial_explorer")
+LARGEST_PEEK = 400  # lines
+NAVEGO = {"imu": "fb_0", "gnss": "stdm_0"}  # a column of each of NaveGo's structures
+
+
+@dataclass(frozen=True)
+class Offer:
+    """What a file, or a table in it, can give, as specs of a mapping; ``sensor`` is an accelerometer or a gyroscope
+    alone."""
+
+    path: Path
+    detail: str
+    imu: dict[str, Any] | None = None
+    gnss: dict[str, Any] | None = None
+    sensor: dict[str, Any] | None = None
+    aids: dict[str, dict[str, Any]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    table: str | None = None
+
+    @property
+    def name(self) -> str:
+        """The file's name, and the table's where a file has several."""
+        return self.path.name if self.table is None else f"{self.path.name}: {self.table}"
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a file gives; ``held`` describes its content, for a line that refuses it."""
+
+    path: Path
+    offers: list[Offer] = field(default_factory=list)
+    held: str = ""
+
+
+def contents(path: Path) -> Contents:
+    """What a file holds."""
+    name = sniffed(path)
+    if name is None:
+        return Contents(path, held="empty" if path.stat().st_size == 0 else "of no format that is known")
+    if name == "matlab":
+        return _of_matlab(path)
+    if name in PRESETS:
+        return _of_preset(path, name)
+    try:
+        options: dict[str, Any] = text_options(path) if name == "csv" else {}
+        table = formats.read(name, path, kind="imu", table=None, text=options, where="reader")
+    except InputError as error:
+        return Contents(path, held=str(error).removeprefix(f"{path}: "))
+    if (count := len(table.frame.columns)) > recognise.MOST_COLUMNS:
+        return Contents(path, held=f"a table of {count} columns, which no log has")
+    found = _of_table(path, name, table, options, None)
+    return Contents(path, found, "" if found else recognise.missing(table))
+
+
+def offer(path: Path) -> Offer | None:
+    """What a file holds; None if nothing that is known."""
+    return next(iter(contents(path).offers), None)
+
+
+def _of_preset(path: Path, name: str) -> Contents:
+    base = preset(PRESETS[name])
+    specs, lacks = {}, []
+    source = {"file": path.name, "text": _preset_text(base)}
+    for kind in ("imu", "gnss"):
+        why = _lacks(path, name, kind)
+        if why is not None:
+            lacks.append(f"no {kind.upper()}{why}")
+            continue
+        specs[kind] = {**base[kind], **source}
+    held = f"{name}, {', '.join(lacks)}"
+    aids = {kind: open_aid({**base[kind], **source}) for kind in _aids_in(path, name)}
+    if not specs and not aids:
+        return Contents(path, held=held)
+    return Contents(path, [Offer(path, f"{name}, as reader={PRESETS[name]}", *opened(specs), aids=aids)], held)
+
+
+def _aids_in(path: Path, name: str) -> tuple[str, ...]:
+    """The aids that a file of a preset's format holds."""
+    module = {"ubx": ubx, "nmea": nmea, "rosbag": rosbag, "px4": autopilot, "ardupilot": autopilot}.get(name)
+    return () if module is None else module.aids(path)
+
+
+def open_aid(spec: Mapping[str, Any]) -> dict[str, Any]:
+    """The spec of an aid with its clock, and a wheel's unit, left to the drive."""
+    out = copy.deepcopy(dict(spec))
+    out["time"] = {**out["time"], "offset_s": "auto"}
+    return out
+
+
+def _lacks(path: Path, name: str, kind: str) -> str | None:
+    """Why a file of a preset's format gives no ``kind``, empty if there is no reason; None where it does."""
+    if name == "rosbag":
+        return None if rosbag.holds(path, kind) else f" among its topics ({rosbag.listed(path)})"
+    if kind == "gnss":
+        return None
+    if name in GNSS_ONLY:
+        return ""
+    base = preset(PRESETS[name])
+    try:
+        spec, options = base[kind], {**_preset_text(base), "lines": base[kind].get("lines")}
+        table = formats.read(spec["format"], path, kind=kind, table=spec.get("table"), text=options, where="")
+    except InputError as error:
+        return f" ({str(error).removeprefix(f'{path}: ').partition('; set reader')[0]})"
+    return None if len(table.frame) > 10 else f" (only {len(table.frame)} samples)"
+
+
+def _of_matlab(path: Path) -> Contents:
+    try:
+        tables = matlab.frames(path)
+    except InputError as error:
+        return Contents(path, held=str(error).removeprefix(f"{path}: "))
+    if all(mark in tables.get(kind, ()) for kind, mark in NAVEGO.items()):
+        return _of_preset(path, "navego")
+    found = [o for name, frame in tables.items() for o in _of_table(path, "matlab", LogTable(frame, path), {}, name)]
+    said = "; ".join(f"{name}: {recognise.missing(LogTable(frame, path))}" for name, frame in list(tables.items())[:4])
+    return Contents(path, found, said or "no matrix and no structure of vectors")
+
+
+def _of_table(path: Path, name: str, table: LogTable, options: dict[str, Any], part: str | None) -> list[Offer]:
+    imu, gnss = recognise.imu_spec(table), None
+    if imu is None or vocabulary.named(map(str, table.frame.columns), "lat"):
+        gnss = recognise.gnss_spec(table)
+    source: dict[str, Any] = {"format": name, "file": path.name, "text": options}
+    source |= {"table": part} if part is not None else {}
+    time = next((one.spec["time"] for one in (imu, gnss) if one is not None), None)
+    aids = aid_specs(recognise.with_numbers(table), recognise.numeric(table.frame), part or path.stem, time)
+    aids = {kind: {**spec, **source} for kind, spec in aids.items()}
+    if imu is None and gnss is None and aids:
+        columns = ", ".join(str(c) for spec in aids.values() for c in _columns(spec))
+        return [Offer(path, f"{name} with {columns}", aids=aids, table=part)]
+    if imu is None and gnss is None:
+        alone = recognise.sensor_spec(table, part or path.stem)
+        if alone is None:
+            return []
+        key, (spec, notes) = alone
+        columns = ", ".join(spec[key]["columns"])
+        return [Offer(path, f"{name} with {columns}", sensor={"key": key, **spec, **source}, notes=notes, table=part)]
+    if imu is not None and gnss is not None:
+        source["rows"] = "filled"
+    found = {kind: one for kind, one in (("imu", imu), ("gnss", gnss)) if one is not None}
+    specs = {kind: {**one.spec, **source} for kind, one in found.items()}
+    columns = ", ".join(str(c) for spec in specs.values() for c in _columns(spec))
+    notes = tuple(note for one in found.values() for note in one.notes)
+    return [Offer(path, f"{name} with {columns}", *opened(specs, stated=True), aids=aids, notes=notes, table=part)]
+
+
+def sniffed(path: Path) -> str | None:
+    """Format of a file by its first bytes; None if it is none of those known."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(65_536)
+    except OSError:
+        return None
+    if path.name == "metadata.yaml":
+        return "rosbag" if b"rosbag2" in head else None
+    for mark, name in ((b"#ROSBAG", "rosbag"), (b"\x89MCAP", "rosbag"), (b"PAR1", "parquet"), (b"ARROW1", "feather"),
+                       (autopilot.ULOG, "px4"), (autopilot.DATAFLASH, "ardupilot")):  # fmt: skip
+        if head.startswith(mark):
+            return name
+    if head.startswith((b"MATLAB", b"\x89HDF")):
+        return "matlab"
+    if b"\xb5b\x01\x07" in head:
+        return "ubx"
+    if len(re.findall(rb"\$[A-Z]{2}(GGA|RMC|GNS),", head)) >= 3:
+        return "nmea"
+    if path.suffix == ".gz":
+        return "csv"
+    if head.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return "csv"
+    if b"\0" in head[:4096] or not head.strip():
+        return None
+    if re.search(rb"^%.*(latitude\(deg\)|x-ecef|latitude\(d)", head, re.M):
+        return "rtklib"
+    if re.search(rb"^Project:.*\n(.*\n)?Program:", head):
+        return "inertial_explorer"
+    if re.search(rb"^[#%](BESTPOS|RAWIMU|INSPVA)", head, re.M):
+        return "novatel"
+    return "gnss_logger" if re.search(rb"^(# )?UncalAccel,", head, re.M) else "csv"
+
+
+def text_options(path: Path) -> dict[str, Any]:
+    """Separator, decimal mark, comment and header of a text table, by its first lines."""
+    lines = [line for line in text.decoded(path, None).splitlines()[:LARGEST_PEEK] if line.strip()]
+    options: dict[str, Any] = {}
+    marked = [line.lstrip()[:1] in "#%" for line in lines]
+    if sum(marked) > 1 or (marked and marked[0] and lines[0].lstrip()[0] == "%"):
+        options["comment"] = lines[marked.index(True)].lstrip()[0]
+        lines = [line for line, is_comment in zip(lines, marked) if not is_comment]
+    if len(lines) < 2:
+        return options
+    body = lines[1 : min(len(lines), 50)]
+    counts = {s: len(text._cells(body[-1], s)) for s in (";", "\t", ",", r"\s+")}
+    few = 3 if counts[r"\s+"] > 1 else 1  # words between blanks may have a comma each
+    separator = next((s for s in (";", "\t") if counts[s] > few), "," if counts[","] > min(few, 2) else r"\s+")
+    options["separator"] = separator
+    if separator in (";", "\t", r"\s+") and any(re.search(r"\d,\d", line) for line in body):
+        options["decimal"] = ","
+    first = text._cells(lines[0].lstrip("#").strip(), separator)
+    options["header"] = not any(text._is_number(c, options.get("decimal", ".")) for c in first)
+    return options
+
+
+def preset(name: str) -> dict[str, Any]:
+    """A reader's preset with what it takes over from csv's."""
+    folder = config_dir() / "reader"
+    own = yaml.safe_load((folder / f"{name}.yaml").read_text())
+    return merged(yaml.safe_load((folder / "csv.yaml").read_text()), own)
+
+
+def _preset_text(base: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: base[key] for key in ("separator", "decimal", "header", "comment") if key in base}
+
+
+def opened(specs: Mapping[str, Any], stated: bool = False) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
+    """Specs with everything that can be estimated left open, but an accelerometer's unit that a header ``stated``."""
+    imu, gnss = (copy.deepcopy(specs.get(kind)) for kind in ("imu", "gnss"))
+    if imu is not None:
+        for key in ("accel", "gyro"):
+            unit = imu[key].get("unit") if stated else None
+            imu[key] = {**imu[key], "unit": unit or "auto", "axes": "auto"}
+    if gnss is not None:
+        gnss["time"] = {**gnss["time"], "offset_s": "auto", "drift_ppm": "auto"}
+        gnss["velocity"] = {**(gnss.get("velocity") or {}), "unit": "auto"}
+        gnss["position"] = {**gnss["position"], "zero": "none", "delay_s": "auto"}
+    return imu, gnss
+
+
+def _columns(spec: Mapping[str, Any]) -> list[Any]:
+    entries = [v for k, v in spec.items() if isinstance(v, Mapping) and k != "time"]
+    return [c for entry in entries for c in entry.get("columns") or []]

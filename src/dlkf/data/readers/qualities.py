@@ -1,0 +1,113 @@
+"""What a receiver's fix quality means: NMEA's GGA codes of words and of other receivers' numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from dlkf.data.readers import vocabulary
+
+Spec = dict[str, Any]
+WORDS = {
+    0: ("", "none", "no fix", "nofix", "no solution", "invalid", "kein fix", "keine", "aucun", "sin fix")
+    + ("无", "无效", "無効"),
+    1: ("single", "spp", "sps", "autonomous", "standalone", "3d", "3d fix", "2d", "2d fix", "gps", "gps fix", "einzel")
+    + ("autonome", "autonomo", "单点", "单点解", "単独", "単独測位"),
+    2: ("dgps", "dgnss", "sbas", "differential", "differentiell", "differentiel", "diferencial")
+    + ("差分", "差分解", "ディファレンシャル"),
+    4: ("rtk", "rtk fix", "rtk fixed", "fixed", "fix", "rtk int", "int", "integer", "fixe", "fijo")
+    + ("固定", "固定解", "フィックス"),
+    5: ("float", "rtk float", "flottant", "flotante", "gleitend", "浮点", "浮点解", "浮動", "フロート"),
+}
+NAMES = {0: "no fix", 1: "single", 2: "DGNSS", 4: "RTK fixed", 5: "RTK float"}
+NAMES |= {6: "dead reckoning", 7: "manual", 8: "simulated"}
+# number of a fix: NMEA's GGA code
+READINGS: dict[str, dict[int, int]] = {
+    "NMEA's GGA code": {0: 0, 1: 1, 2: 2, 4: 4, 5: 5, 6: 6, 7: 7, 8: 8},
+    "u-blox's fix type (3 is 3D)": {0: 0, 1: 0, 2: 1, 3: 1, 4: 1, 5: 0},
+    "MAVLink's fix type (3 is 3D, 6 RTK fixed)": {0: 0, 1: 0, 2: 1, 3: 1, 4: 2, 5: 5, 6: 4},
+    "RTKLIB's Q (1 is RTK fixed)": {0: 0, 1: 4, 2: 5, 3: 2, 4: 2, 5: 1, 6: 2},
+    "ROS' NavSatStatus (0 is a fix)": {-1: 0, 0: 1, 1: 2, 2: 2},
+    "u-blox's carrier solution (2 is RTK fixed)": {0: 1, 1: 5, 2: 4},
+}
+GGA, UBLOX, MAVLINK, RTKLIB, ROS, CARRIER = READINGS
+GOOD_M, POOR_M = 0.15, 1.0  # accuracy of an RTK fix; of one that is none
+
+
+def quality_spec(frame: pd.DataFrame, column: str | None, accuracy_m: float) -> tuple[Spec | None, list[str]]:
+    """The mapping's ``quality`` of a column and a line on what it was taken for; None where its values are unknown.
+
+    ``accuracy_m`` is the median of the accuracies beside it, NaN where there are none.
+    """
+    if column is None:
+        return None, []
+    values = frame[column]
+    numbers = pd.to_numeric(values, errors="coerce")
+    if not bool(numbers.notna().any()):
+        words = _in_words(values, column)
+        unknown = f"quality {column} has words that are not known ({_some(values)}): all count as single; map them"
+        return words, [] if words else [f"{unknown} with reader.gnss.quality={{column: {column}, map: {{…: 4}}}}"]
+    seen = sorted({float(x) for x in numbers.dropna()})
+    fits = [name for name, map_ in READINGS.items() if all(x in map_ for x in seen)]
+    if not fits:
+        return None, [f"quality {column} has numbers that no receiver gives ({_some(values)}): all count as single"]
+    chosen = _reading(column, [int(x) for x in seen], numbers, fits, accuracy_m)
+    codes = {int(x): READINGS[chosen][int(x)] for x in seen}
+    spec: dict[str, Any] = {"column": column}
+    if any(x != code for x, code in codes.items()) or bool(numbers.isna().any()):
+        spec["map"] = {str(x): code for x, code in codes.items()}
+        spec["default"] = 0
+    notes = [f"quality {column}: {_said(codes)}, taken as {chosen}"]
+    others = {name: {x: READINGS[name][x] for x in codes} for name in fits if name != chosen}
+    if likely := next((n for n in _likely(column) if n in others and others[n] != codes), None):
+        map_ = "{" + ", ".join(f"{x}: {code}" for x, code in others[likely].items()) + "}"
+        notes[0] += f"; as {likely} it would be {_said(others[likely])}: reader.gnss.quality.map='{map_}'"
+    return spec, notes
+
+
+def _reading(column: str, seen: list[int], numbers: pd.Series, fits: list[str], accuracy_m: float) -> str:
+    """The most likely reading by name, by the numbers that occur, and by the fixes' own stds."""
+    usual = [name for name in _likely(column) if name in fits] or fits
+    best = numbers.mode().iloc[0]
+    if (usual[0] == GGA and 3 in seen) or (6 in seen and 3 in seen):
+        usual = [MAVLINK] if 6 in seen and MAVLINK in fits else [name for name in usual if name != GGA] or usual
+    fixed = [name for name in usual if READINGS[name][int(best)] != 0] or usual  # there are positions beside it
+    if np.isnan(accuracy_m):
+        return fixed[0]
+    return next((name for name in fixed if _agrees(READINGS[name][int(best)], accuracy_m)), fixed[0])
+
+
+def _agrees(code: int, accuracy_m: float) -> bool:
+    """An RTK fix is good to centimetres, others are not."""
+    return accuracy_m < POOR_M if code in (4, 5) else accuracy_m > GOOD_M
+
+
+def _likely(column: str) -> list[str]:
+    """Readings by a column's name, the most likely first."""
+    said = vocabulary.words(column)
+    if "carr" in said:
+        return [CARRIER]
+    if said == "q":
+        return [RTKLIB, GGA]
+    if "type" in said or "mode" in said or said in ("gps fix", "fix"):
+        return [GGA, UBLOX, MAVLINK]
+    return [GGA, MAVLINK, UBLOX, ROS]
+
+
+def _in_words(values: pd.Series, column: str) -> Spec | None:
+    """GGA codes of the words of a column; None where one of them is not known, or there are none."""
+    texts = [str(word) for word in values.dropna().unique()]
+    codes = {w: code for w in texts for code, known in WORDS.items() if vocabulary.words(w) in known}
+    known = len(codes) == len(texts) and any(vocabulary.words(w) for w in texts)
+    return {"column": column, "map": codes} if known else None
+
+
+def _said(codes: Mapping[int, int]) -> str:
+    return ", ".join(f"{x} is {NAMES[code]}" for x, code in codes.items())
+
+
+def _some(values: pd.Series) -> str:
+    return ", ".join(str(x) for x in values.dropna().unique()[:4])

@@ -1,0 +1,114 @@
+"""Findings shared by several drives of one car and IMU, for those with too little motion of their own."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+# settings that belong to the car, the IMU and the pair of clocks, and how far apart those of two drives may be
+ALIKE: dict[tuple[str, ...], float] = {
+    ("imu", "accel", "unit"): 0.02,  # relative, of a number by gravity
+    ("imu", "gyro", "unit"): 0.02,
+    ("imu", "accel", "axes"): 4.0,  # degrees, twice of what is sure enough
+    ("imu", "gyro", "axes"): 4.0,
+    ("gnss", "velocity", "unit"): 0.0,
+    ("gnss", "time", "drift_ppm"): 60.0,  # two crystals that warm up
+}
+FARTHEST_OFFSET_S = 0.05  # of a drive's own guess from the others', or three of its 1σ
+OFFSETS = ((("gnss", "time", "offset_s"), 0.05), (("imu", "time", "offset_s"), 0.05))  # a delay, not two free clocks
+
+
+def layout(mapping: Mapping[str, Any]) -> str:
+    """What the logs of one car and IMU have in common: formats and columns."""
+    imu = mapping["imu"]
+    parts = [imu.get("format"), *(imu[key].get("columns") for key in ("accel", "gyro"))]
+    return json.dumps(parts, default=str)
+
+
+def pool_settings(mappings: Sequence[Mapping[str, Any]], *, offsets: bool) -> tuple[dict[str, Any], list[str]]:
+    """Settings in which drives agree, as a mapping with these alone, and a line for each in which they do not.
+
+    ``offsets`` between the clocks are among them where they are the same.
+    """
+    out: dict[str, Any] = {}
+    apart: list[str] = []
+    limits = dict(ALIKE) | (dict(OFFSETS) if offsets else {})
+    for path, limit in limits.items():
+        values = [v for v in (_at(m, path) for m in mappings) if v is not None]
+        if not values:
+            continue
+        value = _agreed(values, limit)
+        if value is not None:
+            _set(out, path, value)
+        elif path[-1] != "offset_s":
+            apart.append(f"reader.{'.'.join(path)} is not the same in all drives: {_listed(values)}")
+    return out, apart
+
+
+def agrees(settings: Mapping[str, Any], offset_s: float, std: float) -> bool:
+    """Whether a drive's own guess of the clocks' offset is that of the others, so that it is one and the same pair of
+    clocks and not one that each recording sets again."""
+    shared = next((v for path, _ in OFFSETS if (v := _at(settings, path)) is not None), None)
+    return shared is not None and abs(offset_s - float(shared)) <= max(FARTHEST_OFFSET_S, 3 * std)
+
+
+def list_settings(settings: Mapping[str, Any], before: str = "reader") -> str:
+    """Settings as they are written on a command line."""
+    said = []
+    for key, value in settings.items():
+        deeper = isinstance(value, Mapping) and "yaw" not in value
+        said.append(list_settings(value, f"{before}.{key}") if deeper else f"{before}.{key}={_written(value)}")
+    return " ".join(said)
+
+
+def _written(value: Any) -> str:
+    if not isinstance(value, Mapping):
+        return str(value)
+    return "{" + ", ".join(f"{k}: {v}" for k, v in value.items()) + "}"
+
+
+def _agreed(values: Sequence[Any], limit: float) -> Any:
+    """The mean of values within the limit; None where they are not."""
+    first = values[0]
+    if all(isinstance(v, Mapping) for v in values):
+        turns = Rotation.from_euler("ZYX", [[v["yaw"], v["pitch"], v["roll"]] for v in values], degrees=True)
+        mean = turns.mean()
+        if np.degrees((mean.inv() * turns).magnitude()).max() > limit:
+            return None
+        yaw, pitch, roll = mean.as_euler("ZYX", degrees=True)
+        return {"roll": round(float(roll), 2), "pitch": round(float(pitch), 2), "yaw": round(float(yaw), 2)}
+    if all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values):
+        middle, spread = float(np.median(values)), float(np.ptp(values))
+        if limit >= 0.03:
+            return round(middle, 4) if spread <= limit else None
+        return float(f"{middle:.6g}") if spread <= limit * abs(middle) else None
+    return first if all(v == first for v in values) else None
+
+
+def merged(base: Any, over: Any) -> Any:
+    """A mapping with the values of another one in their place."""
+    if not isinstance(base, Mapping) or not isinstance(over, Mapping):
+        return copy.deepcopy(over)
+    out = {key: copy.deepcopy(value) for key, value in base.items() if key not in over}
+    return out | {key: merged(base.get(key), value) for key, value in over.items()}
+
+
+def _listed(values: Iterable[Any]) -> str:
+    return ", ".join(dict.fromkeys(_written(v) for v in values))
+
+
+def _at(mapping: Any, path: tuple[str, ...]) -> Any:
+    for key in path:
+        mapping = mapping.get(key) if isinstance(mapping, Mapping) else None
+    return None if mapping == "auto" else mapping
+
+
+def _set(out: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
+    for key in path[:-1]:
+        out = out.setdefault(key, {})
+    out[path[-1]] = value

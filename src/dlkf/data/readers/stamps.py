@@ -1,0 +1,137 @@
+"""Which column of a table has its stamps, in what unit, and from when they count."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from dlkf.data.discovery.units import time_unit
+from dlkf.data.readers import units, vocabulary
+from dlkf.data.readers.frames import LogTable
+from dlkf.data.readers.mapping import Mapped
+
+Spec = dict[str, Any]
+OF_DAY = r"^\s*\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?\s*([AaPp][Mm])?\s*Z?\s*$"
+CALENDAR = r"^\s*(\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}-[A-Za-z]{3}-\d{4}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4}|\d{8})"
+CALENDAR += r"[T ]+\d{1,2}:\d{2}"
+DAY = r"^\s*(\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4}|\d{8}|\d{4}年\d{1,2}月\d{1,2}日)\s*$"
+NEWEST_UNIX = 2e9  # s: 2033; a stamp beyond it counts from no known epoch
+SWITCHED_ON_S = 1000.0  # a log that begins with less counts from its own beginning, which is nothing to report
+OLDEST_UNIX = 1.0e9  # s: 2001; no log of a car with an IMU of this kind is older
+TABLES = (None, "csv", "parquet", "feather", "matlab")  # formats whose stamps are what a user's program wrote
+
+
+def time_spec(table: LogTable, rows: pd.Series, slowest: float, fastest: float) -> Spec | None:
+    """The mapping's ``time`` for the rows of one kind, between which ``fastest`` to ``slowest`` seconds pass."""
+    frame = table.frame[rows]
+    if frame.empty:
+        return None
+    names = [str(c) for c in frame.columns]
+    called = vocabulary.matching(names, vocabulary.TIME)
+    if (dated := _dated(frame, called, vocabulary.matching(names, vocabulary.DATE))) is not None:
+        return dated
+    numbers = [name for name in called if pd.api.types.is_numeric_dtype(frame[name])]
+    column = numbers[0] if numbers else only_rising(frame)
+    if column is None:
+        return None
+    values = frame[column].to_numpy(float)
+    unit = time_unit(values, slowest, fastest)
+    if unit is None:
+        return None
+    spec: Spec = {"column": column, "unit": unit}
+    week = vocabulary.named(names, "week")
+    if week is not None and pd.api.types.is_numeric_dtype(frame[week]):
+        return spec | {"week": week}
+    clock = clock_of(column, float(np.nanmedian(values)) / units.TIME[unit])
+    return spec | ({"clock": clock} if clock else {})
+
+
+def clock_of(name: str, seconds: float) -> str | None:
+    """The clock that stamps of this size count by, of two possible ones that of the column's name; None if of none."""
+    possible = [clock for clock, date in _dates(seconds).items() if date is not None]
+    if len(possible) == 1:
+        return possible[0]
+    said = [clock for clock, pattern in vocabulary.CLOCKS.items() if vocabulary.has(name, pattern)]
+    known = [clock for clock in ("unix" if one == "utc" else one for one in said) if clock in possible]
+    return known[0] if known else (units.clock_by_size(seconds) if possible else None)
+
+
+def only_rising(frame: pd.DataFrame) -> str | None:
+    """The column that rises all the way, of any name, where there is one and it does not merely count rows."""
+    steps = {str(n): np.diff(frame[n].to_numpy(float)) for n in frame if pd.api.types.is_numeric_dtype(frame[n])}
+    rising = [name for name, step in steps.items() if len(step) > 1 and np.all(step >= 0) and np.median(step) > 0]
+    clocks = [name for name in rising if not np.all(steps[name] == 1)]
+    return clocks[0] if len(clocks) == 1 else None
+
+
+def _dated(frame: pd.DataFrame, called: list[str], dates: list[str]) -> Spec | None:
+    """Calendar texts in one column, or a date and a time of day in two, by names and by what stands in them."""
+    texts = {n: frame[n].astype(str) for n in frame if not pd.api.types.is_numeric_dtype(frame[n])}
+    texts |= {n: frame[n].map(lambda x: f"{x:.0f}") for n in dates if n not in texts and frame[n].notna().all()}
+
+    def fit(names: list[str], pattern: str) -> list[str]:
+        return [n for n in names if n in texts and bool(texts[n].iloc[:20].str.match(pattern).all())]
+
+    others = [str(n) for n in texts]
+    whole = fit(called, CALENDAR) or fit(dates, CALENDAR) or fit(others, CALENDAR)
+    days, times = fit(dates, DAY) or fit(others, DAY), fit(called, OF_DAY) or fit(others, OF_DAY)
+    columns = whole[:1] or (days[:1] + times[:1] if days and times else [])
+    if not columns:
+        return None
+    clock = "gps" if any(vocabulary.has(n, vocabulary.CLOCKS["gps"]) for n in columns) else "utc"
+    spec: Spec = {"column": columns[0] if len(columns) == 1 else columns, "unit": units.ISO, "clock": clock}
+    if units.day_order(texts[columns[0]]) == "":  # nothing says which: as most of the world writes it
+        spec["order"] = "mdy" if bool(texts[columns[-1]].str.contains("[AaPp][Mm]").any()) else "dmy"
+    return spec
+
+
+def _dates(seconds: float) -> dict[str, str | None]:
+    """The days that a number of seconds may mean, by the clock that it counts by."""
+    unix = OLDEST_UNIX < seconds < NEWEST_UNIX
+    gps = seconds > 0.6e9 and seconds + units.GPS_EPOCH_UNIX < units.now()
+    return {"unix": _day(seconds) if unix else None, "gps": _day(seconds + units.GPS_EPOCH_UNIX) if gps else None}
+
+
+def _day(unix: float) -> str:
+    return str(np.datetime64(int(unix), "s"))[:10]
+
+
+def epoch_note(part: Mapped) -> str | None:
+    """From when the stamps of a table of numbers are taken to count, and what else they may mean; None for dates and
+    for formats that state it themselves."""
+    time = part.spec.get("time") or {}
+    if part.spec.get("format") not in TABLES or time.get("week") is not None or not len(part):
+        return None
+    setting = f"reader.{part.kind}.time"
+    column = time.get("column")
+    what = f"stamps of {part.table.path.name} ({', '.join(map(str, column)) if isinstance(column, list) else column})"
+    clock = time.get("clock")
+    if time.get("unit") == units.ISO:
+        as_what = {"gps": "GPS time", None: "of an unnamed clock"}.get(clock, "UTC")
+        other = ""
+        if order := time.get("order"):
+            swapped = {"dmy": "mdy", "mdy": "dmy"}.get(order)
+            other = f", {'day' if order == 'dmy' else 'month'} first; {setting}.order={swapped} is the other reading"
+        return f"{what}: dates taken as {as_what}{other if swapped_possible(part, time) else ''}"
+    if time.get("week_number") is not None or time.get("day") is not None:
+        return None
+    seconds = float(part.column(str(column), nan=False)[0]) / units.TIME[time.get("unit") or "s"]
+    known = {"unix": "unix", "utc": "unix", "gps": "gps"}.get(str(clock)) or units.clock_by_size(seconds)
+    dates = _dates(seconds)
+    if known is None:
+        if part.kind != "gnss" or not SWITCHED_ON_S < seconds < units.WEEK_S:
+            return None
+        return f"{what}: seconds of a GPS week, it seems, which have no date; {setting}.week_number=… gives the week"
+    names = {"unix": "Unix time (since 1970)", "gps": "GPS seconds since 1980"}
+    other = "gps" if known == "unix" else "unix"
+    first = _day(seconds + (units.GPS_EPOCH_UNIX if known == "gps" else 0))
+    also = f"; as {names[other]} they would be of {dates[other]}: {setting}.clock={other}" if dates[other] else ""
+    return f"{what}: taken as {names[known]}, of {first}{also}"
+
+
+def swapped_possible(part: Mapped, time: Spec) -> bool:
+    """Whether the dates of a table may be read with day and month the other way round."""
+    column = time["column"][0] if isinstance(time["column"], list) else time["column"]
+    return units.day_order(part.texts(column)) == ""

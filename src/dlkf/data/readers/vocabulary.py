@@ -1,0 +1,196 @@
+"""Names of columns: what they mean in English, German, French, Spanish, Chinese and Japanese, and their unit.
+
+Patterns are matched against the whole of a name's words (:func:`words`), without its unit; of several alternatives in a
+list the first that a table has is taken.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Iterable, Sequence
+
+RECEIVER = r"(?:(?:gps|gnss|loc(?:ation)?|rtk|ublox|nmea|receiver|nav|fix) )?"
+NORTH, EAST = r"n(?:orth|ord)?|lat(?:itude)?|norte?", r"e(?:ast)?|lon(?:gitude)?|ost|est|este"
+DOWN, UP = r"d(?:own)?", r"u(?:p)?|alt(?:itude)?|h(?:eight)?"
+ACCURACY = r"(?:acc(?:uracy)?|error|err|std|sigma|genauigkeit|fehler|precision|exactitud|incertitude|精度|误差|誤差)"
+VELOCITY = r"v(?:el(?:ocity)?)?|velocity|geschwindigkeit|vitesse|velocidad|速度"
+
+SENSORS = {
+    "accel": r"(?:(?:total|raw) )?(?:acc(?:el(?:eration|erometer|erometre)?)?|specific ?force|force|f|a|fb"
+    r"|beschl(?:eunigung(?:ssensor)?)?|aceler(?:acion|ometro)?|加速度(?:计|計|センサ|センサー)?)",
+    "gyro": r"(?:raw )?(?:gyro?(?:scop(?:e|io)?)?|omega|w|g|ang(?:ular)? ?(?:velocity|vel|rate|speed)|rate"
+    r"|(?:rotation|turn) ?rate|wb"
+    r"|drehrate|drehgeschwindigkeit|winkelgeschwindigkeit|kreisel|vitesse (?:angulaire|de rotation)|giro(?:scopio)?"
+    r"|velocidad angular|角速度|陀螺仪?|陀螺儀|ジャイロ(?:センサー?)?)",
+}
+AXES = {
+    axis: rf"(?:{axis}|(?:axis|achse|axe|eje) {axis}|{axis} ?(?:axis|achse|axe|eje|轴|軸)(?: ?方向)?)"
+    for axis in "xyz012"
+}
+
+QUANTITIES: dict[str, list[str]] = {
+    "lat": [r"lat(?:itude?)?", r"(?:geo\w* )?breite(?:ngrad)?", r"latitud|phi|纬度|緯度|北纬|北緯"],
+    "lon": [r"lon(?:gitude?)?|lng|long", r"(?:geo\w* )?la?enge|(?:geo\w* )?lange|(?:laengen|langen)grad"]
+    + [r"longitud|lambda|lam|经度|經度|経度|东经|東経"],
+    "height": [r"ellip\w*(?: height)?|h ell|height ell\w*|(?:alt(?:itude)?|height) wgs ?84|大地高|椭球高|楕円体高"]
+    + [r"h|hgt|height|alt(?:itude)?|ele(?:v|vation)?|hoe?he(?: (?:uber|ueber) .*)?|hauteur|altitud|altura|elevacion"]
+    + [r"高度|高程|海拔(?:高度)?|标高|標高|高さ", r"(?:h|height|alt(?:itude)?|ele\w*) ?(?:msl|amsl|asl)|h ?msl"],
+    "geoid": [r"geoid(?: ?sep\w*| ?height| ?undulation)?|undulation|sep|geoidundulation|ondulation"]
+    + [r"高程异常|ジオイド高?"],
+    "north": [rf"(?:{VELOCITY}) ?(?:n(?:orth|ord)?|norte)|north(?:ward)? ?vel(?:ocity)?|北向速度|北向き速度"],
+    "east": [rf"(?:{VELOCITY}) ?(?:e(?:ast)?|ost|este?)|east(?:ward)? ?vel(?:ocity)?|东向速度|東向き速度"],
+    "down": [rf"(?:{VELOCITY}) ?(?:d(?:own)?|ab)|down(?:ward)? ?vel(?:ocity)?"],
+    "up": [rf"(?:{VELOCITY}) ?(?:u(?:p)?|auf)|up(?:ward)? ?vel(?:ocity)?|climb|天向速度|上向き速度"],
+    "speed": [r"(?:ground )?(?:speed|sog|g ?speed|velocity|spd|vel)|speed over ground|g ?s"]
+    + [r"geschw(?:indigkeit)?|tempo|vitesse(?: sol)?|velocidad|rapidez|速度|地速|速率|対地速度|对地速度|速さ"],
+    "course": [r"(?:true )?(?:course|cog|bearing|track|heading|direction|head ?mot)(?: over ground)?|course ?angle"]
+    + [r"(?:fahrt)?richtung|kurs(?: uber grund)?|cap(?: vrai)?|route|rumbo|curso|direccion"]
+    + [r"航向角?|航迹角|方向角?|方位角?|针路|針路|进路|進路|進行方向"],
+    "quality": [r"quality|(?:fix|gga|gps) ?quality|qualitat|qualitaet|qualite|calidad|定位质量|质量|品质|測位品質|品質"]
+    + [r"fix ?(?:type|status|mode|qual)?|(?:gps ?)?status|(?:gps ?)?mode|sol(?:ution)?(?: ?(?:type|status))?"]
+    + [r"carr(?:ier)? ?soln?"]
+    + [r"rtk(?: ?(?:status|fix|mode|state))?|type de fix|tipo de fix|定位状态|定位狀態|解状态|测位状态|測位状態|q"],
+    "hacc": [rf"h(?:or(?:izontal)?)? ?(?:pos(?:ition)? )?{ACCURACY}|eph|pos(?:ition)? ?{ACCURACY}"]
+    + [rf"horizontale? ?{ACCURACY}|{ACCURACY} horizontale?|lagegenauigkeit|水平(?:位置)?(?:精度|误差|誤差)"]
+    + [r"accuracy|genauigkeit|precision|exactitud|(?:位置)?精度|(?:位置)?误差|(?:位置)?誤差"],
+    "vacc": [rf"v(?:ert(?:ical)?)? ?(?:pos(?:ition)? )?{ACCURACY}|epv|(?:alt(?:itude)?|height) ?{ACCURACY}"]
+    + [rf"vertikale ?{ACCURACY}|verticale? ?{ACCURACY}|{ACCURACY} verticale?|ho?e?hengenauigkeit"]
+    + [r"(?:垂直|高度|高程)(?:精度|误差|誤差)"],
+    "sacc": [rf"s ?{ACCURACY}|(?:speed|vel(?:ocity)?) ?{ACCURACY}|eps|geschwindigkeitsgenauigkeit"]
+    + [rf"{ACCURACY} (?:de )?(?:la )?(?:vitesse|velocidad)|速度(?:精度|误差|誤差)"],
+    "hdop": [r"h ?dop|水平精度因子"],
+    "vdop": [r"v ?dop"],
+    "pdop": [r"p ?dop|dop"],
+    "week": [r"week|wn|week ?(?:number|no|num)|woche|semaine|semana|周|星期|週番号|周数"],
+}
+for _kind, _stem in (("pos", r"(?: ?pos(?:ition)?)?"), ("vel", r" ?v(?:el(?:ocity)?)?")):
+    for _axis, _names in (("n", NORTH), ("e", EAST), ("d", rf"{DOWN}|{UP}")):
+        QUANTITIES[f"std_{_kind}_{_axis}"] = [rf"(?:std(?:dev)?|sd|sigma){_stem} ?(?:{_names})"]
+
+WHEEL = r"\b(?:wheels?|obd2?|odo(?:meter)?|can|vehicle|car|ecu|rad\w*|tacho\w*|roues?|ruedas?|vehicule|vehiculo)\b"
+WHEEL += r"|[车車轮輪]"
+SPEEDS = (
+    r"\b(?:speed|velocity|vel|v|geschw\w*|\w*geschwindigkeit|raddrehzahl|vitesse|velocidad|rpm|ticks?|counts?|pulses?"
+)
+SPEEDS += r"|impulse?|odo(?:meter)?|distance|weg)\b|速|オドメータ"
+NO_WHEEL = r"\b(?:gps|gnss|diff\w*|average|avg|mean|max\w*|trip|engine|motor|fan|std|acc\w*|angle|steer\w*|time)\b"
+COUNTED = r"\b(?:ticks?|counts?|pulses?|impulse?|odo(?:meter)?|distance|weg)\b"
+REAR = r"\b(?:rl|rr|rear|hl|hr|hinten|arriere|trasera)\b|后|後"
+HEADING = r"\b(?:hdt|ths|dual|baseline|relpos\w*|antennas?|moving ?base|true ?heading)\b"
+PRESSURE = r"(?:baro(?:meter|metric)? ?)?(?:air ?)?(?:press(?:ure)?|luftdruck|druck|pression|presion|气压|氣壓|気圧)"
+BARO_HEIGHT = r"baro(?:metric|meter)? ?(?:alt(?:itude)?|height)|relative ?altitude"
+
+TIME = (
+    r"#?(?:t|time|time ?stamp|tow|sow|gps ?(?:time|sow|tow|seconds?|t)?|unix ?(?:time)?|posix(?: ?time)?|utc"
+    r"|stamp|epoch|secs?|seconds|date ?time|milli(?:s|seconds)?"
+    r"|micro(?:s|seconds)?|nano(?:s|seconds)?|ms|us|ns|ticks|sample ?time"
+    r"|ros ?time|itow|utc ?time|seconds ?elapsed|elapsed"
+    r"|zeit(?:stempel|punkt)?|uhrzeit|temps|heure|horodatage|tiempo|hora"
+    r"|marca de tiempo"
+    r"|时间戳?|時間|时刻|時刻|タイムスタンプ)(?: (?:utc|gps|unix|local|lokal))*"
+)
+DATE = r"(?:(?:utc|gps|local|gnss) ?)?(?:date|datum|tag|jour|fecha|dia|日期|日付|年月日)(?: (?:utc|gps|local|lokal))?"
+CLOCKS = {"unix": r"\b(unix|posix|epoch|ros)\b", "gps": r"\b(gps|gpst|gnss|tow|sow|itow)\b", "utc": r"\butc\b"}
+
+# units as words (brackets and signs gone): the quantity's unit as the mapping calls it
+UNITS = {
+    **dict.fromkeys(("kmh", "km h", "kph", "kmph", "公里 小时"), "km/h"),
+    **dict.fromkeys(("mph", "mi h"), "mph"),
+    **dict.fromkeys(("kn", "kt", "kts", "knot", "knots", "noeuds", "knoten"), "knots"),
+    **dict.fromkeys(("m s", "mps", "ms 1", "m sec"), "m/s"),
+    **dict.fromkeys(("m s2", "mps2", "m s 2", "ms2", "ms 2", "m s s"), "m/s2"),
+    **dict.fromkeys(("rad s", "rps", "rads"), "rad/s"),
+    **dict.fromkeys(("deg s", "dps", "grad s", "° s"), "deg/s"),
+    **dict.fromkeys(("deg", "degree", "degrees", "grad", "°", "度"), "deg"),
+    **{
+        u: u for u in ["g", "mg", "rad", "m", "mm", "cm", "km", "ft", "s", "ms", "us", "ns", "pa", "hpa", "mbar", "rpm"]
+    },
+    **dict.fromkeys(("sec", "seconds", "sek", "秒"), "s"),
+    **dict.fromkeys(("feet", "fuss"), "ft"),
+    **dict.fromkeys(("meter", "metres", "meters", "米"), "m"),
+    **dict.fromkeys(("毫秒", "msec", "millis"), "ms"),
+    **dict.fromkeys(("c", "grad c", "% ", "percent"), ""),
+}
+
+
+def words(name: str) -> str:
+    """``Accel X [m/s^2]`` → ``accel x``; ``accX`` → ``acc x``; ``vel_n_mps`` → ``vel n``; ``Länge (°)`` → ``lange``."""
+    return split_unit(name)[0]
+
+
+def unit_of(name: str) -> str | None:
+    """The unit that a name ends in or has in brackets, as the mapping calls it; None where it states none."""
+    return split_unit(name)[1]
+
+
+def split_unit(name: str) -> tuple[str, str | None]:
+    """The words of a name, and its unit."""
+    in_brackets = re.findall(r"[\[(（【](.*?)[\])）】]", name)
+    bare = _plain(re.sub(r"[\[(（【].*?[\])）】]", " ", name))
+    for text in in_brackets:
+        if (unit := UNITS.get(_plain(text))) is not None:
+            return bare, unit
+    parts = bare.split()
+    for count in (3, 2, 1):  # the longest that leaves something
+        if len(parts) > count and (unit := UNITS.get(" ".join(parts[-count:]))) is not None:
+            return " ".join(parts[:-count]), unit
+    return bare, None
+
+
+def _plain(text: str) -> str:
+    """Words in small letters, accents of Latin letters gone, full-width letters as usual ones."""
+    spaced = re.sub(r"([a-z0-9à-ÿ])([A-Z])", r"\1 \2", text.replace("ß", "ss").replace("µ", "u").replace("μ", "u"))
+    letters = []
+    for letter in unicodedata.normalize("NFKC", spaced):
+        first = unicodedata.normalize("NFD", letter)[0]
+        letters.append(first if first.isascii() else letter)
+    return re.sub(r"[^\w#°]+|_", " ", "".join(letters).lower()).strip()
+
+
+def named(names: Iterable[str], key: str) -> str | None:
+    """The column of a quantity: by its patterns in their order, the first column of several."""
+    bare = [(name, words(name)) for name in names]
+    for pattern in QUANTITIES[key]:
+        for name, said in bare:
+            if re.fullmatch(rf"{RECEIVER}(?:{pattern})", said):
+                return name
+    return None
+
+
+def matching(names: Iterable[str], pattern: str) -> list[str]:
+    """The columns whose words are all of a pattern."""
+    return [name for name in names if re.fullmatch(pattern, words(name)) or re.fullmatch(pattern, _plain(name))]
+
+
+def triad(names: Sequence[str], stem: str) -> list[str] | None:
+    """Three columns of one sensor: ``acc_x``, ``accX``, ``x_acc``, ``加速度X轴``, ``Beschleunigung X-Achse``."""
+    bare = [(name, words(name)) for name in names]
+    for axes in ("xyz", "012"):
+        found = []
+        for axis in axes:
+            both = rf"(?:imu )?(?:{stem} ?{AXES[axis]}|{AXES[axis]} ?{stem})(?: ?(?:wert|value))?"
+            found.append(next((name for name, said in bare if re.fullmatch(both, said)), None))
+        if all(found):
+            return [str(f) for f in found]
+    return None
+
+
+def wheel_columns(names: Iterable[str], called: str) -> list[str]:
+    """The columns of a wheel's speed or counts, of the rear axle where several are named; ``called`` is the table's
+    name, which counts where a column is plainly a speed."""
+    by_table = has(called, WHEEL) or has(called, r"^speed$")
+    found = []
+    for name in names:
+        bare = _plain(re.sub(r"[()\[\]]", " ", name))
+        if re.search(SPEEDS, bare) and (by_table or re.search(WHEEL, bare)) and not re.search(NO_WHEEL, bare):
+            found.append(name)
+    rates = [n for n in found if not re.search(COUNTED, _plain(n))] or found
+    rear = [n for n in rates if re.search(REAR, _plain(n))]
+    units = {unit_of(n) for n in rates}
+    return rear or (rates if len(units) == 1 and len(rates) in (2, 4) else rates[:1])
+
+
+def has(name: str, pattern: str) -> bool:
+    """Whether a pattern lies in the words of a name, its unit's among them."""
+    return re.search(pattern, _plain(name)) is not None

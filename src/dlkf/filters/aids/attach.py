@@ -1,0 +1,103 @@
+"""Which sensors a filter takes: those of its name, and of a filter with vehicle constraints those of the drive."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import is_dataclass, replace
+from typing import Any
+
+from dlkf.data.aid_tables import AidTable
+from dlkf.filters.aids.heading import DualAntennaHeading
+from dlkf.filters.aids.height import Barometer
+from dlkf.filters.aids.wheel_speed import WheelSpeed
+from dlkf.filters.constraints import CarConstraints
+from dlkf.filters.model_based import Mbkf
+from dlkf.filters.smoother import SmoothedSolution
+from dlkf.filters.sources import Source
+from dlkf.navigation.state import ErrorStates
+
+SENSORS: Mapping[str, type[Source]] = {"speed": WheelSpeed, "heading": DualAntennaHeading, "baro": Barometer}
+
+
+def add_sources(kalman: Mbkf, kinds: Sequence[type[Source]]) -> Mbkf:
+    """The filter with further sources, and their error states behind its own.
+
+    Sensors stand in front of the constraints, which depend on whether a wheel turns; what has no table, behind.
+    """
+    kinds = [kind for kind in kinds if not any(type(source) is kind for source in kalman.sources)]
+    if not kinds:
+        return kalman
+    names = tuple(name for kind in kinds for name in getattr(kind, "parameters", {}))
+    states = replace(kalman.states, others=(*kalman.states.others, *names))
+    made: list[Any] = [kind(kalman.imu, kalman.tuning, states) for kind in kinds]  # type: ignore[call-arg]
+    own = [_with_states(source, states) for source in kalman.sources]
+    sensors = [source for source in made if hasattr(source, "table")]
+    others = [source for source in made if not hasattr(source, "table")]
+    return replace(kalman, states=states, sources=(*sensors, *own, *others))
+
+
+def with_aids(model: Any, tables: Iterable[AidTable]) -> Any:
+    """A filter that also takes these sensors of the contract, if it has vehicle constraints (``_nhc``, ``_car``, plus).
+
+    Others are given back as they are, and so is a filter that has all of them.
+    """
+    if isinstance(model, SmoothedSolution):
+        return SmoothedSolution(with_aids(model.filter, tables))
+    inner = getattr(model, "kalman", model)
+    if not isinstance(inner, Mbkf) or not any(isinstance(source, CarConstraints) for source in inner.sources):
+        return model
+    kalman = add_sources(inner, [SENSORS[table.name] for table in tables])
+    if inner is model:
+        return kalman
+    other = copy.copy(model)
+    other.kalman = kalman
+    return other
+
+
+def aided_name(name: str, aids: Iterable[str]) -> str:
+    """The name of a Kalman filter with vehicle constraints, with these sensors behind a plus; another unchanged."""
+    kind, *own = name.split("+")
+    if not {"nhc", "car"} & set(kind.split("_")):
+        return name
+    return "+".join((name, *(aid for aid in aids if aid not in own)))
+
+
+def describe_aids(models: Mapping[str, Any], tables: Iterable[AidTable]) -> list[str]:
+    """A line for each sensor of a dataset: which filters take it, and which do not."""
+    lines = []
+    for table in tables:
+        takes = [name for name, model in models.items() if table in tables_of(model)]
+        others = [name for name in models if name not in takes]
+        said = f"{table.name}: used by {', '.join(takes)}" if takes else f"{table.name}: used by no filter here"
+        if others:
+            said += f"; {', '.join(others)} {'takes' if len(others) == 1 else 'take'} it as {others[0]}+{table.name}"
+        lines.append(said)
+    return lines
+
+
+def tables_of(model: Any) -> tuple[AidTable, ...]:
+    """The tables that a filter's sources use, in the order of its sources."""
+    inner = model.filter if isinstance(model, SmoothedSolution) else getattr(model, "estimator", model)
+    inner = getattr(inner, "kalman", inner)
+    tables = [getattr(source, "table", None) for source in getattr(inner, "sources", ())]
+    return tuple(table for table in tables if table is not None)
+
+
+def aid_columns(model: Any) -> tuple[str, ...]:
+    """A filter's output about its sensors, in the order of :attr:`dlkf.filters.integration.Correction.aids`:
+    innovation, its 1σ and whether it counted of each, then the estimates of their parameters, then their 1σ."""
+    inner = model.filter if isinstance(model, SmoothedSolution) else getattr(model, "estimator", model)
+    inner = getattr(inner, "kalman", inner)
+    states: ErrorStates = getattr(inner, "states", ErrorStates())
+    said = [f"{t.name}_{x}" for t in tables_of(model) for x in ("innovation", "innovation_std", "used")]
+    return (*said, *states.others, *(f"std_{name}" for name in states.others))
+
+
+def _with_states(source: Any, states: ErrorStates) -> Any:
+    """A source for a filter with further states."""
+    if is_dataclass(source) and not isinstance(source, type):
+        return replace(source, states=states)
+    other: Any = copy.copy(source)
+    other.states = states
+    return other

@@ -1,0 +1,184 @@
+"""Wheel speed, with scale factor, delay and the wheel's place to the right of the IMU as states.
+
+A wheel at y to the right of the IMU that runs at scale 1 + s and comes d seconds late reads at the time t
+
+    m(t) = (1 + s) (v_x(t − d) − y ω_z(t − d))          v_x = (C_bn v_n)_x
+
+and its samples of an update interval make one measurement, compared with the mean of the prediction over their
+stretch. The error states refer to the interval's end, L seconds after the middle of the stretch:
+δv(t) = δv + L ([f_n×] δh + C ε).
+
+R holds white noise, slip in proportion to speed and acceleration (tyre stiffness; Gillespie 1992), and is larger for a
+value that repeats itself, whose error is the same each time. Whole km/h are intervals
+(:mod:`dlkf.filters.aids.rounding`). The gate allows for a drift of the filter's own speed that its covariance does not
+cover, which is no fault of a wheel. A reading of zero counts only where the car is nearly at rest already or shakes no
+more than in its calmest second of motion: a sensor that is dead or a wheel that is locked does not stop the car. A
+sensor without a sign is read with the sign of the filter's own speed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dlkf.data.aid_tables import STANDARD, AidTable
+from dlkf.data.drive import Batch
+from dlkf.filters.aids.rounding import rounded_measurement
+from dlkf.filters.aids.stretch import at_limits, mean_force, stretch_weights, weighted
+from dlkf.filters.aids.trust import Trust, judge
+from dlkf.filters.integration import Epoch
+from dlkf.filters.sources import Measurement, Parameter, Predicted, aid_of, predicted_variance
+from dlkf.filters.tuning import Tuning
+from dlkf.navigation.state import ErrorStates
+
+LEAST_STD = 0.03  # m/s: the least 1σ, whatever a file gives
+KMH = 1 / 3.6
+SLIP = 0.005  # s²/m: share of the speed by which a driven or braked wheel slips per m/s²
+REPEATS = 5.0  # values equal to the last one weigh less and less, up to so many
+ROUNDED_REPEATS = 30.0  # and whole km/h: that the speed stays in its interval says nothing new
+JITTER_S = 0.03  # by which the stamps of a sensor of whole km/h are off
+SLOPE_S = 0.1  # an acceleration is taken over twice so long
+ROLLING, BACKWARDS = 1.0, -0.3  # m/s: a wheel that turns; one with a sign
+ZERO, ZERO_STD = 0.05, 0.1  # m/s: a wheel at rest, and how slowly it may turn then
+NEARLY_AT_REST = 0.5  # m/s: so slow a car may be stopped by its wheel alone
+KNOWS = 0.5  # m/s 1σ: a filter whose speed is better than this can detect a wrong wheel
+DRIFT = 0.2  # m/s² of an IMU that its filter's covariance does not cover: beyond the gate, but no fault of the wheel
+MEMORY_S = 100.0  # s in which the calmest second of motion grows by e
+
+
+class WheelMemory(NamedTuple):
+    """Memory of a wheel."""
+
+    std: Tensor  # (1,) m/s of one interval, the same for all drives
+    trust: Trust
+    last: Tensor  # (B,) m/s, the last value
+    repeats: Tensor  # (B,) how often it came again
+    whole: Tensor  # (B,) share of the values that were whole km/h
+    signed: Tensor  # (B,) bool: it has been negative
+    calmest: Tensor  # (B,) least shaking of an interval in motion, m/s² rad/s
+    rolling: Tensor  # (B,) bool: it turned in the last interval, and counted
+    stopped: Tensor  # (B,) bool: it did not turn in the last interval, and counted
+
+
+@dataclass(frozen=True)
+class WheelSpeed:
+    """One row: the mean forward speed of a wheel over a stretch of the update interval."""
+
+    imu: object
+    tuning: Tuning
+    states: ErrorStates
+
+    table: ClassVar[AidTable] = STANDARD["speed"]
+    parameters: ClassVar[Mapping[str, Parameter]] = {
+        "wheel_scale": Parameter(std=0.05, walk=5e-5),
+        "wheel_delay_s": Parameter(std=0.1, walk=1e-4, start=0.05),
+        "wheel_right_m": Parameter(std=0.5, walk=1e-4),
+    }
+
+    @property
+    def code(self) -> WheelSpeed:
+        """Without the numbers that the memory carries."""
+        return WheelSpeed(None, Tuning(), self.states)
+
+    def begin(self, batch: Batch) -> WheelMemory:
+        """Memory before the first measurement."""
+        B, zeros = batch.size[0], batch.imu.new_zeros(batch.size[0])
+        std = batch.imu.new_tensor([self.tuning.wheel_std])
+        trust = Trust.begin(batch.imu, B)
+        no, unknown = zeros > 0, torch.full_like(zeros, math.inf)
+        return WheelMemory(std, trust, zeros, zeros, zeros, no, unknown, no, no)
+
+    def rows(self, epoch: Epoch, memory: WheelMemory, prediction: Predicted) -> tuple[Measurement | None, WheelMemory]:
+        """The row, and what the wheel has earned by it."""
+        said = aid_of(epoch, self.table.name)
+        if said is None:
+            return None, memory
+        value, std, lag, span, count = said.unbind(-1)
+        seen = count > 0
+        scale = 1.0 + prediction.parameters["wheel_scale"]
+        speed, H, accel = self._predicted(epoch, prediction, lag, span, scale)
+        expected, unsure = scale * speed, predicted_variance(prediction.P, H)[:, 0]
+        reverse = ~memory.signed & (value > 0) & (expected < -2 * unsure.clamp_min(0).sqrt())
+        value = torch.where(reverse, -value, value)
+        z = value - expected
+        same = seen & ((value - memory.last).abs() < 1e-6)
+        repeats = torch.where(
+            seen, torch.where(same, (memory.repeats + 1).clamp_max(ROUNDED_REPEATS), 0.0), memory.repeats
+        )
+        in_kmh = (value / KMH * count).abs()
+        fits = ((in_kmh - (in_kmh + 0.5).floor()).abs() < 1e-3).to(value.dtype)
+        turns = seen & (value.abs() > ROLLING)
+        whole = torch.where(turns, torch.lerp(memory.whole, fits, 0.1), memory.whole)
+        zero = value.abs() < ZERO
+        noise = torch.where(std > 0, std.clamp_min(LEAST_STD), memory.std)
+        noise = torch.where(zero, noise.clamp_min(ZERO_STD), noise * (1 + repeats.clamp_max(REPEATS)))
+        rounded = (whole > 0.5) & ~zero
+        noise = torch.where(rounded, (memory.std.square() + (JITTER_S * accel).square()).sqrt(), noise)
+        R = noise.square() + (SLIP * speed * accel).square()
+        shaking = _shaking(epoch.imu)
+        plausible = ~zero | (z.abs() < NEARLY_AT_REST) | (shaking <= memory.calmest)
+        beyond = torch.where(rounded, (z.abs() - 0.5 * KMH).clamp_min(0.0), z)
+        drifted = (DRIFT * epoch.dt * epoch.imu.shape[1]) ** 2
+        trust, used, excess = judge(memory.trust, seen, beyond, unsure + R + drifted, unsure < KNOWS**2, plausible)
+        R = R * excess
+        of_cell = rounded_measurement(z, 0.5 * KMH, unsure, R)
+        again = torch.where(z.abs() < 0.5 * KMH, (1 + repeats).square(), 1.0)
+        z, R = torch.where(rounded, of_cell[0], z), torch.where(rounded, of_cell[1] * again, R)
+        moving = used & turns & (unsure < KNOWS**2)
+        calmest = memory.calmest * math.exp(epoch.dt * epoch.imu.shape[1] / MEMORY_S)
+        memory = WheelMemory(
+            memory.std, trust, torch.where(seen, value, memory.last), repeats, whole,
+            memory.signed | (used & ~reverse & (value < BACKWARDS)),
+            torch.where(moving, torch.minimum(calmest, shaking), calmest), used & turns, used & zero,
+        )  # fmt: skip
+        return Measurement(z.unsqueeze(-1), H, R.unsqueeze(-1), used.unsqueeze(-1)), memory
+
+    def _predicted(
+        self, epoch: Epoch, prediction: Predicted, lag: Tensor, span: Tensor, scale: Tensor
+    ) -> tuple[Float[Tensor, " B"], Float[Tensor, "B 1 n"], Float[Tensor, " B"]]:
+        """Speed of the wheel over the stretch at scale 1, H of the measurement, and the acceleration along the car."""
+        samples, dt = epoch.corrected.shape[1], epoch.dt
+        T = samples * dt
+        delay, right = prediction.parameters["wheel_delay_s"], prediction.parameters["wheel_right_m"]
+        forward = at_limits(epoch.start.C_nb[..., 0], epoch.window.C_nb[..., 0])
+        v_n = at_limits(epoch.start.v_n, epoch.window.v_n)
+        turn = at_limits(epoch.corrected[:, 0, 5], epoch.corrected[..., 5])
+        along = (forward * v_n).sum(-1)
+        wheel = along - right.unsqueeze(-1) * turn
+        reach = (0.5 * span).clamp(0.5 * dt, 0.5 * T)
+        late = lag + delay
+        middle = torch.minimum(torch.maximum(late, reach), T - reach)  # of a stretch inside the window
+        weights = stretch_weights(middle, span, samples, dt)
+        half = reach.clamp_min(SLOPE_S)
+        first, last = (middle + half).clamp_max(T), (middle - half).clamp_min(0.0)
+        none = torch.zeros_like(span)
+        gained = weighted(stretch_weights(last, none, samples, dt) - stretch_weights(first, none, samples, dt), along)
+        accel = gained / (first - last)
+        speed = weighted(weights, wheel) - accel * (late - middle)
+        axis = weighted(weights, forward)
+        H = axis.new_zeros(len(axis), self.states.count)
+        H[:, self.states.velocity] = axis
+        lever = torch.linalg.cross(axis, mean_force(epoch)) * middle.unsqueeze(-1)
+        H[:, self.states.attitude] = weighted(weights, torch.linalg.cross(forward, v_n)) + lever
+        H[:, 9] = middle
+        H[:, 14] = right
+        H = scale.unsqueeze(-1) * H
+        H[:, self.states.of("wheel_scale")] = speed.unsqueeze(-1)
+        H[:, self.states.of("wheel_delay_s")] = -(scale * accel).unsqueeze(-1)
+        H[:, self.states.of("wheel_right_m")] = -(scale * weighted(weights, turn)).unsqueeze(-1)
+        return speed, H.unsqueeze(1), accel
+
+
+def _shaking(imu: Float[Tensor, "B M 6"]) -> Float[Tensor, " B"]:
+    """Spread of specific force times spread of rate in a window [m/s² rad/s]; of one sample there is none."""
+    if imu.shape[1] < 2:
+        return torch.zeros_like(imu[:, 0, 0])
+    swing = imu - imu.mean(1, keepdim=True)
+    force, rate = (swing.square().sum(1) / (imu.shape[1] - 1)).unflatten(-1, (2, 3)).sum(-1).unbind(-1)
+    return (force * rate).sqrt()

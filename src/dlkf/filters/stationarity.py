@@ -1,0 +1,112 @@
+"""Stationarity detection, from the samples of a window and the vibration levels of this car at rest and in motion.
+
+Engines idle differently and IMUs are noisy differently, so no fixed limit on the samples' spread fits two cars: the
+levels are learned while GNSS shows whether the car moves. A standstill is then a window whose level is closer to the
+least of a stationary second than to the least of a moving one, without acceleration or turn (the hypothesis of
+Skog et al. 2010, within the filter's 1σ), and not against the filter's estimate of the speed. A car
+without vibration has the same spread in both; then a standstill needs a speed below 0.5 m/s + 1σ, of which at most
+0.5 m/s count, for minutes at constant speed show no acceleration and no turn either.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dlkf.filters.integration import Epoch
+from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, VELOCITY
+
+GRAVITY = 9.81  # m/s²
+SURE_STD = 0.3  # m/s: speeds with a larger 1σ teach nothing
+STANDING_SPEED, MOVING_SPEED = 0.3, 1.5  # m/s: from which side on a second counts as the one or the other
+APART = 10.0  # prior ratio of the level of a moving car to that of a stationary one
+TELLING = 2.0  # below this ratio the samples do not separate stationary from moving
+MEMORY_S = 100.0  # s, stationary or moving, in which a level grows by e, so that a wrong second decays
+STILL_ACCEL, STILL_RATE = 0.2, 0.01  # m/s², rad/s: with less, beyond the filter's 2σ, a car may be stationary
+PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 3.0  # m/s, 1σ: a standstill must not contradict the filter
+# m/s: where the samples do not separate the two, a standstill needs a smaller 1σ of the speed
+SILENT_STD = 0.5
+
+
+class VibrationLevel(NamedTuple):
+    """Vibration levels of a car: spread of specific force times spread of rate [m/s² rad/s]; inf: nothing yet."""
+
+    standing: Tensor  # (B,) least level of a stationary second
+    moving: Tensor  # (B,) likewise
+
+    @classmethod
+    def unheard(cls, like: Tensor, batch_size: int) -> VibrationLevel:
+        """Before the first sample."""
+        nothing = like.new_full((batch_size,), math.inf)
+        return cls(nothing, nothing)
+
+    def limit(self, prior: Float[Tensor, " 1"]) -> Float[Tensor, " B"]:
+        """Half way, as logarithms, between stationary and moving; near zero where the two are alike."""
+        return self.thresholds(prior)[0]
+
+    def thresholds(self, prior: Float[Tensor, " 1"]) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
+        """The limit, and whether the samples separate a stationary car from a moving one so far."""
+        moving = torch.where(self.moving.isinf(), prior, self.moving)
+        standing = torch.where(self.standing.isinf(), moving / APART, self.standing)
+        distinct = moving > TELLING * standing
+        return torch.where(distinct, (standing * moving).sqrt(), prior / APART), distinct
+
+    def heard(self, now: Tensor, standing: Tensor, moving: Tensor, span: float) -> VibrationLevel:
+        """After a window of ``span`` seconds in which the car was surely stationary, or moving, or neither."""
+        fade = math.exp(span / MEMORY_S)
+        return VibrationLevel(
+            torch.where(standing, torch.minimum(fade * self.standing, now), self.standing),
+            torch.where(moving, torch.minimum(fade * self.moving, now), self.moving),
+        )
+
+
+class WheelMotion(NamedTuple):
+    """What a wheel that agrees with the filter says of a window; neither where it says nothing, or turns slowly."""
+
+    rolling: Tensor  # (B,) bool
+    stopped: Tensor  # (B,) bool
+
+
+@torch.no_grad()
+def detect_stationary(
+    epoch: Epoch, turning: Float[Tensor, "B 3"], P: Float[Tensor, "B n n"], before: VibrationLevel,
+    prior: Float[Tensor, " 1"], wheel: WheelMotion | None = None,
+) -> tuple[Bool[Tensor, " B"], VibrationLevel]:  # fmt: skip
+    """Whether the car was stationary in the window, and the levels after it; ``turning`` is its mean rate [rad/s].
+
+    Of one sample there is no spread: the levels stay, and no standstill is found. A ``wheel`` that rolls forbids a
+    standstill, one that is stopped makes it where the samples show neither acceleration nor turn, at any vibration;
+    and both give levels of this car where GNSS gives no velocity.
+    """
+    if epoch.imu.shape[1] < 2:
+        return torch.zeros_like(before.standing) > 0, before
+    swing = epoch.imu - epoch.imu.mean(1, keepdim=True)  # torch's var of a middle axis takes four times as long
+    variance = swing.square().sum(1) / (epoch.imu.shape[1] - 1)
+    force, rate = variance.unflatten(-1, (2, 3)).sum(-1).unbind(-1)
+    lively = (force * rate).sqrt()
+    span = epoch.dt * epoch.imu.shape[1]
+    v, diagonal = epoch.window.end.v_n, P.diagonal(dim1=-2, dim2=-1)
+    speed, std = v[:, :2].norm(dim=-1), diagonal[:, VELOCITY][:, :2].sum(-1).sqrt()
+    tilt, accel = diagonal[:, ATTITUDE][:, :2].sum(-1), diagonal[:, ACCEL].sum(-1)
+    gained = (v - epoch.start.v_n)[:, :2].norm(dim=-1) / span
+    still = (gained < STILL_ACCEL + 2 * (GRAVITY**2 * tilt + accel).sqrt()) & (
+        turning.norm(dim=-1) < STILL_RATE + 2 * diagonal[:, GYRO].sum(-1).sqrt()
+    )
+    sure = epoch.used[:, 3:5].all(-1) & (std < SURE_STD)
+    standing, moving = sure & (speed + std < STANDING_SPEED), sure & (speed - std > MOVING_SPEED)
+    if wheel is not None:
+        stopped = wheel.stopped & still
+        standing, moving = standing & ~wheel.rolling | stopped, (moving | wheel.rolling) & ~stopped
+    after = before.heard(lively, standing, moving, span)
+    # equal spectra: a wide 1σ would admit any speed, so only a speed that is nearly zero and known to be counts
+    limit, distinct = after.thresholds(prior)
+    doubt = torch.where(distinct, PLAUSIBLE_SIGMAS * std, std.clamp_max(SILENT_STD))
+    plausible = speed < PLAUSIBLE_SPEED + doubt
+    stationary = (lively <= limit) & still & plausible
+    if wheel is not None:
+        stationary = stationary & ~wheel.rolling | stopped
+    return stationary, after

@@ -1,0 +1,123 @@
+"""White noise of accelerometers and gyroscopes by virtual outages in the recent past.
+
+Beside a Kalman filter runs the trajectory that its own IMU gives without any correction since some update (a virtual
+outage). To first order it differs from the filter's by what the corrections have moved since, d ← Φ d + dx, and a fix
+that the filter was given is, for it, one of an outage of so many seconds:
+
+    z_o = z + H d,    S_o(a, g) = H (P_o + a² Q_a + g² Q_g) Hᵀ + R
+
+with P_o the covariance at the begin of the outage, carried on with all noise but the white one, and Q_a, Q_g what
+the white noise of accelerometers and gyroscopes has added since. S_o is linear in the squares of their levels a and g,
+so one trajectory scores all of them: the density of z_o (horizontal position, Student's t) after 10, 20 and 30 s is
+summed over the outages, older ones forgotten, and with a log-normal prior about 1 gives a posterior of (ln a, ln g)
+on a grid. Its mean is the level in force. Innovations after 1 s say how noisy a fix is; those after 10 to 30 s what
+matters in an outage. Without fixes nothing is learned.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dlkf.filters.integration import Covariances, Epoch
+from dlkf.navigation.error_model import WindowModel
+from dlkf.navigation.state import PVA, STATES
+
+SCORED_S, LAST_S, STALE_S = 10.0, 30.0, 45.0  # ages at which an outage is scored: each multiple up to the last; too old
+MEMORY_S = 600.0  # of fixes, over which an outage is forgotten
+FREEDOM = 4.0  # of Student's t: an outlier decides nothing
+SPREAD = 1.0  # 1σ of ln(level) before anything is known
+LEVELS = tuple(2.0**k for k in range(-5, 6))  # of both sensors
+
+
+class VirtualOutage(NamedTuple):
+    """The trajectory without corrections, and what the outages have said so far."""
+
+    drift: Tensor  # (B, n) d: the filter's estimate less that of the trajectory
+    P: Tensor  # (B, n, n) of the trajectory but for the white noise since it began
+    white: Tensor  # (B, 2, 9, 9) which adds so much at level 1: Q_a, Q_g
+    age: Tensor  # (B,) s
+    due: Tensor  # (B,) s, the age from which on the next fix is scored
+    evidence: Tensor  # (B, L, L) ln p of the scored fixes by levels of accelerometers and gyroscopes, no prior
+
+    @classmethod
+    def begin(cls, P: Float[Tensor, "B n n"]) -> VirtualOutage:
+        """One that begins with a filter, and nothing said."""
+        zeros, B, n = P.new_zeros, len(P), P.shape[-1]
+        due = zeros(B) + SCORED_S
+        return cls(zeros(B, n), P, zeros(B, 2, 9, 9), zeros(B), due, zeros(B, len(LEVELS), len(LEVELS)))
+
+    def levels(self) -> Float[Tensor, "B 2"]:
+        """Factors on the standard deviations of the white noise of accelerometers and gyroscopes; 1 where nothing was
+        said."""
+        x = self.evidence.new_tensor([math.log(level) for level in LEVELS])
+        prior = -0.5 * (x / SPREAD).square()
+        ln = (self.evidence + prior[:, None] + prior).flatten(1)
+        p = torch.exp(ln - ln.amax(1, keepdim=True)).unflatten(1, (len(LEVELS), -1))
+        mean = torch.stack(((p.sum(2) * x).sum(1), (p.sum(1) * x).sum(1)), -1) / p.sum((1, 2)).unsqueeze(-1)
+        said = self.evidence.abs().flatten(1).amax(1, keepdim=True) > 0
+        return torch.where(said, torch.exp(mean), 1.0)
+
+    def after(
+        self, epoch: Epoch, c: Covariances, windows: WindowModel, scale: Float[Tensor, "B 4 3 3"]
+    ) -> VirtualOutage:
+        """After an update of the filter; ``scale`` is that of its noise at level 1."""
+        Phi = c.Phi
+        by_source = windows.noise_of_sources(Phi, scale)
+        top = Phi[:, PVA]
+        drift = torch.cat((torch.bmm(top, self.drift.unsqueeze(-1)).squeeze(-1), self.drift[:, PVA.stop :]), -1)
+        P = self._predicted(top, by_source[:, 2:].sum(1), windows.walk)
+        F = top[:, None, :, PVA]
+        white = F @ self.white @ F.mT + by_source[:, :2, PVA, PVA]
+        age = self.age + epoch.dt * epoch.imu.shape[1]
+
+        fixed = epoch.used[:, :2].all(-1)
+        scored = fixed & (age >= self.due) & (age < STALE_S)
+        H, R = c.H[:, :2], c.R[:, :2]
+        z = epoch.z[:, :2] + torch.bmm(H, drift.unsqueeze(-1)).squeeze(-1)
+        known = torch.bmm(torch.bmm(H, P), H.mT) + torch.diag_embed(R)
+        added = H[:, None, :, PVA] @ white @ H[:, None, :, PVA].mT
+        said = torch.where(scored[:, None, None], _log_density(z, known, added), 0.0)
+        kept = 1 - fixed.to(age.dtype) * (epoch.dt * epoch.imu.shape[1] / MEMORY_S)
+        evidence = kept[:, None, None] * self.evidence + said
+
+        over = fixed & ((scored & (self.due >= LAST_S)) | (age >= STALE_S))
+        due = torch.where(scored, self.due + SCORED_S, self.due)
+        o, oo = over[:, None], over[:, None, None]
+        return VirtualOutage(
+            torch.where(o, 0.0, drift + c.dx), torch.where(oo, c.updated, P), torch.where(oo[..., None], 0.0, white),
+            torch.where(over, 0.0, age), torch.where(over, SCORED_S, due), evidence,
+        )  # fmt: skip
+
+    def _predicted(
+        self, top: Float[Tensor, "B 9 n"], of_walks: Float[Tensor, "B s s"], walk: Float[Tensor, " n"]
+    ) -> Float[Tensor, "B n n"]:
+        """Φ P Φᵀ + Q of all noise but the white one; below position, velocity and attitude Φ is taken for 1."""
+        TP = torch.bmm(top, self.P)
+        upper = torch.cat((torch.bmm(TP, top.mT), TP[:, :, PVA.stop :]), -1)
+        lower = torch.cat((TP[:, :, PVA.stop :].mT, self.P[:, PVA.stop :, PVA.stop :]), -1)
+        P = torch.cat((upper, lower), 1) + walk.diag()
+        rest = P.shape[-1] - STATES
+        return P + torch.nn.functional.pad(of_walks, (0, rest, 0, rest))
+
+
+def _log_density(
+    z: Float[Tensor, "B 2"], known: Float[Tensor, "B 2 2"], added: Float[Tensor, "B 2 2 2"]
+) -> Float[Tensor, "B L L"]:
+    """ln p(z) but for a constant, of Student's t with S = known + a² added₀ + g² added₁, for all levels a, g."""
+    square = z.new_tensor([level**2 for level in LEVELS])
+    a, g = square[:, None], square
+
+    def of(i: int, j: int) -> Tensor:
+        k, x = known[:, i, j, None, None], added[:, :, i, j, None, None]
+        return k + a * x[:, 0] + g * x[:, 1]
+
+    nn, ne, ee = of(0, 0), of(0, 1), of(1, 1)
+    det = nn * ee - ne * ne
+    n, e = z[:, 0, None, None], z[:, 1, None, None]
+    distance = (ee * n * n - 2 * ne * n * e + nn * e * e) / det
+    return -0.5 * torch.log(det) - 0.5 * (FREEDOM + 2) * torch.log1p(distance / FREEDOM)

@@ -1,0 +1,79 @@
+"""Frames as a dataset of one drive, checked as those on disk are."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from dlkf.base.errors import InputError
+from dlkf.frames.checks import check_frames, check_lever_arm
+
+DRIVE = "frames"  # the name of the one drive in the temporary dataset
+IN_PYTHON = (  # what a line advises for logs on disk, and what it is for frames
+    (r"reader\.gnss\.time\.offset_s=auto, or (-?[\d.]+)", r"add \1 s to t of gnss"),
+    (r"reader\.imu\.accel\.unit=auto finds it, if gravity was not taken out", "accel in m/s² with gravity"),
+    (r"reader\.imu\.accel\.axes=flu and gyro\.axes=flu, or auto", "turn the signs of y and z of accel and gyro round"),
+    (r"; set reader\.gnss\.position\.unit", "; give degrees"),
+    (r"\breader\.[\w.]+=\S+, or ", ""),
+    (r" \([^()]*(?:reader\.|dlkf\.ingest )[^()]*\)", ""),
+    (r"no position yet; quality 0", "no position yet; give them quality 0"),
+    (r" with aids=\[\]", ""),
+    (r"; lower align\.min_speed or leave the drive out", "; give a longer part of the drive, with turns and speed"),
+    (r"; reference=smoothed or gnss needs none", "; without reference= the drive smoothed with its fixes is one"),
+    (r"; give smaller ones, or outage=null", "; give a smaller outage_s, or a longer drive"),
+    (r"outage\.first_s=60 and outage\.duration_s=", "60 s with GNSS first and outage_s="),
+)
+PLACE = re.compile(rf"drive {DRIVE}, (\w+)(/drive={DRIVE})?")
+
+
+@contextmanager
+def drive_folder(
+    imu: pd.DataFrame, gnss: pd.DataFrame, reference: pd.DataFrame | None, lever_arm: Sequence[float],
+    aids: Mapping[str, pd.DataFrame | None],
+) -> Iterator[Path]:  # fmt: skip
+    """A temporary dataset of one drive, checked where it is read; error lines name the frames, not its files."""
+    from dlkf.data.schema import ATTITUDE, LEVER_ARM, STD, VELOCITY, write_drive, write_drives_table
+
+    check_frames(imu, gnss, reference, aids)
+    arm = check_lever_arm(lever_arm)
+    with TemporaryDirectory(prefix="dlkf-") as here, errors_of_frames():
+        folder = Path(here) / "frames"
+        meta = {"drive": DRIVE} | dict(zip(LEVER_ARM, arm))
+        fixes = _completed(gnss, dict.fromkeys((*VELOCITY, *STD), np.nan) | {"quality": 1})
+        truth = None
+        if reference is not None:
+            truth = _completed(reference, dict.fromkeys((*VELOCITY, *ATTITUDE), np.nan) | {"valid": True})
+        given = {kind: frame for kind, frame in aids.items() if frame is not None}
+        row = write_drive(folder, meta, imu, fixes, truth, given)
+        write_drives_table(folder, [row])
+        yield folder
+
+
+def _completed(frame: pd.DataFrame, defaults: Mapping[str, Any]) -> pd.DataFrame:
+    return frame.assign(**{name: value for name, value in defaults.items() if name not in frame})
+
+
+@contextmanager
+def errors_of_frames() -> Iterator[None]:
+    """Turns places in the temporary dataset into names of frames, and settings of commands into what callers can do."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(reworded(str(error))) from None
+
+
+def reworded(line: str) -> str:
+    """``drive frames, imu/drive=frames: row 3: …`` → ``imu: row 3: …``."""
+    line = PLACE.sub(r"\1", line).replace(f"drive {DRIVE}: ", "").replace(f"drive {DRIVE}", "this drive")
+    for advice, instead in IN_PYTHON:
+        line = re.sub(advice, instead, line)
+    if "reader." in line:
+        line += " (reader.…: keys of dlkf ingest; or change the frame)"
+    return line

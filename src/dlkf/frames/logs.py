@@ -1,0 +1,103 @@
+"""Drives as frames: simulated ones, and logs in other formats, units and axes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import pandas as pd
+
+from dlkf.base.errors import InputError
+from dlkf.frames.checks import check_above_zero, check_preset, check_whole
+
+if TYPE_CHECKING:
+    from dlkf.data.readers.frames import DriveFrames
+
+
+def simulate(
+    preset: str = "lifelike", *, minutes: float = 10.0, drives: int = 1, seed: int = 0, imu_type: str | None = None
+) -> list[DriveFrames]:
+    """Simulated drives of a preset of ``conf/simulated``, each with ``imu``, ``gnss`` and ``reference`` frames.
+
+    Parameters
+    ----------
+    preset : str
+        ``lifelike``, ``city``, ``highway``, ``tunnel``, ``fleet``, …
+    minutes : float
+        Length of each drive.
+    drives : int
+        How many.
+    seed : int
+        The same seed gives the same drives.
+    imu_type : str, optional
+        A preset of ``conf/imu``; default: the preset's own.
+
+    Raises
+    ------
+    InputError
+        For a preset that does not exist, and for no time or no drives.
+    """
+    from dlkf.base.settings import settings_from
+    from dlkf.command.composing import compose_command
+    from dlkf.command.simulated import SimulateSettings
+    from dlkf.data.readers.frames import DriveFrames
+    from dlkf.simulation.dataset import simulate as simulate_dataset
+
+    check_preset("simulated", preset)
+    if imu_type is not None:
+        check_preset("imu", imu_type)
+    check_above_zero(minutes=minutes)
+    drives, seed = check_whole("drives", drives, 1), check_whole("seed", seed, 0)
+    words = [
+        f"simulated@dataset={preset}",
+        f"dataset.hours={minutes * drives / 60}",
+        f"dataset.drive_minutes={minutes}",
+    ]
+    words += [f"seed={seed}"] + ([f"imu={imu_type}"] if imu_type else [])
+    recipe = settings_from(SimulateSettings, compose_command("simulate", *words), "").recipe
+    with TemporaryDirectory(prefix="dlkf-") as folder:
+        out = Path(folder) / "simulated"
+        simulate_dataset(recipe, out, progress=False)
+        made = []
+        for row in pd.read_parquet(out / "drives.parquet").to_dict("records"):
+            imu, gnss, reference = (_table(out, kind, str(row["drive"])) for kind in ("imu", "gnss", "reference"))
+            assert imu is not None  # simulated drives have one
+            made.append(DriveFrames({str(key): value for key, value in row.items()}, imu, gnss, reference))
+        return made
+
+
+def read_logs(source: str | Path, reader: str = "auto") -> list[DriveFrames]:
+    """Logs in other formats and units as frames in the contract's columns and units, a drive each.
+
+    Parameters
+    ----------
+    source : str or Path
+        A file, a folder with one drive, an app's ``.zip``, or a folder with a subfolder or ``.zip`` per drive.
+    reader : str
+        A preset of ``conf/reader``; ``auto`` finds format, units, clocks and mounting.
+
+    Returns
+    -------
+    list of DriveFrames
+        Each with ``imu``, ``gnss``, ``reference`` (or None), ``aids`` (speed, heading, baro where there are any),
+        ``meta`` (its row of ``drives.parquet``) and ``notes``: what was found and what was left out.
+
+    Raises
+    ------
+    InputError
+        For what cannot be read: which file, what is missing, and how to mend it.
+    """
+    from dlkf.base.classes import instantiate
+    from dlkf.command.composing import compose_command
+
+    if not isinstance(source, (str, Path)):
+        raise InputError(f"source is a {type(source).__name__}, must be the path of a file or a folder with logs")
+    check_preset("reader", reader)
+    values = compose_command("ingest", f"reader={reader}", "source=logs", "out=data")["reader"]
+    return list(instantiate(values, "reader", ("read",)).read(str(Path(source).expanduser())))
+
+
+def _table(folder: Path, kind: str, drive: str) -> pd.DataFrame | None:
+    file = folder / kind / f"drive={drive}" / "part-0.parquet"
+    return pd.read_parquet(file) if file.is_file() else None

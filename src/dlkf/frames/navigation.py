@@ -1,0 +1,167 @@
+"""A filter over one drive of frames, or fed sample by sample."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+import yaml
+
+from dlkf.base.config import config_dir
+from dlkf.frames.checks import (
+    check_above_zero,
+    check_imu_type,
+    check_lever_arm,
+    check_model,
+    check_options,
+    check_switch,
+    imu_values,
+    tuning_values,
+)
+from dlkf.frames.dataset import DRIVE, drive_folder
+from dlkf.frames.solution import Solution
+
+if TYPE_CHECKING:
+    from dlkf.filters.smoother import Filter
+    from dlkf.running.streaming import StreamingFilter
+
+
+def navigate(
+    imu: pd.DataFrame,
+    gnss: pd.DataFrame,
+    *,
+    speed: pd.DataFrame | None = None,
+    heading: pd.DataFrame | None = None,
+    baro: pd.DataFrame | None = None,
+    model: str = "plus",
+    imu_type: str | Mapping[str, Any] = "automotive_mems",
+    tuning: str | Mapping[str, Any] = "untuned",
+    lever_arm: Sequence[float] = (0.0, 0.0, 0.0),
+    smoothed: bool = False,
+    rate_hz: float | None = None,
+    epoch_s: float | None = None,
+) -> Solution:
+    """Run a filter over one drive from IMU and GNSS.
+
+    Parameters
+    ----------
+    imu, gnss : pandas.DataFrame
+        Samples and fixes, columns and units as at the top of this module; missing optional columns count as unknown.
+    speed, heading, baro : pandas.DataFrame, optional
+        Further sensors: t, speed [m/s]; t, heading [rad]; t, pressure [Pa] or height_m; each with ``std`` where known.
+    model : str
+        A filter's name (``plus``, ``mbkf15``, ``mbkf21_car``, …), a folder with weights, an MLflow run id,
+        ``models:/name@alias``, or ``module:Class``.
+    imu_type : str or mapping
+        Error model of the IMU for a Kalman filter: a preset of ``conf/imu`` or such a preset's content. ``plus`` and
+        trained filters need none.
+    tuning : str or mapping
+        Factors on a Kalman filter's noise: a preset of ``conf/tuning`` (``any_car`` for a car of which nothing is
+        known) or such factors by name, as ``dlkf tune`` finds them.
+    lever_arm : sequence of 3 floats
+        IMU → antenna, Forward-Right-Down [m].
+    smoothed : bool
+        Also run the Rauch-Tung-Striebel smoother backwards over the drive.
+    rate_hz, epoch_s : float, optional
+        IMU rate the filter runs at [Hz] and its update interval [s]; default: the filter's own.
+
+    Returns
+    -------
+    Solution
+        A row per update interval from the first moment at which attitude is known.
+
+    Raises
+    ------
+    InputError
+        For frames that break the contract, a filter that does not exist, or a drive that cannot be aligned.
+    """
+    import torch
+
+    from dlkf.data.store import choose_aids, load_dataset
+    from dlkf.filters.aids.attach import tables_of, with_aids
+    from dlkf.filters.saved import grid_of
+    from dlkf.filters.smoother import run_smoother
+    from dlkf.running.innovations import OF_NETWORK, REMEDY
+    from dlkf.running.offline import UsableFixes, epoch_for, navigate_drives
+    from dlkf.tracking.models import short_name, takes_imu_preset
+
+    given = {"rate_hz": rate_hz, "epoch_s": epoch_s}
+    check_above_zero(**{name: value for name, value in given.items() if value is not None})
+    check_switch("smoothed", smoothed)
+    check_model(model)
+    check_imu_type(imu_type)
+    aids = {"speed": speed, "heading": heading, "baro": baro}
+    with drive_folder(imu, gnss, None, lever_arm, aids) as folder:
+        estimator = with_aids(load(model, imu_type=imu_type, tuning=tuning), choose_aids(folder, None))
+        if smoothed:
+            estimator = run_smoother(estimator, "rts")
+        fixes = UsableFixes.of(folder, DRIVE)
+        grid = grid_of([estimator], rate_hz, epoch_s, epoch_for([fixes], rate_hz or 50.0, estimator))
+        drives = load_dataset(folder, dtype=torch.float64, reference=False, aids=tables_of(estimator), **grid)
+        (navigated,) = navigate_drives(drives, estimator, align=_align())
+    return Solution.of(navigated, fixes, short_name(model), REMEDY if takes_imu_preset(model) else OF_NETWORK)
+
+
+def smooth(imu: pd.DataFrame, gnss: pd.DataFrame, *, model: str = "mbkf21_nhc", **options: Any) -> Solution:
+    """:func:`navigate` with the smoother: the best solution of a whole drive, after it. ``options`` are its own."""
+    check_options("smooth", options, navigate, apart=("imu", "gnss", "model", "smoothed"))
+    return navigate(imu, gnss, model=model, smoothed=True, **options)
+
+
+def load(
+    model: str = "plus",
+    *,
+    imu_type: str | Mapping[str, Any] = "automotive_mems",
+    tuning: str | Mapping[str, Any] = "untuned",
+) -> Filter:
+    """A filter by name, from a folder with ``weights.safetensors`` and ``config.yaml``, or from MLflow.
+
+    The result runs in :func:`dlkf.filters.integration.integrate` and :class:`~dlkf.running.streaming.StreamingFilter`.
+    ``imu_type`` and ``tuning`` as in :func:`navigate`. Raises InputError for anything else, listing what is known.
+    """
+    from dlkf.base.settings import settings_from
+    from dlkf.filters.tuning import Tuning
+    from dlkf.tracking.models import resolve_model
+
+    factors = settings_from(Tuning, tuning_values(tuning), "tuning")
+    return resolve_model(check_model(model), _imu_spec(imu_type), tuning=factors)
+
+
+def Stream(
+    model: str = "plus", *, rate_hz: float | None = None, imu_type: str | Mapping[str, Any] = "automotive_mems",
+    tuning: str | Mapping[str, Any] = "untuned", lever_arm: Sequence[float] = (0.0, 0.0, 0.0), **options: Any,
+) -> StreamingFilter:  # fmt: skip
+    """A filter fed sample by sample and fix by fix, as in a vehicle.
+
+    ``rate_hz`` is the rate the filter runs at [Hz] (default its own); samples may come at any rate and jitter.
+    ``options`` are those of :class:`~dlkf.running.streaming.StreamingFilter` (epoch_s, history_s, …), whose methods
+    ``imu``, ``gnss`` and ``now`` return receipts and estimates. Raises InputError for options that do not exist, and
+    for a filter that cannot work on such a grid.
+    """
+    from dlkf.filters.saved import grid_of
+    from dlkf.running.streaming import StreamingFilter
+
+    check_options("Stream", options, StreamingFilter, apart=("estimator", "rate_hz"))
+    epoch_s = options.pop("epoch_s", None)
+    given = {"rate_hz": rate_hz, "epoch_s": epoch_s}
+    check_above_zero(**{name: value for name, value in given.items() if value is not None})
+    arm = check_lever_arm(options.pop("lever_arm_b", lever_arm))
+    estimator = load(model, imu_type=imu_type, tuning=tuning)
+    grid = grid_of([estimator], rate_hz, epoch_s, 1.0)
+    return StreamingFilter(estimator, **grid, lever_arm_b=arm, **options)
+
+
+def _align() -> Any:
+    """How ``dlkf navigate`` starts a drive."""
+    from dlkf.base.settings import settings_from
+    from dlkf.data.alignment import AlignConfig
+
+    return settings_from(AlignConfig, yaml.safe_load((config_dir() / "navigate.yaml").read_text())["align"], "align")
+
+
+def _imu_spec(imu_type: str | Mapping[str, Any]) -> Any:
+    from dlkf.navigation.imu_errors import imu_spec
+
+    check_imu_type(imu_type)
+    return imu_spec(imu_values(imu_type))

@@ -1,0 +1,215 @@
+/* Where a filter may start: attitude at a boundary from IMU and GNSS alone, yaw from the course, roll and pitch by
+ * levelling (dlkf.data.alignment; Groves 5.6.2 with motion). The rule of the stream, all of it in this file. */
+#include <math.h>
+#include <string.h>
+
+#include "constants.h"
+#include "dlkf.h"
+#include "geometry.h"
+
+enum { BACK = DLKF_LEVELLED }; /* update intervals that are levelled over */
+static const double EPOCH_S = DLKF_SAMPLES / DLKF_RATE_HZ;
+
+typedef struct {
+  const dlkf_fix *fix;
+  double C_en[9], lat, height, v_n[3], std[3];
+} boundary;
+
+static const double *samples(const dlkf *d, int64_t epoch) { return d->closed[epoch % DLKF_CLOSED].imu; }
+
+static int has_position(const dlkf_fix *fix) { return fix && fix->used[0] && fix->used[1] && fix->used[2]; }
+
+/* Mean rate of the last RATE_AVERAGE_S before a boundary, of the first where nothing is before it. */
+static void rate_at(const dlkf *d, int64_t number, int64_t first, double *rate_b) {
+  const double *imu = number > first ? samples(d, number - 1) + 6 * (DLKF_SAMPLES - DLKF_TAIL) : samples(d, first);
+  mean3(imu + 3, DLKF_TAIL, rate_b);
+}
+
+/* Mean specific force of the window before a boundary in the axes there, and C_b(boundary)b(window's start). */
+static void carried_force(const dlkf *d, int64_t number, double *force_b, double *turned) {
+  double C[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1}, turn[9], next[9], u[3];
+  memset(force_b, 0, 3 * sizeof *force_b);
+  for (int64_t epoch = number - 1; epoch >= number - BACK; epoch--)
+    for (int k = DLKF_SAMPLES - 1; k >= 0; k--) {
+      const double *x = samples(d, epoch) + 6 * k;
+      double phi[3];
+      for (int c = 0; c < 3; c++) phi[c] = -0.5 * x[3 + c] / DLKF_RATE_HZ;
+      rotation_of(phi, turn);
+      product3(C, turn, next); /* to the middle of the sample, where its force acts */
+      apply3(next, x, u);
+      for (int c = 0; c < 3; c++) force_b[c] += u[c];
+      product3(next, turn, C);
+    }
+  for (int c = 0; c < 3; c++) force_b[c] /= BACK * DLKF_SAMPLES;
+  if (turned) memcpy(turned, C, sizeof C);
+}
+
+/* Yaw that the gyroscopes turn in an update interval: rates about the direction of the force at its end. */
+static double yaw_turned(const dlkf *d, int64_t epoch, int64_t first) {
+  double rate_b[3], force_b[3];
+  carried_force(d, epoch + 1 - BACK < first ? first + BACK : epoch + 1, force_b, NULL);
+  const double size = sqrt(dot3(force_b, force_b));
+  mean3(samples(d, epoch) + 3, DLKF_SAMPLES, rate_b);
+  return -dot3(rate_b, force_b) / (size > 1 ? size : 1) * EPOCH_S;
+}
+
+/* x of A x = b by Cholesky, A symmetric, positive definite (n x n) and destroyed; two right sides in b, by rows. */
+static void solve2(int n, double *A, double *b) {
+  for (int i = 0; i < n; i++)
+    for (int j = 0; j <= i; j++) {
+      double x = A[i * n + j];
+      for (int k = 0; k < j; k++) x -= A[i * n + k] * A[j * n + k];
+      A[i * n + j] = i == j ? sqrt(x) : x / A[j * n + j];
+    }
+  for (int c = 0; c < 2; c++) {
+    double *x = b + c * n;
+    for (int i = 0; i < n; x[i] /= A[i * n + i], i++)
+      for (int k = 0; k < i; k++) x[i] -= A[i * n + k] * x[k];
+    for (int i = n - 1; i >= 0; x[i] /= A[i * n + i], i--)
+      for (int k = i + 1; k < n; k++) x[i] -= A[k * n + i] * x[k];
+  }
+}
+
+/* Velocity fitted to the positions of FIT_S before a boundary, with the turns of the gyroscopes; 0 where they are fewer
+ * than three. Complex numbers are north + i east; u + i v solves as a real system of (u, v) (dlkf.data.alignment). */
+static int fit_velocity(const dlkf *d, int64_t number, int64_t first, boundary *b) {
+  double A[36] = {0}, x[12] = {0}, D[3] = {1e-9, 0, 0}, down[2] = {0}, r_n[3], u[3];
+  double yaw = 0, before[2] = {1, 0}, way[2] = {0, 0}, slowed[2] = {0, 0}, span = 0;
+  int fixes = 0;
+  for (int j = 0; j <= DLKF_FITTED && number - j >= first; j++) {
+    const double tau = j * EPOCH_S;
+    if (j) {
+      yaw -= yaw_turned(d, number - j, first);
+      const double heading[2] = {cos(yaw), sin(yaw)};
+      for (int c = 0; c < 2; c++) {
+        const double middle = 0.5 * (heading[c] + before[c]) * EPOCH_S;
+        way[c] += middle;
+        slowed[c] += middle * (tau - 0.5 * EPOCH_S);
+        before[c] = heading[c];
+      }
+    }
+    const dlkf_fix *fix = dlkf_fix_at(d, number - j);
+    if (!has_position(fix) || fix->lag > 0) continue;
+    fixes++;
+    span = tau;
+    double std = fix->std[0] > fix->std[1] ? fix->std[0] : fix->std[1];
+    std = hypot(fix->std[2] > std ? fix->std[2] : std, FIT_STD);
+    const double weight = 1 / (std * std), row[6] = {1, -way[0], slowed[0], 0, -way[1], slowed[1]}; /* real, imaginary */
+    for (int k = 0; k < 3; k++) u[k] = fix->r_e[k] - b->fix->r_e[k];
+    apply3_transposed(b->C_en, u, r_n);
+    for (int i = 0; i < 3; i++) { /* conj(x_i) x_k and conj(x_i) y */
+      for (int k = 0; k < 3; k++) {
+        const double re = weight * (row[i] * row[k] + row[3 + i] * row[3 + k]);
+        const double im = weight * (row[i] * row[3 + k] - row[3 + i] * row[k]);
+        A[6 * i + k] += re, A[6 * (i + 3) + k + 3] += re;
+        A[6 * (i + 3) + k] += im, A[6 * i + k + 3] -= im;
+      }
+      x[i] += weight * (row[i] * r_n[0] + row[3 + i] * r_n[1]);
+      x[3 + i] += weight * (row[i] * r_n[1] - row[3 + i] * r_n[0]);
+    }
+    D[0] += weight, D[1] -= weight * tau, D[2] += weight * tau * tau;
+    down[0] += weight * r_n[2], down[1] -= weight * tau * r_n[2];
+  }
+  if (fixes < 3) return 0;
+  for (int k = 0; k < 6; k++) A[7 * k] += k % 3 < 2 ? 1e-9 : 1 / (ACCELERATION_STD * ACCELERATION_STD);
+  x[6 + 1] = 1; /* its solution has the variance of the velocity */
+  solve2(6, A, x);
+  b->v_n[0] = x[1], b->v_n[1] = x[4];
+  const double speed = hypot(x[1], x[4]), slope = UNKNOWN_VELOCITY_STD + UNKNOWN_SLOPE_STD * speed;
+  b->std[0] = b->std[1] = hypot(sqrt(x[6 + 1]), 0.5 * GYRO_BIAS_STD * span * speed);
+  D[2] += 1 / (slope * slope);
+  const double determinant = D[0] * D[2] - D[1] * D[1];
+  b->v_n[2] = (D[0] * down[1] - D[1] * down[0]) / determinant;
+  b->std[2] = sqrt(D[0] / determinant);
+  return 1;
+}
+
+/* Velocity of the antenna at a boundary with its 1-sigma; where no fix has any, from positions. */
+static int read_boundary(const dlkf *d, int64_t number, int64_t first, int velocities, boundary *b) {
+  b->fix = dlkf_fix_at(d, number);
+  if (!has_position(b->fix)) return 0;
+  double lon;
+  geodetic_from_ecef(b->fix->r_e, &b->lat, &lon, &b->height);
+  ned_axes(b->lat, lon, b->C_en);
+  if (!velocities) return !(b->fix->lag > 0) && fit_velocity(d, number, first, b);
+  apply3_transposed(b->C_en, b->fix->v_e, b->v_n);
+  for (int k = 0; k < 3; k++)
+    if (!b->fix->used[3 + k]) b->v_n[k] = 0;
+  const double guess = UNKNOWN_VELOCITY_STD + UNKNOWN_SLOPE_STD * hypot(b->v_n[0], b->v_n[1]);
+  for (int k = 0; k < 3; k++) b->std[k] = b->fix->used[3 + k] ? b->fix->std[3 + k] : guess;
+  return b->fix->used[3] && b->fix->used[4];
+}
+
+/* A start at the beginning of a closed update interval: latitude, longitude [rad], height [m] of the IMU, velocity (3)
+ * and attitude (9) in the tangent frame there, 1-sigma of position, velocity, attitude (9); and the mean specific force of
+ * the window before. 0 where there is none. */
+int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b) {
+  const int64_t first = epoch - d->oldest > DLKF_LOOKBACK ? epoch - DLKF_LOOKBACK : d->oldest;
+  const double *arm = d->lever_arm_b;
+  int velocities = 0;
+  for (int64_t k = first; k <= epoch + 1; k++) {
+    const dlkf_fix *fix = dlkf_fix_at(d, k);
+    velocities |= fix && (fix->used[3] || fix->used[4]);
+  }
+  boundary now, then;
+  if (epoch - BACK < first) return 0;
+  if (!read_boundary(d, epoch, first, velocities, &now)) return 0;
+  if (!read_boundary(d, epoch - BACK, first, velocities, &then)) return 0;
+  const double lag = now.fix->lag, lag_then = then.fix->lag, span = BACK * EPOCH_S - lag + lag_then;
+  const double speed = hypot(now.v_n[0], now.v_n[1]), slow = speed > 0.1 ? speed : 0.1;
+  if (!(span > 0.5 * EPOCH_S) || !(speed > MIN_SPEED)) return 0;
+
+  double turned[9], rate_b[3], rate_then[3], swing_b[3], swing_then[3], u[3], w[3];
+  carried_force(d, epoch, u_b, turned);
+  rate_at(d, epoch, first, rate_b);
+  rate_at(d, epoch - BACK, first, rate_then);
+  /* velocity of the IMU in n at both ends: the antenna's less the swing of the lever arm */
+  cross3(rate_b, arm, swing_b);
+  cross3(rate_then, arm, swing_then);
+  double slip = swing_b[1] / slow;
+  slip = asin(slip > 0.9 ? 0.9 : slip < -0.9 ? -0.9 : slip);
+  const double yaw = atan2(now.v_n[1], now.v_n[0]) - slip + lag * rate_b[2];
+  double C_level[9], v_imu[3], v_then[3], acceleration[3], u_n[3], u_h[3], C_nb[9];
+  rotation_from_rpy(0, 0, yaw, C_level);
+  apply3(C_level, swing_b, u);
+  for (int k = 0; k < 3; k++) v_imu[k] = now.v_n[k] - u[k];
+  apply3(turned, swing_then, w);
+  apply3(C_level, w, u);
+  for (int k = 0; k < 3; k++) v_then[k] = then.v_n[k] - u[k];
+  for (int k = 0; k < 3; k++) acceleration[k] = (v_imu[k] - v_then[k]) / span;
+  const double earth_n[3] = {EARTH_RATE * cos(now.lat), 0, -EARTH_RATE * sin(now.lat)};
+  for (int k = 0; k < 3; k++) w[k] = (v_imu[k] + v_then[k]) / 2;
+  cross3(earth_n, w, u);
+  for (int k = 0; k < 3; k++) u_n[k] = acceleration[k] + 2 * u[k];
+  u_n[2] -= normal_gravity(sin(now.lat), now.height);
+  apply3_transposed(C_level, u_n, u_h);
+  double roll, pitch;
+  level3(u_b, u_h, &roll, &pitch);
+  rotation_from_rpy(roll, pitch, yaw, C_nb);
+
+  double r_e[3], v_e[3], C_eb[9], C_new[9];
+  for (int k = 0; k < 3; k++) u[k] = lag * now.v_n[k];
+  apply3(now.C_en, u, w);
+  product3(now.C_en, C_nb, C_eb);
+  apply3(C_eb, arm, u);
+  for (int k = 0; k < 3; k++) r_e[k] = now.fix->r_e[k] + w[k] - u[k];
+  for (int k = 0; k < 3; k++) u[k] = v_imu[k] + lag * acceleration[k];
+  apply3(now.C_en, u, v_e);
+  geodetic_from_ecef(r_e, &start[0], &start[1], &start[2]);
+  ned_axes(start[0], start[1], C_new);
+  apply3_transposed(C_new, v_e, start + 3);
+  product3_transposed(C_new, C_eb, start + 6);
+
+  const double noise = now.std[0] > now.std[1] ? now.std[0] : now.std[1];
+  const double shift = lag > lag_then ? lag : lag_then; /* of the velocities' window against the IMU's */
+  const double jolt = 1.41 * noise / span, jerk = JERK_STD * shift, turning = AXLE_STD * rate_b[2];
+  const double pull = jolt * jolt + jerk * jerk + ACCEL_BIAS_STD * ACCEL_BIAS_STD; /* (m/s2)2 */
+  double *std = start + 15;
+  for (int k = 0; k < 3; k++) std[k] = now.fix->std[k];
+  for (int k = 0; k < 3; k++) std[3 + k] = now.std[k];
+  std[6] = std[7] = sqrt(pull / (STANDARD_GRAVITY * STANDARD_GRAVITY) + SPREAD_STD * SPREAD_STD);
+  std[8] = sqrt(SIDESLIP_STD * SIDESLIP_STD + (noise * noise + turning * turning) / (slow * slow));
+  double sum = 0;
+  for (int k = 0; k < DLKF_START; k++) sum += start[k];
+  return isfinite(sum);
+}

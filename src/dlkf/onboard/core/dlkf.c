@@ -1,0 +1,330 @@
+/* The core: fixes to their boundaries, update intervals, what comes late (dlkf.running.streaming). */
+#include "dlkf.h"
+
+#include <math.h>
+#include <string.h>
+
+#include "constants.h"
+#include "geometry.h"
+
+static const double EPOCH_S = DLKF_SAMPLES / DLKF_RATE_HZ, DEGREE = PI / 180;
+static const double DEFAULT_STD[QUALITIES][6] = DEFAULT_STD_ROWS; /* 0: no satellite fix */
+
+const size_t dlkf_bytes = sizeof(dlkf);
+const int dlkf_columns = DLKF_COLUMNS, dlkf_search_seconds = DLKF_SEARCH_S;
+
+dlkf_status dlkf_counted(dlkf *d, dlkf_status status) {
+  d->counts[status]++;
+  return status;
+}
+
+static dlkf_epoch *epoch_at(dlkf *d, int64_t number) { return &d->closed[number % DLKF_CLOSED]; }
+
+static void clear(dlkf *d) {
+  for (int k = 0; k < DLKF_BOUNDARIES; k++) d->fixes[k].number = -1;
+  d->early_first = d->early_count = 0;
+  d->oldest = 0;
+  d->kind = DLKF_NOTHING;
+  d->latest = 0;
+  d->doubt = 1;
+  dlkf_aids_clear(d);
+  dlkf_samples_clear(&d->samples);
+}
+
+void dlkf_open(dlkf *d, const double *lever_arm_b) {
+  memset(d, 0, sizeof *d);
+  d->layout = DLKF_LAYOUT;
+  for (int k = 0; k < 3; k++) d->lever_arm_b[k] = lever_arm_b ? lever_arm_b[k] : 0;
+  d->samples.phase_s = d->samples.step_s = NAN;
+  dlkf_screen_clear(&d->screen);
+  clear(d);
+}
+
+void dlkf_lay(dlkf *d, double t, double step_s) {
+  d->samples.phase_s = isfinite(t) ? t : NAN;
+  d->samples.step_s = step_s > 0 && step_s < EPOCH_S ? step_s : NAN;
+  clear(d);
+}
+
+int dlkf_fits(const dlkf *d) { return d->layout == DLKF_LAYOUT; }
+
+const dlkf_fix *dlkf_fix_at(const dlkf *d, int64_t boundary) {
+  if (boundary < 0) return NULL;
+  const dlkf_fix *fix = &d->fixes[boundary % DLKF_BOUNDARIES];
+  return fix->number == boundary ? fix : NULL;
+}
+
+/* The fix of a boundary in a tangent frame: value, 1-sigma, what may be used, lag (19 numbers). */
+void dlkf_read_fix(const dlkf *d, int64_t boundary, const double *origin_e, const double *C_en, double *out) {
+  const dlkf_fix *fix = dlkf_fix_at(d, boundary);
+  memset(out, 0, 19 * sizeof *out);
+  for (int k = 0; k < 6; k++) out[6 + k] = 1;
+  if (!fix) return;
+  double away[3], value[6];
+  for (int k = 0; k < 3; k++) away[k] = fix->r_e[k] - origin_e[k];
+  apply3_transposed(C_en, away, value);
+  apply3_transposed(C_en, fix->v_e, value + 3);
+  for (int k = 0; k < 6; k++) {
+    out[k] = fix->used[k] ? value[k] : 0;
+    out[6 + k] = fix->std[k];
+    out[12 + k] = fix->used[k];
+  }
+  out[18] = fix->lag;
+}
+
+static dlkf_before *before(dlkf *d, int64_t number) { return &d->before[number % DLKF_REWIND]; }
+
+static void copy_state(dlkf_state *to, const dlkf_state *from, int kind) {
+  if (kind == DLKF_FILTER) memcpy(to->filter, from->filter, sizeof from->filter);
+#if DLKF_SEARCH_S > 0
+  if (kind == DLKF_SEARCH) to->search = from->search;
+#endif
+}
+
+static void begin_filter(dlkf *d, const double *start) {
+  dlkf_start(start, d->lever_arm_b, d->now.filter, d->work);
+  d->kind = DLKF_FILTER;
+  d->watch.count = 0;
+}
+
+/* Align at the start of a closed update interval, or search over it; whether there is a filter for it. */
+static int aligned(dlkf *d, int64_t number) {
+  double start[DLKF_START];
+#if DLKF_SEARCH_S > 0
+  double doubt;
+  if (d->kind == DLKF_NOTHING) {
+    if (!dlkf_search_begin(d, number)) return 0;
+    if (dlkf_search_start(d, start)) {
+      doubt = d->now.search.doubt;
+      begin_filter(d, start);
+      d->doubt = doubt;
+      return 1;
+    }
+    d->kind = DLKF_SEARCH;
+  }
+  if (!dlkf_search_advance(d, epoch_at(d, number)->imu, number + 1)) {
+    d->counts[DLKF_DIVERGED]++;
+    d->kind = DLKF_NOTHING;
+  } else if (dlkf_search_start(d, start)) {
+    doubt = d->now.search.doubt;
+    begin_filter(d, start);
+    d->doubt = doubt;
+  }
+  return 0;
+#else
+  double force_b[3];
+  if (!dlkf_align(d, number, start, force_b)) return 0;
+  begin_filter(d, start);
+  d->doubt = 0;
+  return 1;
+#endif
+}
+
+/* The filter over a closed update interval: align at its start if need be, then one turn of the loop. */
+static void run(dlkf *d, int64_t number, int revised) {
+  dlkf_epoch *epoch = epoch_at(d, number);
+  dlkf_before *held = before(d, number);
+  double fix[DLKF_FIX];
+  held->watch = d->watch;
+  held->doubt = d->doubt;
+  held->kind = d->kind;
+  copy_state(&held->state, &d->now, d->kind);
+  if (d->kind != DLKF_FILTER && !aligned(d, number)) return;
+  double *memory = d->now.filter;
+  dlkf_read_fix(d, number + 1, memory + DLKF_AT_ORIGIN, memory + DLKF_AT_AXES, fix);
+  dlkf_read_aids(d, number + 1, fix + 19);
+  double *next = d->work + DLKF_WORK - DLKF_MEMORY;
+  dlkf_turn(memory, epoch->imu, fix, next, d->outputs, d->work);
+  memcpy(memory, next, DLKF_MEMORY * sizeof *memory);
+  double sum = 0;
+  for (int k = 0; k < 15; k++) sum += d->outputs[DLKF_OUTPUTS_POSTERIOR + k];
+  const int finite = isfinite(sum);
+  if (!finite || dlkf_lost(d, number, fix)) {
+    d->counts[finite ? DLKF_LOST : DLKF_DIVERGED]++;
+    d->kind = DLKF_NOTHING;
+    d->latest = 0;
+    return;
+  }
+  double *row = d->rows[d->made++];
+  dlkf_row(memory, d->outputs, row + DLKF_LAT_DEG, d->work);
+  row[DLKF_T] = dlkf_samples_boundary(&d->samples, number + 1);
+  row[DLKF_REVISED] = revised;
+  memcpy(d->last, row, sizeof d->last);
+  d->latest = 1;
+  if (row[DLKF_FROM_ORIGIN_M] > DLKF_ANCHOR_M) {
+    memcpy(next, memory, DLKF_MEMORY * sizeof *memory);
+    dlkf_anchor(next, memory, d->work);
+  }
+}
+
+/* A fix to its boundary; what is over is run anew. */
+static dlkf_status file(dlkf *d, const dlkf_report *x) {
+  const int64_t done = d->samples.epochs;
+  const double place = ceil((x->t - d->samples.t0 - ON_BOUNDARY_S) / EPOCH_S);
+  if (!(place <= (double)(done + DLKF_REWIND))) return dlkf_counted(d, DLKF_AHEAD);
+  if (place < 0 || (place > 1 ? place - 1 : 0) < (double)(done - DLKF_REWIND)) return dlkf_counted(d, DLKF_LATE);
+  const int64_t row = (int64_t)place;
+  dlkf_fix *fix = &d->fixes[row % DLKF_BOUNDARIES];
+  if (fix->number == row && fix->t >= x->t) return dlkf_counted(d, fix->t > x->t ? DLKF_SUPERSEDED : DLKF_DOUBLE);
+
+  if (!dlkf_screen_take(&d->screen, x)) return dlkf_counted(d, DLKF_IMPLAUSIBLE_FIX);
+  double C_en[9], v_n[3];
+  const double lat = x->lat_deg * DEGREE, lon = x->lon_deg * DEGREE;
+  ecef_from_geodetic(lat, lon, x->height_m, fix->r_e);
+  ned_axes(lat, lon, C_en);
+  for (int k = 0; k < 6; k++) {
+    double std = x->std[k];
+    if (isnan(std)) std = DEFAULT_STD[x->quality][k];
+    fix->std[k] = std > SMALLEST_STD ? std : SMALLEST_STD;
+    fix->used[k] = k < 3 || !isnan(x->v[k - 3]);
+  }
+  for (int k = 0; k < 3; k++) v_n[k] = fix->used[3 + k] ? x->v[k] : 0;
+  apply3(C_en, v_n, fix->v_e);
+  const double lag = dlkf_samples_boundary(&d->samples, row) - x->t;
+  fix->lag = lag > ON_BOUNDARY_S ? lag : 0;
+  fix->t = x->t;
+  fix->number = row;
+
+  if (row > done || done == d->oldest) return dlkf_counted(d, DLKF_TAKEN);
+  return dlkf_replay(d, row);
+}
+
+/* The filter again from the update interval on that ends at a boundary. */
+dlkf_status dlkf_replay(dlkf *d, int64_t row) {
+  const int64_t done = d->samples.epochs, from = row - 1 > d->oldest ? row - 1 : d->oldest;
+  const dlkf_before *held = before(d, from);
+  d->kind = held->kind;
+  d->watch = held->watch;
+  d->doubt = held->doubt;
+  copy_state(&d->now, &held->state, held->kind);
+  for (int64_t k = from; k < done; k++) run(d, k, 1);
+  return dlkf_counted(d, DLKF_REPLAYED);
+}
+
+/* Lay the grid, once there are fixes enough to lay it through. */
+static void settle(dlkf *d) {
+  double *through = d->work; /* of the filter, which does not run yet */
+  int n = 0;
+  if (!isnan(d->samples.phase_s)) {
+    through[n++] = d->samples.phase_s;
+  } else {
+    const double now = dlkf_samples_latest(&d->samples);
+    for (int k = 0; k < d->early_count; k++) {
+      const double t = d->early[(d->early_first + k) % DLKF_EARLY].t;
+      if (!(fabs(t - now) <= DLKF_LATE_S + SETTLE_S)) continue;
+      int j = n++;
+      for (; j > 0 && through[j - 1] > t; j--) through[j] = through[j - 1];
+      through[j] = t;
+    }
+    if (n < 2 || through[n - 1] - through[0] < SETTLE_S - ON_BOUNDARY_S) return;
+  }
+  if (!dlkf_samples_begin(&d->samples, through, n)) return;
+  for (int k = 0; k < d->early_count; k++) file(d, &d->early[(d->early_first + k) % DLKF_EARLY]);
+  d->early_count = 0;
+  dlkf_aids_file(d);
+}
+
+static void close_epochs(dlkf *d, double slack_s) {
+  for (;;) {
+    const int64_t number = d->samples.epochs;
+    if (!dlkf_samples_closed(&d->samples, slack_s, epoch_at(d, number)->imu)) return;
+    run(d, number, 0);
+    if (number + 1 - d->oldest > DLKF_REWIND + DLKF_LOOKBACK) {
+      dlkf_fix *fix = &d->fixes[d->oldest % DLKF_BOUNDARIES];
+      if (fix->number == d->oldest) fix->number = -1;
+      d->oldest++;
+    }
+  }
+}
+
+dlkf_status dlkf_imu(dlkf *d, double t, const double accel[3], const double gyro[3]) {
+  d->made = d->given = 0;
+  const dlkf_status status = dlkf_samples_take(&d->samples, t, accel, gyro);
+  if (status != DLKF_TAKEN) {
+    if (!dlkf_samples_lost(&d->samples)) return dlkf_counted(d, status);
+    dlkf_screen_clear(&d->screen); /* the clock may be another */
+    clear(d);
+    return dlkf_counted(d, DLKF_RESTARTED);
+  }
+  if (isnan(d->samples.t0)) settle(d);
+  if (!isnan(d->samples.t0)) close_epochs(d, 0);
+  return DLKF_TAKEN;
+}
+
+void dlkf_finish(dlkf *d) {
+  d->made = d->given = 0;
+  if (!isnan(d->samples.t0)) close_epochs(d, dlkf_samples_slack(&d->samples));
+}
+
+dlkf_status dlkf_gnss(dlkf *d, double t, double lat_deg, double lon_deg, double height_m, const double *velocity_ned,
+                      const double *std, int quality) {
+  d->made = d->given = 0;
+  dlkf_report x = {t, lat_deg, lon_deg, height_m, {NAN, NAN, NAN}, {NAN, NAN, NAN, NAN, NAN, NAN}, quality};
+  if (velocity_ned) memcpy(x.v, velocity_ned, sizeof x.v);
+  if (std) memcpy(x.std, std, sizeof x.std);
+  int infinite = isinf(lat_deg) || isinf(lon_deg) || isinf(height_m) || !isfinite(t), below = 0;
+  for (int k = 0; k < 3; k++) infinite |= isinf(x.v[k]) != 0;
+  for (int k = 0; k < 6; k++) infinite |= isinf(x.std[k]) != 0, below |= x.std[k] < 0;
+  if (infinite) return dlkf_counted(d, DLKF_NOT_FINITE);
+  if (quality < 0 || quality >= QUALITIES || !(DEFAULT_STD[quality][0] > 0) || isnan(lat_deg + lon_deg + height_m))
+    return dlkf_counted(d, DLKF_NO_FIX);
+  if (fabs(lat_deg) > 90 || fabs(lon_deg) > 180 || below) return dlkf_counted(d, DLKF_OUTSIDE);
+  if (!isnan(d->samples.t0)) return file(d, &x);
+  if (d->early_count == DLKF_EARLY) d->early_first = (d->early_first + 1) % DLKF_EARLY, d->early_count--;
+  d->early[(d->early_first + d->early_count++) % DLKF_EARLY] = x;
+  return dlkf_counted(d, DLKF_TAKEN);
+}
+
+const double *dlkf_next(dlkf *d) { return d->given < d->made ? d->rows[d->given++] : NULL; }
+
+dlkf_waiting dlkf_waits(const dlkf *d) {
+  if (d->kind == DLKF_FILTER && d->latest) return DLKF_RUNS;
+  if (!d->samples.count) return DLKF_WAITS_FOR_SAMPLES;
+  if (d->kind != DLKF_NOTHING) return DLKF_WAITS_FOR_HEADING;
+  return isnan(d->samples.t0) ? DLKF_WAITS_FOR_FIXES : DLKF_WAITS_FOR_MOTION;
+}
+
+dlkf_waiting dlkf_pose(dlkf *d, double *row) {
+  double outputs[DLKF_OUTPUTS];
+  const dlkf_waiting waiting = dlkf_waits(d);
+  if (waiting != DLKF_RUNS) return waiting;
+  double *imu = d->work + DLKF_WORK - DLKF_SAMPLES * 6;
+  const double span = dlkf_samples_open(&d->samples, imu);
+  memcpy(row, d->last, sizeof d->last);
+  if (!(span > 0)) return DLKF_RUNS;
+  const double share = span / EPOCH_S;
+  dlkf_carry(d->now.filter, imu, &share, d->outputs, outputs, d->work);
+  dlkf_row(d->now.filter, outputs, row + DLKF_LAT_DEG, d->work);
+  row[DLKF_T] = dlkf_samples_latest(&d->samples);
+  row[DLKF_GNSS_USED] = row[DLKF_REVISED] = 0;
+  return DLKF_RUNS;
+}
+
+double dlkf_doubt(const dlkf *d) {
+#if DLKF_SEARCH_S > 0
+  if (d->kind == DLKF_SEARCH) return d->now.search.doubt;
+#endif
+  return d->kind == DLKF_FILTER ? d->doubt : 1;
+}
+
+int64_t dlkf_count(const dlkf *d, dlkf_status status) {
+  return (unsigned)status < DLKF_STATUSES ? d->counts[status] : 0;
+}
+
+const char *dlkf_says(dlkf_status status) {
+  static const char *const words[DLKF_STATUSES] = {
+      "taken", "taken late, and replayed", "superseded by a later one of the same update interval",
+      "refused: a number is not finite", "refused: beyond what an IMU of a car measures", "refused: this stamp again",
+      "refused: the stamp goes back", "refused: the stamp leaps ahead", "refused: more samples than the memory holds",
+      "refused: no fix", "refused: latitude, longitude or 1-sigma out of range", "refused: no car can have come there since the last good fix", "refused: too late",
+      "refused: ahead of the IMU; both need one clock", "refused: this filter takes no such sensor", "started over: samples out of line went on for a second",
+      "the filter diverged, and aligns anew", "the filter was lost, far off good fixes, and aligns anew"};
+  return (unsigned)status < DLKF_STATUSES ? words[status] : "no such status";
+}
+
+const char *dlkf_waits_for(dlkf_waiting waiting) {
+  static const char *const words[] = {"nothing", "samples of the IMU", "fixes over three seconds",
+                                      "the car to move under GNSS",
+                                      "motion that shows which way the car faces"};
+  return (unsigned)waiting < sizeof words / sizeof *words ? words[waiting] : "no such thing";
+}

@@ -1,0 +1,252 @@
+/* IMU samples one at a time, brought to the grid of update intervals (dlkf.running.imu_stream, dlkf.data.resampling). */
+#include <math.h>
+#include <string.h>
+
+#include "constants.h"
+#include "dlkf.h"
+
+static const double EPOCH_S = DLKF_SAMPLES / DLKF_RATE_HZ;
+
+static const dlkf_sample *at(const dlkf_samples *s, int k) { return &s->ring[(s->first + k) % DLKF_RAW]; }
+
+static void drop(dlkf_samples *s) {
+  s->first = (s->first + 1) % DLKF_RAW;
+  s->count--;
+}
+
+static double longest(double usual) {
+  const double some = isnan(usual) ? 0 : GAP_SAMPLES * usual;
+  return some > GAP_S ? some : GAP_S;
+}
+
+static double ulp(double x) { return nextafter(fabs(x), INFINITY) - fabs(x); }
+
+void dlkf_samples_clear(dlkf_samples *s) {
+  s->first = s->count = 0;
+  s->astray[0] = s->astray[1] = s->t0 = NAN;
+  s->step = s->step_s;
+  s->longest = longest(s->step_s);
+  s->epochs = 0;
+}
+
+double dlkf_samples_latest(const dlkf_samples *s) { return s->count ? at(s, s->count - 1)->t : -INFINITY; }
+
+double dlkf_samples_boundary(const dlkf_samples *s, int64_t number) { return s->t0 + (double)number * EPOCH_S; }
+
+/* Samples out of line have gone on for longer than an accident does: the clock was set, or the gap is real. */
+int dlkf_samples_lost(const dlkf_samples *s) { return s->astray[1] - s->astray[0] >= ASTRAY_S; }
+
+static dlkf_status out_of_line(dlkf_samples *s, double t, double last) {
+  const int follows = s->astray[1] < t && t <= s->astray[1] + s->longest;
+  if (!follows) s->astray[0] = t;
+  s->astray[1] = t;
+  return t > last ? DLKF_GAP : t < last ? DLKF_BACK : DLKF_DOUBLE;
+}
+
+dlkf_status dlkf_samples_take(dlkf_samples *s, double t, const double accel[3], const double gyro[3]) {
+  dlkf_sample sample = {t, {accel[0], accel[1], accel[2], gyro[0], gyro[1], gyro[2]}};
+  double sum = t;
+  for (int k = 0; k < 6; k++) sum += sample.x[k];
+  if (!isfinite(sum)) return DLKF_NOT_FINITE;
+  for (int k = 0; k < 6; k++)
+    if (fabs(sample.x[k]) > (k < 3 ? FULL_SCALE_ACCEL : FULL_SCALE_GYRO)) return DLKF_IMPLAUSIBLE;
+  const double last = dlkf_samples_latest(s);
+  if (s->count && !(last < t && t <= last + s->longest)) return out_of_line(s, t, last);
+  if (s->count == DLKF_RAW) {
+    if (!isnan(s->t0)) return DLKF_FULL;
+    drop(s);
+  }
+  s->astray[0] = s->astray[1] = NAN;
+  s->ring[(s->first + s->count++) % DLKF_RAW] = sample;
+  if (isnan(s->t0) && t - at(s, 0)->t > DLKF_KEEP_S) drop(s);
+  return DLKF_TAKEN;
+}
+
+/* The k-th smallest interval between samples, by halving the range of its bits: needs no memory. */
+static double interval(const dlkf_samples *s, int k) {
+  uint64_t low = 0, high = UINT64_C(0x7FF0000000000000);
+  while (low < high) {
+    const uint64_t middle = low + (high - low) / 2;
+    double x;
+    memcpy(&x, &middle, sizeof x);
+    int below = 0;
+    for (int j = 1; j < s->count; j++) below += at(s, j)->t - at(s, j - 1)->t <= x;
+    if (below > k) high = middle;
+    else low = middle + 1;
+  }
+  double x;
+  memcpy(&x, &high, sizeof x);
+  return x;
+}
+
+static double usual_interval(const dlkf_samples *s) {
+  const int n = s->count - 1;
+  return n % 2 ? interval(s, n / 2) : 0.5 * (interval(s, n / 2 - 1) + interval(s, n / 2));
+}
+
+static double wrapped(double x, double period) {
+  const double rest = fmod(x, period);
+  return rest < 0 ? rest + period : rest;
+}
+
+static void sort(double *x, int n) {
+  for (int i = 1; i < n; i++) {
+    const double value = x[i];
+    int j = i;
+    for (; j > 0 && x[j - 1] > value; j--) x[j] = x[j - 1];
+    x[j] = value;
+  }
+}
+
+static double median(const double *sorted, int n) { return 0.5 * (sorted[(n - 1) / 2] + sorted[n / 2]); }
+
+/* Phase of fixes (in order of time) in an update interval (dlkf.data.resampling.fix_phase). */
+static double fix_phase(const double *t, int n) {
+  double c = 0, s = 0, around[DLKF_EARLY];
+  for (int k = 0; k < n; k++) {
+    const double angle = 2 * PI * (wrapped(t[k], EPOCH_S) / EPOCH_S);
+    c += cos(angle) / n;
+    s += sin(angle) / n;
+  }
+  const int together = hypot(c, s) > 0.5;
+  const double centre = together ? atan2(s, c) / (2 * PI) * EPOCH_S : wrapped(t[0], EPOCH_S);
+  for (int k = 0; k < n; k++)
+    around[k] = wrapped(wrapped(t[k], EPOCH_S) - centre + EPOCH_S / 2, EPOCH_S) - EPOCH_S / 2;
+  sort(around, n);
+  if (together) {
+    const double middle = median(around, n);
+    int close = 0;
+    for (int k = 0; k < n; k++) close += fabs(around[k] - middle) <= ON_BOUNDARY_S;
+    if (2 * close > n) return centre + middle;
+    const double place = 0.95 * (n - 1);
+    const int low = (int)place;
+    const double next = around[low + 1 < n ? low + 1 : low];
+    return centre + around[low] + (next - around[low]) * (place - low);
+  }
+  int most = 0, count = 0;
+  double best = 0;
+  for (int k = 0; k < n; k++) { /* the most frequent millisecond, the first of several */
+    count = k && rint(around[k] / ON_BOUNDARY_S) == rint(around[k - 1] / ON_BOUNDARY_S) ? count + 1 : 1;
+    if (count > most) most = count, best = rint(around[k] / ON_BOUNDARY_S) * ON_BOUNDARY_S;
+  }
+  int first = 0, last = n;
+  while (fabs(around[first] - best) > ON_BOUNDARY_S) first++;
+  while (fabs(around[last - 1] - best) > ON_BOUNDARY_S) last--;
+  return centre + median(around + first, last - first);
+}
+
+/* Lay the grid through times of fixes, sorted; 0 while there is less than an update interval of samples. */
+int dlkf_samples_begin(dlkf_samples *s, const double *t_fix, int count) {
+  if (s->count < 2) return 0;
+  const double begin = at(s, 0)->t, last = dlkf_samples_latest(s);
+  if (last - begin + 2 * s->longest < EPOCH_S) return 0;
+  const double found = usual_interval(s), spacing = EPOCH_S / DLKF_SAMPLES;
+  const double slack = 0.5 * (found < spacing ? found : spacing), phase = fix_phase(t_fix, count);
+  const double t0 = phase + ceil((begin - found - phase - slack) / EPOCH_S) * EPOCH_S;
+  if (!(floor((last - t0 + slack) / EPOCH_S) >= 1)) return 0;
+  s->t0 = t0;
+  s->step = isnan(s->step_s) ? found : s->step_s;
+  s->longest = longest(s->step);
+  return 1;
+}
+
+double dlkf_samples_slack(const dlkf_samples *s) {
+  const double spacing = EPOCH_S / DLKF_SAMPLES;
+  return 0.5 * (s->step < spacing ? s->step : spacing);
+}
+
+/* alpha0 x nu + nu0 x alpha, and alpha0 x alpha, of increments (nu [m/s], alpha [rad]) one after the other, added to out
+ * times a factor (dlkf.data.increments) */
+static void second_order(const double *before, const double *now, double factor, double *out) {
+  for (int k = 0; k < 3; k++) {
+    const int i = (k + 1) % 3, j = (k + 2) % 3;
+    out[k] += factor * (before[3 + i] * now[j] - before[3 + j] * now[i] + before[i] * now[3 + j] - before[j] * now[3 + i]);
+    out[3 + k] += factor * (before[3 + i] * now[3 + j] - before[3 + j] * now[3 + i]);
+  }
+}
+
+/* Integral of sample k of those from `first` on over its interval; where stamps are missing in it, the mean of the two
+ * neighbours fills the missing part. */
+static int integral(const dlkf_samples *s, int first, int k, double *step, double *out) {
+  const double *now = at(s, k)->x;
+  *step = k > first ? at(s, k)->t - at(s, k - 1)->t : s->step;
+  const int whole = k == first || *step <= 1.5 * s->step;
+  for (int c = 0; c < 6; c++) {
+    out[c] = now[c] * (whole ? *step : s->step);
+    if (!whole) out[c] += 0.5 * (now[c] + at(s, k - 1)->x[c]) * (*step - s->step);
+  }
+  return whole;
+}
+
+/* Rate and force of interval k that, constant over it, turn and push like the true ones: coning and sculling from the
+ * interval before, rate and force taken as linear through both (Savage 1998). */
+static void rates(const dlkf_samples *s, int first, int k, double *out) {
+  double step, before[6], step0;
+  const int whole = integral(s, first, k, &step, out);
+  if (k > first && integral(s, first, k - 1, &step0, before) && whole) {
+    double raw[6];
+    memcpy(raw, out, sizeof raw);
+    second_order(before, raw, step * step / (6 * step0 * (step0 + step)), out);
+  }
+  for (int c = 0; c < 6; c++) out[c] /= step;
+}
+
+/* `count` samples of equal length from `begin` over `span` seconds, constant in each, composed of the pieces of intervals
+ * inside them (dlkf.data.resampling.resample_imu). */
+static void resampled(const dlkf_samples *s, double begin, double span, int count, double *imu) {
+  const double dt = span / count;
+  int first = 0, end = 0;
+  while (first < s->count && at(s, first)->t <= begin) first++;
+  for (end = first; end < s->count && at(s, end)->t < begin + dt * count;) end++;
+  first = first > BEFORE ? first - BEFORE : 0;
+  end = end + 1 < s->count ? end + 1 : s->count;
+  int k = first; /* interval that ends at sample k; the one beyond the last goes on with its values */
+  double force[6];
+  while (k < end && at(s, k)->t <= begin) k++;
+  const double opening = at(s, first)->t - s->step;
+  int early = begin < opening; /* one interval more before the first */
+  if (early) memcpy(force, at(s, first)->x, sizeof force);
+  else if (k < end) rates(s, first, k, force);
+  else memcpy(force, at(s, end - 1)->x, sizeof force);
+  double now = begin;
+  for (int j = 0; j < count; j++) {
+    const double limit = begin + dt * (j + 1);
+    double total[6] = {0}, products[6] = {0};
+    int pieces = 0;
+    while (now < limit) {
+      const double knot = early ? opening : k < end ? at(s, k)->t : INFINITY;
+      const double until = knot < limit ? knot : limit;
+      double piece[6];
+      for (int c = 0; c < 6; c++) piece[c] = force[c] * (until - now);
+      if (pieces++) second_order(total, piece, 1, products);
+      for (int c = 0; c < 6; c++) total[c] += piece[c];
+      now = until;
+      if (knot <= limit) {
+        k += !early;
+        early = 0;
+        if (k < end) rates(s, first, k, force);
+        else memcpy(force, at(s, end - 1)->x, sizeof force);
+      }
+    }
+    for (int c = 0; c < 6; c++) imu[6 * j + c] = (total[c] + 0.5 * products[c]) / dt;
+  }
+}
+
+/* The next update interval whose end the samples have reached to `slack_s`: 1 and its samples, else 0. */
+int dlkf_samples_closed(dlkf_samples *s, double slack_s, double *imu) {
+  if (isnan(s->t0)) return 0;
+  const double end = dlkf_samples_boundary(s, s->epochs + 1), rounding = 4 * ulp(end);
+  if (!(dlkf_samples_latest(s) >= end - (slack_s > rounding ? slack_s : rounding))) return 0;
+  resampled(s, dlkf_samples_boundary(s, s->epochs), EPOCH_S, DLKF_SAMPLES, imu);
+  s->epochs++;
+  while (s->count > BEFORE && at(s, BEFORE)->t <= dlkf_samples_boundary(s, s->epochs)) drop(s);
+  return 1;
+}
+
+/* DLKF_SAMPLES samples from the open update interval's beginning to the last stamp, and the seconds that they span. */
+double dlkf_samples_open(const dlkf_samples *s, double *imu) {
+  const double begin = dlkf_samples_boundary(s, s->epochs), span = dlkf_samples_latest(s) - begin;
+  if (!(span > 4 * ulp(begin))) return 0;
+  resampled(s, begin, span, DLKF_SAMPLES, imu);
+  return span;
+}

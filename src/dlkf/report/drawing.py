@@ -1,0 +1,121 @@
+"""Figures of plotly.js as plain values.
+
+The Python package plotly checks every property of every trace, which takes longer than all that the figures show, and
+seconds for a page of a dozen drives. Here a figure is a list of traces and a layout, as plotly.js reads them
+(https://plotly.com/javascript/reference/); the tests have plotly check the figures of every page.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+Trace = dict[str, Any]
+TEMPLATE = "plotly_white"
+
+
+@dataclass
+class Figure:
+    """Traces and a layout; ``rows`` panels below each other have the axes ``x``, ``x2`` … and ``y``, ``y2`` …."""
+
+    data: list[Trace] = field(default_factory=list)
+    layout: dict[str, Any] = field(default_factory=dict)
+    rows: int = 1
+
+    def add_trace(self, trace: Trace, row: int = 1) -> None:
+        """A trace in a panel."""
+        if self.rows > 1:
+            trace |= {"xaxis": f"x{_number(row)}", "yaxis": f"y{_number(row)}"}
+        self.data.append(trace)
+
+    def update_layout(self, **more: Any) -> None:
+        """Set properties of the layout, those of nested ones each by itself."""
+        _merge(self.layout, more)
+
+    def update_xaxis(self, row: int = 1, **more: Any) -> None:
+        """Set properties of a panel's time axis."""
+        _merge(self.layout.setdefault(f"xaxis{_number(row)}", {}), more)
+
+    def update_yaxis(self, row: int = 1, **more: Any) -> None:
+        """Set properties of a panel's value axis."""
+        _merge(self.layout.setdefault(f"yaxis{_number(row)}", {}), more)
+
+    def to_json(self) -> str:
+        """As plotly.js reads it; arrays of floats are binary."""
+        return json.dumps(
+            {"data": self.data, "layout": self.layout}, default=_plain, allow_nan=False, separators=(",", ":")
+        )
+
+
+def panels(titles: Sequence[str], spacing: float) -> Figure:
+    """Empty panels below each other, ``spacing`` of the height between them, with the time axis of the last."""
+    rows = len(titles)
+    height = (1.0 - spacing * (rows - 1)) / rows
+    figure = Figure(rows=rows)
+    titled = []
+    for row, title in enumerate(titles, 1):
+        low = (rows - row) * (height + spacing)
+        top = min(low + height, 1.0)
+        shared = {"matches": f"x{_number(rows)}", "showticklabels": False} if row < rows else {}
+        figure.update_xaxis(row, anchor=f"y{_number(row)}", domain=[0.0, 1.0], **shared)
+        figure.update_yaxis(row, anchor=f"x{_number(row)}", domain=[low, top])
+        titled.append(
+            {
+                "text": title, "x": 0, "y": top, "xref": "paper", "yref": "paper", "xanchor": "left",
+                "yanchor": "bottom", "showarrow": False, "font": {"size": 12},
+            }
+        )  # fmt: skip
+    figure.update_layout(annotations=titled)
+    return figure
+
+
+@cache
+def library() -> str:
+    """plotly.js, as the package brings it."""
+    return (_package() / "plotly.min.js").read_text(encoding="utf-8")
+
+
+@cache
+def template() -> str:
+    """The look of all figures of a page, JSON."""
+    return (_package() / "templates" / f"{TEMPLATE}.json").read_text(encoding="utf-8")
+
+
+def _package() -> Path:
+    """Where plotly's files lie; the package itself need not be imported."""
+    spec = find_spec("plotly")
+    assert spec is not None and spec.submodule_search_locations  # a dependency of this package
+    return Path(spec.submodule_search_locations[0]) / "package_data"
+
+
+def _number(row: int) -> str:
+    """Of an axis: the first has none."""
+    return str(row) if row > 1 else ""
+
+
+def _merge(into: dict[str, Any], more: dict[str, Any]) -> None:
+    for key, value in more.items():
+        if isinstance(value, dict) and isinstance(into.get(key), dict):
+            _merge(into[key], value)
+        else:
+            into[key] = value
+
+
+def _plain(value: Any) -> Any:
+    """What :mod:`json` does not know: arrays and numbers of numpy."""
+    if isinstance(value, np.generic):
+        return value.item()
+    if not isinstance(value, np.ndarray):
+        raise TypeError(f"{type(value).__name__} in a figure")
+    if value.dtype in (np.float32, np.float64):
+        little = value.astype(f"<f{value.itemsize}", copy=False)
+        return {"dtype": f"f{value.itemsize}", "bdata": base64.b64encode(little.tobytes()).decode()}
+    return value.tolist()

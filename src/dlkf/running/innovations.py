@@ -1,0 +1,115 @@
+"""Innovations of a drive and whether the filter's own 1σ fits them, by closed form.
+
+Of update k with m components seen, s_k = Σ (z/σ)² / m: of a filter whose σ is right E s = 1. n updates count as fewer
+where they are correlated in time (ρ_j of s at lag j, up to the first that is not positive; Geyer 1992, initial positive
+sequence), and components as fewer where they go together or have heavy tails (Satterthwaite 1946):
+
+    n_eff = n / (1 + 2 Σ_j (1 − j/n) ρ_j),     ν = n_eff · min(m, 2 s̄²/var s),     ν s̄ ~ χ²_ν
+
+So r = √s̄ lies within √(χ²_ν(α/2)/ν) … √(χ²_ν(1 − α/2)/ν) in all but α of the cases.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlkf.filters.gating import chi2_quantile
+
+Array = NDArray[np.floating]
+CHANCE = 1e-4  # α: a filter that is right gets the warning once in as many drives
+TOLERATED = 1.3  # by which a 1σ may be off before it is worth a line: no filter's noise is known better
+SETTLE = 10  # updates from the start on that do not count: the heading is still being found
+REMEDY = "tuning=any_car is for unknown cars, dlkf tune or imu=auto fits the noise; dlkf consistency shows more"
+OF_NETWORK = "its network knows no such sensors: compare it with mbkf21_car imu=auto; dlkf doctor looks at the data"
+
+
+class Innovation(NamedTuple):
+    """GNSS − prediction (T, 6) [m, m/s] in the tangent frame, NaN where no fix was used, and its 1σ as the filter says.
+
+    The 1σ is NaN where the filter has no covariance.
+    """
+
+    value: np.ndarray
+    std: np.ndarray
+
+    @property
+    def ratio(self) -> Array:
+        """Innovation over its 1σ (T, 6)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return self.value / self.std
+
+    @property
+    def normalised_rms(self) -> float:
+        """RMS of innovation over 1σ: 1 for a filter whose 1σ is right."""
+        return rms(self.ratio)
+
+
+class SigmaFit(NamedTuple):
+    """RMS of innovations over their 1σ, and within which bounds it lies where the 1σ is right."""
+
+    ratio: float
+    low: float
+    high: float
+    degrees: float
+
+    @property
+    def too_small(self) -> bool:
+        """Whether the filter is too sure: its 1σ is smaller than chance and the tolerated factor explain."""
+        return self.ratio > TOLERATED * self.high
+
+    def warning(self, name: str, remedy: str = REMEDY) -> str:
+        """One line with the remedy."""
+        return (
+            f"{name} is too sure of itself: innovations are {self.ratio:.2g} of their 1σ (RMS), by chance at most "
+            f"{self.high:.2g} ({self.degrees:.0f} degrees of freedom); in outages it drifts further than its 1σ says; "
+            f"{remedy}"
+        )
+
+
+def rms(ratio: Array) -> float:
+    """Root mean square of what is finite, NaN where nothing is."""
+    known = np.isfinite(ratio)
+    return float(np.sqrt(np.mean(ratio[known] ** 2))) if known.any() else float("nan")
+
+
+def fit_sigma(*drives: Array) -> SigmaFit | None:
+    """Of innovations over their 1σ (T, 6), an array for each independent drive, NaN where there is none; None where no
+    drive has any."""
+    parts = [_squares(drive[SETTLE:]) for drive in drives]
+    parts = [part for part in parts if len(part[0]) > 1]
+    if not parts:
+        return None
+    squares = np.concatenate([s for s, _ in parts])
+    seen = np.concatenate([m for _, m in parts])
+    mean = float(np.average(squares, weights=seen))
+    variance = float(np.var(squares))
+    independent = sum(_independent(s) for s, _ in parts)
+    each = min(float(seen.mean()), 2 * mean**2 / variance) if variance > 0 else float(seen.mean())
+    degrees = max(independent * each, 1e-3)
+    low, high = (float(np.sqrt(chi2_quantile(p, degrees) / degrees)) for p in (CHANCE / 2, 1 - CHANCE / 2))
+    return SigmaFit(float(np.sqrt(mean)), low, high, degrees)
+
+
+def _squares(ratio: Array) -> tuple[Array, Array]:
+    """s_k of the updates with a fix, and how many components each has."""
+    known = np.isfinite(ratio)
+    m = known.sum(-1)
+    s = np.where(known, ratio, 0.0) ** 2
+    return s.sum(-1)[m > 0] / m[m > 0], m[m > 0].astype(float)
+
+
+def _independent(s: Array) -> float:
+    """n_eff of a series."""
+    n = len(s)
+    around = s - s.mean()
+    power = float(around @ around)
+    if power <= 0:
+        return float(n)
+    spectrum = np.abs(np.fft.rfft(around, 2 * n)) ** 2
+    rho = np.fft.irfft(spectrum)[:n] / power
+    end = np.flatnonzero(rho <= 0)
+    j = np.arange(1, end[0] if len(end) else n)
+    return n / (1 + 2 * float(((1 - j / n) * rho[j]).sum()))

@@ -1,0 +1,124 @@
+"""From what a user writes after ``model=`` to a filter that runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from inspect import signature
+from pathlib import Path
+from typing import Any
+
+from dlkf.base.classes import find_class
+from dlkf.base.errors import InputError, did_you_mean
+from dlkf.filters.build import OWN_SOURCE, build_filter, filter_names, is_filter, known_filters
+from dlkf.filters.integration import Estimator
+from dlkf.filters.saved import CONFIG, WEIGHTS, load_filter
+from dlkf.filters.shipped import shipped_folder
+from dlkf.filters.smoother import Filter
+from dlkf.filters.tuning import Prior, Tuning
+from dlkf.navigation.imu_errors import ImuSpec
+from dlkf.tracking.runs import RUN_ID
+
+BEST = "best"  # folder of the weights that a training keeps
+
+
+def resolve_model(
+    spec: str,
+    imu: ImuSpec,
+    tracking_uri: str | None = None,
+    *,
+    tuning: Tuning | None = None,
+    prior: Prior | None = None,
+) -> Filter:
+    """A filter by name, from a folder with weights and config, an MLflow run id, ``models:/name@alias``, or a class of
+    one's own, ``module:Class``.
+
+    ``imu`` and ``tuning`` belong to the model-based filters, ``prior`` to those with ``_prior``. Raises InputError for
+    anything else, listing what is known.
+    """
+    if is_filter(spec):
+        return build_filter(spec, imu, tuning=tuning, prior=prior)
+    if OWN_SOURCE.fullmatch(spec):
+        return own_filter(spec, imu)
+    if folder := shipped_folder(spec):
+        return load_filter(folder)
+    if is_tracked(spec):
+        from dlkf.tracking.registry import download_model  # MLflow takes seconds to import
+
+        return load_filter(download_model(spec, tracking_uri))
+    folder = Path(spec).expanduser()
+    if folder.is_dir():
+        return load_filter(folder)
+    if folder.is_file():
+        raise InputError(f"model={spec} is a file; give the folder with {WEIGHTS} and {CONFIG} (pickles are not read)")
+    raise InputError(
+        f"unknown model {spec!r}{did_you_mean(spec, filter_names()) or ':'} neither a known filter (plus, "
+        f"{known_filters()}) nor a folder, "
+        "an MLflow run id, models:/name@alias or a class of your own, module:Class"
+    )
+
+
+def takes_imu_preset(spec: str) -> bool:
+    """Whether a model's noise is set by ``imu`` and ``tuning``; a network has its own."""
+    return is_filter(spec) or OWN_SOURCE.fullmatch(spec) is not None
+
+
+def model_folder(spec: str) -> Path:
+    """Where weights and config of ``plus`` or of a model's folder lie; InputError where they are not or do not load."""
+    folder = shipped_folder(spec) or Path(spec).expanduser()
+    if not folder.is_dir():
+        raise InputError(f"model={spec}: neither plus nor a folder with {WEIGHTS} and {CONFIG}")
+    load_filter(folder)
+    return folder
+
+
+def own_filter(spec: str, imu: ImuSpec) -> Estimator:
+    """A user's estimator from ``module:Class``, given the IMU's preset if its class takes an argument ``imu``.
+
+    Raises InputError where there is none.
+    """
+    kind = find_class(spec, "model", ("begin", "step"))
+    return kind(imu=imu) if "imu" in signature(kind).parameters else kind()
+
+
+def check_baseline(baseline: str, models: Mapping[str, Filter]) -> None:
+    """InputError for a baseline that is neither among the models nor a filter's name."""
+    if baseline not in models and not is_filter(str(baseline)):
+        near = did_you_mean(baseline, (*models, *filter_names())) or "; see model="
+        raise InputError(f"baseline={baseline} is none of the models {', '.join(models)}{near}")
+
+
+def is_tracked(spec: str) -> bool:
+    """Whether a model is to be had from MLflow: a run id, ``runs:/…`` or ``models:/…``."""
+    return bool(RUN_ID.fullmatch(spec)) or spec.startswith(("models:/", "runs:/"))
+
+
+def resolve_models(
+    specs: Sequence[str], imu: ImuSpec, tracking_uri: str | None = None, **options: Any
+) -> dict[str, Filter]:
+    """``{name in tables: filter}``, in the order of the specs; a repeated name gets a number."""
+    models: dict[str, Filter] = {}
+    for spec in specs:
+        name = short_name(spec)
+        if name in models:
+            name = f"{name}#{sum(n == name or n.startswith(name + '#') for n in models) + 1}"
+        models[name] = resolve_model(spec, imu, tracking_uri, **options)
+    return models
+
+
+def short_name(spec: str) -> str:
+    """What a table calls a model: its name, its folder's, its registered one, or a run's first 8 digits.
+
+    The folder ``best`` of a training is called after the training.
+    """
+    if is_filter(spec) or shipped_folder(spec):
+        return spec
+    if RUN_ID.fullmatch(spec):
+        return spec[:8]
+    if spec.startswith("models:/"):
+        return spec.removeprefix("models:/")
+    if OWN_SOURCE.fullmatch(spec):
+        return spec.partition(":")[2]
+    folder = Path(spec).expanduser().resolve()
+    if folder.name == BEST:  # outputs/train/<name>/<hash>/best
+        return f"{folder.parents[1].name}-{folder.parent.name}"
+    return folder.name

@@ -1,0 +1,28 @@
+"""IMUs and receivers of the training segments made worse than any preset (:mod:`dlkf.data.augmentation`)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import torch
+
+from dlkf.base.settings import settings_from
+from dlkf.data.augmentation import SensorDegradation, degrade_sensors
+from dlkf.data.drive import Batch
+from dlkf.training.callbacks.masking import BatchCallback
+
+
+class SensorDegradationCallback(BatchCallback):
+    """Draws for every segment; keys are those of :class:`dlkf.data.augmentation.SensorDegradation`."""
+
+    def __init__(self, **rough: Any) -> None:
+        self.rough = settings_from(SensorDegradation, rough, "callbacks.sensor_degradation")
+
+    def transform(self, batch: Batch, epoch: int, generator: torch.Generator) -> Batch:
+        """The same motion, felt by other sensors."""
+        return degrade_sensors(batch, self.rough, generator)
+
+    def state_dict(self) -> dict:
+        """Settings, recorded in a checkpoint."""
+        return asdict(self.rough)

@@ -1,0 +1,133 @@
+"""Standing is told from moving by how this very car sounds, whatever engine and IMU it has."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import ClassVar
+
+import pytest
+import torch
+
+from dlkf.filters.build import build_filter
+from dlkf.filters.constraints import CarConstraints
+from dlkf.filters.integration import integrate
+from dlkf.filters.stationarity import APART, MEMORY_S, VibrationLevel
+from dlkf.filters.tuning import Tuning
+from dlkf.navigation.state import NavState
+
+from .scene import IMU, M, scene
+from .test_constraints import drift, driven, outage, slipping
+
+D = torch.float64
+STOP = 40.0  # s
+
+
+def shaken(idling: tuple[float, float], driving: tuple[float, float]):
+    """Cars that stop after 40 s and shake at 9 to 18 Hz [m/s², rad/s, amplitudes] as told, with GNSS for 20 s."""
+    batch = slipping(8, 100, (0.0, 0.0, 0.0, 0.0, 0.0), stop=STOP)
+    _, T, count = batch.size
+    moving = batch.truth.v_n.norm(dim=-1)[..., None, None] > 0.01
+    size = torch.where(moving, *(batch.imu.new_tensor(x).repeat_interleave(3) for x in (driving, idling)))
+    t = (torch.arange(T * count, dtype=D) * batch.dt).reshape(1, T, count, 1)
+    waves = torch.sin(2 * math.pi * torch.linspace(9.3, 17.7, 6, dtype=D) * t)
+    return outage(replace(batch, imu=batch.imu + size * waves), 20, 100)
+
+
+class Watched(CarConstraints):
+    """Constraints that keep in which windows they found a standstill."""
+
+    found: ClassVar[list[torch.Tensor]] = []
+
+    def resting(self, epoch, turning, prediction, memory):
+        resting, liveliness = super().resting(epoch, turning, prediction, memory)
+        self.found.append(resting)
+        return resting, liveliness
+
+
+def steady(speeds: tuple[float, ...], epochs: int):
+    """Cars without vibration that stand for 10 s, speed up for 20 s and keep their speed [m/s] straight on."""
+    base = scene(len(speeds), epochs, seed=12)
+    a = torch.zeros(len(speeds), epochs * M, dtype=D)
+    a[:, 10 * M : 30 * M] = torch.tensor(speeds, dtype=D)[:, None] / 20
+    clean = torch.zeros(len(speeds), epochs * M, 6, dtype=D)
+    start = NavState(torch.zeros(len(speeds), 3, dtype=D), torch.zeros(len(speeds), 3, dtype=D), base.start.C_nb * 0)
+    start = start._replace(C_nb=torch.eye(3, dtype=D).repeat(len(speeds), 1, 1))
+    clean[..., 0], clean[..., :3] = 0, -base.frame.gravity(start.p_n)[:, None]
+    clean[..., 0] += a
+    return driven(base, start, clean.reshape(len(speeds), epochs, M, 6))
+
+
+@pytest.mark.parametrize("name", ["mbkf15_nhc", "mbkf21_car"])
+def test_constant_speed_without_vibration_is_no_standstill(name):
+    """The spread of the samples is the same in both, and the filter's 1σ of the speed grows to several m/s: two
+    minutes without GNSS at 2 to 25 m/s, after a stop that it could learn from, hold no standstill."""
+    batch = outage(steady((2.0, 6.7, 12.0, 17.1, 25.0), 180), 60, 180)
+    taken = found(batch, name, accel_noise=30.0, accel_walk=100.0)
+    assert taken[:, 2:9].any()  # under GNSS it is found
+    assert not taken[:, 31:].any()
+
+
+def found(batch, name: str = "mbkf15_nhc", **tuning: float):
+    """(B, T): windows taken for a standstill by a filter with constraints."""
+    kalman = build_filter(name, IMU, tuning=Tuning(**tuning))
+    Watched.found.clear()
+    sources = tuple(Watched(s.tuning, s.states) if isinstance(s, CarConstraints) else s for s in kalman.sources)
+    integrate(batch, replace(kalman, sources=sources))
+    return torch.stack(Watched.found, 1)
+
+
+@pytest.mark.parametrize("idling", [(0.02, 2e-4), (0.2, 2e-3), (0.5, 5e-3)])
+def test_the_first_stop_is_found_however_the_engine_idles(idling):
+    """In an outage, by a car that GNSS has only seen in motion; three times as lively when it moves."""
+    batch = shaken(idling, (1.7 * idling[0], 4 * idling[1]))
+    speed = batch.truth.v_n.norm(dim=-1)
+    before = torch.cat((speed[:, :1], speed[:, :-1]), 1)
+    rest, moving = (speed < 0.01) & (before < 0.01), speed > 0.5
+    taken = found(batch)
+    assert taken[rest].float().mean() > 0.95
+    assert not taken[moving].any()
+    # a standing car's position is worth what it was when it stopped, 20 s into the outage
+    assert drift(batch, "mbkf15_nhc") < 0.2 * drift(batch, "mbkf15")
+
+
+def test_one_sample_an_epoch_has_no_spread():
+    """At 1 Hz in epochs of 1 s: no standstill, and nothing that is no number, neither told nor kept."""
+    batch = shaken((0.02, 2e-4), (0.04, 4e-4))
+    slow = replace(batch, imu=batch.imu.mean(2, keepdim=True), dt=batch.dt * batch.size[2])
+    heard: list[VibrationLevel] = []
+
+    class Hearing(CarConstraints):
+        def resting(self, epoch, turning, prediction, memory):
+            resting, liveliness = super().resting(epoch, turning, prediction, memory)
+            heard.append(liveliness)
+            assert not resting.any()
+            return resting, liveliness
+
+    kalman = build_filter("mbkf15_nhc", IMU)
+    sources = tuple(Hearing(s.tuning, s.states) if isinstance(s, CarConstraints) else s for s in kalman.sources)
+    solution = integrate(slow, replace(kalman, sources=sources))
+    assert len(heard) == 100 and solution.posterior.p_n.isfinite().all() and solution.std.isfinite().all()
+    assert not any(x.isnan().any() for x in heard[-1])
+
+
+def test_what_is_heard_sets_the_limit_half_way():
+    nothing = VibrationLevel.unheard(torch.zeros(1, dtype=D), 3)
+    prior = torch.tensor([3e-3], dtype=D)
+    no, yes = torch.zeros(3, dtype=bool), torch.ones(3, dtype=bool)
+    torch.testing.assert_close(nothing.limit(prior), prior.expand(3) / APART**0.5)
+    moved = nothing.heard(torch.tensor([4e-2, 4e-3, 4e-4], dtype=D), no, yes, 1.0)
+    torch.testing.assert_close(moved.limit(prior), moved.moving / APART**0.5)
+    both = moved.heard(torch.tensor([1e-3, 1e-3, 1e-3], dtype=D), yes, no, 1.0)
+    limits = torch.tensor([(4e-2 * 1e-3) ** 0.5, (4e-3 * 1e-3) ** 0.5, 3e-3 / APART], dtype=D)
+    torch.testing.assert_close(both.limit(prior), limits)  # the third sounds alike, louder when it stands
+
+
+def test_a_wrong_second_is_forgotten():
+    """Multipath that moves a standing car teaches that moving is quiet; later seconds of motion mend it."""
+    heard = VibrationLevel.unheard(torch.zeros(1, dtype=D), 1)
+    no, yes = torch.zeros(1, dtype=bool), torch.ones(1, dtype=bool)
+    heard = heard.heard(torch.tensor([1e-4], dtype=D), no, yes, 1.0)
+    for _ in range(int(5 * MEMORY_S)):
+        heard = heard.heard(torch.tensor([1e-2], dtype=D), no, yes, 1.0)
+    assert heard.moving.item() == pytest.approx(1e-2)

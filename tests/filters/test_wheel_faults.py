@@ -1,0 +1,146 @@
+"""A wheel that fails in an outage: the error along the way stays that of a filter without the wheel, or close."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dlkf.data.aid_tables import STANDARD
+from dlkf.diagnosis.matched_drives import MatchedDrives, matched_batch
+from dlkf.filters.aids.attach import aid_columns, with_aids
+from dlkf.filters.build import build_filter
+from dlkf.filters.integration import integrate
+from dlkf.navigation.state import NavState
+from tests.cars import IMU, car_batch
+
+BEGIN, END = 70, 130  # s: the outage
+FAULT = 90
+T = 140
+
+
+def _backwards(batch):
+    """The same ways, driven in reverse."""
+    turned = torch.diag(torch.tensor([-1.0, -1.0, 1.0]).double())
+    signs = torch.tensor([-1.0, -1.0, 1.0, -1.0, -1.0, 1.0]).double()
+    start = batch.start._replace(C_nb=batch.start.C_nb @ turned)
+    truth = NavState(batch.truth.p_n, batch.truth.v_n, batch.truth.C_nb @ turned)
+    return replace(batch, imu=batch.imu * signs, start=start, truth=truth)
+
+
+@pytest.fixture(scope="module")
+def drives():
+    """Five cars that lose GNSS for a minute, and their forward speed at the end of each second."""
+    batch = car_batch(5, T)
+    batch.available[:, BEGIN:END] = False
+    return batch
+
+
+def _rows(batch, change=lambda v, t: v):
+    """A wheel that says 1.02 times the speed once a second; where ``change`` gives NaN, nothing."""
+    forward = (batch.truth.C_nb[..., 0] * batch.truth.v_n).sum(-1)
+    noise = 0.02 * torch.randn(forward.shape, generator=torch.Generator().manual_seed(1)).double()
+    value = change(1.02 * forward + noise, torch.arange(T))
+    known, zero = value.isfinite(), torch.zeros_like(value)
+    return {"speed": torch.stack((torch.where(known, value, zero), zero, zero, zero, known.double()), -1)}
+
+
+def _end(batch, model):
+    """RMS error of the distance driven forward in the outage: what a wheel is for; heading has no part in it."""
+    solution = integrate(batch, model)
+    driven = [(x.C_nb[..., 0] * x.v_n).sum(-1)[:, BEGIN:END].sum(1) for x in (solution.posterior, batch.truth)]
+    return (driven[0] - driven[1]).square().mean().sqrt(), solution
+
+
+def _from(t, value, otherwise):
+    return torch.where(t >= FAULT, value, otherwise)
+
+
+FAULTS = {
+    "stuck": lambda v, t: _from(t, v[:, FAULT - 1 : FAULT], v),
+    "zero": lambda v, t: _from(t, 0 * v, v),
+    "doubled": lambda v, t: _from(t, 2 * v, v),
+    "late by half a second": lambda v, t: _from(t, 0.5 * (v + v.roll(1, 1)), v),
+    "slip of 10 % for 5 s": lambda v, t: torch.where((t >= FAULT) & (t < FAULT + 5), 1.1 * v, v),
+    "km/h": lambda v, t: _from(t, 3.6 * v, v),
+    "clock off by a second": lambda v, t: _from(t, v.roll(1, 1), v),
+    "gap of a minute": lambda v, t: torch.where((t >= BEGIN) & (t < END), torch.nan, v),
+    "NaN now and then": lambda v, t: torch.where((t >= BEGIN) & (t % 3 == 0), torch.nan, v),
+    "zero from the beginning": lambda v, t: 0 * v,
+    "doubled from the beginning": lambda v, t: 2 * v,
+}
+
+
+@pytest.fixture(scope="module")
+def without(drives):
+    with torch.no_grad():
+        return _end(drives, build_filter("mbkf21_car", IMU))[0]
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_costs_no_more_than_the_wheel(drives, without, fault, without_shape_checks):
+    model = with_aids(build_filter("mbkf21_car", IMU), [STANDARD["speed"]])
+    with torch.no_grad():
+        error, _ = _end(replace(drives, aids=_rows(drives, FAULTS[fault])), model)
+    assert error < 1.1 * without + 0.05, f"{float(error):.2f} m, without a wheel {float(without):.2f} m"
+
+
+def test_a_wheel_halves_the_error(drives, without, without_shape_checks):
+    model = with_aids(build_filter("mbkf21_car", IMU), [STANDARD["speed"]])
+    with torch.no_grad():
+        error, solution = _end(replace(drives, aids=_rows(drives)), model)
+    said = dict(zip(aid_columns(model), solution.aids.unbind(-1)))
+    off = (said["wheel_scale"] - 0.02).abs().amax(0)
+    assert error < 0.5 * without and off[BEGIN] < 0.006 and off[-1] < 0.01, off[[BEGIN, -1]]
+
+
+def test_an_imu_that_errs_beyond_its_covariance_keeps_its_wheel(drives, without, without_shape_checks):
+    imu = drives.imu.clone()
+    imu[:, FAULT:, :, 0] += 0.15 * torch.linspace(0, 1, T - FAULT)[:, None]  # m/s²: of a tilt that no state covers
+    model = with_aids(build_filter("mbkf21_car", IMU), [STANDARD["speed"]])
+    with torch.no_grad():
+        error, solution = _end(replace(drives, imu=imu, aids=_rows(drives)), model)
+    used = dict(zip(aid_columns(model), solution.aids.unbind(-1)))["speed_used"]
+    assert used.mean() > 0.98 and error < 0.5 * without
+
+
+def test_a_wheel_without_sign_is_read_in_reverse(drives, without, without_shape_checks):
+    model = with_aids(build_filter("mbkf21_car", IMU), [STANDARD["speed"]])
+    reverse = _backwards(drives)
+    with torch.no_grad():
+        plain, _ = _end(reverse, build_filter("mbkf21_car", IMU))
+        error, solution = _end(replace(reverse, aids=_rows(reverse, lambda v, t: v.abs())), model)
+    used = dict(zip(aid_columns(model), solution.aids.unbind(-1)))["speed_used"]
+    assert error < 0.7 * plain and used.mean() > 0.9
+
+
+def _coarse(batch, count):
+    """The batch with updates after so many of its own."""
+    T = batch.size[1] // count * count
+    every = slice(count - 1, T, count)
+    names = ("gnss", "gnss_std", "gnss_valid", "gnss_lag", "available", "truth_valid", "attitude_valid")
+    rows = {name: getattr(batch, name)[:, every] for name in (*names, "true_imu_error", "present")}
+    imu = batch.imu[:, :T].flatten(1, 2).unflatten(1, (T // count, -1))
+    return replace(batch, imu=imu, truth=NavState(*(x[:, every] for x in batch.truth)), **rows)
+
+
+def test_an_hour_without_gnss_keeps_state_and_covariance_sane(without_shape_checks):
+    """A tunnel from the first minute on, IMU at 10 Hz and updates every 20 s: nothing grows that a wheel knows."""
+    batch = _coarse(matched_batch(MatchedDrives(drives=2, minutes=60, rate_hz=10, seed=3), IMU)[0], 20)
+    batch = replace(batch, available=(torch.arange(batch.size[1]) < 3).expand(2, -1))
+    forward = (batch.truth.C_nb[..., 0] * batch.truth.v_n).sum(-1)
+    zero = torch.zeros_like(forward)
+    said = torch.stack((1.02 * forward, zero, zero, zero, zero + 1), -1)
+    model = with_aids(build_filter("mbkf21_car", IMU), [STANDARD["speed"]])
+    with torch.no_grad():
+        solution = integrate(replace(batch, aids={"speed": said}), model, keep_covariances=True)
+    rows = dict(zip(aid_columns(model), solution.aids.unbind(-1)))
+    P = solution.covariances.updated
+    size = torch.linalg.eigvalsh(P)
+    assert P.isfinite().all() and (size[..., 0] > -1e-9 * size[..., -1]).all()
+    assert rows["speed_used"].mean() > 0.95
+    assert rows["wheel_scale"].abs().max() < 0.08 and rows["std_wheel_scale"].max() < 0.06
+    speed = (solution.posterior.C_nb[..., 0] * solution.posterior.v_n).sum(-1)
+    driven = (speed.sum(1) / forward.sum(1) - 1).abs()
+    assert driven.max() < 0.06 and (speed - forward).abs().max() < 2.0

@@ -1,0 +1,204 @@
+"""What goes wrong on the way from sensors to a stream: one table, run against the Python stream and the core in C.
+
+A fault turns the calls of a drive into others; beside it the words that the streams must say of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import inf, nan
+
+import numpy as np
+
+from tests.onboard.streams import Call, Calls
+
+Fault = Callable[[Calls], Calls]
+
+
+def _changed(kind: str, chosen: Callable[[float], bool], change: Callable[[tuple], tuple | list[tuple]]) -> Fault:
+    """Calls of a kind at chosen times replaced by one or more others, or by none."""
+
+    def made(sent: Calls) -> Calls:
+        out: Calls = []
+        for call in sent:
+            if call.kind == kind and chosen(call.arguments[0]):
+                found = change(call.arguments)
+                out += [Call(kind, x) for x in (found if isinstance(found, list) else [found])]
+            else:
+                out.append(call)
+        return out
+
+    return made
+
+
+def _at(t: float, width: float = 0.015) -> Callable[[float], bool]:
+    return lambda x: t <= x < t + width
+
+
+def _between(first: float, last: float) -> Callable[[float], bool]:
+    return lambda x: first < x <= last
+
+
+def _put(x: tuple, place: int, value) -> tuple:
+    return (*x[:place], value, *x[place + 1 :])
+
+
+SENSORS = ("speed", "heading", "baro")
+
+
+def t_ms(x: tuple) -> float:
+    """Stamp of a call [ms]."""
+    return 1e3 * x[0]
+
+
+def _late(seconds: float, since: float = -inf, until: float = inf, kinds: tuple[str, ...] = ("gnss",)) -> Fault:
+    def made(sent: Calls) -> Calls:
+        def comes(call: Call) -> float:
+            t = call.arguments[0]
+            return t + (seconds if call.kind in kinds and since < t <= until else 0.0)
+
+        return sorted(sent, key=comes)
+
+    return made
+
+
+def _clock(since: float, shift: float) -> Fault:
+    """Both clocks are set at a moment."""
+
+    def made(sent: Calls) -> Calls:
+        return [Call(c.kind, (c.arguments[0] + shift, *c.arguments[1:])) if c.arguments[0] > since else c for c in sent]
+
+    return made
+
+
+def _stamps(change: Callable[[np.ndarray], np.ndarray], kinds: tuple[str, ...] = ("imu",)) -> Fault:
+    def made(sent: Calls) -> Calls:
+        t = change(np.array([c.arguments[0] for c in sent])).tolist()
+        return [Call(c.kind, (s, *c.arguments[1:])) if c.kind in kinds else c for c, s in zip(sent, t)]
+
+    return made
+
+
+def _jitter(seed: int, size: float) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda t: t + np.random.default_rng(seed).uniform(-size, size, len(t))
+
+
+def _lost(share: float, kind: str = "imu") -> Fault:
+    def made(sent: Calls) -> Calls:
+        kept = np.random.default_rng(3).random(len(sent)) > share
+        return [c for c, k in zip(sent, kept) if k or c.kind != kind]
+
+    return made
+
+
+def _first(*arguments) -> Fault:
+    """A fix before all others."""
+    return lambda sent: [Call("gnss", arguments), *sent]
+
+
+def _many(sent: Calls) -> Calls:
+    """One sample in twenty and one fix in three are damaged in some way."""
+    g = np.random.default_rng(5)
+    out: Calls = []
+    for call in sent:
+        if call.kind in SENSORS or g.random() > (0.05 if call.kind == "imu" else 0.3):
+            out.append(call)
+            continue
+        x = list(call.arguments)
+        kind = g.integers(6)
+        if kind == 0:
+            continue  # lost
+        if kind == 1:
+            out.append(call)  # twice
+        elif kind == 2:
+            x[0] = float(x[0] + g.choice([-30.0, -0.5, 0.05, 70.0, 1e9, nan, inf]))
+        elif kind == 3 and call.kind == "imu":
+            x[int(g.integers(1, 3))] = [float(g.choice([nan, inf, 1e7])), 0.0, -9.8]
+        elif kind == 3:
+            x[int(g.integers(1, 4))] = float(g.choice([nan, inf, 95.0]))
+        elif kind == 4 and out:
+            out.insert(-1, call)  # out of order
+            continue
+        out.append(Call(call.kind, tuple(x)))
+    return out
+
+
+def _frozen(sent: Calls) -> Calls:
+    """One fix again and again for eight seconds, while the velocity is that of motion."""
+    held = next(c.arguments for c in sent if c.kind == "gnss" and c.arguments[0] > 30)
+    place = held[1:4]
+    return _changed("gnss", _between(30.5, 38.5), lambda x: (x[0], *place, [5.0, 5.0, 0.0], *x[5:]))(sent)
+
+
+WITHOUT_VELOCITY = [nan] * 3
+COARSE = _changed("gnss", lambda t: True, lambda x: (*x[:4], WITHOUT_VELOCITY, [3.0] * 3 + WITHOUT_VELOCITY, x[6]))
+AROUND = (48.8, 9.2, 300.0)  # some place, far from the drive
+FAULTS: dict[str, tuple[Fault, set[str]]] = {
+    "none": (lambda sent: sent, {"taken"}),
+    "a sample missing": (_changed("imu", _at(30.0), lambda x: []), set()),
+    "a sample twice": (_changed("imu", _at(30.0), lambda x: [x, x]), {"double"}),
+    "samples in the wrong order": (_changed("imu", _at(30.0), lambda x: [x, _put(x, 0, x[0] - 0.02)]), {"back"}),
+    "a tenth of the samples missing": (_lost(0.1), set()),
+    "stamps that jitter": (_stamps(_jitter(1, 3e-3)), set()),
+    "an IMU's clock 500 ppm fast": (_stamps(lambda t: t * 1.0005), set()),
+    "samples at half the rate": (lambda sent: [c for k, c in enumerate(sent) if k % 2 or c.kind != "imu"], set()),
+    "a gap of 0.2 s": (_changed("imu", _between(30.1, 30.3), lambda x: []), set()),
+    "a gap of 3 s": (_changed("imu", _between(30.1, 33.1), lambda x: []), {"gap", "restarted"}),
+    "clocks set back 50 s": (_clock(30.5, -50.0), {"back", "restarted"}),
+    "clocks set ahead 1e6 s": (_clock(30.5, 1e6), {"gap", "restarted"}),
+    "a sample of NaN": (_changed("imu", _at(30.0), lambda x: _put(x, 1, [0.0, nan, 0.0])), {"not_finite"}),
+    "a stamp of NaN": (_changed("imu", _at(30.0), lambda x: _put(x, 0, nan)), {"not_finite"}),
+    "1e6 m/s² in a sample": (_changed("imu", _at(30.0), lambda x: _put(x, 1, [1e6, 0.0, 0.0])), {"implausible"}),
+    "a gyroscope at 100 rad/s": (_changed("imu", _at(30.0), lambda x: _put(x, 2, [0.0, 100.0, 0.0])), {"implausible"}),
+    "no fixes for 20 s": (_changed("gnss", _between(25.0, 45.0), lambda x: []), set()),
+    "fixes 3 s late": (_late(3.0), {"replayed"}),
+    "fixes 9.5 s late": (_late(9.5, 20.0), {"replayed"}),
+    "fixes 15 s late": (_late(15.0, 25.0), {"late"}),
+    "all fixes late from the start on": (_late(6.3), {"replayed"}),
+    "a fix twice": (_changed("gnss", _at(30.0, 0.5), lambda x: [x, x]), {"double"}),
+    "an older fix of the same interval": (
+        _changed("gnss", _at(30.0, 0.5), lambda x: [x, _put(x, 0, x[0] - 0.3)]), {"superseded"}),
+    "a fix without velocity": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 4, WITHOUT_VELOCITY)), set()),
+    "positions alone": (_changed("gnss", lambda t: True, lambda x: _put(x, 4, WITHOUT_VELOCITY)), set()),
+    "coarse positions alone": (COARSE, set()),
+    "coarse positions alone, 3 s late": (lambda sent: _late(3.0)(COARSE(sent)), {"replayed"}),
+    "no 1σ": (_changed("gnss", lambda t: True, lambda x: _put(x, 5, [nan] * 6)), set()),
+    "a fix of NaN": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 1, nan)), {"no_fix"}),
+    "a fix of quality 0": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 6, 0)), {"no_fix"}),
+    "a fix of quality 77": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 6, 77)), {"no_fix"}),
+    "an infinite height": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 3, inf)), {"not_finite"}),
+    "a latitude of 95°": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 1, 95.0)), {"outside"}),
+    "a 1σ of −1": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 5, [-1.0] * 6)), {"outside"}),
+    "a fix at 0°, 0°": (_changed("gnss", _at(30.0, 0.5), lambda x: (x[0], 0.0, 0.0, 0.0, *x[4:])), {"implausible_fix"}),
+    "a fix 5 km off": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 1, x[1] + 0.045)), {"implausible_fix"}),
+    "fixes 100 m off, one in six": (
+        _changed("gnss", lambda t: round(t) % 6 == 3, lambda x: _put(x, 1, x[1] + 9e-4)), set()),
+    "a frozen receiver": (_frozen, {"implausible_fix"}),
+    "fixes 20 km off for 25 s": (
+        _changed("gnss", _between(25.5, 50.5), lambda x: _put(x, 1, x[1] + 0.18)), {"implausible_fix"}),
+    "a height of 20 km": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 3, 2e4)), {"implausible_fix"}),
+    "a velocity of 300 m/s": (
+        _changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 4, [300.0, 0.0, 0.0])), {"implausible_fix"}),
+    "a gyroscope that saturates for a second": (
+        _changed("imu", _between(30.0, 31.0), lambda x: _put(x, 2, [0.0, 0.0, 35.0])), set()),
+    "a fix ahead of the samples": (_changed("gnss", _at(30.0, 0.5), lambda x: [x, _put(x, 0, x[0] + 100)]), {"ahead"}),
+    "a first fix of the year 2001": (_first(1e9, *AROUND), set()),
+    "a first fix 18 s ahead": (_first(18.0, *AROUND), set()),
+    "fixes at 2 Hz off the second": (
+        _changed("gnss", lambda t: True, lambda x: [_put(x, 0, x[0] - 0.18), _put(x, 0, x[0] + 0.31)]), set()),
+    "fix stamps that jitter": (_stamps(_jitter(2, 0.04), ("gnss",)), set()),
+    "sensors 0.4 s late": (_late(0.4, 30.0, 34.0, SENSORS), {"replayed"}),
+    "sensors 15 s late": (_late(15.0, 25.0, 40.0, SENSORS), {"late"}),
+    "a wheel speed of NaN": (_changed("speed", _at(30.0, 0.5), lambda x: _put(x, 1, nan)), {"not_finite"}),
+    "a wheel speed twice": (_changed("speed", _at(30.0, 0.5), lambda x: [x, x]), {"double"}),
+    "headings in the wrong order": (
+        _changed("heading", _between(25, 35), lambda x: [_put(x, 0, x[0] - 0.2), x, _put(x, 0, x[0] - 0.4)]), set()),
+    "a barometer ahead of the samples": (
+        _changed("baro", _at(30.0, 1.0), lambda x: [x, _put(x, 0, x[0] + 100)]), {"ahead"}),
+    "wheel speeds with 1σ, and some without": (
+        _changed("speed", lambda t: True, lambda x: _put(x, 2, 0.1 if round(t_ms(x)) % 7 else nan)), set()),
+    "a wheel that stands still on a moving car": (
+        _changed("speed", _between(25.0, 45.0), lambda x: _put(x, 1, 0.0)), set()),
+    "no sensors": (lambda sent: [c for c in sent if c.kind not in SENSORS], set()),
+    "damage of all kinds": (_many, {"not_finite", "implausible", "double", "back"}),
+}  # fmt: skip

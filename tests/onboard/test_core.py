@@ -1,0 +1,51 @@
+"""The core in C against the Python stream: the same faults, the same words, the same solutions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dlkf.data.aids import pressure_height
+from dlkf.onboard.core import Core, Status, Waiting
+from dlkf.onboard.library import compiler
+from dlkf.running.streaming import StreamingFilter
+from tests.onboard.conftest import ARM
+from tests.onboard.faults import FAULTS
+from tests.onboard.streams import apart, calls, through_core, through_python
+
+pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+REFUSED = set(Status) - {Status[x] for x in ("TAKEN", "REPLAYED", "SUPERSEDED", "RESTARTED", "DIVERGED", "LOST")}
+ROUNDING = 1e-6  # m, m/s, rad: sums in another order over a minute
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_the_core_answers_every_fault_as_the_python_stream_does(name, exported, tables):
+    """The same word on every call, the same rows at the same calls, the same state in between."""
+    _, estimator, _, library = exported
+    fault, words = FAULTS[name]
+    sent = fault(calls(tables))
+    stream, inside = StreamingFilter(estimator, lever_arm_b=ARM), Core(library.path, ARM)
+    python, core = through_python(stream, sent), through_core(inside, sent)
+    assert words <= set(python.words)
+    assert [x for x in zip(sent, python.words, core.words) if x[1] != x[2]] == []
+    refused = sum(inside.counts.get(x, 0) for x in REFUSED)
+    assert refused == stream.counts["refused"]
+    assert inside.counts.get(Status.DIVERGED, 0) == stream.counts["diverged"]
+    assert inside.counts.get(Status.LOST, 0) == stream.counts["lost"]
+    assert len(python.solution) > 15 and len(python.now) > 2
+    assert apart(python.rows, core.rows) < ROUNDING
+    assert apart(python.now, core.now) < ROUNDING
+    np.testing.assert_allclose(np.array(core.aids), np.array(python.aids), atol=ROUNDING, rtol=1e-5)
+    assert inside.doubt == pytest.approx(stream.doubt, rel=1e-6)
+
+
+def test_samples_of_sensors_that_cannot_be_taken(exported):
+    core = Core(exported[3].path, ARM)
+    assert core.aid("radar", 1.0, 2.0).status is Status.NO_SENSOR
+    assert core.speed(1.0, 2.0, -0.1).status is Status.OUTSIDE
+    assert core.speed(np.inf, 2.0).status is Status.NOT_FINITE
+    assert core.baro(1.0, pressure=95_000.0).status is Status.TAKEN
+    assert core.counts == {Status.NO_SENSOR: 1, Status.OUTSIDE: 1, Status.NOT_FINITE: 1, Status.TAKEN: 1}
+    height = core._library.dlkf_pressure_height(95_000.0)
+    assert height == pytest.approx(float(pressure_height(np.float64(95_000.0))), abs=1e-9) and 500 < height < 600
+    assert [core.says(x) for x in Status] and core.waiting is Waiting.SAMPLES and core.doubt == 1.0

@@ -1,0 +1,167 @@
+"""The attitude that IMU and GNSS alone give, against truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dlkf.base.errors import InputError
+from dlkf.data.alignment import ALIGN, SEARCH, AlignConfig, align_boundaries
+from dlkf.data.store import load_dataset
+from dlkf.navigation.attitude import rotation_from_rpy, vector_from_rotation
+from dlkf.navigation.earth import ned_axes
+from dlkf.navigation.geodetic import geodetic_from_ecef
+from dlkf.running.start import align, aligned_drives, entry
+from tests.cars import REAL
+
+
+@pytest.fixture(scope="module")
+def drive(town):
+    return load_dataset(town, dtype=torch.float64)[0]
+
+
+def _errors(drive, aligned):
+    """truth ⊖ aligned in local NED: attitude [deg], position [m], velocity [m/s] where both are known."""
+    lat, lon, _ = geodetic_from_ecef(drive.ref_r_e)
+    C = ned_axes(lat, lon)
+    ok = aligned.ok & drive.ref_valid
+    attitude = torch.rad2deg(vector_from_rotation(C.mT @ drive.ref_C_eb @ aligned.C_eb.mT @ C))[ok]
+    turn = [
+        (C.mT @ x.unsqueeze(-1)).squeeze(-1)[ok] for x in (drive.ref_r_e - aligned.r_e, drive.ref_v_e - aligned.v_e)
+    ]
+    return attitude, *turn, aligned.std[ok]
+
+
+def _with_arm(drive, arm: torch.Tensor):
+    """The fixes of an antenna on a lever arm: r + C l, v + C (ω × l), ω relative to the Earth."""
+    rate = torch.cat((drive.imu[:1, 0, 3:], drive.imu[:, -1, 3:]))
+    earth = torch.tensor([0.0, 0.0, 7.292115e-5], dtype=torch.float64).expand(len(rate), 3)
+    rate = rate - (drive.ref_C_eb.mT @ earth.unsqueeze(-1)).squeeze(-1)
+    swing = torch.linalg.cross(rate, arm.expand_as(rate))
+    return replace(
+        drive,
+        gnss_r_e=drive.gnss_r_e + drive.ref_C_eb @ arm,
+        gnss_v_e=drive.gnss_v_e + (drive.ref_C_eb @ swing.unsqueeze(-1)).squeeze(-1),
+        lever_arm_b=arm,
+    )
+
+
+@pytest.mark.parametrize("arm", [(0.0, 0.0, 0.0), (2.0, -0.5, -1.5)])
+def test_perfect_data_give_the_attitude(drive, arm):
+    """Left are the rate's change over the last 0.2 s and a lever arm's pull over 2 s."""
+    moved = _with_arm(drive, torch.tensor(arm, dtype=torch.float64))
+    attitude, r, v, _ = _errors(moved, align_boundaries(moved))
+    assert len(attitude) == 59  # all but the first two
+    assert attitude.abs().max() < (0.01 if arm[0] == 0 else 0.25)
+    assert r.norm(dim=-1).max() < 0.01 and v.norm(dim=-1).max() < 0.05
+
+
+def test_any_mounting_is_levelled(drive):
+    """Body axes turned against the car's: roll and pitch come out, yaw is the car's course by definition."""
+    tilt = rotation_from_rpy(torch.tensor([0.3, -0.2, 0.0], dtype=torch.float64))
+    imu = torch.cat((drive.imu[..., :3] @ tilt, drive.imu[..., 3:] @ tilt), -1)
+    mounted = replace(drive, imu=imu, ref_C_eb=drive.ref_C_eb @ tilt)
+    attitude = _errors(mounted, align_boundaries(mounted))[0]
+    assert attitude.abs().max() < 0.02
+
+
+def test_late_fixes_are_carried_to_the_boundary(drive):
+    """Each fix is 0.3 s old: 3 m and up to 0.2 m/s and 5° that its age explains."""
+    lag = 0.3
+    r = drive.gnss_r_e.clone()
+    v = drive.gnss_v_e.clone()
+    then = [drive.gnss_v_e.roll(1, 0), drive.gnss_r_e.roll(1, 0)]
+    v[1:] = (drive.gnss_v_e + lag * (then[0] - drive.gnss_v_e))[1:]
+    r[1:] = (drive.gnss_r_e - lag * (drive.gnss_v_e + v) / 2)[1:]
+    late = replace(drive, gnss_r_e=r, gnss_v_e=v, gnss_lag=torch.full_like(drive.gnss_lag, lag))
+    attitude, dr, dv, std = _errors(late, align_boundaries(late))
+    # the velocities' window lies 0.3 s before the IMU's: a jerk of 0.8 m/s³ tilts by 0.24/9.8 rad, as stated
+    assert attitude[:, :2].abs().max() < 2.0 and attitude[:, 2].abs().max() < 2.0
+    assert (torch.deg2rad(attitude).abs() < 3 * std[:, 6:]).all()
+    assert dr.norm(dim=-1).max() < 0.3 and dv.norm(dim=-1).max() < 0.5
+
+
+def test_without_velocities_positions_do(drive):
+    blind = replace(drive, gnss_valid=drive.gnss_valid & (torch.arange(6) < 3))
+    attitude, _, v, std = _errors(blind, align_boundaries(blind))
+    assert len(attitude) == 57
+    assert attitude.abs().max() < 2.0 and v.norm(dim=-1).max() < 0.5
+    assert (v.abs() < 3 * std[:, 3:6]).all()
+
+
+def test_coarse_positions_give_a_course_as_good_as_it_says(drive):
+    """Half a metre of white noise at 10 m/s: three successive positions gave 7° (0.5 m · √26 / 2 s / 10 m/s)."""
+    g = torch.Generator().manual_seed(0)
+    headings, ratios = [], []
+    for _ in range(10):
+        noise = 0.5 * torch.randn(drive.gnss_r_e.shape, generator=g, dtype=torch.float64)
+        std = torch.full_like(drive.gnss_std, 0.5)
+        position = drive.gnss_valid & (torch.arange(6) < 3)
+        coarse = replace(drive, gnss_valid=position, gnss_std=std, gnss_r_e=drive.gnss_r_e + noise)
+        attitude, _, _, std = _errors(coarse, align_boundaries(coarse))
+        headings.append(attitude[3:, 2])  # of five fixes
+        ratios.append(torch.deg2rad(attitude[3:, 2]) / std[3:, 8])
+    assert torch.cat(headings).square().mean().sqrt() < 4
+    assert 0.5 < torch.cat(ratios).square().mean().sqrt() < 1.2
+
+
+def test_the_start_is_the_first_moment_it_can_be(drive):
+    still = drive.gnss_v_e.clone()
+    still[:20] = 0.0
+    start = align(replace(drive, gnss_v_e=still))
+    assert start.first == 20  # moving now; before counts only the change of velocity
+    assert align(drive, earliest=33).first == 33
+    state = align(drive).state
+    assert state.p_n.abs().max() == 0 and state.C_nb.dtype == torch.float64
+    batch = aligned_drives([drive, drive])
+    assert batch.size[:2] == (2, 60 - align(drive).first) and batch.start.v_n.shape == (2, 3)
+    error = batch.truth.v_n[:, 0] - batch.start.v_n
+    assert error.norm(dim=-1).max() < 5  # a second later
+
+
+@pytest.mark.parametrize("known", ["all", "positions", "velocities late", "fixes late"])
+@pytest.mark.parametrize("config", [ALIGN, SEARCH])
+def test_a_start_reads_no_more_of_a_drive_than_it_needs(drive, known, config, monkeypatch):
+    """The same as if all of the drive were aligned, and far less of it is; to the bit but for fitted velocities."""
+    valid = drive.gnss_valid.clone()
+    late = 40 if known.endswith("late") else 0 if known == "all" else len(valid)
+    valid[:late, 0 if known.startswith("fixes") else 3 :] = False
+    moved, epochs = replace(drive, gnss_valid=valid), []
+
+    def counted(part, config):
+        epochs.append(part.epochs)
+        return align_boundaries(part, config)
+
+    monkeypatch.setattr(entry, "align_boundaries", counted)
+    starts = []
+    for first in (1000, 5):
+        monkeypatch.setattr(entry, "FIRST_EPOCHS", first)
+        starts.append(align(moved, replace(config, search_s=config.search_s / 4)))
+    assert epochs[0] == drive.epochs and (epochs[-1] < drive.epochs) == (late != 40)
+    a, b = ([*start.state, start.std, torch.tensor([start.first, start.lat, start.height])] for start in starts)
+    near = 1e-12 if known in ("positions", "velocities late") else 0.0  # batched products of other sizes
+    assert all(torch.allclose(x, y, rtol=near, atol=near) for x, y in zip(a, b, strict=True))
+
+
+def test_what_cannot_be_aligned_is_told(drive):
+    with pytest.raises(InputError, match="drive car-0: never moves faster than 2 m/s"):
+        align(replace(drive, gnss_v_e=0 * drive.gnss_v_e))
+    with pytest.raises(InputError, match="drive car-0: never moves faster than 50 m/s"):
+        align(drive, AlignConfig(min_speed=50))
+    with pytest.raises(InputError, match="drive car-0: no GNSS fix"):
+        align(replace(drive, gnss_valid=torch.zeros_like(drive.gnss_valid)))
+
+
+def test_real_drives():
+    """Against the OxTS attitude: course is heading to a degree, levelling good to half a degree."""
+    if not (REAL / "kitti").is_dir():
+        pytest.skip("real drives are not here")
+    parts = [_errors(d, align_boundaries(d)) for d in load_dataset(REAL / "kitti")]
+    attitude, r, v, std = (torch.cat(x) for x in zip(*parts))
+    rms = attitude.pow(2).mean(0).sqrt()
+    assert len(attitude) > 2000 and (rms[:2] < 0.4).all() and rms[2] < 1.5
+    normalised = torch.cat((r, v, torch.deg2rad(attitude)), -1) / std
+    assert (normalised.pow(2).mean(0).sqrt() < 1.6).all()  # the stated 1σ is not too bold
+    assert torch.nonzero(align_boundaries(load_dataset(REAL / "rtkx")[0]).ok).numel() > 150

@@ -1,0 +1,101 @@
+"""Bounds of normalised innovations: closed forms, and filters on simulated drives that are right or too sure."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dlkf.command.composing import compose_command
+from dlkf.filters.build import build_filter
+from dlkf.filters.shipped import trained_filter
+from dlkf.filters.tuning import Tuning
+from dlkf.navigation.imu_errors import imu_spec
+from dlkf.running.innovations import CHANCE, SETTLE, fit_sigma
+from dlkf.running.offline import navigate_dataset, sigma_warning
+
+N = 300 + SETTLE  # updates
+
+
+def autoregressive(phi: float, seed: int, n: int = N) -> np.ndarray:
+    """Six components of unit variance with ρ_j = φʲ."""
+    rng = np.random.default_rng(seed)
+    x = np.empty((n, 6))
+    x[0] = rng.standard_normal(6)
+    for k, noise in enumerate(np.sqrt(1 - phi**2) * rng.standard_normal((n - 1, 6))):
+        x[k + 1] = phi * x[k] + noise
+    return x
+
+
+def test_white_innovations_of_the_right_size_lie_within_the_bounds() -> None:
+    """1 of 5000 would be outside; of 300, none but by a great accident; ν is that of 6 components each (± 20 %)."""
+    fits = [fit_sigma(np.random.default_rng(seed).standard_normal((N, 6))) for seed in range(300)]
+    assert CHANCE < 1e-3 and all(f.low < f.ratio < f.high and not f.too_small for f in fits)
+    assert np.median([f.degrees for f in fits]) == pytest.approx(6 * 300, rel=0.2)
+
+
+@pytest.mark.parametrize("phi", [0.7, 0.95])
+def test_correlated_ones_count_as_fewer(phi: float) -> None:
+    """Squares of an AR(1) have ρ_j = φ²ʲ, so n_eff = n (1 − φ²)/(1 + φ²); still none gets a warning."""
+    fits = [fit_sigma(autoregressive(phi, seed)) for seed in range(200)]
+    expected = 6 * 300 * (1 - phi**2) / (1 + phi**2)
+    assert np.median([f.degrees for f in fits]) == pytest.approx(expected, rel=0.4)
+    assert not any(f.too_small for f in fits)
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.95])
+def test_twice_the_size_is_always_too_sure(phi: float) -> None:
+    assert all(fit_sigma(2.2 * autoregressive(phi, seed)).too_small for seed in range(100))
+
+
+def test_components_that_go_together_count_once() -> None:
+    """Six copies of one are one: Satterthwaite's degrees."""
+    one = np.random.default_rng(3).standard_normal((N, 1))
+    assert fit_sigma(np.repeat(one, 6, axis=1)).degrees == pytest.approx(300, rel=0.3)
+
+
+def test_what_is_not_known_is_left_out() -> None:
+    """The first updates, outages, positions alone, several drives; nothing known gives none."""
+    x = np.random.default_rng(4).standard_normal((N, 6))
+    early = x.copy()
+    early[:SETTLE] *= 100
+    assert fit_sigma(early) == fit_sigma(x)
+    positions = x.copy()
+    positions[:, 3:] = np.nan
+    positions[200:260] = np.nan
+    fit = fit_sigma(positions)
+    assert fit.ratio == pytest.approx(np.sqrt(np.nanmean(positions[SETTLE:] ** 2))) and fit.degrees < 3 * 240 * 1.3
+    assert fit_sigma(x, x[::-1]).degrees > 1.5 * fit_sigma(x).degrees
+    assert fit_sigma(np.full((N, 6), np.nan)) is None and fit_sigma(x[: SETTLE + 1]) is None
+
+
+def test_the_line_names_the_remedy() -> None:
+    line = fit_sigma(3 * np.random.default_rng(5).standard_normal((N, 6))).warning("mbkf15")
+    assert line.startswith("mbkf15 is too sure of itself: innovations are 2.9 of their 1σ") and "dlkf tune" in line
+    assert "\n" not in line
+
+
+@pytest.mark.usefixtures("without_shape_checks")
+@pytest.mark.parametrize(
+    ("name", "factor", "warned"),
+    [
+        ("plus", 1.0, False),
+        ("mbkf21_car tuned", 1.0, False),
+        ("mbkf15", 0.1, True),
+        ("mbkf21_nhc", 0.1, True),
+        ("mbkf21_car", 0.1, True),
+    ],
+)
+def test_filters_on_simulated_drives(simulated, name: str, factor: float, warned: bool) -> None:
+    """Of consumer sensors: one with a tenth of their noise gets the line on every drive, a tuned one on none."""
+    values = compose_command("navigate", "imu=consumer", "tuning=any_car", "dataset=x")
+    sensors = {
+        s: {k: x if k == "correlation_time" else factor * x for k, x in values["imu"][s].items()}
+        for s in ("accel", "gyro")
+    }
+    kind, *tuned = name.split()
+    tuning = Tuning(**values["tuning"]) if tuned else None
+    spec = imu_spec(values["imu"] | sensors)
+    model = trained_filter("plus") if kind == "plus" else build_filter(kind, spec, tuning=tuning)
+    drives = list(navigate_dataset(simulated, model, rate_hz=50.0, epoch_s=1.0))
+    lines = [sigma_warning([drive], kind, "tune it") for drive in drives]
+    assert len(lines) == 2 and all((line is not None) == warned for line in lines), lines

@@ -1,0 +1,149 @@
+"""The public functions do what the commands do: the same solution, the same scores, the same one-line errors."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import gpxpy
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+import dlkf
+from dlkf.base.config import config_dir
+from dlkf.data.schema import POSITION, STD, VELOCITY
+
+
+@pytest.fixture(scope="module")
+def drive(simulated) -> dict[str, pd.DataFrame]:
+    name = pd.read_parquet(simulated / "drives.parquet")["drive"][0]
+    return {
+        kind: pd.read_parquet(simulated / kind / f"drive={name}" / "part-0.parquet")
+        for kind in ("imu", "gnss", "reference")
+    } | {"name": name, "folder": simulated}
+
+
+def test_navigate_gives_the_command_s_solution(drive, call):
+    done = call(
+        "navigate",
+        "model=mbkf21_nhc",
+        f"dataset={drive['folder']}",
+        "imu=consumer",
+        "out=solved",
+        "skip_unaligned=true",
+    )
+    assert done.code == 0, done.err
+    expected = pd.read_parquet(f"solved/drive={drive['name']}/solution.parquet").drop(columns="geometry")
+    row = pd.read_parquet(drive["folder"] / "drives.parquet").iloc[0]
+    arm = row[["lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m"]].astype(float).tolist()
+    solution = dlkf.navigate(drive["imu"], drive["gnss"], model="mbkf21_nhc", imu_type="consumer", lever_arm=arm)
+    pd.testing.assert_frame_equal(pd.DataFrame(solution), expected, check_exact=True)
+    assert solution.summary.startswith("aligned at t = ") and "fixes used" in solution._repr_html_()
+    assert len(solution.map().data) and type(solution[solution.t > 10]) is pd.DataFrame
+
+
+def test_fixes_may_be_positions_alone(drive):
+    positions = drive["gnss"][["t", "lat_deg", "lon_deg", "height_m"]]
+    solution = dlkf.navigate(drive["imu"], positions, model="mbkf15")
+    assert len(solution) > 30 and solution[["lat_deg", "roll", "std_yaw"]].notna().all(axis=None)
+
+
+def test_evaluate_withholds_what_was_asked_for(drive):
+    report = dlkf.evaluate(drive["imu"], drive["gnss"], drive["reference"], models=["ins", "mbkf15"], outage_s=10)
+    assert report.headline.startswith("10 s without GNSS, ") and set(report.table.index) == {"ins", "mbkf15"}
+    assert (report.outages["length_s"] == 10).all() and len(report.outages) >= 2
+    rms = (report.outages["mbkf15"] ** 2).mean() ** 0.5
+    assert report.table.loc["mbkf15", "end_rms_m"] == pytest.approx(rms, rel=1e-12)
+    assert report.headline in report._repr_html_() and "end_rms_m" in repr(report)
+
+
+def test_further_sensors_are_taken(drive):
+    """By a filter that knows a car; another one leaves them."""
+    fixes = drive["gnss"]
+    wheel = pd.DataFrame({"t": fixes.t, "speed": np.hypot(fixes.vel_n, fixes.vel_e)})
+    solution = dlkf.navigate(drive["imu"], fixes, model="mbkf21_nhc", speed=wheel)
+    assert solution["speed_used"].sum() > 20 and "wheel_scale" in solution.summary
+    assert "speed_used" not in dlkf.navigate(drive["imu"], fixes, model="mbkf15", speed=wheel)
+
+
+def test_a_solution_shows_and_writes_itself(drive, tmp_path):
+    solution = dlkf.navigate(drive["imu"], drive["gnss"], model="mbkf15")
+    assert solution.plot()._repr_png_().startswith(b"\x89PNG") and "data:image/png" in solution._repr_html_()
+    place = solution.export(tmp_path / "town", ["gpx", "kml"], start_utc="2025-07-05T12:00:00+02:00")
+    points = gpxpy.parse((place / "solution.gpx").read_text()).tracks[0].segments[0].points
+    assert points[0].time.isoformat() == f"2025-07-05T10:00:{solution.t.iloc[0]:02.0f}+00:00"
+    assert len(points) == len(solution) and "2025-07-05T10:01" in (place / "solution.kml").read_text()
+    solution.export(tmp_path / "town", "gpx")
+    assert "<time>" not in (place / "solution.gpx").read_text()  # t counts from 0: no date
+
+
+def test_a_filter_that_is_too_sure_of_itself_is_said(drive):
+    """A tenth of the preset's noise: one line with the remedy; a filter tuned for any car has none."""
+    spec = yaml.safe_load((config_dir() / "imu" / "consumer.yaml").read_text())
+    for sensor in ("accel", "gyro"):
+        spec[sensor] |= {k: 0.1 * x for k, x in spec[sensor].items() if k != "correlation_time"}
+    frames = drive["imu"], drive["gnss"]
+    sure = dlkf.navigate(*frames, model="mbkf21_nhc", imu_type=spec)
+    assert sure.warning.startswith("mbkf21_nhc is too sure of itself") and "tuning=any_car" in sure.warning
+    assert sure.warning in sure._repr_html_()
+    tuned = dlkf.evaluate(*frames, drive["reference"], models="mbkf21_car", tuning="any_car", outage_s=10)
+    assert tuned.warnings == [] and tuned.table.loc["mbkf21_car", "own_sigma_m"] > 0
+    optimist = dlkf.evaluate(*frames, drive["reference"], models=["mbkf21_nhc", "ins"], imu_type=spec, outage_s=10)
+    (line,) = optimist.warnings
+    assert line in repr(optimist) and optimist.table.loc["mbkf21_nhc", "innovation_per_sigma"] > 1.5
+    assert optimist.plot()._repr_png_().startswith(b"\x89PNG") and np.isnan(optimist.table.loc["ins", "own_sigma_m"])
+
+
+def test_logs_are_read_by_a_preset_that_builds_on_another(tmp_path):
+    """reader=ubx is csv's settings with its own."""
+    with pytest.raises(dlkf.InputError, match="no file"):
+        dlkf.read_logs(tmp_path, "ubx")
+
+
+def test_a_stream_navigates(drive):
+    stream = dlkf.Stream("mbkf15", rate_hz=50, imu_type="consumer")
+    accel, gyro = (drive["imu"][[f"{s}_{a}" for a in "xyz"]].to_numpy() for s in ("accel", "gyro"))
+    fixes = iter(drive["gnss"].to_dict("records"))
+    fix = next(fixes)
+    for t, a, w in zip(drive["imu"]["t"], accel, gyro):
+        stream.imu(t, a, w)
+        while fix is not None and fix["t"] <= t:
+            stream.gnss(fix["t"], *(fix[c] for c in POSITION), [fix[c] for c in VELOCITY], [fix[c] for c in STD])
+            fix = next(fixes, None)
+    assert stream.latest is not None and stream.latest.t > drive["imu"]["t"].iloc[-1] - 2
+
+
+WRONG = {
+    "no frame": (lambda d: (d["imu"].to_numpy(), d["gnss"]), {}, "imu is a ndarray, must be a pandas DataFrame"),
+    "a column": (lambda d: (d["imu"].drop(columns="gyro_x"), d["gnss"]), {}, "column gyro_x missing"),
+    "no model": (lambda d: (d["imu"], d["gnss"]), {"model": "mbkf16"}, "unknown model 'mbkf16'"),
+    "no preset": (lambda d: (d["imu"], d["gnss"]), {"imu_type": "consumr"}, "preset 'consumr'; did you mean consumer?"),
+    "lever arm": (lambda d: (d["imu"], d["gnss"]), {"lever_arm": (1, 2)}, "lever_arm is (1, 2), must be three numbers"),
+    "no fix": (lambda d: (d["imu"], d["gnss"].iloc[:0]), {}, "gnss has no rows"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_mistakes_are_one_line(drive, case):
+    frames, options, message = WRONG[case]
+    with pytest.raises(dlkf.InputError) as error:
+        dlkf.navigate(*frames(drive), **({"model": "mbkf15"} | options))
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_importing_dlkf_imports_little():
+    code = (
+        "import sys, dlkf; print([m for m in ('torch', 'pandas', 'numpy', 'mlflow') if m in sys.modules], dlkf.__all__)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.startswith("[] ") and "navigate" in out
+
+
+def test_a_command_s_module_is_the_function_too(drive):
+    import dlkf.navigate as module
+
+    assert module.main is not None
+    with pytest.raises(dlkf.InputError, match="must be a pandas DataFrame"):
+        dlkf.navigate(1, 2)
