@@ -12,7 +12,7 @@ from multiprocessing import get_context
 from multiprocessing.context import ForkProcess
 from pathlib import Path
 
-PATIENCE_S = 900.0  # a command takes seconds; what a busy machine makes of it is no fault of its own
+PATIENCE_S = 300.0  # a command takes seconds; what a busy machine makes of it is no fault of its own
 
 
 @dataclass(frozen=True)

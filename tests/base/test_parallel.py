@@ -21,6 +21,7 @@ from dlkf.data.tables import dataset_digest, read_drives
 from tests.drives import drives_in
 from tests.jobs import ended, half
 from tests.numbers_in import numbers_in
+from tests.shell import start_fork
 
 DRIVES = 16
 SHORT = (f"dataset.hours={DRIVES * 15 / 3600}", "dataset.drive_minutes=0.25", "dataset.imu_rate_hz=50", "seed=5")
@@ -56,6 +57,31 @@ def test_results_come_in_order_and_a_mistake_ends_it():
     assert list(parallel_map(half, range(10), threads=3)) == [x / 2 for x in range(10)]
     with pytest.raises(InputError, match="a process was killed, most likely because memory ran out"):
         list(parallel_map(ended, range(6), 2))
+
+
+@pytest.mark.parametrize("after_s", np.linspace(0.02, 0.4, 8))
+def test_an_interrupt_at_any_moment_ends_the_threads(after_s, tmp_path):
+    """None waits for a lock that the interrupted thread took with it."""
+
+    def work():
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        (tmp_path / "begun").touch()
+        try:
+            for _ in parallel_map(half, (x % 10 for x in range(10**7)), threads=2):
+                pass
+        except KeyboardInterrupt:
+            os._exit(3)
+
+    process = start_fork(tmp_path, tmp_path / "said", work)
+    while not (tmp_path / "begun").exists():
+        time.sleep(0.005)
+    time.sleep(after_s)
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGINT)
+    process.join(30)
+    code = process.exitcode
+    process.kill()
+    assert code == 3
 
 
 @pytest.mark.parametrize("where", [0, True, 1.5, "", "dask://", "grid", "ray"])

@@ -15,7 +15,8 @@ from sqlalchemy.orm import loading
 
 from dlkf.base.errors import InputError, Terminated
 from dlkf.tracking import runs as tracking
-from dlkf.tracking.endings import PROCESS_TAG, TRACKING_URI, delay_signals
+from dlkf.base.signals import delay_signals
+from dlkf.tracking.endings import PROCESS_TAG, TRACKING_URI
 from dlkf.tracking.runs import (
     VALUE_LENGTH,
     client_of,

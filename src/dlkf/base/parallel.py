@@ -6,15 +6,20 @@ done again where a worker was lost, and what comes out is the same wherever it r
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from itertools import islice
 from typing import Any, TypeVar
 
 from dlkf.base.errors import InputError
+from dlkf.base.signals import delay_signals
 
 DASK = "dask://"
+LONGEST_DELAY_S = 0.2  # of an interrupt while threads work
+AHEAD = 8  # items that wait for each thread
 PATIENCE_S = 30  # for a cluster to answer, and for its first worker
 
 Item = TypeVar("Item")
@@ -53,15 +58,27 @@ def check_engine(where: Any, *places: object) -> None:
 
 
 def _in_threads(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
+    """In threads of this process.
+
+    A signal handler that raises between two of the locks of ``concurrent.futures`` leaves one of them locked for good,
+    and the threads wait for it for ever. So signals wait while this thread is in there.
+    """
     if threads == 1:
         yield from map(function, items)
         return
-    with ThreadPoolExecutor(threads) as pool:
-        try:  # an interrupt never waits for items that have not begun
-            yield from pool.map(function, items)
-        except BaseException:
+    pool, left, begun = ThreadPoolExecutor(threads), iter(items), deque()
+    try:  # an interrupt never waits for items that have not begun
+        while True:
+            with delay_signals():
+                begun.extend(pool.submit(function, item) for item in islice(left, AHEAD * threads - len(begun)))
+                done = bool(begun) and bool(wait([begun[0]], LONGEST_DELAY_S).done)
+            if not begun:
+                return
+            if done:
+                yield begun.popleft().result()
+    finally:
+        with delay_signals():
             pool.shutdown(cancel_futures=True)
-            raise
 
 
 @contextmanager

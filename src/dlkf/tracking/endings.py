@@ -5,8 +5,6 @@ from __future__ import annotations
 import gc
 import logging
 import os
-import signal
-import threading
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +12,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from dlkf.base.processes import MACHINE, is_gone
+from dlkf.base.signals import delay_signals
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -86,32 +85,6 @@ def use_store(uri: str) -> Iterator[None]:
         yield
     finally:
         mlflow.set_tracking_uri(before)
-
-
-@contextmanager
-def delay_signals() -> Iterator[None]:
-    """What SIGTERM and SIGINT do waits for the end of the block; a second one does not wait."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    numbers = (signal.SIGTERM, signal.SIGINT)
-    before: dict[int, Any] = {n: signal.getsignal(n) for n in numbers if callable(signal.getsignal(n))}
-    came: list[int] = []
-
-    def keep(number: int, frame: Any) -> None:
-        came.append(number)
-        if len(came) > 1:
-            before[number](number, frame)
-
-    for number in before:
-        signal.signal(number, keep)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        if len(came) == 1:
-            signal.raise_signal(came[0])
 
 
 def close_killed_runs(client: MlflowClient, experiment: str) -> None:
