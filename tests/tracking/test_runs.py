@@ -14,8 +14,8 @@ from sqlalchemy.engine.default import DefaultDialect
 from sqlalchemy.orm import loading
 
 from dlkf.base.errors import InputError, Terminated
-from dlkf.tracking import runs as tracking
 from dlkf.base.signals import delay_signals
+from dlkf.tracking import runs as tracking
 from dlkf.tracking.endings import PROCESS_TAG, TRACKING_URI
 from dlkf.tracking.runs import (
     VALUE_LENGTH,
