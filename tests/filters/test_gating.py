@@ -53,10 +53,19 @@ def test_p_is_opened_by_what_contradicts_it():
     kept = judged(12.0, 12.0, PATIENCE - 2)[1]
     assert float(kept.factor) == 1.0 and not kept.shift.any() and not kept.passed.any()
     left, opened = judged(12.0, 12.0, PATIENCE - 1)
-    assert left == 0 and float(opened.factor) == pytest.approx(12.0**2 / 4 / 3)
+    assert left == PATIENCE and float(opened.factor) == pytest.approx(12.0**2 / 4 / 3)
     assert opened.shift[0].tolist() == [144.0, 0, 0, 0, 0, 0] and opened.passed[0].tolist() == [True] * 3 + [False] * 3
     P = torch.eye(9, dtype=opened.factor.dtype)[None]
     assert opened.opened(P)[0].diagonal().tolist() == pytest.approx([156.0, *[12.0] * 8])
+
+
+def test_a_filter_that_has_moved_follows_the_next_fixes_at_once():
+    """Those that lie near where it moved to; one elsewhere waits, and each that passes the test counts against it."""
+    after, followed = judged(9.0, 8.0, PATIENCE)
+    assert after == PATIENCE and followed.passed[0, 0] and float(followed.shift[0, 0]) == 81.0
+    assert judged(9.0, 8.0, PATIENCE - 2)[0] == PATIENCE - 1
+    assert judged(1.0, 8.0, PATIENCE)[0] == PATIENCE - 1
+    assert not judged(500.0, 8.0, PATIENCE)[1].passed.any()
 
 
 def cars(name: str, epochs: int):

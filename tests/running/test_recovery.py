@@ -96,8 +96,6 @@ def error_at_the_end(tables: CheckedTables, found, until: float) -> float:
 @pytest.mark.parametrize("name", FILTERS)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_it_is_back_after_thirty_seconds_of_good_data(minutes, fault, name):
-    if name == "mbkf21_nhc_gated" and fault.startswith("gyro") and minutes.row.name.startswith("minutes"):
-        pytest.xfail("overconfident by its constraints, it recovers and refuses centimetre fixes again, 5 s at a time")
     bad = FAULTS[fault](minutes)
     ends = {"15": 15.0, "5": 5.0}.get(fault.split()[-2], 1.0)
     until = AT + ends + GOOD_S

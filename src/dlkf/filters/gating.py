@@ -2,8 +2,9 @@
 
 Position and velocity of a fix are tested apart: zᵀ S⁻¹ z against χ² (Groves sect. 17.3). A filter that has become
 sure of a wrong position would refuse good fixes for ever; so when fixes in a row are refused that agree with each
-other, its covariance is opened up to them. A receiver that repeats the same fix while the car moves is frozen, and not
-used until it changes.
+other, its covariance is inflated and they pass. An error of attitude or a bias takes more than one of them to correct:
+those that follow and agree pass likewise, until as many have passed the test. A receiver that repeats the same fix
+while the car moves is frozen, and not used until it changes.
 
 Filters without that gate have a coarse one that cannot be switched off (:class:`CoarseGate`): a fix ``COARSE_SIGMAS``
 off, such as the first one after a tunnel, is left out. On data whose noise is as stated it never acts.
@@ -43,8 +44,8 @@ def chi2_quantile(probability, degrees: int | float):
 class GateMemory(NamedTuple):
     """Memory of the gate between epochs."""
 
-    refused: Tensor  # (B,) agreeing refusals in a row
-    innovation: Tensor  # (B, 3) of the last refused position
+    refused: Tensor  # (B,) agreeing refusals in a row, less what has passed since
+    innovation: Tensor  # (B, 3) of the last refused position; 0 once the filter has moved there
     age: Tensor  # (B,) s since then
     fix: Tensor  # (B, 6) the last fix offered
     frozen: Tensor  # (B,) bool: it did not move with the car
@@ -174,8 +175,9 @@ class Gate:
         age = memory.age + epoch.dt * epoch.imu.shape[1]
         wrong = position & ~fits[:, 0] & ~frozen
         refused = torch.where(self._agrees(memory, z, used, variance, age), memory.refused + 1, 1.0)
-        refused = torch.where(wrong, refused, torch.where(position & ~frozen, 0.0, memory.refused))
-        yields = refused >= PATIENCE
+        fewer = (memory.refused - 1).clamp_min(0.0)
+        refused = torch.where(wrong, refused, torch.where(position & ~frozen, fewer, memory.refused))
+        yields = wrong & (refused >= PATIENCE)
         passed = (fits.repeat_interleave(3, -1) | yields.unsqueeze(-1)) & used & ~frozen.unsqueeze(-1)
         nis = torch.where(used, z.square() / S.diagonal(dim1=-2, dim2=-1), 0.0).sum(-1) / used.sum(-1).clamp_min(1)
         verdict = Verdict(
@@ -185,8 +187,8 @@ class Gate:
             factor=torch.where(yields, nis.clamp(1.0, MOST_DOUBT), 1.0),
         )
         return GateMemory(
-            torch.where(yields, 0.0, refused),
-            torch.where(wrong.unsqueeze(-1), z[:, :3], memory.innovation),
+            refused.clamp_max(PATIENCE),
+            torch.where(wrong.unsqueeze(-1), torch.where(yields.unsqueeze(-1), 0.0, z[:, :3]), memory.innovation),
             torch.where(wrong, 0.0, age),
             torch.where(offered.unsqueeze(-1), epoch.fix.value, memory.fix),
             torch.where(position, frozen, memory.frozen),
