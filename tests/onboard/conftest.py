@@ -11,9 +11,10 @@ from dlkf.data.validate import read_checked
 from dlkf.filters.aids.attach import with_aids
 from dlkf.filters.build import build_filter
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
-from dlkf.onboard.c_source import exporting, write_source
+from dlkf.onboard.c_source import write_source
 from dlkf.onboard.functions import Grid, carried_state, output_numbers
 from dlkf.onboard.library import LIBRARY, Library, build
+from dlkf.onboard.recording import exporting
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
 from dlkf.simulation.sensors import BaroConfig, HeadingConfig, SensorsConfig, WheelConfig

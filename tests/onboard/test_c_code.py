@@ -103,7 +103,24 @@ class Layers(nn.Module):
         return torch.cat((self.dense(self.gru(h)), c), -1).double()
 
 
-@pytest.mark.parametrize("module", [Sums(), Places(), Elements(), Layers()], ids=lambda m: type(m).__name__)
+class Constants(Places):
+    """What is made of constants alone, then written to."""
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("fixed", 2 * torch.eye(6, dtype=torch.float64))
+
+    def forward(self, x):
+        y = torch.eye(6, dtype=torch.float64).repeat(3, 1, 1)
+        fixed = self.fixed.repeat(3, 1, 1)
+        y[:, :4] += x
+        fixed[:, 1:4, 2] = x[:, :3, 0]
+        return torch.cat((y, fixed), 1)
+
+
+@pytest.mark.parametrize(
+    "module", [Sums(), Places(), Constants(), Elements(), Layers()], ids=lambda m: type(m).__name__
+)
 def test_c_does_what_torch_does(module, tmp_path):
     example = module.example()
     with torch.no_grad():

@@ -26,7 +26,7 @@ from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.onboard import compiled_filter
 from dlkf.onboard.c_source import COLUMNS as CORE_COLUMNS
-from dlkf.onboard.c_source import EXAMPLES, columns_of, exporting, write_source
+from dlkf.onboard.c_source import EXAMPLES, columns_of, write_source
 from dlkf.onboard.check import difference, write_log
 from dlkf.onboard.compiled_filter import CompiledFilter
 from dlkf.onboard.core import Core
@@ -34,6 +34,7 @@ from dlkf.onboard.core_drives import core_drive
 from dlkf.onboard.functions import Turn, carried_state
 from dlkf.onboard.library import LIBRARY, Library, build, compiler
 from dlkf.onboard.meanings import of_column
+from dlkf.onboard.recording import exporting, record
 from dlkf.running.batched import run_filter
 from dlkf.running.estimate import estimates_table
 from dlkf.running.reanchoring import FrameChange, reanchor
@@ -233,9 +234,9 @@ def test_one_library_serves_every_preset_and_every_factor():
         estimator = build_filter("aekf_car_gated", imu, tuning=tuning)  # everything that has factors
         with exporting():
             turn = Turn(estimator, GRID, carried_state(estimator, GRID))
-            program = torch.export.export(turn.eval(), turn.example(), strict=False)
-        numbers = {name: x.tolist() for name, x in (program.state_dict | program.constants).items()}
-        code = program.graph_module.code, numbers  # what C is written from
+            graph = record(turn.eval())
+        attributes = {node.target: getattr(graph, node.target) for node in graph.graph.nodes if node.op == "get_attr"}
+        code = graph.code, {name: x.tolist() for name, x in attributes.items()}  # what C is written from
         recorded.append((code, estimator.code, compiled_filter._digest(estimator, GRID)))
     assert recorded[0] == recorded[1]
 

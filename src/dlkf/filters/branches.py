@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
+
+from dlkf.navigation.compiled import is_recorded
 
 
 def may_branch(on: Tensor) -> bool:
     """Whether what is done next may depend on the values of ``on``; if not, all is done and ``torch.where`` chooses."""
-    return on.device.type == "cpu" and not torch.compiler.is_compiling()
+    return on.device.type == "cpu" and not is_recorded()

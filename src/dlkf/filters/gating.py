@@ -22,6 +22,7 @@ from torch import Tensor
 
 from dlkf.filters.branches import may_branch
 from dlkf.filters.integration import Epoch
+from dlkf.navigation.compiled import is_recorded
 
 PATIENCE = 5  # refused fixes that agree with each other before the filter recovers
 MOST_DOUBT = 25.0  # factor on P at most: what was wrong is as a rule attitude or a bias
@@ -205,7 +206,7 @@ class Gate:
         return near & (memory.refused > 0)
 
     def _fits(self, z: Tensor, S: Tensor, used: Tensor, limits: Tensor) -> Tensor:
-        factor = torch.linalg.cholesky_ex(S, check_errors=not torch.compiler.is_compiling())[0]
+        factor = torch.linalg.cholesky_ex(S, check_errors=not is_recorded())[0]
         nis = (z * torch.cholesky_solve(z.unsqueeze(-1), factor).squeeze(-1)).sum(-1)
         return nis <= limits[0, used.sum(-1)]
 

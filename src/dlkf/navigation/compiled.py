@@ -36,7 +36,7 @@ def fits(x: Tensor, *, gradients: bool = False) -> bool:
 
     Warns once if something prevents it.
     """
-    if _tensor_forms or x.device.type != "cpu" or torch.compiler.is_compiling():
+    if x.device.type != "cpu" or is_recorded():
         return False
     if not gradients and (torch.is_grad_enabled() or x.requires_grad):
         return False
@@ -45,9 +45,14 @@ def fits(x: Tensor, *, gradients: bool = False) -> bool:
     return AVAILABLE
 
 
+def is_recorded() -> bool:
+    """Whether operations are recorded, by an export or a compiler, which cannot follow values out of tensors."""
+    return _tensor_forms or torch.compiler.is_compiling()
+
+
 @contextmanager
 def tensor_forms() -> Iterator[None]:
-    """Inside the block the tensor forms are taken in any case, as an export needs them."""
+    """Inside the block the tensor forms are taken in any case and nothing branches on values: an export needs it."""
     global _tensor_forms
     before, _tensor_forms = _tensor_forms, True
     try:

@@ -110,7 +110,7 @@ class WindowModel:
         return (L @ L.mT) * self.spread
 
     def _accumulated(self, L: Float[Tensor, "B 4 s 3"]) -> Float[Tensor, "B n n"]:
-        Q = self.walk.diag().repeat(len(L), 1, 1)
+        Q = self.walk.diag() + L.new_zeros(len(L), 1, 1)
         Q[:, :STATES, :STATES] = ((L @ L.mT) * self.spread).sum(1)
         return Q
 
@@ -240,7 +240,7 @@ def measurement_matrix(
     states: int = STATES,
 ) -> Float[Tensor, "B 6 n"]:
     """H of antenna position and velocity with the lever arm in it (paper.md 2.5)."""
-    H = _identity(states, rate_b.dtype, rate_b.device).repeat(len(rate_b), 1, 1)
+    H = _identity(states, rate_b.dtype, rate_b.device) + rate_b.new_zeros(len(rate_b), 1, 1)
     if lever_arm_b is not None:
         arm_n, swing_n = _arm(state, rate_b, lever_arm_b)
         H[:, :3, ATTITUDE] = -skew(arm_n)

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dlkf.navigation.compiled import is_recorded
 from dlkf.navigation.earth import ECCENTRICITY_SQ, SEMI_MAJOR, SEMI_MINOR
 
 
@@ -14,7 +15,7 @@ def geodetic_from_ecef(
     r_e: Float[Tensor, "*b 3"],
 ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"], Float[Tensor, "*b"]]:
     """Latitude, longitude [rad] and ellipsoidal height [m], float64 (You 2000, by pymap3d); NaN stays."""
-    if torch.compiler.is_compiling():
+    if is_recorded():
         return _bowring(r_e)
     flat = r_e.detach().cpu().double().reshape(-1, 3)
     known = flat.isfinite().all(-1)

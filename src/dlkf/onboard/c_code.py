@@ -1,8 +1,8 @@
-"""An exported graph as one C function: no library but the C one's mathematics, no allocation, no branch on data.
+"""A recorded graph as one C function: no library but the C one's mathematics, no allocation, no branch on data.
 
-``torch.export`` gives a filter's step as a list of core ATen operations on tensors of known shapes. Views of a tensor
-are strides and offsets and cost nothing; an operation by elements is one loop nest, in which those that feed it alone
-are written out; what depends on constants alone is computed here. Everything in between lies in one block on the stack,
+A filter's step is a list of core ATen operations on tensors of known shapes (:mod:`dlkf.onboard.recording`). Views of
+a tensor are strides and offsets and cost nothing; an operation by elements is one loop nest, in which those that feed
+it alone are written out; what depends on constants alone is computed here. The rest lies in one block on the stack,
 in which what is no longer needed makes room (:class:`dlkf.onboard.c_memory.Block`).
 
 The equations stay where they are, in torch: this knows operations, not filters.
@@ -14,54 +14,36 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.export import ExportedProgram
-from torch.fx import Node
+from torch.fx import GraphModule, Node
 
 from dlkf.base.errors import InputError
 from dlkf.onboard.c_loops import UNKNOWN, WHOLE
 from dlkf.onboard.c_memory import C_TYPES, Buffer, Tensors, View, Written
 from dlkf.onboard.c_operations import BY_ELEMENT, PARTS, literal
 
-KEPT = {  # operations that are one in C, though core ATen has several for them
-    "aten::linalg_cross", "aten::linalg_solve_ex", "aten::_linalg_solve_ex", "aten::linalg_cholesky_ex",
-    "aten::cholesky_solve", "aten::linalg_inv_ex", "aten::linalg_solve_triangular",
-}  # fmt: skip
-
 
 class Translation(Tensors):
     """Walks a graph and writes it down."""
 
-    def __init__(self, program: ExportedProgram) -> None:
+    def __init__(self, graph: GraphModule) -> None:
         super().__init__()
         self.values: dict[Node, Any] = {}
         self.inputs: list[Buffer] = []
         self.outputs: list[View] = []
-        self._program = program
-        for node in program.graph.nodes:
+        self._module = graph
+        for node in graph.graph.nodes:
             getattr(self, f"_{node.op}")(node)
 
     # every kind of node
 
     def _placeholder(self, node: Node) -> None:
-        signature, program = self._program.graph_signature, self._program
-        name = node.name
-        for names in (
-            signature.inputs_to_parameters,
-            signature.inputs_to_buffers,
-            signature.inputs_to_lifted_tensor_constants,
-        ):
-            if name in names:
-                key = names[name]
-                value = program.state_dict.get(key)
-                self.values[node] = program.constants[key] if value is None else value
-                return
         value = node.meta["val"]
         buffer = Buffer(f"in{len(self.inputs)}", value.dtype, value.numel(), fixed=True)
         self.inputs.append(buffer)
         self.values[node] = View(buffer, torch.empty(value.shape, dtype=value.dtype, device="meta"))
 
     def _get_attr(self, node: Node) -> None:
-        self.values[node] = self._program.constants[str(node.target)]
+        self.values[node] = getattr(self._module, str(node.target)).detach()
 
     def _call_function(self, node: Node) -> None:
         if not node.users:
@@ -89,8 +71,8 @@ class Translation(Tensors):
             raise InputError(f"this filter uses {target}, which {UNKNOWN}")
 
     def _output(self, node: Node) -> None:
-        kept = len(self._program.graph_signature.user_outputs)
-        self.outputs = [self.tensor(self.values[n]) for n in node.args[0]][-kept:]  # type: ignore[union-attr]
+        made: Any = node.args[0]
+        self.outputs = [self.tensor(self.values[n]) for n in (made if isinstance(made, (list, tuple)) else [made])]
 
     # operands
 

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import json
 import math
-import warnings
 import zlib
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,8 +23,8 @@ from dlkf.data.aid_tables import LAST
 from dlkf.data.validate import LIMITS
 from dlkf.filters.aids.attach import aid_columns, tables_of
 from dlkf.filters.integration import Estimator
-from dlkf.navigation import compiled, earth
-from dlkf.onboard.c_code import KEPT, Translation
+from dlkf.navigation import earth
+from dlkf.onboard.c_code import Translation
 from dlkf.onboard.c_memory import C_TYPES, Block
 from dlkf.onboard.carried import Layout
 from dlkf.onboard.functions import (
@@ -46,6 +44,7 @@ from dlkf.onboard.functions import (
 )  # fmt: skip
 from dlkf.onboard.headings import Headings, heading_functions
 from dlkf.onboard.meanings import of_column
+from dlkf.onboard.recording import exporting, record
 from dlkf.running import imu_stream, streaming
 from dlkf.running.reanchoring import can_reanchor
 from dlkf.running.start import LOOKBACK_S, bank, standstill
@@ -218,11 +217,10 @@ def _filled(text: str, values: Mapping[str, object]) -> str:
 def function_in_c(name: str, function: Function) -> Written:
     """C of a function that works in memory it is given."""
     try:
-        program = torch.export.export(function, function.example(), strict=False)
+        graph = record(function)
     except Exception as error:
         raise InputError(f"this filter cannot be exported: {str(error).splitlines()[0]}") from error
-    table: dict[Any, Any] = dict(torch.export.default_decompositions())
-    done = Translation(program.run_decompositions({o: f for o, f in table.items() if o._schema.name not in KEPT}))
+    done = Translation(graph)
     block, inputs = done.block, done.inputs
     arguments = [f"const {C_TYPES[b.dtype]} *restrict {b.name}" for b in inputs]
     for k, view in enumerate(done.outputs):
@@ -266,11 +264,3 @@ def _number(x: np.generic) -> str:
     if not np.isfinite(value):
         return "NAN" if np.isnan(value) else f"{'-' if value < 0 else ''}INFINITY"
     return f"{x!s}f" if x.dtype == np.float32 else repr(value)
-
-
-@contextmanager
-def exporting() -> Iterator[None]:
-    """Inside the block filters run as ``torch.export`` can record them."""
-    with compiled.tensor_forms(), torch.no_grad(), warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # of torch about torch
-        yield

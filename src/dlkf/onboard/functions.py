@@ -7,7 +7,7 @@
     anchor(memory)                     → memory        the tangent frame follows the car
 
 They call the same code as :class:`dlkf.running.streaming.StreamingFilter`, and nothing in them depends on data but
-through tensors, so that ``torch.export`` can take them. All numbers are float64, the first axis is that of drives.
+through tensors, so that they can be recorded. All numbers are float64, the first axis is that of drives.
 """
 
 from __future__ import annotations

@@ -1,0 +1,55 @@
+"""What torch does in a function: a graph of core ATen operations on tensors of known shapes, none of them in place."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch.func import functionalize
+from torch.fx import GraphModule
+from torch.fx.experimental.proxy_tensor import make_fx
+
+from dlkf.navigation import compiled
+from dlkf.onboard.functions import Function
+
+KEPT = {  # operations that are one in C, though core ATen has several for them
+    "aten::linalg_cross", "aten::linalg_solve_ex", "aten::_linalg_solve_ex", "aten::linalg_cholesky_ex",
+    "aten::cholesky_solve", "aten::linalg_inv_ex", "aten::linalg_solve_triangular",
+}  # fmt: skip
+
+
+def record(function: Function) -> GraphModule:
+    """The graph of a function at its ``example()``; its constants are attributes."""
+    example, graph = function.example(), function
+    try:
+        for _ in range(2):  # what nn.GRUCell changes in place shows in the first graph and is gone in the second
+            recorder = make_fx(functionalize(graph), _decompositions(), "fake", _allow_non_fake_inputs=True)
+            graph = recorder(*example)
+            if not any(node.op == "call_function" and _is_in_place(node.target) for node in graph.graph.nodes):
+                break
+    except RuntimeError:  # it writes into what it has made of constants alone: the slower way knows them as inputs
+        program = torch.export.export(function, example, strict=False).run_decompositions(_decompositions())
+        return program.module(check_guards=False)
+    return graph
+
+
+@contextmanager
+def exporting() -> Iterator[None]:
+    """Inside the block filters run as ``torch.export`` can record them."""
+    with compiled.tensor_forms(), torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # of torch about torch
+        yield
+
+
+@lru_cache
+def _decompositions() -> dict[Any, Any]:
+    table: dict[Any, Any] = dict(torch.export.default_decompositions())
+    return {operation: f for operation, f in table.items() if operation._schema.name not in KEPT}
+
+
+def _is_in_place(target: Any) -> bool:
+    return isinstance(target, torch._ops.OpOverload) and target._schema.is_mutable
