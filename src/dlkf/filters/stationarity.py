@@ -18,9 +18,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dlkf.filters.integration import Epoch
+from dlkf.navigation.earth import NOMINAL_GRAVITY
 from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, VELOCITY
 
-GRAVITY = 9.81  # m/s²
 SURE_STD = 0.3  # m/s: speeds with a larger 1σ teach nothing
 STANDING_SPEED, MOVING_SPEED = 0.3, 1.5  # m/s: from which side on a second counts as the one or the other
 APART = 10.0  # prior ratio of the level of a moving car to that of a stationary one
@@ -93,7 +93,7 @@ def detect_stationary(
     speed, std = v[:, :2].norm(dim=-1), diagonal[:, VELOCITY][:, :2].sum(-1).sqrt()
     tilt, accel = diagonal[:, ATTITUDE][:, :2].sum(-1), diagonal[:, ACCEL].sum(-1)
     gained = (v - epoch.start.v_n)[:, :2].norm(dim=-1) / span
-    still = (gained < STILL_ACCEL + 2 * (GRAVITY**2 * tilt + accel).sqrt()) & (
+    still = (gained < STILL_ACCEL + 2 * (NOMINAL_GRAVITY**2 * tilt + accel).sqrt()) & (
         turning.norm(dim=-1) < STILL_RATE + 2 * diagonal[:, GYRO].sum(-1).sqrt()
     )
     sure = epoch.used[:, 3:5].all(-1) & (std < SURE_STD)

@@ -26,7 +26,7 @@ from dlkf.data.drive import Batch
 from dlkf.filters.aids.attach import aid_columns, tables_of
 from dlkf.filters.integration import Estimator, Fix, Step, advance
 from dlkf.navigation.calibration import ImuError
-from dlkf.navigation.earth import TangentFrame, tangent_frame
+from dlkf.navigation.earth import NOMINAL_GRAVITY, TangentFrame, tangent_frame
 from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import strapdown
 from dlkf.onboard.carried import Layout
@@ -85,7 +85,7 @@ def carried_state(estimator: Estimator, grid: Grid) -> Layout:
     ones = torch.ones(1, 9, dtype=grid.dtype)
     frame = tangent_frame(0.8 * ones[0, :1], 0.2 * ones[0, :1], 300 * ones[0, :1], grid.dtype)
     state = NavState(0 * ones[:, :3], ones[:, :3], torch.eye(3, dtype=grid.dtype)[None])
-    imu = ones.new_tensor([0.0, 0.0, -9.81, 0.0, 0.0, 0.0]).expand(1, grid.samples, 6)
+    imu = ones.new_tensor([0.0, 0.0, -NOMINAL_GRAVITY, 0.0, 0.0, 0.0]).expand(1, grid.samples, 6)
     x = begin_filter(estimator, frame, state, ones, ones[:, :3], grid)
     for _ in range(2):
         aids = {table.name: ones[:, :AID_N] for table in tables_of(estimator)}

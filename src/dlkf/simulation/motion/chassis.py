@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from dlkf.base.errors import InputError
 from dlkf.base.settings import Ranged, bounded_field
 from dlkf.navigation.attitude import rotation_from_rpy, rpy_from_rotation
+from dlkf.navigation.earth import NOMINAL_GRAVITY
 from dlkf.simulation.motion.routes import Kinematics
 from dlkf.simulation.motion.shaking import Shaking, shake_mount
 from dlkf.simulation.motion.vehicle import Route, Truth, Waves, radians_per_metre, random_waves
 
 Array = NDArray[np.floating]
-GRAVITY = 9.81  # m/s², for the load on the springs alone
 NODE_HZ = 100  # suspension is solved at this rate, for any rate of the IMU, and a spline lies between
 ROUGHEST = 0.0115  # m³ · m/s, G_d(0.1/m) times speed, that a driver bears: about 3 m/s² RMS of the body
 PROFILE_STEP = 0.25  # m, about the length of a tyre's contact
@@ -131,9 +131,9 @@ def slip_angle(car: Car, route: Route, motion: Kinematics) -> tuple[Array, Array
     """
     gust, gust_rate = car.gusts.at(motion)
     bank, bank_rate = route.bank(motion)
-    load = motion.speed * motion.yaw_rate - GRAVITY * bank
+    load = motion.speed * motion.yaw_rate - NOMINAL_GRAVITY * bank
     change = motion.acceleration * motion.yaw_rate + motion.speed * motion.yaw_acceleration
-    return gust - car.sideslip * load, gust_rate - car.sideslip * (change - GRAVITY * bank_rate)
+    return gust - car.sideslip * load, gust_rate - car.sideslip * (change - NOMINAL_GRAVITY * bank_rate)
 
 
 def apply_mounting(rng: np.random.Generator, car: Car, route: Route, axle: Truth) -> Truth:
@@ -204,8 +204,8 @@ def draw_stretches(rng: np.random.Generator, kind: ChassisConfig, length: float,
 
 def loads(route: Route, motion: Kinematics) -> tuple[Array, Array]:
     """Specific force along the road, forward and to the right [m/s²]."""
-    forward = motion.acceleration + GRAVITY * route.slope.at(motion)[0]
-    return forward, motion.speed * motion.yaw_rate - GRAVITY * route.bank(motion)[0]
+    forward = motion.acceleration + NOMINAL_GRAVITY * route.slope.at(motion)[0]
+    return forward, motion.speed * motion.yaw_rate - NOMINAL_GRAVITY * route.bank(motion)[0]
 
 
 def suspension(
