@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from dlkf.base.errors import InputError
-from dlkf.command.composing import imu_preset
+from dlkf.command.composing import imu_preset, tuning_preset
 from dlkf.data.aid_tables import AidTable
 from dlkf.data.drive import Batch
 from dlkf.data.segments import whole_drives
@@ -103,8 +103,9 @@ def ratio(aided: np.ndarray, plain: np.ndarray, groups: Sequence[str]) -> str:
 
 
 def print_errors(
-    folder: str, models: Sequence[str], lengths: Sequence[int], first: int, imu: str, chosen: Sequence[str] | None
-) -> None:
+    folder: str, models: Sequence[str], lengths: Sequence[int], first: int, imu: str, tuning: str,
+    chosen: Sequence[str] | None,
+) -> None:  # fmt: skip
     """A table of one dataset."""
     spec, batch, tables = imu_preset(imu), aligned_batch(folder), choose_aids(folder, chosen)
     group_of = {row.name: row.group for row in drive_rows(folder)}
@@ -120,7 +121,7 @@ def print_errors(
         way = distances(batch, ends, length)
         groups = [group_of[batch.drive[int(row)]] for row in ends.nonzero()[:, 0]]
         for name in models:
-            plain = resolve_model(name, spec)
+            plain = resolve_model(name, spec, tuning=tuning_preset(tuning))
             aided = with_aids(plain, tables)
             solution = run_filter(hidden, aided)
             without, with_them = (end_errors(batch, s, ends) for s in (run_filter(hidden, plain), solution))
@@ -161,6 +162,7 @@ def main() -> None:
     words.add_argument("--lengths", nargs="+", type=int, default=[30, 60, 120])
     words.add_argument("--first", type=int, default=150, help="s of GNSS before the first outage")
     words.add_argument("--imu", default="automotive_mems")
+    words.add_argument("--tuning", default="any_car", help="of conf/tuning; plus has its own")
     words.add_argument("--aids", nargs="+", help="of speed, heading, baro; all that the dataset has")
     words.add_argument("--cost", action="store_true", help="what an update costs, instead of errors")
     options = words.parse_args()
@@ -168,7 +170,9 @@ def main() -> None:
         if options.cost:
             print_costs(folder, options.models, options.imu)
         else:
-            print_errors(folder, options.models, options.lengths, options.first, options.imu, options.aids)
+            print_errors(
+                folder, options.models, options.lengths, options.first, options.imu, options.tuning, options.aids
+            )
 
 
 if __name__ == "__main__":

@@ -108,16 +108,21 @@ def test_it_is_back_after_thirty_seconds_of_good_data(minutes, fault, name):
 
 
 def test_a_filter_is_lost_after_fixes_in_a_row_far_off():
-    """So many, for so long, each farther than the limit; one near fix ends the row."""
-    z = torch.tensor([[LOST_M + 1, 0, 0, 0, 0, 0], [LOST_M - 1, 0, 0, 0, 0, 0]])
-    assert far_off(z, torch.full((2, 6), 0.1)).tolist() == [True, False]
-    assert far_off(z, torch.full((2, 6), 10.0)).tolist() == [False, False]  # fixes that are no better than that
+    """So many, for so long, each beyond the limit, or half as far off in twice as many; one near fix ends the row."""
+    z = torch.tensor([[LOST_M + 1, 0, 0, 0, 0, 0], [0, LOST_M / 2, 0, 0, 0, 0], [0, 0, 0.29 * LOST_M, 0, 0, 0]])
+    assert far_off(z, torch.full((3, 6), 0.1)).tolist() == [1.0, 0.5, 0.0]
+    assert far_off(z, torch.full((3, 6), 10.0)).tolist() == [0.0, 0.0, 0.0]  # fixes that are no better than that
     watch = LossWatch()
     for k in range(LOST_FIXES):
         assert not watch.lost(k)
-        watch = watch.after(float(k), True)
+        watch = watch.after(float(k), 1.0)
     assert watch.count == LOST_FIXES and not watch.lost(LOST_S - 1) and watch.lost(LOST_S)
-    assert watch.after(20.0, False).count == 0
+    assert watch.after(20.0, 0.0).count == 0
+    watch = LossWatch()
+    for k in range(2 * LOST_FIXES):
+        assert not watch.lost(k)
+        watch = watch.after(float(k), 0.5)
+    assert not watch.lost(2 * LOST_S - 1) and watch.lost(2 * LOST_S)
 
 
 def test_the_batch_run_starts_over_as_the_stream_does(drive):

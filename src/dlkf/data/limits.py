@@ -26,8 +26,9 @@ FROZEN_SPEED_M_S, FROZEN_M = 2.0, 10.0  # a position that stays while its own ve
 AGREEING_FIXES, AGREEING_S = 5, 10.0  # refused fixes that agree with each other for so long replace the good one
 LEVER_ARM_M = 30.0  # no antenna of a car is further from its IMU
 ESTIMATE_M_S, ESTIMATE_HEIGHTS_M = 200.0, (-2000.0, 20_000.0)  # an estimate beyond is that of a diverged filter
-# a filter whose position is off by so much and by so many 1σ of the fix, in so many fixes in a row that take so long
-LOST_M, LOST_SIGMAS, LOST_FIXES, LOST_S = 25.0, 10.0, 10, 10.0
+# a filter whose position is off by so much and by so many 1σ of the fix, in so many fixes in a row that take so long;
+# by a share of it, but no smaller one, in so many times more
+LOST_M, LOST_SIGMAS, LOST_FIXES, LOST_S, LOST_SHARE = 25.0, 10.0, 10, 10.0, 0.3
 EARTH_M = 6_371_000.0  # m, mean radius: distances to 0.5 %
 
 

@@ -1,9 +1,9 @@
 """Whether a running filter is lost: far from fixes that agree with each other, or where no car can be.
 
 Gates inside filters judge one fix by the filter. Here fixes that passed the physical limits (:mod:`dlkf.data.limits`)
-judge the filter: if its position is far off in ``LOST_FIXES`` of them in a row, over ``LOST_S`` seconds, it must start
-over with an alignment. So a filter whose attitude was ruined by damaged samples comes back, a gated one too, which
-would refuse good fixes for ever.
+judge the filter: if its position is far off in ``LOST_FIXES`` of them in a row, over ``LOST_S`` seconds, or less far in
+more of them, it must start over with an alignment. So a filter whose attitude was ruined by damaged samples comes back,
+a gated one too, which would refuse good fixes for ever.
 """
 
 from __future__ import annotations
@@ -14,31 +14,34 @@ import torch
 from torch import Tensor
 
 from dlkf.data.drive import Batch
-from dlkf.data.limits import ESTIMATE_HEIGHTS_M, ESTIMATE_M_S, LOST_FIXES, LOST_M, LOST_S, LOST_SIGMAS
+from dlkf.data.limits import ESTIMATE_HEIGHTS_M, ESTIMATE_M_S, LOST_FIXES, LOST_M, LOST_S, LOST_SHARE, LOST_SIGMAS
 from dlkf.filters.integration import Solution
 
 
 class LossWatch(NamedTuple):
-    """Fixes in a row that lie far off, and the time [s] of the first of them."""
+    """Fixes in a row that lie far off, the sum of their shares (:func:`far_off`), the time [s] of the first of them."""
 
     count: int = 0
+    total: float = 0.0
     since: float = 0.0
 
-    def after(self, t: float, far: bool) -> LossWatch:
+    def after(self, t: float, share: float) -> LossWatch:
         """After a fix at ``t`` [s]."""
-        if not far:
+        if share == 0:
             return LossWatch()
-        return LossWatch(self.count + 1, self.since if self.count else t)
+        return LossWatch(self.count + 1, self.total + share, self.since if self.count else t)
 
     def lost(self, t: float) -> bool:
         """Whether that is enough at ``t`` [s]."""
-        return self.count >= LOST_FIXES and t - self.since >= LOST_S
+        return self.total >= LOST_FIXES and (t - self.since) * self.total >= LOST_S * self.count
 
 
 def far_off(innovation: Tensor, std: Tensor) -> Tensor:
-    """Whether positions (…, 6) are off by more than fixes of this 1σ (…, 6) can be."""
+    """How far positions (…, 6) are off, as a share of what fixes of this 1σ (…, 6) can be off: 0 below ``LOST_SHARE``,
+    at most 1."""
     limit = (LOST_SIGMAS * std[..., :3].norm(dim=-1)).clamp_min(LOST_M)
-    return innovation[..., :3].norm(dim=-1) > limit
+    share = innovation[..., :3].norm(dim=-1) / limit
+    return torch.where(share > LOST_SHARE, share.clamp_max(1.0), 0.0)
 
 
 def impossible(v_n: Tensor, p_n: Tensor, origin_height: Tensor) -> Tensor:
@@ -57,13 +60,13 @@ def first_loss(batch: Batch, row: int, solution: Solution) -> int | None:
     nowhere = impossible(state.v_n[row, :n], state.p_n[row, :n], batch.frame.height[row].to(state.p_n))
     at = int(torch.nonzero(nowhere)[0]) if bool(nowhere.any()) else None
     offered = (batch.gnss_valid[row, :n, :3].any(-1) & batch.available[row, :n]).to(state.p_n.device)
-    far = far_off(solution.innovation[row, :n], batch.gnss_std[row, :n].to(state.p_n)) & offered
-    if int(far.sum()) < LOST_FIXES:
+    far = far_off(solution.innovation[row, :n], batch.gnss_std[row, :n].to(state.p_n)) * offered
+    if float(far.sum()) < LOST_FIXES:
         return at
     watch = LossWatch()
     for k in torch.nonzero(offered).flatten().tolist():
         t = k * batch.epoch_s
-        watch = watch.after(t, bool(far[k]))
+        watch = watch.after(t, float(far[k]))
         if watch.lost(t):
             return k if at is None else min(at, k)
     return at

@@ -100,8 +100,8 @@ typedef struct {
 } dlkf_screen;
 
 typedef struct {
-  double since;
-  int32_t count; /* fixes in a row far off the filter */
+  double since, total; /* of fixes in a row far off the filter: time of the first, sum of how far */
+  int32_t count;
 } dlkf_watch;
 
 typedef struct {

@@ -67,12 +67,14 @@ int dlkf_lost(dlkf *d, int64_t number, const double *fix) {
   const double t = (double)number * (DLKF_SAMPLES / DLKF_RATE_HZ), *z = d->outputs + DLKF_OUTPUTS_INNOVATION;
   if (fix[12] > 0 || fix[13] > 0 || fix[14] > 0) {
     const double std = sqrt(fix[6] * fix[6] + fix[7] * fix[7] + fix[8] * fix[8]) * LOST_SIGMAS;
-    const int far = sqrt(z[0] * z[0] + z[1] * z[1] + z[2] * z[2]) > (std > LOST_M ? std : LOST_M);
+    const double share = sqrt(z[0] * z[0] + z[1] * z[1] + z[2] * z[2]) / (std > LOST_M ? std : LOST_M);
+    const int far = share > LOST_SHARE;
     if (far && !d->watch.count) d->watch.since = t;
+    d->watch.total = far ? d->watch.total + (share < 1 ? share : 1) : 0;
     d->watch.count = far ? d->watch.count + 1 : 0;
   }
   const double *p = d->outputs + DLKF_OUTPUTS_POSTERIOR, *v = p + 3;
   const double height = d->now.filter[DLKF_AT_HEIGHT] - p[2] + (p[0] * p[0] + p[1] * p[1]) / 2 / EARTH_M;
-  return (d->watch.count >= LOST_FIXES && t - d->watch.since >= LOST_S) ||
+  return (d->watch.total >= LOST_FIXES && (t - d->watch.since) * d->watch.total >= LOST_S * d->watch.count) ||
          sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]) > ESTIMATE_M_S || height < ESTIMATE_LOWEST_M || height > ESTIMATE_HIGHEST_M;
 }
