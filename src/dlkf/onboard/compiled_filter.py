@@ -12,13 +12,15 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 import dlkf
@@ -40,6 +42,7 @@ from dlkf.running.reanchoring import FrameChange, can_reanchor, reanchor
 
 MANY = 16  # drives from which on torch is faster than C where a network is large: measured with dlkf at 1 and 64
 LARGE = 1_000_000  # weights: more than the cache of a core holds
+_LOADED: dict[Path, tuple[Layout, Library]] = {}  # by folder, whose name is a digest of what they depend on
 
 
 class Vector(NamedTuple):
@@ -119,17 +122,7 @@ class CompiledFilter(WholeLoop):
         fixes = packed_fix(Fix(value, std, usable.flatten(0, 1), batch.gnss_lag.flatten().double(), aids), self._aids)
         fixes, imu = fixes.unflatten(0, batch.size[:2]), batch.imu.double().contiguous()
 
-        epochs = batch.present.sum(1).tolist()
-
-        def run(b: int) -> Tensor:
-            outputs = self.library.run(memory.numbers[b : b + 1], imu[b, : epochs[b]], fixes[b, : epochs[b]])[1]
-            return torch.cat((outputs, outputs[-1:].expand(imu.shape[1] - epochs[b], -1)))
-
-        if len(imu) == 1 or torch.get_num_threads() == 1:
-            outputs = [run(b) for b in range(len(imu))]
-        else:
-            with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-                outputs = list(pool.map(run, range(len(imu))))
+        outputs = self._run(memory.numbers, imu, fixes, batch.present.sum(1).tolist())
         x = split(torch.stack(outputs).to(batch.imu.dtype))
         return Solution(
             prior=_state(x["prior"]), posterior=_state(x["posterior"]), imu_error=x["error"],
@@ -140,6 +133,40 @@ class CompiledFilter(WholeLoop):
             aids=x["aids"] if self._aids else None,
         )  # fmt: skip
 
+    def _run(self, memory: Tensor, imu: Tensor, fixes: Tensor, epochs: list[int]) -> list[Tensor]:
+        """Outputs of every drive; what a drive has in common with the one that it is a copy of is run once."""
+        first, common = shared_epochs(memory, imu, fixes, epochs)
+        splits = {b: sorted({c for f, c in zip(first, common) if f == b and c}) for b in set(first)}
+        at: dict[tuple[int, int], Tensor] = {}  # memories by drive and epoch
+
+        def run(b: int, start: Tensor, begin: int, end: int) -> tuple[Tensor, Tensor]:
+            return self.library.run(start, imu[b, begin:end], fixes[b, begin:end])
+
+        def whole(b: int) -> Tensor:
+            parts, now = [], memory[b : b + 1]
+            for begin, end in pairwise([0, *splits[b], epochs[b]]):
+                now, outputs = run(b, now, begin, end)
+                at[b, end] = now
+                parts.append(outputs)
+            return torch.cat(parts)
+
+        def rest(b: int) -> Tensor:
+            f, c = first[b], common[b]
+            start = at[f, c] if c else memory[b : b + 1]
+            return torch.cat((of_first[f][:c], run(b, start, c, epochs[b])[1]))
+
+        firsts = sorted(splits)
+        copies = [b for b in range(len(imu)) if first[b] != b]
+        if len(imu) == 1 or torch.get_num_threads() == 1:
+            of_first = dict(zip(firsts, map(whole, firsts)))
+            of_copy = dict(zip(copies, map(rest, copies)))
+        else:
+            with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+                of_first = dict(zip(firsts, pool.map(whole, firsts)))
+                of_copy = dict(zip(copies, pool.map(rest, copies)))
+        outputs = [(of_first | of_copy)[b] for b in range(len(imu))]
+        return [torch.cat((x, x[-1:].expand(imu.shape[1] - len(x), -1))) for x in outputs]
+
     @cached_property
     def _is_large(self) -> bool:
         network = self.estimator
@@ -148,6 +175,24 @@ class CompiledFilter(WholeLoop):
     @property
     def _has_std(self) -> bool:
         return any(f.name.endswith(".P") for f in self.layout.fields)
+
+
+def shared_epochs(
+    memory: Float[Tensor, "B K"], imu: Float[Tensor, "B T M 6"], fixes: Float[Tensor, "B T f"], epochs: Sequence[int]
+) -> tuple[list[int], list[int]]:
+    """For every drive the first of those before it with its samples and start, itself without one, and how many epochs
+    the two have in common until their fixes differ; 0 for itself."""
+    first, common = [], []
+    for b, count in enumerate(epochs):
+        f = first[-1] if b else 0
+        if f == b or epochs[f] != count or not (torch.equal(memory[f], memory[b]) and torch.equal(imu[f], imu[b])):
+            first.append(b)
+            common.append(0)
+            continue
+        differ = ((fixes[f] != fixes[b]) & ~(fixes[f].isnan() & fixes[b].isnan()))[:count].any(-1)
+        first.append(f)
+        common.append(int(differ.int().argmax()) if bool(differ.any()) else count)
+    return first, common
 
 
 @reanchor.register
@@ -181,10 +226,11 @@ def compile_filter(estimator: Filter, rate_hz: float, epoch_s: float, whole: boo
                 os.replace(beside, folder)
         finally:
             shutil.rmtree(beside, ignore_errors=True)
-    with torch.no_grad():
-        layout = carried_state(estimator, grid)
-    library = Library(folder / LIBRARY, layout.size, output_numbers(estimator))
-    return CompiledFilter(estimator, grid, layout, library, whole=whole)
+    if folder not in _LOADED:
+        with torch.no_grad():
+            layout = carried_state(estimator, grid)
+        _LOADED[folder] = layout, Library(folder / LIBRARY, layout.size, output_numbers(estimator))
+    return CompiledFilter(estimator, grid, *_LOADED[folder], whole=whole)
 
 
 def compile_or_keep(estimator: Estimator, rate_hz: float, epoch_s: float) -> Estimator:

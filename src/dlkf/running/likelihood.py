@@ -202,8 +202,9 @@ def _withheld(batch: Batch, solution: Solution, tuning: Tuning) -> Float[Tensor,
 
 
 def _density(z: Float[Tensor, "*b m"], S: Float[Tensor, "*b m m"], components: Tensor) -> Float[Tensor, "*b"]:
-    square = (z * torch.linalg.solve(S, z.unsqueeze(-1)).squeeze(-1)).sum(-1)
-    return 0.5 * torch.logdet(S) + 0.5 * (FREEDOM + components) * torch.log1p(square / FREEDOM)
+    L = torch.linalg.cholesky_ex(S)[0]
+    square = torch.linalg.solve_triangular(L, z.unsqueeze(-1), upper=False).square().sum((-2, -1))
+    return L.diagonal(dim1=-2, dim2=-1).log().sum(-1) + 0.5 * (FREEDOM + components) * torch.log1p(square / FREEDOM)
 
 
 def find_noise(
@@ -237,7 +238,7 @@ def find_noise(
     directions = [tuple(k for k in x if k.startswith(s)) for s in ("accel", "gyro")] + [(k,) for k in x]
     pace = evidence.pace
     shifts = [FixOffset(DELAY_STEP_S * late, DELAY_STEP_S * pace * ahead) for late, ahead in WAYS]
-    done = 0
+    done, tried_before = 0, dict[tuple[float, ...], float]()
 
     def judged(values: Mapping[str, float], placing: FixOffset) -> float:
         nonlocal done
@@ -246,11 +247,12 @@ def find_noise(
             progress(done, None)  # how many it takes is known at the end alone
         if any(values[k] > limit for k, limit in LARGEST.items()) or not 0 <= placing.delay_s <= LONGEST_DELAY_S:
             return math.inf
-        away = sum(0.5 * (math.log(v / start[k]) / usual[k]) ** 2 for k, v in values.items())
-        return (
-            evidence.negative_log_likelihood(name, *_built(values, imu, tuning, called), placing)
-            + away / evidence.fixes
-        )
+        place = (*(round(math.log(v), 9) for v in values.values()), *(round(x, 9) for x in placing))
+        if place not in tried_before:  # a step back, or one that failed before another value moved
+            away = sum(0.5 * (math.log(v / start[k]) / usual[k]) ** 2 for k, v in values.items())
+            found = evidence.negative_log_likelihood(name, *_built(values, imu, tuning, called), placing)
+            tried_before[place] = found + away / evidence.fixes
+        return tried_before[place]
 
     def search(
         x: Mapping[str, float], placing: FixOffset, best: float, steps: Sequence[float], shifts: Sequence[FixOffset]
