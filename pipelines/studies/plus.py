@@ -2,13 +2,15 @@
 
     python -m pipelines.studies.plus --real <folder with kitti, rtkx, wid, wid_mru, linkoping> --out outputs/plus
     python -m pipelines.studies.plus --train --out outputs/plus    the constants by gradient and fresh weights as well
+    python -m pipelines.studies.plus --parts --real <real> --out outputs/plus_parts    against itself without its parts
 
 Makes the test sets that are missing (below ``--data``), runs every filter compiled over segments with GNSS for 60, 300
 and 900 s and then none for 120 s (real drives: 30 or 60 s), and writes ``table.md`` and ``manifest.json`` (commit,
 seeds, settings and digest of every dataset). Errors are horizontal, at the end of the outage, RMS / geometric mean [m].
 The rivals begin with ``imu=automotive_mems``: constants from ``conf/tuning``, and ``imu=auto``, whose noise is found on
 the very drives that are scored, with all their fixes. The ratio is to the best of them by the geometric mean of that
-row, a choice with hindsight; [ ] is its 95 % interval over recordings.
+row, a choice with hindsight; [ ] is its 95 % interval over recordings. Last come, over all rows, every filter's errors,
+mean NEES, and the ratio of ``plus`` to it over all outages, by recordings.
 
 The laws of the simulated sets are none of those that the network was trained with: ``tones`` vibrates at other
 frequencies, ``patches`` has rough patches that begin and end and no vibration, ``askew`` has mounts some 5° off (1σ per
@@ -23,7 +25,7 @@ import argparse
 import json
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -46,8 +48,9 @@ from dlkf.data.store import dataset_digest, load_dataset
 from dlkf.evaluation.bootstrap import compare
 from dlkf.evaluation.metrics import mean_error
 from dlkf.filters.build import build_causal, build_filter
-from dlkf.filters.integration import Estimator
+from dlkf.filters.integration import Correction, Epoch, Estimator
 from dlkf.filters.model_based import Mbkf
+from dlkf.filters.plus import PlusFilter, PlusMemory
 from dlkf.filters.shipped import trained_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.onboard.compiled_filter import compile_filter, compile_or_keep
@@ -121,10 +124,10 @@ class Row:
     groups: list[str]
 
 
-def simulate_sets(data: Path, real: Path | None) -> None:
-    """Test sets that are not there yet."""
+def simulate_sets(data: Path, real: Path | None, wanted: Collection[str]) -> None:
+    """Those of the wanted test sets that are not there yet."""
     for name, words in SIMULATED.items():
-        if not (data / name).is_dir():
+        if name in wanted and not (data / name).is_dir():
             with_tones = chassis.TONES
             chassis.TONES = TONES if name == "tones" else with_tones
             try:
@@ -132,10 +135,10 @@ def simulate_sets(data: Path, real: Path | None) -> None:
             finally:
                 chassis.TONES = with_tones
     for name, imu in PYTHON_INS.items():
-        if not (data / name).is_dir():
+        if name in wanted and not (data / name).is_dir():
             write_drives(data / name, preset(imu), 4, 18)
     for name, (imu, seed) in INJECTED.items() if real is not None else ():
-        if not (data / name).is_dir():
+        if name in wanted and not (data / name).is_dir():
             words = [f"source={real}/kitti", f"imu={imu}", f"seed={seed}", f"out={data / name}"]
             subprocess.run([sys.executable, "-m", "dlkf.simulate", *words], check=True)
 
@@ -208,6 +211,31 @@ def found_noise(drives: Sequence[Drive]) -> dict[str, Estimator]:
     return filters
 
 
+class WithoutLevels(PlusFilter):
+    """``plus`` whose virtual outages show it nothing."""
+
+    def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
+        """With the levels of the start."""
+        outage = memory.outage._replace(evidence=torch.zeros_like(memory.outage.evidence))
+        return super().step(memory._replace(outage=outage), epoch)
+
+
+def parts(folder: str) -> dict[str, Estimator]:
+    """``plus`` without its levels, without its network, and without either: its constants."""
+    whole = trained_filter(folder)
+    assert isinstance(whole, PlusFilter)
+    found: dict[str, Estimator] = {}
+    kinds = {"constants": (WithoutLevels, False), "levels": (PlusFilter, False), "network": (WithoutLevels, True)}
+    for name, (kind, network) in kinds.items():
+        found[name] = part = kind(whole.config).eval()
+        part.load_state_dict(whole.state_dict())
+        if not network:
+            with torch.no_grad():
+                for weights in part.network.parameters():
+                    weights.zero_()
+    return found
+
+
 def score(case: Case, filters: Mapping[str, Estimator]) -> list[Row]:
     """A row for each length of outage that some segment holds."""
     batch, rows = case.batch, {}
@@ -251,7 +279,8 @@ def markdown(rows: Sequence[Row]) -> list[str]:
 
 
 def pooled(rows: Sequence[Row]) -> list[str]:
-    """Geometric means over rows of each filter's geometric mean and RMS [m], real and simulated apart."""
+    """Over rows, real and simulated apart: geometric means of each filter's RMS and geometric mean [m], mean NEES; and
+    the ratio of ``plus`` to it, geometric mean over all outages with its interval."""
     names = list(rows[0].errors)
     lines = [f"| over all rows | {' | '.join(names)} |", f"|:--|{'--:|' * len(names)}"]
     real = {*REAL, *INJECTED}
@@ -265,8 +294,23 @@ def pooled(rows: Sequence[Row]) -> list[str]:
                 [np.exp(np.mean([np.log(mean_error(r.errors[n], s)) for r in chosen])) for s in ("rms", "log")]
                 for n in names
             ]
-            lines.append(f"| {kind} | {' | '.join(f'{a:.2f} / {b:.2f}' for a, b in means)} |")
+            nees = [np.mean([r.nees[n] for r in chosen]) for n in names]
+            cells = [f"{a:.2f} / {b:.2f} ({c:.1f})" for (a, b), c in zip(means, nees)]
+            lines.append(f"| {kind} | {' | '.join(cells)} |")
+            both = np.concatenate([r.errors["plus"] for r in chosen])
+            groups = [f"{recorded(r.name)} {g}" for r in chosen for g in r.groups]
+            ratios = []
+            for name in names:
+                other = np.concatenate([r.errors[name] for r in chosen])
+                c = compare(both, other, statistic="geomean", groups=groups)
+                ratios.append(f"{c.ratio:.2f} [{c.ratio_low:.2f}, {c.ratio_high:.2f}]" if name != "plus" else "")
+            lines.append(f"| `plus` : it | {' | '.join(ratios)} |")
     return lines
+
+
+def recorded(name: str) -> str:
+    """The trips of a dataset: those of ``kitti_*`` are the same, and those of ``wid`` and ``wid_mru``."""
+    return name.partition("_")[0] if name in (*INJECTED, *REAL) else name
 
 
 def train(data: Path, out: Path) -> None:
@@ -298,6 +342,7 @@ def main() -> None:
     arguments.add_argument("--data", type=Path, default=Path("data/plus"), help="where test sets lie, or are made")
     arguments.add_argument("--sets", nargs="+", help="only these datasets")
     arguments.add_argument("--no-auto", action="store_true", help="without imu=auto, which takes most of the time")
+    arguments.add_argument("--parts", action="store_true", help="against itself without its levels, or its network")
     arguments.add_argument("--model", default="plus", help="weights: plus, or a folder")
     arguments.add_argument("--train", action="store_true", help="constants and weights anew, first")
     arguments.add_argument("--out", type=Path, default=Path("outputs/plus"))
@@ -306,7 +351,8 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     if options.train:
         train(options.data, options.out)
-    simulate_sets(options.data, options.real)
+    wanted = options.sets or (*SIMULATED, *PYTHON_INS, *INJECTED)
+    simulate_sets(options.data, options.real, wanted)
     folders = {name: options.data / name for name in (*SIMULATED, *PYTHON_INS)}
     if options.real is not None:
         real = {name: options.real / name for name in REAL if (options.real / name).is_dir()}
@@ -315,8 +361,9 @@ def main() -> None:
     rows, digests = [], {}
     for name, folder in folders.items():
         drives, digests[name] = load(folder), dataset_digest(folder)
-        found = {} if options.no_auto else found_noise(drives)
-        filters = {**constants(), **found, "plus": trained_filter(options.model)}
+        found = {} if options.no_auto or options.parts else found_noise(drives)
+        rivals = parts(options.model) if options.parts else {**constants(), **found}
+        filters = {**rivals, "plus": trained_filter(options.model)}
         for case in real_cases(name, drives) if name in REAL else simulated_cases(name, drives):
             rows += score(case, filters)
             print("\n".join(markdown(rows[-1:])[2:]), flush=True)

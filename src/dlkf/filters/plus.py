@@ -4,8 +4,9 @@ States, strapdown, sources and Riccati recursion are those of a classical filter
 white noise. The level of accelerometers and of gyroscopes is slow: virtual outages of 10 to 30 s in the recent past
 show it (:mod:`dlkf.filters.virtual_outages`), and it holds through an outage. A recurrent network adds what is fast, a
 factor for each gyroscope every epoch, in outages too; it sees the samples, the filter's covariance and how well its
-innovations and corrections fit (:mod:`dlkf.filters.matching`). Before the first fix, and with weights of zero until the
-first virtual outage was scored, it is ``base`` to the bit.
+innovations and corrections fit (:mod:`dlkf.filters.matching`). Errors of positions may wander, as far as fixes show
+(:mod:`dlkf.filters.position_errors`). Before the first fix it is ``base`` to the bit; without that wander and with
+weights of zero until the first virtual outage was scored.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from dlkf.filters.integration import Correction, Epoch
 from dlkf.filters.matching import AXIS_FEATURES, LOG_FEATURES, Matching, ratio_by_axis, variance_along
 from dlkf.filters.model_based import KalmanMemory as KalmanMemory
 from dlkf.filters.model_based import Mbkf
+from dlkf.filters.position_errors import PositionErrors
 from dlkf.filters.tuning import Tuning
 from dlkf.filters.virtual_outages import VirtualOutage
 from dlkf.navigation.calibration import ImuError
@@ -94,6 +96,7 @@ class PlusMemory(NamedTuple):
     matching: Matching  # what the fixes say of its noise
     fix_speed: Tensor  # (B,) m/s forward at the last fix
     outage: VirtualOutage  # how much white noise there is
+    errors: PositionErrors  # of the fixes
     gyro_noise: Tensor | None = None  # (B, 3) the last factors, for pictures
 
 
@@ -140,13 +143,15 @@ class PlusFilter(nn.Module):
         zeros, B = batch.imu.new_zeros, batch.size[0]
         zero = zeros(B)
         outage = VirtualOutage.begin(kalman.P)
-        memory = PlusMemory(kalman, self.network.start(B), zero, zero, Matching.begin(batch.imu, B), zero, outage)
-        return memory, error
+        matching, errors = Matching.begin(batch.imu, B), PositionErrors.begin(batch.imu, B, batch.epoch_s)
+        return PlusMemory(kalman, self.network.start(B), zero, zero, matching, zero, outage, errors), error
 
     def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
         """Network, the Kalman filter with the noise of both, then the virtual outage beside it."""
         kalman, epoch = self.kalman.screened(memory.kalman, epoch)
-        memory = memory._replace(kalman=kalman)
+        walk = torch.diag_embed(torch.nn.functional.pad(memory.errors.variance(epoch), (0, kalman.P.shape[-1] - 3)))
+        outage = memory.outage._replace(P=memory.outage.P + walk)
+        memory = memory._replace(kalman=kalman._replace(P=kalman.P + walk), outage=outage)
         span = epoch.dt * epoch.imu.shape[1]
         fixed = epoch.used.any(-1)
         with torch.no_grad():
@@ -173,13 +178,13 @@ class PlusFilter(nn.Module):
         with torch.no_grad():
             after = epoch.window.end.corrected(correction.dx)
             forward = (after.C_nb[:, :, 0] * after.v_n).sum(-1)
-            matching, outage = memory.matching, memory.outage
+            matching, outage, errors = memory.matching, memory.outage, memory.errors
             if (c := correction.covariances) is not None:
                 scale = source_scale(of_network, epoch.start.C_nb)
-                outage = outage.after(epoch, c, memory.kalman.windows, scale)
+                outage, errors = outage.after(epoch, c, memory.kalman.windows, scale), errors.after(epoch, c)
                 matching = matching.corrected(c.dx, c.predicted, c.updated, epoch.window.end.C_nb, fixed)
         return memory._replace(
-            kalman=kalman, hidden=hidden, matching=matching, outage=outage, gyro_noise=gyro_noise,
+            kalman=kalman, hidden=hidden, matching=matching, outage=outage, errors=errors, gyro_noise=gyro_noise,
             fix_speed=torch.where(fixed, forward, memory.fix_speed),
         ), correction  # fmt: skip
 

@@ -100,6 +100,12 @@ MEMORY = {  # by the last parts of a field's name
     "outage.age": "time since the virtual outage began [s]",
     "outage.due": "age from which on the next fix is scored [s]",
     "outage.evidence": "logarithm of the density of the scored fixes by levels of accelerometers and gyroscopes",
+    "errors.residual": "the last fix less the filter's position after it [m]",
+    "errors.change": "change of a position's error since the fix before, over its 1σ",
+    "errors.successive": "fixes in successive epochs",
+    "errors.white": "white part of the variance of positions",
+    "errors.walk": "variance by which errors of positions move in an epoch, over that of a position",
+    "errors.fixes": "fixes that both count for",
     "memory.gyro_noise": "the network's last factors on the gyroscopes' noise; forward, right, down",
 }
 

@@ -124,9 +124,11 @@ def _(memory: learned.LearnedMemory, change: FrameChange, fresh: learned.Learned
 
 @reanchor.register
 def _(memory: plus.PlusMemory, change: FrameChange, fresh: plus.PlusMemory) -> plus.PlusMemory:
-    """The Kalman filter's part and its virtual outage; the network's memory has axes of the body."""
+    """The Kalman filter's part, its virtual outage and the last fix; the network's memory has axes of the body."""
     outage = memory.outage
     drift = torch.cat((change.vectors(outage.drift[:, PVA]), outage.drift[:, PVA.stop :]), -1)
     white = torch.stack([change.covariance(Q) for Q in outage.white.unbind(1)], 1)
     outage = outage._replace(drift=drift, P=change.covariance(outage.P), white=white)
-    return memory._replace(kalman=reanchor(memory.kalman, change, fresh.kalman), outage=outage)
+    of_fix = memory.errors
+    of_fix = of_fix._replace(residual=change.vectors(of_fix.residual), change=change.vectors(of_fix.change))
+    return memory._replace(kalman=reanchor(memory.kalman, change, fresh.kalman), outage=outage, errors=of_fix)

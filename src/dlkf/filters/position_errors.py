@@ -1,0 +1,77 @@
+"""Errors of a receiver's positions that wander: which part of its 1σ is white, and how fast the rest moves.
+
+A receiver's 1σ covers all of an error; multipath, orbits and atmosphere change over tens of seconds. A filter that
+takes that part for white noise averages over it and is soon too sure of its velocity. With the innovation z of a fix
+and the residual r = z − H dx of the one before after its update, the error has changed by
+
+    u = (zₖ − rₖ₋₁) / σ
+
+and by what the filter's velocity is off, which is little in an update interval. White noise of variance w beside a walk
+of variance q per interval, in units of σ², has E[uₖ²] = 2 w + q and E[uₖ uₖ₋₁] = −w, so running means of both products
+give w and q. What is not white may wander: q is at most the share 1 − w of what a Gauss-Markov process of 1σ
+``WANDER`` σ and correlation time ``WANDER_S`` moves by in Δt, 2 Δt / ``WANDER_S`` of its variance.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dlkf.filters.integration import Covariances, Epoch
+from dlkf.navigation.state import POSITION
+
+WANDER, WANDER_S = 2.0, 40.0  # σ, s
+USUAL_FIXES = 20.0  # that white noise alone, and the largest walk, count for before anything is known
+MEMORY = 300.0  # fixes
+LARGEST = 5.0  # σ: the most that a change of the error counts
+
+
+class PositionErrors(NamedTuple):
+    """The last fix, and running means over pairs of fixes in successive update intervals."""
+
+    residual: Tensor  # (B, 3) m, of the last fix after its update
+    change: Tensor  # (B, 3) u
+    successive: Tensor  # (B,) fixes up to the last
+    white: Tensor  # (B,) w
+    walk: Tensor  # (B,) q
+    fixes: Tensor  # (B,) what the means count for
+
+    @classmethod
+    def begin(cls, like: Tensor, size: int, epoch_s: float) -> PositionErrors:
+        """Before the first fix."""
+        zero, zeros = like.new_zeros(size), like.new_zeros(size, 3)
+        return cls(zeros, zeros, zero, zero + 1.0, zero + _largest_walk(epoch_s), zero + USUAL_FIXES)
+
+    def variance(self, epoch: Epoch) -> Float[Tensor, "B 3"]:
+        """By which the errors of the positions have moved in this update interval [m²]; zero without a fix."""
+        largest = (1 - self.white.clamp(0.0, 1.0)) * _largest_walk(epoch.dt * epoch.imu.shape[1])
+        std = torch.where(epoch.used[:, POSITION], epoch.fix.std[:, POSITION], 0.0)
+        return torch.minimum(self.walk.clamp_min(0.0), largest).unsqueeze(-1) * std.square()
+
+    def after(self, epoch: Epoch, c: Covariances) -> PositionErrors:
+        """After an update of the filter."""
+        used = epoch.used[:, POSITION]
+        fixed = used[:, :2].all(-1)
+        z = epoch.z[:, POSITION]
+        std = torch.where(used, epoch.fix.std[:, POSITION], 1.0)
+        change = (z - self.residual) / std
+        change = change * (LARGEST / change[:, :2].norm(dim=-1, keepdim=True).clamp_min(LARGEST))
+        successive = torch.where(fixed, self.successive + 1, 0.0)
+        square, product = (0.5 * (change * x)[:, :2].sum(-1) for x in (change, self.change))  # horizontal
+        fixes = (self.fixes + 1).clamp_max(MEMORY)
+        white = self.white - (product + self.white) / fixes
+        walk = self.walk + (square + 2 * product - self.walk) / fixes
+        counts = successive >= 3  # two changes of the error
+        residual = z - torch.bmm(c.H[:, POSITION], c.dx.unsqueeze(-1)).squeeze(-1)
+        return PositionErrors(
+            torch.where(used, residual, 0.0), change, successive, torch.where(counts, white, self.white),
+            torch.where(counts, walk, self.walk), torch.where(counts, fixes, self.fixes),
+        )  # fmt: skip
+
+
+def _largest_walk(epoch_s: float) -> float:
+    """q of the Gauss-Markov process alone."""
+    return WANDER**2 * 2 * epoch_s / WANDER_S

@@ -1,0 +1,73 @@
+"""Errors of positions that wander: how much of them is white, and how fast the rest moves."""
+
+import math
+from dataclasses import replace
+
+import torch
+
+from dlkf.filters.build import build_filter
+from dlkf.filters.integration import integrate
+from dlkf.filters.plus import ANY_MEMS
+from dlkf.filters.position_errors import PositionErrors
+from dlkf.filters.tuning import Tuning
+from dlkf.navigation.imu_errors import imu_spec
+
+from .scene import scene
+
+STD, TAU = 2.0, 40.0  # m, s
+
+
+class Watched:
+    """A Kalman filter with the errors of its fixes beside it."""
+
+    def __init__(self):
+        self.kalman = build_filter("mbkf21", imu_spec(ANY_MEMS), tuning=Tuning(position_std=2.0))
+        self.errors, self.variances = [], []
+
+    def begin(self, batch):
+        memory, error = self.kalman.begin(batch)
+        return (memory, PositionErrors.begin(batch.imu, batch.size[0], batch.epoch_s)), error
+
+    def step(self, memory, epoch):
+        kalman, errors = memory
+        self.variances.append(errors.variance(epoch))
+        kalman, correction = self.kalman.step(kalman, epoch)
+        self.errors.append(errors.after(epoch, correction.covariances))
+        return (kalman, self.errors[-1]), correction
+
+
+def watched(errors, available=None):
+    """Of cars whose positions have these errors (B, T, 3) and a 1σ of 2 m."""
+    batch = scene(*errors.shape[:2], seed=5, position_std=1e-3)
+    gnss, std = batch.gnss.clone(), batch.gnss_std.clone()
+    gnss[..., :3] += errors
+    std[..., :3] = STD
+    batch = replace(batch, gnss=gnss, gnss_std=std)
+    run = Watched()
+    with torch.inference_mode():
+        integrate(batch if available is None else replace(batch, available=available), run)
+    return run
+
+
+def test_white_errors_and_wandering_ones_are_told_apart():
+    """Means of eight cars each after 150 fixes. White: w = 1, q = 0. Gauss-Markov: w = 0, q = 2 / τ. Each mean starts
+    with 20 fixes of what is usual, and 150 products of pairs scatter by a tenth of the white part."""
+    g, white = torch.Generator().manual_seed(3), torch.randn(8, 150, 3, generator=torch.Generator().manual_seed(1))
+    slow, decay = torch.zeros(8, 150, 3), math.exp(-1 / TAU)
+    now = torch.randn(8, 3, generator=g)
+    for k in range(150):
+        slow[:, k] = now = decay * now + math.sqrt(1 - decay**2) * torch.randn(8, 3, generator=g)
+    run = watched(STD * torch.cat((white, slow)).double())
+    last, variance = run.errors[-1], run.variances[-1]
+    w, q = (x.unflatten(0, (2, 8)).mean(1) for x in (last.white, last.walk))
+    assert 0.8 < w[0] < 1.1 and w[1] < 0.15
+    assert abs(q[0]) < 0.1 and 0.03 < q[1] < 0.1
+    moved = variance.unflatten(0, (2, 8))[..., :2].mean((1, 2)) / STD**2
+    assert moved[0] < 0.02 and 0.02 < moved[1] < 0.1
+
+
+def test_without_pairs_of_fixes_nothing_is_learned():
+    """A fix every other second: all of its error is white."""
+    available = (torch.arange(30) % 2 == 0).expand(2, -1)
+    run = watched(torch.zeros(2, 30, 3).double(), available)
+    assert (run.errors[-1].white == 1).all() and (torch.stack(run.variances) == 0).all()
