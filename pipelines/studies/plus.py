@@ -231,12 +231,22 @@ class WithoutLevels(PlusFilter):
         return super().step(memory._replace(outage=outage), epoch)
 
 
+class WithoutWander(PlusFilter):
+    """``plus`` that takes all errors of fixes for white noise."""
+
+    def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
+        """With no error that moves."""
+        errors = memory.errors._replace(white=torch.ones_like(memory.errors.white))
+        return super().step(memory._replace(errors=errors), epoch)
+
+
 def parts(folder: str) -> dict[str, Estimator]:
-    """``plus`` without its levels, without its network, and without either: its constants."""
+    """``plus`` with neither levels nor network (its constants), with one of them, and without wander."""
     whole = trained_filter(folder)
     assert isinstance(whole, PlusFilter)
     found: dict[str, Estimator] = {}
     kinds = {"constants": (WithoutLevels, False), "levels": (PlusFilter, False), "network": (WithoutLevels, True)}
+    kinds["no wander"] = (WithoutWander, True)
     for name, (kind, network) in kinds.items():
         found[name] = part = kind(whole.config).eval()
         part.load_state_dict(whole.state_dict())
@@ -353,7 +363,7 @@ def main() -> None:
     arguments.add_argument("--data", type=Path, default=Path("data/plus"), help="where test sets lie, or are made")
     arguments.add_argument("--sets", nargs="+", help="only these datasets")
     arguments.add_argument("--no-auto", action="store_true", help="without imu=auto, which takes most of the time")
-    arguments.add_argument("--parts", action="store_true", help="against itself without its levels, or its network")
+    arguments.add_argument("--parts", action="store_true", help="against itself without a part")
     arguments.add_argument("--model", default="plus", help="weights: plus, or a folder")
     arguments.add_argument("--train", action="store_true", help="constants and weights anew, first")
     arguments.add_argument("--out", type=Path, default=Path("outputs/plus"))
