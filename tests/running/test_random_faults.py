@@ -45,7 +45,7 @@ def moved(rng: np.random.Generator, fix: list[float]) -> list[float]:
 
 
 @pytest.mark.mutations
-@pytest.mark.parametrize("name", ["mbkf15", "mbkf21_car", "mbkf21_nhc_gated", "plus", "dlkf"])
+@pytest.mark.parametrize("name", ["mbkf15", "mbkf21_car", "mbkf21_nhc_gated", "plus"])
 def test_phases_of_random_faults(hour, name):
     """Of all phases; an estimate is finite and on Earth at any time, and nothing is raised."""
     rng = np.random.default_rng(1)
