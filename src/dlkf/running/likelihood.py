@@ -48,7 +48,7 @@ from dlkf.running.start import align_each
 FREEDOM = 8.0  # ν
 GAPS_S = ((30.0, 45.0), (30.0, 60.0), (60.0, 90.0))  # s withheld at the end of every so many
 Compiler = Callable[[Estimator, float, float], Estimator]  # filter, IMU rate [Hz], update interval [s]
-IN_C = 600  # epochs of evidence from which on the search, some 150 trials, pays for a library of its filter
+IN_C = 300  # epochs of evidence from which on the search, some 150 trials, pays for a library of its filter
 SETTLE_S = 20.0  # whose innovations depend more on the start than on the filter
 OF_SENSORS = ("noise_density", "turn_on_bias", "instability")
 OF_GNSS = ("position_std", "velocity_std")
@@ -222,7 +222,7 @@ def find_noise(
 
     A search along one value after the other, from ``imu`` and ``tuning`` on, in ever finer steps. It begins with noise
     and biases of both sensors together, for a preset is as a rule wrong in all of them. ``delay``: the age of the fixes
-    and the antenna's place along the car too. From ten minutes of evidence on trials run through
+    and the antenna's place along the car too. From five minutes of evidence on trials run through
     ``compiler`` (:func:`dlkf.onboard.compiled_filter.compile_or_keep`). Raises InputError where the drives have no fix
     to score.
     """
