@@ -131,6 +131,13 @@ def _frozen(sent: Calls) -> Calls:
 
 
 WITHOUT_VELOCITY = [nan] * 3
+OFF = _changed("gnss", _between(25.5, 50.5), lambda x: _put(x, 1, x[1] + 0.18))  # 20 km
+JUMPS_LATE: dict[str, tuple[Fault, Fault]] = {  # what the receiver says, and which of its fixes come late
+    "fixes 20 km off, the last good one late": (OFF, _late(8.0, 24.5, 25.5)),
+    "fixes 20 km off, some of them late": (OFF, _late(6.0, 30.5, 32.5)),
+    "fixes 20 km off, the first good ones after them late": (OFF, _late(7.0, 50.5, 52.5)),
+    "a frozen receiver, and late fixes": (_frozen, _late(5.0, 29.5, 33.5)),
+}
 COARSE = _changed("gnss", lambda t: True, lambda x: (*x[:4], WITHOUT_VELOCITY, [3.0] * 3 + WITHOUT_VELOCITY, x[6]))
 AROUND = (48.8, 9.2, 300.0)  # some place, far from the drive
 FAULTS: dict[str, tuple[Fault, set[str]]] = {
@@ -176,6 +183,8 @@ FAULTS: dict[str, tuple[Fault, set[str]]] = {
     "a frozen receiver": (_frozen, {"implausible_fix"}),
     "fixes 20 km off for 25 s": (
         _changed("gnss", _between(25.5, 50.5), lambda x: _put(x, 1, x[1] + 0.18)), {"implausible_fix"}),
+    **{name: (lambda sent, jump=jump, late=late: late(jump(sent)), {"implausible_fix"})
+       for name, (jump, late) in JUMPS_LATE.items()},
     "a height of 20 km": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 3, 2e4)), {"implausible_fix"}),
     "a velocity of 300 m/s": (
         _changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 4, [300.0, 0.0, 0.0])), {"implausible_fix"}),

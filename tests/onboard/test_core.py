@@ -10,7 +10,7 @@ from dlkf.onboard.core import Core, Status, Waiting
 from dlkf.onboard.library import compiler
 from dlkf.running.streaming import StreamingFilter
 from tests.onboard.conftest import ARM
-from tests.onboard.faults import FAULTS
+from tests.onboard.faults import FAULTS, JUMPS_LATE
 from tests.onboard.streams import apart, calls, through_core, through_python
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
@@ -37,6 +37,19 @@ def test_the_core_answers_every_fault_as_the_python_stream_does(name, exported, 
     assert apart(python.now, core.now) < ROUNDING
     np.testing.assert_allclose(np.array(core.aids), np.array(python.aids), atol=ROUNDING, rtol=1e-5)
     assert inside.doubt == pytest.approx(stream.doubt, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", JUMPS_LATE)
+def test_a_jump_ends_the_same_whether_fixes_come_in_order_or_late(name, exported, tables):
+    """The screen goes back with the filter: every fix counts, or is refused, as in a log in order of time."""
+    jump, late = JUMPS_LATE[name]
+    in_order, delayed = jump(calls(tables)), late(jump(calls(tables)))
+    for through, stream in (
+        (through_python, lambda: StreamingFilter(exported[1], lever_arm_b=ARM)),
+        (through_core, lambda: Core(exported[3].path, ARM)),
+    ):
+        want, got = through(stream(), in_order).solution, through(stream(), delayed).solution
+        np.testing.assert_allclose(got, want[-len(got) :], rtol=0, atol=ROUNDING)
 
 
 def test_samples_of_sensors_that_cannot_be_taken(exported):

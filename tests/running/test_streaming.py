@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from dlkf.base.errors import InputError
+from dlkf.data.schema import POSITION
 from dlkf.data.store import drive_from_tables, drive_rows
 from dlkf.data.validate import read_checked
 from dlkf.running.estimate import estimates_table
@@ -75,12 +76,14 @@ def test_between_epochs_the_state_is_carried_to_the_latest_sample(drive):
 
 def test_of_several_fixes_in_an_epoch_the_latest_counts(segment):
     stream = StreamingFilter(estimator("mbkf15"), lever_arm_b=ARM)
-    found = []
+    found, statuses = [], []
+    at_25 = [float(segment.gnss[c][segment.gnss["t"] == 25.0][0]) for c in POSITION]
     for receipt in replay_drive(stream, segment.imu, segment.gnss):
         found += receipt.estimates
         if receipt.status is Status.TAKEN and 25.0 < stream._samples.latest < 25.015:
-            assert stream.gnss(24.7, 50.0, 8.0, 100.0).status is Status.SUPERSEDED
-            assert stream.gnss(24.7, 50.0, 8.0, 100.0).status is Status.SUPERSEDED
+            statuses += [stream.gnss(t, *at_25).status for t in (24.7, 24.6, 24.7)]
+            assert stream.gnss(24.5, 50.0, 8.0, 100.0).reason.endswith("no car moves so far")
+    assert statuses == [Status.SUPERSEDED, Status.SUPERSEDED, Status.REFUSED]
     assert apart(estimates_table(found), batch(segment, "mbkf15")) < ROUNDING
 
 

@@ -56,6 +56,10 @@ class MeasurementBuffer:
         """A fix in the place of an earlier one."""
         self._fixes[boundary] = (t, fix)
 
+    def drop_fix(self, boundary: int) -> None:
+        """Leave a boundary without a fix."""
+        self._fixes.pop(boundary, None)
+
     def put_aid(self, boundary: int, name: str, t: float, value: float, std: float) -> bool:
         """A sample beside the others of its interval; False where one of its time is there already."""
         held = self._aids.setdefault(boundary, {}).setdefault(name, [])

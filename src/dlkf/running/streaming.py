@@ -18,7 +18,8 @@ solution to rounding, for any order in which fixes arrive:
   and with the IMU error that it started from. It also starts over if its state is no longer finite, is that of no
   car, or stays far from fixes that agree with each other (:mod:`dlkf.running.loss`).
 * **Physical limits**: samples beyond full scale and fixes that no car can have reached since the last good one are
-  refused and counted before any filter sees them (:mod:`dlkf.data.limits`).
+  refused and counted before any filter sees them (:mod:`dlkf.data.limits`), whatever the order of arrival
+  (:mod:`dlkf.running.fix_history`).
 * **The tangent frame** follows the car: beyond ``anchor_m`` from its origin state and memory go over to a new one
   (:mod:`dlkf.running.reanchoring`).
 """
@@ -38,9 +39,7 @@ import torch
 from dlkf.base.errors import InputError
 from dlkf.data.aids import pressure_height
 from dlkf.data.alignment import SEARCH, AlignConfig
-from dlkf.data.limits import FixScreen
 from dlkf.data.resampling import ON_BOUNDARY_S, boundary_after, fixes_at
-from dlkf.data.schema import POSITION, STD, VELOCITY
 from dlkf.data.validate import LIMITS, Limits
 from dlkf.filters.aids.attach import tables_of
 from dlkf.filters.card import warn_slow_drives
@@ -48,6 +47,7 @@ from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.strapdown import strapdown
 from dlkf.running.epoch_filter import EpochFilter, Running
 from dlkf.running.estimate import Estimate
+from dlkf.running.fix_history import FixHistory
 from dlkf.running.imu_stream import ImuStream, Row
 from dlkf.running.measurement_buffer import MeasurementBuffer, checked_fix
 from dlkf.running.start import Search
@@ -123,12 +123,13 @@ class StreamingFilter:
             align=align, rewind=self._rewind, anchor_m=anchor_m, counts=self.counts,
         )  # fmt: skip
         self._warned = warn_slow_drives(estimator, min(rate_hz, 1 / imu_step_s) if imu_step_s else rate_hz)
-        self._screen = FixScreen()
+        self._fixes = FixHistory()
         self._clear()
 
     def _clear(self) -> None:
         self._early: deque[dict[str, np.ndarray]] = deque(maxlen=MOST_EARLY_FIXES)  # before there is a grid
         self._early_aids: deque[tuple[str, float, float, float]] = deque(maxlen=MOST_EARLY_SAMPLES)
+        self._fixes.clear()
         self._buffer.clear()
         self._epochs.clear()
 
@@ -166,7 +167,6 @@ class StreamingFilter:
             if not self._samples.lost:
                 return self._answer(Status.REFUSED, reason)
             self._samples.clear()
-            self._screen.clear()  # the clock may be another
             self._clear()
             return self._answer(Status.RESTARTED, reason)
         if self._samples.grid is None:
@@ -193,7 +193,8 @@ class StreamingFilter:
 
         ``velocity_ned`` [m/s] and ``std`` (6: position n, e, d [m], velocity [m/s]) are None or NaN where unknown;
         unknown stds follow from the ``quality`` (NMEA GGA) as in a log. The receipt of a fix that came after its
-        epoch's end holds the recomputed estimates of all epochs since.
+        epoch's end holds the recomputed estimates of all epochs since; a fix that is refused does so too where later
+        fixes, screened again, count otherwise than before.
         """
         fix = checked_fix(t, (lat_deg, lon_deg, height_m), velocity_ned, std, quality)
         if isinstance(fix, str):
@@ -280,14 +281,26 @@ class StreamingFilter:
         row = self._boundary_of(t)
         if reason := self._untimely("fix", t, row, least=0):
             return self._answer(Status.REFUSED, reason)
-        if self._buffer.fix_time(row) == t:
+        screened, changed = self._fixes.add(t, row, fix, oldest=self._samples.epochs - self._rewind)
+        if screened is None:
             return self._answer(Status.REFUSED, f"fix at t = {t:.3f} again")
+        for boundary in changed:
+            self._put_fix(boundary)
+        estimates = self._replay(min(changed)) if changed else None
+        if not screened.used:
+            return self._answer(Status.REFUSED, screened.reason, estimates or ())
         if self._buffer.fix_time(row) > t:
-            return self._answer(Status.SUPERSEDED)
-        if reason := self._implausible(fix):
-            return self._answer(Status.REFUSED, reason)
-        self._buffer.put_fix(row, t, fixes_at(fix, np.zeros(1, np.int64), np.array([self._samples.boundary(row)])))
-        return self._replay(row) or self._answer(Status.TAKEN)
+            return self._answer(Status.SUPERSEDED, estimates=estimates or ())
+        return self._answered(estimates)
+
+    def _put_fix(self, row: int) -> None:
+        """The fix of a boundary into the buffer, or none."""
+        fix = self._fixes.at(row)
+        if fix is None:
+            self._buffer.drop_fix(row)
+        else:
+            boundary = np.array([self._samples.boundary(row)])
+            self._buffer.put_fix(row, fix.t, fixes_at(fix.table, np.zeros(1, np.int64), boundary))
 
     def _file_aid(self, name: str, t: float, value: float, std: float) -> Receipt:
         """Put a sample of a further sensor to the others of its interval; replay where that is over."""
@@ -296,7 +309,8 @@ class StreamingFilter:
             return self._answer(Status.REFUSED, reason)
         if not self._buffer.put_aid(row, name, t, value, std):
             return self._answer(Status.REFUSED, f"{name} at t = {t:.3f} again")
-        return self._replay(row) or TAKEN
+        estimates = self._replay(row)
+        return TAKEN if estimates is None else self._answered(estimates)
 
     def _boundary_of(self, t: float) -> int:
         assert self._samples.grid is not None
@@ -311,14 +325,11 @@ class StreamingFilter:
         return ""
 
     @torch.inference_mode()
-    def _replay(self, row: int) -> Receipt | None:
-        """The receipt with all epochs since boundary ``row`` recomputed; None where that is still to come."""
+    def _replay(self, row: int) -> list[Estimate] | None:
+        """The estimates of all epochs since boundary ``row``, recomputed; None where that is still to come."""
         if row > self._samples.epochs or not self._epochs.closed:
             return None
-        return self._answer(Status.REPLAYED, estimates=self._epochs.replay(row))
+        return self._epochs.replay(row)
 
-    def _implausible(self, fix: dict[str, np.ndarray]) -> str:
-        """Why no car can have reached a fix, or nothing."""
-        t, *place = (float(fix[name][0]) for name in ("t", *POSITION))
-        speed = math.hypot(*(float(fix[name][0]) for name in VELOCITY))
-        return self._screen.refused(t, (place[0], place[1], place[2]), speed, np.array([fix[c][0] for c in STD]))
+    def _answered(self, replayed: list[Estimate] | None) -> Receipt:
+        return self._answer(Status.TAKEN) if replayed is None else self._answer(Status.REPLAYED, estimates=replayed)

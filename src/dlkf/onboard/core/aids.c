@@ -58,7 +58,7 @@ static dlkf_status file_aid(dlkf *d, int sensor, double t, double value, double 
     memset(a, 0, sizeof *a);
     a->number = row, a->newest = t, a->first = a->last = lag;
   } else if (LAST[sensor]) {
-    return row > done ? dlkf_counted(d, DLKF_TAKEN) : dlkf_replay(d, row); /* an older one changes nothing */
+    return dlkf_counted(d, dlkf_replay(d, row) ? DLKF_REPLAYED : DLKF_TAKEN); /* an older one changes nothing */
   }
   a->count++;
   a->value += value;
@@ -66,8 +66,7 @@ static dlkf_status file_aid(dlkf *d, int sensor, double t, double value, double 
   a->lag += lag;
   if (lag > a->first) a->first = lag;
   if (lag < a->last) a->last = lag;
-  if (row > done || done == d->oldest) return dlkf_counted(d, DLKF_TAKEN);
-  return dlkf_replay(d, row);
+  return dlkf_counted(d, dlkf_replay(d, row) ? DLKF_REPLAYED : DLKF_TAKEN);
 }
 
 /* Those that came before the update intervals were laid. */

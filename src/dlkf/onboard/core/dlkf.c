@@ -18,11 +18,15 @@ dlkf_status dlkf_counted(dlkf *d, dlkf_status status) {
   return status;
 }
 
+static dlkf_report *report_at(dlkf *d, int k) { return &d->reports[(d->report_first + k) % DLKF_EARLY]; }
+
 static dlkf_epoch *epoch_at(dlkf *d, int64_t number) { return &d->closed[number % DLKF_CLOSED]; }
 
 static void clear(dlkf *d) {
   for (int k = 0; k < DLKF_BOUNDARIES; k++) d->fixes[k].number = -1;
-  d->early_first = d->early_count = 0;
+  d->report_first = d->report_count = 0;
+  dlkf_screen_clear(&d->screen);
+  dlkf_screen_clear(&d->screen_before);
   d->oldest = 0;
   d->kind = DLKF_NOTHING;
   d->latest = 0;
@@ -36,7 +40,6 @@ void dlkf_open(dlkf *d, const double *lever_arm_b) {
   d->layout = DLKF_LAYOUT;
   for (int k = 0; k < 3; k++) d->lever_arm_b[k] = lever_arm_b ? lever_arm_b[k] : 0;
   d->samples.phase_s = d->samples.step_s = NAN;
-  dlkf_screen_clear(&d->screen);
   clear(d);
 }
 
@@ -157,17 +160,18 @@ static void run(dlkf *d, int64_t number, int revised) {
   }
 }
 
-/* A fix to its boundary; what is over is run anew. */
-static dlkf_status file(dlkf *d, const dlkf_report *x) {
-  const int64_t done = d->samples.epochs;
-  const double place = ceil((x->t - d->samples.t0 - ON_BOUNDARY_S) / EPOCH_S);
-  if (!(place <= (double)(done + DLKF_REWIND))) return dlkf_counted(d, DLKF_AHEAD);
-  if (place < 0 || (place > 1 ? place - 1 : 0) < (double)(done - DLKF_REWIND)) return dlkf_counted(d, DLKF_LATE);
-  const int64_t row = (int64_t)place;
-  dlkf_fix *fix = &d->fixes[row % DLKF_BOUNDARIES];
-  if (fix->number == row && fix->t >= x->t) return dlkf_counted(d, fix->t > x->t ? DLKF_SUPERSEDED : DLKF_DOUBLE);
+static double place_of(const dlkf *d, double t) { return ceil((t - d->samples.t0 - ON_BOUNDARY_S) / EPOCH_S); }
 
-  if (!dlkf_screen_take(&d->screen, x)) return dlkf_counted(d, DLKF_IMPLAUSIBLE_FIX);
+/* The fix of a boundary: the latest report of its update interval that the screen takes, or none. */
+static void put_fix(dlkf *d, int64_t row) {
+  dlkf_fix *fix = &d->fixes[row % DLKF_BOUNDARIES];
+  const dlkf_report *x = NULL;
+  for (int k = d->report_count; k-- && !x;)
+    if (report_at(d, k)->used && (int64_t)place_of(d, report_at(d, k)->t) == row) x = report_at(d, k);
+  if (!x) {
+    if (fix->number == row) fix->number = -1;
+    return;
+  }
   double C_en[9], v_n[3];
   const double lat = x->lat_deg * DEGREE, lon = x->lon_deg * DEGREE;
   ecef_from_geodetic(lat, lon, x->height_m, fix->r_e);
@@ -184,21 +188,60 @@ static dlkf_status file(dlkf *d, const dlkf_report *x) {
   fix->lag = lag > ON_BOUNDARY_S ? lag : 0;
   fix->t = x->t;
   fix->number = row;
-
-  if (row > done || done == d->oldest) return dlkf_counted(d, DLKF_TAKEN);
-  return dlkf_replay(d, row);
 }
 
-/* The filter again from the update interval on that ends at a boundary. */
-dlkf_status dlkf_replay(dlkf *d, int64_t row) {
+/* Insert a fix among those held, which are in order of time, and screen it; where it is not the latest, screen all of them
+ * again (dlkf.running.fix_history). The fix, and the first boundary whose fix has changed. */
+static dlkf_report *screened(dlkf *d, const dlkf_report *x, int place, int64_t *changed) {
+  while (d->report_count == DLKF_EARLY || (d->report_count && place_of(d, report_at(d, 0)->t) < (double)(d->samples.epochs - DLKF_REWIND))) {
+    (void)dlkf_screen_take(&d->screen_before, report_at(d, 0));
+    d->report_first = (d->report_first + 1) % DLKF_EARLY;
+    d->report_count--;
+    place -= place > 0;
+  }
+  for (int k = d->report_count++; k > place; k--) *report_at(d, k) = *report_at(d, k - 1);
+  *report_at(d, place) = *x;
+  int k = place;
+  if (place < d->report_count - 1) d->screen = d->screen_before, k = 0;
+  for (; k < d->report_count; k++) {
+    dlkf_report *one = report_at(d, k);
+    const int used = dlkf_screen_take(&d->screen, one);
+    if (used == one->used) continue;
+    one->used = used;
+    const int64_t row = (int64_t)place_of(d, one->t);
+    put_fix(d, row);
+    if (row < *changed) *changed = row;
+  }
+  return report_at(d, place);
+}
+
+/* A fix to its boundary; what is over is run anew. */
+static dlkf_status file(dlkf *d, const dlkf_report *x) {
+  const int64_t done = d->samples.epochs;
+  const double place = place_of(d, x->t);
+  if (!(place <= (double)(done + DLKF_REWIND))) return dlkf_counted(d, DLKF_AHEAD);
+  if (place < 0 || (place > 1 ? place - 1 : 0) < (double)(done - DLKF_REWIND)) return dlkf_counted(d, DLKF_LATE);
+  int k = d->report_count;
+  while (k > 0 && report_at(d, k - 1)->t > x->t) k--;
+  if (k > 0 && report_at(d, k - 1)->t >= x->t) return dlkf_counted(d, DLKF_DOUBLE);
+  int64_t changed = INT64_MAX;
+  const int used = screened(d, x, k, &changed)->used, replayed = dlkf_replay(d, changed);
+  if (!used) return dlkf_counted(d, DLKF_IMPLAUSIBLE_FIX);
+  if (d->fixes[(int64_t)place % DLKF_BOUNDARIES].t > x->t) return dlkf_counted(d, DLKF_SUPERSEDED);
+  return dlkf_counted(d, replayed ? DLKF_REPLAYED : DLKF_TAKEN);
+}
+
+/* The filter again from the update interval on that ends at a boundary; 0 where that is still to come. */
+int dlkf_replay(dlkf *d, int64_t row) {
   const int64_t done = d->samples.epochs, from = row - 1 > d->oldest ? row - 1 : d->oldest;
+  if (row > done || done == d->oldest) return 0;
   const dlkf_before *held = before(d, from);
   d->kind = held->kind;
   d->watch = held->watch;
   d->doubt = held->doubt;
   copy_state(&d->now, &held->state, held->kind);
   for (int64_t k = from; k < done; k++) run(d, k, 1);
-  return dlkf_counted(d, DLKF_REPLAYED);
+  return 1;
 }
 
 /* Lay the grid, once there are fixes enough to lay it through. */
@@ -209,8 +252,8 @@ static void settle(dlkf *d) {
     through[n++] = d->samples.phase_s;
   } else {
     const double now = dlkf_samples_latest(&d->samples);
-    for (int k = 0; k < d->early_count; k++) {
-      const double t = d->early[(d->early_first + k) % DLKF_EARLY].t;
+    for (int k = 0; k < d->report_count; k++) {
+      const double t = report_at(d, k)->t;
       if (!(fabs(t - now) <= DLKF_LATE_S + SETTLE_S)) continue;
       int j = n++;
       for (; j > 0 && through[j - 1] > t; j--) through[j] = through[j - 1];
@@ -219,8 +262,12 @@ static void settle(dlkf *d) {
     if (n < 2 || through[n - 1] - through[0] < SETTLE_S - ON_BOUNDARY_S) return;
   }
   if (!dlkf_samples_begin(&d->samples, through, n)) return;
-  for (int k = 0; k < d->early_count; k++) file(d, &d->early[(d->early_first + k) % DLKF_EARLY]);
-  d->early_count = 0;
+  const int count = d->report_count;
+  d->report_count = 0;
+  for (int k = 0; k < count; k++) { /* the same ring, filled from its beginning with those already read */
+    const dlkf_report x = *report_at(d, k);
+    file(d, &x);
+  }
   dlkf_aids_file(d);
 }
 
@@ -242,7 +289,6 @@ dlkf_status dlkf_imu(dlkf *d, double t, const double accel[3], const double gyro
   const dlkf_status status = dlkf_samples_take(&d->samples, t, accel, gyro);
   if (status != DLKF_TAKEN) {
     if (!dlkf_samples_lost(&d->samples)) return dlkf_counted(d, status);
-    dlkf_screen_clear(&d->screen); /* the clock may be another */
     clear(d);
     return dlkf_counted(d, DLKF_RESTARTED);
   }
@@ -259,7 +305,7 @@ void dlkf_finish(dlkf *d) {
 dlkf_status dlkf_gnss(dlkf *d, double t, double lat_deg, double lon_deg, double height_m, const double *velocity_ned,
                       const double *std, int quality) {
   d->made = d->given = 0;
-  dlkf_report x = {t, lat_deg, lon_deg, height_m, {NAN, NAN, NAN}, {NAN, NAN, NAN, NAN, NAN, NAN}, quality};
+  dlkf_report x = {t, lat_deg, lon_deg, height_m, {NAN, NAN, NAN}, {NAN, NAN, NAN, NAN, NAN, NAN}, quality, 0};
   if (velocity_ned) memcpy(x.v, velocity_ned, sizeof x.v);
   if (std) memcpy(x.std, std, sizeof x.std);
   int infinite = isinf(lat_deg) || isinf(lon_deg) || isinf(height_m) || !isfinite(t), below = 0;
@@ -270,8 +316,8 @@ dlkf_status dlkf_gnss(dlkf *d, double t, double lat_deg, double lon_deg, double 
     return dlkf_counted(d, DLKF_NO_FIX);
   if (fabs(lat_deg) > 90 || fabs(lon_deg) > 180 || below) return dlkf_counted(d, DLKF_OUTSIDE);
   if (!isnan(d->samples.t0)) return file(d, &x);
-  if (d->early_count == DLKF_EARLY) d->early_first = (d->early_first + 1) % DLKF_EARLY, d->early_count--;
-  d->early[(d->early_first + d->early_count++) % DLKF_EARLY] = x;
+  if (d->report_count == DLKF_EARLY) d->report_first = (d->report_first + 1) % DLKF_EARLY, d->report_count--;
+  *report_at(d, d->report_count++) = x;
   return dlkf_counted(d, DLKF_TAKEN);
 }
 

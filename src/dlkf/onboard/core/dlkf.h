@@ -40,7 +40,7 @@
 #define DLKF_CLOSED (DLKF_REWIND + DLKF_LOOKBACK + 1)              /* update intervals held */
 #define DLKF_BOUNDARIES (DLKF_CLOSED + DLKF_REWIND + 2)            /* fixes held */
 #define DLKF_ROWS (DLKF_CLOSED + DLKF_KEEP_S * DLKF_RATE_MILLIHZ / (DLKF_SAMPLES * 1000) + 4) /* rows of a call at most */
-#define DLKF_EARLY 200                                             /* fixes held before that */
+#define DLKF_EARLY 200                                             /* fixes held, before that and for the screen */
 #define DLKF_SENSORS (DLKF_AIDS ? DLKF_AIDS : 1)
 #define DLKF_EARLY_AIDS (DLKF_AIDS ? DLKF_AIDS * DLKF_KEEP_S * DLKF_AID_HZ : 1) /* samples of further sensors, likewise */
 #define DLKF_STAMPS 128                                            /* of a sensor, among which one that comes twice is known */
@@ -80,7 +80,7 @@ typedef struct {
 
 typedef struct {
   double t, lat_deg, lon_deg, height_m, v[3], std[6];
-  int32_t quality;
+  int32_t quality, used; /* used: the screen takes it */
 } dlkf_report; /* of a receiver */
 
 typedef struct {
@@ -156,10 +156,10 @@ typedef struct {
   uint32_t layout; /* of this struct: DLKF_LAYOUT, else it is not one */
   double lever_arm_b[3];
   dlkf_samples samples;
-  dlkf_screen screen;
+  dlkf_screen screen, screen_before; /* after the latest fix held, before the oldest */
   dlkf_watch watch;
-  dlkf_report early[DLKF_EARLY];
-  int32_t early_first, early_count;
+  dlkf_report reports[DLKF_EARLY]; /* in order of arrival; with update intervals, in order of time */
+  int32_t report_first, report_count;
   dlkf_fix fixes[DLKF_BOUNDARIES];
   dlkf_epoch closed[DLKF_CLOSED];
   dlkf_before before[DLKF_REWIND];
@@ -267,7 +267,7 @@ int dlkf_search_start(dlkf *d, double *start);
 void dlkf_aids_clear(dlkf *d);
 void dlkf_aids_file(dlkf *d);
 void dlkf_read_aids(const dlkf *d, int64_t boundary, double *out);
-dlkf_status dlkf_replay(dlkf *d, int64_t row);
+int dlkf_replay(dlkf *d, int64_t row);
 dlkf_status dlkf_counted(dlkf *d, dlkf_status status);
 
 #ifdef __cplusplus
