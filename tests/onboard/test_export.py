@@ -107,11 +107,11 @@ def test_the_example_says_what_it_does_not_understand(exported, example, tables,
         (["--arm", "1", "0.3"], lines[:0], "navigate: --arm: take [--arm x y z, in metres]"),
         (["--arm", "1", "0,3", "-1"], lines[:0], "navigate: --arm: take [--arm"),
         (["--latncy"], lines[:0], "navigate: --latncy: take"),
-        ([], ["t,x", *lines[:60], ""], "navigate: line 1 is no measurement, passed over like all such: t,x\n"),
-        ([], ["imu,1,2,x,4,5,6,7"], "1 lines that are no measurement"),
-        ([], ["imu,1" + ",2" * 2000, "imu,1,2,3"], "2 lines that are no measurement"),
-        ([], lines[:60], "navigate: nothing solved, it still waits for fixes over three seconds"),
-        ([], [], "navigate: nothing solved, it still waits for samples of the IMU"),
+        ([], ["t,x", *lines[:60], ""], "navigate: line 1 is not a measurement and is ignored: t,x\n"),
+        ([], ["imu,1,2,x,4,5,6,7"], "1 lines ignored"),
+        ([], ["imu,1" + ",2" * 2000, "imu,1,2,3"], "2 lines ignored"),
+        ([], lines[:60], "navigate: nothing solved, waiting for fixes over three seconds"),
+        ([], [], "navigate: nothing solved, waiting for samples of the IMU"),
     ):
         given = {"input": "".join(f"{line}\n" for line in log), "env": {"LD_LIBRARY_PATH": str(exported[0])}}
         done = subprocess.run([example, *arguments], capture_output=True, text=True, **given)

@@ -360,17 +360,17 @@ int64_t dlkf_count(const dlkf *d, dlkf_status status) {
 const char *dlkf_says(dlkf_status status) {
   static const char *const words[DLKF_STATUSES] = {
       "taken", "taken late, and replayed", "superseded by a later one of the same update interval",
-      "refused: a number is not finite", "refused: beyond what an IMU of a car measures", "refused: this stamp again",
-      "refused: the stamp goes back", "refused: the stamp leaps ahead", "refused: more samples than the memory holds",
-      "refused: no fix", "refused: latitude, longitude or 1-sigma out of range", "refused: no car can have come there since the last good fix", "refused: too late",
-      "refused: ahead of the IMU; both need one clock", "refused: this filter takes no such sensor", "started over: samples out of line went on for a second",
-      "the filter diverged, and aligns anew", "the filter was lost, far off good fixes, and aligns anew"};
+      "refused: a number is not finite", "refused: beyond full scale", "refused: duplicate stamp",
+      "refused: the stamp is before the last one", "refused: a gap before the stamp", "refused: more samples than the memory holds",
+      "refused: no fix", "refused: latitude, longitude or 1-sigma out of range", "refused: not reachable since the last good fix", "refused: too late",
+      "refused: ahead of the IMU; both need one clock", "refused: this filter takes no such sensor", "restarted: stamps were inconsistent for a second",
+      "the filter diverged and realigns", "the filter was far from good fixes and realigns"};
   return (unsigned)status < DLKF_STATUSES ? words[status] : "no such status";
 }
 
 const char *dlkf_waits_for(dlkf_waiting waiting) {
   static const char *const words[] = {"nothing", "samples of the IMU", "fixes over three seconds",
                                       "the car to move under GNSS",
-                                      "motion that shows which way the car faces"};
+                                      "motion that determines the heading"};
   return (unsigned)waiting < sizeof words / sizeof *words ? words[waiting] : "no such thing";
 }

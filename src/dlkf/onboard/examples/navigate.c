@@ -11,22 +11,22 @@
 static const char HELP[] =
     "navigate [--arm x y z] [--samples] [--latency] < drive.csv > solution.csv\n"
     "\n"
-    "One line per measurement, in the order in which they come, one clock for all of them [s]:\n"
+    "One line per measurement, in order of arrival, with stamps of one clock [s]:\n"
     "  imu,t,ax,ay,az,gx,gy,gz                mean over the interval that ends at t [m/s2, rad/s], forward-right-down\n"
     "  gnss,t,lat,lon,h,vn,ve,vd,6 std,q      antenna [deg, m, m/s]; std of position and velocity; q as in NMEA GGA\n"
     "  speed,t,v[,std]                        wheel speed [m/s], forward positive or never negative\n"
     "  heading,t,yaw[,std]                    of a dual-antenna receiver [rad], from North over East\n"
     "  baro,t,h[,std] or pressure,t,p[,std]   barometric height [m], or pressure [Pa]; 1-sigma in metres\n"
-    "The last three, and a sensor of your own by its name, count where the filter was exported with it (aids=).\n"
-    "Rates and jitter are free, nan or nothing stands for what a receiver does not know.\n"
+    "The last three, and user-defined sensors by name, are used if the filter was exported with them (aids=).\n"
+    "Any rate, with jitter; nan or an empty field is an unknown value. Other lines are ignored and counted.\n"
     "\n"
     "  --arm x y z   IMU to antenna [m], forward-right-down; 0 0 0 if not given\n"
-    "  --samples     a row for every IMU sample, not only for every update interval\n"
-    "  --latency     how long the calls take, at the end\n"
+    "  --samples     a row for every IMU sample instead of every update interval\n"
+    "  --latency     report the time per call at the end\n"
     "  --help        this\n"
     "\n"
-    "The first line names the columns. A row that a late fix changes is written again, with revised = 1; the last one of\n"
-    "a time counts. Until the car moves under GNSS there are no rows: what it waits for is said on standard error.\n"
+    "The first line names the columns. A row that a late fix changes is written again, with revised = 1; the last row of\n"
+    "a time is the valid one. There are no rows until the car moves under GNSS; standard error reports what is awaited.\n"
     "Exit code 0: solved; 1: output cannot be written; 2: a wrong argument, or nothing could be solved.\n";
 
 enum { NUMBERS = 14, MICROSECONDS = 100000 };
@@ -132,7 +132,7 @@ int main(int argc, char **argv) {
     else if (!strncmp(line, "gnss,", 5) && n == 14) status = dlkf_gnss(&filter, x[0], x[1], x[2], x[3], x + 4, x + 7, x[13] >= 0 && x[13] < 100 ? (int)x[13] : -1);
     else if ((n == 2 || n == 3) && sensor(line) > -2) status = dlkf_aid(&filter, sensor(line), x[0], strncmp(line, "pressure,", 9) ? x[1] : dlkf_pressure_height(x[1]), n == 3 ? x[2] : NAN);
     else {
-      if (!strange++) fprintf(stderr, "navigate: line %ld is no measurement, passed over like all such: %.60s%s", lines, line, strchr(line, '\n') ? "" : "\n");
+      if (!strange++) fprintf(stderr, "navigate: line %ld is not a measurement and is ignored: %.60s%s", lines, line, strchr(line, '\n') ? "" : "\n");
       continue;
     }
     if (timing) {
@@ -150,9 +150,9 @@ int main(int argc, char **argv) {
   for (const double *row; (row = dlkf_next(&filter));) print(row);
   for (int k = DLKF_TAKEN + 1; k < DLKF_STATUSES; k++)
     if (dlkf_count(&filter, (dlkf_status)k)) fprintf(stderr, "%lld x %s\n", (long long)dlkf_count(&filter, (dlkf_status)k), dlkf_says((dlkf_status)k));
-  if (strange) fprintf(stderr, "%ld lines that are no measurement\n", strange);
+  if (strange) fprintf(stderr, "%ld lines ignored\n", strange);
   if (timing) quantiles();
-  if (!rows) fprintf(stderr, "navigate: nothing solved, it still waits for %s\n", dlkf_waits_for(dlkf_waits(&filter)));
+  if (!rows) fprintf(stderr, "navigate: nothing solved, waiting for %s\n", dlkf_waits_for(dlkf_waits(&filter)));
   if (fflush(stdout) || ferror(stdout)) return fprintf(stderr, "navigate: %s\n", strerror(errno)), 1;
   return rows ? 0 : 2;
 }
