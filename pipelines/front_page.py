@@ -103,7 +103,7 @@ def draw(result: Results) -> None:
     axes.set(xlabel="time without GNSS [s]", ylabel="median horizontal error [m]", yscale="log", xlim=(0, None))
     axes.set_title(f"{result.count['outages']} simulated outages of 60 s, each after 60 s of GNSS", fontsize=10)
     axes.grid(alpha=0.3, which="both")
-    axes.legend(loc="center right", bbox_to_anchor=(1.0, 0.58))
+    axes.legend(loc="center right", bbox_to_anchor=(1.0, 0.66))
     figure.savefig(FIGURE, dpi=130)
 
 
