@@ -33,7 +33,7 @@ from dlkf.data.segments import whole_drives
 from dlkf.data.store import choose_aids, drive_rows, load_dataset
 from dlkf.evaluation.bootstrap import compare
 from dlkf.filters.aids.attach import aid_columns, with_aids
-from dlkf.filters.integration import Solution
+from dlkf.filters.integration import BatchSolution
 from dlkf.filters.smoother import Filter
 from dlkf.running.batched import run_filter
 from dlkf.running.start import align_each
@@ -60,7 +60,7 @@ def hide(batch: Batch, first: int, length: int) -> tuple[Batch, torch.Tensor]:
     return replace(batch, available=batch.available & ~hidden), ends
 
 
-def end_errors(batch: Batch, solution: Solution, ends: torch.Tensor) -> np.ndarray:
+def end_errors(batch: Batch, solution: BatchSolution, ends: torch.Tensor) -> np.ndarray:
     """Horizontal errors [m] where outages end."""
     error = (solution.posterior.p_n - batch.truth.p_n)[..., :2].norm(dim=-1)
     return error[ends].numpy()
@@ -73,7 +73,7 @@ def distances(batch: Batch, ends: torch.Tensor, length: int) -> np.ndarray:
     return (way - way.roll(length, 1))[ends].numpy()
 
 
-def found(solution: Solution, model: Filter, batch: Batch) -> str:
+def found(solution: BatchSolution, model: Filter, batch: Batch) -> str:
     """What was estimated of the sensors at the end of each drive, the median over the drives, and what was refused."""
     if solution.aids is None:
         return "–"

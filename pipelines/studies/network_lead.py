@@ -29,7 +29,7 @@ from dlkf.evaluation.metrics import mean_error
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Protocol, Scenes
 from dlkf.filters.build import build_causal
-from dlkf.filters.integration import Estimator, Solution, integrate
+from dlkf.filters.integration import BatchSolution, Estimator, integrate
 from dlkf.filters.saved import load_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.calibration import ImuError
@@ -95,7 +95,7 @@ def at_outage(
     return {k: np.concatenate(x) for k, x in ends.items()}, {k: _rms(np.concatenate(x)) for k, x in sizes.items()}
 
 
-def _drifted(state: NavState, run: Solution, batch: Batch, seconds: int) -> NavState:
+def _drifted(state: NavState, run: BatchSolution, batch: Batch, seconds: int) -> NavState:
     """After the outage, by strapdown alone with the IMU error that a run had at its start."""
     assert run.error is not None
     bias, matrix = run.error.bias[:, seconds - 1].double(), run.error.matrix

@@ -28,7 +28,7 @@ from dlkf.data.drive import Batch
 from dlkf.evaluation.figures import SHADE, png
 from dlkf.evaluation.table import ResultTable, as_json, as_markdown, format_number
 from dlkf.filters.gating import chi2_quantile
-from dlkf.filters.integration import Solution, integrate
+from dlkf.filters.integration import BatchSolution, integrate
 from dlkf.filters.model_based import CovarianceEstimator, has_covariance
 from dlkf.filters.smoother import Filter
 from dlkf.navigation.state import PVA, ErrorStates
@@ -71,7 +71,7 @@ def normalised_square(e: Float[Tensor, "*b n"], P: Float[Tensor, "*b n n"]) -> F
 
 
 def state_error(
-    batch: Batch, solution: Solution, states: ErrorStates, matrices: Float[Tensor, "B 2 3 3"]
+    batch: Batch, solution: BatchSolution, states: ErrorStates, matrices: Float[Tensor, "B 2 3 3"]
 ) -> Float[Tensor, "B T n"]:
     """truth − estimate of a filter's states without those of the car, in their order.
 

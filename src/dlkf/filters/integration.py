@@ -112,7 +112,7 @@ class WholeLoop:
         """What :func:`advance` gives; state and error are in its memory."""
         raise NotImplementedError
 
-    def integrate(self, batch: Batch) -> Solution:
+    def integrate(self, batch: Batch) -> BatchSolution:
         """What :func:`integrate` gives."""
         raise NotImplementedError
 
@@ -129,7 +129,7 @@ class Step(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Solution:
+class BatchSolution:
     """A filter's output over a batch, one row at the end of each epoch."""
 
     prior: NavState  # (B, T, …) before the update
@@ -188,7 +188,7 @@ def _rate_before(rates: Tensor, late: Tensor, count: int) -> Tensor:
 
 def integrate(
     batch: Batch, estimator: Estimator, *, keep_covariances: bool = False, keep_innovations: bool = False
-) -> Solution:
+) -> BatchSolution:
     """Run an estimator over a batch from its start state; differentiable where the estimator is."""
     if isinstance(estimator, WholeLoop):
         return estimator.integrate(batch)
@@ -220,7 +220,7 @@ def integrate(
     return replace(solution, innovation_covariance=torch.stack(spreads, 1)) if spreads else solution
 
 
-def stack_steps(steps: list[Step], offered: Tensor, *, keep_errors: bool) -> Solution:
+def stack_steps(steps: list[Step], offered: Tensor, *, keep_errors: bool) -> BatchSolution:
     """The steps of a run as one solution; ``offered`` (B, T): where a fix might have been used."""
 
     def over_time(rows: list) -> Tensor | None:
@@ -239,7 +239,7 @@ def stack_steps(steps: list[Step], offered: Tensor, *, keep_errors: bool) -> Sol
     accepted = over_time([a.accepted for a in answers])
     each_covariances = [a.covariances for a in answers]
     covariances = None if each_covariances[0] is None else each(each_covariances, Covariances)
-    return Solution(
+    return BatchSolution(
         prior=each([s.prior for s in steps], NavState),
         posterior=each([s.posterior for s in steps], NavState),
         imu_error=torch.stack([s.complete_error for s in steps], 1),

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
-from dlkf.filters.integration import Estimator, Solution, integrate
+from dlkf.filters.integration import BatchSolution, Estimator, integrate
 from dlkf.filters.model_based import has_covariance
 from dlkf.navigation.state import IMU, PVA, STATES, NavState
 
@@ -45,7 +45,7 @@ def run_smoother(estimator: Filter, smoother: str) -> SmoothedSolution:
     return estimator if isinstance(estimator, SmoothedSolution) else SmoothedSolution(estimator)
 
 
-def smooth(batch: Batch, estimator: Estimator) -> Solution:
+def smooth(batch: Batch, estimator: Estimator) -> BatchSolution:
     """Filter a batch forwards and smooth it backwards; the solution's posterior, IMU error and std are smoothed.
 
     Epochs in the padding after a segment's end carry nothing back. Raises InputError for a filter without a
@@ -88,7 +88,7 @@ def _gain(predicted: Tensor, cross: Tensor) -> Tensor:
     return (solved / unit.unsqueeze(-1)).mT
 
 
-def _matrix_part(filtered: Solution, dx: Tensor, batch: Batch, estimator: Any) -> Tensor | float:
+def _matrix_part(filtered: BatchSolution, dx: Tensor, batch: Batch, estimator: Any) -> Tensor | float:
     """What the smoothed change of the sensor matrices makes of each epoch's mean sample (B, T, 6)."""
     states = estimator.states
     if not states.elements:

@@ -18,7 +18,7 @@ from torch.fx import GraphModule, Node
 
 from dlkf.base.errors import InputError
 from dlkf.onboard.c_loops import UNKNOWN, WHOLE
-from dlkf.onboard.c_memory import C_TYPES, Buffer, Tensors, View, Written
+from dlkf.onboard.c_memory import C_TYPES, Buffer, Expression, Tensors, View
 from dlkf.onboard.c_operations import BY_ELEMENT, PARTS, literal
 
 
@@ -55,7 +55,7 @@ class Translation(Tensors):
             return
         name = target._schema.name.removeprefix("aten::")
         parts = [*_flat(args), *_flat(kwargs)]
-        if not any(isinstance(a, (View, Written)) for a in parts) and "val" in node.meta:
+        if not any(isinstance(a, (View, Expression)) for a in parts) and "val" in node.meta:
             self.values[node] = target(*args, **kwargs)  # known here
         elif name == "_assert_tensor_metadata":
             return
@@ -101,20 +101,22 @@ class Translation(Tensors):
             pattern, args = pattern(value.dtype, args, kwargs)
         segments = []
         for x in args:
-            if isinstance(x, Written) and x.shape == value.shape:
+            if isinstance(x, Expression) and x.shape == value.shape:
                 first = len(operands)
                 inner = x.pattern.format(*(f"{{{first + k}}}" for k in range(len(x.operands))))
                 segments.append(f"({_cast(x.dtype, value.dtype)}({inner}))")
                 operands += x.operands
-            elif isinstance(x, (View, Written)) or (isinstance(x, Tensor) and x.numel() > 1):
+            elif isinstance(x, (View, Expression)) or (isinstance(x, Tensor) and x.numel() > 1):
                 view = self.tensor(x)
                 segments.append(f"{_cast(view.meta.dtype, value.dtype)}{{{len(operands)}}}")
                 operands.append(view.viewed(view.meta.expand(value.shape)))
             else:
                 segments.append(literal(x.item() if isinstance(x, Tensor) else x, value.dtype))
-        written = Written(value.shape, value.dtype, f"({C_TYPES[value.dtype]})({pattern.format(*segments)})", operands)
+        expression = Expression(
+            value.shape, value.dtype, f"({C_TYPES[value.dtype]})({pattern.format(*segments)})", operands
+        )
         alone = len(node.users) == 1 and len(operands) <= 12 and value.numel() > 0
-        return written if alone and _goes_on(next(iter(node.users))) else self.tensor(written)
+        return expression if alone and _goes_on(next(iter(node.users))) else self.tensor(expression)
 
     def _copied(self, node: Node, name: str, args: list) -> View:
         """An operation that changes a part: a copy, then the part."""

@@ -51,7 +51,7 @@ class View:
 
 
 @dataclass
-class Written:
+class Expression:
     """Elements of a tensor that are not computed yet: a C expression over the elements of others."""
 
     shape: torch.Size
@@ -128,7 +128,7 @@ class Tensors:
         """A value as a tensor in memory."""
         if isinstance(x, Tensor):
             return self.block.constant(x)
-        if isinstance(x, Written):
+        if isinstance(x, Expression):
             out = self.block.new(x.shape, x.dtype)
             self.block.over(out, x.pattern, x.operands)
             return out

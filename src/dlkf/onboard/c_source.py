@@ -32,11 +32,11 @@ from dlkf.onboard.functions import (
     ROW,
     START,
     Anchor,
+    Begin,
     Carry,
     Function,
     Grid,
     Row,
-    Start,
     Turn,
     carried_state,
     fix_numbers,
@@ -84,7 +84,7 @@ def write_source(
         layout = carried_state(estimator, grid)
         functions: dict[str, type[Function]] = {"turn": Turn}
         if not loop_alone:
-            functions |= {"start": Start, "row": Row, "carry": Carry}
+            functions |= {"start": Begin, "row": Row, "carry": Carry}
             if can_reanchor(layout.like.memory):
                 functions["anchor"] = Anchor
         done = {f: function_in_c(f"dlkf_{f}", kind(estimator, grid, layout).eval()) for f, kind in functions.items()}

@@ -28,7 +28,7 @@ from dlkf.base.console import warn_once
 from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
 from dlkf.filters.aids.attach import tables_of
-from dlkf.filters.integration import Correction, Estimator, Fix, Solution, Step, WholeLoop, integrate
+from dlkf.filters.integration import BatchSolution, Correction, Estimator, Fix, Step, WholeLoop, integrate
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.calibration import ImuError
@@ -107,7 +107,7 @@ class CompiledFilter(WholeLoop):
         step = Step(_state(x["prior"]), _state(x["posterior"]), error, x["innovation"], x["error"], answer)
         return memory._replace(numbers=vector), step
 
-    def integrate(self, batch: Batch) -> Solution:
+    def integrate(self, batch: Batch) -> BatchSolution:
         """Whole drives, as many at a time as torch has threads; in the precision of the batch.
 
         Beyond a drive's end its last state is repeated, without a fix. Many drives through a large network go through
@@ -124,7 +124,7 @@ class CompiledFilter(WholeLoop):
 
         outputs = self._run(memory.numbers, imu, fixes, batch.present.sum(1).tolist())
         x = split(torch.stack(outputs).to(batch.imu.dtype))
-        return Solution(
+        return BatchSolution(
             prior=_state(x["prior"]), posterior=_state(x["posterior"]), imu_error=x["error"],
             innovation=x["innovation"] * batch.present.unsqueeze(-1), used=(x["used"][..., 0] > 0.5) & batch.present,
             std=x["std"] if self._has_std else None, gain=None,

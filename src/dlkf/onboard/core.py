@@ -20,7 +20,7 @@ Status = IntEnum(
 Waiting = IntEnum("Waiting", ["RUNS", "SAMPLES", "FIXES", "MOTION", "HEADING"], start=0)
 
 
-class Receipt(NamedTuple):
+class CoreReceipt(NamedTuple):
     """Answer to a sample or a fix, and the rows of the update intervals that it closed or changed (n, columns)."""
 
     status: Status
@@ -58,7 +58,7 @@ class Core:
         library.dlkf_open(self.memory, (c_double * 3)(*lever_arm_b))
         library.dlkf_lay(self.memory, phase_s, imu_step_s)
 
-    def imu(self, t: float, accel: Sequence[float], gyro: Sequence[float]) -> Receipt:
+    def imu(self, t: float, accel: Sequence[float], gyro: Sequence[float]) -> CoreReceipt:
         """Take a sample: mean specific force [m/s²] and rate [rad/s] over the interval that ends at ``t`` [s]."""
         three = c_double * 3
         return self._receipt(self._library.dlkf_imu(self.memory, t, three(*accel), three(*gyro)))
@@ -66,31 +66,31 @@ class Core:
     def gnss(
         self, t: float, lat_deg: float, lon_deg: float, height_m: float,
         velocity_ned: Sequence[float] | None = None, std: Sequence[float] | None = None, quality: int = 1,
-    ) -> Receipt:  # fmt: skip
+    ) -> CoreReceipt:  # fmt: skip
         """Take a fix of the antenna, instantaneous at ``t`` [s]."""
         v = None if velocity_ned is None else (c_double * 3)(*velocity_ned)
         s = None if std is None else (c_double * 6)(*std)
         return self._receipt(self._library.dlkf_gnss(self.memory, t, lat_deg, lon_deg, height_m, v, s, int(quality)))
 
-    def aid(self, name: str, t: float, value: float, std: float = np.nan) -> Receipt:
+    def aid(self, name: str, t: float, value: float, std: float = np.nan) -> CoreReceipt:
         """Take a sample of a further sensor, in the unit of its table."""
         sensor = self._library.dlkf_sensor(name.encode())
         return self._receipt(self._library.dlkf_aid(self.memory, sensor, t, value, std))
 
-    def speed(self, t: float, speed: float, std: float = np.nan) -> Receipt:
+    def speed(self, t: float, speed: float, std: float = np.nan) -> CoreReceipt:
         """Take a wheel speed [m/s]."""
         return self.aid("speed", t, speed, std)
 
-    def heading(self, t: float, heading: float, std: float = np.nan) -> Receipt:
+    def heading(self, t: float, heading: float, std: float = np.nan) -> CoreReceipt:
         """Take the car's heading [rad]."""
         return self.aid("heading", t, heading, std)
 
-    def baro(self, t: float, height_m: float = np.nan, std: float = np.nan, *, pressure: float = np.nan) -> Receipt:
+    def baro(self, t: float, height_m: float = np.nan, std: float = np.nan, *, pressure: float = np.nan) -> CoreReceipt:
         """Take a barometric height [m], or a ``pressure`` [Pa]."""
         height = height_m if np.isfinite(height_m) else self._library.dlkf_pressure_height(pressure)
         return self.aid("baro", t, height, std)
 
-    def finish(self) -> Receipt:
+    def finish(self) -> CoreReceipt:
         """The end of a log."""
         self._library.dlkf_finish(self.memory)
         return self._receipt(0)
@@ -134,10 +134,10 @@ class Core:
         """The words of a status."""
         return self._library.dlkf_says(int(status)).decode()
 
-    def _receipt(self, status: int) -> Receipt:
+    def _receipt(self, status: int) -> CoreReceipt:
         rows = []
         while row := self._library.dlkf_next(self.memory):
             rows.append(row[: self._columns])
         if rows:
             self._latest = rows[-1][0]
-        return Receipt(Status(status), np.array(rows).reshape(-1, self._columns))
+        return CoreReceipt(Status(status), np.array(rows).reshape(-1, self._columns))

@@ -140,7 +140,7 @@ class Function(nn.Module):
         return self.layout.pack(self.layout.like)
 
 
-class Start(Function):
+class Begin(Function):
     """(1, :data:`START`), (1, 3) → (1, K): the filter at a start."""
 
     def example(self) -> tuple[Tensor, ...]:
@@ -166,7 +166,7 @@ class Turn(Function):
         return self.somewhere(), ones, ones.new_ones(1, fix_numbers(self.estimator))
 
     def forward(self, memory: Tensor, imu: Tensor, fix: Tensor) -> tuple[Tensor, Tensor]:
-        """The loop's turn, and what a :class:`dlkf.filters.integration.Solution` holds of it."""
+        """The loop's turn, and what a :class:`dlkf.filters.integration.BatchSolution` holds of it."""
         imu, fix = imu.to(self.grid.dtype), fix.to(self.grid.dtype)
         names = [table.name for table in tables_of(self.estimator)]
         aids = {name: fix[:, FIX_N + AID_N * k : FIX_N + AID_N * (k + 1)] for k, name in enumerate(names)}

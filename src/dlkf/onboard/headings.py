@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dlkf.filters.integration import Fix
 from dlkf.onboard.carried import Field, Layout
-from dlkf.onboard.functions import Function, Grid, Start, advance_filter, carried_state
+from dlkf.onboard.functions import Begin, Function, Grid, advance_filter, carried_state
 from dlkf.running.start.bank import bank_filter, fix_std, weigh_step
 
 CARRIED = ("memory.P", "memory.fix.coarse.", "state.", "error.")
@@ -77,7 +77,7 @@ def heading_functions(grid: Grid) -> tuple[Layout, dict[str, Function]]:
     grid = Grid(grid.samples, grid.dt)
     estimator = bank_filter(grid.epoch_s)
     layout = carried_state(estimator, grid)
-    kinds = {"start": Start, "turn": Weigh}
+    kinds = {"start": Begin, "turn": Weigh}
     return layout, {name: kind(estimator, grid, layout).eval() for name, kind in kinds.items()}
 
 

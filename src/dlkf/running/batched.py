@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dlkf.data.drive import Batch
-from dlkf.filters.integration import Solution, integrate
+from dlkf.filters.integration import BatchSolution, integrate
 from dlkf.filters.smoother import Filter, SmoothedSolution, smooth
 
 CHUNK_SAMPLES = 1_500_000  # IMU samples integrated at a time: bounds the memory
@@ -27,7 +27,7 @@ def chunks(batch: Batch, samples: int = CHUNK_SAMPLES) -> Iterator[Tensor]:
 
 def run_filter(
     batch: Batch, estimator: Filter, *, keep_covariances: bool = False, keep_innovations: bool = False
-) -> Solution:
+) -> BatchSolution:
     """The filter loop, smoothed where asked for, without gradients, on the device of the estimator's parameters.
 
     ``keep_covariances``, or those of the innovations alone, where the filter has some and is not smoothed.

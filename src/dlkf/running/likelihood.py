@@ -39,7 +39,7 @@ from dlkf.data.masks import withhold_fixes
 from dlkf.data.segments import whole_drives
 from dlkf.filters.aids.attach import aided_name
 from dlkf.filters.build import build_causal, is_filter
-from dlkf.filters.integration import Estimator, Solution
+from dlkf.filters.integration import BatchSolution, Estimator
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.running.batched import run_filter
@@ -183,14 +183,14 @@ class Evidence:
         return pad(per_drive, (0, -per_drive.shape[1] % long)).unflatten(1, (-1, long)).sum(-1).flatten()
 
 
-def _used(batch: Batch, solution: Solution) -> Float[Tensor, "B T"]:
+def _used(batch: Batch, solution: BatchSolution) -> Float[Tensor, "B T"]:
     """Of the innovations of fixes that the filter was offered; a component without one adds nothing."""
     assert solution.innovation_covariance is not None
     components = (batch.gnss_valid & batch.available.unsqueeze(-1)).sum(-1)
     return _density(solution.innovation, solution.innovation_covariance, components)
 
 
-def _withheld(batch: Batch, solution: Solution, tuning: Tuning) -> Float[Tensor, "B T"]:
+def _withheld(batch: Batch, solution: BatchSolution, tuning: Tuning) -> Float[Tensor, "B T"]:
     """Of horizontal positions that the filter did not see, under its own covariance and that of the fix."""
     assert solution.position_covariance is not None
     state = solution.prior

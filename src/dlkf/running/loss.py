@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.data.limits import ESTIMATE_HEIGHTS_M, ESTIMATE_M_S, LOST_FIXES, LOST_M, LOST_S, LOST_SHARE, LOST_SIGMAS
-from dlkf.filters.integration import Solution
+from dlkf.filters.integration import BatchSolution
 
 
 class LossWatch(NamedTuple):
@@ -53,7 +53,7 @@ def impossible(v_n: Tensor, p_n: Tensor, origin_height: Tensor) -> Tensor:
     return (v_n.norm(dim=-1) > ESTIMATE_M_S) | (height < ESTIMATE_HEIGHTS_M[0]) | (height > ESTIMATE_HEIGHTS_M[1])
 
 
-def first_loss(batch: Batch, row: int, solution: Solution) -> int | None:
+def first_loss(batch: Batch, row: int, solution: BatchSolution) -> int | None:
     """The first epoch at whose end the filter of one drive of a batch was lost; None: never."""
     n = int(batch.present[row].sum())
     state = solution.posterior

@@ -23,7 +23,7 @@ from dlkf.data.tables import read_table
 from dlkf.data.validate import GNSS_QUALITIES
 from dlkf.filters.aids.attach import aid_columns
 from dlkf.filters.constraints import CarConstraints
-from dlkf.filters.integration import Solution
+from dlkf.filters.integration import BatchSolution
 from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.running.batched import CHUNK_SAMPLES, run_filter
 from dlkf.running.innovations import Innovation, fit_sigma
@@ -257,7 +257,7 @@ def navigate_drives(
             progress(done, len(todo))
 
 
-def _run(batch: Batch, estimator: Filter) -> Solution:
+def _run(batch: Batch, estimator: Filter) -> BatchSolution:
     try:
         return run_filter(batch, estimator, keep_covariances=True)
     except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage]
@@ -270,7 +270,7 @@ def _run(batch: Batch, estimator: Filter) -> Solution:
 
 
 def _navigated(
-    drive: Drive, start: Start, batch: Batch, row: int, solution: Solution, estimator: Filter, align: AlignConfig
+    drive: Drive, start: Start, batch: Batch, row: int, solution: BatchSolution, estimator: Filter, align: AlignConfig
 ) -> Navigated:
     """One drive of a batch; where the filter was lost (:mod:`dlkf.running.loss`) it is aligned and run again.
 
@@ -307,7 +307,7 @@ def _navigated(
 
 
 def _rows(
-    drive: str, batch: Batch, row: int, solution: Solution, end: int | None, aids: Sequence[str]
+    drive: str, batch: Batch, row: int, solution: BatchSolution, end: int | None, aids: Sequence[str]
 ) -> tuple[pd.DataFrame, Innovation]:
     """The solution of one drive of a batch up to epoch ``end``, with columns ``aids`` of further sensors; InputError
     where it is not finite."""
@@ -330,7 +330,7 @@ def _rows(
     return table, Innovation(innovation.value[:n], innovation.std[:n])
 
 
-def _innovation(solution: Solution, row: int) -> Innovation:
+def _innovation(solution: BatchSolution, row: int) -> Innovation:
     """Of one drive of a batch, (T, 6); components without a measurement are NaN."""
     value = solution.innovation[row].cpu().double()
     seen = solution.used[row].cpu().unsqueeze(-1) & (value != 0)

@@ -31,7 +31,7 @@ from dlkf.running.streaming import Status, StreamingFilter
 R = TypeVar("R", covariant=True)  # its receipts
 
 
-class Receiver(Protocol[R]):
+class MeasurementSink(Protocol[R]):
     """What takes samples and fixes one by one: :class:`StreamingFilter`, or the core of a vehicle."""
 
     def imu(self, t: float, accel: Sequence[float], gyro: Sequence[float], /) -> R:
@@ -59,7 +59,7 @@ class UnalignedError(InputError):
 
 
 def replay_drive(
-    stream: Receiver[R], imu: Columns, gnss: Columns, arrival: Sequence[float] | None = None,
+    stream: MeasurementSink[R], imu: Columns, gnss: Columns, arrival: Sequence[float] | None = None,
     aids: Mapping[str, Columns] | None = None, tables: Sequence[AidTable] = (), late_s: float = 0.0,
 ) -> Iterator[R]:  # fmt: skip
     """Feed the tables of a drive to a stream in order of time; the receipts.

@@ -14,7 +14,7 @@ from torch.nn.functional import smooth_l1_loss
 from dlkf.base.classes import TARGET, instantiate
 from dlkf.base.settings import settings_from
 from dlkf.data.drive import Batch
-from dlkf.filters.integration import Solution
+from dlkf.filters.integration import BatchSolution
 from dlkf.navigation.state import NavState
 from dlkf.training.outage_loss import likelihood_term, outage_term
 from dlkf.training.processes import count_per_process
@@ -42,16 +42,16 @@ class LossConfig:
     outage: float = 0.0
     likelihood: float = 0.0
 
-    def __call__(self, solution: Solution, batch: Batch) -> Mapping[str, Tensor]:
+    def __call__(self, solution: BatchSolution, batch: Batch) -> Mapping[str, Tensor]:
         """:func:`pva_losses` with these settings."""
         return pva_losses(solution, batch, self)
 
 
 PAPER_FIELDS = {f.name for f in fields(LossConfig)}  # settings that lie beside _target_ where a preset is the base
-Loss = Callable[[Solution, Batch], Mapping[str, Tensor]]
+Loss = Callable[[BatchSolution, Batch], Mapping[str, Tensor]]
 
 
-def pva_losses(solution: Solution, batch: Batch, config: LossConfig) -> dict[str, Tensor]:
+def pva_losses(solution: BatchSolution, batch: Batch, config: LossConfig) -> dict[str, Tensor]:
     """Mean smooth-L1 of the scaled errors of position, velocity and attitude, unweighted between the three.
 
     Attitude error is log(C_ref Ĉᵀ), never a difference of angles. Epochs without truth do not count; a batch

@@ -13,7 +13,7 @@ from torch import Tensor
 from dlkf.data.draws import step_seed
 from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import end_errors, mean_error
-from dlkf.filters.integration import Solution, integrate
+from dlkf.filters.integration import BatchSolution, integrate
 from dlkf.filters.saved import LearnedSettings, learned_filter
 from dlkf.networks.heads import IMU_ERROR_SIZE, INNOVATION_SIZE, STATE_SIZE
 from dlkf.training.loss import Loss, unit_weights, weighted_loss
@@ -86,7 +86,7 @@ class FilterTraining(L.LightningModule):
         """As it is: a step moves it, after what is drawn on the CPU."""
         return batch
 
-    def _run(self, batch: Batch) -> Solution:
+    def _run(self, batch: Batch) -> BatchSolution:
         return integrate(batch, self.filter, keep_covariances=self.covariances)
 
     def _losses(self, batch: Batch) -> Mapping[str, Tensor]:

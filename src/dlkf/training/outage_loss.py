@@ -13,20 +13,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.data.drive import Batch
-from dlkf.filters.integration import Solution
+from dlkf.filters.integration import BatchSolution
 from dlkf.training.processes import count_per_process
 
 FREEDOM = 8.0  # ν
 SMALLEST_VARIANCE = 1e-4  # m²
 
 
-def outage_term(solution: Solution, batch: Batch) -> Tensor:
+def outage_term(solution: BatchSolution, batch: Batch) -> Tensor:
     """Mean over the epochs without GNSS; 0 without any."""
     hidden = ~batch.available & batch.truth_valid & batch.present
     return _mean(torch.log1p(_horizontal(solution, batch).square().sum(-1)), hidden)
 
 
-def likelihood_term(solution: Solution, batch: Batch) -> Tensor:
+def likelihood_term(solution: BatchSolution, batch: Batch) -> Tensor:
     """Half the mean over epochs with GNSS, half that over epochs without; needs ``keep_covariances``."""
     assert solution.covariances is not None
     e = _horizontal(solution, batch)
@@ -39,7 +39,7 @@ def likelihood_term(solution: Solution, batch: Batch) -> Tensor:
     return 0.5 * (_mean(value, known & batch.available) + _mean(value, known & ~batch.available))
 
 
-def _horizontal(solution: Solution, batch: Batch) -> Float[Tensor, "B T 2"]:
+def _horizontal(solution: BatchSolution, batch: Batch) -> Float[Tensor, "B T 2"]:
     return (solution.posterior.p_n - torch.nan_to_num(batch.truth.p_n))[..., :2]
 
 
