@@ -24,7 +24,8 @@ KEPT = {  # operations that are one in C, though core ATen has several for them
 
 def record(function: Function) -> GraphModule:
     """The graph of a function at its ``example()``; its constants are attributes."""
-    example, graph = function.example(), function
+    example = function.example()
+    graph: Any = function
     try:
         for _ in range(2):  # what nn.GRUCell changes in place shows in the first graph and is gone in the second
             recorder = make_fx(functionalize(graph), _decompositions(), "fake", _allow_non_fake_inputs=True)
