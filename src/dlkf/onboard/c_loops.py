@@ -131,14 +131,12 @@ def _product(t: Tensors, node: Node, A: Any, B: Any, begin: Any = None, beta: fl
         start = ("" if beta == 1 else f"{literal(beta, value.dtype)} * ") + wide.at([*lead, "i", "j"])
         used.append(given)
     if b.meta.stride(-1) == 1 or (n > 1 and b.meta.stride(-2) != 1):  # along rows of B
-        # H, K and Φ are mostly zeros: which they are not is listed first, so that the sum has no condition
-        listed = f"int list[{k}], listed = 0; for (int k = 0; k < {k}; k++) if ({at_a} != 0) list[listed++] = k; "
-        each = "for (int q = 0; q < listed; q++) { const int k = list[q]; "
-        if not small or n < WIDE:
-            listed, each = "", f"for (int k = 0; k < {k}; k++) {{ "
+        # H, K and Φ are mostly zeros; a branch round a loop of fixed length costs half of a list of what is not
+        skip = "if (w == 0) continue; " if small and n >= WIDE else ""
         body = (
-            f"{{ {kind} y[{n}]; {listed}for (int j = 0; j < {n}; j++) y[j] = {start}; "
-            f"{each}{kind} w = {scale}{at_a}; for (int j = 0; j < {n}; j++) y[j] += w * {at_b}; }} "
+            f"{{ {kind} y[{n}]; for (int j = 0; j < {n}; j++) y[j] = {start}; "
+            f"for (int k = 0; k < {k}; k++) {{ {kind} w = {scale}{at_a}; {skip}"
+            f"for (int j = 0; j < {n}; j++) y[j] += w * {at_b}; }} "
             f"for (int j = 0; j < {n}; j++) {at} = y[j]; }}"
         )
     else:  # along its columns
