@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 import shutil
 import zipfile
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
+import yaml
 
 from dlkf.base.errors import InputError
 from dlkf.data.intake import IngestOptions, ingest
@@ -20,7 +22,7 @@ from dlkf.data.readers.logs import LogReader
 from dlkf.data.readers.offers import contents
 from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.tables import read_drives
-from tests.cars import car
+from tests.cars import REAL, car
 from tests.data.logs.clock import UNIX
 from tests.data.logs.phones import gnss_logger, sensor_logger
 from tests.data.test_auto import _hidden
@@ -74,6 +76,50 @@ def test_kf_gins_files_that_are_too_short_for_auto_name_the_preset(tmp_path):
     (got,) = read(folder, said.partition("with its axes: ")[2].split())
     np.testing.assert_allclose(got.imu.accel_z, imu.accel_z, atol=1e-6)
     np.testing.assert_allclose(got.gnss.std_pos_n, 0.02)
+
+
+def settings_of(line: str) -> dict:
+    """The keys that a refusal names, as they would be given."""
+    out: dict = {}
+    for path, value in re.findall(r"reader\.([\w.]+)=([^\s,;]+)", line):
+        *above, last = path.split(".")
+        node = out
+        for key in above:
+            node = node.setdefault(key, {})
+        node[last] = yaml.safe_load(value)
+    return out
+
+
+@pytest.mark.parametrize("name", ["rough", "wid-03-dot", "wid-04-dot"])
+def test_fixes_that_jump_name_all_that_must_be_given(tmp_path, streets, name):
+    """Positions alone, their noise above the car's motion: one line with every key and no guess; the keys mend it."""
+    imu, gnss = streets["imu"], streets["gnss"].copy()
+    if name == "rough":
+        noise = np.random.default_rng(5).normal(0.0, 3.0 / 111_000, (len(gnss), 2))
+        gnss[["lat_deg", "lon_deg"]] += noise
+        gnss[["vel_n", "vel_e", "vel_d"]] = np.nan
+    else:
+        if not (REAL / "wid").is_dir():
+            pytest.skip("needs the real drives")
+        imu, gnss = (pd.read_parquet(REAL / "wid" / kind / f"drive={name}") for kind in ("imu", "gnss"))
+    imu.to_csv(tmp_path / "imu.csv", index=False)
+    gnss.to_csv(tmp_path / "gnss.csv", index=False)
+    said = refusal(tmp_path)
+    given = settings_of(said)
+    assert given["gnss"]["time"]["offset_s"] == 0 and given["imu"]["accel"]["axes"] == "frd", said
+    assert "if both files have one clock" in said and "best guess" not in said
+    (got,) = AutoReader(**given).read(tmp_path)
+    assert len(got.gnss) == len(gnss)
+    np.testing.assert_allclose(got.imu[list(ACCEL)], imu[list(ACCEL)], atol=1e-6)
+
+
+def test_files_of_two_clocks_are_not_taken_for_one(tmp_path, streets):
+    """Hours apart: the line asks for the seconds, not for zero."""
+    gnss = streets["gnss"].assign(vel_n=np.nan, vel_e=np.nan, vel_d=np.nan, t=streets["gnss"].t + 7200)
+    gnss[["lat_deg", "lon_deg"]] += np.random.default_rng(5).normal(0.0, 3.0 / 111_000, (len(gnss), 2))
+    streets["imu"].to_csv(tmp_path / "imu.csv", index=False)
+    gnss.to_csv(tmp_path / "gnss.csv", index=False)
+    assert "reader.gnss.time.offset_s=… (seconds to be added to its stamps)" in refusal(tmp_path)
 
 
 def test_gnss_logger_without_gps_lines(tmp_path, streets):

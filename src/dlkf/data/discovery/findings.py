@@ -158,9 +158,11 @@ def _gyro_unit(out: Findings, raw: Raw, pose: Pose | None, known: Mapping[str, f
     if pose is None:
         out.add("imu.gyro.unit", None, False, "no turn to compare with the course")
         return
-    detail = (
-        f"{pose.gyro_scale:.4g} ± {pose.gyro_scale_std:.1g} rad per unit of {np.degrees(pose.turned):.0f}° of turns"
-    )
+    spread, turned = abs(pose.gyro_scale_std), np.degrees(pose.turned)
+    detail = f"{pose.gyro_scale:.4g} ± {spread:.1g} rad per unit of {turned:.0f}° of turns"
+    if pose.gyro_scale <= 0:
+        out.add("imu.gyro.unit", None, False, f"{detail}, which noise alone gives")
+        return
     unit = nearest_unit(pose.gyro_scale, pose.gyro_scale_std, known)
     if unit is None:
         shaking = float(np.sqrt(np.mean(np.var(raw.gyro, axis=0))))

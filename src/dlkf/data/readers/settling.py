@@ -33,6 +33,13 @@ PLACES: dict[str, tuple[tuple[str, ...], Any]] = {
     "gnss.velocity.unit": (("gnss", "velocity", "unit"), 1.0),
     "gnss.position.delay_s": (("gnss", "position", "delay_s"), 0.0),
 }
+USUAL = {
+    "imu.accel.unit": "m/s2 (or g)",
+    "imu.gyro.unit": "rad/s (or deg/s)",
+    "gnss.velocity.unit": "m/s (or km/h)",
+    "gnss.time.drift_ppm": "0 (if both files have one clock)",
+}
+MOSTLY = 0.8  # of the fixes
 FEWEST_FIXES = 3  # below, no finding has a spread
 SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "knots": 1852 / 3600, "cm/s": 0.01, "mm/s": 1e-3, "mph": 0.44704}
 
@@ -98,7 +105,7 @@ def settle(
     found = Findings()
     if "gnss.velocity.unit" in wanted:
         _speed_unit(found, mapped["gnss"], t["gnss"], where)
-        _refuse_doubt(found, wanted, where)
+        _refuse_doubt(found, wanted, where, t)
         specs["gnss"]["velocity"]["unit"] = found.get("gnss.velocity.unit")
     imu = imu_frame(mapped["imu"], t["imu"])
     gnss = gnss_frame(Mapped(mapped["gnss"].table, specs["gnss"], "gnss", mapped["gnss"].parts), t["gnss"])
@@ -116,7 +123,7 @@ def settle(
         drift_given="gnss.time.drift_ppm" not in wanted and _at(specs, PLACES["gnss.time.drift_ppm"][0]) is not None,
     )
     found.found += more.found
-    _refuse_doubt(found, wanted, where)
+    _refuse_doubt(found, wanted, where, t)
     for name in wanted & set(PLACES):
         value = copy.deepcopy(found.get("imu.axes" if name.endswith("axes") else name))
         if value is not None:
@@ -134,7 +141,7 @@ def _by_gravity(specs: dict[str, Any], imu: Mapped, t: np.ndarray, where: str, a
     found = Findings()
     value = names[0] if len(names) == 1 else float(f"{G / size:.5g}") if size > 0 else None
     found.add("imu.accel.unit", value, len(names) > 0, f"median force {size:.4g}")
-    _refuse_doubt(found, {"imu.accel.unit"}, where)
+    _refuse_doubt(found, {"imu.accel.unit"}, where, {"imu": t})
     _set(specs, PLACES["imu.accel.unit"][0], value)
     return Settled(specs, arm, found.found)
 
@@ -171,7 +178,7 @@ def _speed_unit(found: Findings, gnss: Mapped, t: np.ndarray, where: str) -> Non
     found.add("gnss.velocity.unit", best, bool(certain), detail)
 
 
-def _refuse_doubt(found: Findings, wanted: set[str], where: str) -> None:
+def _refuse_doubt(found: Findings, wanted: set[str], where: str, t: Mapping[str, np.ndarray]) -> None:
     doubts = found.doubtful()
     if not doubts:
         return
@@ -180,10 +187,11 @@ def _refuse_doubt(found: Findings, wanted: set[str], where: str) -> None:
         (float(one.value), one.std) for one in found.found if "offset_s" in one.setting and one.value is not None
     ]
     setting = doubt.setting.replace("imu.axes", "imu.accel.axes and .gyro.axes")
-    best = "" if doubt.value is None else f"; the best guess is {_said(doubt.value)}"
+    poor = doubt.setting.endswith(("offset_s", "axes")) and not doubt.wide  # no more than a guess of noise
+    best = "" if doubt.value is None or poor else f"; the best guess is {_said(doubt.value)}"
     if doubt.setting.endswith("drift_ppm") and doubt.setting not in wanted:
         raise InputError(f"{where}: the clocks drift apart, {_said(doubt.value)} {doubt.detail}; reader.{setting}=auto")
-    remedy = "give it, or a longer drive, with turns, starts and stops"
+    remedy = f"give {_by_hand(doubts, wanted, t)}, or a longer drive, with turns, starts and stops"
     if doubt.remedy:
         remedy = doubt.remedy
     elif all(one.wide for one in doubts):
@@ -191,6 +199,27 @@ def _refuse_doubt(found: Findings, wanted: set[str], where: str) -> None:
     unsure = Unsure(f"{where}: not sure of reader.{setting} ({doubt.detail}){best}; {remedy}")
     unsure.offset_s = offsets[0] if offsets else unsure.offset_s
     raise unsure
+
+
+def _by_hand(doubts: list[Finding], wanted: set[str], t: Mapping[str, np.ndarray]) -> str:
+    """The settings of everything in doubt, with their usual values and when these are right."""
+    said = []
+    for setting in (doubt.setting for doubt in doubts):
+        if setting.endswith("offset_s"):
+            value = "0 (if both files have one clock)" if _overlap(t) else "… (seconds to be added to its stamps)"
+            said.append(f"reader.{setting}={value}")
+        elif setting == "imu.axes":
+            names = sorted(wanted & {"imu.accel.axes", "imu.gyro.axes"})
+            said.append(f"{' '.join(f'reader.{name}=frd' for name in names)} (if x is forward, y right, z down)")
+        else:
+            said.append(f"reader.{setting}={USUAL.get(setting, '…')}")
+    return " ".join(said)
+
+
+def _overlap(t: Mapping[str, np.ndarray]) -> bool:
+    """Whether most of the fixes lie within the IMU's samples by their stamps."""
+    within = (t["gnss"] >= t["imu"][0]) & (t["gnss"] <= t["imu"][-1])
+    return bool(np.mean(within) > MOSTLY)
 
 
 def _reported(found: list[Finding], wanted: set[str]) -> list[Finding]:
