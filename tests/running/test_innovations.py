@@ -10,8 +10,11 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.shipped import trained_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import imu_spec
+from dlkf.running import innovations
 from dlkf.running.innovations import CHANCE, SETTLE, fit_sigma
 from dlkf.running.offline import navigate_dataset, sigma_warning
+from tests.conftest import SIZE
+from tests.drives import drives_in
 
 N = 300 + SETTLE  # updates
 
@@ -31,6 +34,15 @@ def test_white_innovations_of_the_right_size_lie_within_the_bounds() -> None:
     fits = [fit_sigma(np.random.default_rng(seed).standard_normal((N, 6))) for seed in range(300)]
     assert CHANCE < 1e-3 and all(f.low < f.ratio < f.high and not f.too_small for f in fits)
     assert np.median([f.degrees for f in fits]) == pytest.approx(6 * 300, rel=0.2)
+
+
+@pytest.mark.parametrize("updates", [20, 60])
+def test_the_bound_is_exceeded_as_seldom_as_it_says(monkeypatch: pytest.MonkeyPatch, updates: int) -> None:
+    """1 % above the upper bound of α = 2 %: of 1500 at most 15 + 3 √15; and some are, so it is no bound of its own."""
+    monkeypatch.setattr(innovations, "CHANCE", 0.02)
+    rng = np.random.default_rng(updates)
+    fits = [fit_sigma(rng.standard_normal((updates + SETTLE, 6))) for _ in range(1500)]
+    assert 2 <= sum(f.ratio > f.high for f in fits) <= 26
 
 
 @pytest.mark.parametrize("phi", [0.7, 0.95])
@@ -99,3 +111,23 @@ def test_filters_on_simulated_drives(simulated, name: str, factor: float, warned
     drives = list(navigate_dataset(simulated, model, rate_hz=50.0, epoch_s=1.0))
     lines = [sigma_warning([drive], kind, "tune it") for drive in drives]
     assert len(lines) == 2 and all((line is not None) == warned for line in lines), lines
+
+
+NOT_STATES = {f"imu.{s}.{k}": 0.0 for s in ("accel", "gyro") for k in ("scale_factor", "misalignment")}
+
+
+@pytest.mark.usefixtures("without_shape_checks")
+@pytest.mark.parametrize(
+    ("name", "errors", "fits"),
+    [("mbkf15", "all", False), ("mbkf33", "all", True), ("mbkf15", "those of its states", True)],
+)
+def test_its_own_preset_is_right_where_all_errors_are_states(tmp_path, name: str, errors: str, fits: bool) -> None:
+    """Scale factors and misalignments of the IMU are none of 15 states: warned of rightly; without them 1σ fits."""
+    left_out = [] if errors == "all" else [f"{key}={value}" for key, value in NOT_STATES.items()]
+    of = ["simulated@dataset=one_imu", "dataset.name=town", *SIZE, "dataset.drive_minutes=3", "dataset.hours=0.1"]
+    folder = drives_in(compose_command("simulate", *of, *left_out), tmp_path / "town")
+    values = compose_command("navigate", "dataset=x", *left_out)
+    model = build_filter(name, imu_spec(values["imu"]), tuning=Tuning(**values["tuning"]))
+    drives = list(navigate_dataset(folder, model, rate_hz=50.0, epoch_s=1.0))
+    fit = fit_sigma(*(drive.innovation.ratio for drive in drives))
+    assert fit.too_small != fits and (fit.low < fit.ratio < fit.high) == fits, fit

@@ -6,7 +6,12 @@ sequence), and components as fewer where they go together or have heavy tails (S
 
     n_eff = n / (1 + 2 Σ_j (1 − j/n) ρ_j),     ν = n_eff · min(m, 2 s̄²/var s),     ν s̄ ~ χ²_ν
 
-So r = √s̄ lies within √(χ²_ν(α/2)/ν) … √(χ²_ν(1 − α/2)/ν) in all but α of the cases.
+So r = √s̄ lies within √(χ²_ν(α/2)/ν) … √(χ²_ν(1 − α/2)/ν) in all but α of the cases. Innovations of a filter that is
+right are white: of 60,000 such drives of 20 to 300 updates none got the warning, and at α = 2 % 0.6 to 0.8 % were above
+the bound (1 % by the equation). In short drives with correlated ones, an AR(1) of 0.95, n_eff is too large: of 10,000
+with 30 updates 2 got the warning, with the tails of Student's t₄ 16; with 60 updates none and 2.
+Filters of 15 and 21 states get it with the preset of their own IMU as well, and rightly: its scale factors and
+misalignments are none of their states.
 """
 
 from __future__ import annotations
@@ -19,10 +24,13 @@ from numpy.typing import NDArray
 from dlkf.filters.gating import chi2_quantile
 
 Array = NDArray[np.floating]
-CHANCE = 1e-4  # α: a filter that is right gets the warning once in as many drives
+CHANCE = 1e-4  # α, of both bounds together
 TOLERATED = 1.3  # by which a 1σ may be off before it is worth a line: no filter's noise is known better
 SETTLE = 10  # updates from the start on that do not count: the heading is still being found
-REMEDY = "tuning=any_car is for unknown cars, dlkf tune or imu=auto fits the noise; dlkf consistency shows more"
+REMEDY = (
+    "scale factors and misalignments are states of mbkf33 alone; tuning=any_car is for unknown cars, "
+    "dlkf tune or imu=auto fits the noise; dlkf consistency shows more"
+)
 OF_NETWORK = "its network knows no such sensors: compare it with mbkf21_car imu=auto; dlkf doctor looks at the data"
 
 
