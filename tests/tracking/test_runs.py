@@ -260,10 +260,24 @@ def test_lightning_writes_into_the_run_and_does_not_end_it(uri, client):
         logger.finalize("success")
         assert client.get_run(run.id).info.status == "RUNNING"
     found = client.get_run(run.id)
-    # in the order in which they came: what chooses the best of a grid is what MLflow compares runs by first
-    kept = ["train/loss", "train/gradient_norm", "val/outage_end_m", "val/loss", "val/a"]
+    # what chooses the best of a grid is what MLflow compares runs by first, also where epoch 7 is not validated
+    kept = ["val/outage_end_m", "val/loss", "val/a", "train/loss", "train/gradient_norm"]
     assert list(found.data.metrics) == kept and found.data.params == {}
     assert [(m.value, m.step) for m in client.get_metric_history(run.id, "train/loss")] == [(0.5, 7)]
+
+
+def test_epochs_before_an_end_without_validation_are_logged(uri, client):
+    """And those of a run that goes on at once: it has its first metric already."""
+    with open_run(uri) as run:
+        logger = lightning_logger(run)
+        logger.log_metrics({"epoch": 0, "train/loss": 2.0})
+        logger.log_metrics({"epoch": 1, "train/loss": 1.0})
+        assert not client.get_run(run.id).data.metrics
+        logger.finalize("failed")
+    with open_run(uri, run_id=run.id) as again:
+        lightning_logger(again).log_metrics({"epoch": 2, "train/loss": 0.5})
+    history = client.get_metric_history(run.id, "train/loss")
+    assert [(m.value, m.step) for m in history] == [(2.0, 0), (1.0, 1), (0.5, 2)]
 
 
 def test_system_metrics_are_sampled_every_second(uri, client, monkeypatch):

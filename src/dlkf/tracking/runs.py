@@ -305,9 +305,12 @@ def lightning_logger(run: TrackedRun, monitor: str | None = None) -> MLFlowLogge
 
     Steps are epochs, so that curves of runs with other batch sizes lie over each other. Of what comes together the
     metric that chooses the weights, ``monitor``, is first, then what chooses them by default: the page that compares
-    runs starts with the metric that a run logged first, which should be the one by which a grid's best is chosen.
+    runs starts with the metric that a run logged first, which should be the one by which a grid's best is chosen. So
+    epochs of a new run before the first validation are logged after it, with the time at which they ended.
     """
     from lightning.pytorch.loggers import MLFlowLogger
+    from mlflow.entities import Metric
+    from mlflow.utils.time import get_current_time_millis
 
     first = [name for name in (monitor, *MONITORS) if name]
 
@@ -315,15 +318,30 @@ def lightning_logger(run: TrackedRun, monitor: str | None = None) -> MLFlowLogge
         return first.index(name) if name in first else len(first), not name.endswith("/loss"), name
 
     class MetricsOnly(MLFlowLogger):
+        held: list[Metric] | None = None if run.resumed else []  # None after the first validation
+
         def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
             """With the epoch as step."""
             rest = {k: metrics[k] for k in sorted(metrics, key=rank) if k != "epoch"}
-            super().log_metrics(rest, int(metrics.get("epoch", step or 0)))
+            epoch = int(metrics.get("epoch", step or 0))
+            if self.held is not None and not any(k.startswith("val/") for k in rest):
+                now = get_current_time_millis()
+                self.held = [*self.held, *(Metric(k, float(v), now, epoch) for k, v in rest.items())]
+                return
+            super().log_metrics(rest, epoch)
+            self.release()
+
+        def release(self) -> None:
+            """Log what was held back."""
+            held, self.held = self.held or [], None
+            for i in range(0, len(held), METRICS_AT_ONCE):
+                run.client.log_batch(run.id, metrics=held[i : i + METRICS_AT_ONCE])
 
         def log_hyperparams(self, params: Any) -> None:
             """The run has the whole config already, uncut."""
 
         def finalize(self, status: str = "success") -> None:
             """The run goes on after training: scores and model follow."""
+            self.release()
 
     return MetricsOnly(run_id=run.id, tracking_uri=run.uri)
