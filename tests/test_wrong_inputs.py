@@ -112,10 +112,16 @@ BAD_FRAMES: dict[str, tuple[str, Callable[[pd.DataFrame], Any], str]] = {  # whi
     "without gravity": ("imu", lambda f: f.assign(accel_z=f.accel_z + 9.80665), "median specific force is 0.85"),
     "milliseconds": ("imu", times(1000, "t"), "imu: a row every 20 s: t looks like milliseconds; divide it by 1e+03"),
     "nanoseconds": ("imu", times(1e9, "t"), "t looks like nanoseconds; divide it by 1e+09"),
+    "nanoseconds at 100 Hz": ("imu", times(5e8, "t"), "t looks like nanoseconds; divide it by 1e+09"),
     "dates": (
         "imu",
         lambda f: f.assign(t=pd.to_datetime(f.t, unit="s")),
         "must be seconds on one clock for all frames: (imu.t - pd.Timestamp(",
+    ),
+    "dates as text": (
+        "imu",
+        lambda f: f.assign(t=pd.to_datetime(f.t, unit="s").astype(str)),
+        "t has dates as text, must be seconds on one clock for all frames: (pd.to_datetime(imu.t) - pd.Timestamp(",
     ),
     "time differences": (
         "imu",
@@ -168,6 +174,13 @@ BAD_FRAMES: dict[str, tuple[str, Callable[[pd.DataFrame], Any], str]] = {  # whi
     "radians": ("gnss", times(PI, "lat_deg", "lon_deg"), "lat_deg and lon_deg look like radians"),
     "degrees and minutes": ("gnss", ddmm, "looks like degrees and minutes"),
     "1e-7 degrees": ("gnss", times(1e7, "lat_deg", "lon_deg"), "looks like 1e-7 degrees"),
+    "UTM": (
+        "gnss",
+        lambda f: f.assign(lat_deg=5.78e6 + f.index, lon_deg=3.4e5),
+        "looks like metres of a grid (UTM, ECEF)",
+    ),
+    "the wrong half of the earth": ("gnss", times(-1, "lat_deg"), "lat_deg or vel_n has the wrong sign"),
+    "west for east": ("gnss", times(-1, "lon_deg"), "lon_deg or vel_e has the wrong sign"),
     "lat and lon exchanged": (
         "gnss",
         lambda f: f.rename(columns={"lat_deg": "lon_deg", "lon_deg": "lat_deg"}),
@@ -298,6 +311,10 @@ CALLS: dict[str, tuple[Callable[[Frames, Path], Any], str]] = {
         lambda d, _: dlkf.navigate(d["imu"], d["gnss"], lever_arm="abc"),
         "lever_arm is 'abc', must be three numbers",
     ),
+    "an arm of nine": (
+        lambda d, _: dlkf.navigate(d["imu"], d["gnss"], lever_arm=np.zeros((3, 3))),
+        "lever_arm is array([[0., 0., 0.], [0., 0., 0.], [0., 0., 0.]]), must be three numbers",
+    ),
     "an arm of one": (
         lambda d, _: dlkf.navigate(d["imu"], d["gnss"], lever_arm=1.2),
         "lever_arm is 1.2, must be three numbers",
@@ -386,6 +403,14 @@ CALLS: dict[str, tuple[Callable[[Frames, Path], Any], str]] = {
         lambda d, _: dlkf.evaluate(d["imu"], d["gnss"], times(1 / PI, "roll", "pitch", "yaw")(d["reference"])),
         "reference: yaw reaches 180.0: looks like degrees",
     ),
+    "a reference of another place": (
+        lambda d, _: dlkf.evaluate(d["imu"], d["gnss"], d["reference"].assign(lat_deg=d["reference"].lat_deg + 1)),
+        "reference: lies 111 km from the fixes in the median; give the reference of this drive",
+    ),
+    "a reference of NaN": (
+        lambda d, _: dlkf.evaluate(d["imu"], d["gnss"], d["reference"].assign(lat_deg=np.nan), models="ins"),
+        "has no valid reference to score against; without reference= the drive smoothed",
+    ),
     "a car misspelt": (
         lambda d, _: dlkf.simulate("lifelik"),
         "unknown simulated preset 'lifelik'; did you mean lifelike?",
@@ -404,6 +429,14 @@ CALLS: dict[str, tuple[Callable[[Frames, Path], Any], str]] = {
         "source is a NoneType, must be the path of a file or a folder",
     ),
     "an empty folder": (lambda d, here: dlkf.read_logs(here), "holds no log that can be recognised"),
+    "half a table of fixes": (
+        lambda d, here: dlkf.read_logs(half_a_parquet(d, here)),
+        "gnss.parquet: not a whole Parquet or Feather file",
+    ),
+    "an archive among the files": (
+        lambda d, here: dlkf.read_logs(zipped(here)),
+        "log.zip (a .zip; give it as source, or unpack it)",
+    ),
     "a picture": (
         lambda d, here: dlkf.read_logs(picture(here)),
         "no IMU found in car.png (of no format that is known)",
@@ -437,6 +470,9 @@ CALLS: dict[str, tuple[Callable[[Frames, Path], Any], str]] = {
         "lever_arm is (1, 2, 'x'), must be three numbers",
     ),
     "a format": (lambda d, here: solved(d).export(here, "shp"), "export=shp: unknown format; known: geojson"),
+    "no format": (lambda d, here: solved(d).export(here, []), "formats is [], must be a name or a list of names"),
+    "a format that is nothing": (lambda d, here: solved(d).export(here, None), "formats is None, must be a name"),
+    "an export to nowhere": (lambda d, _: solved(d).export(None, "gpx"), "folder is None, must be a path"),
     "a date": (
         lambda d, here: solved(d).export(here, "gpx", start_utc="yesterday at noon"),
         "start_utc is 'yesterday at noon', must be a date and time",
@@ -450,6 +486,20 @@ def picture(here: Path) -> Path:
     file = here / "car.png"
     file.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)))
     return file
+
+
+def half_a_parquet(frames: Frames, here: Path) -> Path:
+    """A folder of a drive whose fixes were not copied whole."""
+    for kind in ("imu", "gnss"):
+        frames[kind].to_parquet(here / f"{kind}.parquet")
+    (here / "gnss.parquet").write_bytes((here / "gnss.parquet").read_bytes()[:500])
+    return here
+
+
+def zipped(here: Path) -> Path:
+    """A folder that holds an archive alone, cut short."""
+    (here / "log.zip").write_bytes(b"PK\3\4" + bytes(range(256)))
+    return here
 
 
 def solved(frames: Frames) -> dlkf.Solution:

@@ -24,6 +24,7 @@ DISAGREES, AGREES = 0.5, 0.25  # relative residual of way against velocity
 LEAST_SLOPE = 0.1  # of gyro_z against the course; one that is at its limit in every turn may have 0.3
 FEW = 2  # single fixes at 0°/0° or a continent away are refused by themselves (dlkf.data.limits)
 FARTHEST_KM, KM_PER_DEG = 2000.0, 111.2
+SAME_S, FARTHEST_REFERENCE_KM = 1.0, 1.0  # a row of a reference beside a fix; no antenna, no datum is so far off
 SEARCH_S = 600.0  # clocks of logs that have time in common are hardly further apart
 APART_S = 1.0  # less is a delay, which the filters bear; dlkf.ingest measures it on request
 DRIFTED_S = 0.1  # from a drive's first to its last second: worth a line
@@ -100,7 +101,9 @@ def _other_degrees(lat: np.ndarray) -> str:
     largest = float(np.nanmax(np.abs(lat)))
     if largest <= 9000.0 and np.nanmax(np.abs(lat) % 100.0) < 60.0:
         return ": looks like degrees and minutes (ddmm.mmmm); reader.gnss.position.unit=ddmm, or change them to degrees"
-    return ": looks like 1e-7 degrees; multiply by 1e-7" if 1e5 < largest <= 9e8 else ""
+    if 1e5 < largest <= 1e7:  # 1e-7 degrees within a degree of the equator are fewer than grids
+        return ": looks like metres of a grid (UTM, ECEF); change them to degrees"
+    return ": looks like 1e-7 degrees; multiply by 1e-7" if 1e7 < largest <= 9e8 else ""
 
 
 def _check_places(lat: np.ndarray, lon: np.ndarray, where: str) -> None:
@@ -119,6 +122,19 @@ def _check_places(lat: np.ndarray, lon: np.ndarray, where: str) -> None:
         raise InputError(
             f"{where}: fix {worst} lies {far[worst]:.0f} km from the rest of the drive; give such fixes quality 0"
         )
+
+
+def check_same_place(reference: Columns, fixes: Columns, where: str) -> None:
+    """A reference is of the same drive: near the fixes, in the median over those that it has a row for."""
+    row = np.searchsorted(reference["t"], fixes["t"]).clip(max=len(reference["t"]) - 1)
+    both = np.abs(reference["t"][row] - fixes["t"]) < SAME_S
+    if not both.any():
+        return
+    lat, lon = reference["lat_deg"][row[both]], reference["lon_deg"][row[both]]
+    east = (lon - fixes["lon_deg"][both] + 180) % 360 - 180
+    away = KM_PER_DEG * np.median(np.hypot(lat - fixes["lat_deg"][both], east * np.cos(np.radians(lat))))
+    if away > FARTHEST_REFERENCE_KM:
+        raise InputError(f"{where}: lies {away:.3g} km from the fixes in the median; give the reference of this drive")
 
 
 def _check_way(gnss: Columns, where: str) -> None:
@@ -179,6 +195,8 @@ def _check_way(gnss: Columns, where: str) -> None:
             moved * 3.6,
         ),
         "the velocities have the wrong sign; negate them": (lat, lon, -moved),
+        "lat_deg or vel_n has the wrong sign, north is positive; negate it": (-lat, lon, moved),
+        "lon_deg or vel_e has the wrong sign, east is positive; negate it": (lat, -lon, moved),
     }
     fits = {text: residual(*reading) for text, reading in readings.items()}
     best = min(fits, key=lambda text: fits[text])

@@ -18,6 +18,7 @@ from dlkf.data.plausibility import (
     check_clocks,
     check_gnss_units,
     check_imu_units,
+    check_same_place,
     check_turns,
 )
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY
@@ -99,7 +100,7 @@ def check_tables(tables: CheckedTables, limits: Limits = LIMITS) -> CheckedTable
     check_turns(imu, gnss, _where(name, "imu"))
     check_clocks(imu, read_fixes(gnss), _where(name, "imu"))
     if truth is not None:
-        _check_reference(truth, _where(name, "reference"))
+        _check_reference(truth, gnss, _where(name, "reference"))
     if tables.aids:
         fixes = read_fixes(gnss)
         velocity = np.stack([fixes[c] for c in VELOCITY], -1)
@@ -252,9 +253,12 @@ def _check_gnss(gnss: Columns, imu: Columns, where: str) -> Columns:
     return {name: values[keep] for name, values in gnss.items()}
 
 
-def _check_reference(reference: Columns, where: str) -> None:
+def _check_reference(reference: Columns, gnss: Columns, where: str) -> None:
     _check_time(reference["t"], where)
     _check_finite(reference, (*POSITION, *VELOCITY, *ATTITUDE), where, nan=True)
     known = reference["valid"] & np.isfinite(reference["lat_deg"]) & np.isfinite(reference["lon_deg"])
+    if not known.any():
+        return
     check_gnss_units({name: values[known] for name, values in reference.items()}, where)
+    check_same_place({name: values[known] for name, values in reference.items()}, read_fixes(gnss), where)
     check_attitude({name: values[known] for name, values in reference.items()}, where)

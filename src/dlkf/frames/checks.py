@@ -15,6 +15,7 @@ import yaml
 from dlkf.base.config import config_dir
 from dlkf.base.errors import InputError, did_you_mean
 
+LONGEST_SHOWN = 80  # letters of a wrong value in a line
 LONGEST_ARM_M = 30.0  # a lever arm beyond it is in another unit
 OTHER_NAMES = {  # what people call the contract's columns
     "t": ("time", "timestamp", "time_s", "seconds", "stamp", "date"),
@@ -59,7 +60,7 @@ def _check_seconds(name: str, t: np.ndarray) -> None:
     slowest = {"imu": 0.99, "speed": 50.0, "heading": 50.0, "baro": 50.0}.get(name, 99.0)
     step = float(np.median(np.abs(np.diff(t)))) if len(t) > 2 else 0.0
     for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
-        if slowest < step <= max(slowest, 10.0) * factor:
+        if slowest < step <= slowest * factor:
             raise InputError(f"{name}: a row every {step:g} s: t looks like {unit}; divide it by {factor:.0e}")
 
 
@@ -107,6 +108,11 @@ def _check_numbers(name: str, frame: pd.DataFrame, columns: Iterable[str]) -> No
             continue  # numbers and None
         else:
             wrong = next(k for k, v in enumerate(values) if not _is_number(v))
+            if column == "t" and _is_date(values.iloc[wrong]):
+                raise InputError(
+                    f"{name}: t has dates as text, must be seconds on one clock for all frames: "
+                    f'(pd.to_datetime({name}.t) - pd.Timestamp("2025-07-05")).dt.total_seconds()'
+                )
             remedy = f"row {wrong} has {values.iloc[wrong]!r}, must be a number, NaN where unknown"
         raise InputError(f"{name}: {column}: {remedy}")
 
@@ -119,6 +125,16 @@ def _is_number(value: Any) -> bool:
     return True
 
 
+def _is_date(value: Any) -> bool:
+    return isinstance(value, str) and len(value) > 7 and pd.notna(pd.to_datetime(value, errors="coerce"))
+
+
+def _shown(value: Any) -> str:
+    """A wrong value in one short line: arrays and frames have several."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN - 1]}…"
+
+
 def check_lever_arm(lever_arm: Any) -> tuple[float, float, float]:
     """Three finite numbers [m]."""
     try:
@@ -126,9 +142,11 @@ def check_lever_arm(lever_arm: Any) -> tuple[float, float, float]:
     except (TypeError, ValueError):
         arm = np.empty(0)
     if arm.shape != (3,) or not np.isfinite(arm).all():
-        raise InputError(f"lever_arm is {lever_arm!r}, must be three numbers: IMU → antenna, Forward-Right-Down [m]")
+        raise InputError(
+            f"lever_arm is {_shown(lever_arm)}, must be three numbers: IMU → antenna, Forward-Right-Down [m]"
+        )
     if np.abs(arm).max() > LONGEST_ARM_M:
-        raise InputError(f"lever_arm is {lever_arm!r}: an antenna {np.abs(arm).max():g} m away; metres are meant")
+        raise InputError(f"lever_arm is {_shown(lever_arm)}: an antenna {np.abs(arm).max():g} m away; metres are meant")
     return (float(arm[0]), float(arm[1]), float(arm[2]))
 
 
@@ -136,7 +154,7 @@ def check_above_zero(**values: Any) -> None:
     """InputError for one that is no finite number above 0."""
     for name, value in values.items():
         if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value) or value <= 0:
-            raise InputError(f"{name} is {value!r}, must be a number above 0")
+            raise InputError(f"{name} is {_shown(value)}, must be a number above 0")
 
 
 def check_options(function: str, options: Iterable[str], of: Callable[..., Any], apart: Sequence[str]) -> None:
@@ -150,7 +168,7 @@ def check_options(function: str, options: Iterable[str], of: Callable[..., Any],
 def check_switch(name: str, value: Any) -> None:
     """InputError for what is neither true nor false."""
     if not isinstance(value, (bool, np.bool_)):
-        raise InputError(f"{name} is {value!r}, must be True or False")
+        raise InputError(f"{name} is {_shown(value)}, must be True or False")
 
 
 def check_model(model: Any) -> str:
@@ -166,7 +184,9 @@ def check_models(models: Any) -> list[str]:
     """One or several filters' names."""
     names = [models] if isinstance(models, str) else models
     if not isinstance(names, (list, tuple)) or not names:
-        raise InputError(f"models is {models!r}, must be a name or a list of names such as ['mbkf21_nhc', 'plus']")
+        raise InputError(
+            f"models is {_shown(models)}, must be a name or a list of names such as ['mbkf21_nhc', 'plus']"
+        )
     return [check_model(name) for name in names]
 
 
@@ -182,7 +202,7 @@ def check_imu_type(imu_type: Any) -> None:
 def check_whole(name: str, value: Any, least: int) -> int:
     """A whole number from ``least`` on."""
     if isinstance(value, bool) or not isinstance(value, Real) or value != math.floor(value) or value < least:
-        raise InputError(f"{name} is {value!r}, must be a whole number from {least} on")
+        raise InputError(f"{name} is {_shown(value)}, must be a whole number from {least} on")
     return int(float(value))
 
 
@@ -190,7 +210,7 @@ def check_preset(group: str, name: Any, argument: str = "") -> None:
     """InputError for a name that is no preset of ``conf/<group>``, with the closest."""
     known = sorted(f.stem for f in (config_dir() / group).glob("*.yaml") if not f.stem.startswith("_"))
     if not isinstance(name, str):
-        raise InputError(f"{argument or group} is {name!r}, must be the name of a preset: {', '.join(known)}")
+        raise InputError(f"{argument or group} is {_shown(name)}, must be the name of a preset: {', '.join(known)}")
     if name not in known:
         near = did_you_mean(name, known)
         raise InputError(f"unknown {group} preset {name!r}{near or ';'} known are {', '.join(known)}")

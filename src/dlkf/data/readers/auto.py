@@ -24,6 +24,7 @@ LAYOUTS = {
 }
 BESIDE = {("sensor_logger", "baro"): "Barometer.csv", ("phyphox", "baro"): "Pressure.csv"}
 TABLES = (".csv", ".tsv", ".txt", ".dat")
+DAMAGED = ("not a whole", "cannot be opened")  # how a line on a file begins that may hold the fixes
 RECEIVERS = (".ubx", ".nmea", ".pos", ".bag", ".mcap", ".asc", ".mat", ".bin", ".ulg")
 MOST_HELD = 6  # files that a refusal describes
 
@@ -105,6 +106,8 @@ class AutoReader:
         if (specs["gnss"].get("time") or {}).get("offset_s") is None and specs["gnss"].get("file"):
             specs["gnss"]["time"]["offset_s"] = "auto"
         if not specs["gnss"].get("file") and (foreign := _foreign(within, only)):
+            if foreign.held.startswith(DAMAGED):
+                raise InputError(f"{foreign.path}: {foreign.held}; or take it away where this is a log at rest")
             what = "it is empty" if foreign.held == "empty" else foreign.held
             raise InputError(
                 f"{folder}: no fixes found in {foreign.path.name} ({what}); name its columns (reader=csv "
@@ -277,6 +280,7 @@ def _foreign(within: Iterable[Contents], only: Path | None) -> Contents | None:
         one
         for one in unread
         if one.path.suffix.lower() in RECEIVERS
+        or one.held.startswith(DAMAGED)
         or (one.path.suffix.lower() in TABLES and (sniffed(one.path) == "csv" or one.held == "empty"))
     )
     return next(logs, None)

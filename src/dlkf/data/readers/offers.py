@@ -58,9 +58,16 @@ class Contents:
 
 def contents(path: Path) -> Contents:
     """What a file holds."""
+    try:
+        with path.open("rb") as file:
+            begins = file.read(4)
+    except OSError as error:
+        return Contents(path, held=f"cannot be opened: {(error.strerror or str(error)).lower()}")
+    if begins == b"PK\3\4":
+        return Contents(path, held="a .zip; give it as source, or unpack it")
     name = sniffed(path)
     if name is None:
-        return Contents(path, held="empty" if path.stat().st_size == 0 else "of no format that is known")
+        return Contents(path, held="of no format that is known" if begins else "empty")
     if name == "matlab":
         return _of_matlab(path)
     if name in PRESETS:
