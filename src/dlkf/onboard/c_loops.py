@@ -6,7 +6,7 @@ Each writes its lines and gives the tensor, or the list of them, that the operat
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -122,6 +122,10 @@ def _product(t: Tensors, node: Node, A: Any, B: Any, begin: Any = None, beta: fl
     if small and n >= WIDE and m > 1 and b.meta.stride(-1) != 1:
         b = t.dense(b)
     lead = ["b"] if a.meta.ndim == 3 else []
+    if begin is None and alpha == 1 and n >= WIDE and (rows := _sparse_rows(t, a)):
+        for line in _rows(rows, out, b, len(lead), n):
+            t.block.write(line, out, b)
+        return out
     kind, scale = C_TYPES[value.dtype], "" if alpha == 1 else f"{literal(alpha, value.dtype)} * "
     at_a, at_b, at = a.at([*lead, "i", "k"]), b.at([*lead, "k", "j"]), out.at([*lead, "i", "j"])
     start, used = "0", [a, b]
@@ -146,6 +150,27 @@ def _product(t: Tensors, node: Node, A: Any, B: Any, begin: Any = None, beta: fl
         )
     t.block.write(_loops(lead, a.meta.shape[:1]) + _loops(["i"], [m]) + body, out, *used)
     return out
+
+
+def _sparse_rows(t: Tensors, a: View) -> list[list[tuple[int, float]]]:
+    """Column and value of what is not zero in each row of a constant matrix with at most two of them a row."""
+    values = next((x for buffer, x in t.block.constants if buffer is a.buffer), None)
+    if values is None or a.meta.numel() != a.meta.shape[-2] * a.meta.shape[-1]:
+        return []
+    A = torch.as_strided(torch.from_numpy(values), a.meta.shape, a.meta.stride(), a.meta.storage_offset())
+    rows = [[(k, float(row[k])) for k in row.nonzero()[:, 0].tolist()] for row in A.reshape(A.shape[-2:])]
+    return rows if sum(map(len, rows)) <= 2 * len(rows) else []
+
+
+def _rows(rows: list[list[tuple[int, float]]], out: View, b: View, lead: int, n: int) -> Iterator[str]:
+    """Rows of A B as sums of few rows of B."""
+    for i, row in enumerate(rows):
+        terms = []
+        for k, w in row:
+            at = b.at([*["0"] * lead, str(k), "j"])
+            terms.append(at if w == 1 else f"-{at}" if w == -1 else f"{literal(w, out.meta.dtype)} * {at}")
+        into = out.at([*["0"] * lead, str(i), "j"])
+        yield f"for (int j = 0; j < {n}; j++) {into} = {' + '.join(terms) or '0'};"
 
 
 def _added_product(t: Tensors, node: Node, c: Any, a: Any, b: Any, beta: float = 1, alpha: float = 1) -> View:

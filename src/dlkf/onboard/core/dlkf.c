@@ -132,13 +132,15 @@ static void run(dlkf *d, int64_t number, int revised) {
   held->doubt = d->doubt;
   held->kind = d->kind;
   copy_state(&held->state, &d->now, d->kind);
-  if (d->kind != DLKF_FILTER && !aligned(d, number)) return;
-  double *memory = d->now.filter;
+  double *memory = d->now.filter, *begin = held->state.filter;
+  if (d->kind != DLKF_FILTER) {
+    if (!aligned(d, number)) return;
+    begin = d->work + DLKF_WORK - DLKF_MEMORY;
+    memcpy(begin, memory, DLKF_MEMORY * sizeof *memory);
+  }
   dlkf_read_fix(d, number + 1, memory + DLKF_AT_ORIGIN, memory + DLKF_AT_AXES, fix);
   dlkf_read_aids(d, number + 1, fix + 19);
-  double *next = d->work + DLKF_WORK - DLKF_MEMORY;
-  dlkf_turn(memory, epoch->imu, fix, next, d->outputs, d->work);
-  memcpy(memory, next, DLKF_MEMORY * sizeof *memory);
+  dlkf_turn(begin, epoch->imu, fix, memory, d->outputs, d->work);
   double sum = 0;
   for (int k = 0; k < 15; k++) sum += d->outputs[DLKF_OUTPUTS_POSTERIOR + k];
   const int finite = isfinite(sum);
@@ -155,8 +157,9 @@ static void run(dlkf *d, int64_t number, int revised) {
   memcpy(d->last, row, sizeof d->last);
   d->latest = 1;
   if (row[DLKF_FROM_ORIGIN_M] > DLKF_ANCHOR_M) {
-    memcpy(next, memory, DLKF_MEMORY * sizeof *memory);
-    dlkf_anchor(next, memory, d->work);
+    begin = d->work + DLKF_WORK - DLKF_MEMORY;
+    memcpy(begin, memory, DLKF_MEMORY * sizeof *memory);
+    dlkf_anchor(begin, memory, d->work);
   }
 }
 
