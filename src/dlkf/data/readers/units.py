@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
-from scipy.spatial.transform import Rotation
 
 from dlkf.base.errors import InputError
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
@@ -58,6 +57,8 @@ def rotation(axes: str | Sequence[str] | Mapping[str, float], where: str) -> np.
         if set(axes) != {"roll", "pitch", "yaw"}:
             raise InputError(f"{where}: has {', '.join(map(str, axes))}; must have roll, pitch and yaw [deg]")
         turns = [_number(axes[name], f"{where}.{name}") for name in ("yaw", "pitch", "roll")]
+        from scipy.spatial.transform import Rotation  # every start of navigate would load it
+
         return Rotation.from_euler("ZYX", turns, degrees=True).as_matrix()
     matrix = np.zeros((3, 3))
     if isinstance(axes, str) and len(axes) == 3 and all(c in LETTERS for c in axes.lower()):
