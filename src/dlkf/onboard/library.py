@@ -16,8 +16,9 @@ from torch import Tensor
 from dlkf.base.errors import InputError
 from dlkf.onboard.functions import OUTPUTS
 
-# NaN and infinity keep their meaning, sums may be taken in another order; of the filter, not of the core round it
-FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math")
+# NaN and infinity keep their meaning; of the filter, not of the core round it. Not -fassociative-math: with it gcc 12
+# makes a sum over k of a product that skips zeros, and a filter that was right without it ends in NaN
+FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros")
 CORE_FLAGS = ("-O2",)
 FILTER = ("step.c", "weights.c", "heading.c")
 CORE = ("dlkf.c", "samples.c", "align.c", "search.c", "aids.c", "limits.c")
