@@ -17,6 +17,7 @@ import importlib
 import os
 import shutil
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -38,7 +39,10 @@ SIZE = ("dataset.hours=0.05", "dataset.drive_minutes=1.5", "dataset.imu_rate_hz=
 
 
 SHAPES_CHECKED = {"data", "filters", "navigation", "running", "simulation"}  # rooms of pure functions and of the loop
+SHAPES_CHECKED_S = 0.5  # of a test: a filter run for thousands of epochs calls the same functions again and again
+WITH_STORE = {"evaluate", "train", "tune"}  # commands that make an MLflow store where there is none, in seconds
 FIRST_CASE = pytest.StashKey[bool]()
+CLOCK = pytest.StashKey[threading.Timer]()
 SHIPPED_FLAGS = library.FLAGS  # of the compiler; rooms that only use a compiled filter need not wait for -O3
 LONG_ROOMS = ("training", "tuning", "tracking", "pipelines", "onboard", "docs")  # begin first, so that none ends last
 
@@ -73,17 +77,21 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Shapes and types are checked where functions are tested one by one, in the first case of every test: the others
-    call the same functions with other numbers, and studies and commands by the thousand, in half of the time."""
+    """Shapes and types are checked where functions are tested one by one, in the first half second of the first case
+    of every test: the others call the same functions with other numbers, and studies and commands by the thousand."""
     checked = room(item) in SHAPES_CHECKED and item.stash[FIRST_CASE]
     jaxtyping.config.update("jaxtyping_disable", not checked)
+    if checked:
+        item.stash[CLOCK] = threading.Timer(SHAPES_CHECKED_S, jaxtyping.config.update, ("jaxtyping_disable", True))
+        item.stash[CLOCK].start()
     compiled_filter.FLAGS = library.FLAGS = SHIPPED_FLAGS if room(item) == "onboard" else ("-O1", *SHIPPED_FLAGS[1:])
 
 
-@pytest.fixture
-def without_shape_checks(monkeypatch):
-    """For a test that runs a filter for thousands of epochs."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+def pytest_runtest_teardown(item: pytest.Item) -> None:
+    """The clock of the shapes stops with its test."""
+    if clock := item.stash.get(CLOCK, None):
+        clock.cancel()
+        clock.join()
 
 
 @pytest.fixture(autouse=True)
@@ -156,12 +164,16 @@ def simulated(once: Once) -> Path:
 
 
 @pytest.fixture
-def call(tmp_path, monkeypatch, capfd):
-    """``call("evaluate", "model=ins", …)`` runs the command's main in an empty folder."""
+def call(request, tmp_path, monkeypatch, capfd):
+    """``call("evaluate", "model=ins", …)`` runs the command's main in an empty folder; where it will need an MLflow
+    store (a test that is ``whole``), that is there."""
     monkeypatch.chdir(tmp_path)
+    whole = request.node.get_closest_marker("whole") is not None
 
     def run(command: str, *arguments: object) -> Ended:
         main = importlib.import_module(f"dlkf.{command}").main
+        if whole and command in WITH_STORE and not Path("mlflow.db").exists():
+            shutil.copy(request.getfixturevalue("template"), "mlflow.db")
         monkeypatch.setattr(sys, "argv", [f"dlkf.{command}", *map(str, arguments)])
         capfd.readouterr()
         code = 0

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -90,10 +91,30 @@ def mine(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def composed(primary: str, overrides: list[str]) -> DictConfig:
+@cache
+def composed(primary: str, overrides: tuple[str, ...]) -> DictConfig:
     """A command's configuration, as the command itself would compose it."""
     with initialize_config_dir(config_dir=str(config_dir()), version_base="1.3"):
-        return compose(primary, overrides)
+        return compose(primary, list(overrides))
+
+
+def compose_line(primary: str, overrides: list[str]) -> None:
+    """Fails where a command line does not compose. Presets are composed once for all lines that choose the same; a
+    value's key must be in what they give, and its words in Hydra's grammar."""
+    presets, values = [], []
+    for override in OverridesParser.create().parse_overrides(overrides):
+        key = override.key_or_group
+        preset = "@" in override.input_line or key in ("experiment", "profile") or (config_dir() / key).is_dir()
+        if preset or override.is_delete() or key.startswith("hydra"):
+            presets.append(override.input_line)
+        elif not override.is_add() and not override.is_force_add():
+            values.append(key)
+    config = composed(primary, tuple(presets))
+    for key in values:
+        parent, _, name = key.rpartition(".")
+        node = OmegaConf.select(config, parent) if parent else config
+        keys_there = list(node) if OmegaConf.is_dict(node) else [name]  # a value that is missing has a key
+        assert name in keys_there, f"no key {key}"
 
 
 def as_hydra_takes_it(command: str, word: str) -> str:
@@ -155,7 +176,7 @@ def check(words: tuple[str, ...], mine: Path) -> None:
         overrides = [as_hydra_takes_it(command, w) for w in rest if "=" in w]  # compare takes bare folders
         if sweep:  # a point of it
             overrides = [re.sub(r"=(\[[^\]]*\]|[^\[,]+),.*$", r"=\1", o) for o in overrides]
-        composed(command, overrides)
+        compose_line(command, overrides)
     elif given[1:3] == ["-m", "pytest"]:
         assert all((ROOT / w).exists() for w in given[3:]), "no such tests"
     else:
@@ -174,7 +195,7 @@ def keys() -> frozenset[str]:
     found: set[str] = set()
     for primary in PRIMARIES:
         for variant in VARIANTS.get(primary, [[]]):
-            found |= dotted(OmegaConf.to_container(composed(primary, variant), resolve=False))
+            found |= dotted(OmegaConf.to_container(composed(primary, tuple(variant)), resolve=False))
     return frozenset(found)
 
 

@@ -15,7 +15,7 @@ from tests.cars import IMU, car_batch
 from tests.evaluation.scoring import score
 
 
-def test_a_row_for_each_filter_and_sensor(without_shape_checks):
+def test_a_row_for_each_filter_and_sensor():
     batch = car_batch(2, 30)
     forward = (batch.truth.C_nb[..., 0] * batch.truth.v_n).sum(-1)
     zero = torch.zeros_like(forward)

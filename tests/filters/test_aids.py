@@ -114,7 +114,7 @@ def aided(tmp_path_factory):
     return whole_drives(drives, align_each(drives))
 
 
-def test_scale_delay_and_place_of_a_wheel_are_found(aided, without_shape_checks):
+def test_scale_delay_and_place_of_a_wheel_are_found(aided):
     model = with_aids(build_filter("mbkf21_car", IMU), [STANDARD["speed"]])
     said = dict(zip(aid_columns(model), integrate(aided, model).aids[0].T))
     assert said["speed_used"][2:-2].all()
@@ -127,7 +127,7 @@ def test_scale_delay_and_place_of_a_wheel_are_found(aided, without_shape_checks)
         assert abs(said[name][-1] - true) < 4 * said[f"std_{name}"][-1]
 
 
-def test_all_three_agree_with_the_car(aided, without_shape_checks):
+def test_all_three_agree_with_the_car(aided):
     model = with_aids(build_filter("mbkf21_car", IMU), STANDARD.values())
     assert [table.name for table in tables_of(model)] == list(STANDARD)
     said = dict(zip(aid_columns(model), integrate(aided, model).aids[0].T))
@@ -137,7 +137,7 @@ def test_all_three_agree_with_the_car(aided, without_shape_checks):
     assert abs(said["baro_offset_m"][-1] - 30) < 0.5 and abs(said["heading_offset"][-1]) < 0.005
 
 
-def test_a_filter_with_sensors_that_say_nothing_is_the_filter_without(cars, without_shape_checks):
+def test_a_filter_with_sensors_that_say_nothing_is_the_filter_without(cars):
     plain = build_filter("mbkf21_car", IMU)
     model = with_aids(plain, STANDARD.values())
     none = {name: torch.zeros(*cars.size[:2], len(ROW)).double() for name in STANDARD}

@@ -210,7 +210,6 @@ def driven(base, start: NavState, clean: torch.Tensor):
     )
 
 
-@pytest.mark.usefixtures("without_shape_checks")
 @pytest.mark.parametrize("name,states", [("mbkf21_car", 26), ("mbkf33_car", 38)])
 @pytest.mark.whole
 def test_ten_minutes_in_float32_are_those_in_float64(name, states):

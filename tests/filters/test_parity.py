@@ -9,7 +9,6 @@ from pipelines.studies import parity
 STEP = 1.0  # s: theirs; at its default of 0.1 s the outages end nearer to ours, and take ten times as long
 
 
-pytestmark = pytest.mark.usefixtures("without_shape_checks")
 
 
 @pytest.fixture(scope="module")

@@ -79,14 +79,14 @@ def without(drives):
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_costs_no_more_than_the_wheel(drives, without, fault, without_shape_checks):
+def test_a_fault_costs_no_more_than_the_wheel(drives, without, fault):
     model = with_aids(build_filter("mbkf21_car", IMU), [STANDARD["speed"]])
     with torch.no_grad():
         error, _ = _end(replace(drives, aids=_rows(drives, FAULTS[fault])), model)
     assert error < 1.1 * without + 0.05, f"{float(error):.2f} m, without a wheel {float(without):.2f} m"
 
 
-def test_a_wheel_halves_the_error(drives, without, without_shape_checks):
+def test_a_wheel_halves_the_error(drives, without):
     model = with_aids(build_filter("mbkf21_car", IMU), [STANDARD["speed"]])
     with torch.no_grad():
         error, solution = _end(replace(drives, aids=_rows(drives)), model)
@@ -95,7 +95,7 @@ def test_a_wheel_halves_the_error(drives, without, without_shape_checks):
     assert error < 0.5 * without and off[BEGIN] < 0.006 and off[-1] < 0.01, off[[BEGIN, -1]]
 
 
-def test_an_imu_that_errs_beyond_its_covariance_keeps_its_wheel(drives, without, without_shape_checks):
+def test_an_imu_that_errs_beyond_its_covariance_keeps_its_wheel(drives, without):
     imu = drives.imu.clone()
     imu[:, FAULT:, :, 0] += 0.15 * torch.linspace(0, 1, T - FAULT)[:, None]  # m/s²: of a tilt that no state covers
     model = with_aids(build_filter("mbkf21_car", IMU), [STANDARD["speed"]])
@@ -105,7 +105,7 @@ def test_an_imu_that_errs_beyond_its_covariance_keeps_its_wheel(drives, without,
     assert used.mean() > 0.98 and error < 0.5 * without
 
 
-def test_a_wheel_without_sign_is_read_in_reverse(drives, without, without_shape_checks):
+def test_a_wheel_without_sign_is_read_in_reverse(drives, without):
     model = with_aids(build_filter("mbkf21_car", IMU), [STANDARD["speed"]])
     reverse = _backwards(drives)
     with torch.no_grad():
@@ -125,7 +125,7 @@ def _coarse(batch, count):
     return replace(batch, imu=imu, truth=NavState(*(x[:, every] for x in batch.truth)), **rows)
 
 
-def test_an_hour_without_gnss_keeps_state_and_covariance_sane(without_shape_checks):
+def test_an_hour_without_gnss_keeps_state_and_covariance_sane():
     """A tunnel from the first minute on, IMU at 10 Hz and updates every 20 s: nothing grows that a wheel knows."""
     batch = _coarse(matched_batch(MatchedDrives(drives=2, minutes=60, rate_hz=10, seed=3), IMU)[0], 20)
     batch = replace(batch, available=(torch.arange(batch.size[1]) < 3).expand(2, -1))

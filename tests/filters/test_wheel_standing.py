@@ -42,7 +42,7 @@ def standing():
 
 
 @pytest.mark.parametrize("name", ["mbkf21_car", "mbkf33_car"])
-def test_a_car_whose_wheel_stands_does_not_slide_sideways(standing, name, without_shape_checks):
+def test_a_car_whose_wheel_stands_does_not_slide_sideways(standing, name):
     model = with_aids(build_filter(name, IMU), [STANDARD["speed"]])
     with torch.no_grad():
         solution = integrate(standing, model)

@@ -38,7 +38,7 @@ def at_rest(batch: int = 1) -> NavState:
     return NavState(zero, zero, torch.eye(3, dtype=torch.float64).expand(batch, 3, 3))
 
 
-def test_sample_by_sample_parity(without_shape_checks):
+def test_sample_by_sample_parity():
     """10 s of rough motion. The oracle's own step error (Heun, 0.5 ms) bounds the agreement."""
     frame, imu = frame_at(batch=3), lively_imu(3, 10 * M)
     expected = mechanise(start(3), imu, DT, frame)

@@ -58,7 +58,7 @@ def _apart(a, b) -> float:
 
 
 @pytest.mark.parametrize("name", ["mbkf21_car", "plus"])
-def test_a_stream_is_a_batch_run(tables, name, without_shape_checks):
+def test_a_stream_is_a_batch_run(tables, name):
     model = _filters()[name]
     drive = drive_from_tables(tables, "", **GRID, dtype=torch.float64)
     batch = next(navigate_drives([drive], model, align=CAUSAL))
@@ -71,7 +71,7 @@ def test_a_stream_is_a_batch_run(tables, name, without_shape_checks):
 
 @pytest.mark.skipif(compiler() is None, reason="needs a C compiler")
 @pytest.mark.parametrize("step", [None, 1 / 3.6], ids=["exact", "whole km/h"])
-def test_a_compiled_filter_is_a_batch_run(tables, step, without_shape_checks):
+def test_a_compiled_filter_is_a_batch_run(tables, step):
     model = _filters()["mbkf21_car"]
     if step is not None:
         speed = tables.aids["speed"]

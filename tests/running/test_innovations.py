@@ -86,7 +86,6 @@ def test_the_line_names_the_remedy() -> None:
     assert "\n" not in line
 
 
-@pytest.mark.usefixtures("without_shape_checks")
 @pytest.mark.parametrize(
     ("name", "factor", "warned"),
     [
@@ -116,7 +115,6 @@ def test_filters_on_simulated_drives(simulated, name: str, factor: float, warned
 NOT_STATES = {f"imu.{s}.{k}": 0.0 for s in ("accel", "gyro") for k in ("scale_factor", "misalignment")}
 
 
-@pytest.mark.usefixtures("without_shape_checks")
 @pytest.mark.parametrize(
     ("name", "errors", "fits"),
     [("mbkf15", "all", False), ("mbkf33", "all", True), ("mbkf15", "those of its states", True)],

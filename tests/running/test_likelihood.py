@@ -25,8 +25,6 @@ from dlkf.running.likelihood import Evidence, FixOffset, NoiseFit, find_noise, g
 from dlkf.running.start import align
 from tests.cars import IMU, car_batch, write_segments
 
-pytestmark = pytest.mark.usefixtures("without_shape_checks")  # searches run the filters some hundred times
-
 
 @pytest.fixture(scope="module")
 def long_town(tmp_path_factory) -> Path:
