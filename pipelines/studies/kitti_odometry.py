@@ -4,7 +4,7 @@
 A drive starts from the truth and has no fix afterwards: IMU and a car's constraints alone, as in AI-IMU (Brossard et
 al. 2020: 1.10 %). An error is that of a relative pose over 100, 200, … 800 m, from a first pose every second, as a
 share of the length (KITTI's devkit, ``evaluate_odometry.cpp``). The constants of a filter are those that are best on
-the *other* recordings, of the same Sobol points for all. What is different from AI-IMU is in docs/results/published.md.
+the *other* recordings, of the same grid for all. What is different from AI-IMU is in docs/results/published.md.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.stats import qmc
 
 from dlkf.base.config import config_dir
 from dlkf.base.documents import read_yaml
@@ -38,9 +38,9 @@ SEQUENCES = {  # KITTI's numbers of the recordings that are odometry sequences; 
 }  # fmt: skip
 WITH_GAPS = ("00", "05")  # in the IMU, so that each is several drives
 START = StartLaw(position_m=0.01, velocity_mps=0.05, roll_pitch_deg=0.05, yaw_deg=0.1)  # settings of a filter
-FACTORS = {  # of the Tuning that is searched: from, to
-    "lateral_std": (0.02, 1.0), "vertical_std": (0.02, 1.0), "accel_noise": (0.1, 10.0), "gyro_noise": (0.1, 10.0),
-    "accel_walk": (0.03, 10.0), "gyro_walk": (0.03, 10.0),
+FACTORS = {  # of the Tuning that is searched: a grid
+    "lateral_std": (0.05, 0.1, 0.15, 0.2, 0.3), "vertical_std": (0.1, 0.15, 0.2, 0.3, 0.45),
+    "accel_noise": (1.0, 3.0), "gyro_noise": (1.0, 3.0),
 }  # fmt: skip
 
 
@@ -124,11 +124,9 @@ def joined(errors: Sequence[SegmentErrors]) -> SegmentErrors:
     return SegmentErrors(*(np.concatenate(x) for x in zip(*errors)))
 
 
-def candidates(count: int) -> list[Tuning]:
-    """The default factors, and Sobol points in the logarithms of :data:`FACTORS`."""
-    points = qmc.Sobol(len(FACTORS), seed=0).random_base2((count - 1).bit_length())[: count - 1]
-    low, high = np.log(np.array(list(FACTORS.values()))).T
-    return [Tuning(), *(Tuning(**dict(zip(FACTORS, np.exp(low + x * (high - low)).tolist()))) for x in points)]
+def candidates() -> list[Tuning]:
+    """The default factors, and the grid of :data:`FACTORS`."""
+    return [Tuning(), *(Tuning(**dict(zip(FACTORS, point))) for point in product(*FACTORS.values()))]
 
 
 def left_out_best(errors: Sequence[Sequence[SegmentErrors]], sequence: Sequence[str]) -> dict[str, int]:
@@ -155,6 +153,11 @@ def by_sequence(errors: Sequence[SegmentErrors], sequence: Sequence[str]) -> dic
     return {s: joined([e for e, of in zip(errors, sequence) if of == s]) for s in sorted(set(sequence))}
 
 
+def described(tuning: Tuning) -> str:
+    """The searched factors, in the order of :data:`FACTORS`."""
+    return "/".join(f"{getattr(tuning, name):g}" for name in FACTORS)
+
+
 def preset(name: str) -> ImuSpec:
     """An IMU of conf/imu."""
     return imu_spec(read_yaml(config_dir() / "imu" / f"{name}.yaml"))
@@ -166,7 +169,6 @@ def main() -> None:
     parser.add_argument("--real", type=Path, required=True, help="folder of the real drives, with kitti/ in it")
     parser.add_argument("--imu", default="tactical_oxts", help="settings of the filters with constants")
     parser.add_argument("--models", nargs="+", default=["mbkf21_nhc", "mbkf21_car"], help="with constants")
-    parser.add_argument("--points", type=int, default=64, help="settings of the constants that are compared")
     options = parser.parse_args()
     folder, spec = options.real / "kitti", preset(options.imu)
     names = {row.name: row.group.removeprefix("kitti-2011-") for row in read_drives(folder)}
@@ -182,7 +184,7 @@ def main() -> None:
     for model in ("ins", "plus"):
         say(model, by_sequence(errors_of(batch, resolve_model(model, spec)), sequence))
     for model in options.models:
-        tunings = candidates(options.points)
+        tunings = candidates()
         errors = [errors_of(batch, resolve_model(model, spec, tuning=tuning)) for tuning in tunings]
         say(f"{model}, default constants", by_sequence(errors[0], sequence))
         best = left_out_best(errors, sequence)
@@ -190,8 +192,8 @@ def main() -> None:
         say(f"{model}, constants of the other sequences", by_sequence(held_out, sequence))
         at = min(range(len(tunings)), key=lambda c: float(np.mean(joined(errors[c]).translation)))
         say(f"{model}, constants of these sequences (a bound)", by_sequence(errors[at], sequence))
-        said = {name: f"{getattr(tunings[at], name):.2g}" for name in FACTORS}
-        print(f"  best of {len(tunings)} on all: {said}; of the others: {sorted(set(best.values()))}", flush=True)
+        print(f"  best of {len(tunings)} on all: {described(tunings[at])}; on the other sequences, for each:")
+        print("  " + "; ".join(f"{s} {described(tunings[k])}" for s, k in sorted(best.items())), flush=True)
 
 
 if __name__ == "__main__":
