@@ -9,6 +9,7 @@ from typing import ClassVar
 import pytest
 import torch
 
+from dlkf.data.drive import EPOCHWISE, Batch
 from dlkf.filters.build import build_filter
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import integrate
@@ -89,6 +90,39 @@ def test_the_first_stop_is_found_however_the_engine_idles(idling):
     assert not taken[moving].any()
     # a standing car's position is worth what it was when it stopped, 20 s into the outage
     assert drift(batch, "mbkf15_nhc") < 0.2 * drift(batch, "mbkf15")
+
+
+def in_fifths(batch: Batch) -> Batch:
+    """The same samples and fixes in update intervals of a fifth; what lies between the boundaries is not the truth."""
+    B, T, count = batch.size
+    rows = {name: getattr(batch, name) for name in EPOCHWISE}
+    truth = NavState(*(x.repeat_interleave(5, 1) for x in rows.pop("truth")))
+    rows = {name: x.repeat_interleave(5, 1) for name, x in rows.items()}
+    last = torch.arange(5 * T) % 5 == 4
+    rows["imu"], rows["available"] = batch.imu.reshape(B, 5 * T, count // 5, 6), rows["available"] & last
+    return replace(batch, truth=truth, **rows)
+
+
+@pytest.mark.parametrize("speeds", [(0.0,), (2.0, 6.7)])
+def test_shorter_update_intervals_find_the_same_standstills(speeds):
+    """A fifth of a second is too short for a spread or for an acceleration: seconds are judged. Cars that stop and
+    cars that keep their speed, in an outage."""
+    stop = shaken((0.02, 2e-4), (0.06, 8e-4))
+    batch = stop if speeds == (0.0,) else outage(steady(speeds, 100), 60, 100)
+    speed = batch.truth.v_n.norm(dim=-1)
+    before = torch.cat((speed[:, :1], speed[:, :-1]), 1)
+    taken = found(in_fifths(batch)).unflatten(1, (-1, 5))
+    if batch is stop:
+        assert taken[(speed < 0.01) & (before < 0.01)].float().mean() > 0.9
+    assert not taken[(speed > 1.0) & (before > 1.0)].any()
+
+
+def test_constraints_say_as_much_in_a_second_of_shorter_update_intervals():
+    batch = outage(slipping(4, 90, (0.0, 0.0, 0.0, 0.0, 0.0)), 60, 90)
+    kalman = build_filter("mbkf15_nhc", IMU)
+    whole, fifths = (integrate(x, kalman).std[:, -1, 3:9] for x in (batch, in_fifths(batch)))
+    torch.testing.assert_close(fifths, whole, rtol=0.06, atol=0)
+    assert (integrate(batch, build_filter("mbkf15", IMU)).std[:, -1, 3:5] > 2 * whole[:, :2]).any()
 
 
 def test_one_sample_an_epoch_has_no_spread():

@@ -9,6 +9,9 @@ the IMU sits, k the sideslip per lateral acceleration and speed (single-track mo
 car pitch back per specific force f_x forward (pitch gradient; Gillespie 1992). Plain, all five are zero; with structure
 they are further states of the filter. A standstill (:mod:`dlkf.filters.stationarity`) measures v = 0
 (zero-velocity update) and ω_b = Earth rate (zero-angular-rate update).
+
+The 1σ of a row is that of one a second: of shorter update intervals each row has a larger one, so that a second says
+the same.
 """
 
 from __future__ import annotations
@@ -69,7 +72,8 @@ class CarConstraints:
         resting, liveliness = self.resting(epoch, zr[:, 3:], prediction, memory)
         resting = resting.unsqueeze(-1)
         used = torch.cat(((moving.unsqueeze(-1) & ~resting).expand(-1, 2), resting.expand(-1, 6)), -1)
-        variance = memory.std.square().expand(len(zn), -1)
+        per_second = max(1.0, 1.0 / (epoch.dt * epoch.imu.shape[1]))
+        variance = (memory.std.square() * per_second).expand(len(zn), -1)
         if epoch.advice is not None and epoch.advice.across is not None:
             variance = torch.cat((variance[:, :2] * epoch.advice.across.square(), variance[:, 2:]), -1)
         z = torch.cat((zn, zr), -1) * used

@@ -30,6 +30,7 @@ STILL_ACCEL, STILL_RATE = 0.2, 0.01  # m/s², rad/s: with less, beyond the filte
 PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 3.0  # m/s, 1σ: a standstill must not contradict the filter
 # m/s: where the samples do not separate the two, a standstill needs a smaller 1σ of the speed
 SILENT_STD = 0.5
+LEAST_S = 1.0  # of a standstill and of a level: shorter update intervals are taken together
 
 
 class VibrationLevel(NamedTuple):
@@ -37,12 +38,14 @@ class VibrationLevel(NamedTuple):
 
     standing: Tensor  # (B,) least level of a stationary second
     moving: Tensor  # (B,) likewise
+    variance: Tensor  # (B, 2) of specific force and rate over the last second; 0 before the first sample
+    still_s: Tensor  # (B,) s without acceleration or turn
 
     @classmethod
     def unheard(cls, like: Tensor, batch_size: int) -> VibrationLevel:
         """Before the first sample."""
         nothing = like.new_full((batch_size,), math.inf)
-        return cls(nothing, nothing)
+        return cls(nothing, nothing, like.new_zeros(batch_size, 2), like.new_zeros(batch_size))
 
     def limit(self, prior: Float[Tensor, " 1"]) -> Float[Tensor, " B"]:
         """Half way, as logarithms, between stationary and moving; near zero where the two are alike."""
@@ -58,9 +61,9 @@ class VibrationLevel(NamedTuple):
     def heard(self, now: Tensor, standing: Tensor, moving: Tensor, span: float) -> VibrationLevel:
         """After a window of ``span`` seconds in which the car was surely stationary, or moving, or neither."""
         fade = math.exp(span / MEMORY_S)
-        return VibrationLevel(
-            torch.where(standing, torch.minimum(fade * self.standing, now), self.standing),
-            torch.where(moving, torch.minimum(fade * self.moving, now), self.moving),
+        return self._replace(
+            standing=torch.where(standing, torch.minimum(fade * self.standing, now), self.standing),
+            moving=torch.where(moving, torch.minimum(fade * self.moving, now), self.moving),
         )
 
 
@@ -86,9 +89,12 @@ def detect_stationary(
         return torch.zeros_like(before.standing) > 0, before
     swing = epoch.imu - epoch.imu.mean(1, keepdim=True)  # torch's var of a middle axis takes four times as long
     variance = swing.square().sum(1) / (epoch.imu.shape[1] - 1)
-    force, rate = variance.unflatten(-1, (2, 3)).sum(-1).unbind(-1)
-    lively = (force * rate).sqrt()
+    variance = variance.unflatten(-1, (2, 3)).sum(-1)
     span = epoch.dt * epoch.imu.shape[1]
+    if (share := span / LEAST_S) < 1:
+        variance = torch.where(before.variance > 0, (1 - share) * before.variance + share * variance, variance)
+    force, rate = variance.unbind(-1)
+    lively = (force * rate).sqrt()
     v, diagonal = epoch.window.end.v_n, P.diagonal(dim1=-2, dim2=-1)
     speed, std = v[:, :2].norm(dim=-1), diagonal[:, VELOCITY][:, :2].sum(-1).sqrt()
     tilt, accel = diagonal[:, ATTITUDE][:, :2].sum(-1), diagonal[:, ACCEL].sum(-1)
@@ -101,12 +107,13 @@ def detect_stationary(
     if wheel is not None:
         stopped = wheel.stopped & still
         standing, moving = standing & ~wheel.rolling | stopped, (moving | wheel.rolling) & ~stopped
-    after = before.heard(lively, standing, moving, span)
+    still_s = torch.where(still, before.still_s + span, 0.0)
+    after = before.heard(lively, standing, moving, span)._replace(variance=variance, still_s=still_s)
     # equal spectra: a wide 1σ would admit any speed, so only a speed that is nearly zero and known to be counts
     limit, distinct = after.thresholds(prior)
     doubt = torch.where(distinct, PLAUSIBLE_SIGMAS * std, std.clamp_max(SILENT_STD))
     plausible = speed < PLAUSIBLE_SPEED + doubt
-    stationary = (lively <= limit) & still & plausible
+    stationary = (lively <= limit) & still & (still_s > LEAST_S - 0.5 * span) & plausible
     if wheel is not None:
         stationary = stationary & ~wheel.rolling | stopped
     return stationary, after

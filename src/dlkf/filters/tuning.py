@@ -17,8 +17,8 @@ class Tuning:
     ``walk_floor_gyro`` [rad/s/√s] keep the bias states awake when the preset has no in-run instability, and
     ``position_floor`` [m], ``velocity_floor`` [m/s] keep R positive.
 
-    Filters with constraints: ``lateral_std``, ``vertical_std`` [m/s] of the velocity across the car, once per
-    epoch, ``rest_velocity_std`` [m/s], ``rest_rate_std`` [rad/s] of a standstill; ``rest_accel`` [m/s²] and
+    Filters with constraints: ``lateral_std``, ``vertical_std`` [m/s] of the velocity across the car, once a
+    second, ``rest_velocity_std`` [m/s], ``rest_rate_std`` [rad/s] of a standstill; ``rest_accel`` [m/s²] and
     ``rest_gyro`` [rad/s] are the spread of the samples in the least shaken second of motion, until learned.
     Filters with further sensors: ``wheel_std`` [m/s] and ``baro_std`` [m] of an update interval's measurement where the
     file gives none, ``heading_std`` a factor on that of the heading.

@@ -75,7 +75,7 @@ class Headings(NamedTuple):
 def heading_functions(grid: Grid) -> tuple[Layout, dict[str, Function]]:
     """The layout of a heading's memory, and its functions, while exporting; double precision whatever the filter's."""
     grid = Grid(grid.samples, grid.dt)
-    estimator = bank_filter(grid.epoch_s)
+    estimator = bank_filter()
     layout = carried_state(estimator, grid)
     kinds = {"start": Begin, "turn": Weigh}
     return layout, {name: kind(estimator, grid, layout).eval() for name, kind in kinds.items()}

@@ -160,7 +160,7 @@ def begin_bank(cases: Sequence[Case]) -> Bank:
     p = bank.start.p_n + (less @ arm)[..., 0]
     v = bank.start.v_n + (less @ torch.linalg.cross(rate_b, bank.lever_arm_b)[..., None])[..., 0]
     begun = replace(bank, start=NavState(p, v, C_nb), start_std=torch.cat(std))
-    memory, error = bank_filter(batch.epoch_s).begin(begun)
+    memory, error = bank_filter().begin(begun)
     known = torch.stack([torch.nn.functional.pad(c.gyro_error, (3, 0)) for c in cases])
     error = error._replace(bias=error.bias + known.repeat_interleave(COUNT, 0))
     weighed = torch.ones(len(cases), dtype=torch.bool)
@@ -190,7 +190,7 @@ def advance_bank(bank: Bank, imu: Float[Tensor, "B M 6"], fix: EarthFix, dt: flo
     value = torch.cat((bank.frame.from_ecef(r_e), bank.frame.rotate_from_ecef(v_e)), -1)
     given = Fix(torch.where(valid, value, 0.0), fix_std(std, epoch_s), valid, lag if bool(lag.any()) else None)
     memory, step = advance(
-        bank_filter(epoch_s), bank.memory, bank.state, bank.error, imu.repeat_interleave(COUNT, 0), given,
+        bank_filter(), bank.memory, bank.state, bank.error, imu.repeat_interleave(COUNT, 0), given,
         dt=dt, frame=bank.frame, lever_arm_b=bank.lever_arm_b,
     )  # fmt: skip
     total = bank.score + weigh_step(step, valid, epoch_s).unflatten(0, (-1, COUNT))
@@ -242,10 +242,9 @@ def log_likelihood(z: Float[Tensor, "B 6"], covariances: Covariances) -> Float[T
     return -0.5 * (white.square().sum(-1).clamp(max=NIS_CAP) + spread)
 
 
-def bank_filter(epoch_s: float) -> Mbkf:
-    """The filter of a bank; its constraints are meant for one a second."""
-    often = max(1.0, epoch_s**-0.5)
-    tuning = Tuning(lateral_std=0.5 * often, vertical_std=0.5 * often)
+def bank_filter() -> Mbkf:
+    """The filter of a bank."""
+    tuning = Tuning(lateral_std=0.5, vertical_std=0.5)
     return Mbkf(ANY_IMU, tuning, sources=(Sideslip(tuning, PLAIN),))
 
 
