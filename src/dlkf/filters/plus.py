@@ -60,7 +60,7 @@ ANY_MEMS: Mapping[str, Any] = {  # what is known of an IMU of which nothing is k
 # chosen on simulated and real drives (docs/results/plus.md): where the network's factors begin
 START_TUNING: Mapping[str, float] = {
     "accel_noise": 25.0, "gyro_noise": 4.0, "accel_walk": 5.0, "gyro_walk": 5.0,
-    "position_std": 2.0, "velocity_std": 2.0, "lateral_std": 0.1, "vertical_std": 0.15,
+    "position_std": 2.0, "velocity_std": 2.0, "lateral_std": 0.07, "vertical_std": 0.1,
 }  # fmt: skip
 OLDEST = 600.0  # s, fixes: times and counts are given up to here
 
