@@ -102,10 +102,7 @@ def test_chi_square_of_position_and_velocity():
     """eᵀP⁻¹e of 3000 epochs against χ² of 3 degrees: mean ± 5 √(6/3000), 95 % and 99.9 % limits kept."""
     r_e, observed = observations(2.0)
     solution = solve(observed)
-    for error, covariance in (
-        (solution.r_e - r_e, solution.covariance),
-        (solution.v_e, solution.rate_covariance),
-    ):
+    for error, covariance in ((solution.r_e - r_e, solution.covariance), (solution.v_e, solution.rate_covariance)):
         squared = np.einsum("ti,tij,tj->t", error, np.linalg.inv(covariance[:, :3, :3]), error)
         assert squared.mean() == pytest.approx(3, abs=5 * math.sqrt(6 / 3000))
         for level in (0.95, 0.999):

@@ -161,11 +161,7 @@ class DriveDataModule(L.LightningDataModule):
         """The fixed segments of a side, for scoring."""
         self.setup()
         segments = cut_segments(
-            self.stack,
-            self.eval_length_s,
-            self.eval_stride_s,
-            min_valid=self.min_valid,
-            span=self.spans[side],
+            self.stack, self.eval_length_s, self.eval_stride_s, min_valid=self.min_valid, span=self.spans[side]
         )
         if not segments:
             raise InputError(

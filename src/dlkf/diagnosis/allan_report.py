@@ -16,15 +16,7 @@ from dlkf.base.colours import COLOURS
 from dlkf.base.errors import InputError
 from dlkf.base.files import resolve_place, write_into
 from dlkf.base.provenance import describe_provenance
-from dlkf.diagnosis.allan import (
-    AllanFit,
-    Array,
-    allan_variance,
-    check_static,
-    cluster_sizes,
-    fit_noise,
-    preset_yaml,
-)
+from dlkf.diagnosis.allan import AllanFit, Array, allan_variance, check_static, cluster_sizes, fit_noise, preset_yaml
 from dlkf.evaluation.figures import png
 from dlkf.evaluation.table import ResultTable, as_json, as_markdown, format_number
 from dlkf.navigation.imu_errors import DEG, MILLIGAL, ImuSpec

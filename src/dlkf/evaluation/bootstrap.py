@@ -148,11 +148,7 @@ def _numbered(groups: NDArray[np.str_]) -> NDArray[np.int64]:
 
 
 def rms_band(
-    x: Array,
-    *,
-    groups: Sequence[str] | NDArray[np.str_] | None = None,
-    resamples: int = 500,
-    seed: int = 0,
+    x: Array, *, groups: Sequence[str] | NDArray[np.str_] | None = None, resamples: int = 500, seed: int = 0
 ) -> tuple[Array, Array, Array]:
     """RMS over units at each column of (U, K), and the bounds of its bootstrap interval; each (K,).
 

@@ -164,12 +164,7 @@ def _real(x: float | str | None) -> float:
 
 
 def summarise_scores(
-    scores: Scores,
-    *,
-    settle_s: float = SETTLE_S,
-    baseline: str = BASELINE,
-    resamples: int = 2000,
-    seed: int = 0,
+    scores: Scores, *, settle_s: float = SETTLE_S, baseline: str = BASELINE, resamples: int = 2000, seed: int = 0
 ) -> Results:
     """The results of one kind of data. Raises ValueError for scores of several kinds (split them first)."""
     if len(scores.kinds) > 1:

@@ -55,12 +55,7 @@ class Window(NamedTuple):
         return NavState(p, v, orthonormalise(C))
 
 
-def strapdown(
-    start: NavState,
-    imu: Float[Tensor, "B M 6"],
-    dt: float,
-    frame: TangentFrame,
-) -> Window:
+def strapdown(start: NavState, imu: Float[Tensor, "B M 6"], dt: float, frame: TangentFrame) -> Window:
     """Mechanise one window of corrected IMU samples (specific force m/s², rate rad/s) from ``start``.
 
     Differentiable in the start state and the samples; attitude gradients live in the tangent space of SO(3).

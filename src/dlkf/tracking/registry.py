@@ -37,18 +37,7 @@ if TYPE_CHECKING:
 NAME = "model"
 NO_STEP = -1  # at a step of training MLflow would give the model that step's losses and CPU load as its metrics
 CODE = Path(__file__).with_name("pyfunc_model.py")
-REQUIRED = (
-    "mlflow",
-    "torch",
-    "numpy",
-    "scipy",
-    "pandas",
-    "pyarrow",
-    "safetensors",
-    "pyyaml",
-    "pymap3d",
-    "jaxtyping",
-)
+REQUIRED = ("mlflow", "torch", "numpy", "scipy", "pandas", "pyarrow", "safetensors", "pyyaml", "pymap3d", "jaxtyping")
 SPEC = re.compile(r"(?P<name>[^/:@]+)(?:@(?P<alias>[^/@]+)|/(?P<version>\d+|latest))?")
 
 

@@ -60,12 +60,7 @@ def receive(
 
 
 def observe_satellites(
-    rng: np.random.Generator,
-    truth: Truth,
-    rate_b: Array,
-    config: GnssConfig,
-    receiver: Receiver,
-    sky: Sky | None,
+    rng: np.random.Generator, truth: Truth, rate_b: Array, config: GnssConfig, receiver: Receiver, sky: Sky | None
 ) -> Received:
     """What a receiver makes of the satellites at every row of ``truth`` (uniform in time), by least squares.
 
