@@ -130,7 +130,7 @@ def main(settings: EvaluateSettings) -> None:
     for line in sigma_warnings(done.scores):
         console.print(line, style="yellow", highlight=False, soft_wrap=True)
     if segments and any(0 < int(r.count.get("outages") or 0) < FEW for r in results):
-        console.print("Few outages; mode=drives has them over all of every drive, about twice as many.", style="yellow")
+        console.print("Few outages; mode=drives scores whole drives, with about twice as many.", style="yellow")
     save_log(console, settings.out)
     kept = ""
     if settings.tracking.log:

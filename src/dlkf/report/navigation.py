@@ -71,7 +71,7 @@ def navigation_page(
     page.table(columns, rows, marks=marks, tall=len(courses) > 15)
     page.note(
         "Innovation / σ: what GNSS says less what the filter expects, over the filter's own 1σ of it (RMS). 1 is "
-        "right; above, the filter is surer than it should be: its noise is too small for this IMU and receiver."
+        "right; above, the filter is overconfident: its noise is too small for this IMU and receiver."
     )
     sensors = [course.result.sensors() for course in courses]
     if names := list(dict.fromkeys(name for found in sensors for name in found)):

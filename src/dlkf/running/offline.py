@@ -99,7 +99,7 @@ class Navigated:
         last, used = self.table.iloc[-1], int(self.table.gnss_used.sum())
         text = f"{self.drive}: aligned at t = {round(self.aligned_at, 1) + 0.0:.1f} s, "
         if self.doubt > WORTH_SAYING:
-            text += f"heading in doubt (another way round with probability {self.doubt:.2g}), "
+            text += f"heading ambiguous (the alternatives have probability {self.doubt:.2g}), "
         text += f"{len(self.table)} epochs, "
         if spacing is None:
             text += f"{used} fixes used"
@@ -264,8 +264,8 @@ def _run(batch: Batch, estimator: Filter) -> BatchSolution:
         names = ", ".join(batch.drive[:3]) + (", …" if len(batch.drive) > 3 else "")
         which = f"drive {names}" if len(batch.drive) == 1 else f"one of the drives {names}"
         raise InputError(
-            f"{which}: the filter diverged (a covariance is no longer positive definite); its 1σ and tuning must be "
-            "numbers of a car's"
+            f"{which}: the filter diverged (a covariance is no longer positive definite); check the 1σ of its start and "
+            "tuning"
         ) from None
 
 

@@ -291,7 +291,7 @@ def _written(made_by: Recipe, out: str, job: tuple[int, int]) -> dict[str, Any]:
     tables, row = drive_of(made_by, *job)
     folder = resolve_place(out)
     if not is_url(out) and not folder.is_dir():
-        raise InputError(f"{out} is not there: the worker does not share the folder, or nobody waits for the drive")
+        raise InputError(f"{out} does not exist: the worker does not share the folder, or the command has ended")
     write_drive(folder, row, tables.imu, tables.gnss, tables.reference, tables.aids)
     if made_by.dataset.raw:
         write_raw(folder, row["drive"], tables.raw)

@@ -120,7 +120,7 @@ def reachable(uri: str) -> Iterator[None]:
         no_answer = isinstance(error, RequestException) or "failed with exception" in str(error)
         if not (uri.startswith("http") and no_answer):
             raise
-        message = f"the MLflow server {uri} does not answer; start it, or mend tracking.uri"
+        message = f"the MLflow server {uri} does not answer; start it, or correct tracking.uri"
         raise InputError(message) from None
 
 

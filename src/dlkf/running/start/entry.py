@@ -73,7 +73,7 @@ def align(drive: Drive, config: AlignConfig = ALIGN, *, earliest: int = 0) -> St
     """Position, velocity and attitude at the first boundary ≥ ``earliest`` at which they can be had.
 
     The tangent origin is the IMU's position there. Reads no reference. Raises InputError naming the drive if it has
-    no fix, the car never moves under GNSS, or its heading stays in doubt.
+    no fix, the car never moves under GNSS, or its heading is ambiguous.
     """
     start = align_each([drive], config, earliest=earliest)[0]
     if isinstance(start, InputError):
@@ -248,7 +248,7 @@ def _searched(motions: Sequence[FirstMotion], config: AlignConfig, earliest: int
                 starts[k] = replace(_started(turned, config, earliest), doubt=verdict.doubt)
             elif ended:
                 starts[k] = InputError(
-                    f"drive {drives[k].name}: its heading stays in doubt (another way round with probability "
+                    f"drive {drives[k].name}: its heading is ambiguous (the alternatives have probability "
                     f"{verdict.doubt:.2g}); align.from_rest=true takes the most probable"
                 )
             else:
