@@ -264,8 +264,8 @@ def _run(batch: Batch, estimator: Filter) -> BatchSolution:
         names = ", ".join(batch.drive[:3]) + (", …" if len(batch.drive) > 3 else "")
         which = f"drive {names}" if len(batch.drive) == 1 else f"one of the drives {names}"
         raise InputError(
-            f"{which}: the filter diverged (a covariance is no longer positive definite); check the 1σ of its start and "
-            "tuning"
+            f"{which}: the filter diverged (a covariance is no longer positive definite); check the 1σ of its start "
+            "and tuning"
         ) from None
 
 
