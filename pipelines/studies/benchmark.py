@@ -138,7 +138,7 @@ def peers(bench: Bench, folder: Path, minutes: float, checkout: Path | None) -> 
     bench.add(Timing(f"peer, {SECONDS}", "python-ins, 21 states, 0.1 s", [seconds], samples))
     bench.time(f"peer, {SECONDS}", "mbkf21, torch", lambda: parity.ours(batch, spec, 21, score=False), 3, samples)
     if checkout is not None:
-        beside = kf_gins.measured(checkout, list(COMPILED), kf_gins.MINUTES, kf_gins.ROUNDS)
+        beside = kf_gins.measure(checkout, list(COMPILED), kf_gins.MINUTES, kf_gins.ROUNDS)
         for name, (seconds, samples, _) in beside.items():
             bench.add(Timing(f"beside KF-GINS, {SECONDS}", name, seconds, samples))
 

@@ -141,7 +141,7 @@ def left_out_best(errors: Sequence[Sequence[SegmentErrors]], sequence: Sequence[
     return chosen
 
 
-def say(name: str, errors: dict[str, SegmentErrors]) -> None:
+def print_row(name: str, errors: dict[str, SegmentErrors]) -> None:
     """A row: translational error [%] of each sequence, of all, of those without gaps, and rotation [°/km]."""
     every, counted = joined(list(errors.values())), [e for s, e in errors.items() if s not in WITH_GAPS]
     cells = [f"{100 * e.translation.mean():.2f}" if len(e.translation) else "–" for e in errors.values()]
@@ -180,16 +180,16 @@ def main() -> None:
     print(f"| filter | {' | '.join(sorted(set(sequence)))} | all [%] | without gaps [%] | rotation [°/km] |")
     print(f"|:--|{'--:|' * (len(set(sequence)) + 3)}")
     for model in ("ins", "plus"):
-        say(model, by_sequence(errors_of(batch, resolve_model(model, spec)), sequence))
+        print_row(model, by_sequence(errors_of(batch, resolve_model(model, spec)), sequence))
     for model in options.models:
         tunings = candidates(options.points)
         errors = [errors_of(batch, resolve_model(model, spec, tuning=tuning)) for tuning in tunings]
-        say(f"{model}, default constants", by_sequence(errors[0], sequence))
+        print_row(f"{model}, default constants", by_sequence(errors[0], sequence))
         best = left_out_best(errors, sequence)
         held_out = [errors[best[s]][k] for k, s in enumerate(sequence)]
-        say(f"{model}, constants of the other sequences", by_sequence(held_out, sequence))
+        print_row(f"{model}, constants of the other sequences", by_sequence(held_out, sequence))
         at = min(range(len(tunings)), key=lambda c: float(np.mean(joined(errors[c]).translation)))
-        say(f"{model}, constants of these sequences (a bound)", by_sequence(errors[at], sequence))
+        print_row(f"{model}, constants of these sequences (a bound)", by_sequence(errors[at], sequence))
         said = {name: f"{getattr(tunings[at], name):.2g}" for name in FACTORS}
         print(f"  best of {len(tunings)} on all: {said}; of the others: {sorted(set(best.values()))}", flush=True)
 

@@ -76,7 +76,7 @@ def local_copy(folder: str | Path) -> Iterator[Path]:
         with store_errors_as_input_error(folder):
             for file in place.fs.find(place.path):
                 rest = file.strip("/").removeprefix(place.path.strip("/") + "/")
-                place.fs.get_file(file, str(_made(Path(here) / rest)))
+                place.fs.get_file(file, str(_with_folder(Path(here) / rest)))
         yield Path(here)
 
 
@@ -281,13 +281,13 @@ def _whole_prefix(path: str | Path) -> Iterator[Path]:
                 if old:
                     fs.rm(old[0])
                     fs.rm(target.path, recursive=True)
-            _moved(fs, fs.find(beside.path), beside.path, target.path)
+            _copy_files(fs, fs.find(beside.path), beside.path, target.path)
     finally:
         if beside.exists():
             fs.rm(beside.path, recursive=True)
 
 
-def _made(file: Path) -> Path:
+def _with_folder(file: Path) -> Path:
     """A file whose folder is there."""
     file.parent.mkdir(parents=True, exist_ok=True)
     return file
@@ -298,7 +298,7 @@ def _deep(file: str, folder: str) -> int:
     return file.strip("/").count("/") - folder.strip("/").count("/")
 
 
-def _moved(fs: Any, files: list[str], source: str, target: str) -> None:
+def _copy_files(fs: Any, files: list[str], source: str, target: str) -> None:
     """Copies in the store; files on top come last."""
     source = source.rstrip("/")
     for top in (False, True):

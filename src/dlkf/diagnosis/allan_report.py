@@ -153,7 +153,7 @@ def part(imu: dict[str, Array], from_s: float | None, to_s: float | None) -> tup
     return samples, float((len(t) - 1) / (t[-1] - t[0]))
 
 
-def chosen(names: Sequence[str], drive: str | None) -> str:
+def choose_drive(names: Sequence[str], drive: str | None) -> str:
     """The drive to look at. Raises InputError where there are several and none is named, or it does not exist."""
     if drive is None and len(names) == 1:
         return names[0]

@@ -159,7 +159,7 @@ class PlusFilter(nn.Module):
             memory = memory._replace(
                 elapsed=memory.elapsed + span,
                 since_fix=torch.where(fixed, 0.0, memory.since_fix + span),
-                matching=memory.matching.innovated(normalised, epoch.used),
+                matching=memory.matching.update(normalised, epoch.used),
             )
             bands = window_features(epoch.corrected, epoch.dt)
             levels, matched = band_level(bands), memory.matching.logarithms()

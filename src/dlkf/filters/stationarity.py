@@ -24,7 +24,7 @@ from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, VELOCITY
 SURE_STD = 0.3  # m/s: speeds with a larger 1σ teach nothing
 STANDING_SPEED, MOVING_SPEED = 0.3, 1.5  # m/s: from which side on a second counts as the one or the other
 APART = 10.0  # prior ratio of the level of a moving car to that of a stationary one
-TELLING = 2.0  # below this ratio the samples do not separate stationary from moving
+DISTINCT = 2.0  # below this ratio the samples do not separate stationary from moving
 MEMORY_S = 100.0  # s, stationary or moving, in which a level grows by e, so that a wrong second decays
 STILL_ACCEL, STILL_RATE = 0.2, 0.01  # m/s², rad/s: with less, beyond the filter's 2σ, a car may be stationary
 PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 3.0  # m/s, 1σ: a standstill must not contradict the filter
@@ -39,7 +39,7 @@ class VibrationLevel(NamedTuple):
     moving: Tensor  # (B,) likewise
 
     @classmethod
-    def unheard(cls, like: Tensor, batch_size: int) -> VibrationLevel:
+    def begin(cls, like: Tensor, batch_size: int) -> VibrationLevel:
         """Before the first sample."""
         nothing = like.new_full((batch_size,), math.inf)
         return cls(nothing, nothing)
@@ -52,10 +52,10 @@ class VibrationLevel(NamedTuple):
         """The limit, and whether the samples separate a stationary car from a moving one so far."""
         moving = torch.where(self.moving.isinf(), prior, self.moving)
         standing = torch.where(self.standing.isinf(), moving / APART, self.standing)
-        distinct = moving > TELLING * standing
+        distinct = moving > DISTINCT * standing
         return torch.where(distinct, (standing * moving).sqrt(), prior / APART), distinct
 
-    def heard(self, now: Tensor, standing: Tensor, moving: Tensor, span: float) -> VibrationLevel:
+    def update(self, now: Tensor, standing: Tensor, moving: Tensor, span: float) -> VibrationLevel:
         """After a window of ``span`` seconds in which the car was surely stationary, or moving, or neither."""
         fade = math.exp(span / MEMORY_S)
         return VibrationLevel(
@@ -87,7 +87,7 @@ def detect_stationary(
     swing = epoch.imu - epoch.imu.mean(1, keepdim=True)  # torch's var of a middle axis takes four times as long
     variance = swing.square().sum(1) / (epoch.imu.shape[1] - 1)
     force, rate = variance.unflatten(-1, (2, 3)).sum(-1).unbind(-1)
-    lively = (force * rate).sqrt()
+    level = (force * rate).sqrt()
     span = epoch.dt * epoch.imu.shape[1]
     v, diagonal = epoch.window.end.v_n, P.diagonal(dim1=-2, dim2=-1)
     speed, std = v[:, :2].norm(dim=-1), diagonal[:, VELOCITY][:, :2].sum(-1).sqrt()
@@ -101,12 +101,12 @@ def detect_stationary(
     if wheel is not None:
         stopped = wheel.stopped & still
         standing, moving = standing & ~wheel.rolling | stopped, (moving | wheel.rolling) & ~stopped
-    after = before.heard(lively, standing, moving, span)
+    after = before.update(level, standing, moving, span)
     # equal spectra: a wide 1σ would admit any speed, so only a speed that is nearly zero and known to be counts
     limit, distinct = after.thresholds(prior)
     doubt = torch.where(distinct, PLAUSIBLE_SIGMAS * std, std.clamp_max(SILENT_STD))
     plausible = speed < PLAUSIBLE_SPEED + doubt
-    stationary = (lively <= limit) & still & plausible
+    stationary = (level <= limit) & still & plausible
     if wheel is not None:
         stationary = stationary & ~wheel.rolling | stopped
     return stationary, after

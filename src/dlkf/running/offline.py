@@ -251,7 +251,7 @@ def navigate_drives(
         batch = whole_drives([drives[k] for k in part], [starts[k] for k in part])
         solution = _run(batch, estimator)
         for row, k in enumerate(part):
-            yield _navigated(drives[k], starts[k], batch, row, solution, estimator, align)
+            yield _solve_drive(drives[k], starts[k], batch, row, solution, estimator, align)
         done += len(part)
         if progress is not None:
             progress(done, len(todo))
@@ -269,7 +269,7 @@ def _run(batch: Batch, estimator: Filter) -> BatchSolution:
         ) from None
 
 
-def _navigated(
+def _solve_drive(
     drive: Drive, start: Start, batch: Batch, row: int, solution: BatchSolution, estimator: Filter, align: AlignConfig
 ) -> Navigated:
     """One drive of a batch; where the filter was lost (:mod:`dlkf.running.loss`) it is aligned and run again.

@@ -94,7 +94,7 @@ def align_each(drives: Sequence[Drive], config: AlignConfig = ALIGN, *, earliest
     for i in range(0, len(motions), CASES_AT_ONCE):
         some = motions[i : i + CASES_AT_ONCE]
         starts += (
-            _searched(some, config, earliest) if config.search_s > 0 else [_started(x, config, earliest) for x in some]
+            _search(some, config, earliest) if config.search_s > 0 else [_started(x, config, earliest) for x in some]
         )
     of_motions = iter(starts)
     return [x if isinstance(x, InputError) else next(of_motions) for x in found]
@@ -232,7 +232,7 @@ def _align_until_motion(drive: Drive, config: AlignConfig, earliest: int) -> tup
 
 
 @torch.inference_mode()
-def _searched(motions: Sequence[FirstMotion], config: AlignConfig, earliest: int) -> list[Start | InputError]:
+def _search(motions: Sequence[FirstMotion], config: AlignConfig, earliest: int) -> list[Start | InputError]:
     """Starts from a bank of headings that runs until each of the cases is ready or at its drive's end."""
     drives, cases = [m.drive for m in motions], [m.case for m in motions]
     epoch_s, dt = drives[0].epoch_s, 1 / drives[0].rate_hz
