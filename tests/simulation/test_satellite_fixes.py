@@ -14,7 +14,6 @@ from dlkf.base.errors import InputError
 from dlkf.simulation.dataset import DatasetConfig
 from dlkf.simulation.gnss.almanac import read_almanac
 from dlkf.simulation.gnss.least_squares import Observations, solve
-from dlkf.simulation.gnss.obstruction import hold_visibility, in_view
 from dlkf.simulation.gnss.receiver import (
     Receiver,
     clock,
@@ -26,7 +25,7 @@ from dlkf.simulation.gnss.receiver import (
 )
 from dlkf.simulation.gnss.satellite_fixes import observe_satellites
 from dlkf.simulation.gnss.satellites import LIGHT, signals
-from dlkf.simulation.gnss.surroundings import Sky
+from dlkf.simulation.gnss.surroundings import Sky, hold_visibility, in_view
 from dlkf.simulation.gnss.white import GnssConfig
 from dlkf.simulation.motion.vehicle import Truth
 

@@ -29,8 +29,7 @@ from dlkf.evaluation.metrics import (
     slope,
     summarise_errors,
 )
-from dlkf.evaluation.own_sigma import innovation_rms, sigma_samples
-from dlkf.evaluation.scores import Scores
+from dlkf.evaluation.scores import Scores, innovation_rms, sigma_samples
 
 SETTLE_S = 10.0  # "settled" leaves out this much of every segment, where the initial error dominates
 INTO_OUTAGE_S = (10.0, 20.0, 30.0, 40.0, 50.0, 60.0)

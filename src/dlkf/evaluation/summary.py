@@ -6,9 +6,8 @@ import math
 from collections.abc import Sequence
 
 from dlkf.evaluation.bootstrap import MIN_GROUPS
-from dlkf.evaluation.own_sigma import innovation_fit
 from dlkf.evaluation.results import Results
-from dlkf.evaluation.scores import Scores
+from dlkf.evaluation.scores import Scores, innovation_fit
 from dlkf.evaluation.table import DEGREES, format_number
 from dlkf.running.innovations import OF_NETWORK, REMEDY
 
