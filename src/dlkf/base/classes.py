@@ -1,4 +1,4 @@
-"""The one way from the name of a class, of the package or of a user's own, to the class and to an object of it.
+"""Classes by name, of the package or of a user: find them, check their methods, make objects.
 
 A name may stand in a preset or a model that somebody else wrote. So a class is checked for the methods of what it must
 be before it is called, and nothing of Python's standard library is ever called: ``os:system``, ``subprocess:Popen``

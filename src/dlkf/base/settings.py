@@ -1,4 +1,4 @@
-"""The one way from plain values to settings: every key known, every value of its field's type, one text for all.
+"""Settings from plain values: unknown keys and values of a wrong type are errors, in the same words everywhere.
 
 Settings are frozen dataclasses; the ranges of their values stand beside the defaults, their units in the names.
 """

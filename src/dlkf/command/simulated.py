@@ -1,4 +1,4 @@
-"""Datasets by the presets of ``dlkf simulate``: a recipe, and those of a training that are not there yet."""
+"""Datasets by the presets of ``dlkf simulate``: a recipe, and the missing datasets of a training."""
 
 from __future__ import annotations
 

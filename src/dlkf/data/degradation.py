@@ -1,4 +1,4 @@
-"""GNSS made worse on purpose (paper eqs 12, 13; R130): white noise on position and velocity of every fix."""
+"""Degraded GNSS (paper eqs 12, 13; R130): white noise on position and velocity of every fix."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Paired bootstrap: how sure is it that one filter is better than another on the same segments?
+"""Paired bootstrap: confidence intervals of one filter against another on the same segments.
 
 Both filters are resampled with the same weights, so that a segment that is hard for both does not widen the interval
 (Efron & Tibshirani, *An Introduction to the Bootstrap*, ch. 13). Segments or outages of one recording are not

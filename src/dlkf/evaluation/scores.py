@@ -1,4 +1,4 @@
-"""What every filter made of the same segments: the raw material of tables and figures."""
+"""Errors and estimates of every filter on the same segments, from which tables and figures are made."""
 
 from __future__ import annotations
 

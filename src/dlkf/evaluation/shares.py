@@ -1,4 +1,4 @@
-"""An evaluation share by share: drives of a dataset are loaded, scored and forgotten, here or on other processes."""
+"""An evaluation in chunks of drives, each loaded, scored and released, here or in other processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An evaluation in few numbers and in one sentence: what a tracking server compares, what a person asks for."""
+"""An evaluation in a few metrics for the tracking server and in one sentence for the reader."""
 
 from __future__ import annotations
 

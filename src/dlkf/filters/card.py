@@ -1,4 +1,4 @@
-"""What a learned filter was made of, stored beside its weights, and what follows for scoring it (paper.md 4.8)."""
+"""Model card of a learned filter, stored beside its weights, and what it implies for scoring (paper.md 4.8)."""
 
 from __future__ import annotations
 

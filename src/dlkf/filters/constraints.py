@@ -1,4 +1,4 @@
-"""What a car cannot do, as pseudo-measurements: slide sideways, leave the road, and move while it stands.
+"""Vehicle constraints as pseudo-measurements: no sideways or vertical velocity, none at all while stationary.
 
 Non-holonomic constraint (NHC; Dissanayake et al. 2001). The velocity of the IMU in body axes is, across the car,
 

@@ -1,4 +1,4 @@
-"""``plus``: the analytic Kalman filter that finds the white noise of its IMU while it runs.
+"""``plus``: a Kalman filter that estimates the white noise of its IMU while it runs.
 
 States, strapdown, sources and Riccati recursion are those of a classical filter (``base``). Two factors act on its
 white noise. The level of accelerometers and of gyroscopes is slow: virtual outages of 10 to 30 s in the recent past

@@ -1,4 +1,4 @@
-"""Where a Kalman filter's measurements come from: every source gives rows of one common update per epoch.
+"""Measurement sources of a Kalman filter: each gives rows of one common update per epoch.
 
 A source is a class with two methods, in a file of its own; it needs no change of the package::
 

@@ -1,4 +1,4 @@
-"""Fixes of the last seconds in order of time, and what the screen of implausible ones makes of each."""
+"""Fixes of the last seconds in order of time, and the verdict of the plausibility screen on each."""
 
 from __future__ import annotations
 

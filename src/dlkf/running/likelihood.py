@@ -1,4 +1,4 @@
-"""Noise of an IMU, of its receiver and of the car, found on drives without a reference: what makes their fixes likely.
+"""Noise of IMU, receiver and car on drives without a reference: the maximum likelihood of their fixes.
 
 A filter predicts every fix, with a covariance S. With noise set too small the innovations z are larger than S
 predicts, with noise set too large smaller; the density of z is greatest between the two. A fix a second

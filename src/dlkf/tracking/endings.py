@@ -1,4 +1,4 @@
-"""How runs end: by themselves, by a signal, or by a kill, which the next run on the same machine records in MLflow."""
+"""End of runs in MLflow: normal, by a signal, or by a kill, which the next run on the same machine records."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The classical filters of a study, each tuned itself on training segments with outages (R018; paper.md 4.6)."""
+"""The classical filters of a study, each tuned on training segments with outages (R018; paper.md 4.6)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Baselines as good as training drives can make them: tuned noise, and the prior knowledge of one IMU.
+"""Search of noise factors, and of the prior IMU error of drives that share one IMU.
 
 Nothing here looks at validation or test drives (R018; paper.md 4.6).
 """
