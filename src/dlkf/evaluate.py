@@ -20,12 +20,12 @@ from dlkf.command import command
 from dlkf.command.scored import EvaluateSettings
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import choose_aids, dataset_digest, drive_rows
+from dlkf.evaluation.chunks import EvaluationJob, evaluate_chunks
 from dlkf.evaluation.outages import check_outages
 from dlkf.evaluation.protocol import REFUSED
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.sensors import sensor_table
-from dlkf.evaluation.shares import EvaluationJob, evaluate_chunks
 from dlkf.evaluation.study import results_of
 from dlkf.evaluation.summary import FEW, headline, metrics_of, sigma_warnings
 from dlkf.evaluation.table import ResultTable, all_tables, as_markdown, as_rich, result_tables

@@ -20,9 +20,9 @@ from dlkf.data.kinds import drive_kinds
 from dlkf.data.masks import BiasLaw
 from dlkf.data.segments import StartLaw
 from dlkf.data.store import drive_rows, load_dataset
+from dlkf.evaluation.chunks import EvaluationJob, evaluate_chunks
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Protocol, Scenes, spread_evenly
-from dlkf.evaluation.shares import EvaluationJob, evaluate_chunks
 from dlkf.evaluation.study import run_comparison
 from dlkf.evaluation.table import all_tables
 from dlkf.filters.build import build_filter

@@ -64,10 +64,10 @@ def headline(result: Results) -> str:
     text += _spread(texts[best], count, unit)
     if span and math.isfinite(drift := result.value(best, "outages", "end", "drift", "median")):
         text += f" ({format_number(100 * drift, digits=2)} % of the distance driven)"
-    rival = next((n for n in order[1:] if is_classical(n)), None)
-    if rival is not None:
+    other = next((n for n in order[1:] if is_classical(n)), None)
+    if other is not None:
         which = "next" if is_classical(best) else "best classical filter"
-        text += f"; {which} {rival} {', '.join(texts[rival])}"
+        text += f"; {which} {other} {', '.join(texts[other])}"
     few = f" With {count} {unit}{'s' if count > 1 else ''}, expect larger errors too." if count < FEW else ""
     return f"{text}.{few}"
 
