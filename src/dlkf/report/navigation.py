@@ -98,10 +98,10 @@ def summary_lines(model: str, courses: Sequence[TrackOnMap]) -> list[str]:
         text = f"Longest time without a fix: {longest.without.max():.3g} s"
         text += f" ({longest.result.drive})." if len(courses) > 1 else "."
     if np.isfinite(sigma).any():
-        text += f" The filter's own horizontal 1σ: {np.nanmedian(sigma):.2g} m in half of the time, "
-        text += f"{np.nanmax(sigma):.2g} m at worst."
+        text += f" The filter's own horizontal 1σ: median {np.nanmedian(sigma):.2g} m, "
+        text += f"maximum {np.nanmax(sigma):.2g} m."
     else:
-        text += " This filter does not tell its own 1σ."
+        text += " This filter gives no 1σ."
     refused = [f"{c.result.refused} of {c.result.drive}" for c in courses if any(c.result.refused)]
     more = f" and of {len(refused) - FEW_NAMED} more drives" if len(refused) > FEW_NAMED else ""
     said = [f"Refused beyond physical limits: {', '.join(refused[:FEW_NAMED])}{more}."] if refused else []
