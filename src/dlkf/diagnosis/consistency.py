@@ -148,7 +148,7 @@ def consistency_table(results: Mapping[str, NormalisedSquares], settle_s: float,
             rows.append([name, what, str(degrees), mean, f"{low:.3f} – {high:.3f}", share])
     return ResultTable(
         title=title,
-        note="Normalised error squared over its expectation: 1 is consistent, above 1 overconfident, below conservative. "
+        note="Normalised error squared over its expectation: 1 is consistent, above overconfident, below conservative. "
         f"Band: 95 % of the means over the drives at one time. After {settle_s:g} s.",
         columns=["Filter", "Of", "Degrees\nof freedom", "Mean", "Band", "Epochs in\nthe band [%]"],
         rows=rows,
