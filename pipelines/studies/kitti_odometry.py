@@ -19,15 +19,13 @@ import numpy as np
 import torch
 from scipy.stats import qmc
 
-from dlkf.base.config import config_dir
-from dlkf.base.documents import read_yaml
+from dlkf.command.composing import imu_preset
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.segments import Segment, StartLaw, make_batch
 from dlkf.data.store import load_dataset
 from dlkf.data.tables import read_drives
 from dlkf.filters.smoother import Filter
 from dlkf.filters.tuning import Tuning
-from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.running.batched import run_filter
 from dlkf.tracking.models import resolve_model
 
@@ -155,11 +153,6 @@ def by_sequence(errors: Sequence[SegmentErrors], sequence: Sequence[str]) -> dic
     return {s: joined([e for e, of in zip(errors, sequence) if of == s]) for s in sorted(set(sequence))}
 
 
-def preset(name: str) -> ImuSpec:
-    """An IMU of conf/imu."""
-    return imu_spec(read_yaml(config_dir() / "imu" / f"{name}.yaml"))
-
-
 def main() -> None:
     """Run, choose, print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -168,7 +161,7 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", default=["mbkf21_nhc", "mbkf21_car"], help="with constants")
     parser.add_argument("--points", type=int, default=64, help="settings of the constants that are compared")
     options = parser.parse_args()
-    folder, spec = options.real / "kitti", preset(options.imu)
+    folder, spec = options.real / "kitti", imu_preset(options.imu)
     names = {row.name: row.group.removeprefix("kitti-2011-") for row in read_drives(folder)}
     chosen = {name: SEQUENCES[group] for name, group in names.items() if group in SEQUENCES}
     sequence = list(chosen.values())

@@ -21,14 +21,13 @@ import numpy as np
 import pandas as pd
 import pyins
 import torch
-import yaml
 from numpy.typing import NDArray
 from pyins import filters, inertial_sensor, measurements, sim, strapdown
 from pyins.util import ACCEL_COLS, GYRO_COLS, LLA_COLS, RPH_COLS, VEL_COLS
 from rich.console import Console
 
-from dlkf.base.config import config_dir
 from dlkf.base.files import write_into
+from dlkf.command.composing import imu_preset
 from dlkf.data.drive import Batch
 from dlkf.data.masks import withhold_fixes
 from dlkf.data.schema import ACCEL, GYRO, new_dataset, write_drive, write_drives_table
@@ -43,7 +42,7 @@ from dlkf.filters.model_based import Ins, Mbkf
 from dlkf.navigation.attitude import rpy_from_rotation
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
-from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.state import NavState
 from dlkf.simulation.imu import corrupt, draw_unit
 from dlkf.simulation.motion.routes import VehicleConfig
@@ -66,11 +65,6 @@ class Result(NamedTuple):
     theirs: Array
     theirs_s: float
     hidden: NDArray[np.bool_]
-
-
-def preset(name: str) -> ImuSpec:
-    """An IMU preset of ``conf/imu``."""
-    return imu_spec(yaml.safe_load((config_dir() / "imu" / f"{name}.yaml").read_text()))
 
 
 def write_drives(folder: Path, spec: ImuSpec, drives: int, minutes: float) -> None:
@@ -275,13 +269,13 @@ def main() -> int:
     arguments.add_argument("--threads", type=int, default=1)
     o = arguments.parse_args()
     torch.set_num_threads(o.threads)
-    console, spec = Console(width=150), preset(o.imu)
+    console, spec = Console(width=150), imu_preset(o.imu)
     kept = o.out / f"{o.imu}-{o.drives}x{o.minutes:g}min"
     folder, perfect = kept / "drives", kept / "perfect"
     if not folder.is_dir():
         write_drives(folder, spec, o.drives, o.minutes)
     if not perfect.is_dir():
-        write_drives(perfect, preset("perfect"), 1, o.minutes)
+        write_drives(perfect, imu_preset("perfect"), 1, o.minutes)
     results: dict[int, list[Result]] = {}
     for drive in range(o.drives):
         for states in o.states:

@@ -33,12 +33,11 @@ from pathlib import Path
 import numpy as np
 import torch
 import yaml
-from pipelines.studies.parity import preset, write_drives
+from pipelines.studies.parity import write_drives
 
-from dlkf.base.config import config_dir
 from dlkf.base.errors import InputError
 from dlkf.base.provenance import describe_provenance
-from dlkf.command.composing import imu_preset
+from dlkf.command.composing import imu_preset, tuning_preset
 from dlkf.command.simulated import compose_recipe
 from dlkf.data.alignment import ALIGN
 from dlkf.data.drive import Batch, Drive
@@ -147,7 +146,7 @@ def simulate_sets(data: Path, real: Path | None, wanted: Collection[str]) -> Non
                 chassis.TONES = with_tones
     for name, imu in PYTHON_INS.items():
         if name in wanted and not (data / name).is_dir():
-            write_drives(data / name, preset(imu), 4, 18)
+            write_drives(data / name, imu_preset(imu), 4, 18)
     for name, (imu, seed) in INJECTED.items() if real is not None else ():
         if name in wanted and not (data / name).is_dir():
             words = [f"source={real}/kitti", f"imu={imu}", f"seed={seed}", f"out={data / name}"]
@@ -205,9 +204,9 @@ def constants() -> dict[str, Estimator]:
     found = {}
     for name, tunings in CONSTANTS.items():
         for tuning in tunings:
-            values = yaml.safe_load((config_dir() / "tuning" / f"{tuning}.yaml").read_text())
-            values.pop("defaults")  # untuned: defaults for the rest
-            found[f"{name} {tuning}"] = build_causal(name, imu_preset("automotive_mems"), "no", tuning=Tuning(**values))
+            found[f"{name} {tuning}"] = build_causal(
+                name, imu_preset("automotive_mems"), "no", tuning=tuning_preset(tuning)
+            )
     return found
 
 

@@ -8,10 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from pipelines.studies.parity import POSITION_STD, RATE, START, VELOCITY_STD, preset
+from pipelines.studies.parity import POSITION_STD, RATE, START, VELOCITY_STD
 from pyins import sim
 from pyins.util import ACCEL_COLS, GYRO_COLS, LLA_COLS, VEL_COLS
 
+from dlkf.command.composing import imu_preset
 from dlkf.data.masks import withhold_fixes
 from dlkf.data.schema import write_drive, write_drives_table
 from dlkf.data.segments import cut_segments, make_batch
@@ -48,7 +49,7 @@ def silent_drive(folder, seed: int, speed: float, straight: bool) -> dict:
     v_n = v[:, None] * np.stack((np.cos(yaw), np.sin(yaw), 0 * yaw), -1)
     rpy = np.stack((0 * yaw, 0 * yaw, yaw), -1)
     trajectory, imu = sim.generate_imu(t, (50.0, 8.0, 200.0), np.degrees(rpy), v_n, "increment")
-    spec = preset("consumer")
+    spec = imu_preset("consumer")
     exact = imu[[*ACCEL_COLS, *GYRO_COLS]].to_numpy()[1:] * RATE
     measured, error = corrupt(errors, exact, spec, draw_unit(unit, spec), RATE)
     each = trajectory.iloc[::RATE]
