@@ -3,7 +3,7 @@
     python pipelines/paper_report.py                 outputs/paper/report.html
     python pipelines/paper_report.py --home outputs/paper --quick     with the short trainings of section 5.3
 
-draws figures 1, 2, 3 and 5 (``paper_diagrams.py``) and reads what ``paper_imu_error.py``, with and without
+shows figures 1, 2, 3 and 5 (``docs/figures/paper``) and reads what ``paper_imu_error.py``, with and without
 ``--as-published``, ``paper_kalman_gain.py``, ``paper_outage.py``, ``paper_figures.py``, ``paper_real_motion.py`` and
 ``paper_ablations.py`` left; what has not been run is named with its command. The paper's IMU, roads and receivers are
 not ours: compare ratios and orderings, not metres.
@@ -18,14 +18,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from paper_diagrams import CAPTIONS, diagrams
-
 from dlkf.base.files import write_into
-from dlkf.evaluation.figures import png
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.table import format_interval, format_number
 from dlkf.report.page import Page, embedded
 
+FIGURES = Path(__file__).parents[1] / "docs" / "figures" / "paper"
+CAPTIONS = {
+    "figure1": "Figure 1 (drawn anew): loosely coupled integration with a model-based Kalman filter",
+    "figure2": "Figure 2 (drawn anew): the same loop with the network in the filter's place",
+    "figure3": "Figure 3 (drawn anew): the network of model=dlkf_literal",
+    "figure5": "Figure 5 (drawn anew from the text): antennas on the test vehicle; outline not to scale",
+}
 TERMS = {"position": "P", "velocity": "V", "attitude": "A"}
 UNITS = ("m", "m/s", "rad")
 NOTHING = "nothing published"
@@ -134,8 +138,8 @@ def main() -> int:
     )
     page.heading("What the paper says, and what came out", "Ratios of dlkf to mbkf15, one for each training.")
     page.table(["claim", "published", "ours", "reproduced"], claims, words=True)
-    for name, figure in diagrams().items():
-        page.picture(CAPTIONS[name], embedded(png(figure)))
+    for name, caption in CAPTIONS.items():
+        page.picture(caption, embedded((FIGURES / f"{name}.png").read_bytes()))
     page.heading("Table 2: sensors, as far as the text has it", "The last column is what stands in their place here.")
     page.table(["data", "sensor", "antenna", "here"], SENSORS, words=True)
     page.parts += body.parts

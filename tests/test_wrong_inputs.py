@@ -87,7 +87,7 @@ BAD_FRAMES: dict[str, tuple[str, Callable[[pd.DataFrame], Any], str]] = {  # whi
     "a column twice": (
         "imu",
         lambda f: pd.concat([f, f[["gyro_z"]]], axis=1),
-        "column gyro_z stands there twice; keep one",
+        "column gyro_z appears twice; keep one",
     ),
     "no rows of imu": ("imu", lambda f: f.iloc[:0], "imu has no rows"),
     "one row of imu": ("imu", lambda f: f.iloc[:1], "imu: has a single sample"),
@@ -144,7 +144,7 @@ BAD_FRAMES: dict[str, tuple[str, Callable[[pd.DataFrame], Any], str]] = {  # whi
     "a row twice": (
         "imu",
         lambda f: pd.concat([f.iloc[:5], f.iloc[4:]]),
-        "imu: row 5: t = 0.100000 stands twice; remove duplicate samples",
+        "imu: row 5: t = 0.100000 appears twice; remove duplicate samples",
     ),
     "no time": ("imu", put("t", 7, np.nan), "imu: row 7: t is nan"),
     "NaN in the imu": ("imu", put("accel_y", 9, np.nan), "imu: row 9: accel_y is nan; remove the row"),

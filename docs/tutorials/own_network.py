@@ -59,6 +59,7 @@ class Gru(nn.Module):
 #
 # Named terms of solution and batch; the training weighs position, velocity and attitude adaptively.
 
+
 # %%
 # %%writefile logarithmic.py
 class Logarithmic:

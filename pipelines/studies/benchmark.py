@@ -21,7 +21,7 @@ from pipelines.studies.compiled_step import times_in_c
 from pipelines.studies.figures.bench_figures import Bench, Timing, machine
 from rich.console import Console
 
-from dlkf.command.composing import compose_command
+from dlkf.command.composing import compose_command, imu_preset
 from dlkf.command.simulated import compose_recipe
 from dlkf.data.alignment import ALIGN
 from dlkf.data.datamodule import DriveDataModule
@@ -127,7 +127,7 @@ def epochs(bench: Bench, dataset: Path, imu: ImuSpec, models: list[str]) -> None
 
 def peers(bench: Bench, folder: Path, minutes: float, checkout: Path | None) -> None:
     """python-ins on the same drive with the same states, and KF-GINS' engine where it is at hand."""
-    spec = parity.preset("consumer")
+    spec = imu_preset("consumer")
     parity.write_drives(folder, spec, 1, minutes)
     drives = load_dataset(folder, rate_hz=RATE_HZ, dtype=torch.float64)
     batch = make_batch(
@@ -138,7 +138,7 @@ def peers(bench: Bench, folder: Path, minutes: float, checkout: Path | None) -> 
     bench.add(Timing(f"peer, {SECONDS}", "python-ins, 21 states, 0.1 s", [seconds], samples))
     bench.time(f"peer, {SECONDS}", "mbkf21, torch", lambda: parity.ours(batch, spec, 21, score=False), 3, samples)
     if checkout is not None:
-        beside = kf_gins.measured(checkout, list(COMPILED), kf_gins.MINUTES, kf_gins.ROUNDS)
+        beside = kf_gins.measure(checkout, list(COMPILED), kf_gins.MINUTES, kf_gins.ROUNDS)
         for name, (seconds, samples, _) in beside.items():
             bench.add(Timing(f"beside KF-GINS, {SECONDS}", name, seconds, samples))
 

@@ -42,7 +42,7 @@ IMU = ImuSpec(
 )
 
 
-def built(checkout: Path, folder: Path) -> Path:
+def build_engine(checkout: Path, folder: Path) -> Path:
     """Their engine with our loop, compiled."""
     theirs = checkout / "src"
     program = folder / "engine"
@@ -80,7 +80,7 @@ def _geodetic(batch: Batch, p_n: torch.Tensor) -> np.ndarray:
     return torch.stack(geodetic_from_ecef(batch.frame.to_ecef(p_n)), -1).numpy()
 
 
-def off(batch: Batch, at: np.ndarray) -> float:
+def final_error(batch: Batch, at: np.ndarray) -> float:
     """Horizontal distance [m] of a place from the truth at the end."""
     truth = _geodetic(batch, batch.truth.p_n[:, -1])[0]
     north, east = 6.37e6 * (at[0] - truth[0]), 6.37e6 * np.cos(truth[0]) * (at[1] - truth[1])
@@ -99,7 +99,7 @@ def one_thread() -> Iterator[None]:
 
 
 @one_thread()
-def measured(
+def measure(
     checkout: Path, models: Sequence[str], minutes: float, rounds: int
 ) -> dict[str, tuple[list[float], int, float]]:
     """By name: processor seconds of the rounds, samples of the drive, horizontal error [m] at its end."""
@@ -111,7 +111,7 @@ def measured(
         mbkf = resolve_model("mbkf21", IMU)
         assert isinstance(mbkf, Mbkf)
         numbers(batch, mbkf).tofile(home / "drive.bin")
-        engine = built(checkout, home)
+        engine = build_engine(checkout, home)
         ours: dict[str, Estimator] = {n: compile_filter(resolve_model(n, IMU), RATE_HZ, 1.0) for n in models}
         spent: dict[str, list[float]] = {n: [] for n in ("KF-GINS", *ours)}
         end = np.zeros(3)
@@ -123,7 +123,7 @@ def measured(
                 spent[name].append(processor_time(estimator, batch))
         ends = {n: _geodetic(batch, run_filter(batch, f).posterior.p_n[:, -1])[0] for n, f in ours.items()}
         samples = batch.size[1] * batch.size[2]
-        return {n: (s, samples, off(batch, ends.get(n, np.array(end)))) for n, s in spent.items()}
+        return {n: (s, samples, final_error(batch, ends.get(n, np.array(end)))) for n, s in spent.items()}
 
 
 def main() -> None:
@@ -134,7 +134,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=MINUTES)
     parser.add_argument("--rounds", type=int, default=ROUNDS)
     options = parser.parse_args()
-    found = measured(options.checkout, options.models, options.minutes, options.rounds)
+    found = measure(options.checkout, options.models, options.minutes, options.rounds)
     print("| | IMU epochs/s | × KF-GINS | off at the end [m] |\n|:--|--:|--:|--:|")
     for name, (seconds, samples, distance) in found.items():
         ratio = min(found["KF-GINS"][0]) / min(seconds)

@@ -20,15 +20,15 @@ int main(int, char **argument) {
   for (size_t n; (n = fread(part, sizeof(double), 4096, file)) > 0;) x.insert(x.end(), part, part + n);
   const size_t samples = size_t(x[0]), fixes = size_t(x[1]);
   const double *start = &x[5], *sigma = &x[14], *noise = &x[23], *imu = &x[30], *fix = imu + 7 * samples;
-  GINSOptions told;
+  GINSOptions options;
   const Eigen::Vector3d zero = same(0);
-  told.initstate = {three(start), three(start + 3), three(start + 6), {zero, zero, zero, zero}};
-  told.initstate_std = {three(sigma), three(sigma + 3), three(sigma + 6),
+  options.initstate = {three(start), three(start + 3), three(start + 6), {zero, zero, zero, zero}};
+  options.initstate_std = {three(sigma), three(sigma + 3), three(sigma + 6),
                         {same(noise[2]), same(noise[3]), same(noise[4]), same(noise[5])}};
-  told.imunoise = {same(noise[0]), same(noise[1]), same(noise[2]), same(noise[3]), same(noise[4]), same(noise[5]), noise[6]};
-  told.antlever = three(&x[2]);
+  options.imunoise = {same(noise[0]), same(noise[1]), same(noise[2]), same(noise[3]), same(noise[4]), same(noise[5]), noise[6]};
+  options.antlever = three(&x[2]);
 
-  GIEngine engine(told);
+  GIEngine engine(options);
   size_t next = 0;
   const clock_t began = clock();
   for (size_t k = 0; k < samples; k++, imu += 7) {

@@ -19,15 +19,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from dlkf.base.config import config_dir
-from dlkf.base.documents import read_yaml
+from dlkf.command.composing import imu_preset
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.segments import Segment, StartLaw, make_batch
 from dlkf.data.store import load_dataset
 from dlkf.data.tables import read_drives
 from dlkf.filters.smoother import Filter
 from dlkf.filters.tuning import Tuning
-from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 from dlkf.running.batched import run_filter
 from dlkf.tracking.models import resolve_model
 
@@ -139,7 +137,7 @@ def left_out_best(errors: Sequence[Sequence[SegmentErrors]], sequence: Sequence[
     return chosen
 
 
-def say(name: str, errors: dict[str, SegmentErrors]) -> None:
+def print_row(name: str, errors: dict[str, SegmentErrors]) -> None:
     """A row: translational error [%] of each sequence, of all, of those without gaps, and rotation [°/km]."""
     every, counted = joined(list(errors.values())), [e for s, e in errors.items() if s not in WITH_GAPS]
     cells = [f"{100 * e.translation.mean():.2f}" if len(e.translation) else "–" for e in errors.values()]
@@ -158,11 +156,6 @@ def described(tuning: Tuning) -> str:
     return "/".join(f"{getattr(tuning, name):g}" for name in FACTORS)
 
 
-def preset(name: str) -> ImuSpec:
-    """An IMU of conf/imu."""
-    return imu_spec(read_yaml(config_dir() / "imu" / f"{name}.yaml"))
-
-
 def main() -> None:
     """Run, choose, print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -170,7 +163,7 @@ def main() -> None:
     parser.add_argument("--imu", default="tactical_oxts", help="settings of the filters with constants")
     parser.add_argument("--models", nargs="+", default=["mbkf21_nhc", "mbkf21_car"], help="with constants")
     options = parser.parse_args()
-    folder, spec = options.real / "kitti", preset(options.imu)
+    folder, spec = options.real / "kitti", imu_preset(options.imu)
     names = {row.name: row.group.removeprefix("kitti-2011-") for row in read_drives(folder)}
     chosen = {name: SEQUENCES[group] for name, group in names.items() if group in SEQUENCES}
     sequence = list(chosen.values())
@@ -182,16 +175,16 @@ def main() -> None:
     print(f"| filter | {' | '.join(sorted(set(sequence)))} | all [%] | without gaps [%] | rotation [°/km] |")
     print(f"|:--|{'--:|' * (len(set(sequence)) + 3)}")
     for model in ("ins", "plus"):
-        say(model, by_sequence(errors_of(batch, resolve_model(model, spec)), sequence))
+        print_row(model, by_sequence(errors_of(batch, resolve_model(model, spec)), sequence))
     for model in options.models:
         tunings = candidates()
         errors = [errors_of(batch, resolve_model(model, spec, tuning=tuning)) for tuning in tunings]
-        say(f"{model}, default constants", by_sequence(errors[0], sequence))
+        print_row(f"{model}, default constants", by_sequence(errors[0], sequence))
         best = left_out_best(errors, sequence)
         held_out = [errors[best[s]][k] for k, s in enumerate(sequence)]
-        say(f"{model}, constants of the other sequences", by_sequence(held_out, sequence))
+        print_row(f"{model}, constants of the other sequences", by_sequence(held_out, sequence))
         at = min(range(len(tunings)), key=lambda c: float(np.mean(joined(errors[c]).translation)))
-        say(f"{model}, constants of these sequences (a bound)", by_sequence(errors[at], sequence))
+        print_row(f"{model}, constants of these sequences (a bound)", by_sequence(errors[at], sequence))
         print(f"  best of {len(tunings)} on all: {described(tunings[at])}; on the other sequences, for each:")
         print("  " + "; ".join(f"{s} {described(tunings[k])}" for s, k in sorted(best.items())), flush=True)
 

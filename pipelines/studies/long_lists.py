@@ -50,7 +50,7 @@ class Cost(NamedTuple):
     memory_GB: float
 
 
-def listed(source: Path, out: Path, hours: float) -> int:
+def link_drives(source: Path, out: Path, hours: float) -> int:
     """The drives of ``source`` linked under new names until there are ``hours``; how many they are."""
     known = pd.read_parquet(source / "drives.parquet").to_dict("records")
     rows, seconds = [], 0.0
@@ -67,7 +67,7 @@ def listed(source: Path, out: Path, hours: float) -> int:
     return len(rows)
 
 
-def shortened(source: Path, out: Path, minutes: float) -> Path:
+def cut_drives(source: Path, out: Path, minutes: float) -> Path:
     """Every drive of a dataset cut into drives of so many minutes."""
     rows = []
     known = {row["drive"]: row for row in pd.read_parquet(source / "drives.parquet").to_dict("records")}
@@ -106,12 +106,12 @@ def main() -> None:
     arguments.add_argument("--repeats", type=int, default=1)
     o = arguments.parse_args()
     with tempfile.TemporaryDirectory(dir=o.dataset.parent) as home:
-        sources = [o.dataset] + ([shortened(o.dataset, Path(home) / "short", o.minutes)] if o.minutes else [])
+        sources = [o.dataset] + ([cut_drives(o.dataset, Path(home) / "short", o.minutes)] if o.minutes else [])
         print("| work | hours | drives | processor [s] | clock [s] | memory [GB] |\n|:--|--:|--:|--:|--:|--:|")
         for hours in o.hours:
             for k, source in enumerate(sources):
                 data = Path(home) / f"{k}-{hours:g}"
-                count = listed(source, data, hours)
+                count = link_drives(source, data, hours)
                 for work in o.works:
                     runs = []
                     for repeat in range(o.repeats):

@@ -5,8 +5,7 @@
 Car-like drives at 100 Hz whose IMU is made by python-ins' inverse mechanisation, with the errors of the preset
 ``consumer``, RTK at 1 Hz (0.02 m, 0.05 m/s) and outages of 60 s. Both filters start from the same wrong state with
 the same P₀, and have the same Q, R and masks. Theirs, ``pyins.filters.run_feedback_filter``, takes minutes per
-drive, and what it found is kept in ``out``; ``--step 0.5`` is five times as fast. ``table.md`` and ``parity.png``
-hold the result.
+drive, and what it found is kept in ``out``; ``--step 0.5`` is five times as fast. ``table.md`` holds the result.
 """
 
 from __future__ import annotations
@@ -22,15 +21,13 @@ import numpy as np
 import pandas as pd
 import pyins
 import torch
-import yaml
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pyins import filters, inertial_sensor, measurements, sim, strapdown
 from pyins.util import ACCEL_COLS, GYRO_COLS, LLA_COLS, RPH_COLS, VEL_COLS
 from rich.console import Console
 
-from dlkf.base.config import config_dir
 from dlkf.base.files import write_into
+from dlkf.command.composing import imu_preset
 from dlkf.data.drive import Batch
 from dlkf.data.masks import withhold_fixes
 from dlkf.data.schema import ACCEL, GYRO, new_dataset, write_drive, write_drives_table
@@ -38,7 +35,6 @@ from dlkf.data.segments import StartLaw, cut_segments, make_batch
 from dlkf.data.store import load_dataset
 from dlkf.data.tables import Columns
 from dlkf.evaluation.bootstrap import compare
-from dlkf.evaluation.figures import COLOURS, png
 from dlkf.evaluation.table import ResultTable, as_markdown, as_rich, format_number
 from dlkf.filters.build import build_causal, build_filter
 from dlkf.filters.integration import integrate
@@ -46,7 +42,7 @@ from dlkf.filters.model_based import Ins, Mbkf
 from dlkf.navigation.attitude import rpy_from_rotation
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
-from dlkf.navigation.imu_errors import ImuSpec, imu_spec
+from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.state import NavState
 from dlkf.simulation.imu import corrupt, draw_unit
 from dlkf.simulation.motion.routes import VehicleConfig
@@ -69,11 +65,6 @@ class Result(NamedTuple):
     theirs: Array
     theirs_s: float
     hidden: NDArray[np.bool_]
-
-
-def preset(name: str) -> ImuSpec:
-    """An IMU preset of ``conf/imu``."""
-    return imu_spec(yaml.safe_load((config_dir() / "imu" / f"{name}.yaml").read_text()))
 
 
 def write_drives(folder: Path, spec: ImuSpec, drives: int, minutes: float) -> None:
@@ -217,18 +208,6 @@ def perfect_drift(folder: Path, rate_hz: float) -> float:
     return float((solution.posterior.p_n - batch.truth.p_n)[:, -1, :2].norm(dim=-1).max())
 
 
-def rates(folder: Path, spec: ImuSpec, states: int) -> tuple[float, float]:
-    """IMU epochs per second of ours: one segment of five minutes, and 64 at once; best of three."""
-    drives = load_dataset(folder, rate_hz=float(RATE), dtype=torch.float64)
-    segments = cut_segments(drives, 300.0)
-    out = []
-    for n in (1, 64):
-        batch = make_batch(drives, (segments * n)[:n], dtype=torch.float64, start=START)
-        best = min(ours(batch, spec, states, score=False)[1] for _ in range(3))
-        out.append(n * 300 * RATE / best)
-    return out[0], out[1]
-
-
 def run(folder: Path, kept: Path, drive: int, spec: ImuSpec, states: int, step_s: float) -> Result:
     """Both filters over one drive; theirs from what is kept of an earlier run, where it was run."""
     loaded = load_dataset(folder, rate_hz=float(RATE), dtype=torch.float64, drives=[f"parity-{drive:02d}"])
@@ -278,32 +257,6 @@ def table_of(results: dict[int, list[Result]], minutes: float) -> ResultTable:
     )  # fmt: skip
 
 
-def figure(results: dict[int, list[Result]]) -> Figure:
-    """Error at the end of every outage, ours against theirs, and through an outage, RMS over all."""
-    out = Figure(figsize=(10, 4.6), layout="constrained")
-    ends_ax, growth_ax = out.subplots(1, 2)
-    for (states, runs), colour, marker in zip(results.items(), COLOURS, "os^"):
-        ends = [outage_ends(r.hidden) for r in runs]
-        a, b = (np.concatenate([getattr(r, x)[e] for r, e in zip(runs, ends)]) for x in ("ours", "theirs"))
-        ends_ax.loglog(b, a, marker, color=colour, ms=5, alpha=0.8, lw=0, label=f"{states} states")
-        t = np.arange(1, OUTAGE_S + 1)
-        for x, style in (("ours", "-"), ("theirs", ":")):
-            rows = np.stack([getattr(r, x)[e - OUTAGE_S + 1 : e + 1] for r, es in zip(runs, ends) for e in es])
-            width = 1.2 if x == "ours" else 3.0
-            growth = np.sqrt(np.mean(rows**2, 0))
-            growth_ax.plot(t, growth, style, color=colour, lw=width, label=f"{states} states, {x}")
-    limits = ends_ax.get_xlim()
-    ends_ax.plot(limits, limits, color="#777777", lw=0.8, zorder=0)
-    ends_ax.set(xlabel="Theirs, at the end of an outage [m]", ylabel="Ours [m]", title="Every outage")
-    growth_ax.set(xlabel="Time without GNSS [s]", ylabel="Horizontal RMS [m]", title="All outages")
-    for ax in (ends_ax, growth_ax):
-        ax.grid(color="#EEEEEE", lw=0.8)
-        ax.set_axisbelow(True)
-        ax.spines[["top", "right"]].set_visible(False)
-        ax.legend(frameon=False, fontsize=9)
-    return out
-
-
 def main() -> int:
     """Simulate, run what was not run, print."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -316,13 +269,13 @@ def main() -> int:
     arguments.add_argument("--threads", type=int, default=1)
     o = arguments.parse_args()
     torch.set_num_threads(o.threads)
-    console, spec = Console(width=150), preset(o.imu)
+    console, spec = Console(width=150), imu_preset(o.imu)
     kept = o.out / f"{o.imu}-{o.drives}x{o.minutes:g}min"
     folder, perfect = kept / "drives", kept / "perfect"
     if not folder.is_dir():
         write_drives(folder, spec, o.drives, o.minutes)
     if not perfect.is_dir():
-        write_drives(perfect, preset("perfect"), 1, o.minutes)
+        write_drives(perfect, imu_preset("perfect"), 1, o.minutes)
     results: dict[int, list[Result]] = {}
     for drive in range(o.drives):
         for states in o.states:
@@ -334,19 +287,12 @@ def main() -> int:
                 f"theirs {rms(r.theirs[ends]):.3f} m; {r.ours_s:.1f} s and {r.theirs_s:.1f} s"
             )
     table = table_of(results, o.minutes)
-    columns = ["States", "one drive", "64 at once", "times"]
-    speed = ResultTable("Ours, 5 minutes at 100 Hz, IMU epochs per second", "", columns, [])
-    for states in o.states:
-        one, many = rates(folder, spec, states)
-        speed.rows.append([f"{states}", f"{one:,.0f}", f"{many:,.0f}", f"{many / one:.1f}"])
-    text = "\n".join(map(as_markdown, (table, speed)))
+    text = as_markdown(table)
     drift = " and ".join(f"{perfect_drift(perfect, hz):.4f} m at {hz} Hz" for hz in (50, 100))
     text += f"\nError-free IMU, exact start, 60 s without GNSS: at most {drift}, horizontal.\n"
     with write_into(o.out) as beside:
         (beside / "table.md").write_text(text)
-        (beside / "parity.png").write_bytes(png(figure(results)))
-    for shown in (table, speed):
-        console.print(as_rich(shown))
+    console.print(as_rich(table))
     console.print(text.splitlines()[-1])
     return 0
 

@@ -7,7 +7,7 @@
 Makes the test sets that are missing (below ``--data``), runs every filter compiled over segments with GNSS for 60, 300
 and 900 s and then none for 120 s (real drives: 30 or 60 s), and writes ``table.md`` and ``manifest.json`` (commit,
 seeds, settings and digest of every dataset). Errors are horizontal, at the end of the outage, RMS / geometric mean [m].
-The rivals begin with ``imu=automotive_mems`` and constants from ``conf/tuning``. The ratio is to the best of them by
+The baselines start from ``imu=automotive_mems`` and constants from ``conf/tuning``. The ratio is to the best of them by
 the geometric mean of that row, a choice with hindsight; [ ] is its 95 % interval over recordings. Beside them stands
 ``imu=auto``, whose noise is found on the very drives that are scored, with all their fixes. Last come, over all rows,
 every filter's errors, mean NEES, and the ratio of ``plus`` to it over all outages, by recordings.
@@ -33,12 +33,11 @@ from pathlib import Path
 import numpy as np
 import torch
 import yaml
-from pipelines.studies.parity import preset, write_drives
+from pipelines.studies.parity import write_drives
 
-from dlkf.base.config import config_dir
 from dlkf.base.errors import InputError
 from dlkf.base.provenance import describe_provenance
-from dlkf.command.composing import imu_preset
+from dlkf.command.composing import imu_preset, tuning_preset
 from dlkf.command.simulated import compose_recipe
 from dlkf.data.alignment import ALIGN
 from dlkf.data.drive import Batch, Drive
@@ -147,7 +146,7 @@ def simulate_sets(data: Path, real: Path | None, wanted: Collection[str]) -> Non
                 chassis.TONES = with_tones
     for name, imu in PYTHON_INS.items():
         if name in wanted and not (data / name).is_dir():
-            write_drives(data / name, preset(imu), 4, 18)
+            write_drives(data / name, imu_preset(imu), 4, 18)
     for name, (imu, seed) in INJECTED.items() if real is not None else ():
         if name in wanted and not (data / name).is_dir():
             words = [f"source={real}/kitti", f"imu={imu}", f"seed={seed}", f"out={data / name}"]
@@ -205,9 +204,9 @@ def constants() -> dict[str, Estimator]:
     found = {}
     for name, tunings in CONSTANTS.items():
         for tuning in tunings:
-            values = yaml.safe_load((config_dir() / "tuning" / f"{tuning}.yaml").read_text())
-            values.pop("defaults")  # untuned: defaults for the rest
-            found[f"{name} {tuning}"] = build_causal(name, imu_preset("automotive_mems"), "no", tuning=Tuning(**values))
+            found[f"{name} {tuning}"] = build_causal(
+                name, imu_preset("automotive_mems"), "no", tuning=tuning_preset(tuning)
+            )
     return found
 
 
@@ -281,15 +280,25 @@ def score(case: Case, filters: Mapping[str, Estimator]) -> list[Row]:
 def markdown(rows: Sequence[Row]) -> list[str]:
     """RMS / geometric mean of every filter, ratios of ``plus`` to the best other one without ``auto``, its NEES."""
     after = [name for name in rows[0].errors if name.endswith(" auto")]
-    rivals = [name for name in rows[0].errors if name != "plus" and name not in after]
-    head = ["data", "GNSS [s]", "outage [s]", "outages (recordings)", *rivals, "plus", "RMS ratio", "geometric", "NEES"]
+    baselines = [name for name in rows[0].errors if name != "plus" and name not in after]
+    head = [
+        "data",
+        "GNSS [s]",
+        "outage [s]",
+        "outages (recordings)",
+        *baselines,
+        "plus",
+        "RMS ratio",
+        "geometric",
+        "NEES",
+    ]
     head += after
     lines = [f"| {' | '.join(head)} |", f"|:--|{'--:|' * (len(head) - 1)}"]
     for row in rows:
-        best = min(rivals, key=lambda f: mean_error(row.errors[f], "log"))
+        best = min(baselines, key=lambda f: mean_error(row.errors[f], "log"))
         cells = [row.name, str(row.before_s), str(row.length_s), f"{len(row.groups)} ({len(set(row.groups))})"]
         errors = {n: f"{mean_error(e, 'rms'):.1f} / {mean_error(e, 'log'):.2f}" for n, e in row.errors.items()}
-        cells += [f"**{errors[name]}**" if name == best else errors[name] for name in (*rivals, "plus")]
+        cells += [f"**{errors[name]}**" if name == best else errors[name] for name in (*baselines, "plus")]
         for statistic in ("rms", "geomean"):
             c = compare(row.errors["plus"], row.errors[best], statistic=statistic, groups=row.groups)
             band = "" if np.isnan(c.ratio_low) else f" [{c.ratio_low:.2f}, {c.ratio_high:.2f}]"
@@ -383,8 +392,8 @@ def main() -> None:
     for name, folder in folders.items():
         drives, digests[name] = load(folder), dataset_digest(folder)
         found = {} if options.no_auto or options.parts else found_noise(drives)
-        rivals = parts(options.model) if options.parts else {**constants(), **found}
-        filters = {**rivals, "plus": trained_filter(options.model)}
+        baselines = parts(options.model) if options.parts else {**constants(), **found}
+        filters = {**baselines, "plus": trained_filter(options.model)}
         for case in real_cases(name, drives) if name in REAL else simulated_cases(name, drives):
             rows += score(case, filters)
             print("\n".join(markdown(rows[-1:])[2:]), flush=True)

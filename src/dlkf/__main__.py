@@ -19,7 +19,7 @@ from dlkf.base.errors import did_you_mean
 COMMANDS = {
     "simulate": "drives with known truth, as a dataset",
     "ingest": "foreign logs into a dataset",
-    "doctor": "what is good and bad about a dataset",
+    "doctor": "checks of a dataset before a filter runs",
     "navigate": "a filter over whole drives, from IMU and GNSS alone: solution, map, exports",
     "evaluate": "filters against each other on drives with a reference: tables, report",
     "export": "a filter for a vehicle, as C without libraries",

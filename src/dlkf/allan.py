@@ -15,7 +15,7 @@ from dlkf.command.settings import AllanSettings
 from dlkf.data.tables import read_drives
 from dlkf.data.validate import read_imu
 from dlkf.diagnosis.allan import noise_preset
-from dlkf.diagnosis.allan_report import analyse, chosen, noise_table, part, write_allan
+from dlkf.diagnosis.allan_report import analyse, choose_drive, noise_table, part, write_allan
 from dlkf.evaluation.table import as_rich
 from dlkf.navigation.imu_errors import imu_spec
 
@@ -24,7 +24,7 @@ from dlkf.navigation.imu_errors import imu_spec
 def main(settings: AllanSettings) -> None:
     """Read, check that the IMU is at rest, fit, write, print."""
     name, base = settings.name, imu_spec(settings.imu)
-    drive = chosen([row.name for row in read_drives(settings.dataset)], settings.drive)
+    drive = choose_drive([row.name for row in read_drives(settings.dataset)], settings.drive)
     imu, rate = part(read_imu(settings.dataset, drive), settings.from_s, settings.to_s)
     log = analyse(drive, imu, rate, base)
     source = f"Allan deviation of {drive}, {log.duration_s / 3600:.3g} h at rest; all else from {base.name}"

@@ -1,4 +1,4 @@
-"""What is good and bad about a recording, before anything runs: ``dlkf doctor dataset=data/town``.
+"""Checks of a recording before a filter runs: ``dlkf doctor dataset=data/town``.
 
 Prints a line per finding and drive; exit code 0 where nothing is bad, 1 where something is, 2 where it cannot be read.
 """

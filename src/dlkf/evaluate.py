@@ -20,12 +20,12 @@ from dlkf.command import command
 from dlkf.command.scored import EvaluateSettings
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import choose_aids, dataset_digest, drive_rows
+from dlkf.evaluation.chunks import EvaluationJob, evaluate_chunks
 from dlkf.evaluation.outages import check_outages
 from dlkf.evaluation.protocol import REFUSED
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.sensors import sensor_table
-from dlkf.evaluation.shares import EvaluationJob, evaluate_chunks
 from dlkf.evaluation.study import results_of
 from dlkf.evaluation.summary import FEW, headline, metrics_of, sigma_warnings
 from dlkf.evaluation.table import ResultTable, all_tables, as_markdown, as_rich, result_tables
@@ -130,7 +130,7 @@ def main(settings: EvaluateSettings) -> None:
     for line in sigma_warnings(done.scores):
         console.print(line, style="yellow", highlight=False, soft_wrap=True)
     if segments and any(0 < int(r.count.get("outages") or 0) < FEW for r in results):
-        console.print("Few outages; mode=drives has them over all of every drive, about twice as many.", style="yellow")
+        console.print("Few outages; mode=drives scores whole drives, with about twice as many.", style="yellow")
     save_log(console, settings.out)
     kept = ""
     if settings.tracking.log:

@@ -68,7 +68,7 @@ def main(settings: ExportSettings) -> None:
         else:
             lines = check_export(Path(somewhere), folder, model, grid, layout, tables, drive, settings.latency)
     arm = " ".join(f"{x:g}" for x in tables.row.lever_arm_b)
-    print(f"{short_name(settings.model)} as C in {settings.out}: dlkf.h says how")
+    print(f"{short_name(settings.model)} as C in {settings.out}: dlkf.h describes the calls")
     print("\n".join(lines))
     if not is_url(settings.out):
         print(f"Try it: cd {shlex.quote(settings.out)} && cmake -B build && cmake --build build "

@@ -62,7 +62,7 @@ def main(settings: NavigateSettings) -> None:
     for line in domain_warnings({name: model}, settings.dataset, spacings, spec.name, grid["rate_hz"]):
         print(line)
     if spec.name != AUTO and not takes_imu_preset(settings.model) and (unused := typed_words("imu", "tuning")):
-        print(f"{name} takes no noise: {' '.join(unused)} changes nothing; a Kalman filter would take it")
+        print(f"{name} has its own noise: {' '.join(unused)} has no effect; it sets that of Kalman filters")
     skipped: dict[str, str] | None = {} if settings.skip_unaligned else None
     if settings.streaming and (ahead := "smoother" if settings.smoother else "imu=auto" if spec.name == AUTO else ""):
         raise InputError(f"{ahead} looks ahead, a stream cannot: give {ahead} or streaming, not both")

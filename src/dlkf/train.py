@@ -55,7 +55,7 @@ def main(config: dict[str, Any]) -> None:
     for line in left_out_drives(settings, data):
         console.print(f"left out: {line}", style="yellow", highlight=False)
     if state:
-        console.print(f"going on with the unfinished run in {folder}")
+        console.print(f"resuming the unfinished run in {folder}")
     name = run_name(given.name, HydraConfig.get().overrides.task)
     parent = os.environ.get(PARENT_RUN)
     begun = {"parent_run_id": parent, "run_id": state.get("run_id"), "system_metrics": tracking.system_metrics}

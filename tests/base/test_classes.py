@@ -119,7 +119,7 @@ HOOK = "# @package _global_\nhydra: {callbacks: {x: {_target_: pathlib.Path.touc
         ("[" * 5000, "nested too deeply"),
         ("&a [*a]", "aliases"),
         (BOMB, "aliases"),
-        (HOOK, "found.yaml: names under hydra what Hydra is to call"),
+        (HOOK, "found.yaml: names a class or function for Hydra to call"),
     ],
 )
 def test_a_preset_that_hydra_would_choke_on_or_run(text, said, tmp_path, call):

@@ -162,7 +162,7 @@ def test_one_line_where_a_store_cannot_be_had(server, monkeypatch):
     monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
     monkeypatch.setenv("HOME", "/nowhere")
     fsspec.filesystem("s3").clear_instance_cache()
-    with pytest.raises(InputError, match=r"^s3://drives/x: the store says: Unable to locate credentials"):
+    with pytest.raises(InputError, match=r"^s3://drives/x: store error: Unable to locate credentials"):
         require_empty("s3://drives/x", overwrite=False)
     fsspec.filesystem("s3").clear_instance_cache()
 

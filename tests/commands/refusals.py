@@ -6,13 +6,7 @@ from pathlib import Path
 
 DRIVE = "town-3-00001"  # the second of two: nothing of the first may be written either
 FAST = {
-    "evaluate": (
-        "rate_hz=10",
-        "length_s=60",
-        "outage.first_s=20",
-        "outage.duration_s=20",
-        "injected_bias=null",
-    ),
+    "evaluate": ("rate_hz=10", "length_s=60", "outage.first_s=20", "outage.duration_s=20", "injected_bias=null"),
     "navigate": ("rate_hz=10",),
 }
 

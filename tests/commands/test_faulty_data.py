@@ -136,7 +136,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "no fix at all": (change("gnss", no_fix), (DRIVE, "no GNSS fix")),
     "a pipe": (as_pipe("imu"), (DRIVE, "is no file")),
     "a pipe in the reference": (as_pipe("reference"), (DRIVE, "is no file")),
-    "a column twice": (column_twice, (DRIVE, "gyro_x stands twice")),
+    "a column twice": (column_twice, (DRIVE, "gyro_x appears twice")),
     "a name of 300 letters": (in_drives("drive", "x" * 300), ("at most 200 bytes",)),
     "another clock": (change("gnss", lambda t: t.assign(t=t["t"] + 1e6)), (DRIVE, "same clock")),
 }

@@ -37,11 +37,7 @@ def logs(tmp_path_factory):
 def test_a_line_for_each_drive(call, logs):
     done = call("ingest", "reader=csv", f"source={logs}/csv", "out=town", *STDS)
     assert done.code == 0, done.err
-    for expected in (
-        "monday: 30.0 s, ",
-        " km, IMU 100 Hz, largest gap 10 ms",
-        "GNSS 1 Hz, 31 fixes (RTK fixed 100 %)",
-    ):
+    for expected in ("monday: 30.0 s, ", " km, IMU 100 Hz, largest gap 10 ms", "GNSS 1 Hz, 31 fixes (RTK fixed 100 %)"):
         assert expected in done.out
     assert "town: 2 drives" in done.out
 

@@ -23,13 +23,7 @@ from dlkf.data.validate import validate_dataset
 from tests.shell import PATIENCE_S, start_command
 
 pytestmark = pytest.mark.whole
-SIMULATE = (
-    "simulate",
-    "dataset=one_imu",
-    "out=made/town",
-    "dataset.drive_minutes=1",
-    "dataset.imu_rate_hz=50",
-)
+SIMULATE = ("simulate", "dataset=one_imu", "out=made/town", "dataset.drive_minutes=1", "dataset.imu_rate_hz=50")
 ENOUGH = "dataset.hours=100"  # hours of work that nobody waits for
 
 

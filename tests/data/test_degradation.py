@@ -13,7 +13,7 @@ from tests.cars import write_cars
 
 def test_noise_is_white_of_its_size_and_in_the_stds(tmp_path):
     (drive,) = load_dataset(write_cars(tmp_path / "town", 1, seconds=300.0), dtype=torch.float64)
-    noisy = GnssNoise(2.0, 0.5).added(drive, seed=3)
+    noisy = GnssNoise(2.0, 0.5).add_noise(drive, seed=3)
     seen = drive.gnss_valid.all(-1)
     moved = torch.cat((noisy.gnss_r_e - drive.gnss_r_e, noisy.gnss_v_e - drive.gnss_v_e), -1)[seen]
     # 300 fixes × 3 axes: the standard error of a std is 1/√1800 of it; five of them
@@ -21,7 +21,7 @@ def test_noise_is_white_of_its_size_and_in_the_stds(tmp_path):
     step = moved[1:] * moved[:-1]
     assert (step.mean(0).abs() < 5 * step.std(0) / len(step) ** 0.5).all()
     assert torch.allclose(noisy.gnss_std[:, :3] ** 2, drive.gnss_std[:, :3] ** 2 + 4.0)
-    again, other = (GnssNoise(2.0, 0.5).added(drive, seed=s) for s in (3, 4))
+    again, other = (GnssNoise(2.0, 0.5).add_noise(drive, seed=s) for s in (3, 4))
     assert torch.equal(again.gnss_r_e[seen], noisy.gnss_r_e[seen]) and not torch.equal(other.gnss_r_e, noisy.gnss_r_e)
 
 

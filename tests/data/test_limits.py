@@ -138,10 +138,10 @@ def change(kind: str, column: str, rows, by):
 REFUSED = {
     "accelerations": (change("imu", "accel_x", slice(0, None, 50), lambda x: x + 1e6), "120 of 6000 samples.*400 m/s²"),
     "a run of them": (change("imu", "accel_x", slice(3000, 3040), lambda x: x + 1e6), "IMU gap.*41 samples beyond"),
-    "velocities": (change("gnss", "vel_n", slice(None), lambda x: 1000 * x), "fixes cannot be.*a velocity of"),
+    "velocities": (change("gnss", "vel_n", slice(None), lambda x: 1000 * x), "fixes are impossible.*a velocity of"),
     "a jump": (change("gnss", "lat_deg", slice(30, None), lambda x: x + 2.7), "positions jump by 300 km before t = 40"),
-    "frozen": (change("gnss", "lat_deg", slice(None), lambda x: 0 * x + 48.7), "fixes cannot be.*frozen receiver"),
-    "1σ": (change("gnss", "std_pos_n", slice(None), lambda x: x + 1e30), "fixes cannot be.*1σ beyond"),
+    "frozen": (change("gnss", "lat_deg", slice(None), lambda x: 0 * x + 48.7), "fixes are impossible.*frozen receiver"),
+    "1σ": (change("gnss", "std_pos_n", slice(None), lambda x: x + 1e30), "fixes are impossible.*1σ beyond"),
 }
 
 

@@ -91,7 +91,7 @@ BAD = {
     "nan in the IMU": (_set("imu", "gyro_y", _at(17, np.nan)), "row 17: gyro_y is nan"),
     "inf in the IMU": (_set("imu", "accel_x", _at(18, np.inf)), "row 18: accel_x is inf"),
     "time goes back": (_set("imu", "t", _at(100, 0.5)), "row 100: t goes back"),
-    "duplicate stamp": (_set("imu", "t", lambda t: _at(100, t[99])(t)), "row 100: t = 1.0.* stands twice"),
+    "duplicate stamp": (_set("imu", "t", lambda t: _at(100, t[99])(t)), "row 100: t = 1.0.* appears twice"),
     "ms taken for s": (_set("imu", "t", lambda t: 1000 * t), "row.* a second, an IMU has 1 to 10000: .*imu.time.unit"),
     "ns taken for s": (_set("imu", "t", lambda t: 1e9 * t), "reader.imu.time.unit"),
     "s taken for us": (_set("imu", "t", lambda t: 1e-6 * t), "reader.imu.time.unit"),
@@ -168,7 +168,7 @@ def test_missing_parts(tmp_path, tables):
     assert f"drive {NAME}: imu/drive={NAME}/ has no Parquet file" in _complaint(tmp_path)
     row = {"drive": NAME}
     write_drives_table(tmp_path, [row, row])
-    assert "stands twice" in _complaint(tmp_path)
+    assert "appears twice" in _complaint(tmp_path)
 
 
 def test_what_a_source_does_not_know_may_be_nan(tmp_path, tables):

@@ -106,7 +106,7 @@ def test_a_ubx_log_without_its_last_bytes_says_so(tmp_path):
     ("keep", "said"),
     [
         (50, "drive.ubx: has no NAV-PVT message; .* message cut off, so copy the log again"),
-        (4000, "drive.ubx has [12] fix.*, which are no motion of a car; drive.ubx: the last message is cut off"),
+        (4000, "drive.ubx has [12] fix.*, which are not the motion of a car; drive.ubx: the last message is cut off"),
     ],
 )
 def test_hardly_anything_of_a_ubx_log_is_one_line(keep, said, tmp_path):

@@ -37,7 +37,7 @@ def test_evaluate_leaves_a_report(uri, tmp_path, monkeypatch):
     assert process.exitcode == 0, out
     assert "town (simulated): 6 outages of 10 to 20 s, 6 drives" in out
     assert " without GNSS, 6 outages: " in out
-    assert "mode=drives has them over all of every drive" in " ".join(out.split())
+    assert "mode=drives scores whole drives" in " ".join(out.split())
     content = json.loads((tmp_path / "report" / "metrics.json").read_text())
     assert content["protocol"]["mode"] == "segments" and content["protocol"]["imu"] == "consumer"
     assert content["protocol"]["refused beyond physical limits"] == {"car-01": "1 fix"}

@@ -20,9 +20,9 @@ from dlkf.data.kinds import drive_kinds
 from dlkf.data.masks import BiasLaw
 from dlkf.data.segments import StartLaw
 from dlkf.data.store import drive_rows, load_dataset
+from dlkf.evaluation.chunks import EvaluationJob, evaluate_chunks
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Protocol, Scenes, spread_evenly
-from dlkf.evaluation.shares import EvaluationJob, evaluate_chunks
 from dlkf.evaluation.study import run_comparison
 from dlkf.evaluation.table import all_tables
 from dlkf.filters.build import build_filter
@@ -297,11 +297,7 @@ def test_models_by_name_and_folder(tmp_path):
     assert list(models) == ["ins", "mbkf15", "mbkf15#2"] and models["mbkf15"].tuning.accel_noise == 2.0
     prior = Prior([0.0] * 6, [1.0] * 6)
     assert resolve_model("mbkf15_prior", IMU, prior=prior).prior is prior
-    for spec, said in (
-        ("mbkf99", "ins, mbkf15"),
-        (str(tmp_path), "no config.yaml"),
-        ("mbkf15_prior", "prior"),
-    ):
+    for spec, said in (("mbkf99", "ins, mbkf15"), (str(tmp_path), "no config.yaml"), ("mbkf15_prior", "prior")):
         with pytest.raises(InputError, match=said):
             resolve_model(spec, IMU)
     (tmp_path / "model.pkl").write_bytes(b"\x80\x04")

@@ -48,7 +48,7 @@ def test_a_refused_position_agrees_with_one_as_far_off():
     assert judged(50.0, 50.0 - limit - 0.01, 2)[0] == 1
 
 
-def test_p_is_opened_by_what_contradicts_it():
+def test_p_is_inflated_by_what_contradicts_it():
     """At the last of the agreeing refusals: by z² in itself, and all of it by the mean of z²/S over the components."""
     kept = judged(12.0, 12.0, PATIENCE - 2)[1]
     assert float(kept.factor) == 1.0 and not kept.shift.any() and not kept.passed.any()
@@ -56,7 +56,7 @@ def test_p_is_opened_by_what_contradicts_it():
     assert left == PATIENCE and float(opened.factor) == pytest.approx(12.0**2 / 4 / 3)
     assert opened.shift[0].tolist() == [144.0, 0, 0, 0, 0, 0] and opened.passed[0].tolist() == [True] * 3 + [False] * 3
     P = torch.eye(9, dtype=opened.factor.dtype)[None]
-    assert opened.opened(P)[0].diagonal().tolist() == pytest.approx([156.0, *[12.0] * 8])
+    assert opened.inflated(P)[0].diagonal().tolist() == pytest.approx([156.0, *[12.0] * 8])
 
 
 def test_a_filter_that_has_moved_follows_the_next_fixes_at_once():

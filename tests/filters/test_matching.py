@@ -60,10 +60,10 @@ def test_means_are_true_ones_first_and_fade_later():
     known = Matching.begin(one, 1)
     used = torch.ones(1, 6, dtype=torch.bool)
     for k in range(4):
-        known = known.innovated(one * k, used)
+        known = known.update(one * k, used)
     assert torch.allclose(known.innovations, torch.tensor((0 + 1 + 4 + 9) / 4, dtype=torch.float64))
     for _ in range(30):
-        known = known.innovated(0 * one, used)
+        known = known.update(0 * one, used)
     short, long = known.innovations[0, :, 0]
     assert float(long) == pytest.approx(14 / 34) and float(short) < 0.1 * float(long) * 3
 

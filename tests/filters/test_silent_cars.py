@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
+
 import numpy as np
 import pandas as pd
 import pytest
 import torch
-from pipelines.studies.parity import POSITION_STD, RATE, START, VELOCITY_STD, preset
-from pipelines.studies.standstills import watched
+from pipelines.studies.parity import POSITION_STD, RATE, START, VELOCITY_STD
 from pyins import sim
 from pyins.util import ACCEL_COLS, GYRO_COLS, LLA_COLS, VEL_COLS
 
+from dlkf.command.composing import imu_preset
 from dlkf.data.masks import withhold_fixes
 from dlkf.data.schema import write_drive, write_drives_table
 from dlkf.data.segments import cut_segments, make_batch
 from dlkf.data.store import load_dataset
 from dlkf.filters.build import build_filter
+from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.plus import ANY_MEMS, START_TUNING
 from dlkf.filters.shipped import trained_filter
 from dlkf.filters.tuning import Tuning
@@ -46,7 +49,7 @@ def silent_drive(folder, seed: int, speed: float, straight: bool) -> dict:
     v_n = v[:, None] * np.stack((np.cos(yaw), np.sin(yaw), 0 * yaw), -1)
     rpy = np.stack((0 * yaw, 0 * yaw, yaw), -1)
     trajectory, imu = sim.generate_imu(t, (50.0, 8.0, 200.0), np.degrees(rpy), v_n, "increment")
-    spec = preset("consumer")
+    spec = imu_preset("consumer")
     exact = imu[[*ACCEL_COLS, *GYRO_COLS]].to_numpy()[1:] * RATE
     measured, error = corrupt(errors, exact, spec, draw_unit(unit, spec), RATE)
     each = trajectory.iloc[::RATE]
@@ -79,6 +82,19 @@ def silent(tmp_path_factory):
     return withhold_fixes(batch, hidden), torch.nonzero(hidden[:-1] & ~hidden[1:]).flatten()
 
 
+@dataclass(frozen=True)
+class Watched(CarConstraints):
+    """Constraints that record in which windows they take the car for stationary, and may leave that unused."""
+
+    used: bool = True
+    seen: list[torch.Tensor] = field(default_factory=list)
+
+    def resting(self, epoch, turning, prediction, memory):
+        found, level = super().resting(epoch, turning, prediction, memory)
+        self.seen.append(found)
+        return found & self.used, level
+
+
 def classical():
     """``mbkf21_car`` for an IMU of which nothing is known, and so unsure of its speed after a minute."""
     return build_filter("mbkf21_car", imu_spec(ANY_MEMS), tuning=Tuning(**START_TUNING))
@@ -98,12 +114,14 @@ def test_straight_on_at_constant_speed_is_no_standstill(silent):
     """Nothing shows the sensors' errors, so the filter drifts; it stops no car, and drifts as without the updates."""
     batch, ends = silent
     speed, errors = batch.truth.v_n.norm(dim=-1), []
-    for rule in ("found", "none"):
-        estimator, eye = watched(classical(), rule, speed < 0.01)
+    for used in (True, False):
+        kalman = classical()
+        eyes = [Watched(s.tuning, s.states, used) for s in kalman.sources if isinstance(s, CarConstraints)]
+        estimator = replace(kalman, sources=(*(s for s in kalman.sources if not isinstance(s, CarConstraints)), *eyes))
         with torch.inference_mode():
             solution = run_filter(batch, estimator)
         errors.append((solution.posterior.p_n - batch.truth.p_n)[:STRAIGHT, ends, :2].norm(dim=-1))
-        seen = torch.stack(eye.seen, 1)
+        seen = torch.stack(eyes[0].seen, 1)
         assert not (seen & (speed > 1.0)).any()
         assert (seen & (speed < 0.01)).any()
     assert (errors[0] < 1.1 * errors[1] + 1.0).all(), errors

@@ -146,22 +146,22 @@ def test_one_sample_an_epoch_has_no_spread():
 
 
 def test_what_is_heard_sets_the_limit_half_way():
-    nothing = VibrationLevel.unheard(torch.zeros(1, dtype=D), 3)
+    nothing = VibrationLevel.begin(torch.zeros(1, dtype=D), 3)
     prior = torch.tensor([3e-3], dtype=D)
     no, yes = torch.zeros(3, dtype=bool), torch.ones(3, dtype=bool)
     torch.testing.assert_close(nothing.limit(prior), prior.expand(3) / APART**0.5)
-    moved = nothing.heard(torch.tensor([4e-2, 4e-3, 4e-4], dtype=D), no, yes, 1.0)
+    moved = nothing.update(torch.tensor([4e-2, 4e-3, 4e-4], dtype=D), no, yes, 1.0)
     torch.testing.assert_close(moved.limit(prior), moved.moving / APART**0.5)
-    both = moved.heard(torch.tensor([1e-3, 1e-3, 1e-3], dtype=D), yes, no, 1.0)
+    both = moved.update(torch.tensor([1e-3, 1e-3, 1e-3], dtype=D), yes, no, 1.0)
     limits = torch.tensor([(4e-2 * 1e-3) ** 0.5, (4e-3 * 1e-3) ** 0.5, 3e-3 / APART], dtype=D)
     torch.testing.assert_close(both.limit(prior), limits)  # the third sounds alike, louder when it stands
 
 
 def test_a_wrong_second_is_forgotten():
     """Multipath that moves a standing car teaches that moving is quiet; later seconds of motion mend it."""
-    heard = VibrationLevel.unheard(torch.zeros(1, dtype=D), 1)
+    heard = VibrationLevel.begin(torch.zeros(1, dtype=D), 1)
     no, yes = torch.zeros(1, dtype=bool), torch.ones(1, dtype=bool)
-    heard = heard.heard(torch.tensor([1e-4], dtype=D), no, yes, 1.0)
+    heard = heard.update(torch.tensor([1e-4], dtype=D), no, yes, 1.0)
     for _ in range(int(5 * MEMORY_S)):
-        heard = heard.heard(torch.tensor([1e-2], dtype=D), no, yes, 1.0)
+        heard = heard.update(torch.tensor([1e-2], dtype=D), no, yes, 1.0)
     assert heard.moving.item() == pytest.approx(1e-2)

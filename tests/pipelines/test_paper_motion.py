@@ -1,21 +1,13 @@
-"""Real motion joined with a unit's errors, and attitude and IMU error swapped where an outage begins."""
+"""Real motion joined with a unit's errors."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
-import pytest
-import torch
-from pipelines.studies import network_lead
 
 from dlkf.command.composing import compose_command
-from dlkf.data.store import load_dataset
-from dlkf.filters.build import build_causal
-from dlkf.filters.model_based import Ins
-from tests.filters.scene import IMU
 
 SCRIPTS = Path(__file__).parents[2] / "pipelines"
 
@@ -53,17 +45,3 @@ def test_the_motion_of_all_sources_is_one_dataset_of_a_unit(monkeypatch, tmp_pat
     assert first["model"] == ["mbkf15", "mbkf21_car", "plus", "mbkf15_prior", "net"]
     assert second["model"] == first["model"][:3] and first["prior"]["mean"] == [0.5] * 6
     assert first["outage"]["duration_s"] == 30 and first["mode"] == "drives" and first["tuning"]["accel_noise"] > 1
-
-
-def test_attitude_and_imu_error_are_swapped_where_the_outage_begins(simulated, monkeypatch):
-    drives = load_dataset(simulated, rate_hz=50, epoch_s=1.0, dtype=torch.float64, progress=None)
-    monkeypatch.setattr(network_lead, "OUTAGE_S", 10)
-    monkeypatch.setattr(network_lead, "MOST", 4)
-    filters = {"mbkf15": build_causal("mbkf15", IMU, ""), "dlkf": Ins()}  # whose IMU error is none
-    ends, errors = network_lead.at_outage(filters, drives, 6)
-    truth = torch.stack([d.ref_imu_error[6, :2] for d in drives])
-    assert errors["dlkf"][1] == pytest.approx(float(truth.square().mean().sqrt()), rel=0.2)
-    assert errors["mbkf15"][1] < errors["dlkf"][1]
-    means = {pair: float(np.mean(x)) for pair, x in ends.items()}
-    assert means["mbkf15", "mbkf15"] < min(means["mbkf15", "dlkf"], means["dlkf", "mbkf15"], means["dlkf", "dlkf"])
-    assert means["dlkf", ""] == pytest.approx(means["dlkf", "dlkf"], rel=0.2)  # INS holds what it has

@@ -11,7 +11,6 @@ from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.results import summarise_scores
 from dlkf.evaluation.table import as_json, format_number
 from dlkf.filters.build import build_filter
-from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from tests.evaluation.scoring import score
 from tests.filters.scene import IMU, scene
 
@@ -48,17 +47,6 @@ def test_what_was_run_and_what_was_not(tmp_path, monkeypatch, capsys):
     assert "1.43 m" in page and "Not run yet: python pipelines/paper_kalman_gain.py" in page
     assert "python pipelines/paper_imu_error.py | not run" in said
     assert all(f"Figure {n} (drawn anew" in page for n in (1, 2, 3, 5)) and page.count("data:image/png") == 4
-
-
-def test_the_network_is_drawn_with_its_own_sizes(monkeypatch):
-    monkeypatch.syspath_prepend(SCRIPT.parent)
-    from paper_diagrams import network_figure
-
-    small = {"lstm_hidden": 24, "lstm_layers": 2, "dense": [20, 12], "cnn_channels": 7}
-    (axes,) = network_figure(LearnedFilter(LearnedConfig.from_mapping({"network": small}))).axes
-    said = [text.get_text() for text in axes.texts]
-    assert "LSTM\n2 layers of 24" in said and "dense\n24 → 20\n20 → 12\ndropout 0.5" in said
-    assert any(x.startswith("Conv1d 15 → 7, kernel 3\nConv1d 7 → 1") for x in said)
 
 
 def test_seeds_share_the_rows_of_classical_filters(tmp_path, monkeypatch, capsys):

@@ -44,8 +44,7 @@ def test_alignment_agrees_with_a_tactical_reference():
 
 
 @pytest.mark.parametrize(
-    ("name", "chosen"),
-    [("rtkx", []), ("kitti", ["drives=[kitti-2011-10-03-0042-s0]"]), ("comma2k19", [])],
+    ("name", "chosen"), [("rtkx", []), ("kitti", ["drives=[kitti-2011-10-03-0042-s0]"]), ("comma2k19", [])]
 )
 def test_navigate_needs_no_reference(call, tmp_path, name, chosen):
     shutil.copytree(REAL / name, tmp_path / name, ignore=shutil.ignore_patterns("reference"))

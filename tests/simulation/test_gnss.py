@@ -49,12 +49,7 @@ def test_noise_and_stated_std(truth):
     config = GnssConfig(std_horizontal=0.3, std_vertical=0.4, std_velocity=0.05, s_p=0.4, s_v=0.12, quality=5)
     fixes = observe(np.random.default_rng(1), truth, np.zeros((len(truth.t), 3)), config)
     east, north, up = pymap3d.geodetic2enu(
-        fixes.lat_deg,
-        fixes.lon_deg,
-        fixes.height_m,
-        np.degrees(truth.lat),
-        np.degrees(truth.lon),
-        truth.height,
+        fixes.lat_deg, fixes.lon_deg, fixes.height_m, np.degrees(truth.lat), np.degrees(truth.lon), truth.height
     )
     velocity = fixes[["vel_n", "vel_e", "vel_d"]].to_numpy() - truth.v_n
     spread = [x.std() for x in (north, east, up, *velocity.T)]
@@ -67,13 +62,7 @@ def test_noise_and_stated_std(truth):
 
 @pytest.mark.parametrize(
     "change",
-    [
-        {"std_velocity": 0.0},
-        {"s_p": -1.0},
-        {"quality": 3},
-        {"lever_arm_b": (1.0, 2.0)},
-        {"std_vertical": math.nan},
-    ],
+    [{"std_velocity": 0.0}, {"s_p": -1.0}, {"quality": 3}, {"lever_arm_b": (1.0, 2.0)}, {"std_vertical": math.nan}],
 )
 def test_bad_receivers_are_one_clear_line(change):
     with pytest.raises(InputError, match=next(iter(change))):

@@ -8,15 +8,7 @@ import pytest
 import torch
 import yaml
 from scipy.linalg import expm
-from tests.simulation.oracle import (
-    OMEGA,
-    apart,
-    apart_of_python_ins,
-    attitude,
-    cross_matrix,
-    gravity,
-    strapdown,
-)
+from tests.simulation.oracle import OMEGA, apart, apart_of_python_ins, attitude, cross_matrix, gravity, strapdown
 
 from dlkf.base.errors import InputError
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors, imu_spec
@@ -99,9 +91,7 @@ def test_long_drives_are_cut_without_a_seam(monkeypatch):
 
 
 SPEC = ImuSpec(
-    "test",
-    accel=SensorErrors(1e-3, 0.1, 0.02, 5.0, 5e-3, 3e-3),
-    gyro=SensorErrors(7e-5, 5e-3, 4e-4, 2.0, 2e-3, 1e-3),
+    "test", accel=SensorErrors(1e-3, 0.1, 0.02, 5.0, 5e-3, 3e-3), gyro=SensorErrors(7e-5, 5e-3, 4e-4, 2.0, 2e-3, 1e-3)
 )
 
 

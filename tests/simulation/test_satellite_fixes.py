@@ -14,7 +14,6 @@ from dlkf.base.errors import InputError
 from dlkf.simulation.dataset import DatasetConfig
 from dlkf.simulation.gnss.almanac import read_almanac
 from dlkf.simulation.gnss.least_squares import Observations, solve
-from dlkf.simulation.gnss.obstruction import hold_visibility, in_view
 from dlkf.simulation.gnss.receiver import (
     Receiver,
     clock,
@@ -26,7 +25,7 @@ from dlkf.simulation.gnss.receiver import (
 )
 from dlkf.simulation.gnss.satellite_fixes import observe_satellites
 from dlkf.simulation.gnss.satellites import LIGHT, signals
-from dlkf.simulation.gnss.surroundings import Sky
+from dlkf.simulation.gnss.surroundings import Sky, hold_visibility, in_view
 from dlkf.simulation.gnss.white import GnssConfig
 from dlkf.simulation.motion.vehicle import Truth
 
@@ -102,10 +101,7 @@ def test_chi_square_of_position_and_velocity():
     """eᵀP⁻¹e of 3000 epochs against χ² of 3 degrees: mean ± 5 √(6/3000), 95 % and 99.9 % limits kept."""
     r_e, observed = observations(2.0)
     solution = solve(observed)
-    for error, covariance in (
-        (solution.r_e - r_e, solution.covariance),
-        (solution.v_e, solution.rate_covariance),
-    ):
+    for error, covariance in ((solution.r_e - r_e, solution.covariance), (solution.v_e, solution.rate_covariance)):
         squared = np.einsum("ti,tij,tj->t", error, np.linalg.inv(covariance[:, :3, :3]), error)
         assert squared.mean() == pytest.approx(3, abs=5 * math.sqrt(6 / 3000))
         for level in (0.95, 0.999):

@@ -249,7 +249,7 @@ def test_no_store_is_made_by_looking_for_a_model(tmp_path, monkeypatch):
 
 def test_lost_files_are_said(logged, uri, tmp_path):
     shutil.rmtree(tmp_path / "mlruns")
-    with pytest.raises(InputError, match="cannot be had") as error:
+    with pytest.raises(InputError, match="cannot be read") as error:
         download_model(logged.id, uri)
     assert "\n" not in str(error.value)
 

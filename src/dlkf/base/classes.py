@@ -1,8 +1,8 @@
-"""The one way from the name of a class, of the package or of a user's own, to the class and to an object of it.
+"""Classes by name, of the package or of a user: find them, check their methods, make objects.
 
-A name may stand in a preset or a model that somebody else wrote. So a class is checked for the methods of what it must
-be before it is called, and nothing of Python's standard library is ever called: ``os:system``, ``subprocess:Popen``
-and ``io:FileIO`` are refused. Importing the module that a name stands for runs it: a preset is code.
+A name may come from a preset or a model of another author. So a class must have the methods of its kind before it is
+called, and nothing of Python's standard library is ever called: ``os:system``, ``subprocess:Popen`` and ``io:FileIO``
+are refused. Importing a named module runs it: a preset is code.
 """
 
 from __future__ import annotations
@@ -67,11 +67,11 @@ def instantiate(
     offered: Mapping[str, Any] | None = None,
     spare: Collection[str] = (),
 ) -> Any:
-    """The object of the class that ``_target_`` names, made with the settings that stand beside it.
+    """The object of the class that ``_target_`` names, made with the settings beside it.
 
-    The class ``needs`` these methods, which is checked before it is called (:func:`find_class`). What is ``offered`` is
-    given where the class takes it; keys that are ``spare`` may stand there without being taken. InputError for a class
-    that is not there, a setting it does not take or takes otherwise, and one that it misses.
+    The class must have the methods ``needs``, checked before it is called (:func:`find_class`). ``offered`` arguments
+    are passed where the class takes them; ``spare`` keys are ignored where it does not. InputError for a missing class,
+    an unknown, wrong or missing setting.
     """
     target = f"{where}.{TARGET}"
     if not isinstance(values, Mapping) or not values.get(TARGET):

@@ -1,4 +1,4 @@
-"""YAML that somebody else may have written: values alone, a line for what is no YAML, and no expansion without end."""
+"""YAML from untrusted files: plain values only, one line for malformed YAML, no unbounded alias expansion."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ def local_copy(folder: str | Path) -> Iterator[Path]:
         with store_errors_as_input_error(folder):
             for file in place.fs.find(place.path):
                 rest = file.strip("/").removeprefix(place.path.strip("/") + "/")
-                place.fs.get_file(file, str(_made(Path(here) / rest)))
+                place.fs.get_file(file, str(_with_folder(Path(here) / rest)))
         yield Path(here)
 
 
@@ -123,7 +123,7 @@ def store_errors_as_input_error(folder: str | Path) -> Iterator[None]:
         if not is_url(folder):
             raise
         said = " ".join(str(error).split())[:200] or type(error).__name__
-        raise InputError(f"{folder}: the store says: {said}; mend the URL, the credentials or the endpoint") from None
+        raise InputError(f"{folder}: store error: {said}; correct the URL, the credentials or the endpoint") from None
 
 
 @contextmanager
@@ -157,7 +157,7 @@ def replace_folder(path: str | Path) -> Iterator[Path]:
         return
     target = Path(os.path.abspath(path))
     if Path.cwd().is_relative_to(target.resolve()):
-        raise InputError(f"out={path} would take the place of the folder you stand in; give one below it")
+        raise InputError(f"out={path} would replace the current folder; give one below it")
     restore_folder(target)
     before = _identity(target)
     beside, old = (target.with_name(f".{target.name}{what}{process_label()}") for what in (PARTIAL, OLD))
@@ -270,7 +270,7 @@ def _whole_prefix(path: str | Path) -> Iterator[Path]:
     require_store(path)
     target: Any = resolve_place(path)
     if "/" not in target.path.strip("/") and "memory" not in target.fs.protocol:
-        raise InputError(f"out={path} is a whole bucket, whose place it would take; give a folder in it")
+        raise InputError(f"out={path} is a whole bucket, which it would replace; give a folder in it")
     beside = target.with_name(f".{target.name}{PARTIAL}{uuid.uuid4().hex[:12]}")
     fs = target.fs
     try:
@@ -281,13 +281,13 @@ def _whole_prefix(path: str | Path) -> Iterator[Path]:
                 if old:
                     fs.rm(old[0])
                     fs.rm(target.path, recursive=True)
-            _moved(fs, fs.find(beside.path), beside.path, target.path)
+            _copy_files(fs, fs.find(beside.path), beside.path, target.path)
     finally:
         if beside.exists():
             fs.rm(beside.path, recursive=True)
 
 
-def _made(file: Path) -> Path:
+def _with_folder(file: Path) -> Path:
     """A file whose folder is there."""
     file.parent.mkdir(parents=True, exist_ok=True)
     return file
@@ -298,7 +298,7 @@ def _deep(file: str, folder: str) -> int:
     return file.strip("/").count("/") - folder.strip("/").count("/")
 
 
-def _moved(fs: Any, files: list[str], source: str, target: str) -> None:
+def _copy_files(fs: Any, files: list[str], source: str, target: str) -> None:
     """Copies in the store; files on top come last."""
     source = source.rstrip("/")
     for top in (False, True):

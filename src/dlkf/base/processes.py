@@ -1,4 +1,4 @@
-"""Which process made something, as a word that names no later one, and whether that process is gone."""
+"""A label of a process that no later process shares, and whether the process has ended."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings that are drawn for every drive: a plain mapping in which a range stands where a number would.
+"""Settings that are drawn for every drive: a mapping in which ranges take the place of numbers.
 
 A range is a mapping with one of these keys, and perhaps ``absent``, the probability that the value is 0 instead:
 

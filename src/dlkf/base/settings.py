@@ -1,4 +1,4 @@
-"""The one way from plain values to settings: every key known, every value of its field's type, one text for all.
+"""Settings from plain values: unknown keys and values of a wrong type are errors, in the same words everywhere.
 
 Settings are frozen dataclasses; the ranges of their values stand beside the defaults, their units in the names.
 """
@@ -58,7 +58,7 @@ def convert_value(hint: Any, value: Any, where: str) -> Any:
                 return settings_from(option, value, where)
         elif _fits(option, value):
             return tuple(float(x) if float in get_args(option) else x for x in value) if _is_list(option) else value
-    wanted = " or ".join(dict.fromkeys(_called(option) for option in options))
+    wanted = " or ".join(dict.fromkeys(_describe_type(option) for option in options))
     raise InputError(f"{where} is {value!r}, must be {wanted}")
 
 
@@ -83,7 +83,7 @@ def _is_list(option: Any) -> bool:
     return get_origin(option) in (tuple, list, Sequence) and set(get_args(option)) <= {float, int, str, ...}
 
 
-def _called(option: Any) -> str:
+def _describe_type(option: Any) -> str:
     if get_origin(option) is Literal:
         return f"one of {', '.join(map(str, get_args(option)))}"
     if _is_list(option):

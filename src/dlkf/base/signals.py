@@ -1,4 +1,4 @@
-"""Interrupts that wait until it is safe to be interrupted."""
+"""Delay of SIGINT and SIGTERM during a block that must not be interrupted."""
 
 from __future__ import annotations
 

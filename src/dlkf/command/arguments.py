@@ -48,7 +48,7 @@ def check_presets(arguments: Sequence[str]) -> None:
         if group and name and file.is_file():
             values = read_yaml(file)
             if isinstance(values, Mapping) and _names_calls(values.get("hydra")):
-                raise InputError(f"{file}: names under hydra what Hydra is to call; a preset of yours must not")
+                raise InputError(f"{file}: names a class or function for Hydra to call; presets of your own must not")
 
 
 def _names_calls(values: Any) -> bool:

@@ -17,8 +17,8 @@ OF_THE_DISK = {
     errno.EDQUOT: f"the quota of the disk is used up; make room, {AGAIN}",
     errno.EFBIG: f"the file would be larger than is allowed here; raise the limit (ulimit -f), {AGAIN}",
     errno.EROFS: "the disk is read-only; run from a folder that can be written to",
-    errno.EACCES: "permission denied; run from a folder that can be written to, or mend its permissions",
-    errno.EPERM: "permission denied; run from a folder that can be written to, or mend its permissions",
+    errno.EACCES: "permission denied; run from a folder that can be written to, or change its permissions",
+    errno.EPERM: "permission denied; run from a folder that can be written to, or change its permissions",
 }
 # what an exception says: what it means
 SAID = {

@@ -42,7 +42,7 @@ def help_text(name: str, aliases: Mapping[str, str]) -> str:
     head = [line.removeprefix("# ").removeprefix("#") for line in _head(text)]
     lines = [*head, "", "Presets (key=name; a folder given by --config-dir adds to them):"]
     for group in groups_of(text):
-        key = _written(group, aliases)
+        key = _group_key(group, aliases)
         lines.append(f"  {key}={group['choice']}" + (f"  {group['says']}" if group["says"] else ""))
         lines += _wrapped(presets_of(group["group"], name))
     for folder in OPTIONAL.get(name, ()):
@@ -120,6 +120,6 @@ def _in_preset(folder: Path, choice: str, key: str) -> tuple[str, str]:
     raise KeyError(key)
 
 
-def _written(group: Mapping[str, str], aliases: Mapping[str, str]) -> str:
+def _group_key(group: Mapping[str, str], aliases: Mapping[str, str]) -> str:
     full = group["group"] + (f"@{group['package']}" if group["package"] else "")
     return next((key for key, folder in aliases.items() if full == f"{folder}@{key}"), full)

@@ -1,4 +1,4 @@
-"""Datasets by the presets of ``dlkf simulate``: a recipe, and those of a training that are not there yet."""
+"""Datasets by the presets of ``dlkf simulate``: a recipe, and the missing datasets of a training."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def simulate_missing(datasets: Sequence[str], console: Console, seed: int = 1) -
         preset_file = config_dir() / "simulated" / f"{path.name}.yaml"
         if path.exists() or path.parent != Path("data") or not preset_file.is_file():
             continue
-        console.print(f"{dataset} is not there: simulating it")
+        console.print(f"{dataset} does not exist: simulating it")
         preset = compose("simulate", overrides=[f"simulated@dataset={path.name}", f"seed={seed}"])
         try:
             simulate(settings_from(SimulateSettings, to_plain(preset), "").recipe, path)

@@ -1,4 +1,4 @@
-"""A point of a sweep has a folder of its own, and one that fails does not take the others with it."""
+"""Points of a sweep: a folder for each; a failed point does not stop the others."""
 
 from __future__ import annotations
 

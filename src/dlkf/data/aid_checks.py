@@ -91,7 +91,7 @@ def _check_speed(table: Columns, moved: Motion, where: str) -> None:
     if SCALES[0] <= -ratio <= SCALES[1]:
         raise InputError(f"{where}: speed is negative where the car drives forward; negate it")
     close = [text for text, factor in UNITS.items() if abs(np.log(max(ratio, 1e-9) / factor)) < 0.1]
-    looks = f": looks like {close[0]}" if close else "; it must be in m/s, mend its scale"
+    looks = f": looks like {close[0]}" if close else "; it must be in m/s, correct its scale"
     raise InputError(f"{where}: speed is {ratio:.2f} times that of GNSS in the median{looks}")
 
 
@@ -146,7 +146,7 @@ def _check_baro(table: Columns, where: str) -> None:
         near = PRESSURE_PA[0] < 100 * usual < PRESSURE_PA[1]
         raise InputError(
             f"{where}: pressure is {usual:.4g} in the median, must be in Pa"
-            + (": looks like hPa; multiply it by 100" if near else "; mend its unit")
+            + (": looks like hPa; multiply it by 100" if near else "; correct its unit")
         )
 
 

@@ -181,10 +181,10 @@ def _velocity(
         v_n = torch.where(known, v_n, torch.zeros_like(v_n))
         guess = UNKNOWN_VELOCITY_STD + UNKNOWN_SLOPE_STD * v_n[:, :2].norm(dim=-1, keepdim=True)
         return v_n, torch.where(known, drive.gnss_std[:, 3:], guess), known[:, :2].all(-1)
-    return _fitted_velocity(drive, C_en, position & (drive.gnss_lag == 0), down_b)
+    return _fit_velocity(drive, C_en, position & (drive.gnss_lag == 0), down_b)
 
 
-def _fitted_velocity(
+def _fit_velocity(
     drive: Drive, C_en: Float[Tensor, "rows 3 3"], usable: Bool[Tensor, " rows"], down_b: Float[Tensor, "rows 3"]
 ) -> tuple[Float[Tensor, "rows 3"], Float[Tensor, "rows 3"], Bool[Tensor, " rows"]]:
     """Velocity at boundaries from the positions of ``FIT_S`` before them, with std; usable with three fixes.

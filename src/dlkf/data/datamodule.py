@@ -102,7 +102,7 @@ class DriveDataModule(L.LightningDataModule):
                 folder, rate_hz=self.rate_hz, epoch_s=self.epoch_s, dtype=self.dtype, progress=self.progress
             )
         if self.gnss_noise is not None:
-            drives = [self.gnss_noise.added(d, self.eval_seed) for d in drives]
+            drives = [self.gnss_noise.add_noise(d, self.eval_seed) for d in drives]
         self.stack = DriveStack(drives)
         self.spans = split_rows(self.stack, self.split, self.fractions, self.split_seed, self.eval_length_s)
 
@@ -161,11 +161,7 @@ class DriveDataModule(L.LightningDataModule):
         """The fixed segments of a side, for scoring."""
         self.setup()
         segments = cut_segments(
-            self.stack,
-            self.eval_length_s,
-            self.eval_stride_s,
-            min_valid=self.min_valid,
-            span=self.spans[side],
+            self.stack, self.eval_length_s, self.eval_stride_s, min_valid=self.min_valid, span=self.spans[side]
         )
         if not segments:
             raise InputError(

@@ -1,4 +1,4 @@
-"""GNSS made worse on purpose (paper eqs 12, 13; R130): white noise on position and velocity of every fix."""
+"""Degraded GNSS (paper eqs 12, 13; R130): white noise on position and velocity of every fix."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dlkf.data.drive import Drive
 
 @dataclass(frozen=True)
 class GnssNoise:
-    """1σ per axis of the noise that is added: ``s_p`` [m] and ``s_v`` [m/s]; the fixes' own stds grow with it."""
+    """1σ per axis of the noise that is add_noise: ``s_p`` [m] and ``s_v`` [m/s]; the fixes' own stds grow with it."""
 
     s_p: float = 0.0
     s_v: float = 0.0
@@ -22,7 +22,7 @@ class GnssNoise:
         if not (self.s_p >= 0 and self.s_v >= 0):
             raise InputError(f"gnss_noise: s_p and s_v must be numbers ≥ 0, got {self.s_p}, {self.s_v}")
 
-    def added(self, drive: Drive, seed: int = 0) -> Drive:
+    def add_noise(self, drive: Drive, seed: int = 0) -> Drive:
         """The drive with noise of its own on every fix: p̃ = p + s_p n, ṽ = v + s_v n, n ~ N(0, I) (isotropic, so the
         axes do not matter); std ← √(std² + s²), which a Kalman filter takes for R (R018)."""
         generator = segment_generator(seed, "gnss_noise", drive.name, drive.t0)

@@ -1,4 +1,4 @@
-"""Coning and sculling: IMU samples as the constant rate and force that turn and push like the true ones.
+"""Coning and sculling compensation: IMU samples as constant rates and forces with the true end of each interval.
 
 The strapdown takes rate and force as constant within a sample. Where they are not, the integrals α = ∫ω dt and
 ν = ∫f dt miss what the order of small turns and pushes does. To second order (Savage 1998; Titterton and Weston

@@ -1,4 +1,4 @@
-"""Physical limits of samples, fixes and estimates: what no car and no sensor of one can give.
+"""Physical limits of samples, fixes and estimates: beyond what any car and its sensors can give.
 
 They stand in front of every filter, in batch runs, in streams and in the exported C (which takes the numbers from
 here). A sample beyond full scale, or a fix that no car can have reached since the last good one, is refused and

@@ -279,7 +279,7 @@ def _check_drift(t: np.ndarray, accel: np.ndarray, gyro: np.ndarray, gnss: Motio
         f"beginning, {ends.last_s:+.1f} s at the end; reader.gnss.time.drift_ppm={ppm:.0f} and "
         f"offset_s={ends.first_s:.1f}, then drift_ppm=auto on what is left"
         if abs(ppm) < 1e5
-        else f"{where}: the clocks of IMU and GNSS have different seconds; mend reader.imu.time.unit"
+        else f"{where}: the clocks of IMU and GNSS have different seconds; correct reader.imu.time.unit"
     )
 
 

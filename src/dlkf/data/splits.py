@@ -1,4 +1,4 @@
-"""Who trains and who tests: whole recordings on one side (paper.md 4.8)."""
+"""Training, validation and test split: whole recordings on one side (paper.md 4.8)."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def drive_rows(folder: str | Path, drives: Sequence[str] | str | None = None) ->
     if not drives:
         raise InputError("drives=[] names no drive; null takes all")
     if doubles := sorted({name for name in drives if drives.count(name) > 1}):
-        raise InputError(f"drives names {doubles[0]} twice; a drive counts once")
+        raise InputError(f"drives names {doubles[0]} twice; name each drive once")
     known = {row.name: row for row in rows}
     if unknown := [name for name in drives if name not in known]:
         shown = ", ".join(list(known)[:8]) + (", …" if len(known) > 8 else "")

@@ -1,4 +1,4 @@
-"""A drive in one line: what shows whether an import is right."""
+"""A drive in one line, to see whether an import is right."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def neighbours(folder: Path) -> list[str]:
 def read_drives(folder: str | Path) -> list[DriveRow]:
     """The drives of a dataset in the order of ``drives.parquet``.
 
-    Raises InputError if the folder, the file or a needed column is missing, or a name stands twice.
+    Raises InputError if the folder, the file or a needed column is missing, or a name appears twice.
     """
     if not is_url(folder) and not Path(folder).exists():
         restore_folder(Path(folder).absolute())
@@ -88,7 +88,7 @@ def read_drives(folder: str | Path) -> list[DriveRow]:
     if not names:
         raise InputError(f"dataset {folder}: drives.parquet has no rows; add one per drive")
     if doubles := sorted({n for n in names if names.count(n) > 1}):
-        raise InputError(f"drives.parquet: drive {doubles[0]} stands twice; names must be unique")
+        raise InputError(f"drives.parquet: drive {doubles[0]} appears twice; names must be unique")
     arms = []
     for column in LEVER_ARM:
         if column in table.column_names:
@@ -130,7 +130,7 @@ def drive_clocks(folder: str | Path) -> dict[str, DriveClock]:
         if name in table.column_names:
             values = _column(table, name, pa.float64(), "drives.parquet")
         if (beyond := values[np.abs(values) > LATEST_S]).size:
-            raise InputError(f"drives.parquet: {name} is {beyond[0]:g}, no time in seconds; mend it or leave it out")
+            raise InputError(f"drives.parquet: {name} is {beyond[0]:g}, no time in seconds; correct it or leave it out")
         columns.append(np.where(np.isfinite(values), values, unknown).tolist())
     return {str(drive): DriveClock(*row) for drive, *row in zip(table["drive"].to_pylist(), *columns)}
 
@@ -194,7 +194,7 @@ def _read(path: Path, where: str) -> pa.Table:
         reason = (str(error).splitlines() or [type(error).__name__])[0][:100]
         raise InputError(f"{where}: not a whole Parquet file ({reason}); write or copy it again") from None
     if doubles := sorted({name for name in table.column_names if table.column_names.count(name) > 1}):
-        raise InputError(f"{where}: column {doubles[0]} stands twice; leave one")
+        raise InputError(f"{where}: column {doubles[0]} appears twice; leave one")
     return table
 
 

@@ -147,8 +147,8 @@ def _check_time(t: np.ndarray, where: str) -> None:
         k = int(back[0])
         if t[k + 1] == t[k]:
             raise InputError(
-                f"{where}: row {k + 1}: t = {t[k]:.6f} stands twice; remove duplicate samples (of an IMU with a coarse "
-                "clock: reader.imu.time.respace=true)"
+                f"{where}: row {k + 1}: t = {t[k]:.6f} appears twice; remove duplicate samples (of an IMU with a "
+                "coarse clock: reader.imu.time.respace=true)"
             )
         raise InputError(
             f"{where}: row {k + 1}: t goes back from {t[k]:.6f} to {t[k + 1]:.6f}; sort the rows, or split the drive"
@@ -237,8 +237,8 @@ def _check_gnss(gnss: Columns, imu: Columns, where: str) -> Columns:
     count = int((~screened.keep).sum())
     if count > max(MOST_REFUSED[1] * len(screened.keep), 2):
         raise InputError(
-            f"{where}: {count} of {len(screened.keep)} fixes cannot be, the first at {screened.first}; give them "
-            "quality 0, or mend units and columns"
+            f"{where}: {count} of {len(screened.keep)} fixes are impossible, the first at {screened.first}; give them "
+            "quality 0, or correct units and columns"
         )
     far = [(t, way) for t, way in screened.switched if way > MOST_SWITCH_M]
     if far:

@@ -16,15 +16,7 @@ from dlkf.base.colours import COLOURS
 from dlkf.base.errors import InputError
 from dlkf.base.files import resolve_place, write_into
 from dlkf.base.provenance import describe_provenance
-from dlkf.diagnosis.allan import (
-    AllanFit,
-    Array,
-    allan_variance,
-    check_static,
-    cluster_sizes,
-    fit_noise,
-    preset_yaml,
-)
+from dlkf.diagnosis.allan import AllanFit, Array, allan_variance, check_static, cluster_sizes, fit_noise, preset_yaml
 from dlkf.evaluation.figures import png
 from dlkf.evaluation.table import ResultTable, as_json, as_markdown, format_number
 from dlkf.navigation.imu_errors import DEG, MILLIGAL, ImuSpec
@@ -161,7 +153,7 @@ def part(imu: dict[str, Array], from_s: float | None, to_s: float | None) -> tup
     return samples, float((len(t) - 1) / (t[-1] - t[0]))
 
 
-def chosen(names: Sequence[str], drive: str | None) -> str:
+def choose_drive(names: Sequence[str], drive: str | None) -> str:
     """The drive to look at. Raises InputError where there are several and none is named, or it does not exist."""
     if drive is None and len(names) == 1:
         return names[0]

@@ -1,4 +1,4 @@
-"""Findings about one recording: what a filter can rely on, what it cannot, and what somebody should look at."""
+"""Findings about one recording: good, to be looked at, or bad for a filter."""
 
 from __future__ import annotations
 

@@ -3,8 +3,8 @@
     NEES = eᵀ P⁻¹ e,  e = truth − estimate after the update, n states        NIS = zᵀ S⁻¹ z,  S = H P⁻ Hᵀ + R
 
 A consistent filter's NEES is χ² with n, its NIS with m degrees of freedom. The mean over N independent drives at a
-time lies within χ²_{nN}(2.5 %, 97.5 %)/N in 95 % of all cases. Above: the filter is too sure of itself; below: too
-careful.
+time lies within χ²_{nN}(2.5 %, 97.5 %)/N in 95 % of all cases. Above, the filter is
+overconfident, below, conservative.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def consistency_table(results: Mapping[str, NormalisedSquares], settle_s: float,
             rows.append([name, what, str(degrees), mean, f"{low:.3f} – {high:.3f}", share])
     return ResultTable(
         title=title,
-        note="Normalised error squared over its expectation: 1 is consistent, above 1 too sure, below 1 too careful. "
+        note="Normalised error squared over its expectation: 1 is consistent, above overconfident, below conservative. "
         f"Band: 95 % of the means over the drives at one time. After {settle_s:g} s.",
         columns=["Filter", "Of", "Degrees\nof freedom", "Mean", "Band", "Epochs in\nthe band [%]"],
         rows=rows,

@@ -1,4 +1,4 @@
-"""Simulated drives whose IMU errs exactly as a filter models it: what a test of consistency needs (R020, R090).
+"""Simulated drives whose IMU errors are exactly those of a filter's model, for consistency tests (R020, R090).
 
 A filter of 15 states models biases alone, one of 21 also scale factors, one of 33 also misalignment; so each has
 drives of its own, with the errors that it does not model switched off, and is given the same preset. GNSS errors

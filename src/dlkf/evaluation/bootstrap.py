@@ -1,4 +1,4 @@
-"""Paired bootstrap: how sure is it that one filter is better than another on the same segments?
+"""Paired bootstrap: confidence intervals of one filter against another on the same segments.
 
 Both filters are resampled with the same weights, so that a segment that is hard for both does not widen the interval
 (Efron & Tibshirani, *An Introduction to the Bootstrap*, ch. 13). Segments or outages of one recording are not
@@ -148,11 +148,7 @@ def _numbered(groups: NDArray[np.str_]) -> NDArray[np.int64]:
 
 
 def rms_band(
-    x: Array,
-    *,
-    groups: Sequence[str] | NDArray[np.str_] | None = None,
-    resamples: int = 500,
-    seed: int = 0,
+    x: Array, *, groups: Sequence[str] | NDArray[np.str_] | None = None, resamples: int = 500, seed: int = 0
 ) -> tuple[Array, Array, Array]:
     """RMS over units at each column of (U, K), and the bounds of its bootstrap interval; each (K,).
 

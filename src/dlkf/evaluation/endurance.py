@@ -42,12 +42,7 @@ class OutageErrors:
 
 
 def score_after_gnss(
-    filters: Mapping[str, Filter],
-    data: DriveDataModule,
-    seconds: Sequence[float],
-    *,
-    baseline: str,
-    seed: int,
+    filters: Mapping[str, Filter], data: DriveDataModule, seconds: Sequence[float], *, baseline: str, seed: int
 ) -> list[OutageErrors]:
     """The same outage of 40 s after so many seconds with GNSS, over the test side's drives; a length that no drive
     has room for is left out."""

@@ -1,4 +1,4 @@
-"""What gain does a filter work with? (R130–R137; figures 7–9 of the paper)
+"""Kalman gains of filters (R130–R137; figures 7–9 of the paper).
 
 A gain (9 × 6) takes innovations of position and velocity to corrections of position, velocity and attitude, here in
 North-East-Down: blocks K_pp [1], K_pv [s], K_vp [1/s], K_vv [1], K_hp [rad/m], K_hv [rad s/m].

@@ -1,4 +1,4 @@
-"""What is measured: errors of a filter against the truth, and the numbers made of them.
+"""Metrics: errors of a filter against the truth, and their statistics.
 
 All functions are pure and work on numpy arrays with P segments (rows), T epochs and, after the last update
 that an outage allows, W outages. Two marks have a meaning everywhere: **NaN** = there is no truth to compare

@@ -29,8 +29,7 @@ from dlkf.evaluation.metrics import (
     slope,
     summarise_errors,
 )
-from dlkf.evaluation.own_sigma import innovation_rms, sigma_samples
-from dlkf.evaluation.scores import Scores
+from dlkf.evaluation.scores import Scores, innovation_rms, sigma_samples
 
 SETTLE_S = 10.0  # "settled" leaves out this much of every segment, where the initial error dominates
 INTO_OUTAGE_S = (10.0, 20.0, 30.0, 40.0, 50.0, 60.0)
@@ -164,12 +163,7 @@ def _real(x: float | str | None) -> float:
 
 
 def summarise_scores(
-    scores: Scores,
-    *,
-    settle_s: float = SETTLE_S,
-    baseline: str = BASELINE,
-    resamples: int = 2000,
-    seed: int = 0,
+    scores: Scores, *, settle_s: float = SETTLE_S, baseline: str = BASELINE, resamples: int = 2000, seed: int = 0
 ) -> Results:
     """The results of one kind of data. Raises ValueError for scores of several kinds (split them first)."""
     if len(scores.kinds) > 1:

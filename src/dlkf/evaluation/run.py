@@ -47,7 +47,7 @@ def score_scenes(
     for batch, mask in scenes:
         if parts and abs(batch.epoch_s - parts[0].epoch_s) > 1e-9:
             raise InputError("the batches to be scored have different epoch lengths; score them one by one")
-        parts.append(_unscored(batch, mask, groups or {}, kinds))
+        parts.append(_blank_scores(batch, mask, groups or {}, kinds))
         masked = withhold_fixes(batch, mask)
         for name, estimator in filters.items():
             parts[-1].filters[name] = _blank(batch, len(aid_columns(estimator)))
@@ -61,7 +61,7 @@ def score_scenes(
     return join_scores(parts)
 
 
-def _unscored(batch: Batch, mask: Tensor, groups: Mapping[str, str], kinds: Mapping[str, str] | str) -> Scores:
+def _blank_scores(batch: Batch, mask: Tensor, groups: Mapping[str, str], kinds: Mapping[str, str] | str) -> Scores:
     """The segments of a scene and their truth, before any filter ran."""
     known = (batch.truth_valid & batch.present).unsqueeze(-1)
     p, v = (torch.where(known, x.double(), torch.nan).cpu().numpy() for x in batch.truth[:2])

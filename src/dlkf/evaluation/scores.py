@@ -1,4 +1,4 @@
-"""What every filter made of the same segments: the raw material of tables and figures."""
+"""Errors and estimates of every filter on the same segments, from which tables and figures are made."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 import torch
 
-from dlkf.evaluation.metrics import Array, Mask, OutageIntervals, outage_intervals
+from dlkf.evaluation.metrics import Array, Mask, OutageIntervals, outage_end, outage_intervals
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
+from dlkf.running.innovations import SigmaFit, fit_sigma, rms
 
 
 @dataclass(frozen=True)
@@ -109,3 +110,26 @@ def _padded(x: Array, T: int) -> Array:
     extra = [(0, 0)] * x.ndim
     extra[1] = (0, T - x.shape[1])
     return np.pad(x, extra, constant_values=False if x.dtype == bool else np.nan)
+
+
+def horizontal_sigma(run: FilterRun) -> Array:
+    """√(σ_n² + σ_e²) (P, T) [m], NaN where the filter has none."""
+    return np.hypot(run.position_std[..., 0], run.position_std[..., 1])
+
+
+def sigma_samples(scores: Scores, name: str) -> dict[tuple[str, str, str], Array]:
+    """The filter's own horizontal 1σ at the end of every outage [m]."""
+    w = scores.windows
+    if not len(w.segment):
+        return {}
+    return {("outages", "end", "sigma"): outage_end(horizontal_sigma(scores.filters[name]), w)}
+
+
+def innovation_rms(run: FilterRun) -> float:
+    """RMS of all innovations over their 1σ; NaN of a filter without covariance."""
+    return rms(run.innovation)
+
+
+def innovation_fit(run: FilterRun) -> SigmaFit | None:
+    """Whether the filter's 1σ fits its innovations; segments count as independent."""
+    return fit_sigma(*run.innovation)

@@ -1,4 +1,4 @@
-"""Which further sensors the filters of an evaluation used, how these fitted, and what was found of them."""
+"""Further sensors in an evaluation: which filter used them, their innovations, their estimated parameters."""
 
 from __future__ import annotations
 

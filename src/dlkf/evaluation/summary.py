@@ -1,4 +1,4 @@
-"""An evaluation in few numbers and in one sentence: what a tracking server compares, what a person asks for."""
+"""An evaluation in a few metrics for the tracking server and in one sentence for the reader."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import math
 from collections.abc import Sequence
 
 from dlkf.evaluation.bootstrap import MIN_GROUPS
-from dlkf.evaluation.own_sigma import innovation_fit
 from dlkf.evaluation.results import Results
-from dlkf.evaluation.scores import Scores
+from dlkf.evaluation.scores import Scores, innovation_fit
 from dlkf.evaluation.table import DEGREES, format_number
 from dlkf.running.innovations import OF_NETWORK, REMEDY
 
@@ -65,10 +64,10 @@ def headline(result: Results) -> str:
     text += _spread(texts[best], count, unit)
     if span and math.isfinite(drift := result.value(best, "outages", "end", "drift", "median")):
         text += f" ({format_number(100 * drift, digits=2)} % of the distance driven)"
-    rival = next((n for n in order[1:] if is_classical(n)), None)
-    if rival is not None:
+    other = next((n for n in order[1:] if is_classical(n)), None)
+    if other is not None:
         which = "next" if is_classical(best) else "best classical filter"
-        text += f"; {which} {rival} {', '.join(texts[rival])}"
+        text += f"; {which} {other} {', '.join(texts[other])}"
     few = f" With {count} {unit}{'s' if count > 1 else ''}, expect larger errors too." if count < FEW else ""
     return f"{text}.{few}"
 

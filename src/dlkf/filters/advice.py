@@ -1,4 +1,4 @@
-"""Factors on one epoch's noise from outside the Kalman filter, of a network or of what tunes it.
+"""Factors on one epoch's noise from outside the Kalman filter: from a network, or from tuning by gradient.
 
 Everything is optional, and a factor of 1 changes nothing to the bit. Factors belong to standard deviations.
 """

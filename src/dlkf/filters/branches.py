@@ -1,4 +1,4 @@
-"""Branches on values: on a CPU they save work; a compiled or exported graph has none, and a GPU would be waited for."""
+"""Branches on values: they save work on a CPU; compiled and exported graphs have none, and a GPU would have to sync."""
 
 from __future__ import annotations
 

@@ -48,13 +48,7 @@ def is_filter(name: str) -> bool:
     return base in KALMAN and len(set(endings)) == len(endings) and set(endings) <= set(ENDINGS)
 
 
-def build_filter(
-    name: str,
-    imu: ImuSpec,
-    *,
-    tuning: Tuning | None = None,
-    prior: Prior | None = None,
-) -> Filter:
+def build_filter(name: str, imu: ImuSpec, *, tuning: Tuning | None = None, prior: Prior | None = None) -> Filter:
     """A model-based filter for an IMU; only names with ``_prior`` take the ``prior``.
 
     With the ending ``rts`` it is no estimator but a filter to be smoothed, which only looks back on whole drives.

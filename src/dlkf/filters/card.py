@@ -1,4 +1,4 @@
-"""What a learned filter was made of, stored beside its weights, and what follows for scoring it (paper.md 4.8)."""
+"""Model card of a learned filter, stored beside its weights, and what it implies for scoring (paper.md 4.8)."""
 
 from __future__ import annotations
 
@@ -105,12 +105,7 @@ def domain_warnings(
 
 
 def without_training_recordings(
-    cards: Mapping[str, Mapping[str, Any]],
-    drives: Sequence[DriveRow],
-    dataset: str,
-    digest: str,
-    *,
-    leave_out: bool,
+    cards: Mapping[str, Mapping[str, Any]], drives: Sequence[DriveRow], dataset: str, digest: str, *, leave_out: bool
 ) -> tuple[list[DriveRow], list[str]]:
     """The drives of a dataset to score models on, and a line for each model trained on some of their recordings.
 

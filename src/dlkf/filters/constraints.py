@@ -1,4 +1,4 @@
-"""What a car cannot do, as pseudo-measurements: slide sideways, leave the road, and move while it stands.
+"""Vehicle constraints as pseudo-measurements: no sideways or vertical velocity, none at all while stationary.
 
 Non-holonomic constraint (NHC; Dissanayake et al. 2001). The velocity of the IMU in body axes is, across the car,
 
@@ -62,8 +62,8 @@ class CarConstraints:
         """No standstill so far, and the 1σ of the rows."""
         t, new = self.tuning, batch.imu.new_tensor
         std = [t.lateral_std, t.vertical_std] + [t.rest_velocity_std] * 3 + [t.rest_rate_std] * 3
-        heard = VibrationLevel.unheard(batch.imu, batch.size[0])
-        return CarMemory(new([std]), heard, new([t.rest_accel * t.rest_gyro]))
+        level = VibrationLevel.begin(batch.imu, batch.size[0])
+        return CarMemory(new([std]), level, new([t.rest_accel * t.rest_gyro]))
 
     def rows(self, epoch: Epoch, memory: CarMemory, prediction: Predicted) -> tuple[Measurement, CarMemory]:
         """NHC (2 rows), zero velocity (3), zero angular rate (3)."""

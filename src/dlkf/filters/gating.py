@@ -61,7 +61,7 @@ class Verdict(NamedTuple):
     shift: Tensor  # (B, 6) variance
     factor: Tensor  # (B,) ≥ 1
 
-    def opened(self, P: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
+    def inflated(self, P: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
         """P inflated where the filter recovers, unchanged elsewhere."""
         wide = self.factor[:, None, None] * P
         return wide + torch.nn.functional.pad(torch.diag_embed(self.shift), (0, P.shape[-1] - 6) * 2)
@@ -100,7 +100,7 @@ class CoarseGate:
         with torch.no_grad():
             memory, verdict = self._judge(memory, epoch, P.diagonal(dim1=-2, dim2=-1))
         fix = epoch.fix._replace(used=verdict.passed)
-        return memory, epoch._replace(z=epoch.z * verdict.passed, fix=fix), verdict.opened(P)
+        return memory, epoch._replace(z=epoch.z * verdict.passed, fix=fix), verdict.inflated(P)
 
     def _judge(
         self, memory: CoarseMemory, epoch: Epoch, variance: Float[Tensor, "B n"]

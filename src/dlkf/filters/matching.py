@@ -49,7 +49,7 @@ class Matching(NamedTuple):
         one = like.new_ones
         return cls(one(size, 2, 6), one(size, 2, 12), one(size, 12), like.new_zeros(size))
 
-    def innovated(self, normalised: Float[Tensor, "B 6"], used: Bool[Tensor, "B 6"]) -> Matching:
+    def update(self, normalised: Float[Tensor, "B 6"], used: Bool[Tensor, "B 6"]) -> Matching:
         """After an innovation over its 1σ, in heading axes."""
         fixes = self.fixes + used.any(-1)
         new = normalised.square().clamp_max(LARGEST).unsqueeze(1)

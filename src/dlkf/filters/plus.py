@@ -1,4 +1,4 @@
-"""``plus``: the analytic Kalman filter that finds the white noise of its IMU while it runs.
+"""``plus``: a Kalman filter that estimates the white noise of its IMU while it runs.
 
 States, strapdown, sources and Riccati recursion are those of a classical filter (``base``). Two factors act on its
 white noise. The level of accelerometers and of gyroscopes is slow: virtual outages of 10 to 30 s in the recent past
@@ -159,7 +159,7 @@ class PlusFilter(nn.Module):
             memory = memory._replace(
                 elapsed=memory.elapsed + span,
                 since_fix=torch.where(fixed, 0.0, memory.since_fix + span),
-                matching=memory.matching.innovated(normalised, epoch.used),
+                matching=memory.matching.update(normalised, epoch.used),
             )
             bands = window_features(epoch.corrected, epoch.dt)
             levels, matched = band_level(bands), memory.matching.logarithms()

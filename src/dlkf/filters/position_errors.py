@@ -1,8 +1,8 @@
 """Errors of a receiver's positions that wander: which part of its 1σ is white, and how fast the rest moves.
 
 A receiver's 1σ covers all of an error; multipath, orbits and atmosphere change over tens of seconds. A filter that
-takes that part for white noise averages over it and is soon too sure of its velocity. With the innovation z of a fix
-and the residual r = z − H dx of the one before after its update, the error has changed by
+treats that part as white noise averages over it and becomes overconfident in its velocity. With the innovation z of a
+fix and the residual r = z − H dx of the one before after its update, the error has changed by
 
     u = (zₖ − rₖ₋₁) / σ
 

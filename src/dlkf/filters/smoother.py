@@ -1,4 +1,4 @@
-"""Rauch-Tung-Striebel smoother over a closed-loop error-state filter: the best use of a whole drive (Groves 3.4.3).
+"""Rauch-Tung-Striebel smoother over a closed-loop error-state filter, over a whole drive (Groves 3.4.3).
 
 A closed-loop filter starts every epoch with a zero error state, so what future fixes add to epoch k beyond its
 filtered state is δₖ, the smoothed error of that state:

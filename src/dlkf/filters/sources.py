@@ -1,4 +1,4 @@
-"""Where a Kalman filter's measurements come from: every source gives rows of one common update per epoch.
+"""Measurement sources of a Kalman filter: each gives rows of one common update per epoch.
 
 A source is a class with two methods, in a file of its own; it needs no change of the package::
 
@@ -155,7 +155,7 @@ class GnssFix:
         gate, verdict = self.gate.judge(memory.gate, epoch, S, fix.R)
         H, R = mask_rows(fix.H, fix.R, verdict.passed)
         rows = Measurement(fix.z * verdict.passed, H, R, verdict.passed)
-        return GatedFix(rows, fix.R, offered, verdict.opened(P), verdict.used), memory._replace(gate=gate)
+        return GatedFix(rows, fix.R, offered, verdict.inflated(P), verdict.used), memory._replace(gate=gate)
 
     def _matrix(self, epoch: Epoch) -> Float[Tensor, "B 6 n"]:
         H = measurement_matrix(epoch.at_fix, epoch.rate_at_fix_b, epoch.lever_arm_b, epoch.frame, self.states)

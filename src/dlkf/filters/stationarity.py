@@ -24,7 +24,7 @@ from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, VELOCITY
 SURE_STD = 0.3  # m/s: speeds with a larger 1σ teach nothing
 STANDING_SPEED, MOVING_SPEED = 0.3, 1.5  # m/s: from which side on a second counts as the one or the other
 APART = 10.0  # prior ratio of the level of a moving car to that of a stationary one
-TELLING = 2.0  # below this ratio the samples do not separate stationary from moving
+DISTINCT = 2.0  # below this ratio the samples do not separate stationary from moving
 MEMORY_S = 100.0  # s, stationary or moving, in which a level grows by e, so that a wrong second decays
 STILL_ACCEL, STILL_RATE = 0.2, 0.01  # m/s², rad/s: with less, beyond the filter's 2σ, a car may be stationary
 PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 3.0  # m/s, 1σ: a standstill must not contradict the filter
@@ -42,7 +42,7 @@ class VibrationLevel(NamedTuple):
     still_s: Tensor  # (B,) s without acceleration or turn
 
     @classmethod
-    def unheard(cls, like: Tensor, batch_size: int) -> VibrationLevel:
+    def begin(cls, like: Tensor, batch_size: int) -> VibrationLevel:
         """Before the first sample."""
         nothing = like.new_full((batch_size,), math.inf)
         return cls(nothing, nothing, like.new_zeros(batch_size, 2), like.new_zeros(batch_size))
@@ -55,10 +55,10 @@ class VibrationLevel(NamedTuple):
         """The limit, and whether the samples separate a stationary car from a moving one so far."""
         moving = torch.where(self.moving.isinf(), prior, self.moving)
         standing = torch.where(self.standing.isinf(), moving / APART, self.standing)
-        distinct = moving > TELLING * standing
+        distinct = moving > DISTINCT * standing
         return torch.where(distinct, (standing * moving).sqrt(), prior / APART), distinct
 
-    def heard(self, now: Tensor, standing: Tensor, moving: Tensor, span: float) -> VibrationLevel:
+    def update(self, now: Tensor, standing: Tensor, moving: Tensor, span: float) -> VibrationLevel:
         """After a window of ``span`` seconds in which the car was surely stationary, or moving, or neither."""
         fade = math.exp(span / MEMORY_S)
         return self._replace(
@@ -94,7 +94,7 @@ def detect_stationary(
     if (share := span / LEAST_S) < 1:
         variance = torch.where(before.variance > 0, (1 - share) * before.variance + share * variance, variance)
     force, rate = variance.unbind(-1)
-    lively = (force * rate).sqrt()
+    level = (force * rate).sqrt()
     v, diagonal = epoch.window.end.v_n, P.diagonal(dim1=-2, dim2=-1)
     speed, std = v[:, :2].norm(dim=-1), diagonal[:, VELOCITY][:, :2].sum(-1).sqrt()
     tilt, accel = diagonal[:, ATTITUDE][:, :2].sum(-1), diagonal[:, ACCEL].sum(-1)
@@ -108,12 +108,12 @@ def detect_stationary(
         stopped = wheel.stopped & still
         standing, moving = standing & ~wheel.rolling | stopped, (moving | wheel.rolling) & ~stopped
     still_s = torch.where(still, before.still_s + span, 0.0)
-    after = before.heard(lively, standing, moving, span)._replace(variance=variance, still_s=still_s)
+    after = before.update(level, standing, moving, span)._replace(variance=variance, still_s=still_s)
     # equal spectra: a wide 1σ would admit any speed, so only a speed that is nearly zero and known to be counts
     limit, distinct = after.thresholds(prior)
     doubt = torch.where(distinct, PLAUSIBLE_SIGMAS * std, std.clamp_max(SILENT_STD))
     plausible = speed < PLAUSIBLE_SPEED + doubt
-    stationary = (lively <= limit) & still & (still_s > LEAST_S - 0.5 * span) & plausible
+    stationary = (level <= limit) & still & (still_s > LEAST_S - 0.5 * span) & plausible
     if wheel is not None:
         stationary = stationary & ~wheel.rolling | stopped
     return stationary, after

@@ -67,6 +67,6 @@ class Prior:
     mean: Sequence[float]
     std: Sequence[float]
 
-    def surer(self, factor: float) -> Prior:
+    def scale_spread(self, factor: float) -> Prior:
         """The same mean with the spread times ``factor``."""
         return Prior(self.mean, tuple(factor * s for s in self.std))

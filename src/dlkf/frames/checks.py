@@ -67,7 +67,7 @@ def _check_seconds(name: str, t: np.ndarray) -> None:
 def _check_columns(name: str, frame: pd.DataFrame, needed: Sequence[str]) -> None:
     columns = [str(c) for c in frame.columns]
     if twice := sorted({c for c in columns if columns.count(c) > 1}):
-        raise InputError(f"{name}: column {twice[0]} stands there twice; keep one")
+        raise InputError(f"{name}: column {twice[0]} appears twice; keep one")
     if not (missing := [c for c in needed if c not in columns]):
         return
     lower = {c.lower(): c for c in columns}

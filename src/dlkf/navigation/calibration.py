@@ -1,4 +1,4 @@
-"""The IMU error that a filter takes off its samples: biases, and where estimated the sensor matrices."""
+"""The IMU error that a filter corrects: biases, and where estimated the sensor matrices."""
 
 from __future__ import annotations
 

@@ -167,10 +167,7 @@ class TangentFrame:
 
 
 def tangent_frame(
-    lat: Float[Tensor, " b"],
-    lon: Float[Tensor, " b"],
-    height: Float[Tensor, " b"],
-    dtype: torch.dtype = torch.float64,
+    lat: Float[Tensor, " b"], lon: Float[Tensor, " b"], height: Float[Tensor, " b"], dtype: torch.dtype = torch.float64
 ) -> TangentFrame:
     """Tangent frames at geodetic origins (rad, rad, m, float64); working fields in ``dtype``."""
     lat, lon, height = lat.double(), lon.double(), height.double()

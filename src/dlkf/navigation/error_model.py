@@ -143,10 +143,7 @@ class WindowModel:
         rows, columns = zip(*self.states.elements)
         along = turned[..., list(rows)]
         listed = list(columns)
-        return (
-            torch.cat((turned, along * f[..., listed]), -1),
-            torch.cat((turned, along * w[..., listed]), -1),
-        )
+        return (torch.cat((turned, along * f[..., listed]), -1), torch.cat((turned, along * w[..., listed]), -1))
 
     def _in_order(self, force: Tensor, lever: Tensor) -> tuple[Tensor, ...]:
         if self.states.matrix == "none":

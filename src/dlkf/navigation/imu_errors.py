@@ -5,7 +5,7 @@ and its off-diagonal the misalignments, b a turn-on bias plus an in-run part tha
 Gauss-Markov with time constant τ (a random walk of the same strength while t ≪ τ), w white noise.
 Optional, none by default: a rate random walk, a warm-up drift and a second, faster Gauss-Markov part in b, a
 gyroscope's g-dependent error G f, white noise that differs from axis to axis, quantisation and a full-scale range of
-what is put out (Groves 4.4).
+the output (Groves 4.4).
 """
 
 from __future__ import annotations

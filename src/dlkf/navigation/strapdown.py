@@ -55,12 +55,7 @@ class Window(NamedTuple):
         return NavState(p, v, orthonormalise(C))
 
 
-def strapdown(
-    start: NavState,
-    imu: Float[Tensor, "B M 6"],
-    dt: float,
-    frame: TangentFrame,
-) -> Window:
+def strapdown(start: NavState, imu: Float[Tensor, "B M 6"], dt: float, frame: TangentFrame) -> Window:
     """Mechanise one window of corrected IMU samples (specific force m/s², rate rad/s) from ``start``.
 
     Differentiable in the start state and the samples; attitude gradients live in the tangent space of SO(3).
@@ -189,12 +184,12 @@ class _CompiledStrapdown(torch.autograd.Function):
         C0, imu, gradient, earth_rate = ctx.saved_tensors
         only_end = Gp is None and Gv is None and GC is None
         shape = (len(imu), 1 if only_end else imu.shape[1], 3)
-        Gp, Gv, GC = _ended(Gp, gp, C0, shape), _ended(Gv, gv, C0, shape), _ended(GC, gC, C0, (*shape, 3))
+        Gp, Gv, GC = _add_end(Gp, gp, C0, shape), _add_end(Gv, gv, C0, shape), _add_end(GC, gC, C0, (*shape, 3))
         p0, v0, turn, samples = compiled_adjoint.adjoint(C0, imu, ctx.dt, gradient, earth_rate, Gp, Gv, GC)
         return p0, v0, 0.5 * skew(turn) @ C0, samples, None, None, None, None
 
 
-def _ended(samples: Tensor | None, end: Tensor | None, like: Tensor, shape: tuple[int, ...]) -> Tensor:
+def _add_end(samples: Tensor | None, end: Tensor | None, like: Tensor, shape: tuple[int, ...]) -> Tensor:
     """Gradient of the last samples (B, m, …) with that of the end state added to the last."""
     full = like.new_zeros(shape) if samples is None else samples.clone()
     if end is not None:

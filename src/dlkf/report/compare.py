@@ -17,7 +17,7 @@ from dlkf.evaluation.summary import headline
 from dlkf.evaluation.table import format_number
 from dlkf.report.drawing import Figure
 from dlkf.report.evaluation import best_of
-from dlkf.report.page import Page, flatten_html
+from dlkf.report.page import Page, flatten_settings
 from dlkf.report.plots import FONT
 
 TEST = ("digest", "reference", "mode", "runs", "seed", "length_s", "stride_s", "start", "outage")  # of the protocol
@@ -174,7 +174,7 @@ def differences(reports: Sequence[StoredReport]) -> tuple[list[str], list[list[s
     for report in reports:
         path: list[str] = []
         values = {}
-        for depth, key, text in flatten_html(report.protocol):
+        for depth, key, text in flatten_settings(report.protocol):
             path[depth:] = [key]
             values[".".join(path)] = text
         values_of_all.append(values | {"dataset": report.dataset})

@@ -71,7 +71,7 @@ def navigation_page(
     page.table(columns, rows, marks=marks, tall=len(courses) > 15)
     page.note(
         "Innovation / σ: what GNSS says less what the filter expects, over the filter's own 1σ of it (RMS). 1 is "
-        "right; above, the filter is surer than it should be: its noise is too small for this IMU and receiver."
+        "right; above, the filter is overconfident: its noise is too small for this IMU and receiver."
     )
     sensors = [course.result.sensors() for course in courses]
     if names := list(dict.fromkeys(name for found in sensors for name in found)):
@@ -98,10 +98,10 @@ def summary_lines(model: str, courses: Sequence[TrackOnMap]) -> list[str]:
         text = f"Longest time without a fix: {longest.without.max():.3g} s"
         text += f" ({longest.result.drive})." if len(courses) > 1 else "."
     if np.isfinite(sigma).any():
-        text += f" The filter's own horizontal 1σ: {np.nanmedian(sigma):.2g} m in half of the time, "
-        text += f"{np.nanmax(sigma):.2g} m at worst."
+        text += f" The filter's own horizontal 1σ: median {np.nanmedian(sigma):.2g} m, "
+        text += f"maximum {np.nanmax(sigma):.2g} m."
     else:
-        text += " This filter does not tell its own 1σ."
+        text += " This filter gives no 1σ."
     refused = [f"{c.result.refused} of {c.result.drive}" for c in courses if any(c.result.refused)]
     more = f" and of {len(refused) - FEW_NAMED} more drives" if len(refused) > FEW_NAMED else ""
     said = [f"Refused beyond physical limits: {', '.join(refused[:FEW_NAMED])}{more}."] if refused else []

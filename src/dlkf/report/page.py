@@ -77,7 +77,7 @@ class Page:
         """How the numbers were made, as words: nested settings indented, numbers as they are written by hand."""
         rows = "".join(
             f"<tr><td>{'&emsp;' * depth}{html.escape(words(key))}</td><td><code>{html.escape(text)}</code></td></tr>"
-            for depth, key, text in flatten_html(values)
+            for depth, key, text in flatten_settings(values)
         )
         self.parts.append(f"<h2>How this was made</h2><div class=scroll><table class=protocol>{rows}</table></div>")
 
@@ -102,18 +102,18 @@ def words(key: str) -> str:
     return key.replace("_", " ")
 
 
-def flatten_html(values: Mapping[str, Any], depth: int = 0) -> list[tuple[int, str, str]]:
+def flatten_settings(values: Mapping[str, Any], depth: int = 0) -> list[tuple[int, str, str]]:
     """(depth, key, text) of nested settings; lists and numbers in one line."""
     out: list[tuple[int, str, str]] = []
     for key, value in values.items():
         if isinstance(value, Mapping) and value:
-            out += [(depth, str(key), ""), *flatten_html(value, depth + 1)]
+            out += [(depth, str(key), ""), *flatten_settings(value, depth + 1)]
         else:
-            out.append((depth, str(key), is_shown(value)))
+            out.append((depth, str(key), format_setting(value)))
     return out
 
 
-def is_shown(value: Any) -> str:
+def format_setting(value: Any) -> str:
     """A value for a reader: – for none, numbers with six digits at most."""
     if value is None or (isinstance(value, Mapping) and not value):
         return "–"
@@ -122,5 +122,5 @@ def is_shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, (list, tuple)):
-        return ", ".join(map(is_shown, value)) or "–"
+        return ", ".join(map(format_setting, value)) or "–"
     return str(value)

@@ -86,7 +86,7 @@ class EpochFilter:
         with torch.inference_mode():  # a model that does not fit is refused now, not on the road
             samples = round(rate_hz * epoch_s)
             still = Closed(0, torch.tensor(REST, dtype=torch.float64).expand(1, samples, 6))
-            estimator.begin(whole_drives([self._drive([still])], [_anywhere()]).to(self.device))
+            estimator.begin(whole_drives([self._drive([still])], [_trial_start()]).to(self.device))
 
     def clear(self) -> None:
         """Start over, without any epoch."""
@@ -124,7 +124,7 @@ class EpochFilter:
         epoch.before = self.running
         running = self.running or self._aligned(k)
         if isinstance(running, Search):
-            self.running = self._searched(running, epoch)
+            self.running = self._advance_search(running, epoch)
             return []
         if running is None:
             return []
@@ -178,14 +178,14 @@ class EpochFilter:
             start = None if search is None else search.start()
             if start is None:
                 return search
-            return self._begun(replace(start, first=0), drive.part(row, row + 1))
+            return self._begin_filter(replace(start, first=0), drive.part(row, row + 1))
         try:
             start = align(drive, self._align, earliest=row)
         except InputError:
             return None
-        return self._begun(replace(start, first=0), drive.part(row, row + 1))
+        return self._begin_filter(replace(start, first=0), drive.part(row, row + 1))
 
-    def _searched(self, search: Search, epoch: Closed) -> Running | Search | None:
+    def _advance_search(self, search: Search, epoch: Closed) -> Running | Search | None:
         """After one more epoch: the search, or the filter that begins at its end; nothing if the search has failed."""
         held = self._buffer.fix(epoch.number + 1)
         fix = EarthFix(*(torch.from_numpy(getattr(held, n)) for n in ("r_e", "v_e", "std", "valid", "lag")))
@@ -194,9 +194,9 @@ class EpochFilter:
             self.counts["diverged"] += 1
             return None
         start = search.start()
-        return search if start is None else self._begun(start, self._drive([epoch]))
+        return search if start is None else self._begin_filter(start, self._drive([epoch]))
 
-    def _begun(self, start: Start, drive: Drive) -> Running:
+    def _begin_filter(self, start: Start, drive: Drive) -> Running:
         """The filter at a start."""
         self._first = whole_drives([drive], [start]).to(self.device)
         self.start_doubt = start.doubt
@@ -234,7 +234,7 @@ class EpochFilter:
         return running._replace(memory=reanchor(running.memory, change, fresh), state=state, frame=change.new)
 
 
-def _anywhere() -> Start:
+def _trial_start() -> Start:
     """A start at rest, for a trial."""
     zero = torch.zeros(3, dtype=torch.float64)
     level = torch.eye(3, dtype=torch.float64)

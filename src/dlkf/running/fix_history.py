@@ -1,4 +1,4 @@
-"""Fixes of the last seconds in order of time, and what the screen of implausible ones makes of each."""
+"""Fixes of the last seconds in order of time, and the verdict of the plausibility screen on each."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class FixHistory:
         No fix of a boundary before ``oldest`` comes any more: those are dropped.
         """
         while self._fixes and (len(self._fixes) == HELD or self._fixes[0].boundary < oldest):
-            _refused(self._before, self._fixes.pop(0))
+            _refusal(self._before, self._fixes.pop(0))
         place = bisect_left(self._fixes, t, key=lambda fix: fix.t)
         if place < len(self._fixes) and self._fixes[place].t == t:
             return None, set()
@@ -66,14 +66,14 @@ class FixHistory:
     def _screen(self, fixes: Iterable[ScreenedFix]) -> set[int]:
         changed = set()
         for fix in fixes:
-            used, fix.reason = fix.used, _refused(self._after, fix)
+            used, fix.reason = fix.used, _refusal(self._after, fix)
             fix.used = not fix.reason
             if fix.used != used:
                 changed.add(fix.boundary)
         return changed
 
 
-def _refused(screen: FixScreen, fix: ScreenedFix) -> str:
+def _refusal(screen: FixScreen, fix: ScreenedFix) -> str:
     """Why no car can have reached a fix, or nothing."""
     lat, lon, height = (float(fix.table[name][0]) for name in POSITION)
     speed = float(np.sqrt(sum(fix.table[name][0] ** 2 for name in VELOCITY)))

@@ -1,4 +1,4 @@
-"""Noise of an IMU, of its receiver and of the car, found on drives without a reference: what makes their fixes likely.
+"""Noise of IMU, receiver and car on drives without a reference: the maximum likelihood of their fixes.
 
 A filter predicts every fix, with a covariance S. With noise set too small the innovations z are larger than S
 predicts, with noise set too large smaller; the density of z is greatest between the two. A fix a second
@@ -172,8 +172,8 @@ class Evidence:
         solution = run_filter(batch, estimator, keep_covariances=True)
         scored, kept = self.offered & batch.available, self.offered & ~batch.available
         out = torch.zeros_like(batch.gnss_lag)
-        out[scored] = 0.5 * _used(batch, solution)[scored] / scored.sum()
-        out[kept] = 0.5 * _withheld(batch, solution, tuning)[kept] / kept.sum()
+        out[scored] = 0.5 * _of_used_fixes(batch, solution)[scored] / scored.sum()
+        out[kept] = 0.5 * _of_withheld_fixes(batch, solution, tuning)[kept] / kept.sum()
         return out
 
     def spans(self, shares: Float[Tensor, "B T"]) -> Float[Tensor, " n"]:
@@ -183,14 +183,14 @@ class Evidence:
         return pad(per_drive, (0, -per_drive.shape[1] % long)).unflatten(1, (-1, long)).sum(-1).flatten()
 
 
-def _used(batch: Batch, solution: BatchSolution) -> Float[Tensor, "B T"]:
+def _of_used_fixes(batch: Batch, solution: BatchSolution) -> Float[Tensor, "B T"]:
     """Of the innovations of fixes that the filter was offered; a component without one adds nothing."""
     assert solution.innovation_covariance is not None
     components = (batch.gnss_valid & batch.available.unsqueeze(-1)).sum(-1)
     return _density(solution.innovation, solution.innovation_covariance, components)
 
 
-def _withheld(batch: Batch, solution: BatchSolution, tuning: Tuning) -> Float[Tensor, "B T"]:
+def _of_withheld_fixes(batch: Batch, solution: BatchSolution, tuning: Tuning) -> Float[Tensor, "B T"]:
     """Of horizontal positions that the filter did not see, under its own covariance and that of the fix."""
     assert solution.position_covariance is not None
     state = solution.prior
@@ -240,7 +240,7 @@ def find_noise(
     shifts = [FixOffset(DELAY_STEP_S * late, DELAY_STEP_S * pace * ahead) for late, ahead in WAYS]
     done, tried_before = 0, dict[tuple[float, ...], float]()
 
-    def judged(values: Mapping[str, float], placing: FixOffset) -> float:
+    def score(values: Mapping[str, float], placing: FixOffset) -> float:
         nonlocal done
         done += 1
         if progress is not None:
@@ -266,15 +266,15 @@ def find_noise(
                 for direction in directions:
                     for factor in (step, 1 / step):
                         tried = {k: factor * v if k in direction else v for k, v in x.items()}
-                        while (value := judged(tried, placing)) < best - SURE_GAIN:
+                        while (value := score(tried, placing)) < best - SURE_GAIN:
                             best, x, moved = value, tried, True
                             tried = {k: factor * v if k in direction else v for k, v in x.items()}
                 for shift in shifts:
-                    while (value := judged(x, there := _moved(placing, shift, step))) < best - SURE_GAIN:
+                    while (value := score(x, there := _shift_offset(placing, shift, step))) < best - SURE_GAIN:
                         best, placing, moved = value, there, True
         return x, placing, best
 
-    before = judged(x, NO_OFFSET) if evidence.fixes else math.inf
+    before = score(x, NO_OFFSET) if evidence.fixes else math.inf
     if not math.isfinite(before):
         raise InputError("no noise can be found: it takes two minutes with fixes, and a filter that does not diverge")
     x, placing, best = search(x, NO_OFFSET, before, STEPS, shifts if delay else ())
@@ -284,7 +284,7 @@ def find_noise(
     coarse = placing
     placing, std = search_fix_offset(evidence, name, *_built(x, imu, tuning, called), coarse)
     if placing != coarse:
-        best = judged(x, placing)
+        best = score(x, placing)
         x, placing, best = search(x, placing, best, STEPS[1:], ())
     return NoiseFit(*_built(x, imu, tuning, called), placing, std, before, best)
 
@@ -359,7 +359,7 @@ def search_fix_offset(
     return FixOffset(*(at * unit).tolist()), FixOffset(*(std * unit).tolist())
 
 
-def _moved(placing: FixOffset, shift: FixOffset, step: float) -> FixOffset:
+def _shift_offset(placing: FixOffset, shift: FixOffset, step: float) -> FixOffset:
     return FixOffset(placing.delay_s + step * shift.delay_s, placing.ahead_m + step * shift.ahead_m)
 
 

@@ -1,4 +1,4 @@
-"""Whether a running filter is lost: far from fixes that agree with each other, or where no car can be.
+"""Whether a running filter is lost: far from fixes that agree with each other, or at an impossible position or speed.
 
 Gates inside filters judge one fix by the filter. Here fixes that passed the physical limits (:mod:`dlkf.data.limits`)
 judge the filter: if its position is far off in ``LOST_FIXES`` of them in a row, over ``LOST_S`` seconds, or less far in

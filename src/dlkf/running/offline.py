@@ -99,7 +99,7 @@ class Navigated:
         last, used = self.table.iloc[-1], int(self.table.gnss_used.sum())
         text = f"{self.drive}: aligned at t = {round(self.aligned_at, 1) + 0.0:.1f} s, "
         if self.doubt > WORTH_SAYING:
-            text += f"heading in doubt (another way round with probability {self.doubt:.2g}), "
+            text += f"heading ambiguous (the alternatives have probability {self.doubt:.2g}), "
         text += f"{len(self.table)} epochs, "
         if spacing is None:
             text += f"{used} fixes used"
@@ -251,7 +251,7 @@ def navigate_drives(
         batch = whole_drives([drives[k] for k in part], [starts[k] for k in part])
         solution = _run(batch, estimator)
         for row, k in enumerate(part):
-            yield _navigated(drives[k], starts[k], batch, row, solution, estimator, align)
+            yield _solve_drive(drives[k], starts[k], batch, row, solution, estimator, align)
         done += len(part)
         if progress is not None:
             progress(done, len(todo))
@@ -264,12 +264,12 @@ def _run(batch: Batch, estimator: Filter) -> BatchSolution:
         names = ", ".join(batch.drive[:3]) + (", …" if len(batch.drive) > 3 else "")
         which = f"drive {names}" if len(batch.drive) == 1 else f"one of the drives {names}"
         raise InputError(
-            f"{which}: the filter diverged (a covariance is no longer positive definite); its 1σ and tuning must be "
-            "numbers of a car's"
+            f"{which}: the filter diverged (a covariance is no longer positive definite); check the 1σ of its start "
+            "and tuning"
         ) from None
 
 
-def _navigated(
+def _solve_drive(
     drive: Drive, start: Start, batch: Batch, row: int, solution: BatchSolution, estimator: Filter, align: AlignConfig
 ) -> Navigated:
     """One drive of a batch; where the filter was lost (:mod:`dlkf.running.loss`) it is aligned and run again.

@@ -65,11 +65,7 @@ def check_reference(kind: str) -> None:
 
 
 def make_reference(
-    drives: Sequence[Drive],
-    kind: str,
-    estimator: Mbkf,
-    align: AlignConfig,
-    progress: ProgressCallback | None = None,
+    drives: Sequence[Drive], kind: str, estimator: Mbkf, align: AlignConfig, progress: ProgressCallback | None = None
 ) -> ReferencedDrives:
     """The drives with their smoothed solution (``smoothed``) or their good fixes (``gnss``) as reference.
 

@@ -1,4 +1,4 @@
-"""Logged drives through the streaming filter: sample by sample, what a vehicle would have known by then."""
+"""Logged drives through the streaming filter, sample by sample, without access to later data."""
 
 from __future__ import annotations
 

@@ -279,7 +279,7 @@ class StreamingFilter:
         """Put a fix to its boundary; replay where that is over."""
         t = float(fix["t"][0])
         row = self._boundary_of(t)
-        if reason := self._untimely("fix", t, row, least=0):
+        if reason := self._timing_fault("fix", t, row, least=0):
             return self._answer(Status.REFUSED, reason)
         screened, changed = self._fixes.add(t, row, fix, oldest=self._samples.epochs - self._rewind)
         if screened is None:
@@ -291,7 +291,7 @@ class StreamingFilter:
             return self._answer(Status.REFUSED, screened.reason, estimates or ())
         if self._buffer.fix_time(row) > t:
             return self._answer(Status.SUPERSEDED, estimates=estimates or ())
-        return self._answered(estimates)
+        return self._receipt(estimates)
 
     def _put_fix(self, row: int) -> None:
         """The fix of a boundary into the buffer, or none."""
@@ -305,18 +305,18 @@ class StreamingFilter:
     def _file_aid(self, name: str, t: float, value: float, std: float) -> Receipt:
         """Put a sample of a further sensor to the others of its interval; replay where that is over."""
         row = self._boundary_of(t)
-        if reason := self._untimely(name, t, row, least=1):
+        if reason := self._timing_fault(name, t, row, least=1):
             return self._answer(Status.REFUSED, reason)
         if not self._buffer.put_aid(row, name, t, value, std):
             return self._answer(Status.REFUSED, f"{name} at t = {t:.3f} again")
         estimates = self._replay(row)
-        return TAKEN if estimates is None else self._answered(estimates)
+        return TAKEN if estimates is None else self._receipt(estimates)
 
     def _boundary_of(self, t: float) -> int:
         assert self._samples.grid is not None
         return int(boundary_after(np.array([t]), self._samples.grid)[0])
 
-    def _untimely(self, what: str, t: float, row: int, least: int) -> str:
+    def _timing_fault(self, what: str, t: float, row: int, least: int) -> str:
         """Why a measurement cannot count at boundary ``row``, or nothing; the first that can is ``least``."""
         if row < least or max(row - 1, 0) < self._samples.epochs - self._rewind:
             return f"{what} at t = {t:.3f} is more than {self._history_s:g} s late"
@@ -331,5 +331,5 @@ class StreamingFilter:
             return None
         return self._epochs.replay(row)
 
-    def _answered(self, replayed: list[Estimate] | None) -> Receipt:
+    def _receipt(self, replayed: list[Estimate] | None) -> Receipt:
         return self._answer(Status.TAKEN) if replayed is None else self._answer(Status.REPLAYED, estimates=replayed)

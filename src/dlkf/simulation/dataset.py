@@ -277,7 +277,7 @@ def drive_of(made_by: Recipe, index: int, seconds: int) -> tuple[SimulatedTables
 def _write_drives(made_by: Recipe, folder: Path, workers: int, parallel: int | str | None, progress: bool) -> None:
     config = made_by.dataset
     jobs = list(enumerate(config.durations))
-    written = parallel_map(partial(_written, made_by, absolute_place(folder)), jobs, parallel, threads=workers)
+    written = parallel_map(partial(_write_one, made_by, absolute_place(folder)), jobs, parallel, threads=workers)
     console = Console(stderr=True)
     unseen = not (progress and sys.stderr.isatty())
     shown = track(written, f"simulating {config.name}", total=len(jobs), disable=unseen, console=console)
@@ -286,12 +286,12 @@ def _write_drives(made_by: Recipe, folder: Path, workers: int, parallel: int | s
     (folder / "simulation.json").write_text(json.dumps(made_by.described, indent=2, ensure_ascii=False) + "\n")
 
 
-def _written(made_by: Recipe, out: str, job: tuple[int, int]) -> dict[str, Any]:
+def _write_one(made_by: Recipe, out: str, job: tuple[int, int]) -> dict[str, Any]:
     """A drive by its index and seconds, in its place; its row of ``drives.parquet``."""
     tables, row = drive_of(made_by, *job)
     folder = resolve_place(out)
     if not is_url(out) and not folder.is_dir():
-        raise InputError(f"{out} is not there: the worker does not share the folder, or nobody waits for the drive")
+        raise InputError(f"{out} does not exist: the worker does not share the folder, or the command has ended")
     write_drive(folder, row, tables.imu, tables.gnss, tables.reference, tables.aids)
     if made_by.dataset.raw:
         write_raw(folder, row["drive"], tables.raw)

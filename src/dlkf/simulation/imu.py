@@ -130,10 +130,10 @@ def corrupt(
 ) -> tuple[Array, Array]:
     """Measured samples and their complete error without white noise, both (N, 6) (paper.md 2.7, R090).
 
-        error = M true + G f + b(t),   measured = put out(true + error + w),   std(w) = √S · √rate (R094)
+        error = M true + G f + b(t),   measured = quantise(true + error + w),   std(w) = √S · √rate (R094)
 
     G f, with f the specific force, is in the rates alone. b(t) is the unit's turn-on bias and warm-up drift plus
-    the in-run bias, the wander and the random walk of this drive. What is put out is limited to the full scale and
+    the in-run bias, the wander and the random walk of this drive. The output is limited to the full scale and
     rounded to whole steps of the quantisation; neither is part of the error.
     """
     scaled = np.concatenate((true_imu[:, :3] @ unit.matrix[0].T, true_imu[:, 3:] @ unit.matrix[1].T), -1)

@@ -1,4 +1,4 @@
-"""Pictures of drives, simulated or real: one drive as in the paper's figure 4, and how a dataset moves.
+"""Pictures of a simulated dataset: its first drive as in the paper's figure 4, and how all its drives move.
 
 Colours are Okabe & Ito's, which colour-blind readers can distinguish.
 """
@@ -15,7 +15,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from dlkf.base.errors import InputError
 from dlkf.base.files import folder_name, resolve_place, write_into
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR
 from dlkf.data.tables import Columns, read_drives
@@ -35,7 +34,7 @@ METRES_PER_DEGREE = 111_194.9  # of latitude on a sphere, for a picture
 
 @dataclass(frozen=True)
 class Driving:
-    """How a drive moves over the ground at the times t (N,), from its reference, else its GNSS fixes."""
+    """How a drive moves over the ground at the times t (N,), where its reference is valid."""
 
     t: Array  # s
     north: Array  # m from the start
@@ -62,16 +61,9 @@ class Driving:
 
 
 def driving(tables: CheckedTables) -> Driving:
-    """Speed, acceleration and yaw rate over the ground; derivatives by a sliding parabola of half a second.
-
-    InputError for a drive with less than ten rows that have a velocity.
-    """
-    source = tables.gnss if tables.reference is None else tables.reference
-    known = np.isfinite(np.stack([source[c] for c in ("lat_deg", "lon_deg", "vel_n", "vel_e")])).all(0)
-    if "valid" in source:
-        known &= source["valid"].astype(bool)
-    if known.sum() < 10:
-        raise InputError(f"drive {tables.row.name}: less than ten rows have position and velocity, nothing to draw")
+    """Speed, acceleration and yaw rate over the ground; derivatives by a sliding parabola of half a second."""
+    source = reference_of(tables)
+    known = source["valid"].astype(bool) & np.isfinite(source["vel_n"])
     t, lat, lon, v_n, v_e = (source[c][known] for c in ("t", "lat_deg", "lon_deg", "vel_n", "vel_e"))
     dt = float(np.median(np.diff(t)))
     width = max(3, 2 * round(0.5 * SMOOTH_S / dt) + 1)
@@ -89,22 +81,21 @@ def driving(tables: CheckedTables) -> Driving:
 
 
 def drive_figure(tables: CheckedTables) -> Figure:
-    """One drive: track, speed, specific force, rates, and the IMU's errors where they are known (paper, figure 4)."""
+    """One drive: track, speed, specific force, rates, and the IMU's errors (paper, figure 4)."""
     moved = driving(tables)
-    errors = _known_errors(tables.reference)
-    rows = 3 if errors is None else 5
+    reference, rows = reference_of(tables), 5
     figure = Figure(figsize=(11.5, 1.9 * rows + 0.5), layout="constrained")
     grid = figure.add_gridspec(rows, 2, width_ratios=(1, 1.35))
     _track(figure.add_subplot(grid[:, 0]), figure, moved, tables)
     first = figure.add_subplot(grid[0, 1])
     first.plot(moved.t, 3.6 * moved.speed, color=INK, linewidth=0.8)
     first.set_ylabel("speed [km/h]")
-    panels = [(tables.imu, ACCEL, 1.0, "specific force\n[m/s²]"), (tables.imu, GYRO, 180 / np.pi, "rate [°/s]")]
-    if errors is not None:
-        panels += [
-            (errors, IMU_ERROR[:3], 1.0, "accelerometer\nerror [m/s²]"),
-            (errors, IMU_ERROR[3:], 180 / np.pi, "gyroscope\nerror [°/s]"),
-        ]
+    panels = [
+        (tables.imu, ACCEL, 1.0, "specific force\n[m/s²]"),
+        (tables.imu, GYRO, 180 / np.pi, "rate [°/s]"),
+        (reference, IMU_ERROR[:3], 1.0, "accelerometer\nerror [m/s²]"),
+        (reference, IMU_ERROR[3:], 180 / np.pi, "gyroscope\nerror [°/s]"),
+    ]
     lower = []
     for k, (source, columns, scale, label) in enumerate(panels, start=1):
         lower.append(figure.add_subplot(grid[k, 1], sharex=first))
@@ -150,25 +141,24 @@ def motion_figure(drives: Sequence[Driving], title: str) -> Figure:
     return figure
 
 
-def write_pictures(dataset: str | Path, out: str | Path, names: Sequence[str] = ()) -> list[Path]:
-    """Draw the named drives of a dataset (its first one by default), and all of its motion, into ``out``.
-
-    InputError for a drive that the dataset has not got, or tables that break the contract.
-    """
-    rows = {row.name: row for row in read_drives(dataset)}
-    if unknown := [name for name in names if name not in rows]:
-        raise InputError(f"dataset {dataset}: no drive {', '.join(unknown)}; has {', '.join(list(rows)[:5])} …")
-    files, moved = [], []
+def write_pictures(dataset: str | Path, out: str | Path) -> list[Path]:
+    """Draw the first drive of a dataset, and all of its motion, into ``out``."""
+    rows = read_drives(dataset)
+    files, moved = [f"{rows[0].name}.png", "motion.png"], []
     with write_into(out) as folder:
-        for name, row in rows.items():
+        for row in rows:
             tables = read_checked(dataset, row)
             moved.append(driving(tables).every(0.5))
-            if name in (names or list(rows)[:1]):
-                files.append(f"{name}.png")
-                drive_figure(tables).savefig(folder / files[-1], dpi=90)
-        files.append("motion.png")
-        motion_figure(moved, folder_name(dataset)).savefig(folder / files[-1], dpi=90)
+            if row is rows[0]:
+                drive_figure(tables).savefig(folder / files[0], dpi=90)
+        motion_figure(moved, folder_name(dataset)).savefig(folder / files[1], dpi=90)
     return [resolve_place(out) / file for file in files]
+
+
+def reference_of(tables: CheckedTables) -> Columns:
+    """Of a simulated drive, which has one."""
+    assert tables.reference is not None
+    return tables.reference
 
 
 def _track(axes: Axes, figure: Figure, moved: Driving, tables: CheckedTables) -> None:
@@ -188,12 +178,6 @@ def _track(axes: Axes, figure: Figure, moved: Driving, tables: CheckedTables) ->
     axes.legend(frameon=False, fontsize=8)
     bar = {"location": "bottom", "shrink": 0.7, "aspect": 40, "fraction": 0.05, "pad": 0.02}
     figure.colorbar(drawn, ax=axes, label="speed [km/h]", **bar)
-
-
-def _known_errors(reference: Columns | None) -> Columns | None:
-    if reference is None or not all(c in reference and np.isfinite(reference[c]).any() for c in IMU_ERROR):
-        return None
-    return reference
 
 
 def _histogram(

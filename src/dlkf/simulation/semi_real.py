@@ -41,12 +41,7 @@ INJECTED = "the injected part only: the source's own IMU errors remain and are n
 
 
 def simulate_semi_real(
-    source: str | Path,
-    made_by: Recipe,
-    out: Path,
-    *,
-    overwrite: bool = False,
-    progress: bool = True,
+    source: str | Path, made_by: Recipe, out: Path, *, overwrite: bool = False, progress: bool = True
 ) -> Path:
     """Write every drive of the dataset ``source`` to ``out`` with IMU errors injected and GNSS simulated.
 

@@ -1,4 +1,4 @@
-"""Trainings one after the other as one study: what is finished is not done again; in MLflow a parent with children."""
+"""Trainings one after the other as one study, resumed after a kill; in MLflow a parent with children."""
 
 from __future__ import annotations
 

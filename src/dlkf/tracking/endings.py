@@ -1,4 +1,4 @@
-"""How runs end: by themselves, by a signal, or by a kill, which the next run on the same machine records in MLflow."""
+"""End of runs in MLflow: normal, by a signal, or by a kill, which the next run on the same machine records."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def end_run(status: str, error: BaseException | None = None) -> None:
     """
     mlflow = mlflow_module()
     if error is not None:
-        _let_go(error)
+        _release_frames(error)
     with delay_signals():
         run = mlflow.active_run()
         try:
@@ -54,7 +54,7 @@ def end_run(status: str, error: BaseException | None = None) -> None:
             mlflow.MlflowClient().set_terminated(run.info.run_id, status)
 
 
-def _let_go(error: BaseException) -> None:
+def _release_frames(error: BaseException) -> None:
     """Variables of the frames that an exception and its causes hold; of an interrupt the frames too, whose functions
     keep what they closed over (a list comprehension over the rows of a cursor)."""
     links: list[BaseException | None] = [error]

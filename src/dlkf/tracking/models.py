@@ -1,4 +1,4 @@
-"""From what a user writes after ``model=`` to a filter that runs."""
+"""Resolution of ``model=``: a name, folder, run id, registered model or class to a filter."""
 
 from __future__ import annotations
 

@@ -37,18 +37,7 @@ if TYPE_CHECKING:
 NAME = "model"
 NO_STEP = -1  # at a step of training MLflow would give the model that step's losses and CPU load as its metrics
 CODE = Path(__file__).with_name("pyfunc_model.py")
-REQUIRED = (
-    "mlflow",
-    "torch",
-    "numpy",
-    "scipy",
-    "pandas",
-    "pyarrow",
-    "safetensors",
-    "pyyaml",
-    "pymap3d",
-    "jaxtyping",
-)
+REQUIRED = ("mlflow", "torch", "numpy", "scipy", "pandas", "pyarrow", "safetensors", "pyyaml", "pymap3d", "jaxtyping")
 SPEC = re.compile(r"(?P<name>[^/:@]+)(?:@(?P<alias>[^/@]+)|/(?P<version>\d+|latest))?")
 
 
@@ -262,7 +251,7 @@ def _fetch(source: str, spec: str, uri: str) -> Path:
     except (OSError, MlflowException) as error:
         reason = str(error).splitlines()[0]
         hint = "; a store has absolute places: move its folder back" if there is None else ""
-        raise InputError(f"model={spec}: its files cannot be had from {source}: {reason}{hint}") from None
+        raise InputError(f"model={spec}: its files cannot be read from {source}: {reason}{hint}") from None
     found = sorted(folder.rglob(WEIGHTS))
     if not found:
         raise InputError(f"model={spec}: {source} holds no {WEIGHTS}; was this model logged by dlkf?")

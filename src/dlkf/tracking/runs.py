@@ -22,13 +22,7 @@ from dlkf.base.errors import InputError
 from dlkf.base.files import folder_name, is_url, local_copy
 from dlkf.base.processes import process_label
 from dlkf.base.signals import delay_signals
-from dlkf.tracking.endings import (
-    PROCESS_TAG,
-    close_killed_runs,
-    end_run,
-    mlflow_module,
-    use_store,
-)
+from dlkf.tracking.endings import PROCESS_TAG, close_killed_runs, end_run, mlflow_module, use_store
 
 if TYPE_CHECKING:
     from lightning.pytorch.loggers import MLFlowLogger
@@ -126,7 +120,7 @@ def reachable(uri: str) -> Iterator[None]:
         no_answer = isinstance(error, RequestException) or "failed with exception" in str(error)
         if not (uri.startswith("http") and no_answer):
             raise
-        message = f"the MLflow server {uri} does not answer; start it, or mend tracking.uri"
+        message = f"the MLflow server {uri} does not answer; start it, or correct tracking.uri"
         raise InputError(message) from None
 
 

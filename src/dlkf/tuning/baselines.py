@@ -1,4 +1,4 @@
-"""The classical filters of a study, each tuned itself on training segments with outages (R018; paper.md 4.6)."""
+"""The classical filters of a study, each tuned on training segments with outages (R018; paper.md 4.6)."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def tuned_baselines(
     The search for ``mbkf15`` begins at ``start``. All others but ``ins`` begin at the factors of ``mbkf15``, one with
     ``_prior`` at those of the same filter without, and search over their own (:func:`dlkf.tuning.search.factors_of`).
     """
-    first, _ = _searched(imu, batches, FIRST, rounds, start)
+    first, _ = _search_with_progress(imu, batches, FIRST, rounds, start)
     prior = best_prior(imu, first, batches)
     priors: dict[str, Prior] = {}
     tunings: dict[str, Tuning] = {}
@@ -66,13 +66,13 @@ def tuned_baselines(
             tunings[name] = begun
             error = outage_error(build_causal(name, imu, "tuning does not", tuning=begun), batches)
         else:
-            tunings[name], error = _searched(imu, batches, name, rounds, begun, priors.get(name))
+            tunings[name], error = _search_with_progress(imu, batches, name, rounds, begun, priors.get(name))
         how = "tuned" if rounds and name != "ins" else "untuned"
         say(f"{name} {how}: {error:.2f} m at the end of the outages of training segments (geometric mean)")
     return Baselines(imu, tunings, prior, priors)
 
 
-def _searched(
+def _search_with_progress(
     imu: ImuSpec,
     batches: Sequence[Batch],
     name: str,

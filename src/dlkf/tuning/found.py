@@ -1,4 +1,4 @@
-"""Noise found without a reference, as a preset and factors that the other commands take."""
+"""Noise estimated without a reference, as a preset and factors for the other commands."""
 
 from __future__ import annotations
 

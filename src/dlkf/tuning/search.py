@@ -1,4 +1,4 @@
-"""Baselines as good as training drives can make them: tuned noise, and the prior knowledge of one IMU.
+"""Search of noise factors, and of the prior IMU error of drives that share one IMU.
 
 Nothing here looks at validation or test drives (R018; paper.md 4.6).
 """
@@ -102,18 +102,18 @@ def tune_filter(
     known: dict[Tuning, float] = {}
     best = start or Tuning()
 
-    def told(trial: Tuning) -> Estimator:
+    def build(trial: Tuning) -> Estimator:
         return build_causal(name, imu, "tuning does not", tuning=trial, prior=prior)
 
-    in_c = _fits_c(told(best), batches)
+    in_c = _fits_c(build(best), batches)
 
-    def judged(trial: Tuning) -> float:
+    def evaluate(trial: Tuning) -> float:
         if trial not in known:
-            estimator = _in_c(told(trial), batches[0]) if in_c else told(trial)
+            estimator = _in_c(build(trial), batches[0]) if in_c else build(trial)
             known[trial] = outage_error(estimator, batches, objective)
         return known[trial]
 
-    score = judged(best)
+    score = evaluate(best)
     for _ in range(rounds):
         before = best
         for factor, values in (factors or factors_of(name)).items():
@@ -123,7 +123,7 @@ def tune_filter(
                 worse = 0
                 for value in side:
                     trial = replace(best, **{factor: value})
-                    error = judged(trial)
+                    error = evaluate(trial)
                     if progress is not None:
                         progress(Trial(factor, value, error))
                     worse = 0 if error < score else worse + 1
@@ -216,7 +216,7 @@ def best_prior(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name: str
     The spread of the estimates is their estimator's scatter where all drives share one IMU, and then too wide.
     """
     prior = mean_imu_error(imu, tuning, batches, drop_prior(name))
-    tried = [prior.surer(factor) for factor in (3.0, 1.0, 0.3, 0.1)]
+    tried = [prior.scale_spread(factor) for factor in (3.0, 1.0, 0.3, 0.1)]
 
     def error(tried: Prior) -> float:
         return outage_error(build_causal(name, imu, "a prior does not", tuning=tuning, prior=tried), batches)

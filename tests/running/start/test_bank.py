@@ -172,7 +172,7 @@ def test_doubt_is_carried_through_an_outage_and_said(drives):
         valid = d.gnss_valid.clone()
         valid[6:42] = False
         doubtful = replace(d, gnss_r_e=r_e, gnss_valid=valid, imu=imu)
-        with pytest.raises(InputError, match="heading stays in doubt"):
+        with pytest.raises(InputError, match="heading is ambiguous"):
             align(doubtful.part(0, 30), SEARCH)
         assert align(doubtful.part(0, 30), AROUND).doubt > 0.01
         causal, around = align(doubtful, SEARCH), align(doubtful, AROUND)

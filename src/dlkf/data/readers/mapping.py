@@ -97,14 +97,14 @@ class Mapped:
             empty = values.isna() | texts.str.lower().isin(["", "nan", "na", "none", "null"])
             bad = np.flatnonzero((numbers.isna() & ~empty).to_numpy())
             if len(bad):
-                remedy = "mend the line"
+                remedy = "correct the line"
                 if np.mean(numbers.isna()) > 0.5 and str(name) == str((self.spec.get("time") or {}).get("column")):
                     remedy = f"set reader.{self.kind}.time.unit=iso if that is a date and time"
                 self.fail(int(bad[0]), name, f"is {values.iloc[bad[0]]!r}, not a number; {remedy}")
             values = numbers
         if not nan and bool(values.isna().any()):
             row = int(np.flatnonzero(values.isna())[0])
-            remedy = f"mend or remove the line, or leave such rows out with reader.{self.kind}.rows=filled"
+            remedy = f"correct or remove the line, or leave such rows out with reader.{self.kind}.rows=filled"
             self.fail(row, name, f"is empty; {remedy}")
         return values.to_numpy()
 

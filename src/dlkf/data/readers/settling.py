@@ -99,8 +99,8 @@ def settle(
         log = mapped["gnss"].table
         why = "".join(f"; {note}" for note in log.notes)
         raise InputError(
-            f"{where}: {log.path} has {count} {'fix' if count == 1 else 'fixes'}, which are no motion of a car{why}; "
-            "copy the log again, or leave the drive out"
+            f"{where}: {log.path} has {count} {'fix' if count == 1 else 'fixes'}, which are not the "
+            f"motion of a car{why}; copy the log again, or leave the drive out"
         )
     found = Findings()
     if "gnss.velocity.unit" in wanted:

@@ -1,4 +1,4 @@
-"""Which way a car faces: headings side by side, each a filter of its own, until one has won.
+"""Heading search: hypotheses in parallel, each a filter of its own, until one is significantly more likely.
 
 A course is no heading where the car reverses, and a poor one where fixes are coarse. So a filter with 15 states that
 moves along its axes (:class:`Sideslip`) is run from each of several headings, and they are weighed by their

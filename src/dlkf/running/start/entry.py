@@ -73,7 +73,7 @@ def align(drive: Drive, config: AlignConfig = ALIGN, *, earliest: int = 0) -> St
     """Position, velocity and attitude at the first boundary ≥ ``earliest`` at which they can be had.
 
     The tangent origin is the IMU's position there. Reads no reference. Raises InputError naming the drive if it has
-    no fix, the car never moves under GNSS, or its heading stays in doubt.
+    no fix, the car never moves under GNSS, or its heading is ambiguous.
     """
     start = align_each([drive], config, earliest=earliest)[0]
     if isinstance(start, InputError):
@@ -94,7 +94,7 @@ def align_each(drives: Sequence[Drive], config: AlignConfig = ALIGN, *, earliest
     for i in range(0, len(motions), CASES_AT_ONCE):
         some = motions[i : i + CASES_AT_ONCE]
         starts += (
-            _searched(some, config, earliest) if config.search_s > 0 else [_started(x, config, earliest) for x in some]
+            _search(some, config, earliest) if config.search_s > 0 else [_started(x, config, earliest) for x in some]
         )
     of_motions = iter(starts)
     return [x if isinstance(x, InputError) else next(of_motions) for x in found]
@@ -232,7 +232,7 @@ def _align_until_motion(drive: Drive, config: AlignConfig, earliest: int) -> tup
 
 
 @torch.inference_mode()
-def _searched(motions: Sequence[FirstMotion], config: AlignConfig, earliest: int) -> list[Start | InputError]:
+def _search(motions: Sequence[FirstMotion], config: AlignConfig, earliest: int) -> list[Start | InputError]:
     """Starts from a bank of headings that runs until each of the cases is ready or at its drive's end."""
     drives, cases = [m.drive for m in motions], [m.case for m in motions]
     epoch_s, dt = drives[0].epoch_s, 1 / drives[0].rate_hz
@@ -248,7 +248,7 @@ def _searched(motions: Sequence[FirstMotion], config: AlignConfig, earliest: int
                 starts[k] = replace(_started(turned, config, earliest), doubt=verdict.doubt)
             elif ended:
                 starts[k] = InputError(
-                    f"drive {drives[k].name}: its heading stays in doubt (another way round with probability "
+                    f"drive {drives[k].name}: its heading is ambiguous (the alternatives have probability "
                     f"{verdict.doubt:.2g}); align.from_rest=true takes the most probable"
                 )
             else:

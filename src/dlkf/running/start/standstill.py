@@ -1,4 +1,4 @@
-"""Where a car is stationary, what its samples then give, and attitude carried back to the standstill from first motion.
+"""Standstills: where a car is stationary, gyroscope bias and levelling there, attitude carried back from first motion.
 
 A stationary car does not turn: its mean rate is the gyroscopes' error and the Earth's rate, its mean specific force is
 −g, which gives roll and pitch (Groves 5.6.2), and its heading when it sets off is the heading of the whole standstill.

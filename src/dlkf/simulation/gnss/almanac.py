@@ -79,7 +79,7 @@ def read_almanac(path: str = "") -> Almanac:
         raise InputError(f"almanac {file}: the satellites' times of applicability differ; give one almanac")
     prn = [int(record["prn"]) for record in healthy]
     if len(set(prn)) < len(prn):
-        raise InputError(f"almanac {file}: a satellite stands twice; give one almanac")
+        raise InputError(f"almanac {file}: a satellite appears twice; give one almanac")
     cycles = round((PACKAGED_WEEK - healthy[0]["week"]) / 1024) if healthy[0]["week"] < 1024 else 0
     return Almanac(
         int(healthy[0]["week"]) + 1024 * cycles,

@@ -1,4 +1,4 @@
-"""What a receiver makes of a fix before it reports it: late, with a std of its own opinion, and not always."""
+"""How a receiver reports fixes: delayed, with a scaled std, and with gaps."""
 
 from __future__ import annotations
 

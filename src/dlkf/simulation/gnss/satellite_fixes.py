@@ -14,11 +14,10 @@ from dlkf.navigation.earth import ecef_from_geodetic, ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.simulation.gnss.almanac import Almanac, read_almanac
 from dlkf.simulation.gnss.least_squares import LeastSquaresFix, Observations, solve
-from dlkf.simulation.gnss.obstruction import hold_visibility, in_view
 from dlkf.simulation.gnss.receiver import Receiver, clock, range_errors
 from dlkf.simulation.gnss.reporting import report_fixes
 from dlkf.simulation.gnss.satellites import L1, LIGHT, Signals, ned_at, signals
-from dlkf.simulation.gnss.surroundings import Sky
+from dlkf.simulation.gnss.surroundings import Sky, hold_visibility, in_view
 from dlkf.simulation.gnss.white import FLOAT, GnssConfig, antenna_states, observe, shift_positions
 from dlkf.simulation.motion.vehicle import Truth
 
@@ -60,12 +59,7 @@ def receive(
 
 
 def observe_satellites(
-    rng: np.random.Generator,
-    truth: Truth,
-    rate_b: Array,
-    config: GnssConfig,
-    receiver: Receiver,
-    sky: Sky | None,
+    rng: np.random.Generator, truth: Truth, rate_b: Array, config: GnssConfig, receiver: Receiver, sky: Sky | None
 ) -> Received:
     """What a receiver makes of the satellites at every row of ``truth`` (uniform in time), by least squares.
 

@@ -92,19 +92,12 @@ def satellite_state(almanac: Almanac, t: Array, t_axes: Array | None = None) -> 
     ci, si = np.cos(almanac.inclination), np.sin(almanac.inclination)
     r_e = np.stack((x * cn - y * ci * sn, x * sn + y * ci * cn, y * si), -1)
     v_e = np.stack(
-        (
-            vx * cn - vy * ci * sn - r_e[..., 1] * node_rate,
-            vx * sn + vy * ci * cn + r_e[..., 0] * node_rate,
-            vy * si,
-        ),
+        (vx * cn - vy * ci * sn - r_e[..., 1] * node_rate, vx * sn + vy * ci * cn + r_e[..., 0] * node_rate, vy * si),
         -1,
     )
     relativity = RELATIVITY * e * almanac.sqrt_a
     return SatelliteState(
-        r_e,
-        v_e,
-        almanac.af0 + almanac.af1 * t + relativity * sine,
-        almanac.af1 + relativity * cosine * anomaly_rate,
+        r_e, v_e, almanac.af0 + almanac.af1 * t + relativity * sine, almanac.af1 + relativity * cosine * anomaly_rate
     )
 
 

@@ -1,4 +1,4 @@
-"""What stands around the road and hides the sky: buildings on both sides, tunnels, bridges, garages.
+"""What stands around the road and hides satellites: buildings on both sides, tunnels, bridges, garages.
 
 Everything is a function of the distance driven, so a stationary car has the same sky, and the same road
 sampled at another rate has the same buildings.
@@ -88,3 +88,24 @@ def _covered(rng: np.random.Generator, surroundings: Surroundings, distance: Arr
     count = 1 + int(2 * distance.max() / mean.sum())
     ends = np.cumsum(mean * rng.uniform(0.5, 1.5, (count, 2)))
     return np.searchsorted(ends, distance, side="right") % 2 == 1
+
+
+def in_view(sky: Sky, course: Array, elevation: Array, azimuth: Array) -> NDArray[np.bool_]:
+    """Satellites (T, S) that nothing along the road hides; course (T,), elevation and azimuth (T, S) [rad].
+
+    Buildings are walls along the road: one of elevation m straight across hides what is below the plane through
+    its upper edge, tan(elevation) < tan(m) |sin(azimuth − course)|, so the sky is open ahead and behind.
+    """
+    across = np.sin(azimuth - course[:, None])
+    wall = np.where(across > 0, np.tan(sky.mask_right)[:, None], np.tan(sky.mask_left)[:, None])
+    return (np.tan(elevation) >= wall * np.abs(across)) & ~sky.blocked[:, None]
+
+
+def hold_visibility(condition: NDArray[np.bool_], rows: int) -> NDArray[np.bool_]:
+    """Where ``condition`` (T, …) is true and has been for the ``rows`` rows before; before the first it is taken to be.
+
+    A receiver tracks a satellite again only some time after it has come back into view.
+    """
+    row = np.arange(len(condition)).reshape(-1, *(1,) * (condition.ndim - 1))
+    broken = np.maximum.accumulate(np.where(condition, -rows - 1, row), axis=0)
+    return row - broken > rows

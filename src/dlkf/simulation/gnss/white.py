@@ -73,11 +73,7 @@ class GnssConfig(Ranged, where="gnss"):
 
 
 def observe(
-    rng: np.random.Generator,
-    truth: Truth,
-    rate_b: NDArray[np.floating],
-    config: GnssConfig,
-    sky: Sky | None = None,
+    rng: np.random.Generator, truth: Truth, rate_b: NDArray[np.floating], config: GnssConfig, sky: Sky | None = None
 ) -> pd.DataFrame:
     """GNSS table of the data contract at every row of ``truth`` whose sky is not blocked.
 

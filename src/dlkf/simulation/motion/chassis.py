@@ -1,4 +1,4 @@
-"""What makes a car more than a point: slip, suspension, rough road, vibration, and where the IMU sits.
+"""The car around the IMU: slip, suspension, rough road, vibration, lever arm and mounting.
 
 The rear axle follows the road exactly; on top of it comes a chain of rotations, each with its rate, from the
 path through the car to the IMU:

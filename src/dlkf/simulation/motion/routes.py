@@ -239,8 +239,4 @@ def _ramp_slope(x: Array) -> Array:
 def _ramp_integrals(x: Array) -> tuple[Array, Array, Array]:
     """The ramp 3x² − 2x³ (0 before, 1 after) and its first and second integral."""
     c, over = np.clip(x, 0, 1), np.maximum(x - 1, 0)
-    return (
-        c * c * (3 - 2 * c),
-        c**3 * (1 - c / 2) + over,
-        c**4 * (1 / 4 - c / 10) + over * (1 + over) / 2,
-    )
+    return (c * c * (3 - 2 * c), c**3 * (1 - c / 2) + over, c**4 * (1 / 4 - c / 10) + over * (1 + over) / 2)

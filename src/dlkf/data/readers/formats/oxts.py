@@ -38,7 +38,7 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
         try:
             rows.append(np.array([float(c) for c in cells[:30]] + [np.nan] * (30 - len(cells[:30]))))
         except ValueError:
-            raise InputError(f"{file}: holds something that is no number; mend or remove it") from None
+            raise InputError(f"{file}: holds something that is no number; correct or remove it") from None
         kept.append(number)
     frame = pd.DataFrame(rows, columns=list(NAMES), index=pd.Index(kept))
     frame.insert(0, "t", [stamps[k].strip() for k in kept])

@@ -104,5 +104,5 @@ def _numbers(cells: pd.Series, where: str) -> np.ndarray:
     values = pd.to_numeric(cells, errors="coerce")
     if bool(values.isna().any()):
         line = cells.index[int(np.flatnonzero(values.isna())[0])]
-        raise InputError(f"{where}: line {line}: {cells[line]!r} is not a number; mend the line")
+        raise InputError(f"{where}: line {line}: {cells[line]!r} is not a number; correct the line")
     return values.to_numpy()

@@ -79,7 +79,7 @@ def decoded(path: Path, encoding: str | None) -> str:
         try:
             return raw.decode(encoding)
         except (LookupError, UnicodeDecodeError) as error:
-            raise InputError(f"{path}: reader.encoding={encoding}: {error}; leave it out or mend it") from None
+            raise InputError(f"{path}: reader.encoding={encoding}: {error}; leave it out or correct it") from None
     if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return raw.decode("utf-16", errors="replace")
     if b"\0" in raw[:4096]:

@@ -1,4 +1,4 @@
-"""An evaluation share by share: drives of a dataset are loaded, scored and forgotten, here or on other processes."""
+"""An evaluation in chunks of drives, each loaded, scored and released, here or in other processes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from dlkf.running.references import ReferencedDrives, make_reference
 
 @dataclass(frozen=True)
 class EvaluationJob:
-    """What is done to a share: the filters, the rules, and whose truth the errors are against."""
+    """What is done to a chunk: the filters, the rules, and whose truth the errors are against."""
 
     dataset: str
     filters: Mapping[str, Filter]
@@ -45,7 +45,7 @@ class EvaluationJob:
 
 
 class ChunkResult(NamedTuple):
-    """What became of a share: its run, or why nothing of it can be scored."""
+    """What became of a chunk: its run, or why nothing of it can be scored."""
 
     names: tuple[str, ...]
     run: ScoredRun | None
@@ -58,7 +58,7 @@ class ChunkResult(NamedTuple):
 
 
 class Evaluated(NamedTuple):
-    """All shares together; ``truth`` describes a made reference, ``short`` which drives have no segment."""
+    """All chunks together; ``truth`` describes a made reference, ``short`` which drives have no segment."""
 
     run: ScoredRun
     mode: str
@@ -69,37 +69,37 @@ class Evaluated(NamedTuple):
 
 
 def evaluate_chunks(
-    work: EvaluationJob, shares: Sequence[tuple[str, ...]], parallel: int | str | None = None
+    work: EvaluationJob, chunks: Sequence[tuple[str, ...]], parallel: int | str | None = None
 ) -> Evaluated:
-    """Every filter over every share. InputError where none has anything to score.
+    """Every filter over every chunk. InputError where none has anything to score.
 
     What is drawn for a segment depends on it alone (:mod:`dlkf.data.draws`), so it is the same however the drives are
-    shared out. Where one share has segments, ``mode=auto`` means segments for all.
+    divided. Where one chunk has segments, ``mode=auto`` means segments for all.
     """
-    parts = list(parallel_map(partial(score_chunk, work), shares, parallel))
-    skipped = {drive: why for part in parts for drive, why in part.skipped.items()}
-    scorable = [part for part in parts if part.run is not None]
+    done = list(parallel_map(partial(score_chunk, work), chunks, parallel))
+    skipped = {drive: why for one in done for drive, why in one.skipped.items()}
+    scorable = [one for one in done if one.run is not None]
     if not scorable:
-        raise parts[0].refused or InputError("no drives: give a dataset with at least one")
-    mode = "segments" if any(part.mode == "segments" for part in scorable) else "drives"
-    kept = [part for part in scorable if part.mode == mode]
-    run = join_chunks([part.run for part in kept if part.run is not None])
-    of_other_mode = [part for part in scorable if part.mode != mode]  # no segment, where others have some
-    lost = {name for part in parts for name in part.short} | {name for part in of_other_mode for name in part.names}
-    names = [name for part in parts for name in part.names]
+        raise done[0].refused or InputError("no drives: give a dataset with at least one")
+    mode = "segments" if any(one.mode == "segments" for one in scorable) else "drives"
+    kept = [one for one in scorable if one.mode == mode]
+    run = join_chunks([one.run for one in kept if one.run is not None])
+    of_other_mode = [one for one in scorable if one.mode != mode]  # no segment, where others have some
+    lost = {name for one in done for name in one.short} | {name for one in of_other_mode for name in one.names}
+    names = [name for one in done for name in one.names]
     unused = [name for name in names if name in lost - set(skipped)]
     short = describe_short(unused, len(names), work.protocol) if unused else ""
-    rules = {**kept[0].rules, "runs": sum(part.rules["runs"] for part in kept), "skipped": skipped}
+    rules = {**kept[0].rules, "runs": sum(one.rules["runs"] for one in kept), "skipped": skipped}
     rules |= {"too short": short} if short else {}
-    refused = {drive: said for part in kept for drive, said in part.rules.get(REFUSED, {}).items()}
+    refused = {drive: said for one in kept for drive, said in one.rules.get(REFUSED, {}).items()}
     rules |= {REFUSED: refused} if refused else {}
-    sigmas = [part.sigma for part in kept if part.sigma is not None]
+    sigmas = [one.sigma for one in kept if one.sigma is not None]
     truth = {"reference": ReferencedDrives([], torch.cat(sigmas), {}, work.reference).described()} if sigmas else {}
     return Evaluated(run, mode, rules, skipped, truth, short)
 
 
 def score_chunk(work: EvaluationJob, names: tuple[str, ...]) -> ChunkResult:
-    """One share."""
+    """One chunk."""
     wanted = {"dtype": torch.float64, "reference": work.reference == "file", "drives": names}
     with _bar(work, "Loading drives") as progress:
         drives = load_dataset(work.dataset, progress=progress, **wanted, **work.grid)
