@@ -32,7 +32,7 @@ from dlkf.running.solution import SCHEMA, solution_table
 from dlkf.running.start import align_each
 
 WORTH_SAYING = 0.01  # probability of another heading
-SAMPLES_AT_ONCE = 4_000_000  # IMU samples of drives in memory, 22 h at 50 Hz
+SAMPLES_AT_ONCE = CHUNK_SAMPLES  # IMU samples of drives in memory, 8 h at 50 Hz
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,7 @@ def navigate_drives(
 
 def _run(batch: Batch, estimator: Filter) -> BatchSolution:
     try:
-        return run_filter(batch, estimator, keep_covariances=True)
+        return run_filter(batch, estimator, keep_innovations=True)
     except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage]
         names = ", ".join(batch.drive[:3]) + (", …" if len(batch.drive) > 3 else "")
         which = f"drive {names}" if len(batch.drive) == 1 else f"one of the drives {names}"
