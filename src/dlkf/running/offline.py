@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,8 +24,9 @@ from dlkf.data.tables import read_table
 from dlkf.data.validate import GNSS_QUALITIES
 from dlkf.filters.aids.attach import aid_columns
 from dlkf.filters.constraints import CarConstraints
-from dlkf.filters.integration import BatchSolution
+from dlkf.filters.integration import BatchSolution, WholeLoop
 from dlkf.filters.smoother import Filter, SmoothedSolution
+from dlkf.navigation.compiled import without_loops
 from dlkf.running.batched import CHUNK_SAMPLES, run_filter
 from dlkf.running.innovations import Innovation, fit_sigma
 from dlkf.running.loss import first_loss
@@ -233,7 +235,9 @@ def navigate_drives(
     InputError where a solution is not finite. ``progress(drives done, drives in all)``.
     """
     starts = {}
-    for k, start in enumerate(align_each(drives, align)):
+    with _forms(estimator):
+        aligned = align_each(drives, align)
+    for k, start in enumerate(aligned):
         if not isinstance(start, InputError):
             starts[k] = start
         elif skipped is None:
@@ -257,9 +261,15 @@ def navigate_drives(
             progress(done, len(todo))
 
 
+def _forms(estimator: Filter) -> AbstractContextManager:
+    """What a filter in C leaves to do is done before numba were loaded."""
+    return without_loops() if isinstance(estimator, WholeLoop) else nullcontext()
+
+
 def _run(batch: Batch, estimator: Filter) -> BatchSolution:
     try:
-        return run_filter(batch, estimator, keep_innovations=True)
+        with _forms(estimator):
+            return run_filter(batch, estimator, keep_innovations=True)
     except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage]
         names = ", ".join(batch.drive[:3]) + (", …" if len(batch.drive) > 3 else "")
         which = f"drive {names}" if len(batch.drive) == 1 else f"one of the drives {names}"
