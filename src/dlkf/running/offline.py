@@ -33,6 +33,7 @@ from dlkf.running.loss import first_loss
 from dlkf.running.solution import SCHEMA, solution_table
 from dlkf.running.start import align_each
 
+FEW_DRIVES = 8
 WORTH_SAYING = 0.01  # probability of another heading
 SAMPLES_AT_ONCE = CHUNK_SAMPLES  # IMU samples of drives in memory, 8 h at 50 Hz
 
@@ -235,7 +236,7 @@ def navigate_drives(
     InputError where a solution is not finite. ``progress(drives done, drives in all)``.
     """
     starts = {}
-    with _forms(estimator):
+    with _forms(estimator, len(drives)):
         aligned = align_each(drives, align)
     for k, start in enumerate(aligned):
         if not isinstance(start, InputError):
@@ -261,14 +262,14 @@ def navigate_drives(
             progress(done, len(todo))
 
 
-def _forms(estimator: Filter) -> AbstractContextManager:
-    """What a filter in C leaves to do is done before numba were loaded."""
-    return without_loops() if isinstance(estimator, WholeLoop) else nullcontext()
+def _forms(estimator: Filter, drives: int) -> AbstractContextManager:
+    """What a filter in C leaves to do of a few drives is done before numba were loaded."""
+    return without_loops() if isinstance(estimator, WholeLoop) and drives < FEW_DRIVES else nullcontext()
 
 
 def _run(batch: Batch, estimator: Filter) -> BatchSolution:
     try:
-        with _forms(estimator):
+        with _forms(estimator, len(batch.imu)):
             return run_filter(batch, estimator, keep_innovations=True)
     except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage]
         names = ", ".join(batch.drive[:3]) + (", …" if len(batch.drive) > 3 else "")
