@@ -65,7 +65,13 @@ def main() -> None:
 
 
 def _load(command: str) -> Callable[[], None]:
-    """The function of a command. What is loaded stays, so that to look for garbage in it is a fifth of the time."""
+    """The function of a command. What is loaded stays, so that to look for garbage in it is a fifth of the time.
+
+    torch's threads wait asleep: spinning, as they do else, they take several times the processor and the time where
+    another process wants the core. A training, whose products are larger, is left as it is.
+    """
+    if command != "train":
+        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     gc.disable()
     try:
         return import_module(f"dlkf.{command}").main

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dlkf.base.errors import InputError
-from dlkf.data.discovery.clock import find_lag, known_offset
+from dlkf.data.discovery.clock import ImuSums, find_lag, known_offset
 from dlkf.data.discovery.drift import ends_apart, ends_std, find_drifting_pose, middle
 from dlkf.data.discovery.motion import levelled, motion, position_delay
 from dlkf.data.discovery.orientation import find_pose
@@ -46,7 +46,7 @@ def _place(gnss):
 def test_any_clock_offset(drive, offset):
     """To a quarter of a second by correlation, to a millisecond with the pose: the sensors are perfect."""
     t, accel, gyro, gnss = _arrays(drive, offset=offset)
-    lag = find_lag(t, accel, gyro, gnss)
+    lag = find_lag(ImuSums.of(t, accel, gyro), gnss)
     assert lag is not None and lag.clear and abs(lag.lag_s - offset) < 0.3
     pose = find_pose(t, accel, gyro, gnss, lag.lag_s)
     assert pose is not None and abs(pose.lag_s - offset) < 2e-3
@@ -119,7 +119,7 @@ def test_a_drift_that_no_lag_fits_is_found(streets):
     What is left is the car's: rolling in its turns, sideslip. They are in the 1σ, 100 ppm.
     """
     t, accel, gyro, moved = _arrays({"imu": streets["imu"].assign(t=1.005 * streets["imu"].t), "gnss": streets["gnss"]})
-    ends = ends_apart(t, accel, gyro, moved)
+    ends = ends_apart(ImuSums.of(t, accel, gyro), moved)
     assert ends is not None and abs(ends.drift - 5e-3) < 1e-3
     pose = find_drifting_pose(t, accel, gyro, moved, 0.0)
     assert pose is not None and abs(pose.drift - 5e-3) < 3 * pose.drift_std < 4e-4
@@ -191,7 +191,7 @@ def test_nothing_is_made_up():
     gnss = tables["gnss"]
     v = gnss[list(VELOCITY)].to_numpy()
     for moved in (motion(gnss.t.to_numpy(), *_place(gnss), v), motion(gnss.t.to_numpy(), *_place(gnss), 0 * v)):
-        lag = find_lag(t, noise[0], noise[1], moved)
+        lag = find_lag(ImuSums.of(t, noise[0], noise[1]), moved)
         assert lag is None or not lag.clear
         pose = find_pose(t, noise[0], noise[1], moved, 0.0)
         assert pose is None or pose.explained < 0.8 or pose.yaw_std > math.radians(2)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from dlkf.base.errors import InputError
-from dlkf.data.discovery.clock import find_lag, known_offset
+from dlkf.data.discovery.clock import ImuSums, find_lag, known_offset
 from dlkf.data.discovery.drift import ROUGH_S, ends_apart, find_drifting_pose
 from dlkf.data.discovery.motion import Motion, motion
 from dlkf.data.limits import NOWHERE_DEG
@@ -244,13 +244,14 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
 
     Then the force forward and right also shows whether the sensor looks along the car.
     """
-    t, accel, gyro, moved = _signals(imu, gnss)
-    _check_drift(t, accel, gyro, moved, where)
-    best = find_lag(t, accel, gyro, moved, SEARCH_S)
+    *samples, moved = _signals(imu, gnss)
+    sums = ImuSums.of(*samples)
+    _check_drift(sums, moved, where)
+    best = find_lag(sums, moved, SEARCH_S)
     if best is None or not best.clear or min(best.yaw, best.force) < 0.6 or max(best.yaw, best.force) < 0.85:
         return
     if abs(best.lag_s) > APART_S:
-        here = find_lag(t, accel, gyro, moved, APART_S / 2)
+        here = find_lag(sums, moved, APART_S / 2)
         if here is not None and here.gain > 0.5 * best.gain:
             return
         as_is = "too little in common" if here is None else f"{max(here.yaw, here.force):.2f}"
@@ -268,9 +269,9 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
         )
 
 
-def _check_drift(t: np.ndarray, accel: np.ndarray, gyro: np.ndarray, gnss: Motion, where: str) -> None:
+def _check_drift(imu: ImuSums, gnss: Motion, where: str) -> None:
     """The first and the last third of a drive have the same lag."""
-    ends = ends_apart(t, accel, gyro, gnss)
+    ends = ends_apart(imu, gnss)
     if ends is None or abs(ends.last_s - ends.first_s) <= APART_S:
         return
     ppm = 1e6 * ends.drift
@@ -286,7 +287,7 @@ def _check_drift(t: np.ndarray, accel: np.ndarray, gyro: np.ndarray, gnss: Motio
 def describe_drift(imu: Columns, gnss: Columns) -> str | None:
     """A line about clocks that drift apart by less than :func:`check_clocks` refuses; None where none is found."""
     t, accel, gyro, moved = _signals(imu, gnss)
-    ends = ends_apart(t, accel, gyro, moved)
+    ends = ends_apart(ImuSums.of(t, accel, gyro), moved)
     span = float(moved.t[-1] - moved.t[0]) if len(moved.t) else 0.0
     if span < SHORTEST_S or (ends is not None and abs(ends.drift) * span < DRIFTED_S - ROUGH_S):
         return None
@@ -303,7 +304,8 @@ def describe_drift(imu: Columns, gnss: Columns) -> str | None:
 
 def describe_rotation(imu: Columns, gnss: Columns) -> str | None:
     """A line about a sensor that seems turned, where it is not so clear that :func:`check_clocks` refuses it."""
-    best = find_lag(*_signals(imu, gnss), APART_S)
+    *samples, moved = _signals(imu, gnss)
+    best = find_lag(ImuSums.of(*samples), moved, APART_S)
     if best is None or not best.clear or not min(best.yaw, best.force) > 0.6:
         return None
     turned = np.degrees(best.angle)
@@ -317,7 +319,7 @@ def describe_rotation(imu: Columns, gnss: Columns) -> str | None:
 
 def _signals(imu: Columns, gnss: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray, Motion]:
     moved = motion(gnss["t"], gnss["lat_deg"], gnss["lon_deg"], np.stack([gnss[c] for c in VELOCITY], -1))
-    return imu["t"], np.stack([imu[c] for c in ACCEL], -1), np.stack([imu[c] for c in GYRO], -1), moved
+    return imu["t"], np.stack([imu[c] for c in ACCEL]).T, np.stack([imu[c] for c in GYRO]).T, moved
 
 
 def check_attitude(reference: Columns, where: str) -> None:

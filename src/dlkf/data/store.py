@@ -10,6 +10,7 @@ import torch
 from dlkf.base.console import ProgressCallback
 from dlkf.base.errors import InputError
 from dlkf.base.files import folder_name, resolve_place
+from dlkf.base.parallel import parallel_map
 from dlkf.data.aid_tables import STANDARD, AidTable, standard_tables
 from dlkf.data.aids import aid_rows
 from dlkf.data.drive import Drive
@@ -38,11 +39,16 @@ def load_dataset(
     With ``reference=False`` the folder ``reference/`` is not opened. ``progress(drives done, in all)`` is called
     after each drive. Raises InputError for the first fault in the data or an unknown drive.
     """
-    rows = drive_rows(folder, drives)
-    loaded = []
-    for row in rows:
+
+    def load(row: DriveRow) -> Drive:
         tables = read_checked(folder, row, reference=reference, aids=aids, limits=limits)
-        loaded.append(drive_from_tables(tables, folder_name(folder), rate_hz, epoch_s, dtype, aids or ()))
+        return drive_from_tables(tables, folder_name(folder), rate_hz, epoch_s, dtype, aids or ())
+
+    rows = drive_rows(folder, drives)
+    threads = min(len(rows), torch.get_num_threads())  # NumPy, Arrow and torch work side by side
+    loaded = []
+    for drive in parallel_map(load, rows, threads=threads):
+        loaded.append(drive)
         if progress is not None:
             progress(len(loaded), len(rows))
     return loaded

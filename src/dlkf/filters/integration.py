@@ -189,7 +189,10 @@ def _rate_before(rates: Tensor, late: Tensor, count: int) -> Tensor:
 def integrate(
     batch: Batch, estimator: Estimator, *, keep_covariances: bool = False, keep_innovations: bool = False
 ) -> BatchSolution:
-    """Run an estimator over a batch from its start state; differentiable where the estimator is."""
+    """Run an estimator over a batch from its start state; differentiable where the estimator is.
+
+    ``keep_covariances``: all of them; ``keep_innovations``: those of the innovation and of the horizontal position.
+    """
     if isinstance(estimator, WholeLoop):
         return estimator.integrate(batch)
     state, frame = batch.start, batch.frame.prepared()
@@ -199,7 +202,7 @@ def integrate(
     late = bool(batch.gnss_lag.any())
     lever_arm_b = batch.lever_arm_b if bool(batch.lever_arm_b.any()) else None
     steps: list[Step] = []
-    spreads: list[Tensor] = []
+    spreads: list[tuple[Tensor, Tensor]] = []
     lags = batch.gnss_lag.unbind(1) if late else [None] * batch.size[1]
     aids: Iterable[Mapping[str, Tensor] | None] = repeat(None)
     if batch.aids:
@@ -211,13 +214,17 @@ def integrate(
             dt=batch.dt, frame=frame, lever_arm_b=lever_arm_b,
         )  # fmt: skip
         if keep_innovations and step.answer.covariances is not None:
-            spreads.append(step.answer.covariances.innovation)
+            kept = step.answer.covariances
+            spreads.append((kept.innovation, kept.predicted[:, :2, :2].clone()))
         if not keep_covariances:
             step = step._replace(answer=step.answer._replace(covariances=None))
         state, error = step.posterior, step.error
         steps.append(step)
     solution = stack_steps(steps, usable.any(-1), keep_errors=keep_covariances)
-    return replace(solution, innovation_covariance=torch.stack(spreads, 1)) if spreads else solution
+    if not spreads:
+        return solution
+    of_innovation, of_position = (torch.stack(x, 1) for x in zip(*spreads))
+    return replace(solution, innovation_covariance=of_innovation, position_covariance=of_position)
 
 
 def stack_steps(steps: list[Step], offered: Tensor, *, keep_errors: bool) -> BatchSolution:

@@ -1,12 +1,15 @@
 """The window's sums sample by sample, compiled: what a filter without gradients on a CPU spends its time in.
 
 The same equations as :mod:`dlkf.navigation.strapdown` (and in ``compiled_*`` its gradient and Φ) in the form in which a
-textbook writes them, for one drive as for many. Without numba, or on a GPU, the tensor forms take over.
+textbook writes them, for one drive as for many. Without numba, or on a GPU, the tensor forms take over. numba is loaded
+with the first use of a loop, which takes half a second.
 """
 
 from __future__ import annotations
 
 import math
+import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, no_type_check
@@ -17,17 +20,10 @@ from torch import Tensor
 
 from dlkf.base.console import warn_once
 
-try:
-    import numba
-except (ImportError, OSError) as error:  # not there, or not for this NumPy
-    numba = None
-    TROUBLE = (
-        f"numba cannot be loaded ({error}), so filters run up to 2 × slower; install one for this Python and NumPy"
-    )
-else:
-    TROUBLE = ""
-AVAILABLE = numba is not None
-_tensor_forms = False
+AVAILABLE, TROUBLE = True, ""  # until numba has been asked for
+_tensor_forms, _spared = False, False
+_loops: list[tuple[Callable, dict[str, Any]]] = []  # that wait for numba, with its options
+_loading = threading.Lock()
 
 
 def fits(x: Tensor, *, gradients: bool = False) -> bool:
@@ -38,8 +34,10 @@ def fits(x: Tensor, *, gradients: bool = False) -> bool:
     """
     if x.device.type != "cpu" or is_recorded():
         return False
-    if not gradients and (torch.is_grad_enabled() or x.requires_grad):
+    if _spared or (not gradients and (torch.is_grad_enabled() or x.requires_grad)):
         return False
+    if _loops:
+        _load()
     if TROUBLE:
         warn_once(TROUBLE)
     return AVAILABLE
@@ -61,21 +59,52 @@ def tensor_forms() -> Iterator[None]:
         _tensor_forms = before
 
 
+@contextmanager
+def without_loops() -> Iterator[None]:
+    """Inside the block the tensor forms are taken, for work that is done before numba were loaded."""
+    global _spared
+    before, _spared = _spared, True
+    try:
+        yield
+    finally:
+        _spared = before
+
+
 def njit(**options: Any) -> Callable[[Callable], Any]:
-    """``numba.njit``, kept between processes where there is a folder for it; without numba the function as it is,
-    which :func:`fits` keeps from being called."""
+    """``numba.njit`` of a function, when :func:`fits` first asks for it; until then, and without numba, the function as
+    it is."""
 
     def made(function: Callable) -> Any:
-        global TROUBLE
-        if numba is None:
-            return function
-        try:
-            return numba.njit(cache=True, **options)(function)
-        except RuntimeError:  # numba's word for no folder that it may write into
-            TROUBLE = "every process compiles the loops again, some 3 s each; set NUMBA_CACHE_DIR to a folder of yours"
-            return numba.njit(**options)(function)
+        _loops.append((function, options))
+        return function
 
     return made
+
+
+def _load() -> None:
+    """The loops that wait through numba, kept between processes where there is a folder for it, in their place in the
+    modules that have them."""
+    global AVAILABLE, TROUBLE
+    with _loading:
+        try:
+            import numba
+        except (ImportError, OSError) as error:  # not there, or not for this NumPy
+            AVAILABLE, TROUBLE = False, (
+                f"numba cannot be loaded ({error}), so filters run up to 2 × slower; install one for this Python and "
+                "NumPy"
+            )
+            _loops.clear()
+            return
+        modules = [module for name, module in sys.modules.items() if name.startswith("dlkf.navigation.")]
+        for function, options in _loops:
+            try:
+                loop = numba.njit(cache=True, **options)(function)
+            except RuntimeError:  # numba's word for no folder that it may write into
+                TROUBLE = "every process compiles the loops again, some 3 s each; set NUMBA_CACHE_DIR to a folder of yours"
+                loop = numba.njit(**options)(function)
+            for module in modules:
+                vars(module).update({name: loop for name, value in vars(module).items() if value is function})
+        _loops.clear()
 
 
 def mechanise(

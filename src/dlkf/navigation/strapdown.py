@@ -70,7 +70,7 @@ def strapdown(start: NavState, imu: Float[Tensor, "B M 6"], dt: float, frame: Ta
         )
     elif compiled.fits(imu):
         p, v, C = compiled.mechanise(*start, imu, dt, gravity, frame.earth_rate_n)
-        end = p[:, -1], v[:, -1], orthonormalise(C[:, -1])
+        end = p[:, -1].clone(), v[:, -1].clone(), orthonormalise(C[:, -1])  # views would keep the whole window
     else:
         (p, v, C, *end), _ = _mechanised(*start, imu, dt, gravity, frame.earth_rate_n)
     return Window(p, v, C, NavState(*end), gravity)

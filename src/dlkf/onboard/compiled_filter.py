@@ -32,6 +32,7 @@ from dlkf.filters.integration import BatchSolution, Correction, Estimator, Fix, 
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.calibration import ImuError
+from dlkf.navigation.compiled import without_loops
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import NavState
 from dlkf.onboard.c_source import write_source
@@ -227,7 +228,7 @@ def compile_filter(estimator: Filter, rate_hz: float, epoch_s: float, whole: boo
         finally:
             shutil.rmtree(beside, ignore_errors=True)
     if folder not in _LOADED:
-        with torch.no_grad():
+        with torch.no_grad(), without_loops():
             layout = carried_state(estimator, grid)
         _LOADED[folder] = layout, Library(folder / LIBRARY, layout.size, output_numbers(estimator))
     return CompiledFilter(estimator, grid, *_LOADED[folder], whole=whole)

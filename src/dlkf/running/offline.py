@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,16 +24,18 @@ from dlkf.data.tables import read_table
 from dlkf.data.validate import GNSS_QUALITIES
 from dlkf.filters.aids.attach import aid_columns
 from dlkf.filters.constraints import CarConstraints
-from dlkf.filters.integration import BatchSolution
+from dlkf.filters.integration import BatchSolution, WholeLoop
 from dlkf.filters.smoother import Filter, SmoothedSolution
+from dlkf.navigation.compiled import without_loops
 from dlkf.running.batched import CHUNK_SAMPLES, run_filter
 from dlkf.running.innovations import Innovation, fit_sigma
 from dlkf.running.loss import first_loss
 from dlkf.running.solution import SCHEMA, solution_table
 from dlkf.running.start import align_each
 
+FEW_DRIVES = 8
 WORTH_SAYING = 0.01  # probability of another heading
-SAMPLES_AT_ONCE = 4_000_000  # IMU samples of drives in memory, 22 h at 50 Hz
+SAMPLES_AT_ONCE = CHUNK_SAMPLES  # IMU samples of drives in memory, 8 h at 50 Hz
 
 
 @dataclass(frozen=True)
@@ -233,7 +236,9 @@ def navigate_drives(
     InputError where a solution is not finite. ``progress(drives done, drives in all)``.
     """
     starts = {}
-    for k, start in enumerate(align_each(drives, align)):
+    with _forms(estimator, len(drives)):
+        aligned = align_each(drives, align)
+    for k, start in enumerate(aligned):
         if not isinstance(start, InputError):
             starts[k] = start
         elif skipped is None:
@@ -257,9 +262,15 @@ def navigate_drives(
             progress(done, len(todo))
 
 
+def _forms(estimator: Filter, drives: int) -> AbstractContextManager:
+    """What a filter in C leaves to do of a few drives is done before numba were loaded."""
+    return without_loops() if isinstance(estimator, WholeLoop) and drives < FEW_DRIVES else nullcontext()
+
+
 def _run(batch: Batch, estimator: Filter) -> BatchSolution:
     try:
-        return run_filter(batch, estimator, keep_covariances=True)
+        with _forms(estimator, len(batch.imu)):
+            return run_filter(batch, estimator, keep_innovations=True)
     except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage]
         names = ", ".join(batch.drive[:3]) + (", …" if len(batch.drive) > 3 else "")
         which = f"drive {names}" if len(batch.drive) == 1 else f"one of the drives {names}"

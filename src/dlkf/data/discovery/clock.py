@@ -9,7 +9,6 @@ plus −n ln(1 − |ρ|²) of the other is the gain in log-likelihood over no co
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -47,19 +46,51 @@ class Lag:
         return strong and self.rival < 0.6 * self.gain and self.gain - self.rival > 15.0
 
 
-def find_lag(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, within_s: float | None = None) -> Lag | None:
+@dataclass(frozen=True)
+class ImuSums:
+    """Running integrals over an IMU log, from which the means over any stretch of it follow: (7, n) at the stamps
+    ``t`` of time without gaps, specific force and rate, in any units and axes."""
+
+    t: Floats
+    sums: Floats
+
+    @staticmethod
+    def of(t: Floats, accel: Floats, gyro: Floats) -> ImuSums:
+        """Of samples (n, 3)."""
+        step = np.diff(t, prepend=t[:1])
+        step = np.where(step > 1.0, 0.0, step)
+        sums = np.empty((7, len(t)))
+        np.cumsum(step, out=sums[0])
+        for k, axis in enumerate((*accel.T, *gyro.T), 1):
+            np.cumsum(axis * step, out=sums[k])
+        return ImuSums(t, sums)
+
+    def between(self, first_s: float, last_s: float) -> ImuSums:
+        """The part within these times."""
+        part = slice(*np.searchsorted(self.t, (first_s, last_s)))
+        return ImuSums(self.t[part], self.sums[:, part])
+
+    def reached(self, at: Floats) -> Floats:
+        """The integrals (7, m) at given times, linear between samples."""
+        i = np.clip(np.searchsorted(self.t, at, side="right") - 1, 0, len(self.t) - 2)
+        share = np.clip((at - self.t[i]) / (self.t[i + 1] - self.t[i]), 0.0, 1.0)
+        before = self.sums.take(i, 1)
+        return before + share * (self.sums.take(i + 1, 1) - before)
+
+
+def find_lag(imu: ImuSums, gnss: Motion, within_s: float | None = None) -> Lag | None:
     """The lag of the best agreement, at most ``within_s`` from zero; None where the drive is too short or too even.
 
-    ``accel`` and ``gyro`` (n, 3) in any units and axes; the vertical is the mean of ``accel``.
+    The vertical is the mean of the specific force.
     """
     first, last = gnss.intervals()
-    if len(first) < 5 or len(t) < 10:
+    if len(first) < 5 or len(imu.t) < 10:
         return None
     known, rate, pull = _gnss_signals(gnss, first, last)
     if known.sum() < 5:
         return None
     usual = float(np.median(gnss.t[last] - gnss.t[first]))
-    yaw, force, there, start = _imu_signals(t, accel, gyro, usual)
+    yaw, force, there, start = _imu_signals(imu, usual)
     middle = 0.5 * (gnss.t[first] + gnss.t[last])[known]
     cell = np.round((middle - middle[0]) / STEP_S).astype(int)
     n = int(cell[-1]) + 1
@@ -121,30 +152,19 @@ def _gnss_signals(gnss: Motion, first: np.ndarray, last: np.ndarray) -> tuple[np
     return moving | resting, rate, np.where(moving, pull, 0.0)
 
 
-def _imu_signals(t: Floats, accel: Floats, gyro: Floats, width_s: float) -> tuple[Floats, Complex, Floats, float]:
+def _imu_signals(imu: ImuSums, width_s: float) -> tuple[Floats, Complex, Floats, float]:
     """Yaw rate and horizontal force as means over ``width_s`` on a grid, where there are any, and the grid's start."""
-    up = np.array([axis.mean() for axis in accel.T])  # NumPy's mean over rows of three takes ten times as long
+    up = imu.sums[1:4, -1] - imu.sums[1:4, 0]
     up = up / max(float(np.linalg.norm(up)), 1e-12)
     helper = np.eye(3)[0 if abs(up[0]) < 0.9 else 1]  # x, so that angles count from it
     e1 = helper - up * (helper @ up)
     e1 /= np.linalg.norm(e1)
-    e2 = np.cross(-up, e1)
-    step = np.diff(t, prepend=t[0])
-    step = np.where(step > 1.0, 0.0, step)
-    gained = np.stack([np.cumsum(x * step) for x in (1.0, gyro @ -up, accel @ e1, accel @ e2)], dtype=float)
-    grid = np.arange(t[0] + width_s / 2, t[-1] - width_s / 2, STEP_S)
+    grid = np.arange(imu.t[0] + width_s / 2, imu.t[-1] - width_s / 2, STEP_S)
     if len(grid) < 2:
-        grid = np.array([t[0], t[0] + STEP_S])
-
-    def reached(at: Floats) -> np.ndarray:
-        """The four integrals at given times, linear between samples."""
-        i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-        share = np.clip((at - t[i]) / (t[i + 1] - t[i]), 0.0, 1.0)
-        return gained[:, i] + share * (gained[:, i + 1] - gained[:, i])
-
-    covered, yaw, forward, right = (reached(grid + width_s / 2) - reached(grid - width_s / 2)) / width_s
-    force: Complex = forward + 1j * right
-    return yaw, force, (covered > 0.9).astype(float), float(grid[0])
+        grid = np.array([imu.t[0], imu.t[0] + STEP_S])
+    means = (imu.reached(grid + width_s / 2) - imu.reached(grid - width_s / 2)) / width_s
+    force: Complex = e1 @ means[1:4] + 1j * (np.cross(-up, e1) @ means[1:4])
+    return -up @ means[4:], force, (means[0] > 0.9).astype(float), float(grid[0])
 
 
 def _scores(
@@ -154,40 +174,38 @@ def _scores(
 
     At index 0 the last fix lies on the first sample.
     """
-    from scipy import fft
+    size = _fast_length(len(weight) + len(there) - 1)
+    here = there > 0
+    scale, pull = (max(float(np.std(x[here])) if here.any() else 0.0, 1e-12) for x in (yaw, force))
+    r, a, g, f = r * weight, a * weight, yaw / scale * there, force / pull * there
+    r2, a2, g2, f2 = (np.abs(x) ** 2 for x in (r, a, g, f))
 
-    size = fft.next_fast_len(len(weight) + len(there) - 1)
+    def lagged(spectra: np.ndarray) -> np.ndarray:
+        """Sums of products over all lags, rows from those of their spectra; half a spectrum is a real signal's."""
+        out = np.fft.ifft(spectra) if spectra.shape[1] == size else np.fft.irfft(spectra, size)
+        return np.concatenate((out[:, size - len(weight) + 1 :], out[:, : len(there)]), 1)
 
-    def turned(x: np.ndarray) -> Complex:
-        """Of a real signal half of the spectrum, which is all of it."""
-        return fft.fft(x, size) if np.iscomplexobj(x) else fft.rfft(x, size)
+    W, R, R2, A2 = np.fft.rfft((weight, r, r2, a2), size).conj()
+    M, G, G2, F2 = np.fft.rfft((there, g, g2, f2), size)
+    n, *real = lagged(np.stack((W * M, R * M, W * G, R * G, R2 * M, W * G2, A2 * M, W * F2)))
+    W, A = np.fft.fft((weight, a), size).conj()
+    M, F = np.fft.fft((there, f), size)
+    count, n = np.round(np.maximum(n, 1e-9)), np.maximum(n, 1.0)
+    mean_r, mean_g, rg, mean_r2, mean_g2, mean_a2, mean_f2 = (x / n for x in real)
+    mean_a, mean_f, af = lagged(np.stack((A * M, W * F, A * F))) / n
 
-    def against(left: Complex, right: Complex) -> np.ndarray:
-        product = np.conj(left) * right
-        out = fft.ifft(product) if len(product) == size else fft.irfft(product, size)
-        return np.concatenate((out[size - len(weight) + 1 :], out[: len(there)]))
+    def spread(mean: np.ndarray, mean2: Floats, least: float) -> Floats:
+        return np.maximum(mean2 - np.abs(mean) ** 2, least)
 
-    scale = max(float(np.std(yaw[there > 0])) if (there > 0).any() else 0.0, 1e-12)
-    pull = max(float(np.std(force[there > 0])) if (there > 0).any() else 0.0, 1e-12)
-    g, f = yaw / scale * there, force / pull * there
-    W, M = turned(weight), turned(there)
-    n = np.maximum(against(W, M), 1e-9)
-    count = np.round(n)
-    n = np.maximum(n, 1.0)
-
-    def correlation(ours: np.ndarray, theirs: np.ndarray) -> Any:
-        """Real for real signals."""
-        A, B = turned(ours), turned(theirs)
-        W_, M_ = (turned(weight + 0j), turned(there + 0j)) if len(A) == size else (W, M)
-        mean_a, mean_b = np.conj(against(A, M_)) / n, against(W_, B) / n
-        covariance = against(A, B) / n - np.conj(mean_a) * mean_b
-        power_a = against(turned(np.abs(ours) ** 2), M) / n - np.abs(mean_a) ** 2
-        power_b = against(W, turned(np.abs(theirs) ** 2)) / n - np.abs(mean_b) ** 2
-        least_a = 1e-3 * max(float(np.sum(np.abs(ours) ** 2)), 1e-9) / max(float(weight.sum()), 1.0)
-        return covariance / np.sqrt(np.maximum(power_a, least_a) * np.maximum(power_b, 1e-4))
-
-    yaws = np.clip(correlation(r * weight, g).real, -0.9999, 0.9999)
-    force = correlation(a * weight, f)
-    forces = np.clip(np.abs(force), 0.0, 0.9999)
+    least_r, least_a = (1e-3 * max(float(x.sum()), 1e-9) / max(float(weight.sum()), 1.0) for x in (r2, a2))
+    yaws = (rg - mean_r * mean_g) / np.sqrt(spread(mean_r, mean_r2, least_r) * spread(mean_g, mean_g2, 1e-4))
+    alike = (af - mean_a * mean_f) / np.sqrt(spread(mean_a, mean_a2, least_a) * spread(mean_f, mean_f2, 1e-4))
+    yaws = np.clip(yaws, -0.9999, 0.9999)
+    forces = np.clip(np.abs(alike), 0.0, 0.9999)
     gain = -0.5 * n * np.log1p(-(np.maximum(yaws, 0.0) ** 2)) - n * np.log1p(-(forces**2))
-    return np.where(count > 3, gain, 0.0), yaws, forces, -np.angle(force), count
+    return np.where(count > 3, gain, 0.0), yaws, forces, -np.angle(alike), count
+
+
+def _fast_length(least: int) -> int:
+    """The next length that an FFT takes quickly."""
+    return min(m << (-(-least // m) - 1).bit_length() for m in (1, 3, 5, 9, 15))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dlkf.data.discovery.clock import find_lag
+from dlkf.data.discovery.clock import ImuSums, find_lag
 from dlkf.data.discovery.motion import Floats, Motion
 from dlkf.data.discovery.orientation import Pose, find_pose
 
@@ -28,7 +28,7 @@ class Ends(NamedTuple):
     drift: float
 
 
-def ends_apart(t: Floats, accel: Floats, gyro: Floats, gnss: Motion) -> Ends | None:
+def ends_apart(imu: ImuSums, gnss: Motion) -> Ends | None:
     """The drift by :func:`~dlkf.data.discovery.clock.find_lag` of both ends; None where one of them is not clear."""
     if len(gnss.t) < FEWEST:
         return None
@@ -36,8 +36,7 @@ def ends_apart(t: Floats, accel: Floats, gyro: Floats, gnss: Motion) -> Ends | N
     seen = []
     for part in (gnss.t <= edges[0], gnss.t >= edges[1]):
         some = replace(gnss, t=gnss.t[part], v=gnss.v[part], climb=gnss.climb[part])
-        near = slice(*np.searchsorted(t, (some.t[0] - SEARCH_S, some.t[-1] + SEARCH_S)))
-        lag = find_lag(t[near], accel[near], gyro[near], some, SEARCH_S)
+        lag = find_lag(imu.between(some.t[0] - SEARCH_S, some.t[-1] + SEARCH_S), some, SEARCH_S)
         if lag is None or not lag.clear or min(lag.yaw, lag.force) < 0.6 or max(lag.yaw, lag.force) < 0.85:
             return None
         seen.append((float(some.t.mean()), lag.peak_s))
@@ -58,7 +57,7 @@ def find_drifting_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag
     starts = []
     if abs(first.drift) > max(WORTH_A_LOOK * first.drift_std, LEAST_S / reach):
         starts.append((first.drift, first.lag_s))
-    ends = ends_apart(t - lag_s, accel, gyro, gnss)
+    ends = ends_apart(ImuSums.of(t - lag_s, accel, gyro), gnss)
     if ends is not None and abs(ends.drift) * reach > ROUGH_S:  # so far that the fit may see nothing of it
         starts.append((ends.drift, lag_s + 0.5 * (ends.first_s + ends.last_s)))
     found = [_settled(t, accel, gyro, gnss, drift, lag) for drift, lag in starts]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dlkf.base.settings import Ranged
-from dlkf.data.discovery.clock import Lag, find_lag, known_offset
+from dlkf.data.discovery.clock import ImuSums, Lag, find_lag, known_offset
 from dlkf.data.discovery.drift import ends_std, find_drifting_pose, middle
 from dlkf.data.discovery.motion import MOVING, Floats, Motion, motion, position_delay
 from dlkf.data.discovery.orientation import Pose
@@ -110,9 +110,9 @@ def discover(
         out.add("imu.accel.unit", unit or float(f"{factor:.5g}"), certain, f"median force {size:.4g}{taken}")
     gnss = motion(raw.gnss_t, raw.lat_deg, raw.lon_deg, raw.v_ned)
     away = "imu.time.offset_s" in wanted or "gnss.time.offset_s" in wanted
-    lag = find_lag(raw.t, raw.accel, raw.gyro, gnss, None if away else 2.0)
+    lag = find_lag(ImuSums.of(raw.t, raw.accel, raw.gyro), gnss, None if away else 2.0)
     if raw.accel_factor is None:  # some devices give the reaction's opposite
-        other = find_lag(raw.t, -raw.accel, raw.gyro, gnss, None if away else 2.0)
+        other = find_lag(ImuSums.of(raw.t, -raw.accel, raw.gyro), gnss, None if away else 2.0)
         if other is not None and (lag is None or other.gain > 1.5 * lag.gain) and other.yaw > 0.7:
             lag, factor = other, -factor
             out.found[0] = Finding("imu.accel.unit", factor, True, out.found[0].detail + ", its sign turned round")
@@ -148,7 +148,7 @@ def _is_mirrored(raw: Raw, lag: Lag, gnss: Motion) -> bool:
     """Whether accelerations agree with GNSS where the turns do only in a left-handed triad."""
     if lag.yaw < 0.8 or lag.force > 0.9:
         return False
-    other = find_lag(raw.t, raw.accel * [1.0, -1.0, 1.0], raw.gyro, gnss, None)
+    other = find_lag(ImuSums.of(raw.t, raw.accel * [1.0, -1.0, 1.0], raw.gyro), gnss)
     return other is not None and 1 - other.force < 0.5 * (1 - lag.force) and other.gain > 1.1 * lag.gain
 
 
