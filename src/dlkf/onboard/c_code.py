@@ -20,6 +20,7 @@ from dlkf.base.errors import InputError
 from dlkf.onboard.c_loops import UNKNOWN, WHOLE
 from dlkf.onboard.c_memory import C_TYPES, Buffer, Expression, Tensors, View
 from dlkf.onboard.c_operations import BY_ELEMENT, PARTS, literal
+from dlkf.onboard.c_reductions import REDUCTIONS
 
 
 class Translation(Tensors):
@@ -141,9 +142,9 @@ def _is_view(target: Any) -> bool:
 
 
 def _goes_on(user: Node) -> bool:
-    """Whether a value may stay an expression: its only user takes it element by element."""
+    """Whether a value may stay an expression: its only user takes each element once."""
     schema = getattr(user.target, "_schema", None)
-    return schema is not None and schema.name.removeprefix("aten::") in BY_ELEMENT
+    return schema is not None and schema.name.removeprefix("aten::") in (*BY_ELEMENT, *REDUCTIONS)
 
 
 def _flat(x: Any) -> list:

@@ -13,8 +13,9 @@ import torch
 from torch.fx import Node
 
 from dlkf.base.errors import InputError
-from dlkf.onboard.c_memory import C_TYPES, Tensors, View
+from dlkf.onboard.c_memory import C_TYPES, Tensors, View, loops
 from dlkf.onboard.c_operations import literal, suffix
+from dlkf.onboard.c_reductions import ANY, LARGEST, SUM, mean, norm, reduced, running_sum, variance
 
 SMALL = 4096  # numbers of a matrix that is copied to be read along its rows, rather than weights of a network
 WIDE = 8  # columns from which on a zero is worth asking for
@@ -31,15 +32,6 @@ def _names(count: int) -> list[str]:
     return [f"i{k}" for k in range(count)]
 
 
-def _loops(names: Sequence[str], sizes: Sequence[int]) -> str:
-    return "".join(f"for (int {i} = 0; {i} < {n}; {i}++) " for i, n in zip(names, sizes))
-
-
-def _axes(dims: Any, ndim: int) -> list[int]:
-    listed = range(ndim) if dims in (None, []) else [dims] if isinstance(dims, int) else dims
-    return [d % ndim for d in listed]
-
-
 def _joined(t: Tensors, node: Node, parts: list, dim: int = 0) -> View:
     out, _ = _new(t, node)
     start = 0
@@ -48,69 +40,6 @@ def _joined(t: Tensors, node: Node, parts: list, dim: int = 0) -> View:
             size = view.meta.shape[dim]
             t.block.over(out.viewed(out.meta.narrow(dim, start, size)), "{0}", [view])
             start += size
-    return out
-
-
-def _reduced(first: str, each: str) -> Callable[..., View]:
-    """``first`` into the result, then ``each`` for every element: {0} the result so far, {1} the element."""
-
-    def made(t: Tensors, node: Node, x: Any, dims: Any = None, keepdim: bool = False, **_: Any) -> View:
-        view, (out, _value) = t.tensor(x), _new(t, node)
-        dims = _axes(dims, view.meta.ndim)
-        t.block.over(out, first, [])
-        target = out.meta
-        if not keepdim:
-            for d in sorted(dims):
-                target = target.unsqueeze(d)
-        kept = [d for d in range(view.meta.ndim) if d not in dims]
-        inside = view.meta.stride(-1) == 1 and view.meta.ndim - 1 in dims
-        order = kept + dims if inside else dims + kept  # along memory in the innermost loop
-        target = out.viewed(target.expand(view.meta.shape).permute(order))
-        t.block.over(target, each, [target, view.viewed(view.meta.permute(order))])
-        return out
-
-    return made
-
-
-def _norm(t: Tensors, node: Node, x: Any, ord: float = 2, dims: Any = None, keepdim: bool = False) -> View:
-    if ord != 2:
-        raise InputError(f"this filter uses a norm of order {ord}, which {UNKNOWN}")
-    out = _reduced("0", "{0} + {1} * {1}")(t, node, x, dims, keepdim)
-    t.block.over(out, f"sqrt{suffix(out.meta.dtype)}({{0}})", [out])
-    return out
-
-
-def _mean(t: Tensors, node: Node, x: Any, dims: Any = None, keepdim: bool = False, **_: Any) -> View:
-    out = _reduced("0", "{0} + {1}")(t, node, x, dims, keepdim)
-    t.block.over(out, f"{{0}} / {t.tensor(x).meta.numel() // max(1, out.meta.numel())}", [out])
-    return out
-
-
-def _variance(t: Tensors, node: Node, x: Any, dims: Any = None, *, correction: Any = 1, keepdim: bool = False) -> View:
-    view = t.tensor(x)
-    dims = _axes(dims, view.meta.ndim)
-    mean = _mean(t, node, view, dims, keepdim)
-    wide = mean.meta
-    if not keepdim:
-        for d in sorted(dims):
-            wide = wide.unsqueeze(d)
-    swing = t.block.new(view.meta.shape, view.meta.dtype)
-    t.block.over(swing, "{0} - {1}", [view, mean.viewed(wide.expand(view.meta.shape))])
-    out = _reduced("0", "{0} + {1} * {1}")(t, node, swing, dims, keepdim)
-    n = math.prod(view.meta.shape[d] for d in dims)
-    t.block.over(out, f"{{0}} / {n - (1 if correction is None else correction)}", [out])
-    return out
-
-
-def _summed_up(t: Tensors, node: Node, x: Any, dim: int, **_: Any) -> View:
-    view, (out, value) = t.tensor(x), _new(t, node)
-    n = value.shape[dim]
-    first, source = (v.viewed(v.meta.narrow(dim, 0, 1)) for v in (out, view))
-    t.block.over(first, "{0}", [source])
-    now, before, each = (
-        v.viewed(v.meta.narrow(dim, start, n - 1).movedim(dim, 0)) for v, start in ((out, 1), (out, 0), (view, 1))
-    )
-    t.block.over(now, "{0} + {1}", [before, each])
     return out
 
 
@@ -148,7 +77,7 @@ def _product(t: Tensors, node: Node, A: Any, B: Any, begin: Any = None, beta: fl
             f"for (int j = 0; j < {n}; j++) {{ {kind} y = 0; for (int k = 0; k < {k}; k++) y += {at_a} * {at_b}; "
             f"{at} = {start} + {scale}y; }}"
         )
-    t.block.write(_loops(lead, a.meta.shape[:1]) + _loops(["i"], [m]) + body, out, *used)
+    t.block.write(loops(lead, a.meta.shape[:1]) + loops(["i"], [m]) + body, out, *used)
     return out
 
 
@@ -248,7 +177,7 @@ def _indexed(t: Tensors, node: Node, x: Any, indices: list) -> View:
     view, (out, value) = t.tensor(x), _new(t, node)
     names = _names(value.ndim)
     source, given = _places(t, view, indices, names)
-    t.block.write(f"{_loops(names, value.shape)}{out.at(names)} = {view.at(source)};", out, view, *given)
+    t.block.write(f"{loops(names, value.shape)}{out.at(names)} = {view.at(source)};", out, view, *given)
     return out
 
 
@@ -264,7 +193,7 @@ def _put(t: Tensors, node: Node, x: Any, indices: list, values: Any, accumulate:
     target, given = _places(t, view, indices, names)
     wide = outputs.viewed(outputs.meta.expand(sizes))
     sign = "+=" if accumulate else "="
-    t.block.write(f"{_loops(names, sizes)}{out.at(target)} {sign} {wide.at(names)};", out, outputs, *given)
+    t.block.write(f"{loops(names, sizes)}{out.at(target)} {sign} {wide.at(names)};", out, outputs, *given)
     return out
 
 
@@ -285,7 +214,7 @@ def _gathered(t: Tensors, node: Node, x: Any, dim: int, index: Any, **_: Any) ->
     view, rows, (out, value) = t.tensor(x), t.tensor(index), _new(t, node)
     names = _names(value.ndim)
     source = [rows.at(names) if k == dim % value.ndim else i for k, i in enumerate(names)]
-    t.block.write(f"{_loops(names, value.shape)}{out.at(names)} = {view.at(source)};", out, view, rows)
+    t.block.write(f"{loops(names, value.shape)}{out.at(names)} = {view.at(source)};", out, view, rows)
     return out
 
 
@@ -297,8 +226,8 @@ def _largest(t: Tensors, node: Node, x: Any, dim: int = -1, keepdim: bool = Fals
     at = out.at([("0" if k == dim else i) for k, i in enumerate(names)] if keepdim else [names[k] for k in outer])
     best = view.at([("best" if k == dim else i) for k, i in enumerate(names)])
     t.block.write(
-        f"{_loops([names[k] for k in outer], [view.meta.shape[k] for k in outer])}{{ int best = 0; "
-        f"{_loops([names[dim]], [view.meta.shape[dim]])}if ({view.at(names)} > {best}) best = {names[dim]}; "
+        f"{loops([names[k] for k in outer], [view.meta.shape[k] for k in outer])}{{ int best = 0; "
+        f"{loops([names[dim]], [view.meta.shape[dim]])}if ({view.at(names)} > {best}) best = {names[dim]}; "
         f"{at} = best; }}",
         out, view,
     )  # fmt: skip
@@ -349,9 +278,8 @@ def _repeated(t: Tensors, node: Node, x: Any, times: list) -> View:
 
 
 WHOLE: dict[str, Callable[..., Any]] = {
-    "cat": _joined, "sum": _reduced("0", "{0} + {1}"), "any": _reduced("0", "{0} | ({1} != 0)"),
-    "amax": _reduced("-INFINITY", "{0} > {1} ? {0} : {1}"), "mean": _mean, "var": _variance,
-    "linalg_vector_norm": _norm, "cumsum": _summed_up, "mm": _product, "bmm": _product, "addmm": _added_product,
+    "cat": _joined, "sum": reduced(SUM), "any": reduced(ANY, "{0} != 0"), "amax": reduced(LARGEST), "mean": mean,
+    "var": variance, "linalg_vector_norm": norm, "cumsum": running_sum, "mm": _product, "bmm": _product, "addmm": _added_product,
     "baddbmm": _added_product, "_linalg_solve_ex": _solved, "linalg_solve_ex": _solved,
     "linalg_cholesky_ex": _factored, "cholesky_solve": _solved_by_factor, "linalg_inv_ex": _inverted,
     "linalg_solve_triangular": _solved_triangle,

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.fx import Node
 
 C_TYPES = {
     torch.float64: "double", torch.float32: "float", torch.int64: "int64_t", torch.int32: "int32_t",
@@ -97,8 +98,7 @@ class Block:
         views = [View(v.buffer, _strided(v.meta, sizes, s)) for v, s in zip((out, *operands), strides)]
         index = [f"i{k}" for k in range(len(sizes))]
         elements = [v.at(index) for v in views[1:]]
-        loops = "".join(f"for (int {i} = 0; {i} < {n}; {i}++) " for i, n in zip(index, sizes))
-        self.write(f"{loops}{views[0].at(index)} = {expression.format(*elements)};", out, *operands)
+        self.write(f"{loops(index, sizes)}{views[0].at(index)} = {expression.format(*elements)};", out, *operands)
 
     def laid_out(self) -> int:
         """Give every buffer that is on the stack its place; bytes in all. What lives together lies apart."""
@@ -124,6 +124,18 @@ class Tensors:
     def __init__(self) -> None:
         self.block = Block()
 
+    def result(self, node: Node) -> View:
+        """Memory for what an operation returns."""
+        value: Any = node.meta["val"]
+        return self.block.new(value.shape, value.dtype)
+
+    def elements(self, x: Any) -> Expression:
+        """A value element by element."""
+        if isinstance(x, Expression):
+            return x
+        view = self.tensor(x)
+        return Expression(view.meta.shape, view.meta.dtype, "{0}", [view])
+
     def tensor(self, x: Any) -> View:
         """A value as a tensor in memory."""
         if isinstance(x, Tensor):
@@ -142,6 +154,11 @@ class Tensors:
         out = self.block.new(view.meta.shape, view.meta.dtype)
         self.block.over(out, "{0}", [view])
         return out
+
+
+def loops(names: Sequence[str], sizes: Sequence[int]) -> str:
+    """Heads of nested loops."""
+    return "".join(f"for (int {i} = 0; {i} < {n}; {i}++) " for i, n in zip(names, sizes))
 
 
 def collapsed(sizes: list[int], strides: list[list[int]]) -> tuple[list[int], list[list[int]]]:
