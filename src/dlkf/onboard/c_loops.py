@@ -15,17 +15,17 @@ from torch.fx import Node
 from dlkf.base.errors import InputError
 from dlkf.onboard.c_memory import C_TYPES, Tensors, View, loops
 from dlkf.onboard.c_operations import literal, suffix
+from dlkf.onboard.c_places import is_same
+from dlkf.onboard.c_products import added_product, product
 from dlkf.onboard.c_reductions import ANY, LARGEST, SUM, mean, norm, reduced, running_sum, variance
 
-SMALL = 4096  # numbers of a matrix that is copied to be read along its rows, rather than weights of a network
-WIDE = 8  # columns from which on a zero is worth asking for
 UNKNOWN = "the C form of an exported filter does not know"
 
 
 def _new(t: Tensors, node: Node) -> tuple[View, Any]:
     """The result's memory, and what torch says of it."""
     value: Any = node.meta["val"]
-    return t.block.new(value.shape, value.dtype), value
+    return t.result(node), value
 
 
 def _names(count: int) -> list[str]:
@@ -33,77 +33,16 @@ def _names(count: int) -> list[str]:
 
 
 def _joined(t: Tensors, node: Node, parts: list, dim: int = 0) -> View:
-    out, _ = _new(t, node)
+    out = t.result(node)
     start = 0
     for view in map(t.tensor, parts):
         if view.meta.numel():
             size = view.meta.shape[dim]
-            t.block.over(out.viewed(out.meta.narrow(dim, start, size)), "{0}", [view])
+            place = out.viewed(out.meta.narrow(dim, start, size))
+            if not is_same(place, view):
+                t.block.over(place, "{0}", [view])
             start += size
     return out
-
-
-def _product(t: Tensors, node: Node, A: Any, B: Any, begin: Any = None, beta: float = 1, alpha: float = 1) -> View:
-    """A B (b × m × k · k × n), on top of β · ``begin`` where there is one."""
-    a, b, (out, value) = t.tensor(A), t.tensor(B), _new(t, node)
-    m, k, n = a.meta.shape[-2], a.meta.shape[-1], b.meta.shape[-1]
-    small = value[..., 0, 0].numel() * k * n <= SMALL
-    if small and n >= WIDE and m > 1 and b.meta.stride(-1) != 1:
-        b = t.dense(b)
-    lead = ["b"] if a.meta.ndim == 3 else []
-    if begin is None and alpha == 1 and n >= WIDE and (rows := _sparse_rows(t, a)):
-        for line in _rows(rows, out, b, len(lead), n):
-            t.block.write(line, out, b)
-        return out
-    kind, scale = C_TYPES[value.dtype], "" if alpha == 1 else f"{literal(alpha, value.dtype)} * "
-    at_a, at_b, at = a.at([*lead, "i", "k"]), b.at([*lead, "k", "j"]), out.at([*lead, "i", "j"])
-    start, used = "0", [a, b]
-    if begin is not None:
-        given = t.tensor(begin)
-        wide = given.viewed(given.meta.expand(value.shape))
-        start = ("" if beta == 1 else f"{literal(beta, value.dtype)} * ") + wide.at([*lead, "i", "j"])
-        used.append(given)
-    if b.meta.stride(-1) == 1 or (n > 1 and b.meta.stride(-2) != 1):  # along rows of B
-        # H, K and Φ are mostly zeros; a branch round a loop of fixed length costs half of a list of what is not
-        skip = "if (w == 0) continue; " if small and n >= WIDE else ""
-        body = (
-            f"{{ {kind} y[{n}]; for (int j = 0; j < {n}; j++) y[j] = {start}; "
-            f"for (int k = 0; k < {k}; k++) {{ {kind} w = {scale}{at_a}; {skip}"
-            f"for (int j = 0; j < {n}; j++) y[j] += w * {at_b}; }} "
-            f"for (int j = 0; j < {n}; j++) {at} = y[j]; }}"
-        )
-    else:  # along its columns
-        body = (
-            f"for (int j = 0; j < {n}; j++) {{ {kind} y = 0; for (int k = 0; k < {k}; k++) y += {at_a} * {at_b}; "
-            f"{at} = {start} + {scale}y; }}"
-        )
-    t.block.write(loops(lead, a.meta.shape[:1]) + loops(["i"], [m]) + body, out, *used)
-    return out
-
-
-def _sparse_rows(t: Tensors, a: View) -> list[list[tuple[int, float]]]:
-    """Column and value of what is not zero in each row of a constant matrix with at most two of them a row."""
-    values = next((x for buffer, x in t.block.constants if buffer is a.buffer), None)
-    if values is None or a.meta.numel() != a.meta.shape[-2] * a.meta.shape[-1]:
-        return []
-    A = torch.as_strided(torch.from_numpy(values), a.meta.shape, a.meta.stride(), a.meta.storage_offset())
-    rows = [[(k, float(row[k])) for k in row.nonzero()[:, 0].tolist()] for row in A.reshape(A.shape[-2:])]
-    return rows if sum(map(len, rows)) <= 2 * len(rows) else []
-
-
-def _rows(rows: list[list[tuple[int, float]]], out: View, b: View, lead: int, n: int) -> Iterator[str]:
-    """Rows of A B as sums of few rows of B."""
-    for i, row in enumerate(rows):
-        terms = []
-        for k, w in row:
-            at = b.at([*["0"] * lead, str(k), "j"])
-            terms.append(at if w == 1 else f"-{at}" if w == -1 else f"{literal(w, out.meta.dtype)} * {at}")
-        into = out.at([*["0"] * lead, str(i), "j"])
-        yield f"for (int j = 0; j < {n}; j++) {into} = {' + '.join(terms) or '0'};"
-
-
-def _added_product(t: Tensors, node: Node, c: Any, a: Any, b: Any, beta: float = 1, alpha: float = 1) -> View:
-    return _product(t, node, a, b, c, beta, alpha)
 
 
 def _each(t: Tensors, call: str, sizes: tuple[int, ...], *views: View) -> None:
@@ -279,8 +218,8 @@ def _repeated(t: Tensors, node: Node, x: Any, times: list) -> View:
 
 WHOLE: dict[str, Callable[..., Any]] = {
     "cat": _joined, "sum": reduced(SUM), "any": reduced(ANY, "{0} != 0"), "amax": reduced(LARGEST), "mean": mean,
-    "var": variance, "linalg_vector_norm": norm, "cumsum": running_sum, "mm": _product, "bmm": _product, "addmm": _added_product,
-    "baddbmm": _added_product, "_linalg_solve_ex": _solved, "linalg_solve_ex": _solved,
+    "var": variance, "linalg_vector_norm": norm, "cumsum": running_sum, "mm": product, "bmm": product, "addmm": added_product,
+    "baddbmm": added_product, "_linalg_solve_ex": _solved, "linalg_solve_ex": _solved,
     "linalg_cholesky_ex": _factored, "cholesky_solve": _solved_by_factor, "linalg_inv_ex": _inverted,
     "linalg_solve_triangular": _solved_triangle,
     "linalg_cross": _crossed, "index_select": _picked, "index": _indexed, "index_put": _put, "gather": _gathered,

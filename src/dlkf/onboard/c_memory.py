@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import insort
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import count
+from itertools import count, product
 from typing import Any
 
 import numpy as np
@@ -59,6 +59,37 @@ class Expression:
     dtype: torch.dtype
     pattern: str  # with {0}, {1}, … for the operands
     operands: list[View]
+
+
+@dataclass
+class Rows:
+    """Elements that are not computed yet, an expression for each index of the leading axes."""
+
+    shape: torch.Size
+    dtype: torch.dtype
+    lead: torch.Size
+    items: list[Expression]  # in the order of memory
+
+    def at(self, index: Sequence[int]) -> Expression:
+        """That of an index of the leading axes."""
+        place = 0
+        for n, i in zip(self.lead, index):
+            place = place * n + i
+        return self.items[place]
+
+    def viewed(self, shape: torch.Size) -> Rows | None:
+        """As another shape; None where that parts an expression."""
+        for k in range(len(shape) + 1):
+            if shape[:k].numel() == self.lead.numel():
+                try:
+                    items = [
+                        Expression(shape[k:], x.dtype, x.pattern, [v.viewed(v.meta.view(shape[k:])) for v in x.operands])
+                        for x in self.items
+                    ]
+                except RuntimeError:  # strides that do not allow it
+                    return None
+                return Rows(shape, self.dtype, shape[:k], items)
+        return None
 
 
 @dataclass
@@ -129,6 +160,23 @@ class Tensors:
         value: Any = node.meta["val"]
         return self.block.new(value.shape, value.dtype)
 
+    def goes_on(self, node: Node) -> bool:
+        """Whether a node's value may stay an expression: one node uses it, and that takes each element once."""
+        raise NotImplementedError
+
+    def stored(self, node: Node, x: Expression | Rows) -> View:
+        """A node's value in memory."""
+        return self._written(self.result(node), x)
+
+    def _written(self, out: View, x: Expression | Rows) -> View:
+        if isinstance(x, Expression):
+            self.block.over(out, x.pattern, x.operands)
+        else:
+            for index in product(*map(range, x.lead)):
+                item = x.at(index)
+                self.block.over(out.viewed(out.meta[index]), item.pattern, item.operands)
+        return out
+
     def elements(self, x: Any) -> Expression:
         """A value element by element."""
         if isinstance(x, Expression):
@@ -140,11 +188,7 @@ class Tensors:
         """A value as a tensor in memory."""
         if isinstance(x, Tensor):
             return self.block.constant(x)
-        if isinstance(x, Expression):
-            out = self.block.new(x.shape, x.dtype)
-            self.block.over(out, x.pattern, x.operands)
-            return out
-        return x
+        return self._written(self.block.new(x.shape, x.dtype), x) if isinstance(x, (Expression, Rows)) else x
 
     def dense(self, x: Any) -> View:
         """A value as a tensor without gaps."""

@@ -111,6 +111,7 @@ BY_ELEMENT: dict[str, Pattern] = {
     "_to_copy": _first("{0}"), "clone": _first("{0}"), "lift_fresh_copy": _first("{0}"),
     "prims::copy_strided": _first("{0}"),
 }  # fmt: skip
+COPIES = ("clone", "lift_fresh_copy", "_to_copy", "prims::copy_strided")
 # operations that change a part of a copy: which part of it becomes the second operand
 PARTS: dict[str, Callable[..., Tensor]] = {
     "slice_scatter": torch.ops.aten.slice.Tensor,

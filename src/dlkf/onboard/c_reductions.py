@@ -11,10 +11,11 @@ from collections.abc import Callable, Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
+import torch
 from torch.fx import Node
 
 from dlkf.base.errors import InputError
-from dlkf.onboard.c_memory import C_TYPES, Expression, Tensors, View, loops
+from dlkf.onboard.c_memory import C_TYPES, Expression, Rows, Tensors, View, loops
 from dlkf.onboard.c_operations import suffix
 
 TERMS = 8  # of a sum that is written as one expression
@@ -54,21 +55,38 @@ def reduced(how: Reduction, element: str = "{0}") -> Callable[..., View]:
     """The operation that reduces what ``element`` makes of every element."""
 
     def made(t: Tensors, node: Node, x: Any, dims: Any = None, keepdim: bool = False, **_: Any) -> View:
+        if isinstance(x, Rows) and how is SUM and element == "{0}" and (lines := _summed(x, dims, keepdim)):
+            return t.stored(node, lines)
         x = t.elements(t.tensor(x) if how is LARGEST else x)  # each is read twice
         x = Expression(x.shape, x.dtype, element.format(x.pattern), x.operands)
         out, gone = t.result(node), axes(dims, len(x.shape))
         into = out.meta
         for d in sorted(gone, reverse=True) if keepdim else ():
             into = into.select(d, 0)
-        _write(t, Reduced(out.viewed(into), x, [d for d in range(len(x.shape)) if d not in gone], gone, how))
+        write_reduced(t, Reduced(out.viewed(into), x, [d for d in range(len(x.shape)) if d not in gone], gone, how))
         return out
 
     return made
 
 
-def _write(t: Tensors, r: Reduced) -> None:
+def _summed(x: Rows, dims: Any, keepdim: bool) -> Rows | None:
+    """Sums of few rows; None where that is something else."""
+    gone = axes(dims, len(x.shape))
+    if len(gone) > 1 or gone[0] >= len(x.lead) or keepdim or x.lead[gone[0]] > TERMS:
+        return None
+    kept = [n for d, n in enumerate(x.lead) if d != gone[0]]
+    items = []
+    for place in product(*map(range, kept)):
+        terms = [x.at((*place[: gone[0]], k, *place[gone[0] :])) for k in range(x.lead[gone[0]])]
+        items.append(joined(SUM.joined, terms))
+    shape = torch.Size([*kept, *x.shape[len(x.lead) :]])
+    return Rows(shape, x.dtype, torch.Size(kept), items)
+
+
+def write_reduced(t: Tensors, r: Reduced) -> None:
+    """The loops."""
     x, count = r.of, math.prod(r.of.shape[d] for d in r.gone)
-    if r.how is not LARGEST and count <= TERMS and count * len(x.operands) <= 4 * TERMS:
+    if r.how is not LARGEST and 0 < count <= TERMS and count * len(x.operands) <= 4 * TERMS:
         _write_terms(t, r)
         return
     along = [d for d in r.gone if x.shape[d] >= 2 * LANES and all(v.meta.stride(d) <= 1 for v in x.operands)]
@@ -81,16 +99,27 @@ def _write(t: Tensors, r: Reduced) -> None:
 
 def _write_terms(t: Tensors, r: Reduced) -> None:
     """One expression."""
-    total, operands = "", []
+    terms = []
     for place in product(*(range(r.of.shape[d]) for d in r.gone)):
-        term = r.of.pattern.format(*(f"{{{len(operands) + k}}}" for k in range(len(r.of.operands))))
-        total = r.how.joined.format(total, f"({term})") if total else f"({term})"
+        operands = []
         for view in r.of.operands:
             meta = view.meta
             for d, k in sorted(zip(r.gone, place), reverse=True):
                 meta = meta.select(d, k)
             operands.append(view.viewed(meta))
-    t.block.over(r.into, total or r.how.first, operands)
+        terms.append(Expression(r.into.meta.shape, r.of.dtype, r.of.pattern, operands))
+    total = joined(r.how.joined, terms)
+    t.block.over(r.into, total.pattern, total.operands)
+
+
+def joined(how: str, terms: Sequence[Expression]) -> Expression:
+    """One expression of several."""
+    total, operands = "", []
+    for x in terms:
+        term = f"({x.pattern.format(*(f'{{{len(operands) + k}}}' for k in range(len(x.operands))))})"
+        total = how.format(total, term) if total else term
+        operands += x.operands
+    return Expression(terms[0].shape, terms[0].dtype, total, operands)
 
 
 def _write_lanes(t: Tensors, r: Reduced, along: int) -> None:

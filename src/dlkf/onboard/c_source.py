@@ -224,8 +224,10 @@ def function_in_c(name: str, function: Function) -> Written:
     block, inputs = done.block, done.inputs
     arguments = [f"const {C_TYPES[b.dtype]} *restrict {b.name}" for b in inputs]
     for k, view in enumerate(done.outputs):
-        dense = done.dense(view)
         arguments.append(f"{C_TYPES[view.meta.dtype]} *restrict out{k}")
+        if view.buffer.name == f"out{k}":
+            continue
+        dense = done.dense(view)
         start = dense.meta.storage_offset()
         block.write(
             f"for (int i = 0; i < {dense.meta.numel()}; i++) out{k}[i] = {dense.buffer.name}[{start}+i];", dense
