@@ -125,10 +125,10 @@ class WindowModel:
         """
         dt = self.dt
         C, v, (f, w) = window.C_nb.movedim(1, -1), window.v_n.mT, corrected.mT.contiguous().split(3, 1)
-        before = torch.cat((start.C_nb.unsqueeze(-1), C[..., :-1]), -1)
-        turned = torch.add(before, C).mul(0.5 * dt).unsqueeze(1)
-        v_before = torch.cat((start.v_n.unsqueeze(-1), v[..., :-1]), -1)
-        gained = torch.sub(v - v_before, window.gravity.unsqueeze(-1), alpha=dt)
+        C = torch.cat((start.C_nb.unsqueeze(-1), C), -1)
+        turned = torch.add(C[..., :-1], C[..., 1:]).mul(0.5 * dt).unsqueeze(1)
+        v = torch.cat((start.v_n.unsqueeze(-1), v), -1)
+        gained = torch.sub(v[..., 1:] - v[..., :-1], window.gravity.unsqueeze(-1), alpha=dt)
         gained = self.left.unsqueeze(1) * gained.unsqueeze(1)  # (B, 2, 3, M): for position, for velocity
         later = gained.sum(-1, keepdim=True) - torch.sub(gained.cumsum(-1), gained, alpha=0.5)
         both = (len(turned), 2, *turned.shape[2:])

@@ -20,7 +20,7 @@ from torch.fx import GraphModule, Node
 from dlkf.base.errors import InputError
 from dlkf.onboard.c_loops import UNKNOWN, WHOLE
 from dlkf.onboard.c_memory import C_TYPES, Buffer, Expression, Rows, Tensors, View
-from dlkf.onboard.c_operations import BY_ELEMENT, COPIES, PARTS, literal
+from dlkf.onboard.c_operations import BY_ELEMENT, COPIES, PARTS, literal, vectorised
 from dlkf.onboard.c_places import RESHAPES, Readers, find_places, is_same, name_of
 from dlkf.onboard.c_reductions import REDUCTIONS
 
@@ -151,6 +151,7 @@ class Translation(Tensors):
         pattern, operands = BY_ELEMENT[name], []
         if callable(pattern):
             pattern, args = pattern(dtype, args, kwargs)
+            pattern = vectorised(pattern, shape.numel())
         segments = []
         for x in args:
             if isinstance(x, Expression) and x.shape == shape:
@@ -170,13 +171,14 @@ class Translation(Tensors):
         """An operation that changes a part: a copy, then the part."""
         whole, source = self.tensor(args[0]), self.tensor(args[1])
         out = whole
+        if is_same(source, whole.viewed(PARTS[name](whole.meta, *args[2:]))):
+            return whole
         if not self._readers.may_change(node, whole, source):
             out = self.result(node)
             self.block.over(out, "{0}", [whole])
         part = out.viewed(PARTS[name](out.meta, *args[2:]))
         values = source.viewed(source.meta.expand(part.meta.shape))
-        if not is_same(values, part):
-            self.block.over(part, f"({C_TYPES[out.meta.dtype]}){{0}}", [values])
+        self.block.over(part, f"({C_TYPES[out.meta.dtype]}){{0}}", [values])
         return out
 
 

@@ -102,9 +102,13 @@ class Block:
     places: dict[str, int] = field(default_factory=dict)
     names: Any = field(default_factory=lambda: count(0))
 
-    def new(self, shape: torch.Size | tuple[int, ...], dtype: torch.dtype) -> View:
-        """A tensor to be written next."""
+    def new(
+        self, shape: torch.Size | tuple[int, ...], dtype: torch.dtype, strides: Sequence[int] | None = None
+    ) -> View:
+        """A tensor to be written next; ``strides`` of one without gaps, if its axes stand in another order."""
         meta = torch.empty(shape, dtype=dtype, device="meta")
+        if strides is not None:
+            meta = torch.empty_strided(shape, strides, dtype=dtype, device="meta")
         buffer = Buffer(f"x{next(self.names)}", dtype, max(1, meta.numel()), len(self.lines), len(self.lines))
         self.buffers.append(buffer)
         return View(buffer, meta)
@@ -124,8 +128,9 @@ class Block:
 
     def over(self, out: View, expression: str, operands: Sequence[View]) -> None:
         """``out`` = expression at every index; operands have the shape of ``out``."""
-        metas = [out.meta, *(o.meta for o in operands)]
-        sizes, strides = collapsed(list(out.meta.shape), [list(m.stride()) for m in metas])
+        order = sorted(range(out.meta.ndim), key=lambda d: -out.meta.stride(d))  # along its memory
+        metas = [m.permute(order) for m in (out.meta, *(o.meta for o in operands))]
+        sizes, strides = collapsed(list(metas[0].shape), [list(m.stride()) for m in metas])
         views = [View(v.buffer, _strided(v.meta, sizes, s)) for v, s in zip((out, *operands), strides)]
         index = [f"i{k}" for k in range(len(sizes))]
         elements = [v.at(index) for v in views[1:]]
@@ -158,7 +163,8 @@ class Tensors:
     def result(self, node: Node) -> View:
         """Memory for what an operation returns."""
         value: Any = node.meta["val"]
-        return self.block.new(value.shape, value.dtype)
+        whole = value.numel() and torch.ops.aten.is_non_overlapping_and_dense(value)
+        return self.block.new(value.shape, value.dtype, value.stride() if whole else None)
 
     def goes_on(self, node: Node) -> bool:
         """Whether a node's value may stay an expression: one node uses it, and that takes each element once."""

@@ -23,7 +23,7 @@ from dlkf.onboard.c_reductions import LANES, SUM, Reduced, write_reduced
 SMALL = 4096  # numbers of a matrix that is copied to be read along its rows, rather than weights of a network
 WIDE = 8  # columns from which on a zero is worth asking for
 FEW = 4  # elements of a row of a constant matrix, on average, that is written out
-NARROW = 12  # columns up to which one row at a time is best
+NARROW = 16  # columns up to which one row at a time is best, and a branch costs more than it saves
 BLOCK = 24  # columns of weights at a time where several rows are
 
 
@@ -118,11 +118,11 @@ def _write_rows(
         t.block.write(loops(lead, a.meta.shape[:1]) + loops(["i"], [m]) + body, *used)
         return
     weights = not small or any(buffer is b.buffer for buffer, _ in t.block.constants)
-    beside = 1 if k <= FEW or n <= NARROW else 6 if weights else 3
+    beside = 1 if k <= FEW else 6 if weights else 3 if n > NARROW else 1
     beside, columns = min(m, beside), BLOCK if weights and m > 1 else n
     for top, rows in _pieces(m, beside):
         for left, width in _pieces(n, columns):
-            skips = "" if weights or n < WIDE else "if (w == 0) continue; "
+            skips = "" if weights or n <= NARROW else "if (w == 0) continue; "
             _write_block(t, out, a, b, given, scale, beta, skips, (top, rows, beside), (left, width, columns))
 
 

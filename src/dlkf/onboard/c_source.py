@@ -129,7 +129,8 @@ def heading() -> str:
     kinds = ({"REAL": "double", "F": ""}, {"REAL": "float", "F": "f"})
     include = "\n".join(f"#include {name}" for name in ("<math.h>", "<stdint.h>", "<string.h>", '"step.h"'))
     made = "/* Made by dlkf.export; do not edit: the equations are in the Python package. */"
-    return "\n".join((made, include, UNUSED, "", *(_filled(algebra, kind) for kind in kinds)))
+    elementary = (CORE / "elementary.c.in").read_text()
+    return "\n".join((made, include, UNUSED, "", elementary, *(_filled(algebra, kind) for kind in kinds)))
 
 
 def _sizes(estimator: Estimator, layout: Layout, grid: Grid, name: str, work: int, can_anchor: bool) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from torch.func import functionalize
-from torch.fx import GraphModule
+from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from dlkf.navigation import compiled
@@ -35,7 +35,19 @@ def record(function: Function) -> GraphModule:
     except RuntimeError:  # it writes into what it has made of constants alone: the slower way knows them as inputs
         program = torch.export.export(function, example, strict=False).run_decompositions(_decompositions())
         return program.module(check_guards=False)
+    _merge_equal(graph)
+    graph.graph.eliminate_dead_code()  # views of what was there before a change, too
     return graph
+
+
+def _merge_equal(graph: GraphModule) -> None:
+    """One node for operations that are the same on the same tensors."""
+    seen: dict[str, Node] = {}
+    for node in graph.graph.nodes:
+        if node.op == "call_function":
+            first = seen.setdefault(f"{node.target} {node.args} {node.kwargs}", node)
+            if first is not node:
+                node.replace_all_uses_with(first)
 
 
 @contextmanager
