@@ -54,7 +54,7 @@ class WindowModel:
     def spread(self) -> Float[Tensor, "4 s s"]:
         """S ∫ (1−τ/T)^(nᵢ+nⱼ) dτ of each noise source."""
         T = self.left.shape[1] * self.dt
-        return (self.density[0] * T)[:, None, None] / _orders(self.density.dtype, self.density.device)
+        return (self.density[0] * T)[:, None, None] * _shares(self.density.dtype, self.density.device)
 
     def transition(
         self, start: NavState, window: Window, corrected: Float[Tensor, "B M 6"], frame: TangentFrame
@@ -172,11 +172,11 @@ class _ProcessNoise(torch.autograd.Function):
 
 @lru_cache
 @torch.inference_mode(False)
-def _orders(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """nᵢ + nⱼ + 1 of each noise source (4, s, s)."""
+def _shares(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """1/(nᵢ + nⱼ + 1) of each noise source (4, s, s)."""
     powers = [[math.inf if p is None else p for p in n] for n in SOURCES.values()]
     order = torch.tensor(powers, dtype=dtype, device=device).repeat_interleave(3, -1)
-    return order.unsqueeze(2) + order.unsqueeze(1) + 1
+    return 1 / (order.unsqueeze(2) + order.unsqueeze(1) + 1)
 
 
 def window_model(

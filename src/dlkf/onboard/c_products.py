@@ -118,7 +118,7 @@ def _write_rows(
         t.block.write(loops(lead, a.meta.shape[:1]) + loops(["i"], [m]) + body, *used)
         return
     weights = not small or any(buffer is b.buffer for buffer, _ in t.block.constants)
-    beside = 1 if k <= FEW else 6 if weights else 3 if n > NARROW else 1
+    beside = 1 if k <= FEW or n <= NARROW else 6 if weights else 3
     beside, columns = min(m, beside), BLOCK if weights and m > 1 else n
     for top, rows in _pieces(m, beside):
         for left, width in _pieces(n, columns):

@@ -18,7 +18,7 @@ from dlkf.onboard.functions import Function
 
 KEPT = {  # operations that are one in C, though core ATen has several for them
     "aten::linalg_cross", "aten::linalg_solve_ex", "aten::_linalg_solve_ex", "aten::linalg_cholesky_ex",
-    "aten::cholesky_solve", "aten::linalg_inv_ex", "aten::linalg_solve_triangular",
+    "aten::cholesky_solve", "aten::linalg_inv_ex", "aten::linalg_solve_triangular", "aten::baddbmm",
 }  # fmt: skip
 
 
@@ -44,8 +44,9 @@ def _merge_equal(graph: GraphModule) -> None:
     """One node for operations that are the same on the same tensors."""
     seen: dict[str, Node] = {}
     for node in graph.graph.nodes:
-        if node.op == "call_function":
-            first = seen.setdefault(f"{node.target} {node.args} {node.kwargs}", node)
+        if node.op in ("call_function", "get_attr"):
+            what = id(getattr(graph, str(node.target))) if node.op == "get_attr" else node.target
+            first = seen.setdefault(f"{what} {node.args} {node.kwargs}", node)
             if first is not node:
                 node.replace_all_uses_with(first)
 
