@@ -98,9 +98,10 @@ class VirtualOutage(NamedTuple):
         self, top: Float[Tensor, "B 9 n"], of_walks: Float[Tensor, "B s s"], walk: Float[Tensor, " n"]
     ) -> Float[Tensor, "B n n"]:
         """Φ P Φᵀ + Q of all noise but the white one; below position, velocity and attitude Φ is taken for 1."""
-        P = propagated(self.P, top) + walk.diag()
-        rest = P.shape[-1] - STATES
-        return P + torch.nn.functional.pad(of_walks, (0, rest, 0, rest))
+        P = propagated(self.P, top)
+        P[:, :STATES, :STATES] += of_walks
+        P.diagonal(dim1=-2, dim2=-1).add_(walk)
+        return P
 
 
 def _log_density(

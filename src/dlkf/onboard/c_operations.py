@@ -37,7 +37,7 @@ def suffix(dtype: torch.dtype) -> str:
 
 def vectorised(pattern: str, elements: int) -> str:
     """A pattern of many elements, with the functions of ``elementary.c.in`` for those of <math.h> where it has them."""
-    return re.sub(r"\b(expf?|tanhf|log|log1p|sin|cos)\(", r"each_\1(", pattern) if elements >= MANY else pattern
+    return re.sub(r"\b(expf?|tanhf|log|log1p|asinh|sin|cos)\(", r"each_\1(", pattern) if elements >= MANY else pattern
 
 
 def _function(name: str) -> Pattern:
@@ -123,4 +123,5 @@ COPIES = ("clone", "lift_fresh_copy", "_to_copy", "prims::copy_strided")
 PARTS: dict[str, Callable[..., Tensor]] = {
     "slice_scatter": torch.ops.aten.slice.Tensor,
     "select_scatter": torch.ops.aten.select.int,
+    "diagonal_scatter": torch.ops.aten.diagonal.default,
 }

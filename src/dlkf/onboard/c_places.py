@@ -67,6 +67,8 @@ def _undone(node: Node) -> Callable[[Tensor], Tensor | None] | None:
     name, args = name_of(node), node.args
     if name == "unsqueeze":
         return lambda view: view.squeeze(args[1])
+    if name == "expand" and args[0].meta["val"].shape == node.meta["val"].shape:  # type: ignore[union-attr]
+        return lambda view: view
     if name in RESHAPES:
         return lambda view: _reshaped(view, args[0].meta["val"].shape)  # type: ignore[union-attr]
     if name == "permute":
