@@ -93,8 +93,11 @@ class ManyElements(Elements):
 
     def forward(self, x):
         f, good = x.float(), 100 * x.nan_to_num(0.7, 3.0, -3.0)
-        parts = (x.exp(), x.log(), x.log1p(), x.asinh(), x.sin(), x.cos(), f.exp().double(), f.tanh().double(), f.sigmoid().double(),
-                 good.exp(), good.sin(), good.cos(), (1e-9 * good).log1p(), (1e-308 * good.abs()).log())  # fmt: skip
+        parts = (
+            x.exp(), x.log(), x.log1p(), x.asinh(), x.sin(), x.cos(), f.exp().double(), f.tanh().double(),
+            f.sigmoid().double(), good.exp(), good.sin(), good.cos(), (1e-9 * good).log1p(),
+            (1e-308 * good.abs()).log(),
+        )  # fmt: skip
         return torch.cat((super().forward(x), *(p.flatten() for p in parts)))
 
 

@@ -18,11 +18,11 @@ from torch import Tensor
 from torch.fx import GraphModule, Node
 
 from dlkf.base.errors import InputError
-from dlkf.onboard.c_loops import UNKNOWN, WHOLE
+from dlkf.onboard.c_loops import WHOLE
 from dlkf.onboard.c_memory import C_TYPES, Buffer, Expression, Rows, Tensors, View
 from dlkf.onboard.c_operations import BY_ELEMENT, COPIES, PARTS, literal, vectorised
 from dlkf.onboard.c_places import RESHAPES, Readers, find_places, is_same, name_of
-from dlkf.onboard.c_reductions import REDUCTIONS
+from dlkf.onboard.c_reductions import REDUCTIONS, UNKNOWN
 
 
 class Translation(Tensors):
@@ -130,7 +130,9 @@ class Translation(Tensors):
         rows = next((x for x in args if isinstance(x, Rows) and x.shape == value.shape), None)
         if rows is not None and not any(isinstance(x, Expression) for x in args):
             items = [
-                self._expression(rows.shape[len(rows.lead) :], value.dtype, name, [self._row(x, rows, index) for x in args], kwargs)
+                self._expression(
+                    rows.shape[len(rows.lead) :], value.dtype, name, [self._row(x, rows, index) for x in args], kwargs
+                )
                 for index in product(*map(range, rows.lead))
             ]
             x: Expression | Rows = Rows(rows.shape, value.dtype, rows.lead, items)

@@ -1,25 +1,22 @@
-"""Core ATen operations that are loops of their own: sums, products, solutions, indexing.
+"""Core ATen operations that are loops of their own: solutions, indexing, joining, convolutions.
 
 Each writes its lines and gives the tensor, or the list of them, that the operation returns.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch.fx import Node
 
 from dlkf.base.errors import InputError
-from dlkf.onboard.c_memory import C_TYPES, Tensors, View, loops
+from dlkf.onboard.c_memory import Tensors, View, loops
 from dlkf.onboard.c_operations import literal, suffix
 from dlkf.onboard.c_places import is_same
 from dlkf.onboard.c_products import added_product, product
-from dlkf.onboard.c_reductions import ANY, LARGEST, SUM, mean, norm, reduced, running_sum, variance
-
-UNKNOWN = "the C form of an exported filter does not know"
+from dlkf.onboard.c_reductions import ANY, LARGEST, SUM, UNKNOWN, mean, norm, reduced, running_sum, variance
 
 
 def _new(t: Tensors, node: Node) -> tuple[View, Any]:
@@ -218,8 +215,8 @@ def _repeated(t: Tensors, node: Node, x: Any, times: list) -> View:
 
 WHOLE: dict[str, Callable[..., Any]] = {
     "cat": _joined, "sum": reduced(SUM), "any": reduced(ANY, "{0} != 0"), "amax": reduced(LARGEST), "mean": mean,
-    "var": variance, "linalg_vector_norm": norm, "cumsum": running_sum, "mm": product, "bmm": product, "addmm": added_product,
-    "baddbmm": added_product, "_linalg_solve_ex": _solved, "linalg_solve_ex": _solved,
+    "var": variance, "linalg_vector_norm": norm, "cumsum": running_sum, "mm": product, "bmm": product,
+    "addmm": added_product, "baddbmm": added_product, "_linalg_solve_ex": _solved, "linalg_solve_ex": _solved,
     "linalg_cholesky_ex": _factored, "cholesky_solve": _solved_by_factor, "linalg_inv_ex": _inverted,
     "linalg_solve_triangular": _solved_triangle,
     "linalg_cross": _crossed, "index_select": _picked, "index": _indexed, "index_put": _put, "gather": _gathered,

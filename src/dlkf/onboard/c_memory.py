@@ -82,10 +82,10 @@ class Rows:
         for k in range(len(shape) + 1):
             if shape[:k].numel() == self.lead.numel():
                 try:
-                    items = [
-                        Expression(shape[k:], x.dtype, x.pattern, [v.viewed(v.meta.view(shape[k:])) for v in x.operands])
-                        for x in self.items
-                    ]
+                    items = []
+                    for x in self.items:
+                        operands = [v.viewed(v.meta.view(shape[k:])) for v in x.operands]
+                        items.append(Expression(shape[k:], x.dtype, x.pattern, operands))
                 except RuntimeError:  # strides that do not allow it
                     return None
                 return Rows(shape, self.dtype, shape[:k], items)

@@ -8,7 +8,6 @@ Of other matrices many are mostly zeros in filters (H, K, Φ), so zeros in A sav
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import product as places
 from math import prod
 from typing import Any
 
@@ -27,7 +26,9 @@ NARROW = 16  # columns up to which one row at a time is best, and a branch costs
 BLOCK = 24  # columns of weights at a time where several rows are
 
 
-def product(t: Tensors, node: Node, A: Any, B: Any, begin: Any = None, beta: float = 1, alpha: float = 1) -> View | Rows:
+def product(
+    t: Tensors, node: Node, A: Any, B: Any, begin: Any = None, beta: float = 1, alpha: float = 1
+) -> View | Rows:
     """A B (b × m × k · k × n), on top of β · ``begin`` where there is one."""
     a, b, value = t.tensor(A), t.tensor(B), node.meta["val"]
     m, k, n = a.meta.shape[-2], a.meta.shape[-1], b.meta.shape[-1]
@@ -112,7 +113,8 @@ def _write_rows(
         start = "0" if given is None else f"{beta}{given.at([*lead, 'i', 'j'])}"
         body = (
             f"for (int j = 0; j < {n}; j++) {{ {kind} y = 0; for (int k = 0; k < {k}; k++) "
-            f"y += {a.at([*lead, 'i', 'k'])} * {b.at([*lead, 'k', 'j'])}; {out.at([*lead, 'i', 'j'])} = {start} + {scale}y; }}"
+            f"y += {a.at([*lead, 'i', 'k'])} * {b.at([*lead, 'k', 'j'])}; "
+            f"{out.at([*lead, 'i', 'j'])} = {start} + {scale}y; }}"
         )
         used = [out, a, b, *([] if given is None else [given])]
         t.block.write(loops(lead, a.meta.shape[:1]) + loops(["i"], [m]) + body, *used)

@@ -18,6 +18,7 @@ from dlkf.base.errors import InputError
 from dlkf.onboard.c_memory import C_TYPES, Expression, Rows, Tensors, View, loops
 from dlkf.onboard.c_operations import suffix
 
+UNKNOWN = "the C form of an exported filter does not know"
 TERMS = 8  # of a sum that is written as one expression
 REDUCTIONS = ("sum", "any", "mean", "linalg_vector_norm", "cumsum")  # that read each element once
 LANES = 8  # sums beside each other
@@ -154,7 +155,8 @@ def _write_across(t: Tensors, r: Reduced) -> None:
     into = r.into.at([f"i{d}" for d in r.kept])
     if r.kept and r.of.shape[r.kept[-1]] > KEPT:
         t.block.over(r.into, r.how.first, [])
-        t.block.write(f"{_loops(r, [*r.gone, *r.kept])}{into} = {r.how.joined.format(into, term)};", r.into, *r.of.operands)
+        every = _loops(r, [*r.gone, *r.kept])
+        t.block.write(f"{every}{into} = {r.how.joined.format(into, term)};", r.into, *r.of.operands)
         return
     last = r.kept[-1:]
     at, size = (f"y[i{last[0]}]", r.of.shape[last[0]]) if last else ("y[0]", 1)
@@ -173,7 +175,7 @@ def _loops(r: Reduced, dims: Sequence[int]) -> str:
 def norm(t: Tensors, node: Node, x: Any, ord: float = 2, dims: Any = None, keepdim: bool = False) -> View:
     """The Euclidean norm; InputError for another."""
     if ord != 2:
-        raise InputError(f"this filter uses a norm of order {ord}, which the C form of an exported filter does not know")
+        raise InputError(f"this filter uses a norm of order {ord}, which {UNKNOWN}")
     out = reduced(SUM, f"square{suffix(node.meta['val'].dtype)}({{0}})")(t, node, x, dims, keepdim)
     t.block.over(out, f"sqrt{suffix(out.meta.dtype)}({{0}})", [out])
     return out
@@ -195,8 +197,8 @@ def variance(t: Tensors, node: Node, x: Any, dims: Any = None, *, correction: An
     if not keepdim:
         for d in sorted(dims):
             wide = wide.unsqueeze(d)
-    swing = Expression(view.meta.shape, view.meta.dtype, "{0} - {1}", [view, middle.viewed(wide.expand(view.meta.shape))])
-    swing = t.tensor(swing)
+    operands = [view, middle.viewed(wide.expand(view.meta.shape))]
+    swing = t.tensor(Expression(view.meta.shape, view.meta.dtype, "{0} - {1}", operands))
     out = reduced(SUM, f"square{suffix(view.meta.dtype)}({{0}})")(t, node, swing, dims, keepdim)
     n = math.prod(view.meta.shape[d] for d in dims)
     t.block.over(out, f"{{0}} / {n - (1 if correction is None else correction)}", [out])
@@ -216,8 +218,9 @@ def running_sum(t: Tensors, node: Node, x: Any, dim: int, **_: Any) -> View:
         return loops([names[d] for d in dims], [shape[d] for d in dims])
 
     term = terms.pattern.format(*(v.at(names) for v in terms.operands))
+    rest, kind = over([d for d in others if d not in beside]), C_TYPES[out.meta.dtype]
     t.block.write(
-        f"{over([d for d in others if d not in beside])}{{ {C_TYPES[out.meta.dtype]} y[{size}]; {over(beside)}{at} = 0; "
+        f"{rest}{{ {kind} y[{size}]; {over(beside)}{at} = 0; "
         f"{over([dim, *beside])}{{ {at} += {term}; {out.at(names)} = {at}; }} }}",
         out, *terms.operands,
     )  # fmt: skip
