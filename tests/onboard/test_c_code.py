@@ -66,9 +66,11 @@ class Places(nn.Module):
 class Elements(nn.Module):
     """Functions of single numbers, not-a-number and infinity among them; both precisions."""
 
+    times = 1
+
     def example(self):
         x = torch.tensor([[-2.0, -0.5, 0.0, 0.3, 1.0, 7.0, torch.nan, torch.inf, -torch.inf]]).double()
-        return (x,)
+        return (x.repeat(1, self.times),)
 
     def forward(self, x):
         good = x.nan_to_num(0.7, 3.0, -3.0)
@@ -82,6 +84,21 @@ class Elements(nn.Module):
             torch.addcmul(good, good, good, value=2), torch.nn.functional.leaky_relu(f).double(), x,
         )  # fmt: skip
         return torch.cat([p.flatten() for p in parts])
+
+
+class ManyElements(Elements):
+    """So many that they are vectorised, with functions that have no branch."""
+
+    times = 20
+
+    def forward(self, x):
+        f, good = x.float(), 100 * x.nan_to_num(0.7, 3.0, -3.0)
+        parts = (
+            x.exp(), x.log(), x.log1p(), x.asinh(), x.sin(), x.cos(), f.exp().double(), f.tanh().double(),
+            f.sigmoid().double(), good.exp(), good.sin(), good.cos(), (1e-9 * good).log1p(),
+            (1e-308 * good.abs()).log(),
+        )  # fmt: skip
+        return torch.cat((super().forward(x), *(p.flatten() for p in parts)))
 
 
 class Layers(nn.Module):
@@ -119,7 +136,7 @@ class Constants(Places):
 
 
 @pytest.mark.parametrize(
-    "module", [Sums(), Places(), Constants(), Elements(), Layers()], ids=lambda m: type(m).__name__
+    "module", [Sums(), Places(), Constants(), Elements(), ManyElements(), Layers()], ids=lambda m: type(m).__name__
 )
 def test_c_does_what_torch_does(module, tmp_path):
     example = module.example()

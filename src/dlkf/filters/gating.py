@@ -23,6 +23,7 @@ from torch import Tensor
 from dlkf.filters.branches import may_branch
 from dlkf.filters.integration import Epoch
 from dlkf.navigation.compiled import is_recorded
+from dlkf.navigation.state import PV
 
 PATIENCE = 5  # refused fixes that agree with each other before the filter recovers
 MOST_DOUBT = 25.0  # factor on P at most: what was wrong is as a rule attitude or a bias
@@ -64,7 +65,8 @@ class Verdict(NamedTuple):
     def inflated(self, P: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
         """P inflated where the filter recovers, unchanged elsewhere."""
         wide = self.factor[:, None, None] * P
-        return wide + torch.nn.functional.pad(torch.diag_embed(self.shift), (0, P.shape[-1] - 6) * 2)
+        wide[:, PV, PV] += torch.diag_embed(self.shift)
+        return wide
 
 
 class CoarseMemory(NamedTuple):

@@ -25,13 +25,24 @@ def kalman_prediction(
 ) -> Float[Tensor, "B n n"]:
     """Φ P Φᵀ + Q for symmetric P. ``walking``: below :data:`PVA` Φ is the identity, for what stands there walks.
 
-    Then with D the rows of Φ − I above, and a Φ that is not learned through, fewer products do:
+    Then fewer products do, in C and for the gradient through a Φ that is not learned; with D the rows of Φ − I above,
 
         Φ P Φᵀ = P + D P + P Dᵀ + D P Dᵀ,  ∂P = Φᵀ ∂P⁻ Φ = (I + D)ᵀ ∂P⁻ (I + D)
     """
     if walking and torch.is_grad_enabled() and P.requires_grad and not Phi.requires_grad:
         return _KalmanPrediction.apply(P, Phi, Q)
+    if walking and compiled.is_recorded():
+        return propagated(P, Phi[:, PVA]) + Q
     return torch.baddbmm(Q, Phi, torch.bmm(Phi, P).mT)
+
+
+def propagated(P: Float[Tensor, "B n n"], top: Float[Tensor, "B 9 n"]) -> Float[Tensor, "B n n"]:
+    """Φ P Φᵀ for symmetric P, where Φ is the identity below its rows ``top``."""
+    TP = torch.bmm(top, P)
+    cross = TP[:, :, PVA.stop :]
+    upper = torch.cat((torch.bmm(TP, top.mT), cross), -1)
+    lower = torch.cat((cross.mT, P[:, PVA.stop :, PVA.stop :]), -1)
+    return torch.cat((upper, lower), 1)
 
 
 def kalman_update(

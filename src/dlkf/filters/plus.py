@@ -35,7 +35,7 @@ from dlkf.filters.virtual_outages import VirtualOutage
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.error_model import source_scale
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.navigation.state import IMU, PV, PVA, ErrorStates
+from dlkf.navigation.state import IMU, POSITION, PV, PVA, ErrorStates
 from dlkf.networks.features import level_rotation
 from dlkf.networks.plus import (
     LEAST_RATE_HZ,
@@ -149,9 +149,9 @@ class PlusFilter(nn.Module):
     def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
         """Network, the Kalman filter with the noise of both, then the virtual outage beside it."""
         kalman, epoch = self.kalman.screened(memory.kalman, epoch)
-        walk = torch.diag_embed(torch.nn.functional.pad(memory.errors.variance(epoch), (0, kalman.P.shape[-1] - 3)))
-        outage = memory.outage._replace(P=memory.outage.P + walk)
-        memory = memory._replace(kalman=kalman._replace(P=kalman.P + walk), outage=outage)
+        walk = torch.diag_embed(memory.errors.variance(epoch))
+        outage = memory.outage._replace(P=_with_walk(memory.outage.P, walk))
+        memory = memory._replace(kalman=kalman._replace(P=_with_walk(kalman.P, walk)), outage=outage)
         span = epoch.dt * epoch.imu.shape[1]
         fixed = epoch.used.any(-1)
         with torch.no_grad():
@@ -233,6 +233,13 @@ class PlusFilter(nn.Module):
         return like.new_tensor(
             (1.0,) * 3 + (0.3,) * 3 + (0.02,) * 3 + (0.1,) * 3 + (0.005,) * 3 + (0.005,) * matrix + car
         )
+
+
+def _with_walk(P: Float[Tensor, "B n n"], walk: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B n n"]:
+    """P after a random walk of the position."""
+    P = P.clone()
+    P[:, POSITION, POSITION] += walk
+    return P
 
 
 def _flat(error: ImuError, structure: Tensor | None, states: ErrorStates) -> Float[Tensor, "B k"]:

@@ -24,6 +24,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.filters.integration import Covariances, Epoch
+from dlkf.filters.kalman_update import propagated
 from dlkf.navigation.error_model import WindowModel
 from dlkf.navigation.state import PVA, STATES
 
@@ -97,12 +98,10 @@ class VirtualOutage(NamedTuple):
         self, top: Float[Tensor, "B 9 n"], of_walks: Float[Tensor, "B s s"], walk: Float[Tensor, " n"]
     ) -> Float[Tensor, "B n n"]:
         """Φ P Φᵀ + Q of all noise but the white one; below position, velocity and attitude Φ is taken for 1."""
-        TP = torch.bmm(top, self.P)
-        upper = torch.cat((torch.bmm(TP, top.mT), TP[:, :, PVA.stop :]), -1)
-        lower = torch.cat((TP[:, :, PVA.stop :].mT, self.P[:, PVA.stop :, PVA.stop :]), -1)
-        P = torch.cat((upper, lower), 1) + walk.diag()
-        rest = P.shape[-1] - STATES
-        return P + torch.nn.functional.pad(of_walks, (0, rest, 0, rest))
+        P = propagated(self.P, top)
+        P[:, :STATES, :STATES] += of_walks
+        P.diagonal(dim1=-2, dim2=-1).add_(walk)
+        return P
 
 
 def _log_density(

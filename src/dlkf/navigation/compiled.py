@@ -100,7 +100,7 @@ def _load() -> None:
             try:
                 loop = numba.njit(cache=True, **options)(function)
             except RuntimeError:  # numba's word for no folder that it may write into
-                TROUBLE = "every process compiles the loops again, some 3 s each; set NUMBA_CACHE_DIR to a folder of yours"
+                TROUBLE = "every process compiles the loops again, some 3 s each; set NUMBA_CACHE_DIR to a folder"
                 loop = numba.njit(**options)(function)
             for module in modules:
                 vars(module).update({name: loop for name, value in vars(module).items() if value is function})

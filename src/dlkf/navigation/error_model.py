@@ -54,7 +54,7 @@ class WindowModel:
     def spread(self) -> Float[Tensor, "4 s s"]:
         """S ∫ (1−τ/T)^(nᵢ+nⱼ) dτ of each noise source."""
         T = self.left.shape[1] * self.dt
-        return (self.density[0] * T)[:, None, None] / _orders(self.density.dtype, self.density.device)
+        return (self.density[0] * T)[:, None, None] * _shares(self.density.dtype, self.density.device)
 
     def transition(
         self, start: NavState, window: Window, corrected: Float[Tensor, "B M 6"], frame: TangentFrame
@@ -117,38 +117,39 @@ class WindowModel:
     def _sensor_columns(
         self, start: NavState, window: Window, corrected: Float[Tensor, "B M 6"]
     ) -> Float[Tensor, "B 9 k"]:
-        """Columns of Φ of the biases and the elements of M."""
+        """Columns of Φ of the biases and the elements of M.
+
+        D = ∫C over a sample and g the velocity gained in it: a force error e gives the velocity −Σ D e, a rate error
+        Σₖ gₖ × (Σ_{j<k} Dⱼ + Dₖ/2) e = Σⱼ (Σ_{k>j} gₖ + gⱼ/2) × Dⱼ e; for position each sample counts by the time
+        that is left. Samples come last.
+        """
         dt = self.dt
-        before = torch.cat((start.C_nb.unsqueeze(1), window.C_nb[:, :-1]), 1)
-        turned = torch.add(before, window.C_nb).mul_(0.5 * dt)  # ∫C over each sample
-        v_before = torch.cat((start.v_n.unsqueeze(1), window.v_n[:, :-1]), 1)
-        gained = torch.sub(window.v_n - v_before, window.gravity.unsqueeze(1), alpha=dt)
-        force, rate = self._columns(turned, corrected)
-        swept_rate = torch.sub(rate.cumsum(1), rate, alpha=0.5)
-        lever = torch.linalg.cross(gained.unsqueeze(-1).expand_as(rate), swept_rate, dim=-2)
-        columns = torch.cat(self._in_order(-force, lever), -1)  # of the velocity gained in each sample
-        PV = (self.left @ columns.flatten(2)).reshape(len(columns), 6, -1)
-        turned_by = -rate.sum(1)
-        zero = torch.zeros_like(turned_by)
-        A = torch.cat((zero[..., :3], turned_by[..., :3], zero[..., 3:], turned_by[..., 3:]), -1)
+        C, v, (f, w) = window.C_nb.movedim(1, -1), window.v_n.mT, corrected.mT.contiguous().split(3, 1)
+        C = torch.cat((start.C_nb.unsqueeze(-1), C), -1)
+        turned = torch.add(C[..., :-1], C[..., 1:]).mul(0.5 * dt).unsqueeze(1)
+        v = torch.cat((start.v_n.unsqueeze(-1), v), -1)
+        gained = torch.sub(v[..., 1:] - v[..., :-1], window.gravity.unsqueeze(-1), alpha=dt)
+        gained = self.left.unsqueeze(1) * gained.unsqueeze(1)  # (B, 2, 3, M): for position, for velocity
+        later = gained.sum(-1, keepdim=True) - torch.sub(gained.cumsum(-1), gained, alpha=0.5)
+        both = (len(turned), 2, *turned.shape[2:])
+        lever = torch.linalg.cross(later.unsqueeze(3).expand(both), turned.expand(both), dim=2)
+        force = self._summed(-self.left[:, None, None] * turned, f)
+        rate, tilt = self._summed(lever, w), self._summed(-turned, w)
+        PV = torch.cat((force[..., :3], rate[..., :3], force[..., 3:], rate[..., 3:]), -1)
+        zero = torch.zeros_like(tilt)
+        A = torch.cat((zero[..., :3], tilt[..., :3], zero[..., 3:], tilt[..., 3:]), -1)
         return torch.cat((PV, A), 1)
 
-    def _columns(self, turned: Tensor, corrected: Tensor) -> tuple[Tensor, Tensor]:
-        """∫C e over each sample for the accelerometers' and the gyroscopes' errors (B, M, 3, k)."""
-        if self.states.matrix == "none":
-            return turned, turned
-        f, w = (x.unsqueeze(-2) for x in corrected.split(3, -1))
-        if self.states.matrix == "scale":
-            return torch.cat((turned, turned * f), -1), torch.cat((turned, turned * w), -1)
-        rows, columns = zip(*self.states.elements)
-        along = turned[..., list(rows)]
-        listed = list(columns)
-        return (torch.cat((turned, along * f[..., listed]), -1), torch.cat((turned, along * w[..., listed]), -1))
-
-    def _in_order(self, force: Tensor, lever: Tensor) -> tuple[Tensor, ...]:
-        if self.states.matrix == "none":
-            return force, lever
-        return force[..., :3], lever[..., :3], force[..., 3:], lever[..., 3:]
+    def _summed(self, x: Float[Tensor, "B r 3 3 M"], e: Float[Tensor, "B 3 M"]) -> Float[Tensor, "B 3*r k"]:
+        """Σ x over the samples for a bias, then Σ x[…, row] e[column] for the elements of M."""
+        of_bias, matrix = x.sum(-1), self.states.matrix
+        if matrix == "none":
+            return of_bias.flatten(1, 2)
+        if matrix == "scale":
+            return torch.cat((of_bias, (x * e[:, None, None]).sum(-1)), -1).flatten(1, 2)
+        rows, columns = (list(k) for k in zip(*self.states.elements))
+        products = torch.bmm(x.flatten(1, 3), e.mT).unflatten(1, x.shape[1:4])
+        return torch.cat((of_bias, products[..., rows, columns]), -1).flatten(1, 2)
 
 
 class _ProcessNoise(torch.autograd.Function):
@@ -171,11 +172,11 @@ class _ProcessNoise(torch.autograd.Function):
 
 @lru_cache
 @torch.inference_mode(False)
-def _orders(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """nᵢ + nⱼ + 1 of each noise source (4, s, s)."""
+def _shares(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """1/(nᵢ + nⱼ + 1) of each noise source (4, s, s)."""
     powers = [[math.inf if p is None else p for p in n] for n in SOURCES.values()]
     order = torch.tensor(powers, dtype=dtype, device=device).repeat_interleave(3, -1)
-    return order.unsqueeze(2) + order.unsqueeze(1) + 1
+    return 1 / (order.unsqueeze(2) + order.unsqueeze(1) + 1)
 
 
 def window_model(

@@ -94,8 +94,8 @@ def _mechanised(p0: Tensor, v0: Tensor, C0: Tensor, imu: Tensor, dt: float, g: T
     M = phi.shape[2]
     C = C0.permute(1, 2, 0).unsqueeze(-1)  # (3, 3, B, 1)
     p, v, g3, w = (x.mT.unsqueeze(-1) for x in (p0, v0, g, earth_rate))
-    A = _product(C, prefix_rotations(phi))  # C₀ R at each sample's end, Earth rotation left out
-    A_before = torch.cat((C, A[..., :-1]), -1)
+    A = torch.cat((C, _product(C, prefix_rotations(phi))), -1)  # C₀ R, Earth rotation left out
+    A_before, A = A[..., :-1], A[..., 1:]  # at each sample's begin and end
     # ∫ exp(s φ) ds f over the sample, once for velocity, twice for position
     dv = f * dt
     turn = torch.linalg.cross(phi, dv, dim=0)

@@ -86,26 +86,31 @@ def bounded(x: Tensor, reach: Tensor | float) -> Tensor:
 
 def window_features(samples: Float[Tensor, "B M 6"], dt: float) -> Float[Tensor, "B K"]:
     """Means and logarithms of the variances in bands of frequency of a window's corrected samples, body axes."""
-    waves, inside = _fourier(samples.shape[1], dt, samples.dtype, samples.device)
+    even, odd, inside, late = _fourier(samples.shape[1], dt, samples.dtype, samples.device)
     still, size, least, level = _sizes(samples.dtype, samples.device)
     mean = samples.mean(1)
-    swing = torch.matmul((samples - mean.unsqueeze(1)).mT, waves).square()  # (B, 6, cosines and sines)
-    bands = torch.matmul(swing, inside)
+    swing = (samples - mean.unsqueeze(1)).mT
+    half = len(late)
+    first, middle, last = swing[..., :half], swing[..., half : len(even)], swing[..., late]  # from the middle alike
+    cosines, sines = torch.cat((first + last, middle), -1) @ even, (first - last) @ odd
+    bands = (cosines.square() + sines.square()) @ inside
     return torch.cat((torch.asinh((mean - still) / size), ((torch.log(bands + least) - level) / 4).flatten(1)), -1)
 
 
 @lru_cache
 @torch.inference_mode(False)
-def _fourier(M: int, dt: float, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """(M, 2 w): cosines, then sines, under a Hann window, up to the last band; (2 w, bands): which belong to a band,
-    scaled so that over all frequencies their squares sum to the variance."""
+def _fourier(M: int, dt: float, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Cosines (M − h, w) and sines (h, w) from the middle of M = 2 h (+ 1) samples under a Hann window, up to the last
+    band; (w, bands): which belong to a band, scaled so that over all frequencies their squares sum to the variance;
+    the second half from the end backwards (h,)."""
     taper = torch.hann_window(M, periodic=False, dtype=dtype, device=device)
     waves = torch.arange(min(M // 2, math.ceil(BANDS_HZ[-1] * M * dt)) + 1, device=device)
-    turns = 2 * torch.pi / M * (torch.arange(M, device=device)[:, None] * waves % M).to(dtype)
+    turns = torch.pi / M * ((2 * torch.arange(M, device=device)[:, None] - (M - 1)) * waves % (2 * M)).to(dtype)
     frequency = (waves / (M * dt))[:, None]
     edges = torch.tensor(BANDS_HZ, device=device)
     inside = ((frequency >= edges[:-1]) & (frequency < edges[1:])).to(dtype) * (2 / (M * taper.square().sum()))
-    return torch.cat((torch.cos(turns), torch.sin(turns)), 1) * taper[:, None], inside.repeat(2, 1)
+    cosines, sines = (f(turns) * taper[:, None] for f in (torch.cos, torch.sin))
+    return cosines[: M - M // 2], sines[: M // 2], inside, torch.arange(M - 1, M - 1 - M // 2, -1, device=device)
 
 
 @lru_cache

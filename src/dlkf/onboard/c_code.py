@@ -10,6 +10,7 @@ The equations stay where they are, in torch: this knows operations, not filters.
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import torch
@@ -17,9 +18,11 @@ from torch import Tensor
 from torch.fx import GraphModule, Node
 
 from dlkf.base.errors import InputError
-from dlkf.onboard.c_loops import UNKNOWN, WHOLE
-from dlkf.onboard.c_memory import C_TYPES, Buffer, Expression, Tensors, View
-from dlkf.onboard.c_operations import BY_ELEMENT, PARTS, literal
+from dlkf.onboard.c_loops import WHOLE
+from dlkf.onboard.c_memory import C_TYPES, Buffer, Expression, Rows, Tensors, View
+from dlkf.onboard.c_operations import BY_ELEMENT, COPIES, PARTS, literal, vectorised
+from dlkf.onboard.c_places import RESHAPES, Readers, find_places, is_same, name_of
+from dlkf.onboard.c_reductions import REDUCTIONS, UNKNOWN
 
 
 class Translation(Tensors):
@@ -30,9 +33,11 @@ class Translation(Tensors):
         self.values: dict[Node, Any] = {}
         self.inputs: list[Buffer] = []
         self.outputs: list[View] = []
-        self._module = graph
+        self._module, self._readers, self._places = graph, Readers(graph), find_places(graph)
+        self._held = _results(graph)
         for node in graph.graph.nodes:
             getattr(self, f"_{node.op}")(node)
+            self._readers.note(node, self.values.get(node))
 
     # every kind of node
 
@@ -55,12 +60,14 @@ class Translation(Tensors):
             return
         name = target._schema.name.removeprefix("aten::")
         parts = [*_flat(args), *_flat(kwargs)]
-        if not any(isinstance(a, (View, Expression)) for a in parts) and "val" in node.meta:
+        if not any(isinstance(a, (View, Expression, Rows)) for a in parts) and "val" in node.meta:
             self.values[node] = target(*args, **kwargs)  # known here
         elif name == "_assert_tensor_metadata":
             return
         elif _is_view(target):
-            self.values[node] = self._viewed(target, args, kwargs)
+            self.values[node] = self._viewed(node, target, args, kwargs)
+        elif name in COPIES and _is_copy(args[0], node):
+            self.values[node] = args[0]
         elif name in PARTS:
             self.values[node] = self._copied(node, name, args)
         elif name in BY_ELEMENT:
@@ -83,9 +90,33 @@ class Translation(Tensors):
             return [self._known(a) for a in x]
         return {k: self._known(a) for k, a in x.items()} if isinstance(x, dict) else x
 
+    def result(self, node: Node) -> View:
+        """Memory for what an operation returns: a place in what joins it, if that has one for it."""
+        if node not in self._held:
+            self._held[node] = self._placed(node) or super().result(node)
+        return self._held[node]
+
+    def _placed(self, node: Node) -> View | None:
+        if node not in self._places:
+            return None
+        holder, where = self._places[node]
+        whole = self.result(holder)
+        meta = where(whole.meta)
+        return None if meta is None or meta.shape != node.meta["val"].shape else whole.viewed(meta)
+
+    def goes_on(self, node: Node) -> bool:
+        """As there; views of rows are rows."""
+        users = list(node.users)
+        if len(users) != 1:
+            return False
+        name = name_of(users[0])
+        return name in (*BY_ELEMENT, *REDUCTIONS) or (name in RESHAPES and self.goes_on(users[0]))
+
     # kinds of operation
 
-    def _viewed(self, target: Any, args: list, kwargs: dict) -> Any:
+    def _viewed(self, node: Node, target: Any, args: list, kwargs: dict) -> Any:
+        if isinstance(args[0], Rows) and name_of(node) in RESHAPES and (rows := args[0].viewed(node.meta["val"].shape)):
+            return rows
         view = self.tensor(args[0])
         try:
             made = target(view.meta, *args[1:], **kwargs)
@@ -95,39 +126,73 @@ class Translation(Tensors):
         return [view.viewed(m) for m in made] if isinstance(made, (list, tuple)) else view.viewed(made)
 
     def _by_element(self, node: Node, name: str, args: list, kwargs: dict) -> Any:
-        value = node.meta["val"]
+        value, goes_on = node.meta["val"], self.goes_on(node)
+        rows = next((x for x in args if isinstance(x, Rows) and x.shape == value.shape), None)
+        if rows is not None and not any(isinstance(x, Expression) for x in args):
+            items = [
+                self._expression(
+                    rows.shape[len(rows.lead) :], value.dtype, name, [self._row(x, rows, index) for x in args], kwargs
+                )
+                for index in product(*map(range, rows.lead))
+            ]
+            x: Expression | Rows = Rows(rows.shape, value.dtype, rows.lead, items)
+            return x if goes_on else self.stored(node, x)
+        x = self._expression(value.shape, value.dtype, name, args, kwargs)
+        return x if goes_on and len(x.operands) <= 12 and value.numel() > 0 else self.stored(node, x)
+
+    def _row(self, x: Any, rows: Rows, index: tuple[int, ...]) -> Any:
+        """Of an operand what belongs to a row."""
+        if isinstance(x, Rows) and x.lead == rows.lead:
+            return x.at(index)
+        if not isinstance(x, (View, Rows, Tensor)):
+            return x
+        view = self.tensor(x)
+        return view.viewed(view.meta.expand(rows.shape)[index])
+
+    def _expression(self, shape: torch.Size, dtype: torch.dtype, name: str, args: list, kwargs: dict) -> Expression:
         pattern, operands = BY_ELEMENT[name], []
         if callable(pattern):
-            pattern, args = pattern(value.dtype, args, kwargs)
+            pattern, args = pattern(dtype, args, kwargs)
+            pattern = vectorised(pattern, shape.numel())
         segments = []
         for x in args:
-            if isinstance(x, Expression) and x.shape == value.shape:
+            if isinstance(x, Expression) and x.shape == shape:
                 first = len(operands)
                 inner = x.pattern.format(*(f"{{{first + k}}}" for k in range(len(x.operands))))
-                segments.append(f"({_cast(x.dtype, value.dtype)}({inner}))")
+                segments.append(f"({_cast(x.dtype, dtype)}({inner}))")
                 operands += x.operands
-            elif isinstance(x, (View, Expression)) or (isinstance(x, Tensor) and x.numel() > 1):
+            elif isinstance(x, (View, Expression, Rows)) or (isinstance(x, Tensor) and x.numel() > 1):
                 view = self.tensor(x)
-                segments.append(f"{_cast(view.meta.dtype, value.dtype)}{{{len(operands)}}}")
-                operands.append(view.viewed(view.meta.expand(value.shape)))
+                segments.append(f"{_cast(view.meta.dtype, dtype)}{{{len(operands)}}}")
+                operands.append(view.viewed(view.meta.expand(shape)))
             else:
-                segments.append(literal(x.item() if isinstance(x, Tensor) else x, value.dtype))
-        expression = Expression(
-            value.shape, value.dtype, f"({C_TYPES[value.dtype]})({pattern.format(*segments)})", operands
-        )
-        alone = len(node.users) == 1 and len(operands) <= 12 and value.numel() > 0
-        return expression if alone and _goes_on(next(iter(node.users))) else self.tensor(expression)
+                segments.append(literal(x.item() if isinstance(x, Tensor) else x, dtype))
+        return Expression(shape, dtype, f"({C_TYPES[dtype]})({pattern.format(*segments)})", operands)
 
     def _copied(self, node: Node, name: str, args: list) -> View:
         """An operation that changes a part: a copy, then the part."""
-        whole = self.tensor(args[0])
-        out = self.block.new(whole.meta.shape, whole.meta.dtype)
-        self.block.over(out, "{0}", [whole])
-        part = PARTS[name](out.meta, *args[2:])
-        source = self.tensor(args[1])
-        values = source.viewed(source.meta.expand(part.shape))
-        self.block.over(out.viewed(part), f"({C_TYPES[out.meta.dtype]}){{0}}", [values])
+        whole, source = self.tensor(args[0]), self.tensor(args[1])
+        out = whole
+        if is_same(source, whole.viewed(PARTS[name](whole.meta, *args[2:]))):
+            return whole
+        if not self._readers.may_change(node, whole, source):
+            out = self.result(node)
+            self.block.over(out, "{0}", [whole])
+        part = out.viewed(PARTS[name](out.meta, *args[2:]))
+        values = source.viewed(source.meta.expand(part.meta.shape))
+        self.block.over(part, f"({C_TYPES[out.meta.dtype]}){{0}}", [values])
         return out
+
+
+def _results(graph: GraphModule) -> dict[Node, View]:
+    """Memory of the caller for what a function returns."""
+    returned: Any = next(node for node in graph.graph.nodes if node.op == "output").args[0]
+    held: dict[Node, View] = {}
+    for k, node in enumerate(returned if isinstance(returned, (list, tuple)) else [returned]):
+        value = node.meta["val"]
+        buffer = Buffer(f"out{k}", value.dtype, value.numel(), fixed=True)
+        held.setdefault(node, View(buffer, torch.empty(value.shape, dtype=value.dtype, device="meta")))
+    return held
 
 
 def _cast(given: torch.dtype, wanted: torch.dtype) -> str:
@@ -140,10 +205,10 @@ def _is_view(target: Any) -> bool:
     return bool(returns) and returns[0].alias_info is not None and not returns[0].alias_info.is_write
 
 
-def _goes_on(user: Node) -> bool:
-    """Whether a value may stay an expression: its only user takes it element by element."""
-    schema = getattr(user.target, "_schema", None)
-    return schema is not None and schema.name.removeprefix("aten::") in BY_ELEMENT
+def _is_copy(x: Any, node: Node) -> bool:
+    """Whether an operation returns the same numbers in the same order."""
+    value = node.meta["val"]
+    return isinstance(x, View) and x.meta.dtype == value.dtype and x.meta.stride() == value.stride()
 
 
 def _flat(x: Any) -> list:

@@ -1,180 +1,45 @@
-"""Core ATen operations that are loops of their own: sums, products, solutions, indexing.
+"""Core ATen operations that are loops of their own: solutions, indexing, joining, convolutions.
 
 Each writes its lines and gives the tensor, or the list of them, that the operation returns.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch.fx import Node
 
 from dlkf.base.errors import InputError
-from dlkf.onboard.c_memory import C_TYPES, Tensors, View
+from dlkf.onboard.c_memory import Tensors, View, loops
 from dlkf.onboard.c_operations import literal, suffix
-
-SMALL = 4096  # numbers of a matrix that is copied to be read along its rows, rather than weights of a network
-WIDE = 8  # columns from which on a zero is worth asking for
-UNKNOWN = "the C form of an exported filter does not know"
+from dlkf.onboard.c_places import is_same
+from dlkf.onboard.c_products import added_product, product
+from dlkf.onboard.c_reductions import ANY, LARGEST, SUM, UNKNOWN, mean, norm, reduced, running_sum, variance
 
 
 def _new(t: Tensors, node: Node) -> tuple[View, Any]:
     """The result's memory, and what torch says of it."""
     value: Any = node.meta["val"]
-    return t.block.new(value.shape, value.dtype), value
+    return t.result(node), value
 
 
 def _names(count: int) -> list[str]:
     return [f"i{k}" for k in range(count)]
 
 
-def _loops(names: Sequence[str], sizes: Sequence[int]) -> str:
-    return "".join(f"for (int {i} = 0; {i} < {n}; {i}++) " for i, n in zip(names, sizes))
-
-
-def _axes(dims: Any, ndim: int) -> list[int]:
-    listed = range(ndim) if dims in (None, []) else [dims] if isinstance(dims, int) else dims
-    return [d % ndim for d in listed]
-
-
 def _joined(t: Tensors, node: Node, parts: list, dim: int = 0) -> View:
-    out, _ = _new(t, node)
+    out = t.result(node)
     start = 0
     for view in map(t.tensor, parts):
         if view.meta.numel():
             size = view.meta.shape[dim]
-            t.block.over(out.viewed(out.meta.narrow(dim, start, size)), "{0}", [view])
+            place = out.viewed(out.meta.narrow(dim, start, size))
+            if not is_same(place, view):
+                t.block.over(place, "{0}", [view])
             start += size
     return out
-
-
-def _reduced(first: str, each: str) -> Callable[..., View]:
-    """``first`` into the result, then ``each`` for every element: {0} the result so far, {1} the element."""
-
-    def made(t: Tensors, node: Node, x: Any, dims: Any = None, keepdim: bool = False, **_: Any) -> View:
-        view, (out, _value) = t.tensor(x), _new(t, node)
-        dims = _axes(dims, view.meta.ndim)
-        t.block.over(out, first, [])
-        target = out.meta
-        if not keepdim:
-            for d in sorted(dims):
-                target = target.unsqueeze(d)
-        kept = [d for d in range(view.meta.ndim) if d not in dims]
-        inside = view.meta.stride(-1) == 1 and view.meta.ndim - 1 in dims
-        order = kept + dims if inside else dims + kept  # along memory in the innermost loop
-        target = out.viewed(target.expand(view.meta.shape).permute(order))
-        t.block.over(target, each, [target, view.viewed(view.meta.permute(order))])
-        return out
-
-    return made
-
-
-def _norm(t: Tensors, node: Node, x: Any, ord: float = 2, dims: Any = None, keepdim: bool = False) -> View:
-    if ord != 2:
-        raise InputError(f"this filter uses a norm of order {ord}, which {UNKNOWN}")
-    out = _reduced("0", "{0} + {1} * {1}")(t, node, x, dims, keepdim)
-    t.block.over(out, f"sqrt{suffix(out.meta.dtype)}({{0}})", [out])
-    return out
-
-
-def _mean(t: Tensors, node: Node, x: Any, dims: Any = None, keepdim: bool = False, **_: Any) -> View:
-    out = _reduced("0", "{0} + {1}")(t, node, x, dims, keepdim)
-    t.block.over(out, f"{{0}} / {t.tensor(x).meta.numel() // max(1, out.meta.numel())}", [out])
-    return out
-
-
-def _variance(t: Tensors, node: Node, x: Any, dims: Any = None, *, correction: Any = 1, keepdim: bool = False) -> View:
-    view = t.tensor(x)
-    dims = _axes(dims, view.meta.ndim)
-    mean = _mean(t, node, view, dims, keepdim)
-    wide = mean.meta
-    if not keepdim:
-        for d in sorted(dims):
-            wide = wide.unsqueeze(d)
-    swing = t.block.new(view.meta.shape, view.meta.dtype)
-    t.block.over(swing, "{0} - {1}", [view, mean.viewed(wide.expand(view.meta.shape))])
-    out = _reduced("0", "{0} + {1} * {1}")(t, node, swing, dims, keepdim)
-    n = math.prod(view.meta.shape[d] for d in dims)
-    t.block.over(out, f"{{0}} / {n - (1 if correction is None else correction)}", [out])
-    return out
-
-
-def _summed_up(t: Tensors, node: Node, x: Any, dim: int, **_: Any) -> View:
-    view, (out, value) = t.tensor(x), _new(t, node)
-    n = value.shape[dim]
-    first, source = (v.viewed(v.meta.narrow(dim, 0, 1)) for v in (out, view))
-    t.block.over(first, "{0}", [source])
-    now, before, each = (
-        v.viewed(v.meta.narrow(dim, start, n - 1).movedim(dim, 0)) for v, start in ((out, 1), (out, 0), (view, 1))
-    )
-    t.block.over(now, "{0} + {1}", [before, each])
-    return out
-
-
-def _product(t: Tensors, node: Node, A: Any, B: Any, begin: Any = None, beta: float = 1, alpha: float = 1) -> View:
-    """A B (b × m × k · k × n), on top of β · ``begin`` where there is one."""
-    a, b, (out, value) = t.tensor(A), t.tensor(B), _new(t, node)
-    m, k, n = a.meta.shape[-2], a.meta.shape[-1], b.meta.shape[-1]
-    small = value[..., 0, 0].numel() * k * n <= SMALL
-    if small and n >= WIDE and m > 1 and b.meta.stride(-1) != 1:
-        b = t.dense(b)
-    lead = ["b"] if a.meta.ndim == 3 else []
-    if begin is None and alpha == 1 and n >= WIDE and (rows := _sparse_rows(t, a)):
-        for line in _rows(rows, out, b, len(lead), n):
-            t.block.write(line, out, b)
-        return out
-    kind, scale = C_TYPES[value.dtype], "" if alpha == 1 else f"{literal(alpha, value.dtype)} * "
-    at_a, at_b, at = a.at([*lead, "i", "k"]), b.at([*lead, "k", "j"]), out.at([*lead, "i", "j"])
-    start, used = "0", [a, b]
-    if begin is not None:
-        given = t.tensor(begin)
-        wide = given.viewed(given.meta.expand(value.shape))
-        start = ("" if beta == 1 else f"{literal(beta, value.dtype)} * ") + wide.at([*lead, "i", "j"])
-        used.append(given)
-    if b.meta.stride(-1) == 1 or (n > 1 and b.meta.stride(-2) != 1):  # along rows of B
-        # H, K and Φ are mostly zeros; a branch round a loop of fixed length costs half of a list of what is not
-        skip = "if (w == 0) continue; " if small and n >= WIDE else ""
-        body = (
-            f"{{ {kind} y[{n}]; for (int j = 0; j < {n}; j++) y[j] = {start}; "
-            f"for (int k = 0; k < {k}; k++) {{ {kind} w = {scale}{at_a}; {skip}"
-            f"for (int j = 0; j < {n}; j++) y[j] += w * {at_b}; }} "
-            f"for (int j = 0; j < {n}; j++) {at} = y[j]; }}"
-        )
-    else:  # along its columns
-        body = (
-            f"for (int j = 0; j < {n}; j++) {{ {kind} y = 0; for (int k = 0; k < {k}; k++) y += {at_a} * {at_b}; "
-            f"{at} = {start} + {scale}y; }}"
-        )
-    t.block.write(_loops(lead, a.meta.shape[:1]) + _loops(["i"], [m]) + body, out, *used)
-    return out
-
-
-def _sparse_rows(t: Tensors, a: View) -> list[list[tuple[int, float]]]:
-    """Column and value of what is not zero in each row of a constant matrix with at most two of them a row."""
-    values = next((x for buffer, x in t.block.constants if buffer is a.buffer), None)
-    if values is None or a.meta.numel() != a.meta.shape[-2] * a.meta.shape[-1]:
-        return []
-    A = torch.as_strided(torch.from_numpy(values), a.meta.shape, a.meta.stride(), a.meta.storage_offset())
-    rows = [[(k, float(row[k])) for k in row.nonzero()[:, 0].tolist()] for row in A.reshape(A.shape[-2:])]
-    return rows if sum(map(len, rows)) <= 2 * len(rows) else []
-
-
-def _rows(rows: list[list[tuple[int, float]]], out: View, b: View, lead: int, n: int) -> Iterator[str]:
-    """Rows of A B as sums of few rows of B."""
-    for i, row in enumerate(rows):
-        terms = []
-        for k, w in row:
-            at = b.at([*["0"] * lead, str(k), "j"])
-            terms.append(at if w == 1 else f"-{at}" if w == -1 else f"{literal(w, out.meta.dtype)} * {at}")
-        into = out.at([*["0"] * lead, str(i), "j"])
-        yield f"for (int j = 0; j < {n}; j++) {into} = {' + '.join(terms) or '0'};"
-
-
-def _added_product(t: Tensors, node: Node, c: Any, a: Any, b: Any, beta: float = 1, alpha: float = 1) -> View:
-    return _product(t, node, a, b, c, beta, alpha)
 
 
 def _each(t: Tensors, call: str, sizes: tuple[int, ...], *views: View) -> None:
@@ -248,7 +113,7 @@ def _indexed(t: Tensors, node: Node, x: Any, indices: list) -> View:
     view, (out, value) = t.tensor(x), _new(t, node)
     names = _names(value.ndim)
     source, given = _places(t, view, indices, names)
-    t.block.write(f"{_loops(names, value.shape)}{out.at(names)} = {view.at(source)};", out, view, *given)
+    t.block.write(f"{loops(names, value.shape)}{out.at(names)} = {view.at(source)};", out, view, *given)
     return out
 
 
@@ -264,7 +129,7 @@ def _put(t: Tensors, node: Node, x: Any, indices: list, values: Any, accumulate:
     target, given = _places(t, view, indices, names)
     wide = outputs.viewed(outputs.meta.expand(sizes))
     sign = "+=" if accumulate else "="
-    t.block.write(f"{_loops(names, sizes)}{out.at(target)} {sign} {wide.at(names)};", out, outputs, *given)
+    t.block.write(f"{loops(names, sizes)}{out.at(target)} {sign} {wide.at(names)};", out, outputs, *given)
     return out
 
 
@@ -285,7 +150,7 @@ def _gathered(t: Tensors, node: Node, x: Any, dim: int, index: Any, **_: Any) ->
     view, rows, (out, value) = t.tensor(x), t.tensor(index), _new(t, node)
     names = _names(value.ndim)
     source = [rows.at(names) if k == dim % value.ndim else i for k, i in enumerate(names)]
-    t.block.write(f"{_loops(names, value.shape)}{out.at(names)} = {view.at(source)};", out, view, rows)
+    t.block.write(f"{loops(names, value.shape)}{out.at(names)} = {view.at(source)};", out, view, rows)
     return out
 
 
@@ -297,8 +162,8 @@ def _largest(t: Tensors, node: Node, x: Any, dim: int = -1, keepdim: bool = Fals
     at = out.at([("0" if k == dim else i) for k, i in enumerate(names)] if keepdim else [names[k] for k in outer])
     best = view.at([("best" if k == dim else i) for k, i in enumerate(names)])
     t.block.write(
-        f"{_loops([names[k] for k in outer], [view.meta.shape[k] for k in outer])}{{ int best = 0; "
-        f"{_loops([names[dim]], [view.meta.shape[dim]])}if ({view.at(names)} > {best}) best = {names[dim]}; "
+        f"{loops([names[k] for k in outer], [view.meta.shape[k] for k in outer])}{{ int best = 0; "
+        f"{loops([names[dim]], [view.meta.shape[dim]])}if ({view.at(names)} > {best}) best = {names[dim]}; "
         f"{at} = best; }}",
         out, view,
     )  # fmt: skip
@@ -349,10 +214,9 @@ def _repeated(t: Tensors, node: Node, x: Any, times: list) -> View:
 
 
 WHOLE: dict[str, Callable[..., Any]] = {
-    "cat": _joined, "sum": _reduced("0", "{0} + {1}"), "any": _reduced("0", "{0} | ({1} != 0)"),
-    "amax": _reduced("-INFINITY", "{0} > {1} ? {0} : {1}"), "mean": _mean, "var": _variance,
-    "linalg_vector_norm": _norm, "cumsum": _summed_up, "mm": _product, "bmm": _product, "addmm": _added_product,
-    "baddbmm": _added_product, "_linalg_solve_ex": _solved, "linalg_solve_ex": _solved,
+    "cat": _joined, "sum": reduced(SUM), "any": reduced(ANY, "{0} != 0"), "amax": reduced(LARGEST), "mean": mean,
+    "var": variance, "linalg_vector_norm": norm, "cumsum": running_sum, "mm": product, "bmm": product,
+    "addmm": added_product, "baddbmm": added_product, "_linalg_solve_ex": _solved, "linalg_solve_ex": _solved,
     "linalg_cholesky_ex": _factored, "cholesky_solve": _solved_by_factor, "linalg_inv_ex": _inverted,
     "linalg_solve_triangular": _solved_triangle,
     "linalg_cross": _crossed, "index_select": _picked, "index": _indexed, "index_put": _put, "gather": _gathered,

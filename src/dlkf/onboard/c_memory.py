@@ -5,12 +5,13 @@ from __future__ import annotations
 from bisect import insort
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import count
+from itertools import count, product
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.fx import Node
 
 C_TYPES = {
     torch.float64: "double", torch.float32: "float", torch.int64: "int64_t", torch.int32: "int32_t",
@@ -61,6 +62,37 @@ class Expression:
 
 
 @dataclass
+class Rows:
+    """Elements that are not computed yet, an expression for each index of the leading axes."""
+
+    shape: torch.Size
+    dtype: torch.dtype
+    lead: torch.Size
+    items: list[Expression]  # in the order of memory
+
+    def at(self, index: Sequence[int]) -> Expression:
+        """That of an index of the leading axes."""
+        place = 0
+        for n, i in zip(self.lead, index):
+            place = place * n + i
+        return self.items[place]
+
+    def viewed(self, shape: torch.Size) -> Rows | None:
+        """As another shape; None where that parts an expression."""
+        for k in range(len(shape) + 1):
+            if shape[:k].numel() == self.lead.numel():
+                try:
+                    items = []
+                    for x in self.items:
+                        operands = [v.viewed(v.meta.view(shape[k:])) for v in x.operands]
+                        items.append(Expression(shape[k:], x.dtype, x.pattern, operands))
+                except RuntimeError:  # strides that do not allow it
+                    return None
+                return Rows(shape, self.dtype, shape[:k], items)
+        return None
+
+
+@dataclass
 class Block:
     """Lines of the function, and the buffers that they use."""
 
@@ -70,9 +102,13 @@ class Block:
     places: dict[str, int] = field(default_factory=dict)
     names: Any = field(default_factory=lambda: count(0))
 
-    def new(self, shape: torch.Size | tuple[int, ...], dtype: torch.dtype) -> View:
-        """A tensor to be written next."""
+    def new(
+        self, shape: torch.Size | tuple[int, ...], dtype: torch.dtype, strides: Sequence[int] | None = None
+    ) -> View:
+        """A tensor to be written next; ``strides`` of one without gaps, if its axes stand in another order."""
         meta = torch.empty(shape, dtype=dtype, device="meta")
+        if strides is not None:
+            meta = torch.empty_strided(shape, strides, dtype=dtype, device="meta")
         buffer = Buffer(f"x{next(self.names)}", dtype, max(1, meta.numel()), len(self.lines), len(self.lines))
         self.buffers.append(buffer)
         return View(buffer, meta)
@@ -92,13 +128,13 @@ class Block:
 
     def over(self, out: View, expression: str, operands: Sequence[View]) -> None:
         """``out`` = expression at every index; operands have the shape of ``out``."""
-        metas = [out.meta, *(o.meta for o in operands)]
-        sizes, strides = collapsed(list(out.meta.shape), [list(m.stride()) for m in metas])
+        order = sorted(range(out.meta.ndim), key=lambda d: -out.meta.stride(d))  # along its memory
+        metas = [m.permute(order) for m in (out.meta, *(o.meta for o in operands))]
+        sizes, strides = collapsed(list(metas[0].shape), [list(m.stride()) for m in metas])
         views = [View(v.buffer, _strided(v.meta, sizes, s)) for v, s in zip((out, *operands), strides)]
         index = [f"i{k}" for k in range(len(sizes))]
         elements = [v.at(index) for v in views[1:]]
-        loops = "".join(f"for (int {i} = 0; {i} < {n}; {i}++) " for i, n in zip(index, sizes))
-        self.write(f"{loops}{views[0].at(index)} = {expression.format(*elements)};", out, *operands)
+        self.write(f"{loops(index, sizes)}{views[0].at(index)} = {expression.format(*elements)};", out, *operands)
 
     def laid_out(self) -> int:
         """Give every buffer that is on the stack its place; bytes in all. What lives together lies apart."""
@@ -124,15 +160,41 @@ class Tensors:
     def __init__(self) -> None:
         self.block = Block()
 
+    def result(self, node: Node) -> View:
+        """Memory for what an operation returns."""
+        value: Any = node.meta["val"]
+        whole = value.numel() and torch.ops.aten.is_non_overlapping_and_dense(value)
+        return self.block.new(value.shape, value.dtype, value.stride() if whole else None)
+
+    def goes_on(self, node: Node) -> bool:
+        """Whether a node's value may stay an expression: one node uses it, and that takes each element once."""
+        raise NotImplementedError
+
+    def stored(self, node: Node, x: Expression | Rows) -> View:
+        """A node's value in memory."""
+        return self._written(self.result(node), x)
+
+    def _written(self, out: View, x: Expression | Rows) -> View:
+        if isinstance(x, Expression):
+            self.block.over(out, x.pattern, x.operands)
+        else:
+            for index in product(*map(range, x.lead)):
+                item = x.at(index)
+                self.block.over(out.viewed(out.meta[index]), item.pattern, item.operands)
+        return out
+
+    def elements(self, x: Any) -> Expression:
+        """A value element by element."""
+        if isinstance(x, Expression):
+            return x
+        view = self.tensor(x)
+        return Expression(view.meta.shape, view.meta.dtype, "{0}", [view])
+
     def tensor(self, x: Any) -> View:
         """A value as a tensor in memory."""
         if isinstance(x, Tensor):
             return self.block.constant(x)
-        if isinstance(x, Expression):
-            out = self.block.new(x.shape, x.dtype)
-            self.block.over(out, x.pattern, x.operands)
-            return out
-        return x
+        return self._written(self.block.new(x.shape, x.dtype), x) if isinstance(x, (Expression, Rows)) else x
 
     def dense(self, x: Any) -> View:
         """A value as a tensor without gaps."""
@@ -142,6 +204,11 @@ class Tensors:
         out = self.block.new(view.meta.shape, view.meta.dtype)
         self.block.over(out, "{0}", [view])
         return out
+
+
+def loops(names: Sequence[str], sizes: Sequence[int]) -> str:
+    """Heads of nested loops."""
+    return "".join(f"for (int {i} = 0; {i} < {n}; {i}++) " for i, n in zip(names, sizes))
 
 
 def collapsed(sizes: list[int], strides: list[list[int]]) -> tuple[list[int], list[list[int]]]:

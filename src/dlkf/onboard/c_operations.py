@@ -6,12 +6,14 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
+MANY = 16  # elements from which on a loop that can be vectorised is faster than calls
 Pattern = str | Callable[[torch.dtype, list, dict], tuple[str, list]]
 
 
@@ -31,6 +33,11 @@ def literal(x: Any, dtype: torch.dtype) -> str:
 def suffix(dtype: torch.dtype) -> str:
     """Of the functions in <math.h> for a precision."""
     return "f" if dtype == torch.float32 else ""
+
+
+def vectorised(pattern: str, elements: int) -> str:
+    """A pattern of many elements, with the functions of ``elementary.c.in`` for those of <math.h> where it has them."""
+    return re.sub(r"\b(expf?|tanhf|log|log1p|asinh|sin|cos)\(", r"each_\1(", pattern) if elements >= MANY else pattern
 
 
 def _function(name: str) -> Pattern:
@@ -111,8 +118,10 @@ BY_ELEMENT: dict[str, Pattern] = {
     "_to_copy": _first("{0}"), "clone": _first("{0}"), "lift_fresh_copy": _first("{0}"),
     "prims::copy_strided": _first("{0}"),
 }  # fmt: skip
+COPIES = ("clone", "lift_fresh_copy", "_to_copy", "prims::copy_strided")
 # operations that change a part of a copy: which part of it becomes the second operand
 PARTS: dict[str, Callable[..., Tensor]] = {
     "slice_scatter": torch.ops.aten.slice.Tensor,
     "select_scatter": torch.ops.aten.select.int,
+    "diagonal_scatter": torch.ops.aten.diagonal.default,
 }

@@ -129,7 +129,8 @@ def heading() -> str:
     kinds = ({"REAL": "double", "F": ""}, {"REAL": "float", "F": "f"})
     include = "\n".join(f"#include {name}" for name in ("<math.h>", "<stdint.h>", "<string.h>", '"step.h"'))
     made = "/* Made by dlkf.export; do not edit: the equations are in the Python package. */"
-    return "\n".join((made, include, UNUSED, "", *(_filled(algebra, kind) for kind in kinds)))
+    elementary = (CORE / "elementary.c.in").read_text()
+    return "\n".join((made, include, UNUSED, "", elementary, *(_filled(algebra, kind) for kind in kinds)))
 
 
 def _sizes(estimator: Estimator, layout: Layout, grid: Grid, name: str, work: int, can_anchor: bool) -> dict[str, Any]:
@@ -224,8 +225,10 @@ def function_in_c(name: str, function: Function) -> Written:
     block, inputs = done.block, done.inputs
     arguments = [f"const {C_TYPES[b.dtype]} *restrict {b.name}" for b in inputs]
     for k, view in enumerate(done.outputs):
-        dense = done.dense(view)
         arguments.append(f"{C_TYPES[view.meta.dtype]} *restrict out{k}")
+        if view.buffer.name == f"out{k}":
+            continue
+        dense = done.dense(view)
         start = dense.meta.storage_offset()
         block.write(
             f"for (int i = 0; i < {dense.meta.numel()}; i++) out{k}[i] = {dense.buffer.name}[{start}+i];", dense

@@ -167,7 +167,7 @@ class Turn(Function):
 
     def forward(self, memory: Tensor, imu: Tensor, fix: Tensor) -> tuple[Tensor, Tensor]:
         """The loop's turn, and what a :class:`dlkf.filters.integration.BatchSolution` holds of it."""
-        imu, fix = imu.to(self.grid.dtype), fix.to(self.grid.dtype)
+        imu, fix = imu.to(self.grid.dtype).mT.contiguous().mT, fix.to(self.grid.dtype)  # samples beside each other
         names = [table.name for table in tables_of(self.estimator)]
         aids = {name: fix[:, FIX_N + AID_N * k : FIX_N + AID_N * (k + 1)] for k, name in enumerate(names)}
         given = Fix(fix[:, :6], fix[:, 6:12], fix[:, 12:18] > 0.5, fix[:, 18], aids or None)

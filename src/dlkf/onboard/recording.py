@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from torch.func import functionalize
-from torch.fx import GraphModule
+from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from dlkf.navigation import compiled
@@ -18,7 +18,7 @@ from dlkf.onboard.functions import Function
 
 KEPT = {  # operations that are one in C, though core ATen has several for them
     "aten::linalg_cross", "aten::linalg_solve_ex", "aten::_linalg_solve_ex", "aten::linalg_cholesky_ex",
-    "aten::cholesky_solve", "aten::linalg_inv_ex", "aten::linalg_solve_triangular",
+    "aten::cholesky_solve", "aten::linalg_inv_ex", "aten::linalg_solve_triangular", "aten::baddbmm",
 }  # fmt: skip
 
 
@@ -35,7 +35,20 @@ def record(function: Function) -> GraphModule:
     except RuntimeError:  # it writes into what it has made of constants alone: the slower way knows them as inputs
         program = torch.export.export(function, example, strict=False).run_decompositions(_decompositions())
         return program.module(check_guards=False)
+    _merge_equal(graph)
+    graph.graph.eliminate_dead_code()  # views of what was there before a change, too
     return graph
+
+
+def _merge_equal(graph: GraphModule) -> None:
+    """One node for operations that are the same on the same tensors."""
+    seen: dict[str, Node] = {}
+    for node in graph.graph.nodes:
+        if node.op in ("call_function", "get_attr"):
+            what = id(getattr(graph, str(node.target))) if node.op == "get_attr" else node.target
+            first = seen.setdefault(f"{what} {node.args} {node.kwargs}", node)
+            if first is not node:
+                node.replace_all_uses_with(first)
 
 
 @contextmanager

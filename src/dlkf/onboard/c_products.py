@@ -1,0 +1,160 @@
+"""Matrix products as loops that a compiler can vectorise without changing the order of sums.
+
+Which loops are fast depends on what is known of the matrices. A constant one with few elements is written out, and
+where its rows have one element each they are not even copied. Sums of several rows stay in registers.
+Of other matrices many are mostly zeros in filters (H, K, Φ), so zeros in A save the loop over a row of B.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import prod
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.fx import Node
+
+from dlkf.onboard.c_memory import C_TYPES, Expression, Rows, Tensors, View, loops
+from dlkf.onboard.c_operations import literal
+from dlkf.onboard.c_reductions import LANES, SUM, Reduced, write_reduced
+
+SMALL = 4096  # numbers of a matrix that is copied to be read along its rows, rather than weights of a network
+WIDE = 8  # columns from which on a zero is worth asking for
+FEW = 4  # elements of a row of a constant matrix, on average, that is written out
+NARROW = 16  # columns up to which one row at a time is best, and a branch costs more than it saves
+BLOCK = 24  # columns of weights at a time where several rows are
+
+
+def product(
+    t: Tensors, node: Node, A: Any, B: Any, begin: Any = None, beta: float = 1, alpha: float = 1
+) -> View | Rows:
+    """A B (b × m × k · k × n), on top of β · ``begin`` where there is one."""
+    a, b, value = t.tensor(A), t.tensor(B), node.meta["val"]
+    m, k, n = a.meta.shape[-2], a.meta.shape[-1], b.meta.shape[-1]
+    if begin is None and alpha == 1 and n >= WIDE and (rows := _sparse_rows(t, a)):
+        lines = _lines(rows, b, value)
+        return lines if t.goes_on(node) and max(map(len, rows)) == 1 else t.stored(node, lines)
+    out = t.result(node)
+    given = None
+    if begin is not None:
+        given = t.tensor(begin)
+        given = given.viewed(given.meta.expand(value.shape))
+    scale, beta = ("" if x == 1 else f"{literal(x, value.dtype)} * " for x in (alpha, beta))
+    small = prod(value.shape[:-2]) * k * n <= SMALL
+    along = b.meta.stride(-2) == 1 and b.meta.stride(-1) != 1
+    if along and a.meta.stride(-1) == 1 and k >= 2 * LANES and (n < WIDE or not small):
+        _write_dots(t, out, a, b, given, scale, beta)
+    else:
+        if small and n >= WIDE and m > 1 and b.meta.stride(-1) != 1:
+            b = t.dense(b)
+        _write_rows(t, out, a, b, given, scale, beta, small)
+    return out
+
+
+def added_product(t: Tensors, node: Node, c: Any, a: Any, b: Any, beta: float = 1, alpha: float = 1) -> View | Rows:
+    """β C + α A B."""
+    return product(t, node, a, b, c, beta, alpha)
+
+
+def _values(t: Tensors, view: View) -> Tensor | None:
+    """A constant matrix, None for another tensor."""
+    values = next((x for buffer, x in t.block.constants if buffer is view.buffer), None)
+    if values is None or view.meta.numel() != view.meta.shape[-2] * view.meta.shape[-1]:
+        return None
+    A = torch.as_strided(torch.from_numpy(values), view.meta.shape, view.meta.stride(), view.meta.storage_offset())
+    return A.reshape(A.shape[-2:])
+
+
+def _sparse_rows(t: Tensors, a: View) -> list[list[tuple[int, float]]]:
+    """Column and value of what is not zero in each row of a constant matrix with few elements."""
+    A = _values(t, a)
+    if A is None:
+        return []
+    rows = [[(k, float(row[k])) for k in row.nonzero()[:, 0].tolist()] for row in A]
+    return rows if sum(map(len, rows)) <= FEW * len(rows) else []
+
+
+def _lines(rows: list[list[tuple[int, float]]], b: View, value: Any) -> Rows:
+    """Rows of A B as sums of few rows of B."""
+    matrix = b.meta[0] if b.meta.ndim == 3 else b.meta
+    items = []
+    for row in rows:
+        terms = []
+        for j, (_, w) in enumerate(row):
+            terms.append(f"{{{j}}}" if w == 1 else f"-{{{j}}}" if w == -1 else f"{literal(w, value.dtype)} * {{{j}}}")
+        operands = [b.viewed(matrix[k]) for k, _ in row]
+        items.append(Expression(matrix.shape[1:], value.dtype, f"({' + '.join(terms) or '0'})", operands))
+    return Rows(value.shape, value.dtype, value.shape[:-1], items)
+
+
+def _write_dots(t: Tensors, out: View, a: View, b: View, given: View | None, scale: str, beta: str) -> None:
+    """Both along memory: sums beside each other."""
+    shape = (*out.meta.shape, a.meta.shape[-1])
+    terms = Expression(
+        torch.Size(shape), out.meta.dtype, "{0} * {1}",
+        [a.viewed(a.meta.unsqueeze(-2).expand(shape)), b.viewed(b.meta.mT.unsqueeze(-3).expand(shape))],
+    )  # fmt: skip
+    last = len(shape) - 1
+    write_reduced(t, Reduced(out, terms, list(range(last)), [last], SUM))
+    if given is not None:
+        t.block.over(out, f"{beta}{{0}} + {scale}{{1}}", [given, out])
+    elif scale:
+        t.block.over(out, f"{scale}{{0}}", [out])
+
+
+def _write_rows(
+    t: Tensors, out: View, a: View, b: View, given: View | None, scale: str, beta: str, small: bool
+) -> None:
+    """Several rows of A along rows of B, whose sums stay in registers."""
+    m, k, n = a.meta.shape[-2], a.meta.shape[-1], b.meta.shape[-1]
+    kind, lead = C_TYPES[out.meta.dtype], ["b"] if a.meta.ndim == 3 else []
+    if b.meta.stride(-1) != 1 and (n == 1 or b.meta.stride(-2) == 1):  # along columns of B
+        start = "0" if given is None else f"{beta}{given.at([*lead, 'i', 'j'])}"
+        body = (
+            f"for (int j = 0; j < {n}; j++) {{ {kind} y = 0; for (int k = 0; k < {k}; k++) "
+            f"y += {a.at([*lead, 'i', 'k'])} * {b.at([*lead, 'k', 'j'])}; "
+            f"{out.at([*lead, 'i', 'j'])} = {start} + {scale}y; }}"
+        )
+        used = [out, a, b, *([] if given is None else [given])]
+        t.block.write(loops(lead, a.meta.shape[:1]) + loops(["i"], [m]) + body, *used)
+        return
+    weights = not small or any(buffer is b.buffer for buffer, _ in t.block.constants)
+    beside = 1 if k <= FEW or n <= NARROW else 6 if weights else 3
+    beside, columns = min(m, beside), BLOCK if weights and m > 1 else n
+    for top, rows in _pieces(m, beside):
+        for left, width in _pieces(n, columns):
+            skips = "" if weights or n <= NARROW else "if (w == 0) continue; "
+            _write_block(t, out, a, b, given, scale, beta, skips, (top, rows, beside), (left, width, columns))
+
+
+def _pieces(count: int, size: int) -> Iterator[tuple[int, int]]:
+    """Begin and length of what whole pieces cover, and of the rest."""
+    whole = count - count % size
+    yield from ((begin, length) for begin, length in ((0, whole), (whole, count - whole)) if length)
+
+
+def _write_block(
+    t: Tensors, out: View, a: View, b: View, given: View | None, scale: str, beta: str, skips: str,
+    rows: tuple[int, int, int], columns: tuple[int, int, int],
+) -> None:  # fmt: skip
+    """First, number and how many at a time of rows and columns."""
+    (top, height, beside), (left, width, block) = rows, columns
+    beside, block = min(beside, height), min(block, width)
+    kind, lead, many = C_TYPES[out.meta.dtype], ["b"] if a.meta.ndim == 3 else [], width > block
+    row = [f"(i+{top + r})" if top + r else "i" for r in range(beside)]
+    column = f"(j+c+{left})" if many else f"(j+{left})" if left else "j"
+    each = f"for (int j = 0; j < {block}; j++) "
+    names = [f"y{r}" for r in range(beside)]
+    lines = [f"{kind} {', '.join(f'{y}[{block}]' for y in names)};"]
+    for y, i in zip(names, row):
+        lines.append(f"{each}{y}[j] = {'0' if given is None else beta + given.at([*lead, i, column])};")
+    lines.append(f"for (int k = 0; k < {a.meta.shape[-1]}; k++) {{")
+    lines += [f"{kind} w{r} = {scale}{a.at([*lead, i, 'k'])};" for r, i in enumerate(row)]
+    lines.append(skips.replace("w == 0", " && ".join(f"w{r} == 0" for r in range(beside))))
+    lines += [f"{each}{y}[j] += w{r} * {b.at([*lead, 'k', column])};" for r, y in enumerate(names)]
+    lines.append("}")
+    lines += [f"{each}{out.at([*lead, i, column])} = {y}[j];" for y, i in zip(names, row)]
+    head = loops(lead, a.meta.shape[:1]) + f"for (int i = 0; i < {height}; i += {beside}) "
+    head += f"for (int c = 0; c < {width}; c += {block}) " if many else ""
+    t.block.write(f"{head}{{ {' '.join(filter(None, lines))} }}", out, a, b, *([] if given is None else [given]))
