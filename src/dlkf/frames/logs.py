@@ -14,6 +14,8 @@ from dlkf.frames.checks import check_above_zero, check_preset, check_whole
 if TYPE_CHECKING:
     from dlkf.data.readers.frames import DriveFrames
 
+SHORTEST_MIN, LONGEST_MIN = 0.3, 240.0  # of a simulated drive
+
 
 def simulate(
     preset: str = "lifelike", *, minutes: float = 10.0, drives: int = 1, seed: int = 0, imu_type: str | None = None
@@ -48,6 +50,8 @@ def simulate(
     if imu_type is not None:
         check_preset("imu", imu_type)
     check_above_zero(minutes=minutes)
+    if not SHORTEST_MIN <= minutes <= LONGEST_MIN:
+        raise InputError(f"minutes is {minutes:g}, must be from {SHORTEST_MIN:g} to {LONGEST_MIN:g} a drive")
     drives, seed = check_whole("drives", drives, 1), check_whole("seed", seed, 0)
     words = [
         f"simulated@dataset={preset}",
@@ -93,9 +97,14 @@ def read_logs(source: str | Path, reader: str = "auto") -> list[DriveFrames]:
 
     if not isinstance(source, (str, Path)):
         raise InputError(f"source is a {type(source).__name__}, must be the path of a file or a folder with logs")
+    if not str(source) or "://" in str(source):
+        raise InputError(f"source is {str(source)!r}, must be a file or a folder of this machine")
     check_preset("reader", reader)
+    place = Path(source).expanduser()
+    if (place / "drives.parquet").is_file():
+        raise InputError(f"{source} is a dataset already: pandas.read_parquet reads its tables, dlkf navigate takes it")
     values = compose_command("ingest", f"reader={reader}", "source=logs", "out=data")["reader"]
-    return list(instantiate(values, "reader", ("read",)).read(str(Path(source).expanduser())))
+    return list(instantiate(values, "reader", ("read",)).read(str(place)))
 
 
 def _table(folder: Path, kind: str, drive: str) -> pd.DataFrame | None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
     from dlkf.filters.smoother import Filter
     from dlkf.running.streaming import StreamingFilter
 
+DEFAULT_NOISE = ("automotive_mems", "untuned")  # imu_type and tuning, where none are given
+
 
 def navigate(
     imu: pd.DataFrame,
@@ -34,7 +38,7 @@ def navigate(
     speed: pd.DataFrame | None = None,
     heading: pd.DataFrame | None = None,
     baro: pd.DataFrame | None = None,
-    model: str = "plus",
+    model: str | Path = "plus",
     imu_type: str | Mapping[str, Any] = "automotive_mems",
     tuning: str | Mapping[str, Any] = "untuned",
     lever_arm: Sequence[float] = (0.0, 0.0, 0.0),
@@ -50,7 +54,7 @@ def navigate(
         Samples and fixes, columns and units as at the top of this module; missing optional columns count as unknown.
     speed, heading, baro : pandas.DataFrame, optional
         Further sensors: t, speed [m/s]; t, heading [rad]; t, pressure [Pa] or height_m; each with ``std`` where known.
-    model : str
+    model : str or Path
         A filter's name (``plus``, ``mbkf15``, ``mbkf21_car``, …), a folder with weights, an MLflow run id,
         ``models:/name@alias``, or ``module:Class``.
     imu_type : str or mapping
@@ -89,7 +93,7 @@ def navigate(
     given = {"rate_hz": rate_hz, "epoch_s": epoch_s}
     check_above_zero(**{name: value for name, value in given.items() if value is not None})
     check_switch("smoothed", smoothed)
-    check_model(model)
+    model = check_model(model)
     check_imu_type(imu_type)
     aids = {"speed": speed, "heading": heading, "baro": baro}
     with drive_folder(imu, gnss, None, lever_arm, aids) as folder:
@@ -103,14 +107,14 @@ def navigate(
     return Solution.of(navigated, fixes, short_name(model), REMEDY if takes_imu_preset(model) else OF_NETWORK)
 
 
-def smooth(imu: pd.DataFrame, gnss: pd.DataFrame, *, model: str = "mbkf21_nhc", **options: Any) -> Solution:
+def smooth(imu: pd.DataFrame, gnss: pd.DataFrame, *, model: str | Path = "mbkf21_nhc", **options: Any) -> Solution:
     """:func:`navigate` with the smoother: the best solution of a whole drive, after it. ``options`` are its own."""
     check_options("smooth", options, navigate, apart=("imu", "gnss", "model", "smoothed"))
     return navigate(imu, gnss, model=model, smoothed=True, **options)
 
 
 def load(
-    model: str = "plus",
+    model: str | Path = "plus",
     *,
     imu_type: str | Mapping[str, Any] = "automotive_mems",
     tuning: str | Mapping[str, Any] = "untuned",
@@ -122,14 +126,17 @@ def load(
     """
     from dlkf.base.settings import settings_from
     from dlkf.filters.tuning import Tuning
-    from dlkf.tracking.models import resolve_model
+    from dlkf.tracking.models import resolve_model, takes_imu_preset
 
     factors = settings_from(Tuning, tuning_values(tuning), "tuning")
-    return resolve_model(check_model(model), _imu_spec(imu_type), tuning=factors)
+    model, spec = check_model(model), _imu_spec(imu_type)
+    if (imu_type, tuning) != DEFAULT_NOISE and not takes_imu_preset(model):
+        warnings.warn(f"{model} takes no noise: imu_type and tuning change nothing", UserWarning, stacklevel=3)
+    return resolve_model(model, spec, tuning=factors)
 
 
 def Stream(
-    model: str = "plus", *, rate_hz: float | None = None, imu_type: str | Mapping[str, Any] = "automotive_mems",
+    model: str | Path = "plus", *, rate_hz: float | None = None, imu_type: str | Mapping[str, Any] = "automotive_mems",
     tuning: str | Mapping[str, Any] = "untuned", lever_arm: Sequence[float] = (0.0, 0.0, 0.0), **options: Any,
 ) -> StreamingFilter:  # fmt: skip
     """A filter fed sample by sample and fix by fix, as in a vehicle.

@@ -32,6 +32,8 @@ from dlkf.running.solution import SCHEMA, solution_table
 from dlkf.running.start import align_each
 
 WORTH_SAYING = 0.01  # probability of another heading
+FASTER_THAN_REVERSE = 8.0  # m/s
+MOSTLY = 0.5  # of the updates of a further sensor; where fewer are used, its numbers are likely wrong
 SAMPLES_AT_ONCE = 4_000_000  # IMU samples of drives in memory, 22 h at 50 Hz
 
 
@@ -81,6 +83,14 @@ def epoch_for(spacings: Iterable[UsableFixes], rate_hz: float, estimator: Filter
     return closest if closest < 1.0 and whole and not constrained else 1.0
 
 
+def _drives_backwards(table: pd.DataFrame) -> bool:
+    """Whether a car that moves faster than a reversing one faces the way that it came from, in nearly all rows."""
+    speed = np.hypot(table["vel_n"], table["vel_e"])
+    along = np.cos(table["yaw"]) * table["vel_n"] + np.sin(table["yaw"]) * table["vel_e"]
+    fast = (speed > FASTER_THAN_REVERSE).to_numpy()
+    return bool(fast.any()) and float(np.mean(along.to_numpy()[fast] < 0)) > 0.9
+
+
 @dataclass(frozen=True)
 class Navigated:
     """A drive's solution: its table, the time [s, file clock] at which the filter could start, and the probability
@@ -101,6 +111,8 @@ class Navigated:
         if self.doubt > WORTH_SAYING:
             text += f"heading in doubt (another way round with probability {self.doubt:.2g}), "
         text += f"{len(self.table)} epochs, "
+        if _drives_backwards(self.table):
+            text += "backwards all the way (an IMU mounted the other way round?), "
         if spacing is None:
             text += f"{used} fixes used"
         else:
@@ -133,6 +145,8 @@ class Navigated:
             ratio = table[f"{name}_innovation"] / table[f"{name}_innovation_std"]
             seen = int(ratio.notna().sum())
             said[name] = f"in {int(table[used].sum())} of {seen} updates"
+            if table[used].sum() < MOSTLY * seen:
+                said[name] += ", most of them refused: see its unit, sign and clock"
             if seen:
                 said[name] += f" (innovations {np.sqrt((ratio**2).mean()):.2g} of their 1σ)"
         for std in (column for column in self.sensor_columns if column.startswith("std_")):
