@@ -276,6 +276,18 @@ CALLS: dict[str, tuple[Callable[[Frames, Path], Any], str]] = {
     "a page": (lambda d, _: dlkf.read_logs("https://example.com/a.csv"), "must be a file or a folder of this machine"),
     "a dataset as logs": (lambda d, here: dlkf.read_logs(dataset(here)), "is a dataset already: pandas.read_parquet"),
     "a preset's file as reader": (lambda d, here: dlkf.read_logs(here, "my.yaml"), "unknown reader preset 'my.yaml'"),
+    "a setting that is none": (
+        lambda d, here: dlkf.read_logs(here, "auto", "imu.accel"),
+        "'imu.accel' is no setting of a reader; one is text such as 'reader.imu.accel.unit=g'",
+    ),
+    "a setting misspelt": (
+        lambda d, here: dlkf.read_logs(here, "csv", "reader.imu.acel.unit=g"),
+        "reader.imu: unknown key acel; known are",
+    ),
+    "perhaps without the unsure": (
+        lambda d, here: dlkf.read_logs(here, skip_unsure="maybe"),
+        "skip_unsure is 'maybe', must be True or False",
+    ),
     "a history in words": (lambda d, _: dlkf.Stream("ins", history_s="10"), "history_s is '10', must be a finite number"),
     "a step back in a stream": (lambda d, _: dlkf.Stream("ins", imu_step_s=-1), "imu_step_s is -1, must be a finite"),
     "a phase of NaN": (lambda d, _: dlkf.Stream("ins", phase_s=float("nan")), "phase_s is nan, must be a finite number"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -9,9 +11,10 @@ from typing import TYPE_CHECKING
 import pandas as pd
 
 from dlkf.base.errors import InputError
-from dlkf.frames.checks import check_above_zero, check_preset, check_whole
+from dlkf.frames.checks import check_above_zero, check_preset, check_switch, check_whole
 
 if TYPE_CHECKING:
+    from dlkf.data.intake import IngestResult
     from dlkf.data.readers.frames import DriveFrames
 
 SHORTEST_MIN, LONGEST_MIN = 0.3, 240.0  # of a simulated drive
@@ -71,7 +74,9 @@ def simulate(
         return made
 
 
-def read_logs(source: str | Path, reader: str = "auto") -> list[DriveFrames]:
+def read_logs(
+    source: str | Path, reader: str = "auto", *settings: str, skip_unsure: bool = False
+) -> list[DriveFrames]:
     """Logs in other formats and units as frames in the contract's columns and units, a drive each.
 
     Parameters
@@ -80,6 +85,10 @@ def read_logs(source: str | Path, reader: str = "auto") -> list[DriveFrames]:
         A file, a folder with one drive, an app's ``.zip``, or a folder with a subfolder or ``.zip`` per drive.
     reader : str
         A preset of ``conf/reader``; ``auto`` finds format, units, clocks and mounting.
+    *settings : str
+        What is known, as on the command line: ``"reader.imu.accel.unit=g"``, ``"reader.gnss.time.offset_s=0.3"``.
+    skip_unsure : bool
+        Leave out drives with too little motion for what is to be found, with a warning; else the first is an error.
 
     Returns
     -------
@@ -90,21 +99,48 @@ def read_logs(source: str | Path, reader: str = "auto") -> list[DriveFrames]:
     Raises
     ------
     InputError
-        For what cannot be read: which file, what is missing, and how to mend it.
+        For what cannot be read: which file, what is missing, and the setting that mends it.
     """
     from dlkf.base.classes import instantiate
+    from dlkf.command.arguments import quote_argument
     from dlkf.command.composing import compose_command
+    from dlkf.data.intake import located, read_together
 
     if not isinstance(source, (str, Path)):
         raise InputError(f"source is a {type(source).__name__}, must be the path of a file or a folder with logs")
     if not str(source) or "://" in str(source):
         raise InputError(f"source is {str(source)!r}, must be a file or a folder of this machine")
     check_preset("reader", reader)
+    check_switch("skip_unsure", skip_unsure)
     place = Path(source).expanduser()
     if (place / "drives.parquet").is_file():
         raise InputError(f"{source} is a dataset already: pandas.read_parquet reads its tables, dlkf navigate takes it")
-    values = compose_command("ingest", f"reader={reader}", "source=logs", "out=data")["reader"]
-    return list(instantiate(values, "reader", ("read",)).read(str(place)))
+    for word in settings:
+        if not isinstance(word, str) or not word.startswith("reader.") or "=" not in word:
+            raise InputError(f"{word!r} is no setting of a reader; one is text such as 'reader.imu.accel.unit=g'")
+    words = [f"++{quote_argument(word)}" for word in settings]
+    values = compose_command("ingest", f"reader={reader}", "source=logs", "out=data", *words)["reader"]
+    opened = instantiate(values, "reader", ("read",))
+    if not hasattr(opened, "places"):
+        return list(opened.read(str(place)))
+    places = located(opened, place)
+    made: dict[str, DriveFrames] = {}
+    for result in read_together(opened, _AsFrames(), "", places, None, skip_unsure):
+        for row in result.rows:
+            drive = row["drive"]
+            made[drive.name] = replace(drive, notes=result.notes)
+        if not result.rows:
+            warnings.warn("; ".join(result.notes), UserWarning, stacklevel=2)
+    return [made[name] for _, name, _ in places if name in made]
+
+
+class _AsFrames:
+    """Drives that are read stay frames."""
+
+    def taken(self, drive: DriveFrames, _: str) -> IngestResult:
+        from dlkf.data.intake import IngestResult
+
+        return IngestResult([{"drive": drive}], [], drive.notes, drive.mapping)
 
 
 def _table(folder: Path, kind: str, drive: str) -> pd.DataFrame | None:
