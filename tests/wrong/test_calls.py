@@ -238,8 +238,14 @@ CALLS: dict[str, tuple[Callable[[Frames, Path], Any], str]] = {
     "a folder that is a file": (lambda d, here: solved(d).export(picture(here), "gpx"), "car.png cannot be written to"),
     "a model of capitals": (lambda d, _: dlkf.load("PLUS"), "unknown model 'PLUS'; did you mean plus?"),
     "no model at all": (lambda d, _: dlkf.load(""), "model= is empty; give a name such as plus, or a folder"),
-    "the network of the paper": (lambda d, _: dlkf.load("dlkf"), "has no weights here, it is trained on drives of its IMU"),
-    "a model's folder that is not there": (lambda d, _: dlkf.load("outputs/none/best"), "outputs/none/best: no such folder"),
+    "the network of the paper": (
+        lambda d, _: dlkf.load("dlkf"),
+        "has no weights here, it is trained on drives of its IMU",
+    ),
+    "a model's folder that is not there": (
+        lambda d, _: dlkf.load("outputs/none/best"),
+        "outputs/none/best: no such folder",
+    ),
     "a model's folder as a path": (lambda d, here: dlkf.load(here), "has no config.yaml"),
     "a loaded filter": (lambda d, _: dlkf.load(dlkf.load("ins")), "model is a Ins, must be a name such as 'plus'"),
     "two names in one": (
@@ -265,7 +271,10 @@ CALLS: dict[str, tuple[Callable[[Frames, Path], Any], str]] = {
     "an arm of words": (lambda d, _: dlkf.Stream("ins", lever_arm="1, 0, -1.2"), "lever_arm is '1, 0, -1.2', must be"),
     "an arm by name": (lambda d, _: dlkf.Stream("ins", lever_arm={"x": 1}), "lever_arm is {'x': 1}, must be three"),
     "no tuning": (lambda d, _: dlkf.load("mbkf15", tuning=None), "tuning is None, must be the name of a preset"),
-    "a factor in words": (lambda d, _: dlkf.load("mbkf15", tuning={"accel_noise": "high"}), "is 'high', must be a number"),
+    "a factor in words": (
+        lambda d, _: dlkf.load("mbkf15", tuning={"accel_noise": "high"}),
+        "is 'high', must be a number",
+    ),
     "a factor of NaN": (lambda d, _: dlkf.load("mbkf15", tuning={"accel_noise": np.nan}), "is nan, must be a number"),
     "a preset's file": (lambda d, _: dlkf.load("mbkf15", imu_type="consumer.yaml"), "did you mean consumer?"),
     "a thousand years": (lambda d, _: dlkf.simulate(minutes=1e9), "minutes is 1e+09, must be from 0.3 to 240 a drive"),
@@ -288,12 +297,27 @@ CALLS: dict[str, tuple[Callable[[Frames, Path], Any], str]] = {
         lambda d, here: dlkf.read_logs(here, skip_unsure="maybe"),
         "skip_unsure is 'maybe', must be True or False",
     ),
-    "a history in words": (lambda d, _: dlkf.Stream("ins", history_s="10"), "history_s is '10', must be a finite number"),
+    "a history in words": (
+        lambda d, _: dlkf.Stream("ins", history_s="10"),
+        "history_s is '10', must be a finite number",
+    ),
     "a step back in a stream": (lambda d, _: dlkf.Stream("ins", imu_step_s=-1), "imu_step_s is -1, must be a finite"),
-    "a phase of NaN": (lambda d, _: dlkf.Stream("ins", phase_s=float("nan")), "phase_s is nan, must be a finite number"),
-    "an anchor in words": (lambda d, _: dlkf.Stream("ins", anchor_m="far"), "anchor_m is 'far', must be a finite number"),
-    "an alignment in words": (lambda d, _: dlkf.Stream("ins", align="coarse"), "align is 'coarse', must be a dlkf.data"),
-    "limits of a number": (lambda d, _: dlkf.Stream("ins", limits=5), "limits is 5, must be a dlkf.data.validate.Limits"),
+    "a phase of NaN": (
+        lambda d, _: dlkf.Stream("ins", phase_s=float("nan")),
+        "phase_s is nan, must be a finite number",
+    ),
+    "an anchor in words": (
+        lambda d, _: dlkf.Stream("ins", anchor_m="far"),
+        "anchor_m is 'far', must be a finite number",
+    ),
+    "an alignment in words": (
+        lambda d, _: dlkf.Stream("ins", align="coarse"),
+        "align is 'coarse', must be a dlkf.data",
+    ),
+    "limits of a number": (
+        lambda d, _: dlkf.Stream("ins", limits=5),
+        "limits is 5, must be a dlkf.data.validate.Limits",
+    ),
 }
 
 

@@ -16,6 +16,7 @@ import dlkf
 from dlkf.data.schema import ACCEL, GYRO
 from tests.wrong.spoiling import PI, Frames, check, ddmm, plus, put, times
 
+
 class Polars:
     """A frame of a library that knows the way to pandas."""
 
@@ -288,7 +289,11 @@ BAD_FRAMES: dict[str, tuple[str, Callable[[pd.DataFrame], Any], str]] = {  # whi
         "column lat_deg, lon_deg, height_m missing; has t, x, y, z",
     ),
     "a fix twice": ("gnss", lambda f: pd.concat([f.iloc[:5], f.iloc[4:]]), "row 5: t = 4.000000 stands twice"),
-    "dates with a zone": ("gnss", lambda f: f.assign(t=pd.to_datetime(f.t, unit="s", utc=True)), "t is a date, must be"),
+    "dates with a zone": (
+        "gnss",
+        lambda f: f.assign(t=pd.to_datetime(f.t, unit="s", utc=True)),
+        "t is a date, must be",
+    ),
     "1σ without end": ("gnss", put("std_pos_e", 3, np.inf), "gnss: row 3: std_pos_e is inf; write NaN where"),
     "speed in mph": ("speed", times(1 / 0.44704, "speed"), "looks like mph; multiply it by 0.44704"),
     "an odometer": ("speed", lambda f: f.assign(speed=f.speed.cumsum()), "it must be in m/s, mend its scale"),

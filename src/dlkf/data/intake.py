@@ -94,13 +94,15 @@ Located = tuple[str, str, str | None]
 
 def located(reader: Any, source: str | Path) -> list[Located]:
     """Where a reader finds the drives of ``source``, for :func:`read_together`."""
-    return [(absolute_place(folder), name, only and absolute_place(only)) for folder, name, only in reader.places(source)]
+    return [
+        (absolute_place(folder), name, only and absolute_place(only)) for folder, name, only in reader.places(source)
+    ]
 
 
 class Taker(Protocol):
-    """What becomes of a drive that was read; ``out`` is a dataset's folder."""
+    """What becomes of a drive that was read; ``folder`` is a dataset's."""
 
-    def taken(self, drive: DriveFrames, out: str) -> IngestResult: ...
+    def taken(self, drive: DriveFrames, folder: str) -> IngestResult: ...
 
 
 def read_together(

@@ -92,7 +92,7 @@ def check_gnss_units(gnss: Columns, where: str) -> None:
         raise InputError(f"{where}: fix {bad[0]}: lat_deg is {lat[bad[0]]:.4f}; {remedy}")
     bad = np.flatnonzero(np.abs(lon) > 180)
     if len(bad):
-        remedy = "; subtract 360 where it is above 180" if 0 <= lon.min() and lon.max() <= 360 else ""
+        remedy = "; subtract 360 where it is above 180" if lon.min() >= 0 and lon.max() <= 360 else ""
         raise InputError(f"{where}: fix {bad[0]}: lon_deg is {lon[bad[0]]:.4f}; must lie within ±180 degrees{remedy}")
     _check_places(lat, lon, where)
     _check_way(gnss, where)
@@ -218,8 +218,8 @@ def _check_way(gnss: Columns, where: str) -> None:
         raise InputError(f"{where}: positions and velocities disagree: {best}")
     if np.ptp(v_e[whole]) == 0 or np.ptp(v_n[whole]) == 0:
         raise InputError(
-            f"{where}: positions and velocities disagree: vel_n and vel_e must count North and East, not along the car; "
-            "leave them out, or give speed and course (reader.gnss.velocity.frame=course)"
+            f"{where}: positions and velocities disagree: vel_n and vel_e must count North and East, not along the "
+            "car; leave them out, or give speed and course (reader.gnss.velocity.frame=course)"
         )
 
 

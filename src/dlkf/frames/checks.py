@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from inspect import signature
-from numbers import Real
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
@@ -212,10 +213,15 @@ def check_imu_type(imu_type: Any) -> None:
 
 def check_whole(name: str, value: Any, least: int) -> int:
     """A whole number from ``least`` on."""
-    whole = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value) and value == int(value)
-    if not whole or value < least:
+    if isinstance(value, Integral) and not isinstance(value, bool):
+        number = operator.index(value)  # exact, where a float is not
+    elif isinstance(value, Real) and not isinstance(value, bool) and float(value).is_integer():
+        number = int(float(value))
+    else:
+        number = least - 1
+    if number < least:
         raise InputError(f"{name} is {_shown(value)}, must be a whole number from {least} on")
-    return int(value)
+    return number
 
 
 def check_preset(group: str, name: Any, argument: str = "") -> None:

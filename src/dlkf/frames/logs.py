@@ -23,12 +23,12 @@ SHORTEST_MIN, LONGEST_MIN = 0.3, 240.0  # of a simulated drive
 def simulate(
     preset: str = "lifelike", *, minutes: float = 10.0, drives: int = 1, seed: int = 0, imu_type: str | None = None
 ) -> list[DriveFrames]:
-    """Simulated drives of a preset of ``conf/simulated``, each with ``imu``, ``gnss`` and ``reference`` frames.
+    """Simulated drives with a reference without error.
 
     Parameters
     ----------
     preset : str
-        ``lifelike``, ``city``, ``highway``, ``tunnel``, ``fleet``, …
+        Of ``conf/simulated``: ``lifelike``, ``city``, ``highway``, ``tunnel``, ``fleet``, …
     minutes : float
         Length of each drive.
     drives : int
@@ -37,6 +37,11 @@ def simulate(
         The same seed gives the same drives.
     imu_type : str, optional
         A preset of ``conf/imu``; default: the preset's own.
+
+    Returns
+    -------
+    list of DriveFrames
+        Each with ``imu``, ``gnss`` and ``reference`` frames and ``meta``: its name, lever arm [m], sensors.
 
     Raises
     ------
@@ -74,9 +79,7 @@ def simulate(
         return made
 
 
-def read_logs(
-    source: str | Path, reader: str = "auto", *settings: str, skip_unsure: bool = False
-) -> list[DriveFrames]:
+def read_logs(source: str | Path, reader: str = "auto", *settings: str, skip_unsure: bool = False) -> list[DriveFrames]:
     """Logs in other formats and units as frames in the contract's columns and units, a drive each.
 
     Parameters
@@ -137,7 +140,7 @@ def read_logs(
 class _AsFrames:
     """Drives that are read stay frames."""
 
-    def taken(self, drive: DriveFrames, _: str) -> IngestResult:
+    def taken(self, drive: DriveFrames, folder: str) -> IngestResult:
         from dlkf.data.intake import IngestResult
 
         return IngestResult([{"drive": drive}], [], drive.notes, drive.mapping)

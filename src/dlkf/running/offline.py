@@ -85,10 +85,10 @@ def epoch_for(spacings: Iterable[UsableFixes], rate_hz: float, estimator: Filter
 
 def _drives_backwards(table: pd.DataFrame) -> bool:
     """Whether a car that moves faster than a reversing one faces the way that it came from, in nearly all rows."""
-    speed = np.hypot(table["vel_n"], table["vel_e"])
-    along = np.cos(table["yaw"]) * table["vel_n"] + np.sin(table["yaw"]) * table["vel_e"]
-    fast = (speed > FASTER_THAN_REVERSE).to_numpy()
-    return bool(fast.any()) and float(np.mean(along.to_numpy()[fast] < 0)) > 0.9
+    north, east, yaw = (table[column].to_numpy(float) for column in ("vel_n", "vel_e", "yaw"))
+    fast = np.hypot(north, east) > FASTER_THAN_REVERSE
+    along = np.cos(yaw) * north + np.sin(yaw) * east
+    return bool(fast.any()) and float(np.mean(along[fast] < 0)) > 0.9
 
 
 @dataclass(frozen=True)

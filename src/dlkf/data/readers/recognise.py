@@ -106,7 +106,10 @@ def gnss_spec(table: LogTable) -> Recognised | None:
         out, notes = out | spec, [*notes, note]
     if held is not None:
         out["rows"] = "changed"
-        notes = [*notes, f"took {int(known.sum())} of {len(held)} rows for fixes: the others repeat the position before"]
+        notes = [
+            *notes,
+            f"took {int(known.sum())} of {len(held)} rows for fixes: the others repeat the position before",
+        ]
     return Recognised(out, tuple(notes))
 
 
