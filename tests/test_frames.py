@@ -44,6 +44,20 @@ def test_navigate_gives_the_command_s_solution(drive, call):
     assert len(solution.map().data) and type(solution[solution.t > 10]) is pd.DataFrame
 
 
+def test_numbers_of_other_types_and_columns_of_other_names(drive):
+    """Objects, categories, a quality that is not known in some rows; names that are close are said to be unused."""
+    imu, gnss = drive["imu"].astype({"accel_x": object, "gyro_x": "category"}), drive["gnss"]
+    odd = gnss.assign(quality=gnss.quality.where(gnss.index % 2 > 0), note=[1, *"a" * (len(gnss) - 1)])
+    usual = dlkf.navigate(drive["imu"], gnss, model="ins", rate_hz=10)
+    pd.testing.assert_frame_equal(pd.DataFrame(dlkf.navigate(imu, odd, model="ins", rate_hz=10)), pd.DataFrame(usual))
+    with pytest.warns(
+        UserWarning, match="gnss: columns vn, hacc are not used; the contract's names are vel_n, std_pos_n"
+    ):
+        dlkf.navigate(imu, gnss[["t", *POSITION]].assign(vn=gnss.vel_n, hacc=0.1), model="ins", rate_hz=10)
+    with pytest.warns(UserWarning, match="plus takes no noise"):
+        dlkf.load("plus", tuning="any_car")
+
+
 def test_fixes_may_be_positions_alone(drive):
     positions = drive["gnss"][["t", "lat_deg", "lon_deg", "height_m"]]
     solution = dlkf.navigate(drive["imu"], positions, model="mbkf15")

@@ -24,6 +24,7 @@ FRONT = {"index.md": ("README.md", ""), "results/index.md": ("RESULTS.md", "../"
 EQUATION = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.S)
 NAMED = re.compile(r"`(dlkf(?:\.\w+){2,})`")
 FENCE = re.compile(r"(^```.*?^```$)", re.M | re.S)
+PUBLIC = ("navigation", "evaluation", "logs", "solution")  # modules of frames/ with the public functions
 REMOTE_SHIM = "https://unpkg.com/iframe-worker/shim"
 SIZE = 17  # px of an equation's letters
 HAT, SMALL_HAT = "&#x0005E;", "&#x02C6;"
@@ -88,14 +89,16 @@ def drawn(latex: str, display: bool) -> str:
 
 
 def rooms() -> dict[str, list[str]]:
-    """Rooms of the package and the modules in them; what lies in no room is ``commands``."""
+    """Rooms of the package and the modules in them, the public functions first; what lies in no room is
+    ``commands``."""
     found: dict[str, list[str]] = {}
     for file in sorted(SRC.rglob("*.py")):
         parts = file.relative_to(SRC).with_suffix("").parts
         if parts[-1] == "__init__":
             continue
         found.setdefault(parts[0] if len(parts) > 1 else "commands", []).append(".".join(("dlkf", *parts)))
-    return found
+    public = found.pop("frames")
+    return {"frames": sorted(public, key=lambda module: module.rpartition(".")[2] not in PUBLIC), **found}
 
 
 def room_text(room: str) -> str:
@@ -105,7 +108,21 @@ def room_text(room: str) -> str:
 
 def overview() -> str:
     """The glossary of the package, and what is in which room."""
-    lines = ["# API", "", "```text", docstring(SRC / "__init__.py"), "```", "", "| room | files |", "|:--|:--|"]
+    public = (
+        "The public functions (`dlkf.navigate`, `smooth`, `evaluate`, `Stream`, `load`, `simulate`, `read_logs`) are"
+    )
+    lines = [
+        "# API",
+        "",
+        f"{public} in [frames](frames.md).",
+        "",
+        "```text",
+        docstring(SRC / "__init__.py"),
+        "```",
+        "",
+        "| room | files |",
+        "|:--|:--|",
+    ]
     for room, modules in rooms().items():
         files = " ".join(f"`{module.split('.', 2)[-1]}`" for module in modules)
         lines.append(f"| [{room}]({room}.md) | {files} |")

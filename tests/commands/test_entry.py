@@ -18,7 +18,7 @@ import pytest
 import dlkf
 from dlkf.__main__ import COMMANDS, main
 from dlkf.base.config import config_dir
-from dlkf.command.arguments import quote_argument
+from dlkf.command.arguments import options_first, quote_argument
 from dlkf.data.schema import drive_file
 from tests.shell import PATIENCE_S
 
@@ -65,6 +65,11 @@ def test_modules_of_the_current_folder_are_found(tmp_path):
     command = [sys.executable, "bin/dlkf", "navigate", "model=blend:Blend", "dataset=nowhere", "out=made"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S)
     assert done.returncode == 2 and "model=blend:Blend has no begin and step" in done.stderr, done.stderr
+
+
+def test_settings_on_both_sides_of_an_option():
+    words = ["dataset=a", "-m", "model=b,c", "--config-dir", "x=1", "out=d"]
+    assert options_first(words) == ["-m", "--config-dir", "x=1", "dataset=a", "model=b,c", "out=d"]
 
 
 @pytest.mark.parametrize(

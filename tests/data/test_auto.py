@@ -91,6 +91,15 @@ def test_rows_of_imu_and_fixes_in_one_table():
     assert imu_spec(both).spec["time"] == gnss_spec(both).spec["time"] == {"column": "t", "unit": "s"}
 
 
+def test_fixes_repeated_beside_every_sample(tmp_path, drive):
+    """A table of both kinds without empty cells: a row whose position is new is a fix."""
+    both = pd.merge_asof(drive["imu"], drive["gnss"].drop(columns="quality"), on="t")
+    both.rename(columns={"lat_deg": "lat", "lon_deg": "lon", "height_m": "alt"}).to_csv(tmp_path / "a.csv", index=False)
+    (got,) = AutoReader().read(tmp_path)
+    np.testing.assert_allclose(got.gnss.t, drive["gnss"].t, atol=0.02)  # found at the sample that follows
+    assert "took 181 of 18000 rows for fixes: the others repeat the position before" in got.notes
+
+
 def test_stamps_under_a_name_of_their_own():
     """The only column that rises all the way; a count of the rows tells no time, and of two clocks none is chosen."""
     rows = [f"{4711000 + 10 * k},{k},{20 * k},0,0,-1,{k % 3},0,0\n" for k in range(40)]

@@ -15,6 +15,7 @@ import pytest
 import scipy.io
 import yaml
 
+import dlkf
 from dlkf.base.errors import InputError
 from dlkf.data.intake import IngestOptions, ingest
 from dlkf.data.readers.auto import AutoReader
@@ -286,6 +287,9 @@ def test_an_unsure_drive_does_not_lose_the_others(tmp_path):
     options = {"parallel": None, "skip_unsure": True, "progress": lambda one, _: notes.extend(one.notes)}
     assert ingest(AutoReader(), logs, tmp_path / "out", IngestOptions(), **options) == 2
     assert {row.name for row in read_drives(tmp_path / "out")} == {"long", "short"}
+    with pytest.warns(UserWarning, match="left out: drive other: not sure of"):
+        frames = dlkf.read_logs(logs, skip_unsure=True)
+    assert [one.name for one in frames] == ["long", "short"] and frames[1].notes[0].startswith("short: not sure by")
     (shared,) = (note for note in notes if note.startswith("short: not sure by itself"))
     assert "reader.imu.accel.axes={roll" in shared and "reader.imu.accel.unit=g" in shared and "offset_s=" in shared
     assert any(note.startswith("left out: drive other: not sure of") for note in notes)

@@ -19,7 +19,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
     def closeness(other: str) -> tuple[float, int]:
         alike = next((k for k, (a, b) in enumerate(zip(other, name)) if a != b), min(len(other), len(name)))
-        return difflib.SequenceMatcher(None, other, name).ratio(), alike
+        return difflib.SequenceMatcher(None, other.lower(), name.lower()).ratio(), alike
 
     name = str(name)
     best = max(known, key=closeness, default="")

@@ -59,7 +59,12 @@ def convert_value(hint: Any, value: Any, where: str) -> Any:
         elif _fits(option, value):
             return tuple(float(x) if float in get_args(option) else x for x in value) if _is_list(option) else value
     wanted = " or ".join(dict.fromkeys(_describe_type(option) for option in options))
-    raise InputError(f"{where} is {value!r}, must be {wanted}")
+    remedy = ""
+    if str in options and is_number(value):
+        remedy = f"; as a name: \"{where}='{value}'\""
+    elif str in options and isinstance(value, (list, tuple)):
+        remedy = f"; one at a time, or -m {where}={','.join(map(str, value))} for a run each"
+    raise InputError(f"{where} is {value!r}, must be {wanted}{remedy}")
 
 
 def _fits(option: Any, value: Any) -> bool:

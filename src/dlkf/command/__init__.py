@@ -20,7 +20,16 @@ from dlkf.base.errors import InputError, Terminated
 from dlkf.base.files import resolve_place
 from dlkf.base.settings import Settings, settings_from
 from dlkf.command import sweeps
-from dlkf.command.arguments import check_options, check_out, check_presets, check_seeds, quote_argument, with_near_key
+from dlkf.command.arguments import (
+    check_choices,
+    check_options,
+    check_out,
+    check_presets,
+    check_seeds,
+    options_first,
+    quote_argument,
+    with_near_key,
+)
 from dlkf.command.composing import to_plain
 from dlkf.command.faults import describe_fault
 from dlkf.command.help import help_text
@@ -80,7 +89,9 @@ def command(
             heeded = [n for n in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(n) is not signal.SIG_IGN]
             before = {number: signal.signal(number, _stop) for number in heeded}
             try:
-                given = [with_group(argument, GROUPS.get(name, {})) for argument in arguments(sys.argv[1:])]
+                words = options_first(arguments(sys.argv[1:]))
+                given = [with_group(argument, GROUPS.get(name, {})) for argument in words]
+                check_choices(given)
                 sys.argv[1:] = [quote_argument(argument) for argument in given]
                 check_options(sys.argv[1:])
                 check_presets(given)

@@ -19,6 +19,7 @@ from dlkf.base.files import is_url
 from dlkf.base.settings import is_number
 
 SWITCHED_OFF = ("outage", "injected_bias", "smoother", "export")  # where none means null
+WITH_VALUE = ("--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn", "--package", "-p", "--cfg", "-c")
 
 
 def check_options(arguments: list[str]) -> None:
@@ -30,6 +31,16 @@ def check_options(arguments: list[str]) -> None:
     parser = get_args_parser()
     parser.error = refuse
     parser.parse_args([word for word in arguments if word.startswith("-") or "=" not in word])
+
+
+def options_first(arguments: Sequence[str]) -> list[str]:
+    """Options, then settings: Hydra refuses settings on both sides of an option (``dataset=a -m model=b,c``)."""
+    after = [False, *(word in WITH_VALUE for word in arguments)]
+    settings = ["=" in word and not word.startswith("-") and not value for word, value in zip(arguments, after)]
+    return [
+        *(word for word, setting in zip(arguments, settings) if not setting),
+        *(word for word, setting in zip(arguments, settings) if setting),
+    ]
 
 
 def check_presets(arguments: Sequence[str]) -> None:
@@ -49,6 +60,23 @@ def check_presets(arguments: Sequence[str]) -> None:
             values = read_yaml(file)
             if isinstance(values, Mapping) and _names_calls(values.get("hydra")):
                 raise InputError(f"{file}: names a class or function for Hydra to call; presets of your own must not")
+
+
+def check_choices(arguments: Sequence[str]) -> None:
+    """InputError for a preset that is chosen by a number, by nothing, or by a list where one is needed."""
+    for word in arguments:
+        key, equals, value = word.partition("=")
+        group = key.lstrip("+").partition("@")[0]
+        if not equals or not group or word.startswith(("-", "~")) or not (config_dir() / group).is_dir():
+            continue
+        meant = key.lstrip("+").partition("@")[2] or group
+        if re.fullmatch(r"null|none|true|false|[-+.\d][\d.e+-]*", value, re.IGNORECASE):
+            more = f"; a length in seconds is outage.duration_s={value}" if group == "outage" else ""
+            names = sorted(file.stem for file in (config_dir() / group).glob("[!_]*.yaml"))
+            raise InputError(f"{meant}={value}: must be the name of a preset: {', '.join(names)}{more}")
+        if value.startswith("[") and "," in value and not key.startswith("+"):
+            each = value.strip("[]").replace(" ", "")
+            raise InputError(f"{meant}={value}: one preset at a time; -m {meant}={each} runs one after the other")
 
 
 def _names_calls(values: Any) -> bool:
@@ -144,6 +172,8 @@ def with_near_key(line: str, command: str) -> str:
     if (config_dir() / key).is_dir():
         return f"{line[: unknown.end()]}a preset is chosen with a plus: +{key}=…; {rest}"
     known = list(_paths(compose_command(command, resolve=False)))
+    if key in known:
+        return f"{key}: has no such key; one that its settings take is added as +{key}.<key>=…; {rest}"
     return line[: unknown.end() - 2] + (did_you_mean(key, known) or ";") + " " + rest
 
 

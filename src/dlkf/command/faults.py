@@ -76,6 +76,9 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
 def one_line(error: BaseException) -> str:
     """A message as one line; Hydra's and OmegaConf's lists and hints are folded into it."""
     text = str(error)
+    if several := re.search(r"Ambiguous value for argument '([^=']+)=([^']+)'", text):
+        key, values = several.groups()
+        return f"{key}={values}: several values are '{key}=[{values}]' as a list, or -m {key}={values} for a run each"
     if missing := re.search(r"Could not find '([^']+)'", text):
         options = re.search(r"Available options in '([^']+)':\n((?:\t.*\n?)+)", text)
         near = did_you_mean(missing[1].rpartition("/")[2], options[2].split()) if options else ""
@@ -83,6 +86,8 @@ def one_line(error: BaseException) -> str:
         return f"unknown preset or config {missing[1]!r}{hint}"
     if missing := re.search(r"Could not load '([^']+)'", text):
         return f"unknown preset or config {missing[1]!r}; --help names those that there are"
+    if unknown := re.search(r"is not in struct[\s\S]*full_key: (\S+)", text):
+        return f"unknown config key {unknown[1]!r}; --cfg job prints all keys"
     if unknown := re.search(r"Could not override '([^']+)'|full_key: (\S+)[\s\S]*is not in struct", text):
         return f"unknown config key {unknown[1] or unknown[2]!r}; --cfg job prints all keys"
     if unknown := re.search(r"Key '([^']+)' is not in struct", text):

@@ -121,7 +121,8 @@ def _check_heading(table: Columns, moved: Motion, where: str) -> None:
     course = np.interp(at, moved.t, np.unwrap(moved.course))[fast]
     seen = heading[np.clip(np.searchsorted(t, at[fast]), 0, len(t) - 1)]
     off, mirrored = (_middle(angle - course) for angle in (seen, np.pi / 2 - seen))
-    if abs(off[0]) > np.radians(SQUARE_DEG) and mirrored[1] < 0.5 * off[1] and abs(mirrored[0]) < 0.1:
+    counts_from_east = mirrored[1] < 0.5 * off[1] and abs(mirrored[0]) < 0.1
+    if counts_from_east and max(abs(off[0]), off[1]) > np.radians(SQUARE_DEG):
         raise InputError(f"{where}: heading counts from East, must count clockwise from North; use π/2 − heading")
     if abs(off[0]) > np.radians(SQUARE_DEG):
         raise InputError(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import pandas as pd
@@ -81,12 +81,10 @@ def ingest(
         raise InputError(f"source={source}: is a dataset already; navigate and evaluate take dataset={source}")
     if not hasattr(reader, "places"):
         return ingest_drives(reader.read(source), out, how, **options)
-    places = [
-        (absolute_place(folder), name, only and absolute_place(only)) for folder, name, only in reader.places(source)
-    ]
+    places = located(reader, source)
 
     def taking(folder: str) -> Iterable[IngestResult]:
-        return _read_together(reader, how, absolute_place(folder), places, parallel, skip_unsure)
+        return read_together(reader, how, absolute_place(folder), places, parallel, skip_unsure)
 
     return _ingested(taking, out, how, **options)
 
@@ -94,8 +92,21 @@ def ingest(
 Located = tuple[str, str, str | None]
 
 
-def _read_together(
-    reader: Any, how: IngestOptions, out: str, places: Sequence[Located], parallel: int | str | None, skip_unsure: bool
+def located(reader: Any, source: str | Path) -> list[Located]:
+    """Where a reader finds the drives of ``source``, for :func:`read_together`."""
+    return [
+        (absolute_place(folder), name, only and absolute_place(only)) for folder, name, only in reader.places(source)
+    ]
+
+
+class Taker(Protocol):
+    """What becomes of a drive that was read; ``folder`` is a dataset's."""
+
+    def taken(self, drive: DriveFrames, folder: str) -> IngestResult: ...
+
+
+def read_together(
+    reader: Any, how: Taker, out: str, places: Sequence[Located], parallel: int | str | None, skip_unsure: bool
 ) -> Iterator[IngestResult]:
     """The drives that are sure, then those that are with what these found, then lines on those that disagree."""
     doubts: dict[Located, Unsure] = {}
@@ -132,7 +143,7 @@ def _read_together(
         yield IngestResult([], [], (f"left out: {doubt}",), {})
 
 
-def _read_there(reader: Any, how: IngestOptions, out: str, place: Located) -> IngestResult | Unsure:
+def _read_there(reader: Any, how: Taker, out: str, place: Located) -> IngestResult | Unsure:
     folder, name, only = place
     try:
         drive = reader.drive_at(Path(folder), name, only and Path(only))

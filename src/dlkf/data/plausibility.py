@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from dlkf.base.errors import InputError
+from dlkf.data.axis_checks import check_climb, check_dead_axes, check_handedness
 from dlkf.data.discovery.clock import ImuSums, find_lag, known_offset
 from dlkf.data.discovery.drift import ROUGH_S, ends_apart, find_drifting_pose
 from dlkf.data.discovery.motion import Motion, motion
@@ -20,11 +21,11 @@ from dlkf.navigation.earth import SEMI_MAJOR
 FORCE, UPRIGHT = (7.0, 13.0), 0.7  # m/s², the median specific force; the share of it along −z
 FASTEST_RATE = 20.0  # rad/s: no car turns, and no bump shakes it, that fast for a thousandth of a drive
 CHUNK_S = 10.0  # way and course are compared over such stretches: metres of GNSS noise do not matter
-DISAGREES, AGREES = 0.5, 0.25  # relative residual of way against velocity
+DISAGREES, AGREES = 0.4, 0.25  # relative residual of way against velocity
 LEAST_SLOPE = 0.1  # of gyro_z against the course; one that is at its limit in every turn may have 0.3
 FEW = 2  # single fixes at 0°/0° or a continent away are refused by themselves (dlkf.data.limits)
 FARTHEST_KM, KM_PER_DEG = 2000.0, 111.2
-SAME_S, FARTHEST_REFERENCE_KM = 1.0, 1.0  # a row of a reference beside a fix; no antenna, no datum is so far off
+SAME_S, REFERENCE_M, REFERENCE_SIGMAS = 1.0, 30.0, 5.0  # a reference beside a fix: no antenna, no datum is so far off
 SEARCH_S = 600.0  # clocks of logs that have time in common are hardly further apart
 APART_S = 1.0  # less is a delay, which the filters bear; dlkf.ingest measures it on request
 DRIFTED_S = 0.1  # from a drive's first to its last second: worth a line
@@ -91,9 +92,11 @@ def check_gnss_units(gnss: Columns, where: str) -> None:
         raise InputError(f"{where}: fix {bad[0]}: lat_deg is {lat[bad[0]]:.4f}; {remedy}")
     bad = np.flatnonzero(np.abs(lon) > 180)
     if len(bad):
-        raise InputError(f"{where}: fix {bad[0]}: lon_deg is {lon[bad[0]]:.4f}; must lie within ±180 degrees")
+        remedy = "; subtract 360 where it is above 180" if lon.min() >= 0 and lon.max() <= 360 else ""
+        raise InputError(f"{where}: fix {bad[0]}: lon_deg is {lon[bad[0]]:.4f}; must lie within ±180 degrees{remedy}")
     _check_places(lat, lon, where)
     _check_way(gnss, where)
+    check_climb(gnss, where)
 
 
 def _other_degrees(lat: np.ndarray) -> str:
@@ -130,11 +133,17 @@ def check_same_place(reference: Columns, fixes: Columns, where: str) -> None:
     both = np.abs(reference["t"][row] - fixes["t"]) < SAME_S
     if not both.any():
         return
-    lat, lon = reference["lat_deg"][row[both]], reference["lon_deg"][row[both]]
+    t = fixes["t"][both]
+    lat = np.interp(t, reference["t"], reference["lat_deg"])
+    lon = np.interp(t, reference["t"], np.unwrap(reference["lon_deg"], period=360))
     east = (lon - fixes["lon_deg"][both] + 180) % 360 - 180
-    away = KM_PER_DEG * np.median(np.hypot(lat - fixes["lat_deg"][both], east * np.cos(np.radians(lat))))
-    if away > FARTHEST_REFERENCE_KM:
-        raise InputError(f"{where}: lies {away:.3g} km from the fixes in the median; give the reference of this drive")
+    apart = np.hypot(lat - fixes["lat_deg"][both], east * np.cos(np.radians(lat)))
+    away = 1000 * KM_PER_DEG * float(np.median(apart))
+    sigma = np.nan_to_num(np.hypot(fixes["std_pos_n"][both], fixes["std_pos_e"][both]))
+    if away > REFERENCE_M + REFERENCE_SIGMAS * float(np.median(sigma)):
+        said = f"{away / 1000:.3g} km" if away > 1000 else f"{away:.0f} m"
+        other = "of this drive" if away > 1000 else "of this drive, on the same clock and datum"
+        raise InputError(f"{where}: lies {said} from the fixes in the median; give the reference {other}")
 
 
 def _check_way(gnss: Columns, where: str) -> None:
@@ -189,6 +198,11 @@ def _check_way(gnss: Columns, where: str) -> None:
             lon,
             moved * 0.514444,
         ),
+        "the velocities look like mph; reader.gnss.velocity.unit=auto, or multiply them by 0.44704": (
+            lat,
+            lon,
+            moved * 0.44704,
+        ),
         "the velocities look divided by 3.6; reader.gnss.velocity.unit=auto, or multiply them by 3.6": (
             lat,
             lon,
@@ -202,6 +216,11 @@ def _check_way(gnss: Columns, where: str) -> None:
     best = min(fits, key=lambda text: fits[text])
     if fits[best] < AGREES:
         raise InputError(f"{where}: positions and velocities disagree: {best}")
+    if np.ptp(v_e[whole]) == 0 or np.ptp(v_n[whole]) == 0:
+        raise InputError(
+            f"{where}: positions and velocities disagree: vel_n and vel_e must count North and East, not along the "
+            "car; leave them out, or give speed and course (reader.gnss.velocity.frame=course)"
+        )
 
 
 def check_turns(imu: Columns, gnss: Columns, where: str) -> None:
@@ -216,7 +235,7 @@ def check_turns(imu: Columns, gnss: Columns, where: str) -> None:
     gyro = np.diff(np.interp(t, imu["t"], angle))[use]
     clear = np.abs(turned) > 0.1
     turned, gyro = turned[clear], gyro[clear]
-    if len(turned) < 3 or np.abs(turned).sum() < 1.0 or not np.any(gyro):
+    if len(turned) < 3 or np.abs(turned).sum() < 1.0 or np.ptp(imu["gyro_z"]) == 0:
         return
     slope = float(turned @ gyro / (turned @ turned))
     alike = abs(float(turned @ gyro)) / float(np.linalg.norm(turned) * np.linalg.norm(gyro))
@@ -229,8 +248,8 @@ def check_turns(imu: Columns, gnss: Columns, where: str) -> None:
         )
     if not LEAST_SLOPE < abs(slope) < 1 / LEAST_SLOPE:
         raise InputError(
-            f"{where}: gyro_z is {slope:.3g} times the turn of the course: not in rad/s; reader.imu.gyro.unit=auto "
-            "finds its unit"
+            f"{where}: gyro_z is {slope:.3g} times the turn of the course: not in rad/s, or of another axis; "
+            "reader.imu.gyro.unit=auto finds its unit"
         )
     if slope < 0:
         raise InputError(
@@ -245,9 +264,11 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
     Then the force forward and right also shows whether the sensor looks along the car.
     """
     *samples, moved = _signals(imu, gnss)
+    check_dead_axes(imu, moved, where)
     sums = ImuSums.of(*samples)
     _check_drift(sums, moved, where)
     best = find_lag(sums, moved, SEARCH_S)
+    check_handedness(*samples, moved, best, APART_S, where)
     if best is None or not best.clear or min(best.yaw, best.force) < 0.6 or max(best.yaw, best.force) < 0.85:
         return
     if abs(best.lag_s) > APART_S:

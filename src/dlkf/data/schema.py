@@ -175,7 +175,8 @@ def check_name(drive: str) -> str:
 
 
 def _rate(t: pd.Series) -> float:
-    return float(1 / np.median(np.diff(t))) if len(t) > 1 else float("nan")
+    step = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+    return 1 / step if step else float("nan")
 
 
 def _distance(frame: pd.DataFrame) -> float:

@@ -88,6 +88,8 @@ def choose_aids(
 
     if aids is None:
         return tuple(table for kind, table in STANDARD.items() if is_there(kind))
+    if not isinstance(aids, (str, list, tuple)):
+        raise InputError(f"aids is {aids!r}, must be a list such as [speed], [] for none, null for all that there are")
     tables = standard_tables([aids] if isinstance(aids, str) else list(aids))
     for table in tables:
         if not is_there(table.name):

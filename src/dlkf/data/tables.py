@@ -64,6 +64,8 @@ def read_drives(folder: str | Path) -> list[DriveRow]:
 
     Raises InputError if the folder, the file or a needed column is missing, or a name appears twice.
     """
+    if not str(folder):
+        raise InputError("dataset= is empty; give a folder")
     if not is_url(folder) and not Path(folder).exists():
         restore_folder(Path(folder).absolute())
     folder = resolve_place(folder)

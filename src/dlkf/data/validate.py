@@ -26,6 +26,7 @@ from dlkf.data.tables import Columns, DriveRow, read_drives, read_table
 
 GNSS_QUALITIES = (1, 2, 3, 4, 5, 9)  # NMEA GGA codes that are a satellite fix; 6, 7, 8 are not
 RATES_HZ = {"imu": (1.0, 1e4), "gnss": (1e-3, 500.0)}
+MOST_SAME = 0.2  # of the rows, with the stamp of the row before: more are a rounded clock
 MOST_REFUSED = (0.01, 0.2)  # of the samples, of the fixes; more are no accident
 MOST_SWITCH_M = 10_000.0  # m: fixes that go on so far off make two drives of one
 UNIX_TO_GPS_S, EPOCHS_APART_S = 315_964_800.0, 86_400.0  # 1970 to 1980; as near is no chance
@@ -138,13 +139,27 @@ def _where(drive: str, kind: str) -> str:
     return f"drive {drive}, {kind}/drive={drive}"
 
 
-def _check_time(t: np.ndarray, where: str) -> None:
+def _coarse(t: np.ndarray) -> str:
+    """How stamps of which many are the same were rounded, and the remedy."""
+    if (t == np.floor(t)).all():
+        return "t has whole seconds; give its decimals"
+    if (t == t.astype(np.float32)).all():
+        return f"t has the {np.spacing(np.float32(np.abs(t).max())):g} s of float32; keep it in float64"
+    return "t is rounded; give more decimals"
+
+
+def _check_time(t: np.ndarray, where: str, kind: str = "imu") -> None:
     bad = np.flatnonzero(~np.isfinite(t))
     if len(bad):
         raise InputError(f"{where}: row {bad[0]}: t is {t[bad[0]]}; remove the row or give its time in seconds")
     back = np.flatnonzero(np.diff(t) <= 0)
     if len(back):
         k = int(back[0])
+        if (same := int((np.diff(t) == 0).sum())) > MOST_SAME * len(t):
+            raise InputError(
+                f"{where}: {same} of {len(t)} rows have the stamp of the row before: {_coarse(t)} "
+                f"(reader.{kind}.time.respace=true spreads such samples evenly)"
+            )
         if t[k + 1] == t[k]:
             raise InputError(
                 f"{where}: row {k + 1}: t = {t[k]:.6f} appears twice; remove duplicate samples (of an IMU with a "
@@ -213,11 +228,12 @@ def _in_scale(imu: Columns) -> np.ndarray:
 
 def _check_gnss(gnss: Columns, imu: Columns, where: str) -> Columns:
     """All rows but the fixes that no car can have reached, where those are few."""
-    _check_time(gnss["t"], where)
+    _check_time(gnss["t"], where, "gnss")
     _check_rate(gnss["t"], where, "gnss")
     _check_finite(gnss, (*POSITION, *VELOCITY, *STD), where, nan=True)
     fix = np.isin(gnss["quality"], GNSS_QUALITIES) & np.all([np.isfinite(gnss[c]) for c in POSITION], axis=0)
     if not fix.any():
+        _check_fixes_there(gnss, where)
         raise InputError(f"{where}: no GNSS fix at all (position NaN or quality 0 in every row); leave the drive out")
     for name in STD:
         bad = np.flatnonzero(gnss[name] < 0)
@@ -251,6 +267,16 @@ def _check_gnss(gnss: Columns, imu: Columns, where: str) -> Columns:
     keep = np.ones(len(fix), bool)
     keep[np.flatnonzero(fix)[~screened.keep]] = False
     return {name: values[keep] for name, values in gnss.items()}
+
+
+def _check_fixes_there(gnss: Columns, where: str) -> None:
+    """Why there is no fix, where that is not because the receiver had none."""
+    placed = np.isfinite(gnss["lat_deg"]) & np.isfinite(gnss["lon_deg"])
+    codes = np.unique(gnss["quality"])
+    if placed.any() and not np.isfinite(gnss["height_m"]).any():
+        raise InputError(f"{where}: height_m is NaN in every row; give one number for all where it is not known")
+    if placed.any() and not np.isin(codes, range(10)).any():
+        raise InputError(f"{where}: quality is {codes[0]} in row 0; must be a code of NMEA: 1, 2, 4, 5, 0 for no fix")
 
 
 def _check_reference(reference: Columns, gnss: Columns, where: str) -> None:

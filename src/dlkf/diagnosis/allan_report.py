@@ -148,6 +148,8 @@ def _csv(log: StaticLog) -> str:
 def part(imu: dict[str, Array], from_s: float | None, to_s: float | None) -> tuple[Array, float]:
     """Samples (N, 6) between two times after the start of a table's IMU, and their rate [Hz]."""
     t = imu["t"]
+    if from_s is not None and to_s is not None and to_s <= from_s:
+        raise InputError(f"to_s={to_s:g} is not after from_s={from_s:g}")
     kept = (t >= t[0] + (from_s or 0.0)) & (t <= t[0] + (math.inf if to_s is None else to_s))
     samples = np.stack([imu[c][kept] for c in AXES], -1)
     return samples, float((len(t) - 1) / (t[-1] - t[0]))

@@ -105,7 +105,9 @@ def check_outages(plan: OutagePlan | None, withheld: Tensor | np.ndarray) -> Non
 def _bounds(name: str, value: float | Sequence[float]) -> tuple[float, float]:
     values = [value] if isinstance(value, (int, float)) else list(value)
     if len(values) not in (1, 2) or not np.isfinite(values).all() or min(values) < 0 or values[0] > values[-1]:
-        raise InputError(f"{name} is {value!r}, must be a number ≥ 0 or [low, high] in seconds")
+        several = f"; for a run each -m {name}={','.join(f'{x:g}' for x in values)}" if len(values) > 2 else ""
+        given = values if len(values) > 1 else values[0]
+        raise InputError(f"{name} is {given}, must be a number ≥ 0 or [low, high] in seconds{several}")
     return float(values[0]), float(values[-1])
 
 

@@ -44,8 +44,8 @@ def headline(result: Results) -> str:
     """The answer to "how far does the car drift?" in plain words: of the outages asked for, of the best
     filter and of the best classical one.
 
-    "60 s without GNSS, 40 outages: plus ends 8.8 m from the reference in the median and 33 m in 95 % (1.4 % of the
-    distance driven); best classical filter mbkf21_car 10 m, 41 m." The best has the least median. Of fewer than
+    "60 s without GNSS, 40 outages: plus ends 8.8 m from the reference in the median, within 33 m in 95 % of them (1.4 % of
+    the distance driven); best classical filter mbkf21_car 10 m, 41 m." The best has the least median. Of fewer than
     :data:`FEW` outages the largest error takes the place of the 95 %, with a warning. Without outages the horizontal
     error over the settled part of the segments.
     """
@@ -120,7 +120,7 @@ def _length(low: float, high: float) -> str:
 def _spread(texts: Sequence[str], count: int, unit: str) -> str:
     where = " from the reference" if unit == "outage" else " off horizontally"
     if count >= FEW:
-        return f"{texts[0]}{where} in the median and {texts[1]} in 95 %"
+        return f"{texts[0]}{where} in the median, within {texts[1]} in 95 % of them"
     if count == 1:
         return f"{texts[0]}{where}"
     return f"{texts[0]}{where} in the median, {texts[1]} in the largest"

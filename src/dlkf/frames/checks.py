@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from inspect import signature
-from numbers import Real
+from numbers import Integral, Real
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,19 +16,11 @@ import yaml
 
 from dlkf.base.config import config_dir
 from dlkf.base.errors import InputError, did_you_mean
+from dlkf.frames.columns import check_columns, warn_of_other_columns
 
 LONGEST_SHOWN = 80  # letters of a wrong value in a line
 LONGEST_ARM_M = 30.0  # a lever arm beyond it is in another unit
-OTHER_NAMES = {  # what people call the contract's columns
-    "t": ("time", "timestamp", "time_s", "seconds", "stamp", "date"),
-    "lat_deg": ("lat", "latitude"),
-    "lon_deg": ("lon", "lng", "long", "longitude"),
-    "height_m": ("height", "alt", "altitude", "h", "alt_m"),
-    "speed": ("speed_mps", "velocity", "v", "speed_kmh"),
-    "heading": ("heading_deg", "yaw", "course"),
-    **{f"{s}_{a}": (f"{short}{a}", f"{short}_{a}", f"{s}{a}", f"{s[:3]}_{a}")
-       for s, short in (("accel", "a"), ("gyro", "g")) for a in "xyz"},
-}  # fmt: skip
+CODES = range(10)  # of NMEA's GGA sentence
 
 
 def check_frames(imu: Any, gnss: Any, reference: Any = None, aids: Mapping[str, Any] | None = None) -> None:
@@ -38,7 +32,7 @@ def check_frames(imu: Any, gnss: Any, reference: Any = None, aids: Mapping[str, 
         if frame is None and name not in ("imu", "gnss"):
             continue
         if not isinstance(frame, pd.DataFrame):
-            raise InputError(f"{name} is a {type(frame).__name__}, must be a pandas DataFrame")
+            raise InputError(f"{name} is a {type(frame).__name__}, must be a pandas DataFrame{_as_pandas(name, frame)}")
     if imu is gnss:
         raise InputError("imu and gnss are the same frame")
     if "lat_deg" in imu and "accel_x" in gnss:
@@ -48,39 +42,52 @@ def check_frames(imu: Any, gnss: Any, reference: Any = None, aids: Mapping[str, 
             continue
         schema, more = {**SCHEMAS, **AIDS}[name], OPTIONAL[name]
         needed = ("t", "lat_deg", "lon_deg", "height_m") if name in ("gnss", "reference") else schema.names
-        _check_columns(name, frame, needed)
+        check_columns(name, frame, needed)
         _check_numbers(name, frame, [c for c in (*schema.names, *more.names) if c in frame])
         if not len(frame):
             raise InputError(f"{name} has no rows")
-        _check_seconds(name, frame["t"].to_numpy(float))
+    _check_seconds({name: frame["t"].to_numpy(float) for name, frame in frames.items() if frame is not None})
+    _check_quality(gnss)
+    warn_of_other_columns(gnss)
 
 
-def _check_seconds(name: str, t: np.ndarray) -> None:
-    """InputError for rows so far apart that their times count something smaller than seconds."""
-    slowest = {"imu": 0.99, "speed": 50.0, "heading": 50.0, "baro": 50.0}.get(name, 99.0)
-    step = float(np.median(np.abs(np.diff(t)))) if len(t) > 2 else 0.0
-    for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
-        if slowest < step <= slowest * factor:
-            raise InputError(f"{name}: a row every {step:g} s: t looks like {unit}; divide it by {factor:.0e}")
+def _as_pandas(name: str, given: Any) -> str:
+    """How what was given becomes a pandas frame, where that is known."""
+    if isinstance(given, (str, Path)):
+        return f"; pd.read_csv({str(given)!r}) or dlkf.read_logs make one of a file"
+    for method in ("to_pandas", "toPandas"):
+        if hasattr(given, method):
+            return f": give {name}.{method}()"
+    return ""
 
 
-def _check_columns(name: str, frame: pd.DataFrame, needed: Sequence[str]) -> None:
-    columns = [str(c) for c in frame.columns]
-    if twice := sorted({c for c in columns if columns.count(c) > 1}):
-        raise InputError(f"{name}: column {twice[0]} appears twice; keep one")
-    if not (missing := [c for c in needed if c not in columns]):
+def _check_seconds(times: Mapping[str, np.ndarray]) -> None:
+    """InputError for rows so far apart that their times count something smaller than seconds, or nothing but rows."""
+    for name, t in times.items():
+        slowest = {"imu": 0.99, "speed": 50.0, "heading": 50.0, "baro": 50.0}.get(name, 99.0)
+        step = float(np.median(np.abs(np.diff(t)))) if len(t) > 2 else 0.0
+        if name == "imu" and 0.99 < step < 10 and len(times["gnss"]) and t[-1] - t[0] < 2 * np.ptp(times["gnss"]):
+            raise InputError(f"imu: a row every {step:g} s; a car's IMU has at least 5 a second: give all its samples")
+        for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
+            if slowest < step <= slowest * factor:
+                count = ", or the numbers of the rows" if step == 1 else ""
+                raise InputError(
+                    f"{name}: a row every {step:g} s: t looks like {unit}{count}; divide it by {factor:.0e}"
+                    + (", or by the rate in Hz" if count else "")
+                )
+
+
+def _check_quality(gnss: pd.DataFrame) -> None:
+    """InputError for a quality that is no code of NMEA; NaN is unknown."""
+    if "quality" not in gnss:
         return
-    lower = {c.lower(): c for c in columns}
-    found = {c: next((lower[o] for o in (c, *OTHER_NAMES.get(c, ())) if o in lower), None) for c in missing}
-    renamed = {old: new for new, old in found.items() if old is not None}
-    remedy = f"has {', '.join(columns[:12])}{', …' if len(columns) > 12 else ''}" if columns else "has no columns"
-    if missing == ["t"] and frame.index.name == "t":
-        remedy = f"t is its index; give {name}.reset_index()"
-    elif len(renamed) == len(missing):
-        remedy += f"; {name}.rename(columns={renamed}), units of the contract (dlkf.read_logs finds names and units)"
-    else:
-        remedy += "; dlkf.read_logs reads logs with other names and units"
-    raise InputError(f"{name}: column {', '.join(missing)} missing; {remedy}")
+    values = pd.to_numeric(gnss["quality"]).to_numpy(float, na_value=np.nan)
+    bad = np.flatnonzero(np.isfinite(values) & ~np.isin(values, CODES))
+    if len(bad):
+        raise InputError(
+            f"gnss: quality: row {bad[0]} has {values[bad[0]]:g}, must be a code of NMEA: 1 single, 2 DGNSS, 4 RTK "
+            "fixed, 5 RTK float, 0 no fix, NaN where unknown"
+        )
 
 
 def _check_numbers(name: str, frame: pd.DataFrame, columns: Iterable[str]) -> None:
@@ -97,15 +104,18 @@ def _check_numbers(name: str, frame: pd.DataFrame, columns: Iterable[str]) -> No
                 f"{name}: {column} is a date, must be seconds on one clock for all frames: "
                 f'({name}.{column} - pd.Timestamp("2025-07-05")).dt.total_seconds()'
             )
+        if pd.api.types.is_complex_dtype(values):
+            raise InputError(f"{name}: {column}: complex numbers, must be real")
+        values = values.astype(object)
         try:
             pd.to_numeric(values)
             known = True
         except (TypeError, ValueError):
             known = False
-        if known and not values.isna().any():
-            remedy = f"numbers as text; pd.to_numeric({name}.{column}) makes them numbers"
-        elif known:
+        if known and not any(isinstance(value, str) for value in values):
             continue  # numbers and None
+        if known:
+            remedy = f"numbers as text; pd.to_numeric({name}.{column}) makes them numbers"
         else:
             wrong = next(k for k, v in enumerate(values) if not _is_number(v))
             if column == "t" and _is_date(values.iloc[wrong]):
@@ -172,7 +182,9 @@ def check_switch(name: str, value: Any) -> None:
 
 
 def check_model(model: Any) -> str:
-    """A filter's name; InputError for what is none."""
+    """A filter's name, or its folder's path as text; InputError for what is none."""
+    if isinstance(model, Path):
+        return str(model)
     if not isinstance(model, str):
         raise InputError(
             f"model is a {type(model).__name__}, must be a name such as 'plus', a folder, or 'module:Class'"
@@ -201,14 +213,21 @@ def check_imu_type(imu_type: Any) -> None:
 
 def check_whole(name: str, value: Any, least: int) -> int:
     """A whole number from ``least`` on."""
-    if isinstance(value, bool) or not isinstance(value, Real) or value != math.floor(value) or value < least:
+    if isinstance(value, Integral) and not isinstance(value, bool):
+        number = operator.index(value)  # exact, where a float is not
+    elif isinstance(value, Real) and not isinstance(value, bool) and float(value).is_integer():
+        number = int(float(value))
+    else:
+        number = least - 1
+    if number < least:
         raise InputError(f"{name} is {_shown(value)}, must be a whole number from {least} on")
-    return int(float(value))
+    return number
 
 
 def check_preset(group: str, name: Any, argument: str = "") -> None:
     """InputError for a name that is no preset of ``conf/<group>``, with the closest."""
     known = sorted(f.stem for f in (config_dir() / group).glob("*.yaml") if not f.stem.startswith("_"))
+    known = [name for name in known if (group, name) != ("imu", "auto")]
     if not isinstance(name, str):
         raise InputError(f"{argument or group} is {_shown(name)}, must be the name of a preset: {', '.join(known)}")
     if name not in known:

@@ -46,18 +46,31 @@ def drive_folder(
     with TemporaryDirectory(prefix="dlkf-") as here, errors_of_frames():
         folder = Path(here) / "frames"
         meta = {"drive": DRIVE} | dict(zip(LEVER_ARM, arm))
-        fixes = _completed(gnss, dict.fromkeys((*VELOCITY, *STD), np.nan) | {"quality": 1})
+        fixes = _completed("gnss", gnss, dict.fromkeys((*VELOCITY, *STD), np.nan) | {"quality": 1})
+        fixes["quality"] = fixes["quality"].fillna(1).astype(np.int8)
         truth = None
         if reference is not None:
-            truth = _completed(reference, dict.fromkeys((*VELOCITY, *ATTITUDE), np.nan) | {"valid": True})
-        given = {kind: frame for kind, frame in aids.items() if frame is not None}
-        row = write_drive(folder, meta, imu, fixes, truth, given)
+            unknown = dict.fromkeys((*VELOCITY, *ATTITUDE), np.nan)
+            truth = _completed("reference", reference, unknown | {"valid": True})
+        given = {kind: _completed(kind, frame, {}) for kind, frame in aids.items() if frame is not None}
+        row = write_drive(folder, meta, _completed("imu", imu, {}), fixes, truth, given)
         write_drives_table(folder, [row])
         yield folder
 
 
-def _completed(frame: pd.DataFrame, defaults: Mapping[str, Any]) -> pd.DataFrame:
-    return frame.assign(**{name: value for name, value in defaults.items() if name not in frame})
+def _completed(kind: str, frame: pd.DataFrame, defaults: Mapping[str, Any]) -> pd.DataFrame:
+    """The contract's columns of a frame as numbers; those that it lacks by their defaults."""
+    from dlkf.data.schema import AIDS, OPTIONAL, SCHEMAS
+
+    names = (*{**SCHEMAS, **AIDS}[kind].names, *OPTIONAL[kind].names)
+    kept = {name: pd.to_numeric(frame[name].astype(object)) if _mixed(frame[name]) else frame[name]
+            for name in names if name in frame}  # fmt: skip
+    return pd.DataFrame({**kept, **{name: value for name, value in defaults.items() if name not in frame}})
+
+
+def _mixed(values: pd.Series) -> bool:
+    """Numbers as Python's objects or as categories."""
+    return not pd.api.types.is_numeric_dtype(values)
 
 
 @contextmanager

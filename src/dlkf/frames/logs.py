@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -9,21 +11,24 @@ from typing import TYPE_CHECKING
 import pandas as pd
 
 from dlkf.base.errors import InputError
-from dlkf.frames.checks import check_above_zero, check_preset, check_whole
+from dlkf.frames.checks import check_above_zero, check_preset, check_switch, check_whole
 
 if TYPE_CHECKING:
+    from dlkf.data.intake import IngestResult
     from dlkf.data.readers.frames import DriveFrames
+
+SHORTEST_MIN, LONGEST_MIN = 0.3, 240.0  # of a simulated drive
 
 
 def simulate(
     preset: str = "lifelike", *, minutes: float = 10.0, drives: int = 1, seed: int = 0, imu_type: str | None = None
 ) -> list[DriveFrames]:
-    """Simulated drives of a preset of ``conf/simulated``, each with ``imu``, ``gnss`` and ``reference`` frames.
+    """Simulated drives with a reference without error.
 
     Parameters
     ----------
     preset : str
-        ``lifelike``, ``city``, ``highway``, ``tunnel``, ``fleet``, …
+        Of ``conf/simulated``: ``lifelike``, ``city``, ``highway``, ``tunnel``, ``fleet``, …
     minutes : float
         Length of each drive.
     drives : int
@@ -32,6 +37,11 @@ def simulate(
         The same seed gives the same drives.
     imu_type : str, optional
         A preset of ``conf/imu``; default: the preset's own.
+
+    Returns
+    -------
+    list of DriveFrames
+        Each with ``imu``, ``gnss`` and ``reference`` frames and ``meta``: its name, lever arm [m], sensors.
 
     Raises
     ------
@@ -48,6 +58,8 @@ def simulate(
     if imu_type is not None:
         check_preset("imu", imu_type)
     check_above_zero(minutes=minutes)
+    if not SHORTEST_MIN <= minutes <= LONGEST_MIN:
+        raise InputError(f"minutes is {minutes:g}, must be from {SHORTEST_MIN:g} to {LONGEST_MIN:g} a drive")
     drives, seed = check_whole("drives", drives, 1), check_whole("seed", seed, 0)
     words = [
         f"simulated@dataset={preset}",
@@ -67,7 +79,7 @@ def simulate(
         return made
 
 
-def read_logs(source: str | Path, reader: str = "auto") -> list[DriveFrames]:
+def read_logs(source: str | Path, reader: str = "auto", *settings: str, skip_unsure: bool = False) -> list[DriveFrames]:
     """Logs in other formats and units as frames in the contract's columns and units, a drive each.
 
     Parameters
@@ -76,6 +88,10 @@ def read_logs(source: str | Path, reader: str = "auto") -> list[DriveFrames]:
         A file, a folder with one drive, an app's ``.zip``, or a folder with a subfolder or ``.zip`` per drive.
     reader : str
         A preset of ``conf/reader``; ``auto`` finds format, units, clocks and mounting.
+    *settings : str
+        What is known, as on the command line: ``"reader.imu.accel.unit=g"``, ``"reader.gnss.time.offset_s=0.3"``.
+    skip_unsure : bool
+        Leave out drives with too little motion for what is to be found, with a warning; else the first is an error.
 
     Returns
     -------
@@ -86,16 +102,48 @@ def read_logs(source: str | Path, reader: str = "auto") -> list[DriveFrames]:
     Raises
     ------
     InputError
-        For what cannot be read: which file, what is missing, and how to mend it.
+        For what cannot be read: which file, what is missing, and the setting that mends it.
     """
     from dlkf.base.classes import instantiate
+    from dlkf.command.arguments import quote_argument
     from dlkf.command.composing import compose_command
+    from dlkf.data.intake import located, read_together
 
     if not isinstance(source, (str, Path)):
         raise InputError(f"source is a {type(source).__name__}, must be the path of a file or a folder with logs")
+    if not str(source) or "://" in str(source):
+        raise InputError(f"source is {str(source)!r}, must be a file or a folder of this machine")
     check_preset("reader", reader)
-    values = compose_command("ingest", f"reader={reader}", "source=logs", "out=data")["reader"]
-    return list(instantiate(values, "reader", ("read",)).read(str(Path(source).expanduser())))
+    check_switch("skip_unsure", skip_unsure)
+    place = Path(source).expanduser()
+    if (place / "drives.parquet").is_file():
+        raise InputError(f"{source} is a dataset already: pandas.read_parquet reads its tables, dlkf navigate takes it")
+    for word in settings:
+        if not isinstance(word, str) or not word.startswith("reader.") or "=" not in word:
+            raise InputError(f"{word!r} is no setting of a reader; one is text such as 'reader.imu.accel.unit=g'")
+    words = [f"++{quote_argument(word)}" for word in settings]
+    values = compose_command("ingest", f"reader={reader}", "source=logs", "out=data", *words)["reader"]
+    opened = instantiate(values, "reader", ("read",))
+    if not hasattr(opened, "places"):
+        return list(opened.read(str(place)))
+    places = located(opened, place)
+    made: dict[str, DriveFrames] = {}
+    for result in read_together(opened, _AsFrames(), "", places, None, skip_unsure):
+        for row in result.rows:
+            drive = row["drive"]
+            made[drive.name] = replace(drive, notes=result.notes)
+        if not result.rows:
+            warnings.warn("; ".join(result.notes), UserWarning, stacklevel=2)
+    return [made[name] for _, name, _ in places if name in made]
+
+
+class _AsFrames:
+    """Drives that are read stay frames."""
+
+    def taken(self, drive: DriveFrames, folder: str) -> IngestResult:
+        from dlkf.data.intake import IngestResult
+
+        return IngestResult([{"drive": drive}], [], drive.notes, drive.mapping)
 
 
 def _table(folder: Path, kind: str, drive: str) -> pd.DataFrame | None:

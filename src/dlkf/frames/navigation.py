@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
     from dlkf.filters.smoother import Filter
     from dlkf.running.streaming import StreamingFilter
 
+DEFAULT_NOISE = ("automotive_mems", "untuned")  # imu_type and tuning, where none are given
+
 
 def navigate(
     imu: pd.DataFrame,
@@ -34,7 +38,7 @@ def navigate(
     speed: pd.DataFrame | None = None,
     heading: pd.DataFrame | None = None,
     baro: pd.DataFrame | None = None,
-    model: str = "plus",
+    model: str | Path = "plus",
     imu_type: str | Mapping[str, Any] = "automotive_mems",
     tuning: str | Mapping[str, Any] = "untuned",
     lever_arm: Sequence[float] = (0.0, 0.0, 0.0),
@@ -46,11 +50,15 @@ def navigate(
 
     Parameters
     ----------
-    imu, gnss : pandas.DataFrame
-        Samples and fixes, columns and units as at the top of this module; missing optional columns count as unknown.
+    imu : pandas.DataFrame
+        A row per sample: t [s], gyro_x|y|z [rad/s], accel_x|y|z [m/s², specific force: −9.8 on z at rest], body axes
+        Forward-Right-Down; the means over the interval that ends at t, which increases.
+    gnss : pandas.DataFrame
+        A row per fix: t [s, the clock of ``imu``], lat_deg, lon_deg, height_m (above the ellipsoid); where known,
+        vel_n|e|d [m/s], std_pos_n|e|d [m], std_vel_n|e|d [m/s], quality (NMEA GGA code). NaN where unknown.
     speed, heading, baro : pandas.DataFrame, optional
         Further sensors: t, speed [m/s]; t, heading [rad]; t, pressure [Pa] or height_m; each with ``std`` where known.
-    model : str
+    model : str or Path
         A filter's name (``plus``, ``mbkf15``, ``mbkf21_car``, …), a folder with weights, an MLflow run id,
         ``models:/name@alias``, or ``module:Class``.
     imu_type : str or mapping
@@ -89,7 +97,7 @@ def navigate(
     given = {"rate_hz": rate_hz, "epoch_s": epoch_s}
     check_above_zero(**{name: value for name, value in given.items() if value is not None})
     check_switch("smoothed", smoothed)
-    check_model(model)
+    model = check_model(model)
     check_imu_type(imu_type)
     aids = {"speed": speed, "heading": heading, "baro": baro}
     with drive_folder(imu, gnss, None, lever_arm, aids) as folder:
@@ -103,41 +111,94 @@ def navigate(
     return Solution.of(navigated, fixes, short_name(model), REMEDY if takes_imu_preset(model) else OF_NETWORK)
 
 
-def smooth(imu: pd.DataFrame, gnss: pd.DataFrame, *, model: str = "mbkf21_nhc", **options: Any) -> Solution:
-    """:func:`navigate` with the smoother: the best solution of a whole drive, after it. ``options`` are its own."""
+def smooth(imu: pd.DataFrame, gnss: pd.DataFrame, *, model: str | Path = "mbkf21_nhc", **options: Any) -> Solution:
+    """Run a filter over one drive and the Rauch-Tung-Striebel smoother back over it.
+
+    Parameters
+    ----------
+    imu, gnss : pandas.DataFrame
+        As in :func:`navigate`.
+    model : str or Path
+        A filter with a covariance: a Kalman filter or ``plus``.
+    **options
+        The others of :func:`navigate`: ``imu_type``, ``tuning``, ``lever_arm``, ``speed``, ….
+
+    Returns
+    -------
+    Solution
+        As of :func:`navigate`, with all fixes of the drive used in every row.
+
+    Raises
+    ------
+    InputError
+        As :func:`navigate`, and for a filter without a covariance (``ins``).
+    """
     check_options("smooth", options, navigate, apart=("imu", "gnss", "model", "smoothed"))
     return navigate(imu, gnss, model=model, smoothed=True, **options)
 
 
 def load(
-    model: str = "plus",
+    model: str | Path = "plus",
     *,
     imu_type: str | Mapping[str, Any] = "automotive_mems",
     tuning: str | Mapping[str, Any] = "untuned",
 ) -> Filter:
     """A filter by name, from a folder with ``weights.safetensors`` and ``config.yaml``, or from MLflow.
 
-    The result runs in :func:`dlkf.filters.integration.integrate` and :class:`~dlkf.running.streaming.StreamingFilter`.
-    ``imu_type`` and ``tuning`` as in :func:`navigate`. Raises InputError for anything else, listing what is known.
+    Parameters
+    ----------
+    model : str or Path
+        As in :func:`navigate`.
+    imu_type, tuning : str or mapping
+        As in :func:`navigate`; of a network, which needs neither, they change nothing, with a warning.
+
+    Returns
+    -------
+    Filter
+        For :func:`dlkf.filters.integration.integrate` and :class:`~dlkf.running.streaming.StreamingFilter`.
+
+    Raises
+    ------
+    InputError
+        For anything else, listing what is known.
     """
     from dlkf.base.settings import settings_from
     from dlkf.filters.tuning import Tuning
-    from dlkf.tracking.models import resolve_model
+    from dlkf.tracking.models import resolve_model, takes_imu_preset
 
     factors = settings_from(Tuning, tuning_values(tuning), "tuning")
-    return resolve_model(check_model(model), _imu_spec(imu_type), tuning=factors)
+    model, spec = check_model(model), _imu_spec(imu_type)
+    if (imu_type, tuning) != DEFAULT_NOISE and not takes_imu_preset(model):
+        warnings.warn(f"{model} takes no noise: imu_type and tuning change nothing", UserWarning, stacklevel=3)
+    return resolve_model(model, spec, tuning=factors)
 
 
 def Stream(
-    model: str = "plus", *, rate_hz: float | None = None, imu_type: str | Mapping[str, Any] = "automotive_mems",
+    model: str | Path = "plus", *, rate_hz: float | None = None, imu_type: str | Mapping[str, Any] = "automotive_mems",
     tuning: str | Mapping[str, Any] = "untuned", lever_arm: Sequence[float] = (0.0, 0.0, 0.0), **options: Any,
 ) -> StreamingFilter:  # fmt: skip
     """A filter fed sample by sample and fix by fix, as in a vehicle.
 
-    ``rate_hz`` is the rate the filter runs at [Hz] (default its own); samples may come at any rate and jitter.
-    ``options`` are those of :class:`~dlkf.running.streaming.StreamingFilter` (epoch_s, history_s, …), whose methods
-    ``imu``, ``gnss`` and ``now`` return receipts and estimates. Raises InputError for options that do not exist, and
-    for a filter that cannot work on such a grid.
+    Parameters
+    ----------
+    model, imu_type, tuning, lever_arm
+        As in :func:`navigate`; a filter that is smoothed looks ahead and is refused.
+    rate_hz : float, optional
+        Rate the filter runs at [Hz], default its own; samples may come at any rate and jitter.
+    **options
+        Of :class:`~dlkf.running.streaming.StreamingFilter`: ``epoch_s`` [s], ``history_s`` (how late a fix may be), ….
+
+    Returns
+    -------
+    StreamingFilter
+        Its methods ``imu(t, accel, gyro)`` with accel, gyro (3) [m/s², rad/s], and ``gnss(t, lat_deg, lon_deg,
+        height_m, velocity_ned, std)`` with velocity (3) [m/s] and std (6) return receipts, which hold the estimates of
+        epochs that ended; ``now()`` is the estimate at the latest sample. A wrong sample is refused, not raised.
+
+    Raises
+    ------
+    InputError
+        For options that do not exist, and a filter that cannot work on such a grid.
     """
     from dlkf.filters.saved import grid_of
     from dlkf.running.streaming import StreamingFilter

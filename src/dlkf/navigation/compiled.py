@@ -89,9 +89,12 @@ def _load() -> None:
         try:
             import numba
         except (ImportError, OSError) as error:  # not there, or not for this NumPy
-            AVAILABLE, TROUBLE = False, (
-                f"numba cannot be loaded ({error}), so filters run up to 2 × slower; install one for this Python and "
-                "NumPy"
+            AVAILABLE, TROUBLE = (
+                False,
+                (
+                    f"numba cannot be loaded ({error}), so filters run up to 2 × slower; install one for this Python and "
+                    "NumPy"
+                ),
             )
             _loops.clear()
             return

@@ -54,7 +54,7 @@ def read_reports(folders: Sequence[str | Path]) -> list[StoredReport]:
             results = [Results.of(r) for r in content["results"]]
             about = (content["dataset"], content["protocol"], results, content.get("warnings", []))
             reports.append(StoredReport(name, str(path.absolute()), *about))
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             raise InputError(f"{path}: no metrics.json; give folders that evaluate or train left") from None
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"{path}/metrics.json: not an evaluation of this version ({error!r})") from None

@@ -186,10 +186,12 @@ def colours(scores: Scores) -> dict[str, str]:
 
 
 def growth_chart(scores: Scores) -> Figure:
-    """Median and 95 % of the horizontal error against the time since the last fix, and how many outages reach it."""
+    """Median and 95 % of the horizontal error against the time since the last fix, and how many outages reach it where
+    they are not all as long."""
     w = scores.windows
     seconds = scores.epoch_s * np.arange(1, int(w.length.max()) + 1)
-    figure = stack_panels(["Median [m]", "95 % [m]", "Outages that last so long"], height=230)
+    counted = ["Outages that last so long"] if np.ptp(w.length) else []
+    figure = stack_panels(["Median [m]", "95 % [m]", *counted], height=230)
     for name, shade_of in colours(scores).items():
         x = outage_at(magnitudes(scores.filters[name].error)["horizontal"], w, seconds, scores.epoch_s)
         x = np.where(np.isinf(x), 1e9, x)  # a filter that broke counts
@@ -199,12 +201,13 @@ def growth_chart(scores: Scores) -> Figure:
             y[known] = np.nanpercentile(x[:, known], q, axis=0)
             y[y > 1e8] = np.nan
             figure.add_trace(line(seconds, y, name, shade_of, legend=row == 1, width=2), row)
-    count = (w.length[:, None] * scores.epoch_s >= seconds[None]).sum(0)
-    bars = {"type": "bar", "x": seconds, "y": count, "marker": {"color": SHADE}, "name": "outages"}
-    figure.add_trace(bars | {"showlegend": False}, 3)
+    if counted:
+        count = (w.length[:, None] * scores.epoch_s >= seconds[None]).sum(0)
+        bars = {"type": "bar", "x": seconds, "y": count, "marker": {"color": SHADE}, "name": "outages"}
+        figure.add_trace(bars | {"showlegend": False}, 3)
     figure.update_yaxis(1, type="log", nticks=6)
     figure.update_yaxis(2, type="log", nticks=6)
-    figure.update_xaxis(3, title={"text": "Time without GNSS [s]"})
+    figure.update_xaxis(2 + len(counted), title={"text": "Time without GNSS [s]"})
     return figure
 
 
@@ -274,18 +277,21 @@ def outage_rows(
 
 
 def error_charts(scores: Scores) -> Figure:
-    """RMS over the segments of the horizontal, velocity and attitude error at each time."""
-    figure = stack_panels([title for title, _ in OVER_TIME.values()], height=180)
+    """RMS over the segments of the horizontal, velocity and attitude error at each time, of those that the reference
+    has."""
+    sizes = {name: magnitudes(scores.filters[name].error) for name in scores.filters}
+    known = [q for q in OVER_TIME if q == "horizontal" or any(np.isfinite(size[q]).any() for size in sizes.values())]
+    figure = stack_panels([OVER_TIME[quantity][0] for quantity in known], height=180)
     for name, c in colours(scores).items():
-        size = magnitudes(scores.filters[name].error)
-        for row, (quantity, (_, scale)) in enumerate(OVER_TIME.items(), 1):
-            y = rms_over_segments(np.where(np.isinf(size[quantity]), np.nan, size[quantity])) * scale
+        for row, quantity in enumerate(known, 1):
+            size = sizes[name][quantity]
+            y = rms_over_segments(np.where(np.isinf(size), np.nan, size)) * OVER_TIME[quantity][1]
             if np.isfinite(y).any():
                 figure.add_trace(line(scores.t, y, name, c, legend=row == 1), row)
-    for row in range(1, len(OVER_TIME) + 1):
+    for row in range(1, len(known) + 1):
         figure.update_yaxis(row, type="log", nticks=6)
-    figure.update_xaxis(len(OVER_TIME), title={"text": "Time since the start of a segment [s]"})
-    shade(figure, spans(scores.t, scores.outage.mean(0) > 0.5), len(OVER_TIME))
+    figure.update_xaxis(len(known), title={"text": "Time since the start of a segment [s]"})
+    shade(figure, spans(scores.t, scores.outage.mean(0) > 0.5), len(known))
     return figure
 
 

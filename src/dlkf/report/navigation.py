@@ -245,18 +245,19 @@ def _innovations(course: TrackOnMap, t: Array, gaps: Sequence[tuple[float, float
     innovation = course.result.innovation
     assert innovation is not None
     names = [f"Innovation {q} {a} [{u}], ±3σ" for q, u in (("position", "m"), ("velocity", "m/s")) for a in "NED"]
-    figure = stack_panels(names, height=120)
-    for k in range(6):
+    known = [k for k in range(6) if k < 3 or np.isfinite(innovation.value[:, k]).any()]
+    figure = stack_panels([names[k] for k in known], height=120)
+    for row, k in enumerate(known, 1):
         seen = np.isfinite(innovation.value[:, k])
         if not seen.any():
             continue
         sigma = 3 * innovation.std[seen, k]
         if np.isfinite(sigma).any():
-            figure.add_trace(band(t[seen], -sigma, sigma, "±3σ", COLOURS[5], legend=k == 0), k + 1)
+            figure.add_trace(band(t[seen], -sigma, sigma, "±3σ", COLOURS[5], legend=row == 1), row)
         y = innovation.value[seen, k]
-        figure.add_trace(line(t[seen], y, "innovation", COLOURS[0], legend=k == 0, width=1), k + 1)
-    figure.update_xaxis(6, title={"text": "Time [s]"})
-    shade(figure, gaps, 6)
+        figure.add_trace(line(t[seen], y, "innovation", COLOURS[0], legend=row == 1, width=1), row)
+    figure.update_xaxis(len(known), title={"text": "Time [s]"})
+    shade(figure, gaps, len(known))
     return figure
 
 

@@ -214,6 +214,8 @@ OF_EXTRA = ("mcap", "bag")  # formats that need the extra ``readers``
 
 def chosen_formats(export: str | list[str] | None) -> list[str]:
     """Names of formats; ``all`` for every one. InputError for an unknown one."""
+    if export is not None and not isinstance(export, (str, list, tuple)):
+        raise InputError(f"export={export}: must be a format or a list of formats; known: {', '.join(FORMATS)}, all")
     names = [] if export is None else [export] if isinstance(export, str) else list(export)
     if names == ["all"]:
         return [n for n in FORMATS if n not in OF_EXTRA or find_spec("rosbags") is not None]

@@ -27,11 +27,13 @@ Array = NDArray[np.floating]
 CHANCE = 1e-4  # α, of both bounds together
 TOLERATED = 1.3  # by which a 1σ may be off before it is worth a line: no filter's noise is known better
 SETTLE = 10  # updates from the start on that do not count: the heading is still being found
+FAULTY = 15.0  # innovations so far above their 1σ are no matter of noise: with the preset of another IMU they reach 8
 REMEDY = (
-    "scale factors and misalignments are states of mbkf33 alone; tuning=any_car is for unknown cars, "
-    "dlkf tune or imu=auto fits the noise; dlkf consistency shows more"
+    "take tuning=any_car for an unknown car; dlkf tune, or imu=auto in dlkf navigate, fits the noise; mbkf33 also "
+    "estimates scale factors and misalignments"
 )
-OF_NETWORK = "its network knows no such sensors: compare it with mbkf21_car imu=auto; dlkf doctor looks at the data"
+OF_NETWORK = "compare it with mbkf21_car tuning=any_car; dlkf doctor checks the data"
+OF_DATA = "so far off is a fault of the data, not of the noise: check units, axes, clocks and lever arm (dlkf doctor)"
 
 
 class Innovation(NamedTuple):
@@ -71,9 +73,9 @@ class SigmaFit(NamedTuple):
     def warning(self, name: str, remedy: str = REMEDY) -> str:
         """One line with the remedy."""
         return (
-            f"{name} is too sure of itself: innovations are {self.ratio:.2g} of their 1σ (RMS), by chance at most "
-            f"{self.high:.2g} ({self.degrees:.0f} degrees of freedom); in outages it drifts further than its 1σ says; "
-            f"{remedy}"
+            f"{name} is too sure of itself: its innovations are {self.ratio:.2g} times their 1σ (RMS; by chance at "
+            f"most {self.high:.2g}), so in outages it drifts further than its 1σ says; "
+            f"{OF_DATA if self.ratio > FAULTY else remedy}"
         )
 
 

@@ -36,6 +36,8 @@ from dlkf.running.start import align_each
 FEW_DRIVES = 8
 WORTH_SAYING = 0.01  # probability of another heading
 SAMPLES_AT_ONCE = CHUNK_SAMPLES  # IMU samples of drives in memory, 8 h at 50 Hz
+FASTER_THAN_REVERSE = 8.0  # m/s
+MOSTLY = 0.5  # of the updates of a further sensor; where fewer are used, its numbers are likely wrong
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,14 @@ def epoch_for(spacings: Iterable[UsableFixes], rate_hz: float, estimator: Filter
     return closest if closest < 1.0 and whole and not constrained else 1.0
 
 
+def _drives_backwards(table: pd.DataFrame) -> bool:
+    """Whether a car that moves faster than a reversing one faces the way that it came from, in nearly all rows."""
+    north, east, yaw = (table[column].to_numpy(float) for column in ("vel_n", "vel_e", "yaw"))
+    fast = np.hypot(north, east) > FASTER_THAN_REVERSE
+    along = np.cos(yaw) * north + np.sin(yaw) * east
+    return bool(fast.any()) and float(np.mean(along[fast] < 0)) > 0.9
+
+
 @dataclass(frozen=True)
 class Navigated:
     """A drive's solution: its table, the time [s, file clock] at which the filter could start, and the probability
@@ -104,6 +114,8 @@ class Navigated:
         if self.doubt > WORTH_SAYING:
             text += f"heading ambiguous (the alternatives have probability {self.doubt:.2g}), "
         text += f"{len(self.table)} epochs, "
+        if _drives_backwards(self.table):
+            text += "backwards all the way (an IMU mounted the other way round?), "
         if spacing is None:
             text += f"{used} fixes used"
         else:
@@ -136,6 +148,8 @@ class Navigated:
             ratio = table[f"{name}_innovation"] / table[f"{name}_innovation_std"]
             seen = int(ratio.notna().sum())
             said[name] = f"in {int(table[used].sum())} of {seen} updates"
+            if table[used].sum() < MOSTLY * seen:
+                said[name] += ", most of them refused: see its unit, sign and clock"
             if seen:
                 said[name] += f" (innovations {np.sqrt((ratio**2).mean()):.2g} of their 1σ)"
         for std in (column for column in self.sensor_columns if column.startswith("std_")):

@@ -37,6 +37,7 @@ import numpy as np
 import torch
 
 from dlkf.base.errors import InputError
+from dlkf.base.settings import is_number
 from dlkf.data.aids import pressure_height
 from dlkf.data.alignment import SEARCH, AlignConfig
 from dlkf.data.resampling import ON_BOUNDARY_S, boundary_after, fixes_at
@@ -104,8 +105,16 @@ class StreamingFilter:
         anchor_m: float = ANCHOR_M,
         limits: Limits = LIMITS,
     ) -> None:
-        if not 0 <= history_s < math.inf:
+        if not is_number(history_s) or history_s < 0:
             raise InputError(f"history_s is {history_s!r}, must be a finite number ≥ 0")
+        for name, value in (("imu_step_s", imu_step_s), ("anchor_m", anchor_m)):
+            if value is not None and (not is_number(value) or value <= 0):
+                raise InputError(f"{name} is {value!r}, must be a finite number above 0")
+        if phase_s is not None and not is_number(phase_s):
+            raise InputError(f"phase_s is {phase_s!r}, must be a finite number")
+        for name, value, kind in (("align", align, AlignConfig), ("limits", limits, Limits)):
+            if not isinstance(value, kind):
+                raise InputError(f"{name} is {value!r}, must be a {kind.__module__}.{kind.__name__}")
         if align.from_rest:
             raise InputError("align.from_rest looks ahead, which a stream cannot; leave it out")
         if isinstance(estimator, SmoothedSolution):
@@ -171,7 +180,7 @@ class StreamingFilter:
             return self._answer(Status.RESTARTED, reason)
         if self._samples.grid is None:
             self._settle()
-        if t < self._samples.end - 1e-6:
+        if float(t) < self._samples.end - 1e-6:
             return TAKEN
         return self._close(0.0)
 

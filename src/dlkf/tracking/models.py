@@ -18,6 +18,7 @@ from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.tracking.runs import RUN_ID
 
+NETWORKS = ("dlkf", "dlkf_literal")  # of conf/filter, which dlkf train trains
 BEST = "best"  # folder of the weights that a training keeps
 
 
@@ -35,6 +36,8 @@ def resolve_model(
     ``imu`` and ``tuning`` belong to the model-based filters, ``prior`` to those with ``_prior``. Raises InputError for
     anything else, listing what is known.
     """
+    if not spec.strip():
+        raise InputError("model= is empty; give a name such as plus, or a folder")
     if is_filter(spec):
         return build_filter(spec, imu, tuning=tuning, prior=prior)
     if OWN_SOURCE.fullmatch(spec):
@@ -50,6 +53,13 @@ def resolve_model(
         return load_filter(folder)
     if folder.is_file():
         raise InputError(f"model={spec} is a file; give the folder with {WEIGHTS} and {CONFIG} (pickles are not read)")
+    if spec in NETWORKS:
+        raise InputError(
+            f"model={spec}: this network has no weights here, it is trained on drives of its IMU: dlkf train; then "
+            "model=<the folder best that dlkf train names>, or model=plus, which needs no training"
+        )
+    if "/" in spec:
+        raise InputError(f"model={spec}: no such folder; a model is a folder with {WEIGHTS} beside {CONFIG}")
     raise InputError(
         f"unknown model {spec!r}{did_you_mean(spec, filter_names()) or ':'} neither a known filter (plus, "
         f"{known_filters()}) nor a folder, "

@@ -191,7 +191,8 @@ def _file(folder: Path, spec: Spec, kind: str, where: str, only: Path | None) ->
         return only
     found = _matching(folder, spec.get("file"))
     if len(found) != 1:
-        have = ", ".join(sorted(p.name for p in folder.iterdir())[:8]) or "nothing"
+        seen = [] if only is not None else sorted(p.name for p in folder.iterdir() if not p.name.startswith("."))
+        have = ", ".join(seen[:8]) or (only.name if only is not None else "nothing")
         what = "no" if not found else f"{len(found)} files match, one must be"
         without = ", or reader.reference=null" if kind == "reference" else ""
         raise InputError(

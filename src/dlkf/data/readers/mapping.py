@@ -211,12 +211,13 @@ class Mapped:
 
 
 def selected(mapped: Mapped) -> Mapped:
-    """The rows that ``rows`` chooses: ``{column: …, is: [...]}``, or ``filled``: those whose columns are not empty."""
+    """The rows that ``rows`` chooses: ``{column: …, is: [...]}``; ``filled``: those whose columns are not empty;
+    ``changed``: of these, those whose position is not that of the row before."""
     rows = mapped.spec.get("rows")
     where = f"reader.{mapped.kind}.rows"
     if rows is None:
         return mapped
-    if rows == "filled":
+    if rows in ("filled", "changed"):
         names = {
             str(n) for key in ("accel", "gyro", "position", "value", "pressure", "height") for n in _names(mapped, key)
         }
@@ -226,11 +227,14 @@ def selected(mapped: Mapped) -> Mapped:
         cells = frame[[c for c in frame.columns if c in names]]
         empty = cells.isna() | cells.astype(str).apply(lambda c: c.str.strip() == "")
         keep = ~empty.any(axis=1).to_numpy()
+        if rows == "changed":
+            place = frame.loc[keep, [c for c in frame.columns if c in {str(n) for n in _names(mapped, "position")}]]
+            keep[keep] = (place != place.shift()).any(axis=1).to_numpy()
     elif isinstance(rows, Mapping) and set(rows) == {"column", "is"}:
         values = rows["is"] if isinstance(rows["is"], (list, tuple)) else [rows["is"]]
         keep = mapped.texts(rows["column"]).isin([str(v) for v in values]).to_numpy()
     else:
-        raise InputError(f"{where} is {rows!r}, must be filled or {{column: …, is: [...]}}")
+        raise InputError(f"{where} is {rows!r}, must be filled, changed or {{column: …, is: [...]}}")
     if not keep.any():
         raise InputError(f"{mapped.table.path}: no row is left by {where}={rows}; set it right")
     return mapped.rows(keep)

@@ -169,7 +169,7 @@ def _of_table(path: Path, name: str, table: LogTable, options: dict[str, Any], p
     if imu is not None and gnss is not None:
         source["rows"] = "filled"
     found = {kind: one for kind, one in (("imu", imu), ("gnss", gnss)) if one is not None}
-    specs = {kind: {**one.spec, **source} for kind, one in found.items()}
+    specs = {kind: {**source, **one.spec} for kind, one in found.items()}
     columns = ", ".join(str(c) for spec in specs.values() for c in _columns(spec))
     notes = tuple(note for one in found.values() for note in one.notes)
     return [Offer(path, f"{name} with {columns}", *opened(specs, stated=True), aids=aids, notes=notes, table=part)]

@@ -85,6 +85,9 @@ def gnss_spec(table: LogTable) -> Recognised | None:
         more = "; found others by the way between the positions" if spec["velocity"].get("columns") else ""
         return Recognised(spec, () if _unnamed(names) else (f"took {columns} for latitude, longitude, height{more}",))
     known = frame[[lat, lon]].notna().all(axis=1)
+    held = _held(frame[known], [lat, lon])
+    if held is not None:
+        known[known] = ~held
     time = stamps.time_spec(_of(table, frame), known, SLOWEST_FIX_S, FASTEST_FIX_S)
     if time is None or height is None:
         return None
@@ -101,7 +104,22 @@ def gnss_spec(table: LogTable) -> Recognised | None:
     if "std_position" not in out and found["hdop"] is not None:
         spec, note = _dilutions(frame[known], found, quality)
         out, notes = out | spec, [*notes, note]
+    if held is not None:
+        out["rows"] = "changed"
+        notes = [
+            *notes,
+            f"took {int(known.sum())} of {len(held)} rows for fixes: the others repeat the position before",
+        ]
     return Recognised(out, tuple(notes))
+
+
+def _held(frame: pd.DataFrame, place: list[str]) -> pd.Series | None:
+    """Rows that repeat the position before, in a table of IMU samples beside which most do; else None."""
+    names = [str(c) for c in frame.columns]
+    if len(frame) < 10 or not any(vocabulary.triad(names, stem) for stem in vocabulary.SENSORS.values()):
+        return None
+    same = (frame[place] == frame[place].shift()).all(axis=1)
+    return same if same.mean() > 0.5 else None
 
 
 def velocity_spec(table: LogTable) -> tuple[Spec, Spec] | None:
