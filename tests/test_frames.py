@@ -54,7 +54,7 @@ def test_numbers_of_other_types_and_columns_of_other_names(drive):
         UserWarning, match="gnss: columns vn, hacc are not used; the contract's names are vel_n, std_pos_n"
     ):
         dlkf.navigate(imu, gnss[["t", *POSITION]].assign(vn=gnss.vel_n, hacc=0.1), model="ins", rate_hz=10)
-    with pytest.warns(UserWarning, match="plus takes no noise"):
+    with pytest.warns(UserWarning, match="plus has its own noise"):
         dlkf.load("plus", tuning="any_car")
 
 

@@ -263,12 +263,12 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
 
     Then the force forward and right also shows whether the sensor looks along the car.
     """
-    *samples, moved = _signals(imu, gnss)
+    t, accel, gyro, moved = _signals(imu, gnss)
     check_dead_axes(imu, moved, where)
-    sums = ImuSums.of(*samples)
+    sums = ImuSums.of(t, accel, gyro)
     _check_drift(sums, moved, where)
     best = find_lag(sums, moved, SEARCH_S)
-    check_handedness(*samples, moved, best, APART_S, where)
+    check_handedness(t, accel, gyro, moved, best, APART_S, where)
     if best is None or not best.clear or min(best.yaw, best.force) < 0.6 or max(best.yaw, best.force) < 0.85:
         return
     if abs(best.lag_s) > APART_S:
@@ -325,8 +325,8 @@ def describe_drift(imu: Columns, gnss: Columns) -> str | None:
 
 def describe_rotation(imu: Columns, gnss: Columns) -> str | None:
     """A line about a sensor that seems turned, where it is not so clear that :func:`check_clocks` refuses it."""
-    *samples, moved = _signals(imu, gnss)
-    best = find_lag(ImuSums.of(*samples), moved, APART_S)
+    t, accel, gyro, moved = _signals(imu, gnss)
+    best = find_lag(ImuSums.of(t, accel, gyro), moved, APART_S)
     if best is None or not best.clear or not min(best.yaw, best.force) > 0.6:
         return None
     turned = np.degrees(best.angle)

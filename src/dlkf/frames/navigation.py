@@ -169,7 +169,7 @@ def load(
     factors = settings_from(Tuning, tuning_values(tuning), "tuning")
     model, spec = check_model(model), _imu_spec(imu_type)
     if (imu_type, tuning) != DEFAULT_NOISE and not takes_imu_preset(model):
-        warnings.warn(f"{model} takes no noise: imu_type and tuning change nothing", UserWarning, stacklevel=3)
+        warnings.warn(f"{model} has its own noise: imu_type and tuning have no effect", UserWarning, stacklevel=3)
     return resolve_model(model, spec, tuning=factors)
 
 

@@ -89,13 +89,8 @@ def _load() -> None:
         try:
             import numba
         except (ImportError, OSError) as error:  # not there, or not for this NumPy
-            AVAILABLE, TROUBLE = (
-                False,
-                (
-                    f"numba cannot be loaded ({error}), so filters run up to 2 × slower; install one for this Python and "
-                    "NumPy"
-                ),
-            )
+            AVAILABLE = False
+            TROUBLE = f"numba cannot be loaded ({error}), so filters run up to 2 × slower; install one for this Python"
             _loops.clear()
             return
         modules = [module for name, module in sys.modules.items() if name.startswith("dlkf.navigation.")]
