@@ -72,7 +72,10 @@ def test_tables_hold_the_summarise_scores(scores):
     assert f"{at_end[1]} m in the largest (" in few and " % of the distance driven); next ins " in few
     assert few.endswith(" With 6 outages, expect larger errors too.")
     many, one = (replace(r, count={**r.count, "outages": n}) for n in (20, 1))
-    assert f"mbkf15 ends {at_end[0]} m from the reference in the median, within {at_end[2]} m in 95 % of them (" in headline(many)
+    assert (
+        f"mbkf15 ends {at_end[0]} m from the reference in the median, within {at_end[2]} m in 95 % of them ("
+        in headline(many)
+    )
     assert headline(one).startswith(f"20 s without GNSS, 1 outage: mbkf15 ends {at_end[0]} m from the reference (")
     longer = replace(r, count={**r.count, "outage_s": [30.0, 50.0]})
     assert headline(longer).startswith("30 to 50 s without GNSS, ")
