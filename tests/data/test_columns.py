@@ -214,6 +214,44 @@ def test_from_when_stamps_count(name, seconds, clock):
     assert clock_of(name, seconds) == clock
 
 
+def test_more_that_tables_have():
+    """Letters of the hemisphere, velocities in mm/s, stamps coarser than the rate."""
+    found = gnss_spec(fixes(ns=["N"] * 9, ew=["W"] * 9, velN_mm_s=1, velE_mm_s=2, velD_mm_s=3)).spec
+    assert found["position"]["hemispheres"] == ["ns", "ew"]
+    assert found["velocity"] == {"columns": ["velN_mm_s", "velE_mm_s", "velD_mm_s"], "frame": "ned"}
+    t = np.floor(0.1 * np.arange(200)) / 10
+    frame = pd.DataFrame({"t": t, **{f"{s}{a}": 0.0 for s in ("acc_", "gyr_") for a in "xyz"}}).assign(acc_z=-9.8)
+    spec = imu_spec(LogTable(frame, Path("a")))
+    assert spec is not None and spec.spec["time"]["respace"] is True and "spread evenly" in spec.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("track.gpx", "<gpx>", "no fixes found in track.gpx (a track of GPX or KML; make it a CSV table"),
+        ("fixes.xlsx", "PK", "no fixes found in fixes.xlsx (a spreadsheet; save its sheet as CSV)"),
+        ("fixes.json", "[]", "no fixes found in fixes.json (JSON; write it as a CSV table)"),
+        ("fixes.csv", "time,lat,lon,alt\n1,40°05'47\",8°1'2\",9\n", "lat has text such as 40°05'47\", must be decimal"),
+        ("fixes.csv", "time,lat,lon\n1,50,8\n2,50,8\n", "lacks a height (one number in all rows will do)"),
+        ("fixes.csv", "time,lat,lon,alt\n10:00:01,50,8,9\n10:00:02,50,8,9\n", "lacks a date beside the times of day"),
+    ],
+)
+def test_fixes_that_are_no_table_of_them(name, text, said, tmp_path):
+    """Beside an IMU: never a log at rest."""
+    rest = pd.DataFrame({"t": 0.01 * np.arange(20.0), **{c: 0.0 for c in (*ACCEL, *GYRO)}}).assign(accel_z=-9.8)
+    rest.to_csv(tmp_path / "imu.csv", index=False)
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError) as refused:
+        list(AutoReader().read(tmp_path))
+    assert said in str(refused.value)
+
+
+def test_accelerations_without_gravity_are_refused(tmp_path, drive):
+    write(tmp_path / "a", {**drive, "imu": drive["imu"].assign(accel_z=drive["imu"].accel_z + 9.8)}, HEADERS["English"])
+    with pytest.raises(InputError, match="there is no gravity in the accelerations"):
+        list(AutoReader().read(tmp_path / "a"))
+
+
 def test_names_mean_one_thing():
     """No name above belongs to two quantities, whatever its language, and none of the usual further columns to any."""
     for language, names in HEADERS.items():

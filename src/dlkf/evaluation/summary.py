@@ -44,8 +44,8 @@ def headline(result: Results) -> str:
     """The answer to "how far does the car drift?" in plain words: of the outages asked for, of the best
     filter and of the best classical one.
 
-    "60 s without GNSS, 40 outages: plus ends 8.8 m from the reference in the median, within 33 m in 95 % of them
-    (1.4 % of the distance driven); best classical filter mbkf21_car 10 m, 41 m." The best has the least median. Of fewer than
+    "60 s without GNSS, 40 outages: plus ends 8.8 m from the reference in the median, within 33 m in 95 % of them (1.4 %
+    of the distance driven); best classical filter mbkf21_car 10 m, 41 m." The best has the least median. Of fewer than
     :data:`FEW` outages the largest error takes the place of the 95 %, with a warning. Without outages the horizontal
     error over the settled part of the segments.
     """

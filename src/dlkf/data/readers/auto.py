@@ -12,7 +12,7 @@ from dlkf.data.readers.archives import drive_name, drive_places, is_archive, unp
 from dlkf.data.readers.formats import rosbag
 from dlkf.data.readers.frames import DriveFrames, Place
 from dlkf.data.readers.logs import LogReader
-from dlkf.data.readers.offers import Contents, Offer, contents, open_aid, opened, preset, sniffed, text_options
+from dlkf.data.readers.offers import NO_LOGS, Contents, Offer, contents, open_aid, opened, preset, sniffed, text_options
 from dlkf.data.readers.settling import Unsure
 from dlkf.data.readers.sharing import merged
 
@@ -281,6 +281,7 @@ def _foreign(within: Iterable[Contents], only: Path | None) -> Contents | None:
         for one in unread
         if one.path.suffix.lower() in RECEIVERS
         or one.held.startswith(DAMAGED)
+        or one.path.suffix.lower() in NO_LOGS
         or (one.path.suffix.lower() in TABLES and (sniffed(one.path) == "csv" or one.held == "empty"))
     )
     return next(logs, None)

@@ -23,6 +23,11 @@ PRESETS = {"ubx": "ubx", "nmea": "nmea", "rosbag": "rosbag", "rtklib": "rtklib",
 PRESETS |= {"inertial_explorer": "inertial_explorer", "novatel": "novatel", "navego": "navego"}
 PRESETS |= {"px4": "px4", "ardupilot": "ardupilot"}
 GNSS_ONLY = ("nmea", "rtklib", "inertial_explorer")
+NO_LOGS = {  # formats of other programs, and what makes a table of them
+    **dict.fromkeys((".xlsx", ".xls", ".ods"), "a spreadsheet; save its sheet as CSV"),
+    **dict.fromkeys((".gpx", ".kml", ".kmz"), "a track of GPX or KML; make it a CSV table: time, lat, lon, height"),
+    ".json": "JSON; write it as a CSV table",
+}
 LARGEST_PEEK = 400  # lines
 NAVEGO = {"imu": "fb_0", "gnss": "stdm_0"}  # a column of each of NaveGo's structures
 
@@ -63,6 +68,8 @@ def contents(path: Path) -> Contents:
             begins = file.read(4)
     except OSError as error:
         return Contents(path, held=f"cannot be opened: {(error.strerror or str(error)).lower()}")
+    if (other := NO_LOGS.get(path.suffix.lower())) is not None:
+        return Contents(path, held=other)
     if begins == b"PK\3\4":
         return Contents(path, held="a .zip; give it as source, or unpack it")
     name = sniffed(path)

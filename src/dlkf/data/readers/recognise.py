@@ -18,6 +18,7 @@ SLOWEST_IMU_S, FASTEST_IMU_S = 0.21, 2e-4
 SLOWEST_FIX_S, FASTEST_FIX_S = 12.0, 0.02
 MOST_COLUMNS = 500  # no log of a car has more; each is looked at in many ways
 NEAR_GRAVITY = 0.08
+COARSE = 0.2  # of the samples, with the stamp of the one before: the clock is coarser than the rate
 
 
 class Recognised(NamedTuple):
@@ -39,7 +40,8 @@ def imu_spec(table: LogTable) -> Recognised | None:
             return None
         sensors = {key: {"columns": columns} for key, columns in triads.items() if columns}
         sensors["accel"] |= _stated_unit(frame, triads["accel"])
-        return Recognised({"time": time, **sensors})
+        notes = _spread(frame[known], time)
+        return Recognised({"time": time, **sensors}, notes)
     if any(triads.values()) or vocabulary.named(names, "lat"):
         return None
     spec = by_numbers.imu_spec(frame)
@@ -49,6 +51,18 @@ def imu_spec(table: LogTable) -> Recognised | None:
     notes = () if _unnamed(names) else (f"took {', '.join(columns[:3])} for the accelerometers by gravity, "
                                         f"{', '.join(columns[3:])} for the gyroscopes",)  # fmt: skip
     return Recognised(spec, notes)
+
+
+def _spread(frame: pd.DataFrame, time: Spec) -> tuple[str, ...]:
+    """Asks for samples of one and the same stamp to be spread, where a clock is coarser than the rate."""
+    column = time.get("column")
+    if not isinstance(column, str) or column not in frame or not pd.api.types.is_numeric_dtype(frame[column]):
+        return ()
+    same = float((np.diff(frame[column].to_numpy(float)) == 0).mean()) if len(frame) > 1 else 0.0
+    if same < COARSE:
+        return ()
+    time["respace"] = True
+    return (f"{100 * same:.0f} % of the samples have the stamp of the one before: spread evenly (time.respace=true)",)
 
 
 def sensor_spec(table: LogTable, called: str) -> tuple[str, Recognised] | None:
@@ -96,6 +110,8 @@ def gnss_spec(table: LogTable) -> Recognised | None:
         position["height_unit"] = unit
     if found["geoid"] is not None:
         position["geoid"] = found["geoid"]
+    if (sides := _hemispheres(table.frame[known])) is not None:
+        position["hemispheres"] = sides
     out: Spec = {"time": time, "position": position, "velocity": _velocity(found) or {"columns": None}}
     out |= _accuracies(frame, found)
     quality, notes = quality_spec(table.frame[known], _quality_column(table.frame), _accuracy_m(frame, out))
@@ -111,6 +127,17 @@ def gnss_spec(table: LogTable) -> Recognised | None:
             f"took {int(known.sum())} of {len(held)} rows for fixes: the others repeat the position before",
         ]
     return Recognised(out, tuple(notes))
+
+
+def _hemispheres(frame: pd.DataFrame) -> list[str] | None:
+    """The columns that have N or S, and E or W, in every row; None where a table has not both."""
+    found = []
+    for letters in ({"N", "S"}, {"E", "W"}):
+        texts = (n for n in frame.columns if not pd.api.types.is_numeric_dtype(frame[n]))
+        found.append(
+            next((str(n) for n in texts if set(frame[n].astype(str).str.strip().str.upper()) <= letters), None)
+        )
+    return [side for side in found if side is not None] if all(found) and len(frame) else None
 
 
 def _held(frame: pd.DataFrame, place: list[str]) -> pd.Series | None:
@@ -143,14 +170,19 @@ def missing(table: LogTable) -> str:
     columns = [str(c) for c in table.frame.columns]
     text = f"columns {', '.join(columns[:12])}{', …' if len(columns) > 12 else ''}"
     if not has:
+        lat = vocabulary.named(columns, "lat")
+        if lat is not None and len(table.frame):
+            return f"{text}: {lat} has text such as {table.frame[lat].iloc[0]}, must be decimal degrees"
         return f"{text}, of which none is known"
     lacks = [] if len(has) > 1 or "positions" in has else [{"accel": "a gyroscope", "gyro": "an accelerometer"}[has[0]]]
     if "positions" in has:
         lacks += [] if vocabulary.named(names, "lon") else ["a longitude"]
-        lacks += [] if vocabulary.named(names, "height") else ["a height"]
+        lacks += [] if vocabulary.named(names, "height") else ["a height (one number in all rows will do)"]
     rows = pd.Series(True, table.frame.index)
     if stamps.time_spec(_of(table, frame), rows, SLOWEST_FIX_S, FASTEST_IMU_S) is None:
-        lacks.append("stamps that can be read")
+        times = [n for n in vocabulary.matching(columns, vocabulary.TIME) if n not in names]
+        of_day = times and table.frame[times[0]].astype(str).iloc[:20].str.match(stamps.OF_DAY).all()
+        lacks.append("a date beside the times of day" if of_day else "stamps that can be read")
     return f"{text}: has {' and '.join(has)}" + (f", lacks {' and '.join(lacks)}" if lacks else "")
 
 

@@ -41,6 +41,7 @@ USUAL = {
 }
 MOSTLY = 0.8  # of the fixes
 FEWEST_FIXES = 3  # below, no finding has a spread
+LEAST_GRAVITY = 0.5  # of the mean force: the length of the mean; with gravity in it nearly 1
 SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "knots": 1852 / 3600, "cm/s": 0.01, "mm/s": 1e-3, "mph": 0.44704}
 
 
@@ -108,6 +109,8 @@ def settle(
         _refuse_doubt(found, wanted, where, t)
         specs["gnss"]["velocity"]["unit"] = found.get("gnss.velocity.unit")
     imu = imu_frame(mapped["imu"], t["imu"])
+    if "imu.accel.unit" in wanted:
+        _refuse_without_gravity(imu, where)
     gnss = gnss_frame(Mapped(mapped["gnss"].table, specs["gnss"], "gnss", mapped["gnss"].parts), t["gnss"])
     raw = _raw(imu, gnss, {key: None if f"imu.{key}.unit" in wanted else 1.0 for key in ("accel", "gyro")})
     asked = set(wanted)
@@ -131,6 +134,15 @@ def settle(
     lever = found.get("lever_arm_m") if "lever_arm_m" in wanted else arm
     x, y, z = (float(a) for a in lever)
     return Settled(specs, (x, y, z), _reported(found.found, wanted))
+
+
+def _refuse_without_gravity(imu: pd.DataFrame, where: str) -> None:
+    """InputError for accelerations from which gravity was taken: they point everywhere, and have no mean."""
+    force = imu[list(ACCEL)].to_numpy()
+    if np.linalg.norm(force.mean(0)) < LEAST_GRAVITY * np.linalg.norm(force, axis=-1).mean():
+        raise InputError(
+            f"{where}: there is no gravity in the accelerations (linear acceleration?); give those of the accelerometer"
+        )
 
 
 def _by_gravity(specs: dict[str, Any], imu: Mapped, t: np.ndarray, where: str, arm: Any) -> Settled:

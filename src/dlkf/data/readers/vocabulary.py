@@ -100,6 +100,8 @@ UNITS = {
     **dict.fromkeys(("kn", "kt", "kts", "knot", "knots", "noeuds", "knoten"), "knots"),
     **dict.fromkeys(("m s", "mps", "ms 1", "m sec"), "m/s"),
     **dict.fromkeys(("m s2", "mps2", "m s 2", "ms2", "ms 2", "m s s"), "m/s2"),
+    **dict.fromkeys(("mm s", "mmps"), "mm/s"),
+    **dict.fromkeys(("cm s", "cmps"), "cm/s"),
     **dict.fromkeys(("rad s", "rps", "rads"), "rad/s"),
     **dict.fromkeys(("deg s", "dps", "grad s", "° s"), "deg/s"),
     **dict.fromkeys(("deg", "degree", "degrees", "grad", "°", "度"), "deg"),
