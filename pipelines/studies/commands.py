@@ -1,8 +1,8 @@
 """What a user waits for: whole commands, ``python -m pipelines.studies.commands outputs/commands``.
 
-``dlkf --help``, the help of a command, and ``dlkf navigate`` on a drive of five minutes and on 20 hours of drives of 20
-minutes, 100 Hz, from the command to its page. Every run is a process of its own. With ``--beside`` another
-checkout of the project runs the same commands in alternation, and the solutions of both are compared file by file. The
+``dlkf --help``, the help of a command, ``dlkf navigate`` on a drive of five minutes and on 20 hours of drives of 20
+minutes, 100 Hz, from the command to its page, in torch and as C from the cache, and ``dlkf evaluate`` on two hours.
+Every run is a process of its own, torch with ``--threads``. With ``--beside`` another checkout of the project runs the same commands in alternation, and the solutions of both are compared file by file. The
 least of the rounds counts; the first also fills the caches, of bytecode as pip leaves it with an installation.
 """
 
@@ -25,16 +25,20 @@ WORKS = {
     "dlkf --help": ["--help"],
     "dlkf navigate --help": ["navigate", "--help"],
     "five minutes, page": ["navigate", "dataset={home}/short", "out={out}"],
+    "five minutes, page, compiled": ["navigate", "dataset={home}/short", "out={out}", "compiled=true"],
+    "2 h, page": ["navigate", "model={model}", "dataset={home}/two", "out={out}"],
     "20 h, page": ["navigate", "model={model}", "dataset={home}/long", "out={out}"],
+    "20 h, page, compiled": ["navigate", "model={model}", "dataset={home}/long", "out={out}", "compiled=true"],
+    "2 h, evaluate": ["evaluate", "model={model}", "dataset={home}/two", "out={out}", "tracking.log=false"],
 }
 
 
-def environment(checkout: Path, home: Path) -> dict[str, str]:
+def environment(checkout: Path, home: Path, threads: int = 1) -> dict[str, str]:
     """Of a process that runs a checkout, with a cache of its bytecode."""
     kept = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     source = str(checkout.resolve() / "src")
     cache = home / "bytecode" / hashlib.sha256(source.encode()).hexdigest()[:8]
-    return {**kept, "PYTHONPATH": source, "PYTHONPYCACHEPREFIX": str(cache.resolve()), "OMP_NUM_THREADS": "1"}
+    return {**kept, "PYTHONPATH": source, "PYTHONPYCACHEPREFIX": str(cache.resolve()), "OMP_NUM_THREADS": f"{threads}"}
 
 
 def simulate(home: Path) -> None:
@@ -54,7 +58,7 @@ def solutions(out: Path) -> Mapping[str, str]:
     return {str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest() for path in found}
 
 
-def compare(home: Path, checkouts: list[Path], works: list[str], model: str, rounds: int) -> None:
+def compare(home: Path, checkouts: list[Path], works: list[str], model: str, rounds: int, threads: int) -> None:
     """Run in alternation, print a row for each work."""
     print("| work | checkout | clock [s] | processor [s] | memory [GB] | clock, processor: share | solutions |")
     print("|:--|:--|--:|--:|--:|--:|:--|")
@@ -66,7 +70,7 @@ def compare(home: Path, checkouts: list[Path], works: list[str], model: str, rou
                 out = home / "out"
                 shutil.rmtree(out, ignore_errors=True)
                 words = [word.format(home=home, out=out, model=model) for word in WORKS[work]]
-                runs[checkout].append(cost(["-m", "dlkf", *words], environment(checkout, home)))
+                runs[checkout].append(cost(["-m", "dlkf", *words], environment(checkout, home, threads)))
                 left[checkout] = solutions(out)
         best = {checkout: Cost(*map(min, zip(*of))) for checkout, of in runs.items()}
         first = best[checkouts[-1]]
@@ -85,11 +89,12 @@ def main() -> None:
     parser.add_argument("--works", nargs="+", choices=WORKS, default=list(WORKS))
     parser.add_argument("--model", default="mbkf15", help="of the 20 h")
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--threads", type=int, default=1, help="of torch")
     options = parser.parse_args()
     home = options.home.absolute()
     simulate(home)
     checkouts = [HERE, *([options.beside] if options.beside else [])]
-    compare(home, checkouts, options.works, options.model, options.rounds)
+    compare(home, checkouts, options.works, options.model, options.rounds, options.threads)
 
 
 if __name__ == "__main__":
