@@ -2,8 +2,9 @@
 
 ``dlkf --help``, the help of a command, ``dlkf navigate`` on a drive of five minutes and on 20 hours of drives of 20
 minutes, 100 Hz, from the command to its page, in torch and as C from the cache, and ``dlkf evaluate`` on two hours.
-Every run is a process of its own, torch with ``--threads``. With ``--beside`` another checkout of the project runs the same commands in alternation, and the solutions of both are compared file by file. The
-least of the rounds counts; the first also fills the caches, of bytecode as pip leaves it with an installation.
+Every run is a process of its own, torch with ``--threads``. With ``--beside`` another checkout of the project runs the
+same commands in alternation, and the solutions of both are compared file by file. The least of the rounds counts; the
+first also fills the caches, of bytecode as pip leaves it with an installation.
 """
 
 from __future__ import annotations

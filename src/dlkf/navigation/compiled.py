@@ -89,10 +89,8 @@ def _load() -> None:
         try:
             import numba
         except (ImportError, OSError) as error:  # not there, or not for this NumPy
-            AVAILABLE, TROUBLE = False, (
-                f"numba cannot be loaded ({error}), so filters run up to 2 × slower; install one for this Python and "
-                "NumPy"
-            )
+            AVAILABLE = False
+            TROUBLE = f"numba cannot be loaded ({error}), so filters run up to 2 × slower; install one for this Python and NumPy"
             _loops.clear()
             return
         modules = [module for name, module in sys.modules.items() if name.startswith("dlkf.navigation.")]
@@ -100,7 +98,9 @@ def _load() -> None:
             try:
                 loop = numba.njit(cache=True, **options)(function)
             except RuntimeError:  # numba's word for no folder that it may write into
-                TROUBLE = "every process compiles the loops again, some 3 s each; set NUMBA_CACHE_DIR to a folder of yours"
+                TROUBLE = (
+                    "every process compiles the loops again, some 3 s each; set NUMBA_CACHE_DIR to a folder of yours"
+                )
                 loop = numba.njit(**options)(function)
             for module in modules:
                 vars(module).update({name: loop for name, value in vars(module).items() if value is function})

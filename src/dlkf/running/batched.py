@@ -30,8 +30,8 @@ def run_filter(
 ) -> BatchSolution:
     """The filter loop, smoothed where asked for, without gradients, on the device of the estimator's parameters.
 
-    ``keep_covariances``, or with ``keep_innovations`` those of innovation and horizontal position alone, where the filter
-    has some and is not smoothed.
+    ``keep_covariances``, or with ``keep_innovations`` those of innovation and horizontal position alone, where the
+    filter has some and is not smoothed.
     """
     parameter = next(estimator.parameters(), None) if isinstance(estimator, torch.nn.Module) else None
     if parameter is not None:
