@@ -88,7 +88,7 @@ def main(settings: NavigateSettings) -> None:
         if settings.streaming and settings.compiled:
             run = partial(stream_drives, through=core_drive)
         run = partial(run, absolute_place(settings.dataset), model, align=settings.align, **grid)
-        many = offline.SAMPLES_AT_ONCE if settings.parallel is None else offline.SAMPLES_AT_ONCE // 4
+        many = offline.CHUNK_SAMPLES if settings.parallel is None else offline.SAMPLES_AT_ONCE // 4
         shares = offline.chunk_drives(spacings, grid["rate_hz"], 1 if settings.streaming else many)
         done = parallel_map(partial(offline.load_chunk, run, skipped is not None), shares, settings.parallel)
         navigated = partial(offline.navigate_chunks, done, len(rows), skipped=skipped)

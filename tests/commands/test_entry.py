@@ -10,13 +10,14 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 
 import dlkf
-from dlkf.__main__ import COMMANDS, main
+from dlkf.__main__ import COMMANDS, _load, main
 from dlkf.base.config import config_dir
 from dlkf.command.arguments import options_first, quote_argument
 from dlkf.data.schema import drive_file
@@ -48,6 +49,15 @@ def test_handlers_of_signals_are_as_before(monkeypatch, capsys):
     before = signal.getsignal(signal.SIGTERM)
     typed(monkeypatch, capsys, "--version")
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_threads_of_torch_sleep_but_in_a_training(monkeypatch):
+    monkeypatch.setattr("dlkf.__main__.import_module", lambda name: SimpleNamespace(main=name))
+    for command, policy in (("train", None), ("navigate", "PASSIVE")):
+        monkeypatch.setenv("OMP_WAIT_POLICY", "given")
+        monkeypatch.delenv("OMP_WAIT_POLICY")
+        assert _load(command) == f"dlkf.{command}"
+        assert os.environ.get("OMP_WAIT_POLICY") == policy
 
 
 def test_every_command_has_a_module_and_every_configured_one_is_listed():

@@ -47,3 +47,16 @@ def test_nothing_is_said_where_all_is_well(capfd):
     with torch.no_grad():
         assert compiled.fits(torch.zeros(1))
     assert capfd.readouterr() == ("", "")
+
+
+def test_short_work_can_do_without():
+    with torch.no_grad(), compiled.without_loops():
+        assert not compiled.fits(torch.zeros(1))
+
+
+@pytest.mark.whole
+def test_numba_loads_with_the_first_loop():
+    """It takes half a second, which a command that needs no loop saves."""
+    load = "import sys, dlkf.navigate; assert 'numba' not in sys.modules\n"
+    done = subprocess.run([sys.executable, "-c", load + RUN + "assert 'numba' in sys.modules"], capture_output=True)
+    assert done.returncode == 0, done.stderr

@@ -93,7 +93,7 @@ def _load() -> None:
             TROUBLE = f"numba cannot be loaded ({error}), so filters run up to 2 × slower; install one for this Python"
             _loops.clear()
             return
-        modules = [module for name, module in sys.modules.items() if name.startswith("dlkf.navigation.")]
+        modules = [module for name, module in list(sys.modules.items()) if name.startswith("dlkf.navigation.")]
         for function, options in _loops:
             try:
                 loop = numba.njit(cache=True, **options)(function)

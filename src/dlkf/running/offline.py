@@ -33,7 +33,7 @@ from dlkf.running.loss import first_loss
 from dlkf.running.solution import SCHEMA, solution_table
 from dlkf.running.start import align_each
 
-FEW_DRIVES = 8
+FEW_DRIVES = 8  # whose start in tensor operations takes less than numba takes to load
 WORTH_SAYING = 0.01  # probability of another heading
 SAMPLES_AT_ONCE = CHUNK_SAMPLES  # IMU samples of drives in memory, 8 h at 50 Hz
 FASTER_THAN_REVERSE = 8.0  # m/s
