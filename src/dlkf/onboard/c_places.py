@@ -64,7 +64,7 @@ def _after(
 
 def _undone(node: Node) -> Callable[[Tensor], Tensor | None] | None:
     """What makes the tensor of its view; None where the node is no such view."""
-    name, args = name_of(node), node.args
+    name, args = name_of(node), list[Any](node.args)
     if name == "unsqueeze":
         return lambda view: view.squeeze(args[1])  # type: ignore[call-overload, arg-type]
     if name == "expand" and args[0].meta["val"].shape == node.meta["val"].shape:  # type: ignore[union-attr]

@@ -40,15 +40,15 @@ def product(
     if begin is not None:
         given = t.tensor(begin)
         given = given.viewed(given.meta.expand(value.shape))
-    scale, kept = ("" if x == 1 else f"{literal(x, value.dtype)} * " for x in (alpha, beta))
+    scale, of_given = ("" if x == 1 else f"{literal(x, value.dtype)} * " for x in (alpha, beta))
     small = prod(value.shape[:-2]) * k * n <= SMALL
     along = b.meta.stride(-2) == 1 and b.meta.stride(-1) != 1
     if along and a.meta.stride(-1) == 1 and k >= 2 * LANES and (n < WIDE or not small):
-        _write_dots(t, out, a, b, given, scale, kept)
+        _write_dots(t, out, a, b, given, scale, of_given)
     else:
         if small and n >= WIDE and m > 1 and b.meta.stride(-1) != 1:
             b = t.dense(b)
-        _write_rows(t, out, a, b, given, scale, kept, small)
+        _write_rows(t, out, a, b, given, scale, of_given, small)
     return out
 
 
