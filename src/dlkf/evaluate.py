@@ -1,6 +1,6 @@
 """Score filters on a dataset: ``python -m dlkf.evaluate model=[ins,mbkf15] dataset=data/town imu=consumer``.
 
-Prints the results table and leaves metrics.json, table.md, table.csv, figures/, report.html and log.txt in ``out``.
+Prints the results table and leaves metrics.json, table.md, table.csv, report.html and log.txt in ``out``.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def main(settings: EvaluateSettings) -> None:
     results, segments = done.results, done.mode == "segments"
     write_report(
         settings.out, name, done.scores, results, protocol=done.protocol, by_time=segments, baseline=settings.baseline,
-        more=[done.sensors] if done.sensors else (),
+        more=[done.sensors] if done.sensors else (), figures=settings.figures,
     )  # fmt: skip
     for result in results:
         console.print(as_rich(result_tables(name, result)[-1]))

@@ -30,7 +30,7 @@ def test_evaluate_leaves_a_report(uri, tmp_path, monkeypatch):
     process = start_command(
         tmp_path, said := tmp_path / "said", "evaluate", "model=[ins,mbkf15]", "dataset=town", "out=report",
         "imu=consumer", "rate_hz=20", "length_s=50", "outage.first_s=20", "outage.duration_s=[10,20]",
-        "injected_bias=null",
+        "injected_bias=null", "figures=true",
     )  # fmt: skip
     process.join(PATIENCE_S)
     out = said.read_text()

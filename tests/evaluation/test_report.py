@@ -20,6 +20,7 @@ from dlkf.evaluation.figures import png
 from dlkf.evaluation.metrics import QUANTITIES
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.results import IMU_AXES, Results, summarise_scores
+from dlkf.evaluation.scores import representative
 from dlkf.evaluation.summary import describe_verdict, headline
 from dlkf.evaluation.table import (
     as_csv,
@@ -178,7 +179,7 @@ def test_figures_survive_missing_truth_and_broken_filters(cars):
     s = score(FILTERS, [batch], outages=outages, kinds="real")
     for run in s.filters.values():
         run.error[1, 15:], run.p_n[1, 15:], run.imu_error[1, 15:] = np.inf, np.nan, np.nan
-    segments = figures.representative(s, 4, "mbkf15")
+    segments = representative(s, 4, "mbkf15")
     for figure in (figures.tracks(s, segments), figures.error_over_time(s), figures.error_growth(s)):
         assert len(png(figure, dpi=30)) > 4000
     assert len(png(figures.imu_errors(s, [1]), dpi=30)) > 4000
@@ -191,7 +192,7 @@ def test_report_is_complete_and_replaces_an_older_one(scores, tmp_path):
     (out / "table.md").write_text("old")
     paths = write_report(
         out, "town", scores, [summarise_scores(scores, resamples=50)],
-        protocol={"mode": "segments"}, by_time=True, baseline="mbkf15", dpi=30,
+        protocol={"mode": "segments"}, by_time=True, baseline="mbkf15", figures=True, dpi=30,
     )  # fmt: skip
     assert (out / "table.md").read_text().startswith("**town (simulated)")
     assert all(p.is_file() and p.stat().st_size > 100 for p in paths)

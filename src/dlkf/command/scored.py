@@ -50,6 +50,7 @@ class EvaluateSettings(FilterSettings, DriveSelection, ScoringSettingsBase):
     unseen: bool
     settle_s: float
     baseline: str
+    figures: bool
     tracking: StoreSettings
 
     def __post_init__(self) -> None:

@@ -23,12 +23,11 @@ from matplotlib.patches import Patch
 from dlkf.base.colours import COLOURS, SHADE
 from dlkf.evaluation.bootstrap import MIN_GROUPS, rms_band
 from dlkf.evaluation.metrics import Array, magnitudes, outage_at, outage_intervals, rms_over_segments
-from dlkf.evaluation.scores import Scores
+from dlkf.evaluation.scores import OFF_SCALE, Scores, representative
 from dlkf.evaluation.table import format_number
 
 STYLES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (7, 2)), (0, (3, 1, 1, 1)), (0, (2, 2)))
 MANY = 20  # outages, from which on a histogram is drawn
-OFF_SCALE = 20.0  # a filter this many times worse than the best does not set the scale
 LABELS = {
     "horizontal": ("Horizontal error [m]", 1.0),
     "velocity": ("Velocity error [m/s]", 1.0),
@@ -79,19 +78,6 @@ def line_of(scores: Scores, name: str) -> dict[str, Any]:
     """Colour and style of a filter, the same in every figure of these scores."""
     k = list(scores.filters).index(name)
     return {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[k % len(STYLES)]}
-
-
-def representative(scores: Scores, n: int, filter_name: str | None) -> list[int]:
-    """Up to n segments from good to bad: even quantiles of the horizontal error in outages (or anywhere)."""
-    run = scores.filters[filter_name or next(iter(scores.filters))]
-    size = magnitudes(run.error)["horizontal"]
-    if scores.outage.any():
-        size = np.where(scores.outage, size, np.nan)
-    worst = np.nanmax(np.where(np.isnan(size), -1.0, size), axis=-1)
-    order = [int(i) for i in np.argsort(worst, kind="stable") if worst[i] >= 0]
-    if len(order) <= n:
-        return order
-    return [order[round(q * (len(order) - 1))] for q in (np.arange(n) + 0.5) / n]
 
 
 def tracks(scores: Scores, segments: Sequence[int]) -> Figure:

@@ -8,10 +8,12 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 import torch
 
-from dlkf.evaluation.metrics import Array, Mask, OutageIntervals, outage_end, outage_intervals
+from dlkf.evaluation.metrics import Array, Mask, OutageIntervals, magnitudes, outage_end, outage_intervals
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.running.innovations import SigmaFit, fit_sigma, rms
+
+OFF_SCALE = 20.0  # a filter this many times worse than the best does not set the scale of a figure
 
 
 @dataclass(frozen=True)
@@ -133,3 +135,16 @@ def innovation_rms(run: FilterRun) -> float:
 def innovation_fit(run: FilterRun) -> SigmaFit | None:
     """Whether the filter's 1σ fits its innovations; segments count as independent."""
     return fit_sigma(*run.innovation)
+
+
+def representative(scores: Scores, n: int, filter_name: str | None) -> list[int]:
+    """Up to n segments from good to bad: even quantiles of the horizontal error in outages (or anywhere)."""
+    run = scores.filters[filter_name or next(iter(scores.filters))]
+    size = magnitudes(run.error)["horizontal"]
+    if scores.outage.any():
+        size = np.where(scores.outage, size, np.nan)
+    worst = np.nanmax(np.where(np.isnan(size), -1.0, size), axis=-1)
+    order = [int(i) for i in np.argsort(worst, kind="stable") if worst[i] >= 0]
+    if len(order) <= n:
+        return order
+    return [order[round(q * (len(order) - 1))] for q in (np.arange(n) + 0.5) / n]

@@ -1,4 +1,4 @@
-"""Everything an evaluation leaves behind: metrics.json, table.md, table.csv, figures/*.png, report.html."""
+"""What an evaluation leaves behind: metrics.json, table.md, table.csv, report.html; on request figures for print."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ import numpy as np
 
 from dlkf.base.colours import SHADE, TRUTH, filter_colour
 from dlkf.base.files import resolve_place, write_into
-from dlkf.evaluation.figures import OFF_SCALE, all_figures, png, representative
 from dlkf.evaluation.metrics import magnitudes, outage_at, outage_end, rms_over_segments
 from dlkf.evaluation.results import Results
-from dlkf.evaluation.scores import Scores
+from dlkf.evaluation.scores import OFF_SCALE, Scores, representative
 from dlkf.evaluation.sensors import TITLE as SENSORS_TITLE
 from dlkf.evaluation.summary import END, headline, sigma_warnings
 from dlkf.evaluation.table import DEGREES, ResultTable, all_tables, as_csv, as_json, as_markdown, format_number
@@ -48,20 +47,17 @@ def write_report(
     by_time: bool,
     baseline: str | None,
     more: Sequence[ResultTable] = (),
+    figures: bool,
     dpi: int = 110,
 ) -> list[Path]:
     """Write the whole report into ``out``, all files or none; returns their paths.
 
     ``results`` has one entry per kind of data (of scores.of_kind); ``protocol`` is how the
-    scores were made, in plain values; ``more`` tables follow those of the results. Raises InputError if
-    ``out`` cannot be written to.
+    scores were made, in plain values; ``more`` tables follow those of the results; ``figures``: the page's figures for
+    print as well, figures/*.png. Raises InputError if ``out`` cannot be written to.
     """
     parts = [*all_tables(dataset, results), *more]
-    pictures: list[tuple[str, str, bytes]] = []
-    for kind in scores.kinds:
-        suffix = "" if len(scores.kinds) == 1 else f"_{kind}"
-        for name, caption, figure in all_figures(scores.of_kind(kind), by_time=by_time, baseline=baseline):
-            pictures.append((f"{name}{suffix}.png", f"{kind.capitalize()} data: {caption}", png(figure, dpi)))
+    pictures = print_figures(scores, by_time, baseline, dpi) if figures else []
     files: dict[str, bytes] = {
         "metrics.json": as_json(
             {
@@ -78,10 +74,25 @@ def write_report(
         **{f"figures/{name}": data for name, _, data in pictures},
     }
     with write_into(out) as folder:
-        (folder / "figures").mkdir()
+        if pictures:
+            (folder / "figures").mkdir()
         for name, data in files.items():
             (folder / name).write_bytes(data)
     return [resolve_place(out) / name for name in files]
+
+
+def print_figures(
+    scores: Scores, by_time: bool, baseline: str | None, dpi: int
+) -> list[tuple[str, str, bytes]]:  # fmt: skip
+    """(file name, caption, PNG) of every kind of data."""
+    from dlkf.evaluation.figures import all_figures, png  # matplotlib takes a second to load
+
+    pictures = []
+    for kind in scores.kinds:
+        suffix = "" if len(scores.kinds) == 1 else f"_{kind}"
+        for name, caption, figure in all_figures(scores.of_kind(kind), by_time=by_time, baseline=baseline):
+            pictures.append((f"{name}{suffix}.png", f"{kind.capitalize()} data: {caption}", png(figure, dpi)))
+    return pictures
 
 
 def evaluation_page(
@@ -110,7 +121,8 @@ def evaluation_page(
     for result in results:
         _research(page, scores.of_kind(result.kind), f"{result.kind}: " if many else "", baseline)
     _add_tables(page, [t for t in parts if t not in first])
-    page.images("The figures for print", [(caption, embedded(data)) for _, caption, data in pictures])
+    if pictures:
+        page.images("The figures for print", [(caption, embedded(data)) for _, caption, data in pictures])
     page.protocol(protocol)
     return page.html()
 

@@ -110,6 +110,7 @@ def run_study(
         by_time=True,
         baseline=baseline,
         more=tables,
+        figures=True,
     )
     if gains:
         write_gains(folder / "report", gains, title)
