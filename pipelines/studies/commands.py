@@ -18,7 +18,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from pipelines.studies.long_lists import Cost, cost, listed
+from pipelines.studies.long_lists import Cost, cost, link_drives
 
 HERE = Path(__file__).parents[2]
 IMU_HZ, SHORT_MIN, LONG_H, LINKED_H = 100, 5, 20, 2
@@ -50,7 +50,7 @@ def simulate(home: Path) -> None:
             work = ["-m", "dlkf", "simulate", "dataset=per_drive", *settings.split(), f"out={home / name}"]
             subprocess.run([sys.executable, *work], check=True, env=environment(HERE, home), stdout=subprocess.DEVNULL)
     if not (home / "long").exists():
-        listed(home / "two", home / "long", LONG_H)
+        link_drives(home / "two", home / "long", LONG_H)
 
 
 def solutions(out: Path) -> Mapping[str, str]:
