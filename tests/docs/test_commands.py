@@ -25,7 +25,7 @@ PRIMARIES = sorted(p.stem for p in config_dir().glob("*.yaml") if p.stem != "hyd
 
 def spelt_out(words: list[str]) -> list[str]:
     """``dlkf evaluate`` and ``dlkf.evaluate`` as ``python -m dlkf.evaluate``."""
-    if words[:1] == ["dlkf"] and words[1:]:
+    if words[:1] == ["dlkf"] and words[1:] and not words[1].startswith("-"):
         return ["python", "-m", f"dlkf.{words[1]}", *words[2:]]
     return ["python", "-m", *words] if words and words[0].startswith("dlkf.") else words
 

@@ -270,7 +270,7 @@ BAD_FRAMES: dict[str, tuple[str, Callable[[pd.DataFrame], Any], str]] = {  # whi
     "0 to 360°": ("gnss", lambda f: f.assign(lon_deg=f.lon_deg + 200), "subtract 360 where it is above 180"),
     "knots": ("gnss", times(1 / 0.514444, "vel_n", "vel_e"), "look like knots; multiply them by 0.5144"),
     "mph": ("gnss", times(1 / 0.44704, "vel_n", "vel_e"), "the velocities look like mph; multiply them by 0.44704"),
-    "cm/s": ("gnss", times(100, "vel_n", "vel_e"), "m/s is beyond any car; give them quality 0, or mend units"),
+    "cm/s": ("gnss", times(100, "vel_n", "vel_e"), "m/s is beyond any car; give them quality 0, or correct units"),
     "along the car": (
         "gnss",
         lambda f: f.assign(vel_n=np.hypot(f.vel_n, f.vel_e), vel_e=0.0),
@@ -296,7 +296,7 @@ BAD_FRAMES: dict[str, tuple[str, Callable[[pd.DataFrame], Any], str]] = {  # whi
     ),
     "1σ without end": ("gnss", put("std_pos_e", 3, np.inf), "gnss: row 3: std_pos_e is inf; write NaN where"),
     "speed in mph": ("speed", times(1 / 0.44704, "speed"), "looks like mph; multiply it by 0.44704"),
-    "an odometer": ("speed", lambda f: f.assign(speed=f.speed.cumsum()), "it must be in m/s, mend its scale"),
+    "an odometer": ("speed", lambda f: f.assign(speed=f.speed.cumsum()), "it must be in m/s, correct its scale"),
     "a wheel that turns back": ("speed", times(-1, "speed"), "speed is negative where the car drives forward"),
     "a wheel on another clock": ("speed", plus(5.0), "5.0 s behind that of GNSS; subtract 5.00 s from its t"),
     "no speed at all": ("speed", lambda f: f.assign(speed=np.nan), "speed is NaN in every row; or leave it out"),

@@ -5,7 +5,8 @@ levels are learned while GNSS shows whether the car moves. A standstill is then 
 least of a stationary second than to the least of a moving one, without acceleration or turn (the hypothesis of
 Skog et al. 2010, within the filter's 1σ), and not against the filter's estimate of the speed. A car
 without vibration has the same spread in both; then a standstill needs a speed below 0.5 m/s + 1σ, of which at most
-0.5 m/s count, for minutes at constant speed show no acceleration and no turn either.
+0.5 m/s count, for minutes at constant speed show no acceleration and no turn either. While nothing is learned of a car
+(a receiver of positions alone), the filter's 1σ of tilt may not explain an acceleration.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ APART = 10.0  # prior ratio of the level of a moving car to that of a stationary
 DISTINCT = 2.0  # below this ratio the samples do not separate stationary from moving
 MEMORY_S = 100.0  # s, stationary or moving, in which a level grows by e, so that a wrong second decays
 STILL_ACCEL, STILL_RATE = 0.2, 0.01  # m/s², rad/s: with less, beyond the filter's 2σ, a car may be stationary
+UNLEARNED_ACCEL = 0.3  # m/s²: at most so much of the filter's 2σ counts while nothing is learned of the car
 PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 3.0  # m/s, 1σ: a standstill must not contradict the filter
 # m/s: where the samples do not separate the two, a standstill needs a smaller 1σ of the speed
 SILENT_STD = 0.5
@@ -99,7 +101,9 @@ def detect_stationary(
     speed, std = v[:, :2].norm(dim=-1), diagonal[:, VELOCITY][:, :2].sum(-1).sqrt()
     tilt, accel = diagonal[:, ATTITUDE][:, :2].sum(-1), diagonal[:, ACCEL].sum(-1)
     gained = (v - epoch.start.v_n)[:, :2].norm(dim=-1) / span
-    still = (gained < STILL_ACCEL + 2 * (NOMINAL_GRAVITY**2 * tilt + accel).sqrt()) & (
+    doubt = 2 * (NOMINAL_GRAVITY**2 * tilt + accel).sqrt()  # of the acceleration
+    unlearned = before.standing.isinf() & before.moving.isinf()
+    still = (gained < STILL_ACCEL + torch.where(unlearned, doubt.clamp_max(UNLEARNED_ACCEL), doubt)) & (
         turning.norm(dim=-1) < STILL_RATE + 2 * diagonal[:, GYRO].sum(-1).sqrt()
     )
     sure = epoch.used[:, 3:5].all(-1) & (std < SURE_STD)
