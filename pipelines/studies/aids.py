@@ -33,7 +33,7 @@ from dlkf.data.segments import whole_drives
 from dlkf.data.store import choose_aids, drive_rows, load_dataset
 from dlkf.evaluation.bootstrap import compare
 from dlkf.filters.aids.attach import aid_columns, tables_of, with_aids
-from dlkf.filters.integration import BatchSolution, Fix, advance
+from dlkf.filters.integration import BatchSolution, Estimator, Fix, advance
 from dlkf.filters.smoother import Filter
 from dlkf.navigation.calibration import ImuError
 from dlkf.onboard.compiled_filter import CompiledFilter, compile_filter
@@ -156,7 +156,7 @@ def print_costs(folder: str, models: Sequence[str], imu: str) -> None:
             print(f"| `{name}` | {sensors} | {' | '.join(cells)} |", flush=True)
 
 
-def update_times(model: Filter, compiled: CompiledFilter, batch: Batch) -> np.ndarray:
+def update_times(model: Estimator, compiled: CompiledFilter, batch: Batch) -> np.ndarray:
     """(3, T) processor seconds of every update of one drive: by torch, compiled, and the call in C alone."""
     memory, bias = model.begin(batch)
     numbers, _ = compiled.begin(batch)
