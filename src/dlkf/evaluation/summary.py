@@ -42,7 +42,7 @@ def metrics_of(results: Sequence[Results]) -> dict[str, float]:
 
 def headline(result: Results) -> str:
     """The answer to "how far does the car drift?" in plain words: of the outages asked for, of the best
-    filter and of the best classical one.
+    filter and of the best classical one, or the next where the best is classical.
 
     "60 s without GNSS, 40 outages: plus ends 8.8 m from the reference in the median, within 33 m in 95 % of them (1.4 %
     of the distance driven); best classical filter mbkf21_car 10 m, 41 m." The best has the least median. Of fewer than
@@ -64,7 +64,7 @@ def headline(result: Results) -> str:
     text += _spread(texts[best], count, unit)
     if span and math.isfinite(drift := result.value(best, "outages", "end", "drift", "median")):
         text += f" ({format_number(100 * drift, digits=2)} % of the distance driven)"
-    other = next((n for n in order[1:] if is_classical(n)), None)
+    other = next((n for n in order[1:] if is_classical(best) or is_classical(n)), None)
     if other is not None:
         which = "next" if is_classical(best) else "best classical filter"
         text += f"; {which} {other} {', '.join(texts[other])}"
