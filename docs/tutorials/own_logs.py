@@ -70,7 +70,7 @@ for note in monday.notes:
 # ## Navigate
 #
 # `plus` needs no noise settings. The summary says how many fixes were used, the filter's own 1σ, and whether the
-# innovations fit it (1 is right).
+# innovations fit it (expected: 1).
 
 # %%
 arm = [monday.meta.get(f"lever_arm_{axis}_m", 0.0) for axis in "xyz"]

@@ -34,7 +34,7 @@ def sensor_table(scores: Scores, columns: Mapping[str, Sequence[str]]) -> Result
             rows.append([name, sensor, str(int(seen.sum())), share, spread, ", ".join(found) or "–"])
     if not rows:
         return None
-    note = "Innovation / σ: RMS over the updates that used the sensor, 1 is right. Found: estimates at a run's end."
+    note = "Innovation / σ: RMS over the updates that used the sensor, expected 1. Found: estimates at a run's end."
     return ResultTable(title=TITLE, note=note, columns=COLUMNS, rows=rows)
 
 

@@ -87,7 +87,7 @@ def comparison_page(reports: Sequence[StoredReport]) -> str:
     whole = {r.name: r.path for r in reports}
     columns, rows = end_table(reports)
     about = "Horizontal error; RMS over the segments where there are no outages. Marked: the least median of a test. "
-    about += "Own 1σ: what the filter says of its error (median); innovation / σ: 1 is right, more is too sure."
+    about += "Own 1σ: what the filter says of its error (median); innovation / σ: expected 1, above it overconfident."
     page.heading("At the end of the outages", about)
     page.table(columns, rows, marks=best_of_each(columns, rows, scored_on(reports)), titles=whole)
     page.heading("Horizontal error against the time without GNSS", "Solid: median; dotted: 95 % of the outages.")

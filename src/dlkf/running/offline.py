@@ -127,7 +127,7 @@ class Navigated:
         if np.isfinite(position):
             text += f", final 1σ {position:.2g} m horizontal, {np.degrees(last.std_yaw):.2g}° heading"
         if self.innovation is not None and np.isfinite(spread := self.innovation.normalised_rms):
-            text += f", innovations {spread:.2g} of their 1σ (RMS; 1 is right)"
+            text += f", normalised innovation RMS {spread:.2g} (expected 1)"
         text += "".join(f", {name} {found}" for name, found in self.sensors().items())
         if any(self.refused):
             text += f", {self.refused} beyond physical limits refused"
@@ -151,7 +151,7 @@ class Navigated:
             if table[used].sum() < MOSTLY * seen:
                 said[name] += ", most of them refused: see its unit, sign and clock"
             if seen:
-                said[name] += f" (innovations {np.sqrt((ratio**2).mean()):.2g} of their 1σ)"
+                said[name] += f" (normalised innovation RMS {np.sqrt((ratio**2).mean()):.2g})"
         for std in (column for column in self.sensor_columns if column.startswith("std_")):
             name, last = std.removeprefix("std_"), table.iloc[-1]
             said[name] = f"{last[name]:.4g} ± {last[std]:.2g}"
