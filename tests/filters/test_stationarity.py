@@ -137,6 +137,19 @@ def test_shorter_update_intervals_find_the_same_standstills(speeds):
     assert not taken[(speed > 1.0) & (before > 1.0)].any()
 
 
+def test_a_moment_without_acceleration_is_no_standstill():
+    """Silent cars speed up and slow down by turns of a second at 2 m/s, without GNSS and with a speed known to 0.6 m/s:
+    between the turns a fifth of a second shows no acceleration."""
+    batch = outage(steady((2.0, 2.5), 40, stand_s=0), 0, 40)
+    swing = torch.sin(math.pi * (torch.arange(40 * M, dtype=D) / M)).reshape(40, M)
+    imu, std = batch.imu.clone(), batch.start_std.clone()
+    imu[..., 0] += swing
+    std[:, 3:6] = 0.6
+    start = batch.start._replace(v_n=batch.start.v_n + 2.0 * batch.start.C_nb[..., 0])
+    taken = found(in_fifths(replace(batch, imu=imu, start=start, start_std=std)), "mbkf21_car")
+    assert not taken.any()
+
+
 def test_constraints_say_as_much_in_a_second_of_shorter_update_intervals():
     batch = outage(slipping(4, 90, (0.0, 0.0, 0.0, 0.0, 0.0)), 60, 90)
     kalman = build_filter("mbkf15_nhc", IMU)

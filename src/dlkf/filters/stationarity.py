@@ -32,7 +32,7 @@ UNLEARNED_ACCEL = 0.3  # m/s²: at most so much of the filter's 2σ counts while
 PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 3.0  # m/s, 1σ: a standstill must not contradict the filter
 # m/s: where the samples do not separate the two, a standstill needs a smaller 1σ of the speed
 SILENT_STD = 0.5
-LEAST_S = 1.0  # of a standstill and of a level: shorter update intervals are taken together
+LEAST_S = 1.0  # of a standstill: shorter update intervals are taken together
 
 
 class VibrationLevel(NamedTuple):
@@ -40,14 +40,13 @@ class VibrationLevel(NamedTuple):
 
     standing: Tensor  # (B,) least level of a stationary second
     moving: Tensor  # (B,) likewise
-    variance: Tensor  # (B, 2) of specific force and rate over the last second; 0 before the first sample
     still_s: Tensor  # (B,) s without acceleration or turn
 
     @classmethod
     def begin(cls, like: Tensor, batch_size: int) -> VibrationLevel:
         """Before the first sample."""
         nothing = like.new_full((batch_size,), math.inf)
-        return cls(nothing, nothing, like.new_zeros(batch_size, 2), like.new_zeros(batch_size))
+        return cls(nothing, nothing, like.new_zeros(batch_size))
 
     def limit(self, prior: Float[Tensor, " 1"]) -> Float[Tensor, " B"]:
         """Half way, as logarithms, between stationary and moving; near zero where the two are alike."""
@@ -91,12 +90,9 @@ def detect_stationary(
         return torch.zeros_like(before.standing) > 0, before
     swing = epoch.imu - epoch.imu.mean(1, keepdim=True)  # torch's var of a middle axis takes four times as long
     variance = swing.square().sum(1) / (epoch.imu.shape[1] - 1)
-    variance = variance.unflatten(-1, (2, 3)).sum(-1)
-    span = epoch.dt * epoch.imu.shape[1]
-    if (share := span / LEAST_S) < 1:
-        variance = torch.where(before.variance > 0, (1 - share) * before.variance + share * variance, variance)
-    force, rate = variance.unbind(-1)
+    force, rate = variance.unflatten(-1, (2, 3)).sum(-1).unbind(-1)
     level = (force * rate).sqrt()
+    span = epoch.dt * epoch.imu.shape[1]
     v, diagonal = epoch.window.end.v_n, P.diagonal(dim1=-2, dim2=-1)
     speed, std = v[:, :2].norm(dim=-1), diagonal[:, VELOCITY][:, :2].sum(-1).sqrt()
     tilt, accel = diagonal[:, ATTITUDE][:, :2].sum(-1), diagonal[:, ACCEL].sum(-1)
@@ -112,7 +108,7 @@ def detect_stationary(
         stopped = wheel.stopped & still
         standing, moving = standing & ~wheel.rolling | stopped, (moving | wheel.rolling) & ~stopped
     still_s = torch.where(still, before.still_s + span, 0.0)
-    after = before.update(level, standing, moving, span)._replace(variance=variance, still_s=still_s)
+    after = before.update(level, standing, moving, span)._replace(still_s=still_s)
     # equal spectra: a wide 1σ would admit any speed, so only a speed that is nearly zero and known to be counts
     limit, distinct = after.thresholds(prior)
     doubt = torch.where(distinct, PLAUSIBLE_SIGMAS * std, std.clamp_max(SILENT_STD))

@@ -45,7 +45,6 @@ MEMORY = {  # by the last parts of a field's name
     "std": "1σ across the car [m/s], and at rest: velocity [m/s], rate [rad/s]",
     "liveliness.standing": "least level of a stationary second: spread of force × that of rate [m/s² rad/s]; inf: none",
     "liveliness.moving": "least level of a second of motion, likewise",
-    "liveliness.variance": "variance of force [m²/s⁴] and of rate [rad²/s²] over the last second",
     "liveliness.still_s": "s without acceleration or turn",
     "prior": "prior least level of a second of motion, likewise",
     "structure": "mounting yaw, pitch [rad], distance to the rear axle [m], sideslip [s²/m], pitch gradient [rad s²/m]",
