@@ -121,7 +121,7 @@ def test_a_dataset_through_streams(streets):
     drives = [drive_from_tables(one, "", 50.0, 1.0, torch.float64) for one in checked]
     for whole in navigate_drives(drives, filters):
         found = streamed[whole.drive]
-        assert found.summary() == whole.summary().partition(", innovations")[0]
+        assert found.summary() == whole.summary().partition(", normalised innovation")[0]
         assert apart(found.table, whole.table) < ROUNDING
     tables = checked[0]
     still = {**tables.gnss, **{f"vel_{a}": 0 * tables.gnss["t"] for a in "ned"}}
