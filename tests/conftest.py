@@ -48,6 +48,10 @@ LONG_ROOMS = ("training", "tuning", "tracking", "pipelines", "onboard", "docs") 
 
 WHOLE_FIXTURES = {"uri", "exported", "site", "trained", "cluster", "alone", "server"}
 WHOLE_ROOMS = {"onboard", "pipelines"}
+WHOLE_FILES = {  # that take ten seconds and more
+    "test_aid_logs.py", "test_aid_stream.py", "test_bank.py", "test_configuration.py", "test_faulty_data.py",
+    "test_likelihood.py", "test_recovery.py", "test_refusals.py", "test_silent_cars.py", "test_wheel_faults.py",
+}  # fmt: skip
 
 
 def room(item: pytest.Item) -> str:
@@ -60,7 +64,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     tests come first."""
     seen: set[tuple[Path, str]] = set()
     for item in items:
-        if room(item) in WHOLE_ROOMS or WHOLE_FIXTURES.intersection(getattr(item, "fixturenames", ())):
+        long = room(item) in WHOLE_ROOMS or item.path.name in WHOLE_FILES
+        if long or WHOLE_FIXTURES.intersection(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.whole)
         test = item.path, getattr(item, "originalname", item.name)
         item.stash[FIRST_CASE] = test not in seen

@@ -63,7 +63,8 @@ def test_a_stream_is_a_batch_run(tables, name):
     drive = drive_from_tables(tables, "", **GRID, dtype=torch.float64)
     batch = next(navigate_drives([drive], model, align=CAUSAL))
     assert batch.table["speed_used"].sum() > 40
-    assert re.search(r", speed in 4\d of 4\d updates \(normalised innovation RMS .*, wheel_scale 0\.0[12]\d* ± ", batch.summary())
+    expected = r", speed in 4\d of 4\d updates \(normalised innovation RMS .*, wheel_scale 0\.0[12]\d* ± "
+    assert re.search(expected, batch.summary())
     assert TrackOnMap(batch, None).for_the_map().result.sensors() == batch.sensors()
     for late_s in (0.0, 0.45):
         assert _apart(batch, stream_drive(tables, model, **GRID, late_s=late_s)) < 1e-6, late_s
