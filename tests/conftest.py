@@ -12,6 +12,7 @@ conftest.
 from __future__ import annotations
 
 import fcntl
+import filecmp
 import gc
 import importlib
 import os
@@ -171,14 +172,15 @@ def simulated(once: Once) -> Path:
 @pytest.fixture
 def call(request, tmp_path, monkeypatch, capfd):
     """``call("evaluate", "model=ins", …)`` runs the command's main in an empty folder; where it will need an MLflow
-    store (a test that is ``whole``), that is there."""
+    store (a test that is ``whole``), that is there, and gone again if the command was refused and wrote nothing."""
     monkeypatch.chdir(tmp_path)
     whole = request.node.get_closest_marker("whole") is not None
 
     def run(command: str, *arguments: object) -> Ended:
         main = importlib.import_module(f"dlkf.{command}").main
-        if whole and command in WITH_STORE and not Path("mlflow.db").exists():
-            shutil.copy(request.getfixturevalue("template"), "mlflow.db")
+        store = Path("mlflow.db")
+        if lent := whole and command in WITH_STORE and not store.exists():
+            shutil.copy(empty := request.getfixturevalue("template"), store)
         monkeypatch.setattr(sys, "argv", [f"dlkf.{command}", *map(str, arguments)])
         capfd.readouterr()
         code = 0
@@ -186,6 +188,8 @@ def call(request, tmp_path, monkeypatch, capfd):
             main()
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else 1
+        if lent and code == 2 and filecmp.cmp(store, empty, shallow=False):
+            store.unlink()
         out, err = capfd.readouterr()
         return Ended(code, out, err)
 

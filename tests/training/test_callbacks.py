@@ -12,7 +12,7 @@ from dlkf.base.errors import InputError
 from dlkf.training.callbacks.curriculum import LengthCurriculum
 from dlkf.training.callbacks.guard import StepGuard
 from dlkf.training.callbacks.loss_weights import AdaptiveLossWeights
-from dlkf.training.callbacks.masking import GnssDecimation, OutageInjection
+from dlkf.training.callbacks.masking import GnssDecimation, OutageInjection, SensorLoss
 from tests.filters.scene import scene
 
 
@@ -171,3 +171,20 @@ def test_guard_goes_back_to_the_last_good_epoch_at_a_slower_rate_and_gives_up_at
 def test_settings_that_make_no_sense(make):
     with pytest.raises(InputError):
         make()
+
+
+def test_a_third_of_the_segments_lacks_a_sensor_and_a_third_loses_it():
+    """Rows are whole, gone from a moment on, or gone; GNSS stays; the shares are those asked for."""
+    batch = scene(1, 20)
+    batch = batch.select(torch.zeros(3000, dtype=torch.long))
+    assert SensorLoss().transform(batch, 0, generator()) is batch
+    speed = torch.ones(*batch.size[:2], 5)
+    blanked = SensorLoss().transform(replace(batch, aids={"speed": speed}), 0, generator())
+    rows = blanked.aids["speed"]
+    there = rows.all(-1).sum(1)
+    assert torch.equal(rows, ((torch.arange(20) < there[:, None])[..., None]).expand_as(rows).float())
+    shares = [float((there == k).float().mean()) for k in (0, 20)]
+    assert shares == pytest.approx([1 / 3, 1 / 3 + 1 / 60], abs=0.03) and blanked.available is batch.available
+    assert there[(there > 0) & (there < 20)].float().mean() == pytest.approx(10.0, abs=0.5)
+    with pytest.raises(InputError, match="sensor_loss"):
+        SensorLoss(0.8, 0.3)

@@ -1,5 +1,7 @@
 """The experiment ``plus`` through the same trainer as any learned filter, and fine-tuning of trained weights."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -12,9 +14,13 @@ from dlkf.filters.saved import load_filter
 from dlkf.training.callbacks.sensor_degradation import SensorDegradationCallback
 from dlkf.training.fit import fit
 from dlkf.training.loss import LossConfig, pva_losses, weighted_loss
+from dlkf.training.module import FilterTraining
+from dlkf.training.optimization import OptimizationPlan, OptimizerSettings, SchedulerSettings
 from tests.training.test_resume import fit_of
 
 from .test_resume import data
+
+PLAN = OptimizationPlan(OptimizerSettings(1e-3, 1.0, 0.0), SchedulerSettings())
 
 
 def settings(*overrides: str) -> dict:
@@ -59,6 +65,24 @@ def test_sensor_degradation_takes_its_own_keys_alone():
     assert SensorDegradationCallback(share=0.1).rough.share == 0.1
     with pytest.raises(InputError, match=r"callbacks\.sensor_degradation: unknown key shaar"):
         SensorDegradationCallback(shaar=0.1)
+
+
+def test_a_wheel_of_the_segments_is_used_and_the_weights_stay_the_same(dataset):
+    """Speeds of the reference move the solution, rows that are blank do not, and the gradient reaches the network."""
+    module = data(dataset)
+    module.setup()
+    batch = module.batches("val")[0]
+    truth = batch.truth
+    forward = (truth.C_nb[..., 0] * truth.v_n).sum(-1)
+    rows = torch.stack((forward, *(torch.full_like(forward, x) for x in (0.05, 0.0, 0.0, 1.0))), -1)
+    training = FilterTraining(_small(), LossConfig(prior=0.0, posterior=0.0, outage=1.0), PLAN)
+    with torch.no_grad():
+        alone = training._run(batch).posterior.p_n
+        blank = training._run(replace(batch, aids={"speed": 0 * rows})).posterior.p_n
+    solution = training._run(replace(batch, aids={"speed": rows}))
+    assert torch.equal(alone, blank) and float((solution.posterior.p_n.detach() - alone).abs().max()) > 0.01
+    solution.posterior.p_n.square().sum().backward()
+    assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in training.filter.parameters())
 
 
 def test_without_its_own_weights_fine_tuning_says_so(dataset, tmp_path):

@@ -10,9 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dlkf.data.aid_tables import standard_tables
 from dlkf.data.draws import step_seed
 from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import end_errors, mean_error
+from dlkf.filters.aids.attach import with_aids
 from dlkf.filters.integration import BatchSolution, integrate
 from dlkf.filters.saved import LearnedSettings, learned_filter
 from dlkf.networks.heads import IMU_ERROR_SIZE, INNOVATION_SIZE, STATE_SIZE
@@ -87,7 +89,8 @@ class FilterTraining(L.LightningModule):
         return batch
 
     def _run(self, batch: Batch) -> BatchSolution:
-        return integrate(batch, self.filter, keep_covariances=self.covariances)
+        there = [name for name, rows in batch.aids.items() if bool((rows[..., -1] > 0).any())]
+        return integrate(batch, with_aids(self.filter, standard_tables(there)), keep_covariances=self.covariances)
 
     def _losses(self, batch: Batch) -> Mapping[str, Tensor]:
         return self.loss(self._run(batch), batch)

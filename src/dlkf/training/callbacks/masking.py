@@ -1,8 +1,9 @@
-"""Callbacks that hide GNSS fixes from the filter in training: decimation (R069) and outages (R070)."""
+"""Callbacks that hide measurements in training: GNSS decimation (R069), outages (R070), loss of further sensors."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import lightning as L
@@ -85,6 +86,37 @@ class OutageInjection(BatchCallback):
     def state_dict(self) -> dict:
         """Settings, recorded in a checkpoint."""
         return {k: getattr(self, k) for k in ("duration_s", "before_s", "after_s", "start_epoch")}
+
+
+class SensorLoss(BatchCallback):
+    """Further sensors of the car (wheel speed, …) that a segment lacks, or that fall silent at some moment of it.
+
+    Of the segments a share of ``without`` has none of them, and a share of ``lost`` until a moment that is uniform in
+    the segment; the rest keeps what its drive has. So one set of weights serves cars with a wheel, without, and with
+    one that fails.
+    """
+
+    def __init__(self, without: float = 1 / 3, lost: float = 1 / 3) -> None:
+        shares = (without, lost)
+        if not (all(map(is_number, shares)) and min(shares) >= 0 and sum(shares) <= 1 + 1e-9):
+            raise InputError(
+                f"callbacks.sensor_loss: without is {without!r} and lost {lost!r}, must be shares with a sum ≤ 1"
+            )
+        self.without, self.lost = without, lost
+
+    def transform(self, batch: Batch, epoch: int, generator: torch.Generator) -> Batch:
+        """Blank rows of the batch's sensors."""
+        if not batch.aids:
+            return batch
+        B, T, _ = batch.size
+        kind, moment = torch.rand(2, B, 1, generator=generator)
+        end = torch.where(kind < self.without, 0.0, torch.where(kind < self.without + self.lost, moment, 1.0)) * T
+        there = (torch.arange(T) < end).unsqueeze(-1)
+        return replace(batch, aids={name: rows * there for name, rows in batch.aids.items()})
+
+    def state_dict(self) -> dict:
+        """Settings, recorded in a checkpoint."""
+        return {"without": self.without, "lost": self.lost}
 
 
 def _bounds(name: str, values: Sequence[float]) -> tuple[float, float]:
