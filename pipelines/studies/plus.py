@@ -230,22 +230,23 @@ class WithoutLevels(PlusFilter):
         return super().step(memory._replace(outage=outage), epoch)
 
 
-class WithoutWander(PlusFilter):
-    """``plus`` that takes all errors of fixes for white noise."""
+class AsClaimed(PlusFilter):
+    """``plus`` that takes all errors of positions for white noise of the claimed 1σ."""
 
     def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
-        """With no error that moves."""
-        errors = memory.errors._replace(white=torch.ones_like(memory.errors.white))
+        """With no error that moves, and none that is smaller or larger."""
+        one = torch.ones_like(memory.errors.white)
+        errors = memory.errors._replace(white=one, walk=0 * one, recent=0 * one)
         return super().step(memory._replace(errors=errors), epoch)
 
 
 def parts(folder: str) -> dict[str, Estimator]:
-    """``plus`` with neither levels nor network (its constants), with one of them, and without wander."""
+    """``plus`` with neither levels nor network (its constants), with one of them, and with positions as claimed."""
     whole = trained_filter(folder)
     assert isinstance(whole, PlusFilter)
     found: dict[str, Estimator] = {}
     kinds = {"constants": (WithoutLevels, False), "levels": (PlusFilter, False), "network": (WithoutLevels, True)}
-    kinds["no wander"] = (WithoutWander, True)
+    kinds["positions as claimed"] = (AsClaimed, True)
     for name, (kind, network) in kinds.items():
         found[name] = part = kind(whole.config).eval()
         part.load_state_dict(whole.state_dict())

@@ -38,8 +38,7 @@ def car(segments: int, epochs: int, seed: int = 0):
 
 
 @pytest.mark.parametrize("base", ["mbkf21_car", "mbkf33_car_gated"])
-def test_with_weights_of_zero_it_is_the_classical_filter_to_the_bit(base, monkeypatch):
-    monkeypatch.setattr("dlkf.filters.position_errors.WANDER", 0.0)
+def test_with_weights_of_zero_it_is_the_classical_filter_to_the_bit(base, claimed):
     batch, model = car(3, 10), plus(base)  # no virtual outage is scored so soon
     with torch.no_grad():
         a, b = integrate(batch, model), integrate(batch, build_filter(base, model.imu, tuning=model.tuning))
@@ -80,7 +79,7 @@ def test_weights_matter_in_outages_too():
     assert not torch.allclose(a.std[:, 14], b.std[:, 14])
 
 
-def test_gradient_reaches_the_noise():
+def test_gradient_reaches_the_noise(claimed):
     """From the position in the outage, by finite differences: Riccati recursion and state. Only biases, since what the
     network sees is cut by design; so is Φ in training, for speed, but not here."""
     batch, model = car(2, 14, seed=3), plus(weights=0.05).double()

@@ -123,10 +123,9 @@ def test_one_wild_fix_does_not_decide():
     assert (found[1] / found[0]).log().abs().max() < math.log(1.6)
 
 
-def test_plus_takes_over_the_levels(monkeypatch):
+def test_plus_takes_over_the_levels(claimed):
     """Of a drive with an eighth of the noise: after minutes of fixes an outage's 1σ grows more slowly than that of the
     constants, and in its network's absence not before the first virtual outage was scored."""
-    monkeypatch.setattr("dlkf.filters.position_errors.WANDER", 0.0)
     model = PlusFilter(PlusConfig.from_mapping({"base": "mbkf21", "network": {"hidden": 16}})).eval()
     for p in model.parameters():
         torch.nn.init.zeros_(p)

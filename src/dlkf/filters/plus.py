@@ -4,9 +4,9 @@ States, strapdown, sources and Riccati recursion are those of a classical filter
 white noise. The level of accelerometers and of gyroscopes is slow: virtual outages of 10 to 30 s in the recent past
 show it (:mod:`dlkf.filters.virtual_outages`), and it holds through an outage. A recurrent network adds what is fast, a
 factor for each gyroscope every epoch, in outages too; it sees the samples, the filter's covariance and how well its
-innovations and corrections fit (:mod:`dlkf.filters.matching`). Errors of positions may wander, as far as fixes show
-(:mod:`dlkf.filters.position_errors`). Before the first fix it is ``base`` to the bit; without that wander and with
-weights of zero until the first virtual outage was scored.
+innovations and corrections fit (:mod:`dlkf.filters.matching`). Errors of positions may be smaller than claimed or
+wander, as far as fixes show (:mod:`dlkf.filters.position_errors`). Before the first fix it is ``base`` to the bit; with
+positions as claimed and weights of zero until the first virtual outage was scored.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ ANY_MEMS: Mapping[str, Any] = {  # what is known of an IMU of which nothing is k
         "scale_factor": 5e-3, "misalignment": 5.236e-3,
     },
     "gyro": {
-        "noise_density": 6.98132e-5, "turn_on_bias": 5.236e-3, "instability": 9.69627e-5, "correlation_time": 3600.0,
+        "noise_density": 6.98132e-5, "turn_on_bias": 7.5e-3, "instability": 9.69627e-5, "correlation_time": 3600.0,
         "scale_factor": 5e-3, "misalignment": 5.236e-3,
     },
 }  # fmt: skip
@@ -174,7 +174,8 @@ class PlusFilter(nn.Module):
         levels, same = memory.outage.levels(), torch.ones_like(gyro_noise)
         of_network = torch.stack((same, gyro_noise, same, same), 1)
         process = of_network * torch.cat((levels, torch.ones_like(levels)), -1).unsqueeze(-1)
-        kalman, correction = self.kalman.update(memory.kalman, epoch._replace(advice=NetworkOutput(process)))
+        advice = NetworkOutput(process, memory.errors.noise(epoch, kalman.fix.scale[0, 0, 0]))
+        kalman, correction = self.kalman.update(memory.kalman, epoch._replace(advice=advice))
         with torch.no_grad():
             after = epoch.window.end.corrected(correction.dx)
             forward = (after.C_nb[:, :, 0] * after.v_n).sum(-1)

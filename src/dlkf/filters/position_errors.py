@@ -1,15 +1,20 @@
-"""Errors of a receiver's positions that wander: which part of its 1σ is white, and how fast the rest moves.
+"""Errors of a receiver's positions: which part of its 1σ is white, and how fast the rest moves.
 
 A receiver's 1σ covers all of an error; multipath, orbits and atmosphere change over tens of seconds. A filter that
-treats that part as white noise averages over it and becomes overconfident in its velocity. With the innovation z of a
-fix and the residual r = z − H dx of the one before after its update, the error has changed by
+treats that part as white noise averages over it and becomes overconfident in its velocity. Other receivers claim ten
+times the error that they have. With the innovation z of a fix and the residual r = z − H dx of the one before after
+its update, the error has changed by
 
     u = (zₖ − rₖ₋₁) / σ
 
-and by what the filter's velocity is off, which is little in an update interval. White noise of variance w beside a walk
-of variance q per interval, in units of σ², has E[uₖ²] = 2 w + q and E[uₖ uₖ₋₁] = −w, so running means of both products
-give w and q. What is not white may wander: q is at most the share 1 − w of what a Gauss-Markov process of 1σ
-``WANDER`` σ and correlation time ``WANDER_S`` moves by in Δt, 2 Δt / ``WANDER_S`` of its variance.
+and by what the filter's velocity is off. White noise of variance w beside a walk of variance q per interval, in units
+of σ², has E[uₖ²] = 2 w + q + P_v Δt² / σ² and E[uₖ uₖ₋₁] = −w, so running means of both products give w and q. What is
+not white may wander: q is at most the share 1 − w of what a Gauss-Markov process of 1σ ``WANDER`` σ and correlation
+time ``WANDER_S`` moves by in Δt, 2 Δt / ``WANDER_S`` of its variance.
+
+The noise of a fix is half the mean square by which the error changes in ``NOISE_FIXES`` intervals, w + q n / 2, where
+that is less than claimed; what moves slower is a wander of the position. It rises at once where the last changes are
+larger (``QUICK`` fixes).
 """
 
 from __future__ import annotations
@@ -21,12 +26,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.filters.integration import Covariances, Epoch
-from dlkf.navigation.state import POSITION
+from dlkf.navigation.state import POSITION, VELOCITY
 
 WANDER, WANDER_S = 2.0, 40.0  # σ, s
-USUAL_FIXES = 20.0  # that white noise alone, and the largest walk, count for before anything is known
-MEMORY = 300.0  # fixes
+USUAL_FIXES = 8.0  # that white noise alone, and the largest walk, count for before anything is known
+MEMORY, QUICK = 300.0, 10.0  # fixes
 LARGEST = 5.0  # σ: the most that a change of the error counts
+NOISE_FIXES = 8.0  # an error that changes in more update intervals is no noise
+LEAST_STD = 0.02  # m, the least 1σ of a fix that is made smaller than claimed
 
 
 class PositionErrors(NamedTuple):
@@ -37,19 +44,29 @@ class PositionErrors(NamedTuple):
     successive: Tensor  # (B,) fixes up to the last
     white: Tensor  # (B,) w
     walk: Tensor  # (B,) q
+    recent: Tensor  # (B,) mean of (u² − P_v Δt² / σ²) / 2 over the last fixes
     fixes: Tensor  # (B,) what the means count for
 
     @classmethod
     def begin(cls, like: Tensor, size: int, epoch_s: float) -> PositionErrors:
         """Before the first fix."""
         zero, zeros = like.new_zeros(size), like.new_zeros(size, 3)
-        return cls(zeros, zeros, zero, zero + 1.0, zero + _largest_walk(epoch_s), zero + USUAL_FIXES)
+        return cls(zeros, zeros, zero, zero + 1.0, zero, zero, zero + USUAL_FIXES)
 
     def variance(self, epoch: Epoch) -> Float[Tensor, "B 3"]:
         """By which the errors of the positions have moved in this update interval [m²]; zero without a fix."""
         largest = (1 - self.white.clamp(0.0, 1.0)) * _largest_walk(epoch.dt * epoch.imu.shape[1])
         std = torch.where(epoch.used[:, POSITION], epoch.fix.std[:, POSITION], 0.0)
         return torch.minimum(self.walk.clamp_min(0.0), largest).unsqueeze(-1) * std.square()
+
+    def noise(self, epoch: Epoch, position_std: Float[Tensor, ""]) -> Float[Tensor, "B 4"]:
+        """Factors on the 1σ of position, horizontal and down, and of velocity (1), of a filter that takes positions
+        for ``position_std`` times as noisy as claimed."""
+        slow = self.white.clamp_min(0.0) + 0.5 * NOISE_FIXES * self.walk.clamp_min(0.0)
+        factor = torch.maximum(slow, 0.5 * self.recent).clamp_min(1e-6).sqrt().unsqueeze(-1)
+        least = LEAST_STD / (position_std * epoch.fix.std[:, [0, 2]]).clamp_min(LEAST_STD)
+        factor = torch.maximum(factor, least).clamp_max(1.0)
+        return torch.cat((factor, torch.ones_like(factor)), -1)
 
     def after(self, epoch: Epoch, c: Covariances) -> PositionErrors:
         """After an update of the filter."""
@@ -61,14 +78,19 @@ class PositionErrors(NamedTuple):
         change = change * (LARGEST / change[:, :2].norm(dim=-1, keepdim=True).clamp_min(LARGEST))
         successive = torch.where(fixed, self.successive + 1, 0.0)
         square, product = (0.5 * (change * x)[:, :2].sum(-1) for x in (change, self.change))  # horizontal
+        span = epoch.dt * epoch.imu.shape[1]
+        of_velocity = c.predicted.diagonal(dim1=-2, dim2=-1)[:, VELOCITY] * (span / std).square()
         fixes = (self.fixes + 1).clamp_max(MEMORY)
         white = self.white - (product + self.white) / fixes
+        square = square - 0.5 * of_velocity[:, :2].sum(-1)
         walk = self.walk + (square + 2 * product - self.walk) / fixes
+        recent = self.recent + (0.5 * square - self.recent) / QUICK
         counts = successive >= 3  # two changes of the error
         residual = z - torch.bmm(c.H[:, POSITION], c.dx.unsqueeze(-1)).squeeze(-1)
         return PositionErrors(
             torch.where(used, residual, 0.0), change, successive, torch.where(counts, white, self.white),
-            torch.where(counts, walk, self.walk), torch.where(counts, fixes, self.fixes),
+            torch.where(counts, walk, self.walk), torch.where(counts, recent, self.recent),
+            torch.where(counts, fixes, self.fixes),
         )  # fmt: skip
 
 

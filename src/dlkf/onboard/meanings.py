@@ -106,6 +106,7 @@ MEMORY = {  # by the last parts of a field's name
     "errors.successive": "fixes in successive epochs",
     "errors.white": "white part of the variance of positions",
     "errors.walk": "variance by which errors of positions move in an epoch, over that of a position",
+    "errors.recent": "half the mean square change of the error over the last fixes, of the variance of positions",
     "errors.fixes": "fixes that both count for",
     "memory.gyro_noise": "the network's last factors on the gyroscopes' noise; forward, right, down",
 }
