@@ -85,7 +85,7 @@ def test_a_fix_gets_the_noise_that_it_has():
     assert (begin == 1).all() and 0.8 < after[0].mean() < 1.2 and after[0].min() > 0.7
     assert 0.3 < after[1].mean() < 0.45
     rises = factors[[99, 109], 2, :, 0].mean(1)
-    assert rises[0] < 0.5 and rises[1] > 0.45
+    assert rises[0] < 0.47 and rises[1] > 0.52
 
 
 def test_what_moves_slowly_is_no_noise():

@@ -29,7 +29,7 @@ from dlkf.filters.integration import Covariances, Epoch
 from dlkf.navigation.state import POSITION, VELOCITY
 
 WANDER, WANDER_S = 2.0, 40.0  # σ, s
-USUAL_FIXES = 20.0  # that white noise alone, and the largest walk, count for before anything is known
+USUAL_FIXES = 20.0  # that white noise as claimed counts for before anything is known
 MEMORY, QUICK = 300.0, 10.0  # fixes
 LARGEST = 5.0  # σ: the most that a change of the error counts
 NOISE_FIXES = 8.0  # an error that changes in more update intervals is no noise

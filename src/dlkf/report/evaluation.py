@@ -109,14 +109,14 @@ def evaluation_page(
     many = len(results) > 1
     answers = [f"{r.kind.capitalize()} data. {headline(r)}" if many else headline(r) for r in results]
     own = protocol.get("reference")
-    truth = "reference" if own else "truth"
     answers += [f"No truth: errors are against the {own}."] if own else []
     page = Page(f"Evaluation on {dataset}", answers, warnings=sigma_warnings(scores))
     first = [t for t in parts if "outage" in t.title or t.title == SENSORS_TITLE]
     for result in results:
         kind = f"{result.kind}: " if many else ""
         tables = [t for t in first if not many or f"({result.kind})" in t.title]
-        _answer(page, scores.of_kind(result.kind), result, kind, baseline, truth, tables)
+        named = "truth" if result.kind == "simulated" and not own else "reference"
+        _answer(page, scores.of_kind(result.kind), result, kind, baseline, named, tables)
     _add_tables(page, [t for t in first if many and not any(f"({r.kind})" in t.title for r in results)])
     for result in results:
         _research(page, scores.of_kind(result.kind), f"{result.kind}: " if many else "", baseline)
