@@ -20,7 +20,8 @@ STD, TAU = 2.0, 40.0  # m, s
 class Watched:
     """A Kalman filter with the errors of its fixes beside it."""
 
-    def __init__(self):
+    def __init__(self, speed=1.0):
+        self.speed = speed  # of the true one
         self.kalman = build_filter("mbkf21", imu_spec(ANY_MEMS), tuning=Tuning(position_std=2.0))
         self.errors, self.variances, self.noises = [], [], []
 
@@ -33,18 +34,20 @@ class Watched:
         self.variances.append(errors.variance(epoch))
         self.noises.append(errors.noise(epoch, kalman.fix.scale[0, 0, 0]))
         kalman, correction = self.kalman.step(kalman, epoch)
-        self.errors.append(errors.after(epoch, correction.covariances))
+        end = epoch.window.end
+        window = epoch.window._replace(end=end._replace(v_n=self.speed * end.v_n))
+        self.errors.append(errors.after(epoch._replace(window=window), correction.covariances))
         return (kalman, self.errors[-1]), correction
 
 
-def watched(errors, available=None):
+def watched(errors, available=None, speed=1.0):
     """Of cars whose positions have these errors (B, T, 3) and a 1σ of 2 m."""
     batch = scene(*errors.shape[:2], seed=5, position_std=1e-3)
     gnss, std = batch.gnss.clone(), batch.gnss_std.clone()
     gnss[..., :3] += errors
     std[..., :3] = STD
     batch = replace(batch, gnss=gnss, gnss_std=std)
-    run = Watched()
+    run = Watched(speed)
     with torch.inference_mode():
         integrate(batch if available is None else replace(batch, available=available), run)
     return run
@@ -72,6 +75,12 @@ def test_without_pairs_of_fixes_nothing_is_learned():
     available = (torch.arange(30) % 2 == 0).expand(2, -1)
     run = watched(torch.zeros(2, 30, 3).double(), available)
     assert (run.errors[-1].white == 1).all() and (torch.stack(run.variances) == 0).all()
+
+
+def test_a_receiver_that_holds_its_position_at_a_stop_is_not_taken_for_exact():
+    run = watched(torch.zeros(2, 60, 3).double(), speed=0.0)
+    assert (run.errors[-1].white == 1).all() and (torch.stack(run.noises) == 1).all()
+    assert (watched(torch.zeros(2, 60, 3).double()).noises[-1][:, 0] < 0.6).all()
 
 
 def test_a_fix_gets_the_noise_that_it_has():
