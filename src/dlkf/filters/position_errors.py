@@ -14,7 +14,8 @@ time ``WANDER_S`` moves by in Δt, 2 Δt / ``WANDER_S`` of its variance.
 
 The noise of a fix is half the mean square by which the error changes in ``NOISE_FIXES`` intervals, w + q n / 2, where
 that is less than claimed; what moves slower is a wander of the position. It rises at once where the last changes are
-larger (``QUICK`` fixes). Fixes of a stationary car say nothing: many receivers hold their position then.
+larger (``QUICK`` fixes). Fixes of a stationary car count only where the carrier phase gives them: other receivers hold
+their position then.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ USUAL_FIXES = 20.0  # that white noise as claimed counts for before anything is 
 MEMORY, QUICK = 300.0, 10.0  # fixes
 LARGEST = 5.0  # σ: the most that a change of the error counts
 NOISE_FIXES = 8.0  # an error that changes in more update intervals is no noise
-MOVING = 1.0  # m/s: slower cars are left out
+MOVING, CARRIER_STD = 1.0, 0.2  # m/s, m: slower cars are left out but of a receiver that claims less than this
 LEAST_STD = 0.02  # m, the least 1σ of a fix that is made smaller than claimed
 
 
@@ -86,8 +87,8 @@ class PositionErrors(NamedTuple):
         square = square - 0.5 * of_velocity[:, :2].sum(-1)
         walk = self.walk + (square + 2 * product - self.walk) / fixes
         recent = self.recent + (0.5 * square - self.recent) / QUICK
-        moving = epoch.window.end.v_n.norm(dim=-1) > MOVING
-        counts = (successive >= 3) & moving  # two changes of the error
+        shown = (epoch.window.end.v_n.norm(dim=-1) > MOVING) | (std[:, :2].amax(-1) < CARRIER_STD)
+        counts = (successive >= 3) & shown  # two changes of the error
         residual = z - torch.bmm(c.H[:, POSITION], c.dx.unsqueeze(-1)).squeeze(-1)
         return PositionErrors(
             torch.where(used, residual, 0.0), change, successive, torch.where(counts, white, self.white),
