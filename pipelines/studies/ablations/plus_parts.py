@@ -1,0 +1,45 @@
+"""``plus`` without one of its parts, for :mod:`pipelines.studies.plus`."""
+
+from __future__ import annotations
+
+import torch
+
+from dlkf.filters.integration import Correction, Epoch, Estimator
+from dlkf.filters.plus import PlusFilter, PlusMemory
+from dlkf.filters.shipped import trained_filter
+
+
+class WithoutLevels(PlusFilter):
+    """``plus`` whose virtual outages show it nothing."""
+
+    def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
+        """With the levels of the start."""
+        outage = memory.outage._replace(evidence=torch.zeros_like(memory.outage.evidence))
+        return super().step(memory._replace(outage=outage), epoch)
+
+
+class AsClaimed(PlusFilter):
+    """``plus`` that takes all errors of positions for white noise of the claimed 1σ."""
+
+    def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
+        """With no error that moves, and none that is smaller or larger."""
+        one = torch.ones_like(memory.errors.white)
+        errors = memory.errors._replace(white=one, walk=0 * one, recent=0 * one)
+        return super().step(memory._replace(errors=errors), epoch)
+
+
+def parts(folder: str) -> dict[str, Estimator]:
+    """``plus`` with neither levels nor network (its constants), with one of them, and with positions as claimed."""
+    whole = trained_filter(folder)
+    assert isinstance(whole, PlusFilter)
+    found: dict[str, Estimator] = {}
+    kinds = {"constants": (WithoutLevels, False), "levels": (PlusFilter, False), "network": (WithoutLevels, True)}
+    kinds["positions as claimed"] = (AsClaimed, True)
+    for name, (kind, network) in kinds.items():
+        found[name] = part = kind(whole.config).eval()
+        part.load_state_dict(whole.state_dict())
+        if not network:
+            with torch.no_grad():
+                for weights in part.network.parameters():
+                    weights.zero_()
+    return found
