@@ -12,7 +12,7 @@ of σ², has E[uₖ²] = 2 w + q + P_v Δt² / σ² and E[uₖ uₖ₋₁] = −
 not white may wander: q is at most the share 1 − w of what a Gauss-Markov process of 1σ ``WANDER`` σ and correlation
 time ``WANDER_S`` moves by in Δt, 2 Δt / ``WANDER_S`` of its variance.
 
-The noise of a fix is half the mean square by which the error changes in ``NOISE_FIXES`` intervals, w + q n / 2, where
+The noise of a fix is half the mean square by which the error changes in ``NOISE_S``, w + q ``NOISE_S`` / 2 Δt, where
 that is less than claimed; what moves slower is a wander of the position. It rises at once where the last changes are
 larger (``QUICK`` fixes). Fixes of a stationary car count only where the carrier phase gives them: other receivers hold
 their position then.
@@ -33,7 +33,7 @@ WANDER, WANDER_S = 2.0, 40.0  # σ, s
 USUAL_FIXES = 20.0  # that white noise as claimed counts for before anything is known
 MEMORY, QUICK = 300.0, 10.0  # fixes
 LARGEST = 5.0  # σ: the most that a change of the error counts
-NOISE_FIXES = 8.0  # an error that changes in more update intervals is no noise
+NOISE_S = 8.0  # an error that takes longer to change is no noise
 MOVING, CARRIER_STD = 1.0, 0.2  # m/s, m: slower cars are left out but of a receiver that claims less than this
 LEAST_STD = 0.02  # m, the least 1σ of a fix that is made smaller than claimed
 
@@ -64,7 +64,8 @@ class PositionErrors(NamedTuple):
     def noise(self, epoch: Epoch, position_std: Float[Tensor, ""]) -> Float[Tensor, "B 4"]:
         """Factors on the 1σ of position, horizontal and down, and of velocity (1), of a filter that takes positions
         for ``position_std`` times as noisy as claimed."""
-        slow = self.white.clamp_min(0.0) + 0.5 * NOISE_FIXES * self.walk.clamp_min(0.0)
+        intervals = NOISE_S / (epoch.dt * epoch.imu.shape[1])
+        slow = self.white.clamp_min(0.0) + 0.5 * intervals * self.walk.clamp_min(0.0)
         factor = torch.maximum(slow, 0.5 * self.recent).clamp_min(1e-6).sqrt().unsqueeze(-1)
         least = LEAST_STD / (position_std * epoch.fix.std[:, [0, 2]]).clamp_min(LEAST_STD)
         factor = torch.maximum(factor, least).clamp_max(1.0)
