@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+pytest.register_assert_rewrite("tests.worlds")
+
 FIRST_CASE = pytest.StashKey[bool]()
 LONG_ROOMS = ("training", "tuning", "tracking", "pipelines", "onboard", "docs")  # begin first, so that none ends last
 
