@@ -14,6 +14,7 @@ import filecmp
 import importlib
 import os
 import shutil
+import sqlite3
 import sys
 import threading
 from collections.abc import Callable
@@ -184,7 +185,13 @@ def call(request, tmp_path, monkeypatch, capfd):
 
 @pytest.fixture(scope="session")
 def template(once: Once) -> Path:
-    """A store without a run: MLflow takes seconds to make its tables."""
+    """A store without a run: MLflow takes seconds to make its tables, and SQLite waits for the disk at every commit."""
+    from sqlalchemy import Engine, event
+
+    @event.listens_for(Engine, "connect")
+    def need_no_disk(connection, _):
+        if isinstance(connection, sqlite3.Connection):
+            connection.execute("PRAGMA synchronous = OFF")
 
     def make(folder: Path) -> None:
         mlflow_module().MlflowClient(f"{SQLITE}{folder / 'mlflow.db'}").search_experiments()
