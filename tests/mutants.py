@@ -28,7 +28,7 @@ LIST = Path(__file__).with_suffix(".yaml")
 COPIED = ("src", "tests", "conf", "docs", "pipelines", "pyproject.toml", "README.md", "RESULTS.md", "Makefile")
 LOADED = (
     "pytest",
-    "tests.conftest",
+    "tests.worlds",
     "scipy.stats",
     "scipy.linalg",
     "scipy.spatial.transform",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -31,6 +32,7 @@ GLUED = {"command", "training", "tracking", *FLOORS[-3]}  # rooms that may impor
 GLUE_FILES = {"dlkf.data.datamodule"}
 
 
+@cache
 def modules() -> dict[str, set[str]]:
     """Every module of the package and all that it imports, lazily too; ``__init__`` under its package's name."""
     files = {_name(f): f for f in SRC.glob("dlkf/**/*.py")}
@@ -59,12 +61,9 @@ def _room(module: str) -> str:
     return (module.split(".") + [""])[1]
 
 
-IMPORTS = modules()
-
-
 def test_imports_from_below() -> None:
     wrong = []
-    for module, targets in sorted(IMPORTS.items()):
+    for module, targets in sorted(modules().items()):
         mine = FLOOR[_room(module)]
         for target in sorted(t for t in targets if t.startswith("dlkf")):
             if FLOOR[_room(target)] > mine:
@@ -75,12 +74,12 @@ def test_imports_from_below() -> None:
 
 
 def test_no_circle_between_files() -> None:
-    inside = {m: {t for t in targets if t in IMPORTS and t != m and "." in t} for m, targets in IMPORTS.items()}
+    inside = {m: {t for t in targets if t in modules() and t != m and "." in t} for m, targets in modules().items()}
     list(TopologicalSorter(inside).static_order())
 
 
 def test_floors_below_the_glue_do_without_it() -> None:
-    plain = {m: t for m, t in IMPORTS.items() if _room(m) not in GLUED and m not in GLUE_FILES}
+    plain = {m: t for m, t in modules().items() if _room(m) not in GLUED and m not in GLUE_FILES}
     wrong = {m: glue for m, targets in plain.items() if (glue := {t.partition(".")[0] for t in targets} & GLUE)}
     assert not wrong, wrong
 
@@ -89,9 +88,9 @@ def test_navigating_needs_neither_scoring_nor_training() -> None:
     reached, todo = set(), ["dlkf.navigate"]
     while todo:
         module = todo.pop()
-        if module not in reached and module in IMPORTS:
+        if module not in reached and module in modules():
             reached.add(module)
-            todo += IMPORTS[module]
+            todo += modules()[module]
     rooms = {_room(m) for m in reached}
     assert not rooms & {"evaluation", "training", "tuning", "diagnosis", "simulation"}, rooms
 
@@ -103,8 +102,8 @@ def test_what_reads_drives_loads_no_simulator() -> None:
         loaded, todo = set(), [f"dlkf.{command}"]
         while todo:
             module = todo.pop()
-            if module in IMPORTS and module not in loaded:
+            if module in modules() and module not in loaded:
                 loaded.add(module)
-                todo += IMPORTS[module]
+                todo += modules()[module]
         simulating[command] = [m for m in loaded if m.startswith("dlkf.simulation") or len(loaded) < 20]
     assert not any(simulating.values()), simulating

@@ -23,6 +23,7 @@ from tests.jobs import ended, half
 from tests.numbers_in import numbers_in
 from tests.shell import start_fork
 
+COMMANDS = ("dlkf.simulate", "dlkf.navigate", "dlkf.evaluate", "dlkf.ingest")
 DRIVES = 16
 SHORT = (f"dataset.hours={DRIVES * 15 / 3600}", "dataset.drive_minutes=0.25", "dataset.imu_rate_hz=50", "seed=5")
 
@@ -38,10 +39,12 @@ def alone(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def cluster():
-    """A scheduler and two workers, each a process."""
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as made:
-        yield made
+    """A scheduler and two workers, each a process, forked from one that has loaded what the commands need."""
+    dask, distributed = pytest.importorskip("dask"), pytest.importorskip("distributed")
+    with dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
+        distributed.utils.get_mp_context().set_forkserver_preload(["distributed", *COMMANDS])
+        with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as made:
+            yield made
 
 
 @pytest.fixture

@@ -91,11 +91,13 @@ def tried_models(seeds: range, town: Path, sound: Path, call: Callable[..., Ende
     return wrong
 
 
+@pytest.mark.whole
 @pytest.mark.filterwarnings("ignore")
 def test_some_spoilt_datasets(town, call):
     assert tried_datasets(range(0, DATASETS, DATASETS // 10), town, call) == []
 
 
+@pytest.mark.whole
 @pytest.mark.filterwarnings("ignore")
 def test_some_spoilt_models(town, small_model, call):
     assert tried_models(range(0, MODELS, MODELS // 10), town, small_model, call) == []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -84,19 +85,26 @@ def test_marks_and_letters_of_windows(tmp_path):
     pd.testing.assert_frame_equal(drive.imu, car(12)["imu"], check_exact=False, atol=1e-9)
 
 
-def _ubx(folder: Path, keep: int) -> Path:
-    """A UBX log that ends at a byte, counted from the end where below zero, beside a table of its IMU."""
-    tables = car(90)
+@pytest.fixture(scope="module")
+def logged(tmp_path_factory) -> Path:
+    """A UBX log of 90 s beside a table of its IMU."""
+    folder, tables = tmp_path_factory.mktemp("logged"), car(90)
     ubx(folder, tables)
+    tables["imu"].to_csv(folder / "imu.csv", index=False)
+    return folder
+
+
+def cut(logged: Path, folder: Path, keep: int) -> Path:
+    """The log as it ends at a byte, counted from the end where below zero, with the table."""
+    shutil.copytree(logged, folder, dirs_exist_ok=True)
     log = folder / "drive.ubx"
     log.write_bytes(log.read_bytes()[:keep])
-    tables["imu"].to_csv(folder / "imu.csv", index=False)
     return log
 
 
-def test_a_ubx_log_without_its_last_bytes_says_so(tmp_path):
+def test_a_ubx_log_without_its_last_bytes_says_so(logged, tmp_path):
     """It is read but for the last message: as the receiver leaves it when the power goes."""
-    (drive,) = read(_ubx(tmp_path, -5), ["reader=ubx"])
+    (drive,) = read(cut(logged, tmp_path, -5), ["reader=ubx"])
     assert len(drive.gnss) == len(car(90)["gnss"])  # the last message is a NAV-COV
     said = re.compile(r"drive.ubx: the last message is cut off or damaged: \d+ bytes left out")
     assert any(map(said.fullmatch, drive.notes))
@@ -109,8 +117,8 @@ def test_a_ubx_log_without_its_last_bytes_says_so(tmp_path):
         (4000, "drive.ubx has [12] fix.*, which are not the motion of a car; drive.ubx: the last message is cut off"),
     ],
 )
-def test_hardly_anything_of_a_ubx_log_is_one_line(keep, said, tmp_path):
-    _ubx(tmp_path, keep)
+def test_hardly_anything_of_a_ubx_log_is_one_line(keep, said, logged, tmp_path):
+    cut(logged, tmp_path, keep)
     with pytest.raises(InputError, match=said) as refused:
         list(AutoReader(imu={"file": "imu.csv"}).read(tmp_path))
     assert "\n" not in str(refused.value)

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from dlkf.command.composing import compose_command
-from tests.conftest import Once
 from tests.drives import drives_in
 from tests.shell import Ended
+from tests.worlds import Once
 
 Run = Callable[[Sequence[str]], None]
 # what makes a command small; an override that is not wanted stands later in the line than the page's own

@@ -125,6 +125,7 @@ def as_hydra_takes_it(command: str, word: str) -> str:
     return quote_argument(f"{groups[key]}@{key}={value}" if equals and key in groups else word)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("lines", [SHELL, PRESETS], ids=["pages", "presets"])
 def test_every_command_line_exists(lines: list[tuple[Path, tuple[str, ...]]], mine: Path) -> None:
     assert len(lines) > 50

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.docs.pages import ROOT, blocks
 
 
+@pytest.mark.whole
 def test_the_blocks_run(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     space: dict = {"__name__": "page"}

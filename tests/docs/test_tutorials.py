@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import sys
 from pathlib import Path
 
@@ -24,10 +25,13 @@ def pages() -> list[str]:
 
 @pytest.mark.whole
 @pytest.mark.parametrize("name", pages())
-def test_a_tutorial_runs_and_its_page_is_of_it(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_tutorial_runs_and_its_page_is_of_it(
+    name: str, tmp_path: Path, template: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its cells, as many pictures, and the same words in what it prints (figures depend on the machine)."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(ROOT / "src"), os.environ.get("PYTHONPATH", ""))))
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    shutil.copy(template, tmp_path)
     page, pictures = tutorials.page_of(tutorials.execute(name, tmp_path), name)
     committed = (tutorials.FOLDER / f"{name}.md").read_text()
     assert tutorials.code_blocks(page) == tutorials.code_blocks(committed), "run docs/site/tutorials.py"

@@ -41,6 +41,7 @@ def standing():
     )  # fmt: skip
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("name", ["mbkf21_car", "mbkf33_car"])
 def test_a_car_whose_wheel_stands_does_not_slide_sideways(standing, name):
     model = with_aids(build_filter(name, IMU), [STANDARD["speed"]])

@@ -43,6 +43,17 @@ def _put(x: tuple, place: int, value) -> tuple:
     return (*x[:place], value, *x[place + 1 :])
 
 
+def _one_by_one(kind: str, width: float, *changes: Callable[[tuple], tuple | list[tuple]]) -> Fault:
+    """A call of the kind in every other second from 20 s on, each changed in its own way."""
+
+    def made(sent: Calls) -> Calls:
+        for k, change in enumerate(changes):
+            sent = _changed(kind, _at(20.0 + 2 * k, width), change)(sent)
+        return sent
+
+    return made
+
+
 SENSORS = ("speed", "heading", "baro")
 
 
@@ -131,83 +142,90 @@ def _frozen(sent: Calls) -> Calls:
 
 
 WITHOUT_VELOCITY = [nan] * 3
-OFF = _changed("gnss", _between(25.5, 50.5), lambda x: _put(x, 1, x[1] + 0.18))  # 20 km
-JUMPS_LATE: dict[str, tuple[Fault, Fault]] = {  # what the receiver says, and which of its fixes come late
+JUMPS: dict[str, Fault] = {
+    "fixes 20 km off for 25 s": _changed("gnss", _between(25.5, 50.5), lambda x: _put(x, 1, x[1] + 0.18)),
+    "a frozen receiver": _frozen,
+}
+OFF, FROZEN = JUMPS
+JUMPS_LATE: dict[str, tuple[str, Fault]] = {  # what the receiver says, and which of its fixes come late
     "fixes 20 km off, the last good one late": (OFF, _late(8.0, 24.5, 25.5)),
     "fixes 20 km off, some of them late": (OFF, _late(6.0, 30.5, 32.5)),
     "fixes 20 km off, the first good ones after them late": (OFF, _late(7.0, 50.5, 52.5)),
-    "a frozen receiver, and late fixes": (_frozen, _late(5.0, 29.5, 33.5)),
+    "a frozen receiver, and late fixes": (FROZEN, _late(5.0, 29.5, 33.5)),
 }
 COARSE = _changed("gnss", lambda t: True, lambda x: (*x[:4], WITHOUT_VELOCITY, [3.0] * 3 + WITHOUT_VELOCITY, x[6]))
 AROUND = (48.8, 9.2, 300.0)  # some place, far from the drive
-FAULTS: dict[str, tuple[Fault, set[str]]] = {
-    "none": (lambda sent: sent, {"taken"}),
-    "a sample missing": (_changed("imu", _at(30.0), lambda x: []), set()),
-    "a sample twice": (_changed("imu", _at(30.0), lambda x: [x, x]), {"double"}),
-    "samples in the wrong order": (_changed("imu", _at(30.0), lambda x: [x, _put(x, 0, x[0] - 0.02)]), {"back"}),
-    "a tenth of the samples missing": (_lost(0.1), set()),
-    "stamps that jitter": (_stamps(_jitter(1, 3e-3)), set()),
-    "an IMU's clock 500 ppm fast": (_stamps(lambda t: t * 1.0005), set()),
-    "samples at half the rate": (lambda sent: [c for k, c in enumerate(sent) if k % 2 or c.kind != "imu"], set()),
-    "a gap of 0.2 s": (_changed("imu", _between(30.1, 30.3), lambda x: []), set()),
-    "a gap of 3 s": (_changed("imu", _between(30.1, 33.1), lambda x: []), {"gap", "restarted"}),
-    "clocks set back 50 s": (_clock(30.5, -50.0), {"back", "restarted"}),
-    "clocks set ahead 1e6 s": (_clock(30.5, 1e6), {"gap", "restarted"}),
-    "a sample of NaN": (_changed("imu", _at(30.0), lambda x: _put(x, 1, [0.0, nan, 0.0])), {"not_finite"}),
-    "a stamp of NaN": (_changed("imu", _at(30.0), lambda x: _put(x, 0, nan)), {"not_finite"}),
-    "1e6 m/s² in a sample": (_changed("imu", _at(30.0), lambda x: _put(x, 1, [1e6, 0.0, 0.0])), {"implausible"}),
-    "a gyroscope at 100 rad/s": (_changed("imu", _at(30.0), lambda x: _put(x, 2, [0.0, 100.0, 0.0])), {"implausible"}),
-    "no fixes for 20 s": (_changed("gnss", _between(25.0, 45.0), lambda x: []), set()),
-    "fixes 3 s late": (_late(3.0), {"replayed"}),
-    "fixes 9.5 s late": (_late(9.5, 20.0), {"replayed"}),
-    "fixes 15 s late": (_late(15.0, 25.0), {"late"}),
-    "all fixes late from the start on": (_late(6.3), {"replayed"}),
-    "a fix twice": (_changed("gnss", _at(30.0, 0.5), lambda x: [x, x]), {"double"}),
-    "an older fix of the same interval": (
-        _changed("gnss", _at(30.0, 0.5), lambda x: [x, _put(x, 0, x[0] - 0.3)]), {"superseded"}),
-    "a fix without velocity": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 4, WITHOUT_VELOCITY)), set()),
-    "positions alone": (_changed("gnss", lambda t: True, lambda x: _put(x, 4, WITHOUT_VELOCITY)), set()),
-    "coarse positions alone": (COARSE, set()),
-    "coarse positions alone, 3 s late": (lambda sent: _late(3.0)(COARSE(sent)), {"replayed"}),
-    "no 1σ": (_changed("gnss", lambda t: True, lambda x: _put(x, 5, [nan] * 6)), set()),
-    "a fix of NaN": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 1, nan)), {"no_fix"}),
-    "a fix of quality 0": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 6, 0)), {"no_fix"}),
-    "a fix of quality 77": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 6, 77)), {"no_fix"}),
-    "an infinite height": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 3, inf)), {"not_finite"}),
-    "a latitude of 95°": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 1, 95.0)), {"outside"}),
-    "a 1σ of −1": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 5, [-1.0] * 6)), {"outside"}),
-    "a fix at 0°, 0°": (_changed("gnss", _at(30.0, 0.5), lambda x: (x[0], 0.0, 0.0, 0.0, *x[4:])), {"implausible_fix"}),
-    "a fix 5 km off": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 1, x[1] + 0.045)), {"implausible_fix"}),
+FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
+    "none": (lambda sent: sent, ("taken",)),
+    "single samples": (_one_by_one(
+        "imu", 0.015,
+        lambda x: [],  # missing
+        lambda x: [x, x],
+        lambda x: [x, _put(x, 0, x[0] - 0.02)],  # in the wrong order
+        lambda x: _put(x, 1, [0.0, nan, 0.0]),
+        lambda x: _put(x, 0, nan),
+        lambda x: _put(x, 1, [1e6, 0.0, 0.0]),
+        lambda x: _put(x, 2, [0.0, 100.0, 0.0]),
+    ), ("double", "back", "not_finite", "not_finite", "implausible", "implausible")),
+    "single fixes": (_one_by_one(
+        "gnss", 0.5,
+        lambda x: [x, x],
+        lambda x: [x, _put(x, 0, x[0] - 0.3)],  # an older one of the same interval
+        lambda x: _put(x, 4, WITHOUT_VELOCITY),
+        lambda x: [x, _put(x, 0, x[0] + 100)],  # ahead of the samples
+        lambda x: _put(x, 1, nan),
+        lambda x: _put(x, 6, 0),  # quality
+        lambda x: _put(x, 6, 77),
+        lambda x: _put(x, 3, inf),
+        lambda x: _put(x, 1, 95.0),
+        lambda x: _put(x, 5, [-1.0] * 6),
+        lambda x: (x[0], 0.0, 0.0, 0.0, *x[4:]),
+        lambda x: _put(x, 1, x[1] + 0.045),  # 5 km off
+        lambda x: _put(x, 3, 2e4),
+        lambda x: _put(x, 4, [300.0, 0.0, 0.0]),
+    ), ("double", "superseded", "ahead", *3 * ("no_fix",), "not_finite", *2 * ("outside",), *4 * ("implausible_fix",))),
+    "single samples of sensors": (lambda sent: _changed(
+        "baro", _at(50.0, 1.0), lambda x: [x, _put(x, 0, x[0] + 100)]
+    )(_changed(
+        "heading", _between(25, 35), lambda x: [_put(x, 0, x[0] - 0.2), x, _put(x, 0, x[0] - 0.4)]
+    )(_one_by_one(
+        "speed", 0.5, lambda x: _put(x, 1, nan), lambda x: [x, x]
+    )(sent))), ("not_finite", "double", "ahead")),
+    "a tenth of the samples missing": (_lost(0.1), ()),
+    "stamps that jitter": (_stamps(_jitter(1, 3e-3)), ()),
+    "an IMU's clock 500 ppm fast": (_stamps(lambda t: t * 1.0005), ()),
+    "samples at half the rate": (lambda sent: [c for k, c in enumerate(sent) if k % 2 or c.kind != "imu"], ()),
+    "a gap of 0.2 s": (_changed("imu", _between(30.1, 30.3), lambda x: []), ()),
+    "a gap of 3 s": (_changed("imu", _between(30.1, 33.1), lambda x: []), ("gap", "restarted")),
+    "clocks set back 50 s": (_clock(30.5, -50.0), ("back", "restarted")),
+    "clocks set ahead 1e6 s": (_clock(30.5, 1e6), ("gap", "restarted")),
+    "no fixes for 20 s": (_changed("gnss", _between(25.0, 45.0), lambda x: []), ()),
+    "fixes 3 s late": (_late(3.0), ("replayed",)),
+    "fixes 9.5 s late": (_late(9.5, 20.0), ("replayed",)),
+    "fixes 15 s late": (_late(15.0, 25.0), ("late",)),
+    "all fixes late from the start on": (_late(6.3), ("replayed",)),
+    "positions alone": (_changed("gnss", lambda t: True, lambda x: _put(x, 4, WITHOUT_VELOCITY)), ()),
+    "coarse positions alone": (COARSE, ()),
+    "coarse positions alone, 3 s late": (lambda sent: _late(3.0)(COARSE(sent)), ("replayed",)),
+    "no 1σ": (_changed("gnss", lambda t: True, lambda x: _put(x, 5, [nan] * 6)), ()),
     "fixes 100 m off, one in six": (
-        _changed("gnss", lambda t: round(t) % 6 == 3, lambda x: _put(x, 1, x[1] + 9e-4)), set()),
-    "a frozen receiver": (_frozen, {"implausible_fix"}),
-    "fixes 20 km off for 25 s": (
-        _changed("gnss", _between(25.5, 50.5), lambda x: _put(x, 1, x[1] + 0.18)), {"implausible_fix"}),
-    **{name: (lambda sent, jump=jump, late=late: late(jump(sent)), {"implausible_fix"})
+        _changed("gnss", lambda t: round(t) % 6 == 3, lambda x: _put(x, 1, x[1] + 9e-4)), ()),
+    **{name: (jump, ("implausible_fix",)) for name, jump in JUMPS.items()},
+    **{name: (lambda sent, jump=JUMPS[jump], late=late: late(jump(sent)), ("implausible_fix",))
        for name, (jump, late) in JUMPS_LATE.items()},
-    "a height of 20 km": (_changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 3, 2e4)), {"implausible_fix"}),
-    "a velocity of 300 m/s": (
-        _changed("gnss", _at(30.0, 0.5), lambda x: _put(x, 4, [300.0, 0.0, 0.0])), {"implausible_fix"}),
     "a gyroscope that saturates for a second": (
-        _changed("imu", _between(30.0, 31.0), lambda x: _put(x, 2, [0.0, 0.0, 35.0])), set()),
-    "a fix ahead of the samples": (_changed("gnss", _at(30.0, 0.5), lambda x: [x, _put(x, 0, x[0] + 100)]), {"ahead"}),
-    "a first fix of the year 2001": (_first(1e9, *AROUND), set()),
-    "a first fix 18 s ahead": (_first(18.0, *AROUND), set()),
+        _changed("imu", _between(30.0, 31.0), lambda x: _put(x, 2, [0.0, 0.0, 35.0])), ()),
+    "a first fix of the year 2001": (_first(1e9, *AROUND), ()),
+    "a first fix 18 s ahead": (_first(18.0, *AROUND), ()),
     "fixes at 2 Hz off the second": (
-        _changed("gnss", lambda t: True, lambda x: [_put(x, 0, x[0] - 0.18), _put(x, 0, x[0] + 0.31)]), set()),
-    "fix stamps that jitter": (_stamps(_jitter(2, 0.04), ("gnss",)), set()),
-    "sensors 0.4 s late": (_late(0.4, 30.0, 34.0, SENSORS), {"replayed"}),
-    "sensors 15 s late": (_late(15.0, 25.0, 40.0, SENSORS), {"late"}),
-    "a wheel speed of NaN": (_changed("speed", _at(30.0, 0.5), lambda x: _put(x, 1, nan)), {"not_finite"}),
-    "a wheel speed twice": (_changed("speed", _at(30.0, 0.5), lambda x: [x, x]), {"double"}),
-    "headings in the wrong order": (
-        _changed("heading", _between(25, 35), lambda x: [_put(x, 0, x[0] - 0.2), x, _put(x, 0, x[0] - 0.4)]), set()),
-    "a barometer ahead of the samples": (
-        _changed("baro", _at(30.0, 1.0), lambda x: [x, _put(x, 0, x[0] + 100)]), {"ahead"}),
+        _changed("gnss", lambda t: True, lambda x: [_put(x, 0, x[0] - 0.18), _put(x, 0, x[0] + 0.31)]), ()),
+    "fix stamps that jitter": (_stamps(_jitter(2, 0.04), ("gnss",)), ()),
+    "sensors 0.4 s late": (_late(0.4, 30.0, 34.0, SENSORS), ("replayed",)),
+    "sensors 15 s late": (_late(15.0, 25.0, 40.0, SENSORS), ("late",)),
     "wheel speeds with 1σ, and some without": (
-        _changed("speed", lambda t: True, lambda x: _put(x, 2, 0.1 if round(t_ms(x)) % 7 else nan)), set()),
+        _changed("speed", lambda t: True, lambda x: _put(x, 2, 0.1 if round(t_ms(x)) % 7 else nan)), ()),
     "a wheel that stands still on a moving car": (
-        _changed("speed", _between(25.0, 45.0), lambda x: _put(x, 1, 0.0)), set()),
-    "no sensors": (lambda sent: [c for c in sent if c.kind not in SENSORS], set()),
-    "damage of all kinds": (_many, {"not_finite", "implausible", "double", "back"}),
+        _changed("speed", _between(25.0, 45.0), lambda x: _put(x, 1, 0.0)), ()),
+    "no sensors": (lambda sent: [c for c in sent if c.kind not in SENSORS], ()),
+    "damage of all kinds": (_many, ("not_finite", "implausible", "double", "back")),
 }  # fmt: skip

@@ -67,7 +67,7 @@ def test_navigate_needs_no_reference(call, tmp_path, name, chosen):
 def test_outages_of_30_s_stay_where_they_were_measured(call, tmp_path, name, options, outages, low, high):
     done = call(
         "evaluate", "model=mbkf15", f"dataset={REAL / name}", "mode=drives", "out=report",
-        "outage.duration_s=30", "injected_bias=null", *options,
+        "outage.duration_s=30", "injected_bias=null", "tracking.log=false", *options,
     )  # fmt: skip
     assert done.code == 0, done.err
     (content,) = json.loads((tmp_path / "report" / "metrics.json").read_text())["results"]

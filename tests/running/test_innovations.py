@@ -13,8 +13,8 @@ from dlkf.navigation.imu_errors import imu_spec
 from dlkf.running import innovations
 from dlkf.running.innovations import CHANCE, SETTLE, fit_sigma
 from dlkf.running.offline import navigate_dataset, sigma_warning
-from tests.conftest import SIZE
 from tests.drives import drives_in
+from tests.worlds import SIZE
 
 N = 300 + SETTLE  # updates
 

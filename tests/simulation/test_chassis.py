@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ CONF = Path(__file__).parents[2] / "conf"
 LEVEL = VehicleConfig(slope_std=0.0, height_m=0.0)
 
 
+@cache
 def preset(name: str):
     return dataset_config(compose_command("simulate", f"simulated@dataset={name}")["dataset"])
 

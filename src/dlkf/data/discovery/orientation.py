@@ -20,7 +20,7 @@ moving mean.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -88,6 +88,21 @@ class _Fit:
     slip: tuple[float, float]  # l [m], K [s²/m]
 
 
+class _Equations:
+    """Design and left side of a levelled sensor at any lag. Every block that is left out asks for the same lags: what
+    they have in common is made once."""
+
+    def __init__(self, level: Levelled, gnss: Motion, parts: _Intervals, slip: tuple[float, float]) -> None:
+        self.level, self.gnss, self.parts, self.slip = level, gnss, parts, slip
+        self._made: dict[float, tuple[Complex, Complex]] = {}
+
+    def at(self, lag: float) -> tuple[Complex, Complex]:
+        """As :func:`_design`, without the slope of the way."""
+        if lag not in self._made:
+            self._made[lag] = _design(self.level, self.gnss, self.parts, lag, self.slip, self.level.tilted, 0.0)
+        return self._made[lag]
+
+
 def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float) -> Pose | None:
     """Pose of a sensor with ``accel`` in m/s², ``gyro`` in any unit (n, 3), near a clock offset ``lag_s`` [s].
 
@@ -105,8 +120,9 @@ def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float
     good = np.ones(len(parts.t0), bool)
     for span in (SPAN_S, 0.1, 0.06):
         level = levelled(t, accel, gyro * unit, down)
-        good = _sound(level, gnss, parts, lag, slip)
-        fit = _scan(level, gnss, parts, lag, span, good, slip)
+        equations = _Equations(level, gnss, parts, slip)
+        good = _sound(equations, lag)
+        fit = _scan(equations, lag, span, good)
         if fit is None:
             return None
         lag, unit, slip = fit.lag_s, unit * fit.scale, fit.slip
@@ -121,11 +137,11 @@ def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float
         down = (1 - weight) * down + weight * axis
         down /= np.linalg.norm(down)
     final = _matrix(level, fit, down)
-    leave, middles = [], []
+    leave, middles, equations = [], [], _Equations(level, gnss, parts, slip)
     for block in range(BLOCKS):
         keep = parts.block != block
         keep &= good
-        if (keep & parts.moving).sum() >= FEWEST // 2 and (one := _scan(level, gnss, parts, lag, 0.07, keep, slip)):
+        if (keep & parts.moving).sum() >= FEWEST // 2 and (one := _scan(equations, lag, 0.07, keep)):
             leave.append(one)
             middles.append(float(np.mean(parts.t0[~keep & good])) if (~keep & good).any() else np.nan)
     if len(leave) < BLOCKS // 2:
@@ -207,29 +223,20 @@ def _gyro_scale(t: Floats, rate: Floats, parts: _Intervals, lag_s: float) -> flo
     return float(slope) if slope > 0 else None
 
 
-def _scan(
-    level: Levelled,
-    gnss: Motion,
-    parts: _Intervals,
-    lag_s: float,
-    span: float,
-    keep: np.ndarray,
-    slip: tuple[float, float],
-) -> _Fit | None:
+def _scan(equations: _Equations, lag_s: float, span: float, keep: np.ndarray) -> _Fit | None:
     """The fit of the lag with the least residuals, by a parabola round the best."""
     step = STEP_S if span > 0.3 else STEP_S / 4
     lags = lag_s + np.arange(-round(span / step), round(span / step) + 1) * step
-    use = keep & _covered(level, parts, lags[0], lags[-1])
-    if (use & parts.moving).sum() < FEWEST // 2:
+    use = keep & _covered(equations.level, equations.parts, lags[0], lags[-1])
+    if (use & equations.parts.moving).sum() < FEWEST // 2:
         return None
-    costs = np.array([_fit(level, gnss, parts, lag, use, slip)[1] for lag in lags])
+    costs = np.array([_residuals(equations, lag, use)[-1] for lag in lags])
     lag = float(lags[costs.argmin()])
     near = np.abs(lags - lag) < (2.5 * STEP_S if span > 0.3 else 0.035)
     a, b, _ = np.polyfit(lags[near] - lag, costs[near], 2)  # shaking makes the residuals' minimum a ragged one
     if near.sum() > 3 and a > 0:
         lag += float(np.clip(-0.5 * b / a, -span, span))
-    fit = _fit(level, gnss, parts, lag, use, slip)[0]
-    return replace(fit, bias=_bias(level, gnss, parts, lag, use, slip))
+    return _fit(equations, lag, use)
 
 
 def _covered(level: Levelled, parts: _Intervals, least: float, most: float) -> np.ndarray:
@@ -237,23 +244,20 @@ def _covered(level: Levelled, parts: _Intervals, least: float, most: float) -> n
     return (parts.t0 + least >= level.t[0]) & (parts.t1 + most <= level.t[-1])
 
 
-def _bias(
-    level: Levelled, gnss: Motion, parts: _Intervals, lag: float, use: np.ndarray, slip: tuple[float, float]
-) -> complex:
+def _bias(equations: _Equations, lag: float, use: np.ndarray) -> complex:
     """Mean horizontal force that is not the car's: what levelling left over, and the accelerometers' bias."""
-    design, left = _design(level, gnss, parts, lag, slip, level.force, 1.0)
+    level, slip = equations.level, equations.slip
+    design, left = _design(level, equations.gnss, equations.parts, lag, slip, level.force, 1.0)
     x, *_ = np.linalg.lstsq(design[use], left[use], rcond=None)
     return complex(x[1] / x[0]) if x[0] else 0j
 
 
-def _sound(level: Levelled, gnss: Motion, parts: _Intervals, lag: float, slip: tuple[float, float]) -> np.ndarray:
+def _sound(equations: _Equations, lag: float) -> np.ndarray:
     """Intervals without outliers of GNSS: residuals at most five medians, of a fit to all."""
-    use = _covered(level, parts, lag, lag)
+    use = _covered(equations.level, equations.parts, lag, lag)
     if not use.any():
         return use
-    design, left = _design(level, gnss, parts, lag, slip, level.tilted, 0.0)
-    A, y = _quick(design, use, parts.stride), _quick(left[:, None], use, parts.stride)[:, 0]
-    x, *_ = np.linalg.lstsq(A[use], y[use], rcond=None)
+    A, y, x, _ = _residuals(equations, lag, use)
     off = np.abs(y - A @ x)
     return off <= 5 * max(float(np.median(off[use])), 1e-3)
 
@@ -318,14 +322,20 @@ def _held(level: Levelled, gnss: Motion, lag: float, slip: tuple[float, float]):
     return lambda at: np.interp(at, t, angle)
 
 
-def _fit(
-    level: Levelled, gnss: Motion, parts: _Intervals, lag: float, use: np.ndarray, slip: tuple[float, float]
-) -> tuple[_Fit, float]:
-    """Least squares at a lag, and its residuals' squared sum."""
-    design, left = _design(level, gnss, parts, lag, slip, level.tilted, 0.0)
-    A, y = _quick(design, use, parts.stride)[use], _quick(left[:, None], use, parts.stride)[use, 0]
-    x, *_ = np.linalg.lstsq(A, y, rcond=None)
-    rest = float(np.sum(np.abs(y - A @ x) ** 2)) + 1e-9
+def _residuals(equations: _Equations, lag: float, use: np.ndarray) -> tuple[Complex, Complex, Complex, float]:
+    """Least squares at a lag: design and left side of all rows, the solution, the squared sum of the rows in use."""
+    design, left = equations.at(lag)
+    stride = equations.parts.stride
+    A, y = _quick(design, use, stride), _quick(left[:, None], use, stride)[:, 0]
+    x, *_ = np.linalg.lstsq(A[use], y[use], rcond=None)
+    return A, y, x, float(np.sum(np.abs(y[use] - A[use] @ x) ** 2)) + 1e-9
+
+
+def _fit(equations: _Equations, lag: float, use: np.ndarray) -> _Fit:
+    """All that is fitted at a lag."""
+    level, parts = equations.level, equations.parts
+    A, y, x, rest = _residuals(equations, lag, use)
+    A, y = A[use], y[use]
     inverse = np.linalg.pinv(A.conj().T @ A)
     arm_std = float(np.sqrt(parts.stride * abs(inverse[2, 2]) * rest / max(len(y) - 3, 1)))
     turning = use & parts.moving
@@ -339,9 +349,10 @@ def _fit(
     prior = np.diag([0.0, 0.0, 1 / 2.0, 1 / 0.01]) * SLIP_NOISE
     s, *_ = np.linalg.lstsq(np.concatenate((B, prior)), np.concatenate((z, np.zeros(4))), rcond=None)
     alpha = complex(x[0])
-    fit = _Fit(lag, alpha, 0j, complex(x[2]), float(s[0]), rest,
-               float(np.sum(np.abs(y) ** 2)), arm_std, (float(s[2]), float(s[3])))  # fmt: skip
-    return fit, rest
+    return _Fit(
+        lag, alpha, _bias(equations, lag, use), complex(x[2]), float(s[0]), rest,
+        float(np.sum(np.abs(y) ** 2)), arm_std, (float(s[2]), float(s[3])),
+    )  # fmt: skip
 
 
 def _matrix(level: Levelled, fit: _Fit, down: Floats) -> Floats:
