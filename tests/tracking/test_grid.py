@@ -16,6 +16,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from dlkf.base.points import SWEPT, Failure, collect_failures, report_failure
+from dlkf.command.sweeps import job_folder
 from dlkf.tracking.comparison import best_validation, monitored_metric
 from dlkf.tracking.grid import PARENT_RUN, GridParent, parent_status, run_name, swept_overrides
 from dlkf.tracking.runs import mlflow_module, start_run
@@ -144,6 +145,23 @@ def test_keys_are_short_where_they_can_be(monkeypatch):
     monkeypatch.setenv(SWEPT, '["optimizer.lr", "scoring.outage.first_s", "callbacks.outage.first_s"]')
     words = ["optimizer.lr=1", "scoring.outage.first_s=2", "callbacks.outage.first_s=3", "seed=4"]
     assert run_name("town", words) == "lr=1 scoring.outage.first_s=2 callbacks.outage.first_s=3"
+
+
+def test_a_grid_over_nothing_has_short_names(uri, client):
+    """-m without values to go over: the folder of its one point is its number, not all that was given."""
+    words = ["model=mbkf15", "dataset=data/town", "outage.duration_s=[30,60]"]
+    job = OmegaConf.create({"job": {"num": 0}, "overrides": {"task": words}})
+    grid = GridParent()
+    grid.on_multirun_start(sweep_config(uri, words))
+    parent = os.environ[PARENT_RUN]
+    assert job_folder(job) == "0"
+    point(uri, "only", 5.0)
+    grid.on_multirun_end(OmegaConf.create())
+    assert client.get_run(parent).info.run_name == "grid of one point"
+    grid.on_multirun_start(sweep_config(uri, [*words, "imu=consumer,bmi270"]))
+    job.overrides.task.append("imu=bmi270")
+    assert job_folder(job) == "0-imu=bmi270"
+    grid.close(ended=False)
 
 
 def test_the_page_of_a_grid(uri, client):
