@@ -85,7 +85,7 @@ def test_a_failed_child_fails_the_parent_but_not_the_table(uri, client, capsys):
     grid.close(ended=False)
     assert client.get_run(parent).info.status == "FAILED"
     printed = capsys.readouterr().out
-    assert "| good | FINISHED | 10               | 5    | 9      |" in printed
+    assert "| good | FINISHED | 10.0             | 5.00 | 9.00   |" in printed
     assert "| bad  | FAILED   |                  |" in printed
     grid.close(ended=False)
     assert capsys.readouterr().out == "", "closed once"
@@ -172,7 +172,7 @@ def test_the_page_of_a_grid(uri, client):
     point(uri, "worse", 5.0), point(uri, "better", 2.0)
     grid.on_multirun_end(OmegaConf.create())
     page = mlflow_module().artifacts.load_text(f"{client.get_run(parent).info.artifact_uri}/comparison.html")
-    assert "Best by validation: better, val/outage_end_m 4; on test dlkf 2." in page
+    assert "Best by validation: better, val/outage_end_m 4.00; on test dlkf 2.00." in page
     drawn = json.loads(re.search(r'id="data-coordinates">(.*?)</script>', page, re.S)[1])
     labels = [axis["label"] for axis in drawn["data"][0]["dimensions"]]
     assert labels == ["lr", "val/outage_end_m", "test/dlkf/outage_end_horizontal_m"]
