@@ -7,7 +7,6 @@ that are printed go to the runs.
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 
 from dlkf.base.errors import InputError
@@ -36,7 +35,7 @@ def main() -> None:
     print("\n".join(said), flush=True)
     environment = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true"}
     command = [sys.executable, "-m", "mlflow", "ui", "--workers", "1", "--host", host, "--port", port]
-    sys.exit(subprocess.run([*command, "--backend-store-uri", uri], env=environment).returncode)
+    os.execve(command[0], [*command, "--backend-store-uri", uri], environment)  # in place: signals reach the server
 
 
 def links(uri: str, address: str) -> list[str]:

@@ -16,6 +16,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from dlkf.base.points import SWEPT, Failure, collect_failures, report_failure
+from dlkf.command.sweeps import job_folder
 from dlkf.tracking.comparison import best_validation, monitored_metric
 from dlkf.tracking.grid import PARENT_RUN, GridParent, parent_status, run_name, swept_overrides
 from dlkf.tracking.runs import mlflow_module, start_run
@@ -84,7 +85,7 @@ def test_a_failed_child_fails_the_parent_but_not_the_table(uri, client, capsys):
     grid.close(ended=False)
     assert client.get_run(parent).info.status == "FAILED"
     printed = capsys.readouterr().out
-    assert "| good | FINISHED | 10               | 5    | 9      |" in printed
+    assert "| good | FINISHED | 10.0             | 5.00 | 9.00   |" in printed
     assert "| bad  | FAILED   |                  |" in printed
     grid.close(ended=False)
     assert capsys.readouterr().out == "", "closed once"
@@ -146,6 +147,23 @@ def test_keys_are_short_where_they_can_be(monkeypatch):
     assert run_name("town", words) == "lr=1 scoring.outage.first_s=2 callbacks.outage.first_s=3"
 
 
+def test_a_grid_over_nothing_has_short_names(uri, client):
+    """-m without values to go over: the folder of its one point is its number, not all that was given."""
+    words = ["model=mbkf15", "dataset=data/town", "outage.duration_s=[30,60]"]
+    job = OmegaConf.create({"job": {"num": 0}, "overrides": {"task": words}})
+    grid = GridParent()
+    grid.on_multirun_start(sweep_config(uri, words))
+    parent = os.environ[PARENT_RUN]
+    assert job_folder(job) == "0"
+    point(uri, "only", 5.0)
+    grid.on_multirun_end(OmegaConf.create())
+    assert client.get_run(parent).info.run_name == "grid of one point"
+    grid.on_multirun_start(sweep_config(uri, [*words, "imu=consumer,bmi270"]))
+    job.overrides.task.append("imu=bmi270")
+    assert job_folder(job) == "0-imu=bmi270"
+    grid.close(ended=False)
+
+
 def test_the_page_of_a_grid(uri, client):
     """The best first, an axis for each setting that was swept and for what came of it."""
     grid = GridParent()
@@ -154,7 +172,7 @@ def test_the_page_of_a_grid(uri, client):
     point(uri, "worse", 5.0), point(uri, "better", 2.0)
     grid.on_multirun_end(OmegaConf.create())
     page = mlflow_module().artifacts.load_text(f"{client.get_run(parent).info.artifact_uri}/comparison.html")
-    assert "Best by validation: better, val/outage_end_m 4; on test dlkf 2." in page
+    assert "Best by validation: better, val/outage_end_m 4.00; on test dlkf 2.00." in page
     drawn = json.loads(re.search(r'id="data-coordinates">(.*?)</script>', page, re.S)[1])
     labels = [axis["label"] for axis in drawn["data"][0]["dimensions"]]
     assert labels == ["lr", "val/outage_end_m", "test/dlkf/outage_end_horizontal_m"]

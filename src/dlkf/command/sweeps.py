@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from collections.abc import Iterator
@@ -9,14 +10,16 @@ from contextlib import contextmanager
 
 from hydra.conf import HydraConf
 
-from dlkf.base.points import Failure, collect_failures, failures, report_failure, swept_overrides_of
+from dlkf.base.points import SWEPT, Failure, collect_failures, failures, report_failure, swept_overrides_of
 from dlkf.command.faults import describe_fault
 
 MISTAKES, FAULTS = 2, 1  # exit codes: all failed by mistakes of the user, some by faults of ours
 
 
 def job_folder(hydra_config: HydraConf) -> str:
-    """Folder of a point: its number and what it changes, as ``0-imu=consumer``."""
+    """Folder of a point: its number and what it changes, as ``0-imu=consumer``; ``0`` where nothing is swept."""
+    if os.environ.get(SWEPT) == "[]":
+        return str(hydra_config.job.num)
     return f"{hydra_config.job.num}-{swept_overrides_of(hydra_config.overrides.task)}".replace("/", "-")[:100]
 
 

@@ -14,7 +14,7 @@ from dlkf.data.discovery.clock import ImuSums, find_lag, known_offset
 from dlkf.data.discovery.drift import ROUGH_S, ends_apart, find_drifting_pose
 from dlkf.data.discovery.motion import Motion, motion
 from dlkf.data.limits import NOWHERE_DEG
-from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, VELOCITY
+from dlkf.data.schema import ACCEL, GYRO, VELOCITY
 from dlkf.data.tables import Columns
 from dlkf.navigation.earth import SEMI_MAJOR
 
@@ -25,7 +25,6 @@ DISAGREES, AGREES = 0.4, 0.25  # relative residual of way against velocity
 LEAST_SLOPE = 0.1  # of gyro_z against the course; one that is at its limit in every turn may have 0.3
 FEW = 2  # single fixes at 0°/0° or a continent away are refused by themselves (dlkf.data.limits)
 FARTHEST_KM, KM_PER_DEG = 2000.0, 111.2
-SAME_S, REFERENCE_M, REFERENCE_SIGMAS = 1.0, 30.0, 5.0  # a reference beside a fix: no antenna, no datum is so far off
 SEARCH_S = 600.0  # clocks of logs that have time in common are hardly further apart
 APART_S = 1.0  # less is a delay, which the filters bear; dlkf.ingest measures it on request
 DRIFTED_S = 0.1  # from a drive's first to its last second: worth a line
@@ -125,25 +124,6 @@ def _check_places(lat: np.ndarray, lon: np.ndarray, where: str) -> None:
         raise InputError(
             f"{where}: fix {worst} lies {far[worst]:.0f} km from the rest of the drive; give such fixes quality 0"
         )
-
-
-def check_same_place(reference: Columns, fixes: Columns, where: str) -> None:
-    """A reference is of the same drive: near the fixes, in the median over those that it has a row for."""
-    row = np.searchsorted(reference["t"], fixes["t"]).clip(max=len(reference["t"]) - 1)
-    both = np.abs(reference["t"][row] - fixes["t"]) < SAME_S
-    if not both.any():
-        return
-    t = fixes["t"][both]
-    lat = np.interp(t, reference["t"], reference["lat_deg"])
-    lon = np.interp(t, reference["t"], np.unwrap(reference["lon_deg"], period=360))
-    east = (lon - fixes["lon_deg"][both] + 180) % 360 - 180
-    apart = np.hypot(lat - fixes["lat_deg"][both], east * np.cos(np.radians(lat)))
-    away = 1000 * KM_PER_DEG * float(np.median(apart))
-    sigma = np.nan_to_num(np.hypot(fixes["std_pos_n"][both], fixes["std_pos_e"][both]))
-    if away > REFERENCE_M + REFERENCE_SIGMAS * float(np.median(sigma)):
-        said = f"{away / 1000:.3g} km" if away > 1000 else f"{away:.0f} m"
-        other = "of this drive" if away > 1000 else "of this drive, on the same clock and datum"
-        raise InputError(f"{where}: lies {said} from the fixes in the median; give the reference {other}")
 
 
 def _check_way(gnss: Columns, where: str) -> None:
@@ -341,23 +321,3 @@ def describe_rotation(imu: Columns, gnss: Columns) -> str | None:
 def _signals(imu: Columns, gnss: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray, Motion]:
     moved = motion(gnss["t"], gnss["lat_deg"], gnss["lon_deg"], np.stack([gnss[c] for c in VELOCITY], -1))
     return imu["t"], np.stack([imu[c] for c in ACCEL]).T, np.stack([imu[c] for c in GYRO]).T, moved
-
-
-def check_attitude(reference: Columns, where: str) -> None:
-    """Attitudes in radians, and yaw clockwise from North."""
-    for name in ATTITUDE:
-        largest = np.nanmax(np.abs(reference[name]), initial=0.0)
-        if largest > 2 * np.pi + 0.01:
-            raise InputError(f"{where}: {name} reaches {largest:.1f}: looks like degrees; multiply attitudes by π/180")
-    speed = np.hypot(reference["vel_n"], reference["vel_e"])
-    with np.errstate(invalid="ignore"):
-        fast = (speed > 3) & np.isfinite(reference["yaw"])
-    if fast.sum() < 10:
-        return
-    course, yaw = np.arctan2(reference["vel_e"][fast], reference["vel_n"][fast]), reference["yaw"][fast]
-
-    def apart(angle: np.ndarray) -> float:
-        return float(np.median(np.abs((angle - course + np.pi) % (2 * np.pi) - np.pi)))
-
-    if apart(yaw) > 0.5 and apart(np.pi / 2 - yaw) < 0.1:
-        raise InputError(f"{where}: yaw counts from East, must count clockwise from North; use π/2 − yaw")

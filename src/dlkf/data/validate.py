@@ -13,14 +13,8 @@ from dlkf.data.aid_checks import check_aid
 from dlkf.data.aid_tables import STANDARD, AidTable
 from dlkf.data.discovery.motion import motion
 from dlkf.data.limits import FULL_SCALE, NONE_REFUSED, Refused, screen_fixes, within_full_scale
-from dlkf.data.plausibility import (
-    check_attitude,
-    check_clocks,
-    check_gnss_units,
-    check_imu_units,
-    check_same_place,
-    check_turns,
-)
+from dlkf.data.plausibility import check_clocks, check_gnss_units, check_imu_units, check_turns
+from dlkf.data.reference_checks import check_attitude, check_same_place
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY
 from dlkf.data.tables import Columns, DriveRow, read_drives, read_table
 
@@ -101,7 +95,7 @@ def check_tables(tables: CheckedTables, limits: Limits = LIMITS) -> CheckedTable
     check_turns(imu, gnss, _where(name, "imu"))
     check_clocks(imu, read_fixes(gnss), _where(name, "imu"))
     if truth is not None:
-        _check_reference(truth, gnss, _where(name, "reference"))
+        _check_reference(truth, imu, read_fixes(gnss), _where(name, "reference"))
     if tables.aids:
         fixes = read_fixes(gnss)
         velocity = np.stack([fixes[c] for c in VELOCITY], -1)
@@ -279,12 +273,13 @@ def _check_fixes_there(gnss: Columns, where: str) -> None:
         raise InputError(f"{where}: quality is {codes[0]} in row 0; must be a code of NMEA: 1, 2, 4, 5, 0 for no fix")
 
 
-def _check_reference(reference: Columns, gnss: Columns, where: str) -> None:
+def _check_reference(reference: Columns, imu: Columns, fixes: Columns, where: str) -> None:
     _check_time(reference["t"], where)
     _check_finite(reference, (*POSITION, *VELOCITY, *ATTITUDE), where, nan=True)
     known = reference["valid"] & np.isfinite(reference["lat_deg"]) & np.isfinite(reference["lon_deg"])
     if not known.any():
         return
-    check_gnss_units({name: values[known] for name, values in reference.items()}, where)
-    check_same_place({name: values[known] for name, values in reference.items()}, read_fixes(gnss), where)
-    check_attitude({name: values[known] for name, values in reference.items()}, where)
+    rows = {name: values[known] for name, values in reference.items()}
+    check_gnss_units(rows, where)
+    check_same_place(rows, fixes, where)
+    check_attitude(rows, imu, where)

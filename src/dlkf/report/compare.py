@@ -164,7 +164,8 @@ def growth_figure(reports: Sequence[StoredReport]) -> Figure:
         legend={"orientation": "h", "y": -0.18, "yanchor": "top"},
     )  # fmt: skip
     figure.update_xaxis(title={"text": "Time without GNSS [s]"})
-    figure.update_yaxis(title={"text": "Horizontal error [m]"}, type="log", nticks=8)
+    figure.update_yaxis(title={"text": "Horizontal error [m]"})
+    figure.set_log_scale(ticks=8)
     return figure
 
 

@@ -48,6 +48,10 @@ class Figure:
         """Set properties of a panel's value axis."""
         _merge(self.layout.setdefault(f"yaxis{_number(row)}", {}), more)
 
+    def set_log_scale(self, row: int = 1, *, ticks: int = 5) -> None:
+        """A logarithmic value axis, its numbers written out (10000, not 10k), with about so many of them."""
+        self.update_yaxis(row, type="log", nticks=ticks, exponentformat="none")
+
     def to_json(self) -> str:
         """As plotly.js reads it; arrays of floats are binary."""
         return json.dumps(

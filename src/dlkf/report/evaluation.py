@@ -24,8 +24,8 @@ from dlkf.report.page import Page, embedded
 from dlkf.report.plots import Array, band, line, shade, spans, stack_panels
 
 MAP = (
-    "The {truth}, the outages, and every filter's way in them (of one that is far off by a click on its name); a row "
-    "below goes there."
+    "The {truth}, the outages, and the track of each filter in them; a click on a grey name shows a filter that is far "
+    "off. A click on a row of the table of outages goes there."
 )
 MOST_OUTAGES = 300  # rows of the table of outages: the worst of them
 SENSORS = (("Accelerometer", "m/s²", 1.0), ("Gyroscope", "°/s", DEGREES))
@@ -171,7 +171,7 @@ def _answer(
         if len(result.per_outage) > len(rows):
             page.note(f"The worst {len(rows)} of {len(result.per_outage)}; all are in metrics.json.")
     else:
-        page.heading(f"{kind}Map", f"The {truth} and where every filter went.")
+        page.heading(f"{kind}Map", f"The {truth} and the track of each filter.")
         page.figure(f"map-{name}", segment_map(scores, baseline, truth))
         _add_tables(page, tables)
 
@@ -217,8 +217,8 @@ def growth_chart(scores: Scores) -> Figure:
         count = (w.length[:, None] * scores.epoch_s >= seconds[None]).sum(0)
         bars = {"type": "bar", "x": seconds, "y": count, "marker": {"color": SHADE}, "name": "outages"}
         figure.add_trace(bars | {"showlegend": False}, 3)
-    figure.update_yaxis(1, type="log", nticks=6)
-    figure.update_yaxis(2, type="log", nticks=6)
+    figure.set_log_scale(1, ticks=6)
+    figure.set_log_scale(2, ticks=6)
     figure.update_xaxis(2 + len(counted), title={"text": "Time without GNSS [s]"})
     return figure
 
@@ -301,7 +301,7 @@ def error_charts(scores: Scores) -> Figure:
             if np.isfinite(y).any():
                 figure.add_trace(line(scores.t, y, name, c, legend=row == 1), row)
     for row in range(1, len(known) + 1):
-        figure.update_yaxis(row, type="log", nticks=6)
+        figure.set_log_scale(row)
     figure.update_xaxis(len(known), title={"text": "Time since the start of a segment [s]"})
     shade(figure, spans(scores.t, scores.outage.mean(0) > 0.5), len(known))
     return figure

@@ -7,6 +7,7 @@ from typing import Any
 
 import pandas as pd
 
+from dlkf.evaluation.table import format_number
 from dlkf.report.drawing import Figure
 from dlkf.report.page import Page
 from dlkf.report.plots import FONT
@@ -37,8 +38,8 @@ def _best(chosen: pd.DataFrame, validated: str | None) -> str:
     if validated is None or pd.isna(best[validated]):
         return "No point was validated."
     filters = [c for c in map(str, chosen) if c not in (*NAMES, validated)]
-    on_test = f"; on test {filters[0]} {best[filters[0]]:.3g}" if filters else ""
-    return f"Best by validation: {best['run']}, {validated} {best[validated]:.3g}{on_test}."
+    on_test = f"; on test {filters[0]} {format_number(best[filters[0]])}" if filters else ""
+    return f"Best by validation: {best['run']}, {validated} {format_number(best[validated])}{on_test}."
 
 
 def _scores(table: pd.DataFrame, chosen: pd.DataFrame) -> list[str]:

@@ -177,7 +177,7 @@ def _with_breaks(place: Array, most: int) -> Array:
 def rows_of(courses: Sequence[TrackOnMap]) -> tuple[list[str], list[list[str]], list[str]]:
     """Columns, rows and marks of the table of drives."""
     columns = ["Drive", "Duration\n[s]", "Distance\n[km]", "Fixes\nused", "of", "Longest gap\n[s]", "Standing\n[s]"]
-    columns += ["1σ, median\n[m]", "1σ, worst\n[m]", "Innovation\n/ σ"]
+    columns += ["1σ, median\n[m]", "1σ, maximum\n[m]", "Innovation\n/ σ"]
     rows, marks = [], []
     for course in courses:
         table, sigma = course.result.table, horizontal_std(course)
@@ -191,7 +191,7 @@ def rows_of(courses: Sequence[TrackOnMap]) -> tuple[list[str], list[list[str]], 
             + [str(int(table["gnss_used"].sum())), str(offered), f"{course.without.max():.3g}"]
             + [f"{(speed(course) < STANDING).sum() * step:.0f}"]
             + ([f"{np.nanmedian(sigma):.2g}", f"{np.nanmax(sigma):.2g}"] if known else ["–", "–"])
-            + [f"{ratio:.2g}" if np.isfinite(ratio) else "–"]
+            + [f"{ratio:#.2g}".rstrip(".") if np.isfinite(ratio) else "–"]
         )
         place = _place(course)
         half = 60_000 * max(float(np.ptp(place[:, 0])), float(np.ptp(place[:, 1])), 1e-3)
@@ -235,7 +235,7 @@ def _motion(course: TrackOnMap, t: Array, gaps: Sequence[tuple[float, float]]) -
     figure.add_trace(line(t, np.where(jump, np.nan, heading), "heading", COLOURS[2], legend=False), 2)
     figure.add_trace(line(t, table["height_m"].to_numpy(), "height", COLOURS[3], legend=False), 3)
     figure.add_trace(line(t, horizontal_std(course), "1σ", COLOURS[5], legend=False), 4)
-    figure.update_yaxis(4, type="log", nticks=4)
+    figure.set_log_scale(4, ticks=4)
     figure.update_xaxis(4, title={"text": "Time [s]"})
     shade(figure, gaps, 4)
     return figure

@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 
 from dlkf.base.errors import InputError
+from dlkf.evaluation.table import format_number
 from dlkf.tracking.runs import MONITORS, PARENT_TAG
 
 NAMELESS = ("tracking", "hydra", "resume", "name", "out")  # settings that do not affect the result
@@ -106,7 +107,7 @@ def cells(table: pd.DataFrame) -> list[list[str]]:
 
     def cell(value: Any) -> str:
         if isinstance(value, float):
-            return f"{value:.3g}" if value == value else ""
+            return format_number(value) if value == value else ""
         return "" if value is None else str(value).replace("|", "\\|")
 
     return [[cell(v) for v in row] for row in table.itertuples(index=False)]

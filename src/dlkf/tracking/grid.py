@@ -62,7 +62,7 @@ class GridParent(Callback):
             check_store(self.uri)
             with reachable(self.uri):
                 client = client_of(self.uri)
-                name = "grid " + " × ".join(grid_name(key, values) for key, values in swept.items())
+                name = "grid " + (" × ".join(grid_name(*pair) for pair in swept.items()) or "of one point")
                 run = client.create_run(experiment_id(client, config.name), run_name=name[:250])
         except InputError as error:  # Hydra would make a warning of it and go on
             print(f"dlkf: error: {error}", file=sys.stderr)

@@ -1,0 +1,115 @@
+"""Plausibility of a reference: the place, the height and the heading of the same drive, in the same units and axes.
+
+As in :mod:`dlkf.data.plausibility` each check compares with other data of the drive.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dlkf.base.errors import InputError
+from dlkf.data.discovery.clock import ImuSums, find_lag
+from dlkf.data.discovery.motion import motion
+from dlkf.data.plausibility import APART_S, KM_PER_DEG, TURNED_DEG
+from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, VELOCITY
+from dlkf.data.tables import Columns
+
+SAME_S = 1.0  # between a fix and a row of the reference that are compared
+REFERENCE_M, HEIGHT_M, SIGMAS = 30.0, 20.0, 5.0  # beyond the receiver's own 1σ: no antenna and no datum is so far off
+GEOID_M, STEADY_M = 110.0, 5.0  # the geoid lies no further from the ellipsoid, and is flat over a drive
+FAST, FEWEST = 3.0, 10  # m/s above which the course is the heading; rows
+SIDEWAYS, STEADY = 0.5, 0.8  # rad, about the median, within which such a share of the headings lies
+FORCE_AGREES = 0.6  # correlation of the force with the acceleration that shows where the sensor looks
+
+
+def check_same_place(reference: Columns, fixes: Columns, where: str) -> None:
+    """A reference is of the same drive: near the fixes, in the median over those that it has a row for."""
+    row = np.searchsorted(reference["t"], fixes["t"]).clip(max=len(reference["t"]) - 1)
+    both = np.abs(reference["t"][row] - fixes["t"]) < SAME_S
+    if not both.any():
+        return
+    near = {name: values[both] for name, values in fixes.items()}
+    lat = np.interp(near["t"], reference["t"], reference["lat_deg"])
+    lon = np.interp(near["t"], reference["t"], np.unwrap(reference["lon_deg"], period=360))
+    east = (lon - near["lon_deg"] + 180) % 360 - 180
+    apart = np.hypot(lat - near["lat_deg"], east * np.cos(np.radians(lat)))
+    away = 1000 * KM_PER_DEG * float(np.median(apart))
+    sigma = np.nan_to_num(np.hypot(near["std_pos_n"], near["std_pos_e"]))
+    if away > REFERENCE_M + SIGMAS * float(np.median(sigma)):
+        said = f"{away / 1000:.3g} km" if away > 1000 else f"{away:.0f} m"
+        other = "of this drive" if away > 1000 else "of this drive, on the same clock and datum"
+        raise InputError(f"{where}: lies {said} from the fixes in the median; give the reference {other}")
+    _check_height(reference, near, where)
+
+
+def _check_height(reference: Columns, fixes: Columns, where: str) -> None:
+    """Heights of both above the ellipsoid; one number for all is that of a log that does not know it."""
+    if any((table["height_m"] == table["height_m"][0]).all() for table in (reference, fixes)):
+        return
+    above = np.interp(fixes["t"], reference["t"], reference["height_m"]) - fixes["height_m"]
+    sigma = np.nan_to_num(fixes["std_pos_d"])[np.isfinite(above)]
+    above = above[np.isfinite(above)]
+    middle = float(np.median(above)) if len(above) else 0.0
+    if abs(middle) <= HEIGHT_M + SIGMAS * (float(np.median(sigma)) if len(sigma) else 0.0):
+        return
+    side = f"{where}: lies {abs(middle):.0f} m {'above' if middle > 0 else 'below'} the fixes in the median"
+    flat = abs(middle) < GEOID_M and np.median(np.abs(above - middle)) < STEADY_M
+    raise InputError(
+        f"{side}: most often one counts from sea level (geoid), the other from the ellipsoid; height_m must count from "
+        "the ellipsoid in both; add the geoid to the one from sea level (reader.reference.position.geoid, or of gnss)"
+        if flat
+        else f"{side}; height_m must be in metres above the ellipsoid in both"
+    )
+
+
+def check_attitude(reference: Columns, imu: Columns, where: str) -> None:
+    """Attitudes in radians, yaw clockwise from North and along the motion of a car that drives forward."""
+    for name in ATTITUDE:
+        largest = np.nanmax(np.abs(reference[name]), initial=0.0)
+        if largest > 2 * np.pi + 0.01:
+            raise InputError(f"{where}: {name} reaches {largest:.1f}: looks like degrees; multiply attitudes by π/180")
+    speed = np.hypot(reference["vel_n"], reference["vel_e"])
+    with np.errstate(invalid="ignore"):
+        fast = (speed > FAST) & np.isfinite(reference["yaw"])
+    if fast.sum() < FEWEST:
+        return
+    course, yaw = np.arctan2(reference["vel_e"][fast], reference["vel_n"][fast]), reference["yaw"][fast]
+
+    def apart(angle: np.ndarray) -> float:
+        return float(np.median(np.abs((angle - course + np.pi) % (2 * np.pi) - np.pi)))
+
+    if apart(yaw) > 0.5 and apart(np.pi / 2 - yaw) < 0.1:
+        raise InputError(f"{where}: yaw counts from East, must count clockwise from North; use π/2 − yaw")
+    turned = _turned(yaw - course)
+    if turned is None or abs(turned) < np.radians(TURNED_DEG[0]):
+        return
+    backwards = abs(turned) > np.radians(TURNED_DEG[1])
+    if backwards and not _looks_forward(imu, reference):
+        return  # a car in reverse, or a sensor that looks back
+    by = "180" if backwards else f"{np.degrees(turned):+.0f}"
+    change = f"{'subtract' if turned > 0 else 'add'} {abs(turned):.2f} rad"
+    raise InputError(
+        f"{where}: yaw is {by}° from the course in the median though the car drives forward: of another axis, or in "
+        f"other conventions; must be that of x forward, clockwise from North: {change} "
+        "(or reader.reference.attitude.convention); roll and pitch may be wrong too"
+    )
+
+
+def _turned(angles: np.ndarray) -> float | None:
+    """The median of angles [rad], −π to π, about which most of them lie; None where they do not."""
+    mean = np.angle(np.exp(1j * angles).mean())
+    off = (angles - mean + np.pi) % (2 * np.pi) - np.pi
+    middle = float(np.median(off))
+    if np.mean(np.abs(off - middle) < SIDEWAYS) < STEADY:
+        return None
+    return (float(mean) + middle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _looks_forward(imu: Columns, reference: Columns) -> bool:
+    """Whether the force along the sensor's x axis is that of a motion along it."""
+    whole = np.unique(np.floor(reference["t"]), return_index=True)[1]  # one row a second
+    t, lat, lon, *velocity = (reference[c][whole] for c in ("t", "lat_deg", "lon_deg", *VELOCITY))
+    moved = motion(t, lat, lon, np.stack(velocity, -1))
+    accel, gyro = (np.stack([imu[c] for c in axes], -1) for axes in (ACCEL, GYRO))
+    best = find_lag(ImuSums.of(imu["t"], accel, gyro), moved, APART_S)
+    return best is not None and best.force > FORCE_AGREES and abs(best.angle) < np.radians(TURNED_DEG[0])
