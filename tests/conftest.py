@@ -27,7 +27,7 @@ WHOLE_FILES = {  # that take ten seconds and more
 
 def pytest_configure(config: pytest.Config) -> None:
     """A process that only hands tests to others needs no fixtures, and not torch, which takes seconds to load."""
-    if config.option.dist == "no" or config.option.collectonly:
+    if getattr(config.option, "dist", "no") == "no" or config.option.collectonly:
         config.pluginmanager.import_plugin("tests.worlds")
 
 
