@@ -13,7 +13,7 @@ from dlkf.data.drive import Drive
 
 @dataclass(frozen=True)
 class GnssNoise:
-    """1σ per axis of the noise that is add_noise: ``s_p`` [m] and ``s_v`` [m/s]; the fixes' own stds grow with it."""
+    """1σ per axis of the added noise: ``s_p`` [m] and ``s_v`` [m/s]; the fixes' own stds grow with it."""
 
     s_p: float = 0.0
     s_v: float = 0.0
