@@ -156,6 +156,23 @@ def test_guard_goes_back_to_the_last_good_epoch_at_a_slower_rate_and_gives_up_at
             stepped(fresh, parameter, math.nan)
 
 
+def test_guard_does_not_go_back_to_weights_that_have_diverged_already():
+    """Finite weights whose loss has risen a hundredfold are no place to go back to, a loss twice the least is."""
+    guard, parameter = StepGuard(patience=1, slower=0.5, returns=2), torch.nn.Parameter(torch.ones(2))
+    module = torch.nn.Module()
+    module.weight = parameter
+    for weight, loss in ((1.0, 4.0), (2.0, 1.0), (3.0, 2.0), (4.0, 100.0), (5.0, math.nan)):
+        parameter.data.fill_(weight)
+        for _ in range(2):
+            guard.on_train_batch_end(None, module, {"loss": torch.tensor(loss)}, None, 0)
+        guard.on_train_epoch_end(None, module)
+    again = StepGuard(patience=1)
+    again.load_state_dict(guard.state_dict())
+    assert again.least == 1.0
+    stepped(guard, parameter, math.nan)
+    assert float(parameter[0].detach()) == 3.0
+
+
 @pytest.mark.parametrize(
     "make",
     [

@@ -12,12 +12,15 @@ from lightning.pytorch.callbacks import Callback
 from dlkf.base.errors import InputError
 
 
+RISEN = 3.0  # an epoch whose mean loss is more than so many times the least did not end well
+
+
 class StepGuard(Callback):
     """Skips steps with a non-finite gradient; a large but finite one is harmless once its norm is clipped.
 
-    After ``patience`` skips in a row the weights go back to those of the last epoch that ended well, and the rate is
-    multiplied by ``slower``; after ``returns`` such returns training ends with a clear error. A skip, a return and the
-    gradient norm are logged.
+    After ``patience`` skips in a row the weights go back to those of the last epoch that ended well, finite and with a
+    loss near the least, and the rate is multiplied by ``slower``; after ``returns`` such returns training ends with a
+    clear error. A skip, a return and the gradient norm are logged.
     """
 
     def __init__(self, patience: int = 5, slower: float = 0.5, returns: int = 5) -> None:
@@ -26,6 +29,8 @@ class StepGuard(Callback):
         self.patience, self.slower, self.returns = patience, slower, returns
         self.skipped = self.in_a_row = self.returned = 0
         self.good: dict[str, torch.Tensor] | None = None
+        self.losses: list[torch.Tensor] = []  # of the epoch
+        self.least = math.inf
 
     def on_before_optimizer_step(self, trainer: L.Trainer, module: L.LightningModule, optimizer) -> None:
         """Drop the gradients of a bad step, before clipping; go back where nothing else helps."""
@@ -64,21 +69,35 @@ class StepGuard(Callback):
             for group, base in zip(trainer.optimizers[0].param_groups, scheduled):
                 group["lr"] = base * self.rate_factor()
 
+    def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, outputs, batch, step: int) -> None:
+        """Remember the loss."""
+        self.losses.append(outputs["loss"].detach())
+
     def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        """Keep weights that are finite."""
+        """Keep weights that are finite and whose loss has not risen."""
         state = module.state_dict()
-        if self.in_a_row == 0 and all(bool(x.isfinite().all()) for x in state.values() if x.is_floating_point()):
+        loss = float(torch.stack(self.losses).mean()) if self.losses else 0.0
+        self.losses = []
+        self.least = min(self.least, loss) if math.isfinite(loss) else self.least
+        if self.in_a_row == 0 and loss <= RISEN * self.least and all(map(_is_finite, state.values())):
             self.good = copy.deepcopy(state)
 
     def state_dict(self) -> dict:
-        """Counts; the weights to go back to are those of the checkpoint itself."""
-        return {"skipped": self.skipped, "in_a_row": self.in_a_row, "returned": self.returned}
+        """Counts and the least loss; the weights to go back to are those of the checkpoint itself."""
+        return {
+            "skipped": self.skipped, "in_a_row": self.in_a_row, "returned": self.returned, "least": self.least,
+        }  # fmt: skip
 
     def load_state_dict(self, state: dict) -> None:
-        """Counts of a checkpoint."""
+        """Those of a checkpoint."""
         self.skipped, self.in_a_row, self.returned = state["skipped"], state["in_a_row"], state["returned"]
+        self.least = state["least"]
 
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """A run that goes on starts from good weights."""
         if trainer.current_epoch:
             self.good = copy.deepcopy(module.state_dict())
+
+
+def _is_finite(x: torch.Tensor) -> bool:
+    return not x.is_floating_point() or bool(x.isfinite().all())
