@@ -29,6 +29,7 @@ NO_LOGS = {  # formats of other programs, and what makes a table of them
     ".json": "JSON; write it as a CSV table",
 }
 LARGEST_PEEK = 400  # lines
+MOST_ABOVE = 60  # lines above a header
 NAVEGO = {"imu": "fb_0", "gnss": "stdm_0"}  # a column of each of NaveGo's structures
 
 
@@ -217,8 +218,9 @@ def sniffed(path: Path) -> str | None:
 
 
 def text_options(path: Path) -> dict[str, Any]:
-    """Separator, decimal mark, comment and header of a text table, by its first lines."""
-    lines = [line for line in text.decoded(path, None).splitlines()[:LARGEST_PEEK] if line.strip()]
+    """Separator, decimal mark, comment, lines above the header and header of a text table, by its first lines."""
+    whole = text.decoded(path, None).splitlines()[:LARGEST_PEEK]
+    lines = [line for line in whole if line.strip()]
     options: dict[str, Any] = {}
     marked = [line.lstrip()[:1] in "#%" for line in lines]
     if sum(marked) > 1 or (marked and marked[0] and lines[0].lstrip()[0] == "%"):
@@ -231,11 +233,26 @@ def text_options(path: Path) -> dict[str, Any]:
     few = 3 if counts[r"\s+"] > 1 else 1  # words between blanks may have a comma each
     separator = next((s for s in (";", "\t") if counts[s] > few), "," if counts[","] > min(few, 2) else r"\s+")
     options["separator"] = separator
+    if above := _above_header(lines, separator):
+        options["skip_rows"] = next(k for k, line in enumerate(whole) if line is lines[above])
+        lines = lines[above:]
     if separator in (";", "\t", r"\s+") and any(re.search(r"\d,\d", line) for line in body):
         options["decimal"] = ","
     first = text._cells(lines[0].lstrip("#").strip(), separator)
     options["header"] = not any(text._is_number(c, options.get("decimal", ".")) for c in first)
     return options
+
+
+def _above_header(lines: list[str], separator: str) -> int:
+    """How many lines of text stand above the header: none of them has as many cells as the table, whose first row has
+    names and whose second has numbers."""
+    cells = [text._cells(line, separator) for line in lines[:MOST_ABOVE]]
+    count = len(text._cells(lines[-1], separator))
+    first = next((k for k, row in enumerate(cells) if len(row) == count), 0)
+    if not first or first + 1 >= len(cells) or any(len(row) > count for row in cells[:first]):
+        return 0
+    numbers = [sum(text._is_number(c, ".") for c in row) for row in cells[first : first + 2]]
+    return first if numbers[0] == 0 and numbers[1] > 1 else 0
 
 
 def preset(name: str) -> dict[str, Any]:

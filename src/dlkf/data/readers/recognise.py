@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from dlkf.data.discovery.units import accel_units
 from dlkf.data.readers import by_numbers, stamps, units, vocabulary
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.qualities import quality_spec
@@ -112,7 +113,15 @@ def gnss_spec(table: LogTable) -> Recognised | None:
         position["geoid"] = found["geoid"]
     if (sides := _hemispheres(table.frame[known])) is not None:
         position["hemispheres"] = sides
-    out: Spec = {"time": time, "position": position, "velocity": _velocity(found) or {"columns": None}}
+    velocity, more = _velocity(found), []
+    if velocity is None:
+        velocity = _velocity_by_numbers(table, frame[known], time, position)
+        more = (
+            [f"took {', '.join(velocity['columns'])} for the velocities by the way between the positions"]
+            if velocity["columns"]
+            else []
+        )
+    out: Spec = {"time": time, "position": position, "velocity": velocity}
     out |= _accuracies(frame, found)
     quality, notes = quality_spec(table.frame[known], _quality_column(table.frame), _accuracy_m(frame, out))
     if quality is not None:
@@ -126,7 +135,20 @@ def gnss_spec(table: LogTable) -> Recognised | None:
             *notes,
             f"took {int(known.sum())} of {len(held)} rows for fixes: the others repeat the position before",
         ]
-    return Recognised(out, tuple(notes))
+    return Recognised(out, (*more, *notes))
+
+
+def _velocity_by_numbers(table: LogTable, frame: pd.DataFrame, time: Spec, position: Spec) -> Spec:
+    """Velocities under names that are not known: columns that agree with the way between the positions."""
+    t = stamps.seconds_of(LogTable(table.frame.loc[frame.index], table.path, table.row), time)
+    scale = {"deg": 1.0, "1e-7deg": 1e-7, "rad": 180 / np.pi}.get(position["unit"])
+    if scale is None:
+        return {"columns": None}
+    names = [str(c) for c in frame.columns]
+    taken = {*position["columns"], *(time["column"] if isinstance(time["column"], list) else [time["column"]])}
+    rest = [k for k, name in enumerate(names) if name not in taken]
+    lat, lon = (scale * frame[c].to_numpy(float) for c in position["columns"][:2])
+    return by_numbers.velocities(t, lat, lon, names, frame.to_numpy(float), rest)
 
 
 def _hemispheres(frame: pd.DataFrame) -> list[str] | None:
@@ -218,13 +240,14 @@ def _unnamed(names: list[str]) -> bool:
 
 
 def _stated_unit(frame: pd.DataFrame, columns: list[str]) -> Spec:
-    """The accelerometers' unit where the header states it and gravity does not object."""
+    """The accelerometers' unit where the header states it, gravity does not object and would not find it alone: a unit
+    that gravity finds may have the opposite sign, as some phones give it."""
     unit = vocabulary.unit_of(columns[0])
     if unit not in units.ACCELERATION:
         return {}
     size = float(np.median(np.linalg.norm(frame[columns].dropna().to_numpy(), axis=1)))
     near = size > 0 and abs(np.log(size * units.ACCELERATION[unit] / G)) < NEAR_GRAVITY
-    return {"unit": unit} if near else {}
+    return {"unit": unit} if near and accel_units(size, units.ACCELERATION) != [unit] else {}
 
 
 def _velocity(found: dict[str, str | None]) -> Spec | None:
