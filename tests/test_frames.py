@@ -82,6 +82,13 @@ def test_further_sensors_are_taken(drive):
     assert "speed_used" not in dlkf.navigate(drive["imu"], fixes, model="mbkf15", speed=wheel)
 
 
+def test_a_sensor_that_the_filter_does_not_use_is_named(drive):
+    gnss = drive["gnss"]
+    speed = pd.DataFrame({"t": gnss.t, "speed": np.hypot(gnss.vel_n, gnss.vel_e)})
+    with pytest.warns(UserWarning, match="speed: used by no filter here; mbkf15 takes it"):
+        dlkf.navigate(drive["imu"], gnss, speed=speed, model="mbkf15", rate_hz=10)
+
+
 def test_a_solution_shows_and_writes_itself(drive, tmp_path):
     solution = dlkf.navigate(drive["imu"], drive["gnss"], model="mbkf15")
     assert solution.plot()._repr_png_().startswith(b"\x89PNG") and "data:image/png" in solution._repr_html_()
@@ -99,7 +106,8 @@ def test_a_filter_that_is_too_sure_of_itself_is_said(drive):
     for sensor in ("accel", "gyro"):
         spec[sensor] |= {k: 0.1 * x for k, x in spec[sensor].items() if k != "correlation_time"}
     frames = drive["imu"], drive["gnss"]
-    sure = dlkf.navigate(*frames, model="mbkf21_nhc", imu_type=spec)
+    with pytest.warns(UserWarning, match="mbkf21_nhc is too sure of itself"):  # a script has no page that shows it
+        sure = dlkf.navigate(*frames, model="mbkf21_nhc", imu_type=spec)
     assert sure.warning.startswith("mbkf21_nhc is too sure of itself") and "tuning=any_car" in sure.warning
     assert sure.warning in sure._repr_html_()
     tuned = dlkf.evaluate(*frames, drive["reference"], models="mbkf21_car", tuning="any_car", outage_s=10)

@@ -26,7 +26,12 @@ GNSS_ONLY = ("nmea", "rtklib", "inertial_explorer")
 NO_LOGS = {  # formats of other programs, and what makes a table of them
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "a spreadsheet; save its sheet as CSV"),
     **dict.fromkeys((".gpx", ".kml", ".kmz"), "a track of GPX or KML; make it a CSV table: time, lat, lon, height"),
-    ".json": "JSON; write it as a CSV table",
+    **dict.fromkeys((".json", ".geojson"), "JSON; write it as a CSV table"),
+    **dict.fromkeys((".html", ".htm"), "a web page, not the log itself; download the file behind it"),
+    **dict.fromkeys((".rar", ".7z", ".tar", ".tgz"), "an archive; unpack it and give the folder"),
+    **dict.fromkeys((".obs", ".rnx", ".crx"), "raw GNSS observations (RINEX); RTKLIB makes a solution of them, .pos"),
+    **dict.fromkeys((".mf4", ".mdf", ".blf"), "a CAN or measurement log; export its signals as CSV"),
+    **dict.fromkeys((".pcap", ".pcapng"), "a capture of network packets; save the device's own log"),
 }
 LARGEST_PEEK = 400  # lines
 MOST_ABOVE = 60  # lines above a header
@@ -66,12 +71,14 @@ def contents(path: Path) -> Contents:
     """What a file holds."""
     try:
         with path.open("rb") as file:
-            begins = file.read(4)
+            begins = file.read(64)
     except OSError as error:
         return Contents(path, held=f"cannot be opened: {(error.strerror or str(error)).lower()}")
-    if (other := NO_LOGS.get(path.suffix.lower())) is not None:
+    if (other := NO_LOGS.get(".tar" if ".tar." in path.name.lower() else path.suffix.lower())) is not None:
         return Contents(path, held=other)
-    if begins == b"PK\3\4":
+    if re.match(rb"\s*<(!doctype html|html)", begins, re.IGNORECASE):
+        return Contents(path, held=NO_LOGS[".html"])
+    if begins.startswith(b"PK\3\4"):
         return Contents(path, held="a .zip; give it as source, or unpack it")
     name = sniffed(path)
     if name is None:
