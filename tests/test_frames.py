@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 import subprocess
 import sys
 
@@ -12,6 +14,7 @@ import pytest
 import yaml
 
 import dlkf
+import dlkf.frames
 from dlkf.base.config import config_dir
 from dlkf.data.schema import POSITION, STD, VELOCITY
 
@@ -153,6 +156,19 @@ def test_mistakes_are_one_line(drive, case):
     with pytest.raises(dlkf.InputError) as error:
         dlkf.navigate(*frames(drive), **({"model": "mbkf15"} | options))
     assert message in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["navigate", "smooth", "evaluate", "Stream", "load", "simulate", "read_logs"])
+def test_docstrings_name_every_parameter_with_its_type(name):
+    """As numpydoc has them: a type or choice for each, what is returned, and the errors."""
+    function = getattr(dlkf.frames, name)
+    text = inspect.getdoc(function)
+    described = re.findall(
+        r"^(\*?[\w, *]+)( : .+)?$", text.partition("Parameters\n")[2].partition("\nReturns")[0], re.M
+    )
+    names = [one.strip(" *") for said, kind in described if kind or said.startswith("*") for one in said.split(",")]
+    assert names == [p for p in inspect.signature(function).parameters]
+    assert "Returns\n-------\n" in text and "Raises\n------\nInputError\n    " in text
 
 
 def test_importing_dlkf_imports_little():

@@ -79,16 +79,16 @@ def navigate(
     Solution
         A row per update interval from the first moment at which attitude is known.
 
+    Raises
+    ------
+    InputError
+        For frames that break the contract, a filter that does not exist, or a drive that cannot be aligned.
+
     Warns
     -----
     UserWarning
         Where the filter's 1σ is too small for its innovations, with the remedy (also ``solution.warning``), and for a
         sensor that the filter does not use.
-
-    Raises
-    ------
-    InputError
-        For frames that break the contract, a filter that does not exist, or a drive that cannot be aligned.
     """
     import torch
 
@@ -192,10 +192,14 @@ def Stream(
 
     Parameters
     ----------
-    model, imu_type, tuning, lever_arm
+    model : str or Path
         As in :func:`navigate`; a filter that is smoothed looks ahead and is refused.
     rate_hz : float, optional
         Rate the filter runs at [Hz], default its own; samples may come at any rate and jitter.
+    imu_type, tuning : str or mapping
+        As in :func:`navigate`.
+    lever_arm : sequence of 3 floats
+        IMU → antenna, Forward-Right-Down [m].
     **options
         Of :class:`~dlkf.running.streaming.StreamingFilter`: ``epoch_s`` [s], ``history_s`` (how late a fix may be), ….
 
