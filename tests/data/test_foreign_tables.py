@@ -188,7 +188,7 @@ HEADLESS = {  # columns of the fixes
 
 @pytest.mark.parametrize("order", HEADLESS)
 def test_fixes_without_a_header(order: str, tmp_path: Path, drive: Tables) -> None:
-    """With velocities, by which latitude and longitude are told apart."""
+    """With velocities, which distinguish latitude from longitude."""
     imu, gnss = drive["imu"], drive["gnss"]
     np.savetxt(tmp_path / "a.txt", np.column_stack((1000 * imu.t, imu[[*ACCEL, *GYRO]])), fmt="%.6f")
     course = np.degrees(np.arctan2(gnss.vel_e, gnss.vel_n)) % 360
