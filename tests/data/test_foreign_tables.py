@@ -89,6 +89,10 @@ STAMPS = {  # seconds since the drive's beginning to columns of stamps; what is 
         },
         "(date, utc_time): taken as hours, minutes and seconds (hhmmss) in UTC, from 2025-01-22 on",
     ),
+    "years of two digits": (
+        lambda t: {"Zeit": pd.to_datetime(UNIX + t, unit="s").dt.strftime("%d.%m.%y %H:%M:%S.%f")},
+        "(Zeit): dates taken as UTC",
+    ),
     "hours, minutes and seconds alone": (
         lambda t: {"utc": pd.to_datetime(UNIX + t, unit="s").dt.strftime("%H%M%S.%f").str[:-4]},
         "which have no date; reader.gnss.time.day=… gives it",
@@ -120,7 +124,7 @@ def test_stamps(kind: str, tmp_path: Path, drive: Tables) -> None:
     got, notes = read(tmp_path, drive)
     np.testing.assert_allclose(got.gnss.t, drive["gnss"].t, atol=0.012)
     assert said in notes and "not used" not in notes
-    if "of 2025" in said or "from 2025" in said:
+    if any(word in said for word in ("of 2025", "from 2025", "UTC")):
         assert abs(got.meta["gps_zero_s"] - GPS) < 1.0
 
 
@@ -174,6 +178,31 @@ def test_velocities_under_names_of_their_own(tmp_path: Path, drive: Tables) -> N
     fixes(drive["gnss"], names, t=UNIX + drive["gnss"].t).to_csv(tmp_path / "b.csv", index=False)
     _, notes = read(tmp_path, drive)
     assert "took how_fast, where_to for the velocities by the way between the positions" in notes
+
+
+def test_a_receivers_numbers_as_they_are(tmp_path: Path, drive: Tables) -> None:
+    """u-blox: 1e-7 degrees, mm and mm/s without units in the names; the carrier solution says RTK."""
+    gnss = drive["gnss"]
+    box(drive["imu"]).to_csv(tmp_path / "a.csv", index=False)
+    table = pd.DataFrame({"iTOW": 1000 * (TOW + gnss.t), "lat": 1e7 * gnss.lat_deg, "lon": 1e7 * gnss.lon_deg})
+    table["height"] = 1000 * gnss.height_m
+    table[["velN", "velE", "velD"]] = 1000 * gnss[["vel_n", "vel_e", "vel_d"]]
+    table[["hAcc", "vAcc", "sAcc", "fixType", "carrSoln"]] = (14, 20, 65, 3, 2)
+    table.round().astype("int64").to_csv(tmp_path / "b.csv", index=False)
+    (got,) = AutoReader().read(tmp_path)
+    np.testing.assert_allclose(got.gnss.height_m, gnss.height_m, atol=2e-3)
+    np.testing.assert_allclose(got.gnss.vel_n, gnss.vel_n, atol=2e-3)
+    for name, std in (("std_pos_n", 0.014), ("std_pos_d", 0.02), ("std_vel_e", 0.065)):
+        np.testing.assert_allclose(got.gnss[name], std, err_msg=name)
+    assert set(got.gnss.quality) == {4} and "not used: fixType" in "\n".join(got.notes)
+
+
+def test_a_quality_beside_a_dilution_is_not_rtklibs() -> None:
+    """Q = 1 is RTK fixed there and single in NMEA; RTKLIB writes no HDOP, and 2 cm would be trusted too much."""
+    frame = pd.DataFrame({"q": [1] * 9, "hdop": 0.7})
+    for table, taken in ((frame, "NMEA's GGA code"), (frame[["q"]], "RTKLIB's Q")):
+        _, (note,) = quality_spec(table, "q", np.nan)
+        assert f"taken as {taken}" in note
 
 
 HEADLESS = {  # columns of the fixes

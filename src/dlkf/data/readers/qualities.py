@@ -56,6 +56,8 @@ def quality_spec(frame: pd.DataFrame, column: str | None, accuracy_m: float) -> 
     fits = [name for name, map_ in READINGS.items() if all(x in map_ for x in seen)]
     if not fits:
         return None, [f"quality {column} has numbers that no receiver gives ({_some(values)}): all count as single"]
+    beside_hdop = vocabulary.named([str(c) for c in frame.columns], "hdop") is not None  # RTKLIB writes none
+    fits = [name for name in fits if not (beside_hdop and name == RTKLIB)] or fits
     chosen = _reading(column, [int(x) for x in seen], numbers, fits, accuracy_m)
     codes = {int(x): READINGS[chosen][int(x)] for x in seen}
     spec: dict[str, Any] = {"column": column}

@@ -15,9 +15,11 @@ from dlkf.data.readers.mapping import Mapped
 
 Spec = dict[str, Any]
 OF_DAY = r"^\s*\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?\s*([AaPp][Mm])?\s*Z?\s*$"
-CALENDAR = r"^\s*(\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}-[A-Za-z]{3}-\d{4}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4}|\d{8})"
+CALENDAR = r"^\s*(\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}-[A-Za-z]{3}-\d{4}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4}"
+CALENDAR += r"|\d{1,2}[/.]\d{1,2}[/.]\d{2}|\d{8})"
 CALENDAR += r"[T ]+\d{1,2}:\d{2}"
-DAY = r"^\s*(\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4}|\d{8}|\d{4}年\d{1,2}月\d{1,2}日)\s*$"
+DAY = r"^\s*(\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4}|\d{1,2}[/.]\d{1,2}[/.]\d{2}|\d{8}"
+DAY += r"|\d{4}年\d{1,2}月\d{1,2}日)\s*$"
 NEWEST_UNIX = 2e9  # s: 2033; a stamp beyond it counts from no known epoch
 SWITCHED_ON_S = 1000.0  # a log that begins with less counts from its own beginning, which is nothing to report
 DAY_S = 86_400

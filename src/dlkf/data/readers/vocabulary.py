@@ -14,6 +14,7 @@ RECEIVER = r"(?:(?:gps|gnss|loc(?:ation)?|rtk|ublox|nmea|receiver|nav|fix) )?"
 NORTH, EAST = r"n(?:orth|ord)?|lat(?:itude)?|norte?", r"e(?:ast)?|lon(?:gitude)?|ost|est|este"
 DOWN, UP = r"d(?:own)?", r"u(?:p)?|alt(?:itude)?|h(?:eight)?"
 ACCURACY = r"(?:acc(?:uracy)?|error|err|std|sigma|genauigkeit|fehler|precision|exactitud|incertitude|精度|误差|誤差)"
+CARRIER = r"carr(?:ier)? ?soln?"
 VELOCITY = r"v(?:el(?:ocity)?)?|velocity|geschwindigkeit|vitesse|velocidad|速度"
 
 SENSORS = {
@@ -55,7 +56,7 @@ QUANTITIES: dict[str, list[str]] = {
     "quality": [r"quality|(?:fix|gga|gps) ?quality|qualitat|qualitaet|qualite|calidad"]
     + [r"(?:定位|测位|測位)?(?:质量|品质|品質|質量)"]
     + [r"fix ?(?:typ|type|art|status|mode|qual)?|(?:gps ?)?status|(?:gps ?)?mode|sol(?:ution)?(?: ?(?:type|status))?"]
-    + [r"carr(?:ier)? ?soln?"]
+    + [CARRIER]
     + [r"rtk(?: ?(?:status|fix|mode|state))?|type de fix|tipo de fix|modo|(?:定位|测位|測位|解)(?:状态|狀態|状態)|q"],
     "hacc": [rf"h(?:or(?:izontal)?)? ?(?:pos(?:ition)? )?{ACCURACY}|eph|pos(?:ition)? ?{ACCURACY}"]
     + [rf"horizontale? ?{ACCURACY}|{ACCURACY} horizontale?|lagegenauigkeit|水平(?:位置)?(?:精度|误差|誤差)"]
@@ -91,7 +92,7 @@ TIME = (
     r"#?(?:t|time|time ?stamp|tow|sow|gps ?(?:time|sow|tow|seconds?|t)?|unix ?(?:time)?|posix(?: ?time)?|utc"
     r"|stamp|epoch|secs?|seconds|date ?time|milli(?:s|seconds)?"
     r"|micro(?:s|seconds)?|nano(?:s|seconds)?|ms|us|ns|ticks|sample ?time"
-    r"|ros ?time|itow|utc ?(?:time|seconds)|seconds ?elapsed|elapsed|sample ?time ?fine|date ?num"
+    r"|ros ?time|i ?tow|utc ?(?:time|seconds)|seconds ?elapsed|elapsed|sample ?time ?fine|date ?num"
     r"|(?:location|accelerometer|gyro|motion) timestamp since (?:1970|reboot)"
     r"|zeit(?:stempel|punkt)?|uhrzeit|temps|heure|horodatage|tiempo|hora"
     r"|marca de tiempo"
