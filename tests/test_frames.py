@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 import subprocess
 import sys
 
@@ -12,6 +14,7 @@ import pytest
 import yaml
 
 import dlkf
+import dlkf.frames
 from dlkf.base.config import config_dir
 from dlkf.data.schema import POSITION, STD, VELOCITY
 
@@ -82,6 +85,13 @@ def test_further_sensors_are_taken(drive):
     assert "speed_used" not in dlkf.navigate(drive["imu"], fixes, model="mbkf15", speed=wheel)
 
 
+def test_a_sensor_that_the_filter_does_not_use_is_named(drive):
+    gnss = drive["gnss"]
+    speed = pd.DataFrame({"t": gnss.t, "speed": np.hypot(gnss.vel_n, gnss.vel_e)})
+    with pytest.warns(UserWarning, match="speed: used by no filter here; mbkf15 takes it"):
+        dlkf.navigate(drive["imu"], gnss, speed=speed, model="mbkf15", rate_hz=10)
+
+
 def test_a_solution_shows_and_writes_itself(drive, tmp_path):
     solution = dlkf.navigate(drive["imu"], drive["gnss"], model="mbkf15")
     assert solution.plot()._repr_png_().startswith(b"\x89PNG") and "data:image/png" in solution._repr_html_()
@@ -99,7 +109,8 @@ def test_a_filter_that_is_too_sure_of_itself_is_said(drive):
     for sensor in ("accel", "gyro"):
         spec[sensor] |= {k: 0.1 * x for k, x in spec[sensor].items() if k != "correlation_time"}
     frames = drive["imu"], drive["gnss"]
-    sure = dlkf.navigate(*frames, model="mbkf21_nhc", imu_type=spec)
+    with pytest.warns(UserWarning, match="mbkf21_nhc is too sure of itself"):  # a script has no page that shows it
+        sure = dlkf.navigate(*frames, model="mbkf21_nhc", imu_type=spec)
     assert sure.warning.startswith("mbkf21_nhc is too sure of itself") and "tuning=any_car" in sure.warning
     assert sure.warning in sure._repr_html_()
     tuned = dlkf.evaluate(*frames, drive["reference"], models="mbkf21_car", tuning="any_car", outage_s=10)
@@ -145,6 +156,19 @@ def test_mistakes_are_one_line(drive, case):
     with pytest.raises(dlkf.InputError) as error:
         dlkf.navigate(*frames(drive), **({"model": "mbkf15"} | options))
     assert message in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["navigate", "smooth", "evaluate", "Stream", "load", "simulate", "read_logs"])
+def test_docstrings_name_every_parameter_with_its_type(name):
+    """As numpydoc has them: a type or choice for each, what is returned, and the errors."""
+    function = getattr(dlkf.frames, name)
+    text = inspect.getdoc(function)
+    described = re.findall(
+        r"^(\*?[\w, *]+)( : .+)?$", text.partition("Parameters\n")[2].partition("\nReturns")[0], re.M
+    )
+    names = [one.strip(" *") for said, kind in described if kind or said.startswith("*") for one in said.split(",")]
+    assert names == [p for p in inspect.signature(function).parameters]
+    assert "Returns\n-------\n" in text and "Raises\n------\nInputError\n    " in text
 
 
 def test_importing_dlkf_imports_little():

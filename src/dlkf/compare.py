@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
 
 from dlkf.base.files import require_empty
 from dlkf.command import command
 from dlkf.command.arguments import expand_home
 from dlkf.command.settings import CompareSettings
-from dlkf.report.compare import read_reports, write_comparison
+from dlkf.evaluation.table import ResultTable, as_rich
+from dlkf.report.compare import answers, end_table, named_warnings, read_reports, write_comparison
 
 
 def runs_of(arguments: list[str]) -> list[str]:
@@ -24,7 +29,14 @@ def main(settings: CompareSettings) -> None:
     """Read, write, print."""
     runs, out = settings.runs, settings.out
     require_empty(out, overwrite=settings.overwrite)
-    write_comparison(out, read_reports([str(run) for run in (runs if isinstance(runs, (list, tuple)) else [runs])]))
+    reports = read_reports([str(run) for run in (runs if isinstance(runs, (list, tuple)) else [runs])])
+    write_comparison(out, reports)
+    console = Console(width=None if sys.stdout.isatty() else 110)
+    console.print(as_rich(ResultTable("At the end of the outages", "", *end_table(reports))))
+    for line in answers(reports):
+        console.print(f"[bold]{escape(line)}[/bold]", highlight=False)
+    for line in named_warnings(reports):
+        console.print(escape(line), style="yellow", highlight=False, soft_wrap=True)
     print(f"Report: {out}/compare.html")
 
 

@@ -34,7 +34,7 @@ from dlkf.evaluation.table import (
 )
 from dlkf.filters.build import build_filter
 from dlkf.report.compare import StoredReport, best_of_each, end_table, scored_on, shorten_names
-from dlkf.report.evaluation import least_error, outage_rows, write_report
+from dlkf.report.evaluation import evaluation_page, least_error, outage_rows, write_report
 from tests.cars import IMU
 from tests.evaluation.drawn import figures_of
 from tests.evaluation.scoring import score
@@ -203,6 +203,15 @@ def test_report_is_complete_and_replaces_an_older_one(scores, tmp_path):
     assert len(figures_of(page)) >= 4
     assert page.count("<img loading=lazy") == 5 and "<script src" not in page and "<link" not in page
     assert page.count("class=figure") == 4 and "20 s without GNSS, " in page.partition("<h2>")[0]
+
+
+def test_the_page_of_a_training_begins_with_what_was_trained(scores):
+    results = [summarise_scores(scores, resamples=50)]
+    page = evaluation_page("town", [], scores, results, [], {}, "mbkf15", trained="ins")
+    top = page.partition("<h2>")[0]
+    assert (
+        0 < top.index("ins: ") < top.index("20 s without GNSS, ") and "m RMS at the end of the outages; mbkf15" in top
+    )
 
 
 def test_outages_stand_in_the_order_of_the_best_filter(scores):

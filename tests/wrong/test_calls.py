@@ -199,6 +199,54 @@ CALLS: dict[str, tuple[Callable[[Frames, Path], Any], str]] = {
         lambda d, here: dlkf.read_logs(picture(here)),
         "no IMU found in car.png (of no format that is known)",
     ),
+    "a web page in the place of a log": (
+        lambda d, here: dlkf.read_logs(file_of(here, "log.csv", b"<!DOCTYPE html><html><body>404</body></html>\n")),
+        "no IMU found in log.csv (a web page, not the log itself; download the file behind it)",
+    ),
+    "raw observations": (
+        lambda d, here: dlkf.read_logs(file_of(here, "base.obs", b"     3.04           OBSERVATION DATA\n" * 9)),
+        "base.obs (raw GNSS observations (RINEX); RTKLIB makes a solution of them, .pos)",
+    ),
+    "an archive of another kind": (
+        lambda d, here: dlkf.read_logs(file_of(here, "log.tar.gz", b"\x1f\x8b")),
+        "log.tar.gz (an archive; unpack it and give the folder)",
+    ),
+    "a measurement of a CAN bus": (
+        lambda d, here: dlkf.read_logs(file_of(here, "drive.mf4", b"MDF     4.10")),
+        "drive.mf4 (a CAN or measurement log; export its signals as CSV)",
+    ),
+    "a track of GeoJSON": (
+        lambda d, here: dlkf.read_logs(file_of(here, "a.geojson", b'{"type": "FeatureCollection"}')),
+        "a.geojson (JSON; write it as a CSV table)",
+    ),
+    "a header alone": (
+        lambda d, here: dlkf.read_logs(file_of(here, "imu.csv", b"t,ax,ay,az,gx,gy,gz\n")),
+        "no IMU found in imu.csv (has no rows",
+    ),
+    "a preset for a simulated car as values": (
+        lambda d, _: dlkf.simulate(imu_type={"name": "x"}),
+        "imu_type is {'name': 'x'}, must be the name of a preset",
+    ),
+    "filters as a set": (
+        lambda d, _: dlkf.evaluate(d["imu"], d["gnss"], models={"mbkf15"}),
+        "models is {'mbkf15'}, must be a name or a list of names",
+    ),
+    "a switch for an outage": (
+        lambda d, _: dlkf.evaluate(d["imu"], d["gnss"], outage_s=True),
+        "outage_s is True, must be a number above 0",
+    ),
+    "factors as words": (
+        lambda d, _: dlkf.navigate(d["imu"], d["gnss"], tuning={"accel_noise": "much"}, **KALMAN),
+        "tuning.accel_noise is 'much', must be a number",
+    ),
+    "an interval of minutes": (
+        lambda d, _: dlkf.navigate(d["imu"], d["gnss"], epoch_s=1000, **KALMAN),
+        "epoch_s is 1000, must be above 0 and at most 60",
+    ),
+    "a file of weights": (
+        lambda d, here: dlkf.load(file_of(here, "weights.safetensors", b"xx")),
+        "weights.safetensors is a file; give the folder with weights.safetensors and config.yaml",
+    ),
     "a reader misspelt": (
         lambda d, here: dlkf.read_logs(here, "atuo"),
         "unknown reader preset 'atuo'; did you mean auto?",
@@ -325,6 +373,12 @@ def dataset(here: Path) -> Path:
     """A folder with the table of a dataset's drives."""
     (here / "drives.parquet").touch()
     return here
+
+
+def file_of(here: Path, name: str, content: bytes) -> Path:
+    """A file that is no log."""
+    (here / name).write_bytes(content)
+    return here / name
 
 
 def picture(here: Path) -> Path:

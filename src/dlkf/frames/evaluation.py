@@ -93,7 +93,7 @@ def evaluate(
 
     Parameters
     ----------
-    imu, gnss, speed, heading, baro, imu_type, tuning, lever_arm
+    imu, gnss : pandas.DataFrame
         As in :func:`dlkf.frames.navigation.navigate`.
     reference : pandas.DataFrame, optional
         What errors are measured against; without one the drive smoothed with all its fixes.
@@ -101,10 +101,17 @@ def evaluate(
         Filters to compare, as ``model`` of :func:`dlkf.frames.navigation.navigate`.
     outage_s : float
         Length of an outage [s]; the next begins after as long with GNSS.
+    imu_type, tuning : str or mapping
+        As in :func:`dlkf.frames.navigation.navigate`.
+    lever_arm : sequence of 3 floats
+        IMU → antenna, Forward-Right-Down [m].
+    speed, heading, baro : pandas.DataFrame, optional
+        As in :func:`dlkf.frames.navigation.navigate`.
 
     Returns
     -------
     Evaluation
+        The answer in a sentence, a table with a row per filter, and a row per outage.
 
     Raises
     ------

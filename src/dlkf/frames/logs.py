@@ -56,7 +56,7 @@ def simulate(
 
     check_preset("simulated", preset)
     if imu_type is not None:
-        check_preset("imu", imu_type)
+        check_preset("imu", imu_type, "imu_type")
     check_above_zero(minutes=minutes)
     if not SHORTEST_MIN <= minutes <= LONGEST_MIN:
         raise InputError(f"minutes is {minutes:g}, must be from {SHORTEST_MIN:g} to {LONGEST_MIN:g} a drive")

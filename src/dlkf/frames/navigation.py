@@ -83,11 +83,17 @@ def navigate(
     ------
     InputError
         For frames that break the contract, a filter that does not exist, or a drive that cannot be aligned.
+
+    Warns
+    -----
+    UserWarning
+        Where the filter's 1σ is too small for its innovations, with the remedy (also ``solution.warning``), and for a
+        sensor that the filter does not use.
     """
     import torch
 
     from dlkf.data.store import choose_aids, load_dataset
-    from dlkf.filters.aids.attach import tables_of, with_aids
+    from dlkf.filters.aids.attach import describe_aids, tables_of, with_aids
     from dlkf.filters.saved import grid_of
     from dlkf.filters.smoother import run_smoother
     from dlkf.running.innovations import OF_NETWORK, REMEDY
@@ -101,14 +107,19 @@ def navigate(
     check_imu_type(imu_type)
     aids = {"speed": speed, "heading": heading, "baro": baro}
     with drive_folder(imu, gnss, None, lever_arm, aids) as folder:
-        estimator = with_aids(load(model, imu_type=imu_type, tuning=tuning), choose_aids(folder, None))
+        chosen = choose_aids(folder, None)
+        estimator = with_aids(load(model, imu_type=imu_type, tuning=tuning), chosen)
+        unused = describe_aids({short_name(model): estimator}, [t for t in chosen if t not in tables_of(estimator)])
         if smoothed:
             estimator = run_smoother(estimator, "rts")
         fixes = UsableFixes.of(folder, DRIVE)
         grid = grid_of([estimator], rate_hz, epoch_s, epoch_for([fixes], rate_hz or 50.0, estimator))
         drives = load_dataset(folder, dtype=torch.float64, reference=False, aids=tables_of(estimator), **grid)
         (navigated,) = navigate_drives(drives, estimator, align=_align())
-    return Solution.of(navigated, fixes, short_name(model), REMEDY if takes_imu_preset(model) else OF_NETWORK)
+    solution = Solution.of(navigated, fixes, short_name(model), REMEDY if takes_imu_preset(model) else OF_NETWORK)
+    for line in (*unused, *([solution.warning] if solution.warning else [])):
+        warnings.warn(line, UserWarning, stacklevel=2)
+    return solution
 
 
 def smooth(imu: pd.DataFrame, gnss: pd.DataFrame, *, model: str | Path = "mbkf21_nhc", **options: Any) -> Solution:
@@ -181,10 +192,14 @@ def Stream(
 
     Parameters
     ----------
-    model, imu_type, tuning, lever_arm
+    model : str or Path
         As in :func:`navigate`; a filter that is smoothed looks ahead and is refused.
     rate_hz : float, optional
         Rate the filter runs at [Hz], default its own; samples may come at any rate and jitter.
+    imu_type, tuning : str or mapping
+        As in :func:`navigate`.
+    lever_arm : sequence of 3 floats
+        IMU → antenna, Forward-Right-Down [m].
     **options
         Of :class:`~dlkf.running.streaming.StreamingFilter`: ``epoch_s`` [s], ``history_s`` (how late a fix may be), ….
 

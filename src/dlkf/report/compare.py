@@ -81,9 +81,7 @@ def write_comparison(out: str | Path, reports: Sequence[StoredReport]) -> None:
 
 def comparison_page(reports: Sequence[StoredReport]) -> str:
     """Answers, a table and the growth of the error over all of them, and in what they differ."""
-    lines = [f"{r.name}: {headline(result)}" for r in reports for result in r.results]
-    warnings = [f"{r.name}: {line}" for r in reports for line in r.warnings]
-    page = Page(f"{len(reports)} evaluations compared", lines, warnings=warnings)
+    page = Page(f"{len(reports)} evaluations compared", answers(reports), warnings=named_warnings(reports))
     whole = {r.name: r.path for r in reports}
     columns, rows = end_table(reports)
     about = "Horizontal error; RMS over the segments where there are no outages. Marked: the least median of a test. "
@@ -97,6 +95,16 @@ def comparison_page(reports: Sequence[StoredReport]) -> str:
     page.heading("Where they lie")
     page.table(["Run", "Folder"], list(whole.items()), words=True)
     return page.html()
+
+
+def answers(reports: Sequence[StoredReport]) -> list[str]:
+    """The sentence of each evaluation, behind its name."""
+    return [f"{r.name}: {headline(result)}" for r in reports for result in r.results]
+
+
+def named_warnings(reports: Sequence[StoredReport]) -> list[str]:
+    """The lines on filters that are too sure of themselves, behind the evaluation's name."""
+    return [f"{r.name}: {line}" for r in reports for line in r.warnings]
 
 
 def end_table(reports: Sequence[StoredReport]) -> tuple[list[str], list[list[str]]]:

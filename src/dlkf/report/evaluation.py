@@ -15,7 +15,7 @@ from dlkf.evaluation.metrics import magnitudes, outage_at, outage_end, rms_over_
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import OFF_SCALE, Scores, representative
 from dlkf.evaluation.sensors import TITLE as SENSORS_TITLE
-from dlkf.evaluation.summary import END, headline, sigma_warnings
+from dlkf.evaluation.summary import END, describe_verdict, headline, sigma_warnings
 from dlkf.evaluation.table import DEGREES, ResultTable, all_tables, as_csv, as_json, as_markdown, format_number
 from dlkf.report.drawing import Figure
 from dlkf.report.maps import add_track, chart, join_tracks
@@ -48,13 +48,15 @@ def write_report(
     baseline: str | None,
     more: Sequence[ResultTable] = (),
     figures: bool,
+    trained: str | None = None,
     dpi: int = 110,
 ) -> list[Path]:
     """Write the whole report into ``out``, all files or none; returns their paths.
 
     ``results`` has one entry per kind of data (of scores.of_kind); ``protocol`` is how the
     scores were made, in plain values; ``more`` tables follow those of the results; ``figures``: the page's figures for
-    print as well, figures/*.png. Raises InputError if ``out`` cannot be written to.
+    print as well, figures/*.png; ``trained``: the filter with which the answer begins. Raises InputError if ``out``
+    cannot be written to.
     """
     parts = [*all_tables(dataset, results), *more]
     pictures = print_figures(scores, by_time, baseline, dpi) if figures else []
@@ -70,7 +72,7 @@ def write_report(
         ).encode(),
         "table.md": "\n".join(map(as_markdown, parts)).encode(),
         "table.csv": as_csv(dataset, results).encode(),
-        "report.html": evaluation_page(dataset, parts, scores, results, pictures, protocol, baseline).encode(),
+        "report.html": evaluation_page(dataset, parts, scores, results, pictures, protocol, baseline, trained).encode(),
         **{f"figures/{name}": data for name, _, data in pictures},
     }
     with write_into(out) as folder:
@@ -103,11 +105,15 @@ def evaluation_page(
     pictures: Sequence[tuple[str, str, bytes]],
     protocol: Mapping[str, Any],
     baseline: str | None,
+    trained: str | None = None,
 ) -> str:
-    """The page: answer; for every kind of data map, growth, tables of the outages and of further sensors, every outage;
-    then what is for research: errors over time, IMU errors, the other tables."""
+    """The page: answer, of a training what was ``trained`` first; for every kind of data map, growth, tables of the
+    outages and of further sensors, every outage; then what is for research: errors over time, IMU errors, the other
+    tables."""
     many = len(results) > 1
-    answers = [f"{r.kind.capitalize()} data. {headline(r)}" if many else headline(r) for r in results]
+    verdicts = [(r, v) for r in results if trained is not None and (v := describe_verdict(r, trained))]
+    said = [*verdicts, *((r, headline(r)) for r in results)]
+    answers = [f"{r.kind.capitalize()} data. {line}" if many else line for r, line in said]
     own = protocol.get("reference")
     answers += [f"No truth: errors are against the {own}."] if own else []
     page = Page(f"Evaluation on {dataset}", answers, warnings=sigma_warnings(scores))

@@ -111,6 +111,7 @@ def run_study(
         baseline=baseline,
         more=tables,
         figures=True,
+        trained=learned,
     )
     if gains:
         write_gains(folder / "report", gains, title)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from dlkf.evaluation.summary import headline, metrics_of
+from dlkf.evaluation.summary import describe_verdict, headline, metrics_of
 from dlkf.evaluation.table import all_tables, as_markdown
 from dlkf.training.settings import StudySettings
 from dlkf.training.study import TrainingOutcome
@@ -29,6 +29,7 @@ def note(settings: StudySettings, datasets: Sequence[str], outcome: TrainingOutc
     """The answer and the tables as a Markdown note of the run."""
     names = ", ".join(datasets)
     tables = "\n".join(as_markdown(t) for t in (*all_tables(names, outcome.results), *outcome.tables))
-    headlines = "\n\n".join(f"**{headline(result)}**" for result in outcome.results)
+    said = [*(describe_verdict(result, outcome.name) for result in outcome.results), *map(headline, outcome.results)]
+    headlines = "\n\n".join(f"**{line}**" for line in said if line)
     about = f"{settings.name}: {settings.fit.model.kind} on {names}, seed {settings.fit.seed}"
     return f"{headlines}\n\n{about}\n\n{tables}"

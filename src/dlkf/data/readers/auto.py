@@ -99,7 +99,8 @@ class AutoReader:
                 specs[kind] = {"file": None}
                 continue
             specs[kind] = merged(getattr(chosen, kind), self.known[kind])
-            detail += [f"found the {kind} in {chosen.name}: {chosen.detail}", *chosen.notes]
+            there = chosen.name if chosen.table else specs[kind].get("file") or chosen.name
+            detail += [f"found the {kind} in {there}: {chosen.detail}", *chosen.notes]
             if kind == "gnss" and (more := _velocities_beside(chosen, specs[kind], [] if only else folder.iterdir())):
                 specs[kind]["velocity"] |= more
                 detail.append(f"found velocities in {more.get('table') or more['file']}")

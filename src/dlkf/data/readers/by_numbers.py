@@ -66,15 +66,25 @@ def gnss_spec(table: LogTable) -> Spec | None:
     taken = time["column"] if isinstance(time["column"], list) else [time["column"]]
     names = [str(c) for c in frame.columns if str(c) not in taken]
     values = frame[names].to_numpy(float)
-    place = next((k for k in range(len(names) - 2) if _are_places(values[:, k : k + 3])), None)
-    if place is None:
+    t = stamps.seconds_of(table, time)
+    fits = []  # degrees, or u-blox' 1e-7 of them; latitude first, or longitude
+    for scale, unit in ((1.0, "deg"), (1e-7, "1e-7deg")):
+        for place in range(len(names) - 2):
+            three = values[:, place : place + 3] * (scale, scale, 1e-3 if scale < 1 else 1.0)
+            for lat, lon in ((0, 1), (1, 0)):
+                if _are_places(three[:, [lat, lon, 2]]):
+                    rest = [k for k in range(len(names)) if not place <= k < place + 3]
+                    found = velocities(t, three[:, lat], three[:, lon], names, values, rest)
+                    fits.append((place, lat, lon, unit, rest, found))
+        if fits:
+            break
+    if not fits:
         return None
-    spec: Spec = {"time": time, "position": {"columns": names[place : place + 3], "unit": "deg"}}
-    spec["velocity"] = {"columns": None}
-    rest = [k for k in range(len(names)) if not place <= k < place + 3]
-    if not isinstance(time["column"], list) and time["unit"] in units.TIME:
-        t = frame[taken[0]].to_numpy(float) / units.TIME[time["unit"]]
-        spec["velocity"] = _velocities(t, values[:, place], values[:, place + 1], names, values, rest)
+    place, lat, lon, unit, rest, found = next((fit for fit in fits if fit[-1]["columns"]), fits[0])
+    columns = [names[place + lat], names[place + lon], names[place + 2]]
+    spec: Spec = {"time": time, "position": {"columns": columns, "unit": unit}, "velocity": found}
+    if unit != "deg":
+        spec["position"]["height_unit"] = "mm"
     after = range(place + 3, place + 6)
     if all(k in rest for k in after) and not set(spec["velocity"]["columns"] or ()) & {names[k] for k in after}:
         stds = values[:, after.start : after.stop]
@@ -106,10 +116,13 @@ def _are_places(three: np.ndarray) -> bool:
     return bool(near and still and within and not whole and somewhere and (np.abs(lat) > 1).any())
 
 
-def _velocities(
-    t: np.ndarray, lat: np.ndarray, lon: np.ndarray, names: list[str], values: np.ndarray, rest: list[int]
+def velocities(
+    t: np.ndarray | None, lat: np.ndarray, lon: np.ndarray, names: list[str], values: np.ndarray, rest: list[int]
 ) -> Spec:
-    """Columns that agree with the way between positions: North and East, or speed and course [deg]."""
+    """Columns among ``rest`` that agree with the way between positions [deg] at times ``t`` [s]: North and East, or
+    speed and course [deg]; none without times."""
+    if t is None or len(t) < 3 or not rest:
+        return {"columns": None}
     span = t[2:] - t[:-2]
     north = EARTH_M * np.radians(lat[2:] - lat[:-2]) / span
     east = EARTH_M * np.cos(np.radians(lat[1:-1])) * np.radians(lon[2:] - lon[:-2]) / span

@@ -172,13 +172,18 @@ class Mapped:
                 values = values.str.cat(self._cells(more).astype(str), sep=" ")
             values = values.to_numpy()
         else:
-            values = self.column(name, nan=False)
+            values = self.column(name[-1] if isinstance(name, list) else name, nan=False)
+        day = None if time.get("day") is None else str(time["day"])
+        if unit == units.HHMMSS:
+            values, unit = units.of_the_day(values), "s"
+            day = units.day_of_number(self._cells(name[0]).iloc[0]) if isinstance(name, list) else day
+        if unit in units.DAYS:
+            values, unit = (values - units.DAYS[unit]) * 86_400.0, "s"
         if time.get("wraps_s") is not None:
             values = units.unwrapped(values, float(time["wraps_s"]) * units.TIME.get(unit, 1))
         week = self.column(time["week"], nan=False) if time.get("week") is not None else None
         if time.get("week_number") is not None:
             week = np.full(len(self), int(time["week_number"]))
-        day = None if time.get("day") is None else str(time["day"])
         order = None if time.get("order") is None else str(time["order"])
         return units.seconds(values, unit, week, time.get("clock"), f"{self.table.path}, {where}", day, order)
 

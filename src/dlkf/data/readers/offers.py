@@ -26,9 +26,15 @@ GNSS_ONLY = ("nmea", "rtklib", "inertial_explorer")
 NO_LOGS = {  # formats of other programs, and what makes a table of them
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "a spreadsheet; save its sheet as CSV"),
     **dict.fromkeys((".gpx", ".kml", ".kmz"), "a track of GPX or KML; make it a CSV table: time, lat, lon, height"),
-    ".json": "JSON; write it as a CSV table",
+    **dict.fromkeys((".json", ".geojson"), "JSON; write it as a CSV table"),
+    **dict.fromkeys((".html", ".htm"), "a web page, not the log itself; download the file behind it"),
+    **dict.fromkeys((".rar", ".7z", ".tar", ".tgz"), "an archive; unpack it and give the folder"),
+    **dict.fromkeys((".obs", ".rnx", ".crx"), "raw GNSS observations (RINEX); RTKLIB makes a solution of them, .pos"),
+    **dict.fromkeys((".mf4", ".mdf", ".blf"), "a CAN or measurement log; export its signals as CSV"),
+    **dict.fromkeys((".pcap", ".pcapng"), "a capture of network packets; save the device's own log"),
 }
 LARGEST_PEEK = 400  # lines
+MOST_ABOVE = 60  # lines above a header
 NAVEGO = {"imu": "fb_0", "gnss": "stdm_0"}  # a column of each of NaveGo's structures
 
 
@@ -65,12 +71,14 @@ def contents(path: Path) -> Contents:
     """What a file holds."""
     try:
         with path.open("rb") as file:
-            begins = file.read(4)
+            begins = file.read(64)
     except OSError as error:
         return Contents(path, held=f"cannot be opened: {(error.strerror or str(error)).lower()}")
-    if (other := NO_LOGS.get(path.suffix.lower())) is not None:
+    if (other := NO_LOGS.get(".tar" if ".tar." in path.name.lower() else path.suffix.lower())) is not None:
         return Contents(path, held=other)
-    if begins == b"PK\3\4":
+    if re.match(rb"\s*<(!doctype html|html)", begins, re.IGNORECASE):
+        return Contents(path, held=NO_LOGS[".html"])
+    if begins.startswith(b"PK\3\4"):
         return Contents(path, held="a .zip; give it as source, or unpack it")
     name = sniffed(path)
     if name is None:
@@ -217,8 +225,9 @@ def sniffed(path: Path) -> str | None:
 
 
 def text_options(path: Path) -> dict[str, Any]:
-    """Separator, decimal mark, comment and header of a text table, by its first lines."""
-    lines = [line for line in text.decoded(path, None).splitlines()[:LARGEST_PEEK] if line.strip()]
+    """Separator, decimal mark, comment, lines above the header and header of a text table, by its first lines."""
+    whole = text.decoded(path, None).splitlines()[:LARGEST_PEEK]
+    lines = [line for line in whole if line.strip()]
     options: dict[str, Any] = {}
     marked = [line.lstrip()[:1] in "#%" for line in lines]
     if sum(marked) > 1 or (marked and marked[0] and lines[0].lstrip()[0] == "%"):
@@ -231,11 +240,26 @@ def text_options(path: Path) -> dict[str, Any]:
     few = 3 if counts[r"\s+"] > 1 else 1  # words between blanks may have a comma each
     separator = next((s for s in (";", "\t") if counts[s] > few), "," if counts[","] > min(few, 2) else r"\s+")
     options["separator"] = separator
+    if above := _above_header(lines, separator):
+        options["skip_rows"] = next(k for k, line in enumerate(whole) if line is lines[above])
+        lines = lines[above:]
     if separator in (";", "\t", r"\s+") and any(re.search(r"\d,\d", line) for line in body):
         options["decimal"] = ","
     first = text._cells(lines[0].lstrip("#").strip(), separator)
     options["header"] = not any(text._is_number(c, options.get("decimal", ".")) for c in first)
     return options
+
+
+def _above_header(lines: list[str], separator: str) -> int:
+    """How many lines of text stand above the header: none of them has as many cells as the table, whose first row has
+    names and whose second has numbers."""
+    cells = [text._cells(line, separator) for line in lines[:MOST_ABOVE]]
+    count = len(text._cells(lines[-1], separator))
+    first = next((k for k, row in enumerate(cells) if len(row) == count), 0)
+    if not first or first + 1 >= len(cells) or any(len(row) > count for row in cells[:first]):
+        return 0
+    numbers = [sum(text._is_number(c, ".") for c in row) for row in cells[first : first + 2]]
+    return first if numbers[0] == 0 and numbers[1] > 1 else 0
 
 
 def preset(name: str) -> dict[str, Any]:

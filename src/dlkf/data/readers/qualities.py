@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,6 +12,7 @@ import pandas as pd
 from dlkf.data.readers import vocabulary
 
 Spec = dict[str, Any]
+SOLUTION = r" ?(?:solution|losung|solucion|解)"
 WORDS = {
     0: ("", "none", "no fix", "nofix", "no solution", "invalid", "kein fix", "keine", "aucun", "sin fix")
     + ("无", "无效", "無効"),
@@ -18,7 +20,7 @@ WORDS = {
     + ("autonome", "autonomo", "单点", "单点解", "単独", "単独測位"),
     2: ("dgps", "dgnss", "sbas", "differential", "differentiell", "differentiel", "diferencial")
     + ("差分", "差分解", "ディファレンシャル"),
-    4: ("rtk", "rtk fix", "rtk fixed", "fixed", "fix", "rtk int", "int", "integer", "fixe", "fijo")
+    4: ("rtk", "rtk fix", "rtk fixed", "fixed", "fix", "rtk int", "int", "integer", "fixe", "fijo", "fest")
     + ("固定", "固定解", "フィックス"),
     5: ("float", "rtk float", "flottant", "flotante", "gleitend", "浮点", "浮点解", "浮動", "フロート"),
 }
@@ -54,6 +56,8 @@ def quality_spec(frame: pd.DataFrame, column: str | None, accuracy_m: float) -> 
     fits = [name for name, map_ in READINGS.items() if all(x in map_ for x in seen)]
     if not fits:
         return None, [f"quality {column} has numbers that no receiver gives ({_some(values)}): all count as single"]
+    beside_hdop = vocabulary.named([str(c) for c in frame.columns], "hdop") is not None  # RTKLIB writes none
+    fits = [name for name in fits if not (beside_hdop and name == RTKLIB)] or fits
     chosen = _reading(column, [int(x) for x in seen], numbers, fits, accuracy_m)
     codes = {int(x): READINGS[chosen][int(x)] for x in seen}
     spec: dict[str, Any] = {"column": column}
@@ -100,9 +104,15 @@ def _likely(column: str) -> list[str]:
 def _in_words(values: pd.Series, column: str) -> Spec | None:
     """GGA codes of the words of a column; None where one of them is not known, or there are none."""
     texts = [str(word) for word in values.dropna().unique()]
-    codes = {w: code for w in texts for code, known in WORDS.items() if vocabulary.words(w) in known}
+    codes = {w: code for w in texts if (code := _code(vocabulary.words(w))) is not None}
     known = len(codes) == len(texts) and any(vocabulary.words(w) for w in texts)
     return {"column": column, "map": codes} if known else None
+
+
+def _code(word: str) -> int | None:
+    """The GGA code of a word, with or without RTK before it or a word for solution behind it."""
+    bare = re.sub(rf"^rtk |{SOLUTION}$", "", word)
+    return next((code for code, known in WORDS.items() if word in known or bare in known), None)
 
 
 def _said(codes: Mapping[int, int]) -> str:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from dlkf.data.discovery.units import accel_units
 from dlkf.data.readers import by_numbers, stamps, units, vocabulary
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.qualities import quality_spec
@@ -18,6 +19,7 @@ SLOWEST_IMU_S, FASTEST_IMU_S = 0.21, 2e-4
 SLOWEST_FIX_S, FASTEST_FIX_S = 12.0, 0.02
 MOST_COLUMNS = 500  # no log of a car has more; each is looked at in many ways
 NEAR_GRAVITY = 0.08
+HIGHEST_M = 9000.0  # of a road
 COARSE = 0.2  # of the samples, with the stamp of the one before: the clock is coarser than the rate
 
 
@@ -108,12 +110,22 @@ def gnss_spec(table: LogTable) -> Recognised | None:
     position: Spec = {"columns": [lat, lon, height], "unit": _angle_unit(frame, found)}
     if (unit := vocabulary.unit_of(height)) in units.LENGTH:
         position["height_unit"] = unit
+    elif float(frame[height].abs().median()) > HIGHEST_M:
+        position["height_unit"] = "mm"  # as u-blox has it
     if found["geoid"] is not None:
         position["geoid"] = found["geoid"]
     if (sides := _hemispheres(table.frame[known])) is not None:
         position["hemispheres"] = sides
-    out: Spec = {"time": time, "position": position, "velocity": _velocity(found) or {"columns": None}}
-    out |= _accuracies(frame, found)
+    velocity, more = _velocity(found), []
+    if velocity is None:
+        velocity = _velocity_by_numbers(table, frame[known], time, position)
+        more = (
+            [f"took {', '.join(velocity['columns'])} for the velocities by the way between the positions"]
+            if velocity["columns"]
+            else []
+        )
+    out: Spec = {"time": time, "position": position, "velocity": velocity}
+    out |= _accuracies(frame, found, raw=position["unit"] == "1e-7deg")
     quality, notes = quality_spec(table.frame[known], _quality_column(table.frame), _accuracy_m(frame, out))
     if quality is not None:
         out["quality"] = quality
@@ -126,7 +138,20 @@ def gnss_spec(table: LogTable) -> Recognised | None:
             *notes,
             f"took {int(known.sum())} of {len(held)} rows for fixes: the others repeat the position before",
         ]
-    return Recognised(out, tuple(notes))
+    return Recognised(out, (*more, *notes))
+
+
+def _velocity_by_numbers(table: LogTable, frame: pd.DataFrame, time: Spec, position: Spec) -> Spec:
+    """Velocities under names that are not known: columns that agree with the way between the positions."""
+    t = stamps.seconds_of(LogTable(table.frame.loc[frame.index], table.path, table.row), time)
+    scale = {"deg": 1.0, "1e-7deg": 1e-7, "rad": 180 / np.pi}.get(position["unit"])
+    if scale is None:
+        return {"columns": None}
+    names = [str(c) for c in frame.columns]
+    taken = {*position["columns"], *(time["column"] if isinstance(time["column"], list) else [time["column"]])}
+    rest = [k for k, name in enumerate(names) if name not in taken]
+    lat, lon = (scale * frame[c].to_numpy(float) for c in position["columns"][:2])
+    return by_numbers.velocities(t, lat, lon, names, frame.to_numpy(float), rest)
 
 
 def _hemispheres(frame: pd.DataFrame) -> list[str] | None:
@@ -218,13 +243,14 @@ def _unnamed(names: list[str]) -> bool:
 
 
 def _stated_unit(frame: pd.DataFrame, columns: list[str]) -> Spec:
-    """The accelerometers' unit where the header states it and gravity does not object."""
+    """The accelerometers' unit where the header states it, gravity does not object and would not find it alone: a unit
+    that gravity finds may have the opposite sign, as some phones give it."""
     unit = vocabulary.unit_of(columns[0])
     if unit not in units.ACCELERATION:
         return {}
     size = float(np.median(np.linalg.norm(frame[columns].dropna().to_numpy(), axis=1)))
     near = size > 0 and abs(np.log(size * units.ACCELERATION[unit] / G)) < NEAR_GRAVITY
-    return {"unit": unit} if near else {}
+    return {"unit": unit} if near and accel_units(size, units.ACCELERATION) != [unit] else {}
 
 
 def _velocity(found: dict[str, str | None]) -> Spec | None:
@@ -237,8 +263,11 @@ def _velocity(found: dict[str, str | None]) -> Spec | None:
     return {"columns": [*both, *([found["up"]] if found["up"] else [])], "frame": "course"} if all(both) else None
 
 
-def _accuracies(frame: pd.DataFrame, found: dict[str, str | None]) -> Spec:
-    """1σ of positions and velocities: of each axis, or horizontal and vertical; of velocities one for all axes."""
+def _accuracies(frame: pd.DataFrame, found: dict[str, str | None], raw: bool) -> Spec:
+    """1σ of positions and velocities: of each axis, or horizontal and vertical; of velocities one for all axes.
+
+    ``raw``: positions are u-blox' numbers, so that accuracies without a unit are in mm and mm/s.
+    """
     out: Spec = {}
     for key, stem, others in (
         ("std_position", "pos", [found["hacc"], found["vacc"]]),
@@ -250,7 +279,7 @@ def _accuracies(frame: pd.DataFrame, found: dict[str, str | None]) -> Spec:
             continue
         known = units.LENGTH if stem == "pos" else units.SPEED
         out[key] = {"columns": columns} | ({"unit": u} if (u := vocabulary.unit_of(columns[0])) in known else {})
-        if float(frame[columns[0]].median()) > 500 and "unit" not in out[key]:  # half a kilometre is no accuracy
+        if "unit" not in out[key] and (raw or float(frame[columns[0]].median()) > 500):  # half a km is no accuracy
             out[key]["unit"] = "mm" if stem == "pos" else "mm/s"  # as u-blox has them
     return out
 
@@ -263,8 +292,13 @@ def _accuracy_m(frame: pd.DataFrame, spec: Spec) -> float:
 
 
 def _quality_column(frame: pd.DataFrame) -> str | None:
+    """The column of the fix quality; of u-blox' two the carrier solution, where every row has a fix."""
     names = [str(c) for c in frame.columns[:MOST_COLUMNS]]
-    return vocabulary.named(names, "quality")
+    name, carrier = vocabulary.named(names, "quality"), vocabulary.matching(names, vocabulary.CARRIER)
+    if name is not None and carrier and name not in carrier:
+        kind, solution = (pd.to_numeric(frame[n], errors="coerce") for n in (name, carrier[0]))
+        return carrier[0] if bool((kind > 0).all() and (solution > 0).any()) else name
+    return name
 
 
 def _dilutions(frame: pd.DataFrame, found: dict[str, str | None], quality: Spec | None) -> tuple[Spec, str]:

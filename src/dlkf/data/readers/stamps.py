@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from dlkf.base.errors import InputError
 from dlkf.data.discovery.units import time_unit
 from dlkf.data.readers import units, vocabulary
 from dlkf.data.readers.frames import LogTable
@@ -14,11 +15,14 @@ from dlkf.data.readers.mapping import Mapped
 
 Spec = dict[str, Any]
 OF_DAY = r"^\s*\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?\s*([AaPp][Mm])?\s*Z?\s*$"
-CALENDAR = r"^\s*(\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}-[A-Za-z]{3}-\d{4}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4}|\d{8})"
+CALENDAR = r"^\s*(\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}-[A-Za-z]{3}-\d{4}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4}"
+CALENDAR += r"|\d{1,2}[/.]\d{1,2}[/.]\d{2}|\d{8})"
 CALENDAR += r"[T ]+\d{1,2}:\d{2}"
-DAY = r"^\s*(\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4}|\d{8}|\d{4}年\d{1,2}月\d{1,2}日)\s*$"
+DAY = r"^\s*(\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4}|\d{1,2}[/.]\d{1,2}[/.]\d{2}|\d{8}"
+DAY += r"|\d{4}年\d{1,2}月\d{1,2}日)\s*$"
 NEWEST_UNIX = 2e9  # s: 2033; a stamp beyond it counts from no known epoch
 SWITCHED_ON_S = 1000.0  # a log that begins with less counts from its own beginning, which is nothing to report
+DAY_S = 86_400
 OLDEST_UNIX = 1.0e9  # s: 2001; no log of a car with an IMU of this kind is older
 TABLES = (None, "csv", "parquet", "feather", "matlab")  # formats whose stamps are what a user's program wrote
 
@@ -32,12 +36,22 @@ def time_spec(table: LogTable, rows: pd.Series, slowest: float, fastest: float) 
     called = vocabulary.matching(names, vocabulary.TIME)
     if (dated := _dated(frame, called, vocabulary.matching(names, vocabulary.DATE))) is not None:
         return dated
-    numbers = [name for name in called if pd.api.types.is_numeric_dtype(frame[name])]
+    dates = [name for name in vocabulary.matching(names, vocabulary.DATE) if _counts_days(frame[name], slowest)]
+    numbers = [name for name in (*called, *dates) if pd.api.types.is_numeric_dtype(frame[name])]
     column = numbers[0] if numbers else only_rising(frame)
     if column is None:
         return None
     values = frame[column].to_numpy(float)
+    if _is_clock_face(values, slowest):
+        dates = vocabulary.matching(names, vocabulary.DATE)
+        date = next((n for n in dates if units.day_of_number(frame[n].iloc[0]) is not None), None)
+        of_day: Spec = {"column": column, "unit": units.HHMMSS, "wraps_s": DAY_S}
+        return of_day if date is None else of_day | {"column": [date, column], "clock": "utc"}
+    if column in called and vocabulary.words(column) == "sample time fine":  # Xsens: ticks of 0.1 ms
+        return {"column": column, "unit": "1e-4s", "wraps_s": 2**32 / 10_000}
     unit = time_unit(values, slowest, fastest)
+    if unit is None and (days := _counts_days(frame[column], slowest)) is not None:
+        return {"column": column, "unit": days, "clock": "utc"}
     if unit is None:
         return None
     spec: Spec = {"column": column, "unit": unit}
@@ -46,6 +60,37 @@ def time_spec(table: LogTable, rows: pd.Series, slowest: float, fastest: float) 
         return spec | {"week": week}
     clock = clock_of(column, float(np.nanmedian(values)) / units.TIME[unit])
     return spec | ({"clock": clock} if clock else {})
+
+
+def _is_clock_face(values: np.ndarray, slowest: float) -> bool:
+    """Whether numbers are hours, minutes and seconds (hhmmss): over more than a minute no second is above 60."""
+    good = values[np.isfinite(values)]
+    if len(good) < 10 or np.ptp(good) < 100 or good.min() < 0 or good.max() >= 240_000:
+        return False
+    if np.median(np.diff(good)) > slowest:
+        return False
+    return bool(np.all(good % 100 < 61) and np.all(good // 100 % 100 < 60))
+
+
+def _counts_days(column: pd.Series, slowest: float) -> str | None:
+    """Whether numbers are dates in days of this century, as MATLAB's datenum or a spreadsheet has them, and which."""
+    if not pd.api.types.is_numeric_dtype(column):
+        return None
+    values = column.to_numpy(float)
+    steps = DAY_S * np.diff(values[np.isfinite(values)])
+    if not len(steps) or not 0 < np.median(steps) <= slowest:
+        return None
+    unix = {name: DAY_S * (float(np.nanmedian(values)) - day) for name, day in units.DAYS.items()}
+    return next((name for name, seconds in unix.items() if OLDEST_UNIX < seconds < NEWEST_UNIX), None)
+
+
+def seconds_of(table: LogTable, time: Spec) -> np.ndarray | None:
+    """The rows' times [s] from the first on, by the mapping's ``time``; None where it cannot read them all."""
+    try:
+        whole, part = Mapped(table, {"time": time}, "gnss").own_stamps()
+    except InputError:
+        return None
+    return (whole - whole[0]) + (part - part[0])
 
 
 def clock_of(name: str, seconds: float) -> str | None:
@@ -102,12 +147,25 @@ def epoch_note(part: Mapped) -> str | None:
     """From when the stamps of a table of numbers are taken to count, and what else they may mean; None for dates and
     for formats that state it themselves."""
     time = part.spec.get("time") or {}
-    if part.spec.get("format") not in TABLES or time.get("week") is not None or not len(part):
+    if part.spec.get("format") not in TABLES or not len(part):
         return None
     setting = f"reader.{part.kind}.time"
     column = time.get("column")
     what = f"stamps of {part.table.path.name} ({', '.join(map(str, column)) if isinstance(column, list) else column})"
     clock = time.get("clock")
+    if (time.get("week") is not None or time.get("week_number") is not None) and (first := part.first_gps_s()):
+        what = f"{what[:-1]}, {time['week']})" if time.get("week") is not None else what
+        day = _day(first + units.GPS_EPOCH_UNIX)
+        return f"{what}: taken as week {int(first // units.WEEK_S)} of GPS and seconds of it, of {day}"
+    if (unit := time.get("unit")) in units.DAYS:
+        first = DAY_S * (float(part.column(str(column), nan=False)[0]) - units.DAYS[unit])
+        name = {"datenum": "MATLAB's datenum", "excel": "a spreadsheet's dates"}[unit]
+        return f"{what}: days, taken as {name} in UTC, of {_day(first)}"
+    if time.get("unit") == units.HHMMSS and isinstance(column, list):
+        day = units.day_of_number(part.table.frame[column[0]].iloc[0])
+        return f"{what}: taken as hours, minutes and seconds (hhmmss) in UTC, from {day} on"
+    if time.get("unit") == units.HHMMSS:
+        return f"{what}: taken as hours, minutes and seconds (hhmmss), which have no date; {setting}.day=… gives it"
     if time.get("unit") == units.ISO:
         as_what = {"gps": "GPS time", None: "of an unnamed clock"}.get(clock, "UTC")
         other = ""
@@ -115,7 +173,7 @@ def epoch_note(part: Mapped) -> str | None:
             swapped = {"dmy": "mdy", "mdy": "dmy"}.get(order)
             other = f", {'day' if order == 'dmy' else 'month'} first; {setting}.order={swapped} is the other reading"
         return f"{what}: dates taken as {as_what}{other if swapped_possible(part, time) else ''}"
-    if time.get("week_number") is not None or time.get("day") is not None:
+    if time.get("day") is not None:
         return None
     seconds = float(part.column(str(column), nan=False)[0]) / units.TIME[time.get("unit") or "s"]
     known = {"unix": "unix", "utc": "unix", "gps": "gps"}.get(str(clock)) or units.clock_by_size(seconds)
@@ -123,6 +181,11 @@ def epoch_note(part: Mapped) -> str | None:
     if known is None:
         if part.kind != "gnss" or not SWITCHED_ON_S < seconds < units.WEEK_S:
             return None
+        if seconds < DAY_S and not vocabulary.has(str(column), r"\b(?:tow|sow|itow|week)\b"):
+            return (
+                f"{what}: seconds of a day or of a GPS week, which have no date; {setting}.day=2025-07-05 or "
+                f"{setting}.week_number=… gives it"
+            )
         return f"{what}: seconds of a GPS week, it seems, which have no date; {setting}.week_number=… gives the week"
     names = {"unix": "Unix time (since 1970)", "gps": "GPS seconds since 1980"}
     other = "gps" if known == "unix" else "unix"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections.abc import Mapping, Sequence
 
@@ -18,8 +19,10 @@ RATE = {"rad/s": 1.0, "rad": 1.0, "deg/s": DEG, "deg": DEG, "mdeg/s": DEG * 1e-3
 ANGLE = {"rad": 1.0, "deg": DEG, "1e-7deg": DEG * 1e-7}
 SPEED = {"m/s": 1.0, "km/h": 1 / 3.6, "knots": 1852 / 3600, "cm/s": 0.01, "mm/s": 1e-3, "mph": 0.44704}
 LENGTH = {"m": 1.0, "mm": 1e-3, "cm": 0.01, "km": 1e3, "ft": 0.3048}
-TIME = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": 1_000_000_000}  # ticks per second
+TIME = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": 1_000_000_000, "1e-4s": 10_000}  # ticks per second
 ORDERS = ("ymd", "dmy", "mdy")  # of a date in numbers
+HHMMSS = "hhmmss"  # a clock's face as one number: 235712.7, as NMEA has it
+DAYS = {"datenum": 719_529, "excel": 25_569}  # day 0 of 1970 in MATLAB's datenum and in a spreadsheet's dates
 ISO = "iso"  # calendar texts: 2025-07-05T23:57:12.7Z, 2025/07/05 23:57:12.700
 CLOCKS = ("gps", "unix", "utc")
 WEEK_S = 604_800
@@ -103,7 +106,7 @@ def seconds(
     ``order`` (dmy, mdy) is that of days and months in calendar texts that do not begin with the year.
     """
     if unit not in (*TIME, ISO):
-        raise InputError(f"{where}: unknown time unit {unit!r}; known are {', '.join((*TIME, ISO))}")
+        raise InputError(f"{where}: unknown time unit {unit!r}; known are {', '.join((*TIME, *DAYS, HHMMSS, ISO))}")
     if clock not in (None, *CLOCKS):
         raise InputError(f"{where}: unknown clock {clock!r}; known are {', '.join(CLOCKS)}, or null")
     if unit == ISO:
@@ -145,6 +148,23 @@ def unwrapped(values: np.ndarray, wrap: float) -> np.ndarray:
     return values + turns * wrap
 
 
+def of_the_day(values: np.ndarray) -> np.ndarray:
+    """Hours, minutes and seconds as one number (hhmmss.s) as seconds of the day."""
+    hours, rest = np.divmod(values, 10_000)
+    minutes, seconds = np.divmod(rest, 100)
+    return 3600 * hours + 60 * minutes + seconds
+
+
+def day_of_number(value: object) -> str | None:
+    """The day of a date as one number, ddmmyy as NMEA has it or yyyymmdd; None where it is none."""
+    text = str(value).strip().removesuffix(".0")
+    found = re.fullmatch(r"(\d{4})(\d\d)(\d\d)", text) or re.fullmatch(r"(\d\d)(\d\d)(\d\d)", text.zfill(6))
+    if found is None:
+        return None
+    year, month, day = found.groups() if len(found[1]) == 4 else (f"20{found[3]}", found[2], found[1])
+    return f"{year}-{month}-{day}" if 1 <= int(month) <= 12 and 1 <= int(day) <= 31 else None
+
+
 def degrees_minutes(values: np.ndarray) -> np.ndarray:
     """NMEA's ddmm.mmmm as degrees."""
     size = np.abs(values)
@@ -179,6 +199,7 @@ def _calendar(values: np.ndarray, where: str, order: str | None = None) -> np.nd
         raise InputError(f"{where}.order={order}: must be {', '.join(ORDERS)}, or null")
     texts = pd.Series(values).astype(str).str.strip().str.replace(r"[年月](?=\d)", "-", regex=True)
     texts = texts.str.replace(r"(:\d{2}),(\d)", r"\1.\2", regex=True).str.replace("日", "", regex=False)
+    texts = texts.str.replace(r"^(\d{1,2}[./]\d{1,2}[./])(\d{2})(?!\d)", r"\g<1>20\2", regex=True)
     order = day_order(texts) if order in (None, "ymd") else order
     if order == "":
         setting = where.split(", ")[-1]

@@ -14,14 +14,17 @@ RECEIVER = r"(?:(?:gps|gnss|loc(?:ation)?|rtk|ublox|nmea|receiver|nav|fix) )?"
 NORTH, EAST = r"n(?:orth|ord)?|lat(?:itude)?|norte?", r"e(?:ast)?|lon(?:gitude)?|ost|est|este"
 DOWN, UP = r"d(?:own)?", r"u(?:p)?|alt(?:itude)?|h(?:eight)?"
 ACCURACY = r"(?:acc(?:uracy)?|error|err|std|sigma|genauigkeit|fehler|precision|exactitud|incertitude|精度|误差|誤差)"
+CARRIER = r"carr(?:ier)? ?soln?"
 VELOCITY = r"v(?:el(?:ocity)?)?|velocity|geschwindigkeit|vitesse|velocidad|速度"
 
 SENSORS = {
     "accel": r"(?:(?:total|raw) )?(?:acc(?:el(?:eration|erometer|erometre)?)?|specific ?force|force|f|a|fb"
-    r"|beschl(?:eunigung(?:ssensor)?)?|aceler(?:acion|ometro)?|加速度(?:计|計|センサ|センサー)?)",
-    "gyro": r"(?:raw )?(?:gyro?(?:scop(?:e|io)?)?|omega|w|g|ang(?:ular)? ?(?:velocity|vel|rate|speed)|rate"
-    r"|(?:rotation|turn) ?rate|wb"
-    r"|drehrate|drehgeschwindigkeit|winkelgeschwindigkeit|kreisel|vitesse (?:angulaire|de rotation)|giro(?:scopio)?"
+    r"|accelerometer acceleration|beschl(?:eunigung(?:ssensor|smesser)?)?|acel(?:er(?:acion|ometro)?)?"
+    r"|加速度(?:计|計|センサ|センサー)?)",
+    "gyro": r"(?:raw )?(?:gyro?(?:s[ck]op(?:e|io)?|met(?:er|re))?|omega|w|g|ang(?:ular)? ?(?:velocity|vel|rate|speed)"
+    r"|rate|(?:motion )?(?:rotation|turn) ?rate|gyro(?:scope)? rotation|wb"
+    r"|drehrate|drehgeschwindigkeit|winkelgeschwindigkeit|kreisel|vitesse (?:angulaire|de rotation)"
+    r"|giro(?:scopi?o|metro)?"
     r"|velocidad angular|角速度|陀螺仪?|陀螺儀|ジャイロ(?:センサー?)?)",
 }
 AXES = {
@@ -33,7 +36,8 @@ QUANTITIES: dict[str, list[str]] = {
     "lat": [r"lat(?:itude?)?", r"(?:geo\w* )?breite(?:ngrad)?", r"latitud|phi|纬度|緯度|北纬|北緯"],
     "lon": [r"lon(?:gitude?)?|lng|long", r"(?:geo\w* )?la?enge|(?:geo\w* )?lange|(?:laengen|langen)grad"]
     + [r"longitud|lambda|lam|经度|經度|経度|东经|東経"],
-    "height": [r"ellip\w*(?: height)?|h ell|height ell\w*|(?:alt(?:itude)?|height) wgs ?84|大地高|椭球高|楕円体高"]
+    "height": [r"ell?ip\w*(?: (?:height|alt(?:itude)?|hoe?he))?|h ell|(?:alt(?:itude)?|height) wgs ?84"]
+    + [r"(?:height|alt(?:itud|itude|ura)?|hauteur|elevacion|hoe?he) ell?\w*|大地高|椭球高|橢球高|楕円体高"]
     + [r"h|hgt|height|alt(?:itude)?|ele(?:v|vation)?|hoe?he(?: (?:uber|ueber) .*)?|hauteur|altitud|altura|elevacion"]
     + [r"高度|高程|海拔(?:高度)?|标高|標高|高さ", r"(?:h|height|alt(?:itude)?|ele\w*) ?(?:msl|amsl|asl)|h ?msl"],
     "geoid": [r"geoid(?: ?sep\w*| ?height| ?undulation)?|undulation|sep|geoidundulation|ondulation"]
@@ -44,13 +48,16 @@ QUANTITIES: dict[str, list[str]] = {
     "up": [rf"(?:{VELOCITY}) ?(?:u(?:p)?|auf)|up(?:ward)? ?vel(?:ocity)?|climb|天向速度|上向き速度"],
     "speed": [r"(?:ground )?(?:speed|sog|g ?speed|velocity|spd|vel)|speed over ground|g ?s"]
     + [r"geschw(?:indigkeit)?|tempo|vitesse(?: sol)?|velocidad|rapidez|速度|地速|速率|対地速度|对地速度|速さ"],
-    "course": [r"(?:true )?(?:course|cog|bearing|track|heading|direction|head ?mot)(?: over ground)?|course ?angle"]
+    "course": [
+        r"(?:true )?(?:course|cog|bearing|track|heading|direction|head ?mot)(?: over ground| true)?|course ?angle"
+    ]
     + [r"(?:fahrt)?richtung|kurs(?: uber grund)?|cap(?: vrai)?|route|rumbo|curso|direccion"]
-    + [r"航向角?|航迹角|方向角?|方位角?|针路|針路|进路|進路|進行方向"],
-    "quality": [r"quality|(?:fix|gga|gps) ?quality|qualitat|qualitaet|qualite|calidad|定位质量|质量|品质|測位品質|品質"]
-    + [r"fix ?(?:type|status|mode|qual)?|(?:gps ?)?status|(?:gps ?)?mode|sol(?:ution)?(?: ?(?:type|status))?"]
-    + [r"carr(?:ier)? ?soln?"]
-    + [r"rtk(?: ?(?:status|fix|mode|state))?|type de fix|tipo de fix|定位状态|定位狀態|解状态|测位状态|測位状態|q"],
+    + [r"航向角?|航迹角|方向角?|方位角?|针路|針路|进路|進路|進行方向", r"orientation"],
+    "quality": [r"quality|(?:fix|gga|gps) ?quality|qualitat|qualitaet|qualite|calidad"]
+    + [r"(?:定位|测位|測位)?(?:质量|品质|品質|質量)"]
+    + [r"fix ?(?:typ|type|art|status|mode|qual)?|(?:gps ?)?status|(?:gps ?)?mode|sol(?:ution)?(?: ?(?:type|status))?"]
+    + [CARRIER]
+    + [r"rtk(?: ?(?:status|fix|mode|state))?|type de fix|tipo de fix|modo|(?:定位|测位|測位|解)(?:状态|狀態|状態)|q"],
     "hacc": [rf"h(?:or(?:izontal)?)? ?(?:pos(?:ition)? )?{ACCURACY}|eph|pos(?:ition)? ?{ACCURACY}"]
     + [rf"horizontale? ?{ACCURACY}|{ACCURACY} horizontale?|lagegenauigkeit|水平(?:位置)?(?:精度|误差|誤差)"]
     + [r"accuracy|genauigkeit|precision|exactitud|(?:位置)?精度|(?:位置)?误差|(?:位置)?誤差"],
@@ -85,7 +92,8 @@ TIME = (
     r"#?(?:t|time|time ?stamp|tow|sow|gps ?(?:time|sow|tow|seconds?|t)?|unix ?(?:time)?|posix(?: ?time)?|utc"
     r"|stamp|epoch|secs?|seconds|date ?time|milli(?:s|seconds)?"
     r"|micro(?:s|seconds)?|nano(?:s|seconds)?|ms|us|ns|ticks|sample ?time"
-    r"|ros ?time|itow|utc ?time|seconds ?elapsed|elapsed"
+    r"|ros ?time|i ?tow|utc ?(?:time|seconds)|seconds ?elapsed|elapsed|sample ?time ?fine|date ?num"
+    r"|(?:location|accelerometer|gyro|motion) timestamp since (?:1970|reboot)"
     r"|zeit(?:stempel|punkt)?|uhrzeit|temps|heure|horodatage|tiempo|hora"
     r"|marca de tiempo"
     r"|时间戳?|時間|时刻|時刻|タイムスタンプ)(?: (?:utc|gps|unix|local|lokal))*"
@@ -97,7 +105,9 @@ CLOCKS = {"unix": r"\b(unix|posix|epoch|ros)\b", "gps": r"\b(gps|gpst|gnss|tow|s
 UNITS = {
     **dict.fromkeys(("kmh", "km h", "kph", "kmph", "公里 小时"), "km/h"),
     **dict.fromkeys(("mph", "mi h"), "mph"),
-    **dict.fromkeys(("kn", "kt", "kts", "knot", "knots", "noeuds", "knoten"), "knots"),
+    **dict.fromkeys(
+        ("kn", "kt", "kts", "knot", "knots", "noeuds", "nœuds", "knoten", "nudos", "节", "節", "ノット"), "knots"
+    ),
     **dict.fromkeys(("m s", "mps", "ms 1", "m sec"), "m/s"),
     **dict.fromkeys(("m s2", "mps2", "m s 2", "ms2", "ms 2", "m s s"), "m/s2"),
     **dict.fromkeys(("mm s", "mmps"), "mm/s"),
@@ -114,6 +124,16 @@ UNITS = {
     **dict.fromkeys(("毫秒", "msec", "millis"), "ms"),
     **dict.fromkeys(("c", "grad c", "% ", "percent"), ""),
 }
+
+
+# beyond ASCII, in the names and units of columns: a file's encoding shows by them
+LETTERS = {
+    x
+    for text in (*SENSORS.values(), *AXES.values(), *(p for patterns in QUANTITIES.values() for p in patterns))
+    for x in text
+    if not x.isascii()
+} | {x for text in (TIME, DATE, WHEEL, SPEEDS, PRESSURE, *UNITS) for x in text if not x.isascii()}
+LETTERS |= set("äöüÄÖÜßéèêàâçîôûñóíáúÉÈÀÓÍÁÚ²³°µμ·±") | set("卫星数温磁场角设备名称年月日無効固定解浮点单差分")
 
 
 def words(name: str) -> str:

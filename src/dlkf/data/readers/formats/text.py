@@ -16,6 +16,7 @@ from typing import Any
 import pandas as pd
 
 from dlkf.base.errors import InputError
+from dlkf.data.readers import vocabulary
 from dlkf.data.readers.frames import LogTable
 
 DEFAULTS = {
@@ -29,7 +30,8 @@ DEFAULTS = {
 }
 LARGEST_BYTES = 2 << 30  # unpacked: a day of an IMU at 100 Hz is a third
 LARGEST_RATIO, SMALL_BYTES = 100, 64 << 20  # of unpacked to packed size: text of sensors packs tenfold
-ENCODINGS = ("utf-8-sig", "cp1252", "latin-1")  # tried in turn; the last one reads anything
+ENCODINGS = ("cp1252", "gb18030", "cp932", "big5", "latin-1")  # of files that are not UTF-8; the last reads anything
+PEEK = 1 << 16  # bytes by which one of them is chosen
 
 
 def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
@@ -68,7 +70,8 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
 
 
 def decoded(path: Path, encoding: str | None) -> str:
-    """A text file, gzip or not; without an ``encoding`` the first that fits of UTF-8, UTF-16 by its mark, Windows."""
+    """A text file, gzip or not; without an ``encoding`` UTF-8, UTF-16 by its mark, or the one of Windows (Western,
+    Chinese, Japanese) with most letters of the words that name columns."""
     try:
         if path.is_file() and path.stat().st_size > LARGEST_BYTES:
             raise InputError(f"{path}: is {path.stat().st_size / 2**30:.1f} GiB of text; split it, or write Parquet")
@@ -84,12 +87,22 @@ def decoded(path: Path, encoding: str | None) -> str:
         return raw.decode("utf-16", errors="replace")
     if b"\0" in raw[:4096]:
         raise InputError(f"{path}: is no text file; set its format (reader.imu.format, reader.gnss.format)")
-    for name in ENCODINGS:
+    for name in ("utf-8-sig", *_likely_encodings(raw[:PEEK])):
         try:
             return raw.decode(name)
         except UnicodeDecodeError:
             continue
     raise AssertionError("latin-1 reads any byte")
+
+
+def _likely_encodings(head: bytes) -> list[str]:
+    """The encodings of Windows, first that in which most letters beyond ASCII are those of columns' names."""
+
+    def known(name: str) -> float:
+        letters = [x for x in head.decode(name, errors="replace") if not x.isascii()]
+        return sum(x in vocabulary.LETTERS for x in letters) / max(len(letters), 1)
+
+    return sorted(ENCODINGS[:-1], key=known, reverse=True) + [ENCODINGS[-1]]
 
 
 def _unpacked(path: Path) -> bytes:
