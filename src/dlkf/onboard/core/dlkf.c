@@ -87,7 +87,7 @@ static void copy_state(dlkf_state *to, const dlkf_state *from, int kind) {
 static void begin_filter(dlkf *d, const double *start) {
   dlkf_start(start, d->lever_arm_b, d->now.filter, d->work);
   d->kind = DLKF_FILTER;
-  d->watch.count = 0;
+  memset(&d->watch, 0, sizeof d->watch);
 }
 
 /* Align at the start of a closed update interval, or search over it; whether there is a filter for it. */

@@ -43,7 +43,8 @@
 #define DLKF_EARLY 200                                             /* fixes held, before that and for the screen */
 #define DLKF_SENSORS (DLKF_AIDS ? DLKF_AIDS : 1)
 #define DLKF_EARLY_AIDS (DLKF_AIDS ? DLKF_AIDS * DLKF_KEEP_S * DLKF_AID_HZ : 1) /* samples of further sensors, likewise */
-#define DLKF_STAMPS 128                                            /* of a sensor, among which one that comes twice is known */
+#define DLKF_STAMPS (DLKF_AIDS ? ((DLKF_REWIND + 1) * DLKF_SAMPLES * 1000 / DLKF_RATE_MILLIHZ + 1) * DLKF_AID_HZ : 1)
+                                                                   /* of a sensor, among which one that comes twice is known */
 #define DLKF_HEADINGS 14                                           /* of a search */
 
 /* What became of a sample, a fix or an aid. */
