@@ -236,7 +236,7 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "sensors 15 s late": (_late(15.0, 25.0, 40.0, SENSORS), ("late",)),
     "wheel speeds with 1σ, and some without": (
         _changed("speed", lambda t: True, lambda x: _put(x, 2, 0.1 if round(t_ms(x)) % 7 else nan)), ()),
-    "a wheel that stands still on a moving car": (
+    "a locked wheel on a moving car": (
         _changed("speed", _between(25.0, 45.0), lambda x: _put(x, 1, 0.0)), ()),
     "no sensors": (lambda sent: [c for c in sent if c.kind not in SENSORS], ()),
     "damage of all kinds": (_many, ("not_finite", "implausible", "double", "back")),
