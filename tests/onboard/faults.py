@@ -141,6 +141,15 @@ def _frozen(sent: Calls) -> Calls:
     return _changed("gnss", _between(30.5, 38.5), lambda x: (x[0], *place, [5.0, 5.0, 0.0], *x[5:]))(sent)
 
 
+def _fast_speeds(sent: Calls) -> Calls:
+    """Speeds between those of the drive at every sample of five seconds, the first ten of them once more."""
+    fast = [
+        Call("speed", (c.arguments[0] + 0.001, 5.0, 0.1)) for c in sent if c.kind == "imu" and 25 < c.arguments[0] < 30
+    ]
+    arriving = [*((c.arguments[0], c) for c in (*sent, *fast)), *((28.0, c) for c in fast[:10])]
+    return [call for _, call in sorted(arriving, key=lambda x: x[0])]
+
+
 WITHOUT_VELOCITY = [nan] * 3
 JUMPS: dict[str, Fault] = {
     "fixes 20 km off for 25 s": _changed("gnss", _between(25.5, 50.5), lambda x: _put(x, 1, x[1] + 0.18)),
@@ -185,12 +194,12 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
         lambda x: _put(x, 4, [300.0, 0.0, 0.0]),
     ), ("double", "superseded", "ahead", *3 * ("no_fix",), "not_finite", *2 * ("outside",), *4 * ("implausible_fix",))),
     "single samples of sensors": (lambda sent: _changed(
-        "baro", _at(50.0, 1.0), lambda x: [x, _put(x, 0, x[0] + 100)]
+        "baro", _at(50.0, 1.0), lambda x: [x, _put(x, 0, x[0] + 100), _put(x, 0, 1e300), _put(x, 2, -0.1)]
     )(_changed(
         "heading", _between(25, 35), lambda x: [_put(x, 0, x[0] - 0.2), x, _put(x, 0, x[0] - 0.4)]
     )(_one_by_one(
         "speed", 0.5, lambda x: _put(x, 1, nan), lambda x: [x, x]
-    )(sent))), ("not_finite", "double", "ahead")),
+    )(sent))), ("not_finite", "double", "ahead", "ahead", "outside")),
     "a tenth of the samples missing": (_lost(0.1), ()),
     "stamps that jitter": (_stamps(_jitter(1, 3e-3)), ()),
     "an IMU's clock 500 ppm fast": (_stamps(lambda t: t * 1.0005), ()),
@@ -207,6 +216,9 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "positions alone": (_changed("gnss", lambda t: True, lambda x: _put(x, 4, WITHOUT_VELOCITY)), ()),
     "coarse positions alone": (COARSE, ()),
     "coarse positions alone, 3 s late": (lambda sent: _late(3.0)(COARSE(sent)), ("replayed",)),
+    "fixes of the other hemisphere": (
+        _changed("gnss", lambda t: t < 44, lambda x: _put(x, 1, -x[1])), ("implausible_fix",)),  # lost again and again
+    "wheel speeds at 100 Hz, some again after three seconds": (_fast_speeds, ("double",)),
     "no 1σ": (_changed("gnss", lambda t: True, lambda x: _put(x, 5, [nan] * 6)), ()),
     "fixes 100 m off, one in six": (
         _changed("gnss", lambda t: round(t) % 6 == 3, lambda x: _put(x, 1, x[1] + 9e-4)), ()),
@@ -224,7 +236,7 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "sensors 15 s late": (_late(15.0, 25.0, 40.0, SENSORS), ("late",)),
     "wheel speeds with 1σ, and some without": (
         _changed("speed", lambda t: True, lambda x: _put(x, 2, 0.1 if round(t_ms(x)) % 7 else nan)), ()),
-    "a wheel that stands still on a moving car": (
+    "a locked wheel on a moving car": (
         _changed("speed", _between(25.0, 45.0), lambda x: _put(x, 1, 0.0)), ()),
     "no sensors": (lambda sent: [c for c in sent if c.kind not in SENSORS], ()),
     "damage of all kinds": (_many, ("not_finite", "implausible", "double", "back")),

@@ -26,12 +26,17 @@ def aid_rows(table: AidTable, columns: Columns, grid: SampleGrid) -> np.ndarray:
     std = columns.get("std", np.full(len(value), np.nan))
     place = boundary_after(columns["t"], grid)
     good = np.isfinite(value) & (place >= 1) & (place <= grid.epochs)
-    place, value, std = place[good], value[good], std[good]
-    lag = np.clip(grid.boundaries[place] - columns["t"][good], 0.0, None)
+    lag = np.clip(grid.boundaries[place[good]] - columns["t"][good], 0.0, None)
+    return _reduced(table, place[good], value[good], std[good], lag, grid.epochs + 1)
+
+
+def _reduced(
+    table: AidTable, place: np.ndarray, value: np.ndarray, std: np.ndarray, lag: np.ndarray, rows: int
+) -> np.ndarray:
+    """(rows, 5) :data:`ROW` of samples in order of time, each at its boundary."""
     if table.reduce == LAST:
         last = np.flatnonzero(np.append(np.diff(place) > 0, True)) if len(place) else np.zeros(0, dtype=np.int64)
         place, value, std, lag = (x[last] for x in (place, value, std, lag))
-    rows = grid.epochs + 1
 
     def mean(x: np.ndarray) -> np.ndarray:
         return np.bincount(place, x, rows) / np.maximum(count, 1)
@@ -47,15 +52,12 @@ def aid_rows(table: AidTable, columns: Columns, grid: SampleGrid) -> np.ndarray:
     return np.stack((mean(value), known, mean(lag), span, count), -1)
 
 
-def aid_row(
-    table: AidTable, samples: Sequence[tuple[float, float, float]], boundary: float, epoch_s: float
-) -> np.ndarray:
+def aid_row(table: AidTable, samples: Sequence[tuple[float, float, float]], boundary: float) -> np.ndarray:
     """(1, 5) :data:`ROW` of the samples (t, value, std) of one interval, whose end is at ``boundary``."""
     if not samples:
         return np.zeros((1, len(ROW)))
     t, value, std = np.array(sorted(samples)).T
-    grid = SampleGrid(boundary - epoch_s, epoch_s, 1, 1)
-    return aid_rows(table, {"t": t, table.column: value, "std": std}, grid)[1:]
+    return _reduced(table, np.zeros(len(t), dtype=np.int64), value, std, np.clip(boundary - t, 0.0, None), 1)
 
 
 def aid_values(table: AidTable, columns: Columns) -> np.ndarray:

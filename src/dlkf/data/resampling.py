@@ -20,6 +20,7 @@ LONGEST_BRIDGE_S = 1.1  # the reference is interpolated between samples no furth
 BLOCK = 4000  # samples of the grid that are composed at a time: what they need stays in the processor's cache
 BEFORE = 3  # samples before the first that a block needs, for the interval before it and whether that is whole
 SMALLEST_STD = 1e-3  # m, m/s: what a source calls zero
+FARTHEST = 2**62  # boundary: where stamps beyond any clock are put
 # horizontal position [m] and velocity [m/s] 1σ where a source gives none, by NMEA GGA quality
 DEFAULT_STD = {4: (0.02, 0.05), 5: (0.3, 0.1), 2: (1.0, 0.1), 3: (1.0, 0.1), 9: (1.0, 0.1), 1: (2.5, 0.2)}
 VERTICAL_FACTOR = 1.5  # of the default position std
@@ -173,7 +174,7 @@ def usable_fixes(gnss: Columns) -> np.ndarray:
 
 def boundary_after(t: np.ndarray, grid: SampleGrid) -> np.ndarray:
     """Number of the first boundary at or after times [s]; it may lie outside the grid."""
-    return np.ceil((t - grid.t0 - ON_BOUNDARY_S) / grid.epoch_s).astype(np.int64)
+    return np.clip(np.ceil((t - grid.t0 - ON_BOUNDARY_S) / grid.epoch_s), -FARTHEST, FARTHEST).astype(np.int64)
 
 
 def fixes_at(gnss: Columns, rows: np.ndarray, boundaries: np.ndarray) -> FixRows:

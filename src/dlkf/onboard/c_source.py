@@ -65,6 +65,9 @@ class Written(NamedTuple):
     work: int
 
 
+FINITE = """#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
+#error "NaN stands for an unknown value: compile without -ffast-math, -Ofast and -ffinite-math-only"
+#endif"""
 UNUSED = """#if defined(__GNUC__)
 #define DLKF_UNUSED __attribute__((unused)) /* of helpers and constants that this filter does without */
 #else
@@ -130,7 +133,7 @@ def heading() -> str:
     include = "\n".join(f"#include {name}" for name in ("<math.h>", "<stdint.h>", "<string.h>", '"step.h"'))
     made = "/* Made by dlkf.export; do not edit: the equations are in the Python package. */"
     elementary = (CORE / "elementary.c.in").read_text()
-    return "\n".join((made, include, UNUSED, "", elementary, *(_filled(algebra, kind) for kind in kinds)))
+    return "\n".join((made, include, FINITE, UNUSED, "", elementary, *(_filled(algebra, kind) for kind in kinds)))
 
 
 def _sizes(estimator: Estimator, layout: Layout, grid: Grid, name: str, work: int, can_anchor: bool) -> dict[str, Any]:
@@ -206,7 +209,7 @@ def constants() -> str:
     said = "/* Constants of the Python package, made by dlkf.export; do not edit. */"
     head = f"{said}\n#ifndef DLKF_CONSTANTS_H\n#define DLKF_CONSTANTS_H\n"
     table = f"#define QUALITIES {len(rows)}\n#define DEFAULT_STD_ROWS {{{', '.join(rows)}}}"
-    return "\n".join((head, *lines, table, "\n#endif\n"))
+    return "\n".join((head, FINITE, *lines, table, "\n#endif\n"))
 
 
 def _filled(text: str, values: Mapping[str, object]) -> str:

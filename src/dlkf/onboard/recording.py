@@ -25,6 +25,7 @@ KEPT = {  # operations that are one in C, though core ATen has several for them
 def record(function: Function) -> GraphModule:
     """The graph of a function at its ``example()``; its constants are attributes."""
     example = function.example()
+    function(*example)  # constants that it keeps for later calls are made here, not as tensors of the recorder
     graph: Any = function
     try:
         for _ in range(2):  # what nn.GRUCell changes in place shows in the first graph and is gone in the second

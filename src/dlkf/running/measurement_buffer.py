@@ -23,8 +23,8 @@ NO_FIX = FixRows(
 class MeasurementBuffer:
     """The latest fix and the samples of further sensors (``tables``) of every boundary that is still of use."""
 
-    def __init__(self, tables: Sequence[AidTable], epoch_s: float) -> None:
-        self.tables, self._epoch_s = {table.name: table for table in tables}, epoch_s
+    def __init__(self, tables: Sequence[AidTable]) -> None:
+        self.tables = {table.name: table for table in tables}
         self.clear()
 
     def clear(self) -> None:
@@ -71,7 +71,7 @@ class MeasurementBuffer:
     def aid_rows(self, boundary: int, end: float) -> dict[str, np.ndarray]:
         """Rows (:data:`dlkf.data.aids.ROW`) of the sensors in the epoch before a boundary at ``end`` [s]."""
         held = self._aids.get(boundary, {})
-        return {name: aid_row(table, held.get(name, ()), end, self._epoch_s) for name, table in self.tables.items()}
+        return {name: aid_row(table, held.get(name, ()), end) for name, table in self.tables.items()}
 
 
 def checked_fix(

@@ -48,14 +48,13 @@ from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.strapdown import strapdown
 from dlkf.running.epoch_filter import EpochFilter, Running
 from dlkf.running.estimate import Estimate
-from dlkf.running.fix_history import FixHistory
+from dlkf.running.fix_history import HELD, FixHistory
 from dlkf.running.imu_stream import ImuStream, Row
 from dlkf.running.measurement_buffer import MeasurementBuffer, checked_fix
 from dlkf.running.start import Search
 
 ANCHOR_M = 50_000.0  # from its origin, beyond which the tangent frame moves
 SETTLE_S = 3.0  # fixes over so long lay the grid
-MOST_EARLY_FIXES = 1000
 MOST_EARLY_SAMPLES = 10_000  # of further sensors
 
 
@@ -126,7 +125,7 @@ class StreamingFilter:
         )
         self._rewind = math.ceil(history_s / epoch_s) + 1  # epochs that may be replayed
         self.counts: Counter[str] = Counter()
-        self._buffer = MeasurementBuffer(tables_of(estimator), epoch_s)
+        self._buffer = MeasurementBuffer(tables_of(estimator))
         self._epochs = EpochFilter(
             estimator, self._buffer, self._samples.boundary, rate_hz=rate_hz, epoch_s=epoch_s, lever_arm_b=lever_arm_b,
             align=align, rewind=self._rewind, anchor_m=anchor_m, counts=self.counts,
@@ -136,7 +135,7 @@ class StreamingFilter:
         self._clear()
 
     def _clear(self) -> None:
-        self._early: deque[dict[str, np.ndarray]] = deque(maxlen=MOST_EARLY_FIXES)  # before there is a grid
+        self._early: deque[dict[str, np.ndarray]] = deque(maxlen=HELD)  # before there is a grid
         self._early_aids: deque[tuple[str, float, float, float]] = deque(maxlen=MOST_EARLY_SAMPLES)
         self._fixes.clear()
         self._buffer.clear()
@@ -238,8 +237,10 @@ class StreamingFilter:
             known = ", ".join(self._buffer.tables) or "none"
             return self._answer(Status.REFUSED, f"this filter takes no {name} (it takes {known})")
         sample = (name, float(t), float(value), float(std))
-        if not (math.isfinite(sample[1]) and math.isfinite(sample[2])) or std < 0:
-            return self._answer(Status.REFUSED, f"{name}: t or value is not a finite number, or std is below 0")
+        if not (math.isfinite(sample[1]) and math.isfinite(sample[2])):
+            return self._answer(Status.REFUSED, f"{name}: t or value is not a finite number")
+        if std < 0:
+            return self._answer(Status.REFUSED, f"{name}: std is below 0; NaN if unknown")
         if self._samples.grid is not None:
             return self._file_aid(*sample)
         self._early_aids.append(sample)

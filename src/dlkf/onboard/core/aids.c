@@ -5,7 +5,6 @@
 #include "constants.h"
 #include "dlkf.h"
 
-static const double EPOCH_S = DLKF_SAMPLES / DLKF_RATE_HZ;
 static const char *const NAMES[DLKF_SENSORS] = DLKF_AID_NAMES;
 static const int LAST[DLKF_SENSORS] = DLKF_AID_LAST;
 
@@ -42,10 +41,9 @@ void dlkf_read_aids(const dlkf *d, int64_t boundary, double *out) {
 }
 
 static dlkf_status file_aid(dlkf *d, int sensor, double t, double value, double std) {
-  const int64_t done = d->samples.epochs;
-  const double place = ceil((t - d->samples.t0 - ON_BOUNDARY_S) / EPOCH_S);
-  if (!(place <= (double)(done + DLKF_REWIND))) return dlkf_counted(d, DLKF_AHEAD);
-  if (place < 1 || place - 1 < (double)(done - DLKF_REWIND)) return dlkf_counted(d, DLKF_LATE);
+  const double place = dlkf_samples_place(&d->samples, t);
+  const dlkf_status timing = dlkf_samples_timing(&d->samples, place, 1);
+  if (timing != DLKF_TAKEN) return dlkf_counted(d, timing);
   for (int k = 0; k < DLKF_STAMPS; k++)
     if (d->stamps[sensor][k] == t) return dlkf_counted(d, DLKF_DOUBLE);
   d->stamps[sensor][d->stamp[sensor]] = t;

@@ -87,7 +87,7 @@ static void copy_state(dlkf_state *to, const dlkf_state *from, int kind) {
 static void begin_filter(dlkf *d, const double *start) {
   dlkf_start(start, d->lever_arm_b, d->now.filter, d->work);
   d->kind = DLKF_FILTER;
-  d->watch.count = 0;
+  memset(&d->watch, 0, sizeof d->watch);
 }
 
 /* Align at the start of a closed update interval, or search over it; whether there is a filter for it. */
@@ -163,14 +163,12 @@ static void run(dlkf *d, int64_t number, int revised) {
   }
 }
 
-static double place_of(const dlkf *d, double t) { return ceil((t - d->samples.t0 - ON_BOUNDARY_S) / EPOCH_S); }
-
 /* The fix of a boundary: the latest report of its update interval that the screen takes, or none. */
 static void put_fix(dlkf *d, int64_t row) {
   dlkf_fix *fix = &d->fixes[row % DLKF_BOUNDARIES];
   const dlkf_report *x = NULL;
   for (int k = d->report_count; k-- && !x;)
-    if (report_at(d, k)->used && (int64_t)place_of(d, report_at(d, k)->t) == row) x = report_at(d, k);
+    if (report_at(d, k)->used && (int64_t)dlkf_samples_place(&d->samples, report_at(d, k)->t) == row) x = report_at(d, k);
   if (!x) {
     if (fix->number == row) fix->number = -1;
     return;
@@ -196,7 +194,8 @@ static void put_fix(dlkf *d, int64_t row) {
 /* Insert a fix among those held, which are in order of time, and screen it; where it is not the latest, screen all of them
  * again (dlkf.running.fix_history). The fix, and the first boundary whose fix has changed. */
 static dlkf_report *screened(dlkf *d, const dlkf_report *x, int place, int64_t *changed) {
-  while (d->report_count == DLKF_EARLY || (d->report_count && place_of(d, report_at(d, 0)->t) < (double)(d->samples.epochs - DLKF_REWIND))) {
+  const double oldest = (double)(d->samples.epochs - DLKF_REWIND);
+  while (d->report_count && (d->report_count == DLKF_EARLY || dlkf_samples_place(&d->samples, report_at(d, 0)->t) < oldest)) {
     (void)dlkf_screen_take(&d->screen_before, report_at(d, 0));
     d->report_first = (d->report_first + 1) % DLKF_EARLY;
     d->report_count--;
@@ -211,7 +210,7 @@ static dlkf_report *screened(dlkf *d, const dlkf_report *x, int place, int64_t *
     const int used = dlkf_screen_take(&d->screen, one);
     if (used == one->used) continue;
     one->used = used;
-    const int64_t row = (int64_t)place_of(d, one->t);
+    const int64_t row = (int64_t)dlkf_samples_place(&d->samples, one->t);
     put_fix(d, row);
     if (row < *changed) *changed = row;
   }
@@ -220,10 +219,9 @@ static dlkf_report *screened(dlkf *d, const dlkf_report *x, int place, int64_t *
 
 /* A fix to its boundary; what is over is run anew. */
 static dlkf_status file(dlkf *d, const dlkf_report *x) {
-  const int64_t done = d->samples.epochs;
-  const double place = place_of(d, x->t);
-  if (!(place <= (double)(done + DLKF_REWIND))) return dlkf_counted(d, DLKF_AHEAD);
-  if (place < 0 || (place > 1 ? place - 1 : 0) < (double)(done - DLKF_REWIND)) return dlkf_counted(d, DLKF_LATE);
+  const double place = dlkf_samples_place(&d->samples, x->t);
+  const dlkf_status timing = dlkf_samples_timing(&d->samples, place, 0);
+  if (timing != DLKF_TAKEN) return dlkf_counted(d, timing);
   int k = d->report_count;
   while (k > 0 && report_at(d, k - 1)->t > x->t) k--;
   if (k > 0 && report_at(d, k - 1)->t >= x->t) return dlkf_counted(d, DLKF_DOUBLE);

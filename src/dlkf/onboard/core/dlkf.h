@@ -18,7 +18,7 @@
 
 #include "step.h"
 
-/* Sizes, for the compiler's command line: how late a fix or an aid may come, how fast an IMU or a further sensor may be
+/* Sizes, whole numbers for the compiler's command line: how late a fix or an aid may come, how fast an IMU or a further sensor may be
  * for samples to be kept that long before the first fixes (a faster one is taken, and starts with fewer of them), and
  * for how long a search for the heading goes on; 0: none, the course of the first motion is the heading. */
 #ifndef DLKF_LATE_S
@@ -43,7 +43,8 @@
 #define DLKF_EARLY 200                                             /* fixes held, before that and for the screen */
 #define DLKF_SENSORS (DLKF_AIDS ? DLKF_AIDS : 1)
 #define DLKF_EARLY_AIDS (DLKF_AIDS ? DLKF_AIDS * DLKF_KEEP_S * DLKF_AID_HZ : 1) /* samples of further sensors, likewise */
-#define DLKF_STAMPS 128                                            /* of a sensor, among which one that comes twice is known */
+#define DLKF_STAMPS (DLKF_AIDS ? ((DLKF_REWIND + 1) * DLKF_SAMPLES * 1000 / DLKF_RATE_MILLIHZ + 1) * DLKF_AID_HZ : 1)
+                                                                   /* of a sensor, among which one that comes twice is known */
 #define DLKF_HEADINGS 14                                           /* of a search */
 
 /* What became of a sample, a fix or an aid. */
@@ -251,6 +252,8 @@ int dlkf_samples_begin(dlkf_samples *s, const double *t_fix, int count);
 int dlkf_samples_closed(dlkf_samples *s, double slack_s, double *imu);
 double dlkf_samples_latest(const dlkf_samples *s);
 double dlkf_samples_boundary(const dlkf_samples *s, int64_t number);
+double dlkf_samples_place(const dlkf_samples *s, double t);
+dlkf_status dlkf_samples_timing(const dlkf_samples *s, double place, int least);
 double dlkf_samples_slack(const dlkf_samples *s);
 double dlkf_samples_open(const dlkf_samples *s, double *imu);
 const dlkf_fix *dlkf_fix_at(const dlkf *d, int64_t boundary);

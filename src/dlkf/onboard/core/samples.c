@@ -33,6 +33,16 @@ double dlkf_samples_latest(const dlkf_samples *s) { return s->count ? at(s, s->c
 
 double dlkf_samples_boundary(const dlkf_samples *s, int64_t number) { return s->t0 + (double)number * EPOCH_S; }
 
+/* Number of the first boundary at or after a stamp, whatever it is. */
+double dlkf_samples_place(const dlkf_samples *s, double t) { return ceil((t - s->t0 - ON_BOUNDARY_S) / EPOCH_S); }
+
+/* Whether what counts at a boundary, of which `least` is the first, comes in time. */
+dlkf_status dlkf_samples_timing(const dlkf_samples *s, double place, int least) {
+  if (!(place <= (double)(s->epochs + DLKF_REWIND))) return DLKF_AHEAD;
+  if (place < least || (place > 1 ? place - 1 : 0) < (double)(s->epochs - DLKF_REWIND)) return DLKF_LATE;
+  return DLKF_TAKEN;
+}
+
 /* Samples out of line have gone on for longer than an accident does: the clock was set, or the gap is real. */
 int dlkf_samples_lost(const dlkf_samples *s) { return s->astray[1] - s->astray[0] >= ASTRAY_S; }
 
@@ -53,7 +63,7 @@ dlkf_status dlkf_samples_take(dlkf_samples *s, double t, const double accel[3], 
   const double last = dlkf_samples_latest(s);
   if (s->count && !(last < t && t <= last + s->longest)) return out_of_line(s, t, last);
   if (s->count == DLKF_RAW) {
-    if (!isnan(s->t0)) return DLKF_FULL;
+    if (!isnan(s->t0) || t - at(s, 0)->t < EPOCH_S) return DLKF_FULL;
     drop(s);
   }
   s->astray[0] = s->astray[1] = NAN;

@@ -1,0 +1,65 @@
+"""What the compiler's command line may set, and what it may not."""
+
+from __future__ import annotations
+
+import subprocess
+
+import pytest
+
+from dlkf.onboard.c_source import EXAMPLES
+from dlkf.onboard.core import Core
+from dlkf.onboard.library import CORE, FILTER, compiler
+from dlkf.running.solution import COLUMNS
+from tests.onboard.conftest import ARM
+from tests.onboard.programs import STRICT, compile_program, lines
+from tests.onboard.streams import calls, through_core
+
+pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+
+
+@pytest.fixture(scope="module")
+def log(tables):
+    """Half a minute in lines."""
+    return [c for c in calls(tables) if c.arguments[0] < 30]
+
+
+def ran(exported, sent, out, *switches: str) -> subprocess.CompletedProcess:
+    """``navigate`` with a core that was compiled with these."""
+    flags = ("-O1", *STRICT, *switches)
+    program = compile_program(
+        str(compiler()), exported[0], EXAMPLES / "navigate.c", out / "navigate", flags, filter_of=exported[3].path
+    )
+    command = [program, "--arm", *map(str, ARM)]
+    return subprocess.run(command, input=lines(sent), capture_output=True, text=True)
+
+
+@pytest.mark.parametrize("switches", [("-DDLKF_LATE_S=2", "-DDLKF_IMU_HZ=100"), ("-DDLKF_LATE_S=60",)], ids=" ".join)
+def test_less_memory_or_more_gives_the_same(switches, exported, log, tmp_path):
+    done = ran(exported, log, tmp_path, *switches)
+    want = through_core(Core(exported[3].path, ARM), log).solution
+    rows = [[float(x) for x in line.split(",")] for line in done.stdout.splitlines()[1:]]
+    assert [row[0] for row in rows] == pytest.approx(want[:, 0].tolist()) and done.returncode == 0
+    lat, last = COLUMNS.index("lat_deg"), want[-1]
+    assert rows[-1][2:5] == pytest.approx(last[lat : lat + 3], rel=1e-11)
+
+
+def test_without_the_search_the_course_is_the_heading(exported, log, tmp_path):
+    done = ran(exported, log, tmp_path, "-DDLKF_SEARCH_S=0")
+    assert done.returncode == 0 and len(done.stdout.splitlines()) > 15
+
+
+def test_an_imu_faster_than_the_memory_holds_is_told(exported, log, tmp_path):
+    """Of 100 Hz there must be room for a second."""
+    done = ran(exported, log, tmp_path, "-DDLKF_LATE_S=2", "-DDLKF_IMU_HZ=10")
+    assert done.returncode == 2 and "x refused: more samples than the memory holds" in done.stderr
+
+
+@pytest.mark.parametrize("flag", ["-ffast-math", "-Ofast", "-ffinite-math-only"])
+def test_arithmetic_without_nan_is_refused(flag, exported):
+    """It ran for ever."""
+    sources = [name for name in (*CORE, *FILTER) if name != "weights.c"]
+    for name in sources:
+        done = subprocess.run(
+            [compiler(), "-std=c99", flag, "-fsyntax-only", exported[0] / name], capture_output=True, text=True
+        )
+        assert done.returncode and "compile without -ffast-math" in done.stderr, name
