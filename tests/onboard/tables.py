@@ -27,11 +27,11 @@ from dlkf.onboard.library import build
 from dlkf.running.streaming import StreamingFilter
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
+from tests.cars import REAL
 from tests.onboard.conftest import ARM, GRID, IMU, KIND, SENSORS
 from tests.onboard.faults import FAULTS
 from tests.onboard.streams import METRES, SOLUTION, Answers, Calls, calls, through_core, through_python
 
-REAL = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "real"
 PLACE = [SOLUTION.index(c) for c in ("lat_deg", "lon_deg", "height_m")]
 SCALE = np.array([METRES["lat_deg"], METRES["lon_deg"], 1.0])
 

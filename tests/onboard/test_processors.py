@@ -9,10 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from dlkf.data.store import drive_rows
+from dlkf.data.validate import read_checked
 from dlkf.onboard.c_source import EXAMPLES
 from dlkf.onboard.core import Core
 from dlkf.onboard.library import CORE, FILTER, compiler
 from dlkf.running.solution import COLUMNS
+from tests.cars import REAL
 from tests.onboard.conftest import ARM
 from tests.onboard.programs import HERE, STRICT, compile_program, lines, run, stack_of_calls, tool
 from tests.onboard.streams import Calls, calls, through_core
@@ -36,16 +39,24 @@ def test_gcc_has_no_warnings_and_the_stack_of_every_call_is_small(exported, tmp_
 
 
 @pytest.mark.exports
+@pytest.mark.parametrize("log", ["simulated", "rtkx"])
 @pytest.mark.parametrize("cpu", ["aarch64-linux-gnu", "arm-linux-gnueabihf"])
-def test_arm_under_emulation(cpu, exported, tables, tmp_path):
-    """A drive with late fixes; other processors contract and order sums in their own way."""
+def test_arm_under_emulation(cpu, log, exported, tables, tmp_path):
+    """A drive with late fixes, and a real one as it was logged; other processors contract and order sums in their own
+    way."""
     cc, qemu = tool(f"{cpu}-gcc"), tool("qemu-aarch64" if "64" in cpu else "qemu-arm")
     flags = ("-O2", "-static")
     program = compile_program(cc, exported[0], EXAMPLES / "navigate.c", tmp_path / "navigate", flags)
-    sent = calls(tables, lambda t: t + 1.3)
-    done = run([qemu, program, "--arm", *map(str, ARM)], input=lines(sent))
+    sent, arm = calls(tables, lambda t: t + 1.3), ARM
+    if log != "simulated":
+        if not (REAL / log).is_dir():
+            pytest.skip(f"no {log} here")
+        real = read_checked(REAL / log, drive_rows(REAL / log)[0], reference=False)
+        sent, arm = calls(real), real.row.lever_arm_b
+    done = run([qemu, program, "--arm", *map(str, arm)], input=lines(sent))
     rows = pd.read_csv(io.StringIO(done.stdout)).drop_duplicates("t", keep="last").sort_values("t")
-    want = through_core(Core(exported[3].path, ARM), sent).solution
+    want = through_core(Core(exported[3].path, arm), sent).solution
+    rows = rows[rows["t"] <= want[-1, 0]]  # the example finishes the last update interval as well
     np.testing.assert_allclose(rows[list(COLUMNS)], want, rtol=1e-8, atol=1e-7)
 
 

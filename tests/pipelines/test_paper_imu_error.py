@@ -61,7 +61,8 @@ def test_the_published_filter_is_started_and_set_as_the_paper_says(script, monke
     tuning = training["baselines"]["tuning"]
     assert tuning["position_std"] * fixes["std_horizontal"] == pytest.approx(0.5)  # R017
     assert tuning["velocity_std"] * fixes["std_velocity"] == pytest.approx(0.05)
-    assert training["data"]["start"]["yaw_deg"] == 60 and training["model"]["training_turn"] == pytest.approx(math.pi, abs=1e-5)
+    assert training["data"]["start"]["yaw_deg"] == 60
+    assert training["model"]["training_turn"] == pytest.approx(math.pi, abs=1e-5)
     assert not training["baselines"]["tune"] and training["trainer"]["max_epochs"] == 3
     searched, *scored = (composed(*words) for words in said[1:])
     for given in (searched, *scored):

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -13,8 +12,8 @@ from dlkf.data.alignment import align_boundaries
 from dlkf.data.store import load_dataset
 from dlkf.evaluation.results import Results
 from dlkf.navigation.attitude import vector_from_rotation
+from tests.cars import REAL
 
-REAL = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "real"
 pytestmark = pytest.mark.skipif(not REAL.is_dir(), reason="no real drives beside the checkout")
 
 
