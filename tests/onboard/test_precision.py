@@ -12,7 +12,7 @@ import pytest
 from dlkf.onboard.core import Core
 from dlkf.onboard.library import build, compiler
 from dlkf.running.solution import COLUMNS
-from tests.onboard.conftest import ARM, QUICK
+from tests.onboard.conftest import ARM
 from tests.onboard.streams import METRES, calls, through_core
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
@@ -39,7 +39,7 @@ def test_single_precision_beside_double(exported, tables, tmp_path):
     subprocess.run([sys.executable, "-c", WRITE, tmp_path], cwd=ROOT, check=True)
     sent = calls(tables)
     double, single = (
-        through_core(Core(path, ARM), sent) for path in (exported[3].path, build(tmp_path, flags=QUICK))
+        through_core(Core(path, ARM), sent) for path in (exported[3].path, build(tmp_path, flags=("-O0",)))
     )  # fmt: skip
     assert single.words == double.words and single.solution.shape == double.solution.shape
     apart = np.abs(single.solution - double.solution)
