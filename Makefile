@@ -3,16 +3,18 @@ PYTHON ?= python3
 BIN := .venv/bin
 EXPERIMENT ?= outage
 PROFILE ?= quick
+REAL ?=
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help install train check test mutants lint types bench docs ui clean
+.PHONY: help install train paper check test mutants lint types bench docs ui clean
 
 help:
 	@echo "make install   what training, evaluating and navigating need, into .venv"
 	@echo "make train     train on simulated drives and score against the baselines, some minutes"
+	@echo "make paper     the paper's experiments and their page, days on a CPU; goes on where it stopped, takes REAL=data/kitti"
 	@echo "make check     tests of a developer, under three minutes on two cores: without trainings, MLflow, compilers"
-	@echo "make test      all tests, under seven minutes"
+	@echo "make test      all tests, seven to eight minutes"
 	@echo "make mutants   whether the tests notice small faults of the core (tests/mutants.yaml)"
 	@echo "make lint      ruff, then make types"
 	@echo "make types     pyright over src and pipelines, under a minute"
@@ -41,6 +43,18 @@ install: .venv/installed
 
 train: .venv/installed
 	$(BIN)/python -m dlkf.train +experiment=$(EXPERIMENT) +profile=$(PROFILE) $(ARGS)
+
+# Trainings that are finished are kept, so the same command goes on. ARGS go to each training. REAL: a dataset of real
+# drives with a good IMU, whose motion section 5.3 takes.
+paper: .venv/installed
+	$(BIN)/python pipelines/paper_imu_error.py --as-published --seeds 0 $(ARGS)
+	$(BIN)/python pipelines/paper_imu_error.py $(ARGS)
+	$(BIN)/python pipelines/paper_kalman_gain.py --seeds 0,1,2 $(ARGS)
+	$(BIN)/python pipelines/paper_outage.py --seeds 0,1,2 --models dlkf,dlkf_literal $(ARGS)
+	$(BIN)/python pipelines/paper_figures.py $(if $(REAL),--real $(REAL)) $(ARGS)
+	$(if $(REAL),$(BIN)/python pipelines/paper_real_motion.py --real $(REAL))
+	$(BIN)/python pipelines/paper_ablations.py $(ARGS)
+	$(BIN)/python pipelines/paper_report.py
 
 # worksteal: a worker keeps the tests of a file together, and takes from the other's end when its own are done
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
