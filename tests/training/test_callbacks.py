@@ -156,19 +156,21 @@ def test_guard_goes_back_to_the_last_good_epoch_at_a_slower_rate_and_gives_up_at
             stepped(fresh, parameter, math.nan)
 
 
-def test_guard_does_not_go_back_to_weights_that_have_diverged_already():
-    """Finite weights whose loss has risen a hundredfold are no place to go back to, a loss twice the least is."""
+@pytest.mark.parametrize("losses", [(4.0, 1.0, 2.0, 100.0, math.nan), (-1.0, -2.0, -1.5, 100.0, math.nan)])
+def test_guard_does_not_go_back_to_weights_that_have_diverged_already(losses):
+    """Finite weights whose loss has risen a hundredfold are no place to go back to; a loss near the least is, also of
+    a likelihood, which may be negative."""
     guard, parameter = StepGuard(patience=1, slower=0.5, returns=2), torch.nn.Parameter(torch.ones(2))
     module = torch.nn.Module()
     module.weight = parameter
-    for weight, loss in ((1.0, 4.0), (2.0, 1.0), (3.0, 2.0), (4.0, 100.0), (5.0, math.nan)):
+    for weight, loss in enumerate(losses, 1):
         parameter.data.fill_(weight)
         for _ in range(2):
             guard.on_train_batch_end(None, module, {"loss": torch.tensor(loss)}, None, 0)
         guard.on_train_epoch_end(None, module)
     again = StepGuard(patience=1)
     again.load_state_dict(guard.state_dict())
-    assert again.least == 1.0
+    assert again.least == losses[1]
     stepped(guard, parameter, math.nan)
     assert float(parameter[0].detach()) == 3.0
 

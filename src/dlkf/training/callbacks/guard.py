@@ -12,7 +12,7 @@ from lightning.pytorch.callbacks import Callback
 from dlkf.base.errors import InputError
 
 
-RISEN = 3.0  # an epoch whose mean loss is more than so many times the least did not end well
+RISEN = 2.0  # an epoch whose mean loss is above the least by more than so many times its size did not end well
 
 
 class StepGuard(Callback):
@@ -79,7 +79,7 @@ class StepGuard(Callback):
         loss = float(torch.stack(self.losses).mean()) if self.losses else 0.0
         self.losses = []
         self.least = min(self.least, loss) if math.isfinite(loss) else self.least
-        if self.in_a_row == 0 and loss <= RISEN * self.least and all(map(_is_finite, state.values())):
+        if self.in_a_row == 0 and loss <= self.least + RISEN * abs(self.least) and all(map(_is_finite, state.values())):
             self.good = copy.deepcopy(state)
 
     def state_dict(self) -> dict:
