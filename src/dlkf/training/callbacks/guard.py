@@ -11,7 +11,6 @@ from lightning.pytorch.callbacks import Callback
 
 from dlkf.base.errors import InputError
 
-
 RISEN = 2.0  # an epoch whose mean loss is above the least by more than so many times its size did not end well
 
 
