@@ -7,7 +7,8 @@
 Makes the test sets that are missing (below ``--data``), runs every filter compiled over segments with GNSS for 60, 300
 and 900 s and then none for 120 s (real drives: 30 or 60 s), and writes ``table.md`` and ``manifest.json`` (commit,
 seeds, settings and digest of every dataset). Errors are horizontal, at the end of the outage, RMS / geometric mean [m].
-The baselines start from ``imu=automotive_mems`` and constants from ``conf/tuning``. The ratio is to the best of them by
+The baselines start from ``imu=automotive_mems`` and constants from ``conf/tuning``, each without wheel orders and with
+them. The ratio is to the best of them by
 the geometric mean of that row, a choice with hindsight; [ ] is its 95 % interval over recordings. Beside them stands
 ``imu=auto``, whose noise is found on the very drives that are scored, with all their fixes. Last come, over all rows,
 every filter's errors, mean NEES, and the ratio of ``plus`` to it over all outages, by recordings.
@@ -200,13 +201,13 @@ def _case(
 
 
 def constants() -> dict[str, Estimator]:
-    """The filters with factors of ``conf/tuning``, with the preset ``automotive_mems``."""
-    found = {}
-    for name, tunings in CONSTANTS.items():
-        for tuning in tunings:
-            found[f"{name} {tuning}"] = build_causal(
-                name, imu_preset("automotive_mems"), "no", tuning=tuning_preset(tuning)
-            )
+    """The filters with factors of ``conf/tuning``, with the preset ``automotive_mems``, without wheel orders and with."""
+    imu, found = imu_preset("automotive_mems"), {}
+    for orders in ("", "+wheel_orders"):
+        for kind, tunings in CONSTANTS.items():
+            for tuning in tunings:
+                name = kind + orders
+                found[f"{name} {tuning}"] = build_causal(name, imu, "no", tuning=tuning_preset(tuning))
     return found
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from dlkf.filters.integration import Correction, Epoch, Estimator
@@ -29,14 +31,17 @@ class AsClaimed(PlusFilter):
 
 
 def parts(folder: str) -> dict[str, Estimator]:
-    """``plus`` with neither levels nor network (its constants), with one of them, and with positions as claimed."""
+    """``plus`` with neither levels nor network (its constants), with one of them, with positions as claimed, and without
+    wheel orders."""
     whole = trained_filter(folder)
     assert isinstance(whole, PlusFilter)
     found: dict[str, Estimator] = {}
     kinds = {"constants": (WithoutLevels, False), "levels": (PlusFilter, False), "network": (WithoutLevels, True)}
     kinds["positions as claimed"] = (AsClaimed, True)
+    kinds["no wheel orders"] = (PlusFilter, True)
     for name, (kind, network) in kinds.items():
-        found[name] = part = kind(whole.config).eval()
+        config = replace(whole.config, base="mbkf33_car") if name == "no wheel orders" else whole.config
+        found[name] = part = kind(config).eval()
         part.load_state_dict(whole.state_dict())
         if not network:
             with torch.no_grad():

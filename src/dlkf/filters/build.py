@@ -1,6 +1,6 @@
 """Filters by name: ``ins``, or a Kalman filter with endings for what it carries, as in ``mbkf21_nhc_gated``.
 
-A sensor stands behind a plus, as in ``mbkf15+speed`` (:data:`dlkf.filters.aids.attach.SENSORS`), and so does a source
+A sensor stands behind a plus, as in ``mbkf15+speed`` (:data:`dlkf.filters.aids.attach.SOURCES`), and so does a source
 of measurements of one's own, as in ``mbkf21_nhc+my_sources:SpeedLimit``: a module on PYTHONPATH and a class in it
 (:mod:`dlkf.filters.sources`).
 """
@@ -14,7 +14,7 @@ from typing import Any
 from dlkf.base.classes import find_class
 from dlkf.base.errors import InputError
 from dlkf.filters.adaptive import Adaptation
-from dlkf.filters.aids.attach import SENSORS, add_sources
+from dlkf.filters.aids.attach import SOURCES, add_sources
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import Estimator
 from dlkf.filters.model_based import Ins, Mbkf
@@ -43,7 +43,7 @@ def is_filter(name: str) -> bool:
     base, *endings = name.split("_")
     if name == "ins":
         return not own
-    if not all(part in SENSORS or OWN_SOURCE.fullmatch(part) for part in own):
+    if not all(part in SOURCES or OWN_SOURCE.fullmatch(part) for part in own):
         return False
     return base in KALMAN and len(set(endings)) == len(endings) and set(endings) <= set(ENDINGS)
 
@@ -86,7 +86,7 @@ def build_filter(name: str, imu: ImuSpec, *, tuning: Tuning | None = None, prior
         sources=tuple(sources),
         noise=Adaptation(factors.forgetting) if base == "aekf" else None,
     )
-    kinds = [SENSORS.get(part) or find_class(part, "source", ("begin", "rows")) for part in own]
+    kinds = [SOURCES.get(part) or find_class(part, "source", ("begin", "rows")) for part in own]
     estimator = add_sources(estimator, kinds)
     return SmoothedSolution(estimator) if "rts" in endings else estimator
 

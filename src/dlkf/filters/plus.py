@@ -70,7 +70,7 @@ class PlusConfig:
     """A ``plus`` filter: its classical filter and the size of its network."""
 
     kind: Literal["plus"] = "plus"
-    base: str = "mbkf33_car"
+    base: str = "mbkf33_car+wheel_orders"
     network: PlusNetworkConfig = field(default_factory=PlusNetworkConfig)
     tuning: Mapping[str, float] = field(default_factory=lambda: dict(START_TUNING))
     imu: Mapping[str, Any] = field(default_factory=lambda: dict(ANY_MEMS))
@@ -111,7 +111,7 @@ class PlusFilter(nn.Module):
         self.config = config
         kalman = build_filter(config.base, imu_spec(config.imu), tuning=settings_from(Tuning, config.tuning, "tuning"))
         if not isinstance(kalman, Mbkf):
-            raise InputError(f"model.base={config.base} is no Kalman filter that plus can stand on; take mbkf33_car")
+            raise InputError(f"model.base={config.base} is no Kalman filter that plus can stand on; take mbkf33_car+wheel_orders")
         self.kalman = replace(kalman, cut_transition=True)
         count = self.kalman.states.base.count
         now = 3 + 3 + 3 + 2 + 6
