@@ -201,7 +201,7 @@ def _case(
 
 
 def constants() -> dict[str, Estimator]:
-    """The filters with factors of ``conf/tuning``, with the preset ``automotive_mems``, without wheel orders and with."""
+    """The filters with factors of ``conf/tuning``, with ``automotive_mems``, without wheel orders and with them."""
     imu, found = imu_preset("automotive_mems"), {}
     for orders in ("", "+wheel_orders"):
         for kind, tunings in CONSTANTS.items():

@@ -31,7 +31,8 @@ def study():
 
 def test_every_rival_is_a_tuning_that_anybody_can_name(study):
     found = study.constants()
-    assert set(found) == {f"{name} {tuning}" for name, both in study.CONSTANTS.items() for tuning in both}
+    rivals = {f"{name}{more} {t}" for name, of in study.CONSTANTS.items() for t in of for more in ("", "+wheel_orders")}
+    assert set(found) == rivals
     plus = trained_filter("plus")
     assert isinstance(plus, PlusFilter)
     assert found["mbkf33_car any_car"].tuning == plus.tuning  # where plus begins

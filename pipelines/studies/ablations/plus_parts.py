@@ -31,7 +31,7 @@ class AsClaimed(PlusFilter):
 
 
 def parts(folder: str) -> dict[str, Estimator]:
-    """``plus`` with neither levels nor network (its constants), with one of them, with positions as claimed, and without
+    """``plus`` with neither levels nor network (its constants), with one of them, with positions as claimed, without
     wheel orders."""
     whole = trained_filter(folder)
     assert isinstance(whole, PlusFilter)

@@ -34,9 +34,7 @@ LIMIT = 2.0  # of an order's part
 NYQUIST = 0.45  # share of the sampling rate up to which an order is seen
 
 
-def demodulate(
-    x: Float[Tensor, "B M 6"], distance: Float[Tensor, "B M"]
-) -> Float[Tensor, "B 2 lines 6"]:
+def demodulate(x: Float[Tensor, "B M 6"], distance: Float[Tensor, "B M"]) -> Float[Tensor, "B 2 lines 6"]:
     """Σ_k x_k cos and sin of 2π o κ s_k for every order and line, the orders behind each other.
 
     Sines and cosines are taken of a coarse grid of lines and a fine one, and multiplied; those of the higher orders are
@@ -66,7 +64,7 @@ def log_levels(spectrum: Float[Tensor, "B 2 lines 6"]) -> Float[Tensor, "B O K 6
 
 
 def log_likelihood(levels: Float[Tensor, "B O K 6"], excess: Float[Tensor, "B O 6"]) -> Float[Tensor, "B K"]:
-    """ln Λ of every line, where the lines of this car stand out by ``excess`` (mean of the log level; 0: not at all)."""
+    """ln Λ of every line, if the lines of this car stand out by ``excess`` (mean log level; 0: not at all)."""
     rho = torch.exp(excess.clamp(0, 3)) - 1
     power = torch.exp(levels - MEAN_LOG).clamp_max(LARGEST)
     of_order = SHARE * (power * (rho / (1 + rho)).unsqueeze(2) - torch.log1p(rho).unsqueeze(2)).sum(-1)

@@ -111,7 +111,9 @@ class PlusFilter(nn.Module):
         self.config = config
         kalman = build_filter(config.base, imu_spec(config.imu), tuning=settings_from(Tuning, config.tuning, "tuning"))
         if not isinstance(kalman, Mbkf):
-            raise InputError(f"model.base={config.base} is no Kalman filter that plus can stand on; take mbkf33_car+wheel_orders")
+            raise InputError(
+                f"model.base={config.base} is no Kalman filter that plus can stand on; take {PlusConfig.base}"
+            )
         self.kalman = replace(kalman, cut_transition=True)
         count = self.kalman.states.base.count
         now = 3 + 3 + 3 + 2 + 6

@@ -12,8 +12,8 @@ What the spectrum says of ln κ_line is no Gaussian but has several peaks. Its m
 nothing is kept, so that several do together.
 
 A line counts as a wheel's only by what it foretold: whether the next block's likelihood, before the block is learned
-from, is large where the fixes put the line, in nats against a guess, at speeds other than those it was learned at. Tones
-of a fixed frequency, of other gears or of nothing at all do not pass, and the filter is as without this source.
+from, is large where the fixes put the line, in nats against a guess, at speeds other than those it was learned at.
+Tones of a fixed frequency, of other gears or of nothing at all do not pass, and the filter is as without this source.
 Training gets no rows: a peak has no gradient.
 """
 
@@ -250,9 +250,7 @@ class WheelOrders:
         R = R * (z.square() / (of_speed + R) / OUTLIER**2).clamp_min(1.0)
         return Measurement(z.unsqueeze(-1), H, R.unsqueeze(-1), used.unsqueeze(-1)), wheels, undecided
 
-    def _matrix(
-        self, epoch: Epoch, middle: Float[Tensor, " B"], speed: Float[Tensor, " B"]
-    ) -> Float[Tensor, "B 1 n"]:
+    def _matrix(self, epoch: Epoch, middle: Float[Tensor, " B"], speed: Float[Tensor, " B"]) -> Float[Tensor, "B 1 n"]:
         """H of ln of the true over the filter's mean speed of a block, whose middle is so many seconds ago."""
         end = epoch.window.end
         along = end.v_n / end.v_n.norm(dim=-1, keepdim=True).clamp_min(0.5)
