@@ -15,7 +15,7 @@ from dlkf.data.validate import CheckedTables
 from dlkf.filters.build import build_filter, is_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.order_spectrum import LEAST, LINES, ORDERS, STEP, demodulate, log_levels, log_likelihood, log_turns
-from dlkf.filters.wheel_orders import HEARD, OrdersMemory, _gaussian
+from dlkf.filters.wheel_orders import DETECTED, OrdersMemory, _gaussian
 from tests.cars import car
 
 from .scene import IMU, RATE
@@ -142,10 +142,10 @@ def test_what_a_gaussian_density_says_is_found_again():
     assert not bool(sure)  # the prior alone says nothing
 
 
-def test_it_hears_the_wheels_and_knows_their_turns():
-    heard = memory(cars(4, 100, wheel, 1))
-    assert heard.wheels.heard.all() and (heard.wheels.evidence > HEARD).all()
-    assert torch.allclose(torch.exp(heard.wheels.log_turns), torch.tensor(TURNS).double(), rtol=4e-3)
+def test_it_detects_the_wheels_and_knows_their_turns():
+    found = memory(cars(4, 100, wheel, 1))
+    assert found.wheels.detected.all() and (found.wheels.evidence > DETECTED).all()
+    assert torch.allclose(torch.exp(found.wheels.log_turns), torch.tensor(TURNS).double(), rtol=4e-3)
 
 
 def test_it_holds_the_speed_in_an_outage_and_says_how_well():
@@ -160,7 +160,7 @@ def test_it_holds_the_speed_in_an_outage_and_says_how_well():
 
 @pytest.mark.parametrize("turns", [fixed, half])
 def test_a_tone_that_does_not_follow_the_speed_is_not_taken_for_a_wheel(turns):
-    assert not memory(cars(6, 120, turns, 3)).wheels.heard.any()
+    assert not memory(cars(6, 120, turns, 3)).wheels.detected.any()
 
 
 def test_a_car_that_does_not_shake_is_navigated_as_without():
@@ -174,8 +174,8 @@ def test_a_wheel_that_falls_silent_is_given_up_when_fixes_show_the_speed():
     loud, silent = (cars(2, 300, turns, 5) for turns in (wheel, fixed))
     imu = torch.where((torch.arange(300) < 100)[None, :, None, None], loud.imu, silent.imu)
     both = replace(loud, imu=imu)
-    assert memory(loud).wheels.heard.all()
-    assert not memory(both).wheels.heard.any()
+    assert memory(loud).wheels.detected.all()
+    assert not memory(both).wheels.detected.any()
 
 
 def test_training_sees_a_filter_without_it():

@@ -11,7 +11,7 @@ What the spectrum says of ln κ_line is no Gaussian but has several peaks. Its m
 1σ, widened by ``SEARCH``, are those of a measurement with variance R that is taken from them; a block that decides
 nothing is kept, so that several do together.
 
-A line counts as a wheel's only by what it foretold: whether the next block's likelihood, before the block is learned
+A line counts as a wheel's only by what it predicted: whether the next block's likelihood, before the block is learned
 from, is large where the fixes put the line, in nats against a guess, at speeds other than those it was learned at.
 Tones of a fixed frequency, of other gears or of nothing at all do not pass, and the filter is as without this source.
 Training gets no rows: a peak has no gradient.
@@ -53,10 +53,10 @@ MEMORY = 75.0  # blocks of the averages
 APART = 0.1  # in ln v: so far from the mean speed of what was learned a block is full evidence
 GUESS, HIT = 0.12, 0.0125  # in ln κ: where a line may lie, and how near to it is a hit
 LEAST_DENSITY = 0.05  # of a guess's: so much a single block may contradict
-FIRST_BLOCKS = 3  # before anything is foretold
-HEARD, LOST = 4.0, 1.0  # nats of evidence from which a line counts, and below which it does no more
+FIRST_BLOCKS = 3  # before anything is predicted
+DETECTED, LOST = 4.0, 1.0  # nats of evidence from which a line counts, and below which it does no more
 EDGE = 5  # lines at the ends of the range, which may be the flank of something outside
-FIRST_STD = 0.015  # of ln κ when a line is first heard
+FIRST_STD = 0.015  # of ln κ when a line is first detected
 WANDER = 1e-4  # of ln κ, per √block
 DRIFT = 0.01  # in ln v, by which a filter's speed may drift from block to block
 SEARCH = 0.02  # in ln v, beyond the filter's 1σ
@@ -115,8 +115,8 @@ class Wheels(NamedTuple):
     levels: Tensor  # (B, O, K, 6) mean of the log levels
     blocks: Tensor  # (B,) in that mean
     log_speed: Tensor  # (B,) its mean ln v
-    evidence: Tensor  # (B,) nats by which the lines foretold the speed better than a guess
-    heard: Tensor  # (B,) bool: that is enough
+    evidence: Tensor  # (B,) nats by which the lines predicted the speed better than a guess
+    detected: Tensor  # (B,) bool: that is enough
     log_turns: Tensor  # (B,) ln κ
     variance: Tensor  # (B,) its variance
 
@@ -145,28 +145,28 @@ class Wheels(NamedTuple):
         return chosen, (at >= EDGE) & (at <= LINES - 1 - EDGE)
 
     def line(self) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
-        """ln κ of the line that is heard, else of the strongest, and whether it is one."""
+        """ln κ of the line that is detected, else of the strongest, and whether it is one."""
         strongest, inside = self.strongest()
-        return torch.where(self.heard, self.log_turns, strongest), self.heard | inside
+        return torch.where(self.detected, self.log_turns, strongest), self.detected | inside
 
     def learned(
-        self, levels: Tensor, foretold: Float[Tensor, "B K"], speed: Float[Tensor, " B"], knows: Bool[Tensor, " B"]
+        self, levels: Tensor, predicted: Float[Tensor, "B K"], speed: Float[Tensor, " B"], knows: Bool[Tensor, " B"]
     ) -> Wheels:
-        """After a block whose speed fixes show: ``foretold``, its ln Λ at :meth:`line`, is judged, then it is learned
+        """After a block whose speed fixes show: ``predicted``, its ln Λ at :meth:`line`, is judged, then it is learned
         from."""
         log_speed = torch.log(speed)
         line, known = self.line()
-        gain = _gain(foretold, (_lines(levels) - line.unsqueeze(-1)).abs())
+        gain = _gain(predicted, (_lines(levels) - line.unsqueeze(-1)).abs())
         weight = ((log_speed - self.log_speed).abs() / APART).clamp_max(1.0)
         judged = knows & known & (self.blocks >= FIRST_BLOCKS)
         evidence = torch.where(judged, (1 - 1 / MEMORY) * self.evidence + weight * gain, self.evidence)
         blocks = torch.where(knows, self.blocks + 1, self.blocks)
         rate = torch.where(knows, 1 / blocks.clamp(1, MEMORY), 0.0)
-        new = ~self.heard & judged & (evidence > HEARD)
+        new = ~self.detected & judged & (evidence > DETECTED)
         return Wheels(
             self.levels + rate[:, None, None, None] * (levels - self.levels), blocks,
             self.log_speed + rate * (log_speed - self.log_speed), evidence,
-            (self.heard & (evidence > LOST)) | new, torch.where(new, line, self.log_turns),
+            (self.detected & (evidence > LOST)) | new, torch.where(new, line, self.log_turns),
             torch.where(new, FIRST_STD**2, self.variance),
         )  # fmt: skip
 
@@ -193,7 +193,7 @@ class WheelOrders:
         return WheelOrders(None, Tuning(), self.states)
 
     def begin(self, batch: Batch) -> OrdersMemory:
-        """Nothing heard."""
+        """Nothing detected."""
         B = batch.size[0]
         return OrdersMemory(
             Block.begin(batch.imu, B), Wheels.begin(batch.imu, B), batch.imu.new_zeros(B, LINES)
@@ -232,7 +232,7 @@ class WheelOrders:
         before = memory.wheels
         likelihood = log_likelihood(levels, before.excess(before.line()[0]) * seen.unsqueeze(-1))
         undecided = _diffused(memory.undecided)
-        undecided = undecided + torch.where((moving & before.heard).unsqueeze(-1), likelihood, 0.0)
+        undecided = undecided + torch.where((moving & before.detected).unsqueeze(-1), likelihood, 0.0)
 
         knows = moving & block.fixed & (of_speed < KNOWN**2)
         wheels = before.learned(levels * seen[:, :, None, None], likelihood, speed, knows)
@@ -240,7 +240,7 @@ class WheelOrders:
         off = lines - before.log_turns.unsqueeze(-1)
         searched = of_speed + before.variance + SEARCH**2
         z, R, decided = _gaussian(undecided - 0.5 * off.square() / searched.unsqueeze(-1), off, searched)
-        used = moving & before.heard & wheels.heard & decided & (of_speed + before.variance < LOST_STD**2)
+        used = moving & before.detected & wheels.detected & decided & (of_speed + before.variance < LOST_STD**2)
         gain = torch.where(knows & used, wheels.variance / (wheels.variance + of_speed + R), 0.0)
         wheels = wheels._replace(
             log_turns=wheels.log_turns + gain * z,
@@ -261,9 +261,9 @@ class WheelOrders:
         return (H / speed.unsqueeze(-1)).unsqueeze(1)
 
 
-def _gain(foretold: Float[Tensor, "B K"], off: Float[Tensor, "B K"]) -> Float[Tensor, " B"]:
+def _gain(predicted: Float[Tensor, "B K"], off: Float[Tensor, "B K"]) -> Float[Tensor, " B"]:
     """ln of the probability density at the line over that of a guess, ``off`` in ln κ from it."""
-    likely = torch.where(off < GUESS, foretold, -1e3)
+    likely = torch.where(off < GUESS, predicted, -1e3)
     p = torch.exp(likely - likely.amax(1, keepdim=True)) * (off < GUESS)
     hit, guessed = (off < HIT).to(p.dtype), (off < GUESS).to(p.dtype).sum(1)
     share = (p * hit).sum(1) / p.sum(1).clamp_min(1e-12)
