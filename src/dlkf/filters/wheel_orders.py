@@ -241,6 +241,8 @@ class WheelOrders:
         searched = of_speed + before.variance + SEARCH**2
         z, R, decided = _gaussian(undecided - 0.5 * off.square() / searched.unsqueeze(-1), off, searched)
         used = moving & before.detected & wheels.detected & decided & (of_speed + before.variance < LOST_STD**2)
+        if prediction.rolling is not None:  # a wheel that agrees says more
+            used = used & ~prediction.rolling
         gain = torch.where(knows & used, wheels.variance / (wheels.variance + of_speed + R), 0.0)
         wheels = wheels._replace(
             log_turns=wheels.log_turns + gain * z,
