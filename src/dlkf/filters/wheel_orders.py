@@ -63,6 +63,7 @@ SEARCH = 0.02  # in ln v, beyond the filter's 1σ
 FINEST = 0.005  # in ln κ: a line is no finer
 DECIDED, SURE, OUTLIER = 0.8, 0.03, 3.0  # of the search's variance; 1σ in ln κ; σ: what decides a block
 LOST_STD = 0.1  # relative 1σ of a speed that no line is looked for at
+UNCHECKED_S = 100.0  # s after a fix, from which on what nothing has checked is worth less and less
 TOGETHER = 10.0  # measurements that share the error of κ count as so many
 
 
@@ -177,6 +178,7 @@ class OrdersMemory(NamedTuple):
     block: Block
     wheels: Wheels
     undecided: Tensor  # (B, K) ln Λ of blocks that decided nothing
+    age: Tensor  # (B,) s since the last fix
 
 
 @dataclass(frozen=True)
@@ -196,7 +198,7 @@ class WheelOrders:
         """Nothing detected."""
         B = batch.size[0]
         return OrdersMemory(
-            Block.begin(batch.imu, B), Wheels.begin(batch.imu, B), batch.imu.new_zeros(B, LINES)
+            Block.begin(batch.imu, B), Wheels.begin(batch.imu, B), batch.imu.new_zeros(B, LINES), batch.imu.new_zeros(B)
         )  # fmt: skip
 
     def rows(
@@ -209,12 +211,13 @@ class WheelOrders:
         block_s = max(1, round(BLOCK_S / span)) * span
         block = memory.block.after(epoch, block_s)
         done = block.elapsed > block_s - 0.5 * span
+        memory = memory._replace(age=torch.where(epoch.used.any(-1), 0.0, memory.age + span))
         if may_branch(done) and not bool(done.any()):
             return None, memory._replace(block=block)
         row, wheels, undecided = self._judged(epoch, memory, prediction, block, done)
         kept = torch.where(epoch.used.any(-1, keepdim=True) | row.used, 0.0, undecided)
         undecided = torch.where(done.unsqueeze(-1), kept, memory.undecided)
-        return row, OrdersMemory(block.next(done), wheels, undecided)
+        return row, OrdersMemory(block.next(done), wheels, undecided, memory.age)
 
     def _judged(
         self, epoch: Epoch, memory: OrdersMemory, prediction: Predicted, block: Block, done: Bool[Tensor, " B"]
@@ -248,7 +251,7 @@ class WheelOrders:
             log_turns=wheels.log_turns + gain * z,
             variance=(1 - gain) * wheels.variance + torch.where(done, WANDER**2, 0.0),
         )
-        R = R + TOGETHER * before.variance
+        R = (R + TOGETHER * before.variance) * (1 + (memory.age / UNCHECKED_S).square())
         R = R * (z.square() / (of_speed + R) / OUTLIER**2).clamp_min(1.0)
         return Measurement(z.unsqueeze(-1), H, R.unsqueeze(-1), used.unsqueeze(-1)), wheels, undecided
 

@@ -74,6 +74,7 @@ MEMORY = {  # by the last parts of a field's name
     "wheels.log_turns": "ln of the wheel's turns per metre",
     "wheels.variance": "variance of that",
     "undecided": "ln of the likelihood of every line in blocks that gave no measurement",
+    "age": "time since the last fix [s]",
     "noise.Q": "adapted covariance of an epoch's process noise, units of P",
     "noise.R": "adapted variance of a fix: position [m²], velocity [m²/s²]",
     "noise.settled": "1 where the adapted noise is in force",
