@@ -1,6 +1,6 @@
 """Filters by name: ``ins``, or a Kalman filter with endings for what it carries, as in ``mbkf21_nhc_gated``.
 
-A sensor stands behind a plus, as in ``mbkf15+speed`` (:data:`dlkf.filters.aids.attach.SOURCES`), and so does a source
+A sensor stands behind a plus, as in ``mbkf15+speed``, and so do wheel orders (:data:`dlkf.filters.aids.attach.SOURCES`), and so does a source
 of measurements of one's own, as in ``mbkf21_nhc+my_sources:SpeedLimit``: a module on PYTHONPATH and a class in it
 (:mod:`dlkf.filters.sources`).
 """
@@ -117,4 +117,5 @@ def filter_names() -> list[str]:
 
 def known_filters() -> str:
     """What to write after ``model=``, for messages."""
-    return f"{', '.join(MODEL_BASED)}; endings of a Kalman filter: {', '.join('_' + e for e in ENDINGS)}"
+    endings = ", ".join("_" + ending for ending in ENDINGS)
+    return f"{', '.join(MODEL_BASED)}; endings of a Kalman filter: {endings}; behind a plus: {', '.join(SOURCES)}"
