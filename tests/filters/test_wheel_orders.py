@@ -14,7 +14,7 @@ from dlkf.data.tables import DriveRow
 from dlkf.data.validate import CheckedTables
 from dlkf.filters.build import build_filter, is_filter
 from dlkf.filters.integration import integrate
-from dlkf.filters.order_spectrum import LEAST, LINES, ORDERS, STEP, demodulate, log_levels, log_likelihood, log_turns
+from dlkf.filters.order_spectrum import LEAST, LINES, ORDERS, STEP, demodulate, log_levels, log_likelihood, log_lines
 from dlkf.filters.wheel_orders import DETECTED, OrdersMemory, _gaussian
 from tests.cars import car
 
@@ -106,7 +106,7 @@ def test_the_spectrum_is_the_sum_that_its_equation_says():
     for number, order in enumerate(ORDERS):
         for line in (0, 7, 8, LINES - 1):
             kappa = LEAST + STEP * line
-            assert torch.exp(log_turns(x))[line] == pytest.approx(kappa)
+            assert torch.exp(log_lines(x))[line] == pytest.approx(kappa)
             angle = 2 * math.pi * order * kappa * s
             expected = torch.stack([(f(angle).unsqueeze(-1) * x).sum(1) for f in (torch.cos, torch.sin)], 1)
             assert torch.allclose(got[:, :, number * LINES + line], expected, atol=1e-12)

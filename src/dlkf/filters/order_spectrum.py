@@ -71,9 +71,15 @@ def log_likelihood(levels: Float[Tensor, "B O K 6"], excess: Float[Tensor, "B O 
     return of_order.clamp(-LIMIT, LIMIT).sum(1)
 
 
-def log_turns(like: Tensor) -> Float[Tensor, " K"]:
-    """ln κ of the lines."""
-    return torch.log(LEAST + STEP * torch.arange(LINES, dtype=like.dtype, device=like.device))
+def log_lines(like: Tensor) -> Float[Tensor, " K"]:
+    """ln κ of the lines, of the type of ``like``."""
+    return _log_lines(like.dtype, like.device)
+
+
+@lru_cache
+@torch.inference_mode(False)
+def _log_lines(dtype: torch.dtype, device: torch.device) -> Float[Tensor, " K"]:
+    return torch.log(LEAST + STEP * torch.arange(LINES, dtype=dtype, device=device))
 
 
 @lru_cache

@@ -40,7 +40,7 @@ from dlkf.filters.order_spectrum import (
     demodulate,
     log_levels,
     log_likelihood,
-    log_turns,
+    log_lines,
 )
 from dlkf.filters.sources import Measurement, Predicted, predicted_variance
 from dlkf.filters.tuning import Tuning
@@ -130,7 +130,7 @@ class Wheels(NamedTuple):
     def excess(self, log_turns: Float[Tensor, " B"]) -> Float[Tensor, "B O 6"]:
         """By what a wheel's lines stand out if it turns so often."""
         kappa = torch.exp(log_turns).unsqueeze(-1)
-        near = torch.exp(-0.5 * ((torch.exp(_lines(kappa)) - kappa) / STEP).square())
+        near = torch.exp(-0.5 * ((torch.exp(log_lines(kappa)) - kappa) / STEP).square())
         near = near / near.sum(1, keepdim=True).clamp_min(1e-12)
         return (self.levels * near[:, None, :, None]).sum(2)
 
@@ -141,7 +141,7 @@ class Wheels(NamedTuple):
         number = torch.arange(LINES, dtype=total.dtype, device=total.device)
         largest = (total >= total.amax(1, keepdim=True)).to(total.dtype)
         at = (largest * number).sum(1) / largest.sum(1)
-        lines = _lines(total)
+        lines = log_lines(total)
         chosen = (largest * lines).sum(1) / largest.sum(1)
         return chosen, (at >= EDGE) & (at <= LINES - 1 - EDGE)
 
@@ -157,7 +157,7 @@ class Wheels(NamedTuple):
         from."""
         log_speed = torch.log(speed)
         line, known = self.line()
-        gain = _gain(predicted, (_lines(levels) - line.unsqueeze(-1)).abs())
+        gain = _gain(predicted, (log_lines(levels) - line.unsqueeze(-1)).abs())
         weight = ((log_speed - self.log_speed).abs() / APART).clamp_max(1.0)
         judged = knows & known & (self.blocks >= FIRST_BLOCKS)
         evidence = torch.where(judged, (1 - 1 / MEMORY) * self.evidence + weight * gain, self.evidence)
@@ -224,7 +224,7 @@ class WheelOrders:
     ) -> tuple[Measurement, Wheels, Float[Tensor, "B K"]]:
         """The row of a block that is done, what is known after it, and what the blocks since the last row say."""
         levels = log_levels(block.spectrum)
-        lines = _lines(levels)
+        lines = log_lines(levels)
         speed = (block.distance / block.elapsed).clamp_min(0.1)
         moving = done & (block.slowest > SLOWEST)
         highest = 0.55 * speed.unsqueeze(-1) * speed.new_tensor(ORDERS)
@@ -300,16 +300,6 @@ def _diffused(log_likelihood: Float[Tensor, "B K"]) -> Float[Tensor, "B K"]:
 @lru_cache
 @torch.inference_mode(False)
 def _drift(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "K K"]:
-    lines = log_turns(torch.empty(0, dtype=dtype, device=device))
+    lines = log_lines(torch.empty(0, dtype=dtype, device=device))
     near = torch.exp(-0.5 * ((lines[:, None] - lines) / DRIFT).square())
     return near / near.sum(1, keepdim=True)
-
-
-def _lines(like: Tensor) -> Float[Tensor, " K"]:
-    return _log_turns(like.dtype, like.device)
-
-
-@lru_cache
-@torch.inference_mode(False)
-def _log_turns(dtype: torch.dtype, device: torch.device) -> Float[Tensor, " K"]:
-    return log_turns(torch.empty(0, dtype=dtype, device=device))
