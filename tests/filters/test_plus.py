@@ -153,3 +153,29 @@ def test_it_can_be_smoothed():
 def test_mistakes_are_one_line(settings, words):
     with pytest.raises(InputError, match=words):
         learned_filter(learned_settings(settings))
+
+
+class Judged:
+    """A filter whose virtual outages say from the start that its network is wrong, or right."""
+
+    def __init__(self, model: PlusFilter, hypothesis: int) -> None:
+        self.model, self.hypothesis = model, hypothesis
+
+    def begin(self, batch):
+        memory, error = self.model.begin(batch)
+        evidence = memory.outage.evidence.clone()
+        evidence[:, self.hypothesis] += 1e3
+        return memory._replace(outage=memory.outage._replace(evidence=evidence)), error
+
+    def step(self, memory, epoch):
+        return self.model.step(memory, epoch)
+
+
+def test_a_network_that_outages_contradict_has_no_effect(claimed):
+    """κ^w with w = 0 is the filter with weights of zero; with w = 1 it is another."""
+    batch, model = car(2, 10), plus(weights=0.5)
+    with torch.no_grad():
+        wrong, right = (integrate(batch, Judged(model, k)) for k in (1, 0))
+        none = integrate(batch, Judged(plus(), 1))
+    assert torch.allclose(wrong.std, none.std, rtol=1e-12)
+    assert not torch.allclose(right.std, none.std, rtol=1e-3)

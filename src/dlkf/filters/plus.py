@@ -173,9 +173,11 @@ class PlusFilter(nn.Module):
         seen = memory.since_fix < memory.elapsed  # before the first fix there is nothing to adapt to
         if not (may_branch(seen) and bool(seen.all())):
             gyro_noise = torch.where(seen.unsqueeze(-1), gyro_noise, 1.0)
-        levels, same = memory.outage.levels(), torch.ones_like(gyro_noise)
-        of_network = torch.stack((same, gyro_noise, same, same), 1)
-        process = of_network * torch.cat((levels, torch.ones_like(levels)), -1).unsqueeze(-1)
+        (levels, weight), same = memory.outage.estimates(), torch.ones_like(gyro_noise)
+        of_network, in_force = (
+            torch.stack((same, x, same, same), 1) for x in (gyro_noise, gyro_noise ** weight.unsqueeze(-1))
+        )
+        process = in_force * torch.cat((levels, torch.ones_like(levels)), -1).unsqueeze(-1)
         advice = NetworkOutput(process, memory.errors.noise(epoch, kalman.fix.scale[0, 0, 0]))
         kalman, correction = self.kalman.update(memory.kalman, epoch._replace(advice=advice))
         with torch.no_grad():

@@ -12,6 +12,9 @@ so one trajectory scores all of them: the density of z_o (horizontal position, S
 summed over the outages, older ones forgotten, and with a log-normal prior about 1 gives a posterior of (ln a, ln g)
 on a grid. Its mean is the level in force. Innovations after 1 s say how noisy a fix is; those after 10 to 30 s what
 matters in an outage. Without fixes nothing is learned.
+
+A network that scales the noise of the gyroscopes is judged by the same outages: beside Q_g with its factors runs Q_g
+without, and the posterior has both. The probability w of the network is the weight of its factors, κ^w.
 """
 
 from __future__ import annotations
@@ -26,12 +29,13 @@ from torch import Tensor
 from dlkf.filters.integration import Covariances, Epoch
 from dlkf.filters.kalman_update import propagated
 from dlkf.navigation.error_model import WindowModel
-from dlkf.navigation.state import PVA, STATES
+from dlkf.navigation.state import ATTITUDE, PVA, STATES
 
 SCORED_S, LAST_S, STALE_S = 10.0, 30.0, 45.0  # ages at which an outage is scored: each multiple up to the last; too old
 MEMORY_S = 600.0  # of fixes, over which an outage is forgotten
 FREEDOM = 4.0  # of Student's t: an outlier decides nothing
 SPREAD = 1.0  # 1σ of ln(level) before anything is known
+TRUST = 0.9  # probability of a network's factors before anything is known
 LEVELS = tuple(2.0**k for k in range(-5, 6))  # of both sensors
 
 
@@ -40,40 +44,45 @@ class VirtualOutage(NamedTuple):
 
     drift: Tensor  # (B, n) d: the filter's estimate less that of the trajectory
     P: Tensor  # (B, n, n) of the trajectory but for the white noise since it began
-    white: Tensor  # (B, 2, 9, 9) which adds so much at level 1: Q_a, Q_g
+    white: Tensor  # (B, 3, 9, 9) which adds so much at level 1: Q_a, Q_g, Q_g without a network's factors
     age: Tensor  # (B,) s
     due: Tensor  # (B,) s, the age from which on the next fix is scored
-    evidence: Tensor  # (B, L, L) ln p of the scored fixes by levels of accelerometers and gyroscopes, no prior
+    evidence: Tensor  # (B, 2, L, L) ln p of the scored fixes with the network and without, by levels, no prior
 
     @classmethod
     def begin(cls, P: Float[Tensor, "B n n"]) -> VirtualOutage:
         """One that begins with a filter, and nothing said."""
         zeros, B, n = P.new_zeros, len(P), P.shape[-1]
         due = zeros(B) + SCORED_S
-        return cls(zeros(B, n), P, zeros(B, 2, 9, 9), zeros(B), due, zeros(B, len(LEVELS), len(LEVELS)))
+        return cls(zeros(B, n), P, zeros(B, 3, 9, 9), zeros(B), due, zeros(B, 2, len(LEVELS), len(LEVELS)))
 
-    def levels(self) -> Float[Tensor, "B 2"]:
-        """Factors on the standard deviations of the white noise of accelerometers and gyroscopes; 1 where nothing was
-        said."""
+    def estimates(self) -> tuple[Float[Tensor, "B 2"], Float[Tensor, " B"]]:
+        """Factors on the standard deviations of the white noise of accelerometers and gyroscopes, 1 where nothing was
+        said; and the weight of the network's factors."""
         x = self.evidence.new_tensor([math.log(level) for level in LEVELS])
         prior = -0.5 * (x / SPREAD).square()
-        ln = (self.evidence + prior[:, None] + prior).flatten(1)
-        p = torch.exp(ln - ln.amax(1, keepdim=True)).unflatten(1, (len(LEVELS), -1))
-        mean = torch.stack(((p.sum(2) * x).sum(1), (p.sum(1) * x).sum(1)), -1) / p.sum((1, 2)).unsqueeze(-1)
+        of_network = self.evidence.new_tensor([math.log(TRUST), math.log(1 - TRUST)])[:, None, None]
+        ln = self.evidence + (prior[:, None] + prior + of_network)
+        p = torch.exp(ln - ln.amax((1, 2, 3), keepdim=True))
+        of_both = p.sum(1)
+        total = of_both.sum((1, 2))
+        mean = torch.stack(((of_both.sum(2) * x).sum(1), (of_both.sum(1) * x).sum(1)), -1) / total.unsqueeze(-1)
         said = self.evidence.abs().flatten(1).amax(1, keepdim=True) > 0
-        return torch.where(said, torch.exp(mean), 1.0)
+        return torch.where(said, torch.exp(mean), 1.0), p[:, 0].sum((1, 2)) / total
 
     def after(
         self, epoch: Epoch, c: Covariances, windows: WindowModel, scale: Float[Tensor, "B 4 3 3"]
     ) -> VirtualOutage:
-        """After an update of the filter; ``scale`` is that of its noise at level 1."""
+        """After an update of the filter; ``scale`` is that of its noise at level 1, with the network's factors."""
         Phi = c.Phi
         by_source = windows.noise_of_sources(Phi, scale)
         top = Phi[:, PVA]
         drift = torch.cat((torch.bmm(top, self.drift.unsqueeze(-1)).squeeze(-1), self.drift[:, PVA.stop :]), -1)
         P = self._predicted(top, by_source[:, 2:].sum(1), windows.walk)
         F = top[:, None, :, PVA]
-        white = F @ self.white @ F.mT + by_source[:, :2, PVA, PVA]
+        L = Phi[:, PVA, ATTITUDE]
+        plain = (L @ L.mT) * windows.spread[1, PVA, PVA]
+        white = F @ self.white @ F.mT + torch.cat((by_source[:, :2, PVA, PVA], plain.unsqueeze(1)), 1)
         age = self.age + epoch.dt * epoch.imu.shape[1]
 
         fixed = epoch.used[:, :2].all(-1)
@@ -82,9 +91,10 @@ class VirtualOutage(NamedTuple):
         z = epoch.z[:, :2] + torch.bmm(H, drift.unsqueeze(-1)).squeeze(-1)
         known = torch.bmm(torch.bmm(H, P), H.mT) + torch.diag_embed(R)
         added = H[:, None, :, PVA] @ white @ H[:, None, :, PVA].mT
-        said = torch.where(scored[:, None, None], _log_density(z, known, added), 0.0)
+        said = torch.stack((_log_density(z, known, added[:, :2]), _log_density(z, known, added[:, ::2])), 1)
+        said = torch.where(scored[:, None, None, None], said, 0.0)
         kept = 1 - fixed.to(age.dtype) * (epoch.dt * epoch.imu.shape[1] / MEMORY_S)
-        evidence = kept[:, None, None] * self.evidence + said
+        evidence = kept[:, None, None, None] * self.evidence + said
 
         over = fixed & ((scored & (self.due >= LAST_S)) | (age >= STALE_S))
         due = torch.where(scored, self.due + SCORED_S, self.due)
