@@ -3,6 +3,7 @@
     python -m pipelines.studies.plus --real <folder with kitti, rtkx, wid, wid_mru, linkoping> --out outputs/plus
     python -m pipelines.studies.plus --train --out outputs/plus    the constants by gradient and fresh weights as well
     python -m pipelines.studies.plus --parts --real <real> --out outputs/plus_parts    against itself without its parts
+    python -m pipelines.studies.plus --oracle --no-auto --sets good fleet others    beside a filter given the true noise
 
 Makes the test sets that are missing (below ``--data``), runs every filter compiled over segments with GNSS for 60, 300
 and 900 s and then none for 120 s (real drives: 30 or 60 s), and writes ``table.md`` and ``manifest.json`` (commit,
@@ -10,15 +11,9 @@ seeds, settings and digest of every dataset). Errors are horizontal, at the end 
 The baselines start from ``imu=automotive_mems`` and constants from ``conf/tuning``, each without wheel orders and with
 them. The ratio is to the best of them by
 the geometric mean of that row, a choice with hindsight; [ ] is its 95 % interval over recordings. Beside them stands
-``imu=auto``, whose noise is found on the very drives that are scored, with all their fixes. Last come, over all rows,
+``imu=auto``, whose noise is found on the very drives that are scored, with all their fixes, and with ``--oracle``
+``mbkf33_car+wheel_orders`` given the noise that each simulated drive was made with. Last come, over all rows,
 every filter's errors, mean NEES, and the ratio of ``plus`` to it over all outages, by recordings.
-
-The laws of the simulated sets are none of those that the network was trained with: ``tones`` vibrates at other
-frequencies, ``patches`` has rough patches that begin and end and no vibration, ``askew`` has mounts some 5° off (1σ per
-axis) and rough roads, ``steady`` drives minutes at constant speed, ``puck`` has positions alone with 2 m of error that
-wanders over 40 s and a 1σ of 0.4 of the true one (``puck_other`` 3 m, 90 s, 0.6; ``puck_slow`` 1.5 m, 300 s, 0.8, IMU
-types not trained on; ``puck_white`` 1.5 m of white noise and the true 1σ), ``good`` has good IMUs alone, ``others`` IMU
-types not trained on; ``pyins_*`` are made by python-ins.
 """
 
 from __future__ import annotations
@@ -27,15 +22,16 @@ import argparse
 import json
 import subprocess
 import sys
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 import yaml
 from pipelines.studies.ablations.plus_parts import parts
-from pipelines.studies.parity import write_drives
+from pipelines.studies.simulated_laws import COMMON, INJECTED, PYTHON_INS, SILENT, SIMULATED, simulate_sets
 
 from dlkf.base.errors import InputError
 from dlkf.base.provenance import describe_provenance
@@ -58,50 +54,12 @@ from dlkf.onboard.compiled_filter import compile_filter, compile_or_keep
 from dlkf.running.likelihood import Evidence, find_noise
 from dlkf.running.start import align_each
 from dlkf.simulation.dataset import simulate
-from dlkf.simulation.motion import chassis
 from dlkf.tuning.descent import tune_by_gradient
 
 START, COARSE = StartLaw(0.1, 0.1, 1.0, 2.0), StartLaw(1.5, 0.3, 1.0, 3.0)
 BEFORE_S, LENGTHS_S, MOST = (60, 300, 900), (30, 60, 120), 48
-TONES = ((28.0, 0.0, 0.5), (0.0, 0.37, 0.2), (14.0, 0.8, 0.3))  # of `tones`: Hz at rest, per metre, share of the power
 CONSTANTS = {"mbkf21_car": ("any_car", "gradient"), "mbkf33_car": ("any_car", "gradient")}
-COMMON = ("dataset.hours=3.6", "dataset.drive_minutes=18")
-SILENT = ("dataset.chassis.vibration=0", "dataset.chassis.vibration_rate=0")
-STEADY = (
-    "dataset.vehicle.manoeuvres={stretch: 0.7, turn: 0.15, stop: 0.15, eight: 0.0, slowest: 0.3, "
-    "turn_deg: [10.0, 90.0], stretch_s: [60.0, 180.0], stop_s: [3.0, 30.0]}"
-)
-PATCHES = ("+dataset.chassis.roughness_spread=1.3", "+dataset.chassis.roughness_length=80")
-
-
-def positions(std: float, wander: float, wander_s: float, factor: float) -> tuple[str, ...]:
-    """A receiver of positions alone: 1σ of white noise and of what wanders [m], its time, and the share it reports."""
-    return (
-        f"dataset.gnss.std_horizontal={std}", f"dataset.gnss.std_vertical={2 * std}", f"+dataset.gnss.wander={wander}",
-        f"+dataset.gnss.wander_s={wander_s}", f"+dataset.gnss.std_factor={factor}", "dataset.gnss.quality=1",
-        "receiver=white",
-    )  # fmt: skip
-
-
-NOT_GOOD = ("automotive_mems", "lifelike_mems", "consumer", "icm20602", "bmi055")
-SIMULATED: Mapping[str, tuple[str, ...]] = {
-    "tones": ("simulated@dataset=fleet", "seed=7101"),
-    "patches": ("simulated@dataset=fleet", "seed=7102", *SILENT, *PATCHES),
-    "askew": (
-        "simulated@dataset=other_imus", "seed=7103", "dataset.chassis.mounting_std_deg=5",
-        "dataset.chassis.roughness=512e-6",
-    ),
-    "steady": ("simulated@dataset=fleet", "seed=7104", *SILENT, "dataset.chassis.roughness=4e-6", STEADY),
-    "puck": ("simulated@dataset=fleet", "seed=7105", *positions(0.5, 2.0, 40, 0.4)),
-    "puck_other": ("simulated@dataset=fleet", "seed=8105", *positions(0.6, 3.0, 90, 0.6)),
-    "puck_slow": ("simulated@dataset=other_imus", "seed=8108", *positions(0.4, 1.5, 300, 0.8)),
-    "puck_white": ("simulated@dataset=fleet", "seed=8109", *positions(1.5, 0.0, 40, 1.0)),
-    "good": ("simulated@dataset=fleet", "seed=7106", *(f"~dataset.fleet.{kind}" for kind in NOT_GOOD)),
-    "others": ("simulated@dataset=other_imus", "seed=7107"),
-    "fleet": ("simulated@dataset=fleet", "seed=601"),
-}  # fmt: skip
-PYTHON_INS = {"pyins_adis": "adis16465_i2nav", "pyins_consumer": "consumer"}
-INJECTED = {"kitti_consumer": ("consumer", 21), "kitti_adis": ("adis16465_i2nav", 22)}
+ORACLE = "true noise"
 REAL = ("rtkx", "wid", "wid_mru", "linkoping")
 TRAINING: Mapping[str, tuple[str, ...]] = {
     "train_wide": ("simulated@dataset=wide", "seed=1", "dataset.hours=5.4", "dataset.drive_minutes=18"),
@@ -133,25 +91,6 @@ class Row:
     errors: dict[str, np.ndarray]
     nees: dict[str, float]
     groups: list[str]
-
-
-def simulate_sets(data: Path, real: Path | None, wanted: Collection[str]) -> None:
-    """Those of the wanted test sets that are not there yet."""
-    for name, words in SIMULATED.items():
-        if name in wanted and not (data / name).is_dir():
-            with_tones = chassis.TONES
-            chassis.TONES = TONES if name == "tones" else with_tones
-            try:
-                simulate(compose_recipe(*words, *COMMON), data / name, workers=1)
-            finally:
-                chassis.TONES = with_tones
-    for name, imu in PYTHON_INS.items():
-        if name in wanted and not (data / name).is_dir():
-            write_drives(data / name, imu_preset(imu), 4, 18)
-    for name, (imu, seed) in INJECTED.items() if real is not None else ():
-        if name in wanted and not (data / name).is_dir():
-            words = [f"source={real}/kitti", f"imu={imu}", f"seed={seed}", f"out={data / name}"]
-            subprocess.run([sys.executable, "-m", "dlkf.simulate", *words], check=True)
 
 
 def load(folder: Path) -> list[Drive]:
@@ -222,6 +161,26 @@ def found_noise(drives: Sequence[Drive]) -> dict[str, Estimator]:
     return filters
 
 
+def given_noise(folder: Path) -> dict[str, Estimator]:
+    """``mbkf33_car+wheel_orders`` with the preset of each kind of IMU in a simulated dataset, by the preset's name."""
+    kinds = sorted(set(pd.read_parquet(folder / "drives.parquet")["imu"]))
+    tuning = replace(Tuning(), lateral_std=0.07, vertical_std=0.1)
+    return {k: build_causal("mbkf33_car+wheel_orders", imu_preset(k), "no", tuning=tuning) for k in kinds}
+
+
+def with_oracle(case: Case, rows: Sequence[Row], folder: Path) -> list[Row]:
+    """The rows with the errors of the filter that is given the noise of each drive."""
+    meta = pd.read_parquet(folder / "drives.parquet").set_index("group")["imu"]
+    by_kind = given_noise(folder)
+    given = []
+    for row, of_kinds in zip(rows, score(case, by_kind), strict=True):
+        kinds = [str(meta[g]) for g in row.groups]
+        errors = np.array([of_kinds.errors[k][i] for i, k in enumerate(kinds)])
+        nees = float(np.mean([of_kinds.nees[k] for k in kinds]))
+        given.append(replace(row, errors=row.errors | {ORACLE: errors}, nees=row.nees | {ORACLE: nees}))
+    return given
+
+
 def score(case: Case, filters: Mapping[str, Estimator]) -> list[Row]:
     """A row for each length of outage that some segment holds."""
     batch, rows = case.batch, {}
@@ -245,7 +204,7 @@ def score(case: Case, filters: Mapping[str, Estimator]) -> list[Row]:
 
 def markdown(rows: Sequence[Row]) -> list[str]:
     """RMS / geometric mean of every filter, ratios of ``plus`` to the best other one without ``auto``, its NEES."""
-    after = [name for name in rows[0].errors if name.endswith(" auto")]
+    after = [name for name in rows[0].errors if name.endswith(" auto") or name == ORACLE]
     baselines = [name for name in rows[0].errors if name != "plus" and name not in after]
     head = [
         "data",
@@ -338,6 +297,7 @@ def main() -> None:
     arguments.add_argument("--data", type=Path, default=Path("data/plus"), help="where test sets lie, or are made")
     arguments.add_argument("--sets", nargs="+", help="only these datasets")
     arguments.add_argument("--no-auto", action="store_true", help="without imu=auto, which takes most of the time")
+    arguments.add_argument("--oracle", action="store_true", help="beside a filter given the noise of simulated drives")
     arguments.add_argument("--parts", action="store_true", help="against itself without a part")
     arguments.add_argument("--model", default="plus", help="weights: plus, or a folder")
     arguments.add_argument("--train", action="store_true", help="constants and weights anew, first")
@@ -361,7 +321,8 @@ def main() -> None:
         baselines = parts(options.model) if options.parts else {**constants(), **found}
         filters = {**baselines, "plus": trained_filter(options.model)}
         for case in real_cases(name, drives) if name in REAL else simulated_cases(name, drives):
-            rows += score(case, filters)
+            scored = score(case, filters)
+            rows += with_oracle(case, scored, folder) if options.oracle else scored
             print("\n".join(markdown(rows[-1:])[2:]), flush=True)
     lines = [*markdown(rows), "", *pooled(rows)]
     (options.out / "table.md").write_text("\n".join(lines) + "\n")
