@@ -87,7 +87,7 @@ def _knot(t, n, usual, p):
 @njit(inline="always")
 @no_type_check
 def _integral(t, x, usual, k):
-    """Length and integral of the interval that ends at sample k; of what is missing by the mean of the two neighbours."""
+    """Length and integral of the interval that ends at sample k; what is missing has the mean of the two neighbours."""
     now = six(x, k)
     h = t[k] - t[k - 1] if k else t[0] - (t[0] - usual)
     if h <= 1.5 * usual:
