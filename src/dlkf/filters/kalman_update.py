@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dlkf.navigation import compiled, compiled_update
+from dlkf.navigation import compiled
 from dlkf.navigation.state import PVA
 
 
@@ -51,12 +51,11 @@ def kalman_update(
     """Correction, gain and covariance for symmetric P and diagonal R; the gain is returned without a gradient."""
     if torch.is_grad_enabled() and any(x.requires_grad for x in (P, H, R, z)):
         return _KalmanUpdate.apply(P, H, R, z)
-    dx, Kt, P = compiled_update.update(P, H, R, z) if compiled.fits(P) else _updated(P, H, R, z)[:3]
-    return dx, Kt.mT, P
+    return _updated(P, H, R, z)[:3]
 
 
 def _updated(P: Tensor, H: Tensor, R: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """dx, Kᵀ, P⁺ and S. For any K, P⁺ = X − K (H X − R Kᵀ) with X = P − (H P)ᵀ Kᵀ: no product of n × n matrices."""
+    """dx, K, P⁺ and S. For any K, P⁺ = X − K (H X − R Kᵀ) with X = P − (H P)ᵀ Kᵀ: no product of n × n matrices."""
     HP = torch.bmm(H, P)
     S = torch.baddbmm(torch.diag_embed(R), HP, H.mT)
     Kt = _solved(S, HP)
@@ -64,7 +63,7 @@ def _updated(P: Tensor, H: Tensor, R: Tensor, z: Tensor) -> tuple[Tensor, Tensor
     surplus = torch.baddbmm(R.unsqueeze(-1) * Kt, H, X, beta=-1)
     dx = torch.bmm(Kt.mT, z.unsqueeze(-1)).squeeze(-1)
     P = torch.baddbmm(X, Kt.mT, surplus, alpha=-1)
-    return dx, Kt, torch.lerp(P, P.mT, 0.5), S
+    return dx, Kt.mT, torch.lerp(P, P.mT, 0.5), S
 
 
 def _solved(S: Float[Tensor, "B m m"], X: Float[Tensor, "B m n"]) -> Float[Tensor, "B m n"]:
@@ -100,8 +99,7 @@ class _KalmanUpdate(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, P, H, R, z):
-        dx, Kt, updated, S = _updated(P, H, R, z)
-        K = Kt.mT
+        dx, K, updated, S = _updated(P, H, R, z)
         ctx.save_for_backward(H, z, dx, K, updated, S)
         ctx.mark_non_differentiable(K)
         return dx, K, updated
