@@ -7,11 +7,13 @@ ask for a fixture that does: ``make check`` leaves them out.
 from __future__ import annotations
 
 import gc
+import os
 from pathlib import Path
 
 import pytest
 
 pytest.register_assert_rewrite("tests.worlds")
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else each of the processes that tests start compiles all it imports
 
 FIRST_CASE = pytest.StashKey[bool]()
 LONG_ROOMS = ("training", "tuning", "tracking", "pipelines", "onboard", "docs")  # begin first, so that none ends last

@@ -15,6 +15,7 @@ from typing import NoReturn
 
 import dlkf
 from dlkf.base.errors import did_you_mean
+from dlkf.base.own_process import end_at_once, keep_freed_memory
 
 COMMANDS = {
     "simulate": "drives with known truth, as a dataset",
@@ -31,6 +32,12 @@ COMMANDS = {
     "register": "the model of a run into the registry",
     "ui": "MLflow's pages over the runs of this folder",
 }
+
+
+def program() -> None:
+    """:func:`main` as a process of its own, which ends with it."""
+    main()
+    end_at_once()
 
 
 def main() -> None:
@@ -72,6 +79,7 @@ def _load(command: str) -> Callable[[], None]:
     """
     if command != "train":
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+        keep_freed_memory()
     gc.disable()
     try:
         return import_module(f"dlkf.{command}").main
@@ -97,4 +105,4 @@ def usage() -> str:
 
 
 if __name__ == "__main__":
-    main()
+    program()

@@ -60,6 +60,45 @@ def test_threads_of_torch_sleep_but_in_a_training(monkeypatch):
         assert os.environ.get("OMP_WAIT_POLICY") == policy
 
 
+END = """
+import atexit, sys, threading, time
+from dlkf.base.own_process import end_at_once
+atexit.register(print, "registered")
+class Left:
+    def __del__(self): print("taken apart")
+left = Left()
+before
+print("done")
+end_at_once()
+print("went on")
+"""
+
+
+@pytest.mark.parametrize(
+    ("before", "said"),
+    [
+        ("pass", ["done", "registered"]),
+        ("threading.Thread(target=time.sleep, args=(0.2,)).start()", ["done", "went on", "registered", "taken apart"]),
+        ("sys.modules['mlflow'] = sys", ["done", "went on", "registered", "taken apart"]),
+    ],
+)
+def test_a_command_ends_without_taking_apart_what_is_loaded(before, said):
+    """But what was registered for its end is done, and threads and stores end as usual."""
+    done = subprocess.run([sys.executable, "-c", END.replace("before", before)], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout.splitlines() == said and not done.stderr
+
+
+def test_output_that_cannot_be_written_ends_as_usual():
+    """With Python's own line and status for a full disk."""
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full here")
+    buffered = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
+    program = "from dlkf.base.own_process import end_at_once; print(1); end_at_once()"
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([sys.executable, "-c", program], stdout=full, stderr=subprocess.PIPE, env=buffered)
+    assert done.returncode == 120
+
+
 def test_every_command_has_a_module_and_every_configured_one_is_listed():
     here = Path(dlkf.__file__).parent
     assert all((here / f"{name}.py").is_file() for name in COMMANDS)

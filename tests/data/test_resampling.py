@@ -10,8 +10,22 @@ from dlkf.base.errors import InputError
 from dlkf.data import resampling
 from dlkf.data.resampling import SampleGrid, assign_fixes, epoch_grid, fix_phase, reference_at, resample_imu
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, IMU_ERROR, POSITION, STD, VELOCITY
+from dlkf.navigation import compiled
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.earth import ecef_from_geodetic, ned_axes
+
+
+@pytest.fixture(autouse=True, params=["arrays", "loops"])
+def form(request):
+    """Every test with both forms of the resampling."""
+    if request.param == "arrays":
+        with compiled.without_loops():
+            yield
+    else:
+        compiled.load_loops()
+        if not compiled.loops_are_loaded():
+            pytest.skip("loops cannot be compiled here")
+        yield
 
 
 def _imu(t: np.ndarray, values: np.ndarray) -> dict:
@@ -172,3 +186,18 @@ def test_impossible_grids_are_refused():
         epoch_grid(t, np.zeros(1), 50, 1.0, "a")
     with pytest.raises(InputError, match="whole number of samples"):
         epoch_grid(t, np.zeros(1), 50, 0.25, "a")
+
+
+def test_both_forms_give_the_same_to_the_bit():
+    """At any ratio, with jitter, missing samples, a grid that begins before the samples or ends after them."""
+    rng = np.random.default_rng(5)
+    compiled.load_loops()
+    for rate, jitter, kept in ((100.0, 0.0, 1.0), (47.3, 0.3, 1.0), (125.0, 0.0, 0.9), (400.0, 0.3, 0.8)):
+        t = 1000.1 + np.arange(2000) / rate
+        t = np.sort(t + jitter / rate * rng.uniform(-1, 1, 2000))[rng.uniform(size=2000) <= kept]
+        imu = _imu(t, rng.standard_normal((len(t), 6)))
+        exact = epoch_grid(t, t[:1], 50, 1.0, "a")
+        for grid in (exact, SampleGrid(exact.t0 - 0.021, 1.0, exact.epochs + 1, 50)):
+            loops = resample_imu(imu, grid)
+            with compiled.without_loops():
+                np.testing.assert_array_equal(resample_imu(imu, grid), loops)

@@ -192,6 +192,20 @@ def test_compiled_transition_is_the_tensor_form_s(matrix):
         assert torch.allclose(model.transition(state, window, imu, frame), expected, rtol=1e-12, atol=1e-12)
 
 
+def test_compiled_process_noise_is_the_tensor_form_s():
+    """Summed in another order: equal to rounding of the largest element of each row and column."""
+    state, imu, frame = scene(8)
+    model = model_of(frame, ErrorStates("full"))
+    Phi = model.transition(state, strapdown(state, imu, DT, frame), imu, frame)
+    expected = model.noise(Phi)
+    with torch.no_grad():
+        assert compiled.fits(Phi)
+        got = model.noise(Phi)
+    size = expected.diagonal(dim1=-2, dim2=-1).sqrt()
+    assert torch.equal(got, got.mT)
+    assert ((got - expected).abs() <= 1e-14 * size[:, :, None] * size[:, None]).all()
+
+
 def test_gradient_of_the_process_noise_in_its_scale_is_the_numerical_one():
     """In closed form, where nothing is learned through Φ."""
     state, imu, frame = scene(9)

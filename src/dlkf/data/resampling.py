@@ -8,11 +8,13 @@ import numpy as np
 import torch
 
 from dlkf.base.errors import InputError
+from dlkf.data import compiled_samples
 from dlkf.data.increments import merge_increments, two_sample
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, IMU_ERROR, POSITION, STD, VELOCITY
 from dlkf.data.tables import Columns
 from dlkf.data.validate import GNSS_QUALITIES
 from dlkf.navigation.attitude import rotation_from_rpy, rotation_from_vector, vector_from_rotation
+from dlkf.navigation.compiled import loops_are_loaded
 from dlkf.navigation.earth import ecef_from_geodetic, ned_axes
 
 ON_BOUNDARY_S = 1e-3  # a fix this close to a boundary counts as on it
@@ -105,6 +107,10 @@ def resample_imu(imu: Columns, grid: SampleGrid, usual: float | None = None) -> 
     t, at = imu["t"], grid.sample_times
     if usual is None:
         usual = float(np.median(np.diff(t)))
+    step = grid.epoch_s / grid.samples
+    if loops_are_loaded():
+        columns = tuple(imu[c] for c in (*ACCEL, *GYRO))
+        return compiled_samples.composed(t, columns, at, usual, step).reshape(grid.epochs, grid.samples, 6)
     out = np.empty((grid.epochs * grid.samples, 6))
     for first in range(0, len(out), BLOCK):
         last = min(first + BLOCK, len(out))
@@ -112,7 +118,7 @@ def resample_imu(imu: Columns, grid: SampleGrid, usual: float | None = None) -> 
         end = int(np.searchsorted(t, at[last])) + 1
         part = np.stack([imu[c][begin:end] for c in (*ACCEL, *GYRO)])
         out[first:last] = _composed(t[begin:end], part, at[first : last + 1], usual).T
-    out /= grid.epoch_s / grid.samples
+    out /= step
     return out.reshape(grid.epochs, grid.samples, 6)
 
 

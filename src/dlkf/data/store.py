@@ -13,6 +13,7 @@ from dlkf.base.files import folder_name, resolve_place
 from dlkf.base.parallel import parallel_map
 from dlkf.data.aid_tables import STANDARD, AidTable, standard_tables
 from dlkf.data.aids import aid_rows
+from dlkf.data.compiled_samples import prepare
 from dlkf.data.drive import Drive
 from dlkf.data.resampling import assign_fixes, epoch_grid, reference_at, resample_imu
 from dlkf.data.tables import DriveRow, dataset_digest, read_drives
@@ -45,6 +46,7 @@ def load_dataset(
         return drive_from_tables(tables, folder_name(folder), rate_hz, epoch_s, dtype, aids or ())
 
     rows = drive_rows(folder, drives)
+    prepare(len(rows))
     threads = min(len(rows), torch.get_num_threads())  # NumPy, Arrow and torch work side by side
     loaded = []
     for drive in parallel_map(load, rows, threads=threads):

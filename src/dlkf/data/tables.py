@@ -167,7 +167,9 @@ def read_table(folder: str | Path, kind: str, drive: str, column: str = "") -> C
             if field.name in table.column_names:
                 columns[field.name] = _column(table, field.name, field.type, where)
         segments.append(columns)
-    rows = {name: np.concatenate([segment[name] for segment in segments]) for name in segments[0]}
+    rows = segments[0]
+    if len(segments) > 1:
+        rows = {name: np.concatenate([segment[name] for segment in segments]) for name in rows}
     if len(rows["t"]) == 0 and kind != "reference":
         remedy = "leave the drive out" if kind in SCHEMAS else "remove the table"
         raise InputError(f"drive {drive}, {place}: has no rows; {remedy} or give its data")

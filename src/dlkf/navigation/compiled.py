@@ -24,6 +24,7 @@ AVAILABLE, TROUBLE = True, ""  # until numba has been asked for
 _tensor_forms, _spared = False, False
 _loops: list[tuple[Callable, dict[str, Any]]] = []  # that wait for numba, with its options
 _loading = threading.Lock()
+ROOMS_WITH_LOOPS = ("dlkf.navigation.", "dlkf.data.compiled")
 
 
 def fits(x: Tensor, *, gradients: bool = False) -> bool:
@@ -70,6 +71,17 @@ def without_loops() -> Iterator[None]:
         _spared = before
 
 
+def load_loops() -> None:
+    """Load numba now, with the loops of all modules that are there, for work that is worth it."""
+    if _loops and not _spared:
+        _load()
+
+
+def loops_are_loaded() -> bool:
+    """Whether the loops run compiled, and nobody forbids them."""
+    return AVAILABLE and not _loops and not (_spared or is_recorded())
+
+
 def njit(**options: Any) -> Callable[[Callable], Any]:
     """``numba.njit`` of a function, when :func:`fits` first asks for it; until then, and without numba, the function as
     it is."""
@@ -93,7 +105,7 @@ def _load() -> None:
             TROUBLE = f"numba cannot be loaded ({error}), so filters run up to 2 × slower; install one for this Python"
             _loops.clear()
             return
-        modules = [module for name, module in list(sys.modules.items()) if name.startswith("dlkf.navigation.")]
+        modules = [module for name, module in list(sys.modules.items()) if name.startswith(ROOMS_WITH_LOOPS)]
         for function, options in _loops:
             try:
                 loop = numba.njit(cache=True, **options)(function)

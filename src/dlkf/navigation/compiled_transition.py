@@ -95,3 +95,32 @@ def _sensor_columns(C0, v0, C, v, g, samples, dt, elements, out):
                 out[b, i, to] = of_force[d, 3 * i + c]
             for i in range(9):
                 out[b, i, to + (3 if n < 3 else e)] = of_rate[d, 3 * i + c]
+
+
+def process_noise(L: Tensor, density: Tensor, shares: Tensor, walk: Tensor) -> Tensor:
+    """Q (B, n, n) of :meth:`dlkf.navigation.error_model.WindowModel.noise` from what the sources do, (B, 4, s, 3),
+    their ``density`` (4,) over the window, ``shares`` (4, s, s) and what it adds to the diagonal, ``walk`` (n,)."""
+    Q = L.new_empty(len(L), len(walk), len(walk))
+    _process_noise(*(x.numpy() for x in (L, density, shares, walk, Q)))
+    return Q
+
+
+@njit()
+@no_type_check
+def _process_noise(L, density, shares, walk, Q):
+    B, sources, states = L.shape[:3]
+    Q[:] = 0.0
+    for b in range(B):
+        for s in range(sources):
+            for i in range(states):
+                x, y, z = L[b, s, i, 0], L[b, s, i, 1], L[b, s, i, 2]
+                if x == 0.0 and y == 0.0 and z == 0.0:
+                    continue
+                for j in range(i + 1):
+                    along = x * L[b, s, j, 0] + y * L[b, s, j, 1] + z * L[b, s, j, 2]
+                    Q[b, i, j] += along * (density[s] * shares[s, i, j])
+        for i in range(states):
+            for j in range(i):
+                Q[b, j, i] = Q[b, i, j]
+        for i in range(len(walk)):
+            Q[b, i, i] += walk[i]

@@ -51,10 +51,14 @@ class WindowModel:
     walk: Tensor  # (n,) variance that a window adds to the states of the car and of further sensors
 
     @property
+    def _over_window(self) -> Float[Tensor, " 4"]:
+        """S T of each noise source."""
+        return self.density[0] * (self.left.shape[1] * self.dt)
+
+    @property
     def spread(self) -> Float[Tensor, "4 s s"]:
         """S ∫ (1−τ/T)^(nᵢ+nⱼ) dτ of each noise source."""
-        T = self.left.shape[1] * self.dt
-        return (self.density[0] * T)[:, None, None] * _shares(self.density.dtype, self.density.device)
+        return self._over_window[:, None, None] * _shares(self.density.dtype, self.density.device)
 
     def transition(
         self, start: NavState, window: Window, corrected: Float[Tensor, "B M 6"], frame: TangentFrame
@@ -110,6 +114,9 @@ class WindowModel:
         return (L @ L.mT) * self.spread
 
     def _accumulated(self, L: Float[Tensor, "B 4 s 3"]) -> Float[Tensor, "B n n"]:
+        if compiled.fits(L):
+            shares = _shares(self.density.dtype, self.density.device)
+            return compiled_transition.process_noise(L, self._over_window, shares, self.walk)
         Q = self.walk.diag() + L.new_zeros(len(L), 1, 1)
         Q[:, :STATES, :STATES] = ((L @ L.mT) * self.spread).sum(1)
         return Q

@@ -12,7 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dlkf.data import compiled_samples
 from dlkf.data.discovery.motion import MOVING, RESTING, Complex, Floats, Motion
+from dlkf.navigation.compiled import loops_are_loaded
 from dlkf.navigation.earth import STANDARD_GRAVITY
 
 STEP_S = 0.25
@@ -48,7 +50,7 @@ class Lag:
 
 @dataclass(frozen=True)
 class ImuSums:
-    """Running integrals over an IMU log, from which the means over any stretch of it follow: (7, n) at the stamps
+    """Running integrals over an IMU log, from which the means over any stretch of it follow: (n, 7) at the stamps
     ``t`` of time without gaps, specific force and rate, in any units and axes."""
 
     t: Floats
@@ -57,25 +59,28 @@ class ImuSums:
     @staticmethod
     def of(t: Floats, accel: Floats, gyro: Floats) -> ImuSums:
         """Of samples (n, 3)."""
+        if loops_are_loaded():
+            stamps, *axes = (np.ascontiguousarray(x, dtype=np.float64) for x in (t, accel.T, gyro.T))
+            return ImuSums(t, compiled_samples.running_sums(stamps, *axes))
         step = np.diff(t, prepend=t[:1])
         step = np.where(step > 1.0, 0.0, step)
-        sums = np.empty((7, len(t)))
-        np.cumsum(step, out=sums[0])
+        sums = np.empty((len(t), 7))
+        np.cumsum(step, out=sums[:, 0])
         for k, axis in enumerate((*accel.T, *gyro.T), 1):
-            np.cumsum(axis * step, out=sums[k])
+            np.cumsum(axis * step, out=sums[:, k])
         return ImuSums(t, sums)
 
     def between(self, first_s: float, last_s: float) -> ImuSums:
         """The part within these times."""
         part = slice(*np.searchsorted(self.t, (first_s, last_s)))
-        return ImuSums(self.t[part], self.sums[:, part])
+        return ImuSums(self.t[part], self.sums[part])
 
     def reached(self, at: Floats) -> Floats:
-        """The integrals (7, m) at given times, linear between samples."""
+        """The integrals (m, 7) at given times, linear between samples."""
         i = np.clip(np.searchsorted(self.t, at, side="right") - 1, 0, len(self.t) - 2)
         share = np.clip((at - self.t[i]) / (self.t[i + 1] - self.t[i]), 0.0, 1.0)
-        before = self.sums.take(i, 1)
-        return before + share * (self.sums.take(i + 1, 1) - before)
+        before = self.sums.take(i, 0)
+        return before + share[:, None] * (self.sums.take(i + 1, 0) - before)
 
 
 def find_lag(imu: ImuSums, gnss: Motion, within_s: float | None = None) -> Lag | None:
@@ -154,7 +159,7 @@ def _gnss_signals(gnss: Motion, first: np.ndarray, last: np.ndarray) -> tuple[np
 
 def _imu_signals(imu: ImuSums, width_s: float) -> tuple[Floats, Complex, Floats, float]:
     """Yaw rate and horizontal force as means over ``width_s`` on a grid, where there are any, and the grid's start."""
-    up = imu.sums[1:4, -1] - imu.sums[1:4, 0]
+    up = imu.sums[-1, 1:4] - imu.sums[0, 1:4]
     up = up / max(float(np.linalg.norm(up)), 1e-12)
     helper = np.eye(3)[0 if abs(up[0]) < 0.9 else 1]  # x, so that angles count from it
     e1 = helper - up * (helper @ up)
@@ -162,7 +167,7 @@ def _imu_signals(imu: ImuSums, width_s: float) -> tuple[Floats, Complex, Floats,
     grid = np.arange(imu.t[0] + width_s / 2, imu.t[-1] - width_s / 2, STEP_S)
     if len(grid) < 2:
         grid = np.array([imu.t[0], imu.t[0] + STEP_S])
-    means = (imu.reached(grid + width_s / 2) - imu.reached(grid - width_s / 2)) / width_s
+    means = ((imu.reached(grid + width_s / 2) - imu.reached(grid - width_s / 2)) / width_s).T
     force: Complex = e1 @ means[1:4] + 1j * (np.cross(-up, e1) @ means[1:4])
     return -up @ means[4:], force, (means[0] > 0.9).astype(float), float(grid[0])
 

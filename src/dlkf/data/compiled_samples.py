@@ -1,0 +1,147 @@
+"""Long tables of IMU samples in one pass each, compiled: the equations of :mod:`dlkf.data.increments` and of
+:class:`dlkf.data.discovery.clock.ImuSums` as loops, equal to their array forms to the bit.
+
+They are taken where numba is loaded already, or so many drives are to be read that loading it pays (:func:`prepare`).
+"""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import numpy as np
+
+from dlkf.navigation import compiled
+from dlkf.navigation.compiled import njit
+
+MANY_DRIVES = 8  # whose reading takes longer than numba takes to load
+
+
+def prepare(drives: int) -> None:
+    """Load numba for so many drives, where that pays."""
+    if drives >= MANY_DRIVES:
+        compiled.load_loops()
+
+
+def composed(t: np.ndarray, columns: tuple[np.ndarray, ...], at: np.ndarray, usual: float, step: float) -> np.ndarray:
+    """Specific force and rate (m, 6), of samples of ``step`` [s] between the limits ``at`` (m + 1,), of six columns
+    (n,) of samples that end at ``t``: :func:`dlkf.data.resampling.resample_imu`."""
+    out = np.empty((len(at) - 1, 6))
+    _composed(t, columns, at, usual, step, out)
+    return out
+
+
+def running_sums(t: np.ndarray, accel: np.ndarray, gyro: np.ndarray) -> np.ndarray:
+    """Running integrals (n, 7) of 1, specific force and rate (3, n) each, over time without its gaps."""
+    out = np.empty((len(t), 7))
+    _running_sums(t, accel, gyro, out)
+    return out
+
+
+@njit(inline="always")
+@no_type_check
+def second_order(a, b):
+    """Of six numbers each: :func:`dlkf.data.increments.second_order`."""
+    return (
+        a[4] * b[2] - a[5] * b[1] + a[1] * b[5] - a[2] * b[4],
+        a[5] * b[0] - a[3] * b[2] + a[2] * b[3] - a[0] * b[5],
+        a[3] * b[1] - a[4] * b[0] + a[0] * b[4] - a[1] * b[3],
+        a[4] * b[5] - a[5] * b[4],
+        a[5] * b[3] - a[3] * b[5],
+        a[3] * b[4] - a[4] * b[3],
+    )
+
+
+@njit(inline="always")
+@no_type_check
+def six(x, k):
+    """Row k of six columns."""
+    return x[0][k], x[1][k], x[2][k], x[3][k], x[4][k], x[5][k]
+
+
+@njit(inline="always")
+@no_type_check
+def times(s, a):
+    """s a."""
+    return s * a[0], s * a[1], s * a[2], s * a[3], s * a[4], s * a[5]
+
+
+@njit(inline="always")
+@no_type_check
+def sum_of(a, b):
+    """a + b."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5]
+
+
+@njit(inline="always")
+@no_type_check
+def _knot(t, n, usual, p):
+    """Where segment p begins: one interval before the first, those of the samples, one after the last."""
+    if 2 <= p <= n + 1:
+        return t[p - 2]
+    first = t[0] - (t[0] - usual)
+    if p < 2:
+        return t[0] - (2 - p) * first
+    return t[n - 1] + (t[n - 1] - t[n - 2] if n > 1 else first) if p == n + 2 else np.inf
+
+
+@njit(inline="always")
+@no_type_check
+def _integral(t, x, usual, k):
+    """Length and integral of the interval that ends at sample k; what is missing has the mean of the two neighbours."""
+    now = six(x, k)
+    h = t[k] - t[k - 1] if k else t[0] - (t[0] - usual)
+    if h <= 1.5 * usual:
+        return h, times(h, now)
+    return h, sum_of(times(usual, now), times(h - usual, times(0.5, sum_of(now, six(x, k - 1)))))
+
+
+@njit(nogil=True)
+@no_type_check
+def _composed(t, x, at, usual, step, out):
+    n = len(t)
+    p = int(np.searchsorted(t, at[0], side="right")) + 1  # the segment that holds the beginning
+    while p >= 0 and _knot(t, n, usual, p) > at[0]:
+        p -= 1
+    p -= 1
+    following, rate = at[0], (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    h0, before = _integral(t, x, usual, min(max(p - 1, 0), n - 1))
+    for j in range(len(out)):
+        begin, last = at[j], at[j + 1]
+        total, products = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        while True:
+            while following <= begin:
+                p += 1
+                following = _knot(t, n, usual, p + 1)
+                if p < 1 or p > n:
+                    rate = six(x, 0 if p < 1 else n - 1)
+                else:
+                    h, now = _integral(t, x, usual, p - 1)
+                    turned = now
+                    if p > 1 and h <= 1.5 * usual and h0 <= 1.5 * usual:
+                        c = h * h / (6 * h0 * (h0 + h))
+                        turned = sum_of(now, times(c, second_order(before, now)))
+                    rate = turned[0] / h, turned[1] / h, turned[2] / h, turned[3] / h, turned[4] / h, turned[5] / h
+                    h0, before = h, now
+            segment = times(min(following, last) - begin, rate)
+            products = sum_of(products, second_order(total, segment))
+            total = sum_of(total, segment)
+            if following >= last:
+                break
+            begin = following
+        for i in range(6):
+            out[j, i] = (total[i] + 0.5 * products[i]) / step
+
+
+@njit(nogil=True)
+@no_type_check
+def _running_sums(t, accel, gyro, out):
+    s = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    along = 0.0
+    for k in range(len(t)):
+        h = t[k] - t[k - 1] if k else 0.0
+        h = 0.0 if h > 1.0 else h
+        along += h
+        s = sum_of(s, times(h, (accel[0, k], accel[1, k], accel[2, k], gyro[0, k], gyro[1, k], gyro[2, k])))
+        out[k, 0] = along
+        for i in range(6):
+            out[k, 1 + i] = s[i]
