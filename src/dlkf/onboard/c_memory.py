@@ -157,8 +157,8 @@ class Block:
 class Tensors:
     """Values of a graph as tensors in memory."""
 
-    def __init__(self) -> None:
-        self.block = Block()
+    def __init__(self, block: Block | None = None) -> None:
+        self.block = Block() if block is None else block
 
     def result(self, node: Node) -> View:
         """Memory for what an operation returns."""
