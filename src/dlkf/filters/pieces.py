@@ -15,7 +15,7 @@ from torch.nn.functional import pad
 
 from dlkf.navigation.compiled import is_recorded
 
-LONGEST = 25  # samples of a piece
+LONGEST = 20  # samples of a piece
 AT_ONCE = 400  # samples of all drives up to which Python takes them at once
 Sum = Callable[..., Tensor]
 
