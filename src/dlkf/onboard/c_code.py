@@ -23,7 +23,7 @@ from dlkf.base.errors import InputError
 from dlkf.onboard.c_branches import choice, find_branches
 from dlkf.onboard.c_loops import WHOLE
 from dlkf.onboard.c_memory import C_TYPES, Buffer, Expression, Rows, Tensors, View
-from dlkf.onboard.c_operations import BY_ELEMENT, COPIES, PARTS, literal, vectorised
+from dlkf.onboard.c_operations import BY_ELEMENT, COPIES, MANY, PARTS, literal, vectorised
 from dlkf.onboard.c_pieces import SUMMED, write_sum
 from dlkf.onboard.c_places import RESHAPES, Readers, find_places, is_same, name_of
 from dlkf.onboard.c_reductions import REDUCTIONS, UNKNOWN
@@ -69,7 +69,7 @@ class Translation(Tensors):
         self.values[node] = getattr(self._module, str(node.target)).detach()
 
     def _call_function(self, node: Node) -> None:
-        if not node.users:
+        if not node.users or node in self.values:
             return
         target: Any = node.target
         args, kwargs = self._known(node.args), self._known(node.kwargs)
@@ -185,6 +185,8 @@ class Translation(Tensors):
 
     def _by_element(self, node: Node, name: str, args: list, kwargs: dict) -> Any:
         value, goes_on = node.meta["val"], self.goes_on(node)
+        if name in ("sin", "cos") and (both := self._sine_and_cosine(node, args[0])):
+            return both
         rows = next((x for x in args if isinstance(x, Rows) and x.shape == value.shape), None)
         if rows is not None and not any(isinstance(x, Expression) for x in args):
             items = [
@@ -197,6 +199,22 @@ class Translation(Tensors):
             return x if goes_on else self.stored(node, x)
         x = self._expression(value.shape, value.dtype, name, args, kwargs)
         return x if goes_on and len(x.operands) <= 12 and value.numel() > 0 else self.stored(node, x)
+
+    def _sine_and_cosine(self, node: Node, x: Any) -> View | None:
+        """Of the same many angles, at once; None where one is wanted alone."""
+        pair = {name_of(user): user for user in node.args[0].users if user.args == node.args}  # type: ignore[union-attr]
+        value = node.meta["val"]
+        plain = isinstance(x, View) and x.meta.is_contiguous() and x.meta.dtype == torch.float64 == value.dtype
+        if not plain or value.numel() < MANY or not {"sin", "cos"} <= pair.keys():
+            return None
+        if self._on.get(pair["sin"]) is not self._on.get(pair["cos"]):
+            return None
+        outs = [self.block.new(value.shape, value.dtype) for _ in range(2)]
+        at = ", ".join(f"&{v.at(['0'] * v.meta.ndim)[:-1]}+i]" for v in outs)
+        angle = f"{x.at(['0'] * x.meta.ndim)[:-1]}+i]"
+        self.block.write(f"for (int i = 0; i < {value.numel()}; i++) each_sincos({angle}, {at});", x, *outs)
+        self.values |= {pair["sin"]: outs[0], pair["cos"]: outs[1]}
+        return self.values[node]
 
     def _row(self, x: Any, rows: Rows, index: tuple[int, ...]) -> Any:
         """Of an operand what belongs to a row."""
