@@ -40,7 +40,7 @@ NYQUIST = 0.45  # share of the sampling rate up to which an order is seen
 def demodulate(
     x: Float[Tensor, "B M 6"], distance: Float[Tensor, "B M"], begin: Float[Tensor, "B 6 waves"]
 ) -> Float[Tensor, "B 6 waves"]:
-    """``begin`` + Σ_k x_k cos and sin of 2π o κ s_k for every order and line: waves are (2, O, K), lines along memory."""
+    """``begin`` + Σ_k x_k cos and sin of 2π o κ s_k for every order and line; waves are (2, O, K)."""
     return summed(add_waves, begin, x, distance)
 
 

@@ -40,7 +40,9 @@ def of_name(name: str) -> Sum:
     return getattr(import_module(module), function)
 
 
-@torch.library.custom_op("dlkf::summed", mutates_args=())
+@torch.library.custom_op(
+    "dlkf::summed", mutates_args=(), schema="(str name, int count, Tensor begin, Tensor[] samples) -> Tensor"
+)
 def _summed(name: str, count: int, begin: Tensor, samples: list[Tensor]) -> Tensor:
     return of_name(name)(begin.clone(), *samples)
 

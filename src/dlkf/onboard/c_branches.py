@@ -1,9 +1,9 @@
 """Branches of a recorded graph: what only one ``torch.where`` takes, and that only where a truth value holds, is
 computed where it holds.
 
-A graph has no branches: everything is computed, and ``where(on, then, otherwise)`` chooses. With one drive ``on`` is one
-truth value, and the operations that nothing but the ``then`` of such a choice uses are moved before it, for the C code
-to put them in an ``if``. Values are the same.
+A graph has no branches: everything is computed, and ``where(on, then, otherwise)`` chooses. With one drive ``on`` is
+one truth value, and the operations that nothing but the ``then`` of such a choice uses are moved before it, for the C
+code to put them in an ``if``. Values are the same.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from torch.fx import GraphModule, Node
 from dlkf.base.errors import InputError
 from dlkf.onboard.c_branches import choice, find_branches
 from dlkf.onboard.c_loops import WHOLE
-from dlkf.onboard.c_memory import C_TYPES, Buffer, Expression, Rows, Tensors, View
+from dlkf.onboard.c_memory import C_TYPES, Block, Buffer, Expression, Rows, Tensors, View
 from dlkf.onboard.c_operations import BY_ELEMENT, COPIES, MANY, PARTS, literal, vectorised
 from dlkf.onboard.c_pieces import SUMMED, write_sum
 from dlkf.onboard.c_places import RESHAPES, Readers, find_places, is_same, name_of

@@ -21,6 +21,7 @@ from dlkf.onboard.functions import OUTPUTS
 # nor gcc's partial redundancy elimination, which keeps loops over exp and log from being vectorised
 FLAGS = (
     "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fno-tree-pre", "-fno-gcse",
+    "-ffp-contract=fast",
 )  # fmt: skip
 CORE_FLAGS = ("-O2",)
 FILTER = ("step.c", "weights.c", "heading.c")
