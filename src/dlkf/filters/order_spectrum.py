@@ -64,7 +64,7 @@ def add_waves(
     return torch.baddbmm(begin, x.mT, waves)
 
 
-def _crossed(of: Float[Tensor, "B m C+F"]) -> tuple[Float[Tensor, "B m C 1"], Float[Tensor, "B m 1 F"]]:
+def _crossed(of: Float[Tensor, "B m grids"]) -> tuple[Float[Tensor, "B m coarse 1"], Float[Tensor, "B m 1 fine"]]:
     coarse, fine = of.split((COARSE, FINE), -1)
     return coarse.unsqueeze(-1), fine.unsqueeze(-2)
 
@@ -109,7 +109,7 @@ def _neighbours(dtype: torch.dtype, device: torch.device) -> Float[Tensor, " K"]
 
 @lru_cache
 @torch.inference_mode(False)
-def _grids(dtype: torch.dtype, device: torch.device) -> Float[Tensor, " C+F"]:
+def _grids(dtype: torch.dtype, device: torch.device) -> Float[Tensor, " grids"]:
     """2π κ [rad/m] of the coarse grid of lines and of the fine one, which are added."""
     coarse = LEAST + STEP * FINE * torch.arange(COARSE, dtype=dtype, device=device)
     return 2 * math.pi * torch.cat((coarse, STEP * torch.arange(FINE, dtype=dtype, device=device)))

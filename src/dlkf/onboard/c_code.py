@@ -163,13 +163,6 @@ class Translation(Tensors):
         self._open = None
         return out
 
-    def elements_of(self, x: Any, shape: torch.Size) -> tuple[str, list[View]]:
-        """Pattern and operands of a tensor of a shape."""
-        if isinstance(x, Expression) and x.shape == shape:
-            return f"({x.pattern})", x.operands
-        view = self.tensor(x)
-        return "{0}", [view.viewed(view.meta.expand(shape))]
-
     # kinds of operation
 
     def _viewed(self, node: Node, target: Any, args: list, kwargs: dict) -> Any:

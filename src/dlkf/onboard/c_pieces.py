@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.fx import Node
 
 from dlkf.filters.pieces import of_name
-from dlkf.onboard.c_memory import Buffer, View
+from dlkf.onboard.c_memory import Buffer, Tensors, View
 from dlkf.onboard.recording import record
 
 SUMMED = "dlkf::summed"
 
-if TYPE_CHECKING:
-    from dlkf.onboard.c_code import Translation
 
-
-def write_sum(t: Translation, node: Node, name: str, count: int, begin: Any, samples: list) -> View:
+def write_sum(t: Tensors, node: Node, name: str, count: int, begin: Any, samples: list) -> View:
     """What a piece adds, in ``count`` turns."""
     out = t.result(node)
     t.block.over(out, *t.elements_of(begin, out.meta.shape))
