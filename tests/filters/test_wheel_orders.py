@@ -14,7 +14,17 @@ from dlkf.data.tables import DriveRow
 from dlkf.data.validate import CheckedTables
 from dlkf.filters.build import build_filter, is_filter
 from dlkf.filters.integration import integrate
-from dlkf.filters.order_spectrum import LEAST, LINES, ORDERS, STEP, demodulate, log_levels, log_likelihood, log_lines
+from dlkf.filters.order_spectrum import (
+    LEAST,
+    LINES,
+    ORDERS,
+    STEP,
+    WAVES,
+    demodulate,
+    log_levels,
+    log_likelihood,
+    log_lines,
+)
 from dlkf.filters.wheel_orders import DETECTED, OrdersMemory, _gaussian
 from tests.cars import car
 
@@ -102,32 +112,33 @@ def test_the_spectrum_is_the_sum_that_its_equation_says():
     g = torch.Generator().manual_seed(3)
     x = torch.randn(2, 40, 6, generator=g, dtype=torch.float64)
     s = torch.rand(2, 40, generator=g, dtype=torch.float64).cumsum(1)
-    got = demodulate(x, s)
+    begin = torch.randn(2, 6, WAVES, generator=g, dtype=torch.float64)
+    got = (demodulate(x, s, begin) - begin).unflatten(-1, (2, len(ORDERS), LINES))
     for number, order in enumerate(ORDERS):
         for line in (0, 7, 8, LINES - 1):
             kappa = LEAST + STEP * line
             assert torch.exp(log_lines(x))[line] == pytest.approx(kappa)
             angle = 2 * math.pi * order * kappa * s
-            expected = torch.stack([(f(angle).unsqueeze(-1) * x).sum(1) for f in (torch.cos, torch.sin)], 1)
-            assert torch.allclose(got[:, :, number * LINES + line], expected, atol=1e-12)
+            expected = torch.stack([(f(angle).unsqueeze(-1) * x).sum(1) for f in (torch.cos, torch.sin)], -1)
+            assert torch.allclose(got[..., number, line], expected, atol=1e-12)
 
 
 def test_levels_have_no_mean_over_the_neighbours():
     g = torch.Generator().manual_seed(4)
-    spectrum = torch.randn(1, 2, LINES * len(ORDERS), 6, generator=g, dtype=torch.float64)
-    power = spectrum.square().sum(1).log().unflatten(1, (len(ORDERS), LINES))
+    spectrum = torch.randn(1, 6, WAVES, generator=g, dtype=torch.float64)
+    power = spectrum.unflatten(2, (2, len(ORDERS), LINES)).square().sum(2).log()
     levels = log_levels(spectrum)
     for k in (0, 10, 30, LINES - 1):
-        near = power[:, :, max(0, k - 16) : k + 17]
-        assert torch.allclose(levels[:, :, k], power[:, :, k] - near.mean(2), atol=1e-9)
+        near = power[..., max(0, k - 16) : k + 17]
+        assert torch.allclose(levels[..., k], power[..., k] - near.mean(-1), atol=1e-9)
 
 
 def test_the_likelihood_of_a_line_is_highest_where_it_stands_and_flat_for_a_car_without():
-    levels = torch.zeros(1, len(ORDERS), LINES, 6, dtype=torch.float64)
-    levels[:, 0, 20], levels[:, 1, 20] = 2.0, 1.5
-    excess = torch.zeros(1, len(ORDERS), 6, dtype=torch.float64)
+    levels = torch.zeros(1, 6, len(ORDERS), LINES, dtype=torch.float64)
+    levels[..., 0, 20], levels[..., 1, 20] = 2.0, 1.5
+    excess = torch.zeros(1, 6, len(ORDERS), dtype=torch.float64)
     assert not log_likelihood(levels, excess).any()
-    excess[:, :2] = 1.0
+    excess[..., :2] = 1.0
     said = log_likelihood(levels, excess)
     assert said.argmax() == 20 and said[0, 20] > 0 > said[0, 0]
 

@@ -23,9 +23,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dlkf.filters.pieces import summed
+
 ORDERS = (1, 2, 3)
 COARSE, FINE, STEP, LEAST = 7, 8, 0.005, 0.36  # 1/m: passenger cars turn a wheel 0.41 to 0.57 times a metre
 LINES = COARSE * FINE
+WAVES = 2 * len(ORDERS) * LINES  # cosines and sines
 NEIGHBOURS = 16  # lines to both sides, over which the level of the noise is taken
 MEAN_LOG = 0.577  # of the logarithm of exponential power of mean 1, negative (Euler's constant)
 LARGEST = 8.0  # power over that of the noise above which more says nothing
@@ -34,40 +37,54 @@ LIMIT = 2.0  # of an order's part
 NYQUIST = 0.45  # share of the sampling rate up to which an order is seen
 
 
-def demodulate(x: Float[Tensor, "B M 6"], distance: Float[Tensor, "B M"]) -> Float[Tensor, "B 2 lines 6"]:
-    """Σ_k x_k cos and sin of 2π o κ s_k for every order and line, the orders behind each other.
+def demodulate(
+    x: Float[Tensor, "B M 6"], distance: Float[Tensor, "B M"], begin: Float[Tensor, "B 6 waves"]
+) -> Float[Tensor, "B 6 waves"]:
+    """``begin`` + Σ_k x_k cos and sin of 2π o κ s_k for every order and line; waves are (2, O, K)."""
+    return summed(add_waves, begin, x, distance)
+
+
+def add_waves(
+    begin: Float[Tensor, "B 6 waves"], x: Float[Tensor, "B m 6"], distance: Float[Tensor, "B m"]
+) -> Float[Tensor, "B 6 waves"]:
+    """:func:`demodulate` of some samples.
 
     Sines and cosines are taken of a coarse grid of lines and a fine one, and multiplied; those of the higher orders are
     powers.
     """
-    coarse = LEAST + STEP * FINE * torch.arange(COARSE, dtype=x.dtype, device=x.device)
-    fine = STEP * torch.arange(FINE, dtype=x.dtype, device=x.device)
-    angle = 2 * math.pi * distance.unsqueeze(-1)
-    a, b = angle * coarse, angle * fine
-    ca, sa, cb, sb = a.cos().unsqueeze(-1), a.sin().unsqueeze(-1), b.cos().unsqueeze(-2), b.sin().unsqueeze(-2)
+    angle = distance.unsqueeze(-1) * _grids(x.dtype, x.device)
+    cosines, sines = angle.cos(), angle.sin()
+    (ca, cb), (sa, sb) = (_crossed(of) for of in (cosines, sines))
     c, s = (ca * cb - sa * sb).flatten(2), (sa * cb + ca * sb).flatten(2)
-    cosines, sines = [c], [s]
+    powers = [(c, s)]
     for _ in ORDERS[1:]:
-        cosines.append(cosines[-1] * c - sines[-1] * s)
-        sines.append(sines[-1] * c + cosines[-2] * s)
-    return torch.stack([torch.bmm(torch.cat(of, -1).mT, x) for of in (cosines, sines)], 1)
+        u, v = powers[-1]
+        powers.append((u * c - v * s, v * c + u * s))
+    waves = torch.cat([*(u for u, _ in powers), *(v for _, v in powers)], -1)
+    return torch.baddbmm(begin, x.mT, waves)
 
 
-def log_levels(spectrum: Float[Tensor, "B 2 lines 6"]) -> Float[Tensor, "B O K 6"]:
-    """ln of the power of every order, line and axis over its neighbours'."""
-    power = torch.log(spectrum.square().sum(1) + 1e-30).unflatten(1, (len(ORDERS), LINES))
-    total = power.cumsum(2)
-    last = total[:, :, -1:].expand(-1, -1, NEIGHBOURS, -1)
-    above = torch.cat((total[:, :, NEIGHBOURS:], last), 2)
-    below = torch.cat((torch.zeros_like(total[:, :, : NEIGHBOURS + 1]), total[:, :, : -NEIGHBOURS - 1]), 2)
+def _crossed(of: Float[Tensor, "B m grids"]) -> tuple[Float[Tensor, "B m coarse 1"], Float[Tensor, "B m 1 fine"]]:
+    coarse, fine = of.split((COARSE, FINE), -1)
+    return coarse.unsqueeze(-1), fine.unsqueeze(-2)
+
+
+def log_levels(spectrum: Float[Tensor, "B 6 waves"]) -> Float[Tensor, "B 6 O K"]:
+    """ln of the power of every axis, order and line over its neighbours'."""
+    cosines, sines = spectrum.unflatten(2, (2, len(ORDERS), LINES)).unbind(2)
+    power = torch.log(cosines.square() + sines.square() + 1e-30)
+    total = power.cumsum(-1)
+    last = total[..., -1:].expand(-1, -1, -1, NEIGHBOURS)
+    above = torch.cat((total[..., NEIGHBOURS:], last), -1)
+    below = torch.cat((torch.zeros_like(total[..., : NEIGHBOURS + 1]), total[..., : -NEIGHBOURS - 1]), -1)
     return power - (above - below) / _neighbours(power.dtype, power.device)
 
 
-def log_likelihood(levels: Float[Tensor, "B O K 6"], excess: Float[Tensor, "B O 6"]) -> Float[Tensor, "B K"]:
+def log_likelihood(levels: Float[Tensor, "B 6 O K"], excess: Float[Tensor, "B 6 O"]) -> Float[Tensor, "B K"]:
     """ln Λ of every line, if the lines of this car stand out by ``excess`` (mean log level; 0: not at all)."""
     rho = torch.exp(excess.clamp(0, 3)) - 1
     power = torch.exp(levels - MEAN_LOG).clamp_max(LARGEST)
-    of_order = SHARE * (power * (rho / (1 + rho)).unsqueeze(2) - torch.log1p(rho).unsqueeze(2)).sum(-1)
+    of_order = SHARE * (power * (rho / (1 + rho)).unsqueeze(-1) - torch.log1p(rho).unsqueeze(-1)).sum(1)
     return of_order.clamp(-LIMIT, LIMIT).sum(1)
 
 
@@ -84,7 +101,15 @@ def _log_lines(dtype: torch.dtype, device: torch.device) -> Float[Tensor, " K"]:
 
 @lru_cache
 @torch.inference_mode(False)
-def _neighbours(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "K 1"]:
+def _neighbours(dtype: torch.dtype, device: torch.device) -> Float[Tensor, " K"]:
     """How many lines are near to each, itself among them."""
     k = torch.arange(LINES, device=device)
-    return ((k[:, None] - k).abs() <= NEIGHBOURS).sum(1, keepdim=True).to(dtype)
+    return ((k[:, None] - k).abs() <= NEIGHBOURS).sum(1).to(dtype)
+
+
+@lru_cache
+@torch.inference_mode(False)
+def _grids(dtype: torch.dtype, device: torch.device) -> Float[Tensor, " grids"]:
+    """2π κ [rad/m] of the coarse grid of lines and of the fine one, which are added."""
+    coarse = LEAST + STEP * FINE * torch.arange(COARSE, dtype=dtype, device=device)
+    return 2 * math.pi * torch.cat((coarse, STEP * torch.arange(FINE, dtype=dtype, device=device)))

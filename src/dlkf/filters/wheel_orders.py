@@ -30,13 +30,14 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.filters.aids.stretch import at_limits, mean_force
-from dlkf.filters.branches import may_branch
+from dlkf.filters.branches import chosen, may_branch
 from dlkf.filters.integration import Epoch
 from dlkf.filters.order_spectrum import (
     LINES,
     NYQUIST,
     ORDERS,
     STEP,
+    WAVES,
     demodulate,
     log_levels,
     log_likelihood,
@@ -70,7 +71,7 @@ TOGETHER = 10.0  # measurements that share the error of κ count as so many
 class Block(NamedTuple):
     """The present block."""
 
-    spectrum: Tensor  # (B, 2, lines, 6)
+    spectrum: Tensor  # (B, 6, waves), of the last block until the first samples of the next
     last: Tensor  # (B, 6) the last sample
     distance: Tensor  # (B,) m
     elapsed: Tensor  # (B,) s
@@ -81,8 +82,7 @@ class Block(NamedTuple):
     def begin(cls, like: Tensor, B: int) -> Block:
         """Nothing in it."""
         zero = like.new_zeros(B)
-        spectrum = like.new_zeros(B, 2, len(ORDERS) * LINES, 6)
-        return cls(spectrum, like.new_zeros(B, 6), zero, zero, zero + 1e3, zero > 0)
+        return cls(like.new_zeros(B, 6, WAVES), like.new_zeros(B, 6), zero, zero, zero + 1e3, zero > 0)
 
     def after(self, epoch: Epoch, block_s: float) -> Block:
         """With one more update interval."""
@@ -93,10 +93,14 @@ class Block(NamedTuple):
         distance = self.distance.unsqueeze(-1) + step.cumsum(1) - 0.5 * step
         time = self.elapsed.unsqueeze(-1) + dt * (torch.arange(M, dtype=x.dtype, device=x.device) + 0.5)
         weight = torch.sin((math.pi / block_s) * time).clamp_min(0.0)
+        fresh = self.elapsed <= 0
+        begun = self.spectrum
+        if not may_branch(fresh) or bool(fresh.any()):
+            begun = torch.where(fresh[:, None, None], 0.0, begun)
         known = (self.last != 0).any(-1, keepdim=True)
         before = torch.cat((torch.where(known, self.last, x[:, 0]).unsqueeze(1), x[:, :-1]), 1)
         return Block(
-            self.spectrum + demodulate((x - before) * weight.unsqueeze(-1), distance), x[:, -1],
+            demodulate((x - before) * weight.unsqueeze(-1), distance, begun), x[:, -1],
             self.distance + step.sum(1), self.elapsed + dt * M,
             torch.minimum(self.slowest, -(-speed).amax(1)), self.fixed | epoch.used.any(-1),
         )  # fmt: skip
@@ -104,7 +108,7 @@ class Block(NamedTuple):
     def next(self, done: Bool[Tensor, " B"]) -> Block:
         """This one, or where it is done a new one."""
         return Block(
-            torch.where(done[:, None, None, None], 0.0, self.spectrum), self.last,
+            self.spectrum, self.last,
             torch.where(done, 0.0, self.distance), torch.where(done, 0.0, self.elapsed),
             torch.where(done, 1e3, self.slowest), self.fixed & ~done,
         )  # fmt: skip
@@ -113,7 +117,7 @@ class Block(NamedTuple):
 class Wheels(NamedTuple):
     """What is known of this car's wheels."""
 
-    levels: Tensor  # (B, O, K, 6) mean of the log levels
+    levels: Tensor  # (B, 6, O, K) mean of the log levels
     blocks: Tensor  # (B,) in that mean
     log_speed: Tensor  # (B,) its mean ln v
     evidence: Tensor  # (B,) nats by which the lines predicted the speed better than a guess
@@ -125,18 +129,18 @@ class Wheels(NamedTuple):
     def begin(cls, like: Tensor, B: int) -> Wheels:
         """Nothing."""
         zero = like.new_zeros(B)
-        return cls(like.new_zeros(B, len(ORDERS), LINES, 6), zero, zero, zero, zero > 0, zero, zero)
+        return cls(like.new_zeros(B, 6, len(ORDERS), LINES), zero, zero, zero, zero > 0, zero, zero)
 
-    def excess(self, log_turns: Float[Tensor, " B"]) -> Float[Tensor, "B O 6"]:
+    def excess(self, log_turns: Float[Tensor, " B"]) -> Float[Tensor, "B 6 O"]:
         """By what a wheel's lines stand out if it turns so often."""
         kappa = torch.exp(log_turns).unsqueeze(-1)
         near = torch.exp(-0.5 * ((torch.exp(log_lines(kappa)) - kappa) / STEP).square())
         near = near / near.sum(1, keepdim=True).clamp_min(1e-12)
-        return (self.levels * near[:, None, :, None]).sum(2)
+        return (self.levels * near[:, None, None]).sum(-1)
 
     def strongest(self) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
         """ln κ of the strongest line, and whether it is inside the range."""
-        total = self.levels.clamp_min(0).sum((1, 3))
+        total = self.levels.clamp_min(0).sum((1, 2))
         total = torch.cat((total[:, :1], (total[:, :-2] + total[:, 1:-1] + total[:, 2:]) / 3, total[:, -1:]), 1)
         number = torch.arange(LINES, dtype=total.dtype, device=total.device)
         largest = (total >= total.amax(1, keepdim=True)).to(total.dtype)
@@ -216,8 +220,10 @@ class WheelOrders:
             return None, memory._replace(block=block)
         row, wheels, undecided = self._judged(epoch, memory, prediction, block, done)
         kept = torch.where(epoch.used.any(-1, keepdim=True) | row.used, 0.0, undecided)
-        undecided = torch.where(done.unsqueeze(-1), kept, memory.undecided)
-        return row, OrdersMemory(block.next(done), wheels, undecided, memory.age)
+        nothing = Measurement(*map(torch.zeros_like, row))
+        return chosen(done, row, nothing), OrdersMemory(
+            block.next(done), chosen(done, wheels, memory.wheels), chosen(done, kept, memory.undecided), memory.age
+        )  # fmt: skip
 
     def _judged(
         self, epoch: Epoch, memory: OrdersMemory, prediction: Predicted, block: Block, done: Bool[Tensor, " B"]
@@ -233,12 +239,12 @@ class WheelOrders:
         H = self._matrix(epoch, 0.5 * block.elapsed, speed)
         of_speed = predicted_variance(prediction.P, H)[:, 0]
         before = memory.wheels
-        likelihood = log_likelihood(levels, before.excess(before.line()[0]) * seen.unsqueeze(-1))
+        likelihood = log_likelihood(levels, before.excess(before.line()[0]) * seen.unsqueeze(1))
         undecided = _diffused(memory.undecided)
         undecided = undecided + torch.where((moving & before.detected).unsqueeze(-1), likelihood, 0.0)
 
         knows = moving & block.fixed & (of_speed < KNOWN**2)
-        wheels = before.learned(levels * seen[:, :, None, None], likelihood, speed, knows)
+        wheels = before.learned(levels * seen[:, None, :, None], likelihood, speed, knows)
 
         off = lines - before.log_turns.unsqueeze(-1)
         searched = of_speed + before.variance + SEARCH**2

@@ -1,15 +1,17 @@
-"""A recorded graph as one C function: no library but the C one's mathematics, no allocation, no branch on data.
+"""A recorded graph as one C function: no library but the C one's mathematics, no allocation.
 
 A filter's step is a list of core ATen operations on tensors of known shapes (:mod:`dlkf.onboard.recording`). Views of
 a tensor are strides and offsets and cost nothing; an operation by elements is one loop nest, in which those that feed
-it alone are written out; what depends on constants alone is computed here. The rest lies in one block on the stack,
-in which what is no longer needed makes room (:class:`dlkf.onboard.c_memory.Block`).
+it alone are written out; what depends on constants alone is computed here. The rest lies in one block of memory, in
+which what is no longer needed makes room (:class:`dlkf.onboard.c_memory.Block`). What is needed on a condition alone
+stands in an ``if`` (:mod:`dlkf.onboard.c_branches`).
 
 The equations stay where they are, in torch: this knows operations, not filters.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
@@ -18,9 +20,11 @@ from torch import Tensor
 from torch.fx import GraphModule, Node
 
 from dlkf.base.errors import InputError
+from dlkf.onboard.c_branches import choice, find_branches
 from dlkf.onboard.c_loops import WHOLE
-from dlkf.onboard.c_memory import C_TYPES, Buffer, Expression, Rows, Tensors, View
-from dlkf.onboard.c_operations import BY_ELEMENT, COPIES, PARTS, literal, vectorised
+from dlkf.onboard.c_memory import C_TYPES, Block, Buffer, Expression, Rows, Tensors, View
+from dlkf.onboard.c_operations import BY_ELEMENT, COPIES, MANY, PARTS, literal, vectorised
+from dlkf.onboard.c_pieces import SUMMED, write_sum
 from dlkf.onboard.c_places import RESHAPES, Readers, find_places, is_same, name_of
 from dlkf.onboard.c_reductions import REDUCTIONS, UNKNOWN
 
@@ -28,20 +32,34 @@ from dlkf.onboard.c_reductions import REDUCTIONS, UNKNOWN
 class Translation(Tensors):
     """Walks a graph and writes it down."""
 
-    def __init__(self, graph: GraphModule) -> None:
-        super().__init__()
+    def __init__(self, graph: GraphModule, block: Block | None = None, given: Sequence[View] = ()) -> None:
+        """``given``, in a ``block`` of another function, are the inputs; the result goes into the first of them."""
+        super().__init__(block)
         self.values: dict[Node, Any] = {}
         self.inputs: list[Buffer] = []
         self.outputs: list[View] = []
+        self._given = list(given)
+        self._on = find_branches(graph)
         self._module, self._readers, self._places = graph, Readers(graph), find_places(graph)
-        self._held = _results(graph)
+        self._held = _result_in(graph, given[0]) if given else _results(graph)
+        self._conditions, self._open = set(self._on.values()), None
         for node in graph.graph.nodes:
+            self._enter(self._on.get(node, choice(node, self._on)))
             getattr(self, f"_{node.op}")(node)
             self._readers.note(node, self.values.get(node))
+
+    def within(self, graph: GraphModule, given: Sequence[View]) -> None:
+        """The lines of another graph, which changes the first of ``given``."""
+        made = Translation(graph, self.block, given).outputs[0]
+        if not is_same(made, given[0]):
+            self.block.over(given[0], "{0}", [made])
 
     # every kind of node
 
     def _placeholder(self, node: Node) -> None:
+        if self._given:
+            self.values[node] = self._given[len(self.values)]
+            return
         value = node.meta["val"]
         buffer = Buffer(f"in{len(self.inputs)}", value.dtype, value.numel(), fixed=True)
         self.inputs.append(buffer)
@@ -51,7 +69,7 @@ class Translation(Tensors):
         self.values[node] = getattr(self._module, str(node.target)).detach()
 
     def _call_function(self, node: Node) -> None:
-        if not node.users:
+        if not node.users or node in self.values:
             return
         target: Any = node.target
         args, kwargs = self._known(node.args), self._known(node.kwargs)
@@ -70,6 +88,10 @@ class Translation(Tensors):
             self.values[node] = args[0]
         elif name in PARTS:
             self.values[node] = self._copied(node, name, args)
+        elif choice(node, self._on) is not None:
+            self.values[node] = self._chosen(node, args[1], args[2])
+        elif name == SUMMED:
+            self.values[node] = write_sum(self, node, *args)
         elif name in BY_ELEMENT:
             self.values[node] = self._by_element(node, name, args, kwargs)
         elif name in WHOLE:
@@ -107,10 +129,39 @@ class Translation(Tensors):
     def goes_on(self, node: Node) -> bool:
         """As there; views of rows are rows."""
         users = list(node.users)
-        if len(users) != 1:
+        if len(users) != 1 or node in self._conditions:
             return False
         name = name_of(users[0])
-        return name in (*BY_ELEMENT, *REDUCTIONS) or (name in RESHAPES and self.goes_on(users[0]))
+        return name in (*BY_ELEMENT, *REDUCTIONS, SUMMED) or (name in RESHAPES and self.goes_on(users[0]))
+
+    # branches
+
+    def _enter(self, condition: Node | None) -> None:
+        """The lines that follow are for a truth value alone, or for all."""
+        if condition is self._open:
+            return
+        if self._open is not None:
+            self.block.write("}")
+        if condition is not None:
+            on = self.tensor(self.values[condition])
+            self.block.write(f"if ({on.at(['0'] * on.meta.ndim)}) {{", on)
+        self._open = condition
+
+    def _chosen(self, node: Node, then: Any, otherwise: Any) -> View:
+        """The branches' ends: one tensor in both."""
+        out = self.result(node)
+        for x in (then, otherwise):
+            if isinstance(x, (View, Expression, Rows)) or (isinstance(x, Tensor) and x.numel() > 1):
+                pattern, operands = self.elements_of(x, out.meta.shape)
+            else:
+                pattern, operands = literal(x.item() if isinstance(x, Tensor) else x, out.meta.dtype), []
+            if not (operands and is_same(operands[0], out)):
+                self.block.over(out, f"({C_TYPES[out.meta.dtype]}){pattern}", operands)
+            if x is then:
+                self.block.write("} else {")
+        self.block.write("}")
+        self._open = None
+        return out
 
     # kinds of operation
 
@@ -127,6 +178,8 @@ class Translation(Tensors):
 
     def _by_element(self, node: Node, name: str, args: list, kwargs: dict) -> Any:
         value, goes_on = node.meta["val"], self.goes_on(node)
+        if name in ("sin", "cos") and (both := self._sine_and_cosine(node, args[0])):
+            return both
         rows = next((x for x in args if isinstance(x, Rows) and x.shape == value.shape), None)
         if rows is not None and not any(isinstance(x, Expression) for x in args):
             items = [
@@ -139,6 +192,22 @@ class Translation(Tensors):
             return x if goes_on else self.stored(node, x)
         x = self._expression(value.shape, value.dtype, name, args, kwargs)
         return x if goes_on and len(x.operands) <= 12 and value.numel() > 0 else self.stored(node, x)
+
+    def _sine_and_cosine(self, node: Node, x: Any) -> View | None:
+        """Of the same many angles, at once; None where one is wanted alone."""
+        pair = {name_of(user): user for user in node.args[0].users if user.args == node.args}  # type: ignore[union-attr]
+        value = node.meta["val"]
+        plain = isinstance(x, View) and x.meta.is_contiguous() and x.meta.dtype == torch.float64 == value.dtype
+        if not plain or value.numel() < MANY or not {"sin", "cos"} <= pair.keys():
+            return None
+        if self._on.get(pair["sin"]) is not self._on.get(pair["cos"]):
+            return None
+        outs = [self.block.new(value.shape, value.dtype) for _ in range(2)]
+        at = ", ".join(f"&{v.at(['0'] * v.meta.ndim)[:-1]}+i]" for v in outs)
+        angle = f"{x.at(['0'] * x.meta.ndim)[:-1]}+i]"
+        self.block.write(f"for (int i = 0; i < {value.numel()}; i++) each_sincos({angle}, {at});", x, *outs)
+        self.values |= {pair["sin"]: outs[0], pair["cos"]: outs[1]}
+        return self.values[node]
 
     def _row(self, x: Any, rows: Rows, index: tuple[int, ...]) -> Any:
         """Of an operand what belongs to a row."""
@@ -193,6 +262,15 @@ def _results(graph: GraphModule) -> dict[Node, View]:
         buffer = Buffer(f"out{k}", value.dtype, value.numel(), fixed=True)
         held.setdefault(node, View(buffer, torch.empty(value.shape, dtype=value.dtype, device="meta")))
     return held
+
+
+def _result_in(graph: GraphModule, into: View) -> dict[Node, View]:
+    """Memory of the first input for what a function returns, if nothing but the returned operation reads that."""
+    nodes = list(graph.graph.nodes)
+    made: Any = nodes[-1].args[0]
+    made = made[0] if isinstance(made, (list, tuple)) else made
+    alone = list(nodes[0].users) == [made] and name_of(made) in ("baddbmm", *BY_ELEMENT)
+    return {made: into} if alone else {}
 
 
 def _cast(given: torch.dtype, wanted: torch.dtype) -> str:

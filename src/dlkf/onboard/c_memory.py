@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.fx import Node
+from torch.fx import GraphModule, Node
 
 C_TYPES = {
     torch.float64: "double", torch.float32: "float", torch.int64: "int64_t", torch.int32: "int32_t",
@@ -157,8 +157,8 @@ class Block:
 class Tensors:
     """Values of a graph as tensors in memory."""
 
-    def __init__(self) -> None:
-        self.block = Block()
+    def __init__(self, block: Block | None = None) -> None:
+        self.block = Block() if block is None else block
 
     def result(self, node: Node) -> View:
         """Memory for what an operation returns."""
@@ -169,6 +169,17 @@ class Tensors:
     def goes_on(self, node: Node) -> bool:
         """Whether a node's value may stay an expression: one node uses it, and that takes each element once."""
         raise NotImplementedError
+
+    def within(self, graph: GraphModule, given: Sequence[View]) -> None:
+        """The lines of another graph, which changes the first of ``given``."""
+        raise NotImplementedError
+
+    def elements_of(self, x: Any, shape: torch.Size) -> tuple[str, list[View]]:
+        """Pattern and operands of a tensor of a shape."""
+        if isinstance(x, Expression) and x.shape == shape:
+            return f"({x.pattern})", x.operands
+        view = self.tensor(x)
+        return "{0}", [view.viewed(view.meta.expand(shape))]
 
     def stored(self, node: Node, x: Expression | Rows) -> View:
         """A node's value in memory."""

@@ -62,11 +62,12 @@ def _scaled(sign: str) -> Pattern:
 def _clamped(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
     low, high = ([*args[1:], None, None])[:2]
     low, high = kwargs.get("min", low), kwargs.get("max", high)
+    end = suffix(dtype) if dtype.is_floating_point else "_int"
     if low is None:
-        return "({0} > {1} ? {1} : {0})", [args[0], high]
+        return f"at_most{end}({{0}}, {{1}})", [args[0], high]
     if high is None:
-        return "({0} < {1} ? {1} : {0})", [args[0], low]
-    return "({0} < {1} ? {1} : {0} > {2} ? {2} : {0})", [args[0], low, high]
+        return f"at_least{end}({{0}}, {{1}})", [args[0], low]
+    return f"at_most{end}(at_least{end}({{0}}, {{1}}), {{2}})", [args[0], low, high]
 
 
 def _power(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:

@@ -26,6 +26,7 @@ from dlkf.filters.integration import Estimator
 from dlkf.navigation import earth
 from dlkf.onboard.c_code import Translation
 from dlkf.onboard.c_memory import C_TYPES, Block
+from dlkf.onboard.c_parts import parts_in_c
 from dlkf.onboard.carried import Layout
 from dlkf.onboard.functions import (
     OUTPUTS,
@@ -70,8 +71,10 @@ FINITE = """#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
 #endif"""
 UNUSED = """#if defined(__GNUC__)
 #define DLKF_UNUSED __attribute__((unused)) /* of helpers and constants that this filter does without */
+#define DLKF_APART __attribute__((noinline)) /* a compiler takes more than twice as long for one long function */
 #else
 #define DLKF_UNUSED
+#define DLKF_APART
 #endif"""
 
 
@@ -237,13 +240,10 @@ def function_in_c(name: str, function: Function) -> Written:
             f"for (int i = 0; i < {dense.meta.numel()}; i++) out{k}[i] = {dense.buffer.name}[{start}+i];", dense
         )
     size = block.laid_out()
-    places = [f"{C_TYPES[b.dtype]} *{b.name} = (void *)(block + {block.places[b.name]});" for b in block.buffers]
-    body = ["unsigned char *block = (unsigned char *)work;", *places, *block.lines]
-    head = f"void {name}({', '.join([*arguments, 'double *restrict work'])}) {{"
+    arguments.append("double *restrict work")
     own, large = _constants(name, block)
-    unused = [f"(void){b.name};" for b in inputs]
     forget = [f"#undef {buffer.name}" for buffer, _ in block.constants]
-    code = "\n".join((*own, head, *(f"  {line}" for line in (*unused, *body)), "}", *forget, ""))
+    code = "\n".join((*own, *parts_in_c(name, arguments, block), *forget, ""))
     return Written(code, "".join(f"{line}\n" for line in large), size)
 
 

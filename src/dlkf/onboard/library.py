@@ -18,7 +18,11 @@ from dlkf.onboard.functions import OUTPUTS
 
 # NaN and infinity keep their meaning; of the filter, not of the core round it. Not -fassociative-math: with it gcc 12
 # makes a sum over k of a product that skips zeros, and a filter that was right without it ends in NaN
-FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros")
+# nor gcc's partial redundancy elimination, which keeps loops over exp and log from being vectorised
+FLAGS = (
+    "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fno-tree-pre", "-fno-gcse",
+    "-ffp-contract=fast",
+)  # fmt: skip
 CORE_FLAGS = ("-O2",)
 FILTER = ("step.c", "weights.c", "heading.c")
 CORE = ("dlkf.c", "samples.c", "align.c", "search.c", "aids.c", "limits.c")

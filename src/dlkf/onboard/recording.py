@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch.func import functionalize
@@ -14,7 +14,6 @@ from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from dlkf.navigation import compiled
-from dlkf.onboard.functions import Function
 
 KEPT = {  # operations that are one in C, though core ATen has several for them
     "aten::linalg_cross", "aten::linalg_solve_ex", "aten::_linalg_solve_ex", "aten::linalg_cholesky_ex",
@@ -22,11 +21,24 @@ KEPT = {  # operations that are one in C, though core ATen has several for them
 }  # fmt: skip
 
 
-def record(function: Function) -> GraphModule:
+class Recordable(Protocol):
+    """A function of tensors, and such tensors."""
+
+    def example(self) -> tuple[torch.Tensor, ...]:
+        """Arguments of the shapes that the function takes."""
+        ...
+
+    def __call__(self, *args: torch.Tensor) -> Any:
+        """The function."""
+        ...
+
+
+def record(function: Recordable) -> GraphModule:
     """The graph of a function at its ``example()``; its constants are attributes."""
     example = function.example()
     function(*example)  # constants that it keeps for later calls are made here, not as tensors of the recorder
     graph: Any = function
+    whole: Any = function
     try:
         for _ in range(2):  # what nn.GRUCell changes in place shows in the first graph and is gone in the second
             recorder = make_fx(functionalize(graph), _decompositions(), "fake", _allow_non_fake_inputs=True)
@@ -34,7 +46,7 @@ def record(function: Function) -> GraphModule:
             if not any(node.op == "call_function" and _is_in_place(node.target) for node in graph.graph.nodes):
                 break
     except RuntimeError:  # it writes into what it has made of constants alone: the slower way knows them as inputs
-        program = torch.export.export(function, example, strict=False).run_decompositions(_decompositions())
+        program = torch.export.export(whole, example, strict=False).run_decompositions(_decompositions())
         return program.module(check_guards=False)
     _merge_equal(graph)
     graph.graph.eliminate_dead_code()  # views of what was there before a change, too

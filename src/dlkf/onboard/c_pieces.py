@@ -1,0 +1,45 @@
+"""``dlkf::summed`` in C: a loop over pieces of the samples round what :mod:`dlkf.filters.pieces` does with one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.fx import Node
+
+from dlkf.filters.pieces import of_name
+from dlkf.onboard.c_memory import Buffer, Tensors, View
+from dlkf.onboard.recording import record
+
+SUMMED = "dlkf::summed"
+
+
+def write_sum(t: Tensors, node: Node, name: str, count: int, begin: Any, samples: list) -> View:
+    """What a piece adds, in ``count`` turns."""
+    out = t.result(node)
+    t.block.over(out, *t.elements_of(begin, out.meta.shape))
+    wholes = [t.tensor(x) for x in samples]
+    pieces = [t.block.new((x.meta.shape[0], x.meta.shape[1] // count, *x.meta.shape[2:]), x.meta.dtype) for x in wholes]
+    example = tuple(torch.zeros(x.meta.shape, dtype=x.meta.dtype) for x in (out, *pieces))
+    t.block.write(f"for (int t = 0; t < {count}; t++) {{", out, *wholes)
+    for whole, piece in zip(wholes, pieces):
+        size, step = piece.meta.shape[1], whole.meta.stride(1)
+        at = Buffer(f"({whole.buffer.name}+{size * step}*t)", whole.buffer.dtype, whole.buffer.numbers, fixed=True)
+        t.block.over(piece, "{0}", [View(at, whole.meta.narrow(1, 0, size))])
+    t.within(record(_Piece(name, example)), [out, *pieces])
+    t.block.write("}", out, *wholes, *pieces)
+    return out
+
+
+class _Piece:
+    """What is done with one, as the recorder takes it."""
+
+    def __init__(self, name: str, example: tuple[Tensor, ...]) -> None:
+        self._work, self._example = of_name(name), example
+
+    def example(self) -> tuple[Tensor, ...]:
+        return self._example
+
+    def __call__(self, *args: Tensor) -> Tensor:
+        return self._work(*args)
