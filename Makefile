@@ -7,12 +7,13 @@ REAL ?=
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help install train paper check test mutants lint types bench docs ui clean
+.PHONY: help install train paper plus check test mutants lint types bench docs ui clean
 
 help:
 	@echo "make install   what training, evaluating and navigating need, into .venv"
 	@echo "make train     train on simulated drives and score against the baselines, some minutes"
 	@echo "make paper     the paper's experiments and their page, days on a CPU; goes on where it stopped, takes REAL=data/kitti"
+	@echo "make plus      the tables of docs/results/plus.md, an hour; takes REAL=data/real, ARGS=--train for fresh weights and constants"
 	@echo "make check     tests of a developer, under three minutes on two cores: without trainings, MLflow, compilers"
 	@echo "make test      all tests, 580 s of processor time on two cores"
 	@echo "make mutants   whether the tests notice small faults of the core (tests/mutants.yaml)"
@@ -55,6 +56,15 @@ paper: .venv/installed
 	$(if $(REAL),$(BIN)/python pipelines/paper_real_motion.py --real $(REAL))
 	$(BIN)/python pipelines/paper_ablations.py $(ARGS)
 	$(BIN)/python pipelines/paper_report.py
+
+# Without --sets a study makes and scores every simulated set. REAL: a folder with kitti, rtkx, wid, wid_mru, linkoping.
+PLUS := $(BIN)/python -m pipelines.studies.plus
+PARTS := tones patches askew steady puck good others fleet gears cvt soft_mount rough phone
+MOTION := kitti_consumer kitti_adis rtkx wid wid_mru linkoping
+plus: .venv/installed
+	$(PLUS) --oracle --no-auto --out outputs/plus $(ARGS)
+	$(if $(REAL),$(PLUS) --real $(REAL) --sets $(MOTION) --out outputs/plus_real)
+	$(PLUS) --parts $(if $(REAL),--real $(REAL)) --sets $(if $(REAL),$(MOTION)) $(PARTS) --out outputs/plus_parts
 
 # worksteal: a worker keeps the tests of a file together, and takes from the other's end when its own are done
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal

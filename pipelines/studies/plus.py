@@ -322,7 +322,8 @@ def main() -> None:
         filters = {**baselines, "plus": trained_filter(options.model)}
         for case in real_cases(name, drives) if name in REAL else simulated_cases(name, drives):
             scored = score(case, filters)
-            rows += with_oracle(case, scored, folder) if options.oracle else scored
+            simulated = name in SIMULATED or name in PYTHON_INS
+            rows += with_oracle(case, scored, folder) if options.oracle and simulated else scored
             print("\n".join(markdown(rows[-1:])[2:]), flush=True)
     lines = [*markdown(rows), "", *pooled(rows)]
     (options.out / "table.md").write_text("\n".join(lines) + "\n")
