@@ -11,7 +11,7 @@ seeds, settings and digest of every dataset). Errors are horizontal, at the end 
 The baselines start from ``imu=automotive_mems`` and constants from ``conf/tuning``, each without wheel orders and with
 them. The ratio is to the best of them by
 the geometric mean of that row, a choice with hindsight; [ ] is its 95 % interval over recordings. Beside them stands
-``imu=auto``, whose noise is found on the very drives that are scored, with all their fixes, and with ``--oracle``
+``imu=auto``, whose noise is found on the drives that are scored, with all their fixes, and with ``--oracle``
 ``mbkf33_car+wheel_orders`` given the noise that each simulated drive was made with. Last come, over all rows,
 every filter's errors, mean NEES, and the ratio of ``plus`` to it over all outages, by recordings.
 """
@@ -151,13 +151,14 @@ def constants() -> dict[str, Estimator]:
 
 
 def found_noise(drives: Sequence[Drive]) -> dict[str, Estimator]:
-    """The same filters with the noise that ``imu=auto`` finds on the drives."""
+    """The same filters with the noise that ``imu=auto`` finds on the drives, without wheel orders and with them."""
     evidence, filters = Evidence.of(drives), {}
-    for name in CONSTANTS:
+    for kind in CONSTANTS:
         found = find_noise(
-            evidence, name, imu_preset("automotive_mems"), Tuning(), delay=False, compiler=compile_or_keep
+            evidence, kind, imu_preset("automotive_mems"), Tuning(), delay=False, compiler=compile_or_keep
         )
-        filters[f"{name} auto"] = build_causal(name, found.imu, "no", tuning=found.tuning)
+        for name in (kind, f"{kind}+wheel_orders"):
+            filters[f"{name} auto"] = build_causal(name, found.imu, "no", tuning=found.tuning)
     return filters
 
 
