@@ -1,6 +1,8 @@
 """Test sets of ``plus`` for :mod:`pipelines.studies.plus`: simulated drives of other laws than those that its network
 was trained with, and real motion with the errors of an IMU added.
 
+    python -m pipelines.studies.simulated_laws gears rough --data data/plus    makes these sets
+
 ``tones`` vibrates at other frequencies, ``patches`` has rough patches that begin and end and no vibration, ``askew``
 has mounts some 5° off (1σ per axis) and rough roads, ``steady`` drives minutes at constant speed, ``puck`` has
 positions alone with 2 m of error that wanders over 40 s and a 1σ of 0.4 of the true one (``puck_other`` 3 m, 90 s, 0.6;
@@ -13,6 +15,7 @@ shakes, ``cvt`` one that turns at nearly one speed, and wheels; ``soft_mount`` b
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 from collections.abc import Collection, Mapping
@@ -105,3 +108,17 @@ def simulate_sets(data: Path, real: Path | None, wanted: Collection[str]) -> Non
         if name in wanted and not (data / name).is_dir():
             words = [f"source={real}/kitti", f"imu={imu}", f"seed={seed}", f"out={data / name}"]
             subprocess.run([sys.executable, "-m", "dlkf.simulate", *words], check=True)
+
+
+def main() -> None:
+    """Make the sets that are named, or all."""
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    arguments.add_argument("sets", nargs="*", help="all of them if none is named")
+    arguments.add_argument("--data", type=Path, default=Path("data/plus"), help="where they lie, or are made")
+    arguments.add_argument("--real", type=Path, help="folder with kitti, whose motion kitti_* take")
+    options = arguments.parse_args()
+    simulate_sets(options.data, options.real, options.sets or (*SIMULATED, *PYTHON_INS, *INJECTED))
+
+
+if __name__ == "__main__":
+    main()
