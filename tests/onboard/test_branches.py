@@ -192,8 +192,8 @@ class Drives(Choice):
 
 
 CHOICES = [
-    Choice(), Several(), OfTwo(), Either(), OfItself(), Inner(), Inwards(), Elsewhere(), ThenUsed(), Changed(), Copied(),
-    Angles(), Products(), Little(), Otherwise(), Drives(),
+    Choice(), Several(), OfTwo(), Either(), OfItself(), Inner(), Inwards(), Elsewhere(), ThenUsed(), Changed(),
+    Copied(), Angles(), Products(), Little(), Otherwise(), Drives(),
 ]  # fmt: skip
 
 
