@@ -83,6 +83,16 @@ class OfItself(Choice):
         return torch.cat((chosen(large, y, x), chosen(large, (y - 30).exp() + y, x)))
 
 
+class Truth(Choice):
+    """A truth value is itself what is chosen where it holds."""
+
+    branches, outside, inside = 0, 1, 0
+
+    def forward(self, s, t, x):
+        on = (s * x).exp().mean(1) > 3
+        return torch.where(on, on, t > 0).double()
+
+
 class Inner(Choice):
     """A choice within what is chosen, its truth value too."""
 
@@ -192,8 +202,8 @@ class Drives(Choice):
 
 
 CHOICES = [
-    Choice(), Several(), OfTwo(), Either(), OfItself(), Inner(), Inwards(), Elsewhere(), ThenUsed(), Changed(),
-    Copied(), Angles(), Products(), Little(), Otherwise(), Drives(),
+    Choice(), Several(), OfTwo(), Either(), OfItself(), Truth(), Inner(), Inwards(), Elsewhere(), ThenUsed(),
+    Changed(), Copied(), Angles(), Products(), Little(), Otherwise(), Drives(),
 ]  # fmt: skip
 
 

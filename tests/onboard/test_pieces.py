@@ -9,6 +9,7 @@ from torch import nn
 from dlkf.filters import pieces
 from dlkf.filters.pieces import LONGEST, summed
 from dlkf.onboard.library import compiler
+from dlkf.onboard.recording import exporting
 from tests.onboard.translated import lines_within, translate
 
 SAMPLES = (1, 2, LONGEST - 1, LONGEST, LONGEST + 1, 2 * LONGEST + 1, 61, 100)  # 61 leaves a gap in each of four pieces
@@ -57,4 +58,6 @@ def test_python_has_the_plain_sum(samples, drives, monkeypatch):
     want = add_products(begin, x, y)
     for at_once in (0, 10**9):
         monkeypatch.setattr(pieces, "AT_ONCE", at_once)
+        torch.testing.assert_close(summed(add_products, begin, x, y), want, rtol=1e-12, atol=1e-12)
+    with exporting():
         torch.testing.assert_close(summed(add_products, begin, x, y), want, rtol=1e-12, atol=1e-12)
