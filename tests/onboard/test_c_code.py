@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import ctypes
-
 import pytest
 import torch
 from torch import nn
 
 from dlkf.base.errors import InputError
-from dlkf.onboard.c_source import function_in_c, heading
-from dlkf.onboard.library import build, compiler
-from tests.onboard.conftest import QUICK
+from dlkf.onboard.c_source import function_in_c
+from dlkf.onboard.library import compiler
+from tests.onboard.translated import translate
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
-HEADER = "#include <stdint.h>\n"
 
 
 class Sums(nn.Module):
@@ -139,16 +136,8 @@ class Constants(Places):
     "module", [Sums(), Places(), Constants(), Elements(), ManyElements(), Layers()], ids=lambda m: type(m).__name__
 )
 def test_c_does_what_torch_does(module, tmp_path):
-    example = module.example()
-    with torch.no_grad():
-        want = module(*example).reshape(-1)
-        code, weights, work = function_in_c("tested", module.eval())
-    (tmp_path / "step.h").write_text(HEADER)
-    (tmp_path / "step.c").write_text(heading() + code)
-    (tmp_path / "weights.c").write_text(HEADER + weights)
-    got, room = torch.empty_like(want), torch.empty(work)
-    library = ctypes.CDLL(str(build(tmp_path, flags=QUICK)))
-    library.tested(*(ctypes.c_void_p(x.contiguous().data_ptr()) for x in (*example, got, room)))
+    (function,), example = translate(tmp_path, module), module.example()
+    got, want = function(*example), function.wanted(*example)
     # sums in another order; float32 inside the network
     tolerance = 1e-5 if isinstance(module, Layers) else 1e-6 if isinstance(module, Elements) else 1e-12
     torch.testing.assert_close(got, want, rtol=tolerance, atol=tolerance, equal_nan=True)

@@ -20,7 +20,7 @@ def may_branch(on: Tensor) -> bool:
 
 
 def chosen(on: Bool[Tensor, " B"], then: Parts, otherwise: Parts) -> Parts:
-    """``then`` for the drives that are ``on``, else ``otherwise``: a tensor, or tuples of equal build.
+    """``then`` for the drives that are ``on``, else ``otherwise``: a tensor, or named tuples of the same kind.
 
     Exported C computes what only this uses of ``then`` if ``on`` alone (:mod:`dlkf.onboard.c_branches`).
     """

@@ -150,16 +150,14 @@ class Translation(Tensors):
     def _chosen(self, node: Node, then: Any, otherwise: Any) -> View:
         """The branches' ends: one tensor in both."""
         out = self.result(node)
-        for x in (then, otherwise):
+        for x, end in ((then, "} else {"), (otherwise, "}")):
             if isinstance(x, (View, Expression, Rows)) or (isinstance(x, Tensor) and x.numel() > 1):
                 pattern, operands = self.elements_of(x, out.meta.shape)
             else:
                 pattern, operands = literal(x.item() if isinstance(x, Tensor) else x, out.meta.dtype), []
             if not (operands and is_same(operands[0], out)):
                 self.block.over(out, f"({C_TYPES[out.meta.dtype]}){pattern}", operands)
-            if x is then:
-                self.block.write("} else {")
-        self.block.write("}")
+            self.block.write(end)
         self._open = None
         return out
 
