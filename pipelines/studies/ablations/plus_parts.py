@@ -31,12 +31,12 @@ class AsClaimed(PlusFilter):
 
 
 def parts(folder: str) -> dict[str, Estimator]:
-    """``plus`` with neither levels nor network (its constants), with one of them, with positions as claimed, without
-    wheel orders."""
+    """``plus`` with neither levels nor network, with one of them, with positions as claimed, without wheel orders."""
     whole = trained_filter(folder)
     assert isinstance(whole, PlusFilter)
     found: dict[str, Estimator] = {}
-    kinds = {"constants": (WithoutLevels, False), "levels": (PlusFilter, False), "network": (WithoutLevels, True)}
+    kinds = {"neither levels nor network": (WithoutLevels, False), "no network": (PlusFilter, False)}
+    kinds["no levels"] = (WithoutLevels, True)
     kinds["positions as claimed"] = (AsClaimed, True)
     kinds["no wheel orders"] = (PlusFilter, True)
     for name, (kind, network) in kinds.items():
