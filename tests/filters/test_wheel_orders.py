@@ -23,9 +23,13 @@ from dlkf.filters.order_spectrum import (
     demodulate,
     log_levels,
     log_likelihood,
+    log_likelihood_of_phase,
     log_lines,
+    relative,
+    rotated,
 )
-from dlkf.filters.wheel_orders import DETECTED, OrdersMemory, _gaussian
+from dlkf.filters.wheel_line import DETECTED, WheelLine
+from dlkf.filters.wheel_orders import OrdersMemory, _gaussian
 from tests.cars import car
 
 from .scene import IMU, RATE
@@ -37,10 +41,10 @@ ROUGH = replace(
 KALMAN, AIDED = "mbkf21_nhc", "mbkf21_nhc+wheel_orders"
 
 
-def cars(count, epochs, turns_hz, seed=0, size=0.4):
+def cars(count, epochs, turns_hz, seed=0, size=0.4, epoch_s=1.0):
     """Cars at 10 ± 3 m/s on a plane road, in road noise, that two axes show a tone of and its second harmonic, whose
     phase (turns) is a function of time t and distance s."""
-    tables = car(epochs + 1.0, RATE)
+    tables = car(epochs * epoch_s + 1.0, RATE)
     t = tables["imu"]["t"].to_numpy() - 0.5 / RATE
     phase = 2 * np.pi * turns_hz(t, 10 * t + 15 * (1 - np.cos(0.2 * t)))
     drives = []
@@ -55,9 +59,9 @@ def cars(count, epochs, turns_hz, seed=0, size=0.4):
                 imu[f"{axis}_y"] += size * scale * np.sin(order * phase + k)
         others = [{str(c): tables[n][c].to_numpy(copy=True) for c in tables[n]} for n in ("gnss", "reference")]
         row = DriveRow(f"car-{k}", "cars", (0.0, 0.0, 0.0))
-        drives.append(drive_from_tables(CheckedTables(row, imu, *others), "cars", RATE, 1.0, torch.float64))
+        drives.append(drive_from_tables(CheckedTables(row, imu, *others), "cars", RATE, epoch_s, torch.float64))
     stack = DriveStack(drives)
-    segments = cut_segments(stack, float(epochs), float(epochs))
+    segments = cut_segments(stack, epochs * epoch_s, epochs * epoch_s)
     law, generator = StartLaw(0.1, 0.1, 1.0, 2.0), torch.Generator().manual_seed(seed)
     return make_batch(stack, segments, dtype=torch.float64, start=law, generator=generator)
 
@@ -133,6 +137,82 @@ def test_levels_have_no_mean_over_the_neighbours():
         assert torch.allclose(levels[..., k], power[..., k] - near.mean(-1), atol=1e-9)
 
 
+def test_a_spectrum_relative_to_its_noise_has_power_one_and_the_phase_it_had():
+    g = torch.Generator().manual_seed(5)
+    spectrum = 30 * torch.randn(400, 6, WAVES, generator=g, dtype=torch.float64)
+    got = relative(spectrum).unflatten(2, (2, -1))
+    power = got.square().sum(2)
+    assert power.max() <= 4 + 1e-9  # a knock is no line
+    assert power[power < 3.9].mean() == pytest.approx(1 - 4.9 * math.exp(-3.9) / (1 - math.exp(-3.9)), abs=0.04)
+    whole = spectrum.unflatten(2, (2, -1))
+    assert torch.allclose(torch.atan2(got[:, :, 1], got[:, :, 0]), torch.atan2(whole[:, :, 1], whole[:, :, 0]))
+
+
+def test_a_rotated_spectrum_is_that_of_a_distance_counted_from_further_on():
+    g = torch.Generator().manual_seed(6)
+    x = torch.randn(2, 40, 6, generator=g, dtype=torch.float64)
+    s = torch.rand(2, 40, generator=g, dtype=torch.float64).cumsum(1)
+    nothing, further = torch.zeros(2, 6, WAVES, dtype=torch.float64), torch.tensor([3.0, -41.5]).double()
+    expected = demodulate(x, s - further[:, None], nothing)
+    assert torch.allclose(rotated(demodulate(x, s, nothing), further), expected, atol=1e-11)
+
+
+def test_the_likelihood_of_phase_is_that_of_gaussian_noise_about_a_template():
+    """ln p(Z | h) − ln p(Z | 0) of complex noise of power 1, times its share."""
+    g = torch.Generator().manual_seed(7)
+    Z, h = (0.3 * torch.randn(1, 6, WAVES, generator=g, dtype=torch.float64) for _ in range(2))
+    seen = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
+    square = Z.square() - (Z - h).square()
+    by_order = 0.8 * square.unflatten(2, (2, len(ORDERS), LINES)).sum((1, 2))
+    expected = (by_order * seen.unsqueeze(-1)).clamp(-2, 2).sum(1)
+    assert torch.allclose(log_likelihood_of_phase(Z, h, seen), expected, atol=1e-12)
+
+
+def line_of(amplitude, speeds, seed=0, coherent=True):
+    """What seconds of noise of power 1 with a line of an amplitude at number 30 show, on distances at these speeds."""
+    g = torch.Generator().manual_seed(seed)
+    line, one, distance = WheelLine.begin(torch.zeros(1).double(), 1), torch.ones(1).double(), torch.zeros(1).double()
+    yes, seen = torch.tensor([True]), torch.ones(1, 3, dtype=torch.float64)
+    axes = torch.tensor([0.0, 0.0, 1.0, 0.0, 1.0, 0.0], dtype=torch.float64)
+    for speed in speeds:
+        spectrum = math.sqrt(0.5) * torch.randn(1, 6, WAVES, generator=g, dtype=torch.float64)
+        tone = torch.zeros(1, 6, 2, len(ORDERS), LINES, dtype=torch.float64)
+        turn = 0.0 if coherent else 2 * math.pi * float(torch.rand(1, generator=g))
+        tone[0, :, 0, 0, 30], tone[0, :, 1, 0, 30] = (
+            amplitude * math.cos(turn) * axes,
+            amplitude * math.sin(turn) * axes,
+        )
+        spectrum = spectrum + rotated(tone.flatten(2), distance)  # its phase goes on with the distance
+        line = line.after(spectrum, one, torch.log(speed * one), seen, yes, yes).from_here(speed * one, yes)
+        distance = distance + speed
+    return line
+
+
+VARIED = [8.0 + 4.0 * math.sin(0.3 * k) for k in range(60)]
+
+
+def test_a_line_that_keeps_its_phase_is_found_in_the_noise_of_its_neighbours():
+    found = line_of(0.9, VARIED)
+    log_turns, variance = found.log_turns()
+    assert bool(found.detected) and abs(float(log_turns) - math.log(LEAST + 30 * STEP)) < 4 * float(variance.sqrt())
+    assert not any(bool(line_of(0.9, VARIED, seed, coherent=False).detected) for seed in range(5))
+
+
+def test_noise_alone_is_no_line():
+    assert not any(bool(line_of(0.0, VARIED, seed).detected) for seed in range(20))
+
+
+def test_at_one_speed_nothing_is_a_wheel():
+    assert not bool(line_of(0.9, [10.0] * 120).detected)
+
+
+@pytest.mark.parametrize("epoch_s", [0.2, 0.5, 2.0])
+def test_other_update_intervals_detect_the_wheel_too(epoch_s):
+    found = memory(cars(3, round(120 / epoch_s), wheel, 8, epoch_s=epoch_s))
+    assert found.wheels.detected.all()
+    assert torch.allclose(torch.exp(found.wheels.log_turns), torch.tensor(TURNS).double(), rtol=6e-3)
+
+
 def test_the_likelihood_of_a_line_is_highest_where_it_stands_and_flat_for_a_car_without():
     levels = torch.zeros(1, 6, len(ORDERS), LINES, dtype=torch.float64)
     levels[..., 0, 20], levels[..., 1, 20] = 2.0, 1.5
@@ -155,7 +235,7 @@ def test_what_a_gaussian_density_says_is_found_again():
 
 def test_it_detects_the_wheels_and_knows_their_turns():
     found = memory(cars(4, 100, wheel, 1))
-    assert found.wheels.detected.all() and (found.wheels.evidence > DETECTED).all()
+    assert found.wheels.detected.all() and (found.line.evidence.sum(1).amax(1) > DETECTED).all()
     assert torch.allclose(torch.exp(found.wheels.log_turns), torch.tensor(TURNS).double(), rtol=4e-3)
 
 

@@ -12,6 +12,13 @@ exponential power of mean 1, a line of fading amplitude with mean power 1 + ρ h
     ln Λ(κ) = Σ_o [β Σ_axes (ρ/(1 + ρ) |Z_o|²/N − ln(1 + ρ))], each order's part limited
 
 β < 1 because the axes show the same shaking, and limited because an engine's tone that crosses an order is no proof.
+
+A wheel also keeps its phase: Z of a second, on the distance since some earlier time, has the phase that it had then.
+With a template h, the mean of Z over the seconds before, the likelihood ratio against noise is
+
+    ln Λ_h(κ) = Σ_o [β Σ_axes (2 Re Z h* − |h|²)/N], each order's part limited
+
+Fixes show the distance, so such lines stand out long before their power does.
 """
 
 from __future__ import annotations
@@ -32,8 +39,9 @@ WAVES = 2 * len(ORDERS) * LINES  # cosines and sines
 NEIGHBOURS = 16  # lines to both sides, over which the level of the noise is taken
 MEAN_LOG = 0.577  # of the logarithm of exponential power of mean 1, negative (Euler's constant)
 LARGEST = 8.0  # power over that of the noise above which more says nothing
-SHARE = 0.45  # β
+SHARE, PHASE_SHARE = 0.45, 0.8  # β of power, and where the phase counts
 LIMIT = 2.0  # of an order's part
+LARGEST_AMPLITUDE = 2.0  # over that of the noise: a knock is no line
 NYQUIST = 0.45  # share of the sampling rate up to which an order is seen
 
 
@@ -52,7 +60,12 @@ def add_waves(
     Sines and cosines are taken of a coarse grid of lines and a fine one, and multiplied; those of the higher orders are
     powers.
     """
-    angle = distance.unsqueeze(-1) * _grids(x.dtype, x.device)
+    return torch.baddbmm(begin, x.mT, _waves(distance))
+
+
+def _waves(distance: Float[Tensor, "B m"]) -> Float[Tensor, "B m waves"]:
+    """cos and sin of 2π o κ s."""
+    angle = distance.unsqueeze(-1) * _grids(distance.dtype, distance.device)
     cosines, sines = angle.cos(), angle.sin()
     (ca, cb), (sa, sb) = (_crossed(of) for of in (cosines, sines))
     c, s = (ca * cb - sa * sb).flatten(2), (sa * cb + ca * sb).flatten(2)
@@ -60,8 +73,14 @@ def add_waves(
     for _ in ORDERS[1:]:
         u, v = powers[-1]
         powers.append((u * c - v * s, v * c + u * s))
-    waves = torch.cat([*(u for u, _ in powers), *(v for _, v in powers)], -1)
-    return torch.baddbmm(begin, x.mT, waves)
+    return torch.cat([*(u for u, _ in powers), *(v for _, v in powers)], -1)
+
+
+def rotated(spectrum: Float[Tensor, "B 6 waves"], distance: Float[Tensor, " B"]) -> Float[Tensor, "B 6 waves"]:
+    """The spectrum with the distance counted from so many metres further on: Z exp(2πi o κ s), with Z = C − i S."""
+    cosines, sines = _split(_waves(distance.unsqueeze(1)))
+    C, S = _split(spectrum)
+    return torch.cat((C * cosines + S * sines, S * cosines - C * sines), 2).flatten(2)
 
 
 def _crossed(of: Float[Tensor, "B m grids"]) -> tuple[Float[Tensor, "B m coarse 1"], Float[Tensor, "B m 1 fine"]]:
@@ -71,13 +90,36 @@ def _crossed(of: Float[Tensor, "B m grids"]) -> tuple[Float[Tensor, "B m coarse 
 
 def log_levels(spectrum: Float[Tensor, "B 6 waves"]) -> Float[Tensor, "B 6 O K"]:
     """ln of the power of every axis, order and line over its neighbours'."""
-    cosines, sines = spectrum.unflatten(2, (2, len(ORDERS), LINES)).unbind(2)
-    power = torch.log(cosines.square() + sines.square() + 1e-30)
+    power = _log_power(spectrum)
+    return power - _over_neighbours(power)
+
+
+def relative(spectrum: Float[Tensor, "B 6 waves"]) -> Float[Tensor, "B 6 waves"]:
+    """The spectrum in units of the noise's amplitude, which its neighbours show, limited."""
+    power = _log_power(spectrum)
+    scale = torch.exp(-0.5 * (_over_neighbours(power) + MEAN_LOG))
+    scale = torch.minimum(scale, LARGEST_AMPLITUDE * torch.exp(-0.5 * power)).flatten(2)
+    return spectrum * torch.cat((scale, scale), -1)
+
+
+def _split(waves: Float[Tensor, "B n waves"]) -> tuple[Tensor, Tensor]:
+    """Cosines and sines (B, n, O K)."""
+    cosines, sines = waves.unflatten(2, (2, -1)).unbind(2)
+    return cosines, sines
+
+
+def _log_power(spectrum: Float[Tensor, "B 6 waves"]) -> Float[Tensor, "B 6 O K"]:
+    cosines, sines = _split(spectrum)
+    return torch.log(cosines.square() + sines.square() + 1e-30).unflatten(2, (len(ORDERS), LINES))
+
+
+def _over_neighbours(power: Float[Tensor, "B 6 O K"]) -> Float[Tensor, "B 6 O K"]:
+    """Its mean over the neighbouring lines."""
     total = power.cumsum(-1)
     last = total[..., -1:].expand(-1, -1, -1, NEIGHBOURS)
     above = torch.cat((total[..., NEIGHBOURS:], last), -1)
     below = torch.cat((torch.zeros_like(total[..., : NEIGHBOURS + 1]), total[..., : -NEIGHBOURS - 1]), -1)
-    return power - (above - below) / _neighbours(power.dtype, power.device)
+    return (above - below) / _neighbours(power.dtype, power.device)
 
 
 def log_likelihood(levels: Float[Tensor, "B 6 O K"], excess: Float[Tensor, "B 6 O"]) -> Float[Tensor, "B K"]:
@@ -86,6 +128,15 @@ def log_likelihood(levels: Float[Tensor, "B 6 O K"], excess: Float[Tensor, "B 6 
     power = torch.exp(levels - MEAN_LOG).clamp_max(LARGEST)
     of_order = SHARE * (power * (rho / (1 + rho)).unsqueeze(-1) - torch.log1p(rho).unsqueeze(-1)).sum(1)
     return of_order.clamp(-LIMIT, LIMIT).sum(1)
+
+
+def log_likelihood_of_phase(
+    spectrum: Float[Tensor, "B 6 waves"], template: Float[Tensor, "B 6 waves"], seen: Float[Tensor, "B O"]
+) -> Float[Tensor, "B K"]:
+    """ln Λ_h of every line, of the orders that are ``seen``; both as :func:`relative` gives them, on one distance."""
+    cosines, sines = _split((2 * spectrum - template) * template)
+    of_order = PHASE_SHARE * (cosines + sines).sum(1).unflatten(1, (len(ORDERS), LINES))
+    return (of_order * seen.unsqueeze(-1)).clamp(-LIMIT, LIMIT).sum(1)
 
 
 def log_lines(like: Tensor) -> Float[Tensor, " K"]:

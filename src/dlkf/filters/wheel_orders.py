@@ -1,9 +1,10 @@
 """Speed from the wheels' orders in the vibration that an IMU measures: a wheel sensor without a wheel.
 
-While fixes show the speed, the spectrum over the distance covered (:mod:`dlkf.filters.order_spectrum`) is averaged over
-blocks of some 3 s, and a line that stands out shows how often a wheel turns in a metre, κ. In an outage the line of a
-block stands at κ v̄/v̂ for the true and the filter's own mean speed, which makes a measurement of the speed (chassis
-vibrations: Lindfors et al. 2016),
+While fixes show the speed, the phase that lines in the spectrum over the distance covered keep
+(:mod:`dlkf.filters.wheel_line`) shows which of them is a wheel's, and so how often it turns in a metre, κ; the mean of
+spectra over blocks of some 3 s shows by how much it stands out. In an outage the line of a block stands at κ v̄/v̂ for
+the true and the filter's own mean speed, which makes a measurement of the speed (chassis vibrations: Lindfors et al.
+2016),
 
     z = ln κ_line − ln κ,    H = uᵀ δv̄ / v̂,    δv̄ = δv − L (Cε + [f_n×] δh)ᵀu    u along the velocity, L half a block
 
@@ -11,10 +12,8 @@ What the spectrum says of ln κ_line is no Gaussian but has several peaks. Its m
 1σ, widened by ``SEARCH``, are those of a measurement with variance R that is taken from them; a block that decides
 nothing is kept, so that several do together.
 
-A line counts as a wheel's only by what it predicted: whether the next block's likelihood, before the block is learned
-from, is large where the fixes put the line, in nats against a guess, at speeds other than those it was learned at.
-Tones of a fixed frequency, of other gears or of nothing at all do not pass, and the filter is as without this source.
-Training gets no rows: a peak has no gradient.
+Tones of a fixed frequency, of other gears or of nothing at all are no line of a wheel, and the filter is as without
+this source. Training gets no rows: a peak has no gradient.
 """
 
 from __future__ import annotations
@@ -45,19 +44,13 @@ from dlkf.filters.order_spectrum import (
 )
 from dlkf.filters.sources import Measurement, Predicted, predicted_variance
 from dlkf.filters.tuning import Tuning
+from dlkf.filters.wheel_line import WheelLine
 from dlkf.navigation.state import ACCEL, ErrorStates
 
-BLOCK_S = 3.0
-SLOWEST = 3.0  # m/s in a block: below, the orders lie among the car's own motion
-KNOWN = 0.02  # relative 1σ of a speed that teaches
+PART_S, BLOCK_S = 1.0, 3.0  # whose phase counts, and whose power
+SLOWEST = 3.0  # m/s: below, the orders lie among the car's own motion
+KNOWN, KNOWN_BLOCK = 0.04, 0.02  # relative 1σ of a speed that shows a line, and of one that teaches its power
 MEMORY = 75.0  # blocks of the averages
-APART = 0.1  # in ln v: so far from the mean speed of what was learned a block is full evidence
-GUESS, HIT = 0.12, 0.0125  # in ln κ: where a line may lie, and how near to it is a hit
-LEAST_DENSITY = 0.05  # of a guess's: so much a single block may contradict
-FIRST_BLOCKS = 3  # before anything is predicted
-DETECTED, LOST = 4.0, 1.0  # nats of evidence from which a line counts, and below which it does no more
-EDGE = 5  # lines at the ends of the range, which may be the flank of something outside
-FIRST_STD = 0.015  # of ln κ when a line is first detected
 WANDER = 1e-4  # of ln κ, per √block
 DRIFT = 0.01  # in ln v, by which a filter's speed may drift from block to block
 SEARCH = 0.02  # in ln v, beyond the filter's 1σ
@@ -68,60 +61,63 @@ UNCHECKED_S = 100.0  # s after a fix, from which on what nothing has checked is 
 TOGETHER = 10.0  # measurements that share the error of κ count as so many
 
 
-class Block(NamedTuple):
-    """The present block."""
+class Stretch(NamedTuple):
+    """Samples of some update intervals."""
 
-    spectrum: Tensor  # (B, 6, waves), of the last block until the first samples of the next
-    last: Tensor  # (B, 6) the last sample
+    spectrum: Tensor  # (B, 6, waves)
     distance: Tensor  # (B,) m
     elapsed: Tensor  # (B,) s
     slowest: Tensor  # (B,) m/s
     fixed: Tensor  # (B,) bool: it had a fix
 
     @classmethod
-    def begin(cls, like: Tensor, B: int) -> Block:
+    def begin(cls, like: Tensor, B: int) -> Stretch:
         """Nothing in it."""
         zero = like.new_zeros(B)
-        return cls(like.new_zeros(B, 6, WAVES), like.new_zeros(B, 6), zero, zero, zero + 1e3, zero > 0)
+        return cls(like.new_zeros(B, 6, WAVES), zero, zero, zero + 1e3, zero > 0)
 
-    def after(self, epoch: Epoch, block_s: float) -> Block:
-        """With one more update interval."""
+    @property
+    def speed(self) -> Float[Tensor, " B"]:
+        """Mean speed [m/s]."""
+        return (self.distance / self.elapsed.clamp_min(1e-3)).clamp_min(0.1)
+
+    @property
+    def moving(self) -> Bool[Tensor, " B"]:
+        """Whether it was fast enough all the time."""
+        return self.slowest > SLOWEST
+
+    def after(self, epoch: Epoch, of_block: Stretch, block_s: float, last: Float[Tensor, "B 6"]) -> Stretch:
+        """With one more update interval; ``last`` is the sample before it."""
         x, dt = epoch.corrected, epoch.dt
         M = x.shape[1]
         speed = at_limits(epoch.start.v_n, epoch.window.v_n)[..., :2].norm(dim=-1)
         step = 0.5 * dt * (speed[:, 1:] + speed[:, :-1])
-        distance = self.distance.unsqueeze(-1) + step.cumsum(1) - 0.5 * step
-        time = self.elapsed.unsqueeze(-1) + dt * (torch.arange(M, dtype=x.dtype, device=x.device) + 0.5)
+        distance = (of_block.distance + self.distance).unsqueeze(-1) + step.cumsum(1) - 0.5 * step
+        sample = torch.arange(M, dtype=x.dtype, device=x.device)
+        time = (of_block.elapsed + self.elapsed).unsqueeze(-1) + dt * (sample + 0.5)
         weight = torch.sin((math.pi / block_s) * time).clamp_min(0.0)
-        fresh = self.elapsed <= 0
-        begun = self.spectrum
-        if not may_branch(fresh) or bool(fresh.any()):
-            begun = torch.where(fresh[:, None, None], 0.0, begun)
-        known = (self.last != 0).any(-1, keepdim=True)
-        before = torch.cat((torch.where(known, self.last, x[:, 0]).unsqueeze(1), x[:, :-1]), 1)
-        return Block(
-            demodulate((x - before) * weight.unsqueeze(-1), distance, begun), x[:, -1],
+        known = (last != 0).any(-1, keepdim=True)
+        before = torch.cat((torch.where(known, last, x[:, 0]).unsqueeze(1), x[:, :-1]), 1)
+        return Stretch(
+            demodulate((x - before) * weight.unsqueeze(-1), distance, self.spectrum),
             self.distance + step.sum(1), self.elapsed + dt * M,
             torch.minimum(self.slowest, -(-speed).amax(1)), self.fixed | epoch.used.any(-1),
         )  # fmt: skip
 
-    def next(self, done: Bool[Tensor, " B"]) -> Block:
-        """This one, or where it is done a new one."""
-        return Block(
-            self.spectrum, self.last,
-            torch.where(done, 0.0, self.distance), torch.where(done, 0.0, self.elapsed),
-            torch.where(done, 1e3, self.slowest), self.fixed & ~done,
+    def joined(self, part: Stretch) -> Stretch:
+        """With a part behind it."""
+        return Stretch(
+            self.spectrum + part.spectrum, self.distance + part.distance, self.elapsed + part.elapsed,
+            torch.minimum(self.slowest, part.slowest), self.fixed | part.fixed,
         )  # fmt: skip
 
 
 class Wheels(NamedTuple):
-    """What is known of this car's wheels."""
+    """How a wheel's lines stand out, and how often it turns in a metre."""
 
     levels: Tensor  # (B, 6, O, K) mean of the log levels
     blocks: Tensor  # (B,) in that mean
-    log_speed: Tensor  # (B,) its mean ln v
-    evidence: Tensor  # (B,) nats by which the lines predicted the speed better than a guess
-    detected: Tensor  # (B,) bool: that is enough
+    detected: Tensor  # (B,) bool
     log_turns: Tensor  # (B,) ln κ
     variance: Tensor  # (B,) its variance
 
@@ -129,57 +125,39 @@ class Wheels(NamedTuple):
     def begin(cls, like: Tensor, B: int) -> Wheels:
         """Nothing."""
         zero = like.new_zeros(B)
-        return cls(like.new_zeros(B, 6, len(ORDERS), LINES), zero, zero, zero, zero > 0, zero, zero)
+        return cls(like.new_zeros(B, 6, len(ORDERS), LINES), zero, zero > 0, zero, zero)
 
-    def excess(self, log_turns: Float[Tensor, " B"]) -> Float[Tensor, "B 6 O"]:
-        """By what a wheel's lines stand out if it turns so often."""
-        kappa = torch.exp(log_turns).unsqueeze(-1)
+    def excess(self) -> Float[Tensor, "B 6 O"]:
+        """By what its lines stand out."""
+        kappa = torch.exp(self.log_turns).unsqueeze(-1)
         near = torch.exp(-0.5 * ((torch.exp(log_lines(kappa)) - kappa) / STEP).square())
         near = near / near.sum(1, keepdim=True).clamp_min(1e-12)
         return (self.levels * near[:, None, None]).sum(-1)
 
-    def strongest(self) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
-        """ln κ of the strongest line, and whether it is inside the range."""
-        total = self.levels.clamp_min(0).sum((1, 2))
-        total = torch.cat((total[:, :1], (total[:, :-2] + total[:, 1:-1] + total[:, 2:]) / 3, total[:, -1:]), 1)
-        number = torch.arange(LINES, dtype=total.dtype, device=total.device)
-        largest = (total >= total.amax(1, keepdim=True)).to(total.dtype)
-        at = (largest * number).sum(1) / largest.sum(1)
-        lines = log_lines(total)
-        chosen = (largest * lines).sum(1) / largest.sum(1)
-        return chosen, (at >= EDGE) & (at <= LINES - 1 - EDGE)
+    def of_line(self, line: WheelLine) -> Wheels:
+        """With a line that was detected, or lost."""
+        new = line.detected & ~self.detected
+        log_turns, variance = line.log_turns()
+        return self._replace(
+            detected=line.detected,
+            log_turns=torch.where(new, log_turns, self.log_turns),
+            variance=torch.where(new, variance, self.variance),
+        )
 
-    def line(self) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
-        """ln κ of the line that is detected, else of the strongest, and whether it is one."""
-        strongest, inside = self.strongest()
-        return torch.where(self.detected, self.log_turns, strongest), self.detected | inside
-
-    def learned(
-        self, levels: Tensor, predicted: Float[Tensor, "B K"], speed: Float[Tensor, " B"], knows: Bool[Tensor, " B"]
-    ) -> Wheels:
-        """After a block whose speed fixes show: ``predicted``, its ln Λ at :meth:`line`, is judged, then it is learned
-        from."""
-        log_speed = torch.log(speed)
-        line, known = self.line()
-        gain = _gain(predicted, (log_lines(levels) - line.unsqueeze(-1)).abs())
-        weight = ((log_speed - self.log_speed).abs() / APART).clamp_max(1.0)
-        judged = knows & known & (self.blocks >= FIRST_BLOCKS)
-        evidence = torch.where(judged, (1 - 1 / MEMORY) * self.evidence + weight * gain, self.evidence)
+    def learned(self, levels: Float[Tensor, "B 6 O K"], knows: Bool[Tensor, " B"]) -> Wheels:
+        """After a block whose speed fixes show."""
         blocks = torch.where(knows, self.blocks + 1, self.blocks)
         rate = torch.where(knows, 1 / blocks.clamp(1, MEMORY), 0.0)
-        new = ~self.detected & judged & (evidence > DETECTED)
-        return Wheels(
-            self.levels + rate[:, None, None, None] * (levels - self.levels), blocks,
-            self.log_speed + rate * (log_speed - self.log_speed), evidence,
-            (self.detected & (evidence > LOST)) | new, torch.where(new, line, self.log_turns),
-            torch.where(new, FIRST_STD**2, self.variance),
-        )  # fmt: skip
+        return self._replace(levels=self.levels + rate[:, None, None, None] * (levels - self.levels), blocks=blocks)
 
 
 class OrdersMemory(NamedTuple):
     """Memory of the source; nothing of it has axes in n."""
 
-    block: Block
+    block: Stretch  # the present one, of the parts that are over
+    part: Stretch  # the present one
+    last_sample: Tensor  # (B, 6)
+    line: WheelLine
     wheels: Wheels
     undecided: Tensor  # (B, K) ln Λ of blocks that decided nothing
     age: Tensor  # (B,) s since the last fix
@@ -200,9 +178,11 @@ class WheelOrders:
 
     def begin(self, batch: Batch) -> OrdersMemory:
         """Nothing detected."""
-        B = batch.size[0]
+        like, B = batch.imu, batch.size[0]
+        nothing = Stretch.begin(like, B)
         return OrdersMemory(
-            Block.begin(batch.imu, B), Wheels.begin(batch.imu, B), batch.imu.new_zeros(B, LINES), batch.imu.new_zeros(B)
+            nothing, nothing, like.new_zeros(B, 6), WheelLine.begin(like, B), Wheels.begin(like, B),
+            like.new_zeros(B, LINES), like.new_zeros(B),
         )  # fmt: skip
 
     def rows(
@@ -212,54 +192,77 @@ class WheelOrders:
         if torch.is_grad_enabled():
             return None, memory
         span = epoch.dt * epoch.imu.shape[1]
-        block_s = max(1, round(BLOCK_S / span)) * span
-        block = memory.block.after(epoch, block_s)
-        done = block.elapsed > block_s - 0.5 * span
-        memory = memory._replace(age=torch.where(epoch.used.any(-1), 0.0, memory.age + span))
+        part_s = max(1, round(PART_S / span)) * span
+        block_s = max(1, round(BLOCK_S / part_s)) * part_s
+        part = memory.part.after(epoch, memory.block, block_s, memory.last_sample)
+        age = torch.where(epoch.used.any(-1), 0.0, memory.age + span)
+        memory = memory._replace(part=part, last_sample=epoch.corrected[:, -1], age=age)
+        over = part.elapsed > part_s - 0.5 * span
+        if may_branch(over) and not bool(over.any()):
+            return None, memory
+        line = self._shown(epoch, memory, prediction)
+        memory = memory._replace(
+            block=chosen(over, memory.block.joined(part), memory.block), part=_emptied(part, over),
+            line=chosen(over, line, memory.line),
+        )  # fmt: skip
+        done = over & (memory.block.elapsed > block_s - 0.5 * span)
         if may_branch(done) and not bool(done.any()):
-            return None, memory._replace(block=block)
-        row, wheels, undecided = self._judged(epoch, memory, prediction, block, done)
+            return None, memory
+        line = memory.line.from_here(memory.block.distance, done)
+        row, wheels, undecided = self._judged(epoch, memory, prediction, done)
         kept = torch.where(epoch.used.any(-1, keepdim=True) | row.used, 0.0, undecided)
         nothing = Measurement(*map(torch.zeros_like, row))
-        return chosen(done, row, nothing), OrdersMemory(
-            block.next(done), chosen(done, wheels, memory.wheels), chosen(done, kept, memory.undecided), memory.age
+        return chosen(done, row, nothing), memory._replace(
+            block=_emptied(memory.block, done), line=line, wheels=chosen(done, wheels, memory.wheels),
+            undecided=chosen(done, kept, memory.undecided),
         )  # fmt: skip
 
+    def _shown(self, epoch: Epoch, memory: OrdersMemory, prediction: Predicted) -> WheelLine:
+        """What the phase of the lines shows after a part that is over."""
+        part = memory.part
+        of_speed = predicted_variance(prediction.P, self._matrix(epoch, 0.5 * part.elapsed, part.speed))[:, 0]
+        knows = part.moving & part.fixed & (of_speed < KNOWN**2)
+        seen = self._seen(epoch, part.speed)
+        return memory.line.after(part.spectrum, part.elapsed, torch.log(part.speed), seen, part.moving, knows)
+
     def _judged(
-        self, epoch: Epoch, memory: OrdersMemory, prediction: Predicted, block: Block, done: Bool[Tensor, " B"]
+        self, epoch: Epoch, memory: OrdersMemory, prediction: Predicted, done: Bool[Tensor, " B"]
     ) -> tuple[Measurement, Wheels, Float[Tensor, "B K"]]:
         """The row of a block that is done, what is known after it, and what the blocks since the last row say."""
+        block, before = memory.block, memory.wheels
         levels = log_levels(block.spectrum)
         lines = log_lines(levels)
-        speed = (block.distance / block.elapsed).clamp_min(0.1)
-        moving = done & (block.slowest > SLOWEST)
-        highest = 0.55 * speed.unsqueeze(-1) * speed.new_tensor(ORDERS)
-        seen = (highest < NYQUIST / epoch.dt).to(levels.dtype)
+        speed, moving, seen = block.speed, done & block.moving, self._seen(epoch, block.speed)
 
         H = self._matrix(epoch, 0.5 * block.elapsed, speed)
         of_speed = predicted_variance(prediction.P, H)[:, 0]
-        before = memory.wheels
-        likelihood = log_likelihood(levels, before.excess(before.line()[0]) * seen.unsqueeze(1))
+        wheels = before.of_line(memory.line)
+        likelihood = log_likelihood(levels, wheels.excess() * seen.unsqueeze(1))
         undecided = _diffused(memory.undecided)
-        undecided = undecided + torch.where((moving & before.detected).unsqueeze(-1), likelihood, 0.0)
+        undecided = undecided + torch.where((moving & wheels.detected).unsqueeze(-1), likelihood, 0.0)
 
-        knows = moving & block.fixed & (of_speed < KNOWN**2)
-        wheels = before.learned(levels * seen[:, None, :, None], likelihood, speed, knows)
+        knows = moving & block.fixed & (of_speed < KNOWN_BLOCK**2)
+        wheels = wheels.learned(levels * seen[:, None, :, None], knows)
 
-        off = lines - before.log_turns.unsqueeze(-1)
-        searched = of_speed + before.variance + SEARCH**2
+        off = lines - wheels.log_turns.unsqueeze(-1)
+        searched = of_speed + wheels.variance + SEARCH**2
         z, R, decided = _gaussian(undecided - 0.5 * off.square() / searched.unsqueeze(-1), off, searched)
-        used = moving & before.detected & wheels.detected & decided & (of_speed + before.variance < LOST_STD**2)
+        used = moving & wheels.detected & decided & (of_speed + wheels.variance < LOST_STD**2)
         if prediction.rolling is not None:  # a wheel that agrees says more
             used = used & ~prediction.rolling
         gain = torch.where(knows & used, wheels.variance / (wheels.variance + of_speed + R), 0.0)
+        R = (R + TOGETHER * wheels.variance) * (1 + (memory.age / UNCHECKED_S).square())
+        R = R * (z.square() / (of_speed + R) / OUTLIER**2).clamp_min(1.0)
         wheels = wheels._replace(
             log_turns=wheels.log_turns + gain * z,
             variance=(1 - gain) * wheels.variance + torch.where(done, WANDER**2, 0.0),
         )
-        R = (R + TOGETHER * before.variance) * (1 + (memory.age / UNCHECKED_S).square())
-        R = R * (z.square() / (of_speed + R) / OUTLIER**2).clamp_min(1.0)
         return Measurement(z.unsqueeze(-1), H, R.unsqueeze(-1), used.unsqueeze(-1)), wheels, undecided
+
+    def _seen(self, epoch: Epoch, speed: Float[Tensor, " B"]) -> Float[Tensor, "B O"]:
+        """Which orders are below the sampling's limit at a speed."""
+        highest = 0.55 * speed.unsqueeze(-1) * speed.new_tensor(ORDERS)
+        return (highest < NYQUIST / epoch.dt).to(speed.dtype)
 
     def _matrix(self, epoch: Epoch, middle: Float[Tensor, " B"], speed: Float[Tensor, " B"]) -> Float[Tensor, "B 1 n"]:
         """H of ln of the true over the filter's mean speed of a block, whose middle is so many seconds ago."""
@@ -272,13 +275,12 @@ class WheelOrders:
         return (H / speed.unsqueeze(-1)).unsqueeze(1)
 
 
-def _gain(predicted: Float[Tensor, "B K"], off: Float[Tensor, "B K"]) -> Float[Tensor, " B"]:
-    """ln of the probability density at the line over that of a guess, ``off`` in ln κ from it."""
-    likely = torch.where(off < GUESS, predicted, -1e3)
-    p = torch.exp(likely - likely.amax(1, keepdim=True)) * (off < GUESS)
-    hit, guessed = (off < HIT).to(p.dtype), (off < GUESS).to(p.dtype).sum(1)
-    share = (p * hit).sum(1) / p.sum(1).clamp_min(1e-12)
-    return torch.log((share * guessed / hit.sum(1).clamp_min(1.0)).clamp_min(LEAST_DENSITY))
+def _emptied(stretch: Stretch, over: Bool[Tensor, " B"]) -> Stretch:
+    """The stretch, or where it is over a new one."""
+    return Stretch(
+        torch.where(over[:, None, None], 0.0, stretch.spectrum), torch.where(over, 0.0, stretch.distance),
+        torch.where(over, 0.0, stretch.elapsed), torch.where(over, 1e3, stretch.slowest), stretch.fixed & ~over,
+    )  # fmt: skip
 
 
 def _gaussian(
