@@ -90,15 +90,15 @@ def _crossed(of: Float[Tensor, "B m grids"]) -> tuple[Float[Tensor, "B m coarse 
 
 def log_levels(spectrum: Float[Tensor, "B 6 waves"]) -> Float[Tensor, "B 6 O K"]:
     """ln of the power of every axis, order and line over its neighbours'."""
-    power = _log_power(spectrum)
+    power = torch.log(_power(spectrum))
     return power - _over_neighbours(power)
 
 
 def relative(spectrum: Float[Tensor, "B 6 waves"]) -> Float[Tensor, "B 6 waves"]:
     """The spectrum in units of the noise's amplitude, which its neighbours show, limited."""
-    power = _log_power(spectrum)
-    scale = torch.exp(-0.5 * (_over_neighbours(power) + MEAN_LOG))
-    scale = torch.minimum(scale, LARGEST_AMPLITUDE * torch.exp(-0.5 * power)).flatten(2)
+    power = _power(spectrum)
+    scale = torch.exp(-0.5 * (_over_neighbours(torch.log(power)) + MEAN_LOG))
+    scale = torch.minimum(scale, LARGEST_AMPLITUDE * power.rsqrt()).flatten(2)
     return spectrum * torch.cat((scale, scale), -1)
 
 
@@ -108,9 +108,9 @@ def _split(waves: Float[Tensor, "B n waves"]) -> tuple[Tensor, Tensor]:
     return cosines, sines
 
 
-def _log_power(spectrum: Float[Tensor, "B 6 waves"]) -> Float[Tensor, "B 6 O K"]:
+def _power(spectrum: Float[Tensor, "B 6 waves"]) -> Float[Tensor, "B 6 O K"]:
     cosines, sines = _split(spectrum)
-    return torch.log(cosines.square() + sines.square() + 1e-30).unflatten(2, (len(ORDERS), LINES))
+    return (cosines.square() + sines.square() + 1e-30).unflatten(2, (len(ORDERS), LINES))
 
 
 def _over_neighbours(power: Float[Tensor, "B 6 O K"]) -> Float[Tensor, "B 6 O K"]:

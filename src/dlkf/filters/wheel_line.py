@@ -56,21 +56,20 @@ class WheelLine(NamedTuple):
         """After the spectrum of a second: in motion it joins the template, and at a speed that fixes show (``knows``)
         it is evidence. ``seen``: the orders that the sampling rate shows."""
         lasts = torch.exp(-span_s / TEMPLATE_S)
-        weight = lasts * self.weight
+        faded = self._replace(template=lasts[:, None, None] * self.template, weight=lasts * self.weight)
         if may_branch(moving) and not bool(moving.any()):
-            return self._replace(template=lasts[:, None, None] * self.template, weight=weight)
+            return faded
         part = relative(spectrum)
         said = log_likelihood_of_phase(part, self._predicted(lasts), seen)
-        judged = knows & moving & (self.weight > LEAST_WEIGHT)
         number = ((log_speed - SLOWEST) / WIDTH).floor().clamp(0, CLASSES - 1)
-        of_class = torch.arange(CLASSES, dtype=said.dtype, device=said.device) == number.unsqueeze(-1)
-        here = (judged.unsqueeze(-1) & of_class).to(said.dtype).unsqueeze(-1)
-        evidence = self.evidence + here * (said.unsqueeze(1) - (span_s / MEMORY_S)[:, None, None] * self.evidence)
-        evidence = evidence - (evidence.amax(2, keepdim=True) - MOST).clamp_min(0.0)
-        joins = moving.to(said.dtype)
-        template = lasts[:, None, None] * self.template + joins[:, None, None] * part
-        after = WheelLine(template, weight + joins, evidence, self.detected)
-        return after._replace(detected=after._is_sure())
+        here = torch.arange(CLASSES, dtype=said.dtype, device=said.device) == number.unsqueeze(-1)
+        before = torch.bmm(here.to(said.dtype).unsqueeze(1), self.evidence).squeeze(1)
+        of_class = before + said - (span_s / MEMORY_S).unsqueeze(-1) * before
+        of_class = of_class - (of_class.amax(1, keepdim=True) - MOST).clamp_min(0.0)
+        judged = knows & (self.weight > LEAST_WEIGHT)
+        evidence = torch.where((here & judged.unsqueeze(-1)).unsqueeze(-1), of_class.unsqueeze(1), self.evidence)
+        after = WheelLine(faded.template + part, faded.weight + 1, evidence, self.detected)
+        return chosen(moving, after._replace(detected=after._is_sure()), faded)
 
     def from_here(self, distance: Float[Tensor, " B"], on: Bool[Tensor, " B"]) -> WheelLine:
         """With the distance counted from so many metres further on, where ``on``."""

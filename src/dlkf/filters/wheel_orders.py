@@ -239,7 +239,7 @@ class WheelOrders:
         wheels = before.of_line(memory.line)
         likelihood = log_likelihood(levels, wheels.excess() * seen.unsqueeze(1))
         undecided = _diffused(memory.undecided)
-        undecided = undecided + torch.where((moving & wheels.detected).unsqueeze(-1), likelihood, 0.0)
+        undecided = undecided + (moving & wheels.detected).to(likelihood.dtype).unsqueeze(-1) * likelihood
 
         knows = moving & block.fixed & (of_speed < KNOWN_BLOCK**2)
         wheels = wheels.learned(levels * seen[:, None, :, None], knows)
