@@ -28,8 +28,10 @@ def sensor_table(scores: Scores, columns: Mapping[str, Sequence[str]]) -> Result
             counted = seen & used
             spread = f"{np.sqrt(np.mean(ratio[counted] ** 2)):.2f}" if counted.any() else "–"
             share = f"{100 * counted.sum() / seen.sum():.1f}" if seen.any() else "–"
-            prefix = "wheel" if sensor == "speed" else sensor
+            own = sensor == "speed"
+            prefix = "wheel" if own else sensor
             names = [n for n in of if n.startswith(f"{prefix}_") and f"std_{n}" in of]
+            names = [n for n in names if not (own and n.startswith("wheel_orders_"))]
             found = [f"{n} {_last(of[n]):.4g} ± {_last(of[f'std_{n}']):.2g}" for n in names]
             rows.append([name, sensor, str(int(seen.sum())), share, spread, ", ".join(found) or "–"])
     if not rows:

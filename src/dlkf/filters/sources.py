@@ -20,7 +20,8 @@ A source is a class with two methods, in a file of its own; it needs no change o
 
 and every command takes it behind a filter's name: ``model=mbkf21_nhc+speed_limit:SpeedLimit``. One that belongs to a
 sensor names its table of the dataset (``table``) and the error states that it adds (``parameters``), as wheel speed,
-heading and barometer do (:mod:`dlkf.filters.aids`); ``docs/developing.md`` has an example.
+heading and barometer do (:mod:`dlkf.filters.aids`); ``docs/developing.md`` has an example. One without a table may name
+``columns`` of the output and give them by ``describe(epoch, memory, rows, P)``, as wheel orders do.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from functools import cached_property
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dlkf.data.drive import Batch
@@ -98,10 +99,17 @@ class Source(Protocol):
 def describe_aid(epoch: Epoch, name: str, rows: Measurement | None, P: Float[Tensor, "B n n"]) -> Float[Tensor, "B 3"]:
     """Of a further sensor's first row: innovation, its 1σ (NaN where there was no sample), whether it counted."""
     seen = aid_of(epoch, name)
+    return describe_row(epoch, rows, P, None if seen is None else seen[:, 4] > 0)
+
+
+def describe_row(
+    epoch: Epoch, rows: Measurement | None, P: Float[Tensor, "B n n"], seen: Bool[Tensor, " B"] | None
+) -> Float[Tensor, "B 3"]:
+    """Of the first row: innovation, its 1σ (NaN where it was not ``seen``), whether it counted."""
     if rows is None or seen is None:
         return epoch.z.new_tensor([[torch.nan, torch.nan, 0.0]]).expand(len(epoch.z), -1)
     std = (predicted_variance(P, rows.H[:, :1]) + rows.R[:, :1]).sqrt()
-    said = torch.where(seen[:, 4:] > 0, torch.cat((rows.z[:, :1], std), -1), torch.nan)
+    said = torch.where(seen.unsqueeze(-1), torch.cat((rows.z[:, :1], std), -1), torch.nan)
     return torch.cat((said, rows.used[:, :1].to(said.dtype)), -1)
 
 

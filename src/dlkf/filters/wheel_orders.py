@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -42,7 +42,7 @@ from dlkf.filters.order_spectrum import (
     log_likelihood,
     log_lines,
 )
-from dlkf.filters.sources import Measurement, Predicted, predicted_variance
+from dlkf.filters.sources import Measurement, Predicted, describe_row, predicted_variance
 from dlkf.filters.tuning import Tuning
 from dlkf.filters.wheel_line import WheelLine
 from dlkf.navigation.state import ACCEL, ErrorStates
@@ -170,6 +170,10 @@ class WheelOrders:
     imu: object
     tuning: Tuning
     states: ErrorStates
+    columns: ClassVar[tuple[str, ...]] = (
+        "wheel_orders_innovation", "wheel_orders_innovation_std", "wheel_orders_used",
+        "wheel_orders_circumference_m", "std_wheel_orders_circumference_m",
+    )  # fmt: skip
 
     @property
     def code(self) -> WheelOrders:
@@ -216,6 +220,16 @@ class WheelOrders:
             block=_emptied(memory.block, done), line=line, wheels=chosen(done, wheels, memory.wheels),
             undecided=chosen(done, kept, memory.undecided),
         )  # fmt: skip
+
+    def describe(
+        self, epoch: Epoch, memory: OrdersMemory, rows: Measurement | None, P: Float[Tensor, "B n n"]
+    ) -> Float[Tensor, "B 5"]:
+        """What is to be said of an update interval: :attr:`columns`; NaN where nothing was measured, or is detected."""
+        wheels = memory.wheels
+        said = describe_row(epoch, rows, P, None if rows is None else wheels.detected & (rows.R[:, 0] > 0))
+        length = torch.exp(-wheels.log_turns)
+        found = torch.stack((length, length * wheels.variance.clamp_min(0.0).sqrt()), -1)
+        return torch.cat((said, torch.where(wheels.detected.unsqueeze(-1), found, torch.nan)), -1)
 
     def _shown(self, epoch: Epoch, memory: OrdersMemory, prediction: Predicted) -> WheelLine:
         """What the phase of the lines shows after a part that is over."""

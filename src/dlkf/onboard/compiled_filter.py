@@ -27,7 +27,7 @@ import dlkf
 from dlkf.base.console import warn_once
 from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
-from dlkf.filters.aids.attach import tables_of
+from dlkf.filters.aids.attach import aid_columns, tables_of
 from dlkf.filters.integration import BatchSolution, Correction, Estimator, Fix, Step, WholeLoop, integrate
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.smoother import Filter, SmoothedSolution
@@ -67,7 +67,7 @@ class CompiledFilter(WholeLoop):
         self, estimator: Estimator, grid: Grid, layout: Layout, library: Library, *, whole: bool = False
     ) -> None:
         self.estimator, self.grid, self.layout, self.library, self.whole = estimator, grid, layout, library, whole
-        self._aids = tables_of(estimator)
+        self._aids, self._columns = tables_of(estimator), aid_columns(estimator)
         self._vector = Vector if can_reanchor(layout.like.memory) else FixedVector
 
     def __reduce__(self) -> tuple[Callable, tuple]:
@@ -104,7 +104,7 @@ class CompiledFilter(WholeLoop):
         error = ImuError(bias, self.layout.field("error.matrix", vector))
         std = x["std"] if self._has_std else None
         answer = Correction(x["prior"].new_zeros(1, 9), error, std=std, accepted=x["used"][:, 0] > 0.5)
-        answer = answer._replace(aids=x["aids"] if self._aids else None)
+        answer = answer._replace(aids=x["aids"] if self._columns else None)
         step = Step(_state(x["prior"]), _state(x["posterior"]), error, x["innovation"], x["error"], answer)
         return memory._replace(numbers=vector), step
 
@@ -131,7 +131,7 @@ class CompiledFilter(WholeLoop):
             std=x["std"] if self._has_std else None, gain=None,
             innovation_covariance=x["innovation_covariance"].unflatten(-1, (6, 6)),
             position_covariance=x["position_covariance"].unflatten(-1, (2, 2)),
-            aids=x["aids"] if self._aids else None,
+            aids=x["aids"] if self._columns else None,
         )  # fmt: skip
 
     def _run(self, memory: Tensor, imu: Tensor, fixes: Tensor, epochs: list[int]) -> list[Tensor]:

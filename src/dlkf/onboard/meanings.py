@@ -19,6 +19,12 @@ COLUMNS = {  # of a row, at the IMU; before the last part of a name that is an a
     "accel_error": "accelerometer error {}, measured less true [m/s²]",
     "gyro_error": "gyroscope error {}, measured less true [rad/s]",
 }
+WHEEL_ORDERS = {
+    "wheel_orders_innovation": "ln of the speed that wheel orders show over the filter's",
+    "wheel_orders_innovation_std": "1σ of that",
+    "wheel_orders_used": "1 where that was used, else 0",
+    "wheel_orders_circumference_m": "circumference of the tyre whose orders are used [m]",
+}
 SENSOR = {  # of a further sensor, after its name
     "_innovation": "sample of the sensor {} less expected, in its unit",
     "_innovation_std": "1σ of that of the sensor {}, in its unit",
@@ -151,8 +157,8 @@ def of_column(name: str) -> str:
             return said + of_column(name.removeprefix(head))
     if name.startswith("std_"):
         return "1σ of " + of_column(name.removeprefix("std_"))
-    if name in COLUMNS:
-        return COLUMNS[name]
+    if (said := {**COLUMNS, **WHEEL_ORDERS}.get(name)) is not None:
+        return said
     for tail, said in SENSOR.items():
         if name.endswith(tail):
             return said.format(name.removesuffix(tail))

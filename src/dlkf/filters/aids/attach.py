@@ -88,11 +88,17 @@ def tables_of(model: Any) -> tuple[AidTable, ...]:
 
 def aid_columns(model: Any) -> tuple[str, ...]:
     """A filter's output about its sensors, in the order of :attr:`dlkf.filters.integration.Correction.aids`:
-    innovation, its 1σ and whether it counted of each, then the estimates of their parameters, then their 1σ."""
+    innovation, its 1σ and whether it counted of each, with what wheel orders found behind theirs, then the estimates of
+    the sensors' parameters, then their 1σ."""
     inner = model.filter if isinstance(model, SmoothedSolution) else getattr(model, "estimator", model)
     inner = getattr(inner, "kalman", inner)
     states: ErrorStates = getattr(inner, "states", ErrorStates())
-    said = [f"{t.name}_{x}" for t in tables_of(model) for x in ("innovation", "innovation_std", "used")]
+    said: list[str] = []
+    for source in getattr(inner, "sources", ()):
+        if (table := getattr(source, "table", None)) is not None:
+            said += (f"{table.name}_{x}" for x in ("innovation", "innovation_std", "used"))
+        else:
+            said += getattr(source, "columns", ())
     return (*said, *states.others, *(f"std_{name}" for name in states.others))
 
 
