@@ -216,9 +216,9 @@ def test_other_update_intervals_detect_the_wheel_too(epoch_s):
 def test_the_likelihood_of_a_line_is_highest_where_it_stands_and_flat_for_a_car_without():
     levels = torch.zeros(1, 6, len(ORDERS), LINES, dtype=torch.float64)
     levels[..., 0, 20], levels[..., 1, 20] = 2.0, 1.5
-    excess = torch.zeros(1, 6, len(ORDERS), dtype=torch.float64)
+    excess = torch.zeros(1, 6, len(ORDERS), 1, dtype=torch.float64)
     assert not log_likelihood(levels, excess).any()
-    excess[..., :2] = 1.0
+    excess[:, :, :2] = 1.0
     said = log_likelihood(levels, excess)
     assert said.argmax() == 20 and said[0, 20] > 0 > said[0, 0]
 
@@ -235,7 +235,7 @@ def test_what_a_gaussian_density_says_is_found_again():
 
 def test_it_detects_the_wheels_and_knows_their_turns():
     found = memory(cars(4, 100, wheel, 1))
-    assert found.wheels.detected.all() and (found.line.evidence.sum(1).amax(1) > DETECTED).all()
+    assert found.wheels.detected.all() and (found.line.by_phase.nats.sum(1).amax(1) > DETECTED).all()
     assert torch.allclose(torch.exp(found.wheels.log_turns), torch.tensor(TURNS).double(), rtol=4e-3)
 
 

@@ -122,11 +122,12 @@ def _over_neighbours(power: Float[Tensor, "B 6 O K"]) -> Float[Tensor, "B 6 O K"
     return (above - below) / _neighbours(power.dtype, power.device)
 
 
-def log_likelihood(levels: Float[Tensor, "B 6 O K"], excess: Float[Tensor, "B 6 O"]) -> Float[Tensor, "B K"]:
-    """ln Λ of every line, if the lines of this car stand out by ``excess`` (mean log level; 0: not at all)."""
+def log_likelihood(levels: Float[Tensor, "B 6 O K"], excess: Float[Tensor, "B 6 O k"]) -> Float[Tensor, "B K"]:
+    """ln Λ of every line, if the lines of this car stand out by ``excess`` (mean log level; 0: not at all), one for all
+    lines or each its own."""
     rho = torch.exp(excess.clamp(0, 3)) - 1
     power = torch.exp(levels - MEAN_LOG).clamp_max(LARGEST)
-    of_order = SHARE * (power * (rho / (1 + rho)).unsqueeze(-1) - torch.log1p(rho).unsqueeze(-1)).sum(1)
+    of_order = SHARE * (power * (rho / (1 + rho)) - torch.log1p(rho)).sum(1)
     return of_order.clamp(-LIMIT, LIMIT).sum(1)
 
 

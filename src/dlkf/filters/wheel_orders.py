@@ -1,7 +1,7 @@
 """Speed from the wheels' orders in the vibration that an IMU measures: a wheel sensor without a wheel.
 
-While fixes show the speed, the phase that lines in the spectrum over the distance covered keep
-(:mod:`dlkf.filters.wheel_line`) shows which of them is a wheel's, and so how often it turns in a metre, κ; the mean of
+While fixes show the speed, the phase that lines in the spectrum over the distance covered keep, and their power, show
+which of them is a wheel's (:mod:`dlkf.filters.wheel_line`), and so how often it turns in a metre, κ; the mean of
 spectra over blocks of some 3 s shows by how much it stands out. In an outage the line of a block stands at κ v̄/v̂ for
 the true and the filter's own mean speed, which makes a measurement of the speed (chassis vibrations: Lindfors et al.
 2016),
@@ -50,6 +50,7 @@ from dlkf.navigation.state import ACCEL, ErrorStates
 PART_S, BLOCK_S = 1.0, 3.0  # whose phase counts, and whose power
 SLOWEST = 3.0  # m/s: below, the orders lie among the car's own motion
 KNOWN, KNOWN_BLOCK = 0.04, 0.02  # relative 1σ of a speed that shows a line, and of one that teaches its power
+FIRST_BLOCKS = 3  # before power is predicted
 MEMORY = 75.0  # blocks of the averages
 WANDER = 1e-4  # of ln κ, per √block
 DRIFT = 0.01  # in ln v, by which a filter's speed may drift from block to block
@@ -212,8 +213,8 @@ class WheelOrders:
         done = over & (memory.block.elapsed > block_s - 0.5 * span)
         if may_branch(done) and not bool(done.any()):
             return None, memory
-        line = memory.line.from_here(memory.block.distance, done)
-        row, wheels, undecided = self._judged(epoch, memory, prediction, done)
+        row, wheels, undecided, line = self._judged(epoch, memory, prediction, done)
+        line = chosen(done, line, memory.line).from_here(memory.block.distance, done)
         kept = torch.where(epoch.used.any(-1, keepdim=True) | row.used, 0.0, undecided)
         nothing = Measurement(*map(torch.zeros_like, row))
         return chosen(done, row, nothing), memory._replace(
@@ -241,7 +242,7 @@ class WheelOrders:
 
     def _judged(
         self, epoch: Epoch, memory: OrdersMemory, prediction: Predicted, done: Bool[Tensor, " B"]
-    ) -> tuple[Measurement, Wheels, Float[Tensor, "B K"]]:
+    ) -> tuple[Measurement, Wheels, Float[Tensor, "B K"], WheelLine]:
         """The row of a block that is done, what is known after it, and what the blocks since the last row say."""
         block, before = memory.block, memory.wheels
         levels = log_levels(block.spectrum)
@@ -250,13 +251,16 @@ class WheelOrders:
 
         H = self._matrix(epoch, 0.5 * block.elapsed, speed)
         of_speed = predicted_variance(prediction.P, H)[:, 0]
-        wheels = before.of_line(memory.line)
-        likelihood = log_likelihood(levels, wheels.excess() * seen.unsqueeze(1))
+        levels = levels * seen[:, None, :, None]
+        knows = moving & block.fixed & (of_speed < KNOWN_BLOCK**2)
+        by_power, judged = log_likelihood(levels, before.levels), knows & (before.blocks >= FIRST_BLOCKS)
+        line = memory.line.with_power(by_power, block.elapsed, torch.log(speed), judged)
+        wheels = before.of_line(line)
+        likelihood = log_likelihood(levels, (wheels.excess() * seen.unsqueeze(1)).unsqueeze(-1))
         undecided = _diffused(memory.undecided)
         undecided = undecided + (moving & wheels.detected).to(likelihood.dtype).unsqueeze(-1) * likelihood
 
-        knows = moving & block.fixed & (of_speed < KNOWN_BLOCK**2)
-        wheels = wheels.learned(levels * seen[:, None, :, None], knows)
+        wheels = wheels.learned(levels, knows)
 
         off = lines - wheels.log_turns.unsqueeze(-1)
         searched = of_speed + wheels.variance + SEARCH**2
@@ -271,7 +275,7 @@ class WheelOrders:
             log_turns=wheels.log_turns + gain * z,
             variance=(1 - gain) * wheels.variance + torch.where(done, WANDER**2, 0.0),
         )
-        return Measurement(z.unsqueeze(-1), H, R.unsqueeze(-1), used.unsqueeze(-1)), wheels, undecided
+        return Measurement(z.unsqueeze(-1), H, R.unsqueeze(-1), used.unsqueeze(-1)), wheels, undecided, line
 
     def _seen(self, epoch: Epoch, speed: Float[Tensor, " B"]) -> Float[Tensor, "B O"]:
         """Which orders are below the sampling's limit at a speed."""
