@@ -12,6 +12,7 @@ from dlkf.data.stack import DriveStack
 from dlkf.data.store import drive_from_tables
 from dlkf.data.tables import DriveRow
 from dlkf.data.validate import CheckedTables
+from dlkf.filters.aids.attach import aid_columns
 from dlkf.filters.build import build_filter, is_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.order_spectrum import (
@@ -237,6 +238,17 @@ def test_it_detects_the_wheels_and_knows_their_turns():
     found = memory(cars(4, 100, wheel, 1))
     assert found.wheels.detected.all() and (found.line.by_phase.nats.sum(1).amax(1) > DETECTED).all()
     assert torch.allclose(torch.exp(found.wheels.log_turns), torch.tensor(TURNS).double(), rtol=4e-3)
+
+
+def test_it_writes_what_it_measured_and_the_tyre_that_it_found():
+    batch = cars(3, 120, wheel, 1)
+    said = dict(zip(aid_columns(build_filter(AIDED, ROUGH)), run(batch, AIDED).aids.unbind(-1)))
+    found = said["wheel_orders_circumference_m"]
+    assert found[:, :5].isnan().all() and torch.allclose(found[:, -1], torch.tensor(1 / TURNS).double(), rtol=4e-3)
+    assert ((found[:, -1] - 1 / TURNS).abs() < 4 * said["std_wheel_orders_circumference_m"][:, -1]).all()
+    used = said["wheel_orders_used"] > 0
+    ratio = (said["wheel_orders_innovation"] / said["wheel_orders_innovation_std"])[used]
+    assert used.any() and float(ratio.square().mean()) < 2 and said["wheel_orders_innovation"][:, 0].isnan().all()
 
 
 def test_it_holds_the_speed_in_an_outage_and_says_how_well():

@@ -191,8 +191,8 @@ class Mbkf:
                 prediction = prediction._replace(rolling=rolling, stopped=getattr(of_source, "stopped", None))
             if (table := getattr(source, "table", None)) is not None:
                 said.append(describe_aid(epoch, table.name, rows, prediction.P))
-            elif hasattr(source, "columns"):
-                said.append(source.describe(epoch, of_source, rows, prediction.P))
+            elif (describe := getattr(source, "describe", None)) is not None:
+                said.append(describe(epoch, of_source, rows, prediction.P))
             if rows is not None:
                 H, R = mask_rows(rows.H, rows.R, rows.used)
                 parts.append(Measurement(rows.z * rows.used, H, R, rows.used))
