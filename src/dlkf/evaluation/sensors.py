@@ -32,7 +32,8 @@ def sensor_table(scores: Scores, columns: Mapping[str, Sequence[str]]) -> Result
             prefix = "wheel" if own else sensor
             names = [n for n in of if n.startswith(f"{prefix}_") and f"std_{n}" in of]
             names = [n for n in names if not (own and n.startswith("wheel_orders_"))]
-            found = [f"{n} {_last(of[n]):.4g} ± {_last(of[f'std_{n}']):.2g}" for n in names]
+            known = [n for n in names if np.isfinite(of[n]).any()]
+            found = [f"{n} {_last(of[n]):.4g} ± {_last(of[f'std_{n}']):.2g}" for n in known]
             rows.append([name, sensor, str(int(seen.sum())), share, spread, ", ".join(found) or "–"])
     if not rows:
         return None
