@@ -90,16 +90,21 @@ def _crossed(of: Float[Tensor, "B m grids"]) -> tuple[Float[Tensor, "B m coarse 
 
 def log_levels(spectrum: Float[Tensor, "B 6 waves"]) -> Float[Tensor, "B 6 O K"]:
     """ln of the power of every axis, order and line over its neighbours'."""
-    power = torch.log(_power(spectrum))
-    return power - _over_neighbours(power)
+    return _log_levels(_power(spectrum))
 
 
 def relative(spectrum: Float[Tensor, "B 6 waves"]) -> Float[Tensor, "B 6 waves"]:
     """The spectrum in units of the noise's amplitude, which its neighbours show, limited."""
     power = _power(spectrum)
-    scale = torch.exp(-0.5 * (_over_neighbours(torch.log(power)) + MEAN_LOG))
-    scale = torch.minimum(scale, LARGEST_AMPLITUDE * power.rsqrt()).flatten(2)
+    amplitude = torch.exp(0.5 * (_log_levels(power) - MEAN_LOG)).clamp_max(LARGEST_AMPLITUDE)
+    scale = (amplitude * power.rsqrt()).flatten(2)
     return spectrum * torch.cat((scale, scale), -1)
+
+
+def _log_levels(power: Float[Tensor, "B 6 O K"]) -> Float[Tensor, "B 6 O K"]:
+    """ln of a power over its neighbours'."""
+    power = torch.log(power)
+    return power - _over_neighbours(power)
 
 
 def _split(waves: Float[Tensor, "B n waves"]) -> tuple[Tensor, Tensor]:

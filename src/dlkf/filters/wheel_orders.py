@@ -216,7 +216,10 @@ class WheelOrders:
         row, wheels, undecided, line = self._judged(epoch, memory, prediction, done)
         line = chosen(done, line, memory.line).from_here(memory.block.distance, done)
         kept = torch.where(epoch.used.any(-1, keepdim=True) | row.used, 0.0, undecided)
-        nothing = Measurement(*map(torch.zeros_like, row))
+        zeros, B = epoch.z.new_zeros, len(epoch.z)  # zeros like the row's would need the row, in C at any time
+        nothing = Measurement(
+            zeros(B, 1), zeros(B, 1, self.states.count), zeros(B, 1), zeros(B, 1, dtype=torch.bool)
+        )  # fmt: skip
         return chosen(done, row, nothing), memory._replace(
             block=_emptied(memory.block, done), line=line, wheels=chosen(done, wheels, memory.wheels),
             undecided=chosen(done, kept, memory.undecided),
