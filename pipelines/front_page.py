@@ -26,8 +26,8 @@ FILTERS = {  # in the table: its text
     "ins": "INS, strapdown from the last fix",
     "mbkf15": "EKF, 15 states",
     "mbkf21_car": "EKF with vehicle constraints",
-    "plus": "the same, finds its IMU's noise while it runs, default of `navigate`",
-    "dlkf": "the paper's network, trained on this IMU",
+    "plus": "the same, finds wheels and noise in its IMU while it runs, default of `navigate`",
+    "dlkf": "the paper's network, trained on this IMU (24 epochs)",
 }
 QUICK = ("+experiment=outage", "+profile=quick", "baselines.models=[mbkf15]", "baselines.tune=false",
          "scoring.hour=null", "scoring.after_s=[]")  # fmt: skip
