@@ -18,8 +18,6 @@ COLUMNS = {  # of a row, at the IMU; before the last part of a name that is an a
     "vel": "velocity {} [m/s]",
     "accel_error": "accelerometer error {}, measured less true [m/s²]",
     "gyro_error": "gyroscope error {}, measured less true [rad/s]",
-}
-WHEEL_ORDERS = {
     "wheel_orders_innovation": "ln of the speed that wheel orders show over the filter's",
     "wheel_orders_innovation_std": "1σ of that",
     "wheel_orders_used": "1 where that was used, else 0",
@@ -159,8 +157,8 @@ def of_column(name: str) -> str:
             return said + of_column(name.removeprefix(head))
     if name.startswith("std_"):
         return "1σ of " + of_column(name.removeprefix("std_"))
-    if (said := {**COLUMNS, **WHEEL_ORDERS}.get(name)) is not None:
-        return said
+    if name in COLUMNS:
+        return COLUMNS[name]
     for tail, said in SENSOR.items():
         if name.endswith(tail):
             return said.format(name.removesuffix(tail))
