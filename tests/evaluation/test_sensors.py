@@ -37,14 +37,14 @@ def test_a_row_for_each_filter_and_sensor():
     assert sensor_table(score({"plain": plain}, [batch]), columns) is None
 
 
-def test_wheel_orders_have_a_row_of_their_own_beside_a_wheel_sensor():
+def test_speed_from_vibration_has_a_row_of_its_own_beside_a_wheel_sensor():
     batch = car_batch(2, 30)
     forward = (batch.truth.C_nb[..., 0] * batch.truth.v_n).sum(-1)
     zero = torch.zeros_like(forward)
     batch = replace(batch, aids={"speed": torch.stack((forward, zero, zero, zero, zero + 1), -1)})
-    model = with_aids(build_filter("mbkf21_car+wheel_orders", IMU), [STANDARD["speed"]])
+    model = with_aids(build_filter("mbkf21_car+vibration_speed", IMU), [STANDARD["speed"]])
     table = sensor_table(score({"both": model}, [batch]), {"both": aid_columns(model)})
     assert table is not None
-    speed, orders = table.rows
-    assert speed[1] == "speed" and "wheel_scale" in speed[-1] and "wheel_orders" not in speed[-1]
-    assert orders == ["both", "wheel_orders", "0", "–", "–", "–"]  # this car does not shake
+    speed, vibration = table.rows
+    assert speed[1] == "speed" and "wheel_scale" in speed[-1] and "vibration" not in speed[-1]
+    assert vibration[:2] == ["both", "vibration_speed"] and vibration[-1] == "–"  # this car does not shake

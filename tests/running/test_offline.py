@@ -44,23 +44,21 @@ def driven(seed: int) -> TrackOnMap:
     return TrackOnMap(Navigated(f"d{seed}", 0.0, table, innovation), fixes)
 
 
-def with_wheel(course: TrackOnMap, circumference: float, used: int) -> TrackOnMap:
-    """With the columns of wheel orders, a wheel found in the second half."""
-    table = course.result.table.assign(wheel_orders_circumference_m=np.nan, wheel_orders_used=0.0)
-    table.loc[600:, "wheel_orders_circumference_m"] = circumference
-    table.loc[600 : 599 + used, "wheel_orders_used"] = 1.0
+def with_vibration(course: TrackOnMap, share: float, used: int) -> TrackOnMap:
+    """With the columns of speed from vibration, which is trusted in the second half."""
+    table = course.result.table.assign(vibration_speed_share=0.02, vibration_speed_used=0.0)
+    table.loc[600:, "vibration_speed_share"] = share
+    table.loc[600 : 599 + used, "vibration_speed_used"] = 1.0
     return course._replace(result=replace(course.result, table=table))
 
 
-def test_the_summary_says_in_which_drives_a_wheel_was_found():
+def test_the_summary_says_in_which_drives_vibration_shows_the_speed():
     a, b = driven(0), driven(1)
-    assert not [line for line in summary_lines("mbkf15", [a, b]) if "wheel" in line]
-    none = with_wheel(b, np.nan, 0)
-    assert summary_lines("plus", [none])[2] == "Wheel orders: no wheel found in the vibration of the IMU."
-    said = summary_lines("plus", [with_wheel(a, 1.88, 7), none])[2]
-    assert said == "Wheel orders: a wheel in 1 of 2 drives, circumference 1.88 m; 7 measurements of speed used."
-    said = summary_lines("plus", [with_wheel(a, 1.8, 7), with_wheel(b, 1.9, 2)])[2]
-    assert "2 of 2 drives, circumference 1.80 to 1.90 m; 9 measurements" in said
+    assert not [line for line in summary_lines("mbkf15", [a, b]) if "vibration" in line]
+    none = with_vibration(b, 0.05, 0)
+    assert summary_lines("plus", [none])[2] == "Speed from vibration: the spectrum of the IMU does not show it."
+    said = summary_lines("plus", [with_vibration(a, 0.4, 7), none])[2]
+    assert said == "Speed from vibration: the spectrum of the IMU shows it in 1 of 2 drives; 7 measurements used."
 
 
 def test_drives_without_plots_of_their_own_are_kept_small_and_shown_the_same():

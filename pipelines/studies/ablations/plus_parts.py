@@ -31,16 +31,16 @@ class AsClaimed(PlusFilter):
 
 
 def parts(folder: str) -> dict[str, Estimator]:
-    """``plus`` with neither levels nor network, with one of them, with positions as claimed, without wheel orders."""
+    """``plus`` with neither levels nor network, with one of them, with positions as claimed, without vibration."""
     whole = trained_filter(folder)
     assert isinstance(whole, PlusFilter)
     found: dict[str, Estimator] = {}
     kinds = {"neither levels nor network": (WithoutLevels, False), "no network": (PlusFilter, False)}
     kinds["no levels"] = (WithoutLevels, True)
     kinds["positions as claimed"] = (AsClaimed, True)
-    kinds["no wheel orders"] = (PlusFilter, True)
+    kinds["no speed from vibration"] = (PlusFilter, True)
     for name, (kind, network) in kinds.items():
-        config = replace(whole.config, base="mbkf33_car") if name == "no wheel orders" else whole.config
+        config = replace(whole.config, base="mbkf33_car") if name == "no speed from vibration" else whole.config
         found[name] = part = kind(config).eval()
         part.load_state_dict(whole.state_dict())
         if not network:

@@ -28,8 +28,8 @@ def sensor_table(scores: Scores, columns: Mapping[str, Sequence[str]]) -> Result
             counted = seen & used
             spread = f"{np.sqrt(np.mean(ratio[counted] ** 2)):.2f}" if counted.any() else "–"
             share = f"{100 * counted.sum() / seen.sum():.1f}" if seen.any() else "–"
-            prefix, other = ("wheel_", "wheel_orders_") if sensor == "speed" else (f"{sensor}_", " ")
-            names = [n for n in of if n.startswith(prefix) and not n.startswith(other) and f"std_{n}" in of]
+            prefix = "wheel_" if sensor == "speed" else f"{sensor}_"
+            names = [n for n in of if n.startswith(prefix) and f"std_{n}" in of]
             found = [f"{n} {_last(of[n]):.4g} ± {_last(of[f'std_{n}']):.2g}" for n in names if np.isfinite(of[n]).any()]
             rows.append([name, sensor, str(int(seen.sum())), share, spread, ", ".join(found) or "–"])
     if not rows:

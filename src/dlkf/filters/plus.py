@@ -70,7 +70,7 @@ class PlusConfig:
     """A ``plus`` filter: its classical filter and the size of its network."""
 
     kind: Literal["plus"] = "plus"
-    base: str = "mbkf33_car+wheel_orders"
+    base: str = "mbkf33_car+vibration_speed"
     network: PlusNetworkConfig = field(default_factory=PlusNetworkConfig)
     tuning: Mapping[str, float] = field(default_factory=lambda: dict(START_TUNING))
     imu: Mapping[str, Any] = field(default_factory=lambda: dict(ANY_MEMS))

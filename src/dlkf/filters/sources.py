@@ -21,7 +21,7 @@ A source is a class with two methods, in a file of its own; it needs no change o
 and every command takes it behind a filter's name: ``model=mbkf21_nhc+speed_limit:SpeedLimit``. One that belongs to a
 sensor names its table of the dataset (``table``) and the error states that it adds (``parameters``), as wheel speed,
 heading and barometer do (:mod:`dlkf.filters.aids`); ``docs/developing.md`` has an example. One without a table may name
-``columns`` of the output and give them by ``describe(epoch, memory, rows, P)``, as wheel orders do.
+``columns`` of the output and give them by ``describe(epoch, memory, rows, P)``, as speed from vibration does.
 """
 
 from __future__ import annotations

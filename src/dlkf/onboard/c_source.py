@@ -99,7 +99,8 @@ def write_source(
     parts = [heading(), *(x.code for x in done.values()), loop, anchor]
     (folder / "step.c").write_text("\n".join(parts))
     large = "".join(x.weights for x in done.values())
-    (folder / "weights.c").write_text(f"/* Weights of the filter, made by dlkf.export. */\n#include <math.h>\n{large}")
+    head = "/* Weights of the filter, made by dlkf.export. */\n#include <math.h>\n#include <stdint.h>\n"
+    (folder / "weights.c").write_text(head + large)
     of_search = Headings.none() if loop_alone else _headings(grid.samples, grid.dt)
     values = _sizes(estimator, layout, grid, name, max(x.work for x in done.values()), "anchor" in done)
     room = max(int(values["WORK"]), -(-of_search.work // 8) + 2 * of_search.size)

@@ -22,7 +22,7 @@ SHOWN = ("t", "lat_deg", "lon_deg", "vel_n", "vel_e", "std_pos_n", "std_pos_e", 
 FEW_NAMED = 3  # drives in a sentence
 GAP_S = 3.0  # longer without a fix is an outage
 STANDING = 0.15  # m/s
-CIRCUMFERENCE = "wheel_orders_circumference_m"  # a column of the solution
+SHARE, SHOWS = "vibration_speed_share", 0.1  # a column of the solution, and from where on vibration shows a speed
 R2D = 180 / np.pi
 
 
@@ -106,21 +106,20 @@ def summary_lines(model: str, courses: Sequence[TrackOnMap]) -> list[str]:
     refused = [f"{c.result.refused} of {c.result.drive}" for c in courses if any(c.result.refused)]
     more = f" and of {len(refused) - FEW_NAMED} more drives" if len(refused) > FEW_NAMED else ""
     said = [f"Refused beyond physical limits: {', '.join(refused[:FEW_NAMED])}{more}."] if refused else []
-    return [lead, text, *wheel_lines(courses), *said]
+    return [lead, text, *vibration_lines(courses), *said]
 
 
-def wheel_lines(courses: Sequence[TrackOnMap]) -> list[str]:
-    """In which drives wheel orders showed a wheel; none where the filter has no wheel orders."""
-    tables = [c.result.table for c in courses if CIRCUMFERENCE in c.result.table]
+def vibration_lines(courses: Sequence[TrackOnMap]) -> list[str]:
+    """In which drives the vibration showed the speed; none where the filter does not look at it."""
+    tables = [c.result.table for c in courses if SHARE in c.result.table]
     if not tables:
         return []
-    last = [t[CIRCUMFERENCE].dropna().iloc[-1:] for t in tables]
-    found, used = np.concatenate(last), sum(int(t["wheel_orders_used"].sum()) for t in tables)
-    if not len(found):
-        return ["Wheel orders: no wheel found in the vibration of the IMU."]
-    size = f"{found.min():.2f} m" if np.ptp(found) < 0.005 else f"{found.min():.2f} to {found.max():.2f} m"
-    where = f"in {len(found)} of {len(tables)} drives" if len(tables) > 1 else "found"
-    return [f"Wheel orders: a wheel {where}, circumference {size}; {used} measurements of speed used."]
+    shows = sum(float(t[SHARE].max()) > SHOWS for t in tables)
+    used = sum(int(t["vibration_speed_used"].sum()) for t in tables)
+    if not shows:
+        return ["Speed from vibration: the spectrum of the IMU does not show it."]
+    where = f" in {shows} of {len(tables)} drives" if len(tables) > 1 else ""
+    return [f"Speed from vibration: the spectrum of the IMU shows it{where}; {used} measurements used."]
 
 
 def duration(hours: float) -> str:

@@ -15,11 +15,11 @@ from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.smoother import SmoothedSolution
 from dlkf.filters.sources import Source
-from dlkf.filters.wheel_orders import WheelOrders
+from dlkf.filters.vibration_speed import VibrationSpeed
 from dlkf.navigation.state import ErrorStates
 
 SENSORS: Mapping[str, type[Source]] = {"speed": WheelSpeed, "heading": DualAntennaHeading, "baro": Barometer}
-SOURCES: Mapping[str, type[Source]] = {**SENSORS, "wheel_orders": WheelOrders}  # that stand behind a plus
+SOURCES: Mapping[str, type[Source]] = {**SENSORS, "vibration_speed": VibrationSpeed}  # that stand behind a plus
 
 
 def add_sources(kalman: Mbkf, kinds: Sequence[type[Source]]) -> Mbkf:
