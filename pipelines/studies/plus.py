@@ -140,7 +140,7 @@ def _case(
 
 
 def constants() -> dict[str, Estimator]:
-    """The filters with factors of ``conf/tuning``, with ``automotive_mems``, without ``vibration_speed`` and with it."""
+    """The filters with factors of ``conf/tuning``, with ``automotive_mems``, without ``vibration_speed`` and with."""
     imu, found = imu_preset("automotive_mems"), {}
     for vibration in ("", "+vibration_speed"):
         for kind, tunings in CONSTANTS.items():

@@ -2,11 +2,11 @@
 
     python -m pipelines.studies.vibration_speed --real data/real
 
-Runs ``plus`` over the outages of :mod:`pipelines.studies.plus`. A row for each dataset: the drives and those whose
-spectrum was trusted at the end of a run; then of the measurements of ln(true speed / speed of the filter) in outages that
-were used: how many, which share of the blocks in motion they are, the slope of a line through them and what the reference
-says (1: they show the error that there is), their RMS against the reference, the RMS of their own 1σ, and that of the
-error before them.
+Runs ``plus`` over the outages of :mod:`pipelines.studies.plus`. A row for each dataset: the drives, and those whose
+spectrum was trusted at the end of a run; then, of the measurements of ln(true speed / speed of the filter) that were
+used in outages: how many, which share of the blocks in motion they are, the slope of a line through them and what the
+reference says (1: they show the error that there is), their RMS against the reference, the RMS of their own 1σ, and that
+of the error before them.
 """
 
 from __future__ import annotations

@@ -57,6 +57,26 @@ def test_jacobian_matches_finite_differences():
         assert (numeric - H[:, i]).abs().max() < 1e-4, i
 
 
+def test_a_knock_counts_for_its_weight_and_not_for_its_size():
+    """Within 3σ a row has its own variance; beyond, one in proportion to the innovation's square."""
+    batch = scene(1, 1, seed=3)
+    rules = CarConstraints(Tuning(), STATES)
+    P = 1e-4 * torch.eye(STATES.count, dtype=D).unsqueeze(0)
+    C_nb = batch.start.C_nb[0]
+    correction, variances = [], []
+    for sideways in (0.1, 2.0, 4.0):
+        state = batch.start._replace(v_n=(C_nb @ torch.tensor([10.0, sideways, 0.0], dtype=D)).unsqueeze(0))
+        row, _ = rules.rows(
+            epoch_of(batch, state, ImuError(torch.zeros(1, 6, dtype=D))), rules.begin(batch), Predicted(P)
+        )
+        variances.append(float(row.R[0, 0]))
+        S = float(row.H[0, 0] @ P[0] @ row.H[0, 0]) + variances[-1]
+        correction.append(abs(float(row.z[0, 0])) / S)
+    assert variances[0] == pytest.approx(Tuning().lateral_std ** 2) and variances[1] > variances[0]
+    assert variances[2] == pytest.approx(4 * variances[1], rel=0.05)
+    assert correction[2] < correction[1]
+
+
 def test_a_car_at_rest_feels_the_earth_turn():
     """Tilted, on error-free sensors: the innovation of the rate is zero to rounding, not the Earth's 7e-5 rad/s."""
     batch = scene(3, 1, seed=4)

@@ -32,7 +32,7 @@ from dlkf.filters.vibration_spectrum import (
     shifts,
     tone_shares,
 )
-from dlkf.filters.vibration_speed import Mean, VibrationMemory, VibrationSpeed, _foretold
+from dlkf.filters.vibration_speed import Mean, VibrationMemory, VibrationSpeed, _predictive
 from dlkf.navigation.calibration import ImuError
 from tests.cars import car
 
@@ -213,7 +213,7 @@ def test_what_a_gaussian_likelihood_says_is_found_again():
 
 def test_shares_are_worth_the_density_that_they_give_to_the_known_speed():
     off, known = shifts(torch.zeros(1).double()), torch.tensor([0.01**2]).double()
-    right, wrong = (_foretold((-0.5 * (off - m).square() / 0.02**2).unsqueeze(0), known)[0] for m in (0.0, 0.09))
+    right, wrong = (_predictive((-0.5 * (off - m).square() / 0.02**2).unsqueeze(0), known)[0] for m in (0.0, 0.09))
     assert right[0] == wrong[0] == 0 and (right.diff() > 0).all() and (wrong.diff() < 0).all()
 
 

@@ -10,6 +10,9 @@ car pitch back per specific force f_x forward (pitch gradient; Gillespie 1992). 
 they are further states of the filter. A standstill (:mod:`dlkf.filters.stationarity`) measures v = 0
 (zero-velocity update) and ω_b = Earth rate (zero-angular-rate update).
 
+A pothole or a knock turns or moves the IMU for a moment, so that a row across the car is off by many σ. Beyond
+``OUTLIER`` σ its 1σ grows in proportion to the innovation (Huber 1981: such a row counts for its weight, not its size).
+
 The 1σ of a row is that of one a second: of shorter update intervals each row has a larger one, so that a second says
 the same.
 """
@@ -26,7 +29,7 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.filters.integration import Epoch
-from dlkf.filters.sources import Measurement, Predicted
+from dlkf.filters.sources import Measurement, Predicted, predicted_variance
 from dlkf.filters.stationarity import VibrationLevel, WheelMotion, detect_stationary
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import skew
@@ -35,6 +38,7 @@ from dlkf.navigation.state import GYRO, STATES, VELOCITY, ErrorStates
 STRUCTURE_STD = (0.05, 0.05, 1.5, 0.01, 0.005)  # rad, rad, m, s²/m, s²·rad/m: what is known of a car before it moves
 STRUCTURE_WALK_STD = (2e-5, 2e-5, 1e-4, 1e-6, 1e-6)  # per √s
 SPRINGS_S = 0.3  # the springs follow the force so slowly: it is averaged over so long, at most an epoch
+OUTLIER = 3.0  # σ of an innovation across the car, from which on its 1σ grows with it
 SLOWEST = 0.5  # m/s: below, course and yaw rate do not show the vehicle parameters
 
 
@@ -76,6 +80,8 @@ class CarConstraints:
         variance = (memory.std.square() * per_second).expand(len(zn), -1)
         if epoch.advice is not None and epoch.advice.across is not None:
             variance = torch.cat((variance[:, :2] * epoch.advice.across.square(), variance[:, 2:]), -1)
+        S = predicted_variance(prediction.P, Hn) + variance[:, :2]
+        variance = torch.cat((variance[:, :2] * (zn.square() / (OUTLIER**2 * S)).clamp_min(1.0), variance[:, 2:]), -1)
         z = torch.cat((zn, zr), -1) * used
         return Measurement(z, torch.cat((Hn, Hr), 1), variance, used), memory._replace(liveliness=liveliness)
 

@@ -13,7 +13,7 @@ earlier stretches and a variance of y of π²/6, that of the logarithm of expone
 
     ln Λ(δ) = Σ_axes Σ_F [y(F) A(F e^−δ) − ½ A(F e^−δ)²] / (π²/6)
 
-against a spectrum without a shape, for as many independent frequencies as the distance can tell apart.
+against a spectrum without a shape, for as many independent frequencies as the distance resolves.
 """
 
 from __future__ import annotations

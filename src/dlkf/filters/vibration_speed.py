@@ -12,8 +12,8 @@ Resonances and tones of a fixed frequency do not follow the speed. So two means 
 frequencies in distance and one over frequencies in time, each of what the other leaves, and only the first is shifted.
 
 How far the shape can be trusted is learned too: ln Λ counts with a share from 0 to 1. While fixes show the speed, each
-of :data:`SHARES` foretells it from a block, by the density that it gives to the known δ; the mean share under these
-densities is in force. A car that shows nothing, or whose vibration misleads, gets 0, and the filter is as without this
+of :data:`SHARES` predicts δ from a block, and its evidence is the density that it gives to the known δ; the mean share
+under the evidence is in force. A car that shows nothing, or whose vibration misleads, gets 0, and the filter is as without this
 source. Training gets no rows.
 """
 
@@ -221,7 +221,7 @@ class VibrationSpeed:
 
         knows = moving & block.fixed & (of_speed < KNOWN**2)
         tried = (knows & (memory.blocks >= FIRST_BLOCKS)).to(y.dtype).unsqueeze(-1)
-        evidence = memory.evidence + tried * (_foretold(likelihood, of_speed) - memory.evidence / TRIED)
+        evidence = memory.evidence + tried * (_predictive(likelihood, of_speed) - memory.evidence / TRIED)
         learns = knows.to(y.dtype)
         on_tones = torch.bmm(weight.unsqueeze(1), tones)  # (B, 1, N)
         left = torch.bmm(weight.unsqueeze(1) * (y - of_distance), tones) / on_tones.clamp_min(1e-6)
@@ -262,7 +262,7 @@ class VibrationSpeed:
         return (H / speed.unsqueeze(-1)).unsqueeze(1)
 
 
-def _foretold(likelihood: Float[Tensor, "B O"], of_speed: Float[Tensor, " B"]) -> Float[Tensor, "B S"]:
+def _predictive(likelihood: Float[Tensor, "B O"], of_speed: Float[Tensor, " B"]) -> Float[Tensor, "B S"]:
     """ln of the density that each share gives to the known δ, less that of a share of 0.
 
     Before the block δ is N(0, ``WRONG``²); known it is as well as the filter knows its speed.
