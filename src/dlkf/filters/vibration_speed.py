@@ -13,8 +13,8 @@ frequencies in distance and one over frequencies in time, each of what the other
 
 How far the shape can be trusted is learned too: ln Λ counts with a share from 0 to 1. While fixes show the speed, each
 of :data:`SHARES` predicts δ from a block, and its evidence is the density that it gives to the known δ; the mean share
-under the evidence is in force. A car that shows nothing, or whose vibration misleads, gets 0, and the filter is as without this
-source. Training gets no rows.
+under the evidence is in force. A car that shows nothing, or whose vibration misleads, gets 0, and the filter is as
+without this source. Training gets no rows.
 """
 
 from __future__ import annotations
