@@ -242,8 +242,9 @@ def test_it_holds_the_speed_in_an_outage_and_says_how_well():
 
 
 def test_it_writes_what_it_measured_and_how_far_it_trusts():
-    said = columns(cars(3, 120, road, 1))
-    assert said["vibration_speed_innovation"][:, 0].isnan().all() and (said["vibration_speed_share"][:, -1] > 0.3).all()
+    said = columns(without_fixes(cars(3, 180, road, 1), 90))
+    assert said["vibration_speed_innovation"][:, :90].isnan().all()  # a block with fixes teaches
+    assert (said["vibration_speed_share"][:, -1] > 0.3).all()
     used = said["vibration_speed_used"] > 0
     ratio = (said["vibration_speed_innovation"] / said["vibration_speed_innovation_std"])[used]
     assert used.sum() > 50 and 0.05 < float(ratio.square().mean()) < 2

@@ -6,7 +6,8 @@ block fits it makes a measurement of the speed,
 
     z = δ = ln(v̄/v̂),    H = uᵀ δv̄ / v̂,    δv̄ = δv − L (Cε + [f_n×] δh)ᵀu    u along the velocity, L half a block
 
-with the mean and variance that the likelihood of δ has under the filter's own 1σ, widened by ``SEARCH``.
+with the mean and variance that the likelihood of δ has under the filter's own 1σ, widened by ``SEARCH``. A block with a
+fix teaches and does not measure: a shape learned at the filter's own speed must not confirm that speed.
 
 Resonances and tones of a fixed frequency do not follow the speed. So two means are learned that add up, one over
 frequencies in distance and one over frequencies in time, each of what the other leaves, and only the first is shifted.
@@ -245,7 +246,7 @@ class VibrationSpeed:
         R = 1 / (1 / torch.minimum(variance, SAYS * searched) - 1 / searched)
         z = mean * (1 + R / searched)
         plain = z.square() < OUTLIER**2 * (searched + R)
-        measured = moving & (share > LEAST_SHARE) & (memory.blocks >= FIRST_BLOCKS)
+        measured = moving & ~memory.block.fixed & (share > LEAST_SHARE) & (memory.blocks >= FIRST_BLOCKS)
         used = measured & says & plain & (of_speed < LOST_STD**2)
         R = R * (1 + TOGETHER / memory.blocks.clamp_min(1.0)) * (1 + (memory.age / UNCHECKED_S).square())
         R = torch.where(measured, R, 0.0)
