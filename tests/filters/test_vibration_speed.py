@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ from dlkf.filters.vibration_spectrum import (
     shifts,
     tone_shares,
 )
-from dlkf.filters.vibration_speed import Mean, VibrationMemory, VibrationSpeed, _predictive
+from dlkf.filters.vibration_speed import Mean, Stretch, VibrationMemory, VibrationSpeed, _predictive
 from dlkf.navigation.calibration import ImuError
 from tests.cars import car
 
@@ -209,6 +210,26 @@ def test_what_a_gaussian_likelihood_says_is_found_again():
         assert bool(row.used)
     row = source()._row(memory_, torch.zeros(1, len(off)).double(), torch.zeros(1, 1, 21), of_speed, yes)
     assert not bool(row.used)  # the prior alone says nothing
+
+
+def test_a_wrong_heading_is_no_wrong_speed():
+    """A trajectory that is turned as a whole, δv = δh × v, has the same speeds: H δx = 0, in a bend too."""
+    batch = cars(1, 4, noise)
+    made_ = source()
+    for lag in (0.0, 0.3):
+        block = Stretch.begin(batch.imu, 1)
+        block = block._replace(distance=block.distance + 36.0, elapsed=block.elapsed + 3.0, turned=block.turned + lag)
+        v, C_nb = torch.tensor([[7.0, 9.0, 0.0]]).double(), batch.start.C_nb
+        v = 12.0 * v / v.norm()
+        window = SimpleNamespace(
+            end=SimpleNamespace(v_n=v, C_nb=C_nb), gravity=torch.tensor([[0.0, 0.0, 9.8]]).double()
+        )
+        H = made_._matrix(SimpleNamespace(window=window), block)[0, 0]
+        heading = torch.tensor([0.0, 0.0, 1.0]).double()
+        dx = torch.zeros(len(H), dtype=torch.float64)
+        dx[3:6], dx[6:9] = torch.linalg.cross(heading, v[0]), heading
+        assert abs(float(H @ dx)) < 1e-9
+        assert float(H[3:6].norm()) == pytest.approx(1 / 12) and float(H[9:12].norm()) == pytest.approx(1.5 / 12)
 
 
 def test_shares_are_worth_the_density_that_they_give_to_the_known_speed():

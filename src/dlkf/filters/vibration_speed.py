@@ -4,9 +4,10 @@ The shape is that of the car and its roads (:mod:`dlkf.filters.vibration_spectru
 2016). While fixes show the speed it is learned, as the mean over blocks of some 3 s; in an outage the shift by which a
 block fits it makes a measurement of the speed,
 
-    z = δ = ln(v̄/v̂),    H = uᵀ δv̄ / v̂,    δv̄ = δv − L (Cε + [f_n×] δh)ᵀu    u along the velocity, L half a block
+    z = δ = ln(v̄/v̂),    H δx = uᵀδv̄ / v̂,    δv̄ = δv + L C ε + S × δh
 
-with the mean and variance that the likelihood of δ has under the filter's own 1σ, widened by ``SEARCH``. A block with a
+with u the course at the middle of the block, L ago, and S = v − v̂ u − L g the impulse of the specific force since; mean
+and variance are those that the likelihood of δ has under the filter's own 1σ, widened by ``SEARCH``. A block with a
 fix teaches and does not measure: a shape learned at the filter's own speed must not confirm that speed.
 
 Resonances and tones of a fixed frequency do not follow the speed. So two means are learned that add up, one over
@@ -29,7 +30,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dlkf.data.drive import Batch
-from dlkf.filters.aids.stretch import at_limits, mean_force
+from dlkf.filters.aids.stretch import at_limits
 from dlkf.filters.branches import chosen, may_branch
 from dlkf.filters.integration import Epoch
 from dlkf.filters.sources import Measurement, Predicted, describe_row, predicted_variance
@@ -75,17 +76,24 @@ class Stretch(NamedTuple):
     elapsed: Tensor  # (B,) s
     slowest: Tensor  # (B,) m/s
     fixed: Tensor  # (B,) bool: it had a fix
+    turned: Tensor  # (B,) rad: course since the beginning
+    turned_s: Tensor  # (B,) its integral over time
 
     @classmethod
     def begin(cls, like: Tensor, B: int) -> Stretch:
         """Nothing in it."""
         zero = like.new_zeros(B)
-        return cls(like.new_zeros(B, 6, WAVES), zero, zero, zero + 1e3, zero > 0)
+        return cls(like.new_zeros(B, 6, WAVES), zero, zero, zero + 1e3, zero > 0, zero, zero)
 
     @property
     def speed(self) -> Float[Tensor, " B"]:
         """Mean speed [m/s]."""
         return (self.distance / self.elapsed.clamp_min(1e-3)).clamp_min(0.1)
+
+    @property
+    def course_lag(self) -> Float[Tensor, " B"]:
+        """By what the course at the end is ahead of the mean course [rad]."""
+        return self.turned - self.turned_s / self.elapsed.clamp_min(1e-3)
 
     def after(self, epoch: Epoch, block_s: float, last: Float[Tensor, "B 6"]) -> Stretch:
         """With one more update interval; ``last`` is the sample before it."""
@@ -98,11 +106,13 @@ class Stretch(NamedTuple):
         time = self.elapsed.unsqueeze(-1) + dt * (sample + 0.5)
         window = torch.sin((math.pi / block_s) * time).clamp_min(0.0)
         known = (last != 0).any(-1, keepdim=True)
+        turn = dt * x[..., 5].sum(1)
         before = torch.cat((torch.where(known, last, x[:, 0]).unsqueeze(1), x[:, :-1]), 1)
         return Stretch(
             demodulate((x - before) * window.unsqueeze(-1), distance, self.spectrum),
             self.distance + step.sum(1), self.elapsed + dt * M,
             torch.minimum(self.slowest, -(-speed).amax(1)), self.fixed | epoch.used.any(-1),
+            self.turned + turn, self.turned_s + dt * M * (self.turned + 0.5 * turn),
         )  # fmt: skip
 
 
@@ -210,7 +220,7 @@ class VibrationSpeed:
         """The row of a block that is done; means, their blocks, and evidence after it."""
         block, speed = memory.block, memory.block.speed
         moving = done & (block.slowest > SLOWEST)
-        H = self._matrix(epoch, 0.5 * block.elapsed, speed)
+        H = self._matrix(epoch, block)
         of_speed = predicted_variance(prediction.P, H)[:, 0]
         weight, tones = line_weights(speed, epoch.dt), tone_shares(speed)
         y = shape(block.spectrum, weight)
@@ -252,15 +262,23 @@ class VibrationSpeed:
         R = torch.where(measured, R, 0.0)
         return Measurement(z.unsqueeze(-1), H, R.unsqueeze(-1), used.unsqueeze(-1))
 
-    def _matrix(self, epoch: Epoch, middle: Float[Tensor, " B"], speed: Float[Tensor, " B"]) -> Float[Tensor, "B 1 n"]:
-        """H of ln of the true over the filter's mean speed of a block, whose middle is so many seconds ago."""
-        end = epoch.window.end
-        along = end.v_n / end.v_n.norm(dim=-1, keepdim=True).clamp_min(0.5)
-        H = along.new_zeros(len(along), self.states.count)
-        H[:, self.states.velocity] = along
-        H[:, self.states.attitude] = middle.unsqueeze(-1) * torch.linalg.cross(along, mean_force(epoch))
-        H[:, ACCEL] = middle.unsqueeze(-1) * torch.bmm(end.C_nb.mT, along.unsqueeze(-1)).squeeze(-1)
-        return (H / speed.unsqueeze(-1)).unsqueeze(1)
+    def _matrix(self, epoch: Epoch, block: Stretch) -> Float[Tensor, "B 1 n"]:
+        """H of ln of the true over the filter's mean speed of a block that ends now.
+
+        At its middle, L ago, the velocity had the direction u, and its error was that of now before the errors of
+        attitude and accelerometers moved it by the impulse S of the specific force since.
+        """
+        end, middle, speed = epoch.window.end, 0.5 * block.elapsed.unsqueeze(-1), block.speed.unsqueeze(-1)
+        now = end.v_n / end.v_n.norm(dim=-1, keepdim=True).clamp_min(0.5)
+        cos, sin = block.course_lag.cos(), block.course_lag.sin()
+        north, east, down = now.unbind(-1)
+        u = torch.stack((cos * north + sin * east, cos * east - sin * north, down), -1)
+        impulse = end.v_n - speed * u - middle * epoch.window.gravity
+        H = u.new_zeros(len(u), self.states.count)
+        H[:, self.states.velocity] = u
+        H[:, self.states.attitude] = torch.linalg.cross(u, impulse)
+        H[:, ACCEL] = middle * torch.bmm(end.C_nb.mT, now.unsqueeze(-1)).squeeze(-1)
+        return (H / speed).unsqueeze(1)
 
 
 def _predictive(likelihood: Float[Tensor, "B O"], of_speed: Float[Tensor, " B"]) -> Float[Tensor, "B S"]:
@@ -292,4 +310,5 @@ def _emptied(stretch: Stretch, over: Bool[Tensor, " B"]) -> Stretch:
     return Stretch(
         torch.where(over[:, None, None], 0.0, stretch.spectrum), torch.where(over, 0.0, stretch.distance),
         torch.where(over, 0.0, stretch.elapsed), torch.where(over, 1e3, stretch.slowest), stretch.fixed & ~over,
+        torch.where(over, 0.0, stretch.turned), torch.where(over, 0.0, stretch.turned_s),
     )  # fmt: skip

@@ -69,6 +69,8 @@ MEMORY = {  # by the last parts of a field's name
     "block.elapsed": "time in the block [s]",
     "block.slowest": "least speed in the block [m/s]",
     "block.fixed": "1 where it had a fix",
+    "block.turned": "course since the block began [rad]",
+    "block.turned_s": "its integral over time [rad s]",
     "last_sample": "the last sample [m/s², rad/s]",
     "by_distance.total": "sum over blocks of ln power less its trend, by axis and spatial frequency",
     "by_distance.weight": "blocks in that sum",
