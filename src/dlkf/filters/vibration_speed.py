@@ -256,8 +256,8 @@ class VibrationSpeed:
         R = 1 / (1 / torch.minimum(variance, SAYS * searched) - 1 / searched)
         z = mean * (1 + R / searched)
         plain = z.square() < OUTLIER**2 * (searched + R)
-        measured = moving & ~memory.block.fixed & (share > LEAST_SHARE) & (memory.blocks >= FIRST_BLOCKS)
-        used = measured & says & plain & (of_speed < LOST_STD**2)
+        measured = moving & ~memory.block.fixed & (share > LEAST_SHARE) & (memory.blocks >= FIRST_BLOCKS) & says
+        used = measured & plain & (of_speed < LOST_STD**2)
         R = R * (1 + TOGETHER / memory.blocks.clamp_min(1.0)) * (1 + (memory.age / UNCHECKED_S).square())
         R = torch.where(measured, R, 0.0)
         return Measurement(z.unsqueeze(-1), H, R.unsqueeze(-1), used.unsqueeze(-1))
