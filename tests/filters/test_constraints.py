@@ -57,7 +57,7 @@ def test_jacobian_matches_finite_differences():
         assert (numeric - H[:, i]).abs().max() < 1e-4, i
 
 
-def test_a_knock_counts_for_its_weight_and_not_for_its_size():
+def test_beyond_three_sigma_a_larger_innovation_corrects_less():
     """Within 3σ a row has its own variance; beyond, one in proportion to the innovation's square."""
     batch = scene(1, 1, seed=3)
     rules = CarConstraints(Tuning(), STATES)

@@ -11,7 +11,7 @@ they are further states of the filter. A standstill (:mod:`dlkf.filters.stationa
 (zero-velocity update) and ω_b = Earth rate (zero-angular-rate update).
 
 A pothole or a knock turns or moves the IMU for a moment, so that a row across the car is off by many σ. Beyond
-``OUTLIER`` σ its 1σ grows in proportion to the innovation (Huber 1981: such a row counts for its weight, not its size).
+``OUTLIER`` σ the 1σ of the row grows in proportion to its innovation, and its correction falls with one over it.
 
 The 1σ of a row is that of one a second: of shorter update intervals each row has a larger one, so that a second says
 the same.

@@ -88,7 +88,17 @@ def tables_of(model: Any) -> tuple[AidTable, ...]:
 
 def aid_columns(model: Any) -> tuple[str, ...]:
     """A filter's output about its sensors, in the order of :attr:`dlkf.filters.integration.Correction.aids`:
-    innovation, its 1σ and whether it counted of each, with what wheel orders found behind theirs, then the estimates of
+    innovation, its 1σ and whether it counted of each, with what a source without a table adds behind its own, then the
+    estimates of the sensors' parameters, then their 1σ."""
+    inner = model.filter if isinstance(model, SmoothedSolution) else getattr(model, "estimator", model)
+    inner = getattr(inner, "kalman", inner)
+    tables = [getattr(source, "table", None) for source in getattr(inner, "sources", ())]
+    return tuple(table for table in tables if table is not None)
+
+
+def aid_columns(model: Any) -> tuple[str, ...]:
+    """A filter's output about its sensors, in the order of :attr:`dlkf.filters.integration.Correction.aids`:
+    innovation, its 1σ and whether it counted of each, with what a source without a table adds behind its own, then the estimates of
     the sensors' parameters, then their 1σ."""
     inner = model.filter if isinstance(model, SmoothedSolution) else getattr(model, "estimator", model)
     inner = getattr(inner, "kalman", inner)
