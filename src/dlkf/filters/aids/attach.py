@@ -92,16 +92,6 @@ def aid_columns(model: Any) -> tuple[str, ...]:
     estimates of the sensors' parameters, then their 1σ."""
     inner = model.filter if isinstance(model, SmoothedSolution) else getattr(model, "estimator", model)
     inner = getattr(inner, "kalman", inner)
-    tables = [getattr(source, "table", None) for source in getattr(inner, "sources", ())]
-    return tuple(table for table in tables if table is not None)
-
-
-def aid_columns(model: Any) -> tuple[str, ...]:
-    """A filter's output about its sensors, in the order of :attr:`dlkf.filters.integration.Correction.aids`:
-    innovation, its 1σ and whether it counted of each, with what a source without a table adds behind its own, then the estimates of
-    the sensors' parameters, then their 1σ."""
-    inner = model.filter if isinstance(model, SmoothedSolution) else getattr(model, "estimator", model)
-    inner = getattr(inner, "kalman", inner)
     states: ErrorStates = getattr(inner, "states", ErrorStates())
     said: list[str] = []
     for source in getattr(inner, "sources", ()):
