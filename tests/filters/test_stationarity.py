@@ -95,6 +95,46 @@ def test_the_first_stop_is_found_however_the_engine_idles(idling):
     assert drift(batch, "mbkf15_nhc") < 0.2 * drift(batch, "mbkf15")
 
 
+def positions_alone(batch: Batch) -> Batch:
+    """With fixes of centimetres and no velocity, throughout."""
+    valid, std = batch.gnss_valid.clone(), torch.full_like(batch.gnss_std, 0.02)
+    valid[..., 3:] = False
+    noise = 0.02 * torch.randn(*batch.gnss.shape, generator=torch.Generator().manual_seed(9), dtype=D)
+    gnss = torch.cat((batch.truth.p_n, batch.truth.v_n), -1) + noise
+    return replace(batch, gnss=gnss, gnss_std=std, gnss_valid=valid, available=torch.ones_like(batch.available))
+
+
+def test_positions_alone_show_how_a_car_shakes_at_rest():
+    """As velocities do: a stop in an outage is found by a car that has stood and moved under positions alone."""
+    batch = positions_alone(shaken((0.5, 5e-3), (1.0, 2e-2)))
+    batch = outage(batch, 60, 100)
+    taken, speed = found(batch), batch.truth.v_n.norm(dim=-1)
+    assert taken[:, 60:].float().mean() > 0.95 and not taken[speed > 0.5].any()
+
+
+@pytest.mark.parametrize("positions", [True, False])
+def test_a_standstill_that_fixes_show_is_one_at_any_vibration(positions):
+    """An engine that idles more lively than the car rolls: no level of vibration shows its stop, but fixes do, and the
+    gyroscopes' bias is learned there."""
+    batch = shaken((0.5, 5e-3), (0.05, 5e-4))
+    batch = positions_alone(batch) if positions else replace(batch, available=torch.ones_like(batch.available))
+    speed = batch.truth.v_n.norm(dim=-1)
+    rest = torch.stack([speed.roll(k, 1) < 0.01 for k in range(5)]).all(0)
+    rest[:, :5] = False
+    taken = found(batch)
+    assert taken[rest].float().mean() > 0.9 and not taken[speed > 0.5].any()
+    assert not found(outage(batch, 30, 100))[:, 30:].any()
+    bias = integrate(batch, build_filter("mbkf15_nhc", IMU)).imu_error[:, -1, 5]
+    assert (bias - batch.true_imu_error[:, -1, 5]).abs().max() < 2e-4
+
+
+def test_fixes_that_show_a_creeping_car_stop_it_not():
+    batch = steady((0.3, 0.5), 60, stand_s=0)
+    noise = 0.5 * torch.randn(*batch.imu.shape, generator=torch.Generator().manual_seed(1), dtype=D)
+    batch = positions_alone(replace(batch, imu=batch.imu + noise * torch.tensor([1.0] * 3 + [0.02] * 3, dtype=D)))
+    assert not found(batch, accel_noise=30.0, gyro_noise=10.0)[:, 20:].any()
+
+
 @pytest.mark.parametrize("name", ["mbkf21_nhc", "mbkf21_car"])
 def test_a_smooth_car_moves_off_under_positions_of_metres(name):
     """Silent cars move off gently; of the tilt 4° are unknown, which would explain it. While nothing is learned of the

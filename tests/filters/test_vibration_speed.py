@@ -25,6 +25,7 @@ from dlkf.filters.vibration_spectrum import (
     TONES,
     WAVES,
     demodulate,
+    expected_log_likelihood,
     line_weights,
     lines,
     log_likelihood,
@@ -213,6 +214,10 @@ def test_what_a_gaussian_likelihood_says_is_found_again():
         assert bool(row.used)
     row = source()._row(memory_, torch.zeros(1, len(off)).double(), torch.zeros(1, 1, 21), of_speed, yes)
     assert not bool(row.used)  # the prior alone says nothing
+    row = source()._row(memory_, (-0.5 * (off - 0.14).square() / 0.01**2).unsqueeze(0), torch.zeros(1, 1, 21),
+                        of_speed, yes)  # fmt: skip
+    S = row.R.item() + 0.03**2 + 0.02**2  # an outlier is of 3σ
+    assert bool(row.used) and row.z.item() > 0.13 and row.z.item() == pytest.approx(3 * S**0.5)
 
 
 def test_a_wrong_heading_is_no_wrong_speed():
@@ -279,6 +284,23 @@ def test_what_does_not_follow_the_speed_is_not_trusted(vibration):
     hidden = without_fixes(batch, 90)
     plain, aided = (speed_error(run(hidden, name), hidden)[:, 90:].square().mean().sqrt() for name in (KALMAN, AIDED))
     assert aided < 1.05 * plain
+
+
+def test_a_shape_has_the_likelihood_that_is_expected_of_it():
+    A, weight, distance = 0.5 * made(11, 1, 6, LINES), made(12, 1, LINES).sigmoid(), torch.tensor([30.0]).double()
+    y = A + LOG_VARIANCE**0.5 * made(13, 4000, 6, LINES)
+    found = log_likelihood(y, A.expand_as(y), weight.expand(4000, -1), distance.expand(4000))[:, 16]
+    expected = expected_log_likelihood(A, weight, distance)[0, 0]
+    assert float(found.mean()) == pytest.approx(float(expected), rel=0.05)
+
+
+def test_a_shape_that_does_not_hold_in_an_outage_says_nothing():
+    """Other vibration from the outage on: the filter is about as without this source."""
+    known, other = (cars(8, 150, vibration, 7) for vibration in (road, tones))
+    imu = torch.where((torch.arange(150) < 90)[None, :, None, None], known.imu, other.imu)
+    hidden = without_fixes(replace(known, imu=imu), 90)
+    plain, aided = (speed_error(run(hidden, name), hidden)[:, 90:].square().mean().sqrt() for name in (KALMAN, AIDED))
+    assert aided < 1.25 * plain
 
 
 def test_a_shape_that_is_gone_is_given_up_when_fixes_show_the_speed():

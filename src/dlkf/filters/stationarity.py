@@ -3,10 +3,14 @@
 Engines idle differently and IMUs are noisy differently, so no fixed limit on the samples' spread fits two cars: the
 levels are learned while GNSS shows whether the car moves. A standstill is then a window whose level is closer to the
 least of a stationary second than to the least of a moving one, without acceleration or turn (the hypothesis of
-Skog et al. 2010, within the filter's 1σ), and not against the filter's estimate of the speed. A car
-without vibration has the same spread in both; then a standstill needs a speed below 0.5 m/s + 1σ, of which at most
-0.5 m/s count, for minutes at constant speed show no acceleration and no turn either. While nothing is learned of a car
-(a receiver of positions alone), the filter's 1σ of tilt may not explain an acceleration.
+Skog et al. 2010, within the filter's 1σ), and not against the filter's estimate of the speed. A car without vibration
+has the same spread in both; then a standstill needs a speed below 0.5 m/s + 1σ, of which at most 0.5 m/s count, for
+minutes at constant speed show no acceleration and no turn either. While nothing is learned of a car, the filter's 1σ of
+tilt may not explain an acceleration.
+
+Carrier-phase positions show motion as velocities do; positions with an error of metres do not, since the small 1σ after
+a wrong standstill would confirm it. Where fixes show a standstill for some seconds, its vibration does not matter: an
+idling engine can shake the IMU more than a smooth road does.
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ from dlkf.navigation.earth import NOMINAL_GRAVITY
 from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, VELOCITY
 
 SURE_STD = 0.3  # m/s: speeds with a larger 1σ teach nothing
+CARRIER_STD = 0.2  # m: positions with a larger 1σ show no motion
 STANDING_SPEED, MOVING_SPEED = 0.3, 1.5  # m/s: from which side on a second counts as the one or the other
 APART = 10.0  # prior ratio of the level of a moving car to that of a stationary one
 DISTINCT = 2.0  # below this ratio the samples do not separate stationary from moving
@@ -30,6 +35,7 @@ MEMORY_S = 100.0  # s, stationary or moving, in which a level grows by e, so tha
 STILL_ACCEL, STILL_RATE = 0.2, 0.01  # m/s², rad/s: with less, beyond the filter's 2σ, a car may be stationary
 UNLEARNED_ACCEL = 0.3  # m/s²: at most so much of the filter's 2σ counts while nothing is learned of the car
 PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 3.0  # m/s, 1σ: a standstill must not contradict the filter
+PROVEN_S, PROVEN_SPEED = 3.0, 0.2  # s without acceleration or turn, m/s beyond 2σ: a standstill that fixes show
 # m/s: where the samples do not separate the two, a standstill needs a smaller 1σ of the speed
 SILENT_STD = 0.5
 LEAST_S = 1.0  # of a standstill: shorter update intervals are taken together
@@ -102,7 +108,8 @@ def detect_stationary(
     still = (gained < STILL_ACCEL + torch.where(unlearned, doubt.clamp_max(UNLEARNED_ACCEL), doubt)) & (
         turning.norm(dim=-1) < STILL_RATE + 2 * diagonal[:, GYRO].sum(-1).sqrt()
     )
-    sure = epoch.used[:, 3:5].all(-1) & (std < SURE_STD)
+    exact = epoch.used[:, :2].all(-1) & (epoch.fix.std[:, :2].amax(-1) < CARRIER_STD)
+    sure = (epoch.used[:, 3:5].all(-1) | exact) & (std < SURE_STD)
     standing, moving = sure & (speed + std < STANDING_SPEED), sure & (speed - std > MOVING_SPEED)
     if wheel is not None:
         stopped = wheel.stopped & still
@@ -114,6 +121,8 @@ def detect_stationary(
     doubt = torch.where(distinct, PLAUSIBLE_SIGMAS * std, std.clamp_max(SILENT_STD))
     plausible = speed < PLAUSIBLE_SPEED + doubt
     stationary = (level <= limit) & still & (still_s > LEAST_S - 0.5 * span) & plausible
+    proven = sure & still & (still_s > PROVEN_S - 0.5 * span) & (speed + 2 * std < PROVEN_SPEED)
+    stationary = stationary | proven
     if wheel is not None:
         stationary = stationary & ~wheel.rolling | stopped
     return stationary, after

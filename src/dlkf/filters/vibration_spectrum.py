@@ -13,7 +13,8 @@ earlier stretches and a variance of y of π²/6, that of the logarithm of expone
 
     ln Λ(δ) = Σ_axes Σ_F [y(F) A(F e^−δ) − ½ A(F e^−δ)²] / (π²/6)
 
-against a spectrum without a shape, for as many independent frequencies as the distance resolves.
+against a spectrum without a shape, for as many independent frequencies as the distance resolves. A block of the shape
+has Σ Σ ½ A² / (π²/6) on average at the true δ.
 """
 
 from __future__ import annotations
@@ -97,8 +98,19 @@ def log_likelihood(
     near, far = mean[:, :, first], mean[:, :, first + 1]
     moved = near + share * (far - near)  # (B, 6, O, K)
     weight = weight[:, None, None]
-    said = (weight * moved * (y.unsqueeze(2) - 0.5 * moved)).sum((1, 3))
-    return (STEP / APART * distance).clamp_max(1.0).unsqueeze(-1) / LOG_VARIANCE * said
+    return _independent(distance) * (weight * moved * (y.unsqueeze(2) - 0.5 * moved)).sum((1, 3))
+
+
+def expected_log_likelihood(
+    mean: Float[Tensor, "B 6 K"], weight: Float[Tensor, "B K"], distance: Float[Tensor, " B"]
+) -> Float[Tensor, "B 1"]:
+    """ln Λ that a block of this shape has on average at the true δ."""
+    return _independent(distance) * (0.5 * weight.unsqueeze(1) * mean.square()).sum((1, 2)).unsqueeze(-1)
+
+
+def _independent(distance: Float[Tensor, " B"]) -> Float[Tensor, "B 1"]:
+    """Share of the lines that are independent over a distance [m], over their variance."""
+    return (STEP / APART * distance).clamp_max(1.0).unsqueeze(-1) / LOG_VARIANCE
 
 
 def lines(like: Tensor) -> Float[Tensor, " K"]:

@@ -10,6 +10,10 @@ with u the course at the middle of the block, L ago, and S = v − v̂ u − L g
 and variance are those that the likelihood of δ has under the filter's own 1σ, widened by ``SEARCH``. A block with a
 fix teaches and does not measure: a shape learned at the filter's own speed must not confirm that speed.
 
+On another road, or in another gear, the shape may not hold. So ln Λ of a block counts with its best value over the one
+that the shape has on average, at most 1, and not at all where no shift fits better than no shape. An innovation beyond
+``OUTLIER`` σ has a 1σ that grows with it, as in :mod:`dlkf.filters.constraints`.
+
 Resonances and tones of a fixed frequency do not follow the speed. So two means are learned that add up, one over
 frequencies in distance and one over frequencies in time, each of what the other leaves, and only the first is shifted.
 
@@ -41,6 +45,7 @@ from dlkf.filters.vibration_spectrum import (
     TONES,
     WAVES,
     demodulate,
+    expected_log_likelihood,
     line_weights,
     log_likelihood,
     shape,
@@ -62,7 +67,8 @@ WRONG = 0.06  # 1σ of δ, from which the shares have to find the known one
 LEAST_SHARE = 0.03  # that is used
 SEARCH = 0.02  # in ln v, beyond the filter's 1σ
 FINEST = 0.004  # 1σ of δ at best
-SAYS, OUTLIER = 0.97, 3.0  # of the search's variance, below which a block says something; σ
+SAYS = 0.97  # of the search's variance, below which a block says something
+OUTLIER = 3.0  # σ of an innovation, from which on its 1σ grows with it
 LOST_STD = 0.1  # relative 1σ of a speed at which no shape is looked for
 TOGETHER = 10.0  # measurements that share the error of the mean
 UNCHECKED_S = 100.0  # s after a fix, from which on what nothing has checked is worth less and less
@@ -226,7 +232,9 @@ class VibrationSpeed:
         y = shape(block.spectrum, weight)
         of_distance, of_time = memory.by_distance.value, torch.bmm(memory.by_time.value, tones.mT)
         likelihood = log_likelihood(y - of_time, of_distance, weight, block.distance)
-        row = self._row(memory, likelihood, H, of_speed, moving)
+        expected = expected_log_likelihood(of_distance, weight, block.distance).clamp_min(1e-3)
+        holds = (likelihood.amax(-1, keepdim=True) / expected).clamp(0.0, 1.0)
+        row = self._row(memory, holds * likelihood, H, of_speed, moving)
         if prediction.rolling is not None:  # a wheel that agrees says more
             row = row._replace(used=row.used & ~prediction.rolling.unsqueeze(-1))
 
@@ -255,9 +263,9 @@ class VibrationSpeed:
         says = variance < SAYS * searched
         R = 1 / (1 / torch.minimum(variance, SAYS * searched) - 1 / searched)
         z = mean * (1 + R / searched)
-        plain = z.square() < OUTLIER**2 * (searched + R)
+        R = torch.maximum(R, z.square() / OUTLIER**2 - searched)
         measured = moving & ~memory.block.fixed & (share > LEAST_SHARE) & (memory.blocks >= FIRST_BLOCKS) & says
-        used = measured & plain & (of_speed < LOST_STD**2)
+        used = measured & (of_speed < LOST_STD**2)
         R = R * (1 + TOGETHER / memory.blocks.clamp_min(1.0)) * (1 + (memory.age / UNCHECKED_S).square())
         R = torch.where(measured, R, 0.0)
         return Measurement(z.unsqueeze(-1), H, R.unsqueeze(-1), used.unsqueeze(-1))
