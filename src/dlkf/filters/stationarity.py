@@ -4,9 +4,9 @@ Engines idle differently and IMUs are noisy differently, so no fixed limit on th
 levels are learned while GNSS shows whether the car moves. A standstill is then a window whose level is closer to the
 least of a stationary second than to the least of a moving one, without acceleration or turn (the hypothesis of
 Skog et al. 2010, within the filter's 1σ), and not against the filter's estimate of the speed. A car without vibration
-has the same spread in both; then a standstill needs a speed below 0.5 m/s + 1σ, of which at most 0.5 m/s count, for
-minutes at constant speed show no acceleration and no turn either. While nothing is learned of a car, the filter's 1σ of
-tilt may not explain an acceleration.
+has the same spread in both, and a smoother road may still come: where the two are not four times apart, a standstill
+needs a speed below 0.5 m/s + 1σ, of which at most 0.5 m/s count, for minutes at constant speed show no acceleration and
+no turn either. While nothing is learned of a car, the filter's 1σ of tilt may not explain an acceleration.
 
 Carrier-phase positions show motion as velocities do; positions with an error of metres do not, since the small 1σ after
 a wrong standstill would confirm it. Where fixes show a standstill for some seconds, its vibration does not matter: an
@@ -30,7 +30,8 @@ SURE_STD = 0.3  # m/s: speeds with a larger 1σ teach nothing
 CARRIER_STD = 0.2  # m: positions with a larger 1σ show no motion
 STANDING_SPEED, MOVING_SPEED = 0.3, 1.5  # m/s: from which side on a second counts as the one or the other
 APART = 10.0  # prior ratio of the level of a moving car to that of a stationary one
-DISTINCT = 2.0  # below this ratio the samples do not separate stationary from moving
+# ratios of moving to standing: below the first the samples do not separate the two, above the second they surely do
+DISTINCT, SURELY_DISTINCT = 2.0, 4.0
 MEMORY_S = 100.0  # s, stationary or moving, in which a level grows by e, so that a wrong second decays
 STILL_ACCEL, STILL_RATE = 0.2, 0.01  # m/s², rad/s: with less, beyond the filter's 2σ, a car may be stationary
 UNLEARNED_ACCEL = 0.3  # m/s²: at most so much of the filter's 2σ counts while nothing is learned of the car
@@ -59,11 +60,11 @@ class VibrationLevel(NamedTuple):
         return self.thresholds(prior)[0]
 
     def thresholds(self, prior: Float[Tensor, " 1"]) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
-        """The limit, and whether the samples separate a stationary car from a moving one so far."""
+        """The limit, and whether the samples surely separate a stationary car from a moving one so far."""
         moving = torch.where(self.moving.isinf(), prior, self.moving)
         standing = torch.where(self.standing.isinf(), moving / APART, self.standing)
-        distinct = moving > DISTINCT * standing
-        return torch.where(distinct, (standing * moving).sqrt(), prior / APART), distinct
+        limit = torch.where(moving > DISTINCT * standing, (standing * moving).sqrt(), prior / APART)
+        return limit, moving > SURELY_DISTINCT * standing
 
     def update(self, now: Tensor, standing: Tensor, moving: Tensor, span: float) -> VibrationLevel:
         """After a window of ``span`` seconds in which the car was surely stationary, or moving, or neither."""
@@ -116,7 +117,7 @@ def detect_stationary(
         standing, moving = standing & ~wheel.rolling | stopped, (moving | wheel.rolling) & ~stopped
     still_s = torch.where(still, before.still_s + span, 0.0)
     after = before.update(level, standing, moving, span)._replace(still_s=still_s)
-    # equal spectra: a wide 1σ would admit any speed, so only a speed that is nearly zero and known to be counts
+    # like spectra: a wide 1σ would admit any speed, so only a speed that is nearly zero and known to be counts
     limit, distinct = after.thresholds(prior)
     doubt = torch.where(distinct, PLAUSIBLE_SIGMAS * std, std.clamp_max(SILENT_STD))
     plausible = speed < PLAUSIBLE_SPEED + doubt
