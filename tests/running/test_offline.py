@@ -61,6 +61,16 @@ def test_the_summary_says_in_which_drives_vibration_shows_the_speed():
     assert said == "Speed from vibration: the spectrum of the IMU shows it in 1 of 2 drives; 7 measurements used."
 
 
+def test_a_sensor_that_made_no_update_is_said_to_have_made_none():
+    result = with_vibration(driven(0), 0.4, 7).result
+    z = np.where(result.table.vibration_speed_used > 0, 0.02, np.nan)
+    measured = result.table.assign(vibration_speed_innovation=z, vibration_speed_innovation_std=0.01)
+    said = replace(result, table=measured).sensors()["vibration_speed"]
+    assert said == "in 7 of 7 updates (normalised innovation RMS 2)"
+    nothing = measured.assign(vibration_speed_innovation=np.nan, vibration_speed_used=0.0)
+    assert replace(result, table=nothing).sensors()["vibration_speed"] == "no update"
+
+
 def test_drives_without_plots_of_their_own_are_kept_small_and_shown_the_same():
     whole = [driven(seed) for seed in range(3)]
     small = [course.for_the_map() for course in whole]

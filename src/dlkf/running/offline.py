@@ -147,11 +147,13 @@ class Navigated:
             name = used.removesuffix("_used")
             ratio = table[f"{name}_innovation"] / table[f"{name}_innovation_std"]
             seen = int(ratio.notna().sum())
+            if not seen:
+                said[name] = "no update"
+                continue
             said[name] = f"in {int(table[used].sum())} of {seen} updates"
             if table[used].sum() < MOSTLY * seen:
                 said[name] += ", most of them refused: see its unit, sign and clock"
-            if seen:
-                said[name] += f" (normalised innovation RMS {np.sqrt((ratio**2).mean()):.2g})"
+            said[name] += f" (normalised innovation RMS {np.sqrt((ratio**2).mean()):.2g})"
         for std in (column for column in self.sensor_columns if column.startswith("std_")):
             name, last = std.removeprefix("std_"), table.iloc[-1]
             said[name] = f"{last[name]:.4g} ± {last[std]:.2g}"
