@@ -3,10 +3,11 @@
 Engines idle differently and IMUs are noisy differently, so no fixed limit on the samples' spread fits two cars: the
 levels are learned while GNSS shows whether the car moves. A standstill is then a window whose level is closer to the
 least of a stationary second than to the least of a moving one, without acceleration or turn (the hypothesis of
-Skog et al. 2010, within the filter's 1σ), and not against the filter's estimate of the speed. A car without vibration
-has the same spread in both, and a smoother road may still come: where the two are not four times apart, a standstill
-needs a speed below 0.5 m/s + 1σ, of which at most 0.5 m/s count, for minutes at constant speed show no acceleration and
-no turn either. While nothing is learned of a car, the filter's 1σ of tilt may not explain an acceleration.
+Skog et al. 2010, within the filter's 1σ), and not against the filter's estimate of the speed: within 3σ, or within 2σ
+of at most 2 m/s where the two levels are not four times apart, since a smoother road may still come. A car without
+vibration has the same spread in both; then a standstill needs a speed below 0.5 m/s + 1σ, of which at most 0.5 m/s
+count, for minutes at constant speed show no acceleration and no turn either. While nothing is learned of a car, the
+filter's 1σ of tilt may not explain an acceleration.
 
 Carrier-phase positions show motion as velocities do; positions with an error of metres do not, since the small 1σ after
 a wrong standstill would confirm it. Where fixes show a standstill for some seconds, its vibration does not matter: an
@@ -36,6 +37,7 @@ MEMORY_S = 100.0  # s, stationary or moving, in which a level grows by e, so tha
 STILL_ACCEL, STILL_RATE = 0.2, 0.01  # m/s², rad/s: with less, beyond the filter's 2σ, a car may be stationary
 UNLEARNED_ACCEL = 0.3  # m/s²: at most so much of the filter's 2σ counts while nothing is learned of the car
 PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 3.0  # m/s, 1σ: a standstill must not contradict the filter
+DOUBTFUL_SPEED = 2.0  # m/s, at most so much of 2σ where the samples separate the two, but not surely
 PROVEN_S, PROVEN_SPEED = 3.0, 0.2  # s without acceleration or turn, m/s beyond 2σ: a standstill that fixes show
 # m/s: where the samples do not separate the two, a standstill needs a smaller 1σ of the speed
 SILENT_STD = 0.5
@@ -59,12 +61,14 @@ class VibrationLevel(NamedTuple):
         """Half way, as logarithms, between stationary and moving; near zero where the two are alike."""
         return self.thresholds(prior)[0]
 
-    def thresholds(self, prior: Float[Tensor, " 1"]) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
-        """The limit, and whether the samples surely separate a stationary car from a moving one so far."""
+    def thresholds(
+        self, prior: Float[Tensor, " 1"]
+    ) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"], Bool[Tensor, " B"]]:
+        """The limit, and whether the samples separate a stationary car from a moving one, and surely do, so far."""
         moving = torch.where(self.moving.isinf(), prior, self.moving)
         standing = torch.where(self.standing.isinf(), moving / APART, self.standing)
-        limit = torch.where(moving > DISTINCT * standing, (standing * moving).sqrt(), prior / APART)
-        return limit, moving > SURELY_DISTINCT * standing
+        distinct, surely = moving > DISTINCT * standing, moving > SURELY_DISTINCT * standing
+        return torch.where(distinct, (standing * moving).sqrt(), prior / APART), distinct, surely
 
     def update(self, now: Tensor, standing: Tensor, moving: Tensor, span: float) -> VibrationLevel:
         """After a window of ``span`` seconds in which the car was surely stationary, or moving, or neither."""
@@ -118,8 +122,9 @@ def detect_stationary(
     still_s = torch.where(still, before.still_s + span, 0.0)
     after = before.update(level, standing, moving, span)._replace(still_s=still_s)
     # like spectra: a wide 1σ would admit any speed, so only a speed that is nearly zero and known to be counts
-    limit, distinct = after.thresholds(prior)
-    doubt = torch.where(distinct, PLAUSIBLE_SIGMAS * std, std.clamp_max(SILENT_STD))
+    limit, distinct, surely = after.thresholds(prior)
+    doubt = torch.where(distinct, (2 * std).clamp_max(DOUBTFUL_SPEED), std.clamp_max(SILENT_STD))
+    doubt = torch.where(surely, PLAUSIBLE_SIGMAS * std, doubt)
     plausible = speed < PLAUSIBLE_SPEED + doubt
     stationary = (level <= limit) & still & (still_s > LEAST_S - 0.5 * span) & plausible
     proven = sure & still & (still_s > PROVEN_S - 0.5 * span) & (speed + 2 * std < PROVEN_SPEED)
