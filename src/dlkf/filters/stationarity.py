@@ -64,7 +64,7 @@ class VibrationLevel(NamedTuple):
     def thresholds(
         self, prior: Float[Tensor, " 1"]
     ) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"], Bool[Tensor, " B"]]:
-        """The limit, and whether the samples separate a stationary car from a moving one, and surely do, so far."""
+        """The limit, and whether the samples separate a stationary car from a moving one so far, and surely."""
         moving = torch.where(self.moving.isinf(), prior, self.moving)
         standing = torch.where(self.standing.isinf(), moving / APART, self.standing)
         distinct, surely = moving > DISTINCT * standing, moving > SURELY_DISTINCT * standing
