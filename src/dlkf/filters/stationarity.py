@@ -4,7 +4,7 @@ Engines idle differently and IMUs are noisy differently, so no fixed limit on th
 levels are learned while GNSS shows whether the car moves. A standstill is then a window whose level is closer to the
 least of a stationary second than to the least of a moving one, without acceleration or turn (the hypothesis of
 Skog et al. 2010, within the filter's 1σ), and not against the filter's estimate of the speed: within 3σ, or within 2σ
-of at most 2 m/s where the two levels are not four times apart, since a smoother road may still come. A car without
+of at most 1 m/s where the two levels are not four times apart, since a smoother road may still come. A car without
 vibration has the same spread in both; then a standstill needs a speed below 0.5 m/s + 1σ, of which at most 0.5 m/s
 count, for minutes at constant speed show no acceleration and no turn either. While nothing is learned of a car, the
 filter's 1σ of tilt may not explain an acceleration.
@@ -37,7 +37,7 @@ MEMORY_S = 100.0  # s, stationary or moving, in which a level grows by e, so tha
 STILL_ACCEL, STILL_RATE = 0.2, 0.01  # m/s², rad/s: with less, beyond the filter's 2σ, a car may be stationary
 UNLEARNED_ACCEL = 0.3  # m/s²: at most so much of the filter's 2σ counts while nothing is learned of the car
 PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 3.0  # m/s, 1σ: a standstill must not contradict the filter
-DOUBTFUL_SPEED = 2.0  # m/s, at most so much of 2σ where the samples separate the two, but not surely
+DOUBTFUL_SPEED = 1.0  # m/s, at most so much of 2σ where the samples separate the two, but not surely
 PROVEN_S, PROVEN_SPEED = 3.0, 0.2  # s without acceleration or turn, m/s beyond 2σ: a standstill that fixes show
 # m/s: where the samples do not separate the two, a standstill needs a smaller 1σ of the speed
 SILENT_STD = 0.5
