@@ -27,6 +27,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.filters.integration import Covariances, Epoch
+from dlkf.filters.stationarity import CARRIER_STD
 from dlkf.navigation.state import POSITION, VELOCITY
 
 WANDER, WANDER_S = 2.0, 40.0  # σ, s
@@ -34,7 +35,7 @@ USUAL_FIXES = 20.0  # that white noise as claimed counts for before anything is 
 MEMORY, QUICK = 300.0, 10.0  # fixes
 LARGEST = 5.0  # σ: the most that a change of the error counts
 NOISE_S = 8.0  # an error that takes longer to change is no noise
-MOVING, CARRIER_STD = 1.0, 0.2  # m/s, m: slower cars are left out but of a receiver that claims less than this
+MOVING = 1.0  # m/s: slower cars are left out, but for receivers of ``CARRIER_STD``
 LEAST_STD = 0.02  # m, the least 1σ of a fix that is made smaller than claimed
 
 
