@@ -74,7 +74,7 @@ def test_a_further_process_that_fails_is_said():
 
 
 SMALL = (
-    "data.batch_size=6", "data.length_s=20", "data.eval_length_s=40", "model.network.dropout=0",
+    "data.batch_size=5", "data.length_s=20", "data.eval_length_s=40", "model.network.dropout=0",
     "scoring.outage.first_s=10", "scoring.outage.duration_s=20",
     "model.network.lstm_hidden=16", "model.network.lstm_layers=1", "model.network.dense=[16,8]", "trainer.max_epochs=2",
     "trainer.validate_every=1", "trainer.best_from_epoch=0", "trainer.accelerator=cpu", "callbacks.curriculum=null",
