@@ -28,8 +28,8 @@ from torch import Tensor
 
 from dlkf.filters.pieces import summed
 
-COARSE, FINE, STEP, LEAST = 16, 8, 0.016, 0.2  # cycles/m
-LINES = COARSE * FINE
+FAR, NEAR, STEP, LEAST = 4, 16, 0.016, 0.2  # cycles/m; a line is a near frequency ± a far one
+LINES = 2 * FAR * NEAR
 WAVES = 2 * LINES  # cosines and sines
 SLOW_HZ, FAST_HZ = 1.5, 20.0  # between which a line is looked at: above the car's own motion, below the sensor's noise
 SLOW_EDGE_HZ, FAST_EDGE_HZ = 0.2, 0.5
@@ -45,24 +45,31 @@ APART = 1.5  # distance times the least difference of independent frequencies, f
 def demodulate(
     x: Float[Tensor, "B M 6"], distance: Float[Tensor, "B M"], begin: Float[Tensor, "B 6 waves"]
 ) -> Float[Tensor, "B 6 waves"]:
-    """``begin`` + Σ_k x_k cos and sin of 2π F s_k for every line; waves are (2, K)."""
+    """``begin`` + Σ_k x_k of the products of cos and sin that :func:`components` makes the spectrum of."""
     return summed(add_waves, begin, x, distance)
 
 
 def add_waves(
     begin: Float[Tensor, "B 6 waves"], x: Float[Tensor, "B m 6"], distance: Float[Tensor, "B m"]
 ) -> Float[Tensor, "B 6 waves"]:
-    """:func:`demodulate` of some samples; sines and cosines of a coarse grid of lines and of a fine one, multiplied."""
+    """:func:`demodulate` of some samples."""
     angle = distance.unsqueeze(-1) * _grids(distance.dtype, distance.device)
-    cosines, sines = angle.cos(), angle.sin()
-    (ca, cb), (sa, sb) = (_crossed(of) for of in (cosines, sines))
-    waves = torch.cat(((ca * cb - sa * sb).flatten(2), (sa * cb + ca * sb).flatten(2)), -1)
-    return torch.baddbmm(begin, x.mT, waves)
+    far, near = zip(*(of.split((FAR, NEAR), -1) for of in (angle.cos(), angle.sin())))
+    waves = torch.cat(far, -1).unsqueeze(-1) * torch.cat(near, -1).unsqueeze(-2)
+    return torch.baddbmm(begin, x.mT, waves.flatten(2))
 
 
-def _crossed(of: Float[Tensor, "B m grids"]) -> tuple[Float[Tensor, "B m coarse 1"], Float[Tensor, "B m 1 fine"]]:
-    coarse, fine = of.split((COARSE, FINE), -1)
-    return coarse.unsqueeze(-1), fine.unsqueeze(-2)
+def components(spectrum: Float[Tensor, "B 6 waves"]) -> tuple[Float[Tensor, "B 6 K"], Float[Tensor, "B 6 K"]]:
+    """Σ_k x_k cos and Σ_k x_k sin of 2π F s_k for every line, by the sums of angles."""
+    far_cos, far_sin = spectrum.unflatten(2, (2, FAR, 2, NEAR)).unbind(2)
+    (cos_cos, cos_sin), (sin_cos, sin_sin) = far_cos.unbind(3), far_sin.unbind(3)  # of far, of near
+    cosines = _ascending(cos_cos + sin_sin, cos_cos - sin_sin)
+    return cosines, _ascending(cos_sin - sin_cos, cos_sin + sin_cos)
+
+
+def _ascending(below: Float[Tensor, "B 6 far near"], above: Float[Tensor, "B 6 far near"]) -> Float[Tensor, "B 6 K"]:
+    """Lines at near − far and near + far, in the order of their frequency."""
+    return torch.cat((*reversed(below.unbind(2)), *above.unbind(2)), -1)
 
 
 def line_weights(speed: Float[Tensor, " B"], dt: float) -> Float[Tensor, "B K"]:
@@ -72,10 +79,14 @@ def line_weights(speed: Float[Tensor, " B"], dt: float) -> Float[Tensor, "B K"]:
     return torch.sigmoid((f - SLOW_HZ) / SLOW_EDGE_HZ) * torch.sigmoid((fast - f) / FAST_EDGE_HZ)
 
 
-def shape(spectrum: Float[Tensor, "B 6 waves"], weight: Float[Tensor, "B K"]) -> Float[Tensor, "B 6 K"]:
-    """y of every axis and line, with the trend by least squares under ``weight``."""
-    cosines, sines = spectrum.unflatten(2, (2, LINES)).unbind(2)
-    power = torch.log(cosines.square() + sines.square() + 1e-30)
+def log_power(spectrum: Float[Tensor, "B 6 waves"]) -> Float[Tensor, "B 6 K"]:
+    """ln |Z(F)|² of every axis and line."""
+    cosines, sines = components(spectrum)
+    return torch.log(cosines.square() + sines.square() + 1e-30)
+
+
+def shape(power: Float[Tensor, "B 6 K"], weight: Float[Tensor, "B K"]) -> Float[Tensor, "B 6 K"]:
+    """y of every axis and line: ln |Z|² without its trend, by least squares under ``weight``."""
     trends = _trends(power.dtype, power.device)
     weighted = trends * weight.unsqueeze(1)
     normal = weighted @ trends.mT + 1e-6 * torch.eye(COSINES, dtype=power.dtype, device=power.device)
@@ -93,12 +104,18 @@ def tone_shares(speed: Float[Tensor, " B"]) -> Float[Tensor, "B K N"]:
 def log_likelihood(
     y: Float[Tensor, "B 6 K"], mean: Float[Tensor, "B 6 K"], weight: Float[Tensor, "B K"], distance: Float[Tensor, " B"]
 ) -> Float[Tensor, "B O"]:
-    """ln Λ of every shift δ (:func:`shifts`)."""
-    first, share = _places(y.dtype, y.device)
-    near, far = mean[:, :, first], mean[:, :, first + 1]
-    moved = near + share * (far - near)  # (B, 6, O, K)
-    weight = weight[:, None, None]
-    return _independent(distance) * (weight * moved * (y.unsqueeze(2) - 0.5 * moved)).sum((1, 3))
+    """ln Λ of every shift δ (:func:`shifts`), from the products of y and A at all lines.
+
+    Between lines A is linear, A(F e^−δ) = (1 − r) A_i + r A_{i+1}.
+    """
+    first, r = _places(y.dtype, y.device)
+    products = torch.bmm((weight.unsqueeze(1) * y).mT, mean).flatten(1)  # Σ_axes w y(F) A(F′), F′ fastest
+    squares, neighbours = mean.square().sum(1), (mean[..., :-1] * mean[..., 1:]).sum(1)
+    place = first + LINES * torch.arange(LINES, device=y.device)
+    fits = products[:, place] + r * (products[:, place + 1] - products[:, place])
+    size = (1 - r).square() * squares[:, first] + r.square() * squares[:, first + 1]
+    size = size + 2 * r * (1 - r) * neighbours[:, first]
+    return _independent(distance) * (fits - 0.5 * weight.unsqueeze(1) * size).sum(-1)
 
 
 def expected_log_likelihood(
@@ -156,6 +173,7 @@ def _trends(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "n K"]:
 @lru_cache
 @torch.inference_mode(False)
 def _grids(dtype: torch.dtype, device: torch.device) -> Float[Tensor, " grids"]:
-    """2π F [rad/m] of the coarse grid of lines and of the fine one, which are added."""
-    coarse = LEAST + STEP * FINE * torch.arange(COARSE, dtype=dtype, device=device)
-    return 2 * math.pi * torch.cat((coarse, STEP * torch.arange(FINE, dtype=dtype, device=device)))
+    """2π F [rad/m] of the far frequencies and of the near ones."""
+    far = STEP * NEAR * (torch.arange(FAR, dtype=dtype, device=device) + 0.5)
+    near = LEAST + STEP * (NEAR * (FAR - 0.5) + torch.arange(NEAR, dtype=dtype, device=device))
+    return 2 * math.pi * torch.cat((far, near))

@@ -48,6 +48,7 @@ from dlkf.filters.vibration_spectrum import (
     expected_log_likelihood,
     line_weights,
     log_likelihood,
+    log_power,
     shape,
     shifts,
     tone_shares,
@@ -229,7 +230,7 @@ class VibrationSpeed:
         H = self._matrix(epoch, block)
         of_speed = predicted_variance(prediction.P, H)[:, 0]
         weight, tones = line_weights(speed, epoch.dt), tone_shares(speed)
-        y = shape(block.spectrum, weight)
+        y = shape(log_power(block.spectrum), weight)
         of_distance, of_time = memory.by_distance.value, torch.bmm(memory.by_time.value, tones.mT)
         likelihood = log_likelihood(y - of_time, of_distance, weight, block.distance)
         expected = expected_log_likelihood(of_distance, weight, block.distance).clamp_min(1e-3)
