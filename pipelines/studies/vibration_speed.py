@@ -5,8 +5,8 @@
 Runs ``plus`` over the outages of :mod:`pipelines.studies.plus`. A row for each dataset: the drives, and those whose
 spectrum was trusted at the end of a run; then, of the measurements of ln(true speed / speed of the filter) that were
 used in outages: how many, which share of the blocks in motion they are, the slope of a line through them and what the
-reference says (1: they show the error that there is), their RMS against the reference, the RMS of their own 1σ, and
-that of the error before them.
+reference says (1: they show the error that there is), their RMS against the reference, their own 1σ, and the RMS of the
+error before them. Each counts with 1/R, as the filter weighs it.
 """
 
 from __future__ import annotations
@@ -129,8 +129,8 @@ def main() -> None:
         z, true, R, _ = every[every[:, 3] > 0].T
         cells = [name, str(len(trusted)), str(sum(trusted.values())), str(len(z)), f"{100 * len(z) / len(every):.0f}"]
         if len(z) > 1:
-            cells.append(f"{(z * true).sum() / (true * true).sum():.2f}")
-            cells += [f"{100 * math.sqrt(np.mean(x)):.1f}" for x in ((z - true) ** 2, R, true**2)]
+            cells.append(f"{(z * true / R).sum() / (true * true / R).sum():.2f}")
+            cells += [f"{100 * math.sqrt(np.average(x, weights=1 / R)):.1f}" for x in ((z - true) ** 2, R, true**2)]
         print(f"| {' | '.join(cells)} |", flush=True)
     if options.figure is not None:
         draw(shapes, options.figure)

@@ -8,10 +8,12 @@ that the filter was given is, for it, one of an outage of so many seconds:
 
 with P_o the covariance at the begin of the outage, carried on with all noise but the white one, and Q_a, Q_g what
 the white noise of accelerometers and gyroscopes has added since. S_o is linear in the squares of their levels a and g,
-so one trajectory scores all of them: the density of z_o (horizontal position, Student's t) after 10, 20 and 30 s is
-summed over the outages, older ones forgotten, and with a log-normal prior about 1 gives a posterior of (ln a, ln g)
-on a grid. Its mean is the level in force. Innovations after 1 s say how noisy a fix is; those after 10 to 30 s what
-matters in an outage. Without fixes nothing is learned.
+so one trajectory scores all of them: the log density of z_o (position, Student's t) after 10, 20 and 30 s is summed
+over the outages, older ones forgotten, and with a log-normal prior about 1 gives a posterior of (ln a, ln g) on a grid.
+Its mean is the level in force. Gyroscopes tilt the horizontal acceleration and hardly move the height, so the height
+tells accelerometers from gyroscopes; it counts with ``HEIGHT``, since the vertical accelerometer need not be as noisy
+as the others. Innovations after 1 s say how noisy a fix is; those after 10 to 30 s what matters in an outage. Without
+fixes nothing is learned.
 
 A network that scales the noise of the gyroscopes is judged by the same outages: beside Q_g with its factors runs Q_g
 without, and the posterior has both. The probability w of the network is the weight of its factors, κ^w.
@@ -26,6 +28,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dlkf.filters.branches import chosen, may_branch
 from dlkf.filters.integration import Covariances, Epoch
 from dlkf.filters.kalman_update import propagated
 from dlkf.navigation.error_model import WindowModel
@@ -34,6 +37,7 @@ from dlkf.navigation.state import ATTITUDE, PVA, STATES
 SCORED_S, LAST_S, STALE_S = 10.0, 30.0, 45.0  # ages at which an outage is scored: each multiple up to the last; too old
 MEMORY_S = 600.0  # of fixes, over which an outage is forgotten
 FREEDOM = 4.0  # of Student's t: an outlier decides nothing
+HEIGHT = 0.25  # weight of the log density of a height
 SPREAD = 1.0  # 1σ of ln(level) before anything is known
 TRUST = 0.9  # probability of a network's factors before anything is known
 LEVELS = tuple(2.0**k for k in range(-5, 6))  # of both sensors
@@ -87,12 +91,9 @@ class VirtualOutage(NamedTuple):
 
         fixed = epoch.used[:, :2].all(-1)
         scored = fixed & (age >= self.due) & (age < STALE_S)
-        H, R = c.H[:, :2], c.R[:, :2]
-        z = epoch.z[:, :2] + torch.bmm(H, drift.unsqueeze(-1)).squeeze(-1)
-        known = torch.bmm(torch.bmm(H, P), H.mT) + torch.diag_embed(R)
-        added = H[:, None, :, PVA] @ white @ H[:, None, :, PVA].mT
-        said = torch.stack((_log_density(z, known, added[:, :2]), _log_density(z, known, added[:, ::2])), 1)
-        said = torch.where(scored[:, None, None, None], said, 0.0)
+        said = torch.zeros_like(self.evidence)
+        if not may_branch(scored) or bool(scored.any()):
+            said = chosen(scored, _said(epoch, c, drift, P, white), said)
         kept = 1 - fixed.to(age.dtype) * (epoch.dt * epoch.imu.shape[1] / MEMORY_S)
         evidence = kept[:, None, None, None] * self.evidence + said
 
@@ -114,10 +115,25 @@ class VirtualOutage(NamedTuple):
         return P
 
 
+def _said(
+    epoch: Epoch, c: Covariances, drift: Float[Tensor, "B n"], P: Float[Tensor, "B n n"],
+    white: Float[Tensor, "B 3 9 9"],
+) -> Float[Tensor, "B 2 L L"]:  # fmt: skip
+    """What a fix says of the levels, with a network's factors and without."""
+    H = c.H[:, :3]
+    z = epoch.z[:, :3] + torch.bmm(H, drift.unsqueeze(-1)).squeeze(-1)
+    known = torch.bmm(torch.bmm(H, P), H.mT) + torch.diag_embed(c.R[:, :3])
+    added = H[:, None, :, PVA] @ white @ H[:, None, :, PVA].mT
+    height = torch.where(epoch.used[:, 2], HEIGHT, 0.0)[:, None, None]
+    return torch.stack([_log_density(z, known, x, height) for x in (added[:, :2], added[:, ::2])], 1)
+
+
 def _log_density(
-    z: Float[Tensor, "B 2"], known: Float[Tensor, "B 2 2"], added: Float[Tensor, "B 2 2 2"]
-) -> Float[Tensor, "B L L"]:
-    """ln p(z) but for a constant, of Student's t with S = known + a² added₀ + g² added₁, for all levels a, g."""
+    z: Float[Tensor, "B 3"], known: Float[Tensor, "B 3 3"], added: Float[Tensor, "B 2 3 3"],
+    height: Float[Tensor, "B 1 1"],
+) -> Float[Tensor, "B L L"]:  # fmt: skip
+    """ln p(z) but for a constant, for all levels a, g: Student's t with S = known + a² added₀ + g² added₁ of the
+    horizontal part, and that of the vertical one with the weight ``height``."""
     square = z.new_tensor([level**2 for level in LEVELS])
     a, g = square[:, None], square
 
@@ -125,8 +141,13 @@ def _log_density(
         k, x = known[:, i, j, None, None], added[:, :, i, j, None, None]
         return k + a * x[:, 0] + g * x[:, 1]
 
-    nn, ne, ee = of(0, 0), of(0, 1), of(1, 1)
+    nn, ne, ee, dd = of(0, 0), of(0, 1), of(1, 1), of(2, 2)
+    n, e, d = z[:, :, None, None].unbind(1)
     det = nn * ee - ne * ne
-    n, e = z[:, 0, None, None], z[:, 1, None, None]
-    distance = (ee * n * n - 2 * ne * n * e + nn * e * e) / det
-    return -0.5 * torch.log(det) - 0.5 * (FREEDOM + 2) * torch.log1p(distance / FREEDOM)
+    horizontal = _student_t((ee * n * n - 2 * ne * n * e + nn * e * e) / det, det, 2)
+    return horizontal + height * _student_t(d * d / dd, dd, 1)
+
+
+def _student_t(distance: Float[Tensor, "B L L"], det: Float[Tensor, "B L L"], count: int) -> Float[Tensor, "B L L"]:
+    """ln p of ``count`` numbers of a squared Mahalanobis distance and the determinant of S."""
+    return -0.5 * torch.log(det) - 0.5 * (FREEDOM + count) * torch.log1p(distance / FREEDOM)
