@@ -296,7 +296,7 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     arguments.add_argument("--real", type=Path, help="folder of real datasets; without it only simulated ones")
     arguments.add_argument("--data", type=Path, default=Path("data/plus"), help="where test sets lie, or are made")
-    arguments.add_argument("--sets", nargs="+", help="only these datasets")
+    arguments.add_argument("--sets", nargs="+", help="only these datasets; others of your own lie in --data too")
     arguments.add_argument("--no-auto", action="store_true", help="without imu=auto, which takes most of the time")
     arguments.add_argument("--oracle", action="store_true", help="beside a filter given the noise of simulated drives")
     arguments.add_argument("--parts", action="store_true", help="against itself without a part")
@@ -314,7 +314,11 @@ def main() -> None:
     if options.real is not None:
         real = {name: options.real / name for name in REAL if (options.real / name).is_dir()}
         folders = {**{name: options.data / name for name in INJECTED}, **real, **folders}
-    folders = {name: folder for name, folder in folders.items() if options.sets is None or name in options.sets}
+    if options.sets is not None:
+        folders = {name: folders.get(name, options.data / name) for name in options.sets}
+    for name, folder in folders.items():
+        if not folder.is_dir():
+            arguments.error(f"no dataset {name}: {folder} is no folder; real ones need --real")
     rows, digests = [], {}
     for name, folder in folders.items():
         drives, digests[name] = load(folder), dataset_digest(folder)

@@ -12,7 +12,7 @@ of σ², has E[uₖ²] = 2 w + q + P_v Δt² / σ² and E[uₖ uₖ₋₁] = −
 not white may wander: q is at most the share 1 − w of what a Gauss-Markov process of 1σ ``WANDER`` σ and correlation
 time ``WANDER_S`` moves by in Δt, 2 Δt / ``WANDER_S`` of its variance.
 
-The noise of a fix is half the mean square by which the error changes in ``NOISE_S``, w + q ``NOISE_S`` / 2 Δt, where
+The noise of a fix is half the mean square by which the error changes in ``NOISE_S``, w + q ``NOISE_S`` / (2 Δt), where
 that is less than claimed; what moves slower is a wander of the position. It rises at once where the last changes are
 larger (``QUICK`` fixes). Fixes of a stationary car count only where the carrier phase gives them: other receivers hold
 their position then.

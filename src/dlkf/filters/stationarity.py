@@ -27,7 +27,7 @@ from dlkf.filters.integration import Epoch
 from dlkf.navigation.earth import NOMINAL_GRAVITY
 from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, VELOCITY
 
-SURE_STD = 0.3  # m/s: speeds with a larger 1σ teach nothing
+SURE_STD = 0.3  # m/s: speeds with a larger 1σ do not update the levels
 CARRIER_STD = 0.2  # m: positions with a larger 1σ show no motion
 STANDING_SPEED, MOVING_SPEED = 0.3, 1.5  # m/s: from which side on a second counts as the one or the other
 APART = 10.0  # prior ratio of the level of a moving car to that of a stationary one

@@ -30,7 +30,7 @@ from dlkf.filters.pieces import summed
 
 FAR, NEAR, STEP, LEAST = 4, 16, 0.016, 0.2  # cycles/m; a line is a near frequency ± a far one
 LINES = 2 * FAR * NEAR
-WAVES = 2 * LINES  # cosines and sines
+WAVES = 2 * LINES  # products of a cosine or sine of each
 SLOW_HZ, FAST_HZ = 1.5, 20.0  # between which a line is looked at: above the car's own motion, below the sensor's noise
 SLOW_EDGE_HZ, FAST_EDGE_HZ = 0.2, 0.5
 NYQUIST = 0.45  # share of the sampling rate up to which it is

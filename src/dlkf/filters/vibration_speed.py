@@ -8,7 +8,7 @@ block fits it makes a measurement of the speed,
 
 with u the course at the middle of the block, L ago, and S = v − v̂ u − L g the impulse of the specific force since; mean
 and variance are those that the likelihood of δ has under the filter's own 1σ, widened by ``SEARCH``. A block with a
-fix teaches and does not measure: a shape learned at the filter's own speed must not confirm that speed.
+fix updates the shape and is no measurement: a shape learned at the filter's own speed must not confirm that speed.
 
 On another road, or in another gear, the shape may not hold. So ln Λ of a block counts with its best value over the one
 that the shape has on average, at most 1, and not at all where no shift fits better than no shape. An innovation beyond
@@ -68,11 +68,11 @@ WRONG = 0.06  # 1σ of δ, from which the shares have to find the known one
 LEAST_SHARE = 0.03  # that is used
 SEARCH = 0.02  # in ln v, beyond the filter's 1σ
 FINEST = 0.004  # 1σ of δ at best
-SAYS = 0.97  # of the search's variance, below which a block says something
+SAYS = 0.97  # of the search's variance, below which a block is informative
 OUTLIER = 3.0  # σ of an innovation, from which on its 1σ grows with it
 LOST_STD = 0.1  # relative 1σ of a speed at which no shape is looked for
 TOGETHER = 10.0  # measurements that share the error of the mean
-UNCHECKED_S = 100.0  # s after a fix, from which on what nothing has checked is worth less and less
+UNCHECKED_S = 100.0  # s after a fix over which R grows
 
 
 class Stretch(NamedTuple):

@@ -6,7 +6,7 @@ that the filter was given is, for it, one of an outage of so many seconds:
 
     z_o = z + H d,    S_o(a, g) = H (P_o + a² Q_a + g² Q_g) Hᵀ + R
 
-with P_o the covariance at the begin of the outage, carried on with all noise but the white one, and Q_a, Q_g what
+with P_o the covariance at the start of the outage, carried on with all noise but the white one, and Q_a, Q_g what
 the white noise of accelerometers and gyroscopes has added since. S_o is linear in the squares of their levels a and g,
 so one trajectory scores all of them: the log density of z_o (position, Student's t) after 10, 20 and 30 s is summed
 over the outages, older ones forgotten, and with a log-normal prior about 1 gives a posterior of (ln a, ln g) on a grid.
@@ -44,7 +44,7 @@ LEVELS = tuple(2.0**k for k in range(-5, 6))  # of both sensors
 
 
 class VirtualOutage(NamedTuple):
-    """The trajectory without corrections, and what the outages have said so far."""
+    """The trajectory without corrections, and the evidence for the levels so far."""
 
     drift: Tensor  # (B, n) d: the filter's estimate less that of the trajectory
     P: Tensor  # (B, n, n) of the trajectory but for the white noise since it began
@@ -55,7 +55,7 @@ class VirtualOutage(NamedTuple):
 
     @classmethod
     def begin(cls, P: Float[Tensor, "B n n"]) -> VirtualOutage:
-        """One that begins with a filter, and nothing said."""
+        """One that starts with the filter, without evidence."""
         zeros, B, n = P.new_zeros, len(P), P.shape[-1]
         due = zeros(B) + SCORED_S
         return cls(zeros(B, n), P, zeros(B, 3, 9, 9), zeros(B), due, zeros(B, 2, len(LEVELS), len(LEVELS)))
@@ -91,11 +91,11 @@ class VirtualOutage(NamedTuple):
 
         fixed = epoch.used[:, :2].all(-1)
         scored = fixed & (age >= self.due) & (age < STALE_S)
-        said = torch.zeros_like(self.evidence)
+        gained = torch.zeros_like(self.evidence)
         if not may_branch(scored) or bool(scored.any()):
-            said = chosen(scored, _said(epoch, c, drift, P, white), said)
+            gained = chosen(scored, _log_evidence(epoch, c, drift, P, white), gained)
         kept = 1 - fixed.to(age.dtype) * (epoch.dt * epoch.imu.shape[1] / MEMORY_S)
-        evidence = kept[:, None, None, None] * self.evidence + said
+        evidence = kept[:, None, None, None] * self.evidence + gained
 
         over = fixed & ((scored & (self.due >= LAST_S)) | (age >= STALE_S))
         due = torch.where(scored, self.due + SCORED_S, self.due)
@@ -115,11 +115,11 @@ class VirtualOutage(NamedTuple):
         return P
 
 
-def _said(
+def _log_evidence(
     epoch: Epoch, c: Covariances, drift: Float[Tensor, "B n"], P: Float[Tensor, "B n n"],
     white: Float[Tensor, "B 3 9 9"],
 ) -> Float[Tensor, "B 2 L L"]:  # fmt: skip
-    """What a fix says of the levels, with a network's factors and without."""
+    """Log likelihood of the levels from one fix, with a network's factors and without."""
     H = c.H[:, :3]
     z = epoch.z[:, :3] + torch.bmm(H, drift.unsqueeze(-1)).squeeze(-1)
     known = torch.bmm(torch.bmm(H, P), H.mT) + torch.diag_embed(c.R[:, :3])
