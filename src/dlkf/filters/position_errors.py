@@ -15,7 +15,7 @@ time ``WANDER_S`` moves by in Δt, 2 Δt / ``WANDER_S`` of its variance.
 The noise of a fix is half the mean square by which the error changes in ``NOISE_S``, w + q ``NOISE_S`` / (2 Δt), where
 that is less than claimed; what moves slower is a wander of the position. It rises at once where the last changes are
 larger (``QUICK`` fixes). Fixes of a stationary car count only where the carrier phase gives them: other receivers hold
-their position then.
+their position then. Horizontal and vertical errors have means of their own.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ LARGEST = 5.0  # σ: the most that a change of the error counts
 NOISE_S = 8.0  # an error that takes longer to change is no noise
 MOVING = 1.0  # m/s: slower cars are left out, but for receivers of ``CARRIER_STD``
 LEAST_STD = 0.02  # m, the least 1σ of a fix that is made smaller than claimed
+PART = [0, 0, 1]  # of a position's components: horizontal, down
 
 
 class PositionErrors(NamedTuple):
@@ -44,30 +45,30 @@ class PositionErrors(NamedTuple):
 
     residual: Tensor  # (B, 3) m, of the last fix after its update
     change: Tensor  # (B, 3) u
-    successive: Tensor  # (B,) fixes up to the last
-    white: Tensor  # (B,) w
-    walk: Tensor  # (B,) q
-    recent: Tensor  # (B,) mean of (u² − P_v Δt² / σ²) / 2 over the last fixes
-    fixes: Tensor  # (B,) what the means count for
+    successive: Tensor  # (B, 2) fixes up to the last, horizontal and down, as all that follow
+    white: Tensor  # (B, 2) w
+    walk: Tensor  # (B, 2) q
+    recent: Tensor  # (B, 2) mean of (u² − P_v Δt² / σ²) / 2 over the last fixes
+    fixes: Tensor  # (B, 2) what the means count for
 
     @classmethod
     def begin(cls, like: Tensor, size: int, epoch_s: float) -> PositionErrors:
         """Before the first fix."""
-        zero, zeros = like.new_zeros(size), like.new_zeros(size, 3)
+        zero, zeros = like.new_zeros(size, 2), like.new_zeros(size, 3)
         return cls(zeros, zeros, zero, zero + 1.0, zero, zero, zero + USUAL_FIXES)
 
     def variance(self, epoch: Epoch) -> Float[Tensor, "B 3"]:
         """By which the errors of the positions have moved in this update interval [m²]; zero without a fix."""
         largest = (1 - self.white.clamp(0.0, 1.0)) * _largest_walk(epoch.dt * epoch.imu.shape[1])
         std = torch.where(epoch.used[:, POSITION], epoch.fix.std[:, POSITION], 0.0)
-        return torch.minimum(self.walk.clamp_min(0.0), largest).unsqueeze(-1) * std.square()
+        return torch.minimum(self.walk.clamp_min(0.0), largest)[:, PART] * std.square()
 
     def noise(self, epoch: Epoch, position_std: Float[Tensor, ""]) -> Float[Tensor, "B 4"]:
         """Factors on the 1σ of position, horizontal and down, and of velocity (1), of a filter that takes positions
         for ``position_std`` times as noisy as claimed."""
         intervals = NOISE_S / (epoch.dt * epoch.imu.shape[1])
         slow = self.white.clamp_min(0.0) + 0.5 * intervals * self.walk.clamp_min(0.0)
-        factor = torch.maximum(slow, 0.5 * self.recent).clamp_min(1e-6).sqrt().unsqueeze(-1)
+        factor = torch.maximum(slow, 0.5 * self.recent).clamp_min(1e-6).sqrt()
         least = LEAST_STD / (position_std * epoch.fix.std[:, [0, 2]]).clamp_min(LEAST_STD)
         factor = torch.maximum(factor, least).clamp_max(1.0)
         return torch.cat((factor, torch.ones_like(factor)), -1)
@@ -75,28 +76,33 @@ class PositionErrors(NamedTuple):
     def after(self, epoch: Epoch, c: Covariances) -> PositionErrors:
         """After an update of the filter."""
         used = epoch.used[:, POSITION]
-        fixed = used[:, :2].all(-1)
         z = epoch.z[:, POSITION]
         std = torch.where(used, epoch.fix.std[:, POSITION], 1.0)
         change = (z - self.residual) / std
-        change = change * (LARGEST / change[:, :2].norm(dim=-1, keepdim=True).clamp_min(LARGEST))
-        successive = torch.where(fixed, self.successive + 1, 0.0)
-        square, product = (0.5 * (change * x)[:, :2].sum(-1) for x in (change, self.change))  # horizontal
+        size = torch.stack((change[:, :2].norm(dim=-1), change[:, 2].abs()), -1)
+        change = change * (LARGEST / size.clamp_min(LARGEST))[:, PART]
+        successive = torch.where(torch.stack((used[:, :2].all(-1), used[:, 2]), -1), self.successive + 1, 0.0)
+        square, product = (_parts(change * x) for x in (change, self.change))
         span = epoch.dt * epoch.imu.shape[1]
         of_velocity = c.predicted.diagonal(dim1=-2, dim2=-1)[:, VELOCITY] * (span / std).square()
         fixes = (self.fixes + 1).clamp_max(MEMORY)
         white = self.white - (product + self.white) / fixes
-        square = square - 0.5 * of_velocity[:, :2].sum(-1)
+        square = square - _parts(of_velocity)
         walk = self.walk + (square + 2 * product - self.walk) / fixes
         recent = self.recent + (0.5 * square - self.recent) / QUICK
         shown = (epoch.window.end.v_n.norm(dim=-1) > MOVING) | (std[:, :2].amax(-1) < CARRIER_STD)
-        counts = (successive >= 3) & shown  # two changes of the error
+        counts = (successive >= 3) & shown.unsqueeze(-1)  # two changes of the error
         residual = z - torch.bmm(c.H[:, POSITION], c.dx.unsqueeze(-1)).squeeze(-1)
         return PositionErrors(
             torch.where(used, residual, 0.0), change, successive, torch.where(counts, white, self.white),
             torch.where(counts, walk, self.walk), torch.where(counts, recent, self.recent),
             torch.where(counts, fixes, self.fixes),
         )  # fmt: skip
+
+
+def _parts(x: Float[Tensor, "B 3"]) -> Float[Tensor, "B 2"]:
+    """Mean of the horizontal components, and the one down."""
+    return torch.stack((0.5 * x[:, :2].sum(-1), x[:, 2]), -1)
 
 
 def _largest_walk(epoch_s: float) -> float:
