@@ -55,8 +55,8 @@ def watched(errors, available=None, speed=1.0, claim=STD):
 
 def test_white_errors_and_wandering_ones_are_told_apart():
     """Means of eight cars each after 150 fixes. White: w = 1, q = 0. Gauss-Markov: w = 0, q = 2 / τ. Each mean starts
-    with 20 fixes of white noise, and 150 products of pairs scatter by a tenth of the white part. Horizontal errors
-    and those down are told apart too: cars 17 to 32 have them exchanged."""
+    with 20 fixes of white noise, and 150 products of pairs scatter by a tenth of the white part. Horizontal
+    and vertical errors have estimates of their own: cars 17 to 32 have one of each kind."""
     g, white = torch.Generator().manual_seed(3), torch.randn(8, 150, 3, generator=torch.Generator().manual_seed(1))
     slow, decay = torch.zeros(8, 150, 3), math.exp(-1 / TAU)
     now = torch.randn(8, 3, generator=g)

@@ -37,7 +37,7 @@ LARGEST = 5.0  # σ: the most that a change of the error counts
 NOISE_S = 8.0  # an error that takes longer to change is no noise
 MOVING = 1.0  # m/s: slower cars are left out, but for receivers of ``CARRIER_STD``
 LEAST_STD = 0.02  # m, the least 1σ of a fix that is made smaller than claimed
-PART = [0, 0, 1]  # of a position's components: horizontal, down
+PART = [0, 0, 1]  # of a position's components: horizontal, vertical
 
 
 class PositionErrors(NamedTuple):
@@ -45,7 +45,7 @@ class PositionErrors(NamedTuple):
 
     residual: Tensor  # (B, 3) m, of the last fix after its update
     change: Tensor  # (B, 3) u
-    successive: Tensor  # (B, 2) fixes up to the last, horizontal and down, as all that follow
+    successive: Tensor  # (B, 2) fixes up to the last; as below, horizontal and vertical
     white: Tensor  # (B, 2) w
     walk: Tensor  # (B, 2) q
     recent: Tensor  # (B, 2) mean of (u² − P_v Δt² / σ²) / 2 over the last fixes
@@ -101,7 +101,7 @@ class PositionErrors(NamedTuple):
 
 
 def _parts(x: Float[Tensor, "B 3"]) -> Float[Tensor, "B 2"]:
-    """Mean of the horizontal components, and the one down."""
+    """Mean of the horizontal components, and the vertical one."""
     return torch.stack((0.5 * x[:, :2].sum(-1), x[:, 2]), -1)
 
 
