@@ -1,5 +1,6 @@
-"""The gate's verdict on one position, by hand: when refused fixes agree, and how far P is then opened."""
+"""The gates' verdicts on one fix by hand, and filters with outliers, steps and outages."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -7,14 +8,16 @@ import torch
 
 from dlkf.filters.build import build_filter
 from dlkf.filters.gating import (
-    AGREEMENT_SPEED,
+    AGREEMENT_RATE,
     COARSE_FLOOR,
     COARSE_PATIENCE,
     COARSE_SIGMAS,
+    FLOOR,
     PATIENCE,
+    USUAL_STEP,
     CoarseGate,
     Gate,
-    Verdict,
+    _predicted_variance,
 )
 from dlkf.filters.integration import Fix, integrate
 from dlkf.filters.shipped import trained_filter
@@ -24,48 +27,76 @@ from .scene import IMU, scene
 from .test_constraints import epoch_of, slipping
 
 
-def judged(off: float, before: float, refused: int) -> tuple[float, Verdict]:
-    """A position ``off`` [m] along north where S has 2 m (1σ), a second after one ``before`` [m] off that was the
-    last of ``refused``; fixes of 1 cm. How many are refused now, and the verdict."""
+def judged(off: float, before: float = 0.0, refused: int = 0, usual: float = 0.0, *, std: float = 1.0, height=0.0):
+    """A position ``off`` [m] along north of a filter without any error, a second after one ``before`` [m] off that was
+    the last of ``refused``; fixes of 1σ ``std`` for a filter that takes them so. The memory after, the epoch, P."""
     batch = scene(1, 1)
     epoch = epoch_of(batch, batch.start, ImuError(batch.imu.new_zeros(1, 6)))
     z, used = torch.zeros_like(epoch.z), torch.tensor([[True] * 3 + [False] * 3])
-    z[0, 0] = off
-    fix = Fix(z, torch.full_like(z, 0.01), used, None)
-    gate = Gate(0.999)
+    z[0, 0], z[0, 2] = off, height
+    gate, fix = Gate(0.999), Fix(z, torch.full_like(z, std), used, None)
     memory = gate.begin(epoch.z)
-    memory.innovation[0, 0], memory.refused[0] = before, refused
-    after, verdict = gate.judge(
-        memory, epoch._replace(z=z, fix=fix), torch.diag_embed(torch.where(used, 4.0, 1.0).to(z)), fix.std.square()
-    )
-    return float(after.refused), verdict
+    memory.innovation[0, 0], memory.refused[0, 0], memory.usual[:] = before, refused, usual
+    return gate.screened(memory, epoch._replace(z=z, fix=fix), torch.zeros(1, 15, 15).to(z), fix.std.square())
+
+
+def test_the_limit_by_hand():
+    """χ² of two degrees of freedom at 0.999 is −2 ln 0.001: as a mean over north and east, off by √(2 · 6.9) 1σ."""
+    limit = (-2 * math.log(0.001) * (1 + FLOOR**2)) ** 0.5
+    for off, kept in ((0.999 * limit, True), (1.001 * limit, False)):
+        memory, epoch, P = judged(off)
+        assert epoch.used[0].tolist() == [kept] * 3 + [False] * 3 and not P.any()
+        assert float(epoch.z[0, 0]) == off * kept and float(memory.refused[0, 0]) == 1.0 - kept
+    assert judged(0.0, height=3.28 * (1 + FLOOR**2) ** 0.5)[1].used[0].tolist() == [True] * 3 + [False] * 3
+    assert judged(0.0, height=3.30 * (1 + FLOOR**2) ** 0.5)[1].used[0].tolist() == [True, True, *[False] * 4]
+
+
+def test_an_outlier_is_larger_than_usual():
+    """Where d² is usually 9 times its median, the limit is 3 times as far; and s² follows by a step, never below 1."""
+    usual, limit = 2 * math.log(3.0), 3 * (-2 * math.log(0.001) * (1 + FLOOR**2)) ** 0.5
+    assert judged(0.999 * limit, usual=usual)[1].used[0, 0] and not judged(1.001 * limit, usual=usual)[1].used[0, 0]
+    moved = judged(50.0, usual=1.0)[0].usual[0].tolist()
+    assert moved == pytest.approx([1 + USUAL_STEP, 1 - USUAL_STEP, 1.0, 1.0])
+    assert judged(0.0)[0].usual[0].tolist() == [0.0] * 4
 
 
 def test_a_refused_position_agrees_with_one_as_far_off():
     """Within 6σ of both fixes, √6 cm (three axes each), and what 2 m/s make of the second between them."""
-    limit = 6 * 0.01 * 6**0.5 + AGREEMENT_SPEED
-    assert judged(50.0, 50.0 - limit + 0.01, 2)[0] == 3
-    assert judged(50.0, 50.0 - limit - 0.01, 2)[0] == 1
+    limit = 6 * 0.01 * 6**0.5 + AGREEMENT_RATE
+    assert judged(50.0, 50.0 - limit + 0.01, 1, std=0.01)[1].used[0, 0]
+    memory, epoch, P = judged(50.0, 50.0 - limit - 0.01, 1, std=0.01)
+    assert not epoch.used[0, :2].any() and float(memory.refused[0, 0]) == 1 and not P.any()
 
 
-def test_p_is_inflated_by_what_contradicts_it():
-    """At the last of the agreeing refusals: by z² in itself, and all of it by the mean of z²/S over the components."""
-    kept = judged(12.0, 12.0, PATIENCE - 2)[1]
-    assert float(kept.factor) == 1.0 and not kept.shift.any() and not kept.passed.any()
-    left, opened = judged(12.0, 12.0, PATIENCE - 1)
-    assert left == PATIENCE and float(opened.factor) == pytest.approx(12.0**2 / 4 / 3)
-    assert opened.shift[0].tolist() == [144.0, 0, 0, 0, 0, 0] and opened.passed[0].tolist() == [True] * 3 + [False] * 3
-    P = torch.eye(9, dtype=opened.factor.dtype)[None]
-    assert opened.inflated(P)[0].diagonal().tolist() == pytest.approx([156.0, *[12.0] * 8])
+def test_p_is_opened_by_what_contradicts_it():
+    """At the last of the agreeing refusals: z² is added to the variance of the position, and the next starts anew."""
+    for refused in range(PATIENCE):
+        memory, epoch, P = judged(12.0, 12.0, refused)
+        last = refused == PATIENCE - 1
+        assert bool(epoch.used[0, 0]) is last and float(memory.refused[0, 0]) == (0 if last else refused + 1)
+        assert P[0].diagonal().tolist() == [144.0 * last, *[0.0] * 14]
 
 
-def test_a_filter_that_has_moved_follows_the_next_fixes_at_once():
-    """Those that lie near where it moved to; one elsewhere waits, and each that passes the test counts against it."""
-    after, followed = judged(9.0, 8.0, PATIENCE)
-    assert after == PATIENCE and followed.passed[0, 0] and float(followed.shift[0, 0]) == 81.0
-    assert judged(9.0, 8.0, PATIENCE - 2)[0] == PATIENCE - 1
-    assert judged(1.0, 8.0, PATIENCE)[0] == PATIENCE - 1
-    assert not judged(500.0, 8.0, PATIENCE)[1].passed.any()
+def test_the_variance_an_epoch_later_is_that_of_the_filter():
+    """To what correlations make of it: P of a car in motion, carried on by Φ and Q."""
+    batch = slipping(3, 30, (0.0,) * 5)
+    estimator, seen = build_filter("mbkf15", IMU), []
+
+    class Watched(type(estimator)):
+        def update(self, memory, epoch):
+            memory, correction = super().update(memory, epoch)
+            seen.append((before.pop(), correction.covariances.predicted.diagonal(dim1=-2, dim2=-1)[:, :6]))
+            return memory, correction
+
+        def screened(self, memory, epoch):
+            before.append(_predicted_variance(epoch, memory.P))
+            return super().screened(memory, epoch)
+
+    before: list[torch.Tensor] = []
+    with torch.inference_mode():
+        integrate(batch, Watched(**{name: getattr(estimator, name) for name in estimator.__dataclass_fields__}))
+    ratio = torch.stack([(mine / its).sqrt() for mine, its in seen[5:]])
+    assert ratio.min() > 0.5 and ratio.max() < 5.0 and 0.9 < ratio.median() < 1.6
 
 
 def cars(name: str, epochs: int):
@@ -105,7 +136,8 @@ def test_the_first_fix_after_an_outage_may_be_wrong(name):
     found, without = solved(wrong, name), solved(hidden(batch, slice(50, 51)), name)
     assert not found.used[:, 50].any() and found.used[:, 51:].all()
     assert off(batch, found, 50) < off(batch, without, 50) + 1e-6
-    assert torch.equal(found.posterior.p_n[:, 51:], without.posterior.p_n[:, 51:])
+    apart = (found.posterior.p_n - without.posterior.p_n)[:, 51:].abs().max()
+    assert apart < (1e-4 if name == "plus" else 1e-9)  # what plus knows of the receiver's errors has a 1σ more
 
 
 @pytest.mark.parametrize("name", ["mbkf15", "plus"])
@@ -125,6 +157,30 @@ def test_a_receiver_that_was_right_is_followed(name):
     assert not found.used[:, 30:first].any() and found.used[:, first:].all()
     target = batch.truth.p_n[:, -1, :2] + 3000
     assert (found.posterior.p_n[:, -1, :2] - target).norm(dim=-1).max() < 1.0
+
+
+@pytest.mark.parametrize("name", ["mbkf15_gated", "mbkf21_car_gated", "plus"])
+@pytest.mark.parametrize("size, share", [(30.0, 0.1), (3.0, 0.1), (1.0, 0.2)])
+def test_wrong_fixes_do_little(name, size, share):
+    """Positions of 5 cm of which some are off by metres, alone: in an outage nearly as well as without them."""
+    batch = cars(name, 150)
+    g = torch.Generator().manual_seed(1)
+    hit = torch.rand(batch.gnss.shape[:2], generator=g) < share
+    hit[:, :8] = False
+    gnss = batch.gnss.clone()
+    gnss[..., :3] += hit.unsqueeze(-1) * size * torch.randn(*hit.shape, 3, generator=g).to(gnss)
+    outage = slice(120, 150)
+    clean, wrong = (solved(hidden(b, outage), name) for b in (batch, replace(batch, gnss=gnss)))
+    assert off(batch, wrong, 119) < 0.5 and off(batch, wrong, 149) < 1.5 * off(batch, clean, 149) + 2.0
+
+
+@pytest.mark.parametrize("name", ["mbkf15_gated", "plus"])
+def test_fixes_noisier_than_claimed_are_used(name):
+    """White noise of five times the 1σ is no outlier: what is usual is found in seconds, and few are left out."""
+    batch = cars(name, 90)
+    noise = torch.randn(batch.gnss.shape, generator=torch.Generator().manual_seed(2), dtype=batch.gnss.dtype)
+    batch = replace(batch, gnss=batch.gnss + 4.9 * batch.gnss_std * noise)
+    assert solved(batch, name).used[:, 20:].float().mean() > 0.9
 
 
 def test_a_filter_that_is_itself_wrong_loses_one_fix():
@@ -163,6 +219,6 @@ def test_the_coarse_limit_by_hand():
         z[0, 0] = z0
         fix = Fix(z, torch.full_like(z, 4.0), used, None)
         gate = CoarseGate()
-        _, screened, after = gate.screened(gate.begin(z), epoch._replace(z=z, fix=fix), P)
+        _, screened, after = gate.screened(gate.begin(z), epoch._replace(z=z, fix=fix), P, fix.std.square())
         assert bool(screened.used[0, 0]) is kept and float(screened.z[0, 0]) == (z0 if kept else 0.0)
         assert torch.equal(after, P)

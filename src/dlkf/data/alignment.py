@@ -11,7 +11,8 @@ v(t) = e^{iα(t)} (z − w τ), τ = t_end − t, so
     p(t) = p_end − z ∫ e^{iα} dτ + w ∫ τ e^{iα} dτ,
 
 which is linear in position, velocity z and acceleration w at the boundary; w has a prior of :data:`ACCELERATION_STD`,
-so that coarse positions are fitted by a constant speed and fine ones by an accelerated motion.
+so that coarse positions are fitted by a constant speed and fine ones by an accelerated motion. Where the residuals are
+larger than the positions' 1σ, that of the velocity grows with them.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ JERK_STD = 0.7  # m/s³, of a car
 FIT_S = 5.0  # of positions to which a velocity is fitted
 ACCELERATION_STD = 1.0  # m/s², of a car
 GYRO_BIAS_STD = 0.01  # rad/s, that turns the positions of a window about its end
+MOTION_SIGMAS = 2.0  # of a velocity: less is no motion
 FIT_STD = 0.1  # m: how far a car keeps from the fit's motion
 SPREAD_STD = math.radians(0.5)  # lever arm to the rear axle, vibration
 
@@ -100,7 +102,8 @@ class Start:
 
 
 def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
-    """Align at every boundary that has a fix with velocity faster than ``min_speed`` and one a window before.
+    """Align at every boundary that has a fix with velocity faster than ``min_speed`` and than ``MOTION_SIGMAS`` times
+    its 1σ, and one a window before.
 
     A source without any velocity has it fitted to its positions. Reads no reference.
     """
@@ -149,7 +152,7 @@ def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     std = torch.cat((drive.gnss_std[:, :3], v_std, attitude_std), -1)
     C_eb = C_en @ C_nb
     finite = torch.cat((r_e, now, C_eb.flatten(1), std), -1).isfinite().all(-1)
-    ok &= (speed > config.min_speed) & finite
+    ok &= (speed > config.min_speed) & (speed > MOTION_SIGMAS * noise) & finite
     return Aligned(ok, r_e, (C_en @ now.unsqueeze(-1)).squeeze(-1), C_eb, std)
 
 
@@ -222,7 +225,10 @@ def _fit_velocity(
     v_n, v_std = torch.zeros(rows, 3, dtype=torch.float64), torch.zeros(rows, 3, dtype=torch.float64)
     v_n[:, 0], v_n[:, 1] = level[:, 1].real, level[:, 1].imag
     span = (tau * fixed).amax(-1)
-    v_std[:, :2] = torch.hypot(variance[:, 1].sqrt(), 0.5 * GYRO_BIAS_STD * span * level[:, 1].abs())[:, None]
+    residual = torch.complex(r_n[..., 0], r_n[..., 1]) - (x.to(level.dtype) @ level.unsqueeze(-1))[..., 0]
+    squares = (weight * residual.abs().square()).sum(-1) / (2 * fixed.sum(-1) - 5).clamp_min(1)
+    scale = squares.clamp_min(1.0).sqrt()  # Birge ratio: of positions that scatter by more than claimed, or jump
+    v_std[:, :2] = torch.hypot(scale * variance[:, 1].sqrt(), 0.5 * GYRO_BIAS_STD * span * level[:, 1].abs())[:, None]
     x = torch.stack((torch.ones_like(fixed, dtype=torch.float64), -tau.expand(rows, -1)), -1)
     slope = UNKNOWN_VELOCITY_STD + UNKNOWN_SLOPE_STD * v_n[:, :2].norm(dim=-1)
     down, variance = solve(x, r_n[..., 2], torch.stack((torch.full_like(slope, 1e-9), slope**-2), -1))

@@ -1,10 +1,19 @@
-"""Innovation gating: fixes that contradict the filter are left out, and a filter that is wrong recovers (inflates P).
+"""Innovation gating: outliers among the fixes are left out, and a filter that is wrong follows fixes that agree.
 
-Position and velocity of a fix are tested apart: zᵀ S⁻¹ z against χ² (Groves sect. 17.3). A filter that has become
-sure of a wrong position would refuse good fixes for ever; so when fixes in a row are refused that agree with each
-other, its covariance is inflated and they pass. An error of attitude or a bias takes more than one of them to correct:
-those that follow and agree pass likewise, until as many have passed the test. A receiver that repeats the same fix
-while the car moves is frozen, and not used until it changes.
+The four parts of a fix, position and velocity, horizontal and down, are tested apart. With k components and S the
+predicted variance of the innovation z, a part is an outlier where
+
+    d² = (1/k) Σ z² / S > (χ²ₖ / k) max(s², 1),
+
+χ²ₖ the quantile of the probability that a good one passes (Groves sect. 17.3). With an outlying horizontal position the
+whole fix is left out. s² is what d² usually is over its median: its logarithm moves by ``USUAL_STEP`` up or down with
+every fix (a running median, which outliers hardly move). A filter or a receiver that claims too small a 1σ has large
+innovations all the time, and loses no fixes for that; an outlier is one that is larger than usual.
+
+A filter that is sure of a wrong position would refuse good fixes; so with ``PATIENCE`` in a row that agree with each
+other they pass, and z² is added to the variance: the position is elsewhere, for whichever reason, and attitude and
+biases need not explain it. A receiver that repeats the same fix while the car moves is frozen, and not used until it
+changes.
 
 Filters without that gate have a coarse one that cannot be switched off (:class:`CoarseGate`): a fix ``COARSE_SIGMAS``
 off, such as the first one after a tunnel, is left out. On data whose noise is as stated it never acts.
@@ -22,15 +31,19 @@ from torch import Tensor
 
 from dlkf.filters.branches import may_branch
 from dlkf.filters.integration import Epoch
-from dlkf.navigation.compiled import is_recorded
-from dlkf.navigation.state import PV
+from dlkf.navigation.earth import STANDARD_GRAVITY
+from dlkf.navigation.state import ACCEL, ATTITUDE, POSITION, PV, VELOCITY
 
-PATIENCE = 5  # refused fixes that agree with each other before the filter recovers
-MOST_DOUBT = 25.0  # factor on P at most: what was wrong is as a rule attitude or a bias
-AGREEMENT_SIGMAS, AGREEMENT_SPEED = 6.0, 2.0  # two refusals agree within 6σ of the fixes + 2 m/s · time
+PATIENCE = 2  # refused fixes in a row that agree with each other before the filter follows them
+AGREEMENT_SIGMAS, AGREEMENT_RATE = 6.0, 2.0  # two refusals agree within 6σ of the fixes + 2 m/s, 2 m/s² · time
+FLOOR = 0.05  # m, m/s added to 1σ of an innovation
+USUAL_STEP = 0.3  # per fix, by which the logarithm of the usual squared innovation follows
+PARTS, OF_PART = [0, 2, 3, 5], [0, 0, 1, 2, 2, 3]  # a component of each part; the part of each component
+MEDIANS = (0.6931, 0.4549, 0.6931, 0.4549)  # of d² of each part: of χ² of two and of one degree of freedom
 FROZEN_SPEED = 1.0  # m/s: above, a fix cannot be the same twice
 COARSE_SIGMAS, COARSE_FLOOR = 20.0, (2.0, 0.5)  # m, m/s added to 1σ of position and velocity: an error, no noise
 COARSE_PATIENCE = 2  # refused fixes that agree with each other before such a filter recovers
+MOST_DOUBT = 25.0  # factor on P at most: what was wrong is as a rule attitude or a bias
 COARSE_JUMP = 1000.0  # m: beyond, P is inflated; less is a filter's own drift, whose shape P has
 UNKNOWN_SPEED = 60.0  # m/s: of a car between two fixes without velocity
 NEAR = COARSE_SIGMAS * COARSE_FLOOR[1] / 3**0.5  # m, m/s: with no component beyond, nothing is refused
@@ -44,26 +57,26 @@ def chi2_quantile(probability, degrees: int | float):
 
 
 class GateMemory(NamedTuple):
-    """Memory of the gate between epochs."""
+    """Memory of the gate between epochs; parts are position horizontal and down, velocity horizontal and down."""
 
-    refused: Tensor  # (B,) agreeing refusals in a row, less what has passed since
-    innovation: Tensor  # (B, 3) of the last refused position; 0 once the filter has moved there
-    age: Tensor  # (B,) s since then
-    fix: Tensor  # (B, 6) the last fix offered
+    usual: Tensor  # (B, 4) ln s² of each part, ≥ 0
+    refused: Tensor  # (B, 2) agreeing refusals in a row, of positions and of velocities
+    innovation: Tensor  # (B, 6) of the last refused ones
+    age: Tensor  # (B, 2) s since then
+    fix: Tensor  # (B, 3) the last position offered
     frozen: Tensor  # (B,) bool: it did not move with the car
-    limits: Tensor  # (1, 4) highest normalised innovation squared by the number of components, for all drives
+    limits: Tensor  # (1, 4) of d² of each part over s², the same for all drives
 
 
 class Verdict(NamedTuple):
-    """A gate's verdict on a fix; P is to become ``factor`` · P with ``shift`` added to position and velocity."""
+    """The coarse gate's verdict on a fix; P becomes ``factor`` · P with ``shift`` added to position and velocity."""
 
     passed: Tensor  # (B, 6) bool
-    used: Tensor  # (B,) bool: its position passed, or its velocity where that is all there is
     shift: Tensor  # (B, 6) variance
     factor: Tensor  # (B,) ≥ 1
 
     def inflated(self, P: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
-        """P inflated where the filter recovers, unchanged elsewhere."""
+        """P inflated where the filter follows refused fixes, unchanged elsewhere."""
         wide = self.factor[:, None, None] * P
         wide[:, PV, PV] += torch.diag_embed(self.shift)
         return wide
@@ -84,8 +97,7 @@ class CoarseGate:
 
     P is that of the update before, position's grown by velocity's over the update interval. Refused fixes are compared
     with each other, not with the filter: with ``COARSE_PATIENCE`` in a row whose positions and velocities agree they
-    pass, so that a filter that is itself wrong loses one fix; beyond ``COARSE_JUMP`` P is inflated as
-    :class:`Gate` does.
+    pass, so that a filter that is itself wrong loses one fix; beyond ``COARSE_JUMP`` P is inflated.
     """
 
     def begin(self, like: Tensor) -> CoarseMemory:
@@ -94,9 +106,10 @@ class CoarseGate:
         return CoarseMemory(zeros(B), zeros(B, 6), zeros(B) > 0, zeros(B))
 
     def screened(
-        self, memory: CoarseMemory, epoch: Epoch, P: Float[Tensor, "B n n"]
+        self, memory: CoarseMemory, epoch: Epoch, P: Float[Tensor, "B n n"], R: Float[Tensor, "B 6"]
     ) -> tuple[CoarseMemory, Epoch, Float[Tensor, "B n n"]]:
-        """The epoch without what is refused, and P, inflated where the gate recovers."""
+        """The epoch without what is refused, and P, inflated where the gate recovers; it judges by the fix's own 1σ,
+        not by the ``R`` that the filter takes it for."""
         if may_branch(epoch.z) and float(epoch.z.detach().abs().max()) <= NEAR and not bool(memory.refused.any()):
             return memory, epoch, P
         with torch.no_grad():
@@ -125,7 +138,6 @@ class CoarseGate:
         mean = squares.sum(-1) / used.sum(-1).clamp_min(1)
         verdict = Verdict(
             passes,
-            used=passes.any(-1),
             shift=torch.where(jumps.unsqueeze(-1) & passes, z * z, 0.0),
             factor=torch.where(jumps, mean.clamp(1.0, MOST_DOUBT), 1.0),
         )
@@ -141,77 +153,91 @@ class CoarseGate:
         """Whether the way from the last refused position is that of the mean of both velocities."""
         known = (moves & memory.moves).unsqueeze(-1)
         way = torch.where(known, 0.5 * (fix[:, 3:] + memory.fix[:, 3:]) * age.unsqueeze(-1), 0.0)
-        spread = AGREEMENT_SIGMAS * (2 * R[:, :3]).sum(-1).sqrt() + AGREEMENT_SPEED * age
+        spread = AGREEMENT_SIGMAS * (2 * R[:, :3]).sum(-1).sqrt() + AGREEMENT_RATE * age
         spread = spread + torch.where(known.squeeze(-1), 0.0, UNKNOWN_SPEED * age)
         return (fix[:, :3] - memory.fix[:, :3] - way).norm(dim=-1) < spread
 
 
 @dataclass(frozen=True)
 class Gate:
-    """χ² gate with recovery; ``probability`` is that of passing a good fix."""
+    """Refuses outliers; ``probability`` is that of passing a good part of a fix."""
 
     probability: float
 
     def begin(self, like: Tensor) -> GateMemory:
         """Nothing refused yet; ``like`` (B, …) gives batch and precision."""
-        zeros = like.new_zeros
-        B, limits = len(like), like.new_tensor([self._limits])
-        return GateMemory(
-            zeros(B), zeros(B, 3), zeros(B), torch.full_like(zeros(B, 6), torch.nan), zeros(B) > 0, limits
-        )
+        B, zeros = len(like), like.new_zeros
+        limits = like.new_tensor([[self._limits[k] for k in (2, 1, 2, 1)]])
+        nowhere = torch.full_like(zeros(B, 3), torch.nan)
+        return GateMemory(zeros(B, 4), zeros(B, 2), zeros(B, 6), zeros(B, 2), nowhere, zeros(B) > 0, limits)
 
-    def judge(
-        self, memory: GateMemory, epoch: Epoch, S: Float[Tensor, "B 6 6"], variance: Float[Tensor, "B 6"]
-    ) -> tuple[GateMemory, Verdict]:
-        """What passes, and by how much P is inflated where the filter recovers.
+    def screened(
+        self, memory: GateMemory, epoch: Epoch, P: Float[Tensor, "B n n"], R: Float[Tensor, "B 6"]
+    ) -> tuple[GateMemory, Epoch, Float[Tensor, "B n n"]]:
+        """The epoch without what is refused, and P, inflated where the filter follows refused fixes.
 
-        ``S`` is the innovation covariance with unit rows where a component is not offered, ``variance`` the fix's.
+        ``P`` is that of the update before, ``R`` (B, 6) the variance of the fix.
         """
-        used, z = epoch.used, epoch.z
-        position, velocity = used[:, :3].any(-1), used[:, 3:].any(-1)
-        offered = position | velocity
-        same = (epoch.fix.value == memory.fix)[:, :3].all(-1) & position
+        with torch.no_grad():
+            memory, passed, shift = self._judge(memory, epoch, P, R)
+        P = P.clone()
+        P[:, PV, PV] += torch.diag_embed(shift)
+        return memory, epoch._replace(z=epoch.z * passed, fix=epoch.fix._replace(used=passed)), P
+
+    def _judge(self, memory: GateMemory, epoch: Epoch, P: Tensor, R: Tensor) -> tuple[GateMemory, Tensor, Tensor]:
+        """What passes (B, 6), and the variance that P is to have added."""
+        z, used, span = epoch.z, epoch.used, epoch.dt * epoch.imu.shape[1]
+        position = used[:, :3].any(-1)
+        same = (epoch.fix.value[:, :3] == memory.fix).all(-1) & position
         frozen = same & (memory.frozen | (epoch.window.end.v_n.norm(dim=-1) > FROZEN_SPEED))
-        fits = torch.stack(
-            [self._fits(z[:, k], S[:, k, k], used[:, k], memory.limits) for k in (slice(0, 3), slice(3, 6))], -1
-        )
-        age = memory.age + epoch.dt * epoch.imu.shape[1]
-        wrong = position & ~fits[:, 0] & ~frozen
-        refused = torch.where(self._agrees(memory, z, used, variance, age), memory.refused + 1, 1.0)
-        fewer = (memory.refused - 1).clamp_min(0.0)
-        refused = torch.where(wrong, refused, torch.where(position & ~frozen, fewer, memory.refused))
-        yields = wrong & (refused >= PATIENCE)
-        passed = (fits.repeat_interleave(3, -1) | yields.unsqueeze(-1)) & used & ~frozen.unsqueeze(-1)
-        nis = torch.where(used, z.square() / S.diagonal(dim1=-2, dim2=-1), 0.0).sum(-1) / used.sum(-1).clamp_min(1)
-        verdict = Verdict(
-            passed,
-            used=torch.where(position, passed[:, :3].any(-1), passed.any(-1)),
-            shift=torch.where(yields.unsqueeze(-1) & passed, z * z, 0.0),
-            factor=torch.where(yields, nis.clamp(1.0, MOST_DOUBT), 1.0),
-        )
+        S = _predicted_variance(epoch, P) + R + FLOOR * FLOOR
+        square = _by_part(torch.where(used, z.square() / S, 0.0))
+        offered = used[:, PARTS] & ~frozen.unsqueeze(-1)
+        outlier = offered & (square > memory.limits * torch.exp(memory.usual))
+        wrong = torch.stack((outlier[:, :2].any(-1), outlier[:, 2:].any(-1)), -1)
+
+        age = memory.age + span
+        change = (z - memory.innovation).unflatten(-1, (2, 3)).norm(dim=-1)
+        spread = AGREEMENT_SIGMAS * (2 * R).unflatten(-1, (2, 3)).sum(-1).sqrt() + AGREEMENT_RATE * age
+        agrees = (change < spread) & (memory.refused > 0)
+        refused = torch.where(agrees, memory.refused + 1, torch.ones_like(age))
+        seen = torch.stack((offered[:, :2].any(-1), offered[:, 2:].any(-1)), -1)
+        refused = torch.where(wrong, refused, torch.where(seen, 0.0, memory.refused))
+        follows = wrong & (refused >= PATIENCE)
+        of_parts, of_components = follows[:, [0, 0, 1, 1]], follows[:, [0, 0, 0, 1, 1, 1]]
+
+        passed = offered & (~outlier | of_parts)
+        passed = (passed & (passed[:, :1] | ~offered[:, :1]))[:, OF_PART] & used
+        more = square > square.new_tensor(MEDIANS) * torch.exp(memory.usual)
+        usual = (memory.usual + torch.where(more, USUAL_STEP, -USUAL_STEP)).clamp_min(0.0)
         return GateMemory(
-            refused.clamp_max(PATIENCE),
-            torch.where(wrong.unsqueeze(-1), torch.where(yields.unsqueeze(-1), 0.0, z[:, :3]), memory.innovation),
+            torch.where(offered, usual, memory.usual),
+            torch.where(follows, 0.0, refused),
+            torch.where(wrong[:, [0, 0, 0, 1, 1, 1]], z, memory.innovation),
             torch.where(wrong, 0.0, age),
-            torch.where(offered.unsqueeze(-1), epoch.fix.value, memory.fix),
+            torch.where(position.unsqueeze(-1), epoch.fix.value[:, :3], memory.fix),
             torch.where(position, frozen, memory.frozen),
             memory.limits,
-        ), verdict
-
-    def _agrees(self, memory: GateMemory, z: Tensor, used: Tensor, variance: Tensor, age: Tensor) -> Tensor:
-        """Whether a position agrees with the last refused one: as far off, or further by the velocity that the
-        fix contradicts the filter by."""
-        change = z[:, :3] - memory.innovation
-        explained = (z[:, 3:] * used[:, 3:]) * age.unsqueeze(-1)
-        spread = AGREEMENT_SIGMAS * (2 * variance[:, :3]).sum(-1).sqrt() + AGREEMENT_SPEED * age
-        near = (change.norm(dim=-1) < spread) | ((change - explained).norm(dim=-1) < spread)
-        return near & (memory.refused > 0)
-
-    def _fits(self, z: Tensor, S: Tensor, used: Tensor, limits: Tensor) -> Tensor:
-        factor = torch.linalg.cholesky_ex(S, check_errors=not is_recorded())[0]
-        nis = (z * torch.cholesky_solve(z.unsqueeze(-1), factor).squeeze(-1)).sum(-1)
-        return nis <= limits[0, used.sum(-1)]
+        ), passed, torch.where(of_components & passed, z * z, 0.0)  # fmt: skip
 
     @cached_property
     def _limits(self) -> tuple[float, ...]:
-        return (0.0, *(float(chi2_quantile(self.probability, components)) for components in (1, 2, 3)))
+        """Of the mean over so many components."""
+        return (0.0, *(float(chi2_quantile(self.probability, k)) / k for k in (1, 2)))
+
+
+def _by_part(x: Float[Tensor, "B 6"]) -> Float[Tensor, "B 4"]:
+    """Means over the components of each part."""
+    return torch.stack((0.5 * (x[:, 0] + x[:, 1]), x[:, 2], 0.5 * (x[:, 3] + x[:, 4]), x[:, 5]), -1)
+
+
+def _predicted_variance(epoch: Epoch, P: Float[Tensor, "B n n"]) -> Float[Tensor, "B 6"]:
+    """Variance of position and velocity at the end of the window, of P at its start: to first order, correlations left
+    out. Acceleration is unknown by what tilt makes of gravity, heading of the horizontal force, and by its bias."""
+    span, variance = epoch.dt * epoch.imu.shape[1], P.diagonal(dim1=-2, dim2=-1)
+    force = epoch.corrected[..., :2].mean(1).square().sum(-1)
+    tilt, heading = variance[:, ATTITUDE][:, :2].amax(-1), variance[:, ATTITUDE][:, 2]
+    acceleration = STANDARD_GRAVITY**2 * tilt + force * heading + variance[:, ACCEL].amax(-1)
+    velocity = variance[:, VELOCITY] + span**2 * acceleration.unsqueeze(-1)
+    position = variance[:, POSITION] + span**2 * variance[:, VELOCITY] + 0.25 * span**4 * acceleration.unsqueeze(-1)
+    return torch.cat((position, velocity), -1)

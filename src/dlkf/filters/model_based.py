@@ -15,7 +15,6 @@ from dlkf.data.drive import Batch
 from dlkf.filters.adaptive import Adaptation, AdaptiveNoise
 from dlkf.filters.branches import may_branch
 from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD
-from dlkf.filters.gating import CoarseGate
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
 from dlkf.filters.kalman_update import kalman_prediction, kalman_update
 from dlkf.filters.sources import FixMemory, GnssFix, Measurement, Parameter, Predicted, Source, describe_aid
@@ -157,17 +156,13 @@ class Mbkf:
         }
 
     def step(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Correction]:
-        """:meth:`update` with what the coarse gate leaves of the fix."""
+        """:meth:`update` with what the gate leaves of the fix."""
         return self.update(*self.screened(memory, epoch))
 
     def screened(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Epoch]:
-        """Memory and epoch after the coarse gate; filters with a gate of their own have none."""
-        if memory.fix.coarse is None:
-            return memory, epoch
-        coarse, epoch, P = CoarseGate().screened(memory.fix.coarse, epoch, memory.P)
-        if coarse is memory.fix.coarse:
-            return memory, epoch
-        return memory._replace(P=P, fix=memory.fix._replace(coarse=coarse)), epoch
+        """Memory and epoch after the gate of its fixes."""
+        fix, epoch, P = self.fix.screened(memory.fix, epoch, memory.P, memory.noise)
+        return memory if fix is memory.fix else memory._replace(P=P, fix=fix), epoch
 
     def update(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Correction]:
         """Propagate P over the window, update where there is something to learn (paper eqs 2–6, Joseph form)."""
@@ -178,12 +173,11 @@ class Mbkf:
             Q = torch.where(memory.noise.settled[:, None, None], memory.noise.Q, Q)
         predicted = kalman_prediction(memory.P, Phi, Q, walking=not self.gauss_markov)
         prediction = Predicted(predicted, memory.structure, memory.noise)
-        fix, fix_memory = self.fix.rows(epoch, memory.fix, prediction)
-        prediction = prediction._replace(P=fix.P)
+        fix = self.fix.rows(epoch, memory.fix, memory.noise)
         if memory.parameters is not None:
             named = dict(zip(self.states.others, memory.parameters.unbind(-1)))
             prediction = prediction._replace(parameters=named)
-        parts, sources, said = [fix.rows], [], []
+        parts, sources, said = [fix], [], []
         for source, of_source in zip(self.sources, memory.sources, strict=True):
             rows, of_source = source.rows(epoch, of_source, prediction)
             sources.append(of_source)
@@ -197,16 +191,16 @@ class Mbkf:
                 H, R = mask_rows(rows.H, rows.R, rows.used)
                 parts.append(Measurement(rows.z * rows.used, H, R, rows.used))
         z, H, R = ((x[0] if len(x) == 1 else torch.cat(x, 1)) for x in ([m[k] for m in parts] for k in range(3)))
-        informative = not may_branch(fix.P) or any(bool(m.used.any()) for m in parts)
-        P = fix.P
-        prior = P
+        informative = not may_branch(predicted) or any(bool(m.used.any()) for m in parts)
+        P = predicted
         if informative:
             dx, K, P = kalman_update(P, H, R, z)
         else:
             dx, K, P = P.new_zeros(P.shape[:2]), P.new_zeros(*P.shape[:2], H.shape[1]), torch.lerp(P, P.mT, 0.5)
         noise = memory.noise
         if self.noise is not None and noise is not None:
-            noise = self.noise.learned(noise, epoch, fix.rows.used, H[:, :6], fix.variance, P, dx, Q)
+            variance = self.fix.variance(epoch, memory.fix, memory.noise)
+            noise = self.noise.learned(noise, epoch, fix.used, H[:, :6], variance, P, dx, Q)
         structure = memory.structure
         if structure is not None:
             structure = structure + dx[:, self.states.of_structure]
@@ -215,11 +209,11 @@ class Mbkf:
         if parameters is not None:
             parameters = parameters + dx[:, self.states.of_others]
             said += [parameters, P.diagonal(dim1=-2, dim2=-1)[:, self.states.of_others].clamp_min(0).sqrt()]
-        memory = KalmanMemory(P, memory.windows, fix_memory, tuple(sources), structure, noise, parameters)
+        memory = KalmanMemory(P, memory.windows, memory.fix, tuple(sources), structure, noise, parameters)
         return memory, Correction(
             dx[:, PVA], epoch.error.updated(dx, self.states), std=std, gain=K[:, PVA, :6],
-            accepted=epoch.used.any(-1) if fix.accepted is None else fix.accepted,
-            covariances=Covariances(Phi, prior, P, *fix.offered, dx), aids=torch.cat(said, -1) if said else None,
+            accepted=epoch.used.any(-1), covariances=Covariances(Phi, predicted, P, fix.H, fix.R, dx),
+            aids=torch.cat(said, -1) if said else None,
         )  # fmt: skip
 
     def _transition(self, memory: KalmanMemory, epoch: Epoch) -> Float[Tensor, "B n n"]:

@@ -49,11 +49,11 @@ from dlkf.networks.plus import (
 ANY_MEMS: Mapping[str, Any] = {  # what is known of an IMU of which nothing is known
     "name": "any MEMS",
     "accel": {
-        "noise_density": 9.80665e-4, "turn_on_bias": 0.1, "instability": 1e-3, "correlation_time": 3600.0,
+        "noise_density": 9.80665e-4, "turn_on_bias": 0.2, "instability": 1e-3, "correlation_time": 3600.0,
         "scale_factor": 5e-3, "misalignment": 5.236e-3,
     },
     "gyro": {
-        "noise_density": 6.98132e-5, "turn_on_bias": 7.5e-3, "instability": 9.69627e-5, "correlation_time": 3600.0,
+        "noise_density": 6.98132e-5, "turn_on_bias": 0.015, "instability": 9.69627e-5, "correlation_time": 3600.0,
         "scale_factor": 5e-3, "misalignment": 5.236e-3,
     },
 }  # fmt: skip
@@ -70,7 +70,7 @@ class PlusConfig:
     """A ``plus`` filter: its classical filter and the size of its network."""
 
     kind: Literal["plus"] = "plus"
-    base: str = "mbkf33_car+vibration_speed"
+    base: str = "mbkf33_car_gated+vibration_speed"
     network: PlusNetworkConfig = field(default_factory=PlusNetworkConfig)
     tuning: Mapping[str, float] = field(default_factory=lambda: dict(START_TUNING))
     imu: Mapping[str, Any] = field(default_factory=lambda: dict(ANY_MEMS))
@@ -150,8 +150,9 @@ class PlusFilter(nn.Module):
 
     def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
         """Network, the Kalman filter with the noise of both, then the virtual outage beside it."""
+        offered = epoch
         kalman, epoch = self.kalman.screened(memory.kalman, epoch)
-        walk = torch.diag_embed(memory.errors.variance(epoch))
+        walk = torch.diag_embed(memory.errors.variance(offered))
         outage = memory.outage._replace(P=_with_walk(memory.outage.P, walk))
         memory = memory._replace(kalman=kalman._replace(P=_with_walk(kalman.P, walk)), outage=outage)
         span = epoch.dt * epoch.imu.shape[1]
@@ -178,7 +179,7 @@ class PlusFilter(nn.Module):
             torch.stack((same, x, same, same), 1) for x in (gyro_noise, gyro_noise ** weight.unsqueeze(-1))
         )
         process = in_force * torch.cat((levels, torch.ones_like(levels)), -1).unsqueeze(-1)
-        advice = NetworkOutput(process, memory.errors.noise(epoch, kalman.fix.scale[0, 0, 0]))
+        advice = NetworkOutput(process, memory.errors.noise(offered, kalman.fix.scale[0, 0, 0]))
         kalman, correction = self.kalman.update(memory.kalman, epoch._replace(advice=advice))
         with torch.no_grad():
             after = epoch.window.end.corrected(correction.dx)
@@ -186,7 +187,7 @@ class PlusFilter(nn.Module):
             matching, outage, errors = memory.matching, memory.outage, memory.errors
             if (c := correction.covariances) is not None:
                 scale = source_scale(of_network, epoch.start.C_nb)
-                outage, errors = outage.after(epoch, c, memory.kalman.windows, scale), errors.after(epoch, c)
+                outage, errors = outage.after(epoch, c, memory.kalman.windows, scale), errors.after(offered, c)
                 matching = matching.corrected(c.dx, c.predicted, c.updated, epoch.window.end.C_nb, fixed)
         return memory._replace(
             kalman=kalman, hidden=hidden, matching=matching, outage=outage, errors=errors, gyro_noise=gyro_noise,

@@ -117,53 +117,49 @@ class FixMemory(NamedTuple):
     """What belongs to the receiver."""
 
     scale: Tensor  # (1, 2, 6) factor and floor of the fixes' stds, the same for all drives
-    gate: GateMemory | None = None
-    coarse: CoarseMemory | None = None  # of filters without that gate
-
-
-class GatedFix(NamedTuple):
-    """The six rows of GNSS and what its gate made of them and of the filter's covariance."""
-
-    rows: Measurement
-    variance: Tensor  # (B, 6) of all components, used or not
-    offered: tuple[Tensor, Tensor]  # H and R before the gate
-    P: Tensor  # (B, n, n), inflated where the filter recovers
-    accepted: Tensor | None  # (B,) bool; None: without a gate
+    gate: CoarseMemory | GateMemory
 
 
 @dataclass(frozen=True)
 class GnssFix:
-    """Position and velocity of GNSS, with lever arm and lag; a ``gate`` may refuse them."""
+    """Position and velocity of GNSS, with lever arm and lag; a gate refuses outliers first."""
 
     tuning: Tuning
     states: int
     gated: bool = False
 
     @cached_property
-    def gate(self) -> Gate:
-        """Built once: its limits are quantiles that take longer than an epoch."""
-        return Gate(self.tuning.gate)
+    def gate(self) -> CoarseGate | Gate:
+        """Built once: the limits of :class:`Gate` are quantiles that take longer than an epoch."""
+        return Gate(self.tuning.gate) if self.gated else CoarseGate()
 
     def begin(self, batch: Batch) -> FixMemory:
         """Factors on the stds; nothing refused yet."""
         t = self.tuning
         scale = [[t.position_std] * 3 + [t.velocity_std] * 3, [t.position_floor] * 3 + [t.velocity_floor] * 3]
-        gate = self.gate.begin(batch.imu) if self.gated else None
-        coarse = None if self.gated else CoarseGate().begin(batch.imu)
-        return FixMemory(torch.tensor([scale], dtype=batch.imu.dtype, device=batch.imu.device), gate, coarse)
+        like = {"dtype": batch.imu.dtype, "device": batch.imu.device}
+        return FixMemory(torch.tensor([scale], **like), self.gate.begin(batch.imu))
 
-    def rows(self, epoch: Epoch, memory: FixMemory, prediction: Predicted) -> tuple[GatedFix, FixMemory]:
-        """Six rows, of which those count that the receiver offers and the gate lets pass."""
-        P, R = prediction.P, self._variance(epoch, memory, prediction)
-        fix = Measurement(epoch.z, self._matrix(epoch), R, epoch.used)
-        H, R = offered = mask_rows(fix.H, fix.R, fix.used)
-        if memory.gate is None:
-            return GatedFix(Measurement(fix.z * fix.used, H, R, fix.used), fix.R, offered, P, None), memory
-        S = H @ P @ H.mT + torch.diag_embed(R)
-        gate, verdict = self.gate.judge(memory.gate, epoch, S, fix.R)
-        H, R = mask_rows(fix.H, fix.R, verdict.passed)
-        rows = Measurement(fix.z * verdict.passed, H, R, verdict.passed)
-        return GatedFix(rows, fix.R, offered, verdict.inflated(P), verdict.used), memory._replace(gate=gate)
+    def screened(
+        self, memory: FixMemory, epoch: Epoch, P: Float[Tensor, "B n n"], noise: AdaptiveNoise | None
+    ) -> tuple[FixMemory, Epoch, Float[Tensor, "B n n"]]:
+        """The epoch without what the gate refuses, and P of the update before, inflated where it follows such fixes."""
+        gate, epoch, P = self.gate.screened(memory.gate, epoch, P, self.variance(epoch, memory, noise))
+        return memory if gate is memory.gate else memory._replace(gate=gate), epoch, P
+
+    def rows(self, epoch: Epoch, memory: FixMemory, noise: AdaptiveNoise | None) -> Measurement:
+        """Six rows, of which those count that the receiver offers."""
+        H, R = mask_rows(self._matrix(epoch), self.variance(epoch, memory, noise), epoch.used)
+        return Measurement(epoch.z * epoch.used, H, R, epoch.used)
+
+    def variance(self, epoch: Epoch, memory: FixMemory, noise: AdaptiveNoise | None) -> Float[Tensor, "B 6"]:
+        """Of all components, used or not."""
+        scale, floor = memory.scale[0]
+        R = torch.maximum(scale * epoch.fix.std, floor).square()
+        if noise is not None:
+            R = torch.where(noise.settled.unsqueeze(-1), noise.R, R)
+        factors = None if epoch.advice is None else epoch.advice.fix_std
+        return R if factors is None else R * factors.square()
 
     def _matrix(self, epoch: Epoch) -> Float[Tensor, "B 6 n"]:
         H = measurement_matrix(epoch.at_fix, epoch.rate_at_fix_b, epoch.lever_arm_b, epoch.frame, self.states)
@@ -172,11 +168,3 @@ class GnssFix:
             v = VELOCITY.start
             H[:, 0, v] = H[:, 1, v + 1] = H[:, 2, v + 2] = -epoch.fix.lag
         return H
-
-    def _variance(self, epoch: Epoch, memory: FixMemory, prediction: Predicted) -> Float[Tensor, "B 6"]:
-        scale, floor = memory.scale[0]
-        R = torch.maximum(scale * epoch.fix.std, floor).square()
-        if prediction.noise is not None:
-            R = torch.where(prediction.noise.settled.unsqueeze(-1), prediction.noise.R, R)
-        factors = None if epoch.advice is None else epoch.advice.fix_std
-        return R if factors is None else R * factors.square()

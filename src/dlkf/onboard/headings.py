@@ -16,7 +16,7 @@ from dlkf.onboard.carried import Field, Layout
 from dlkf.onboard.functions import Begin, Function, Grid, advance_filter, carried_state
 from dlkf.running.start.bank import bank_filter, fix_std, weigh_step
 
-CARRIED = ("memory.P", "memory.fix.coarse.", "state.", "error.")
+CARRIED = ("memory.P", "memory.fix.gate.", "state.", "error.")
 
 
 class Weigh(Function):

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dlkf.filters import learned, model_based, plus
+from dlkf.filters.gating import GateMemory
 from dlkf.navigation.earth import TangentFrame, tangent_frame
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.state import PVA, NavState
@@ -89,11 +90,11 @@ def _(memory: None, change: FrameChange, fresh: None) -> None:
 def _(
     memory: model_based.KalmanMemory, change: FrameChange, fresh: model_based.KalmanMemory
 ) -> model_based.KalmanMemory:
-    gate, coarse, noise = memory.fix.gate, memory.fix.coarse, memory.noise
-    if coarse is not None:
-        coarse = coarse._replace(fix=change.fixes(coarse.fix))
-    if gate is not None:  # NaN: equal to no other fix, so a frozen receiver shows one fix later
+    gate, noise = memory.fix.gate, memory.noise
+    if isinstance(gate, GateMemory):  # NaN: equal to no other fix, so a frozen receiver shows one fix later
         gate = gate._replace(innovation=change.vectors(gate.innovation), fix=torch.full_like(gate.fix, torch.nan))
+    else:
+        gate = gate._replace(fix=change.fixes(gate.fix))
     if noise is not None:
         noise = noise._replace(Q=change.covariance(noise.Q), R=change.variances(noise.R))
     sources = tuple(
@@ -101,7 +102,7 @@ def _(
     )
     windows = replace(fresh.windows, density=memory.windows.density)
     return memory._replace(
-        P=change.covariance(memory.P), windows=windows, fix=memory.fix._replace(gate=gate, coarse=coarse),
+        P=change.covariance(memory.P), windows=windows, fix=memory.fix._replace(gate=gate),
         sources=sources, noise=noise,
     )  # fmt: skip
 

@@ -245,7 +245,7 @@ def log_likelihood(z: Float[Tensor, "B 6"], covariances: Covariances) -> Float[T
 def bank_filter() -> Mbkf:
     """The filter of a bank."""
     tuning = Tuning(lateral_std=0.5, vertical_std=0.5)
-    return Mbkf(ANY_IMU, tuning, sources=(Sideslip(tuning, PLAIN),))
+    return Mbkf(ANY_IMU, tuning, gated=True, sources=(Sideslip(tuning, PLAIN),))
 
 
 def _rate_after(drive: Drive) -> Float[Tensor, " 3"]:

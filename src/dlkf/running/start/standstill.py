@@ -19,7 +19,7 @@ from dlkf.navigation.attitude import prefix_rotations
 from dlkf.navigation.earth import EARTH_RATE
 
 REST_SPREAD = (0.4, 0.05)  # m/s², rad/s: the greatest spread of the samples of a stationary car, engine on
-REST_RATE = 0.06  # rad/s, of the error of gyroscopes
+REST_RATE = 0.2  # rad/s, of the error of gyroscopes
 REST_SPEED = 0.2  # m/s, on top of what the receiver may be wrong by
 REST_POSITION_STD = 0.1  # m: fixes without velocity and with a larger 1σ are not used
 SHORTEST_REST_S = 2.0
