@@ -8,7 +8,7 @@ import torch
 
 from dlkf.filters.build import build_filter
 from dlkf.filters.gating import (
-    AGREEMENT_RATE,
+    AGREEMENT_RATES,
     COARSE_FLOOR,
     COARSE_PATIENCE,
     COARSE_SIGMAS,
@@ -34,9 +34,9 @@ def judged(off: float, before: float = 0.0, refused: int = 0, usual: float = 0.0
     epoch = epoch_of(batch, batch.start, ImuError(batch.imu.new_zeros(1, 6)))
     z, used = torch.zeros_like(epoch.z), torch.tensor([[True] * 3 + [False] * 3])
     z[0, 0], z[0, 2] = off, height
-    gate, fix = Gate(0.999), Fix(z, torch.full_like(z, std), used, None)
+    gate, fix = Gate(0.999, usual), Fix(z, torch.full_like(z, std), used, None)
     memory = gate.begin(epoch.z)
-    memory.innovation[0, 0], memory.refused[0, 0], memory.usual[:] = before, refused, usual
+    memory.innovation[0, 0], memory.refused[0, 0] = before, refused
     return gate.screened(memory, epoch._replace(z=z, fix=fix), torch.zeros(1, 15, 15).to(z), fix.std.square())
 
 
@@ -61,8 +61,8 @@ def test_an_outlier_is_larger_than_usual():
 
 
 def test_a_refused_position_agrees_with_one_as_far_off():
-    """Within 6σ of both fixes, √6 cm (three axes each), and what 2 m/s make of the second between them."""
-    limit = 6 * 0.01 * 6**0.5 + AGREEMENT_RATE
+    """Within 6σ of both fixes, √6 cm (three axes each), and what 5 m/s make of the second between them."""
+    limit = 6 * 0.01 * 6**0.5 + AGREEMENT_RATES[0]
     assert judged(50.0, 50.0 - limit + 0.01, 1, std=0.01)[1].used[0, 0]
     memory, epoch, P = judged(50.0, 50.0 - limit - 0.01, 1, std=0.01)
     assert not epoch.used[0, :2].any() and float(memory.refused[0, 0]) == 1 and not P.any()

@@ -61,10 +61,10 @@ def test_frozen_receiver_is_not_believed():
 
 
 def test_a_filter_with_a_wrong_velocity_is_not_locked_out():
-    """5 m/s off and told 0.1 m/s: each refused fix lies farther from the filter than the last, and yet they agree."""
+    """5 m/s off and told 0.1 m/s, so that attitude and biases are to explain it: without the gate over 100 m off."""
     batch = scene(10, 60, seed=6)
     lost = replace(batch, start=batch.start._replace(v_n=batch.start.v_n + 5.0, p_n=batch.start.p_n + 20.0))
-    assert error(lost, "mbkf15_gated")[:, 40:].max() < 1.0
+    assert error(lost, "mbkf15_gated")[:, 40:].max() < 3.0 and error(lost, "mbkf15")[:, 40:].max() > 30.0
 
 
 def test_a_receiver_that_froze_stays_frozen_while_the_car_stands():

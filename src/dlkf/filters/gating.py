@@ -35,14 +35,16 @@ from dlkf.navigation.earth import STANDARD_GRAVITY
 from dlkf.navigation.state import ACCEL, ATTITUDE, POSITION, PV, VELOCITY
 
 PATIENCE = 2  # refused fixes in a row that agree with each other before the filter follows them
-AGREEMENT_SIGMAS, AGREEMENT_RATE = 6.0, 2.0  # two refusals agree within 6σ of the fixes + 2 m/s, 2 m/s² · time
+AGREEMENT_SIGMAS, AGREEMENT_RATES = 6.0, (5.0, 2.0)  # two refusals agree within 6σ of the fixes + 5 m/s, 2 m/s² · time
 FLOOR = 0.05  # m, m/s added to 1σ of an innovation
 USUAL_STEP = 0.3  # per fix, by which the logarithm of the usual squared innovation follows
+FIRST_USUAL = 2.0  # of that logarithm: a filter's first seconds may be worse than it knows
 PARTS, OF_PART = [0, 2, 3, 5], [0, 0, 1, 2, 2, 3]  # a component of each part; the part of each component
 MEDIANS = (0.6931, 0.4549, 0.6931, 0.4549)  # of d² of each part: of χ² of two and of one degree of freedom
 FROZEN_SPEED = 1.0  # m/s: above, a fix cannot be the same twice
 COARSE_SIGMAS, COARSE_FLOOR = 20.0, (2.0, 0.5)  # m, m/s added to 1σ of position and velocity: an error, no noise
 COARSE_PATIENCE = 2  # refused fixes that agree with each other before such a filter recovers
+COARSE_AGREEMENT = 2.0  # m/s beyond their 1σ that two of them may differ by
 MOST_DOUBT = 25.0  # factor on P at most: what was wrong is as a rule attitude or a bias
 COARSE_JUMP = 1000.0  # m: beyond, P is inflated; less is a filter's own drift, whose shape P has
 UNKNOWN_SPEED = 60.0  # m/s: of a car between two fixes without velocity
@@ -153,23 +155,25 @@ class CoarseGate:
         """Whether the way from the last refused position is that of the mean of both velocities."""
         known = (moves & memory.moves).unsqueeze(-1)
         way = torch.where(known, 0.5 * (fix[:, 3:] + memory.fix[:, 3:]) * age.unsqueeze(-1), 0.0)
-        spread = AGREEMENT_SIGMAS * (2 * R[:, :3]).sum(-1).sqrt() + AGREEMENT_RATE * age
+        spread = AGREEMENT_SIGMAS * (2 * R[:, :3]).sum(-1).sqrt() + COARSE_AGREEMENT * age
         spread = spread + torch.where(known.squeeze(-1), 0.0, UNKNOWN_SPEED * age)
         return (fix[:, :3] - memory.fix[:, :3] - way).norm(dim=-1) < spread
 
 
 @dataclass(frozen=True)
 class Gate:
-    """Refuses outliers; ``probability`` is that of passing a good part of a fix."""
+    """Refuses outliers; ``probability`` is that of passing a good part of a fix, ``usual`` ln s² before the first."""
 
     probability: float
+    usual: float = FIRST_USUAL
 
     def begin(self, like: Tensor) -> GateMemory:
         """Nothing refused yet; ``like`` (B, …) gives batch and precision."""
         B, zeros = len(like), like.new_zeros
         limits = like.new_tensor([[self._limits[k] for k in (2, 1, 2, 1)]])
         nowhere = torch.full_like(zeros(B, 3), torch.nan)
-        return GateMemory(zeros(B, 4), zeros(B, 2), zeros(B, 6), zeros(B, 2), nowhere, zeros(B) > 0, limits)
+        usual = zeros(B, 4) + self.usual
+        return GateMemory(usual, zeros(B, 2), zeros(B, 6), zeros(B, 2), nowhere, zeros(B) > 0, limits)
 
     def screened(
         self, memory: GateMemory, epoch: Epoch, P: Float[Tensor, "B n n"], R: Float[Tensor, "B 6"]
@@ -197,9 +201,11 @@ class Gate:
         wrong = torch.stack((outlier[:, :2].any(-1), outlier[:, 2:].any(-1)), -1)
 
         age = memory.age + span
-        change = (z - memory.innovation).unflatten(-1, (2, 3)).norm(dim=-1)
-        spread = AGREEMENT_SIGMAS * (2 * R).unflatten(-1, (2, 3)).sum(-1).sqrt() + AGREEMENT_RATE * age
-        agrees = (change < spread) & (memory.refused > 0)
+        change = (z - memory.innovation).unflatten(-1, (2, 3))
+        drift = z[:, 3:] * used[:, 3:] * age[:, :1]  # as far as the velocity of the fix contradicts the filter's
+        apart = torch.minimum(change.norm(dim=-1), torch.stack((change[:, 0] - drift, change[:, 1]), 1).norm(dim=-1))
+        spread = AGREEMENT_SIGMAS * (2 * R).unflatten(-1, (2, 3)).sum(-1).sqrt() + age.new_tensor(AGREEMENT_RATES) * age
+        agrees = (apart < spread) & (memory.refused > 0)
         refused = torch.where(agrees, memory.refused + 1, torch.ones_like(age))
         seen = torch.stack((offered[:, :2].any(-1), offered[:, 2:].any(-1)), -1)
         refused = torch.where(wrong, refused, torch.where(seen, 0.0, memory.refused))

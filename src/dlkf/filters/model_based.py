@@ -15,6 +15,7 @@ from dlkf.data.drive import Batch
 from dlkf.filters.adaptive import Adaptation, AdaptiveNoise
 from dlkf.filters.branches import may_branch
 from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD
+from dlkf.filters.gating import CoarseGate, Gate
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
 from dlkf.filters.kalman_update import kalman_prediction, kalman_update
 from dlkf.filters.sources import FixMemory, GnssFix, Measurement, Parameter, Predicted, Source, describe_aid
@@ -96,8 +97,8 @@ class Mbkf:
 
     @cached_property
     def fix(self) -> GnssFix:
-        """Where GNSS comes in."""
-        return GnssFix(self.tuning, self.states.count, self.gated)
+        """Where GNSS comes in; built once, since the gate's limits take longer than an epoch."""
+        return GnssFix(self.tuning, self.states.count, Gate(self.tuning.gate) if self.gated else CoarseGate())
 
     @property
     def code(self) -> Mbkf:

@@ -28,7 +28,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -126,12 +125,7 @@ class GnssFix:
 
     tuning: Tuning
     states: int
-    gated: bool = False
-
-    @cached_property
-    def gate(self) -> CoarseGate | Gate:
-        """Built once: the limits of :class:`Gate` are quantiles that take longer than an epoch."""
-        return Gate(self.tuning.gate) if self.gated else CoarseGate()
+    gate: CoarseGate | Gate
 
     def begin(self, batch: Batch) -> FixMemory:
         """Factors on the stds; nothing refused yet."""

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
@@ -27,9 +28,10 @@ from dlkf.data.alignment import ACCEL_BIAS_STD, SIDESLIP_STD, AlignConfig, Start
 from dlkf.data.drive import Drive
 from dlkf.data.segments import whole_drives
 from dlkf.filters.constraints import CarConstraints
+from dlkf.filters.gating import Gate
 from dlkf.filters.integration import Covariances, Epoch, Fix, Step, advance
 from dlkf.filters.model_based import Mbkf
-from dlkf.filters.sources import Predicted
+from dlkf.filters.sources import GnssFix, Predicted
 from dlkf.filters.stationarity import VibrationLevel
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import rotation_from_rpy, vector_from_rotation
@@ -242,10 +244,19 @@ def log_likelihood(z: Float[Tensor, "B 6"], covariances: Covariances) -> Float[T
     return -0.5 * (white.square().sum(-1).clamp(max=NIS_CAP) + spread)
 
 
+class BankFilter(Mbkf):
+    """The filter of a bank, with a gate that is strict from the first fix on: its headings are to differ."""
+
+    @cached_property
+    def fix(self) -> GnssFix:
+        """Where GNSS comes in."""
+        return GnssFix(self.tuning, self.states.count, Gate(self.tuning.gate, usual=0.0))
+
+
 def bank_filter() -> Mbkf:
     """The filter of a bank."""
     tuning = Tuning(lateral_std=0.5, vertical_std=0.5)
-    return Mbkf(ANY_IMU, tuning, gated=True, sources=(Sideslip(tuning, PLAIN),))
+    return BankFilter(ANY_IMU, tuning, gated=True, sources=(Sideslip(tuning, PLAIN),))
 
 
 def _rate_after(drive: Drive) -> Float[Tensor, " 3"]:
