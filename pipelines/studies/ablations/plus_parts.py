@@ -21,23 +21,24 @@ class WithoutLevels(PlusFilter):
 
 
 class AsClaimed(PlusFilter):
-    """``plus`` that takes all errors of positions for white noise of the claimed 1σ."""
+    """``plus`` that takes all errors of fixes for white noise of the claimed 1σ."""
 
     def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
         """With no error that moves, and none that is smaller or larger."""
         one = torch.ones_like(memory.errors.white)
         errors = memory.errors._replace(white=one, walk=0 * one, recent=0 * one)
-        return super().step(memory._replace(errors=errors), epoch)
+        fix_noise = memory.fix_noise._replace(variance=torch.ones_like(memory.fix_noise.variance))
+        return super().step(memory._replace(errors=errors, fix_noise=fix_noise), epoch)
 
 
 def parts(folder: str) -> dict[str, Estimator]:
-    """``plus`` with neither levels nor network, with one of them, with positions as claimed, without vibration."""
+    """``plus`` with neither levels nor network, with one of them, with fixes as claimed, without vibration."""
     whole = trained_filter(folder)
     assert isinstance(whole, PlusFilter)
     found: dict[str, Estimator] = {}
     kinds = {"neither levels nor network": (WithoutLevels, False), "no network": (PlusFilter, False)}
     kinds["no levels"] = (WithoutLevels, True)
-    kinds["positions as claimed"] = (AsClaimed, True)
+    kinds["fixes as claimed"] = (AsClaimed, True)
     kinds["no speed from vibration"] = (PlusFilter, True)
     for name, (kind, network) in kinds.items():
         config = replace(whole.config, base="mbkf33_car") if name == "no speed from vibration" else whole.config

@@ -195,7 +195,7 @@ class Gate:
         same = (epoch.fix.value[:, :3] == memory.fix).all(-1) & position
         frozen = same & (memory.frozen | (epoch.window.end.v_n.norm(dim=-1) > FROZEN_SPEED))
         S = _predicted_variance(epoch, P) + R + FLOOR * FLOOR
-        square = _by_part(torch.where(used, z.square() / S, 0.0))
+        square = by_part(torch.where(used, z.square() / S, 0.0))
         offered = used[:, PARTS] & ~frozen.unsqueeze(-1)
         outlier = offered & (square > memory.limits * torch.exp(memory.usual))
         wrong = torch.stack((outlier[:, :2].any(-1), outlier[:, 2:].any(-1)), -1)
@@ -232,7 +232,7 @@ class Gate:
         return (0.0, *(float(chi2_quantile(self.probability, k)) / k for k in (1, 2)))
 
 
-def _by_part(x: Float[Tensor, "B 6"]) -> Float[Tensor, "B 4"]:
+def by_part(x: Float[Tensor, "B 6"]) -> Float[Tensor, "B 4"]:
     """Means over the components of each part."""
     return torch.stack((0.5 * (x[:, 0] + x[:, 1]), x[:, 2], 0.5 * (x[:, 3] + x[:, 4]), x[:, 5]), -1)
 

@@ -25,6 +25,7 @@ from dlkf.data.drive import Batch
 from dlkf.filters.advice import NetworkOutput
 from dlkf.filters.branches import may_branch
 from dlkf.filters.build import build_filter
+from dlkf.filters.fix_noise import FixNoise
 from dlkf.filters.integration import Correction, Epoch
 from dlkf.filters.matching import AXIS_FEATURES, LOG_FEATURES, Matching, ratio_by_axis, variance_along
 from dlkf.filters.model_based import KalmanMemory as KalmanMemory
@@ -97,6 +98,7 @@ class PlusMemory(NamedTuple):
     fix_speed: Tensor  # (B,) m/s forward at the last fix
     outage: VirtualOutage  # how much white noise there is
     errors: PositionErrors  # of the fixes
+    fix_noise: FixNoise  # of those that claim too little
     gyro_noise: Tensor | None = None  # (B, 3) the last factors, for pictures
 
 
@@ -146,12 +148,13 @@ class PlusFilter(nn.Module):
         zero = zeros(B)
         outage = VirtualOutage.begin(kalman.P)
         matching, errors = Matching.begin(batch.imu, B), PositionErrors.begin(batch.imu, B, batch.epoch_s)
-        return PlusMemory(kalman, self.network.start(B), zero, zero, matching, zero, outage, errors), error
+        fix_noise = FixNoise.begin(batch.imu, B)
+        return PlusMemory(kalman, self.network.start(B), zero, zero, matching, zero, outage, errors, fix_noise), error
 
     def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
         """Network, the Kalman filter with the noise of both, then the virtual outage beside it."""
-        offered = epoch
-        kalman, epoch = self.kalman.screened(memory.kalman, epoch)
+        claimed, offered = epoch, memory.fix_noise.honest(epoch)
+        kalman, epoch = self.kalman.screened(memory.kalman, offered)
         walk = torch.diag_embed(memory.errors.variance(offered))
         outage = memory.outage._replace(P=_with_walk(memory.outage.P, walk))
         memory = memory._replace(kalman=kalman._replace(P=_with_walk(kalman.P, walk)), outage=outage)
@@ -178,20 +181,22 @@ class PlusFilter(nn.Module):
         of_network, in_force = (
             torch.stack((same, x, same, same), 1) for x in (gyro_noise, gyro_noise ** weight.unsqueeze(-1))
         )
-        process = in_force * torch.cat((levels, torch.ones_like(levels)), -1).unsqueeze(-1)
+        process = in_force * torch.cat((levels, levels.clamp_min(1.0)), -1).unsqueeze(-1)
         advice = NetworkOutput(process, memory.errors.noise(offered, kalman.fix.scale[0, 0, 0]))
         kalman, correction = self.kalman.update(memory.kalman, epoch._replace(advice=advice))
         with torch.no_grad():
             after = epoch.window.end.corrected(correction.dx)
             forward = (after.C_nb[:, :, 0] * after.v_n).sum(-1)
             matching, outage, errors = memory.matching, memory.outage, memory.errors
+            fix_noise = memory.fix_noise
             if (c := correction.covariances) is not None:
                 scale = source_scale(of_network, epoch.start.C_nb)
-                outage, errors = outage.after(epoch, c, memory.kalman.windows, scale), errors.after(offered, c)
+                outage = outage.after(epoch, c, memory.kalman.windows, scale)
+                errors, fix_noise = errors.after(claimed, c), fix_noise.after(claimed, c)
                 matching = matching.corrected(c.dx, c.predicted, c.updated, epoch.window.end.C_nb, fixed)
         return memory._replace(
-            kalman=kalman, hidden=hidden, matching=matching, outage=outage, errors=errors, gyro_noise=gyro_noise,
-            fix_speed=torch.where(fixed, forward, memory.fix_speed),
+            kalman=kalman, hidden=hidden, matching=matching, outage=outage, errors=errors, fix_noise=fix_noise,
+            gyro_noise=gyro_noise, fix_speed=torch.where(fixed, forward, memory.fix_speed),
         ), correction  # fmt: skip
 
     def _normalised(self, memory: PlusMemory, epoch: Epoch) -> Float[Tensor, "B 6"]:

@@ -125,6 +125,11 @@ MEMORY = {  # by the last parts of a field's name
     "errors.walk": "variance by which errors of positions move in an epoch, over that of a position",
     "errors.recent": "half the mean square change of the error over the last fixes, of the variance of positions",
     "errors.fixes": "fixes that both count for",
+    "fix_noise.residual": "the last fix less the filter's estimate after it [m, m/s]",
+    "fix_noise.change": "change of a fix's error since the fix before, over the claimed 1σ",
+    "fix_noise.successive": "fixes in successive epochs, by part of a fix",
+    "fix_noise.variance": "variance of the errors of fixes over the claimed one, by part",
+    "fix_noise.fixes": "fixes that it counts for",
     "memory.gyro_noise": "the network's last factors on the gyroscopes' noise; forward, right, down",
 }
 

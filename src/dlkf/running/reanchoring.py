@@ -132,4 +132,7 @@ def _(memory: plus.PlusMemory, change: FrameChange, fresh: plus.PlusMemory) -> p
     outage = outage._replace(drift=drift, P=change.covariance(outage.P), white=white)
     of_fix = memory.errors
     of_fix = of_fix._replace(residual=change.vectors(of_fix.residual), change=change.vectors(of_fix.change))
-    return memory._replace(kalman=reanchor(memory.kalman, change, fresh.kalman), outage=outage, errors=of_fix)
+    noise = memory.fix_noise
+    noise = noise._replace(residual=change.vectors(noise.residual), change=change.vectors(noise.change))
+    kalman = reanchor(memory.kalman, change, fresh.kalman)
+    return memory._replace(kalman=kalman, outage=outage, errors=of_fix, fix_noise=noise)

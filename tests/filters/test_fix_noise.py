@@ -1,0 +1,118 @@
+"""Fixes that scatter by more than they claim: how much of it is found, and what does not count as noise."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dlkf.filters.build import build_filter
+from dlkf.filters.fix_noise import FixNoise
+from dlkf.filters.integration import integrate
+from dlkf.filters.plus import ANY_MEMS
+from dlkf.filters.shipped import trained_filter
+from dlkf.filters.tuning import Tuning
+from dlkf.navigation.imu_errors import imu_spec
+
+from .scene import scene
+
+CLAIM = (0.2, 0.1)  # m, m/s
+
+
+class Watched:
+    """A Kalman filter with the noise of its fixes beside it."""
+
+    def __init__(self):
+        self.kalman, self.noises = build_filter("mbkf21", imu_spec(ANY_MEMS), tuning=Tuning(position_std=2.0)), []
+
+    def begin(self, batch):
+        memory, error = self.kalman.begin(batch)
+        return (memory, FixNoise.begin(batch.imu, batch.size[0])), error
+
+    def step(self, memory, epoch):
+        kalman, noise = memory
+        kalman, correction = self.kalman.step(kalman, epoch)
+        self.noises.append(noise.after(epoch, correction.covariances))
+        return (kalman, self.noises[-1]), correction
+
+
+def fixes(errors, claim=CLAIM, seed=5):
+    """Cars whose fixes have these errors (B, T, 6) and that 1σ of positions and velocities."""
+    batch = scene(*errors.shape[:2], seed=seed, position_std=1e-3, velocity_std=1e-3)
+    std = torch.cat([torch.full_like(batch.gnss_std[..., :3], x) for x in claim], -1)
+    return replace(batch, gnss=batch.gnss + errors, gnss_std=std)
+
+
+def found(batch) -> torch.Tensor:
+    """w by part after the last fix, mean of the cars."""
+    run = Watched()
+    with torch.inference_mode():
+        integrate(batch, run)
+    return run.noises[-1].variance.mean(0)
+
+
+def white(sizes, cars=8, epochs=150) -> torch.Tensor:
+    """White noise [m, m/s] by part."""
+    g = torch.Generator().manual_seed(3)
+    parts = torch.tensor(sizes, dtype=torch.float64)[[0, 0, 1, 2, 2, 3]]
+    return parts * torch.randn(cars, epochs, 6, generator=g, dtype=torch.float64)
+
+
+def test_noise_as_claimed_is_found_to_be_that():
+    """Clipping at 2.5σ of a change whose 1σ is √2 takes a fifth of it off."""
+    w = found(fixes(white((0.2, 0.2, 0.1, 0.1))))
+    assert (w > 0.6).all() and (w < 1.15).all()
+
+
+def test_each_part_that_claims_too_little_is_found():
+    """Five times the 1σ of one part each: its factor is 3.3 to 5.5, after clipping; that of the others near 1."""
+    for k in range(4):
+        sizes = [0.2, 0.2, 0.1, 0.1]
+        sizes[k] *= 5
+        factor = found(fixes(white(sizes))).clamp_min(1.0).sqrt()
+        others = torch.cat((factor[:k], factor[k + 1 :]))
+        assert 3.3 < float(factor[k]) < 5.5 and others.max() < 1.3
+
+
+def test_a_velocity_that_lags_is_noisy():
+    """By a second, of cars that accelerate: half the mean square by which its error changes."""
+    batch = fixes(torch.zeros(8, 120, 6, dtype=torch.float64))
+    gnss = batch.gnss.clone()
+    gnss[:, 1:, 3:] = batch.gnss[:, :-1, 3:]
+    error = (gnss - batch.gnss)[:, 2:, 3:5] / CLAIM[1]
+    half = 0.5 * error.diff(dim=1).square().mean()
+    w = found(replace(batch, gnss=gnss))
+    assert w[:2].max() < 1.2 and float(w[2]) == pytest.approx(float(half), rel=0.5) and float(w[2]) > 2.0
+
+
+def test_a_filter_that_drifts_makes_no_position_noisy():
+    """Biases of gyroscopes of 1 °/s: velocities go wrong, and positions with them, the same way for seconds."""
+    batch = fixes(white((0.2, 0.2, 1.0, 1.0)), (0.2, 1.0))
+    imu = batch.imu.clone()
+    imu[..., 3:] += math.radians(1.0)
+    assert found(replace(batch, imu=imu))[:2].max() < 1.5
+
+
+def test_a_few_outliers_do_not_make_all_fixes_noisy():
+    """One position in ten off by 30 m, 150σ."""
+    errors = white((0.2, 0.2, 0.1, 0.1))
+    hit = torch.rand(errors.shape[:2], generator=torch.Generator().manual_seed(4)) < 0.1
+    errors[..., :2] += hit.unsqueeze(-1) * 30.0
+    assert float(found(fixes(errors))[0]) < 4.0
+
+
+@pytest.mark.parametrize("part, size", [(slice(0, 3), 1.0), (slice(3, 6), 0.5)])
+def test_plus_is_nearly_as_good_as_with_a_receiver_that_says_so(part, size):
+    """Five times the 1σ of all positions, or of all velocities: after two minutes half a minute without fixes."""
+    errors = torch.zeros(8, 150, 6, dtype=torch.float64)
+    errors[..., part] = size * torch.randn(8, 150, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+    said = [size if part.start == k else x for k, x in zip((0, 3), CLAIM)]
+    ends = []
+    for claim in (CLAIM, tuple(said)):
+        batch = fixes(errors, claim)
+        available = batch.available.clone()
+        available[:, 120:] = False
+        with torch.inference_mode():
+            solution = integrate(replace(batch, available=available), trained_filter("plus"))
+        ends.append((solution.posterior.p_n - batch.truth.p_n)[:, -1, :2].norm(dim=-1).square().mean().sqrt())
+    assert ends[0] < 1.3 * ends[1] + 0.5
