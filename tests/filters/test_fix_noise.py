@@ -59,19 +59,19 @@ def white(sizes, cars=8, epochs=150) -> torch.Tensor:
 
 
 def test_noise_as_claimed_is_found_to_be_that():
-    """Clipping at 2.5σ of a change whose 1σ is √2 takes a fifth of it off."""
+    """But for what clipping at 3σ takes off changes whose 1σ is √2."""
     w = found(fixes(white((0.2, 0.2, 0.1, 0.1))))
     assert (w > 0.6).all() and (w < 1.15).all()
 
 
 def test_each_part_that_claims_too_little_is_found():
-    """Five times the 1σ of one part each: its factor is 3.3 to 5.5, after clipping; that of the others near 1."""
+    """Five times the 1σ of one part each: its factor is 3 to 5.5, after clipping; that of the others near 1."""
     for k in range(4):
         sizes = [0.2, 0.2, 0.1, 0.1]
         sizes[k] *= 5
         factor = found(fixes(white(sizes))).clamp_min(1.0).sqrt()
         others = torch.cat((factor[:k], factor[k + 1 :]))
-        assert 3.3 < float(factor[k]) < 5.5 and others.max() < 1.3
+        assert 3.0 < float(factor[k]) < 5.5 and others.max() < 1.3
 
 
 def test_a_velocity_that_lags_is_noisy():

@@ -25,7 +25,7 @@ from dlkf.filters.integration import Covariances, Epoch
 
 CLAIMED_FIXES = 10.0  # that the claimed 1σ counts for before anything is known
 MEMORY = 300.0  # fixes
-LARGEST = 2.5  # σ: the most that a change of the error counts
+LARGEST = 3.0  # σ: the most that a change of the error counts
 
 
 class FixNoise(NamedTuple):

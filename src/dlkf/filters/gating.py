@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float
@@ -91,6 +91,20 @@ class CoarseMemory(NamedTuple):
     fix: Tensor  # (B, 6) the last refused one
     moves: Tensor  # (B,) bool: it had a velocity
     age: Tensor  # (B,) s since then
+
+
+class FixGate(Protocol):
+    """What a filter asks of a gate; its memory may be anything."""
+
+    def begin(self, like: Tensor) -> Any:
+        """Nothing refused yet; ``like`` (B, …) gives batch and precision."""
+        ...
+
+    def screened(
+        self, memory: Any, epoch: Epoch, P: Float[Tensor, "B n n"], R: Float[Tensor, "B 6"]
+    ) -> tuple[Any, Epoch, Float[Tensor, "B n n"]]:
+        """The epoch without what is refused, and P of the update before, inflated where the filter is to follow."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from torch import Tensor
 
 from dlkf.data.drive import Batch
 from dlkf.filters.adaptive import AdaptiveNoise
-from dlkf.filters.gating import CoarseGate, CoarseMemory, Gate, GateMemory
+from dlkf.filters.gating import CoarseMemory, FixGate, GateMemory
 from dlkf.filters.integration import Epoch
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.error_model import mask_rows, measurement_matrix
@@ -125,7 +125,7 @@ class GnssFix:
 
     tuning: Tuning
     states: int
-    gate: CoarseGate | Gate
+    gate: FixGate
 
     def begin(self, batch: Batch) -> FixMemory:
         """Factors on the stds; nothing refused yet."""
