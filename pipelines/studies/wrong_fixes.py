@@ -1,11 +1,13 @@
-"""Filters when some positions of the receiver are wrong: outages of real drives, errors added to their fixes.
+"""Filters whose receiver is wrong: outages of real and simulated drives, with errors added to the fixes before them.
 
     python -m pipelines.studies.wrong_fixes --real <folder with kitti, rtkx, wid, wid_mru, linkoping>
 
-The outages are those of :mod:`pipelines.studies.plus`. From the tenth second after the start on, fixes get errors that
-the reported 1σ does not know: single ones off by 3 or 30 m (1σ per axis), or all of them by one error of 3 m for ten
-seconds, about every 50 s. Writes ``table.md``: RMS / geometric mean of the horizontal error at the end of the outage
-over the rows [m], mean NEES, and the ratio of ``plus`` to itself with the fixes as they are.
+The outages are those of :mod:`pipelines.studies.plus` on real motion and on ``fleet``. From the tenth second after the
+start on, fixes get errors that the reported 1σ does not know: positions off by 3, 1 or 30 m (1σ per axis) in some
+seconds, by one error of 3 m for ten seconds about every 50 s, or by 1 m in all; velocities (``kitti``, ``rtkx``,
+``fleet``) off by 0.5 m/s in all, or those of a second before. Writes ``table.md``: RMS / geometric mean of the
+horizontal error at the end of the outage over the rows [m] and mean NEES, of constants without a gate and with it,
+and of ``plus``.
 """
 
 from __future__ import annotations
@@ -30,55 +32,71 @@ from dlkf.evaluation.metrics import mean_error
 from dlkf.filters.build import build_causal
 from dlkf.filters.integration import Estimator
 from dlkf.filters.shipped import trained_filter
+from dlkf.navigation.state import POSITION, VELOCITY
 
 FIRST_S, LASTS_S, EVERY_S = 10, 10, (20, 60)  # from the start on; of a step, and the time between two
 LONGEST_S = 3600
+FLEET, STATISTICS = "fleet", ("rms", "log")
+Change = Callable[[Float[Tensor, "T 6"], torch.Generator], Float[Tensor, "T 6"]]
 
 
-def single(share: float, size: float) -> Callable[[torch.Generator], Float[Tensor, "T 3"]]:
-    """Errors [m] of 1σ ``size`` per axis in a share of the seconds."""
+def single(share: float, size: float, part: slice = POSITION) -> Change:
+    """Errors of 1σ ``size`` per axis [m, m/s] in a share of the seconds."""
 
-    def draw(g: torch.Generator) -> Tensor:
-        hit = torch.rand(LONGEST_S, 1, generator=g, dtype=torch.float64) < share
-        return hit * size * torch.randn(LONGEST_S, 3, generator=g, dtype=torch.float64)
+    def change(gnss: Tensor, g: torch.Generator) -> Tensor:
+        hit = torch.rand(LONGEST_S, 1, generator=g, dtype=gnss.dtype) < share
+        gnss[:, part] += (hit * size * torch.randn(LONGEST_S, 3, generator=g, dtype=gnss.dtype))[: len(gnss)]
+        return gnss
 
-    return draw
+    return change
 
 
-def steps(size: float) -> Callable[[torch.Generator], Float[Tensor, "T 3"]]:
+def steps(size: float) -> Change:
     """One error [m] of 1σ ``size`` per axis for ``LASTS_S`` seconds, again and again."""
 
-    def draw(g: torch.Generator) -> Tensor:
-        errors, k = torch.zeros(LONGEST_S, 3, dtype=torch.float64), FIRST_S
-        while k < LONGEST_S:
+    def change(gnss: Tensor, g: torch.Generator) -> Tensor:
+        k = FIRST_S
+        while k < len(gnss):
             k += int(torch.randint(*EVERY_S, (1,), generator=g))
-            errors[k : k + LASTS_S] = size * torch.randn(3, generator=g, dtype=torch.float64)
+            gnss[k : k + LASTS_S, POSITION] += size * torch.randn(3, generator=g, dtype=gnss.dtype)
             k += LASTS_S
-        return errors
+        return gnss
 
-    return draw
+    return change
 
 
-ERRORS: Mapping[str, Callable[[torch.Generator], Tensor] | None] = {
+def late(gnss: Tensor, g: torch.Generator) -> Tensor:
+    """Velocities of the second before."""
+    gnss[1:, VELOCITY] = gnss[:-1, VELOCITY].clone()
+    return gnss
+
+
+ERRORS: Mapping[str, Change | None] = {
     "none": None,
     "3 m in one of ten": single(0.1, 3.0),
     "1 m in one of five": single(0.2, 1.0),
     "30 m in one of twenty": single(0.05, 30.0),
     "3 m for 10 s": steps(3.0),
+    "1 m in all": single(1.0, 1.0),
+    "velocity 0.5 m/s in all": single(1.0, 0.5, VELOCITY),
+    "velocity a second late": late,
 }
+OF_VELOCITIES = [name for name in ERRORS if name.startswith("velocity")]
 
 
-def with_errors(case: Case, draw: Callable[[torch.Generator], Tensor] | None) -> Case:
-    """A case whose positions have these errors, the same in every outage of a drive."""
-    if draw is None:
+def with_errors(case: Case, change: Change | None) -> Case:
+    """A case whose fixes have these errors, the same in every outage of a drive."""
+    if change is None:
         return case
-    batch = case.batch
-    of_drives = {d: draw(torch.Generator().manual_seed(zlib.crc32(d.encode()))) for d in sorted(set(batch.drive))}
-    errors = torch.stack([of_drives[d][: batch.size[1]] for d in batch.drive])
-    errors[:, :FIRST_S] = 0.0
-    gnss = batch.gnss.clone()
-    gnss[..., :3] += torch.where(batch.gnss_valid[..., :3], errors, 0.0)
-    return replace(case, batch=replace(batch, gnss=gnss))
+    batch, changed = case.batch, case.batch.gnss.clone()
+    for b, drive in enumerate(batch.drive):
+        changed[b] = change(changed[b], torch.Generator().manual_seed(zlib.crc32(drive.encode())))
+    both = batch.gnss_valid.clone()
+    both[:, 1:] &= batch.gnss_valid[:, :-1] | ~batch.gnss_valid[:, 1:]  # late velocities need the one before
+    valid = both if change is late else batch.gnss_valid
+    first = torch.arange(batch.size[1])[:, None] < FIRST_S
+    gnss = torch.where(first, batch.gnss, torch.where(valid, changed, 0.0))
+    return replace(case, batch=replace(batch, gnss=gnss, gnss_valid=torch.where(first, batch.gnss_valid, valid)))
 
 
 def rivals() -> dict[str, Estimator]:
@@ -91,19 +109,15 @@ def rivals() -> dict[str, Estimator]:
 def table(rows: Mapping[str, list[Row]]) -> list[str]:
     """A line for each kind of error."""
     names = list(next(iter(rows.values()))[0].errors)
-    lines = [f"| errors | {' | '.join(names)} | plus : without errors |", f"|:--|{'--:|' * (len(names) + 1)}"]
-
-    def means(some: list[Row], name: str) -> list[float]:
-        return [float(np.exp(np.mean([np.log(mean_error(r.errors[name], s)) for r in some]))) for s in ("rms", "log")]
-
-    clean = means(rows["none"], "plus")
+    lines = [f"| errors | rows | {' | '.join(names)} |", f"|:--|{'--:|' * (len(names) + 1)}"]
     for kind, some in rows.items():
         cells = []
         for name in names:
-            rms, geometric = means(some, name)
+            rms, geometric = (
+                np.exp(np.mean([np.log(mean_error(r.errors[name], s)) for r in some])) for s in STATISTICS
+            )
             cells.append(f"{rms:.1f} / {geometric:.2f} ({np.mean([r.nees[name] for r in some]):.1f})")
-        ratio = " / ".join(f"{a / b:.2f}" for a, b in zip(means(some, "plus"), clean))
-        lines.append(f"| {kind} | {' | '.join(cells)} | {ratio} |")
+        lines.append(f"| {kind} | {len(some)} | {' | '.join(cells)} |")
     return lines
 
 
@@ -116,15 +130,20 @@ def main() -> None:
     options = arguments.parse_args()
     torch.set_num_threads(1)
     options.out.mkdir(parents=True, exist_ok=True)
-    simulate_sets(options.data, options.real, tuple(INJECTED))
-    cases: list[Case] = []
-    for name in (*INJECTED, *REAL):
-        drives = load((options.data if name in INJECTED else options.real) / name)
-        cases += simulated_cases(name, drives) if name in INJECTED else real_cases(name, drives)
+    simulate_sets(options.data, options.real, (*INJECTED, FLEET))
     filters, rows = rivals(), {}
-    for kind, draw in ERRORS.items():
-        rows[kind] = [row for case in cases for row in score(with_errors(case, draw), filters)]
-        print(table(rows)[-1], flush=True)
+    for name in (*INJECTED, *REAL, FLEET):
+        drives = load((options.real if name in REAL else options.data) / name)
+        for case in real_cases(name, drives) if name in REAL else simulated_cases(name, drives):
+            moves = bool(case.batch.gnss_valid[..., VELOCITY].any())
+            for kind, change in ERRORS.items():
+                if moves or kind not in OF_VELOCITIES:
+                    where = "simulated" if name == FLEET else "real motion"
+                    rows.setdefault(f"{kind}, {where}", []).extend(score(with_errors(case, change), filters))
+        print(name, flush=True)
+    rows = dict(
+        sorted(rows.items(), key=lambda x: (not x[0].endswith("motion"), [*ERRORS].index(x[0].rpartition(", ")[0])))
+    )
     (options.out / "table.md").write_text("\n".join(table(rows)) + "\n")
     (options.out / "manifest.json").write_text(json.dumps(describe_provenance(), indent=1) + "\n")
 

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -93,6 +93,7 @@ class CoarseMemory(NamedTuple):
     age: Tensor  # (B,) s since then
 
 
+@runtime_checkable
 class FixGate(Protocol):
     """What a filter asks of a gate; its memory may be anything."""
 
