@@ -4,9 +4,10 @@ States, strapdown, sources and Riccati recursion are those of a classical filter
 white noise. The level of accelerometers and of gyroscopes is slow: virtual outages of 10 to 30 s in the recent past
 show it (:mod:`dlkf.filters.virtual_outages`), and it holds through an outage. A recurrent network adds what is fast, a
 factor for each gyroscope every epoch, in outages too; it sees the samples, the filter's covariance and how well its
-innovations and corrections fit (:mod:`dlkf.filters.matching`). Errors of positions may be smaller than claimed or
-wander, as far as fixes show (:mod:`dlkf.filters.position_errors`). Before the first fix it is ``base`` to the bit; with
-positions as claimed and weights of zero until the first virtual outage was scored.
+innovations and corrections fit (:mod:`dlkf.filters.matching`). As far as fixes show, their errors are larger than
+claimed (:mod:`dlkf.filters.fix_noise`), or those of positions smaller, or wander (:mod:`dlkf.filters.position_errors`).
+Before the first fix it is ``base`` to the bit; with fixes as claimed and weights of zero until the first virtual outage
+was scored.
 """
 
 from __future__ import annotations
