@@ -74,7 +74,7 @@ static void solve2(int n, double *A, double *b) {
  * than three. Complex numbers are north + i east; u + i v solves as a real system of (u, v) (dlkf.data.alignment). */
 static int fit_velocity(const dlkf *d, int64_t number, int64_t first, boundary *b) {
   double A[36] = {0}, x[12] = {0}, D[3] = {1e-9, 0, 0}, down[2] = {0}, r_n[3], u[3];
-  double yaw = 0, before[2] = {1, 0}, way[2] = {0, 0}, slowed[2] = {0, 0}, span = 0;
+  double yaw = 0, before[2] = {1, 0}, way[2] = {0, 0}, slowed[2] = {0, 0}, span = 0, squares = 0;
   int fixes = 0;
   for (int j = 0; j <= DLKF_FITTED && number - j >= first; j++) {
     const double tau = j * EPOCH_S;
@@ -107,16 +107,24 @@ static int fit_velocity(const dlkf *d, int64_t number, int64_t first, boundary *
       x[i] += weight * (row[i] * r_n[0] + row[3 + i] * r_n[1]);
       x[3 + i] += weight * (row[i] * r_n[1] - row[3 + i] * r_n[0]);
     }
+    squares += weight * (r_n[0] * r_n[0] + r_n[1] * r_n[1]);
     D[0] += weight, D[1] -= weight * tau, D[2] += weight * tau * tau;
     down[0] += weight * r_n[2], down[1] -= weight * tau * r_n[2];
   }
   if (fixes < 3) return 0;
-  for (int k = 0; k < 6; k++) A[7 * k] += k % 3 < 2 ? 1e-9 : 1 / (ACCELERATION_STD * ACCELERATION_STD);
+  double prior[6], right[6];
+  for (int k = 0; k < 6; k++) {
+    prior[k] = k % 3 < 2 ? 1e-9 : 1 / (ACCELERATION_STD * ACCELERATION_STD);
+    A[7 * k] += prior[k], right[k] = x[k];
+  }
   x[6 + 1] = 1; /* its solution has the variance of the velocity */
   solve2(6, A, x);
+  for (int k = 0; k < 6; k++) squares -= x[k] * (right[k] + prior[k] * x[k]); /* of the residuals over their 1-sigma */
+  squares /= fixes > 3 ? 2 * fixes - 5 : 1;
+  const double scale = squares > 1 ? sqrt(squares) : 1; /* Birge ratio */
   b->v_n[0] = x[1], b->v_n[1] = x[4];
   const double speed = hypot(x[1], x[4]), slope = UNKNOWN_VELOCITY_STD + UNKNOWN_SLOPE_STD * speed;
-  b->std[0] = b->std[1] = hypot(sqrt(x[6 + 1]), 0.5 * GYRO_BIAS_STD * span * speed);
+  b->std[0] = b->std[1] = hypot(scale * sqrt(x[6 + 1]), 0.5 * GYRO_BIAS_STD * span * speed);
   D[2] += 1 / (slope * slope);
   const double determinant = D[0] * D[2] - D[1] * D[1];
   b->v_n[2] = (D[0] * down[1] - D[1] * down[0]) / determinant;
@@ -157,7 +165,8 @@ int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b) {
   if (!read_boundary(d, epoch - BACK, first, velocities, &then)) return 0;
   const double lag = now.fix->lag, lag_then = then.fix->lag, span = BACK * EPOCH_S - lag + lag_then;
   const double speed = hypot(now.v_n[0], now.v_n[1]), slow = speed > 0.1 ? speed : 0.1;
-  if (!(span > 0.5 * EPOCH_S) || !(speed > MIN_SPEED)) return 0;
+  const double noise = now.std[0] > now.std[1] ? now.std[0] : now.std[1];
+  if (!(span > 0.5 * EPOCH_S) || !(speed > MIN_SPEED) || !(speed > MOTION_SIGMAS * noise)) return 0;
 
   double turned[9], rate_b[3], rate_then[3], swing_b[3], swing_then[3], u[3], w[3];
   carried_force(d, epoch, u_b, turned);
@@ -200,7 +209,6 @@ int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b) {
   apply3_transposed(C_new, v_e, start + 3);
   product3_transposed(C_new, C_eb, start + 6);
 
-  const double noise = now.std[0] > now.std[1] ? now.std[0] : now.std[1];
   const double shift = lag > lag_then ? lag : lag_then; /* of the velocities' window against the IMU's */
   const double jolt = 1.41 * noise / span, jerk = JERK_STD * shift, turning = AXLE_STD * rate_b[2];
   const double pull = jolt * jolt + jerk * jerk + ACCEL_BIAS_STD * ACCEL_BIAS_STD; /* (m/s2)2 */
