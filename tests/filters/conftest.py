@@ -8,6 +8,6 @@ from dlkf.filters import fix_noise, position_errors
 @pytest.fixture
 def claimed(monkeypatch) -> None:
     """Fixes have the white noise that is claimed, whatever they show."""
-    monkeypatch.setattr(fix_noise.FixNoise, "honest", lambda self, epoch: epoch)
+    monkeypatch.setattr(fix_noise.FixNoise, "inflated", lambda self, epoch: epoch)
     monkeypatch.setattr(position_errors, "WANDER", 0.0)
     monkeypatch.setattr(position_errors.PositionErrors, "noise", lambda self, epoch, std: std.new_ones(1, 4))

@@ -43,7 +43,7 @@ def test_outliers_are_refused_and_good_fixes_are_not():
 
 
 def test_a_filter_sure_of_a_wrong_place_finds_back():
-    """Start 200 m off and told 1 m: the first fix is refused; the filter follows the second, which agrees."""
+    """A start 200 m off with a 1σ of 1 m: the first fix is refused; the filter follows the second, which agrees."""
     batch = scene(10, 60, seed=2)
     lost = replace(batch, start=batch.start._replace(p_n=batch.start.p_n + 200.0))
     off = error(lost, "mbkf15_gated")
@@ -61,7 +61,7 @@ def test_frozen_receiver_is_not_believed():
 
 
 def test_a_filter_with_a_wrong_velocity_is_not_locked_out():
-    """5 m/s off and told 0.1 m/s, so that attitude and biases are to explain it: without the gate over 100 m off."""
+    """5 m/s off with a 1σ of 0.1 m/s, so that attitude and biases change instead: over 100 m off without the gate."""
     batch = scene(10, 60, seed=6)
     lost = replace(batch, start=batch.start._replace(v_n=batch.start.v_n + 5.0, p_n=batch.start.p_n + 20.0))
     assert error(lost, "mbkf15_gated")[:, 40:].max() < 3.0 and error(lost, "mbkf15")[:, 40:].max() > 30.0

@@ -41,7 +41,7 @@ def parts(folder: str) -> dict[str, Estimator]:
     kinds["fixes as claimed"] = (AsClaimed, True)
     kinds["no speed from vibration"] = (PlusFilter, True)
     for name, (kind, network) in kinds.items():
-        config = replace(whole.config, base="mbkf33_car") if name == "no speed from vibration" else whole.config
+        config = replace(whole.config, base="mbkf33_car_gated") if name == "no speed from vibration" else whole.config
         found[name] = part = kind(config).eval()
         part.load_state_dict(whole.state_dict())
         if not network:

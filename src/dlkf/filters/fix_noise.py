@@ -43,7 +43,7 @@ class FixNoise(NamedTuple):
         components, parts = like.new_zeros(size, 6), like.new_zeros(size, 4)
         return cls(components, components, parts, parts + 1.0, parts + CLAIMED_FIXES)
 
-    def honest(self, epoch: Epoch) -> Epoch:
+    def inflated(self, epoch: Epoch) -> Epoch:
         """The epoch with the 1σ of its fix as large as its errors have been."""
         factor = self.variance.clamp_min(1.0).sqrt()[:, OF_PART]
         return epoch._replace(fix=epoch.fix._replace(std=epoch.fix.std * factor))

@@ -154,7 +154,7 @@ class PlusFilter(nn.Module):
 
     def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
         """Network, the Kalman filter with the noise of both, then the virtual outage beside it."""
-        claimed, offered = epoch, memory.fix_noise.honest(epoch)
+        claimed, offered = epoch, memory.fix_noise.inflated(epoch)
         kalman, epoch = self.kalman.screened(memory.kalman, offered)
         walk = torch.diag_embed(memory.errors.variance(offered))
         outage = memory.outage._replace(P=_with_walk(memory.outage.P, walk))

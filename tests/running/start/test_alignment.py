@@ -122,7 +122,7 @@ def test_positions_that_scatter_more_than_they_claim_give_a_course_that_knows_it
 
 
 def test_a_position_that_jumps_is_no_motion(drive):
-    """A car at rest whose positions of 5 cm are off by 20 m once: its velocity is fitted, and not believed."""
+    """A car at rest whose positions of 5 cm are off by 20 m once: the velocity fitted to them is within 2σ of zero."""
     position = drive.gnss_valid & (torch.arange(6) < 3)
     r_e = drive.gnss_r_e[:1].repeat(len(drive.gnss_r_e), 1)
     r_e[30] += 20.0
