@@ -313,3 +313,22 @@ def test_what_cannot_be_solved_is_not_finite_and_no_error():
     S, X = torch.zeros(1, 2, 2, dtype=torch.float64), torch.ones(1, 2, 3, dtype=torch.float64)
     with torch.no_grad():
         assert not _solved(S, X).isfinite().any()
+
+
+@pytest.mark.parametrize("name", ["mbkf15", "mbkf33_car"])
+def test_a_start_that_shows_the_gyroscopes_bias_is_weighed_against_what_is_known_of_the_imu(name):
+    """The product of two Gaussians; a start that shows nothing changes nothing, and position to accelerometers stay."""
+    batch = scene(3, 5, seed=1)
+    estimator = build_filter(name, IMU)
+    assert isinstance(estimator, Mbkf)
+    prior = float(bias_sigma(IMU, estimator.states)[3])
+    found = torch.tensor([[0.02, -0.01, 0.03]], dtype=torch.float64).expand(3, 3)
+    std = torch.stack([torch.full((3,), s, dtype=torch.float64) for s in (prior, 0.1 * prior, math.inf)])
+    memory, error = estimator.begin(replace(batch, start_gyro=torch.cat((found, std), -1)))
+    plain, without = estimator.begin(batch)
+    variance = 1 / (1 / prior**2 + 1 / std.square())
+    assert torch.allclose(memory.P.diagonal(dim1=1, dim2=2)[:, 12:15], variance, rtol=1e-9)
+    assert torch.allclose(error.bias[:, 3:], variance * found / std.square(), rtol=1e-9)
+    others = [k for k in range(memory.P.shape[-1]) if k not in (12, 13, 14)]
+    assert torch.equal(memory.P[:, others][:, :, others], plain.P[:, others][:, :, others])
+    assert torch.equal(error.bias[:, :3], without.bias[:, :3]) and torch.equal(error.bias[2], without.bias[2])

@@ -6,7 +6,7 @@ A fault turns the calls of a drive into others; beside it the words that the str
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import inf, nan
+from math import inf, nan, sin
 
 import numpy as np
 
@@ -162,6 +162,9 @@ JUMPS_LATE: dict[str, tuple[str, Fault]] = {  # what the receiver says, and whic
     "fixes 20 km off, the first good ones after them late": (OFF, _late(7.0, 50.5, 52.5)),
     "a frozen receiver, and late fixes": (FROZEN, _late(5.0, 29.5, 33.5)),
 }
+ALONE = _changed("gnss", lambda t: True, lambda x: _put(x, 4, WITHOUT_VELOCITY))
+JUMPY = _changed("gnss", lambda t: round(t) % 7 == 3, lambda x: _put(x, 1, x[1] + 2.7e-5))
+SCATTERED = _changed("gnss", lambda t: True, lambda x: _put(x, 1, x[1] + 2.5e-5 * sin(round(x[0]) ** 2)))
 COARSE = _changed("gnss", lambda t: True, lambda x: (*x[:4], WITHOUT_VELOCITY, [3.0] * 3 + WITHOUT_VELOCITY, x[6]))
 AROUND = (48.8, 9.2, 300.0)  # some place, far from the drive
 FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
@@ -213,7 +216,9 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "fixes 9.5 s late": (_late(9.5, 20.0), ("replayed",)),
     "fixes 15 s late": (_late(15.0, 25.0), ("late",)),
     "all fixes late from the start on": (_late(6.3), ("replayed",)),
-    "positions alone": (_changed("gnss", lambda t: True, lambda x: _put(x, 4, WITHOUT_VELOCITY)), ()),
+    "positions alone": (ALONE, ()),
+    "positions alone, one in seven 3 m off": (lambda sent: JUMPY(ALONE(sent)), ()),
+    "positions alone that scatter by two metres": (lambda sent: SCATTERED(ALONE(sent)), ()),
     "coarse positions alone": (COARSE, ()),
     "coarse positions alone, 3 s late": (lambda sent: _late(3.0)(COARSE(sent)), ("replayed",)),
     "fixes of the other hemisphere": (
@@ -227,6 +232,8 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
        for name, (jump, late) in JUMPS_LATE.items()},
     "a gyroscope that saturates for a second": (
         _changed("imu", _between(30.0, 31.0), lambda x: _put(x, 2, [0.0, 0.0, 35.0])), ()),
+    "gyroscopes 3 °/s off": (
+        _changed("imu", lambda t: True, lambda x: _put(x, 2, [w + 0.05 for w in x[2]])), ()),
     "a first fix of the year 2001": (_first(1e9, *AROUND), ()),
     "a first fix 18 s ahead": (_first(18.0, *AROUND), ()),
     "fixes at 2 Hz off the second": (

@@ -4,15 +4,7 @@ Over a window that ends at the boundary the gyroscopes carry the specific force 
 u_b = mean(C_b(end)b(t) f_b(t)), and GNSS gives the same vector in n, u_n = Δv/Δt − g. With yaw ψ from the
 course, C_nb u_b = u_n is solved for roll and pitch in closed form (Groves sect. 5.6.2, with motion).
 
-A receiver without velocities has them fitted to the positions of :data:`FIT_S`. With north + i east as one complex
-number and α(t) the yaw from the boundary back to t by the gyroscopes, a car that does not slip has the velocity
-v(t) = e^{iα(t)} (z − w τ), τ = t_end − t, so
-
-    p(t) = p_end − z ∫ e^{iα} dτ + w ∫ τ e^{iα} dτ,
-
-which is linear in position, velocity z and acceleration w at the boundary; w has a prior of :data:`ACCELERATION_STD`,
-so that coarse positions are fitted by a constant speed and fine ones by an accelerated motion. Where the residuals are
-larger than the positions' 1σ, that of the velocity grows with them.
+A receiver without velocities has them fitted to its positions (:mod:`dlkf.data.velocity_fit`).
 """
 
 from __future__ import annotations
@@ -26,6 +18,7 @@ from torch import Tensor
 
 from dlkf.base.errors import InputError
 from dlkf.data.drive import Drive
+from dlkf.data.velocity_fit import MOTION_SIGMAS, antenna_velocity, scattered_std
 from dlkf.navigation.attitude import prefix_rotations, rotation_from_rpy, rotation_from_vector, rpy_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, STANDARD_GRAVITY, ned_axes, normal_gravity
 from dlkf.navigation.error_model import RATE_AVERAGE_S
@@ -35,13 +28,7 @@ from dlkf.navigation.state import NavState
 SIDESLIP_STD = math.radians(1.5)  # course is not heading: sideslip, mounting yaw
 AXLE_STD = 0.7  # m, how far the IMU may sit before the rear axle; in a turn that is no small angle
 ACCEL_BIAS_STD = 0.1  # m/s²; tilts the level by bias / g
-UNKNOWN_VELOCITY_STD, UNKNOWN_SLOPE_STD = 0.2, 0.05  # m/s and slope of the road, where v_d is not measured
 JERK_STD = 0.7  # m/s³, of a car
-FIT_S = 5.0  # of positions to which a velocity is fitted
-ACCELERATION_STD = 1.0  # m/s², of a car
-GYRO_BIAS_STD = 0.01  # rad/s, that turns the positions of a window about its end
-MOTION_SIGMAS = 2.0  # of a velocity: less is no motion
-FIT_STD = 0.1  # m: how far a car keeps from the fit's motion
 SPREAD_STD = math.radians(0.5)  # lever arm to the rear axle, vibration
 
 
@@ -76,7 +63,8 @@ SEARCH = AlignConfig(search_s=20.0)
 class Aligned:
     """State of the IMU at the N+1 boundaries, where ``ok``; float64, garbage elsewhere.
 
-    ``r_e`` [m], ``v_e`` [m/s] in ECEF, ``C_eb``; ``std`` (9) of position, velocity, attitude in local NED.
+    ``r_e`` [m], ``v_e`` [m/s] in ECEF, ``C_eb``; ``std`` (9) of position, velocity, attitude in local NED. ``scatter``
+    is the Birge ratio of the positions, ≥ 1.
     """
 
     ok: Bool[Tensor, " rows"]
@@ -84,13 +72,14 @@ class Aligned:
     v_e: Float[Tensor, "rows 3"]
     C_eb: Float[Tensor, "rows 3 3"]
     std: Float[Tensor, "rows 9"]
+    scatter: Float[Tensor, " rows"]
 
 
 @dataclass(frozen=True)
 class Start:
     """Where a filter starts on a drive: epoch ``first``, tangent origin [rad, rad, m], state there (one
-    element, float64, in the tangent frame of that origin), its 1σ (9), and the probability that the car faces
-    another way."""
+    element, float64, in the tangent frame of that origin), its 1σ (9), the probability that the car faces
+    another way, and the gyroscopes' bias with its 1σ (6) [rad/s] where it has been found."""
 
     first: int
     lat: float
@@ -99,6 +88,7 @@ class Start:
     state: NavState
     std: Float[Tensor, " 9"]
     doubt: float = 0.0
+    gyro: Float[Tensor, " 6"] | None = None
 
 
 def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
@@ -113,7 +103,8 @@ def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     C_en = ned_axes(lat, lon)
     position = drive.gnss_valid[:, :3].all(-1)
     u_b, rate_b, turned = _carried_force(drive, back)
-    v_n, v_std, moving = _velocity(drive, C_en, position, -u_b / u_b.norm(dim=-1, keepdim=True).clamp_min(1.0))
+    down_b = -u_b / u_b.norm(dim=-1, keepdim=True).clamp_min(1.0)
+    v_n, v_std, moving, scatter, off = antenna_velocity(drive, C_en, down_b)
 
     then = torch.arange(rows) - back
     ok = position & moving & (then >= 0)
@@ -149,11 +140,12 @@ def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     turning = AXLE_STD * rate_b[:, 2]  # m/s across the car
     heading = torch.sqrt(SIDESLIP_STD**2 + (noise**2 + turning**2) / speed.clamp_min(0.1) ** 2)
     attitude_std = torch.stack((tilt, tilt, heading), -1)
-    std = torch.cat((drive.gnss_std[:, :3], v_std, attitude_std), -1)
+    position_std = torch.hypot(scattered_std(drive.gnss_std[:, :3], scatter[:, None]), off[:, None])
+    std = torch.cat((position_std, v_std, attitude_std), -1)
     C_eb = C_en @ C_nb
     finite = torch.cat((r_e, now, C_eb.flatten(1), std), -1).isfinite().all(-1)
     ok &= (speed > config.min_speed) & (speed > MOTION_SIGMAS * noise) & finite
-    return Aligned(ok, r_e, (C_en @ now.unsqueeze(-1)).squeeze(-1), C_eb, std)
+    return Aligned(ok, r_e, (C_en @ now.unsqueeze(-1)).squeeze(-1), C_eb, std, scatter)
 
 
 def mean_force(drive: Drive, row: int, config: AlignConfig = ALIGN) -> Float[Tensor, " 3"]:
@@ -172,68 +164,6 @@ def level_attitude(
     force_h = (C_level.mT @ force_n.unsqueeze(-1)).squeeze(-1)
     roll, pitch = _level(force_b.expand_as(force_h), force_h)
     return rotation_from_rpy(torch.stack((roll, pitch, yaw), -1))
-
-
-def _velocity(
-    drive: Drive, C_en: Float[Tensor, "rows 3 3"], position: Bool[Tensor, " rows"], down_b: Float[Tensor, "rows 3"]
-) -> tuple[Float[Tensor, "rows 3"], Float[Tensor, "rows 3"], Bool[Tensor, " rows"]]:
-    """Antenna velocity in n with std, and where its horizontal part is known; an unknown v_d is zero."""
-    known = drive.gnss_valid[:, 3:]
-    if torch.compiler.is_compiling() or bool(known[:, :2].any()):
-        v_n = (C_en.mT @ drive.gnss_v_e.unsqueeze(-1)).squeeze(-1)
-        v_n = torch.where(known, v_n, torch.zeros_like(v_n))
-        guess = UNKNOWN_VELOCITY_STD + UNKNOWN_SLOPE_STD * v_n[:, :2].norm(dim=-1, keepdim=True)
-        return v_n, torch.where(known, drive.gnss_std[:, 3:], guess), known[:, :2].all(-1)
-    return _fit_velocity(drive, C_en, position & (drive.gnss_lag == 0), down_b)
-
-
-def _fit_velocity(
-    drive: Drive, C_en: Float[Tensor, "rows 3 3"], usable: Bool[Tensor, " rows"], down_b: Float[Tensor, "rows 3"]
-) -> tuple[Float[Tensor, "rows 3"], Float[Tensor, "rows 3"], Bool[Tensor, " rows"]]:
-    """Velocity at boundaries from the positions of ``FIT_S`` before them, with std; usable with three fixes.
-
-    Its std grows with what an unknown gyroscope bias turns the fit by.
-    """
-    h, rows = drive.epoch_s, len(usable)
-    count = max(2, min(round(FIT_S / h), rows - 1))
-    before = torch.arange(rows)[:, None] - torch.arange(count + 1)  # boundary, epochs back
-    fixed = usable[before.clamp_min(0)] & (before >= 0)
-    turned = (drive.imu[..., 3:].double().mean(1) * down_b[1:]).sum(-1) * h  # yaw of every epoch
-    yaw = torch.nn.functional.pad(turned.cumsum(0), (1, 0))[before.clamp_min(0)]
-    heading = torch.polar(torch.ones_like(yaw), yaw - yaw[:, :1])
-    tau = h * torch.arange(count + 1, dtype=torch.float64)
-    middle, pad = 0.5 * (heading[:, 1:] + heading[:, :-1]) * h, torch.nn.functional.pad
-    way = pad(middle.cumsum(-1), (1, 0))
-    slowed = pad((middle * 0.5 * (tau[1:] + tau[:-1])).cumsum(-1), (1, 0))
-    r_n = (C_en.mT.unsqueeze(1) @ (drive.gnss_r_e[before.clamp_min(0)] - drive.gnss_r_e.unsqueeze(1)).unsqueeze(-1))[
-        ..., 0
-    ]
-    r_n = torch.where(fixed[..., None], r_n, 0.0)
-    weight = fixed / torch.hypot(drive.gnss_std[:, :3].amax(-1), torch.tensor(FIT_STD))[:, None].square()
-    weight = torch.where(fixed[:, :1], weight.nan_to_num(), 0.0)
-
-    def solve(x: Tensor, y: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-        """Weighted least squares of y (rows, n) by x (rows, n, k): solution and its covariance."""
-        weighted = x.mH * weight.unsqueeze(1)
-        cov = torch.linalg.inv(weighted @ x + torch.diag_embed(prior).to(x.dtype))
-        return (cov @ (weighted @ y.unsqueeze(-1)))[..., 0], cov.diagonal(dim1=-2, dim2=-1).real
-
-    # 1e-9: boundaries without fixes, whose matrix would be singular
-    prior = torch.tensor([1e-9, 1e-9, ACCELERATION_STD**-2], dtype=torch.float64).expand(rows, -1)
-    x = torch.stack((torch.ones_like(way), -way, slowed), -1)
-    level, variance = solve(x, torch.complex(r_n[..., 0], r_n[..., 1]), prior)
-    v_n, v_std = torch.zeros(rows, 3, dtype=torch.float64), torch.zeros(rows, 3, dtype=torch.float64)
-    v_n[:, 0], v_n[:, 1] = level[:, 1].real, level[:, 1].imag
-    span = (tau * fixed).amax(-1)
-    residual = torch.complex(r_n[..., 0], r_n[..., 1]) - (x.to(level.dtype) @ level.unsqueeze(-1))[..., 0]
-    squares = (weight * residual.abs().square()).sum(-1) / (2 * fixed.sum(-1) - 5).clamp_min(1)
-    scale = squares.clamp_min(1.0).sqrt()  # Birge ratio: of positions that scatter by more than claimed, or jump
-    v_std[:, :2] = torch.hypot(scale * variance[:, 1].sqrt(), 0.5 * GYRO_BIAS_STD * span * level[:, 1].abs())[:, None]
-    x = torch.stack((torch.ones_like(fixed, dtype=torch.float64), -tau.expand(rows, -1)), -1)
-    slope = UNKNOWN_VELOCITY_STD + UNKNOWN_SLOPE_STD * v_n[:, :2].norm(dim=-1)
-    down, variance = solve(x, r_n[..., 2], torch.stack((torch.full_like(slope, 1e-9), slope**-2), -1))
-    v_n[:, 2], v_std[:, 2] = down[:, 1], variance[:, 1].sqrt()
-    return v_n, v_std, fixed[:, 0] & (fixed.sum(-1) >= 3)
 
 
 def _carried_force(

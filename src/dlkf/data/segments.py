@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -20,6 +20,7 @@ from dlkf.data.stack import DriveStack, stack_drives
 from dlkf.navigation.earth import TangentFrame, tangent_frame
 from dlkf.navigation.state import NavState
 
+UNKNOWN_GYRO = (0.0, 0.0, 0.0, math.inf, math.inf, math.inf)  # bias and 1σ where a start shows none
 REST = (0.0, 0.0, -9.8, 0.0, 0.0, 0.0)  # IMU in the padding after a segment's end
 
 
@@ -194,7 +195,11 @@ def whole_drives(drives: Sequence[Drive], starts: Sequence[Start], *, dtype: tor
     frame = tangent_frame(*llh.unbind(-1), dtype=dtype)
     state = NavState(*(torch.stack(x) for x in zip(*(s.state for s in starts))))
     std = torch.stack([s.std for s in starts])
-    return _assemble(stack, torch.arange(len(stack)), first, stack.epochs - first, frame, state, std, dtype)
+    batch = _assemble(stack, torch.arange(len(stack)), first, stack.epochs - first, frame, state, std, dtype)
+    if all(s.gyro is None for s in starts):
+        return batch
+    gyro = torch.stack([std.new_tensor(UNKNOWN_GYRO) if s.gyro is None else s.gyro for s in starts])
+    return replace(batch, start_gyro=gyro.to(dtype))
 
 
 def _with_alignment(

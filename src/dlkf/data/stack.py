@@ -72,7 +72,9 @@ class DriveStack(Sequence[Drive]):
     def aligned(self) -> Aligned:
         """Attitude from IMU and GNSS at every boundary of every drive."""
         parts = [align_boundaries(d) for d in self.drives]
-        return Aligned(*(torch.cat([getattr(a, f) for a in parts]) for f in ("ok", "r_e", "v_e", "C_eb", "std")))
+        return Aligned(
+            *(torch.cat([getattr(a, f) for a in parts]) for f in ("ok", "r_e", "v_e", "C_eb", "std", "scatter"))
+        )
 
     @cached_property
     def origin(self) -> Tensor:

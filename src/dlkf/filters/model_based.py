@@ -24,7 +24,7 @@ from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import STANDARD_GRAVITY
 from dlkf.navigation.error_model import PLAIN, WindowModel, mask_rows, source_scale, window_model
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
-from dlkf.navigation.state import PVA, STATES, ErrorStates
+from dlkf.navigation.state import GYRO, PVA, STATES, ErrorStates
 
 GENERIC_IMU = ImuSpec("any", SensorErrors(), SensorErrors())
 
@@ -110,7 +110,8 @@ class Mbkf:
         )  # fmt: skip
 
     def begin(self, batch: Batch) -> tuple[KalmanMemory, ImuError]:
-        """P₀ from the start's law and the preset; the IMU error at its prior mean."""
+        """P₀ from the start's law and the preset; the IMU error at its prior mean, both with what the start has found
+        of the gyroscopes' bias."""
         like = {"dtype": batch.imu.dtype, "device": batch.imu.device}
         B, _, M = batch.size
         sigma = torch.cat((batch.start_std, self._imu_sigma().to(**like).expand(B, -1)), -1)
@@ -133,13 +134,18 @@ class Mbkf:
         )  # fmt: skip
         sources = tuple(source.begin(batch) for source in self.sources)
         noise = None if self.noise is None else self.noise.begin(batch.imu, self.states.count)
+        error = ImuError(torch.zeros(B, 6, **like))
+        if self.prior is not None:
+            mean = torch.tensor(self.prior.mean, **like).expand(B, -1)
+            error = error.updated(torch.cat((torch.zeros(B, 9, **like), mean), -1), self.states)
+        if batch.start_gyro is not None:
+            found, std = batch.start_gyro.split(3, -1)
+            variance, bias = sigma[:, GYRO].square(), error.bias[:, 3:]
+            gain = variance / (variance + std.square())
+            error = error._replace(bias=torch.cat((error.bias[:, :3], bias + gain * (found - bias)), -1))
+            sigma = torch.cat((sigma[:, :12], ((1 - gain) * variance).sqrt(), sigma[:, 15:]), -1)
         P, fix = torch.diag_embed(sigma**2), self.fix.begin(batch)
-        memory = KalmanMemory(P, windows, fix, sources, structure, noise, parameters)
-        known = torch.zeros(B, 9, **like)
-        if self.prior is None:
-            return memory, ImuError(known[:, :6])
-        mean = torch.tensor(self.prior.mean, **like).expand(B, -1)
-        return memory, ImuError(torch.zeros_like(known[:, :6])).updated(torch.cat((known, mean), -1), self.states)
+        return KalmanMemory(P, windows, fix, sources, structure, noise, parameters), error
 
     @cached_property
     def parameters(self) -> dict[str, Parameter]:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from dlkf.base.errors import InputError
-from dlkf.data import aids, alignment, limits, resampling
+from dlkf.data import aids, alignment, limits, resampling, velocity_fit
 from dlkf.data.aid_tables import LAST
 from dlkf.data.validate import LIMITS
 from dlkf.filters.aids.attach import aid_columns, tables_of
@@ -144,12 +144,13 @@ def _sizes(estimator: Estimator, layout: Layout, grid: Grid, name: str, work: in
     """What ``step.h`` is filled with."""
     place = {f.name: f.offset for f in layout.fields}
     window_s, columns = alignment.SEARCH.window_s, columns_of(estimator)
-    lookback = math.ceil(max(LOOKBACK_S, window_s + alignment.FIT_S) / grid.epoch_s) + 2
+    lookback = math.ceil(max(LOOKBACK_S, window_s + velocity_fit.READ_S) / grid.epoch_s) + 2
     layout_of = f"{name} {grid} {layout.size} {[(f.name, f.shape) for f in layout.fields]} {columns}"
     return {
         "NAME": name, "MEMORY": layout.size, "SAMPLES": grid.samples, "RATE_HZ": repr(1 / grid.dt),
         "RATE_MILLIHZ": round(1e3 / grid.dt), "LOOKBACK": lookback,
-        "LEVELLED": max(1, round(window_s / grid.epoch_s)), "FITTED": max(2, round(alignment.FIT_S / grid.epoch_s)),
+        "LEVELLED": max(1, round(window_s / grid.epoch_s)), "FITTED": max(2, round(velocity_fit.FIT_S / grid.epoch_s)),
+        "CONFIRMED": max(1, round(velocity_fit.CONFIRMED_S / grid.epoch_s)),
         "REST": round(LOOKBACK_S / grid.epoch_s), "STILL": max(1, round(standstill.SHORTEST_REST_S / grid.epoch_s)),
         "TAIL": max(1, min(grid.samples, round(alignment.RATE_AVERAGE_S / grid.dt))),
         "FIX": fix_numbers(estimator), "START": START, "OUTPUTS": output_numbers(estimator),
@@ -198,11 +199,11 @@ def constants() -> str:
     for module, names in (
         (aids, ("SEA_LEVEL_PA", "SCALE_M", "EXPONENT")),
         (bank, ("RING", "REVERSE_PRIOR", "REVERSE_SPEED", "RING_PRIOR", "COARSE", "NIS_CAP", "DECIDED", "OTHER",
-                "READY_STD", "OVERBOUND")),
+                "READY_STD", "OVERBOUND", "BIAS_OVERBOUND", "LEAST_BIAS_STD")),
         (standstill, ("REST_RATE", "REST_SPEED", "REST_POSITION_STD", "RATE_STD", "RATE_DRIFT_STD", "RATE_SCALE_STD")),
-        (alignment, ("SIDESLIP_STD", "AXLE_STD", "ACCEL_BIAS_STD", "UNKNOWN_VELOCITY_STD", "UNKNOWN_SLOPE_STD",
-                     "JERK_STD", "SPREAD_STD", "ACCELERATION_STD", "GYRO_BIAS_STD", "FIT_STD", "FIT_S",
-                     "MOTION_SIGMAS")),
+        (alignment, ("SIDESLIP_STD", "AXLE_STD", "ACCEL_BIAS_STD", "JERK_STD", "SPREAD_STD")),
+        (velocity_fit, ("UNKNOWN_VELOCITY_STD", "UNKNOWN_SLOPE_STD", "ACCELERATION_STD", "GYRO_BIAS_STD", "FIT_STD",
+                        "OUTLIER_SIGMAS", "MOST_OUTLIERS", "LEAST_SHARE", "OVERDETERMINED", "MOTION_SIGMAS")),
         (earth, ("SEMI_MAJOR", "SEMI_MINOR", "ECCENTRICITY_SQ", "EARTH_RATE", "GRAVITY_EQUATOR", "SOMIGLIANA",
                  "GRAVITATIONAL_CONSTANT", "STANDARD_GRAVITY")),
         (limits, ("FASTEST_M_S", "STEEPEST_M_S", "JUMP_M", "JUMP_SIGMAS", "MOST_JUMP_STD_M", "LARGEST_STD",

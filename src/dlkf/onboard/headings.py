@@ -58,8 +58,8 @@ class Headings(NamedTuple):
     def sizes(self) -> dict[str, object]:
         """What ``step.h`` says of them."""
         if not self.size:
-            names = ("HEADING", "OWN", "OWN_COUNT", "OWN_P", "OWN_C")
-            return dict.fromkeys((*names, *(f"HEADING_{x}" for x in ("P", "BIAS", "ORIGIN", "AXES"))), 0)
+            names = ("HEADING", "OWN", "OWN_COUNT", "OWN_P", "OWN_C", "OWN_BIAS")
+            return dict.fromkeys((*names, *(f"HEADING_{x}" for x in ("P", "ORIGIN", "AXES"))), 0)
         within = {}
         for first, count in self.own:
             within |= {first + k: len(within) + k for k in range(count)}
@@ -67,7 +67,8 @@ class Headings(NamedTuple):
         return {
             "HEADING": self.size, "OWN": ", ".join(f"{{{first}, {count}}}" for first, count in self.own),
             "OWN_COUNT": len(within), "OWN_P": within[at["state.p_n"]], "OWN_C": within[at["state.C_nb"]],
-            "HEADING_P": at["state.p_n"], "HEADING_BIAS": at["error.bias"],
+            "OWN_BIAS": within[at["error.bias"]],
+            "HEADING_P": at["state.p_n"],
             "HEADING_ORIGIN": at["frame.origin_e"], "HEADING_AXES": at["frame.C_en"],
         }  # fmt: skip
 

@@ -13,10 +13,11 @@ import torch
 from torch import Tensor
 
 from dlkf.base.errors import InputError
-from dlkf.data.alignment import FIT_S, AlignConfig, Start
+from dlkf.data.alignment import AlignConfig, Start
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.resampling import BLANK, FixRows
 from dlkf.data.segments import REST, whole_drives
+from dlkf.data.velocity_fit import READ_S
 from dlkf.filters.aids.attach import aid_columns
 from dlkf.filters.integration import Estimator, Fix, advance
 from dlkf.navigation.calibration import ImuError
@@ -75,7 +76,7 @@ class EpochFilter:
         self._estimator, self._buffer, self._boundary, self._align = estimator, buffer, boundary, align
         self._rate_hz, self._epoch_s, self._anchor_m, self._rewind = rate_hz, epoch_s, anchor_m, rewind
         self._said, self.counts = aid_columns(estimator), counts
-        back_s = max(LOOKBACK_S, align.window_s + FIT_S)
+        back_s = max(LOOKBACK_S, align.window_s + READ_S)
         self._lookback = math.ceil(back_s / epoch_s) + 2  # epochs that an alignment reads
         module: object = estimator
         parameter = next(module.parameters(), None) if isinstance(module, torch.nn.Module) else None

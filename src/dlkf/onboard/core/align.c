@@ -13,7 +13,12 @@ static const double EPOCH_S = DLKF_SAMPLES / DLKF_RATE_HZ;
 typedef struct {
   const dlkf_fix *fix;
   double C_en[9], lat, height, v_n[3], std[3];
+  double scatter, off; /* of positions: Birge ratio of their fit; m of this one from the fit to the others */
 } boundary;
+
+typedef struct {
+  double weight, row[6], r_n[3], tau; /* of position, velocity and acceleration: real, imaginary; s before the boundary */
+} fitted;
 
 static const double *samples(const dlkf *d, int64_t epoch) { return d->closed[epoch % DLKF_CLOSED].imu; }
 
@@ -53,29 +58,87 @@ static double yaw_turned(const dlkf *d, int64_t epoch, int64_t first) {
   return -dot3(rate_b, force_b) / (size > 1 ? size : 1) * EPOCH_S;
 }
 
-/* x of A x = b by Cholesky, A symmetric, positive definite (n x n) and destroyed; two right sides in b, by rows. */
-static void solve2(int n, double *A, double *b) {
-  for (int i = 0; i < n; i++)
+/* Cholesky factor of A, symmetric and positive definite (6 x 6), in its lower triangle. */
+static void factor6(double *A) {
+  for (int i = 0; i < 6; i++)
     for (int j = 0; j <= i; j++) {
-      double x = A[i * n + j];
-      for (int k = 0; k < j; k++) x -= A[i * n + k] * A[j * n + k];
-      A[i * n + j] = i == j ? sqrt(x) : x / A[j * n + j];
+      double x = A[i * 6 + j];
+      for (int k = 0; k < j; k++) x -= A[i * 6 + k] * A[j * 6 + k];
+      A[i * 6 + j] = i == j ? sqrt(x) : x / A[j * 6 + j];
     }
-  for (int c = 0; c < 2; c++) {
-    double *x = b + c * n;
-    for (int i = 0; i < n; x[i] /= A[i * n + i], i++)
-      for (int k = 0; k < i; k++) x[i] -= A[i * n + k] * x[k];
-    for (int i = n - 1; i >= 0; x[i] /= A[i * n + i], i--)
-      for (int k = i + 1; k < n; k++) x[i] -= A[k * n + i] * x[k];
+}
+
+static void solve_lower6(const double *L, double *x) {
+  for (int i = 0; i < 6; x[i] /= L[i * 6 + i], i++)
+    for (int k = 0; k < i; k++) x[i] -= L[i * 6 + k] * x[k];
+}
+
+static void solve6(const double *L, double *x) {
+  solve_lower6(L, x);
+  for (int i = 5; i >= 0; x[i] /= L[i * 6 + i], i--)
+    for (int k = i + 1; k < 6; k++) x[i] -= L[k * 6 + i] * x[k];
+}
+
+/* Weighted least squares: solution (u, v) of the real system, variance of the velocity, and of the fixes with weight their
+ * number, the sum of squared residuals over their 1-sigma, the square of the worst over its own 1-sigma and which that is;
+ * 1 - h of the first. */
+typedef struct {
+  double x[6], variance, squares, largest, others_share;
+  int fixes, worst;
+} solution;
+
+static void solve_fit(const fitted *at, int count, solution *s) {
+  double A[36] = {0}, v[6];
+  memset(s, 0, sizeof *s);
+  for (int n = 0; n < count; n++) {
+    const double *row = at[n].row, *r_n = at[n].r_n, weight = at[n].weight;
+    for (int i = 0; i < 3; i++) { /* conj(x_i) x_k and conj(x_i) y */
+      for (int k = 0; k < 3; k++) {
+        const double re = weight * (row[i] * row[k] + row[3 + i] * row[3 + k]);
+        const double im = weight * (row[i] * row[3 + k] - row[3 + i] * row[k]);
+        A[6 * i + k] += re, A[6 * (i + 3) + k + 3] += re;
+        A[6 * (i + 3) + k] += im, A[6 * i + k + 3] -= im;
+      }
+      s->x[i] += weight * (row[i] * r_n[0] + row[3 + i] * r_n[1]);
+      s->x[3 + i] += weight * (row[i] * r_n[1] - row[3 + i] * r_n[0]);
+    }
+  }
+  for (int k = 0; k < 6; k++) A[7 * k] += k % 3 < 2 ? 1e-9 : 1 / (ACCELERATION_STD * ACCELERATION_STD);
+  factor6(A);
+  solve6(A, s->x);
+  for (int k = 0; k < 6; k++) v[k] = k == 1;
+  solve6(A, v);
+  s->variance = v[1];
+  for (int n = 0; n < count; n++) {
+    const double *row = at[n].row, *x = s->x;
+    double east = at[n].r_n[1], north = at[n].r_n[0];
+    for (int k = 0; k < 3; k++) {
+      north -= row[k] * x[k] - row[3 + k] * x[3 + k], east -= row[k] * x[3 + k] + row[3 + k] * x[k];
+      v[k] = row[k], v[3 + k] = -row[3 + k];
+    }
+    solve_lower6(A, v);
+    double others = 1 - at[n].weight * (dot3(v, v) + dot3(v + 3, v + 3)); /* 1 - h */
+    if (others < LEAST_SHARE) others = LEAST_SHARE;
+    const double square = at[n].weight * (north * north + east * east);
+    if (square / others > s->largest) s->largest = square / others, s->worst = n;
+    if (!n) s->others_share = others;
+    s->squares += square;
+    s->fixes += at[n].weight > 0;
   }
 }
 
-/* Velocity fitted to the positions of FIT_S before a boundary, with the turns of the gyroscopes; 0 where they are fewer
- * than three. Complex numbers are north + i east; u + i v solves as a real system of (u, v) (dlkf.data.alignment). */
+/* 1-sigma [m] of a position whose fit has a Birge ratio of scatter. */
+double dlkf_scattered(double std, double scatter) { return scatter > 1 ? scatter * hypot(std, FIT_STD) : std; }
+
+/* Velocity fitted to the positions of FIT_S before a boundary, with the turns of the gyroscopes and without outliers; 0
+ * where they are fewer than three, or the boundary's is one. Complex numbers are north + i east; u + i v solves as a real
+ * system of (u, v) (dlkf.data.velocity_fit). */
 static int fit_velocity(const dlkf *d, int64_t number, int64_t first, boundary *b) {
-  double A[36] = {0}, x[12] = {0}, D[3] = {1e-9, 0, 0}, down[2] = {0}, r_n[3], u[3];
-  double yaw = 0, before[2] = {1, 0}, way[2] = {0, 0}, slowed[2] = {0, 0}, span = 0, squares = 0;
-  int fixes = 0;
+  double yaw = 0, before[2] = {1, 0}, way[2] = {0, 0}, slowed[2] = {0, 0}, u[3], span = 0;
+  double D[3] = {1e-9, 0, 0}, down[2] = {0};
+  fitted at[DLKF_FITTED + 1];
+  int count = 0;
+  if (b->fix->lag > 0) return 0;
   for (int j = 0; j <= DLKF_FITTED && number - j >= first; j++) {
     const double tau = j * EPOCH_S;
     if (j) {
@@ -90,56 +153,62 @@ static int fit_velocity(const dlkf *d, int64_t number, int64_t first, boundary *
     }
     const dlkf_fix *fix = dlkf_fix_at(d, number - j);
     if (!has_position(fix) || fix->lag > 0) continue;
-    fixes++;
-    span = tau;
     double std = fix->std[0] > fix->std[1] ? fix->std[0] : fix->std[1];
     std = hypot(fix->std[2] > std ? fix->std[2] : std, FIT_STD);
-    const double weight = 1 / (std * std), row[6] = {1, -way[0], slowed[0], 0, -way[1], slowed[1]}; /* real, imaginary */
+    at[count] = (fitted){1 / (std * std), {1, -way[0], slowed[0], 0, -way[1], slowed[1]}, {0}, tau};
     for (int k = 0; k < 3; k++) u[k] = fix->r_e[k] - b->fix->r_e[k];
-    apply3_transposed(b->C_en, u, r_n);
-    for (int i = 0; i < 3; i++) { /* conj(x_i) x_k and conj(x_i) y */
-      for (int k = 0; k < 3; k++) {
-        const double re = weight * (row[i] * row[k] + row[3 + i] * row[3 + k]);
-        const double im = weight * (row[i] * row[3 + k] - row[3 + i] * row[k]);
-        A[6 * i + k] += re, A[6 * (i + 3) + k + 3] += re;
-        A[6 * (i + 3) + k] += im, A[6 * i + k + 3] -= im;
-      }
-      x[i] += weight * (row[i] * r_n[0] + row[3 + i] * r_n[1]);
-      x[3 + i] += weight * (row[i] * r_n[1] - row[3 + i] * r_n[0]);
-    }
-    squares += weight * (r_n[0] * r_n[0] + r_n[1] * r_n[1]);
+    apply3_transposed(b->C_en, u, at[count++].r_n);
+  }
+  solution s;
+  for (int round = 0;; round++) { /* data snooping */
+    solve_fit(at, count, &s);
+    const int redundancy = 2 * s.fixes - 5;
+    double others = (s.squares - s.largest) / (redundancy > 3 ? redundancy - 2 : 1);
+    if (others < 1) others = 1;
+    if (round == MOST_OUTLIERS || redundancy < OVERDETERMINED) break;
+    if (!(s.largest > OUTLIER_SIGMAS * OUTLIER_SIGMAS * others)) break;
+    at[s.worst].weight = 0;
+  }
+  if (s.fixes < 3 || !(at[0].weight > 0)) return 0;
+  const double squares = s.squares / (s.fixes > 4 ? 2 * s.fixes - 7 : 1);
+  b->scatter = squares > 1 ? sqrt(squares) : 1;
+  b->off = hypot(s.x[0], s.x[3]) / s.others_share;
+  for (int n = 0; n < count; n++) {
+    const double weight = at[n].weight, tau = at[n].tau;
+    if (weight > 0) span = tau;
     D[0] += weight, D[1] -= weight * tau, D[2] += weight * tau * tau;
-    down[0] += weight * r_n[2], down[1] -= weight * tau * r_n[2];
+    down[0] += weight * at[n].r_n[2], down[1] -= weight * tau * at[n].r_n[2];
   }
-  if (fixes < 3) return 0;
-  double prior[6], right[6];
-  for (int k = 0; k < 6; k++) {
-    prior[k] = k % 3 < 2 ? 1e-9 : 1 / (ACCELERATION_STD * ACCELERATION_STD);
-    A[7 * k] += prior[k], right[k] = x[k];
-  }
-  x[6 + 1] = 1; /* its solution has the variance of the velocity */
-  solve2(6, A, x);
-  for (int k = 0; k < 6; k++) squares -= x[k] * (right[k] + prior[k] * x[k]); /* of the residuals over their 1-sigma */
-  squares /= fixes > 3 ? 2 * fixes - 5 : 1;
-  const double scale = squares > 1 ? sqrt(squares) : 1; /* Birge ratio */
-  b->v_n[0] = x[1], b->v_n[1] = x[4];
-  const double speed = hypot(x[1], x[4]), slope = UNKNOWN_VELOCITY_STD + UNKNOWN_SLOPE_STD * speed;
-  b->std[0] = b->std[1] = hypot(scale * sqrt(x[6 + 1]), 0.5 * GYRO_BIAS_STD * span * speed);
+  b->v_n[0] = s.x[1], b->v_n[1] = s.x[4];
+  const double speed = hypot(s.x[1], s.x[4]), slope = UNKNOWN_VELOCITY_STD + UNKNOWN_SLOPE_STD * speed;
+  b->std[0] = b->std[1] = hypot(b->scatter * sqrt(s.variance), 0.5 * GYRO_BIAS_STD * span * speed);
   D[2] += 1 / (slope * slope);
   const double determinant = D[0] * D[2] - D[1] * D[1];
   b->v_n[2] = (D[0] * down[1] - D[1] * down[0]) / determinant;
   b->std[2] = sqrt(D[0] / determinant);
+  return speed > MOTION_SIGMAS * b->std[0];
+}
+
+/* The boundary at which a fix with a position is; 0 where there is none. */
+static int find_boundary(const dlkf *d, int64_t number, boundary *b) {
+  double lon;
+  b->fix = dlkf_fix_at(d, number);
+  b->scatter = 1, b->off = 0;
+  if (!has_position(b->fix)) return 0;
+  geodetic_from_ecef(b->fix->r_e, &b->lat, &lon, &b->height);
+  ned_axes(b->lat, lon, b->C_en);
   return 1;
 }
 
-/* Velocity of the antenna at a boundary with its 1-sigma; where no fix has any, from positions. */
+/* Velocity of the antenna at a boundary with its 1-sigma; where no fix has any, from positions, if by those of a second
+ * before the car moved too. */
 static int read_boundary(const dlkf *d, int64_t number, int64_t first, int velocities, boundary *b) {
-  b->fix = dlkf_fix_at(d, number);
-  if (!has_position(b->fix)) return 0;
-  double lon;
-  geodetic_from_ecef(b->fix->r_e, &b->lat, &lon, &b->height);
-  ned_axes(b->lat, lon, b->C_en);
-  if (!velocities) return !(b->fix->lag > 0) && fit_velocity(d, number, first, b);
+  boundary before;
+  if (!find_boundary(d, number, b)) return 0;
+  if (!velocities)
+    return fit_velocity(d, number, first, b) && number - DLKF_CONFIRMED >= first &&
+           find_boundary(d, number - DLKF_CONFIRMED, &before) &&
+           fit_velocity(d, number - DLKF_CONFIRMED, first, &before);
   apply3_transposed(b->C_en, b->fix->v_e, b->v_n);
   for (int k = 0; k < 3; k++)
     if (!b->fix->used[3 + k]) b->v_n[k] = 0;
@@ -149,9 +218,10 @@ static int read_boundary(const dlkf *d, int64_t number, int64_t first, int veloc
 }
 
 /* A start at the beginning of a closed update interval: latitude, longitude [rad], height [m] of the IMU, velocity (3)
- * and attitude (9) in the tangent frame there, 1-sigma of position, velocity, attitude (9); and the mean specific force of
- * the window before. 0 where there is none. */
-int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b) {
+ * and attitude (9) in the tangent frame there, 1-sigma of position, velocity, attitude (9), gyroscope bias (3) and its
+ * 1-sigma (3), which is unknown; and the mean specific force of
+ * the window before; the Birge ratio of the positions. 0 where there is none. */
+int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b, double *scatter) {
   const int64_t first = epoch - d->oldest > DLKF_LOOKBACK ? epoch - DLKF_LOOKBACK : d->oldest;
   const double *arm = d->lever_arm_b;
   int velocities = 0;
@@ -213,11 +283,13 @@ int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b) {
   const double jolt = 1.41 * noise / span, jerk = JERK_STD * shift, turning = AXLE_STD * rate_b[2];
   const double pull = jolt * jolt + jerk * jerk + ACCEL_BIAS_STD * ACCEL_BIAS_STD; /* (m/s2)2 */
   double *std = start + 15;
-  for (int k = 0; k < 3; k++) std[k] = now.fix->std[k];
+  for (int k = 0; k < 3; k++) std[k] = hypot(dlkf_scattered(now.fix->std[k], now.scatter), now.off);
   for (int k = 0; k < 3; k++) std[3 + k] = now.std[k];
   std[6] = std[7] = sqrt(pull / (STANDARD_GRAVITY * STANDARD_GRAVITY) + SPREAD_STD * SPREAD_STD);
   std[8] = sqrt(SIDESLIP_STD * SIDESLIP_STD + (noise * noise + turning * turning) / (slow * slow));
+  *scatter = now.scatter;
   double sum = 0;
-  for (int k = 0; k < DLKF_START; k++) sum += start[k];
+  for (int k = 0; k < 24; k++) sum += start[k];
+  for (int k = 0; k < 3; k++) start[24 + k] = 0, start[27 + k] = INFINITY;
   return isfinite(sum);
 }

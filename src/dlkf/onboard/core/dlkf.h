@@ -112,7 +112,8 @@ typedef struct {
 #if DLKF_SEARCH_S > 0
 typedef struct {
   double start[DLKF_START], score[DLKF_HEADINGS], own[DLKF_HEADINGS][DLKF_HEADING_OWN_COUNT];
-  double doubt; /* probability of another heading than the likeliest */
+  double doubt;   /* probability of another heading than the likeliest */
+  double scatter; /* Birge ratio of the positions before */
   int32_t epochs, weighed;
 } dlkf_search;
 #endif
@@ -261,7 +262,8 @@ void dlkf_read_fix(const dlkf *d, int64_t boundary, const double *origin_e, cons
 void dlkf_screen_clear(dlkf_screen *s);
 int dlkf_screen_take(dlkf_screen *s, const dlkf_report *x);
 int dlkf_lost(dlkf *d, int64_t number, const double *fix);
-int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *force_b);
+double dlkf_scattered(double std, double scatter);
+int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *force_b, double *scatter);
 #if DLKF_SEARCH_S > 0
 int dlkf_search_begin(dlkf *d, int64_t number);
 int dlkf_search_advance(dlkf *d, const double *imu, int64_t boundary);

@@ -165,7 +165,7 @@ int dlkf_search_begin(dlkf *d, int64_t number) {
   dlkf_search *s = &d->now.search;
   double force_b[3], C_en[9], C_eb[9], rate_b[3], force_n[3];
   standstill rest;
-  if (!dlkf_align(d, number, s->start, force_b)) return 0;
+  if (!dlkf_align(d, number, s->start, force_b, &s->scatter)) return 0;
   const double *C_nb = s->start + 6, *std = s->start + 15, *arm = d->lever_arm_b;
   ned_axes(s->start[0], s->start[1], C_en);
   product3(C_en, C_nb, C_eb);
@@ -200,8 +200,10 @@ int dlkf_search_begin(dlkf *d, int64_t number) {
     apply3(less, swing_b, dv);
     for (int c = 0; c < 3; c++) one[3 + c] += dv[c];
     memcpy(one + 6, level, sizeof level);
+    for (int c = 0; c < 3 && rest.level_std >= 0; c++)
+      one[24 + c] = rest.error[c], one[27 + c] = rest.std > LEAST_BIAS_STD ? rest.std : LEAST_BIAS_STD;
     dlkf_heading_start(one, arm, memory, d->work);
-    for (int c = 0; c < 3; c++) memory[DLKF_HEADING_AT_P + c] += dp[c], memory[DLKF_HEADING_AT_BIAS + 3 + c] += rest.error[c];
+    for (int c = 0; c < 3; c++) memory[DLKF_HEADING_AT_P + c] += dp[c];
     get_own(memory, s->own[h]);
   }
   s->epochs = 0;
@@ -215,6 +217,7 @@ int dlkf_search_advance(dlkf *d, const double *imu, int64_t boundary) {
   double fix[19], score, best = -INFINITY, *out = d->work + DLKF_WORK - DLKF_HEADING, *memory = out - DLKF_HEADING;
   dlkf_heading_start(s->start, d->lever_arm_b, memory, d->work); /* what all have in common */
   dlkf_read_fix(d, boundary, memory + DLKF_HEADING_AT_ORIGIN, memory + DLKF_HEADING_AT_AXES, fix);
+  for (int k = 6; k < 9; k++) fix[k] = dlkf_scattered(fix[k], s->scatter);
   s->weighed = 0;
   for (int k = 12; k < 18; k++) s->weighed |= fix[k] > 0;
   for (int h = 0; h < DLKF_HEADINGS; h++) {
@@ -278,6 +281,11 @@ int dlkf_search_start(dlkf *d, double *start) {
   product3_transposed(C_new, C_eb, start + 6);
   for (int k = 0; k < 8; k++) start[15 + k] = sqrt(P[k * 15 + k]);
   start[15 + 8] = yaw_std;
+  for (int c = 0; c < 3; c++) {
+    const double std = BIAS_OVERBOUND * sqrt(P[(12 + c) * 15 + 12 + c]);
+    start[24 + c] = s->own[best][DLKF_HEADING_OWN_BIAS + 3 + c];
+    start[27 + c] = std > LEAST_BIAS_STD ? std : LEAST_BIAS_STD;
+  }
   return 1;
 }
 #else

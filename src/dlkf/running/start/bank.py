@@ -27,6 +27,7 @@ from torch import Tensor
 from dlkf.data.alignment import ACCEL_BIAS_STD, SIDESLIP_STD, AlignConfig, Start, level_attitude
 from dlkf.data.drive import Drive
 from dlkf.data.segments import whole_drives
+from dlkf.data.velocity_fit import scattered_std
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.gating import Gate
 from dlkf.filters.integration import Covariances, Epoch, Fix, Step, advance
@@ -47,17 +48,18 @@ REVERSE_PRIOR, REVERSE_SPEED = 0.1, 4.0  # probability that a car reverses, and 
 REVERSE_S = (5.0, 1.0)  # mean time of reversing: of a slow car, and at most
 RING_PRIOR = 0.1  # of all headings of the ring together, where a course is coarse
 COARSE = math.radians(10)  # a course with a larger 1σ is
-NIS_CAP = 30.0  # the most that one fix may count against a heading: an outlier is no proof
+NIS_CAP = 9.0  # the most that one fix may count against a heading: an outlier is no proof
 DECIDED = 5.0  # ln of the odds against any other heading
 OTHER = math.radians(25)  # apart, to be another
-READY_STD = math.radians(5)  # of a heading that a filter may begin with before the search is over
+READY_STD = math.radians(6.5)  # of a heading that a filter may begin with before the search is over
+BIAS_OVERBOUND, LEAST_BIAS_STD = 2.0, 1e-3  # on the 1σ of its gyroscope bias [rad/s]
 OVERBOUND = 1.25  # on the posterior's 1σ: the errors of the IMU are a guess
 FIX_FLOOR = (0.3, 0.3, 0.5, 0.05, 0.05, 0.1)  # m, m/s
 # an unknown IMU: the most that MEMS on a car's roof have shown
 ANY_IMU = ImuSpec(
     "any",
-    SensorErrors(noise_density=5e-3, turn_on_bias=0.15, scale_factor=5e-3, misalignment=5e-3),
-    SensorErrors(noise_density=5e-4, turn_on_bias=1e-2, scale_factor=5e-3, misalignment=5e-3),
+    SensorErrors(noise_density=5e-3, turn_on_bias=0.3, scale_factor=5e-3, misalignment=5e-3),
+    SensorErrors(noise_density=5e-4, turn_on_bias=3e-2, scale_factor=5e-3, misalignment=5e-3),
 )
 
 
@@ -75,15 +77,17 @@ class Sideslip(CarConstraints):
 class Case:
     """A drive from the bank's first boundary on, the start there by course, and the mean specific force there [m/s²].
 
-    ``gyro_error`` [rad/s] in b as far as known. ``rest_force``: specific force of the last standstill carried to the
-    boundary's axes, and 1σ [rad] of its direction; None where the car has not been at rest.
+    ``gyro``: bias of the gyroscopes and its 1σ [rad/s], if known. ``rest_force``: specific force of the last standstill
+    carried to the boundary's axes, and 1σ [rad] of its direction; None where the car has not been at rest.
+    ``scatter``: Birge ratio of the positions before.
     """
 
     drive: Drive
     start: Start
     force_b: Float[Tensor, " 3"]
-    gyro_error: Float[Tensor, " 3"]
+    gyro: Float[Tensor, " 6"] | None
     rest_force: tuple[Float[Tensor, " 3"], float] | None = None
+    scatter: float = 1.0
 
 
 class Bank(NamedTuple):
@@ -96,6 +100,7 @@ class Bank(NamedTuple):
     lever_arm_b: Float[Tensor, "BK 3"]
     score: Float[Tensor, "B K"]
     weighed: Bool[Tensor, " B"]  # by a fix of the last epoch
+    scatter: Float[Tensor, "BK 1"]  # Birge ratio of positions
 
 
 class HeadingVerdict(NamedTuple):
@@ -126,7 +131,7 @@ def begin_bank(cases: Sequence[Case]) -> Bank:
     ring = 2 * math.pi / RING * (torch.arange(RING, dtype=torch.float64) + 0.5)
     turns = torch.cat((torch.tensor([0.0, math.pi], dtype=torch.float64), ring))
     turned = rotation_from_rpy(torch.stack((0 * turns, 0 * turns, turns), -1))
-    batch = whole_drives([c.drive.part(0, 1) for c in cases], [c.start for c in cases])
+    batch = whole_drives([c.drive.part(0, 1) for c in cases], [replace(c.start, gyro=c.gyro) for c in cases])
     C, std, score = [], [], []
     for case in cases:
         start = case.start
@@ -163,10 +168,11 @@ def begin_bank(cases: Sequence[Case]) -> Bank:
     v = bank.start.v_n + (less @ torch.linalg.cross(rate_b, bank.lever_arm_b)[..., None])[..., 0]
     begun = replace(bank, start=NavState(p, v, C_nb), start_std=torch.cat(std))
     memory, error = bank_filter().begin(begun)
-    known = torch.stack([torch.nn.functional.pad(c.gyro_error, (3, 0)) for c in cases])
-    error = error._replace(bias=error.bias + known.repeat_interleave(COUNT, 0))
     weighed = torch.ones(len(cases), dtype=torch.bool)
-    return Bank(memory, begun.start, error, bank.frame.prepared(), bank.lever_arm_b, torch.stack(score), weighed)
+    scatter = p.new_tensor([[c.scatter] for c in cases]).repeat_interleave(COUNT, 0)
+    return Bank(
+        memory, begun.start, error, bank.frame.prepared(), bank.lever_arm_b, torch.stack(score), weighed, scatter
+    )
 
 
 class EarthFix(NamedTuple):
@@ -189,6 +195,7 @@ def advance_bank(bank: Bank, imu: Float[Tensor, "B M 6"], fix: EarthFix, dt: flo
     """The bank one epoch on."""
     epoch_s = imu.shape[1] * dt
     r_e, v_e, std, valid, lag = (x.repeat_interleave(COUNT, 0) for x in fix)
+    std = torch.cat((scattered_std(std[:, :3], bank.scatter), std[:, 3:]), -1)
     value = torch.cat((bank.frame.from_ecef(r_e), bank.frame.rotate_from_ecef(v_e)), -1)
     given = Fix(torch.where(valid, value, 0.0), fix_std(std, epoch_s), valid, lag if bool(lag.any()) else None)
     memory, step = advance(
@@ -196,7 +203,7 @@ def advance_bank(bank: Bank, imu: Float[Tensor, "B M 6"], fix: EarthFix, dt: flo
         dt=dt, frame=bank.frame, lever_arm_b=bank.lever_arm_b,
     )  # fmt: skip
     total = bank.score + weigh_step(step, valid, epoch_s).unflatten(0, (-1, COUNT))
-    return Bank(memory, step.posterior, step.error, bank.frame, bank.lever_arm_b, total, fix.valid.any(-1))
+    return bank._replace(memory=memory, state=step.posterior, error=step.error, score=total, weighed=fix.valid.any(-1))
 
 
 def fix_std(std: Float[Tensor, "B 6"], epoch_s: float) -> Float[Tensor, "B 6"]:
@@ -234,6 +241,12 @@ def yaw_std(bank: Bank, seconds: float) -> Float[Tensor, " BK"]:
     J[:, 2] += 1.0
     variance = torch.einsum("bi,bij,bj->b", J, P, J) + ANY_IMU.gyro.noise_psd * seconds
     return torch.hypot(OVERBOUND * variance.clamp_min(0).sqrt(), torch.tensor(SIDESLIP_STD))
+
+
+def gyro_bias(bank: Bank, k: int) -> Float[Tensor, " 6"]:
+    """Gyroscope bias [rad/s] that a heading has found, and its 1σ."""
+    std = bank.memory.P[k].diagonal()[GYRO].sqrt()
+    return torch.cat((bank.error.bias[k, 3:], (BIAS_OVERBOUND * std).clamp_min(LEAST_BIAS_STD)))
 
 
 def log_likelihood(z: Float[Tensor, "B 6"], covariances: Covariances) -> Float[Tensor, " B"]:

@@ -42,12 +42,14 @@ from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.state import NavState
 from dlkf.running.start.bank import (
     COUNT,
+    LEAST_BIAS_STD,
     Bank,
     Case,
     EarthFix,
     HeadingVerdict,
     advance_bank,
     begin_bank,
+    gyro_bias,
     judge_bank,
     yaw_std,
 )
@@ -165,14 +167,28 @@ class FirstMotion:
         less = a.C_eb[row] - self.C_eb
         r_e = a.r_e[row] + less @ self.drive.lever_arm_b
         v_e = a.v_e[row] + less @ _swing(self.drive, row)
-        return _start_at(row, r_e, v_e, self.C_eb, torch.cat((a.std[row, :6], self.std)))
+        start = _start_at(row, r_e, v_e, self.C_eb, torch.cat((a.std[row, :6], self.std)))
+        return replace(start, gyro=self.gyro)
+
+    @property
+    def gyro(self) -> Tensor | None:
+        """Gyroscope bias and its 1σ [rad/s], if known."""
+        if not self.gyros.known:
+            return None
+        return torch.cat((self.gyros.error, self.gyros.error.new_full((3,), max(self.gyros.std, LEAST_BIAS_STD))))
+
+    def with_gyros(self, bias: Float[Tensor, " 6"]) -> FirstMotion:
+        """With gyroscopes of this bias and 1σ [rad/s]."""
+        error, std = bias.split(3)
+        return replace(self, gyros=Gyros(error + self.C_eb[2] * EARTH_RATE, error, float(std.max())))
 
     @property
     def case(self) -> Case:
         """The drive from here on for the bank of headings."""
         ahead = self.drive.part(self.row, self.drive.epochs)
         level = carry_level(self.drive, self.rest, self.row, self.gyros)
-        return Case(ahead, replace(self.start, first=0), self.force_b, self.gyros.error, level)
+        scatter = float(self.aligned.scatter[self.row])
+        return Case(ahead, replace(self.start, first=0), self.force_b, self.gyro, level, scatter)
 
     def best_course(self, search_s: float) -> tuple[Tensor, float]:
         """The course where it is best known within so many seconds, carried back: attitude in n, 1σ of its yaw."""
@@ -244,8 +260,10 @@ def _search(motions: Sequence[FirstMotion], config: AlignConfig, earliest: int) 
             if k in starts or not (ended or verdict.ready(t * epoch_s, config)):
                 continue
             if back is not None:
-                turned = motions[k].towards(*back.at_first(motions[k], k, verdict.best, config))
-                starts[k] = replace(_started(turned, config, earliest), doubt=verdict.doubt)
+                found = gyro_bias(bank, k * COUNT + verdict.best)
+                motion = motions[k].with_gyros(found)
+                turned = motion.towards(*back.at_first(motion, k, verdict.best, config))
+                starts[k] = replace(_started(turned, config, earliest), doubt=verdict.doubt, gyro=found)
             elif ended:
                 starts[k] = InputError(
                     f"drive {drives[k].name}: its heading is ambiguous (the alternatives have probability "
@@ -270,7 +288,7 @@ class BackCarried:
 
     def __init__(self, bank: Bank) -> None:
         self.std = yaw_std(bank, 0.0)
-        self.C_nb, self.bias = bank.state.C_nb, bank.error.bias
+        self.C_nb = bank.state.C_nb
         self.epoch = torch.zeros(len(self.std), dtype=torch.int64)
 
     def keep(self, bank: Bank, epoch: int, epoch_s: float) -> None:
@@ -280,7 +298,6 @@ class BackCarried:
         self.std = torch.where(better, std, self.std)
         self.epoch = torch.where(better, epoch, self.epoch)
         self.C_nb = torch.where(better[:, None, None], bank.state.C_nb, self.C_nb)
-        self.bias = torch.where(better[:, None], bank.error.bias, self.bias)
 
     def at_first(self, motion: FirstMotion, case: int, best: int, config: AlignConfig) -> tuple[Tensor, float]:
         """Attitude at the first boundary in the tangent frame there, and 1σ of its yaw.
@@ -288,11 +305,10 @@ class BackCarried:
         The best course or its reverse where that is the better known of the two and agrees with the bank.
         """
         k = case * COUNT + best
-        C_en = _ned_axes_at(motion.aligned.r_e[motion.row])
-        shown = self.bias[k, 3:] + self.C_nb[k].mT @ C_en.mT @ C_en.new_tensor([0.0, 0.0, EARTH_RATE])
-        gyros = replace(motion.gyros, shown=shown)
         moving = torch.zeros_like(motion.rest)
-        C = carry_attitude_back(motion.drive, self.C_nb[k], motion.row + int(self.epoch[k]), motion.row, gyros, moving)
+        C = carry_attitude_back(
+            motion.drive, self.C_nb[k], motion.row + int(self.epoch[k]), motion.row, motion.gyros, moving
+        )
         std = float(self.std[k])
         course, course_std = motion.best_course(config.search_s)
         for turn in (1.0, -1.0):
@@ -311,7 +327,7 @@ def _start_of(bank: Bank, case: int, verdict: HeadingVerdict, row: int) -> Start
     std = torch.cat((std[:8], std.new_tensor([verdict.std])))
     r_e, C_en = frame.to_ecef(bank.state.p_n[k : k + 1])[0], frame.C_en[0]
     start = _start_at(row, r_e, C_en @ bank.state.v_n[k], C_en @ bank.state.C_nb[k], std)
-    return replace(start, doubt=verdict.doubt)
+    return replace(start, doubt=verdict.doubt, gyro=gyro_bias(bank, k))
 
 
 def _started(motion: FirstMotion, config: AlignConfig, earliest: int) -> Start:
@@ -343,7 +359,8 @@ def _started(motion: FirstMotion, config: AlignConfig, earliest: int) -> Start:
         v_e = C_en @ torch.where(known_v, v_n, 0.0) - C_eb @ _swing(drive, k)
         v_std = torch.where(known_v, torch.hypot(drive.gnss_std[k, 3:], v_n.new_tensor(STALE_ACCELERATION * lag)), 0.5)
     r_e = drive.gnss_r_e[k] - C_eb @ drive.lever_arm_b + float(drive.gnss_lag[k]) * v_e
-    return _start_at(k, r_e, v_e, C_eb, torch.cat((drive.gnss_std[k, :3], v_std, std)))
+    start = _start_at(k, r_e, v_e, C_eb, torch.cat((drive.gnss_std[k, :3], v_std, std)))
+    return replace(start, gyro=motion.gyro)
 
 
 def _start_at(row: int, r_e: Tensor, v_e: Tensor, C_eb: Tensor, std: Tensor) -> Start:

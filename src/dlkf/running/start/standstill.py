@@ -75,13 +75,14 @@ class Gyros:
     shown: Float[Tensor, " 3"]
     error: Float[Tensor, " 3"]
     std: float
+    known: bool = True  # not just assumed
 
 
 def stationary_gyros(drive: Drive, rest: Bool[Tensor, " epochs"], C_eb: Float[Tensor, "3 3"]) -> Gyros:
     """From the mean over the epochs at rest; without any, the Earth's rate at attitude ``C_eb`` and no error."""
     earth = C_eb[2] * EARTH_RATE
     if not bool(rest.any()):
-        return Gyros(earth, torch.zeros_like(earth), RATE_STD)
+        return Gyros(earth, torch.zeros_like(earth), RATE_STD, known=False)
     samples = drive.imu[rest][..., 3:].double().flatten(0, 1)
     noise = float(samples.std(0).max()) / math.sqrt(len(samples))
     shown = samples.mean(0)

@@ -1,0 +1,145 @@
+"""Velocity of the antenna at epoch boundaries: the receiver's, or one fitted to its positions.
+
+A receiver without velocities has them fitted to the positions of :data:`FIT_S`. With north + i east as one complex
+number and α(t) the yaw from the boundary back to t by the gyroscopes, a car that does not slip has the velocity
+v(t) = e^{iα(t)} (z − w τ), τ = t_end − t, so
+
+    p(t) = p_end − z ∫ e^{iα} dτ + w ∫ τ e^{iα} dτ,
+
+which is linear in position, velocity z and acceleration w at the boundary; w has a prior of :data:`ACCELERATION_STD`,
+so that coarse positions are fitted by a constant speed and fine ones by an accelerated motion.
+
+Positions may be wrong by more than they claim. Outliers are left out by data snooping (Baarda 1968): the largest of
+the residuals over their own 1σ, eᵢ / (σᵢ √(1 − hᵢ)) with h the diagonal of the hat matrix, where it is beyond
+``OUTLIER_SIGMAS``, also in units of what the other residuals scatter by. The 1σ of what is found grows with that
+scatter (Birge ratio). The car moves where it has by the fit of a
+second before too.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dlkf.data.drive import Drive
+
+UNKNOWN_VELOCITY_STD, UNKNOWN_SLOPE_STD = 0.2, 0.05  # m/s and slope of the road, where v_d is not measured
+FIT_S = 5.0  # of positions to which a velocity is fitted
+ACCELERATION_STD = 1.0  # m/s², of a car
+GYRO_BIAS_STD = 0.01  # rad/s, that turns the positions of a window about its end
+FIT_STD = 0.1  # m: how far a car keeps from the fit's motion
+OUTLIER_SIGMAS = 5.0  # of a position among those of a fit
+MOST_OUTLIERS = 3  # of a fit
+LEAST_SHARE = 1e-3  # of 1 − h
+OVERDETERMINED = 5  # components more than unknowns, without which no outlier is looked for
+MOTION_SIGMAS = 2.0  # of a velocity: less is no motion
+CONFIRMED_S = 1.0  # that a motion has been one
+READ_S = FIT_S + CONFIRMED_S  # before a boundary
+
+
+class AntennaVelocity(NamedTuple):
+    """Velocity at the N+1 boundaries, in n; an unknown v_d is zero."""
+
+    v_n: Float[Tensor, "rows 3"]  # m/s
+    std: Float[Tensor, "rows 3"]
+    known: Bool[Tensor, " rows"]  # its horizontal part
+    scatter: Float[Tensor, " rows"]  # Birge ratio ≥ 1 of positions
+    off: Float[Tensor, " rows"]  # m, of the position at the boundary from the fit to the others
+
+
+def antenna_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Float[Tensor, "rows 3"]) -> AntennaVelocity:
+    """The receiver's velocity, or if it has none anywhere one fitted to positions; ``down_b``: n's down in b."""
+    known = drive.gnss_valid[:, 3:]
+    if not torch.compiler.is_compiling() and not bool(known[:, :2].any()):
+        return _fit_velocity(drive, C_en, down_b)
+    v_n = torch.where(known, (C_en.mT @ drive.gnss_v_e.unsqueeze(-1)).squeeze(-1), 0.0)
+    std = torch.where(known, drive.gnss_std[:, 3:], _vertical_std(v_n).unsqueeze(-1))
+    zero = torch.zeros_like(drive.gnss_lag)
+    return AntennaVelocity(v_n, std, known[:, :2].all(-1), zero + 1, zero)
+
+
+def scattered_std(std: Float[Tensor, "rows 3"], scatter: Float[Tensor, "rows 1"]) -> Float[Tensor, "rows 3"]:
+    """1σ [m] of positions whose fit has a Birge ratio of ``scatter``; the claimed one where that is 1."""
+    return torch.where(scatter > 1, scatter * torch.hypot(std, std.new_tensor(FIT_STD)), std)
+
+
+def _vertical_std(v_n: Tensor) -> Tensor:
+    """1σ of a vertical velocity that nothing measures."""
+    return UNKNOWN_VELOCITY_STD + UNKNOWN_SLOPE_STD * v_n[:, :2].norm(dim=-1)
+
+
+def _fit_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Float[Tensor, "rows 3"]) -> AntennaVelocity:
+    """Fitted to the positions of ``FIT_S`` before a boundary, three at least; its std grows with what an unknown
+    gyroscope bias turns the fit by."""
+    h, rows = drive.epoch_s, drive.epochs + 1
+    usable = drive.gnss_valid[:, :3].all(-1) & (drive.gnss_lag == 0)
+    count = max(2, min(round(FIT_S / h), rows - 1))
+    before = torch.arange(rows)[:, None] - torch.arange(count + 1)  # boundary, epochs back
+    fixed = usable[before.clamp_min(0)] & (before >= 0) & usable[:, None]
+    turned = (drive.imu[..., 3:].double().mean(1) * down_b[1:]).sum(-1) * h  # yaw of every epoch
+    yaw = torch.nn.functional.pad(turned.cumsum(0), (1, 0))[before.clamp_min(0)]
+    heading = torch.polar(torch.ones_like(yaw), yaw - yaw[:, :1])
+    tau = h * torch.arange(count + 1, dtype=torch.float64)
+    middle, pad = 0.5 * (heading[:, 1:] + heading[:, :-1]) * h, torch.nn.functional.pad
+    way = pad(middle.cumsum(-1), (1, 0))
+    slowed = pad((middle * 0.5 * (tau[1:] + tau[:-1])).cumsum(-1), (1, 0))
+    r_e = drive.gnss_r_e[before.clamp_min(0)] - drive.gnss_r_e.unsqueeze(1)
+    r_n = torch.where(fixed[..., None], (C_en.mT.unsqueeze(1) @ r_e.unsqueeze(-1))[..., 0], 0.0)
+    std = torch.hypot(drive.gnss_std[:, :3].amax(-1), torch.tensor(FIT_STD))[before.clamp_min(0)]
+    weight = torch.where(fixed, std.square().reciprocal(), 0.0)
+
+    # 1e-9: boundaries without fixes, whose matrix would be singular
+    prior = torch.tensor([1e-9, 1e-9, ACCELERATION_STD**-2], dtype=torch.float64).expand(rows, -1)
+    x, y = torch.stack((torch.ones_like(way), -way, slowed), -1), torch.complex(r_n[..., 0], r_n[..., 1])
+    for _ in range(MOST_OUTLIERS):
+        weight = _without_outlier(x, y, weight, prior)
+    fixed = weight > 0
+    fit = _fit(x, y, weight, prior)
+    # − 2: the fewer they are, the less certain is what they scatter by
+    scatter = (fit.squares.sum(-1) / (_redundancy(weight) - 2).clamp_min(1)).clamp_min(1.0).sqrt()
+    velocity, spread = fit.found[:, 1], scatter * fit.covariance[:, 1, 1].real.sqrt()
+    spread = torch.hypot(spread, 0.5 * GYRO_BIAS_STD * (tau * fixed).amax(-1) * velocity.abs())
+    v_n = torch.stack((velocity.real, velocity.imag, torch.zeros_like(spread)), -1)
+    slope, level = _vertical_std(v_n), torch.stack((torch.ones_like(tau), -tau), -1).expand(rows, -1, -1)
+    down = _fit(level, r_n[..., 2], weight, torch.stack((torch.full_like(slope, 1e-9), slope**-2), -1))
+    v_n[:, 2] = down.found[:, 1]
+
+    before = max(1, min(round(CONFIRMED_S / h), count))
+    moving = fixed[:, 0] & (fixed.sum(-1) >= 3) & (velocity.abs() > MOTION_SIGMAS * spread)
+    known = moving & pad(moving[:-before], (before, 0))
+    off = fit.found[:, 0].abs() / (1 - fit.own[:, 0]).clamp_min(LEAST_SHARE)
+    return AntennaVelocity(v_n, torch.stack((spread, spread, down.covariance[:, 1, 1].sqrt()), -1), known, scatter, off)
+
+
+class _Fit(NamedTuple):
+    """Weighted least squares of y (rows, n) by x (rows, n, k)."""
+
+    found: Tensor  # (rows, k)
+    covariance: Tensor  # (rows, k, k)
+    squares: Tensor  # (rows, n) of the residuals over their 1σ
+    own: Tensor  # (rows, n) h, diagonal of the hat matrix
+
+
+def _fit(x: Tensor, y: Tensor, weight: Tensor, prior: Tensor) -> _Fit:
+    weighted = x.mH * weight.unsqueeze(1)
+    covariance = torch.linalg.inv(weighted @ x + torch.diag_embed(prior).to(x.dtype))
+    found = (covariance @ (weighted @ y.unsqueeze(-1)))[..., 0]
+    squares = weight * (y - (x @ found.unsqueeze(-1))[..., 0]).abs().square()
+    return _Fit(found, covariance, squares, weight * ((x @ covariance) * x.conj()).sum(-1).real)
+
+
+def _redundancy(weight: Tensor) -> Tensor:
+    """Components more than unknowns; of the acceleration's two, whose prior counts, one."""
+    return 2 * (weight > 0).sum(-1) - 5
+
+
+def _without_outlier(x: Tensor, y: Tensor, weight: Tensor, prior: Tensor) -> Tensor:
+    """Weights without the worst of the outliers."""
+    fit, redundancy = _fit(x, y, weight, prior), _redundancy(weight)
+    most, worst = (fit.squares / (1 - fit.own).clamp_min(LEAST_SHARE)).max(-1)
+    others = ((fit.squares.sum(-1) - most) / (redundancy - 2).clamp_min(1)).clamp_min(1.0)
+    outlier = (redundancy >= OVERDETERMINED) & (most > OUTLIER_SIGMAS**2 * others)
+    return weight.masked_fill(outlier[:, None] & (torch.arange(weight.shape[1]) == worst[:, None]), 0.0)
