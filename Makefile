@@ -65,7 +65,7 @@ plus: .venv/installed
 	$(PLUS) --oracle --no-auto --out outputs/plus $(ARGS)
 	$(if $(REAL),$(PLUS) --real $(REAL) --sets $(MOTION) --out outputs/plus_real)
 	$(PLUS) --parts $(if $(REAL),--real $(REAL)) --sets $(if $(REAL),$(MOTION)) $(PARTS) --out outputs/plus_parts
-	$(if $(REAL),$(BIN)/python -m pipelines.studies.wrong_fixes --real $(REAL))
+	$(if $(REAL),$(BIN)/python -m pipelines.studies.wrong_sensors --real $(REAL))
 
 # worksteal: a worker keeps the tests of a file together, and takes from the other's end when its own are done
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal

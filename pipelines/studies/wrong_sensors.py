@@ -1,0 +1,258 @@
+"""Filters and starts whose receiver or IMU is wrong: outages and headings of real and simulated drives with errors.
+
+    python -m pipelines.studies.wrong_sensors --real <folder with kitti, rtkx, wid, wid_mru, linkoping>
+
+From the first on, fixes get errors that the reported 1σ does not know: positions off by 3, 1 or 30 m (1σ per axis) in
+some seconds, by one error of 3 m for ten seconds about every 50 s, or by 1 m in all; velocities off by 0.5 m/s in all,
+or those of a second before. Or the IMU has a turn-on bias, of random direction, beside its own.
+
+``outages.md``: the outages of :mod:`pipelines.studies.plus` on real motion and on ``fleet``; the entirely real drives
+start on the wrong data, alone with biases (elsewhere the start is the truth with an error, which shows no bias). RMS /
+geometric mean of the horizontal error at the end over the rows [m] and mean NEES, of constants without a gate and with
+it and of ``plus``, and its ratio to constants with a gate, geometric mean over all outages with a 95 % interval over
+recordings.
+
+``starts.md``: yaw at the start against the reference attitude, or where a drive has none that of ``plus`` on the same
+drive without errors; as a stream starts (``align.search_s=20``) and from rest (``align.from_rest=true`` beside it).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from pipelines.studies.plus import REAL, Row, load, real_cases, recorded, score, simulated_cases
+from pipelines.studies.simulated_laws import INJECTED, simulate_sets
+from torch import Tensor
+
+from dlkf.base.errors import InputError
+from dlkf.base.provenance import describe_provenance
+from dlkf.command.composing import imu_preset, tuning_preset
+from dlkf.data.alignment import SEARCH, Start
+from dlkf.data.drive import Drive
+from dlkf.data.segments import whole_drives
+from dlkf.evaluation.bootstrap import compare
+from dlkf.evaluation.metrics import mean_error
+from dlkf.filters.build import build_causal
+from dlkf.filters.integration import Estimator
+from dlkf.filters.shipped import trained_filter
+from dlkf.navigation.attitude import vector_from_rotation
+from dlkf.navigation.earth import ned_axes
+from dlkf.onboard.compiled_filter import compile_filter
+from dlkf.running.start import align_each
+
+LASTS_S, EVERY_S = 10, (20, 60)  # of a step, and the time between two
+LONGEST_S = 3600
+FLEET, BASE, STATISTICS = "fleet", "mbkf33_car", ("rms", "log")
+STARTS = {"wid": None, "wid_mru": None, "puck": 12}  # datasets, and drives of them; positions alone
+DRAWS, START_S = 5, 150
+FROM_REST = replace(SEARCH, from_rest=True)
+Change = Callable[[Drive, torch.Generator], Drive]
+
+
+def positions(share: float, size: float) -> Change:
+    """Errors of 1σ ``size`` per axis [m] in a share of the seconds."""
+    return lambda drive, g: replace(drive, gnss_r_e=drive.gnss_r_e + _single(share, size, len(drive.gnss_r_e), g))
+
+
+def velocities(size: float) -> Change:
+    """Errors of 1σ ``size`` per axis [m/s] in all."""
+    return lambda drive, g: replace(drive, gnss_v_e=drive.gnss_v_e + _single(1.0, size, len(drive.gnss_v_e), g))
+
+
+def _single(share: float, size: float, count: int, g: torch.Generator) -> Tensor:
+    hit = torch.rand(LONGEST_S, 1, generator=g, dtype=torch.float64) < share
+    return (hit * size * torch.randn(LONGEST_S, 3, generator=g, dtype=torch.float64))[:count]
+
+
+def steps(size: float) -> Change:
+    """One error [m] of 1σ ``size`` per axis for ``LASTS_S`` seconds, again and again."""
+
+    def change(drive: Drive, g: torch.Generator) -> Drive:
+        r_e, k = drive.gnss_r_e.clone(), 0
+        while k < len(r_e):
+            k += int(torch.randint(*EVERY_S, (1,), generator=g))
+            r_e[k : k + LASTS_S] += size * torch.randn(3, generator=g, dtype=torch.float64)
+            k += LASTS_S
+        return replace(drive, gnss_r_e=r_e)
+
+    return change
+
+
+def late(drive: Drive, g: torch.Generator) -> Drive:
+    """Velocities of the second before."""
+    v_e, valid = drive.gnss_v_e.clone(), drive.gnss_valid.clone()
+    v_e[1:] = drive.gnss_v_e[:-1]
+    valid[1:, 3:] &= drive.gnss_valid[:-1, 3:]
+    return replace(drive, gnss_v_e=v_e, gnss_valid=valid)
+
+
+def biases(accel: float, gyro_dps: float) -> Change:
+    """Accelerometers and gyroscopes off by so much RMS over their axes [m/s², °/s]."""
+
+    def change(drive: Drive, g: torch.Generator) -> Drive:
+        u = torch.nn.functional.normalize(torch.randn(2, 3, generator=g, dtype=torch.float64), dim=-1) * 3**0.5
+        return replace(drive, imu=drive.imu + torch.cat((accel * u[0], np.radians(gyro_dps) * u[1])))
+
+    return change
+
+
+ERRORS: Mapping[str, Change] = {
+    "none": lambda drive, g: drive,
+    "positions: 3 m in one of ten": positions(0.1, 3.0),
+    "1 m in one of five": positions(0.2, 1.0),
+    "30 m in one of twenty": positions(0.05, 30.0),
+    "3 m for 10 s": steps(3.0),
+    "1 m in all": positions(1.0, 1.0),
+    "velocities: 0.5 m/s in all": velocities(0.5),
+    "those of a second before": late,
+    "biases: 0.3 m/s², 1 °/s": biases(0.3, 1.0),
+    "0.3 m/s², 2 °/s": biases(0.3, 2.0),
+    "0.5 m/s², 3 °/s": biases(0.5, 3.0),
+    "0.5 m/s², 5 °/s": biases(0.5, 5.0),
+}
+OF_VELOCITIES, OF_IMU = [*ERRORS][6:8], [*ERRORS][8:]
+
+
+def with_errors(drive: Drive, kind: str, draw: int = 0) -> Drive:
+    """A drive with errors of that kind, always the same for a draw."""
+    return ERRORS[kind](drive, torch.Generator().manual_seed(zlib.crc32(drive.name.encode()) + draw))
+
+
+def rivals() -> dict[str, Estimator]:
+    """The constants of ``any_car`` without a gate and with it, those of ``gradient`` with it, and ``plus``."""
+    imu, tuning = imu_preset("automotive_mems"), tuning_preset("any_car")
+    gated = f"{BASE}_gated+vibration_speed"
+    filters = {f"{n} any_car": build_causal(n, imu, "no", tuning=tuning) for n in (f"{BASE}+vibration_speed", gated)}
+    filters[f"{gated} gradient"] = build_causal(gated, imu, "no", tuning=tuning_preset("gradient"))
+    return {**filters, "plus": trained_filter("plus")}
+
+
+def outage_rows(name: str, drives: Sequence[Drive], filters: Mapping[str, Estimator]) -> Iterator[tuple[str, str, Row]]:
+    """Where, kind of error and row of every kind that a dataset can have."""
+    moves = any(bool(d.gnss_valid[:, 3:].any()) for d in drives)
+    for kind in ERRORS:
+        if (kind in OF_VELOCITIES and not moves) or (kind in OF_IMU and name not in REAL):
+            continue
+        wrong = [with_errors(d, kind) for d in drives]
+        for case in real_cases(name, wrong) if name in REAL else simulated_cases(name, wrong):
+            for row in score(case, filters):
+                if kind not in OF_IMU:
+                    yield "simulated" if name == FLEET else "real motion", kind, row
+                if name in REAL and (kind in OF_IMU or kind == "none"):
+                    yield "real drives", kind, row
+
+
+def table(rows: Mapping[tuple[str, str], list[Row]]) -> list[str]:
+    """A line for each kind of error; the ratio of ``plus`` to the constants of ``any_car`` with a gate."""
+    names = list(next(iter(rows.values()))[0].errors)
+    lines = [
+        f"| | errors | rows | {' | '.join(names)} | `plus` : {names[1]} |",
+        f"|:--|:--|{'--:|' * (len(names) + 2)}",
+    ]
+    for (where, kind), some in rows.items():
+        cells = []
+        for name in names:
+            rms, geometric = (
+                np.exp(np.mean([np.log(mean_error(r.errors[name], s)) for r in some])) for s in STATISTICS
+            )
+            cells.append(f"{rms:.1f} / {geometric:.2f} ({np.mean([r.nees[name] for r in some]):.1f})")
+        ours, other = (np.concatenate([r.errors[name] for r in some]) for name in ("plus", names[1]))
+        groups = [f"{recorded(r.name)} {g}" for r in some for g in r.groups]
+        c = compare(ours, other, statistic="geomean", groups=groups)
+        cells.append(f"{c.ratio:.2f} [{c.ratio_low:.2f}, {c.ratio_high:.2f}]")
+        lines.append(f"| {where} | {kind} | {len(some)} | {' | '.join(cells)} |")
+    return lines
+
+
+def attitude(drive: Drive, start: Start) -> Tensor:
+    """C_eb (rows, 3, 3): the reference's, or that of ``plus`` from a start on; NaN where there is none."""
+    if bool(drive.ref_C_eb.isfinite().any()):
+        return drive.ref_C_eb
+    with torch.inference_mode():
+        plus = compile_filter(trained_filter("plus"), drive.rate_hz, drive.epoch_s)
+        C_nb = plus.integrate(whole_drives([drive], [start])).posterior.C_nb[0]
+    C_eb = torch.full((drive.epochs + 1, 3, 3), torch.nan, dtype=torch.float64)
+    C_eb[start.first] = _axes(start) @ start.state.C_nb
+    C_eb[start.first + 1 :] = _axes(start) @ C_nb.double()
+    return C_eb
+
+
+def _axes(start: Start) -> Tensor:
+    return ned_axes(*torch.tensor([start.lat, start.lon], dtype=torch.float64))
+
+
+def start_table(sets: Mapping[str, Sequence[Drive]]) -> list[str]:
+    """A line for each dataset, way to start and kind of error; positions alone."""
+    head = ["data", "start", "errors", "starts", "median [°]", "largest [°]", "over 10°", "RMS / 1σ", "first at [s]"]
+    lines = [f"| {' | '.join(head)} |", f"|:--|:--|:--|{'--:|' * (len(head) - 3)}"]
+    for name, drives in sets.items():
+        found = align_each(drives, FROM_REST)
+        truth = {d.name: attitude(d, s) for d, s in zip(drives, found) if not isinstance(s, InputError)}
+        for way, config in (("stream", SEARCH), ("from rest", FROM_REST)):
+            for kind in ERRORS:
+                if kind not in OF_VELOCITIES:
+                    lines.append(_start_line(f"{name} | {way} | {kind}", drives, kind, config, truth))
+                    print(lines[-1], flush=True)
+    return lines
+
+
+def _start_line(said: str, drives: Sequence[Drive], kind: str, config, truth: Mapping[str, Tensor]) -> str:
+    off, ratio, first = [], [], []
+    for draw in range(1 if kind == "none" else DRAWS):
+        wrong = [with_errors(d, kind, draw) for d in drives if d.name in truth]
+        for d, start in zip(wrong, align_each(wrong, config)):
+            if isinstance(start, InputError) or not bool(truth[d.name][start.first].isfinite().all()):
+                continue
+            C = start.state.C_nb @ (_axes(start).mT @ truth[d.name][start.first]).mT
+            off.append(abs(float(torch.rad2deg(vector_from_rotation(C)[2]))))
+            ratio.append(off[-1] / float(torch.rad2deg(start.std[8])))
+            first.append(start.first * d.epoch_s)
+    over, rms = np.mean(np.array(off) > 10), np.sqrt(np.mean(np.square(ratio)))
+    spread = f"{np.median(off):.1f} | {max(off):.0f} | {100 * over:.0f} %"
+    return f"| {said} | {len(off)} | {spread} | {rms:.1f} | {np.mean(first):.1f} |"
+
+
+def positions_alone(drive: Drive) -> Drive:
+    """The first minutes of a drive, without velocities."""
+    part = drive.part(0, min(drive.epochs, START_S))
+    return replace(part, gnss_valid=part.gnss_valid & (torch.arange(6) < 3))
+
+
+def main() -> None:
+    """Add errors, run, write."""
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    arguments.add_argument("--real", type=Path, required=True, help="folder of real datasets")
+    arguments.add_argument("--data", type=Path, default=Path("data/plus"), help="where test sets lie, or are made")
+    arguments.add_argument("--out", type=Path, default=Path("outputs/wrong_sensors"))
+    options = arguments.parse_args()
+    torch.set_num_threads(1)
+    options.out.mkdir(parents=True, exist_ok=True)
+    simulate_sets(options.data, options.real, (*INJECTED, FLEET, "puck"))
+    folders = {
+        name: (options.real if name in REAL else options.data) / name for name in (*INJECTED, *REAL, FLEET, "puck")
+    }
+    sets = {}
+    for name, most in STARTS.items():
+        drives = [positions_alone(d) for d in load(folders[name])]
+        sets[name] = drives[:: len(drives) // most][:most] if most else drives
+    (options.out / "starts.md").write_text("\n".join(start_table(sets)) + "\n")
+    filters, rows = rivals(), {}
+    for name in (*INJECTED, *REAL, FLEET):
+        for where, kind, row in outage_rows(name, load(folders[name]), filters):
+            rows.setdefault((where, kind), []).append(row)
+        print(name, flush=True)
+    order = ("real motion", "real drives", "simulated")
+    rows = dict(sorted(rows.items(), key=lambda x: (order.index(x[0][0]), [*ERRORS].index(x[0][1]))))
+    (options.out / "outages.md").write_text("\n".join(table(rows)) + "\n")
+    (options.out / "manifest.json").write_text(json.dumps(describe_provenance(), indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
