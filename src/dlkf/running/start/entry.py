@@ -3,11 +3,12 @@
 * **First motion.** The first boundary at which the car moves under GNSS: yaw from the course, roll and pitch by
   levelling (:mod:`dlkf.data.alignment`). With ``search_s`` = 0 that is the start.
 * **Search.** A bank of headings runs from there until no other is left and the heading is good
-  (:mod:`dlkf.running.start.bank`); the filter begins there and then with its state and 1σ. So do a stream and, with
-  ``from_rest`` = false, a batch run, which are the same to rounding. Doubt is carried on as long as it lasts, through
-  an outage too.
+  (:mod:`dlkf.running.start.bank`); the filter begins there and then with its state, 1σ and gyroscope bias. So do a
+  stream and, with ``from_rest`` = false, a batch run, which are the same to rounding. Doubt is carried on as long as it
+  lasts, through an outage too.
 * **From rest.** With the whole drive available the heading that has won is carried back to the first fix: a car at rest
-  does not turn, and its specific force gives roll and pitch (:mod:`dlkf.running.start.standstill`).
+  does not turn, and its specific force gives roll and pitch (:mod:`dlkf.running.start.standstill`). The bias that the
+  bank has found at its end is that of the start.
 """
 
 from __future__ import annotations
@@ -265,9 +266,11 @@ def _search(motions: Sequence[FirstMotion], config: AlignConfig, earliest: int) 
                 turned = motion.towards(*back.at_first(motion, k, verdict.best, config))
                 starts[k] = replace(_started(turned, config, earliest), doubt=verdict.doubt, gyro=found)
             elif ended:
+                why = f"ambiguous (the alternatives have probability {verdict.doubt:.2g})"
+                if verdict.decided:
+                    why = f"known to {math.degrees(verdict.std):.1f}° only"
                 starts[k] = InputError(
-                    f"drive {drives[k].name}: its heading is ambiguous (the alternatives have probability "
-                    f"{verdict.doubt:.2g}); align.from_rest=true takes the most probable"
+                    f"drive {drives[k].name}: its heading is {why}; align.from_rest=true takes the most probable"
                 )
             else:
                 starts[k] = _start_of(bank, k, verdict, motions[k].row + t)
