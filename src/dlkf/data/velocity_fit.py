@@ -12,8 +12,7 @@ so that coarse positions are fitted by a constant speed and fine ones by an acce
 Positions may be wrong by more than they claim. Outliers are left out by data snooping (Baarda 1968): the largest of
 the residuals over their own 1σ, eᵢ / (σᵢ √(1 − hᵢ)) with h the diagonal of the hat matrix, where it is beyond
 ``OUTLIER_SIGMAS``, also in units of what the other residuals scatter by. The 1σ of what is found grows with that
-scatter (Birge ratio). The car moves where it has by the fit of a
-second before too.
+scatter (Birge ratio). The car moves where it does so by the fit of a second before too.
 """
 
 from __future__ import annotations
