@@ -104,12 +104,12 @@ def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     position = drive.gnss_valid[:, :3].all(-1)
     u_b, rate_b, turned = _carried_force(drive, back)
     down_b = -u_b / u_b.norm(dim=-1, keepdim=True).clamp_min(1.0)
-    v_n, v_std, moving, scatter, off = antenna_velocity(drive, C_en, down_b)
+    v_n, v_std, known, moving, scatter, off = antenna_velocity(drive, C_en, down_b)
 
     then = torch.arange(rows) - back
     ok = position & moving & (then >= 0)
     then = then.clamp_min(0)
-    ok &= moving[then]
+    ok &= known[then]
     span = back * drive.epoch_s - drive.gnss_lag + drive.gnss_lag[then]
     ok &= span > 0.5 * drive.epoch_s
     span = span.clamp_min(0.5 * drive.epoch_s)

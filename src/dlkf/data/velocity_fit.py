@@ -12,7 +12,10 @@ so that coarse positions are fitted by a constant speed and fine ones by an acce
 Positions may be wrong by more than they claim. Outliers are left out by data snooping (Baarda 1968): the largest of
 the residuals over their own 1σ, eᵢ / (σᵢ √(1 − hᵢ)) with h the diagonal of the hat matrix, where it is beyond
 ``OUTLIER_SIGMAS``, also in units of what the other residuals scatter by. The 1σ of what is found grows with that
-scatter (Birge ratio). The car moves where it does so by the fit of a second before too.
+scatter (Birge ratio).
+
+The car moves where it does so by the velocity of a second before too. A receiver's velocity is an outlier where it
+differs from that of a second before, turned with the gyroscopes, by more than a car changes it.
 """
 
 from __future__ import annotations
@@ -36,6 +39,7 @@ LEAST_SHARE = 1e-3  # of 1 − h
 OVERDETERMINED = 5  # components more than unknowns, without which no outlier is looked for
 MOTION_SIGMAS = 2.0  # of a velocity: less is no motion
 CONFIRMED_S = 1.0  # that a motion has been one
+CHANGE_SIGMAS, MOST_ACCELERATION = 3.0, 3.0  # σ and m/s² · time that two velocities of a receiver may differ by
 READ_S = FIT_S + CONFIRMED_S  # before a boundary
 
 
@@ -44,7 +48,8 @@ class AntennaVelocity(NamedTuple):
 
     v_n: Float[Tensor, "rows 3"]  # m/s
     std: Float[Tensor, "rows 3"]
-    known: Bool[Tensor, " rows"]  # its horizontal part
+    known: Bool[Tensor, " rows"]  # its horizontal part, and no outlier as far as that shows
+    moving: Bool[Tensor, " rows"]  # not just noise, now and a second before
     scatter: Float[Tensor, " rows"]  # Birge ratio ≥ 1 of positions
     off: Float[Tensor, " rows"]  # m, of the position at the boundary from the fit to the others
 
@@ -56,8 +61,33 @@ def antenna_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Floa
         return _fit_velocity(drive, C_en, down_b)
     v_n = torch.where(known, (C_en.mT @ drive.gnss_v_e.unsqueeze(-1)).squeeze(-1), 0.0)
     std = torch.where(known, drive.gnss_std[:, 3:], _vertical_std(v_n).unsqueeze(-1))
+    before = _confirming(drive)
+    level, noise = torch.complex(v_n[:, 0], v_n[:, 1]), std[:, :2].amax(-1)
+    yaw = _yaw(drive, down_b)
+    turn = torch.polar(torch.ones_like(yaw), yaw)
+    change = (level[before:] / turn[before:] - level[:-before] / turn[:-before]).abs()
+    most = CHANGE_SIGMAS * torch.hypot(noise[before:], noise[:-before]) + MOST_ACCELERATION * drive.epoch_s * before
+    given = known[:, :2].all(-1) & drive.gnss_valid[:, :3].all(-1)
+    agrees = torch.nn.functional.pad(given[:-before] & (change <= most), (before, 0)) & given
     zero = torch.zeros_like(drive.gnss_lag)
-    return AntennaVelocity(v_n, std, known[:, :2].all(-1), zero + 1, zero)
+    return AntennaVelocity(
+        v_n, std, agrees, _moving(agrees & (level.abs() > MOTION_SIGMAS * noise), before), zero + 1, zero
+    )
+
+
+def _confirming(drive: Drive) -> int:
+    """Epochs after which a motion is confirmed."""
+    return max(1, min(round(CONFIRMED_S / drive.epoch_s), drive.epochs))
+
+
+def _moving(moves: Bool[Tensor, " rows"], before: int) -> Bool[Tensor, " rows"]:
+    return moves & torch.nn.functional.pad(moves[:-before], (before, 0))
+
+
+def _yaw(drive: Drive, down_b: Float[Tensor, "rows 3"]) -> Float[Tensor, " rows"]:
+    """Yaw at the boundaries since the first, by the gyroscopes."""
+    turned = (drive.imu[..., 3:].double().mean(1) * down_b[1:]).sum(-1) * drive.epoch_s
+    return torch.nn.functional.pad(turned.cumsum(0), (1, 0))
 
 
 def scattered_std(std: Float[Tensor, "rows 3"], scatter: Float[Tensor, "rows 1"]) -> Float[Tensor, "rows 3"]:
@@ -78,8 +108,7 @@ def _fit_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Float[T
     count = max(2, min(round(FIT_S / h), rows - 1))
     before = torch.arange(rows)[:, None] - torch.arange(count + 1)  # boundary, epochs back
     fixed = usable[before.clamp_min(0)] & (before >= 0) & usable[:, None]
-    turned = (drive.imu[..., 3:].double().mean(1) * down_b[1:]).sum(-1) * h  # yaw of every epoch
-    yaw = torch.nn.functional.pad(turned.cumsum(0), (1, 0))[before.clamp_min(0)]
+    yaw = _yaw(drive, down_b)[before.clamp_min(0)]
     heading = torch.polar(torch.ones_like(yaw), yaw - yaw[:, :1])
     tau = h * torch.arange(count + 1, dtype=torch.float64)
     middle, pad = 0.5 * (heading[:, 1:] + heading[:, :-1]) * h, torch.nn.functional.pad
@@ -106,11 +135,12 @@ def _fit_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Float[T
     down = _fit(level, r_n[..., 2], weight, torch.stack((torch.full_like(slope, 1e-9), slope**-2), -1))
     v_n[:, 2] = down.found[:, 1]
 
-    before = max(1, min(round(CONFIRMED_S / h), count))
-    moving = fixed[:, 0] & (fixed.sum(-1) >= 3) & (velocity.abs() > MOTION_SIGMAS * spread)
-    known = moving & pad(moving[:-before], (before, 0))
+    moves = fixed[:, 0] & (fixed.sum(-1) >= 3) & (velocity.abs() > MOTION_SIGMAS * spread)
+    moving = _moving(moves, _confirming(drive))
     off = fit.found[:, 0].abs() / (1 - fit.own[:, 0]).clamp_min(LEAST_SHARE)
-    return AntennaVelocity(v_n, torch.stack((spread, spread, down.covariance[:, 1, 1].sqrt()), -1), known, scatter, off)
+    return AntennaVelocity(
+        v_n, torch.stack((spread, spread, down.covariance[:, 1, 1].sqrt()), -1), moving, moving, scatter, off
+    )
 
 
 class _Fit(NamedTuple):

@@ -53,7 +53,7 @@ def test_perfect_data_give_the_attitude(drive, arm):
     """Left are the rate's change over the last 0.2 s and a lever arm's pull over 2 s."""
     moved = _with_arm(drive, torch.tensor(arm, dtype=torch.float64))
     attitude, r, v, _ = _errors(moved, align_boundaries(moved))
-    assert len(attitude) == 59  # all but the first two
+    assert len(attitude) == 58  # two seconds of levelling, and one that confirms the velocity before
     assert attitude.abs().max() < (0.01 if arm[0] == 0 else 0.25)
     assert r.norm(dim=-1).max() < 0.01 and v.norm(dim=-1).max() < 0.05
 
@@ -149,6 +149,24 @@ def test_positions_that_jump_again_and_again_are_no_motion(drive, size):
     assert moves <= 4  # of 2280
 
 
+def test_velocities_that_jump_are_no_motion_and_no_course(drive):
+    """One in ten of 5 cm/s off by 5 m/s (1σ per axis): none at rest is a motion, and in motion their course is none."""
+    g, moves, headings = torch.Generator().manual_seed(5), 0, []
+    imu = torch.zeros_like(drive.imu)
+    imu[..., 2] = -9.8
+    std = torch.full_like(drive.gnss_std, 0.05)
+    for _ in range(20):
+        hit = torch.rand(len(drive.gnss_v_e), 1, generator=g) < 0.1
+        wrong = hit * 5.0 * torch.randn(drive.gnss_v_e.shape, generator=g, dtype=torch.float64)
+        still = replace(drive, imu=imu, gnss_v_e=wrong, gnss_r_e=drive.gnss_r_e[:1].expand_as(wrong), gnss_std=std)
+        moves += int(align_boundaries(still).ok.sum())
+        jumpy = replace(drive, gnss_v_e=drive.gnss_v_e + wrong, gnss_std=std)
+        headings.append(_errors(jumpy, align_boundaries(jumpy))[0][:, 2])
+    heading = torch.cat(headings)
+    assert moves <= 1  # of 1180
+    assert len(heading) > 600 and heading.abs().max() < 30 and (heading.abs() > 5).double().mean() < 0.03
+
+
 def test_a_circle_is_a_motion(drive):
     """Half a radian a second at 8 m/s: the fit turns with the gyroscopes."""
     t, rate, speed = torch.arange(len(drive.gnss_r_e), dtype=torch.float64), 0.5, 8.0
@@ -202,7 +220,10 @@ def test_the_start_is_the_first_moment_it_can_be(drive):
     still = drive.gnss_v_e.clone()
     still[:20] = 0.0
     start = align(replace(drive, gnss_v_e=still))
-    assert start.first == 20  # moving now; before counts only the change of velocity
+    assert start.first == 23  # no car changes its velocity so; the next two agree, and then two seconds of levelling
+    still[:20] = drive.gnss_v_e[:20] * torch.arange(20)[:, None].clamp_min(12).sub(12) / 8
+    start = align(replace(drive, gnss_v_e=still))
+    assert start.first == 14  # faster than 2 m/s
     assert align(drive, earliest=33).first == 33
     state = align(drive).state
     assert state.p_n.abs().max() == 0 and state.C_nb.dtype == torch.float64

@@ -24,6 +24,10 @@ static const double *samples(const dlkf *d, int64_t epoch) { return d->closed[ep
 
 static int has_position(const dlkf_fix *fix) { return fix && fix->used[0] && fix->used[1] && fix->used[2]; }
 
+static double noise_of(const boundary *b) { return b->std[0] > b->std[1] ? b->std[0] : b->std[1]; }
+
+static int moves(const boundary *b) { return hypot(b->v_n[0], b->v_n[1]) > MOTION_SIGMAS * noise_of(b); }
+
 /* Mean rate of the last RATE_AVERAGE_S before a boundary, of the first where nothing is before it. */
 static void rate_at(const dlkf *d, int64_t number, int64_t first, double *rate_b) {
   const double *imu = number > first ? samples(d, number - 1) + 6 * (DLKF_SAMPLES - DLKF_TAIL) : samples(d, first);
@@ -186,7 +190,7 @@ static int fit_velocity(const dlkf *d, int64_t number, int64_t first, boundary *
   const double determinant = D[0] * D[2] - D[1] * D[1];
   b->v_n[2] = (D[0] * down[1] - D[1] * down[0]) / determinant;
   b->std[2] = sqrt(D[0] / determinant);
-  return speed > MOTION_SIGMAS * b->std[0];
+  return moves(b);
 }
 
 /* The boundary at which a fix with a position is; 0 where there is none. */
@@ -200,21 +204,41 @@ static int find_boundary(const dlkf *d, int64_t number, boundary *b) {
   return 1;
 }
 
-/* Velocity of the antenna at a boundary with its 1-sigma; where no fix has any, from positions, if by those of a second
- * before the car moved too. */
-static int read_boundary(const dlkf *d, int64_t number, int64_t first, int velocities, boundary *b) {
-  boundary before;
-  if (!find_boundary(d, number, b)) return 0;
-  if (!velocities)
-    return fit_velocity(d, number, first, b) && number - DLKF_CONFIRMED >= first &&
-           find_boundary(d, number - DLKF_CONFIRMED, &before) &&
-           fit_velocity(d, number - DLKF_CONFIRMED, first, &before);
+/* The velocity of the receiver at a boundary with its 1-sigma. */
+static int read_velocity(const dlkf *d, int64_t number, boundary *b) {
+  if (!find_boundary(d, number, b) || !b->fix->used[3] || !b->fix->used[4]) return 0;
   apply3_transposed(b->C_en, b->fix->v_e, b->v_n);
-  for (int k = 0; k < 3; k++)
-    if (!b->fix->used[3 + k]) b->v_n[k] = 0;
+  if (!b->fix->used[5]) b->v_n[2] = 0;
   const double guess = UNKNOWN_VELOCITY_STD + UNKNOWN_SLOPE_STD * hypot(b->v_n[0], b->v_n[1]);
   for (int k = 0; k < 3; k++) b->std[k] = b->fix->used[3 + k] ? b->fix->std[3 + k] : guess;
-  return b->fix->used[3] && b->fix->used[4];
+  return 1;
+}
+
+/* Whether a velocity is one that a car can have had since that of a second before. */
+static int agrees(const dlkf *d, int64_t number, int64_t first, const boundary *b) {
+  boundary before;
+  double yaw = 0;
+  if (number - DLKF_CONFIRMED < first || !read_velocity(d, number - DLKF_CONFIRMED, &before)) return 0;
+  for (int j = 1; j <= DLKF_CONFIRMED; j++) yaw += yaw_turned(d, number - j, first);
+  const double north = b->v_n[0] - (cos(yaw) * before.v_n[0] - sin(yaw) * before.v_n[1]);
+  const double east = b->v_n[1] - (sin(yaw) * before.v_n[0] + cos(yaw) * before.v_n[1]);
+  const double may = CHANGE_SIGMAS * hypot(noise_of(b), noise_of(&before)) + MOST_ACCELERATION * EPOCH_S * DLKF_CONFIRMED;
+  return hypot(north, east) <= may;
+}
+
+/* Velocity of the antenna at a boundary with its 1-sigma; where no fix has any, from positions, if by those of a second
+ * before the car moved too. 0 where it is none, or an outlier. */
+static int read_boundary(const dlkf *d, int64_t number, int64_t first, int velocities, boundary *b) {
+  boundary before;
+  if (velocities) return read_velocity(d, number, b) && agrees(d, number, first, b);
+  return find_boundary(d, number, b) && fit_velocity(d, number, first, b) && number - DLKF_CONFIRMED >= first &&
+         find_boundary(d, number - DLKF_CONFIRMED, &before) && fit_velocity(d, number - DLKF_CONFIRMED, first, &before);
+}
+
+/* Whether the car moves, and did a second before. */
+static int is_moving(const dlkf *d, int64_t number, int64_t first, int velocities, const boundary *now) {
+  boundary before;
+  return !velocities || (moves(now) && read_boundary(d, number - DLKF_CONFIRMED, first, 1, &before) && moves(&before));
 }
 
 /* A start at the beginning of a closed update interval: latitude, longitude [rad], height [m] of the IMU, velocity (3)
@@ -231,11 +255,11 @@ int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b, double 
   }
   boundary now, then;
   if (epoch - BACK < first) return 0;
-  if (!read_boundary(d, epoch, first, velocities, &now)) return 0;
+  if (!read_boundary(d, epoch, first, velocities, &now) || !is_moving(d, epoch, first, velocities, &now)) return 0;
   if (!read_boundary(d, epoch - BACK, first, velocities, &then)) return 0;
   const double lag = now.fix->lag, lag_then = then.fix->lag, span = BACK * EPOCH_S - lag + lag_then;
   const double speed = hypot(now.v_n[0], now.v_n[1]), slow = speed > 0.1 ? speed : 0.1;
-  const double noise = now.std[0] > now.std[1] ? now.std[0] : now.std[1];
+  const double noise = noise_of(&now);
   if (!(span > 0.5 * EPOCH_S) || !(speed > MIN_SPEED) || !(speed > MOTION_SIGMAS * noise)) return 0;
 
   double turned[9], rate_b[3], rate_then[3], swing_b[3], swing_then[3], u[3], w[3];
