@@ -255,6 +255,7 @@ int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b, double 
   }
   boundary now, then;
   if (epoch - BACK < first) return 0;
+  if (velocities && !(read_velocity(d, epoch, &now) && hypot(now.v_n[0], now.v_n[1]) > MIN_SPEED)) return 0; /* quick */
   if (!read_boundary(d, epoch, first, velocities, &now) || !is_moving(d, epoch, first, velocities, &now)) return 0;
   if (!read_boundary(d, epoch - BACK, first, velocities, &then)) return 0;
   const double lag = now.fix->lag, lag_then = then.fix->lag, span = BACK * EPOCH_S - lag + lag_then;
