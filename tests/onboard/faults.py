@@ -234,6 +234,8 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
         _changed("imu", _between(30.0, 31.0), lambda x: _put(x, 2, [0.0, 0.0, 35.0])), ()),
     "velocities 4 m/s off, one in five": (
         _changed("gnss", lambda t: round(t) % 5 == 2, lambda x: _put(x, 4, [x[4][0] + 4.0, *x[4][1:]])), ()),
+    "velocities that scatter by 2 m/s": (_changed("gnss", lambda t: True, lambda x: _put(
+        x, 4, [x[4][0] + 2.0 * sin(round(x[0]) ** 2), x[4][1] + 2.0 * sin(3 + round(x[0]) ** 2), x[4][2]])), ()),
     "gyroscopes 3 °/s off": (
         _changed("imu", lambda t: True, lambda x: _put(x, 2, [w + 0.05 for w in x[2]])), ()),
     "a first fix of the year 2001": (_first(1e9, *AROUND), ()),

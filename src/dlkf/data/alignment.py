@@ -63,8 +63,8 @@ SEARCH = AlignConfig(search_s=20.0)
 class Aligned:
     """State of the IMU at the N+1 boundaries, where ``ok``; float64, garbage elsewhere.
 
-    ``r_e`` [m], ``v_e`` [m/s] in ECEF, ``C_eb``; ``std`` (9) of position, velocity, attitude in local NED. ``scatter``
-    is the Birge ratio of the positions, ≥ 1.
+    ``r_e`` [m], ``v_e`` [m/s] in ECEF, ``C_eb``; ``std`` (9) of position, velocity, attitude in local NED. ``scatter``:
+    how many times more than claimed positions and velocities scatter, ≥ 1.
     """
 
     ok: Bool[Tensor, " rows"]
@@ -72,7 +72,7 @@ class Aligned:
     v_e: Float[Tensor, "rows 3"]
     C_eb: Float[Tensor, "rows 3 3"]
     std: Float[Tensor, "rows 9"]
-    scatter: Float[Tensor, " rows"]
+    scatter: Float[Tensor, "rows 2"]
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     turning = AXLE_STD * rate_b[:, 2]  # m/s across the car
     heading = torch.sqrt(SIDESLIP_STD**2 + (noise**2 + turning**2) / speed.clamp_min(0.1) ** 2)
     attitude_std = torch.stack((tilt, tilt, heading), -1)
-    position_std = torch.hypot(scattered_std(drive.gnss_std[:, :3], scatter[:, None]), off[:, None])
+    position_std = torch.hypot(scattered_std(drive.gnss_std[:, :3], scatter[:, :1]), off[:, None])
     std = torch.cat((position_std, v_std, attitude_std), -1)
     C_eb = C_en @ C_nb
     finite = torch.cat((r_e, now, C_eb.flatten(1), std), -1).isfinite().all(-1)

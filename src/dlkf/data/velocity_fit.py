@@ -15,11 +15,14 @@ the residuals over their own 1σ, eᵢ / (σᵢ √(1 − hᵢ)) with h the diag
 scatter (Birge ratio).
 
 The car moves where it does so by the velocity of a second before too. A receiver's velocity is an outlier where it
-differs from that of a second before, turned with the gyroscopes, by more than a car changes it.
+differs from that of a second before, turned with the gyroscopes, by more than a car changes it. Their second
+differences show how much they scatter: E|vₖ − 2 vₖ₋₁ + vₖ₋₂|² = 12 σ² for white noise of σ per axis, of which the
+median is ln 2 times as large.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -40,7 +43,10 @@ OVERDETERMINED = 5  # components more than unknowns, without which no outlier is
 MOTION_SIGMAS = 2.0  # of a velocity: less is no motion
 CONFIRMED_S = 1.0  # that a motion has been one
 CHANGE_SIGMAS, MOST_ACCELERATION = 3.0, 3.0  # σ and m/s² · time that two velocities of a receiver may differ by
-READ_S = FIT_S + CONFIRMED_S  # before a boundary
+READ_S = FIT_S + 2 * CONFIRMED_S  # before a boundary
+JOLT_STD = 0.3  # m/s, that second differences of a car's velocity are taken for
+LEAST_DIFFERENCES = 3  # that show a scatter
+SECOND_DIFFERENCE = 12 * math.log(2)  # median of its square over the variance of an axis
 
 
 class AntennaVelocity(NamedTuple):
@@ -50,7 +56,7 @@ class AntennaVelocity(NamedTuple):
     std: Float[Tensor, "rows 3"]
     known: Bool[Tensor, " rows"]  # its horizontal part, and no outlier as far as that shows
     moving: Bool[Tensor, " rows"]  # not just noise, now and a second before
-    scatter: Float[Tensor, " rows"]  # Birge ratio ≥ 1 of positions
+    scatter: Float[Tensor, "rows 2"]  # Birge ratio ≥ 1 of positions, and the like of velocities
     off: Float[Tensor, " rows"]  # m, of the position at the boundary from the fit to the others
 
 
@@ -69,10 +75,29 @@ def antenna_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Floa
     most = CHANGE_SIGMAS * torch.hypot(noise[before:], noise[:-before]) + MOST_ACCELERATION * drive.epoch_s * before
     given = known[:, :2].all(-1) & drive.gnss_valid[:, :3].all(-1)
     agrees = torch.nn.functional.pad(given[:-before] & (change <= most), (before, 0)) & given
-    zero = torch.zeros_like(drive.gnss_lag)
-    return AntennaVelocity(
-        v_n, std, agrees, _moving(agrees & (level.abs() > MOTION_SIGMAS * noise), before), zero + 1, zero
-    )
+    scatter = _scatter_of_velocities(drive, level / turn, given, noise)
+    std[:, :2] = scattered_std(std[:, :2], scatter[:, None], JOLT_STD)
+    moving = _moving(agrees & (level.abs() > MOTION_SIGMAS * std[:, :2].amax(-1)), before)
+    both = torch.stack((torch.ones_like(scatter), scatter), -1)
+    return AntennaVelocity(v_n, std, agrees, moving, both, torch.zeros_like(scatter))
+
+
+def _scatter_of_velocities(
+    drive: Drive, level: Tensor, given: Bool[Tensor, " rows"], noise: Float[Tensor, " rows"]
+) -> Float[Tensor, " rows"]:
+    """By the second differences of the ``FIT_S`` before a boundary of velocities ``level`` (rows,) turned back with the
+    gyroscopes; 1 where they are few."""
+    rows, one = len(given), _confirming(drive)
+    if rows <= 2 * one:
+        return torch.ones_like(noise)
+    square = (level[2 * one :] - 2 * level[one:-one] + level[: -2 * one]).abs().square()
+    square = square / (SECOND_DIFFERENCE * (noise[2 * one :].square() + JOLT_STD**2))
+    square = torch.where(given[2 * one :] & given[one:-one] & given[: -2 * one], square, torch.inf)
+    count = max(2, round(FIT_S / drive.epoch_s))
+    values, _ = torch.nn.functional.pad(square, (count + 2 * one, 0), value=torch.inf).unfold(0, count + 1, 1).sort(-1)
+    found = values.isfinite().sum(-1)
+    median = values.gather(-1, ((found - 1).clamp_min(0) // 2)[:, None])[:, 0]
+    return torch.where(found >= LEAST_DIFFERENCES, median, 1.0).clamp_min(1.0).sqrt()
 
 
 def _confirming(drive: Drive) -> int:
@@ -90,9 +115,11 @@ def _yaw(drive: Drive, down_b: Float[Tensor, "rows 3"]) -> Float[Tensor, " rows"
     return torch.nn.functional.pad(turned.cumsum(0), (1, 0))
 
 
-def scattered_std(std: Float[Tensor, "rows 3"], scatter: Float[Tensor, "rows 1"]) -> Float[Tensor, "rows 3"]:
-    """1σ [m] of positions whose fit has a Birge ratio of ``scatter``; the claimed one where that is 1."""
-    return torch.where(scatter > 1, scatter * torch.hypot(std, std.new_tensor(FIT_STD)), std)
+def scattered_std(
+    std: Float[Tensor, "rows k"], scatter: Float[Tensor, "rows 1"], floor: float = FIT_STD
+) -> Float[Tensor, "rows k"]:
+    """1σ of positions [m], with ``JOLT_STD`` of velocities, that scatter so much; the claimed one where that is 1."""
+    return torch.where(scatter > 1, scatter * torch.hypot(std, std.new_tensor(floor)), std)
 
 
 def _vertical_std(v_n: Tensor) -> Tensor:
@@ -137,9 +164,15 @@ def _fit_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Float[T
 
     moves = fixed[:, 0] & (fixed.sum(-1) >= 3) & (velocity.abs() > MOTION_SIGMAS * spread)
     moving = _moving(moves, _confirming(drive))
+    one = torch.ones_like(scatter)
     off = fit.found[:, 0].abs() / (1 - fit.own[:, 0]).clamp_min(LEAST_SHARE)
     return AntennaVelocity(
-        v_n, torch.stack((spread, spread, down.covariance[:, 1, 1].sqrt()), -1), moving, moving, scatter, off
+        v_n,
+        torch.stack((spread, spread, down.covariance[:, 1, 1].sqrt()), -1),
+        moving,
+        moving,
+        torch.stack((scatter, one), -1),
+        off,
     )
 
 

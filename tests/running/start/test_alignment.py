@@ -167,6 +167,23 @@ def test_velocities_that_jump_are_no_motion_and_no_course(drive):
     assert len(heading) > 600 and heading.abs().max() < 30 and (heading.abs() > 5).double().mean() < 0.03
 
 
+def test_velocities_that_scatter_more_than_they_claim_give_a_course_that_knows_it(drive):
+    """Half a metre a second, claimed to be 5 cm/s: second differences show it; one outlier in ten does not look so."""
+    g, ratios, jumps = torch.Generator().manual_seed(6), [], []
+    std = torch.full_like(drive.gnss_std, 0.05)
+    for _ in range(10):
+        noise = 0.5 * torch.randn(drive.gnss_v_e.shape, generator=g, dtype=torch.float64)
+        wrong = replace(drive, gnss_std=std, gnss_v_e=drive.gnss_v_e + noise)
+        aligned = align_boundaries(wrong)
+        attitude, _, _, sigma = _errors(wrong, aligned)
+        ratios.append(torch.deg2rad(attitude[8:, 2]) / sigma[8:, 8])
+        hit = torch.rand(len(noise), 1, generator=g) < 0.1
+        jumps.append(align_boundaries(replace(drive, gnss_std=std, gnss_v_e=drive.gnss_v_e + 10 * hit * noise)))
+    assert 0.5 < torch.cat(ratios).square().mean().sqrt() < 1.3
+    clean = align_boundaries(replace(drive, gnss_std=std))
+    assert clean.scatter.median() == 1 and torch.cat([a.scatter[a.ok, 1] for a in jumps]).median() < 1.5
+
+
 def test_a_circle_is_a_motion(drive):
     """Half a radian a second at 8 m/s: the fit turns with the gyroscopes."""
     t, rate, speed = torch.arange(len(drive.gnss_r_e), dtype=torch.float64), 0.5, 8.0

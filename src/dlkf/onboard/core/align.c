@@ -13,7 +13,7 @@ static const double EPOCH_S = DLKF_SAMPLES / DLKF_RATE_HZ;
 typedef struct {
   const dlkf_fix *fix;
   double C_en[9], lat, height, v_n[3], std[3];
-  double scatter, off; /* of positions: Birge ratio of their fit; m of this one from the fit to the others */
+  double scatter[2], off; /* of positions and velocities over what they claim; m of the position from the fit */
 } boundary;
 
 typedef struct {
@@ -131,8 +131,10 @@ static void solve_fit(const fitted *at, int count, solution *s) {
   }
 }
 
-/* 1-sigma [m] of a position whose fit has a Birge ratio of scatter. */
-double dlkf_scattered(double std, double scatter) { return scatter > 1 ? scatter * hypot(std, FIT_STD) : std; }
+/* 1-sigma of a position or velocity that scatters so many times more than claimed. */
+double dlkf_scattered(double std, const double *scatter, int velocity) {
+  return scatter[velocity] > 1 ? scatter[velocity] * hypot(std, velocity ? JOLT_STD : FIT_STD) : std;
+}
 
 /* Velocity fitted to the positions of FIT_S before a boundary, with the turns of the gyroscopes and without outliers; 0
  * where they are fewer than three, or the boundary's is one. Complex numbers are north + i east; u + i v solves as a real
@@ -175,7 +177,7 @@ static int fit_velocity(const dlkf *d, int64_t number, int64_t first, boundary *
   }
   if (s.fixes < 3 || !(at[0].weight > 0)) return 0;
   const double squares = s.squares / (s.fixes > 4 ? 2 * s.fixes - 7 : 1);
-  b->scatter = squares > 1 ? sqrt(squares) : 1;
+  b->scatter[0] = squares > 1 ? sqrt(squares) : 1;
   b->off = hypot(s.x[0], s.x[3]) / s.others_share;
   for (int n = 0; n < count; n++) {
     const double weight = at[n].weight, tau = at[n].tau;
@@ -185,7 +187,7 @@ static int fit_velocity(const dlkf *d, int64_t number, int64_t first, boundary *
   }
   b->v_n[0] = s.x[1], b->v_n[1] = s.x[4];
   const double speed = hypot(s.x[1], s.x[4]), slope = UNKNOWN_VELOCITY_STD + UNKNOWN_SLOPE_STD * speed;
-  b->std[0] = b->std[1] = hypot(b->scatter * sqrt(s.variance), 0.5 * GYRO_BIAS_STD * span * speed);
+  b->std[0] = b->std[1] = hypot(b->scatter[0] * sqrt(s.variance), 0.5 * GYRO_BIAS_STD * span * speed);
   D[2] += 1 / (slope * slope);
   const double determinant = D[0] * D[2] - D[1] * D[1];
   b->v_n[2] = (D[0] * down[1] - D[1] * down[0]) / determinant;
@@ -197,7 +199,7 @@ static int fit_velocity(const dlkf *d, int64_t number, int64_t first, boundary *
 static int find_boundary(const dlkf *d, int64_t number, boundary *b) {
   double lon;
   b->fix = dlkf_fix_at(d, number);
-  b->scatter = 1, b->off = 0;
+  b->scatter[0] = b->scatter[1] = 1, b->off = 0;
   if (!has_position(b->fix)) return 0;
   geodetic_from_ecef(b->fix->r_e, &b->lat, &lon, &b->height);
   ned_axes(b->lat, lon, b->C_en);
@@ -226,11 +228,45 @@ static int agrees(const dlkf *d, int64_t number, int64_t first, const boundary *
   return hypot(north, east) <= may;
 }
 
+/* How many times more than claimed the velocities of FIT_S before a boundary scatter, by the median of their second
+ * differences; 1 where they are few. */
+static double scatter_of_velocities(const dlkf *d, int64_t number, int64_t first) {
+  enum { SPAN = DLKF_FITTED + 1 + 2 * DLKF_CONFIRMED };
+  double level[SPAN][2], noise[SPAN], squares[DLKF_FITTED + 1], yaw = 0;
+  int given[SPAN], found = 0;
+  for (int j = 0; j < SPAN; j++) { /* turned back with the gyroscopes, but for one turn of all */
+    boundary b;
+    given[j] = number - j >= first && read_velocity(d, number - j, &b);
+    if (j && number - j >= first) yaw += yaw_turned(d, number - j, first);
+    if (!given[j]) continue;
+    level[j][0] = cos(yaw) * b.v_n[0] - sin(yaw) * b.v_n[1];
+    level[j][1] = sin(yaw) * b.v_n[0] + cos(yaw) * b.v_n[1];
+    noise[j] = noise_of(&b);
+  }
+  for (int j = 0; j <= DLKF_FITTED; j++) {
+    const int one = j + DLKF_CONFIRMED, two = one + DLKF_CONFIRMED;
+    if (!given[j] || !given[one] || !given[two]) continue;
+    const double north = level[j][0] - 2 * level[one][0] + level[two][0];
+    const double east = level[j][1] - 2 * level[one][1] + level[two][1];
+    const double square = (north * north + east * east) / (SECOND_DIFFERENCE * (noise[j] * noise[j] + JOLT_STD * JOLT_STD));
+    int at = found++;
+    for (; at && squares[at - 1] > square; at--) squares[at] = squares[at - 1];
+    squares[at] = square;
+  }
+  const double median = found >= LEAST_DIFFERENCES ? squares[(found - 1) / 2] : 1;
+  return median > 1 ? sqrt(median) : 1;
+}
+
 /* Velocity of the antenna at a boundary with its 1-sigma; where no fix has any, from positions, if by those of a second
  * before the car moved too. 0 where it is none, or an outlier. */
 static int read_boundary(const dlkf *d, int64_t number, int64_t first, int velocities, boundary *b) {
   boundary before;
-  if (velocities) return read_velocity(d, number, b) && agrees(d, number, first, b);
+  if (velocities) {
+    if (!read_velocity(d, number, b) || !agrees(d, number, first, b)) return 0;
+    b->scatter[1] = scatter_of_velocities(d, number, first);
+    for (int k = 0; k < 2; k++) b->std[k] = dlkf_scattered(b->std[k], b->scatter, 1);
+    return 1;
+  }
   return find_boundary(d, number, b) && fit_velocity(d, number, first, b) && number - DLKF_CONFIRMED >= first &&
          find_boundary(d, number - DLKF_CONFIRMED, &before) && fit_velocity(d, number - DLKF_CONFIRMED, first, &before);
 }
@@ -244,7 +280,7 @@ static int is_moving(const dlkf *d, int64_t number, int64_t first, int velocitie
 /* A start at the beginning of a closed update interval: latitude, longitude [rad], height [m] of the IMU, velocity (3)
  * and attitude (9) in the tangent frame there, 1-sigma of position, velocity, attitude (9), gyroscope bias (3) and its
  * 1-sigma (3), which is unknown; and the mean specific force of
- * the window before; the Birge ratio of the positions. 0 where there is none. */
+ * the window before; how many times more than claimed positions and velocities (2) scatter. 0 where there is none. */
 int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b, double *scatter) {
   const int64_t first = epoch - d->oldest > DLKF_LOOKBACK ? epoch - DLKF_LOOKBACK : d->oldest;
   const double *arm = d->lever_arm_b;
@@ -308,11 +344,11 @@ int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b, double 
   const double jolt = 1.41 * noise / span, jerk = JERK_STD * shift, turning = AXLE_STD * rate_b[2];
   const double pull = jolt * jolt + jerk * jerk + ACCEL_BIAS_STD * ACCEL_BIAS_STD; /* (m/s2)2 */
   double *std = start + 15;
-  for (int k = 0; k < 3; k++) std[k] = hypot(dlkf_scattered(now.fix->std[k], now.scatter), now.off);
+  for (int k = 0; k < 3; k++) std[k] = hypot(dlkf_scattered(now.fix->std[k], now.scatter, 0), now.off);
   for (int k = 0; k < 3; k++) std[3 + k] = now.std[k];
   std[6] = std[7] = sqrt(pull / (STANDARD_GRAVITY * STANDARD_GRAVITY) + SPREAD_STD * SPREAD_STD);
   std[8] = sqrt(SIDESLIP_STD * SIDESLIP_STD + (noise * noise + turning * turning) / (slow * slow));
-  *scatter = now.scatter;
+  memcpy(scatter, now.scatter, sizeof now.scatter);
   double sum = 0;
   for (int k = 0; k < 24; k++) sum += start[k];
   for (int k = 0; k < 3; k++) start[24 + k] = 0, start[27 + k] = INFINITY;

@@ -115,8 +115,8 @@ static int aligned(dlkf *d, int64_t number) {
   }
   return 0;
 #else
-  double force_b[3], scatter;
-  if (!dlkf_align(d, number, start, force_b, &scatter)) return 0;
+  double force_b[3], scatter[2];
+  if (!dlkf_align(d, number, start, force_b, scatter)) return 0;
   begin_filter(d, start);
   d->doubt = 0;
   return 1;

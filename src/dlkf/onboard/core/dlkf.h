@@ -113,7 +113,7 @@ typedef struct {
 typedef struct {
   double start[DLKF_START], score[DLKF_HEADINGS], own[DLKF_HEADINGS][DLKF_HEADING_OWN_COUNT];
   double doubt;   /* probability of another heading than the likeliest */
-  double scatter; /* Birge ratio of the positions before */
+  double scatter[2]; /* of positions and velocities before, over what they claim */
   int32_t epochs, weighed;
 } dlkf_search;
 #endif
@@ -262,7 +262,7 @@ void dlkf_read_fix(const dlkf *d, int64_t boundary, const double *origin_e, cons
 void dlkf_screen_clear(dlkf_screen *s);
 int dlkf_screen_take(dlkf_screen *s, const dlkf_report *x);
 int dlkf_lost(dlkf *d, int64_t number, const double *fix);
-double dlkf_scattered(double std, double scatter);
+double dlkf_scattered(double std, const double *scatter, int velocity);
 int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *force_b, double *scatter);
 #if DLKF_SEARCH_S > 0
 int dlkf_search_begin(dlkf *d, int64_t number);

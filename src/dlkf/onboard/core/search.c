@@ -165,7 +165,7 @@ int dlkf_search_begin(dlkf *d, int64_t number) {
   dlkf_search *s = &d->now.search;
   double force_b[3], C_en[9], C_eb[9], rate_b[3], force_n[3];
   standstill rest;
-  if (!dlkf_align(d, number, s->start, force_b, &s->scatter)) return 0;
+  if (!dlkf_align(d, number, s->start, force_b, s->scatter)) return 0;
   const double *C_nb = s->start + 6, *std = s->start + 15, *arm = d->lever_arm_b;
   ned_axes(s->start[0], s->start[1], C_en);
   product3(C_en, C_nb, C_eb);
@@ -217,7 +217,7 @@ int dlkf_search_advance(dlkf *d, const double *imu, int64_t boundary) {
   double fix[19], score, best = -INFINITY, *out = d->work + DLKF_WORK - DLKF_HEADING, *memory = out - DLKF_HEADING;
   dlkf_heading_start(s->start, d->lever_arm_b, memory, d->work); /* what all have in common */
   dlkf_read_fix(d, boundary, memory + DLKF_HEADING_AT_ORIGIN, memory + DLKF_HEADING_AT_AXES, fix);
-  for (int k = 6; k < 9; k++) fix[k] = dlkf_scattered(fix[k], s->scatter);
+  for (int k = 6; k < 12; k++) fix[k] = dlkf_scattered(fix[k], s->scatter, k > 8);
   s->weighed = 0;
   for (int k = 12; k < 18; k++) s->weighed |= fix[k] > 0;
   for (int h = 0; h < DLKF_HEADINGS; h++) {

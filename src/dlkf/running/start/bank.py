@@ -27,7 +27,7 @@ from torch import Tensor
 from dlkf.data.alignment import ACCEL_BIAS_STD, SIDESLIP_STD, AlignConfig, Start, level_attitude
 from dlkf.data.drive import Drive
 from dlkf.data.segments import whole_drives
-from dlkf.data.velocity_fit import scattered_std
+from dlkf.data.velocity_fit import JOLT_STD, scattered_std
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.gating import Gate
 from dlkf.filters.integration import Covariances, Epoch, Fix, Step, advance
@@ -79,7 +79,7 @@ class Case:
 
     ``gyro``: bias of the gyroscopes and its 1σ [rad/s], if known. ``rest_force``: specific force of the last standstill
     carried to the boundary's axes, and 1σ [rad] of its direction; None where the car has not been at rest.
-    ``scatter``: Birge ratio of the positions before.
+    ``scatter``: how many times more than claimed positions and velocities scatter.
     """
 
     drive: Drive
@@ -87,7 +87,7 @@ class Case:
     force_b: Float[Tensor, " 3"]
     gyro: Float[Tensor, " 6"] | None
     rest_force: tuple[Float[Tensor, " 3"], float] | None = None
-    scatter: float = 1.0
+    scatter: tuple[float, float] = (1.0, 1.0)
 
 
 class Bank(NamedTuple):
@@ -100,7 +100,7 @@ class Bank(NamedTuple):
     lever_arm_b: Float[Tensor, "BK 3"]
     score: Float[Tensor, "B K"]
     weighed: Bool[Tensor, " B"]  # by a fix of the last epoch
-    scatter: Float[Tensor, "BK 1"]  # Birge ratio of positions
+    scatter: Float[Tensor, "BK 2"]  # of positions and velocities, over what they claim
 
 
 class HeadingVerdict(NamedTuple):
@@ -169,7 +169,7 @@ def begin_bank(cases: Sequence[Case]) -> Bank:
     begun = replace(bank, start=NavState(p, v, C_nb), start_std=torch.cat(std))
     memory, error = bank_filter().begin(begun)
     weighed = torch.ones(len(cases), dtype=torch.bool)
-    scatter = p.new_tensor([[c.scatter] for c in cases]).repeat_interleave(COUNT, 0)
+    scatter = p.new_tensor([c.scatter for c in cases]).repeat_interleave(COUNT, 0)
     return Bank(
         memory, begun.start, error, bank.frame.prepared(), bank.lever_arm_b, torch.stack(score), weighed, scatter
     )
@@ -195,7 +195,8 @@ def advance_bank(bank: Bank, imu: Float[Tensor, "B M 6"], fix: EarthFix, dt: flo
     """The bank one epoch on."""
     epoch_s = imu.shape[1] * dt
     r_e, v_e, std, valid, lag = (x.repeat_interleave(COUNT, 0) for x in fix)
-    std = torch.cat((scattered_std(std[:, :3], bank.scatter), std[:, 3:]), -1)
+    position, velocity = bank.scatter.split(1, -1)
+    std = torch.cat((scattered_std(std[:, :3], position), scattered_std(std[:, 3:], velocity, JOLT_STD)), -1)
     value = torch.cat((bank.frame.from_ecef(r_e), bank.frame.rotate_from_ecef(v_e)), -1)
     given = Fix(torch.where(valid, value, 0.0), fix_std(std, epoch_s), valid, lag if bool(lag.any()) else None)
     memory, step = advance(
