@@ -74,7 +74,7 @@ def antenna_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Floa
     change = (level[before:] / turn[before:] - level[:-before] / turn[:-before]).abs()
     most = CHANGE_SIGMAS * torch.hypot(noise[before:], noise[:-before]) + MOST_ACCELERATION * drive.epoch_s * before
     given = known[:, :2].all(-1) & drive.gnss_valid[:, :3].all(-1)
-    agrees = torch.nn.functional.pad(given[:-before] & (change <= most), (before, 0)) & given
+    agrees = given & torch.nn.functional.pad((change <= most) | ~given[:-before], (before, 0), value=True)
     scatter = _scatter_of_velocities(drive, level / turn, given, noise)
     std[:, :2] = scattered_std(std[:, :2], scatter[:, None], JOLT_STD)
     moving = _moving(agrees & (level.abs() > MOTION_SIGMAS * std[:, :2].amax(-1)), before)

@@ -53,7 +53,7 @@ def test_perfect_data_give_the_attitude(drive, arm):
     """Left are the rate's change over the last 0.2 s and a lever arm's pull over 2 s."""
     moved = _with_arm(drive, torch.tensor(arm, dtype=torch.float64))
     attitude, r, v, _ = _errors(moved, align_boundaries(moved))
-    assert len(attitude) == 58  # two seconds of levelling, and one that confirms the velocity before
+    assert len(attitude) == 59  # all but the first two
     assert attitude.abs().max() < (0.01 if arm[0] == 0 else 0.25)
     assert r.norm(dim=-1).max() < 0.01 and v.norm(dim=-1).max() < 0.05
 

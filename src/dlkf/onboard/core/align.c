@@ -216,11 +216,11 @@ static int read_velocity(const dlkf *d, int64_t number, boundary *b) {
   return 1;
 }
 
-/* Whether a velocity is one that a car can have had since that of a second before. */
+/* Whether a velocity is one that a car can have a second after that before, if there is one. */
 static int agrees(const dlkf *d, int64_t number, int64_t first, const boundary *b) {
   boundary before;
   double yaw = 0;
-  if (number - DLKF_CONFIRMED < first || !read_velocity(d, number - DLKF_CONFIRMED, &before)) return 0;
+  if (number - DLKF_CONFIRMED < first || !read_velocity(d, number - DLKF_CONFIRMED, &before)) return 1;
   for (int j = 1; j <= DLKF_CONFIRMED; j++) yaw += yaw_turned(d, number - j, first);
   const double north = b->v_n[0] - (cos(yaw) * before.v_n[0] - sin(yaw) * before.v_n[1]);
   const double east = b->v_n[1] - (sin(yaw) * before.v_n[0] + cos(yaw) * before.v_n[1]);
@@ -274,7 +274,8 @@ static int read_boundary(const dlkf *d, int64_t number, int64_t first, int veloc
 /* Whether the car moves, and did a second before. */
 static int is_moving(const dlkf *d, int64_t number, int64_t first, int velocities, const boundary *now) {
   boundary before;
-  return !velocities || (moves(now) && read_boundary(d, number - DLKF_CONFIRMED, first, 1, &before) && moves(&before));
+  return !velocities || (moves(now) && number - DLKF_CONFIRMED >= first &&
+                         read_boundary(d, number - DLKF_CONFIRMED, first, 1, &before) && moves(&before));
 }
 
 /* A start at the beginning of a closed update interval: latitude, longitude [rad], height [m] of the IMU, velocity (3)
