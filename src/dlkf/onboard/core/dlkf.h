@@ -112,7 +112,7 @@ typedef struct {
 #if DLKF_SEARCH_S > 0
 typedef struct {
   double start[DLKF_START], score[DLKF_HEADINGS], own[DLKF_HEADINGS][DLKF_HEADING_OWN_COUNT];
-  double doubt;   /* probability of another heading than the likeliest */
+  double doubt;      /* probability of another heading than the likeliest */
   double scatter[2]; /* of positions and velocities before, over what they claim */
   int32_t epochs, weighed;
 } dlkf_search;
