@@ -3,8 +3,9 @@
     python -m pipelines.studies.wrong_sensors --real <folder with kitti, rtkx, wid, wid_mru, linkoping>
 
 From the first on, fixes get errors that the reported 1σ does not know: positions off by 3, 1 or 30 m (1σ per axis) in
-some seconds, by one error of 3 m for ten seconds about every 50 s, or by 1 m in all; velocities off by 5 m/s in some,
-by 0.5 m/s in all, or those of a second before. Or the IMU has a turn-on bias, of random direction, beside its own.
+some seconds, by one error of 3 m for ten seconds about every 50 s, by 0.3, 1 or 3 m in all, or by 1 m that wanders over
+30 s; velocities off by 5 m/s in some, by 0.5 m/s in all, or those of a second before. Or the IMU has a turn-on bias, of
+random direction, beside its own.
 
 ``outages.md``: the outages of :mod:`pipelines.studies.plus` on real motion and on ``fleet``; the entirely real drives
 start on the wrong data, alone with biases (elsewhere the start is the truth with an error, which shows no bias). RMS /
@@ -20,6 +21,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -85,6 +87,19 @@ def steps(size: float) -> Change:
     return change
 
 
+def wandering(size: float, seconds: float) -> Change:
+    """A Gauss-Markov process of 1σ ``size`` per axis [m] and that correlation time in the positions."""
+
+    def change(drive: Drive, g: torch.Generator) -> Drive:
+        kept = math.exp(-drive.epoch_s / seconds)
+        error = size * torch.randn(len(drive.gnss_r_e), 3, generator=g, dtype=torch.float64)
+        for k in range(1, len(error)):
+            error[k] = kept * error[k - 1] + math.sqrt(1 - kept * kept) * error[k]
+        return replace(drive, gnss_r_e=drive.gnss_r_e + error)
+
+    return change
+
+
 def late(drive: Drive, g: torch.Generator) -> Drive:
     """Velocities of the second before."""
     v_e, valid = drive.gnss_v_e.clone(), drive.gnss_valid.clone()
@@ -109,7 +124,10 @@ ERRORS: Mapping[str, Change] = {
     "1 m in one of five": positions(0.2, 1.0),
     "30 m in one of twenty": positions(0.05, 30.0),
     "3 m for 10 s": steps(3.0),
+    "0.3 m in all": positions(1.0, 0.3),
     "1 m in all": positions(1.0, 1.0),
+    "3 m in all": positions(1.0, 3.0),
+    "1 m that wanders over 30 s": wandering(1.0, 30.0),
     "velocities: 5 m/s in one of ten": velocities(0.1, 5.0),
     "0.5 m/s in all": velocities(1.0, 0.5),
     "those of a second before": late,
@@ -118,7 +136,7 @@ ERRORS: Mapping[str, Change] = {
     "0.5 m/s², 3 °/s": biases(0.5, 3.0),
     "0.5 m/s², 5 °/s": biases(0.5, 5.0),
 }
-OF_VELOCITIES, OF_IMU = [*ERRORS][6:9], [*ERRORS][9:]
+OF_VELOCITIES, OF_IMU = [*ERRORS][9:12], [*ERRORS][12:]
 
 
 def with_errors(drive: Drive, kind: str, draw: int = 0) -> Drive:

@@ -12,6 +12,8 @@ from dlkf.filters.integration import integrate
 from dlkf.filters.plus import ANY_MEMS
 from dlkf.filters.shipped import trained_filter
 from dlkf.filters.tuning import Tuning
+from dlkf.filters.virtual_outages import VirtualOutage
+from dlkf.navigation.error_model import source_scale
 from dlkf.navigation.imu_errors import imu_spec
 
 from .scene import scene
@@ -21,20 +23,23 @@ CLAIM = (0.2, 0.1)  # m, m/s
 
 
 class Watched:
-    """A Kalman filter with the noise of its fixes beside it."""
+    """A Kalman filter with virtual outages and the noise of its fixes beside it."""
 
     def __init__(self):
         self.kalman, self.noises = build_filter("mbkf21", imu_spec(ANY_MEMS), tuning=Tuning(position_std=2.0)), []
 
     def begin(self, batch):
         memory, error = self.kalman.begin(batch)
-        return (memory, FixNoise.begin(batch.imu, batch.size[0])), error
+        noise = FixNoise.begin(batch.imu, batch.size[0], batch.start_noise)
+        return (memory, VirtualOutage.begin(memory.P), noise), error
 
     def step(self, memory, epoch):
-        kalman, noise = memory
+        kalman, outage, noise = memory
         kalman, correction = self.kalman.step(kalman, epoch)
-        self.noises.append(noise.after(epoch, correction.covariances))
-        return (kalman, self.noises[-1]), correction
+        same = source_scale(epoch.z.new_ones(len(epoch.z), 4, 3), epoch.start.C_nb)
+        outage = outage.after(epoch, correction.covariances, kalman.windows, same)
+        self.noises.append(noise.after(epoch, correction.covariances, outage))
+        return (kalman, outage, self.noises[-1]), correction
 
 
 def fixes(errors, claim=CLAIM, seed=5):
@@ -60,19 +65,20 @@ def white(sizes, cars=8, epochs=150) -> torch.Tensor:
 
 
 def test_noise_as_claimed_is_found_to_be_that():
-    """But for what clipping at 3σ takes off changes whose 1σ is √2."""
+    """But that w of positions, which wanders by a quarter, is never below 1."""
     w = found(fixes(white((0.2, 0.2, 0.1, 0.1))))
-    assert (w > 0.6).all() and (w < 1.15).all()
+    assert (w > 0.9).all() and (w < 1.4).all()
 
 
 def test_each_part_that_claims_too_little_is_found():
-    """Five times the 1σ of one part each: its factor is 3 to 5.5, after clipping; that of the others near 1."""
+    """Five times the 1σ of one part each; of positions over what a car's motion adds, 1 m of √(0.2² + 0.1²) m."""
     for k in range(4):
         sizes = [0.2, 0.2, 0.1, 0.1]
         sizes[k] *= 5
         factor = found(fixes(white(sizes))).clamp_min(1.0).sqrt()
         others = torch.cat((factor[:k], factor[k + 1 :]))
-        assert 3.0 < float(factor[k]) < 5.5 and others.max() < 1.3
+        known = 5.0 if k > 1 else 1.0 / math.hypot(0.2, 0.1)
+        assert float(factor[k]) == pytest.approx(known, rel=0.15) and others.max() < 1.2
 
 
 def test_a_velocity_that_lags_is_noisy():
@@ -94,12 +100,42 @@ def test_a_filter_that_drifts_makes_no_position_noisy():
     assert found(replace(batch, imu=imu))[:2].max() < 1.5
 
 
+def test_a_filter_that_is_sure_of_a_wrong_velocity_hides_no_noise():
+    """3 m/s off by its own account of 0.1: innovations of one sign, one after the other, beside 1 m of white noise."""
+    batch = fixes(white((1.0, 1.0, 0.1, 0.1)), (0.05, 10.0))
+    start = replace(batch, start=batch.start._replace(v_n=batch.start.v_n + 3.0))
+    assert found(start)[0].sqrt() * math.hypot(0.05, 0.1) == pytest.approx(1.0, rel=0.25)
+
+
+def test_it_begins_with_what_the_start_has_found():
+    """Ten fixes with two metres of noise that claim 0.2: √w is 9; from the claim on it is found to be 4 by then."""
+    batch = fixes(white((2.0, 2.0, 0.1, 0.1), epochs=10))
+    noise = torch.tensor([[2.0 / math.hypot(0.2, 0.1), 1.0]], dtype=torch.float64).expand(8, -1)
+    known, left = (found(replace(batch, start_noise=x)).sqrt() for x in (noise, None))
+    assert known[:2].min() > 5.5 and left[:2].max() < 4.5
+
+
+def test_one_sigma_grows_from_the_claimed_one():
+    """σ² + (w − 1) (σ² + 0.1²) of positions, w σ² of velocities."""
+    seen, batch = [], fixes(white((0.2, 0.2, 0.1, 0.1), epochs=3))
+
+    class Seen(Watched):
+        def step(self, memory, epoch):
+            seen.append(memory[2].inflated(epoch).fix.std[0])
+            return super().step(memory, epoch)
+
+    with torch.inference_mode():
+        integrate(replace(batch, start_noise=torch.full((8, 2), 3.0, dtype=torch.float64)), Seen())
+    std = [math.sqrt(0.2**2 + 8 * (0.2**2 + 0.1**2))] * 3 + [0.3] * 3
+    assert seen[0].tolist() == pytest.approx(std)
+
+
 def test_a_few_outliers_do_not_make_all_fixes_noisy():
     """One position in ten off by 30 m, 150σ."""
     errors = white((0.2, 0.2, 0.1, 0.1))
     hit = torch.rand(errors.shape[:2], generator=torch.Generator().manual_seed(4)) < 0.1
     errors[..., :2] += hit.unsqueeze(-1) * 30.0
-    assert float(found(fixes(errors))[0]) < 4.0
+    assert float(found(fixes(errors))[0]) < 2.5
 
 
 @pytest.mark.parametrize("part, size, most", [(slice(0, 3), 2.0, 8.0), (slice(3, 6), 1.0, 1.0)])

@@ -219,6 +219,7 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "positions alone": (ALONE, ()),
     "positions alone, one in seven 3 m off": (lambda sent: JUMPY(ALONE(sent)), ()),
     "positions alone that scatter by two metres": (lambda sent: SCATTERED(ALONE(sent)), ()),
+    "positions that scatter by two metres": (SCATTERED, ()),
     "coarse positions alone": (COARSE, ()),
     "coarse positions alone, 3 s late": (lambda sent: _late(3.0)(COARSE(sent)), ("replayed",)),
     "fixes of the other hemisphere": (

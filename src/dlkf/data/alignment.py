@@ -79,7 +79,8 @@ class Aligned:
 class Start:
     """Where a filter starts on a drive: epoch ``first``, tangent origin [rad, rad, m], state there (one
     element, float64, in the tangent frame of that origin), its 1σ (9), the probability that the car faces
-    another way, and the gyroscopes' bias with its 1σ (6) [rad/s] where it has been found."""
+    another way, the gyroscopes' bias with its 1σ (6) [rad/s] where it has been found, and how many times more than
+    claimed positions and velocities scatter (2; √w of :mod:`dlkf.filters.fix_noise`), where fixes have shown it."""
 
     first: int
     lat: float
@@ -89,6 +90,7 @@ class Start:
     std: Float[Tensor, " 9"]
     doubt: float = 0.0
     gyro: Float[Tensor, " 6"] | None = None
+    noise: Float[Tensor, " 2"] | None = None
 
 
 def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:

@@ -99,6 +99,7 @@ class Batch:
     t_start: Tensor  # (B,) float64 s, file clock
     aids: Mapping[str, Tensor] = field(default_factory=dict)  # (B, T, 5) of further sensors, see dlkf.data.aids.ROW
     start_gyro: Tensor | None = None  # (B, 6) rad/s: gyroscope bias as far as the start shows it, and its 1σ or inf
+    start_noise: Tensor | None = None  # (B, 2) √w of positions and velocities, see dlkf.filters.fix_noise
 
     @property
     def size(self) -> tuple[int, int, int]:

@@ -196,10 +196,13 @@ def whole_drives(drives: Sequence[Drive], starts: Sequence[Start], *, dtype: tor
     state = NavState(*(torch.stack(x) for x in zip(*(s.state for s in starts))))
     std = torch.stack([s.std for s in starts])
     batch = _assemble(stack, torch.arange(len(stack)), first, stack.epochs - first, frame, state, std, dtype)
-    if all(s.gyro is None for s in starts):
-        return batch
-    gyro = torch.stack([std.new_tensor(UNKNOWN_GYRO) if s.gyro is None else s.gyro for s in starts])
-    return replace(batch, start_gyro=gyro.to(dtype))
+    if any(s.gyro is not None for s in starts):
+        gyro = torch.stack([std.new_tensor(UNKNOWN_GYRO) if s.gyro is None else s.gyro for s in starts])
+        batch = replace(batch, start_gyro=gyro.to(dtype))
+    if any(s.noise is not None for s in starts):
+        noise = torch.stack([std.new_ones(2) if s.noise is None else s.noise for s in starts])
+        batch = replace(batch, start_noise=noise.to(dtype))
+    return batch
 
 
 def _with_alignment(

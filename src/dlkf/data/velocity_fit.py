@@ -17,7 +17,8 @@ scatter (Birge ratio).
 The car moves where it does so by the velocity of a second before too. A receiver's velocity is an outlier where it
 differs from that of a second before, turned with the gyroscopes, by more than a car changes it. Their second
 differences show how much they scatter: E|vₖ − 2 vₖ₋₁ + vₖ₋₂|² = 12 σ² for white noise of σ per axis, of which the
-median is ln 2 times as large.
+median is ln 2 times as large. How much the positions beside them do, differences from the way by the velocities show:
+E|pₖ − pₖ₋₁ − ½ (vₖ + vₖ₋₁) Δt|² = 4 σ² + (σᵥ Δt)².
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ READ_S = FIT_S + 2 * CONFIRMED_S  # before a boundary
 JOLT_STD = 0.3  # m/s, that second differences of a car's velocity are taken for
 LEAST_DIFFERENCES = 3  # that show a scatter
 SECOND_DIFFERENCE = 12 * math.log(2)  # median of its square over the variance of an axis
+DIFFERENCE = 2 * math.log(2)  # the same of a difference of positions, over the variances of an axis at both ends
 
 
 class AntennaVelocity(NamedTuple):
@@ -78,7 +80,7 @@ def antenna_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Floa
     scatter = _scatter_of_velocities(drive, level / turn, given, noise)
     std[:, :2] = scattered_std(std[:, :2], scatter[:, None], JOLT_STD)
     moving = _moving(agrees & (level.abs() > MOTION_SIGMAS * std[:, :2].amax(-1)), before)
-    both = torch.stack((torch.ones_like(scatter), scatter), -1)
+    both = torch.stack((_scatter_of_positions(drive, C_en, v_n, given, noise, scatter), scatter), -1)
     return AntennaVelocity(v_n, std, agrees, moving, both, torch.zeros_like(scatter))
 
 
@@ -87,15 +89,44 @@ def _scatter_of_velocities(
 ) -> Float[Tensor, " rows"]:
     """By the second differences of the ``FIT_S`` before a boundary of velocities ``level`` (rows,) turned back with the
     gyroscopes; 1 where they are few."""
-    rows, one = len(given), _confirming(drive)
-    if rows <= 2 * one:
+    one = _confirming(drive)
+    if len(given) <= 2 * one:
         return torch.ones_like(noise)
     square = (level[2 * one :] - 2 * level[one:-one] + level[: -2 * one]).abs().square()
     square = square / (SECOND_DIFFERENCE * (noise[2 * one :].square() + JOLT_STD**2))
     square = torch.where(given[2 * one :] & given[one:-one] & given[: -2 * one], square, torch.inf)
+    return _root_of_median(_last(square, drive))
+
+
+def _scatter_of_positions(
+    drive: Drive, C_en: Float[Tensor, "rows 3 3"], v_n: Tensor, given: Bool[Tensor, " rows"],
+    noise: Float[Tensor, " rows"], scatter: Float[Tensor, " rows"],
+) -> Float[Tensor, " rows"]:  # fmt: skip
+    """By the differences of the ``FIT_S`` before a boundary of positions from the way by velocities, whose 1σ ``noise``
+    scatters so much there."""
+    h, one = drive.epoch_s, _confirming(drive)
+    if len(given) <= one:
+        return torch.ones_like(noise)
+    step = (C_en[one:].mT @ (drive.gnss_r_e[one:] - drive.gnss_r_e[:-one])[..., None])[:, :2, 0]
+    late = drive.gnss_lag[:, None] * v_n[:, :2]
+    between = v_n[:, :2].unfold(0, one + 1, 1)
+    way = h * (between.sum(-1) - 0.5 * (between[..., 0] + between[..., -1])) + late[:-one] - late[one:]
+    square = torch.where(given.unfold(0, one + 1, 1).all(-1), (step - way).square().sum(-1), torch.inf)
+    of_position = drive.gnss_std[:, :2].amax(-1).square() + FIT_STD**2
+    of_position, of_velocity = (_last(x[one:] + x[:-one], drive) for x in (of_position, noise.square()))
+    scattered = scattered_std(of_velocity.sqrt(), scatter[:, None], 2**0.5 * JOLT_STD).square()
+    return _root_of_median(_last(square, drive) / (DIFFERENCE * (of_position + (0.5 * h * one) ** 2 * scattered)))
+
+
+def _last(x: Float[Tensor, " n"], drive: Drive) -> Float[Tensor, "rows k"]:
+    """Those of the ``FIT_S`` before each boundary; the last n boundaries have one."""
     count = max(2, round(FIT_S / drive.epoch_s))
-    values, _ = torch.nn.functional.pad(square, (count + 2 * one, 0), value=torch.inf).unfold(0, count + 1, 1).sort(-1)
-    found = values.isfinite().sum(-1)
+    return torch.nn.functional.pad(x, (count + drive.epochs + 1 - len(x), 0), value=torch.inf).unfold(0, count + 1, 1)
+
+
+def _root_of_median(square: Float[Tensor, "rows k"]) -> Float[Tensor, " rows"]:
+    """At least 1; 1 where few are finite."""
+    values, found = square.nan_to_num(nan=torch.inf).sort(-1).values, square.isfinite().sum(-1)
     median = values.gather(-1, ((found - 1).clamp_min(0) // 2)[:, None])[:, 0]
     return torch.where(found >= LEAST_DIFFERENCES, median, 1.0).clamp_min(1.0).sqrt()
 
@@ -119,7 +150,7 @@ def scattered_std(
     std: Float[Tensor, "rows k"], scatter: Float[Tensor, "rows 1"], floor: float = FIT_STD
 ) -> Float[Tensor, "rows k"]:
     """1σ of positions [m], with ``JOLT_STD`` of velocities, that scatter so much; the claimed one where that is 1."""
-    return torch.where(scatter > 1, scatter * torch.hypot(std, std.new_tensor(floor)), std)
+    return (std.square() + (scatter.square() - 1) * (std.square() + floor**2)).sqrt()
 
 
 def _vertical_std(v_n: Tensor) -> Tensor:

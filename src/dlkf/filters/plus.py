@@ -149,7 +149,7 @@ class PlusFilter(nn.Module):
         zero = zeros(B)
         outage = VirtualOutage.begin(kalman.P)
         matching, errors = Matching.begin(batch.imu, B), PositionErrors.begin(batch.imu, B, batch.epoch_s)
-        fix_noise = FixNoise.begin(batch.imu, B)
+        fix_noise = FixNoise.begin(batch.imu, B, batch.start_noise)
         return PlusMemory(kalman, self.network.start(B), zero, zero, matching, zero, outage, errors, fix_noise), error
 
     def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
@@ -193,7 +193,8 @@ class PlusFilter(nn.Module):
             if (c := correction.covariances) is not None:
                 scale = source_scale(of_network, epoch.start.C_nb)
                 outage = outage.after(epoch, c, memory.kalman.windows, scale)
-                errors, fix_noise = errors.after(claimed, c), fix_noise.after(claimed, c)
+                offering = c._replace(H=self.kalman.fix.matrix(claimed))  # before the gate
+                errors, fix_noise = errors.after(offered, offering), fix_noise.after(claimed, offering, outage)
                 matching = matching.corrected(c.dx, c.predicted, c.updated, epoch.window.end.C_nb, fixed)
         return memory._replace(
             kalman=kalman, hidden=hidden, matching=matching, outage=outage, errors=errors, fix_noise=fix_noise,

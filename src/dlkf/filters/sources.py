@@ -143,7 +143,7 @@ class GnssFix:
 
     def rows(self, epoch: Epoch, memory: FixMemory, noise: AdaptiveNoise | None) -> Measurement:
         """Six rows, of which those count that the receiver offers."""
-        H, R = mask_rows(self._matrix(epoch), self.variance(epoch, memory, noise), epoch.used)
+        H, R = mask_rows(self.matrix(epoch), self.variance(epoch, memory, noise), epoch.used)
         return Measurement(epoch.z * epoch.used, H, R, epoch.used)
 
     def variance(self, epoch: Epoch, memory: FixMemory, noise: AdaptiveNoise | None) -> Float[Tensor, "B 6"]:
@@ -155,7 +155,8 @@ class GnssFix:
         factors = None if epoch.advice is None else epoch.advice.fix_std
         return R if factors is None else R * factors.square()
 
-    def _matrix(self, epoch: Epoch) -> Float[Tensor, "B 6 n"]:
+    def matrix(self, epoch: Epoch) -> Float[Tensor, "B 6 n"]:
+        """H of all components, used or not."""
         H = measurement_matrix(epoch.at_fix, epoch.rate_at_fix_b, epoch.lever_arm_b, epoch.frame, self.states)
         if epoch.fix.lag is not None:  # δp at the fix = δp at the window's end − lag · δv
             H = H.clone()

@@ -34,8 +34,8 @@ from dlkf.running.reanchoring import FrameChange, frame_at, reanchor
 from dlkf.running.solution import COLUMNS, solution_columns
 
 # latitude, longitude [rad], height [m], velocity (3), attitude (9), 1σ of position, velocity, attitude (9), bias of the
-# gyroscopes and its 1σ (6)
-START = 30
+# gyroscopes and its 1σ (6), how much more than claimed fixes scatter (2)
+START = 32
 FIX_N = 19  # value (6), 1σ (6), used (6), lag; then of each further sensor AID_N
 AID_N = len(AID_ROW)
 OUTPUTS = {
@@ -99,6 +99,7 @@ def carried_state(estimator: Estimator, grid: Grid) -> Layout:
 def begin_filter(
     estimator: Estimator, frame: TangentFrame, state: NavState, std: Float[Tensor, "B 9"],
     lever_arm_b: Float[Tensor, "B 3"], grid: Grid, gyro: Float[Tensor, "B 6"] | None = None,
+    noise: Float[Tensor, "B 2"] | None = None,
 ) -> Carried:  # fmt: skip
     """A filter at a known start."""
     B, z = len(std), std.new_zeros
@@ -108,7 +109,7 @@ def begin_filter(
         imu=z(B, 1, grid.samples, 6), dt=grid.dt, frame=frame, gnss=z(B, 1, 6), gnss_std=z(B, 1, 6),
         gnss_valid=z(B, 1, 6) > 0, gnss_lag=z(B, 1), available=no, lever_arm_b=lever_arm_b, start=state,
         start_std=std, truth=nowhere, truth_valid=no, attitude_valid=no, true_imu_error=z(B, 1, 6), present=~no,
-        drive=("",) * B, t_start=z(B), start_gyro=gyro,
+        drive=("",) * B, t_start=z(B), start_gyro=gyro, start_noise=noise,
     )  # fmt: skip
     memory, bias = estimator.begin(batch)
     return Carried(memory, state, ImuError.of(bias), frame, lever_arm_b)
@@ -156,7 +157,8 @@ class Begin(Function):
         start, arm = start.to(self.grid.dtype), lever_arm_b.to(self.grid.dtype)
         v_n, C_nb, std = start[:, 3:6], start[:, 6:15].unflatten(-1, (3, 3)), start[:, 15:24]
         state = NavState(torch.zeros_like(v_n), v_n, C_nb)
-        return self.layout.pack(begin_filter(self.estimator, frame, state, std, arm, self.grid, start[:, 24:]))
+        gyro, noise = start[:, 24:30], start[:, 30:]
+        return self.layout.pack(begin_filter(self.estimator, frame, state, std, arm, self.grid, gyro, noise))
 
 
 class Turn(Function):

@@ -133,6 +133,7 @@ def _(memory: plus.PlusMemory, change: FrameChange, fresh: plus.PlusMemory) -> p
     of_fix = memory.errors
     of_fix = of_fix._replace(residual=change.vectors(of_fix.residual), change=change.vectors(of_fix.change))
     noise = memory.fix_noise
-    noise = noise._replace(residual=change.vectors(noise.residual), change=change.vectors(noise.change))
+    apart = change.vectors(noise.apart.flatten(1)).unflatten(1, (3, 3))
+    noise = noise._replace(residual=change.vectors(noise.residual), apart=apart)
     kalman = reanchor(memory.kalman, change, fresh.kalman)
     return memory._replace(kalman=kalman, outage=outage, errors=of_fix, fix_noise=noise)

@@ -184,6 +184,25 @@ def test_velocities_that_scatter_more_than_they_claim_give_a_course_that_knows_i
     assert clean.scatter.median() == 1 and torch.cat([a.scatter[a.ok, 1] for a in jumps]).median() < 1.5
 
 
+@pytest.mark.parametrize("velocity_std, least", [(0.05, 0.8), (0.5, 0.4)])
+def test_positions_that_scatter_beside_velocities_are_found(drive, velocity_std, least):
+    """A metre, claimed to be 2 cm, by the way between them; velocities that scatter, or late fixes, do not look so."""
+    g, noisy, clean = torch.Generator().manual_seed(7), [], []
+    std = torch.full_like(drive.gnss_std, 0.02)
+    std[:, 3:] = 0.05
+    lag = 0.3 * torch.rand(len(drive.gnss_lag), generator=g, dtype=torch.float64)
+    for _ in range(10):
+        p, v = torch.randn(2, *drive.gnss_r_e.shape, generator=g, dtype=torch.float64)
+        late = drive.gnss_r_e - lag[:, None] * drive.gnss_v_e
+        fixes = replace(drive, gnss_std=std, gnss_v_e=drive.gnss_v_e + velocity_std * v, gnss_lag=lag, gnss_r_e=late)
+        scatter = align_boundaries(replace(fixes, gnss_r_e=late + p)), align_boundaries(fixes)
+        for found, aligned in zip((noisy, clean), scatter):
+            found.append(aligned.scatter[aligned.ok, 0][8:])
+        ok = scatter[0].ok & (torch.arange(len(lag)) > 8)
+        assert scatter[0].std[ok, :3].median() > 0.8 * least
+    assert least < torch.cat(noisy).median() * 0.102 < 1.2 and torch.cat(clean).median() < 1.3
+
+
 def test_a_circle_is_a_motion(drive):
     """Half a radian a second at 8 m/s: the fit turns with the gyroscopes."""
     t, rate, speed = torch.arange(len(drive.gnss_r_e), dtype=torch.float64), 0.5, 8.0

@@ -133,7 +133,8 @@ static void solve_fit(const fitted *at, int count, solution *s) {
 
 /* 1-sigma of a position or velocity that scatters so many times more than claimed. */
 double dlkf_scattered(double std, const double *scatter, int velocity) {
-  return scatter[velocity] > 1 ? scatter[velocity] * hypot(std, velocity ? JOLT_STD : FIT_STD) : std;
+  const double floor = velocity ? JOLT_STD : FIT_STD, more = scatter[velocity] * scatter[velocity] - 1;
+  return sqrt(std * std + more * (std * std + floor * floor));
 }
 
 /* Velocity fitted to the positions of FIT_S before a boundary, with the turns of the gyroscopes and without outliers; 0
@@ -228,8 +229,20 @@ static int agrees(const dlkf *d, int64_t number, int64_t first, const boundary *
   return hypot(north, east) <= may;
 }
 
-/* How many times more than claimed the velocities of FIT_S before a boundary scatter, by the median of their second
- * differences; 1 where they are few. */
+/* The square among some of a window, in ascending order. */
+static void sort_in(double *squares, int *count, double square) {
+  int at = (*count)++;
+  for (; at && squares[at - 1] > square; at--) squares[at] = squares[at - 1];
+  squares[at] = square;
+}
+
+/* At least 1; 1 where they are few. */
+static double root_of_median(const double *squares, int count) {
+  const double median = count >= LEAST_DIFFERENCES ? squares[(count - 1) / 2] : 1;
+  return median > 1 ? sqrt(median) : 1;
+}
+
+/* How many times more than claimed the velocities of FIT_S before a boundary scatter, by their second differences. */
 static double scatter_of_velocities(const dlkf *d, int64_t number, int64_t first) {
   enum { SPAN = DLKF_FITTED + 1 + 2 * DLKF_CONFIRMED };
   double level[SPAN][2], noise[SPAN], squares[DLKF_FITTED + 1], yaw = 0;
@@ -248,13 +261,40 @@ static double scatter_of_velocities(const dlkf *d, int64_t number, int64_t first
     if (!given[j] || !given[one] || !given[two]) continue;
     const double north = level[j][0] - 2 * level[one][0] + level[two][0];
     const double east = level[j][1] - 2 * level[one][1] + level[two][1];
-    const double square = (north * north + east * east) / (SECOND_DIFFERENCE * (noise[j] * noise[j] + JOLT_STD * JOLT_STD));
-    int at = found++;
-    for (; at && squares[at - 1] > square; at--) squares[at] = squares[at - 1];
-    squares[at] = square;
+    const double variance = noise[j] * noise[j] + JOLT_STD * JOLT_STD;
+    sort_in(squares, &found, (north * north + east * east) / (SECOND_DIFFERENCE * variance));
   }
-  const double median = found >= LEAST_DIFFERENCES ? squares[(found - 1) / 2] : 1;
-  return median > 1 ? sqrt(median) : 1;
+  return root_of_median(squares, found);
+}
+
+/* The same of positions, by their differences from the way by velocities, of which the scatter is known. */
+static double scatter_of_positions(const dlkf *d, int64_t number, int64_t first, const double *scatter) {
+  const double half = 0.5 * EPOCH_S;
+  double squares[DLKF_FITTED + 1], u[3], step[3];
+  int found = 0;
+  for (int j = 0; j <= DLKF_FITTED; j++) {
+    boundary now, then;
+    double way[2] = {0}, variance = 0;
+    int given = number - j - DLKF_CONFIRMED >= first && read_velocity(d, number - j, &now);
+    then = now;
+    for (int k = 1; given && k <= DLKF_CONFIRMED; k++) {
+      const boundary after = then;
+      given = read_velocity(d, number - j - k, &then);
+      for (int c = 0; given && c < 2; c++) way[c] += half * (after.v_n[c] + then.v_n[c]);
+    }
+    if (!given) continue;
+    for (int k = 0; k < 3; k++) u[k] = now.fix->r_e[k] - then.fix->r_e[k];
+    apply3_transposed(now.C_en, u, step);
+    const boundary *both[2] = {&now, &then};
+    for (int k = 0; k < 2; k++) {
+      const double *claimed = both[k]->fix->std, std = claimed[0] > claimed[1] ? claimed[0] : claimed[1];
+      variance += std * std + FIT_STD * FIT_STD;
+      variance += square_of(DLKF_CONFIRMED * half * dlkf_scattered(noise_of(both[k]), scatter, 1));
+      for (int c = 0; c < 2; c++) way[c] += (k ? 1 : -1) * both[k]->fix->lag * both[k]->v_n[c];
+    }
+    sort_in(squares, &found, (square_of(step[0] - way[0]) + square_of(step[1] - way[1])) / (DIFFERENCE * variance));
+  }
+  return root_of_median(squares, found);
 }
 
 /* Velocity of the antenna at a boundary with its 1-sigma; where no fix has any, from positions, if by those of a second
@@ -264,6 +304,7 @@ static int read_boundary(const dlkf *d, int64_t number, int64_t first, int veloc
   if (velocities) {
     if (!read_velocity(d, number, b) || !agrees(d, number, first, b)) return 0;
     b->scatter[1] = scatter_of_velocities(d, number, first);
+    b->scatter[0] = scatter_of_positions(d, number, first, b->scatter);
     for (int k = 0; k < 2; k++) b->std[k] = dlkf_scattered(b->std[k], b->scatter, 1);
     return 1;
   }
@@ -280,8 +321,8 @@ static int is_moving(const dlkf *d, int64_t number, int64_t first, int velocitie
 
 /* A start at the beginning of a closed update interval: latitude, longitude [rad], height [m] of the IMU, velocity (3)
  * and attitude (9) in the tangent frame there, 1-sigma of position, velocity, attitude (9), gyroscope bias (3) and its
- * 1-sigma (3), unknown here; the mean specific force of the window before; and how many times more than claimed positions
- * and velocities (2) scatter. 0 where there is none. */
+ * 1-sigma (3), unknown here, how much more than claimed positions and velocities scatter (2, as dlkf.filters.fix_noise has
+ * it); the mean specific force of the window before; and how many times more than claimed positions and velocities (2) scatter. 0 where there is none. */
 int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b, double *scatter) {
   const int64_t first = epoch - d->oldest > DLKF_LOOKBACK ? epoch - DLKF_LOOKBACK : d->oldest;
   const double *arm = d->lever_arm_b;
@@ -350,6 +391,9 @@ int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b, double 
   std[6] = std[7] = sqrt(pull / (STANDARD_GRAVITY * STANDARD_GRAVITY) + SPREAD_STD * SPREAD_STD);
   std[8] = sqrt(SIDESLIP_STD * SIDESLIP_STD + (noise * noise + turning * turning) / (slow * slow));
   memcpy(scatter, now.scatter, sizeof now.scatter);
+  const double *of_velocity = now.fix->std + 3, claimed = of_velocity[0] > of_velocity[1] ? of_velocity[0] : of_velocity[1];
+  start[30] = now.scatter[0];
+  start[31] = now.scatter[1] > 1 ? dlkf_scattered(claimed, now.scatter, 1) / claimed : 1;
   double sum = 0;
   for (int k = 0; k < 24; k++) sum += start[k];
   for (int k = 0; k < 3; k++) start[24 + k] = 0, start[27 + k] = INFINITY;

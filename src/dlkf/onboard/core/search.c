@@ -286,6 +286,7 @@ int dlkf_search_start(dlkf *d, double *start) {
     start[24 + c] = s->own[best][DLKF_HEADING_OWN_BIAS + 3 + c];
     start[27 + c] = std > LEAST_BIAS_STD ? std : LEAST_BIAS_STD;
   }
+  for (int k = 0; k < 2; k++) start[30 + k] = s->start[30 + k];
   return 1;
 }
 #else

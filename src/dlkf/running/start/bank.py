@@ -101,6 +101,7 @@ class Bank(NamedTuple):
     score: Float[Tensor, "B K"]
     weighed: Bool[Tensor, " B"]  # by a fix of the last epoch
     scatter: Float[Tensor, "BK 2"]  # of positions and velocities, over what they claim
+    noise: Float[Tensor, "B 2"] | None = None  # as the starts have it
 
 
 class HeadingVerdict(NamedTuple):
@@ -171,8 +172,9 @@ def begin_bank(cases: Sequence[Case]) -> Bank:
     weighed = torch.ones(len(cases), dtype=torch.bool)
     scatter = p.new_tensor([c.scatter for c in cases]).repeat_interleave(COUNT, 0)
     return Bank(
-        memory, begun.start, error, bank.frame.prepared(), bank.lever_arm_b, torch.stack(score), weighed, scatter
-    )
+        memory, begun.start, error, bank.frame.prepared(), bank.lever_arm_b, torch.stack(score), weighed, scatter,
+        batch.start_noise,
+    )  # fmt: skip
 
 
 class EarthFix(NamedTuple):

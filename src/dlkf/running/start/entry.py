@@ -36,6 +36,7 @@ from dlkf.data.alignment import (
 )
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.segments import whole_drives
+from dlkf.data.velocity_fit import JOLT_STD, scattered_std
 from dlkf.navigation.attitude import vector_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, STANDARD_GRAVITY, ned_axes
 from dlkf.navigation.error_model import RATE_AVERAGE_S
@@ -169,7 +170,14 @@ class FirstMotion:
         r_e = a.r_e[row] + less @ self.drive.lever_arm_b
         v_e = a.v_e[row] + less @ _swing(self.drive, row)
         start = _start_at(row, r_e, v_e, self.C_eb, torch.cat((a.std[row, :6], self.std)))
-        return replace(start, gyro=self.gyro)
+        return replace(start, gyro=self.gyro, noise=self.noise)
+
+    @property
+    def noise(self) -> Tensor:
+        """How many times more than claimed positions and velocities scatter: √w of :mod:`dlkf.filters.fix_noise`."""
+        position, velocity = self.aligned.scatter[self.row]
+        claimed = self.drive.gnss_std[self.row, 3:5].amax().nan_to_num(nan=1.0)
+        return torch.stack((position, scattered_std(claimed, velocity, JOLT_STD) / claimed))
 
     @property
     def gyro(self) -> Tensor | None:
@@ -330,7 +338,8 @@ def _start_of(bank: Bank, case: int, verdict: HeadingVerdict, row: int) -> Start
     std = torch.cat((std[:8], std.new_tensor([verdict.std])))
     r_e, C_en = frame.to_ecef(bank.state.p_n[k : k + 1])[0], frame.C_en[0]
     start = _start_at(row, r_e, C_en @ bank.state.v_n[k], C_en @ bank.state.C_nb[k], std)
-    return replace(start, doubt=verdict.doubt, gyro=gyro_bias(bank, k))
+    noise = None if bank.noise is None else bank.noise[case]
+    return replace(start, doubt=verdict.doubt, gyro=gyro_bias(bank, k), noise=noise)
 
 
 def _started(motion: FirstMotion, config: AlignConfig, earliest: int) -> Start:
@@ -360,10 +369,12 @@ def _started(motion: FirstMotion, config: AlignConfig, earliest: int) -> Start:
         v_n = C_en.mT @ drive.gnss_v_e[k]
         known_v, lag = drive.gnss_valid[k, 3:], float(drive.gnss_lag[k])
         v_e = C_en @ torch.where(known_v, v_n, 0.0) - C_eb @ _swing(drive, k)
-        v_std = torch.where(known_v, torch.hypot(drive.gnss_std[k, 3:], v_n.new_tensor(STALE_ACCELERATION * lag)), 0.5)
+        v_std = torch.hypot(motion.noise[1] * drive.gnss_std[k, 3:], v_n.new_tensor(STALE_ACCELERATION * lag))
+        v_std = torch.where(known_v, v_std, 0.5)
     r_e = drive.gnss_r_e[k] - C_eb @ drive.lever_arm_b + float(drive.gnss_lag[k]) * v_e
-    start = _start_at(k, r_e, v_e, C_eb, torch.cat((drive.gnss_std[k, :3], v_std, std)))
-    return replace(start, gyro=motion.gyro)
+    p_std = scattered_std(drive.gnss_std[k, :3], motion.noise[0])
+    start = _start_at(k, r_e, v_e, C_eb, torch.cat((p_std, v_std, std)))
+    return replace(start, gyro=motion.gyro, noise=motion.noise)
 
 
 def _start_at(row: int, r_e: Tensor, v_e: Tensor, C_eb: Tensor, std: Tensor) -> Start:
