@@ -138,6 +138,29 @@ def test_a_few_outliers_do_not_make_all_fixes_noisy():
     assert float(found(fixes(errors))[0]) < 2.5
 
 
+@pytest.mark.parametrize("down", [1.0, 0.3])
+def test_plus_takes_no_position_for_good_that_is_noisy(down):
+    """Positions alone of 1 m that claim 2 cm, from the start on: 1σ in use is never near the claimed one."""
+    batch = fixes(white((1.0, down, 0.1, 0.1), epochs=40), (0.02, 0.1))
+    valid = batch.gnss_valid & (torch.arange(6) < 3)
+    std = torch.cat((batch.start_std[:, :3], 0 * batch.start_std[:, 3:6] + 2.0, batch.start_std[:, 6:]), -1)
+    noise = torch.tensor([[10.0, 1.0]], dtype=torch.float64).expand(8, -1)
+    plus, used = trained_filter("plus"), []
+
+    class Seen:
+        begin = plus.begin
+
+        def step(self, memory, epoch):
+            memory, correction = plus.step(memory, epoch)
+            used.append(correction.covariances.R[:, [0, 2]].sqrt())
+            return memory, correction
+
+    with torch.inference_mode():
+        integrate(replace(batch, gnss_valid=valid, start_std=std, start_noise=noise), Seen())
+    least = torch.stack(used).amin(0)
+    assert least[:, 0].median() > 0.5 and least[:, 1].median() > 0.5 * down
+
+
 @pytest.mark.parametrize("part, size, most", [(slice(0, 3), 2.0, 8.0), (slice(3, 6), 1.0, 1.0)])
 def test_plus_does_not_blame_its_imu(part, size, most, monkeypatch):
     """Fixes that claim 5 cm and 5 cm/s, all positions or all velocities noisier by far: after two minutes half a minute

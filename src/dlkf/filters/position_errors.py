@@ -5,9 +5,9 @@ treats that part as white noise averages over it and becomes overconfident in it
 times the error that they have. With the innovation z of a fix and the residual r = z − H dx of the one before after
 its update, the error has changed by
 
-    u = (zₖ − rₖ₋₁) / σ
+    u = (zₖ − rₖ₋₁) / σ,
 
-and by what the filter's velocity is off. White noise of variance w beside a walk of variance q per interval, in units
+σ as it is in force (:mod:`dlkf.filters.fix_noise`), and by what the filter's velocity is off. White noise of variance w beside a walk of variance q per interval, in units
 of σ², has E[uₖ²] = 2 w + q + P_v Δt² / σ² and E[uₖ uₖ₋₁] = −w, so running means of both products give w and q. What is
 not white may wander: q is at most the share 1 − w of what a Gauss-Markov process of 1σ ``WANDER`` σ and correlation
 time ``WANDER_S`` moves by in Δt, 2 Δt / ``WANDER_S`` of its variance.
