@@ -143,7 +143,7 @@ def test_the_first_fix_after_an_outage_may_be_wrong(name):
     assert not found.used[:, 50].any() and found.used[:, 51:].all()
     assert off(batch, found, 50) < off(batch, without, 50) + 1e-6
     apart = (found.posterior.p_n - without.posterior.p_n)[:, 51:].abs().max()
-    assert apart < (0.03 if name == "plus" else 1e-9)  # what plus knows of the receiver's errors has a 1σ more
+    assert apart < (0.05 if name == "plus" else 1e-9)  # what plus knows of the receiver's errors has a 1σ more
 
 
 @pytest.mark.parametrize("name", ["mbkf15", "plus"])

@@ -125,10 +125,10 @@ MEMORY = {  # by the last parts of a field's name
     "errors.walk": "variance by which errors of positions move in an epoch, over that of a position",
     "errors.recent": "half the mean square change of the error over the last fixes, of the variance of positions",
     "errors.fixes": "fixes that both count for",
-    "fix_noise.residual": "the last fix less the filter's estimate after it [m, m/s]",
-    "fix_noise.change": "change of a fix's error since the fix before, over the claimed 1σ",
+    "fix_noise.apart": "positions of the last three fixes less those of the virtual outage [m], the latest first",
+    "fix_noise.residual": "velocity of the last fix less the filter's estimate after it [m/s]",
     "fix_noise.successive": "fixes in successive epochs, by part of a fix",
-    "fix_noise.variance": "variance of the errors of fixes over the claimed one, by part",
+    "fix_noise.variance": "variance of the noise of fixes over the claimed one (of positions with 0.1 m more), by part",
     "fix_noise.fixes": "fixes that it counts for",
     "memory.gyro_noise": "the network's last factors on the gyroscopes' noise; forward, right, down",
 }
