@@ -11,3 +11,4 @@ def claimed(monkeypatch) -> None:
     monkeypatch.setattr(fix_noise.FixNoise, "inflated", lambda self, epoch: epoch)
     monkeypatch.setattr(position_errors, "WANDER", 0.0)
     monkeypatch.setattr(position_errors.PositionErrors, "noise", lambda self, epoch, std: std.new_ones(1, 4))
+    monkeypatch.setattr(position_errors.PositionErrors, "stated", lambda self, std: std)

@@ -111,6 +111,15 @@ def test_noise_that_grows_is_seen_within_ten_fixes():
     assert before < 0.32 and after > 0.48
 
 
+def test_the_stated_1σ_of_a_position_has_what_no_filter_averages():
+    """Of a receiver that claims 2 m and is off by a constant nearly all, of white noise little; other states keep it."""
+    std = torch.full((8, 15), 0.3, dtype=torch.float64)
+    white = STD * torch.randn(8, 300, 3, generator=torch.Generator().manual_seed(3)).double()
+    constant, noisy = (watched(x).errors[-1].stated(std) for x in (torch.ones(8, 300, 3).double(), white))
+    assert torch.allclose(constant[:, :3], constant.new_tensor((0.3**2 + 0.94 * STD**2) ** 0.5), rtol=0.03)
+    assert noisy[:, :2].mean() < 0.9 and (constant[:, 3:] == 0.3).all() and constant.shape == std.shape
+
+
 def test_what_moves_slowly_is_no_noise():
     """A walk of 0.3 m per second: its changes in eight seconds have a variance of 8 · 0.3², half of it is noise."""
     steps = 0.3 * torch.randn(8, 300, 3, generator=torch.Generator().manual_seed(2)).double()

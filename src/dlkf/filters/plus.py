@@ -196,6 +196,8 @@ class PlusFilter(nn.Module):
                 offering = c._replace(H=self.kalman.fix.matrix(claimed))  # before the gate
                 errors, fix_noise = errors.after(offered, offering), fix_noise.after(claimed, offering, outage)
                 matching = matching.corrected(c.dx, c.predicted, c.updated, epoch.window.end.C_nb, fixed)
+        if correction.std is not None:
+            correction = correction._replace(std=errors.stated(correction.std))
         return memory._replace(
             kalman=kalman, hidden=hidden, matching=matching, outage=outage, errors=errors, fix_noise=fix_noise,
             gyro_noise=gyro_noise, fix_speed=torch.where(fixed, forward, memory.fix_speed),

@@ -16,7 +16,8 @@ variance.
 The noise of a fix is half the mean square by which the error changes in ``NOISE_S``, w + q ``NOISE_S`` / (2 Δt), where
 that is less than claimed; what moves slower is a wander of the position. It rises at once where the last changes are
 larger (``QUICK`` fixes). Fixes of a stationary car count only where the carrier phase gives them: other receivers hold
-their position then. Horizontal and vertical errors have means of their own.
+their position then. Horizontal and vertical errors have means of their own. The 1σ of a position has the part that is
+not white beside the filter's own.
 """
 
 from __future__ import annotations
@@ -51,12 +52,13 @@ class PositionErrors(NamedTuple):
     walk: Tensor  # (B, 2) q
     recent: Tensor  # (B, 2) mean of (u² − P_v Δt² / σ²) / 2 over the last fixes
     fixes: Tensor  # (B, 2) what the means count for
+    slow: Tensor  # (B, 3) m², variance of the last fix that is not white
 
     @classmethod
     def begin(cls, like: Tensor, size: int, epoch_s: float) -> PositionErrors:
         """Before the first fix."""
         zero, zeros = like.new_zeros(size, 2), like.new_zeros(size, 3)
-        return cls(zeros, zeros, zero, zero + 1.0, zero, zero, zero + USUAL_FIXES)
+        return cls(zeros, zeros, zero, zero + 1.0, zero, zero, zero + USUAL_FIXES, zeros)
 
     def variance(self, epoch: Epoch) -> Float[Tensor, "B 3"]:
         """By which the errors of the positions have moved in this update interval [m²]; zero without a fix."""
@@ -73,6 +75,11 @@ class PositionErrors(NamedTuple):
         least = LEAST_STD / (position_std * epoch.fix.std[:, [0, 2]]).clamp_min(LEAST_STD)
         factor = torch.maximum(factor, least).clamp_max(1.0)
         return torch.cat((factor, torch.ones_like(factor)), -1)
+
+    def stated(self, std: Float[Tensor, "B k"]) -> Float[Tensor, "B k"]:
+        """1σ of the states with that of the position by which the receiver is off for long: no filter averages it."""
+        position = (std[:, POSITION].square() + self.slow).sqrt()
+        return torch.cat((position, std[:, POSITION.stop :]), -1)
 
     def after(self, epoch: Epoch, c: Covariances) -> PositionErrors:
         """After an update of the filter."""
@@ -94,10 +101,12 @@ class PositionErrors(NamedTuple):
         shown = (epoch.window.end.v_n.norm(dim=-1) > MOVING) | (std[:, :2].amax(-1) < CARRIER_STD)
         counts = (successive >= 3) & shown.unsqueeze(-1)  # two changes of the error
         residual = z - torch.bmm(c.H[:, POSITION], c.dx.unsqueeze(-1)).squeeze(-1)
+        white = torch.where(counts, white, self.white)
+        slow = (1 - white.clamp(0.0, 1.0))[:, PART] * std.square()
         return PositionErrors(
-            torch.where(used, residual, 0.0), change, successive, torch.where(counts, white, self.white),
-            torch.where(counts, walk, self.walk), torch.where(counts, recent, self.recent),
-            torch.where(counts, fixes, self.fixes),
+            torch.where(used, residual, 0.0), change, successive, white, torch.where(counts, walk, self.walk),
+            torch.where(counts, recent, self.recent), torch.where(counts, fixes, self.fixes),
+            torch.where(used, slow, self.slow),
         )  # fmt: skip
 
 

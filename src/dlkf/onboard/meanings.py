@@ -125,6 +125,7 @@ MEMORY = {  # by the last parts of a field's name
     "errors.walk": "variance by which errors of positions move in an epoch, over that of a position",
     "errors.recent": "half the mean square change of the error over the last fixes, of the variance of positions",
     "errors.fixes": "fixes that both count for",
+    "errors.slow": "variance of the last position that is not white [m²]",
     "fix_noise.apart": "positions of the last three fixes less those of the virtual outage [m], the latest first",
     "fix_noise.residual": "velocity of the last fix less the filter's estimate after it [m/s]",
     "fix_noise.successive": "fixes in successive epochs, by part of a fix",
