@@ -112,7 +112,7 @@ def test_noise_that_grows_is_seen_within_ten_fixes():
 
 
 def test_the_stated_1σ_of_a_position_has_what_no_filter_averages():
-    """Of a receiver that claims 2 m and is off by a constant nearly all, of white noise little; other states keep it."""
+    """Claimed are 2 m: of a constant error nearly all, of white noise little; the other states keep theirs."""
     std = torch.full((8, 15), 0.3, dtype=torch.float64)
     white = STD * torch.randn(8, 300, 3, generator=torch.Generator().manual_seed(3)).double()
     constant, noisy = (watched(x).errors[-1].stated(std) for x in (torch.ones(8, 300, 3).double(), white))
