@@ -72,6 +72,25 @@ def test_a_drive_that_begins_at_rest_starts_with_its_first_fix(drives):
         assert 1e-3 < s.std[8] < math.radians(3)
 
 
+def test_a_start_hands_on_what_fixes_scatter(drives):
+    """Positions of a metre that claim 2 cm: at the start's position too; those of 1 cm say nothing."""
+    g = torch.Generator().manual_seed(0)
+    std = [torch.cat((torch.full_like(d.gnss_std[:, :3], 0.02), d.gnss_std[:, 3:]), -1) for d in drives]
+    noise = [torch.randn(d.gnss_r_e.shape, generator=g, dtype=torch.float64) for d in drives]
+    for size in (1.0, 0.01):
+        wrong = [replace(d, gnss_std=s, gnss_r_e=d.ref_r_e + size * n) for d, s, n in zip(drives, std, noise)]
+        wrong = [replace(w, gnss_r_e=w.gnss_r_e + (d.ref_C_eb @ d.lever_arm_b)) for w, d in zip(wrong, drives)]
+        for config in (SEARCH, AROUND):
+            found = align_each(wrong, config)
+            scatter = torch.stack([s.noise for s in found])
+            p_std = torch.stack([s.std[0] for s in found])
+            if size == 1.0:
+                assert 5 < scatter[:, 0].median() < 15 and p_std.median() > 0.3
+            else:
+                assert scatter[:, 0].max() < 1.5
+            assert (scatter[:, 1] >= 1 - 1e-12).all()
+
+
 def test_a_drive_that_begins_in_motion_starts_with_its_first_fix_too(drives):
     parts = [d.part(int(torch.nonzero(d.gnss_v_e.norm(dim=-1) > 5)[0]), d.epochs) for d in drives]
     around = align_each(parts, AROUND)

@@ -321,8 +321,9 @@ static int is_moving(const dlkf *d, int64_t number, int64_t first, int velocitie
 
 /* A start at the beginning of a closed update interval: latitude, longitude [rad], height [m] of the IMU, velocity (3)
  * and attitude (9) in the tangent frame there, 1-sigma of position, velocity, attitude (9), gyroscope bias (3) and its
- * 1-sigma (3), unknown here, how much more than claimed positions and velocities scatter (2, as dlkf.filters.fix_noise has
- * it); the mean specific force of the window before; and how many times more than claimed positions and velocities (2) scatter. 0 where there is none. */
+ * 1-sigma (3), unknown here, and how many times more than claimed positions and velocities scatter (2), as
+ * dlkf.filters.fix_noise has it; the mean specific force of the window before; and that scatter as dlkf_scattered takes
+ * it (2). 0 where there is none. */
 int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b, double *scatter) {
   const int64_t first = epoch - d->oldest > DLKF_LOOKBACK ? epoch - DLKF_LOOKBACK : d->oldest;
   const double *arm = d->lever_arm_b;
