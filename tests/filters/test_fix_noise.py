@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from dlkf.filters.build import build_filter
-from dlkf.filters.fix_noise import FixNoise
+from dlkf.filters.fix_noise import LIMITS, QUANTILE, FixNoise
+from dlkf.filters.gating import chi2_quantile
 from dlkf.filters.integration import integrate
 from dlkf.filters.plus import ANY_MEMS
 from dlkf.filters.shipped import trained_filter
@@ -113,6 +114,11 @@ def test_it_begins_with_what_the_start_has_found():
     noise = torch.tensor([[2.0 / math.hypot(0.2, 0.1), 1.0]], dtype=torch.float64).expand(8, -1)
     known, left = (found(replace(batch, start_noise=x)).sqrt() for x in (noise, None))
     assert known[:2].min() > 5.5 and left[:2].max() < 4.5
+
+
+def test_the_limits_are_quantiles():
+    """Of χ² of two degrees of freedom, over two, and of one."""
+    assert [chi2_quantile(QUANTILE, k) / k for k in (2, 1)] == pytest.approx(LIMITS, abs=1e-4)
 
 
 def test_one_sigma_grows_from_the_claimed_one():

@@ -24,6 +24,7 @@ E|pₖ − pₖ₋₁ − ½ (vₖ + vₖ₋₁) Δt|² = 4 σ² + (σᵥ Δt)²
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -147,10 +148,10 @@ def _yaw(drive: Drive, down_b: Float[Tensor, "rows 3"]) -> Float[Tensor, " rows"
 
 
 def scattered_std(
-    std: Float[Tensor, "rows k"], scatter: Float[Tensor, "rows 1"], floor: float = FIT_STD
-) -> Float[Tensor, "rows k"]:
+    std: Float[Tensor, "*rows k"], scatter: Float[Tensor, "*rows #k"], floor: float | Sequence[float] = FIT_STD
+) -> Float[Tensor, "*rows k"]:
     """1σ of positions [m], with ``JOLT_STD`` of velocities, that scatter so much; the claimed one where that is 1."""
-    return (std.square() + (scatter.square() - 1) * (std.square() + floor**2)).sqrt()
+    return (std.square() + (scatter.square() - 1) * (std.square() + std.new_tensor(floor).square())).sqrt()
 
 
 def _vertical_std(v_n: Tensor) -> Tensor:

@@ -24,6 +24,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dlkf.data.velocity_fit import FIT_STD, scattered_std
 from dlkf.filters.gating import OF_PART, PARTS, by_part
 from dlkf.filters.integration import Covariances, Epoch
 from dlkf.filters.virtual_outages import VirtualOutage
@@ -34,7 +35,7 @@ MEMORY = 300.0  # fixes
 STEP, QUANTILE = 20.0, 0.3  # of ln w, over the number of fixes
 LIMITS = (0.3567, 0.1485)  # the quantile of χ² of two components, over two, and of one
 LARGEST = 3.0  # σ: the most that a change of a velocity's error counts
-FLOOR = (0.1, 0.1, 0.1, 0.0, 0.0, 0.0)  # m
+FLOOR = 3 * (FIT_STD,) + 3 * (0.0,)  # m
 DIFFERENCES = (20.0, 20.0, 2.0, 2.0)  # sums of the squared coefficients of Δ³ and Δ
 SUCCESSIVE = (4.0, 4.0, 3.0, 3.0)  # fixes from which on one counts: Δ³ takes four, and a start's velocity is off
 
@@ -57,9 +58,8 @@ class FixNoise(NamedTuple):
 
     def inflated(self, epoch: Epoch) -> Epoch:
         """The epoch with the 1σ of its fix as large as they have scattered."""
-        claimed = epoch.fix.std.square()
-        more = (self.variance - 1).clamp_min(0.0)[:, OF_PART] * (claimed + claimed.new_tensor(FLOOR).square())
-        return epoch._replace(fix=epoch.fix._replace(std=(claimed + more).sqrt()))
+        scatter = self.variance.clamp_min(1.0).sqrt()[:, OF_PART]
+        return epoch._replace(fix=epoch.fix._replace(std=scattered_std(epoch.fix.std, scatter, FLOOR)))
 
     def after(self, claimed: Epoch, c: Covariances, outage: VirtualOutage) -> FixNoise:
         """After an update of the filter and of the virtual outage; ``claimed`` is the epoch with the fix's own 1σ, and
