@@ -5,7 +5,7 @@
 From the first on, fixes get errors that the reported 1σ does not know: positions off by 3, 1 or 30 m (1σ per axis) in
 some seconds, by one error of 3 m for ten seconds about every 50 s, by 0.3, 1 or 3 m in all, or by 1 m that wanders over
 30 s; velocities off by 5 m/s in some, by 0.5 m/s in all, or those of a second before. Or the IMU has a turn-on bias, of
-random direction, beside its own.
+random direction, beside its own, or one of 500 samples of a sensor is spoiled, before anything is made of them.
 
 ``outages.md``: the outages of :mod:`pipelines.studies.plus` on real motion and on ``fleet``; the entirely real drives
 start on the wrong data, alone with biases (elsewhere the start is the truth with an error, which shows no bias). RMS /
@@ -38,7 +38,10 @@ from dlkf.base.provenance import describe_provenance
 from dlkf.command.composing import imu_preset, tuning_preset
 from dlkf.data.alignment import SEARCH, Start
 from dlkf.data.drive import Drive
+from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.segments import whole_drives
+from dlkf.data.store import drive_from_tables, drive_rows
+from dlkf.data.validate import CheckedTables, read_checked
 from dlkf.evaluation.bootstrap import compare
 from dlkf.evaluation.metrics import mean_error
 from dlkf.filters.build import build_causal
@@ -137,11 +140,30 @@ ERRORS: Mapping[str, Change] = {
     "0.5 m/s², 5 °/s": biases(0.5, 5.0),
 }
 OF_VELOCITIES, OF_IMU = [*ERRORS][9:12], [*ERRORS][12:]
+SPIKES: Mapping[str, tuple[float, float]] = {  # 1σ per axis [m/s², rad/s]
+    "accelerometers: 15 m/s² in one of 500 samples": (15.0, 0.0),
+    "gyroscopes: 1 rad/s in one of 500 samples": (0.0, 1.0),
+}
+SPIKED = 1 / 500
 
 
 def with_errors(drive: Drive, kind: str, draw: int = 0) -> Drive:
     """A drive with errors of that kind, always the same for a draw."""
     return ERRORS[kind](drive, torch.Generator().manual_seed(zlib.crc32(drive.name.encode()) + draw))
+
+
+def with_spikes(folder: Path, kind: str) -> list[Drive]:
+    """The drives of a dataset with some samples of its files off, always the same."""
+    return [_spoiled(read_checked(folder, row), np.repeat(SPIKES[kind], 3)) for row in drive_rows(folder)]
+
+
+def _spoiled(tables: CheckedTables, size: np.ndarray) -> Drive:
+    g = np.random.default_rng(zlib.crc32(tables.row.name.encode()))
+    t = tables.imu["t"]
+    hit = g.random(len(t)) < SPIKED
+    off = hit * size[:, None] * g.standard_normal((6, len(t)))
+    imu = {**tables.imu, **{c: tables.imu[c] + x for c, x in zip((*ACCEL, *GYRO), off)}}
+    return drive_from_tables(replace(tables, imu=imu), "", 50.0, 1.0, torch.float64)
 
 
 def rivals() -> dict[str, Estimator]:
@@ -153,13 +175,14 @@ def rivals() -> dict[str, Estimator]:
     return {**filters, "plus": trained_filter("plus")}
 
 
-def outage_rows(name: str, drives: Sequence[Drive], filters: Mapping[str, Estimator]) -> Iterator[tuple[str, str, Row]]:
+def outage_rows(name: str, folder: Path, filters: Mapping[str, Estimator]) -> Iterator[tuple[str, str, Row]]:
     """Where, kind of error and row of every kind that a dataset can have."""
+    drives = load(folder)
     moves = any(bool(d.gnss_valid[:, 3:].any()) for d in drives)
-    for kind in ERRORS:
+    for kind in (*ERRORS, *SPIKES):
         if (kind in OF_VELOCITIES and not moves) or (kind in OF_IMU and name not in REAL):
             continue
-        wrong = [with_errors(d, kind) for d in drives]
+        wrong = with_spikes(folder, kind) if kind in SPIKES else [with_errors(d, kind) for d in drives]
         for case in real_cases(name, wrong) if name in REAL else simulated_cases(name, wrong):
             for row in score(case, filters):
                 if kind not in OF_IMU:
@@ -261,11 +284,11 @@ def main() -> None:
     (options.out / "starts.md").write_text("\n".join(start_table(sets)) + "\n")
     filters, rows = rivals(), {}
     for name in (*INJECTED, *REAL, FLEET):
-        for where, kind, row in outage_rows(name, load(folders[name]), filters):
+        for where, kind, row in outage_rows(name, folders[name], filters):
             rows.setdefault((where, kind), []).append(row)
         print(name, flush=True)
     order = ("real motion", "real drives", "simulated")
-    rows = dict(sorted(rows.items(), key=lambda x: (order.index(x[0][0]), [*ERRORS].index(x[0][1]))))
+    rows = dict(sorted(rows.items(), key=lambda x: (order.index(x[0][0]), [*ERRORS, *SPIKES].index(x[0][1]))))
     (options.out / "outages.md").write_text("\n".join(table(rows)) + "\n")
     (options.out / "manifest.json").write_text(json.dumps(describe_provenance(), indent=1) + "\n")
 

@@ -86,7 +86,7 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console) -> Evaluation
     for reason in done.skipped.values():
         console.print(f"left out: {reason}", style="yellow")
     for drive, said in done.rules.get(REFUSED, {}).items():
-        console.print(f"drive {drive}: {said} beyond physical limits refused", style="yellow", highlight=False)
+        console.print(f"drive {drive}: left out as impossible: {said}", style="yellow", highlight=False)
     if done.short:
         console.print(f"left out: {done.short}", style="yellow", highlight=False)
     if done.truth:

@@ -123,7 +123,7 @@ def test_samples_beyond_full_scale_and_far_fixes_are_left_out_and_counted(tmp_pa
     clean["imu"], clean["gnss"] = clean["imu"].drop([2000, 2500]), clean["gnss"].drop(20)
     write(tmp_path / "less", clean)
     less = load_dataset(tmp_path / "less")[0]
-    assert less.refused == (0, 0)
+    assert less.refused == Refused()
     assert torch.equal(drive.imu, less.imu) and torch.equal(drive.gnss_valid, less.gnss_valid)
     assert drive.imu.abs().max() < FULL_SCALE[0]
 
@@ -190,4 +190,4 @@ def test_numbers_that_no_float_holds_exactly_are_read(tmp_path, tables):
     table = pa.Table.from_pandas(tables["gnss"], preserve_index=False)
     quality = pa.array([2**60] + [4] * (len(table) - 1), pa.int64())
     pq.write_table(table.set_column(table.schema.get_field_index("quality"), "quality", quality), path)
-    assert load_dataset(tmp_path)[0].refused == (0, 0)
+    assert load_dataset(tmp_path)[0].refused == Refused()

@@ -150,6 +150,23 @@ def _fast_speeds(sent: Calls) -> Calls:
     return [call for _, call in sorted(arriving, key=lambda x: x[0])]
 
 
+def _spikes(first: float, every: float) -> Fault:
+    """A sample of one sensor or of both that is far off, again and again."""
+
+    def made(sent: Calls) -> Calls:
+        out, due, k = [], first, 0
+        for call in sent:
+            if call.kind == "imu" and call.arguments[0] >= due - 1e-9:
+                t, accel, gyro = call.arguments
+                due, k = due + every, k + 1
+                accel = [accel[0], accel[1] - 30.0, accel[2] + 12.0] if k % 3 else accel
+                call = Call("imu", (t, accel, gyro if k % 3 == 1 else [gyro[0], gyro[1], gyro[2] + 1.5]))
+            out.append(call)
+        return out
+
+    return made
+
+
 WITHOUT_VELOCITY = [nan] * 3
 JUMPS: dict[str, Fault] = {
     "fixes 20 km off for 25 s": _changed("gnss", _between(25.5, 50.5), lambda x: _put(x, 1, x[1] + 0.18)),
@@ -203,6 +220,10 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     )(_one_by_one(
         "speed", 0.5, lambda x: _put(x, 1, nan), lambda x: [x, x]
     )(sent))), ("not_finite", "double", "ahead", "ahead", "outside")),
+    "spikes": (_spikes(0.0, 3.17), ()),
+    "spikes in the last and the last but one sample of an update interval": (_spikes(19.99, 2.99), ()),
+    "knocks of two samples": (_changed("imu", lambda t: t > 20 and t % 3 < 0.025, lambda x: _put(
+        x, 1, [x[1][0] + 30.0, *x[1][1:]])), ()),
     "a tenth of the samples missing": (_lost(0.1), ()),
     "stamps that jitter": (_stamps(_jitter(1, 3e-3)), ()),
     "an IMU's clock 500 ppm fast": (_stamps(lambda t: t * 1.0005), ()),

@@ -17,7 +17,8 @@ from tests.onboard.faults import FAULTS, JUMPS, JUMPS_LATE
 from tests.onboard.streams import apart, calls, through_core, through_python
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
-REFUSED = set(Status) - {Status[x] for x in ("TAKEN", "REPLAYED", "SUPERSEDED", "RESTARTED", "DIVERGED", "LOST")}
+OTHERS = "TAKEN", "REPLAYED", "SUPERSEDED", "RESTARTED", "DIVERGED", "LOST", "SPIKE"
+REFUSED = set(Status) - {Status[x] for x in OTHERS}
 ROUNDING = 1e-6  # m, m/s, rad: sums in another order over a minute
 
 
@@ -45,6 +46,8 @@ def test_the_core_answers_every_fault_as_the_python_stream_does(name, exported, 
     assert refused == stream.counts["refused"]
     assert inside.counts.get(Status.DIVERGED, 0) == stream.counts["diverged"]
     assert inside.counts.get(Status.LOST, 0) == stream.counts["lost"]
+    assert inside.counts.get(Status.SPIKE, 0) == stream.counts["spikes"]
+    assert (stream.counts["spikes"] > 3) is ("spikes" in name)
     assert len(want.solution) > 15 and len(want.now) > 2
     assert apart(want.rows, core.rows) < ROUNDING
     assert apart(want.now, core.now) < ROUNDING

@@ -33,15 +33,17 @@ EARTH_M = 6_371_000.0  # m, mean radius: distances to 0.5 %
 
 
 class Refused(NamedTuple):
-    """How many samples and fixes of a drive lie beyond the limits and were left out."""
+    """How many samples and fixes of a drive lie beyond the limits, and how many samples are spikes; left out."""
 
     samples: int = 0
     fixes: int = 0
+    spikes: int = 0  # dlkf.data.spikes
 
     def __str__(self) -> str:
         """As a part of a sentence; empty where nothing was refused."""
-        words = (("sample", "samples"), ("fix", "fixes"))
-        return " and ".join(f"{n} {one if n == 1 else many}" for n, (one, many) in zip(self, words) if n)
+        words = (("sample", "samples"), ("fix", "fixes"), ("spike of the IMU", "spikes of the IMU"))
+        said = [f"{n} {one if n == 1 else many}" for n, (one, many) in zip(self, words) if n]
+        return " and ".join((", ".join(said[:-1]), said[-1]) if len(said) > 1 else said)
 
 
 NONE_REFUSED = Refused()

@@ -16,6 +16,7 @@ from dlkf.data.aids import aid_rows
 from dlkf.data.compiled_samples import prepare
 from dlkf.data.drive import Drive
 from dlkf.data.resampling import assign_fixes, epoch_grid, reference_at, resample_imu
+from dlkf.data.spikes import without_spikes
 from dlkf.data.tables import DriveRow, dataset_digest, read_drives
 from dlkf.data.validate import GNSS_QUALITIES, LIMITS, CheckedTables, Limits, read_checked
 
@@ -107,12 +108,13 @@ def drive_from_tables(
     dtype: torch.dtype,
     aids: Sequence[AidTable] = (),
 ) -> Drive:
-    """One drive's checked tables on its epoch grid; raises InputError if it is shorter than an epoch.
+    """One drive's checked tables, without the spikes of its IMU, on its epoch grid.
 
-    ``aids`` explains those of its further tables that are not in the contract.
+    ``aids`` explains those of its further tables that are not in the contract. Raises InputError if the drive is
+    shorter than an epoch.
     """
     kinds = {**STANDARD, **{aid.name: aid for aid in aids}}
-    imu, gnss = tables.imu, tables.gnss
+    (imu, spikes), gnss = without_spikes(tables.imu), tables.gnss
     fix = torch.from_numpy(gnss["quality"])
     usable = torch.isin(fix, torch.tensor(GNSS_QUALITIES)).numpy()
     grid = epoch_grid(imu["t"], gnss["t"][usable], rate_hz, epoch_s, tables.row.name)
@@ -138,6 +140,6 @@ def drive_from_tables(
         ref_valid=torch.from_numpy(truth.valid),
         ref_imu_error=torch.from_numpy(truth.imu_error),
         lever_arm_b=torch.tensor(tables.row.lever_arm_b, dtype=torch.float64),
-        refused=tables.refused,
+        refused=tables.refused._replace(spikes=spikes),
         aids={name: torch.from_numpy(aid_rows(kinds[name], x, grid)) for name, x in tables.aids.items()},
     )

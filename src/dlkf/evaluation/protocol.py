@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 MODES = ("auto", "segments", "drives")
-REFUSED = "refused beyond physical limits"  # of the rules: what was left out of drives
+REFUSED = "left out as impossible"  # of the rules: samples and fixes of drives
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from dlkf.base.errors import InputError
-from dlkf.data import aids, alignment, limits, resampling, velocity_fit
+from dlkf.data import aids, alignment, limits, resampling, spikes, velocity_fit
 from dlkf.data.aid_tables import LAST
 from dlkf.data.validate import LIMITS
 from dlkf.filters.aids.attach import aid_columns, tables_of
@@ -52,7 +52,7 @@ from dlkf.running.start import LOOKBACK_S, bank, standstill
 
 CORE = Path(__file__).parent / "core"
 EXAMPLES = Path(__file__).parent / "examples"
-CORE_FILES = ("dlkf.h", "dlkf.c", "samples.c", "align.c", "search.c", "aids.c", "limits.c", "geometry.h")
+CORE_FILES = ("dlkf.h", "dlkf.c", "samples.c", "spikes.c", "align.c", "search.c", "aids.c", "limits.c", "geometry.h")
 IN_A_FILE = 4096  # constants of more numbers than that go to weights.c
 COLUMNS = ("t", "revised", *ROW)  # of a row of the core; then those of further sensors
 ANCHOR_M = {torch.float64: streaming.ANCHOR_M, torch.float32: 1000.0}  # where float resolves 0.1 mm
@@ -195,6 +195,9 @@ def constants() -> str:
         "ON_BOUNDARY_S": resampling.ON_BOUNDARY_S, "SMALLEST_STD": resampling.SMALLEST_STD,
         "MIN_SPEED": alignment.SEARCH.min_speed, "RATE_AVERAGE_S": alignment.RATE_AVERAGE_S,
     }  # fmt: skip
+    values |= {"SPIKE_ACCEL": spikes.FLOOR[0], "SPIKE_GYRO": spikes.FLOOR[1]}
+    names = ("RATIO", "SHARE", "QUIET", "QUIET_FLOOR", "BEFORE", "QUARTILE")
+    values |= {f"SPIKE_{name}": getattr(spikes, name) for name in names}
     values |= {"REST_SPREAD_ACCEL": standstill.REST_SPREAD[0], "REST_SPREAD_GYRO": standstill.REST_SPREAD[1]}
     for module, names in (
         (aids, ("SEA_LEVEL_PA", "SCALE_M", "EXPONENT")),

@@ -14,7 +14,7 @@ import numpy as np
 Status = IntEnum(
     "Status",
     "TAKEN REPLAYED SUPERSEDED NOT_FINITE IMPLAUSIBLE DOUBLE BACK GAP FULL NO_FIX OUTSIDE IMPLAUSIBLE_FIX LATE AHEAD "
-    "NO_SENSOR RESTARTED DIVERGED LOST",
+    "NO_SENSOR RESTARTED DIVERGED LOST SPIKE",
     start=0,
 )  # those of dlkf_status
 Waiting = IntEnum("Waiting", ["RUNS", "SAMPLES", "FIXES", "MOTION", "HEADING"], start=0)

@@ -58,5 +58,5 @@ def core_drive(
     table = pd.DataFrame(rows, columns=list(columns_of(estimator)))
     table = table[[*COLUMNS, "gnss_used", *aid_columns(estimator)]].astype({"gnss_used": bool})
     return Navigated(
-        name, float(rows[0, 0]) - epoch_s, table, refused=tables.refused, restarts=tuple(lost), doubt=core.doubt
+        name, float(rows[0, 0]) - epoch_s, table, refused=drive.refused, restarts=tuple(lost), doubt=core.doubt
     )

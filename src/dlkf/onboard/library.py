@@ -25,7 +25,7 @@ FLAGS = (
 )  # fmt: skip
 CORE_FLAGS = ("-O2",)
 FILTER = ("step.c", "weights.c", "heading.c")
-CORE = ("dlkf.c", "samples.c", "align.c", "search.c", "aids.c", "limits.c")
+CORE = ("dlkf.c", "samples.c", "spikes.c", "align.c", "search.c", "aids.c", "limits.c")
 LIBRARY = "step.so"
 
 

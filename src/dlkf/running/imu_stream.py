@@ -12,6 +12,7 @@ from dlkf.base.errors import InputError
 from dlkf.data.limits import FULL_SCALE
 from dlkf.data.resampling import SampleGrid, epoch_grid, resample_imu, samples_per_epoch
 from dlkf.data.schema import ACCEL, GYRO
+from dlkf.data.spikes import AHEAD, SpikeScreen
 from dlkf.data.validate import LIMITS, Limits
 
 Row = Sequence[float] | np.ndarray
@@ -25,7 +26,9 @@ class ImuStream:
 
     ``step_s`` is the usual interval between stamps [s]; None: the median of the samples before the grid began.
     A sample is in line if its stamp lies after the last one, by no more than ``limits`` call a gap; missing
-    samples within are bridged as the loader does. Out of line are stamps that run back or leap ahead.
+    samples within are bridged as the loader does. Out of line are stamps that run back or leap ahead. Spikes are left
+    out (:mod:`dlkf.data.spikes`), ``spikes`` of them so far; while a sample may prove to be one, an epoch that ends
+    with it waits for up to two more.
     """
 
     def __init__(
@@ -39,12 +42,13 @@ class ImuStream:
     ) -> None:
         self._samples = samples_per_epoch(rate_hz, epoch_s)
         self._rate_hz, self._epoch_s, self._limits, self._keep_s = rate_hz, epoch_s, limits, keep_s
-        self._given = step_s
+        self._given, self._screen, self.spikes = step_s, SpikeScreen(), 0
         self.clear()
 
     def clear(self) -> None:
         """Drop all samples and the grid."""
         self._rows: deque[tuple[float, ...]] = deque()
+        self._screen.clear()
         self._astray: tuple[float, float] | None = None  # first and last stamp of a run out of line
         self._step = self._given
         self._longest = self._longest_step(self._given)
@@ -56,6 +60,12 @@ class ImuStream:
     def latest(self) -> float:
         """Stamp of the last sample in line [s]; −∞ before the first."""
         return self._rows[-1][0] if self._rows else -math.inf
+
+    @property
+    def settled(self) -> float:
+        """Stamp of the last sample that can no longer prove to be a spike [s]; −∞ before the first."""
+        last = -1 - self._screen.undecided
+        return self._rows[last][0] if len(self._rows) >= -last else -math.inf
 
     @property
     def lost(self) -> bool:
@@ -79,6 +89,9 @@ class ImuStream:
             return self._out_of_line(row[0], last)
         self._astray = None
         self._rows.append(row)
+        if self._screen.add(row[1:]):
+            del self._rows[-1 - AHEAD]
+            self.spikes += 1
         if self.grid is None and row[0] - self._rows[0][0] > self._keep_s:
             self._rows.popleft()
         return ""
@@ -98,13 +111,14 @@ class ImuStream:
         self.end = grid.t0 + self._epoch_s
         return True
 
-    def closed(self, slack_s: float = 0.0) -> list[np.ndarray]:
+    def closed(self, ended: bool = False) -> list[np.ndarray]:
         """Samples (1, M, 6) of the epochs whose end the stream has reached, each of them once.
 
-        ``slack_s`` [s] before an epoch's end counts as reached.
+        Where the stream has ``ended``, the loader's slack before an epoch's end counts as reached, and the last
+        samples are no spikes.
         """
-        done = []
-        while self.latest >= self.end - max(slack_s, 4 * math.ulp(self.end)):
+        done, slack, last = [], self.slack_s if ended else 0.0, self.latest if ended else self.settled
+        while last >= self.end - max(slack, 4 * math.ulp(self.end)):
             done.append(self._resampled(SampleGrid(self.boundary(self.epochs), self._epoch_s, 1, self._samples)))
             self.epochs += 1
             self.end = self.boundary(self.epochs + 1)
@@ -128,11 +142,11 @@ class ImuStream:
         return 0.5 * min(self.step_s, self._epoch_s / self._samples)
 
     def open(self) -> tuple[np.ndarray, float] | None:
-        """As many samples (1, M, 6) as an epoch has, from its beginning to the latest stamp, and their length [s]."""
+        """As many samples (1, M, 6) as an epoch has, from its beginning to :attr:`settled`, and their length [s]."""
         if self.grid is None:
             return None
         begin = self.boundary(self.epochs)
-        span = self.latest - begin
+        span = self.settled - begin
         if span <= 4 * math.ulp(begin):
             return None
         return self._resampled(SampleGrid(begin, span, 1, self._samples)), span / self._samples

@@ -103,7 +103,7 @@ class Navigated:
     aligned_at: float
     table: pd.DataFrame
     innovation: Innovation | None = None
-    refused: Refused = NONE_REFUSED  # samples and fixes beyond physical limits, which were left out
+    refused: Refused = NONE_REFUSED  # samples and fixes that were left out as impossible
     restarts: tuple[float, ...] = ()  # times [s] at which the filter was lost and restarted
     doubt: float = 0.0
 
@@ -130,7 +130,7 @@ class Navigated:
             text += f", normalised innovation RMS {spread:.2g} (expected 1)"
         text += "".join(f", {name} {found}" for name, found in self.sensors().items())
         if any(self.refused):
-            text += f", {self.refused} beyond physical limits refused"
+            text += f", left out as impossible: {self.refused}"
         if self.restarts:
             text += ", lost and started over at t = " + ", ".join(f"{t:.0f}" for t in self.restarts[:5]) + " s"
         return text

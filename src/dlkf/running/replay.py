@@ -150,7 +150,7 @@ def stream_drive(
         tables.row.name,
         estimates[0].t - epoch_s,
         table,
-        refused=tables.refused,
+        refused=drive.refused,
         restarts=tuple(stream.lost_at),
         doubt=stream.doubt,
     )

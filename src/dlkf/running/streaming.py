@@ -17,6 +17,8 @@ solution to rounding, for any order in which fixes arrive:
   a clock that has been set again, is accepted after one second of it: then the filter starts over with an alignment,
   and with the IMU error that it started from. It also starts over if its state is no longer finite, is that of no
   car, or stays far from fixes that agree with each other (:mod:`dlkf.running.loss`).
+* **Spikes** of the IMU are left out as in a log; an epoch whose last sample may be one closes up to two samples later
+  (:mod:`dlkf.data.spikes`).
 * **Physical limits**: samples beyond full scale and fixes that no car can have reached since the last good one are
   refused and counted before any filter sees them (:mod:`dlkf.data.limits`), whatever the order of arrival
   (:mod:`dlkf.running.fix_history`).
@@ -84,8 +86,9 @@ class StreamingFilter:
 
     ``rate_hz``, ``epoch_s``: the grid that the filter works on, as in training and in ``navigate``.
     ``lever_arm_b`` [m]: IMU → antenna, Forward-Right-Down. ``history_s``: how late a fix may be. ``counts`` has how
-    often each status was returned (samples that are taken do not count), how often the state was no longer finite
-    (``diverged``), and how often the filter was lost (``lost``, at the times ``lost_at``). For one thread at a time.
+    often each status was returned (samples that are taken do not count), how many samples proved to be spikes
+    (``spikes``), how often the state was no longer finite (``diverged``), and how often the filter was lost (``lost``,
+    at the times ``lost_at``). For one thread at a time.
     Raises InputError if the filter cannot work on such a grid, and warns (LowSampleRateWarning) where it would take
     features from samples that come too seldom for that.
     """
@@ -179,13 +182,15 @@ class StreamingFilter:
             return self._answer(Status.RESTARTED, reason)
         if self._samples.grid is None:
             self._settle()
+        if self._samples.spikes != self.counts["spikes"]:
+            self.counts["spikes"] = self._samples.spikes
         if float(t) < self._samples.end - 1e-6:
             return TAKEN
-        return self._close(0.0)
+        return self._close(ended=False)
 
     def finish(self) -> Receipt:
         """Close an epoch that the end of a drive has reached within the loader's slack of half a sample."""
-        return self._close(self._samples.slack_s)
+        return self._close(ended=True)
 
     def gnss(
         self,
@@ -248,13 +253,14 @@ class StreamingFilter:
 
     @torch.inference_mode()
     def now(self) -> Estimate | None:
-        """The last epoch's state carried to the latest sample; IMU error and 1σ are that epoch's. None: aligning."""
+        """The last epoch's state carried to the latest sample that can be no spike; IMU error and 1σ are that epoch's.
+        None: aligning."""
         running, latest, tail = self._epochs.running, self._epochs.latest, self._samples.open()
         if not isinstance(running, Running) or latest is None or tail is None:
             return latest
         imu, dt = torch.from_numpy(tail[0]).to(self._epochs.device), tail[1]
         window = strapdown(running.state, running.error.corrected(imu), dt, running.frame)
-        return replace(latest, t=self._samples.latest, frame=running.frame, state=window.end, gnss_used=False)
+        return replace(latest, t=self._samples.settled, frame=running.frame, state=window.end, gnss_used=False)
 
     def _answer(self, status: Status, reason: str = "", estimates: Sequence[Estimate] = ()) -> Receipt:
         self.counts[status] += 1
@@ -281,8 +287,8 @@ class StreamingFilter:
             self._early_aids.clear()
 
     @torch.inference_mode()
-    def _close(self, slack_s: float) -> Receipt:
-        estimates = [e for imu in self._samples.closed(slack_s) for e in self._epochs.close(imu)]
+    def _close(self, ended: bool) -> Receipt:
+        estimates = [e for imu in self._samples.closed(ended) for e in self._epochs.close(imu)]
         return Receipt(Status.TAKEN, tuple(estimates))
 
     def _file(self, fix: dict[str, np.ndarray]) -> Receipt:

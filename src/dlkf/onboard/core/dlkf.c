@@ -272,10 +272,10 @@ static void settle(dlkf *d) {
   dlkf_aids_file(d);
 }
 
-static void close_epochs(dlkf *d, double slack_s) {
+static void close_epochs(dlkf *d, int ended) {
   for (;;) {
     const int64_t number = d->samples.epochs;
-    if (!dlkf_samples_closed(&d->samples, slack_s, epoch_at(d, number)->imu)) return;
+    if (!dlkf_samples_closed(&d->samples, ended, epoch_at(d, number)->imu)) return;
     run(d, number, 0);
     if (number + 1 - d->oldest > DLKF_REWIND + DLKF_LOOKBACK) {
       dlkf_fix *fix = &d->fixes[d->oldest % DLKF_BOUNDARIES];
@@ -287,7 +287,9 @@ static void close_epochs(dlkf *d, double slack_s) {
 
 dlkf_status dlkf_imu(dlkf *d, double t, const double accel[3], const double gyro[3]) {
   d->made = d->given = 0;
+  const int64_t spiked = d->samples.spiked;
   const dlkf_status status = dlkf_samples_take(&d->samples, t, accel, gyro);
+  d->counts[DLKF_SPIKE] += d->samples.spiked - spiked;
   if (status != DLKF_TAKEN) {
     if (!dlkf_samples_lost(&d->samples)) return dlkf_counted(d, status);
     clear(d);
@@ -300,7 +302,7 @@ dlkf_status dlkf_imu(dlkf *d, double t, const double accel[3], const double gyro
 
 void dlkf_finish(dlkf *d) {
   d->made = d->given = 0;
-  if (!isnan(d->samples.t0)) close_epochs(d, dlkf_samples_slack(&d->samples));
+  if (!isnan(d->samples.t0)) close_epochs(d, 1);
 }
 
 dlkf_status dlkf_gnss(dlkf *d, double t, double lat_deg, double lon_deg, double height_m, const double *velocity_ned,
@@ -342,7 +344,7 @@ dlkf_waiting dlkf_pose(dlkf *d, double *row) {
   const double share = span / EPOCH_S;
   dlkf_carry(d->now.filter, imu, &share, d->outputs, outputs, d->work);
   dlkf_row(d->now.filter, outputs, row + DLKF_LAT_DEG, d->work);
-  row[DLKF_T] = dlkf_samples_latest(&d->samples);
+  row[DLKF_T] = dlkf_samples_settled(&d->samples);
   row[DLKF_GNSS_USED] = row[DLKF_REVISED] = 0;
   return DLKF_RUNS;
 }
@@ -365,7 +367,7 @@ const char *dlkf_says(dlkf_status status) {
       "refused: the stamp is before the last one", "refused: a gap before the stamp", "refused: more samples than the memory holds",
       "refused: no fix", "refused: latitude, longitude or 1-sigma out of range", "refused: not reachable since the last good fix", "refused: too late",
       "refused: ahead of the IMU; both need one clock", "refused: this filter takes no such sensor", "restarted: stamps were inconsistent for a second",
-      "the filter diverged and realigns", "the filter was far from good fixes and realigns"};
+      "the filter diverged and realigns", "the filter was far from good fixes and realigns", "an isolated spike of the IMU, left out"};
   return (unsigned)status < DLKF_STATUSES ? words[status] : "no such status";
 }
 

@@ -45,6 +45,8 @@
 #define DLKF_EARLY_AIDS (DLKF_AIDS ? DLKF_AIDS * DLKF_KEEP_S * DLKF_AID_HZ : 1) /* samples of further sensors, likewise */
 #define DLKF_STAMPS (DLKF_AIDS ? ((DLKF_REWIND + 1) * DLKF_SAMPLES * 1000 / DLKF_RATE_MILLIHZ + 1) * DLKF_AID_HZ : 1)
                                                                    /* of a sensor, among which one that comes twice is known */
+#define DLKF_SPIKE_AHEAD 2                                         /* samples after one that decide whether it is a spike */
+#define DLKF_STRETCH 54                                            /* samples that such a decision takes */
 #define DLKF_HEADINGS 14                                           /* of a search */
 
 /* What became of a sample, a fix or an aid. */
@@ -67,6 +69,7 @@ typedef enum {
   DLKF_RESTARTED,   /* samples out of line went on for a second: everything begins anew with an alignment */
   DLKF_DIVERGED,    /* only a count: the state was not finite, so the filter aligns anew */
   DLKF_LOST,        /* only a count: far off ten good fixes in a row, or where no car can be; it aligns anew */
+  DLKF_SPIKE,       /* only a count: a sample proved to be an isolated spike, and was left out */
   DLKF_STATUSES
 } dlkf_status;
 
@@ -145,11 +148,20 @@ typedef struct {
 } dlkf_early_aid;
 
 typedef struct {
+  double ring[DLKF_STRETCH][6]; /* the last samples, spikes among them */
+  int32_t next, count;
+  int32_t apart[2];  /* which of the last two jump away from a quiet one */
+  int32_t undecided; /* how many of the last may yet prove to be spikes */
+} dlkf_spikes;
+
+typedef struct {
   double phase_s, step_s; /* given: a moment on a boundary, usual time between samples [s]; NAN: found */
   double step, longest;   /* in force: usual, and longest that is no gap [s] */
   double t0;              /* of the grid; NAN: not laid yet */
   double astray[2];       /* first and last stamp of a run out of line; NAN: none */
   int64_t epochs;         /* closed */
+  int64_t spiked;         /* samples that proved to be spikes */
+  dlkf_spikes spikes;
   int32_t first, count;   /* of the ring */
   dlkf_sample ring[DLKF_RAW];
 } dlkf_samples;
@@ -223,7 +235,7 @@ void dlkf_finish(dlkf *d);
  * row[DLKF_REVISED] is 1 where a late fix changed one that was there before. */
 const double *dlkf_next(dlkf *d);
 
-/* The state at the last sample, IMU error and 1-sigma of the last row. */
+/* The state at the last sample that can be no spike, IMU error and 1-sigma of the last row. */
 dlkf_waiting dlkf_pose(dlkf *d, double *row);
 
 dlkf_waiting dlkf_waits(const dlkf *d);
@@ -250,13 +262,14 @@ dlkf_status dlkf_samples_take(dlkf_samples *s, double t, const double accel[3], 
 void dlkf_samples_clear(dlkf_samples *s);
 int dlkf_samples_lost(const dlkf_samples *s);
 int dlkf_samples_begin(dlkf_samples *s, const double *t_fix, int count);
-int dlkf_samples_closed(dlkf_samples *s, double slack_s, double *imu);
+int dlkf_samples_closed(dlkf_samples *s, int ended, double *imu);
 double dlkf_samples_latest(const dlkf_samples *s);
+double dlkf_samples_settled(const dlkf_samples *s);
 double dlkf_samples_boundary(const dlkf_samples *s, int64_t number);
 double dlkf_samples_place(const dlkf_samples *s, double t);
 dlkf_status dlkf_samples_timing(const dlkf_samples *s, double place, int least);
-double dlkf_samples_slack(const dlkf_samples *s);
 double dlkf_samples_open(const dlkf_samples *s, double *imu);
+int dlkf_spikes_add(dlkf_spikes *s, const double *x);
 const dlkf_fix *dlkf_fix_at(const dlkf *d, int64_t boundary);
 void dlkf_read_fix(const dlkf *d, int64_t boundary, const double *origin_e, const double *C_en, double *out);
 void dlkf_screen_clear(dlkf_screen *s);

@@ -23,6 +23,8 @@ static double ulp(double x) { return nextafter(fabs(x), INFINITY) - fabs(x); }
 
 void dlkf_samples_clear(dlkf_samples *s) {
   s->first = s->count = 0;
+  s->spiked = 0;
+  memset(&s->spikes, 0, sizeof s->spikes);
   s->astray[0] = s->astray[1] = s->t0 = NAN;
   s->step = s->step_s;
   s->longest = longest(s->step_s);
@@ -30,6 +32,12 @@ void dlkf_samples_clear(dlkf_samples *s) {
 }
 
 double dlkf_samples_latest(const dlkf_samples *s) { return s->count ? at(s, s->count - 1)->t : -INFINITY; }
+
+/* Stamp of the last sample that can no longer prove to be a spike. */
+double dlkf_samples_settled(const dlkf_samples *s) {
+  const int k = s->count - 1 - s->spikes.undecided;
+  return k < 0 ? -INFINITY : at(s, k)->t;
+}
 
 double dlkf_samples_boundary(const dlkf_samples *s, int64_t number) { return s->t0 + (double)number * EPOCH_S; }
 
@@ -68,6 +76,11 @@ dlkf_status dlkf_samples_take(dlkf_samples *s, double t, const double accel[3], 
   }
   s->astray[0] = s->astray[1] = NAN;
   s->ring[(s->first + s->count++) % DLKF_RAW] = sample;
+  if (dlkf_spikes_add(&s->spikes, sample.x)) {
+    for (int k = s->count - 1 - DLKF_SPIKE_AHEAD; k < s->count - 1; k++) s->ring[(s->first + k) % DLKF_RAW] = *at(s, k + 1);
+    s->count--;
+    s->spiked++;
+  }
   if (isnan(s->t0) && t - at(s, 0)->t > DLKF_KEEP_S) drop(s);
   return DLKF_TAKEN;
 }
@@ -160,7 +173,7 @@ int dlkf_samples_begin(dlkf_samples *s, const double *t_fix, int count) {
   return 1;
 }
 
-double dlkf_samples_slack(const dlkf_samples *s) {
+static double slack(const dlkf_samples *s) {
   const double spacing = EPOCH_S / DLKF_SAMPLES;
   return 0.5 * (s->step < spacing ? s->step : spacing);
 }
@@ -242,20 +255,22 @@ static void resampled(const dlkf_samples *s, double begin, double span, int coun
   }
 }
 
-/* The next update interval whose end the samples have reached to `slack_s`: 1 and its samples, else 0. */
-int dlkf_samples_closed(dlkf_samples *s, double slack_s, double *imu) {
+/* The next update interval whose end the samples have reached: 1 and its samples, else 0. Where the stream has ended, to
+ * half a sample, and the last are no spikes. */
+int dlkf_samples_closed(dlkf_samples *s, int ended, double *imu) {
   if (isnan(s->t0)) return 0;
   const double end = dlkf_samples_boundary(s, s->epochs + 1), rounding = 4 * ulp(end);
-  if (!(dlkf_samples_latest(s) >= end - (slack_s > rounding ? slack_s : rounding))) return 0;
+  const double last = ended ? dlkf_samples_latest(s) : dlkf_samples_settled(s);
+  if (!(last >= end - (ended && slack(s) > rounding ? slack(s) : rounding))) return 0;
   resampled(s, dlkf_samples_boundary(s, s->epochs), EPOCH_S, DLKF_SAMPLES, imu);
   s->epochs++;
   while (s->count > BEFORE && at(s, BEFORE)->t <= dlkf_samples_boundary(s, s->epochs)) drop(s);
   return 1;
 }
 
-/* DLKF_SAMPLES samples from the open update interval's beginning to the last stamp, and the seconds that they span. */
+/* DLKF_SAMPLES samples from the open update interval's beginning to the last that can be no spike, and the seconds that they span. */
 double dlkf_samples_open(const dlkf_samples *s, double *imu) {
-  const double begin = dlkf_samples_boundary(s, s->epochs), span = dlkf_samples_latest(s) - begin;
+  const double begin = dlkf_samples_boundary(s, s->epochs), span = dlkf_samples_settled(s) - begin;
   if (!(span > 4 * ulp(begin))) return 0;
   resampled(s, begin, span, DLKF_SAMPLES, imu);
   return span;
