@@ -62,7 +62,7 @@ def test_where_the_car_shakes_a_jump_has_to_be_larger():
     least = RATIO * 1.15 * 2**0.5 * 2.0
     for jump, is_one in ((0.6 * least, False), (1.7 * least, True)):
         x = still(size=(2.0, 0.005))
-        x[148:153, 0] = x[100, 0]  # quiet beside it
+        x[148:153, 0] = x[100, 0]  # steady beside it
         x[150, 0] += jump
         assert (found(x) == [150]) is is_one
 

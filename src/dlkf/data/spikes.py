@@ -5,8 +5,8 @@ In one axis or more a sample k jumps away from the one before and back to the on
     s = min(|x_k − x_(k−1)|, |x_(k+1) − x_k|) > max(FLOOR, RATIO q),
 
 with q the third quartile of the absolute differences of the ``BEFORE`` samples before it. What is to either side is
-quiet: |x_(k+1) − x_(k−1)|, |x_(k−1) − x_(k−2)| and |x_(k+2) − x_(k+1)| are at most ``SHARE`` of s. And each of the two
-sensors either jumps so itself or stays quiet, its two differences within ``QUIET`` q (or that share of its floor). A
+steady: |x_(k+1) − x_(k−1)|, |x_(k−1) − x_(k−2)| and |x_(k+2) − x_(k+1)| are at most ``SHARE`` of s. And each of the two
+sensors either jumps so itself or stays steady, its two differences within ``STEADY`` q (or that share of its floor). A
 knock on the car is neither: a body rings on, and turns. A spike is left out, and the gap bridged as any other.
 """
 
@@ -21,8 +21,8 @@ from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.tables import Columns
 
 FLOOR = (5.0, 0.1)  # m/s², rad/s: a smaller jump does little harm
-RATIO, SHARE, QUIET = 8.0, 0.15, 4.0
-QUIET_FLOOR = 0.2  # of FLOOR
+RATIO, SHARE, STEADY = 8.0, 0.15, 4.0
+STEADY_FLOOR = 0.2  # of FLOOR
 BEFORE = 50  # differences that show what is usual
 QUARTILE = 3 * BEFORE // 4  # place of the third quartile among them, from 0
 AHEAD = 2  # samples after one that decide on it
@@ -63,7 +63,7 @@ class SpikeScreen:
     def clear(self) -> None:
         """Forget all samples."""
         self._rows: deque[Sequence[float]] = deque(maxlen=ROWS)
-        self._apart = (False, False, False)  # which of the last three jump away from a quiet one
+        self._apart = (False, False, False)  # which of the last three jump away from a steady one
         self.undecided = 0
 
     def add(self, row: Sequence[float]) -> bool:
@@ -83,7 +83,7 @@ class SpikeScreen:
         return older and len(rows) == ROWS and bool(_spiked(np.array(rows)[None])[0])
 
     def _would_be(self, back: int) -> bool:
-        """Whether the last sample, or the one ``back`` before it, is a spike if what follows is as quiet as can be."""
+        """Whether the last sample, or the one ``back`` before it, is a spike if what follows is as steady as can be."""
         rows, ahead = [*self._rows], AHEAD - back
         rows = [*rows[ahead - ROWS :], *([rows[-2 + back]] * ahead)]
         return len(rows) == ROWS and bool(_spiked(np.array(rows)[None])[0])
@@ -105,7 +105,7 @@ def _jumps(x: Sequence[float], before: Sequence[float], earlier: Sequence[float]
 
 
 def _apart(x: np.ndarray, floor: float) -> np.ndarray:
-    """Places that jump away from both neighbours by more than ``floor``, with quiet ones to either side."""
+    """Places that jump away from both neighbours by more than ``floor``, with steady ones to either side."""
     d = np.diff(x)
     if not len(d) or max(d.max(), -d.min()) <= floor:
         return np.zeros(0, np.int64)
@@ -126,6 +126,6 @@ def _spiked(x: np.ndarray) -> np.ndarray:
     beside = np.maximum(np.abs(up + down), np.maximum(size[:, BEFORE - 1], size[:, BEFORE + 2]))
     jumps = (least > np.maximum(_FLOORS, RATIO * usual)) & (up * down < 0) & (beside <= SHARE * least)
     most = np.maximum(size[:, BEFORE], size[:, BEFORE + 1])
-    quiet = most <= np.maximum(QUIET_FLOOR * _FLOORS, QUIET * usual)
+    steady = most <= np.maximum(STEADY_FLOOR * _FLOORS, STEADY * usual)
     of_sensor = jumps.reshape(-1, 2, 3).any(-1)
-    return of_sensor.any(-1) & (of_sensor | quiet.reshape(-1, 2, 3).all(-1)).all(-1)
+    return of_sensor.any(-1) & (of_sensor | steady.reshape(-1, 2, 3).all(-1)).all(-1)

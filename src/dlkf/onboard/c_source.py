@@ -196,7 +196,7 @@ def constants() -> str:
         "MIN_SPEED": alignment.SEARCH.min_speed, "RATE_AVERAGE_S": alignment.RATE_AVERAGE_S,
     }  # fmt: skip
     values |= {"SPIKE_ACCEL": spikes.FLOOR[0], "SPIKE_GYRO": spikes.FLOOR[1]}
-    names = ("RATIO", "SHARE", "QUIET", "QUIET_FLOOR", "BEFORE", "QUARTILE")
+    names = ("RATIO", "SHARE", "STEADY", "STEADY_FLOOR", "BEFORE", "QUARTILE")
     values |= {f"SPIKE_{name}": getattr(spikes, name) for name in names}
     values |= {"REST_SPREAD_ACCEL": standstill.REST_SPREAD[0], "REST_SPREAD_GYRO": standstill.REST_SPREAD[1]}
     for module, names in (

@@ -150,7 +150,7 @@ typedef struct {
 typedef struct {
   double ring[DLKF_STRETCH][6]; /* the last samples, spikes among them */
   int32_t next, count;
-  int32_t apart[2];  /* which of the last two jump away from a quiet one */
+  int32_t apart[2];  /* which of the last two jump away from a steady one */
   int32_t undecided; /* how many of the last may yet prove to be spikes */
 } dlkf_spikes;
 

@@ -30,7 +30,7 @@ static int spiked(double x[DLKF_STRETCH][6]) {
   const int k = SPIKE_BEFORE + 1;
   int some = 0;
   for (int sensor = 0; sensor < 2; sensor++) {
-    int jumps = 0, quiet = 1;
+    int jumps = 0, steady = 1;
     for (int axis = 3 * sensor; axis < 3 * sensor + 3; axis++) {
       const double usual = usual_difference(x, axis), floor = limit(axis);
       const double up = x[k][axis] - x[k - 1][axis], down = x[k + 1][axis] - x[k][axis];
@@ -38,9 +38,9 @@ static int spiked(double x[DLKF_STRETCH][6]) {
       const double before = fabs(x[k - 1][axis] - x[k - 2][axis]), after = fabs(x[k + 2][axis] - x[k + 1][axis]);
       const double beside = larger(fabs(up + down), larger(before, after));
       jumps |= least > larger(floor, SPIKE_RATIO * usual) && up * down < 0 && beside <= SPIKE_SHARE * least;
-      quiet &= larger(fabs(up), fabs(down)) <= larger(SPIKE_QUIET_FLOOR * floor, SPIKE_QUIET * usual);
+      steady &= larger(fabs(up), fabs(down)) <= larger(SPIKE_STEADY_FLOOR * floor, SPIKE_STEADY * usual);
     }
-    if (!jumps && !quiet) return 0;
+    if (!jumps && !steady) return 0;
     some |= jumps;
   }
   return some;
@@ -50,7 +50,7 @@ static const double *sample_before(const dlkf_spikes *s, int back) {
   return s->ring[(s->next + 2 * DLKF_STRETCH - 1 - back) % DLKF_STRETCH];
 }
 
-/* Whether the sample `back` before the last is a spike, where the missing ones after it are as quiet as can be. */
+/* Whether the sample `back` before the last is a spike, where the missing ones after it are as steady as can be. */
 static int would_be(const dlkf_spikes *s, int back) {
   double x[DLKF_STRETCH][6];
   const int missing = DLKF_SPIKE_AHEAD - back, known = DLKF_STRETCH - missing;
