@@ -8,12 +8,12 @@
 Makes the test sets that are missing (below ``--data``), runs every filter compiled over segments with GNSS for 60, 300
 and 900 s and then none for 120 s (real drives: 30 or 60 s), and writes ``table.md`` and ``manifest.json`` (commit,
 seeds, settings and digest of every dataset). Errors are horizontal, at the end of the outage, RMS / geometric mean [m].
-The baselines start from ``imu=automotive_mems`` and constants from ``conf/tuning``, each without speed from
-vibration and with it. The ratio is to the best of them by
+The baselines start from ``imu=automotive_mems`` and constants from ``conf/tuning``, each alone, and with speed from
+vibration, delay and antenna (``+vibration_speed+receiver``) as ``plus`` has them. The ratio is to the best of them by
 the geometric mean of that row, a choice with hindsight; [ ] is its 95 % interval over recordings. Beside them stands
 ``imu=auto``, whose noise is found on the drives that are scored, with all their fixes, and with ``--oracle``
-``mbkf33_car+vibration_speed`` given the noise that each simulated drive was made with. Last come, over all rows,
-every filter's errors, mean NEES, and the ratio of ``plus`` to it over all outages, by recordings.
+``mbkf33_car+vibration_speed+receiver`` given the noise that each simulated drive was made with. Last come, over all
+rows, every filter's errors, mean NEES, and the ratio of ``plus`` to it over all outages, by recordings.
 """
 
 from __future__ import annotations
@@ -59,6 +59,7 @@ from dlkf.tuning.descent import tune_by_gradient
 START, COARSE = StartLaw(0.1, 0.1, 1.0, 2.0), StartLaw(1.5, 0.3, 1.0, 3.0)
 BEFORE_S, LENGTHS_S, MOST = (60, 300, 900), (30, 60, 120), 48
 CONSTANTS = {"mbkf21_car": ("any_car", "gradient"), "mbkf33_car": ("any_car", "gradient")}
+SOURCES = "+vibration_speed+receiver"
 ORACLE = "true noise"
 REAL = ("rtkx", "wid", "wid_mru", "linkoping")
 TRAINING: Mapping[str, tuple[str, ...]] = {
@@ -140,33 +141,34 @@ def _case(
 
 
 def constants() -> dict[str, Estimator]:
-    """The filters with factors of ``conf/tuning``, with ``automotive_mems``, without ``vibration_speed`` and with."""
+    """The filters with factors of ``conf/tuning``, with ``automotive_mems``, alone and with the sources of ``plus``."""
     imu, found = imu_preset("automotive_mems"), {}
-    for vibration in ("", "+vibration_speed"):
+    for sources in ("", SOURCES):
         for kind, tunings in CONSTANTS.items():
             for tuning in tunings:
-                name = kind + vibration
+                name = kind + sources
                 found[f"{name} {tuning}"] = build_causal(name, imu, "no", tuning=tuning_preset(tuning))
     return found
 
 
 def found_noise(drives: Sequence[Drive]) -> dict[str, Estimator]:
-    """The same filters with the noise that ``imu=auto`` finds on the drives, without ``vibration_speed`` and with."""
+    """The same filters with the noise that ``imu=auto`` finds on the drives, alone and with the sources of ``plus``."""
     evidence, filters = Evidence.of(drives), {}
     for kind in CONSTANTS:
         found = find_noise(
             evidence, kind, imu_preset("automotive_mems"), Tuning(), delay=False, compiler=compile_or_keep
         )
-        for name in (kind, f"{kind}+vibration_speed"):
+        for name in (kind, kind + SOURCES):
             filters[f"{name} auto"] = build_causal(name, found.imu, "no", tuning=found.tuning)
     return filters
 
 
 def given_noise(folder: Path) -> dict[str, Estimator]:
-    """``mbkf33_car+vibration_speed`` with the preset of each kind of IMU in a dataset, by the preset's name."""
+    """``mbkf33_car`` with the sources of ``plus`` and the preset of each kind of IMU in a dataset, by the preset's
+    name."""
     kinds = sorted(set(pd.read_parquet(folder / "drives.parquet")["imu"]))
     tuning = replace(Tuning(), lateral_std=0.07, vertical_std=0.1)
-    return {k: build_causal("mbkf33_car+vibration_speed", imu_preset(k), "no", tuning=tuning) for k in kinds}
+    return {k: build_causal("mbkf33_car" + SOURCES, imu_preset(k), "no", tuning=tuning) for k in kinds}
 
 
 def with_oracle(case: Case, rows: Sequence[Row], folder: Path) -> list[Row]:

@@ -5,7 +5,8 @@
 From the first on, fixes get errors that the reported 1σ does not know: positions off by 3, 1 or 30 m (1σ per axis) in
 some seconds, by one error of 3 m for ten seconds about every 50 s, by 0.3, 1 or 3 m in all, or by 1 m that wanders over
 30 s; velocities off by 5 m/s in some, by 0.5 m/s in all, or those of a second before. Or the IMU has a turn-on bias, of
-random direction, beside its own, or one of 500 samples of a sensor is spoiled, before anything is made of them.
+random direction, beside its own. Or the files are wrong: stamps of fixes 0.1 or 0.3 s late, an antenna 1.4 m from
+where the lever arm says, one of 500 samples of a sensor spoiled.
 
 ``outages.md``: the outages of :mod:`pipelines.studies.plus` on real motion and on ``fleet``; the entirely real drives
 start on the wrong data, alone with biases (elsewhere the start is the truth with an error, which shows no bias). RMS /
@@ -29,7 +30,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from pipelines.studies.plus import REAL, Row, load, real_cases, recorded, score, simulated_cases
+from pipelines.studies.plus import REAL, SOURCES, Row, load, real_cases, recorded, score, simulated_cases
 from pipelines.studies.simulated_laws import INJECTED, simulate_sets
 from torch import Tensor
 
@@ -140,11 +141,8 @@ ERRORS: Mapping[str, Change] = {
     "0.5 m/s², 5 °/s": biases(0.5, 5.0),
 }
 OF_VELOCITIES, OF_IMU = [*ERRORS][9:12], [*ERRORS][12:]
-SPIKES: Mapping[str, tuple[float, float]] = {  # 1σ per axis [m/s², rad/s]
-    "accelerometers: 15 m/s² in one of 500 samples": (15.0, 0.0),
-    "gyroscopes: 1 rad/s in one of 500 samples": (0.0, 1.0),
-}
 SPIKED = 1 / 500
+WRONG_ARM = (1.0, 0.5, -0.8)  # m
 
 
 def with_errors(drive: Drive, kind: str, draw: int = 0) -> Drive:
@@ -152,25 +150,50 @@ def with_errors(drive: Drive, kind: str, draw: int = 0) -> Drive:
     return ERRORS[kind](drive, torch.Generator().manual_seed(zlib.crc32(drive.name.encode()) + draw))
 
 
-def with_spikes(folder: Path, kind: str) -> list[Drive]:
-    """The drives of a dataset with some samples of its files off, always the same."""
-    return [_spoiled(read_checked(folder, row), np.repeat(SPIKES[kind], 3)) for row in drive_rows(folder)]
+def spikes(accel: float, gyro: float) -> Callable[[CheckedTables], CheckedTables]:
+    """Errors of 1σ [m/s², rad/s] per axis in some samples, always the same."""
+
+    def change(tables: CheckedTables) -> CheckedTables:
+        g = np.random.default_rng(zlib.crc32(tables.row.name.encode()))
+        t = tables.imu["t"]
+        hit = g.random(len(t)) < SPIKED
+        off = hit * np.repeat((accel, gyro), 3)[:, None] * g.standard_normal((6, len(t)))
+        return replace(tables, imu={**tables.imu, **{c: tables.imu[c] + x for c, x in zip((*ACCEL, *GYRO), off)}})
+
+    return change
 
 
-def _spoiled(tables: CheckedTables, size: np.ndarray) -> Drive:
-    g = np.random.default_rng(zlib.crc32(tables.row.name.encode()))
-    t = tables.imu["t"]
-    hit = g.random(len(t)) < SPIKED
-    off = hit * size[:, None] * g.standard_normal((6, len(t)))
-    imu = {**tables.imu, **{c: tables.imu[c] + x for c, x in zip((*ACCEL, *GYRO), off)}}
-    return drive_from_tables(replace(tables, imu=imu), "", 50.0, 1.0, torch.float64)
+def stamped_late(seconds: float) -> Callable[[CheckedTables], CheckedTables]:
+    """Stamps of fixes so late."""
+    return lambda tables: replace(tables, gnss={**tables.gnss, "t": tables.gnss["t"] + seconds})
+
+
+def antenna_elsewhere(tables: CheckedTables) -> CheckedTables:
+    """A lever arm that is wrong by :data:`WRONG_ARM`."""
+    arm = tuple(x + off for x, off in zip(tables.row.lever_arm_b, WRONG_ARM))
+    return replace(tables, row=replace(tables.row, lever_arm_b=arm))
+
+
+OF_FILES: Mapping[str, Callable[[CheckedTables], CheckedTables]] = {
+    "fixes stamped 0.1 s late": stamped_late(0.1),
+    "0.3 s late": stamped_late(0.3),
+    "antenna 1.4 m elsewhere": antenna_elsewhere,
+    "accelerometers: 15 m/s² in one of 500 samples": spikes(15.0, 0.0),
+    "gyroscopes: 1 rad/s in one of 500 samples": spikes(0.0, 1.0),
+}
+
+
+def from_wrong_files(folder: Path, kind: str) -> list[Drive]:
+    """The drives of a dataset whose files are wrong."""
+    tables = [OF_FILES[kind](read_checked(folder, row)) for row in drive_rows(folder)]
+    return [drive_from_tables(one, "", 50.0, 1.0, torch.float64) for one in tables]
 
 
 def rivals() -> dict[str, Estimator]:
     """The constants of ``any_car`` without a gate and with it, those of ``gradient`` with it, and ``plus``."""
     imu, tuning = imu_preset("automotive_mems"), tuning_preset("any_car")
-    gated = f"{BASE}_gated+vibration_speed"
-    filters = {f"{n} any_car": build_causal(n, imu, "no", tuning=tuning) for n in (f"{BASE}+vibration_speed", gated)}
+    plain, gated = f"{BASE}{SOURCES}", f"{BASE}_gated{SOURCES}"
+    filters = {f"{n} any_car": build_causal(n, imu, "no", tuning=tuning) for n in (plain, gated)}
     filters[f"{gated} gradient"] = build_causal(gated, imu, "no", tuning=tuning_preset("gradient"))
     return {**filters, "plus": trained_filter("plus")}
 
@@ -179,10 +202,10 @@ def outage_rows(name: str, folder: Path, filters: Mapping[str, Estimator]) -> It
     """Where, kind of error and row of every kind that a dataset can have."""
     drives = load(folder)
     moves = any(bool(d.gnss_valid[:, 3:].any()) for d in drives)
-    for kind in (*ERRORS, *SPIKES):
+    for kind in (*ERRORS, *OF_FILES):
         if (kind in OF_VELOCITIES and not moves) or (kind in OF_IMU and name not in REAL):
             continue
-        wrong = with_spikes(folder, kind) if kind in SPIKES else [with_errors(d, kind) for d in drives]
+        wrong = from_wrong_files(folder, kind) if kind in OF_FILES else [with_errors(d, kind) for d in drives]
         for case in real_cases(name, wrong) if name in REAL else simulated_cases(name, wrong):
             for row in score(case, filters):
                 if kind not in OF_IMU:
@@ -288,7 +311,7 @@ def main() -> None:
             rows.setdefault((where, kind), []).append(row)
         print(name, flush=True)
     order = ("real motion", "real drives", "simulated")
-    rows = dict(sorted(rows.items(), key=lambda x: (order.index(x[0][0]), [*ERRORS, *SPIKES].index(x[0][1]))))
+    rows = dict(sorted(rows.items(), key=lambda x: (order.index(x[0][0]), [*ERRORS, *OF_FILES].index(x[0][1]))))
     (options.out / "outages.md").write_text("\n".join(table(rows)) + "\n")
     (options.out / "manifest.json").write_text(json.dumps(describe_provenance(), indent=1) + "\n")
 

@@ -31,7 +31,7 @@ def study():
 
 def test_every_rival_is_a_tuning_that_anybody_can_name(study):
     found = study.constants()
-    names = [name + more for name in study.CONSTANTS for more in ("", "+vibration_speed")]
+    names = [name + more for name in study.CONSTANTS for more in ("", study.SOURCES)]
     rivals = {f"{name} {t}" for name in names for t in study.CONSTANTS[name.partition("+")[0]]}
     assert set(found) == rivals
     plus = trained_filter("plus")

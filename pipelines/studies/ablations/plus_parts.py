@@ -32,16 +32,17 @@ class AsClaimed(PlusFilter):
 
 
 def parts(folder: str) -> dict[str, Estimator]:
-    """``plus`` with neither levels nor network, with one of them, with fixes as claimed, without vibration."""
+    """``plus`` with neither levels nor network, with one of them, with fixes as claimed, without one of its sources."""
     whole = trained_filter(folder)
     assert isinstance(whole, PlusFilter)
     found: dict[str, Estimator] = {}
     kinds = {"neither levels nor network": (WithoutLevels, False), "no network": (PlusFilter, False)}
     kinds["no levels"] = (WithoutLevels, True)
     kinds["fixes as claimed"] = (AsClaimed, True)
-    kinds["no speed from vibration"] = (PlusFilter, True)
+    bases = {"no speed from vibration": "+vibration_speed", "no delay and antenna": "+receiver"}
+    kinds |= dict.fromkeys(bases, (PlusFilter, True))
     for name, (kind, network) in kinds.items():
-        config = replace(whole.config, base="mbkf33_car_gated") if name == "no speed from vibration" else whole.config
+        config = replace(whole.config, base=whole.config.base.replace(bases.get(name, ""), ""))
         found[name] = part = kind(config).eval()
         part.load_state_dict(whole.state_dict())
         if not network:

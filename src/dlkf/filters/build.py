@@ -1,6 +1,6 @@
 """Filters by name: ``ins``, or a Kalman filter with endings for what it carries, as in ``mbkf21_nhc_gated``.
 
-A sensor stands behind a plus, as in ``mbkf15+speed``, as do ``vibration_speed``
+A sensor stands behind a plus, as in ``mbkf15+speed``, as do ``vibration_speed``, ``receiver``
 (:data:`dlkf.filters.aids.attach.SOURCES`) and sources of measurements of one's own, as in
 ``mbkf21_nhc+my_sources:SpeedLimit``: a module on PYTHONPATH and a class in it (:mod:`dlkf.filters.sources`).
 """

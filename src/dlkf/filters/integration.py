@@ -89,6 +89,7 @@ class Correction(NamedTuple):
     accepted: Tensor | None = None  # (B,) bool: a fix was used; None: all that might be
     covariances: Covariances | None = None
     aids: Tensor | None = None  # (B, A) of further sensors, see dlkf.filters.aids.report.aid_columns
+    innovation: Tensor | None = None  # (B, 6) as the estimator predicts the fix; None: as the loop does
 
 
 @runtime_checkable
@@ -167,17 +168,18 @@ def advance(
     tail = max(1, min(imu.shape[1], round(RATE_AVERAGE_S / dt)))
     at_fix = prior if fix.lag is None else window.before(fix.lag, dt)
     rate_b = corrected[:, -tail:, 3:].sum(1) / tail
-    rate_at_fix_b = rate_b if fix.lag is None else _rate_before(corrected[..., 3:], fix.lag / dt, tail)
+    rate_at_fix_b = rate_b if fix.lag is None else rate_before(corrected[..., 3:], fix.lag / dt, tail)
     predicted = antenna(at_fix, rate_at_fix_b, lever_arm_b, frame)
     z = (fix.value - predicted) * fix.used
     epoch = Epoch(imu, corrected, error, state, window, at_fix, rate_b, rate_at_fix_b, z, fix, lever_arm_b, dt, frame)
     memory, answer = estimator.step(memory, epoch)
     after = ImuError.of(answer.imu_error)
     complete = after.bias if after.matrix is None else after.at(corrected.mean(1))
-    return memory, Step(prior, prior.corrected(answer.dx), after, z, complete, answer)
+    innovation = z if answer.innovation is None else answer.innovation
+    return memory, Step(prior, prior.corrected(answer.dx), after, innovation, complete, answer)
 
 
-def _rate_before(rates: Tensor, late: Tensor, count: int) -> Tensor:
+def rate_before(rates: Tensor, late: Tensor, count: int) -> Tensor:
     """Mean of the ``count`` samples (B, M, 3) that end nearest to ``late`` (B,) samples before the window's end."""
     M = rates.shape[1]
     end = M - (late + 0.5).floor().clamp(0, M - count).unsqueeze(-1)

@@ -18,6 +18,7 @@ from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD
 from dlkf.filters.gating import CoarseGate, Gate
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
 from dlkf.filters.kalman_update import kalman_prediction, kalman_update
+from dlkf.filters.receiver import has_receiver, predict_fix, widen_start
 from dlkf.filters.sources import FixMemory, GnssFix, Measurement, Parameter, Predicted, Source, describe_aid
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.calibration import ImuError
@@ -98,7 +99,7 @@ class Mbkf:
     @cached_property
     def fix(self) -> GnssFix:
         """Where GNSS comes in; built once, since the gate's limits take longer than an epoch."""
-        return GnssFix(self.tuning, self.states.count, Gate(self.tuning.gate) if self.gated else CoarseGate())
+        return GnssFix(self.tuning, self.states, Gate(self.tuning.gate) if self.gated else CoarseGate())
 
     @property
     def code(self) -> Mbkf:
@@ -145,6 +146,8 @@ class Mbkf:
             error = error._replace(bias=torch.cat((error.bias[:, :3], bias + gain * (found - bias)), -1))
             sigma = torch.cat((sigma[:, :12], ((1 - gain) * variance).sqrt(), sigma[:, 15:]), -1)
         P, fix = torch.diag_embed(sigma**2), self.fix.begin(batch)
+        if has_receiver(self.states):
+            P = widen_start(P, batch.start, self.states)
         return KalmanMemory(P, windows, fix, sources, structure, noise, parameters), error
 
     @cached_property
@@ -164,7 +167,15 @@ class Mbkf:
 
     def step(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Correction]:
         """:meth:`update` with what the gate leaves of the fix."""
-        return self.update(*self.screened(memory, epoch))
+        epoch = self.predicted_fix(memory, epoch)
+        memory, correction = self.update(*self.screened(memory, epoch))
+        return memory, correction._replace(innovation=epoch.z)
+
+    def predicted_fix(self, memory: KalmanMemory, epoch: Epoch) -> Epoch:
+        """The epoch with the innovation that delay and antenna give, where the filter estimates them."""
+        if memory.parameters is None or not has_receiver(self.states):
+            return epoch
+        return predict_fix(epoch, self._named(memory))
 
     def screened(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Epoch]:
         """Memory and epoch after the gate of its fixes."""
@@ -182,8 +193,7 @@ class Mbkf:
         prediction = Predicted(predicted, memory.structure, memory.noise)
         fix = self.fix.rows(epoch, memory.fix, memory.noise)
         if memory.parameters is not None:
-            named = dict(zip(self.states.others, memory.parameters.unbind(-1)))
-            prediction = prediction._replace(parameters=named)
+            prediction = prediction._replace(parameters=self._named(memory))
         parts, sources, said = [fix], [], []
         for source, of_source in zip(self.sources, memory.sources, strict=True):
             rows, of_source = source.rows(epoch, of_source, prediction)
@@ -222,6 +232,11 @@ class Mbkf:
             accepted=epoch.used.any(-1), covariances=Covariances(Phi, predicted, P, fix.H, fix.R, dx),
             aids=torch.cat(said, -1) if said else None,
         )  # fmt: skip
+
+    def _named(self, memory: KalmanMemory) -> dict[str, Tensor]:
+        """Estimates (B,) of the sources' parameters."""
+        assert memory.parameters is not None
+        return dict(zip(self.states.others, memory.parameters.unbind(-1)))
 
     def _transition(self, memory: KalmanMemory, epoch: Epoch) -> Float[Tensor, "B n n"]:
         if not (self.cut_transition and torch.is_grad_enabled()):

@@ -72,7 +72,7 @@ class PlusConfig:
     """A ``plus`` filter: its classical filter and the size of its network."""
 
     kind: Literal["plus"] = "plus"
-    base: str = "mbkf33_car_gated+vibration_speed"
+    base: str = "mbkf33_car_gated+vibration_speed+receiver"
     network: PlusNetworkConfig = field(default_factory=PlusNetworkConfig)
     tuning: Mapping[str, float] = field(default_factory=lambda: dict(START_TUNING))
     imu: Mapping[str, Any] = field(default_factory=lambda: dict(ANY_MEMS))
@@ -154,7 +154,8 @@ class PlusFilter(nn.Module):
 
     def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
         """Network, the Kalman filter with the noise of both, then the virtual outage beside it."""
-        claimed, offered = epoch, memory.fix_noise.inflated(epoch)
+        claimed = self.kalman.predicted_fix(memory.kalman, epoch)
+        offered = memory.fix_noise.inflated(claimed)
         kalman, epoch = self.kalman.screened(memory.kalman, offered)
         walk = torch.diag_embed(memory.errors.variance(offered))
         outage = memory.outage._replace(P=_with_walk(memory.outage.P, walk))
@@ -198,6 +199,7 @@ class PlusFilter(nn.Module):
                 matching = matching.corrected(c.dx, c.predicted, c.updated, epoch.window.end.C_nb, fixed)
         if correction.std is not None:
             correction = correction._replace(std=errors.stated(correction.std))
+        correction = correction._replace(innovation=claimed.z)
         return memory._replace(
             kalman=kalman, hidden=hidden, matching=matching, outage=outage, errors=errors, fix_noise=fix_noise,
             gyro_noise=gyro_noise, fix_speed=torch.where(fixed, forward, memory.fix_speed),

@@ -38,9 +38,10 @@ from dlkf.data.drive import Batch
 from dlkf.filters.adaptive import AdaptiveNoise
 from dlkf.filters.gating import CoarseMemory, FixGate, GateMemory
 from dlkf.filters.integration import Epoch
+from dlkf.filters.receiver import add_columns, has_receiver
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.error_model import mask_rows, measurement_matrix
-from dlkf.navigation.state import VELOCITY
+from dlkf.navigation.state import VELOCITY, ErrorStates
 
 
 class Measurement(NamedTuple):
@@ -124,7 +125,7 @@ class GnssFix:
     """Position and velocity of GNSS, with lever arm and lag; a gate refuses outliers first."""
 
     tuning: Tuning
-    states: int
+    states: ErrorStates
     gate: FixGate
 
     def begin(self, batch: Batch) -> FixMemory:
@@ -157,9 +158,9 @@ class GnssFix:
 
     def matrix(self, epoch: Epoch) -> Float[Tensor, "B 6 n"]:
         """H of all components, used or not."""
-        H = measurement_matrix(epoch.at_fix, epoch.rate_at_fix_b, epoch.lever_arm_b, epoch.frame, self.states)
+        H = measurement_matrix(epoch.at_fix, epoch.rate_at_fix_b, epoch.lever_arm_b, epoch.frame, self.states.count)
         if epoch.fix.lag is not None:  # δp at the fix = δp at the window's end − lag · δv
             H = H.clone()
             v = VELOCITY.start
             H[:, 0, v] = H[:, 1, v + 1] = H[:, 2, v + 2] = -epoch.fix.lag
-        return H
+        return add_columns(H, epoch, self.states) if has_receiver(self.states) else H

@@ -10,6 +10,7 @@ from typing import Any
 from dlkf.data.aid_tables import AidTable
 from dlkf.filters.aids.heading import DualAntennaHeading
 from dlkf.filters.aids.height import Barometer
+from dlkf.filters.aids.receiver import Receiver
 from dlkf.filters.aids.wheel_speed import WheelSpeed
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.model_based import Mbkf
@@ -19,7 +20,8 @@ from dlkf.filters.vibration_speed import VibrationSpeed
 from dlkf.navigation.state import ErrorStates
 
 SENSORS: Mapping[str, type[Source]] = {"speed": WheelSpeed, "heading": DualAntennaHeading, "baro": Barometer}
-SOURCES: Mapping[str, type[Source]] = {**SENSORS, "vibration_speed": VibrationSpeed}  # that stand behind a plus
+OTHERS: Mapping[str, type[Source]] = {"vibration_speed": VibrationSpeed, "receiver": Receiver}
+SOURCES: Mapping[str, type[Source]] = {**SENSORS, **OTHERS}  # that stand behind a plus
 
 
 def add_sources(kalman: Mbkf, kinds: Sequence[type[Source]]) -> Mbkf:

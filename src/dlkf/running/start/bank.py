@@ -266,7 +266,7 @@ class BankFilter(Mbkf):
     @cached_property
     def fix(self) -> GnssFix:
         """Where GNSS comes in."""
-        return GnssFix(self.tuning, self.states.count, Gate(self.tuning.gate, usual=0.0))
+        return GnssFix(self.tuning, self.states, Gate(self.tuning.gate, usual=0.0))
 
 
 def bank_filter() -> Mbkf:

@@ -1,0 +1,69 @@
+"""What a log does not know of its receiver: how old a fix is at its stamp, and where the antenna is.
+
+With a delay d of the fixes and an antenna at l̂ = l + δl from the IMU, a fix that is stamped t is predicted as position
+and velocity of the antenna at t − d (:func:`dlkf.navigation.error_model.antenna`): between two samples of the window,
+and beyond its ends with its mean acceleration a. H has −v_a and −a for δd, C and C [ω×] for δl, with v_a the velocity
+of the antenna, and −(λ + d) I for the velocity in a position that lies λ before the window's end by its stamp. A filter
+with the source ``+receiver`` (:class:`dlkf.filters.aids.receiver.Receiver`) estimates d and δl.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dlkf.filters.integration import Epoch, rate_before
+from dlkf.navigation.attitude import skew
+from dlkf.navigation.error_model import RATE_AVERAGE_S, antenna
+from dlkf.navigation.state import POSITION, ErrorStates, NavState
+
+DELAY = "fix_delay_s"
+ARM = ("lever_forward_m", "lever_right_m", "lever_down_m")
+
+
+def has_receiver(states: ErrorStates) -> bool:
+    """Whether a filter has these states."""
+    return DELAY in states.others
+
+
+def widen_start(P: Float[Tensor, "B n n"], start: NavState, states: ErrorStates) -> Float[Tensor, "B n n"]:
+    """P of a start whose position is that of a fix: as uncertain as its age and its antenna, σ_d² v vᵀ + C Σ_l Cᵀ."""
+    P, k, d = P.clone(), states.of(ARM[0]).start, states.of(DELAY).start
+    v, C = start.v_n.unsqueeze(-1), start.C_nb
+    P[:, POSITION, POSITION] += P[:, d : d + 1, d : d + 1] * (v @ v.mT) + C @ P[:, k : k + 3, k : k + 3] @ C.mT
+    return P
+
+
+def predict_fix(epoch: Epoch, parameters: Mapping[str, Tensor]) -> Epoch:
+    """The epoch with the innovation, and the state at the fix, that estimates (B,) of delay and antenna give."""
+    arm = torch.stack([parameters[name] for name in ARM], -1)
+    if epoch.lever_arm_b is not None:
+        arm = arm + epoch.lever_arm_b
+    lag, M, dt = parameters[DELAY], epoch.imu.shape[1], epoch.dt
+    if epoch.fix.lag is not None:
+        lag = lag + epoch.fix.lag
+    within = lag.clamp(0.0, (M - 1) * dt)
+    at_fix = epoch.window.before(within, dt)
+    tail = max(1, min(M, round(RATE_AVERAGE_S / dt)))
+    rate, beyond = rate_before(epoch.corrected[..., 3:], within / dt, tail), (lag - within).unsqueeze(-1)
+    p, v = antenna(at_fix, rate, arm, epoch.frame).split(3, -1)
+    a = _acceleration(epoch)
+    predicted = torch.cat((p - beyond * v + 0.5 * beyond.square() * a, v - beyond * a), -1)
+    z, fix = (epoch.fix.value - predicted) * epoch.used, epoch.fix._replace(lag=lag)
+    return epoch._replace(at_fix=at_fix, rate_at_fix_b=rate, lever_arm_b=arm, z=z, fix=fix)
+
+
+def add_columns(H: Float[Tensor, "B 6 n"], epoch: Epoch, states: ErrorStates) -> Float[Tensor, "B 6 n"]:
+    """H with the columns of delay and antenna, for an epoch of :func:`predict_fix`."""
+    H, C, k = H.clone(), epoch.at_fix.C_nb, states.of(ARM[0]).start
+    v = antenna(epoch.at_fix, epoch.rate_at_fix_b, epoch.lever_arm_b, epoch.frame)[:, 3:]
+    H[:, :, states.of(DELAY).start] = -torch.cat((v, _acceleration(epoch)), -1)
+    H[:, :, k : k + 3] = torch.cat((C, C @ skew(epoch.rate_at_fix_b)), 1)
+    return H
+
+
+def _acceleration(epoch: Epoch) -> Float[Tensor, "B 3"]:
+    return (epoch.window.end.v_n - epoch.start.v_n) / (epoch.dt * epoch.imu.shape[1])

@@ -1,0 +1,118 @@
+"""Delay of the fixes and place of the antenna as states: H by differences, what is found, and what it is worth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from dlkf.data.alignment import ALIGN
+from dlkf.data.masks import withhold_fixes
+from dlkf.data.schema import write_drive, write_drives_table
+from dlkf.data.segments import whole_drives
+from dlkf.data.store import load_dataset
+from dlkf.filters.aids.attach import aid_columns
+from dlkf.filters.build import build_filter
+from dlkf.filters.integration import Epoch, Fix, integrate
+from dlkf.filters.receiver import ARM, DELAY, add_columns, predict_fix
+from dlkf.navigation.calibration import ImuError
+from dlkf.navigation.strapdown import strapdown
+from dlkf.running.start import align_each
+from tests.cars import IMU, car, car_batch
+
+WRONG = {DELAY: 0.2, "lever_forward_m": 1.0, "lever_right_m": -0.6, "lever_down_m": 0.0}
+
+
+def test_h_is_the_derivative_of_the_predicted_fix():
+    """Of delay and antenna, in the middle of a window; its velocity is that of then."""
+    batch = car_batch(3, 4)
+    states = build_filter("mbkf15+receiver", IMU).states
+    imu, frame, dt = batch.imu[:, 0], batch.frame, batch.dt
+    window = strapdown(batch.start, imu, dt, frame)
+    arm, nothing = torch.tensor([0.4, -0.2, -1.0]).expand(3, -1).to(imu), imu.new_zeros(3, 6)
+    fix = Fix(batch.gnss[:, 0], batch.gnss_std[:, 0], torch.ones(3, 6, dtype=torch.bool), None)
+    rate, found = imu[:, -5:, 3:].mean(1), torch.tensor([0.51, 0.3, -0.1, 0.2]).repeat(3, 1).to(imu)
+    epoch = Epoch(
+        imu, imu, ImuError(nothing), batch.start, window, window.end, rate, rate, nothing, fix, arm, dt, frame
+    )
+
+    def predicted(values: torch.Tensor) -> Epoch:
+        return predict_fix(epoch, dict(zip((DELAY, *ARM), values.unbind(-1))))
+
+    H = add_columns(imu.new_zeros(3, 6, states.count), predicted(found), states)
+    for k, name in enumerate((DELAY, *ARM)):
+        step = torch.zeros_like(found)
+        step[:, k] = 0.1 if k == 0 else 1e-3
+        measured = (predicted(found - step).z - predicted(found + step).z) / (2 * step[:, k : k + 1])
+        # H has the mean acceleration of the window, and leaves out that the antenna turns with the Earth
+        close = {"atol": 0.15, "rtol": 0.02} if k == 0 else {"atol": 1e-4}
+        assert torch.allclose(measured, H[:, :, states.of(name).start], **close)
+    kalman = build_filter("mbkf15+receiver", IMU)
+    whole = kalman.fix.matrix(predicted(found))
+    assert torch.equal(whole[:, 0, states.velocity], torch.tensor([[-0.51, 0.0, 0.0]]).expand(3, -1).to(imu))
+
+
+def test_the_position_of_a_start_is_as_uncertain_as_the_age_and_the_antenna_of_a_fix():
+    batch = car_batch(2, 3)
+    P = build_filter("mbkf15+receiver", IMU).begin(batch)[0].P
+    v, C = batch.start.v_n, batch.start.C_nb
+    own = torch.diag_embed(batch.start_std[:, :3].square())
+    want = own + 0.1**2 * v[:, :, None] * v[:, None] + 0.3**2 * C @ C.mT
+    assert torch.allclose(P[:, :3, :3], want.to(P), rtol=1e-9)
+    assert torch.equal(P[:, :3, 3:], torch.zeros_like(P[:, :3, 3:]))
+
+
+@pytest.fixture(scope="module")
+def cars(tmp_path_factory):
+    """Five minutes, once as it is and once with fixes that are 0.2 s old at their stamp and an antenna elsewhere; noise
+    of IMU and receiver."""
+    folder, g = tmp_path_factory.mktemp("receiver"), np.random.default_rng(0)
+    tables = car(300)
+    imu, gnss = tables["imu"], tables["gnss"]
+    imu[["accel_x", "accel_y", "accel_z"]] += 0.02 * g.standard_normal((len(imu), 3)) + 0.03
+    imu[["gyro_x", "gyro_y", "gyro_z"]] += 1e-3 * g.standard_normal((len(imu), 3)) + 1e-3
+    gnss[["lat_deg", "lon_deg"]] += 0.02 / 111_195 * g.standard_normal((len(gnss), 2))
+    gnss["height_m"] += 0.03 * g.standard_normal(len(gnss))
+    gnss[["vel_n", "vel_e", "vel_d"]] += 0.05 * g.standard_normal((len(gnss), 3))
+    late = gnss.assign(t=gnss["t"] + WRONG[DELAY])
+    for name, fixes in (("right", gnss), ("wrong", late)):
+        arm = {f"lever_arm_{x}_m": -WRONG[n] if name == "wrong" else 0.0 for x, n in zip("xyz", ARM)}
+        row = write_drive(folder / name, {"drive": name, **arm}, imu, fixes, tables["reference"])
+        write_drives_table(folder / name, [row])
+    return {name: load_dataset(folder / name, dtype=torch.float64)[0] for name in ("right", "wrong")}
+
+
+def run(drive, model: str, outage: bool = False):
+    """Solution and batch; with an outage, the last 30 s are without fixes."""
+    batch = whole_drives([drive], align_each([drive], replace(ALIGN, search_s=0.0)))
+    T = batch.size[1]
+    if outage:
+        batch = withhold_fixes(batch, (torch.arange(T) >= T - 30).expand(1, -1))
+    kalman = build_filter(model, IMU)
+    return kalman, integrate(batch, kalman, keep_innovations=True), batch
+
+
+def test_delay_and_antenna_are_found(cars):
+    """Within 3σ, of which the delay's is below 10 ms; the innovations are then as large as the filter says."""
+    for name, wrong in (("wrong", WRONG), ("right", dict.fromkeys(WRONG, 0.0))):
+        kalman, solution, _ = run(cars[name], "mbkf21_car+receiver")
+        columns = aid_columns(kalman)
+        last = dict(zip(columns, solution.aids[0, -1].tolist()))
+        for parameter, value in wrong.items():
+            assert abs(last[parameter] - value) < 3 * last[f"std_{parameter}"]
+        assert last[f"std_{DELAY}"] < 0.01 and max(last[f"std_{x}"] for x in ARM[:2]) < 0.15
+        z, S = solution.innovation[0, 100:], solution.innovation_covariance[0, 100:]
+        ratio = (z.unsqueeze(1) @ torch.linalg.solve(S, z.unsqueeze(-1))).mean() / 6
+        assert 0.2 < ratio < 1.5
+
+
+def test_an_outage_is_as_good_as_with_the_right_ones(cars):
+    def error(name: str, model: str) -> float:
+        _, solution, batch = run(cars[name], model, outage=True)
+        return float((solution.posterior.p_n - batch.truth.p_n)[0, -1, :2].norm())
+
+    right = error("right", "mbkf21_car")
+    assert error("right", "mbkf21_car+receiver") < right + 0.3
+    assert error("wrong", "mbkf21_car+receiver") < right + 0.5 < 2.0 < error("wrong", "mbkf21_car")
