@@ -16,8 +16,9 @@ from dlkf.data.store import load_dataset
 from dlkf.filters.aids.attach import aid_columns
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Epoch, Fix, integrate
-from dlkf.filters.receiver import ARM, DELAY, add_columns, predict_fix
+from dlkf.filters.receiver import ARM, DELAY, predict_fix
 from dlkf.navigation.calibration import ImuError
+from dlkf.navigation.error_model import antenna
 from dlkf.navigation.strapdown import strapdown
 from dlkf.running.start import align_each
 from tests.cars import IMU, car, car_batch
@@ -25,33 +26,48 @@ from tests.cars import IMU, car, car_batch
 WRONG = {DELAY: 0.2, "lever_forward_m": 1.0, "lever_right_m": -0.6, "lever_down_m": 0.0}
 
 
-def test_h_is_the_derivative_of_the_predicted_fix():
-    """Of delay and antenna, in the middle of a window; its velocity is that of then."""
+ANTENNA = (0.4, -0.2, -1.0)
+
+
+@pytest.fixture(scope="module")
+def epoch() -> Epoch:
+    """The first window of three cars, with an antenna away from the IMU."""
     batch = car_batch(3, 4)
-    states = build_filter("mbkf15+receiver", IMU).states
     imu, frame, dt = batch.imu[:, 0], batch.frame, batch.dt
     window = strapdown(batch.start, imu, dt, frame)
-    arm, nothing = torch.tensor([0.4, -0.2, -1.0]).expand(3, -1).to(imu), imu.new_zeros(3, 6)
+    arm, nothing = torch.tensor(ANTENNA).expand(3, -1).to(imu), imu.new_zeros(3, 6)
     fix = Fix(batch.gnss[:, 0], batch.gnss_std[:, 0], torch.ones(3, 6, dtype=torch.bool), None)
-    rate, found = imu[:, -5:, 3:].mean(1), torch.tensor([0.51, 0.3, -0.1, 0.2]).repeat(3, 1).to(imu)
-    epoch = Epoch(
-        imu, imu, ImuError(nothing), batch.start, window, window.end, rate, rate, nothing, fix, arm, dt, frame
-    )
+    rate = imu[:, -2:, 3:].mean(1)  # of 0.1 s
+    return Epoch(imu, imu, ImuError(nothing), batch.start, window, window.end, rate, rate, nothing, fix, arm, dt, frame)
 
-    def predicted(values: torch.Tensor) -> Epoch:
-        return predict_fix(epoch, dict(zip((DELAY, *ARM), values.unbind(-1))))
 
-    H = add_columns(imu.new_zeros(3, 6, states.count), predicted(found), states)
+def predicted(epoch: Epoch, *values: float) -> Epoch:
+    """With these estimates of delay and antenna."""
+    return predict_fix(epoch, {name: epoch.z.new_full((3,), x) for name, x in zip((DELAY, *ARM), values)})
+
+
+def test_h_is_the_derivative_of_the_predicted_fix(epoch):
+    """Of delay and antenna, in the middle of a window; its velocity is that of then."""
+    kalman, found = build_filter("mbkf15+receiver", IMU), (0.51, 0.3, -0.1, 0.2)
+    H = kalman.fix.matrix(predicted(epoch, *found))
     for k, name in enumerate((DELAY, *ARM)):
-        step = torch.zeros_like(found)
-        step[:, k] = 0.1 if k == 0 else 1e-3
-        measured = (predicted(found - step).z - predicted(found + step).z) / (2 * step[:, k : k + 1])
+        step = 0.1 if k == 0 else 1e-3
+        less, more = ([x + sign * step * (i == k) for i, x in enumerate(found)] for sign in (-1, 1))
+        measured = (predicted(epoch, *less).z - predicted(epoch, *more).z) / (2 * step)
         # H has the mean acceleration of the window, and leaves out that the antenna turns with the Earth
         close = {"atol": 0.15, "rtol": 0.02} if k == 0 else {"atol": 1e-4}
-        assert torch.allclose(measured, H[:, :, states.of(name).start], **close)
-    kalman = build_filter("mbkf15+receiver", IMU)
-    whole = kalman.fix.matrix(predicted(found))
-    assert torch.equal(whole[:, 0, states.velocity], torch.tensor([[-0.51, 0.0, 0.0]]).expand(3, -1).to(imu))
+        assert torch.allclose(measured, H[:, :, kalman.states.of(name).start], **close)
+    assert torch.equal(H[:, 0, kalman.states.velocity], H.new_tensor([[-0.51, 0.0, 0.0]]).expand(3, -1))
+
+
+def test_with_nothing_found_the_fix_is_that_of_the_loop_and_an_early_one_lies_beyond_the_window(epoch):
+    at_end = antenna(epoch.window.end, epoch.rate_b, epoch.lever_arm_b, epoch.frame)
+    assert torch.allclose(predicted(epoch, 0, 0, 0, 0).z, epoch.fix.value - at_end, atol=1e-9)
+    early = predicted(epoch, -0.2, 0, 0, 0)
+    a = (epoch.window.end.v_n - epoch.start.v_n) / (epoch.dt * epoch.imu.shape[1])
+    further = torch.cat((0.2 * at_end[:, 3:] + 0.02 * a, 0.2 * a), -1)
+    assert torch.allclose(early.z, epoch.fix.value - at_end - further, atol=1e-9)
+    assert torch.equal(early.fix.lag, epoch.z.new_full((3,), -0.2))
 
 
 def test_the_position_of_a_start_is_as_uncertain_as_the_age_and_the_antenna_of_a_fix():

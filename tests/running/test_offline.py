@@ -71,6 +71,17 @@ def test_a_sensor_that_made_no_update_is_said_to_have_made_none():
     assert replace(result, table=nothing).sensors()["vibration_speed"] == "no update"
 
 
+def test_of_delay_and_antenna_what_differs_from_the_log_is_said():
+    """Beyond 3σ."""
+    result = driven(0).result
+    table = result.table.assign(
+        fix_delay_s=0.15, std_fix_delay_s=0.01, lever_forward_m=-0.2, std_lever_forward_m=0.1, wheel_scale=0.01,
+        std_wheel_scale=0.02,
+    )  # fmt: skip
+    said = replace(result, table=table).sensors()
+    assert said == {"fix_delay_s": "0.15 ± 0.01", "wheel_scale": "0.01 ± 0.02"}
+
+
 def test_drives_without_plots_of_their_own_are_kept_small_and_shown_the_same():
     whole = [driven(seed) for seed in range(3)]
     small = [course.for_the_map() for course in whole]
