@@ -71,13 +71,17 @@ def test_with_nothing_found_the_fix_is_that_of_the_loop_and_an_early_one_lies_be
 
 
 def test_the_position_of_a_start_is_as_uncertain_as_the_age_and_the_antenna_of_a_fix():
-    batch = car_batch(2, 3)
-    P = build_filter("mbkf15+receiver", IMU).begin(batch)[0].P
+    """Of a start that was found from fixes; one that is given is what it says."""
+    batch, kalman = car_batch(2, 3), build_filter("mbkf15+receiver", IMU)
+    given, found = (
+        kalman.begin(b)[0].P for b in (batch, replace(batch, start_noise=torch.ones(2, 2, dtype=torch.float64)))
+    )
     v, C = batch.start.v_n, batch.start.C_nb
     own = torch.diag_embed(batch.start_std[:, :3].square())
-    want = own + 0.1**2 * v[:, :, None] * v[:, None] + 0.3**2 * C @ C.mT
-    assert torch.allclose(P[:, :3, :3], want.to(P), rtol=1e-9)
-    assert torch.equal(P[:, :3, 3:], torch.zeros_like(P[:, :3, 3:]))
+    want = own + 0.05**2 * v[:, :, None] * v[:, None] + 0.2**2 * C @ C.mT
+    assert torch.allclose(found[:, :3, :3], want.to(found), rtol=1e-9)
+    assert torch.allclose(given[:, :3, :3], own.to(given), rtol=1e-9)
+    assert torch.equal(found[:, :3, 3:], torch.zeros_like(found[:, :3, 3:]))
 
 
 @pytest.fixture(scope="module")

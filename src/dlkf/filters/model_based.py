@@ -146,7 +146,7 @@ class Mbkf:
             error = error._replace(bias=torch.cat((error.bias[:, :3], bias + gain * (found - bias)), -1))
             sigma = torch.cat((sigma[:, :12], ((1 - gain) * variance).sqrt(), sigma[:, 15:]), -1)
         P, fix = torch.diag_embed(sigma**2), self.fix.begin(batch)
-        if has_receiver(self.states):
+        if has_receiver(self.states) and batch.start_noise is not None:  # a start that was found from fixes
             P = widen_start(P, batch.start, self.states)
         return KalmanMemory(P, windows, fix, sources, structure, noise, parameters), error
 
@@ -225,6 +225,10 @@ class Mbkf:
         parameters = memory.parameters
         if parameters is not None:
             parameters = parameters + dx[:, self.states.of_others]
+            largest = [self.parameters[name].largest for name in self.states.others]
+            if min(largest) < math.inf:
+                most = parameters.new_tensor(largest)
+                parameters = torch.maximum(torch.minimum(parameters, most), -most)
             said += [parameters, P.diagonal(dim1=-2, dim2=-1)[:, self.states.of_others].clamp_min(0).sqrt()]
         memory = KalmanMemory(P, memory.windows, memory.fix, tuple(sources), structure, noise, parameters)
         return memory, Correction(

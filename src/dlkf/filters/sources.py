@@ -26,6 +26,7 @@ heading and barometer do (:mod:`dlkf.filters.aids`); ``docs/developing.md`` has 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -54,12 +55,13 @@ class Measurement(NamedTuple):
 
 
 class Parameter(NamedTuple):
-    """A quantity that a source estimates as an error state of its own: its value and 1σ at the start, and the 1σ of
-    its random walk per √s."""
+    """A quantity that a source estimates as an error state of its own: its value and 1σ at the start, the 1σ of its
+    random walk per √s, and the largest value that an estimate may have."""
 
     std: float
     walk: float = 0.0
     start: float = 0.0
+    largest: float = math.inf
 
 
 class Predicted(NamedTuple):

@@ -23,8 +23,8 @@ class Receiver:
     states: ErrorStates
 
     parameters: ClassVar[Mapping[str, Parameter]] = {
-        DELAY: Parameter(std=0.1, walk=1e-4),
-        **{name: Parameter(std=0.3) for name in ARM},
+        DELAY: Parameter(std=0.05, walk=3e-4, largest=0.5),  # a walk that follows clocks 100 ppm apart
+        **{name: Parameter(std=0.2, largest=2.0) for name in ARM},
     }
 
     @property
