@@ -136,3 +136,12 @@ def test_an_outage_is_as_good_as_with_the_right_ones(cars):
     right = error("right", "mbkf21_car")
     assert error("right", "mbkf21_car+receiver") < right + 0.3
     assert error("wrong", "mbkf21_car+receiver") < right + 0.5 < 2.0 < error("wrong", "mbkf21_car")
+
+
+def test_what_is_beyond_any_receiver_is_not_followed(cars):
+    """An IMU that is three seconds late."""
+    right = cars["right"]
+    late = right.imu.flatten(0, 1).roll(round(3 * right.rate_hz), 0).reshape(right.imu.shape)
+    kalman, solution, _ = run(replace(right, imu=late), "mbkf21_car+receiver")
+    found = solution.aids[0, :, [*aid_columns(kalman)].index(DELAY)]
+    assert -0.5 <= float(found.min()) < -0.45
