@@ -86,10 +86,10 @@ def test_the_position_of_a_start_is_as_uncertain_as_the_age_and_the_antenna_of_a
 
 @pytest.fixture(scope="module")
 def cars(tmp_path_factory):
-    """Five minutes, once as it is and once with fixes that are 0.2 s old at their stamp and an antenna elsewhere; noise
+    """Three minutes, once as it is and once with fixes that are 0.2 s old at their stamp and an antenna elsewhere; noise
     of IMU and receiver."""
     folder, g = tmp_path_factory.mktemp("receiver"), np.random.default_rng(0)
-    tables = car(300)
+    tables = car(180)
     imu, gnss = tables["imu"], tables["gnss"]
     imu[["accel_x", "accel_y", "accel_z"]] += 0.02 * g.standard_normal((len(imu), 3)) + 0.03
     imu[["gyro_x", "gyro_y", "gyro_z"]] += 1e-3 * g.standard_normal((len(imu), 3)) + 1e-3
