@@ -128,4 +128,5 @@ def _spiked(x: np.ndarray) -> np.ndarray:
     most = np.maximum(size[:, BEFORE], size[:, BEFORE + 1])
     steady = most <= np.maximum(STEADY_FLOOR * _FLOORS, STEADY * usual)
     of_sensor = jumps.reshape(-1, 2, 3).any(-1)
-    return of_sensor.any(-1) & (of_sensor | steady.reshape(-1, 2, 3).all(-1)).all(-1)
+    fits = of_sensor | steady.reshape(-1, 2, 3).all(-1)
+    return (of_sensor[:, 0] | of_sensor[:, 1]) & fits[:, 0] & fits[:, 1]
