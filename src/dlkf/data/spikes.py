@@ -127,6 +127,7 @@ def _spiked(x: np.ndarray) -> np.ndarray:
     jumps = (least > np.maximum(_FLOORS, RATIO * usual)) & (up * down < 0) & (beside <= SHARE * least)
     most = np.maximum(size[:, BEFORE], size[:, BEFORE + 1])
     steady = most <= np.maximum(STEADY_FLOOR * _FLOORS, STEADY * usual)
-    of_sensor = jumps.reshape(-1, 2, 3).any(-1)
-    fits = of_sensor | steady.reshape(-1, 2, 3).all(-1)
-    return (of_sensor[:, 0] | of_sensor[:, 1]) & fits[:, 0] & fits[:, 1]
+    either, both = np.logical_or.reduce, np.logical_and.reduce
+    of_sensor = either(jumps.reshape(-1, 2, 3), axis=-1)
+    fits = of_sensor | both(steady.reshape(-1, 2, 3), axis=-1)
+    return either(of_sensor, axis=-1) & both(fits, axis=-1)
