@@ -86,8 +86,8 @@ def test_the_position_of_a_start_is_as_uncertain_as_the_age_and_the_antenna_of_a
 
 @pytest.fixture(scope="module")
 def cars(tmp_path_factory):
-    """Three minutes, once as it is and once with fixes that are 0.2 s old at their stamp and an antenna elsewhere; noise
-    of IMU and receiver."""
+    """Three minutes with noise of IMU and receiver, once as they are and once with fixes that are 0.2 s old at their
+    stamp and an antenna elsewhere."""
     folder, g = tmp_path_factory.mktemp("receiver"), np.random.default_rng(0)
     tables = car(180)
     imu, gnss = tables["imu"], tables["gnss"]
