@@ -11,8 +11,8 @@ antenna 1.4 m from where the lever arm says, one of 500 samples of a sensor spoi
 ``outages.md``: the outages of :mod:`pipelines.studies.plus` on real motion and on ``fleet``; the entirely real drives
 start on the wrong data, alone with biases (elsewhere the start is the truth with an error, which shows no bias). RMS /
 geometric mean of the horizontal error at the end over the rows [m] and mean NEES, of constants without a gate and with
-it and of ``plus``, and its ratio to the better constants with a gate, geometric mean over all outages with a 95 % interval over
-recordings.
+it and of ``plus``, and its ratio to the better constants with a gate, geometric mean over all outages with a 95 %
+interval over recordings.
 
 ``starts.md``: yaw at the start against the reference attitude, or where a drive has none that of ``plus`` on the same
 drive without errors; as a stream starts (``align.search_s=20``) and from rest (``align.from_rest=true`` beside it).
@@ -202,8 +202,8 @@ def from_wrong_files(folder: Path, kind: str) -> list[Drive]:
 
 
 def rivals() -> dict[str, Estimator]:
-    """Constants of ``any_car`` without a gate, with it, and with it but without delay and antenna; those of ``gradient``
-    with a gate; ``plus`` without delay and antenna; ``plus``."""
+    """Constants of ``any_car`` without a gate, with it, and with it but without delay and antenna; of ``gradient`` with
+    a gate; ``plus`` without delay and antenna; ``plus``."""
     imu, tuning = imu_preset("automotive_mems"), tuning_preset("any_car")
     plain, gated = f"{BASE}{SOURCES}", f"{BASE}_gated{SOURCES}"
     fixed = gated.replace("+receiver", "")
@@ -230,7 +230,7 @@ def outage_rows(name: str, folder: Path, filters: Mapping[str, Estimator]) -> It
 
 
 def table(rows: Mapping[tuple[str, str], list[Row]]) -> list[str]:
-    """A line for each kind of error; the ratio of ``plus`` to the better of the constants of ``any_car`` with a gate."""
+    """A line for each kind of error; the ratio of ``plus`` to the better constants of ``any_car`` with a gate."""
     names = list(next(iter(rows.values()))[0].errors)
     lines = [
         f"| | errors | rows | {' | '.join(names)} | `plus` : the better of the two with a gate |",
