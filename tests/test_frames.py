@@ -59,6 +59,11 @@ def test_numbers_of_other_types_and_columns_of_other_names(drive):
         dlkf.navigate(imu, gnss[["t", *POSITION]].assign(vn=gnss.vel_n, hacc=0.1), model="ins", rate_hz=10)
     with pytest.warns(UserWarning, match="plus has its own noise"):
         dlkf.load("plus", tuning="any_car")
+    with pytest.warns(UserWarning, match="imu_type has no effect .*model=plus_imu takes biases"):
+        dlkf.load("plus", imu_type="consumer")
+    assert dlkf.load("plus_imu", imu_type="consumer").imu.gyro.turn_on_bias == 9.69627e-4
+    with pytest.warns(UserWarning, match="plus_imu has its own noise: tuning has no effect [^;]*$"):
+        dlkf.load("plus_imu", tuning="any_car")
 
 
 def test_fixes_may_be_positions_alone(drive):

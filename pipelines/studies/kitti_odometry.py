@@ -174,7 +174,7 @@ def main() -> None:
     print(f"{len(drives)} drives of {len(set(sequence))} sequences, {km:.1f} km, {minutes:.0f} min")
     print(f"| filter | {' | '.join(sorted(set(sequence)))} | all [%] | without gaps [%] | rotation [°/km] |")
     print(f"|:--|{'--:|' * (len(set(sequence)) + 3)}")
-    for model in ("ins", "plus"):
+    for model in ("ins", "plus", "plus_imu"):
         print_row(model, by_sequence(errors_of(batch, resolve_model(model, spec)), sequence))
     for model in options.models:
         tunings = candidates()

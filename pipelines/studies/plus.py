@@ -12,8 +12,9 @@ The baselines start from ``imu=automotive_mems`` and constants from ``conf/tunin
 vibration, delay and antenna (``+vibration_speed+receiver``) as ``plus`` has them. The ratio is to the best of them by
 the geometric mean of that row, a choice with hindsight; [ ] is its 95 % interval over recordings. Beside them stands
 ``imu=auto``, whose noise is found on the drives that are scored, with all their fixes, and with ``--oracle``
-``mbkf33_car+vibration_speed+receiver`` given the noise that each simulated drive was made with. Last come, over all
-rows, every filter's errors, mean NEES, and the ratio of ``plus`` to it over all outages, by recordings.
+``mbkf33_car+vibration_speed+receiver`` given the IMU preset that each simulated drive was made with, and ``plus_imu``
+given its biases, scale factors and misalignments. Last come, over all rows, every filter's errors, mean NEES, and the
+ratio of ``plus`` to it over all outages, by recordings.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ from dlkf.evaluation.metrics import mean_error
 from dlkf.filters.build import build_causal, build_filter
 from dlkf.filters.integration import Estimator
 from dlkf.filters.model_based import Mbkf
-from dlkf.filters.shipped import trained_filter
+from dlkf.filters.shipped import KNOWN_IMU, plus_with_imu, trained_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.onboard.compiled_filter import compile_filter, compile_or_keep
 from dlkf.running.likelihood import Evidence, find_noise
@@ -61,6 +62,7 @@ BEFORE_S, LENGTHS_S, MOST = (60, 300, 900), (30, 60, 120), 48
 CONSTANTS = {"mbkf21_car": ("any_car", "gradient"), "mbkf33_car": ("any_car", "gradient")}
 SOURCES = "+vibration_speed+receiver"
 ORACLE = "true noise"
+GIVEN = (ORACLE, KNOWN_IMU)  # a preset of each drive's IMU
 REAL = ("rtkx", "wid", "wid_mru", "linkoping")
 TRAINING: Mapping[str, tuple[str, ...]] = {
     "train_wide": ("simulated@dataset=wide", "seed=1", "dataset.hours=5.4", "dataset.drive_minutes=18"),
@@ -163,25 +165,23 @@ def found_noise(drives: Sequence[Drive]) -> dict[str, Estimator]:
     return filters
 
 
-def given_noise(folder: Path) -> dict[str, Estimator]:
-    """``mbkf33_car`` with the sources of ``plus`` and the preset of each kind of IMU in a dataset, by the preset's
-    name."""
-    kinds = sorted(set(pd.read_parquet(folder / "drives.parquet")["imu"]))
-    tuning = replace(Tuning(), lateral_std=0.07, vertical_std=0.1)
-    return {k: build_causal("mbkf33_car" + SOURCES, imu_preset(k), "no", tuning=tuning) for k in kinds}
-
-
-def with_oracle(case: Case, rows: Sequence[Row], folder: Path) -> list[Row]:
-    """The rows with the errors of the filter that is given the noise of each drive."""
+def with_presets(case: Case, rows: Sequence[Row], folder: Path) -> list[Row]:
+    """The rows with the errors of the filters that are given the preset of each drive's IMU: ``mbkf33_car`` with the
+    sources of ``plus`` all of it, ``plus_imu`` all but the noise."""
     meta = pd.read_parquet(folder / "drives.parquet").set_index("group")["imu"]
-    by_kind = given_noise(folder)
-    given = []
-    for row, of_kinds in zip(rows, score(case, by_kind), strict=True):
-        kinds = [str(meta[g]) for g in row.groups]
-        errors = np.array([of_kinds.errors[k][i] for i, k in enumerate(kinds)])
-        nees = float(np.mean([of_kinds.nees[k] for k in kinds]))
-        given.append(replace(row, errors=row.errors | {ORACLE: errors}, nees=row.nees | {ORACLE: nees}))
-    return given
+    tuning = replace(Tuning(), lateral_std=0.07, vertical_std=0.1)
+    presets = {k: imu_preset(k) for k in sorted(set(meta))}
+    given = {ORACLE: {k: build_causal("mbkf33_car" + SOURCES, imu, "no", tuning=tuning) for k, imu in presets.items()}}
+    given[KNOWN_IMU] = {k: plus_with_imu(imu) for k, imu in presets.items()}
+    for name, by_kind in given.items():
+        found = []
+        for row, of_kinds in zip(rows, score(case, by_kind), strict=True):
+            kinds = [str(meta[g]) for g in row.groups]
+            errors = np.array([of_kinds.errors[k][i] for i, k in enumerate(kinds)])
+            nees = float(np.mean([of_kinds.nees[k] for k in kinds]))
+            found.append(replace(row, errors=row.errors | {name: errors}, nees=row.nees | {name: nees}))
+        rows = found
+    return list(rows)
 
 
 def score(case: Case, filters: Mapping[str, Estimator]) -> list[Row]:
@@ -207,7 +207,7 @@ def score(case: Case, filters: Mapping[str, Estimator]) -> list[Row]:
 
 def markdown(rows: Sequence[Row]) -> list[str]:
     """RMS / geometric mean of every filter, ratios of ``plus`` to the best other one without ``auto``, its NEES."""
-    after = [name for name in rows[0].errors if name.endswith(" auto") or name == ORACLE]
+    after = [name for name in rows[0].errors if name.endswith(" auto") or name in GIVEN]
     baselines = [name for name in rows[0].errors if name != "plus" and name not in after]
     head = [
         "data",
@@ -330,7 +330,7 @@ def main() -> None:
         for case in real_cases(name, drives) if name in REAL else simulated_cases(name, drives):
             scored = score(case, filters)
             simulated = name in SIMULATED or name in PYTHON_INS
-            rows += with_oracle(case, scored, folder) if options.oracle and simulated else scored
+            rows += with_presets(case, scored, folder) if options.oracle and simulated else scored
             print("\n".join(markdown(rows[-1:])[2:]), flush=True)
     lines = [*markdown(rows), "", *pooled(rows)]
     (options.out / "table.md").write_text("\n".join(lines) + "\n")

@@ -33,10 +33,10 @@ from dlkf.report.navigation import MOST_DRIVES, TrackOnMap, summary_lines, write
 from dlkf.running import offline
 from dlkf.running.exports import chosen_formats, export, utc_times
 from dlkf.running.innovations import OF_NETWORK, REMEDY
-from dlkf.running.likelihood import generic_filter
+from dlkf.running.likelihood import check_finds_noise, generic_filter
 from dlkf.running.replay import stream_drives
 from dlkf.running.solution import write_solution
-from dlkf.tracking.models import resolve_model, short_name, takes_imu_preset
+from dlkf.tracking.models import resolve_model, short_name, takes_tuning, unused_settings
 
 
 @command("navigate", NavigateSettings)
@@ -48,6 +48,8 @@ def main(settings: NavigateSettings) -> None:
     if not isinstance(settings.model, str):
         raise InputError(f"navigate runs one model at a time, got model={settings.model}")
     spec, tuning = settings.spec, settings.tuning
+    if spec.name == AUTO:
+        check_finds_noise(settings.model)
     model = resolve_model(settings.model, spec, settings.tracking.uri, **settings.filter_options)
     clocks = drive_clocks(settings.dataset)
     rows, name = drive_rows(settings.dataset, settings.drives), short_name(settings.model)
@@ -61,8 +63,8 @@ def main(settings: NavigateSettings) -> None:
         print(line)
     for line in domain_warnings({name: model}, settings.dataset, spacings, spec.name, grid["rate_hz"]):
         print(line)
-    if spec.name != AUTO and not takes_imu_preset(settings.model) and (unused := typed_words("imu", "tuning")):
-        print(f"{name} has its own noise: {' '.join(unused)} has no effect; it sets that of Kalman filters")
+    if spec.name != AUTO and (line := unused_settings(settings.model, typed_words("imu", "tuning"))):
+        print(line)
     skipped: dict[str, str] | None = {} if settings.skip_unaligned else None
     if settings.streaming and (ahead := "smoother" if settings.smoother else "imu=auto" if spec.name == AUTO else ""):
         raise InputError(f"{ahead} looks ahead, a stream cannot: give {ahead} or streaming, not both")
@@ -110,7 +112,7 @@ def main(settings: NavigateSettings) -> None:
             "aids": [table.name for table in grid["aids"]],
         }
         made |= {"digest": dataset_digest(settings.dataset), "imu": asdict(spec), "tuning": asdict(tuning)}
-        remedy = REMEDY if takes_imu_preset(settings.model) else OF_NETWORK
+        remedy = REMEDY if takes_tuning(settings.model) else OF_NETWORK
         doubt = offline.sigma_warning((course.result for course in courses), name, remedy)
         warnings = [doubt] if doubt else []
         write_page(folder, name, folder_name(settings.dataset), courses, made, warnings)

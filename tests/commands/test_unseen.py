@@ -57,7 +57,7 @@ def test_navigate_and_evaluate_say_so_of_a_file_and_of_a_rate(call, town, tmp_pa
         assert "told no noise" not in done.out
     noise = ("imu=consumer", "tuning.gyro_noise=2.5")
     done = call("navigate", f"dataset={town}", "out=untold", drive, *noise)
-    assert done.code == 0 and f"plus has its own noise: {' '.join(noise)} has no effect" in done.out, done
+    assert done.code == 0 and f"plus has its own noise: {' '.join(noise)} have no effect" in done.out, done
     done = call("navigate", "model=mbkf15", f"dataset={town}", "out=told", drive, *noise)
     assert done.code == 0 and "told no noise" not in done.out, done
     done = call("evaluate", "model=[mbkf15,plus]", f"dataset={slow}", "out=scored", drive, *SCORING)

@@ -11,6 +11,7 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.plus import PlusFilter
 from dlkf.filters.shipped import WEIGHTS_FOLDER, shipped_folder, trained_filter
+from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.tracking.models import resolve_model, short_name
 
 from .scene import IMU
@@ -28,6 +29,31 @@ def test_it_is_there_small_and_tells_what_it_was_trained_on():
 
 def test_model_plus_is_a_filter_like_any_other():
     assert isinstance(resolve_model("plus", IMU), PlusFilter) and short_name("plus") == "plus"
+
+
+def test_plus_imu_takes_biases_scale_factors_and_misalignments_of_a_preset():
+    """And nothing else: its noise is that of ``plus``."""
+    plus, known = trained_filter("plus"), resolve_model("plus_imu", IMU)
+    assert isinstance(known, PlusFilter) and short_name("plus_imu") == "plus_imu" and known.card == plus.card
+    for name in ("accel", "gyro"):
+        sensor, unknown, given = getattr(known.imu, name), getattr(plus.imu, name), getattr(IMU, name)
+        expected = {k: getattr(given, k) for k in ("turn_on_bias", "scale_factor", "misalignment")}
+        assert sensor == replace(unknown, **expected) != unknown
+    assert all(torch.equal(a, b) for a, b in zip(known.state_dict().values(), plus.state_dict().values(), strict=True))
+    assert known.tuning == plus.tuning
+
+
+def test_without_any_fix_a_known_imu_drifts_less():
+    """Nothing else shows a bias along the road: an unknown IMU's acceleration may well be one."""
+    batch = slipping(24, 60, (0.0, 0.0, 0.8, 0.0, 0.0))
+    unbiased = batch.imu - batch.true_imu_error.unsqueeze(2)
+    batch = replace(batch, imu=unbiased, available=torch.zeros_like(batch.available))
+    good = ImuSpec("good", SensorErrors(1e-3, turn_on_bias=1e-3), SensorErrors(1e-5, turn_on_bias=1e-5))
+    with torch.no_grad():
+        a, b = (integrate(batch, f) for f in (resolve_model("plus_imu", good), trained_filter("plus")))
+    off = [(s.posterior.p_n - batch.truth.p_n)[:, -1, :2].norm(dim=-1) for s in (a, b)]
+    assert off[0].log().mean() < off[1].log().mean() - 0.5
+    assert (a.std[:, -1, :2] < 0.5 * b.std[:, -1, :2]).all()
 
 
 @pytest.mark.whole

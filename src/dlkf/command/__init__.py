@@ -34,7 +34,7 @@ from dlkf.command.composing import to_plain
 from dlkf.command.faults import describe_fault
 from dlkf.command.help import help_text
 
-MISTAKE, INTERRUPTED, TERMINATED = 2, 130, 143
+MISTAKE, INTERRUPTED, UNREAD, TERMINATED = 2, 130, 141, 143
 stopped_by: list[int] = []  # signals that came while a command ran
 
 
@@ -50,7 +50,7 @@ def command(
 
     A user's mistake (:class:`InputError`, an unknown key or preset, a malformed override) and a fault of the machine
     (a full disk, a locked store, no GPU) are one line on stderr and exit code 2; Ctrl-C is exit code 130, SIGTERM
-    143; a fault of ours keeps its traceback. ``arguments`` may rewrite the command line first. The points of a
+    143, a reader of the output that has gone 141; a fault of ours keeps its traceback. ``arguments`` may rewrite the command line first. The points of a
     sweep write into folders of their own under ``out``, and those that fail leave the others alone.
     """
 
@@ -137,6 +137,9 @@ def _end(error: BaseException, name: str) -> NoReturn:
         terminated = signal.SIGTERM in stopped_by or isinstance(error, Terminated)
         print(f"dlkf: {'terminated' if terminated else 'interrupted'}", file=sys.stderr)
         sys.exit(TERMINATED if terminated else INTERRUPTED)
+    if isinstance(error, BrokenPipeError):  # as in ``dlkf … | head``: nobody reads on
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nor what is still to be flushed
+        sys.exit(UNREAD)
     if (said := describe_fault(error)) is None:
         raise error
     print(f"dlkf: error: {with_near_key(said, name)}", file=sys.stderr)

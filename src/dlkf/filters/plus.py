@@ -64,6 +64,7 @@ START_TUNING: Mapping[str, float] = {
     "accel_noise": 25.0, "gyro_noise": 4.0, "accel_walk": 5.0, "gyro_walk": 5.0,
     "position_std": 2.0, "velocity_std": 2.0, "lateral_std": 0.07, "vertical_std": 0.1,
 }  # fmt: skip
+KNOWN_BY_PRESET = ("turn_on_bias", "scale_factor", "misalignment")
 OLDEST = 600.0  # s, fixes: times and counts are given up to here
 
 
@@ -137,6 +138,20 @@ class PlusFilter(nn.Module):
     def imu(self) -> ImuSpec:
         """What it takes an unknown IMU for."""
         return self.kalman.imu
+
+    def with_imu(self, imu: ImuSpec) -> PlusFilter:
+        """The same weights for an IMU whose 1σ of turn-on biases, scale factors and misalignments are known.
+
+        Its white noise and the walks of its biases stay those of an unknown IMU: they are found, and data sheets do not
+        know a car's vibration.
+        """
+        known = {}
+        for name, sensor in (("accel", imu.accel), ("gyro", imu.gyro)):
+            known[name] = {**self.config.imu[name], **{k: getattr(sensor, k) for k in KNOWN_BY_PRESET}}
+        same = PlusFilter(replace(self.config, imu={"name": imu.name, **known}))
+        same.load_state_dict(self.state_dict())
+        same.card = getattr(self, "card", {})
+        return same.train(self.training)
 
     def heads(self) -> Iterator[nn.Parameter]:
         """Weights of the output layer, but for that of the axes, which has to find what is small."""

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dlkf.filters.plus import PlusFilter
 from dlkf.filters.saved import Learned, load_filter
+from dlkf.navigation.imu_errors import ImuSpec
 
 WEIGHTS_FOLDER = Path(__file__).parents[1] / "weights"
+KNOWN_IMU = "plus_imu"  # plus with biases, scale factors and misalignments of a preset
 
 
 def shipped_folder(name: str) -> Path | None:
@@ -18,3 +21,10 @@ def shipped_folder(name: str) -> Path | None:
 def trained_filter(name: str) -> Learned:
     """A filter with its trained weights: one that comes with the package, or from a folder."""
     return load_filter(shipped_folder(name) or Path(name).expanduser())
+
+
+def plus_with_imu(imu: ImuSpec) -> PlusFilter:
+    """``plus`` for an IMU of which a preset is known; see :meth:`~dlkf.filters.plus.PlusFilter.with_imu`."""
+    plus = trained_filter("plus")
+    assert isinstance(plus, PlusFilter)
+    return plus.with_imu(imu)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from dlkf.filters.smoother import Filter
     from dlkf.running.streaming import StreamingFilter
 
-DEFAULT_NOISE = ("automotive_mems", "untuned")  # imu_type and tuning, where none are given
+DEFAULT_NOISE = {"imu_type": "automotive_mems", "tuning": "untuned"}
 
 
 def navigate(
@@ -63,7 +63,7 @@ def navigate(
         ``models:/name@alias``, or ``module:Class``.
     imu_type : str or mapping
         Error model of the IMU for a Kalman filter: a preset of ``conf/imu`` or such a preset's content. ``plus`` and
-        trained filters need none.
+        trained filters need none; ``plus_imu`` is ``plus`` with its biases, scale factors and misalignments.
     tuning : str or mapping
         Factors on a Kalman filter's noise: a preset of ``conf/tuning`` (``any_car`` for a car of which nothing is
         known) or such factors by name, as ``dlkf tune`` finds them.
@@ -98,7 +98,7 @@ def navigate(
     from dlkf.filters.smoother import run_smoother
     from dlkf.running.innovations import OF_NETWORK, REMEDY
     from dlkf.running.offline import UsableFixes, epoch_for, navigate_drives
-    from dlkf.tracking.models import short_name, takes_imu_preset
+    from dlkf.tracking.models import short_name, takes_tuning
 
     given = {"rate_hz": rate_hz, "epoch_s": epoch_s}
     check_above_zero(**{name: value for name, value in given.items() if value is not None})
@@ -116,7 +116,7 @@ def navigate(
         grid = grid_of([estimator], rate_hz, epoch_s, epoch_for([fixes], rate_hz or 50.0, estimator))
         drives = load_dataset(folder, dtype=torch.float64, reference=False, aids=tables_of(estimator), **grid)
         (navigated,) = navigate_drives(drives, estimator, align=_align())
-    solution = Solution.of(navigated, fixes, short_name(model), REMEDY if takes_imu_preset(model) else OF_NETWORK)
+    solution = Solution.of(navigated, fixes, short_name(model), REMEDY if takes_tuning(model) else OF_NETWORK)
     for line in (*unused, *([solution.warning] if solution.warning else [])):
         warnings.warn(line, UserWarning, stacklevel=2)
     return solution
@@ -161,7 +161,7 @@ def load(
     model : str or Path
         As in :func:`navigate`.
     imu_type, tuning : str or mapping
-        As in :func:`navigate`; of a network, which needs neither, they change nothing, with a warning.
+        As in :func:`navigate`; where a trained filter does not take them they change nothing, with a warning.
 
     Returns
     -------
@@ -175,12 +175,13 @@ def load(
     """
     from dlkf.base.settings import settings_from
     from dlkf.filters.tuning import Tuning
-    from dlkf.tracking.models import resolve_model, takes_imu_preset
+    from dlkf.tracking.models import resolve_model, unused_settings
 
     factors = settings_from(Tuning, tuning_values(tuning), "tuning")
     model, spec = check_model(model), _imu_spec(imu_type)
-    if (imu_type, tuning) != DEFAULT_NOISE and not takes_imu_preset(model):
-        warnings.warn(f"{model} has its own noise: imu_type and tuning have no effect", UserWarning, stacklevel=3)
+    given = {"imu_type": imu_type, "tuning": tuning}
+    if line := unused_settings(model, [name for name, value in given.items() if value != DEFAULT_NOISE[name]]):
+        warnings.warn(line, UserWarning, stacklevel=3)
     return resolve_model(model, spec, tuning=factors)
 
 

@@ -289,6 +289,13 @@ def find_noise(
     return NoiseFit(*_built(x, imu, tuning, called), placing, std, before, best)
 
 
+def check_finds_noise(name: str) -> None:
+    """InputError for ``imu=auto`` with a filter that takes no noise, or more than noise."""
+    if not is_filter(name) or name == "ins" or "prior" in name.split("_"):
+        what = "imu=auto finds the noise of a Kalman filter"
+        raise InputError(f"{what}, model={name} takes none; leave imu out, or take model=mbkf21_nhc")
+
+
 def generic_filter(
     drives: Sequence[Drive], name: str, imu: ImuSpec, tuning: Tuning, align: AlignConfig,
     aids: Sequence[AidTable] = (), **given: Any,
@@ -296,11 +303,9 @@ def generic_filter(
     """A Kalman filter that finds its noise on the drives themselves, and the drives with their fixes so placed.
 
     One with vehicle constraints also takes ``aids``, sensors that the drives have, while the noise is found. InputError
-    for a filter that takes no noise, or more than noise.
+    as :func:`check_finds_noise`.
     """
-    if not is_filter(name) or name == "ins" or "prior" in name.split("_"):
-        what = "imu=auto finds the noise of a Kalman filter"
-        raise InputError(f"{what}, model={name} takes none; leave imu out, or take model=mbkf21_nhc")
+    check_finds_noise(name)
     name = aided_name(name, [table.name for table in aids])
     found = find_noise(Evidence.of(drives, align=align), name, imu, tuning, **given)
     placed = [found.placing.of_drive(d) for d in drives]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from dlkf.base.errors import InputError, did_you_mean
 from dlkf.filters.build import OWN_SOURCE, build_filter, filter_names, is_filter, known_filters
 from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import CONFIG, WEIGHTS, load_filter
-from dlkf.filters.shipped import shipped_folder
+from dlkf.filters.shipped import KNOWN_IMU, plus_with_imu, shipped_folder
 from dlkf.filters.smoother import Filter
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
@@ -33,8 +33,8 @@ def resolve_model(
     """A filter by name, from a folder with weights and config, an MLflow run id, ``models:/name@alias``, or a class of
     one's own, ``module:Class``.
 
-    ``imu`` and ``tuning`` belong to the model-based filters, ``prior`` to those with ``_prior``. Raises InputError for
-    anything else, listing what is known.
+    ``imu`` and ``tuning`` belong to the model-based filters, ``imu`` to ``plus_imu`` as well, ``prior`` to those with
+    ``_prior``. Raises InputError for anything else, listing what is known.
     """
     if not spec.strip():
         raise InputError("model= is empty; give a name such as plus, or a folder")
@@ -42,6 +42,8 @@ def resolve_model(
         return build_filter(spec, imu, tuning=tuning, prior=prior)
     if OWN_SOURCE.fullmatch(spec):
         return own_filter(spec, imu)
+    if spec == KNOWN_IMU:
+        return plus_with_imu(imu)
     if folder := shipped_folder(spec):
         return load_filter(folder)
     if is_tracked(spec):
@@ -60,16 +62,35 @@ def resolve_model(
         )
     if "/" in spec:
         raise InputError(f"model={spec}: no such folder; a model is a folder with {WEIGHTS} beside {CONFIG}")
+    near = did_you_mean(spec, (*filter_names(), KNOWN_IMU))
     raise InputError(
-        f"unknown model {spec!r}{did_you_mean(spec, filter_names()) or ':'} neither a known filter (plus, "
-        f"{known_filters()}) nor a folder, "
-        "an MLflow run id, models:/name@alias or a class of your own, module:Class"
+        f"unknown model {spec!r}{near or ':'} neither a known filter (plus, {KNOWN_IMU}, {known_filters()}) nor a "
+        "folder, an MLflow run id, models:/name@alias or a class of your own, module:Class"
     )
 
 
-def takes_imu_preset(spec: str) -> bool:
-    """Whether a model's noise is set by ``imu`` and ``tuning``; a network has its own."""
-    return is_filter(spec) or OWN_SOURCE.fullmatch(spec) is not None
+def settings_taken(spec: str) -> tuple[str, ...]:
+    """Which of ``imu`` and ``tuning`` have an effect on a model: a trained filter has its own noise."""
+    if is_filter(spec) or OWN_SOURCE.fullmatch(spec):
+        return ("imu", "tuning")
+    return ("imu",) if spec == KNOWN_IMU else ()
+
+
+def takes_tuning(spec: str) -> bool:
+    """Whether the noise of a model is set by ``imu`` and ``tuning``."""
+    return "tuning" in settings_taken(spec)
+
+
+def unused_settings(spec: str, given: Iterable[str]) -> str:
+    """A line for settings that a model does not take, as they were given (``imu=consumer``); empty without any."""
+    by_key = {word: word.partition("=")[0].partition(".")[0].removesuffix("_type") for word in given}
+    unused = [word for word, key in by_key.items() if key not in settings_taken(spec)]
+    if not unused:
+        return ""
+    known = spec == "plus" and "imu" in by_key.values()
+    hint = f"; model={KNOWN_IMU} takes biases, scale factors and misalignments of an IMU from it" if known else ""
+    what = f"{' '.join(unused)} {'has' if len(unused) == 1 else 'have'} no effect"
+    return f"{short_name(spec)} has its own noise: {what} (for Kalman filters){hint}"
 
 
 def model_folder(spec: str) -> Path:
@@ -120,7 +141,7 @@ def short_name(spec: str) -> str:
 
     The folder ``best`` of a training is called after the training.
     """
-    if is_filter(spec) or shipped_folder(spec):
+    if is_filter(spec) or shipped_folder(spec) or spec == KNOWN_IMU:
         return spec
     if RUN_ID.fullmatch(spec):
         return spec[:8]
