@@ -129,13 +129,14 @@ def test_an_interrupt_that_became_another_error_is_one(signal_, code, call, monk
     assert ended.code == code and "cannot be read" not in ended.err
 
 
-def test_a_reader_that_has_gone_ends_a_command_without_a_word(town):
-    """As ``dlkf doctor … | head -1`` does."""
-    command = (sys.executable, "-m", "dlkf.doctor", f"dataset={town}")
+def test_a_reader_that_has_gone_ends_a_command_without_a_word(town, tmp_path):
+    """As ``dlkf navigate … | head -1`` does."""
+    command = (sys.executable, "-m", "dlkf.navigate", "model=ins", f"dataset={town}", f"out={tmp_path}/solved")
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None and process.stderr is not None
         process.stdout.close()
         assert (process.stderr.read(), process.wait(PATIENCE_S)) == ("", 141)
+    assert (tmp_path / "solved" / "report.html").exists()
 
 
 def killed(program: str) -> None:

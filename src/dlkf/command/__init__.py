@@ -50,8 +50,9 @@ def command(
 
     A user's mistake (:class:`InputError`, an unknown key or preset, a malformed override) and a fault of the machine
     (a full disk, a locked store, no GPU) are one line on stderr and exit code 2; Ctrl-C is exit code 130, SIGTERM
-    143, a reader of the output that has gone 141; a fault of ours keeps its traceback. ``arguments`` may rewrite the command line first. The points of a
-    sweep write into folders of their own under ``out``, and those that fail leave the others alone.
+    143, a reader of the output that has gone 141; a fault of ours keeps its traceback. ``arguments`` may rewrite the
+    command line first. The points of a sweep write into folders of their own under ``out``, and those that fail leave
+    the others alone.
     """
 
     def decorate(function: Callable[[Any], None]) -> Callable[[], None]:
