@@ -18,7 +18,7 @@ from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD
 from dlkf.filters.gating import CoarseGate, Gate
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
 from dlkf.filters.kalman_update import kalman_prediction, kalman_update
-from dlkf.filters.receiver import has_receiver, predict_fix, widen_start
+from dlkf.filters.receiver import has_receiver, let_delay_grow, predict_fix, widen_start, with_drift
 from dlkf.filters.sources import FixMemory, GnssFix, Measurement, Parameter, Predicted, Source, describe_aid
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.calibration import ImuError
@@ -167,9 +167,17 @@ class Mbkf:
 
     def step(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Correction]:
         """:meth:`update` with what the gate leaves of the fix."""
+        memory = self.advanced(memory, epoch.dt * epoch.imu.shape[1])
         epoch = self.predicted_fix(memory, epoch)
         memory, correction = self.update(*self.screened(memory, epoch))
         return memory, correction._replace(innovation=epoch.z)
+
+    def advanced(self, memory: KalmanMemory, seconds: float) -> KalmanMemory:
+        """At the end of an update interval, as far as the fix is concerned: its delay has grown."""
+        if memory.parameters is None or not has_receiver(self.states):
+            return memory
+        P, parameters = let_delay_grow(memory.P, memory.parameters, self.states, seconds)
+        return memory._replace(P=P, parameters=parameters)
 
     def predicted_fix(self, memory: KalmanMemory, epoch: Epoch) -> Epoch:
         """The epoch with the innovation that delay and antenna give, where the filter estimates them."""
@@ -230,6 +238,8 @@ class Mbkf:
                 most = parameters.new_tensor(largest)
                 parameters = torch.maximum(torch.minimum(parameters, most), -most)
             said += [parameters, P.diagonal(dim1=-2, dim2=-1)[:, self.states.of_others].clamp_min(0).sqrt()]
+        if has_receiver(self.states):
+            Phi = with_drift(Phi, self.states, epoch.dt * epoch.imu.shape[1])
         memory = KalmanMemory(P, memory.windows, memory.fix, tuple(sources), structure, noise, parameters)
         return memory, Correction(
             dx[:, PVA], epoch.error.updated(dx, self.states), std=std, gain=K[:, PVA, :6],

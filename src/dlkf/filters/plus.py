@@ -169,13 +169,14 @@ class PlusFilter(nn.Module):
 
     def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
         """Network, the Kalman filter with the noise of both, then the virtual outage beside it."""
+        span = epoch.dt * epoch.imu.shape[1]
+        memory = memory._replace(kalman=self.kalman.advanced(memory.kalman, span))
         claimed = self.kalman.predicted_fix(memory.kalman, epoch)
         offered = memory.fix_noise.inflated(claimed)
         kalman, epoch = self.kalman.screened(memory.kalman, offered)
         walk = torch.diag_embed(memory.errors.variance(offered))
         outage = memory.outage._replace(P=_with_walk(memory.outage.P, walk))
         memory = memory._replace(kalman=kalman._replace(P=_with_walk(kalman.P, walk)), outage=outage)
-        span = epoch.dt * epoch.imu.shape[1]
         fixed = epoch.used.any(-1)
         with torch.no_grad():
             normalised = self._normalised(memory, epoch)

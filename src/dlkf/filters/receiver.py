@@ -1,10 +1,11 @@
-"""What a log does not know of its receiver: how old a fix is at its stamp, and where the antenna is.
+"""What a log does not know of its receiver: how old a fix is at its stamp, how fast its clock, where the antenna is.
 
 With a delay d of the fixes and an antenna at l̂ = l + δl from the IMU, a fix that is stamped t is predicted as position
 and velocity of the antenna at t − d (:func:`dlkf.navigation.error_model.antenna`): between two samples of the window,
 and beyond its ends with its mean acceleration a. H has −v_a and −a for δd, C and C [ω×] for δl, with v_a the velocity
-of the antenna, and −(λ + d) I for the velocity in a position that lies λ before the window's end by its stamp. A filter
-with the source ``+receiver`` (:class:`dlkf.filters.aids.receiver.Receiver`) estimates d and δl.
+of the antenna, and −(λ + d) I for the velocity in a position that lies λ before the window's end by its stamp. A
+receiver's clock that is fast by r against that of the IMU makes the delay grow, ḋ = r (:func:`let_delay_grow`). A
+filter with the source ``+receiver`` (:class:`dlkf.filters.aids.receiver.Receiver`) estimates d, δl and r.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from dlkf.navigation.state import POSITION, ErrorStates, NavState
 
 DELAY = "fix_delay_s"
 ARM = ("lever_forward_m", "lever_right_m", "lever_down_m")
+DRIFT = "clock_drift_ppm"
+PPM = 1e-6
 
 
 def has_receiver(states: ErrorStates) -> bool:
@@ -35,6 +38,25 @@ def widen_start(P: Float[Tensor, "B n n"], start: NavState, states: ErrorStates)
     v, C = start.v_n.unsqueeze(-1), start.C_nb
     P[:, POSITION, POSITION] += P[:, d : d + 1, d : d + 1] * (v @ v.mT) + C @ P[:, k : k + 3, k : k + 3] @ C.mT
     return P
+
+
+def let_delay_grow(
+    P: Float[Tensor, "B n n"], parameters: Float[Tensor, "B k"], states: ErrorStates, seconds: float
+) -> tuple[Float[Tensor, "B n n"], Float[Tensor, "B k"]]:
+    """P and the estimates after so long without a fix: d + r t."""
+    d, r, first = states.of(DELAY).start, states.of(DRIFT).start, states.of_others.start
+    P, parameters, grows = P.clone(), parameters.clone(), PPM * seconds
+    P[:, d] += grows * P[:, r]
+    P[:, :, d] += grows * P[:, :, r]
+    parameters[:, d - first] += grows * parameters[:, r - first]
+    return P, parameters
+
+
+def with_drift(Phi: Float[Tensor, "B n n"], states: ErrorStates, seconds: float) -> Float[Tensor, "B n n"]:
+    """Φ of an update interval with the growth of the delay in it, for a smoother."""
+    Phi = Phi.clone()
+    Phi[:, states.of(DELAY).start, states.of(DRIFT).start] = PPM * seconds
+    return Phi
 
 
 def predict_fix(epoch: Epoch, parameters: Mapping[str, Tensor]) -> Epoch:

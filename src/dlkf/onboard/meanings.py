@@ -23,6 +23,7 @@ COLUMNS = {  # of a row, at the IMU; before the last part of a name that is an a
     "vibration_speed_used": "1 where that was used, else 0",
     "vibration_speed_share": "how far the spectrum of the vibration is trusted, 0 to 1",
     "fix_delay_s": "how old fixes are at their stamp [s]",
+    "clock_drift_ppm": "receiver's clock fast against that of the IMU, per million: the delay grows so",
     "lever_forward_m": "antenna further forward than the lever arm says [m]",
     "lever_right_m": "antenna further to the right than the lever arm says [m]",
     "lever_down_m": "antenna further down than the lever arm says [m]",

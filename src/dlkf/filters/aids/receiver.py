@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from dlkf.data.drive import Batch
 from dlkf.filters.integration import Epoch
-from dlkf.filters.receiver import ARM, DELAY
+from dlkf.filters.receiver import ARM, DELAY, DRIFT
 from dlkf.filters.sources import Parameter, Predicted
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.state import ErrorStates
@@ -16,15 +16,16 @@ from dlkf.navigation.state import ErrorStates
 
 @dataclass(frozen=True)
 class Receiver:
-    """Delay of the fixes and antenna; it has no rows of its own, those of the fix contain both."""
+    """Delay of the fixes, antenna and clock; it has no rows of its own, those of the fix contain them."""
 
     imu: object
     tuning: Tuning
     states: ErrorStates
 
     parameters: ClassVar[Mapping[str, Parameter]] = {
-        DELAY: Parameter(std=0.05, walk=3e-4, largest=0.5),  # a walk that follows clocks 100 ppm apart
+        DELAY: Parameter(std=0.05, walk=1e-4, largest=0.9),
         **{name: Parameter(std=0.2, largest=2.0) for name in ARM},
+        DRIFT: Parameter(std=100.0, walk=0.1, largest=1000.0),
     }
 
     @property
