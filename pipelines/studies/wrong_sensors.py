@@ -5,8 +5,8 @@
 From the first on, fixes get errors that the reported 1σ does not know: positions off by 3, 1 or 30 m (1σ per axis) in
 some seconds, by one error of 3 m for ten seconds about every 50 s, by 0.3, 1 or 3 m in all, or by 1 m that wanders over
 30 s; velocities off by 5 m/s in some, by 0.5 m/s in all, or those of a second before. Or the IMU has a turn-on bias, of
-random direction, beside its own. Or the files are wrong: stamps of fixes 0.1 or 0.3 s late, clocks 100 or 300 ppm apart,
-an antenna 1.4 m from where the lever arm says, one of 500 samples of a sensor spoiled.
+random direction, beside its own. Or the files are wrong: stamps of fixes 0.1 or 0.3 s late, clocks 100 or 300 ppm
+apart, an antenna 1.4 m from where the lever arm says, one of 500 samples of a sensor spoiled.
 
 ``outages.md``: the outages of :mod:`pipelines.studies.plus` on real motion and on ``fleet``; the entirely real drives
 start on the wrong data, alone with biases (elsewhere the start is the truth with an error, which shows no bias). RMS /
