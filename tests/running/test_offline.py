@@ -75,8 +75,8 @@ def test_of_delay_and_antenna_what_differs_from_the_log_is_said():
     """Beyond 3σ."""
     result = driven(0).result
     table = result.table.assign(
-        fix_delay_s=0.15, std_fix_delay_s=0.01, lever_forward_m=-0.2, std_lever_forward_m=0.1, wheel_scale=0.01,
-        std_wheel_scale=0.02,
+        fix_delay_s=0.15, std_fix_delay_s=0.01, lever_forward_m=-0.2, std_lever_forward_m=0.1,
+        clock_drift_ppm=40.0, std_clock_drift_ppm=20.0, wheel_scale=0.01, std_wheel_scale=0.02,
     )  # fmt: skip
     said = replace(result, table=table).sensors()
     assert said == {"fix_delay_s": "0.15 ± 0.01", "wheel_scale": "0.01 ± 0.02"}

@@ -25,7 +25,7 @@ from dlkf.data.validate import GNSS_QUALITIES
 from dlkf.filters.aids.attach import aid_columns
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import BatchSolution, WholeLoop
-from dlkf.filters.receiver import ARM, DELAY
+from dlkf.filters.receiver import ARM, DELAY, DRIFT
 from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.compiled import without_loops
 from dlkf.running.batched import CHUNK_SAMPLES, run_filter
@@ -36,7 +36,7 @@ from dlkf.running.start import align_each
 
 FEW_DRIVES = 8  # whose start in tensor operations takes less than numba takes to load
 WORTH_SAYING = 0.01  # probability of another heading
-OF_RECEIVER, SIGMAS = (DELAY, *ARM), 3.0  # what differs from what a log says by so many 1σ is worth saying
+OF_RECEIVER, SIGMAS = (DELAY, *ARM, DRIFT), 3.0  # what differs from what a log says by so many 1σ is worth saying
 SAMPLES_AT_ONCE = CHUNK_SAMPLES  # IMU samples of drives in memory, 8 h at 50 Hz
 FASTER_THAN_REVERSE = 8.0  # m/s
 MOSTLY = 0.5  # of the updates of a further sensor; where fewer are used, its numbers are likely wrong
