@@ -16,6 +16,7 @@ from dlkf.filters.adaptive import Adaptation, AdaptiveNoise
 from dlkf.filters.branches import may_branch
 from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD
 from dlkf.filters.gating import CoarseGate, Gate
+from dlkf.filters.heavy_tails import HeavyTails
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
 from dlkf.filters.kalman_update import kalman_prediction, kalman_update
 from dlkf.filters.receiver import has_receiver, let_delay_grow, predict_fix, widen_start, with_drift
@@ -60,6 +61,7 @@ class KalmanMemory(NamedTuple):
     structure: Tensor | None = None  # (B, 5) of the car
     noise: AdaptiveNoise | None = None
     parameters: Tensor | None = None  # (B, k) of the sources, in the order of ``states.others``
+    tails: HeavyTails | None = None  # of the vertical gyroscope's priors
 
 
 def bias_sigma(imu: ImuSpec, states: ErrorStates) -> Float[Tensor, " 6"]:
@@ -95,6 +97,7 @@ class Mbkf:
     sources: tuple[Source, ...] = ()
     noise: Adaptation | None = None
     cut_transition: bool = False  # no gradient through Φ, which makes training faster
+    heavy_tails: bool = False  # of the priors of bias and scale factor of the vertical gyroscope
 
     @cached_property
     def fix(self) -> GnssFix:
@@ -148,7 +151,8 @@ class Mbkf:
         P, fix = torch.diag_embed(sigma**2), self.fix.begin(batch)
         if has_receiver(self.states) and batch.start_noise is not None:  # a start that was found from fixes
             P = widen_start(P, batch.start, self.states)
-        return KalmanMemory(P, windows, fix, sources, structure, noise, parameters), error
+        tails = HeavyTails.begin(self._imu_sigma().to(**like).expand(B, -1), self.states) if self.heavy_tails else None
+        return KalmanMemory(P, windows, fix, sources, structure, noise, parameters, tails), error
 
     @cached_property
     def parameters(self) -> dict[str, Parameter]:
@@ -222,6 +226,9 @@ class Mbkf:
             dx, K, P = kalman_update(P, H, R, z)
         else:
             dx, K, P = P.new_zeros(P.shape[:2]), P.new_zeros(*P.shape[:2], H.shape[1]), torch.lerp(P, P.mT, 0.5)
+        tails = memory.tails
+        if tails is not None:
+            tails, P, dx = tails.after(P, dx, epoch.error, self.states)
         noise = memory.noise
         if self.noise is not None and noise is not None:
             variance = self.fix.variance(epoch, memory.fix, memory.noise)
@@ -240,7 +247,7 @@ class Mbkf:
             said += [parameters, P.diagonal(dim1=-2, dim2=-1)[:, self.states.of_others].clamp_min(0).sqrt()]
         if has_receiver(self.states):
             Phi = with_drift(Phi, self.states, epoch.dt * epoch.imu.shape[1])
-        memory = KalmanMemory(P, memory.windows, memory.fix, tuple(sources), structure, noise, parameters)
+        memory = KalmanMemory(P, memory.windows, memory.fix, tuple(sources), structure, noise, parameters, tails)
         return memory, Correction(
             dx[:, PVA], epoch.error.updated(dx, self.states), std=std, gain=K[:, PVA, :6],
             accepted=epoch.used.any(-1), covariances=Covariances(Phi, predicted, P, fix.H, fix.R, dx),

@@ -6,8 +6,9 @@ show it (:mod:`dlkf.filters.virtual_outages`), and it holds through an outage. A
 factor for each gyroscope every epoch, in outages too; it sees the samples, the filter's covariance and how well its
 innovations and corrections fit (:mod:`dlkf.filters.matching`). As far as fixes show, their errors are larger than
 claimed (:mod:`dlkf.filters.fix_noise`), or those of positions smaller, or wander (:mod:`dlkf.filters.position_errors`).
-Before the first fix it is ``base`` to the bit; with fixes as claimed and weights of zero until the first virtual outage
-was scored.
+The priors of the vertical gyroscope's bias and scale factor have heavy tails (:mod:`dlkf.filters.heavy_tails`). Before
+the first fix it is ``base`` with these priors to the bit; with fixes as claimed and weights of zero until the first
+virtual outage was scored.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ class PlusFilter(nn.Module):
             raise InputError(
                 f"model.base={config.base} is no Kalman filter that plus can stand on; take {PlusConfig.base}"
             )
-        self.kalman = replace(kalman, cut_transition=True)
+        self.kalman = replace(kalman, cut_transition=True, heavy_tails=True)
         count = self.kalman.states.base.count
         now = 3 + 3 + 3 + 2 + 6
         features = WINDOW_FEATURES + count + (count - 9) + 2 + 4 + 6 + LOG_FEATURES + 4 + now
