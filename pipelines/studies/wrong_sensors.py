@@ -5,8 +5,9 @@
 From the first on, fixes get errors that the reported 1σ does not know: positions off by 3, 1 or 30 m (1σ per axis) in
 some seconds, by one error of 3 m for ten seconds about every 50 s, by 0.3, 1 or 3 m in all, or by 1 m that wanders over
 30 s; velocities off by 5 m/s in some, by 0.5 m/s in all, or those of a second before. Or the IMU has a turn-on bias, of
-random direction, beside its own. Or the files are wrong: stamps of fixes 0.1 or 0.3 s late, clocks 100 or 300 ppm
-apart, an antenna 1.4 m from where the lever arm says, one of 500 samples of a sensor spoiled.
+random direction, beside its own, or gyroscopes whose scale factors are 1 or 3 % off. Or the files are wrong: stamps of
+fixes 0.1 or 0.3 s late, clocks 100 or 300 ppm apart, an antenna 1.4 m from where the lever arm says, one of 500 samples
+of a sensor spoiled.
 
 ``outages.md``: the outages of :mod:`pipelines.studies.plus` on real motion and on ``fleet``; the entirely real drives
 start on the wrong data, alone with biases (elsewhere the start is the truth with an error, which shows no bias). RMS /
@@ -123,6 +124,12 @@ def biases(accel: float, gyro_dps: float) -> Change:
     return change
 
 
+def gyro_scale(off: float) -> Change:
+    """Gyroscopes that say so much more than is."""
+    factor = torch.tensor([1.0] * 3 + [1 + off] * 3, dtype=torch.float64)
+    return lambda drive, g: replace(drive, imu=drive.imu * factor)
+
+
 ERRORS: Mapping[str, Change] = {
     "none": lambda drive, g: drive,
     "positions: 3 m in one of ten": positions(0.1, 3.0),
@@ -140,8 +147,10 @@ ERRORS: Mapping[str, Change] = {
     "0.3 m/s², 2 °/s": biases(0.3, 2.0),
     "0.5 m/s², 3 °/s": biases(0.5, 3.0),
     "0.5 m/s², 5 °/s": biases(0.5, 5.0),
+    "scale factors of the gyroscopes 1 % off": gyro_scale(0.01),
+    "3 % off": gyro_scale(0.03),
 }
-OF_VELOCITIES, OF_IMU = [*ERRORS][9:12], [*ERRORS][12:]
+OF_VELOCITIES, OF_IMU = [*ERRORS][9:12], [*ERRORS][12:16]
 SPIKED = 1 / 500
 WRONG_ARM = (1.0, 0.5, -0.8)  # m
 

@@ -19,7 +19,7 @@ from dlkf.navigation.state import ErrorStates
 
 from .test_constraints import slipping
 
-D = torch.float64
+D, FIXED = torch.float64, torch.tensor([True])
 UNIT = ImuSpec(
     "unit", SensorErrors(1e-3, 0.02, 1e-4, 3600.0, 3e-3, 3e-3), SensorErrors(7e-5, 1e-3, 1e-5, 3600.0, 5e-3, 3e-3)
 )
@@ -70,14 +70,16 @@ def test_a_prior_widens_with_what_is_found_and_with_nothing_else():
     grown = P.clone()
     grown[:, 14, 14] = 0.04  # as of a walk
     for unchanged in (P, grown):
-        after, same, change = tails.after(unchanged, dx, nothing, states)
+        after, same, change = tails.after(unchanged, dx, nothing, states, FIXED)
         assert torch.equal(after.variance, tails.start) and torch.equal(same, unchanged) and torch.equal(change, dx)
     known = 1e-6 * P
-    found, _, _ = tails.after(known, dx, ImuError(torch.tensor([[0.0, 0, 0, 0.9, 0.9, 0.5]], dtype=D)), states)
+    found, _, _ = tails.after(known, dx, ImuError(torch.tensor([[0.0, 0, 0, 0.9, 0.9, 0.5]], dtype=D)), states, FIXED)
     assert float(found.variance[0, 0]) == pytest.approx((FREEDOM * 0.01 + 0.25) / (FREEDOM + 1), rel=1e-5)
     assert torch.equal(found.variance[:, 1], tails.start[:, 1])
-    back, _, _ = found.after(known, dx, nothing, states)
+    back, _, _ = found.after(known, dx, nothing, states, FIXED)
     assert torch.equal(back.variance, found.variance)
+    alone, _, _ = tails.after(known, dx, ImuError(torch.full((1, 6), 0.9, dtype=D)), states, ~FIXED)
+    assert torch.equal(alone.variance, tails.start)
 
 
 def heading_error(batch, estimator: Mbkf) -> float:

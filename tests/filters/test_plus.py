@@ -59,7 +59,7 @@ def test_before_the_first_fix_it_is_the_classical_filter_to_the_bit():
     available[:, :9] = False
     batch = replace(batch, available=available)
     with torch.no_grad():
-        a, b = integrate(batch, model), integrate(batch, classical("mbkf21_car", model))
+        a, b = integrate(batch, model), integrate(batch, build_filter("mbkf21_car", model.imu, tuning=model.tuning))
     assert torch.equal(a.posterior.p_n[:, :9], b.posterior.p_n[:, :9]) and torch.equal(a.std[:, :9], b.std[:, :9])
     assert not torch.equal(a.posterior.p_n[:, 12], b.posterior.p_n[:, 12])
 

@@ -7,8 +7,16 @@ from dataclasses import replace
 import torch
 
 from dlkf.filters.integration import Correction, Epoch, Estimator
-from dlkf.filters.plus import PlusFilter, PlusMemory
+from dlkf.filters.plus import PlusConfig, PlusFilter, PlusMemory
 from dlkf.filters.shipped import trained_filter
+
+
+class GaussianPriors(PlusFilter):
+    """``plus`` without heavy tails."""
+
+    def __init__(self, config: PlusConfig) -> None:
+        super().__init__(config)
+        self.kalman = replace(self.kalman, heavy_tails=False)
 
 
 class WithoutLevels(PlusFilter):
@@ -32,7 +40,8 @@ class AsClaimed(PlusFilter):
 
 
 def parts(folder: str) -> dict[str, Estimator]:
-    """``plus`` with neither levels nor network, with one of them, with fixes as claimed, without one of its sources."""
+    """``plus`` with neither levels nor network, with one of them, with fixes as claimed, without one of its sources,
+    and with Gaussian priors."""
     whole = trained_filter(folder)
     assert isinstance(whole, PlusFilter)
     found: dict[str, Estimator] = {}
@@ -41,6 +50,7 @@ def parts(folder: str) -> dict[str, Estimator]:
     kinds["fixes as claimed"] = (AsClaimed, True)
     bases = {"no speed from vibration": "+vibration_speed", "no delay and antenna": "+receiver"}
     kinds |= dict.fromkeys(bases, (PlusFilter, True))
+    kinds["Gaussian priors"] = (GaussianPriors, True)
     for name, (kind, network) in kinds.items():
         config = replace(whole.config, base=whole.config.base.replace(bases.get(name, ""), ""))
         found[name] = part = kind(config).eval()

@@ -12,7 +12,7 @@ g = 1/σ² − 1/σ₁² of information, exact at any time for a linear filter (
 
     P⁺ = P + c p pᵀ,   dx = c x p,   c = g / (1 − g pᵢ),   p the column of x in P, pᵢ its own entry
 
-The prior becomes wider alone, never narrower, so no estimate can pull it in.
+The prior becomes wider alone, never narrower, and only where a fix was used.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dlkf.navigation.calibration import ImuError
@@ -43,15 +43,20 @@ class HeavyTails(NamedTuple):
         return cls(variance, variance.clone())
 
     def after(
-        self, P: Float[Tensor, "B n n"], dx: Float[Tensor, "B n"], error: ImuError, states: ErrorStates
-    ) -> tuple[HeavyTails, Float[Tensor, "B n n"], Float[Tensor, "B n"]]:
-        """After an update by ``dx`` to P of a filter that had the IMU ``error``: priors, P and correction."""
+        self, P: Float[Tensor, "B n n"], dx: Float[Tensor, "B n"], error: ImuError, states: ErrorStates,
+        fixed: Bool[Tensor, " B"],
+    ) -> tuple[HeavyTails, Float[Tensor, "B n n"], Float[Tensor, "B n"]]:  # fmt: skip
+        """After an update by ``dx`` to P of a filter that had the IMU ``error``: priors, P and correction.
+
+        Where no fix was used they stay: constraints alone would lead a filter astray.
+        """
         found = []
         for k, start, before, x in zip(
             vertical_states(states), self.start.unbind(-1), self.variance.unbind(-1), vertical_errors(error, states)
         ):
             x, p = x + dx[:, k], torch.minimum(P[:, k, k], before)  # a walk is no evidence
             variance = torch.maximum(before, (FREEDOM * start + x.square() + p) / (FREEDOM + 1))
+            variance = torch.where(fixed, variance, before)
             P, change = widen_prior(P, x, k, before, variance)
             dx = dx + change
             found.append(variance)

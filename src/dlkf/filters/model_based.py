@@ -228,7 +228,7 @@ class Mbkf:
             dx, K, P = P.new_zeros(P.shape[:2]), P.new_zeros(*P.shape[:2], H.shape[1]), torch.lerp(P, P.mT, 0.5)
         tails = memory.tails
         if tails is not None:
-            tails, P, dx = tails.after(P, dx, epoch.error, self.states)
+            tails, P, dx = tails.after(P, dx, epoch.error, self.states, epoch.used.any(-1))
         noise = memory.noise
         if self.noise is not None and noise is not None:
             variance = self.fix.variance(epoch, memory.fix, memory.noise)
