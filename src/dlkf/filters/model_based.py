@@ -61,7 +61,7 @@ class KalmanMemory(NamedTuple):
     structure: Tensor | None = None  # (B, 5) of the car
     noise: AdaptiveNoise | None = None
     parameters: Tensor | None = None  # (B, k) of the sources, in the order of ``states.others``
-    tails: HeavyTails | None = None  # of the vertical gyroscope's priors
+    tails: HeavyTails | None = None  # of the prior of the vertical gyroscope's scale factor
 
 
 def bias_sigma(imu: ImuSpec, states: ErrorStates) -> Float[Tensor, " 6"]:
@@ -97,7 +97,7 @@ class Mbkf:
     sources: tuple[Source, ...] = ()
     noise: Adaptation | None = None
     cut_transition: bool = False  # no gradient through Φ, which makes training faster
-    heavy_tails: bool = False  # of the priors of bias and scale factor of the vertical gyroscope
+    heavy_tails: bool = False  # of the prior of the vertical gyroscope's scale factor, where it is a state
 
     @cached_property
     def fix(self) -> GnssFix:
@@ -151,7 +151,9 @@ class Mbkf:
         P, fix = torch.diag_embed(sigma**2), self.fix.begin(batch)
         if has_receiver(self.states) and batch.start_noise is not None:  # a start that was found from fixes
             P = widen_start(P, batch.start, self.states)
-        tails = HeavyTails.begin(self._imu_sigma().to(**like).expand(B, -1), self.states) if self.heavy_tails else None
+        tails = None
+        if self.heavy_tails and self.states.elements:
+            tails = HeavyTails.begin(self._imu_sigma().to(**like).expand(B, -1), self.states)
         return KalmanMemory(P, windows, fix, sources, structure, noise, parameters, tails), error
 
     @cached_property

@@ -6,9 +6,9 @@ show it (:mod:`dlkf.filters.virtual_outages`), and it holds through an outage. A
 factor for each gyroscope every epoch, in outages too; it sees the samples, the filter's covariance and how well its
 innovations and corrections fit (:mod:`dlkf.filters.matching`). As far as fixes show, their errors are larger than
 claimed (:mod:`dlkf.filters.fix_noise`), or those of positions smaller, or wander (:mod:`dlkf.filters.position_errors`).
-The priors of the vertical gyroscope's bias and scale factor have heavy tails (:mod:`dlkf.filters.heavy_tails`). Before
-the first fix it is ``base`` to the bit; with fixes as claimed and weights of zero ``base`` with these priors until the
-first virtual outage was scored.
+The prior of the vertical gyroscope's scale factor has heavy tails (:mod:`dlkf.filters.heavy_tails`). Before the first
+fix it is ``base`` to the bit; with fixes as claimed and weights of zero ``base`` with this prior until the first
+virtual outage was scored.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ MEMORY = {  # by the last parts of a field's name
     "liveliness.moving": "least level of a second of motion, likewise",
     "liveliness.still_s": "s without acceleration or turn",
     "prior": "prior least level of a second of motion, likewise",
-    "tails.start": "variance of the priors of the vertical gyroscope's bias [rad²/s²] and scale factor, at the start",
+    "tails.start": "variance of the prior of the vertical gyroscope's scale factor, at the start",
     "tails.variance": "the same, in force",
     "structure": "mounting yaw, pitch [rad], distance to the rear axle [m], sideslip [s²/m], pitch gradient [rad s²/m]",
     "parameters": "estimates of what further sensors add to the states, in their order",
