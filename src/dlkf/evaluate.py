@@ -16,7 +16,7 @@ from dlkf.base.console import make_console, save_log
 from dlkf.base.files import absolute_place, folder_name, require_empty
 from dlkf.base.parallel import check_engine
 from dlkf.base.provenance import describe_provenance
-from dlkf.command import command
+from dlkf.command import command, typed_words
 from dlkf.command.scored import EvaluateSettings
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import choose_aids, dataset_digest, drive_rows
@@ -37,7 +37,7 @@ from dlkf.report.evaluation import write_report
 from dlkf.running.offline import SAMPLES_AT_ONCE, UsableFixes, chunk_drives
 from dlkf.running.references import check_reference
 from dlkf.tracking.grid import start_point
-from dlkf.tracking.models import check_baseline, resolve_models
+from dlkf.tracking.models import check_baseline, resolve_models, unused_settings
 from dlkf.tracking.runs import check_store, tracking_uri
 
 
@@ -118,6 +118,9 @@ def main(settings: EvaluateSettings) -> None:
     uri, name = tracking_uri(settings.tracking.uri), folder_name(settings.dataset)
     if settings.tracking.log:
         check_store(uri)
+    unused = [unused_settings(model, typed_words("imu", "tuning")) for model in settings.models]
+    if all(unused):  # beside a model that takes them nobody wonders
+        console.print("\n".join(unused), style="yellow", highlight=False, soft_wrap=True)
     done = evaluate_dataset(settings, console)
     results, segments = done.results, done.mode == "segments"
     write_report(

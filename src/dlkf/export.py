@@ -15,7 +15,7 @@ import torch
 from dlkf.base.errors import InputError
 from dlkf.base.files import is_url, require_empty, write_into
 from dlkf.base.provenance import describe_provenance
-from dlkf.command import command
+from dlkf.command import command, typed_words
 from dlkf.command.settings import ExportSettings
 from dlkf.data.aid_tables import standard_tables
 from dlkf.data.store import drive_from_tables, drive_rows
@@ -30,7 +30,7 @@ from dlkf.onboard.library import compiler
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
 from dlkf.simulation.sensors import BaroConfig, HeadingConfig, SensorsConfig, WheelConfig
-from dlkf.tracking.models import resolve_model, short_name
+from dlkf.tracking.models import resolve_model, short_name, unused_settings
 
 COPIED = ("navigate.c", "ros2_node.cpp", "CMakeLists.txt")
 ARM = (1.0, 0.3, -1.2)  # m, IMU to antenna of the simulated car
@@ -43,6 +43,8 @@ def main(settings: ExportSettings) -> None:
     require_empty(settings.out, overwrite=settings.overwrite)
     imu = settings.spec
     model = resolve_model(str(settings.model), imu, settings.tracking.uri, **settings.filter_options)
+    if line := unused_settings(str(settings.model), typed_words("imu", "tuning")):
+        print(line)
     aids = [settings.aids] if isinstance(settings.aids, str) else list(settings.aids or ())
     model = with_aids(model, standard_tables(aids))
     if isinstance(model, SmoothedSolution):

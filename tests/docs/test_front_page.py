@@ -88,6 +88,6 @@ def test_simulated_drives(desk: Path, run: Run, monkeypatch: pytest.MonkeyPatch,
     capfd.readouterr()
     exec(compile(program.text, "vehicle.md", "exec"), {"__name__": "vehicle"})
     printed = [[float(x) for x in line.split()] for line in capfd.readouterr().out.splitlines()]
-    solved = pd.read_parquet("outputs/solved/drive=per_drive-3-00000/solution.parquet").set_index("t")
+    solved = pd.read_parquet("outputs/consumer_solved/drive=per_drive-3-00000/solution.parquet").set_index("t")
     t, lat, lon, _ = printed[-1]
     assert abs(lat - solved.loc[t, "lat_deg"]) < 1e-6 and abs(lon - solved.loc[t, "lon_deg"]) < 1e-6  # 0.1 m

@@ -293,7 +293,7 @@ def check_finds_noise(name: str) -> None:
     """InputError for ``imu=auto`` with a filter that takes no noise, or more than noise."""
     if not is_filter(name) or name == "ins" or "prior" in name.split("_"):
         what = "imu=auto finds the noise of a Kalman filter"
-        raise InputError(f"{what}, model={name} takes none; leave imu out, or take model=mbkf21_nhc")
+        raise InputError(f"{what}, model={name} takes none; give a preset or leave imu out, or take model=mbkf21_nhc")
 
 
 def generic_filter(

@@ -36,7 +36,8 @@ from dlkf.running.start import align_each
 
 FEW_DRIVES = 8  # whose start in tensor operations takes less than numba takes to load
 WORTH_SAYING = 0.01  # probability of another heading
-OF_RECEIVER, SIGMAS = (DELAY, *ARM, DRIFT), 3.0  # what differs from what a log says by so many 1σ is worth saying
+SIGMAS = 3.0  # what differs from what a log says by so many 1σ is worth saying
+OF_RECEIVER = {DELAY: 0.01, **dict.fromkeys(ARM, 0.1), DRIFT: 30.0}  # s, m, ppm: 1σ of what no model of a car contains
 SAMPLES_AT_ONCE = CHUNK_SAMPLES  # IMU samples of drives in memory, 8 h at 50 Hz
 FASTER_THAN_REVERSE = 8.0  # m/s
 MOSTLY = 0.5  # of the updates of a further sensor; where fewer are used, its numbers are likely wrong
@@ -158,7 +159,8 @@ class Navigated:
             said[name] += f" (normalised innovation RMS {np.sqrt((ratio**2).mean()):.2g})"
         for std in (column for column in self.sensor_columns if column.startswith("std_")):
             name, last = std.removeprefix("std_"), table.iloc[-1]
-            if name in OF_RECEIVER and abs(last[name]) <= SIGMAS * last[std]:
+            floor = OF_RECEIVER.get(name)
+            if floor is not None and abs(last[name]) <= SIGMAS * np.hypot(last[std], floor):
                 continue
             said[name] = f"{last[name]:.4g} ± {last[std]:.2g}"
         return said
