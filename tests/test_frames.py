@@ -114,9 +114,9 @@ def test_a_filter_that_is_too_sure_of_itself_is_said(drive):
     for sensor in ("accel", "gyro"):
         spec[sensor] |= {k: 0.1 * x for k, x in spec[sensor].items() if k != "correlation_time"}
     frames = drive["imu"], drive["gnss"]
-    with pytest.warns(UserWarning, match="mbkf21_nhc is too sure of itself"):  # a script has no page that shows it
+    with pytest.warns(UserWarning, match="mbkf21_nhc is overconfident"):  # a script has no page that shows it
         sure = dlkf.navigate(*frames, model="mbkf21_nhc", imu_type=spec)
-    assert sure.warning.startswith("mbkf21_nhc is too sure of itself") and "tuning=any_car" in sure.warning
+    assert sure.warning.startswith("mbkf21_nhc is overconfident") and "tuning=any_car" in sure.warning
     assert sure.warning in sure._repr_html_()
     tuned = dlkf.evaluate(*frames, drive["reference"], models="mbkf21_car", tuning="any_car", outage_s=10)
     assert tuned.warnings == [] and tuned.table.loc["mbkf21_car", "own_sigma_m"] > 0

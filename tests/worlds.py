@@ -39,7 +39,7 @@ from tests.shell import Ended
 
 SIZE = ("dataset.hours=0.05", "dataset.drive_minutes=1.5", "dataset.imu_rate_hz=50", "seed=3")
 SHAPES_CHECKED = {"data", "filters", "navigation", "running", "simulation"}  # rooms of pure functions and of the loop
-SHAPES_CHECKED_S = 0.5  # of a test: a filter run for thousands of epochs calls the same functions again and again
+SHAPES_CHECKED_S = 0.05  # of a test: a filter run for thousands of epochs calls the same functions again and again
 WITH_STORE = {"evaluate", "train", "tune"}  # commands that make an MLflow store where there is none, in seconds
 CLOCK = pytest.StashKey[threading.Timer]()
 SHIPPED_FLAGS = library.FLAGS  # of the compiler; rooms that only use a compiled filter need not wait for -O3
@@ -47,7 +47,7 @@ SHIPPED_FLAGS = library.FLAGS  # of the compiler; rooms that only use a compiled
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Shapes and types are checked where functions are tested one by one, in the first half second of the first case
+    """Shapes and types are checked where functions are tested one by one, at the beginning of the first case
     of every test: the others call the same functions with other numbers, and studies and commands by the thousand."""
     checked = room(item) in SHAPES_CHECKED and item.stash[FIRST_CASE]
     jaxtyping.config.update("jaxtyping_disable", not checked)

@@ -5,7 +5,7 @@ Prints the results table and leaves metrics.json, table.md, table.csv, report.ht
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
@@ -42,7 +42,8 @@ from dlkf.tracking.runs import check_store, tracking_uri
 
 
 class EvaluationRun(NamedTuple):
-    """Scores of an evaluation, its results per kind of data, the filters' names, how it was done and on which data."""
+    """Scores of an evaluation, its results per kind of data, the filters' names, how it was done, on which data, and
+    what was said of drives and filters."""
 
     scores: Scores
     results: list[Results]
@@ -51,6 +52,7 @@ class EvaluationRun(NamedTuple):
     protocol: Mapping[str, Any]
     digest: str
     sensors: ResultTable | None = None
+    notes: Sequence[str] = ()
 
 
 def evaluate_dataset(settings: EvaluateSettings, console: Console) -> EvaluationRun:
@@ -70,7 +72,8 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console) -> Evaluation
     cards = {model_name: getattr(model, "card", {}) for model_name, model in models.items()}
     rows, seen = without_training_recordings(cards, rows, name, digest, leave_out=settings.unseen)
     strange = domain_warnings(models, settings.dataset, [row.name for row in rows], spec.name, grid["rate_hz"])
-    for line in (*seen, *strange):
+    notes = [*seen, *strange]
+    for line in notes:
         console.print(line, style="yellow")
     for line in describe_aids(models, chosen):
         console.print(line, highlight=False)
@@ -95,7 +98,7 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console) -> Evaluation
         said = f"no segment of {settings.length_s:g} s with a known attitude: whole drives, from their own alignment"
         console.print(said, style="yellow")
     scores = done.run.scores
-    check_outages(protocol.outage, scores.outage)
+    check_outages(protocol.outage, scores.outage, max(x.span_s for x in fixes.values()))
     results = results_of(done.run, baseline=settings.baseline, settle_s=settings.settle_s, seed=settings.seed)
     decided = {
         "models": settings.model,
@@ -107,7 +110,7 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console) -> Evaluation
     made_how = {**describe_provenance(), **decided, "digest": digest, **done.truth, **step, **done.rules}
     made_how["aids"] = [table.name for table in taken]
     sensors = sensor_table(scores, {model_name: aid_columns(model) for model_name, model in models.items()})
-    return EvaluationRun(scores, results, list(models), done.mode, made_how, digest, sensors)
+    return EvaluationRun(scores, results, list(models), done.mode, made_how, digest, sensors, notes)
 
 
 @command("evaluate", EvaluateSettings)

@@ -36,7 +36,7 @@ from dlkf.running.innovations import OF_NETWORK, REMEDY
 from dlkf.running.likelihood import check_finds_noise, generic_filter
 from dlkf.running.replay import stream_drives
 from dlkf.running.solution import write_solution
-from dlkf.tracking.models import resolve_model, short_name, takes_tuning, unused_settings
+from dlkf.tracking.models import resolve_model, settings_taken, short_name, takes_tuning, unused_settings
 
 
 @command("navigate", NavigateSettings)
@@ -48,6 +48,7 @@ def main(settings: NavigateSettings) -> None:
     if not isinstance(settings.model, str):
         raise InputError(f"navigate runs one model at a time, got model={settings.model}")
     spec, tuning = settings.spec, settings.tuning
+    preset = spec.name
     if spec.name == AUTO:
         check_finds_noise(settings.model)
     model = resolve_model(settings.model, spec, settings.tracking.uri, **settings.filter_options)
@@ -95,6 +96,7 @@ def main(settings: NavigateSettings) -> None:
         done = parallel_map(partial(offline.load_chunk, run, skipped is not None), shares, settings.parallel)
         navigated = partial(offline.navigate_chunks, done, len(rows), skipped=skipped)
     lines, courses = [], []
+    shown = f"{name} (imu={preset})" if "imu" in settings_taken(settings.model) else name
     with write_into(settings.out) as folder, show_progress("Navigating") as progress:
         for result in navigated(progress=progress):
             write_solution(folder / f"drive={result.drive}" / "solution.parquet", result.table)
@@ -117,7 +119,7 @@ def main(settings: NavigateSettings) -> None:
         warnings = [doubt] if doubt else []
         write_page(folder, name, folder_name(settings.dataset), courses, made, warnings)
         left_out = [f"left out: {reason}" for reason in (skipped or {}).values()]
-        said = "\n".join((*sorted(lines), *left_out, *summary_lines(name, courses), *warnings))
+        said = "\n".join((*sorted(lines), *left_out, *summary_lines(shown, courses), *warnings))
         (folder / LOG).write_text(f"{said}\n")
     print(said)
     print(f"Solutions: {settings.out}/drive=*/solution.parquet; report: {settings.out}/report.html")

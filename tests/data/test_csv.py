@@ -203,7 +203,7 @@ def test_mistakes_in_the_files(tmp_path, tables):
     lines = path.read_text().splitlines()
     for line, cells, message in (
         (41, "0.4,0,0,oops,0,0,-9.8", "line 42: column 'gyro_z' is 'oops', not a number"),
-        (41, "0.4,0,0,,0,0,-9.8", "line 42: column 'gyro_z' is empty"),
+        (41, "0.4,0,0,,0,0,-9.8", "line 42: column 'gyro_z' has no value"),
         (41, "0.4,0,0,0,0,0,-9.8,7,7", "cannot be read as a table"),
         (41, "0.39,0,0,0,0,0,-9.8", "row 40: t = 0.390000 appears twice|row 40: t"),
     ):

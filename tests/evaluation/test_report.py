@@ -71,7 +71,7 @@ def test_tables_hold_the_summarise_scores(scores):
     few = headline(r)
     assert few.startswith(f"20 s without GNSS, 6 outages: mbkf15 ends {at_end[0]} m from the reference in the median, ")
     assert f"{at_end[1]} m in the largest (" in few and " % of the distance driven); next ins " in few
-    assert few.endswith(" With 6 outages, expect larger errors too.")
+    assert few.endswith(" Based on 6 outages only; larger errors can occur.")
     many, one = (replace(r, count={**r.count, "outages": n}) for n in (20, 1))
     assert (
         f"mbkf15 ends {at_end[0]} m from the reference in the median, within {at_end[2]} m in 95 % of them ("

@@ -51,7 +51,7 @@ CALLS: dict[str, tuple[Callable[[Frames, Path], Any], str]] = {
     ),
     "imu_type=auto": (
         lambda d, _: dlkf.navigate(d["imu"], d["gnss"], imu_type="auto", **KALMAN),
-        "imu_type='auto' is for dlkf navigate imu=auto",
+        "imu_type='auto': only the command dlkf navigate finds the noise",
     ),
     "a tuning misspelt": (
         lambda d, _: dlkf.navigate(d["imu"], d["gnss"], tuning="any_care", **KALMAN),
@@ -59,7 +59,7 @@ CALLS: dict[str, tuple[Callable[[Frames, Path], Any], str]] = {
     ),
     "a factor that is none": (
         lambda d, _: dlkf.navigate(d["imu"], d["gnss"], tuning={"accel_nois": 2.0}, **KALMAN),
-        "tuning: unknown key accel_nois; known are accel_noise",
+        "tuning: unknown key accel_nois; did you mean accel_noise? known are",
     ),
     "an arm of two": (
         lambda d, _: dlkf.navigate(d["imu"], d["gnss"], lever_arm=(1, 2)),
@@ -339,7 +339,7 @@ CALLS: dict[str, tuple[Callable[[Frames, Path], Any], str]] = {
     ),
     "a setting misspelt": (
         lambda d, here: dlkf.read_logs(here, "csv", "reader.imu.acel.unit=g"),
-        "reader.imu: unknown key acel; known are",
+        "reader.imu: unknown key acel; did you mean accel? known are",
     ),
     "perhaps without the unsure": (
         lambda d, here: dlkf.read_logs(here, skip_unsure="maybe"),

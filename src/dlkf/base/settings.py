@@ -11,7 +11,7 @@ from dataclasses import MISSING, field, fields, is_dataclass
 from types import NoneType, UnionType
 from typing import Any, ClassVar, Literal, Protocol, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, did_you_mean
 
 
 class Settings(Protocol):
@@ -41,7 +41,8 @@ def settings_from(kind: type[T], config: Any, where: str) -> T:
     if unknown := sorted(str(key) for key in config if key not in known):
         if not where:
             raise InputError(f"unknown config key {unknown[0]!r}; --cfg job prints all keys")
-        raise InputError(f"{head}unknown key {', '.join(unknown)}; known are {', '.join(known)}")
+        near = did_you_mean(unknown[0], known) or ";"
+        raise InputError(f"{head}unknown key {unknown[0]}{near} known are {', '.join(known)}")
     given = {key: convert_value(known[key], value, f"{where}.{key}" if where else key) for key, value in config.items()}
     optional = {f.name for f in fields(kind) if f.default is not MISSING or f.default_factory is not MISSING}
     if missing := [key for key in known if key not in given and key not in optional]:

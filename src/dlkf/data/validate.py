@@ -101,7 +101,7 @@ def check_tables(tables: CheckedTables, limits: Limits = LIMITS) -> CheckedTable
         velocity = np.stack([fixes[c] for c in VELOCITY], -1)
         moved = motion(fixes["t"], fixes["lat_deg"], fixes["lon_deg"], velocity)
         for kind, table in tables.aids.items():
-            _check_time(table["t"], _where(name, kind))
+            _check_time(table["t"], _where(name, kind), kind)
             check_aid(kind, table, imu, moved, _where(name, kind))
     return tables
 
@@ -150,15 +150,15 @@ def _check_time(t: np.ndarray, where: str, kind: str = "imu") -> None:
     if len(back):
         k = int(back[0])
         if (same := int((np.diff(t) == 0).sum())) > MOST_SAME * len(t):
+            remedy = _coarse(t) if kind == "imu" else f"remove duplicate rows; if there are none, {_coarse(t)}"
             raise InputError(
-                f"{where}: {same} of {len(t)} rows have the stamp of the row before: {_coarse(t)} "
-                f"(reader.{kind}.time.respace=true spreads such samples evenly)"
+                f"{where}: {same} of {len(t)} rows have the stamp of the row before: {remedy} "
+                f"(reader.{kind}.time.respace=true spreads such rows evenly)"
             )
         if t[k + 1] == t[k]:
-            raise InputError(
-                f"{where}: row {k + 1}: t = {t[k]:.6f} appears twice; remove duplicate samples (of an IMU with a "
-                "coarse clock: reader.imu.time.respace=true)"
-            )
+            coarse = " (of an IMU with a coarse clock: reader.imu.time.respace=true)" if kind == "imu" else ""
+            rows = {"imu": "samples", "gnss": "fixes"}.get(kind, "rows")
+            raise InputError(f"{where}: row {k + 1}: t = {t[k]:.6f} appears twice; remove duplicate {rows}{coarse}")
         raise InputError(
             f"{where}: row {k + 1}: t goes back from {t[k]:.6f} to {t[k + 1]:.6f}; sort the rows, or split the drive"
         )
@@ -274,7 +274,7 @@ def _check_fixes_there(gnss: Columns, where: str) -> None:
 
 
 def _check_reference(reference: Columns, imu: Columns, fixes: Columns, where: str) -> None:
-    _check_time(reference["t"], where)
+    _check_time(reference["t"], where, "reference")
     _check_finite(reference, (*POSITION, *VELOCITY, *ATTITUDE), where, nan=True)
     known = reference["valid"] & np.isfinite(reference["lat_deg"]) & np.isfinite(reference["lon_deg"])
     if not known.any():

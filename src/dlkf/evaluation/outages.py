@@ -93,12 +93,16 @@ def scorable_outages(batch: Batch, outage: Tensor) -> Tensor:
     return outage & (faulty.gather(1, window) == 0)
 
 
-def check_outages(plan: OutagePlan | None, withheld: Tensor | np.ndarray) -> None:
-    """Raises InputError where a plan was given and nothing was ``withheld``: no outage could be scored."""
+def check_outages(plan: OutagePlan | None, withheld: Tensor | np.ndarray, longest_s: float) -> None:
+    """Raises InputError where a plan was given and nothing was ``withheld``: no outage could be scored.
+
+    ``longest_s``: from the first fix to the last of the longest drive.
+    """
     if plan is not None and not withheld.any():
         raise InputError(
             f"no outage fits into these drives: outage.first_s={plan.first_s} and outage.duration_s={plan.duration_s} "
-            "need a fix at its start and valid truth throughout; give smaller ones, or outage=null"
+            f"need a fix at its start and valid truth throughout; the longest drive has {longest_s:.0f} s with GNSS; "
+            "give smaller ones, or outage=null"
         )
 
 

@@ -68,7 +68,7 @@ def headline(result: Results) -> str:
     if other is not None:
         which = "next" if is_classical(best) else "best classical filter"
         text += f"; {which} {other} {', '.join(texts[other])}"
-    few = f" With {count} {unit}{'s' if count > 1 else ''}, expect larger errors too." if count < FEW else ""
+    few = f" Based on {count} {unit}{'s' if count > 1 else ''} only; larger errors can occur." if count < FEW else ""
     return f"{text}.{few}"
 
 

@@ -57,7 +57,7 @@ def unseen_imus(cards: Mapping[str, Mapping[str, Any]], imus: Iterable[str]) -> 
         if known and (unmet := sorted(set(imus) - known)):
             lines.append(
                 f"{name} was trained on the IMU {', '.join(sorted(known))} and has not met {', '.join(unmet)}: "
-                "it may be worse than any other filter here"
+                "its accuracy is not validated there"
             )
     return lines
 
@@ -78,7 +78,7 @@ def slow_drives(models: Mapping[str, object], rates: Iterable[float], having: st
             have = f"{slow[0]:g}" if len(slow) == 1 else f"{slow[0]:g} to {slow[-1]:g}"
             lines.append(
                 f"{name} needs samples at {least:g} Hz or more and {having} {have} Hz: "
-                "it runs, but may be worse than any other filter here"
+                "its accuracy is not validated below; consider mbkf21_car"
             )
     return lines
 

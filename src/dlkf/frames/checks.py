@@ -65,7 +65,8 @@ def _check_seconds(times: Mapping[str, np.ndarray]) -> None:
     """InputError for rows so far apart that their times count something smaller than seconds, or nothing but rows."""
     for name, t in times.items():
         slowest = {"imu": 0.99, "speed": 50.0, "heading": 50.0, "baro": 50.0}.get(name, 99.0)
-        step = float(np.median(np.abs(np.diff(t)))) if len(t) > 2 else 0.0
+        steps = np.diff(t)
+        step = float(np.median(steps)) if len(t) > 2 and (steps > 0).all() else 0.0
         if name == "imu" and 0.99 < step < 10 and len(times["gnss"]) and t[-1] - t[0] < 2 * np.ptp(times["gnss"]):
             raise InputError(f"imu: a row every {step:g} s; a car's IMU has at least 5 a second: give all its samples")
         for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
@@ -207,7 +208,9 @@ def check_imu_type(imu_type: Any) -> None:
     if isinstance(imu_type, Mapping):
         return
     if imu_type == "auto":
-        raise InputError("imu_type='auto' is for dlkf navigate imu=auto alone; give a preset, or model='plus'")
+        raise InputError(
+            "imu_type='auto': only the command dlkf navigate finds the noise (imu=auto); give a preset, or model='plus'"
+        )
     check_preset("imu", imu_type, "imu_type")
 
 

@@ -24,7 +24,8 @@ class Evaluation:
     headline : str
         How far the best filter drifts in the outages, in one sentence.
     warnings : list of str
-        A line for each filter whose 1σ does not fit its innovations, with the remedy.
+        A line for each filter whose 1σ does not fit its innovations, with the remedy, and for one that the drive's
+        sample rate is too low for.
     table : pandas.DataFrame
         A row per filter: horizontal error at the end of the outages, RMS, median and 95 % [m], drift [% of distance],
         the filter's own horizontal 1σ at the end (median) [m], innovations over their 1σ (RMS).
@@ -36,11 +37,11 @@ class Evaluation:
         Errors and tracks of every filter over time.
     """
 
-    def __init__(self, results: Results, scores: Scores) -> None:
+    def __init__(self, results: Results, scores: Scores, notes: Sequence[str] = ()) -> None:
         from dlkf.evaluation.summary import headline, sigma_warnings
 
         self.results, self.scores, self.headline = results, scores, headline(results)
-        self.warnings = sigma_warnings(scores)
+        self.warnings = [*notes, *sigma_warnings(scores)]
         end = {"end_rms_m": ("horizontal", "rms"), "median_m": ("horizontal", "median"), "p95_m": ("horizontal", "p95")}
         rows = {
             name: {key: results.value(name, "outages", "end", *which) for key, which in end.items()}
@@ -139,4 +140,4 @@ def evaluate(
         settings = settings_from(EvaluateSettings, values, "")
         done = evaluate_dataset(settings, Console(quiet=True))
     (results,) = done.results
-    return Evaluation(results, done.scores)
+    return Evaluation(results, done.scores, done.notes)

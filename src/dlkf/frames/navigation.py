@@ -87,13 +87,15 @@ def navigate(
     Warns
     -----
     UserWarning
-        Where the filter's 1σ is too small for its innovations, with the remedy (also ``solution.warning``), and for a
-        sensor that the filter does not use.
+        Where the filter's 1σ is too small for its innovations, with the remedy (also ``solution.warning``), for a
+        sensor that the filter does not use, and for a sample rate that is too low for it.
     """
     import torch
 
+    from dlkf.data.kinds import drive_rates
     from dlkf.data.store import choose_aids, load_dataset
     from dlkf.filters.aids.attach import describe_aids, tables_of, with_aids
+    from dlkf.filters.card import slow_drives
     from dlkf.filters.saved import grid_of
     from dlkf.filters.smoother import run_smoother
     from dlkf.running.innovations import OF_NETWORK, REMEDY
@@ -109,7 +111,9 @@ def navigate(
     with drive_folder(imu, gnss, None, lever_arm, aids) as folder:
         chosen = choose_aids(folder, None)
         estimator = with_aids(load(model, imu_type=imu_type, tuning=tuning), chosen)
-        unused = describe_aids({short_name(model): estimator}, [t for t in chosen if t not in tables_of(estimator)])
+        named = {short_name(model): estimator}
+        unused = describe_aids(named, [t for t in chosen if t not in tables_of(estimator)])
+        slow = slow_drives(named, drive_rates(folder).values(), "this drive has")
         if smoothed:
             estimator = run_smoother(estimator, "rts")
         fixes = UsableFixes.of(folder, DRIVE)
@@ -117,7 +121,7 @@ def navigate(
         drives = load_dataset(folder, dtype=torch.float64, reference=False, aids=tables_of(estimator), **grid)
         (navigated,) = navigate_drives(drives, estimator, align=_align())
     solution = Solution.of(navigated, fixes, short_name(model), REMEDY if takes_tuning(model) else OF_NETWORK)
-    for line in (*unused, *([solution.warning] if solution.warning else [])):
+    for line in (*unused, *slow, *([solution.warning] if solution.warning else [])):
         warnings.warn(line, UserWarning, stacklevel=2)
     return solution
 

@@ -38,7 +38,7 @@ class Solution(pd.DataFrame):
 
     @classmethod
     def of(cls, navigated: Navigated, fixes: UsableFixes, model: str, remedy: str) -> Solution:
-        """The frame of a drive that was navigated with ``model``; ``remedy`` if that is too sure of itself."""
+        """The frame of a drive that was navigated with ``model``; ``remedy`` if that is overconfident."""
         from dlkf.running.offline import sigma_warning
 
         solution = cls(navigated.table)

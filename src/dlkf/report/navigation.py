@@ -119,7 +119,8 @@ def vibration_lines(courses: Sequence[TrackOnMap]) -> list[str]:
     if not shows:
         return ["Speed from vibration: the spectrum of the IMU does not show it."]
     where = f" in {shows} of {len(tables)} drives" if len(tables) > 1 else ""
-    return [f"Speed from vibration: the spectrum of the IMU shows it{where}; {used} measurements used."]
+    done = f"{used} measurements used" + ("" if used else " (only outages use them)")
+    return [f"Speed from vibration: the spectrum of the IMU shows it{where}; {done}."]
 
 
 def duration(hours: float) -> str:

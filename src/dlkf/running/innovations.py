@@ -73,7 +73,7 @@ class SigmaFit(NamedTuple):
     def warning(self, name: str, remedy: str = REMEDY) -> str:
         """One line with the remedy."""
         return (
-            f"{name} is too sure of itself: its innovations are {self.ratio:.2g} times their 1σ (RMS from update "
+            f"{name} is overconfident: its innovations are {self.ratio:.2g} times their 1σ (RMS from update "
             f"{SETTLE + 1} on; by chance at most {self.high:.2g}), so in outages it drifts further than its 1σ says; "
             f"{OF_DATA if self.ratio > FAULTY else remedy}"
         )

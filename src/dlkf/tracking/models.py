@@ -64,8 +64,8 @@ def resolve_model(
         raise InputError(f"model={spec}: no such folder; a model is a folder with {WEIGHTS} beside {CONFIG}")
     near = did_you_mean(spec, (*filter_names(), KNOWN_IMU))
     raise InputError(
-        f"unknown model {spec!r}{near or ':'} neither a known filter (plus, {KNOWN_IMU}, {known_filters()}) nor a "
-        "folder, an MLflow run id, models:/name@alias or a class of your own, module:Class"
+        f"unknown model {spec!r}{near or '.'} A model is a filter (plus, {KNOWN_IMU}, {known_filters()}), a folder, "
+        "an MLflow run id, models:/name@alias or a class of your own, module:Class"
     )
 
 

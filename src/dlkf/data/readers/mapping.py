@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, did_you_mean
 from dlkf.data.readers import units
 from dlkf.data.readers.frames import LogTable
 
@@ -44,6 +44,7 @@ ENTRIES = {
 }
 NUMBERS = ("week_number", "wraps_s", "offset_s", "drift_ppm", "delay_s", "every_s", "per_metre", "per_turn")
 NUMBERS += ("radius_m", "antennas_deg")  # or auto, where that is allowed
+OPTIONAL = ("velocity", "std_position", "std_velocity", "quality", "attitude", "valid", "std")
 POSITIVE = ("week_number", "wraps_s", "every_s", "per_metre", "per_turn", "radius_m")
 SWITCHES = ("respace", "increments", "counts")
 
@@ -64,7 +65,8 @@ def _known(spec: Any, known: tuple[str, ...], where: str) -> None:
     if not isinstance(spec, Mapping):
         raise InputError(f"{where} is {spec!r}, must be a mapping of {', '.join(known)}")
     if unknown := [str(key) for key in spec if key not in known]:
-        raise InputError(f"{where}: unknown key {unknown[0]}; known are {', '.join(known)}")
+        near = did_you_mean(unknown[0], known)
+        raise InputError(f"{where}: unknown key {unknown[0]}{near or ';'} known are {', '.join(known)}")
     for key in NUMBERS:
         if spec.get(key) not in (None, "auto") and _finite(spec[key], f"{where}.{key}") <= 0 and key in POSITIVE:
             raise InputError(f"{where}.{key} is {spec[key]}, must be above 0")
@@ -105,7 +107,7 @@ class Mapped:
         if not nan and bool(values.isna().any()):
             row = int(np.flatnonzero(values.isna())[0])
             remedy = f"correct or remove the line, or leave such rows out with reader.{self.kind}.rows=filled"
-            self.fail(row, name, f"is empty; {remedy}")
+            self.fail(row, name, f"has no value; {remedy}")
         return values.to_numpy()
 
     def texts(self, name: str | int) -> pd.Series:
@@ -210,9 +212,19 @@ class Mapped:
             have = [str(c) for c in self.table.frame.columns]
             has = ", ".join(have[:24]) + (", …" if len(have) > 24 else "")
             other = next((m for m in (";", "\t") if len(have) == 1 and m in have[0]), None)
-            remedy = f"set it in reader.{self.kind}" if other is None else f"set reader.separator={other!r}"
+            remedy = self._entry_to_set(name) if other is None else f"set reader.separator={other!r}"
             raise InputError(f"{self.table.path}: no column {name!r}; has {has}; {remedy}")
         return self.table.frame[name]
+
+    def _entry_to_set(self, name: str) -> str:
+        """How to mend a mapping that names a column which is not there; an entry that a log need not have is null."""
+        for key in OPTIONAL:
+            for word in ("columns", "column"):
+                named = (self.spec.get(key) or {}).get(word)
+                if name in ([named] if isinstance(named, (str, int)) else [str(n) for n in named or ()]):
+                    entry = f"reader.{self.kind}.{key}.{word}"
+                    return f"set {entry}, {entry}=null if the log has none"
+        return f"set it in reader.{self.kind}"
 
 
 def selected(mapped: Mapped) -> Mapped:
