@@ -48,7 +48,7 @@ def test_values_of_the_right_type_become_settings():
         ({"name": "x", "when_s": ["a"]}, "must be a number or a list of numbers"),
         ({"name": "x", "every_s": "no"}, "must be a number or null"),
         ({"name": "x", "mode": "c"}, "outer\\.mode is 'c', must be one of a, b"),
-        ({"name": "x", "inner": {"with_m": 1}}, "outer\\.inner: unknown key with_m; did you mean width_m\\? known are width_m"),
+        ({"name": "x", "inner": {"with_m": 1}}, "outer\\.inner: unknown key with_m; did you mean width_m"),
         ({"name": "x", "inner": 5}, "outer\\.inner is 5, must be a mapping"),
         ([1], "outer: is \\[1\\], must be a mapping"),
     ],

@@ -206,7 +206,7 @@ def test_no_position_yet(tmp_path, tables):
 
 
 MISTAKES = {
-    "unknown key": ({"imu__accel__unti": "g"}, "reader.imu.accel: unknown key unti; did you mean unit? known are columns, unit"),
+    "unknown key": ({"imu__accel__unti": "g"}, "reader.imu.accel: unknown key unti; did you mean unit? known"),
     "unknown format": ({"gnss__format": "gpx"}, "reader.gnss.format=gpx: unknown; known are csv"),
     "rows": ({"imu__rows": "some"}, "reader.imu.rows is 'some', must be filled, changed or"),
     "no row left": ({"imu__rows": {"column": "t", "is": ["x"]}}, "no row is left"),
