@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from dlkf.base.errors import InputError
 from dlkf.networks.features import CNN_CHANNELS, COMPONENTS
-from dlkf.networks.products import EpochLinear, EpochLSTMCell, begin_batch
+from dlkf.networks.products import EpochLinear, EpochLSTMCell, GRUCell, begin_batch
 
-CELLS = {"lstm": EpochLSTMCell, "gru": nn.GRUCell}
+CELLS = {"lstm": EpochLSTMCell, "gru": GRUCell}
 
 
 @dataclass(frozen=True)

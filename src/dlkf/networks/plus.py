@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from dlkf.base.errors import InputError
+from dlkf.networks.products import GRUCell
 
 BANDS_HZ = (0.5, 1.5, 3.5, 5.5, 8.5, 12.5, 16.5, 20.5, 25.5)  # edges; below 0.5 Hz is the car's own motion
 LEAST_RATE_HZ = 50.0  # of samples that have all bands
@@ -49,7 +50,7 @@ class PlusNetwork(nn.Module):
         super().__init__()
         self.config = config
         self.inward = nn.Linear(config.features, config.hidden)
-        self.memory = nn.GRUCell(config.hidden, config.hidden)
+        self.memory = GRUCell(config.hidden, config.hidden)
         self.noise = nn.Linear(config.hidden + now, 3)
         self.context = nn.Linear(config.hidden, AXIS_HIDDEN)
         self.of_axis = nn.Linear(config.of_axis, AXIS_HIDDEN)

@@ -16,7 +16,23 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
+from dlkf.navigation.compiled import is_recorded
+
 ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
+
+
+class GRUCell(nn.GRUCell):
+    """Torch's own, which an export records gate by gate: torch's takes sums in place and has to be recorded twice."""
+
+    def forward(self, input: Float[Tensor, "B K"], hx: Float[Tensor, "B h"]) -> Float[Tensor, "B h"]:
+        """r, z = σ(W x + b + U h + c), n = tanh(W x + b + r (U h + c)), h⁺ = n + z (h − n)."""
+        if not is_recorded():
+            return super().forward(input, hx)
+        of_input = linear(input, self.weight_ih, self.bias_ih).chunk(3, -1)
+        of_memory = linear(hx, self.weight_hh, self.bias_hh).chunk(3, -1)
+        r, z = (torch.sigmoid(x + h) for x, h in zip(of_input[:2], of_memory))
+        n = torch.tanh(of_input[2] + r * of_memory[2])
+        return n + z * (hx - n)
 
 
 class EpochProduct:

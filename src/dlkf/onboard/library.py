@@ -35,8 +35,8 @@ def compiler() -> str | None:
     return next((found for name in (*given, "cc", "gcc", "clang") if (found := shutil.which(name))), None)
 
 
-def build(folder: Path, into: Path | None = None, flags: Sequence[str] = FLAGS) -> Path:
-    """Compile what was exported to a folder, the filter with ``flags``.
+def build(folder: Path, into: Path | None = None, flags: Sequence[str] | None = None) -> Path:
+    """Compile what was exported to a folder, the filter with ``flags``; default: :data:`FLAGS`.
 
     Raises InputError where there is no compiler, or it fails.
     """
@@ -45,7 +45,7 @@ def build(folder: Path, into: Path | None = None, flags: Sequence[str] = FLAGS) 
         raise InputError("no C compiler found (cc, gcc, clang, or $CC); install one, such as apt-get install gcc")
     into = (into or folder).resolve()
     objects = []
-    for names, own in ((FILTER, flags), (CORE, CORE_FLAGS)):
+    for names, own in ((FILTER, FLAGS if flags is None else flags), (CORE, CORE_FLAGS)):
         for name in names:
             if (folder / name).is_file():
                 objects.append(into / f"{name}.o")

@@ -40,7 +40,7 @@ def record(function: Recordable) -> GraphModule:
     graph: Any = function
     whole: Any = function
     try:
-        for _ in range(2):  # what nn.GRUCell changes in place shows in the first graph and is gone in the second
+        for _ in range(2):  # what is changed in place shows in the first graph and is gone in the second
             recorder = make_fx(functionalize(graph), _decompositions(), "fake", _allow_non_fake_inputs=True)
             graph = recorder(*example)
             if not any(node.op == "call_function" and _is_in_place(node.target) for node in graph.graph.nodes):
