@@ -39,7 +39,7 @@ from tests.shell import Ended
 
 SIZE = ("dataset.hours=0.05", "dataset.drive_minutes=1.5", "dataset.imu_rate_hz=50", "seed=3")
 SHAPES_CHECKED = {"data", "filters", "navigation", "running", "simulation"}  # rooms of pure functions and of the loop
-SHAPES_CHECKED_S = 0.05  # of a test: a filter run for thousands of epochs calls the same functions again and again
+SHAPES_CHECKED_S = 0.03  # of a test: a filter run for thousands of epochs calls the same functions again and again
 WITH_STORE = {"evaluate", "train", "tune"}  # commands that make an MLflow store where there is none, in seconds
 CLOCK = pytest.StashKey[threading.Timer]()
 SHIPPED_FLAGS = library.FLAGS  # of the compiler; rooms that only use a compiled filter need not wait for -O3

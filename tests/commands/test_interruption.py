@@ -93,6 +93,7 @@ TRAIN = (
 )  # fmt: skip
 
 
+@pytest.mark.commands
 def test_train(town, template, tmp_path):
     """SIGTERM in the middle of a training in an interpreter of its own: the exit code says so, and MLflow's run is no
     longer running."""

@@ -23,13 +23,8 @@ def pages() -> list[str]:
     return tutorials.tutorials()
 
 
-def marked(name: str):
-    """A tutorial that trains takes half a minute."""
-    trains = "dlkf.train" in (tutorials.FOLDER / f"{name}.py").read_text()
-    return pytest.param(name, marks=pytest.mark.commands if trains else pytest.mark.whole)
-
-
-@pytest.mark.parametrize("name", [marked(name) for name in pages()])
+@pytest.mark.commands
+@pytest.mark.parametrize("name", pages())
 def test_a_tutorial_runs_and_its_page_is_of_it(
     name: str, tmp_path: Path, template: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

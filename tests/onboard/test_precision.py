@@ -34,6 +34,7 @@ LIMITS = {"lat_deg": 0.01, "lon_deg": 0.01, "height_m": 0.01, "vel_n": 0.005, "v
           "roll": 1e-4, "pitch": 1e-4, "yaw": 1e-3}  # m, m/s, rad: of a minute  # fmt: skip
 
 
+@pytest.mark.exports
 def test_single_precision_beside_double(exported, tables, tmp_path):
     """Constants that the package keeps from call to call must not be made while it records: a new process has none."""
     subprocess.run([sys.executable, "-c", WRITE, tmp_path], cwd=ROOT, check=True)

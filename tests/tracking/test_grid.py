@@ -257,6 +257,7 @@ def swept(folder: Path, client, *launcher: str, **environment: str) -> None:
     assert "position_rms_m" in done.stdout and parent in done.stdout
 
 
+@pytest.mark.commands
 def test_a_real_sweep_with_a_failing_point(uri, client, tmp_path):
     """Through Hydra into SQLite, at once from two processes."""
     swept(tmp_path, client, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
