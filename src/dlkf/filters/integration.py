@@ -174,7 +174,7 @@ def advance(
     epoch = Epoch(imu, corrected, error, state, window, at_fix, rate_b, rate_at_fix_b, z, fix, lever_arm_b, dt, frame)
     memory, answer = estimator.step(memory, epoch)
     after = ImuError.of(answer.imu_error)
-    complete = after.bias if after.matrix is None else after.at(corrected.mean(1))
+    complete = after.bias if after[1:] == (None, None) else after.at(corrected.mean(1))
     innovation = z if answer.innovation is None else answer.innovation
     return memory, Step(prior, prior.corrected(answer.dx), after, innovation, complete, answer)
 

@@ -15,6 +15,7 @@ from dlkf.data.drive import Batch
 from dlkf.filters.adaptive import Adaptation, AdaptiveNoise
 from dlkf.filters.branches import may_branch
 from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD
+from dlkf.filters.g_sensitivity import add_columns, entries, has_g_sensitivity
 from dlkf.filters.gating import CoarseGate, Gate
 from dlkf.filters.heavy_tails import HeavyTails
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
@@ -199,6 +200,8 @@ class Mbkf:
     def update(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Correction]:
         """Propagate P over the window, update where there is something to learn (paper eqs 2–6, Joseph form)."""
         Phi = self._transition(memory, epoch)
+        if has_g_sensitivity(self.states):
+            Phi = add_columns(Phi, epoch.corrected, self.states)
         process = None if epoch.advice is None else epoch.advice.process
         Q = memory.windows.noise(Phi, None if process is None else source_scale(process, epoch.start.C_nb))
         if memory.noise is not None:
@@ -250,8 +253,11 @@ class Mbkf:
         if has_receiver(self.states):
             Phi = with_drift(Phi, self.states, epoch.dt * epoch.imu.shape[1])
         memory = KalmanMemory(P, memory.windows, memory.fix, tuple(sources), structure, noise, parameters, tails)
+        error = epoch.error.updated(dx, self.states)
+        if parameters is not None and has_g_sensitivity(self.states):
+            error = error._replace(g_sensitivity=entries(parameters, self.states))
         return memory, Correction(
-            dx[:, PVA], epoch.error.updated(dx, self.states), std=std, gain=K[:, PVA, :6],
+            dx[:, PVA], error, std=std, gain=K[:, PVA, :6],
             accepted=epoch.used.any(-1), covariances=Covariances(Phi, predicted, P, fix.H, fix.R, dx),
             aids=torch.cat(said, -1) if said else None,
         )  # fmt: skip

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
+from dlkf.filters.g_sensitivity import entries, has_g_sensitivity
 from dlkf.filters.integration import BatchSolution, Estimator, integrate
 from dlkf.filters.model_based import has_covariance
 from dlkf.navigation.state import IMU, PVA, STATES, NavState
@@ -89,13 +90,19 @@ def _gain(predicted: Tensor, cross: Tensor) -> Tensor:
 
 
 def _matrix_part(filtered: BatchSolution, dx: Tensor, batch: Batch, estimator: Any) -> Tensor | float:
-    """What the smoothed change of the sensor matrices makes of each epoch's mean sample (B, T, 6)."""
+    """What the smoothed change of sensor matrices and g-sensitivity makes of each epoch's mean sample (B, T, 6)."""
     states = estimator.states
-    if not states.elements:
-        return 0.0
     mean = batch.imu.mean(2) - filtered.imu_error
+    if has_g_sensitivity(states):
+        change = entries(dx.flatten(0, -2)[:, states.of_others], states)
+        shown = torch.bmm(change, mean.flatten(0, -2)[:, :2].unsqueeze(-1)).reshape(*mean.shape[:-1], 3)
+        of_force = torch.nn.functional.pad(shown, (3, 0))
+    else:
+        of_force = 0.0
+    if not states.elements:
+        return of_force
     change = dx[..., states.of_matrix].unflatten(-1, (2, -1))
     parts = torch.zeros_like(mean).unflatten(-1, (2, 3))
     for n, (i, j) in enumerate(states.elements):
         parts[..., i] += change[..., n] * mean.unflatten(-1, (2, 3))[..., j]
-    return parts.flatten(-2)
+    return parts.flatten(-2) + of_force

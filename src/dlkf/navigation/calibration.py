@@ -1,4 +1,4 @@
-"""The IMU error that a filter corrects: biases, and where estimated the sensor matrices."""
+"""The IMU error that a filter corrects: biases, and where estimated the sensor matrices and the g-sensitivity."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ class ImuError(NamedTuple):
     """Bias (B, 6), accelerometers then gyroscopes, and M of measured = (I + M) true + bias.
 
     ``matrix`` is None for M = 0, (B, 6) for scale factors only, (B, 2, 3, 3) for all elements of both sensors.
+    ``g_sensitivity`` (B, 3, 2) is the rate that the gyroscopes show of the specific force forward and right, or None.
     """
 
     bias: Tensor
     matrix: Tensor | None = None
+    g_sensitivity: Tensor | None = None
 
     @classmethod
     def of(cls, error: Tensor | ImuError) -> ImuError:
@@ -27,7 +29,15 @@ class ImuError(NamedTuple):
         return error if isinstance(error, ImuError) else cls(error)
 
     def corrected(self, raw: Float[Tensor, "B M 6"]) -> Float[Tensor, "B M 6"]:
-        """The samples without the error: (I + M)⁻¹ (raw − bias)."""
+        """The samples without the error: (I + M)⁻¹ (raw − bias), the rates of these less G f."""
+        samples = self._without_matrix(raw)
+        if self.g_sensitivity is None:
+            return samples
+        force, rate = samples.split(3, -1)
+        return torch.cat((force, rate - torch.bmm(force[..., :2], self.g_sensitivity.mT)), -1)
+
+    def _without_matrix(self, raw: Float[Tensor, "B M 6"]) -> Float[Tensor, "B M 6"]:
+        """(I + M)⁻¹ (raw − bias)."""
         if self.matrix is not None and self.matrix.ndim == 4:
             if torch.is_grad_enabled() and not raw.requires_grad and self.matrix.requires_grad:
                 return _Corrected.apply(raw, self.bias, self.matrix)
@@ -39,20 +49,26 @@ class ImuError(NamedTuple):
         """The error after a correction of a filter's states: columns 9… of ``dx``."""
         bias = self.bias + dx[:, 9:15]
         if states.matrix == "none":
-            return ImuError(bias, self.matrix)
+            return self._replace(bias=bias)
         if states.matrix == "scale":
             change = dx[:, states.of_matrix]
-            return ImuError(bias, change if self.matrix is None else self.matrix + change)
+            return self._replace(bias=bias, matrix=change if self.matrix is None else self.matrix + change)
         change = torch.index_select(dx, 1, _by_rows(states, dx.device)).unflatten(-1, (2, 3, 3))
-        return ImuError(bias, change if self.matrix is None else self.matrix + change)
+        return self._replace(bias=bias, matrix=change if self.matrix is None else self.matrix + change)
 
     def at(self, mean: Float[Tensor, "B 6"]) -> Float[Tensor, "B 6"]:
-        """Complete error of samples whose corrected mean is ``mean``: bias + M · mean."""
+        """Complete error of samples whose corrected mean is ``mean``: bias + M · mean, of
+        gyroscopes bias + G f + M · (mean + G f)."""
+        error = self.bias
+        if self.g_sensitivity is not None:
+            shown = torch.bmm(self.g_sensitivity, mean[:, :2].unsqueeze(-1)).squeeze(-1)
+            shown = torch.cat((torch.zeros_like(shown), shown), -1)
+            error, mean = error + shown, mean + shown
         if self.matrix is None:
-            return self.bias
+            return error
         if self.matrix.ndim == 2:
-            return self.bias + self.matrix * mean
-        return self.bias + (self.matrix @ mean.unflatten(-1, (2, 3)).unsqueeze(-1)).flatten(1)
+            return error + self.matrix * mean
+        return error + (self.matrix @ mean.unflatten(-1, (2, 3)).unsqueeze(-1)).flatten(1)
 
 
 @lru_cache

@@ -99,9 +99,9 @@ class CompiledFilter(WholeLoop):
         """One epoch of one drive."""
         vector, outputs = self.library.turn(memory.numbers, imu.contiguous(), packed_fix(fix, self._aids))
         x = split(outputs)
-        bias = self.layout.field("error.bias", vector)
+        bias, *others = (self.layout.field(f"error.{name}", vector) for name in ImuError._fields)
         assert bias is not None
-        error = ImuError(bias, self.layout.field("error.matrix", vector))
+        error = ImuError(bias, *others)
         std = x["std"] if self._has_std else None
         answer = Correction(x["prior"].new_zeros(1, 9), error, std=std, accepted=x["used"][:, 0] > 0.5)
         answer = answer._replace(aids=x["aids"] if self._columns else None)

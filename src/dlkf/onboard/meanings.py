@@ -22,6 +22,10 @@ COLUMNS = {  # of a row, at the IMU; before the last part of a name that is an a
     "vibration_speed_innovation_std": "1σ of that",
     "vibration_speed_used": "1 where that was used, else 0",
     "vibration_speed_share": "how far the spectrum of the vibration is trusted, 0 to 1",
+    **{
+        f"g_sensitivity_{axis}": f"rate {name} that the gyroscopes show of specific force {{}} [rad/s per m/s²]"
+        for axis, name in AXES.items()
+    },
     "fix_delay_s": "how old fixes are at their stamp [s]",
     "clock_drift_ppm": "receiver's clock fast against that of the IMU, per million: the delay grows so",
     "lever_forward_m": "antenna further forward than the lever arm says [m]",
@@ -45,6 +49,7 @@ MEMORY = {  # by the last parts of a field's name
     "state.v_n": "velocity in n [m/s]",
     "state.C_nb": "attitude, body (forward, right, down) to n",
     "error.bias": "accelerometer [m/s²] and gyroscope [rad/s] bias in force",
+    "error.g_sensitivity": "rate that gyroscopes show of specific force forward and right [rad/s per m/s²]",
     "error.matrix": "scale factors, or M of measured = (I + M) true + bias",
     "lever_arm_b": "IMU to antenna, forward, right, down [m]",
     "P": "covariance of the error states: m, m/s, rad, m/s², rad/s, then elements of M, then the car",

@@ -8,6 +8,7 @@ from dataclasses import is_dataclass, replace
 from typing import Any
 
 from dlkf.data.aid_tables import AidTable
+from dlkf.filters.aids.g_sensitivity import GSensitivity
 from dlkf.filters.aids.heading import DualAntennaHeading
 from dlkf.filters.aids.height import Barometer
 from dlkf.filters.aids.receiver import Receiver
@@ -20,7 +21,9 @@ from dlkf.filters.vibration_speed import VibrationSpeed
 from dlkf.navigation.state import ErrorStates
 
 SENSORS: Mapping[str, type[Source]] = {"speed": WheelSpeed, "heading": DualAntennaHeading, "baro": Barometer}
-OTHERS: Mapping[str, type[Source]] = {"vibration_speed": VibrationSpeed, "receiver": Receiver}
+OTHERS: Mapping[str, type[Source]] = {
+    "vibration_speed": VibrationSpeed, "receiver": Receiver, "g_sensitivity": GSensitivity,
+}  # fmt: skip
 SOURCES: Mapping[str, type[Source]] = {**SENSORS, **OTHERS}  # that stand behind a plus
 
 
