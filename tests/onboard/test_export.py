@@ -157,8 +157,10 @@ def test_columns_say_axis_and_unit():
     assert all(text.endswith("]") for c, text in said.items() if c not in ("revised", "gnss_used"))
 
 
-def test_a_batch_through_the_compiled_filter(compiled, drive):
+def test_a_batch_through_the_compiled_filter(compiled, drive, monkeypatch):
     torch.manual_seed(0)
+    ran, run = [], Library.run
+    monkeypatch.setattr(Library, "run", lambda self, x, imu, fixes: (ran.append(len(imu)), run(self, x, imu, fixes))[1])
     batch = aligned_drives([drive], ALIGN).select(torch.zeros(3, dtype=torch.int64))
     available = torch.rand(batch.available.shape) < 0.7
     available[1, :20], available[2] = available[0, :20], available[0]  # what copies have in common is run once
@@ -169,6 +171,7 @@ def test_a_batch_through_the_compiled_filter(compiled, drive):
     for mine, theirs in zip((*got.prior, *got.posterior), (*want.prior, *want.posterior)):
         torch.testing.assert_close(mine, theirs, atol=ROUNDING, rtol=0)
     assert torch.equal(got.used, want.used)
+    assert ran and sum(ran) <= 2 * batch.size[1] - 20
     assert run_filter(batch.in_precision(torch.float32), compiled).std.dtype == torch.float32
 
 

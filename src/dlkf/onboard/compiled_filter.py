@@ -186,11 +186,11 @@ def shared_epochs(
     first, common = [], []
     for b, count in enumerate(epochs):
         f = first[-1] if b else 0
-        if f == b or epochs[f] != count or not (torch.equal(memory[f], memory[b]) and torch.equal(imu[f], imu[b])):
+        if f == b or epochs[f] != count or not (_same(memory[f], memory[b]).all() and torch.equal(imu[f], imu[b])):
             first.append(b)
             common.append(0)
             continue
-        differ = ((fixes[f] != fixes[b]) & ~(fixes[f].isnan() & fixes[b].isnan()))[:count].any(-1)
+        differ = ~_same(fixes[f], fixes[b])[:count].all(-1)
         first.append(f)
         common.append(int(differ.int().argmax()) if bool(differ.any()) else count)
     return first, common
@@ -269,6 +269,11 @@ def _digest(estimator: Estimator, grid: Grid) -> str:
         for name, x in sorted(estimator.state_dict().items()):
             made_of.update(name.encode() + x.detach().cpu().contiguous().numpy().tobytes())
     return made_of.hexdigest()[:32]
+
+
+def _same(a: Tensor, b: Tensor) -> Tensor:
+    """Where they are equal, or both NaN."""
+    return (a == b) | (a.isnan() & b.isnan())
 
 
 def _state(x: Tensor) -> NavState:
