@@ -234,12 +234,12 @@ def test_what_is_heard_sets_the_limit_half_way():
     nothing = VibrationLevel.begin(torch.zeros(1, dtype=D), 3)
     prior = torch.tensor([3e-3], dtype=D)
     no, yes = torch.zeros(3, dtype=bool), torch.ones(3, dtype=bool)
-    torch.testing.assert_close(nothing.limit(prior), prior.expand(3) / APART**0.5)
+    torch.testing.assert_close(nothing.thresholds(prior)[0], prior.expand(3) / APART**0.5)
     moved = nothing.update(torch.tensor([4e-2, 4e-3, 4e-4], dtype=D), no, yes, 1.0)
-    torch.testing.assert_close(moved.limit(prior), moved.moving / APART**0.5)
+    torch.testing.assert_close(moved.thresholds(prior)[0], moved.moving / APART**0.5)
     both = moved.update(torch.tensor([1e-3, 1e-3, 1e-3], dtype=D), yes, no, 1.0)
     limits = torch.tensor([(4e-2 * 1e-3) ** 0.5, (4e-3 * 1e-3) ** 0.5, 3e-3 / APART], dtype=D)
-    torch.testing.assert_close(both.limit(prior), limits)  # the third sounds alike, louder when it stands
+    torch.testing.assert_close(both.thresholds(prior)[0], limits)  # the third sounds alike, louder when it stands
 
 
 def test_a_wrong_second_is_forgotten():

@@ -88,12 +88,16 @@ def test_a_compiled_filter_is_a_batch_run(tables, step):
 
 def test_what_cannot_be_taken_is_refused_with_a_reason(tables):
     stream = StreamingFilter(_filters()["plus"], phase_s=0.0)
-    assert stream.speed(1.0, 3.0).status is Status.TAKEN
+    assert stream.speed(1.0, 3.0).status is Status.TAKEN and stream.speed(1.0, 3.0, None).status is Status.TAKEN
+    assert "takes no baro" in stream.baro(1.0, None).reason and "takes no baro" in stream.baro(1.0).reason
     for receipt, reason in (
         (stream.heading(1.0, 0.1), "takes no heading"),
         (stream.speed(1.0, float("nan")), "not a finite number"),
         (stream.speed(float("inf"), 1.0), "not a finite number"),
         (stream.speed(1.0, 1.0, -0.1), "std is below 0"),
+        (stream.speed(None, 1.0), "not a finite number"),
+        (stream.speed(1.0, "fast"), "not a finite number"),
+        (stream.speed(2**2000, 1.0), "not a finite number"),
     ):
         assert receipt.status is Status.REFUSED and reason in receipt.reason
     for k in range(1, 1001):

@@ -14,7 +14,7 @@ from dlkf.base.classes import TARGET
 from dlkf.base.errors import InputError
 from dlkf.base.settings import settings_from
 from dlkf.data.drive import Batch
-from dlkf.filters.branches import may_branch
+from dlkf.filters.branches import chosen, may_branch
 from dlkf.filters.integration import Correction, Epoch, integrate
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.state import ATTITUDE, NavState
@@ -154,11 +154,11 @@ class LearnedFilter(nn.Module):
             shrink = (self.config.training_turn / turn.clamp_min(1e-9)).clamp(max=1.0)
             part = torch.cat((part[:, :6], part[:, ATTITUDE] * shrink), -1)
         if hold and not picking:
-            dx, gain = _chosen(has_fix, part, dx), _chosen(has_fix, K, gain)
+            dx, gain = chosen(has_fix, part, dx), chosen(has_fix, K, gain)
             matrix = None
             if error.matrix is not None and epoch.error.matrix is not None:
-                matrix = _chosen(has_fix, error.matrix, epoch.error.matrix)
-            error = ImuError(_chosen(has_fix, error.bias, epoch.error.bias), matrix)
+                matrix = chosen(has_fix, error.matrix, epoch.error.matrix)
+            error = ImuError(chosen(has_fix, error.bias, epoch.error.bias), matrix)
             recurrent = tuple(torch.where(has_fix[:, None], new, o) for new, o in zip(recurrent, memory.recurrent))
         elif whole:
             dx, gain = part, K
@@ -226,12 +226,12 @@ class LearnedFilter(nn.Module):
         return LearnedMemory(
             recurrent=recurrent,
             origin=memory.origin,
-            elapsed=_chosen(ran, torch.zeros_like(memory.elapsed), memory.elapsed),
-            since_fix=_chosen(has_fix, torch.zeros_like(memory.since_fix), memory.since_fix),
-            posterior=NavState(*(_chosen(ran, n, o) for n, o in zip(posterior, memory.posterior))),
-            difference=_chosen(ran, difference, memory.difference),
-            difference_s=_chosen(ran, memory.elapsed, memory.difference_s),
-            correction=_chosen(ran, dx, memory.correction),
+            elapsed=chosen(ran, torch.zeros_like(memory.elapsed), memory.elapsed),
+            since_fix=chosen(has_fix, torch.zeros_like(memory.since_fix), memory.since_fix),
+            posterior=chosen(ran, posterior, memory.posterior),
+            difference=chosen(ran, difference, memory.difference),
+            difference_s=chosen(ran, memory.elapsed, memory.difference_s),
+            correction=chosen(ran, dx, memory.correction),
             fix=torch.where(epoch.used, epoch.fix.value, memory.fix),
             had_fix=memory.had_fix | epoch.used,
         )
@@ -253,11 +253,6 @@ class LearnedFilter(nn.Module):
                 integrate(batch, self)
         windows, components = (torch.cat(x).float() for x in zip(*seen))
         self.scaling.fit(windows.clone(), components.clone())
-
-
-def _chosen(which: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """``new`` for some segments, ``old`` for the others."""
-    return torch.where(which.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
 
 def _with_rows(old: ImuError, rows: Tensor, new: ImuError) -> ImuError:

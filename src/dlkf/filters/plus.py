@@ -38,7 +38,7 @@ from dlkf.filters.virtual_outages import VirtualOutage
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.error_model import source_scale
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.navigation.state import IMU, POSITION, PV, PVA, ErrorStates
+from dlkf.navigation.state import IMU, POSITION, PV, PVA
 from dlkf.networks.features import level_rotation
 from dlkf.networks.plus import (
     LEAST_RATE_HZ,
@@ -243,7 +243,9 @@ class PlusFilter(nn.Module):
         size = self._sizes(P)
         v_b = torch.bmm(C_nb.mT, epoch.window.end.v_n.unsqueeze(-1)).squeeze(-1)
         rate, force = epoch.rate_b, epoch.corrected[..., :3].mean(1)
-        known = _flat(epoch.error, memory.kalman.structure, self.kalman.states)
+        error, structure = epoch.error, memory.kalman.structure
+        parts = (error.bias, error.elements(self.kalman.states), *(() if structure is None else (structure,)))
+        known = torch.cat(parts, -1)
         fix_std = torch.log(epoch.fix.std[:, [0, 2, 3, 5]].clamp(1e-3, 1e3)) / 3 * fixed
         age = torch.log1p(torch.stack((memory.since_fix, memory.elapsed), -1).clamp_max(OLDEST)) / 3
         fixes = torch.log(4 + memory.matching.fixes.clamp_max(OLDEST)) / 3
@@ -274,20 +276,6 @@ def _with_walk(P: Float[Tensor, "B n n"], walk: Float[Tensor, "B 3 3"]) -> Float
     P = P.clone()
     P[:, POSITION, POSITION] += walk
     return P
-
-
-def _flat(error: ImuError, structure: Tensor | None, states: ErrorStates) -> Float[Tensor, "B k"]:
-    """Estimates of the IMU's errors and of the car's structure in the order of their states."""
-    parts = [error.bias]
-    if states.elements:
-        if error.matrix is None:
-            parts.append(error.bias.new_zeros(len(error.bias), 2 * len(states.elements)))
-        elif error.matrix.ndim == 2:
-            parts.append(error.matrix)
-        else:
-            rows, columns = (list(x) for x in zip(*states.elements))
-            parts.append(error.matrix[:, :, rows, columns].flatten(1))
-    return torch.cat(parts if structure is None else [*parts, structure], -1)
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -98,6 +98,28 @@ class Source(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class SensorSource:
+    """A source made with an IMU, factors and states. By itself it brings states alone: no memory and no rows."""
+
+    imu: object
+    tuning: Tuning
+    states: ErrorStates
+
+    @property
+    def code(self) -> SensorSource:
+        """Without the numbers that the memory carries."""
+        return type(self)(None, Tuning(), self.states)
+
+    def begin(self, batch: Batch) -> Any:
+        """Memory before the first measurement."""
+        return None
+
+    def rows(self, epoch: Epoch, memory: Any, prediction: Predicted) -> tuple[Measurement | None, Any]:
+        """No rows."""
+        return None, memory
+
+
 def describe_aid(epoch: Epoch, name: str, rows: Measurement | None, P: Float[Tensor, "B n n"]) -> Float[Tensor, "B 3"]:
     """Of a further sensor's first row: innovation, its 1σ (NaN where there was no sample), whether it counted."""
     seen = aid_of(epoch, name)

@@ -57,14 +57,11 @@ class VibrationLevel(NamedTuple):
         nothing = like.new_full((batch_size,), math.inf)
         return cls(nothing, nothing, like.new_zeros(batch_size))
 
-    def limit(self, prior: Float[Tensor, " 1"]) -> Float[Tensor, " B"]:
-        """Half way, as logarithms, between stationary and moving; near zero where the two are alike."""
-        return self.thresholds(prior)[0]
-
     def thresholds(
         self, prior: Float[Tensor, " 1"]
     ) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"], Bool[Tensor, " B"]]:
-        """The limit, and whether the samples separate a stationary car from a moving one so far, and surely."""
+        """The limit, half way as logarithms between stationary and moving, near zero where the two are alike; and
+        whether the samples separate a stationary car from a moving one so far, and surely."""
         moving = torch.where(self.moving.isinf(), prior, self.moving)
         standing = torch.where(self.standing.isinf(), moving / APART, self.standing)
         distinct, surely = moving > DISTINCT * standing, moving > SURELY_DISTINCT * standing
@@ -86,6 +83,15 @@ class WheelMotion(NamedTuple):
     stopped: Tensor  # (B,) bool
 
 
+def vibration_level(imu: Float[Tensor, "B M 6"]) -> Float[Tensor, " B"]:
+    """Spread of specific force times spread of rate in a window [m/s² rad/s]; of one sample there is none."""
+    if imu.shape[1] < 2:
+        return torch.zeros_like(imu[:, 0, 0])
+    swing = imu - imu.mean(1, keepdim=True)  # torch's var of a middle axis takes four times as long
+    force, rate = (swing.square().sum(1) / (imu.shape[1] - 1)).unflatten(-1, (2, 3)).sum(-1).unbind(-1)
+    return (force * rate).sqrt()
+
+
 @torch.no_grad()
 def detect_stationary(
     epoch: Epoch, turning: Float[Tensor, "B 3"], P: Float[Tensor, "B n n"], before: VibrationLevel,
@@ -99,10 +105,7 @@ def detect_stationary(
     """
     if epoch.imu.shape[1] < 2:
         return torch.zeros_like(before.standing) > 0, before
-    swing = epoch.imu - epoch.imu.mean(1, keepdim=True)  # torch's var of a middle axis takes four times as long
-    variance = swing.square().sum(1) / (epoch.imu.shape[1] - 1)
-    force, rate = variance.unflatten(-1, (2, 3)).sum(-1).unbind(-1)
-    level = (force * rate).sqrt()
+    level = vibration_level(epoch.imu)
     span = epoch.dt * epoch.imu.shape[1]
     v, diagonal = epoch.window.end.v_n, P.diagonal(dim1=-2, dim2=-1)
     speed, std = v[:, :2].norm(dim=-1), diagonal[:, VELOCITY][:, :2].sum(-1).sqrt()

@@ -26,7 +26,6 @@ without this source. Training gets no rows.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -37,8 +36,7 @@ from dlkf.data.drive import Batch
 from dlkf.filters.aids.stretch import at_limits
 from dlkf.filters.branches import chosen, may_branch
 from dlkf.filters.integration import Epoch
-from dlkf.filters.sources import Measurement, Predicted, describe_row, predicted_variance
-from dlkf.filters.tuning import Tuning
+from dlkf.filters.sources import Measurement, Predicted, SensorSource, describe_row, predicted_variance
 from dlkf.filters.vibration_spectrum import (
     LINES,
     SHIFT,
@@ -53,7 +51,7 @@ from dlkf.filters.vibration_spectrum import (
     shifts,
     tone_shares,
 )
-from dlkf.navigation.state import ACCEL, ErrorStates
+from dlkf.navigation.state import ACCEL
 
 BLOCK_S = 3.0
 SLOWEST = 3.0  # m/s: below, most lines lie among the car's own motion
@@ -164,21 +162,12 @@ class VibrationMemory(NamedTuple):
         return (_probability(self.evidence) * self.evidence.new_tensor(SHARES)).sum(-1)
 
 
-@dataclass(frozen=True)
-class VibrationSpeed:
+class VibrationSpeed(SensorSource):
     """One row: ln of the true over the filter's mean speed in a block."""
 
-    imu: object
-    tuning: Tuning
-    states: ErrorStates
     columns: ClassVar[tuple[str, ...]] = (
         "vibration_speed_innovation", "vibration_speed_innovation_std", "vibration_speed_used", "vibration_speed_share",
     )  # fmt: skip
-
-    @property
-    def code(self) -> VibrationSpeed:
-        """It has no settings of its own."""
-        return VibrationSpeed(None, Tuning(), self.states)
 
     def begin(self, batch: Batch) -> VibrationMemory:
         """Nothing learned."""

@@ -56,6 +56,15 @@ class ImuError(NamedTuple):
         change = torch.index_select(dx, 1, _by_rows(states, dx.device)).unflatten(-1, (2, 3, 3))
         return self._replace(bias=bias, matrix=change if self.matrix is None else self.matrix + change)
 
+    def elements(self, states: ErrorStates) -> Float[Tensor, "*b k"]:
+        """The estimated elements of both sensor matrices, in the order of their states."""
+        if self.matrix is None or not states.elements:
+            return self.bias.new_zeros(*self.bias.shape[:-1], 2 * len(states.elements))
+        if states.matrix == "scale":
+            return self.matrix
+        rows, columns = (list(x) for x in zip(*states.elements))
+        return self.matrix[..., rows, columns].flatten(-2)
+
     def at(self, mean: Float[Tensor, "B 6"]) -> Float[Tensor, "B 6"]:
         """Complete error of samples whose corrected mean is ``mean``: bias + M · mean, of
         gyroscopes bias + G f + M · (mean + G f)."""

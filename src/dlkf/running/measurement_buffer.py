@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -72,6 +73,14 @@ class MeasurementBuffer:
         """Rows (:data:`dlkf.data.aids.ROW`) of the sensors in the epoch before a boundary at ``end`` [s]."""
         held = self._aids.get(boundary, {})
         return {name: aid_row(table, held.get(name, ()), end) for name, table in self.tables.items()}
+
+
+def as_number(x: Any) -> float:
+    """As float; NaN where it is no number."""
+    try:
+        return float(x)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
 
 
 def checked_fix(

@@ -52,7 +52,7 @@ from dlkf.running.epoch_filter import EpochFilter, Running
 from dlkf.running.estimate import Estimate
 from dlkf.running.fix_history import HELD, FixHistory
 from dlkf.running.imu_stream import ImuStream, Row
-from dlkf.running.measurement_buffer import MeasurementBuffer, checked_fix
+from dlkf.running.measurement_buffer import MeasurementBuffer, as_number, checked_fix
 from dlkf.running.start import Search
 
 ANCHOR_M = 50_000.0  # from its origin, beyond which the tangent frame moves
@@ -229,8 +229,10 @@ class StreamingFilter:
         self, t: float, height_m: float = math.nan, std: float = math.nan, *, pressure: float = math.nan
     ) -> Receipt:
         """Take a barometric height [m], or a ``pressure`` [Pa], at ``t`` [s]."""
-        value = height_m if math.isfinite(height_m) else float(pressure_height(np.asarray(pressure)))
-        return self.aid("baro", t, value, std)
+        height = as_number(height_m)
+        if not math.isfinite(height):
+            height = float(pressure_height(np.asarray(as_number(pressure))))
+        return self.aid("baro", t, height, std)
 
     def aid(self, name: str, t: float, value: float, std: float = math.nan) -> Receipt:
         """Take a sample of the sensor ``name`` of the filter, in the unit of its table.
@@ -241,10 +243,10 @@ class StreamingFilter:
         if name not in self._buffer.tables:
             known = ", ".join(self._buffer.tables) or "none"
             return self._answer(Status.REFUSED, f"this filter takes no {name} (it takes {known})")
-        sample = (name, float(t), float(value), float(std))
+        sample = (name, as_number(t), as_number(value), as_number(std))
         if not (math.isfinite(sample[1]) and math.isfinite(sample[2])):
             return self._answer(Status.REFUSED, f"{name}: t or value is not a finite number")
-        if std < 0:
+        if sample[3] < 0:
             return self._answer(Status.REFUSED, f"{name}: std is below 0; NaN if unknown")
         if self._samples.grid is not None:
             return self._file_aid(*sample)

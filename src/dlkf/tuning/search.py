@@ -23,7 +23,6 @@ from dlkf.filters.build import build_causal
 from dlkf.filters.integration import Estimator, integrate
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.tuning import Prior, Tuning
-from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.state import ErrorStates
 from dlkf.onboard.compiled_filter import CompiledFilter, compile_filter
@@ -179,7 +178,7 @@ def mean_imu_error(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name:
             before = _information(estimator.begin(seen)[0].P, states)[0]
         assert filtered.covariances is not None and filtered.error is not None
         known = _information(filtered.covariances.updated[:, -1], states)
-        last.append(_imu_states(filtered.error, states).double())
+        last.append(torch.cat((filtered.error.bias, filtered.error.elements(states)), -1)[:, -1].double())
         gains.append((known - before).sum(0))
         pulls.append((known @ last[-1][:, 6:, None]).sum(0))
     estimates = torch.cat(last)
@@ -196,18 +195,6 @@ def mean_imu_error(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name:
 def _information(P: Float[Tensor, "B n n"], states: ErrorStates) -> Float[Tensor, "B m m"]:
     """Inverse covariance of the sensor matrices, the other states unknown."""
     return torch.linalg.inv(P[:, states.of_matrix, states.of_matrix].double())
-
-
-def _imu_states(error: ImuError, states: ErrorStates) -> Float[Tensor, "B k"]:
-    """Biases and elements of the sensor matrices at the end of a run, in the order of the states."""
-    bias = error.bias[:, -1]
-    if error.matrix is None:
-        return bias
-    matrix = error.matrix[:, -1]
-    if states.matrix == "full":
-        rows, columns = (list(x) for x in zip(*states.elements))
-        matrix = matrix[:, :, rows, columns].flatten(1)
-    return torch.cat((bias, matrix), -1)
 
 
 def best_prior(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name: str = "mbkf15_prior") -> Prior:

@@ -83,11 +83,15 @@ def describe_aids(models: Mapping[str, Any], tables: Iterable[AidTable]) -> list
     return lines
 
 
+def kalman_of(model: Any) -> Any:
+    """The Kalman filter in a smoothed, compiled or learned one, if it has one."""
+    inner = model.filter if isinstance(model, SmoothedSolution) else getattr(model, "estimator", model)
+    return getattr(inner, "kalman", inner)
+
+
 def tables_of(model: Any) -> tuple[AidTable, ...]:
     """The tables that a filter's sources use, in the order of its sources."""
-    inner = model.filter if isinstance(model, SmoothedSolution) else getattr(model, "estimator", model)
-    inner = getattr(inner, "kalman", inner)
-    tables = [getattr(source, "table", None) for source in getattr(inner, "sources", ())]
+    tables = [getattr(source, "table", None) for source in getattr(kalman_of(model), "sources", ())]
     return tuple(table for table in tables if table is not None)
 
 
@@ -95,8 +99,7 @@ def aid_columns(model: Any) -> tuple[str, ...]:
     """A filter's output about its sensors, in the order of :attr:`dlkf.filters.integration.Correction.aids`:
     innovation, its 1σ and whether it counted of each, with what a source without a table adds behind its own, then the
     estimates of the sensors' parameters, then their 1σ."""
-    inner = model.filter if isinstance(model, SmoothedSolution) else getattr(model, "estimator", model)
-    inner = getattr(inner, "kalman", inner)
+    inner = kalman_of(model)
     states: ErrorStates = getattr(inner, "states", ErrorStates())
     said: list[str] = []
     for source in getattr(inner, "sources", ()):

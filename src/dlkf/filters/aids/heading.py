@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -22,9 +21,7 @@ from dlkf.data.drive import Batch
 from dlkf.filters.aids.stretch import at_limits, stretch_weights, weighted
 from dlkf.filters.aids.trust import Trust, judge
 from dlkf.filters.integration import Epoch
-from dlkf.filters.sources import Measurement, Parameter, Predicted, aid_of, predicted_variance
-from dlkf.filters.tuning import Tuning
-from dlkf.navigation.state import ErrorStates
+from dlkf.filters.sources import Measurement, Parameter, Predicted, SensorSource, aid_of, predicted_variance
 
 DEFAULT_STD, LEAST_STD = math.radians(0.5), math.radians(0.1)
 KNOWS = math.radians(5.0)  # 1σ: a filter whose heading is better than this can detect a wrong one
@@ -37,21 +34,11 @@ class HeadingMemory(NamedTuple):
     trust: Trust
 
 
-@dataclass(frozen=True)
-class DualAntennaHeading:
+class DualAntennaHeading(SensorSource):
     """One row: the heading at the last sample of the update interval."""
-
-    imu: object
-    tuning: Tuning
-    states: ErrorStates
 
     table: ClassVar[AidTable] = STANDARD["heading"]
     parameters: ClassVar[Mapping[str, Parameter]] = {"heading_offset": Parameter(std=0.03, walk=1e-6)}
-
-    @property
-    def code(self) -> DualAntennaHeading:
-        """Without the numbers that the memory carries."""
-        return DualAntennaHeading(None, Tuning(), self.states)
 
     def begin(self, batch: Batch) -> HeadingMemory:
         """Memory before the first measurement."""

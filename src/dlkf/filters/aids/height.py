@@ -6,7 +6,6 @@ m = h + b,  h = h₀ − p_D + (p_N² + p_E²) / 2R         height above the ell
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -17,9 +16,7 @@ from dlkf.data.drive import Batch
 from dlkf.filters.aids.stretch import at_limits, stretch_weights, weighted
 from dlkf.filters.aids.trust import Trust, judge
 from dlkf.filters.integration import Epoch
-from dlkf.filters.sources import Measurement, Parameter, Predicted, aid_of, predicted_variance
-from dlkf.filters.tuning import Tuning
-from dlkf.navigation.state import ErrorStates
+from dlkf.filters.sources import Measurement, Parameter, Predicted, SensorSource, aid_of, predicted_variance
 
 LEAST_STD = 0.1  # m
 KNOWS = 5.0  # m 1σ of the height above which an offset cannot be separated from a faulty barometer
@@ -32,21 +29,11 @@ class BarometerMemory(NamedTuple):
     trust: Trust
 
 
-@dataclass(frozen=True)
-class Barometer:
+class Barometer(SensorSource):
     """One row: the mean height over a stretch of the update interval."""
-
-    imu: object
-    tuning: Tuning
-    states: ErrorStates
 
     table: ClassVar[AidTable] = STANDARD["baro"]
     parameters: ClassVar[Mapping[str, Parameter]] = {"baro_offset_m": Parameter(std=300.0, walk=0.03)}
-
-    @property
-    def code(self) -> Barometer:
-        """Without the numbers that the memory carries."""
-        return Barometer(None, Tuning(), self.states)
 
     def begin(self, batch: Batch) -> BarometerMemory:
         """Memory before the first measurement."""

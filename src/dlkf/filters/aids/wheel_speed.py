@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -33,9 +32,8 @@ from dlkf.filters.aids.rounding import rounded_measurement
 from dlkf.filters.aids.stretch import at_limits, mean_force, stretch_weights, weighted
 from dlkf.filters.aids.trust import Trust, judge
 from dlkf.filters.integration import Epoch
-from dlkf.filters.sources import Measurement, Parameter, Predicted, aid_of, predicted_variance
-from dlkf.filters.tuning import Tuning
-from dlkf.navigation.state import ErrorStates
+from dlkf.filters.sources import Measurement, Parameter, Predicted, SensorSource, aid_of, predicted_variance
+from dlkf.filters.stationarity import vibration_level
 
 LEAST_STD = 0.03  # m/s: the least 1σ, whatever a file gives
 KMH = 1 / 3.6
@@ -66,13 +64,8 @@ class WheelMemory(NamedTuple):
     stopped: Tensor  # (B,) bool: it did not turn in the last interval, and counted
 
 
-@dataclass(frozen=True)
-class WheelSpeed:
+class WheelSpeed(SensorSource):
     """One row: the mean forward speed of a wheel over a stretch of the update interval."""
-
-    imu: object
-    tuning: Tuning
-    states: ErrorStates
 
     table: ClassVar[AidTable] = STANDARD["speed"]
     parameters: ClassVar[Mapping[str, Parameter]] = {
@@ -80,11 +73,6 @@ class WheelSpeed:
         "wheel_delay_s": Parameter(std=0.1, walk=1e-4, start=0.05),
         "wheel_right_m": Parameter(std=0.5, walk=1e-4),
     }
-
-    @property
-    def code(self) -> WheelSpeed:
-        """Without the numbers that the memory carries."""
-        return WheelSpeed(None, Tuning(), self.states)
 
     def begin(self, batch: Batch) -> WheelMemory:
         """Memory before the first measurement."""
@@ -121,7 +109,7 @@ class WheelSpeed:
         rounded = (whole > 0.5) & ~zero
         noise = torch.where(rounded, (memory.std.square() + (JITTER_S * accel).square()).sqrt(), noise)
         R = noise.square() + (SLIP * speed * accel).square()
-        shaking = _shaking(epoch.imu)
+        shaking = vibration_level(epoch.imu)
         plausible = ~zero | (z.abs() < NEARLY_AT_REST) | (shaking <= memory.calmest)
         beyond = torch.where(rounded, (z.abs() - 0.5 * KMH).clamp_min(0.0), z)
         drifted = (DRIFT * epoch.dt * epoch.imu.shape[1]) ** 2
@@ -173,12 +161,3 @@ class WheelSpeed:
         H[:, self.states.of("wheel_delay_s")] = -(scale * accel).unsqueeze(-1)
         H[:, self.states.of("wheel_right_m")] = -(scale * weighted(weights, turn)).unsqueeze(-1)
         return speed, H.unsqueeze(1), accel
-
-
-def _shaking(imu: Float[Tensor, "B M 6"]) -> Float[Tensor, " B"]:
-    """Spread of specific force times spread of rate in a window [m/s² rad/s]; of one sample there is none."""
-    if imu.shape[1] < 2:
-        return torch.zeros_like(imu[:, 0, 0])
-    swing = imu - imu.mean(1, keepdim=True)
-    force, rate = (swing.square().sum(1) / (imu.shape[1] - 1)).unflatten(-1, (2, 3)).sum(-1).unbind(-1)
-    return (force * rate).sqrt()
