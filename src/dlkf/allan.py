@@ -6,10 +6,7 @@ beside the Allan deviations as picture, page and table.
 
 from __future__ import annotations
 
-import sys
-
-from rich.console import Console
-
+from dlkf.base.console import make_console
 from dlkf.command import command
 from dlkf.command.settings import AllanSettings
 from dlkf.data.tables import read_drives
@@ -30,7 +27,7 @@ def main(settings: AllanSettings) -> None:
     source = f"Allan deviation of {drive}, {log.duration_s / 3600:.3g} h at rest; all else from {base.name}"
     spec = noise_preset(name, (log.fits["accel"], log.fits["gyro"]), base, source, in_run=settings.in_run)
     write_allan(settings.out, log, spec)
-    Console(width=None if sys.stdout.isatty() else 110).print(as_rich(noise_table(log)))
+    make_console().print(as_rich(noise_table(log)))
     print(f"Preset: {settings.out}/imu/{name}.yaml; report: {settings.out}/allan.html")
 
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
-from rich.console import Console
 from rich.markup import escape
 
+from dlkf.base.console import make_console
 from dlkf.base.files import require_empty
 from dlkf.command import command
 from dlkf.command.arguments import expand_home
@@ -31,7 +30,7 @@ def main(settings: CompareSettings) -> None:
     require_empty(out, overwrite=settings.overwrite)
     reports = read_reports([str(run) for run in (runs if isinstance(runs, (list, tuple)) else [runs])])
     write_comparison(out, reports)
-    console = Console(width=None if sys.stdout.isatty() else 110)
+    console = make_console()
     console.print(as_rich(ResultTable("At the end of the outages", "", *end_table(reports))))
     for line in answers(reports):
         console.print(f"[bold]{escape(line)}[/bold]", highlight=False)

@@ -6,11 +6,7 @@ consistency.json in ``out``.
 
 from __future__ import annotations
 
-import sys
-
-from rich.console import Console
-
-from dlkf.base.console import show_progress
+from dlkf.base.console import make_console, show_progress
 from dlkf.base.errors import InputError
 from dlkf.base.files import require_empty
 from dlkf.command import command
@@ -54,7 +50,7 @@ def main(settings: ConsistencySettings) -> None:
     title = f"{matched.drives} simulated drives of {matched.minutes:g} min, IMU {preset.name}, errors as modelled"
     table = consistency_table(results, settings.settle_s, title)
     write_consistency(settings.out, results, table, outage)
-    Console(width=None if sys.stdout.isatty() else 110).print(as_rich(table))
+    make_console().print(as_rich(table))
     print(f"Report: {settings.out}/consistency.png, table.md")
 
 

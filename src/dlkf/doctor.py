@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import sys
 
-from rich.console import Console
 from rich.text import Text
 
+from dlkf.base.console import make_console
 from dlkf.command import command
 from dlkf.command.settings import DoctorSettings
 from dlkf.data.store import drive_rows
@@ -19,7 +19,7 @@ from dlkf.diagnosis.checkup import GOOD, STYLES, checkup
 @command("doctor", DoctorSettings)
 def main(settings: DoctorSettings) -> None:
     """Read, look, print; the exit code is not 0 where something is bad."""
-    console = Console(width=None if sys.stdout.isatty() else 140, highlight=False)
+    console = make_console(140)
     bad = noted = 0
     for row in drive_rows(settings.dataset, settings.drives):
         console.print(Text(row.name, style="bold"))

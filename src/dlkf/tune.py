@@ -6,14 +6,12 @@ logs the search to MLflow.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict
 from pathlib import Path
 
 import torch
-from rich.console import Console
 
-from dlkf.base.console import show_progress
+from dlkf.base.console import make_console, show_progress
 from dlkf.base.errors import InputError
 from dlkf.base.files import is_url, require_store
 from dlkf.command import command
@@ -70,7 +68,7 @@ def main(settings: TuneSettings) -> None:
         for file in files:
             run.log_files(out / file)
         run.note(as_markdown(table))
-    Console(width=None if sys.stdout.isatty() else 110).print(as_rich(table))
+    make_console().print(as_rich(table))
     print(f"{out}/{files[0]}; for evaluate and navigate: --config-dir {out}; MLflow: run {run.id}")
 
 

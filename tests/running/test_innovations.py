@@ -82,9 +82,7 @@ def test_what_is_not_known_is_left_out() -> None:
 
 def test_the_line_names_the_remedy() -> None:
     line = fit_sigma(3 * np.random.default_rng(5).standard_normal((N, 6))).warning("mbkf15")
-    assert (
-        line.startswith("mbkf15 is overconfident: its innovations are 2.9 times their 1σ") and "dlkf tune" in line
-    )
+    assert line.startswith("mbkf15 is overconfident: its innovations are 2.9 times their 1σ") and "dlkf tune" in line
     assert "\n" not in line
 
 

@@ -24,11 +24,11 @@ LOG = "log.txt"  # beside a report
 SAY_EVERY_S = 30.0  # in a file; a terminal has a bar
 
 
-def make_console() -> Console:
-    """A console as wide as the terminal, or 110 columns, that keeps its lines."""
+def make_console(width: int = 110) -> Console:
+    """A console as wide as the terminal, or so many columns, that keeps its lines."""
     from rich.console import Console
 
-    return Console(width=None if sys.stdout.isatty() else 110, record=True)
+    return Console(width=None if sys.stdout.isatty() else width, record=True)
 
 
 def save_log(console: Console, folder: str | Path) -> None:

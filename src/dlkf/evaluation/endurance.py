@@ -17,7 +17,7 @@ from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.drive import Drive
 from dlkf.data.segments import StartLaw, cut_segments
 from dlkf.evaluation.bootstrap import Comparison, compare
-from dlkf.evaluation.metrics import magnitudes, mean_error, outage_end, summarise_errors
+from dlkf.evaluation.metrics import magnitudes, outage_end, summarise_errors
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Protocol, Scenes
 from dlkf.evaluation.run import score_scenes
@@ -66,7 +66,7 @@ def score_after_gnss(
             stats = summarise_errors(ends[name])
             rows[name] = {
                 "rms_m": stats["rms"],
-                "geometric_m": mean_error(ends[name][~np.isnan(ends[name])], "log"),
+                "geometric_m": stats["geomean"],
                 "heading_deg": math.degrees(summarise_errors(before)["rms"]),
             }
         ratios = {

@@ -29,7 +29,8 @@ from dlkf.evaluation.metrics import (
     slope,
     summarise_errors,
 )
-from dlkf.evaluation.scores import Scores, innovation_rms, sigma_samples
+from dlkf.evaluation.scores import Scores, sigma_samples
+from dlkf.running.innovations import rms
 
 SETTLE_S = 10.0  # "settled" leaves out this much of every segment, where the initial error dominates
 INTO_OUTAGE_S = (10.0, 20.0, 30.0, 40.0, 50.0, 60.0)
@@ -179,7 +180,7 @@ def summarise_scores(
             samples[name] |= _outage_samples(scores, name, distance) | sigma_samples(scores, name)
         for (over, part, quantity), x in samples[name].items():
             values += values_of(scores.kinds[0], name, over, part, quantity, summarise_errors(x))
-        spread = {"rms": innovation_rms(scores.filters[name])}
+        spread = {"rms": rms(scores.filters[name].innovation)}  # over their 1σ; NaN of a filter without covariance
         values += values_of(scores.kinds[0], name, "segments", "with_gnss", "innovation", spread)
         values += _imu_error_quality(scores, name)
     return Results(

@@ -11,7 +11,7 @@ import torch
 from dlkf.evaluation.metrics import Array, Mask, OutageIntervals, magnitudes, outage_end, outage_intervals
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
-from dlkf.running.innovations import SigmaFit, fit_sigma, rms
+from dlkf.running.innovations import SigmaFit, fit_sigma
 
 OFF_SCALE = 20.0  # a filter this many times worse than the best does not set the scale of a figure
 
@@ -114,22 +114,13 @@ def _padded(x: Array, T: int) -> Array:
     return np.pad(x, extra, constant_values=False if x.dtype == bool else np.nan)
 
 
-def horizontal_sigma(run: FilterRun) -> Array:
-    """√(σ_n² + σ_e²) (P, T) [m], NaN where the filter has none."""
-    return np.hypot(run.position_std[..., 0], run.position_std[..., 1])
-
-
 def sigma_samples(scores: Scores, name: str) -> dict[tuple[str, str, str], Array]:
-    """The filter's own horizontal 1σ at the end of every outage [m]."""
+    """The filter's own horizontal 1σ √(σ_n² + σ_e²) at the end of every outage [m], NaN where it has none."""
     w = scores.windows
     if not len(w.segment):
         return {}
-    return {("outages", "end", "sigma"): outage_end(horizontal_sigma(scores.filters[name]), w)}
-
-
-def innovation_rms(run: FilterRun) -> float:
-    """RMS of all innovations over their 1σ; NaN of a filter without covariance."""
-    return rms(run.innovation)
+    std = scores.filters[name].position_std
+    return {("outages", "end", "sigma"): outage_end(np.hypot(std[..., 0], std[..., 1]), w)}
 
 
 def innovation_fit(run: FilterRun) -> SigmaFit | None:

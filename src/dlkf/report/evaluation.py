@@ -128,7 +128,7 @@ def evaluation_page(
         _research(page, scores.of_kind(result.kind), f"{result.kind}: " if many else "", baseline)
     _add_tables(page, [t for t in parts if t not in first])
     if pictures:
-        page.images("The figures for print", [(caption, embedded(data)) for _, caption, data in pictures])
+        page.for_print([(caption, embedded(data)) for _, caption, data in pictures])
     page.protocol(protocol)
     return page.html()
 

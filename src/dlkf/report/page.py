@@ -66,9 +66,9 @@ class Page:
         words = html.escape(caption)
         self.parts.append(f'<h2>{words}</h2><img loading=lazy alt="{words}" src="{source}">')
 
-    def images(self, title: str, pictures: Sequence[tuple[str, str]]) -> None:
+    def for_print(self, pictures: Sequence[tuple[str, str]]) -> None:
         """Pictures (caption, data URI) behind a fold."""
-        self.parts.append(f"<details><summary>{html.escape(title)}</summary>")
+        self.parts.append("<details><summary>The figures for print</summary>")
         for caption, source in pictures:
             self.picture(caption, source)
         self.parts.append("</details>")

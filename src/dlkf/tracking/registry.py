@@ -21,6 +21,7 @@ from dlkf.running.solution import COLUMNS
 from dlkf.tracking.endings import use_store
 from dlkf.tracking.runs import (
     NOTE_TAG,
+    PARENT_TAG,
     RUN_ID,
     TrackedRun,
     client_of,
@@ -33,6 +34,7 @@ from dlkf.tracking.runs import (
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
+    from mlflow.entities import Run
 
 NAME = "model"
 NO_STEP = -1  # at a step of training MLflow would give the model that step's losses and CPU load as its metrics
@@ -108,7 +110,7 @@ def register_model(client: MlflowClient, run_id: str, name: str, alias: str | No
     """
     check_registration(name, alias)
     run = client.get_run(run_id)
-    logged = run.outputs.model_outputs if run.outputs else []
+    logged = _logged_models(run)
     if not logged:
         raise InputError(f"run {run_id} logged no model (its status is {run.info.status})")
     scores = {k: f"{v:.4g}" for k, v in run.data.metrics.items() if k.startswith(("test/", "val/"))}
@@ -185,15 +187,19 @@ def download_model(spec: str, uri: str | None = None) -> Path:
         return _fetch(find(client, spec, uri), spec, uri)
 
 
+def _logged_models(run: Run) -> list:
+    return run.outputs.model_outputs if run.outputs else []
+
+
 def _of_run(client: MlflowClient, spec: str, uri: str) -> str:
     run_id = spec.removeprefix("runs:/").partition("/")[0]
     if not RUN_ID.fullmatch(run_id) or not run_exists(client, run_id):
         raise InputError(f"model={spec}: {uri} has no run {run_id!r}")
     run = client.get_run(run_id)
-    logged = run.outputs.model_outputs if run.outputs else []
+    logged = _logged_models(run)
     if logged:
         return client.get_logged_model(logged[-1].model_id).artifact_location
-    children = client.search_runs([run.info.experiment_id], f"tags.`mlflow.parentRunId` = '{run_id}'", max_results=1)
+    children = client.search_runs([run.info.experiment_id], f"tags.`{PARENT_TAG}` = '{run_id}'", max_results=1)
     if children:
         raise InputError(f"model={spec} is the parent run of a grid search; name one of its children")
     raise InputError(f"model={spec}: the run logged no model (its status is {run.info.status})")

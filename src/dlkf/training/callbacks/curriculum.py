@@ -36,7 +36,3 @@ class LengthCurriculum(Callback):
         """Hand the law to the data module, which asks it when it cuts an epoch's segments."""
         if stage == "fit":
             trainer.datamodule.length_law = self.length_s  # pyright: ignore[reportAttributeAccessIssue]  set by fit
-
-    def state_dict(self) -> dict:
-        """Settings, recorded in a checkpoint."""
-        return {k: getattr(self, k) for k in ("warm_s", "full_s", "warm_until", "full_from")}

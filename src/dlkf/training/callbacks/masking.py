@@ -50,10 +50,6 @@ class GnssDecimation(BatchCallback):
         spacing = (interval / batch.epoch_s).round().long().clamp_min(1)  # epochs
         return withhold_fixes(batch, torch.arange(1, T + 1) % spacing != 0)
 
-    def state_dict(self) -> dict:
-        """Settings, recorded in a checkpoint."""
-        return {"every_s": self.every_s, "start_epoch": self.start_epoch}
-
 
 class OutageInjection(BatchCallback):
     """One outage of ``duration_s`` (low, high) in every sub-trajectory, after the warm-up (R070, R072; paper.md 4.14).
@@ -83,10 +79,6 @@ class OutageInjection(BatchCallback):
         start = self.before_s + (room - length) * torch.rand(B, 1, generator=generator)
         return withhold_fixes(batch, outage_within(batch, start[:, 0], length[:, 0]))
 
-    def state_dict(self) -> dict:
-        """Settings, recorded in a checkpoint."""
-        return {k: getattr(self, k) for k in ("duration_s", "before_s", "after_s", "start_epoch")}
-
 
 class SensorLoss(BatchCallback):
     """Further sensors of the car (wheel speed, …) that a segment lacks, or that fall silent at some moment of it.
@@ -113,10 +105,6 @@ class SensorLoss(BatchCallback):
         end = torch.where(kind < self.without, 0.0, torch.where(kind < self.without + self.lost, moment, 1.0)) * T
         there = (torch.arange(T) < end).unsqueeze(-1)
         return replace(batch, aids={name: rows * there for name, rows in batch.aids.items()})
-
-    def state_dict(self) -> dict:
-        """Settings, recorded in a checkpoint."""
-        return {"without": self.without, "lost": self.lost}
 
 
 def _bounds(name: str, values: Sequence[float]) -> tuple[float, float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -20,9 +19,5 @@ class SensorDegradationCallback(BatchCallback):
         self.rough = settings_from(SensorDegradation, rough, "callbacks.sensor_degradation")
 
     def transform(self, batch: Batch, epoch: int, generator: torch.Generator) -> Batch:
-        """The same motion, felt by other sensors."""
+        """The batch with degraded IMU samples and fixes."""
         return degrade_sensors(batch, self.rough, generator)
-
-    def state_dict(self) -> dict:
-        """Settings, recorded in a checkpoint."""
-        return asdict(self.rough)
