@@ -2,13 +2,13 @@
 
 import pytest
 import torch
+from pipelines.studies.descent import FACTORS, ScaledFilter, tune_by_gradient
 
 from dlkf.data.masks import withhold_fixes
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.tuning import Tuning
-from pipelines.studies.descent import FACTORS, ScaledFilter, tune_by_gradient
 from dlkf.tuning.search import outage_error
 from tests.filters.scene import IMU, scene
 

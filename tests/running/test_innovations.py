@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from dlkf.command.composing import compose_command
@@ -11,8 +12,8 @@ from dlkf.filters.shipped import trained_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.running import innovations
-from dlkf.running.innovations import CHANCE, SETTLE, fit_sigma
-from dlkf.running.offline import navigate_dataset, sigma_warning
+from dlkf.running.innovations import CHANCE, SETTLE, STRETCH, Innovation, fit_sigma, worst_stretch
+from dlkf.running.offline import Navigated, navigate_dataset, sigma_warning
 from tests.drives import drives_in
 from tests.worlds import SIZE
 
@@ -84,6 +85,30 @@ def test_the_line_names_the_remedy() -> None:
     line = fit_sigma(3 * np.random.default_rng(5).standard_normal((N, 6))).warning("mbkf15")
     assert line.startswith("mbkf15 is overconfident: its innovations are 2.9 times their 1σ") and "dlkf tune" in line
     assert "\n" not in line
+
+
+def test_the_worst_stretch_is_found() -> None:
+    """Of updates with a fix, after those that settle; none of a drive with fewer."""
+    x = np.random.default_rng(6).standard_normal((N, 6))
+    assert worst_stretch(x)[0] < 1.5
+    x[:SETTLE] *= 100
+    x[100 : 100 + STRETCH + 5] *= 4
+    x[110:115] = np.nan
+    off, first, last = worst_stretch(x)
+    assert off == pytest.approx(4, rel=0.1) and (first, last) == (100, 99 + STRETCH + 5)
+    assert worst_stretch(x[: SETTLE + STRETCH - 1]) == (0.0, 0, 0)
+
+
+def test_a_drive_with_a_bad_stretch_gets_a_line_with_its_times() -> None:
+    x = np.random.default_rng(7).standard_normal((N, 6)) / 2
+    table = pd.DataFrame({"t": 40.0 + np.arange(N)})
+    good = Navigated("good", 40.0, table, Innovation(x.copy(), np.ones_like(x)))
+    x[200 : 200 + STRETCH] *= 8
+    bad = Navigated("bad", 40.0, table, Innovation(x, np.ones_like(x)))
+    assert sigma_warning([good], "mbkf15", "do this") is None
+    line = sigma_warning([good, bad], "mbkf15", "do this")
+    assert line is not None and "mbkf15 is overconfident in drive bad from t = 240 to 259 s" in line
+    assert line.endswith("do this") and "\n" not in line
 
 
 @pytest.mark.parametrize(

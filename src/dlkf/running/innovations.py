@@ -28,6 +28,8 @@ CHANCE = 1e-4  # α, of both bounds together
 TOLERATED = 1.3  # by which a 1σ may be off before it is worth a line: no filter's noise is known better
 SETTLE = 10  # updates from the start on that do not count: the heading is still being found
 FAULTY = 15.0  # innovations so far above their 1σ are no matter of noise: with the preset of another IMU they reach 8
+STRETCH = 20  # successive updates with a fix
+FAR = 2.5  # RMS of them over their 1σ, from which on it is worth a line: plus has 1.5 at most on 30 drives of many kinds
 REMEDY = (
     "take tuning=any_car for an unknown car; dlkf tune, or imu=auto in dlkf navigate, fits the noise; mbkf33 also "
     "estimates scale factors and misalignments"
@@ -83,6 +85,18 @@ def rms(ratio: Array) -> float:
     """Root mean square of what is finite, NaN where nothing is."""
     known = np.isfinite(ratio)
     return float(np.sqrt(np.mean(ratio[known] ** 2))) if known.any() else float("nan")
+
+
+def worst_stretch(ratio: Array) -> tuple[float, int, int]:
+    """Largest RMS of innovations over their 1σ (T, 6) in :data:`STRETCH` successive updates with a fix, and the first
+    and the last row of them; 0 where there are fewer."""
+    squares, _ = _squares(ratio[SETTLE:])
+    if len(squares) < STRETCH:
+        return 0.0, 0, 0
+    rows = SETTLE + np.flatnonzero(np.isfinite(ratio[SETTLE:]).any(-1))
+    means = np.convolve(squares, np.ones(STRETCH) / STRETCH, "valid")
+    first = int(means.argmax())
+    return float(np.sqrt(means[first])), int(rows[first]), int(rows[first + STRETCH - 1])
 
 
 def fit_sigma(*drives: Array) -> SigmaFit | None:

@@ -29,7 +29,7 @@ from dlkf.filters.receiver import ARM, DELAY, DRIFT
 from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.compiled import without_loops
 from dlkf.running.batched import CHUNK_SAMPLES, run_filter
-from dlkf.running.innovations import Innovation, fit_sigma
+from dlkf.running.innovations import FAR, Innovation, fit_sigma, worst_stretch
 from dlkf.running.loss import first_loss
 from dlkf.running.solution import SCHEMA, solution_table
 from dlkf.running.start import align_each
@@ -167,9 +167,21 @@ class Navigated:
 
 
 def sigma_warning(drives: Iterable[Navigated], model: str, remedy: str) -> str | None:
-    """One line where a filter's 1σ is smaller than its innovations in these drives allow, else None."""
-    fit = fit_sigma(*(drive.innovation.ratio for drive in drives if drive.innovation is not None))
-    return fit.warning(model, remedy) if fit is not None and fit.too_small else None
+    """One line where a filter's 1σ is smaller than its innovations in these drives allow, or in a stretch of one, else
+    None."""
+    ratios = [(drive, drive.innovation.ratio) for drive in drives if drive.innovation is not None]
+    fit = fit_sigma(*(ratio for _, ratio in ratios))
+    if fit is not None and fit.too_small:
+        return fit.warning(model, remedy)
+    for drive, ratio in ratios:
+        off, first, last = worst_stretch(ratio)
+        if off > FAR:
+            t = drive.table.t.iloc[[first, last]].to_numpy()
+            return (
+                f"{model} is overconfident in drive {drive.drive} from t = {t[0]:.0f} to {t[1]:.0f} s: its innovations "
+                f"are {off:.2g} times their 1σ there, so its position is further off than its 1σ says; {remedy}"
+            )
+    return None
 
 
 def chunk_drives(
