@@ -56,7 +56,7 @@ def test_named_groups_and_their_mistakes(town):
     ):
         with pytest.raises(InputError, match=expected):
             _module(town, split=split).setup()
-    with pytest.raises(InputError, match="needs a group for each of train, val, test, but there are only 1"):
+    with pytest.raises(InputError, match="needs a group for each of train, val, test, but the drives have only 1"):
         _module(write_cars(town.parent / "single", 1, seconds=20)).setup()
     with pytest.raises(InputError, match="fractions"):
         _module(town, fractions=(0.5, 0.1, 0.1)).setup()

@@ -59,8 +59,9 @@ def _by_time(stack: DriveStack, fractions: list[float], seed: int) -> dict[str, 
     wanted = [side for side, f in zip(SIDES, fractions) if f > 0]
     if len(time) < len(wanted):
         raise InputError(
-            f"split by group needs a group for each of {', '.join(wanted)}, but there are only {len(time)} "
-            f"({', '.join(sorted(time))}); add recordings, or set data.fractions or data.split"
+            f"split by group needs a group for each of {', '.join(wanted)}, but the drives have only {len(time)} "
+            f"({', '.join(sorted(time))}); add recordings, or set fractions or split (data.fractions "
+            "and data.split in train)"
         )
     names = sorted(time)
     order = [names[i] for i in np.random.default_rng(seed).permutation(len(names))]

@@ -175,7 +175,8 @@ def as_rich(table: ResultTable) -> RichTable:
     out = RichTable(title=Text(table.title), caption=Text(table.note), box=SIMPLE_HEAD, padding=(0, 1))
     out.title_justify, out.caption_justify, out.title_style = "left", "left", "bold"
     for i, column in enumerate(table.columns):
-        out.add_column(Text(column), justify="right" if i else "left", vertical="bottom")
+        side, wrap = ("right", "ellipsis") if i else ("left", "fold")
+        out.add_column(Text(column), justify=side, overflow=wrap, vertical="bottom")
     for row in table.rows:
         out.add_row(*map(Text, row))  # Text: brackets are units, not markup
     return out

@@ -6,9 +6,9 @@ predicted variance of the innovation z, a part is an outlier where
     d² = (1/k) Σ z² / S > (χ²ₖ / k) max(s², 1),
 
 χ²ₖ the quantile of the probability that a good one passes (Groves sect. 17.3). With an outlying horizontal position the
-whole fix is left out. s² is what d² usually is over its median: its logarithm moves by ``USUAL_STEP`` up or down with
-every fix (a running median, which outliers hardly move). A filter or a receiver that claims too small a 1σ has large
-innovations all the time, and loses no fixes for that; an outlier is one that is larger than usual.
+whole fix is left out. s² is the usual d² over the median of χ²_k/k: its logarithm moves by ``USUAL_STEP`` up or down
+with every fix (a running median, which outliers hardly move). A filter or a receiver that claims too small a 1σ has
+large innovations all the time, and loses no fixes for that; an outlier is one that is larger than usual.
 
 A filter that is sure of a wrong position would refuse good fixes; so with ``PATIENCE`` in a row that agree with each
 other they pass, and z² is added to the variance: the position is elsewhere, for whichever reason, and attitude and

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from dlkf.running.streaming import StreamingFilter
 
 DEFAULT_NOISE = {"imu_type": "automotive_mems", "tuning": "untuned"}
+
+PACKAGE = str(Path(__file__).parents[1])
 
 
 def navigate(
@@ -122,11 +125,19 @@ def navigate(
         (navigated,) = navigate_drives(drives, estimator, align=_align())
     solution = Solution.of(navigated, fixes, short_name(model), REMEDY if takes_tuning(model) else OF_NETWORK)
     for line in (*unused, *slow, *([solution.warning] if solution.warning else [])):
-        warnings.warn(line, UserWarning, stacklevel=2)
+        warnings.warn(line, UserWarning, stacklevel=_depth())
     return solution
 
 
-def smooth(imu: pd.DataFrame, gnss: pd.DataFrame, *, model: str | Path = "mbkf21_nhc", **options: Any) -> Solution:
+def _depth() -> int:
+    """How many calls the caller of this package is away, for a warning that names its line."""
+    frame, depth = sys._getframe(1), 1
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(PACKAGE):
+        frame, depth = frame.f_back, depth + 1
+    return depth
+
+
+def smooth(imu: pd.DataFrame, gnss: pd.DataFrame, *, model: str | Path = "plus", **options: Any) -> Solution:
     """Run a filter over one drive and the Rauch-Tung-Striebel smoother back over it.
 
     Parameters

@@ -62,7 +62,7 @@ def tensor_forms() -> Iterator[None]:
 
 @contextmanager
 def without_loops() -> Iterator[None]:
-    """Inside the block the tensor forms are taken, for work that is done before numba were loaded."""
+    """Use the tensor forms inside the block: for work that is shorter than loading numba."""
     global _spared
     before, _spared = _spared, True
     try:

@@ -29,10 +29,10 @@ TOLERATED = 1.3  # by which a 1σ may be off before it is worth a line: no filte
 SETTLE = 10  # updates from the start on that do not count: the heading is still being found
 FAULTY = 15.0  # innovations so far above their 1σ are no matter of noise: with the preset of another IMU they reach 8
 STRETCH = 20  # successive updates with a fix
-FAR = 2.5  # RMS of them over their 1σ, from which on it is worth a line: plus has 1.5 at most on 30 drives of many kinds
+FAR = 2.5  # RMS of them over their 1σ, from which on it is worth a line: plus has at most 1.5 on 30 drives
 REMEDY = (
-    "take tuning=any_car for an unknown car; dlkf tune, or imu=auto in dlkf navigate, fits the noise; mbkf33 also "
-    "estimates scale factors and misalignments"
+    "take plus, which estimates the noise, or tuning=any_car for an unknown car; dlkf tune, or imu=auto in dlkf "
+    "navigate, fits the noise; mbkf33 also estimates scale factors and misalignments"
 )
 OF_NETWORK = "compare it with mbkf21_car tuning=any_car; dlkf doctor checks the data"
 OF_DATA = "so far off is a fault of the data, not of the noise: check units, axes, clocks and lever arm (dlkf doctor)"

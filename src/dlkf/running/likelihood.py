@@ -114,7 +114,11 @@ class NoiseFit(NamedTuple):
             return ""
         way = "forward" if ahead > 0 else "back"
         far = f"{abs(ahead):.2f} m ± {ahead_std:.2f} m further {way} than lever_arm_m says"
-        when = f"{late:.3f} s ± {late_std:.3f} s late" if late else f"not late that one could tell (± {late_std:.3f} s)"
+        when = (
+            f"{late:.3f} s ± {late_std:.3f} s late"
+            if late
+            else f"not late that one could tell (± {late_std:.3f} s; whether they are early is not searched)"
+        )
         where = far if ahead else f"where lever_arm_m says (± {ahead_std:.2f} m along the car)"
         return f"The fixes are {when}; the antenna sits {where}"
 
@@ -166,7 +170,7 @@ class Evidence:
     def shares(self, name: str, imu: ImuSpec, tuning: Tuning, placing: FixOffset) -> Float[Tensor, "B T"]:
         """What every fix adds to that mean; 0 without one."""
         batch = placing.of(self.batch)
-        estimator = build_causal(name, imu, "this does not", tuning=tuning)
+        estimator = build_causal(name, imu, "the search for noise does not", tuning=tuning)
         if self.compiler is not None:
             estimator = self.compiler(estimator, 1 / batch.dt, batch.epoch_s)
         solution = run_filter(batch, estimator, keep_covariances=True)
@@ -227,7 +231,7 @@ def find_noise(
     to score.
     """
     if compiler is not None and int(evidence.batch.present.sum()) >= IN_C:
-        first = build_causal(name, imu, "this does not", tuning=tuning)
+        first = build_causal(name, imu, "the search for noise does not", tuning=tuning)
         if compiler(first, 1 / evidence.batch.dt, evidence.batch.epoch_s) is not first:
             evidence = replace(evidence, compiler=compiler)
     sensors = [(s, k) for s in ("accel", "gyro") for k in OF_SENSORS]

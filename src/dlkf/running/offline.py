@@ -75,6 +75,9 @@ class UsableFixes:
         return int(((self.t > first + 1e-3) & (self.t <= last + 1e-3)).sum())
 
 
+EARLY_S = 3.0  # before a solution begins, from which on a fix without one is worth saying
+
+
 def epoch_for(spacings: Iterable[UsableFixes], rate_hz: float, estimator: Filter) -> float:
     """Update interval [s] that uses every fix: the closest usual spacing, at most 1 s.
 
@@ -114,6 +117,8 @@ class Navigated:
         """One line: rows, alignment, fixes used (of those in the file), and the filter's own 1σ at the end."""
         last, used = self.table.iloc[-1], int(self.table.gnss_used.sum())
         text = f"{self.drive}: aligned at t = {round(self.aligned_at, 1) + 0.0:.1f} s, "
+        if spacing is not None and (early := spacing.between(-np.inf, self.aligned_at - EARLY_S)):
+            text += f"no solution for the {early} fixes before, "
         if self.doubt > WORTH_SAYING:
             text += f"heading ambiguous (the alternatives have probability {self.doubt:.2g}), "
         text += f"{len(self.table)} epochs, "
@@ -177,9 +182,10 @@ def sigma_warning(drives: Iterable[Navigated], model: str, remedy: str) -> str |
         off, first, last = worst_stretch(ratio)
         if off > FAR:
             t = drive.table.t.iloc[[first, last]].to_numpy()
+            where = f"in drive {drive.drive} " if len(ratios) > 1 else ""
             return (
-                f"{model} is overconfident in drive {drive.drive} from t = {t[0]:.0f} to {t[1]:.0f} s: its innovations "
-                f"are {off:.2g} times their 1σ there, so its position is further off than its 1σ says; {remedy}"
+                f"{model} is overconfident {where}from t = {t[0]:.0f} to {t[1]:.0f} s: its innovations there are "
+                f"{off:.2g} times their 1σ, so its position is further off than its 1σ says; {remedy}"
             )
     return None
 
@@ -297,7 +303,7 @@ def navigate_drives(
 
 
 def _forms(estimator: Filter, drives: int) -> AbstractContextManager:
-    """What a filter in C leaves to do of a few drives is done before numba were loaded."""
+    """Leaves numba unloaded where a filter in C runs a few drives: loading takes longer than the work."""
     return without_loops() if isinstance(estimator, WholeLoop) and drives < FEW_DRIVES else nullcontext()
 
 
