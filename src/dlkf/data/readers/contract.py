@@ -192,8 +192,8 @@ def _quality(mapped: Mapped) -> np.ndarray:
 
 
 def _code(value: Any, where: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 8:
-        raise InputError(f"reader.gnss.quality.{where} is {value!r}, must be a code of NMEA's GGA, 0 to 8")
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 9:
+        raise InputError(f"reader.gnss.quality.{where} is {value!r}, must be a code of NMEA's GGA, 0 to 9")
     return value
 
 
