@@ -14,7 +14,7 @@ from dlkf.base.errors import InputError
 from dlkf.data.discovery.findings import Raw, discover
 from dlkf.data.schema import ACCEL, GYRO, POSITION, VELOCITY
 from dlkf.data.tables import Columns, DriveRow
-from dlkf.data.validate import GNSS_QUALITIES, CheckedTables, read_checked
+from dlkf.data.validate import CheckedTables, read_checked, read_fixes, usable_fixes
 from dlkf.navigation.earth import STANDARD_GRAVITY
 
 GOOD, NOTE, BAD = "good", "note", "BAD"
@@ -91,7 +91,7 @@ def imu_findings(imu: Columns) -> Iterator[CheckupResult]:
 
 def gnss_findings(imu: Columns, gnss: Columns) -> Iterator[CheckupResult]:
     """Rate, gaps, shares of quality, velocities, 1σ, overlap with the IMU, jumps."""
-    usable = np.isin(gnss["quality"], GNSS_QUALITIES)
+    usable = usable_fixes(gnss)
     t = gnss["t"][usable]
     if len(t) < 2:
         yield CheckupResult(BAD, f"GNSS: {len(t)} usable fixes")
@@ -141,7 +141,7 @@ def _horizontal_steps(gnss: Columns, usable: np.ndarray) -> tuple[np.ndarray, np
 
 def motion_findings(gnss: Columns) -> Iterator[CheckupResult]:
     """Speed and standstills: a filter needs motion to find its heading, and gains from rest."""
-    usable = np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite(gnss["vel_n"]) & np.isfinite(gnss["vel_e"])
+    usable = usable_fixes(gnss) & np.isfinite(gnss["vel_n"]) & np.isfinite(gnss["vel_e"])
     if not usable.any():
         return
     t, v = gnss["t"][usable], np.hypot(gnss["vel_n"], gnss["vel_e"])[usable]
@@ -157,12 +157,11 @@ def motion_findings(gnss: Columns) -> Iterator[CheckupResult]:
 
 def discover_findings(tables: CheckedTables) -> Iterator[CheckupResult]:
     """Clock offset, pose of the sensor in the car, and lever arm estimated from the motion, against what is stored."""
-    imu, gnss = tables.imu, tables.gnss
-    ok = np.isin(gnss["quality"], GNSS_QUALITIES)
+    imu, gnss = tables.imu, read_fixes(tables.gnss)
     raw = Raw(
         t=imu["t"], accel=np.stack([imu[c] for c in ACCEL], -1), gyro=np.stack([imu[c] for c in GYRO], -1),
-        accel_factor=1.0, gyro_factor=1.0, gnss_t=gnss["t"][ok], lat_deg=gnss[POSITION[0]][ok],
-        lon_deg=gnss[POSITION[1]][ok], v_ned=np.stack([gnss[c][ok] for c in VELOCITY], -1),
+        accel_factor=1.0, gyro_factor=1.0, gnss_t=gnss["t"], lat_deg=gnss[POSITION[0]],
+        lon_deg=gnss[POSITION[1]], v_ned=np.stack([gnss[c] for c in VELOCITY], -1),
     )  # fmt: skip
     for finding in discover(raw, {"imu.time.offset_s", "imu.axes"}, known_accel={}, known_gyro={}).found:
         if finding.setting == "gnss.time.drift_ppm":
