@@ -21,7 +21,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, cast
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, first_line
 from dlkf.base.processes import is_gone, process_label
 
 PARTIAL = ".partial-"  # before the process: a folder in which files wait for the rest
@@ -46,7 +46,7 @@ def resolve_place(given: str | Path) -> Path:
         _ = place.fs  # imports the library of the store
     except (ImportError, ValueError) as error:
         known = "paths, s3:// and gs:// (pip install 'dlkf[cloud]'), memory://"
-        raise InputError(f"{given}: {str(error).splitlines()[0]}; known are {known}") from None
+        raise InputError(f"{given}: {first_line(error)}; known are {known}") from None
     return cast(Path, place)
 
 

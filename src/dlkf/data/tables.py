@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from dlkf.base.errors import InputError, did_you_mean
+from dlkf.base.errors import InputError, did_you_mean, first_line
 from dlkf.base.files import (
     is_url,
     open_parquet,
@@ -195,7 +195,7 @@ def _read(path: Path, where: str) -> pa.Table:
     try:
         table = pq.ParquetFile(open_parquet(path), page_checksum_verification=True).read()
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0][:100]
+        reason = first_line(error)
         raise InputError(f"{where}: not a whole Parquet file ({reason}); write or copy it again") from None
     if doubles := sorted({name for name in table.column_names if table.column_names.count(name) > 1}):
         raise InputError(f"{where}: column {doubles[0]} appears twice; leave one")

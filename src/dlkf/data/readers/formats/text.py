@@ -15,7 +15,7 @@ from typing import Any
 
 import pandas as pd
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, first_line
 from dlkf.data.readers import vocabulary
 from dlkf.data.readers.frames import LogTable
 
@@ -133,7 +133,7 @@ def _parsed(path: Path, lines: list[str], numbers: list[int], options: Mapping[s
                 low_memory=False,
             )
     except (pd.errors.ParserError, pd.errors.EmptyDataError, ValueError, re.error) as error:
-        detail = str(error).splitlines()[0].strip()
+        detail = first_line(error).strip()
         if found := re.search(r"line (\d+)", detail):
             place = min(int(found[1]), len(numbers)) - 1
             detail = detail.replace(found[0], f"line {numbers[place]}")
