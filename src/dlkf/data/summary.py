@@ -7,6 +7,7 @@ import pandas as pd
 
 from dlkf.data.discovery.motion import RESTING
 from dlkf.data.readers.frames import DriveFrames
+from dlkf.data.validate import usable_fixes
 
 AIDS = {"speed": "wheel speed", "heading": "heading", "baro": "barometer"}
 STANDS_S = 2.0  # less is a creeping car
@@ -23,7 +24,7 @@ def drive_line(drive: DriveFrames) -> str:
     at, quality = drive.gnss["t"].to_numpy(), drive.gnss["quality"].to_numpy()
     shares = {int(q): float(np.mean(quality == q)) for q in np.unique(quality)}
     named = (f"{QUALITIES.get(q, f'quality {q}')} {100 * share:.3g} %" for q, share in shares.items())
-    fixed = at[quality > 0]
+    fixed = at[usable_fixes(drive.gnss)]
     gaps = np.diff(fixed)
     rate = f"{1 / np.median(np.diff(at)):.3g} Hz" if len(at) > 1 else "a single row"
     detail.append(f"GNSS {rate}, {len(fixed)} fixes ({', '.join(named)})")

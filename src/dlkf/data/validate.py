@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from dlkf.base.errors import InputError
 from dlkf.data.aid_checks import check_aid
@@ -119,7 +120,7 @@ def read_fixes(gnss: Columns) -> Columns:
     return {column: values[usable] for column, values in gnss.items()}
 
 
-def usable_fixes(gnss: Columns) -> np.ndarray:
+def usable_fixes(gnss: Columns | pd.DataFrame) -> np.ndarray:
     """Rows whose quality is that of a satellite fix and whose position is finite."""
     return np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite([gnss[c] for c in POSITION]).all(0)
 
