@@ -39,6 +39,10 @@ VELOCITY = ("vel_n", "vel_e", "vel_d")
 STD = ("std_pos_n", "std_pos_e", "std_pos_d", "std_vel_n", "std_vel_e", "std_vel_d")
 ATTITUDE = ("roll", "pitch", "yaw")
 IMU_ERROR = ("accel_error_x", "accel_error_y", "accel_error_z", "gyro_error_x", "gyro_error_y", "gyro_error_z")
+QUALITIES = {  # of a fix, by NMEA's GGA code
+    0: "no fix", 1: "single", 2: "DGNSS", 3: "PPS", 4: "RTK fixed", 5: "RTK float", 6: "dead reckoning", 7: "manual",
+    8: "simulated", 9: "SBAS",
+}  # fmt: skip
 LONGEST_NAME = 200  # bytes of a drive's name: a file system takes 255 with what stands before it
 LEVER_ARM = ("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m")
 

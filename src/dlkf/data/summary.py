@@ -7,11 +7,11 @@ import pandas as pd
 
 from dlkf.data.discovery.motion import RESTING
 from dlkf.data.readers.frames import DriveFrames
+from dlkf.data.schema import QUALITIES
 from dlkf.data.validate import usable_fixes
 
 AIDS = {"speed": "wheel speed", "heading": "heading", "baro": "barometer"}
 STANDS_S = 2.0  # less is a creeping car
-QUALITIES = {0: "no fix", 1: "single", 2: "DGNSS", 3: "PPS", 4: "RTK fixed", 5: "RTK float", 9: "SBAS"}
 
 
 def drive_line(drive: DriveFrames) -> str:

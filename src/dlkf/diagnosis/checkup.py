@@ -12,14 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.findings import Raw, discover
-from dlkf.data.schema import ACCEL, GYRO, POSITION, VELOCITY
+from dlkf.data.schema import ACCEL, GYRO, POSITION, QUALITIES, VELOCITY
 from dlkf.data.tables import Columns, DriveRow
 from dlkf.data.validate import CheckedTables, read_checked, read_fixes, usable_fixes
 from dlkf.navigation.earth import STANDARD_GRAVITY
 
 GOOD, NOTE, BAD = "good", "note", "BAD"
 STYLES = {GOOD: "green", NOTE: "yellow", BAD: "bold red"}
-NAMES = {0: "no fix", 1: "single", 2: "DGNSS", 3: "PPS", 4: "RTK fixed", 5: "RTK float", 6: "dead reckoning", 9: "SBAS"}
 FASTEST_MOVE = 2.0  # m/s, from which on course is heading
 STANDING = 0.15  # m/s
 OFFSET_S, DELAY_S, ANGLE_DEG = 0.05, 0.3, 3.0  # more is worth a word, is a wrong clock, is a turned sensor
@@ -99,7 +98,7 @@ def gnss_findings(imu: Columns, gnss: Columns) -> Iterator[CheckupResult]:
     usual = float(np.median(np.diff(t)))
     yield CheckupResult(GOOD, f"GNSS: {len(t)} usable fixes, one every {usual:.3g} s" + _fast(usual))
     codes, counts = np.unique(gnss["quality"], return_counts=True)
-    shares = ", ".join(f"{c / len(gnss['t']):.0%} {NAMES.get(int(q), f'quality {q}')}" for q, c in zip(codes, counts))
+    shares = ", ".join(f"{c / len(gnss['t']):.0%} {QUALITIES.get(q, f'quality {q}')}" for q, c in zip(codes, counts))
     best = float(np.mean(np.isin(gnss["quality"], (4, 5, 2, 9))))
     yield CheckupResult(GOOD if best > 0.5 else NOTE, f"GNSS: {shares}")
     gaps = np.diff(t)

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from dlkf.data.readers import vocabulary
+from dlkf.data.schema import QUALITIES
 
 Spec = dict[str, Any]
 SOLUTION = r" ?(?:solution|losung|solucion|解)"
@@ -24,11 +25,9 @@ WORDS = {
     + ("固定", "固定解", "フィックス"),
     5: ("float", "rtk float", "flottant", "flotante", "gleitend", "浮点", "浮点解", "浮動", "フロート"),
 }
-NAMES = {0: "no fix", 1: "single", 2: "DGNSS", 3: "PPS", 4: "RTK fixed", 5: "RTK float"}
-NAMES |= {6: "dead reckoning", 7: "manual", 8: "simulated", 9: "SBAS"}
 # number of a fix: NMEA's GGA code
 READINGS: dict[str, dict[int, int]] = {
-    "NMEA's GGA code": {code: code for code in NAMES},
+    "NMEA's GGA code": {code: code for code in QUALITIES},
     "u-blox's fix type (3 is 3D)": {0: 0, 1: 0, 2: 1, 3: 1, 4: 1, 5: 0},
     "MAVLink's fix type (3 is 3D, 6 RTK fixed)": {0: 0, 1: 0, 2: 1, 3: 1, 4: 2, 5: 5, 6: 4},
     "RTKLIB's Q (1 is RTK fixed)": {0: 0, 1: 4, 2: 5, 3: 2, 4: 2, 5: 1, 6: 2},
@@ -117,7 +116,7 @@ def _code(word: str) -> int | None:
 
 
 def _said(codes: Mapping[int, int]) -> str:
-    return ", ".join(f"{x} is {NAMES[code]}" for x, code in codes.items())
+    return ", ".join(f"{x} is {QUALITIES[code]}" for x, code in codes.items())
 
 
 def _some(values: pd.Series) -> str:

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dlkf.base.settings import is_number
+
 # settings that belong to the car, the IMU and the pair of clocks, and how far apart those of two drives may be
 ALIKE: dict[tuple[str, ...], float] = {
     ("imu", "accel", "unit"): 0.02,  # relative, of a number by gravity
@@ -83,7 +85,7 @@ def _agreed(values: Sequence[Any], limit: float) -> Any:
             return None
         yaw, pitch, roll = mean.as_euler("ZYX", degrees=True)
         return {"roll": round(float(roll), 2), "pitch": round(float(pitch), 2), "yaw": round(float(yaw), 2)}
-    if all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values):
+    if all(map(is_number, values)):
         middle, spread = float(np.median(values)), float(np.ptp(values))
         if limit >= 0.03:
             return round(middle, 4) if spread <= limit else None
