@@ -174,6 +174,12 @@ def degrees_minutes(values: np.ndarray) -> np.ndarray:
     return np.sign(values) * (whole + (size - 100 * whole) / 60)
 
 
+def degrees_minutes_seconds(cells: pd.DataFrame) -> np.ndarray:
+    """Three columns of texts as degrees; −0° is south or west as well."""
+    size = cells.apply(pd.to_numeric, errors="coerce").abs().to_numpy() @ [1, 1 / 60, 1 / 3600]
+    return np.where(cells.iloc[:, 0].str.startswith("-"), -size, size)
+
+
 def _split(values: np.ndarray, ticks: int) -> tuple[np.ndarray, np.ndarray]:
     if np.issubdtype(values.dtype, np.integer):
         whole, rest = np.divmod(values.astype(np.int64), ticks)
