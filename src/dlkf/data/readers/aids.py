@@ -22,7 +22,6 @@ PRESSURE = {"pa": 1.0, "hpa": 100.0, "mbar": 100.0, "kpa": 1000.0}
 TURNS = {"rpm": 1 / 60, "turns": 1.0}  # turns (a second), with radius_m
 COUNTS = ("ticks", "turns", "m")  # what has been gained since the beginning; its rate is the speed
 NEAR = 0.15  # of a wheel's scale from a known unit: tyres differ by some per cent
-KNOWN = {**units.SPEED, "cm/s": 0.01, "mm/s": 1e-3}
 
 
 def aid_frame(name: str, mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
@@ -113,7 +112,7 @@ def _settled(
 def _unit(wheel: Wheel, counts: bool) -> tuple[str | float, str]:
     """The unit of about a scale; a number where it is none of those known: of ticks, whose scale is lost so."""
     detail = f"{wheel.scale:.4g} ± {wheel.scale_std:.1g} m/s of GNSS per unit"
-    near = {name: abs(np.log(wheel.scale / value)) for name, value in KNOWN.items()} if wheel.scale > 0 else {}
+    near = {name: abs(np.log(wheel.scale / value)) for name, value in units.SPEED.items()} if wheel.scale > 0 else {}
     best = min(near, key=lambda name: near[name], default=None)
     if best is not None and near[best] < NEAR and not counts:
         return best, detail

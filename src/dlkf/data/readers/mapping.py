@@ -15,7 +15,7 @@ from dlkf.data.readers import units
 from dlkf.data.readers.frames import LogTable
 
 Spec = Mapping[str, Any]
-TABULAR = (None, "csv", "parquet", "feather", "matlab")  # formats whose columns are a user's own
+TABULAR = (None, "csv", "parquet", "feather", "matlab")  # formats whose columns and stamps are a user's own
 MOST_NAMED = 24
 SOURCE = ("format", "file", "table", "lines", "rows", "text", "time")
 TIME = ("column", "unit", "week", "week_number", "day", "order", "wraps_s", "clock", "offset_s", "drift_ppm", "respace")

@@ -44,7 +44,6 @@ USUAL = {
 MOSTLY = 0.8  # of the fixes
 FEWEST_FIXES = 3  # below, no finding has a spread
 LEAST_GRAVITY = 0.5  # of the mean force: the length of the mean; with gravity in it nearly 1
-SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "knots": 1852 / 3600, "cm/s": 0.01, "mm/s": 1e-3, "mph": 0.44704}
 
 
 class Unsure(InputError):
@@ -186,7 +185,7 @@ def _speed_unit(found: Findings, gnss: Mapped, t: np.ndarray, where: str) -> Non
     speed = v[:, 0] if gnss.spec["velocity"].get("frame") == "course" else np.hypot(v[:, 0], v[:, 1])
     place = positions(gnss)
     factor, spread = speed_factor(t, place["lat_deg"], place["lon_deg"], speed)
-    apart = {name: abs(np.log(factor / f)) if factor > 0 else np.inf for name, f in SPEEDS.items()}
+    apart = {name: abs(np.log(factor / f)) if factor > 0 else np.inf for name, f in units.SPEED.items()}
     best = min(apart, key=lambda name: apart[name])
     certain = apart[best] < 0.08 and spread < 0.2 * factor
     detail = f"positions move {factor:.3g} ± {spread:.1g} m per unit" if factor > 0 else "the car hardly moves"

@@ -16,10 +16,10 @@ import pandas as pd
 import scipy.io
 
 from dlkf.base.errors import InputError, first_line
+from dlkf.data.readers import units
 from dlkf.data.readers.formats import library
 from dlkf.data.readers.frames import LogTable
 
-DATENUM_1970 = 719_529.0
 DATENUMS = (723_000.0, 767_000.0)  # 1979 to 2099
 LARGEST_BYTES = 4 << 30
 DEEPEST = 6  # of structures in structures
@@ -146,7 +146,7 @@ def _dated(frame: pd.DataFrame) -> pd.DataFrame:
         values = frame[name].to_numpy(float)
         within = len(values) > 1 and DATENUMS[0] < values.min() and values.max() < DATENUMS[1] and np.ptp(values) < 30
         if within and np.all(np.diff(values) >= 0) and np.any(values != np.round(values)):
-            frame[name] = np.round((values - DATENUM_1970) * 86_400e6).astype(np.int64) * 1000
+            frame[name] = np.round((values - units.DAYS["datenum"]) * 86_400e6).astype(np.int64) * 1000
     return frame
 
 
