@@ -139,7 +139,7 @@ def write_drive(
         row.setdefault("gnss_rate_hz", _rate(gnss["t"]))
     row.setdefault("duration_s", float(imu["t"].iloc[-1] - imu["t"].iloc[0]) if len(imu) else 0.0)
     way = gnss if reference is None else reference
-    row.setdefault("distance_m", float("nan") if way is None else _distance(way))
+    row.setdefault("distance_m", float("nan") if way is None else driven_distance(way))
     return row
 
 
@@ -183,7 +183,7 @@ def _rate(t: pd.Series) -> float:
     return 1 / step if step else float("nan")
 
 
-def _distance(frame: pd.DataFrame) -> float:
+def driven_distance(frame: pd.DataFrame) -> float:
     """Length of the way [m] from the horizontal velocities (trapezoid); unknown velocities count as zero."""
     speed = np.nan_to_num(np.hypot(frame["vel_n"], frame["vel_e"]))
     return float(np.trapezoid(speed, frame["t"])) if len(frame) > 1 else 0.0

@@ -6,8 +6,9 @@ import numpy as np
 import pandas as pd
 
 from dlkf.data.discovery.motion import RESTING
+from dlkf.data.limits import EARTH_M
 from dlkf.data.readers.frames import DriveFrames
-from dlkf.data.schema import QUALITIES
+from dlkf.data.schema import QUALITIES, driven_distance
 from dlkf.data.validate import usable_fixes
 
 AIDS = {"speed": "wheel speed", "heading": "heading", "baro": "barometer"}
@@ -64,11 +65,11 @@ def _way(drive: DriveFrames) -> float:
     assert gnss is not None
     speed = np.hypot(gnss["vel_n"].to_numpy(), gnss["vel_e"].to_numpy())
     if np.isfinite(speed).mean() > 0.5:
-        return float(np.trapezoid(np.nan_to_num(speed), gnss["t"]))
+        return driven_distance(gnss)
     lat, lon = (np.radians(gnss[c].dropna().to_numpy()) for c in ("lat_deg", "lon_deg"))
     if not len(lat):
         return 0.0
-    north, east = 6.37e6 * (lat - lat[0]), 6.37e6 * np.cos(lat[0]) * (lon - lon[0])
+    north, east = EARTH_M * (lat - lat[0]), EARTH_M * np.cos(lat[0]) * (lon - lon[0])
     way, last = 0.0, (north[0], east[0])
     for here in zip(north, east):
         if (moved := float(np.hypot(here[0] - last[0], here[1] - last[1]))) > 5.0:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.findings import Raw, discover
+from dlkf.data.limits import horizontal_distance
 from dlkf.data.schema import ACCEL, GYRO, POSITION, QUALITIES, VELOCITY
 from dlkf.data.tables import Columns, DriveRow
 from dlkf.data.validate import CheckedTables, read_checked, read_fixes, usable_fixes
@@ -121,21 +122,17 @@ def gnss_findings(imu: Columns, gnss: Columns) -> Iterator[CheckupResult]:
     if np.isfinite(std).any():
         text = f"GNSS: horizontal 1σ {np.nanmedian(std):.2g} m in the median, {np.nanmax(std):.2g} m at worst"
     yield CheckupResult(GOOD if np.isfinite(std).any() else NOTE, text)
-    v = np.hypot(*_horizontal_steps(gnss, usable)) / np.maximum(gaps, 1e-3)
+    lat, lon = gnss["lat_deg"][usable], gnss["lon_deg"][usable]
+    way = horizontal_distance(lat[:-1], lon[:-1], lat[1:], lon[1:])
+    v = way / np.maximum(gaps, 1e-3)
     if (fast := v > 100).any():
         k = int(np.argmax(v))
-        text = f"GNSS: {fast.sum()} jumps; at t = {t[k + 1]:.1f} s it moves {v[k] * gaps[k]:.3g} m in {gaps[k]:.3g} s"
+        text = f"GNSS: {fast.sum()} jumps; at t = {t[k + 1]:.1f} s it moves {way[k]:.3g} m in {gaps[k]:.3g} s"
         yield CheckupResult(BAD, text)
 
 
 def _fast(usual: float) -> str:
     return f"; epoch_s={usual:.3g} takes them all" if usual < 0.8 else ""
-
-
-def _horizontal_steps(gnss: Columns, usable: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    lat, lon = np.radians(gnss["lat_deg"][usable]), np.radians(gnss["lon_deg"][usable])
-    east = (np.diff(lon) + np.pi) % (2 * np.pi) - np.pi
-    return np.diff(lat) * 6.37e6, east * 6.37e6 * np.cos(lat[:-1])
 
 
 def motion_findings(gnss: Columns) -> Iterator[CheckupResult]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dlkf.base.angles import wrap_angle
 from dlkf.data import compiled_samples
 from dlkf.data.discovery.motion import MOVING, RESTING, Complex, Floats, Motion
 from dlkf.data.readers.units import WEEK_S
@@ -149,7 +150,7 @@ def _gnss_signals(gnss: Motion, first: np.ndarray, last: np.ndarray) -> tuple[np
     span = gnss.t[last] - gnss.t[first]
     slow = np.minimum(gnss.speed[first], gnss.speed[last])
     moving, resting = slow > MOVING, np.maximum(gnss.speed[first], gnss.speed[last]) < RESTING
-    turned = np.angle(np.exp(1j * (gnss.course[last] - gnss.course[first])))
+    turned = wrap_angle(gnss.course[last] - gnss.course[first])
     rate = np.where(moving, turned / span, 0.0)
     mean = gnss.v[first] + gnss.v[last]
     along = np.where(np.abs(mean) > 0.5, mean / np.maximum(np.abs(mean), 1e-9), 1.0)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import known_offset
 from dlkf.data.discovery.motion import Motion, motion
@@ -178,7 +179,7 @@ def _heading(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
     if (entry.get("convention") or "ned") == "enu":
         angle = np.pi / 2 - angle
     angle = angle - units.DEG * float(entry.get("antennas_deg") or 0.0)
-    out = pd.DataFrame({"t": t, "heading": np.mod(angle + np.pi, 2 * np.pi) - np.pi})
+    out = pd.DataFrame({"t": t, "heading": wrap_angle(angle)})
     if mapped.has("std"):
         out["std"] = mapped.vector("std", (1,), nan=True)[:, 0] * mapped.scale("value", units.ANGLE)
     return out

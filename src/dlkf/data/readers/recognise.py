@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from dlkf.data.discovery.units import accel_units
+from dlkf.data.limits import DEGREE_M, EARTH_M
 from dlkf.data.readers import by_numbers, stamps, units, vocabulary
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.qualities import quality_spec
@@ -336,4 +337,4 @@ def _moves_like_radians(frame: pd.DataFrame, found: dict[str, str | None]) -> bo
         return False
     name = found["north"] or found["speed"]
     way = float(np.nansum(np.abs(frame[name].to_numpy(float))))
-    return spread > 0 and way > 0 and abs(np.log(spread * 6.37e6 / way)) < abs(np.log(spread * 1.11e5 / way))
+    return spread > 0 and way > 0 and abs(np.log(spread * EARTH_M / way)) < abs(np.log(spread * DEGREE_M / way))
