@@ -17,14 +17,9 @@ def describe_provenance() -> dict[str, str]:
     made = {
         "command": command_line(),
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-        "version": package_version(),
+        "version": dlkf.__version__,
     }
     return made | ({"commit": found} if (found := repository_commit()) else {})
-
-
-def package_version() -> str:
-    """Of this package."""
-    return dlkf.__version__
 
 
 def command_line() -> str:

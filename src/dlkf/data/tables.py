@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -135,6 +136,11 @@ def drive_clocks(folder: str | Path) -> dict[str, DriveClock]:
             raise InputError(f"drives.parquet: {name} is {beyond[0]:g}, no time in seconds; correct it or leave it out")
         columns.append(np.where(np.isfinite(values), values, unknown).tolist())
     return {str(drive): DriveClock(*row) for drive, *row in zip(table["drive"].to_pylist(), *columns)}
+
+
+def read_drives_table(folder: str | Path) -> pd.DataFrame:
+    """All columns of ``drives.parquet``."""
+    return _read(resolve_place(folder) / "drives.parquet", "drives.parquet").to_pandas()
 
 
 def read_table(folder: str | Path, kind: str, drive: str, column: str = "") -> Columns | None:
