@@ -19,7 +19,7 @@ from dlkf.base.files import folder_name, resolve_place, write_into
 from dlkf.data.limits import DEGREE_M
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR
 from dlkf.data.tables import Columns, read_drives
-from dlkf.data.validate import CheckedTables, read_checked
+from dlkf.data.validate import CheckedTables, read_checked, read_fixes
 
 Array = NDArray[np.floating]
 AXES = (("x", "#0072B2"), ("y", "#D55E00"), ("z", "#009E73"))
@@ -164,7 +164,7 @@ def reference_of(tables: CheckedTables) -> Columns:
 def _track(axes: Axes, figure: Figure, moved: Driving, tables: CheckedTables) -> None:
     drawn = axes.scatter(moved.east, moved.north, c=3.6 * moved.speed, s=2, cmap="viridis", linewidths=0)
     axes.plot(moved.east[0], moved.north[0], "o", color=INK, markersize=5, label="start")
-    fixes = tables.gnss["t"][tables.gnss["quality"] > 0]
+    fixes = read_fixes(tables.gnss)["t"]
     edges = np.concatenate(((moved.t[0],), fixes, (moved.t[-1],)))
     before = np.searchsorted(edges, moved.t, side="right").clip(1, len(edges) - 1)
     usual = float(np.median(np.diff(fixes))) if len(fixes) > 1 else np.inf

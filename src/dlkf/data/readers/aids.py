@@ -17,6 +17,7 @@ from dlkf.data.discovery.wheel import Wheel, find_wheel
 from dlkf.data.readers import units
 from dlkf.data.readers.mapping import Mapped
 from dlkf.data.schema import VELOCITY
+from dlkf.data.validate import usable_fixes
 
 AUTO = "auto"
 PRESSURE = {"pa": 1.0, "hpa": 100.0, "mbar": 100.0, "kpa": 1000.0}
@@ -62,7 +63,7 @@ def _times(mapped: Mapped, zero: int) -> np.ndarray:
 
 
 def _motion(fixes: pd.DataFrame) -> Motion:
-    good = fixes[(fixes["quality"] > 0) & fixes["lat_deg"].notna()]
+    good = fixes[usable_fixes(fixes)]
     t, lat, lon = (good[c].to_numpy() for c in ("t", "lat_deg", "lon_deg"))
     return motion(t, lat, lon, good[list(VELOCITY)].to_numpy())
 
