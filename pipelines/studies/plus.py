@@ -32,6 +32,7 @@ import pandas as pd
 import torch
 import yaml
 from pipelines.studies.ablations.plus_parts import parts
+from pipelines.studies.descent import tune_by_gradient
 from pipelines.studies.simulated_laws import COMMON, INJECTED, PYTHON_INS, SILENT, SIMULATED, simulate_sets
 
 from dlkf.base.errors import InputError
@@ -55,7 +56,6 @@ from dlkf.onboard.compiled_filter import compile_filter, compile_or_keep
 from dlkf.running.likelihood import Evidence, find_noise
 from dlkf.running.start import align_each
 from dlkf.simulation.dataset import simulate
-from pipelines.studies.descent import tune_by_gradient
 
 START, COARSE = StartLaw(0.1, 0.1, 1.0, 2.0), StartLaw(1.5, 0.3, 1.0, 3.0)
 BEFORE_S, LENGTHS_S, MOST = (60, 300, 900), (30, 60, 120), 48

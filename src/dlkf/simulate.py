@@ -6,12 +6,12 @@ import math
 import time
 
 import numpy as np
-import pandas as pd
 
 from dlkf.base.callable_module import make_callable
 from dlkf.base.errors import InputError
-from dlkf.base.files import open_parquet, resolve_place
+from dlkf.base.files import resolve_place
 from dlkf.command import command
+from dlkf.data.tables import read_drives_table
 from dlkf.simulation.dataset import SimulateSettings, simulate
 from dlkf.simulation.semi_real import simulate_semi_real
 
@@ -35,7 +35,7 @@ def main(settings: SimulateSettings) -> None:
         simulate(
             settings.recipe, out, overwrite=settings.overwrite, workers=settings.workers, parallel=settings.parallel
         )
-    drives = pd.read_parquet(open_parquet(out / "drives.parquet"))
+    drives = read_drives_table(out)
     hours = drives["duration_s"].sum() / 3600
     made_by = settings.recipe
     errors = made_by.dataset.imu_errors

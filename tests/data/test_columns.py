@@ -110,6 +110,8 @@ def test_every_column_that_is_not_used_is_named(tmp_path, drive):
         ("gpsFix", [0, 1], np.nan, {0: 0, 1: 1}),
         ("Q", [1, 2, 5], 0.02, {1: 4, 2: 5, 5: 1}),  # RTKLIB
         ("quality", [1, 2, 4, 5], np.nan, {1: 1, 2: 2, 4: 4, 5: 5}),
+        ("quality", [4, 5, 9], np.nan, {4: 4, 5: 5, 9: 9}),  # SBAS
+        ("quality", [3, 9], np.nan, {3: 3, 9: 9}),  # no receiver but NMEA's has 9, so 3 is PPS
         ("carrSoln", [0, 1, 2], np.nan, {0: 1, 1: 5, 2: 4}),
         ("status", [-1, 0, 2], np.nan, {-1: 0, 0: 1, 2: 2}),  # ROS
     ],

@@ -164,11 +164,11 @@ def test_a_table_without_header(tmp_path, tables):
         gnss__velocity__columns=[4, 5, 6],
         gnss__std_position=None,
         gnss__std_velocity=None,
-        gnss__quality={"default": 2},
+        gnss__quality={"default": 9},
     )
     drive = next(iter(reader.read(folder)))
     np.testing.assert_allclose(drive.imu.accel_z, tables["imu"].accel_z)
-    assert set(drive.gnss.quality) == {2}
+    assert set(drive.gnss.quality) == {9}
 
 
 MISTAKES = {

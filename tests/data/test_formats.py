@@ -14,7 +14,7 @@ from hydra.utils import get_class
 from dlkf.base.errors import InputError
 from dlkf.command.composing import compose_command
 from dlkf.data.intake import ingest_drives
-from dlkf.data.readers.formats import novatel
+from dlkf.data.readers.formats import novatel, rtklib
 from dlkf.data.readers.frames import DriveFrames
 from dlkf.data.readers.units import WEEK_S
 from dlkf.data.summary import drive_line
@@ -209,3 +209,12 @@ def test_units_that_some_columns_lack_stand_under_their_names(tmp_path):
     table = novatel.read(tmp_path / "town.txt", kind="gnss", table=None, text={}).frame
     np.testing.assert_allclose(table["Latitude"], [-48.5, -48.51])
     assert list(table["Name"]) == ["a", "b"] and list(table["Q"]) == [1, 1]
+
+
+def test_minutes_and_seconds_west_of_greenwich_keep_their_sign(tmp_path):
+    """Minus zero degrees is a whole number without a sign."""
+    head = "%  UTC                   latitude(d'\")   longitude(d'\")  height(m)   Q\n"
+    rows = "".join(f"2025/07/05 10:00:0{k}.000  51 30 00.00000   -0 07 30.00000   40.0000   1\n" for k in (1, 2))
+    (tmp_path / "town.pos").write_text(head + rows)
+    table = rtklib.read(tmp_path / "town.pos", kind="gnss", table=None, text={}).frame
+    np.testing.assert_allclose(table[["lat_deg", "lon_deg"]], [[51.5, -0.125]] * 2)

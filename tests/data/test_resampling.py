@@ -10,6 +10,9 @@ from dlkf.base.errors import InputError
 from dlkf.data import resampling
 from dlkf.data.resampling import SampleGrid, assign_fixes, epoch_grid, fix_phase, reference_at, resample_imu
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, IMU_ERROR, POSITION, STD, VELOCITY
+from dlkf.data.store import drive_from_tables
+from dlkf.data.tables import DriveRow
+from dlkf.data.validate import CheckedTables
 from dlkf.navigation import compiled
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.earth import ecef_from_geodetic, ned_axes
@@ -142,6 +145,16 @@ def test_unknown_stds_and_velocities():
     np.testing.assert_allclose(fixes.std[:4, 2], np.array([0.02, 0.3, 1.0, 2.5]) * 1.5)
     np.testing.assert_allclose(fixes.std[:4, 3], [0.05, 0.1, 0.1, 0.2])
     assert np.isfinite(fixes.v_e[:4]).all()
+
+
+def test_a_row_without_a_position_has_no_say_in_the_phase():
+    t, gnss = np.arange(0, 20, 0.02), _gnss(np.arange(2.0, 18.0) + 0.4)
+    imu = _imu(t, np.tile([0, 0, -9.81, 0, 0, 0], (len(t), 1)))
+    tables = CheckedTables(DriveRow("a", "a", (0.0, 0.0, 0.0)), imu, gnss, None)
+    t0 = drive_from_tables(tables, "", 50.0, 1.0, torch.float64).t0
+    gnss["lat_deg"][5:] = np.nan
+    gnss["t"][5:] += 0.3
+    assert drive_from_tables(tables, "", 50.0, 1.0, torch.float64).t0 == pytest.approx(t0)
 
 
 def _reference(t: np.ndarray) -> dict:

@@ -13,6 +13,7 @@ import pytest
 
 from dlkf.base.errors import InputError
 from dlkf.data.readers.auto import AutoReader
+from dlkf.data.readers.formats import columnar
 from tests.cars import car
 from tests.data.logs.receivers import ubx
 from tests.data.test_formats import read
@@ -74,6 +75,15 @@ def test_a_wrong_file_is_one_line(name, tmp_path):
     with pytest.raises(InputError) as refused:
         read(source, options)
     assert said in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_an_error_without_a_message_is_named_by_its_class(tmp_path, monkeypatch):
+    def fail(_):
+        raise OSError
+
+    monkeypatch.setattr(columnar.pq, "ParquetFile", fail)
+    with pytest.raises(InputError, match=r"not a whole Parquet or Feather file \(OSError\)"):
+        columnar.read(tmp_path / "x.parquet", kind="imu", table=None, text={})
 
 
 def test_marks_and_letters_of_windows(tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY, write_drive
 from dlkf.filters.build import build_filter
 from dlkf.filters.saved import grid_of
 from dlkf.filters.shipped import trained_filter
@@ -25,6 +26,15 @@ def test_epochs_are_as_long_as_fixes_are_apart_but_constraints_keep_a_second(nam
     estimator = build_filter(name, IMU)
     assert epoch_for([FIVE_A_SECOND], 50.0, estimator) == epoch_s
     assert epoch_for([FIVE_A_SECOND], 12.0, estimator) == 1.0  # 2.4 samples make no epoch
+
+
+def test_a_row_without_a_position_is_no_usable_fix(tmp_path):
+    t = np.arange(0.0, 4.0)
+    imu = pd.DataFrame({"t": t} | dict.fromkeys((*GYRO, *ACCEL), 0.0))
+    gnss = pd.DataFrame({"t": t} | dict.fromkeys((*POSITION, *VELOCITY, *STD), 1.0) | {"quality": 1})
+    gnss.loc[1, list(POSITION)] = np.nan
+    write_drive(tmp_path, {"drive": "a"}, imu, gnss)
+    assert UsableFixes.of(tmp_path, "a").t.tolist() == [0.0, 2.0, 3.0]
 
 
 def test_a_network_round_a_filter_with_constraints_keeps_its_second():

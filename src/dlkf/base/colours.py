@@ -10,14 +10,8 @@ COLOURS = (
 )  # fmt: skip
 SHADE = "#DDDDDD"
 TRUTH = "#000000"
-QUALITY = {  # NMEA GGA code: name, colour
-    1: ("single", "#E69F00"),
-    2: ("DGNSS", "#56B4E9"),
-    3: ("PPS", "#56B4E9"),
-    4: ("RTK fixed", "#009E73"),
-    5: ("RTK float", "#CC79A7"),
-    9: ("SBAS", "#0072B2"),
-}
+# of fixes by NMEA's GGA code
+QUALITY = {1: "#E69F00", 2: "#56B4E9", 3: "#56B4E9", 4: "#009E73", 5: "#CC79A7", 9: "#0072B2"}
 
 
 def filter_colour(k: int) -> str:

@@ -3,6 +3,7 @@
 import difflib
 from collections.abc import Iterable
 
+LONGEST_LINE = 200  # letters of a message of another library
 CLOSE = 0.7  # difflib's ratio from which on another name is worth naming
 
 
@@ -11,6 +12,11 @@ class InputError(ValueError):
 
     Commands print it as one line and exit with code 2.
     """
+
+
+def first_line(error: Exception) -> str:
+    """The first line of another library's message, the error's class where that is empty."""
+    return (str(error).splitlines() or [type(error).__name__])[0][:LONGEST_LINE]
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -21,7 +21,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, cast
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, first_line
 from dlkf.base.processes import is_gone, process_label
 
 PARTIAL = ".partial-"  # before the process: a folder in which files wait for the rest
@@ -46,7 +46,7 @@ def resolve_place(given: str | Path) -> Path:
         _ = place.fs  # imports the library of the store
     except (ImportError, ValueError) as error:
         known = "paths, s3:// and gs:// (pip install 'dlkf[cloud]'), memory://"
-        raise InputError(f"{given}: {str(error).splitlines()[0]}; known are {known}") from None
+        raise InputError(f"{given}: {first_line(error)}; known are {known}") from None
     return cast(Path, place)
 
 
@@ -277,7 +277,7 @@ def _whole_prefix(path: str | Path) -> Iterator[Path]:
         yield beside
         with store_errors_as_input_error(path):
             if target.exists():
-                old = sorted(fs.find(target.path), key=lambda file: _deep(file, target.path))
+                old = sorted(fs.find(target.path), key=lambda file: _depth_below(file, target.path))
                 if old:
                     fs.rm(old[0])
                     fs.rm(target.path, recursive=True)
@@ -293,7 +293,7 @@ def _with_folder(file: Path) -> Path:
     return file
 
 
-def _deep(file: str, folder: str) -> int:
+def _depth_below(file: str, folder: str) -> int:
     """How many folders a file lies below one."""
     return file.strip("/").count("/") - folder.strip("/").count("/")
 
@@ -302,7 +302,7 @@ def _copy_files(fs: Any, files: list[str], source: str, target: str) -> None:
     """Copies in the store; files on top come last."""
     source = source.rstrip("/")
     for top in (False, True):
-        some = [file for file in files if (_deep(file, source) == 1) == top]
+        some = [file for file in files if (_depth_below(file, source) == 1) == top]
         if some:
             fs.copy(some, [target.rstrip("/") + "/" + f.strip("/").removeprefix(source.strip("/") + "/") for f in some])
 

@@ -9,7 +9,7 @@ import threading
 
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
 KEPT_BYTES = 1 << 28
-TAKEN_APART = ("mlflow", "multiprocessing.pool", "loky", "joblib", "distributed")  # with stores or workers to close
+NEEDS_TEARDOWN = ("mlflow", "multiprocessing.pool", "loky", "joblib", "distributed")  # with stores or workers to close
 
 
 def end_at_once() -> None:
@@ -20,7 +20,7 @@ def end_at_once() -> None:
     where somebody traces the process, and where its output cannot be written.
     """
     traced = sys.gettrace() or sys.getprofile() or sys.flags.interactive
-    if traced or threading.active_count() > 1 or any(name in sys.modules for name in TAKEN_APART):
+    if traced or threading.active_count() > 1 or any(name in sys.modules for name in NEEDS_TEARDOWN):
         return
     try:
         sys.stdout.flush()

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from itertools import islice
 from typing import Any, TypeVar
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, first_line
 from dlkf.base.signals import delay_signals
 
 DASK = "dask://"
@@ -114,8 +114,9 @@ def _client(where: str) -> Iterator[Any]:
     try:
         client = Client(address, timeout=PATIENCE_S, set_as_default=False)
     except (OSError, ValueError) as error:
-        said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"parallel={where}: no scheduler answers ({said}); start one: dask scheduler") from None
+        raise InputError(
+            f"parallel={where}: no scheduler answers ({first_line(error)}); start one: dask scheduler"
+        ) from None
     with client:
         try:
             yield client

@@ -21,6 +21,7 @@ from zlib import crc32
 import numpy as np
 
 from dlkf.base.errors import InputError
+from dlkf.base.settings import is_number
 
 KINDS = ("uniform", "log_uniform", "normal", "choice")
 Pick = Callable[[str, np.ndarray], int]  # path and shares to the index of a variant
@@ -122,13 +123,13 @@ def _kind(path: str, config: Mapping[str, Any]) -> str:
     if len(kinds) != 1 or set(config) - {kinds[0], "absent"}:
         raise InputError(f"{where} must have one of {', '.join(KINDS)}, and perhaps absent")
     absent, span = config.get("absent", 0.0), config[kinds[0]]
-    if not _is_number(absent) or not 0 <= absent <= 1:
+    if not is_number(absent) or not 0 <= absent <= 1:
         raise InputError(f"{where}: absent must be a probability")
     if not isinstance(span, (list, tuple)) or not span:
         raise InputError(f"{where}: {kinds[0]} must be a list")
     if kinds[0] == "choice":
         return "choice"
-    if len(span) != 2 or not all(_is_number(x) and math.isfinite(x) for x in span):
+    if len(span) != 2 or not all(map(is_number, span)):
         raise InputError(f"{where}: {kinds[0]} must be two numbers")
     if kinds[0] == "normal":
         if span[1] < 0:
@@ -136,7 +137,3 @@ def _kind(path: str, config: Mapping[str, Any]) -> str:
     elif span[0] > span[1] or (kinds[0] == "log_uniform" and span[0] <= 0):
         raise InputError(f"{where}: must rise" + (" from above 0" if kinds[0] == "log_uniform" else ""))
     return kinds[0]
-
-
-def _is_number(x: Any) -> bool:
-    return isinstance(x, (int, float)) and not isinstance(x, bool)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from dlkf.base.angles import circular_median
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.motion import Motion
 from dlkf.data.schema import OPTIONAL
@@ -133,10 +134,8 @@ def _check_heading(table: Columns, moved: Motion, where: str) -> None:
 
 def _middle(angle: np.ndarray) -> tuple[float, float]:
     """Circular median of angles, and the median distance from it [rad]."""
-    mean = np.angle(np.exp(1j * angle).sum())
-    around = (angle - mean + np.pi) % (2 * np.pi) - np.pi
-    middle = mean + np.median(around)
-    return float((middle + np.pi) % (2 * np.pi) - np.pi), float(np.median(np.abs(around - np.median(around))))
+    middle, off = circular_median(angle)
+    return middle, float(np.median(np.abs(off)))
 
 
 def _check_baro(table: Columns, where: str) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import ImuSums, Lag, find_lag
 from dlkf.data.discovery.motion import Motion
@@ -24,7 +25,7 @@ def check_dead_axes(imu: Columns, moved: Motion, where: str) -> None:
     if fast.sum() < 3:
         return
     both = fast[1:] & fast[:-1]
-    turns = np.abs(np.angle(np.exp(1j * np.diff(moved.course))))[both].sum() > TURNED
+    turns = np.abs(wrap_angle(np.diff(moved.course)))[both].sum() > TURNED
     brakes = np.ptp(moved.speed[fast]) > SPEED_CHANGE
     for name, shown, what in (("gyro_z", turns, "turns"), ("accel_x", brakes, "brakes"), ("accel_y", turns, "turns")):
         if shown and np.ptp(imu[name]) == 0:

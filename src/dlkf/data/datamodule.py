@@ -195,14 +195,7 @@ class DriveDataModule(L.LightningDataModule):
 
     def val_dataloader(self) -> FixedBatches | list:
         """Validation batches; no loader where the split has no validation side."""
-        return self._fixed("val") if self.drives("val") else []
-
-    def test_dataloader(self) -> FixedBatches:
-        """Test batches."""
-        return self._fixed("test")
-
-    def _fixed(self, side: str) -> FixedBatches:
-        return FixedBatches(self.batches(side, share=(self._rank, self._world)))
+        return FixedBatches(self.batches("val", share=(self._rank, self._world))) if self.drives("val") else []
 
     def summary(self) -> list[dict[str, Any]]:
         """Per side: drives, groups, minutes of driving, and segments for scoring."""

@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from dlkf.base.errors import InputError
-from dlkf.base.files import open_parquet, resolve_place
 from dlkf.base.settings import is_number
+from dlkf.data.tables import read_drives_table
 
 KINDS = ("simulated", "semi-real", "real", "unknown")
 
@@ -52,4 +50,4 @@ def drive_rates(dataset: str | Path) -> dict[str, float]:
 
 
 def _rows(dataset: str | Path) -> list[dict[Any, Any]]:
-    return pd.read_parquet(open_parquet(resolve_place(dataset) / "drives.parquet")).to_dict("records")
+    return read_drives_table(dataset).to_dict("records")

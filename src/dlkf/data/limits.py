@@ -30,6 +30,7 @@ ESTIMATE_M_S, ESTIMATE_HEIGHTS_M = 200.0, (-2000.0, 20_000.0)  # an estimate bey
 # by a share of it, but no smaller one, in so many times more
 LOST_M, LOST_SIGMAS, LOST_FIXES, LOST_S, LOST_SHARE = 25.0, 10.0, 10, 10.0, 0.3
 EARTH_M = 6_371_000.0  # m, mean radius: distances to 0.5 %
+DEGREE_M = math.radians(EARTH_M)  # of latitude
 
 
 class Refused(NamedTuple):

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
 from dlkf.data.axis_checks import check_climb, check_dead_axes, check_handedness
 from dlkf.data.discovery.clock import ImuSums, find_lag, known_offset
 from dlkf.data.discovery.drift import ROUGH_S, ends_apart, find_drifting_pose
 from dlkf.data.discovery.motion import Motion, motion
-from dlkf.data.limits import NOWHERE_DEG
+from dlkf.data.limits import DEGREE_M, NOWHERE_DEG
 from dlkf.data.schema import ACCEL, GYRO, VELOCITY
 from dlkf.data.tables import Columns
 from dlkf.navigation.earth import SEMI_MAJOR
@@ -24,7 +25,7 @@ CHUNK_S = 10.0  # way and course are compared over such stretches: metres of GNS
 DISAGREES, AGREES = 0.4, 0.25  # relative residual of way against velocity
 LEAST_SLOPE = 0.1  # of gyro_z against the course; one that is at its limit in every turn may have 0.3
 FEW = 2  # single fixes at 0°/0° or a continent away are refused by themselves (dlkf.data.limits)
-FARTHEST_KM, KM_PER_DEG = 2000.0, 111.2
+FARTHEST_KM = 2000.0
 SEARCH_S = 600.0  # clocks of logs that have time in common are hardly further apart
 APART_S = 1.0  # less is a delay, which the filters bear; dlkf.ingest measures it on request
 DRIFTED_S = 0.1  # from a drive's first to its last second: worth a line
@@ -117,8 +118,8 @@ def _check_places(lat: np.ndarray, lon: np.ndarray, where: str) -> None:
             "reader.gnss.position.zero=none, or quality 0"
         )
     middle, side = np.median(lat), np.median(np.cos(np.radians(lat)))
-    east = (lon - np.median(lon) + 180) % 360 - 180
-    far = np.hypot(lat - middle, east * side) * KM_PER_DEG
+    east = wrap_angle(lon - np.median(lon), 180)
+    far = np.hypot(lat - middle, east * side) * DEGREE_M / 1000
     worst = int(far.argmax()) if len(far) else 0
     if (far > FARTHEST_KM).sum() > FEW and np.mean(far > FARTHEST_KM) < 0.3:
         raise InputError(
@@ -157,7 +158,7 @@ def _check_way(gnss: Columns, where: str) -> None:
     first, last, moved = first[far], last[far], moved[far]
 
     def residual(lat: np.ndarray, lon: np.ndarray, moved: np.ndarray) -> float:
-        turn = (lon[last] - lon[first] + np.pi) % (2 * np.pi) - np.pi
+        turn = wrap_angle(lon[last] - lon[first])
         way = SEMI_MAJOR * np.stack((lat[last] - lat[first], np.cos(lat[first]) * turn), -1)
         return float(np.median(np.linalg.norm(way - moved, axis=-1) / np.linalg.norm(moved, axis=-1)))
 
@@ -211,7 +212,7 @@ def check_turns(imu: Columns, gnss: Columns, where: str) -> None:
     with np.errstate(invalid="ignore"):
         use = (np.diff(t) <= 1.5) & (speed[1:] > 3) & (speed[:-1] > 3)
         use &= (t[1:] <= imu["t"][-1]) & (t[:-1] >= imu["t"][0])
-    turned = ((np.diff(course) + np.pi) % (2 * np.pi) - np.pi)[use]
+    turned = wrap_angle(np.diff(course))[use]
     gyro = np.diff(np.interp(t, imu["t"], angle))[use]
     clear = np.abs(turned) > 0.1
     turned, gyro = turned[clear], gyro[clear]

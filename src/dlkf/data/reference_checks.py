@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from dlkf.base.angles import circular_median, wrap_angle
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import ImuSums, find_lag
 from dlkf.data.discovery.motion import motion
-from dlkf.data.plausibility import APART_S, KM_PER_DEG, TURNED_DEG
+from dlkf.data.limits import DEGREE_M
+from dlkf.data.plausibility import APART_S, TURNED_DEG
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, VELOCITY
 from dlkf.data.tables import Columns
 
@@ -31,9 +33,9 @@ def check_same_place(reference: Columns, fixes: Columns, where: str) -> None:
     near = {name: values[both] for name, values in fixes.items()}
     lat = np.interp(near["t"], reference["t"], reference["lat_deg"])
     lon = np.interp(near["t"], reference["t"], np.unwrap(reference["lon_deg"], period=360))
-    east = (lon - near["lon_deg"] + 180) % 360 - 180
+    east = wrap_angle(lon - near["lon_deg"], 180)
     apart = np.hypot(lat - near["lat_deg"], east * np.cos(np.radians(lat)))
-    away = 1000 * KM_PER_DEG * float(np.median(apart))
+    away = DEGREE_M * float(np.median(apart))
     sigma = np.nan_to_num(np.hypot(near["std_pos_n"], near["std_pos_e"]))
     if away > REFERENCE_M + SIGMAS * float(np.median(sigma)):
         said = f"{away / 1000:.3g} km" if away > 1000 else f"{away:.0f} m"
@@ -76,7 +78,7 @@ def check_attitude(reference: Columns, imu: Columns, where: str) -> None:
     course, yaw = np.arctan2(reference["vel_e"][fast], reference["vel_n"][fast]), reference["yaw"][fast]
 
     def apart(angle: np.ndarray) -> float:
-        return float(np.median(np.abs((angle - course + np.pi) % (2 * np.pi) - np.pi)))
+        return float(np.median(np.abs(wrap_angle(angle - course))))
 
     if apart(yaw) > 0.5 and apart(np.pi / 2 - yaw) < 0.1:
         raise InputError(f"{where}: yaw counts from East, must count clockwise from North; use π/2 − yaw")
@@ -97,12 +99,8 @@ def check_attitude(reference: Columns, imu: Columns, where: str) -> None:
 
 def _turned(angles: np.ndarray) -> float | None:
     """The median of angles [rad], −π to π, about which most of them lie; None where they do not."""
-    mean = np.angle(np.exp(1j * angles).mean())
-    off = (angles - mean + np.pi) % (2 * np.pi) - np.pi
-    middle = float(np.median(off))
-    if np.mean(np.abs(off - middle) < SIDEWAYS) < STEADY:
-        return None
-    return (float(mean) + middle + np.pi) % (2 * np.pi) - np.pi
+    middle, off = circular_median(angles)
+    return middle if np.mean(np.abs(off) < SIDEWAYS) >= STEADY else None
 
 
 def _looks_forward(imu: Columns, reference: Columns) -> bool:

@@ -12,7 +12,7 @@ from dlkf.data import compiled_samples
 from dlkf.data.increments import merge_increments, two_sample
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, IMU_ERROR, POSITION, STD, VELOCITY
 from dlkf.data.tables import Columns
-from dlkf.data.validate import GNSS_QUALITIES
+from dlkf.data.validate import usable_fixes
 from dlkf.navigation.attitude import rotation_from_rpy, rotation_from_vector, vector_from_rotation
 from dlkf.navigation.compiled import loops_are_loaded
 from dlkf.navigation.earth import ecef_from_geodetic, ned_axes
@@ -170,12 +170,6 @@ def assign_fixes(gnss: Columns, grid: SampleGrid) -> FixRows:
     at = np.flatnonzero(chosen >= 0)
     found = fixes_at(gnss, chosen[at], grid.boundaries[at])
     return FixRows(*(_spread(getattr(found, name), at, rows, blank) for name, blank in BLANK.items()))
-
-
-def usable_fixes(gnss: Columns) -> np.ndarray:
-    """Rows whose quality is that of a satellite fix and whose position is finite."""
-    position = np.stack([gnss[c] for c in POSITION])
-    return np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite(position).all(0)
 
 
 def boundary_after(t: np.ndarray, grid: SampleGrid) -> np.ndarray:

@@ -39,6 +39,10 @@ VELOCITY = ("vel_n", "vel_e", "vel_d")
 STD = ("std_pos_n", "std_pos_e", "std_pos_d", "std_vel_n", "std_vel_e", "std_vel_d")
 ATTITUDE = ("roll", "pitch", "yaw")
 IMU_ERROR = ("accel_error_x", "accel_error_y", "accel_error_z", "gyro_error_x", "gyro_error_y", "gyro_error_z")
+QUALITIES = {  # of a fix, by NMEA's GGA code
+    0: "no fix", 1: "single", 2: "DGNSS", 3: "PPS", 4: "RTK fixed", 5: "RTK float", 6: "dead reckoning", 7: "manual",
+    8: "simulated", 9: "SBAS",
+}  # fmt: skip
 LONGEST_NAME = 200  # bytes of a drive's name: a file system takes 255 with what stands before it
 LEVER_ARM = ("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m")
 
@@ -135,7 +139,7 @@ def write_drive(
         row.setdefault("gnss_rate_hz", _rate(gnss["t"]))
     row.setdefault("duration_s", float(imu["t"].iloc[-1] - imu["t"].iloc[0]) if len(imu) else 0.0)
     way = gnss if reference is None else reference
-    row.setdefault("distance_m", float("nan") if way is None else _distance(way))
+    row.setdefault("distance_m", float("nan") if way is None else driven_distance(way))
     return row
 
 
@@ -179,7 +183,7 @@ def _rate(t: pd.Series) -> float:
     return 1 / step if step else float("nan")
 
 
-def _distance(frame: pd.DataFrame) -> float:
+def driven_distance(frame: pd.DataFrame) -> float:
     """Length of the way [m] from the horizontal velocities (trapezoid); unknown velocities count as zero."""
     speed = np.nan_to_num(np.hypot(frame["vel_n"], frame["vel_e"]))
     return float(np.trapezoid(speed, frame["t"])) if len(frame) > 1 else 0.0

@@ -18,7 +18,7 @@ from dlkf.data.drive import Drive
 from dlkf.data.resampling import assign_fixes, epoch_grid, reference_at, resample_imu
 from dlkf.data.spikes import without_spikes
 from dlkf.data.tables import DriveRow, dataset_digest, read_drives
-from dlkf.data.validate import GNSS_QUALITIES, LIMITS, CheckedTables, Limits, read_checked
+from dlkf.data.validate import LIMITS, CheckedTables, Limits, read_checked, usable_fixes
 
 __all__ = ["dataset_digest", "drive_from_tables", "load_dataset"]
 
@@ -115,9 +115,7 @@ def drive_from_tables(
     """
     kinds = {**STANDARD, **{aid.name: aid for aid in aids}}
     (imu, spikes), gnss = without_spikes(tables.imu), tables.gnss
-    fix = torch.from_numpy(gnss["quality"])
-    usable = torch.isin(fix, torch.tensor(GNSS_QUALITIES)).numpy()
-    grid = epoch_grid(imu["t"], gnss["t"][usable], rate_hz, epoch_s, tables.row.name)
+    grid = epoch_grid(imu["t"], gnss["t"][usable_fixes(gnss)], rate_hz, epoch_s, tables.row.name)
     fixes = assign_fixes(gnss, grid)
     truth = reference_at(tables.reference, grid)
     return Drive(

@@ -6,11 +6,13 @@ import numpy as np
 import pandas as pd
 
 from dlkf.data.discovery.motion import RESTING
+from dlkf.data.limits import EARTH_M
 from dlkf.data.readers.frames import DriveFrames
+from dlkf.data.schema import QUALITIES, driven_distance
+from dlkf.data.validate import usable_fixes
 
 AIDS = {"speed": "wheel speed", "heading": "heading", "baro": "barometer"}
 STANDS_S = 2.0  # less is a creeping car
-QUALITIES = {0: "no fix", 1: "single", 2: "DGNSS", 3: "PPS", 4: "RTK fixed", 5: "RTK float", 9: "SBAS"}
 
 
 def drive_line(drive: DriveFrames) -> str:
@@ -23,7 +25,7 @@ def drive_line(drive: DriveFrames) -> str:
     at, quality = drive.gnss["t"].to_numpy(), drive.gnss["quality"].to_numpy()
     shares = {int(q): float(np.mean(quality == q)) for q in np.unique(quality)}
     named = (f"{QUALITIES.get(q, f'quality {q}')} {100 * share:.3g} %" for q, share in shares.items())
-    fixed = at[quality > 0]
+    fixed = at[usable_fixes(drive.gnss)]
     gaps = np.diff(fixed)
     rate = f"{1 / np.median(np.diff(at)):.3g} Hz" if len(at) > 1 else "a single row"
     detail.append(f"GNSS {rate}, {len(fixed)} fixes ({', '.join(named)})")
@@ -63,11 +65,11 @@ def _way(drive: DriveFrames) -> float:
     assert gnss is not None
     speed = np.hypot(gnss["vel_n"].to_numpy(), gnss["vel_e"].to_numpy())
     if np.isfinite(speed).mean() > 0.5:
-        return float(np.trapezoid(np.nan_to_num(speed), gnss["t"]))
+        return driven_distance(gnss)
     lat, lon = (np.radians(gnss[c].dropna().to_numpy()) for c in ("lat_deg", "lon_deg"))
     if not len(lat):
         return 0.0
-    north, east = 6.37e6 * (lat - lat[0]), 6.37e6 * np.cos(lat[0]) * (lon - lon[0])
+    north, east = EARTH_M * (lat - lat[0]), EARTH_M * np.cos(lat[0]) * (lon - lon[0])
     way, last = 0.0, (north[0], east[0])
     for here in zip(north, east):
         if (moved := float(np.hypot(here[0] - last[0], here[1] - last[1]))) > 5.0:

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from dlkf.base.errors import InputError, did_you_mean
+from dlkf.base.errors import InputError, did_you_mean, first_line
 from dlkf.base.files import (
     is_url,
     open_parquet,
@@ -137,6 +138,11 @@ def drive_clocks(folder: str | Path) -> dict[str, DriveClock]:
     return {str(drive): DriveClock(*row) for drive, *row in zip(table["drive"].to_pylist(), *columns)}
 
 
+def read_drives_table(folder: str | Path) -> pd.DataFrame:
+    """All columns of ``drives.parquet``."""
+    return _read(resolve_place(folder) / "drives.parquet", "drives.parquet").to_pandas()
+
+
 def read_table(folder: str | Path, kind: str, drive: str, column: str = "") -> Columns | None:
     """The contract's columns of a drive's table (``imu``, ``gnss``, ``reference`` or an aid) as numpy arrays.
 
@@ -195,7 +201,7 @@ def _read(path: Path, where: str) -> pa.Table:
     try:
         table = pq.ParquetFile(open_parquet(path), page_checksum_verification=True).read()
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0][:100]
+        reason = first_line(error)
         raise InputError(f"{where}: not a whole Parquet file ({reason}); write or copy it again") from None
     if doubles := sorted({name for name in table.column_names if table.column_names.count(name) > 1}):
         raise InputError(f"{where}: column {doubles[0]} appears twice; leave one")

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from dlkf.base.errors import InputError
 from dlkf.data.aid_checks import check_aid
@@ -114,9 +115,14 @@ def read_imu(folder: str | Path, drive: str, limits: Limits = LIMITS) -> Columns
 
 
 def read_fixes(gnss: Columns) -> Columns:
-    """The rows with a position by satellites."""
-    fixed = np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite(gnss["lat_deg"]) & np.isfinite(gnss["lon_deg"])
-    return {column: values[fixed] for column, values in gnss.items()}
+    """The usable rows."""
+    usable = usable_fixes(gnss)
+    return {column: values[usable] for column, values in gnss.items()}
+
+
+def usable_fixes(gnss: Columns | pd.DataFrame) -> np.ndarray:
+    """Rows whose quality is that of a satellite fix and whose position is finite."""
+    return np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite([gnss[c] for c in POSITION]).all(0)
 
 
 def gap_rows(t: np.ndarray, limits: Limits) -> np.ndarray:
@@ -225,7 +231,7 @@ def _check_gnss(gnss: Columns, imu: Columns, where: str) -> Columns:
     _check_time(gnss["t"], where, "gnss")
     _check_rate(gnss["t"], where, "gnss")
     _check_finite(gnss, (*POSITION, *VELOCITY, *STD), where, nan=True)
-    fix = np.isin(gnss["quality"], GNSS_QUALITIES) & np.all([np.isfinite(gnss[c]) for c in POSITION], axis=0)
+    fix = usable_fixes(gnss)
     if not fix.any():
         _check_fixes_there(gnss, where)
         raise InputError(f"{where}: no GNSS fix at all (position NaN or quality 0 in every row); leave the drive out")

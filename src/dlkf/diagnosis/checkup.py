@@ -12,14 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.findings import Raw, discover
-from dlkf.data.schema import ACCEL, GYRO, POSITION, VELOCITY
+from dlkf.data.limits import horizontal_distance
+from dlkf.data.schema import ACCEL, GYRO, POSITION, QUALITIES, VELOCITY
 from dlkf.data.tables import Columns, DriveRow
-from dlkf.data.validate import GNSS_QUALITIES, CheckedTables, read_checked
+from dlkf.data.validate import CheckedTables, read_checked, read_fixes, usable_fixes
 from dlkf.navigation.earth import STANDARD_GRAVITY
 
 GOOD, NOTE, BAD = "good", "note", "BAD"
 STYLES = {GOOD: "green", NOTE: "yellow", BAD: "bold red"}
-NAMES = {0: "no fix", 1: "single", 2: "DGNSS", 3: "PPS", 4: "RTK fixed", 5: "RTK float", 6: "dead reckoning", 9: "SBAS"}
 FASTEST_MOVE = 2.0  # m/s, from which on course is heading
 STANDING = 0.15  # m/s
 OFFSET_S, DELAY_S, ANGLE_DEG = 0.05, 0.3, 3.0  # more is worth a word, is a wrong clock, is a turned sensor
@@ -91,7 +91,7 @@ def imu_findings(imu: Columns) -> Iterator[CheckupResult]:
 
 def gnss_findings(imu: Columns, gnss: Columns) -> Iterator[CheckupResult]:
     """Rate, gaps, shares of quality, velocities, 1σ, overlap with the IMU, jumps."""
-    usable = np.isin(gnss["quality"], GNSS_QUALITIES)
+    usable = usable_fixes(gnss)
     t = gnss["t"][usable]
     if len(t) < 2:
         yield CheckupResult(BAD, f"GNSS: {len(t)} usable fixes")
@@ -99,7 +99,7 @@ def gnss_findings(imu: Columns, gnss: Columns) -> Iterator[CheckupResult]:
     usual = float(np.median(np.diff(t)))
     yield CheckupResult(GOOD, f"GNSS: {len(t)} usable fixes, one every {usual:.3g} s" + _fast(usual))
     codes, counts = np.unique(gnss["quality"], return_counts=True)
-    shares = ", ".join(f"{c / len(gnss['t']):.0%} {NAMES.get(int(q), f'quality {q}')}" for q, c in zip(codes, counts))
+    shares = ", ".join(f"{c / len(gnss['t']):.0%} {QUALITIES.get(q, f'quality {q}')}" for q, c in zip(codes, counts))
     best = float(np.mean(np.isin(gnss["quality"], (4, 5, 2, 9))))
     yield CheckupResult(GOOD if best > 0.5 else NOTE, f"GNSS: {shares}")
     gaps = np.diff(t)
@@ -122,10 +122,12 @@ def gnss_findings(imu: Columns, gnss: Columns) -> Iterator[CheckupResult]:
     if np.isfinite(std).any():
         text = f"GNSS: horizontal 1σ {np.nanmedian(std):.2g} m in the median, {np.nanmax(std):.2g} m at worst"
     yield CheckupResult(GOOD if np.isfinite(std).any() else NOTE, text)
-    v = np.hypot(*_horizontal_steps(gnss, usable)) / np.maximum(gaps, 1e-3)
+    lat, lon = gnss["lat_deg"][usable], gnss["lon_deg"][usable]
+    way = horizontal_distance(lat[:-1], lon[:-1], lat[1:], lon[1:])
+    v = way / np.maximum(gaps, 1e-3)
     if (fast := v > 100).any():
         k = int(np.argmax(v))
-        text = f"GNSS: {fast.sum()} jumps; at t = {t[k + 1]:.1f} s it moves {v[k] * gaps[k]:.3g} m in {gaps[k]:.3g} s"
+        text = f"GNSS: {fast.sum()} jumps; at t = {t[k + 1]:.1f} s it moves {way[k]:.3g} m in {gaps[k]:.3g} s"
         yield CheckupResult(BAD, text)
 
 
@@ -133,15 +135,9 @@ def _fast(usual: float) -> str:
     return f"; epoch_s={usual:.3g} takes them all" if usual < 0.8 else ""
 
 
-def _horizontal_steps(gnss: Columns, usable: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    lat, lon = np.radians(gnss["lat_deg"][usable]), np.radians(gnss["lon_deg"][usable])
-    east = (np.diff(lon) + np.pi) % (2 * np.pi) - np.pi
-    return np.diff(lat) * 6.37e6, east * 6.37e6 * np.cos(lat[:-1])
-
-
 def motion_findings(gnss: Columns) -> Iterator[CheckupResult]:
     """Speed and standstills: a filter needs motion to find its heading, and gains from rest."""
-    usable = np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite(gnss["vel_n"]) & np.isfinite(gnss["vel_e"])
+    usable = usable_fixes(gnss) & np.isfinite(gnss["vel_n"]) & np.isfinite(gnss["vel_e"])
     if not usable.any():
         return
     t, v = gnss["t"][usable], np.hypot(gnss["vel_n"], gnss["vel_e"])[usable]
@@ -157,12 +153,11 @@ def motion_findings(gnss: Columns) -> Iterator[CheckupResult]:
 
 def discover_findings(tables: CheckedTables) -> Iterator[CheckupResult]:
     """Clock offset, pose of the sensor in the car, and lever arm estimated from the motion, against what is stored."""
-    imu, gnss = tables.imu, tables.gnss
-    ok = np.isin(gnss["quality"], GNSS_QUALITIES)
+    imu, gnss = tables.imu, read_fixes(tables.gnss)
     raw = Raw(
         t=imu["t"], accel=np.stack([imu[c] for c in ACCEL], -1), gyro=np.stack([imu[c] for c in GYRO], -1),
-        accel_factor=1.0, gyro_factor=1.0, gnss_t=gnss["t"][ok], lat_deg=gnss[POSITION[0]][ok],
-        lon_deg=gnss[POSITION[1]][ok], v_ned=np.stack([gnss[c][ok] for c in VELOCITY], -1),
+        accel_factor=1.0, gyro_factor=1.0, gnss_t=gnss["t"], lat_deg=gnss[POSITION[0]],
+        lon_deg=gnss[POSITION[1]], v_ned=np.stack([gnss[c] for c in VELOCITY], -1),
     )  # fmt: skip
     for finding in discover(raw, {"imu.time.offset_s", "imu.axes"}, known_accel={}, known_gyro={}).found:
         if finding.setting == "gnss.time.drift_ppm":

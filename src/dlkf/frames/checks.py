@@ -16,10 +16,10 @@ import yaml
 
 from dlkf.base.config import config_dir
 from dlkf.base.errors import InputError, did_you_mean
+from dlkf.data.limits import LEVER_ARM_M
 from dlkf.frames.columns import check_columns, warn_of_other_columns
 
 LONGEST_SHOWN = 80  # letters of a wrong value in a line
-LONGEST_ARM_M = 30.0  # a lever arm beyond it is in another unit
 CODES = range(10)  # of NMEA's GGA sentence
 
 
@@ -156,7 +156,7 @@ def check_lever_arm(lever_arm: Any) -> tuple[float, float, float]:
         raise InputError(
             f"lever_arm is {_shown(lever_arm)}, must be three numbers: IMU → antenna, Forward-Right-Down [m]"
         )
-    if np.abs(arm).max() > LONGEST_ARM_M:
+    if np.abs(arm).max() > LEVER_ARM_M:
         raise InputError(f"lever_arm is {_shown(lever_arm)}: an antenna {np.abs(arm).max():g} m away; metres are meant")
     return (float(arm[0]), float(arm[1]), float(arm[2]))
 

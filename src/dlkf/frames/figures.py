@@ -10,6 +10,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from dlkf.base.colours import COLOURS, SHADE, filter_colour
+from dlkf.data.limits import DEGREE_M
 from dlkf.evaluation.figures import png
 from dlkf.evaluation.metrics import magnitudes, outage_at
 from dlkf.evaluation.scores import Scores
@@ -18,7 +19,6 @@ from dlkf.report.plots import spans
 from dlkf.running.offline import Navigated, UsableFixes
 
 DPI = 80
-EARTH_M = 111_195.0  # of a degree of latitude on a sphere of 6371 km: for a picture
 
 
 class NotebookFigure(Figure):
@@ -40,7 +40,7 @@ def draw_solution(navigated: Navigated, fixes: UsableFixes) -> NotebookFigure:
     figure = NotebookFigure(figsize=(10, 4.2), layout="constrained")
     axes: Any = figure.subplot_mosaic([["track", "sigma"], ["track", "innovation"]], width_ratios=[1, 1.2])
     lat, lon = table["lat_deg"].to_numpy(), table["lon_deg"].to_numpy()
-    scale = np.array([EARTH_M * np.cos(np.radians(lat[0])), EARTH_M])
+    scale = np.array([DEGREE_M * np.cos(np.radians(lat[0])), DEGREE_M])
 
     def metres(lat: np.ndarray, lon: np.ndarray) -> np.ndarray:
         return (np.stack((lon, lat), -1) - (table["lon_deg"].iloc[0], table["lat_deg"].iloc[0])) * scale

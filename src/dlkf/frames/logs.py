@@ -52,6 +52,7 @@ def simulate(
     from dlkf.command.composing import compose_command
     from dlkf.command.simulated import SimulateSettings
     from dlkf.data.readers.frames import DriveFrames
+    from dlkf.data.tables import read_drives_table
     from dlkf.simulation.dataset import simulate as simulate_dataset
 
     check_preset("simulated", preset)
@@ -72,7 +73,7 @@ def simulate(
         out = Path(folder) / "simulated"
         simulate_dataset(recipe, out, progress=False)
         made = []
-        for row in pd.read_parquet(out / "drives.parquet").to_dict("records"):
+        for row in read_drives_table(out).to_dict("records"):
             imu, gnss, reference = (_table(out, kind, str(row["drive"])) for kind in ("imu", "gnss", "reference"))
             assert imu is not None  # simulated drives have one
             made.append(DriveFrames({str(key): value for key, value in row.items()}, imu, gnss, reference))

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, first_line
 from dlkf.data import aids, alignment, limits, resampling, spikes, velocity_fit
 from dlkf.data.aid_tables import LAST
 from dlkf.data.validate import LIMITS
@@ -234,7 +234,7 @@ def function_in_c(name: str, function: Function) -> Written:
     try:
         graph = record(function)
     except Exception as error:
-        raise InputError(f"this filter cannot be exported: {str(error).splitlines()[0]}") from error
+        raise InputError(f"this filter cannot be exported: {first_line(error)}") from error
     done = Translation(graph)
     block, inputs = done.block, done.inputs
     arguments = [f"const {C_TYPES[b.dtype]} *restrict {b.name}" for b in inputs]

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
 from dlkf.data.aid_tables import STANDARD
 from dlkf.data.aids import aid_values
@@ -122,7 +123,7 @@ def difference(estimator: Estimator, library: Library, tables: CheckedTables, dr
     apart["lat_deg"] = np.radians(apart["lat_deg"]) * SEMI_MAJOR
     apart["lon_deg"] = np.radians(apart["lon_deg"]) * SEMI_MAJOR * np.cos(np.radians(mine["lat_deg"]))
     for c in ("roll", "pitch", "yaw"):
-        apart[c] = np.abs((apart[c] + np.pi) % (2 * np.pi) - np.pi)
+        apart[c] = np.abs(wrap_angle(apart[c]))
     largest = {kind: float(max(apart[c].max() for c in columns)) for kind, columns in KINDS.items()}
     relative = [apart[c] / table[c].numpy() for c in COLUMNS if c.startswith("std_")]
     return Difference(len(rows), largest, float(np.nan_to_num(np.stack(relative)).max()))

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dlkf.base.colours import COLOURS, QUALITY
+from dlkf.data.schema import QUALITIES
 from dlkf.report.drawing import Figure
 from dlkf.report.maps import add_track, chart, dots, join_tracks
 from dlkf.report.page import Page
@@ -167,11 +168,11 @@ def route_map(courses: Sequence[TrackOnMap]) -> Figure:
     if any(np.isfinite(h).any() for h in hidden):
         gaps = np.concatenate([_with_breaks(h, share) for h in hidden])
         add(add_track(gaps, f"over {GAP_S:g} s without a fix", "#D55E00", width=5), "outages")
-    for code, (name, colour) in QUALITY.items():
+    for code, colour in QUALITY.items():
         seen = [np.stack((c.fixes.lat_deg, c.fixes.lon_deg), -1)[c.fixes.quality == code] for c in courses]
         points = np.concatenate([s[every(len(s), share)] for s in seen])
         if len(points):
-            add(dots(points, name, colour, size=5), "fixes")
+            add(dots(points, QUALITIES[code], colour, size=5), "fixes")
     index = [every(len(c.result.table), share) for c in courses]
     sigma = np.concatenate([horizontal_std(c)[i] for c, i in zip(courses, index)])
     if np.isfinite(sigma).any():

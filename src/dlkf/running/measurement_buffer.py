@@ -10,9 +10,9 @@ import numpy as np
 
 from dlkf.data.aid_tables import AidTable
 from dlkf.data.aids import aid_row
-from dlkf.data.resampling import BLANK, FixRows, usable_fixes
+from dlkf.data.resampling import BLANK, FixRows
 from dlkf.data.schema import POSITION, STD, VELOCITY
-from dlkf.data.validate import GNSS_QUALITIES
+from dlkf.data.validate import GNSS_QUALITIES, usable_fixes
 from dlkf.running.imu_stream import Row
 
 NO_FIX = FixRows(

@@ -21,7 +21,7 @@ from dlkf.data.limits import NONE_REFUSED, Refused
 from dlkf.data.segments import whole_drives
 from dlkf.data.store import load_dataset
 from dlkf.data.tables import read_table
-from dlkf.data.validate import GNSS_QUALITIES
+from dlkf.data.validate import usable_fixes
 from dlkf.filters.aids.attach import aid_columns, kalman_of
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import BatchSolution, WholeLoop
@@ -57,7 +57,7 @@ class UsableFixes:
         """Of a drive of a dataset."""
         gnss = read_table(folder, "gnss", drive)
         assert gnss is not None  # read_table raises where there is none
-        usable = np.isin(gnss["quality"], GNSS_QUALITIES)
+        usable = usable_fixes(gnss)
         return UsableFixes(*(gnss[c][usable] for c in ("t", "lat_deg", "lon_deg", "quality")))
 
     @property

@@ -16,9 +16,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dlkf.base.files import folder_name, resolve_place, write_into
+from dlkf.data.limits import DEGREE_M
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR
 from dlkf.data.tables import Columns, read_drives
-from dlkf.data.validate import CheckedTables, read_checked
+from dlkf.data.validate import CheckedTables, read_checked, read_fixes
 
 Array = NDArray[np.floating]
 AXES = (("x", "#0072B2"), ("y", "#D55E00"), ("z", "#009E73"))
@@ -29,7 +30,6 @@ MOVING = 2.0  # m/s above which a course means something
 TURNING = 1 / 2000  # 1/m, curvature of what counts as a turn
 SHARP = 300.0  # m, radius of the turns whose lateral acceleration is shown
 STEADY = 0.02  # rad/s² below which the yaw rate of a turn counts as steady
-METRES_PER_DEGREE = 111_194.9  # of latitude on a sphere, for a picture
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,8 @@ def driving(tables: CheckedTables) -> Driving:
     yaw_rate = np.where(moving, (v_n * a_e - v_e * a_n) / safe**2, 0.0)
     change = np.asarray(scipy.signal.savgol_filter(yaw_rate, width, 2, deriv=1, delta=dt))
     turning = np.abs(yaw_rate) > TURNING * np.maximum(speed, MOVING)
-    north = METRES_PER_DEGREE * (lat - lat[0])
-    east = METRES_PER_DEGREE * (lon - lon[0]) * np.cos(np.radians(lat[0]))
+    north = DEGREE_M * (lat - lat[0])
+    east = DEGREE_M * (lon - lon[0]) * np.cos(np.radians(lat[0]))
     return Driving(t, north, east, speed, along, yaw_rate, turning & (np.abs(change) < STEADY))
 
 
@@ -164,7 +164,7 @@ def reference_of(tables: CheckedTables) -> Columns:
 def _track(axes: Axes, figure: Figure, moved: Driving, tables: CheckedTables) -> None:
     drawn = axes.scatter(moved.east, moved.north, c=3.6 * moved.speed, s=2, cmap="viridis", linewidths=0)
     axes.plot(moved.east[0], moved.north[0], "o", color=INK, markersize=5, label="start")
-    fixes = tables.gnss["t"][tables.gnss["quality"] > 0]
+    fixes = read_fixes(tables.gnss)["t"]
     edges = np.concatenate(((moved.t[0],), fixes, (moved.t[-1],)))
     before = np.searchsorted(edges, moved.t, side="right").clip(1, len(edges) - 1)
     usual = float(np.median(np.diff(fixes))) if len(fixes) > 1 else np.inf

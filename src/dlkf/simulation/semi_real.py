@@ -13,17 +13,15 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow.parquet as pq
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
 from dlkf.base.errors import InputError
-from dlkf.base.files import open_parquet, resolve_place
 from dlkf.data.resampling import SampleGrid, reference_at
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR, VELOCITY, new_dataset, write_drive, write_drives_table
-from dlkf.data.tables import Columns, read_drives
+from dlkf.data.tables import Columns, read_drives, read_drives_table
 from dlkf.data.validate import CheckedTables, read_checked, validate_dataset
 from dlkf.navigation.attitude import rpy_from_rotation
 from dlkf.navigation.earth import ned_axes
@@ -50,9 +48,7 @@ def simulate_semi_real(
     usable reference, or whose IMU errors are known already (it is no real drive).
     """
     rows = read_drives(source)
-    described = (
-        pq.ParquetFile(open_parquet(resolve_place(source) / "drives.parquet")).read().to_pandas().to_dict("records")
-    )
+    described = read_drives_table(source).to_dict("records")
     shown = track(rows, f"semi-real {made_by.dataset.name}", disable=not progress, console=Console(stderr=True))
     with closing(iter(shown)) as drives, new_dataset(out, overwrite) as folder:  # type: ignore[type-var]
         written = []
@@ -172,7 +168,7 @@ def _epochs(t_imu: Array, t_reference: Array, rate_hz: float, name: str) -> Arra
     return np.arange(first, last + 1) / rate_hz
 
 
-def _row(described: dict[str, Any], config: DatasetConfig, spec: ImuSpec, rough: Array) -> dict[str, Any]:
+def _row(described: dict[Any, Any], config: DatasetConfig, spec: ImuSpec, rough: Array) -> dict[str, Any]:
     """The drive's row of ``drives.parquet``: what it was, what was done to it, and the source's licence."""
     return {
         **described,

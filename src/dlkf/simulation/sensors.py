@@ -13,6 +13,7 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
+from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
 from dlkf.base.settings import Ranged, bounded_field
 from dlkf.data.aids import EXPONENT, SCALE_M, SEA_LEVEL_PA
@@ -117,8 +118,9 @@ def sense(seed: np.random.SeedSequence, config: SensorsConfig, axle: Truth, turn
         t = _times(motion.t, config.heading.rate_hz)
         heading = np.interp(t, motion.t, motion.yaw) + np.radians(config.heading.offset_deg)
         heading += np.radians(config.heading.std_deg) * heading_rng.standard_normal(len(t))
-        turned = (heading + np.pi) % (2 * np.pi) - np.pi
-        tables["heading"] = pd.DataFrame({"t": t, "heading": turned, "std": np.radians(config.heading.std_deg)})
+        tables["heading"] = pd.DataFrame(
+            {"t": t, "heading": wrap_angle(heading), "std": np.radians(config.heading.std_deg)}
+        )
     if config.baro is not None:
         tables["baro"] = _pressures(baro_rng, config.baro, motion)
     return tables

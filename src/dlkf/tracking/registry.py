@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import dlkf
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, first_line
 from dlkf.data.rows import GNSS_COLUMNS, IMU_COLUMNS, example_drive
 from dlkf.filters.saved import WEIGHTS
 from dlkf.running.solution import COLUMNS
@@ -255,7 +255,7 @@ def _fetch(source: str, spec: str, uri: str) -> Path:
     try:
         folder = Path(download_artifacts(artifact_uri=source, dst_path=there, tracking_uri=uri))
     except (OSError, MlflowException) as error:
-        reason = str(error).splitlines()[0]
+        reason = first_line(error)
         hint = "; a store has absolute places: move its folder back" if there is None else ""
         raise InputError(f"model={spec}: its files cannot be read from {source}: {reason}{hint}") from None
     found = sorted(folder.rglob(WEIGHTS))

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dlkf.base.angles import wrap_angle
 from dlkf.data import compiled_samples
 from dlkf.data.discovery.motion import MOVING, RESTING, Complex, Floats, Motion
+from dlkf.data.readers.units import WEEK_S
 from dlkf.navigation.compiled import loops_are_loaded
 from dlkf.navigation.earth import STANDARD_GRAVITY
 
@@ -128,10 +130,10 @@ def _between(three: Floats) -> float:
 
 def known_offset(lag_s: float) -> str:
     """What an offset is known for."""
-    for weeks in (round(lag_s / 604_800),):
-        if weeks and abs(lag_s - weeks * 604_800) < 40:
-            rest = lag_s - weeks * 604_800
-            return f"; {weeks} GPS weeks" + (f" and {rest:.1f} s" if abs(rest) > 0.5 else "")
+    weeks = round(lag_s / WEEK_S)
+    rest = lag_s - weeks * WEEK_S
+    if weeks and abs(rest) < 40:
+        return f"; {weeks} GPS weeks" + (f" and {rest:.1f} s" if abs(rest) > 0.5 else "")
     for known, name in KNOWN_OFFSETS.items():
         if abs(abs(lag_s) - known) < 0.5:
             return f"; {name}"
@@ -148,7 +150,7 @@ def _gnss_signals(gnss: Motion, first: np.ndarray, last: np.ndarray) -> tuple[np
     span = gnss.t[last] - gnss.t[first]
     slow = np.minimum(gnss.speed[first], gnss.speed[last])
     moving, resting = slow > MOVING, np.maximum(gnss.speed[first], gnss.speed[last]) < RESTING
-    turned = np.angle(np.exp(1j * (gnss.course[last] - gnss.course[first])))
+    turned = wrap_angle(gnss.course[last] - gnss.course[first])
     rate = np.where(moving, turned / span, 0.0)
     mean = gnss.v[first] + gnss.v[last]
     along = np.where(np.abs(mean) > 0.5, mean / np.maximum(np.abs(mean), 1e-9), 1.0)
@@ -179,7 +181,9 @@ def _scores(
 
     At index 0 the last fix lies on the first sample.
     """
-    size = _fast_length(len(weight) + len(there) - 1)
+    from scipy.fft import next_fast_len  # every start of navigate would load it
+
+    size = next_fast_len(len(weight) + len(there) - 1, real=True)
     here = there > 0
     scale, pull = (max(float(np.std(x[here])) if here.any() else 0.0, 1e-12) for x in (yaw, force))
     r, a, g, f = r * weight, a * weight, yaw / scale * there, force / pull * there
@@ -209,8 +213,3 @@ def _scores(
     forces = np.clip(np.abs(alike), 0.0, 0.9999)
     gain = -0.5 * n * np.log1p(-(np.maximum(yaws, 0.0) ** 2)) - n * np.log1p(-(forces**2))
     return np.where(count > 3, gain, 0.0), yaws, forces, -np.angle(alike), count
-
-
-def _fast_length(least: int) -> int:
-    """The next length that an FFT takes quickly."""
-    return min(m << (-(-least // m) - 1).bit_length() for m in (1, 3, 5, 9, 15))

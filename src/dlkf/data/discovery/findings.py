@@ -48,8 +48,6 @@ class Findings:
     """All findings of a drive."""
 
     found: list[Finding] = field(default_factory=list)
-    pose: Pose | None = None
-    lag: Lag | None = None
 
     def add(
         self, setting: str, value: Any, sure: bool, detail: str, wide: str = "", remedy: str = "", std: float = math.nan
@@ -116,7 +114,6 @@ def discover(
         if other is not None and (lag is None or other.gain > 1.5 * lag.gain) and other.yaw > 0.7:
             lag, factor = other, -factor
             out.found[0] = Finding("imu.accel.unit", factor, True, out.found[0].detail + ", its sign turned round")
-    out.lag = lag
     if lag is not None and away and _is_mirrored(raw, lag, gnss):
         detail = f"turns agree to {lag.yaw:.2f}, accelerations to {lag.force:.2f}, well with the y axis turned round"
         remedy = "give it as the sensor's axis that counts the other way (x, y or z), the gyroscope's too if need be"
@@ -125,7 +122,6 @@ def discover(
     pose = None
     if lag is not None:
         pose = find_drifting_pose(raw.t, raw.accel * factor, raw.gyro, gnss, lag.lag_s)
-    out.pose = pose
     _gyro_unit(out, raw, pose, known_gyro, increments)
     sound = pose is not None and pose.explained > LEAST_EXPLAINED and AGREE[0] < pose.scale < AGREE[1]
     sound = sound and not (pose is not None and pose.down_apart > FARTHEST_DOWN)

@@ -10,13 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dlkf.data.limits import EARTH_M
+
 Floats = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]
 
 MOVING, RESTING = 2.0, 0.3  # m/s: above, the course is known; below, the car stands
 LONGEST_STEP_S = 2.5  # fixes further apart make no interval
 SHORTEST_STEP_S = 0.45  # of faster fixes intervals span several: the noise of a difference grows with its rate
-EARTH_M = 6_371_000.0
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dlkf.base.angles import wrap_angle
 from dlkf.data.discovery.motion import MOVING, Complex, Floats, Levelled, Motion, levelled
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
@@ -194,7 +195,7 @@ def _intervals(gnss: Motion) -> _Intervals:
     mean = gnss.v[first] + gnss.v[last]
     along = mean / np.maximum(np.abs(mean), 1e-9)
     slope = G * 0.5 * (gnss.climb[first] + gnss.climb[last]) * (t1 - t0) * along
-    turned = np.angle(np.exp(1j * (gnss.course[last] - gnss.course[first])))
+    turned = wrap_angle(gnss.course[last] - gnss.course[first])
     block = np.minimum((BLOCKS * np.arange(len(t0))) // max(len(t0), 1), BLOCKS - 1)
     dv = gnss.v[last] - gnss.v[first]
     v0, v1 = gnss.speed[first], gnss.speed[last]

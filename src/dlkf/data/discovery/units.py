@@ -6,7 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from dlkf.data.discovery.motion import EARTH_M, Floats
+from dlkf.data.discovery.motion import Floats
+from dlkf.data.limits import EARTH_M
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
 NEAR = 0.06  # of gravity: a scale error, the road's curves, a cold sensor

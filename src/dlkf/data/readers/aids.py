@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import known_offset
 from dlkf.data.discovery.motion import Motion, motion
@@ -16,13 +17,13 @@ from dlkf.data.discovery.wheel import Wheel, find_wheel
 from dlkf.data.readers import units
 from dlkf.data.readers.mapping import Mapped
 from dlkf.data.schema import VELOCITY
+from dlkf.data.validate import usable_fixes
 
 AUTO = "auto"
 PRESSURE = {"pa": 1.0, "hpa": 100.0, "mbar": 100.0, "kpa": 1000.0}
 TURNS = {"rpm": 1 / 60, "turns": 1.0}  # turns (a second), with radius_m
 COUNTS = ("ticks", "turns", "m")  # what has been gained since the beginning; its rate is the speed
 NEAR = 0.15  # of a wheel's scale from a known unit: tyres differ by some per cent
-KNOWN = {**units.SPEED, "cm/s": 0.01, "mm/s": 1e-3}
 
 
 def aid_frame(name: str, mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
@@ -62,7 +63,7 @@ def _times(mapped: Mapped, zero: int) -> np.ndarray:
 
 
 def _motion(fixes: pd.DataFrame) -> Motion:
-    good = fixes[(fixes["quality"] > 0) & fixes["lat_deg"].notna()]
+    good = fixes[usable_fixes(fixes)]
     t, lat, lon = (good[c].to_numpy() for c in ("t", "lat_deg", "lon_deg"))
     return motion(t, lat, lon, good[list(VELOCITY)].to_numpy())
 
@@ -113,7 +114,7 @@ def _settled(
 def _unit(wheel: Wheel, counts: bool) -> tuple[str | float, str]:
     """The unit of about a scale; a number where it is none of those known: of ticks, whose scale is lost so."""
     detail = f"{wheel.scale:.4g} ± {wheel.scale_std:.1g} m/s of GNSS per unit"
-    near = {name: abs(np.log(wheel.scale / value)) for name, value in KNOWN.items()} if wheel.scale > 0 else {}
+    near = {name: abs(np.log(wheel.scale / value)) for name, value in units.SPEED.items()} if wheel.scale > 0 else {}
     best = min(near, key=lambda name: near[name], default=None)
     if best is not None and near[best] < NEAR and not counts:
         return best, detail
@@ -179,7 +180,7 @@ def _heading(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
     if (entry.get("convention") or "ned") == "enu":
         angle = np.pi / 2 - angle
     angle = angle - units.DEG * float(entry.get("antennas_deg") or 0.0)
-    out = pd.DataFrame({"t": t, "heading": np.mod(angle + np.pi, 2 * np.pi) - np.pi})
+    out = pd.DataFrame({"t": t, "heading": wrap_angle(angle)})
     if mapped.has("std"):
         out["std"] = mapped.vector("std", (1,), nan=True)[:, 0] * mapped.scale("value", units.ANGLE)
     return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -128,8 +129,7 @@ class AutoReader:
             other = Unsure(f"{unsure}{_preset_that_fits(specs)}")
             other.layout, other.offset_s = unsure.layout, unsure.offset_s
             raise other from None
-        notes = (*dict.fromkeys(detail), *drive.notes)
-        return DriveFrames(drive.meta, drive.imu, drive.gnss, drive.reference, notes, drive.mapping, drive.aids)
+        return replace(drive, notes=(*dict.fromkeys(detail), *drive.notes))
 
     def _chosen(self, within: list[Contents], kind: str, folder: Path, only: Path | None) -> Offer | None:
         offers = [o for one in within for o in one.offers]

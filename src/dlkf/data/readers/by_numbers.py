@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from dlkf.data.discovery.motion import EARTH_M
+from dlkf.base.angles import wrap_angle
 from dlkf.data.discovery.units import time_unit
+from dlkf.data.limits import EARTH_M
 from dlkf.data.readers import stamps, units
 from dlkf.data.readers.frames import LogTable
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
@@ -142,7 +143,7 @@ def velocities(
         return {"columns": [names[k], names[j]], "frame": "ned"}
 
     def turned(k: int) -> float:
-        apart = (values[1:-1, k] - course + 180) % 360 - 180
+        apart = wrap_angle(values[1:-1, k] - course, 180)
         apart = np.abs(apart[moving & np.isfinite(apart)])
         return float(np.median(apart)) if len(apart) > 10 else np.inf
 

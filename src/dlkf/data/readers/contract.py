@@ -10,14 +10,15 @@ import pandas as pd
 import pymap3d
 from scipy.spatial.transform import Rotation
 
+from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
+from dlkf.data.limits import NOWHERE_DEG
 from dlkf.data.readers import units
 from dlkf.data.readers.mapping import Mapped
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY
 
 LATE = {"end": 0.0, "middle": 0.5, "start": 1.0}  # of the interval, by which a stamp is early
 ANGLES = {"deg": 1.0, "rad": 1 / units.DEG, "1e-7deg": 1e-7, "ddmm": 1.0}  # degrees per unit
-NO_FIX = 1e-6  # degrees: what receivers write before they have a position
 
 
 def imu_frame(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
@@ -98,7 +99,7 @@ def positions(mapped: Mapped) -> dict[str, np.ndarray]:
             geoid = mapped.of("position").column(spec["geoid"], nan=True)
             height = height + geoid * mapped.scale("position", units.LENGTH, "height_unit")
     with np.errstate(invalid="ignore"):
-        lost = (np.abs(lat) < NO_FIX) & (np.abs(lon) < NO_FIX) & (zero == "none")
+        lost = (np.abs(lat) < NOWHERE_DEG) & (np.abs(lon) < NOWHERE_DEG) & (zero == "none")
     return dict(zip(POSITION, (np.where(lost, np.nan, x) for x in (lat, lon, height))))
 
 
@@ -192,8 +193,8 @@ def _quality(mapped: Mapped) -> np.ndarray:
 
 
 def _code(value: Any, where: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 8:
-        raise InputError(f"reader.gnss.quality.{where} is {value!r}, must be a code of NMEA's GGA, 0 to 8")
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 9:
+        raise InputError(f"reader.gnss.quality.{where} is {value!r}, must be a code of NMEA's GGA, 0 to 9")
     return value
 
 
@@ -218,7 +219,7 @@ def _attitudes(mapped: Mapped) -> np.ndarray:
             turn = units.rotation("rfu", "") @ turn @ units.rotation("flu", "").T
         yaw_pitch_roll = Rotation.from_matrix(turn).as_euler("ZYX")
         rpy = np.where(known[:, None], yaw_pitch_roll[:, ::-1], np.nan)
-    rpy[:, 2] = np.mod(rpy[:, 2] + np.pi, 2 * np.pi) - np.pi
+    rpy[:, 2] = wrap_angle(rpy[:, 2])
     return rpy
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from dlkf.base.errors import InputError
-from dlkf.base.settings import settings_from
+from dlkf.base.settings import is_number, settings_from
 from dlkf.data.discovery.findings import Sure
 from dlkf.data.readers import formats
 from dlkf.data.readers.aids import read_aids
@@ -295,8 +295,7 @@ def _filled(spec: Any, settings: Any) -> Any:
 
 def _lever_arm(arm: Any) -> tuple[float, float, float]:
     numbers = arm if isinstance(arm, (list, tuple)) else [arm]
-    fine = [isinstance(x, (int, float)) and not isinstance(x, bool) and np.isfinite(x) for x in numbers]
-    if len(numbers) != 3 or not all(fine):
+    if len(numbers) != 3 or not all(map(is_number, numbers)):
         raise InputError(
             f"reader.lever_arm_m={arm}: must be three numbers, IMU → antenna: '[forward, right, down]' [m]"
         )

@@ -15,7 +15,7 @@ from dlkf.data.readers import units
 from dlkf.data.readers.frames import LogTable
 
 Spec = Mapping[str, Any]
-TABULAR = (None, "csv", "parquet", "feather", "matlab")  # formats whose columns are a user's own
+TABULAR = (None, "csv", "parquet", "feather", "matlab")  # formats whose columns and stamps are a user's own
 MOST_NAMED = 24
 SOURCE = ("format", "file", "table", "lines", "rows", "text", "time")
 TIME = ("column", "unit", "week", "week_number", "day", "order", "wraps_s", "clock", "offset_s", "drift_ppm", "respace")
@@ -68,7 +68,7 @@ def _known(spec: Any, known: tuple[str, ...], where: str) -> None:
         near = did_you_mean(unknown[0], known)
         raise InputError(f"{where}: unknown key {unknown[0]}{near or ';'} known are {', '.join(known)}")
     for key in NUMBERS:
-        if spec.get(key) not in (None, "auto") and _finite(spec[key], f"{where}.{key}") <= 0 and key in POSITIVE:
+        if spec.get(key) not in (None, "auto") and units.number(spec[key], f"{where}.{key}") <= 0 and key in POSITIVE:
             raise InputError(f"{where}.{key} is {spec[key]}, must be above 0")
     for key in SWITCHES:
         if not isinstance(spec.get(key), (bool, type(None))):
@@ -142,8 +142,8 @@ class Mapped:
         time = self.spec.get("time") or {}
         where = f"reader.{self.kind}.time"
         whole, part = self.own_stamps()
-        offset = _finite(time.get("offset_s") or 0.0, f"{where}.offset_s")
-        if drift := _finite(time.get("drift_ppm") or 0.0, f"{where}.drift_ppm"):
+        offset = units.number(time.get("offset_s") or 0.0, f"{where}.offset_s")
+        if drift := units.number(time.get("drift_ppm") or 0.0, f"{where}.drift_ppm"):
             part = part + 1e-6 * drift * ((whole - whole[0]) + (part - part[0]))
         jump = math.floor(offset)
         return whole + jump, part + (offset - jump)
@@ -305,9 +305,3 @@ def _some(names: Sequence[str]) -> str:
 def _names(mapped: Mapped, key: str) -> list[Any]:
     entry = mapped.spec.get(key) or {}
     return [] if key in mapped.parts else list(entry.get("columns") or [])
-
-
-def _finite(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise InputError(f"{where} is {value!r}, must be a number")
-    return float(value)

@@ -19,10 +19,8 @@ from dlkf.data.readers.formats import autopilot, matlab, nmea, rosbag, text, ubx
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.sharing import merged
 
-PRESETS = {"ubx": "ubx", "nmea": "nmea", "rosbag": "rosbag", "rtklib": "rtklib", "gnss_logger": "gnss_logger"}
-PRESETS |= {"inertial_explorer": "inertial_explorer", "novatel": "novatel", "navego": "navego"}
-PRESETS |= {"px4": "px4", "ardupilot": "ardupilot"}
 GNSS_ONLY = ("nmea", "rtklib", "inertial_explorer")
+PRESETS = (*GNSS_ONLY, "ubx", "rosbag", "gnss_logger", "novatel", "navego", "px4", "ardupilot")
 NO_LOGS = {  # formats of other programs, and what makes a table of them
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "a spreadsheet; save its sheet as CSV"),
     **dict.fromkeys((".gpx", ".kml", ".kmz"), "a track of GPX or KML; make it a CSV table: time, lat, lon, height"),
@@ -98,13 +96,8 @@ def contents(path: Path) -> Contents:
     return Contents(path, found, "" if found else recognise.missing(table))
 
 
-def offer(path: Path) -> Offer | None:
-    """What a file holds; None if nothing that is known."""
-    return next(iter(contents(path).offers), None)
-
-
 def _of_preset(path: Path, name: str) -> Contents:
-    base = preset(PRESETS[name])
+    base = preset(name)
     specs, lacks = {}, []
     source = {"file": path.name, "text": _preset_text(base)}
     for kind in ("imu", "gnss"):
@@ -117,7 +110,7 @@ def _of_preset(path: Path, name: str) -> Contents:
     aids = {kind: open_aid({**base[kind], **source}) for kind in _aids_in(path, name)}
     if not specs and not aids:
         return Contents(path, held=held)
-    return Contents(path, [Offer(path, f"{name}, as reader={PRESETS[name]}", *opened(specs), aids=aids)], held)
+    return Contents(path, [Offer(path, f"{name}, as reader={name}", *opened(specs), aids=aids)], held)
 
 
 def _aids_in(path: Path, name: str) -> tuple[str, ...]:
@@ -141,7 +134,7 @@ def _lacks(path: Path, name: str, kind: str) -> str | None:
         return None
     if name in GNSS_ONLY:
         return ""
-    base = preset(PRESETS[name])
+    base = preset(name)
     try:
         spec, options = base[kind], {**_preset_text(base), "lines": base[kind].get("lines")}
         table = formats.read(spec["format"], path, kind=kind, table=spec.get("table"), text=options, where="")
@@ -169,7 +162,8 @@ def _of_table(path: Path, name: str, table: LogTable, options: dict[str, Any], p
     source: dict[str, Any] = {"format": name, "file": path.name, "text": options}
     source |= {"table": part} if part is not None else {}
     time = next((one.spec["time"] for one in (imu, gnss) if one is not None), None)
-    aids = aid_specs(recognise.with_numbers(table), recognise.numeric(table.frame), part or path.stem, time)
+    numbers = recognise.numeric(table.frame)
+    aids = aid_specs(recognise.with_numbers(table, numbers), numbers, part or path.stem, time)
     aids = {kind: {**spec, **source} for kind, spec in aids.items()}
     if imu is None and gnss is None and aids:
         columns = ", ".join(str(c) for spec in aids.values() for c in _columns(spec))

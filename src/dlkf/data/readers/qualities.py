@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from dlkf.data.readers import vocabulary
+from dlkf.data.schema import QUALITIES
 
 Spec = dict[str, Any]
 SOLUTION = r" ?(?:solution|losung|solucion|解)"
@@ -24,11 +25,9 @@ WORDS = {
     + ("固定", "固定解", "フィックス"),
     5: ("float", "rtk float", "flottant", "flotante", "gleitend", "浮点", "浮点解", "浮動", "フロート"),
 }
-NAMES = {0: "no fix", 1: "single", 2: "DGNSS", 4: "RTK fixed", 5: "RTK float"}
-NAMES |= {6: "dead reckoning", 7: "manual", 8: "simulated"}
 # number of a fix: NMEA's GGA code
 READINGS: dict[str, dict[int, int]] = {
-    "NMEA's GGA code": {0: 0, 1: 1, 2: 2, 4: 4, 5: 5, 6: 6, 7: 7, 8: 8},
+    "NMEA's GGA code": {code: code for code in QUALITIES},
     "u-blox's fix type (3 is 3D)": {0: 0, 1: 0, 2: 1, 3: 1, 4: 1, 5: 0},
     "MAVLink's fix type (3 is 3D, 6 RTK fixed)": {0: 0, 1: 0, 2: 1, 3: 1, 4: 2, 5: 5, 6: 4},
     "RTKLIB's Q (1 is RTK fixed)": {0: 0, 1: 4, 2: 5, 3: 2, 4: 2, 5: 1, 6: 2},
@@ -57,7 +56,8 @@ def quality_spec(frame: pd.DataFrame, column: str | None, accuracy_m: float) -> 
     if not fits:
         return None, [f"quality {column} has numbers that no receiver gives ({_some(values)}): all count as single"]
     beside_hdop = vocabulary.named([str(c) for c in frame.columns], "hdop") is not None  # RTKLIB writes none
-    fits = [name for name in fits if not (beside_hdop and name == RTKLIB)] or fits
+    unlikely = {RTKLIB: beside_hdop, GGA: 3 in seen}  # PPS is rare, 3D is not
+    fits = [name for name in fits if not unlikely.get(name)] or fits
     chosen = _reading(column, [int(x) for x in seen], numbers, fits, accuracy_m)
     codes = {int(x): READINGS[chosen][int(x)] for x in seen}
     spec: dict[str, Any] = {"column": column}
@@ -76,8 +76,8 @@ def _reading(column: str, seen: list[int], numbers: pd.Series, fits: list[str], 
     """The most likely reading by name, by the numbers that occur, and by the fixes' own stds."""
     usual = [name for name in _likely(column) if name in fits] or fits
     best = numbers.mode().iloc[0]
-    if (usual[0] == GGA and 3 in seen) or (6 in seen and 3 in seen):
-        usual = [MAVLINK] if 6 in seen and MAVLINK in fits else [name for name in usual if name != GGA] or usual
+    if 3 in seen and 6 in seen and MAVLINK in fits:
+        usual = [MAVLINK]
     fixed = [name for name in usual if READINGS[name][int(best)] != 0] or usual  # there are positions beside it
     if np.isnan(accuracy_m):
         return fixed[0]
@@ -116,7 +116,7 @@ def _code(word: str) -> int | None:
 
 
 def _said(codes: Mapping[int, int]) -> str:
-    return ", ".join(f"{x} is {NAMES[code]}" for x, code in codes.items())
+    return ", ".join(f"{x} is {QUALITIES[code]}" for x, code in codes.items())
 
 
 def _some(values: pd.Series) -> str:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from dlkf.data.discovery.units import accel_units
+from dlkf.data.limits import DEGREE_M, EARTH_M
 from dlkf.data.readers import by_numbers, stamps, units, vocabulary
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.qualities import quality_spec
@@ -37,7 +39,7 @@ def imu_spec(table: LogTable) -> Recognised | None:
     triads = {key: vocabulary.triad(names, stem) for key, stem in vocabulary.SENSORS.items()}
     if triads["accel"] and triads["gyro"]:
         known = frame[triads["accel"] + triads["gyro"]].notna().all(axis=1)
-        time = stamps.time_spec(_of(table, frame), known, SLOWEST_IMU_S, FASTEST_IMU_S)
+        time = stamps.time_spec(with_numbers(table, frame), known, SLOWEST_IMU_S, FASTEST_IMU_S)
         if time is None:
             return None
         sensors = {key: {"columns": columns} for key, columns in triads.items() if columns}
@@ -79,7 +81,7 @@ def sensor_spec(table: LogTable, called: str) -> tuple[str, Recognised] | None:
         if columns is None:
             continue
         known = frame[columns].notna().all(axis=1)
-        time = stamps.time_spec(_of(table, frame), known, SLOWEST_IMU_S, FASTEST_IMU_S)
+        time = stamps.time_spec(with_numbers(table, frame), known, SLOWEST_IMU_S, FASTEST_IMU_S)
         if time is not None:
             return key, Recognised({"time": time, key: {"columns": columns}})
     return None
@@ -94,7 +96,7 @@ def gnss_spec(table: LogTable) -> Recognised | None:
     if (lat is None or lon is None) and any(vocabulary.triad(names, stem) for stem in vocabulary.SENSORS.values()):
         return None
     if lat is None or lon is None:
-        spec = by_numbers.gnss_spec(_of(table, frame))
+        spec = by_numbers.gnss_spec(with_numbers(table, frame))
         if spec is None:
             return None
         columns = ", ".join(spec["position"]["columns"])
@@ -104,7 +106,7 @@ def gnss_spec(table: LogTable) -> Recognised | None:
     held = _held(frame[known], [lat, lon])
     if held is not None:
         known[known] = ~held
-    time = stamps.time_spec(_of(table, frame), known, SLOWEST_FIX_S, FASTEST_FIX_S)
+    time = stamps.time_spec(with_numbers(table, frame), known, SLOWEST_FIX_S, FASTEST_FIX_S)
     if time is None or height is None:
         return None
     position: Spec = {"columns": [lat, lon, height], "unit": _angle_unit(frame, found)}
@@ -182,7 +184,7 @@ def velocity_spec(table: LogTable) -> tuple[Spec, Spec] | None:
     if velocity is None:
         return None
     every = pd.Series(True, table.frame.index)
-    time = stamps.time_spec(_of(table, frame), every, SLOWEST_FIX_S, FASTEST_FIX_S)
+    time = stamps.time_spec(with_numbers(table, frame), every, SLOWEST_FIX_S, FASTEST_FIX_S)
     return None if time is None else (time, velocity)
 
 
@@ -204,7 +206,7 @@ def missing(table: LogTable) -> str:
         lacks += [] if vocabulary.named(names, "lon") else ["a longitude"]
         lacks += [] if vocabulary.named(names, "height") else ["a height (one number in all rows will do)"]
     rows = pd.Series(True, table.frame.index)
-    if stamps.time_spec(_of(table, frame), rows, SLOWEST_FIX_S, FASTEST_IMU_S) is None:
+    if stamps.time_spec(with_numbers(table, frame), rows, SLOWEST_FIX_S, FASTEST_IMU_S) is None:
         times = [n for n in vocabulary.matching(columns, vocabulary.TIME) if n not in names]
         of_day = times and table.frame[times[0]].astype(str).iloc[:20].str.match(stamps.OF_DAY).all()
         lacks.append("a date beside the times of day" if of_day else "stamps that can be read")
@@ -225,17 +227,12 @@ def numeric(frame: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(keep, index=frame.index)
 
 
-def with_numbers(table: LogTable) -> LogTable:
-    """The table with its numbers as such."""
-    return _of(table, numeric(table.frame))
-
-
-def _of(table: LogTable, frame: pd.DataFrame) -> LogTable:
-    """The table with its numbers as such."""
+def with_numbers(table: LogTable, numbers: pd.DataFrame) -> LogTable:
+    """The table with columns of :func:`numeric` in their places."""
     whole = table.frame.iloc[:, :MOST_COLUMNS].copy(deep=False)
-    for name in frame.columns:
-        whole[name] = frame[name]
-    return LogTable(whole, table.path, table.row, table.units, table.notes)
+    for name in numbers.columns:
+        whole[name] = numbers[name]
+    return replace(table, frame=whole)
 
 
 def _unnamed(names: list[str]) -> bool:
@@ -336,4 +333,4 @@ def _moves_like_radians(frame: pd.DataFrame, found: dict[str, str | None]) -> bo
         return False
     name = found["north"] or found["speed"]
     way = float(np.nansum(np.abs(frame[name].to_numpy(float))))
-    return spread > 0 and way > 0 and abs(np.log(spread * 6.37e6 / way)) < abs(np.log(spread * 1.11e5 / way))
+    return spread > 0 and way > 0 and abs(np.log(spread * EARTH_M / way)) < abs(np.log(spread * DEGREE_M / way))

@@ -17,7 +17,9 @@ from dlkf.data.discovery.units import accel_units, speed_factor
 from dlkf.data.readers import units
 from dlkf.data.readers.contract import gnss_frame, imu_frame, positions
 from dlkf.data.readers.mapping import Mapped
+from dlkf.data.readers.sharing import set_value, value_at, write_value
 from dlkf.data.schema import ACCEL, GYRO, VELOCITY
+from dlkf.data.validate import usable_fixes
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
 AUTO = "auto"
@@ -42,7 +44,6 @@ USUAL = {
 MOSTLY = 0.8  # of the fixes
 FEWEST_FIXES = 3  # below, no finding has a spread
 LEAST_GRAVITY = 0.5  # of the mean force: the length of the mean; with gravity in it nearly 1
-SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "knots": 1852 / 3600, "cm/s": 0.01, "mm/s": 1e-3, "mph": 0.44704}
 
 
 class Unsure(InputError):
@@ -66,21 +67,21 @@ class Settled:
     @property
     def notes(self) -> tuple[str, ...]:
         """A line per finding."""
-        return tuple(f"found reader.{f.setting}={_said(f.value)}  ({f.detail})" for f in self.findings)
+        return tuple(f"found reader.{f.setting}={write_value(f.value)}  ({f.detail})" for f in self.findings)
 
 
 def open_settings(specs: Mapping[str, Any], lever_arm_m: Any) -> set[str]:
     """Settings that are ``auto``."""
-    wanted = {name for name, (path, _) in PLACES.items() if _at(specs, path) == AUTO}
+    wanted = {name for name, (path, _) in PLACES.items() if value_at(specs, path) == AUTO}
     return wanted | ({"lever_arm_m"} if lever_arm_m == AUTO else set())
 
 
 def placeholders(specs: Mapping[str, Any]) -> dict[str, Any]:
     """The specs with neutral values for every ``auto``."""
-    out = copy.deepcopy({kind: _plain(spec) for kind, spec in specs.items()})
+    out = _plain(specs)
     for path, neutral in PLACES.values():
-        if _at(out, path) == AUTO:
-            _set(out, path, neutral)
+        if value_at(out, path) == AUTO:
+            set_value(out, path, neutral)
     return out
 
 
@@ -91,7 +92,7 @@ def settle(
 
     ``t`` are the stamps of the tables. InputError where an answer is not sure.
     """
-    specs = {kind: copy.deepcopy(_plain(part.spec)) for kind, part in mapped.items()}
+    specs = {kind: _plain(part.spec) for kind, part in mapped.items()}
     if "gnss" not in mapped and wanted == {"imu.accel.unit"}:
         return _by_gravity(specs, mapped["imu"], t["imu"], where, arm)
     if "gnss" not in mapped:
@@ -123,14 +124,15 @@ def settle(
         known_accel=units.ACCELERATION,
         known_gyro=units.RATE,
         increments=bool(mapped["imu"].spec.get("increments")),
-        drift_given="gnss.time.drift_ppm" not in wanted and _at(specs, PLACES["gnss.time.drift_ppm"][0]) is not None,
+        drift_given="gnss.time.drift_ppm" not in wanted
+        and value_at(specs, PLACES["gnss.time.drift_ppm"][0]) is not None,
     )
     found.found += more.found
     _refuse_doubt(found, wanted, where, t)
     for name in wanted & set(PLACES):
         value = copy.deepcopy(found.get("imu.axes" if name.endswith("axes") else name))
         if value is not None:
-            _set(specs, PLACES[name][0], value)
+            set_value(specs, PLACES[name][0], value)
     lever = found.get("lever_arm_m") if "lever_arm_m" in wanted else arm
     x, y, z = (float(a) for a in lever)
     return Settled(specs, (x, y, z), _reported(found.found, wanted))
@@ -154,12 +156,12 @@ def _by_gravity(specs: dict[str, Any], imu: Mapped, t: np.ndarray, where: str, a
     value = names[0] if len(names) == 1 else float(f"{G / size:.5g}") if size > 0 else None
     found.add("imu.accel.unit", value, len(names) > 0, f"median force {size:.4g}")
     _refuse_doubt(found, {"imu.accel.unit"}, where, {"imu": t})
-    _set(specs, PLACES["imu.accel.unit"][0], value)
+    set_value(specs, PLACES["imu.accel.unit"][0], value)
     return Settled(specs, arm, found.found)
 
 
 def _raw(imu: pd.DataFrame, gnss: pd.DataFrame, factors: Mapping[str, float | None]) -> Raw:
-    good = gnss[(gnss["quality"] > 0) & gnss["lat_deg"].notna() & gnss["lon_deg"].notna()]
+    good = gnss[usable_fixes(gnss)]
     good = good[np.concatenate(([True], np.diff(good["t"]) > 0))] if len(good) else good
     rows = imu[np.concatenate(([True], np.diff(imu["t"]) > 0))]
     return Raw(
@@ -183,7 +185,7 @@ def _speed_unit(found: Findings, gnss: Mapped, t: np.ndarray, where: str) -> Non
     speed = v[:, 0] if gnss.spec["velocity"].get("frame") == "course" else np.hypot(v[:, 0], v[:, 1])
     place = positions(gnss)
     factor, spread = speed_factor(t, place["lat_deg"], place["lon_deg"], speed)
-    apart = {name: abs(np.log(factor / f)) if factor > 0 else np.inf for name, f in SPEEDS.items()}
+    apart = {name: abs(np.log(factor / f)) if factor > 0 else np.inf for name, f in units.SPEED.items()}
     best = min(apart, key=lambda name: apart[name])
     certain = apart[best] < 0.08 and spread < 0.2 * factor
     detail = f"positions move {factor:.3g} ± {spread:.1g} m per unit" if factor > 0 else "the car hardly moves"
@@ -200,9 +202,11 @@ def _refuse_doubt(found: Findings, wanted: set[str], where: str, t: Mapping[str,
     ]
     setting = doubt.setting.replace("imu.axes", "imu.accel.axes and .gyro.axes")
     poor = doubt.setting.endswith(("offset_s", "axes")) and not doubt.wide  # no more than a guess of noise
-    best = "" if doubt.value is None or poor else f"; the best guess is {_said(doubt.value)}"
+    best = "" if doubt.value is None or poor else f"; the best guess is {write_value(doubt.value)}"
     if doubt.setting.endswith("drift_ppm") and doubt.setting not in wanted:
-        raise InputError(f"{where}: the clocks drift apart, {_said(doubt.value)} {doubt.detail}; reader.{setting}=auto")
+        raise InputError(
+            f"{where}: the clocks drift apart, {write_value(doubt.value)} {doubt.detail}; reader.{setting}=auto"
+        )
     remedy = f"give {_by_hand(doubts, wanted, t)}, or a longer drive, with turns, starts and stops"
     if doubt.remedy:
         remedy = doubt.remedy
@@ -245,30 +249,7 @@ def _reported(found: list[Finding], wanted: set[str]) -> list[Finding]:
     return out
 
 
-def _said(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{k}: {v}" for k, v in value.items()) + "}"
-    return str(value)
-
-
 def _plain(spec: Any) -> Any:
     if isinstance(spec, Mapping):
         return {key: _plain(value) for key, value in spec.items()}
     return [_plain(x) for x in spec] if isinstance(spec, (list, tuple)) else spec
-
-
-def _at(specs: Mapping[str, Any], path: tuple[str, ...]) -> Any:
-    node: Any = specs
-    for key in path:
-        if not isinstance(node, Mapping) or key not in node:
-            return None
-        node = node[key]
-    return node
-
-
-def _set(specs: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
-    node = specs
-    for key in path[:-1]:
-        node[key] = dict(node.get(key) or {})
-        node = node[key]
-    node[path[-1]] = value

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dlkf.base.settings import is_number
+
 # settings that belong to the car, the IMU and the pair of clocks, and how far apart those of two drives may be
 ALIKE: dict[tuple[str, ...], float] = {
     ("imu", "accel", "unit"): 0.02,  # relative, of a number by gravity
@@ -39,12 +41,12 @@ def pool_settings(mappings: Sequence[Mapping[str, Any]], *, offsets: bool) -> tu
     apart: list[str] = []
     limits = dict(ALIKE) | (dict(OFFSETS) if offsets else {})
     for path, limit in limits.items():
-        values = [v for v in (_at(m, path) for m in mappings) if v is not None]
+        values = [v for v in (value_at(m, path) for m in mappings) if v not in (None, "auto")]
         if not values:
             continue
         value = _agreed(values, limit)
         if value is not None:
-            _set(out, path, value)
+            set_value(out, path, value)
         elif path[-1] != "offset_s":
             apart.append(f"reader.{'.'.join(path)} is not the same in all drives: {_listed(values)}")
     return out, apart
@@ -53,7 +55,7 @@ def pool_settings(mappings: Sequence[Mapping[str, Any]], *, offsets: bool) -> tu
 def agrees(settings: Mapping[str, Any], offset_s: float, std: float) -> bool:
     """Whether a drive's own guess of the clocks' offset is that of the others, so that it is one and the same pair of
     clocks and not one that each recording sets again."""
-    shared = next((v for path, _ in OFFSETS if (v := _at(settings, path)) is not None), None)
+    shared = next((v for path, _ in OFFSETS if (v := value_at(settings, path)) is not None), None)
     return shared is not None and abs(offset_s - float(shared)) <= max(FARTHEST_OFFSET_S, 3 * std)
 
 
@@ -62,11 +64,12 @@ def list_settings(settings: Mapping[str, Any], before: str = "reader") -> str:
     said = []
     for key, value in settings.items():
         deeper = isinstance(value, Mapping) and "yaw" not in value
-        said.append(list_settings(value, f"{before}.{key}") if deeper else f"{before}.{key}={_written(value)}")
+        said.append(list_settings(value, f"{before}.{key}") if deeper else f"{before}.{key}={write_value(value)}")
     return " ".join(said)
 
 
-def _written(value: Any) -> str:
+def write_value(value: Any) -> str:
+    """A value as it is written on a command line."""
     if not isinstance(value, Mapping):
         return str(value)
     return "{" + ", ".join(f"{k}: {v}" for k, v in value.items()) + "}"
@@ -82,7 +85,7 @@ def _agreed(values: Sequence[Any], limit: float) -> Any:
             return None
         yaw, pitch, roll = mean.as_euler("ZYX", degrees=True)
         return {"roll": round(float(roll), 2), "pitch": round(float(pitch), 2), "yaw": round(float(yaw), 2)}
-    if all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values):
+    if all(map(is_number, values)):
         middle, spread = float(np.median(values)), float(np.ptp(values))
         if limit >= 0.03:
             return round(middle, 4) if spread <= limit else None
@@ -99,16 +102,18 @@ def merged(base: Any, over: Any) -> Any:
 
 
 def _listed(values: Iterable[Any]) -> str:
-    return ", ".join(dict.fromkeys(_written(v) for v in values))
+    return ", ".join(dict.fromkeys(write_value(v) for v in values))
 
 
-def _at(mapping: Any, path: tuple[str, ...]) -> Any:
+def value_at(mapping: Any, path: tuple[str, ...]) -> Any:
+    """The value of a setting, None where there is none."""
     for key in path:
         mapping = mapping.get(key) if isinstance(mapping, Mapping) else None
-    return None if mapping == "auto" else mapping
+    return mapping
 
 
-def _set(out: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
+def set_value(out: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
+    """Set a setting in place."""
     for key in path[:-1]:
         out = out.setdefault(key, {})
     out[path[-1]] = value

@@ -11,7 +11,7 @@ from dlkf.base.errors import InputError
 from dlkf.data.discovery.units import time_unit
 from dlkf.data.readers import units, vocabulary
 from dlkf.data.readers.frames import LogTable
-from dlkf.data.readers.mapping import Mapped
+from dlkf.data.readers.mapping import TABULAR, Mapped
 
 Spec = dict[str, Any]
 OF_DAY = r"^\s*\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?\s*([AaPp][Mm])?\s*Z?\s*$"
@@ -24,7 +24,6 @@ NEWEST_UNIX = 2e9  # s: 2033; a stamp beyond it counts from no known epoch
 SWITCHED_ON_S = 1000.0  # a log that begins with less counts from its own beginning, which is nothing to report
 DAY_S = 86_400
 OLDEST_UNIX = 1.0e9  # s: 2001; no log of a car with an IMU of this kind is older
-TABLES = (None, "csv", "parquet", "feather", "matlab")  # formats whose stamps are what a user's program wrote
 
 
 def time_spec(table: LogTable, rows: pd.Series, slowest: float, fastest: float) -> Spec | None:
@@ -147,7 +146,7 @@ def epoch_note(part: Mapped) -> str | None:
     """From when the stamps of a table of numbers are taken to count, and what else they may mean; None for dates and
     for formats that state it themselves."""
     time = part.spec.get("time") or {}
-    if part.spec.get("format") not in TABLES or not len(part):
+    if part.spec.get("format") not in TABULAR or not len(part):
         return None
     setting = f"reader.{part.kind}.time"
     column = time.get("column")

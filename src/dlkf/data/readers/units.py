@@ -6,11 +6,13 @@ import math
 import re
 import time
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from dlkf.base.errors import InputError
+from dlkf.base.settings import is_number
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
 DEG = math.pi / 180
@@ -42,7 +44,7 @@ LETTERS = {"f": (0, 1), "b": (0, -1), "r": (1, 1), "l": (1, -1), "d": (2, 1), "u
 
 def factor(unit: str | float, table: Mapping[str, float], where: str) -> float:
     """SI per unit; ``unit`` is a name in the table or that number itself. InputError for unknown names."""
-    if isinstance(unit, (int, float)) and not isinstance(unit, bool):
+    if is_number(unit):
         return float(unit)
     if not isinstance(unit, str) or unit not in table:
         raise InputError(f"{where}: unknown unit {unit!r}; known are {', '.join(table)}, or a number (SI per unit)")
@@ -59,7 +61,7 @@ def rotation(axes: str | Sequence[str] | Mapping[str, float], where: str) -> np.
     if isinstance(axes, Mapping):
         if set(axes) != {"roll", "pitch", "yaw"}:
             raise InputError(f"{where}: has {', '.join(map(str, axes))}; must have roll, pitch and yaw [deg]")
-        turns = [_number(axes[name], f"{where}.{name}") for name in ("yaw", "pitch", "roll")]
+        turns = [number(axes[name], f"{where}.{name}") for name in ("yaw", "pitch", "roll")]
         from scipy.spatial.transform import Rotation  # every start of navigate would load it
 
         return Rotation.from_euler("ZYX", turns, degrees=True).as_matrix()
@@ -172,6 +174,12 @@ def degrees_minutes(values: np.ndarray) -> np.ndarray:
     return np.sign(values) * (whole + (size - 100 * whole) / 60)
 
 
+def degrees_minutes_seconds(cells: pd.DataFrame) -> np.ndarray:
+    """Three columns of texts as degrees; −0° is south or west as well."""
+    size = cells.apply(pd.to_numeric, errors="coerce").abs().to_numpy() @ [1, 1 / 60, 1 / 3600]
+    return np.where(cells.iloc[:, 0].str.startswith("-"), -size, size)
+
+
 def _split(values: np.ndarray, ticks: int) -> tuple[np.ndarray, np.ndarray]:
     if np.issubdtype(values.dtype, np.integer):
         whole, rest = np.divmod(values.astype(np.int64), ticks)
@@ -222,7 +230,8 @@ def _calendar(values: np.ndarray, where: str, order: str | None = None) -> np.nd
     return stamps.dt.as_unit("ns").astype(np.int64).to_numpy()
 
 
-def _number(value: object, where: str) -> float:
-    if not isinstance(value, (int, float)) or isinstance(value, bool) or not math.isfinite(value):
+def number(value: Any, where: str) -> float:
+    """The value of a setting that must be a finite number."""
+    if not is_number(value):
         raise InputError(f"{where} is {value!r}, must be a number")
     return float(value)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, first_line
 from dlkf.data.readers.formats import library
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.units import GPS_EPOCH_UNIX, WEEK_S, leap_seconds
@@ -49,7 +49,7 @@ def _ulog(path: Path) -> dict[str, pd.DataFrame]:
     try:
         found = pyulog.ULog(str(path), wanted)
     except Exception as error:  # pyulog has no errors of its own: TypeError, struct.error, IndexError of damaged files
-        raise InputError(f"{path}: cannot be read as a PX4 log ({_line(error)}); copy it again") from None
+        raise InputError(f"{path}: cannot be read as a PX4 log ({first_line(error)}); copy it again") from None
     data = {d.name: pd.DataFrame(d.data) for d in reversed(found.data_list)}  # the first instance stays
     out: dict[str, pd.DataFrame] = {}
     fixes = next((data[name] for name in ULOG_GNSS if name in data and len(data[name])), None)
@@ -97,7 +97,7 @@ def _dataflash(path: Path) -> dict[str, pd.DataFrame]:
             if int(getattr(message, "I", 0)) == 0:  # the first of several sensors
                 rows[message.get_type()].append(message.to_dict())
     except Exception as error:  # as pyulog
-        raise InputError(f"{path}: cannot be read as an ArduPilot log ({_line(error)}); copy it again") from None
+        raise InputError(f"{path}: cannot be read as an ArduPilot log ({first_line(error)}); copy it again") from None
     data = {name: pd.DataFrame(found) for name, found in rows.items()}
     out: dict[str, pd.DataFrame] = {}
     shift = 0
@@ -128,7 +128,3 @@ def _dataflash_fixes(gps: pd.DataFrame, accuracy: pd.DataFrame) -> tuple[pd.Data
     stamps = np.where(known, week * WEEK_S * 10**9 + ms * 10**6, t_ns + shift)
     quality = gps["Status"].astype(int).map(QUALITY).fillna(0).astype(int)
     return pd.DataFrame({"t_ns": stamps, **out, "quality": quality}), shift
-
-
-def _line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:120]

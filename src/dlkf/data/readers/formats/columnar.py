@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.feather as feather
 import pyarrow.parquet as pq
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, first_line
 from dlkf.data.readers.frames import LogTable
 
 
@@ -23,7 +23,7 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
         else:
             columns = pq.ParquetFile(path).read()
     except (pa.ArrowInvalid, OSError) as error:
-        reason = str(error).splitlines()[0][:100]
+        reason = first_line(error)
         raise InputError(f"{path}: not a whole Parquet or Feather file ({reason}); write or copy it again") from None
     frame = columns.to_pandas(ignore_metadata=True)
     for name in frame.columns:

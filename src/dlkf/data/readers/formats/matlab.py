@@ -15,11 +15,11 @@ import numpy as np
 import pandas as pd
 import scipy.io
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, first_line
+from dlkf.data.readers import units
 from dlkf.data.readers.formats import library
 from dlkf.data.readers.frames import LogTable
 
-DATENUM_1970 = 719_529.0
 DATENUMS = (723_000.0, 767_000.0)  # 1979 to 2099
 LARGEST_BYTES = 4 << 30
 DEEPEST = 6  # of structures in structures
@@ -69,7 +69,7 @@ def _loaded(path: Path) -> dict[str, Any]:
     except NotImplementedError:  # version 7.3 is HDF5
         return _hdf5_variables(path)
     except (scipy.io.matlab.MatReadError, ValueError, OSError, TypeError, IndexError, KeyError, MemoryError) as error:
-        raise InputError(f"{path}: cannot be read as a MATLAB file ({_first_line(error)}); save it again") from None
+        raise InputError(f"{path}: cannot be read as a MATLAB file ({first_line(error)}); save it again") from None
     objects = [n for n, v in found.items() if isinstance(v, scipy.io.matlab.MatlabOpaque)]
     if objects and len(objects) == len(found):
         name = objects[0]
@@ -89,7 +89,7 @@ def _hdf5_variables(path: Path) -> dict[str, Any]:
     except (OSError, KeyError, RuntimeError, MemoryError, ValueError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path}: cannot be read as a MATLAB file ({_first_line(error)}); save it again") from None
+        raise InputError(f"{path}: cannot be read as a MATLAB file ({first_line(error)}); save it again") from None
 
 
 def _check_size(h5py: Any, file: Any, path: Path) -> None:
@@ -146,7 +146,7 @@ def _dated(frame: pd.DataFrame) -> pd.DataFrame:
         values = frame[name].to_numpy(float)
         within = len(values) > 1 and DATENUMS[0] < values.min() and values.max() < DATENUMS[1] and np.ptp(values) < 30
         if within and np.all(np.diff(values) >= 0) and np.any(values != np.round(values)):
-            frame[name] = np.round((values - DATENUM_1970) * 86_400e6).astype(np.int64) * 1000
+            frame[name] = np.round((values - units.DAYS["datenum"]) * 86_400e6).astype(np.int64) * 1000
     return frame
 
 
@@ -157,7 +157,3 @@ def _is_numeric(value: Any) -> bool:
         return np.asarray(value).dtype.kind in "fiub"
     except ValueError:  # a list of vectors of several lengths
         return False
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:120]

@@ -12,11 +12,11 @@ import numpy as np
 import pandas as pd
 
 from dlkf.base.errors import InputError
+from dlkf.data.readers import units
 from dlkf.data.readers.formats import library
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.schema import POSITION, STD, VELOCITY
 
-KNOTS, KMH = 1852 / 3600, 1 / 3.6
 DAY_NS = 86_400 * 10**9
 MODES = {"N": 0, "A": 1, "D": 2, "P": 2, "R": 4, "F": 5}  # of GNS, a letter a constellation; the best one counts
 HEADINGS = re.compile(rb"\$[A-Z]{2}(HDT|THS),\d")
@@ -131,7 +131,7 @@ def _stamps(of_day: np.ndarray, date: pd.Series) -> np.ndarray:
 
 
 def _set_velocity(row: dict[str, Any], knots: Any, course: Any) -> None:
-    speed, angle = _float(knots) * KNOTS, _float(course)
+    speed, angle = _float(knots) * units.SPEED["knots"], _float(course)
     if np.isnan(speed):
         return
     if np.isnan(angle):  # receivers leave the course empty at rest

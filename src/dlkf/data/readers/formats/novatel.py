@@ -18,7 +18,7 @@ import pandas as pd
 
 from dlkf.base.errors import InputError
 from dlkf.data.readers import units
-from dlkf.data.readers.formats.text import decoded
+from dlkf.data.readers.formats.text import decoded, without_cut_line
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.schema import POSITION, STD, VELOCITY
 
@@ -44,12 +44,7 @@ def _export(lines: list[str], path: Path) -> LogTable:
     first = heads[0] + (2 if any(marks) else 1)
     rows = [(k + 1, line.split()) for k, line in enumerate(lines) if k >= first and line.strip()]
     widths = [3 if "D M S" in m else 1 for m in marks]
-    notes = ()
-    if rows and len(rows[-1][1]) < sum(widths):
-        notes = (f"{path.name}: line {rows[-1][0]}, the last, is cut off: left out",)
-        rows = rows[:-1]
-    if not rows:
-        raise InputError(f"{path}: has no rows; leave the drive out or give its data")
+    rows, notes = without_cut_line(rows, sum(widths), path)
     if bad := [n for n, cells in rows if len(cells) != sum(widths)]:
         raise InputError(f"{path}: line {bad[0]}: has not the {sum(widths)} cells that the header names")
     cells = pd.DataFrame([c for _, c in rows], index=pd.Index([n for n, _ in rows]))
@@ -57,9 +52,7 @@ def _export(lines: list[str], path: Path) -> LogTable:
     for name, width in zip(names, widths):
         part = cells.iloc[:, at : at + width]
         if width == 3:
-            d = part.apply(pd.to_numeric, errors="coerce").to_numpy()
-            negative = part.iloc[:, 0].str.startswith("-").to_numpy()
-            out[name] = np.where(negative, -1, 1) * (np.abs(d) @ [1, 1 / 60, 1 / 3600])
+            out[name] = units.degrees_minutes_seconds(part)
         else:
             numbers = pd.to_numeric(part.iloc[:, 0], errors="coerce")
             out[name] = part.iloc[:, 0].to_numpy() if bool(numbers.isna().any()) else numbers.to_numpy()

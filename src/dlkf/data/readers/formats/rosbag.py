@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, first_line
 from dlkf.data.readers.formats import foxglove, library, nmea
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
@@ -80,7 +80,7 @@ def _opened(path: Path) -> Iterator[Any]:
         raise
     except Exception as error:
         # rosbags raises errors of its own, of sqlite, lz4 and struct for damaged bags
-        raise InputError(f"{path}: cannot be read as a bag ({_first_line(error)}); give a whole one") from None
+        raise InputError(f"{path}: cannot be read as a bag ({first_line(error)}); give a whole one") from None
 
 
 def _read(reader: Any, path: Path, kind: str, table: str | None) -> LogTable:
@@ -178,10 +178,6 @@ def _sentences(messages: Iterator[tuple[int, Any]], where: str) -> pd.DataFrame:
 
 def _short(msgtype: str) -> str:
     return msgtype.replace("/msg/", "/")
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:120]
 
 
 WHEEL = re.compile(r"wheel|odom|vehicle|can|chassis|encoder|speed", re.IGNORECASE)

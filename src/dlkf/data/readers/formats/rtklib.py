@@ -17,7 +17,7 @@ import pymap3d
 
 from dlkf.base.errors import InputError
 from dlkf.data.readers import units
-from dlkf.data.readers.formats.text import decoded
+from dlkf.data.readers.formats.text import decoded, without_cut_line
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.schema import POSITION, STD, VELOCITY
 
@@ -40,24 +40,17 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
     zone = names[0]
     if zone not in ZONES:
         raise InputError(f"{path}: times in {zone}; write the solution in {' or '.join(ZONES)}")
-    rows, numbers = [], []
-    for k, line in enumerate(lines):
-        if line.strip() and not line.startswith("%"):
-            rows.append([c.strip() for c in line.split(separator)])
-            numbers.append(k + 1)
-    notes = ()
-    usual = len(rows[0]) if rows else 0
-    if len(rows) > 1 and len(rows[-1]) < usual:
-        notes = (f"{path.name}: line {numbers[-1]}, the last, is cut off: left out",)
-        rows, numbers = rows[:-1], numbers[:-1]
-    if not rows:
-        raise InputError(f"{path}: has no rows; leave the drive out or give its data")
-    short = [n for row, n in zip(rows, numbers) if len(row) != usual]
-    if short:
-        raise InputError(f"{path}: line {short[0]}: has another number of cells than line {numbers[0]}")
-    return LogTable(
-        _frame(pd.DataFrame(rows, index=pd.Index(numbers)), names, ZONES[zone], path), path, "line", {}, notes
-    )
+    rows = [
+        (k, [c.strip() for c in line.split(separator)])
+        for k, line in enumerate(lines, 1)
+        if line.strip() and not line.startswith("%")
+    ]
+    usual = len(rows[0][1]) if rows else 0
+    rows, notes = without_cut_line(rows, usual, path)
+    if bad := [n for n, cells in rows if len(cells) != usual]:
+        raise InputError(f"{path}: line {bad[0]}: has another number of cells than line {rows[0][0]}")
+    cells = pd.DataFrame([c for _, c in rows], index=pd.Index([n for n, _ in rows]))
+    return LogTable(_frame(cells, names, ZONES[zone], path), path, "line", {}, notes)
 
 
 def _frame(cells: pd.DataFrame, names: list[str], clock: str, path: Path) -> pd.DataFrame:
@@ -75,9 +68,8 @@ def _frame(cells: pd.DataFrame, names: list[str], clock: str, path: Path) -> pd.
     wide = cells.shape[1] - skip - len(names) + 1  # degrees, minutes, seconds take three cells
     numbers = np.stack([_numbers(cells[k], where) for k in range(skip, cells.shape[1])], -1)
     if wide == 4:
-        dms = [numbers[:, 3 * k : 3 * k + 3] for k in range(2)]
-        angles = [np.where(np.signbit(d[:, 0]), -1, 1) * (np.abs(d) @ [1, 1 / 60, 1 / 3600]) for d in dms]
-        numbers = np.concatenate((np.stack(angles, -1), numbers[:, 6:]), 1)
+        angles = [units.degrees_minutes_seconds(cells.iloc[:, k : k + 3]) for k in (skip, skip + 3)]
+        numbers = np.column_stack((*angles, numbers[:, 6:]))
     elif wide != 0:
         raise InputError(f"{where}: rows have {cells.shape[1]} cells, the header names {len(names)} columns")
     column = {n: numbers[:, k] for k, n in enumerate(names[1:])}

@@ -15,7 +15,7 @@ from typing import Any
 
 import pandas as pd
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, first_line
 from dlkf.data.readers import vocabulary
 from dlkf.data.readers.frames import LogTable
 
@@ -95,6 +95,19 @@ def decoded(path: Path, encoding: str | None) -> str:
     raise AssertionError("latin-1 reads any byte")
 
 
+def without_cut_line(
+    rows: list[tuple[int, list[str]]], cells: int, path: Path
+) -> tuple[list[tuple[int, list[str]]], tuple[str, ...]]:
+    """Numbered rows but the last where that has fewer cells, and a note on it; InputError where no row is left."""
+    notes = ()
+    if rows and len(rows[-1][1]) < cells:
+        notes = (f"{path.name}: line {rows[-1][0]}, the last, is cut off: left out",)
+        rows = rows[:-1]
+    if not rows:
+        raise InputError(f"{path}: has no rows; leave the drive out or give its data")
+    return rows, notes
+
+
 def _likely_encodings(head: bytes) -> list[str]:
     """The encodings of Windows, first that in which most letters beyond ASCII are those of columns' names."""
 
@@ -133,7 +146,7 @@ def _parsed(path: Path, lines: list[str], numbers: list[int], options: Mapping[s
                 low_memory=False,
             )
     except (pd.errors.ParserError, pd.errors.EmptyDataError, ValueError, re.error) as error:
-        detail = str(error).splitlines()[0].strip()
+        detail = first_line(error).strip()
         if found := re.search(r"line (\d+)", detail):
             place = min(int(found[1]), len(numbers)) - 1
             detail = detail.replace(found[0], f"line {numbers[place]}")
