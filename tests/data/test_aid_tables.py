@@ -69,7 +69,7 @@ def _rows(name, pick):
 
 
 BAD = {
-    "km/h": (_speed(lambda v: 3.6 * v), "3.67 times that of GNSS in the median: looks like km/h; divide it by 3.6"),
+    "km/h": (_speed(lambda v: 3.6 * v), r"3.67 times that of GNSS.*divide it by 3.6 \(reader.speed.value.unit=km/h\)"),
     "mph": (_speed(lambda v: 2.237 * v), "looks like mph"),
     "doubled": (_speed(lambda v: 2 * v), "2.04 times that of GNSS"),
     "dead": (_speed(lambda v: 0 * v), "stays 0 m/s though the car moves"),

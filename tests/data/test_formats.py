@@ -126,7 +126,9 @@ def test_standstills_are_told(drive):
     for first, last in ((0, 3), (8, 13), (16, 17)):
         gnss.loc[first:last, ["vel_n", "vel_e"]] = 0.05
     frames = DriveFrames({"drive": "a", "group": "a"}, drive["imu"], gnss)
-    assert drive_line(frames).endswith("stands 2 times for 8 s in all")
+    assert drive_line(frames).endswith("stands 2 times for 8 s in all") and "missing" not in drive_line(frames)
+    thinned = DriveFrames(frames.meta, drive["imu"][np.arange(len(drive["imu"])) % 4 > 0], gnss)
+    assert "25 % of its samples missing" in drive_line(thinned)
 
 
 def _pykitti():

@@ -163,6 +163,16 @@ BAD_FRAMES: dict[str, tuple[str, Callable[[pd.DataFrame], Any], str]] = {  # whi
         put("std_pos_n", 2, -1.0),
         "gnss: row 2: std_pos_n is -1.0; must be ≥ 0, or NaN if unknown",
     ),
+    "fixes of another time zone": (
+        "gnss",
+        plus(-7200.0),
+        "both need the same clock: they are 2 h apart, as time zones are; add 7200 s to t of gnss",
+    ),
+    "north without east": (
+        "gnss",
+        lambda f: f.drop(columns="vel_e"),
+        "gnss: has vel_n alone; give vel_n and vel_e, or neither without velocities",
+    ),
     "fixes of another day": ("gnss", plus(86_400.0), "lie outside the IMU's 0.020 to 60.000; both need the same clock"),
     "Unix and GPS seconds": (
         "gnss",

@@ -19,11 +19,11 @@ FAST = 3.0  # m/s: above, the ratio of two speeds means something and the car lo
 LEAST_COMMON = 10  # instants at which an aid and GNSS are compared
 SCALES = (0.7, 1.4)  # of a wheel to GNSS that a filter may calibrate; beyond, the unit is wrong
 UNITS = {
-    "km/h; divide it by 3.6": 3.6,
-    "mph; multiply it by 0.44704": 2.23694,
-    "knots; multiply it by 0.514444": 1.94384,
-    "cm/s; divide it by 100": 100.0,
-    "mm/s; divide it by 1000": 1000.0,
+    "km/h; divide it by 3.6 (reader.speed.value.unit=km/h)": 3.6,
+    "mph; multiply it by 0.44704 (reader.speed.value.unit=mph)": 2.23694,
+    "knots; multiply it by 0.514444 (reader.speed.value.unit=knots)": 1.94384,
+    "cm/s; divide it by 100 (reader.speed.value.unit=cm/s)": 100.0,
+    "mm/s; divide it by 1000 (reader.speed.value.unit=mm/s)": 1000.0,
     "m/s divided by 3.6; multiply it by 3.6": 1 / 3.6,
 }
 CLOCK_S, STEP_S = 5.0, 0.05  # so far apart are clocks compared, in such steps

@@ -12,6 +12,7 @@ from dlkf.data.schema import QUALITIES, driven_distance
 from dlkf.data.validate import usable_fixes
 
 AIDS = {"speed": "wheel speed", "heading": "heading", "baro": "barometer"}
+MISSING = 0.02  # share of the IMU's samples, from which on it is worth a word
 STANDS_S = 2.0  # less is a creeping car
 
 
@@ -19,7 +20,9 @@ def drive_line(drive: DriveFrames) -> str:
     """Duration, rates, distance, share of fixes by quality, largest gaps of a drive."""
     t = drive.imu["t"].to_numpy()
     step = np.diff(t)
-    detail = [_duration(t[-1] - t[0]), f"IMU {1 / np.median(step):.4g} Hz, largest gap {_short(step.max())}"]
+    missing = 1 - len(step) * np.median(step) / (t[-1] - t[0])
+    lost = f", {100 * missing:.2g} % of its samples missing" if missing > MISSING else ""
+    detail = [_duration(t[-1] - t[0]), f"IMU {1 / np.median(step):.4g} Hz{lost}, largest gap {_short(step.max())}"]
     if drive.gnss is None or not len(drive.gnss):
         return ", ".join((*detail, "no GNSS"))
     at, quality = drive.gnss["t"].to_numpy(), drive.gnss["quality"].to_numpy()

@@ -24,6 +24,7 @@ RATES_HZ = {"imu": (1.0, 1e4), "gnss": (1e-3, 500.0)}
 MOST_SAME = 0.2  # of the rows, with the stamp of the row before: more are a rounded clock
 MOST_REFUSED = (0.01, 0.2)  # of the samples, of the fixes; more are no accident
 MOST_SWITCH_M = 10_000.0  # m: fixes that go on so far off make two drives of one
+MOST_HOURS = 14  # between time zones
 UNIX_TO_GPS_S, EPOCHS_APART_S = 315_964_800.0, 86_400.0  # 1970 to 1980; as near is no chance
 
 
@@ -242,10 +243,16 @@ def _check_gnss(gnss: Columns, imu: Columns, where: str) -> Columns:
     t, first, last = gnss["t"][fix], imu["t"][0], imu["t"][-1]
     if not ((t > first) & (t <= last + 1)).any():
         epochs = abs(abs(t[0] - first) - UNIX_TO_GPS_S) < EPOCHS_APART_S
+        hours = round((first + last - t[0] - t[-1]) / 2 / 3600)
+        zone = 0 < abs(hours) <= MOST_HOURS and bool(
+            ((t + 3600 * hours > first) & (t + 3600 * hours <= last + 1)).any()
+        )
         raise InputError(
             f"{where}: fixes from t = {t[0]:.3f} to {t[-1]:.3f} lie outside the IMU's {first:.3f} to "
             f"{last:.3f}; both need the same clock"
             + (": one counts from 1970, the other from 1980; give time.clock to both or to neither" if epochs else "")
+            + (f": they are {abs(hours)} h apart, as time zones are; add {3600 * hours} s to t of gnss" if zone else "")
+            + (f" (reader.gnss.time.offset_s={3600 * hours})" if zone else "")
         )
     fixes = {name: values[fix] for name, values in gnss.items()}
     check_gnss_units(fixes, where)

@@ -162,7 +162,7 @@ def discover_findings(tables: CheckedTables) -> Iterator[CheckupResult]:
     for finding in discover(raw, {"imu.time.offset_s", "imu.axes"}, known_accel={}, known_gyro={}).found:
         if finding.setting == "gnss.time.drift_ppm":
             yield CheckupResult(
-                NOTE, f"clocks: {finding.value:+.0f} {finding.detail}; ingest with reader.{finding.setting}=auto"
+                NOTE, f"clocks: {finding.value:+.0f} {finding.detail}; {ESTIMATED}reader.{finding.setting}=auto"
             )
         elif not finding.sure:
             yield CheckupResult(NOTE, f"{finding.setting}: the motion does not show it ({finding.detail})")
@@ -172,7 +172,7 @@ def discover_findings(tables: CheckedTables) -> Iterator[CheckupResult]:
             lead = "IMU and GNSS agree" if fine else f"add {finding.value:+.3f} s to the IMU's stamps"
             text = f"clocks: {lead} ({finding.detail})"
             grade = GOOD if fine else NOTE if off < DELAY_S else BAD  # receivers are late, clocks are wrong
-            yield CheckupResult(grade, text + ("" if fine else "; ingest with reader.imu.time.offset_s=auto"))
+            yield CheckupResult(grade, text + ("" if fine else f"; {OFFSETS}"))
         elif finding.setting == "imu.axes":
             angle = turned_deg(finding.value)
             fine = angle < ANGLE_DEG
@@ -180,6 +180,13 @@ def discover_findings(tables: CheckedTables) -> Iterator[CheckupResult]:
             yield CheckupResult(
                 GOOD if fine else BAD, text + ("" if fine else "; ingest with reader=auto or reader.imu.axes")
             )
+
+
+ESTIMATED = "plus and filters with +receiver estimate it; for others ingest with "
+OFFSETS = (
+    ESTIMATED + "reader.imu.time.offset_s=auto and reader.gnss.position.delay_s=auto (this is the offset of the "
+    "velocities; that of the positions may differ)"
+)
 
 
 def turned_deg(angles: Mapping[str, float]) -> float:

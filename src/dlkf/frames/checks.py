@@ -48,6 +48,8 @@ def check_frames(imu: Any, gnss: Any, reference: Any = None, aids: Mapping[str, 
             raise InputError(f"{name} has no rows")
     _check_seconds({name: frame["t"].to_numpy(float) for name, frame in frames.items() if frame is not None})
     _check_quality(gnss)
+    if len(horizontal := [c for c in ("vel_n", "vel_e") if c in gnss]) == 1:
+        raise InputError(f"gnss: has {horizontal[0]} alone; give vel_n and vel_e, or neither without velocities")
     warn_of_other_columns(gnss)
 
 
