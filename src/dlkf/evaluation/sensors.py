@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from dlkf.evaluation.metrics import Array
+from dlkf.evaluation.results import last_finite
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.table import ResultTable
 
@@ -40,6 +41,4 @@ def sensor_table(scores: Scores, columns: Mapping[str, Sequence[str]]) -> Result
 
 def _last(values: Array) -> float:
     """Median over the runs of the last known values of (P, T)."""
-    known = np.isfinite(values)
-    last = np.where(known.any(1), known.shape[1] - 1 - np.argmax(known[:, ::-1], 1), 0)
-    return float(np.nanmedian(values[np.arange(len(values)), last]))
+    return float(np.nanmedian(last_finite(values[..., None])))

@@ -202,7 +202,10 @@ def check_models(models: Any) -> list[str]:
         raise InputError(
             f"models is {_shown(models)}, must be a name or a list of names such as ['mbkf21_nhc', 'plus']"
         )
-    return [check_model(name) for name in names]
+    checked = [check_model(name) for name in names]
+    if twice := sorted({name for name in checked if checked.count(name) > 1}):
+        raise InputError(f"models: {', '.join(twice)} stands twice; name each filter once")
+    return checked
 
 
 def check_imu_type(imu_type: Any) -> None:
