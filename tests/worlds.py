@@ -47,14 +47,19 @@ SHIPPED_FLAGS = library.FLAGS  # of the compiler; rooms that only use a compiled
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Shapes are not checked in fixtures."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    compiled_filter.FLAGS = library.FLAGS = SHIPPED_FLAGS if room(item) == "onboard" else ("-O1", *SHIPPED_FLAGS[1:])
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_call(item: pytest.Item) -> None:
     """Shapes and types are checked where functions are tested one by one, at the beginning of the first case
     of every test: the others call the same functions with other numbers, and studies and commands by the thousand."""
-    checked = room(item) in SHAPES_CHECKED and item.stash[FIRST_CASE]
-    jaxtyping.config.update("jaxtyping_disable", not checked)
-    if checked:
+    if room(item) in SHAPES_CHECKED and item.stash[FIRST_CASE]:
+        jaxtyping.config.update("jaxtyping_disable", False)
         item.stash[CLOCK] = threading.Timer(SHAPES_CHECKED_S, jaxtyping.config.update, ("jaxtyping_disable", True))
         item.stash[CLOCK].start()
-    compiled_filter.FLAGS = library.FLAGS = SHIPPED_FLAGS if room(item) == "onboard" else ("-O1", *SHIPPED_FLAGS[1:])
 
 
 def pytest_runtest_teardown(item: pytest.Item) -> None:
