@@ -60,7 +60,7 @@ def scene(
         window = strapdown(state, clean[:, k], 1 / RATE, frame)
         state = window.end
         rows.append(state)
-        w_b = clean[:, k, -5:, 3:].mean(1)
+        w_b = clean[:, k, -1, 3:]
         swing.append(torch.linalg.cross(w_b, arm))
     truth = NavState(*(torch.stack(x, 1) for x in zip(*rows)))
     arm_n = (truth.C_nb @ arm[:, None, :, None]).squeeze(-1)

@@ -19,7 +19,7 @@ from dlkf.data.drive import Batch
 from dlkf.filters.advice import NetworkOutput
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import TangentFrame
-from dlkf.navigation.error_model import RATE_AVERAGE_S, antenna
+from dlkf.navigation.error_model import ARM_RATE_S, RATE_AVERAGE_S, antenna
 from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import Window, strapdown
 
@@ -43,8 +43,8 @@ class Epoch(NamedTuple):
     start: NavState  # at the window's start, after the last correction
     window: Window
     at_fix: NavState  # the window's end, or where a late fix was taken
-    rate_b: Tensor  # (B, 3) corrected angular rate at the window's end
-    rate_at_fix_b: Tensor  # (B, 3) and where a late fix was taken
+    rate_b: Tensor  # (B, 3) corrected angular rate at the window's end, mean of 0.1 s
+    rate_at_fix_b: Tensor  # (B, 3) and where the fix was taken, mean of 0.02 s
     z: Tensor  # (B, 6) GNSS − prediction, zero where not used
     fix: Fix
     lever_arm_b: Tensor | None  # (B, 3); None: the antenna is at the IMU
@@ -168,7 +168,11 @@ def advance(
     tail = max(1, min(imu.shape[1], round(RATE_AVERAGE_S / dt)))
     at_fix = prior if fix.lag is None else window.before(fix.lag, dt)
     rate_b = corrected[:, -tail:, 3:].sum(1) / tail
-    rate_at_fix_b = rate_b if fix.lag is None else rate_before(corrected[..., 3:], fix.lag / dt, tail)
+    few = max(1, min(tail, round(ARM_RATE_S / dt)))
+    if fix.lag is None:
+        rate_at_fix_b = corrected[:, -few:, 3:].sum(1) / few
+    else:
+        rate_at_fix_b = rate_before(corrected[..., 3:], fix.lag / dt, few)
     predicted = antenna(at_fix, rate_at_fix_b, lever_arm_b, frame)
     z = (fix.value - predicted) * fix.used
     epoch = Epoch(imu, corrected, error, state, window, at_fix, rate_b, rate_at_fix_b, z, fix, lever_arm_b, dt, frame)

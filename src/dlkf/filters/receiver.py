@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dlkf.filters.integration import Epoch, rate_before
 from dlkf.navigation.attitude import skew
-from dlkf.navigation.error_model import RATE_AVERAGE_S, antenna
+from dlkf.navigation.error_model import ARM_RATE_S, antenna
 from dlkf.navigation.state import POSITION, ErrorStates, NavState
 
 DELAY = "fix_delay_s"
@@ -69,8 +69,8 @@ def predict_fix(epoch: Epoch, parameters: Mapping[str, Tensor]) -> Epoch:
         lag = lag + epoch.fix.lag
     within = lag.clamp(0.0, (M - 1) * dt)
     at_fix = epoch.window.before(within, dt)
-    tail = max(1, min(M, round(RATE_AVERAGE_S / dt)))
-    rate, beyond = rate_before(epoch.corrected[..., 3:], within / dt, tail), (lag - within).unsqueeze(-1)
+    few = max(1, min(M, round(ARM_RATE_S / dt)))
+    rate, beyond = rate_before(epoch.corrected[..., 3:], within / dt, few), (lag - within).unsqueeze(-1)
     p, v = antenna(at_fix, rate, arm, epoch.frame).split(3, -1)
     a = _acceleration(epoch)
     predicted = torch.cat((p - beyond * v + 0.5 * beyond.square() * a, v - beyond * a), -1)

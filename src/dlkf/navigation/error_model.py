@@ -36,7 +36,8 @@ SOURCES = {
 }
 DRIVEN = slice(VELOCITY.start, GYRO.stop)  # four blocks of three columns of Φ, one per source
 PLAIN = ErrorStates()
-RATE_AVERAGE_S = 0.1  # the lever-arm velocity uses the mean rate over so long before the fix
+RATE_AVERAGE_S = 0.1  # of the mean rate at a boundary, in vehicle constraints and at a start
+ARM_RATE_S = 0.02  # the same for the velocity of the lever arm: a mean of 0.1 s lags, and on roads the arm seems short
 
 
 @dataclass(frozen=True)
