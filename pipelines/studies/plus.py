@@ -32,8 +32,8 @@ import pandas as pd
 import torch
 import yaml
 from pipelines.studies.ablations.plus_parts import parts
-from pipelines.studies.descent import tune_by_gradient
 from pipelines.studies.simulated_laws import COMMON, INJECTED, PYTHON_INS, SILENT, SIMULATED, simulate_sets
+from pipelines.studies.tuning.descent import tune_by_gradient
 
 from dlkf.base.errors import InputError
 from dlkf.base.provenance import describe_provenance

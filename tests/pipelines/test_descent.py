@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from pipelines.studies.descent import FACTORS, ScaledFilter, tune_by_gradient
+from pipelines.studies.tuning.descent import FACTORS, ScaledFilter, tune_by_gradient
 
 from dlkf.data.masks import withhold_fixes
 from dlkf.evaluation.outages import OutagePlan
