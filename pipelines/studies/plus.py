@@ -154,13 +154,12 @@ def constants() -> dict[str, Estimator]:
 
 
 def found_noise(drives: Sequence[Drive]) -> dict[str, Estimator]:
-    """The same filters with the noise that ``imu=auto`` finds on the drives, alone and with the sources of ``plus``."""
-    evidence, filters = Evidence.of(drives), {}
-    for kind in CONSTANTS:
-        found = find_noise(
-            evidence, kind, imu_preset("automotive_mems"), Tuning(), delay=False, compiler=compile_or_keep
-        )
-        for name in (kind, kind + SOURCES):
+    """The same filters with the noise that ``imu=auto`` finds for each on the drives."""
+    evidence, imu, filters = Evidence.of(drives), imu_preset("automotive_mems"), {}
+    for sources in ("", SOURCES):
+        for kind in CONSTANTS:
+            name = kind + sources
+            found = find_noise(evidence, name, imu, Tuning(), delay=False, compiler=compile_or_keep)
             filters[f"{name} auto"] = build_causal(name, found.imu, "no", tuning=found.tuning)
     return filters
 

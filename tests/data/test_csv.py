@@ -221,6 +221,16 @@ def test_mistakes_in_the_files(tmp_path, tables):
         list(log_reader().read(tmp_path / "b"))
 
 
+def test_a_column_that_is_missing_is_named_with_its_key_and_files_that_are_not_read_with_theirs(tmp_path, tables):
+    _plain(tmp_path, tables)
+    (drive,) = log_reader().read(tmp_path)
+    assert "files that are not read: reference.csv" in drive.notes
+    with pytest.raises(InputError, match=r"no column 'alt'.*set reader\.gnss\.position\.columns$"):
+        list(log_reader(gnss__position={"columns": ["lat_deg", "lon_deg", "alt"]}).read(tmp_path))
+    with pytest.raises(InputError, match=r"no column 'stamp'.*set reader\.imu\.time\.column$"):
+        list(log_reader(imu__time={"column": "stamp"}).read(tmp_path))
+
+
 def test_drives_are_split_at_gaps(tmp_path, tables):
     imu = tables["imu"]
     holes = imu[~imu.t.between(20.0, 21.5) & ~imu.t.between(25.0, 26.0)]

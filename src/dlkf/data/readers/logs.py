@@ -25,7 +25,7 @@ from dlkf.data.readers.archives import drive_name, drive_places, is_archive, unp
 from dlkf.data.readers.contract import gnss_frame, imu_frame, reference_frame
 from dlkf.data.readers.formats import rosbag
 from dlkf.data.readers.frames import DriveFrames, Place
-from dlkf.data.readers.mapping import SOURCE, Mapped, Spec, check_keys, respaced, selected, unused
+from dlkf.data.readers.mapping import SOURCE, Mapped, Spec, check_keys, join_some, respaced, selected, unused
 from dlkf.data.readers.settling import AUTO, Unsure, open_settings, placeholders, settle
 from dlkf.data.readers.sharing import layout
 from dlkf.data.readers.stamps import epoch_note
@@ -146,6 +146,7 @@ class LogReader:
         notes = [note for part in every.values() for one in (part, *part.parts.values()) for note in one.table.notes]
         notes += [note for part in mapped.values() if (note := epoch_note(part)) is not None]
         said = (*dict.fromkeys((*notes, *unused(every))), *_velocities_left(mapped.get("gnss")), *found, *of_aids)
+        said = said if only is not None else (*_files_left(folder, every), *said)
         return DriveFrames(meta, frames["imu"], frames.get("gnss"), frames.get("reference"), said, mapping, aids)
 
     def _times(self, mapped: Mapping[str, Mapped]) -> tuple[int, dict[str, np.ndarray]]:
@@ -253,6 +254,14 @@ def _joined(whole: Mapped, parts: Mapping[str, Mapped]) -> Mapped:
         brought[key] = replace(part, table=replace(part.table, frame=frame))
     joined = replace(whole, parts=brought)
     return joined if keep.all() else joined.rows(keep)
+
+
+def _files_left(folder: Path, mapped: Mapping[str, Mapped]) -> list[str]:
+    """A line on files beside those that were read, of the same suffixes."""
+    read = {p.table.path.name for whole in mapped.values() for p in (whole, *whole.parts.values())}
+    suffixes = {Path(name).suffix.lower() for name in read} - {""}
+    left = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in suffixes and p.name not in read)
+    return [f"files that are not read: {join_some(left)}"] if left else []
 
 
 def _velocities_left(gnss: Mapped | None) -> list[str]:

@@ -217,13 +217,14 @@ class Mapped:
         return self.table.frame[name]
 
     def _entry_to_set(self, name: str) -> str:
-        """How to mend a mapping that names a column which is not there; an entry that a log need not have is null."""
-        for key in OPTIONAL:
-            for word in ("columns", "column"):
-                named = (self.spec.get(key) or {}).get(word)
+        """The key that names a column which is not there; an entry that a log need not have may be null."""
+        for key in ("time", *GROUPS[self.kind]):
+            entry = self.spec.get(key)
+            for word in ("columns", "column") if isinstance(entry, Mapping) else ():
+                named = entry.get(word)
                 if name in ([named] if isinstance(named, (str, int)) else [str(n) for n in named or ()]):
-                    entry = f"reader.{self.kind}.{key}.{word}"
-                    return f"set {entry}, {entry}=null if the log has none"
+                    place = f"reader.{self.kind}.{key}.{word}"
+                    return f"set {place}" + (f", {place}=null if the log has none" if key in OPTIONAL else "")
         return f"set it in reader.{self.kind}"
 
 
@@ -280,7 +281,7 @@ def unused(mapped: Mapping[str, Mapped]) -> list[str]:
             there.setdefault(name, [str(c) for c in part.table.frame.columns])
             used.setdefault(name, set()).update(_mentioned(part.spec))
     left = {name: [c for c in columns if c not in used[name]] for name, columns in there.items()}
-    return [f"columns of {name} that are not used: {_some(columns)}" for name, columns in left.items() if columns]
+    return [f"columns of {name} that are not used: {join_some(columns)}" for name, columns in left.items() if columns]
 
 
 def _mentioned(spec: Any) -> set[str]:
@@ -297,7 +298,8 @@ def _mentioned(spec: Any) -> set[str]:
     return found
 
 
-def _some(names: Sequence[str]) -> str:
+def join_some(names: Sequence[str]) -> str:
+    """Names after one another, the first :data:`MOST_NAMED` of them."""
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
     return ", ".join(names[:MOST_NAMED]) + more
 
