@@ -6,12 +6,14 @@ least of a stationary second than to the least of a moving one, without accelera
 Skog et al. 2010, within the filter's 1σ), and not against the filter's estimate of the speed: within 3σ, or within 2σ
 of at most 1 m/s where the two levels are not four times apart, since a smoother road may still come. A car without
 vibration has the same spread in both; then a standstill needs a speed below 0.5 m/s + 1σ, of which at most 0.5 m/s
-count, for minutes at constant speed show no acceleration and no turn either. While nothing is learned of a car, the
-filter's 1σ of tilt may not explain an acceleration.
+count, for minutes at constant speed show no acceleration and no turn either. So does one of a car of which nothing is
+learned, and there the filter's 1σ of tilt explains little of an acceleration. A speed above 0.5 m/s needs
+``DOUBTFUL_S``, for a car creeps as calmly for a second. Where a car has shaken as little for ``LONG_S`` as at a
+standstill, and shakes far more in motion, the filter's speed is wrong, within 6σ.
 
-Carrier-phase positions show motion as velocities do; positions with an error of metres do not, since the small 1σ after
-a wrong standstill would confirm it. Where fixes show a standstill for some seconds, its vibration does not matter: an
-idling engine can shake the IMU more than a smooth road does.
+Carrier-phase positions show motion as velocities do. Of positions with an error of metres, two that lie ``SPAN_S`` apart
+do: the filter's own 1σ shows nothing, for a wrong standstill would confirm itself. Where fixes show a standstill for
+some seconds, its vibration does not matter: an idling engine can shake the IMU more than a smooth road does.
 """
 
 from __future__ import annotations
@@ -42,6 +44,48 @@ PROVEN_S, PROVEN_SPEED = 3.0, 0.2  # s without acceleration or turn, m/s beyond 
 # m/s: where the samples do not separate the two, a standstill needs a smaller 1σ of the speed
 SILENT_STD = 0.5
 LEAST_S = 1.0  # of a standstill: shorter update intervals are taken together
+DOUBTFUL_S = 2.0  # of one at which the filter's speed is above PLAUSIBLE_SPEED: a car creeps for a second as calmly
+SPAN_S, SPAN_LEFT_S = 5.0, 10.0  # s between two positions that show a mean speed; longer ones show none
+SPAN_SIGMAS, SPAN_STANDING = 3.0, 0.3  # 1σ that a mean speed is beyond MOVING_SPEED; m/s, that of a standstill
+LONG_S, LONG_SIGMAS, ALIKE = 10.0, 6.0, 2.0  # s, 1σ of the speed: of a standstill at most so many times its level
+
+
+class PositionSpan(NamedTuple):
+    """Positions of a receiver that gives no velocity, some seconds apart: the mean speed between them."""
+
+    place: Tensor  # (B, 2) m, of the IMU in n by the fix that the span begins with; NaN: none
+    age_s: Tensor  # (B,) s since
+    moving: Tensor  # (B,) least level since, in seconds in which the filter moves; inf: none
+    still: Tensor  # (B,) least level since, in seconds without acceleration or turn
+
+    @classmethod
+    def begin(cls, like: Tensor, batch_size: int) -> PositionSpan:
+        """Before the first fix."""
+        nothing = like.new_full((batch_size,), math.inf)
+        return cls(like.new_full((batch_size, 2), math.nan), torch.zeros_like(nothing), nothing, nothing)
+
+    def after(
+        self, epoch: Epoch, fixed: Bool[Tensor, " B"], level: Float[Tensor, " B"], moves: Bool[Tensor, " B"],
+        still: Bool[Tensor, " B"],
+    ) -> tuple[PositionSpan, Float[Tensor, " B"], Float[Tensor, " B"]]:  # fmt: skip
+        """After a window, ``fixed`` by a position that counts; and the levels of a stationary and of a moving second
+        that the span shows, inf: none."""
+        infinite = torch.full_like(level, math.inf)
+        age = self.age_s + epoch.dt * epoch.imu.shape[1]
+        least = torch.minimum(self.moving, torch.where(moves, level, infinite))
+        least_still = torch.minimum(self.still, torch.where(still, level, infinite))
+        place = epoch.at_fix.p_n[:, :2] + epoch.z[:, :2]
+        speed = (place - self.place).norm(dim=-1) / age
+        std = math.sqrt(2) * epoch.fix.std[:, :2].amax(-1) / age
+        ends = fixed & (self.place.isnan().any(-1) | (age >= SPAN_S))
+        shows = ends & (age <= SPAN_LEFT_S)
+        moving = torch.where(shows & (speed - SPAN_SIGMAS * std > MOVING_SPEED), least, infinite)
+        standing = torch.where(shows & (speed < SPAN_STANDING), least_still, infinite)
+        span = PositionSpan(
+            torch.where(ends.unsqueeze(-1), place, self.place), torch.where(ends, 0.0, age),
+            torch.where(ends, infinite, least), torch.where(ends, infinite, least_still),
+        )  # fmt: skip
+        return span, standing, moving
 
 
 class VibrationLevel(NamedTuple):
@@ -50,12 +94,15 @@ class VibrationLevel(NamedTuple):
     standing: Tensor  # (B,) least level of a stationary second
     moving: Tensor  # (B,) likewise
     still_s: Tensor  # (B,) s without acceleration or turn
+    calm_s: Tensor  # (B,) s of these at a level that may be a standstill, less those that were not
+    rest_s: Tensor  # (B,) s of these at the level of one
+    span: PositionSpan
 
     @classmethod
     def begin(cls, like: Tensor, batch_size: int) -> VibrationLevel:
         """Before the first sample."""
-        nothing = like.new_full((batch_size,), math.inf)
-        return cls(nothing, nothing, like.new_zeros(batch_size))
+        nothing, zero = like.new_full((batch_size,), math.inf), like.new_zeros(batch_size)
+        return cls(nothing, nothing, zero, zero, zero, PositionSpan.begin(like, batch_size))
 
     def thresholds(
         self, prior: Float[Tensor, " 1"]
@@ -67,12 +114,13 @@ class VibrationLevel(NamedTuple):
         distinct, surely = moving > DISTINCT * standing, moving > SURELY_DISTINCT * standing
         return torch.where(distinct, (standing * moving).sqrt(), prior / APART), distinct, surely
 
-    def update(self, now: Tensor, standing: Tensor, moving: Tensor, span: float) -> VibrationLevel:
-        """After a window of ``span`` seconds in which the car was surely stationary, or moving, or neither."""
+    def update(self, standing: Tensor, moving: Tensor, span: float) -> VibrationLevel:
+        """After ``span`` seconds with the levels of a second in which the car was surely stationary, or moving; inf:
+        neither."""
         fade = math.exp(span / MEMORY_S)
         return self._replace(
-            standing=torch.where(standing, torch.minimum(fade * self.standing, now), self.standing),
-            moving=torch.where(moving, torch.minimum(fade * self.moving, now), self.moving),
+            standing=torch.where(standing.isinf(), self.standing, torch.minimum(fade * self.standing, standing)),
+            moving=torch.where(moving.isinf(), self.moving, torch.minimum(fade * self.moving, moving)),
         )
 
 
@@ -109,29 +157,51 @@ def detect_stationary(
     span = epoch.dt * epoch.imu.shape[1]
     v, diagonal = epoch.window.end.v_n, P.diagonal(dim1=-2, dim2=-1)
     speed, std = v[:, :2].norm(dim=-1), diagonal[:, VELOCITY][:, :2].sum(-1).sqrt()
-    tilt, accel = diagonal[:, ATTITUDE][:, :2].sum(-1), diagonal[:, ACCEL].sum(-1)
     gained = (v - epoch.start.v_n)[:, :2].norm(dim=-1) / span
-    doubt = 2 * (NOMINAL_GRAVITY**2 * tilt + accel).sqrt()  # of the acceleration
+    doubt = 2 * _acceleration_std(P, epoch.window.end.C_nb)
     unlearned = before.standing.isinf() & before.moving.isinf()
     still = (gained < STILL_ACCEL + torch.where(unlearned, doubt.clamp_max(UNLEARNED_ACCEL), doubt)) & (
         turning.norm(dim=-1) < STILL_RATE + 2 * diagonal[:, GYRO].sum(-1).sqrt()
     )
-    exact = epoch.used[:, :2].all(-1) & (epoch.fix.std[:, :2].amax(-1) < CARRIER_STD)
-    sure = (epoch.used[:, 3:5].all(-1) | exact) & (std < SURE_STD)
+    fixed, with_velocity = epoch.used[:, :2].all(-1), epoch.used[:, 3:5].all(-1)
+    exact = fixed & (epoch.fix.std[:, :2].amax(-1) < CARRIER_STD)
+    sure = (with_velocity | exact) & (std < SURE_STD)
     standing, moving = sure & (speed + std < STANDING_SPEED), sure & (speed - std > MOVING_SPEED)
     if wheel is not None:
         stopped = wheel.stopped & still
         standing, moving = standing & ~wheel.rolling | stopped, (moving | wheel.rolling) & ~stopped
     still_s = torch.where(still, before.still_s + span, 0.0)
-    after = before.update(level, standing, moving, span)._replace(still_s=still_s)
+    positions, *of_span = before.span.after(epoch, fixed & ~with_velocity & ~exact, level, speed > MOVING_SPEED, still)
+    shown = (torch.where(x, level, math.inf).minimum(y) for x, y in zip((standing, moving), of_span))
+    after = before.update(*shown, span)._replace(still_s=still_s, span=positions)
     # like spectra: a wide 1σ would admit any speed, so only a speed that is nearly zero and known to be counts
     limit, distinct, surely = after.thresholds(prior)
+    calm = level <= limit
+    calm_s = torch.where(still, (before.calm_s + torch.where(calm, span, -span)).clamp_min(0.0), 0.0)
+    least = ALIKE * torch.minimum(after.standing, after.moving / APART)  # inf: nothing learned
+    rest_s = torch.where(still & surely & (level <= least) & ~after.moving.isinf(), before.rest_s + span, 0.0)
+    after = after._replace(calm_s=calm_s, rest_s=rest_s)
+    learned = ~(after.standing.isinf() & after.moving.isinf())
     doubt = torch.where(distinct, (2 * std).clamp_max(DOUBTFUL_SPEED), std.clamp_max(SILENT_STD))
     doubt = torch.where(surely, PLAUSIBLE_SIGMAS * std, doubt)
-    plausible = speed < PLAUSIBLE_SPEED + doubt
-    stationary = (level <= limit) & still & (still_s > LEAST_S - 0.5 * span) & plausible
+    doubt = torch.where(learned, doubt, std.clamp_max(SILENT_STD))
+    slow = (speed < PLAUSIBLE_SPEED) & (still_s > LEAST_S - 0.5 * span)
+    plausible = (speed < PLAUSIBLE_SPEED + doubt) & (calm_s > DOUBTFUL_S - 0.5 * span)
+    long = (speed < LONG_SIGMAS * std) & (rest_s > LONG_S - 0.5 * span)
+    stationary = calm & still & (slow | plausible) | long
     proven = sure & still & (still_s > PROVEN_S - 0.5 * span) & (speed + 2 * std < PROVEN_SPEED)
     stationary = stationary | proven
     if wheel is not None:
         stationary = stationary & ~wheel.rolling | stopped
     return stationary, after
+
+
+def _acceleration_std(P: Float[Tensor, "B n n"], C_nb: Float[Tensor, "B 3 3"]) -> Float[Tensor, " B"]:
+    """1σ of the horizontal acceleration [m/s²]: δa = f × δh + C ε with f of a car that hardly accelerates. At a
+    standstill tilt and bias cancel each other."""
+    g = NOMINAL_GRAVITY
+    gravity = C_nb.new_tensor(((0.0, g), (-g, 0.0))).expand(len(C_nb), 2, 2)
+    J = torch.cat((gravity, C_nb[:, :2]), -1)  # tilt, accelerometers
+    tilt, accel = P[:, ATTITUDE][:, :2], P[:, ACCEL]
+    rows = (torch.cat((x[:, :, ATTITUDE][..., :2], x[:, :, ACCEL]), -1) for x in (tilt, accel))
+    return torch.einsum("bij,bjk,bik->b", J, torch.cat(tuple(rows), 1), J).clamp_min(0.0).sqrt()

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dlkf.filters import learned, model_based, plus
+from dlkf.filters import constraints, learned, model_based, plus
 from dlkf.filters.gating import GateMemory
 from dlkf.navigation.earth import TangentFrame, tangent_frame
 from dlkf.navigation.geodetic import geodetic_from_ecef
@@ -105,6 +105,15 @@ def _(
         P=change.covariance(memory.P), windows=windows, fix=memory.fix._replace(gate=gate),
         sources=sources, noise=noise,
     )  # fmt: skip
+
+
+@reanchor.register
+def _(memory: constraints.CarMemory, change: FrameChange, fresh: constraints.CarMemory) -> constraints.CarMemory:
+    """The place of a fix; its height moves a horizontal place by nothing that matters in a span of seconds."""
+    level = memory.liveliness
+    place = torch.nn.functional.pad(level.span.place, (0, 1))
+    span = level.span._replace(place=change.new.from_ecef(change.old.to_ecef(place))[:, :2].to(place.dtype))
+    return memory._replace(liveliness=level._replace(span=span))
 
 
 @reanchor.register
