@@ -11,7 +11,7 @@ learned, and there the filter's 1σ of tilt explains little of an acceleration. 
 ``DOUBTFUL_S``, for a car creeps as calmly for a second. Where a car has shaken as little for ``LONG_S`` as at a
 standstill, and shakes far more in motion, the filter's speed is wrong, within 6σ.
 
-Carrier-phase positions show motion as velocities do. Of positions with an error of metres, two that lie ``SPAN_S`` apart
+Carrier-phase positions show motion as velocities do. Of positions that are off by metres, two that lie ``SPAN_S`` apart
 do: the filter's own 1σ shows nothing, for a wrong standstill would confirm itself. Where fixes show a standstill for
 some seconds, its vibration does not matter: an idling engine can shake the IMU more than a smooth road does.
 """
@@ -36,7 +36,7 @@ APART = 10.0  # prior ratio of the level of a moving car to that of a stationary
 # ratios of moving to standing: below the first the samples do not separate the two, above the second they surely do
 DISTINCT, SURELY_DISTINCT = 2.0, 4.0
 MEMORY_S = 100.0  # s, stationary or moving, in which a level grows by e, so that a wrong second decays
-STILL_ACCEL, STILL_RATE = 0.2, 0.01  # m/s², rad/s: with less, beyond the filter's 2σ, a car may be stationary
+STILL_ACCEL, STILL_RATE = 0.1, 0.01  # m/s², rad/s: with less, beyond the filter's 2σ, a car may be stationary
 UNLEARNED_ACCEL = 0.3  # m/s²: at most so much of the filter's 2σ counts while nothing is learned of the car
 PLAUSIBLE_SPEED, PLAUSIBLE_SIGMAS = 0.5, 3.0  # m/s, 1σ: a standstill must not contradict the filter
 DOUBTFUL_SPEED = 1.0  # m/s, at most so much of 2σ where the samples separate the two, but not surely
@@ -47,6 +47,7 @@ LEAST_S = 1.0  # of a standstill: shorter update intervals are taken together
 DOUBTFUL_S = 2.0  # of one at which the filter's speed is above PLAUSIBLE_SPEED: a car creeps for a second as calmly
 SPAN_S, SPAN_LEFT_S = 5.0, 10.0  # s between two positions that show a mean speed; longer ones show none
 SPAN_SIGMAS, SPAN_STANDING = 3.0, 0.3  # 1σ that a mean speed is beyond MOVING_SPEED; m/s, that of a standstill
+LONG_ACCEL = 0.2  # m/s², instead of STILL_ACCEL, of a long rest: a filter with a wrong speed has a wrong tilt
 LONG_S, LONG_SIGMAS, ALIKE = 10.0, 6.0, 2.0  # s, 1σ of the speed: of a standstill at most so many times its level
 
 
@@ -160,9 +161,9 @@ def detect_stationary(
     gained = (v - epoch.start.v_n)[:, :2].norm(dim=-1) / span
     doubt = 2 * _acceleration_std(P, epoch.window.end.C_nb)
     unlearned = before.standing.isinf() & before.moving.isinf()
-    still = (gained < STILL_ACCEL + torch.where(unlearned, doubt.clamp_max(UNLEARNED_ACCEL), doubt)) & (
-        turning.norm(dim=-1) < STILL_RATE + 2 * diagonal[:, GYRO].sum(-1).sqrt()
-    )
+    doubt = torch.where(unlearned, doubt.clamp_max(UNLEARNED_ACCEL), doubt)
+    straight = turning.norm(dim=-1) < STILL_RATE + 2 * diagonal[:, GYRO].sum(-1).sqrt()
+    still, still_long = (straight & (gained < limit + doubt) for limit in (STILL_ACCEL, LONG_ACCEL))
     fixed, with_velocity = epoch.used[:, :2].all(-1), epoch.used[:, 3:5].all(-1)
     exact = fixed & (epoch.fix.std[:, :2].amax(-1) < CARRIER_STD)
     sure = (with_velocity | exact) & (std < SURE_STD)
@@ -179,7 +180,7 @@ def detect_stationary(
     calm = level <= limit
     calm_s = torch.where(still, (before.calm_s + torch.where(calm, span, -span)).clamp_min(0.0), 0.0)
     least = ALIKE * torch.minimum(after.standing, after.moving / APART)  # inf: nothing learned
-    rest_s = torch.where(still & surely & (level <= least) & ~after.moving.isinf(), before.rest_s + span, 0.0)
+    rest_s = torch.where(still_long & surely & (level <= least) & ~after.moving.isinf(), before.rest_s + span, 0.0)
     after = after._replace(calm_s=calm_s, rest_s=rest_s)
     learned = ~(after.standing.isinf() & after.moving.isinf())
     doubt = torch.where(distinct, (2 * std).clamp_max(DOUBTFUL_SPEED), std.clamp_max(SILENT_STD))
