@@ -183,11 +183,9 @@ def detect_stationary(
     rest_s = torch.where(still_long & surely & (level <= least) & ~after.moving.isinf(), before.rest_s + span, 0.0)
     after = after._replace(calm_s=calm_s, rest_s=rest_s)
     learned = ~(after.standing.isinf() & after.moving.isinf())
-    doubt = torch.where(distinct, (2 * std).clamp_max(DOUBTFUL_SPEED), std.clamp_max(SILENT_STD))
-    doubt = torch.where(surely, PLAUSIBLE_SIGMAS * std, doubt)
-    doubt = torch.where(learned, doubt, std.clamp_max(SILENT_STD))
     slow = (speed < PLAUSIBLE_SPEED) & (still_s > LEAST_S - 0.5 * span)
-    plausible = (speed < PLAUSIBLE_SPEED + doubt) & (calm_s > DOUBTFUL_S - 0.5 * span)
+    fastest = PLAUSIBLE_SPEED + _speed_doubt(std, learned & distinct, learned & surely)
+    plausible = (speed < fastest) & (calm_s > DOUBTFUL_S - 0.5 * span)
     long = (speed < LONG_SIGMAS * std) & (rest_s > LONG_S - 0.5 * span)
     stationary = calm & still & (slow | plausible) | long
     proven = sure & still & (still_s > PROVEN_S - 0.5 * span) & (speed + 2 * std < PROVEN_SPEED)
@@ -195,6 +193,14 @@ def detect_stationary(
     if wheel is not None:
         stationary = stationary & ~wheel.rolling | stopped
     return stationary, after
+
+
+def _speed_doubt(
+    std: Float[Tensor, " B"], distinct: Bool[Tensor, " B"], surely: Bool[Tensor, " B"]
+) -> Float[Tensor, " B"]:
+    """What of a stationary car's speed [m/s] its 1σ may explain, by how the samples separate rest and motion."""
+    doubt = torch.where(distinct, (2 * std).clamp_max(DOUBTFUL_SPEED), std.clamp_max(SILENT_STD))
+    return torch.where(surely, PLAUSIBLE_SIGMAS * std, doubt)
 
 
 def _acceleration_std(P: Float[Tensor, "B n n"], C_nb: Float[Tensor, "B 3 3"]) -> Float[Tensor, " B"]:
