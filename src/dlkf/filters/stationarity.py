@@ -172,9 +172,11 @@ def detect_stationary(
         stopped = wheel.stopped & still
         standing, moving = standing & ~wheel.rolling | stopped, (moving | wheel.rolling) & ~stopped
     still_s = torch.where(still, before.still_s + span, 0.0)
-    positions, *of_span = before.span.after(epoch, fixed & ~with_velocity & ~exact, level, speed > MOVING_SPEED, still)
-    shown = (torch.where(x, level, math.inf).minimum(y) for x, y in zip((standing, moving), of_span))
-    after = before.update(*shown, span)._replace(still_s=still_s, span=positions)
+    position_alone = fixed & ~with_velocity & ~exact
+    positions, at_rest, in_motion = before.span.after(epoch, position_alone, level, speed > MOVING_SPEED, still)
+    at_rest = torch.where(standing, level, math.inf).minimum(at_rest)
+    in_motion = torch.where(moving, level, math.inf).minimum(in_motion)
+    after = before.update(at_rest, in_motion, span)._replace(still_s=still_s, span=positions)
     # like spectra: a wide 1σ would admit any speed, so only a speed that is nearly zero and known to be counts
     limit, distinct, surely = after.thresholds(prior)
     calm = level <= limit

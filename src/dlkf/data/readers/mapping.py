@@ -220,8 +220,8 @@ class Mapped:
         """The key that names a column which is not there; an entry that a log need not have may be null."""
         for key in ("time", *GROUPS[self.kind]):
             entry = self.spec.get(key)
-            for word in ("columns", "column") if isinstance(entry, Mapping) else ():
-                named = entry.get(word)
+            for word in ("columns", "column"):
+                named = entry.get(word) if isinstance(entry, Mapping) else None
                 if name in ([named] if isinstance(named, (str, int)) else [str(n) for n in named or ()]):
                     place = f"reader.{self.kind}.{key}.{word}"
                     return f"set {place}" + (f", {place}=null if the log has none" if key in OPTIONAL else "")
