@@ -78,7 +78,7 @@ class PositionSpan(NamedTuple):
         place = epoch.at_fix.p_n[:, :2] + epoch.z[:, :2]
         speed = (place - self.place).norm(dim=-1) / age
         std = math.sqrt(2) * epoch.fix.std[:, :2].amax(-1) / age
-        ends = fixed & (self.place.isnan().any(-1) | (age >= SPAN_S))
+        ends = fixed & (self.place[:, 0].isnan() | (age >= SPAN_S))
         shows = ends & (age <= SPAN_LEFT_S)
         moving = torch.where(shows & (speed - SPAN_SIGMAS * std > MOVING_SPEED), least, infinite)
         standing = torch.where(shows & (speed < SPAN_STANDING), least_still, infinite)
