@@ -13,9 +13,11 @@ from dlkf.data.drive import EPOCHWISE, Batch
 from dlkf.filters.build import build_filter
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import integrate
-from dlkf.filters.stationarity import APART, MEMORY_S, VibrationLevel
+from dlkf.filters.stationarity import APART, MEMORY_S, VibrationLevel, _acceleration_std
 from dlkf.filters.tuning import Tuning
-from dlkf.navigation.state import NavState
+from dlkf.navigation.attitude import rotation_from_rpy, rotation_from_vector
+from dlkf.navigation.state import ACCEL, ATTITUDE, NavState
+from dlkf.navigation.strapdown import strapdown
 
 from .scene import IMU, M, scene
 from .test_constraints import drift, driven, outage, slipping
@@ -82,6 +84,30 @@ def test_a_smoother_road_than_any_before_is_no_standstill():
     batch = outage(replace(batch, imu=shaken_), 60, 160)
     taken = found(batch, "mbkf21_car", accel_noise=30.0, accel_walk=100.0)
     assert taken[:, 2:9].any() and not taken[:, 31:].any()
+
+
+def test_the_uncertainty_of_an_acceleration_is_that_of_the_strapdown():
+    """Tilt C = exp([δh×]) Ĉ and bias errors of a stationary car, pushed through the strapdown one by one: the mean
+    acceleration of a second, with a covariance in which tilt and bias hang together."""
+    base = scene(1, 1)
+    C = rotation_from_rpy(torch.tensor([[0.1, -0.2, 0.7]], dtype=D))
+    zero, g = torch.zeros(1, 3, dtype=D), base.frame.gravity(torch.zeros(1, 3, dtype=D))
+
+    def acceleration(tilt: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
+        """Of the truth where the estimate stands still: its attitude is turned, its samples have that much less."""
+        force = (-(C.mT @ g[..., None])[..., 0] - bias).expand(1, M, 3)
+        state = NavState(zero, zero, rotation_from_vector(tilt) @ C)
+        return strapdown(state, torch.cat((force, 0 * force), -1), base.dt, base.frame).end.v_n[0, :2]
+
+    step = 1e-5 * torch.eye(3, dtype=D)
+    at_rest = acceleration(zero, zero)
+    columns = [acceleration(x[None], zero) for x in step] + [acceleration(zero, x[None]) for x in step]
+    J = (torch.stack(columns, -1) - at_rest[:, None]) / 1e-5
+    A = torch.randn(9 + 6, 9 + 6, generator=torch.Generator().manual_seed(3), dtype=D)
+    P = (A @ A.mT)[None]
+    of = [*range(*ATTITUDE.indices(15)), *range(*ACCEL.indices(15))]
+    expected = (J @ P[0][of][:, of] @ J.mT).trace().sqrt()
+    torch.testing.assert_close(_acceleration_std(P, C)[0], expected, rtol=2e-3, atol=0)
 
 
 def found(batch, name: str = "mbkf15_nhc", **tuning: float):

@@ -257,6 +257,19 @@ def test_noise_goes_with_the_drive_into_another_frame(drive):
     assert not torch.equal(moved.windows.spread, other.windows.spread)
 
 
+def test_a_span_of_positions_begins_anew_in_another_frame(drive):
+    """Its places are in the axes of the old one."""
+    kalman, batch = build_filter("mbkf15_nhc", IMU), aligned_drives([drive], ALIGN)
+    fresh = kalman.begin(batch)[0]
+    (index,) = (k for k, x in enumerate(fresh.sources) if hasattr(x, "liveliness"))
+    car = fresh.sources[index]
+    level = car.liveliness
+    old = level._replace(still_s=level.still_s + 3, span=level.span._replace(place=torch.zeros_like(level.span.place)))
+    sources = (*fresh.sources[:index], car._replace(liveliness=old), *fresh.sources[index + 1 :])
+    moved = reanchor(fresh._replace(sources=sources), FrameChange(batch.frame, batch.frame), fresh).sources[index]
+    assert moved.liveliness.span.place.isnan().all() and (moved.liveliness.still_s == 3).all()
+
+
 def test_what_does_not_fit_is_refused_in_a_line(compiled, drive, monkeypatch, tmp_path):
     with pytest.raises(InputError, match="compiled for 50 samples"):
         compiled.begin(aligned_drives([drive_with(drive, 25)], ALIGN))

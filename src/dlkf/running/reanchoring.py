@@ -109,11 +109,8 @@ def _(
 
 @reanchor.register
 def _(memory: constraints.CarMemory, change: FrameChange, fresh: constraints.CarMemory) -> constraints.CarMemory:
-    """The place of a fix; its height moves a horizontal place by nothing that matters in a span of seconds."""
-    level = memory.liveliness
-    place = torch.nn.functional.pad(level.span.place, (0, 1))
-    span = level.span._replace(place=change.new.from_ecef(change.old.to_ecef(place))[:, :2].to(place.dtype))
-    return memory._replace(liveliness=level._replace(span=span))
+    """Without the place of the last fix, whose height is not kept: a span of some seconds begins anew."""
+    return memory._replace(liveliness=memory.liveliness._replace(span=fresh.liveliness.span))
 
 
 @reanchor.register
