@@ -253,11 +253,11 @@ def test_one_sample_an_epoch_has_no_spread():
     sources = tuple(Hearing(s.tuning, s.states) if isinstance(s, CarConstraints) else s for s in kalman.sources)
     solution = integrate(slow, replace(kalman, sources=sources))
     assert len(heard) == 100 and solution.posterior.p_n.isfinite().all() and solution.std.isfinite().all()
-    assert not any(x.isnan().any() for x in heard[-1][:-1])
+    assert not any(x.isnan().any() for x in heard[-1][:5])
 
 
 def test_what_is_heard_sets_the_limit_half_way():
-    nothing = VibrationLevel.begin(torch.zeros(1, dtype=D), 3)
+    nothing = VibrationLevel.begin(scene(3, 1))
     prior = torch.tensor([3e-3], dtype=D)
     none = torch.full((3,), math.inf, dtype=D)
     torch.testing.assert_close(nothing.thresholds(prior)[0], prior.expand(3) / APART**0.5)
@@ -270,7 +270,7 @@ def test_what_is_heard_sets_the_limit_half_way():
 
 def test_a_wrong_second_is_forgotten():
     """Multipath that moves a standing car teaches that moving is quiet; later seconds of motion mend it."""
-    heard = VibrationLevel.begin(torch.zeros(1, dtype=D), 1)
+    heard = VibrationLevel.begin(scene(1, 1))
     none = torch.full((1,), math.inf, dtype=D)
     heard = heard.update(none, torch.tensor([1e-4], dtype=D), 1.0)
     for _ in range(int(5 * MEMORY_S)):

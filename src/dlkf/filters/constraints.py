@@ -66,8 +66,7 @@ class CarConstraints:
         """No standstill so far, and the 1σ of the rows."""
         t, new = self.tuning, batch.imu.new_tensor
         std = [t.lateral_std, t.vertical_std] + [t.rest_velocity_std] * 3 + [t.rest_rate_std] * 3
-        level = VibrationLevel.begin(batch.imu, batch.size[0])
-        return CarMemory(new([std]), level, new([t.rest_accel * t.rest_gyro]))
+        return CarMemory(new([std]), VibrationLevel.begin(batch), new([t.rest_accel * t.rest_gyro]))
 
     def rows(self, epoch: Epoch, memory: CarMemory, prediction: Predicted) -> tuple[Measurement, CarMemory]:
         """NHC (2 rows), zero velocity (3), zero angular rate (3)."""

@@ -1,7 +1,9 @@
 """Stationarity detection, from the samples of a window and the vibration levels of this car at rest and in motion.
 
-Engines idle differently and IMUs are noisy differently, so no fixed limit on the samples' spread fits two cars: the
-levels are learned while GNSS shows whether the car moves. A standstill is then a window whose level is closer to the
+An idling engine shakes an IMU at 10 Hz and more, and can do so more than a smooth road; a car that moves also sways
+and pitches more slowly. So the level is that of means over ``AVERAGE_S``, in which the noise of the sensors is smaller
+too. IMUs and roads differ, so no fixed limit on it fits two cars: the levels are learned while GNSS shows whether the
+car moves. A standstill is then a window whose level is closer to the
 least of a stationary second than to the least of a moving one, without acceleration or turn (the hypothesis of
 Skog et al. 2010, within the filter's 1σ), and not against the filter's estimate of the speed: within 3σ, or within 2σ
 of at most 1 m/s where the two levels are not four times apart, since a smoother road may still come. A car without
@@ -13,7 +15,7 @@ standstill, and shakes far more in motion, the filter's speed is wrong, within 6
 
 Carrier-phase positions show motion as velocities do. Of positions that are off by metres, two that lie ``SPAN_S`` apart
 do: the filter's own 1σ shows nothing, for a wrong standstill would confirm itself. Where fixes show a standstill for
-some seconds, its vibration does not matter: an idling engine can shake the IMU more than a smooth road does.
+some seconds, its vibration does not matter.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dlkf.data.drive import Batch
 from dlkf.filters.integration import Epoch
 from dlkf.navigation.earth import NOMINAL_GRAVITY
 from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, VELOCITY
@@ -44,11 +47,57 @@ PROVEN_S, PROVEN_SPEED = 3.0, 0.2  # s without acceleration or turn, m/s beyond 
 # m/s: where the samples do not separate the two, a standstill needs a smaller 1σ of the speed
 SILENT_STD = 0.5
 LEAST_S = 1.0  # of a standstill: shorter update intervals are taken together
+AVERAGE_S = 0.1  # of the samples: a car in motion sways and pitches more slowly, an engine shakes faster
 DOUBTFUL_S = 2.0  # of one at which the filter's speed is above PLAUSIBLE_SPEED: a car creeps for a second as calmly
 SPAN_S, SPAN_LEFT_S = 5.0, 10.0  # s between two positions that show a mean speed; longer ones show none
 SPAN_SIGMAS, SPAN_STANDING = 3.0, 0.3  # 1σ that a mean speed is beyond MOVING_SPEED; m/s, that of a standstill
 LONG_ACCEL = 0.2  # m/s², instead of STILL_ACCEL, of a long rest: a filter with a wrong speed has a wrong tilt
 LONG_S, LONG_SIGMAS, ALIKE = 10.0, 6.0, 2.0  # s, 1σ of the speed: of a standstill at most so many times its level
+
+
+class LastSecond(NamedTuple):
+    """The samples of the last second, as means over ``AVERAGE_S`` or the update intervals that are shorter."""
+
+    means: Tensor | None  # (B, k, 6), NaN: not yet; None: an update interval has them all
+
+    @classmethod
+    def begin(cls, batch: Batch) -> LastSecond:
+        """Before the first sample."""
+        B, _, M = batch.size
+        parts = _Parts.of(M, batch.dt)
+        if parts.count <= parts.each:
+            return cls(None)
+        return cls(batch.imu.new_full((B, parts.count, 6), math.nan))
+
+    def after(self, imu: Float[Tensor, "B M 6"], dt: float) -> tuple[LastSecond, Float[Tensor, " B"] | None]:
+        """After the samples of an update interval, and the vibration level; None: too few samples for one."""
+        parts = _Parts.of(imu.shape[1], dt)
+        means = imu[:, imu.shape[1] - parts.each * parts.samples :]
+        if parts.samples > 1:
+            means = means.unflatten(1, (parts.each, parts.samples)).mean(2)
+        if self.means is not None:
+            means = torch.cat((self.means, means), 1)[:, -parts.count :]
+        boxes = means.unflatten(1, (-1, parts.together)).mean(2) if parts.together > 1 else means
+        level = vibration_level(boxes) if boxes.shape[1] > 1 else None
+        return LastSecond(None if self.means is None else means), level
+
+
+class _Parts(NamedTuple):
+    """How a second is cut: ``each`` means of ``samples`` an update interval, ``together`` of which are averaged again,
+    and ``count`` of which are kept."""
+
+    samples: int
+    each: int
+    together: int
+    count: int
+
+    @classmethod
+    def of(cls, M: int, dt: float) -> _Parts:
+        """For M samples an update interval."""
+        samples = min(M, max(1, round(AVERAGE_S / dt)))
+        each, together = M // samples, max(1, round(AVERAGE_S / (samples * dt)))
+        boxes = max(round(LEAST_S / (together * samples * dt)), each // together, 1)
+        return cls(samples, each, together, together * boxes)
 
 
 class PositionSpan(NamedTuple):
@@ -90,7 +139,8 @@ class PositionSpan(NamedTuple):
 
 
 class VibrationLevel(NamedTuple):
-    """Vibration levels of a car: spread of specific force times spread of rate [m/s² rad/s]; inf: nothing yet."""
+    """Vibration levels of a car: spread of specific force times spread of rate [m/s² rad/s], of means over
+    ``AVERAGE_S``; inf: nothing yet."""
 
     standing: Tensor  # (B,) least level of a stationary second
     moving: Tensor  # (B,) likewise
@@ -98,12 +148,14 @@ class VibrationLevel(NamedTuple):
     calm_s: Tensor  # (B,) s of these at a level that may be a standstill, less those that were not
     rest_s: Tensor  # (B,) s of these at the level of one
     span: PositionSpan
+    second: LastSecond
 
     @classmethod
-    def begin(cls, like: Tensor, batch_size: int) -> VibrationLevel:
+    def begin(cls, batch: Batch) -> VibrationLevel:
         """Before the first sample."""
-        nothing, zero = like.new_full((batch_size,), math.inf), like.new_zeros(batch_size)
-        return cls(nothing, nothing, zero, zero, zero, PositionSpan.begin(like, batch_size))
+        like, B = batch.imu, batch.size[0]
+        nothing, zero = like.new_full((B,), math.inf), like.new_zeros(B)
+        return cls(nothing, nothing, zero, zero, zero, PositionSpan.begin(like, B), LastSecond.begin(batch))
 
     def thresholds(
         self, prior: Float[Tensor, " 1"]
@@ -132,13 +184,12 @@ class WheelMotion(NamedTuple):
     stopped: Tensor  # (B,) bool
 
 
-def vibration_level(imu: Float[Tensor, "B M 6"]) -> Float[Tensor, " B"]:
-    """Spread of specific force times spread of rate in a window [m/s² rad/s]; of one sample there is none."""
-    if imu.shape[1] < 2:
-        return torch.zeros_like(imu[:, 0, 0])
-    swing = imu - imu.mean(1, keepdim=True)  # torch's var of a middle axis takes four times as long
-    force, rate = (swing.square().sum(1) / (imu.shape[1] - 1)).unflatten(-1, (2, 3)).sum(-1).unbind(-1)
-    return (force * rate).sqrt()
+def vibration_level(means: Float[Tensor, "B k 6"]) -> Float[Tensor, " B"]:
+    """Spread of specific force times spread of rate [m/s² rad/s]; inf where one is not known yet."""
+    swing = means - means.mean(1, keepdim=True)  # torch's var of a middle axis takes four times as long
+    force, rate = (swing.square().sum(1) / (means.shape[1] - 1)).unflatten(-1, (2, 3)).sum(-1).unbind(-1)
+    level = (force * rate).sqrt()
+    return torch.where(level.isnan(), math.inf, level)
 
 
 @torch.no_grad()
@@ -148,13 +199,13 @@ def detect_stationary(
 ) -> tuple[Bool[Tensor, " B"], VibrationLevel]:  # fmt: skip
     """Whether the car was stationary in the window, and the levels after it; ``turning`` is its mean rate [rad/s].
 
-    Of one sample there is no spread: the levels stay, and no standstill is found. A ``wheel`` that rolls forbids a
+    Of one sample a second there is no spread: the levels stay, and no standstill is found. A ``wheel`` that rolls forbids a
     standstill, one that is stopped makes it where the samples show neither acceleration nor turn, at any vibration;
     and both give levels of this car where GNSS gives no velocity.
     """
-    if epoch.imu.shape[1] < 2:
+    second, level = before.second.after(epoch.imu, epoch.dt)
+    if level is None:
         return torch.zeros_like(before.standing) > 0, before
-    level = vibration_level(epoch.imu)
     span = epoch.dt * epoch.imu.shape[1]
     v, diagonal = epoch.window.end.v_n, P.diagonal(dim1=-2, dim2=-1)
     speed, std = v[:, :2].norm(dim=-1), diagonal[:, VELOCITY][:, :2].sum(-1).sqrt()
@@ -176,7 +227,7 @@ def detect_stationary(
     positions, at_rest, in_motion = before.span.after(epoch, position_alone, level, speed > MOVING_SPEED, still)
     at_rest = torch.where(standing, level, math.inf).minimum(at_rest)
     in_motion = torch.where(moving, level, math.inf).minimum(in_motion)
-    after = before.update(at_rest, in_motion, span)._replace(still_s=still_s, span=positions)
+    after = before.update(at_rest, in_motion, span)._replace(still_s=still_s, span=positions, second=second)
     # like spectra: a wide 1σ would admit any speed, so only a speed that is nearly zero and known to be counts
     limit, distinct, surely = after.thresholds(prior)
     calm = level <= limit

@@ -33,7 +33,7 @@ from dlkf.filters.aids.stretch import at_limits, mean_force, stretch_weights, we
 from dlkf.filters.aids.trust import Trust, judge
 from dlkf.filters.integration import Epoch
 from dlkf.filters.sources import Measurement, Parameter, Predicted, SensorSource, aid_of, predicted_variance
-from dlkf.filters.stationarity import vibration_level
+from dlkf.filters.stationarity import LastSecond
 
 LEAST_STD = 0.03  # m/s: the least 1σ, whatever a file gives
 KMH = 1 / 3.6
@@ -59,9 +59,10 @@ class WheelMemory(NamedTuple):
     repeats: Tensor  # (B,) how often it came again
     whole: Tensor  # (B,) share of the values that were whole km/h
     signed: Tensor  # (B,) bool: it has been negative
-    calmest: Tensor  # (B,) least shaking of an interval in motion, m/s² rad/s
+    calmest: Tensor  # (B,) least vibration level of a second in motion, m/s² rad/s
     rolling: Tensor  # (B,) bool: it turned in the last interval, and counted
     stopped: Tensor  # (B,) bool: it did not turn in the last interval, and counted
+    second: LastSecond
 
 
 class WheelSpeed(SensorSource):
@@ -80,13 +81,15 @@ class WheelSpeed(SensorSource):
         std = batch.imu.new_tensor([self.tuning.wheel_std])
         trust = Trust.begin(batch.imu, B)
         no, unknown = zeros > 0, torch.full_like(zeros, math.inf)
-        return WheelMemory(std, trust, zeros, zeros, zeros, no, unknown, no, no)
+        return WheelMemory(std, trust, zeros, zeros, zeros, no, unknown, no, no, LastSecond.begin(batch))
 
     def rows(self, epoch: Epoch, memory: WheelMemory, prediction: Predicted) -> tuple[Measurement | None, WheelMemory]:
         """The row, and what the wheel has earned by it."""
         said = aid_of(epoch, self.table.name)
         if said is None:
             return None, memory
+        second, level = memory.second.after(epoch.imu, epoch.dt)
+        shaking = torch.zeros_like(memory.calmest) if level is None else level
         value, std, lag, span, count = said.unbind(-1)
         seen = count > 0
         scale = 1.0 + prediction.parameters["wheel_scale"]
@@ -109,7 +112,6 @@ class WheelSpeed(SensorSource):
         rounded = (whole > 0.5) & ~zero
         noise = torch.where(rounded, (memory.std.square() + (JITTER_S * accel).square()).sqrt(), noise)
         R = noise.square() + (SLIP * speed * accel).square()
-        shaking = vibration_level(epoch.imu)
         plausible = ~zero | (z.abs() < NEARLY_AT_REST) | (shaking <= memory.calmest)
         beyond = torch.where(rounded, (z.abs() - 0.5 * KMH).clamp_min(0.0), z)
         drifted = (DRIFT * epoch.dt * epoch.imu.shape[1]) ** 2
@@ -123,7 +125,7 @@ class WheelSpeed(SensorSource):
         memory = WheelMemory(
             memory.std, trust, torch.where(seen, value, memory.last), repeats, whole,
             memory.signed | (used & ~reverse & (value < BACKWARDS)),
-            torch.where(moving, torch.minimum(calmest, shaking), calmest), used & turns, used & zero,
+            torch.where(moving, torch.minimum(calmest, shaking), calmest), used & turns, used & zero, second,
         )  # fmt: skip
         return Measurement(z.unsqueeze(-1), H, R.unsqueeze(-1), used.unsqueeze(-1)), memory
 
