@@ -11,7 +11,8 @@ vibration has the same spread in both; then a standstill needs a speed below 0.5
 count, for minutes at constant speed show no acceleration and no turn either. So does one of a car of which nothing is
 learned, and there the filter's 1σ of tilt explains little of an acceleration. A speed above 0.5 m/s needs
 ``DOUBTFUL_S``, for a car creeps as calmly for a second. Where a car has shaken as little for ``LONG_S`` as at a
-standstill, and shakes far more in motion, the filter's speed is wrong, within 6σ.
+standstill, and ``FAR_APART`` times more in every second of motion, the filter's speed is wrong, within 20σ: one event
+that its noise does not know spoils it so much.
 
 Carrier-phase positions show motion as velocities do. Of positions that are off by metres, two that lie ``SPAN_S`` apart
 do: the filter's own 1σ shows nothing, for a wrong standstill would confirm itself. Where fixes show a standstill for
@@ -52,7 +53,8 @@ DOUBTFUL_S = 2.0  # of one at which the filter's speed is above PLAUSIBLE_SPEED:
 SPAN_S, SPAN_LEFT_S = 5.0, 10.0  # s between two positions that show a mean speed; longer ones show none
 SPAN_SIGMAS, SPAN_STANDING = 3.0, 0.3  # 1σ that a mean speed is beyond MOVING_SPEED; m/s, that of a standstill
 LONG_ACCEL = 0.2  # m/s², instead of STILL_ACCEL, of a long rest: a filter with a wrong speed has a wrong tilt
-LONG_S, LONG_SIGMAS, ALIKE = 10.0, 6.0, 2.0  # s, 1σ of the speed: of a standstill at most so many times its level
+LONG_S, LONG_SIGMAS, ALIKE = 10.0, 20.0, 2.0  # s, 1σ of the speed: of a standstill at most so many times its level
+FAR_APART = 30.0  # prior ratio of the levels there
 
 
 class LastSecond(NamedTuple):
@@ -69,8 +71,11 @@ class LastSecond(NamedTuple):
             return cls(None)
         return cls(batch.imu.new_full((B, parts.count, 6), math.nan))
 
-    def after(self, imu: Float[Tensor, "B M 6"], dt: float) -> tuple[LastSecond, Float[Tensor, " B"] | None]:
-        """After the samples of an update interval, and the vibration level; None: too few samples for one."""
+    def after(
+        self, imu: Float[Tensor, "B M 6"], dt: float
+    ) -> tuple[LastSecond, Float[Tensor, " B"] | None, Float[Tensor, "B 6"]]:
+        """After the samples of an update interval, the vibration level (None: too few samples for one), and the mean
+        over the interval, or the last 0.2 s if it is shorter."""
         parts = _Parts.of(imu.shape[1], dt)
         means = imu[:, imu.shape[1] - parts.each * parts.samples :]
         if parts.samples > 1:
@@ -79,7 +84,7 @@ class LastSecond(NamedTuple):
             means = torch.cat((self.means, means), 1)[:, -parts.count :]
         boxes = means.unflatten(1, (-1, parts.together)).mean(2) if parts.together > 1 else means
         level = vibration_level(boxes) if boxes.shape[1] > 1 else None
-        return LastSecond(None if self.means is None else means), level
+        return LastSecond(None if self.means is None else means), level, means[:, -max(parts.each, 2 * parts.together) :].mean(1)
 
 
 class _Parts(NamedTuple):
@@ -203,17 +208,20 @@ def detect_stationary(
     standstill, one that is stopped makes it where the samples show neither acceleration nor turn, at any vibration;
     and both give levels of this car where GNSS gives no velocity.
     """
-    second, level = before.second.after(epoch.imu, epoch.dt)
+    second, level, mean = before.second.after(epoch.corrected, epoch.dt)
     if level is None:
         return torch.zeros_like(before.standing) > 0, before
     span = epoch.dt * epoch.imu.shape[1]
     v, diagonal = epoch.window.end.v_n, P.diagonal(dim1=-2, dim2=-1)
     speed, std = v[:, :2].norm(dim=-1), diagonal[:, VELOCITY][:, :2].sum(-1).sqrt()
-    gained = (v - epoch.start.v_n)[:, :2].norm(dim=-1) / span
+    gained, turn = (v - epoch.start.v_n)[:, :2].norm(dim=-1) / span, turning.norm(dim=-1)
+    if second.means is not None:  # short intervals show the swing of the vibration
+        force_n = torch.bmm(epoch.window.end.C_nb, mean[:, :3].unsqueeze(-1)).squeeze(-1)
+        gained, turn = force_n[:, :2].norm(dim=-1), mean[:, 3:].norm(dim=-1)
     doubt = 2 * _acceleration_std(P, epoch.window.end.C_nb)
     unlearned = before.standing.isinf() & before.moving.isinf()
     doubt = torch.where(unlearned, doubt.clamp_max(UNLEARNED_ACCEL), doubt)
-    straight = turning.norm(dim=-1) < STILL_RATE + 2 * diagonal[:, GYRO].sum(-1).sqrt()
+    straight = turn < STILL_RATE + 2 * diagonal[:, GYRO].sum(-1).sqrt()
     still, still_long = (straight & (gained < limit + doubt) for limit in (STILL_ACCEL, LONG_ACCEL))
     fixed, with_velocity = epoch.used[:, :2].all(-1), epoch.used[:, 3:5].all(-1)
     exact = fixed & (epoch.fix.std[:, :2].amax(-1) < CARRIER_STD)
@@ -232,7 +240,7 @@ def detect_stationary(
     limit, distinct, surely = after.thresholds(prior)
     calm = level <= limit
     calm_s = torch.where(still, (before.calm_s + torch.where(calm, span, -span)).clamp_min(0.0), 0.0)
-    least = ALIKE * torch.minimum(after.standing, after.moving / APART)  # inf: nothing learned
+    least = ALIKE * torch.minimum(after.standing, after.moving / FAR_APART)  # inf: nothing learned
     rest_s = torch.where(still_long & surely & (level <= least) & ~after.moving.isinf(), before.rest_s + span, 0.0)
     after = after._replace(calm_s=calm_s, rest_s=rest_s)
     learned = ~(after.standing.isinf() & after.moving.isinf())
