@@ -84,7 +84,11 @@ class LastSecond(NamedTuple):
             means = torch.cat((self.means, means), 1)[:, -parts.count :]
         boxes = means.unflatten(1, (-1, parts.together)).mean(2) if parts.together > 1 else means
         level = vibration_level(boxes) if boxes.shape[1] > 1 else None
-        return LastSecond(None if self.means is None else means), level, means[:, -max(parts.each, 2 * parts.together) :].mean(1)
+        return (
+            LastSecond(None if self.means is None else means),
+            level,
+            means[:, -max(parts.each, 2 * parts.together) :].mean(1),
+        )
 
 
 class _Parts(NamedTuple):
