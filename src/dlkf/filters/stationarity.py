@@ -208,9 +208,9 @@ def detect_stationary(
 ) -> tuple[Bool[Tensor, " B"], VibrationLevel]:  # fmt: skip
     """Whether the car was stationary in the window, and the levels after it; ``turning`` is its mean rate [rad/s].
 
-    Of one sample a second there is no spread: the levels stay, and no standstill is found. A ``wheel`` that rolls forbids a
-    standstill, one that is stopped makes it where the samples show neither acceleration nor turn, at any vibration;
-    and both give levels of this car where GNSS gives no velocity.
+    Of one sample a second there is no spread: the levels stay, and no standstill is found. A ``wheel`` that rolls
+    forbids a standstill, one that is stopped makes it where the samples show neither acceleration nor turn, at any
+    vibration; and both give levels of this car where GNSS gives no velocity.
     """
     second, level, mean = before.second.after(epoch.corrected, epoch.dt)
     if level is None:
