@@ -122,16 +122,16 @@ def simulated_cases(name: str, drives: Sequence[Drive]) -> Iterator[Case]:
             yield _case(name, before, batch, np.full(len(segments), before), lengths, groups)
 
 
-def real_cases(name: str, drives: Sequence[Drive]) -> Iterator[Case]:
-    """Whole drives from their own alignment, an outage every 10 s from 45 s on, each in a run of its own."""
+def real_cases(name: str, drives: Sequence[Drive], before_s: int = 45, every_s: int = 10) -> Iterator[Case]:
+    """Whole drives from their own alignment, an outage every so often from ``before_s`` on, each in its own run."""
     groups = {d.name: d.group for d in drives}
     starts = [(d, s) for d, s in zip(drives, align_each(drives, replace(ALIGN, from_rest=True, search_s=20.0)))]
     usable = [(d, s) for d, s in starts if not isinstance(s, InputError)]
     for length in (30, 60):
-        runs = [(d, s, k) for d, s in usable for k in range(45, d.epochs - s.first - length, 10)]
+        runs = [(d, s, k) for d, s in usable for k in range(before_s, d.epochs - s.first - length, every_s)]
         if runs:
             batch = whole_drives([d for d, *_ in runs], [s for _, s, _ in runs])
-            yield _case(name, 45, batch, np.array([k for *_, k in runs]), (length,), groups)
+            yield _case(name, before_s, batch, np.array([k for *_, k in runs]), (length,), groups)
 
 
 def _case(
@@ -153,14 +153,14 @@ def constants() -> dict[str, Estimator]:
     return found
 
 
-def found_noise(drives: Sequence[Drive]) -> dict[str, Estimator]:
-    """The same filters with the noise that ``imu=auto`` finds for each on the drives."""
+def found_noise(
+    drives: Sequence[Drive], names: Sequence[str] = (*CONSTANTS, *(kind + SOURCES for kind in CONSTANTS))
+) -> dict[str, Estimator]:
+    """Filters, else those of :func:`constants`, with the noise that ``imu=auto`` finds for each on the drives."""
     evidence, imu, filters = Evidence.of(drives), imu_preset("automotive_mems"), {}
-    for sources in ("", SOURCES):
-        for kind in CONSTANTS:
-            name = kind + sources
-            found = find_noise(evidence, name, imu, Tuning(), delay=False, compiler=compile_or_keep)
-            filters[f"{name} auto"] = build_causal(name, found.imu, "no", tuning=found.tuning)
+    for name in names:
+        found = find_noise(evidence, name, imu, Tuning(), delay=False, compiler=compile_or_keep)
+        filters[f"{name} auto"] = build_causal(name, found.imu, "no", tuning=found.tuning)
     return filters
 
 

@@ -1,0 +1,205 @@
+"""Logs of public repositories, written here in their formats from one known drive: axes, signs and clocks of each."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from pipelines.studies import other_cars
+from scipy.io import savemat
+
+from dlkf.data.schema import ACCEL, GYRO, POSITION, STD
+from dlkf.data.store import load_dataset
+from dlkf.navigation.attitude import rotation_from_rpy
+
+BASE_S, END_S, LAT, LON = 152_143.0, 120.0, 44.2, 8.6
+T = np.arange(0, END_S, 1e-3)
+SPEED, RATE = 9 + 4 * np.sin(2 * np.pi * T / 24), 0.3 * np.sin(2 * np.pi * T / 40)
+YAW = np.cumsum(RATE) * 1e-3
+WAY = np.cumsum(SPEED * np.exp(1j * YAW)) * 1e-3  # North + i East
+FORCE = np.stack([np.pi / 3 * np.cos(2 * np.pi * T / 24), SPEED * RATE, np.full(len(T), -other_cars.G)], -1)
+TILT = rotation_from_rpy(torch.tensor([0.03, -0.1, 0.0], dtype=torch.float64)).numpy()  # of a holder
+
+
+def at(t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """What is true at times."""
+    return values[np.clip(np.round(1000 * t).astype(int), 0, len(T) - 1)]
+
+
+def sensed(t: np.ndarray, to_frd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Specific force and rates (3, n) in the axes of a sensor."""
+    rates = np.stack([0 * t, 0 * t, at(t, RATE)])
+    return to_frd.T @ at(t, FORCE).T, to_frd.T @ rates
+
+
+def place(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Latitude and longitude [°]."""
+    metre = 1 / other_cars.DEGREE_M
+    return LAT + way.real * metre, LON + way.imag * metre / np.cos(np.radians(LAT))
+
+
+def write(path: Path, table: pd.DataFrame) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    table.to_csv(path, index=False)
+
+
+def write_nuance(logs: Path) -> None:
+    """Fixes arrive 0.43 s late, on a clock of which their own seconds say nothing."""
+    t, seconds = np.arange(0.02, END_S, 0.025), np.arange(1.0, END_S - 1)
+    lat, lon = place(at(seconds, WAY))
+    stamps = BASE_S + seconds + 0.43 + 0.01 * np.sin(5 * seconds)
+    sentences = [
+        f"$GPGGA,{int(180000 + k // 60 * 100 + k % 60)}.000,,N,,W,1,09,1.2,16.6,M,-33.8,M,,*55" for k in seconds
+    ]
+    gnss = {"latitude": lat, "longitude": lon, "hdop": 1.2, "gpgga_read": sentences}
+    accel, gyro = sensed(t, np.eye(3))
+    town = {f"{kind}_{axis}": x[k] for kind, x in (("accel", accel), ("gyro", gyro)) for k, axis in enumerate("xyz")}
+    folder = logs / "freecode23/EECE5554/lab5/data/first_test"
+    write(folder / "town_imu.csv", pd.DataFrame({"stamp": BASE_S + t, **town}))
+    write(folder / "town_gps.csv", pd.DataFrame({"stamp": stamps, **gnss}))
+    long = {"accel": "imu.linear_acceleration", "gyro": "imu.angular_velocity"}
+    driving = {f"{long[name[:-2]]}.{name[-1]}": x for name, x in town.items()}
+    folder = logs / "aaronpan-eng/EECE5554/lab5/src/data"
+    write(folder / "imu.csv", pd.DataFrame({"Time": BASE_S + t + 0.01 * (np.arange(len(t)) % 2), **driving}))
+    write(folder / "gps.csv", pd.DataFrame({"Time": stamps, **gnss}))
+    with zipfile.ZipFile(folder / "data_driving.zip", "w") as archive:
+        for name in ("imu.csv", "gps.csv"):
+            archive.write(folder / name, f"data_driving/{name}")
+
+
+def write_kingston(logs: Path) -> None:
+    """Right-Forward-Up at 10 Hz; heights of fixes 34 m above those of the reference."""
+    top = logs / "marwanrashed/INSfullMech"
+    folder = top / "2008-06-23 kingston downtown/rover/Mat"
+    folder.mkdir(parents=True)
+    t, seconds = np.arange(0.09, END_S, 0.1), np.arange(1.0, END_S - 1)
+    accel, gyro = sensed(t, np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]))
+    f, w = (dict(zip("xyz", x)) for x in (accel, gyro))
+    savemat(top / "f_w_IMSseconds_dt_Marwan.mat", {"IMU_second": BASE_S + t, "f": f, "w": w})
+    (lat, lon), v = place(at(seconds, WAY)), at(seconds, SPEED * np.exp(1j * YAW))
+    whole, still = (BASE_S + seconds).astype(int), 0 * seconds
+    names = ("Lat", "Long", "Alt")
+    position = {f"BGP_{n}": x for n, x in zip(names, (lat, lon, still + 73))}
+    position |= {f"BGP_{n}_std": still + 1.5 for n in names}
+    velocity = {"BGV_second": whole, "BGV_vn": v.real, "BGV_ve": v.imag, "BGV_vu": still}
+    own = {f"INS_{n}": x for n, x in zip(names, (lat, lon, still + 39))}
+    own |= {"INS_vn": v.real, "INS_ve": v.imag, "INS_vu": still, "INS_Roll": still, "INS_Pitch": still}
+    savemat(folder / "BESTGPSPOS.mat", {"BGP_second": whole, **position})
+    savemat(folder / "BESTGPSVEL.mat", velocity)
+    savemat(folder / "INSPVA.mat", {"INS_second": whole, "INS_Azi": np.degrees(at(seconds, YAW)) % 360, **own})
+
+
+ARM = 0.9 + 0.2j  # of the antenna of amz
+
+
+def write_amz(logs: Path) -> None:
+    """Forward-Left-Up at 200 Hz; positions of an antenna, every other one new, 0.1 s late; speed beside the IMU."""
+    folder = logs / "raghuramshankar/kalman-filter-localization/amz-data-import"
+    folder.mkdir(parents=True)
+    t, late, fast = np.arange(0.005, END_S, 0.005), np.arange(0.2, END_S, 0.1), np.arange(0.002, END_S, 0.004)
+    accel, gyro = sensed(t, np.diag([1, -1, -1]))
+    seen = late[np.maximum(np.arange(len(late)) - 1 + np.arange(len(late)) % 2, 0)] - 0.1
+    lat, lon = place(at(seen, WAY + ARM * np.exp(1j * YAW)))
+    v = at(fast, SPEED + 1j * RATE * other_cars.OPTICAL_SENSOR)
+    log = dict(zip(("a_x", "a_y", "a_z", "wXsens", "wYsens", "wZsens"), (*accel, *gyro)))
+    log |= {"lat": lat, "long": lon, "lin_v_x": v.real, "lin_v_y": -v.imag}
+    savemat(folder / "AMZ_data_non_resample.mat", {"d": log})
+    for name, clock in (("IMU", t), ("GPS", late), ("speed", fast)):
+        savemat(folder / f"AMZ_{name}.mat", {f"{name.lower()}_time": BASE_S + clock})
+
+
+def write_beersheva(logs: Path) -> None:
+    """Back-Right-Up in a tilted holder, in g and without gravity; rows of both kinds, fixes at times repeated."""
+    t, fixes = np.arange(0, END_S, 0.01), np.arange(0.1, END_S - 0.1, 0.1)
+    accel, gyro = sensed(t, TILT @ np.diag([-1, 1, -1]))
+    up = (TILT @ np.diag([-1, 1, -1])).T @ [0, 0, -1]
+    names = ["ax[m/s^2]", " ay", " az", "gy_x[rad/sec]", "gy_y", "gy_z", "roll[rad]", "pitch[rad]"]
+    attitude = [0 * t + np.arctan2(up[1], up[2]), 0 * t - np.arcsin(up[0])]
+    imu = pd.DataFrame(dict(zip(names, (*(accel / other_cars.G - up[:, None]), *gyro, *attitude))))
+    imu.insert(0, "t[s]", 68734 + np.round(100 * t))
+    lat, lon = place(at(fixes, WAY))
+    gnss = pd.DataFrame({"t[s]": 68734 + np.round(100 * fixes), "latitude": lat, "longitude": lon})
+    both = pd.concat([imu, gnss, gnss[::7]]).sort_values("t[s]", kind="stable")
+    write(logs / "orshalev91/NavigationSystem/Input/drive3_rt-GPS.csv", both)
+
+
+def write_dresden(logs: Path) -> None:
+    """Forward-Left-Up in a tilted holder, the other sign of acceleration; fixes 0.9 s late, their speed a row later."""
+    t = np.arange(0.02, END_S, 0.02)
+    accel, gyro = sensed(t, TILT @ np.diag([1, -1, -1]))
+    table = dict(zip(("ax", "ay", "az"), -accel)) | dict(zip(("rollrate", "pitchrate", "yawrate"), np.degrees(gyro)))
+    new, later = (np.floor((t - x) * 10 + 1e-6) / 10 - 0.9 for x in (0, 0.02))
+    lat, lon = place(at(new, WAY))
+    v = at(later, SPEED * np.exp(1j * YAW))
+    table |= {"latitude": lat, "longitude": lon, "altitude": 110.0}
+    table |= {"speed": 3.6 * np.abs(v), "course": np.degrees(np.angle(v)) % 360, "millis": 1e3 * (BASE_S + t)}
+    write(logs / "balzer82/Kalman/2014-03-26-000-Data.csv", pd.DataFrame(table))
+
+
+WRITERS = {
+    "nuance": write_nuance,
+    "kingston": write_kingston,
+    "amz": write_amz,
+    "beersheva": write_beersheva,
+    "dresden": write_dresden,
+}
+
+
+@pytest.mark.parametrize("name", other_cars.LOGS)
+def test_axes_signs_and_clocks_of_a_log(name, tmp_path):
+    WRITERS[name](tmp_path)
+    drives = list(other_cars.LOGS[name].read(tmp_path))
+    assert len(drives) == (2 if name == "nuance" else 1)
+    for drive in drives:
+        t = drive.imu["t"].to_numpy()
+        tilt = 0.2 if name in ("beersheva", "dresden") else 0.03  # levelled by the mean, which holds some acceleration
+        np.testing.assert_allclose(drive.imu[list(ACCEL)], at(t, FORCE), atol=tilt)
+        np.testing.assert_allclose(drive.imu["gyro_z"], at(t, RATE), atol=0.005)
+        np.testing.assert_allclose(drive.imu[list(GYRO[:2])], 0, atol=0.01)
+        antenna = WAY + ARM * np.exp(1j * YAW) if name == "amz" else WAY
+        for table, truth, within in ((drive.gnss, antenna, 0.1), (drive.reference, WAY, 0.2)):
+            rows = table[(table["t"] > 5) & (table["t"] < END_S - 5)]
+            lat, lon = place(at(rows["t"].to_numpy(), truth))
+            away = (rows[list(POSITION[:2])].to_numpy() - np.stack([lat, lon], -1)) * other_cars.DEGREE_M
+            assert np.abs(away).max() < within, (name, np.abs(away).max())
+        rows = drive.reference[(drive.reference["t"] > 5) & (drive.reference["t"] < END_S - 5)]
+        v = at(rows["t"].to_numpy(), SPEED * np.exp(1j * YAW))
+        np.testing.assert_allclose(rows[["vel_n", "vel_e"]], np.stack([v.real, v.imag], -1), atol=0.3)
+        found = other_cars.correlate(drive)
+        assert min(r for r, _ in found.values()) > 0.99
+        assert all(abs(slope - 1) < 0.05 for _, slope in found.values()), found
+
+
+def test_what_single_logs_know(tmp_path):
+    for writer in WRITERS.values():
+        writer(tmp_path)
+    read = {name: list(log.read(tmp_path))[-1] for name, log in other_cars.LOGS.items()}
+    arm = complex(read["amz"].meta["lever_arm_x_m"], read["amz"].meta["lever_arm_y_m"])
+    assert abs(arm - ARM) < 0.05
+    assert read["kingston"].gnss["height_m"].mean() == pytest.approx(39)
+    yaw = read["kingston"].reference["yaw"].to_numpy()
+    turned = at(read["kingston"].reference["t"].to_numpy(), YAW)
+    np.testing.assert_allclose(np.exp(1j * yaw), np.exp(1j * turned), atol=0.02)
+    assert read["nuance"].gnss["height_m"].mean() == pytest.approx(16.6 - 33.8)
+    assert read["nuance"].gnss[list(STD[:3])].mean().tolist() == pytest.approx([1.2, 1.2, 1.8])
+    assert read["dresden"].gnss["vel_n"].notna().all() and read["beersheva"].gnss["vel_n"].isna().all()
+
+
+@pytest.mark.parametrize("name", other_cars.LOGS)
+def test_a_dataset_is_written_and_its_reference_is_found(name, tmp_path):
+    WRITERS[name](tmp_path / "logs")
+    lines = other_cars.convert(name, tmp_path / "logs", tmp_path / name)
+    assert all(line.startswith(f"{name}/") and "slope 1.0" in line for line in lines)
+    for drive in load_dataset(tmp_path / name, rate_hz=50.0, dtype=torch.float64):
+        assert float(drive.ref_valid.double().mean()) > 0.95
+
+
+def test_a_turned_sensor_is_refused(tmp_path, monkeypatch):
+    write_kingston(tmp_path)
+    monkeypatch.setattr(other_cars, "RFU", np.array([[1, 0, 0], [0, -1, 0], [0, 0, -1]]))
+    with pytest.raises(AssertionError):
+        other_cars.convert("kingston", tmp_path, tmp_path / "out")
