@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import zipfile
 from pathlib import Path
 
@@ -203,3 +204,19 @@ def test_a_turned_sensor_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(other_cars, "RFU", np.array([[1, 0, 0], [0, -1, 0], [0, 0, -1]]))
     with pytest.raises(AssertionError):
         other_cars.convert("kingston", tmp_path, tmp_path / "out")
+
+
+def test_the_whole_study_on_one_log(tmp_path, monkeypatch, capsys):
+    write_kingston(tmp_path / "logs")
+    words = ["--logs", str(tmp_path / "logs"), "--sets", "kingston", "--out", str(tmp_path / "out")]
+    monkeypatch.setattr(sys, "argv", ["other_cars", *words])
+    one = other_cars.constants()["mbkf33_car any_car"]  # which is compiled sooner than the others
+    monkeypatch.setattr(other_cars, "constants", lambda: dict.fromkeys(other_cars.FIXED, one))
+    monkeypatch.setattr(other_cars, "trained_filter", lambda _: one)
+    monkeypatch.setattr(other_cars, "found_noise", lambda *_: {})
+    other_cars.main()
+    head, _, *rows = (tmp_path / "out" / "table.md").read_text().splitlines()
+    assert head.startswith("| log | GNSS [s] | outage [s] | outages | mbkf33_car any_car |")
+    cells = [row.split(" | ")[:4] for row in rows]
+    assert cells == [["| `kingston`", "45", "30", "2"], ["| `kingston`", "45", "60", "1"]]
+    assert "digests" in (tmp_path / "out" / "manifest.json").read_text() and rows[0] in capsys.readouterr().out
