@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import torch
 
+from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import Correction, Epoch, Estimator
 from dlkf.filters.plus import PlusConfig, PlusFilter, PlusMemory
 from dlkf.filters.shipped import trained_filter
@@ -17,6 +18,15 @@ class GaussianPriors(PlusFilter):
     def __init__(self, config: PlusConfig) -> None:
         super().__init__(config)
         self.kalman = replace(self.kalman, heavy_tails=False)
+
+
+class ConstraintsAsSet(PlusFilter):
+    """``plus`` whose vehicle constraints keep their 1σ."""
+
+    def __init__(self, config: PlusConfig) -> None:
+        super().__init__(config)
+        kept = (replace(s, finds_noise=False) if isinstance(s, CarConstraints) else s for s in self.kalman.sources)
+        self.kalman = replace(self.kalman, sources=tuple(kept))
 
 
 class WithoutLevels(PlusFilter):
@@ -41,7 +51,7 @@ class AsClaimed(PlusFilter):
 
 def parts(folder: str) -> dict[str, Estimator]:
     """``plus`` with neither levels nor network, with one of them, with fixes as claimed, without one of its sources,
-    and with Gaussian priors."""
+    with Gaussian priors, and with constraints as set."""
     whole = trained_filter(folder)
     assert isinstance(whole, PlusFilter)
     found: dict[str, Estimator] = {}
@@ -50,7 +60,7 @@ def parts(folder: str) -> dict[str, Estimator]:
     kinds["fixes as claimed"] = (AsClaimed, True)
     bases = {"no speed from vibration": "+vibration_speed", "no delay and antenna": "+receiver"}
     kinds |= dict.fromkeys(bases, (PlusFilter, True))
-    kinds["Gaussian priors"] = (GaussianPriors, True)
+    kinds |= {"Gaussian priors": (GaussianPriors, True), "constraints as set": (ConstraintsAsSet, True)}
     for name, (kind, network) in kinds.items():
         config = replace(whole.config, base=whole.config.base.replace(bases.get(name, ""), ""))
         found[name] = part = kind(config).eval()

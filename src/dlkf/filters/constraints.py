@@ -19,7 +19,7 @@ the same.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -28,6 +28,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dlkf.data.drive import Batch
+from dlkf.filters.constraint_noise import ConstraintNoise
 from dlkf.filters.integration import Epoch
 from dlkf.filters.sources import Measurement, Predicted, predicted_variance
 from dlkf.filters.stationarity import VibrationLevel, WheelMotion, detect_stationary
@@ -48,25 +49,31 @@ class CarMemory(NamedTuple):
     std: Tensor  # (1, 8) of the rows, the same for all drives
     liveliness: VibrationLevel  # of this car
     prior: Tensor  # (1,) prior least level of a second of motion, the same for all drives
+    noise: ConstraintNoise | None = None  # across the car, where it is found
 
 
 @dataclass(frozen=True)
 class CarConstraints:
-    """Constraints on a car's motion for a filter with the given error states."""
+    """Constraints on a car's motion for a filter with the given error states.
+
+    ``finds_noise``: the 1σ across the car follows what innovations show (:mod:`dlkf.filters.constraint_noise`).
+    """
 
     tuning: Tuning
     states: ErrorStates
+    finds_noise: bool = False
 
     @property
     def code(self) -> CarConstraints:
         """Without the numbers that the memory carries."""
-        return CarConstraints(Tuning(), self.states)
+        return replace(self, tuning=Tuning())
 
     def begin(self, batch: Batch) -> CarMemory:
         """No standstill so far, and the 1σ of the rows."""
         t, new = self.tuning, batch.imu.new_tensor
         std = [t.lateral_std, t.vertical_std] + [t.rest_velocity_std] * 3 + [t.rest_rate_std] * 3
-        return CarMemory(new([std]), VibrationLevel.begin(batch), new([t.rest_accel * t.rest_gyro]))
+        noise = ConstraintNoise.begin(batch.imu, batch.size[0]) if self.finds_noise else None
+        return CarMemory(new([std]), VibrationLevel.begin(batch), new([t.rest_accel * t.rest_gyro]), noise)
 
     def rows(self, epoch: Epoch, memory: CarMemory, prediction: Predicted) -> tuple[Measurement, CarMemory]:
         """NHC (2 rows), zero velocity (3), zero angular rate (3)."""
@@ -75,14 +82,23 @@ class CarConstraints:
         resting, liveliness = self.resting(epoch, zr[:, 3:], prediction, memory)
         resting = resting.unsqueeze(-1)
         used = torch.cat(((moving.unsqueeze(-1) & ~resting).expand(-1, 2), resting.expand(-1, 6)), -1)
-        per_second = max(1.0, 1.0 / (epoch.dt * epoch.imu.shape[1]))
+        span = epoch.dt * epoch.imu.shape[1]
+        per_second = max(1.0, 1.0 / span)
         variance = (memory.std.square() * per_second).expand(len(zn), -1)
         if epoch.advice is not None and epoch.advice.across is not None:
             variance = torch.cat((variance[:, :2] * epoch.advice.across.square(), variance[:, 2:]), -1)
-        S = predicted_variance(prediction.P, Hn) + variance[:, :2]
+        noise, of_state, a_second = memory.noise, predicted_variance(prediction.P, Hn), variance[:, :2] / per_second
+        if noise is not None:
+            variance = torch.cat((noise.factor * variance[:, :2], variance[:, 2:]), -1)
+        S = of_state + variance[:, :2]
+        if noise is not None:
+            learns = used[:, 0] & epoch.used[:, :2].all(-1)
+            noise = noise.after(zn, of_state + a_second, OUTLIER**2 * S, learns, span)
         variance = torch.cat((variance[:, :2] * (zn.square() / (OUTLIER**2 * S)).clamp_min(1.0), variance[:, 2:]), -1)
         z = torch.cat((zn, zr), -1) * used
-        return Measurement(z, torch.cat((Hn, Hr), 1), variance, used), memory._replace(liveliness=liveliness)
+        return Measurement(z, torch.cat((Hn, Hr), 1), variance, used), memory._replace(
+            liveliness=liveliness, noise=noise
+        )
 
     def resting(
         self, epoch: Epoch, turning: Float[Tensor, "B 3"], prediction: Predicted, memory: CarMemory

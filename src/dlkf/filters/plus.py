@@ -6,8 +6,9 @@ show it (:mod:`dlkf.filters.virtual_outages`), and it holds through an outage. A
 factor for each gyroscope every epoch, in outages too; it sees the samples, the filter's covariance and how well its
 innovations and corrections fit (:mod:`dlkf.filters.matching`). As far as fixes show, their errors are larger than
 claimed (:mod:`dlkf.filters.fix_noise`), or those of positions smaller, or wander (:mod:`dlkf.filters.position_errors`).
-The prior of the vertical gyroscope's scale factor has heavy tails (:mod:`dlkf.filters.heavy_tails`). Before the first
-fix it is ``base`` to the bit; with fixes as claimed and weights of zero ``base`` with this prior until the first
+The noise of the vehicle constraints is what innovations show (:mod:`dlkf.filters.constraint_noise`), and the prior of
+the vertical gyroscope's scale factor has heavy tails (:mod:`dlkf.filters.heavy_tails`). Before the first fix it is
+``base`` to the bit; with fixes and constraints as claimed and weights of zero ``base`` with this prior until the first
 virtual outage was scored.
 """
 
@@ -27,6 +28,7 @@ from dlkf.data.drive import Batch
 from dlkf.filters.advice import NetworkOutput
 from dlkf.filters.branches import may_branch
 from dlkf.filters.build import build_filter
+from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.fix_noise import FixNoise
 from dlkf.filters.integration import Correction, Epoch
 from dlkf.filters.matching import AXIS_FEATURES, LOG_FEATURES, Matching, ratio_by_axis, variance_along
@@ -119,7 +121,8 @@ class PlusFilter(nn.Module):
             raise InputError(
                 f"model.base={config.base} is no Kalman filter that plus can stand on; take {PlusConfig.base}"
             )
-        self.kalman = replace(kalman, cut_transition=True, heavy_tails=True)
+        sources = tuple(replace(s, finds_noise=True) if isinstance(s, CarConstraints) else s for s in kalman.sources)
+        self.kalman = replace(kalman, sources=sources, cut_transition=True, heavy_tails=True)
         count = self.kalman.states.base.count
         now = 3 + 3 + 3 + 2 + 6
         features = WINDOW_FEATURES + count + (count - 9) + 2 + 4 + 6 + LOG_FEATURES + 4 + now

@@ -98,6 +98,8 @@ MEMORY = {  # by the last parts of a field's name
     "blocks": "blocks in both",
     "evidence": "evidence for each share of the vibration's likelihood [nats]",
     "age": "time since the last fix [s]",
+    "noise.squares": "sum over motion with fixes of innovation² over its usual variance, sideways, down [s]",
+    "noise.moved": "motion with fixes in that sum [s]",
     "noise.Q": "adapted covariance of an epoch's process noise, units of P",
     "noise.R": "adapted variance of a fix: position [m²], velocity [m²/s²]",
     "noise.settled": "1 where the adapted noise is in force",
