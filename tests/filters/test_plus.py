@@ -8,6 +8,7 @@ import torch
 from dlkf.base.errors import InputError
 from dlkf.data.augmentation import turn_frames
 from dlkf.filters.build import build_filter
+from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import integrate
 from dlkf.filters.model_based import has_covariance
 from dlkf.filters.plus import PlusConfig, PlusFilter
@@ -32,7 +33,9 @@ def plus(base="mbkf21_car", weights: float = 0.0, hidden: int = 16) -> PlusFilte
 
 def classical(base: str, model: PlusFilter):
     """Its classical filter."""
-    return replace(build_filter(base, model.imu, tuning=model.tuning), heavy_tails=True)
+    kalman = build_filter(base, model.imu, tuning=model.tuning)
+    sources = tuple(replace(s, finds_noise=True) if isinstance(s, CarConstraints) else s for s in kalman.sources)
+    return replace(kalman, sources=sources, heavy_tails=True)
 
 
 def car(segments: int, epochs: int, seed: int = 0):

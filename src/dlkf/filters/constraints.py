@@ -82,8 +82,7 @@ class CarConstraints:
         resting, liveliness = self.resting(epoch, zr[:, 3:], prediction, memory)
         resting = resting.unsqueeze(-1)
         used = torch.cat(((moving.unsqueeze(-1) & ~resting).expand(-1, 2), resting.expand(-1, 6)), -1)
-        span = epoch.dt * epoch.imu.shape[1]
-        per_second = max(1.0, 1.0 / span)
+        per_second = max(1.0, 1.0 / (epoch.dt * epoch.imu.shape[1]))
         variance = (memory.std.square() * per_second).expand(len(zn), -1)
         if epoch.advice is not None and epoch.advice.across is not None:
             variance = torch.cat((variance[:, :2] * epoch.advice.across.square(), variance[:, 2:]), -1)
@@ -93,7 +92,7 @@ class CarConstraints:
         S = of_state + variance[:, :2]
         if noise is not None:
             learns = used[:, 0] & epoch.used[:, :2].all(-1)
-            noise = noise.after(zn, of_state + a_second, OUTLIER**2 * S, learns, span)
+            noise = noise.after(zn, of_state, a_second, OUTLIER, learns)
         variance = torch.cat((variance[:, :2] * (zn.square() / (OUTLIER**2 * S)).clamp_min(1.0), variance[:, 2:]), -1)
         z = torch.cat((zn, zr), -1) * used
         return Measurement(z, torch.cat((Hn, Hr), 1), variance, used), memory._replace(

@@ -1,0 +1,98 @@
+"""The noise of vehicle constraints is what innovations show of cars whose sideways and vertical velocity is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from dlkf.filters.build import build_filter
+from dlkf.filters.constraint_noise import FIRST, LEAST, MEMORY, MOST, USUAL, ConstraintNoise
+from dlkf.filters.constraints import CarConstraints, CarMemory
+from dlkf.filters.integration import integrate
+from dlkf.filters.tuning import Tuning
+from dlkf.navigation.state import NavState
+
+from .scene import IMU, M, scene
+from .test_constraints import driven, outage
+from .test_stationarity import in_parts
+
+D = torch.float64
+
+
+def swaying(sideways: float, down: float, epochs: int = 120):
+    """Cars at 15 m/s whose velocity across them has this 1σ [m/s], anew every second, with GNSS throughout."""
+    base, g = scene(6, epochs, seed=3), torch.Generator().manual_seed(5)
+    C = torch.eye(3, dtype=D).repeat(6, 1, 1)
+    start = NavState(torch.zeros(6, 3, dtype=D), torch.tensor([[15.0, 0.0, 0.0]], dtype=D).repeat(6, 1), C)
+    v = torch.randn(6, epochs + 1, 3, generator=g, dtype=D) * torch.tensor([0.0, sideways, down], dtype=D)
+    v[:, 0] = 0.0
+    clean = torch.zeros(6, epochs, M, 6, dtype=D)
+    clean[..., 3:] = base.frame.earth_rate_n[:, None, None]
+    clean[..., :3] = (v[:, 1:] - v[:, :-1])[:, :, None] - base.frame.gravity(start.p_n)[:, None, None]
+    batch = driven(base, start, clean)
+    return replace(batch, available=torch.ones_like(batch.available))
+
+
+def factors(batch, name: str = "mbkf21_car", **tuning: float) -> torch.Tensor:
+    """(B, 2) f at the end."""
+    kalman, last = build_filter(name, IMU, tuning=Tuning(**tuning)), {}
+
+    class Watched(CarConstraints):
+        def rows(self, epoch, memory, prediction):
+            row, after = super().rows(epoch, memory, prediction)
+            last["f"] = after.noise.factor
+            return row, after
+
+    sources = tuple(
+        Watched(s.tuning, s.states, finds_noise=True) if isinstance(s, CarConstraints) else s for s in kalman.sources
+    )
+    integrate(batch, replace(kalman, sources=sources))
+    return last["f"]
+
+
+def test_sums_are_those_of_numpy():
+    g = np.random.default_rng(3)
+    z, of_state, variance = g.normal(size=(400, 2)), g.uniform(0.1, 0.3, (400, 2)), g.uniform(0.2, 0.6, (400, 2))
+    learns = g.random(400) < 0.8
+    noise, squares, fixes, f = ConstraintNoise.begin(torch.zeros(1, dtype=D), 1), np.zeros(2), 0.0, np.ones(2)
+    for k in range(400):
+        row = [torch.from_numpy(x)[None] for x in (z[k], of_state[k], variance[k])]
+        noise = noise.after(*row, 2.0, torch.tensor([bool(learns[k])]))
+        if learns[k]:
+            keep = 1 - 1 / MEMORY
+            square = np.minimum(z[k] ** 2, 4 * (of_state[k] + f * variance[k]))
+            squares, fixes = keep * squares + square / (USUAL * (of_state[k] + variance[k])), keep * fixes + 1
+            f = np.clip((FIRST + squares) / (FIRST + fixes), LEAST, MOST)
+    np.testing.assert_allclose(noise.factor.numpy()[0], f, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("sideways", "down"), [(0.5, 0.02), (0.02, 0.5)])
+def test_a_car_that_sways_has_a_larger_variance_on_that_axis(sideways, down):
+    f = factors(swaying(sideways, down), lateral_std=0.1, vertical_std=0.1)
+    large, small = (0, 1) if sideways > down else (1, 0)
+    assert (f[:, large] > 4).all() and (f[:, small] < 1).all()
+
+
+def test_nothing_is_learned_without_fixes_or_at_rest():
+    batch = swaying(0.5, 0.5, 30)
+    torch.testing.assert_close(factors(outage(batch, 0, 30)), torch.ones(6, 2, dtype=D))
+    standing = replace(batch, imu=scene(6, 30).imu * 0.0 + batch.imu.mean((1, 2), keepdim=True))
+    stopped = standing.start._replace(v_n=torch.zeros_like(standing.start.v_n))
+    gnss = torch.zeros_like(standing.gnss)
+    torch.testing.assert_close(factors(replace(standing, start=stopped, gnss=gnss)), torch.ones(6, 2, dtype=D))
+
+
+def test_shorter_update_intervals_find_the_same():
+    batch = swaying(0.4, 0.2)
+    whole, fifths = (factors(x, lateral_std=0.1, vertical_std=0.1) for x in (batch, in_parts(batch, 5)))
+    assert ((fifths / whole - 1).abs() < 0.35).all()
+
+
+def test_only_a_filter_that_finds_it_carries_it():
+    batch = scene(2, 3)
+    rules = next(s for s in build_filter("mbkf21_car", IMU).sources if isinstance(s, CarConstraints))
+    begun = rules.begin(batch), replace(rules, finds_noise=True).code.begin(batch)
+    assert isinstance(begun[0], CarMemory) and begun[0].noise is None and begun[1].noise is not None
