@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dlkf.filters.build import build_filter
-from dlkf.filters.constraint_noise import FIRST, LEAST, MEMORY, MOST, USUAL, ConstraintNoise
+from dlkf.filters.constraint_noise import EXPECTED, FIRST, HIGH, LEAST, LOW, MEMORY, MOST, ConstraintNoise
 from dlkf.filters.constraints import CarConstraints, CarMemory
 from dlkf.filters.integration import integrate
 from dlkf.filters.tuning import Tuning
@@ -53,9 +53,10 @@ def factors(batch, name: str = "mbkf21_car", **tuning: float) -> torch.Tensor:
     return last["f"]
 
 
-def test_sums_are_those_of_numpy():
+@pytest.mark.parametrize("size", [0.1, 0.5, 2.0])
+def test_sums_are_those_of_numpy(size):
     g = np.random.default_rng(3)
-    z, of_state, variance = g.normal(size=(400, 2)), g.uniform(0.1, 0.3, (400, 2)), g.uniform(0.2, 0.6, (400, 2))
+    z, of_state, variance = size * g.normal(size=(400, 2)), g.uniform(0.1, 0.3, (400, 2)), g.uniform(0.2, 0.6, (400, 2))
     learns = g.random(400) < 0.8
     noise, squares, fixes, f = ConstraintNoise.begin(torch.zeros(1, dtype=D), 1), np.zeros(2), 0.0, np.ones(2)
     for k in range(400):
@@ -64,8 +65,9 @@ def test_sums_are_those_of_numpy():
         if learns[k]:
             keep = 1 - 1 / MEMORY
             square = np.minimum(z[k] ** 2, 4 * (of_state[k] + f * variance[k]))
-            squares, fixes = keep * squares + square / (USUAL * (of_state[k] + variance[k])), keep * fixes + 1
-            f = np.clip((FIRST + squares) / (FIRST + fixes), LEAST, MOST)
+            squares, fixes = keep * squares + square / (of_state[k] + variance[k]), keep * fixes + 1
+            mean = (FIRST * EXPECTED + squares) / (FIRST + fixes)
+            f = np.clip(np.where(mean > HIGH, mean / HIGH, np.where(mean < LOW, mean / LOW, 1.0)), LEAST, MOST)
     np.testing.assert_allclose(noise.factor.numpy()[0], f, rtol=1e-12)
 
 
@@ -74,6 +76,11 @@ def test_a_car_that_sways_has_a_larger_variance_on_that_axis(sideways, down):
     f = factors(swaying(sideways, down), lateral_std=0.1, vertical_std=0.1)
     large, small = (0, 1) if sideways > down else (1, 0)
     assert (f[:, large] > 4).all() and (f[:, small] < 1).all()
+
+
+def test_a_car_that_hardly_breaks_them_keeps_its_variance_within_limits():
+    assert (factors(swaying(0.05, 0.05), lateral_std=0.1, vertical_std=0.1) == 1).all()
+    assert (factors(swaying(0.01, 0.01), lateral_std=0.1, vertical_std=0.1) < 1).all()
 
 
 def test_nothing_is_learned_without_fixes_or_at_rest():

@@ -1,17 +1,14 @@
 """How far a car breaks the vehicle constraints, and by what factor their variance is to change for it.
 
 While fixes hold the filter, the innovation z of a row across the car (:mod:`dlkf.filters.constraints`) shows what
-roads, tyres and the mount do. Some of that lasts for seconds, so a row a second with the variance of white noise would
-be too exact, and the 1σ σ that is best in outages is larger than z alone would have it:
+roads, tyres and the mount do. Its mean square over its variance
 
-    E[z²] = ``USUAL`` (H P Hᵀ + σ²)
+    m = (``FIRST`` ``EXPECTED`` + Σ z²/(H P Hᵀ + σ²)) / (FIRST + Σ 1)
 
-The variance of the rows is σ² times
-
-    f = (``FIRST`` + Σ z²/(USUAL (H P Hᵀ + σ²))) / (FIRST + Σ 1),    ``LEAST`` ≤ f ≤ ``MOST``
-
-with the sums over the last ``MEMORY`` fixes in motion, sideways and down apart. A square counts with at most that of
-the innovation from which on the row's own 1σ grows.
+over the last ``MEMORY`` fixes in motion, sideways and down apart, would be 1 for rows with white noise of variance σ².
+But what roads and tyres do lasts for seconds, and the σ that is best in outages is larger: with m between ``LOW`` and
+``HIGH`` it fits. Beyond, the variance is σ² m/HIGH or σ² m/LOW, within ``LEAST`` and ``MOST`` times σ². A square counts
+with at most that of the innovation from which on the row's own 1σ grows.
 """
 
 from __future__ import annotations
@@ -22,16 +19,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-USUAL = 0.5  # of the variance of z, where σ fits
-FIRST = 30.0  # fixes for which σ counts as it is set
+FIRST, EXPECTED = 10.0, 0.25  # fixes for which a mean of so much counts at the start
 MEMORY = 300.0  # fixes
-LEAST, MOST = 0.4, 30.0  # a worse road may come: little below 1
+LOW, HIGH = 0.1, 0.5  # of m, where σ fits
+LEAST, MOST = 0.1, 30.0
 
 
 class ConstraintNoise(NamedTuple):
     """Running sums over fixes in motion."""
 
-    squares: Tensor  # (B, 2) of z² over its usual variance, sideways and down
+    squares: Tensor  # (B, 2) of z² over its variance, sideways and down
     fixes: Tensor  # (B, 1) how many
 
     @classmethod
@@ -41,8 +38,9 @@ class ConstraintNoise(NamedTuple):
 
     @property
     def factor(self) -> Float[Tensor, "B 2"]:
-        """f, on the variance of the rows."""
-        return ((FIRST + self.squares) / (FIRST + self.fixes)).clamp(LEAST, MOST)
+        """On the variance of the rows."""
+        mean = (FIRST * EXPECTED + self.squares) / (FIRST + self.fixes)
+        return torch.maximum(mean / HIGH, (mean / LOW).clamp_max(1.0)).clamp(LEAST, MOST)
 
     def after(
         self,
@@ -57,5 +55,5 @@ class ConstraintNoise(NamedTuple):
         counts = learns.to(z.dtype).unsqueeze(-1)
         keep = 1 - counts / MEMORY
         most = sigmas**2 * (of_state + self.factor * variance)
-        square = torch.minimum(z.square(), most) / (USUAL * (of_state + variance))
+        square = torch.minimum(z.square(), most) / (of_state + variance)
         return ConstraintNoise(keep * self.squares + counts * square, keep * self.fixes + counts)
