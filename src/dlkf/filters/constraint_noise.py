@@ -42,6 +42,7 @@ class ConstraintNoise(NamedTuple):
         mean = (FIRST * EXPECTED + self.squares) / (FIRST + self.fixes)
         return torch.maximum(mean / HIGH, (mean / LOW).clamp_max(1.0)).clamp(LEAST, MOST)
 
+    @torch.no_grad()
     def after(
         self,
         z: Float[Tensor, "B 2"],
