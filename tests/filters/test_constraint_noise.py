@@ -12,11 +12,13 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.constraint_noise import EXPECTED, FIRST, HIGH, LEAST, LOW, MEMORY, MOST, ConstraintNoise
 from dlkf.filters.constraints import CarConstraints, CarMemory
 from dlkf.filters.integration import integrate
+from dlkf.filters.sources import Predicted
 from dlkf.filters.tuning import Tuning
-from dlkf.navigation.state import NavState
+from dlkf.navigation.calibration import ImuError
+from dlkf.navigation.state import ErrorStates, NavState
 
 from .scene import IMU, M, scene
-from .test_constraints import driven, outage
+from .test_constraints import driven, epoch_of, outage
 from .test_stationarity import in_parts
 
 D = torch.float64
@@ -96,6 +98,20 @@ def test_shorter_update_intervals_find_the_same():
     batch = swaying(0.4, 0.2)
     whole, fifths = (factors(x, lateral_std=0.1, vertical_std=0.1) for x in (batch, in_parts(batch, 5)))
     assert ((fifths / whole - 1).abs() < 0.35).all()
+
+
+def test_the_rows_have_the_variance_that_was_found():
+    batch = scene(1, 1, seed=3)
+    states = ErrorStates(structure=True)
+    rules = CarConstraints(Tuning(), states, finds_noise=True)
+    memory = rules.begin(batch)
+    found = ConstraintNoise(torch.tensor([[90.0, 1.0]], dtype=D), torch.tensor([[90.0]], dtype=D))
+    at = epoch_of(batch, batch.start, ImuError(torch.zeros(1, 6, dtype=D)))
+    P = Predicted(1e-4 * torch.eye(states.count, dtype=D).unsqueeze(0))
+    row, other = (rules.rows(at, m, P)[0] for m in (memory, memory._replace(noise=found)))
+    expected = [(2.5 + 90) / 100 / HIGH, (2.5 + 1) / 100 / LOW]
+    torch.testing.assert_close((other.R / row.R)[0, :2], torch.tensor(expected, dtype=D))
+    torch.testing.assert_close(other.R[:, 2:], row.R[:, 2:])
 
 
 def test_only_a_filter_that_finds_it_carries_it():

@@ -15,7 +15,7 @@ from dlkf.navigation.state import NavState
 from tests.cars import IMU, car_batch
 
 LOST, END = 15, 60  # s: the outage
-SHAKE = (0.1, 0.02)  # m/s², rad/s: of an idling diesel, above what is taken for standing until the drive tells
+SHAKE = (0.1, 0.02)  # m/s², rad/s: of a car in the wind, above what is taken for standing until the drive shows it
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,8 @@ def standing():
     rest = torch.cat(
         ((C.mT @ -batch.frame.gravity(p)[..., None])[..., 0], (C.mT @ batch.frame.earth_rate_n[..., None])[..., 0]), -1
     )
-    shake = torch.tensor([SHAKE[0]] * 3 + [SHAKE[1]] * 3) * (1.0 - 2.0 * (torch.arange(M) % 2))[:, None]  # sums to zero
+    sign = 1.0 - 2.0 * ((10 * torch.arange(M) // M) % 2)  # at 5 Hz; sums to zero
+    shake = torch.tensor([SHAKE[0]] * 3 + [SHAKE[1]] * 3) * sign[:, None]
     imu = rest[:, None, None] + batch.true_imu_error[:, :, None] + shake
     truth = NavState(p[:, None].repeat(1, T, 1), torch.zeros(B, T, 3).double(), C[:, None].repeat(1, T, 1, 1))
     start = NavState(p, torch.zeros(B, 3).double(), C)
@@ -48,4 +49,4 @@ def test_a_car_whose_wheel_stands_does_not_slide_sideways(standing, name):
     with torch.no_grad():
         solution = integrate(standing, model)
     error = (solution.posterior.p_n - standing.truth.p_n)[:, -1, :2].norm(dim=-1)
-    assert error.max() < 0.3, error
+    assert error.max() < 0.5, error
