@@ -22,7 +22,7 @@ from torch import Tensor
 FIRST, EXPECTED = 10.0, 0.25  # fixes for which a mean of so much counts at the start
 MEMORY = 300.0  # fixes
 LOW, HIGH = 0.1, 0.5  # of m, where σ fits
-LEAST, MOST = 0.1, 30.0
+LEAST, MOST = 0.1, 10.0
 
 
 class ConstraintNoise(NamedTuple):

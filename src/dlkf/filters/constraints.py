@@ -34,7 +34,7 @@ from dlkf.filters.sources import Measurement, Predicted, predicted_variance
 from dlkf.filters.stationarity import VibrationLevel, WheelMotion, detect_stationary
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import skew
-from dlkf.navigation.state import GYRO, STATES, VELOCITY, ErrorStates
+from dlkf.navigation.state import GYRO, POSITION, STATES, VELOCITY, ErrorStates
 
 STRUCTURE_STD = (0.05, 0.05, 1.5, 0.01, 0.005)  # rad, rad, m, s²/m, s²·rad/m: what is known of a car before it moves
 STRUCTURE_WALK_STD = (2e-5, 2e-5, 1e-4, 1e-6, 1e-6)  # per √s
@@ -91,7 +91,7 @@ class CarConstraints:
             variance = torch.cat((noise.factor * variance[:, :2], variance[:, 2:]), -1)
         S = of_state + variance[:, :2]
         if noise is not None:
-            learns = used[:, 0] & epoch.used[:, :2].all(-1)
+            learns = used[:, 0] & _near_fix(epoch, prediction.P)
             noise = noise.after(zn, of_state, a_second, OUTLIER, learns)
         variance = torch.cat((variance[:, :2] * (zn.square() / (OUTLIER**2 * S)).clamp_min(1.0), variance[:, 2:]), -1)
         z = torch.cat((zn, zr), -1) * used
@@ -143,6 +143,13 @@ class CarConstraints:
         earth_b = torch.bmm(state.C_nb.mT, epoch.frame.earth_rate_n.unsqueeze(-1)).squeeze(-1)
         z = torch.cat((-state.v_n, epoch.corrected[..., 3:].mean(1) - earth_b), -1)
         return z, _standing(self.states.count, z.dtype, z.device).expand(len(z), -1, -1)
+
+
+def _near_fix(epoch: Epoch, P: Float[Tensor, "B n n"]) -> Bool[Tensor, " B"]:
+    """Whether the window has a fix whose horizontal position is within 3σ of the filter's."""
+    S = P.diagonal(dim1=-2, dim2=-1)[:, POSITION] + epoch.fix.std[:, POSITION].square()
+    near = epoch.z[:, POSITION].square() < OUTLIER**2 * S
+    return (epoch.used[:, POSITION] & near)[:, :2].all(-1)
 
 
 @lru_cache
