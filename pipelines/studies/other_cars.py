@@ -124,10 +124,8 @@ def _nuance_drive(
 def read_kingston(logs: Path) -> Iterator[DriveFrames]:
     """An HG1700 averaged to 10 Hz (Right-Forward-Up), a receiver with heights above sea level, the SPAN solution."""
     top = logs / "marwanrashed/INSfullMech"
-    folder, log = (
-        top / "2008-06-23 kingston downtown/rover/Mat",
-        loadmat(top / "f_w_IMSseconds_dt_Marwan.mat", squeeze_me=True),
-    )
+    folder = top / "2008-06-23 kingston downtown/rover/Mat"
+    log = loadmat(top / "f_w_IMSseconds_dt_Marwan.mat", squeeze_me=True)
     accel, gyro = (np.stack([log[k][axis].item() for axis in "xyz"], -1).astype(float) for k in "fw")
     zero = np.floor(log["IMU_second"][0])
     imu = imu_table(log["IMU_second"] - zero, accel, gyro, RFU)

@@ -36,7 +36,7 @@ LEAST = 0.005  # share of the seconds in motion
 KINDS = ("all samples", f"means over {AVERAGE_S:g} s")
 
 
-def levels(drives: Iterable[Drive]) -> tuple[np.ndarray, np.ndarray]:
+def vibration_levels(drives: Iterable[Drive]) -> tuple[np.ndarray, np.ndarray]:
     """(n, 2) of the seconds at rest and of those in motion, by :data:`KINDS`."""
     at_rest, in_motion = [], []
     for drive in drives:
@@ -60,21 +60,23 @@ class Recorded(CarConstraints):
     def resting(
         self, epoch: Epoch, turning: Float[Tensor, "B 3"], prediction: Predicted, memory: CarMemory
     ) -> tuple[Bool[Tensor, " B"], VibrationLevel]:
-        """As ever."""
+        """As without recording."""
         resting, level = super().resting(epoch, turning, prediction, memory)
         self.found.append(resting)
         return resting, level
 
 
-def counted(cases: Iterable[Case]) -> tuple[int, int, int, int]:
+def count_standstills(cases: Iterable[Case]) -> tuple[int, int, int, int]:
     """Seconds of outages at rest, those found, seconds in motion, those taken for a standstill."""
     total = np.zeros(4, int)
     for case in cases:
         filter_: Any = trained_filter("plus")
         assert isinstance(filter_, PlusFilter)
-        source = Recorded(filter_.kalman.tuning, filter_.kalman.states)
-        sources = tuple(source if isinstance(s, CarConstraints) else s for s in filter_.kalman.sources)
-        filter_.kalman = replace(filter_.kalman, sources=sources)
+        sources, found = [], []
+        for s in filter_.kalman.sources:
+            is_car = isinstance(s, CarConstraints)
+            sources.append(Recorded(s.tuning, s.states, found, adapts_noise=s.adapts_noise) if is_car else s)
+        filter_.kalman = replace(filter_.kalman, sources=tuple(sources))
         batch = case.batch
         with torch.no_grad():
             integrate(batch, filter_)
@@ -82,14 +84,14 @@ def counted(cases: Iterable[Case]) -> tuple[int, int, int, int]:
         speed = torch.stack((speed[:, :-1], speed[:, 1:]), -1)
         outage = ~batch.available & batch.present & batch.truth_valid
         rest, motion = outage & (speed.amax(-1) < STANDING), outage & (speed.amin(-1) > TAKEN)
-        found = torch.stack(source.found, 1)
-        total += [int(x.sum()) for x in (rest, rest & found, motion, motion & found)]
+        taken = torch.stack(found, 1)
+        total += [int(x.sum()) for x in (rest, rest & taken, motion, motion & taken)]
     return tuple(int(x) for x in total)  # type: ignore[return-value]
 
 
-def row(name: str, drives: Sequence[Drive], cases: Iterable[Case]) -> str:
-    """Of a table."""
-    rest, motion = levels(drives)
+def format_row(name: str, drives: Sequence[Drive], cases: Iterable[Case]) -> str:
+    """The row of a dataset in the table."""
+    rest, motion = vibration_levels(drives)
     if not len(rest) or not len(motion):
         raise SystemExit(f"{name}: no second at rest, or none in motion")
     least = np.quantile(motion, LEAST, axis=0)
@@ -97,7 +99,7 @@ def row(name: str, drives: Sequence[Drive], cases: Iterable[Case]) -> str:
     for k in range(len(KINDS)):
         below = np.mean(rest[:, k] < least[k])
         cells += [f"{np.median(rest[:, k]):.1e}", f"{least[k]:.1e}", f"{100 * below:.0f} %"]
-    return f"| {' | '.join((*cells, *map(str, counted(cases))))} |"
+    return f"| {' | '.join((*cells, *map(str, count_standstills(cases))))} |"
 
 
 def main() -> None:
@@ -113,7 +115,7 @@ def main() -> None:
     print(f"| {' | '.join(head)} |\n|:--|{'--:|' * (len(head) - 1)}")
     for folder, cases in (*((x, real_cases) for x in options.real), *((x, simulated_cases) for x in options.datasets)):
         drives = load(folder)
-        print(row(folder.name, drives, cases(folder.name, drives)), flush=True)
+        print(format_row(folder.name, drives, cases(folder.name, drives)), flush=True)
 
 
 if __name__ == "__main__":

@@ -49,7 +49,7 @@ def factors(batch, name: str = "mbkf21_car", **tuning: float) -> torch.Tensor:
             return row, after
 
     sources = tuple(
-        Watched(s.tuning, s.states, finds_noise=True) if isinstance(s, CarConstraints) else s for s in kalman.sources
+        Watched(s.tuning, s.states, adapts_noise=True) if isinstance(s, CarConstraints) else s for s in kalman.sources
     )
     integrate(batch, replace(kalman, sources=sources))
     return last["f"]
@@ -114,7 +114,7 @@ def test_shorter_update_intervals_find_the_same():
 def test_the_rows_have_the_variance_that_was_found():
     batch = scene(1, 1, seed=3)
     states = ErrorStates(structure=True)
-    rules = CarConstraints(Tuning(), states, finds_noise=True)
+    rules = CarConstraints(Tuning(), states, adapts_noise=True)
     memory = rules.begin(batch)
     found = ConstraintNoise(torch.tensor([[90.0, 1.0]], dtype=D), torch.tensor([[90.0]], dtype=D))
     at = epoch_of(batch, batch.start, ImuError(torch.zeros(1, 6, dtype=D)))
@@ -128,5 +128,5 @@ def test_the_rows_have_the_variance_that_was_found():
 def test_only_a_filter_that_finds_it_carries_it():
     batch = scene(2, 3)
     rules = next(s for s in build_filter("mbkf21_car", IMU).sources if isinstance(s, CarConstraints))
-    begun = rules.begin(batch), replace(rules, finds_noise=True).code.begin(batch)
+    begun = rules.begin(batch), replace(rules, adapts_noise=True).code.begin(batch)
     assert isinstance(begun[0], CarMemory) and begun[0].noise is None and begun[1].noise is not None

@@ -34,7 +34,7 @@ def plus(base="mbkf21_car", weights: float = 0.0, hidden: int = 16) -> PlusFilte
 def classical(base: str, model: PlusFilter):
     """Its classical filter."""
     kalman = build_filter(base, model.imu, tuning=model.tuning)
-    sources = tuple(replace(s, finds_noise=True) if isinstance(s, CarConstraints) else s for s in kalman.sources)
+    sources = tuple(replace(s, adapts_noise=True) if isinstance(s, CarConstraints) else s for s in kalman.sources)
     return replace(kalman, sources=sources, heavy_tails=True)
 
 

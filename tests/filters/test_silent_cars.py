@@ -116,7 +116,7 @@ def test_straight_on_at_constant_speed_is_no_standstill(silent):
     speed, errors = batch.truth.v_n.norm(dim=-1), []
     for used in (True, False):
         kalman = classical()
-        eyes = [Watched(s.tuning, s.states, used) for s in kalman.sources if isinstance(s, CarConstraints)]
+        eyes = [Watched(s.tuning, s.states, used=used) for s in kalman.sources if isinstance(s, CarConstraints)]
         estimator = replace(kalman, sources=(*(s for s in kalman.sources if not isinstance(s, CarConstraints)), *eyes))
         with torch.inference_mode():
             solution = run_filter(batch, estimator)

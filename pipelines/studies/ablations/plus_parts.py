@@ -25,7 +25,7 @@ class ConstraintsAsSet(PlusFilter):
 
     def __init__(self, config: PlusConfig) -> None:
         super().__init__(config)
-        kept = (replace(s, finds_noise=False) if isinstance(s, CarConstraints) else s for s in self.kalman.sources)
+        kept = (replace(s, adapts_noise=False) if isinstance(s, CarConstraints) else s for s in self.kalman.sources)
         self.kalman = replace(self.kalman, sources=tuple(kept))
 
 

@@ -7,8 +7,8 @@ roads, tyres and the mount do. Its mean square over its variance
 
 over the last ``MEMORY`` fixes in motion, sideways and down apart, would be 1 for rows with white noise of variance σ².
 But what roads and tyres do lasts for seconds, and the σ that is best in outages is larger: with m between ``LOW`` and
-``HIGH`` it fits. Beyond, the variance is σ² m/HIGH or σ² m/LOW, within ``LEAST`` and ``MOST`` times σ². A square counts
-with at most that of the innovation from which on the row's own 1σ grows.
+``HIGH`` it fits. Beyond, the variance is σ² m/HIGH or σ² m/LOW, within ``LEAST`` and ``MOST`` times σ². z² is capped at
+9 (H P Hᵀ + f σ²), f the factor in force.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class ConstraintNoise(NamedTuple):
     """Running sums over fixes in motion."""
 
     squares: Tensor  # (B, 2) of z² over its variance, sideways and down
-    fixes: Tensor  # (B, 1) how many
+    fixes: Tensor  # (B, 1) how many, those long ago less
 
     @classmethod
     def begin(cls, like: Tensor, batch_size: int) -> ConstraintNoise:
@@ -42,7 +42,6 @@ class ConstraintNoise(NamedTuple):
         mean = (FIRST * EXPECTED + self.squares) / (FIRST + self.fixes)
         return torch.maximum(mean / HIGH, (mean / LOW).clamp_max(1.0)).clamp(LEAST, MOST)
 
-    @torch.no_grad()
     def after(
         self,
         z: Float[Tensor, "B 2"],
@@ -51,8 +50,8 @@ class ConstraintNoise(NamedTuple):
         sigmas: float,
         learns: Bool[Tensor, " B"],
     ) -> ConstraintNoise:
-        """After an update interval that counts where it ``learns``; H P Hᵀ, σ² of a row a second, and of how many σ in
-        force an innovation counts at most."""
+        """Sums after an update interval; only drives that ``learns`` marks count. ``of_state`` is H P Hᵀ, ``variance``
+        σ² of a row a second, ``sigmas`` how many σ in force an innovation counts at most."""
         counts = learns.to(z.dtype).unsqueeze(-1)
         keep = 1 - counts / MEMORY
         most = sigmas**2 * (of_state + self.factor * variance)

@@ -19,7 +19,7 @@ the same.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -56,12 +56,12 @@ class CarMemory(NamedTuple):
 class CarConstraints:
     """Constraints on a car's motion for a filter with the given error states.
 
-    ``finds_noise``: the 1σ across the car follows what innovations show (:mod:`dlkf.filters.constraint_noise`).
+    ``adapts_noise``: the 1σ across the car follows what innovations show (:mod:`dlkf.filters.constraint_noise`).
     """
 
     tuning: Tuning
     states: ErrorStates
-    finds_noise: bool = False
+    adapts_noise: bool = field(default=False, kw_only=True)
 
     @property
     def code(self) -> CarConstraints:
@@ -72,7 +72,7 @@ class CarConstraints:
         """No standstill so far, and the 1σ of the rows."""
         t, new = self.tuning, batch.imu.new_tensor
         std = [t.lateral_std, t.vertical_std] + [t.rest_velocity_std] * 3 + [t.rest_rate_std] * 3
-        noise = ConstraintNoise.begin(batch.imu, batch.size[0]) if self.finds_noise else None
+        noise = ConstraintNoise.begin(batch.imu, batch.size[0]) if self.adapts_noise else None
         return CarMemory(new([std]), VibrationLevel.begin(batch), new([t.rest_accel * t.rest_gyro]), noise)
 
     def rows(self, epoch: Epoch, memory: CarMemory, prediction: Predicted) -> tuple[Measurement, CarMemory]:

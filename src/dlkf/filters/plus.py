@@ -121,7 +121,7 @@ class PlusFilter(nn.Module):
             raise InputError(
                 f"model.base={config.base} is no Kalman filter that plus can stand on; take {PlusConfig.base}"
             )
-        sources = tuple(replace(s, finds_noise=True) if isinstance(s, CarConstraints) else s for s in kalman.sources)
+        sources = tuple(replace(s, adapts_noise=True) if isinstance(s, CarConstraints) else s for s in kalman.sources)
         self.kalman = replace(kalman, sources=sources, cut_transition=True, heavy_tails=True)
         count = self.kalman.states.base.count
         now = 3 + 3 + 3 + 2 + 6

@@ -1,6 +1,6 @@
 """Stationarity detection, from the samples of a window and the vibration levels of this car at rest and in motion.
 
-An idling engine shakes an IMU at 10 Hz and more, and can do so more than a smooth road; a car that moves also sways
+An idling engine shakes an IMU at 10 Hz and more, and can do so more than a smooth road; a car in motion also sways
 and pitches more slowly. So the level is that of means over ``AVERAGE_S``, in which the noise of the sensors is smaller
 too. IMUs and roads differ, so no fixed limit on it fits two cars: the levels are learned while GNSS shows whether the
 car moves. A standstill is then a window whose level is closer to the
@@ -11,7 +11,7 @@ vibration has the same spread in both; then a standstill needs a speed below 0.5
 count, for minutes at constant speed show no acceleration and no turn either. So does one of a car of which nothing is
 learned, and there the filter's 1σ of tilt explains little of an acceleration. A speed above 0.5 m/s needs
 ``DOUBTFUL_S``, for a car creeps as calmly for a second. Where a car has shaken as little for ``LONG_S`` as at a
-standstill, and ``FAR_APART`` times more in every second of motion, the filter's speed is wrong, within 20σ: one event
+standstill, and far more in every second of motion so far, the filter's speed is wrong, within 20σ and 10 m/s: one event
 that its noise does not know spoils it so much.
 
 Carrier-phase positions show motion as velocities do. Of positions that are off by metres, two that lie ``SPAN_S`` apart
@@ -54,7 +54,7 @@ SPAN_S, SPAN_LEFT_S = 5.0, 10.0  # s between two positions that show a mean spee
 SPAN_SIGMAS, SPAN_STANDING = 3.0, 0.3  # 1σ that a mean speed is beyond MOVING_SPEED; m/s, that of a standstill
 LONG_ACCEL = 0.2  # m/s², instead of STILL_ACCEL, of a long rest: a filter with a wrong speed has a wrong tilt
 LONG_S, LONG_SIGMAS, ALIKE = 10.0, 20.0, 2.0  # s, 1σ of the speed: of a standstill at most so many times its level
-FAR_APART = 30.0  # prior ratio of the levels there
+LONG_SPEED, FAR_APART = 10.0, 30.0  # m/s, at most; a level of rest is taken for so many times below that of motion
 
 
 class LastSecond(NamedTuple):
@@ -93,7 +93,7 @@ class LastSecond(NamedTuple):
 
 class _Parts(NamedTuple):
     """How a second is cut: ``each`` means of ``samples`` an update interval, ``together`` of which are averaged again,
-    and ``count`` of which are kept."""
+    and ``count`` of which are kept. The first samples of an interval that they do not divide are left out."""
 
     samples: int
     each: int
@@ -103,9 +103,11 @@ class _Parts(NamedTuple):
     @classmethod
     def of(cls, M: int, dt: float) -> _Parts:
         """For M samples an update interval."""
-        samples = min(M, max(1, round(AVERAGE_S / dt)))
+        samples = max(1, M // max(1, round(M * dt / AVERAGE_S)))
         each, together = M // samples, max(1, round(AVERAGE_S / (samples * dt)))
-        boxes = max(round(LEAST_S / (together * samples * dt)), each // together, 1)
+        boxes = each // together
+        if M * dt < LEAST_S - 0.5 * AVERAGE_S:
+            boxes = max(boxes, round(LEAST_S / (together * samples * dt)), 1)
         return cls(samples, each, together, together * boxes)
 
 
@@ -251,7 +253,7 @@ def detect_stationary(
     slow = (speed < PLAUSIBLE_SPEED) & (still_s > LEAST_S - 0.5 * span)
     fastest = PLAUSIBLE_SPEED + _speed_doubt(std, learned & distinct, learned & surely)
     plausible = (speed < fastest) & (calm_s > DOUBTFUL_S - 0.5 * span)
-    long = (speed < LONG_SIGMAS * std) & (rest_s > LONG_S - 0.5 * span)
+    long = (speed < (LONG_SIGMAS * std).clamp_max(LONG_SPEED)) & (rest_s > LONG_S - 0.5 * span)
     stationary = calm & still & (slow | plausible) | long
     proven = sure & still & (still_s > PROVEN_S - 0.5 * span) & (speed + 2 * std < PROVEN_SPEED)
     stationary = stationary | proven

@@ -19,7 +19,7 @@ class Tuning:
 
     Filters with constraints: ``lateral_std``, ``vertical_std`` [m/s] of the velocity across the car, once a
     second, ``rest_velocity_std`` [m/s], ``rest_rate_std`` [rad/s] of a standstill; ``rest_accel`` [m/s²] and
-    ``rest_gyro`` [rad/s] are the spread of the samples in the least shaken second of motion, until learned.
+    ``rest_gyro`` [rad/s] are the spread of means over 0.1 s in the least shaken second of motion, until learned.
     Filters with further sensors: ``wheel_std`` [m/s] and ``baro_std`` [m] of an update interval's measurement where the
     file gives none, ``heading_std`` a factor on that of the heading.
     Filters with a gate: ``gate`` is the probability that a good fix passes. ``aekf``: ``forgetting`` is the share
