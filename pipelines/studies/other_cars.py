@@ -29,6 +29,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.io import loadmat
 from scipy.ndimage import uniform_filter1d
 
+from dlkf.base.errors import InputError
 from dlkf.base.provenance import describe_provenance
 from dlkf.data.intake import IngestOptions, ingest_drives
 from dlkf.data.readers.frames import DriveFrames
@@ -245,14 +246,16 @@ def correlate(drive: DriveFrames) -> dict[str, tuple[float, float]]:
 
 
 def convert(name: str, logs: Path, folder: Path) -> list[str]:
-    """Write a log as a dataset and return what its axes, signs and clocks are checked by; AssertionError on doubt."""
+    """Write a log as a dataset and return what its axes, signs and clocks are checked by; InputError on doubt."""
     lines, drives = [], list(LOGS[name].read(logs))
     for drive in drives:
         found = correlate(drive)
         down = float(drive.imu["accel_z"].mean())
-        assert abs(down + G) < 0.6 and min(r for r, _ in found.values()) > 0.7, (drive.name, down, found)
         shown = "; ".join(f"{axis} r {r:.3f}, slope {slope:.2f}" for axis, (r, slope) in found.items())
-        lines.append(f"{name}/{drive.name}: accel_z {down:.2f} m/s² in the mean; {shown}")
+        line = f"{name}/{drive.name}: accel_z {down:.2f} m/s² in the mean; {shown}"
+        if abs(down + G) >= 0.6 or min(r for r, _ in found.values()) <= 0.7:
+            raise InputError(f"axes, signs or clocks are not those of the log that this was written for: {line}")
+        lines.append(line)
         drive.meta.update(source=" ".join(LOGS[name].repositories), licence="of the repository")
     ingest_drives(drives, folder, IngestOptions(), overwrite=True)
     return lines

@@ -13,6 +13,7 @@ import torch
 from pipelines.studies import other_cars
 from scipy.io import savemat
 
+from dlkf.base.errors import InputError
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD
 from dlkf.data.store import load_dataset
 from dlkf.navigation.attitude import rotation_from_rpy
@@ -202,7 +203,7 @@ def test_a_dataset_is_written_and_its_reference_is_found(name, tmp_path):
 def test_a_turned_sensor_is_refused(tmp_path, monkeypatch):
     write_kingston(tmp_path)
     monkeypatch.setattr(other_cars, "RFU", np.array([[1, 0, 0], [0, -1, 0], [0, 0, -1]]))
-    with pytest.raises(AssertionError):
+    with pytest.raises(InputError):
         other_cars.convert("kingston", tmp_path, tmp_path / "out")
 
 
