@@ -18,6 +18,8 @@ from dlkf.filters.tuning import Tuning
 from dlkf.navigation.attitude import rotation_from_rpy, rotation_from_vector
 from dlkf.navigation.state import ACCEL, ATTITUDE, NavState
 from dlkf.navigation.strapdown import strapdown
+from dlkf.onboard.compiled_filter import compile_filter
+from dlkf.onboard.library import compiler
 
 from .scene import IMU, M, scene
 from .test_constraints import drift, driven, outage, slipping
@@ -257,6 +259,16 @@ def test_shorter_update_intervals_find_the_same_standstills(speeds):
     if batch is stop:
         assert taken[(speed < 0.01) & (before < 0.01)].float().mean() > 0.9
     assert not taken[(speed > 1.0) & (before > 1.0)].any()
+
+
+@pytest.mark.exports
+@pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+def test_the_last_second_is_the_same_in_c():
+    """Update intervals of a fifth, whose means are kept from one to the next; a stop in an outage."""
+    batch, kalman = in_parts(shaken((0.02, 2e-4), (0.2, 8e-3), SWAY)), build_filter("mbkf21_car", IMU)
+    with torch.inference_mode():
+        both = [integrate(batch, kalman), compile_filter(kalman, 1 / batch.dt, batch.epoch_s).integrate(batch)]
+    torch.testing.assert_close(both[1].posterior.p_n, both[0].posterior.p_n, rtol=0, atol=1e-9)
 
 
 def test_a_moment_without_acceleration_is_no_standstill():
