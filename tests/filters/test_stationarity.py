@@ -261,7 +261,7 @@ def test_shorter_update_intervals_find_the_same_standstills(speeds):
     assert not taken[(speed > 1.0) & (before > 1.0)].any()
 
 
-@pytest.mark.exports
+@pytest.mark.whole
 @pytest.mark.skipif(compiler() is None, reason="no C compiler here")
 def test_the_last_second_is_the_same_in_c():
     """Update intervals of a fifth, whose means are kept from one to the next; a stop in an outage."""
