@@ -148,11 +148,7 @@ class LearnedFilter(nn.Module):
             return memory, Correction(dx, epoch.error, gain=gain)
         whole = len(rows) == B
         K, error, recurrent = self._run(memory, epoch, rows, whole, has_fix)
-        part = (K @ epoch.z[rows].unsqueeze(-1)).squeeze(-1)
-        if self.training and self.config.training_turn:
-            turn = part[:, ATTITUDE].norm(dim=-1, keepdim=True).detach()
-            shrink = (self.config.training_turn / turn.clamp_min(1e-9)).clamp(max=1.0)
-            part = torch.cat((part[:, :6], part[:, ATTITUDE] * shrink), -1)
+        part = self._limited((K @ epoch.z[rows].unsqueeze(-1)).squeeze(-1))
         if hold and not picking:
             dx, gain = chosen(has_fix, part, dx), chosen(has_fix, K, gain)
             matrix = None
@@ -169,10 +165,19 @@ class LearnedFilter(nn.Module):
         ran = has_fix if hold else torch.ones_like(has_fix)
         return self._remember(memory, epoch, dx, has_fix, ran, recurrent), Correction(dx, error, gain=gain)
 
+    def _limited(self, dx: Tensor) -> Tensor:
+        """A correction (b, 9) whose turn is limited in training."""
+        if not (self.training and self.config.training_turn):
+            return dx
+        turn = dx[:, ATTITUDE].norm(dim=-1, keepdim=True).detach()
+        shrink = (self.config.training_turn / turn.clamp_min(1e-9)).clamp(max=1.0)
+        return torch.cat((dx[:, :6], dx[:, ATTITUDE] * shrink), -1)
+
     def _run(
-        self, memory: LearnedMemory, epoch: Epoch, rows: Tensor, whole: bool, has_fix: Tensor
-    ) -> tuple[Tensor, ImuError, Recurrent]:
-        """Gain in n, IMU error and new state of the cells for the segments in ``rows``."""
+        self, memory: LearnedMemory, epoch: Epoch, rows: Tensor, whole: bool, has_fix: Tensor,
+        further: Tensor | None = None,
+    ) -> tuple[Tensor, ImuError, Recurrent]:  # fmt: skip
+        """Gain in n, IMU error and new state of the cells for the segments in ``rows``; ``further`` inputs (b, k)."""
 
         def pick(x: Tensor) -> Tensor:
             x = x.detach() if self.config.detach_features else x
@@ -185,6 +190,8 @@ class LearnedFilter(nn.Module):
             fixed = pick(has_fix)
             age = torch.log1p(pick(memory.since_fix)) * ~fixed
             components = torch.cat((components, fixed[:, None].to(age.dtype), age[:, None]), -1)
+        if further is not None:
+            components = torch.cat((components, pick(further)), -1)
         dtype = self.imu_error.linear.weight.dtype
         recurrent = memory.recurrent if whole else tuple(x[:, rows] for x in memory.recurrent)
         h, recurrent = self.network(window.to(dtype), components.to(dtype), recurrent)

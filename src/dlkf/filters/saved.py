@@ -14,13 +14,16 @@ from dlkf.base.documents import read_yaml
 from dlkf.base.errors import InputError
 from dlkf.filters.card import CARD, read_card
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
+from dlkf.filters.learned_kalman import LearnedKalmanConfig, LearnedKalmanFilter
 from dlkf.filters.plus import PlusConfig, PlusFilter
 
 WEIGHTS, CONFIG = "weights.safetensors", "config.yaml"
 FASTEST_HZ, LONGEST_S = 10_000.0, 60.0  # of an IMU, of an epoch: beyond these something was mistyped
 LearnedSettings = LearnedConfig | PlusConfig
 Learned = LearnedFilter | PlusFilter
-KINDS: Mapping[str, type[LearnedConfig] | type[PlusConfig]] = {"dlkf": LearnedConfig, "plus": PlusConfig}
+KINDS: Mapping[str, type[LearnedConfig] | type[PlusConfig]] = {
+    "dlkf": LearnedConfig, "dlkf_kalman": LearnedKalmanConfig, "plus": PlusConfig,
+}  # fmt: skip
 
 
 def learned_settings(values: Mapping[str, Any]) -> LearnedSettings:
@@ -33,7 +36,9 @@ def learned_settings(values: Mapping[str, Any]) -> LearnedSettings:
 
 def learned_filter(settings: LearnedSettings) -> Learned:
     """A filter with fresh weights."""
-    return PlusFilter(settings) if isinstance(settings, PlusConfig) else LearnedFilter(settings)
+    if isinstance(settings, PlusConfig):
+        return PlusFilter(settings)
+    return LearnedKalmanFilter(settings) if isinstance(settings, LearnedKalmanConfig) else LearnedFilter(settings)
 
 
 def save_filter(model: Learned, folder: Path | str, card: Mapping[str, Any] | None = None) -> None:

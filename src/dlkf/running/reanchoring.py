@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dlkf.filters import constraints, learned, model_based, plus
+from dlkf.filters import constraints, learned, learned_kalman, model_based, plus
 from dlkf.filters.gating import GateMemory
 from dlkf.navigation.earth import TangentFrame, tangent_frame
 from dlkf.navigation.geodetic import geodetic_from_ecef
@@ -127,6 +127,14 @@ def _(memory: learned.LearnedMemory, change: FrameChange, fresh: learned.Learned
         correction=change.vectors(memory.correction),
         fix=torch.where(memory.had_fix, change.fixes(memory.fix), memory.fix),
     )
+
+
+@reanchor.register
+def _(
+    memory: learned_kalman.LearnedKalmanMemory, change: FrameChange, fresh: learned_kalman.LearnedKalmanMemory
+) -> learned_kalman.LearnedKalmanMemory:
+    network = reanchor(memory.network, change, fresh.network)
+    return memory._replace(network=network, kalman=reanchor(memory.kalman, change, fresh.kalman))
 
 
 @reanchor.register

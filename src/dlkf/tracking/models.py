@@ -18,7 +18,7 @@ from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.tracking.runs import RUN_ID
 
-NETWORKS = ("dlkf", "dlkf_literal")  # of conf/filter, which dlkf train trains
+NETWORKS = ("dlkf", "dlkf_kalman", "dlkf_literal")  # of conf/filter, which dlkf train trains
 BEST = "best"  # folder of the weights that a training keeps
 
 

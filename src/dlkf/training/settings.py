@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from lightning.pytorch.callbacks import Callback
@@ -14,6 +14,7 @@ from dlkf.base.settings import Ranged, bounded_field
 from dlkf.data.masks import BiasLaw
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import is_filter
+from dlkf.filters.learned_kalman import LearnedKalmanConfig
 from dlkf.filters.saved import LearnedSettings, learned_settings
 from dlkf.filters.shipped import shipped_folder
 from dlkf.filters.tuning import Tuning
@@ -148,4 +149,7 @@ class TrainSettings:
         fit = self.fit
         if fit.model.kind in self.baselines.models:
             raise InputError(f"baselines.models has {fit.model.kind}, the name of the trained filter; take it out")
-        return StudySettings(self.name, imu_spec(self.imu), fit, self.baselines, self.scoring)
+        baselines = self.baselines
+        if isinstance(fit.model, LearnedKalmanConfig) and fit.model.base not in baselines.models:
+            baselines = replace(baselines, models=[*baselines.models, fit.model.base])  # its noise is tuned with them
+        return StudySettings(self.name, imu_spec(self.imu), fit, baselines, self.scoring)

@@ -5,14 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from lightning.pytorch.loggers import Logger
 
 import dlkf
+from dlkf.base.documents import read_yaml
 from dlkf.base.provenance import describe_provenance
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.kinds import drive_imus, drive_kinds
@@ -27,7 +29,8 @@ from dlkf.evaluation.study import run_comparison
 from dlkf.evaluation.table import ResultTable
 from dlkf.filters.build import refuse_smoothed
 from dlkf.filters.integration import Estimator
-from dlkf.filters.saved import load_filter
+from dlkf.filters.learned_kalman import LearnedKalmanConfig
+from dlkf.filters.saved import LearnedSettings, learned_settings, load_filter
 from dlkf.filters.shipped import shipped_folder, trained_filter
 from dlkf.report.evaluation import write_report
 from dlkf.training.callbacks.curriculum import LengthCurriculum
@@ -36,6 +39,7 @@ from dlkf.training.settings import FitSettings, ScoringSettings, StudySettings
 from dlkf.tuning.baselines import Baselines, tuned_baselines
 
 Say = Callable[[str], None]
+MODEL = "model.yaml"  # settings of the model of a training, in its folder
 
 
 @dataclass(frozen=True)
@@ -72,8 +76,10 @@ def run_study(
         baselines = _baselines(settings, data, say)
     with _timed(seconds, "training"):
         card = model_card(settings, data, getattr(logger, "run_id", None))
-        mean = baselines.prior.mean
-        weights = fit(settings.fit, data, folder, logger, mean_imu_error=mean, notes=card, further=further)
+        model = model_on_baseline(settings.fit.model, baselines)
+        (folder / MODEL).write_text(yaml.safe_dump(model.plain(), sort_keys=False))  # for further processes
+        on_baseline, mean = replace(settings.fit, model=model), baselines.prior.mean
+        weights = fit(on_baseline, data, folder, logger, mean_imu_error=mean, notes=card, further=further)
     with _timed(seconds, "scoring"):
         filters = {**baselines.build(), **_shipped(names), learned: load_filter(weights)}
         scenes = Scenes.of_split(data, "test", plan, scoring.seed)
@@ -122,7 +128,15 @@ def train_with_baselines(settings: StudySettings, data: DriveDataModule, folder:
     """The part of a further process of the same training: it writes, logs and scores nothing."""
     data.setup()
     set_threads(settings.fit)
-    fit(settings.fit, data, folder, False)
+    model = learned_settings(read_yaml(folder / MODEL))
+    fit(replace(settings.fit, model=model), data, folder, False)
+
+
+def model_on_baseline(model: LearnedSettings, baselines: Baselines) -> LearnedSettings:
+    """The settings of a model; one round a Kalman filter (``dlkf_kalman``) has noise and prior of that baseline."""
+    if not isinstance(model, LearnedKalmanConfig):
+        return model
+    return model.with_base(baselines.imu, baselines.tunings[model.base], baselines.priors.get(model.base))
 
 
 def left_out_drives(settings: StudySettings, data: DriveDataModule) -> list[str]:
@@ -183,7 +197,7 @@ def model_card(settings: StudySettings, data: DriveDataModule, run: str | None) 
     drives, called = data.drives("train"), {}
     for dataset in data.datasets:
         called |= drive_imus(dataset)
-    overfitted = settings.fit.model.kind == "dlkf" and not settings.fit.finetune
+    overfitted = settings.fit.model.kind != "plus" and not settings.fit.finetune
     return {
         "trained_on": sorted({d.group for d in drives}),
         "chosen_on": sorted({d.group for d in data.drives("val")}),

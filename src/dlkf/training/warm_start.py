@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.filters.learned import LearnedFilter
+from dlkf.filters.learned_kalman import LearnedKalmanFilter
 
 SEGMENTS = 60
 
@@ -18,11 +19,12 @@ SEGMENTS = 60
 def warm_start(model: LearnedFilter, data: DriveDataModule, mean_imu_error: Sequence[float] | None) -> None:
     """Start the IMU error at ``mean_imu_error`` (m/s² x 3, rad/s x 3) and learn the sizes of the features.
 
-    Nothing happens to a model whose ``known_from`` is not ``training``.
+    Nothing happens to a model whose ``known_from`` is not ``training``. Round a Kalman filter the network's own error
+    starts at zero: the filter has the mean, if it is one with ``_prior``.
     """
     if model.config.known_from != "training":
         return
-    if mean_imu_error is not None:
+    if mean_imu_error is not None and not isinstance(model, LearnedKalmanFilter):
         model.imu_error.start_at(mean_imu_error)
     batches, seen = [], 0
     for step in range(len(data.train_segments(0))):
