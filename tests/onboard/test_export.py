@@ -21,6 +21,7 @@ from dlkf.base.errors import InputError
 from dlkf.data.alignment import ALIGN
 from dlkf.filters.build import build_filter
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
+from dlkf.filters.learned_kalman import LearnedKalmanConfig, LearnedKalmanFilter
 from dlkf.filters.plus import PlusConfig, PlusFilter
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
@@ -285,6 +286,19 @@ def drive_with(drive, samples: int):
     return replace(drive, imu=drive.imu[:, ::2][:, :samples], rate_hz=25.0)
 
 
+def learned_kalman(base: str) -> LearnedKalmanFilter:
+    """A small network beside a Kalman filter, whose heads have weights of some size."""
+    torch.manual_seed(0)
+    size = {"lstm_hidden": 12, "lstm_layers": 2, "dense": [10, 8]}
+    settings = {"network": size, "frame": "heading", "imu_error": "affine", "imu_error_bound": 4.0, "base": base}
+    config = LearnedKalmanConfig.from_mapping(settings).with_base(IMU, Tuning(), None)
+    model = LearnedKalmanFilter(config).eval()
+    with torch.no_grad():
+        model.gain.linear.weight.mul_(20)
+        model.imu_error.linear.weight.mul_(20)
+    return model
+
+
 def learned(**settings) -> LearnedFilter:
     torch.manual_seed(0)
     network = {"cnn_channels": 4, "lstm_hidden": 8, "lstm_layers": 2, "dense": [16, 8]}
@@ -376,9 +390,14 @@ def test_the_ros_2_node_says_what_the_example_does(exported, example, tables, tm
         *(lambda n=n: build_filter(n, IMU) for n in ("ins", "aekf", "mbkf21_car", "mbkf33_nhc_gated_gm")),
         learned,
         lambda: learned(outage_mode="run", frame="heading", imu_error="affine", imu_error_bound=4.0),
+        lambda: learned_kalman("mbkf21_car"),
+        lambda: learned_kalman("mbkf33_gated"),
         talkative_plus,
     ],
-    ids=["ins", "aekf", "mbkf21_car", "mbkf33_nhc_gated_gm", "dlkf_literal", "dlkf", "plus"],
+    ids=[
+        "ins", "aekf", "mbkf21_car", "mbkf33_nhc_gated_gm", "dlkf_literal", "dlkf", "dlkf_kalman_car", "dlkf_kalman",
+        "plus",
+    ],
 )
 def test_every_kind_of_filter(estimator, tables, drive, tmp_path):
     model = estimator()

@@ -12,7 +12,9 @@ from dlkf.data.store import drive_from_tables
 from dlkf.data.validate import CheckedTables
 from dlkf.filters.build import build_filter
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
+from dlkf.filters.learned_kalman import LearnedKalmanConfig, LearnedKalmanFilter
 from dlkf.filters.plus import PlusConfig, PlusFilter
+from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.running.estimate import estimates_table
 from dlkf.running.offline import navigate_drives
@@ -46,9 +48,19 @@ def plus() -> PlusFilter:
     return model.double()
 
 
+def beside_kalman(base: str) -> LearnedKalmanFilter:
+    """A network beside a Kalman filter; its heads change the gain by a tenth or so."""
+    torch.manual_seed(0)
+    size = {"lstm_hidden": 16, "lstm_layers": 2, "dense": [24, 12]}
+    config = LearnedKalmanConfig.from_mapping({"network": size, "frame": "heading", "base": base})
+    return LearnedKalmanFilter(config.with_base(IMU, Tuning(), None)).eval().double()
+
+
 def estimator(name: str):
     if name == "plus":
         return plus()
+    if name.startswith("dlkf_kalman"):
+        return beside_kalman(name.removeprefix("dlkf_kalman_"))
     return network(outage_mode=name[4:]) if name.startswith("net_") else build_filter(name, IMU)
 
 
