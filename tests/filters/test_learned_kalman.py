@@ -12,9 +12,11 @@ from dlkf.filters.learned_kalman import LearnedKalmanConfig, LearnedKalmanFilter
 from dlkf.filters.saved import load_filter, save_filter
 from dlkf.filters.tuning import Prior, Tuning
 
-from .scene import IMU, scene
+from .scene import IMU as PLAIN
+from .scene import scene
 
 SMALL = {"network": {"lstm_hidden": 16, "lstm_layers": 2, "dense": [24, 12]}, "frame": "heading"}
+IMU = replace(PLAIN, accel=replace(PLAIN.accel, scale_factor=5e-3), gyro=replace(PLAIN.gyro, misalignment=5e-3))
 TUNING = Tuning(accel_noise=3.0, velocity_std=1.5)
 PRIOR = Prior((0.02, -0.03, 0.01, 1e-3, -1e-3, 5e-4), (0.02,) * 3 + (1e-3,) * 3)
 
