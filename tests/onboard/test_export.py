@@ -394,10 +394,7 @@ def test_the_ros_2_node_says_what_the_example_does(exported, example, tables, tm
         lambda: learned_kalman("mbkf33_gated"),
         talkative_plus,
     ],
-    ids=[
-        "ins", "aekf", "mbkf21_car", "mbkf33_nhc_gated_gm", "dlkf_literal", "dlkf", "dlkf_kalman_car", "dlkf_kalman",
-        "plus",
-    ],
+    ids="ins aekf mbkf21_car mbkf33_nhc_gated_gm dlkf_literal dlkf dlkf_kalman_car dlkf_kalman plus".split(),
 )
 def test_every_kind_of_filter(estimator, tables, drive, tmp_path):
     model = estimator()
