@@ -4,6 +4,7 @@
     python pipelines/paper_outage.py --quick            some minutes on two cores
     python pipelines/paper_outage.py --seeds 0,1,2      several trainings, for the spread between them
     python pipelines/paper_outage.py --models dlkf,dlkf_literal     beside it the paper to the letter
+    python pipelines/paper_outage.py --models dlkf_kalman           the network beside a Kalman filter
 
 Every seed is trained with ``+experiment=outage``, scored beside the classical filters on the test drives, and
 registered as ``models:/outage@seed<n>``. All of them then run over ``data/per_drive``, where each drive has an
@@ -25,7 +26,7 @@ def main() -> None:
     """Train every seed, then evaluate all models together."""
     parser = arguments(__doc__, "0", "one training of every model for each")
     parser.add_argument("--quick", action="store_true", help="a few minutes of training instead of 500 epochs")
-    parser.add_argument("--models", default="dlkf", help="dlkf, dlkf_literal (the paper to the letter), or both")
+    parser.add_argument("--models", default="dlkf", help="of dlkf, dlkf_literal (the paper to the letter), dlkf_kalman")
     options, overrides = parser.parse_known_args()
     profile = ["+profile=quick"] if options.quick else []
     study = Study(HOME if not options.quick else HOME.with_name("outage_quick"))

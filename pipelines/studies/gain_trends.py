@@ -22,7 +22,7 @@ from dlkf.evaluation.results import Results
 FIGURES = {7: ("set1", "set2", "set3"), 8: ("set1", "set4", "set5"), 9: ("set6",)}
 FALLS = {"K_pp": ("set1", "set2", "set3"), "K_vv": ("set1", "set4", "set5")}  # monotone down (R134, R135)
 RISES = {"K_pv": ("set1", "set3"), "K_vp": ("set1", "set5")}
-FILTERS = ("dlkf", "mbkf15")
+LEARNED, BASELINE = ("dlkf", "dlkf_kalman"), "mbkf15"
 QUANTITIES = {"position": "m", "velocity": "m/s", "attitude": "rad"}
 
 
@@ -38,21 +38,22 @@ def main() -> int:
     runs = {tuple(k.split("/")): Path(v) / "report" for k, v in json.loads(file.read_text()).items() if "/" in k}
     gains = {key: json.loads((folder / "gains.json").read_text()) for key, folder in runs.items()}
     seeds = sorted({seed for _, seed in gains})
+    filters = [n for n in (*LEARNED, BASELINE) if all(n in of_filters for of_filters in gains.values())]
     for number, sets in FIGURES.items():
         known = [s for s in sets if (s, seeds[0]) in gains]
-        panels = [(f"{f}, {s}", np.array(gains[s, seeds[0]][f]["last"])) for f in FILTERS for s in known]
+        panels = [(f"{f}, {s}", np.array(gains[s, seeds[0]][f]["last"])) for f in filters for s in known]
         if panels:
             title = f"Figure {number}: gain at the last fix of one segment"
             (home / f"figure{number}.png").write_bytes(png(heat_map(panels, len(known) if number < 9 else 2, title)))
-    holds, text = trends(gains, seeds)
+    holds, text = trends(gains, seeds, filters)
     (home / "trends.md").write_text(text)
     (home / "table4.md").write_text(table4(runs))
-    (home / "table5.md").write_text(table5(runs))
+    (home / "table5.md").write_text(table5(runs, filters))
     print((home / "table5.md").read_text(), text, sep="\n")
     return 0 if holds else 1
 
 
-def trends(gains: dict, seeds: list[str]) -> tuple[bool, str]:
+def trends(gains: dict, seeds: list[str], filters: list[str]) -> tuple[bool, str]:
     """Whether each block falls or rises as it should, with the values."""
     lines = ["| block | sets | filter | seed | mean diagonal | as it should |", "|:--|:--|:--|:--|:--|:--|"]
     all_hold = True
@@ -61,7 +62,7 @@ def trends(gains: dict, seeds: list[str]) -> tuple[bool, str]:
             for seed in seeds:
                 if any((s, seed) not in gains for s in sets):
                     continue
-                for name in FILTERS:
+                for name in filters:
                     values = [gains[s, seed][name][block] for s in sets]
                     holds = bool((sign * np.diff(values) > 0).all())
                     all_hold &= holds
@@ -80,13 +81,13 @@ def table4(runs: dict[tuple[str, str], Path]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def table5(runs: dict[tuple[str, str], Path]) -> str:
+def table5(runs: dict[tuple[str, str], Path], filters: list[str]) -> str:
     """Mean over the segments of the RMS of position, velocity and attitude, every set, filter and seed."""
     lines = ["| set | seed | filter | P [m] | V [m/s] | A [rad] |", "|:--|:--|:--|--:|--:|--:|"]
     for (name, seed), folder in sorted(runs.items()):
         (content,) = json.loads((folder / "metrics.json").read_text())["results"]
         result = Results.of(content)
-        for f in FILTERS:
+        for f in filters:
             cells = [f"{result.value(f, 'segments', 'all', q, 'mean'):.3g}" for q in QUANTITIES]
             lines.append(f"| {name} | {seed} | {f} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
