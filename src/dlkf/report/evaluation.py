@@ -189,7 +189,7 @@ def _research(page: Page, scores: Scores, kind: str, baseline: str | None) -> No
         f"{kind}Errors over time", f"RMS over {len(scores.segments)} segments; grey: outages of most segments."
     )
     page.figure(f"errors-{name}", error_charts(scores))
-    chosen = representative(scores, 3, baseline if baseline in scores.filters else None)
+    chosen = representative(scores, 3, baseline)
     if chosen:
         i = chosen[len(chosen) // 2]
         segment = scores.segments[i]
@@ -258,7 +258,7 @@ def far_off(scores: Scores) -> list[str]:
 
 def segment_map(scores: Scores, baseline: str | None, named: str) -> Figure:
     """Truth and every filter of up to eight segments from good to bad."""
-    chosen = representative(scores, 8, baseline if baseline in scores.filters else None)
+    chosen = representative(scores, 8, baseline)
     traces = [add_track(join_tracks([scores.geodetic(i, scores.truth_p_n[i]) for i in chosen]), named, TRUTH, width=2)]
     for name, c in colours(scores).items():
         p = scores.filters[name].p_n
