@@ -61,6 +61,14 @@ def motion(t: Floats, lat_deg: Floats, lon_deg: Floats, v_ned: Floats) -> Motion
     return Motion(t[known], v, np.clip(climb, -0.3, 0.3), stride=_stride(t[known]))
 
 
+def stretches(t: Floats, seconds: float, broken: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First and last rows of the stretches of so many seconds, one from every row, with no ``broken`` step (n − 1,)."""
+    first, last = np.arange(len(t)), np.searchsorted(t, t + seconds)
+    breaks = np.concatenate(([0], np.cumsum(broken)))
+    whole = (last < len(t)) & (breaks[np.minimum(last, len(t) - 1)] == breaks)
+    return first[whole], last[whole]
+
+
 def _stride(t: Floats) -> int:
     """How many fixes an interval spans."""
     step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0

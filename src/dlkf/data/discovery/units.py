@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from dlkf.data.discovery.motion import Floats
+from dlkf.data.discovery.motion import Floats, stretches
 from dlkf.data.limits import EARTH_M
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
@@ -60,9 +60,7 @@ def speed_factor(t: Floats, lat_deg: Floats, lon_deg: Floats, speed: Floats) -> 
     fine = (step > 0) & (step <= 2.5)
     moved = np.concatenate(([0.0], np.cumsum(np.where(fine, np.hypot(north, east), 0.0))))
     way = np.concatenate(([0.0], np.cumsum(np.where(fine, 0.5 * (speed[1:] + speed[:-1]) * step, 0.0))))
-    last = np.searchsorted(t, t + 10.0)
-    first = np.flatnonzero(last < len(t))
-    last = last[first]
+    first, last = stretches(t, 10.0, np.zeros(len(step), bool))
     far = (moved[last] - moved[first]) > 30.0
     if far.sum() < 3:
         return float("nan"), float("nan")
