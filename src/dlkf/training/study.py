@@ -23,7 +23,7 @@ from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Scenes
 from dlkf.evaluation.results import BASELINE, Results
 from dlkf.evaluation.scores import Scores
-from dlkf.evaluation.study import run_comparison
+from dlkf.evaluation.study import results_of, run_scenes
 from dlkf.evaluation.table import ResultTable
 from dlkf.filters.build import refuse_smoothed
 from dlkf.filters.integration import Estimator
@@ -81,15 +81,9 @@ def run_study(
         for dataset in data.datasets:
             kinds |= drive_kinds(dataset)
         baseline = BASELINE if BASELINE in filters else None
-        scores, made = run_comparison(
-            filters,
-            scenes,
-            kinds=kinds,
-            groups={d.name: d.group for d in data.stack},
-            settle_s=scoring.settle_s,
-            injected_bias=scoring.injected_bias,
-            seed=scoring.seed,
-        )
+        groups = {d.name: d.group for d in data.stack}
+        run = run_scenes(filters, scenes, kinds=kinds, groups=groups, law=scoring.injected_bias, seed=scoring.seed)
+        scores, made = run.scores, results_of(run, settle_s=scoring.settle_s, seed=scoring.seed)
         title = ", ".join(Path(d).name for d in data.datasets)
         after, hour, tables = _endurance(filters, data, scoring, title, say)
         gains = gains_of(filters, scenes, settle_s=scoring.settle_s) if scoring.gains else {}
