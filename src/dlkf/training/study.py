@@ -75,7 +75,8 @@ def run_study(
         mean = baselines.prior.mean
         weights = fit(settings.fit, data, folder, logger, mean_imu_error=mean, notes=card, further=further)
     with _timed(seconds, "scoring"):
-        filters = {**baselines.build(), **_shipped(names), learned: load_filter(weights)}
+        shipped = {name: trained_filter(name) for name in names if shipped_folder(name)}
+        filters = {**baselines.build(), **shipped, learned: load_filter(weights)}
         scenes = Scenes.of_split(data, "test", plan, scoring.seed)
         kinds: dict[str, str] = {}
         for dataset in data.datasets:
@@ -129,11 +130,6 @@ def set_threads(settings: FitSettings) -> None:
     """CPU threads of this process, where they are set."""
     if settings.trainer.threads:
         torch.set_num_threads(settings.trainer.threads)
-
-
-def _shipped(names: Sequence[str]) -> dict[str, Estimator]:
-    """Those of the names that come with the package trained."""
-    return {name: trained_filter(name) for name in names if shipped_folder(name)}
 
 
 def _baselines(settings: StudySettings, data: DriveDataModule, say: Say) -> Baselines:
