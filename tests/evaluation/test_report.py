@@ -163,7 +163,7 @@ def test_figures_have_content(scores, draw):
         "one": lambda: figures.error_over_time(scores, [2]),
         "imu": lambda: figures.imu_errors(scores, 1),
         "growth": lambda: figures.error_growth(scores),
-        "spread": lambda: figures.error_histograms(scores, list(scores.filters)[:2], 5.0),
+        "spread": lambda: figures.error_histograms(scores, list(scores.filters)[:2]),
     }[draw]()
     data = png(figure, dpi=40)
     assert data.startswith(b"\x89PNG") and len(data) > 5000
@@ -191,7 +191,7 @@ def test_report_is_complete_and_replaces_an_older_one(scores, tmp_path):
     (out / "table.md").write_text("old")
     paths = write_report(
         out, "town", scores, [summarise_scores(scores, resamples=50)],
-        protocol={"mode": "segments"}, by_time=True, baseline="mbkf15", figures=True, dpi=30,
+        protocol={"mode": "segments"}, by_time=True, baseline="mbkf15", figures=True,
     )  # fmt: skip
     assert (out / "table.md").read_text().startswith("**town (simulated)")
     assert all(p.is_file() and p.stat().st_size > 100 for p in paths)

@@ -270,13 +270,13 @@ def error_growth(scores: Scores) -> Figure:
     return figure
 
 
-def error_histograms(scores: Scores, names: Sequence[str], every_s: float = 10.0) -> Figure:
+def error_histograms(scores: Scores, names: Sequence[str]) -> Figure:
     """How the outages are spread: horizontal RMS since the outage began, 10, 20, … s into it (paper fig. 14, R148).
 
     At most six times; the last bin holds what lies beyond.
     """
     w = scores.windows
-    times = np.arange(every_s, w.length.min() * scores.epoch_s + 1e-9, every_s)[:6]
+    times = np.arange(10.0, w.length.min() * scores.epoch_s + 1e-9, 10.0)[:6]
     counts = np.rint(times / scores.epoch_s).astype(int)
     figure = Figure(figsize=(10, 1.2 + 1.9 * math.ceil(len(counts) / 2)), layout="constrained")
     panels = figure.subplots(math.ceil(len(counts) / 2), 2, squeeze=False)

@@ -49,7 +49,6 @@ def write_report(
     more: Sequence[ResultTable] = (),
     figures: bool,
     trained: str | None = None,
-    dpi: int = 110,
 ) -> list[Path]:
     """Write the whole report into ``out``, all files or none; returns their paths.
 
@@ -59,7 +58,7 @@ def write_report(
     cannot be written to.
     """
     parts = [*all_tables(dataset, results), *more]
-    pictures = print_figures(scores, by_time, baseline, dpi) if figures else []
+    pictures = print_figures(scores, by_time, baseline) if figures else []
     files: dict[str, bytes] = {
         "metrics.json": as_json(
             {
@@ -83,9 +82,7 @@ def write_report(
     return [resolve_place(out) / name for name in files]
 
 
-def print_figures(
-    scores: Scores, by_time: bool, baseline: str | None, dpi: int
-) -> list[tuple[str, str, bytes]]:  # fmt: skip
+def print_figures(scores: Scores, by_time: bool, baseline: str | None) -> list[tuple[str, str, bytes]]:
     """(file name, caption, PNG) of every kind of data."""
     from dlkf.evaluation.figures import all_figures, png  # matplotlib takes a second to load
 
@@ -93,7 +90,7 @@ def print_figures(
     for kind in scores.kinds:
         suffix = "" if len(scores.kinds) == 1 else f"_{kind}"
         for name, caption, figure in all_figures(scores.of_kind(kind), by_time=by_time, baseline=baseline):
-            pictures.append((f"{name}{suffix}.png", f"{kind.capitalize()} data: {caption}", png(figure, dpi)))
+            pictures.append((f"{name}{suffix}.png", f"{kind.capitalize()} data: {caption}", png(figure, 110)))
     return pictures
 
 
