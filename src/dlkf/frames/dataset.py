@@ -75,10 +75,10 @@ def errors_of_frames() -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise InputError(reworded(str(error))) from None
+        raise InputError(reword(str(error))) from None
 
 
-def reworded(line: str) -> str:
+def reword(line: str) -> str:
     """``drive frames, imu/drive=frames: row 3: …`` → ``imu: row 3: …``."""
     line = PLACE.sub(r"\1", line).replace(f"drive {DRIVE}: ", "").replace(f"drive {DRIVE}", "this drive")
     for advice, instead in IN_PYTHON:

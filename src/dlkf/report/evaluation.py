@@ -20,7 +20,7 @@ from dlkf.evaluation.table import DEGREES, ResultTable, all_tables, as_csv, as_j
 from dlkf.report.drawing import Figure
 from dlkf.report.maps import add_track, chart, join_tracks
 from dlkf.report.navigation import mark_outages
-from dlkf.report.page import Page, embedded
+from dlkf.report.page import Page, embed_png
 from dlkf.report.plots import Array, band, line, shade, spans, stack_panels
 
 MAP = (
@@ -125,7 +125,7 @@ def evaluation_page(
         _research(page, scores.of_kind(result.kind), f"{result.kind}: " if many else "", baseline)
     _add_tables(page, [t for t in parts if t not in first])
     if pictures:
-        page.for_print([(caption, embedded(data)) for _, caption, data in pictures])
+        page.for_print([(caption, embed_png(data)) for _, caption, data in pictures])
     page.protocol(protocol)
     return page.html()
 

@@ -100,7 +100,7 @@ class NoiseFit(NamedTuple):
     before: float
     after: float
 
-    def described(self) -> dict[str, float]:
+    def describe(self) -> dict[str, float]:
         """Plain values by name, SI units."""
         sensors = {
             f"{name}.{key}": float(getattr(sensor, key))

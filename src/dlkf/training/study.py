@@ -96,8 +96,8 @@ def run_study(
         made,
         protocol={
             **describe_provenance(),
-            **baselines.described(),
-            **scenes.described(),
+            **baselines.describe(),
+            **scenes.describe(),
             "trained on": card,
             "gnss_noise": noise,
             "left out": left_out_drives(settings, data),

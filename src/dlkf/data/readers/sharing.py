@@ -94,12 +94,12 @@ def _agreed(values: Sequence[Any], limit: float) -> Any:
     return first if all(v == first for v in values) else None
 
 
-def merged(base: Any, over: Any) -> Any:
+def merge_settings(base: Any, over: Any) -> Any:
     """A mapping with the values of another one in their place."""
     if not isinstance(base, Mapping) or not isinstance(over, Mapping):
         return copy.deepcopy(over)
     out = {key: copy.deepcopy(value) for key, value in base.items() if key not in over}
-    return out | {key: merged(base.get(key), value) for key, value in over.items()}
+    return out | {key: merge_settings(base.get(key), value) for key, value in over.items()}
 
 
 def value_at(mapping: Any, path: tuple[str, ...]) -> Any:
