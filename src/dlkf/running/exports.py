@@ -172,12 +172,9 @@ def write_kitti(path: Path, table: pd.DataFrame, when: Times, name: str) -> None
 
 def write_csv(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
     """All columns of ``solution.parquet``, and the UTC time first where the date is known."""
-    dated = (
-        table
-        if when is None
-        else pd.concat([pd.Series([_iso(t) for t in when], table.index, name="utc"), table], axis=1)
-    )
-    dated.to_csv(path, index=False, float_format="%.12g", lineterminator="\n", encoding="utf-8")
+    if when is not None:
+        table = table.set_axis([_iso(t) for t in when]).rename_axis("utc")
+    table.to_csv(path, index=when is not None, float_format="%.12g", lineterminator="\n", encoding="utf-8")
 
 
 def write_ros(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
