@@ -16,11 +16,11 @@ import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+from trainings import run
 
 from dlkf.base.colours import filter_colour
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.table import format_number
-from dlkf.tracking.chain import run
 
 FILTERS = {  # in the table: its text
     "ins": "INS, strapdown from the last fix",

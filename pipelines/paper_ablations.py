@@ -14,9 +14,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from trainings import Study, arguments
+
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.table import format_interval, format_number
-from dlkf.tracking.chain import Study, arguments
 
 HOME = Path("outputs/paper/ablations")
 ROWS: dict[str, tuple[str, ...]] = {

@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dlkf.tracking.chain import Study, run
+from trainings import Study, run
 
 HOME = Path("outputs/paper/figures")
 SEMI_REAL = Path("data/semi_real_one")

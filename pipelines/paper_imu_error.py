@@ -19,8 +19,7 @@ import shutil
 from pathlib import Path
 
 import pandas as pd
-
-from dlkf.tracking.chain import Study, arguments, run
+from trainings import Study, arguments, run
 
 HOME = Path("outputs/paper/imu_error")
 CLEAN, IMU = "data/paper_clean", "imu=table3_standin"

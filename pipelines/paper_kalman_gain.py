@@ -15,7 +15,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from dlkf.tracking.chain import Study, arguments
+from trainings import Study, arguments
 
 HOME = Path("outputs/paper/kalman_gain")
 SETS = ("set1", "set2", "set3", "set4", "set5", "set6")

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dlkf.tracking.chain import Study, arguments, run
+from trainings import Study, arguments, run
 
 HOME = Path("outputs/paper/outage")
 NEW_IMUS = Path("data/per_drive")

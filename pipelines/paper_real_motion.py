@@ -18,9 +18,9 @@ from pathlib import Path
 
 import pandas as pd
 from paper_imu_error import unit_error
+from trainings import Study, run
 
 from dlkf.data.schema import new_dataset, write_drives_table
-from dlkf.tracking.chain import Study, run
 
 HOME = Path("outputs/paper/real_motion")
 KNOWN_UNIT = "177"  # dataset.unit_seed of conf/simulated/_point_car.yaml

@@ -21,7 +21,7 @@ from typing import NamedTuple
 from dlkf.base.files import write_into
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.table import format_interval, format_number
-from dlkf.report.page import Page, embedded
+from dlkf.report.page import Page, embed_png
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures" / "paper"
 CAPTIONS = {
@@ -139,7 +139,7 @@ def main() -> int:
     page.heading("What the paper says, and what came out", "Ratios of dlkf to mbkf15, one for each training.")
     page.table(["claim", "published", "ours", "reproduced"], claims, words=True)
     for name, caption in CAPTIONS.items():
-        page.picture(caption, embedded((FIGURES / f"{name}.png").read_bytes()))
+        page.picture(caption, embed_png((FIGURES / f"{name}.png").read_bytes()))
     page.heading("Table 2: sensors, as far as the text has it", "The last column is what stands in their place here.")
     page.table(["data", "sensor", "antenna", "here"], SENSORS, words=True)
     page.parts += body.parts
@@ -204,7 +204,7 @@ def section(page: Page, home: Path, part: Part) -> list[Claim]:
             page.table(columns, body)
     for name, caption in part.pictures.items():
         if (first / "figures" / f"{name}.png").is_file():
-            page.picture(f"{caption} ({key})", embedded((first / "figures" / f"{name}.png").read_bytes()))
+            page.picture(f"{caption} ({key})", embed_png((first / "figures" / f"{name}.png").read_bytes()))
     return claims_of(part, results)
 
 
@@ -281,7 +281,7 @@ def gains(page: Page, folder: Path) -> list[Claim]:
         page.table(head, rows[name])
     for n, caption in {7: "position noise grows", 8: "velocity noise grows", 9: "both"}.items():
         if (folder / f"figure{n}.png").is_file():
-            page.picture(f"Figure {n}: gains, {caption}", embedded((folder / f"figure{n}.png").read_bytes()))
+            page.picture(f"Figure {n}: gains, {caption}", embed_png((folder / f"figure{n}.png").read_bytes()))
     claims = []
     for name in ("dlkf", "mbkf15"):
         held = {(row[0], row[3]): row[-1] == "yes" for row in rows["trends"] if row[2] == name}

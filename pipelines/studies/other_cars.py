@@ -33,7 +33,7 @@ from dlkf.base.errors import InputError
 from dlkf.base.provenance import describe_provenance
 from dlkf.data.intake import IngestOptions, ingest_drives
 from dlkf.data.readers.frames import DriveFrames
-from dlkf.data.readers.mapping import respaced
+from dlkf.data.readers.mapping import spread_stamps
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY
 from dlkf.data.store import dataset_digest
 from dlkf.evaluation.metrics import mean_error
@@ -191,7 +191,7 @@ def read_beersheva(logs: Path) -> Iterator[DriveFrames]:
     gnss = gnss[gnss["t"].diff() != 0]
     llh = np.stack([gnss["latitude"], gnss["longitude"], 0 * gnss["t"]], -1)
     fixes = fix_table(gnss["t"].to_numpy(), llh)
-    table = level(imu_table(respaced(imu["t"].to_numpy()), accel, gyro, BRU))
+    table = level(imu_table(spread_stamps(imu["t"].to_numpy()), accel, gyro, BRU))
     yield DriveFrames({"drive": "drive3"}, table, fixes, reference_table(fixes))
 
 

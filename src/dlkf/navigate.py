@@ -77,7 +77,7 @@ def main(settings: NavigateSettings) -> None:
                 drives, settings.model, spec, tuning, settings.align, chosen,
                 progress=progress, compiler=compile_or_keep,
             )  # fmt: skip
-        print("found: " + ", ".join(f"{k} {v:.2g}" for k, v in found.described().items()))
+        print("found: " + ", ".join(f"{k} {v:.2g}" for k, v in found.describe().items()))
         print(found.describe_offset())
         spec, tuning = found.imu, found.tuning
     if settings.smoother is not None:

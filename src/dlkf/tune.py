@@ -57,7 +57,7 @@ def main(settings: TuneSettings) -> None:
             found = find_dataset_noise(drives, model, spec, start, minutes=settings.minutes, name=name)
             table = noise_table(model, dataset, spec, start, found)
             files = write_noise(out, found, table)
-            run.log_metrics({f"found/{k}": v for k, v in found.described().items()})
+            run.log_metrics({f"found/{k}": v for k, v in found.describe().items()})
         else:
             options = {"objective": settings.objective, "rounds": settings.rounds, "segments": settings.segments}
             result = search(model, spec, parts, protocol, start=start, **options)

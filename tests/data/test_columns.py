@@ -17,7 +17,7 @@ from dlkf.data.readers.qualities import quality_spec
 from dlkf.data.readers.recognise import gnss_spec, imu_spec
 from dlkf.data.readers.stamps import clock_of
 from dlkf.data.readers.units import day_order
-from dlkf.data.readers.vocabulary import DATE, QUANTITIES, SENSORS, TIME, matching, named, split_unit, triad
+from dlkf.data.readers.vocabulary import DATE, QUANTITIES, SENSORS, TIME, find_column, match_columns, split_unit, triad
 from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.tables import DriveClock, read_drives
 from dlkf.running.exports import utc_times
@@ -261,13 +261,13 @@ def test_names_mean_one_thing():
             continue
         wanted = ("lat", "lon", "height", "speed", "course", "hacc", "quality")
         for name, key in zip(names[4:], wanted):
-            assert [k for k in QUANTITIES if named([name], k)] == [key], name
-        assert matching([names[0], names[3]], TIME) == [names[0], names[3]]
+            assert [k for k in QUANTITIES if find_column([name], k)] == [key], name
+        assert match_columns([names[0], names[3]], TIME) == [names[0], names[3]]
         for key, pattern in zip(SENSORS, names[1:3]):
             assert triad([pattern.format(a) for a in "XYZ"], SENSORS[key]) is not None, pattern
     for name in ("numSV", "sats", "temp", "mag_x", "battery", "Stunde", "卫星数", "x", "id", "roll"):
-        assert not [k for k in QUANTITIES if named([name], k)], name
-        assert not matching([name], TIME) and not matching([name], DATE)
+        assert not [k for k in QUANTITIES if find_column([name], k)], name
+        assert not match_columns([name], TIME) and not match_columns([name], DATE)
     assert split_unit("Länge (°)") == ("lange", "deg") and split_unit("alt_ft") == ("alt", "ft")
 
 

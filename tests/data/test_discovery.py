@@ -26,7 +26,6 @@ from dlkf.data.readers.units import rotation
 from dlkf.data.schema import ACCEL, GYRO, VELOCITY
 from dlkf.data.tables import read_drives
 from dlkf.diagnosis.checkup import checkup
-from dlkf.navigation import compiled
 from tests.cars import car
 
 TURN = Rotation.from_euler("ZYX", [130.0, -35.0, 70.0], degrees=True).as_matrix()  # car → sensor
@@ -250,14 +249,3 @@ def test_a_sensor_that_seems_turned_gets_a_line(streets):
     turn = Rotation.from_euler("Z", 75.0, degrees=True).as_matrix()
     turned = {**imu, **dict(zip(ACCEL, turn @ np.stack([imu[c] for c in ACCEL])))}
     assert "turned by" in (describe_rotation(turned, gnss) or "")
-
-
-def test_both_forms_of_the_integrals_are_equal():
-    """To the bit, with a gap in time that does not count."""
-    rng = np.random.default_rng(0)
-    t, accel, gyro = np.arange(3000) / 97.0, rng.standard_normal((3000, 3)), rng.standard_normal((3000, 3))
-    t[2000:] += 5.0
-    with compiled.without_loops():
-        arrays = ImuSums.of(t, accel, gyro)
-    compiled.load_loops()
-    np.testing.assert_array_equal(ImuSums.of(t, accel, gyro).sums, arrays.sums)

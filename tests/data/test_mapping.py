@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dlkf.base.errors import InputError
-from dlkf.data.readers.mapping import respaced
-from dlkf.data.readers.units import degrees_minutes, leap_seconds, rotation, seconds, unwrapped
+from dlkf.data.readers.mapping import spread_stamps
+from dlkf.data.readers.units import degrees_minutes, leap_seconds, rotation, seconds, unwrap_stamps
 from tests.cars import car
 from tests.data.logs import metres
 from tests.data.logs.clock import GPS, UNIX
@@ -66,7 +66,7 @@ def test_leap_seconds_and_wrapping_counters():
     dates = ["1980-02-01", "2011-09-26", "2015-06-30T23:59:59", "2015-07-01", "2018-01-01"]
     unix = np.array(dates, "datetime64[s]").astype(np.int64)
     assert leap_seconds(unix).tolist() == [0, 15, 16, 17, 18]
-    assert unwrapped(np.array([604_799.5, 0.0, 0.5]), 604_800).tolist() == [604_799.5, 604_800.0, 604_800.5]
+    assert unwrap_stamps(np.array([604_799.5, 0.0, 0.5]), 604_800).tolist() == [604_799.5, 604_800.0, 604_800.5]
     whole, part = seconds(np.array(["2015-07-01T00:00:00.25"]), "iso", None, "gps", "")
     assert whole[0] + part[0] == unix[3] - 315_964_800 + 0.25
 
@@ -180,7 +180,7 @@ def test_equal_stamps(tmp_path, tables):
     imu.assign(t=np.ceil(imu.t / 0.02 - 1e-9) * 0.02).to_csv(tmp_path / "imu.csv", index=False)
     drive = read(tmp_path, tables, imu__time={"column": "t", "respace": True})
     np.testing.assert_allclose(drive.imu.t, imu.t, atol=1e-9)
-    assert respaced(np.repeat([1.0, 2.0, 3.0, 9.0], 2)).tolist() == [0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 7.5, 9.0]
+    assert spread_stamps(np.repeat([1.0, 2.0, 3.0, 9.0], 2)).tolist() == [0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 7.5, 9.0]
 
 
 def test_a_pose_in_degrees(tmp_path, tables):

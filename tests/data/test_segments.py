@@ -93,8 +93,6 @@ def test_segments_lie_where_the_reference_is_valid(drives):
     rows = [(p.first, p.first + p.epochs) for p in cut_segments([holes], 10)]
     assert rows == [(0, 10), (22, 32), (41, 51)]
     assert [p.first for p in cut_segments([holes], 10, 5)] == [0, 5, 22, 27, 41, 46]
-    loose = cut_segments([holes], 30, min_valid=0.9)
-    assert [p.first for p in loose] == [0, 30]
     assert not cut_segments([holes], 61) and len(cut_segments(drives, 60)) == 6
     with pytest.raises(InputError, match="no segments"):
         make_batch(drives, [])

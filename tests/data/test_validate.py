@@ -12,7 +12,7 @@ from dlkf.base.errors import InputError
 from dlkf.data.plausibility import check_imu_units
 from dlkf.data.schema import drive_file, write_drive, write_drives_table
 from dlkf.data.store import load_dataset
-from dlkf.data.validate import LIMITS, Limits, gap_rows, validate_dataset
+from dlkf.data.validate import LIMITS, Limits, gap_rows, read_checked, validate_dataset
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.motion.routes import Manoeuvres, VehicleConfig
 from tests.cars import REAL, Tables
@@ -222,8 +222,9 @@ def test_a_broken_reference_is_not_opened_where_none_is_asked_for(tmp_path, tabl
 
 def test_limits_of_gaps_are_configurable(tmp_path, tables):
     _write(tmp_path, _rows("imu", lambda f: f.drop(f.index[1000:1020]))(tables))
-    validate_dataset(tmp_path)  # 0.21 s
-    assert "IMU gap of 0.210" in _complaint(tmp_path, limits=Limits(gap_s=0.1))
+    (row,) = validate_dataset(tmp_path)  # 0.21 s
+    with pytest.raises(InputError, match=r"IMU gap of 0\.210"):
+        read_checked(tmp_path, row, limits=Limits(gap_s=0.1))
 
 
 def test_noisy_gnss_raises_no_alarm(tmp_path, tables):

@@ -19,7 +19,7 @@ from dlkf.command import GROUPS
 from dlkf.command.arguments import quote_argument
 from tests.docs.pages import PAGES, ROOT, blocks, commands
 
-CHAIN = ROOT / "src" / "dlkf" / "tracking" / "chain.py"
+CHAIN = ROOT / "pipelines" / "trainings.py"
 PRIMARIES = sorted(p.stem for p in config_dir().glob("*.yaml") if p.stem != "hydra_output")
 
 
@@ -184,7 +184,7 @@ def check(words: tuple[str, ...], mine: Path) -> None:
         script = given[2].replace(".", "/") + ".py" if given[1] == "-m" else given[1]
         assert (ROOT / script).is_file(), script
         text = (ROOT / script).read_text()
-        if "tracking.chain" in text:
+        if "from trainings import" in text:
             text += CHAIN.read_text()
         unknown = [w for w in given[2:] if w.startswith("--") and f'"{w.partition("=")[0]}"' not in text]
         assert not unknown, f"{script} knows no {unknown}"

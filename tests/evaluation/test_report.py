@@ -155,16 +155,15 @@ def test_kind_of_a_drive():
         drive_kind({"drive": "a", "kind": "fake"})
 
 
-@pytest.mark.parametrize("draw", ["tracks", "over_time", "one", "imu", "imu_all", "growth", "spread"])
+@pytest.mark.parametrize("draw", ["tracks", "over_time", "one", "imu", "growth", "spread"])
 def test_figures_have_content(scores, draw):
     figure = {
         "tracks": lambda: figures.tracks(scores, [0, 3]),
         "over_time": lambda: figures.error_over_time(scores),
         "one": lambda: figures.error_over_time(scores, [2]),
-        "imu": lambda: figures.imu_errors(scores, [1]),
-        "imu_all": lambda: figures.imu_errors(scores, list(range(6))),
+        "imu": lambda: figures.imu_errors(scores, 1),
         "growth": lambda: figures.error_growth(scores),
-        "spread": lambda: figures.error_histograms(scores, list(scores.filters)[:2], 5.0),
+        "spread": lambda: figures.error_histograms(scores, list(scores.filters)[:2]),
     }[draw]()
     data = png(figure, dpi=40)
     assert data.startswith(b"\x89PNG") and len(data) > 5000
@@ -182,7 +181,7 @@ def test_figures_survive_missing_truth_and_broken_filters(cars):
     segments = representative(s, 4, "mbkf15")
     for figure in (figures.tracks(s, segments), figures.error_over_time(s), figures.error_growth(s)):
         assert len(png(figure, dpi=30)) > 4000
-    assert len(png(figures.imu_errors(s, [1]), dpi=30)) > 4000
+    assert len(png(figures.imu_errors(s, 1), dpi=30)) > 4000
 
 
 @pytest.mark.whole
@@ -192,7 +191,7 @@ def test_report_is_complete_and_replaces_an_older_one(scores, tmp_path):
     (out / "table.md").write_text("old")
     paths = write_report(
         out, "town", scores, [summarise_scores(scores, resamples=50)],
-        protocol={"mode": "segments"}, by_time=True, baseline="mbkf15", figures=True, dpi=30,
+        protocol={"mode": "segments"}, by_time=True, baseline="mbkf15", figures=True,
     )  # fmt: skip
     assert (out / "table.md").read_text().startswith("**town (simulated)")
     assert all(p.is_file() and p.stat().st_size > 100 for p in paths)

@@ -11,7 +11,6 @@ import pandas as pd
 import pytest
 
 from dlkf.command.composing import compose_command
-from dlkf.tracking import chain
 
 SCRIPTS = Path(__file__).parents[2] / "pipelines"
 
@@ -21,6 +20,7 @@ def script(monkeypatch, tmp_path):
     """The pipeline in a folder with a unit of known error; commands are composed, not run."""
     monkeypatch.syspath_prepend(SCRIPTS)
     import paper_imu_error
+    import trainings
 
     monkeypatch.chdir(tmp_path)
     reference = tmp_path / "data" / "paper_clean" / "reference" / "drive=a"
@@ -38,9 +38,9 @@ def script(monkeypatch, tmp_path):
             out.mkdir(parents=True, exist_ok=True)
         return ["Report: run/report/report.html"]
 
-    monkeypatch.setattr(chain, "run", run)
+    monkeypatch.setattr(trainings, "run", run)
     monkeypatch.setattr(paper_imu_error, "run", run)
-    monkeypatch.setattr(chain.Study, "parent", lambda *_: chain.contextmanager(lambda: iter([None]))())
+    monkeypatch.setattr(trainings.Study, "parent", lambda *_: trainings.contextmanager(lambda: iter([None]))())
     return paper_imu_error, said
 
 

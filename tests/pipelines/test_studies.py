@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 STUDIES = sorted(path.stem for path in (ROOT / "pipelines" / "studies").glob("*.py") if path.stem != "__init__")
-CHAINS = sorted(path.stem for path in (ROOT / "pipelines").glob("*.py"))
+CHAINS = sorted(path.stem for path in (ROOT / "pipelines").glob("*.py") if path.stem != "trainings")
 
 
 def started(name: str, monkeypatch, *arguments: object) -> int:

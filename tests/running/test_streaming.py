@@ -116,7 +116,7 @@ def test_memory_does_not_grow_and_the_covariance_stays_one(segment):
                 sigma = P.diagonal().sqrt()
                 assert torch.equal(P, P.mT) and torch.linalg.eigvalsh(P / torch.outer(sigma, sigma))[0] > 0
         assert len(sizes) > 5 and max(sizes) < 1.05 * min(sizes)
-        assert len(stream._epochs.closed) == 18 and len(stream._buffer) <= 20
+        assert len(stream._epochs.closed) == 18 and len(stream._buffer._fixes) <= 20
 
 
 def test_put_away_and_taken_up_again_it_goes_on(segment):

@@ -109,12 +109,12 @@ def test_white_noise_has_density_times_root_rate():
 def test_gauss_markov_variance_and_time_constant():
     """Autocorrelation e^(−lag/τ) at lags of 0, τ/2 and τ; 3 × 4000 s hold some 3000 spans of 2τ."""
     rate, sensor = 20, SPEC.gyro
-    b = gauss_markov(np.random.default_rng(2), 4000 * rate, sensor.instability, sensor.correlation_time, rate)
+    settings = 1 / (rate * sensor.correlation_time), sensor.instability
+    b = gauss_markov(np.random.default_rng(2), (4000 * rate, 3), *settings)
     for lag in (0, 20, 40):
         correlation = (b[: len(b) - lag] * b[lag:]).mean() / sensor.instability**2
         assert correlation == pytest.approx(math.exp(-lag / rate / sensor.correlation_time), abs=0.1)
-    settings = sensor.instability, sensor.correlation_time, rate
-    starts = np.stack([gauss_markov(np.random.default_rng(k), 2, *settings)[0] for k in range(600)])
+    starts = np.stack([gauss_markov(np.random.default_rng(k), (2, 3), *settings)[0] for k in range(600)])
     assert starts.std() == pytest.approx(sensor.instability, rel=0.1)  # stationary from the first sample on
 
 

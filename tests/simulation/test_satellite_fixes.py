@@ -17,7 +17,6 @@ from dlkf.simulation.gnss.least_squares import Observations, solve
 from dlkf.simulation.gnss.receiver import (
     Receiver,
     clock,
-    gauss_markov,
     iono_mapping,
     multipath_growth,
     receiver_spec,
@@ -225,14 +224,6 @@ def test_a_seed_gives_the_same_bits():
     one, two, other = (received(ALL, truth, seed) for seed in (7, 7, 8))
     assert one.fixes.equals(two.fixes) and one.raw.equals(two.raw)
     assert not one.fixes.equals(other.fixes)
-
-
-def test_gauss_markov_is_stationary_with_its_time_constant():
-    """20 s at 1 Hz, 200 processes of 2000 steps: correlation e^(−k/20)."""
-    x = gauss_markov(np.random.default_rng(3), (2000, 200), 20.0, 1.0)
-    assert x[0].std() == pytest.approx(1, abs=0.25) and x.std() == pytest.approx(1, abs=0.05)
-    for lag in (1, 20):
-        assert (x[lag:] * x[:-lag]).mean() == pytest.approx(math.exp(-lag / 20), abs=0.05)
 
 
 def test_clock_walks_as_its_spectra_say():

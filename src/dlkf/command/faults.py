@@ -39,6 +39,10 @@ SAID = {
     "shorter drives, or a smaller model",
     r"invalid accelerator name|[Yy]ou selected an invalid": "trainer.accelerator is unknown; known: auto, cpu, gpu",
 }
+UNKNOWN_KEY = (
+    r"is not in struct[\s\S]*full_key: (\S+)", r"Could not override '([^']+)'",
+    r"full_key: (\S+)[\s\S]*is not in struct", r"Key '([^']+)' is not in struct",
+)  # fmt: skip
 
 
 def describe_fault(error: BaseException) -> str | None:
@@ -86,12 +90,9 @@ def one_line(error: BaseException) -> str:
         return f"unknown preset or config {missing[1]!r}{hint}"
     if missing := re.search(r"Could not load '([^']+)'", text):
         return f"unknown preset or config {missing[1]!r}; --help names those that there are"
-    if unknown := re.search(r"is not in struct[\s\S]*full_key: (\S+)", text):
-        return f"unknown config key {unknown[1]!r}; --cfg job prints all keys"
-    if unknown := re.search(r"Could not override '([^']+)'|full_key: (\S+)[\s\S]*is not in struct", text):
-        return f"unknown config key {unknown[1] or unknown[2]!r}; --cfg job prints all keys"
-    if unknown := re.search(r"Key '([^']+)' is not in struct", text):
-        return f"unknown config key {unknown[1]!r}; --cfg job prints all keys"
+    for pattern in UNKNOWN_KEY:
+        if unknown := re.search(pattern, text):
+            return f"unknown config key {unknown[1]!r}; --cfg job prints all keys"
     if missing := re.search(r"Missing mandatory value: (\S+)", text):
         return f"{missing[1]} is missing; give {missing[1]}=…"
     if bare := re.search(r"Error parsing override '([^'=]*)'", text):

@@ -10,12 +10,13 @@ import numpy as np
 from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import ImuSums, Lag, find_lag
-from dlkf.data.discovery.motion import Motion
+from dlkf.data.discovery.motion import Motion, stretches
 from dlkf.data.tables import Columns
 
 MOVING, TURNED, SPEED_CHANGE = 3.0, 1.0, 3.0  # m/s; rad and m/s over a drive that an axis at work must show
 YAW_AGREES, FORCE_DISAGREES, FORCE_AGREES = 0.85, 0.6, 0.85  # correlations with GNSS
-CHUNK_S, LEAST_CLIMB_M, ALIKE = 10.0, 1.0, 0.9  # stretches over which heights are compared, RMS of their climb
+CHUNK_S = 10.0  # way, height and course are compared over such stretches: metres of GNSS noise do not matter
+LEAST_CLIMB_M, ALIKE = 1.0, 0.9  # RMS of the climb; correlation
 FEET = (2.5, 4.2)  # of the climb by heights to that by velocities
 
 
@@ -63,13 +64,8 @@ def check_climb(gnss: Columns, where: str) -> None:
         return
     step = np.diff(t)
     fallen = np.concatenate(([0.0], np.cumsum(step * (down[1:] + down[:-1]) / 2)))
-    gaps = np.concatenate(([0], np.cumsum(step > 2.0)))
-    first = np.arange(len(t))
-    last = np.searchsorted(t, t + CHUNK_S)
-    use = last < len(t)
-    first, last = first[use], last[use]
-    whole = gaps[first] == gaps[last]
-    climbed, rose = (height[last] - height[first])[whole], (fallen[first] - fallen[last])[whole]
+    first, last = stretches(t, CHUNK_S, step > 2.0)
+    climbed, rose = height[last] - height[first], fallen[first] - fallen[last]
     if len(rose) < 10 or np.sqrt(np.mean(rose**2)) < LEAST_CLIMB_M:
         return
     slope = float(climbed @ rose / (rose @ rose))

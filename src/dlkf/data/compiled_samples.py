@@ -1,7 +1,7 @@
-"""Long tables of IMU samples in one pass each, compiled: the equations of :mod:`dlkf.data.increments` and of
-:class:`dlkf.data.discovery.clock.ImuSums` as loops, equal to their array forms to the bit.
+"""A long table of IMU samples on a grid in one pass, compiled: the equations of :mod:`dlkf.data.increments` as a loop,
+equal to their array form to the bit.
 
-They are taken where numba is loaded already, or so many drives are to be read that loading it pays (:func:`prepare`).
+It is taken where numba is loaded already, or so many drives are to be read that loading it pays (:func:`prepare`).
 """
 
 from __future__ import annotations
@@ -27,13 +27,6 @@ def composed(t: np.ndarray, columns: tuple[np.ndarray, ...], at: np.ndarray, usu
     (n,) of samples that end at ``t``: :func:`dlkf.data.resampling.resample_imu`."""
     out = np.empty((len(at) - 1, 6))
     _composed(t, columns, at, usual, step, out)
-    return out
-
-
-def running_sums(t: np.ndarray, accel: np.ndarray, gyro: np.ndarray) -> np.ndarray:
-    """Running integrals (n, 7) of 1, specific force and rate (3, n) each, over time without its gaps."""
-    out = np.empty((len(t), 7))
-    _running_sums(t, accel, gyro, out)
     return out
 
 
@@ -130,18 +123,3 @@ def _composed(t, x, at, usual, step, out):
             begin = following
         for i in range(6):
             out[j, i] = (total[i] + 0.5 * products[i]) / step
-
-
-@njit(nogil=True)
-@no_type_check
-def _running_sums(t, accel, gyro, out):
-    s = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    along = 0.0
-    for k in range(len(t)):
-        h = t[k] - t[k - 1] if k else 0.0
-        h = 0.0 if h > 1.0 else h
-        along += h
-        s = sum_of(s, times(h, (accel[0, k], accel[1, k], accel[2, k], gyro[0, k], gyro[1, k], gyro[2, k])))
-        out[k, 0] = along
-        for i in range(6):
-            out[k, 1 + i] = s[i]

@@ -65,7 +65,6 @@ class DriveDataModule(L.LightningDataModule):
         eval_length_s: float = 60.0,
         eval_stride_s: float | None = None,
         eval_outage: Outage | None = None,
-        min_valid: float = 1.0,
         start: StartLaw | None = None,
         turn_frames: bool = False,
         gnss_noise: GnssNoise | None = None,
@@ -84,7 +83,7 @@ class DriveDataModule(L.LightningDataModule):
         self.rate_hz, self.epoch_s, self.dtype = rate_hz, epoch_s, DTYPES[dtype]
         self.split, self.fractions = split, tuple(fractions)
         self.batch_size, self.train_length_s = batch_size, length_s
-        self.eval_length_s, self.eval_stride_s, self.min_valid = eval_length_s, eval_stride_s, min_valid
+        self.eval_length_s, self.eval_stride_s = eval_length_s, eval_stride_s
         self.eval_outage, self.injected_bias, self.gnss_noise = eval_outage, injected_bias, gnss_noise
         self.start, self.turn_frames = start or StartLaw(), turn_frames
         self.seed, self.eval_seed, self.split_seed, self.progress = seed, eval_seed, split_seed, progress
@@ -125,7 +124,7 @@ class DriveDataModule(L.LightningDataModule):
         if self._latest[:2] == (epoch, length):
             return self._latest[2]
         if length not in self._starts:
-            allowed = possible_starts(self.stack, length, min_valid=self.min_valid, span=self.spans["train"])
+            allowed = possible_starts(self.stack, length, span=self.spans["train"])
             self._starts[length] = torch.nonzero(allowed).flatten()
         starts = self._starts[length]
         if not len(starts):
@@ -160,9 +159,7 @@ class DriveDataModule(L.LightningDataModule):
     def segments(self, side: str) -> list[Segment]:
         """The fixed segments of a side, for scoring."""
         self.setup()
-        segments = cut_segments(
-            self.stack, self.eval_length_s, self.eval_stride_s, min_valid=self.min_valid, span=self.spans[side]
-        )
+        segments = cut_segments(self.stack, self.eval_length_s, self.eval_stride_s, span=self.spans[side])
         if not segments:
             raise InputError(
                 f"no {side} segment of {self.eval_length_s:g} s: its drives are shorter or not valid "
@@ -202,9 +199,7 @@ class DriveDataModule(L.LightningDataModule):
         table = []
         for side in SIDES:
             drives, span = self.drives(side), self.spans[side]
-            segments = cut_segments(
-                self.stack, self.eval_length_s, self.eval_stride_s, min_valid=self.min_valid, span=span
-            )
+            segments = cut_segments(self.stack, self.eval_length_s, self.eval_stride_s, span=span)
             ends = self.stack.first_row + self.stack.epochs  # the last boundary begins no epoch
             epochs = int((span >= 0).sum() - (span[ends] >= 0).sum())
             table.append(
@@ -223,10 +218,7 @@ class DriveDataModule(L.LightningDataModule):
         fixed = ("data.eval_length_s", self.eval_length_s)
         lengths = dict.fromkeys(SIDES, fixed) | {"train": ("data.length_s", longest_s)}
         sides = {side: [d.name for d in self.drives(side)] for side in SIDES}  # of several datasets names may repeat
-        cut = [
-            cut_segments(self.stack, length, min_valid=self.min_valid, span=self.spans[side])
-            for side, (_, length) in lengths.items()
-        ]
+        cut = [cut_segments(self.stack, length, span=self.spans[side]) for side, (_, length) in lengths.items()]
         idle = find_unused_drives(self.stack, [segment for segments in cut for segment in segments])
         out = []
         for side, (key, length) in lengths.items():

@@ -44,7 +44,7 @@ class IngestOptions:
     shortest_s: float = 10.0
     limits: Limits = LIMITS
 
-    def taken(self, drive: DriveFrames, folder: str | Path) -> IngestResult:
+    def take_in(self, drive: DriveFrames, folder: str | Path) -> IngestResult:
         """Write a drive into a dataset's folder and check what lies there; InputError for the first fault."""
         rows, lines, detail = [], [], list(drive.notes)
         for part in split_at_gaps(drive, self.shortest_s, self.limits) if self.split_gaps else [drive]:
@@ -81,7 +81,7 @@ def ingest(
         raise InputError(f"source={source}: is a dataset already; navigate and evaluate take dataset={source}")
     if not hasattr(reader, "places"):
         return ingest_drives(reader.read(source), out, how, **options)
-    places = located(reader, source)
+    places = absolute_places(reader, source)
 
     def taking(folder: str) -> Iterable[IngestResult]:
         return read_together(reader, how, absolute_place(folder), places, parallel, skip_unsure)
@@ -89,10 +89,10 @@ def ingest(
     return _ingested(taking, out, how, **options)
 
 
-Located = tuple[str, str, str | None]
+AbsolutePlace = tuple[str, str, str | None]
 
 
-def located(reader: Any, source: str | Path) -> list[Located]:
+def absolute_places(reader: Any, source: str | Path) -> list[AbsolutePlace]:
     """Where a reader finds the drives of ``source``, for :func:`read_together`."""
     return [
         (absolute_place(folder), name, only and absolute_place(only)) for folder, name, only in reader.places(source)
@@ -102,17 +102,17 @@ def located(reader: Any, source: str | Path) -> list[Located]:
 class Taker(Protocol):
     """What becomes of a drive that was read; ``folder`` is a dataset's."""
 
-    def taken(self, drive: DriveFrames, folder: str) -> IngestResult: ...
+    def take_in(self, drive: DriveFrames, folder: str) -> IngestResult: ...
 
 
 def read_together(
-    reader: Any, how: Taker, out: str, places: Sequence[Located], parallel: int | str | None, skip_unsure: bool
+    reader: Any, how: Taker, out: str, places: Sequence[AbsolutePlace], parallel: int | str | None, skip_unsure: bool
 ) -> Iterator[IngestResult]:
     """The drives that are sure, then those that are with what these found, then lines on those that disagree."""
-    doubts: dict[Located, Unsure] = {}
+    doubts: dict[AbsolutePlace, Unsure] = {}
     mappings: list[dict[str, Any]] = []
 
-    def read_all(reader: Any, places: Sequence[Located]) -> Iterator[tuple[Located, IngestResult]]:
+    def read_all(reader: Any, places: Sequence[AbsolutePlace]) -> Iterator[tuple[AbsolutePlace, IngestResult]]:
         for place, result in zip(places, parallel_map(partial(_read_there, reader, how, out), places, parallel)):
             doubts.pop(place, None)
             if isinstance(result, Unsure):
@@ -143,7 +143,7 @@ def read_together(
         yield IngestResult([], [], (f"left out: {doubt}",), {})
 
 
-def _read_there(reader: Any, how: Taker, out: str, place: Located) -> IngestResult | Unsure:
+def _read_there(reader: Any, how: Taker, out: str, place: AbsolutePlace) -> IngestResult | Unsure:
     folder, name, only = place
     try:
         drive = reader.drive_at(Path(folder), name, only and Path(only))
@@ -151,7 +151,7 @@ def _read_there(reader: Any, how: Taker, out: str, place: Located) -> IngestResu
         return doubt
     except MemoryError:
         raise InputError(f"drive {name}: its logs do not fit into memory; split them, or write Parquet") from None
-    return how.taken(drive, out)
+    return how.take_in(drive, out)
 
 
 def ingest_drives(
@@ -165,7 +165,7 @@ def ingest_drives(
     What readers found out stands in ``reader/found.yaml``, as a preset that reads the same logs again and that a person
     can correct. Raises InputError, leaving nothing behind, if a drive does not pass the checks or none is left.
     """
-    return _ingested(lambda folder: (how.taken(drive, folder) for drive in drives), out, how, **options)
+    return _ingested(lambda folder: (how.take_in(drive, folder) for drive in drives), out, how, **options)
 
 
 def _ingested(

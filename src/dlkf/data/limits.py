@@ -93,10 +93,6 @@ class FixScreen:
     """
 
     def __init__(self) -> None:
-        self.clear()
-
-    def clear(self) -> None:
-        """Forget all fixes."""
         self._good: GoodFix | None = None
         self._count = 0  # good fixes in a row, up to AGREEING_FIXES
         self._other: GoodFix | None = None  # the last refused one

@@ -10,10 +10,10 @@ import numpy as np
 
 from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
-from dlkf.data.axis_checks import check_climb, check_dead_axes, check_handedness
+from dlkf.data.axis_checks import CHUNK_S, check_climb, check_dead_axes, check_handedness
 from dlkf.data.discovery.clock import ImuSums, find_lag, known_offset
 from dlkf.data.discovery.drift import ROUGH_S, ends_apart, find_drifting_pose
-from dlkf.data.discovery.motion import Motion, motion
+from dlkf.data.discovery.motion import Motion, motion, stretches
 from dlkf.data.limits import DEGREE_M, NOWHERE_DEG
 from dlkf.data.schema import ACCEL, GYRO, VELOCITY
 from dlkf.data.tables import Columns
@@ -21,9 +21,14 @@ from dlkf.navigation.earth import SEMI_MAJOR
 
 FORCE, UPRIGHT = (7.0, 13.0), 0.7  # m/s², the median specific force; the share of it along −z
 FASTEST_RATE = 20.0  # rad/s: no car turns, and no bump shakes it, that fast for a thousandth of a drive
-CHUNK_S = 10.0  # way and course are compared over such stretches: metres of GNSS noise do not matter
 DISAGREES, AGREES = 0.4, 0.25  # relative residual of way against velocity
 LEAST_SLOPE = 0.1  # of gyro_z against the course; one that is at its limit in every turn may have 0.3
+UNITS = (  # that velocities may be in, the remedy, m/s per unit
+    ("like km/h", "divide them by 3.6", 1 / 3.6),
+    ("like knots", "multiply them by 0.5144", 0.514444),
+    ("like mph", "multiply them by 0.44704", 0.44704),
+    ("divided by 3.6", "multiply them by 3.6", 3.6),
+)
 FEW = 2  # single fixes at 0°/0° or a continent away are refused by themselves (dlkf.data.limits)
 FARTHEST_KM = 2000.0
 SEARCH_S = 600.0  # clocks of logs that have time in common are hardly further apart
@@ -142,15 +147,7 @@ def _check_way(gnss: Columns, where: str) -> None:
     way_n, way_e = (
         np.concatenate(([0.0], np.cumsum(np.where(smooth, step * (v[1:] + v[:-1]) / 2, 0.0)))) for v in (v_n, v_e)
     )
-    breaks = np.concatenate(([0], np.cumsum(~smooth)))
-    first = np.arange(len(t))
-    last = np.searchsorted(t, t + CHUNK_S)
-    use = last < len(t)
-    first, last = first[use], last[use]
-    same = breaks[first] == breaks[last]
-    first, last = first[same], last[same]
-    if not len(first):
-        return
+    first, last = stretches(t, CHUNK_S, ~smooth)
     moved = np.stack((way_n[last] - way_n[first], way_e[last] - way_e[first]), -1)
     far = np.hypot(*moved.T) > 20.0
     if far.sum() < 3:
@@ -167,28 +164,12 @@ def _check_way(gnss: Columns, where: str) -> None:
     readings = {
         "latitude and longitude look swapped; exchange lat_deg and lon_deg": (lon, lat, moved),
         "lat_deg and lon_deg look like radians (unit=rad), or like degrees that were read as ddmm (unit=deg); set "
-        "reader.gnss.position.unit": (
-            np.degrees(lat),
-            np.degrees(lon),
-            moved,
-        ),
+        "reader.gnss.position.unit": (np.degrees(lat), np.degrees(lon), moved),
         "vel_n and vel_e look swapped; reader.gnss.velocity.frame=enu, or exchange them": (lat, lon, moved[:, ::-1]),
-        "the velocities look like km/h; reader.gnss.velocity.unit=auto, or divide them by 3.6": (lat, lon, moved / 3.6),
-        "the velocities look like knots; reader.gnss.velocity.unit=auto, or multiply them by 0.5144": (
-            lat,
-            lon,
-            moved * 0.514444,
-        ),
-        "the velocities look like mph; reader.gnss.velocity.unit=auto, or multiply them by 0.44704": (
-            lat,
-            lon,
-            moved * 0.44704,
-        ),
-        "the velocities look divided by 3.6; reader.gnss.velocity.unit=auto, or multiply them by 3.6": (
-            lat,
-            lon,
-            moved * 3.6,
-        ),
+        **{
+            f"the velocities look {so}; reader.gnss.velocity.unit=auto, or {remedy}": (lat, lon, moved * factor)
+            for so, remedy, factor in UNITS
+        },
         "the velocities have the wrong sign; negate them": (lat, lon, -moved),
         "lat_deg or vel_n has the wrong sign, north is positive; negate it": (-lat, lon, moved),
         "lon_deg or vel_e has the wrong sign, east is positive; negate it": (lat, -lon, moved),

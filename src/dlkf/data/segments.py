@@ -65,15 +65,13 @@ def possible_starts(
     epochs: int,
     *,
     attitude: bool = False,
-    min_valid: float = 1.0,
     span: Int[Tensor, " rows"] | None = None,
 ) -> Bool[Tensor, " rows"]:
     """Boundaries of the stack from which ``epochs`` epochs can be cut.
 
-    The reference must be valid at the start and at ``min_valid`` of the boundaries after it, and a whole
-    start state known, from the reference or, unless ``attitude`` asks for true attitude, from IMU and GNSS.
-    With ``span`` (a label per boundary, that of the epoch it begins; −1 belongs to none) a segment must stay
-    inside one span.
+    The reference must be valid at the start and at all boundaries after it, and a whole start state known, from the
+    reference or, unless ``attitude`` asks for true attitude, from IMU and GNSS. With ``span`` (a label per boundary,
+    that of the epoch it begins; −1 belongs to none) a segment must stay inside one span.
     """
     stack = stack_drives(drives)
     truth = stack.start_from_truth
@@ -88,7 +86,7 @@ def possible_starts(
     last = row + epochs
     inside = last <= ends
     last = last.clamp(max=rows - 1)
-    ok = inside & start & (bad[last + 1] - bad[row + 1] <= (1 - min_valid) * epochs + 1e-9)
+    ok = inside & start & (bad[last + 1] == bad[row + 1])
     if span is not None:
         ok &= (span >= 0) & (span == span[(last - 1).clamp_min(0)])
     return ok
@@ -107,7 +105,6 @@ def cut_segments(
     stride_s: float | None = None,
     *,
     attitude: bool = False,
-    min_valid: float = 1.0,
     span: Int[Tensor, " rows"] | None = None,
 ) -> list[Segment]:
     """Segments of ``length_s`` every ``stride_s`` (default: end to end), only where the reference is valid.
@@ -118,7 +115,7 @@ def cut_segments(
     stack = stack_drives(drives)
     epochs = epochs_of(length_s, stack.epoch_s)
     stride = epochs if stride_s is None else epochs_of(stride_s, stack.epoch_s)
-    allowed = possible_starts(stack, epochs, attitude=attitude, min_valid=min_valid, span=span)
+    allowed = possible_starts(stack, epochs, attitude=attitude, span=span)
     candidates = torch.nonzero(allowed).flatten()
     drive = torch.searchsorted(stack.first_row, candidates, right=True) - 1
     chosen, free, now = [], -1, -1

@@ -51,14 +51,14 @@ class CheckedTables:
     refused: Refused = NONE_REFUSED  # samples and fixes that were left out because they are beyond physical limits
 
 
-def validate_dataset(folder: str | Path, *, reference: bool = True, limits: Limits = LIMITS) -> list[DriveRow]:
+def validate_dataset(folder: str | Path, *, reference: bool = True) -> list[DriveRow]:
     """Check every drive of a dataset and return their rows; raises InputError for the first fault.
 
     With ``reference=False`` the folder ``reference/`` is not opened.
     """
     rows = read_drives(folder)
     for row in rows:
-        read_checked(folder, row, reference=reference, limits=limits)
+        read_checked(folder, row, reference=reference)
     return rows
 
 

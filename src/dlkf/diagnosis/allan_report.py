@@ -20,7 +20,7 @@ from dlkf.diagnosis.allan import AllanFit, Array, allan_variance, check_static, 
 from dlkf.evaluation.figures import png
 from dlkf.evaluation.table import ResultTable, as_json, as_markdown, format_number
 from dlkf.navigation.imu_errors import DEG, MILLIGAL, ImuSpec
-from dlkf.report.page import Page, embedded
+from dlkf.report.page import Page, embed_png
 
 AXES = tuple(f"{sensor}_{axis}" for sensor in ("accel", "gyro") for axis in "xyz")
 TRIADS = ("accel", "gyro")
@@ -111,7 +111,7 @@ def _page(log: StaticLog, table: ResultTable, picture: bytes, settings: dict[str
     page = Page(f"Allan deviation of {log.drive}", [table.title])
     page.table(table.columns, table.rows)
     page.note(table.note)
-    page.picture("Overlapping Allan deviation (IEEE Std 952)", embedded(picture))
+    page.picture("Overlapping Allan deviation (IEEE Std 952)", embed_png(picture))
     page.protocol(settings | describe_provenance())
     return page.html()
 

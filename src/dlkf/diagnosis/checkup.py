@@ -97,7 +97,8 @@ def gnss_findings(imu: Columns, gnss: Columns) -> Iterator[CheckupResult]:
         yield CheckupResult(BAD, f"GNSS: {len(t)} usable fixes")
         return
     usual = float(np.median(np.diff(t)))
-    yield CheckupResult(GOOD, f"GNSS: {len(t)} usable fixes, one every {usual:.3g} s" + _fast(usual))
+    fast = f"; epoch_s={usual:.3g} takes them all" if usual < 0.8 else ""
+    yield CheckupResult(GOOD, f"GNSS: {len(t)} usable fixes, one every {usual:.3g} s{fast}")
     codes, counts = np.unique(gnss["quality"], return_counts=True)
     shares = ", ".join(f"{c / len(gnss['t']):.0%} {QUALITIES.get(q, f'quality {q}')}" for q, c in zip(codes, counts))
     best = float(np.mean(np.isin(gnss["quality"], (4, 5, 2, 9))))
@@ -125,14 +126,10 @@ def gnss_findings(imu: Columns, gnss: Columns) -> Iterator[CheckupResult]:
     lat, lon = gnss["lat_deg"][usable], gnss["lon_deg"][usable]
     way = horizontal_distance(lat[:-1], lon[:-1], lat[1:], lon[1:])
     v = way / np.maximum(gaps, 1e-3)
-    if (fast := v > 100).any():
+    if (jumps := v > 100).any():
         k = int(np.argmax(v))
-        text = f"GNSS: {fast.sum()} jumps; at t = {t[k + 1]:.1f} s it moves {way[k]:.3g} m in {gaps[k]:.3g} s"
+        text = f"GNSS: {jumps.sum()} jumps; at t = {t[k + 1]:.1f} s it moves {way[k]:.3g} m in {gaps[k]:.3g} s"
         yield CheckupResult(BAD, text)
-
-
-def _fast(usual: float) -> str:
-    return f"; epoch_s={usual:.3g} takes them all" if usual < 0.8 else ""
 
 
 def motion_findings(gnss: Columns) -> Iterator[CheckupResult]:

@@ -94,7 +94,7 @@ def evaluate_chunks(
     refused = {drive: said for one in kept for drive, said in one.rules.get(REFUSED, {}).items()}
     rules |= {REFUSED: refused} if refused else {}
     sigmas = [one.sigma for one in kept if one.sigma is not None]
-    truth = {"reference": ReferencedDrives([], torch.cat(sigmas), {}, work.reference).described()} if sigmas else {}
+    truth = {"reference": ReferencedDrives([], torch.cat(sigmas), {}, work.reference).describe()} if sigmas else {}
     return Evaluated(run, mode, rules, skipped, truth, short)
 
 
@@ -119,7 +119,7 @@ def score_chunk(work: EvaluationJob, names: tuple[str, ...]) -> ChunkResult:
     run = run_scenes(
         work.filters, scenes, kinds=work.kinds, groups=work.groups, law=work.law, seed=work.seed, counting=bar
     )
-    return ChunkResult(names, run, scenes.mode, scenes.described(), {**left_out, **scenes.skipped}, sigma, scenes.short)
+    return ChunkResult(names, run, scenes.mode, scenes.describe(), {**left_out, **scenes.skipped}, sigma, scenes.short)
 
 
 def join_chunks(runs: Sequence[ScoredRun]) -> ScoredRun:

@@ -54,7 +54,7 @@ def all_figures(scores: Scores, *, by_time: bool, baseline: str | None) -> Itera
     ``by_time``: the segments are alike (same length, outage at the same time), so that an average over them at
     each time means something; whole drives are shown one by one instead.
     """
-    chosen = representative(scores, 4, baseline if baseline in scores.filters else None)
+    chosen = representative(scores, 4, baseline)
     if not chosen:
         return
     middle = chosen[len(chosen) // 2]
@@ -71,7 +71,7 @@ def all_figures(scores: Scores, *, by_time: bool, baseline: str | None) -> Itera
     if by_time and len(scores.segments) > 1:
         yield "error_over_time", "errors over time, all segments", error_over_time(scores)
     yield "error_over_time_one", "errors over time, one segment", error_over_time(scores, [middle])
-    yield "imu_errors", "IMU-error estimates, one segment", imu_errors(scores, [middle])
+    yield "imu_errors", "IMU-error estimates, one segment", imu_errors(scores, middle)
 
 
 def line_of(scores: Scores, name: str) -> dict[str, Any]:
@@ -200,32 +200,26 @@ def error_over_time(scores: Scores, segments: Sequence[int] | None = None) -> Fi
     return figure
 
 
-def imu_errors(scores: Scores, segments: Sequence[int]) -> Figure:
-    """IMU-error estimates over time, six axes; truth in black, ±1σ as a band for one segment (figs 6, 11)."""
+def imu_errors(scores: Scores, i: int) -> Figure:
+    """IMU-error estimates of a segment over time, six axes; truth in black, ±1σ as a band (figs 6, 11)."""
     figure = Figure(figsize=(12, 6.4), layout="constrained")
     axes = figure.subplots(2, 3, sharex=True)
-    known = ~np.isnan(scores.true_imu_error[list(segments)]).all()
-    alone = len(segments) == 1
-    last = np.flatnonzero(~np.isnan(scores.truth_p_n[list(segments)]).all((0, 2)))[-1]
+    known = not np.isnan(scores.true_imu_error[i]).all()
+    last = np.flatnonzero(~np.isnan(scores.truth_p_n[i]).all(-1))[-1]
     settled = scores.t > 0.2 * scores.t[last]
+    runs = {n: r for n, r in scores.filters.items() if np.nan_to_num(r.imu_error[i]).any()}  # that estimate one
     for k, (ax, (label, unit, scale)) in enumerate(zip(axes.ravel(), IMU_AXES)):
-        _shade(ax, scores, segments)
+        _shade(ax, scores, [i])
         extent: list[Array] = []
-        for name, run in scores.filters.items():
-            if not np.nan_to_num(run.imu_error[list(segments)]).any():
-                continue  # a filter that estimates none
+        for name, run in runs.items():
             style = line_of(scores, name)
-            for i in segments:
-                y = run.imu_error[i, :, k] * scale
-                ax.plot(scores.t, y, lw=1.7 if alone else 0.9, alpha=1.0 if alone else 0.65, zorder=3, **style)
-                extent.append(y[settled])
-                if alone:
-                    s = run.imu_std[i, :, k] * scale
-                    ax.fill_between(scores.t, y - s, y + s, color=style["color"], alpha=0.15, lw=0, zorder=2)
-                    extent += [(y - s)[settled], (y + s)[settled]]
-        for i in segments if known else ():
+            y, s = run.imu_error[i, :, k] * scale, run.imu_std[i, :, k] * scale
+            ax.plot(scores.t, y, lw=1.7, zorder=3, **style)
+            ax.fill_between(scores.t, y - s, y + s, color=style["color"], alpha=0.15, lw=0, zorder=2)
+            extent += [x[settled] for x in (y, y - s, y + s)]
+        if known:
             y = scores.true_imu_error[i, :, k] * scale
-            ax.plot(scores.t, y, color="black", lw=1.4 if alone else 0.7, ls="-" if alone else ":", zorder=4)
+            ax.plot(scores.t, y, color="black", lw=1.4, zorder=4)
             extent.append(y[settled])
         _limits(ax, extent)
         ax.set_title(label, fontsize=9, loc="left")
@@ -234,18 +228,12 @@ def imu_errors(scores: Scores, segments: Sequence[int]) -> Figure:
         if k >= 3:
             ax.set_xlabel("Time since the start [s]")
         _plain(ax)
-    handles: list[Artist] = []
-    if known:
-        handles.append(Line2D([], [], color="black", lw=1.4, ls="-" if alone else ":", label="truth"))
-    for n, r in scores.filters.items():
-        if np.nan_to_num(r.imu_error[list(segments)]).any():
-            handles.append(Line2D([], [], lw=1.7, label=n, **line_of(scores, n)))
-    stds = any(np.isfinite(r.imu_std[list(segments)]).any() for r in scores.filters.values())
-    if alone and stds:
+    handles: list[Artist] = [Line2D([], [], color="black", lw=1.4, label="truth")] if known else []
+    handles += [Line2D([], [], lw=1.7, label=n, **line_of(scores, n)) for n in runs]
+    if any(np.isfinite(r.imu_std[i]).any() for r in scores.filters.values()):
         handles.append(Patch(color=COLOURS[1], alpha=0.2, label="±1σ of the filter"))
-    title = _name(scores, segments[0]) if alone else f"{len(segments)} segments"
-    figure.suptitle(f"IMU-error estimates, {title}", fontsize=10)
-    _legend(figure, handles + _outage_handle(scores, segments))
+    figure.suptitle(f"IMU-error estimates, {_name(scores, i)}", fontsize=10)
+    _legend(figure, handles + _outage_handle(scores, [i]))
     return figure
 
 
@@ -282,13 +270,13 @@ def error_growth(scores: Scores) -> Figure:
     return figure
 
 
-def error_histograms(scores: Scores, names: Sequence[str], every_s: float = 10.0) -> Figure:
+def error_histograms(scores: Scores, names: Sequence[str]) -> Figure:
     """How the outages are spread: horizontal RMS since the outage began, 10, 20, … s into it (paper fig. 14, R148).
 
     At most six times; the last bin holds what lies beyond.
     """
     w = scores.windows
-    times = np.arange(every_s, w.length.min() * scores.epoch_s + 1e-9, every_s)[:6]
+    times = np.arange(10.0, w.length.min() * scores.epoch_s + 1e-9, 10.0)[:6]
     counts = np.rint(times / scores.epoch_s).astype(int)
     figure = Figure(figsize=(10, 1.2 + 1.9 * math.ceil(len(counts) / 2)), layout="constrained")
     panels = figure.subplots(math.ceil(len(counts) / 2), 2, squeeze=False)

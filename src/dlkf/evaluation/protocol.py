@@ -109,7 +109,7 @@ class Scenes:
             order = sorted(starts, key=lambda d: -stack[d].epochs)  # like lengths together: little padding
             parts = _parts(order, [stack[d].epochs for d in order], stack)
             self._batches = [([stack[d] for d in part], [starts[d] for d in part]) for part in parts]
-            self.outage = protocol.outage and repeated(protocol.outage)
+            self.outage = protocol.outage and repeat_outages(protocol.outage)
         self.protocol = protocol
         offsets = len(self.outage.offsets_s or ()) if self.outage else 1
         self.runs = offsets * sum(len(part) for _, part in self._batches)
@@ -142,7 +142,7 @@ class Scenes:
         """All batches with the outages applied."""
         return [withhold_fixes(batch, mask) for batch, mask in self]
 
-    def described(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         """The rules as plain values, for files."""
         p = self.protocol
         common: dict[str, Any] = {"mode": self.mode, "runs": self.runs, "seed": p.seed}
@@ -190,7 +190,7 @@ def spread_evenly(items: Sequence[Item], limit: int | None) -> list[Item]:
     return [items[(2 * k + 1) * n // (2 * limit)] for k in range(limit)]
 
 
-def repeated(plan: OutagePlan) -> OutagePlan:
+def repeat_outages(plan: OutagePlan) -> OutagePlan:
     """The plan for whole drives: repeated to the end, in as many runs as cover the drive, where not given."""
     longest = plan.duration_s if isinstance(plan.duration_s, (int, float)) else max(plan.duration_s)
     every = plan.every_s if plan.every_s is not None else 2.0 * longest

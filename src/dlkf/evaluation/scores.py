@@ -129,8 +129,9 @@ def innovation_fit(run: FilterRun) -> SigmaFit | None:
 
 
 def representative(scores: Scores, n: int, filter_name: str | None) -> list[int]:
-    """Up to n segments from good to bad: even quantiles of the horizontal error in outages (or anywhere)."""
-    run = scores.filters[filter_name or next(iter(scores.filters))]
+    """Up to n segments from good to bad: even quantiles of a filter's horizontal error in outages (or anywhere), of the
+    first filter where that is not among them."""
+    run = scores.filters.get(filter_name or "") or next(iter(scores.filters.values()))
     size = magnitudes(run.error)["horizontal"]
     if scores.outage.any():
         size = np.where(scores.outage, size, np.nan)

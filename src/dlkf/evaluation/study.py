@@ -60,18 +60,3 @@ def results_of(run: ScoredRun, *, baseline: str = BASELINE, settle_s: float = SE
         values = (imu_error_values(result.kind, n, "injected_slope", six) for n, six in slopes.items())
         made[k] = result.with_values([v for six in values for v in six])
     return made
-
-
-def run_comparison(
-    filters: Mapping[str, Filter],
-    scenes: Scenes,
-    *,
-    kinds: Mapping[str, str] | str,
-    groups: Mapping[str, str] | None = None,
-    settle_s: float = SETTLE_S,
-    injected_bias: BiasLaw | None = None,
-    seed: int = 0,
-) -> tuple[Scores, list[Results]]:
-    """Scores of every filter over the scenes, and the results of each kind of data."""
-    run = run_scenes(filters, scenes, kinds=kinds, groups=groups, law=injected_bias, seed=seed)
-    return run.scores, results_of(run, settle_s=settle_s, seed=seed)

@@ -54,7 +54,7 @@ def check_columns(name: str, frame: pd.DataFrame, needed: Sequence[str]) -> None
 
 def other_names(columns: Sequence[str], missing: Iterable[str]) -> dict[str, str]:
     """Which columns are likely to be the missing ones: ``{"ax": "accel_x"}``."""
-    from dlkf.data.readers.vocabulary import SENSORS, named, triad
+    from dlkf.data.readers.vocabulary import SENSORS, find_column, triad
 
     lower = {c.lower(): c for c in columns}
     found = {c: next((lower[o] for o in (c, *OTHER_NAMES.get(c, ())) if o in lower), None) for c in missing}
@@ -63,19 +63,19 @@ def other_names(columns: Sequence[str], missing: Iterable[str]) -> dict[str, str
         found |= {f"{sensor}_{a}": c for a, c in zip("xyz", three) if found.get(f"{sensor}_{a}", c) is None}
     for column, quantity in QUANTITIES.items():
         if column in found and found[column] is None:
-            found[column] = named(columns, quantity)
+            found[column] = find_column(columns, quantity)
     return {old: new for new, old in found.items() if old is not None}
 
 
 def warn_of_other_columns(gnss: pd.DataFrame) -> None:
     """A warning for columns of a fix that the contract has under another name: they are not used."""
-    from dlkf.data.readers.vocabulary import named
+    from dlkf.data.readers.vocabulary import find_column
 
     others: list[Any] = [c for c in gnss.columns if c not in ("t", *QUANTITIES, *OPTIONAL_OF_GNSS.values())]
     unused = {
         column: wanted
         for quantity, wanted in OPTIONAL_OF_GNSS.items()
-        if wanted not in gnss and (column := named(map(str, others), quantity)) is not None
+        if wanted not in gnss and (column := find_column(map(str, others), quantity)) is not None
     }
     if unused:
         names, wanted = ", ".join(unused), ", ".join(dict.fromkeys(unused.values()))

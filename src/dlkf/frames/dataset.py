@@ -63,14 +63,10 @@ def _completed(kind: str, frame: pd.DataFrame, defaults: Mapping[str, Any]) -> p
     from dlkf.data.schema import AIDS, OPTIONAL, SCHEMAS
 
     names = (*{**SCHEMAS, **AIDS}[kind].names, *OPTIONAL[kind].names)
-    kept = {name: pd.to_numeric(frame[name].astype(object)) if _mixed(frame[name]) else frame[name]
-            for name in names if name in frame}  # fmt: skip
+    kept = {name: frame[name] for name in names if name in frame}
+    mixed = {name: x for name, x in kept.items() if not pd.api.types.is_numeric_dtype(x)}  # objects, categories
+    kept |= {name: pd.to_numeric(x.astype(object)) for name, x in mixed.items()}
     return pd.DataFrame({**kept, **{name: value for name, value in defaults.items() if name not in frame}})
-
-
-def _mixed(values: pd.Series) -> bool:
-    """Numbers as Python's objects or as categories."""
-    return not pd.api.types.is_numeric_dtype(values)
 
 
 @contextmanager
@@ -79,10 +75,10 @@ def errors_of_frames() -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise InputError(reworded(str(error))) from None
+        raise InputError(reword(str(error))) from None
 
 
-def reworded(line: str) -> str:
+def reword(line: str) -> str:
     """``drive frames, imu/drive=frames: row 3: …`` → ``imu: row 3: …``."""
     line = PLACE.sub(r"\1", line).replace(f"drive {DRIVE}: ", "").replace(f"drive {DRIVE}", "this drive")
     for advice, instead in IN_PYTHON:

@@ -108,7 +108,7 @@ def read_logs(source: str | Path, reader: str = "auto", *settings: str, skip_uns
     from dlkf.base.classes import instantiate
     from dlkf.command.arguments import quote_argument
     from dlkf.command.composing import compose_command
-    from dlkf.data.intake import located, read_together
+    from dlkf.data.intake import absolute_places, read_together
 
     if not isinstance(source, (str, Path)):
         raise InputError(f"source is a {type(source).__name__}, must be the path of a file or a folder with logs")
@@ -127,7 +127,7 @@ def read_logs(source: str | Path, reader: str = "auto", *settings: str, skip_uns
     opened = instantiate(values, "reader", ("read",))
     if not hasattr(opened, "places"):
         return list(opened.read(str(place)))
-    places = located(opened, place)
+    places = absolute_places(opened, place)
     made: dict[str, DriveFrames] = {}
     for result in read_together(opened, _AsFrames(), "", places, None, skip_unsure):
         for row in result.rows:
@@ -141,7 +141,7 @@ def read_logs(source: str | Path, reader: str = "auto", *settings: str, skip_uns
 class _AsFrames:
     """Drives that are read stay frames."""
 
-    def taken(self, drive: DriveFrames, folder: str) -> IngestResult:
+    def take_in(self, drive: DriveFrames, folder: str) -> IngestResult:
         from dlkf.data.intake import IngestResult
 
         return IngestResult([{"drive": drive}], [], drive.notes, drive.mapping)

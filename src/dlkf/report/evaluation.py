@@ -20,7 +20,7 @@ from dlkf.evaluation.table import DEGREES, ResultTable, all_tables, as_csv, as_j
 from dlkf.report.drawing import Figure
 from dlkf.report.maps import add_track, chart, join_tracks
 from dlkf.report.navigation import mark_outages
-from dlkf.report.page import Page, embedded
+from dlkf.report.page import Page, embed_png
 from dlkf.report.plots import Array, band, line, shade, spans, stack_panels
 
 MAP = (
@@ -49,7 +49,6 @@ def write_report(
     more: Sequence[ResultTable] = (),
     figures: bool,
     trained: str | None = None,
-    dpi: int = 110,
 ) -> list[Path]:
     """Write the whole report into ``out``, all files or none; returns their paths.
 
@@ -59,7 +58,7 @@ def write_report(
     cannot be written to.
     """
     parts = [*all_tables(dataset, results), *more]
-    pictures = print_figures(scores, by_time, baseline, dpi) if figures else []
+    pictures = print_figures(scores, by_time, baseline) if figures else []
     files: dict[str, bytes] = {
         "metrics.json": as_json(
             {
@@ -83,9 +82,7 @@ def write_report(
     return [resolve_place(out) / name for name in files]
 
 
-def print_figures(
-    scores: Scores, by_time: bool, baseline: str | None, dpi: int
-) -> list[tuple[str, str, bytes]]:  # fmt: skip
+def print_figures(scores: Scores, by_time: bool, baseline: str | None) -> list[tuple[str, str, bytes]]:
     """(file name, caption, PNG) of every kind of data."""
     from dlkf.evaluation.figures import all_figures, png  # matplotlib takes a second to load
 
@@ -93,7 +90,7 @@ def print_figures(
     for kind in scores.kinds:
         suffix = "" if len(scores.kinds) == 1 else f"_{kind}"
         for name, caption, figure in all_figures(scores.of_kind(kind), by_time=by_time, baseline=baseline):
-            pictures.append((f"{name}{suffix}.png", f"{kind.capitalize()} data: {caption}", png(figure, dpi)))
+            pictures.append((f"{name}{suffix}.png", f"{kind.capitalize()} data: {caption}", png(figure, 110)))
     return pictures
 
 
@@ -128,7 +125,7 @@ def evaluation_page(
         _research(page, scores.of_kind(result.kind), f"{result.kind}: " if many else "", baseline)
     _add_tables(page, [t for t in parts if t not in first])
     if pictures:
-        page.for_print([(caption, embedded(data)) for _, caption, data in pictures])
+        page.for_print([(caption, embed_png(data)) for _, caption, data in pictures])
     page.protocol(protocol)
     return page.html()
 
@@ -189,7 +186,7 @@ def _research(page: Page, scores: Scores, kind: str, baseline: str | None) -> No
         f"{kind}Errors over time", f"RMS over {len(scores.segments)} segments; grey: outages of most segments."
     )
     page.figure(f"errors-{name}", error_charts(scores))
-    chosen = representative(scores, 3, baseline if baseline in scores.filters else None)
+    chosen = representative(scores, 3, baseline)
     if chosen:
         i = chosen[len(chosen) // 2]
         segment = scores.segments[i]
@@ -258,7 +255,7 @@ def far_off(scores: Scores) -> list[str]:
 
 def segment_map(scores: Scores, baseline: str | None, named: str) -> Figure:
     """Truth and every filter of up to eight segments from good to bad."""
-    chosen = representative(scores, 8, baseline if baseline in scores.filters else None)
+    chosen = representative(scores, 8, baseline)
     traces = [add_track(join_tracks([scores.geodetic(i, scores.truth_p_n[i]) for i in chosen]), named, TRUTH, width=2)]
     for name, c in colours(scores).items():
         p = scores.filters[name].p_n

@@ -92,7 +92,7 @@ class Page:
         return filled.replace("{{body}}", "\n".join(self.parts)).replace("{{plotly}}", library() if drawn else "")
 
 
-def embedded(png: bytes) -> str:
+def embed_png(png: bytes) -> str:
     """A PNG as data URI."""
     return f"data:image/png;base64,{base64.b64encode(png).decode()}"
 

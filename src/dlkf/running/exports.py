@@ -7,7 +7,6 @@ without, count seconds from midnight of 6 January 1980 (GPS week 0).
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
@@ -66,7 +65,7 @@ def write_geojson(path: Path, table: pd.DataFrame, when: Times, name: str) -> No
         if np.isfinite(sigma[k]):
             properties["std_horizontal_m"] = round(float(sigma[k]), 4)
         if when is not None:
-            properties["time"] = when[k].isoformat().replace("+00:00", "Z")
+            properties["time"] = _iso(when[k])
         features.append(
             {"type": "Feature", "properties": properties, "geometry": {"type": "Point", "coordinates": point}}
         )
@@ -81,7 +80,7 @@ def write_kml(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
     places = [tuple(p) for p in table[["lon_deg", "lat_deg", "height_m"]].to_numpy()]
     if when is not None:
         track = kml.newgxtrack(name=name)
-        track.newwhen([w.isoformat().replace("+00:00", "Z") for w in when])
+        track.newwhen(list(map(_iso, when)))
         track.newgxcoord(places)
     else:
         track = kml.newlinestring(name=name, coords=places)
@@ -173,12 +172,9 @@ def write_kitti(path: Path, table: pd.DataFrame, when: Times, name: str) -> None
 
 def write_csv(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
     """All columns of ``solution.parquet``, and the UTC time first where the date is known."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow((["utc"] if when else []) + list(table))
-        for k, row in enumerate(table.itertuples(index=False)):
-            values = ["" if x != x else x if isinstance(x, (bool, np.bool_)) else f"{x:.12g}" for x in row]
-            writer.writerow(([when[k].isoformat().replace("+00:00", "Z")] if when else []) + values)
+    if when is not None:
+        table = table.set_axis([_iso(t) for t in when]).rename_axis("utc")
+    table.to_csv(path, index=when is not None, float_format="%.12g", lineterminator="\n", encoding="utf-8")
 
 
 def write_ros(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
@@ -229,6 +225,10 @@ def export(folder: Path, table: pd.DataFrame, names: list[str], when: Times, dri
     for name in names:
         file, write = FORMATS[name]
         write(folder / file, table, when, drive)
+
+
+def _iso(when: datetime) -> str:
+    return when.isoformat().replace("+00:00", "Z")
 
 
 def _speed(table: pd.DataFrame) -> NDArray[np.floating]:

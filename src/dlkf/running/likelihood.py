@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -47,6 +47,7 @@ from dlkf.running.start import align_each
 
 FREEDOM = 8.0  # ν
 GAPS_S = ((30.0, 45.0), (30.0, 60.0), (60.0, 90.0))  # s withheld at the end of every so many
+Data = TypeVar("Data", Batch, Drive)
 Compiler = Callable[[Estimator, float, float], Estimator]  # filter, IMU rate [Hz], update interval [s]
 IN_C = 300  # epochs of evidence from which on the search, some 150 trials, pays for a library of its filter
 SETTLE_S = 20.0  # whose innovations depend more on the start than on the filter
@@ -73,15 +74,17 @@ class FixOffset(NamedTuple):
 
     def of(self, batch: Batch) -> Batch:
         """The batch with fixes so placed."""
-        if not any(self):
-            return batch
-        lag = (batch.gnss_lag + self.delay_s).clamp(max=0.99 * batch.epoch_s)
-        return replace(batch, gnss_lag=lag, lever_arm_b=batch.lever_arm_b + _forward(self.ahead_m, batch.lever_arm_b))
+        return self.placed(batch) if any(self) else batch
 
-    def of_drive(self, drive: Drive) -> Drive:
-        """The drive with fixes so placed."""
-        lag = (drive.gnss_lag + self.delay_s).clamp(max=0.99 * drive.epoch_s)
-        return replace(drive, gnss_lag=lag, lever_arm_b=drive.lever_arm_b + _forward(self.ahead_m, drive.lever_arm_b))
+    def shifted(self, by: FixOffset, step: float) -> FixOffset:
+        """So many times ``by`` further."""
+        return FixOffset(self.delay_s + step * by.delay_s, self.ahead_m + step * by.ahead_m)
+
+    def placed(self, data: Data) -> Data:
+        """A batch or a drive with fixes so placed."""
+        lag = (data.gnss_lag + self.delay_s).clamp(max=0.99 * data.epoch_s)
+        arm = data.lever_arm_b
+        return replace(data, gnss_lag=lag, lever_arm_b=arm + arm.new_tensor([self.ahead_m, 0.0, 0.0]))
 
 
 NO_OFFSET = FixOffset()
@@ -97,7 +100,7 @@ class NoiseFit(NamedTuple):
     before: float
     after: float
 
-    def described(self) -> dict[str, float]:
+    def describe(self) -> dict[str, float]:
         """Plain values by name, SI units."""
         sensors = {
             f"{name}.{key}": float(getattr(sensor, key))
@@ -274,7 +277,7 @@ def find_noise(
                             best, x, moved = value, tried, True
                             tried = {k: factor * v if k in direction else v for k, v in x.items()}
                 for shift in shifts:
-                    while (value := score(x, there := _shift_offset(placing, shift, step))) < best - SURE_GAIN:
+                    while (value := score(x, there := placing.shifted(shift, step))) < best - SURE_GAIN:
                         best, placing, moved = value, there, True
         return x, placing, best
 
@@ -312,7 +315,7 @@ def generic_filter(
     check_finds_noise(name)
     name = aided_name(name, [table.name for table in aids])
     found = find_noise(Evidence.of(drives, align=align), name, imu, tuning, **given)
-    placed = [found.placing.of_drive(d) for d in drives]
+    placed = [found.placing.placed(d) for d in drives]
     return build_causal(name, found.imu, "imu=auto does not", tuning=found.tuning), placed, found
 
 
@@ -366,14 +369,6 @@ def search_fix_offset(
             break
         free = sure
     return FixOffset(*(at * unit).tolist()), FixOffset(*(std * unit).tolist())
-
-
-def _shift_offset(placing: FixOffset, shift: FixOffset, step: float) -> FixOffset:
-    return FixOffset(placing.delay_s + step * shift.delay_s, placing.ahead_m + step * shift.ahead_m)
-
-
-def _forward(metres: float, like: Tensor) -> Tensor:
-    return like.new_tensor([metres, 0.0, 0.0])
 
 
 def _built(values: Mapping[str, float], imu: ImuSpec, tuning: Tuning, called: str) -> tuple[ImuSpec, Tuning]:

@@ -33,9 +33,6 @@ class MeasurementBuffer:
         self._fixes: dict[int, tuple[float, FixRows]] = {}  # time and fix by boundary
         self._aids: dict[int, dict[str, list[tuple[float, float, float]]]] = {}  # t, value, std by boundary and sensor
 
-    def __len__(self) -> int:
-        return len(self._fixes)
-
     def drop(self, boundary: int) -> None:
         """What belongs to a boundary that no replay reaches any more."""
         self._fixes.pop(boundary, None)

@@ -51,7 +51,7 @@ class ReferencedDrives(NamedTuple):
         """Median 1σ."""
         return float(self.sigma.median(0).values[2])
 
-    def described(self) -> str:
+    def describe(self) -> str:
         """What errors against it are errors against."""
         what = "smoothed solution with all fixes" if self.kind == "smoothed" else "good fixes"
         sigma = f"{self.horizontal_m:.2g} m horizontal, {self.vertical_m:.2g} m vertical"

@@ -138,9 +138,8 @@ def corrupt(
     """
     scaled = np.concatenate((true_imu[:, :3] @ unit.matrix[0].T, true_imu[:, 3:] @ unit.matrix[1].T), -1)
     sensors = (spec.accel, spec.gyro)
-    drift = [
-        gauss_markov(rng, len(true_imu), sensor.instability, sensor.correlation_time, rate_hz) for sensor in sensors
-    ]
+    shape = (len(true_imu), 3)
+    drift = [gauss_markov(rng, shape, 1 / (rate_hz * s.correlation_time), s.instability) for s in sensors]
     error = scaled + unit.bias + np.concatenate(drift, -1)
     density = np.repeat([sensor.noise_density for sensor in sensors], 3) * unit.noise_factors
     noise = density * math.sqrt(rate_hz) * rng.standard_normal(true_imu.shape)
@@ -148,13 +147,13 @@ def corrupt(
         error[:, 3:] += true_imu[:, :3] @ unit.g_sensitivity.T
     for part, sensor in zip((slice(0, 3), slice(3, 6)), sensors):
         if sensor.random_walk > 0:
-            steps = sensor.random_walk / math.sqrt(rate_hz) * rng.standard_normal((len(true_imu), 3))
+            steps = sensor.random_walk / math.sqrt(rate_hz) * rng.standard_normal(shape)
             error[:, part] += np.cumsum(steps, axis=0)
         if sensor.warm_up > 0:
             t = np.arange(1, len(true_imu) + 1) / rate_hz
             error[:, part] -= np.expm1(-t / sensor.warm_up_time)[:, None] * unit.warm_up[part]
         if sensor.wander > 0:
-            error[:, part] += gauss_markov(rng, len(true_imu), sensor.wander, sensor.wander_time, rate_hz)
+            error[:, part] += gauss_markov(rng, shape, 1 / (rate_hz * sensor.wander_time), sensor.wander)
     measured = true_imu + error + noise
     for part, sensor in zip((slice(0, 3), slice(3, 6)), sensors):
         measured[:, part] = quantise(measured[:, part], sensor)
@@ -170,12 +169,11 @@ def quantise(x: Array, sensor: SensorErrors) -> Array:
     return x
 
 
-def gauss_markov(rng: np.random.Generator, samples: int, sigma: float, time: float, rate_hz: float) -> Array:
-    """A wandering bias (samples, 3): stationary first-order Gauss-Markov process, discretised exactly.
+def gauss_markov(rng: np.random.Generator, shape: tuple[int, int], step: float, sigma: float = 1.0) -> Array:
+    """Stationary first-order Gauss-Markov processes of 1σ ``sigma``, one per column (N, k), discretised exactly.
 
-    b₀ ~ N(0, σ²), b_k = a b_{k−1} + σ √(1 − a²) n_k with a = exp(−1/(rate τ)), τ the ``time`` [s].
+    b₀ ~ N(0, σ²), b_k = a b_{k−1} + σ √(1 − a²) n_k with a = exp(−step), ``step`` = dt/τ.
     """
-    step = -1 / (rate_hz * time)
-    n = sigma * rng.standard_normal((samples, 3))
-    n[1:] *= math.sqrt(-math.expm1(2 * step))
-    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -math.exp(step)], n, axis=0))
+    n = sigma * rng.standard_normal(shape)
+    n[1:] *= math.sqrt(-math.expm1(-2 * step))
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -math.exp(-step)], n, axis=0))

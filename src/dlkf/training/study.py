@@ -25,7 +25,7 @@ from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Scenes
 from dlkf.evaluation.results import BASELINE, Results
 from dlkf.evaluation.scores import Scores
-from dlkf.evaluation.study import run_comparison
+from dlkf.evaluation.study import results_of, run_scenes
 from dlkf.evaluation.table import ResultTable
 from dlkf.filters.build import refuse_smoothed
 from dlkf.filters.integration import Estimator
@@ -81,21 +81,16 @@ def run_study(
         on_baseline, mean = replace(settings.fit, model=model), baselines.prior.mean
         weights = fit(on_baseline, data, folder, logger, mean_imu_error=mean, notes=card, further=further)
     with _timed(seconds, "scoring"):
-        filters = {**baselines.build(), **_shipped(names), learned: load_filter(weights)}
+        shipped = {name: trained_filter(name) for name in names if shipped_folder(name)}
+        filters = {**baselines.build(), **shipped, learned: load_filter(weights)}
         scenes = Scenes.of_split(data, "test", plan, scoring.seed)
         kinds: dict[str, str] = {}
         for dataset in data.datasets:
             kinds |= drive_kinds(dataset)
         baseline = BASELINE if BASELINE in filters else None
-        scores, made = run_comparison(
-            filters,
-            scenes,
-            kinds=kinds,
-            groups={d.name: d.group for d in data.stack},
-            settle_s=scoring.settle_s,
-            injected_bias=scoring.injected_bias,
-            seed=scoring.seed,
-        )
+        groups = {d.name: d.group for d in data.stack}
+        run = run_scenes(filters, scenes, kinds=kinds, groups=groups, law=scoring.injected_bias, seed=scoring.seed)
+        scores, made = run.scores, results_of(run, settle_s=scoring.settle_s, seed=scoring.seed)
         title = ", ".join(Path(d).name for d in data.datasets)
         after, hour, tables = _endurance(filters, data, scoring, title, say)
         gains = gains_of(filters, scenes, settle_s=scoring.settle_s) if scoring.gains else {}
@@ -107,8 +102,8 @@ def run_study(
         made,
         protocol={
             **describe_provenance(),
-            **baselines.described(),
-            **scenes.described(),
+            **baselines.describe(),
+            **scenes.describe(),
             "trained on": card,
             "gnss_noise": noise,
             "left out": left_out_drives(settings, data),
@@ -149,11 +144,6 @@ def set_threads(settings: FitSettings) -> None:
     """CPU threads of this process, where they are set."""
     if settings.trainer.threads:
         torch.set_num_threads(settings.trainer.threads)
-
-
-def _shipped(names: Sequence[str]) -> dict[str, Estimator]:
-    """Those of the names that come with the package trained."""
-    return {name: trained_filter(name) for name in names if shipped_folder(name)}
 
 
 def _baselines(settings: StudySettings, data: DriveDataModule, say: Say) -> Baselines:

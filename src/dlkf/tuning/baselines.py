@@ -31,7 +31,7 @@ class Baselines:
         """The filters."""
         return {n: build_filter(n, self.imu, tuning=t, prior=self.priors.get(n)) for n, t in self.tunings.items()}
 
-    def described(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         """Plain values for a report."""
         return {
             "imu": self.imu.name,

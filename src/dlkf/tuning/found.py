@@ -29,7 +29,7 @@ def find_dataset_noise(
 
 def noise_table(model: str, dataset: str, imu: ImuSpec, tuning: Tuning, found: NoiseFit) -> ResultTable:
     """Every value before and after."""
-    before, after = NoiseFit(imu, tuning, NO_OFFSET, NO_OFFSET, 0.0, 0.0).described(), found.described()
+    before, after = NoiseFit(imu, tuning, NO_OFFSET, NO_OFFSET, 0.0, 0.0).describe(), found.describe()
     rows = [[key, format_number(before[key]), format_number(after[key])] for key in after]
     return ResultTable(
         title=f"{model} on {dataset}: noise under which the fixes are most likely",

@@ -13,10 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dlkf.base.angles import wrap_angle
-from dlkf.data import compiled_samples
 from dlkf.data.discovery.motion import MOVING, RESTING, Complex, Floats, Motion
 from dlkf.data.readers.units import WEEK_S
-from dlkf.navigation.compiled import loops_are_loaded
 from dlkf.navigation.earth import STANDARD_GRAVITY
 
 STEP_S = 0.25
@@ -61,9 +59,6 @@ class ImuSums:
     @staticmethod
     def of(t: Floats, accel: Floats, gyro: Floats) -> ImuSums:
         """Of samples (n, 3)."""
-        if loops_are_loaded():
-            stamps, *axes = (np.ascontiguousarray(x, dtype=np.float64) for x in (t, accel.T, gyro.T))
-            return ImuSums(t, compiled_samples.running_sums(stamps, *axes))
         step = np.diff(t, prepend=t[:1])
         step = np.where(step > 1.0, 0.0, step)
         sums = np.empty((len(t), 7))

@@ -73,7 +73,7 @@ def _settled(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, drift: float,
     """The pose on a clock that runs faster by ``drift``, and what is left of that taken off, until it is little."""
     pose = None
     for _ in range(ROUNDS):
-        pose = find_pose(t, accel, gyro, stretched(gnss, drift), lag_s)
+        pose = find_pose(t, accel, gyro, stretch_time(gnss, drift), lag_s)
         if pose is None:
             return None
         left, drift, lag_s = pose.drift, drift + pose.drift, pose.lag_s
@@ -93,6 +93,6 @@ def middle(gnss: Motion) -> float:
     return 0.5 * float(gnss.t[0] + gnss.t[-1])
 
 
-def stretched(gnss: Motion, drift: float) -> Motion:
+def stretch_time(gnss: Motion, drift: float) -> Motion:
     """On a clock that runs faster by ``drift``; velocities stay."""
     return replace(gnss, t=gnss.t + drift * (gnss.t - middle(gnss)))

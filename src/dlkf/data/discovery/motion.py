@@ -61,6 +61,20 @@ def motion(t: Floats, lat_deg: Floats, lon_deg: Floats, v_ned: Floats) -> Motion
     return Motion(t[known], v, np.clip(climb, -0.3, 0.3), stride=_stride(t[known]))
 
 
+def stretches(t: Floats, seconds: float, broken: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First and last rows of the stretches of so many seconds, one from every row, with no ``broken`` step (n − 1,)."""
+    first, last = np.arange(len(t)), np.searchsorted(t, t + seconds)
+    breaks = np.concatenate(([0], np.cumsum(broken)))
+    whole = (last < len(t)) & (breaks[np.minimum(last, len(t) - 1)] == breaks)
+    return first[whole], last[whole]
+
+
+def displacements(lat_deg: Floats, lon_deg: Floats) -> Complex:
+    """From each position to the next, north + i east [m]."""
+    lat, lon = np.radians(lat_deg), np.radians(lon_deg)
+    return EARTH_M * (np.diff(lat) + 1j * np.cos(lat[:-1]) * np.diff(lon))
+
+
 def _stride(t: Floats) -> int:
     """How many fixes an interval spans."""
     step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
@@ -75,12 +89,11 @@ def _thinned(t: Floats, good: NDArray[np.bool_]) -> NDArray[np.int64]:
 def _from_positions(t: Floats, lat_deg: Floats, lon_deg: Floats) -> Motion:
     """Velocity between two fixes, at the middle of their interval."""
     rows = _thinned(t, np.isfinite(t))
-    t, lat, lon = t[rows], np.radians(lat_deg[rows]), np.radians(lon_deg[rows])
+    t, moved = t[rows], displacements(lat_deg[rows], lon_deg[rows])
     step = np.diff(t)
     fine = (step > 0) & (step <= LONGEST_STEP_S)
-    z = EARTH_M * (np.diff(lat) + 1j * np.cos(lat[:-1]) * np.diff(lon))
     middle = 0.5 * (t[1:] + t[:-1])[fine]
-    return Motion(middle, z[fine] / step[fine], np.zeros(int(fine.sum())))
+    return Motion(middle, moved[fine] / step[fine], np.zeros(int(fine.sum())))
 
 
 def position_delay(t: Floats, lat_deg: Floats, lon_deg: Floats, v_ned: Floats) -> tuple[float, float]:
@@ -91,11 +104,10 @@ def position_delay(t: Floats, lat_deg: Floats, lon_deg: Floats, v_ned: Floats) -
     good = np.isfinite(v_ned[:, :2]).all(-1) & np.isfinite(lat_deg) & np.isfinite(lon_deg)
     rows = _thinned(t, good)
     t, v = t[rows], v_ned[rows, 0] + 1j * v_ned[rows, 1]
-    lat, lon = np.radians(lat_deg[rows]), np.radians(lon_deg[rows])
     step = np.diff(t)
     fine = (step > 0) & (step < LONGEST_STEP_S)
     # the mean radius is good to 0.3 %: what it spoils is a share of the way, so it is fitted beside the delay
-    moved = (EARTH_M * (np.diff(lat) + 1j * np.cos(lat[:-1]) * np.diff(lon)))[fine]
+    moved = displacements(lat_deg[rows], lon_deg[rows])[fine]
     way, change = ((v[1:] + v[:-1]) / 2 * step)[fine], np.diff(v)[fine]
     if len(way) < 20 or np.sum(np.abs(change) ** 2) < 20.0:
         return float("nan"), float("nan")

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from dlkf.data.discovery.motion import Floats
-from dlkf.data.limits import EARTH_M
+from dlkf.data.discovery.motion import Floats, displacements, stretches
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
 NEAR = 0.06  # of gravity: a scale error, the road's curves, a cold sensor
@@ -52,17 +51,14 @@ def speed_factor(t: Floats, lat_deg: Floats, lon_deg: Floats, speed: Floats) -> 
     Over stretches of ten seconds, so that the noise of fixes does not matter.
     """
     good = np.isfinite(lat_deg) & np.isfinite(lon_deg) & np.isfinite(speed)
-    t, lat, lon, speed = t[good], np.radians(lat_deg[good]), np.radians(lon_deg[good]), speed[good]
+    t, speed = t[good], speed[good]
     if len(t) < 5:
         return float("nan"), float("nan")
     step = np.diff(t)
-    north, east = EARTH_M * np.diff(lat), EARTH_M * np.cos(lat[:-1]) * np.diff(lon)
     fine = (step > 0) & (step <= 2.5)
-    moved = np.concatenate(([0.0], np.cumsum(np.where(fine, np.hypot(north, east), 0.0))))
+    moved = np.concatenate(([0.0], np.cumsum(np.where(fine, np.abs(displacements(lat_deg[good], lon_deg[good])), 0.0))))
     way = np.concatenate(([0.0], np.cumsum(np.where(fine, 0.5 * (speed[1:] + speed[:-1]) * step, 0.0))))
-    last = np.searchsorted(t, t + 10.0)
-    first = np.flatnonzero(last < len(t))
-    last = last[first]
+    first, last = stretches(t, 10.0, np.zeros(len(step), bool))
     far = (moved[last] - moved[first]) > 30.0
     if far.sum() < 3:
         return float("nan"), float("nan")

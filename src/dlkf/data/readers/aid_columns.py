@@ -24,22 +24,22 @@ def aid_specs(table: LogTable, numbers: pd.DataFrame, called: str, time: Spec | 
     speed of a receiver is none of a wheel: it stands beside a latitude, or is called so.
     """
     names = [str(c) for c in numbers.columns]
-    places = vocabulary.named(names, "lat") is not None
+    places = vocabulary.find_column(names, "lat") is not None
     found: dict[str, Spec] = {}
     wheels = vocabulary.wheel_columns(names, "" if places else called)
     if wheels:
         found["speed"] = {"value": _wheel_value(numbers, wheels)}
     headings = [n for n in names if vocabulary.has(n, vocabulary.HEADING)]
     if not headings and not places and vocabulary.has(called, rf"{vocabulary.HEADING}|^heading$"):
-        headings = [n for n in names if n == vocabulary.named([n], "course")]
+        headings = [n for n in names if n == vocabulary.find_column([n], "course")]
     if headings:
         degrees = float(np.nanmax(np.abs(numbers[headings[0]]))) > 2 * np.pi + 0.01
         found["heading"] = {"value": {"columns": headings[:1], "unit": "deg" if degrees else "rad"}}
-    if pressures := vocabulary.matching(names, vocabulary.PRESSURE):
+    if pressures := vocabulary.match_columns(names, vocabulary.PRESSURE):
         size = float(np.nanmedian(numbers[pressures[0]]))
         if unit := next((u for u, (least, most) in PRESSURES.items() if least < size < most), None):
             found["baro"] = {"pressure": {"columns": pressures[:1], "unit": unit}}
-    elif heights := vocabulary.matching(names, vocabulary.BARO_HEIGHT):
+    elif heights := vocabulary.match_columns(names, vocabulary.BARO_HEIGHT):
         found["baro"] = {"pressure": {"columns": None}, "height": {"columns": heights[:1], "unit": "m"}}
     out = {}
     for name, spec in found.items():

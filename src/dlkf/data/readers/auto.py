@@ -13,9 +13,19 @@ from dlkf.data.readers.archives import drive_name, drive_places, is_archive, unp
 from dlkf.data.readers.formats import rosbag
 from dlkf.data.readers.frames import DriveFrames, Place
 from dlkf.data.readers.logs import LogReader
-from dlkf.data.readers.offers import NO_LOGS, Contents, Offer, contents, open_aid, opened, preset, sniffed, text_options
+from dlkf.data.readers.offers import (
+    NO_LOGS,
+    Contents,
+    Offer,
+    contents,
+    find_format,
+    leave_open,
+    open_aid,
+    preset,
+    text_options,
+)
 from dlkf.data.readers.settling import Unsure
-from dlkf.data.readers.sharing import merged
+from dlkf.data.readers.sharing import merge_settings
 
 # presets whose files are known by a name
 LAYOUTS = {
@@ -83,7 +93,7 @@ class AutoReader:
 
     def sharing(self, settings: Mapping[str, Any]) -> AutoReader:
         """The same reader, with settings found from other drives; settings given before still win."""
-        known = {kind: merged(settings.get(kind, {}), self.known[kind]) for kind in self.known}
+        known = {kind: merge_settings(settings.get(kind, {}), self.known[kind]) for kind in self.known}
         return AutoReader(known["imu"], known["gnss"], drive=self.drive, **self.aids, **self.rest)
 
     def drive_at(self, folder: Path, name: str, only: Path | None = None) -> DriveFrames:
@@ -99,7 +109,7 @@ class AutoReader:
             if chosen is None:
                 specs[kind] = {"file": None}
                 continue
-            specs[kind] = merged(getattr(chosen, kind), self.known[kind])
+            specs[kind] = merge_settings(getattr(chosen, kind), self.known[kind])
             there = chosen.name if chosen.table else specs[kind].get("file") or chosen.name
             detail += [f"found the {kind} in {there}: {chosen.detail}", *chosen.notes]
             if kind == "gnss" and (more := _velocities_beside(chosen, specs[kind], [] if only else folder.iterdir())):
@@ -171,8 +181,8 @@ class AutoReader:
             names = ", ".join(o.name for o in fits)
             raise InputError(f"{folder}: {names} all hold {kind}; choose one with reader.{kind}.file, or null for none")
         if not fits:
-            return (merged(open_aid(preset("csv")[kind]), known) if file is not None else None), []
-        spec = merged(fits[0].aids[kind], known)
+            return (merge_settings(open_aid(preset("csv")[kind]), known) if file is not None else None), []
+        spec = merge_settings(fits[0].aids[kind], known)
         columns = [c for key in ("value", "pressure", "height") for c in (spec.get(key) or {}).get("columns") or []]
         return spec, [f"found {kind} in {fits[0].name}: {', '.join(map(str, columns))}"]
 
@@ -187,7 +197,7 @@ def _contents_of(folder: Path) -> list[Contents]:
             specs = {kind: {**base[kind]} for kind in ("imu", "gnss")}
             beside = {kind: BESIDE.get((name, kind), "") for kind in ("speed", "heading", "baro")}
             aids = {k: {**base[k], "file": f} for k, f in beside.items() if f and (folder / f).is_file()}
-            return [Contents(folder / file, [Offer(folder / file, f"layout of {name}", *opened(specs), aids=aids)])]
+            return [Contents(folder / file, [Offer(folder / file, f"layout of {name}", *leave_open(specs), aids=aids)])]
     files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
     return [contents(path) for path in files]
 
@@ -211,7 +221,7 @@ def _joined_sensors(offers: list[Offer]) -> list[Offer]:
     assert accel.sensor is not None and gyro.sensor is not None
     spec = {key: value for key, value in accel.sensor.items() if key != "key"}
     source = {key: gyro.sensor[key] for key in ("format", "file", "table", "text", "time") if key in gyro.sensor}
-    imu, _ = opened({"imu": {**spec, "gyro": {**gyro.sensor["gyro"], **source}}})
+    imu, _ = leave_open({"imu": {**spec, "gyro": {**gyro.sensor["gyro"], **source}}})
     detail = f"{accel.detail}, and {gyro.name} with {', '.join(gyro.sensor['gyro']['columns'])}"
     return [Offer(accel.path, detail, imu, notes=(*accel.notes, *gyro.notes), table=accel.table)]
 
@@ -261,7 +271,7 @@ def _velocities_beside(chosen: Offer, gnss: Mapping[str, Any], files: Iterable[P
     if gnss.get("format") != "csv" or gnss["velocity"].get("columns"):
         return None
     for path in sorted(files):
-        if path == chosen.path or not path.is_file() or path.name.startswith(".") or sniffed(path) != "csv":
+        if path == chosen.path or not path.is_file() or path.name.startswith(".") or find_format(path) != "csv":
             continue
         try:
             options = text_options(path)
@@ -283,6 +293,6 @@ def _foreign(within: Iterable[Contents], only: Path | None) -> Contents | None:
         if one.path.suffix.lower() in RECEIVERS
         or one.held.startswith(DAMAGED)
         or one.path.suffix.lower() in NO_LOGS
-        or (one.path.suffix.lower() in TABLES and (sniffed(one.path) == "csv" or one.held == "empty"))
+        or (one.path.suffix.lower() in TABLES and (find_format(one.path) == "csv" or one.held == "empty"))
     )
     return next(logs, None)

@@ -25,7 +25,16 @@ from dlkf.data.readers.archives import drive_name, drive_places, is_archive, unp
 from dlkf.data.readers.contract import gnss_frame, imu_frame, reference_frame
 from dlkf.data.readers.formats import rosbag
 from dlkf.data.readers.frames import DriveFrames, Place
-from dlkf.data.readers.mapping import SOURCE, Mapped, Spec, check_keys, join_some, respaced, selected, unused
+from dlkf.data.readers.mapping import (
+    SOURCE,
+    Mapped,
+    Spec,
+    check_keys,
+    join_some,
+    list_unused,
+    select_rows,
+    spread_stamps,
+)
 from dlkf.data.readers.settling import AUTO, Unsure, open_settings, placeholders, settle
 from dlkf.data.readers.sharing import layout
 from dlkf.data.readers.stamps import epoch_note
@@ -145,7 +154,7 @@ class LogReader:
         meta |= dict(zip(("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m"), arm))
         notes = [note for part in every.values() for one in (part, *part.parts.values()) for note in one.table.notes]
         notes += [note for part in mapped.values() if (note := epoch_note(part)) is not None]
-        said = (*dict.fromkeys((*notes, *unused(every))), *_velocities_left(mapped.get("gnss")), *found, *of_aids)
+        said = (*dict.fromkeys((*notes, *list_unused(every))), *_velocities_left(mapped.get("gnss")), *found, *of_aids)
         said = said if only is not None else (*_files_left(folder, every), *said)
         return DriveFrames(meta, frames["imu"], frames.get("gnss"), frames.get("reference"), said, mapping, aids)
 
@@ -156,7 +165,7 @@ class LogReader:
         t = {kind: (whole - zero) + part for kind, (whole, part) in stamps.items()}
         for kind, part in mapped.items():
             if (part.spec.get("time") or {}).get("respace"):
-                t[kind] = respaced(t[kind])
+                t[kind] = spread_stamps(t[kind])
         return zero, t
 
     def _mapping(self, specs: Mapping[str, Any], arm: Sequence[float]) -> dict[str, Any]:
@@ -166,7 +175,7 @@ class LogReader:
 
     def _mapped(self, folder: Path, spec: Spec, kind: str, only: Path | None) -> Mapped:
         """The table of a kind, with the entries that come from other tables brought to its rows."""
-        whole = selected(self._table(folder, spec, kind, f"reader.{kind}", only))
+        whole = select_rows(self._table(folder, spec, kind, f"reader.{kind}", only))
         parts: dict[str, Mapped] = {}
         for key, entry in spec.items():
             if not isinstance(entry, Mapping) or key == "time" or not any(entry.get(s) is not None for s in SOURCE):
@@ -174,7 +183,7 @@ class LogReader:
             if not whole.has(key):
                 continue
             own = {**spec, **{s: entry[s] for s in SOURCE if entry.get(s) is not None}}
-            parts[key] = selected(self._table(folder, own, kind, f"reader.{kind}.{key}", only))
+            parts[key] = select_rows(self._table(folder, own, kind, f"reader.{kind}.{key}", only))
         return _joined(whole, parts) if parts else whole
 
     def _table(self, folder: Path, spec: Spec, kind: str, where: str, only: Path | None) -> Mapped:

@@ -182,7 +182,7 @@ class Mapped:
         if unit in units.DAYS:
             values, unit = (values - units.DAYS[unit]) * 86_400.0, "s"
         if time.get("wraps_s") is not None:
-            values = units.unwrapped(values, float(time["wraps_s"]) * units.TIME.get(unit, 1))
+            values = units.unwrap_stamps(values, float(time["wraps_s"]) * units.TIME.get(unit, 1))
         week = self.column(time["week"], nan=False) if time.get("week") is not None else None
         if time.get("week_number") is not None:
             week = np.full(len(self), int(time["week_number"]))
@@ -228,7 +228,7 @@ class Mapped:
         return f"set it in reader.{self.kind}"
 
 
-def selected(mapped: Mapped) -> Mapped:
+def select_rows(mapped: Mapped) -> Mapped:
     """The rows that ``rows`` chooses: ``{column: …, is: [...]}``; ``filled``: those whose columns are not empty;
     ``changed``: of these, those whose position is not that of the row before."""
     rows = mapped.spec.get("rows")
@@ -258,7 +258,7 @@ def selected(mapped: Mapped) -> Mapped:
     return mapped.rows(keep)
 
 
-def respaced(t: np.ndarray) -> np.ndarray:
+def spread_stamps(t: np.ndarray) -> np.ndarray:
     """Rows of one stamp spread evenly over the time since the stamp before (a clock coarser than the rate)."""
     first = np.flatnonzero(np.diff(t, prepend=-np.inf) != 0)
     count = np.diff(first, append=len(t))
@@ -269,7 +269,7 @@ def respaced(t: np.ndarray) -> np.ndarray:
     return t - np.repeat(since, count) * (1 - place / np.repeat(count, count))
 
 
-def unused(mapped: Mapping[str, Mapped]) -> list[str]:
+def list_unused(mapped: Mapping[str, Mapped]) -> list[str]:
     """A line for each text table, matrix or file of columns on those that no entry of the mapping takes."""
     used: dict[str, set[str]] = {}
     there: dict[str, list[str]] = {}
@@ -279,12 +279,12 @@ def unused(mapped: Mapping[str, Mapped]) -> list[str]:
                 continue
             name = f"{part.table.path.name}{'' if not part.spec.get('table') else ': ' + str(part.spec['table'])}"
             there.setdefault(name, [str(c) for c in part.table.frame.columns])
-            used.setdefault(name, set()).update(_mentioned(part.spec))
+            used.setdefault(name, set()).update(_column_names(part.spec))
     left = {name: [c for c in columns if c not in used[name]] for name, columns in there.items()}
     return [f"columns of {name} that are not used: {join_some(columns)}" for name, columns in left.items() if columns]
 
 
-def _mentioned(spec: Any) -> set[str]:
+def _column_names(spec: Any) -> set[str]:
     """Every name of a column in a mapping, alternatives (``A | B``) apart."""
     if not isinstance(spec, Mapping):
         return set()
@@ -294,7 +294,7 @@ def _mentioned(spec: Any) -> set[str]:
             for name in [value] if isinstance(value, (str, int)) else value:
                 found |= {str(name), *str(name).split(" | ")}
         else:
-            found |= _mentioned(value)
+            found |= _column_names(value)
     return found
 
 

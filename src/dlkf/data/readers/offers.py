@@ -17,7 +17,7 @@ from dlkf.data.readers import formats, recognise, vocabulary
 from dlkf.data.readers.aid_columns import aid_specs
 from dlkf.data.readers.formats import autopilot, matlab, nmea, rosbag, text, ubx
 from dlkf.data.readers.frames import LogTable
-from dlkf.data.readers.sharing import merged
+from dlkf.data.readers.sharing import merge_settings
 
 GNSS_ONLY = ("nmea", "rtklib", "inertial_explorer")
 PRESETS = (*GNSS_ONLY, "ubx", "rosbag", "gnss_logger", "novatel", "navego", "px4", "ardupilot")
@@ -78,7 +78,7 @@ def contents(path: Path) -> Contents:
         return Contents(path, held=NO_LOGS[".html"])
     if begins.startswith(b"PK\3\4"):
         return Contents(path, held="a .zip; give it as source, or unpack it")
-    name = sniffed(path)
+    name = find_format(path)
     if name is None:
         return Contents(path, held="of no format that is known" if begins else "empty")
     if name == "matlab":
@@ -110,7 +110,7 @@ def _of_preset(path: Path, name: str) -> Contents:
     aids = {kind: open_aid({**base[kind], **source}) for kind in _aids_in(path, name)}
     if not specs and not aids:
         return Contents(path, held=held)
-    return Contents(path, [Offer(path, f"{name}, as reader={name}", *opened(specs), aids=aids)], held)
+    return Contents(path, [Offer(path, f"{name}, as reader={name}", *leave_open(specs), aids=aids)], held)
 
 
 def _aids_in(path: Path, name: str) -> tuple[str, ...]:
@@ -129,7 +129,7 @@ def open_aid(spec: Mapping[str, Any]) -> dict[str, Any]:
 def _lacks(path: Path, name: str, kind: str) -> str | None:
     """Why a file of a preset's format gives no ``kind``, empty if there is no reason; None where it does."""
     if name == "rosbag":
-        return None if rosbag.holds(path, kind) else f" among its topics ({rosbag.listed(path)})"
+        return None if rosbag.holds(path, kind) else f" among its topics ({rosbag.list_topics(path)})"
     if kind == "gnss":
         return None
     if name in GNSS_ONLY:
@@ -157,7 +157,7 @@ def _of_matlab(path: Path) -> Contents:
 
 def _of_table(path: Path, name: str, table: LogTable, options: dict[str, Any], part: str | None) -> list[Offer]:
     imu, gnss = recognise.imu_spec(table), None
-    if imu is None or vocabulary.named(map(str, table.frame.columns), "lat"):
+    if imu is None or vocabulary.find_column(map(str, table.frame.columns), "lat"):
         gnss = recognise.gnss_spec(table)
     source: dict[str, Any] = {"format": name, "file": path.name, "text": options}
     source |= {"table": part} if part is not None else {}
@@ -181,10 +181,10 @@ def _of_table(path: Path, name: str, table: LogTable, options: dict[str, Any], p
     specs = {kind: {**source, **one.spec} for kind, one in found.items()}
     columns = ", ".join(str(c) for spec in specs.values() for c in _columns(spec))
     notes = tuple(note for one in found.values() for note in one.notes)
-    return [Offer(path, f"{name} with {columns}", *opened(specs, stated=True), aids=aids, notes=notes, table=part)]
+    return [Offer(path, f"{name} with {columns}", *leave_open(specs, stated=True), aids=aids, notes=notes, table=part)]
 
 
-def sniffed(path: Path) -> str | None:
+def find_format(path: Path) -> str | None:
     """Format of a file by its first bytes; None if it is none of those known."""
     try:
         with path.open("rb") as file:
@@ -220,7 +220,7 @@ def sniffed(path: Path) -> str | None:
 
 def text_options(path: Path) -> dict[str, Any]:
     """Separator, decimal mark, comment, lines above the header and header of a text table, by its first lines."""
-    whole = text.decoded(path, None).splitlines()[:LARGEST_PEEK]
+    whole = text.decode_text(path, None).splitlines()[:LARGEST_PEEK]
     lines = [line for line in whole if line.strip()]
     options: dict[str, Any] = {}
     marked = [line.lstrip()[:1] in "#%" for line in lines]
@@ -260,14 +260,14 @@ def preset(name: str) -> dict[str, Any]:
     """A reader's preset with what it takes over from csv's."""
     folder = config_dir() / "reader"
     own = yaml.safe_load((folder / f"{name}.yaml").read_text())
-    return merged(yaml.safe_load((folder / "csv.yaml").read_text()), own)
+    return merge_settings(yaml.safe_load((folder / "csv.yaml").read_text()), own)
 
 
 def _preset_text(base: Mapping[str, Any]) -> dict[str, Any]:
     return {key: base[key] for key in ("separator", "decimal", "header", "comment") if key in base}
 
 
-def opened(specs: Mapping[str, Any], stated: bool = False) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
+def leave_open(specs: Mapping[str, Any], stated: bool = False) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
     """Specs with everything that can be estimated left open, but an accelerometer's unit that a header ``stated``."""
     imu, gnss = (copy.deepcopy(specs.get(kind)) for kind in ("imu", "gnss"))
     if imu is not None:

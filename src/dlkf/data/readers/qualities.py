@@ -55,7 +55,7 @@ def quality_spec(frame: pd.DataFrame, column: str | None, accuracy_m: float) -> 
     fits = [name for name, map_ in READINGS.items() if all(x in map_ for x in seen)]
     if not fits:
         return None, [f"quality {column} has numbers that no receiver gives ({_some(values)}): all count as single"]
-    beside_hdop = vocabulary.named([str(c) for c in frame.columns], "hdop") is not None  # RTKLIB writes none
+    beside_hdop = vocabulary.find_column([str(c) for c in frame.columns], "hdop") is not None  # RTKLIB writes none
     unlikely = {RTKLIB: beside_hdop, GGA: 3 in seen}  # PPS is rare, 3D is not
     fits = [name for name in fits if not unlikely.get(name)] or fits
     chosen = _reading(column, [int(x) for x in seen], numbers, fits, accuracy_m)

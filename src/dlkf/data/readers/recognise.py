@@ -46,7 +46,7 @@ def imu_spec(table: LogTable) -> Recognised | None:
         sensors["accel"] |= _stated_unit(frame, triads["accel"])
         notes = _spread(frame[known], time)
         return Recognised({"time": time, **sensors}, notes)
-    if any(triads.values()) or vocabulary.named(names, "lat"):
+    if any(triads.values()) or vocabulary.find_column(names, "lat"):
         return None
     spec = by_numbers.imu_spec(frame)
     if spec is None:
@@ -91,7 +91,7 @@ def gnss_spec(table: LogTable) -> Recognised | None:
     """The mapping of a table that holds fixes; None if it does not."""
     frame = numeric(table.frame)
     names = [str(c) for c in frame.columns]
-    found = {key: vocabulary.named(names, key) for key in vocabulary.QUANTITIES}
+    found = {key: vocabulary.find_column(names, key) for key in vocabulary.QUANTITIES}
     lat, lon, height = (found[key] for key in ("lat", "lon", "height"))
     if (lat is None or lon is None) and any(vocabulary.triad(names, stem) for stem in vocabulary.SENSORS.values()):
         return None
@@ -180,7 +180,7 @@ def velocity_spec(table: LogTable) -> tuple[Spec, Spec] | None:
     """Time and velocities of a table that has these and no positions; None if it does not."""
     frame = numeric(table.frame)
     names = [str(c) for c in frame.columns]
-    velocity = _velocity({key: vocabulary.named(names, key) for key in vocabulary.QUANTITIES})
+    velocity = _velocity({key: vocabulary.find_column(names, key) for key in vocabulary.QUANTITIES})
     if velocity is None:
         return None
     every = pd.Series(True, table.frame.index)
@@ -193,21 +193,21 @@ def missing(table: LogTable) -> str:
     frame = numeric(table.frame)
     names = [str(c) for c in frame.columns]
     has = [key for key, stem in vocabulary.SENSORS.items() if vocabulary.triad(names, stem)]
-    has += [name for key, name in (("lat", "positions"),) if vocabulary.named(names, key)]
+    has += [name for key, name in (("lat", "positions"),) if vocabulary.find_column(names, key)]
     columns = [str(c) for c in table.frame.columns]
     text = f"columns {', '.join(columns[:12])}{', …' if len(columns) > 12 else ''}"
     if not has:
-        lat = vocabulary.named(columns, "lat")
+        lat = vocabulary.find_column(columns, "lat")
         if lat is not None and len(table.frame):
             return f"{text}: {lat} has text such as {table.frame[lat].iloc[0]}, must be decimal degrees"
         return f"{text}, of which none is known"
     lacks = [] if len(has) > 1 or "positions" in has else [{"accel": "a gyroscope", "gyro": "an accelerometer"}[has[0]]]
     if "positions" in has:
-        lacks += [] if vocabulary.named(names, "lon") else ["a longitude"]
-        lacks += [] if vocabulary.named(names, "height") else ["a height (one number in all rows will do)"]
+        lacks += [] if vocabulary.find_column(names, "lon") else ["a longitude"]
+        lacks += [] if vocabulary.find_column(names, "height") else ["a height (one number in all rows will do)"]
     rows = pd.Series(True, table.frame.index)
     if stamps.time_spec(with_numbers(table, frame), rows, SLOWEST_FIX_S, FASTEST_IMU_S) is None:
-        times = [n for n in vocabulary.matching(columns, vocabulary.TIME) if n not in names]
+        times = [n for n in vocabulary.match_columns(columns, vocabulary.TIME) if n not in names]
         of_day = times and table.frame[times[0]].astype(str).iloc[:20].str.match(stamps.OF_DAY).all()
         lacks.append("a date beside the times of day" if of_day else "stamps that can be read")
     return f"{text}: has {' and '.join(has)}" + (f", lacks {' and '.join(lacks)}" if lacks else "")
@@ -291,7 +291,7 @@ def _accuracy_m(frame: pd.DataFrame, spec: Spec) -> float:
 def _quality_column(frame: pd.DataFrame) -> str | None:
     """The column of the fix quality; of u-blox' two the carrier solution, where every row has a fix."""
     names = [str(c) for c in frame.columns[:MOST_COLUMNS]]
-    name, carrier = vocabulary.named(names, "quality"), vocabulary.matching(names, vocabulary.CARRIER)
+    name, carrier = vocabulary.find_column(names, "quality"), vocabulary.match_columns(names, vocabulary.CARRIER)
     if name is not None and carrier and name not in carrier:
         kind, solution = (pd.to_numeric(frame[n], errors="coerce") for n in (name, carrier[0]))
         return carrier[0] if bool((kind > 0).all() and (solution > 0).any()) else name

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -48,7 +48,8 @@ def pool_settings(mappings: Sequence[Mapping[str, Any]], *, offsets: bool) -> tu
         if value is not None:
             set_value(out, path, value)
         elif path[-1] != "offset_s":
-            apart.append(f"reader.{'.'.join(path)} is not the same in all drives: {_listed(values)}")
+            listed = ", ".join(dict.fromkeys(map(write_value, values)))
+            apart.append(f"reader.{'.'.join(path)} is not the same in all drives: {listed}")
     return out, apart
 
 
@@ -93,16 +94,12 @@ def _agreed(values: Sequence[Any], limit: float) -> Any:
     return first if all(v == first for v in values) else None
 
 
-def merged(base: Any, over: Any) -> Any:
+def merge_settings(base: Any, over: Any) -> Any:
     """A mapping with the values of another one in their place."""
     if not isinstance(base, Mapping) or not isinstance(over, Mapping):
         return copy.deepcopy(over)
     out = {key: copy.deepcopy(value) for key, value in base.items() if key not in over}
-    return out | {key: merged(base.get(key), value) for key, value in over.items()}
-
-
-def _listed(values: Iterable[Any]) -> str:
-    return ", ".join(dict.fromkeys(write_value(v) for v in values))
+    return out | {key: merge_settings(base.get(key), value) for key, value in over.items()}
 
 
 def value_at(mapping: Any, path: tuple[str, ...]) -> Any:

@@ -32,17 +32,17 @@ def time_spec(table: LogTable, rows: pd.Series, slowest: float, fastest: float) 
     if frame.empty:
         return None
     names = [str(c) for c in frame.columns]
-    called = vocabulary.matching(names, vocabulary.TIME)
-    if (dated := _dated(frame, called, vocabulary.matching(names, vocabulary.DATE))) is not None:
+    called = vocabulary.match_columns(names, vocabulary.TIME)
+    if (dated := _dated(frame, called, vocabulary.match_columns(names, vocabulary.DATE))) is not None:
         return dated
-    dates = [name for name in vocabulary.matching(names, vocabulary.DATE) if _counts_days(frame[name], slowest)]
+    dates = [name for name in vocabulary.match_columns(names, vocabulary.DATE) if _counts_days(frame[name], slowest)]
     numbers = [name for name in (*called, *dates) if pd.api.types.is_numeric_dtype(frame[name])]
     column = numbers[0] if numbers else only_rising(frame)
     if column is None:
         return None
     values = frame[column].to_numpy(float)
     if _is_clock_face(values, slowest):
-        dates = vocabulary.matching(names, vocabulary.DATE)
+        dates = vocabulary.match_columns(names, vocabulary.DATE)
         date = next((n for n in dates if units.day_of_number(frame[n].iloc[0]) is not None), None)
         of_day: Spec = {"column": column, "unit": units.HHMMSS, "wraps_s": DAY_S}
         return of_day if date is None else of_day | {"column": [date, column], "clock": "utc"}
@@ -54,7 +54,7 @@ def time_spec(table: LogTable, rows: pd.Series, slowest: float, fastest: float) 
     if unit is None:
         return None
     spec: Spec = {"column": column, "unit": unit}
-    week = vocabulary.named(names, "week")
+    week = vocabulary.find_column(names, "week")
     if week is not None and pd.api.types.is_numeric_dtype(frame[week]):
         return spec | {"week": week}
     clock = clock_of(column, float(np.nanmedian(values)) / units.TIME[unit])

@@ -142,7 +142,7 @@ def leap_seconds(unix: np.ndarray | int) -> np.ndarray:
     return np.searchsorted(LEAP_UNIX, unix, side="right")
 
 
-def unwrapped(values: np.ndarray, wrap: float) -> np.ndarray:
+def unwrap_stamps(values: np.ndarray, wrap: float) -> np.ndarray:
     """Stamps that start again after ``wrap`` (week, day, counter) made to go on."""
     if np.issubdtype(values.dtype, np.integer):
         wrap = int(wrap)

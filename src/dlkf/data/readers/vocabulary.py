@@ -170,7 +170,7 @@ def _plain(text: str) -> str:
     return re.sub(r"[^\w#°]+|_", " ", "".join(letters).lower()).strip()
 
 
-def named(names: Iterable[str], key: str) -> str | None:
+def find_column(names: Iterable[str], key: str) -> str | None:
     """The column of a quantity: by its patterns in their order, the first column of several."""
     bare = [(name, words(name)) for name in names]
     for pattern in QUANTITIES[key]:
@@ -180,7 +180,7 @@ def named(names: Iterable[str], key: str) -> str | None:
     return None
 
 
-def matching(names: Iterable[str], pattern: str) -> list[str]:
+def match_columns(names: Iterable[str], pattern: str) -> list[str]:
     """The columns whose words are all of a pattern."""
     return [name for name in names if re.fullmatch(pattern, words(name)) or re.fullmatch(pattern, _plain(name))]
 

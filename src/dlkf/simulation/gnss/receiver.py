@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from dlkf.base.errors import InputError
 from dlkf.base.settings import Ranged, bounded_field, settings_from
+from dlkf.simulation.imu import gauss_markov
 
 Array = NDArray[np.floating]
 LOWEST = math.radians(3.0)  # mappings and noise grow without bound towards the horizon
@@ -99,10 +99,10 @@ def range_errors(
     shape = elevation.shape
     lowered = multipath_growth(elevation)
     white, rate = rng.standard_normal((2, *shape))
-    multipath = gauss_markov(rng, shape, receiver.multipath_s, dt)
-    orbit = gauss_markov(rng, shape, receiver.orbit_s, dt)
-    ambiguity = gauss_markov(rng, shape, receiver.ambiguity_s, dt) * is_float[:, None]
-    vertical = gauss_markov(rng, (shape[0], 2), receiver.atmosphere_s, dt)
+    multipath = gauss_markov(rng, shape, dt / receiver.multipath_s)
+    orbit = gauss_markov(rng, shape, dt / receiver.orbit_s)
+    ambiguity = gauss_markov(rng, shape, dt / receiver.ambiguity_s) * is_float[:, None]
+    vertical = gauss_markov(rng, (shape[0], 2), dt / receiver.atmosphere_s)
     common = np.stack((receiver.iono * iono_mapping(elevation), receiver.tropo * tropo_mapping(elevation)))
     independent = (
         lowered * (receiver.std_range * white + receiver.multipath * multipath)
@@ -133,13 +133,6 @@ def tropo_mapping(elevation: Array) -> Array:
 def iono_mapping(elevation: Array) -> Array:
     """Slant over vertical delay of a thin shell, (1 − (R cos E/(R + h))²)^−½ (RTCA DO-229 A.4.4.10.4)."""
     return 1 / np.sqrt(1 - (EARTH_RADIUS * np.cos(elevation) / (EARTH_RADIUS + IONOSPHERE)) ** 2)
-
-
-def gauss_markov(rng: np.random.Generator, shape: tuple[int, int], time_constant: float, dt: float) -> Array:
-    """Stationary first-order Gauss-Markov processes of 1σ = 1, one per column (T, N), discretised exactly."""
-    noise = rng.standard_normal(shape)
-    noise[1:] *= math.sqrt(-math.expm1(-2 * dt / time_constant))
-    return scipy.signal.lfilter([1.0], [1.0, -math.exp(-dt / time_constant)], noise, axis=0)
 
 
 def clock(rng: np.random.Generator, receiver: Receiver, rows: int, dt: float) -> tuple[Array, Array]:

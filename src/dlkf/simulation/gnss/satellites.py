@@ -50,16 +50,6 @@ class Signals:
     elevation: Array
     azimuth: Array
 
-    @property
-    def pseudorange(self) -> Array:
-        """Distance less the satellite's clock, ρ − c δt_s [m]; the receiver's clock comes on top."""
-        return self.distance - LIGHT * self.satellite.clock
-
-    @property
-    def pseudorange_rate(self) -> Array:
-        """d/dt of :attr:`pseudorange` [m/s]; a Doppler shift is −f_L1/c times this."""
-        return self.distance_rate - LIGHT * self.satellite.clock_rate
-
 
 def satellite_state(almanac: Almanac, t: Array, t_axes: Array | None = None) -> SatelliteState:
     """The satellites at times ``t`` (T,) or (T, S), in the ECEF axes of the times ``t_axes`` (T,), by default ``t``.

@@ -14,12 +14,12 @@ from dlkf.base.errors import InputError
 from dlkf.base.settings import Ranged, bounded_field
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.earth import EARTH_RATE
-from dlkf.simulation.gnss.receiver import gauss_markov
+from dlkf.simulation.gnss.receiver import QUALITIES
 from dlkf.simulation.gnss.surroundings import Sky
+from dlkf.simulation.imu import gauss_markov
 from dlkf.simulation.motion.vehicle import Truth, radii_of_curvature
 from dlkf.simulation.tables import fix_columns
 
-QUALITIES = (1, 2, 4, 5)
 FLOAT = 5  # NMEA GGA code: RTK with open ambiguities
 AXES = np.array((1.0, 1.0, 1.5))  # of errors that last, north, east, down
 
@@ -101,10 +101,10 @@ def _wandering(
     error, is_float = np.zeros((len(t), 3)), np.zeros(len(t), dtype=bool)
     dt = float(t[1] - t[0]) if len(t) > 1 else 1.0
     if config.wander > 0:
-        error += config.wander * AXES * gauss_markov(rng, error.shape, config.wander_s, dt)
+        error += config.wander * AXES * gauss_markov(rng, error.shape, dt / config.wander_s)
     if config.float_share > 0:
         is_float = episodes(rng, t, config.float_share, config.float_s)
-        error += config.float_std * AXES * gauss_markov(rng, error.shape, config.float_s, dt) * is_float[:, None]
+        error += config.float_std * AXES * gauss_markov(rng, error.shape, dt / config.float_s) * is_float[:, None]
     return error, is_float
 
 

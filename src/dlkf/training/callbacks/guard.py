@@ -78,7 +78,8 @@ class StepGuard(Callback):
         loss = float(torch.stack(self.losses).mean()) if self.losses else 0.0
         self.losses = []
         self.least = min(self.least, loss) if math.isfinite(loss) else self.least
-        if self.in_a_row == 0 and loss <= self.least + RISEN * abs(self.least) and all(map(_is_finite, state.values())):
+        finite = all(bool(x.isfinite().all()) for x in state.values())
+        if self.in_a_row == 0 and loss <= self.least + RISEN * abs(self.least) and finite:
             self.good = copy.deepcopy(state)
 
     def state_dict(self) -> dict:
@@ -96,7 +97,3 @@ class StepGuard(Callback):
         """A run that goes on starts from good weights."""
         if trainer.current_epoch:
             self.good = copy.deepcopy(module.state_dict())
-
-
-def _is_finite(x: torch.Tensor) -> bool:
-    return not x.is_floating_point() or bool(x.isfinite().all())

@@ -18,7 +18,7 @@ import pandas as pd
 
 from dlkf.base.errors import InputError
 from dlkf.data.readers import units
-from dlkf.data.readers.formats.text import decoded, without_cut_line
+from dlkf.data.readers.formats.text import decode_text, without_cut_line
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.schema import POSITION, STD, VELOCITY
 
@@ -29,7 +29,7 @@ SIZES = {"RAWIMUSX": 2, "RAWIMUX": 2}  # IMU info and type stand before week and
 
 def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
     """An export's table, or the logs of a ``kind``; ``table`` names the IMU's log, or INSPVA."""
-    lines = decoded(path, None).splitlines()
+    lines = decode_text(path, None).splitlines()
     if any(LOG.match(line) for line in lines[:200]):
         return _logs(lines, path, kind, table)
     return _export(lines, path)

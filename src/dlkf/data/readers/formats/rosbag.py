@@ -35,7 +35,7 @@ def holds(path: Path, kind: str) -> bool:
     return any(t in (IMU if kind == "imu" else (*FIX, SENTENCE)) for t in _topics(path).values())
 
 
-def listed(path: Path) -> str:
+def list_topics(path: Path) -> str:
     """The topics of a bag and their types."""
     return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(_topics(path).items())) or "none"
 

@@ -17,7 +17,7 @@ import pymap3d
 
 from dlkf.base.errors import InputError
 from dlkf.data.readers import units
-from dlkf.data.readers.formats.text import decoded, without_cut_line
+from dlkf.data.readers.formats.text import decode_text, without_cut_line
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.schema import POSITION, STD, VELOCITY
 
@@ -27,7 +27,7 @@ ZONES = {"GPST": "gps", "UTC": "utc"}
 
 def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
     """The solution's rows; InputError for a solution of baselines, which has no place on the Earth."""
-    lines = decoded(path, None).splitlines()
+    lines = decode_text(path, None).splitlines()
     heads = [k for k, line in enumerate(lines) if line.startswith("%") and re.search(r"\bQ\b", line)]
     if not heads:
         raise InputError(f"{path}: has no header line '%  GPST … Q …'; give a .pos file of RTKLIB")

@@ -39,7 +39,7 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
     options = {**DEFAULTS, **{k: v for k, v in text.items() if v is not None}}
     if len(options["separator"]) > 1:
         _pattern(options["separator"], "separator")
-    content = decoded(path, options["encoding"])
+    content = decode_text(path, options["encoding"])
     lines = content.splitlines()
     comment, pattern = options["comment"], options["lines"]
     chosen = _pattern(pattern, "lines") if pattern else None
@@ -69,7 +69,7 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
     return LogTable(frame, path, "line", units, tuple(notes))
 
 
-def decoded(path: Path, encoding: str | None) -> str:
+def decode_text(path: Path, encoding: str | None) -> str:
     """A text file, gzip or not; without an ``encoding`` UTF-8, UTF-16 by its mark, or the one of Windows (Western,
     Chinese, Japanese) with most letters of the words that name columns."""
     try:
