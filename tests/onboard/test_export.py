@@ -383,6 +383,12 @@ def test_the_ros_2_node_says_what_the_example_does(exported, example, tables, tm
         np.testing.assert_allclose(Rotation.from_quat(got[:, [5, 6, 7, 4]]).as_matrix(), ned @ turned @ frd, atol=1e-8)
 
 
+KINDS = [
+    "ins", "aekf", "mbkf21_car", "mbkf33_nhc_gated_gm", "dlkf_literal", "dlkf", "dlkf_kalman_car", "dlkf_kalman",
+    "plus",
+]  # fmt: skip
+
+
 @pytest.mark.exports
 @pytest.mark.parametrize(
     "estimator",
@@ -394,7 +400,7 @@ def test_the_ros_2_node_says_what_the_example_does(exported, example, tables, tm
         lambda: learned_kalman("mbkf33_gated"),
         talkative_plus,
     ],
-    ids="ins aekf mbkf21_car mbkf33_nhc_gated_gm dlkf_literal dlkf dlkf_kalman_car dlkf_kalman plus".split(),
+    ids=KINDS,
 )
 def test_every_kind_of_filter(estimator, tables, drive, tmp_path):
     model = estimator()
