@@ -284,7 +284,9 @@ def _is_view(target: Any) -> bool:
 def _is_copy(x: Any, node: Node) -> bool:
     """Whether an operation returns the same numbers in the same order."""
     value = node.meta["val"]
-    return isinstance(x, View) and x.meta.dtype == value.dtype and x.meta.stride() == value.stride()
+    if not isinstance(x, View) or x.meta.dtype != value.dtype:
+        return False
+    return all(n == 1 or s == v for n, s, v in zip(value.shape, x.meta.stride(), value.stride()))
 
 
 def _flat(x: Any) -> list:
