@@ -55,8 +55,8 @@ def add_waves(
     """:func:`demodulate` of some samples."""
     angle = distance.unsqueeze(-1) * _grids(distance.dtype, distance.device)
     far, near = zip(*(of.split((FAR, NEAR), -1) for of in (angle.cos(), angle.sin())))
-    waves = torch.cat(far, -1).unsqueeze(-1) * torch.cat(near, -1).unsqueeze(-2)
-    return torch.baddbmm(begin, x.mT, waves.flatten(2))
+    of_far = (x.unsqueeze(-1) * torch.cat(far, -1).unsqueeze(-2)).flatten(2)
+    return torch.baddbmm(begin.view(len(x), -1, 2 * NEAR), of_far.mT, torch.cat(near, -1)).view(begin.shape)
 
 
 def components(spectrum: Float[Tensor, "B 6 waves"]) -> tuple[Float[Tensor, "B 6 K"], Float[Tensor, "B 6 K"]]:

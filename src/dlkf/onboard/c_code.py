@@ -267,8 +267,13 @@ def _result_in(graph: GraphModule, into: View) -> dict[Node, View]:
     nodes = list(graph.graph.nodes)
     made: Any = nodes[-1].args[0]
     made = made[0] if isinstance(made, (list, tuple)) else made
-    alone = list(nodes[0].users) == [made] and name_of(made) in ("baddbmm", *BY_ELEMENT)
-    return {made: into} if alone else {}
+    while name_of(made) in RESHAPES:
+        made = made.args[0]
+    read = nodes[0]
+    while len(read.users) == 1 and name_of(user := next(iter(read.users))) in RESHAPES:
+        read = user
+    alone = list(read.users) == [made] and name_of(made) in ("baddbmm", *BY_ELEMENT)
+    return {made: into.viewed(into.meta.view(made.meta["val"].shape))} if alone else {}
 
 
 def _cast(given: torch.dtype, wanted: torch.dtype) -> str:
