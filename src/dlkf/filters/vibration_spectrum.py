@@ -53,10 +53,11 @@ def add_waves(
     begin: Float[Tensor, "B 6 waves"], x: Float[Tensor, "B m 6"], distance: Float[Tensor, "B m"]
 ) -> Float[Tensor, "B 6 waves"]:
     """:func:`demodulate` of some samples."""
-    angle = distance.unsqueeze(-1) * _grids(distance.dtype, distance.device)
-    far, near = zip(*(of.split((FAR, NEAR), -1) for of in (angle.cos(), angle.sin())))
-    of_far = (x.unsqueeze(-1) * torch.cat(far, -1).unsqueeze(-2)).flatten(2)
-    return torch.baddbmm(begin.view(len(x), -1, 2 * NEAR), of_far.mT, torch.cat(near, -1)).view(begin.shape)
+    far, near = _grids(distance.dtype, distance.device)
+    far, near = far.unsqueeze(-1) * distance.unsqueeze(1), distance.unsqueeze(-1) * near
+    of_far = x.mT.unsqueeze(2) * torch.cat((far.cos(), far.sin()), 1).unsqueeze(1)
+    of_near = torch.cat((near.cos(), near.sin()), -1)
+    return torch.baddbmm(begin.view(len(x), -1, 2 * NEAR), of_far.flatten(1, 2), of_near).view(begin.shape)
 
 
 def components(spectrum: Float[Tensor, "B 6 waves"]) -> tuple[Float[Tensor, "B 6 K"], Float[Tensor, "B 6 K"]]:
@@ -109,13 +110,13 @@ def log_likelihood(
     Between lines A is linear, A(F e^−δ) = (1 − r) A_i + r A_{i+1}.
     """
     first, r = _places(y.dtype, y.device)
-    products = torch.bmm((weight.unsqueeze(1) * y).mT, mean).flatten(1)  # Σ_axes w y(F) A(F′), F′ fastest
+    products = torch.bmm((weight.unsqueeze(1) * y).mT, mean)  # Σ_axes w y(F) A(F′)
     squares, neighbours = mean.square().sum(1), (mean[..., :-1] * mean[..., 1:]).sum(1)
-    place = first + LINES * torch.arange(LINES, device=y.device)
-    fits = products[:, place] + r * (products[:, place + 1] - products[:, place])
-    size = (1 - r).square() * squares[:, first] + r.square() * squares[:, first + 1]
-    size = size + 2 * r * (1 - r) * neighbours[:, first]
-    return _independent(distance) * (fits - 0.5 * weight.unsqueeze(1) * size).sum(-1)
+    lines, s = torch.arange(LINES, device=y.device), 1 - r
+    fits = s * products[..., :-1][:, lines, first] + r * products[..., 1:][:, lines, first]
+    sizes = s * (s * squares[:, :-1][:, first] + 2 * (r * neighbours[:, first]))
+    sizes = sizes + r * (r * squares[:, 1:][:, first])
+    return _independent(distance) * (fits - 0.5 * weight.unsqueeze(1) * sizes).sum(-1)
 
 
 def expected_log_likelihood(
@@ -172,8 +173,8 @@ def _trends(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "n K"]:
 
 @lru_cache
 @torch.inference_mode(False)
-def _grids(dtype: torch.dtype, device: torch.device) -> Float[Tensor, " grids"]:
+def _grids(dtype: torch.dtype, device: torch.device) -> tuple[Float[Tensor, " far"], Float[Tensor, " near"]]:
     """2π F [rad/m] of the far frequencies and of the near ones."""
     far = STEP * NEAR * (torch.arange(FAR, dtype=dtype, device=device) + 0.5)
     near = LEAST + STEP * (NEAR * (FAR - 0.5) + torch.arange(NEAR, dtype=dtype, device=device))
-    return 2 * math.pi * torch.cat((far, near))
+    return 2 * math.pi * far, 2 * math.pi * near

@@ -189,7 +189,7 @@ class Translation(Tensors):
             x: Expression | Rows = Rows(rows.shape, value.dtype, rows.lead, items)
             return x if goes_on else self.stored(node, x)
         x = self._expression(value.shape, value.dtype, name, args, kwargs)
-        return x if goes_on and len(x.operands) <= 12 and value.numel() > 0 else self.stored(node, x)
+        return x if goes_on and len(x.operands) <= 24 and value.numel() > 0 else self.stored(node, x)
 
     def _sine_and_cosine(self, node: Node, x: Any) -> View | None:
         """Of the same many angles, at once; None where one is wanted alone."""
@@ -200,7 +200,9 @@ class Translation(Tensors):
             return None
         if self._on.get(pair["sin"]) is not self._on.get(pair["cos"]):
             return None
-        outs = [self.block.new(value.shape, value.dtype) for _ in range(2)]
+        outs = [self.result(pair[name]) for name in ("sin", "cos")]
+        if not all(out.meta.is_contiguous() for out in outs):
+            outs = [self.block.new(value.shape, value.dtype) for _ in range(2)]
         at = ", ".join(f"&{v.at(['0'] * v.meta.ndim)[:-1]}+i]" for v in outs)
         angle = f"{x.at(['0'] * x.meta.ndim)[:-1]}+i]"
         self.block.write(f"for (int i = 0; i < {value.numel()}; i++) each_sincos({angle}, {at});", x, *outs)

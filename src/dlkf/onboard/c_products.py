@@ -30,7 +30,7 @@ def product(
 ) -> View | Rows:
     """A B (b × m × k · k × n), on top of β · ``begin`` where there is one."""
     a, b, value = t.tensor(A), t.tensor(B), node.meta["val"]
-    m, k, n = a.meta.shape[-2], a.meta.shape[-1], b.meta.shape[-1]
+    n = b.meta.shape[-1]
     if begin is None and alpha == 1 and n >= WIDE and (rows := _sparse_rows(t, a)):
         lines = _lines(rows, b, value)
         return lines if t.goes_on(node) and max(map(len, rows)) == 1 else t.stored(node, lines)
@@ -39,16 +39,26 @@ def product(
     if begin is not None:
         given = t.tensor(begin)
         given = given.viewed(given.meta.expand(value.shape))
-    scale, of_given = ("" if x == 1 else f"{literal(x, value.dtype)} * " for x in (alpha, beta))
-    small = prod(value.shape[:-2]) * k * n <= SMALL
+    factors = ["" if x == 1 else f"{literal(x, value.dtype)} * " for x in (alpha, beta)]
+    if a.meta.stride(-2) == out.meta.stride(-2) == 1 != out.meta.stride(-1):  # both by columns
+        of_given = None if given is None else given.viewed(given.meta.mT)
+        _write(t, out.viewed(out.meta.mT), b.viewed(b.meta.mT), a.viewed(a.meta.mT), of_given, *factors)
+    else:
+        _write(t, out, a, b, given, *factors)
+    return out
+
+
+def _write(t: Tensors, out: View, a: View, b: View, given: View | None, scale: str, beta: str) -> None:
+    """``scale`` A B + ``beta`` · ``given``."""
+    m, k, n = a.meta.shape[-2], a.meta.shape[-1], b.meta.shape[-1]
+    small = prod(out.meta.shape[:-2]) * k * n <= SMALL
     along = b.meta.stride(-2) == 1 and b.meta.stride(-1) != 1
     if along and a.meta.stride(-1) == 1 and k >= 2 * LANES and (n < WIDE or not small):
-        _write_dots(t, out, a, b, given, scale, of_given)
+        _write_dots(t, out, a, b, given, scale, beta)
     else:
         if small and n >= WIDE and m > 1 and b.meta.stride(-1) != 1:
             b = t.dense(b)
-        _write_rows(t, out, a, b, given, scale, of_given, small)
-    return out
+        _write_rows(t, out, a, b, given, scale, beta, small)
 
 
 def added_product(t: Tensors, node: Node, c: Any, a: Any, b: Any, beta: float = 1, alpha: float = 1) -> View | Rows:
