@@ -16,10 +16,10 @@ from torch.fx import Node
 
 from dlkf.onboard.c_memory import C_TYPES, Expression, Rows, Tensors, View, loops
 from dlkf.onboard.c_operations import literal, suffix
-from dlkf.onboard.c_reductions import LANES, SUM, Reduced, write_reduced
+from dlkf.onboard.c_reductions import LANES
 
 SMALL = 4096  # numbers of a matrix that is copied to be read along its rows, rather than weights of a network
-WIDE = 8  # columns from which on a zero is worth asking for
+WIDE = 8  # columns from which on rows of B are worth it, and of A from which on zeros are worth asking for
 FEW = 4  # elements of a row of a constant matrix, on average, that is written out
 NARROW = 16  # columns up to which a branch costs more than it saves
 VECTOR = 64  # bytes of a processor's largest vector: rows as long as that go through tiles
@@ -98,14 +98,12 @@ def _lines(rows: list[list[tuple[int, float]]], b: View, value: Any) -> Rows:
 
 
 def _write_dots(t: Tensors, out: View, a: View, b: View, given: View | None, scale: str, beta: str) -> None:
-    """Both along memory: sums beside each other."""
-    shape = (*out.meta.shape, a.meta.shape[-1])
-    terms = Expression(
-        torch.Size(shape), out.meta.dtype, "{0} * {1}",
-        [a.viewed(a.meta.unsqueeze(-2).expand(shape)), b.viewed(b.meta.mT.unsqueeze(-3).expand(shape))],
-    )  # fmt: skip
-    last = len(shape) - 1
-    write_reduced(t, Reduced(out, terms, list(range(last)), [last], SUM))
+    """Both along memory: ``dots`` of products.c.in."""
+    lead = ["b"] if a.meta.ndim == 3 else []
+    at = [f"&{x.at([*lead, '0', '0'])}, {x.meta.stride(d)}" for x, d in ((a, -2), (b, -1), (out, -2))]
+    sizes = f"{a.meta.shape[-2]}, {a.meta.shape[-1]}, {b.meta.shape[-1]}"
+    call = f"dots{suffix(out.meta.dtype)}({sizes}, {', '.join(at)}, {out.meta.stride(-1)});"
+    t.block.write(loops(lead, a.meta.shape[:1]) + call, out, a, b)
     if given is not None:
         t.block.over(out, f"{beta}{{0}} + {scale}{{1}}", [given, out])
     elif scale:
@@ -130,7 +128,8 @@ def _write_rows(
         t.block.write(each + loops(["i"], [m]) + body, *used)
     elif n * out.meta.dtype.itemsize >= VECTOR and b.meta.stride(-1) == out.meta.stride(-1) == 1:
         weights = not small or any(buffer is b.buffer for buffer, _ in t.block.constants)
-        _write_tiles(t, out, a, b, given, scale, beta, sparse=not weights and n > NARROW)
+        sums = given is not None and given.buffer is out.buffer
+        _write_tiles(t, out, a, b, given, scale, beta, sparse=not (weights or sums) and k >= WIDE and n > NARROW)
     else:
         row = loops(["j"], [n])
         start = "0" if given is None else beta + given.at([*lead, "i", "j"])
