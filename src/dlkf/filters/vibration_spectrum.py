@@ -25,6 +25,7 @@ from functools import lru_cache
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from dlkf.filters.pieces import summed
 
@@ -38,6 +39,7 @@ COSINES = 4  # in ln F, of the trend
 LOWEST, HIGHEST = -3.0, 2.5  # of y: a knock or a zero says no more
 TONES, FIRST_HZ, TONE_HZ = 40, 1.0, 0.5  # frequencies in time: how many, the first, and their distance
 SHIFTS, SHIFT = 16, 0.01  # δ to both sides, and its step
+REACH = math.ceil((LINES + LEAST / STEP) * math.expm1(SHIFTS * SHIFT))  # lines between F and F e^−δ at most
 LOG_VARIANCE = math.pi**2 / 6  # of the logarithm of exponential power
 APART = 1.5  # distance times the least difference of independent frequencies, for a sine as the window
 
@@ -110,10 +112,12 @@ def log_likelihood(
     Between lines A is linear, A(F e^−δ) = (1 − r) A_i + r A_{i+1}.
     """
     first, r = _places(y.dtype, y.device)
-    products = torch.bmm((weight.unsqueeze(1) * y).mT, mean)  # Σ_axes w y(F) A(F′)
+    around = pad(mean, (REACH, REACH)).unfold(-1, 2 * REACH + 1, 1)  # A of the lines beside each
+    products = ((weight.unsqueeze(1) * y).unsqueeze(-1) * around).sum(1)  # Σ_axes w y(F) A(F′)
     squares, neighbours = mean.square().sum(1), (mean[..., :-1] * mean[..., 1:]).sum(1)
-    lines, s = torch.arange(LINES, device=y.device), 1 - r
-    fits = s * products[..., :-1][:, lines, first] + r * products[..., 1:][:, lines, first]
+    line, s = torch.arange(LINES, device=y.device), 1 - r
+    place = first - line + REACH
+    fits = s * products[..., :-1][:, line, place] + r * products[..., 1:][:, line, place]
     sizes = s * (s * squares[:, :-1][:, first] + 2 * (r * neighbours[:, first]))
     sizes = sizes + r * (r * squares[:, 1:][:, first])
     return _independent(distance) * (fits - 0.5 * weight.unsqueeze(1) * sizes).sum(-1)
