@@ -76,7 +76,7 @@ def widen_prior(
     P: Float[Tensor, "B n n"], x: Float[Tensor, " B"], k: int, before: Float[Tensor, " B"], after: Float[Tensor, " B"]
 ) -> tuple[Float[Tensor, "B n n"], Float[Tensor, "B n"]]:
     """P and correction of the states where state k, estimated as x, had a prior of 0 with another variance."""
-    column = P[:, :, k]
+    column = P[:, k]  # P is symmetric, and its rows lie in memory
     known = before > 0
     less = torch.where(known, 1 / torch.where(known, before, 1.0) - 1 / torch.where(known, after, 1.0), 0.0)
     c = less / (1 - (less * column[:, k]).clamp_max(SHARE))

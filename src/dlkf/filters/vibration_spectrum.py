@@ -25,6 +25,7 @@ from functools import lru_cache
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from dlkf.filters.pieces import summed
 
@@ -38,6 +39,7 @@ COSINES = 4  # in ln F, of the trend
 LOWEST, HIGHEST = -3.0, 2.5  # of y: a knock or a zero says no more
 TONES, FIRST_HZ, TONE_HZ = 40, 1.0, 0.5  # frequencies in time: how many, the first, and their distance
 SHIFTS, SHIFT = 16, 0.01  # δ to both sides, and its step
+REACH = math.ceil((LINES + LEAST / STEP) * math.expm1(SHIFTS * SHIFT))  # lines between F and F e^−δ at most
 LOG_VARIANCE = math.pi**2 / 6  # of the logarithm of exponential power
 APART = 1.5  # distance times the least difference of independent frequencies, for a sine as the window
 
@@ -53,10 +55,11 @@ def add_waves(
     begin: Float[Tensor, "B 6 waves"], x: Float[Tensor, "B m 6"], distance: Float[Tensor, "B m"]
 ) -> Float[Tensor, "B 6 waves"]:
     """:func:`demodulate` of some samples."""
-    angle = distance.unsqueeze(-1) * _grids(distance.dtype, distance.device)
-    far, near = zip(*(of.split((FAR, NEAR), -1) for of in (angle.cos(), angle.sin())))
-    waves = torch.cat(far, -1).unsqueeze(-1) * torch.cat(near, -1).unsqueeze(-2)
-    return torch.baddbmm(begin, x.mT, waves.flatten(2))
+    far, near = _grids(distance.dtype, distance.device)
+    far, near = far.unsqueeze(-1) * distance.unsqueeze(1), distance.unsqueeze(-1) * near
+    of_far = x.mT.unsqueeze(2) * torch.cat((far.cos(), far.sin()), 1).unsqueeze(1)
+    of_near = torch.cat((near.cos(), near.sin()), -1)
+    return torch.baddbmm(begin.view(len(x), -1, 2 * NEAR), of_far.flatten(1, 2), of_near).view(begin.shape)
 
 
 def components(spectrum: Float[Tensor, "B 6 waves"]) -> tuple[Float[Tensor, "B 6 K"], Float[Tensor, "B 6 K"]]:
@@ -109,13 +112,15 @@ def log_likelihood(
     Between lines A is linear, A(F e^−δ) = (1 − r) A_i + r A_{i+1}.
     """
     first, r = _places(y.dtype, y.device)
-    products = torch.bmm((weight.unsqueeze(1) * y).mT, mean).flatten(1)  # Σ_axes w y(F) A(F′), F′ fastest
+    around = pad(mean, (REACH, REACH)).unfold(-1, 2 * REACH + 1, 1)  # A of the lines beside each
+    products = ((weight.unsqueeze(1) * y).unsqueeze(-1) * around).sum(1)  # Σ_axes w y(F) A(F′)
     squares, neighbours = mean.square().sum(1), (mean[..., :-1] * mean[..., 1:]).sum(1)
-    place = first + LINES * torch.arange(LINES, device=y.device)
-    fits = products[:, place] + r * (products[:, place + 1] - products[:, place])
-    size = (1 - r).square() * squares[:, first] + r.square() * squares[:, first + 1]
-    size = size + 2 * r * (1 - r) * neighbours[:, first]
-    return _independent(distance) * (fits - 0.5 * weight.unsqueeze(1) * size).sum(-1)
+    line, s = torch.arange(LINES, device=y.device), 1 - r
+    place = first - line + REACH
+    fits = s * products[..., :-1][:, line, place] + r * products[..., 1:][:, line, place]
+    sizes = s * (s * squares[:, :-1][:, first] + 2 * (r * neighbours[:, first]))
+    sizes = sizes + r * (r * squares[:, 1:][:, first])
+    return _independent(distance) * (fits - 0.5 * weight.unsqueeze(1) * sizes).sum(-1)
 
 
 def expected_log_likelihood(
@@ -172,8 +177,8 @@ def _trends(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "n K"]:
 
 @lru_cache
 @torch.inference_mode(False)
-def _grids(dtype: torch.dtype, device: torch.device) -> Float[Tensor, " grids"]:
+def _grids(dtype: torch.dtype, device: torch.device) -> tuple[Float[Tensor, " far"], Float[Tensor, " near"]]:
     """2π F [rad/m] of the far frequencies and of the near ones."""
     far = STEP * NEAR * (torch.arange(FAR, dtype=dtype, device=device) + 0.5)
     near = LEAST + STEP * (NEAR * (FAR - 0.5) + torch.arange(NEAR, dtype=dtype, device=device))
-    return 2 * math.pi * torch.cat((far, near))
+    return 2 * math.pi * far, 2 * math.pi * near

@@ -189,7 +189,7 @@ class Translation(Tensors):
             x: Expression | Rows = Rows(rows.shape, value.dtype, rows.lead, items)
             return x if goes_on else self.stored(node, x)
         x = self._expression(value.shape, value.dtype, name, args, kwargs)
-        return x if goes_on and len(x.operands) <= 12 and value.numel() > 0 else self.stored(node, x)
+        return x if goes_on and len(x.operands) <= 24 and value.numel() > 0 else self.stored(node, x)
 
     def _sine_and_cosine(self, node: Node, x: Any) -> View | None:
         """Of the same many angles, at once; None where one is wanted alone."""
@@ -200,7 +200,9 @@ class Translation(Tensors):
             return None
         if self._on.get(pair["sin"]) is not self._on.get(pair["cos"]):
             return None
-        outs = [self.block.new(value.shape, value.dtype) for _ in range(2)]
+        outs = [self.result(pair[name]) for name in ("sin", "cos")]
+        if not all(out.meta.is_contiguous() for out in outs):
+            outs = [self.block.new(value.shape, value.dtype) for _ in range(2)]
         at = ", ".join(f"&{v.at(['0'] * v.meta.ndim)[:-1]}+i]" for v in outs)
         angle = f"{x.at(['0'] * x.meta.ndim)[:-1]}+i]"
         self.block.write(f"for (int i = 0; i < {value.numel()}; i++) each_sincos({angle}, {at});", x, *outs)
@@ -267,8 +269,13 @@ def _result_in(graph: GraphModule, into: View) -> dict[Node, View]:
     nodes = list(graph.graph.nodes)
     made: Any = nodes[-1].args[0]
     made = made[0] if isinstance(made, (list, tuple)) else made
-    alone = list(nodes[0].users) == [made] and name_of(made) in ("baddbmm", *BY_ELEMENT)
-    return {made: into} if alone else {}
+    while name_of(made) in RESHAPES:
+        made = made.args[0]
+    read = nodes[0]
+    while len(read.users) == 1 and name_of(user := next(iter(read.users))) in RESHAPES:
+        read = user
+    alone = list(read.users) == [made] and name_of(made) in ("baddbmm", *BY_ELEMENT)
+    return {made: into.viewed(into.meta.view(made.meta["val"].shape))} if alone else {}
 
 
 def _cast(given: torch.dtype, wanted: torch.dtype) -> str:
@@ -284,7 +291,9 @@ def _is_view(target: Any) -> bool:
 def _is_copy(x: Any, node: Node) -> bool:
     """Whether an operation returns the same numbers in the same order."""
     value = node.meta["val"]
-    return isinstance(x, View) and x.meta.dtype == value.dtype and x.meta.stride() == value.stride()
+    if not isinstance(x, View) or x.meta.dtype != value.dtype:
+        return False
+    return all(n == 1 or s == v for n, s, v in zip(value.shape, x.meta.stride(), value.stride()))
 
 
 def _flat(x: Any) -> list:

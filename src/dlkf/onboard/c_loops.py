@@ -9,10 +9,11 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.fx import Node
 
 from dlkf.base.errors import InputError
-from dlkf.onboard.c_memory import Tensors, View, loops
+from dlkf.onboard.c_memory import Expression, Tensors, View, loops
 from dlkf.onboard.c_operations import literal, suffix
 from dlkf.onboard.c_places import is_same
 from dlkf.onboard.c_products import added_product, product
@@ -104,17 +105,30 @@ def _crossed(t: Tensors, node: Node, A: Any, B: Any, *, dim: int = -1) -> View:
     return out
 
 
-def _picked(t: Tensors, node: Node, x: Any, dim: int, index: Any) -> View:
+def _picked(t: Tensors, node: Node, x: Any, dim: int, index: Any) -> View | Expression:
     return _indexed(t, node, x, [None] * (dim % t.tensor(x).meta.ndim) + [index])
 
 
-def _indexed(t: Tensors, node: Node, x: Any, indices: list) -> View:
+def _indexed(t: Tensors, node: Node, x: Any, indices: list) -> View | Expression:
     """x[…, i, j, …] with tensors side by side that broadcast, None for a whole axis."""
-    view, (out, value) = t.tensor(x), _new(t, node)
+    view, value = t.tensor(x), node.meta["val"]
+    if t.goes_on(node) and all(i is None or isinstance(i, Tensor) for i in indices):
+        return _looked_up(t, view, indices)
+    out = t.result(node)
     names = _names(value.ndim)
     source, given = _places(t, view, indices, names)
     t.block.write(f"{loops(names, value.shape)}{out.at(names)} = {view.at(source)};", out, view, *given)
     return out
+
+
+def _looked_up(t: Tensors, view: View, indices: list) -> Expression:
+    """The same with constants, element by element: by a table of where each is in memory."""
+    shape, stride, offset = view.meta.shape, view.meta.stride(), view.meta.storage_offset()
+    last = sum((n - 1) * s for n, s in zip(shape, stride))
+    places = torch.arange(last + 1, dtype=torch.int32).as_strided(shape, stride)
+    table = t.block.constant(places[tuple(slice(None) if i is None else i for i in indices)])
+    source = view.viewed(torch.as_strided(view.meta, table.meta.shape, [0] * table.meta.ndim))
+    return Expression(table.meta.shape, view.meta.dtype, f"({view.buffer.name}+{offset})[{{0}}]", [table, source])
 
 
 def _put(t: Tensors, node: Node, x: Any, indices: list, values: Any, accumulate: bool = False) -> View:

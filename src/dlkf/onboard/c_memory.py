@@ -18,6 +18,7 @@ C_TYPES = {
     torch.bool: "unsigned char",
 }  # fmt: skip
 CACHE_LINE = 64  # bytes
+SHORT, LONG = 8, 16  # a row shorter than that is no vector; rows from which on they are many
 
 
 @dataclass
@@ -116,8 +117,12 @@ class Block:
     def constant(self, value: Tensor) -> View:
         """A tensor known here."""
         value = value.detach().cpu().contiguous()
-        buffer = Buffer(f"c{next(self.names)}", value.dtype, max(1, value.numel()), fixed=True)
-        self.constants.append((buffer, value.reshape(-1).numpy()))
+        numbers = value.reshape(-1).numpy()
+        same = (buffer for buffer, x in self.constants if x.dtype == numbers.dtype and x.tobytes() == numbers.tobytes())
+        buffer = next(same, None)
+        if buffer is None:
+            buffer = Buffer(f"c{next(self.names)}", value.dtype, max(1, value.numel()), fixed=True)
+            self.constants.append((buffer, numbers))
         return View(buffer, value.to("meta"))
 
     def write(self, line: str, *used: View) -> None:
@@ -161,8 +166,11 @@ class Tensors:
         self.block = Block() if block is None else block
 
     def result(self, node: Node) -> View:
-        """Memory for what an operation returns."""
+        """Memory for what an operation returns, as torch has it; many rows of few numbers column by column."""
         value: Any = node.meta["val"]
+        if value.ndim > 1 and value.shape[-1] < SHORT <= LONG <= value.shape[-2] and value.is_contiguous():
+            out = self.block.new((*value.shape[:-2], *value.shape[:-3:-1]), value.dtype)
+            return out.viewed(out.meta.mT)
         whole = value.numel() and torch.ops.aten.is_non_overlapping_and_dense(value)
         return self.block.new(value.shape, value.dtype, value.stride() if whole else None)
 

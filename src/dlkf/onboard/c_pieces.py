@@ -19,16 +19,15 @@ def write_sum(t: Tensors, node: Node, name: str, count: int, begin: Any, samples
     """What a piece adds, in ``count`` turns."""
     out = t.result(node)
     t.block.over(out, *t.elements_of(begin, out.meta.shape))
-    wholes = [t.tensor(x) for x in samples]
-    pieces = [t.block.new((x.meta.shape[0], x.meta.shape[1] // count, *x.meta.shape[2:]), x.meta.dtype) for x in wholes]
+    wholes, pieces = [t.tensor(x) for x in samples], []
+    for x in wholes:
+        size = x.meta.shape[1] // count
+        at = Buffer(f"({x.buffer.name}+{size * x.meta.stride(1)}*t)", x.buffer.dtype, x.buffer.numbers, fixed=True)
+        pieces.append(View(at, x.meta.narrow(1, 0, size)))
     example = tuple(torch.zeros(x.meta.shape, dtype=x.meta.dtype) for x in (out, *pieces))
     t.block.write(f"for (int t = 0; t < {count}; t++) {{", out, *wholes)
-    for whole, piece in zip(wholes, pieces):
-        size, step = piece.meta.shape[1], whole.meta.stride(1)
-        at = Buffer(f"({whole.buffer.name}+{size * step}*t)", whole.buffer.dtype, whole.buffer.numbers, fixed=True)
-        t.block.over(piece, "{0}", [View(at, whole.meta.narrow(1, 0, size))])
     t.within(record(_Piece(name, example)), [out, *pieces])
-    t.block.write("}", out, *wholes, *pieces)
+    t.block.write("}", out, *wholes)
     return out
 
 

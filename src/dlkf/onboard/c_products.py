@@ -7,7 +7,6 @@ Of other matrices many are mostly zeros in filters (H, K, Φ), so zeros in A sav
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from math import prod
 from typing import Any
 
@@ -16,14 +15,14 @@ from torch import Tensor
 from torch.fx import Node
 
 from dlkf.onboard.c_memory import C_TYPES, Expression, Rows, Tensors, View, loops
-from dlkf.onboard.c_operations import literal
-from dlkf.onboard.c_reductions import LANES, SUM, Reduced, write_reduced
+from dlkf.onboard.c_operations import literal, suffix
+from dlkf.onboard.c_reductions import LANES
 
 SMALL = 4096  # numbers of a matrix that is copied to be read along its rows, rather than weights of a network
-WIDE = 8  # columns from which on a zero is worth asking for
+WIDE = 8  # columns from which on rows of B are worth it, and of A from which on zeros are worth asking for
 FEW = 4  # elements of a row of a constant matrix, on average, that is written out
-NARROW = 16  # columns up to which one row at a time is best, and a branch costs more than it saves
-BLOCK = 24  # columns of weights at a time where several rows are
+NARROW = 16  # columns up to which a branch costs more than it saves
+VECTOR = 64  # bytes of a processor's largest vector: rows as long as that go through tiles
 
 
 def product(
@@ -31,7 +30,7 @@ def product(
 ) -> View | Rows:
     """A B (b × m × k · k × n), on top of β · ``begin`` where there is one."""
     a, b, value = t.tensor(A), t.tensor(B), node.meta["val"]
-    m, k, n = a.meta.shape[-2], a.meta.shape[-1], b.meta.shape[-1]
+    n = b.meta.shape[-1]
     if begin is None and alpha == 1 and n >= WIDE and (rows := _sparse_rows(t, a)):
         lines = _lines(rows, b, value)
         return lines if t.goes_on(node) and max(map(len, rows)) == 1 else t.stored(node, lines)
@@ -40,16 +39,26 @@ def product(
     if begin is not None:
         given = t.tensor(begin)
         given = given.viewed(given.meta.expand(value.shape))
-    scale, of_given = ("" if x == 1 else f"{literal(x, value.dtype)} * " for x in (alpha, beta))
-    small = prod(value.shape[:-2]) * k * n <= SMALL
+    factors = ["" if x == 1 else f"{literal(x, value.dtype)} * " for x in (alpha, beta)]
+    if a.meta.stride(-2) == out.meta.stride(-2) == 1 != out.meta.stride(-1):  # both by columns
+        of_given = None if given is None else given.viewed(given.meta.mT)
+        _write(t, out.viewed(out.meta.mT), b.viewed(b.meta.mT), a.viewed(a.meta.mT), of_given, *factors)
+    else:
+        _write(t, out, a, b, given, *factors)
+    return out
+
+
+def _write(t: Tensors, out: View, a: View, b: View, given: View | None, scale: str, beta: str) -> None:
+    """``scale`` A B + ``beta`` · ``given``."""
+    m, k, n = a.meta.shape[-2], a.meta.shape[-1], b.meta.shape[-1]
+    small = prod(out.meta.shape[:-2]) * k * n <= SMALL
     along = b.meta.stride(-2) == 1 and b.meta.stride(-1) != 1
     if along and a.meta.stride(-1) == 1 and k >= 2 * LANES and (n < WIDE or not small):
-        _write_dots(t, out, a, b, given, scale, of_given)
+        _write_dots(t, out, a, b, given, scale, beta)
     else:
         if small and n >= WIDE and m > 1 and b.meta.stride(-1) != 1:
             b = t.dense(b)
-        _write_rows(t, out, a, b, given, scale, of_given, small)
-    return out
+        _write_rows(t, out, a, b, given, scale, beta, small)
 
 
 def added_product(t: Tensors, node: Node, c: Any, a: Any, b: Any, beta: float = 1, alpha: float = 1) -> View | Rows:
@@ -89,14 +98,12 @@ def _lines(rows: list[list[tuple[int, float]]], b: View, value: Any) -> Rows:
 
 
 def _write_dots(t: Tensors, out: View, a: View, b: View, given: View | None, scale: str, beta: str) -> None:
-    """Both along memory: sums beside each other."""
-    shape = (*out.meta.shape, a.meta.shape[-1])
-    terms = Expression(
-        torch.Size(shape), out.meta.dtype, "{0} * {1}",
-        [a.viewed(a.meta.unsqueeze(-2).expand(shape)), b.viewed(b.meta.mT.unsqueeze(-3).expand(shape))],
-    )  # fmt: skip
-    last = len(shape) - 1
-    write_reduced(t, Reduced(out, terms, list(range(last)), [last], SUM))
+    """Both along memory: ``dots`` of products.c.in."""
+    lead = ["b"] if a.meta.ndim == 3 else []
+    at = [f"&{x.at([*lead, '0', '0'])}, {x.meta.stride(d)}" for x, d in ((a, -2), (b, -1), (out, -2))]
+    sizes = f"{a.meta.shape[-2]}, {a.meta.shape[-1]}, {b.meta.shape[-1]}"
+    call = f"dots{suffix(out.meta.dtype)}({sizes}, {', '.join(at)}, {out.meta.stride(-1)});"
+    t.block.write(loops(lead, a.meta.shape[:1]) + call, out, a, b)
     if given is not None:
         t.block.over(out, f"{beta}{{0}} + {scale}{{1}}", [given, out])
     elif scale:
@@ -106,9 +113,11 @@ def _write_dots(t: Tensors, out: View, a: View, b: View, given: View | None, sca
 def _write_rows(
     t: Tensors, out: View, a: View, b: View, given: View | None, scale: str, beta: str, small: bool
 ) -> None:
-    """Several rows of A along rows of B, whose sums stay in registers."""
+    """Along rows of B, or along its columns where these alone lie in memory."""
     m, k, n = a.meta.shape[-2], a.meta.shape[-1], b.meta.shape[-1]
     kind, lead = C_TYPES[out.meta.dtype], ["b"] if a.meta.ndim == 3 else []
+    used = [out, a, b, *([] if given is None else [given])]
+    each = loops(lead, a.meta.shape[:1])
     if b.meta.stride(-1) != 1 and (n == 1 or b.meta.stride(-2) == 1):  # along columns of B
         start = "0" if given is None else f"{beta}{given.at([*lead, 'i', 'j'])}"
         body = (
@@ -116,45 +125,42 @@ def _write_rows(
             f"y += {a.at([*lead, 'i', 'k'])} * {b.at([*lead, 'k', 'j'])}; "
             f"{out.at([*lead, 'i', 'j'])} = {start} + {scale}y; }}"
         )
-        used = [out, a, b, *([] if given is None else [given])]
-        t.block.write(loops(lead, a.meta.shape[:1]) + loops(["i"], [m]) + body, *used)
-        return
-    weights = not small or any(buffer is b.buffer for buffer, _ in t.block.constants)
-    beside = 1 if k <= FEW or n <= NARROW else 6 if weights else 3
-    beside, columns = min(m, beside), BLOCK if weights and m > 1 else n
-    for top, rows in _pieces(m, beside):
-        for left, width in _pieces(n, columns):
-            skips = "" if weights or n <= NARROW else "if (w == 0) continue; "
-            _write_block(t, out, a, b, given, scale, beta, skips, (top, rows, beside), (left, width, columns))
+        t.block.write(each + loops(["i"], [m]) + body, *used)
+    elif n * out.meta.dtype.itemsize >= VECTOR and b.meta.stride(-1) == out.meta.stride(-1) == 1:
+        weights = not small or any(buffer is b.buffer for buffer, _ in t.block.constants)
+        sums = given is not None and given.buffer is out.buffer
+        _write_tiles(t, out, a, b, given, scale, beta, sparse=not (weights or sums) and k >= WIDE and n > NARROW)
+    else:
+        row = loops(["j"], [n])
+        start = "0" if given is None else beta + given.at([*lead, "i", "j"])
+        body = (
+            f"{{ {kind} y[{n}]; {row}y[j] = {start}; for (int k = 0; k < {k}; k++) {{ "
+            f"{kind} w = {scale}{a.at([*lead, 'i', 'k'])}; {row}y[j] += w * {b.at([*lead, 'k', 'j'])}; }} "
+            f"{row}{out.at([*lead, 'i', 'j'])} = y[j]; }}"
+        )
+        t.block.write(each + loops(["i"], [m]) + body, *used)
 
 
-def _pieces(count: int, size: int) -> Iterator[tuple[int, int]]:
-    """Begin and length of what whole pieces cover, and of the rest."""
-    whole = count - count % size
-    yield from ((begin, length) for begin, length in ((0, whole), (whole, count - whole)) if length)
+def _write_tiles(
+    t: Tensors, out: View, a: View, b: View, given: View | None, scale: str, beta: str, sparse: bool
+) -> None:
+    """By ``multiply`` of products.c.in."""
+    m, k, n = a.meta.shape[-2], a.meta.shape[-1], b.meta.shape[-1]
+    overlaps = given is not None and given.buffer is out.buffer and n * out.meta.dtype.itemsize % VECTOR != 0
+    if given is not None and (overlaps or given.meta.stride(-1) != 1):
+        copy = t.block.new(given.meta.shape, given.meta.dtype)
+        t.block.over(copy, "{0}", [given])
+        given = copy
+    lead = ["b"] if a.meta.ndim == 3 else []
 
+    def place(view: View) -> str:
+        return "&" + view.at([*lead, "0", "0"])
 
-def _write_block(
-    t: Tensors, out: View, a: View, b: View, given: View | None, scale: str, beta: str, skips: str,
-    rows: tuple[int, int, int], columns: tuple[int, int, int],
-) -> None:  # fmt: skip
-    """First, number and how many at a time of rows and columns."""
-    (top, height, beside), (left, width, block) = rows, columns
-    beside, block = min(beside, height), min(block, width)
-    kind, lead, many = C_TYPES[out.meta.dtype], ["b"] if a.meta.ndim == 3 else [], width > block
-    row = [f"(i+{top + r})" if top + r else "i" for r in range(beside)]
-    column = f"(j+c+{left})" if many else f"(j+{left})" if left else "j"
-    each = f"for (int j = 0; j < {block}; j++) "
-    names = [f"y{r}" for r in range(beside)]
-    lines = [f"{kind} {', '.join(f'{y}[{block}]' for y in names)};"]
-    for y, i in zip(names, row):
-        lines.append(f"{each}{y}[j] = {'0' if given is None else beta + given.at([*lead, i, column])};")
-    lines.append(f"for (int k = 0; k < {a.meta.shape[-1]}; k++) {{")
-    lines += [f"{kind} w{r} = {scale}{a.at([*lead, i, 'k'])};" for r, i in enumerate(row)]
-    lines.append(skips.replace("w == 0", " && ".join(f"w{r} == 0" for r in range(beside))))
-    lines += [f"{each}{y}[j] += w{r} * {b.at([*lead, 'k', column])};" for r, y in enumerate(names)]
-    lines.append("}")
-    lines += [f"{each}{out.at([*lead, i, column])} = {y}[j];" for y, i in zip(names, row)]
-    head = loops(lead, a.meta.shape[:1]) + f"for (int i = 0; i < {height}; i += {beside}) "
-    head += f"for (int c = 0; c < {width}; c += {block}) " if many else ""
-    t.block.write(f"{head}{{ {' '.join(filter(None, lines))} }}", out, a, b, *([] if given is None else [given]))
+    factors = [x.removesuffix(" * ") or "1" for x in (scale, beta)]
+    begin = "0, 0" if given is None else f"{place(given)}, {given.meta.stride(-2)}"
+    call = (
+        f"multiply{suffix(out.meta.dtype)}({m}, {k}, {n}, {int(sparse)}, {factors[0]}, {place(a)}, "
+        f"{a.meta.stride(-2)}, {a.meta.stride(-1)}, {place(b)}, {b.meta.stride(-2)}, {factors[1]}, {begin}, "
+        f"{place(out)}, {out.meta.stride(-2)});"
+    )
+    t.block.write(loops(lead, a.meta.shape[:1]) + call, out, a, b, *([] if given is None else [given]))

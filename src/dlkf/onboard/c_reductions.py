@@ -15,7 +15,7 @@ import torch
 from torch.fx import Node
 
 from dlkf.base.errors import InputError
-from dlkf.onboard.c_memory import C_TYPES, Expression, Rows, Tensors, View, loops
+from dlkf.onboard.c_memory import C_TYPES, Expression, Rows, Tensors, View, collapsed, loops
 from dlkf.onboard.c_operations import suffix
 
 UNKNOWN = "the C form of an exported filter does not know"
@@ -86,6 +86,7 @@ def _summed(x: Rows, dims: Any, keepdim: bool) -> Rows | None:
 
 def write_reduced(t: Tensors, r: Reduced) -> None:
     """The loops."""
+    r = _as_one(r)
     x, count = r.of, math.prod(r.of.shape[d] for d in r.gone)
     if r.how is not LARGEST and 0 < count <= TERMS and count * len(x.operands) <= 4 * TERMS:
         _write_terms(t, r)
@@ -96,6 +97,21 @@ def write_reduced(t: Tensors, r: Reduced) -> None:
         _write_lanes(t, r, along[-1])
     else:
         _write_across(t, r)
+
+
+def _as_one(r: Reduced) -> Reduced:
+    """With one axis for those that are gone, where all operands have them as one in memory."""
+    operands, gone, kept = r.of.operands, sorted(r.gone), r.kept
+    sizes, strides = collapsed([r.of.shape[d] for d in gone], [[v.meta.stride(d) for d in gone] for v in operands])
+    if len(gone) < 2 or len(sizes) != 1:
+        return r
+    shape = torch.Size([*(r.of.shape[d] for d in kept), *sizes])
+    flat = [
+        v.viewed(torch.as_strided(v.meta, shape, [*(v.meta.stride(d) for d in kept), *s], v.meta.storage_offset()))
+        for v, s in zip(operands, strides)
+    ]
+    elements = Expression(shape, r.of.dtype, r.of.pattern, flat)
+    return Reduced(r.into, elements, list(range(len(kept))), [len(kept)], r.how)
 
 
 def _write_terms(t: Tensors, r: Reduced) -> None:

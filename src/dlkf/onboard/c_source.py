@@ -76,6 +76,24 @@ UNUSED = """#if defined(__GNUC__)
 #define DLKF_UNUSED
 #define DLKF_APART
 #endif"""
+VECTORS = """#if defined(__GNUC__)
+#define DLKF_WITHIN inline __attribute__((always_inline)) /* with the sizes of a call, which are constants */
+#if defined(__AVX512F__)
+#define DLKF_VECTOR 64 /* bytes */
+#define DLKF_ROWS 6 /* of a tile */
+#define DLKF_TILE 24 /* vectors that leave room for others in the registers */
+#elif defined(__AVX__) || defined(__SSE2__) || defined(__ARM_NEON)
+#if defined(__AVX__)
+#define DLKF_VECTOR 32
+#else
+#define DLKF_VECTOR 16
+#endif
+#define DLKF_ROWS 4
+#define DLKF_TILE 12
+#endif
+#else
+#define DLKF_WITHIN inline
+#endif"""
 
 
 def write_source(
@@ -137,7 +155,8 @@ def heading() -> str:
     include = "\n".join(f"#include {name}" for name in ("<math.h>", "<stdint.h>", "<string.h>", '"step.h"'))
     made = "/* Made by dlkf.export; do not edit: the equations are in the Python package. */"
     elementary = (CORE / "elementary.c.in").read_text()
-    return "\n".join((made, include, FINITE, UNUSED, "", elementary, *(_filled(algebra, kind) for kind in kinds)))
+    twice = (_filled(text, kind) for text in (algebra, (CORE / "products.c.in").read_text()) for kind in kinds)
+    return "\n".join((made, include, FINITE, UNUSED, VECTORS, "", elementary, *twice))
 
 
 def _sizes(estimator: Estimator, layout: Layout, grid: Grid, name: str, work: int, can_anchor: bool) -> dict[str, Any]:

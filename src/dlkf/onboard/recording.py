@@ -18,6 +18,7 @@ from dlkf.navigation import compiled
 KEPT = {  # operations that are one in C, though core ATen has several for them
     "aten::linalg_cross", "aten::linalg_solve_ex", "aten::_linalg_solve_ex", "aten::linalg_cholesky_ex",
     "aten::cholesky_solve", "aten::linalg_inv_ex", "aten::linalg_solve_triangular", "aten::baddbmm",
+    "aten::select_scatter", "aten::unfold",
 }  # fmt: skip
 
 
