@@ -152,7 +152,7 @@ def test_it_can_be_smoothed():
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"kind": "minus"}, "dlkf, plus"),
+        ({"kind": "minus"}, "dlkf, dlkf_kalman, plus"),
         ({"kind": "plus", "hiden": 3}, "unknown key hiden"),
         ({"kind": "plus", "base": "ins"}, "no Kalman filter"),
         ({"kind": "plus", "network": {"hidden": 1000}}, "between 8 and 256"),
