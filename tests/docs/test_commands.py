@@ -70,7 +70,7 @@ VARIANTS = {
         ["simulated@dataset=fleet"],
         ["simulated@dataset=wide"],
     ],
-    "train": [["+experiment=outage"]],
+    "train": [["+experiment=outage", "filter@model=dlkf_kalman"]],
 }
 SETTING = re.compile(r"^([a-z_]+(?:\.[a-z_]+)+)(?:=.*)?$")
 
