@@ -46,8 +46,11 @@ FURTHER = len(USUAL_STD) + 6  # inputs of the network: logarithms of the 1σ, no
 
 @dataclass(frozen=True)
 class LearnedKalmanConfig(LearnedConfig):
-    """As :class:`LearnedConfig`, and the Kalman filter ``base``. A training takes its ``imu``, its ``tuning`` and, for a
-    base with ``_prior``, its ``prior`` (``mean``, ``std``) from the baseline of that name."""
+    """As :class:`LearnedConfig`, and the Kalman filter ``base``.
+
+    A training takes its ``imu``, its ``tuning`` and, for a base with ``_prior``, its ``prior`` (``mean``, ``std``) from
+    the baseline of that name.
+    """
 
     outage_mode: Literal["hold", "run"] = "run"
     base: str = "mbkf33_prior"
