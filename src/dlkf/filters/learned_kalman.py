@@ -31,12 +31,12 @@ from dlkf.data.drive import Batch
 from dlkf.filters.build import build_causal, has_prior, is_filter, refuse_smoothed
 from dlkf.filters.integration import Correction, Covariances, Epoch
 from dlkf.filters.learned import LearnedConfig, LearnedFilter, LearnedMemory
-from dlkf.filters.matching import variance_along
+from dlkf.filters.matching import normalised_innovation, variance_along
 from dlkf.filters.model_based import KalmanMemory, Mbkf
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.navigation.state import IMU, PV, PVA, STATES
+from dlkf.navigation.state import IMU, PVA, STATES
 from dlkf.networks.features import level_rotation
 
 # usual 1σ of position [m], velocity [m/s], attitude [rad], accelerometer [m/s²] and gyroscope bias [rad/s]
@@ -146,11 +146,9 @@ class LearnedKalmanFilter(LearnedFilter):
         C_hn = level_rotation(epoch.window.end.C_nb, "heading")
         variance = variance_along(P[:, PVA, PVA], C_hn.mT)
         of_imu = P.diagonal(dim1=-2, dim2=-1)[:, IMU]
-        R = torch.bmm(epoch.fix.std.square().unflatten(-1, (2, 3)), C_hn.mT.square()).flatten(1)
-        z = torch.bmm(epoch.z.unflatten(-1, (2, 3)), C_hn.mT).flatten(1)
         usual = P.new_tensor(USUAL_STD)
         spread = torch.log(torch.cat((variance, of_imu), -1).clamp_min(1e-18).sqrt() / usual) / 2
-        return torch.cat((spread, torch.asinh(z / (variance[:, PV] + R + 1e-6).sqrt())), -1)
+        return torch.cat((spread, torch.asinh(normalised_innovation(P, epoch.z, epoch.fix.std, C_hn, 1e-6))), -1)
 
 
 def _with_gain(P: Float[Tensor, "B n n"], gain: Float[Tensor, "B 9 6"], c: Covariances) -> Float[Tensor, "B n n"]:

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dlkf.navigation import compiled
-from dlkf.navigation.state import ATTITUDE, IMU, VELOCITY
+from dlkf.navigation.state import ATTITUDE, IMU, PV, VELOCITY
 
 MEMORIES = (10.0, 60.0)  # fixes
 LARGEST = 1e3  # of a ratio: the most that one outlier counts
@@ -33,6 +33,17 @@ def variance_along(P: Float[Tensor, "B k k"], axes: Float[Tensor, "B 3 3"]) -> F
     blocks = P.unflatten(-1, (-1, 3)).unflatten(-3, (-1, 3)).diagonal(dim1=1, dim2=3)  # (B, 3, 3, blocks)
     along = torch.bmm(axes.mT, blocks.flatten(2)).unflatten(-1, (3, -1))
     return (along * axes.mT.unsqueeze(-1)).sum(2).mT.flatten(1)
+
+
+def normalised_innovation(
+    P: Float[Tensor, "B n n"], z: Float[Tensor, "B 6"], std: Float[Tensor, "B 6"], C_hn: Float[Tensor, "B 3 3"],
+    least: float,
+) -> Float[Tensor, "B 6"]:  # fmt: skip
+    """Innovations of position and velocity over √(P + R + ``least``), in the axes of C_hn; zero stays zero."""
+    variance = variance_along(P[:, PV, PV], C_hn.mT)
+    R = torch.bmm(std.square().unflatten(-1, (2, 3)), C_hn.mT.square()).flatten(1)
+    z = torch.bmm(z.unflatten(-1, (2, 3)), C_hn.mT).flatten(1)
+    return z / (variance + R + least).sqrt()
 
 
 class Matching(NamedTuple):

@@ -31,7 +31,14 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.fix_noise import FixNoise
 from dlkf.filters.integration import Correction, Epoch
-from dlkf.filters.matching import AXIS_FEATURES, LOG_FEATURES, Matching, ratio_by_axis, variance_along
+from dlkf.filters.matching import (
+    AXIS_FEATURES,
+    LOG_FEATURES,
+    Matching,
+    normalised_innovation,
+    ratio_by_axis,
+    variance_along,
+)
 from dlkf.filters.model_based import KalmanMemory as KalmanMemory
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.position_errors import PositionErrors
@@ -40,7 +47,7 @@ from dlkf.filters.virtual_outages import VirtualOutage
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.error_model import source_scale
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.navigation.state import IMU, POSITION, PV, PVA
+from dlkf.navigation.state import IMU, POSITION, PVA
 from dlkf.networks.features import level_rotation
 from dlkf.networks.plus import (
     LEAST_RATE_HZ,
@@ -228,10 +235,7 @@ class PlusFilter(nn.Module):
     def _normalised(self, memory: PlusMemory, epoch: Epoch) -> Float[Tensor, "B 6"]:
         """Innovations over their 1σ as the filter of the last epoch has it, in heading axes; zero without a fix."""
         C_hn = level_rotation(epoch.window.end.C_nb, "heading")
-        variance = variance_along(memory.kalman.P[:, PV, PV], C_hn.mT)
-        R = torch.bmm(epoch.fix.std.square().unflatten(-1, (2, 3)), C_hn.mT.square()).flatten(1)
-        z = torch.bmm(epoch.z.unflatten(-1, (2, 3)), C_hn.mT).flatten(1)
-        return z / (variance + R + 1e-4).sqrt()
+        return normalised_innovation(memory.kalman.P, epoch.z, epoch.fix.std, C_hn, 1e-4)
 
     def _features(
         self, memory: PlusMemory, epoch: Epoch, normalised: Float[Tensor, "B 6"], bands: Float[Tensor, "B K"],
