@@ -1,7 +1,7 @@
 """A user's mistake, and the end that a signal asks for."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 LONGEST_LINE = 200  # letters of a message of another library
 CLOSE = 0.7  # difflib's ratio from which on another name is worth naming
@@ -30,6 +30,11 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     name = str(name)
     best = max(known, key=closeness, default="")
     return f"; did you mean {best}?" if best and closeness(best)[0] >= CLOSE else ""
+
+
+def no_drives(skipped: Mapping[str, str] | None = None) -> InputError:
+    """What is wrong where no drive is left: why the first was ``skipped``, or that there was none."""
+    return InputError(next(iter((skipped or {}).values()), "no drives: give a dataset with at least one"))
 
 
 class Terminated(KeyboardInterrupt):

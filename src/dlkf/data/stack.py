@@ -9,7 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, no_drives
 from dlkf.data.aids import ROW
 from dlkf.data.alignment import Aligned, align_boundaries
 from dlkf.data.drive import Drive
@@ -32,7 +32,7 @@ class DriveStack(Sequence[Drive]):
 
     def __init__(self, drives: Sequence[Drive]) -> None:
         if not drives:
-            raise InputError("no drives: give a dataset with at least one")
+            raise no_drives()
         for d in drives:
             if (d.rate_hz, d.epoch_s) != (drives[0].rate_hz, drives[0].epoch_s):
                 raise InputError(f"drive {d.name}: rate and epoch differ from those of {drives[0].name}; load alike")

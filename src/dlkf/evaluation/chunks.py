@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dlkf.base.console import ProgressCallback, show_progress
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, no_drives
 from dlkf.base.parallel import parallel_map
 from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.masks import BiasLaw
@@ -80,7 +80,7 @@ def evaluate_chunks(
     skipped = {drive: why for one in done for drive, why in one.skipped.items()}
     scorable = [one for one in done if one.run is not None]
     if not scorable:
-        raise done[0].refused or InputError("no drives: give a dataset with at least one")
+        raise done[0].refused or no_drives()
     mode = "segments" if any(one.mode == "segments" for one in scorable) else "drives"
     kept = [one for one in scorable if one.mode == mode]
     run = join_chunks([one.run for one in kept if one.run is not None])

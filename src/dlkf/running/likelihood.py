@@ -72,15 +72,11 @@ class FixOffset(NamedTuple):
     delay_s: float = 0.0  # by which the fixes are older than their stamps
     ahead_m: float = 0.0  # by which the antenna sits further forward than stated
 
-    def of(self, batch: Batch) -> Batch:
-        """The batch with fixes so placed."""
-        return self.placed(batch) if any(self) else batch
-
     def shifted(self, by: FixOffset, step: float) -> FixOffset:
         """So many times ``by`` further."""
         return FixOffset(self.delay_s + step * by.delay_s, self.ahead_m + step * by.ahead_m)
 
-    def placed(self, data: Data) -> Data:
+    def apply(self, data: Data) -> Data:
         """A batch or a drive with fixes so placed."""
         lag = (data.gnss_lag + self.delay_s).clamp(max=0.99 * data.epoch_s)
         arm = data.lever_arm_b
@@ -172,7 +168,7 @@ class Evidence:
 
     def shares(self, name: str, imu: ImuSpec, tuning: Tuning, placing: FixOffset) -> Float[Tensor, "B T"]:
         """What every fix adds to that mean; 0 without one."""
-        batch = placing.of(self.batch)
+        batch = placing.apply(self.batch)
         estimator = build_causal(name, imu, "the search for noise does not", tuning=tuning)
         if self.compiler is not None:
             estimator = self.compiler(estimator, 1 / batch.dt, batch.epoch_s)
@@ -315,7 +311,7 @@ def generic_filter(
     check_finds_noise(name)
     name = aided_name(name, [table.name for table in aids])
     found = find_noise(Evidence.of(drives, align=align), name, imu, tuning, **given)
-    placed = [found.placing.placed(d) for d in drives]
+    placed = [found.placing.apply(d) for d in drives]
     return build_causal(name, found.imu, "imu=auto does not", tuning=found.tuning), placed, found
 
 

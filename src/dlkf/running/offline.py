@@ -14,7 +14,7 @@ import pandas as pd
 import torch
 
 from dlkf.base.console import ProgressCallback
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, no_drives
 from dlkf.data.alignment import SEARCH, AlignConfig, Start
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.limits import NONE_REFUSED, Refused
@@ -244,7 +244,7 @@ def navigate_chunks(
         if progress is not None:
             progress(done, count)
     if not any_ran:
-        raise InputError(next(iter((skipped or {}).values()), "no drives: give a dataset with at least one"))
+        raise no_drives(skipped)
 
 
 def navigate_dataset(
@@ -286,7 +286,7 @@ def navigate_drives(
         else:
             skipped[drives[k].name] = str(start)
     if not starts:
-        raise InputError(next(iter((skipped or {}).values()), "no drives: give a dataset with at least one"))
+        raise no_drives(skipped)
     todo = sorted(starts, key=lambda k: drives[k].epochs - starts[k].first, reverse=True)
     done = 0
     while done < len(todo):

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from dlkf.base.console import ProgressCallback
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, no_drives
 from dlkf.data.aid_tables import STANDARD, AidTable
 from dlkf.data.aids import aid_values
 from dlkf.data.alignment import SEARCH, AlignConfig
@@ -192,4 +192,4 @@ def stream_drives(
         if progress is not None:
             progress(k + 1, len(rows))
     if not solved:
-        raise InputError(next(iter((skipped or {}).values()), "no drives: give a dataset with at least one"))
+        raise no_drives(skipped)
