@@ -170,7 +170,7 @@ def test_a_receiver_that_was_right_is_followed(name):
 WRONG = ((30.0, 0.1), (3.0, 0.1), (1.0, 0.2))  # size [m] and share of positions that are wrong
 
 
-@pytest.mark.parametrize("name", ["mbkf15_gated", "mbkf21_car_gated", "plus"])
+@pytest.mark.parametrize("name", ["mbkf15_gated", "mbkf21_car_gated", pytest.param("plus", marks=pytest.mark.whole)])
 def test_wrong_fixes_do_little(name):
     """Positions of 5 cm of which some are off by metres, alone: in an outage nearly as well as without them."""
     clean, wrong = cars(name, 150), []

@@ -89,7 +89,7 @@ class Answers:
 
 
 def through_python(stream: StreamingFilter, sent: Calls, look: int = 997, out: Answers | None = None) -> Answers:
-    """The Python stream; its state is looked at every ``look`` calls. It goes on behind the calls answered in ``out``."""
+    """The Python stream; its state is looked at every ``look`` calls. It goes on after those answered in ``out``."""
     out = out or Answers()
     for k, call in enumerate(sent[len(out.words) :], len(out.words)):
         receipt = getattr(stream, call.kind)(*call.arguments)
@@ -130,7 +130,8 @@ class Trunk:
 
     def branch(self, sent: Calls) -> tuple[StreamingFilter, Answers]:
         """The stream after ``sent``, and its answers; calls of the drive are the same objects in both."""
-        same = next((k for k, (a, b) in enumerate(zip(sent, self.drive)) if a is not b), min(len(sent), len(self.drive)))
+        both = enumerate(zip(sent, self.drive))
+        same = next((k for k, (a, b) in both if a is not b), min(len(sent), len(self.drive)))
         stream, out = self._copy(min(same // self.STEP, len(self.kept) - 1))
         return stream, through_python(stream, sent, out=out)
 
