@@ -80,7 +80,6 @@ def test_any_pose_and_unit(drive):
 
 @pytest.mark.parametrize("decades_s", [0.0, -1.457507878e9])  # a counter that began today, beside GPS time
 @pytest.mark.whole
-@pytest.mark.whole
 def test_clocks_that_drift_apart(drive, decades_s):
     """1000 ppm over three minutes are 0.18 s; with perfect sensors they are seen to some ppm, and none where none are.
 
@@ -96,7 +95,6 @@ def test_clocks_that_drift_apart(drive, decades_s):
         assert abs(pose.lag_s - lag_s) < 2e-3
 
 
-@pytest.mark.whole
 @pytest.mark.whole
 def test_a_drift_is_found_or_refused(tmp_path, drive):
     """A reader that may find it writes it down, and reads with it; one that may not says it in one line."""
