@@ -13,18 +13,28 @@ import fcntl
 import filecmp
 import importlib
 import os
+import pickle
 import shutil
 import sqlite3
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import jaxtyping
 import pytest
+from hydra._internal import config_loader_impl
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.config_repository import ConfigRepository, IConfigRepository
+from hydra._internal.defaults_list import DefaultsList, Overrides, create_defaults_list
 from hydra._internal.hydra import Hydra
-from omegaconf import _utils
+from hydra.core.default_element import ResultDefault
+from hydra.core.override_parser.types import Override
+from hydra.plugins.config_source import ConfigResult
+from omegaconf import DictConfig, _utils
 
+from dlkf.base.config import config_dir
 from dlkf.base.points import SWEPT
 from dlkf.command.composing import compose_command
 from dlkf.data.drive import Batch
@@ -102,7 +112,59 @@ def presets_read_once():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_utils, "get_yaml_loader", lambda: Reader)
+        patch.setattr(ConfigRepository, "load_config", load_presets_once(ConfigRepository.load_config))
+        patch.setattr(config_loader_impl, "create_defaults_list", list_presets_once())
+        compose = ConfigLoaderImpl._compose_config_from_defaults_list
+        patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", compose_presets_once(compose))
         yield
+
+
+def are_shipped(repo: IConfigRepository) -> bool:
+    """Whether all presets come from the package's files, which no test changes."""
+    return {x.path for x in repo.get_sources() if x.scheme() == "file"} == {str(config_dir())}
+
+
+def load_presets_once(load: Callable[..., ConfigResult | None]) -> Callable[..., ConfigResult | None]:
+    """Each file of presets is made a configuration once."""
+    made: dict[str, bytes] = {}  # a copy by pickle takes a sixth of the time of deepcopy
+
+    def load_preset(self: ConfigRepository, config_path: str) -> ConfigResult | None:
+        if not are_shipped(self):
+            return load(self, config_path)
+        if config_path not in made:
+            made[config_path] = pickle.dumps(load(self, config_path))
+        return pickle.loads(made[config_path])
+
+    return load_preset
+
+
+def list_presets_once() -> Callable[..., DefaultsList]:
+    """Hydra's search for the presets of a command line, once for each choice of them: values decide none."""
+    found: dict[tuple, DefaultsList] = {}
+
+    def list_presets(repo: IConfigRepository, config_name: str, overrides_list: list[Override], **options: bool):
+        values = Overrides(repo, overrides_list).config_overrides
+        chosen = [x.input_line for x in overrides_list if x not in values]
+        key = config_name, *chosen, *options.items()
+        if key not in found or not are_shipped(repo):
+            found[key] = create_defaults_list(repo, config_name, overrides_list, **options)
+        return replace(found[key], config_overrides=values)
+
+    return list_presets
+
+
+def compose_presets_once(compose: Callable[..., DictConfig]) -> Callable[..., DictConfig]:
+    """Each list of presets is merged once; what a command line sets in them goes into a copy."""
+    made: dict[str, bytes] = {}
+
+    def compose_presets(self: ConfigLoaderImpl, defaults: list[ResultDefault], repo: IConfigRepository) -> DictConfig:
+        if not are_shipped(repo):
+            return compose(self, defaults, repo)
+        if (key := repr(defaults)) not in made:
+            made[key] = pickle.dumps(compose(self, defaults, repo))
+        return pickle.loads(made[key])
+
+    return compose_presets
 
 
 Once = Callable[[str, Callable[[Path], object]], Path]

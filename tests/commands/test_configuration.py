@@ -73,10 +73,18 @@ EXPERIMENTS = [
     for experiment in presets("experiment")
     for profile in ([], *([f"+profile={name}"] for name in presets("profile")))
 ] + [["+experiment=kalman_gain", f"+noise={name}"] for name in presets("noise")]
-OPTIONS = {
-    primary: [[], *([f"{group}={name}"] for group, folder in groups.items() for name in presets(folder))]
-    for primary, groups in GROUPS.items()
-}
+ALL_IMUS = {"simulate", "evaluate", "train"}  # the other commands read a preset of an IMU as evaluate does
+SOME_IMUS = {"auto", "consumer", "perfect"}
+
+
+def options(primary: str, groups: dict[str, str]) -> list[list[str]]:
+    """What chooses a preset for a command."""
+    chosen = [(group, name) for group, folder in groups.items() for name in presets(folder)]
+    kept = [(group, name) for group, name in chosen if group != "imu" or primary in ALL_IMUS or name in SOME_IMUS]
+    return [[], *([f"{group}={name}"] for group, name in kept)]
+
+
+OPTIONS = {primary: options(primary, groups) for primary, groups in GROUPS.items()}
 CASES = [(p, option) for p in GROUPS for option in OPTIONS[p] if option != ["imu=auto"] or p == "navigate"]
 CASES = [(p, [*o, "++dataset.imu_errors=wide"] if (p, o) == ("simulate", ["imu=wide"]) else o) for p, o in CASES]
 CASES += [("train", experiment) for experiment in EXPERIMENTS]

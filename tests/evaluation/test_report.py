@@ -170,6 +170,7 @@ def test_figures_have_content(scores, draw):
     assert all(ax.get_xlabel() or ax.get_shared_x_axes() for ax in figure.axes)
 
 
+@pytest.mark.whole
 def test_figures_survive_missing_truth_and_broken_filters(cars):
     truth = cars.truth_valid.clone()
     truth[:, :7] = truth[0, 30:] = False

@@ -1,12 +1,14 @@
 """Batches of turning, accelerating cars with known IMU errors, made by the error-free strapdown itself."""
 
 import math
+from dataclasses import fields, replace
+from typing import Any
 
 import torch
 
 from dlkf.data.drive import Batch
 from dlkf.navigation.attitude import rotation_from_rpy
-from dlkf.navigation.earth import tangent_frame
+from dlkf.navigation.earth import TangentFrame, tangent_frame
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import strapdown
@@ -18,6 +20,22 @@ IMU = ImuSpec(
     accel=SensorErrors(noise_density=1e-3, turn_on_bias=0.1, instability=1e-3, correlation_time=100.0),
     gyro=SensorErrors(noise_density=7e-5, turn_on_bias=5e-3, instability=5e-5, correlation_time=100.0),
 )
+
+
+def beside(*batches: Batch) -> Batch:
+    """The cars of several batches in one, which takes a filter no longer than one of them."""
+
+    def joined(parts: tuple[Any, ...]) -> Any:
+        first = parts[0]
+        if isinstance(first, NavState):
+            return NavState(*map(joined, zip(*parts)))
+        if isinstance(first, TangentFrame):
+            return replace(first, **{f.name: joined(tuple(getattr(x, f.name) for x in parts)) for f in fields(first)})
+        if isinstance(first, torch.Tensor):
+            return torch.cat(parts)
+        return sum(parts, ()) if isinstance(first, tuple) else first
+
+    return replace(batches[0], **{f.name: joined(tuple(getattr(x, f.name) for x in batches)) for f in fields(Batch)})
 
 
 def scene(

@@ -100,28 +100,37 @@ def classical():
     return build_filter("mbkf21_car", imu_spec(ANY_MEMS), tuning=Tuning(**START_TUNING))
 
 
+@pytest.fixture(scope="module")
+def classically(silent):
+    """The solution of the classical filter, and in which windows it took the cars for stationary."""
+    return solve(silent[0], used=True)
+
+
+def solve(batch, used: bool):
+    """Whether stationary windows are used or only seen."""
+    kalman = classical()
+    eyes = [Watched(s.tuning, s.states, used=used) for s in kalman.sources if isinstance(s, CarConstraints)]
+    estimator = replace(kalman, sources=(*(s for s in kalman.sources if not isinstance(s, CarConstraints)), *eyes))
+    with torch.inference_mode():
+        return run_filter(batch, estimator), torch.stack(eyes[0].seen, 1)
+
+
 @pytest.mark.parametrize("name", ["mbkf21_car", "plus"])
-def test_two_minutes_with_curves_are_bridged(silent, name):
+def test_two_minutes_with_curves_are_bridged(silent, classically, name):
     """Horizontal RMS at the ends of the outages below 15 m."""
     batch, ends = silent
     with torch.inference_mode():
-        solution = run_filter(batch, trained_filter("plus") if name == "plus" else classical())
+        solution = run_filter(batch, trained_filter("plus")) if name == "plus" else classically[0]
     off = (solution.posterior.p_n - batch.truth.p_n)[STRAIGHT:, ends, :2].norm(dim=-1)
     assert off.square().mean().sqrt() < 15, off
 
 
-def test_straight_on_at_constant_speed_is_no_standstill(silent):
+def test_straight_on_at_constant_speed_is_no_standstill(silent, classically):
     """Nothing shows the sensors' errors, so the filter drifts; it stops no car, and drifts as without the updates."""
     batch, ends = silent
     speed, errors = batch.truth.v_n.norm(dim=-1), []
-    for used in (True, False):
-        kalman = classical()
-        eyes = [Watched(s.tuning, s.states, used=used) for s in kalman.sources if isinstance(s, CarConstraints)]
-        estimator = replace(kalman, sources=(*(s for s in kalman.sources if not isinstance(s, CarConstraints)), *eyes))
-        with torch.inference_mode():
-            solution = run_filter(batch, estimator)
+    for solution, seen in (classically, solve(batch, used=False)):
         errors.append((solution.posterior.p_n - batch.truth.p_n)[:STRAIGHT, ends, :2].norm(dim=-1))
-        seen = torch.stack(eyes[0].seen, 1)
         assert not (seen & (speed > 1.0)).any()
         assert (seen & (speed < 0.01)).any()
     assert (errors[0] < 1.1 * errors[1] + 1.0).all(), errors

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable
+from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -87,10 +88,10 @@ class Answers:
         return np.array([last[t] for t in sorted(last)]).reshape(-1, len(SOLUTION))
 
 
-def through_python(stream: StreamingFilter, sent: Iterable[Call], look: int = 997) -> Answers:
-    """The Python stream; its state is looked at every ``look`` calls."""
-    out = Answers()
-    for k, call in enumerate(sent):
+def through_python(stream: StreamingFilter, sent: Calls, look: int = 997, out: Answers | None = None) -> Answers:
+    """The Python stream; its state is looked at every ``look`` calls. It goes on after those answered in ``out``."""
+    out = out or Answers()
+    for k, call in enumerate(sent[len(out.words) :], len(out.words)):
         receipt = getattr(stream, call.kind)(*call.arguments)
         out.words.append(of(receipt))
         out.rows += [(k, _row(e)) for e in receipt.estimates]
@@ -111,6 +112,28 @@ def through_core(core: Core, sent: Iterable[Call], look: int = 997) -> Answers:
         if k % look == 0 and (now := core.now()) is not None:
             out.now.append((k, now[SAME]))
     return out
+
+
+class Trunk:
+    """A drive through the Python stream, kept every ``STEP`` calls: drives that begin as it does branch off there."""
+
+    STEP = 500
+
+    def __init__(self, stream: StreamingFilter, drive: Calls) -> None:
+        self.drive, self.filter, self.kept = drive, stream.estimator, [(stream, Answers())]
+        for end in range(self.STEP, len(drive), self.STEP):
+            stream, out = self._copy(-1)
+            self.kept.append((stream, through_python(stream, drive[:end], out=out)))
+
+    def _copy(self, place: int) -> tuple[StreamingFilter, Answers]:
+        return deepcopy(self.kept[place], {id(self.filter): self.filter})
+
+    def branch(self, sent: Calls) -> tuple[StreamingFilter, Answers]:
+        """The stream after ``sent``, and its answers; calls of the drive are the same objects in both."""
+        both = enumerate(zip(sent, self.drive))
+        same = next((k for k, (a, b) in both if a is not b), min(len(sent), len(self.drive)))
+        stream, out = self._copy(min(same // self.STEP, len(self.kept) - 1))
+        return stream, through_python(stream, sent, out=out)
 
 
 def _row(estimate: Any) -> np.ndarray:

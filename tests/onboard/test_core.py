@@ -14,7 +14,7 @@ from dlkf.onboard.library import compiler
 from dlkf.running.streaming import StreamingFilter
 from tests.onboard.conftest import ARM
 from tests.onboard.faults import FAULTS, JUMPS, JUMPS_LATE
-from tests.onboard.streams import apart, calls, through_core, through_python
+from tests.onboard.streams import Trunk, apart, calls, through_core
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
 OTHERS = "TAKEN", "REPLAYED", "SUPERSEDED", "RESTARTED", "DIVERGED", "LOST", "SPIKE"
@@ -23,22 +23,23 @@ ROUNDING = 1e-6  # m, m/s, rad: sums in another order over a minute
 
 
 @pytest.fixture(scope="module")
-def python(exported, tables):
-    """``python(name)``: the stream, and what it answers to the calls with that fault; run once."""
+def plain(tables):
+    """The calls of the drive."""
+    return calls(tables)
 
-    @cache
-    def ran(name: str):
-        stream = StreamingFilter(exported[1], lever_arm_b=ARM)
-        return stream, through_python(stream, FAULTS[name][0](calls(tables)))
 
-    return ran
+@pytest.fixture(scope="module")
+def python(exported, plain):
+    """``python(name)``: the stream, and what it answers to the calls with that fault; run once, from the fault on."""
+    trunk = Trunk(StreamingFilter(exported[1], lever_arm_b=ARM), plain)
+    return cache(lambda name: trunk.branch(FAULTS[name][0](plain)))
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_the_core_answers_every_fault_as_the_python_stream_does(name, exported, tables, python):
+def test_the_core_answers_every_fault_as_the_python_stream_does(name, exported, plain, python):
     """The same word on every call, the same rows at the same calls, the same state in between."""
     fault, words = FAULTS[name]
-    sent, inside = fault(calls(tables)), Core(exported[3].path, ARM)
+    sent, inside = fault(plain), Core(exported[3].path, ARM)
     (stream, want), core = python(name), through_core(inside, sent)
     assert Counter(words) <= want.counts
     assert [x for x in zip(sent, want.words, core.words, strict=True) if x[1] != x[2]] == []
@@ -56,10 +57,10 @@ def test_the_core_answers_every_fault_as_the_python_stream_does(name, exported, 
 
 
 @pytest.mark.parametrize("name", JUMPS_LATE)
-def test_a_jump_ends_the_same_whether_fixes_come_in_order_or_late(name, exported, tables, python):
+def test_a_jump_ends_the_same_whether_fixes_come_in_order_or_late(name, exported, plain, python):
     """The screen goes back with the filter: every fix counts, or is refused, as in a log in order of time."""
     jump, late = JUMPS_LATE[name]
-    in_order = JUMPS[jump](calls(tables))
+    in_order = JUMPS[jump](plain)
     in_c = [through_core(Core(exported[3].path, ARM), sent) for sent in (in_order, late(in_order))]
     for want, got in ((python(jump)[1], python(name)[1]), in_c):
         np.testing.assert_allclose(got.solution, want.solution[-len(got.solution) :], rtol=0, atol=ROUNDING)

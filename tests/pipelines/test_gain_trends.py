@@ -51,6 +51,7 @@ def test_figures_tables_and_trends(home, monkeypatch, capsys):
 
 
 def test_a_gain_that_does_not_follow_is_said(home, monkeypatch, capsys):
+    monkeypatch.setattr(gain_trends, "FIGURES", {})  # drawn above
     file = home / "set3" / "report" / "gains.json"
     whole = json.loads(file.read_text())
     whole["dlkf"]["K_pp"] = 1.5

@@ -277,9 +277,7 @@ def _design(
     hold = np.exp(1j * _held(level, gnss, lag, slip)(middle))
 
     def gained(values: Complex) -> Complex:
-        ends = [np.interp(t + lag, level.t, values.real) + 1j * np.interp(t + lag, level.t, values.imag)
-                for t in (parts.t0, parts.t1)]  # fmt: skip
-        return hold * (ends[1] - ends[0])
+        return hold * (np.interp(parts.t1 + lag, level.t, values) - np.interp(parts.t0 + lag, level.t, values))
 
     design = np.stack([gained(x) for x in (force, level.ones, level.swing)], -1)
     return design, parts.dv + slope * parts.slope
@@ -291,10 +289,8 @@ def _quick(columns: Complex, use: np.ndarray, stride: int) -> Complex:
 
     weight, rows = use.astype(float), SLOW_ROWS * stride
     share = np.maximum(gaussian_filter1d(weight, rows, mode="constant"), 1e-6)
-    masked = columns * weight[:, None]
-    slow = gaussian_filter1d(masked.real, rows, axis=0, mode="constant") + 1j * gaussian_filter1d(
-        masked.imag, rows, axis=0, mode="constant"
-    )
+    masked = (columns * weight[:, None]).view(float)  # real and imaginary parts side by side
+    slow = gaussian_filter1d(masked, rows, axis=0, mode="constant").view(complex)
     return columns - slow / share[:, None]
 
 
@@ -313,12 +309,12 @@ def _held(level: Levelled, gnss: Motion, lag: float, slip: tuple[float, float]):
     weight = np.minimum(speed, 15.0) ** 2
     reach = max(1, round(2 * SMOOTH_S / max(float(np.median(np.diff(t))) if len(t) > 1 else 1.0, 0.1)))
     total = np.zeros(len(t), complex)
-    for shift in range(-reach, reach + 1):
-        other = np.arange(len(t)) + shift
-        inside = (other >= 0) & (other < len(t))
-        other = other[inside]
-        near = np.exp(-0.5 * ((t[other] - t[inside]) / SMOOTH_S) ** 2)
-        total[inside] += near * weight[other] * apart[other]
+    for shift in range(min(reach + 1, len(t))):  # each row and the one so many behind it, of the same distance
+        first, second = slice(len(t) - shift), slice(shift, None)
+        near = np.exp(-0.5 * ((t[second] - t[first]) / SMOOTH_S) ** 2)
+        total[first] += near * weight[second] * apart[second]
+        if shift:
+            total[second] += near * weight[first] * apart[first]
     angle = np.unwrap(np.angle(total))
     return lambda at: np.interp(at, t, angle)
 
@@ -327,7 +323,8 @@ def _residuals(equations: _Equations, lag: float, use: np.ndarray) -> tuple[Comp
     """Least squares at a lag: design and left side of all rows, the solution, the squared sum of the rows in use."""
     design, left = equations.at(lag)
     stride = equations.parts.stride
-    A, y = _quick(design, use, stride), _quick(left[:, None], use, stride)[:, 0]
+    quick = _quick(np.column_stack((design, left)), use, stride)
+    A, y = quick[:, :-1], quick[:, -1]
     x, *_ = np.linalg.lstsq(A[use], y[use], rcond=None)
     return A, y, x, float(np.sum(np.abs(y[use] - A[use] @ x) ** 2)) + 1e-9
 
