@@ -13,7 +13,7 @@ g = 1/σ² − 1/σ₁² of information, exact at any time for a linear filter (
     P⁺ = P + c p pᵀ,   dx = c x p,   c = g / (1 − g pᵢ),   p the column of x in P, pᵢ its own entry
 
 The prior becomes wider alone, never narrower, and only where a fix was used. A bias has none: fixes that are wrong look
-like one, and a prior that follows them leads the filter astray (docs/results/plus.md).
+like one, and a prior that follows them leads the filter astray (docs/results/plus_development.md).
 """
 
 from __future__ import annotations
