@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
+from operator import getitem
 from typing import Any, Protocol
 
 import torch
+from torch import Tensor
 from torch.func import functionalize
-from torch.fx import GraphModule, Node
-from torch.fx.experimental.proxy_tensor import make_fx
+from torch.fx import Graph, GraphModule, Node
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_map_only
 
 from dlkf.navigation import compiled
 
@@ -20,6 +23,9 @@ KEPT = {  # operations that are one in C, though core ATen has several for them
     "aten::cholesky_solve", "aten::linalg_inv_ex", "aten::linalg_solve_triangular", "aten::baddbmm",
     "aten::select_scatter", "aten::unfold",
 }  # fmt: skip
+LIFT, COPY = torch.ops.aten.lift_fresh.default, torch.ops.aten.lift_fresh_copy.default
+INDEX = torch.ops.aten.index.Tensor
+SAME = {torch.ops.aten.alias.default, torch.ops.aten.detach.default}  # operations that return their argument
 
 
 class Recordable(Protocol):
@@ -34,6 +40,76 @@ class Recordable(Protocol):
         ...
 
 
+class Recorder(TorchDispatchMode):
+    """Runs operations and notes each in a graph: what ``make_fx`` does, on tensors with values, in a tenth of its time.
+
+    A tensor that is neither an input nor the result of an operation is a constant, an attribute of the graph.
+    Raises RuntimeError where a value in Python, or a shape, depends on values of the inputs.
+    """
+
+    def __init__(self, inputs: tuple[Tensor, ...]) -> None:
+        super().__init__()
+        self.graph, self.constants = Graph(), torch.nn.Module()
+        self._nodes: dict[int, Node] = {}
+        self._tensors: list[Tensor] = []  # so that no other tensor gets the identity of one that is gone
+        self._varies: set[int] = set()  # tensors that depend on the inputs
+        for k, x in enumerate(inputs):
+            self._note(x, self.graph.placeholder(f"in_{k}"), True)
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        simpler: Callable[..., Any] | None = _decompositions().get(func)
+        if simpler is None and _is_composite(func):
+            simpler = func.decompose
+        if simpler is not None:
+            with self:
+                made = simpler(*args, **kwargs)
+            if made is not NotImplemented:
+                return made
+        varies = any(id(x) in self._varies for x in _tensors_of((args, kwargs)))
+        takes_value = torch.Tag.data_dependent_output in func.tags
+        if varies and (takes_value or _has_shape_of_values(func, args)):
+            raise RuntimeError(f"what {func} gives depends on values of a tensor")
+        if takes_value:
+            return func(*args, **kwargs)
+        func = COPY if func is LIFT else func
+        made = func(*args, **kwargs)
+        if func in SAME:
+            self._note(made, self.node(args[0]), varies)
+            return made
+        node = self.graph.call_function(func, *tree_map_only(Tensor, self.node, (args, kwargs)))
+        if isinstance(made, Tensor):
+            self._note(made, node, varies)
+        elif isinstance(made, (tuple, list)):
+            node.meta["val"] = made
+            for k, part in enumerate(made):
+                if isinstance(part, Tensor):
+                    self._note(part, self.graph.call_function(getitem, (node, k)), varies)
+        return made
+
+    def node(self, x: Tensor) -> Node:
+        """That makes a tensor; a tensor that none has made is a constant."""
+        if id(x) not in self._nodes:
+            name = f"constant_{len(self._tensors)}"
+            setattr(self.constants, name, x)
+            self._note(x, self.graph.get_attr(name), False)
+        return self._nodes[id(x)]
+
+    def _note(self, x: Tensor, node: Node, varies: bool) -> None:
+        node.meta.setdefault("val", x)
+        self._nodes[id(x)] = node
+        self._tensors.append(x)
+        if varies:
+            self._varies.add(id(x))
+
+    def finish(self, made: Any) -> GraphModule:
+        """The graph of what was recorded, that returns these tensors."""
+        self.graph.output(tree_map_only(Tensor, self.node, made))
+        return GraphModule(self.constants, self.graph)
+
+
 def record(function: Recordable) -> GraphModule:
     """The graph of a function at its ``example()``; its constants are attributes."""
     example = function.example()
@@ -42,8 +118,10 @@ def record(function: Recordable) -> GraphModule:
     whole: Any = function
     try:
         for _ in range(2):  # what is changed in place shows in the first graph and is gone in the second
-            recorder = make_fx(functionalize(graph), _decompositions(), "fake", _allow_non_fake_inputs=True)
-            graph = recorder(*example)
+            recorder = Recorder(example)
+            with recorder:
+                made = functionalize(graph)(*example)
+            graph = recorder.finish(made)
             if not any(node.op == "call_function" and _is_in_place(node.target) for node in graph.graph.nodes):
                 break
     except RuntimeError:  # it writes into what it has made of constants alone: the slower way knows them as inputs
@@ -70,7 +148,7 @@ def _merge_equal(graph: GraphModule) -> None:
 
 @contextmanager
 def exporting() -> Iterator[None]:
-    """Inside the block filters run as ``torch.export`` can record them."""
+    """Inside the block filters run as :func:`record` can record them."""
     with compiled.tensor_forms(), torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # of torch about torch
         yield
@@ -84,3 +162,25 @@ def _decompositions() -> dict[Any, Any]:
 
 def _is_in_place(target: Any) -> bool:
     return isinstance(target, torch._ops.OpOverload) and target._schema.is_mutable
+
+
+@lru_cache
+def _is_composite(func: Any) -> bool:
+    """Whether torch runs it as other operations."""
+    return func._can_decompose() and not torch._C._dispatch_has_kernel_for_dispatch_key(func.name(), "CPU")
+
+
+def _has_shape_of_values(func: Any, args: tuple[Any, ...]) -> bool:
+    if func is INDEX:  # by positions the shape is that of the positions
+        return any(x.dtype in (torch.bool, torch.uint8) for x in _tensors_of(args[1]))
+    return torch.Tag.dynamic_output_shape in func.tags
+
+
+def _tensors_of(x: Any) -> Iterator[Tensor]:
+    if isinstance(x, Tensor):
+        yield x
+    elif isinstance(x, (tuple, list)):
+        for part in x:
+            yield from _tensors_of(part)
+    elif isinstance(x, dict):
+        yield from _tensors_of(list(x.values()))
