@@ -31,7 +31,7 @@ def summed(work: Sum, begin: Tensor, *samples: Tensor) -> Tensor:
     count = -(-samples[0].shape[1] // LONGEST)
     size = -(-samples[0].shape[1] // count)
     filled = [pad(x, (*(0, 0) * (x.ndim - 2), 0, count * size - x.shape[1])) for x in samples]
-    return _summed(f"{work.__module__}:{work.__name__}", count, begin, filled)
+    return torch.ops.dlkf.summed(f"{work.__module__}:{work.__name__}", count, begin, filled)
 
 
 def of_name(name: str) -> Sum:
@@ -40,13 +40,14 @@ def of_name(name: str) -> Sum:
     return getattr(import_module(module), function)
 
 
-@torch.library.custom_op(
-    "dlkf::summed", mutates_args=(), schema="(str name, int count, Tensor begin, Tensor[] samples) -> Tensor"
-)
-def _summed(name: str, count: int, begin: Tensor, samples: list[Tensor]) -> Tensor:
+torch.library.define("dlkf::summed", "(str name, int count, Tensor begin, Tensor[] samples) -> Tensor")
+
+
+@torch.library.impl("dlkf::summed", "cpu")
+def _run(name: str, count: int, begin: Tensor, samples: list[Tensor]) -> Tensor:
     return of_name(name)(begin.clone(), *samples)
 
 
-@_summed.register_fake
+@torch.library.register_fake("dlkf::summed")
 def _(name: str, count: int, begin: Tensor, samples: list[Tensor]) -> Tensor:
     return torch.empty_like(begin)

@@ -87,7 +87,7 @@ class WindowModel:
         left = torch.add(start.v_n, fallen, alpha=0.5)
         s = torch.stack((torch.sub(moved, left, alpha=T), end.v_n - start.v_n - fallen), 1)
         Phi = self.still.clone()
-        Phi[:, :6, ATTITUDE] = skew(torch.add(s, coriolis, alpha=2).neg_()).flatten(1, 2)
+        Phi[:, :6, ATTITUDE] = -skew(torch.add(s, coriolis, alpha=2)).flatten(1, 2)
         Phi[:, :9, ACCEL.start : self.states.navigation] = columns
         return Phi
 

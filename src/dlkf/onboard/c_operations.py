@@ -105,7 +105,7 @@ BY_ELEMENT: dict[str, Pattern] = {
     "add": _scaled("+"), "sub": _scaled("-"), "mul": "{0} * {1}", "div": "{0} / {1}", "neg": "-{0}",
     "reciprocal": "1 / {0}", "pow": _power, "square": _function("square"), "rsqrt": _root,
     "sqrt": _function("sqrt"), "exp": _function("exp"), "erf": _function("erf"), "log": _function("log"),
-    "log1p": _function("log1p"),
+    "log1p": _function("log1p"), "rad2deg": f"{math.degrees(1)!r} * {{0}}",
     "sin": _function("sin"), "cos": _function("cos"), "asin": _function("asin"), "asinh": _function("asinh"),
     "atan2": _function("atan2"), "tanh": _function("tanh"), "hypot": _function("hypot"), "floor": _function("floor"),
     "abs": _function("fabs"), "sigmoid": _sigmoid, "leaky_relu": _leaky, "relu": "({0} > 0 ? {0} : 0)",

@@ -21,7 +21,7 @@ from dlkf.navigation import compiled
 KEPT = {  # operations that are one in C, though core ATen has several for them
     "aten::linalg_cross", "aten::linalg_solve_ex", "aten::_linalg_solve_ex", "aten::linalg_cholesky_ex",
     "aten::cholesky_solve", "aten::linalg_inv_ex", "aten::linalg_solve_triangular", "aten::baddbmm",
-    "aten::select_scatter", "aten::unfold",
+    "aten::select_scatter", "aten::unfold", "aten::addcmul", "aten::lerp", "aten::rad2deg",
 }  # fmt: skip
 LIFT, COPY = torch.ops.aten.lift_fresh.default, torch.ops.aten.lift_fresh_copy.default
 INDEX = torch.ops.aten.index.Tensor
@@ -47,6 +47,11 @@ class Recorder(TorchDispatchMode):
     Raises RuntimeError where a value in Python, or a shape, depends on values of the inputs.
     """
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """No: that would load torch's compiler, which takes seconds and which this does without."""
+        return False
+
     def __init__(self, inputs: tuple[Tensor, ...]) -> None:
         super().__init__()
         self.graph, self.constants = Graph(), torch.nn.Module()
@@ -60,6 +65,10 @@ class Recorder(TorchDispatchMode):
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
         kwargs = kwargs or {}
+        if func in SAME:
+            made, x = func(*args, **kwargs), args[0]
+            self._note(made, self.node(x), id(x) in self._varies)
+            return made
         simpler: Callable[..., Any] | None = _decompositions().get(func)
         if simpler is None and _is_composite(func):
             simpler = func.decompose
@@ -76,9 +85,6 @@ class Recorder(TorchDispatchMode):
             return func(*args, **kwargs)
         func = COPY if func is LIFT else func
         made = func(*args, **kwargs)
-        if func in SAME:
-            self._note(made, self.node(args[0]), varies)
-            return made
         node = self.graph.call_function(func, *tree_map_only(Tensor, self.node, (args, kwargs)))
         if isinstance(made, Tensor):
             self._note(made, node, varies)

@@ -211,7 +211,7 @@ def advance_bank(bank: Bank, imu: Float[Tensor, "B M 6"], fix: EarthFix, dt: flo
 
 def fix_std(std: Float[Tensor, "B 6"], epoch_s: float) -> Float[Tensor, "B 6"]:
     """1σ of fixes as a bank takes them: none better than :data:`FIX_FLOOR`, and no more than one a second."""
-    return torch.maximum(std.nan_to_num(nan=1.0), std.new_tensor(FIX_FLOOR)) * max(1.0, epoch_s**-0.5)
+    return torch.maximum(torch.where(std.isnan(), 1.0, std), std.new_tensor(FIX_FLOOR)) * max(1.0, epoch_s**-0.5)
 
 
 def weigh_step(step: Step, valid: Bool[Tensor, "B 6"], epoch_s: float) -> Float[Tensor, " B"]:
@@ -225,7 +225,7 @@ def weigh_step(step: Step, valid: Bool[Tensor, "B 6"], epoch_s: float) -> Float[
 
 def judge_bank(bank: Bank) -> list[HeadingVerdict]:
     """The most probable heading of each case; its 1σ is that of a car whose IMU is not mounted straight."""
-    score = bank.score.nan_to_num(nan=-math.inf)
+    score = torch.where(bank.score.isnan(), -math.inf, bank.score)
     best = score.argmax(-1)
     C = bank.state.C_nb.unflatten(0, (-1, COUNT))
     chosen = C[torch.arange(len(best)), best]
