@@ -13,9 +13,9 @@ from dlkf.base.errors import InputError
 from dlkf.data.axis_checks import CHUNK_S, check_climb, check_dead_axes, check_handedness
 from dlkf.data.discovery.clock import ImuSums, find_lag, known_offset
 from dlkf.data.discovery.drift import ROUGH_S, ends_apart, find_drifting_pose
-from dlkf.data.discovery.motion import Motion, motion, stretches
+from dlkf.data.discovery.motion import Motion, motion_of, stretches
 from dlkf.data.limits import DEGREE_M, NOWHERE_DEG
-from dlkf.data.schema import ACCEL, GYRO, VELOCITY
+from dlkf.data.schema import ACCEL, GYRO, stack_columns
 from dlkf.data.tables import Columns
 from dlkf.navigation.earth import SEMI_MAJOR
 
@@ -301,5 +301,4 @@ def describe_rotation(imu: Columns, gnss: Columns) -> str | None:
 
 
 def _signals(imu: Columns, gnss: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray, Motion]:
-    moved = motion(gnss["t"], gnss["lat_deg"], gnss["lon_deg"], np.stack([gnss[c] for c in VELOCITY], -1))
-    return imu["t"], np.stack([imu[c] for c in ACCEL]).T, np.stack([imu[c] for c in GYRO]).T, moved
+    return imu["t"], stack_columns(imu, ACCEL), stack_columns(imu, GYRO), motion_of(gnss)

@@ -12,11 +12,11 @@ import pandas as pd
 from dlkf.base.errors import InputError
 from dlkf.data.aid_checks import check_aid
 from dlkf.data.aid_tables import STANDARD, AidTable
-from dlkf.data.discovery.motion import motion
+from dlkf.data.discovery.motion import motion_of
 from dlkf.data.limits import FULL_SCALE, NONE_REFUSED, Refused, screen_fixes, within_full_scale
 from dlkf.data.plausibility import check_clocks, check_gnss_units, check_imu_units, check_turns
 from dlkf.data.reference_checks import check_attitude, check_same_place
-from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY
+from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY, stack_columns
 from dlkf.data.tables import Columns, DriveRow, read_drives, read_table
 
 GNSS_QUALITIES = (1, 2, 3, 4, 5, 9)  # NMEA GGA codes that are a satellite fix; 6, 7, 8 are not
@@ -99,9 +99,7 @@ def check_tables(tables: CheckedTables, limits: Limits = LIMITS) -> CheckedTable
     if truth is not None:
         _check_reference(truth, imu, read_fixes(gnss), _where(name, "reference"))
     if tables.aids:
-        fixes = read_fixes(gnss)
-        velocity = np.stack([fixes[c] for c in VELOCITY], -1)
-        moved = motion(fixes["t"], fixes["lat_deg"], fixes["lon_deg"], velocity)
+        moved = motion_of(read_fixes(gnss))
         for kind, table in tables.aids.items():
             _check_time(table["t"], _where(name, kind), kind)
             check_aid(kind, table, imu, moved, _where(name, kind))
@@ -224,7 +222,7 @@ def _in_scale(imu: Columns) -> np.ndarray:
     """Samples within full scale; usually all are, which their extremes show."""
     if all(np.abs((imu[c].min(), imu[c].max())).max() <= most for s, most in zip((ACCEL, GYRO), FULL_SCALE) for c in s):
         return np.ones(len(imu["t"]), bool)
-    return within_full_scale(*(np.stack([imu[c] for c in sensor], -1) for sensor in (ACCEL, GYRO)))
+    return within_full_scale(stack_columns(imu, ACCEL), stack_columns(imu, GYRO))
 
 
 def _check_gnss(gnss: Columns, imu: Columns, where: str) -> Columns:

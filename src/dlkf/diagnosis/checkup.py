@@ -11,9 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlkf.base.errors import InputError
-from dlkf.data.discovery.findings import Raw, discover
+from dlkf.data.discovery.findings import discover
 from dlkf.data.limits import horizontal_distance
-from dlkf.data.schema import ACCEL, GYRO, POSITION, QUALITIES, VELOCITY
+from dlkf.data.schema import ACCEL, GYRO, QUALITIES
 from dlkf.data.tables import Columns, DriveRow
 from dlkf.data.validate import CheckedTables, read_checked, read_fixes, usable_fixes
 from dlkf.navigation.earth import STANDARD_GRAVITY
@@ -150,13 +150,7 @@ def motion_findings(gnss: Columns) -> Iterator[CheckupResult]:
 
 def discover_findings(tables: CheckedTables) -> Iterator[CheckupResult]:
     """Clock offset, pose of the sensor in the car, and lever arm estimated from the motion, against what is stored."""
-    imu, gnss = tables.imu, read_fixes(tables.gnss)
-    raw = Raw(
-        t=imu["t"], accel=np.stack([imu[c] for c in ACCEL], -1), gyro=np.stack([imu[c] for c in GYRO], -1),
-        accel_factor=1.0, gyro_factor=1.0, gnss_t=gnss["t"], lat_deg=gnss[POSITION[0]],
-        lon_deg=gnss[POSITION[1]], v_ned=np.stack([gnss[c] for c in VELOCITY], -1),
-    )  # fmt: skip
-    for finding in discover(raw, {"imu.time.offset_s", "imu.axes"}, known_accel={}, known_gyro={}).found:
+    for finding in discover(tables.imu, read_fixes(tables.gnss), {"imu.time.offset_s", "imu.axes"}):
         if finding.setting == "gnss.time.drift_ppm":
             yield CheckupResult(
                 NOTE, f"clocks: {finding.value:+.0f} {finding.detail}; {ESTIMATED}reader.{finding.setting}=auto"

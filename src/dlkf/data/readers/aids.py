@@ -12,11 +12,10 @@ import pandas as pd
 from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import known_offset
-from dlkf.data.discovery.motion import Motion, motion
+from dlkf.data.discovery.motion import Motion, motion_of
 from dlkf.data.discovery.wheel import Wheel, find_wheel
 from dlkf.data.readers import units
 from dlkf.data.readers.mapping import Mapped
-from dlkf.data.schema import VELOCITY
 from dlkf.data.validate import usable_fixes
 
 AUTO = "auto"
@@ -43,7 +42,7 @@ def read_aids(
     found. InputError where they are not clear.
     """
     frames, specs, notes = {}, {}, []
-    moved = None if fixes is None or len(fixes) < 3 else _motion(fixes)
+    moved = None if fixes is None or len(fixes) < 3 else motion_of(fixes[usable_fixes(fixes)])
     for name, part in mapped.items():
         spec, found = _settled(name, part, zero, gnss, moved, f"{where}: {part.table.path.name}")
         done = Mapped(part.table, spec, name, part.parts)
@@ -60,12 +59,6 @@ def _times(mapped: Mapped, zero: int) -> np.ndarray:
     time["offset_s"] = None if time.get("offset_s") == AUTO else time.get("offset_s")
     whole, part = Mapped(mapped.table, {**mapped.spec, "time": time}, mapped.kind, mapped.parts).stamps()
     return (whole - zero) + part
-
-
-def _motion(fixes: pd.DataFrame) -> Motion:
-    good = fixes[usable_fixes(fixes)]
-    t, lat, lon = (good[c].to_numpy() for c in ("t", "lat_deg", "lon_deg"))
-    return motion(t, lat, lon, good[list(VELOCITY)].to_numpy())
 
 
 def _settled(

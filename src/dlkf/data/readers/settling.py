@@ -12,13 +12,14 @@ import numpy as np
 import pandas as pd
 
 from dlkf.base.errors import InputError
-from dlkf.data.discovery.findings import Finding, Findings, Raw, Sure, discover
+from dlkf.data.discovery.findings import Finding, Sure, discover, value_found
 from dlkf.data.discovery.units import accel_units, speed_factor
 from dlkf.data.readers import units
 from dlkf.data.readers.contract import gnss_frame, imu_frame, positions
 from dlkf.data.readers.mapping import Mapped
 from dlkf.data.readers.sharing import set_value, value_at, write_value
-from dlkf.data.schema import ACCEL, GYRO, VELOCITY
+from dlkf.data.schema import ACCEL
+from dlkf.data.tables import Columns
 from dlkf.data.validate import usable_fixes
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
@@ -104,38 +105,35 @@ def settle(
             f"{where}: {log.path} has {count} {'fix' if count == 1 else 'fixes'}, which are not the "
             f"motion of a car{why}; copy the log again, or leave the drive out"
         )
-    found = Findings()
+    found: list[Finding] = []
     if "gnss.velocity.unit" in wanted:
-        _speed_unit(found, mapped["gnss"], t["gnss"], where)
+        found.append(_speed_unit(mapped["gnss"], t["gnss"]))
         _refuse_doubt(found, wanted, where, t)
-        specs["gnss"]["velocity"]["unit"] = found.get("gnss.velocity.unit")
+        specs["gnss"]["velocity"]["unit"] = found[0].value
     imu = imu_frame(mapped["imu"], t["imu"])
     if "imu.accel.unit" in wanted:
         _refuse_without_gravity(imu, where)
     gnss = gnss_frame(Mapped(mapped["gnss"].table, specs["gnss"], "gnss", mapped["gnss"].parts), t["gnss"])
-    raw = _raw(imu, gnss, {key: None if f"imu.{key}.unit" in wanted else 1.0 for key in ("accel", "gyro")})
     asked = set(wanted)
     if {"imu.accel.axes", "imu.gyro.axes"} & wanted:
         asked.add("imu.axes")
-    more = discover(
-        raw,
+    found += discover(
+        _in_order(imu),
+        _in_order(gnss[usable_fixes(gnss)]),
         asked,
         sure,
-        known_accel=units.ACCELERATION,
-        known_gyro=units.RATE,
         increments=bool(mapped["imu"].spec.get("increments")),
         drift_given="gnss.time.drift_ppm" not in wanted
         and value_at(specs, PLACES["gnss.time.drift_ppm"][0]) is not None,
     )
-    found.found += more.found
     _refuse_doubt(found, wanted, where, t)
     for name in wanted & set(PLACES):
-        value = copy.deepcopy(found.get("imu.axes" if name.endswith("axes") else name))
+        value = copy.deepcopy(value_found(found, "imu.axes" if name.endswith("axes") else name))
         if value is not None:
             set_value(specs, PLACES[name][0], value)
-    lever = found.get("lever_arm_m") if "lever_arm_m" in wanted else arm
+    lever = value_found(found, "lever_arm_m") if "lever_arm_m" in wanted else arm
     x, y, z = (float(a) for a in lever)
-    return Settled(specs, (x, y, z), _reported(found.found, wanted))
+    return Settled(specs, (x, y, z), _reported(found, wanted))
 
 
 def _refuse_without_gravity(imu: pd.DataFrame, where: str) -> None:
@@ -152,36 +150,23 @@ def _by_gravity(specs: dict[str, Any], imu: Mapped, t: np.ndarray, where: str, a
     frame = imu_frame(imu, t)
     size = float(np.median(np.linalg.norm(frame[list(ACCEL)].to_numpy(), axis=-1)))
     names = accel_units(size, units.ACCELERATION)
-    found = Findings()
     value = names[0] if len(names) == 1 else float(f"{G / size:.5g}") if size > 0 else None
-    found.add("imu.accel.unit", value, len(names) > 0, f"median force {size:.4g}")
+    found = [Finding("imu.accel.unit", value, len(names) > 0, f"median force {size:.4g}")]
     _refuse_doubt(found, {"imu.accel.unit"}, where, {"imu": t})
     set_value(specs, PLACES["imu.accel.unit"][0], value)
-    return Settled(specs, arm, found.found)
+    return Settled(specs, arm, found)
 
 
-def _raw(imu: pd.DataFrame, gnss: pd.DataFrame, factors: Mapping[str, float | None]) -> Raw:
-    good = gnss[usable_fixes(gnss)]
-    good = good[np.concatenate(([True], np.diff(good["t"]) > 0))] if len(good) else good
-    rows = imu[np.concatenate(([True], np.diff(imu["t"]) > 0))]
-    return Raw(
-        t=rows["t"].to_numpy(),
-        accel=rows[list(ACCEL)].to_numpy(),
-        gyro=rows[list(GYRO)].to_numpy(),
-        accel_factor=factors["accel"],
-        gyro_factor=factors["gyro"],
-        gnss_t=good["t"].to_numpy(),
-        lat_deg=good["lat_deg"].to_numpy(),
-        lon_deg=good["lon_deg"].to_numpy(),
-        v_ned=good[list(VELOCITY)].to_numpy(),
-    )
+def _in_order(frame: pd.DataFrame) -> Columns:
+    """The columns of the rows that are later than the row before."""
+    rows = frame[frame["t"].diff().fillna(1.0) > 0]
+    return {str(name): rows[name].to_numpy() for name in rows}
 
 
-def _speed_unit(found: Findings, gnss: Mapped, t: np.ndarray, where: str) -> None:
+def _speed_unit(gnss: Mapped, t: np.ndarray) -> Finding:
     v = gnss.vector("velocity", (2, 3), nan=True) if gnss.has("velocity") else np.full((1, 3), np.nan)
     if not np.isfinite(v).any():
-        found.add("gnss.velocity.unit", "m/s", True, "no velocities")
-        return
+        return Finding("gnss.velocity.unit", "m/s", True, "no velocities")
     speed = v[:, 0] if gnss.spec["velocity"].get("frame") == "course" else np.hypot(v[:, 0], v[:, 1])
     place = positions(gnss)
     factor, spread = speed_factor(t, place["lat_deg"], place["lon_deg"], speed)
@@ -189,17 +174,15 @@ def _speed_unit(found: Findings, gnss: Mapped, t: np.ndarray, where: str) -> Non
     best = min(apart, key=lambda name: apart[name])
     certain = apart[best] < 0.08 and spread < 0.2 * factor
     detail = f"positions move {factor:.3g} ± {spread:.1g} m per unit" if factor > 0 else "the car hardly moves"
-    found.add("gnss.velocity.unit", best, bool(certain), detail)
+    return Finding("gnss.velocity.unit", best, bool(certain), detail)
 
 
-def _refuse_doubt(found: Findings, wanted: set[str], where: str, t: Mapping[str, np.ndarray]) -> None:
-    doubts = found.doubtful()
+def _refuse_doubt(found: list[Finding], wanted: set[str], where: str, t: Mapping[str, np.ndarray]) -> None:
+    doubts = [one for one in found if not one.sure]
     if not doubts:
         return
     doubt = doubts[0]
-    offsets = [
-        (float(one.value), one.std) for one in found.found if "offset_s" in one.setting and one.value is not None
-    ]
+    offsets = [(float(one.value), one.std) for one in found if "offset_s" in one.setting and one.value is not None]
     setting = doubt.setting.replace("imu.axes", "imu.accel.axes and .gyro.axes")
     poor = doubt.setting.endswith(("offset_s", "axes")) and not doubt.wide  # no more than a guess of noise
     best = "" if doubt.value is None or poor else f"; the best guess is {write_value(doubt.value)}"
