@@ -129,7 +129,7 @@ def read_logs(source: str | Path, reader: str = "auto", *settings: str, skip_uns
         return list(opened.read(str(place)))
     places = absolute_places(opened, place)
     made: dict[str, DriveFrames] = {}
-    for result in read_together(opened, _AsFrames(), "", places, None, skip_unsure):
+    for result in read_together(opened, _as_frames, places, None, skip_unsure):
         for row in result.rows:
             drive = row["drive"]
             made[drive.name] = replace(drive, notes=result.notes)
@@ -138,13 +138,11 @@ def read_logs(source: str | Path, reader: str = "auto", *settings: str, skip_uns
     return [made[name] for _, name, _ in places if name in made]
 
 
-class _AsFrames:
-    """Drives that are read stay frames."""
+def _as_frames(drive: DriveFrames) -> IngestResult:
+    """A drive that stays frames."""
+    from dlkf.data.intake import IngestResult
 
-    def take_in(self, drive: DriveFrames, folder: str) -> IngestResult:
-        from dlkf.data.intake import IngestResult
-
-        return IngestResult([{"drive": drive}], [], drive.notes, drive.mapping)
+    return IngestResult([{"drive": drive}], [], drive.notes, drive.mapping)
 
 
 def _table(folder: Path, kind: str, drive: str) -> pd.DataFrame | None:

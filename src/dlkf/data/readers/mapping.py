@@ -156,9 +156,7 @@ class Mapped:
         known = units.clock_by_size(first)
         if known is not None and (time.get("clock") or time.get("week") or time.get("week_number") is not None):
             known = "gps"
-        if known == "unix":
-            first += float(units.leap_seconds(int(whole[0]))) - units.GPS_EPOCH_UNIX
-        return None if known is None else first
+        return None if known is None else float(units.gps_seconds(first)) if known == "unix" else first
 
     def own_stamps(self) -> tuple[np.ndarray, np.ndarray]:
         """Whole seconds and the rest of the rows' times on the table's own clock, as GPS time where that is given."""

@@ -24,17 +24,10 @@ from dlkf.data.validate import usable_fixes
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
 AUTO = "auto"
-# settings that may be auto: where they stand in the mapping, and what stands there until they are known
-PLACES: dict[str, tuple[tuple[str, ...], Any]] = {
-    "imu.accel.unit": (("imu", "accel", "unit"), 1.0),
-    "imu.gyro.unit": (("imu", "gyro", "unit"), 1.0),
-    "imu.accel.axes": (("imu", "accel", "axes"), "frd"),
-    "imu.gyro.axes": (("imu", "gyro", "axes"), "frd"),
-    "imu.time.offset_s": (("imu", "time", "offset_s"), 0.0),
-    "gnss.time.offset_s": (("gnss", "time", "offset_s"), 0.0),
-    "gnss.time.drift_ppm": (("gnss", "time", "drift_ppm"), 0.0),
-    "gnss.velocity.unit": (("gnss", "velocity", "unit"), 1.0),
-    "gnss.position.delay_s": (("gnss", "position", "delay_s"), 0.0),
+NEUTRAL: dict[str, Any] = {  # settings that may be auto, and what stands there until they are known
+    **dict.fromkeys(("imu.accel.unit", "imu.gyro.unit", "gnss.velocity.unit"), 1.0),
+    **dict.fromkeys(("imu.accel.axes", "imu.gyro.axes"), "frd"),
+    **dict.fromkeys(("imu.time.offset_s", "gnss.time.offset_s", "gnss.time.drift_ppm", "gnss.position.delay_s"), 0.0),
 }
 USUAL = {
     "imu.accel.unit": "m/s2 (or g)",
@@ -73,16 +66,16 @@ class Settled:
 
 def open_settings(specs: Mapping[str, Any], lever_arm_m: Any) -> set[str]:
     """Settings that are ``auto``."""
-    wanted = {name for name, (path, _) in PLACES.items() if value_at(specs, path) == AUTO}
+    wanted = {name for name in NEUTRAL if value_at(specs, name) == AUTO}
     return wanted | ({"lever_arm_m"} if lever_arm_m == AUTO else set())
 
 
 def placeholders(specs: Mapping[str, Any]) -> dict[str, Any]:
     """The specs with neutral values for every ``auto``."""
     out = _plain(specs)
-    for path, neutral in PLACES.values():
-        if value_at(out, path) == AUTO:
-            set_value(out, path, neutral)
+    for name, value in NEUTRAL.items():
+        if value_at(out, name) == AUTO:
+            set_value(out, name, value)
     return out
 
 
@@ -123,14 +116,13 @@ def settle(
         asked,
         sure,
         increments=bool(mapped["imu"].spec.get("increments")),
-        drift_given="gnss.time.drift_ppm" not in wanted
-        and value_at(specs, PLACES["gnss.time.drift_ppm"][0]) is not None,
+        drift_given="gnss.time.drift_ppm" not in wanted and value_at(specs, "gnss.time.drift_ppm") is not None,
     )
     _refuse_doubt(found, wanted, where, t)
-    for name in wanted & set(PLACES):
+    for name in wanted & set(NEUTRAL):
         value = copy.deepcopy(value_found(found, "imu.axes" if name.endswith("axes") else name))
         if value is not None:
-            set_value(specs, PLACES[name][0], value)
+            set_value(specs, name, value)
     lever = value_found(found, "lever_arm_m") if "lever_arm_m" in wanted else arm
     x, y, z = (float(a) for a in lever)
     return Settled(specs, (x, y, z), _reported(found, wanted))
@@ -153,7 +145,7 @@ def _by_gravity(specs: dict[str, Any], imu: Mapped, t: np.ndarray, where: str, a
     value = names[0] if len(names) == 1 else float(f"{G / size:.5g}") if size > 0 else None
     found = [Finding("imu.accel.unit", value, len(names) > 0, f"median force {size:.4g}")]
     _refuse_doubt(found, {"imu.accel.unit"}, where, {"imu": t})
-    set_value(specs, PLACES["imu.accel.unit"][0], value)
+    set_value(specs, "imu.accel.unit", value)
     return Settled(specs, arm, found)
 
 

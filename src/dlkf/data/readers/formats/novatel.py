@@ -100,7 +100,7 @@ def _weeks(columns: Mapping[str, Any], marks: Mapping[str, str], where: str) -> 
         week = np.round((day - units.GPS_EPOCH_UNIX + 43_200 - of_day) / units.WEEK_S).astype(np.int64)
         return {"Week": week}
     whole = day + np.floor(of_day).astype(np.int64)
-    gps = whole - units.GPS_EPOCH_UNIX + (units.leap_seconds(whole) if time == "UTCTime" else 0)
+    gps = units.gps_seconds(whole) if time == "UTCTime" else whole - units.GPS_EPOCH_UNIX
     return {"Week": gps // units.WEEK_S, "GPSTime": gps % units.WEEK_S + of_day % 1}
 
 

@@ -19,9 +19,9 @@ from dlkf.base.errors import InputError
 from dlkf.data.readers import units
 from dlkf.data.readers.formats.text import decode_text, without_cut_line
 from dlkf.data.readers.frames import LogTable
+from dlkf.data.readers.qualities import READINGS, RTKLIB
 from dlkf.data.schema import POSITION, STD, VELOCITY
 
-QUALITY = {1: 4, 2: 5, 3: 2, 4: 2, 5: 1, 6: 2}  # fix, float, SBAS, DGPS, single, PPP
 ZONES = {"GPST": "gps", "UTC": "utc"}
 
 
@@ -88,7 +88,7 @@ def _frame(cells: pd.DataFrame, names: list[str], clock: str, path: Path) -> pd.
         out |= dict(zip(POSITION, (column["latitude"], column["longitude"], column["height"])))
         out |= dict(zip(VELOCITY, (column.get("vn", nan), column.get("ve", nan), -column.get("vu", nan))))
         out |= dict(zip(STD, (column.get(f"sd{a}", nan) for a in ("n", "e", "u", "vn", "ve", "vu"))))
-    out["quality"] = pd.Series(column["Q"]).map(QUALITY).fillna(0).to_numpy()
+    out["quality"] = pd.Series(column["Q"]).map(READINGS[RTKLIB]).fillna(0).to_numpy()
     return pd.DataFrame(out, index=cells.index)
 
 
