@@ -18,6 +18,10 @@ EPOCHWISE = (
     "imu", "gnss", "gnss_std", "gnss_valid", "gnss_lag", "available", "truth", "truth_valid", "attitude_valid",
     "true_imu_error", "present",
 )  # fields of Batch with a row for every epoch  # fmt: skip
+BOUNDARY_COLUMNS = (
+    "gnss_r_e", "gnss_v_e", "gnss_std", "gnss_valid", "gnss_lag",
+    "ref_r_e", "ref_v_e", "ref_C_eb", "ref_valid", "ref_imu_error",
+)  # of Drive, with a row for every boundary; quality is one too, of no use to a filter  # fmt: skip
 
 
 def _changed(value: Any, change: Callable[[Any], Any]) -> Any:
@@ -69,13 +73,12 @@ class Drive:
     def part(self, first: int, last: int) -> Drive:
         """Epochs ``first`` to ``last`` − 1 as a drive of its own."""
         rows = slice(first, last + 1)
-        of_boundaries = [f.name for f in fields(self) if f.name.startswith(("gnss_", "ref_"))] + ["quality"]
         return replace(
             self,
             t0=self.t0 + first * self.epoch_s,
             imu=self.imu[first:last],
             aids={name: x[rows] for name, x in self.aids.items()},
-            **{name: getattr(self, name)[rows] for name in of_boundaries},
+            **{name: getattr(self, name)[rows] for name in (*BOUNDARY_COLUMNS, "quality")},
         )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -180,6 +181,25 @@ def read_table(folder: str | Path, kind: str, drive: str, column: str = "") -> C
         remedy = "leave the drive out" if kind in SCHEMAS else "remove the table"
         raise InputError(f"drive {drive}, {place}: has no rows; {remedy} or give its data")
     return rows if len(rows["t"]) else None
+
+
+def refuse_rows(
+    table: Columns, names: Iterable[str], is_bad: Callable[[np.ndarray], np.ndarray], where: str, remedy: str
+) -> None:
+    """InputError for the first row in which one of the columns is bad."""
+    for name in names:
+        if len(rows := np.flatnonzero(is_bad(table[name]))):
+            raise InputError(f"{where}: row {rows[0]}: {name} is {table[name][rows[0]]}; {remedy}")
+
+
+def is_negative(values: np.ndarray) -> np.ndarray:
+    """Numbers below 0; NaN is none."""
+    return values < 0
+
+
+def is_unknown(values: np.ndarray) -> np.ndarray:
+    """What is no finite number."""
+    return ~np.isfinite(values)
 
 
 def dataset_digest(folder: str | Path) -> str:

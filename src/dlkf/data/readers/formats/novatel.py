@@ -111,9 +111,8 @@ def _days(texts: pd.Series, mark: str, where: str) -> np.ndarray:
         raise InputError(f"{where} has {texts.iloc[0]!r}, must be a date such as 11/14/2019")
     order = mark.strip("()").upper()
     if order not in ("MDY", "DMY", "YMD"):
-        first, second = float(parts[0].max()), float(parts[1].max())
-        order = "YMD" if first > 31 else "DMY" if first > 12 else "MDY" if second > 12 else ""
-    if not order:
+        order = {None: "YMD", "dmy": "DMY", "mdy": "MDY"}.get(units.day_order(texts))
+    if order is None:
         raise InputError(f"{where}: {texts.iloc[0]} may be day or month first; export it with its unit (MDY) or (DMY)")
     named = {name: parts[order.index(letter)] for name, letter in (("year", "Y"), ("month", "M"), ("day", "D"))}
     days = pd.to_datetime(pd.DataFrame(named), errors="coerce")

@@ -19,15 +19,7 @@ from dlkf.base.errors import InputError, first_line
 from dlkf.data.readers import vocabulary
 from dlkf.data.readers.frames import LogTable
 
-DEFAULTS = {
-    "separator": ",",
-    "decimal": ".",
-    "header": True,
-    "comment": None,
-    "skip_rows": 0,
-    "encoding": None,
-    "lines": None,
-}
+DEFAULTS = dict(separator=",", decimal=".", header=True, comment=None, skip_rows=0, encoding=None, lines=None)
 LARGEST_BYTES = 2 << 30  # unpacked: a day of an IMU at 100 Hz is a third
 LARGEST_RATIO, SMALL_BYTES = 100, 64 << 20  # of unpacked to packed size: text of sensors packs tenfold
 ENCODINGS = ("cp1252", "gb18030", "cp932", "big5", "latin-1")  # of files that are not UTF-8; the last reads anything
