@@ -231,11 +231,8 @@ class DriveDataModule(L.LightningDataModule):
 
     def describe(self) -> str:
         """The summary as a small table."""
-        rows = self.summary()
-        lines = ["split   drives  groups  minutes  segments"]
-        for r in rows:
-            lines.append(f"{r['split']:<6} {r['drives']:>7} {r['groups']:>7} {r['minutes']:>8.1f} {r['segments']:>7}")
-        return "\n".join(lines)
+        row = "{split:<6} {drives:>7} {groups:>7} {minutes:>8.1f} {segments:>7}"
+        return "\n".join(("split   drives  groups  minutes  segments", *(row.format(**r) for r in self.summary())))
 
     @property
     def _rank(self) -> int:

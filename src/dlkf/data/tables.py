@@ -27,7 +27,6 @@ from dlkf.base.files import (
 from dlkf.data.limits import LEVER_ARM_M
 from dlkf.data.schema import (
     AIDS,
-    DRIVES,
     DRIVES_REQUIRED,
     LEVER_ARM,
     OPTIONAL,
@@ -93,13 +92,8 @@ def read_drives(folder: str | Path) -> list[DriveRow]:
         raise InputError(f"dataset {folder}: drives.parquet has no rows; add one per drive")
     if doubles := sorted({n for n in names if names.count(n) > 1}):
         raise InputError(f"drives.parquet: drive {doubles[0]} appears twice; names must be unique")
-    arms = []
-    for column in LEVER_ARM:
-        if column in table.column_names:
-            kind = DRIVES.field(column).type
-            arms.append(np.nan_to_num(_column(table, column, kind, "drives.parquet").astype(float)))
-        else:
-            arms.append(np.zeros(len(names)))
+    there = {c: _column(table, c, pa.float64(), "drives.parquet") for c in LEVER_ARM if c in table.column_names}
+    arms = [np.nan_to_num(there.get(column, np.zeros(len(names)))) for column in LEVER_ARM]
     for name, arm in zip(names, zip(*arms)):
         if not math.hypot(*arm) <= LEVER_ARM_M:
             raise InputError(

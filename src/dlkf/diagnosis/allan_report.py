@@ -64,12 +64,7 @@ def noise_table(log: StaticLog) -> ResultTable:
         accel = name.startswith("accel")
         walk, bias = (60.0, 1 / MILLIGAL) if accel else (60 / DEG, 3600 / DEG)
         time = format_number(fit.time) + ("" if fit.resolved else "*")
-        row = [
-            format_number(fit.density * walk),
-            format_number(fit.floor * bias),
-            format_number(fit.floor_s),
-            format_number(fit.walk * bias * 60),
-        ]
+        row = [format_number(x) for x in (fit.density * walk, fit.floor * bias, fit.floor_s, fit.walk * bias * 60)]
         row += [format_number(fit.sigma * bias), time] if fit.rises else ["–", "–"]
         rows.append([f"{NAMES[name]}, all axes" if name in TRIADS else name.replace("_", " "), *row])
     order = [0, 1, 2, 6, 3, 4, 5, 7]

@@ -38,24 +38,28 @@ def drive_folder(
     imu: pd.DataFrame, gnss: pd.DataFrame, reference: pd.DataFrame | None, lever_arm: Sequence[float],
     aids: Mapping[str, pd.DataFrame | None],
 ) -> Iterator[Path]:  # fmt: skip
-    """A temporary dataset of one drive, checked where it is read; error lines name the frames, not its files."""
+    """A temporary dataset of one drive, checked where it is read.
+
+    Error lines name the frames, not its files, and what callers can do, not settings of commands.
+    """
     from dlkf.data.schema import ATTITUDE, LEVER_ARM, STD, VELOCITY, write_drive, write_drives_table
 
     check_frames(imu, gnss, reference, aids)
     arm = check_lever_arm(lever_arm)
-    with TemporaryDirectory(prefix="dlkf-") as here, errors_of_frames():
-        folder = Path(here) / "frames"
-        meta = {"drive": DRIVE} | dict(zip(LEVER_ARM, arm))
-        fixes = _completed("gnss", gnss, dict.fromkeys((*VELOCITY, *STD), np.nan) | {"quality": 1})
-        fixes["quality"] = fixes["quality"].fillna(1).astype(np.int8)
-        truth = None
-        if reference is not None:
-            unknown = dict.fromkeys((*VELOCITY, *ATTITUDE), np.nan)
-            truth = _completed("reference", reference, unknown | {"valid": True})
-        given = {kind: _completed(kind, frame, {}) for kind, frame in aids.items() if frame is not None}
-        row = write_drive(folder, meta, _completed("imu", imu, {}), fixes, truth, given)
-        write_drives_table(folder, [row])
-        yield folder
+    meta = {"drive": DRIVE} | dict(zip(LEVER_ARM, arm))
+    fixes = _completed("gnss", gnss, dict.fromkeys((*VELOCITY, *STD), np.nan) | {"quality": 1})
+    fixes["quality"] = fixes["quality"].fillna(1).astype(np.int8)
+    unknown = dict.fromkeys((*VELOCITY, *ATTITUDE), np.nan) | {"valid": True}
+    truth = None if reference is None else _completed("reference", reference, unknown)
+    given = {kind: _completed(kind, frame, {}) for kind, frame in aids.items() if frame is not None}
+    try:
+        with TemporaryDirectory(prefix="dlkf-") as here:
+            folder = Path(here) / "frames"
+            row = write_drive(folder, meta, _completed("imu", imu, {}), fixes, truth, given)
+            write_drives_table(folder, [row])
+            yield folder
+    except InputError as error:
+        raise InputError(reword(str(error))) from None
 
 
 def _completed(kind: str, frame: pd.DataFrame, defaults: Mapping[str, Any]) -> pd.DataFrame:
@@ -67,15 +71,6 @@ def _completed(kind: str, frame: pd.DataFrame, defaults: Mapping[str, Any]) -> p
     mixed = {name: x for name, x in kept.items() if not pd.api.types.is_numeric_dtype(x)}  # objects, categories
     kept |= {name: pd.to_numeric(x.astype(object)) for name, x in mixed.items()}
     return pd.DataFrame({**kept, **{name: value for name, value in defaults.items() if name not in frame}})
-
-
-@contextmanager
-def errors_of_frames() -> Iterator[None]:
-    """Turns places in the temporary dataset into names of frames, and settings of commands into what callers can do."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(reword(str(error))) from None
 
 
 def reword(line: str) -> str:

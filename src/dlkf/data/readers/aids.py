@@ -66,7 +66,7 @@ def _settled(
 ) -> tuple[dict[str, Any], list[str]]:
     """Offset and unit that are left ``auto``: of a table beside the fixes as those have it, of a wheel by its speed."""
     spec: dict[str, Any] = copy.deepcopy(dict(mapped.spec))
-    time, notes = dict(spec.get("time") or {}), []
+    time, notes = spec.get("time") or {}, []
     spec["time"] = time
     if time.get("offset_s") == AUTO and gnss is not None and gnss.table.path == mapped.table.path:
         said = gnss.spec.get("time") or {}
@@ -82,7 +82,6 @@ def _settled(
         return spec, notes
     if moved is None:
         raise InputError(f"{where}: reader.speed.…=auto needs GNSS to compare with; give value.unit and time.offset_s")
-    value = spec["value"] = dict(value)
     one = {**value, "unit": 1.0} if value.get("unit") == AUTO else value
     neutral = Mapped(mapped.table, {**spec, "value": one}, name, mapped.parts)
     raw = aid_frame(name, neutral, _times(neutral, zero))

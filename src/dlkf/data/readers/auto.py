@@ -28,12 +28,8 @@ from dlkf.data.readers.settling import Unsure
 from dlkf.data.readers.sharing import merge_settings
 
 # presets whose files are known by a name
-LAYOUTS = {
-    "kitti": "oxts/timestamps.txt",
-    "sensor_logger": "TotalAcceleration.csv",
-    "phyphox": "Gyroscope.csv",
-}
-BESIDE = {("sensor_logger", "baro"): "Barometer.csv", ("phyphox", "baro"): "Pressure.csv"}
+LAYOUTS = {"kitti": "oxts/timestamps.txt", "sensor_logger": "TotalAcceleration.csv", "phyphox": "Gyroscope.csv"}
+BAROMETERS = {"sensor_logger": "Barometer.csv", "phyphox": "Pressure.csv"}
 TABLES = (".csv", ".tsv", ".txt", ".dat")
 DAMAGED = ("not a whole", "cannot be opened")  # how a line on a file begins that may hold the fixes
 RECEIVERS = (".ubx", ".nmea", ".pos", ".bag", ".mcap", ".asc", ".mat", ".bin", ".ulg")
@@ -195,11 +191,10 @@ def _contents_of(folder: Path) -> list[Contents]:
                 continue
             base = preset(name)
             specs = {kind: {**base[kind]} for kind in ("imu", "gnss")}
-            beside = {kind: BESIDE.get((name, kind), "") for kind in ("speed", "heading", "baro")}
-            aids = {k: {**base[k], "file": f} for k, f in beside.items() if f and (folder / f).is_file()}
+            beside = BAROMETERS.get(name, "")
+            aids = {"baro": {**base["baro"], "file": beside}} if beside and (folder / beside).is_file() else {}
             return [Contents(folder / file, [Offer(folder / file, f"layout of {name}", *leave_open(specs), aids=aids)])]
-    files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
-    return [contents(path) for path in files]
+    return [contents(p) for p in sorted(folder.iterdir()) if p.is_file() and not p.name.startswith(".")]
 
 
 def _held(within: Iterable[Contents], offers: Iterable[Offer] = ()) -> str:

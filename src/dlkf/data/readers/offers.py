@@ -21,6 +21,7 @@ from dlkf.data.readers.sharing import merge_settings
 
 GNSS_ONLY = ("nmea", "rtklib", "inertial_explorer")
 PRESETS = (*GNSS_ONLY, "ubx", "rosbag", "gnss_logger", "novatel", "navego", "px4", "ardupilot")
+WITH_AIDS = {"ubx": ubx, "nmea": nmea, "rosbag": rosbag, "px4": autopilot, "ardupilot": autopilot}
 NO_LOGS = {  # formats of other programs, and what makes a table of them
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "a spreadsheet; save its sheet as CSV"),
     **dict.fromkeys((".gpx", ".kml", ".kmz"), "a track of GPX or KML; make it a CSV table: time, lat, lon, height"),
@@ -98,25 +99,15 @@ def contents(path: Path) -> Contents:
 
 def _of_preset(path: Path, name: str) -> Contents:
     base = preset(name)
-    specs, lacks = {}, []
     source = {"file": path.name, "text": _preset_text(base)}
-    for kind in ("imu", "gnss"):
-        why = _lacks(path, name, kind)
-        if why is not None:
-            lacks.append(f"no {kind.upper()}{why}")
-            continue
-        specs[kind] = {**base[kind], **source}
-    held = f"{name}, {', '.join(lacks)}"
-    aids = {kind: open_aid({**base[kind], **source}) for kind in _aids_in(path, name)}
+    lacks = {kind: _lacks(path, name, kind) for kind in ("imu", "gnss")}
+    specs = {kind: {**base[kind], **source} for kind, why in lacks.items() if why is None}
+    held = f"{name}, {', '.join(f'no {kind.upper()}{why}' for kind, why in lacks.items() if why is not None)}"
+    module = WITH_AIDS.get(name)
+    aids = {kind: open_aid({**base[kind], **source}) for kind in (module.aids(path) if module else ())}
     if not specs and not aids:
         return Contents(path, held=held)
     return Contents(path, [Offer(path, f"{name}, as reader={name}", *leave_open(specs), aids=aids)], held)
-
-
-def _aids_in(path: Path, name: str) -> tuple[str, ...]:
-    """The aids that a file of a preset's format holds."""
-    module = {"ubx": ubx, "nmea": nmea, "rosbag": rosbag, "px4": autopilot, "ardupilot": autopilot}.get(name)
-    return () if module is None else module.aids(path)
 
 
 def open_aid(spec: Mapping[str, Any]) -> dict[str, Any]:
