@@ -193,6 +193,14 @@ class Mapped:
         where = f"reader.{self.kind}.{key}.{name}"
         return units.factor(next(iter(table)) if unit is None else unit, table, where)
 
+    def option(self, key: str, name: str, *known: str) -> str:
+        """A word in an entry, the first of those known where it has none; InputError for any other."""
+        word = (self.spec.get(key) or {}).get(name) or known[0]
+        if word not in known:
+            *most, last = known
+            raise InputError(f"reader.{self.kind}.{key}.{name}={word}: must be {', '.join(most)} or {last}")
+        return word
+
     def rows(self, keep: np.ndarray) -> Mapped:
         """Some rows, of the parts too."""
         parts = {key: part.rows(keep) for key, part in self.parts.items()}
