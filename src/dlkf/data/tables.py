@@ -186,16 +186,6 @@ def refuse_rows(
             raise InputError(f"{where}: row {rows[0]}: {name} is {table[name][rows[0]]}; {remedy}")
 
 
-def is_negative(values: np.ndarray) -> np.ndarray:
-    """Numbers below 0; NaN is none."""
-    return values < 0
-
-
-def is_unknown(values: np.ndarray) -> np.ndarray:
-    """What is no finite number."""
-    return ~np.isfinite(values)
-
-
 def dataset_digest(folder: str | Path) -> str:
     """Hash of the contents of a dataset's files, 32 hexadecimal digits; names count, dates do not."""
     folder = resolve_place(folder)

@@ -17,7 +17,7 @@ from dlkf.data.limits import FULL_SCALE, NONE_REFUSED, Refused, screen_fixes, wi
 from dlkf.data.plausibility import check_clocks, check_gnss_units, check_imu_units, check_turns
 from dlkf.data.reference_checks import check_attitude, check_same_place
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY, stack_columns
-from dlkf.data.tables import Columns, DriveRow, is_negative, is_unknown, read_drives, read_table, refuse_rows
+from dlkf.data.tables import Columns, DriveRow, read_drives, read_table, refuse_rows
 
 GNSS_QUALITIES = (1, 2, 3, 4, 5, 9)  # NMEA GGA codes that are a satellite fix; 6, 7, 8 are not
 RATES_HZ = {"imu": (1.0, 1e4), "gnss": (1e-3, 500.0)}
@@ -148,7 +148,7 @@ def _coarse(t: np.ndarray) -> str:
 
 
 def _check_time(t: np.ndarray, where: str, kind: str = "imu") -> None:
-    refuse_rows({"t": t}, ("t",), is_unknown, where, "remove the row or give its time in seconds")
+    refuse_rows({"t": t}, ("t",), lambda x: ~np.isfinite(x), where, "remove the row or give its time in seconds")
     back = np.flatnonzero(np.diff(t) <= 0)
     if len(back):
         k = int(back[0])
@@ -182,7 +182,8 @@ def _check_imu(imu: Columns, where: str, limits: Limits) -> Columns:
     """The samples within full scale, where the others are few."""
     t = imu["t"]
     _check_time(t, where)
-    refuse_rows(imu, (*GYRO, *ACCEL), is_unknown, where, "remove the row or split the drive there")
+    remedy = "remove the row or split the drive there"
+    refuse_rows(imu, (*GYRO, *ACCEL), lambda x: ~np.isfinite(x), where, remedy)
     if len(t) < 2:
         raise InputError(f"{where}: has a single sample; leave the drive out or give its data")
     _check_rate(t, where, "imu")
@@ -222,7 +223,7 @@ def _check_gnss(gnss: Columns, imu: Columns, where: str) -> Columns:
     if not fix.any():
         _check_fixes_there(gnss, where)
         raise InputError(f"{where}: no GNSS fix at all (position NaN or quality 0 in every row); leave the drive out")
-    refuse_rows(gnss, STD, is_negative, where, "must be ≥ 0, or NaN if unknown")
+    refuse_rows(gnss, STD, lambda x: x < 0, where, "must be ≥ 0, or NaN if unknown")
     t, first, last = gnss["t"][fix], imu["t"][0], imu["t"][-1]
     if not ((t > first) & (t <= last + 1)).any():
         epochs = abs(abs(t[0] - first) - UNIX_TO_GPS_S) < EPOCHS_APART_S

@@ -51,6 +51,18 @@ def value_found(found: Sequence[Finding], setting: str) -> Any:
     return next((f.value for f in found if f.setting == setting), None)
 
 
+def find_accel_unit(accel: Floats, increments: bool) -> tuple[Finding, float]:
+    """The accelerometers' unit by gravity, and its m/s²; of ``increments`` any number is sure."""
+    size = float(np.median(np.linalg.norm(accel, axis=-1)))
+    names = accel_units(size, ACCELERATION)
+    unit = names[0] if len(names) == 1 else None
+    factor = ACCELERATION[unit] if unit else G / max(size, 1e-9)
+    taken = "" if unit else f": {' or '.join(names) or 'no known unit'}, so a number by gravity"
+    certain = size > 0 and (len(names) > 0 or increments)
+    value = unit or (float(f"{factor:.5g}") if size > 0 else None)
+    return Finding("imu.accel.unit", value, certain, f"median force {size:.4g}{taken}"), factor
+
+
 def discover(
     imu: Columns,
     gnss: Columns,
@@ -70,14 +82,8 @@ def discover(
     t, accel, gyro = imu["t"], stack_columns(imu, ACCEL), stack_columns(imu, GYRO)
     factor = 1.0
     if "imu.accel.unit" in wanted:
-        size = float(np.median(np.linalg.norm(accel, axis=-1)))
-        names = accel_units(size, ACCELERATION)
-        unit = names[0] if len(names) == 1 else None
-        factor = ACCELERATION[unit] if unit else G / size
-        taken = "" if unit else f": {' or '.join(names) or 'no known unit'}, so a number by gravity"
-        certain = size > 0 and (len(names) > 0 or increments)
-        value = unit or float(f"{factor:.5g}")
-        out.append(Finding("imu.accel.unit", value, certain, f"median force {size:.4g}{taken}"))
+        finding, factor = find_accel_unit(accel, increments)
+        out.append(finding)
     moved = motion_of(gnss)
     away = "imu.time.offset_s" in wanted or "gnss.time.offset_s" in wanted
     lag = find_lag(ImuSums.of(t, accel, gyro), moved, None if away else 2.0)

@@ -5,23 +5,22 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from dlkf.base.errors import InputError
-from dlkf.data.discovery.findings import Finding, Sure, discover, value_found
-from dlkf.data.discovery.units import accel_units, speed_factor
+from dlkf.data.discovery.findings import Finding, Sure, discover, find_accel_unit, value_found
+from dlkf.data.discovery.units import speed_factor
 from dlkf.data.readers import units
 from dlkf.data.readers.contract import gnss_frame, imu_frame, positions
 from dlkf.data.readers.mapping import Mapped
 from dlkf.data.readers.sharing import set_value, value_at, write_value
-from dlkf.data.schema import ACCEL
+from dlkf.data.schema import ACCEL, stack_columns
 from dlkf.data.tables import Columns
 from dlkf.data.validate import usable_fixes
-from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
 AUTO = "auto"
 NEUTRAL: dict[str, Any] = {  # settings that may be auto, and what stands there until they are known
@@ -106,7 +105,7 @@ def settle(
     imu = imu_frame(mapped["imu"], t["imu"])
     if "imu.accel.unit" in wanted:
         _refuse_without_gravity(imu, where)
-    gnss = gnss_frame(Mapped(mapped["gnss"].table, specs["gnss"], "gnss", mapped["gnss"].parts), t["gnss"])
+    gnss = gnss_frame(replace(mapped["gnss"], spec=specs["gnss"]), t["gnss"])
     asked = set(wanted)
     if {"imu.accel.axes", "imu.gyro.axes"} & wanted:
         asked.add("imu.axes")
@@ -139,14 +138,10 @@ def _refuse_without_gravity(imu: pd.DataFrame, where: str) -> None:
 
 def _by_gravity(specs: dict[str, Any], imu: Mapped, t: np.ndarray, where: str, arm: Any) -> Settled:
     """The accelerometers' unit of a log without fixes."""
-    frame = imu_frame(imu, t)
-    size = float(np.median(np.linalg.norm(frame[list(ACCEL)].to_numpy(), axis=-1)))
-    names = accel_units(size, units.ACCELERATION)
-    value = names[0] if len(names) == 1 else float(f"{G / size:.5g}") if size > 0 else None
-    found = [Finding("imu.accel.unit", value, len(names) > 0, f"median force {size:.4g}")]
-    _refuse_doubt(found, {"imu.accel.unit"}, where, {"imu": t})
-    set_value(specs, "imu.accel.unit", value)
-    return Settled(specs, arm, found)
+    finding, _ = find_accel_unit(stack_columns(imu_frame(imu, t), ACCEL), increments=False)
+    _refuse_doubt([finding], {"imu.accel.unit"}, where, {"imu": t})
+    set_value(specs, "imu.accel.unit", finding.value)
+    return Settled(specs, arm, [finding])
 
 
 def _in_order(frame: pd.DataFrame) -> Columns:

@@ -18,7 +18,7 @@ import pandas as pd
 
 from dlkf.base.errors import InputError
 from dlkf.data.readers import units
-from dlkf.data.readers.formats.text import decode_text, without_cut_line
+from dlkf.data.readers.formats.text import cells_of, decode_text
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.schema import POSITION, STD, VELOCITY
 
@@ -44,10 +44,7 @@ def _export(lines: list[str], path: Path) -> LogTable:
     first = heads[0] + (2 if any(marks) else 1)
     rows = [(k + 1, line.split()) for k, line in enumerate(lines) if k >= first and line.strip()]
     widths = [3 if "D M S" in m else 1 for m in marks]
-    rows, notes = without_cut_line(rows, sum(widths), path)
-    if bad := [n for n, cells in rows if len(cells) != sum(widths)]:
-        raise InputError(f"{path}: line {bad[0]}: has not the {sum(widths)} cells that the header names")
-    cells = pd.DataFrame([c for _, c in rows], index=pd.Index([n for n, _ in rows]))
+    cells, notes = cells_of(rows, sum(widths), path, f"not the {sum(widths)} cells that the header names")
     out, at = {}, 0
     for name, width in zip(names, widths):
         part = cells.iloc[:, at : at + width]
