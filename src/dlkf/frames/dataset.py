@@ -17,13 +17,8 @@ from dlkf.frames.checks import check_frames, check_lever_arm
 
 DRIVE = "frames"  # the name of the one drive in the temporary dataset
 IN_PYTHON = (  # what a line advises for logs on disk, and what it is for frames
-    (r"reader\.gnss\.time\.offset_s=auto, or (-?[\d.]+)", r"add \1 s to t of gnss"),
-    (r"reader\.imu\.accel\.unit=auto finds it, if gravity was not taken out", "accel in m/s² with gravity"),
-    (r"reader\.imu\.accel\.axes=flu and gyro\.axes=flu, or auto", "turn the signs of y and z of accel and gyro round"),
-    (r"; set reader\.gnss\.position\.unit", "; give degrees"),
-    (r"\breader\.[\w.]+=\S+, or ", ""),
+    (r"\breader\.[\w.]+=\S+( and [\w.]+=\S+)?, or ", ""),
     (r" \([^()]*(?:reader\.|dlkf\.ingest )[^()]*\)", ""),
-    (r"no position yet; quality 0", "no position yet; give them quality 0"),
     (r" with aids=\[\]", ""),
     (r"; lower align\.min_speed or leave the drive out", "; give a longer part of the drive, with turns and speed"),
     (r"; reference=smoothed or gnss needs none", "; without reference= the drive smoothed with its fixes is one"),
