@@ -82,8 +82,8 @@ def check_attitude(reference: Columns, imu: Columns, where: str) -> None:
 
     if apart(yaw) > 0.5 and apart(np.pi / 2 - yaw) < 0.1:
         raise InputError(f"{where}: yaw counts from East, must count clockwise from North; use π/2 − yaw")
-    turned = _turned(yaw - course)
-    if turned is None or abs(turned) < np.radians(TURNED_DEG[0]):
+    turned, off = circular_median(yaw - course)
+    if np.mean(np.abs(off) < SIDEWAYS) < STEADY or abs(turned) < np.radians(TURNED_DEG[0]):
         return
     backwards = abs(turned) > np.radians(TURNED_DEG[1])
     if backwards and not _looks_forward(imu, reference):
@@ -95,12 +95,6 @@ def check_attitude(reference: Columns, imu: Columns, where: str) -> None:
         f"other conventions; must be that of x forward, clockwise from North: {change} "
         "(or reader.reference.attitude.convention); roll and pitch may be wrong too"
     )
-
-
-def _turned(angles: np.ndarray) -> float | None:
-    """The median of angles [rad], −π to π, about which most of them lie; None where they do not."""
-    middle, off = circular_median(angles)
-    return middle if np.mean(np.abs(off) < SIDEWAYS) >= STEADY else None
 
 
 def _looks_forward(imu: Columns, reference: Columns) -> bool:

@@ -54,12 +54,6 @@ def path_is_file(path: Path) -> bool:
     return not is_url(str(path)) and path.is_file()
 
 
-def neighbours(folder: Path) -> list[str]:
-    """Folders of this machine beside one that is not there."""
-    above = folder.parent
-    return [p.name for p in above.iterdir() if p.is_dir()] if not is_url(str(folder)) and above.is_dir() else []
-
-
 def read_drives(folder: str | Path) -> list[DriveRow]:
     """The drives of a dataset in the order of ``drives.parquet``.
 
@@ -77,7 +71,8 @@ def read_drives(folder: str | Path) -> list[DriveRow]:
         require_store(folder)
         if path_is_file(folder):
             raise InputError(f"dataset {folder}: is a file; give its folder, {folder.parent}")
-        near = did_you_mean(folder.name, neighbours(folder)) or "; make one with dlkf.simulate or dlkf.ingest"
+        beside = () if is_url(str(folder)) else folder.parent.glob("*/")
+        near = did_you_mean(folder.name, [p.name for p in beside]) or "; make one with dlkf.simulate or dlkf.ingest"
         raise InputError(f"dataset {folder}: no such folder{near}")
     if not whole:
         above = folder.parent

@@ -72,7 +72,8 @@ def simulate(
         made = []
         for row in read_drives_table(out).to_dict("records"):
             files = (drive_file(out, kind, str(row["drive"])) for kind in ("imu", "gnss", "reference"))
-            made.append(DriveFrames({str(key): value for key, value in row.items()}, *map(pd.read_parquet, files)))
+            imu, gnss, reference = map(pd.read_parquet, files)
+            made.append(DriveFrames({str(key): value for key, value in row.items()}, imu, gnss, reference))
         return made
 
 

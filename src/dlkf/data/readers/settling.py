@@ -192,7 +192,9 @@ def _by_hand(doubts: list[Finding], wanted: set[str], t: Mapping[str, np.ndarray
     said = []
     for setting in (doubt.setting for doubt in doubts):
         if setting.endswith("offset_s"):
-            value = "0 (if both files have one clock)" if _overlap(t) else "… (seconds to be added to its stamps)"
+            within = (t["gnss"] >= t["imu"][0]) & (t["gnss"] <= t["imu"][-1])
+            overlap = np.mean(within) > MOSTLY
+            value = "0 (if both files have one clock)" if overlap else "… (seconds to be added to its stamps)"
             said.append(f"reader.{setting}={value}")
         elif setting == "imu.axes":
             names = sorted(wanted & {"imu.accel.axes", "imu.gyro.axes"})
@@ -200,12 +202,6 @@ def _by_hand(doubts: list[Finding], wanted: set[str], t: Mapping[str, np.ndarray
         else:
             said.append(f"reader.{setting}={USUAL.get(setting, '…')}")
     return " ".join(said)
-
-
-def _overlap(t: Mapping[str, np.ndarray]) -> bool:
-    """Whether most of the fixes lie within the IMU's samples by their stamps."""
-    within = (t["gnss"] >= t["imu"][0]) & (t["gnss"] <= t["imu"][-1])
-    return bool(np.mean(within) > MOSTLY)
 
 
 def _reported(found: list[Finding], wanted: set[str]) -> list[Finding]:

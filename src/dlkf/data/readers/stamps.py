@@ -171,7 +171,7 @@ def epoch_note(part: Mapped) -> str | None:
         if order := time.get("order"):
             swapped = {"dmy": "mdy", "mdy": "dmy"}.get(order)
             other = f", {'day' if order == 'dmy' else 'month'} first; {setting}.order={swapped} is the other reading"
-        texts = part.texts(column[0] if isinstance(column, list) else column)
+        texts = part.texts(str(column[0] if isinstance(column, list) else column))
         return f"{what}: dates taken as {as_what}{other if units.day_order(texts) == '' else ''}"
     if time.get("day") is not None:
         return None
