@@ -25,16 +25,7 @@ from dlkf.base.files import (
     store_errors_as_input_error,
 )
 from dlkf.data.limits import LEVER_ARM_M
-from dlkf.data.schema import (
-    AIDS,
-    DRIVES_REQUIRED,
-    LEVER_ARM,
-    OPTIONAL,
-    POSITION,
-    SCHEMAS,
-    check_name,
-    own_schema,
-)
+from dlkf.data.schema import AIDS, DRIVES_REQUIRED, LEVER_ARM, OPTIONAL, POSITION, SCHEMAS, check_name, own_schema
 
 Columns = dict[str, np.ndarray]
 CONTRACT = {**SCHEMAS, **AIDS}

@@ -13,16 +13,7 @@ from dlkf.data.readers.archives import drive_name, drive_places, is_archive, unp
 from dlkf.data.readers.formats import rosbag
 from dlkf.data.readers.frames import DriveFrames, Place
 from dlkf.data.readers.logs import LogReader
-from dlkf.data.readers.offers import (
-    NO_LOGS,
-    Contents,
-    Offer,
-    contents,
-    find_format,
-    leave_open,
-    preset,
-    text_options,
-)
+from dlkf.data.readers.offers import NO_LOGS, Contents, Offer, contents, find_format, leave_open, preset, text_options
 from dlkf.data.readers.settling import Unsure
 from dlkf.data.readers.sharing import merge_settings
 
