@@ -150,7 +150,7 @@ def test_velocities_in_a_file_beside_the_fixes(tmp_path):
     ):
         (tmp_path / f"{name}.csv").write_text(f"{columns}\n" + f"{row}\n" * 3)
     (chosen,) = contents(tmp_path / "pos.csv").offers
-    found = _velocities_beside(chosen, chosen.gnss, tmp_path.iterdir())
+    found = _velocities_beside(chosen, chosen.specs["gnss"], tmp_path.iterdir())
     assert found == {"columns": ["speed", "course"], "frame": "course", "file": "vel.csv"}
 
 
@@ -161,13 +161,13 @@ def test_velocities_of_a_bag_lie_in_a_topic_of_their_own(tmp_path, writer):
     writer(tmp_path, tables)
     (path,) = (p for pattern in ("*.bag", "drive/metadata.yaml") for p in tmp_path.glob(pattern))
     (chosen,) = contents(path).offers
-    assert _velocities_beside(chosen, chosen.gnss, []) == {"table": "/gnss/vel"}
+    assert _velocities_beside(chosen, chosen.specs["gnss"], []) == {"table": "/gnss/vel"}
     (got,) = read(path.parent, ["reader=rosbag"])
     assert any("reader.gnss.velocity.table=/gnss/vel" in note for note in got.notes)
     (tmp_path / "ublox").mkdir()
     ros2_ublox(tmp_path / "ublox", tables)
     (other,) = contents(tmp_path / "ublox" / "drive" / "metadata.yaml").offers
-    assert _velocities_beside(other, other.gnss, []) is None
+    assert _velocities_beside(other, other.specs["gnss"], []) is None
 
 
 def test_a_bag_with_two_imus_or_cut_off_says_so(tmp_path):

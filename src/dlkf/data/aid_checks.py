@@ -12,7 +12,7 @@ from dlkf.base.angles import circular_median
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.motion import Motion
 from dlkf.data.schema import OPTIONAL
-from dlkf.data.tables import Columns
+from dlkf.data.tables import Columns, refuse_rows
 
 RATES_HZ = (0.02, 1000.0)
 FAST = 3.0  # m/s: above, the ratio of two speeds means something and the car looks along its course
@@ -52,14 +52,10 @@ def _check_values(name: str, table: Columns, imu: Columns, where: str) -> None:
         raise InputError(f"{where}: has neither of {', '.join(OPTIONAL[name].names[:-1])}; one of them is needed")
     if len(t) > 1 and not RATES_HZ[0] <= (rate := 1 / float(np.median(np.diff(t)))) <= RATES_HZ[1]:
         raise InputError(f"{where}: {rate:.3g} rows a second: t is not in seconds; give t in seconds")
-    for column in values:
-        bad = np.flatnonzero(np.isinf(table[column]))
-        if len(bad):
-            raise InputError(f"{where}: row {bad[0]}: {column} is {table[column][bad[0]]}; write NaN where unknown")
+    refuse_rows(table, values, np.isinf, where, "write NaN where unknown")
     if not np.any([np.isfinite(table[c]) for c in values]):
         raise InputError(f"{where}: {' and '.join(values)} is NaN in every row" + DROP)
-    if "std" in table and len(bad := np.flatnonzero(table["std"] < 0)):
-        raise InputError(f"{where}: row {bad[0]}: std is {table['std'][bad[0]]}; must be ≥ 0, or NaN if unknown")
+    refuse_rows(table, table.keys() & {"std"}, lambda x: x < 0, where, "must be ≥ 0, or NaN if unknown")
     if not ((t > imu["t"][0]) & (t <= imu["t"][-1] + 1)).any():
         raise InputError(
             f"{where}: t from {t[0]:.3f} to {t[-1]:.3f} lies outside the IMU's {imu['t'][0]:.3f} to "

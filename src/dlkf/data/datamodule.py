@@ -192,7 +192,7 @@ class DriveDataModule(L.LightningDataModule):
 
     def val_dataloader(self) -> FixedBatches | list:
         """Validation batches; no loader where the split has no validation side."""
-        return FixedBatches(self.batches("val", share=(self._rank, self._world))) if self.drives("val") else []
+        return FixedBatches(self.batches("val", share=self.share)) if self.drives("val") else []
 
     def summary(self) -> list[dict[str, Any]]:
         """Per side: drives, groups, minutes of driving, and segments for scoring."""
@@ -231,19 +231,13 @@ class DriveDataModule(L.LightningDataModule):
 
     def describe(self) -> str:
         """The summary as a small table."""
-        rows = self.summary()
-        lines = ["split   drives  groups  minutes  segments"]
-        for r in rows:
-            lines.append(f"{r['split']:<6} {r['drives']:>7} {r['groups']:>7} {r['minutes']:>8.1f} {r['segments']:>7}")
-        return "\n".join(lines)
+        row = "{split:<6} {drives:>7} {groups:>7} {minutes:>8.1f} {segments:>7}"
+        return "\n".join(("split   drives  groups  minutes  segments", *(row.format(**r) for r in self.summary())))
 
     @property
-    def _rank(self) -> int:
-        return self.trainer.global_rank if self.trainer is not None else 0
-
-    @property
-    def _world(self) -> int:
-        return self.trainer.world_size if self.trainer is not None else 1
+    def share(self) -> tuple[int, int]:
+        """Number of this process, and how many there are."""
+        return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
 
 
 class TrainBatches:
@@ -260,7 +254,7 @@ class TrainBatches:
         return self.module.trainer.current_epoch if self.module.trainer is not None else 0
 
     def _steps(self, epoch: int) -> int:
-        world = self.module._world
+        _, world = self.module.share
         return sum(len(batch) >= world for batch in self.module.train_segments(epoch))
 
     def __len__(self) -> int:

@@ -6,21 +6,17 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from dlkf.base.errors import InputError
+from dlkf.base.settings import Ranged
 from dlkf.data.draws import segment_generator
 from dlkf.data.drive import Drive
 
 
 @dataclass(frozen=True)
-class GnssNoise:
+class GnssNoise(Ranged, where="gnss_noise", least=0):
     """1σ per axis of the added noise: ``s_p`` [m] and ``s_v`` [m/s]; the fixes' own stds grow with it."""
 
     s_p: float = 0.0
     s_v: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not (self.s_p >= 0 and self.s_v >= 0):
-            raise InputError(f"gnss_noise: s_p and s_v must be numbers ≥ 0, got {self.s_p}, {self.s_v}")
 
     def add_noise(self, drive: Drive, seed: int = 0) -> Drive:
         """The drive with noise of its own on every fix: p̃ = p + s_p n, ṽ = v + s_v n, n ~ N(0, I) (isotropic, so the

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -18,6 +18,19 @@ EPOCHWISE = (
     "imu", "gnss", "gnss_std", "gnss_valid", "gnss_lag", "available", "truth", "truth_valid", "attitude_valid",
     "true_imu_error", "present",
 )  # fields of Batch with a row for every epoch  # fmt: skip
+BOUNDARY_COLUMNS = (
+    "gnss_r_e", "gnss_v_e", "gnss_std", "gnss_valid", "gnss_lag",
+    "ref_r_e", "ref_v_e", "ref_C_eb", "ref_valid", "ref_imu_error",
+)  # of Drive, with a row for every boundary; quality is one too, of no use to a filter  # fmt: skip
+
+
+def _changed(value: Any, change: Callable[[Any], Any]) -> Any:
+    """A field of a batch with ``change`` made to the tensors in it."""
+    if isinstance(value, NavState):
+        return NavState(*map(change, value))
+    if isinstance(value, Mapping):
+        return {name: change(x) for name, x in value.items()}
+    return change(value) if isinstance(value, (Tensor, TangentFrame)) else value
 
 
 @dataclass(frozen=True)
@@ -60,13 +73,12 @@ class Drive:
     def part(self, first: int, last: int) -> Drive:
         """Epochs ``first`` to ``last`` − 1 as a drive of its own."""
         rows = slice(first, last + 1)
-        of_boundaries = [f.name for f in fields(self) if f.name.startswith(("gnss_", "ref_"))] + ["quality"]
         return replace(
             self,
             t0=self.t0 + first * self.epoch_s,
             imu=self.imu[first:last],
             aids={name: x[rows] for name, x in self.aids.items()},
-            **{name: getattr(self, name)[rows] for name in of_boundaries},
+            **{name: getattr(self, name)[rows] for name in (*BOUNDARY_COLUMNS, "quality")},
         )
 
 
@@ -113,48 +125,28 @@ class Batch:
 
     def select(self, index: Int[Tensor, " b"]) -> Batch:
         """Some segments of the batch."""
-
-        def kept(x: Any) -> Any:
-            if isinstance(x, NavState):
-                return NavState(*(part[index] for part in x))
-            if isinstance(x, (Tensor, TangentFrame)):
-                return x[index]
-            if isinstance(x, Mapping):
-                return {name: part[index] for name, part in x.items()}
-            return tuple(x[i] for i in index.tolist()) if isinstance(x, tuple) else x
-
-        return replace(self, **{f.name: kept(getattr(self, f.name)) for f in fields(self)})
+        kept = {f.name: _changed(getattr(self, f.name), lambda x: x[index]) for f in fields(self)}
+        return replace(self, **kept | {"drive": tuple(self.drive[i] for i in index.tolist())})
 
     def trimmed(self) -> Batch:
         """The batch without the padding that none of its segments needs."""
         T = max(1, int(self.present.sum(-1).max()))
         if self.size[1] == T:
             return self
-        short = {name: getattr(self, name)[:, :T] for name in EPOCHWISE if name != "truth"}
-        aids = {name: x[:, :T] for name, x in self.aids.items()}
-        return replace(self, truth=NavState(*(x[:, :T] for x in self.truth)), aids=aids, **short)
+        names = (*EPOCHWISE, "aids")
+        return replace(self, **{name: _changed(getattr(self, name), lambda x: x[:, :T]) for name in names})
 
     def to(self, device: torch.device | str) -> Batch:
         """The same batch on another device."""
-        moved = {}
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if isinstance(value, (Tensor, TangentFrame)):
-                moved[f.name] = value.to(device)
-            elif isinstance(value, NavState):
-                moved[f.name] = NavState(*(x.to(device) for x in value))
-            elif isinstance(value, Mapping):
-                moved[f.name] = {name: x.to(device) for name, x in value.items()}
-        return replace(self, **moved)
+        return replace(self, **{f.name: _changed(getattr(self, f.name), lambda x: x.to(device)) for f in fields(self)})
 
     def in_precision(self, dtype: torch.dtype) -> Batch:
         """The same batch with its working fields in ``dtype``; file clock and ECEF origin stay float64."""
 
-        def cast(x: Tensor) -> Tensor:
+        def cast(x: Tensor | TangentFrame) -> Tensor | TangentFrame:
+            if isinstance(x, TangentFrame):
+                return x.in_precision(dtype)
             return x.to(dtype) if x.is_floating_point() else x
 
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        tensors = {k: cast(v) for k, v in values.items() if isinstance(v, Tensor) and k != "t_start"}
-        states = {k: NavState(*map(cast, v)) for k, v in values.items() if isinstance(v, NavState)}
-        aids = {name: cast(x) for name, x in self.aids.items()}
-        return replace(self, frame=self.frame.in_precision(dtype), aids=aids, **tensors, **states)
+        working = [f.name for f in fields(self) if f.name != "t_start"]
+        return replace(self, **{name: _changed(getattr(self, name), cast) for name in working})

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -84,12 +84,14 @@ def ingest(
     places = absolute_places(reader, source)
 
     def taking(folder: str) -> Iterable[IngestResult]:
-        return read_together(reader, how, absolute_place(folder), places, parallel, skip_unsure)
+        take_in = partial(how.take_in, folder=absolute_place(folder))
+        return read_together(reader, take_in, places, parallel, skip_unsure)
 
     return _ingested(taking, out, how, **options)
 
 
 AbsolutePlace = tuple[str, str, str | None]
+TakeIn = Callable[[DriveFrames], IngestResult]  # what becomes of a drive that was read
 
 
 def absolute_places(reader: Any, source: str | Path) -> list[AbsolutePlace]:
@@ -99,21 +101,16 @@ def absolute_places(reader: Any, source: str | Path) -> list[AbsolutePlace]:
     ]
 
 
-class Taker(Protocol):
-    """What becomes of a drive that was read; ``folder`` is a dataset's."""
-
-    def take_in(self, drive: DriveFrames, folder: str) -> IngestResult: ...
-
-
 def read_together(
-    reader: Any, how: Taker, out: str, places: Sequence[AbsolutePlace], parallel: int | str | None, skip_unsure: bool
+    reader: Any, take_in: TakeIn, places: Sequence[AbsolutePlace], parallel: int | str | None, skip_unsure: bool
 ) -> Iterator[IngestResult]:
-    """The drives that are sure, then those that are with what these found, then lines on those that disagree."""
+    """What ``take_in`` makes of the drives that are sure, then of those that are with what these found, then lines on
+    those that disagree."""
     doubts: dict[AbsolutePlace, Unsure] = {}
     mappings: list[dict[str, Any]] = []
 
     def read_all(reader: Any, places: Sequence[AbsolutePlace]) -> Iterator[tuple[AbsolutePlace, IngestResult]]:
-        for place, result in zip(places, parallel_map(partial(_read_there, reader, how, out), places, parallel)):
+        for place, result in zip(places, parallel_map(partial(_read_there, reader, take_in), places, parallel)):
             doubts.pop(place, None)
             if isinstance(result, Unsure):
                 doubts[place] = result
@@ -143,7 +140,7 @@ def read_together(
         yield IngestResult([], [], (f"left out: {doubt}",), {})
 
 
-def _read_there(reader: Any, how: Taker, out: str, place: AbsolutePlace) -> IngestResult | Unsure:
+def _read_there(reader: Any, take_in: TakeIn, place: AbsolutePlace) -> IngestResult | Unsure:
     folder, name, only = place
     try:
         drive = reader.drive_at(Path(folder), name, only and Path(only))
@@ -151,7 +148,7 @@ def _read_there(reader: Any, how: Taker, out: str, place: AbsolutePlace) -> Inge
         return doubt
     except MemoryError:
         raise InputError(f"drive {name}: its logs do not fit into memory; split them, or write Parquet") from None
-    return how.take_in(drive, out)
+    return take_in(drive)
 
 
 def ingest_drives(

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dlkf.data.schema import POSITION, STD, VELOCITY
+from dlkf.data.schema import POSITION, STD, VELOCITY, stack_columns
 
 FULL_SCALE = (400.0, 40.0)  # m/s², rad/s: beyond any IMU of a car, so a damaged packet
 FASTEST_M_S, STEEPEST_M_S = 120.0, 30.0  # m/s, horizontally and vertically: beyond any road car
@@ -164,7 +164,7 @@ class Screened(NamedTuple):
 def screen_fixes(gnss: dict[str, np.ndarray]) -> Screened:
     """A table of usable fixes in order of time through a :class:`FixScreen`; no loop where no two contradict."""
     t, (lat, lon, height) = gnss["t"], (gnss[c] for c in POSITION)
-    std = np.stack([gnss[c] for c in STD], -1)
+    std = stack_columns(gnss, STD)
     speed = np.sqrt(sum(gnss[c] ** 2 for c in VELOCITY))
     spread = _spread(std[:, :3])
     keep = np.ones(len(t), bool)

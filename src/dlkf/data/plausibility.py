@@ -13,9 +13,9 @@ from dlkf.base.errors import InputError
 from dlkf.data.axis_checks import CHUNK_S, check_climb, check_dead_axes, check_handedness
 from dlkf.data.discovery.clock import ImuSums, find_lag, known_offset
 from dlkf.data.discovery.drift import ROUGH_S, ends_apart, find_drifting_pose
-from dlkf.data.discovery.motion import Motion, motion, stretches
+from dlkf.data.discovery.motion import Motion, motion_of, stretches
 from dlkf.data.limits import DEGREE_M, NOWHERE_DEG
-from dlkf.data.schema import ACCEL, GYRO, VELOCITY
+from dlkf.data.schema import ACCEL, GYRO, stack_columns
 from dlkf.data.tables import Columns
 from dlkf.navigation.earth import SEMI_MAJOR
 
@@ -53,14 +53,15 @@ def check_imu_units(imu: Columns, where: str) -> None:
         )
     if not FORCE[0] < size < FORCE[1]:
         raise InputError(
-            f"{where}: median specific force is {size:.3g} m/s², must be near 9.8; reader.imu.accel.unit="
-            "auto finds it, if gravity was not taken out"
+            f"{where}: median specific force is {size:.3g} m/s², must be near 9.8; reader.imu.accel.unit=auto, or "
+            "accel in m/s² with gravity"
         )
     axes = np.array([np.median(imu[c]) for c in ACCEL])
     if axes[2] > UPRIGHT * size:
         raise InputError(
             f"{where}: accel_z is {axes[2]:+.2f} m/s² in the median, must be about −9.8 (Forward-Right-"
-            "Down); the z axis points up (FLU?): reader.imu.accel.axes=flu and gyro.axes=flu, or auto"
+            "Down); the z axis points up (FLU?): reader.imu.accel.axes=auto and gyro.axes=auto, or turn the signs of y "
+            "and z of accel and gyro round"
         )
     if axes[2] > -UPRIGHT * size:
         k = int(np.abs(axes).argmax())
@@ -120,7 +121,7 @@ def _check_places(lat: np.ndarray, lon: np.ndarray, where: str) -> None:
     if FEW < len(zero) < len(lat):
         raise InputError(
             f"{where}: fix {zero[0]} is at 0°/0°, as {len(zero)} of {len(lat)}: no position yet; "
-            "reader.gnss.position.zero=none, or quality 0"
+            "reader.gnss.position.zero=none, or give them quality 0"
         )
     middle, side = np.median(lat), np.median(np.cos(np.radians(lat)))
     east = wrap_angle(lon - np.median(lon), 180)
@@ -163,8 +164,8 @@ def _check_way(gnss: Columns, where: str) -> None:
         return
     readings = {
         "latitude and longitude look swapped; exchange lat_deg and lon_deg": (lon, lat, moved),
-        "lat_deg and lon_deg look like radians (unit=rad), or like degrees that were read as ddmm (unit=deg); set "
-        "reader.gnss.position.unit": (np.degrees(lat), np.degrees(lon), moved),
+        "lat_deg and lon_deg look like radians (unit=rad), or like degrees that were read as ddmm (unit=deg); "
+        "reader.gnss.position.unit=…, or give degrees": (np.degrees(lat), np.degrees(lon), moved),
         "vel_n and vel_e look swapped; reader.gnss.velocity.frame=enu, or exchange them": (lat, lon, moved[:, ::-1]),
         **{
             f"the velocities look {so}; reader.gnss.velocity.unit=auto, or {remedy}": (lat, lon, moved * factor)
@@ -241,7 +242,7 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
         raise InputError(
             f"{where}: the clocks of IMU and GNSS are {abs(best.lag_s):.1f} s apart: yaw rate and course agree to "
             f"{best.yaw:.2f} with {best.lag_s:+.1f} s on GNSS, as they stand {as_is}{known_offset(best.lag_s)}; "
-            f"reader.gnss.time.offset_s=auto, or {best.lag_s:.1f}"
+            f"reader.gnss.time.offset_s=auto, or add {best.lag_s:.1f} s to t of gnss"
         )
     turned = np.degrees(best.angle)
     if best.force > 0.85 and TURNED_DEG[0] < abs(turned) < TURNED_DEG[1]:
@@ -301,5 +302,4 @@ def describe_rotation(imu: Columns, gnss: Columns) -> str | None:
 
 
 def _signals(imu: Columns, gnss: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray, Motion]:
-    moved = motion(gnss["t"], gnss["lat_deg"], gnss["lon_deg"], np.stack([gnss[c] for c in VELOCITY], -1))
-    return imu["t"], np.stack([imu[c] for c in ACCEL]).T, np.stack([imu[c] for c in GYRO]).T, moved
+    return imu["t"], stack_columns(imu, ACCEL), stack_columns(imu, GYRO), motion_of(gnss)

@@ -10,10 +10,10 @@ import numpy as np
 from dlkf.base.angles import circular_median, wrap_angle
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import ImuSums, find_lag
-from dlkf.data.discovery.motion import motion
+from dlkf.data.discovery.motion import motion_of
 from dlkf.data.limits import DEGREE_M
 from dlkf.data.plausibility import APART_S, TURNED_DEG
-from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, VELOCITY
+from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, stack_columns
 from dlkf.data.tables import Columns
 
 SAME_S = 1.0  # between a fix and a row of the reference that are compared
@@ -82,8 +82,8 @@ def check_attitude(reference: Columns, imu: Columns, where: str) -> None:
 
     if apart(yaw) > 0.5 and apart(np.pi / 2 - yaw) < 0.1:
         raise InputError(f"{where}: yaw counts from East, must count clockwise from North; use π/2 − yaw")
-    turned = _turned(yaw - course)
-    if turned is None or abs(turned) < np.radians(TURNED_DEG[0]):
+    turned, off = circular_median(yaw - course)
+    if np.mean(np.abs(off) < SIDEWAYS) < STEADY or abs(turned) < np.radians(TURNED_DEG[0]):
         return
     backwards = abs(turned) > np.radians(TURNED_DEG[1])
     if backwards and not _looks_forward(imu, reference):
@@ -97,17 +97,9 @@ def check_attitude(reference: Columns, imu: Columns, where: str) -> None:
     )
 
 
-def _turned(angles: np.ndarray) -> float | None:
-    """The median of angles [rad], −π to π, about which most of them lie; None where they do not."""
-    middle, off = circular_median(angles)
-    return middle if np.mean(np.abs(off) < SIDEWAYS) >= STEADY else None
-
-
 def _looks_forward(imu: Columns, reference: Columns) -> bool:
     """Whether the force along the sensor's x axis is that of a motion along it."""
     whole = np.unique(np.floor(reference["t"]), return_index=True)[1]  # one row a second
-    t, lat, lon, *velocity = (reference[c][whole] for c in ("t", "lat_deg", "lon_deg", *VELOCITY))
-    moved = motion(t, lat, lon, np.stack(velocity, -1))
-    accel, gyro = (np.stack([imu[c] for c in axes], -1) for axes in (ACCEL, GYRO))
-    best = find_lag(ImuSums.of(imu["t"], accel, gyro), moved, APART_S)
+    moved = motion_of({name: values[whole] for name, values in reference.items()})
+    best = find_lag(ImuSums.of(imu["t"], stack_columns(imu, ACCEL), stack_columns(imu, GYRO)), moved, APART_S)
     return best is not None and best.force > FORCE_AGREES and abs(best.angle) < np.radians(TURNED_DEG[0])

@@ -10,7 +10,7 @@ import torch
 from dlkf.base.errors import InputError
 from dlkf.data import compiled_samples
 from dlkf.data.increments import merge_increments, two_sample
-from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, IMU_ERROR, POSITION, STD, VELOCITY
+from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, IMU_ERROR, POSITION, STD, VELOCITY, stack_columns
 from dlkf.data.tables import Columns
 from dlkf.data.validate import usable_fixes
 from dlkf.navigation.attitude import rotation_from_rpy, rotation_from_vector, vector_from_rotation
@@ -210,16 +210,14 @@ def reference_at(reference: Columns | None, grid: SampleGrid) -> ReferenceStates
     linear, attitude along the geodesic of SO(3). NaN and not valid elsewhere.
     """
     rows = grid.epochs + 1
-    nan3 = np.full((rows, 3), np.nan)
-    empty = ReferenceStates(
-        nan3, nan3.copy(), np.full((rows, 3, 3), np.nan), np.zeros(rows, bool), np.full((rows, 6), np.nan)
-    )
+    r_e, v_e, C_eb, imu_error = (np.full((rows, *shape), np.nan) for shape in ((3,), (3,), (3, 3), (6,)))
+    out = ReferenceStates(r_e, v_e, C_eb, np.zeros(rows, bool), imu_error)
     if reference is None:
-        return empty
+        return out
     known = reference["valid"] & np.isfinite(np.stack([reference[c] for c in (*POSITION, *VELOCITY)])).all(0)
     t, at = reference["t"], grid.boundaries
     if len(t) < 2:
-        return empty
+        return out
     i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
     h = t[i + 1] - t[i]
     s = (at - t[i]) / h
@@ -244,15 +242,11 @@ def reference_at(reference: Columns | None, grid: SampleGrid) -> ReferenceStates
         v_e = np.where(s == end, v0 if end == 0 else v1, v_e)
     error = np.full((len(i), 6), np.nan)
     if all(c in reference for c in IMU_ERROR):
-        e = np.stack([reference[c] for c in IMU_ERROR], -1)
+        e = stack_columns(reference, IMU_ERROR)
         error = np.where(s == 0, e[i], np.where(s == 1, e[i + 1], e[i] + s * (e[i + 1] - e[i])))
-    return ReferenceStates(
-        r_e=_spread(r_e, rows_at, rows, np.nan),
-        v_e=_spread(v_e, rows_at, rows, np.nan),
-        C_eb=_spread(C_eb, rows_at, rows, np.nan),
-        valid=_spread(np.ones(len(i), bool), rows_at, rows, False),
-        imu_error=_spread(error, rows_at, rows, np.nan),
-    )
+    out.r_e[rows_at], out.v_e[rows_at], out.C_eb[rows_at] = r_e, v_e, C_eb
+    out.valid[rows_at], out.imu_error[rows_at] = True, error
+    return out
 
 
 def default_std(quality: int) -> tuple[float, ...]:

@@ -52,7 +52,7 @@ def example_drive() -> pd.DataFrame:
     rows["accel_z"] = -9.806
     fixed = np.isclose(t % 1.0, 0.0) | np.isclose(t % 1.0, 1.0)
     detail = {"lat_deg": 48.0 + 10 * t / 111_200, "lon_deg": 11.0, "height_m": 500.0, "vel_n": 10.0, "vel_e": 0.0}
-    detail |= {"vel_d": 0.0, "quality": 4.0} | dict.fromkeys(STD[:3], 0.02) | dict.fromkeys(STD[3:], 0.02)
+    detail |= {"vel_d": 0.0, "quality": 4.0} | dict.fromkeys(STD, 0.02)
     for column in GNSS_COLUMNS:
         rows[column] = np.where(fixed, detail[column], np.nan)
     return rows.round(9)

@@ -80,6 +80,11 @@ def own_schema(column: str = "") -> pa.Schema:
     return _schema(dict.fromkeys(("t", column) if column else ("t",), F))
 
 
+def stack_columns(table: Mapping[str, Any] | pd.DataFrame, names: Sequence[str]) -> np.ndarray:
+    """Columns of a table side by side, (rows, names)."""
+    return np.stack([table[name] for name in names]).T
+
+
 def drive_file(folder: Path, kind: str, drive: str) -> Path:
     """Where a table of a drive is written; ``kind`` is imu, gnss, reference or one of :data:`AIDS`."""
     return resolve_place(folder) / kind / f"drive={drive}" / "part-0.parquet"

@@ -61,11 +61,7 @@ def epochs_of(length_s: float, epoch_s: float) -> int:
 
 
 def possible_starts(
-    drives: Sequence[Drive],
-    epochs: int,
-    *,
-    attitude: bool = False,
-    span: Int[Tensor, " rows"] | None = None,
+    drives: Sequence[Drive], epochs: int, *, attitude: bool = False, span: Int[Tensor, " rows"] | None = None
 ) -> Bool[Tensor, " rows"]:
     """Boundaries of the stack from which ``epochs`` epochs can be cut.
 

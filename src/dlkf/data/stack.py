@@ -12,13 +12,8 @@ from torch import Tensor
 from dlkf.base.errors import InputError, no_drives
 from dlkf.data.aids import ROW
 from dlkf.data.alignment import Aligned, align_boundaries
-from dlkf.data.drive import Drive
+from dlkf.data.drive import BOUNDARY_COLUMNS, Drive
 from dlkf.navigation.geodetic import geodetic_from_ecef
-
-BOUNDARY_COLUMNS = (
-    "gnss_r_e", "gnss_v_e", "gnss_std", "gnss_valid", "gnss_lag",
-    "ref_r_e", "ref_v_e", "ref_C_eb", "ref_valid", "ref_imu_error",
-)  # fmt: skip
 
 
 class DriveStack(Sequence[Drive]):
@@ -41,9 +36,7 @@ class DriveStack(Sequence[Drive]):
         self.first_epoch = lengths.cumsum(0) - lengths
         self.first_row = (lengths + 1).cumsum(0) - (lengths + 1)
         self.imu = torch.cat([d.imu for d in drives])
-        self.rows: dict[str, Tensor] = {
-            name: torch.cat([getattr(d, name) for d in drives]) for name in BOUNDARY_COLUMNS
-        }
+        self.rows = {name: torch.cat([getattr(d, name) for d in drives]) for name in BOUNDARY_COLUMNS}
         names = sorted({name for d in drives for name in d.aids})
         none = [torch.zeros(d.epochs + 1, len(ROW), dtype=torch.float64) for d in drives]
         self.aids = {n: torch.cat([d.aids.get(n, blank) for d, blank in zip(drives, none)]) for n in names}

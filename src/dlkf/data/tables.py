@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -24,17 +25,7 @@ from dlkf.base.files import (
     store_errors_as_input_error,
 )
 from dlkf.data.limits import LEVER_ARM_M
-from dlkf.data.schema import (
-    AIDS,
-    DRIVES,
-    DRIVES_REQUIRED,
-    LEVER_ARM,
-    OPTIONAL,
-    POSITION,
-    SCHEMAS,
-    check_name,
-    own_schema,
-)
+from dlkf.data.schema import AIDS, DRIVES_REQUIRED, LEVER_ARM, OPTIONAL, POSITION, SCHEMAS, check_name, own_schema
 
 Columns = dict[str, np.ndarray]
 CONTRACT = {**SCHEMAS, **AIDS}
@@ -54,12 +45,6 @@ def path_is_file(path: Path) -> bool:
     return not is_url(str(path)) and path.is_file()
 
 
-def neighbours(folder: Path) -> list[str]:
-    """Folders of this machine beside one that is not there."""
-    above = folder.parent
-    return [p.name for p in above.iterdir() if p.is_dir()] if not is_url(str(folder)) and above.is_dir() else []
-
-
 def read_drives(folder: str | Path) -> list[DriveRow]:
     """The drives of a dataset in the order of ``drives.parquet``.
 
@@ -77,7 +62,8 @@ def read_drives(folder: str | Path) -> list[DriveRow]:
         require_store(folder)
         if path_is_file(folder):
             raise InputError(f"dataset {folder}: is a file; give its folder, {folder.parent}")
-        near = did_you_mean(folder.name, neighbours(folder)) or "; make one with dlkf.simulate or dlkf.ingest"
+        beside = () if is_url(str(folder)) else folder.parent.glob("*/")
+        near = did_you_mean(folder.name, [p.name for p in beside]) or "; make one with dlkf.simulate or dlkf.ingest"
         raise InputError(f"dataset {folder}: no such folder{near}")
     if not whole:
         above = folder.parent
@@ -92,13 +78,8 @@ def read_drives(folder: str | Path) -> list[DriveRow]:
         raise InputError(f"dataset {folder}: drives.parquet has no rows; add one per drive")
     if doubles := sorted({n for n in names if names.count(n) > 1}):
         raise InputError(f"drives.parquet: drive {doubles[0]} appears twice; names must be unique")
-    arms = []
-    for column in LEVER_ARM:
-        if column in table.column_names:
-            kind = DRIVES.field(column).type
-            arms.append(np.nan_to_num(_column(table, column, kind, "drives.parquet").astype(float)))
-        else:
-            arms.append(np.zeros(len(names)))
+    there = {c: _column(table, c, pa.float64(), "drives.parquet") for c in LEVER_ARM if c in table.column_names}
+    arms = [np.nan_to_num(there.get(column, np.zeros(len(names)))) for column in LEVER_ARM]
     for name, arm in zip(names, zip(*arms)):
         if not math.hypot(*arm) <= LEVER_ARM_M:
             raise InputError(
@@ -180,6 +161,15 @@ def read_table(folder: str | Path, kind: str, drive: str, column: str = "") -> C
         remedy = "leave the drive out" if kind in SCHEMAS else "remove the table"
         raise InputError(f"drive {drive}, {place}: has no rows; {remedy} or give its data")
     return rows if len(rows["t"]) else None
+
+
+def refuse_rows(
+    table: Columns, names: Iterable[str], is_bad: Callable[[np.ndarray], np.ndarray], where: str, remedy: str
+) -> None:
+    """InputError for the first row in which one of the columns is bad."""
+    for name in names:
+        if len(rows := np.flatnonzero(is_bad(table[name]))):
+            raise InputError(f"{where}: row {rows[0]}: {name} is {table[name][rows[0]]}; {remedy}")
 
 
 def dataset_digest(folder: str | Path) -> str:

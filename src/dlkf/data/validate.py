@@ -12,12 +12,12 @@ import pandas as pd
 from dlkf.base.errors import InputError
 from dlkf.data.aid_checks import check_aid
 from dlkf.data.aid_tables import STANDARD, AidTable
-from dlkf.data.discovery.motion import motion
+from dlkf.data.discovery.motion import motion_of
 from dlkf.data.limits import FULL_SCALE, NONE_REFUSED, Refused, screen_fixes, within_full_scale
 from dlkf.data.plausibility import check_clocks, check_gnss_units, check_imu_units, check_turns
 from dlkf.data.reference_checks import check_attitude, check_same_place
-from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY
-from dlkf.data.tables import Columns, DriveRow, read_drives, read_table
+from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY, stack_columns
+from dlkf.data.tables import Columns, DriveRow, read_drives, read_table, refuse_rows
 
 GNSS_QUALITIES = (1, 2, 3, 4, 5, 9)  # NMEA GGA codes that are a satellite fix; 6, 7, 8 are not
 RATES_HZ = {"imu": (1.0, 1e4), "gnss": (1e-3, 500.0)}
@@ -99,9 +99,7 @@ def check_tables(tables: CheckedTables, limits: Limits = LIMITS) -> CheckedTable
     if truth is not None:
         _check_reference(truth, imu, read_fixes(gnss), _where(name, "reference"))
     if tables.aids:
-        fixes = read_fixes(gnss)
-        velocity = np.stack([fixes[c] for c in VELOCITY], -1)
-        moved = motion(fixes["t"], fixes["lat_deg"], fixes["lon_deg"], velocity)
+        moved = motion_of(read_fixes(gnss))
         for kind, table in tables.aids.items():
             _check_time(table["t"], _where(name, kind), kind)
             check_aid(kind, table, imu, moved, _where(name, kind))
@@ -150,9 +148,7 @@ def _coarse(t: np.ndarray) -> str:
 
 
 def _check_time(t: np.ndarray, where: str, kind: str = "imu") -> None:
-    bad = np.flatnonzero(~np.isfinite(t))
-    if len(bad):
-        raise InputError(f"{where}: row {bad[0]}: t is {t[bad[0]]}; remove the row or give its time in seconds")
+    refuse_rows({"t": t}, ("t",), lambda x: ~np.isfinite(x), where, "remove the row or give its time in seconds")
     back = np.flatnonzero(np.diff(t) <= 0)
     if len(back):
         k = int(back[0])
@@ -182,21 +178,12 @@ def _check_rate(t: np.ndarray, where: str, kind: str) -> None:
         )
 
 
-def _check_finite(table: Columns, names: tuple[str, ...], where: str, *, nan: bool) -> None:
-    for name in names:
-        values = table[name]
-        bad = np.flatnonzero(np.isinf(values) if nan else ~np.isfinite(values))
-        if len(bad):
-            k = int(bad[0])
-            remedy = "write NaN where it is unknown" if nan else "remove the row or split the drive there"
-            raise InputError(f"{where}: row {k}: {name} is {values[k]}; {remedy}")
-
-
 def _check_imu(imu: Columns, where: str, limits: Limits) -> Columns:
     """The samples within full scale, where the others are few."""
     t = imu["t"]
     _check_time(t, where)
-    _check_finite(imu, (*GYRO, *ACCEL), where, nan=False)
+    remedy = "remove the row or split the drive there"
+    refuse_rows(imu, (*GYRO, *ACCEL), lambda x: ~np.isfinite(x), where, remedy)
     if len(t) < 2:
         raise InputError(f"{where}: has a single sample; leave the drive out or give its data")
     _check_rate(t, where, "imu")
@@ -224,22 +211,19 @@ def _in_scale(imu: Columns) -> np.ndarray:
     """Samples within full scale; usually all are, which their extremes show."""
     if all(np.abs((imu[c].min(), imu[c].max())).max() <= most for s, most in zip((ACCEL, GYRO), FULL_SCALE) for c in s):
         return np.ones(len(imu["t"]), bool)
-    return within_full_scale(*(np.stack([imu[c] for c in sensor], -1) for sensor in (ACCEL, GYRO)))
+    return within_full_scale(stack_columns(imu, ACCEL), stack_columns(imu, GYRO))
 
 
 def _check_gnss(gnss: Columns, imu: Columns, where: str) -> Columns:
     """All rows but the fixes that no car can have reached, where those are few."""
     _check_time(gnss["t"], where, "gnss")
     _check_rate(gnss["t"], where, "gnss")
-    _check_finite(gnss, (*POSITION, *VELOCITY, *STD), where, nan=True)
+    refuse_rows(gnss, (*POSITION, *VELOCITY, *STD), np.isinf, where, "write NaN where it is unknown")
     fix = usable_fixes(gnss)
     if not fix.any():
         _check_fixes_there(gnss, where)
         raise InputError(f"{where}: no GNSS fix at all (position NaN or quality 0 in every row); leave the drive out")
-    for name in STD:
-        bad = np.flatnonzero(gnss[name] < 0)
-        if len(bad):
-            raise InputError(f"{where}: row {bad[0]}: {name} is {gnss[name][bad[0]]}; must be ≥ 0, or NaN if unknown")
+    refuse_rows(gnss, STD, lambda x: x < 0, where, "must be ≥ 0, or NaN if unknown")
     t, first, last = gnss["t"][fix], imu["t"][0], imu["t"][-1]
     if not ((t > first) & (t <= last + 1)).any():
         epochs = abs(abs(t[0] - first) - UNIX_TO_GPS_S) < EPOCHS_APART_S
@@ -288,7 +272,7 @@ def _check_fixes_there(gnss: Columns, where: str) -> None:
 
 def _check_reference(reference: Columns, imu: Columns, fixes: Columns, where: str) -> None:
     _check_time(reference["t"], where, "reference")
-    _check_finite(reference, (*POSITION, *VELOCITY, *ATTITUDE), where, nan=True)
+    refuse_rows(reference, (*POSITION, *VELOCITY, *ATTITUDE), np.isinf, where, "write NaN where it is unknown")
     known = reference["valid"] & np.isfinite(reference["lat_deg"]) & np.isfinite(reference["lon_deg"])
     if not known.any():
         return

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
 from dlkf.base.colours import COLOURS
 from dlkf.base.errors import InputError
 from dlkf.base.files import resolve_place, write_into
 from dlkf.base.provenance import describe_provenance
+from dlkf.data.schema import stack_columns
 from dlkf.diagnosis.allan import AllanFit, Array, allan_variance, check_static, cluster_sizes, fit_noise, preset_yaml
 from dlkf.evaluation.figures import png
 from dlkf.evaluation.table import ResultTable, as_json, as_markdown, format_number
@@ -64,12 +64,7 @@ def noise_table(log: StaticLog) -> ResultTable:
         accel = name.startswith("accel")
         walk, bias = (60.0, 1 / MILLIGAL) if accel else (60 / DEG, 3600 / DEG)
         time = format_number(fit.time) + ("" if fit.resolved else "*")
-        row = [
-            format_number(fit.density * walk),
-            format_number(fit.floor * bias),
-            format_number(fit.floor_s),
-            format_number(fit.walk * bias * 60),
-        ]
+        row = [format_number(x) for x in (fit.density * walk, fit.floor * bias, fit.floor_s, fit.walk * bias * 60)]
         row += [format_number(fit.sigma * bias), time] if fit.rises else ["–", "–"]
         rows.append([f"{NAMES[name]}, all axes" if name in TRIADS else name.replace("_", " "), *row])
     order = [0, 1, 2, 6, 3, 4, 5, 7]
@@ -138,11 +133,9 @@ def write_allan(out: str | Path, log: StaticLog, spec: ImuSpec) -> list[Path]:
 
 
 def _csv(log: StaticLog) -> str:
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["tau_s", *(f"{axis}_{unit}" for axis, unit in zip(AXES, ["m_s2"] * 3 + ["rad_s"] * 3))])
-    writer.writerows([f"{x:.6g}" for x in row] for row in np.column_stack((log.tau, log.deviation)))
-    return out.getvalue()
+    columns = [f"{axis}_{unit}" for axis, unit in zip(AXES, ["m_s2"] * 3 + ["rad_s"] * 3)]
+    table = pd.DataFrame(log.deviation, log.tau, columns).rename_axis("tau_s").reset_index()
+    return table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
 
 
 def part(imu: dict[str, Array], from_s: float | None, to_s: float | None) -> tuple[Array, float]:
@@ -151,8 +144,7 @@ def part(imu: dict[str, Array], from_s: float | None, to_s: float | None) -> tup
     if from_s is not None and to_s is not None and to_s <= from_s:
         raise InputError(f"to_s={to_s:g} is not after from_s={from_s:g}")
     kept = (t >= t[0] + (from_s or 0.0)) & (t <= t[0] + (math.inf if to_s is None else to_s))
-    samples = np.stack([imu[c][kept] for c in AXES], -1)
-    return samples, float((len(t) - 1) / (t[-1] - t[0]))
+    return stack_columns(imu, AXES)[kept], float((len(t) - 1) / (t[-1] - t[0]))
 
 
 def choose_drive(names: Sequence[str], drive: str | None) -> str:

@@ -11,9 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlkf.base.errors import InputError
-from dlkf.data.discovery.findings import Raw, discover
+from dlkf.data.discovery.findings import discover
 from dlkf.data.limits import horizontal_distance
-from dlkf.data.schema import ACCEL, GYRO, POSITION, QUALITIES, VELOCITY
+from dlkf.data.schema import ACCEL, GYRO, QUALITIES
 from dlkf.data.tables import Columns, DriveRow
 from dlkf.data.validate import CheckedTables, read_checked, read_fixes, usable_fixes
 from dlkf.navigation.earth import STANDARD_GRAVITY
@@ -47,9 +47,8 @@ def checkup(folder: str | Path, row: DriveRow, *, discover_pose: bool = True) ->
     yield from gnss_findings(tables.imu, tables.gnss)
     yield from motion_findings(tables.gnss)
     if tables.reference is None:
-        yield CheckupResult(
-            NOTE, "no reference: evaluate reference=smoothed scores against the drive's own smoothed solution"
-        )
+        text = "no reference: evaluate reference=smoothed scores against the drive's own smoothed solution"
+        yield CheckupResult(NOTE, text)
     else:
         share = float(np.mean(tables.reference["valid"]))
         attitude = bool(np.isfinite(tables.reference["roll"]).any())
@@ -79,9 +78,8 @@ def imu_findings(imu: Columns) -> Iterator[CheckupResult]:
             x = imu[name]
             top = np.abs(x).max()
             if top > 0 and np.sum(np.abs(x) == top) > max(10, 0.001 * len(x)) and np.ptp(x) > 0:
-                yield CheckupResult(
-                    BAD, f"{name} stays at {top:.4g} {unit}: the sensor saturates; choose a larger range"
-                )
+                text = f"{name} stays at {top:.4g} {unit}: the sensor saturates; choose a larger range"
+                yield CheckupResult(BAD, text)
             if np.ptp(x) == 0:
                 yield CheckupResult(BAD, f"{name} never changes: {x[0]:.4g} {unit}")
     force = float(np.median(np.sqrt(sum(imu[n] ** 2 for n in ACCEL))))
@@ -103,21 +101,17 @@ def gnss_findings(imu: Columns, gnss: Columns) -> Iterator[CheckupResult]:
     shares = ", ".join(f"{c / len(gnss['t']):.0%} {QUALITIES.get(q, f'quality {q}')}" for q, c in zip(codes, counts))
     best = float(np.mean(np.isin(gnss["quality"], (4, 5, 2, 9))))
     yield CheckupResult(GOOD if best > 0.5 else NOTE, f"GNSS: {shares}")
-    gaps = np.diff(t)
-    holes = gaps[gaps > max(3 * usual, 2.0)]
-    if len(holes):
-        yield CheckupResult(
-            NOTE, f"GNSS: {len(holes)} gaps over {max(3 * usual, 2.0):.3g} s, the longest {holes.max():.4g} s"
-        )
+    gaps, most = np.diff(t), max(3 * usual, 2.0)
+    if len(holes := gaps[gaps > most]):
+        yield CheckupResult(NOTE, f"GNSS: {len(holes)} gaps over {most:.3g} s, the longest {holes.max():.4g} s")
     overlap = (min(t[-1], imu["t"][-1]) - max(t[0], imu["t"][0])) / max(imu["t"][-1] - imu["t"][0], 1e-9)
     if overlap < 0.9:
         text = f"GNSS and IMU have only {max(overlap, 0):.0%} of the IMU's time in common"
         yield CheckupResult(NOTE if overlap > 0.5 else BAD, text)
     known = np.isfinite(gnss["vel_n"][usable]).mean()
     if known < 0.9:
-        yield CheckupResult(
-            NOTE, f"GNSS: {known:.0%} of the fixes have a velocity; alignment and outages are better with it"
-        )
+        text = f"GNSS: {known:.0%} of the fixes have a velocity; alignment and outages are better with it"
+        yield CheckupResult(NOTE, text)
     std = np.hypot(gnss["std_pos_n"], gnss["std_pos_e"])[usable]
     text = "GNSS: no 1σ in the file; the filter takes usual ones of the quality"
     if np.isfinite(std).any():
@@ -150,17 +144,10 @@ def motion_findings(gnss: Columns) -> Iterator[CheckupResult]:
 
 def discover_findings(tables: CheckedTables) -> Iterator[CheckupResult]:
     """Clock offset, pose of the sensor in the car, and lever arm estimated from the motion, against what is stored."""
-    imu, gnss = tables.imu, read_fixes(tables.gnss)
-    raw = Raw(
-        t=imu["t"], accel=np.stack([imu[c] for c in ACCEL], -1), gyro=np.stack([imu[c] for c in GYRO], -1),
-        accel_factor=1.0, gyro_factor=1.0, gnss_t=gnss["t"], lat_deg=gnss[POSITION[0]],
-        lon_deg=gnss[POSITION[1]], v_ned=np.stack([gnss[c] for c in VELOCITY], -1),
-    )  # fmt: skip
-    for finding in discover(raw, {"imu.time.offset_s", "imu.axes"}, known_accel={}, known_gyro={}).found:
+    for finding in discover(tables.imu, read_fixes(tables.gnss), {"imu.time.offset_s", "imu.axes"}):
         if finding.setting == "gnss.time.drift_ppm":
-            yield CheckupResult(
-                NOTE, f"clocks: {finding.value:+.0f} {finding.detail}; {ESTIMATED}reader.{finding.setting}=auto"
-            )
+            text = f"clocks: {finding.value:+.0f} {finding.detail}; {ESTIMATED}reader.{finding.setting}=auto"
+            yield CheckupResult(NOTE, text)
         elif not finding.sure:
             yield CheckupResult(NOTE, f"{finding.setting}: the motion does not show it ({finding.detail})")
         elif finding.setting == "imu.time.offset_s":
@@ -174,9 +161,8 @@ def discover_findings(tables: CheckedTables) -> Iterator[CheckupResult]:
             angle = turned_deg(finding.value)
             fine = angle < ANGLE_DEG
             text = f"pose: the sensor is turned {angle:.1f}° against the car ({finding.detail})"
-            yield CheckupResult(
-                GOOD if fine else BAD, text + ("" if fine else "; ingest with reader=auto or reader.imu.axes")
-            )
+            remedy = "" if fine else "; ingest with reader=auto or reader.imu.axes"
+            yield CheckupResult(GOOD if fine else BAD, text + remedy)
 
 
 ESTIMATED = "plus and filters with +receiver estimate it; for others ingest with "

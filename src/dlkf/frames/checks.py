@@ -120,13 +120,14 @@ def _check_numbers(name: str, frame: pd.DataFrame, columns: Iterable[str]) -> No
         if known:
             remedy = f"numbers as text; pd.to_numeric({name}.{column}) makes them numbers"
         else:
-            wrong = next(k for k, v in enumerate(values) if not _is_number(v))
-            if column == "t" and _is_date(values.iloc[wrong]):
+            wrong, value = next((k, v) for k, v in enumerate(values) if not _is_number(v))
+            is_text = isinstance(value, str) and len(value) > 7
+            if column == "t" and is_text and pd.notna(pd.to_datetime(value, errors="coerce")):
                 raise InputError(
                     f"{name}: t has dates as text, must be seconds on one clock for all frames: "
                     f'(pd.to_datetime({name}.t) - pd.Timestamp("2025-07-05")).dt.total_seconds()'
                 )
-            remedy = f"row {wrong} has {values.iloc[wrong]!r}, must be a number, NaN where unknown"
+            remedy = f"row {wrong} has {value!r}, must be a number, NaN where unknown"
         raise InputError(f"{name}: {column}: {remedy}")
 
 
@@ -136,10 +137,6 @@ def _is_number(value: Any) -> bool:
     except (TypeError, ValueError):
         return False
     return True
-
-
-def _is_date(value: Any) -> bool:
-    return isinstance(value, str) and len(value) > 7 and pd.notna(pd.to_datetime(value, errors="coerce"))
 
 
 def _shown(value: Any) -> str:

@@ -13,9 +13,6 @@ from dlkf.base.errors import InputError
 SHOWN = 12  # columns in a line
 OTHER_NAMES = {  # what people call the contract's columns, beside what the readers know (dlkf.data.readers.vocabulary)
     "t": ("time", "timestamp", "time_s", "seconds", "stamp", "date"),
-    "lat_deg": ("lat", "latitude"),
-    "lon_deg": ("lon", "lng", "long", "longitude"),
-    "height_m": ("height", "alt", "altitude", "h", "alt_m"),
     "speed": ("speed_mps", "velocity", "v", "speed_kmh"),
     "heading": ("heading_deg", "yaw", "course"),
     **{f"{s}_{a}": (f"{short}{a}", f"{short}_{a}", f"{s}{a}", f"{s[:3]}_{a}")

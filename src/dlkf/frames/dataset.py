@@ -17,13 +17,8 @@ from dlkf.frames.checks import check_frames, check_lever_arm
 
 DRIVE = "frames"  # the name of the one drive in the temporary dataset
 IN_PYTHON = (  # what a line advises for logs on disk, and what it is for frames
-    (r"reader\.gnss\.time\.offset_s=auto, or (-?[\d.]+)", r"add \1 s to t of gnss"),
-    (r"reader\.imu\.accel\.unit=auto finds it, if gravity was not taken out", "accel in m/s² with gravity"),
-    (r"reader\.imu\.accel\.axes=flu and gyro\.axes=flu, or auto", "turn the signs of y and z of accel and gyro round"),
-    (r"; set reader\.gnss\.position\.unit", "; give degrees"),
-    (r"\breader\.[\w.]+=\S+, or ", ""),
+    (r"\breader\.[\w.]+=\S+( and [\w.]+=\S+)?, or ", ""),
     (r" \([^()]*(?:reader\.|dlkf\.ingest )[^()]*\)", ""),
-    (r"no position yet; quality 0", "no position yet; give them quality 0"),
     (r" with aids=\[\]", ""),
     (r"; lower align\.min_speed or leave the drive out", "; give a longer part of the drive, with turns and speed"),
     (r"; reference=smoothed or gnss needs none", "; without reference= the drive smoothed with its fixes is one"),
@@ -38,24 +33,28 @@ def drive_folder(
     imu: pd.DataFrame, gnss: pd.DataFrame, reference: pd.DataFrame | None, lever_arm: Sequence[float],
     aids: Mapping[str, pd.DataFrame | None],
 ) -> Iterator[Path]:  # fmt: skip
-    """A temporary dataset of one drive, checked where it is read; error lines name the frames, not its files."""
+    """A temporary dataset of one drive, checked where it is read.
+
+    Error lines name the frames, not its files, and what callers can do, not settings of commands.
+    """
     from dlkf.data.schema import ATTITUDE, LEVER_ARM, STD, VELOCITY, write_drive, write_drives_table
 
     check_frames(imu, gnss, reference, aids)
     arm = check_lever_arm(lever_arm)
-    with TemporaryDirectory(prefix="dlkf-") as here, errors_of_frames():
-        folder = Path(here) / "frames"
-        meta = {"drive": DRIVE} | dict(zip(LEVER_ARM, arm))
-        fixes = _completed("gnss", gnss, dict.fromkeys((*VELOCITY, *STD), np.nan) | {"quality": 1})
-        fixes["quality"] = fixes["quality"].fillna(1).astype(np.int8)
-        truth = None
-        if reference is not None:
-            unknown = dict.fromkeys((*VELOCITY, *ATTITUDE), np.nan)
-            truth = _completed("reference", reference, unknown | {"valid": True})
-        given = {kind: _completed(kind, frame, {}) for kind, frame in aids.items() if frame is not None}
-        row = write_drive(folder, meta, _completed("imu", imu, {}), fixes, truth, given)
-        write_drives_table(folder, [row])
-        yield folder
+    meta = {"drive": DRIVE} | dict(zip(LEVER_ARM, arm))
+    fixes = _completed("gnss", gnss, dict.fromkeys((*VELOCITY, *STD), np.nan) | {"quality": 1})
+    fixes["quality"] = fixes["quality"].fillna(1).astype(np.int8)
+    unknown = dict.fromkeys((*VELOCITY, *ATTITUDE), np.nan) | {"valid": True}
+    truth = None if reference is None else _completed("reference", reference, unknown)
+    given = {kind: _completed(kind, frame, {}) for kind, frame in aids.items() if frame is not None}
+    try:
+        with TemporaryDirectory(prefix="dlkf-") as here:
+            folder = Path(here) / "frames"
+            row = write_drive(folder, meta, _completed("imu", imu, {}), fixes, truth, given)
+            write_drives_table(folder, [row])
+            yield folder
+    except InputError as error:
+        raise InputError(reword(str(error))) from None
 
 
 def _completed(kind: str, frame: pd.DataFrame, defaults: Mapping[str, Any]) -> pd.DataFrame:
@@ -67,15 +66,6 @@ def _completed(kind: str, frame: pd.DataFrame, defaults: Mapping[str, Any]) -> p
     mixed = {name: x for name, x in kept.items() if not pd.api.types.is_numeric_dtype(x)}  # objects, categories
     kept |= {name: pd.to_numeric(x.astype(object)) for name, x in mixed.items()}
     return pd.DataFrame({**kept, **{name: value for name, value in defaults.items() if name not in frame}})
-
-
-@contextmanager
-def errors_of_frames() -> Iterator[None]:
-    """Turns places in the temporary dataset into names of frames, and settings of commands into what callers can do."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(reword(str(error))) from None
 
 
 def reword(line: str) -> str:

@@ -52,6 +52,7 @@ def simulate(
     from dlkf.command.composing import compose_command
     from dlkf.command.simulated import SimulateSettings
     from dlkf.data.readers.frames import DriveFrames
+    from dlkf.data.schema import drive_file
     from dlkf.data.tables import read_drives_table
     from dlkf.simulation.dataset import simulate as simulate_dataset
 
@@ -62,20 +63,16 @@ def simulate(
     if not SHORTEST_MIN <= minutes <= LONGEST_MIN:
         raise InputError(f"minutes is {minutes:g}, must be from {SHORTEST_MIN:g} to {LONGEST_MIN:g} a drive")
     drives, seed = check_whole("drives", drives, 1), check_whole("seed", seed, 0)
-    words = [
-        f"simulated@dataset={preset}",
-        f"dataset.hours={minutes * drives / 60}",
-        f"dataset.drive_minutes={minutes}",
-    ]
-    words += [f"seed={seed}"] + ([f"imu={imu_type}"] if imu_type else [])
+    words = [f"simulated@dataset={preset}", f"dataset.hours={minutes * drives / 60}", f"seed={seed}"]
+    words += [f"dataset.drive_minutes={minutes}", *([f"imu={imu_type}"] if imu_type else [])]
     recipe = settings_from(SimulateSettings, compose_command("simulate", *words), "").recipe
     with TemporaryDirectory(prefix="dlkf-") as folder:
         out = Path(folder) / "simulated"
         simulate_dataset(recipe, out, progress=False)
         made = []
         for row in read_drives_table(out).to_dict("records"):
-            imu, gnss, reference = (_table(out, kind, str(row["drive"])) for kind in ("imu", "gnss", "reference"))
-            assert imu is not None  # simulated drives have one
+            files = (drive_file(out, kind, str(row["drive"])) for kind in ("imu", "gnss", "reference"))
+            imu, gnss, reference = map(pd.read_parquet, files)
             made.append(DriveFrames({str(key): value for key, value in row.items()}, imu, gnss, reference))
         return made
 
@@ -129,7 +126,7 @@ def read_logs(source: str | Path, reader: str = "auto", *settings: str, skip_uns
         return list(opened.read(str(place)))
     places = absolute_places(opened, place)
     made: dict[str, DriveFrames] = {}
-    for result in read_together(opened, _AsFrames(), "", places, None, skip_unsure):
+    for result in read_together(opened, _as_frames, places, None, skip_unsure):
         for row in result.rows:
             drive = row["drive"]
             made[drive.name] = replace(drive, notes=result.notes)
@@ -138,15 +135,8 @@ def read_logs(source: str | Path, reader: str = "auto", *settings: str, skip_uns
     return [made[name] for _, name, _ in places if name in made]
 
 
-class _AsFrames:
-    """Drives that are read stay frames."""
+def _as_frames(drive: DriveFrames) -> IngestResult:
+    """A drive that stays frames."""
+    from dlkf.data.intake import IngestResult
 
-    def take_in(self, drive: DriveFrames, folder: str) -> IngestResult:
-        from dlkf.data.intake import IngestResult
-
-        return IngestResult([{"drive": drive}], [], drive.notes, drive.mapping)
-
-
-def _table(folder: Path, kind: str, drive: str) -> pd.DataFrame | None:
-    file = folder / kind / f"drive={drive}" / "part-0.parquet"
-    return pd.read_parquet(file) if file.is_file() else None
+    return IngestResult([{"drive": drive}], [], drive.notes, drive.mapping)

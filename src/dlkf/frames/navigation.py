@@ -190,14 +190,16 @@ def load(
     """
     from dlkf.base.settings import settings_from
     from dlkf.filters.tuning import Tuning
+    from dlkf.navigation.imu_errors import imu_spec
     from dlkf.tracking.models import resolve_model, unused_settings
 
     factors = settings_from(Tuning, tuning_values(tuning), "tuning")
-    model, spec = check_model(model), _imu_spec(imu_type)
+    model = check_model(model)
+    check_imu_type(imu_type)
     given = {"imu_type": imu_type, "tuning": tuning}
     if line := unused_settings(model, [name for name, value in given.items() if value != DEFAULT_NOISE[name]]):
         warnings.warn(line, UserWarning, stacklevel=3)
-    return resolve_model(model, spec, tuning=factors)
+    return resolve_model(model, imu_spec(imu_values(imu_type)), tuning=factors)
 
 
 def Stream(
@@ -250,10 +252,3 @@ def _align() -> Any:
     from dlkf.data.alignment import AlignConfig
 
     return settings_from(AlignConfig, yaml.safe_load((config_dir() / "navigate.yaml").read_text())["align"], "align")
-
-
-def _imu_spec(imu_type: str | Mapping[str, Any]) -> Any:
-    from dlkf.navigation.imu_errors import imu_spec
-
-    check_imu_type(imu_type)
-    return imu_spec(imu_values(imu_type))

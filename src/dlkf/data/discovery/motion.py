@@ -8,9 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from dlkf.data.limits import EARTH_M
+from dlkf.data.schema import VELOCITY, stack_columns
+from dlkf.data.tables import Columns
 
 Floats = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]
@@ -59,6 +62,12 @@ def motion(t: Floats, lat_deg: Floats, lon_deg: Floats, v_ned: Floats) -> Motion
     speed = np.abs(v)
     climb = np.where(speed > MOVING, -np.nan_to_num(v_ned[known, 2]) / np.maximum(speed, 0.1), 0.0)
     return Motion(t[known], v, np.clip(climb, -0.3, 0.3), stride=_stride(t[known]))
+
+
+def motion_of(fixes: Columns | pd.DataFrame) -> Motion:
+    """:func:`motion` of the usable rows of a GNSS table."""
+    t, lat, lon = (np.asarray(fixes[c]) for c in ("t", "lat_deg", "lon_deg"))
+    return motion(t, lat, lon, stack_columns(fixes, VELOCITY))
 
 
 def stretches(t: Floats, seconds: float, broken: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

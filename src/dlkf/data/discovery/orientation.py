@@ -90,18 +90,113 @@ class _Fit:
 
 
 class _Equations:
-    """Design and left side of a levelled sensor at any lag. Every block that is left out asks for the same lags: what
-    they have in common is made once."""
+    """Those of a levelled sensor at any lag. Every block that is left out asks for the same lags: what they have in
+    common is made once."""
 
     def __init__(self, level: Levelled, gnss: Motion, parts: _Intervals, slip: tuple[float, float]) -> None:
         self.level, self.gnss, self.parts, self.slip = level, gnss, parts, slip
         self._made: dict[float, tuple[Complex, Complex]] = {}
 
-    def at(self, lag: float) -> tuple[Complex, Complex]:
-        """As :func:`_design`, without the slope of the way."""
+    def scan(self, lag_s: float, span: float, keep: np.ndarray) -> _Fit | None:
+        """The fit of the lag with the least residuals, by a parabola round the best."""
+        step = STEP_S if span > 0.3 else STEP_S / 4
+        lags = lag_s + np.arange(-round(span / step), round(span / step) + 1) * step
+        use = keep & self._covered(lags[0], lags[-1])
+        if (use & self.parts.moving).sum() < FEWEST // 2:
+            return None
+        costs = np.array([self._residuals(lag, use)[-1] for lag in lags])
+        lag = float(lags[costs.argmin()])
+        near = np.abs(lags - lag) < (2.5 * STEP_S if span > 0.3 else 0.035)
+        a, b, _ = np.polyfit(lags[near] - lag, costs[near], 2)  # shaking makes the residuals' minimum a ragged one
+        if near.sum() > 3 and a > 0:
+            lag += float(np.clip(-0.5 * b / a, -span, span))
+        return self._fit(lag, use)
+
+    def sound(self, lag: float) -> np.ndarray:
+        """Intervals without outliers of GNSS: residuals at most five medians, of a fit to all."""
+        use = self._covered(lag, lag)
+        if not use.any():
+            return use
+        A, y, x, _ = self._residuals(lag, use)
+        off = np.abs(y - A @ x)
+        return off <= 5 * max(float(np.median(off[use])), 1e-3)
+
+    def _covered(self, least: float, most: float) -> np.ndarray:
+        """Intervals that lie inside the IMU's time at all lags from ``least`` to ``most``."""
+        return (self.parts.t0 + least >= self.level.t[0]) & (self.parts.t1 + most <= self.level.t[-1])
+
+    def _gained(self, values: np.ndarray, lag: float) -> np.ndarray:
+        """What values at the limits of the samples gain in each interval."""
+        t = self.level.t
+        return np.interp(self.parts.t1 + lag, t, values) - np.interp(self.parts.t0 + lag, t, values)
+
+    def _rates(self, at: Floats) -> Floats:
+        """Yaw rate [rad/s] round times of the IMU, mean of 0.2 s."""
+        t, turn = self.level.t, self.level.turn
+        return (np.interp(at + 0.1, t, turn) - np.interp(at - 0.1, t, turn)) / 0.2
+
+    def _design(self, lag: float, force: Complex, slope: float) -> tuple[Complex, Complex]:
+        """Columns (α, α b, λ) and left side; ``slope`` 1 to take the way's slope from GNSS."""
+        hold = np.exp(1j * self._held(lag))
+        design = np.stack([hold * self._gained(x, lag) for x in (force, self.level.ones, self.level.swing)], -1)
+        return design, self.parts.dv + slope * self.parts.slope
+
+    def _held(self, lag: float) -> Floats:
+        """Heading minus turn in the middle of the intervals: averaged over seconds, weighted by speed."""
+        gnss, level = self.gnss, self.level
+        rows = np.arange(len(gnss.t))[:: gnss.stride]
+        rows = rows[gnss.speed[rows] > MOVING]
+        t, speed = gnss.t[rows], gnss.speed[rows]
+        beside = self._rates(t + lag) * (self.slip[0] / speed + self.slip[1] * speed)
+        apart = np.exp(1j * (gnss.course[rows] - beside - np.interp(t + lag, level.t, level.turn)))
+        weight = np.minimum(speed, 15.0) ** 2
+        reach = max(1, round(2 * SMOOTH_S / max(float(np.median(np.diff(t))) if len(t) > 1 else 1.0, 0.1)))
+        total = np.zeros(len(t), complex)
+        for shift in range(min(reach + 1, len(t))):  # each row and the one so many behind it, of the same distance
+            first, second = slice(len(t) - shift), slice(shift, None)
+            near = np.exp(-0.5 * ((t[second] - t[first]) / SMOOTH_S) ** 2)
+            total[first] += near * weight[second] * apart[second]
+            if shift:
+                total[second] += near * weight[first] * apart[first]
+        return np.interp(0.5 * (self.parts.t0 + self.parts.t1), t, np.unwrap(np.angle(total)))
+
+    def _residuals(self, lag: float, use: np.ndarray) -> tuple[Complex, Complex, Complex, float]:
+        """Least squares at a lag, without the way's slope: design and left side of all rows, the solution, the squared
+        sum of the rows in use."""
         if lag not in self._made:
-            self._made[lag] = _design(self.level, self.gnss, self.parts, lag, self.slip, self.level.tilted, 0.0)
-        return self._made[lag]
+            self._made[lag] = self._design(lag, self.level.tilted, 0.0)
+        quick = _quick(np.column_stack(self._made[lag]), use, self.parts.stride)
+        A, y = quick[:, :-1], quick[:, -1]
+        x, *_ = np.linalg.lstsq(A[use], y[use], rcond=None)
+        return A, y, x, float(np.sum(np.abs(y[use] - A[use] @ x) ** 2)) + 1e-9
+
+    def _bias(self, lag: float, use: np.ndarray) -> complex:
+        """Mean horizontal force that is not the car's: what levelling left over, and the accelerometers' bias."""
+        design, left = self._design(lag, self.level.force, 1.0)
+        x, *_ = np.linalg.lstsq(design[use], left[use], rcond=None)
+        return complex(x[1] / x[0]) if x[0] else 0j
+
+    def _fit(self, lag: float, use: np.ndarray) -> _Fit:
+        """All that is fitted at a lag."""
+        parts = self.parts
+        A, y, x, rest = self._residuals(lag, use)
+        A, y = A[use], y[use]
+        inverse = np.linalg.pinv(A.conj().T @ A)
+        arm_std = float(np.sqrt(parts.stride * abs(inverse[2, 2]) * rest / max(len(y) - 3, 1)))
+        turning = use & parts.moving
+        rate0, rate1 = self._rates(parts.t0 + lag), self._rates(parts.t1 + lag)
+        v0, v1 = np.maximum(parts.v0, MOVING), np.maximum(parts.v1, MOVING)
+        turn = self._gained(self.level.turn, lag)
+        columns = (turn, parts.t1 - parts.t0, rate1 / v1 - rate0 / v0, rate1 * v1 - rate0 * v0)
+        B = np.column_stack(columns)[turning] * parts.weight[turning, None]
+        z = parts.turned[turning] * parts.weight[turning]
+        # what is known of cars: an antenna 2 m or so from the axle, sideslip of 0.01 s²/m
+        prior = np.diag([0.0, 0.0, 1 / 2.0, 1 / 0.01]) * SLIP_NOISE
+        s, *_ = np.linalg.lstsq(np.concatenate((B, prior)), np.concatenate((z, np.zeros(4))), rcond=None)
+        return _Fit(
+            lag, complex(x[0]), self._bias(lag, use), complex(x[2]), float(s[0]), rest,
+            float(np.sum(np.abs(y) ** 2)), arm_std, (float(s[2]), float(s[3])),
+        )  # fmt: skip
 
 
 def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float) -> Pose | None:
@@ -122,8 +217,8 @@ def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float
     for span in (SPAN_S, 0.1, 0.06):
         level = levelled(t, accel, gyro * unit, down)
         equations = _Equations(level, gnss, parts, slip)
-        good = _sound(equations, lag)
-        fit = _scan(equations, lag, span, good)
+        good = equations.sound(lag)
+        fit = equations.scan(lag, span, good)
         if fit is None:
             return None
         lag, unit, slip = fit.lag_s, unit * fit.scale, fit.slip
@@ -142,7 +237,7 @@ def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float
     for block in range(BLOCKS):
         keep = parts.block != block
         keep &= good
-        if (keep & parts.moving).sum() >= FEWEST // 2 and (one := _scan(equations, lag, 0.07, keep)):
+        if (keep & parts.moving).sum() >= FEWEST // 2 and (one := equations.scan(lag, 0.07, keep)):
             leave.append(one)
             middles.append(float(np.mean(parts.t0[~keep & good])) if (~keep & good).any() else np.nan)
     if len(leave) < BLOCKS // 2:
@@ -224,65 +319,6 @@ def _gyro_scale(t: Floats, rate: Floats, parts: _Intervals, lag_s: float) -> flo
     return float(slope) if slope > 0 else None
 
 
-def _scan(equations: _Equations, lag_s: float, span: float, keep: np.ndarray) -> _Fit | None:
-    """The fit of the lag with the least residuals, by a parabola round the best."""
-    step = STEP_S if span > 0.3 else STEP_S / 4
-    lags = lag_s + np.arange(-round(span / step), round(span / step) + 1) * step
-    use = keep & _covered(equations.level, equations.parts, lags[0], lags[-1])
-    if (use & equations.parts.moving).sum() < FEWEST // 2:
-        return None
-    costs = np.array([_residuals(equations, lag, use)[-1] for lag in lags])
-    lag = float(lags[costs.argmin()])
-    near = np.abs(lags - lag) < (2.5 * STEP_S if span > 0.3 else 0.035)
-    a, b, _ = np.polyfit(lags[near] - lag, costs[near], 2)  # shaking makes the residuals' minimum a ragged one
-    if near.sum() > 3 and a > 0:
-        lag += float(np.clip(-0.5 * b / a, -span, span))
-    return _fit(equations, lag, use)
-
-
-def _covered(level: Levelled, parts: _Intervals, least: float, most: float) -> np.ndarray:
-    """Intervals that lie inside the IMU's time at all lags from ``least`` to ``most``."""
-    return (parts.t0 + least >= level.t[0]) & (parts.t1 + most <= level.t[-1])
-
-
-def _bias(equations: _Equations, lag: float, use: np.ndarray) -> complex:
-    """Mean horizontal force that is not the car's: what levelling left over, and the accelerometers' bias."""
-    level, slip = equations.level, equations.slip
-    design, left = _design(level, equations.gnss, equations.parts, lag, slip, level.force, 1.0)
-    x, *_ = np.linalg.lstsq(design[use], left[use], rcond=None)
-    return complex(x[1] / x[0]) if x[0] else 0j
-
-
-def _sound(equations: _Equations, lag: float) -> np.ndarray:
-    """Intervals without outliers of GNSS: residuals at most five medians, of a fit to all."""
-    use = _covered(equations.level, equations.parts, lag, lag)
-    if not use.any():
-        return use
-    A, y, x, _ = _residuals(equations, lag, use)
-    off = np.abs(y - A @ x)
-    return off <= 5 * max(float(np.median(off[use])), 1e-3)
-
-
-def _design(
-    level: Levelled,
-    gnss: Motion,
-    parts: _Intervals,
-    lag: float,
-    slip: tuple[float, float],
-    force: Complex,
-    slope: float,
-) -> tuple[Complex, Complex]:
-    """Columns (α, α b, λ) and left side of the equations; ``slope`` 1 to take the way's slope from GNSS."""
-    middle = 0.5 * (parts.t0 + parts.t1)
-    hold = np.exp(1j * _held(level, gnss, lag, slip)(middle))
-
-    def gained(values: Complex) -> Complex:
-        return hold * (np.interp(parts.t1 + lag, level.t, values) - np.interp(parts.t0 + lag, level.t, values))
-
-    design = np.stack([gained(x) for x in (force, level.ones, level.swing)], -1)
-    return design, parts.dv + slope * parts.slope
-
-
 def _quick(columns: Complex, use: np.ndarray, stride: int) -> Complex:
     """Columns less their mean over ``SLOW_ROWS`` round each row, of the rows in use: tilt drifts, cars do not wait."""
     from scipy.ndimage import gaussian_filter1d
@@ -292,65 +328,6 @@ def _quick(columns: Complex, use: np.ndarray, stride: int) -> Complex:
     masked = (columns * weight[:, None]).view(float)  # real and imaginary parts side by side
     slow = gaussian_filter1d(masked, rows, axis=0, mode="constant").view(complex)
     return columns - slow / share[:, None]
-
-
-def _rates(level: Levelled, at: Floats) -> Floats:
-    """Yaw rate [rad/s] round times of the IMU, mean of 0.2 s."""
-    return (np.interp(at + 0.1, level.t, level.turn) - np.interp(at - 0.1, level.t, level.turn)) / 0.2
-
-
-def _held(level: Levelled, gnss: Motion, lag: float, slip: tuple[float, float]):
-    """Heading minus turn as a function of GNSS time: averaged over seconds, weighted by speed."""
-    rows = np.arange(len(gnss.t))[:: gnss.stride]
-    rows = rows[gnss.speed[rows] > MOVING]
-    t, speed = gnss.t[rows], gnss.speed[rows]
-    beside = _rates(level, t + lag) * (slip[0] / speed + slip[1] * speed)
-    apart = np.exp(1j * (gnss.course[rows] - beside - np.interp(t + lag, level.t, level.turn)))
-    weight = np.minimum(speed, 15.0) ** 2
-    reach = max(1, round(2 * SMOOTH_S / max(float(np.median(np.diff(t))) if len(t) > 1 else 1.0, 0.1)))
-    total = np.zeros(len(t), complex)
-    for shift in range(min(reach + 1, len(t))):  # each row and the one so many behind it, of the same distance
-        first, second = slice(len(t) - shift), slice(shift, None)
-        near = np.exp(-0.5 * ((t[second] - t[first]) / SMOOTH_S) ** 2)
-        total[first] += near * weight[second] * apart[second]
-        if shift:
-            total[second] += near * weight[first] * apart[first]
-    angle = np.unwrap(np.angle(total))
-    return lambda at: np.interp(at, t, angle)
-
-
-def _residuals(equations: _Equations, lag: float, use: np.ndarray) -> tuple[Complex, Complex, Complex, float]:
-    """Least squares at a lag: design and left side of all rows, the solution, the squared sum of the rows in use."""
-    design, left = equations.at(lag)
-    stride = equations.parts.stride
-    quick = _quick(np.column_stack((design, left)), use, stride)
-    A, y = quick[:, :-1], quick[:, -1]
-    x, *_ = np.linalg.lstsq(A[use], y[use], rcond=None)
-    return A, y, x, float(np.sum(np.abs(y[use] - A[use] @ x) ** 2)) + 1e-9
-
-
-def _fit(equations: _Equations, lag: float, use: np.ndarray) -> _Fit:
-    """All that is fitted at a lag."""
-    level, parts = equations.level, equations.parts
-    A, y, x, rest = _residuals(equations, lag, use)
-    A, y = A[use], y[use]
-    inverse = np.linalg.pinv(A.conj().T @ A)
-    arm_std = float(np.sqrt(parts.stride * abs(inverse[2, 2]) * rest / max(len(y) - 3, 1)))
-    turning = use & parts.moving
-    turn = np.interp(parts.t1 + lag, level.t, level.turn) - np.interp(parts.t0 + lag, level.t, level.turn)
-    rate0, rate1 = _rates(level, parts.t0 + lag), _rates(level, parts.t1 + lag)
-    v0, v1 = np.maximum(parts.v0, MOVING), np.maximum(parts.v1, MOVING)
-    columns = (turn, parts.t1 - parts.t0, rate1 / v1 - rate0 / v0, rate1 * v1 - rate0 * v0)
-    B = np.column_stack(columns)[turning] * parts.weight[turning, None]
-    z = parts.turned[turning] * parts.weight[turning]
-    # what is known of cars: an antenna 2 m or so from the axle, sideslip of 0.01 s²/m
-    prior = np.diag([0.0, 0.0, 1 / 2.0, 1 / 0.01]) * SLIP_NOISE
-    s, *_ = np.linalg.lstsq(np.concatenate((B, prior)), np.concatenate((z, np.zeros(4))), rcond=None)
-    alpha = complex(x[0])
-    return _Fit(
-        lag, alpha, _bias(equations, lag, use), complex(x[2]), float(s[0]), rest,
-        float(np.sum(np.abs(y) ** 2)), arm_std, (float(s[2]), float(s[3])),
-    )  # fmt: skip
 
 
 def _matrix(level: Levelled, fit: _Fit, down: Floats) -> Floats:

@@ -11,6 +11,7 @@ from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
 NEAR = 0.06  # of gravity: a scale error, the road's curves, a cold sensor
 ALIKE = 0.12  # of a unit's size, of what is regressed
+TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}  # of a stamp, in a second
 SHAKES = np.radians((0.15, 8.0))  # rad/s RMS of a car on its way, noise and turns included; less wide than °/s in rad/s
 
 
@@ -71,7 +72,7 @@ def time_unit(values: Floats, slowest_s: float, fastest_s: float) -> str | None:
     """Unit of stamps: by their size where they count from 1970, else by their usual step; None if ambiguous."""
     numbers = np.asarray(values, dtype=float)
     size = float(np.nanmedian(np.abs(numbers)))
-    for unit, ticks in (("ns", 1e9), ("us", 1e6), ("ms", 1e3), ("s", 1.0)):
+    for unit, ticks in TICKS.items():
         if 8e8 * ticks < size < 5e9 * ticks:
             return unit
     step = np.diff(numbers)
@@ -79,7 +80,5 @@ def time_unit(values: Floats, slowest_s: float, fastest_s: float) -> str | None:
     if not len(step):
         return None
     usual = float(np.median(step))
-    fits = [
-        u for u, ticks in (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)) if fastest_s <= usual / ticks <= slowest_s
-    ]
+    fits = [unit for unit, ticks in TICKS.items() if fastest_s <= usual / ticks <= slowest_s]
     return fits[0] if len(fits) == 1 else None

@@ -12,11 +12,10 @@ import pandas as pd
 from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import known_offset
-from dlkf.data.discovery.motion import Motion, motion
+from dlkf.data.discovery.motion import Motion, motion_of
 from dlkf.data.discovery.wheel import Wheel, find_wheel
 from dlkf.data.readers import units
 from dlkf.data.readers.mapping import Mapped
-from dlkf.data.schema import VELOCITY
 from dlkf.data.validate import usable_fixes
 
 AUTO = "auto"
@@ -43,7 +42,7 @@ def read_aids(
     found. InputError where they are not clear.
     """
     frames, specs, notes = {}, {}, []
-    moved = None if fixes is None or len(fixes) < 3 else _motion(fixes)
+    moved = None if fixes is None or len(fixes) < 3 else motion_of(fixes[usable_fixes(fixes)])
     for name, part in mapped.items():
         spec, found = _settled(name, part, zero, gnss, moved, f"{where}: {part.table.path.name}")
         done = Mapped(part.table, spec, name, part.parts)
@@ -62,18 +61,12 @@ def _times(mapped: Mapped, zero: int) -> np.ndarray:
     return (whole - zero) + part
 
 
-def _motion(fixes: pd.DataFrame) -> Motion:
-    good = fixes[usable_fixes(fixes)]
-    t, lat, lon = (good[c].to_numpy() for c in ("t", "lat_deg", "lon_deg"))
-    return motion(t, lat, lon, good[list(VELOCITY)].to_numpy())
-
-
 def _settled(
     name: str, mapped: Mapped, zero: int, gnss: Mapped | None, moved: Motion | None, where: str
 ) -> tuple[dict[str, Any], list[str]]:
     """Offset and unit that are left ``auto``: of a table beside the fixes as those have it, of a wheel by its speed."""
     spec: dict[str, Any] = copy.deepcopy(dict(mapped.spec))
-    time, notes = dict(spec.get("time") or {}), []
+    time, notes = spec.get("time") or {}, []
     spec["time"] = time
     if time.get("offset_s") == AUTO and gnss is not None and gnss.table.path == mapped.table.path:
         said = gnss.spec.get("time") or {}
@@ -89,7 +82,6 @@ def _settled(
         return spec, notes
     if moved is None:
         raise InputError(f"{where}: reader.speed.…=auto needs GNSS to compare with; give value.unit and time.offset_s")
-    value = spec["value"] = dict(value)
     one = {**value, "unit": 1.0} if value.get("unit") == AUTO else value
     neutral = Mapped(mapped.table, {**spec, "value": one}, name, mapped.parts)
     raw = aid_frame(name, neutral, _times(neutral, zero))

@@ -59,8 +59,7 @@ def _extract(archive: zipfile.ZipFile, info: zipfile.ZipInfo, folder: Path) -> N
 
 def drive_places(source: Path) -> list[Path]:
     """What may each be a drive in a folder: its subfolders and archives."""
-    found = (p for p in source.iterdir() if not p.name.startswith(".") and (p.is_dir() or is_archive(p)))
-    return sorted(found)
+    return sorted(p for p in source.iterdir() if not p.name.startswith(".") and (p.is_dir() or is_archive(p)))
 
 
 def drive_name(path: Path) -> str:

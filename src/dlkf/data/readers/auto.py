@@ -13,27 +13,13 @@ from dlkf.data.readers.archives import drive_name, drive_places, is_archive, unp
 from dlkf.data.readers.formats import rosbag
 from dlkf.data.readers.frames import DriveFrames, Place
 from dlkf.data.readers.logs import LogReader
-from dlkf.data.readers.offers import (
-    NO_LOGS,
-    Contents,
-    Offer,
-    contents,
-    find_format,
-    leave_open,
-    open_aid,
-    preset,
-    text_options,
-)
+from dlkf.data.readers.offers import NO_LOGS, Contents, Offer, contents, find_format, leave_open, preset, text_options
 from dlkf.data.readers.settling import Unsure
 from dlkf.data.readers.sharing import merge_settings
 
 # presets whose files are known by a name
-LAYOUTS = {
-    "kitti": "oxts/timestamps.txt",
-    "sensor_logger": "TotalAcceleration.csv",
-    "phyphox": "Gyroscope.csv",
-}
-BESIDE = {("sensor_logger", "baro"): "Barometer.csv", ("phyphox", "baro"): "Pressure.csv"}
+LAYOUTS = {"kitti": "oxts/timestamps.txt", "sensor_logger": "TotalAcceleration.csv", "phyphox": "Gyroscope.csv"}
+BAROMETERS = {"sensor_logger": "Barometer.csv", "phyphox": "Pressure.csv"}
 TABLES = (".csv", ".tsv", ".txt", ".dat")
 DAMAGED = ("not a whole", "cannot be opened")  # how a line on a file begins that may hold the fixes
 RECEIVERS = (".ubx", ".nmea", ".pos", ".bag", ".mcap", ".asc", ".mat", ".bin", ".ulg")
@@ -60,8 +46,8 @@ class AutoReader:
         meta: Mapping[str, Any] | None = None,
         sure: Mapping[str, Any] | None = None,
     ) -> None:
-        self.known = {"imu": dict(imu or {}), "gnss": dict(gnss or {})}
-        self.aids = {"speed": dict(speed or {}), "heading": dict(heading or {}), "baro": dict(baro or {})}
+        known = {"imu": imu, "gnss": gnss, "speed": speed, "heading": heading, "baro": baro}
+        self.known = {kind: dict(spec or {}) for kind, spec in known.items()}
         self.drive = drive
         self.rest = {"group": group, "lever_arm_m": lever_arm_m, "meta": meta, "sure": sure}
 
@@ -93,8 +79,8 @@ class AutoReader:
 
     def sharing(self, settings: Mapping[str, Any]) -> AutoReader:
         """The same reader, with settings found from other drives; settings given before still win."""
-        known = {kind: merge_settings(settings.get(kind, {}), self.known[kind]) for kind in self.known}
-        return AutoReader(known["imu"], known["gnss"], drive=self.drive, **self.aids, **self.rest)
+        known = {kind: merge_settings(settings.get(kind, {}), spec) for kind, spec in self.known.items()}
+        return AutoReader(drive=self.drive, **known, **self.rest)
 
     def drive_at(self, folder: Path, name: str, only: Path | None = None) -> DriveFrames:
         """The drive of a place, by that name."""
@@ -109,7 +95,7 @@ class AutoReader:
             if chosen is None:
                 specs[kind] = {"file": None}
                 continue
-            specs[kind] = merge_settings(getattr(chosen, kind), self.known[kind])
+            specs[kind] = merge_settings(chosen.specs[kind], self.known[kind])
             there = chosen.name if chosen.table else specs[kind].get("file") or chosen.name
             detail += [f"found the {kind} in {there}: {chosen.detail}", *chosen.notes]
             if kind == "gnss" and (more := _velocities_beside(chosen, specs[kind], [] if only else folder.iterdir())):
@@ -126,7 +112,7 @@ class AutoReader:
                 f"reader.gnss.file={foreign.path.name} …), or take it away where this is a log at rest"
             )
         rest = dict(self.rest)
-        for kind in self.aids:
+        for kind in ("speed", "heading", "baro"):
             rest[kind], notes = self._aid(within, kind, folder)
             detail += notes
         if not specs["gnss"].get("file"):
@@ -143,13 +129,13 @@ class AutoReader:
 
     def _chosen(self, within: list[Contents], kind: str, folder: Path, only: Path | None) -> Offer | None:
         offers = [o for one in within for o in one.offers]
-        fits = [o for o in offers if getattr(o, kind) is not None]
+        fits = [o for o in offers if kind in o.specs]
         if not fits and kind == "imu":
             fits = _joined_sensors(offers)
         if (file := self.known[kind].get("file")) is not None:
             fits = [o for o in fits if o.path.match(str(file))]
             if not fits:
-                have = ", ".join(o.name for o in offers if getattr(o, kind) is not None) or "no file"
+                have = ", ".join(o.name for o in offers if kind in o.specs) or "no file"
                 raise InputError(f"{folder}: reader.{kind}.file={file}: no such {kind.upper()} here; found in {have}")
         if (table := self.known[kind].get("table")) is not None and any(o.table for o in fits):
             fits = [o for o in fits if o.table == str(table)]
@@ -167,10 +153,10 @@ class AutoReader:
 
     def _aid(self, within: list[Contents], kind: str, folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
         """The spec of an aid, and what it was found in; None where there is none, or file=null leaves it out."""
-        known = self.aids[kind]
+        known = self.known[kind]
         if "file" in known and known["file"] is None:
             return None, []
-        fits = [o for one in within for o in one.offers if kind in o.aids]
+        fits = [o for one in within for o in one.offers if kind in o.specs]
         if (file := known.get("file")) is not None:
             fits = [o for o in fits if o.path.match(str(file))]
             if not fits and not (known.get("value") or known.get("pressure") or known.get("height")):
@@ -180,9 +166,11 @@ class AutoReader:
         if len(fits) > 1:
             names = ", ".join(o.name for o in fits)
             raise InputError(f"{folder}: {names} all hold {kind}; choose one with reader.{kind}.file, or null for none")
+        if not fits and file is None:
+            return None, []
         if not fits:
-            return (merge_settings(open_aid(preset("csv")[kind]), known) if file is not None else None), []
-        spec = merge_settings(fits[0].aids[kind], known)
+            return merge_settings(leave_open({kind: preset("csv")[kind]})[kind], known), []
+        spec = merge_settings(fits[0].specs[kind], known)
         columns = [c for key in ("value", "pressure", "height") for c in (spec.get(key) or {}).get("columns") or []]
         return spec, [f"found {kind} in {fits[0].name}: {', '.join(map(str, columns))}"]
 
@@ -194,12 +182,11 @@ def _contents_of(folder: Path) -> list[Contents]:
             if name == "phyphox" and not (folder / "Location.csv").is_file():
                 continue
             base = preset(name)
-            specs = {kind: {**base[kind]} for kind in ("imu", "gnss")}
-            beside = {kind: BESIDE.get((name, kind), "") for kind in ("speed", "heading", "baro")}
-            aids = {k: {**base[k], "file": f} for k, f in beside.items() if f and (folder / f).is_file()}
-            return [Contents(folder / file, [Offer(folder / file, f"layout of {name}", *leave_open(specs), aids=aids)])]
-    files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
-    return [contents(path) for path in files]
+            specs = {kind: base[kind] for kind in ("imu", "gnss")}
+            beside = BAROMETERS.get(name, "")
+            specs |= {"baro": {**base["baro"], "file": beside}} if beside and (folder / beside).is_file() else {}
+            return [Contents(folder / file, [Offer(folder / file, f"layout of {name}", leave_open(specs))])]
+    return [contents(p) for p in sorted(folder.iterdir()) if p.is_file() and not p.name.startswith(".")]
 
 
 def _held(within: Iterable[Contents], offers: Iterable[Offer] = ()) -> str:
@@ -221,9 +208,9 @@ def _joined_sensors(offers: list[Offer]) -> list[Offer]:
     assert accel.sensor is not None and gyro.sensor is not None
     spec = {key: value for key, value in accel.sensor.items() if key != "key"}
     source = {key: gyro.sensor[key] for key in ("format", "file", "table", "text", "time") if key in gyro.sensor}
-    imu, _ = leave_open({"imu": {**spec, "gyro": {**gyro.sensor["gyro"], **source}}})
+    specs = leave_open({"imu": {**spec, "gyro": {**gyro.sensor["gyro"], **source}}})
     detail = f"{accel.detail}, and {gyro.name} with {', '.join(gyro.sensor['gyro']['columns'])}"
-    return [Offer(accel.path, detail, imu, notes=(*accel.notes, *gyro.notes), table=accel.table)]
+    return [Offer(accel.path, detail, specs, notes=(*accel.notes, *gyro.notes), table=accel.table)]
 
 
 def _taken_at_rest(imu: dict[str, Any]) -> list[str]:

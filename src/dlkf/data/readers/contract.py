@@ -77,27 +77,22 @@ def reference_frame(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
 def positions(mapped: Mapped) -> dict[str, np.ndarray]:
     """Latitude and longitude [deg] and height above the ellipsoid [m], from those or from ECEF."""
     spec = mapped.spec.get("position") or {}
-    where = f"reader.{mapped.kind}.position"
-    frame, zero = spec.get("frame") or "llh", spec.get("zero") or "fix"
-    if frame not in ("llh", "ecef"):
-        raise InputError(f"{where}.frame={frame}: must be llh or ecef")
+    zero = spec.get("zero") or "fix"
     if zero not in ("fix", "none"):
+        where = f"reader.{mapped.kind}.position"
         raise InputError(f"{where}.zero={zero}: must be fix, or none where 0°/0° means no position")
-    if frame == "ecef":
+    if mapped.option("position", "frame", "llh", "ecef") == "ecef":
         metre = 1.0 if spec.get("unit") == "deg" else mapped.scale("position", units.LENGTH)  # csv's preset: no length
         xyz = mapped.vector("position", (3,), nan=True) * metre
         lost = ~np.isfinite(xyz).all(-1) | (np.linalg.norm(xyz, axis=-1) < 1e6)
         with np.errstate(invalid="ignore"):
             lat, lon, height = pymap3d.ecef2geodetic(*np.where(lost[:, None], np.nan, xyz).T)
     else:
-        unit = spec.get("unit") or "deg"
-        angle = mapped.scale("position", ANGLES)
-        lat, lon, height = _latitudes(mapped, unit == "ddmm")
-        lat, lon = lat * angle, lon * angle
-        height = height * mapped.scale("position", units.LENGTH, "height_unit")
+        angle, metre = mapped.scale("position", ANGLES), mapped.scale("position", units.LENGTH, "height_unit")
+        lat, lon, height = _latitudes(mapped, spec.get("unit") == "ddmm")
+        lat, lon, height = lat * angle, lon * angle, height * metre
         if spec.get("geoid") is not None:
-            geoid = mapped.of("position").column(spec["geoid"], nan=True)
-            height = height + geoid * mapped.scale("position", units.LENGTH, "height_unit")
+            height = height + mapped.of("position").column(spec["geoid"], nan=True) * metre
     with np.errstate(invalid="ignore"):
         lost = (np.abs(lat) < NOWHERE_DEG) & (np.abs(lon) < NOWHERE_DEG) & (zero == "none")
     return dict(zip(POSITION, (np.where(lost, np.nan, x) for x in (lat, lon, height))))
@@ -108,7 +103,7 @@ def velocities(mapped: Mapped, position: Mapping[str, np.ndarray]) -> dict[str, 
     if not mapped.has("velocity"):
         return dict.fromkeys(VELOCITY, np.full(len(mapped), np.nan))
     v = mapped.vector("velocity", (2, 3), nan=True)
-    frame = mapped.spec["velocity"].get("frame") or "ned"
+    frame = mapped.option("velocity", "frame", "ned", "enu", "course", "ecef")
     speed = mapped.scale("velocity", units.SPEED)
     third = v[:, 2] * speed if v.shape[1] == 3 else np.full(len(v), np.nan)
     if frame == "course":  # speed over ground, course over ground [deg], climb
@@ -121,8 +116,6 @@ def velocities(mapped: Mapped, position: Mapping[str, np.ndarray]) -> dict[str, 
         if v.shape[1] != 3:
             raise InputError(f"reader.{mapped.kind}.velocity.columns has 2 names, must have 3 with frame=ecef")
         return dict(zip(VELOCITY, _to_ned(v * speed, position).T))
-    if frame not in ("ned", "enu"):
-        raise InputError(f"reader.{mapped.kind}.velocity.frame={frame}: must be ned, enu, course or ecef")
     north, east = (v[:, 1], v[:, 0]) if frame == "enu" else (v[:, 0], v[:, 1])
     return dict(zip(VELOCITY, (speed * north, speed * east, -third if frame == "enu" else third)))
 
@@ -160,9 +153,7 @@ def _stds(mapped: Mapped, key: str, known: Mapping[str, float], position: Mappin
         return [np.full(len(mapped), np.nan)] * 3
     s = mapped.vector(key, (1, 2, 3), nan=True) * mapped.scale(key, known)
     s = np.where(s < 0, np.nan, s)  # phones and receivers write −1 for unknown values
-    frame = mapped.spec[key].get("frame") or "ned"
-    if frame not in ("ned", "enu", "ecef"):
-        raise InputError(f"reader.{mapped.kind}.{key}.frame={frame}: must be ned, enu or ecef")
+    frame = mapped.option(key, "frame", "ned", "enu", "ecef")
     if frame == "ecef" and s.shape[1] == 3:  # variances turned, correlations unknown
         axes = [_to_ned(np.broadcast_to(unit, s.shape), position) for unit in np.eye(3)]
         return list(np.sqrt(sum((s[:, [k]] * axis) ** 2 for k, axis in enumerate(axes))).T)
@@ -200,12 +191,8 @@ def _code(value: Any, where: str) -> int:
 
 def _attitudes(mapped: Mapped) -> np.ndarray:
     """Roll, pitch, yaw [rad] of Forward-Right-Down in North-East-Down, from angles or quaternions (body → n)."""
-    spec = mapped.spec["attitude"]
-    convention, order = spec.get("convention") or "ned", spec.get("order") or "wxyz"
-    if convention not in ("ned", "enu"):
-        raise InputError(f"reader.reference.attitude.convention={convention}: must be ned or enu")
-    if order not in ("wxyz", "xyzw"):
-        raise InputError(f"reader.reference.attitude.order={order}: must be wxyz or xyzw")
+    convention = mapped.option("attitude", "convention", "ned", "enu")
+    order = mapped.option("attitude", "order", "wxyz", "xyzw")
     values = mapped.vector("attitude", (3, 4), nan=True)
     if values.shape[1] == 3:
         rpy = values * mapped.scale("attitude", units.ANGLE)

@@ -144,9 +144,9 @@ class LogReader:
         aids, specs, of_aids = read_aids(others, zero, mapped.get("gnss"), frames.get("gnss"), f"drive {name}")
         if self.wanted or of_aids:
             assert not isinstance(arm, str)  # auto is wanted, and found above
-            mapping = self._mapping(
-                {**self.neutral, **{k: dict(part.spec) for k, part in mapped.items()}, **specs}, arm
-            )
+            named = {"time_zero": self.time_zero, "group": self.group, "lever_arm_m": list(arm), "meta": self.meta}
+            known = {**self.neutral, **{kind: dict(part.spec) for kind, part in mapped.items()}, **specs}
+            mapping = {"_target_": "dlkf.data.readers.logs.LogReader", **self.text, **named, **known}
         meta = {"drive": name, "group": self.group or name, "time_zero_s": float(zero)}
         if "gnss" in mapped:
             meta |= _gps_time(mapped["gnss"], t["gnss"])
@@ -167,11 +167,6 @@ class LogReader:
             if (part.spec.get("time") or {}).get("respace"):
                 t[kind] = spread_stamps(t[kind])
         return zero, t
-
-    def _mapping(self, specs: Mapping[str, Any], arm: Sequence[float]) -> dict[str, Any]:
-        """The settings of a reader that reads this drive again, without anything to find out."""
-        named = {"time_zero": self.time_zero, "group": self.group, "lever_arm_m": list(arm), "meta": self.meta}
-        return {"_target_": "dlkf.data.readers.logs.LogReader", **self.text, **named, **specs}
 
     def _mapped(self, folder: Path, spec: Spec, kind: str, only: Path | None) -> Mapped:
         """The table of a kind, with the entries that come from other tables brought to its rows."""

@@ -156,9 +156,7 @@ class Mapped:
         known = units.clock_by_size(first)
         if known is not None and (time.get("clock") or time.get("week") or time.get("week_number") is not None):
             known = "gps"
-        if known == "unix":
-            first += float(units.leap_seconds(int(whole[0]))) - units.GPS_EPOCH_UNIX
-        return None if known is None else first
+        return None if known is None else float(units.gps_seconds(first)) if known == "unix" else first
 
     def own_stamps(self) -> tuple[np.ndarray, np.ndarray]:
         """Whole seconds and the rest of the rows' times on the table's own clock, as GPS time where that is given."""
@@ -194,6 +192,14 @@ class Mapped:
         unit = self.spec[key].get(name)
         where = f"reader.{self.kind}.{key}.{name}"
         return units.factor(next(iter(table)) if unit is None else unit, table, where)
+
+    def option(self, key: str, name: str, *known: str) -> str:
+        """A word in an entry, the first of those known where it has none; InputError for any other."""
+        word = (self.spec.get(key) or {}).get(name) or known[0]
+        if word not in known:
+            *most, last = known
+            raise InputError(f"reader.{self.kind}.{key}.{name}={word}: must be {', '.join(most)} or {last}")
+        return word
 
     def rows(self, keep: np.ndarray) -> Mapped:
         """Some rows, of the parts too."""

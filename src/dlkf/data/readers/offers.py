@@ -21,6 +21,7 @@ from dlkf.data.readers.sharing import merge_settings
 
 GNSS_ONLY = ("nmea", "rtklib", "inertial_explorer")
 PRESETS = (*GNSS_ONLY, "ubx", "rosbag", "gnss_logger", "novatel", "navego", "px4", "ardupilot")
+WITH_AIDS = {"ubx": ubx, "nmea": nmea, "rosbag": rosbag, "px4": autopilot, "ardupilot": autopilot}
 NO_LOGS = {  # formats of other programs, and what makes a table of them
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "a spreadsheet; save its sheet as CSV"),
     **dict.fromkeys((".gpx", ".kml", ".kmz"), "a track of GPX or KML; make it a CSV table: time, lat, lon, height"),
@@ -38,15 +39,13 @@ NAVEGO = {"imu": "fb_0", "gnss": "stdm_0"}  # a column of each of NaveGo's struc
 
 @dataclass(frozen=True)
 class Offer:
-    """What a file, or a table in it, can give, as specs of a mapping; ``sensor`` is an accelerometer or a gyroscope
-    alone."""
+    """What a file, or a table in it, can give: ``specs`` of a mapping by kind (imu, gnss, speed, heading, baro);
+    ``sensor`` is an accelerometer or a gyroscope alone."""
 
     path: Path
     detail: str
-    imu: dict[str, Any] | None = None
-    gnss: dict[str, Any] | None = None
+    specs: dict[str, dict[str, Any]] = field(default_factory=dict)
     sensor: dict[str, Any] | None = None
-    aids: dict[str, dict[str, Any]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     table: str | None = None
 
@@ -98,32 +97,13 @@ def contents(path: Path) -> Contents:
 
 def _of_preset(path: Path, name: str) -> Contents:
     base = preset(name)
-    specs, lacks = {}, []
     source = {"file": path.name, "text": _preset_text(base)}
-    for kind in ("imu", "gnss"):
-        why = _lacks(path, name, kind)
-        if why is not None:
-            lacks.append(f"no {kind.upper()}{why}")
-            continue
-        specs[kind] = {**base[kind], **source}
-    held = f"{name}, {', '.join(lacks)}"
-    aids = {kind: open_aid({**base[kind], **source}) for kind in _aids_in(path, name)}
-    if not specs and not aids:
-        return Contents(path, held=held)
-    return Contents(path, [Offer(path, f"{name}, as reader={name}", *leave_open(specs), aids=aids)], held)
-
-
-def _aids_in(path: Path, name: str) -> tuple[str, ...]:
-    """The aids that a file of a preset's format holds."""
-    module = {"ubx": ubx, "nmea": nmea, "rosbag": rosbag, "px4": autopilot, "ardupilot": autopilot}.get(name)
-    return () if module is None else module.aids(path)
-
-
-def open_aid(spec: Mapping[str, Any]) -> dict[str, Any]:
-    """The spec of an aid with its clock, and a wheel's unit, left to the drive."""
-    out = copy.deepcopy(dict(spec))
-    out["time"] = {**out["time"], "offset_s": "auto"}
-    return out
+    lacks = {kind: _lacks(path, name, kind) for kind in ("imu", "gnss")}
+    specs = {kind: {**base[kind], **source} for kind, why in lacks.items() if why is None}
+    held = f"{name}, {', '.join(f'no {kind.upper()}{why}' for kind, why in lacks.items() if why is not None)}"
+    module = WITH_AIDS.get(name)
+    specs |= {kind: {**base[kind], **source} for kind in (module.aids(path) if module else ())}
+    return Contents(path, [Offer(path, f"{name}, as reader={name}", leave_open(specs))] if specs else [], held)
 
 
 def _lacks(path: Path, name: str, kind: str) -> str | None:
@@ -165,23 +145,20 @@ def _of_table(path: Path, name: str, table: LogTable, options: dict[str, Any], p
     numbers = recognise.numeric(table.frame)
     aids = aid_specs(recognise.with_numbers(table, numbers), numbers, part or path.stem, time)
     aids = {kind: {**spec, **source} for kind, spec in aids.items()}
-    if imu is None and gnss is None and aids:
-        columns = ", ".join(str(c) for spec in aids.values() for c in _columns(spec))
-        return [Offer(path, f"{name} with {columns}", aids=aids, table=part)]
-    if imu is None and gnss is None:
+    found = {kind: one for kind, one in (("imu", imu), ("gnss", gnss)) if one is not None}
+    if not found and not aids:
         alone = recognise.sensor_spec(table, part or path.stem)
         if alone is None:
             return []
         key, (spec, notes) = alone
         columns = ", ".join(spec[key]["columns"])
         return [Offer(path, f"{name} with {columns}", sensor={"key": key, **spec, **source}, notes=notes, table=part)]
-    if imu is not None and gnss is not None:
+    if len(found) == 2:
         source["rows"] = "filled"
-    found = {kind: one for kind, one in (("imu", imu), ("gnss", gnss)) if one is not None}
     specs = {kind: {**source, **one.spec} for kind, one in found.items()}
-    columns = ", ".join(str(c) for spec in specs.values() for c in _columns(spec))
+    columns = ", ".join(str(c) for spec in (specs or aids).values() for c in _columns(spec))
     notes = tuple(note for one in found.values() for note in one.notes)
-    return [Offer(path, f"{name} with {columns}", *leave_open(specs, stated=True), aids=aids, notes=notes, table=part)]
+    return [Offer(path, f"{name} with {columns}", leave_open(specs | aids, stated=True), notes=notes, table=part)]
 
 
 def find_format(path: Path) -> str | None:
@@ -267,18 +244,21 @@ def _preset_text(base: Mapping[str, Any]) -> dict[str, Any]:
     return {key: base[key] for key in ("separator", "decimal", "header", "comment") if key in base}
 
 
-def leave_open(specs: Mapping[str, Any], stated: bool = False) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
+def leave_open(specs: Mapping[str, Any], stated: bool = False) -> dict[str, dict[str, Any]]:
     """Specs with everything that can be estimated left open, but an accelerometer's unit that a header ``stated``."""
-    imu, gnss = (copy.deepcopy(specs.get(kind)) for kind in ("imu", "gnss"))
-    if imu is not None:
-        for key in ("accel", "gyro"):
-            unit = imu[key].get("unit") if stated else None
-            imu[key] = {**imu[key], "unit": unit or "auto", "axes": "auto"}
-    if gnss is not None:
-        gnss["time"] = {**gnss["time"], "offset_s": "auto", "drift_ppm": "auto"}
-        gnss["velocity"] = {**(gnss.get("velocity") or {}), "unit": "auto"}
-        gnss["position"] = {**gnss["position"], "zero": "none", "delay_s": "auto"}
-    return imu, gnss
+    out = {kind: copy.deepcopy(dict(spec)) for kind, spec in specs.items()}
+    for kind, spec in out.items():
+        if kind == "imu":
+            for key in ("accel", "gyro"):
+                unit = spec[key].get("unit") if stated else None
+                spec[key] = {**spec[key], "unit": unit or "auto", "axes": "auto"}
+        else:
+            spec["time"] = {**spec["time"], "offset_s": "auto"}
+        if kind == "gnss":
+            spec["time"]["drift_ppm"] = "auto"
+            spec["velocity"] = {**(spec.get("velocity") or {}), "unit": "auto"}
+            spec["position"] = {**spec["position"], "zero": "none", "delay_s": "auto"}
+    return out
 
 
 def _columns(spec: Mapping[str, Any]) -> list[Any]:

@@ -121,11 +121,8 @@ def gnss_spec(table: LogTable) -> Recognised | None:
     velocity, more = _velocity(found), []
     if velocity is None:
         velocity = _velocity_by_numbers(table, frame[known], time, position)
-        more = (
-            [f"took {', '.join(velocity['columns'])} for the velocities by the way between the positions"]
-            if velocity["columns"]
-            else []
-        )
+        if columns := velocity["columns"]:
+            more = [f"took {', '.join(columns)} for the velocities by the way between the positions"]
     out: Spec = {"time": time, "position": position, "velocity": velocity}
     out |= _accuracies(frame, found, raw=position["unit"] == "1e-7deg")
     quality, notes = quality_spec(table.frame[known], _quality_column(table.frame), _accuracy_m(frame, out))
@@ -133,13 +130,11 @@ def gnss_spec(table: LogTable) -> Recognised | None:
         out["quality"] = quality
     if "std_position" not in out and found["hdop"] is not None:
         spec, note = _dilutions(frame[known], found, quality)
-        out, notes = out | spec, [*notes, note]
+        out |= spec
+        notes.append(note)
     if held is not None:
         out["rows"] = "changed"
-        notes = [
-            *notes,
-            f"took {int(known.sum())} of {len(held)} rows for fixes: the others repeat the position before",
-        ]
+        notes.append(f"took {int(known.sum())} of {len(held)} rows for fixes: the others repeat the position before")
     return Recognised(out, (*more, *notes))
 
 
@@ -158,13 +153,10 @@ def _velocity_by_numbers(table: LogTable, frame: pd.DataFrame, time: Spec, posit
 
 def _hemispheres(frame: pd.DataFrame) -> list[str] | None:
     """The columns that have N or S, and E or W, in every row; None where a table has not both."""
-    found = []
-    for letters in ({"N", "S"}, {"E", "W"}):
-        texts = (n for n in frame.columns if not pd.api.types.is_numeric_dtype(frame[n]))
-        found.append(
-            next((str(n) for n in texts if set(frame[n].astype(str).str.strip().str.upper()) <= letters), None)
-        )
-    return [side for side in found if side is not None] if all(found) and len(frame) else None
+    texts = [str(n) for n in frame.columns if not pd.api.types.is_numeric_dtype(frame[n])]
+    letters = {n: set(frame[n].astype(str).str.strip().str.upper()) for n in texts}
+    sides = [next((n for n in texts if letters[n] <= both), None) for both in ({"N", "S"}, {"E", "W"})]
+    return [side for side in sides if side is not None] if all(sides) and len(frame) else None
 
 
 def _held(frame: pd.DataFrame, place: list[str]) -> pd.Series | None:
@@ -193,7 +185,7 @@ def missing(table: LogTable) -> str:
     frame = numeric(table.frame)
     names = [str(c) for c in frame.columns]
     has = [key for key, stem in vocabulary.SENSORS.items() if vocabulary.triad(names, stem)]
-    has += [name for key, name in (("lat", "positions"),) if vocabulary.find_column(names, key)]
+    has += ["positions"] if vocabulary.find_column(names, "lat") else []
     columns = [str(c) for c in table.frame.columns]
     text = f"columns {', '.join(columns[:12])}{', …' if len(columns) > 12 else ''}"
     if not has:

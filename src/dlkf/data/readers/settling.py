@@ -5,35 +5,28 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from dlkf.base.errors import InputError
-from dlkf.data.discovery.findings import Finding, Findings, Raw, Sure, discover
-from dlkf.data.discovery.units import accel_units, speed_factor
+from dlkf.data.discovery.findings import Finding, Sure, discover, find_accel_unit, value_found
+from dlkf.data.discovery.units import speed_factor
 from dlkf.data.readers import units
 from dlkf.data.readers.contract import gnss_frame, imu_frame, positions
 from dlkf.data.readers.mapping import Mapped
 from dlkf.data.readers.sharing import set_value, value_at, write_value
-from dlkf.data.schema import ACCEL, GYRO, VELOCITY
+from dlkf.data.schema import ACCEL, stack_columns
+from dlkf.data.tables import Columns
 from dlkf.data.validate import usable_fixes
-from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
 AUTO = "auto"
-# settings that may be auto: where they stand in the mapping, and what stands there until they are known
-PLACES: dict[str, tuple[tuple[str, ...], Any]] = {
-    "imu.accel.unit": (("imu", "accel", "unit"), 1.0),
-    "imu.gyro.unit": (("imu", "gyro", "unit"), 1.0),
-    "imu.accel.axes": (("imu", "accel", "axes"), "frd"),
-    "imu.gyro.axes": (("imu", "gyro", "axes"), "frd"),
-    "imu.time.offset_s": (("imu", "time", "offset_s"), 0.0),
-    "gnss.time.offset_s": (("gnss", "time", "offset_s"), 0.0),
-    "gnss.time.drift_ppm": (("gnss", "time", "drift_ppm"), 0.0),
-    "gnss.velocity.unit": (("gnss", "velocity", "unit"), 1.0),
-    "gnss.position.delay_s": (("gnss", "position", "delay_s"), 0.0),
+NEUTRAL: dict[str, Any] = {  # settings that may be auto, and what stands there until they are known
+    **dict.fromkeys(("imu.accel.unit", "imu.gyro.unit", "gnss.velocity.unit"), 1.0),
+    **dict.fromkeys(("imu.accel.axes", "imu.gyro.axes"), "frd"),
+    **dict.fromkeys(("imu.time.offset_s", "gnss.time.offset_s", "gnss.time.drift_ppm", "gnss.position.delay_s"), 0.0),
 }
 USUAL = {
     "imu.accel.unit": "m/s2 (or g)",
@@ -72,16 +65,16 @@ class Settled:
 
 def open_settings(specs: Mapping[str, Any], lever_arm_m: Any) -> set[str]:
     """Settings that are ``auto``."""
-    wanted = {name for name, (path, _) in PLACES.items() if value_at(specs, path) == AUTO}
+    wanted = {name for name in NEUTRAL if value_at(specs, name) == AUTO}
     return wanted | ({"lever_arm_m"} if lever_arm_m == AUTO else set())
 
 
 def placeholders(specs: Mapping[str, Any]) -> dict[str, Any]:
     """The specs with neutral values for every ``auto``."""
     out = _plain(specs)
-    for path, neutral in PLACES.values():
-        if value_at(out, path) == AUTO:
-            set_value(out, path, neutral)
+    for name, value in NEUTRAL.items():
+        if value_at(out, name) == AUTO:
+            set_value(out, name, value)
     return out
 
 
@@ -104,38 +97,34 @@ def settle(
             f"{where}: {log.path} has {count} {'fix' if count == 1 else 'fixes'}, which are not the "
             f"motion of a car{why}; copy the log again, or leave the drive out"
         )
-    found = Findings()
+    found: list[Finding] = []
     if "gnss.velocity.unit" in wanted:
-        _speed_unit(found, mapped["gnss"], t["gnss"], where)
+        found.append(_speed_unit(mapped["gnss"], t["gnss"]))
         _refuse_doubt(found, wanted, where, t)
-        specs["gnss"]["velocity"]["unit"] = found.get("gnss.velocity.unit")
+        specs["gnss"]["velocity"]["unit"] = found[0].value
     imu = imu_frame(mapped["imu"], t["imu"])
     if "imu.accel.unit" in wanted:
         _refuse_without_gravity(imu, where)
-    gnss = gnss_frame(Mapped(mapped["gnss"].table, specs["gnss"], "gnss", mapped["gnss"].parts), t["gnss"])
-    raw = _raw(imu, gnss, {key: None if f"imu.{key}.unit" in wanted else 1.0 for key in ("accel", "gyro")})
+    gnss = gnss_frame(replace(mapped["gnss"], spec=specs["gnss"]), t["gnss"])
     asked = set(wanted)
     if {"imu.accel.axes", "imu.gyro.axes"} & wanted:
         asked.add("imu.axes")
-    more = discover(
-        raw,
+    found += discover(
+        _in_order(imu),
+        _in_order(gnss[usable_fixes(gnss)]),
         asked,
         sure,
-        known_accel=units.ACCELERATION,
-        known_gyro=units.RATE,
         increments=bool(mapped["imu"].spec.get("increments")),
-        drift_given="gnss.time.drift_ppm" not in wanted
-        and value_at(specs, PLACES["gnss.time.drift_ppm"][0]) is not None,
+        drift_given="gnss.time.drift_ppm" not in wanted and value_at(specs, "gnss.time.drift_ppm") is not None,
     )
-    found.found += more.found
     _refuse_doubt(found, wanted, where, t)
-    for name in wanted & set(PLACES):
-        value = copy.deepcopy(found.get("imu.axes" if name.endswith("axes") else name))
+    for name in wanted & set(NEUTRAL):
+        value = copy.deepcopy(value_found(found, "imu.axes" if name.endswith("axes") else name))
         if value is not None:
-            set_value(specs, PLACES[name][0], value)
-    lever = found.get("lever_arm_m") if "lever_arm_m" in wanted else arm
+            set_value(specs, name, value)
+    lever = value_found(found, "lever_arm_m") if "lever_arm_m" in wanted else arm
     x, y, z = (float(a) for a in lever)
-    return Settled(specs, (x, y, z), _reported(found.found, wanted))
+    return Settled(specs, (x, y, z), _reported(found, wanted))
 
 
 def _refuse_without_gravity(imu: pd.DataFrame, where: str) -> None:
@@ -149,39 +138,22 @@ def _refuse_without_gravity(imu: pd.DataFrame, where: str) -> None:
 
 def _by_gravity(specs: dict[str, Any], imu: Mapped, t: np.ndarray, where: str, arm: Any) -> Settled:
     """The accelerometers' unit of a log without fixes."""
-    frame = imu_frame(imu, t)
-    size = float(np.median(np.linalg.norm(frame[list(ACCEL)].to_numpy(), axis=-1)))
-    names = accel_units(size, units.ACCELERATION)
-    found = Findings()
-    value = names[0] if len(names) == 1 else float(f"{G / size:.5g}") if size > 0 else None
-    found.add("imu.accel.unit", value, len(names) > 0, f"median force {size:.4g}")
-    _refuse_doubt(found, {"imu.accel.unit"}, where, {"imu": t})
-    set_value(specs, PLACES["imu.accel.unit"][0], value)
-    return Settled(specs, arm, found.found)
+    finding, _ = find_accel_unit(stack_columns(imu_frame(imu, t), ACCEL), increments=False)
+    _refuse_doubt([finding], {"imu.accel.unit"}, where, {"imu": t})
+    set_value(specs, "imu.accel.unit", finding.value)
+    return Settled(specs, arm, [finding])
 
 
-def _raw(imu: pd.DataFrame, gnss: pd.DataFrame, factors: Mapping[str, float | None]) -> Raw:
-    good = gnss[usable_fixes(gnss)]
-    good = good[np.concatenate(([True], np.diff(good["t"]) > 0))] if len(good) else good
-    rows = imu[np.concatenate(([True], np.diff(imu["t"]) > 0))]
-    return Raw(
-        t=rows["t"].to_numpy(),
-        accel=rows[list(ACCEL)].to_numpy(),
-        gyro=rows[list(GYRO)].to_numpy(),
-        accel_factor=factors["accel"],
-        gyro_factor=factors["gyro"],
-        gnss_t=good["t"].to_numpy(),
-        lat_deg=good["lat_deg"].to_numpy(),
-        lon_deg=good["lon_deg"].to_numpy(),
-        v_ned=good[list(VELOCITY)].to_numpy(),
-    )
+def _in_order(frame: pd.DataFrame) -> Columns:
+    """The columns of the rows that are later than the row before."""
+    rows = frame[frame["t"].diff().fillna(1.0) > 0]
+    return {str(name): rows[name].to_numpy() for name in rows}
 
 
-def _speed_unit(found: Findings, gnss: Mapped, t: np.ndarray, where: str) -> None:
+def _speed_unit(gnss: Mapped, t: np.ndarray) -> Finding:
     v = gnss.vector("velocity", (2, 3), nan=True) if gnss.has("velocity") else np.full((1, 3), np.nan)
     if not np.isfinite(v).any():
-        found.add("gnss.velocity.unit", "m/s", True, "no velocities")
-        return
+        return Finding("gnss.velocity.unit", "m/s", True, "no velocities")
     speed = v[:, 0] if gnss.spec["velocity"].get("frame") == "course" else np.hypot(v[:, 0], v[:, 1])
     place = positions(gnss)
     factor, spread = speed_factor(t, place["lat_deg"], place["lon_deg"], speed)
@@ -189,17 +161,15 @@ def _speed_unit(found: Findings, gnss: Mapped, t: np.ndarray, where: str) -> Non
     best = min(apart, key=lambda name: apart[name])
     certain = apart[best] < 0.08 and spread < 0.2 * factor
     detail = f"positions move {factor:.3g} ± {spread:.1g} m per unit" if factor > 0 else "the car hardly moves"
-    found.add("gnss.velocity.unit", best, bool(certain), detail)
+    return Finding("gnss.velocity.unit", best, bool(certain), detail)
 
 
-def _refuse_doubt(found: Findings, wanted: set[str], where: str, t: Mapping[str, np.ndarray]) -> None:
-    doubts = found.doubtful()
+def _refuse_doubt(found: list[Finding], wanted: set[str], where: str, t: Mapping[str, np.ndarray]) -> None:
+    doubts = [one for one in found if not one.sure]
     if not doubts:
         return
     doubt = doubts[0]
-    offsets = [
-        (float(one.value), one.std) for one in found.found if "offset_s" in one.setting and one.value is not None
-    ]
+    offsets = [(float(one.value), one.std) for one in found if "offset_s" in one.setting and one.value is not None]
     setting = doubt.setting.replace("imu.axes", "imu.accel.axes and .gyro.axes")
     poor = doubt.setting.endswith(("offset_s", "axes")) and not doubt.wide  # no more than a guess of noise
     best = "" if doubt.value is None or poor else f"; the best guess is {write_value(doubt.value)}"
@@ -222,7 +192,9 @@ def _by_hand(doubts: list[Finding], wanted: set[str], t: Mapping[str, np.ndarray
     said = []
     for setting in (doubt.setting for doubt in doubts):
         if setting.endswith("offset_s"):
-            value = "0 (if both files have one clock)" if _overlap(t) else "… (seconds to be added to its stamps)"
+            within = (t["gnss"] >= t["imu"][0]) & (t["gnss"] <= t["imu"][-1])
+            overlap = np.mean(within) > MOSTLY
+            value = "0 (if both files have one clock)" if overlap else "… (seconds to be added to its stamps)"
             said.append(f"reader.{setting}={value}")
         elif setting == "imu.axes":
             names = sorted(wanted & {"imu.accel.axes", "imu.gyro.axes"})
@@ -230,12 +202,6 @@ def _by_hand(doubts: list[Finding], wanted: set[str], t: Mapping[str, np.ndarray
         else:
             said.append(f"reader.{setting}={USUAL.get(setting, '…')}")
     return " ".join(said)
-
-
-def _overlap(t: Mapping[str, np.ndarray]) -> bool:
-    """Whether most of the fixes lie within the IMU's samples by their stamps."""
-    within = (t["gnss"] >= t["imu"][0]) & (t["gnss"] <= t["imu"][-1])
-    return bool(np.mean(within) > MOSTLY)
 
 
 def _reported(found: list[Finding], wanted: set[str]) -> list[Finding]:

@@ -13,16 +13,16 @@ from scipy.spatial.transform import Rotation
 from dlkf.base.settings import is_number
 
 # settings that belong to the car, the IMU and the pair of clocks, and how far apart those of two drives may be
-ALIKE: dict[tuple[str, ...], float] = {
-    ("imu", "accel", "unit"): 0.02,  # relative, of a number by gravity
-    ("imu", "gyro", "unit"): 0.02,
-    ("imu", "accel", "axes"): 4.0,  # degrees, twice of what is sure enough
-    ("imu", "gyro", "axes"): 4.0,
-    ("gnss", "velocity", "unit"): 0.0,
-    ("gnss", "time", "drift_ppm"): 60.0,  # two crystals that warm up
+ALIKE = {
+    "imu.accel.unit": 0.02,  # relative, of a number by gravity
+    "imu.gyro.unit": 0.02,
+    "imu.accel.axes": 4.0,  # degrees, twice of what is sure enough
+    "imu.gyro.axes": 4.0,
+    "gnss.velocity.unit": 0.0,
+    "gnss.time.drift_ppm": 60.0,  # two crystals that warm up
 }
 FARTHEST_OFFSET_S = 0.05  # of a drive's own guess from the others', or three of its 1σ
-OFFSETS = ((("gnss", "time", "offset_s"), 0.05), (("imu", "time", "offset_s"), 0.05))  # a delay, not two free clocks
+OFFSETS = {"gnss.time.offset_s": 0.05, "imu.time.offset_s": 0.05}  # a delay, not two free clocks
 
 
 def layout(mapping: Mapping[str, Any]) -> str:
@@ -39,24 +39,23 @@ def pool_settings(mappings: Sequence[Mapping[str, Any]], *, offsets: bool) -> tu
     """
     out: dict[str, Any] = {}
     apart: list[str] = []
-    limits = dict(ALIKE) | (dict(OFFSETS) if offsets else {})
-    for path, limit in limits.items():
-        values = [v for v in (value_at(m, path) for m in mappings) if v not in (None, "auto")]
+    for name, limit in (ALIKE | (OFFSETS if offsets else {})).items():
+        values = [v for v in (value_at(m, name) for m in mappings) if v not in (None, "auto")]
         if not values:
             continue
         value = _agreed(values, limit)
         if value is not None:
-            set_value(out, path, value)
-        elif path[-1] != "offset_s":
+            set_value(out, name, value)
+        elif name not in OFFSETS:
             listed = ", ".join(dict.fromkeys(map(write_value, values)))
-            apart.append(f"reader.{'.'.join(path)} is not the same in all drives: {listed}")
+            apart.append(f"reader.{name} is not the same in all drives: {listed}")
     return out, apart
 
 
 def agrees(settings: Mapping[str, Any], offset_s: float, std: float) -> bool:
     """Whether a drive's own guess of the clocks' offset is that of the others, so that it is one and the same pair of
     clocks and not one that each recording sets again."""
-    shared = next((v for path, _ in OFFSETS if (v := value_at(settings, path)) is not None), None)
+    shared = next((v for name in OFFSETS if (v := value_at(settings, name)) is not None), None)
     return shared is not None and abs(offset_s - float(shared)) <= max(FARTHEST_OFFSET_S, 3 * std)
 
 
@@ -102,15 +101,16 @@ def merge_settings(base: Any, over: Any) -> Any:
     return out | {key: merge_settings(base.get(key), value) for key, value in over.items()}
 
 
-def value_at(mapping: Any, path: tuple[str, ...]) -> Any:
-    """The value of a setting, None where there is none."""
-    for key in path:
+def value_at(mapping: Any, name: str) -> Any:
+    """The value of a setting such as ``imu.accel.unit``, None where there is none."""
+    for key in name.split("."):
         mapping = mapping.get(key) if isinstance(mapping, Mapping) else None
     return mapping
 
 
-def set_value(out: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
+def set_value(out: dict[str, Any], name: str, value: Any) -> None:
     """Set a setting in place."""
-    for key in path[:-1]:
+    *above, last = name.split(".")
+    for key in above:
         out = out.setdefault(key, {})
-    out[path[-1]] = value
+    out[last] = value

@@ -171,7 +171,8 @@ def epoch_note(part: Mapped) -> str | None:
         if order := time.get("order"):
             swapped = {"dmy": "mdy", "mdy": "dmy"}.get(order)
             other = f", {'day' if order == 'dmy' else 'month'} first; {setting}.order={swapped} is the other reading"
-        return f"{what}: dates taken as {as_what}{other if swapped_possible(part, time) else ''}"
+        texts = part.texts(str(column[0] if isinstance(column, list) else column))
+        return f"{what}: dates taken as {as_what}{other if units.day_order(texts) == '' else ''}"
     if time.get("day") is not None:
         return None
     seconds = float(part.column(str(column), nan=False)[0]) / units.TIME[time.get("unit") or "s"]
@@ -191,9 +192,3 @@ def epoch_note(part: Mapped) -> str | None:
     first = _day(seconds + (units.GPS_EPOCH_UNIX if known == "gps" else 0))
     also = f"; as {names[other]} they would be of {dates[other]}: {setting}.clock={other}" if dates[other] else ""
     return f"{what}: taken as {names[known]}, of {first}{also}"
-
-
-def swapped_possible(part: Mapped, time: Spec) -> bool:
-    """Whether the dates of a table may be read with day and month the other way round."""
-    column = time["column"][0] if isinstance(time["column"], list) else time["column"]
-    return units.day_order(part.texts(column)) == ""

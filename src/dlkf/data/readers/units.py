@@ -122,7 +122,7 @@ def seconds(
     if week is not None:
         whole = whole + WEEK_S * week.astype(np.int64)
     if clock in ("unix", "utc"):
-        whole = whole - GPS_EPOCH_UNIX + leap_seconds(whole)
+        whole = gps_seconds(whole)
     return whole, part
 
 
@@ -140,6 +140,11 @@ def now() -> float:
 def leap_seconds(unix: np.ndarray | int) -> np.ndarray:
     """GPS − UTC [s] at Unix times."""
     return np.searchsorted(LEAP_UNIX, unix, side="right")
+
+
+def gps_seconds(unix: Any) -> Any:
+    """GPS time [s since 1980] of Unix times [s], one or an array."""
+    return unix - GPS_EPOCH_UNIX + leap_seconds(unix)
 
 
 def unwrap_stamps(values: np.ndarray, wrap: float) -> np.ndarray:

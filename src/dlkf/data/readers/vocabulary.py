@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence
+from itertools import chain
 
 RECEIVER = r"(?:(?:gps|gnss|loc(?:ation)?|rtk|ublox|nmea|receiver|nav|fix) )?"
 NORTH, EAST = r"n(?:orth|ord)?|lat(?:itude)?|norte?", r"e(?:ast)?|lon(?:gitude)?|ost|est|este"
@@ -127,12 +128,10 @@ UNITS = {
 
 
 # beyond ASCII, in the names and units of columns: a file's encoding shows by them
-LETTERS = {
-    x
-    for text in (*SENSORS.values(), *AXES.values(), *(p for patterns in QUANTITIES.values() for p in patterns))
-    for x in text
-    if not x.isascii()
-} | {x for text in (TIME, DATE, WHEEL, SPEEDS, PRESSURE, *UNITS) for x in text if not x.isascii()}
+LETTERS = set().union(
+    *SENSORS.values(), *AXES.values(), *chain(*QUANTITIES.values()), TIME, DATE, WHEEL, SPEEDS, *UNITS
+)
+LETTERS = {x for x in LETTERS.union(PRESSURE) if not x.isascii()}
 LETTERS |= set("äöüÄÖÜßéèêàâçîôûñóíáúÉÈÀÓÍÁÚ²³°µμ·±") | set("卫星数温磁场角设备名称年月日無効固定解浮点单差分")
 
 

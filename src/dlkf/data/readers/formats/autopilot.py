@@ -16,17 +16,18 @@ import pandas as pd
 from dlkf.base.errors import InputError, first_line
 from dlkf.data.readers.formats import library
 from dlkf.data.readers.frames import LogTable
-from dlkf.data.readers.units import GPS_EPOCH_UNIX, WEEK_S, leap_seconds
+from dlkf.data.readers.qualities import MAVLINK, READINGS
+from dlkf.data.readers.units import WEEK_S, gps_seconds
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
 
-QUALITY = {0: 0, 1: 0, 2: 1, 3: 1, 4: 2, 5: 5, 6: 4, 8: 1}  # of MAVLink's GPS_FIX_TYPE
+QUALITY = READINGS[MAVLINK] | {8: 1}  # of MAVLink's GPS_FIX_TYPE
 ULOG, DATAFLASH = b"ULog\x01\x12\x35", b"\xa3\x95\x80"  # a DataFlash log begins with the format of formats
 ULOG_GNSS = ("vehicle_gps_position", "sensor_gps")
 
 
 def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
     """IMU samples, fixes or a barometer of a log; ``table`` names another instance (``IMU1``, ``sensor_gps``)."""
-    tables = _ulog(path) if _is_ulog(path) else _dataflash(path)
+    tables = _tables(path)
     if kind not in tables or not len(tables[kind]):
         raise InputError(f"{path}: has no {kind}; has {', '.join(k for k, t in tables.items() if len(t)) or 'nothing'}")
     return LogTable(tables[kind], path, "message")
@@ -34,13 +35,13 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
 
 def aids(path: Path) -> tuple[str, ...]:
     """Which further sensors a log has: baro."""
-    tables = _ulog(path) if _is_ulog(path) else _dataflash(path)
-    return tuple(kind for kind in ("baro",) if kind in tables and len(tables[kind]))
+    return ("baro",) if len(_tables(path).get("baro", ())) else ()
 
 
-def _is_ulog(path: Path) -> bool:
+def _tables(path: Path) -> dict[str, pd.DataFrame]:
     with path.open("rb") as file:
-        return file.read(len(ULOG)) == ULOG
+        is_ulog = file.read(len(ULOG)) == ULOG
+    return _ulog(path) if is_ulog else _dataflash(path)
 
 
 def _ulog(path: Path) -> dict[str, pd.DataFrame]:
@@ -81,9 +82,8 @@ def _ulog_fixes(gps: pd.DataFrame) -> tuple[pd.DataFrame, int]:
     utc = gps["time_utc_usec"].astype(np.int64).to_numpy() if "time_utc_usec" in gps else np.zeros(len(gps), np.int64)
     shift = 0
     if (known := np.flatnonzero(utc > 0)).size:
-        unix = utc[known] * 1000
-        gps_ns = unix + (int(leap_seconds(int(unix[0] // 10**9))) - GPS_EPOCH_UNIX) * 10**9
-        shift = int(np.median(gps_ns - t_ns[known]))
+        whole, rest = np.divmod(utc[known], 10**6)
+        shift = int(np.median(gps_seconds(whole) * 10**9 + rest * 1000 - t_ns[known]))
     quality = gps["fix_type"].astype(int).map(QUALITY).fillna(0).astype(int)
     return pd.DataFrame({"t_ns": t_ns + shift, **out, "quality": quality}), shift
 

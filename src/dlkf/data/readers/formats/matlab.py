@@ -36,7 +36,7 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
     if name is None or name not in tables:
         have = ", ".join(tables) or "nothing"
         raise InputError(f"{path}: no variable {name or kind}; has {have}; set reader.{kind}.table")
-    frame = tables[name] if isinstance(tables[name], pd.DataFrame) else _frame(tables[name], f"{path}: {name}")
+    frame = _frame(tables[name], f"{path}: {name}")
     if not len(frame):
         raise InputError(f"{path}: {name} has no rows; give a structure of vectors or a matrix")
     return LogTable(frame, path)
@@ -44,12 +44,8 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
 
 def frames(path: Path) -> dict[str, pd.DataFrame]:
     """The variables that are tables of more than one row, by name."""
-    out = {}
-    for name, value in variables(path).items():
-        frame = value if isinstance(value, pd.DataFrame) else _frame(value, f"{path}: {name}", strict=False)
-        if len(frame) > 1:
-            out[name] = frame
-    return out
+    found = {name: _frame(value, f"{path}: {name}", strict=False) for name, value in variables(path).items()}
+    return {name: frame for name, frame in found.items() if len(frame) > 1}
 
 
 def variables(path: Path) -> dict[str, Any]:
@@ -112,6 +108,8 @@ def _hdf5(h5py: Any, node: Any, depth: int) -> Any:
 
 
 def _frame(value: Any, where: str, strict: bool = True) -> pd.DataFrame:
+    if isinstance(value, pd.DataFrame):
+        return value
     if not isinstance(value, Mapping):
         try:
             matrix = np.atleast_2d(np.asarray(value, dtype=float))
@@ -151,8 +149,6 @@ def _dated(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _is_numeric(value: Any) -> bool:
-    if value is None or isinstance(value, (Mapping, str)):
-        return False
     try:
         return np.asarray(value).dtype.kind in "fiub"
     except ValueError:  # a list of vectors of several lengths

@@ -21,7 +21,6 @@ DAY_NS = 86_400 * 10**9
 MODES = {"N": 0, "A": 1, "D": 2, "P": 2, "R": 4, "F": 5}  # of GNS, a letter a constellation; the best one counts
 HEADINGS = re.compile(rb"\$[A-Z]{2}(HDT|THS),\d")
 BEST = (4, 5, 2, 1, 0)
-COLUMNS = (*POSITION, *VELOCITY, *STD, "quality")
 
 
 def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
@@ -95,13 +94,10 @@ def fixes(messages: Iterator[Any], where: str) -> pd.DataFrame:
             rows.append({"of_day": stamp})
         row = rows[-1]
         row["date"] = date
-        if m.msgID == "GGA" and m.lat not in ("", None):
-            row |= {"lat_deg": m.lat, "lon_deg": m.lon, "quality": int(m.quality)}
-            row["height_m"] = _float(m.alt) + np.nan_to_num(_float(m.sep))
-        elif m.msgID == "GNS" and m.lat not in ("", None) and "lat_deg" not in row:
-            codes = {MODES.get(letter, 0) for letter in str(m.posMode)}
-            row |= {"lat_deg": m.lat, "lon_deg": m.lon, "quality": next(code for code in BEST if code in codes | {0})}
-            row["height_m"] = _float(m.alt) + np.nan_to_num(_float(m.sep))
+        if m.msgID == "GGA" or (m.msgID == "GNS" and "lat_deg" not in row):
+            if m.lat not in ("", None):
+                row |= {"lat_deg": m.lat, "lon_deg": m.lon, "quality": _quality(m)}
+                row["height_m"] = _float(m.alt) + np.nan_to_num(_float(m.sep))
         elif m.msgID == "RMC":
             _set_velocity(row, m.spd, m.cog)
         elif m.msgID == "GST":
@@ -113,12 +109,17 @@ def fixes(messages: Iterator[Any], where: str) -> pd.DataFrame:
         raise InputError(f"{where}: has no GGA or GNS sentence with a position; log GGA beside RMC")
     if frame["date"].isna().all():
         raise InputError(f"{where}: has no date (RMC or ZDA); log RMC beside GGA or GNS")
-    for name in COLUMNS:
-        if name not in frame:
-            frame[name] = np.nan
     frame["quality"] = frame["quality"].fillna(0)
     frame["utc_ns"] = _stamps(frame["of_day"].to_numpy(np.int64), frame["date"])
-    return frame[["utc_ns", *COLUMNS]]
+    return frame.reindex(columns=["utc_ns", *POSITION, *VELOCITY, *STD, "quality"])
+
+
+def _quality(m: Any) -> int:
+    """NMEA GGA code of a GGA, or of the best constellation of a GNS."""
+    if m.msgID == "GGA":
+        return int(m.quality)
+    codes = {MODES.get(letter, 0) for letter in str(m.posMode)} | {0}
+    return next(code for code in BEST if code in codes)
 
 
 def _stamps(of_day: np.ndarray, date: pd.Series) -> np.ndarray:

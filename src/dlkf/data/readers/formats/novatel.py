@@ -18,7 +18,7 @@ import pandas as pd
 
 from dlkf.base.errors import InputError
 from dlkf.data.readers import units
-from dlkf.data.readers.formats.text import decode_text, without_cut_line
+from dlkf.data.readers.formats.text import cells_of, decode_text
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.schema import POSITION, STD, VELOCITY
 
@@ -44,10 +44,7 @@ def _export(lines: list[str], path: Path) -> LogTable:
     first = heads[0] + (2 if any(marks) else 1)
     rows = [(k + 1, line.split()) for k, line in enumerate(lines) if k >= first and line.strip()]
     widths = [3 if "D M S" in m else 1 for m in marks]
-    rows, notes = without_cut_line(rows, sum(widths), path)
-    if bad := [n for n, cells in rows if len(cells) != sum(widths)]:
-        raise InputError(f"{path}: line {bad[0]}: has not the {sum(widths)} cells that the header names")
-    cells = pd.DataFrame([c for _, c in rows], index=pd.Index([n for n, _ in rows]))
+    cells, notes = cells_of(rows, sum(widths), path, f"not the {sum(widths)} cells that the header names")
     out, at = {}, 0
     for name, width in zip(names, widths):
         part = cells.iloc[:, at : at + width]
@@ -100,7 +97,7 @@ def _weeks(columns: Mapping[str, Any], marks: Mapping[str, str], where: str) -> 
         week = np.round((day - units.GPS_EPOCH_UNIX + 43_200 - of_day) / units.WEEK_S).astype(np.int64)
         return {"Week": week}
     whole = day + np.floor(of_day).astype(np.int64)
-    gps = whole - units.GPS_EPOCH_UNIX + (units.leap_seconds(whole) if time == "UTCTime" else 0)
+    gps = units.gps_seconds(whole) if time == "UTCTime" else whole - units.GPS_EPOCH_UNIX
     return {"Week": gps // units.WEEK_S, "GPSTime": gps % units.WEEK_S + of_day % 1}
 
 
@@ -111,9 +108,8 @@ def _days(texts: pd.Series, mark: str, where: str) -> np.ndarray:
         raise InputError(f"{where} has {texts.iloc[0]!r}, must be a date such as 11/14/2019")
     order = mark.strip("()").upper()
     if order not in ("MDY", "DMY", "YMD"):
-        first, second = float(parts[0].max()), float(parts[1].max())
-        order = "YMD" if first > 31 else "DMY" if first > 12 else "MDY" if second > 12 else ""
-    if not order:
+        order = {None: "YMD", "dmy": "DMY", "mdy": "MDY"}.get(units.day_order(texts))
+    if order is None:
         raise InputError(f"{where}: {texts.iloc[0]} may be day or month first; export it with its unit (MDY) or (DMY)")
     named = {name: parts[order.index(letter)] for name, letter in (("year", "Y"), ("month", "M"), ("day", "D"))}
     days = pd.to_datetime(pd.DataFrame(named), errors="coerce")

@@ -19,6 +19,7 @@ import pandas as pd
 from dlkf.base.errors import InputError, first_line
 from dlkf.data.readers.formats import foxglove, library, nmea
 from dlkf.data.readers.frames import LogTable
+from dlkf.data.readers.qualities import READINGS, ROS
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
 
 Row = dict[str, Any]
@@ -116,9 +117,7 @@ def _read(reader: Any, path: Path, kind: str, table: str | None) -> LogTable:
         raise InputError(f"{path}: topic {chosen[0].topic} has no messages; give another one")
     frame = pd.DataFrame(rows)
     if kind in ("gnss", "reference"):
-        for column in (*POSITION, *VELOCITY, *STD):
-            if column not in frame:
-                frame[column] = np.nan
+        frame = frame.reindex(columns=list(dict.fromkeys((*frame, *POSITION, *VELOCITY, *STD))))
     return LogTable(frame, path, "message")
 
 
@@ -131,27 +130,32 @@ def _nav_sat_fix(m: Any) -> Row:
     """Covariance is East-North-Up; status −1 is no fix, 2 corrections of a ground station."""
     row: Row = {"lat_deg": m.latitude, "lon_deg": m.longitude, "height_m": m.altitude}
     if m.position_covariance_type > 0:
-        east, north, up = (float(np.sqrt(max(x, 0.0))) for x in np.asarray(m.position_covariance)[[0, 4, 8]])
-        row |= dict(zip(STD[:3], (north, east, up)))
-    row["quality"] = {-1: 0, 0: 1, 1: 2, 2: 2}.get(int(m.status.status), 1) if hasattr(m, "status") else 1
+        row |= dict(zip(STD[:3], _stds(np.asarray(m.position_covariance)[[4, 0, 8]])))
+    row["quality"] = READINGS[ROS].get(int(m.status.status), 1) if hasattr(m, "status") else 1
     return row
+
+
+def _stds(variances: np.ndarray) -> list[float]:
+    return np.sqrt(np.maximum(variances, 0.0)).tolist()
 
 
 def _twist(m: Any) -> Row:
-    twist = m.twist.twist if hasattr(m.twist, "twist") else m.twist
-    v = twist.linear
+    v = _linear(m)
     row: Row = dict(zip(VELOCITY, (v.y, v.x, -v.z)))
     if hasattr(m.twist, "covariance"):
-        east, north, up = (float(np.sqrt(max(x, 0.0))) for x in np.asarray(m.twist.covariance)[[0, 7, 14]])
-        row |= dict(zip(STD[3:], (north, east, up)))
+        row |= dict(zip(STD[3:], _stds(np.asarray(m.twist.covariance)[[7, 0, 14]])))
     return row
+
+
+def _linear(m: Any) -> Any:
+    """The velocity of a twist, with a covariance beside it or not."""
+    return (m.twist.twist if hasattr(m.twist, "twist") else m.twist).linear
 
 
 def _forward(m: Any) -> Row:
     """Speed along the x axis of the car's frame (REP 105: child_frame_id), and its 1σ where there is one."""
-    twist = m.twist.twist if hasattr(m.twist, "twist") else m.twist
     variance = float(np.asarray(m.twist.covariance)[0]) if hasattr(m.twist, "covariance") else 0.0
-    return {"speed": twist.linear.x, "std": float(np.sqrt(variance)) if variance > 0 else np.nan}
+    return {"speed": _linear(m).x, "std": float(np.sqrt(variance)) if variance > 0 else np.nan}
 
 
 def _nav_pvt(m: Any) -> Row:

@@ -17,11 +17,11 @@ import pymap3d
 
 from dlkf.base.errors import InputError
 from dlkf.data.readers import units
-from dlkf.data.readers.formats.text import decode_text, without_cut_line
+from dlkf.data.readers.formats.text import cells_of, decode_text
 from dlkf.data.readers.frames import LogTable
+from dlkf.data.readers.qualities import READINGS, RTKLIB
 from dlkf.data.schema import POSITION, STD, VELOCITY
 
-QUALITY = {1: 4, 2: 5, 3: 2, 4: 2, 5: 1, 6: 2}  # fix, float, SBAS, DGPS, single, PPP
 ZONES = {"GPST": "gps", "UTC": "utc"}
 
 
@@ -45,11 +45,8 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
         for k, line in enumerate(lines, 1)
         if line.strip() and not line.startswith("%")
     ]
-    usual = len(rows[0][1]) if rows else 0
-    rows, notes = without_cut_line(rows, usual, path)
-    if bad := [n for n, cells in rows if len(cells) != usual]:
-        raise InputError(f"{path}: line {bad[0]}: has another number of cells than line {rows[0][0]}")
-    cells = pd.DataFrame([c for _, c in rows], index=pd.Index([n for n, _ in rows]))
+    first, usual = (rows[0][0], len(rows[0][1])) if rows else (0, 0)
+    cells, notes = cells_of(rows, usual, path, f"another number of cells than line {first}")
     return LogTable(_frame(cells, names, ZONES[zone], path), path, "line", {}, notes)
 
 
@@ -88,7 +85,7 @@ def _frame(cells: pd.DataFrame, names: list[str], clock: str, path: Path) -> pd.
         out |= dict(zip(POSITION, (column["latitude"], column["longitude"], column["height"])))
         out |= dict(zip(VELOCITY, (column.get("vn", nan), column.get("ve", nan), -column.get("vu", nan))))
         out |= dict(zip(STD, (column.get(f"sd{a}", nan) for a in ("n", "e", "u", "vn", "ve", "vu"))))
-    out["quality"] = pd.Series(column["Q"]).map(QUALITY).fillna(0).to_numpy()
+    out["quality"] = pd.Series(column["Q"]).map(READINGS[RTKLIB]).fillna(0).to_numpy()
     return pd.DataFrame(out, index=cells.index)
 
 

@@ -19,18 +19,10 @@ from dlkf.base.errors import InputError, first_line
 from dlkf.data.readers import vocabulary
 from dlkf.data.readers.frames import LogTable
 
-DEFAULTS = {
-    "separator": ",",
-    "decimal": ".",
-    "header": True,
-    "comment": None,
-    "skip_rows": 0,
-    "encoding": None,
-    "lines": None,
-}
+DEFAULTS = dict(separator=",", decimal=".", header=True, comment=None, skip_rows=0, encoding=None, lines=None)
 LARGEST_BYTES = 2 << 30  # unpacked: a day of an IMU at 100 Hz is a third
 LARGEST_RATIO, SMALL_BYTES = 100, 64 << 20  # of unpacked to packed size: text of sensors packs tenfold
-ENCODINGS = ("cp1252", "gb18030", "cp932", "big5", "latin-1")  # of files that are not UTF-8; the last reads anything
+ENCODINGS = ("cp1252", "gb18030", "cp932", "big5")  # of files that are not UTF-8; where none fits, Latin-1 reads any
 PEEK = 1 << 16  # bytes by which one of them is chosen
 
 
@@ -92,20 +84,26 @@ def decode_text(path: Path, encoding: str | None) -> str:
             return raw.decode(name)
         except UnicodeDecodeError:
             continue
-    raise AssertionError("latin-1 reads any byte")
+    return raw.decode("latin-1")
 
 
-def without_cut_line(
-    rows: list[tuple[int, list[str]]], cells: int, path: Path
-) -> tuple[list[tuple[int, list[str]]], tuple[str, ...]]:
-    """Numbered rows but the last where that has fewer cells, and a note on it; InputError where no row is left."""
+def cells_of(
+    rows: list[tuple[int, list[str]]], count: int, path: Path, otherwise: str
+) -> tuple[pd.DataFrame, tuple[str, ...]]:
+    """Numbered rows of ``count`` cells as texts, without the last where that has fewer, and a note on it.
+
+    InputError where no row is left, and with ``otherwise`` for one that has another number of cells.
+    """
     notes = ()
-    if rows and len(rows[-1][1]) < cells:
+    if rows and len(rows[-1][1]) < count:
         notes = (f"{path.name}: line {rows[-1][0]}, the last, is cut off: left out",)
         rows = rows[:-1]
     if not rows:
         raise InputError(f"{path}: has no rows; leave the drive out or give its data")
-    return rows, notes
+    numbers, cells = zip(*rows)
+    if bad := [number for number, row in rows if len(row) != count]:
+        raise InputError(f"{path}: line {bad[0]}: has {otherwise}")
+    return pd.DataFrame(list(cells), index=pd.Index(numbers)), notes
 
 
 def _likely_encodings(head: bytes) -> list[str]:
@@ -115,7 +113,7 @@ def _likely_encodings(head: bytes) -> list[str]:
         letters = [x for x in head.decode(name, errors="replace") if not x.isascii()]
         return sum(x in vocabulary.LETTERS for x in letters) / max(len(letters), 1)
 
-    return sorted(ENCODINGS[:-1], key=known, reverse=True) + [ENCODINGS[-1]]
+    return sorted(ENCODINGS, key=known, reverse=True)
 
 
 def _unpacked(path: Path) -> bytes:

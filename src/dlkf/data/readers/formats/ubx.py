@@ -9,7 +9,7 @@ earliest arrival between fixes. A constant latency of the IMU remains: ``reader.
 from __future__ import annotations
 
 import struct
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ import pandas as pd
 from dlkf.base.errors import InputError
 from dlkf.data.readers.formats import library
 from dlkf.data.readers.frames import LogTable
-from dlkf.data.readers.units import DEG, GPS_EPOCH_UNIX, WEEK_S, leap_seconds
+from dlkf.data.readers.units import DEG, WEEK_S, gps_seconds
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
 
 # dataType of ESF-MEAS and ESF-RAW: contract column, SI per step (u-blox F9 interface description, "External sensor")
@@ -58,10 +58,9 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
         return LogTable(found, path, "message", notes=notes)
     if kind != "imu":
         return LogTable(fixes, path, "fix", notes=notes)
-    for name in wanted:
-        samples = _samples(messages, name)
-        if len(samples):
-            return LogTable(samples, path, "sample", notes=notes)
+    samples = _first(_samples(messages, name) for name in wanted)
+    if len(samples):
+        return LogTable(samples, path, "sample", notes=notes)
     have = ", ".join(sorted({m.identity for m in messages}))
     raise InputError(f"{path}: has no IMU in {' or '.join(wanted)}; has {have}; set reader.imu.format and file{cut}")
 
@@ -134,9 +133,12 @@ def _gps_ns(m: Any) -> int | None:
         return None
     if not 1980 <= m.year < 2100:
         return None
-    unix = int(date.astype("datetime64[s]").astype(np.int64))
-    gps = unix - GPS_EPOCH_UNIX + int(leap_seconds(unix))
-    week = round((gps - m.iTOW / 1000) / WEEK_S)
+    gps = int(gps_seconds(date.astype("datetime64[s]").astype(np.int64)))
+    return _in_week(round((gps - m.iTOW / 1000) / WEEK_S), m)
+
+
+def _in_week(week: int, m: Any) -> int:
+    """GPS nanoseconds of a message's iTOW."""
     return week * WEEK_S * 10**9 + m.iTOW * 10**6
 
 
@@ -148,29 +150,21 @@ def _quality(m: Any) -> int:
 
 
 def _samples(messages: list[Any], name: str) -> pd.DataFrame:
-    """IMU samples: values of one time tag, complete where all six axes are there."""
-    tags, arrived = _tagged(messages, name, SENSORS)
-    whole = {tag: values for tag, values in tags.items() if len(values) == len(SENSORS)}
-    if len(whole) < FEWEST:
-        return pd.DataFrame()
-    at = np.array(sorted(whole))
-    rows = [{column: _signed(whole[tag][k]) * step for k, (column, step) in SENSORS.items()} for tag in at]
-    return pd.DataFrame(rows)[[*GYRO, *ACCEL]].assign(t_ns=_on_gps_time(at, np.array([arrived[t] for t in at])))
+    """IMU samples: values of one time tag, where all six axes are there."""
+    stamps, values = _complete(messages, name, SENSORS)
+    columns = {c: step * _signed(x) for (c, step), x in zip(SENSORS.values(), values.T)}
+    return pd.DataFrame(columns)[[*GYRO, *ACCEL]].assign(t_ns=stamps)
 
 
 def _wheels(messages: list[Any], name: str) -> pd.DataFrame:
     """Speed [m/s] of the car's own sensor, else ticks counted on: the mean of the rear wheels, the single tick, the
     mean of the front ones, whichever there is."""
     for kinds in (SPEED, *TICKS):
-        tags, arrived = _tagged(messages, name, kinds)
-        whole = {tag: values for tag, values in tags.items() if len(values) == len(kinds)}
-        if len(whole) < FEWEST:
+        stamps, values = _complete(messages, name, kinds)
+        if not len(stamps):
             continue
-        at = np.array(sorted(whole))
-        stamps = _on_gps_time(at, np.array([arrived[t] for t in at]))
-        values = np.array([[whole[tag][k] for k in kinds] for tag in at])
         if kinds == SPEED:
-            return pd.DataFrame({"t_ns": stamps, "speed": [1e-3 * _signed(v) for v in values[:, 0]]})
+            return pd.DataFrame({"t_ns": stamps, "speed": 1e-3 * _signed(values[:, 0])})
         backward, count = values & BACKWARD > 0, values & (BACKWARD - 1)
         step = np.diff(count, axis=0, prepend=count[:1])
         step = (step + BACKWARD // 2) % BACKWARD - BACKWARD // 2
@@ -186,13 +180,16 @@ def _headings(messages: list[Any]) -> pd.DataFrame:
         if m.identity == "NAV-PVT" and (stamp := _gps_ns(m)) is not None:
             week = stamp // (WEEK_S * 10**9)
         if m.identity == "NAV-RELPOSNED" and week is not None and getattr(m, "relPosHeadingValid", 0):
-            stamp = week * WEEK_S * 10**9 + m.iTOW * 10**6
-            rows.append({"t_ns": stamp, "heading_deg": m.relPosHeading, "std_deg": m.accHeading})
+            rows.append({"t_ns": _in_week(week, m), "heading_deg": m.relPosHeading, "std_deg": m.accHeading})
     return pd.DataFrame(rows)
 
 
-def _tagged(messages: list[Any], name: str, wanted: Container[int]) -> tuple[dict[int, dict[int, int]], dict[int, int]]:
-    """Values by time tag and data type, and of every tag the GPS time of the last fix before its message."""
+def _complete(messages: list[Any], name: str, kinds: Collection[int]) -> tuple[np.ndarray, np.ndarray]:
+    """GPS nanoseconds (n,) and values (n, kinds) of the time tags that have a value of every data type; none where
+    these are fewer than ``FEWEST``.
+
+    Of every tag the GPS time of the last fix before its message tells when it arrived.
+    """
     tags: dict[int, dict[int, int]] = {}
     arrived: dict[int, int] = {}
     now, last, turns = None, None, 0
@@ -202,13 +199,17 @@ def _tagged(messages: list[Any], name: str, wanted: Container[int]) -> tuple[dic
         if m.identity != name or now is None:
             continue
         for value, sensor, tag in _values(m, name):
-            if sensor not in wanted:
+            if sensor not in kinds:
                 continue
             turns += last is not None and tag < last - TAG_WRAP // 2
             last = tag
             tags.setdefault(tag + turns * TAG_WRAP, {})[sensor] = value
             arrived[tag + turns * TAG_WRAP] = now
-    return tags, arrived
+    at = sorted(tag for tag, values in tags.items() if len(values) == len(kinds))
+    if len(at) < FEWEST:
+        return np.zeros(0, np.int64), np.zeros((0, len(kinds)), np.int64)
+    values = np.array([[tags[tag][k] for k in kinds] for tag in at])
+    return _on_gps_time(np.array(at), np.array([arrived[tag] for tag in at])), values
 
 
 def _values(m: Any, name: str) -> Iterator[tuple[int, int, int]]:
@@ -224,10 +225,9 @@ def _values(m: Any, name: str) -> Iterator[tuple[int, int, int]]:
         k += 1
 
 
-def _signed(value: int) -> int:
+def _signed(values: np.ndarray) -> np.ndarray:
     """24 bits, two's complement."""
-    value &= 0xFFFFFF
-    return value - (1 << 24) if value & (1 << 23) else value
+    return ((values & 0xFFFFFF) ^ (1 << 23)) - (1 << 23)
 
 
 def _on_gps_time(tags: np.ndarray, after: np.ndarray) -> np.ndarray:
