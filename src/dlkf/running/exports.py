@@ -20,7 +20,7 @@ import pymap3d
 from numpy.typing import NDArray
 
 from dlkf.base.errors import InputError
-from dlkf.data.readers.units import GPS_EPOCH_UNIX, WEEK_S, clock_by_size, leap_seconds
+from dlkf.data.readers.units import GPS_EPOCH_UNIX, WEEK_S, clock_by_size, gps_seconds, leap_seconds
 from dlkf.data.tables import DriveClock
 from dlkf.running.bag_exports import write_bag
 
@@ -133,11 +133,7 @@ def write_nmea(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
 
 def write_pos(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
     """RTKLIB's solution file in GPS week and time of week; Q 1 with a fix, 6 (here: dead reckoning) without."""
-    if when is None:
-        gps = table["t"].to_numpy()
-    else:
-        unix = np.array([w.timestamp() for w in when])
-        gps = unix - GPS_EPOCH_UNIX + leap_seconds(unix)
+    gps = table["t"].to_numpy() if when is None else gps_seconds(np.array([w.timestamp() for w in when]))
     week = np.floor(gps / WEEK_S)
     std = [table[f"std_pos_{a}"].fillna(0).to_numpy() for a in "ned"]
     head = "%  GPST               latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)"

@@ -1,0 +1,73 @@
+"""What the recorder takes down is what torch does, at other inputs as well; what depends on values it refuses."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from dlkf.base.errors import InputError
+from dlkf.onboard.c_source import function_in_c
+from dlkf.onboard.recording import exporting, record
+
+SCALE = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+
+
+class Recorded:
+    """A function of one vector of three."""
+
+    def __init__(self, work) -> None:
+        self._work = work
+
+    def example(self):
+        return (torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64),)
+
+    def __call__(self, x):
+        return self._work(x)
+
+
+def parts_changed(x):
+    y = torch.zeros(2, 3, dtype=x.dtype)
+    y[0] = x * SCALE
+    y[1, 1:] = x[:2].cumsum(0)
+    y[0, 0].add_(x[2])
+    return y, y.sum(0).detach()
+
+
+def constants_read(x):
+    half = torch.tensor(0.5, dtype=torch.float64)
+    return (x * half.item() if half > 0 else x) + SCALE[torch.tensor([2, 0, 1])]
+
+
+def split(x):
+    low, high = torch.sort(x).values.aminmax()
+    return torch.stack((low, high, x.to(torch.float32).double().norm()))
+
+
+@pytest.mark.parametrize("work", [parts_changed, constants_read, split])
+def test_a_graph_has_the_values_of_its_function(work) -> None:
+    with exporting():
+        graph = record(Recorded(work))
+    x = torch.tensor([-7.0, 0.25, 1e3], dtype=torch.float64)
+    torch.testing.assert_close(graph(x), work(x), rtol=0, atol=0)
+
+
+def test_a_constant_is_not_changed_by_recording() -> None:
+    with exporting():
+        record(Recorded(lambda x: SCALE.clone().mul_(2) + x))
+    assert SCALE.tolist() == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        lambda x: x * x[0].item(),
+        lambda x: x if x[0] > 0 else -x,
+        lambda x: x[x > 0].sum(),
+        lambda x: x.nonzero().sum(),
+        lambda x: x if torch.equal(x, SCALE) else -x,
+    ],
+    ids=["value", "branch", "mask", "nonzero", "equal"],
+)
+def test_what_depends_on_values_is_refused(work) -> None:
+    with exporting(), pytest.raises(InputError, match="cannot be exported"):
+        function_in_c("f", Recorded(work))
