@@ -26,7 +26,7 @@ FILTERS = {  # in the table: its text
     "ins": "INS, strapdown from the last fix",
     "mbkf15": "EKF, 15 states",
     "mbkf21_car": "EKF with vehicle constraints",
-    "plus": "the same, learns noise of the IMU, vibration of the car, delay and antenna of the receiver; the default",
+    "plus": "EKF with vehicle constraints that adapts to IMU, car and receiver; the default of navigate",
     "dlkf": "the paper's network, trained on this IMU (24 epochs)",
 }
 QUICK = ("+experiment=outage", "+profile=quick", "baselines.models=[mbkf15]", "baselines.tune=false",
