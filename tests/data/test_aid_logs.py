@@ -291,6 +291,7 @@ def test_barometers_of_phones(tmp_path, drive):
         (got,) = AutoReader().read(folder)
         np.testing.assert_allclose(got.aids["baro"].pressure, 100 * pressure)
         assert ingest_drives([got], tmp_path / f"out-{folder.name}") == 1
+        assert not [note for note in got.notes if "baro.time" in note]  # the phone's own clock
     _hidden(tmp_path / "a", drive)
     box = pd.read_csv(tmp_path / "a" / "box.txt", sep=";").assign(Luftdruck=950.0)
     box.to_csv(tmp_path / "a" / "box.txt", index=False, sep=";")

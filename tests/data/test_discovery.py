@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import ImuSums, find_lag, known_offset
 from dlkf.data.discovery.drift import ends_apart, ends_std, find_drifting_pose, middle
+from dlkf.data.discovery.findings import discover, find_value
 from dlkf.data.discovery.motion import levelled, motion, position_delay
 from dlkf.data.discovery.orientation import find_pose
 from dlkf.data.discovery.units import accel_units, nearest_unit, time_unit, unit_left
@@ -195,6 +196,14 @@ def test_nothing_is_made_up():
         assert lag is None or not lag.clear
         pose = find_pose(t, noise[0], noise[1], moved, 0.0)
         assert pose is None or pose.explained < 0.8 or pose.yaw_std > math.radians(2)
+
+
+def test_without_a_usable_fix_clock_and_axes_are_unsure():
+    tables = car(60)
+    imu, gnss = ({c: t[c].to_numpy() for c in t} for t in (tables["imu"], tables["gnss"].iloc[:0]))
+    found = discover(imu, gnss, {"imu.axes", "gnss.time.offset_s", "lever_arm_m"})
+    assert not any(f.sure for f in found if f.setting in ("imu.axes", "gnss.time.offset_s"))
+    assert find_value(found, "lever_arm_m") == [0.0, 0.0, 0.0]
 
 
 def test_a_straight_minute_is_refused_with_the_limits_that_would_take_it(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
@@ -9,19 +10,21 @@ from dlkf.base.errors import InputError
 from dlkf.onboard.c_source import function_in_c
 from dlkf.onboard.recording import exporting, record
 
+EXAMPLE = torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
 SCALE = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
 
 
-class Recorded:
+class Recorded(torch.nn.Module):
     """A function of one vector of three."""
 
     def __init__(self, work) -> None:
+        super().__init__()
         self._work = work
 
     def example(self):
-        return (torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64),)
+        return (EXAMPLE,)
 
-    def __call__(self, x):
+    def forward(self, x):
         return self._work(x)
 
 
@@ -43,7 +46,15 @@ def split(x):
     return torch.stack((low, high, x.to(torch.float32).double().norm()))
 
 
-@pytest.mark.parametrize("work", [parts_changed, constants_read, split])
+def masked(x):
+    return x[torch.tensor([True, False, True])].sum() * x
+
+
+def of_its_example(x):
+    return x * EXAMPLE[0] + EXAMPLE
+
+
+@pytest.mark.parametrize("work", [parts_changed, constants_read, split, masked, of_its_example])
 def test_a_graph_has_the_values_of_its_function(work) -> None:
     with exporting():
         graph = record(Recorded(work))
@@ -58,16 +69,25 @@ def test_a_constant_is_not_changed_by_recording() -> None:
 
 
 @pytest.mark.parametrize(
-    "work",
+    ("work", "said"),
     [
-        lambda x: x * x[0].item(),
-        lambda x: x if x[0] > 0 else -x,
-        lambda x: x[x > 0].sum(),
-        lambda x: x.nonzero().sum(),
-        lambda x: x if torch.equal(x, SCALE) else -x,
+        (lambda x: x * x[0].item(), "values"),
+        (lambda x: x if x[0] > 0 else -x, "values"),
+        (lambda x: x * max(1.0, x[0]), "values"),
+        (lambda x: x[x > 0].sum(), "values"),
+        (lambda x: x.nonzero().sum(), "values"),
+        (lambda x: x if torch.equal(x, SCALE) else -x, "values"),
+        (lambda x: torch.from_numpy(2 * x.numpy()), "values"),
+        (lambda x: x * float(np.asarray(x)[0]), "values"),
+        (lambda x: x + torch.rand(3), "random"),
     ],
-    ids=["value", "branch", "mask", "nonzero", "equal"],
+    ids=["value", "branch", "maximum", "mask", "nonzero", "equal", "numpy", "array", "random"],
 )
-def test_what_depends_on_values_is_refused(work) -> None:
-    with exporting(), pytest.raises(InputError, match="cannot be exported"):
+def test_what_depends_on_values_is_refused(work, said) -> None:
+    with exporting(), pytest.raises(InputError, match=f"cannot be exported: .*{said}"):
         function_in_c("f", Recorded(work))
+
+
+def test_what_depends_on_inputs_alone_is_not_refused() -> None:
+    with exporting():
+        assert "in0" in function_in_c("f", Recorded(lambda x: x * len(x))).code

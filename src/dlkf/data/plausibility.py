@@ -60,7 +60,7 @@ def check_imu_units(imu: Columns, where: str) -> None:
     if axes[2] > UPRIGHT * size:
         raise InputError(
             f"{where}: accel_z is {axes[2]:+.2f} m/s² in the median, must be about −9.8 (Forward-Right-"
-            "Down); the z axis points up (FLU?): reader.imu.accel.axes=auto and gyro.axes=auto, or turn the signs of y "
+            "Down); the z axis points up (FLU?): reader.imu.accel.axes=flu and gyro.axes=flu, or turn the signs of y "
             "and z of accel and gyro round"
         )
     if axes[2] > -UPRIGHT * size:

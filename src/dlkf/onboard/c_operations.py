@@ -93,6 +93,10 @@ def _added_product(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, l
     return "{0} + {3} * {1} * {2}", [*args[:3], kwargs.get("value", 1)]
 
 
+def _degrees(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
+    return "{1} * {0}", [args[0], math.degrees(1)]
+
+
 def _second(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
     return "{0}", [args[1]]
 
@@ -105,7 +109,7 @@ BY_ELEMENT: dict[str, Pattern] = {
     "add": _scaled("+"), "sub": _scaled("-"), "mul": "{0} * {1}", "div": "{0} / {1}", "neg": "-{0}",
     "reciprocal": "1 / {0}", "pow": _power, "square": _function("square"), "rsqrt": _root,
     "sqrt": _function("sqrt"), "exp": _function("exp"), "erf": _function("erf"), "log": _function("log"),
-    "log1p": _function("log1p"), "rad2deg": f"{math.degrees(1)!r} * {{0}}",
+    "log1p": _function("log1p"), "rad2deg": _degrees,
     "sin": _function("sin"), "cos": _function("cos"), "asin": _function("asin"), "asinh": _function("asinh"),
     "atan2": _function("atan2"), "tanh": _function("tanh"), "hypot": _function("hypot"), "floor": _function("floor"),
     "abs": _function("fabs"), "sigmoid": _sigmoid, "leaky_relu": _leaky, "relu": "({0} > 0 ? {0} : 0)",

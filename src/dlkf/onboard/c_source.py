@@ -251,10 +251,11 @@ def _filled(text: str, values: Mapping[str, object]) -> str:
 def function_in_c(name: str, function: Function) -> Written:
     """C of a function that works in memory it is given."""
     try:
-        graph = record(function)
+        done = Translation(record(function))
+    except InputError:
+        raise
     except Exception as error:
         raise InputError(f"this filter cannot be exported: {first_line(error)}") from error
-    done = Translation(graph)
     block, inputs = done.block, done.inputs
     arguments = [f"const {C_TYPES[b.dtype]} *restrict {b.name}" for b in inputs]
     for k, view in enumerate(done.outputs):

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.func import functionalize
 from torch.fx import Graph, GraphModule, Node
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_map_only
 
@@ -25,7 +26,7 @@ KEPT = {  # operations that are one in C, though core ATen has several for them
 }  # fmt: skip
 LIFT, COPY = torch.ops.aten.lift_fresh.default, torch.ops.aten.lift_fresh_copy.default
 INDEX = torch.ops.aten.index.Tensor
-SAME = {torch.ops.aten.alias.default, torch.ops.aten.detach.default}  # operations that return their argument
+SAME = {torch.ops.aten.alias.default, torch.ops.aten.detach.default}  # the same numbers in another tensor
 
 
 class Recordable(Protocol):
@@ -40,11 +41,26 @@ class Recordable(Protocol):
         ...
 
 
+class ValueDependence(Exception):
+    """A value in Python, a shape or a random number that no graph can follow."""
+
+
+class NoValues(TorchFunctionMode):
+    """Refuses the ways on which values leave a tensor without an operation."""
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        if func in (Tensor.numpy, Tensor.__array__, Tensor.__dlpack__, Tensor.__repr__):
+            raise ValueDependence(f"{func.__name__} takes values out of a tensor")
+        return func(*args, **(kwargs or {}))
+
+
 class Recorder(TorchDispatchMode):
-    """Runs operations and notes each in a graph: what ``make_fx`` does, on tensors with values, in a tenth of its time.
+    """Runs operations and notes each in a graph: what ``make_fx`` does, on tensors with values, in a fifth of its time.
 
     A tensor that is neither an input nor the result of an operation is a constant, an attribute of the graph.
-    Raises RuntimeError where a value in Python, or a shape, depends on values of the inputs.
+    Raises ValueDependence where a value in Python, or a shape, depends on values of the inputs, and for random numbers.
     """
 
     @classmethod
@@ -79,8 +95,10 @@ class Recorder(TorchDispatchMode):
                 return made
         varies = any(id(x) in self._varies for x in _tensors_of((args, kwargs)))
         takes_value = torch.Tag.data_dependent_output in func.tags
-        if varies and (takes_value or _has_shape_of_values(func, args)):
-            raise RuntimeError(f"what {func} gives depends on values of a tensor")
+        if varies and (takes_value or self._has_shape_of_values(func, args)):
+            raise ValueDependence(f"what {func} gives depends on values of a tensor")
+        if torch.Tag.nondeterministic_seeded in func.tags:
+            raise ValueDependence(f"{func} is random")
         if takes_value:
             return func(*args, **kwargs)
         func = COPY if func is LIFT else func
@@ -96,12 +114,18 @@ class Recorder(TorchDispatchMode):
         return made
 
     def node(self, x: Tensor) -> Node:
-        """That makes a tensor; a tensor that none has made is a constant."""
+        """The node that makes a tensor; a tensor that none has made is a constant."""
         if id(x) not in self._nodes:
             name = f"constant_{len(self._tensors)}"
             setattr(self.constants, name, x)
             self._note(x, self.graph.get_attr(name), False)
         return self._nodes[id(x)]
+
+    def _has_shape_of_values(self, func: Any, args: tuple[Any, ...]) -> bool:
+        if func is INDEX:  # by positions, or by a constant mask, the shape is known
+            masks = (x for x in _tensors_of(args[1]) if x.dtype in (torch.bool, torch.uint8))
+            return any(id(x) in self._varies for x in masks)
+        return torch.Tag.dynamic_output_shape in func.tags
 
     def _note(self, x: Tensor, node: Node, varies: bool) -> None:
         node.meta.setdefault("val", x)
@@ -118,14 +142,14 @@ class Recorder(TorchDispatchMode):
 
 def record(function: Recordable) -> GraphModule:
     """The graph of a function at its ``example()``; its constants are attributes."""
-    example = function.example()
+    example = tuple(x.clone() for x in function.example())  # none of them is a constant, or given twice
     function(*example)  # constants that it keeps for later calls are made here, not as tensors of the recorder
     graph: Any = function
     whole: Any = function
     try:
         for _ in range(2):  # what is changed in place shows in the first graph and is gone in the second
             recorder = Recorder(example)
-            with recorder:
+            with NoValues(), recorder:
                 made = functionalize(graph)(*example)
             graph = recorder.finish(made)
             if not any(node.op == "call_function" and _is_in_place(node.target) for node in graph.graph.nodes):
@@ -174,12 +198,6 @@ def _is_in_place(target: Any) -> bool:
 def _is_composite(func: Any) -> bool:
     """Whether torch runs it as other operations."""
     return func._can_decompose() and not torch._C._dispatch_has_kernel_for_dispatch_key(func.name(), "CPU")
-
-
-def _has_shape_of_values(func: Any, args: tuple[Any, ...]) -> bool:
-    if func is INDEX:  # by positions the shape is that of the positions
-        return any(x.dtype in (torch.bool, torch.uint8) for x in _tensors_of(args[1]))
-    return torch.Tag.dynamic_output_shape in func.tags
 
 
 def _tensors_of(x: Any) -> Iterator[Tensor]:

@@ -46,7 +46,7 @@ class Finding:
     std: float = math.nan
 
 
-def value_found(found: Sequence[Finding], setting: str) -> Any:
+def find_value(found: Sequence[Finding], setting: str) -> Any:
     """The value of a setting, None if it was not looked for or not found."""
     return next((f.value for f in found if f.setting == setting), None)
 
@@ -104,7 +104,8 @@ def discover(
         out.append(_gyro_unit(gyro, pose, increments))
     sound = pose is not None and pose.explained > LEAST_EXPLAINED and AGREE[0] < pose.scale < AGREE[1]
     sound = sound and not (pose is not None and pose.down_apart > FARTHEST_DOWN)
-    before_s = middle(moved) - float(gnss["t"][0])  # of the first fix, the middle that the pose's lag is of
+    # of the first fix, the middle that the pose's lag is of
+    before_s = middle(moved) - float(gnss["t"][0]) if len(gnss["t"]) else 0.0
     if away or "gnss.time.drift_ppm" in wanted:
         if drift_given and pose is not None:
             pose = replace(pose, doubt=0.0)

@@ -184,8 +184,10 @@ def _contents_of(folder: Path) -> list[Contents]:
             base = preset(name)
             specs = {kind: base[kind] for kind in ("imu", "gnss")}
             beside = BAROMETERS.get(name, "")
-            specs |= {"baro": {**base["baro"], "file": beside}} if beside and (folder / beside).is_file() else {}
-            return [Contents(folder / file, [Offer(folder / file, f"layout of {name}", leave_open(specs))])]
+            specs = leave_open(specs)
+            if beside and (folder / beside).is_file():  # by the clock of the IMU
+                specs["baro"] = {**base["baro"], "file": beside}
+            return [Contents(folder / file, [Offer(folder / file, f"layout of {name}", specs)])]
     return [contents(p) for p in sorted(folder.iterdir()) if p.is_file() and not p.name.startswith(".")]
 
 

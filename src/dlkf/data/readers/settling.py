@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from dlkf.base.errors import InputError
-from dlkf.data.discovery.findings import Finding, Sure, discover, find_accel_unit, value_found
+from dlkf.data.discovery.findings import Finding, Sure, discover, find_accel_unit, find_value
 from dlkf.data.discovery.units import speed_factor
 from dlkf.data.readers import units
 from dlkf.data.readers.contract import gnss_frame, imu_frame, positions
@@ -119,10 +119,10 @@ def settle(
     )
     _refuse_doubt(found, wanted, where, t)
     for name in wanted & set(NEUTRAL):
-        value = copy.deepcopy(value_found(found, "imu.axes" if name.endswith("axes") else name))
+        value = copy.deepcopy(find_value(found, "imu.axes" if name.endswith("axes") else name))
         if value is not None:
             set_value(specs, name, value)
-    lever = value_found(found, "lever_arm_m") if "lever_arm_m" in wanted else arm
+    lever = find_value(found, "lever_arm_m") if "lever_arm_m" in wanted else arm
     x, y, z = (float(a) for a in lever)
     return Settled(specs, (x, y, z), _reported(found, wanted))
 
@@ -146,7 +146,7 @@ def _by_gravity(specs: dict[str, Any], imu: Mapped, t: np.ndarray, where: str, a
 
 def _in_order(frame: pd.DataFrame) -> Columns:
     """The columns of the rows that are later than the row before."""
-    rows = frame[frame["t"].diff().fillna(1.0) > 0]
+    rows = frame[np.diff(frame["t"], prepend=-np.inf) > 0]
     return {str(name): rows[name].to_numpy() for name in rows}
 
 

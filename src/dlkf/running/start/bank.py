@@ -225,7 +225,7 @@ def weigh_step(step: Step, valid: Bool[Tensor, "B 6"], epoch_s: float) -> Float[
 
 def judge_bank(bank: Bank) -> list[HeadingVerdict]:
     """The most probable heading of each case; its 1σ is that of a car whose IMU is not mounted straight."""
-    score = torch.where(bank.score.isnan(), -math.inf, bank.score)
+    score = torch.where(bank.score.isnan() | bank.score.isinf(), torch.finfo(bank.score.dtype).min, bank.score)
     best = score.argmax(-1)
     C = bank.state.C_nb.unflatten(0, (-1, COUNT))
     chosen = C[torch.arange(len(best)), best]
