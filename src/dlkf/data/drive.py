@@ -24,7 +24,7 @@ BOUNDARY_COLUMNS = (
 )  # of Drive, with a row for every boundary; quality is one too, of no use to a filter  # fmt: skip
 
 
-def _change_fields(value: Any, change: Callable[[Any], Any]) -> Any:
+def _apply(value: Any, change: Callable[[Any], Any]) -> Any:
     """A field of a batch with ``change`` made to the tensors in it."""
     if isinstance(value, NavState):
         return NavState(*map(change, value))
@@ -125,7 +125,7 @@ class Batch:
 
     def select(self, index: Int[Tensor, " b"]) -> Batch:
         """Some segments of the batch."""
-        kept = {f.name: _change_fields(getattr(self, f.name), lambda x: x[index]) for f in fields(self)}
+        kept = {f.name: _apply(getattr(self, f.name), lambda x: x[index]) for f in fields(self)}
         return replace(self, **kept | {"drive": tuple(self.drive[i] for i in index.tolist())})
 
     def trimmed(self) -> Batch:
@@ -134,11 +134,11 @@ class Batch:
         if self.size[1] == T:
             return self
         names = (*EPOCHWISE, "aids")
-        return replace(self, **{name: _change_fields(getattr(self, name), lambda x: x[:, :T]) for name in names})
+        return replace(self, **{name: _apply(getattr(self, name), lambda x: x[:, :T]) for name in names})
 
     def to(self, device: torch.device | str) -> Batch:
         """The same batch on another device."""
-        return replace(self, **{f.name: _change_fields(getattr(self, f.name), lambda x: x.to(device)) for f in fields(self)})
+        return replace(self, **{f.name: _apply(getattr(self, f.name), lambda x: x.to(device)) for f in fields(self)})
 
     def in_precision(self, dtype: torch.dtype) -> Batch:
         """The same batch with its working fields in ``dtype``; file clock and ECEF origin stay float64."""
@@ -149,4 +149,4 @@ class Batch:
             return x.to(dtype) if x.is_floating_point() else x
 
         working = [f.name for f in fields(self) if f.name != "t_start"]
-        return replace(self, **{name: _change_fields(getattr(self, name), cast) for name in working})
+        return replace(self, **{name: _apply(getattr(self, name), cast) for name in working})
