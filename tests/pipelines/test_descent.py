@@ -9,7 +9,7 @@ from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.tuning import Tuning
-from dlkf.tuning.search import outage_error
+from dlkf.tuning.search import evaluate_objective
 from tests.filters.scene import IMU, scene
 
 
@@ -33,5 +33,5 @@ def test_a_factor_by_advice_is_a_factor_by_tuning(batch):
 def test_it_descends(batch):
     kalman = build_filter("mbkf33_car", IMU, tuning=Tuning(accel_noise=30.0, lateral_std=2.0))
     found = tune_by_gradient(kalman, batch, 34, steps=6)
-    before, after = (outage_error(build_filter("mbkf33_car", IMU, tuning=t), [batch]) for t in (kalman.tuning, found))
+    before, after = (evaluate_objective(build_filter("mbkf33_car", IMU, tuning=t), [batch]) for t in (kalman.tuning, found))
     assert after < 0.97 * before

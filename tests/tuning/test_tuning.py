@@ -18,7 +18,7 @@ from dlkf.filters.integration import integrate
 from dlkf.filters.tuning import Tuning
 from dlkf.onboard.library import compiler
 from dlkf.tuning.baselines import tuned_baselines
-from dlkf.tuning.search import FACTORS, factors_of, mean_imu_error, outage_error, tune_filter
+from dlkf.tuning.search import FACTORS, factors_of, mean_imu_error, evaluate_objective, tune_filter
 from dlkf.tuning.study import check_settings, train_test_drives
 from tests.cars import IMU
 
@@ -31,7 +31,7 @@ def test_objectives_are_what_they_say(cars):
     batch = hidden(cars)
     solution = integrate(batch, build_filter("mbkf15", IMU))
     ends = (solution.posterior.p_n - batch.truth.p_n)[:, 49, :2].norm(dim=-1)
-    found = {o: outage_error(build_filter("mbkf15", IMU), [batch], o) for o in ("rms", "median", "log")}
+    found = {o: evaluate_objective(build_filter("mbkf15", IMU), [batch], o) for o in ("rms", "median", "log")}
     assert found["rms"] == pytest.approx(float(ends.square().mean().sqrt()))
     assert found["median"] == pytest.approx(float(ends.quantile(0.5)))
     assert found["log"] == pytest.approx(float(ends.log().mean().exp()))
@@ -43,7 +43,7 @@ def test_one_lost_segment_decides_rms_but_not_the_median(cars):
     imu[0, 30:] += torch.tensor([2.0, 2.0, 0, 0, 0, 0.1])
     lost = replace(batch, imu=imu)
     filters = build_filter("mbkf15", IMU)
-    before, after = ([outage_error(filters, [b], o) for o in ("rms", "median")] for b in (batch, lost))
+    before, after = ([evaluate_objective(filters, [b], o) for o in ("rms", "median")] for b in (batch, lost))
     assert after[0] > 10 * before[0]
     assert after[1] < 2 * before[1]
 
@@ -54,7 +54,7 @@ def test_a_search_mends_noise_that_is_told_too_small(cars):
     factors = {"accel_noise": (1.0, 100.0), "gyro_noise": (1.0, 100.0)}
     best, score = tune_filter(small, [hidden(cars)], factors=factors, rounds=1, progress=trials.append)
     assert (best.accel_noise, best.gyro_noise) != (1.0, 1.0)
-    assert score == min(t.score for t in trials) < outage_error(build_filter("mbkf15", small), [hidden(cars)])
+    assert score == min(t.score for t in trials) < evaluate_objective(build_filter("mbkf15", small), [hidden(cars)])
 
 
 @pytest.mark.skipif(compiler() is None, reason="no C compiler here")
@@ -133,7 +133,7 @@ def test_a_filter_that_is_told_its_unit_drifts_less(cars):
     batch, expected, _ = one_unit(cars)
     found = tuned_baselines(["mbkf15_prior", "mbkf33", "mbkf33_prior"], expected, [hidden(batch)], rounds=0, say=str)
     assert len(found.priors["mbkf15_prior"].mean) == 6 and len(found.priors["mbkf33_prior"].mean) == 24
-    expected, untold = (outage_error(found.build()[n], [hidden(batch)]) for n in ("mbkf33_prior", "mbkf33"))
+    expected, untold = (evaluate_objective(found.build()[n], [hidden(batch)]) for n in ("mbkf33_prior", "mbkf33"))
     assert expected < 0.8 * untold
 
 

@@ -147,7 +147,15 @@ def end_errors(batch: Batch, state: NavState) -> Array:
     return outage_end(np.nan_to_num(off.cpu().numpy(), nan=np.inf), outage_intervals(hidden))
 
 
+def segment_errors(batch: Batch, state: NavState) -> Array:
+    """RMS over each segment of position [m], velocity [m/s] and attitude [rad], (B, 3), the measure of the paper's
+    tables (R120); NaN without truth, inf where not finite."""
+    size = magnitudes(error_series(batch, state))
+    return np.stack([segment_rms(size[name]) for name in ("position", "velocity", "attitude")], -1)
+
+
 OBJECTIVES = ("log", "rms", "median")
+PVA = "pva"  # the objective of whole segments, with or without outages
 
 
 def mean_error(errors: Array, objective: str) -> float:

@@ -21,7 +21,7 @@ from dlkf.data.kinds import drive_imus, drive_kinds
 from dlkf.data.store import dataset_digest, load_dataset
 from dlkf.evaluation.endurance import OutageErrors, after_tables, hour_table, score_after_gnss, score_without_outage
 from dlkf.evaluation.gains import gains_of, write_gains
-from dlkf.evaluation.outages import OutagePlan
+from dlkf.evaluation.metrics import PVA
 from dlkf.evaluation.protocol import Scenes
 from dlkf.evaluation.results import BASELINE, Results
 from dlkf.evaluation.scores import Scores
@@ -147,13 +147,14 @@ def set_threads(settings: FitSettings) -> None:
 
 
 def _baselines(settings: StudySettings, data: DriveDataModule, say: Say) -> Baselines:
-    """The classical filters, tuned on training segments with outages: those scored, or 20 s where none are."""
+    """The classical filters, tuned on training segments for what is scored: ends of outages, or whole segments."""
     given, scoring = settings.baselines, settings.scoring
-    plan = scoring.outage or OutagePlan(data.eval_length_s / 2, min(20.0, data.eval_length_s / 3), offsets_s=(0.0,))
-    segments = Scenes.of_split(data, "train", plan, scoring.seed, given.segments).withheld()
+    segments = Scenes.of_split(data, "train", scoring.outage, scoring.seed, given.segments).withheld()
     classical = [name for name in given.models if not shipped_folder(name)]
     rounds = given.rounds if given.tune else 0
-    return tuned_baselines(classical, settings.imu, segments, rounds=rounds, say=say, start=given.tuning)
+    objective = "log" if scoring.outage else PVA
+    tuning = {"rounds": rounds, "start": given.tuning, "objective": objective}
+    return tuned_baselines(classical, settings.imu, segments, **tuning, say=say)
 
 
 def _endurance(

@@ -18,7 +18,7 @@ from torch import Tensor
 from dlkf.base.console import warn_once
 from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
-from dlkf.evaluation.metrics import end_errors, mean_error
+from dlkf.evaluation.metrics import PVA, end_errors, geometric_mean, mean_error, segment_errors
 from dlkf.filters.build import build_causal
 from dlkf.filters.integration import Estimator, integrate
 from dlkf.filters.model_based import Mbkf
@@ -52,7 +52,7 @@ MORE_FACTORS: Mapping[str, Mapping[str, tuple[float, ...]]] = {
 
 
 class Trial(NamedTuple):
-    """One point of the search: which factor had which value, and the objective [m]."""
+    """One point of the search: which factor had which value, and the objective."""
 
     factor: str
     value: float
@@ -68,15 +68,24 @@ def factors_of(name: str) -> dict[str, tuple[float, ...]]:
     return found
 
 
-def outage_error(estimator: Estimator, batches: Sequence[Batch], objective: str = "log") -> float:
-    """Horizontal error [m] at the end of the outages of all batches (:func:`dlkf.evaluation.metrics.mean_error`);
-    inf if the filter diverged or there is no outage."""
-    ends = []
+def evaluate_objective(estimator: Estimator, batches: Sequence[Batch], objective: str = "log") -> float:
+    """What tuning makes small, over all batches; inf if the filter diverged or there is nothing to compare.
+
+    ``log``, ``rms``, ``median``: horizontal error [m] at the end of the outages
+    (:func:`dlkf.evaluation.metrics.mean_error`). ``pva``: geometric mean of the RMS of position [m], velocity [m/s] and
+    attitude [rad] over each segment: where factors change all three by the same share, so does this.
+    """
+    measure = segment_errors if objective == PVA else end_errors
+    found = []
     for batch in batches:
         with torch.inference_mode():
-            ends.append(end_errors(batch, integrate(batch, estimator).posterior))
-    error = mean_error(np.concatenate(ends), objective)
-    return float("inf") if math.isnan(error) else error
+            found.append(measure(batch, integrate(batch, estimator).posterior))
+    errors = np.concatenate(found)
+    if objective == PVA:
+        known = errors[~np.isnan(errors)]
+        return geometric_mean(known) if len(known) else math.inf
+    error = mean_error(errors, objective)
+    return math.inf if math.isnan(error) else error
 
 
 def tune_filter(
@@ -91,12 +100,12 @@ def tune_filter(
     prior: Prior | None = None,
     progress: Callable[[Trial], None] | None = None,
 ) -> tuple[Tuning, float]:
-    """Over-bounding factors of a filter by coordinate search on training segments with outages.
+    """Over-bounding factors of a filter by coordinate search on training segments.
 
     A factor goes up its values, or down them, until two in a row are worse; nothing is tried twice. From an hour of
     segments on trials run compiled (:mod:`dlkf.onboard`), which is the same to rounding; where they cannot, a line
     has the reason. ``prior`` is given to a filter with ``_prior``. Returns the best factors and their
-    :func:`outage_error` [m]; ``progress`` is called at every trial.
+    :func:`evaluate_objective`; ``progress`` is called at every trial.
     """
     known: dict[Tuning, float] = {}
     best = start or Tuning()
@@ -109,7 +118,7 @@ def tune_filter(
     def evaluate(trial: Tuning) -> float:
         if trial not in known:
             estimator = _in_c(build(trial), batches[0]) if in_c else build(trial)
-            known[trial] = outage_error(estimator, batches, objective)
+            known[trial] = evaluate_objective(estimator, batches, objective)
         return known[trial]
 
     score = evaluate(best)
@@ -197,8 +206,10 @@ def _information(P: Float[Tensor, "B n n"], states: ErrorStates) -> Float[Tensor
     return torch.linalg.inv(P[:, states.of_matrix, states.of_matrix].double())
 
 
-def best_prior(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name: str = "mbkf15_prior") -> Prior:
-    """The mean IMU error with the spread, of four, that serves ``name`` best in the outages of training segments.
+def best_prior(
+    imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name: str = "mbkf15_prior", objective: str = "log"
+) -> Prior:
+    """The mean IMU error with the spread, of four, with which ``name`` has the least objective on training segments.
 
     The spread of the estimates is their estimator's scatter where all drives share one IMU, and then too wide.
     """
@@ -206,6 +217,7 @@ def best_prior(imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name: str
     tried = [prior.scale_spread(factor) for factor in (3.0, 1.0, 0.3, 0.1)]
 
     def error(tried: Prior) -> float:
-        return outage_error(build_causal(name, imu, "a prior does not", tuning=tuning, prior=tried), batches)
+        estimator = build_causal(name, imu, "a prior does not", tuning=tuning, prior=tried)
+        return evaluate_objective(estimator, batches, objective)
 
     return min(tried, key=error)

@@ -23,7 +23,7 @@ from dlkf.evaluation.table import ResultTable, as_markdown, format_number
 from dlkf.filters.build import build_causal, is_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.tuning.search import Trial, factors_of, outage_error, tune_filter
+from dlkf.tuning.search import Trial, factors_of, evaluate_objective, tune_filter
 
 LIKELIHOOD = "likelihood"  # the objective that needs no reference (dlkf.tuning.found)
 
@@ -131,7 +131,7 @@ def search(
         batches["test"] = withhold_outages(drives["test"], protocol, left_out=left_out)
     old, new = (build_causal(model, imu, "tuning does not", tuning=t) for t in (start, after))
     errors = [
-        (side, o, outage_error(old, b, o), outage_error(new, b, o)) for side, b in batches.items() for o in OBJECTIVES
+        (side, o, evaluate_objective(old, b, o), evaluate_objective(new, b, o)) for side, b in batches.items() for o in OBJECTIVES
     ]
     return TuningResult(model, start, after, tuple(trials), tuple(errors), tuple(left_out))
 
