@@ -59,8 +59,8 @@ def score_as_published(study: Study, seed: str, weights: Path) -> None:
     for this start; ``mbkf15_prior`` is given the unit's true error."""
     tuned = HOME / "tuned_for_published_start"
     if not tuned.is_dir():
-        outage = ("outage.first_s=30", "outage.duration_s=20", "fractions=[0.55,0.1,0.35]", "segments=60")
-        run("tune", "model=mbkf15", "name=published_start", f"out={tuned}", *SEGMENTS, *outage)
+        scored = ("objective=pva", "outage=null", "fractions=[0.55,0.1,0.35]", "segments=60")
+        run("tune", "model=mbkf15", "name=published_start", f"out={tuned}", *SEGMENTS, *scored)
     kinds = {
         "as_published_prior": tuple(f"tuning.{factor}" for factor in R),
         "as_published_tuned": ("--config-dir", str(tuned), "tuning=published_start"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,13 +13,14 @@ import yaml
 from dlkf.base.console import warn_once
 from dlkf.base.errors import InputError
 from dlkf.data.masks import withhold_fixes
+from dlkf.evaluation.metrics import PVA
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.tuning import Tuning
 from dlkf.onboard.library import compiler
 from dlkf.tuning.baselines import tuned_baselines
-from dlkf.tuning.search import FACTORS, factors_of, mean_imu_error, evaluate_objective, tune_filter
+from dlkf.tuning.search import FACTORS, evaluate_objective, factors_of, mean_imu_error, tune_filter
 from dlkf.tuning.study import check_settings, train_test_drives
 from tests.cars import IMU
 
@@ -35,6 +37,28 @@ def test_objectives_are_what_they_say(cars):
     assert found["rms"] == pytest.approx(float(ends.square().mean().sqrt()))
     assert found["median"] == pytest.approx(float(ends.quantile(0.5)))
     assert found["log"] == pytest.approx(float(ends.log().mean().exp()))
+
+
+def test_pva_is_the_geometric_mean_of_what_the_papers_tables_score(cars):
+    """RMS of position, velocity and attitude over each segment, with GNSS throughout."""
+    state, truth = integrate(cars, build_filter("mbkf15", IMU)).posterior, cars.truth
+    turn = state.C_nb @ truth.C_nb.mT
+    angle = torch.arccos(((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1))
+    sizes = torch.stack([(state.p_n - truth.p_n).norm(dim=-1), (state.v_n - truth.v_n).norm(dim=-1), angle])
+    expected = sizes.square().mean(-1).sqrt().log().mean().exp()
+    assert evaluate_objective(build_filter("mbkf15", IMU), [cars], PVA) == pytest.approx(float(expected), rel=1e-4)
+
+
+def test_a_filter_tuned_for_gnss_throughout_beats_one_tuned_for_outages_there(cars):
+    batches = {"log": [hidden(cars)], PVA: [cars]}
+    tuned = {o: tune_filter(IMU, b, rounds=1, objective=o)[0] for o, b in batches.items()}
+    assert tuned["log"] != tuned[PVA]
+    for objective, other in (("log", PVA), (PVA, "log")):
+        best, worse = (
+            evaluate_objective(build_filter("mbkf15", IMU, tuning=tuned[o]), batches[objective], objective)
+            for o in (objective, other)
+        )
+        assert best < worse
 
 
 def test_one_lost_segment_decides_rms_but_not_the_median(cars):
@@ -161,6 +185,17 @@ def test_the_command_writes_factors_that_evaluate_takes(uri, call, town):
     assert done.code == 0, done.err
     done = call("tune", "model=mbkf15", f"dataset={town}", "out=none", *size[:1], "outage.first_s=45", *size[2:])
     assert done.code == 2 and not Path("none").exists(), done.err
+
+
+def test_the_command_tunes_for_gnss_throughout(uri, call, town):
+    common = ("tune", "model=mbkf15", f"dataset={town}", "imu=perfect", "length_s=50", "outage=null", "rounds=1")
+    done = call(*common, "fractions=[0.5,0,0.5]", "objective=pva", "name=cars", "out=found")
+    assert done.code == 0, done.err
+    assert set(json.loads(Path("found/errors.json").read_text())) == {
+        f"{side}/pva/{when}" for side in ("train", "test") for when in ("untuned", "tuned")
+    }
+    done = call(*common, "objective=log", "out=none")
+    assert done.code == 2 and "give objective=pva" in done.err and not Path("none").exists()
 
 
 def test_a_split_that_cuts_drives_is_refused():

@@ -9,11 +9,11 @@ from typing import Any
 
 from dlkf.base.console import show_progress
 from dlkf.data.drive import Batch
+from dlkf.evaluation.metrics import PVA
 from dlkf.filters.build import build_causal, build_filter, has_prior
 from dlkf.filters.smoother import Filter
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.evaluation.metrics import PVA
 from dlkf.tuning.search import best_prior, drop_prior, evaluate_objective, factors_of, tune_filter
 
 FIRST = "mbkf15"  # where the others' search starts, and what the mean IMU error is estimated with
@@ -79,9 +79,9 @@ def tuned_baselines(
 
 
 def _describe_error(error: float, objective: str) -> str:
-    """The objective in words: on training segments, geometric mean."""
+    """The objective's value in words."""
     if objective == PVA:
-        return f"{error:.4g} is the geometric mean of position [m], velocity [m/s], attitude [rad] on training segments"
+        return f"{error:.4g}, geometric mean of the RMS of position (m), velocity (m/s), attitude (rad), training segments"
     return f"{error:.2f} m at the end of the outages of training segments (geometric mean)"
 
 

@@ -17,20 +17,20 @@ from dlkf.base.files import write_into
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.splits import Split, split_rows
 from dlkf.data.stack import DriveStack
-from dlkf.evaluation.metrics import OBJECTIVES
+from dlkf.evaluation.metrics import OBJECTIVES, PVA
 from dlkf.evaluation.protocol import Protocol, Scenes, describe_short
 from dlkf.evaluation.table import ResultTable, as_markdown, format_number
 from dlkf.filters.build import build_causal, is_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.tuning.search import Trial, factors_of, evaluate_objective, tune_filter
+from dlkf.tuning.search import Trial, evaluate_objective, factors_of, tune_filter
 
 LIKELIHOOD = "likelihood"  # the objective that needs no reference (dlkf.tuning.found)
 
 
 @dataclass(frozen=True)
 class TuningResult:
-    """Factors before and after, the trials, and errors in outages [m]: (side, objective, before, after)."""
+    """Factors before and after, the trials, and the objectives' values: (side, objective, before, after)."""
 
     model: str
     before: Tuning
@@ -46,9 +46,9 @@ class TuningResult:
         return {k: v for k, v in start.items() if v != default[k]}
 
     def metrics(self) -> dict[str, float]:
-        """For a log: ``train/outage_rms/tuned`` and the like."""
+        """For a log: ``train/outage_rms/tuned``, ``test/pva/untuned`` and the like."""
         return {
-            f"{side}/outage_{objective}/{when}": value
+            f"{side}/{objective if objective == PVA else f'outage_{objective}'}/{when}": value
             for side, objective, *values in self.errors
             for when, value in zip(("untuned", "tuned"), values)
         }
@@ -62,8 +62,8 @@ def check_settings(model: str, objective: str) -> None:
         raise InputError(f"model={model} is smoothed, its noise is that of the filter; tune it without _rts")
     if "prior" in model.split("_"):
         raise InputError(f"model={model}: the factors of a filter do not depend on its prior; tune it without _prior")
-    if objective not in (*OBJECTIVES, LIKELIHOOD):
-        raise InputError(f"objective={objective} is none of {', '.join((*OBJECTIVES, LIKELIHOOD))}")
+    if objective not in (known := (*OBJECTIVES, PVA, LIKELIHOOD)):
+        raise InputError(f"objective={objective} is none of {', '.join(known)}")
 
 
 def train_test_drives(
@@ -87,16 +87,17 @@ def train_test_drives(
 def withhold_outages(
     drives: Sequence[Drive], protocol: Protocol, segments: int | None = None, left_out: list[str] | None = None
 ) -> list[Batch]:
-    """Batches of drives with their outages, of at most so many segments, spread evenly.
+    """Batches of drives with their outages, if there are any, of at most so many segments, spread evenly.
 
-    What is left out of them, and why, is added to ``left_out``. Raises InputError if no outage fits.
+    What is left out of them, and why, is added to ``left_out``. Raises InputError if the protocol has an outage and
+    none fits.
     """
     scenes = Scenes(drives, protocol, limit=segments)
     kept = scenes.withheld()
     if left_out is not None:
         short = [describe_short(scenes.short, len(drives), protocol)] if scenes.short else []
         left_out += [*scenes.skipped.values(), *short]
-    if not any(bool((~b.available & b.truth_valid & b.present).any()) for b in kept):
+    if protocol.outage and not any(bool((~b.available & b.truth_valid & b.present).any()) for b in kept):
         raise InputError("no outage fits into the valid truth of the training drives; see outage.* and length_s")
     return kept
 
@@ -113,6 +114,8 @@ def search(
     segments: int | None,
 ) -> TuningResult:
     """Fit on ``drives["train"]``, then errors before and after on both sides."""
+    if protocol.outage is None and objective != PVA:
+        raise InputError(f"objective={objective} is of outages and outage=null has none; give objective={PVA}")
     left_out: list[str] = []
     training = withhold_outages(drives["train"], protocol, segments, left_out)
     trials: list[Trial] = []
@@ -130,14 +133,17 @@ def search(
     if drives["test"]:
         batches["test"] = withhold_outages(drives["test"], protocol, left_out=left_out)
     old, new = (build_causal(model, imu, "tuning does not", tuning=t) for t in (start, after))
+    objectives = (*OBJECTIVES, PVA) if protocol.outage else (PVA,)
     errors = [
-        (side, o, evaluate_objective(old, b, o), evaluate_objective(new, b, o)) for side, b in batches.items() for o in OBJECTIVES
+        (side, name, *(evaluate_objective(estimator, part, name) for estimator in (old, new)))
+        for side, part in batches.items()
+        for name in objectives
     ]
     return TuningResult(model, start, after, tuple(trials), tuple(errors), tuple(left_out))
 
 
 def tuning_table(result: TuningResult, dataset: str) -> ResultTable:
-    """Errors in outages before and after, on both sides."""
+    """Errors before and after, on both sides."""
     rows = [
         [side, objective, format_number(before), format_number(after), format_number(after / before)]
         for side, objective, before, after in result.errors
@@ -145,8 +151,9 @@ def tuning_table(result: TuningResult, dataset: str) -> ResultTable:
     factors = ", ".join(f"{k}={v:g}" for k, v in result.changed.items()) or "all as they were"
     return ResultTable(
         title=f"{result.model} on {dataset}: {factors}",
-        note="Horizontal error at the end of the outages [m]: geometric mean (log), RMS and median over them. Fitted "
-        + "".join(["on the training drives alone.", *(f" Left out: {line}." for line in result.left_out)]),
+        note="log, rms, median: horizontal error at the end of the outages [m], geometric mean, RMS and median over "
+        "them. pva: geometric mean of the RMS of position [m], velocity [m/s] and attitude [rad] over each segment. "
+        + "".join(["Fitted on the training drives alone.", *(f" Left out: {line}." for line in result.left_out)]),
         columns=["Drives", "Objective", "Before", "After", "Ratio"],
         rows=rows,
     )
@@ -157,7 +164,7 @@ def write_tuning(out: str | Path, name: str, result: TuningResult, table: Result
     factors = f"# {table.title}\n{yaml.safe_dump(asdict(result.after), sort_keys=False)}"
     trials = io.StringIO()
     writer = csv.writer(trials, lineterminator="\n")
-    writer.writerow(["factor", "value", "error_m"])
+    writer.writerow(["factor", "value", "objective"])
     writer.writerows(result.trials)
     with write_into(out) as folder:
         (folder / "tuning").mkdir()
