@@ -81,7 +81,7 @@ def tuned_baselines(
 def _describe_error(error: float, objective: str) -> str:
     """The objective's value in words."""
     if objective == PVA:
-        return f"{error:.4g}, geometric mean of the RMS of position (m), velocity (m/s), attitude (rad), training segments"
+        return f"geometric mean of position (m), velocity (m/s), attitude (rad) on training segments {error:.4g}"
     return f"{error:.2f} m at the end of the outages of training segments (geometric mean)"
 
 

@@ -135,7 +135,7 @@ def search(
     old, new = (build_causal(model, imu, "tuning does not", tuning=t) for t in (start, after))
     objectives = (*OBJECTIVES, PVA) if protocol.outage else (PVA,)
     errors = [
-        (side, name, *(evaluate_objective(estimator, part, name) for estimator in (old, new)))
+        (side, name, evaluate_objective(old, part, name), evaluate_objective(new, part, name))
         for side, part in batches.items()
         for name in objectives
     ]
