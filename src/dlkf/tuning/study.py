@@ -26,6 +26,11 @@ from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.tuning.search import Trial, evaluate_objective, factors_of, tune_filter
 
 LIKELIHOOD = "likelihood"  # the objective that needs no reference (dlkf.tuning.found)
+OF_OUTAGES = "log, rms, median: horizontal error at the end of the outages [m], geometric mean, RMS, median over them."
+OF_SEGMENTS = (
+    "pva: geometric mean of the RMS of position [m], velocity [m/s] and attitude [rad] over each segment. Fitted on the "
+    "training drives alone."
+)
 
 
 @dataclass(frozen=True)
@@ -148,12 +153,13 @@ def tuning_table(result: TuningResult, dataset: str) -> ResultTable:
         [side, objective, format_number(before), format_number(after), format_number(after / before)]
         for side, objective, before, after in result.errors
     ]
+    outages = any(objective != PVA for _, objective, *_ in result.errors)
     factors = ", ".join(f"{k}={v:g}" for k, v in result.changed.items()) or "all as they were"
     return ResultTable(
         title=f"{result.model} on {dataset}: {factors}",
-        note="log, rms, median: horizontal error at the end of the outages [m], geometric mean, RMS and median over "
-        "them. pva: geometric mean of the RMS of position [m], velocity [m/s] and attitude [rad] over each segment. "
-        + "".join(["Fitted on the training drives alone.", *(f" Left out: {line}." for line in result.left_out)]),
+        note=" ".join(
+            [*([OF_OUTAGES] if outages else []), OF_SEGMENTS, *(f"Left out: {line}." for line in result.left_out)]
+        ),
         columns=["Drives", "Objective", "Before", "After", "Ratio"],
         rows=rows,
     )
