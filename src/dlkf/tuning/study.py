@@ -28,8 +28,8 @@ from dlkf.tuning.search import Trial, evaluate_objective, factors_of, tune_filte
 LIKELIHOOD = "likelihood"  # the objective that needs no reference (dlkf.tuning.found)
 OF_OUTAGES = "log, rms, median: horizontal error at the end of the outages [m], geometric mean, RMS, median over them."
 OF_SEGMENTS = (
-    "pva: geometric mean of the RMS of position [m], velocity [m/s] and attitude [rad] over each segment. Fitted on the "
-    "training drives alone."
+    "pva: geometric mean of the RMS of position [m], velocity [m/s] and attitude [rad] over each segment. "
+    "Fitted on the training drives alone."
 )
 
 
