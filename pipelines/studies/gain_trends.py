@@ -84,8 +84,8 @@ def table4(runs: dict[tuple[str, str], Path]) -> str:
 
 
 def table5(runs: dict[tuple[str, str], Path]) -> str:
-    """Mean over the segments of the RMS of position, velocity and attitude, and their ratios to ``mbkf15``, of every set
-    and filter; of a learned one with every seed."""
+    """Mean over the segments of the RMS of position, velocity and attitude, and ratios to ``mbkf15``, of every set and
+    filter; of a learned one with every seed."""
     lines = ["| set | filter | seed | P [m] | V [m/s] | A [rad] | P / V / A, ratio |", "|:--|:--|:--|--:|--:|--:|--:|"]
     scored = set()
     for (name, seed), folder in sorted(runs.items()):
