@@ -152,7 +152,8 @@ ERRORS: Mapping[str, Change] = {
 }
 OF_VELOCITIES, OF_IMU = [*ERRORS][9:12], [*ERRORS][12:16]
 SPIKED = 1 / 500
-WIDE_SCALE = 0.02
+WIDE_ACCEL = {"turn_on_bias": 0.5}  # m/s², 1σ
+WIDE_GYRO = {"turn_on_bias": math.radians(2.0), "scale_factor": 0.02}
 WRONG_ARM = (1.0, 0.5, -0.8)  # m
 
 
@@ -213,14 +214,14 @@ def from_wrong_files(folder: Path, kind: str) -> list[Drive]:
 
 
 def rivals() -> dict[str, Estimator]:
-    """Constants of ``any_car`` without a gate, with it, with it but without delay and antenna, and with it and scale
-    factors of the gyroscopes of 2 % (1σ); of ``gradient`` with a gate; ``plus`` without delay and antenna; ``plus``."""
+    """Constants of ``any_car`` without a gate, with it, with it but without delay and antenna, and with it and wide
+    priors of the IMU; of ``gradient`` with a gate; ``plus`` without delay and antenna; ``plus``."""
     imu, tuning = imu_preset("automotive_mems"), tuning_preset("any_car")
     plain, gated = f"{BASE}{SOURCES}", f"{BASE}_gated{SOURCES}"
     fixed = gated.replace("+receiver", "")
     filters = {f"{n} any_car": build_causal(n, imu, "no", tuning=tuning) for n in (plain, gated, fixed)}
-    wide = replace(imu, gyro=replace(imu.gyro, scale_factor=WIDE_SCALE))
-    filters[f"{gated} any_car, scale factors 2 %"] = build_causal(gated, wide, "no", tuning=tuning)
+    wide = replace(imu, accel=replace(imu.accel, **WIDE_ACCEL), gyro=replace(imu.gyro, **WIDE_GYRO))
+    filters[f"{gated} any_car, wide priors"] = build_causal(gated, wide, "no", tuning=tuning)
     filters[f"{gated} gradient"] = build_causal(gated, imu, "no", tuning=tuning_preset("gradient"))
     without = "no delay and antenna"
     return {**filters, f"plus, {without}": parts("plus")[without], "plus": trained_filter("plus")}
