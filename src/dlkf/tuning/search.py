@@ -42,10 +42,12 @@ BIAS_SPREADS = (3.0, 1.0, 0.3, 0.1)  # of the mean IMU error's 1σ
 MATRIX_SPREADS = (10.0, 3.0, 1.0, 0.3)
 PATIENCE = 2  # values in a row that are worse, before the rest on that side is left out
 
+CONSTRAINT_STDS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # m/s
+
 # what a filter with these endings, or of this base, takes besides
 MORE_FACTORS: Mapping[str, Mapping[str, tuple[float, ...]]] = {
-    "nhc": {"lateral_std": (0.05, 0.1, 0.2, 0.5, 1.0), "vertical_std": (0.05, 0.1, 0.2, 0.5, 1.0)},
-    "car": {"lateral_std": (0.02, 0.05, 0.1, 0.2, 0.5), "vertical_std": (0.02, 0.05, 0.1, 0.2, 0.5)},
+    "nhc": {"lateral_std": CONSTRAINT_STDS, "vertical_std": CONSTRAINT_STDS},
+    "car": {"lateral_std": CONSTRAINT_STDS, "vertical_std": CONSTRAINT_STDS},
     "gated": {"gate": (0.99, 0.999, 0.9999, 0.999999)},
     "speed": {"wheel_std": (0.03, 0.05, 0.1, 0.2, 0.5)},
     "heading": {"heading_std": (0.5, 1.0, 2.0, 5.0)},
