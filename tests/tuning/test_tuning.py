@@ -17,10 +17,10 @@ from dlkf.evaluation.metrics import PVA
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
-from dlkf.filters.tuning import Tuning
+from dlkf.filters.tuning import Prior, Tuning
 from dlkf.onboard.library import compiler
 from dlkf.tuning.baselines import tuned_baselines
-from dlkf.tuning.search import FACTORS, evaluate_objective, factors_of, mean_imu_error, tune_filter
+from dlkf.tuning.search import FACTORS, best_prior, evaluate_objective, factors_of, mean_imu_error, tune_filter
 from dlkf.tuning.study import check_settings, train_test_drives
 from tests.cars import IMU
 
@@ -159,6 +159,27 @@ def test_a_filter_that_is_told_its_unit_drifts_less(cars):
     assert len(found.priors["mbkf15_prior"].mean) == 6 and len(found.priors["mbkf33_prior"].mean) == 24
     expected, untold = (evaluate_objective(found.build()[n], [hidden(batch)]) for n in ("mbkf33_prior", "mbkf33"))
     assert expected < 0.8 * untold
+
+
+def test_the_best_prior_is_the_best_of_all_that_were_tried(cars, monkeypatch):
+    """Of factors and spreads, for biases and sensor matrices apart, with the means of longer segments."""
+    monkeypatch.setattr("dlkf.tuning.search.BIAS_SPREADS", (3.0, 0.3))
+    monkeypatch.setattr("dlkf.tuning.search.MATRIX_SPREADS", (10.0, 1.0))
+    batch, expected, _ = one_unit(cars)
+    tunings, name = [Tuning(), Tuning(accel_noise=30.0, gyro_noise=30.0)], "mbkf33_prior"
+    prior, tuning = best_prior(expected, tunings, [hidden(batch)], name, longer=[batch])
+    known = [mean_imu_error(expected, t, [batch], "mbkf33") for t in tunings]
+    trials = [(p.scale_spread(b, m), t) for p in known for b in (3.0, 0.3) for m in (10.0, 1.0) for t in tunings]
+    tried = {
+        (p, t): evaluate_objective(build_filter(name, expected, tuning=t, prior=p), [hidden(batch)]) for p, t in trials
+    }
+    assert (prior, tuning) == min(tried, key=tried.__getitem__)
+    assert len(set(tried.values())) == 16
+
+
+def test_spreads_of_biases_and_matrices_scale_apart():
+    prior = Prior(tuple(range(24)), (1.0,) * 24).scale_spread(3.0, 0.5)
+    assert prior.mean == tuple(range(24)) and prior.std == (3.0,) * 6 + (0.5,) * 18
 
 
 def test_untuned_baselines_keep_the_factors_that_they_begin_with(cars):
