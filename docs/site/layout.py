@@ -1,4 +1,8 @@
-"""Numbers of tables on one line where the table has room; else they break between a value and its interval only."""
+"""How tables and pictures are laid out.
+
+Numbers of a table stay on one line where the table has room; else they break between a value and its interval only. A
+picture has its text as caption and opens in full size.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +18,24 @@ RIGHT = '<td style="text-align: right;">'
 TAG = re.compile(r"(<[^>]*>)")
 WHOLE = re.compile(".+", re.S)
 PARTS = re.compile(
-    r"\[[^][]*\]|\([^()]*\)|[\d.]+(?: [/±] [\d.]+)+|[\d.]+ (?:%|(?:s|m|km|ms)\b)"
-)  # interval, pair, unit
+    r"\[[^][]*\]|\([^()]*\)|[\d.]+(?:(?: [/±]|,) [\d.]+)+|[\d.]+ (?:%|(?:s|m|km|ms)\b)"
+)  # interval, numbers, unit
+PICTURES = re.compile(r"<p>((?:\s*<img [^>]*/?>)+)\s*</p>")
+PICTURE = re.compile(r'<img alt="([^"]*)" src="([^"]*)"[^>]*>')
+UNNAMED = "Output of the cell above"  # of a notebook
 WIDEST, WORDS, PADDING = 122, 20, 2.3  # letters: of a table, of a column of words, around a cell
 
 
 def on_page_content(text: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """All tables of a page."""
-    return TABLE.sub(lambda table: unbroken(table[0]), text)
+    """All tables and pictures of a page."""
+    text = TABLE.sub(lambda table: unbroken(table[0]), text)
+    return PICTURES.sub(lambda found: PICTURE.sub(captioned, found[1]) if PICTURE.search(found[1]) else found[0], text)
+
+
+def captioned(picture: re.Match[str]) -> str:
+    """A picture that opens in full size, above its text."""
+    words = f"<figcaption>{picture[1]}</figcaption>" if picture[1] not in ("", UNNAMED) else ""
+    return f'<figure><a href="{picture[2]}">{picture[0]}</a>{words}</figure>'
 
 
 def unbroken(table: str) -> str:
