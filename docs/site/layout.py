@@ -20,14 +20,18 @@ WHOLE = re.compile(".+", re.S)
 PARTS = re.compile(
     r"\[[^][]*\]|\([^()]*\)|[\d.]+(?:(?: [/±]|,) [\d.]+)+|[\d.]+ (?:%|(?:s|m|km|ms)\b)"
 )  # interval, numbers, unit
+UNIT = re.compile(r"(?:\d+ )?[^ ]+ \[[^][]*\]")  # of a head, with the word before it
 PICTURES = re.compile(r"<p>((?:\s*<img [^>]*/?>)+)\s*</p>")
 PICTURE = re.compile(r'<img alt="([^"]*)" src="([^"]*)"[^>]*>')
+CODE, OPTION = re.compile(r"<code>[^<]*</code>"), re.compile(r"(?<![\w-])--[\w-]+")
+JOINED = r'<span class="joined">\g<0></span>'
 UNNAMED = "Output of the cell above"  # of a notebook
 WIDEST, WORDS, PADDING = 122, 20, 2.3  # letters: of a table, of a column of words, around a cell
 
 
 def on_page_content(text: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """All tables and pictures of a page."""
+    """All tables, pictures and options in code of a page."""
+    text = CODE.sub(lambda code: OPTION.sub(JOINED, code[0]), text)
     text = TABLE.sub(lambda table: unbroken(table[0]), text)
     return PICTURES.sub(lambda found: PICTURE.sub(captioned, found[1]) if PICTURE.search(found[1]) else found[0], text)
 
@@ -40,8 +44,13 @@ def captioned(picture: re.Match[str]) -> str:
 
 def unbroken(table: str) -> str:
     """A table whose numbers (cells to the right) do not break, or in parts only."""
-    pattern = WHOLE if width(table) <= WIDEST else PARTS
-    return CELL.sub(lambda cell: cell[1] + (joined(cell[2], pattern) if cell[1] == RIGHT else cell[2]), table)
+    numbers = WHOLE if width(table) <= WIDEST else PARTS
+
+    def laid_out(cell: re.Match[str]) -> str:
+        pattern = numbers if cell[1] == RIGHT else UNIT if cell[1].startswith("<th") else None
+        return cell[1] + (cell[2] if pattern is None else joined(cell[2], pattern))
+
+    return CELL.sub(laid_out, table)
 
 
 def width(table: str) -> float:
@@ -53,5 +62,5 @@ def width(table: str) -> float:
 def joined(cell: str, pattern: re.Pattern[str]) -> str:
     """A cell in which what fits a pattern stays on one line."""
     parts = TAG.split(cell)  # every second one is a tag
-    parts[::2] = [pattern.sub(r'<span class="joined">\g<0></span>', part) for part in parts[::2]]
+    parts[::2] = [pattern.sub(JOINED, part) for part in parts[::2]]
     return "".join(parts)
