@@ -206,7 +206,7 @@ def rows_of(courses: Sequence[TrackOnMap]) -> tuple[list[str], list[list[str]], 
             [course.result.drive, f"{np.ptp(table['t']):.0f}", f"{distance(course) / 1000:.2f}"]
             + [str(int(table["gnss_used"].sum())), str(offered), f"{course.without.max():.3g}"]
             + [f"{(speed(course) < STANDING).sum() * step:.0f}"]
-            + ([_two_digits(np.nanmedian(sigma)), _two_digits(np.nanmax(sigma))] if known else ["–", "–"])
+            + ([_two_digits(float(np.nanmedian(sigma))), _two_digits(float(np.nanmax(sigma)))] if known else ["–", "–"])
             + [_two_digits(ratio) if np.isfinite(ratio) else "–"]
         )
         place = _place(course)
