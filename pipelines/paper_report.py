@@ -84,7 +84,8 @@ PARTS = {
         {"dlkf": (0.45, 0.02, 0.07), "mbkf15": (0.49, 0.04, 0.27)},  # R122
         {"imu_errors": "Figure 6: estimates of the IMU's errors (black: true)"}, only=("as_published",),
         note="Start 60° off in yaw (1σ), untuned, R of 0.5 m and 0.05 m/s (R017). as_published_prior: all unseen "
-        "drives, mbkf15_prior given the unit's true error; as_published_tuned: with the factors tuned for this start.",
+        "drives, mbkf15_prior given the unit's true error; as_published_tuned and as_published_prior_tuned: mbkf15 and "
+        "mbkf15_prior with factors of their own, tuned for this start.",
     ),
     "outage": Part(
         "5.3 Outages of 30 to 50 s", "outage", "paper_outage.py",

@@ -188,10 +188,10 @@ def test_untuned_baselines_keep_the_factors_that_they_begin_with(cars):
     assert found.tunings == {"ins": Tuning(), "mbkf15": coarse, "mbkf21": coarse}
 
 
-@pytest.mark.parametrize("model", ["ins", "mbkf15_prior", "no_such"])
-def test_what_has_no_noise_of_its_own_is_refused(model):
+@pytest.mark.parametrize("model, objective", [("ins", "rms"), ("mbkf15_prior", "likelihood"), ("no_such", "rms")])
+def test_what_has_no_noise_of_its_own_is_refused(model, objective):
     with pytest.raises(InputError, match=f"model={model}"):
-        check_settings(model, "rms")
+        check_settings(model, objective)
 
 
 def test_the_command_writes_factors_that_evaluate_takes(uri, call, town):
@@ -215,6 +215,14 @@ def test_the_command_tunes_for_gnss_throughout(uri, call, town):
     assert set(json.loads(Path("found/errors.json").read_text())) == {
         f"{side}/pva/{when}" for side in ("train", "test") for when in ("untuned", "tuned")
     }
+    prior = ("prior.mean=[0,0,0,0,0,0]", "prior.std=[1e-3,1e-3,1e-3,1e-5,1e-5,1e-5]")
+    of_prior = ("tune", "model=mbkf15_prior", *common[2:], "fractions=[0.5,0,0.5]", "objective=pva", "name=cars")
+    done = call(*of_prior, *prior, "out=known")
+    assert done.code == 0, done.err
+    tuned = [Path(f"{out}/tuning/cars.yaml").read_text() for out in ("found", "known")]
+    assert tuned[0] != tuned[1]
+    done = call(*of_prior, "out=none")
+    assert done.code == 2 and "prior.mean" in done.err and not Path("none").exists()
     done = call(*common, "objective=log", "out=none")
     assert done.code == 2 and "give objective=pva" in done.err and not Path("none").exists()
 
