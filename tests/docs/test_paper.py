@@ -59,9 +59,9 @@ def test_figures_called_measured_stand_on_the_page_of_results() -> None:
 
 def test_a_wrong_figure_would_be_found() -> None:
     link = "[measured](results/paper.md#52-gains)"
-    assert lost_figures(f"{link}: yes, 0.991 → 0.0502 → 0.041") == []
-    assert lost_figures(f"{link}: 0.991 → 0.0503, -0.0011 and 12 × `mbkf15`, 4.5") == ["0.0503", "12"]
-    assert lost_figures("[measured](results/paper.md#51-imu-errors): 0.0502") == ["0.0502"]  # of another section
+    assert lost_figures(f"{link}: yes, 0.826 → 0.0379 → 0.0361") == []
+    assert lost_figures(f"{link}: 0.826 → 0.0503, −0.178 and 12 × `mbkf15`, 4.5") == ["0.0503", "12"]
+    assert lost_figures("[measured](results/paper.md#51-imu-errors): 0.0379") == ["0.0379"]  # of another section
 
 
 def test_what_a_page_of_results_measured_is_not_called_unmeasured() -> None:
