@@ -37,7 +37,7 @@ from dlkf.filters.integration import BatchSolution, Estimator, Fix, advance
 from dlkf.filters.smoother import Filter
 from dlkf.navigation.calibration import ImuError
 from dlkf.onboard.compiled_filter import CompiledFilter, compile_filter
-from dlkf.onboard.functions import packed_fix
+from dlkf.onboard.functions import pack_fix
 from dlkf.running.batched import run_filter
 from dlkf.running.start import align_each
 from dlkf.tracking.models import resolve_model
@@ -167,7 +167,7 @@ def update_times(model: Estimator, compiled: CompiledFilter, batch: Batch) -> np
         for k in range(batch.size[1]):
             aids = {name: rows[:, k] for name, rows in batch.aids.items()}
             fix = Fix(batch.gnss[:, k], batch.gnss_std[:, k], usable[:, k], batch.gnss_lag[:, k], aids)
-            imu, packed = batch.imu[:, k].contiguous(), packed_fix(fix, tables_of(model))
+            imu, packed = batch.imu[:, k].contiguous(), pack_fix(fix, tables_of(model))
             began = time.process_time()
             memory, step = advance(
                 model, memory, state, error, imu, fix, dt=batch.dt, frame=frame, lever_arm_b=batch.lever_arm_b

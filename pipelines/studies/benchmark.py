@@ -36,9 +36,9 @@ from dlkf.filters.saved import learned_filter, learned_settings
 from dlkf.navigation.attitude import rotation_from_vector
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.strapdown import strapdown
-from dlkf.onboard.check import epoch_times
+from dlkf.onboard.check import time_epochs
 from dlkf.onboard.compiled_filter import compile_filter
-from dlkf.onboard.library import compiler
+from dlkf.onboard.library import find_compiler
 from dlkf.running.batched import run_filter
 from dlkf.running.start import aligned_drives
 from dlkf.simulation.dataset import simulate
@@ -105,7 +105,7 @@ def filters(bench: Bench, dataset: Path, imu: ImuSpec, length_s: float, models: 
     segments = (cut_segments(drives, length_s) * 64)[:64]
     for name in models:
         estimator = resolve_model(name, imu)
-        in_c = compile_filter(estimator, RATE_HZ, 1.0) if compiler() else None
+        in_c = compile_filter(estimator, RATE_HZ, 1.0) if find_compiler() else None
         for count in (1, 64):
             batch = make_batch(drives, segments[:count], dtype=torch.float64)
             what = f"{name}, {count} drive{'s' * (count > 1)} of {batch.size[1] * batch.epoch_s:g} s"
@@ -119,9 +119,9 @@ def epochs(bench: Bench, dataset: Path, imu: ImuSpec, models: list[str]) -> None
     """One epoch with its fix by itself: in Python by torch and compiled, and the call in C."""
     drive = load_dataset(dataset, rate_hz=RATE_HZ, dtype=torch.float64)[0]
     batch = aligned_drives([drive], ALIGN)
-    for name in models if compiler() else ():
+    for name in models if find_compiler() else ():
         in_c = compile_filter(resolve_model(name, imu), RATE_HZ, 1.0)
-        for kind, seconds in {**epoch_times(in_c, drive), "C": times_in_c(in_c, batch)}.items():
+        for kind, seconds in {**time_epochs(in_c, drive), "C": times_in_c(in_c, batch)}.items():
             bench.add(Timing("an epoch", f"{name} in {kind}", seconds))
 
 
@@ -198,7 +198,7 @@ def scaling(bench: Bench, dataset: Path, imu: ImuSpec, length_s: float) -> None:
     for rate in (25.0, 50.0, RATE_HZ):
         slower = load_dataset(dataset, rate_hz=rate, dtype=torch.float64)
         run("rate (Hz)", rate, f"8 × {length_s:g} s at {rate:g} Hz", 8, cut_segments(slower, length_s), slower)
-    if compiler():  # whose threads share nothing; those of torch wait for each other, for minutes on a busy machine
+    if find_compiler():  # its threads share nothing; those of torch wait for each other, for minutes on a busy machine
         usual_clock, bench.clock = bench.clock, time.perf_counter  # two threads use two processors
         estimator = compile_filter(estimator, RATE_HZ, 1.0)
         for threads in sorted({1, 2, os.cpu_count() or 1}):

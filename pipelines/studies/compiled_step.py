@@ -18,7 +18,7 @@ from dlkf.data.alignment import ALIGN
 from dlkf.data.store import load_dataset
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
-from dlkf.onboard.check import Latency, latencies
+from dlkf.onboard.check import Latency, measure_latencies
 from dlkf.onboard.compiled_filter import CompiledFilter, compile_filter
 from dlkf.running.batched import run_filter
 from dlkf.running.start import aligned_drives
@@ -59,7 +59,7 @@ def report(name: str, data: Path, rate_hz: float, rounds: int) -> None:
         samples = drives * many.size[1] * many.size[2]
         print(f"{name}, {rate_hz:g} Hz, {drives} drives: {samples / old:,.0f} → {samples / new:,.0f} IMU epochs/s, "
               f"{old / new:.1f} ×", flush=True)  # fmt: skip
-    for kind, x in {**latencies(compiled, drive), "C": Latency.of(times_in_c(compiled, batch))}.items():
+    for kind, x in {**measure_latencies(compiled, drive), "C": Latency.of(times_in_c(compiled, batch))}.items():
         print(f"{name}, an epoch in {kind}: p50 {x.p50:.4f} ms, p99 {x.p99:.4f} ms", flush=True)
 
 

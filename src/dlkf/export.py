@@ -26,7 +26,7 @@ from dlkf.filters.smoother import SmoothedSolution
 from dlkf.onboard.c_source import EXAMPLES, write_source
 from dlkf.onboard.check import check_export, write_log
 from dlkf.onboard.functions import Grid
-from dlkf.onboard.library import compiler
+from dlkf.onboard.library import find_compiler
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
 from dlkf.simulation.sensors import BaroConfig, HeadingConfig, SensorsConfig, WheelConfig
@@ -65,7 +65,7 @@ def main(settings: ExportSettings) -> None:
         for name in COPIED:
             (folder / name).write_text((EXAMPLES / name).read_text())
         write_log(folder / "drive.csv", tables)
-        if compiler() is None:
+        if find_compiler() is None:
             lines = ["not checked: no C compiler here (cc, gcc or clang)"]
         else:
             lines = check_export(Path(somewhere), folder, model, grid, layout, tables, drive, settings.latency)

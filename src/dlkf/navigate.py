@@ -28,7 +28,7 @@ from dlkf.filters.saved import grid_of
 from dlkf.filters.smoother import run_smoother
 from dlkf.navigation.imu_errors import AUTO
 from dlkf.onboard.compiled_filter import compile_filter, compile_or_keep
-from dlkf.onboard.core_drives import core_drive, runs_in_core
+from dlkf.onboard.core_drives import run_core_drive, runs_in_core
 from dlkf.report.navigation import MOST_DRIVES, TrackOnMap, summary_lines, write_page
 from dlkf.running import offline
 from dlkf.running.exports import chosen_formats, export, utc_times
@@ -89,7 +89,7 @@ def main(settings: NavigateSettings) -> None:
     else:
         run = stream_drives if settings.streaming else offline.navigate_dataset
         if settings.streaming and settings.compiled:
-            run = partial(stream_drives, through=core_drive)
+            run = partial(stream_drives, through=run_core_drive)
         run = partial(run, absolute_place(settings.dataset), model, align=settings.align, **grid)
         many = offline.CHUNK_SAMPLES if settings.parallel is None else offline.SAMPLES_AT_ONCE // 4
         shares = offline.chunk_drives(spacings, grid["rate_hz"], 1 if settings.streaming else many)

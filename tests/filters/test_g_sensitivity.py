@@ -17,7 +17,7 @@ from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.error_model import window_model
 from dlkf.navigation.strapdown import strapdown
 from dlkf.onboard.compiled_filter import compile_filter
-from dlkf.onboard.library import compiler
+from dlkf.onboard.library import find_compiler
 from tests.cars import IMU, car_batch
 
 G = torch.tensor([[2e-4, -1e-4], [-3e-4, 2e-4], [1e-4, 1e-4]], dtype=torch.float64)  # rad/s per m/s²
@@ -96,7 +96,7 @@ def test_a_smoother_has_its_part_of_the_error(sensitive):
 
 
 @pytest.mark.whole
-@pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 def test_in_c_it_is_the_same(sensitive):
     kalman = build_filter("mbkf21_car+receiver+g_sensitivity", IMU)
     in_c = compile_filter(kalman, rate_hz=1 / sensitive.dt, epoch_s=sensitive.epoch_s)

@@ -19,7 +19,7 @@ from dlkf.navigation.attitude import rotation_from_rpy, rotation_from_vector
 from dlkf.navigation.state import ACCEL, ATTITUDE, NavState
 from dlkf.navigation.strapdown import strapdown
 from dlkf.onboard.compiled_filter import compile_filter
-from dlkf.onboard.library import compiler
+from dlkf.onboard.library import find_compiler
 
 from .scene import IMU, M, beside, scene
 from .test_constraints import driven, outage, slipping
@@ -270,7 +270,7 @@ def test_shorter_update_intervals_find_the_same_standstills():
 
 
 @pytest.mark.whole
-@pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 def test_the_last_second_is_the_same_in_c():
     """Update intervals of a fifth, whose means are kept from one to the next; a stop in an outage."""
     batch, kalman = in_parts(shaken((0.02, 2e-4), (0.2, 8e-3), SWAY)), build_filter("mbkf21_car", IMU)

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from dlkf.filters.branches import chosen
-from dlkf.onboard.library import compiler
+from dlkf.onboard.library import find_compiler
 from tests.onboard.translated import lines_within, translate
 
-pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 BRANCH = re.compile(r"^ *if \((x|in)\d+\[0\]\) \{", re.MULTILINE)
 COUNT = 400  # numbers, so many that an exponential of them is worth a branch
 GOOD = torch.linspace(-2, 3, COUNT, dtype=torch.float64)[None]

@@ -9,10 +9,10 @@ from torch import nn
 from dlkf.filters.branches import chosen
 from dlkf.onboard import c_parts
 from dlkf.onboard.c_memory import Block
-from dlkf.onboard.library import compiler
+from dlkf.onboard.library import find_compiler
 from tests.onboard.translated import translate
 
-pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 PARTS = "static DLKF_APART void"
 
 
@@ -60,8 +60,8 @@ def test_a_part_ends_outside_braces_only(monkeypatch):
     lines = ["x0[0] = 1;", "if (in0[0]) {", *(f"x0[{k}] = {k};" for k in range(4)), "}", "out0[0] = x0[3];"]
     for line in lines:
         block.write(line, x)
-    block.laid_out()
-    code = c_parts.parts_in_c(
+    block.lay_out()
+    code = c_parts.write_parts(
         "f", ["const double *restrict in0", "double *restrict out0", "double *restrict work"], block
     )
     written = [line.strip() for line in code]

@@ -13,14 +13,14 @@ from dlkf.data.store import drive_rows
 from dlkf.data.validate import read_checked
 from dlkf.onboard.c_source import EXAMPLES
 from dlkf.onboard.core import Core
-from dlkf.onboard.library import CORE, FILTER, compiler
+from dlkf.onboard.library import CORE, FILTER, find_compiler
 from dlkf.running.solution import COLUMNS
 from tests.cars import REAL
 from tests.onboard.conftest import ARM
 from tests.onboard.programs import HERE, STRICT, compile_program, lines, run, stack_of_calls, tool
 from tests.onboard.streams import Calls, calls, through_core
 
-pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 CORTEX_M7 = ("-mcpu=cortex-m7", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv5-d16", "-O2")
 SMALL = ("-DDLKF_IMU_HZ=100", "-DDLKF_LATE_S=2")
 KINDS = {"gnss": 0, "imu": 1, "speed": -1, "heading": -2, "baro": -3}  # as board.c reads them

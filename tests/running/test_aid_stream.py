@@ -18,7 +18,7 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.saved import load_filter
 from dlkf.filters.shipped import shipped_folder
 from dlkf.onboard.compiled_filter import compile_filter
-from dlkf.onboard.library import compiler
+from dlkf.onboard.library import find_compiler
 from dlkf.report.navigation import TrackOnMap
 from dlkf.running.offline import navigate_drives
 from dlkf.running.replay import stream_drive
@@ -71,7 +71,7 @@ def test_a_stream_is_a_batch_run(tables, name, lateness_s):
         assert _apart(batch, stream_drive(tables, model, **GRID, late_s=late_s)) < 1e-6, late_s
 
 
-@pytest.mark.skipif(compiler() is None, reason="needs a C compiler")
+@pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
 @pytest.mark.parametrize("step", [None, 1 / 3.6], ids=["exact", "whole km/h"])
 def test_a_compiled_filter_is_a_batch_run(tables, step):
     model = _filters()["mbkf21_car"]

@@ -18,7 +18,7 @@ from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.tuning import Tuning
-from dlkf.onboard.library import compiler
+from dlkf.onboard.library import find_compiler
 from dlkf.tuning.baselines import tuned_baselines
 from dlkf.tuning.search import FACTORS, evaluate_objective, factors_of, mean_imu_error, tune_filter
 from dlkf.tuning.study import check_settings, train_test_drives
@@ -81,7 +81,7 @@ def test_a_search_mends_noise_that_is_told_too_small(cars):
     assert score == min(t.score for t in trials) < evaluate_objective(build_filter("mbkf15", small), [hidden(cars)])
 
 
-@pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 @pytest.mark.whole
 def test_a_search_in_c_finds_what_one_in_torch_finds(cars, monkeypatch):
     """Every trial, though C takes sums in another order."""

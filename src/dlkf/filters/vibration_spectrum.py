@@ -27,7 +27,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from dlkf.filters.pieces import summed
+from dlkf.filters.pieces import sum_pieces
 
 FAR, NEAR, STEP, LEAST = 4, 16, 0.016, 0.2  # cycles/m; a line is a near frequency ± a far one
 LINES = 2 * FAR * NEAR
@@ -48,7 +48,7 @@ def demodulate(
     x: Float[Tensor, "B M 6"], distance: Float[Tensor, "B M"], begin: Float[Tensor, "B 6 waves"]
 ) -> Float[Tensor, "B 6 waves"]:
     """``begin`` + Σ_k x_k of the products of cos and sin that :func:`components` makes the spectrum of."""
-    return summed(add_waves, begin, x, distance)
+    return sum_pieces(add_waves, begin, x, distance)
 
 
 def add_waves(
