@@ -32,7 +32,7 @@ from dlkf.data.drive import Batch
 from dlkf.data.segments import whole_drives
 from dlkf.data.store import choose_aids, drive_rows, load_dataset
 from dlkf.evaluation.bootstrap import compare
-from dlkf.filters.aids.attach import aid_columns, tables_of, with_aids
+from dlkf.filters.aids.attach import aid_columns, find_tables, with_aids
 from dlkf.filters.integration import BatchSolution, Estimator, Fix, advance
 from dlkf.filters.smoother import Filter
 from dlkf.navigation.calibration import ImuError
@@ -160,14 +160,14 @@ def update_times(model: Estimator, compiled: CompiledFilter, batch: Batch) -> np
     """(3, T) processor seconds of every update of one drive: by torch, compiled, and the call in C alone."""
     memory, bias = model.begin(batch)
     numbers, _ = compiled.begin(batch)
-    state, error, frame = batch.start, ImuError.of(bias), batch.frame.prepared()
+    state, error, frame = batch.start, ImuError.of(bias), batch.frame.prepare()
     seconds = np.zeros((3, batch.size[1]))
     usable = batch.gnss_valid & batch.available.unsqueeze(-1)
     with torch.inference_mode():
         for k in range(batch.size[1]):
             aids = {name: rows[:, k] for name, rows in batch.aids.items()}
             fix = Fix(batch.gnss[:, k], batch.gnss_std[:, k], usable[:, k], batch.gnss_lag[:, k], aids)
-            imu, packed = batch.imu[:, k].contiguous(), pack_fix(fix, tables_of(model))
+            imu, packed = batch.imu[:, k].contiguous(), pack_fix(fix, find_tables(model))
             began = time.process_time()
             memory, step = advance(
                 model, memory, state, error, imu, fix, dt=batch.dt, frame=frame, lever_arm_b=batch.lever_arm_b

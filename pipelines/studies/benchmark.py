@@ -32,7 +32,7 @@ from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Protocol
 from dlkf.filters.build import build_causal
 from dlkf.filters.integration import Estimator, integrate
-from dlkf.filters.saved import learned_filter, learned_settings
+from dlkf.filters.saved import build_learned_filter, parse_learned_settings
 from dlkf.navigation.attitude import rotation_from_vector
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.strapdown import strapdown
@@ -155,7 +155,7 @@ def training_epoch(data: DriveDataModule, name: str, steps: int | None = None) -
     """An epoch with decimation, outages, backward pass and optimiser, or so many steps of it."""
     settings = compose_command("train", f"filter@model={name}")["model"]
     torch.manual_seed(0)
-    model = learned_filter(learned_settings(settings)).train()
+    model = build_learned_filter(parse_learned_settings(settings)).train()
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4)
     transforms = (GnssDecimation(), OutageInjection(start_epoch=0))
     for step in range(steps or len(data.train_segments(1))):

@@ -29,10 +29,10 @@ from dlkf.evaluation.sensors import sensor_table
 from dlkf.evaluation.study import results_of
 from dlkf.evaluation.summary import FEW, headline, metrics_of, sigma_warnings
 from dlkf.evaluation.table import ResultTable, all_tables, as_markdown, as_rich, result_tables
-from dlkf.filters.aids.attach import aid_columns, describe_aids, tables_of, with_aids
+from dlkf.filters.aids.attach import aid_columns, describe_aids, find_tables, with_aids
 from dlkf.filters.build import build_filter
-from dlkf.filters.card import domain_warnings, without_training_recordings
-from dlkf.filters.saved import grid_of
+from dlkf.filters.card import domain_warnings, select_scored_drives
+from dlkf.filters.saved import choose_grid
 from dlkf.report.evaluation import write_report
 from dlkf.running.offline import SAMPLES_AT_ONCE, UsableFixes, chunk_drives
 from dlkf.running.references import check_reference
@@ -63,14 +63,14 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console) -> Evaluation
     check_reference(settings.reference)
     chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
     models = {model_name: with_aids(model, chosen) for model_name, model in models.items()}
-    taken = dict.fromkeys(table for model in models.values() for table in tables_of(model))
-    step = grid_of(models.values(), settings.rate_hz, settings.epoch_s)
+    taken = dict.fromkeys(table for model in models.values() for table in find_tables(model))
+    step = choose_grid(models.values(), settings.rate_hz, settings.epoch_s)
     grid = {**step, "aids": tuple(taken)}
     check_engine(settings.parallel, settings.dataset)
     rows, name = drive_rows(settings.dataset, settings.drives), folder_name(settings.dataset)
     digest, kinds = dataset_digest(settings.dataset), drive_kinds(settings.dataset)
     cards = {model_name: getattr(model, "card", {}) for model_name, model in models.items()}
-    rows, seen = without_training_recordings(cards, rows, name, digest, leave_out=settings.unseen)
+    rows, seen = select_scored_drives(cards, rows, name, digest, leave_out=settings.unseen)
     strange = domain_warnings(models, settings.dataset, [row.name for row in rows], spec.name, grid["rate_hz"])
     notes = [*seen, *strange]
     for line in notes:

@@ -20,8 +20,8 @@ from dlkf.command.settings import ExportSettings
 from dlkf.data.aid_tables import standard_tables
 from dlkf.data.store import drive_from_tables, drive_rows
 from dlkf.data.validate import read_checked
-from dlkf.filters.aids.attach import tables_of, with_aids
-from dlkf.filters.saved import grid_of
+from dlkf.filters.aids.attach import find_tables, with_aids
+from dlkf.filters.saved import choose_grid
 from dlkf.filters.smoother import SmoothedSolution
 from dlkf.onboard.c_source import EXAMPLES, write_source
 from dlkf.onboard.check import check_export, write_log
@@ -49,18 +49,18 @@ def main(settings: ExportSettings) -> None:
     model = with_aids(model, standard_tables(aids))
     if isinstance(model, SmoothedSolution):
         raise InputError(f"model={settings.model} looks ahead, which a vehicle cannot; take it without _rts")
-    given = grid_of([model], settings.rate_hz, settings.epoch_s)
+    given = choose_grid([model], settings.rate_hz, settings.epoch_s)
     dtype = {"double": torch.float64, "float": torch.float32}[settings.precision]
     grid = Grid(round(given["rate_hz"] * given["epoch_s"]), 1 / given["rate_hz"], dtype)
     with write_into(settings.out) as folder, tempfile.TemporaryDirectory() as somewhere:
         dataset = settings.dataset
         if dataset is None:
-            sensors = SENSORS if tables_of(model) else None
+            sensors = SENSORS if find_tables(model) else None
             gnss = GnssConfig(lever_arm_b=ARM)
             drive = DatasetConfig("check", hours=5 / 60, drive_minutes=5.0, gnss=gnss, sensors=sensors)
             dataset = simulate_dataset(drive, imu, 0, Path(somewhere) / "check", progress=False, workers=1)
         tables = read_checked(dataset, drive_rows(dataset, settings.drive)[0], reference=False)
-        drive = drive_from_tables(tables, "", given["rate_hz"], given["epoch_s"], torch.float64, tables_of(model))
+        drive = drive_from_tables(tables, "", given["rate_hz"], given["epoch_s"], torch.float64, find_tables(model))
         layout = write_source(folder, model, grid, short_name(settings.model), describe_provenance())
         for name in COPIED:
             (folder / name).write_text((EXAMPLES / name).read_text())

@@ -22,9 +22,9 @@ from dlkf.command.settings import NavigateSettings
 from dlkf.data.drive import Drive
 from dlkf.data.store import choose_aids, dataset_digest, drive_rows, load_dataset
 from dlkf.data.tables import drive_clocks
-from dlkf.filters.aids.attach import describe_aids, tables_of, with_aids
+from dlkf.filters.aids.attach import describe_aids, find_tables, with_aids
 from dlkf.filters.card import domain_warnings
-from dlkf.filters.saved import grid_of
+from dlkf.filters.saved import choose_grid
 from dlkf.filters.smoother import run_smoother
 from dlkf.navigation.imu_errors import AUTO
 from dlkf.onboard.compiled_filter import compile_filter, compile_or_keep
@@ -56,10 +56,10 @@ def main(settings: NavigateSettings) -> None:
     rows, name = drive_rows(settings.dataset, settings.drives), short_name(settings.model)
     spacings = {row.name: offline.UsableFixes.of(settings.dataset, row.name) for row in rows}
     usual = offline.epoch_for(spacings.values(), settings.rate_hz or 50.0, model)
-    step = grid_of([model], settings.rate_hz, settings.epoch_s, usual)
+    step = choose_grid([model], settings.rate_hz, settings.epoch_s, usual)
     chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
     model = with_aids(model, chosen)
-    grid = {**step, "aids": tables_of(model)}
+    grid = {**step, "aids": find_tables(model)}
     for line in describe_aids({name: model}, chosen):
         print(line)
     for line in domain_warnings({name: model}, settings.dataset, spacings, spec.name, grid["rate_hz"]):

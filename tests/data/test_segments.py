@@ -179,4 +179,4 @@ def test_the_error_state_of_a_start_is_truth_minus_estimate():
     frame = tangent_frame(*(torch.zeros(1, dtype=torch.float64) for _ in range(3)))
     truth = NavState(torch.ones(1, 3).double(), torch.ones(1, 3).double(), torch.eye(3).double()[None])
     dx = torch.arange(1.0, 10.0).double()[None] / 100
-    assert torch.allclose(truth.corrected(-dx).error_to(truth), dx) and frame.height.item() == 0
+    assert torch.allclose(truth.correct(-dx).error_to(truth), dx) and frame.height.item() == 0

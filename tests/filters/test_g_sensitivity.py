@@ -44,7 +44,7 @@ def test_columns_are_the_derivative_of_the_strapdown():
     for k, name in enumerate(NAMES):
         entry = imu.new_zeros(3, 6)
         entry[:, k] = small
-        with_it = ImuError(bias, None, entry.unflatten(-1, (3, 2))).corrected(imu)
+        with_it = ImuError(bias, None, entry.unflatten(-1, (3, 2))).correct(imu)
         measured = window.end.error_to(strapdown(batch.start, with_it, dt, frame).end) / small
         column = Phi[:, :9, states.of(name).start]
         assert torch.allclose(measured[:, 6:], column[:, 6:], atol=3e-3)
@@ -54,7 +54,7 @@ def test_columns_are_the_derivative_of_the_strapdown():
 def test_the_complete_error_is_what_is_taken_off_the_samples():
     error = ImuError(torch.full((2, 6), 0.01), torch.full((2, 6), 0.02), G.float().expand(2, -1, -1))
     raw = torch.randn(2, 5, 6, generator=torch.Generator().manual_seed(0))
-    corrected = error.corrected(raw)
+    corrected = error.correct(raw)
     assert torch.allclose(error.at(corrected.mean(1)), (raw - corrected).mean(1), atol=1e-6)
 
 

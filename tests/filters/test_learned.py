@@ -177,7 +177,7 @@ def test_features_take_the_sizes_of_training_segments_and_keep_them(tmp_path):
     batches = [single(scene(20, 30, seed=9))]
     model = small(frame="heading", outage_mode="run")
     model.learn_sizes(batches)
-    with model.recording() as seen, torch.inference_mode():
+    with model.record_inputs() as seen, torch.inference_mode():
         integrate(batches[0], model)
     scaled = model.scaling(*(torch.cat(x) for x in zip(*seen)))
     spread = scaled[1].std(0)

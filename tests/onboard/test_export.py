@@ -150,7 +150,7 @@ def test_the_description_tells_every_number_of_the_memory(exported):
 def test_every_number_has_a_meaning(kind):
     made = {"dlkf": learned, "plus": talkative_plus}
     layout = make_layout(made[kind]() if kind in made else build_filter(kind, IMU), GRID)
-    assert [f.name for f in layout.fields if not f.plain().get("meaning")] == []
+    assert [f.name for f in layout.fields if not f.as_dict().get("meaning")] == []
 
 
 def test_columns_say_axis_and_unit():

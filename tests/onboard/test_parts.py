@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from dlkf.filters.branches import chosen
+from dlkf.filters.branches import select_branch
 from dlkf.onboard import c_parts
 from dlkf.onboard.c_memory import Block
 from dlkf.onboard.library import find_compiler
@@ -29,7 +29,7 @@ class Long(nn.Module):
         then = made[-1]
         for k in range(30):
             then = (then @ made[k]).tanh().cumsum(2)
-        return torch.cat((chosen(on > 0, then, first), made[-1], made[33]))
+        return torch.cat((select_branch(on > 0, then, first), made[-1], made[33]))
 
 
 def test_values_and_braces_of_parts(tmp_path, monkeypatch):

@@ -8,7 +8,7 @@ import pytest
 
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY, write_drive
 from dlkf.filters.build import build_filter
-from dlkf.filters.saved import grid_of
+from dlkf.filters.saved import choose_grid
 from dlkf.filters.shipped import trained_filter
 from dlkf.report.navigation import TrackOnMap, route_map, rows_of, summary_lines
 from dlkf.running.offline import Innovation, Navigated, UsableFixes, epoch_for
@@ -39,7 +39,7 @@ def test_a_row_without_a_position_is_no_usable_fix(tmp_path):
 
 def test_a_network_round_a_filter_with_constraints_keeps_its_second():
     plus = trained_filter("plus")
-    assert grid_of([plus]) == {"rate_hz": 50.0, "epoch_s": 1.0}
+    assert choose_grid([plus]) == {"rate_hz": 50.0, "epoch_s": 1.0}
     assert epoch_for([FIVE_A_SECOND], 50.0, plus) == 1.0
 
 

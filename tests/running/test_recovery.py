@@ -132,13 +132,13 @@ def test_a_filter_is_lost_after_fixes_in_a_row_far_off():
     watch = LossWatch()
     for k in range(LOST_FIXES):
         assert not watch.lost(k)
-        watch = watch.after(float(k), 1.0)
+        watch = watch.update(float(k), 1.0)
     assert watch.count == LOST_FIXES and not watch.lost(LOST_S - 1) and watch.lost(LOST_S)
-    assert watch.after(20.0, 0.0).count == 0
+    assert watch.update(20.0, 0.0).count == 0
     watch = LossWatch()
     for k in range(2 * LOST_FIXES):
         assert not watch.lost(k)
-        watch = watch.after(float(k), 0.5)
+        watch = watch.update(float(k), 0.5)
     assert not watch.lost(2 * LOST_S - 1) and watch.lost(2 * LOST_S)
 
 

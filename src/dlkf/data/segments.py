@@ -175,7 +175,7 @@ def make_batch(
     from_truth = stack.start_from_truth[row]
     if not bool(from_truth.all()):
         truth, std, dx = _with_alignment(stack, row, frame, truth, std, dx)
-    return _assemble(stack, drive, first, epochs, frame, truth.corrected(-dx), std, dtype)
+    return _assemble(stack, drive, first, epochs, frame, truth.correct(-dx), std, dtype)
 
 
 def whole_drives(drives: Sequence[Drive], starts: Sequence[Start], *, dtype: torch.dtype = torch.float64) -> Batch:

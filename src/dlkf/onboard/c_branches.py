@@ -54,8 +54,9 @@ def _find_condition(node: Node, user: Node, on: dict[Node, Node]) -> Node | None
     """On what a user needs a node."""
     if user in on:
         return on[user]
-    then = operation_name(user) == "where" and user.args[1] is node
-    if then and user.args[0] is not node and user.args[2] is not node:
+    if operation_name(user) != "where":
+        return None
+    if user.args[1] is node and user.args[0] is not node and user.args[2] is not node:
         return _find_scalar(user.args[0])
     return None
 

@@ -21,7 +21,7 @@ from dlkf.base.errors import InputError, first_line
 from dlkf.data import aids, alignment, limits, resampling, spikes, velocity_fit
 from dlkf.data.aid_tables import LAST
 from dlkf.data.validate import LIMITS
-from dlkf.filters.aids.attach import aid_columns, tables_of
+from dlkf.filters.aids.attach import aid_columns, find_tables
 from dlkf.filters.integration import Estimator
 from dlkf.navigation import earth
 from dlkf.onboard.c_code import Translation
@@ -134,7 +134,7 @@ def write_source(
     described = {
         "model": name, "rate_hz": 1 / grid.dt, "epoch_s": grid.epoch_s,
         "row": [{"name": c, "place": k, "meaning": describe_column(c)} for k, c in enumerate(list_columns(estimator))],
-        "memory": {"numbers": layout.size, "type": "float64", "fields": [f.plain() for f in layout.fields]}, **made,
+        "memory": {"numbers": layout.size, "type": "float64", "fields": [f.as_dict() for f in layout.fields]}, **made,
     }  # fmt: skip
     (folder / "step.json").write_text(json.dumps(described, indent=1, ensure_ascii=False) + "\n")
     return layout
@@ -192,7 +192,7 @@ def list_columns(estimator: Estimator) -> tuple[str, ...]:
 
 def _aids(estimator: Estimator) -> dict[str, object]:
     """What ``step.h`` says of further sensors."""
-    tables = tables_of(estimator)
+    tables = find_tables(estimator)
     return {
         "AIDS": len(tables), "AID_NAMES": ", ".join(f'"{t.name}"' for t in tables) or '""',
         "AID_LAST": ", ".join(str(int(t.reduce == LAST)) for t in tables) or "0",

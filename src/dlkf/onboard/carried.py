@@ -37,7 +37,7 @@ class Field:
         """Where the drives are."""
         return 1 if RECURRENT in self.name else 0
 
-    def plain(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """For a file."""
         meaning = describe_field(self.name)
         return {

@@ -27,7 +27,7 @@ import dlkf
 from dlkf.base.console import warn_once
 from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
-from dlkf.filters.aids.attach import aid_columns, tables_of
+from dlkf.filters.aids.attach import aid_columns, find_tables
 from dlkf.filters.integration import BatchSolution, Correction, Estimator, Fix, Step, WholeLoop, integrate
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.smoother import Filter, SmoothedSolution
@@ -75,7 +75,7 @@ class CompiledFilter(WholeLoop):
         self, estimator: Estimator, grid: Grid, layout: Layout, library: Library, *, whole: bool = False
     ) -> None:
         self.estimator, self.grid, self.layout, self.library, self.whole = estimator, grid, layout, library, whole
-        self._aids, self._columns = tables_of(estimator), aid_columns(estimator)
+        self._aids, self._columns = find_tables(estimator), aid_columns(estimator)
         self._vector = Vector if can_reanchor(layout.like.memory) else FixedVector
 
     def __reduce__(self) -> tuple[Callable, tuple]:
@@ -270,7 +270,7 @@ def _digest(estimator: Estimator, grid: Grid) -> str:
     """Of everything that the code depends on: this package, torch, the filter and its weights, grid, machine."""
     made_of = _digest_package().copy()
     code = estimator.code if isinstance(estimator, Mbkf) else estimator
-    aids = tables_of(estimator)
+    aids = find_tables(estimator)
     machine, compiler = describe_machine(), str(find_compiler())
     for part in (torch.__version__, machine, compiler, *FLAGS, repr(code), repr(grid), repr(aids)):
         made_of.update(part.encode())

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from dlkf.data.aid_tables import AidTable
 from dlkf.data.aids import ROW as AID_ROW
 from dlkf.data.drive import Batch
-from dlkf.filters.aids.attach import aid_columns, tables_of
+from dlkf.filters.aids.attach import aid_columns, find_tables
 from dlkf.filters.integration import Estimator, Fix, Step, advance
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import NOMINAL_GRAVITY, TangentFrame, tangent_frame
@@ -90,7 +90,7 @@ def make_layout(estimator: Estimator, grid: Grid) -> Layout:
     imu = ones.new_tensor([0.0, 0.0, -NOMINAL_GRAVITY, 0.0, 0.0, 0.0]).expand(1, grid.samples, 6)
     x = begin_filter(estimator, frame, state, ones, ones[:, :3], grid)
     for _ in range(2):
-        aids = {table.name: ones[:, :AID_N] for table in tables_of(estimator)}
+        aids = {table.name: ones[:, :AID_N] for table in find_tables(estimator)}
         fix = Fix(torch.cat((x.state.p_n, x.state.v_n), -1), ones[:, :6], ones[:, :6] > 0, 0 * ones[:, 0], aids)
         x, _ = advance_filter(estimator, x, imu, fix, grid)
     return Layout(x)
@@ -172,7 +172,7 @@ class Turn(Function):
     def forward(self, memory: Tensor, imu: Tensor, fix: Tensor) -> tuple[Tensor, Tensor]:
         """The loop's turn, and what a :class:`dlkf.filters.integration.BatchSolution` holds of it."""
         imu, fix = imu.to(self.grid.dtype).mT.contiguous().mT, fix.to(self.grid.dtype)  # samples beside each other
-        names = [table.name for table in tables_of(self.estimator)]
+        names = [table.name for table in find_tables(self.estimator)]
         aids = {name: fix[:, FIX_N + AID_N * k : FIX_N + AID_N * (k + 1)] for k, name in enumerate(names)}
         given = Fix(fix[:, :6], fix[:, 6:12], fix[:, 12:18] > 0.5, fix[:, 18], aids or None)
         after, step = advance_filter(self.estimator, self.layout.unpack(memory), imu, given, self.grid)
@@ -221,7 +221,7 @@ class Carry(Function):
         """What was said of the last epoch, with another posterior."""
         x = self.layout.unpack(memory)
         error, state = ImuError(*_to_double(x.error)), NavState(*_to_double(x.state))
-        force, rate = error.corrected(imu).split(3, -1)
+        force, rate = error.correct(imu).split(3, -1)
         s = share.unsqueeze(-1)
         begin, scaled = state._replace(v_n=state.v_n * share), torch.cat((force * s**2, rate * s), -1)
         frame: Any = _OtherTime(x.frame.in_precision(torch.float64), share)
@@ -277,7 +277,7 @@ def move_anchor(estimator: Estimator, x: Carried, grid: Grid, change: FrameChang
 
 def count_fix_numbers(estimator: Any) -> int:
     """How many numbers a turn takes beside the samples: those of a fix, then of each further sensor."""
-    return FIX_N + AID_N * len(tables_of(estimator))
+    return FIX_N + AID_N * len(find_tables(estimator))
 
 
 def pack_fix(fix: Fix, aids: Sequence[AidTable] = ()) -> Float[Tensor, "B f"]:

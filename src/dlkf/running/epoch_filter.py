@@ -145,7 +145,7 @@ class EpochFilter:
             return []
         watch = running.watch
         if bool(fix.used[:, :3].any()):
-            watch = watch.after(epoch.number * self._epoch_s, float(far_off(step.innovation, fix.std)))
+            watch = watch.update(epoch.number * self._epoch_s, float(far_off(step.innovation, fix.std)))
         nowhere = impossible(step.posterior.v_n, step.posterior.p_n, running.frame.height.to(step.posterior.p_n))
         if watch.lost(epoch.number * self._epoch_s) or bool(nowhere):
             self.counts["lost"] += 1

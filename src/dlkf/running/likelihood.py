@@ -37,7 +37,7 @@ from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.masks import withhold_fixes
 from dlkf.data.segments import whole_drives
-from dlkf.filters.aids.attach import aided_name
+from dlkf.filters.aids.attach import append_aids
 from dlkf.filters.build import build_causal, is_filter
 from dlkf.filters.integration import BatchSolution, Estimator
 from dlkf.filters.tuning import Tuning
@@ -309,7 +309,7 @@ def generic_filter(
     as :func:`check_finds_noise`.
     """
     check_finds_noise(name)
-    name = aided_name(name, [table.name for table in aids])
+    name = append_aids(name, [table.name for table in aids])
     found = find_noise(Evidence.of(drives, align=align), name, imu, tuning, **given)
     placed = [found.placing.apply(d) for d in drives]
     return build_causal(name, found.imu, "imu=auto does not", tuning=found.tuning), placed, found

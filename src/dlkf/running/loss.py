@@ -25,7 +25,7 @@ class LossWatch(NamedTuple):
     total: float = 0.0
     since: float = 0.0
 
-    def after(self, t: float, share: float) -> LossWatch:
+    def update(self, t: float, share: float) -> LossWatch:
         """After a fix at ``t`` [s]."""
         if share == 0:
             return LossWatch()
@@ -66,7 +66,7 @@ def first_loss(batch: Batch, row: int, solution: BatchSolution) -> int | None:
     watch = LossWatch()
     for k in torch.nonzero(offered).flatten().tolist():
         t = k * batch.epoch_s
-        watch = watch.after(t, float(far[k]))
+        watch = watch.update(t, float(far[k]))
         if watch.lost(t):
             return k if at is None else min(at, k)
     return at

@@ -22,7 +22,7 @@ from dlkf.data.segments import whole_drives
 from dlkf.data.store import load_dataset
 from dlkf.data.tables import read_table
 from dlkf.data.validate import usable_fixes
-from dlkf.filters.aids.attach import aid_columns, kalman_of
+from dlkf.filters.aids.attach import aid_columns, find_kalman
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import BatchSolution, WholeLoop
 from dlkf.filters.receiver import ARM, DELAY, DRIFT
@@ -87,7 +87,7 @@ def epoch_for(spacings: Iterable[UsableFixes], rate_hz: float, estimator: Filter
     closest = min((s.usual_s for s in spacings), default=1.0)
     samples = closest * rate_hz if math.isfinite(closest) else 0.0  # no drive has two fixes: any grid will do
     whole = samples >= 1 and abs(samples - round(samples)) < 1e-6
-    sources = getattr(kalman_of(estimator), "sources", ())
+    sources = getattr(find_kalman(estimator), "sources", ())
     constrained = any(isinstance(source, CarConstraints) for source in sources)
     return closest if closest < 1.0 and whole and not constrained else 1.0
 

@@ -20,7 +20,7 @@ from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
 from dlkf.data.store import drive_from_tables, drive_rows
 from dlkf.data.tables import Columns
 from dlkf.data.validate import CheckedTables, read_checked
-from dlkf.filters.aids.attach import tables_of
+from dlkf.filters.aids.attach import find_tables
 from dlkf.filters.card import LowSampleRateWarning
 from dlkf.filters.smoother import Filter
 from dlkf.running import start
@@ -124,7 +124,7 @@ def stream_drive(
     run ``from_rest=False``.
     Raises UnalignedError if the drive cannot be aligned, InputError if the filter diverges.
     """
-    kinds = tables_of(estimator)
+    kinds = find_tables(estimator)
     drive = drive_from_tables(tables, "", rate_hz, epoch_s, torch.float64, kinds)
     causal = replace(align, from_rest=False)
     stream = StreamingFilter(

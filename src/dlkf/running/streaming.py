@@ -44,7 +44,7 @@ from dlkf.data.aids import pressure_height
 from dlkf.data.alignment import SEARCH, AlignConfig
 from dlkf.data.resampling import ON_BOUNDARY_S, boundary_after, fixes_at
 from dlkf.data.validate import LIMITS, Limits
-from dlkf.filters.aids.attach import tables_of
+from dlkf.filters.aids.attach import find_tables
 from dlkf.filters.card import warn_slow_drives
 from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.strapdown import strapdown
@@ -128,7 +128,7 @@ class StreamingFilter:
         )
         self._rewind = math.ceil(history_s / epoch_s) + 1  # epochs that may be replayed
         self.counts: Counter[str] = Counter()
-        self._buffer = MeasurementBuffer(tables_of(estimator))
+        self._buffer = MeasurementBuffer(find_tables(estimator))
         self._epochs = EpochFilter(
             estimator, self._buffer, self._samples.boundary, rate_hz=rate_hz, epoch_s=epoch_s, lever_arm_b=lever_arm_b,
             align=align, rewind=self._rewind, anchor_m=anchor_m, counts=self.counts,
@@ -261,7 +261,7 @@ class StreamingFilter:
         if not isinstance(running, Running) or latest is None or tail is None:
             return latest
         imu, dt = torch.from_numpy(tail[0]).to(self._epochs.device), tail[1]
-        window = strapdown(running.state, running.error.corrected(imu), dt, running.frame)
+        window = strapdown(running.state, running.error.correct(imu), dt, running.frame)
         return replace(latest, t=self._samples.settled, frame=running.frame, state=window.end, gnss_used=False)
 
     def _answer(self, status: Status, reason: str = "", estimates: Sequence[Estimate] = ()) -> Receipt:

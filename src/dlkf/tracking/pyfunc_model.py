@@ -49,9 +49,9 @@ class NavigationFilter(PythonModel):
 
         from dlkf.data.rows import drives_of
         from dlkf.data.store import drive_from_tables, load_dataset
-        from dlkf.filters.saved import grid_of
+        from dlkf.filters.saved import choose_grid
 
-        grid = grid_of([self.filter])
+        grid = choose_grid([self.filter])
         rate_hz, epoch_s = grid["rate_hz"], grid["epoch_s"]
         if "dataset" in given and given["dataset"].notna().any():
             for folder in given["dataset"].dropna():

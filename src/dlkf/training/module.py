@@ -16,7 +16,7 @@ from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import end_errors, mean_error
 from dlkf.filters.aids.attach import with_aids
 from dlkf.filters.integration import BatchSolution, integrate
-from dlkf.filters.saved import LearnedSettings, learned_filter
+from dlkf.filters.saved import LearnedSettings, build_learned_filter
 from dlkf.networks.heads import IMU_ERROR_SIZE, INNOVATION_SIZE, STATE_SIZE
 from dlkf.training.loss import Loss, unit_weights, weighted_loss
 from dlkf.training.optimization import OptimizationPlan
@@ -42,7 +42,7 @@ class FilterTraining(L.LightningModule):
     ) -> None:
         super().__init__()
         torch.manual_seed(seed)
-        self.filter = learned_filter(model)
+        self.filter = build_learned_filter(model)
         self.loss = loss
         self.descent = descent
         self.covariances = getattr(loss, "likelihood", 0.0) > 0

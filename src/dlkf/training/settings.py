@@ -15,7 +15,7 @@ from dlkf.data.masks import BiasLaw
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import is_filter
 from dlkf.filters.learned_kalman import LearnedKalmanConfig
-from dlkf.filters.saved import LearnedSettings, learned_settings
+from dlkf.filters.saved import LearnedSettings, parse_learned_settings
 from dlkf.filters.shipped import shipped_folder
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
@@ -132,7 +132,7 @@ class TrainSettings:
     def fit(self) -> FitSettings:
         """What decides the weights; InputError for a class that is not there or takes other settings."""
         return FitSettings(
-            model=learned_settings(self.model),
+            model=parse_learned_settings(self.model),
             loss=loss_of(self.loss),
             descent=OptimizationPlan.of(self.optimizer, self.scheduler),
             trainer=self.trainer,

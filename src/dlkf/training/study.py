@@ -30,7 +30,7 @@ from dlkf.evaluation.table import ResultTable
 from dlkf.filters.build import refuse_smoothed
 from dlkf.filters.integration import Estimator
 from dlkf.filters.learned_kalman import LearnedKalmanConfig
-from dlkf.filters.saved import LearnedSettings, learned_settings, load_filter
+from dlkf.filters.saved import LearnedSettings, load_filter, parse_learned_settings
 from dlkf.filters.shipped import shipped_folder, trained_filter
 from dlkf.report.evaluation import write_report
 from dlkf.training.callbacks.curriculum import LengthCurriculum
@@ -77,7 +77,7 @@ def run_study(
     with _timed(seconds, "training"):
         card = model_card(settings, data, getattr(logger, "run_id", None))
         model = model_on_baseline(settings.fit.model, baselines)
-        (folder / MODEL).write_text(yaml.safe_dump(model.plain(), sort_keys=False))  # for further processes
+        (folder / MODEL).write_text(yaml.safe_dump(model.as_dict(), sort_keys=False))  # for further processes
         on_baseline, mean = replace(settings.fit, model=model), baselines.prior.mean
         weights = fit(on_baseline, data, folder, logger, mean_imu_error=mean, notes=card, further=further)
     with _timed(seconds, "scoring"):
@@ -123,7 +123,7 @@ def train_with_baselines(settings: StudySettings, data: DriveDataModule, folder:
     """The part of a further process of the same training: it writes, logs and scores nothing."""
     data.setup()
     set_threads(settings.fit)
-    model = learned_settings(read_yaml(folder / MODEL))
+    model = parse_learned_settings(read_yaml(folder / MODEL))
     fit(replace(settings.fit, model=model), data, folder, False)
 
 

@@ -66,7 +66,7 @@ ANY_IMU = ImuSpec(
 class Sideslip(CarConstraints):
     """The constraints across the car alone, without detection of standstills."""
 
-    def resting(
+    def detect_rest(
         self, epoch: Epoch, turning: Tensor, prediction: Predicted, memory: Any
     ) -> tuple[Bool[Tensor, " B"], VibrationLevel]:
         """Never."""
@@ -172,7 +172,7 @@ def begin_bank(cases: Sequence[Case]) -> Bank:
     weighed = torch.ones(len(cases), dtype=torch.bool)
     scatter = p.new_tensor([c.scatter for c in cases]).repeat_interleave(COUNT, 0)
     return Bank(
-        memory, begun.start, error, bank.frame.prepared(), bank.lever_arm_b, torch.stack(score), weighed, scatter,
+        memory, begun.start, error, bank.frame.prepare(), bank.lever_arm_b, torch.stack(score), weighed, scatter,
         batch.start_noise,
     )  # fmt: skip
 
