@@ -140,7 +140,7 @@ def print_costs(folder: str, models: Sequence[str], imu: str) -> None:
     """Time of an update with each sensor and without, 99th percentile: by torch, compiled, and the call in C."""
     spec, tables = imu_preset(imu), choose_aids(folder, None)
     batch = aligned_batch(folder).select(torch.tensor([0]))
-    batch = replace(batch, present=batch.present & (torch.arange(batch.size[1]) < TIMED)).trimmed()
+    batch = replace(batch, present=batch.present & (torch.arange(batch.size[1]) < TIMED)).trim()
     print(f"\n{Path(folder).name}, one drive, {TIMED} updates\n")
     print("| filter | sensor | torch [ms], ratio | compiled [ms], ratio | in C [ms], ratio |\n|:--|:--|--:|--:|--:|")
     for name in models:

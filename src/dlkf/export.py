@@ -19,7 +19,7 @@ from dlkf.command import command, typed_words
 from dlkf.command.settings import ExportSettings
 from dlkf.data.aid_tables import standard_tables
 from dlkf.data.store import drive_from_tables, drive_rows
-from dlkf.data.validate import read_checked
+from dlkf.data.validate import read_drive
 from dlkf.filters.aids.attach import find_tables, with_aids
 from dlkf.filters.saved import choose_grid
 from dlkf.filters.smoother import SmoothedSolution
@@ -59,7 +59,7 @@ def main(settings: ExportSettings) -> None:
             gnss = GnssConfig(lever_arm_b=ARM)
             drive = DatasetConfig("check", hours=5 / 60, drive_minutes=5.0, gnss=gnss, sensors=sensors)
             dataset = simulate_dataset(drive, imu, 0, Path(somewhere) / "check", progress=False, workers=1)
-        tables = read_checked(dataset, drive_rows(dataset, settings.drive)[0], reference=False)
+        tables = read_drive(dataset, drive_rows(dataset, settings.drive)[0], reference=False)
         drive = drive_from_tables(tables, "", given["rate_hz"], given["epoch_s"], torch.float64, find_tables(model))
         layout = write_source(folder, model, grid, short_name(settings.model), describe_provenance())
         for name in COPIED:

@@ -46,7 +46,7 @@ def test_chunks_cover_every_segment_once_and_drop_the_padding(cars):
     batch = _ragged(cars)
     found = list(chunks(batch, 2500))
     assert sorted(i for c in found for i in c.tolist()) == list(range(6))
-    shortest = batch.select(found[-1]).trimmed()
+    shortest = batch.select(found[-1]).trim()
     assert shortest.size[1] == int(batch.present[found[-1]].sum(-1).max())
     assert shortest.drive == tuple(batch.drive[i] for i in found[-1])
     assert torch.equal(shortest.frame.origin_e, batch.frame.origin_e[found[-1]])
@@ -76,9 +76,9 @@ def test_ins_runs_free_from_the_last_fix_not_from_the_start(cars):
 
 
 def test_several_batches_are_joined_and_named(cars):
-    short = cars.select(torch.tensor([1, 2])).trimmed()
+    short = cars.select(torch.tensor([1, 2])).trim()
     short = replace(short, present=short.present.clone().index_fill_(1, torch.arange(40, 60), False))
-    short = short.select(torch.tensor([0, 1])).trimmed()
+    short = short.select(torch.tensor([0, 1])).trim()
     scores = score({"ins": FILTERS["ins"]}, [cars, short], groups={"car-01": "g"}, kinds={"car-01": "real"})
     assert len(scores.segments) == 8 and scores.filters["ins"].error.shape == (8, 60, 9)
     assert [p.group for p in scores.segments][-2:] == ["g", "car-02"]

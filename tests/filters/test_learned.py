@@ -89,7 +89,7 @@ def test_segments_of_a_batch_do_not_touch_each_other():
         model = lively(small(outage_mode=mode))
         together = integrate(batch, model)
         for i in range(5):
-            alone = integrate(batch.select(torch.tensor([i])).trimmed(), model)
+            alone = integrate(batch.select(torch.tensor([i])).trim(), model)
             assert (alone.posterior.p_n[0] - together.posterior.p_n[i]).abs().max() < 2e-3
             assert (alone.imu_error[0] - together.imu_error[i]).abs().max() < 1e-5
 

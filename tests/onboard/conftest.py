@@ -7,7 +7,7 @@ import torch
 
 from dlkf.data.aid_tables import STANDARD
 from dlkf.data.store import drive_from_tables, drive_rows
-from dlkf.data.validate import read_checked
+from dlkf.data.validate import read_drive
 from dlkf.filters.aids.attach import with_aids
 from dlkf.filters.build import build_filter
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
@@ -43,7 +43,7 @@ def tables(once):
     dataset = once(
         "onboard_town", lambda folder: simulate_dataset(config, IMU, 0, folder / "data", progress=False, workers=1)
     ) / "data"  # fmt: skip
-    return read_checked(dataset, drive_rows(dataset)[0], reference=False)
+    return read_drive(dataset, drive_rows(dataset)[0], reference=False)
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ import pytest
 
 from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.store import drive_rows
-from dlkf.data.validate import CheckedTables, read_checked
+from dlkf.data.validate import CheckedTables, read_drive
 from dlkf.filters.build import build_filter
 from dlkf.filters.shipped import trained_filter
 from dlkf.onboard.c_source import write_source
@@ -87,5 +87,5 @@ def test_every_real_log_through_the_filters_of_a_car(model, tmp_path):
 def same_on_real(estimator, library: Path, dataset: str, drive: int, least: int = 20) -> None:
     if not (REAL / dataset).is_dir():
         pytest.skip(f"no {dataset} here")
-    tables = read_checked(REAL / dataset, drive_rows(REAL / dataset)[drive], reference=False)
+    tables = read_drive(REAL / dataset, drive_rows(REAL / dataset)[drive], reference=False)
     same(estimator, library, calls(tables), tables.row.lever_arm_b, 1e-3, least)

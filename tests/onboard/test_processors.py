@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from dlkf.data.store import drive_rows
-from dlkf.data.validate import read_checked
+from dlkf.data.validate import read_drive
 from dlkf.onboard.c_source import EXAMPLES
 from dlkf.onboard.core import Core
 from dlkf.onboard.library import CORE, FILTER, find_compiler
@@ -51,7 +51,7 @@ def test_arm_under_emulation(cpu, log, exported, tables, tmp_path):
     if log != "simulated":
         if not (REAL / log).is_dir():
             pytest.skip(f"no {log} here")
-        real = read_checked(REAL / log, drive_rows(REAL / log)[0], reference=False)
+        real = read_drive(REAL / log, drive_rows(REAL / log)[0], reference=False)
         sent, arm = calls(real), real.row.lever_arm_b
     done = run([qemu, program, "--arm", *map(str, arm)], input=lines(sent))
     rows = pd.read_csv(io.StringIO(done.stdout)).drop_duplicates("t", keep="last").sort_values("t")

@@ -12,7 +12,7 @@ import torch
 from dlkf.data.aid_tables import STANDARD
 from dlkf.data.alignment import SEARCH
 from dlkf.data.store import drive_from_tables, drive_rows
-from dlkf.data.validate import read_checked
+from dlkf.data.validate import read_drive
 from dlkf.filters.aids.attach import aid_columns, with_aids
 from dlkf.filters.build import build_filter
 from dlkf.filters.saved import load_filter
@@ -34,7 +34,7 @@ def tables(tmp_path_factory):
     """A minute of the exact car with all three sensors; the wheel lacks ten seconds."""
     wheel = {"scale": 1.02, "delay_s": 0.1, "right_m": 0.5}
     folder = write_cars(tmp_path_factory.mktemp("data") / "aided", 1, aids=wheel, seconds=60.0)
-    tables = read_checked(folder, drive_rows(folder)[0], reference=False)
+    tables = read_drive(folder, drive_rows(folder)[0], reference=False)
     speed = tables.aids["speed"]
     kept = (speed["t"] < 30) | (speed["t"] > 40)
     return replace(tables, aids={**tables.aids, "speed": {k: v[kept] for k, v in speed.items()}})

@@ -14,7 +14,7 @@ import torch
 from dlkf.base.errors import InputError
 from dlkf.data.limits import LOST_FIXES, LOST_M, LOST_S
 from dlkf.data.store import drive_from_tables, drive_rows
-from dlkf.data.validate import CheckedTables, read_checked
+from dlkf.data.validate import CheckedTables, read_drive
 from dlkf.filters.build import build_filter
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.model_based import Ins
@@ -35,7 +35,7 @@ FILTERS = ("mbkf15", "mbkf21_car", "mbkf21_nhc_gated", "plus", "dlkf")
 def minutes(tmp_path_factory) -> CheckedTables:
     """Two minutes of a town, or of the real drive ``rtkx`` from a minute before its fault."""
     if (REAL / "rtkx").is_dir():
-        tables = read_checked(REAL / "rtkx", drive_rows(REAL / "rtkx")[0])
+        tables = read_drive(REAL / "rtkx", drive_rows(REAL / "rtkx")[0])
         for kind in ("imu", "gnss", "reference"):
             t = getattr(tables, kind)["t"] - 60.0
             inside = (t > 0) & (t < AT + GOOD_S + 15)
@@ -45,7 +45,7 @@ def minutes(tmp_path_factory) -> CheckedTables:
     folder = tmp_path_factory.mktemp("minutes")
     made = simulate_dataset(DatasetConfig("minutes", hours=2 / 60, drive_minutes=2.0), IMU, 3, folder / "d",
                             progress=False, workers=1)  # fmt: skip
-    return read_checked(made, drive_rows(made)[0])
+    return read_drive(made, drive_rows(made)[0])
 
 
 def spoiled(tables: CheckedTables, kind: str, seconds: float, **change: float) -> CheckedTables:

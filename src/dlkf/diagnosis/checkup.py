@@ -15,7 +15,7 @@ from dlkf.data.discovery.findings import discover
 from dlkf.data.limits import horizontal_distance
 from dlkf.data.schema import ACCEL, GYRO, QUALITIES
 from dlkf.data.tables import Columns, DriveRow
-from dlkf.data.validate import CheckedTables, read_checked, read_fixes, usable_fixes
+from dlkf.data.validate import CheckedTables, read_drive, read_fixes, usable_fixes
 from dlkf.navigation.earth import STANDARD_GRAVITY
 
 GOOD, NOTE, BAD = "good", "note", "BAD"
@@ -39,7 +39,7 @@ def checkup(folder: str | Path, row: DriveRow, *, discover_pose: bool = True) ->
     (:mod:`dlkf.data.discovery`).
     """
     try:
-        tables = read_checked(folder, row, reference=True)
+        tables = read_drive(folder, row, reference=True)
     except InputError as error:
         yield CheckupResult(BAD, str(error))
         return

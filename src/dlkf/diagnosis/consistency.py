@@ -109,7 +109,7 @@ def measure_consistency(
     """NEES and NIS of a filter over drives with errors as it models them (``matched_drives``)."""
     n, rows = estimator.states.navigation, []
     for index in torch.arange(batch.size[0]).split(AT_ONCE):
-        part = batch.select(index).trimmed()
+        part = batch.select(index).trim()
         with torch.inference_mode():
             s = integrate(part, estimator, keep_covariances=True)
         assert s.covariances is not None

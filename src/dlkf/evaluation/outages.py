@@ -16,7 +16,7 @@ from torch import Tensor
 from dlkf.base.errors import InputError
 from dlkf.data.draws import draw_per_segment
 from dlkf.data.drive import Batch
-from dlkf.data.masks import outage_within
+from dlkf.data.masks import mask_outage
 
 LAST_FIX_WITHIN_S = 2.0  # an outage counts from a fix: one must lie this close before its start
 
@@ -74,7 +74,7 @@ def outage_mask(batch: Batch, start_s: Tensor, duration_s: Tensor) -> Tensor:
     start, stop = start_s.double()[:, None], (start_s + duration_s).double()[:, None]
     slack = 1e-6 * batch.epoch_s
     length = batch.present.cpu().sum(-1, keepdim=True) * batch.epoch_s
-    return outage_within(batch, start_s, duration_s) & (start > -slack) & (stop <= length + slack)
+    return mask_outage(batch, start_s, duration_s) & (start > -slack) & (stop <= length + slack)
 
 
 def scorable_outages(batch: Batch, outage: Tensor) -> Tensor:

@@ -52,7 +52,7 @@ def score_scenes(
         for name, estimator in filters.items():
             parts[-1].filters[name] = _blank(batch, len(aid_columns(estimator)))
             for index in chunks(batch, chunk_samples):
-                _fill(parts[-1].filters[name], index, masked.select(index).trimmed(), estimator)
+                _fill(parts[-1].filters[name], index, masked.select(index).trim(), estimator)
                 done += len(index)
                 if progress is not None:
                     progress(done, total and total * len(filters))

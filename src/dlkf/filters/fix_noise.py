@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dlkf.data.velocity_fit import FIT_STD, scattered_std
+from dlkf.data.velocity_fit import FIT_STD, scale_std
 from dlkf.filters.gating import OF_PART, PARTS, average_by_part
 from dlkf.filters.integration import Covariances, Epoch
 from dlkf.filters.virtual_outages import VirtualOutage
@@ -59,7 +59,7 @@ class FixNoise(NamedTuple):
     def inflate_fix(self, epoch: Epoch) -> Epoch:
         """The epoch with the 1σ of its fix as large as they have scattered."""
         scatter = self.variance.clamp_min(1.0).sqrt()[:, OF_PART]
-        return epoch._replace(fix=epoch.fix._replace(std=scattered_std(epoch.fix.std, scatter, FLOOR)))
+        return epoch._replace(fix=epoch.fix._replace(std=scale_std(epoch.fix.std, scatter, FLOOR)))
 
     def update(self, claimed: Epoch, c: Covariances, outage: VirtualOutage) -> FixNoise:
         """After an update of the filter and of the virtual outage; ``claimed`` is the epoch with the fix's own 1σ, and

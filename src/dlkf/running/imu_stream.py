@@ -72,7 +72,7 @@ class ImuStream:
         """Samples out of line have gone on for longer than an accident does: the stream must begin again."""
         return self._astray is not None and self._astray[1] - self._astray[0] >= ASTRAY_S
 
-    def refused(self, t: float, accel: Row, gyro: Row) -> str:
+    def find_refusal(self, t: float, accel: Row, gyro: Row) -> str:
         """Take a sample (s, m/s², rad/s); a reason if it cannot be, else nothing."""
         try:
             row = (float(t), *map(float, accel), *map(float, gyro))

@@ -42,7 +42,7 @@ from dlkf.base.errors import InputError
 from dlkf.base.settings import is_number
 from dlkf.data.aids import pressure_height
 from dlkf.data.alignment import SEARCH, AlignConfig
-from dlkf.data.resampling import ON_BOUNDARY_S, boundary_after, fixes_at
+from dlkf.data.resampling import ON_BOUNDARY_S, find_boundary, make_fixes
 from dlkf.data.validate import LIMITS, Limits
 from dlkf.filters.aids.attach import find_tables
 from dlkf.filters.card import warn_slow_drives
@@ -174,7 +174,7 @@ class StreamingFilter:
         The receipt holds the estimates of the epochs that end with it: as a rule none, or one once an epoch, and
         several after a bridged gap, or where the grid has just been laid.
         """
-        if reason := self._samples.refused(t, accel, gyro):
+        if reason := self._samples.find_refusal(t, accel, gyro):
             if not self._samples.lost:
                 return self._answer(Status.REFUSED, reason)
             self._samples.clear()
@@ -318,7 +318,7 @@ class StreamingFilter:
             self._buffer.drop_fix(row)
         else:
             boundary = np.array([self._samples.boundary(row)])
-            self._buffer.put_fix(row, fix.t, fixes_at(fix.table, np.zeros(1, np.int64), boundary))
+            self._buffer.put_fix(row, fix.t, make_fixes(fix.table, np.zeros(1, np.int64), boundary))
 
     def _file_aid(self, name: str, t: float, value: float, std: float) -> Receipt:
         """Put a sample of a further sensor to the others of its interval; replay where that is over."""
@@ -332,7 +332,7 @@ class StreamingFilter:
 
     def _boundary_of(self, t: float) -> int:
         assert self._samples.grid is not None
-        return int(boundary_after(np.array([t]), self._samples.grid)[0])
+        return int(find_boundary(np.array([t]), self._samples.grid)[0])
 
     def _timing_fault(self, what: str, t: float, row: int, least: int) -> str:
         """Why a measurement cannot count at boundary ``row``, or nothing; the first that can is ``least``."""

@@ -19,7 +19,7 @@ from dlkf.base.files import folder_name, resolve_place, write_into
 from dlkf.data.limits import DEGREE_M
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR
 from dlkf.data.tables import Columns, read_drives
-from dlkf.data.validate import CheckedTables, read_checked, read_fixes
+from dlkf.data.validate import CheckedTables, read_drive, read_fixes
 
 Array = NDArray[np.floating]
 AXES = (("x", "#0072B2"), ("y", "#D55E00"), ("z", "#009E73"))
@@ -147,7 +147,7 @@ def write_pictures(dataset: str | Path, out: str | Path) -> list[Path]:
     files, moved = [f"{rows[0].name}.png", "motion.png"], []
     with write_into(out) as folder:
         for row in rows:
-            tables = read_checked(dataset, row)
+            tables = read_drive(dataset, row)
             moved.append(driving(tables).every(0.5))
             if row is rows[0]:
                 drive_figure(tables).savefig(folder / files[0], dpi=90)

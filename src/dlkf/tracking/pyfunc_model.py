@@ -47,7 +47,7 @@ class NavigationFilter(PythonModel):
     def _loaded(self, given: pd.DataFrame, params: dict[str, Any]) -> Iterator[tuple[str, list]]:
         import torch
 
-        from dlkf.data.rows import drives_of
+        from dlkf.data.rows import split_drives
         from dlkf.data.store import drive_from_tables, load_dataset
         from dlkf.filters.saved import choose_grid
 
@@ -59,7 +59,7 @@ class NavigationFilter(PythonModel):
                 yield folder, load_dataset(folder, dtype=torch.float64, **options)
             return
         arm = [float(params.get(f"lever_arm_{a}_m", 0.0)) for a in "xyz"]
-        tables = drives_of(given, arm)
+        tables = split_drives(given, arm)
         yield "", [drive_from_tables(t, "", rate_hz, epoch_s, torch.float64) for t in tables]
 
 

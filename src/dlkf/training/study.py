@@ -137,7 +137,7 @@ def model_on_baseline(model: LearnedSettings, baselines: Baselines) -> LearnedSe
 def left_out_drives(settings: StudySettings, data: DriveDataModule) -> list[str]:
     """A line for every side on drives that are too short for its segments, at the full length of a curriculum."""
     grown = [c.full_s for c in settings.fit.callbacks if isinstance(c, LengthCurriculum)]
-    return data.left_out(max(grown, default=data.train_length_s))
+    return data.list_left_out(max(grown, default=data.train_length_s))
 
 
 def set_threads(settings: FitSettings) -> None:

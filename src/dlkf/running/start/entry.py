@@ -36,7 +36,7 @@ from dlkf.data.alignment import (
 )
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.segments import whole_drives
-from dlkf.data.velocity_fit import JOLT_STD, scattered_std
+from dlkf.data.velocity_fit import JOLT_STD, scale_std
 from dlkf.navigation.attitude import vector_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, STANDARD_GRAVITY, ned_axes
 from dlkf.navigation.error_model import RATE_AVERAGE_S
@@ -177,7 +177,7 @@ class FirstMotion:
         """How many times more than claimed positions and velocities scatter: √w of :mod:`dlkf.filters.fix_noise`."""
         position, velocity = self.aligned.scatter[self.row]
         claimed = self.drive.gnss_std[self.row, 3:5].amax().nan_to_num(nan=1.0)
-        return torch.stack((position, scattered_std(claimed, velocity, JOLT_STD) / claimed))
+        return torch.stack((position, scale_std(claimed, velocity, JOLT_STD) / claimed))
 
     @property
     def gyro(self) -> Tensor | None:
@@ -372,7 +372,7 @@ def _started(motion: FirstMotion, config: AlignConfig, earliest: int) -> Start:
         v_std = torch.hypot(motion.noise[1] * drive.gnss_std[k, 3:], v_n.new_tensor(STALE_ACCELERATION * lag))
         v_std = torch.where(known_v, v_std, 0.5)
     r_e = drive.gnss_r_e[k] - C_eb @ drive.lever_arm_b + float(drive.gnss_lag[k]) * v_e
-    p_std = scattered_std(drive.gnss_std[k, :3], motion.noise[0])
+    p_std = scale_std(drive.gnss_std[k, :3], motion.noise[0])
     start = _start_at(k, r_e, v_e, C_eb, torch.cat((p_std, v_std, std)))
     return replace(start, gyro=motion.gyro, noise=motion.noise)
 
