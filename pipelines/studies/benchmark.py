@@ -40,12 +40,12 @@ from dlkf.onboard.check import time_epochs
 from dlkf.onboard.compiled_filter import compile_filter
 from dlkf.onboard.library import find_compiler
 from dlkf.running.batched import run_filter
-from dlkf.running.start import aligned_drives
+from dlkf.running.start import align_drives
 from dlkf.simulation.dataset import simulate
 from dlkf.tracking.models import resolve_model
 from dlkf.training.callbacks.masking import GnssDecimation, OutageInjection
 from dlkf.training.loss import TERMS, LossConfig, pva_losses, weighted_loss
-from dlkf.tuning.search import factors_of, tune_filter
+from dlkf.tuning.search import list_factors, tune_filter
 from dlkf.tuning.study import withhold_outages
 
 COMPILED = ("mbkf15", "mbkf21", "mbkf21_car", "plus")
@@ -118,7 +118,7 @@ def filters(bench: Bench, dataset: Path, imu: ImuSpec, length_s: float, models: 
 def epochs(bench: Bench, dataset: Path, imu: ImuSpec, models: list[str]) -> None:
     """One epoch with its fix by itself: in Python by torch and compiled, and the call in C."""
     drive = load_dataset(dataset, rate_hz=RATE_HZ, dtype=torch.float64)[0]
-    batch = aligned_drives([drive], ALIGN)
+    batch = align_drives([drive], ALIGN)
     for name in models if find_compiler() else ():
         in_c = compile_filter(resolve_model(name, imu), RATE_HZ, 1.0)
         for kind, seconds in {**time_epochs(in_c, drive), "C": times_in_c(in_c, batch)}.items():
@@ -147,7 +147,8 @@ def tuning(bench: Bench, dataset: Path, imu: ImuSpec) -> None:
     """A search over all factors of a filter on sixty segments of two minutes."""
     drives = load_dataset(dataset, rate_hz=50.0, dtype=torch.float64)
     segments = withhold_outages(drives, Protocol(outage=OutagePlan(60.0, 60.0)), 60)
-    work = f"mbkf21_car, {len(factors_of('mbkf21_car'))} factors, {sum(b.size[0] for b in segments)} segments of 120 s"
+    factors, count = len(list_factors("mbkf21_car")), sum(b.size[0] for b in segments)
+    work = f"mbkf21_car, {factors} factors, {count} segments of 120 s"
     bench.time("tuning", work, lambda: tune_filter(imu, segments, name="mbkf21_car"), 1)
 
 

@@ -15,7 +15,7 @@ import torch
 from dlkf.base.errors import InputError
 from dlkf.base.files import is_url, require_empty, write_into
 from dlkf.base.provenance import describe_provenance
-from dlkf.command import command, typed_words
+from dlkf.command import command, list_typed_words
 from dlkf.command.settings import ExportSettings
 from dlkf.data.aid_tables import standard_tables
 from dlkf.data.store import drive_from_tables, drive_rows
@@ -43,7 +43,7 @@ def main(settings: ExportSettings) -> None:
     require_empty(settings.out, overwrite=settings.overwrite)
     imu = settings.spec
     model = resolve_model(str(settings.model), imu, settings.tracking.uri, **settings.filter_options)
-    if line := unused_settings(str(settings.model), typed_words("imu", "tuning")):
+    if line := unused_settings(str(settings.model), list_typed_words("imu", "tuning")):
         print(line)
     aids = [settings.aids] if isinstance(settings.aids, str) else list(settings.aids or ())
     model = with_aids(model, standard_tables(aids))

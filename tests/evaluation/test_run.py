@@ -9,7 +9,7 @@ import torch
 
 from dlkf.base.errors import InputError
 from dlkf.data.masks import BiasLaw
-from dlkf.evaluation.bias_slope import injected_response
+from dlkf.evaluation.bias_slope import inject_bias
 from dlkf.evaluation.metrics import magnitudes, rms_over_segments, slope
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
@@ -114,7 +114,7 @@ def test_float32_agrees_with_float64(cars):
 def test_a_kalman_filter_follows_an_injected_bias_and_pure_inertial_does_not(cars):
     base = score(FILTERS, [cars])
     no_outage = torch.zeros(cars.size[:2], dtype=torch.bool)
-    cause, followed = injected_response(base, FILTERS, [(cars, no_outage)], law=BiasLaw(0.03, 0.06), seed=4)
+    cause, followed = inject_bias(base, FILTERS, [(cars, no_outage)], law=BiasLaw(0.03, 0.06), seed=4)
     slopes = {name: slope(x, cause, intercept=False) for name, x in followed.items()}
     assert np.allclose(slopes["ins"], 0.0)
     assert np.allclose(slopes["mbkf15"][[2, 3, 4]], 1.0, atol=0.05)  # down and level rates: always seen

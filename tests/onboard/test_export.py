@@ -41,7 +41,7 @@ from dlkf.running.estimate import estimates_table
 from dlkf.running.reanchoring import FrameChange, reanchor
 from dlkf.running.replay import UnalignedError, replay_drive, stream_drive
 from dlkf.running.solution import COLUMNS
-from dlkf.running.start import aligned_drives
+from dlkf.running.start import align_drives
 from dlkf.running.streaming import StreamingFilter
 from tests.onboard.conftest import ARM, GRID, IMU, QUICK
 from tests.onboard.streams import calls, through_core
@@ -164,7 +164,7 @@ def test_a_batch_through_the_compiled_filter(compiled, drive, monkeypatch):
     torch.manual_seed(0)
     ran, run = [], Library.run
     monkeypatch.setattr(Library, "run", lambda self, x, imu, fixes: (ran.append(len(imu)), run(self, x, imu, fixes))[1])
-    batch = aligned_drives([drive], ALIGN).select(torch.zeros(3, dtype=torch.int64))
+    batch = align_drives([drive], ALIGN).select(torch.zeros(3, dtype=torch.int64))
     available = torch.rand(batch.available.shape) < 0.7
     available[1, :20], available[2] = available[0, :20], available[0]  # what copies have in common is run once
     batch = replace(batch, available=available)
@@ -181,9 +181,9 @@ def test_a_batch_through_the_compiled_filter(compiled, drive, monkeypatch):
 def test_drives_of_unlike_length_through_the_compiled_filter(compiled, drive):
     """As each by itself; beyond its end a drive has no fix."""
     whole, half = ([drive.part(0, n)] for n in (drive.epochs, drive.epochs // 2))
-    both = run_filter(aligned_drives([*whole, *half], ALIGN), compiled)
+    both = run_filter(align_drives([*whole, *half], ALIGN), compiled)
     for row, one in enumerate((whole, half)):
-        alone = run_filter(aligned_drives(one, ALIGN), compiled)
+        alone = run_filter(align_drives(one, ALIGN), compiled)
         n = alone.used.shape[1]
         for name in ("std", "innovation_covariance"):
             mine, theirs = getattr(both, name)[row, :n], getattr(alone, name)[0]
@@ -251,7 +251,7 @@ def test_one_library_serves_every_preset_and_every_factor():
 
 def test_noise_goes_with_the_drive_into_another_frame(drive):
     loud, quiet = (build_filter("mbkf15", IMU, tuning=Tuning(accel_noise=x)) for x in (9.0, 1.0))
-    batch = aligned_drives([drive], ALIGN)
+    batch = align_drives([drive], ALIGN)
     memory, other = loud.begin(batch)[0], quiet.begin(batch)[0]
     moved = reanchor(memory, FrameChange(batch.frame, batch.frame), other)
     assert torch.equal(moved.windows.spread, memory.windows.spread)
@@ -260,7 +260,7 @@ def test_noise_goes_with_the_drive_into_another_frame(drive):
 
 def test_a_span_of_positions_begins_anew_in_another_frame(drive):
     """Its places are in the axes of the old one."""
-    kalman, batch = build_filter("mbkf15_nhc", IMU), aligned_drives([drive], ALIGN)
+    kalman, batch = build_filter("mbkf15_nhc", IMU), align_drives([drive], ALIGN)
     fresh = kalman.begin(batch)[0]
     (index,) = (k for k, x in enumerate(fresh.sources) if hasattr(x, "liveliness"))
     car = fresh.sources[index]
@@ -273,7 +273,7 @@ def test_a_span_of_positions_begins_anew_in_another_frame(drive):
 
 def test_what_does_not_fit_is_refused_in_a_line(compiled, drive, monkeypatch, tmp_path):
     with pytest.raises(InputError, match="compiled for 50 samples"):
-        compiled.begin(aligned_drives([drive_with(drive, 25)], ALIGN))
+        compiled.begin(align_drives([drive_with(drive, 25)], ALIGN))
     with pytest.raises(InputError, match="smoothed"):
         compiled_filter.compile_filter(build_filter("mbkf15_rts", IMU), 50.0, 1.0)
     monkeypatch.setattr("dlkf.onboard.library.find_compiler", lambda: None)
@@ -318,7 +318,7 @@ def test_many_drives_through_a_large_network_go_through_torch(drive, monkeypatch
     layout = make_layout(model, GRID)
     monkeypatch.setattr(compiled_filter, "LARGE", sum(p.numel() for p in model.parameters()) - 1)
     in_c = CompiledFilter(model, GRID, layout, None)  # would be called for fewer
-    batch = aligned_drives([drive], ALIGN)
+    batch = align_drives([drive], ALIGN)
     with pytest.raises(AttributeError, match="run"):
         run_filter(batch, in_c)
     many = batch.select(torch.zeros(compiled_filter.MANY, dtype=torch.int64))

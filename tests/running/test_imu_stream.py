@@ -26,8 +26,8 @@ def _fed(stream: ImuStream, t: np.ndarray, x: np.ndarray, phase: float) -> np.nd
         assert stream.find_refusal(stamp, row[:3], row[3:]) == ""
         if stream.grid is None and stamp > t[0] + 3:
             stream.begin(np.array([phase]))
-        done += stream.closed()
-    return np.concatenate(done + stream.closed(ended=True))
+        done += stream.close_epochs()
+    return np.concatenate(done + stream.close_epochs(ended=True))
 
 
 @pytest.mark.parametrize("t0", [0.0, 1.7e9])

@@ -20,7 +20,7 @@ from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.model_based import Ins
 from dlkf.filters.shipped import trained_filter
 from dlkf.running.loss import LossWatch, far_off
-from dlkf.running.offline import UsableFixes, epoch_for, navigate_drives
+from dlkf.running.offline import UsableFixes, choose_epoch, navigate_drives
 from dlkf.running.replay import replay_drive
 from dlkf.running.streaming import StreamingFilter
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
@@ -131,15 +131,15 @@ def test_a_filter_is_lost_after_fixes_in_a_row_far_off():
     assert far_off(z, torch.full((3, 6), 10.0)).tolist() == [0.0, 0.0, 0.0]  # fixes that are no better than that
     watch = LossWatch()
     for k in range(LOST_FIXES):
-        assert not watch.lost(k)
+        assert not watch.is_lost(k)
         watch = watch.update(float(k), 1.0)
-    assert watch.count == LOST_FIXES and not watch.lost(LOST_S - 1) and watch.lost(LOST_S)
+    assert watch.count == LOST_FIXES and not watch.is_lost(LOST_S - 1) and watch.is_lost(LOST_S)
     assert watch.update(20.0, 0.0).count == 0
     watch = LossWatch()
     for k in range(2 * LOST_FIXES):
-        assert not watch.lost(k)
+        assert not watch.is_lost(k)
         watch = watch.update(float(k), 0.5)
-    assert not watch.lost(2 * LOST_S - 1) and watch.lost(2 * LOST_S)
+    assert not watch.is_lost(2 * LOST_S - 1) and watch.is_lost(2 * LOST_S)
 
 
 def test_the_batch_run_starts_over_as_the_stream_does(drive):
@@ -169,7 +169,7 @@ def test_what_is_no_number_is_refused_and_never_raised():
 
 def test_no_usable_fix_in_any_drive_is_one_line(drive):
     nothing = np.zeros(0)
-    assert epoch_for([UsableFixes(nothing, nothing, nothing, nothing)], 50.0, estimator("mbkf15")) == 1.0
+    assert choose_epoch([UsableFixes(nothing, nothing, nothing, nothing)], 50.0, estimator("mbkf15")) == 1.0
     blind = replace(drive, gnss={**drive.gnss, "quality": 0 * drive.gnss["quality"]})
     loaded = drive_from_tables(blind, "", 50.0, 1.0, torch.float64)
     with pytest.raises(InputError, match="no GNSS fix"):

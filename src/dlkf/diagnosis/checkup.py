@@ -158,7 +158,7 @@ def discover_findings(tables: CheckedTables) -> Iterator[CheckupResult]:
             grade = GOOD if fine else NOTE if off < DELAY_S else BAD  # receivers are late, clocks are wrong
             yield CheckupResult(grade, text + ("" if fine else f"; {OFFSETS}"))
         elif finding.setting == "imu.axes":
-            angle = turned_deg(finding.value)
+            angle = measure_turn(finding.value)
             fine = angle < ANGLE_DEG
             text = f"pose: the sensor is turned {angle:.1f}° against the car ({finding.detail})"
             remedy = "" if fine else "; ingest with reader=auto or reader.imu.axes"
@@ -172,7 +172,7 @@ OFFSETS = (
 )
 
 
-def turned_deg(angles: Mapping[str, float]) -> float:
+def measure_turn(angles: Mapping[str, float]) -> float:
     """Angle of the rotation of a pose that is given as roll, pitch, yaw [°]."""
     turn = Rotation.from_euler("ZYX", [angles[k] for k in ("yaw", "pitch", "roll")], degrees=True)
     return math.degrees(float(turn.magnitude()))

@@ -93,7 +93,7 @@ def state_error(
     return torch.cat(parts, -1)
 
 
-def states_of(name: str, estimator: Filter) -> ErrorStates:
+def find_states(name: str, estimator: Filter) -> ErrorStates:
     """The error states of a filter. Raises InputError for one without a covariance."""
     if not has_covariance(estimator):
         raise InputError(f"model {name} has no covariance to compare its errors with; give a Kalman filter")

@@ -56,8 +56,8 @@ class OutagePlan:
         """
         B, T, _ = batch.size
         epoch_s = batch.epoch_s
-        first = _drawn(self.first_s, batch, seed, "first_s")
-        duration = _drawn(self.duration_s, batch, seed, "duration_s")
+        first = _draw(self.first_s, batch, seed, "first_s")
+        duration = _draw(self.duration_s, batch, seed, "duration_s")
         repeats = 1 if self.every_s is None else max(1, int(T * epoch_s / self.every_s) + 1)
         out = []
         for offset in self.offsets_s or (0.0,):
@@ -115,7 +115,7 @@ def _bounds(name: str, value: float | Sequence[float]) -> tuple[float, float]:
     return float(values[0]), float(values[-1])
 
 
-def _drawn(value: float | Sequence[float], batch: Batch, seed: int, name: str) -> Tensor:
+def _draw(value: float | Sequence[float], batch: Batch, seed: int, name: str) -> Tensor:
     low, high = _bounds(f"outage.{name}", value)
     steps = round((high - low) / batch.epoch_s)
     if not steps:

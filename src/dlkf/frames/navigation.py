@@ -102,7 +102,7 @@ def navigate(
     from dlkf.filters.saved import choose_grid
     from dlkf.filters.smoother import run_smoother
     from dlkf.running.innovations import OF_NETWORK, REMEDY
-    from dlkf.running.offline import UsableFixes, epoch_for, navigate_drives
+    from dlkf.running.offline import UsableFixes, choose_epoch, navigate_drives
     from dlkf.tracking.models import short_name, takes_tuning
 
     given = {"rate_hz": rate_hz, "epoch_s": epoch_s}
@@ -120,7 +120,7 @@ def navigate(
         if smoothed:
             estimator = run_smoother(estimator, "rts")
         fixes = UsableFixes.of(folder, DRIVE)
-        grid = choose_grid([estimator], rate_hz, epoch_s, epoch_for([fixes], rate_hz or 50.0, estimator))
+        grid = choose_grid([estimator], rate_hz, epoch_s, choose_epoch([fixes], rate_hz or 50.0, estimator))
         drives = load_dataset(folder, dtype=torch.float64, reference=False, aids=find_tables(estimator), **grid)
         (navigated,) = navigate_drives(drives, estimator, align=_align())
     solution = Solution.of(navigated, fixes, short_name(model), REMEDY if takes_tuning(model) else OF_NETWORK)

@@ -31,7 +31,7 @@ from dlkf.onboard.library import Library, build
 from dlkf.running.batched import run_filter
 from dlkf.running.replay import replay_drive
 from dlkf.running.solution import COLUMNS, solution_columns
-from dlkf.running.start import align, aligned_drives
+from dlkf.running.start import align, align_drives
 
 # m: float32 of a network beside its own rounding over minutes; of everything
 FARTHEST_M = {torch.float64: 1e-3, torch.float32: 0.05}
@@ -136,7 +136,7 @@ def measure_latencies(compiled: CompiledFilter, drive: Drive) -> dict[str, Laten
 
 def time_epochs(compiled: CompiledFilter, drive: Drive) -> dict[str, list[float]]:
     """Seconds of epochs in Python, as torch runs them and compiled, interleaved; without the first few."""
-    batch = aligned_drives([drive])
+    batch = align_drives([drive])
     T = min(TIMED, batch.size[1])
     usable = batch.gnss_valid & batch.available.unsqueeze(-1)
     running = {}

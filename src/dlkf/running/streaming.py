@@ -52,7 +52,7 @@ from dlkf.running.epoch_filter import EpochFilter, Running
 from dlkf.running.estimate import Estimate
 from dlkf.running.fix_history import HELD, FixHistory
 from dlkf.running.imu_stream import ImuStream, Row
-from dlkf.running.measurement_buffer import MeasurementBuffer, as_number, checked_fix
+from dlkf.running.measurement_buffer import MeasurementBuffer, as_number, check_fix
 from dlkf.running.start import Search
 
 ANCHOR_M = 50_000.0  # from its origin, beyond which the tangent frame moves
@@ -209,7 +209,7 @@ class StreamingFilter:
         epoch's end holds the recomputed estimates of all epochs since; a fix that is refused does so too where later
         fixes, screened again, count otherwise than before.
         """
-        fix = checked_fix(t, (lat_deg, lon_deg, height_m), velocity_ned, std, quality)
+        fix = check_fix(t, (lat_deg, lon_deg, height_m), velocity_ned, std, quality)
         if isinstance(fix, str):
             return self._answer(Status.REFUSED, fix)
         if self._samples.grid is not None:
@@ -290,13 +290,13 @@ class StreamingFilter:
 
     @torch.inference_mode()
     def _close(self, ended: bool) -> Receipt:
-        estimates = [e for imu in self._samples.closed(ended) for e in self._epochs.close(imu)]
+        estimates = [e for imu in self._samples.close_epochs(ended) for e in self._epochs.close(imu)]
         return Receipt(Status.TAKEN, tuple(estimates))
 
     def _file(self, fix: dict[str, np.ndarray]) -> Receipt:
         """Put a fix to its boundary; replay where that is over."""
         t = float(fix["t"][0])
-        row = self._boundary_of(t)
+        row = self._find_boundary(t)
         if reason := self._timing_fault("fix", t, row, least=0):
             return self._answer(Status.REFUSED, reason)
         screened, changed = self._fixes.add(t, row, fix, oldest=self._samples.epochs - self._rewind)
@@ -322,7 +322,7 @@ class StreamingFilter:
 
     def _file_aid(self, name: str, t: float, value: float, std: float) -> Receipt:
         """Put a sample of a further sensor to the others of its interval; replay where that is over."""
-        row = self._boundary_of(t)
+        row = self._find_boundary(t)
         if reason := self._timing_fault(name, t, row, least=1):
             return self._answer(Status.REFUSED, reason)
         if not self._buffer.put_aid(row, name, t, value, std):
@@ -330,7 +330,7 @@ class StreamingFilter:
         estimates = self._replay(row)
         return TAKEN if estimates is None else self._receipt(estimates)
 
-    def _boundary_of(self, t: float) -> int:
+    def _find_boundary(self, t: float) -> int:
         assert self._samples.grid is not None
         return int(find_boundary(np.array([t]), self._samples.grid)[0])
 

@@ -62,7 +62,7 @@ class Driving:
 
 def driving(tables: CheckedTables) -> Driving:
     """Speed, acceleration and yaw rate over the ground; derivatives by a sliding parabola of half a second."""
-    source = reference_of(tables)
+    source = require_reference(tables)
     known = source["valid"].astype(bool) & np.isfinite(source["vel_n"])
     t, lat, lon, v_n, v_e = (source[c][known] for c in ("t", "lat_deg", "lon_deg", "vel_n", "vel_e"))
     dt = float(np.median(np.diff(t)))
@@ -83,7 +83,7 @@ def driving(tables: CheckedTables) -> Driving:
 def drive_figure(tables: CheckedTables) -> Figure:
     """One drive: track, speed, specific force, rates, and the IMU's errors (paper, figure 4)."""
     moved = driving(tables)
-    reference, rows = reference_of(tables), 5
+    reference, rows = require_reference(tables), 5
     figure = Figure(figsize=(11.5, 1.9 * rows + 0.5), layout="constrained")
     grid = figure.add_gridspec(rows, 2, width_ratios=(1, 1.35))
     _track(figure.add_subplot(grid[:, 0]), figure, moved, tables)
@@ -155,7 +155,7 @@ def write_pictures(dataset: str | Path, out: str | Path) -> list[Path]:
     return [resolve_place(out) / file for file in files]
 
 
-def reference_of(tables: CheckedTables) -> Columns:
+def require_reference(tables: CheckedTables) -> Columns:
     """Of a simulated drive, which has one."""
     assert tables.reference is not None
     return tables.reference

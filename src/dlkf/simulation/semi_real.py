@@ -60,7 +60,7 @@ def simulate_semi_real(
             config, _, kind, unit = draw_presets(made_by, unit_seed, type_seed, ranges_seed)
             imu_rng, gnss_rng, sky_rng = (np.random.default_rng(stream) for stream in streams)
             imu, reference = inject_errors(imu_rng, tables, kind, unit)
-            received, rough = gnss_of_reference(gnss_rng, sky_rng, tables, config)
+            received, rough = simulate_gnss(gnss_rng, sky_rng, tables, config)
             row = _row(described[index], config, kind, rough)
             written.append(write_drive(folder, row, imu, received.fixes, reference))
             if config.raw:
@@ -97,7 +97,7 @@ def inject_errors(
     )
 
 
-def gnss_of_reference(
+def simulate_gnss(
     rng: np.random.Generator, sky_rng: np.random.Generator, tables: CheckedTables, config: DatasetConfig
 ) -> tuple[Received, Array]:
     """GNSS at whole multiples of 1/rate where the reference is known, and the reference's roughness (3,) [m].

@@ -69,7 +69,7 @@ def resolve_model(
     )
 
 
-def settings_taken(spec: str) -> tuple[str, ...]:
+def list_settings_taken(spec: str) -> tuple[str, ...]:
     """Which of ``imu`` and ``tuning`` have an effect on a model: a trained filter has its own noise."""
     if is_filter(spec) or OWN_SOURCE.fullmatch(spec):
         return ("imu", "tuning")
@@ -78,13 +78,13 @@ def settings_taken(spec: str) -> tuple[str, ...]:
 
 def takes_tuning(spec: str) -> bool:
     """Whether the noise of a model is set by ``imu`` and ``tuning``."""
-    return "tuning" in settings_taken(spec)
+    return "tuning" in list_settings_taken(spec)
 
 
 def unused_settings(spec: str, given: Iterable[str]) -> str:
     """A line for settings that a model does not take, as they were given (``imu=consumer``); empty without any."""
     by_key = {word: word.partition("=")[0].partition(".")[0].removesuffix("_type") for word in given}
-    unused = [word for word, key in by_key.items() if key not in settings_taken(spec)]
+    unused = [word for word, key in by_key.items() if key not in list_settings_taken(spec)]
     if not unused:
         return ""
     known = spec == "plus" and "imu" in by_key.values()

@@ -36,7 +36,7 @@ class NavigationFilter(PythonModel):
         from dlkf.running.offline import navigate_drives
 
         tables = []
-        for folder, drives in self._loaded(model_input, params or {}):
+        for folder, drives in self._load_drives(model_input, params or {}):
             for result in navigate_drives(drives, self.filter, skipped={}):
                 result.table.insert(0, "drive", result.drive)
                 if folder:
@@ -44,7 +44,7 @@ class NavigationFilter(PythonModel):
                 tables.append(result.table)
         return pd.concat(tables, ignore_index=True)
 
-    def _loaded(self, given: pd.DataFrame, params: dict[str, Any]) -> Iterator[tuple[str, list]]:
+    def _load_drives(self, given: pd.DataFrame, params: dict[str, Any]) -> Iterator[tuple[str, list]]:
         import torch
 
         from dlkf.data.rows import split_drives

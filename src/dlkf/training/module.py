@@ -20,7 +20,7 @@ from dlkf.filters.saved import LearnedSettings, build_learned_filter
 from dlkf.networks.heads import IMU_ERROR_SIZE, INNOVATION_SIZE, STATE_SIZE
 from dlkf.training.loss import Loss, unit_weights, weighted_loss
 from dlkf.training.optimization import OptimizationPlan
-from dlkf.training.processes import of_all
+from dlkf.training.processes import gather_all
 
 STATE, INNOVATION = torch.tensor(STATE_SIZE), torch.tensor(INNOVATION_SIZE)
 
@@ -120,7 +120,7 @@ class FilterTraining(L.LightningModule):
         ``val/gain_std`` and ``val/imu_error_std`` are relative to the heads' physical sizes: near zero they show that
         the network is a constant, for any errors.
         """
-        ends, gains, errors = np.concatenate(of_all(self._ends)), of_all(self._gains), of_all(self._errors)
+        ends, gains, errors = np.concatenate(gather_all(self._ends)), gather_all(self._gains), gather_all(self._errors)
         if len(ends):
             self.log("val/outage_end_m", mean_error(ends, "log"))
             self.log("val/outage_end_rms_m", mean_error(ends, "rms"))

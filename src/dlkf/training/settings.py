@@ -19,7 +19,7 @@ from dlkf.filters.saved import LearnedSettings, parse_learned_settings
 from dlkf.filters.shipped import shipped_folder
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.training.loss import Loss, loss_of
+from dlkf.training.loss import Loss, build_loss
 from dlkf.training.optimization import MANY, OptimizationPlan
 
 CALLBACK = ("setup", "on_train_epoch_start", "state_dict")  # of Lightning's methods those that every callback has
@@ -133,7 +133,7 @@ class TrainSettings:
         """What decides the weights; InputError for a class that is not there or takes other settings."""
         return FitSettings(
             model=parse_learned_settings(self.model),
-            loss=loss_of(self.loss),
+            loss=build_loss(self.loss),
             descent=OptimizationPlan.of(self.optimizer, self.scheduler),
             trainer=self.trainer,
             callbacks=[

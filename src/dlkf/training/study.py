@@ -20,12 +20,12 @@ from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.kinds import drive_imus, drive_kinds
 from dlkf.data.store import dataset_digest, load_dataset
 from dlkf.evaluation.endurance import OutageErrors, after_tables, hour_table, score_after_gnss, score_without_outage
-from dlkf.evaluation.gains import gains_of, write_gains
+from dlkf.evaluation.gains import measure_gains, write_gains
 from dlkf.evaluation.metrics import PVA
 from dlkf.evaluation.protocol import Scenes
 from dlkf.evaluation.results import BASELINE, Results
 from dlkf.evaluation.scores import Scores
-from dlkf.evaluation.study import results_of, run_scenes
+from dlkf.evaluation.study import make_results, run_scenes
 from dlkf.evaluation.table import ResultTable
 from dlkf.filters.build import refuse_smoothed
 from dlkf.filters.integration import Estimator
@@ -36,7 +36,7 @@ from dlkf.report.evaluation import write_report
 from dlkf.training.callbacks.curriculum import LengthCurriculum
 from dlkf.training.fit import fit
 from dlkf.training.settings import FitSettings, ScoringSettings, StudySettings
-from dlkf.tuning.baselines import Baselines, tuned_baselines
+from dlkf.tuning.baselines import Baselines, tune_baselines
 
 Say = Callable[[str], None]
 MODEL = "model.yaml"  # settings of the model of a training, in its folder
@@ -72,15 +72,15 @@ def run_study(
     for name in names:
         refuse_smoothed(name, "the filters of this table do not")
     set_threads(settings.fit)
-    with _timed(seconds, "tuning"):
+    with _time(seconds, "tuning"):
         baselines = _baselines(settings, data, say)
-    with _timed(seconds, "training"):
+    with _time(seconds, "training"):
         card = model_card(settings, data, getattr(logger, "run_id", None))
         model = model_on_baseline(settings.fit.model, baselines)
         (folder / MODEL).write_text(yaml.safe_dump(model.as_dict(), sort_keys=False))  # for further processes
         on_baseline, mean = replace(settings.fit, model=model), baselines.prior.mean
         weights = fit(on_baseline, data, folder, logger, mean_imu_error=mean, notes=card, further=further)
-    with _timed(seconds, "scoring"):
+    with _time(seconds, "scoring"):
         shipped = {name: trained_filter(name) for name in names if shipped_folder(name)}
         filters = {**baselines.build(), **shipped, learned: load_filter(weights)}
         scenes = Scenes.of_split(data, "test", plan, scoring.seed)
@@ -90,10 +90,10 @@ def run_study(
         baseline = BASELINE if BASELINE in filters else None
         groups = {d.name: d.group for d in data.stack}
         run = run_scenes(filters, scenes, kinds=kinds, groups=groups, law=scoring.injected_bias, seed=scoring.seed)
-        scores, made = run.scores, results_of(run, settle_s=scoring.settle_s, seed=scoring.seed)
+        scores, made = run.scores, make_results(run, settle_s=scoring.settle_s, seed=scoring.seed)
         title = ", ".join(Path(d).name for d in data.datasets)
         after, hour, tables = _endurance(filters, data, scoring, title, say)
-        gains = gains_of(filters, scenes, settle_s=scoring.settle_s) if scoring.gains else {}
+        gains = measure_gains(filters, scenes, settle_s=scoring.settle_s) if scoring.gains else {}
     noise = None if data.gnss_noise is None else asdict(data.gnss_noise)
     write_report(
         folder / "report",
@@ -106,7 +106,7 @@ def run_study(
             **scenes.describe(),
             "trained on": card,
             "gnss_noise": noise,
-            "left out": left_out_drives(settings, data),
+            "left out": list_left_out_drives(settings, data),
         },
         by_time=True,
         baseline=baseline,
@@ -134,7 +134,7 @@ def model_on_baseline(model: LearnedSettings, baselines: Baselines) -> LearnedSe
     return model.with_base(baselines.imu, baselines.tunings[model.base], baselines.priors.get(model.base))
 
 
-def left_out_drives(settings: StudySettings, data: DriveDataModule) -> list[str]:
+def list_left_out_drives(settings: StudySettings, data: DriveDataModule) -> list[str]:
     """A line for every side on drives that are too short for its segments, at the full length of a curriculum."""
     grown = [c.full_s for c in settings.fit.callbacks if isinstance(c, LengthCurriculum)]
     return data.list_left_out(max(grown, default=data.train_length_s))
@@ -149,12 +149,12 @@ def set_threads(settings: FitSettings) -> None:
 def _baselines(settings: StudySettings, data: DriveDataModule, say: Say) -> Baselines:
     """The classical filters, tuned on training segments for what is scored: ends of outages, or whole segments."""
     given, scoring = settings.baselines, settings.scoring
-    segments = Scenes.of_split(data, "train", scoring.outage, scoring.seed, given.segments).withheld()
+    segments = Scenes.of_split(data, "train", scoring.outage, scoring.seed, given.segments).withhold()
     classical = [name for name in given.models if not shipped_folder(name)]
     rounds = given.rounds if given.tune else 0
     objective = "log" if scoring.outage else PVA
     tuning = {"rounds": rounds, "start": given.tuning, "objective": objective}
-    return tuned_baselines(classical, settings.imu, segments, **tuning, say=say)
+    return tune_baselines(classical, settings.imu, segments, **tuning, say=say)
 
 
 def _endurance(
@@ -204,7 +204,7 @@ def model_card(settings: StudySettings, data: DriveDataModule, run: str | None) 
 
 
 @contextmanager
-def _timed(seconds: dict[str, float], what: str) -> Iterator[None]:
+def _time(seconds: dict[str, float], what: str) -> Iterator[None]:
     clock = time.perf_counter()
     yield
     seconds[what] = time.perf_counter() - clock
