@@ -55,24 +55,25 @@ def main() -> None:
 
 
 def score_as_published(study: Study, seed: str, weights: Path) -> None:
-    """The drives that the network has not seen, from the same start, with Kalman filters of the published R and tuned
-    for this start; ``mbkf15_prior`` is given the unit's true error."""
-    tuned = HOME / "tuned_for_published_start"
-    if not tuned.is_dir():
-        scored = ("objective=pva", "outage=null", "fractions=[0.55,0.1,0.35]", "segments=60")
-        run("tune", "model=mbkf15", "name=published_start", f"out={tuned}", *SEGMENTS, *scored)
-    kinds = {
-        "as_published_prior": tuple(f"tuning.{factor}" for factor in R),
-        "as_published_tuned": ("--config-dir", str(tuned), "tuning=published_start"),
+    """The drives that the network has not seen, from the same start, with Kalman filters of the published R, and with
+    each tuned for this start; ``mbkf15_prior`` is given the unit's true error."""
+    prior = (f"prior.mean={unit_error(Path(CLEAN))}", f"prior.std={STD}")
+    kinds: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+        "as_published_prior": (("mbkf15", "mbkf15_prior"), tuple(f"tuning.{factor}" for factor in R)),
     }
-    for kind, factors in kinds.items():
+    for name, kind in (("mbkf15", "as_published_tuned"), ("mbkf15_prior", "as_published_prior_tuned")):
+        tuned = HOME / f"tuned_{name}"
+        if not tuned.is_dir():
+            scored = ("objective=pva", "outage=null", "fractions=[0.55,0.1,0.35]", "segments=60")
+            run("tune", f"model={name}", "name=published_start", f"out={tuned}", *SEGMENTS, *scored, *prior)
+        kinds[kind] = ((name,), ("--config-dir", str(tuned), "tuning=published_start"))
+    for kind, (names, factors) in kinds.items():
         if f"{kind}/{seed}" in study.done:
             continue
         home = HOME / kind / seed
         shutil.copytree(weights, home / "dlkf", dirs_exist_ok=True)  # the tables call a model after its folder
-        models = f"model=[mbkf15,mbkf15_prior,{home / 'dlkf'}]"
-        prior = (f"prior.mean={unit_error(Path(CLEAN))}", f"prior.std={STD}")
-        report = (f"out={home / 'report'}", "overwrite=true", "unseen=true", "outage=null")
+        models = f"model=[{','.join(names)},{home / 'dlkf'}]"
+        report = (f"out={home / 'report'}", "overwrite=true", "unseen=true", "outage=null", f"baseline={names[0]}")
         run("evaluate", *factors, models, *SEGMENTS, *prior, *report)
         study.remember(f"{kind}/{seed}", str(home))
 

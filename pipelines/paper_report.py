@@ -84,7 +84,8 @@ PARTS = {
         {"dlkf": (0.45, 0.02, 0.07), "mbkf15": (0.49, 0.04, 0.27)},  # R122
         {"imu_errors": "Figure 6: estimates of the IMU's errors (black: true)"}, only=("as_published",),
         note="Start 60° off in yaw (1σ), untuned, R of 0.5 m and 0.05 m/s (R017). as_published_prior: all unseen "
-        "drives, mbkf15_prior given the unit's true error; as_published_tuned: with the factors tuned for this start.",
+        "drives, mbkf15_prior given the unit's true error; as_published_tuned and as_published_prior_tuned: mbkf15 and "
+        "mbkf15_prior with factors of their own, tuned for this start.",
     ),
     "outage": Part(
         "5.3 Outages of 30 to 50 s", "outage", "paper_outage.py",
@@ -169,7 +170,7 @@ def trainings(folder: Path) -> dict[str, Path]:
     return {k: Path(v) / "report" for k, v in json.loads(file.read_text()).items() if "/" in k}
 
 
-def results_of(report: Path) -> Results:
+def read_results(report: Path) -> Results:
     """The results of a report's one kind of data."""
     (content,) = json.loads((report / "metrics.json").read_text())["results"]
     return Results.of(content)
@@ -182,7 +183,7 @@ def section(page: Page, home: Path, part: Part) -> list[Claim]:
     if not runs:
         page.note(f"Not run yet: python pipelines/{part.command}")
         return [Claim(part.title, "", f"python pipelines/{part.command}", "not run")]
-    results = {key: results_of(report) for key, report in runs.items()}
+    results = {key: read_results(report) for key, report in runs.items()}
     rows = [["published", "", name, *published_cells(part, name)] for name in part.published]
     for key, result in results.items():
         for name in result.filters:

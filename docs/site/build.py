@@ -58,7 +58,7 @@ def on_page_markdown(text: str, page: Page, config: MkDocsConfig, files: Files) 
     """Names of functions and classes become links to their API."""
     text = text.replace("](../README.md", "](index.md").replace("](../RESULTS.md", "](results/index.md")
     parts = FENCE.split(text)  # every second one is a fenced block
-    parts[::2] = [NAMED.sub(lambda found: f"[`{shortened(found[1])}`][{found[1]}]", part) for part in parts[::2]]
+    parts[::2] = [NAMED.sub(lambda found: linked(found[1]), part) for part in parts[::2]]
     return "".join(parts)
 
 
@@ -70,6 +70,12 @@ def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
 def on_post_template(output: str, template_name: str, config: MkDocsConfig) -> str:
     """The same for the page of a wrong address."""
     return output.replace(REMOTE_SHIM, "site/worker.js")
+
+
+def linked(name: str) -> str:
+    """A dotted name as a link to its API; packages and constants, which have no place of their own, as code."""
+    has_none = SRC.joinpath(*name.split(".")[1:]).is_dir() or name.rpartition(".")[2].isupper()
+    return f"`{name}`" if has_none else f"[`{shortened(name)}`][{name}]"
 
 
 def shortened(name: str) -> str:

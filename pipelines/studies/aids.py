@@ -113,10 +113,10 @@ def print_errors(
     spec, batch, tables = imu_preset(imu), aligned_batch(folder), choose_aids(folder, chosen)
     group_of = {row.name: row.group for row in drive_rows(folder)}
     aids = "+".join(table.name for table in tables)
-    about = "geometric mean, median, RMS [m], % of way"
+    about = "geometric mean, median, RMS [m], % of distance"
     print(f"\n{Path(folder).name}, first outage after {first} s\n")
-    print(f"| s | n | recordings | filter | without: {about} | with {aids} | ratio of geometric means | found |")
-    print("|--:|--:|--:|:--|:--|:--|--:|:--|")
+    print(f"| outage [s] | n | recordings | filter | without: {about} | with {aids} | ratio of geom. means | found |")
+    print("|--:|--:|--:|:--|--:|--:|--:|:--|")
     for length in lengths:
         hidden, ends = hide(batch, first, length)
         if not ends.any():

@@ -208,29 +208,20 @@ def markdown(rows: Sequence[Row]) -> list[str]:
     """RMS / geometric mean of every filter, ratios of ``plus`` to the best other one without ``auto``, its NEES."""
     after = [name for name in rows[0].errors if name.endswith(" auto") or name in GIVEN]
     baselines = [name for name in rows[0].errors if name != "plus" and name not in after]
-    head = [
-        "data",
-        "GNSS [s]",
-        "outage [s]",
-        "outages (recordings)",
-        *baselines,
-        "plus",
-        "RMS ratio",
-        "geometric",
-        "NEES",
-    ]
-    head += after
+    head = ["data", "GNSS [s]", "outage [s]", "outages (recordings)", "plus", "RMS ratio", "geometric", "NEES"]
+    head += [*baselines, *after]
     lines = [f"| {' | '.join(head)} |", f"|:--|{'--:|' * (len(head) - 1)}"]
     for row in rows:
         best = min(baselines, key=lambda f: mean_error(row.errors[f], "log"))
         cells = [row.name, str(row.before_s), str(row.length_s), f"{len(row.groups)} ({len(set(row.groups))})"]
         errors = {n: f"{mean_error(e, 'rms'):.1f} / {mean_error(e, 'log'):.2f}" for n, e in row.errors.items()}
-        cells += [f"**{errors[name]}**" if name == best else errors[name] for name in (*baselines, "plus")]
+        cells.append(errors["plus"])
         for statistic in ("rms", "geomean"):
             c = compare(row.errors["plus"], row.errors[best], statistic=statistic, groups=row.groups)
             band = "" if np.isnan(c.ratio_low) else f" [{c.ratio_low:.2f}, {c.ratio_high:.2f}]"
             cells.append(f"{c.ratio:.2f}{band}")
-        cells += [f"{row.nees['plus']:.1f}", *(errors[name] for name in after)]
+        cells.append(f"{row.nees['plus']:.1f}")
+        cells += [f"**{errors[name]}**" if name == best else errors[name] for name in (*baselines, *after)]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 

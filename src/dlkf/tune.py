@@ -59,8 +59,17 @@ def main(settings: TuneSettings) -> None:
             files = write_noise(out, found, table)
             run.log_metrics({f"found/{k}": v for k, v in found.describe().items()})
         else:
-            options = {"objective": settings.objective, "rounds": settings.rounds, "segments": settings.segments}
-            result = search(model, spec, parts, protocol, start=start, **options)
+            result = search(
+                model,
+                spec,
+                parts,
+                protocol,
+                start=start,
+                objective=settings.objective,
+                rounds=settings.rounds,
+                segments=settings.segments,
+                prior=settings.filter_options["prior"],
+            )
             table = tuning_table(result, dataset)
             files = write_tuning(out, name, result, table)
             run.log_metrics(result.metrics())

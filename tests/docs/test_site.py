@@ -49,5 +49,14 @@ def test_equations_are_drawn(site: Path) -> None:
 def test_docstrings_and_names_are_linked(site: Path) -> None:
     assert 'id="dlkf.navigation.strapdown.strapdown"' in (site / "api" / "navigation.html").read_text()
     assert 'href="api/navigation.html#dlkf.navigation.strapdown.strapdown"' in (site / "algorithm.html").read_text()
-    api = "".join(p.read_text() for p in (site / "api").glob("*.html"))
-    assert ":func:" not in api and "][dlkf." not in api
+    pages = {p.name: p.read_text() for p in site.rglob("*.html")}
+    assert not [name for name, text in pages.items() if "][dlkf." in text]
+    assert ":func:" not in "".join(p.read_text() for p in (site / "api").glob("*.html"))
+
+
+def test_numbers_of_tables_break_in_whole_intervals_and_pictures_have_captions(site: Path) -> None:
+    text = (site / "results" / "faulty_data.html").read_text()
+    assert '<span class="joined">[0.41, 1.01]</span>' in text and '<span class="joined">4.6 / 2.45</span>' in text
+    narrow = (site / "results" / "vibration.html").read_text()
+    assert '<span class="joined">0.61 [0.40, 0.91]</span>' in narrow
+    assert "<figcaption>Shapes of the spectrum over distance on real drives</figcaption>" in narrow

@@ -12,6 +12,7 @@ from plotly.subplots import make_subplots
 from dlkf.report.drawing import Figure, library, panels, template
 from dlkf.report.grid import coordinates
 from dlkf.report.navigation import navigation_page
+from dlkf.report.page import Page
 from dlkf.report.plots import MOST, extremes
 from tests.evaluation.drawn import figures_of
 from tests.running.test_offline import driven
@@ -56,6 +57,31 @@ def test_nested_properties_are_set_each_by_itself():
     figure.update_yaxis(title={"text": "m"})
     assert figure.layout["legend"] == {"y": 2, "orientation": "h"} and figure.layout["height"] == 100
     assert figure.layout["yaxis"] == {"type": "log", "title": {"text": "m"}}
+
+
+@pytest.mark.parametrize(
+    ("values", "shown"),
+    [
+        ((0.6, 4.0), ["0.5", "1", "2", "5"]),
+        ((0.03, 40.0), ["0.01", "0.1", "1", "10", "100"]),
+        ((0.02, 8000.0), ["0.01", "1", "100", "10000"]),
+        ((0.0, np.nan), ["1", "2", "5", "10"]),
+    ],
+)
+def test_a_logarithmic_axis_has_round_numbers_in_full(values, shown):
+    figure = panels(["one", "two"], 0.1)
+    figure.add_trace({"type": "scatter", "x": [0.0, 1.0], "y": np.array(values)}, 2)
+    figure.set_log_scale(2)
+    axis = figure.layout["yaxis2"]
+    assert [float(text) for text in axis["ticktext"]] == axis["tickvals"] and axis["type"] == "log"
+    first = axis["ticktext"].index(shown[0])
+    assert axis["ticktext"][first : first + len(shown)] == shown
+
+
+def test_words_of_a_table_are_left_aligned_and_numbers_right():
+    page = Page("town", [])
+    page.table(["Run", "Filter", "Error", "Found"], [["a", "plus", "1.5", "–"], ["b", "–", "∞", "–"]])
+    assert page.parts[0].count("class=text") == 3 and "<td class=text>plus</td><td>1.5</td>" in page.parts[0]
 
 
 def test_a_page_of_drives_holds_figures_that_plotly_knows():

@@ -11,7 +11,13 @@ from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.segments import StartLaw
 from dlkf.data.store import load_dataset
 from dlkf.evaluation import endurance
-from dlkf.evaluation.endurance import after_tables, hour_table, score_after_gnss, score_without_outage
+from dlkf.evaluation.endurance import (
+    after_tables,
+    hour_table,
+    scenes_after_gnss,
+    score_after_gnss,
+    score_without_outage,
+)
 from dlkf.evaluation.protocol import Protocol, Scenes
 from dlkf.evaluation.run import score_scenes
 from dlkf.filters.build import build_filter
@@ -42,6 +48,10 @@ def test_a_filter_is_better_after_more_gnss(town):
     """Outages of 40 s after 3 and 10 s; 60 s of drive have no room for one after 30 s."""
     data = DriveDataModule(town, split={"train": ["g0"], "val": ["g1"], "test": ["g2"]}, eval_length_s=50.0, rate_hz=20)
     data.setup()
+    assert scenes_after_gnss(data, "train", 30.0, 2, None) is None
+    scenes = scenes_after_gnss(data, "train", 10.0, 2, 1)
+    (batch,) = scenes.withhold()
+    assert len(batch.drive) == 1 and torch.nonzero(~batch.available[0]).flatten().tolist() == list(range(10, 50))
     rows = score_after_gnss(FILTERS, data, [3, 10, 30], baseline="mbkf15", seed=2)
     assert [(r.seconds, r.segments, r.groups) for r in rows] == [(3.0, 2, 1), (10.0, 2, 1)]
     early, late = (r.filters["mbkf15"] for r in rows)

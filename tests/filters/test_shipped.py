@@ -6,10 +6,11 @@ import pytest
 import torch
 import yaml
 
+from dlkf.command.composing import compose_command
 from dlkf.data.augmentation import SensorDegradation, degrade_sensors
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
-from dlkf.filters.plus import PlusFilter
+from dlkf.filters.plus import PlusConfig, PlusFilter
 from dlkf.filters.shipped import WEIGHTS_FOLDER, shipped_folder, trained_filter
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.tracking.models import resolve_model, short_name
@@ -29,6 +30,11 @@ def test_it_is_there_small_and_tells_what_it_was_trained_on():
 
 def test_model_plus_is_a_filter_like_any_other():
     assert isinstance(resolve_model("plus", IMU), PlusFilter) and short_name("plus") == "plus"
+
+
+def test_the_preset_trains_the_filter_that_ships():
+    settings = compose_command("train", "filter@model=plus")["model"]
+    assert settings["base"] == trained_filter("plus").config.base == PlusConfig.base
 
 
 def test_plus_imu_takes_biases_scale_factors_and_misalignments_of_a_preset():

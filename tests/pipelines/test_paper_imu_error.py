@@ -55,7 +55,7 @@ def test_the_published_filter_is_started_and_set_as_the_paper_says(script, monke
     module, said = script
     monkeypatch.setattr(sys, "argv", ["paper_imu_error", "--as-published", "--seeds", "0", "trainer.max_epochs=3"])
     module.main()
-    assert [words[0] for words in said] == ["train", "tune", "evaluate", "evaluate"]
+    assert [words[0] for words in said] == ["train", "tune", "tune", *["evaluate"] * 3]
     training = composed(*said[0])
     fixes = compose_command("simulate", "simulated@dataset=paper_clean")["dataset"]["gnss"]
     tuning = training["baselines"]["tuning"]
@@ -64,16 +64,19 @@ def test_the_published_filter_is_started_and_set_as_the_paper_says(script, monke
     assert training["data"]["start"]["yaw_deg"] == 60
     assert training["model"]["training_turn"] == pytest.approx(math.pi, abs=1e-5)
     assert not training["baselines"]["tune"] and training["trainer"]["max_epochs"] == 3
-    searched, *scored = (composed(*words) for words in said[1:])
-    for given in (searched, *scored):
+    *searched, first, second, third = (composed(*words) for words in said[1:])
+    scored = (first, second, third)
+    for given in (*searched, *scored):
         assert given["start"] == training["data"]["start"] and given["dataset"] == training["data"]["datasets"][0]
-    assert searched["fractions"] == training["data"]["fractions"]
-    assert all("outage=null" in words for words in said[2:])
+    assert [given["model"] for given in searched] == ["mbkf15", "mbkf15_prior"]
+    for given in searched:
+        assert given["fractions"] == training["data"]["fractions"] and given["objective"] == "pva"
+    assert all("outage=null" in words for words in said[1:])
     for given in scored:
         assert given["prior"]["mean"] == [1, 2, 3, 4, 5, 6] and given["unseen"]
         assert (Path(given["model"][-1]) / "config.yaml").is_file() and given["length_s"] == 60
     assert scored[0]["tuning"] == tuning
     done = json.loads((module.HOME / "trainings.json").read_text())
-    assert list(done) == ["as_published/0", "as_published_prior/0", "as_published_tuned/0"]
+    assert list(done) == [f"as_published{kind}/0" for kind in ("", "_prior", "_tuned", "_prior_tuned")]
     module.main()
-    assert len(said) == 4  # what is finished is not done again
+    assert len(said) == 6  # what is finished is not done again

@@ -17,10 +17,10 @@ from dlkf.evaluation.metrics import PVA
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
-from dlkf.filters.tuning import Tuning
+from dlkf.filters.tuning import Prior, Tuning
 from dlkf.onboard.library import find_compiler
 from dlkf.tuning.baselines import tune_baselines
-from dlkf.tuning.search import FACTORS, evaluate_objective, list_factors, mean_imu_error, tune_filter
+from dlkf.tuning.search import FACTORS, best_prior, evaluate_objective, list_factors, mean_imu_error, tune_filter
 from dlkf.tuning.study import check_settings, train_test_drives
 from tests.cars import IMU
 
@@ -161,16 +161,37 @@ def test_a_filter_that_is_told_its_unit_drifts_less(cars):
     assert expected < 0.8 * untold
 
 
+def test_the_best_prior_is_the_best_of_all_that_were_tried(cars, monkeypatch):
+    """Of factors and spreads, for biases and sensor matrices apart, with the means of longer segments."""
+    monkeypatch.setattr("dlkf.tuning.search.BIAS_SPREADS", (3.0, 0.3))
+    monkeypatch.setattr("dlkf.tuning.search.MATRIX_SPREADS", (10.0, 1.0))
+    batch, expected, _ = one_unit(cars)
+    tunings, name = [Tuning(), Tuning(accel_noise=30.0, gyro_noise=30.0)], "mbkf33_prior"
+    prior, tuning = best_prior(expected, tunings, [hidden(batch)], name, longer=[batch])
+    known = [mean_imu_error(expected, t, [batch], "mbkf33") for t in tunings]
+    trials = [(p.scale_spread(b, m), t) for p in known for b in (3.0, 0.3) for m in (10.0, 1.0) for t in tunings]
+    tried = {
+        (p, t): evaluate_objective(build_filter(name, expected, tuning=t, prior=p), [hidden(batch)]) for p, t in trials
+    }
+    assert (prior, tuning) == min(tried, key=tried.__getitem__)
+    assert len(set(tried.values())) == 16
+
+
+def test_spreads_of_biases_and_matrices_scale_apart():
+    prior = Prior(tuple(range(24)), (1.0,) * 24).scale_spread(3.0, 0.5)
+    assert prior.mean == tuple(range(24)) and prior.std == (3.0,) * 6 + (0.5,) * 18
+
+
 def test_untuned_baselines_keep_the_factors_that_they_begin_with(cars):
     coarse = Tuning(position_std=25.0, velocity_std=2.5)
     found = tune_baselines(["ins", "mbkf15", "mbkf21"], IMU, [hidden(cars)], rounds=0, say=str, start=coarse)
     assert found.tunings == {"ins": Tuning(), "mbkf15": coarse, "mbkf21": coarse}
 
 
-@pytest.mark.parametrize("model", ["ins", "mbkf15_prior", "no_such"])
-def test_what_has_no_noise_of_its_own_is_refused(model):
+@pytest.mark.parametrize("model, objective", [("ins", "rms"), ("mbkf15_prior", "likelihood"), ("no_such", "rms")])
+def test_what_has_no_noise_of_its_own_is_refused(model, objective):
     with pytest.raises(InputError, match=f"model={model}"):
-        check_settings(model, "rms")
+        check_settings(model, objective)
 
 
 def test_the_command_writes_factors_that_evaluate_takes(uri, call, town):
@@ -194,6 +215,14 @@ def test_the_command_tunes_for_gnss_throughout(uri, call, town):
     assert set(json.loads(Path("found/errors.json").read_text())) == {
         f"{side}/pva/{when}" for side in ("train", "test") for when in ("untuned", "tuned")
     }
+    prior = ("prior.mean=[0,0,0,0,0,0]", "prior.std=[1e-3,1e-3,1e-3,1e-5,1e-5,1e-5]")
+    of_prior = ("tune", "model=mbkf15_prior", *common[2:], "fractions=[0.5,0,0.5]", "objective=pva", "name=cars")
+    done = call(*of_prior, *prior, "out=known")
+    assert done.code == 0, done.err
+    tuned = [Path(f"{out}/tuning/cars.yaml").read_text() for out in ("found", "known")]
+    assert tuned[0] != tuned[1]
+    done = call(*of_prior, "out=none")
+    assert done.code == 2 and "prior.mean" in done.err and not Path("none").exists()
     done = call(*common, "objective=log", "out=none")
     assert done.code == 2 and "give objective=pva" in done.err and not Path("none").exists()
 

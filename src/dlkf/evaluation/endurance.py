@@ -41,6 +41,17 @@ class OutageErrors:
     ratios: dict[str, Comparison]  # geometric means against the baseline, with intervals
 
 
+def scenes_after_gnss(data: DriveDataModule, side: str, first_s: float, seed: int, limit: int | None) -> Scenes | None:
+    """Segments of a side with an outage of 40 s after ``first_s`` with GNSS, at most ``limit`` (None: all); None where
+    no drive has room for one."""
+    length = first_s + OUTAGE_S + REST_S
+    if not (segments := cut_segments(data.stack, length, span=data.spans[side])):
+        return None
+    plan = OutagePlan(float(first_s), OUTAGE_S, offsets_s=(0.0,))
+    protocol = Protocol("segments", length, length, data.start, outage=plan, seed=seed)
+    return Scenes(data.stack, protocol, segments=segments, limit=limit)
+
+
 def score_after_gnss(
     filters: Mapping[str, Filter], data: DriveDataModule, seconds: Sequence[float], *, baseline: str, seed: int
 ) -> list[OutageErrors]:
@@ -48,13 +59,8 @@ def score_after_gnss(
     has room for is left out."""
     out = []
     for first in seconds:
-        length = first + OUTAGE_S + REST_S
-        segments = cut_segments(data.stack, length, span=data.spans["test"])
-        if not segments:
+        if (scenes := scenes_after_gnss(data, "test", first, seed, MOST_SEGMENTS)) is None:
             continue
-        plan = OutagePlan(float(first), OUTAGE_S, offsets_s=(0.0,))
-        protocol = Protocol("segments", length, length, data.start, outage=plan, seed=seed)
-        scenes = Scenes(data.stack, protocol, segments=segments, limit=MOST_SEGMENTS)
         scores = score_scenes(filters, scenes, groups={d.name: d.group for d in data.stack})
         w = scores.windows
         groups = [scores.segments[i].group for i in w.segment]

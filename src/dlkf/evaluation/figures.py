@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from typing import Any
@@ -135,7 +136,7 @@ def _track(ax: Axes, scores: Scores, i: int, middle: Array, half: float) -> None
 def _absent(ax: Axes, names: Sequence[str]) -> None:
     if names:
         box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1}
-        note = f"leaves the picture: {', '.join(names)}"
+        note = textwrap.fill(f"leaves the picture: {', '.join(names)}", 42)
         ax.text(0.02, 0.02, note, transform=ax.transAxes, fontsize=8, color="#555555", zorder=6, bbox=box)
 
 

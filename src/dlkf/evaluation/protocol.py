@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 MODES = ("auto", "segments", "drives")
+LONG_S, STEP_S = 600, 30  # of long segments: the longest, and what they are shortened by
 REFUSED = "left out as impossible"  # of the rules: samples and fixes of drives
 
 
@@ -136,6 +137,16 @@ class Scenes:
         protocol = Protocol("segments", data.eval_length_s, stride, data.start, outage=outage, seed=seed)
         scenes = cls(data.stack, protocol, segments=segments, limit=limit)
         scenes.side = side
+        return scenes
+
+    @classmethod
+    def of_long_segments(cls, data: DriveDataModule, side: str, seed: int) -> Scenes:
+        """Segments of up to ten minutes without an outage, as long as four fifths of a side's time allow."""
+        covered, scenes = len(data.segments(side)) * data.eval_length_s, cls.of_split(data, side, None, seed)
+        for length in range(LONG_S, int(data.eval_length_s), -STEP_S):
+            segments = cut_segments(data.stack, length, span=data.spans[side])
+            if len(segments) * length >= 0.8 * covered:
+                return cls(data.stack, Protocol("segments", length, length, data.start, seed=seed), segments=segments)
         return scenes
 
     def withhold(self) -> list[Batch]:

@@ -44,10 +44,10 @@ def headline(result: Results) -> str:
     """The answer to "how far does the car drift?" in plain words: of the outages asked for, of the best
     filter and of the best classical one, or the next where the best is classical.
 
-    "60 s without GNSS, 40 outages: plus ends 8.8 m from the reference in the median, within 33 m in 95 % of them (1.4 %
-    of the distance driven); best classical filter mbkf21_car 10 m, 41 m." The best has the least median. Of fewer than
-    :data:`FEW` outages the largest error takes the place of the 95 %, with a warning. Without outages the horizontal
-    error over the settled part of the segments.
+    "60 s without GNSS, 40 outages: plus ends 8.8 m from the reference in the median (1.4 % of the distance driven),
+    within 33 m in 95 % of them; best classical filter mbkf21_car 10 m, 41 m." The best has the least median. Of fewer
+    than :data:`FEW` outages the largest error takes the place of the 95 %, with a warning. Without outages the
+    horizontal error over the settled part of the segments.
     """
     span = result.count["outage_s"]
     where = ("outages", "end", "horizontal") if span else ("segments", "settled", "horizontal")
@@ -61,9 +61,9 @@ def headline(result: Results) -> str:
     best, texts = order[0], {n: [f"{format_number(x)} m" for x in errors[n]] for n in order}
     lead = f"{_length(*span)} without GNSS" if span else "With GNSS throughout"
     text = f"{lead}, {count} {unit}{'s' if count > 1 else ''}: {best} ends " if span else f"{lead}: {best} is "
-    text += _spread(texts[best], count, unit)
-    if span and math.isfinite(drift := result.value(best, "outages", "end", "drift", "median")):
-        text += f" ({format_number(100 * drift, digits=2)} % of the distance driven)"
+    drift = result.value(best, "outages", "end", "drift", "median") if span else math.nan
+    share = f" ({format_number(100 * drift, digits=2)} % of the distance driven)" if math.isfinite(drift) else ""
+    text += _spread(texts[best], count, unit, share)
     other = next((n for n in order[1:] if is_classical(best) or is_classical(n)), None)
     if other is not None:
         which = "next" if is_classical(best) else "best classical filter"
@@ -104,26 +104,30 @@ def describe_verdict(result: Results, name: str) -> str | None:
 
 def sigma_warnings(scores: Scores) -> list[str]:
     """A line for each filter whose own 1σ is too small for its innovations, with the remedy (another for a network,
-    which is given no noise)."""
-    fits = {name: innovation_fit(run) for name, run in scores.filters.items()}
-    return [
-        fit.warning(name, REMEDY if is_classical(name) else OF_NETWORK)
-        for name, fit in fits.items()
-        if fit is not None and fit.too_small
-    ]
+    which is given no noise) in the first that needs it."""
+    lines: list[str] = []
+    remedies: set[str] = set()
+    for name, run in scores.filters.items():
+        fit = innovation_fit(run)
+        if fit is not None and fit.too_small:
+            remedy = fit.remedy(REMEDY if is_classical(name) else OF_NETWORK)
+            lines.append(fit.short_warning(name) if remedy in remedies else fit.warning(name, remedy))
+            remedies.add(remedy)
+    return lines
 
 
 def _length(low: float, high: float) -> str:
     return f"{low:g} s" if low == high else f"{low:g} to {high:g} s"
 
 
-def _spread(texts: Sequence[str], count: int, unit: str) -> str:
+def _spread(texts: Sequence[str], count: int, unit: str, share: str) -> str:
+    """``share``: the median as a fraction of the distance, behind it."""
     where = " from the reference" if unit == "outage" else " off horizontally"
     if count >= FEW:
-        return f"{texts[0]}{where} in the median, within {texts[1]} in 95 % of them"
+        return f"{texts[0]}{where} in the median{share}, within {texts[1]} in 95 % of them"
     if count == 1:
-        return f"{texts[0]}{where}"
-    return f"{texts[0]}{where} in the median, {texts[1]} in the largest"
+        return f"{texts[0]}{where}{share}"
+    return f"{texts[0]}{where} in the median{share}, {texts[1]} in the largest"
 
 
 def is_classical(name: str) -> bool:

@@ -67,6 +67,7 @@ class Prior:
     mean: Sequence[float]
     std: Sequence[float]
 
-    def scale_spread(self, factor: float) -> Prior:
-        """The same mean with the spread times ``factor``."""
-        return Prior(self.mean, tuple(factor * s for s in self.std))
+    def scale_spread(self, biases: float, matrices: float = 1.0) -> Prior:
+        """The same mean with the 1σ of biases and of sensor matrices times a factor each."""
+        std = (biases * s if i < 6 else matrices * s for i, s in enumerate(self.std))
+        return Prior(self.mean, tuple(std))

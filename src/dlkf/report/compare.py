@@ -173,7 +173,7 @@ def growth_figure(reports: Sequence[StoredReport]) -> Figure:
     )  # fmt: skip
     figure.update_xaxis(title={"text": "Time without GNSS [s]"})
     figure.update_yaxis(title={"text": "Horizontal error [m]"})
-    figure.set_log_scale(ticks=8)
+    figure.set_log_scale()
     return figure
 
 

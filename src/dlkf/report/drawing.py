@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -20,6 +21,7 @@ import numpy as np
 
 Trace = dict[str, Any]
 TEMPLATE = "plotly_white"
+NARROW_DECADES, MOST_DECADES = 1.5, 5  # of a logarithmic axis: with 2 and 5; with every power of ten
 
 
 @dataclass
@@ -48,9 +50,20 @@ class Figure:
         """Set properties of a panel's value axis."""
         _merge(self.layout.setdefault(f"yaxis{_number(row)}", {}), more)
 
-    def set_log_scale(self, row: int = 1, *, ticks: int = 5) -> None:
-        """A logarithmic value axis, its numbers written out (10000, not 10k), with about so many of them."""
-        self.update_yaxis(row, type="log", nticks=ticks, exponentformat="none")
+    def set_log_scale(self, row: int = 1) -> None:
+        """A logarithmic value axis of the traces that the panel has, its numbers written out (10000, not 10k): powers
+        of ten, of narrow data also 2 and 5 times these."""
+        axis = f"y{_number(row)}"
+        y = [np.asarray(trace["y"], float) for trace in self.data if trace.get("yaxis", "y") == axis]
+        values = np.concatenate(y) if y else np.empty(0)
+        values = np.log10(values[np.isfinite(values) & (values > 0)])
+        low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
+        every = 2 if high - low > MOST_DECADES else 1
+        decades = range(every * (math.floor(low / every) - 1), math.ceil(high) + 2, every)
+        steps = (1, 2, 5) if high - low < NARROW_DECADES else (1,)
+        ticks = [float(f"{step}e{k}") for k in decades for step in steps]
+        texts = [np.format_float_positional(v, trim="-") for v in ticks]
+        self.update_yaxis(row, type="log", tickvals=ticks, ticktext=texts)
 
     def to_json(self) -> str:
         """As plotly.js reads it; arrays of floats are binary."""

@@ -104,9 +104,8 @@ def evaluation_page(
     baseline: str | None,
     trained: str | None = None,
 ) -> str:
-    """The page: answer, of a training what was ``trained`` first; for every kind of data map, growth, tables of the
-    outages and of further sensors, every outage; then what is for research: errors over time, IMU errors, the other
-    tables."""
+    """The page: answer, of a training what was ``trained`` first; for every kind of data the table of the outages, map,
+    growth, further sensors, every outage; then what is for research: errors over time, IMU errors, the other tables."""
     many = len(results) > 1
     verdicts = [(r, v) for r in results if trained is not None and (v := describe_verdict(r, trained))]
     said = [*verdicts, *((r, headline(r)) for r in results)]
@@ -122,7 +121,7 @@ def evaluation_page(
         _answer(page, scores.of_kind(result.kind), result, kind, baseline, named, tables)
     _add_tables(page, [t for t in first if many and not any(f"({r.kind})" in t.title for r in results)])
     for result in results:
-        _research(page, scores.of_kind(result.kind), f"{result.kind}: " if many else "", baseline)
+        _research(page, scores.of_kind(result.kind), result, f"{result.kind}: " if many else "", baseline)
     _add_tables(page, [t for t in parts if t not in first])
     if pictures:
         page.for_print([(caption, embed_png(data)) for _, caption, data in pictures])
@@ -158,14 +157,15 @@ def _answer(
     page: Page, scores: Scores, result: Results, kind: str, baseline: str | None, truth: str,
     tables: Sequence[ResultTable],
 ) -> None:  # fmt: skip
-    """Map, growth, tables, every outage."""
+    """Table, map, growth, further sensors, every outage."""
     name = kind.strip(": ") or "all"
     if scores.outage.any():
+        _add_tables(page, [t for t in tables if t.title != SENSORS_TITLE])
         page.heading(f"{kind}Map", MAP.format(truth=truth))
         page.figure(f"map-{name}", outage_map(scores, truth))
         page.heading(f"{kind}Error against the time without GNSS", "Median and 95 % of the outages that last so long.")
         page.figure(f"growth-{name}", growth_chart(scores))
-        _add_tables(page, tables)
+        _add_tables(page, [t for t in tables if t.title == SENSORS_TITLE])
         best = least_error(scores, result)
         about = f"Horizontal error at the end [m], the worst of {best} first; a click shows it on the map."
         page.heading(f"{kind}Outages", about)
@@ -179,7 +179,7 @@ def _answer(
         _add_tables(page, tables)
 
 
-def _research(page: Page, scores: Scores, kind: str, baseline: str | None) -> None:
+def _research(page: Page, scores: Scores, result: Results, kind: str, baseline: str | None) -> None:
     """Errors over time, IMU errors."""
     name = kind.strip(": ") or "all"
     page.heading(
@@ -190,9 +190,11 @@ def _research(page: Page, scores: Scores, kind: str, baseline: str | None) -> No
     if chosen:
         i = chosen[len(chosen) // 2]
         segment = scores.segments[i]
-        about = f"{segment.drive} from t = {segment.t_start:.0f} s, a middling segment; black: truth; bands: ±3σ."
+        best = least_error(scores, result)
+        about = f"{segment.drive} from t = {segment.t_start:.0f} s, an average segment; black: truth; "
+        about += f"band: ±3σ of {best}."
         page.heading(f"{kind}IMU errors", about)
-        page.figure(f"imu-{name}", imu_error_charts(scores, i))
+        page.figure(f"imu-{name}", imu_error_charts(scores, i, best))
 
 
 def colours(scores: Scores) -> dict[str, str]:
@@ -220,8 +222,8 @@ def growth_chart(scores: Scores) -> Figure:
         count = (w.length[:, None] * scores.epoch_s >= seconds[None]).sum(0)
         bars = {"type": "bar", "x": seconds, "y": count, "marker": {"color": SHADE}, "name": "outages"}
         figure.add_trace(bars | {"showlegend": False}, 3)
-    figure.set_log_scale(1, ticks=6)
-    figure.set_log_scale(2, ticks=6)
+    figure.set_log_scale(1)
+    figure.set_log_scale(2)
     figure.update_xaxis(2 + len(counted), title={"text": "Time without GNSS [s]"})
     return figure
 
@@ -310,8 +312,8 @@ def error_charts(scores: Scores) -> Figure:
     return figure
 
 
-def imu_error_charts(scores: Scores, i: int) -> Figure:
-    """Estimates of one segment with their ±3σ, and the truth where it is known."""
+def imu_error_charts(scores: Scores, i: int, banded: str) -> Figure:
+    """Estimates of one segment, with the ±3σ of the filter ``banded``, and the truth where it is known."""
     figure = stack_panels([title for title, _ in IMU], height=120)
     for k, (_, scale) in enumerate(IMU):
         truth = scores.true_imu_error[i, :, k] * scale
@@ -320,7 +322,7 @@ def imu_error_charts(scores: Scores, i: int) -> Figure:
             y, sigma = run.imu_error[i, :, k] * scale, 3 * run.imu_std[i, :, k] * scale
             if not np.nan_to_num(run.imu_error[i]).any():
                 continue
-            if np.isfinite(sigma).any():
+            if name == banded and np.isfinite(sigma).any():
                 figure.add_trace(band(scores.t, y - sigma, y + sigma, name, c), k + 1)
             figure.add_trace(line(scores.t, y, name, c, legend=k == 0), k + 1)
         if np.isfinite(truth).any():

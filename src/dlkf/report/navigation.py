@@ -15,7 +15,7 @@ from dlkf.report.drawing import Figure
 from dlkf.report.maps import add_track, chart, dots, join_tracks
 from dlkf.report.page import Page
 from dlkf.report.plots import Array, band, every, line, shade, spans, stack_panels
-from dlkf.running.innovations import Innovation
+from dlkf.running.innovations import SETTLE, Innovation
 from dlkf.running.offline import Navigated, UsableFixes
 
 MOST_DRIVES = 12  # with plots of their own; all are on the map
@@ -206,14 +206,18 @@ def make_rows(courses: Sequence[TrackOnMap]) -> tuple[list[str], list[list[str]]
             [course.result.drive, f"{np.ptp(table['t']):.0f}", f"{distance(course) / 1000:.2f}"]
             + [str(int(table["gnss_used"].sum())), str(offered), f"{course.without.max():.3g}"]
             + [f"{(speed(course) < STANDING).sum() * step:.0f}"]
-            + ([f"{np.nanmedian(sigma):.2g}", f"{np.nanmax(sigma):.2g}"] if known else ["–", "–"])
-            + [f"{ratio:#.2g}".rstrip(".") if np.isfinite(ratio) else "–"]
+            + ([_two_digits(float(np.nanmedian(sigma))), _two_digits(float(np.nanmax(sigma)))] if known else ["–", "–"])
+            + [_two_digits(ratio) if np.isfinite(ratio) else "–"]
         )
         place = _place(course)
         half = 60_000 * max(float(np.ptp(place[:, 0])), float(np.ptp(place[:, 1])), 1e-3)
         lat, lon = place.mean(0)
         marks.append(mark_outages("map", lat, lon, half))
     return columns, rows, marks
+
+
+def _two_digits(value: float) -> str:
+    return f"{value:#.2g}".rstrip(".")
 
 
 def mark_outages(figure: str, lat: float, lon: float, half_m: float) -> str:
@@ -251,7 +255,7 @@ def _motion(course: TrackOnMap, t: Array, gaps: Sequence[tuple[float, float]]) -
     figure.add_trace(line(t, np.where(jump, np.nan, heading), "heading", COLOURS[2], legend=False), 2)
     figure.add_trace(line(t, table["height_m"].to_numpy(), "height", COLOURS[3], legend=False), 3)
     figure.add_trace(line(t, horizontal_std(course), "1σ", COLOURS[5], legend=False), 4)
-    figure.set_log_scale(4, ticks=4)
+    figure.set_log_scale(4)
     figure.update_xaxis(4, title={"text": "Time [s]"})
     shade(figure, gaps, 4)
     return figure
@@ -272,6 +276,9 @@ def _innovations(course: TrackOnMap, t: Array, gaps: Sequence[tuple[float, float
             figure.add_trace(band(t[seen], -sigma, sigma, "±3σ", COLOURS[5], legend=row == 1), row)
         y = innovation.value[seen, k]
         figure.add_trace(line(t[seen], y, "innovation", COLOURS[0], legend=row == 1, width=1), row)
+        if len(y) > SETTLE:  # the wide start may leave the panel
+            limit = 1.2 * float(np.nanmax(np.concatenate((np.abs(y[SETTLE:]), sigma[SETTLE:]))))
+            figure.update_yaxis(row, range=[-limit, limit])
     figure.update_xaxis(len(known), title={"text": "Time [s]"})
     shade(figure, gaps, len(known))
     return figure

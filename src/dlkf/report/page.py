@@ -10,6 +10,7 @@ import html
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
+from itertools import repeat
 from types import MappingProxyType
 from typing import Any
 
@@ -50,9 +51,15 @@ class Page:
         """A table; ``marks`` are attributes of its rows (class, data-lat …), ``tall`` scrolls in a box of its own,
         ``words`` are left-aligned and wrap; a text in ``titles`` shows its longer form under the pointer."""
         more = {text: f' title="{html.escape(longer)}"' for text, longer in titles.items()}
-        head = "".join(f"<th{more.get(c, '')}>{html.escape(c).replace(chr(10), '<br>')}</th>" for c in columns)
+        text = [k > 0 and not words and _has_words([row[k] for row in rows]) for k in range(len(columns))]
+        sides = [" class=text" if has_words else "" for has_words in text]
+
+        def cell(tag: str, content: str, side: str) -> str:
+            return f"<{tag}{side}{more.get(content, '')}>{html.escape(content)}</{tag}>"
+
+        head = "".join(map(cell, repeat("th"), columns, sides)).replace("\n", "<br>")
         attributes = list(marks) or [""] * len(rows)
-        cells = ("".join(f"<td{more.get(c, '')}>{html.escape(c)}</td>" for c in row) for row in rows)
+        cells = ("".join(map(cell, repeat("td"), row, sides)) for row in rows)
         body = "".join(f"<tr {a}>{row}</tr>" for row, a in zip(cells, attributes))
         table = f"<table{' class=words' if words else ''}><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
         self.parts.append(f'<div class="{"scroll tall" if tall else "scroll"}">{table}</div>')
@@ -90,6 +97,12 @@ class Page:
         drawn = any("class=figure" in part for part in self.parts)
         filled = filled.replace("{{template}}", template() if drawn else "{}")
         return filled.replace("{{body}}", "\n".join(self.parts)).replace("{{plotly}}", library() if drawn else "")
+
+
+def _has_words(column: Sequence[str]) -> bool:
+    """Whether the cells are words: one begins with a letter, none with a digit or a sign."""
+    first = {cell[:1] for cell in column}
+    return any(map(str.isalpha, first)) and not first & set("0123456789+-−<")
 
 
 def embed_png(png: bytes) -> str:

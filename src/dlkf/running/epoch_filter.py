@@ -123,7 +123,7 @@ class EpochFilter:
         """The filter over closed epoch ``k`` of those held: align at its start if need be, then one turn."""
         epoch = self.closed[k]
         epoch.before = self.running
-        running = self.running or self._align(k)
+        running = self.running or self._find_start(k)
         if isinstance(running, Search):
             self.running = self._advance_search(running, epoch)
             return []
@@ -168,7 +168,7 @@ class EpochFilter:
         lag = torch.from_numpy(held.lag).to(self.device) if held.lag[0] > 0 else None
         return Fix(torch.where(used, value, 0.0), torch.nan_to_num(std, nan=1.0), used, lag)
 
-    def _align(self, k: int) -> Running | Search | None:
+    def _find_start(self, k: int) -> Running | Search | None:
         """The filter at the start of closed epoch ``k``, or the search for its heading, if the car moves there."""
         epochs = self.closed[max(0, k - self._lookback) : k + 1]
         if not self._buffer.has_fix(epochs[-1].number):

@@ -77,8 +77,16 @@ class SigmaFit(NamedTuple):
         return (
             f"{name} is overconfident: its innovations are {self.ratio:.2g} times their 1σ (RMS from update "
             f"{SETTLE + 1} on; by chance at most {self.high:.2g}), so in outages it drifts further than its 1σ says; "
-            f"{OF_DATA if self.ratio > FAULTY else remedy}"
+            f"{self.remedy(remedy)}"
         )
+
+    def short_warning(self, name: str) -> str:
+        """The line behind that of another filter with the same remedy."""
+        return f"{name} is overconfident, too: {self.ratio:.2g} times (by chance at most {self.high:.2g})"
+
+    def remedy(self, of_filter: str) -> str:
+        """That of the filter, or of the data where the innovations are too large for any noise."""
+        return OF_DATA if self.ratio > FAULTY else of_filter
 
 
 def rms(ratio: Array) -> float:

@@ -19,7 +19,14 @@ from dlkf.base.provenance import describe_provenance
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.kinds import drive_imus, drive_kinds
 from dlkf.data.store import dataset_digest, load_dataset
-from dlkf.evaluation.endurance import OutageErrors, after_tables, hour_table, score_after_gnss, score_without_outage
+from dlkf.evaluation.endurance import (
+    OutageErrors,
+    after_tables,
+    hour_table,
+    scenes_after_gnss,
+    score_after_gnss,
+    score_without_outage,
+)
 from dlkf.evaluation.gains import measure_gains, write_gains
 from dlkf.evaluation.metrics import PVA
 from dlkf.evaluation.protocol import Scenes
@@ -147,13 +154,19 @@ def set_threads(settings: FitSettings) -> None:
 
 
 def _baselines(settings: StudySettings, data: DriveDataModule, say: Say) -> Baselines:
-    """The classical filters, tuned on training segments for what is scored: ends of outages, or whole segments."""
+    """The classical filters, tuned on training segments for what is scored: ends of outages, after longer GNSS too
+    where that is scored, or whole segments."""
     given, scoring = settings.baselines, settings.scoring
     segments = Scenes.of_split(data, "train", scoring.outage, scoring.seed, given.segments).withhold()
+    for first_s in scoring.after_s:
+        limit = given.segments and max(1, given.segments // len(scoring.after_s))
+        if scenes := scenes_after_gnss(data, "train", first_s, scoring.seed, limit):
+            segments += scenes.withhold()
+    longer = Scenes.of_long_segments(data, "train", scoring.seed).withhold()
     classical = [name for name in given.models if not shipped_folder(name)]
     rounds = given.rounds if given.tune else 0
     objective = "log" if scoring.outage else PVA
-    tuning = {"rounds": rounds, "start": given.tuning, "objective": objective}
+    tuning = {"rounds": rounds, "start": given.tuning, "objective": objective, "longer": longer}
     return tune_baselines(classical, settings.imu, segments, **tuning, say=say)
 
 

@@ -50,21 +50,26 @@ def tune_baselines(
     say: Callable[[str], None],
     start: Tuning | None = None,
     objective: str = "log",
+    longer: Sequence[Batch] | None = None,
 ) -> Baselines:
     """Tune each of ``names`` on training segments by an objective (:func:`dlkf.tuning.search.evaluate_objective`); 0
     ``rounds`` leave the factors at ``start``.
 
-    The search for ``mbkf15`` begins at ``start``. All others but ``ins`` begin at the factors of ``mbkf15``, one with
-    ``_prior`` at those of the same filter without, and search over their own (:func:`dlkf.tuning.search.list_factors`).
+    The search for ``mbkf15`` begins at ``start``. All others but ``ins`` begin at the factors of ``mbkf15``, and search
+    over their own (:func:`dlkf.tuning.search.list_factors`). One with ``_prior`` begins at those of the same filter
+    without or at ``start``, with the prior that is best then, found on ``longer`` segments with GNSS throughout.
     """
+    untuned = start or Tuning()
     first, least = _search_with_progress(imu, batches, FIRST, rounds, objective, start)
-    prior = best_prior(imu, first, batches, objective=objective)
+    prior, begin = best_prior(imu, [untuned, first], batches, objective=objective, longer=longer)
     priors: dict[str, Prior] = {}
     tunings: dict[str, Tuning] = {}
     for name in names:
         begun = Tuning() if name == "ins" else tunings.get(drop_prior(name), first)
-        if has_prior(name):
-            priors[name] = prior if name == f"{FIRST}_prior" else best_prior(imu, begun, batches, name, objective)
+        if name == f"{FIRST}_prior":
+            priors[name], begun = prior, begin
+        elif has_prior(name):
+            priors[name], begun = best_prior(imu, [untuned, begun], batches, name, objective, longer)
         if name == FIRST:
             tunings[name], error = first, least
         elif name == "ins":

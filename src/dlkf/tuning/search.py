@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -37,12 +38,16 @@ FACTORS: Mapping[str, tuple[float, ...]] = {
 }
 
 IN_C = 3600  # epochs of segments from which on a search pays for the library that its filter has to be made into
+BIAS_SPREADS = (3.0, 1.0, 0.3, 0.1)  # of the mean IMU error's 1σ
+MATRIX_SPREADS = (10.0, 3.0, 1.0, 0.3)
 PATIENCE = 2  # values in a row that are worse, before the rest on that side is left out
+
+CONSTRAINT_STDS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # m/s
 
 # what a filter with these endings, or of this base, takes besides
 MORE_FACTORS: Mapping[str, Mapping[str, tuple[float, ...]]] = {
-    "nhc": {"lateral_std": (0.05, 0.1, 0.2, 0.5, 1.0), "vertical_std": (0.05, 0.1, 0.2, 0.5, 1.0)},
-    "car": {"lateral_std": (0.02, 0.05, 0.1, 0.2, 0.5), "vertical_std": (0.02, 0.05, 0.1, 0.2, 0.5)},
+    "nhc": {"lateral_std": CONSTRAINT_STDS, "vertical_std": CONSTRAINT_STDS},
+    "car": {"lateral_std": CONSTRAINT_STDS, "vertical_std": CONSTRAINT_STDS},
     "gated": {"gate": (0.99, 0.999, 0.9999, 0.999999)},
     "speed": {"wheel_std": (0.03, 0.05, 0.1, 0.2, 0.5)},
     "heading": {"heading_std": (0.5, 1.0, 2.0, 5.0)},
@@ -207,17 +212,28 @@ def _information(P: Float[Tensor, "B n n"], states: ErrorStates) -> Float[Tensor
 
 
 def best_prior(
-    imu: ImuSpec, tuning: Tuning, batches: Sequence[Batch], name: str = "mbkf15_prior", objective: str = "log"
-) -> Prior:
-    """The mean IMU error with the spread, of four, with which ``name`` has the least objective on training segments.
+    imu: ImuSpec,
+    tunings: Sequence[Tuning],
+    batches: Sequence[Batch],
+    name: str = "mbkf15_prior",
+    objective: str = "log",
+    longer: Sequence[Batch] | None = None,
+) -> tuple[Prior, Tuning]:
+    """The prior, and the factors of ``tunings`` with it, with which ``name`` has the least objective on ``batches``.
 
-    The spread of the estimates is their estimator's scatter where all drives share one IMU, and then too wide.
+    The mean IMU error is found with each of the factors on ``longer`` segments with GNSS throughout (default:
+    ``batches``). Its spread is tried times several numbers, for biases and sensor matrices apart: it is the estimator's
+    scatter where all drives share one IMU, and then too wide or, of many segments together, too narrow.
     """
-    prior = mean_imu_error(imu, tuning, batches, drop_prior(name))
-    tried = [prior.scale_spread(factor) for factor in (3.0, 1.0, 0.3, 0.1)]
+    tunings = list(dict.fromkeys(tunings))
+    known = [mean_imu_error(imu, tuning, longer or batches, drop_prior(name)) for tuning in tunings]
+    spreads = product(BIAS_SPREADS, MATRIX_SPREADS if len(known[0].mean) > 6 else (1.0,))
+    trials = [(p.scale_spread(*spread), tuning) for spread in spreads for p in known for tuning in tunings]
+    in_c = _fits_c(build_causal(name, imu, "a prior does not", prior=trials[0][0]), batches)
 
-    def error(tried: Prior) -> float:
-        estimator = build_causal(name, imu, "a prior does not", tuning=tuning, prior=tried)
-        return evaluate_objective(estimator, batches, objective)
+    def error(trial: tuple[Prior, Tuning]) -> float:
+        prior, tuning = trial
+        estimator = build_causal(name, imu, "a prior does not", tuning=tuning, prior=prior)
+        return evaluate_objective(_in_c(estimator, batches[0]) if in_c else estimator, batches, objective)
 
-    return min(tried, key=error)
+    return min(trials, key=error)

@@ -20,8 +20,8 @@ from dlkf.data.stack import DriveStack
 from dlkf.evaluation.metrics import OBJECTIVES, PVA
 from dlkf.evaluation.protocol import Protocol, Scenes, describe_short
 from dlkf.evaluation.table import ResultTable, as_markdown, format_number
-from dlkf.filters.build import build_causal, is_filter
-from dlkf.filters.tuning import Tuning
+from dlkf.filters.build import build_causal, has_prior, is_filter
+from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.tuning.search import Trial, evaluate_objective, list_factors, tune_filter
 
@@ -65,8 +65,8 @@ def check_settings(model: str, objective: str) -> None:
         raise InputError(f"model={model} has no noise to tune; give the name of a Kalman filter, such as mbkf21")
     if "rts" in model.split("_"):
         raise InputError(f"model={model} is smoothed, its noise is that of the filter; tune it without _rts")
-    if "prior" in model.split("_"):
-        raise InputError(f"model={model}: the factors of a filter do not depend on its prior; tune it without _prior")
+    if has_prior(model) and objective == LIKELIHOOD:
+        raise InputError(f"model={model}: the noise of an IMU does not depend on a prior; give the name without _prior")
     if objective not in (known := (*OBJECTIVES, PVA, LIKELIHOOD)):
         raise InputError(f"objective={objective} is none of {', '.join(known)}")
 
@@ -117,8 +117,9 @@ def search(
     objective: str,
     rounds: int,
     segments: int | None,
+    prior: Prior | None = None,
 ) -> TuningResult:
-    """Fit on ``drives["train"]``, then errors before and after on both sides."""
+    """Fit on ``drives["train"]``, then errors before and after on both sides; ``prior`` of a filter with ``_prior``."""
     if protocol.outage is None and objective != PVA:
         raise InputError(f"objective={objective} is of outages and outage=null has none; give objective={PVA}")
     left_out: list[str] = []
@@ -132,12 +133,12 @@ def search(
             progress(len(trials), most)
 
         after, _ = tune_filter(
-            imu, training, name=model, start=start, objective=objective, rounds=rounds, progress=tell
+            imu, training, name=model, start=start, objective=objective, rounds=rounds, prior=prior, progress=tell
         )
     batches = {"train": training}
     if drives["test"]:
         batches["test"] = withhold_outages(drives["test"], protocol, left_out=left_out)
-    old, new = (build_causal(model, imu, "tuning does not", tuning=t) for t in (start, after))
+    old, new = (build_causal(model, imu, "tuning does not", tuning=t, prior=prior) for t in (start, after))
     objectives = (*OBJECTIVES, PVA) if protocol.outage else (PVA,)
     errors = [
         (side, name, evaluate_objective(old, part, name), evaluate_objective(new, part, name))
