@@ -58,7 +58,9 @@ def score_as_published(study: Study, seed: str, weights: Path) -> None:
     """The drives that the network has not seen, from the same start, with Kalman filters of the published R, and with
     each tuned for this start; ``mbkf15_prior`` is given the unit's true error."""
     prior = (f"prior.mean={unit_error(Path(CLEAN))}", f"prior.std={STD}")
-    kinds = {"as_published_prior": (("mbkf15", "mbkf15_prior"), tuple(f"tuning.{factor}" for factor in R))}
+    kinds: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+        "as_published_prior": (("mbkf15", "mbkf15_prior"), tuple(f"tuning.{factor}" for factor in R)),
+    }
     for name, kind in (("mbkf15", "as_published_tuned"), ("mbkf15_prior", "as_published_prior_tuned")):
         tuned = HOME / f"tuned_{name}"
         if not tuned.is_dir():

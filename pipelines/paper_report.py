@@ -170,7 +170,7 @@ def trainings(folder: Path) -> dict[str, Path]:
     return {k: Path(v) / "report" for k, v in json.loads(file.read_text()).items() if "/" in k}
 
 
-def results_of(report: Path) -> Results:
+def read_results(report: Path) -> Results:
     """The results of a report's one kind of data."""
     (content,) = json.loads((report / "metrics.json").read_text())["results"]
     return Results.of(content)
@@ -183,7 +183,7 @@ def section(page: Page, home: Path, part: Part) -> list[Claim]:
     if not runs:
         page.note(f"Not run yet: python pipelines/{part.command}")
         return [Claim(part.title, "", f"python pipelines/{part.command}", "not run")]
-    results = {key: results_of(report) for key, report in runs.items()}
+    results = {key: read_results(report) for key, report in runs.items()}
     rows = [["published", "", name, *published_cells(part, name)] for name in part.published]
     for key, result in results.items():
         for name in result.filters:

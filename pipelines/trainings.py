@@ -13,7 +13,7 @@ from pathlib import Path
 
 from dlkf.base.files import replace_file
 from dlkf.tracking.grid import PARENT_RUN, parent_status
-from dlkf.tracking.runs import client_of, experiment_id, tracking_uri
+from dlkf.tracking.runs import experiment_id, open_client, tracking_uri
 
 
 def arguments(doc: str | None, seeds: str, each: str) -> argparse.ArgumentParser:
@@ -54,7 +54,7 @@ class Study:
     def parent(self, experiment: str, name: str) -> Iterator[None]:
         """One MLflow run above all trainings inside, the same one when the study goes on after a kill."""
         uri = tracking_uri(None)
-        client = client_of(uri)
+        client = open_client(uri)
         if "parent" not in self.done:
             self.remember("parent", client.create_run(experiment_id(client, experiment), run_name=name).info.run_id)
         os.environ[PARENT_RUN] = self.done["parent"]

@@ -145,7 +145,7 @@ def car_batch(
         imu=imu, dt=dt, frame=frame,
         gnss=torch.cat((truth.p_n, truth.v_n), -1) + std * draw(B, T, 6), gnss_std=std,
         gnss_valid=yes[..., None].expand(B, T, 6), gnss_lag=torch.zeros(B, T).double(), available=yes,
-        lever_arm_b=torch.zeros(B, 3).double(), start=start.corrected(-law * draw(B, 9)),
+        lever_arm_b=torch.zeros(B, 3).double(), start=start.correct(-law * draw(B, 9)),
         start_std=law.expand(B, 9), truth=truth, truth_valid=yes, attitude_valid=yes,
         true_imu_error=bias[:, None].expand(B, T, 6), present=yes,
         drive=tuple(f"car-{i:02d}" for i in range(B)), t_start=100.0 * torch.arange(B).double(),

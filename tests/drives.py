@@ -11,7 +11,7 @@ from dlkf.data.drive import Drive
 from dlkf.data.store import drive_from_tables
 from dlkf.data.tables import DriveRow
 from dlkf.data.validate import CheckedTables
-from dlkf.simulation.dataset import Recipe, drive_of, make_recipe, simulate
+from dlkf.simulation.dataset import Recipe, make_drive, make_recipe, simulate
 
 
 def recipe_of(config: dict[str, Any]) -> Recipe:
@@ -28,7 +28,7 @@ def drives_in(config: dict[str, Any], out: Path, **options: Any) -> Path:
 
 def tables_in_memory(made_by: Recipe, index: int, seconds: int) -> CheckedTables:
     """Drive ``index`` of the dataset, never written."""
-    tables, row = drive_of(made_by, index, seconds)
+    tables, row = make_drive(made_by, index, seconds)
     columns = ({str(c): t[c].to_numpy(copy=True) for c in t} for t in (tables.imu, tables.gnss, tables.reference))
     arm = tuple(row[f"lever_arm_{axis}_m"] for axis in "xyz")
     return CheckedTables(DriveRow(row["drive"], row["group"], arm), *columns)

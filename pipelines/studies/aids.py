@@ -32,12 +32,12 @@ from dlkf.data.drive import Batch
 from dlkf.data.segments import whole_drives
 from dlkf.data.store import choose_aids, drive_rows, load_dataset
 from dlkf.evaluation.bootstrap import compare
-from dlkf.filters.aids.attach import aid_columns, tables_of, with_aids
+from dlkf.filters.aids.attach import aid_columns, find_tables, with_aids
 from dlkf.filters.integration import BatchSolution, Estimator, Fix, advance
 from dlkf.filters.smoother import Filter
 from dlkf.navigation.calibration import ImuError
 from dlkf.onboard.compiled_filter import CompiledFilter, compile_filter
-from dlkf.onboard.functions import packed_fix
+from dlkf.onboard.functions import pack_fix
 from dlkf.running.batched import run_filter
 from dlkf.running.start import align_each
 from dlkf.tracking.models import resolve_model
@@ -140,7 +140,7 @@ def print_costs(folder: str, models: Sequence[str], imu: str) -> None:
     """Time of an update with each sensor and without, 99th percentile: by torch, compiled, and the call in C."""
     spec, tables = imu_preset(imu), choose_aids(folder, None)
     batch = aligned_batch(folder).select(torch.tensor([0]))
-    batch = replace(batch, present=batch.present & (torch.arange(batch.size[1]) < TIMED)).trimmed()
+    batch = replace(batch, present=batch.present & (torch.arange(batch.size[1]) < TIMED)).trim()
     print(f"\n{Path(folder).name}, one drive, {TIMED} updates\n")
     print("| filter | sensor | torch [ms], ratio | compiled [ms], ratio | in C [ms], ratio |\n|:--|:--|--:|--:|--:|")
     for name in models:
@@ -160,14 +160,14 @@ def update_times(model: Estimator, compiled: CompiledFilter, batch: Batch) -> np
     """(3, T) processor seconds of every update of one drive: by torch, compiled, and the call in C alone."""
     memory, bias = model.begin(batch)
     numbers, _ = compiled.begin(batch)
-    state, error, frame = batch.start, ImuError.of(bias), batch.frame.prepared()
+    state, error, frame = batch.start, ImuError.of(bias), batch.frame.prepare()
     seconds = np.zeros((3, batch.size[1]))
     usable = batch.gnss_valid & batch.available.unsqueeze(-1)
     with torch.inference_mode():
         for k in range(batch.size[1]):
             aids = {name: rows[:, k] for name, rows in batch.aids.items()}
             fix = Fix(batch.gnss[:, k], batch.gnss_std[:, k], usable[:, k], batch.gnss_lag[:, k], aids)
-            imu, packed = batch.imu[:, k].contiguous(), packed_fix(fix, tables_of(model))
+            imu, packed = batch.imu[:, k].contiguous(), pack_fix(fix, find_tables(model))
             began = time.process_time()
             memory, step = advance(
                 model, memory, state, error, imu, fix, dt=batch.dt, frame=frame, lever_arm_b=batch.lever_arm_b

@@ -32,20 +32,20 @@ from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Protocol
 from dlkf.filters.build import build_causal
 from dlkf.filters.integration import Estimator, integrate
-from dlkf.filters.saved import learned_filter, learned_settings
+from dlkf.filters.saved import build_learned_filter, parse_learned_settings
 from dlkf.navigation.attitude import rotation_from_vector
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.navigation.strapdown import strapdown
-from dlkf.onboard.check import epoch_times
+from dlkf.onboard.check import time_epochs
 from dlkf.onboard.compiled_filter import compile_filter
-from dlkf.onboard.library import compiler
+from dlkf.onboard.library import find_compiler
 from dlkf.running.batched import run_filter
-from dlkf.running.start import aligned_drives
+from dlkf.running.start import align_drives
 from dlkf.simulation.dataset import simulate
 from dlkf.tracking.models import resolve_model
 from dlkf.training.callbacks.masking import GnssDecimation, OutageInjection
 from dlkf.training.loss import TERMS, LossConfig, pva_losses, weighted_loss
-from dlkf.tuning.search import factors_of, tune_filter
+from dlkf.tuning.search import list_factors, tune_filter
 from dlkf.tuning.study import withhold_outages
 
 COMPILED = ("mbkf15", "mbkf21", "mbkf21_car", "plus")
@@ -105,7 +105,7 @@ def filters(bench: Bench, dataset: Path, imu: ImuSpec, length_s: float, models: 
     segments = (cut_segments(drives, length_s) * 64)[:64]
     for name in models:
         estimator = resolve_model(name, imu)
-        in_c = compile_filter(estimator, RATE_HZ, 1.0) if compiler() else None
+        in_c = compile_filter(estimator, RATE_HZ, 1.0) if find_compiler() else None
         for count in (1, 64):
             batch = make_batch(drives, segments[:count], dtype=torch.float64)
             what = f"{name}, {count} drive{'s' * (count > 1)} of {batch.size[1] * batch.epoch_s:g} s"
@@ -118,10 +118,10 @@ def filters(bench: Bench, dataset: Path, imu: ImuSpec, length_s: float, models: 
 def epochs(bench: Bench, dataset: Path, imu: ImuSpec, models: list[str]) -> None:
     """One epoch with its fix by itself: in Python by torch and compiled, and the call in C."""
     drive = load_dataset(dataset, rate_hz=RATE_HZ, dtype=torch.float64)[0]
-    batch = aligned_drives([drive], ALIGN)
-    for name in models if compiler() else ():
+    batch = align_drives([drive], ALIGN)
+    for name in models if find_compiler() else ():
         in_c = compile_filter(resolve_model(name, imu), RATE_HZ, 1.0)
-        for kind, seconds in {**epoch_times(in_c, drive), "C": times_in_c(in_c, batch)}.items():
+        for kind, seconds in {**time_epochs(in_c, drive), "C": times_in_c(in_c, batch)}.items():
             bench.add(Timing("an epoch", f"{name} in {kind}", seconds))
 
 
@@ -147,7 +147,8 @@ def tuning(bench: Bench, dataset: Path, imu: ImuSpec) -> None:
     """A search over all factors of a filter on sixty segments of two minutes."""
     drives = load_dataset(dataset, rate_hz=50.0, dtype=torch.float64)
     segments = withhold_outages(drives, Protocol(outage=OutagePlan(60.0, 60.0)), 60)
-    work = f"mbkf21_car, {len(factors_of('mbkf21_car'))} factors, {sum(b.size[0] for b in segments)} segments of 120 s"
+    factors, count = len(list_factors("mbkf21_car")), sum(b.size[0] for b in segments)
+    work = f"mbkf21_car, {factors} factors, {count} segments of 120 s"
     bench.time("tuning", work, lambda: tune_filter(imu, segments, name="mbkf21_car"), 1)
 
 
@@ -155,7 +156,7 @@ def training_epoch(data: DriveDataModule, name: str, steps: int | None = None) -
     """An epoch with decimation, outages, backward pass and optimiser, or so many steps of it."""
     settings = compose_command("train", f"filter@model={name}")["model"]
     torch.manual_seed(0)
-    model = learned_filter(learned_settings(settings)).train()
+    model = build_learned_filter(parse_learned_settings(settings)).train()
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4)
     transforms = (GnssDecimation(), OutageInjection(start_epoch=0))
     for step in range(steps or len(data.train_segments(1))):
@@ -198,7 +199,7 @@ def scaling(bench: Bench, dataset: Path, imu: ImuSpec, length_s: float) -> None:
     for rate in (25.0, 50.0, RATE_HZ):
         slower = load_dataset(dataset, rate_hz=rate, dtype=torch.float64)
         run("rate (Hz)", rate, f"8 × {length_s:g} s at {rate:g} Hz", 8, cut_segments(slower, length_s), slower)
-    if compiler():  # whose threads share nothing; those of torch wait for each other, for minutes on a busy machine
+    if find_compiler():  # its threads share nothing; those of torch wait for each other, for minutes on a busy machine
         usual_clock, bench.clock = bench.clock, time.perf_counter  # two threads use two processors
         estimator = compile_filter(estimator, RATE_HZ, 1.0)
         for threads in sorted({1, 2, os.cpu_count() or 1}):

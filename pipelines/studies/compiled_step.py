@@ -18,10 +18,10 @@ from dlkf.data.alignment import ALIGN
 from dlkf.data.store import load_dataset
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
-from dlkf.onboard.check import Latency, latencies
+from dlkf.onboard.check import Latency, measure_latencies
 from dlkf.onboard.compiled_filter import CompiledFilter, compile_filter
 from dlkf.running.batched import run_filter
-from dlkf.running.start import aligned_drives
+from dlkf.running.start import align_drives
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
 from dlkf.tracking.models import resolve_model
@@ -50,7 +50,7 @@ def report(name: str, data: Path, rate_hz: float, rounds: int) -> None:
     """Three lines of one model."""
     drive = load_dataset(data, rate_hz=rate_hz, dtype=torch.float64)[0]
     compiled = compile_filter(model_of(name), rate_hz, 1.0)
-    batch = aligned_drives([drive], ALIGN)
+    batch = align_drives([drive], ALIGN)
     for drives in (1, 64):
         many = batch.select(torch.zeros(drives, dtype=torch.int64))
         many = replace(many, imu=many.imu + 1e-9 * torch.randn_like(many.imu))  # no drive a copy of another
@@ -59,7 +59,7 @@ def report(name: str, data: Path, rate_hz: float, rounds: int) -> None:
         samples = drives * many.size[1] * many.size[2]
         print(f"{name}, {rate_hz:g} Hz, {drives} drives: {samples / old:,.0f} → {samples / new:,.0f} IMU epochs/s, "
               f"{old / new:.1f} ×", flush=True)  # fmt: skip
-    for kind, x in {**latencies(compiled, drive), "C": Latency.of(times_in_c(compiled, batch))}.items():
+    for kind, x in {**measure_latencies(compiled, drive), "C": Latency.of(times_in_c(compiled, batch))}.items():
         print(f"{name}, an epoch in {kind}: p50 {x.p50:.4f} ms, p99 {x.p99:.4f} ms", flush=True)
 
 

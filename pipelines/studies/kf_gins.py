@@ -31,7 +31,7 @@ from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.onboard.compiled_filter import compile_filter
 from dlkf.running.batched import run_filter
-from dlkf.running.start import aligned_drives
+from dlkf.running.start import align_drives
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
 from dlkf.tracking.models import resolve_model
@@ -107,7 +107,7 @@ def measure(
         home, gnss = Path(folder), GnssConfig(lever_arm_b=(1.0, 0.3, -1.2))
         config = DatasetConfig("one", hours=minutes / 60, drive_minutes=minutes, gnss=gnss)
         data = simulate_dataset(config, IMU, 0, home / "data", progress=False, workers=1)
-        batch = aligned_drives([load_dataset(data, rate_hz=RATE_HZ, dtype=torch.float64)[0]], ALIGN)
+        batch = align_drives([load_dataset(data, rate_hz=RATE_HZ, dtype=torch.float64)[0]], ALIGN)
         mbkf = resolve_model("mbkf21", IMU)
         assert isinstance(mbkf, Mbkf)
         numbers(batch, mbkf).tofile(home / "drive.bin")

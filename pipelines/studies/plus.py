@@ -50,7 +50,7 @@ from dlkf.evaluation.metrics import mean_error
 from dlkf.filters.build import build_causal, build_filter
 from dlkf.filters.integration import Estimator
 from dlkf.filters.model_based import Mbkf
-from dlkf.filters.shipped import KNOWN_IMU, plus_with_imu, trained_filter
+from dlkf.filters.shipped import KNOWN_IMU, build_plus, trained_filter
 from dlkf.filters.tuning import Tuning
 from dlkf.onboard.compiled_filter import compile_filter, compile_or_keep
 from dlkf.running.likelihood import Evidence, find_noise
@@ -171,7 +171,7 @@ def with_presets(case: Case, rows: Sequence[Row], folder: Path) -> list[Row]:
     tuning = replace(Tuning(), lateral_std=0.07, vertical_std=0.1)
     presets = {k: imu_preset(k) for k in sorted(set(meta))}
     given = {ORACLE: {k: build_causal("mbkf33_car" + SOURCES, imu, "no", tuning=tuning) for k, imu in presets.items()}}
-    given[KNOWN_IMU] = {k: plus_with_imu(imu) for k, imu in presets.items()}
+    given[KNOWN_IMU] = {k: build_plus(imu) for k, imu in presets.items()}
     for name, by_kind in given.items():
         found = []
         for row, of_kinds in zip(rows, score(case, by_kind), strict=True):

@@ -57,11 +57,11 @@ class Recorded(CarConstraints):
 
     found: list[Tensor] = field(default_factory=list, compare=False)
 
-    def resting(
+    def detect_rest(
         self, epoch: Epoch, turning: Float[Tensor, "B 3"], prediction: Predicted, memory: CarMemory
     ) -> tuple[Bool[Tensor, " B"], VibrationLevel]:
         """As without recording."""
-        resting, level = super().resting(epoch, turning, prediction, memory)
+        resting, level = super().detect_rest(epoch, turning, prediction, memory)
         self.found.append(resting)
         return resting, level
 

@@ -44,7 +44,7 @@ from dlkf.data.drive import Drive
 from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.segments import whole_drives
 from dlkf.data.store import drive_from_tables, drive_rows
-from dlkf.data.validate import CheckedTables, read_checked
+from dlkf.data.validate import CheckedTables, read_drive
 from dlkf.evaluation.bootstrap import compare
 from dlkf.evaluation.metrics import mean_error
 from dlkf.filters.build import build_causal
@@ -209,7 +209,7 @@ OF_FILES: Mapping[str, Callable[[CheckedTables], CheckedTables]] = {
 
 def from_wrong_files(folder: Path, kind: str) -> list[Drive]:
     """The drives of a dataset whose files are wrong."""
-    tables = [OF_FILES[kind](read_checked(folder, row)) for row in drive_rows(folder)]
+    tables = [OF_FILES[kind](read_drive(folder, row)) for row in drive_rows(folder)]
     return [drive_from_tables(one, "", 50.0, 1.0, torch.float64) for one in tables]
 
 

@@ -43,7 +43,7 @@ def program() -> None:
 def main() -> None:
     """Run a command; 2 for an unknown one, 130 after Ctrl-C, even while the libraries load."""
     word, rest = (sys.argv[1] if len(sys.argv) > 1 else "help"), sys.argv[2:]
-    before = signal.signal(signal.SIGTERM, _terminated)
+    before = signal.signal(signal.SIGTERM, _terminate)
     try:
         if word in ("help", "--help", "-h"):
             print(usage())
@@ -88,7 +88,7 @@ def _load(command: str) -> Callable[[], None]:
         gc.enable()
 
 
-def _terminated(*_: object) -> NoReturn:
+def _terminate(*_: object) -> NoReturn:
     print("dlkf: terminated", file=sys.stderr)
     sys.exit(143)
 

@@ -15,7 +15,7 @@ from dlkf.evaluation.table import ResultTable, as_rich
 from dlkf.report.compare import answers, end_table, named_warnings, read_reports, write_comparison
 
 
-def runs_of(arguments: list[str]) -> list[str]:
+def split_runs(arguments: list[str]) -> list[str]:
     """Bare words are the folders; the points of a sweep have an equals sign in their names (``0-imu=consumer``)."""
     folders = [a for a in arguments if not a.startswith("-") and ("=" not in a or Path(a, "metrics.json").is_file())]
     rest = [a for a in arguments if a not in folders]
@@ -23,7 +23,7 @@ def runs_of(arguments: list[str]) -> list[str]:
     return [*rest, f"runs=[{quoted}]"] if folders else rest
 
 
-@command("compare", CompareSettings, runs_of)
+@command("compare", CompareSettings, split_runs)
 def main(settings: CompareSettings) -> None:
     """Read, write, print."""
     runs, out = settings.runs, settings.out

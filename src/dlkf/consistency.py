@@ -15,11 +15,11 @@ from dlkf.data.masks import withhold_fixes
 from dlkf.diagnosis.consistency import (
     NormalisedSquares,
     consistency_table,
+    find_states,
     measure_consistency,
-    states_of,
     write_consistency,
 )
-from dlkf.diagnosis.matched_drives import make_matched_drives, matched_batch
+from dlkf.diagnosis.matched_drives import make_matched_batch, make_matched_drives
 from dlkf.evaluation.table import as_rich
 from dlkf.filters.model_based import has_covariance
 from dlkf.tracking.models import resolve_model, resolve_models
@@ -31,13 +31,13 @@ def main(settings: ConsistencySettings) -> None:
     require_empty(settings.out, overwrite=settings.overwrite)
     matched, preset, plan = settings.matched, settings.spec, settings.outage
     asked = resolve_models(settings.models, preset, tuning=settings.tuning)
-    states = {name: states_of(name, model) for name, model in asked.items()}
+    states = {name: find_states(name, model) for name, model in asked.items()}
     results: dict[str, NormalisedSquares] = {}
     outage = None
     for name, model in zip(asked, settings.models, strict=True):
         spec = make_matched_drives(preset, states[name])
         with show_progress(f"Simulating for {name}") as progress:
-            batch, matrices = matched_batch(matched, spec, progress)
+            batch, matrices = make_matched_batch(matched, spec, progress)
         if plan is not None:
             mask = plan.masks(batch)[0]
             if not bool(mask.any()):

@@ -16,7 +16,7 @@ from dlkf.base.console import make_console, save_log
 from dlkf.base.files import absolute_place, folder_name, require_empty
 from dlkf.base.parallel import check_engine
 from dlkf.base.provenance import describe_provenance
-from dlkf.command import command, typed_words
+from dlkf.command import command, list_typed_words
 from dlkf.command.scored import EvaluateSettings
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import choose_aids, dataset_digest, drive_rows
@@ -26,13 +26,13 @@ from dlkf.evaluation.protocol import REFUSED
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.sensors import sensor_table
-from dlkf.evaluation.study import results_of
-from dlkf.evaluation.summary import FEW, headline, metrics_of, sigma_warnings
+from dlkf.evaluation.study import make_results
+from dlkf.evaluation.summary import FEW, collect_metrics, headline, sigma_warnings
 from dlkf.evaluation.table import ResultTable, all_tables, as_markdown, as_rich, result_tables
-from dlkf.filters.aids.attach import aid_columns, describe_aids, tables_of, with_aids
+from dlkf.filters.aids.attach import aid_columns, describe_aids, find_tables, with_aids
 from dlkf.filters.build import build_filter
-from dlkf.filters.card import domain_warnings, without_training_recordings
-from dlkf.filters.saved import grid_of
+from dlkf.filters.card import domain_warnings, select_scored_drives
+from dlkf.filters.saved import choose_grid
 from dlkf.report.evaluation import write_report
 from dlkf.running.offline import SAMPLES_AT_ONCE, UsableFixes, chunk_drives
 from dlkf.running.references import check_reference
@@ -63,14 +63,14 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console) -> Evaluation
     check_reference(settings.reference)
     chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
     models = {model_name: with_aids(model, chosen) for model_name, model in models.items()}
-    taken = dict.fromkeys(table for model in models.values() for table in tables_of(model))
-    step = grid_of(models.values(), settings.rate_hz, settings.epoch_s)
+    taken = dict.fromkeys(table for model in models.values() for table in find_tables(model))
+    step = choose_grid(models.values(), settings.rate_hz, settings.epoch_s)
     grid = {**step, "aids": tuple(taken)}
     check_engine(settings.parallel, settings.dataset)
     rows, name = drive_rows(settings.dataset, settings.drives), folder_name(settings.dataset)
     digest, kinds = dataset_digest(settings.dataset), drive_kinds(settings.dataset)
     cards = {model_name: getattr(model, "card", {}) for model_name, model in models.items()}
-    rows, seen = without_training_recordings(cards, rows, name, digest, leave_out=settings.unseen)
+    rows, seen = select_scored_drives(cards, rows, name, digest, leave_out=settings.unseen)
     strange = domain_warnings(models, settings.dataset, [row.name for row in rows], spec.name, grid["rate_hz"])
     notes = [*seen, *strange]
     for line in notes:
@@ -99,7 +99,7 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console) -> Evaluation
         console.print(said, style="yellow")
     scores = done.run.scores
     check_outages(protocol.outage, scores.outage, max(x.span_s for x in fixes.values()))
-    results = results_of(done.run, baseline=settings.baseline, settle_s=settings.settle_s, seed=settings.seed)
+    results = make_results(done.run, baseline=settings.baseline, settle_s=settings.settle_s, seed=settings.seed)
     decided = {
         "models": settings.model,
         "dataset": settings.dataset,
@@ -121,7 +121,7 @@ def main(settings: EvaluateSettings) -> None:
     uri, name = tracking_uri(settings.tracking.uri), folder_name(settings.dataset)
     if settings.tracking.log:
         check_store(uri)
-    unused = [unused_settings(model, typed_words("imu", "tuning")) for model in settings.models]
+    unused = [unused_settings(model, list_typed_words("imu", "tuning")) for model in settings.models]
     if all(unused):  # beside a model that takes them nobody wonders
         console.print("\n".join(unused), style="yellow", highlight=False, soft_wrap=True)
     done = evaluate_dataset(settings, console)
@@ -143,7 +143,7 @@ def main(settings: EvaluateSettings) -> None:
         with start_point(uri, settings.name, f"{' '.join(done.models)} on {name}") as run:
             run.log_config(asdict(settings))
             run.log_dataset(settings.dataset, done.digest, "evaluation")
-            run.log_metrics(metrics_of(results))
+            run.log_metrics(collect_metrics(results))
             run.log_files(settings.out)
             run.note("\n".join(as_markdown(t) for t in all_tables(name, results)))
         kept = f"; MLflow: run {run.id}"

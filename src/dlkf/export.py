@@ -15,18 +15,18 @@ import torch
 from dlkf.base.errors import InputError
 from dlkf.base.files import is_url, require_empty, write_into
 from dlkf.base.provenance import describe_provenance
-from dlkf.command import command, typed_words
+from dlkf.command import command, list_typed_words
 from dlkf.command.settings import ExportSettings
 from dlkf.data.aid_tables import standard_tables
 from dlkf.data.store import drive_from_tables, drive_rows
-from dlkf.data.validate import read_checked
-from dlkf.filters.aids.attach import tables_of, with_aids
-from dlkf.filters.saved import grid_of
+from dlkf.data.validate import read_drive
+from dlkf.filters.aids.attach import find_tables, with_aids
+from dlkf.filters.saved import choose_grid
 from dlkf.filters.smoother import SmoothedSolution
 from dlkf.onboard.c_source import EXAMPLES, write_source
 from dlkf.onboard.check import check_export, write_log
 from dlkf.onboard.functions import Grid
-from dlkf.onboard.library import compiler
+from dlkf.onboard.library import find_compiler
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
 from dlkf.simulation.sensors import BaroConfig, HeadingConfig, SensorsConfig, WheelConfig
@@ -43,29 +43,29 @@ def main(settings: ExportSettings) -> None:
     require_empty(settings.out, overwrite=settings.overwrite)
     imu = settings.spec
     model = resolve_model(str(settings.model), imu, settings.tracking.uri, **settings.filter_options)
-    if line := unused_settings(str(settings.model), typed_words("imu", "tuning")):
+    if line := unused_settings(str(settings.model), list_typed_words("imu", "tuning")):
         print(line)
     aids = [settings.aids] if isinstance(settings.aids, str) else list(settings.aids or ())
     model = with_aids(model, standard_tables(aids))
     if isinstance(model, SmoothedSolution):
         raise InputError(f"model={settings.model} looks ahead, which a vehicle cannot; take it without _rts")
-    given = grid_of([model], settings.rate_hz, settings.epoch_s)
+    given = choose_grid([model], settings.rate_hz, settings.epoch_s)
     dtype = {"double": torch.float64, "float": torch.float32}[settings.precision]
     grid = Grid(round(given["rate_hz"] * given["epoch_s"]), 1 / given["rate_hz"], dtype)
     with write_into(settings.out) as folder, tempfile.TemporaryDirectory() as somewhere:
         dataset = settings.dataset
         if dataset is None:
-            sensors = SENSORS if tables_of(model) else None
+            sensors = SENSORS if find_tables(model) else None
             gnss = GnssConfig(lever_arm_b=ARM)
             drive = DatasetConfig("check", hours=5 / 60, drive_minutes=5.0, gnss=gnss, sensors=sensors)
             dataset = simulate_dataset(drive, imu, 0, Path(somewhere) / "check", progress=False, workers=1)
-        tables = read_checked(dataset, drive_rows(dataset, settings.drive)[0], reference=False)
-        drive = drive_from_tables(tables, "", given["rate_hz"], given["epoch_s"], torch.float64, tables_of(model))
+        tables = read_drive(dataset, drive_rows(dataset, settings.drive)[0], reference=False)
+        drive = drive_from_tables(tables, "", given["rate_hz"], given["epoch_s"], torch.float64, find_tables(model))
         layout = write_source(folder, model, grid, short_name(settings.model), describe_provenance())
         for name in COPIED:
             (folder / name).write_text((EXAMPLES / name).read_text())
         write_log(folder / "drive.csv", tables)
-        if compiler() is None:
+        if find_compiler() is None:
             lines = ["not checked: no C compiler here (cc, gcc or clang)"]
         else:
             lines = check_export(Path(somewhere), folder, model, grid, layout, tables, drive, settings.latency)

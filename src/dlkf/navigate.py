@@ -17,32 +17,32 @@ from dlkf.base.errors import InputError
 from dlkf.base.files import absolute_place, folder_name, require_empty, write_into
 from dlkf.base.parallel import check_engine, parallel_map
 from dlkf.base.provenance import describe_provenance
-from dlkf.command import command, typed_words
+from dlkf.command import command, list_typed_words
 from dlkf.command.settings import NavigateSettings
 from dlkf.data.drive import Drive
 from dlkf.data.store import choose_aids, dataset_digest, drive_rows, load_dataset
 from dlkf.data.tables import drive_clocks
-from dlkf.filters.aids.attach import describe_aids, tables_of, with_aids
+from dlkf.filters.aids.attach import describe_aids, find_tables, with_aids
 from dlkf.filters.card import domain_warnings
-from dlkf.filters.saved import grid_of
+from dlkf.filters.saved import choose_grid
 from dlkf.filters.smoother import run_smoother
 from dlkf.navigation.imu_errors import AUTO
 from dlkf.onboard.compiled_filter import compile_filter, compile_or_keep
-from dlkf.onboard.core_drives import core_drive, runs_in_core
+from dlkf.onboard.core_drives import run_core_drive, runs_in_core
 from dlkf.report.navigation import MOST_DRIVES, TrackOnMap, summary_lines, write_page
 from dlkf.running import offline
-from dlkf.running.exports import chosen_formats, export, utc_times
+from dlkf.running.exports import choose_formats, export, utc_times
 from dlkf.running.innovations import OF_NETWORK, REMEDY
 from dlkf.running.likelihood import check_finds_noise, generic_filter
 from dlkf.running.replay import stream_drives
 from dlkf.running.solution import write_solution
-from dlkf.tracking.models import resolve_model, settings_taken, short_name, takes_tuning, unused_settings
+from dlkf.tracking.models import list_settings_taken, resolve_model, short_name, takes_tuning, unused_settings
 
 
 @command("navigate", NavigateSettings)
 def main(settings: NavigateSettings) -> None:
     """Load, align, run, write; print a line per drive."""
-    formats = chosen_formats(settings.export)
+    formats = choose_formats(settings.export)
     require_empty(settings.out, overwrite=settings.overwrite)
     check_engine(settings.parallel, settings.dataset)
     if not isinstance(settings.model, str):
@@ -55,16 +55,16 @@ def main(settings: NavigateSettings) -> None:
     clocks = drive_clocks(settings.dataset)
     rows, name = drive_rows(settings.dataset, settings.drives), short_name(settings.model)
     spacings = {row.name: offline.UsableFixes.of(settings.dataset, row.name) for row in rows}
-    usual = offline.epoch_for(spacings.values(), settings.rate_hz or 50.0, model)
-    step = grid_of([model], settings.rate_hz, settings.epoch_s, usual)
+    usual = offline.choose_epoch(spacings.values(), settings.rate_hz or 50.0, model)
+    step = choose_grid([model], settings.rate_hz, settings.epoch_s, usual)
     chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
     model = with_aids(model, chosen)
-    grid = {**step, "aids": tables_of(model)}
+    grid = {**step, "aids": find_tables(model)}
     for line in describe_aids({name: model}, chosen):
         print(line)
     for line in domain_warnings({name: model}, settings.dataset, spacings, spec.name, grid["rate_hz"]):
         print(line)
-    if spec.name != AUTO and (line := unused_settings(settings.model, typed_words("imu", "tuning"))):
+    if spec.name != AUTO and (line := unused_settings(settings.model, list_typed_words("imu", "tuning"))):
         print(line)
     skipped: dict[str, str] | None = {} if settings.skip_unaligned else None
     if settings.streaming and (ahead := "smoother" if settings.smoother else "imu=auto" if spec.name == AUTO else ""):
@@ -89,14 +89,14 @@ def main(settings: NavigateSettings) -> None:
     else:
         run = stream_drives if settings.streaming else offline.navigate_dataset
         if settings.streaming and settings.compiled:
-            run = partial(stream_drives, through=core_drive)
+            run = partial(stream_drives, through=run_core_drive)
         run = partial(run, absolute_place(settings.dataset), model, align=settings.align, **grid)
         many = offline.CHUNK_SAMPLES if settings.parallel is None else offline.SAMPLES_AT_ONCE // 4
         shares = offline.chunk_drives(spacings, grid["rate_hz"], 1 if settings.streaming else many)
         done = parallel_map(partial(offline.load_chunk, run, skipped is not None), shares, settings.parallel)
         navigated = partial(offline.navigate_chunks, done, len(rows), skipped=skipped)
     lines, courses = [], []
-    shown = f"{name} (imu={preset})" if "imu" in settings_taken(settings.model) else name
+    shown = f"{name} (imu={preset})" if "imu" in list_settings_taken(settings.model) else name
     with write_into(settings.out) as folder, show_progress("Navigating") as progress:
         for result in navigated(progress=progress):
             write_solution(folder / f"drive={result.drive}" / "solution.parquet", result.table)

@@ -9,10 +9,10 @@ from dlkf.base.errors import InputError
 from dlkf.command import command
 from dlkf.command.settings import RegisterSettings
 from dlkf.filters.card import CARD_TEXT
-from dlkf.tracking.comparison import best_of
+from dlkf.tracking.comparison import choose_best
 from dlkf.tracking.models import model_folder
 from dlkf.tracking.registry import check_registration, log_model, register_model
-from dlkf.tracking.runs import check_store, client_of, reachable, run_exists, start_run, store_missing, tracking_uri
+from dlkf.tracking.runs import check_store, open_client, reachable, run_exists, start_run, store_missing, tracking_uri
 
 
 @command("register", RegisterSettings)
@@ -36,10 +36,10 @@ def main(settings: RegisterSettings) -> None:
             raise InputError(f"there is no MLflow store at {uri.removeprefix('sqlite:///')}; give tracking.uri=…")
         check_store(uri)
     with reachable(uri):
-        client = client_of(uri)
+        client = open_client(uri)
         if not run_exists(client, run_id):
             raise InputError(f"run={run_id}: {uri} has no such run")
-        best = best_of(client, run_id)
+        best = choose_best(client, run_id)
         number = register_model(client, best.info.run_id, name, alias)
     also = f", models:/{name}@{alias}" if alias else ""
     print(f"{best.info.run_name}: models:/{name}/{number}{also}")

@@ -16,13 +16,13 @@ from dlkf.simulation.dataset import SimulateSettings, simulate
 from dlkf.simulation.semi_real import simulate_semi_real
 
 
-def arguments_of_source(arguments: list[str]) -> list[str]:
+def choose_dataset(arguments: list[str]) -> list[str]:
     """``source=`` alone means the dataset ``semi_real``, not simulated drives' default."""
     given = {argument.partition("=")[0].removeprefix("simulated@") for argument in arguments}
     return [*arguments, "dataset=semi_real"] if "source" in given and "dataset" not in given else arguments
 
 
-@command("simulate", SimulateSettings, arguments_of_source)
+@command("simulate", SimulateSettings, choose_dataset)
 def main(settings: SimulateSettings) -> None:
     """Write the dataset to ``out`` (default ``data/<name>``) and print what it holds."""
     start = time.perf_counter()

@@ -15,7 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from dlkf.base.classes import instantiate
 from dlkf.base.console import make_console, save_log
 from dlkf.base.settings import settings_from
-from dlkf.command import command, same_command
+from dlkf.command import command, repeat_command
 from dlkf.command.composing import configuration_hash
 from dlkf.command.simulated import HOUR_SEED, simulate_missing
 from dlkf.data.store import dataset_digest
@@ -27,9 +27,9 @@ from dlkf.tracking.registry import check_registration, log_model
 from dlkf.tracking.runs import check_store, lightning_logger, start_run, tracking_uri
 from dlkf.training.fit import check_fit
 from dlkf.training.processes import is_worker
-from dlkf.training.run_folder import checked_digests, run_folder, write_state
+from dlkf.training.run_folder import check_digests, run_folder, write_state
 from dlkf.training.settings import TrainSettings
-from dlkf.training.study import left_out_drives, run_study, train_with_baselines
+from dlkf.training.study import list_left_out_drives, run_study, train_with_baselines
 from dlkf.training.summary import key_metrics, note
 
 
@@ -52,7 +52,7 @@ def main(config: dict[str, Any]) -> None:
     data.setup()
     simulate_missing([given.scoring.hour] if given.scoring.hour else [], console, HOUR_SEED)
     console.print(data.describe())
-    for line in left_out_drives(settings, data):
+    for line in list_left_out_drives(settings, data):
         console.print(f"left out: {line}", style="yellow", highlight=False)
     if state:
         console.print(f"resuming the unfinished run in {folder}")
@@ -60,12 +60,12 @@ def main(config: dict[str, Any]) -> None:
     parent = os.environ.get(PARENT_RUN)
     begun = {"parent_run_id": parent, "run_id": state.get("run_id"), "system_metrics": tracking.system_metrics}
     with start_run(uri, given.name, name, **begun) as run:
-        write_state(folder, run_id=run.id, data=checked_digests(data.datasets, state))
+        write_state(folder, run_id=run.id, data=check_digests(data.datasets, state))
         run.log_config(config)
         for dataset in data.datasets:
             run.log_dataset(dataset, dataset_digest(dataset), "training")
         logger = lightning_logger(run, given.trainer.monitor)
-        outcome = run_study(settings, data, folder, logger, console.print, same_command("train"))
+        outcome = run_study(settings, data, folder, logger, console.print, repeat_command("train"))
         for result in outcome.results:
             console.print(as_rich(result_tables(", ".join(Path(d).name for d in data.datasets), result)[-1]))
         save_log(console, folder / "report")

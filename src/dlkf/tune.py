@@ -18,7 +18,7 @@ from dlkf.command import command
 from dlkf.command.scored import TuneSettings
 from dlkf.data.store import choose_aids, dataset_digest, load_dataset
 from dlkf.evaluation.table import as_markdown, as_rich
-from dlkf.filters.aids.attach import aided_name
+from dlkf.filters.aids.attach import append_aids
 from dlkf.tracking.runs import start_run, tracking_uri
 from dlkf.tuning.found import find_dataset_noise, noise_table, write_noise
 from dlkf.tuning.study import LIKELIHOOD, check_settings, search, train_test_drives, tuning_table, write_tuning
@@ -28,7 +28,7 @@ from dlkf.tuning.study import LIKELIHOOD, check_settings, search, train_test_dri
 def main(settings: TuneSettings) -> None:
     """Load, split, search, check, write, log, print."""
     chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
-    model = aided_name(str(settings.model), [table.name for table in chosen])
+    model = append_aids(str(settings.model), [table.name for table in chosen])
     name, spec, start = settings.name, settings.spec, settings.tuning
     check_settings(model, settings.objective)
     if is_url(settings.out):

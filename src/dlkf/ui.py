@@ -10,7 +10,7 @@ import os
 import sys
 
 from dlkf.base.errors import InputError
-from dlkf.tracking.runs import client_of, store_missing, tracking_uri
+from dlkf.tracking.runs import open_client, store_missing, tracking_uri
 
 PAGE = "/#/experiments{of}?workflowType=machine_learning"
 
@@ -40,7 +40,7 @@ def main() -> None:
 
 def links(uri: str, address: str) -> list[str]:
     """A line for every experiment with runs, the latest first, with the page that has them."""
-    client = client_of(uri)
+    client = open_client(uri)
     kept = [e for e in client.search_experiments() if client.search_runs([e.experiment_id], max_results=1)]
     latest = sorted(kept, key=lambda e: e.last_update_time or 0, reverse=True)
     pages = [(f"Runs of {e.name}", f"/{e.experiment_id}/runs") for e in latest] or [("Runs", "")]

@@ -16,7 +16,7 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.tracking.models import resolve_model
 from dlkf.training.callbacks.guard import StepGuard
-from dlkf.training.loss import loss_of
+from dlkf.training.loss import build_loss
 from dlkf.training.optimization import OptimizationPlan
 from dlkf.training.settings import CALLBACK
 
@@ -43,7 +43,7 @@ IMU = imu_preset("consumer")
 PLACES = {
     "reader": lambda values: instantiate(values, "reader", ("read",)),
     "callback": lambda values: instantiate(values, "callbacks.mine", CALLBACK),
-    "loss": loss_of,
+    "loss": build_loss,
     "network": lambda values: LearnedFilter(LearnedConfig.from_mapping({"network": values})),
     "optimizer": lambda values: OptimizationPlan.of({**FIXED, **values}, {}).build([torch.nn.Parameter()], []),
     "schedule": lambda values: OptimizationPlan.of(FIXED, values).build([torch.nn.Parameter()], []),

@@ -22,7 +22,7 @@ from dlkf.command.settings import (
     NavigateSettings,
     RegisterSettings,
 )
-from dlkf.filters.saved import learned_filter
+from dlkf.filters.saved import build_learned_filter
 from dlkf.simulation.dataset import SimulateSettings
 from dlkf.training.settings import TrainSettings
 
@@ -138,7 +138,7 @@ def compose_and_build(primary: str, overrides: list[str]) -> None:
         instantiate(settings.reader, "reader", ("read",))
     if isinstance(settings, TrainSettings):
         fit = settings.study.fit
-        learned_filter(fit.model)
+        build_learned_filter(fit.model)
         assert all(callback.state_dict() is not None for callback in fit.callbacks)
         find_class(settings.data["_target_"], "data._target_", ("setup", "describe"))
 

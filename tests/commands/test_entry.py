@@ -19,7 +19,7 @@ import pytest
 import dlkf
 from dlkf.__main__ import COMMANDS, _load, main
 from dlkf.base.config import config_dir
-from dlkf.command.arguments import options_first, quote_argument
+from dlkf.command.arguments import move_options_first, quote_argument
 from dlkf.data.schema import drive_file
 from tests.shell import PATIENCE_S
 
@@ -118,7 +118,7 @@ def test_modules_of_the_current_folder_are_found(tmp_path):
 
 def test_settings_on_both_sides_of_an_option():
     words = ["dataset=a", "-m", "model=b,c", "--config-dir", "x=1", "out=d"]
-    assert options_first(words) == ["-m", "--config-dir", "x=1", "dataset=a", "model=b,c", "out=d"]
+    assert move_options_first(words) == ["-m", "--config-dir", "x=1", "dataset=a", "model=b,c", "out=d"]
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 import dlkf
 from dlkf.base.config import config_dir
 from dlkf.command import GROUPS
-from dlkf.command.help import MOST, describe_key, groups_of, help_text, keys_of
+from dlkf.command.help import MOST, describe_key, help_text, list_groups, list_keys
 
 COMMANDS = sorted(path.stem for path in config_dir().glob("*.yaml") if path.stem != "hydra_output")
 
@@ -18,11 +18,11 @@ def test_every_command_has_a_page(name):
     page = help_text(name, GROUPS.get(name, {}))
     text = (config_dir() / f"{name}.yaml").read_text()
     assert f"python -m dlkf.{name}" in page and max(map(len, page.splitlines())) < 160
-    for group in groups_of(text):
+    for group in list_groups(text):
         assert f"={group['choice']}" in page
     for key in MOST[name]:
         assert f"  {key}=" in page
-    keys = [k for k, (value, _) in keys_of(text).items() if value[:1] not in ("", "{") and not k.startswith("hydra")]
+    keys = [k for k, (value, _) in list_keys(text).items() if value[:1] not in ("", "{") and not k.startswith("hydra")]
     assert len(MOST[name]) == min(5, len(keys))
 
 
@@ -45,7 +45,7 @@ def test_a_command_says_the_version_of_this_package(call):
 def test_keys_are_read_with_value_and_comment():
     text = "defaults:\n  - start: aligned # how\n  - _self_\n\na: 1 # one\nb: # two\n  c: [1, 2] # three\n"
     text += "d: {e: x, f: 2} # four\n"
-    assert keys_of(text) == {
+    assert list_keys(text) == {
         "a": ("1", "one"), "b": ("", "two"), "b.c": ("[1, 2]", "three"), "d": ("{e: x, f: 2}", "four"),
         "d.e": ("x", "four"), "d.f": ("2", "four"),
     }  # fmt: skip

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from dlkf.data.store import dataset_digest
-from dlkf.filters.card import recordings_seen, slow_drives, unseen_imus
+from dlkf.filters.card import describe_slow_drives, describe_unseen_imus, find_seen_recordings
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.saved import save_filter
 
@@ -21,15 +21,15 @@ SCORING = ("length_s=60", "outage.first_s=20", "outage.duration_s=20", "injected
 
 def test_recordings_count_by_name_or_digest_of_their_dataset():
     card = {"trained_on": ["a"], "chosen_on": ["b"], "datasets": {"town": "123"}}
-    assert recordings_seen(card, "town", "999", ["a", "b", "c"]) == {"a", "b"}
-    assert recordings_seen(card, "moved", "123", ["a", "c"]) == {"a"}
-    assert recordings_seen(card, "other", "999", ["a"]) == set() == recordings_seen({}, "town", "123", ["a"])
+    assert find_seen_recordings(card, "town", "999", ["a", "b", "c"]) == {"a", "b"}
+    assert find_seen_recordings(card, "moved", "123", ["a", "c"]) == {"a"}
+    assert find_seen_recordings(card, "other", "999", ["a"]) == set() == find_seen_recordings({}, "town", "123", ["a"])
 
 
 def test_an_imu_that_a_model_has_not_met_is_said_and_no_other():
     cards = {"mine": {"imus": ["consumer"]}, "plus": {"imus": []}, "mbkf15": {}}
-    assert unseen_imus(cards, ["consumer"]) == []
-    (line,) = unseen_imus(cards, ["consumer", "bmi270"])
+    assert describe_unseen_imus(cards, ["consumer"]) == []
+    (line,) = describe_unseen_imus(cards, ["consumer", "bmi270"])
     assert line.startswith("mine was trained on the IMU consumer and has not met bmi270")
 
 
@@ -38,8 +38,8 @@ def test_a_filter_that_listens_says_that_samples_are_too_slow_for_it():
         least_rate_hz = 50.0
 
     models = {"plus": Listening(), "mbkf15": object()}
-    assert slow_drives(models, [50.0, 100.0, 49.9]) == []
-    (line,) = slow_drives(models, [100.0, 10.01, 1.0])
+    assert describe_slow_drives(models, [50.0, 100.0, 49.9]) == []
+    (line,) = describe_slow_drives(models, [100.0, 10.01, 1.0])
     assert line.startswith("plus needs samples at 50 Hz or more and these drives have 1 to 10 Hz")
 
 

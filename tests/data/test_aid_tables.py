@@ -10,7 +10,7 @@ from dlkf.base.errors import InputError
 from dlkf.data.aid_tables import STANDARD
 from dlkf.data.schema import AIDS, drive_file, write_drive, write_drives_table
 from dlkf.data.tables import read_drives, read_table
-from dlkf.data.validate import read_checked, validate_dataset
+from dlkf.data.validate import read_drive, validate_dataset
 
 
 @pytest.fixture(scope="module")
@@ -40,16 +40,16 @@ def test_tables_come_back_as_written_and_only_those_that_are_asked_for(tmp_path,
     for name in AIDS:
         back = read_table(tmp_path, name, "a")
         assert all(np.array_equal(back[c], aids[name][c].to_numpy()) for c in aids[name])
-    assert set(read_checked(tmp_path, row).aids) == set(AIDS)
-    assert set(read_checked(tmp_path, row, aids=[STANDARD["heading"]]).aids) == {"heading"}
+    assert set(read_drive(tmp_path, row).aids) == set(AIDS)
+    assert set(read_drive(tmp_path, row, aids=[STANDARD["heading"]]).aids) == {"heading"}
     drive_file(tmp_path, "speed", "a").write_bytes(b"broken")
-    assert read_checked(tmp_path, row, aids=[]).aids == {}
+    assert read_drive(tmp_path, row, aids=[]).aids == {}
     with pytest.raises(InputError, match="not a whole Parquet file"):
         validate_dataset(tmp_path)
 
 
 def test_a_drive_without_them_has_none(town):
-    assert read_checked(town, read_drives(town)[0]).aids == {}
+    assert read_drive(town, read_drives(town)[0]).aids == {}
 
 
 def _speed(change):

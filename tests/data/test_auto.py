@@ -12,10 +12,10 @@ import yaml
 
 from dlkf.base.errors import InputError
 from dlkf.data.intake import ingest_drives
-from dlkf.data.readers.auto import AutoReader, _velocities_beside
+from dlkf.data.readers.auto import AutoReader, _find_velocities
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.logs import LogReader
-from dlkf.data.readers.offers import contents
+from dlkf.data.readers.offers import recognise_file
 from dlkf.data.readers.recognise import gnss_spec, imu_spec
 from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.tables import read_table
@@ -149,8 +149,8 @@ def test_velocities_in_a_file_beside_the_fixes(tmp_path):
         ("vel", "t,speed,course", "1751760000,9,45"),
     ):
         (tmp_path / f"{name}.csv").write_text(f"{columns}\n" + f"{row}\n" * 3)
-    (chosen,) = contents(tmp_path / "pos.csv").offers
-    found = _velocities_beside(chosen, chosen.specs["gnss"], tmp_path.iterdir())
+    (chosen,) = recognise_file(tmp_path / "pos.csv").offers
+    found = _find_velocities(chosen, chosen.specs["gnss"], tmp_path.iterdir())
     assert found == {"columns": ["speed", "course"], "frame": "course", "file": "vel.csv"}
 
 
@@ -160,14 +160,14 @@ def test_velocities_of_a_bag_lie_in_a_topic_of_their_own(tmp_path, writer):
     tables = car(6)
     writer(tmp_path, tables)
     (path,) = (p for pattern in ("*.bag", "drive/metadata.yaml") for p in tmp_path.glob(pattern))
-    (chosen,) = contents(path).offers
-    assert _velocities_beside(chosen, chosen.specs["gnss"], []) == {"table": "/gnss/vel"}
+    (chosen,) = recognise_file(path).offers
+    assert _find_velocities(chosen, chosen.specs["gnss"], []) == {"table": "/gnss/vel"}
     (got,) = read(path.parent, ["reader=rosbag"])
     assert any("reader.gnss.velocity.table=/gnss/vel" in note for note in got.notes)
     (tmp_path / "ublox").mkdir()
     ros2_ublox(tmp_path / "ublox", tables)
-    (other,) = contents(tmp_path / "ublox" / "drive" / "metadata.yaml").offers
-    assert _velocities_beside(other, other.specs["gnss"], []) is None
+    (other,) = recognise_file(tmp_path / "ublox" / "drive" / "metadata.yaml").offers
+    assert _find_velocities(other, other.specs["gnss"], []) is None
 
 
 def test_a_bag_with_two_imus_or_cut_off_says_so(tmp_path):

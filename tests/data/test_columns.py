@@ -15,7 +15,7 @@ from dlkf.data.readers.auto import AutoReader
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.qualities import quality_spec
 from dlkf.data.readers.recognise import gnss_spec, imu_spec
-from dlkf.data.readers.stamps import clock_of
+from dlkf.data.readers.stamps import choose_clock
 from dlkf.data.readers.units import day_order
 from dlkf.data.readers.vocabulary import DATE, QUANTITIES, SENSORS, TIME, find_column, match_columns, split_unit, triad
 from dlkf.data.schema import ACCEL, GYRO
@@ -213,7 +213,7 @@ def test_gps_seconds_since_1980_are_no_unix_time(tmp_path, drive):
     ],
 )
 def test_from_when_stamps_count(name, seconds, clock):
-    assert clock_of(name, seconds) == clock
+    assert choose_clock(name, seconds) == clock
 
 
 def test_more_that_tables_have():

@@ -11,7 +11,7 @@ from dlkf.base.classes import instantiate
 from dlkf.base.errors import InputError
 from dlkf.command.composing import compose_command
 from dlkf.data.datamodule import DriveDataModule
-from dlkf.data.masks import BiasLaw, Outage, outage_within, withhold_fixes
+from dlkf.data.masks import BiasLaw, Outage, mask_outage, withhold_fixes
 from tests.cars import REAL, write_cars
 
 
@@ -118,7 +118,7 @@ def test_scoring_batches_are_fixed(town):
     one, two = data.batches("test"), _module(town, eval_outage=Outage(5, 10), eval_stride_s=10).batches("test")
     assert all(torch.equal(x.start.p_n, y.start.p_n) for x, y in zip(one, two))
     plain = _module(town, eval_stride_s=10).batches("test")
-    assert torch.equal(withhold_fixes(plain[0], outage_within(plain[0], 5, 10)).available, one[0].available)
+    assert torch.equal(withhold_fixes(plain[0], mask_outage(plain[0], 5, 10)).available, one[0].available)
     assert (~one[0].available).sum(1).unique().tolist() == [10]
     assert len(data.describe().splitlines()) == 4
 
@@ -126,8 +126,8 @@ def test_scoring_batches_are_fixed(town):
 def test_drives_too_short_for_their_side_are_named(town):
     """Which drives, of how many, and the key that takes them in; nothing where all are long enough."""
     data = _module(town)
-    assert data.left_out(data.train_length_s) == []
-    (line,) = data.left_out(1e4)
+    assert data.list_left_out(data.train_length_s) == []
+    (line,) = data.list_left_out(1e4)
     train = [d.name for d in data.drives("train")]
     assert line.startswith(f"{len(train)} of {len(train)} drives, too short") and "a shorter data.length_s" in line
     assert "train segment of 10000 s: " + ", ".join(train[:4]) in line

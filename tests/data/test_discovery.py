@@ -11,10 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dlkf.base.errors import InputError
-from dlkf.data.discovery.clock import ImuSums, find_lag, known_offset
-from dlkf.data.discovery.drift import ends_apart, ends_std, find_drifting_pose, middle
+from dlkf.data.discovery.clock import ImuSums, describe_offset, find_lag
+from dlkf.data.discovery.drift import compare_ends, ends_std, find_drifting_pose, middle
 from dlkf.data.discovery.findings import discover, find_value
-from dlkf.data.discovery.motion import levelled, motion, position_delay
+from dlkf.data.discovery.motion import integrate_level, motion, position_delay
 from dlkf.data.discovery.orientation import find_pose
 from dlkf.data.discovery.units import accel_units, nearest_unit, time_unit, unit_left
 from dlkf.data.intake import ingest_drives
@@ -61,7 +61,7 @@ def test_biases_of_the_gyroscopes_are_told_from_turning_about_a_leaning_axis():
     bias = np.array([2e-3, -1e-3, 0.0])
     gyro = rate[:, None] * lean[:, 2] + bias
     accel = np.broadcast_to(-9.81 * lean[:, 2], gyro.shape)
-    level = levelled(t, accel, gyro, np.array([0.0, 0.0, 1.0]))
+    level = integrate_level(t, accel, gyro, np.array([0.0, 0.0, 1.0]))
     grown = np.diff(level.tilted) / np.diff(level.t)
     # what turns about down is cos 3° of the loop, half a degree short; with mean rates for biases, 2π sin 3° / 120 s
     # would have grown to 0.1 rad, 1 m/s², by the end of the loop
@@ -120,7 +120,7 @@ def test_a_drift_that_no_lag_fits_is_found(streets):
     What is left is the car's: rolling in its turns, sideslip. They are in the 1σ, 100 ppm.
     """
     t, accel, gyro, moved = _arrays({"imu": streets["imu"].assign(t=1.005 * streets["imu"].t), "gnss": streets["gnss"]})
-    ends = ends_apart(ImuSums.of(t, accel, gyro), moved)
+    ends = compare_ends(ImuSums.of(t, accel, gyro), moved)
     assert ends is not None and abs(ends.drift - 5e-3) < 1e-3
     pose = find_drifting_pose(t, accel, gyro, moved, 0.0)
     assert pose is not None and abs(pose.drift - 5e-3) < 3 * pose.drift_std < 4e-4
@@ -246,9 +246,9 @@ def test_units_by_size():
     assert unit_left(0.0204, 0.01, 5000.0, units.RATE) is None and unit_left(0.5, 0.05, 1.2, units.RATE) is None
     assert time_unit(1.75e12 + 10.0 * np.arange(9), 0.2, 1e-4) == "ms"
     assert time_unit(10.0 * np.arange(9), 0.21, 2e-4) == "ms"
-    assert "leap seconds" in known_offset(18.1) and "3 GPS weeks" in known_offset(3 * 604_800.0)
-    assert "time zone of +2 h" in known_offset(7200.0) and known_offset(-63.0) == ""
-    assert "has no date" in known_offset(-1_421_625_596.8) and known_offset(20 * 3600.0) == ""
+    assert "leap seconds" in describe_offset(18.1) and "3 GPS weeks" in describe_offset(3 * 604_800.0)
+    assert "time zone of +2 h" in describe_offset(7200.0) and describe_offset(-63.0) == ""
+    assert "has no date" in describe_offset(-1_421_625_596.8) and describe_offset(20 * 3600.0) == ""
 
 
 def test_a_sensor_that_seems_turned_gets_a_line(streets):

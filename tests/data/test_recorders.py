@@ -11,7 +11,7 @@ from dlkf.base.errors import InputError
 from dlkf.data.intake import ingest_drives
 from dlkf.data.readers.auto import AutoReader
 from dlkf.data.readers.formats import rosbag
-from dlkf.data.readers.offers import contents
+from dlkf.data.readers.offers import recognise_file
 from dlkf.data.schema import ACCEL, GYRO
 from tests.cars import car
 from tests.data.logs import metres
@@ -133,7 +133,7 @@ def test_an_mcap_of_ros_2(tmp_path, tables):
     (got,) = read(path, ["reader=rosbag", "reader.gnss.velocity.table=/gnss/vel"])
     np.testing.assert_allclose(got.imu.accel_x, tables["imu"].accel_x, atol=1e-9)
     np.testing.assert_allclose(got.gnss.vel_n, tables["gnss"].vel_n, atol=1e-9)
-    assert "imu" in contents(path).offers[0].specs
+    assert "imu" in recognise_file(path).offers[0].specs
     path.write_bytes(path.read_bytes()[:3000])
     with pytest.raises(InputError, match="cannot be read as a bag"):
         read(path, ["reader=rosbag"])

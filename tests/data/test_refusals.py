@@ -20,7 +20,7 @@ from dlkf.base.errors import InputError
 from dlkf.data.intake import IngestOptions, ingest
 from dlkf.data.readers.auto import AutoReader
 from dlkf.data.readers.logs import LogReader
-from dlkf.data.readers.offers import contents
+from dlkf.data.readers.offers import recognise_file
 from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.tables import read_drives
 from tests.cars import REAL, car
@@ -222,7 +222,7 @@ def test_what_each_file_holds_is_said(tmp_path, drive):
     drive["gnss"].drop(columns="height_m").to_csv(tmp_path / "fixes.csv", index=False)
     (tmp_path / "photo.jpg").write_bytes(b"\xff\xd8\0\0")
     (tmp_path / "empty.txt").touch()
-    assert "lacks a height" in contents(tmp_path / "fixes.csv").held
+    assert "lacks a height" in recognise_file(tmp_path / "fixes.csv").held
     said = refusal(tmp_path)
     for part in ("acc.csv (csv with accel_x", "photo.jpg (of no format that is known)", "empty.txt (empty)"):
         assert part in said, part

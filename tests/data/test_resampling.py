@@ -8,7 +8,7 @@ import torch
 
 from dlkf.base.errors import InputError
 from dlkf.data import resampling
-from dlkf.data.resampling import SampleGrid, assign_fixes, epoch_grid, fix_phase, reference_at, resample_imu
+from dlkf.data.resampling import SampleGrid, assign_fixes, epoch_grid, fix_phase, interpolate_reference, resample_imu
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, IMU_ERROR, POSITION, STD, VELOCITY
 from dlkf.data.store import drive_from_tables
 from dlkf.data.tables import DriveRow
@@ -168,7 +168,7 @@ def _reference(t: np.ndarray) -> dict:
 
 def test_the_reference_between_samples():
     """A cubic height is exact under Hermite interpolation, a constant turn along the geodesic."""
-    truth = reference_at(_reference(np.arange(0, 6, 0.4) + 0.1), SampleGrid(1.0, 1.0, 3, 50))
+    truth = interpolate_reference(_reference(np.arange(0, 6, 0.4) + 0.1), SampleGrid(1.0, 1.0, 3, 50))
     assert truth.valid.all()
     at = np.arange(1.0, 5.0)
     lat, lon = (torch.full((4,), np.radians(x), dtype=torch.float64) for x in (50.0, 9.0))
@@ -183,14 +183,14 @@ def test_the_reference_is_not_invented():
     table = _reference(np.array([0.0, 0.5, 1.0, 1.5, 3.5, 4.0, 4.5, 5.0, 5.5]))
     table["valid"][5] = False  # t = 4.0
     table["roll"][7] = np.nan  # t = 5.0
-    truth = reference_at(table, SampleGrid(0.0, 1.0, 6, 50))
+    truth = interpolate_reference(table, SampleGrid(0.0, 1.0, 6, 50))
     # 2 and 3 lie in a gap of 2 s, 4 is not valid, 5 has no roll, 6 is past the end
     assert truth.valid.tolist() == [True, True, False, False, False, True, False]
     assert np.isnan(truth.C_eb).any((1, 2)).tolist() == [False, False, True, True, True, True, True]
-    beside = reference_at(table, SampleGrid(0.5, 1.0, 4, 50))  # an exact hit next to an unusable sample stands
+    beside = interpolate_reference(table, SampleGrid(0.5, 1.0, 4, 50))  # an exact hit next to an unusable sample stands
     assert beside.valid.tolist() == [True, True, False, True, True]
     assert np.isfinite(beside.C_eb[3]).all()
-    assert not reference_at(None, SampleGrid(0.0, 1.0, 5, 50)).valid.any()
+    assert not interpolate_reference(None, SampleGrid(0.0, 1.0, 5, 50)).valid.any()
 
 
 def test_impossible_grids_are_refused():

@@ -10,7 +10,7 @@ import torch
 
 from dlkf.base.errors import InputError
 from dlkf.data.augmentation import turn_frames
-from dlkf.data.masks import BiasLaw, add_bias, outage_within, withhold_fixes
+from dlkf.data.masks import BiasLaw, add_bias, mask_outage, withhold_fixes
 from dlkf.data.segments import (
     Segment,
     StartLaw,
@@ -140,7 +140,7 @@ def test_whole_drives_are_padded(drives):
 
 def test_masks(drives):
     batch = make_batch(drives, [Segment(0, 0, 30)])
-    out = withhold_fixes(batch, outage_within(batch, 10, 15))
+    out = withhold_fixes(batch, mask_outage(batch, 10, 15))
     assert torch.nonzero(~out.available[0]).flatten().tolist() == list(range(10, 25))  # ends of epochs 11 … 25 s
     assert batch.available.all()
 
@@ -179,4 +179,4 @@ def test_the_error_state_of_a_start_is_truth_minus_estimate():
     frame = tangent_frame(*(torch.zeros(1, dtype=torch.float64) for _ in range(3)))
     truth = NavState(torch.ones(1, 3).double(), torch.ones(1, 3).double(), torch.eye(3).double()[None])
     dx = torch.arange(1.0, 10.0).double()[None] / 100
-    assert torch.allclose(truth.corrected(-dx).error_to(truth), dx) and frame.height.item() == 0
+    assert torch.allclose(truth.correct(-dx).error_to(truth), dx) and frame.height.item() == 0

@@ -8,7 +8,7 @@ import torch
 
 from dlkf.data.limits import Refused
 from dlkf.data.schema import write_drive, write_drives_table
-from dlkf.data.spikes import BEFORE, FLOOR, RATIO, SpikeScreen, isolated_spikes
+from dlkf.data.spikes import BEFORE, FLOOR, RATIO, SpikeScreen, find_spikes
 from dlkf.data.store import load_dataset
 from tests.cars import car
 
@@ -21,7 +21,7 @@ def still(n: int = 300, size: tuple[float, float] = (0.2, 0.005), seed: int = 0)
 
 
 def found(x: np.ndarray) -> list[int]:
-    return isolated_spikes(list(x.T)).tolist()
+    return find_spikes(list(x.T)).tolist()
 
 
 @pytest.mark.parametrize("axes", [[0], [4], [1, 2], [0, 1, 2, 3, 4, 5]])

@@ -12,7 +12,7 @@ from dlkf.base.errors import InputError
 from dlkf.data.plausibility import check_imu_units
 from dlkf.data.schema import drive_file, write_drive, write_drives_table
 from dlkf.data.store import load_dataset
-from dlkf.data.validate import LIMITS, Limits, gap_rows, read_checked, validate_dataset
+from dlkf.data.validate import LIMITS, Limits, find_gaps, read_drive, validate_dataset
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.motion.routes import Manoeuvres, VehicleConfig
 from tests.cars import REAL, Tables
@@ -224,7 +224,7 @@ def test_limits_of_gaps_are_configurable(tmp_path, tables):
     _write(tmp_path, _rows("imu", lambda f: f.drop(f.index[1000:1020]))(tables))
     (row,) = validate_dataset(tmp_path)  # 0.21 s
     with pytest.raises(InputError, match=r"IMU gap of 0\.210"):
-        read_checked(tmp_path, row, limits=Limits(gap_s=0.1))
+        read_drive(tmp_path, row, limits=Limits(gap_s=0.1))
 
 
 def test_noisy_gnss_raises_no_alarm(tmp_path, tables):
@@ -298,6 +298,6 @@ def test_shortcuts_of_the_checks_say_what_medians_and_quantiles_say(n):
 
 def test_gaps_are_found_where_a_step_is_long():
     t = np.arange(0, 10, 0.01)
-    assert len(gap_rows(t, LIMITS)) == 0 and len(gap_rows(t[:1], LIMITS)) == 0
-    assert gap_rows(np.delete(t, slice(500, 530)), LIMITS).tolist() == [500]
-    assert len(gap_rows(np.arange(0.0, 10.0, 0.5), LIMITS)) == 0  # slow, without a gap
+    assert len(find_gaps(t, LIMITS)) == 0 and len(find_gaps(t[:1], LIMITS)) == 0
+    assert find_gaps(np.delete(t, slice(500, 530)), LIMITS).tolist() == [500]
+    assert len(find_gaps(np.arange(0.0, 10.0, 0.5), LIMITS)) == 0  # slow, without a gap

@@ -15,7 +15,7 @@ from dlkf.base.config import config_dir
 from dlkf.data.masks import withhold_fixes
 from dlkf.data.segments import StartLaw
 from dlkf.diagnosis.consistency import chi2_band, measure_consistency, normalised_square
-from dlkf.diagnosis.matched_drives import MatchedDrives, make_matched_drives, matched_batch
+from dlkf.diagnosis.matched_drives import MatchedDrives, make_matched_batch, make_matched_drives
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.navigation.imu_errors import imu_spec
@@ -46,7 +46,7 @@ def test_a_filter_with_matching_errors_knows_how_wrong_it_is(name):
     """The mean over 24 drives and the last 40 s, of which 20 s without GNSS; errors are correlated in time, so the
     band is that of a single time."""
     spec = make_matched_drives(CONSUMER, build_filter(name, CONSUMER).states)
-    batch, matrices = matched_batch(DRIVES, spec)
+    batch, matrices = make_matched_batch(DRIVES, spec)
     batch = withhold_fixes(batch, OutagePlan(80.0, 20.0).masks(batch)[0])
     result = measure_consistency(build_filter(name, spec), batch, matrices)
     assert np.isnan(result.nis[:, 80:100]).all()  # nothing to compare in the outage
@@ -57,7 +57,7 @@ def test_a_filter_with_matching_errors_knows_how_wrong_it_is(name):
 
 def test_a_filter_that_is_told_too_little_noise_is_found_out():
     spec = make_matched_drives(CONSUMER, build_filter("mbkf15", CONSUMER).states)
-    batch, matrices = matched_batch(replace(DRIVES, drives=8, minutes=1.0), spec)
+    batch, matrices = make_matched_batch(replace(DRIVES, drives=8, minutes=1.0), spec)
     sure = replace(
         spec,
         accel=replace(spec.accel, noise_density=0.3 * spec.accel.noise_density, turn_on_bias=0.005),

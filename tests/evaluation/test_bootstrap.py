@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import gmean, norm, t
 
-from dlkf.evaluation.bootstrap import compare, levels, resampled_weights, rms_band, weighted_means
+from dlkf.evaluation.bootstrap import compare, draw_weights, levels, rms_band, weighted_means
 
 
 def test_weighted_statistics_equal_those_of_the_repeated_values():
@@ -124,7 +124,7 @@ def test_missing_truth_is_left_out_of_both_and_a_broken_filter_stays():
 
 def test_weights_draw_every_group_as_often_on_average():
     groups = np.array([0, 0, 1, 2, 2, 2, 3])
-    w = np.concatenate(list(resampled_weights(groups, 4000, np.random.default_rng(0))))
+    w = np.concatenate(list(draw_weights(groups, 4000, np.random.default_rng(0))))
     assert np.array_equal(w[:, 0], w[:, 1]) and (w[:, [0, 2, 3, 6]].sum(-1) == 4).all()
     assert np.allclose(w.mean(0), 1.0, atol=0.06)  # σ of the mean of 4000 draws is 0.014
 

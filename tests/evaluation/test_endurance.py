@@ -50,7 +50,7 @@ def test_a_filter_is_better_after_more_gnss(town):
     data.setup()
     assert scenes_after_gnss(data, "train", 30.0, 2, None) is None
     scenes = scenes_after_gnss(data, "train", 10.0, 2, 1)
-    (batch,) = scenes.withheld()
+    (batch,) = scenes.withhold()
     assert len(batch.drive) == 1 and torch.nonzero(~batch.available[0]).flatten().tolist() == list(range(10, 50))
     rows = score_after_gnss(FILTERS, data, [3, 10, 30], baseline="mbkf15", seed=2)
     assert [(r.seconds, r.segments, r.groups) for r in rows] == [(3.0, 2, 1), (10.0, 2, 1)]

@@ -16,7 +16,7 @@ from dlkf.navigation.state import NavState
 def test_errors_are_truth_minus_estimate_in_the_tangent_frame_near_its_origin(cars):
     dx = torch.tensor([1.0, -2.0, 3.0, 0.1, -0.2, 0.3, 0.01, -0.02, 0.05], dtype=torch.float64)
     B, T, _ = cars.size
-    estimate = cars.truth.corrected(-dx.expand(B, T, 9))  # truth = estimate ⊞ dx up to the order of rotations
+    estimate = cars.truth.correct(-dx.expand(B, T, 9))  # truth = estimate ⊞ dx up to the order of rotations
     error = m.error_series(cars, estimate)
     # 1 km from the origin the axes turn by 1.6e-4 rad: 4e-4 of a 2.2 m error, and convergence of as much
     assert np.allclose(error, dx.numpy(), atol=2e-3)

@@ -23,7 +23,7 @@ from dlkf.data.store import drive_rows, load_dataset
 from dlkf.evaluation.chunks import EvaluationJob, evaluate_chunks
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.protocol import Protocol, Scenes, spread_evenly
-from dlkf.evaluation.study import results_of, run_scenes
+from dlkf.evaluation.study import make_results, run_scenes
 from dlkf.evaluation.table import all_tables
 from dlkf.filters.build import build_filter
 from dlkf.filters.tuning import Prior, Tuning
@@ -63,7 +63,7 @@ def tables_of(folder, **settings):
     data = DriveDataModule(folder, split={"train": ["g0"], "val": ["g1"], "test": ["g2"]}, **{**size, **settings})
     scenes = Scenes.of_split(data, "test", OutagePlan(first_s=(5, 10), duration_s=(5, 15)), seed=4)
     names = {"mbkf15": MBKF, "ins": build_filter("ins", IMU)}
-    made = results_of(run_scenes(names, scenes, kinds="simulated", law=BiasLaw(0.05, 0.1), seed=4), seed=4)
+    made = make_results(run_scenes(names, scenes, kinds="simulated", law=BiasLaw(0.05, 0.1), seed=4), seed=4)
     return json.dumps([r.as_dict() for r in made])
 
 
@@ -113,7 +113,7 @@ def test_truth_without_attitude_means_whole_drives_from_their_own_alignment(driv
     masks = torch.stack([mask for _, mask in scenes])
     t = torch.arange(1, masks.shape[-1] + 1)
     assert masks.any(0)[:, (t > 10) & (t <= 50)].all() and not masks.all(0).any()  # covered, once each
-    (result,) = results_of(run_scenes({"mbkf15": MBKF}, scenes, kinds="real"))
+    (result,) = make_results(run_scenes({"mbkf15": MBKF}, scenes, kinds="real"))
     counted = {q: result.value("mbkf15", "segments", "all", q, "n") for q in ("attitude", "position")}
     assert counted == {"attitude": 0, "position": 12}
     assert result.value("mbkf15", "outages", "end", "horizontal") < 5
@@ -125,7 +125,7 @@ def test_study_reports_each_kind_apart_and_the_slope_of_an_injected_bias(drives)
     kinds = {d.name: "real" if i < 2 else "simulated" for i, d in enumerate(drives)}
     groups = {d.name: d.group for d in drives}
     bias = BiasLaw(accel_mps2=0.03, gyro_dps=0.06)
-    made = results_of(run_scenes({"mbkf15": MBKF}, scenes, kinds=kinds, groups=groups, law=bias))
+    made = make_results(run_scenes({"mbkf15": MBKF}, scenes, kinds=kinds, groups=groups, law=bias))
     assert [(r.kind, r.count["segments"]) for r in made] == [("real", 2), ("simulated", 4)]
     for r in made:
         for axis in ("accel_z", "gyro_x"):

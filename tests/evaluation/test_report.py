@@ -33,7 +33,7 @@ from dlkf.evaluation.table import (
     slope_table,
 )
 from dlkf.filters.build import build_filter
-from dlkf.report.compare import StoredReport, best_of_each, end_table, scored_on, shorten_names
+from dlkf.report.compare import StoredReport, describe_tests, end_table, mark_best_of_each, shorten_names
 from dlkf.report.evaluation import evaluation_page, least_error, outage_rows, write_report
 from tests.cars import IMU
 from tests.evaluation.drawn import figures_of
@@ -254,8 +254,8 @@ def test_the_best_is_marked_among_those_of_the_same_test(scores):
         StoredReport(name, name, data, rules, results) for name, data, rules in (*said, ("d", "city", {"seed": 1}))
     ]
     columns, rows = end_table(reports)
-    by_test = scored_on(reports)
+    by_test = describe_tests(reports)
     assert [by_test.index(t) for t in by_test[:: len(FILTERS)]] == [0, 0, 4, 6]
-    marked = [row[0] for row, mark in zip(rows, best_of_each(columns, rows, by_test)) if mark]
+    marked = [row[0] for row, mark in zip(rows, mark_best_of_each(columns, rows, by_test)) if mark]
     assert marked == ["a", "c", "d"]
-    assert best_of_each(columns, rows[:2], ["one", "another"]) == ["", ""]
+    assert mark_best_of_each(columns, rows[:2], ["one", "another"]) == ["", ""]

@@ -9,7 +9,7 @@ import torch
 
 from dlkf.base.errors import InputError
 from dlkf.data.masks import BiasLaw
-from dlkf.evaluation.bias_slope import injected_response
+from dlkf.evaluation.bias_slope import inject_bias
 from dlkf.evaluation.metrics import magnitudes, rms_over_segments, slope
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
@@ -46,7 +46,7 @@ def test_chunks_cover_every_segment_once_and_drop_the_padding(cars):
     batch = _ragged(cars)
     found = list(chunks(batch, 2500))
     assert sorted(i for c in found for i in c.tolist()) == list(range(6))
-    shortest = batch.select(found[-1]).trimmed()
+    shortest = batch.select(found[-1]).trim()
     assert shortest.size[1] == int(batch.present[found[-1]].sum(-1).max())
     assert shortest.drive == tuple(batch.drive[i] for i in found[-1])
     assert torch.equal(shortest.frame.origin_e, batch.frame.origin_e[found[-1]])
@@ -76,9 +76,9 @@ def test_ins_runs_free_from_the_last_fix_not_from_the_start(cars):
 
 
 def test_several_batches_are_joined_and_named(cars):
-    short = cars.select(torch.tensor([1, 2])).trimmed()
+    short = cars.select(torch.tensor([1, 2])).trim()
     short = replace(short, present=short.present.clone().index_fill_(1, torch.arange(40, 60), False))
-    short = short.select(torch.tensor([0, 1])).trimmed()
+    short = short.select(torch.tensor([0, 1])).trim()
     scores = score({"ins": FILTERS["ins"]}, [cars, short], groups={"car-01": "g"}, kinds={"car-01": "real"})
     assert len(scores.segments) == 8 and scores.filters["ins"].error.shape == (8, 60, 9)
     assert [p.group for p in scores.segments][-2:] == ["g", "car-02"]
@@ -114,7 +114,7 @@ def test_float32_agrees_with_float64(cars):
 def test_a_kalman_filter_follows_an_injected_bias_and_pure_inertial_does_not(cars):
     base = score(FILTERS, [cars])
     no_outage = torch.zeros(cars.size[:2], dtype=torch.bool)
-    cause, followed = injected_response(base, FILTERS, [(cars, no_outage)], law=BiasLaw(0.03, 0.06), seed=4)
+    cause, followed = inject_bias(base, FILTERS, [(cars, no_outage)], law=BiasLaw(0.03, 0.06), seed=4)
     slopes = {name: slope(x, cause, intercept=False) for name, x in followed.items()}
     assert np.allclose(slopes["ins"], 0.0)
     assert np.allclose(slopes["mbkf15"][[2, 3, 4]], 1.0, atol=0.05)  # down and level rates: always seen

@@ -104,7 +104,7 @@ def scene(
         gnss_lag=torch.zeros(batch, epochs, dtype=D),
         available=ones.clone(),
         lever_arm_b=arm.clone(),
-        start=start.corrected(start_error),
+        start=start.correct(start_error),
         start_std=START_STD.expand(batch, 9).clone(),
         truth=truth,
         truth_valid=ones,

@@ -13,7 +13,7 @@ from dlkf.data.aids import ROW, aid_rows, pressure_height
 from dlkf.data.resampling import SampleGrid
 from dlkf.data.segments import whole_drives
 from dlkf.data.store import load_dataset
-from dlkf.filters.aids.attach import SENSORS, aid_columns, tables_of, with_aids
+from dlkf.filters.aids.attach import SENSORS, aid_columns, find_tables, with_aids
 from dlkf.filters.aids.stretch import stretch_weights
 from dlkf.filters.aids.trust import PATIENCE, PROBATION, Trust, judge
 from dlkf.filters.build import build_filter
@@ -64,7 +64,7 @@ def segments():
 
 def _epoch(batch, start, error, row):
     fix = Fix(batch.gnss[:, 0], batch.gnss_std[:, 0], batch.gnss_valid[:, 0], None, row)
-    corrected = error.corrected(batch.imu[:, 0])
+    corrected = error.correct(batch.imu[:, 0])
     window = strapdown(start, corrected, batch.dt, batch.frame)
     rate = corrected[:, -2:, 3:].mean(1)
     z = torch.zeros_like(fix.value)
@@ -92,7 +92,7 @@ def test_h_is_the_derivative_of_what_is_predicted(segments, name):
     for _ in range(4):
         delta = size * torch.randn(3, 9).double()
         bias = torch.tensor([1e-2] * 3 + [1e-4] * 3).double() * torch.randn(3, 6).double()
-        there = _epoch(segments, segments.start.corrected(delta), ImuError(bias), said)
+        there = _epoch(segments, segments.start.correct(delta), ImuError(bias), said)
         moved, _ = source.rows(there, memory, prediction)
         dx = torch.zeros(3, states.count).double()
         dx[:, PVA] = here.window.end.error_to(there.window.end)
@@ -129,7 +129,7 @@ def test_scale_delay_and_place_of_a_wheel_are_found(aided):
 
 def test_all_three_agree_with_the_car(aided):
     model = with_aids(build_filter("mbkf21_car", IMU), STANDARD.values())
-    assert [table.name for table in tables_of(model)] == list(STANDARD)
+    assert [table.name for table in find_tables(model)] == list(STANDARD)
     said = dict(zip(aid_columns(model), integrate(aided, model).aids[0].T))
     for name in STANDARD:
         seen = said[f"{name}_innovation"].isfinite()
@@ -151,7 +151,7 @@ def test_only_filters_that_know_a_car_take_what_a_drive_has():
     speed = [STANDARD["speed"]]
     assert with_aids(build_filter("mbkf15", IMU), speed) == build_filter("mbkf15", IMU)
     named = build_filter("mbkf15+speed", IMU)
-    assert [t.name for t in tables_of(named)] == ["speed"] and named.states.count == 18
+    assert [t.name for t in find_tables(named)] == ["speed"] and named.states.count == 18
     both = build_filter("mbkf21_nhc+speed", IMU)
     assert with_aids(both, speed) is both
     assert both == with_aids(build_filter("mbkf21_nhc", IMU), speed)

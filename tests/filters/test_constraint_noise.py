@@ -10,7 +10,7 @@ import torch
 
 from dlkf.filters.build import build_filter
 from dlkf.filters.constraint_noise import EXPECTED, FIRST, HIGH, LEAST, LOW, MEMORY, MOST, ConstraintNoise
-from dlkf.filters.constraints import CarConstraints, CarMemory, _near_fix
+from dlkf.filters.constraints import CarConstraints, CarMemory, _is_near_fix
 from dlkf.filters.integration import integrate
 from dlkf.filters.sources import Predicted
 from dlkf.filters.tuning import Tuning
@@ -63,7 +63,7 @@ def test_sums_are_those_of_numpy(size):
     noise, squares, fixes, f = ConstraintNoise.begin(torch.zeros(1, dtype=D), 1), np.zeros(2), 0.0, np.ones(2)
     for k in range(400):
         row = [torch.from_numpy(x)[None] for x in (z[k], of_state[k], variance[k])]
-        noise = noise.after(*row, 2.0, torch.tensor([bool(learns[k])]))
+        noise = noise.update(*row, 2.0, torch.tensor([bool(learns[k])]))
         if learns[k]:
             keep = 1 - 1 / MEMORY
             square = np.minimum(z[k] ** 2, 4 * (of_state[k] + f * variance[k]))
@@ -101,8 +101,8 @@ def test_a_fix_far_from_the_filter_teaches_nothing():
     yes = torch.ones(1, 6, dtype=torch.bool)
     for off, near in ((1.4, True), (1.6, False)):
         z = torch.tensor([[0.1, off, 0.0, 9.0, 9.0, 9.0]], dtype=D)
-        assert bool(_near_fix(at._replace(z=z, fix=at.fix._replace(std=std, used=yes)), P)) is near
-    assert not bool(_near_fix(at._replace(z=0 * z, fix=at.fix._replace(std=std, used=~yes)), P))
+        assert bool(_is_near_fix(at._replace(z=z, fix=at.fix._replace(std=std, used=yes)), P)) is near
+    assert not bool(_is_near_fix(at._replace(z=0 * z, fix=at.fix._replace(std=std, used=~yes)), P))
 
 
 def test_shorter_update_intervals_find_the_same():

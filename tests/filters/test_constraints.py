@@ -26,7 +26,7 @@ D = torch.float64
 
 def epoch_of(batch, state: NavState, error: ImuError) -> Epoch:
     raw = batch.imu[:, 0]
-    corrected = error.corrected(raw)
+    corrected = error.correct(raw)
     window = strapdown(state, corrected, batch.dt, batch.frame)._replace(end=state)
     none = torch.zeros(len(raw), 6, dtype=D)
     fix = Fix(none, none + 1, none > 0, None)
@@ -43,12 +43,12 @@ def test_jacobian_matches_finite_differences():
     rules = CarConstraints(Tuning(), STATES)
 
     def innovation(dx):
-        moved = epoch_of(batch, batch.start.corrected(dx[:, :9]), error.updated(dx, STATES))
-        across = rules._across(moved, structure + dx[:, STATES.of_structure])[0]
-        return torch.cat((across, rules._standing(moved)[0]), -1)
+        moved = epoch_of(batch, batch.start.correct(dx[:, :9]), error.update(dx, STATES))
+        across = rules._measure_lateral(moved, structure + dx[:, STATES.of_structure])[0]
+        return torch.cat((across, rules._measure_standstill(moved)[0]), -1)
 
     still = epoch_of(batch, batch.start, error)
-    H = torch.cat((rules._across(still, structure)[1], rules._standing(still)[1]), 1)[0]
+    H = torch.cat((rules._measure_lateral(still, structure)[1], rules._measure_standstill(still)[1]), 1)[0]
     for i in (*range(3, 10), *range(12, 15), *range(21, 26)):
         dx = torch.zeros(1, STATES.count, dtype=D)
         dx[0, i] = 1e-6
@@ -87,7 +87,7 @@ def test_a_car_at_rest_feels_the_earth_turn():
     raw = torch.cat((torch.zeros(3, M, 3, dtype=D), earth_b.expand(-1, M, -1)), -1)
     at_rest = replace(batch, imu=raw.unsqueeze(1))
     epoch = epoch_of(at_rest, NavState(still, still, C), ImuError(torch.zeros(3, 6, dtype=D)))
-    z, _ = CarConstraints(Tuning(), STATES)._standing(epoch)
+    z, _ = CarConstraints(Tuning(), STATES)._measure_standstill(epoch)
     assert z.abs().max() < 1e-15
 
 
@@ -226,7 +226,7 @@ def driven(base, start: NavState, clean: torch.Tensor):
         imu=clean + base.true_imu_error.unsqueeze(2) + white * noise,
         gnss=torch.cat((truth.p_n, truth.v_n), -1) + base.gnss - old,
         truth=truth,
-        start=start.corrected(-off),
+        start=start.correct(-off),
     )
 
 

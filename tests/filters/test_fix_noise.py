@@ -38,8 +38,8 @@ class Watched:
         kalman, outage, noise = memory
         kalman, correction = self.kalman.step(kalman, epoch)
         same = source_scale(epoch.z.new_ones(len(epoch.z), 4, 3), epoch.start.C_nb)
-        outage = outage.after(epoch, correction.covariances, kalman.windows, same)
-        self.noises.append(noise.after(epoch, correction.covariances, outage))
+        outage = outage.update(epoch, correction.covariances, kalman.windows, same)
+        self.noises.append(noise.update(epoch, correction.covariances, outage))
         return (kalman, outage, self.noises[-1]), correction
 
 
@@ -127,7 +127,7 @@ def test_one_sigma_grows_from_the_claimed_one():
 
     class Seen(Watched):
         def step(self, memory, epoch):
-            seen.append(memory[2].inflated(epoch).fix.std[0])
+            seen.append(memory[2].inflate_fix(epoch).fix.std[0])
             return super().step(memory, epoch)
 
     with torch.inference_mode():
@@ -188,5 +188,5 @@ def test_plus_does_not_blame_its_imu(monkeypatch):
         return error.unflatten(0, (2, 8)).square().mean(1).sqrt()
 
     found = off()
-    monkeypatch.setattr(FixNoise, "inflated", lambda self, epoch: epoch)
+    monkeypatch.setattr(FixNoise, "inflate_fix", lambda self, epoch: epoch)
     assert found[0] < 8.0 and found[1] < 1.0 and (found < 0.5 * off()).all()

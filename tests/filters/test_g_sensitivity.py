@@ -17,7 +17,7 @@ from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.error_model import window_model
 from dlkf.navigation.strapdown import strapdown
 from dlkf.onboard.compiled_filter import compile_filter
-from dlkf.onboard.library import compiler
+from dlkf.onboard.library import find_compiler
 from tests.cars import IMU, car_batch
 
 G = torch.tensor([[2e-4, -1e-4], [-3e-4, 2e-4], [1e-4, 1e-4]], dtype=torch.float64)  # rad/s per m/s²
@@ -44,7 +44,7 @@ def test_columns_are_the_derivative_of_the_strapdown():
     for k, name in enumerate(NAMES):
         entry = imu.new_zeros(3, 6)
         entry[:, k] = small
-        with_it = ImuError(bias, None, entry.unflatten(-1, (3, 2))).corrected(imu)
+        with_it = ImuError(bias, None, entry.unflatten(-1, (3, 2))).correct(imu)
         measured = window.end.error_to(strapdown(batch.start, with_it, dt, frame).end) / small
         column = Phi[:, :9, states.of(name).start]
         assert torch.allclose(measured[:, 6:], column[:, 6:], atol=3e-3)
@@ -54,7 +54,7 @@ def test_columns_are_the_derivative_of_the_strapdown():
 def test_the_complete_error_is_what_is_taken_off_the_samples():
     error = ImuError(torch.full((2, 6), 0.01), torch.full((2, 6), 0.02), G.float().expand(2, -1, -1))
     raw = torch.randn(2, 5, 6, generator=torch.Generator().manual_seed(0))
-    corrected = error.corrected(raw)
+    corrected = error.correct(raw)
     assert torch.allclose(error.at(corrected.mean(1)), (raw - corrected).mean(1), atol=1e-6)
 
 
@@ -96,7 +96,7 @@ def test_a_smoother_has_its_part_of_the_error(sensitive):
 
 
 @pytest.mark.whole
-@pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 def test_in_c_it_is_the_same(sensitive):
     kalman = build_filter("mbkf21_car+receiver+g_sensitivity", IMU)
     in_c = compile_filter(kalman, rate_hz=1 / sensitive.dt, epoch_s=sensitive.epoch_s)

@@ -37,7 +37,7 @@ def judged(off: float, before: float = 0.0, refused: int = 0, usual: float = 0.0
     gate, fix = Gate(0.999, usual), Fix(z, torch.full_like(z, std), used, None)
     memory = gate.begin(epoch.z)
     memory.innovation[0, 0], memory.refused[0, 0] = before, refused
-    return gate.screened(memory, epoch._replace(z=z, fix=fix), torch.zeros(1, 15, 15).to(z), fix.std.square())
+    return gate.screen_fix(memory, epoch._replace(z=z, fix=fix), torch.zeros(1, 15, 15).to(z), fix.std.square())
 
 
 def test_the_limit_by_hand():
@@ -94,9 +94,9 @@ def test_the_variance_an_epoch_later():
             seen.append((before.pop(), correction.covariances.predicted.diagonal(dim1=-2, dim2=-1)[:, :6]))
             return memory, correction
 
-        def screened(self, memory, epoch):
+        def screen_fix(self, memory, epoch):
             before.append(_predicted_variance(epoch, memory.P))
-            return super().screened(memory, epoch)
+            return super().screen_fix(memory, epoch)
 
     before: list[torch.Tensor] = []
     with torch.inference_mode():
@@ -208,7 +208,7 @@ def test_the_coarse_gate_never_acts_on_good_fixes():
     """A minute, an outage of 30 s and what follows: to the bit the filter without it."""
 
     class Without(type(build_filter("mbkf15", IMU))):
-        def screened(self, memory, epoch):
+        def screen_fix(self, memory, epoch):
             return memory, epoch
 
     for estimator in (build_filter("mbkf15", IMU), build_filter("mbkf21_car", IMU)):
@@ -232,6 +232,6 @@ def test_the_coarse_limit_by_hand():
         z[0, 0] = z0
         fix = Fix(z, torch.full_like(z, 4.0), used, None)
         gate = CoarseGate()
-        _, screened, after = gate.screened(gate.begin(z), epoch._replace(z=z, fix=fix), P, fix.std.square())
+        _, screened, after = gate.screen_fix(gate.begin(z), epoch._replace(z=z, fix=fix), P, fix.std.square())
         assert bool(screened.used[0, 0]) is kept and float(screened.z[0, 0]) == (z0 if kept else 0.0)
         assert torch.equal(after, P)

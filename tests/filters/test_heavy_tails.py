@@ -54,7 +54,7 @@ def test_the_state_is_that_of_the_vertical_gyroscope(matrix):
     states = ErrorStates(matrix)
     dx, error = torch.zeros(1, states.count, dtype=D), ImuError(torch.zeros(1, 6, dtype=D))
     dx[:, vertical_scale(states)] = 0.25
-    found = error.updated(dx, states).at(torch.tensor([[1.0, 2.0, 3.0, 5.0, 7.0, 2.0]], dtype=D))
+    found = error.update(dx, states).at(torch.tensor([[1.0, 2.0, 3.0, 5.0, 7.0, 2.0]], dtype=D))
     assert torch.equal(found, torch.tensor([[0.0, 0, 0, 0, 0, 0.5]], dtype=D))
 
 
@@ -67,18 +67,18 @@ def test_a_prior_widens_with_what_is_found_and_with_nothing_else(matrix):
     grown = P.clone()
     grown[:, k, k] = 0.04  # as of a walk
     for unchanged in (P, grown):
-        after, same, change = tails.after(unchanged, dx, nothing, states, FIXED)
+        after, same, change = tails.update(unchanged, dx, nothing, states, FIXED)
         assert torch.equal(after.variance, tails.start) and torch.equal(same, unchanged) and torch.equal(change, dx)
     known, moved = 1e-6 * P, dx.clone()
     moved[:, k] = 0.2
-    error = nothing.updated(moved, states)
-    found, _, _ = tails.after(known, 0.25 * moved, error, states, FIXED)
+    error = nothing.update(moved, states)
+    found, _, _ = tails.update(known, 0.25 * moved, error, states, FIXED)
     assert float(found.variance) == pytest.approx((FREEDOM * 0.01 + 0.25**2) / (FREEDOM + 1), rel=1e-5)
-    back, _, _ = found.after(known, dx, nothing, states, FIXED)
+    back, _, _ = found.update(known, dx, nothing, states, FIXED)
     assert torch.equal(back.variance, found.variance)
-    most, _, _ = tails.after(known, 9 * moved, error, states, FIXED)
+    most, _, _ = tails.update(known, 9 * moved, error, states, FIXED)
     assert float(most.variance) == pytest.approx(MOST**2 * 0.01)
-    alone, _, _ = tails.after(known, moved, error, states, ~FIXED)
+    alone, _, _ = tails.update(known, moved, error, states, ~FIXED)
     assert torch.equal(alone.variance, tails.start)
 
 

@@ -89,7 +89,7 @@ def test_segments_of_a_batch_do_not_touch_each_other():
         model = lively(small(outage_mode=mode))
         together = integrate(batch, model)
         for i in range(5):
-            alone = integrate(batch.select(torch.tensor([i])).trimmed(), model)
+            alone = integrate(batch.select(torch.tensor([i])).trim(), model)
             assert (alone.posterior.p_n[0] - together.posterior.p_n[i]).abs().max() < 2e-3
             assert (alone.imu_error[0] - together.imu_error[i]).abs().max() < 1e-5
 
@@ -177,7 +177,7 @@ def test_features_take_the_sizes_of_training_segments_and_keep_them(tmp_path):
     batches = [single(scene(20, 30, seed=9))]
     model = small(frame="heading", outage_mode="run")
     model.learn_sizes(batches)
-    with model.recording() as seen, torch.inference_mode():
+    with model.record_inputs() as seen, torch.inference_mode():
         integrate(batches[0], model)
     scaled = model.scaling(*(torch.cat(x) for x in zip(*seen)))
     spread = scaled[1].std(0)

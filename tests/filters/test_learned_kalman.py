@@ -8,7 +8,7 @@ import torch
 from dlkf.base.errors import InputError
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Covariances, integrate
-from dlkf.filters.learned_kalman import LearnedKalmanConfig, LearnedKalmanFilter, _with_gain
+from dlkf.filters.learned_kalman import LearnedKalmanConfig, LearnedKalmanFilter, _add_gain
 from dlkf.filters.saved import load_filter, save_filter
 from dlkf.filters.tuning import Prior, Tuning
 
@@ -79,7 +79,7 @@ def test_covariance_with_a_further_gain_is_that_of_joseph_s_form():
     E[:, :9, :6] = further
     optimal = joseph(K)
     known = Covariances(P, P, optimal, H[:, :6], R[:, :6], random(2, n))
-    assert torch.allclose(_with_gain(optimal, further, known), joseph(K + E), rtol=1e-9, atol=1e-9)
+    assert torch.allclose(_add_gain(optimal, further, known), joseph(K + E), rtol=1e-9, atol=1e-9)
 
 
 def test_a_wrong_gain_makes_the_filter_less_sure():

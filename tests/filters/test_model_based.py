@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from dlkf.base.errors import InputError
 from dlkf.filters.build import MODEL_BASED, build_filter
 from dlkf.filters.integration import integrate
-from dlkf.filters.kalman_update import _solved, _updated, kalman_prediction, kalman_update
+from dlkf.filters.kalman_update import _compute_update, _solve, kalman_prediction, kalman_update
 from dlkf.filters.model_based import Ins, Mbkf, bias_sigma
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.error_model import antenna
@@ -59,7 +59,7 @@ def test_gradient_of_the_update_is_that_of_its_steps():
         (of_prior, *others) = torch.autograd.grad((dx * of_dx).sum() + (P * of_P).sum(), given)
         return torch.lerp(of_prior, of_prior.mT, 0.5), *others
 
-    for got, expected in zip(gradients(kalman_update), gradients(_updated), strict=True):
+    for got, expected in zip(gradients(kalman_update), gradients(_compute_update), strict=True):
         assert torch.allclose(got, expected, rtol=1e-9, atol=1e-10)  # rounding: S is conditioned to some 1e3
 
 
@@ -192,7 +192,7 @@ def test_late_fix_is_compared_at_its_own_time():
     rows, state = [], batch.start
     for t in range(batch.size[1]):
         window = strapdown(state, batch.imu[:, t], batch.dt, batch.frame)
-        at = window.before(shifted.gnss_lag[:, t], batch.dt)
+        at = window.interpolate_before(shifted.gnss_lag[:, t], batch.dt)
         rows.append(torch.cat((at.p_n, at.v_n), -1))
         state = window.end
     shifted = replace(shifted, gnss=torch.stack(rows, 1))
@@ -209,7 +209,7 @@ def test_h_of_a_late_fix_matches_finite_differences():
     for i in range(6):
         dx = torch.zeros(4, 15, dtype=torch.float64)
         dx[:, i] = 1e-3
-        moved = integrate(replace(batch, start=batch.start.corrected(dx[:, :9])), Mbkf(IMU))
+        moved = integrate(replace(batch, start=batch.start.correct(dx[:, :9])), Mbkf(IMU))
         change = (moved.innovation - solution.innovation)[:, 0]
         # left out on purpose: gravity's gradient and Coriolis between the fix and the end, 3e-4 of dx
         assert (change + (H @ Phi @ dx.unsqueeze(-1)).squeeze(-1)).abs().max() < 1e-6, i
@@ -328,14 +328,14 @@ def test_compiled_solution_is_that_of_the_tensor_form():
     A, X = (torch.randn(5, 7, n, generator=g, dtype=torch.float64) for n in (7, 3))
     S = A @ A.mT + torch.eye(7, dtype=torch.float64)
     with torch.no_grad():
-        assert torch.allclose(S @ _solved(S, X), X, rtol=0, atol=1e-12)
-    assert torch.allclose(S @ _solved(S, X), X, rtol=0, atol=1e-12)
+        assert torch.allclose(S @ _solve(S, X), X, rtol=0, atol=1e-12)
+    assert torch.allclose(S @ _solve(S, X), X, rtol=0, atol=1e-12)
 
 
 def test_what_cannot_be_solved_is_not_finite_and_no_error():
     S, X = torch.zeros(1, 2, 2, dtype=torch.float64), torch.ones(1, 2, 3, dtype=torch.float64)
     with torch.no_grad():
-        assert not _solved(S, X).isfinite().any()
+        assert not _solve(S, X).isfinite().any()
 
 
 @pytest.mark.parametrize("name", ["mbkf15", "mbkf33_car"])

@@ -12,9 +12,9 @@ from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import integrate
 from dlkf.filters.model_based import has_covariance
 from dlkf.filters.plus import PlusConfig, PlusFilter
-from dlkf.filters.saved import learned_filter, learned_settings, load_filter, save_filter
+from dlkf.filters.saved import build_learned_filter, load_filter, parse_learned_settings, save_filter
 from dlkf.filters.smoother import smooth
-from dlkf.networks.plus import bounded, window_features
+from dlkf.networks.plus import bound_factor, window_features
 
 from .scene import scene
 
@@ -114,7 +114,7 @@ def test_gradient_reaches_the_noise(claimed):
 
 def test_factors_are_bounded_and_begin_with_the_slope_of_exp():
     x = torch.tensor([-50.0, 0.0, 50.0], requires_grad=True)
-    y = bounded(x, 2.0)
+    y = bound_factor(x, 2.0)
     (gradient,) = torch.autograd.grad(y.sum(), x)
     assert y.tolist() == pytest.approx([torch.e**-2, 1.0, torch.e**2]) and float(gradient[1]) == 1.0
 
@@ -160,7 +160,7 @@ def test_it_can_be_smoothed():
 )
 def test_mistakes_are_one_line(settings, words):
     with pytest.raises(InputError, match=words):
-        learned_filter(learned_settings(settings))
+        build_learned_filter(parse_learned_settings(settings))
 
 
 class Judged:

@@ -36,7 +36,7 @@ class Watched:
         kalman, correction = self.kalman.step(kalman, epoch)
         end = epoch.window.end
         window = epoch.window._replace(end=end._replace(v_n=self.speed * end.v_n))
-        self.errors.append(errors.after(epoch._replace(window=window), correction.covariances))
+        self.errors.append(errors.update(epoch._replace(window=window), correction.covariances))
         return (kalman, self.errors[-1]), correction
 
 
@@ -115,7 +115,7 @@ def test_the_stated_1σ_of_a_position_has_what_no_filter_averages():
     """Claimed are 2 m: of a constant error nearly all, of white noise little; the other states keep theirs."""
     std = torch.full((8, 15), 0.3, dtype=torch.float64)
     white = STD * torch.randn(8, 300, 3, generator=torch.Generator().manual_seed(3)).double()
-    constant, noisy = (watched(x).errors[-1].stated(std) for x in (torch.ones(8, 300, 3).double(), white))
+    constant, noisy = (watched(x).errors[-1].add_slow_std(std) for x in (torch.ones(8, 300, 3).double(), white))
     assert torch.allclose(constant[:, :3], constant.new_tensor((0.3**2 + 0.94 * STD**2) ** 0.5), rtol=0.03)
     assert noisy[:, :2].mean() < 0.9 and (constant[:, 3:] == 0.3).all() and constant.shape == std.shape
 

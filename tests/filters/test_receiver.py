@@ -16,7 +16,7 @@ from dlkf.data.store import load_dataset
 from dlkf.filters.aids.attach import aid_columns
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Epoch, Fix, integrate
-from dlkf.filters.receiver import ARM, DELAY, DRIFT, PPM, let_delay_grow, predict_fix, with_drift
+from dlkf.filters.receiver import ARM, DELAY, DRIFT, PPM, add_drift, let_delay_grow, predict_fix
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.error_model import antenna
 from dlkf.navigation.strapdown import strapdown
@@ -138,7 +138,7 @@ def test_a_delay_that_grows_is_one_transition():
     T[states.of(DELAY).start, states.of(DRIFT).start] = 30.0 * PPM
     P, grown = let_delay_grow(A @ A.mT, x, states, 30.0)
     assert torch.allclose(P, T @ A @ A.mT @ T.mT) and torch.equal(
-        with_drift(torch.eye(len(T)).double()[None], states, 30.0)[0], T
+        add_drift(torch.eye(len(T)).double()[None], states, 30.0)[0], T
     )
     of_receiver = T[states.of_others, states.of_others]
     assert torch.allclose(grown, x @ of_receiver.mT)

@@ -89,8 +89,8 @@ class Watched(CarConstraints):
     used: bool = True
     seen: list[torch.Tensor] = field(default_factory=list)
 
-    def resting(self, epoch, turning, prediction, memory):
-        found, level = super().resting(epoch, turning, prediction, memory)
+    def detect_rest(self, epoch, turning, prediction, memory):
+        found, level = super().detect_rest(epoch, turning, prediction, memory)
         self.seen.append(found)
         return found & self.used, level
 

@@ -19,7 +19,7 @@ from dlkf.navigation.attitude import rotation_from_rpy, rotation_from_vector
 from dlkf.navigation.state import ACCEL, ATTITUDE, NavState
 from dlkf.navigation.strapdown import strapdown
 from dlkf.onboard.compiled_filter import compile_filter
-from dlkf.onboard.library import compiler
+from dlkf.onboard.library import find_compiler
 
 from .scene import IMU, M, beside, scene
 from .test_constraints import driven, outage, slipping
@@ -47,8 +47,8 @@ class Watched(CarConstraints):
 
     found: ClassVar[list[torch.Tensor]] = []
 
-    def resting(self, epoch, turning, prediction, memory):
-        resting, liveliness = super().resting(epoch, turning, prediction, memory)
+    def detect_rest(self, epoch, turning, prediction, memory):
+        resting, liveliness = super().detect_rest(epoch, turning, prediction, memory)
         self.found.append(resting)
         return resting, liveliness
 
@@ -176,7 +176,7 @@ def test_the_level_is_that_of_a_second_whatever_the_update_interval():
         cut = in_parts(batch, per_second) if per_second > 1 else batch
         second, levels = LastSecond.begin(cut), []
         for k in range(cut.size[1]):
-            second, level, mean = second.after(cut.imu[:, k], cut.dt)
+            second, level, mean = second.update(cut.imu[:, k], cut.dt)
             assert level is not None
             levels.append(level)
         torch.testing.assert_close(torch.stack(levels, 1)[:, per_second - 1 :: per_second], torch.from_numpy(expected))
@@ -186,7 +186,7 @@ def test_the_level_is_that_of_a_second_whatever_the_update_interval():
         whole = replace(batch, imu=torch.zeros(2, 3, rate, 6, dtype=D), dt=1 / rate)
         assert LastSecond.begin(whole).means is None
     slow = replace(batch, imu=batch.imu.mean(2, keepdim=True), dt=1.0)
-    assert LastSecond.begin(slow).after(slow.imu[:, 0], 1.0)[1] is None
+    assert LastSecond.begin(slow).update(slow.imu[:, 0], 1.0)[1] is None
 
 
 def positions_alone(batch: Batch) -> Batch:
@@ -270,7 +270,7 @@ def test_shorter_update_intervals_find_the_same_standstills():
 
 
 @pytest.mark.whole
-@pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 def test_the_last_second_is_the_same_in_c():
     """Update intervals of a fifth, whose means are kept from one to the next; a stop in an outage."""
     batch, kalman = in_parts(shaken((0.02, 2e-4), (0.2, 8e-3), SWAY)), build_filter("mbkf21_car", IMU)
@@ -307,8 +307,8 @@ def test_one_sample_an_epoch_has_no_spread():
     heard: list[VibrationLevel] = []
 
     class Hearing(CarConstraints):
-        def resting(self, epoch, turning, prediction, memory):
-            resting, liveliness = super().resting(epoch, turning, prediction, memory)
+        def detect_rest(self, epoch, turning, prediction, memory):
+            resting, liveliness = super().detect_rest(epoch, turning, prediction, memory)
             heard.append(liveliness)
             assert not resting.any()
             return resting, liveliness

@@ -31,7 +31,7 @@ from dlkf.filters.vibration_spectrum import (
     lines,
     log_likelihood,
     log_power,
-    shape,
+    remove_trend,
     shifts,
     tone_shares,
 )
@@ -113,7 +113,7 @@ def memory(batch) -> VibrationMemory:
             used = batch.gnss_valid[:, k] & batch.available[:, k, None]
             fix = Fix(batch.gnss[:, k], batch.gnss_std[:, k], used, None)
             carried, step = advance(
-                kalman, carried, state, error, batch.imu[:, k], fix, dt=batch.dt, frame=batch.frame.prepared(),
+                kalman, carried, state, error, batch.imu[:, k], fix, dt=batch.dt, frame=batch.frame.prepare(),
                 lever_arm_b=None,
             )  # fmt: skip
             state, error = step.posterior, step.error
@@ -148,7 +148,7 @@ def test_a_shape_has_no_trend_and_no_size():
     power, weight = log_power(0.3 * made(4, 1, 6, WAVES) + 1), torch.ones(1, LINES).double()
     share = torch.log(lines(power) / LEAST) / math.log(float(lines(power)[-1]) / LEAST)
     again = power + 4 + 1.4 * torch.cos(math.pi * share) - 0.8 * torch.cos(3 * math.pi * share)
-    assert torch.allclose(shape(power, weight), shape(again, weight), atol=1e-4)
+    assert torch.allclose(remove_trend(power, weight), remove_trend(again, weight), atol=1e-4)
 
 
 def test_lines_count_between_two_frequencies_in_time():
@@ -191,11 +191,11 @@ def test_a_mean_of_few_blocks_is_drawn_towards_nothing():
     mean, one = Mean.begin(torch.zeros(1).double(), 1, 3), torch.ones(1).double()
     y, weight = torch.full((1, 6, 3), 2.0).double(), torch.tensor([[1.0, 0.5, 0.0]]).double()
     for _ in range(10):
-        mean = mean.after(y, weight, one)
+        mean = mean.update(y, weight, one)
     n = sum((1 - 1 / MEMORY) ** k for k in range(10))  # blocks, of which older ones count less
     expected = torch.tensor([2 * n / (n + FEW), n / (0.5 * n + FEW), 0.0]).double()
     assert torch.allclose(mean.value, expected.expand(1, 6, 3), atol=1e-6) and 1.3 < float(expected[0]) < 1.4
-    assert torch.equal(mean.after(y, weight, 0 * one).value, mean.value)
+    assert torch.equal(mean.update(y, weight, 0 * one).value, mean.value)
 
 
 def source():

@@ -35,7 +35,7 @@ class Watched:
         factors = epoch.z.new_ones(len(epoch.z), 4, 3)
         factors[:, 1] = self.gyro_factor
         scale = source_scale(factors, epoch.start.C_nb)
-        outage = outage.after(epoch, correction.covariances, kalman.windows, scale)
+        outage = outage.update(epoch, correction.covariances, kalman.windows, scale)
         self.outages.append(outage)
         return (kalman, outage), correction
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dlkf.data.aid_tables import STANDARD
-from dlkf.diagnosis.matched_drives import MatchedDrives, matched_batch
+from dlkf.diagnosis.matched_drives import MatchedDrives, make_matched_batch
 from dlkf.filters.aids.attach import aid_columns, with_aids
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
@@ -127,7 +127,7 @@ def _coarse(batch, count):
 
 def test_an_hour_without_gnss_keeps_state_and_covariance_sane():
     """A tunnel from the first minute on, IMU at 10 Hz and updates every 20 s: nothing grows that a wheel knows."""
-    batch = _coarse(matched_batch(MatchedDrives(drives=2, minutes=60, rate_hz=10, seed=3), IMU)[0], 20)
+    batch = _coarse(make_matched_batch(MatchedDrives(drives=2, minutes=60, rate_hz=10, seed=3), IMU)[0], 20)
     batch = replace(batch, available=(torch.arange(batch.size[1]) < 3).expand(2, -1))
     forward = (batch.truth.C_nb[..., 0] * batch.truth.v_n).sum(-1)
     zero = torch.zeros_like(forward)

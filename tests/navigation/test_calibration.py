@@ -29,7 +29,7 @@ def test_correcting_undoes_the_error_and_at_names_it(matrix):
     error, M = errors(matrix)
     true = torch.randn(3, 20, 6, generator=torch.Generator().manual_seed(4), dtype=D)
     measured = true + torch.einsum("bij,bmj->bmi", M, true) + error.bias[:, None]
-    torch.testing.assert_close(error.corrected(measured), true, rtol=0, atol=1e-12)
+    torch.testing.assert_close(error.correct(measured), true, rtol=0, atol=1e-12)
     torch.testing.assert_close(error.at(true.mean(1)), (measured - true).mean(1), rtol=0, atol=1e-12)
 
 
@@ -38,4 +38,4 @@ def test_gradient_through_full_matrices_is_the_numerical_one():
     error, _ = errors("full")
     raw = torch.randn(3, 5, 6, generator=torch.Generator().manual_seed(5), dtype=D)
     given = [x.requires_grad_() for x in error if x is not None]
-    assert torch.autograd.gradcheck(lambda *parts: ImuError(*parts).corrected(raw), given)
+    assert torch.autograd.gradcheck(lambda *parts: ImuError(*parts).correct(raw), given)

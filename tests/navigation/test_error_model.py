@@ -61,7 +61,7 @@ def test_transition_matches_finite_differences(seed, matrix, earth):
     states = ErrorStates(matrix)
     n = states.count
     error = ImuError(torch.full((1, 6), 0.01, dtype=torch.float64))
-    corrected = error.corrected(raw)
+    corrected = error.correct(raw)
     window = strapdown(state, corrected, DT, frame)
     Phi = model_of(frame, states).transition(state, window, corrected, frame)[0]
     steps = torch.full((n,), 1e-4, dtype=torch.float64)
@@ -72,8 +72,8 @@ def test_transition_matches_finite_differences(seed, matrix, earth):
         for sign in (1, -1):
             dx = torch.zeros(1, n, dtype=torch.float64)
             dx[0, i] = sign * steps[i]
-            true_imu = error.updated(dx, states).corrected(raw)
-            ends.append(window.end.error_to(strapdown(state.corrected(dx[:, :9]), true_imu, DT, frame).end)[0])
+            true_imu = error.update(dx, states).correct(raw)
+            ends.append(window.end.error_to(strapdown(state.correct(dx[:, :9]), true_imu, DT, frame).end)[0])
         numeric[:9, i] = (ends[0] - ends[1]) / (2 * steps[i])
     off = (Phi - numeric).abs()
     for row, tolerances in LEFT_OUT[earth].items():
@@ -165,8 +165,8 @@ def test_measurement_matrix_matches_finite_differences():
     for i in range(15):
         dx = torch.zeros(1, 15, dtype=torch.float64)
         dx[0, i] = step
-        ahead = antenna(state.corrected(dx[:, :9]), rate - dx[:, 12:], arm, frame)
-        behind = antenna(state.corrected(-dx[:, :9]), rate + dx[:, 12:], arm, frame)
+        ahead = antenna(state.correct(dx[:, :9]), rate - dx[:, 12:], arm, frame)
+        behind = antenna(state.correct(-dx[:, :9]), rate + dx[:, 12:], arm, frame)
         numeric = (ahead - behind)[0] / (2 * step)
         # the rate's own error enters with +Ĉ[l×]: truth − estimate of (ω − ζ)×l is l×ζ
         assert (numeric - H[0, :, i]).abs().max() < 1e-6, i

@@ -141,9 +141,10 @@ def test_state_between_samples():
     frame, imu, state = frame_at(), lively_imu(1, M), start(1)
     window = strapdown(state, imu, DT, frame)
     lag = torch.tensor([10.5 * DT], dtype=torch.float64)
-    between = window.before(lag, DT)
+    between = window.interpolate_before(lag, DT)
     assert torch.allclose(between.p_n, (window.p_n[:, -11] + window.p_n[:, -12]) / 2)
-    assert torch.allclose(window.before(torch.zeros(1, dtype=torch.float64), DT).C_nb, window.end.C_nb, atol=1e-9)
+    at_end = window.interpolate_before(torch.zeros(1, dtype=torch.float64), DT)
+    assert torch.allclose(at_end.C_nb, window.end.C_nb, atol=1e-9)
 
 
 def test_python_ins_agrees_on_a_minute_of_driving():

@@ -7,14 +7,14 @@ import torch
 
 from dlkf.data.aid_tables import STANDARD
 from dlkf.data.store import drive_from_tables, drive_rows
-from dlkf.data.validate import read_checked
+from dlkf.data.validate import read_drive
 from dlkf.filters.aids.attach import with_aids
 from dlkf.filters.build import build_filter
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.onboard.c_source import write_source
-from dlkf.onboard.functions import Grid, carried_state, output_numbers
+from dlkf.onboard.functions import Grid, count_output_numbers, make_layout
 from dlkf.onboard.library import LIBRARY, Library, build
-from dlkf.onboard.recording import exporting
+from dlkf.onboard.recording import export_mode
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
 from dlkf.simulation.sensors import BaroConfig, HeadingConfig, SensorsConfig, WheelConfig
@@ -43,7 +43,7 @@ def tables(once):
     dataset = once(
         "onboard_town", lambda folder: simulate_dataset(config, IMU, 0, folder / "data", progress=False, workers=1)
     ) / "data"  # fmt: skip
-    return read_checked(dataset, drive_rows(dataset)[0], reference=False)
+    return read_drive(dataset, drive_rows(dataset)[0], reference=False)
 
 
 @pytest.fixture(scope="session")
@@ -63,10 +63,10 @@ def exported(once):
 
     folder = once("exported", made)
     layout = layout_of(estimator)
-    return folder, estimator, layout, Library(folder / LIBRARY, layout.size, output_numbers(estimator))
+    return folder, estimator, layout, Library(folder / LIBRARY, layout.size, count_output_numbers(estimator))
 
 
 def layout_of(estimator):
     """Of the memory."""
-    with exporting():
-        return carried_state(estimator, GRID)
+    with export_mode():
+        return make_layout(estimator, GRID)

@@ -21,7 +21,7 @@ import torch
 from pipelines.studies.compiled_step import IMU, model_of
 
 from dlkf.data.store import drive_rows
-from dlkf.data.validate import CheckedTables, read_checked
+from dlkf.data.validate import CheckedTables, read_drive
 from dlkf.onboard.c_source import EXAMPLES, write_source
 from dlkf.onboard.check import Latency, write_log
 from dlkf.onboard.core import Core
@@ -66,7 +66,7 @@ def a_drive(folder: Path, minutes: float) -> CheckedTables:
     gnss = GnssConfig(lever_arm_b=ARM)
     config = DatasetConfig("one", hours=minutes / 60, drive_minutes=minutes, gnss=gnss)
     data = simulate_dataset(config, IMU, 0, folder / "data", progress=False, workers=1)
-    return read_checked(data, drive_rows(data)[0], reference=False)
+    return read_drive(data, drive_rows(data)[0], reference=False)
 
 
 def first(tables: CheckedTables, seconds: float) -> CheckedTables:

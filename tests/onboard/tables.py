@@ -18,7 +18,7 @@ from pipelines.studies.compiled_step import model_of
 
 from dlkf.data.aid_tables import STANDARD
 from dlkf.data.store import drive_rows
-from dlkf.data.validate import read_checked
+from dlkf.data.validate import read_drive
 from dlkf.filters.aids.attach import with_aids
 from dlkf.filters.build import build_filter
 from dlkf.onboard.c_source import write_source
@@ -56,7 +56,7 @@ def faults(folder: Path) -> None:
         "town", hours=1 / 60, drive_minutes=1.0, gnss=GnssConfig(lever_arm_b=ARM), sensors=SENSORS
     )  # the drive of the tests
     data = simulate_dataset(config, IMU, 0, folder / "data", progress=False, workers=1)
-    sent = calls(read_checked(data, drive_rows(data)[0], reference=False))
+    sent = calls(read_drive(data, drive_rows(data)[0], reference=False))
     estimator = with_aids(build_filter(KIND, IMU), STANDARD.values())
     library = exported(folder, estimator)
     for name, (fault, _) in FAULTS.items():
@@ -78,7 +78,7 @@ def logs(folder: Path, model: str) -> None:
         samples, intervals, squares, differing = 0, Counter(), 0.0, 0
         rows = drive_rows(REAL / dataset)
         for row in rows:
-            tables = read_checked(REAL / dataset, row, reference=False)
+            tables = read_drive(REAL / dataset, row, reference=False)
             arm = tables.row.lever_arm_b
             python, c = both(StreamingFilter(estimator, lever_arm_b=arm), Core(library, arm), calls(tables))
             samples += len(tables.imu["t"])

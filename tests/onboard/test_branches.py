@@ -10,11 +10,11 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from dlkf.filters.branches import chosen
-from dlkf.onboard.library import compiler
+from dlkf.filters.branches import select_branch
+from dlkf.onboard.library import find_compiler
 from tests.onboard.translated import lines_within, translate
 
-pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 BRANCH = re.compile(r"^ *if \((x|in)\d+\[0\]\) \{", re.MULTILINE)
 COUNT = 400  # numbers, so many that an exponential of them is worth a branch
 GOOD = torch.linspace(-2, 3, COUNT, dtype=torch.float64)[None]
@@ -38,7 +38,7 @@ class Choice(nn.Module):
         return torch.tensor([1.0]).double(), torch.tensor([-1.0]).double(), GOOD
 
     def forward(self, s, t, x):
-        return chosen(s > 0, x.exp() + 1, 2 * x)
+        return select_branch(s > 0, x.exp() + 1, 2 * x)
 
 
 class Several(Choice):
@@ -48,7 +48,7 @@ class Several(Choice):
 
     def forward(self, s, t, x):
         shared = x.exp()
-        first, second = chosen(s > 0, Pair(shared + 1, shared * x), Pair(x, 0 * x))
+        first, second = select_branch(s > 0, Pair(shared + 1, shared * x), Pair(x, 0 * x))
         return torch.cat((first, second.cumsum(-1), torch.where((s > 0)[:, None], (-x).exp() + first, x)))
 
 
@@ -59,7 +59,7 @@ class OfTwo(Choice):
 
     def forward(self, s, t, x):
         y = x.exp()
-        return torch.cat((chosen(s > 0, y, x), chosen(t > 0, y, x)))
+        return torch.cat((select_branch(s > 0, y, x), select_branch(t > 0, y, x)))
 
 
 class Either(Choice):
@@ -69,7 +69,7 @@ class Either(Choice):
 
     def forward(self, s, t, x):
         y = x.exp()
-        return torch.cat((chosen(s > 0, y, x), chosen(s > 0, x, y)))
+        return torch.cat((select_branch(s > 0, y, x), select_branch(s > 0, x, y)))
 
 
 class OfItself(Choice):
@@ -80,7 +80,7 @@ class OfItself(Choice):
     def forward(self, s, t, x):
         y = (s * x).exp()
         large = y.mean(1) > 3
-        return torch.cat((chosen(large, y, x), chosen(large, (y - 30).exp() + y, x)))
+        return torch.cat((select_branch(large, y, x), select_branch(large, (y - 30).exp() + y, x)))
 
 
 class Truth(Choice):
@@ -100,8 +100,8 @@ class Inner(Choice):
 
     def forward(self, s, t, x):
         y = x.exp()
-        within = chosen(t * y.nan_to_num().mean(1) > 0, (-y).exp(), (x - 1).exp())
-        return chosen(s > 0, within + 1, x)
+        within = select_branch(t * y.nan_to_num().mean(1) > 0, (-y).exp(), (x - 1).exp())
+        return select_branch(s > 0, within + 1, x)
 
 
 class Inwards(Choice):
@@ -110,8 +110,8 @@ class Inwards(Choice):
     branches, inside = 2, 3
 
     def forward(self, s, t, x):
-        within = chosen(t > 0, (-x).exp(), (x - 1).exp())
-        return torch.cat((chosen(s > 0, within + 1, x), chosen(t > 0, (2 * x).exp(), x)))
+        within = select_branch(t > 0, (-x).exp(), (x - 1).exp())
+        return torch.cat((select_branch(s > 0, within + 1, x), select_branch(t > 0, (2 * x).exp(), x)))
 
 
 class Elsewhere(Choice):
@@ -121,7 +121,7 @@ class Elsewhere(Choice):
 
     def forward(self, s, t, x):
         y = x.exp()
-        return torch.cat((chosen(s > 0, (-y).exp() + y, x), y))
+        return torch.cat((select_branch(s > 0, (-y).exp() + y, x), y))
 
 
 class ThenUsed(Choice):
@@ -131,7 +131,7 @@ class ThenUsed(Choice):
 
     def forward(self, s, t, x):
         y = x.exp()
-        return chosen(s > 0, y, x) + y.sum()
+        return select_branch(s > 0, y, x) + y.sum()
 
 
 class Changed(Choice):
@@ -141,7 +141,7 @@ class Changed(Choice):
         z = 3 * x
         y = z.clone()
         y[:, 3:300] += x.exp()[:, 3:300]
-        return torch.cat((chosen(s > 0, y, z), z))
+        return torch.cat((select_branch(s > 0, y, z), z))
 
 
 class Copied(Choice):
@@ -151,7 +151,7 @@ class Copied(Choice):
 
     def forward(self, s, t, x):
         y = x * 2
-        return torch.cat((chosen(s > 0, y.clone(), y), chosen(s > 0, x.exp(), x)))
+        return torch.cat((select_branch(s > 0, y.clone(), y), select_branch(s > 0, x.exp(), x)))
 
 
 class Angles(Choice):
@@ -160,7 +160,8 @@ class Angles(Choice):
     branches = 2
 
     def forward(self, s, t, x):
-        return torch.cat((chosen(s > 0, x.exp() + x.sin(), x), x.cos(), chosen(s > 0, (x + 1).cos(), (x + 1).sin())))
+        first = select_branch(s > 0, x.exp() + x.sin(), x)
+        return torch.cat((first, x.cos(), select_branch(s > 0, (x + 1).cos(), (x + 1).sin())))
 
 
 class Products(Choice):
@@ -171,7 +172,7 @@ class Products(Choice):
     def forward(self, s, t, x):
         A = x.view(20, 20)
         P = (A @ A.mT).unsqueeze(0) + 50 * torch.eye(20)
-        return chosen(s > 0, torch.linalg.solve_ex(P, A.unsqueeze(0))[0], A.unsqueeze(0))
+        return select_branch(s > 0, torch.linalg.solve_ex(P, A.unsqueeze(0))[0], A.unsqueeze(0))
 
 
 class Little(Choice):
@@ -180,7 +181,7 @@ class Little(Choice):
     branches, outside, inside = 0, 1, 0
 
     def forward(self, s, t, x):
-        return chosen(s > 0, x[:, :9].exp(), x[:, :9])
+        return select_branch(s > 0, x[:, :9].exp(), x[:, :9])
 
 
 class Otherwise(Choice):
@@ -189,7 +190,7 @@ class Otherwise(Choice):
     branches, outside, inside = 0, 1, 0
 
     def forward(self, s, t, x):
-        return chosen(s > 0, x, x.exp())
+        return select_branch(s > 0, x, x.exp())
 
 
 class Drives(Choice):
@@ -266,8 +267,8 @@ class Random(Choice):
                 case 6:
                     truths.append(a.mean(1) > b.mean(1))
                 case _:
-                    made.append(chosen(on, a, b))
-        return torch.cat((*made[-3:], chosen(s > 0, made[-4], x)))
+                    made.append(select_branch(on, a, b))
+        return torch.cat((*made[-3:], select_branch(s > 0, made[-4], x)))
 
 
 def test_random_functions_have_the_values_of_torch(tmp_path):

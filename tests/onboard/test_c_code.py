@@ -7,11 +7,11 @@ import torch
 from torch import nn
 
 from dlkf.base.errors import InputError
-from dlkf.onboard.c_source import function_in_c
-from dlkf.onboard.library import compiler
+from dlkf.onboard.c_source import translate_function
+from dlkf.onboard.library import find_compiler
 from tests.onboard.translated import translate
 
-pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 
 
 class Sums(nn.Module):
@@ -149,7 +149,7 @@ def test_an_unknown_operation_is_named():
             return torch.sort(x)[0]
 
     with torch.no_grad(), pytest.raises(InputError, match=r"aten\.sort.*does not know"):
-        function_in_c("tested", Sorted())
+        translate_function("tested", Sorted())
 
 
 @pytest.mark.parametrize("other", [{"stride": 2}, {"dilation": 2}, {"groups": 2}])
@@ -159,4 +159,4 @@ def test_a_convolution_that_is_not_the_plain_one_is_refused(other):
             return nn.functional.conv1d(x, torch.ones(2, 4 // other.get("groups", 1), 3).double(), **other)
 
     with torch.no_grad(), pytest.raises(InputError, match="stride, dilation and groups 1"):
-        function_in_c("tested", Other())
+        translate_function("tested", Other())

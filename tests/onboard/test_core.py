@@ -10,13 +10,13 @@ import pytest
 
 from dlkf.data.aids import pressure_height
 from dlkf.onboard.core import Core, Status, Waiting
-from dlkf.onboard.library import compiler
+from dlkf.onboard.library import find_compiler
 from dlkf.running.streaming import StreamingFilter
 from tests.onboard.conftest import ARM
 from tests.onboard.faults import FAULTS, JUMPS, JUMPS_LATE
 from tests.onboard.streams import Trunk, apart, calls, through_core
 
-pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 OTHERS = "TAKEN", "REPLAYED", "SUPERSEDED", "RESTARTED", "DIVERGED", "LOST", "SPIKE"
 REFUSED = set(Status) - {Status[x] for x in OTHERS}
 ROUNDING = 1e-6  # m, m/s, rad: sums in another order over a minute
@@ -75,4 +75,4 @@ def test_samples_of_sensors_that_cannot_be_taken(exported):
     assert core.counts == {Status.NO_SENSOR: 1, Status.OUTSIDE: 1, Status.NOT_FINITE: 1, Status.TAKEN: 1}
     height = core._library.dlkf_pressure_height(95_000.0)
     assert height == pytest.approx(float(pressure_height(np.float64(95_000.0))), abs=1e-9) and 500 < height < 600
-    assert [core.says(x) for x in Status] and core.waiting is Waiting.SAMPLES and core.doubt == 1.0
+    assert [core.describe_status(x) for x in Status] and core.waiting is Waiting.SAMPLES and core.doubt == 1.0

@@ -27,27 +27,27 @@ from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.onboard import compiled_filter
 from dlkf.onboard.c_source import COLUMNS as CORE_COLUMNS
-from dlkf.onboard.c_source import EXAMPLES, columns_of, write_source
-from dlkf.onboard.check import difference, write_log
+from dlkf.onboard.c_source import EXAMPLES, list_columns, write_source
+from dlkf.onboard.check import measure_difference, write_log
 from dlkf.onboard.compiled_filter import CompiledFilter
 from dlkf.onboard.core import Core
-from dlkf.onboard.core_drives import core_drive
-from dlkf.onboard.functions import Turn, carried_state
-from dlkf.onboard.library import LIBRARY, Library, build, compiler
-from dlkf.onboard.meanings import of_column
-from dlkf.onboard.recording import exporting, record
+from dlkf.onboard.core_drives import run_core_drive
+from dlkf.onboard.functions import Turn, make_layout
+from dlkf.onboard.library import LIBRARY, Library, build, find_compiler
+from dlkf.onboard.meanings import describe_column
+from dlkf.onboard.recording import export_mode, record
 from dlkf.running.batched import run_filter
 from dlkf.running.estimate import estimates_table
 from dlkf.running.reanchoring import FrameChange, reanchor
 from dlkf.running.replay import UnalignedError, replay_drive, stream_drive
 from dlkf.running.solution import COLUMNS
-from dlkf.running.start import aligned_drives
+from dlkf.running.start import align_drives
 from dlkf.running.streaming import StreamingFilter
 from tests.onboard.conftest import ARM, GRID, IMU, QUICK
 from tests.onboard.streams import calls, through_core
 from tests.shell import PATIENCE_S
 
-pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 ROUNDING = 1e-6  # m, m/s, rad; sums in another order, and what a minute makes of that
 
 
@@ -60,7 +60,7 @@ def compiled(exported):
 
 def test_the_exported_filter_is_the_original(exported, tables, drive):
     _, estimator, _, library = exported
-    found = difference(estimator, library, tables, drive)
+    found = measure_difference(estimator, library, tables, drive)
     assert found.epochs > 40
     assert max(*found.largest.values(), found.std) < ROUNDING
 
@@ -72,7 +72,7 @@ def example(exported, tmp_path_factory):
     program = tmp_path_factory.mktemp("example") / "navigate"
     strict = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
     files = EXAMPLES / "navigate.c", folder / LIBRARY, "-o", program, "-lm"
-    subprocess.run([compiler(), *strict, f"-I{folder}", *files], check=True)
+    subprocess.run([find_compiler(), *strict, f"-I{folder}", *files], check=True)
     return program
 
 
@@ -138,7 +138,7 @@ def test_the_description_tells_every_number_of_the_memory(exported):
     folder, estimator, layout, _ = exported
     described = json.loads((folder / "step.json").read_text())
     assert sum(int(np.prod(f["shape"])) for f in described["memory"]["fields"]) == layout.size
-    assert [column["name"] for column in described["row"]] == list(columns_of(estimator))
+    assert [column["name"] for column in described["row"]] == list(list_columns(estimator))
     assert all(x.get("meaning") for x in (*described["row"], *described["memory"]["fields"]))
     assert described["row"][5] == {"name": "vel_n", "place": 5, "meaning": "velocity North [m/s]"}
     header = (folder / "step.h").read_text()
@@ -149,12 +149,12 @@ def test_the_description_tells_every_number_of_the_memory(exported):
 @pytest.mark.parametrize("kind", ["aekf_car_gated", "mbkf33_nhc_gated_gm", "dlkf", "plus"])
 def test_every_number_has_a_meaning(kind):
     made = {"dlkf": learned, "plus": talkative_plus}
-    layout = carried_state(made[kind]() if kind in made else build_filter(kind, IMU), GRID)
-    assert [f.name for f in layout.fields if not f.plain().get("meaning")] == []
+    layout = make_layout(made[kind]() if kind in made else build_filter(kind, IMU), GRID)
+    assert [f.name for f in layout.fields if not f.as_dict().get("meaning")] == []
 
 
 def test_columns_say_axis_and_unit():
-    said = {c: of_column(c) for c in CORE_COLUMNS}
+    said = {c: describe_column(c) for c in CORE_COLUMNS}
     assert said["std_gyro_error_z"] == "1σ of gyroscope error down, measured less true [rad/s]"
     assert said["innovation_std_pos_d"] == "1σ of fix less expected: position Down [m]"
     assert all(text.endswith("]") for c, text in said.items() if c not in ("revised", "gnss_used"))
@@ -164,7 +164,7 @@ def test_a_batch_through_the_compiled_filter(compiled, drive, monkeypatch):
     torch.manual_seed(0)
     ran, run = [], Library.run
     monkeypatch.setattr(Library, "run", lambda self, x, imu, fixes: (ran.append(len(imu)), run(self, x, imu, fixes))[1])
-    batch = aligned_drives([drive], ALIGN).select(torch.zeros(3, dtype=torch.int64))
+    batch = align_drives([drive], ALIGN).select(torch.zeros(3, dtype=torch.int64))
     available = torch.rand(batch.available.shape) < 0.7
     available[1, :20], available[2] = available[0, :20], available[0]  # what copies have in common is run once
     batch = replace(batch, available=available)
@@ -181,9 +181,9 @@ def test_a_batch_through_the_compiled_filter(compiled, drive, monkeypatch):
 def test_drives_of_unlike_length_through_the_compiled_filter(compiled, drive):
     """As each by itself; beyond its end a drive has no fix."""
     whole, half = ([drive.part(0, n)] for n in (drive.epochs, drive.epochs // 2))
-    both = run_filter(aligned_drives([*whole, *half], ALIGN), compiled)
+    both = run_filter(align_drives([*whole, *half], ALIGN), compiled)
     for row, one in enumerate((whole, half)):
-        alone = run_filter(aligned_drives(one, ALIGN), compiled)
+        alone = run_filter(align_drives(one, ALIGN), compiled)
         n = alone.used.shape[1]
         for name in ("std", "innovation_covariance"):
             mine, theirs = getattr(both, name)[row, :n], getattr(alone, name)[0]
@@ -209,15 +209,15 @@ def test_a_logged_drive_through_the_core_is_that_through_the_stream(exported, ta
     _, estimator, layout, library = exported
     in_c = CompiledFilter(estimator, GRID, layout, library, whole=True)
     grid = {"rate_hz": 50.0, "epoch_s": 1.0}
-    want, got = stream_drive(tables, estimator, **grid), core_drive(tables, in_c, **grid)
+    want, got = stream_drive(tables, estimator, **grid), run_core_drive(tables, in_c, **grid)
     assert list(got.table.columns) == list(want.table.columns) and got.table.gnss_used.dtype == bool
     np.testing.assert_allclose(got.table.to_numpy(float), want.table.to_numpy(float), rtol=1e-5, atol=ROUNDING)
     assert got.aligned_at == want.aligned_at and got.doubt == pytest.approx(want.doubt, rel=1e-6)
-    other = core_drive(tables, in_c, **grid, align=ALIGN)
+    other = run_core_drive(tables, in_c, **grid, align=ALIGN)
     assert other.doubt == 0.0 < got.doubt  # the course alone
     short = replace(tables, imu={c: x[:500] for c, x in tables.imu.items()})
     with pytest.raises(UnalignedError, match=r"never moves|no GNSS fix|is ambiguous"):
-        core_drive(short, in_c, **grid)
+        run_core_drive(short, in_c, **grid)
 
 
 def test_it_is_made_once_and_can_be_put_away(exported, tmp_path, monkeypatch):
@@ -240,8 +240,8 @@ def test_one_library_serves_every_preset_and_every_factor():
     recorded = []
     for imu, tuning in ((IMU, Tuning()), (other, changed)):
         estimator = build_filter("aekf_car_gated", imu, tuning=tuning)  # everything that has factors
-        with exporting():
-            turn = Turn(estimator, GRID, carried_state(estimator, GRID))
+        with export_mode():
+            turn = Turn(estimator, GRID, make_layout(estimator, GRID))
             graph = record(turn.eval())
         attributes = {node.target: getattr(graph, node.target) for node in graph.graph.nodes if node.op == "get_attr"}
         code = graph.code, {name: x.tolist() for name, x in attributes.items()}  # what C is written from
@@ -251,7 +251,7 @@ def test_one_library_serves_every_preset_and_every_factor():
 
 def test_noise_goes_with_the_drive_into_another_frame(drive):
     loud, quiet = (build_filter("mbkf15", IMU, tuning=Tuning(accel_noise=x)) for x in (9.0, 1.0))
-    batch = aligned_drives([drive], ALIGN)
+    batch = align_drives([drive], ALIGN)
     memory, other = loud.begin(batch)[0], quiet.begin(batch)[0]
     moved = reanchor(memory, FrameChange(batch.frame, batch.frame), other)
     assert torch.equal(moved.windows.spread, memory.windows.spread)
@@ -260,7 +260,7 @@ def test_noise_goes_with_the_drive_into_another_frame(drive):
 
 def test_a_span_of_positions_begins_anew_in_another_frame(drive):
     """Its places are in the axes of the old one."""
-    kalman, batch = build_filter("mbkf15_nhc", IMU), aligned_drives([drive], ALIGN)
+    kalman, batch = build_filter("mbkf15_nhc", IMU), align_drives([drive], ALIGN)
     fresh = kalman.begin(batch)[0]
     (index,) = (k for k, x in enumerate(fresh.sources) if hasattr(x, "liveliness"))
     car = fresh.sources[index]
@@ -273,10 +273,10 @@ def test_a_span_of_positions_begins_anew_in_another_frame(drive):
 
 def test_what_does_not_fit_is_refused_in_a_line(compiled, drive, monkeypatch, tmp_path):
     with pytest.raises(InputError, match="compiled for 50 samples"):
-        compiled.begin(aligned_drives([drive_with(drive, 25)], ALIGN))
+        compiled.begin(align_drives([drive_with(drive, 25)], ALIGN))
     with pytest.raises(InputError, match="smoothed"):
         compiled_filter.compile_filter(build_filter("mbkf15_rts", IMU), 50.0, 1.0)
-    monkeypatch.setattr("dlkf.onboard.library.compiler", lambda: None)
+    monkeypatch.setattr("dlkf.onboard.library.find_compiler", lambda: None)
     with pytest.raises(InputError, match="no C compiler"):
         build(tmp_path)
 
@@ -315,10 +315,10 @@ def talkative_plus() -> PlusFilter:
 
 def test_many_drives_through_a_large_network_go_through_torch(drive, monkeypatch):
     model = learned()
-    layout = carried_state(model, GRID)
+    layout = make_layout(model, GRID)
     monkeypatch.setattr(compiled_filter, "LARGE", sum(p.numel() for p in model.parameters()) - 1)
     in_c = CompiledFilter(model, GRID, layout, None)  # would be called for fewer
-    batch = aligned_drives([drive], ALIGN)
+    batch = align_drives([drive], ALIGN)
     with pytest.raises(AttributeError, match="run"):
         run_filter(batch, in_c)
     many = batch.select(torch.zeros(compiled_filter.MANY, dtype=torch.int64))
@@ -330,7 +330,7 @@ def test_ten_hours_with_one_call_in_twenty_faulty(exported, tmp_path):
     """36,000 update intervals in C, allocations counted by the program's own allocator; it still knows where it is."""
     folder, *_ = exported
     files = Path(__file__).with_name("ten_hours.c"), folder / LIBRARY, "-o", tmp_path / "go", "-lm"
-    subprocess.run([compiler(), "-O2", f"-I{folder}", *files], check=True)
+    subprocess.run([find_compiler(), "-O2", f"-I{folder}", *files], check=True)
     message = {"capture_output": True, "text": True, "check": True}
     said = subprocess.run([tmp_path / "go"], env={"LD_LIBRARY_PATH": str(folder)}, timeout=PATIENCE_S, **message).stdout
     rows, faults, allocations, more_kB, off = (float(x) for x in re.findall(r"[\d.]+(?= )", said))
@@ -405,6 +405,6 @@ KINDS = [
 def test_every_kind_of_filter(estimator, tables, drive, tmp_path):
     model = estimator()
     layout = write_source(tmp_path, model, GRID, "tested", {})
-    found = difference(model, Library(build(tmp_path, flags=QUICK), layout.size), tables, drive)
+    found = measure_difference(model, Library(build(tmp_path, flags=QUICK), layout.size), tables, drive)
     single = isinstance(model, torch.nn.Module)  # a network's float32
     assert max(found.largest.values()) < (1e-3 if single else ROUNDING)

@@ -11,18 +11,18 @@ import pytest
 
 from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.store import drive_rows
-from dlkf.data.validate import CheckedTables, read_checked
+from dlkf.data.validate import CheckedTables, read_drive
 from dlkf.filters.build import build_filter
 from dlkf.filters.shipped import trained_filter
 from dlkf.onboard.c_source import write_source
 from dlkf.onboard.core import Core
-from dlkf.onboard.library import build, compiler
+from dlkf.onboard.library import build, find_compiler
 from dlkf.running.streaming import StreamingFilter
 from tests.cars import REAL
 from tests.onboard.conftest import ARM, GRID, IMU, QUICK
 from tests.onboard.streams import Calls, apart, calls, through_core, through_python
 
-pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 DRIVES = (("rtkx", 0), ("wid", 0), ("wid_mru", 0), ("linkoping", 0), ("comma2k19", 0))
 
 
@@ -87,5 +87,5 @@ def test_every_real_log_through_the_filters_of_a_car(model, tmp_path):
 def same_on_real(estimator, library: Path, dataset: str, drive: int, least: int = 20) -> None:
     if not (REAL / dataset).is_dir():
         pytest.skip(f"no {dataset} here")
-    tables = read_checked(REAL / dataset, drive_rows(REAL / dataset)[drive], reference=False)
+    tables = read_drive(REAL / dataset, drive_rows(REAL / dataset)[drive], reference=False)
     same(estimator, library, calls(tables), tables.row.lever_arm_b, 1e-3, least)

@@ -6,13 +6,13 @@ import pytest
 import torch
 from torch import nn
 
-from dlkf.filters.branches import chosen
+from dlkf.filters.branches import select_branch
 from dlkf.onboard import c_parts
 from dlkf.onboard.c_memory import Block
-from dlkf.onboard.library import compiler
+from dlkf.onboard.library import find_compiler
 from tests.onboard.translated import translate
 
-pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 PARTS = "static DLKF_APART void"
 
 
@@ -29,7 +29,7 @@ class Long(nn.Module):
         then = made[-1]
         for k in range(30):
             then = (then @ made[k]).tanh().cumsum(2)
-        return torch.cat((chosen(on > 0, then, first), made[-1], made[33]))
+        return torch.cat((select_branch(on > 0, then, first), made[-1], made[33]))
 
 
 def test_values_and_braces_of_parts(tmp_path, monkeypatch):
@@ -60,8 +60,8 @@ def test_a_part_ends_outside_braces_only(monkeypatch):
     lines = ["x0[0] = 1;", "if (in0[0]) {", *(f"x0[{k}] = {k};" for k in range(4)), "}", "out0[0] = x0[3];"]
     for line in lines:
         block.write(line, x)
-    block.laid_out()
-    code = c_parts.parts_in_c(
+    block.lay_out()
+    code = c_parts.write_parts(
         "f", ["const double *restrict in0", "double *restrict out0", "double *restrict work"], block
     )
     written = [line.strip() for line in code]

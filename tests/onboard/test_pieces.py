@@ -7,9 +7,9 @@ import torch
 from torch import nn
 
 from dlkf.filters import pieces
-from dlkf.filters.pieces import LONGEST, summed
-from dlkf.onboard.library import compiler
-from dlkf.onboard.recording import exporting
+from dlkf.filters.pieces import LONGEST, sum_pieces
+from dlkf.onboard.library import find_compiler
+from dlkf.onboard.recording import export_mode
 from tests.onboard.translated import lines_within, translate
 
 SAMPLES = (1, 2, LONGEST - 1, LONGEST, LONGEST + 1, 2 * LONGEST + 1, 61, 100)  # 61 leaves a gap in each of four pieces
@@ -37,11 +37,11 @@ class Sum(nn.Module):
         return numbers(1, self.samples)
 
     def forward(self, begin, x, y):
-        first = summed(add_products, 2 * begin, x - 1, y.mT.mT)
-        return torch.cat((first, summed(add_products, first, x, 2 * y), begin), 1)
+        first = sum_pieces(add_products, 2 * begin, x - 1, y.mT.mT)
+        return torch.cat((first, sum_pieces(add_products, first, x, 2 * y), begin), 1)
 
 
-@pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 def test_c_has_the_plain_sum(tmp_path):
     for function in translate(tmp_path, *(Sum(samples) for samples in SAMPLES)):
         example = function.module.example()
@@ -58,6 +58,6 @@ def test_python_has_the_plain_sum(samples, drives, monkeypatch):
     want = add_products(begin, x, y)
     for at_once in (0, 10**9):
         monkeypatch.setattr(pieces, "AT_ONCE", at_once)
-        torch.testing.assert_close(summed(add_products, begin, x, y), want, rtol=1e-12, atol=1e-12)
-    with exporting():
-        torch.testing.assert_close(summed(add_products, begin, x, y), want, rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(sum_pieces(add_products, begin, x, y), want, rtol=1e-12, atol=1e-12)
+    with export_mode():
+        torch.testing.assert_close(sum_pieces(add_products, begin, x, y), want, rtol=1e-12, atol=1e-12)

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from dlkf.onboard.core import Core
-from dlkf.onboard.library import build, compiler
+from dlkf.onboard.library import build, find_compiler
 from dlkf.running.solution import COLUMNS
 from tests.onboard.conftest import ARM
 from tests.onboard.streams import METRES, calls, through_core
 
-pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 ROOT = Path(__file__).parents[2]
 WRITE = """
 import sys

@@ -10,17 +10,17 @@ import pandas as pd
 import pytest
 
 from dlkf.data.store import drive_rows
-from dlkf.data.validate import read_checked
+from dlkf.data.validate import read_drive
 from dlkf.onboard.c_source import EXAMPLES
 from dlkf.onboard.core import Core
-from dlkf.onboard.library import CORE, FILTER, compiler
+from dlkf.onboard.library import CORE, FILTER, find_compiler
 from dlkf.running.solution import COLUMNS
 from tests.cars import REAL
 from tests.onboard.conftest import ARM
 from tests.onboard.programs import HERE, STRICT, compile_program, lines, run, stack_of_calls, tool
 from tests.onboard.streams import Calls, calls, through_core
 
-pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 CORTEX_M7 = ("-mcpu=cortex-m7", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv5-d16", "-O2")
 SMALL = ("-DDLKF_IMU_HZ=100", "-DDLKF_LATE_S=2")
 KINDS = {"gnss": 0, "imu": 1, "speed": -1, "heading": -2, "baro": -3}  # as board.c reads them
@@ -51,7 +51,7 @@ def test_arm_under_emulation(cpu, log, exported, tables, tmp_path):
     if log != "simulated":
         if not (REAL / log).is_dir():
             pytest.skip(f"no {log} here")
-        real = read_checked(REAL / log, drive_rows(REAL / log)[0], reference=False)
+        real = read_drive(REAL / log, drive_rows(REAL / log)[0], reference=False)
         sent, arm = calls(real), real.row.lever_arm_b
     done = run([qemu, program, "--arm", *map(str, arm)], input=lines(sent))
     rows = pd.read_csv(io.StringIO(done.stdout)).drop_duplicates("t", keep="last").sort_values("t")

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from dlkf.base.errors import InputError
-from dlkf.onboard.c_source import function_in_c
-from dlkf.onboard.recording import exporting, record
+from dlkf.onboard.c_source import translate_function
+from dlkf.onboard.recording import export_mode, record
 
 EXAMPLE = torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
 SCALE = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
@@ -56,14 +56,14 @@ def of_its_example(x):
 
 @pytest.mark.parametrize("work", [parts_changed, constants_read, split, masked, of_its_example])
 def test_a_graph_has_the_values_of_its_function(work) -> None:
-    with exporting():
+    with export_mode():
         graph = record(Recorded(work))
     x = torch.tensor([-7.0, 0.25, 1e3], dtype=torch.float64)
     torch.testing.assert_close(graph(x), work(x), rtol=0, atol=0)
 
 
 def test_a_constant_is_not_changed_by_recording() -> None:
-    with exporting():
+    with export_mode():
         record(Recorded(lambda x: SCALE.clone().mul_(2) + x))
     assert SCALE.tolist() == [1.0, 2.0, 3.0]
 
@@ -84,10 +84,10 @@ def test_a_constant_is_not_changed_by_recording() -> None:
     ids=["value", "branch", "maximum", "mask", "nonzero", "equal", "numpy", "array", "random"],
 )
 def test_what_depends_on_values_is_refused(work, said) -> None:
-    with exporting(), pytest.raises(InputError, match=f"cannot be exported: .*{said}"):
-        function_in_c("f", Recorded(work))
+    with export_mode(), pytest.raises(InputError, match=f"cannot be exported: .*{said}"):
+        translate_function("f", Recorded(work))
 
 
 def test_what_depends_on_inputs_alone_is_not_refused() -> None:
-    with exporting():
-        assert "in0" in function_in_c("f", Recorded(lambda x: x * len(x))).code
+    with export_mode():
+        assert "in0" in translate_function("f", Recorded(lambda x: x * len(x))).code

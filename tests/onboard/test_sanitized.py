@@ -10,13 +10,13 @@ import pytest
 
 from dlkf.onboard.c_source import EXAMPLES
 from dlkf.onboard.core import Core
-from dlkf.onboard.library import compiler
+from dlkf.onboard.library import find_compiler
 from tests.onboard.conftest import ARM
 from tests.onboard.faults import FAULTS
 from tests.onboard.programs import HERE, SANITIZED, compile_program, lines, run, tool
 from tests.onboard.streams import apart, calls, through_core
 
-pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 EVERY_SAMPLE = ("none", "a gap of 0.2 s", "damage of all kinds")  # the state at every sample takes its time
 FUZZ_S = 600  # of each of the two
 
@@ -27,7 +27,7 @@ def sanitized(request, exported, tmp_path_factory):
     folder = tmp_path_factory.mktemp("sanitized")
     made = exported[3].path if request.param == "core" else None
     main = EXAMPLES / "navigate.c"
-    return compile_program(str(compiler()), exported[0], main, folder / "navigate", SANITIZED, filter_of=made)
+    return compile_program(str(find_compiler()), exported[0], main, folder / "navigate", SANITIZED, filter_of=made)
 
 
 def test_every_fault_as_lines(sanitized, tables):

@@ -8,13 +8,13 @@ import pytest
 
 from dlkf.onboard.c_source import EXAMPLES
 from dlkf.onboard.core import Core
-from dlkf.onboard.library import CORE, FILTER, compiler
+from dlkf.onboard.library import CORE, FILTER, find_compiler
 from dlkf.running.solution import COLUMNS
 from tests.onboard.conftest import ARM
 from tests.onboard.programs import STRICT, compile_program, lines
 from tests.onboard.streams import calls, through_core
 
-pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def ran(exported, sent, out, *switches: str) -> subprocess.CompletedProcess:
     """``navigate`` with a core that was compiled with these."""
     flags = ("-O1", *STRICT, *switches)
     program = compile_program(
-        str(compiler()), exported[0], EXAMPLES / "navigate.c", out / "navigate", flags, filter_of=exported[3].path
+        str(find_compiler()), exported[0], EXAMPLES / "navigate.c", out / "navigate", flags, filter_of=exported[3].path
     )
     command = [program, "--arm", *map(str, ARM)]
     return subprocess.run(command, input=lines(sent), capture_output=True, text=True)
@@ -60,6 +60,6 @@ def test_arithmetic_without_nan_is_refused(flag, exported):
     sources = [name for name in (*CORE, *FILTER) if name != "weights.c"]
     for name in sources:
         done = subprocess.run(
-            [compiler(), "-std=c99", flag, "-fsyntax-only", exported[0] / name], capture_output=True, text=True
+            [find_compiler(), "-std=c99", flag, "-fsyntax-only", exported[0] / name], capture_output=True, text=True
         )
         assert done.returncode and "compile without -ffast-math" in done.stderr, name

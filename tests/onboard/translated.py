@@ -9,9 +9,9 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from dlkf.onboard.c_source import function_in_c, heading
+from dlkf.onboard.c_source import translate_function, write_preamble
 from dlkf.onboard.library import build
-from dlkf.onboard.recording import exporting
+from dlkf.onboard.recording import export_mode
 from tests.onboard.conftest import QUICK
 
 HEADER = "#include <stdint.h>\n"
@@ -37,10 +37,10 @@ class Translated:
 
 def translate(folder: Path, *modules: nn.Module) -> list[Translated]:
     """Each module as a function of one library in a folder."""
-    with exporting():
-        written = [function_in_c(f"tested{k}", module.eval()) for k, module in enumerate(modules)]
+    with export_mode():
+        written = [translate_function(f"tested{k}", module.eval()) for k, module in enumerate(modules)]
     (folder / "step.h").write_text(HEADER)
-    (folder / "step.c").write_text(heading() + "".join(w.code for w in written))
+    (folder / "step.c").write_text(write_preamble() + "".join(w.code for w in written))
     (folder / "weights.c").write_text(HEADER + "".join(w.weights for w in written))
     library = ctypes.CDLL(str(build(folder, flags=QUICK)))
     return [

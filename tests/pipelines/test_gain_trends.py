@@ -9,7 +9,7 @@ import pytest
 import torch
 from pipelines.studies import gain_trends
 
-from dlkf.evaluation.gains import gains_of, write_gains
+from dlkf.evaluation.gains import measure_gains, write_gains
 from dlkf.evaluation.results import summarise_scores
 from dlkf.evaluation.table import as_json
 from dlkf.filters.build import build_filter
@@ -27,7 +27,7 @@ def home(tmp_path_factory):
     for name, (s_p, s_v) in NOISE.items():
         batch = scene(3, 30, seed=1, position_std=0.03 + s_p, velocity_std=0.02 + s_v)
         report = folder / name / "report"
-        write_gains(report, gains_of(filters, [(batch, torch.zeros(batch.size[:2], dtype=torch.bool))]), name)
+        write_gains(report, measure_gains(filters, [(batch, torch.zeros(batch.size[:2], dtype=torch.bool))]), name)
         results = summarise_scores(score(filters, [batch], kinds="simulated"))
         noise = {"s_p": s_p, "s_v": s_v} if s_p or s_v else None
         content = {"protocol": {"gnss_noise": noise}, "results": [results.as_dict()]}

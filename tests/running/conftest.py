@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from dlkf.data.store import drive_rows
-from dlkf.data.validate import CheckedTables, read_checked
+from dlkf.data.validate import CheckedTables, read_drive
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from dlkf.simulation.gnss.white import GnssConfig
 from tests.running.streams import ARM, IMU, until
@@ -22,7 +22,7 @@ def streets(tmp_path_factory):
 @pytest.fixture(scope="session")
 def drive(streets) -> CheckedTables:
     """A minute; the car drives off after 7 s."""
-    return read_checked(streets, drive_rows(streets)[0])
+    return read_drive(streets, drive_rows(streets)[0])
 
 
 @pytest.fixture(scope="session")

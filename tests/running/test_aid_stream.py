@@ -12,13 +12,13 @@ import torch
 from dlkf.data.aid_tables import STANDARD
 from dlkf.data.alignment import SEARCH
 from dlkf.data.store import drive_from_tables, drive_rows
-from dlkf.data.validate import read_checked
+from dlkf.data.validate import read_drive
 from dlkf.filters.aids.attach import aid_columns, with_aids
 from dlkf.filters.build import build_filter
 from dlkf.filters.saved import load_filter
 from dlkf.filters.shipped import shipped_folder
 from dlkf.onboard.compiled_filter import compile_filter
-from dlkf.onboard.library import compiler
+from dlkf.onboard.library import find_compiler
 from dlkf.report.navigation import TrackOnMap
 from dlkf.running.offline import navigate_drives
 from dlkf.running.replay import stream_drive
@@ -34,7 +34,7 @@ def tables(tmp_path_factory):
     """A minute of the exact car with all three sensors; the wheel lacks ten seconds."""
     wheel = {"scale": 1.02, "delay_s": 0.1, "right_m": 0.5}
     folder = write_cars(tmp_path_factory.mktemp("data") / "aided", 1, aids=wheel, seconds=60.0)
-    tables = read_checked(folder, drive_rows(folder)[0], reference=False)
+    tables = read_drive(folder, drive_rows(folder)[0], reference=False)
     speed = tables.aids["speed"]
     kept = (speed["t"] < 30) | (speed["t"] > 40)
     return replace(tables, aids={**tables.aids, "speed": {k: v[kept] for k, v in speed.items()}})
@@ -71,7 +71,7 @@ def test_a_stream_is_a_batch_run(tables, name, lateness_s):
         assert _apart(batch, stream_drive(tables, model, **GRID, late_s=late_s)) < 1e-6, late_s
 
 
-@pytest.mark.skipif(compiler() is None, reason="needs a C compiler")
+@pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
 @pytest.mark.parametrize("step", [None, 1 / 3.6], ids=["exact", "whole km/h"])
 def test_a_compiled_filter_is_a_batch_run(tables, step):
     model = _filters()["mbkf21_car"]

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from dlkf.base.errors import InputError
 from dlkf.data.readers.units import GPS_EPOCH_UNIX
 from dlkf.data.tables import DriveClock
-from dlkf.running.exports import FORMATS, chosen_formats, export, poses, utc_times
+from dlkf.running.exports import FORMATS, choose_formats, export, poses, utc_times
 from dlkf.running.solution import COLUMNS, SCHEMA, write_solution
 
 KML, GX = "{http://www.opengis.net/kml/2.2}", "{http://www.google.com/kml/ext/2.2}"
@@ -46,7 +46,7 @@ def table() -> pd.DataFrame:
 def folder(table, tmp_path_factory):
     """All formats, with a known date."""
     out = tmp_path_factory.mktemp("exports")
-    export(out, table, chosen_formats("all"), utc_times(table, DriveClock(MONDAY), "unix"), "town & country")
+    export(out, table, choose_formats("all"), utc_times(table, DriveClock(MONDAY), "unix"), "town & country")
     return out
 
 
@@ -211,6 +211,6 @@ def test_the_receivers_date_is_believed_before_that_of_the_files(table):
 
 def test_mistakes():
     with pytest.raises(InputError, match="known: geojson, kml"):
-        chosen_formats(["kml", "shp"])
+        choose_formats(["kml", "shp"])
     with pytest.raises(InputError, match="export_clock"):
         utc_times(pd.DataFrame({"t": [0.0]}), DriveClock(0.0), "tai")

@@ -23,11 +23,11 @@ def _log(rate: float, t0: float, seconds: float = 20.0, seed: int = 0) -> tuple[
 def _fed(stream: ImuStream, t: np.ndarray, x: np.ndarray, phase: float) -> np.ndarray:
     done = []
     for stamp, row in zip(t.tolist(), x.tolist()):
-        assert stream.refused(stamp, row[:3], row[3:]) == ""
+        assert stream.find_refusal(stamp, row[:3], row[3:]) == ""
         if stream.grid is None and stamp > t[0] + 3:
             stream.begin(np.array([phase]))
-        done += stream.closed()
-    return np.concatenate(done + stream.closed(ended=True))
+        done += stream.close_epochs()
+    return np.concatenate(done + stream.close_epochs(ended=True))
 
 
 @pytest.mark.parametrize("t0", [0.0, 1.7e9])
@@ -61,17 +61,17 @@ def test_what_is_out_of_line_is_refused_and_believed_when_it_goes_on():
 
     s = stream()
     still = (0.0, 0.0, -9.8), (0.0, 0.0, 0.0)
-    assert "again" in s.refused(5.0, *still) and "goes back" in s.refused(3.0, *still)
-    assert "gap of 4.000 s" in s.refused(9.0, *still) and not s.lost
-    assert s.refused(5.01, *still) == "" and not s.lost  # the line goes on
+    assert "again" in s.find_refusal(5.0, *still) and "goes back" in s.find_refusal(3.0, *still)
+    assert "gap of 4.000 s" in s.find_refusal(9.0, *still) and not s.lost
+    assert s.find_refusal(5.01, *still) == "" and not s.lost  # the line goes on
     for t in 2.0 + np.arange(90) / 100:
-        assert s.refused(t, *still)
-    assert not s.lost and s.refused(5.02, *still) == ""
+        assert s.find_refusal(t, *still)
+    assert not s.lost and s.find_refusal(5.02, *still) == ""
     for t in 9.0 + np.arange(102) / 100:
-        assert s.refused(t, *still)
+        assert s.find_refusal(t, *still)
     assert s.lost
     s.clear()
-    assert not s.lost and s.grid is None and s.refused(10.1, *still) == ""
+    assert not s.lost and s.grid is None and s.find_refusal(10.1, *still) == ""
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_what_is_out_of_line_is_refused_and_believed_when_it_goes_on():
     ],
 )
 def test_damaged_samples(accel, gyro, words):
-    assert words in ImuStream(50, 1.0).refused(0.0, accel, gyro)
+    assert words in ImuStream(50, 1.0).find_refusal(0.0, accel, gyro)
 
 
 def test_an_epoch_must_hold_whole_samples():
@@ -97,5 +97,5 @@ def test_before_the_first_fix_so_many_seconds_are_kept_and_no_more():
     """A receiver may be silent for hours."""
     stream = ImuStream(50, 1.0, keep_s=2.0)
     for k in range(1, 1001):
-        assert stream.refused(k / 100, (0.0, 0.0, -9.8), (0.0, 0.0, 0.0)) == ""
+        assert stream.find_refusal(k / 100, (0.0, 0.0, -9.8), (0.0, 0.0, 0.0)) == ""
     assert stream._rows[-1][0] - stream._rows[0][0] == pytest.approx(2.0, abs=0.011)

@@ -16,7 +16,7 @@ from dlkf.data.aid_tables import STANDARD
 from dlkf.data.alignment import ALIGN
 from dlkf.data.segments import whole_drives
 from dlkf.data.store import load_dataset
-from dlkf.filters.aids.attach import tables_of
+from dlkf.filters.aids.attach import find_tables
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import imu_spec
 from dlkf.onboard.compiled_filter import compile_or_keep
@@ -175,5 +175,5 @@ def test_noise_is_found_with_the_sensors_that_a_drive_has(drives, monkeypatch):
     monkeypatch.setattr(likelihood, "find_noise", found)
     for name, tables in (("mbkf21_car", ["speed"]), ("mbkf21_car", []), ("mbkf15", ["speed"])):
         estimator, _, _ = generic_filter(drives, name, IMU, Tuning(), ALIGN, [STANDARD[t] for t in tables])
-        assert [t.name for t in tables_of(estimator)] == (tables if "car" in name else [])
+        assert [t.name for t in find_tables(estimator)] == (tables if "car" in name else [])
     assert names == ["mbkf21_car+speed", "mbkf21_car", "mbkf15"]

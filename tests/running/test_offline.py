@@ -8,10 +8,10 @@ import pytest
 
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY, write_drive
 from dlkf.filters.build import build_filter
-from dlkf.filters.saved import grid_of
+from dlkf.filters.saved import choose_grid
 from dlkf.filters.shipped import trained_filter
-from dlkf.report.navigation import TrackOnMap, route_map, rows_of, summary_lines
-from dlkf.running.offline import Innovation, Navigated, UsableFixes, epoch_for
+from dlkf.report.navigation import TrackOnMap, make_rows, route_map, summary_lines
+from dlkf.running.offline import Innovation, Navigated, UsableFixes, choose_epoch
 from dlkf.running.solution import COLUMNS
 from tests.cars import IMU
 
@@ -24,8 +24,8 @@ FIVE_A_SECOND = UsableFixes(*(np.arange(0.0, 10.0, 0.2) for _ in range(4)))
 )
 def test_epochs_are_as_long_as_fixes_are_apart_but_constraints_keep_a_second(name, epoch_s):
     estimator = build_filter(name, IMU)
-    assert epoch_for([FIVE_A_SECOND], 50.0, estimator) == epoch_s
-    assert epoch_for([FIVE_A_SECOND], 12.0, estimator) == 1.0  # 2.4 samples make no epoch
+    assert choose_epoch([FIVE_A_SECOND], 50.0, estimator) == epoch_s
+    assert choose_epoch([FIVE_A_SECOND], 12.0, estimator) == 1.0  # 2.4 samples make no epoch
 
 
 def test_a_row_without_a_position_is_no_usable_fix(tmp_path):
@@ -39,8 +39,8 @@ def test_a_row_without_a_position_is_no_usable_fix(tmp_path):
 
 def test_a_network_round_a_filter_with_constraints_keeps_its_second():
     plus = trained_filter("plus")
-    assert grid_of([plus]) == {"rate_hz": 50.0, "epoch_s": 1.0}
-    assert epoch_for([FIVE_A_SECOND], 50.0, plus) == 1.0
+    assert choose_grid([plus]) == {"rate_hz": 50.0, "epoch_s": 1.0}
+    assert choose_epoch([FIVE_A_SECOND], 50.0, plus) == 1.0
 
 
 def driven(seed: int) -> TrackOnMap:
@@ -96,10 +96,10 @@ def test_of_delay_and_antenna_what_differs_from_the_log_is_said():
 def test_drives_without_plots_of_their_own_are_kept_small_and_shown_the_same():
     whole = [driven(seed) for seed in range(3)]
     small = [course.for_the_map() for course in whole]
-    assert rows_of(small) == rows_of(whole) and summary_lines("mbkf15", small) == summary_lines("mbkf15", whole)
+    assert make_rows(small) == make_rows(whole) and summary_lines("mbkf15", small) == summary_lines("mbkf15", whole)
     assert "Longest time without a fix: 41 s (d0)." in summary_lines("mbkf15", whole)[1]
     with_all = whole[0]._replace(result=replace(whole[0].result, table=whole[0].result.table.assign(gnss_used=True)))
     assert summary_lines("mbkf15", [with_all])[1].startswith("A fix in every epoch. ")
-    assert {row[4] for row in rows_of(whole)[1]} == {"1199"}  # of those after the start
+    assert {row[4] for row in make_rows(whole)[1]} == {"1199"}  # of those after the start
     assert route_map(small).to_json() == route_map(whole).to_json()
     assert sum(c.result.table.memory_usage().sum() for c in small) < 80 * 3600

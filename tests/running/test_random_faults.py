@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dlkf.data.store import drive_rows
-from dlkf.data.validate import CheckedTables, read_checked
+from dlkf.data.validate import CheckedTables, read_drive
 from dlkf.running.streaming import Status, StreamingFilter
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
 from tests.running.streams import EARTH, IMU
@@ -26,7 +26,7 @@ def hour(tmp_path_factory) -> CheckedTables:
     """A long drive in a town."""
     config = DatasetConfig("hour", hours=MINUTES / 60, drive_minutes=float(MINUTES), imu_rate_hz=50)
     made = simulate_dataset(config, IMU, 1, tmp_path_factory.mktemp("hour") / "d", progress=False, workers=1)
-    return read_checked(made, drive_rows(made)[0])
+    return read_drive(made, drive_rows(made)[0])
 
 
 def changed(rng: np.random.Generator, sample: list[float], among: int) -> list[float]:

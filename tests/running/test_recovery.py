@@ -14,13 +14,13 @@ import torch
 from dlkf.base.errors import InputError
 from dlkf.data.limits import LOST_FIXES, LOST_M, LOST_S
 from dlkf.data.store import drive_from_tables, drive_rows
-from dlkf.data.validate import CheckedTables, read_checked
+from dlkf.data.validate import CheckedTables, read_drive
 from dlkf.filters.build import build_filter
 from dlkf.filters.learned import LearnedConfig, LearnedFilter
 from dlkf.filters.model_based import Ins
 from dlkf.filters.shipped import trained_filter
 from dlkf.running.loss import LossWatch, far_off
-from dlkf.running.offline import UsableFixes, epoch_for, navigate_drives
+from dlkf.running.offline import UsableFixes, choose_epoch, navigate_drives
 from dlkf.running.replay import replay_drive
 from dlkf.running.streaming import StreamingFilter
 from dlkf.simulation.dataset import DatasetConfig, simulate_dataset
@@ -35,7 +35,7 @@ FILTERS = ("mbkf15", "mbkf21_car", "mbkf21_nhc_gated", "plus", "dlkf")
 def minutes(tmp_path_factory) -> CheckedTables:
     """Two minutes of a town, or of the real drive ``rtkx`` from a minute before its fault."""
     if (REAL / "rtkx").is_dir():
-        tables = read_checked(REAL / "rtkx", drive_rows(REAL / "rtkx")[0])
+        tables = read_drive(REAL / "rtkx", drive_rows(REAL / "rtkx")[0])
         for kind in ("imu", "gnss", "reference"):
             t = getattr(tables, kind)["t"] - 60.0
             inside = (t > 0) & (t < AT + GOOD_S + 15)
@@ -45,7 +45,7 @@ def minutes(tmp_path_factory) -> CheckedTables:
     folder = tmp_path_factory.mktemp("minutes")
     made = simulate_dataset(DatasetConfig("minutes", hours=2 / 60, drive_minutes=2.0), IMU, 3, folder / "d",
                             progress=False, workers=1)  # fmt: skip
-    return read_checked(made, drive_rows(made)[0])
+    return read_drive(made, drive_rows(made)[0])
 
 
 def spoiled(tables: CheckedTables, kind: str, seconds: float, **change: float) -> CheckedTables:
@@ -131,15 +131,15 @@ def test_a_filter_is_lost_after_fixes_in_a_row_far_off():
     assert far_off(z, torch.full((3, 6), 10.0)).tolist() == [0.0, 0.0, 0.0]  # fixes that are no better than that
     watch = LossWatch()
     for k in range(LOST_FIXES):
-        assert not watch.lost(k)
-        watch = watch.after(float(k), 1.0)
-    assert watch.count == LOST_FIXES and not watch.lost(LOST_S - 1) and watch.lost(LOST_S)
-    assert watch.after(20.0, 0.0).count == 0
+        assert not watch.is_lost(k)
+        watch = watch.update(float(k), 1.0)
+    assert watch.count == LOST_FIXES and not watch.is_lost(LOST_S - 1) and watch.is_lost(LOST_S)
+    assert watch.update(20.0, 0.0).count == 0
     watch = LossWatch()
     for k in range(2 * LOST_FIXES):
-        assert not watch.lost(k)
-        watch = watch.after(float(k), 0.5)
-    assert not watch.lost(2 * LOST_S - 1) and watch.lost(2 * LOST_S)
+        assert not watch.is_lost(k)
+        watch = watch.update(float(k), 0.5)
+    assert not watch.is_lost(2 * LOST_S - 1) and watch.is_lost(2 * LOST_S)
 
 
 def test_the_batch_run_starts_over_as_the_stream_does(drive):
@@ -169,7 +169,7 @@ def test_what_is_no_number_is_refused_and_never_raised():
 
 def test_no_usable_fix_in_any_drive_is_one_line(drive):
     nothing = np.zeros(0)
-    assert epoch_for([UsableFixes(nothing, nothing, nothing, nothing)], 50.0, estimator("mbkf15")) == 1.0
+    assert choose_epoch([UsableFixes(nothing, nothing, nothing, nothing)], 50.0, estimator("mbkf15")) == 1.0
     blind = replace(drive, gnss={**drive.gnss, "quality": 0 * drive.gnss["quality"]})
     loaded = drive_from_tables(blind, "", 50.0, 1.0, torch.float64)
     with pytest.raises(InputError, match="no GNSS fix"):

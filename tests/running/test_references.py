@@ -18,7 +18,7 @@ from dlkf.evaluation.protocol import Protocol, Scenes
 from dlkf.evaluation.run import score_scenes
 from dlkf.filters.build import build_filter
 from dlkf.navigation.imu_errors import imu_spec
-from dlkf.running.references import _at_imu, make_reference
+from dlkf.running.references import _carry_to_imu, make_reference
 from tests.drives import drives_in
 
 
@@ -62,7 +62,7 @@ def test_the_antenna_swings_with_the_rate_of_the_last_tenth_of_a_second(world, r
     turning = replace(drive, imu=imu, rate_hz=rate_hz, lever_arm_b=arm)
     rows = slice(1, drive.epochs + 1)
     C = torch.eye(3, dtype=torch.float64).expand(drive.epochs, 3, 3)
-    _, v, good = _at_imu(turning, rows, C, torch.zeros(drive.epochs, 3, dtype=torch.float64))
+    _, v, good = _carry_to_imu(turning, rows, C, torch.zeros(drive.epochs, 3, dtype=torch.float64))
     swing = (drive.gnss_v_e[rows] - v)[good & drive.gnss_valid[rows, 3:].all(-1)]
     assert len(swing) > 60
     # to the half sample by which 0.1 s is no whole number of them

@@ -55,7 +55,7 @@ def test_stds_are_those_of_drawn_errors():
     std = torch.tensor([1.0, 3.0, 2.0, 0.1, 0.2, 0.3, 1e-3, 2e-3, 4e-3] + [0.02] * 3 + [1e-4] * 3, dtype=torch.float64)
     g = torch.Generator().manual_seed(1)
     dx = std[:9] * torch.randn(n, 9, generator=g, dtype=torch.float64)
-    many = NavState(*(x.expand(n, *x.shape[1:]) for x in one)).corrected(dx)
+    many = NavState(*(x.expand(n, *x.shape[1:]) for x in one)).correct(dx)
     zeros = torch.zeros(n, 6)
     draws = solution_table(torch.zeros(n), frame, many, zeros, None, zeros[:, 0].bool())
     said = solution_table(torch.zeros(1), frame, one, zeros[:1], std[None], zeros[:1, 0].bool()).iloc[0]

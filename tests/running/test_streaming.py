@@ -13,7 +13,7 @@ import torch
 from dlkf.base.errors import InputError
 from dlkf.data.schema import POSITION
 from dlkf.data.store import drive_from_tables, drive_rows
-from dlkf.data.validate import read_checked
+from dlkf.data.validate import read_drive
 from dlkf.running.estimate import estimates_table
 from dlkf.running.offline import navigate_drives
 from dlkf.running.replay import replay_drive, stream_drive, stream_drives
@@ -134,7 +134,7 @@ def test_a_dataset_through_streams(streets):
     a drive that cannot be aligned is left out."""
     filters = estimator("mbkf15")
     streamed = {r.drive: r for r in stream_drives(streets, filters, rate_hz=50.0, epoch_s=1.0)}
-    checked = [read_checked(streets, row) for row in drive_rows(streets)]
+    checked = [read_drive(streets, row) for row in drive_rows(streets)]
     drives = [drive_from_tables(one, "", 50.0, 1.0, torch.float64) for one in checked]
     for whole in navigate_drives(drives, filters):
         found = streamed[whole.drive]

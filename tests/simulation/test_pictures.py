@@ -6,7 +6,7 @@ from tests.drives import drives_in
 from tests.simulation.test_dataset import config
 
 from dlkf.data.tables import read_drives
-from dlkf.data.validate import read_checked
+from dlkf.data.validate import read_drive
 from dlkf.simulation.pictures import driving, write_pictures
 
 
@@ -33,7 +33,7 @@ def circled(tables, speed: float, radius: float):
 
 def test_motion_on_a_circle(dataset):
     """A parabola over 0.5 s of a cosine of 0.2 rad/s is off by (ωh)²/6 or so: below 1e-3."""
-    moved = driving(circled(read_checked(dataset, read_drives(dataset)[0]), speed=10.0, radius=50.0))
+    moved = driving(circled(read_drive(dataset, read_drives(dataset)[0]), speed=10.0, radius=50.0))
     assert moved.yaw_rate[5:-5] == pytest.approx(0.2, rel=1e-3)
     assert moved.lateral[5:-5] == pytest.approx(2.0, rel=1e-3)
     assert np.abs(moved.along[5:-5]).max() < 1e-3

@@ -12,7 +12,7 @@ from dlkf.data.kinds import drive_kinds
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR, write_drive, write_drives_table
 from dlkf.data.validate import validate_dataset
 from dlkf.navigation.imu_errors import SensorErrors
-from dlkf.simulate import arguments_of_source
+from dlkf.simulate import choose_dataset
 from dlkf.simulation.semi_real import simulate_semi_real
 
 QUIET = {**dict.fromkeys(SensorErrors.__dataclass_fields__, 0.0), "correlation_time": 3600.0}
@@ -192,6 +192,6 @@ def test_without_attitude_the_antenna_is_at_the_imu(real, tmp_path):
 
 
 def test_a_source_means_semi_real_unless_a_dataset_is_named():
-    assert arguments_of_source(["source=x", "seed=2"]) == ["source=x", "seed=2", "dataset=semi_real"]
-    assert arguments_of_source(["source=x", "dataset=mine"]) == ["source=x", "dataset=mine"]
-    assert arguments_of_source(["dataset.hours=2"]) == ["dataset.hours=2"]
+    assert choose_dataset(["source=x", "seed=2"]) == ["source=x", "seed=2", "dataset=semi_real"]
+    assert choose_dataset(["source=x", "dataset=mine"]) == ["source=x", "dataset=mine"]
+    assert choose_dataset(["dataset.hours=2"]) == ["dataset.hours=2"]

@@ -71,7 +71,7 @@ def test_draws_stay_possible():
     made_by = wide()
     kinds = set()
     for k in range(150):
-        config, spec = made_by.of_drive(np.random.SeedSequence(9, spawn_key=(k,)))
+        config, spec = made_by.draw_drive(np.random.SeedSequence(9, spawn_key=(k,)))
         kinds.add((config.vehicle.manoeuvres.stop, getattr(config.receiver, "name", "white")))
         assert spec.accel.noise_density <= 0.03
     assert len(kinds) > 10
@@ -80,7 +80,7 @@ def test_draws_stay_possible():
 def test_a_point_may_drive_in_the_fleet():
     """What the preset says stands above what the variants of roads say of their roughness."""
     for k in range(5):
-        config, _ = wide("chassis@dataset.chassis=point").of_drive(np.random.SeedSequence(k))
+        config, _ = wide("chassis@dataset.chassis=point").draw_drive(np.random.SeedSequence(k))
         assert config.chassis.is_point
 
 
@@ -97,5 +97,5 @@ def test_odd_ranges_are_one_clear_line(overrides, words):
     with pytest.raises(InputError, match=words) as caught:
         made_by = wide(*overrides)
         for k in range(20):
-            made_by.of_drive(np.random.SeedSequence(0, spawn_key=(k,)))
+            made_by.draw_drive(np.random.SeedSequence(0, spawn_key=(k,)))
     assert "\n" not in str(caught.value)

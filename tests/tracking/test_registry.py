@@ -23,7 +23,7 @@ from dlkf.data.schema import drive_file
 from dlkf.data.store import load_dataset
 from dlkf.filters.saved import load_filter
 from dlkf.running.offline import navigate_drives
-from dlkf.tracking.comparison import best_of
+from dlkf.tracking.comparison import choose_best
 from dlkf.tracking.grid import PARENT_RUN, GridParent
 from dlkf.tracking.registry import REQUIRED, check_registration, download_model, log_model, register_model
 from dlkf.tracking.runs import mlflow_module, start_run
@@ -291,7 +291,7 @@ def test_the_best_of_a_grid_is_registered_at_its_end(uri, client, weights, capsy
     grid.on_multirun_end(OmegaConf.create())
     assert client.get_model_version_by_alias("town", "champion").run_id == ids[1]
     assert "Registered the best, rms 2.0: models:/town/1" in capsys.readouterr().out
-    assert best_of(client, parent).info.run_id == ids[1] and best_of(client, ids[2]).info.run_id == ids[2]
+    assert choose_best(client, parent).info.run_id == ids[1] and choose_best(client, ids[2]).info.run_id == ids[2]
     version = client.get_model_version("town", register_model(client, ids[0], "town"))
     assert version.run_id == ids[0] and "rms 5.0" in version.description
 

@@ -19,10 +19,10 @@ from dlkf.tracking import runs as tracking
 from dlkf.tracking.endings import PROCESS_TAG, TRACKING_URI
 from dlkf.tracking.runs import (
     VALUE_LENGTH,
-    client_of,
     flatten_config,
     lightning_logger,
     mlflow_module,
+    open_client,
     start_run,
     store_missing,
     tracking_uri,
@@ -51,7 +51,7 @@ def test_the_store_is_here_by_default(tmp_path, monkeypatch):
 @pytest.mark.whole
 def test_trainings_that_begin_together_share_a_new_store(tmp_path):
     def begin():
-        client_of(f"sqlite:///{tmp_path}/mlflow.db").search_experiments()
+        open_client(f"sqlite:///{tmp_path}/mlflow.db").search_experiments()
 
     together = [start_fork(tmp_path, tmp_path / f"said {k}", begin) for k in range(2)]
     for k, process in enumerate(together):

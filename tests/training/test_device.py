@@ -12,7 +12,7 @@ from dlkf.command.composing import compose_command
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.masks import Outage
 from dlkf.filters.integration import integrate
-from dlkf.filters.saved import learned_filter, learned_settings, load_filter
+from dlkf.filters.saved import build_learned_filter, load_filter, parse_learned_settings
 from dlkf.training.callbacks.checkpoints import ResumePoint
 from dlkf.training.fit import fit
 from dlkf.training.loss import LossConfig, weighted_loss
@@ -47,7 +47,8 @@ def test_loss_and_gradients_are_the_cpus_and_the_host_waits_for_nothing(kind, mo
 
     def step(batch, device):
         torch.manual_seed(1)
-        filter_ = learned_filter(learned_settings({"kind": kind, "network": SIZES[kind], **more})).double().to(device)
+        settings = parse_learned_settings({"kind": kind, "network": SIZES[kind], **more})
+        filter_ = build_learned_filter(settings).double().to(device)
         loss = LOSSES[kind](integrate(batch, filter_, keep_covariances=kind == "plus"), batch)
         weighted_loss(loss, {}).backward()
         return loss, {k: p.grad.to("cpu") for k, p in filter_.named_parameters() if p.grad is not None}
@@ -73,7 +74,7 @@ def test_an_epoch_is_as_many_operations_as_the_docs_tell(kind, operations):
     counts = []
     for T in (4, 8):
         with Elsewhere() as device:
-            filter_ = learned_filter(learned_settings({"kind": kind})).to(DEVICE)
+            filter_ = build_learned_filter(parse_learned_settings({"kind": kind})).to(DEVICE)
             batch = car_batch(2, T, 50, dtype=torch.float32).to(DEVICE)
             device.work = 0
             losses = LOSSES[kind](integrate(batch, filter_, keep_covariances=kind == "plus"), batch)

@@ -11,7 +11,7 @@ from dlkf.filters.integration import integrate
 from dlkf.filters.model_based import Ins
 from dlkf.navigation.attitude import rotation_from_vector
 from dlkf.navigation.state import NavState
-from dlkf.training.loss import LossConfig, loss_of, pva_losses, weighted_loss
+from dlkf.training.loss import LossConfig, build_loss, pva_losses, weighted_loss
 from dlkf.training.outage_loss import likelihood_term
 from tests.filters.scene import IMU, scene
 
@@ -113,15 +113,15 @@ def test_a_loss_of_one_s_own_takes_its_settings_and_no_others():
     batch = scene(2, 5)
     solution = integrate(batch, Ins())
     own = {"_target_": f"{__name__}.Late", "scale": 2.0, "position_scale": 1.0}
-    quarter, whole = (loss_of(own | {"scale": s})(solution, batch)["late"] for s in (2.0, 1.0))
+    quarter, whole = (build_loss(own | {"scale": s})(solution, batch)["late"] for s in (2.0, 1.0))
     assert float(whole) == pytest.approx(4 * float(quarter)) and float(whole) > 0
     assert float(weighted_loss({"late": whole}, {"position": 5.0})) == float(whole)
     with pytest.raises(InputError, match="takes no colour"):
-        loss_of(own | {"colour": 1})
+        build_loss(own | {"colour": 1})
     with pytest.raises(InputError, match="PYTHONPATH"):
-        loss_of({"_target_": "nowhere.Late"})
+        build_loss({"_target_": "nowhere.Late"})
     with pytest.raises(InputError, match="unknown key colour"):
-        loss_of({"colour": 1})
+        build_loss({"colour": 1})
 
 
 def test_one_of_the_three_losses_can_be_left_out():

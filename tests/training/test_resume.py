@@ -15,7 +15,7 @@ from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.masks import Outage
 from dlkf.training.fit import check_fit, fit
 from dlkf.training.module import FilterTraining
-from dlkf.training.run_folder import checked_digests, read_state, run_folder, write_state
+from dlkf.training.run_folder import check_digests, read_state, run_folder, write_state
 from dlkf.training.settings import FitSettings, TrainSettings
 from tests.shell import PATIENCE_S, start_fork
 
@@ -119,10 +119,10 @@ def test_an_unknown_monitor_is_said_clearly(dataset, tmp_path):
 
 @pytest.mark.whole
 def test_other_data_than_the_unfinished_run_began_with_are_refused(dataset, tmp_path):
-    digests = checked_digests([str(dataset)], {})
-    assert checked_digests([str(dataset)], {"data": digests}) == digests
+    digests = check_digests([str(dataset)], {})
+    assert check_digests([str(dataset)], {"data": digests}) == digests
     with pytest.raises(InputError, match="resume=false"):
-        checked_digests([str(dataset)], {"data": {str(dataset): "0" * 32}})
+        check_digests([str(dataset)], {"data": {str(dataset): "0" * 32}})
 
 
 @pytest.mark.parametrize(("epochs", "every", "start", "some"), [(1, 1, 3, False), (4, 3, 3, False), (6, 3, 3, True)])

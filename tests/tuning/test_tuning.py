@@ -18,9 +18,9 @@ from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import integrate
 from dlkf.filters.tuning import Prior, Tuning
-from dlkf.onboard.library import compiler
-from dlkf.tuning.baselines import tuned_baselines
-from dlkf.tuning.search import FACTORS, best_prior, evaluate_objective, factors_of, mean_imu_error, tune_filter
+from dlkf.onboard.library import find_compiler
+from dlkf.tuning.baselines import tune_baselines
+from dlkf.tuning.search import FACTORS, best_prior, evaluate_objective, list_factors, mean_imu_error, tune_filter
 from dlkf.tuning.study import check_settings, train_test_drives
 from tests.cars import IMU
 
@@ -81,7 +81,7 @@ def test_a_search_mends_noise_that_is_told_too_small(cars):
     assert score == min(t.score for t in trials) < evaluate_objective(build_filter("mbkf15", small), [hidden(cars)])
 
 
-@pytest.mark.skipif(compiler() is None, reason="no C compiler here")
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 @pytest.mark.whole
 def test_a_search_in_c_finds_what_one_in_torch_finds(cars, monkeypatch):
     """Every trial, though C takes sums in another order."""
@@ -123,12 +123,12 @@ def test_a_search_that_cannot_run_in_c_says_so_once(wrong, cars, monkeypatch, tm
 
 
 def test_every_filter_has_the_factors_that_it_uses():
-    assert factors_of("mbkf15") == dict(FACTORS)
-    assert set(factors_of("mbkf33_car_gated")) == {*FACTORS, "lateral_std", "vertical_std", "gate"}
-    assert set(factors_of("aekf")) == {*FACTORS, "forgetting"}
+    assert list_factors("mbkf15") == dict(FACTORS)
+    assert set(list_factors("mbkf33_car_gated")) == {*FACTORS, "lateral_std", "vertical_std", "gate"}
+    assert set(list_factors("aekf")) == {*FACTORS, "forgetting"}
     known = set(Tuning.__dataclass_fields__)
     for name in ("mbkf15_nhc", "mbkf21_car", "mbkf15_gated", "aekf"):
-        assert set(factors_of(name)) <= known
+        assert set(list_factors(name)) <= known
 
 
 def one_unit(batch):
@@ -155,7 +155,7 @@ def test_many_segments_together_show_the_sensor_matrices_of_their_unit(cars):
 
 def test_a_filter_that_is_told_its_unit_drifts_less(cars):
     batch, expected, _ = one_unit(cars)
-    found = tuned_baselines(["mbkf15_prior", "mbkf33", "mbkf33_prior"], expected, [hidden(batch)], rounds=0, say=str)
+    found = tune_baselines(["mbkf15_prior", "mbkf33", "mbkf33_prior"], expected, [hidden(batch)], rounds=0, say=str)
     assert len(found.priors["mbkf15_prior"].mean) == 6 and len(found.priors["mbkf33_prior"].mean) == 24
     expected, untold = (evaluate_objective(found.build()[n], [hidden(batch)]) for n in ("mbkf33_prior", "mbkf33"))
     assert expected < 0.8 * untold
@@ -184,7 +184,7 @@ def test_spreads_of_biases_and_matrices_scale_apart():
 
 def test_untuned_baselines_keep_the_factors_that_they_begin_with(cars):
     coarse = Tuning(position_std=25.0, velocity_std=2.5)
-    found = tuned_baselines(["ins", "mbkf15", "mbkf21"], IMU, [hidden(cars)], rounds=0, say=str, start=coarse)
+    found = tune_baselines(["ins", "mbkf15", "mbkf21"], IMU, [hidden(cars)], rounds=0, say=str, start=coarse)
     assert found.tunings == {"ins": Tuning(), "mbkf15": coarse, "mbkf21": coarse}
 
 

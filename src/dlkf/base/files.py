@@ -241,17 +241,17 @@ def restore_folder(target: Path) -> None:
     What one had begun is removed. A folder that had been moved aside for a new one, which then did not come, is back.
     """
     _clear_dead(target.parent, f".{target.name}{PARTIAL}")
-    for old in _dead(target.parent, f".{target.name}{OLD}"):
+    for old in _find_dead(target.parent, f".{target.name}{OLD}"):
         with suppress(OSError):  # another command is at it as well
             shutil.rmtree(old) if target.exists() else old.rename(target)
 
 
 def _clear_dead(parent: Path, begins: str) -> None:
-    for left in _dead(parent, begins):
+    for left in _find_dead(parent, begins):
         shutil.rmtree(left, ignore_errors=True)
 
 
-def _dead(parent: Path, begins: str) -> list[Path]:
+def _find_dead(parent: Path, begins: str) -> list[Path]:
     """Folders that begin so and whose process, of this machine, is gone."""
     found = [p for p in parent.iterdir() if p.name.startswith(begins)] if parent.is_dir() else []
     return [p for p in found if is_gone(p.name[len(begins) :])]

@@ -23,7 +23,7 @@ class Failure:
     mistake: bool
 
 
-def swept_overrides_of(overrides: Sequence[str]) -> str:
+def select_swept_overrides(overrides: Sequence[str]) -> str:
     """Of a point's overrides those that are swept: ``imu=consumer,seed=1``."""
     swept = json.loads(os.environ.get(SWEPT, "[]"))
     return ",".join(o for o in overrides if not swept or o.partition("=")[0] in swept)

@@ -36,7 +36,7 @@ def draw_ranges(config: Any, seed: np.random.SeedSequence) -> Any:
         return np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=key))
 
     def value(path: str, config: Mapping[str, Any]) -> Any:
-        rng, kind = generator(path), _kind(path, config)
+        rng, kind = generator(path), _find_kind(path, config)
         is_absent = rng.random() < config.get("absent", 0.0)
         span = config[kind]
         if kind == "choice":
@@ -52,14 +52,14 @@ def draw_ranges(config: Any, seed: np.random.SeedSequence) -> Any:
     def pick(path: str, shares: np.ndarray) -> int:
         return int(generator(f"{path}.one_of").choice(len(shares), p=shares))
 
-    return _resolved(config, "", pick, value)
+    return _resolve(config, "", pick, value)
 
 
 def range_middle(config: Any) -> Any:
     """The mapping with the middle of every range: mean, geometric mean, first choice, the most probable variant."""
 
     def value(path: str, config: Mapping[str, Any]) -> Any:
-        kind = _kind(path, config)
+        kind = _find_kind(path, config)
         span = config[kind]
         if config.get("absent", 0.0) > 0.5:
             return 0.0
@@ -67,7 +67,7 @@ def range_middle(config: Any) -> Any:
             return span[0]
         return math.sqrt(span[0] * span[1]) if kind == "log_uniform" else 0.5 * (span[0] + span[1])
 
-    return _resolved(config, "", lambda path, shares: int(np.argmax(shares)), value)
+    return _resolve(config, "", lambda path, shares: int(np.argmax(shares)), value)
 
 
 def has_ranges(config: Any) -> bool:
@@ -77,21 +77,22 @@ def has_ranges(config: Any) -> bool:
     return isinstance(config, (list, tuple)) and any(map(has_ranges, config))
 
 
-def _resolved(config: Any, path: str, pick: Pick, value: Value) -> Any:
+def _resolve(config: Any, path: str, pick: Pick, value: Value) -> Any:
     if isinstance(config, Mapping):
         if _is_range(config):
             drawn = value(path, config)
-            return _resolved(drawn, f"{path}.chosen", pick, value) if "choice" in config else drawn
+            return _resolve(drawn, f"{path}.chosen", pick, value) if "choice" in config else drawn
         if "one_of" in config:
-            config = _merged(_variant(config["one_of"], path, pick), {k: v for k, v in config.items() if k != "one_of"})
-            return _resolved(config, path, pick, value)
-        return {key: _resolved(x, f"{path}.{key}" if path else str(key), pick, value) for key, x in config.items()}
+            above = {k: v for k, v in config.items() if k != "one_of"}
+            config = _merge(_choose_variant(config["one_of"], path, pick), above)
+            return _resolve(config, path, pick, value)
+        return {key: _resolve(x, f"{path}.{key}" if path else str(key), pick, value) for key, x in config.items()}
     if isinstance(config, (list, tuple)):
-        return [_resolved(x, f"{path}.{k}", pick, value) for k, x in enumerate(config)]
+        return [_resolve(x, f"{path}.{k}", pick, value) for k, x in enumerate(config)]
     return config
 
 
-def _variant(variants: Any, path: str, pick: Pick) -> Mapping[str, Any]:
+def _choose_variant(variants: Any, path: str, pick: Pick) -> Mapping[str, Any]:
     where = f"{path}.one_of" if path else "one_of"
     if not isinstance(variants, Mapping) or not all(isinstance(x, Mapping) for x in variants.values()):
         raise InputError(f"{where}: is {variants!r}, must be a mapping of variants, each a mapping")
@@ -102,13 +103,13 @@ def _variant(variants: Any, path: str, pick: Pick) -> Mapping[str, Any]:
     return {key: x for key, x in chosen.items() if key != "share"}
 
 
-def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+def _merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
     """Both mappings in one; where both have a key, mappings are merged likewise and else the one ``above`` stands."""
     merged = dict(below)
     for key, x in above.items():
         old = merged.get(key)
         both = isinstance(old, Mapping) and isinstance(x, Mapping) and not _is_range(x) and not _is_range(old)
-        merged[key] = _merged(old, x) if both else x  # type: ignore[arg-type]
+        merged[key] = _merge(old, x) if both else x  # type: ignore[arg-type]
     return merged
 
 
@@ -116,7 +117,7 @@ def _is_range(config: Mapping[str, Any]) -> bool:
     return any(kind in config for kind in KINDS)
 
 
-def _kind(path: str, config: Mapping[str, Any]) -> str:
+def _find_kind(path: str, config: Mapping[str, Any]) -> str:
     """The type of a range; InputError for two types in one, or limits that are none."""
     kinds = [key for key in config if key in KINDS]
     where = f"{path}: range {dict(config)}"

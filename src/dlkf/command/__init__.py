@@ -26,7 +26,7 @@ from dlkf.command.arguments import (
     check_out,
     check_presets,
     check_seeds,
-    options_first,
+    move_options_first,
     quote_argument,
     with_near_key,
 )
@@ -90,7 +90,7 @@ def command(
             heeded = [n for n in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(n) is not signal.SIG_IGN]
             before = {number: signal.signal(number, _stop) for number in heeded}
             try:
-                words = options_first(arguments(sys.argv[1:]))
+                words = move_options_first(arguments(sys.argv[1:]))
                 given = [with_group(argument, GROUPS.get(name, {})) for argument in words]
                 check_choices(given)
                 sys.argv[1:] = [quote_argument(argument) for argument in given]
@@ -115,13 +115,13 @@ def print_help(name: str) -> None:
     print(help_text(name, GROUPS.get(name, {})))
 
 
-def typed_words(*keys: str) -> list[str]:
+def list_typed_words(*keys: str) -> list[str]:
     """What was typed for these keys or for parts of them: ``imu=consumer``, ``imu.gyro.noise_density=1e-4``."""
     words = HydraConfig.get().overrides.task
     return [word for word in words if word.partition("=")[0].lstrip("+").split(".")[0] in keys]
 
 
-def same_command(name: str) -> list[str]:
+def repeat_command(name: str) -> list[str]:
     """The command line that composes once more what Hydra composed here, for a point of a sweep too."""
     config = HydraConfig.get()
     folders = [s.path for s in config.runtime.config_sources if s.provider == "command-line"]

@@ -33,7 +33,7 @@ def check_options(arguments: list[str]) -> None:
     parser.parse_args([word for word in arguments if word.startswith("-") or "=" not in word])
 
 
-def options_first(arguments: Sequence[str]) -> list[str]:
+def move_options_first(arguments: Sequence[str]) -> list[str]:
     """Options, then settings: Hydra refuses settings on both sides of an option (``dataset=a -m model=b,c``)."""
     after = [False, *(word in WITH_VALUE for word in arguments)]
     settings = ["=" in word and not word.startswith("-") and not value for word, value in zip(arguments, after)]
@@ -103,10 +103,10 @@ def quote_argument(argument: str) -> str:
     if _parses(f"{key}={value}"):
         return f"{key}={value}"
     if listed:
-        inside = ",".join(word if _parses(f"{key}={word}") else _quoted(word) for word in words)
+        inside = ",".join(word if _parses(f"{key}={word}") else _quote(word) for word in words)
         if _parses(f"{key}=[{inside}]"):
             return f"{key}=[{inside}]"
-    quoted = f"{key}={_quoted(value)}"
+    quoted = f"{key}={_quote(value)}"
     return quoted if _parses(quoted) else argument
 
 
@@ -129,7 +129,7 @@ def _parses(override: str) -> bool:
     return True
 
 
-def _quoted(value: str) -> str:
+def _quote(value: str) -> str:
     return "'" + value.replace("'", "\\'") + "'"
 
 

@@ -41,13 +41,13 @@ def help_text(name: str, aliases: Mapping[str, str]) -> str:
     text = (config_dir() / f"{name}.yaml").read_text()
     head = [line.removeprefix("# ").removeprefix("#") for line in _head(text)]
     lines = [*head, "", "Presets (key=name; a folder given by --config-dir adds to them):"]
-    for group in groups_of(text):
+    for group in list_groups(text):
         key = _group_key(group, aliases)
         lines.append(f"  {key}={group['choice']}" + (f"  {group['says']}" if group["says"] else ""))
-        lines += _wrapped(presets_of(group["group"], name))
+        lines += _wrap(list_presets(group["group"], name))
     for folder in OPTIONAL.get(name, ()):
-        lines += [f"  +{folder}=…", *_wrapped(presets_of(folder, name))]
-    if not groups_of(text):
+        lines += [f"  +{folder}=…", *_wrap(list_presets(folder, name))]
+    if not list_groups(text):
         lines[-1] = "It has no presets."
     lines += ["", "Keys that matter most (key=value):"]
     for key in MOST[name]:
@@ -58,7 +58,7 @@ def help_text(name: str, aliases: Mapping[str, str]) -> str:
     return "\n".join([*lines, "", *textwrap.wrap(more, WIDTH)])
 
 
-def _wrapped(names: list[str]) -> list[str]:
+def _wrap(names: list[str]) -> list[str]:
     return textwrap.wrap(", ".join(names), WIDTH, initial_indent="      ", subsequent_indent="      ")
 
 
@@ -67,20 +67,20 @@ def _head(text: str) -> list[str]:
     return lines[: next(k for k, line in enumerate(lines) if not line.startswith("#"))]
 
 
-def groups_of(text: str) -> list[dict[str, str]]:
+def list_groups(text: str) -> list[dict[str, str]]:
     """The defaults list of a file: ``group``, ``package``, ``choice``, ``says``."""
     found = [m.groupdict(default="") for line in text.splitlines() if (m := GROUP.fullmatch(line))]
     return [g for g in found if g["group"] not in SILENT]
 
 
-def presets_of(group: str, command: str) -> list[str]:
+def list_presets(group: str, command: str) -> list[str]:
     """Names to choose from; what several share begins with an underscore."""
     preset, taker = ALONE.get(group, ("", command))
     found = sorted(path.stem for path in (config_dir() / group).glob("[!_]*.yaml"))
     return [name for name in found if name != preset or command == taker]
 
 
-def keys_of(text: str) -> dict[str, tuple[str, str]]:
+def list_keys(text: str) -> dict[str, tuple[str, str]]:
     """Dotted key → (value, comment) of the keys of a file, those below the keys of a group left out."""
     found: dict[str, tuple[str, str]] = {}
     path: list[tuple[int, str]] = []
@@ -99,10 +99,10 @@ def keys_of(text: str) -> dict[str, tuple[str, str]]:
 
 def describe_key(text: str, key: str) -> tuple[str, str]:
     """Value and comment of a key, from the file itself or from the preset that its defaults list takes."""
-    own = keys_of(text)
+    own = list_keys(text)
     if key in own:
         return own[key]
-    for group in groups_of(text):
+    for group in list_groups(text):
         package = group["package"] or group["group"]
         if key.startswith(f"{package}."):
             return _in_preset(config_dir() / group["group"], group["choice"], key.removeprefix(f"{package}."))
@@ -111,7 +111,7 @@ def describe_key(text: str, key: str) -> tuple[str, str]:
 
 def _in_preset(folder: Path, choice: str, key: str) -> tuple[str, str]:
     text = (folder / f"{choice}.yaml").read_text()
-    own = keys_of(text)
+    own = list_keys(text)
     if key in own:
         return own[key]
     for parent in re.findall(r"^  - (\w+)$", text, flags=re.M):

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 from hydra.conf import HydraConf
 
-from dlkf.base.points import SWEPT, Failure, collect_failures, failures, report_failure, swept_overrides_of
+from dlkf.base.points import SWEPT, Failure, collect_failures, failures, report_failure, select_swept_overrides
 from dlkf.command.faults import describe_fault
 
 MISTAKES, FAULTS = 2, 1  # exit codes: all failed by mistakes of the user, some by faults of ours
@@ -20,13 +20,13 @@ def job_folder(hydra_config: HydraConf) -> str:
     """Folder of a point: its number and what it changes, as ``0-imu=consumer``; ``0`` where nothing is swept."""
     if os.environ.get(SWEPT) == "[]":
         return str(hydra_config.job.num)
-    return f"{hydra_config.job.num}-{swept_overrides_of(hydra_config.overrides.task)}".replace("/", "-")[:100]
+    return f"{hydra_config.job.num}-{select_swept_overrides(hydra_config.overrides.task)}".replace("/", "-")[:100]
 
 
 def record_failure(error: Exception, hydra_config: HydraConf) -> None:
     """Record that a job failed and continue the sweep; raises the error where no sweep collects it."""
     said = describe_fault(error)
-    point = swept_overrides_of(hydra_config.overrides.task)
+    point = select_swept_overrides(hydra_config.overrides.task)
     failure = Failure(point, said or f"{type(error).__name__}: {error}", mistake=said is not None)
     if not report_failure(failure, hydra_config.job.num):
         raise error

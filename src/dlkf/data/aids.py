@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dlkf.data.aid_tables import LAST, AidTable
-from dlkf.data.resampling import SampleGrid, boundary_after
+from dlkf.data.resampling import SampleGrid, find_boundary
 from dlkf.data.tables import Columns
 
 ROW = ("value", "std", "lag_s", "span_s", "count")  # of an update interval; a std of 0 is not known, a count of 0: none
@@ -24,13 +24,13 @@ def aid_rows(table: AidTable, columns: Columns, grid: SampleGrid) -> np.ndarray:
     """(N + 1, 5) :data:`ROW` at the boundaries of a grid: of the samples in the interval that ends there."""
     value = aid_values(table, columns)
     std = columns.get("std", np.full(len(value), np.nan))
-    place = boundary_after(columns["t"], grid)
+    place = find_boundary(columns["t"], grid)
     good = np.isfinite(value) & (place >= 1) & (place <= grid.epochs)
     lag = np.clip(grid.boundaries[place[good]] - columns["t"][good], 0.0, None)
-    return _reduced(table, place[good], value[good], std[good], lag, grid.epochs + 1)
+    return _reduce(table, place[good], value[good], std[good], lag, grid.epochs + 1)
 
 
-def _reduced(
+def _reduce(
     table: AidTable, place: np.ndarray, value: np.ndarray, std: np.ndarray, lag: np.ndarray, rows: int
 ) -> np.ndarray:
     """(rows, 5) :data:`ROW` of samples in order of time, each at its boundary."""
@@ -57,7 +57,7 @@ def aid_row(table: AidTable, samples: Sequence[tuple[float, float, float]], boun
     if not samples:
         return np.zeros((1, len(ROW)))
     t, value, std = np.array(sorted(samples)).T
-    return _reduced(table, np.zeros(len(t), dtype=np.int64), value, std, np.clip(boundary - t, 0.0, None), 1)
+    return _reduce(table, np.zeros(len(t), dtype=np.int64), value, std, np.clip(boundary - t, 0.0, None), 1)
 
 
 def aid_values(table: AidTable, columns: Columns) -> np.ndarray:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dlkf.base.errors import InputError
 from dlkf.data.drive import Drive
-from dlkf.data.velocity_fit import MOTION_SIGMAS, antenna_velocity, scattered_std
+from dlkf.data.velocity_fit import MOTION_SIGMAS, antenna_velocity, scale_std
 from dlkf.navigation.attitude import prefix_rotations, rotation_from_rpy, rotation_from_vector, rpy_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, STANDARD_GRAVITY, ned_axes, normal_gravity
 from dlkf.navigation.error_model import RATE_AVERAGE_S
@@ -104,7 +104,7 @@ def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     lat, lon, height = geodetic_from_ecef(torch.nan_to_num(drive.gnss_r_e, nan=1e6))
     C_en = ned_axes(lat, lon)
     position = drive.gnss_valid[:, :3].all(-1)
-    u_b, rate_b, turned = _carried_force(drive, back)
+    u_b, rate_b, turned = _average_force(drive, back)
     down_b = -u_b / u_b.norm(dim=-1, keepdim=True).clamp_min(1.0)
     v_n, v_std, known, moving, scatter, off = antenna_velocity(drive, C_en, down_b)
 
@@ -142,7 +142,7 @@ def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     turning = AXLE_STD * rate_b[:, 2]  # m/s across the car
     heading = torch.sqrt(SIDESLIP_STD**2 + (noise**2 + turning**2) / speed.clamp_min(0.1) ** 2)
     attitude_std = torch.stack((tilt, tilt, heading), -1)
-    position_std = torch.hypot(scattered_std(drive.gnss_std[:, :3], scatter[:, :1]), off[:, None])
+    position_std = torch.hypot(scale_std(drive.gnss_std[:, :3], scatter[:, :1]), off[:, None])
     std = torch.cat((position_std, v_std, attitude_std), -1)
     C_eb = C_en @ C_nb
     finite = torch.cat((r_e, now, C_eb.flatten(1), std), -1).isfinite().all(-1)
@@ -153,7 +153,7 @@ def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
 def mean_force(drive: Drive, row: int, config: AlignConfig = ALIGN) -> Float[Tensor, " 3"]:
     """Mean specific force [m/s²] of the window that ends at boundary ``row``, carried to the body axes there."""
     back = min(row, max(1, round(config.window_s / drive.epoch_s)))
-    return _carried_force(drive.part(row - back, row), back)[0][-1]
+    return _average_force(drive.part(row - back, row), back)[0][-1]
 
 
 def level_attitude(
@@ -168,7 +168,7 @@ def level_attitude(
     return rotation_from_rpy(torch.stack((roll, pitch, yaw), -1))
 
 
-def _carried_force(
+def _average_force(
     drive: Drive, back: int
 ) -> tuple[Float[Tensor, "rows 3"], Float[Tensor, "rows 3"], Float[Tensor, "rows 3 3"]]:
     """Mean specific force of the ``back`` epochs before each boundary in the boundary's body axes.

@@ -26,25 +26,25 @@ def turn_frames(batch: Batch, generator: torch.Generator | None = None) -> Batch
     R64 = rotation_from_rpy(torch.stack((zero, zero, psi), -1))
     R = R64.to(batch.imu)
 
-    def turned(u: Tensor) -> Tensor:
+    def turn(u: Tensor) -> Tensor:
         return torch.einsum("bij,b...j->b...i", R.to(u), u)
 
-    def both(u: Tensor) -> Tensor:
-        return torch.cat((turned(u[..., :3]), turned(u[..., 3:])), -1)
+    def turn_both(u: Tensor) -> Tensor:
+        return torch.cat((turn(u[..., :3]), turn(u[..., 3:])), -1)
 
-    def stds(s: Tensor) -> Tensor:
+    def turn_stds(s: Tensor) -> Tensor:
         parts = [torch.einsum("bij,b...j->b...i", R.to(s) ** 2, x**2) for x in s.split(3, -1)]
         return torch.cat(parts, -1).sqrt()
 
-    def state(x: NavState) -> NavState:
+    def turn_state(x: NavState) -> NavState:
         extra = (1,) * (x.p_n.ndim - 2)
-        return NavState(turned(x.p_n), turned(x.v_n), R.to(x.C_nb).reshape(B, *extra, 3, 3) @ x.C_nb)
+        return NavState(turn(x.p_n), turn(x.v_n), R.to(x.C_nb).reshape(B, *extra, 3, 3) @ x.C_nb)
 
     frame = replace(
         batch.frame,
         C_en=batch.frame.C_en @ R64.mT,
-        axis_n=turned(batch.frame.axis_n),
-        earth_rate_n=turned(batch.frame.earth_rate_n),
+        axis_n=turn(batch.frame.axis_n),
+        earth_rate_n=turn(batch.frame.earth_rate_n),
     )
     # turned, a horizontal component is known only where both are
     horizontal = [v[..., :2].all(-1, keepdim=True).expand_as(v[..., :2]) for v in batch.gnss_valid.split(3, -1)]
@@ -52,12 +52,12 @@ def turn_frames(batch: Batch, generator: torch.Generator | None = None) -> Batch
     return replace(
         batch,
         frame=frame,
-        gnss=torch.where(valid, both(batch.gnss), torch.zeros_like(batch.gnss)),
-        gnss_std=stds(batch.gnss_std),
+        gnss=torch.where(valid, turn_both(batch.gnss), torch.zeros_like(batch.gnss)),
+        gnss_std=turn_stds(batch.gnss_std),
         gnss_valid=valid,
-        start=state(batch.start),
-        start_std=stds(batch.start_std),
-        truth=state(batch.truth),
+        start=turn_state(batch.start),
+        start_std=turn_stds(batch.start_std),
+        truth=turn_state(batch.truth),
     )
 
 
@@ -96,7 +96,7 @@ def degrade_sensors(batch: Batch, rough: SensorDegradation, generator: torch.Gen
     def chance(share: float) -> Tensor:
         return torch.rand(B, generator=generator) < share
 
-    def drawn(bounds: tuple[float, ...], *shape: int) -> Tensor:
+    def draw(bounds: tuple[float, ...], *shape: int) -> Tensor:
         low, high = (math.log(x) for x in bounds)
         return torch.exp(low + (high - low) * torch.rand(*shape, generator=generator))
 
@@ -113,11 +113,11 @@ def degrade_sensors(batch: Batch, rough: SensorDegradation, generator: torch.Gen
     flat = torch.where((shaken != 1)[:, None, None], slow + shaken[:, None, None] * (flat - slow), flat)
     hit = torch.stack([chance(rough.share) for _ in range(2)], -1).repeat_interleave(3, -1)  # each sensor by itself
     axes = torch.exp(rough.uneven * normal(B, 6))
-    white = torch.cat([drawn(b, B, 1).expand(B, 3) for b in (rough.accel_noise, rough.gyro_noise)], -1) * axes
-    slowly = torch.cat([drawn(b, B, 1).expand(B, 3) for b in (rough.accel_wander, rough.gyro_wander)], -1)
+    white = torch.cat([draw(b, B, 1).expand(B, 3) for b in (rough.accel_noise, rough.gyro_noise)], -1) * axes
+    slowly = torch.cat([draw(b, B, 1).expand(B, 3) for b in (rough.accel_wander, rough.gyro_wander)], -1)
     slowly = slowly * torch.exp(rough.uneven * normal(B, 6))
-    keep = torch.exp(-batch.epoch_s / drawn(rough.wander_s, B, 1))
-    of_loud = torch.cat([drawn(b, B, 1).expand(B, 3) for b in (rough.accel_rectified, rough.gyro_rectified)], -1)
+    keep = torch.exp(-batch.epoch_s / draw(rough.wander_s, B, 1))
+    of_loud = torch.cat([draw(b, B, 1).expand(B, 3) for b in (rough.accel_rectified, rough.gyro_rectified)], -1)
     of_loud = of_loud * torch.exp(normal(B, 6)) * chance(rough.rectified)[:, None]
     loud = (flat - slow).unflatten(1, (T, M)).square().mean(2).sqrt().to(of_loud)
     size = (slowly * hit)[:, None] + loud * of_loud[:, None]
@@ -125,8 +125,8 @@ def degrade_sensors(batch: Batch, rough: SensorDegradation, generator: torch.Gen
     noise = (white / batch.dt**0.5 * hit)[:, None] * normal(B, T * M, 6)
     flat = flat + (noise + wander).to(imu)
     worse = chance(rough.gnss)[:, None, None]
-    size = torch.cat([drawn(b, B, 1).expand(B, 3) for b in (rough.position, rough.velocity)], -1)[:, None]
-    lasting = draw_correlated_noise(normal(B, T, 6), torch.exp(-batch.epoch_s / drawn((5.0, 60.0), B, 1)))
+    size = torch.cat([draw(b, B, 1).expand(B, 3) for b in (rough.position, rough.velocity)], -1)[:, None]
+    lasting = draw_correlated_noise(normal(B, T, 6), torch.exp(-batch.epoch_s / draw((5.0, 60.0), B, 1)))
     error = size * (0.5**0.5) * (normal(B, T, 6) + lasting * torch.tensor([1.0] * 3 + [0.3] * 3))
     detail = size * torch.exp(0.7 * normal(B, 1, 1))
     gnss = torch.where(worse & batch.gnss_valid, batch.gnss + error.to(batch.gnss), batch.gnss)

@@ -22,11 +22,11 @@ def prepare(drives: int) -> None:
         compiled.load_loops()
 
 
-def composed(t: np.ndarray, columns: tuple[np.ndarray, ...], at: np.ndarray, usual: float, step: float) -> np.ndarray:
+def compose(t: np.ndarray, columns: tuple[np.ndarray, ...], at: np.ndarray, usual: float, step: float) -> np.ndarray:
     """Specific force and rate (m, 6), of samples of ``step`` [s] between the limits ``at`` (m + 1,), of six columns
     (n,) of samples that end at ``t``: :func:`dlkf.data.resampling.resample_imu`."""
     out = np.empty((len(at) - 1, 6))
-    _composed(t, columns, at, usual, step, out)
+    _compose(t, columns, at, usual, step, out)
     return out
 
 
@@ -60,7 +60,7 @@ def times(s, a):
 
 @njit(inline="always")
 @no_type_check
-def sum_of(a, b):
+def add(a, b):
     """a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5]
 
@@ -85,12 +85,12 @@ def _integral(t, x, usual, k):
     h = t[k] - t[k - 1] if k else t[0] - (t[0] - usual)
     if h <= 1.5 * usual:
         return h, times(h, now)
-    return h, sum_of(times(usual, now), times(h - usual, times(0.5, sum_of(now, six(x, k - 1)))))
+    return h, add(times(usual, now), times(h - usual, times(0.5, add(now, six(x, k - 1)))))
 
 
 @njit(nogil=True)
 @no_type_check
-def _composed(t, x, at, usual, step, out):
+def _compose(t, x, at, usual, step, out):
     n = len(t)
     p = int(np.searchsorted(t, at[0], side="right")) + 1  # the segment that holds the beginning
     while p >= 0 and _knot(t, n, usual, p) > at[0]:
@@ -112,12 +112,12 @@ def _composed(t, x, at, usual, step, out):
                     turned = now
                     if p > 1 and h <= 1.5 * usual and h0 <= 1.5 * usual:
                         c = h * h / (6 * h0 * (h0 + h))
-                        turned = sum_of(now, times(c, second_order(before, now)))
+                        turned = add(now, times(c, second_order(before, now)))
                     rate = turned[0] / h, turned[1] / h, turned[2] / h, turned[3] / h, turned[4] / h, turned[5] / h
                     h0, before = h, now
             segment = times(min(following, last) - begin, rate)
-            products = sum_of(products, second_order(total, segment))
-            total = sum_of(total, segment)
+            products = add(products, second_order(total, segment))
+            total = add(total, segment)
             if following >= last:
                 break
             begin = following

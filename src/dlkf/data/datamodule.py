@@ -14,19 +14,19 @@ from dlkf.base.console import ProgressCallback
 from dlkf.base.errors import InputError
 from dlkf.data.augmentation import turn_frames
 from dlkf.data.degradation import GnssNoise
-from dlkf.data.draws import combined_seed
+from dlkf.data.draws import combine_seed
 from dlkf.data.drive import Batch, Drive
-from dlkf.data.masks import BiasLaw, Outage, add_bias, outage_within, withhold_fixes
+from dlkf.data.masks import BiasLaw, Outage, add_bias, mask_outage, withhold_fixes
 from dlkf.data.segments import (
     Segment,
     StartLaw,
+    count_epochs,
     cut_segments,
     describe_unused_drives,
-    epochs_of,
     find_unused_drives,
     make_batch,
+    make_segments,
     possible_starts,
-    segments_at,
 )
 from dlkf.data.splits import SIDES, Split, split_rows
 from dlkf.data.stack import DriveStack
@@ -120,7 +120,7 @@ class DriveDataModule(L.LightningDataModule):
         """The segments of an epoch, batch by batch: one start drawn from each of as many equal parts of all
         possible starts as segments fit into the training time, in random order."""
         self.setup()
-        length = epochs_of(self.length_s(epoch), self.epoch_s)
+        length = count_epochs(self.length_s(epoch), self.epoch_s)
         if self._latest[:2] == (epoch, length):
             return self._latest[2]
         if length not in self._starts:
@@ -139,14 +139,14 @@ class DriveDataModule(L.LightningDataModule):
         rng = np.random.default_rng((self.seed, epoch))
         part = (np.arange(count) + rng.random(count)) / count
         rows = starts[torch.from_numpy((part * len(starts)).astype(np.int64))]
-        segments = segments_at(self.stack, rows[torch.from_numpy(rng.permutation(count))], length)
+        segments = make_segments(self.stack, rows[torch.from_numpy(rng.permutation(count))], length)
         batches = [segments[k : k + self.batch_size] for k in range(0, count, self.batch_size)]
         self._latest = (epoch, length, batches)
         return batches
 
     def train_batch(self, epoch: int, step: int) -> Batch:
         """The batch of a training step."""
-        generator = torch.Generator().manual_seed(combined_seed(self.seed, epoch, step))
+        generator = torch.Generator().manual_seed(combine_seed(self.seed, epoch, step))
         segments = self.train_segments(epoch)[step]
         batch = make_batch(self.stack, segments, dtype=self.dtype, start=self.start, generator=generator)
         if self.turn_frames:
@@ -180,9 +180,7 @@ class DriveDataModule(L.LightningDataModule):
             part = segments[first:last][k::n]
             batch = make_batch(self.stack, part, dtype=self.dtype, start=self.start, seed=self.eval_seed)
             if self.eval_outage is not None:
-                batch = withhold_fixes(
-                    batch, outage_within(batch, self.eval_outage.first_s, self.eval_outage.duration_s)
-                )
+                batch = withhold_fixes(batch, mask_outage(batch, self.eval_outage.first_s, self.eval_outage.duration_s))
             out.append(batch)
         return out
 
@@ -213,7 +211,7 @@ class DriveDataModule(L.LightningDataModule):
             )
         return table
 
-    def left_out(self, longest_s: float) -> list[str]:
+    def list_left_out(self, longest_s: float) -> list[str]:
         """A line per side on its drives that give no segment on any; training segments grow to ``longest_s``."""
         fixed = ("data.eval_length_s", self.eval_length_s)
         lengths = dict.fromkeys(SIDES, fixed) | {"train": ("data.length_s", longest_s)}

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 
-def combined_seed(*numbers: int) -> int:
+def combine_seed(*numbers: int) -> int:
     """One seed from several numbers, the same on every machine: of batches and segments."""
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0]) >> 1
 

@@ -128,7 +128,7 @@ class Batch:
         kept = {f.name: _apply(getattr(self, f.name), lambda x: x[index]) for f in fields(self)}
         return replace(self, **kept | {"drive": tuple(self.drive[i] for i in index.tolist())})
 
-    def trimmed(self) -> Batch:
+    def trim(self) -> Batch:
         """The batch without the padding that none of its segments needs."""
         T = max(1, int(self.present.sum(-1).max()))
         if self.size[1] == T:

@@ -23,7 +23,7 @@ from dlkf.data.readers.sharing import agrees, layout, list_settings, pool_settin
 from dlkf.data.schema import new_dataset, write_drive, write_drives_table
 from dlkf.data.summary import drive_line
 from dlkf.data.tables import DriveRow, read_drives
-from dlkf.data.validate import LIMITS, Limits, gap_rows, read_checked, read_fixes, read_imu
+from dlkf.data.validate import LIMITS, Limits, find_gaps, read_drive, read_fixes, read_imu
 
 
 class IngestResult(NamedTuple):
@@ -50,7 +50,7 @@ class IngestOptions:
         for part in split_at_gaps(drive, self.shortest_s, self.limits) if self.split_gaps else [drive]:
             rows.append(write_drive(folder, part.meta, part.imu, part.gnss, part.reference, part.aids))
             if part.gnss is not None:
-                tables = read_checked(folder, DriveRow(part.name, part.name, (0.0, 0.0, 0.0)), limits=self.limits)
+                tables = read_drive(folder, DriveRow(part.name, part.name, (0.0, 0.0, 0.0)), limits=self.limits)
                 for check in (describe_drift, describe_rotation):
                     if line := check(tables.imu, read_fixes(tables.gnss)):
                         detail.append(f"{part.name}: {line}")
@@ -87,7 +87,7 @@ def ingest(
         take_in = partial(how.take_in, folder=absolute_place(folder))
         return read_together(reader, take_in, places, parallel, skip_unsure)
 
-    return _ingested(taking, out, how, **options)
+    return _write_dataset(taking, out, how, **options)
 
 
 AbsolutePlace = tuple[str, str, str | None]
@@ -125,13 +125,13 @@ def read_together(
         settings, apart = pool_settings(alike, offsets=False)
         if apart:
             yield IngestResult([], [], tuple(apart), {})
-        for offsets in (False, True) if hasattr(reader, "sharing") else ():
+        for offsets in (False, True) if hasattr(reader, "with_settings") else ():
             settings, _ = pool_settings(alike, offsets=offsets)
             again = [place for place, doubt in doubts.items() if doubt.layout == kind]
             if offsets:
                 again = [place for place in again if agrees(settings, *doubts[place].offset_s)]
             shared = f"not sure by itself: took {list_settings(settings)}, found in other drives ({len(alike)})"
-            for (_, name, _), result in read_all(reader.sharing(settings), again):
+            for (_, name, _), result in read_all(reader.with_settings(settings), again):
                 yield result._replace(notes=(f"{name}: {shared}", *result.notes))
     if doubts and not skip_unsure:
         first = next(iter(doubts.values()))
@@ -162,10 +162,10 @@ def ingest_drives(
     What readers found out stands in ``reader/found.yaml``, as a preset that reads the same logs again and that a person
     can correct. Raises InputError, leaving nothing behind, if a drive does not pass the checks or none is left.
     """
-    return _ingested(lambda folder: (how.take_in(drive, folder) for drive in drives), out, how, **options)
+    return _write_dataset(lambda folder: (how.take_in(drive, folder) for drive in drives), out, how, **options)
 
 
-def _ingested(
+def _write_dataset(
     taking: Callable[[str], Iterable[IngestResult]],
     out: str | Path,
     how: IngestOptions,
@@ -197,20 +197,20 @@ def write_found(path: Path, mappings: Sequence[dict[str, Any]]) -> None:
         "#   python -m dlkf.ingest --config-dir <this dataset> reader=found source=<the logs> out=<another dataset>\n"
     )
     with replace_file(path) as beside:
-        beside.write_text(head + yaml.safe_dump(_agreed(mappings), sort_keys=False, allow_unicode=True))
+        beside.write_text(head + yaml.safe_dump(_merge_values(mappings), sort_keys=False, allow_unicode=True))
 
 
-def _agreed(values: Sequence[Any]) -> Any:
+def _merge_values(values: Sequence[Any]) -> Any:
     first = values[0]
     if all(isinstance(v, dict) and v.keys() == first.keys() for v in values) and set(first) != {"roll", "pitch", "yaw"}:
-        return {key: _agreed([v[key] for v in values]) for key in first}
+        return {key: _merge_values([v[key] for v in values]) for key in first}
     return first if all(v == first for v in values) else "auto"
 
 
 def split_at_gaps(drive: DriveFrames, shortest_s: float, limits: Limits) -> Iterator[DriveFrames]:
     """The parts of a drive between its IMU gaps; the drive itself where it has none."""
     t = drive.imu["t"].to_numpy()
-    gaps = gap_rows(t, limits)
+    gaps = find_gaps(t, limits)
     if not len(gaps):
         yield drive
         return

@@ -78,7 +78,7 @@ def _spread(std: np.ndarray) -> np.ndarray:
     return np.minimum(np.sqrt((np.nan_to_num(std, nan=0.0) ** 2).sum(-1)), MOST_JUMP_STD_M)
 
 
-def reachable(dt, way_m, climb_m, std_m):
+def is_reachable(dt, way_m, climb_m, std_m):
     """Whether a car can have moved so far [m] in ``dt`` [s]; ``std_m`` is the sum of both fixes' 1σ."""
     slack = JUMP_M + JUMP_SIGMAS * std_m
     return (way_m <= FASTEST_M_S * dt + slack) & (np.abs(climb_m) <= STEEPEST_M_S * dt + slack)
@@ -99,10 +99,10 @@ class FixScreen:
         self._others, self._others_since = 0, 0.0
         self.switched: list[tuple[float, float]] = []
 
-    def refused(self, t: float, place: tuple[float, float, float], speed: float, std: np.ndarray) -> str:
+    def find_refusal(self, t: float, place: tuple[float, float, float], speed: float, std: np.ndarray) -> str:
         """Why a fix cannot be: time [s], lat [°], lon [°], height [m], speed [m/s] or NaN, 1σ (6); empty if it can."""
         lat, lon, height = place
-        if reason := implausible(lat, lon, height, speed, std):
+        if reason := find_implausible(lat, lon, height, speed, std):
             return reason
         fix = GoodFix(t, lat, lon, height, float(_spread(std[:3])), t)
         if self._good is None:
@@ -137,10 +137,10 @@ class FixScreen:
     @staticmethod
     def _reaches(a: GoodFix, b: GoodFix) -> bool:
         way = horizontal_distance(a.lat_deg, a.lon_deg, b.lat_deg, b.lon_deg)
-        return bool(reachable(abs(b.t - a.t), way, b.height_m - a.height_m, a.std_m + b.std_m))
+        return bool(is_reachable(abs(b.t - a.t), way, b.height_m - a.height_m, a.std_m + b.std_m))
 
 
-def implausible(lat: float, lon: float, height: float, speed: float, std: np.ndarray) -> str:
+def find_implausible(lat: float, lon: float, height: float, speed: float, std: np.ndarray) -> str:
     """What is beyond the limits in one fix by itself, or nothing."""
     if abs(lat) < NOWHERE_DEG and abs(lon) < NOWHERE_DEG:
         return "at 0°/0°: no position yet"
@@ -177,13 +177,13 @@ def screen_fixes(gnss: dict[str, np.ndarray]) -> Screened:
             | (np.nan_to_num(std, nan=0.0) > LARGEST_STD).any(-1)
         )  # fmt: skip
         frozen = still & (speed[1:] > FROZEN_SPEED_M_S)
-    apart = ~reachable(np.diff(t), way, np.diff(height), spread[:-1] + spread[1:])
+    apart = ~is_reachable(np.diff(t), way, np.diff(height), spread[:-1] + spread[1:])
     if not (alone.any() or apart.any() or frozen.any()):
         return Screened(keep, "", [])
     screen, first = FixScreen(), ""
     for k in range(len(t)):
         speed_k = float(speed[k]) if math.isfinite(speed[k]) else math.nan
-        reason = screen.refused(float(t[k]), (float(lat[k]), float(lon[k]), float(height[k])), speed_k, std[k])
+        reason = screen.find_refusal(float(t[k]), (float(lat[k]), float(lon[k]), float(height[k])), speed_k, std[k])
         if reason:
             keep[k] = False
             first = first or f"t = {t[k]:.3f}: {reason}"

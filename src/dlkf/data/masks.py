@@ -39,7 +39,7 @@ def withhold_fixes(batch: Batch, hidden: Bool[Tensor, "b t"]) -> Batch:
     return replace(batch, available=batch.available & ~hidden.to(batch.available.device))
 
 
-def outage_within(batch: Batch, start_s: float | Tensor, duration_s: float | Tensor) -> Bool[Tensor, "b t"]:
+def mask_outage(batch: Batch, start_s: float | Tensor, duration_s: float | Tensor) -> Bool[Tensor, "b t"]:
     """True where an epoch's end has start < t ≤ start + duration, seconds from the start of a segment; each (B,)."""
     B, T, _ = batch.size
     t = torch.arange(1, T + 1, dtype=torch.float64) * batch.epoch_s

@@ -11,9 +11,9 @@ import numpy as np
 from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
 from dlkf.data.axis_checks import CHUNK_S, check_climb, check_dead_axes, check_handedness
-from dlkf.data.discovery.clock import ImuSums, find_lag, known_offset
-from dlkf.data.discovery.drift import ROUGH_S, ends_apart, find_drifting_pose
-from dlkf.data.discovery.motion import Motion, motion_of, stretches
+from dlkf.data.discovery.clock import ImuSums, describe_offset, find_lag
+from dlkf.data.discovery.drift import ROUGH_S, compare_ends, find_drifting_pose
+from dlkf.data.discovery.motion import Motion, find_motion, stretches
 from dlkf.data.limits import DEGREE_M, NOWHERE_DEG
 from dlkf.data.schema import ACCEL, GYRO, stack_columns
 from dlkf.data.tables import Columns
@@ -42,7 +42,7 @@ def check_imu_units(imu: Columns, where: str) -> None:
     """Gravity must be about 9.8 m/s² and upwards along −z; rates must be those of a car in rad/s."""
     force = _length(imu, ACCEL)
     down, largest = -imu["accel_z"], float(_length(imu, GYRO).max())
-    usual = _most(force > FORCE[0]) and _most(force < FORCE[1]) and _most(down > UPRIGHT * FORCE[1])
+    usual = _is_usual(force > FORCE[0]) and _is_usual(force < FORCE[1]) and _is_usual(down > UPRIGHT * FORCE[1])
     if usual and largest <= FASTEST_RATE:
         return  # the medians and the quantile below, which cost more than all else, would say the same
     size = float(np.median(force))
@@ -78,7 +78,7 @@ def check_imu_units(imu: Columns, where: str) -> None:
         )
 
 
-def _most(holds: np.ndarray) -> bool:
+def _is_usual(holds: np.ndarray) -> bool:
     """Whether more than half hold, and so the median."""
     return 2 * int(np.count_nonzero(holds)) > len(holds) + 1
 
@@ -241,7 +241,7 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
         as_is = "too little in common" if here is None else f"{max(here.yaw, here.force):.2f}"
         raise InputError(
             f"{where}: the clocks of IMU and GNSS are {abs(best.lag_s):.1f} s apart: yaw rate and course agree to "
-            f"{best.yaw:.2f} with {best.lag_s:+.1f} s on GNSS, as they stand {as_is}{known_offset(best.lag_s)}; "
+            f"{best.yaw:.2f} with {best.lag_s:+.1f} s on GNSS, as they stand {as_is}{describe_offset(best.lag_s)}; "
             f"reader.gnss.time.offset_s=auto, or add {best.lag_s:.1f} s to t of gnss"
         )
     turned = np.degrees(best.angle)
@@ -255,7 +255,7 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
 
 def _check_drift(imu: ImuSums, gnss: Motion, where: str) -> None:
     """The first and the last third of a drive have the same lag."""
-    ends = ends_apart(imu, gnss)
+    ends = compare_ends(imu, gnss)
     if ends is None or abs(ends.last_s - ends.first_s) <= APART_S:
         return
     ppm = 1e6 * ends.drift
@@ -271,7 +271,7 @@ def _check_drift(imu: ImuSums, gnss: Motion, where: str) -> None:
 def describe_drift(imu: Columns, gnss: Columns) -> str | None:
     """A line about clocks that drift apart by less than :func:`check_clocks` refuses; None where none is found."""
     t, accel, gyro, moved = _signals(imu, gnss)
-    ends = ends_apart(ImuSums.of(t, accel, gyro), moved)
+    ends = compare_ends(ImuSums.of(t, accel, gyro), moved)
     span = float(moved.t[-1] - moved.t[0]) if len(moved.t) else 0.0
     if span < SHORTEST_S or (ends is not None and abs(ends.drift) * span < DRIFTED_S - ROUGH_S):
         return None
@@ -302,4 +302,4 @@ def describe_rotation(imu: Columns, gnss: Columns) -> str | None:
 
 
 def _signals(imu: Columns, gnss: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray, Motion]:
-    return imu["t"], stack_columns(imu, ACCEL), stack_columns(imu, GYRO), motion_of(gnss)
+    return imu["t"], stack_columns(imu, ACCEL), stack_columns(imu, GYRO), find_motion(gnss)

@@ -10,7 +10,7 @@ import numpy as np
 from dlkf.base.angles import circular_median, wrap_angle
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import ImuSums, find_lag
-from dlkf.data.discovery.motion import motion_of
+from dlkf.data.discovery.motion import find_motion
 from dlkf.data.limits import DEGREE_M
 from dlkf.data.plausibility import APART_S, TURNED_DEG
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, stack_columns
@@ -77,10 +77,10 @@ def check_attitude(reference: Columns, imu: Columns, where: str) -> None:
         return
     course, yaw = np.arctan2(reference["vel_e"][fast], reference["vel_n"][fast]), reference["yaw"][fast]
 
-    def apart(angle: np.ndarray) -> float:
+    def measure_distance(angle: np.ndarray) -> float:
         return float(np.median(np.abs(wrap_angle(angle - course))))
 
-    if apart(yaw) > 0.5 and apart(np.pi / 2 - yaw) < 0.1:
+    if measure_distance(yaw) > 0.5 and measure_distance(np.pi / 2 - yaw) < 0.1:
         raise InputError(f"{where}: yaw counts from East, must count clockwise from North; use π/2 − yaw")
     turned, off = circular_median(yaw - course)
     if np.mean(np.abs(off) < SIDEWAYS) < STEADY or abs(turned) < np.radians(TURNED_DEG[0]):
@@ -100,6 +100,6 @@ def check_attitude(reference: Columns, imu: Columns, where: str) -> None:
 def _looks_forward(imu: Columns, reference: Columns) -> bool:
     """Whether the force along the sensor's x axis is that of a motion along it."""
     whole = np.unique(np.floor(reference["t"]), return_index=True)[1]  # one row a second
-    moved = motion_of({name: values[whole] for name, values in reference.items()})
+    moved = find_motion({name: values[whole] for name, values in reference.items()})
     best = find_lag(ImuSums.of(imu["t"], stack_columns(imu, ACCEL), stack_columns(imu, GYRO)), moved, APART_S)
     return best is not None and best.force > FORCE_AGREES and abs(best.angle) < np.radians(TURNED_DEG[0])

@@ -110,19 +110,19 @@ def resample_imu(imu: Columns, grid: SampleGrid, usual: float | None = None) -> 
     step = grid.epoch_s / grid.samples
     if loops_are_loaded():
         columns = tuple(imu[c] for c in (*ACCEL, *GYRO))
-        return compiled_samples.composed(t, columns, at, usual, step).reshape(grid.epochs, grid.samples, 6)
+        return compiled_samples.compose(t, columns, at, usual, step).reshape(grid.epochs, grid.samples, 6)
     out = np.empty((grid.epochs * grid.samples, 6))
     for first in range(0, len(out), BLOCK):
         last = min(first + BLOCK, len(out))
         begin = max(0, int(np.searchsorted(t, at[first], side="right")) - BEFORE)
         end = int(np.searchsorted(t, at[last])) + 1
         part = np.stack([imu[c][begin:end] for c in (*ACCEL, *GYRO)])
-        out[first:last] = _composed(t[begin:end], part, at[first : last + 1], usual).T
+        out[first:last] = _compose(t[begin:end], part, at[first : last + 1], usual).T
     out /= step
     return out.reshape(grid.epochs, grid.samples, 6)
 
 
-def _composed(t: np.ndarray, values: np.ndarray, at: np.ndarray, usual: float) -> np.ndarray:
+def _compose(t: np.ndarray, values: np.ndarray, at: np.ndarray, usual: float) -> np.ndarray:
     """Increments (6, m) between the limits ``at`` (m + 1,) of samples (6, n) that end at ``t``."""
     step = np.diff(t, prepend=t[0] - usual)
     whole = step <= 1.5 * usual
@@ -163,21 +163,21 @@ def assign_fixes(gnss: Columns, grid: SampleGrid) -> FixRows:
     Unknown stds take the defaults of ``DEFAULT_STD``; components that are NaN are not valid.
     """
     rows = grid.epochs + 1
-    place = boundary_after(gnss["t"], grid)
+    place = find_boundary(gnss["t"], grid)
     inside = np.flatnonzero(usable_fixes(gnss) & (place >= 0) & (place < rows))
     chosen = np.full(rows, -1)
     chosen[place[inside]] = inside  # rows are in order of time: the last assignment stays
     at = np.flatnonzero(chosen >= 0)
-    found = fixes_at(gnss, chosen[at], grid.boundaries[at])
+    found = make_fixes(gnss, chosen[at], grid.boundaries[at])
     return FixRows(*(_spread(getattr(found, name), at, rows, blank) for name, blank in BLANK.items()))
 
 
-def boundary_after(t: np.ndarray, grid: SampleGrid) -> np.ndarray:
+def find_boundary(t: np.ndarray, grid: SampleGrid) -> np.ndarray:
     """Number of the first boundary at or after times [s]; it may lie outside the grid."""
     return np.clip(np.ceil((t - grid.t0 - ON_BOUNDARY_S) / grid.epoch_s), -FARTHEST, FARTHEST).astype(np.int64)
 
 
-def fixes_at(gnss: Columns, rows: np.ndarray, boundaries: np.ndarray) -> FixRows:
+def make_fixes(gnss: Columns, rows: np.ndarray, boundaries: np.ndarray) -> FixRows:
     """Some rows of a GNSS table as fixes of the boundaries [s] given for them."""
     r_e, v_e, C_en = _ecef(gnss, rows)
     quality = gnss["quality"][rows].astype(np.int64)
@@ -203,7 +203,7 @@ class ReferenceStates:
     imu_error: np.ndarray
 
 
-def reference_at(reference: Columns | None, grid: SampleGrid) -> ReferenceStates:
+def interpolate_reference(reference: Columns | None, grid: SampleGrid) -> ReferenceStates:
     """The reference interpolated to the boundaries, from samples that are both valid and close.
 
     Position by cubic Hermite with the velocities (linear where samples are dense), velocity and IMU error

@@ -17,7 +17,7 @@ GNSS_COLUMNS = (*POSITION, *VELOCITY, *STD, "quality")
 NEEDED = ("t", *IMU_COLUMNS, *POSITION)
 
 
-def drives_of(rows: pd.DataFrame, lever_arm_b: Sequence[float]) -> Iterator[CheckedTables]:
+def split_drives(rows: pd.DataFrame, lever_arm_b: Sequence[float]) -> Iterator[CheckedTables]:
     """The checked tables of every ``drive`` in the rows (one drive where there is no such column).
 
     Columns are those of the data contract; ``vel_*``, ``std_*`` and ``quality`` (default 1, single) may be missing.

@@ -52,7 +52,7 @@ class StartLaw(Ranged, where="start", least=0):
         return torch.tensor(values, dtype=torch.float64)
 
 
-def epochs_of(length_s: float, epoch_s: float) -> int:
+def count_epochs(length_s: float, epoch_s: float) -> int:
     """Whole epochs in a length; InputError if there is none."""
     epochs = round(length_s / epoch_s)
     if epochs < 1:
@@ -88,7 +88,7 @@ def possible_starts(
     return ok
 
 
-def segments_at(stack: DriveStack, rows: Int[Tensor, " p"], epochs: int) -> list[Segment]:
+def make_segments(stack: DriveStack, rows: Int[Tensor, " p"], epochs: int) -> list[Segment]:
     """Segments that start at rows of the stack."""
     drive = torch.searchsorted(stack.first_row, rows, right=True) - 1
     first = rows - stack.first_row[drive]
@@ -109,8 +109,8 @@ def cut_segments(
     :func:`possible_starts`.
     """
     stack = stack_drives(drives)
-    epochs = epochs_of(length_s, stack.epoch_s)
-    stride = epochs if stride_s is None else epochs_of(stride_s, stack.epoch_s)
+    epochs = count_epochs(length_s, stack.epoch_s)
+    stride = epochs if stride_s is None else count_epochs(stride_s, stack.epoch_s)
     allowed = possible_starts(stack, epochs, attitude=attitude, span=span)
     candidates = torch.nonzero(allowed).flatten()
     drive = torch.searchsorted(stack.first_row, candidates, right=True) - 1
@@ -121,7 +121,7 @@ def cut_segments(
         if row >= free:
             chosen.append(row)
             free = row + stride
-    return segments_at(stack, torch.tensor(chosen, dtype=torch.int64), epochs)
+    return make_segments(stack, torch.tensor(chosen, dtype=torch.int64), epochs)
 
 
 def find_unused_drives(drives: Sequence[Drive], segments: Sequence[Segment]) -> list[str]:
@@ -174,8 +174,8 @@ def make_batch(
     dx = std * noise
     from_truth = stack.start_from_truth[row]
     if not bool(from_truth.all()):
-        truth, std, dx = _with_alignment(stack, row, frame, truth, std, dx)
-    return _assemble(stack, drive, first, epochs, frame, truth.corrected(-dx), std, dtype)
+        truth, std, dx = _fill_alignment(stack, row, frame, truth, std, dx)
+    return _assemble(stack, drive, first, epochs, frame, truth.correct(-dx), std, dtype)
 
 
 def whole_drives(drives: Sequence[Drive], starts: Sequence[Start], *, dtype: torch.dtype = torch.float64) -> Batch:
@@ -198,7 +198,7 @@ def whole_drives(drives: Sequence[Drive], starts: Sequence[Start], *, dtype: tor
     return batch
 
 
-def _with_alignment(
+def _fill_alignment(
     stack: DriveStack, row: Tensor, frame: TangentFrame, truth: NavState, std: Tensor, dx: Tensor
 ) -> tuple[NavState, Tensor, Tensor]:
     """Fill in what the reference lacks of the start from IMU and GNSS; no drawn error there."""

@@ -32,20 +32,20 @@ _FLOORS = np.repeat(FLOOR, 3)
 _EACH = tuple(_FLOORS.tolist())
 
 
-def isolated_spikes(columns: Sequence[np.ndarray]) -> np.ndarray:
+def find_spikes(columns: Sequence[np.ndarray]) -> np.ndarray:
     """Rows, in order, of six columns (n,) of specific force [m/s²] and rate [rad/s] that are spikes."""
-    found = [_apart(x, floor) for x, floor in zip(columns, _FLOORS)]
+    found = [_find_jumps(x, floor) for x, floor in zip(columns, _FLOORS)]
     at = np.unique(np.concatenate(found))
     at = at[(at > BEFORE) & (at < len(columns[0]) - AHEAD)]
     if not len(at):
         return at
     around = at[:, None] + np.arange(-BEFORE - 1, AHEAD + 1)
-    return at[_spiked(np.stack([x[around] for x in columns], -1))]
+    return at[_is_spike(np.stack([x[around] for x in columns], -1))]
 
 
-def without_spikes(imu: Columns) -> tuple[Columns, int]:
+def remove_spikes(imu: Columns) -> tuple[Columns, int]:
     """A table of samples without its spikes, and how many there were."""
-    spikes = isolated_spikes([imu[c] for c in (*ACCEL, *GYRO)])
+    spikes = find_spikes([imu[c] for c in (*ACCEL, *GYRO)])
     if not len(spikes):
         return imu, 0
     return {name: np.delete(x, spikes) for name, x in imu.items()}, len(spikes)
@@ -69,27 +69,27 @@ class SpikeScreen:
     def add(self, row: Sequence[float]) -> bool:
         """Take a sample, six numbers; whether the one two before it was a spike."""
         rows = self._rows
-        new = len(rows) > 1 and _far(row, rows[-1]) and _jumps(row, rows[-1], rows[-2])
+        new = len(rows) > 1 and _is_far(row, rows[-1]) and _jumps(row, rows[-1], rows[-2])
         rows.append(row)
         _, older, old = self._apart
         self._apart = (older, old, new)
         self.undecided = 0
         if not (new or old or older):
             return False
-        if new and self._would_be(0):
+        if new and self._may_be_spike(0):
             self.undecided = 1
-        if old and self._would_be(1):
+        if old and self._may_be_spike(1):
             self.undecided = 2
-        return older and len(rows) == ROWS and bool(_spiked(np.array(rows)[None])[0])
+        return older and len(rows) == ROWS and bool(_is_spike(np.array(rows)[None])[0])
 
-    def _would_be(self, back: int) -> bool:
+    def _may_be_spike(self, back: int) -> bool:
         """Whether the last sample, or the one ``back`` before it, is a spike if what follows is as steady as can be."""
         rows, ahead = [*self._rows], AHEAD - back
         rows = [*rows[ahead - ROWS :], *([rows[-2 + back]] * ahead)]
-        return len(rows) == ROWS and bool(_spiked(np.array(rows)[None])[0])
+        return len(rows) == ROWS and bool(_is_spike(np.array(rows)[None])[0])
 
 
-def _far(a: Sequence[float], b: Sequence[float]) -> bool:
+def _is_far(a: Sequence[float], b: Sequence[float]) -> bool:
     f, w = FLOOR
     return (
         abs(a[0] - b[0]) > f or abs(a[1] - b[1]) > f or abs(a[2] - b[2]) > f
@@ -104,7 +104,7 @@ def _jumps(x: Sequence[float], before: Sequence[float], earlier: Sequence[float]
     )
 
 
-def _apart(x: np.ndarray, floor: float) -> np.ndarray:
+def _find_jumps(x: np.ndarray, floor: float) -> np.ndarray:
     """Places that jump away from both neighbours by more than ``floor``, with steady ones to either side."""
     d = np.diff(x)
     if not len(d) or max(d.max(), -d.min()) <= floor:
@@ -117,7 +117,7 @@ def _apart(x: np.ndarray, floor: float) -> np.ndarray:
     return 1 + at[(up * down < 0) & (np.maximum(np.abs(up + down), size.max(0)) <= SHARE * least)]
 
 
-def _spiked(x: np.ndarray) -> np.ndarray:
+def _is_spike(x: np.ndarray) -> np.ndarray:
     """Whether the third last sample of each of m stretches (m, ROWS, 6) is a spike (m,)."""
     d = np.diff(x, axis=1)
     usual = np.partition(np.abs(d[:, :BEFORE]), QUARTILE, axis=1)[:, QUARTILE]

@@ -10,7 +10,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from dlkf.base.errors import InputError
-from dlkf.data.segments import epochs_of
+from dlkf.data.segments import count_epochs
 from dlkf.data.stack import DriveStack
 
 SIDES = ("train", "val", "test")
@@ -30,11 +30,11 @@ def split_rows(
     something gets nothing, or a group is unknown or on two sides.
     """
     if split == "random":
-        return _shuffled_blocks(stack, _checked(fractions), seed, epochs_of(block_s, stack.epoch_s))
+        return _shuffle_blocks(stack, _check_fractions(fractions), seed, count_epochs(block_s, stack.epoch_s))
     if split == "group":
-        sides = _by_time(stack, _checked(fractions), seed)
+        sides = _split_by_time(stack, _check_fractions(fractions), seed)
     elif isinstance(split, Mapping):
-        sides = _named(stack, split)
+        sides = _split_by_name(stack, split)
     else:
         raise InputError(f"split={split}: must be group, random, or a mapping of train, val and test to groups")
     labels = {}
@@ -44,14 +44,14 @@ def split_rows(
     return labels
 
 
-def _checked(fractions: Sequence[float]) -> list[float]:
+def _check_fractions(fractions: Sequence[float]) -> list[float]:
     values = [float(f) for f in fractions]
     if len(values) != 3 or min(values) < 0 or abs(sum(values) - 1) > 1e-6:
         raise InputError(f"fractions={values}: must be three numbers ≥ 0 for train, val and test with sum 1")
     return values
 
 
-def _by_time(stack: DriveStack, fractions: list[float], seed: int) -> dict[str, set[str]]:
+def _split_by_time(stack: DriveStack, fractions: list[float], seed: int) -> dict[str, set[str]]:
     """Groups in random order, each to the side that lacks most of its share of the driving time."""
     time: dict[str, int] = {}
     for d in stack:
@@ -75,7 +75,7 @@ def _by_time(stack: DriveStack, fractions: list[float], seed: int) -> dict[str, 
     return sides
 
 
-def _named(stack: DriveStack, split: Mapping[str, Sequence[str] | str]) -> dict[str, set[str]]:
+def _split_by_name(stack: DriveStack, split: Mapping[str, Sequence[str] | str]) -> dict[str, set[str]]:
     known = {d.group for d in stack}
     if unknown := sorted(set(split) - set(SIDES)):
         raise InputError(f"split: unknown side {unknown[0]}; known are {', '.join(SIDES)}")
@@ -102,7 +102,7 @@ def _named(stack: DriveStack, split: Mapping[str, Sequence[str] | str]) -> dict[
     return sides
 
 
-def _shuffled_blocks(
+def _shuffle_blocks(
     stack: DriveStack, fractions: list[float], seed: int, block: int
 ) -> dict[str, Int[Tensor, " rows"]]:
     labels = torch.full((int((stack.epochs + 1).sum()),), -1, dtype=torch.int64)

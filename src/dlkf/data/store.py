@@ -15,10 +15,10 @@ from dlkf.data.aid_tables import STANDARD, AidTable, standard_tables
 from dlkf.data.aids import aid_rows
 from dlkf.data.compiled_samples import prepare
 from dlkf.data.drive import Drive
-from dlkf.data.resampling import assign_fixes, epoch_grid, reference_at, resample_imu
-from dlkf.data.spikes import without_spikes
+from dlkf.data.resampling import assign_fixes, epoch_grid, interpolate_reference, resample_imu
+from dlkf.data.spikes import remove_spikes
 from dlkf.data.tables import DriveRow, dataset_digest, read_drives
-from dlkf.data.validate import LIMITS, CheckedTables, Limits, read_checked, usable_fixes
+from dlkf.data.validate import LIMITS, CheckedTables, Limits, read_drive, usable_fixes
 
 __all__ = ["dataset_digest", "drive_from_tables", "load_dataset"]
 
@@ -43,7 +43,7 @@ def load_dataset(
     """
 
     def load(row: DriveRow) -> Drive:
-        tables = read_checked(folder, row, reference=reference, aids=aids, limits=limits)
+        tables = read_drive(folder, row, reference=reference, aids=aids, limits=limits)
         return drive_from_tables(tables, folder_name(folder), rate_hz, epoch_s, dtype, aids or ())
 
     rows = drive_rows(folder, drives)
@@ -114,10 +114,10 @@ def drive_from_tables(
     shorter than an epoch.
     """
     kinds = {**STANDARD, **{aid.name: aid for aid in aids}}
-    (imu, spikes), gnss = without_spikes(tables.imu), tables.gnss
+    (imu, spikes), gnss = remove_spikes(tables.imu), tables.gnss
     grid = epoch_grid(imu["t"], gnss["t"][usable_fixes(gnss)], rate_hz, epoch_s, tables.row.name)
     fixes = assign_fixes(gnss, grid)
-    truth = reference_at(tables.reference, grid)
+    truth = interpolate_reference(tables.reference, grid)
     return Drive(
         name=tables.row.name,
         group=tables.row.group,

@@ -12,7 +12,7 @@ import pandas as pd
 from dlkf.base.errors import InputError
 from dlkf.data.aid_checks import check_aid
 from dlkf.data.aid_tables import STANDARD, AidTable
-from dlkf.data.discovery.motion import motion_of
+from dlkf.data.discovery.motion import find_motion
 from dlkf.data.limits import FULL_SCALE, NONE_REFUSED, Refused, screen_fixes, within_full_scale
 from dlkf.data.plausibility import check_clocks, check_gnss_units, check_imu_units, check_turns
 from dlkf.data.reference_checks import check_attitude, check_same_place
@@ -58,11 +58,11 @@ def validate_dataset(folder: str | Path, *, reference: bool = True) -> list[Driv
     """
     rows = read_drives(folder)
     for row in rows:
-        read_checked(folder, row, reference=reference)
+        read_drive(folder, row, reference=reference)
     return rows
 
 
-def read_checked(
+def read_drive(
     folder: str | Path,
     row: DriveRow,
     *,
@@ -99,7 +99,7 @@ def check_tables(tables: CheckedTables, limits: Limits = LIMITS) -> CheckedTable
     if truth is not None:
         _check_reference(truth, imu, read_fixes(gnss), _where(name, "reference"))
     if tables.aids:
-        moved = motion_of(read_fixes(gnss))
+        moved = find_motion(read_fixes(gnss))
         for kind, table in tables.aids.items():
             _check_time(table["t"], _where(name, kind), kind)
             check_aid(kind, table, imu, moved, _where(name, kind))
@@ -124,7 +124,7 @@ def usable_fixes(gnss: Columns | pd.DataFrame) -> np.ndarray:
     return np.isin(gnss["quality"], GNSS_QUALITIES) & np.isfinite([gnss[c] for c in POSITION]).all(0)
 
 
-def gap_rows(t: np.ndarray, limits: Limits) -> np.ndarray:
+def find_gaps(t: np.ndarray, limits: Limits) -> np.ndarray:
     """Rows before which the IMU has a gap."""
     if len(t) < 2:
         return np.zeros(0, dtype=np.int64)
@@ -138,7 +138,7 @@ def _where(drive: str, kind: str) -> str:
     return f"drive {drive}, {kind}/drive={drive}"
 
 
-def _coarse(t: np.ndarray) -> str:
+def _describe_rounding(t: np.ndarray) -> str:
     """How stamps of which many are the same were rounded, and the remedy."""
     if (t == np.floor(t)).all():
         return "t has whole seconds; give its decimals"
@@ -153,7 +153,8 @@ def _check_time(t: np.ndarray, where: str, kind: str = "imu") -> None:
     if len(back):
         k = int(back[0])
         if (same := int((np.diff(t) == 0).sum())) > MOST_SAME * len(t):
-            remedy = _coarse(t) if kind == "imu" else f"remove duplicate rows; if there are none, {_coarse(t)}"
+            rounding = _describe_rounding(t)
+            remedy = rounding if kind == "imu" else f"remove duplicate rows; if there are none, {rounding}"
             raise InputError(
                 f"{where}: {same} of {len(t)} rows have the stamp of the row before: {remedy} "
                 f"(reader.{kind}.time.respace=true spreads such rows evenly)"
@@ -188,14 +189,14 @@ def _check_imu(imu: Columns, where: str, limits: Limits) -> Columns:
         raise InputError(f"{where}: has a single sample; leave the drive out or give its data")
     _check_rate(t, where, "imu")
     check_imu_units(imu, where)
-    keep = _in_scale(imu)
+    keep = _check_scale(imu)
     beyond = np.flatnonzero(~keep)
     if len(beyond) > max(MOST_REFUSED[0] * len(t), 2):
         raise InputError(
             f"{where}: {len(beyond)} of {len(t)} samples, the first in row {beyond[0]}, are beyond "
             f"{FULL_SCALE[0]:g} m/s², {FULL_SCALE[1]:g} rad/s: damaged, or in another unit; remove them"
         )
-    gaps = gap_rows(t[keep], limits)
+    gaps = find_gaps(t[keep], limits)
     if len(gaps):
         k = int(np.flatnonzero(keep)[gaps[0]])
         before = t[keep][gaps[0] - 1]
@@ -207,7 +208,7 @@ def _check_imu(imu: Columns, where: str, limits: Limits) -> Columns:
     return imu if not len(beyond) else {column: values[keep] for column, values in imu.items()}
 
 
-def _in_scale(imu: Columns) -> np.ndarray:
+def _check_scale(imu: Columns) -> np.ndarray:
     """Samples within full scale; usually all are, which their extremes show."""
     if all(np.abs((imu[c].min(), imu[c].max())).max() <= most for s, most in zip((ACCEL, GYRO), FULL_SCALE) for c in s):
         return np.ones(len(imu["t"]), bool)

@@ -70,7 +70,7 @@ def antenna_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Floa
         return _fit_velocity(drive, C_en, down_b)
     v_n = torch.where(known, (C_en.mT @ drive.gnss_v_e.unsqueeze(-1)).squeeze(-1), 0.0)
     std = torch.where(known, drive.gnss_std[:, 3:], _vertical_std(v_n).unsqueeze(-1))
-    before = _confirming(drive)
+    before = _count_confirming(drive)
     level, noise = torch.complex(v_n[:, 0], v_n[:, 1]), std[:, :2].amax(-1)
     yaw = _yaw(drive, down_b)
     turn = torch.polar(torch.ones_like(yaw), yaw)
@@ -79,8 +79,8 @@ def antenna_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Floa
     given = known[:, :2].all(-1) & drive.gnss_valid[:, :3].all(-1)
     agrees = given & torch.nn.functional.pad((change <= most) | ~given[:-before], (before, 0), value=True)
     scatter = _scatter_of_velocities(drive, level / turn, given, noise)
-    std[:, :2] = scattered_std(std[:, :2], scatter[:, None], JOLT_STD)
-    moving = _moving(agrees & (level.abs() > MOTION_SIGMAS * std[:, :2].amax(-1)), before)
+    std[:, :2] = scale_std(std[:, :2], scatter[:, None], JOLT_STD)
+    moving = _confirm_motion(agrees & (level.abs() > MOTION_SIGMAS * std[:, :2].amax(-1)), before)
     both = torch.stack((_scatter_of_positions(drive, C_en, v_n, given, noise, scatter), scatter), -1)
     return AntennaVelocity(v_n, std, agrees, moving, both, torch.zeros_like(scatter))
 
@@ -90,13 +90,13 @@ def _scatter_of_velocities(
 ) -> Float[Tensor, " rows"]:
     """By the second differences of the ``FIT_S`` before a boundary of velocities ``level`` (rows,) turned back with the
     gyroscopes; 1 where they are few."""
-    one = _confirming(drive)
+    one = _count_confirming(drive)
     if len(given) <= 2 * one:
         return torch.ones_like(noise)
     square = (level[2 * one :] - 2 * level[one:-one] + level[: -2 * one]).abs().square()
     square = square / (SECOND_DIFFERENCE * (noise[2 * one :].square() + JOLT_STD**2))
     square = torch.where(given[2 * one :] & given[one:-one] & given[: -2 * one], square, torch.inf)
-    return _root_of_median(_last(square, drive))
+    return _root_of_median(_unfold_last(square, drive))
 
 
 def _scatter_of_positions(
@@ -105,7 +105,7 @@ def _scatter_of_positions(
 ) -> Float[Tensor, " rows"]:  # fmt: skip
     """By the differences of the ``FIT_S`` before a boundary of positions from the way by velocities, whose 1σ ``noise``
     scatters so much there."""
-    h, one = drive.epoch_s, _confirming(drive)
+    h, one = drive.epoch_s, _count_confirming(drive)
     if len(given) <= one:
         return torch.ones_like(noise)
     step = (C_en[one:].mT @ (drive.gnss_r_e[one:] - drive.gnss_r_e[:-one])[..., None])[:, :2, 0]
@@ -114,12 +114,13 @@ def _scatter_of_positions(
     way = h * (between.sum(-1) - 0.5 * (between[..., 0] + between[..., -1])) + late[:-one] - late[one:]
     square = torch.where(given.unfold(0, one + 1, 1).all(-1), (step - way).square().sum(-1), torch.inf)
     of_position = drive.gnss_std[:, :2].amax(-1).square() + FIT_STD**2
-    of_position, of_velocity = (_last(x[one:] + x[:-one], drive) for x in (of_position, noise.square()))
-    scattered = scattered_std(of_velocity.sqrt(), scatter[:, None], 2**0.5 * JOLT_STD).square()
-    return _root_of_median(_last(square, drive) / (DIFFERENCE * (of_position + (0.5 * h * one) ** 2 * scattered)))
+    of_position, of_velocity = (_unfold_last(x[one:] + x[:-one], drive) for x in (of_position, noise.square()))
+    scattered = scale_std(of_velocity.sqrt(), scatter[:, None], 2**0.5 * JOLT_STD).square()
+    variance = DIFFERENCE * (of_position + (0.5 * h * one) ** 2 * scattered)
+    return _root_of_median(_unfold_last(square, drive) / variance)
 
 
-def _last(x: Float[Tensor, " n"], drive: Drive) -> Float[Tensor, "rows k"]:
+def _unfold_last(x: Float[Tensor, " n"], drive: Drive) -> Float[Tensor, "rows k"]:
     """Those of the ``FIT_S`` before each boundary; the last n boundaries have one."""
     count = max(2, round(FIT_S / drive.epoch_s))
     return torch.nn.functional.pad(x, (count + drive.epochs + 1 - len(x), 0), value=torch.inf).unfold(0, count + 1, 1)
@@ -132,12 +133,12 @@ def _root_of_median(square: Float[Tensor, "rows k"]) -> Float[Tensor, " rows"]:
     return torch.where(found >= LEAST_DIFFERENCES, median, 1.0).clamp_min(1.0).sqrt()
 
 
-def _confirming(drive: Drive) -> int:
+def _count_confirming(drive: Drive) -> int:
     """Epochs after which a motion is confirmed."""
     return max(1, min(round(CONFIRMED_S / drive.epoch_s), drive.epochs))
 
 
-def _moving(moves: Bool[Tensor, " rows"], before: int) -> Bool[Tensor, " rows"]:
+def _confirm_motion(moves: Bool[Tensor, " rows"], before: int) -> Bool[Tensor, " rows"]:
     return moves & torch.nn.functional.pad(moves[:-before], (before, 0))
 
 
@@ -147,7 +148,7 @@ def _yaw(drive: Drive, down_b: Float[Tensor, "rows 3"]) -> Float[Tensor, " rows"
     return torch.nn.functional.pad(turned.cumsum(0), (1, 0))
 
 
-def scattered_std(
+def scale_std(
     std: Float[Tensor, "*rows k"], scatter: Float[Tensor, "*rows #k"], floor: float | Sequence[float] = FIT_STD
 ) -> Float[Tensor, "*rows k"]:
     """1σ of positions [m], with ``JOLT_STD`` of velocities, that scatter so much; the claimed one where that is 1."""
@@ -182,7 +183,7 @@ def _fit_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Float[T
     prior = torch.tensor([1e-9, 1e-9, ACCELERATION_STD**-2], dtype=torch.float64).expand(rows, -1)
     x, y = torch.stack((torch.ones_like(way), -way, slowed), -1), torch.complex(r_n[..., 0], r_n[..., 1])
     for _ in range(MOST_OUTLIERS):
-        weight = _without_outlier(x, y, weight, prior)
+        weight = _reject_outlier(x, y, weight, prior)
     fixed = weight > 0
     fit = _fit(x, y, weight, prior)
     # − 2: the fewer they are, the less certain is what they scatter by
@@ -195,7 +196,7 @@ def _fit_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Float[T
     v_n[:, 2] = down.found[:, 1]
 
     moves = fixed[:, 0] & (fixed.sum(-1) >= 3) & (velocity.abs() > MOTION_SIGMAS * spread)
-    moving = _moving(moves, _confirming(drive))
+    moving = _confirm_motion(moves, _count_confirming(drive))
     one = torch.ones_like(scatter)
     off = fit.found[:, 0].abs() / (1 - fit.own[:, 0]).clamp_min(LEAST_SHARE)
     return AntennaVelocity(
@@ -230,7 +231,7 @@ def _redundancy(weight: Tensor) -> Tensor:
     return 2 * (weight > 0).sum(-1) - 5
 
 
-def _without_outlier(x: Tensor, y: Tensor, weight: Tensor, prior: Tensor) -> Tensor:
+def _reject_outlier(x: Tensor, y: Tensor, weight: Tensor, prior: Tensor) -> Tensor:
     """Weights without the worst of the outliers."""
     fit, redundancy = _fit(x, y, weight, prior), _redundancy(weight)
     most, worst = (fit.squares / (1 - fit.own).clamp_min(LEAST_SHARE)).max(-1)

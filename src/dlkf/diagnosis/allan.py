@@ -87,7 +87,7 @@ def fit_noise(tau: Array, variance: Array, duration_s: float, correlation_time: 
     """
     weight = np.sqrt(np.maximum(duration_s / tau - 1, 0.1))
 
-    def fitted(T: float) -> tuple[float, Array]:
+    def fit(T: float) -> tuple[float, Array]:
         shapes, scale = _shapes(tau, T), variance
         for _ in range(3):  # relative to the fit itself: relative to the data would favour what is low by chance
             rows = weight / scale
@@ -96,10 +96,10 @@ def fit_noise(tau: Array, variance: Array, duration_s: float, correlation_time: 
         return rest, parts
 
     grid = np.geomspace(10 * tau[0], 100 * duration_s, 60)
-    T = min((float(x) for x in grid), key=lambda T: fitted(T)[0])
+    T = min((float(x) for x in grid), key=lambda T: fit(T)[0])
     resolved = duration_s / RESOLVED >= T
     T = T if resolved else correlation_time
-    parts = fitted(T)[1]
+    parts = fit(T)[1]
     Q, N, s = np.sqrt(parts)
     low = int(variance.argmin())
     rises = variance[-3:].mean() > RISE * N**2 / tau[-3:].mean()
@@ -142,9 +142,9 @@ def noise_preset(name: str, triads: Sequence[AllanFit], base: ImuSpec, source: s
                 f"the log is too short for the in-run bias of the {kind}: at its longest cluster time their Allan "
                 f"deviation still falls like white noise; give a longer log, or in_run=keep for that of imu={base.name}"
             )
-        values = {"noise_density": _rounded(fit.density)}
+        values = {"noise_density": _round(fit.density)}
         if in_run == "fit":
-            values |= {"instability": _rounded(fit.sigma), "correlation_time": _rounded(fit.time), "random_walk": 0.0}
+            values |= {"instability": _round(fit.sigma), "correlation_time": _round(fit.time), "random_walk": 0.0}
         sensors.append(replace(sensor, **values))
     return ImuSpec(name, *sensors, source=source)
 
@@ -176,5 +176,5 @@ def _shapes(tau: Array, T: float) -> Array:
     return np.stack((3 / tau**2, 1 / tau, 2 / x * bracket), -1)
 
 
-def _rounded(x: float) -> float:
+def _round(x: float) -> float:
     return float(f"{x:.4g}")

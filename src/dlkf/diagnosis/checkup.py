@@ -15,7 +15,7 @@ from dlkf.data.discovery.findings import discover
 from dlkf.data.limits import horizontal_distance
 from dlkf.data.schema import ACCEL, GYRO, QUALITIES
 from dlkf.data.tables import Columns, DriveRow
-from dlkf.data.validate import CheckedTables, read_checked, read_fixes, usable_fixes
+from dlkf.data.validate import CheckedTables, read_drive, read_fixes, usable_fixes
 from dlkf.navigation.earth import STANDARD_GRAVITY
 
 GOOD, NOTE, BAD = "good", "note", "BAD"
@@ -39,7 +39,7 @@ def checkup(folder: str | Path, row: DriveRow, *, discover_pose: bool = True) ->
     (:mod:`dlkf.data.discovery`).
     """
     try:
-        tables = read_checked(folder, row, reference=True)
+        tables = read_drive(folder, row, reference=True)
     except InputError as error:
         yield CheckupResult(BAD, str(error))
         return
@@ -158,7 +158,7 @@ def discover_findings(tables: CheckedTables) -> Iterator[CheckupResult]:
             grade = GOOD if fine else NOTE if off < DELAY_S else BAD  # receivers are late, clocks are wrong
             yield CheckupResult(grade, text + ("" if fine else f"; {OFFSETS}"))
         elif finding.setting == "imu.axes":
-            angle = turned_deg(finding.value)
+            angle = measure_turn(finding.value)
             fine = angle < ANGLE_DEG
             text = f"pose: the sensor is turned {angle:.1f}° against the car ({finding.detail})"
             remedy = "" if fine else "; ingest with reader=auto or reader.imu.axes"
@@ -172,7 +172,7 @@ OFFSETS = (
 )
 
 
-def turned_deg(angles: Mapping[str, float]) -> float:
+def measure_turn(angles: Mapping[str, float]) -> float:
     """Angle of the rotation of a pose that is given as roll, pitch, yaw [°]."""
     turn = Rotation.from_euler("ZYX", [angles[k] for k in ("yaw", "pitch", "roll")], degrees=True)
     return math.degrees(float(turn.magnitude()))

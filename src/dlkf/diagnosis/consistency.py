@@ -93,7 +93,7 @@ def state_error(
     return torch.cat(parts, -1)
 
 
-def states_of(name: str, estimator: Filter) -> ErrorStates:
+def find_states(name: str, estimator: Filter) -> ErrorStates:
     """The error states of a filter. Raises InputError for one without a covariance."""
     if not has_covariance(estimator):
         raise InputError(f"model {name} has no covariance to compare its errors with; give a Kalman filter")
@@ -109,7 +109,7 @@ def measure_consistency(
     """NEES and NIS of a filter over drives with errors as it models them (``matched_drives``)."""
     n, rows = estimator.states.navigation, []
     for index in torch.arange(batch.size[0]).split(AT_ONCE):
-        part = batch.select(index).trimmed()
+        part = batch.select(index).trim()
         with torch.inference_mode():
             s = integrate(part, estimator, keep_covariances=True)
         assert s.covariances is not None

@@ -64,7 +64,7 @@ def make_matched_drives(spec: ImuSpec, states: ErrorStates) -> ImuSpec:
     return replace(spec, name=f"{spec.name}, {states.matrix}", accel=of(spec.accel), gyro=of(spec.gyro))
 
 
-def matched_batch(
+def make_matched_batch(
     settings: MatchedDrives, spec: ImuSpec, progress: ProgressCallback | None = None
 ) -> tuple[Batch, Tensor]:
     """The drives as one batch, and the units' matrices M (B, 2, 3, 3).

@@ -18,7 +18,7 @@ from dlkf.evaluation.scores import Scores
 from dlkf.filters.smoother import Filter
 
 
-def injected_response(
+def inject_bias(
     base: Scores,
     filters: Mapping[str, Filter],
     scenes: Iterable[Scene],
@@ -42,14 +42,14 @@ def injected_response(
         generator = segment_generator(seed, f"bias {seen[segment]}", *segment)
         return law.std * torch.randn(6, generator=generator, dtype=torch.float64)
 
-    def shifted() -> Iterator[Scene]:
+    def shift_scenes() -> Iterator[Scene]:
         for batch, mask in scenes:
             segments = list(zip(batch.drive, batch.t_start.tolist()))
             drawn.append(torch.stack([bias(segment) for segment in segments]))
             seen.update(segments)
             yield add_bias(batch, drawn[-1]), mask
 
-    scores = score_scenes(filters, shifted(), total=total, progress=progress)
+    scores = score_scenes(filters, shift_scenes(), total=total, progress=progress)
     followed: dict[str, Array] = {
         name: last_finite(run.imu_error) - last_finite(base.filters[name].imu_error)
         for name, run in scores.filters.items()

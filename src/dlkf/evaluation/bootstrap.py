@@ -86,7 +86,7 @@ def _dot(weights: Array, values: Array) -> Array:
     return np.where((weights[:, ~finite] > 0).any(-1), np.inf, total)
 
 
-def resampled_weights(groups: NDArray[np.int64], resamples: int, generator: np.random.Generator) -> Iterator[Array]:
+def draw_weights(groups: NDArray[np.int64], resamples: int, generator: np.random.Generator) -> Iterator[Array]:
     """Bootstrap weights (R, U) in blocks: draws of each unit's group; ``groups`` (U,) from 0 up."""
     G = int(groups.max()) + 1
     block = max(1, _CELLS // max(len(groups), 1))
@@ -127,14 +127,14 @@ def compare(
     a, b = np.asarray(a, float), np.asarray(b, float)
     keep = ~(np.isnan(a) | np.isnan(b))
     a, b = a[keep], b[keep]
-    drawn = np.arange(len(a)) if groups is None else _numbered(np.asarray(groups, dtype=str)[keep])
+    drawn = np.arange(len(a)) if groups is None else _number(np.asarray(groups, dtype=str)[keep])
     G = int(drawn.max()) + 1 if len(a) else 0
     one = np.ones((1, len(a)))
     sa, sb = ((float(weighted_means(x, one, statistic)[0]) if len(a) else np.nan) for x in (a, b))
     ratios, differences = [np.empty(0)], [np.empty(0)]
     with np.errstate(invalid="ignore", divide="ignore"):
         if G >= MIN_GROUPS:
-            for w in resampled_weights(drawn, resamples, np.random.default_rng(seed)):
+            for w in draw_weights(drawn, resamples, np.random.default_rng(seed)):
                 ra, rb = weighted_means(a, w, statistic), weighted_means(b, w, statistic)
                 ratios.append(ra / rb)
                 differences.append(ra - rb)
@@ -143,7 +143,7 @@ def compare(
     return Comparison(statistic, sa, sb, ratio, rl, rh, difference, dl, dh, len(a), G, CONFIDENCE)
 
 
-def _numbered(groups: NDArray[np.str_]) -> NDArray[np.int64]:
+def _number(groups: NDArray[np.str_]) -> NDArray[np.int64]:
     return np.unique(groups, return_inverse=True)[1] if len(groups) else np.empty(0, np.int64)
 
 
@@ -160,14 +160,14 @@ def rms_band(
     square = np.where(valid, x, 0.0) ** 2
     rms = np.where(n > 0, np.sqrt(square.sum(0) / np.maximum(n, 1)), np.nan)
     low, high = np.full((2, len(rms)), np.nan)
-    drawn = np.arange(len(x)) if groups is None else _numbered(np.asarray(groups, dtype=str))
+    drawn = np.arange(len(x)) if groups is None else _number(np.asarray(groups, dtype=str))
     counted = np.array([len(np.unique(drawn[valid[:, k]])) for k in range(len(rms))])  # groups with a value
     sure = np.flatnonzero((counted >= MIN_GROUPS) & np.isfinite(rms))
     if not len(sure):
         return rms, low, high
     draws = []
     with np.errstate(invalid="ignore"):
-        for w in resampled_weights(drawn, resamples, np.random.default_rng(seed)):
+        for w in draw_weights(drawn, resamples, np.random.default_rng(seed)):
             draws.append(np.sqrt((w @ square[:, sure]) / (w @ valid[:, sure].astype(float))))
     every = np.concatenate(draws)
     for k, column in enumerate(sure):

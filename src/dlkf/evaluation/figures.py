@@ -75,7 +75,7 @@ def all_figures(scores: Scores, *, by_time: bool, baseline: str | None) -> Itera
     yield "imu_errors", "IMU-error estimates, one segment", imu_errors(scores, middle)
 
 
-def line_of(scores: Scores, name: str) -> dict[str, Any]:
+def line_style(scores: Scores, name: str) -> dict[str, Any]:
     """Colour and style of a filter, the same in every figure of these scores."""
     k = list(scores.filters).index(name)
     return {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[k % len(STYLES)]}
@@ -110,7 +110,7 @@ def tracks(scores: Scores, segments: Sequence[int]) -> Figure:
     handles = [Line2D([], [], color="black", lw=1.6, label="truth")]
     if hidden:
         handles.append(Line2D([], [], color=SHADE, lw=8, solid_capstyle="round", label="outage"))
-    handles += [Line2D([], [], lw=1.8, label=n, **line_of(scores, n)) for n in scores.filters]
+    handles += [Line2D([], [], lw=1.8, label=n, **line_style(scores, n)) for n in scores.filters]
     _legend(figure, handles)
     return figure
 
@@ -125,7 +125,7 @@ def _track(ax: Axes, scores: Scores, i: int, middle: Array, half: float) -> None
     ax.plot(truth[:, 1], truth[:, 0], color="black", lw=1.6, zorder=3)
     for name, run in scores.filters.items():
         p = run.p_n[i, :, :2]
-        ax.plot(p[:, 1], p[:, 0], lw=1.8, alpha=0.9, zorder=4, **line_of(scores, name))
+        ax.plot(p[:, 1], p[:, 0], lw=1.8, alpha=0.9, zorder=4, **line_style(scores, name))
     ax.set_aspect("equal")
     ax.set_xlim(middle[1] - half, middle[1] + half)
     ax.set_ylim(middle[0] - half, middle[0] + half)
@@ -157,7 +157,7 @@ def _outage_end(ax: Axes, scores: Scores, i: int) -> None:
         p = run.p_n[i, last]
         if not (np.abs(p[:2] - truth) <= half).all():
             absent.append(name)
-        ax.plot(p[1], p[0], "o", ms=8, mfc="none", mec=line_of(scores, name)["color"], mew=1.6, zorder=5)
+        ax.plot(p[1], p[0], "o", ms=8, mfc="none", mec=line_style(scores, name)["color"], mew=1.6, zorder=5)
     _absent(ax, absent)
     ax.set_title(f"end of the outage, {w.length[k] * scores.epoch_s:g} s without GNSS", fontsize=9)
 
@@ -179,7 +179,7 @@ def error_over_time(scores: Scores, segments: Sequence[int] | None = None) -> Fi
         for name in scores.filters:
             x = sizes[name][q] * scale
             finite = np.where(np.isfinite(x), x, np.nan)
-            style = line_of(scores, name)
+            style = line_style(scores, name)
             ax.plot(scores.t, rms_over_segments(np.where(np.isinf(x), np.nan, x)), lw=1.8, zorder=3, **style)
             if len(index) > 4:
                 some = (~np.isnan(finite)).sum(0) > 4
@@ -196,7 +196,7 @@ def error_over_time(scores: Scores, segments: Sequence[int] | None = None) -> Fi
     if len(index) > 4:
         what += ", band: middle 80 % of the segments"
     axes[0].set_title(what, fontsize=9, loc="left")
-    handles = [Line2D([], [], lw=1.8, label=n, **line_of(scores, n)) for n in scores.filters]
+    handles = [Line2D([], [], lw=1.8, label=n, **line_style(scores, n)) for n in scores.filters]
     _legend(figure, handles + _outage_handle(scores, index))
     return figure
 
@@ -213,7 +213,7 @@ def imu_errors(scores: Scores, i: int) -> Figure:
         _shade(ax, scores, [i])
         extent: list[Array] = []
         for name, run in runs.items():
-            style = line_of(scores, name)
+            style = line_style(scores, name)
             y, s = run.imu_error[i, :, k] * scale, run.imu_std[i, :, k] * scale
             ax.plot(scores.t, y, lw=1.7, zorder=3, **style)
             ax.fill_between(scores.t, y - s, y + s, color=style["color"], alpha=0.15, lw=0, zorder=2)
@@ -230,7 +230,7 @@ def imu_errors(scores: Scores, i: int) -> Figure:
             ax.set_xlabel("Time since the start [s]")
         _plain(ax)
     handles: list[Artist] = [Line2D([], [], color="black", lw=1.4, label="truth")] if known else []
-    handles += [Line2D([], [], lw=1.7, label=n, **line_of(scores, n)) for n in runs]
+    handles += [Line2D([], [], lw=1.7, label=n, **line_style(scores, n)) for n in runs]
     if any(np.isfinite(r.imu_std[i]).any() for r in scores.filters.values()):
         handles.append(Patch(color=COLOURS[1], alpha=0.2, label="±1σ of the filter"))
     figure.suptitle(f"IMU-error estimates, {_name(scores, i)}", fontsize=10)
@@ -252,7 +252,7 @@ def error_growth(scores: Scores) -> Figure:
     for name, run in scores.filters.items():
         x = outage_at(magnitudes(run.error)["horizontal"], w, seconds, scores.epoch_s)
         rms, low, high = rms_band(x, groups=groups)
-        style = line_of(scores, name)
+        style = line_style(scores, name)
         ax.plot(seconds, np.where(np.isfinite(rms), rms, np.nan), lw=2, label=name, zorder=3, **style)
         ax.fill_between(seconds, low, high, color=style["color"], alpha=0.15, lw=0, zorder=2)
         banded |= bool(np.isfinite(low).any())
@@ -290,7 +290,7 @@ def error_histograms(scores: Scores, names: Sequence[str]) -> Figure:
         for n, x in found.items():
             heights, edges = np.histogram(np.minimum(x, top), bins=20, range=(0.0, top))
             last = n == names[-1]
-            ax.stairs(heights, edges, lw=1.6, fill=last, alpha=0.7 if last else 1, **line_of(scores, n))
+            ax.stairs(heights, edges, lw=1.6, fill=last, alpha=0.7 if last else 1, **line_style(scores, n))
         ax.set(xlim=(0, top))
         ax.set_title(f"{count * scores.epoch_s:g} s without GNSS", fontsize=9)
         _plain(ax)
@@ -300,7 +300,7 @@ def error_histograms(scores: Scores, names: Sequence[str]) -> Figure:
         ax.set_xlabel("Horizontal RMS since the outage began [m]", fontsize=9)
     for ax in panels[:, 0]:
         ax.set_ylabel("Outages", fontsize=9)
-    _legend(figure, [Line2D([], [], label=n, **line_of(scores, n)) for n in names])
+    _legend(figure, [Line2D([], [], label=n, **line_style(scores, n)) for n in names])
     return figure
 
 

@@ -42,7 +42,9 @@ class Gains:
         return float(np.mean([self.last[:, row + k, column + k] for k in range(3)]))
 
 
-def gains_of(filters: Mapping[str, Filter], scenes: Iterable[Scene], *, settle_s: float = 10.0) -> dict[str, Gains]:
+def measure_gains(
+    filters: Mapping[str, Filter], scenes: Iterable[Scene], *, settle_s: float = 10.0
+) -> dict[str, Gains]:
     """Gains of those filters that have one."""
     last: dict[str, list[Array]] = {}
     used: dict[str, list[Array]] = {}

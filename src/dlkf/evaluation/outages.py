@@ -16,7 +16,7 @@ from torch import Tensor
 from dlkf.base.errors import InputError
 from dlkf.data.draws import draw_per_segment
 from dlkf.data.drive import Batch
-from dlkf.data.masks import outage_within
+from dlkf.data.masks import mask_outage
 
 LAST_FIX_WITHIN_S = 2.0  # an outage counts from a fix: one must lie this close before its start
 
@@ -56,8 +56,8 @@ class OutagePlan:
         """
         B, T, _ = batch.size
         epoch_s = batch.epoch_s
-        first = _drawn(self.first_s, batch, seed, "first_s")
-        duration = _drawn(self.duration_s, batch, seed, "duration_s")
+        first = _draw(self.first_s, batch, seed, "first_s")
+        duration = _draw(self.duration_s, batch, seed, "duration_s")
         repeats = 1 if self.every_s is None else max(1, int(T * epoch_s / self.every_s) + 1)
         out = []
         for offset in self.offsets_s or (0.0,):
@@ -74,7 +74,7 @@ def outage_mask(batch: Batch, start_s: Tensor, duration_s: Tensor) -> Tensor:
     start, stop = start_s.double()[:, None], (start_s + duration_s).double()[:, None]
     slack = 1e-6 * batch.epoch_s
     length = batch.present.cpu().sum(-1, keepdim=True) * batch.epoch_s
-    return outage_within(batch, start_s, duration_s) & (start > -slack) & (stop <= length + slack)
+    return mask_outage(batch, start_s, duration_s) & (start > -slack) & (stop <= length + slack)
 
 
 def scorable_outages(batch: Batch, outage: Tensor) -> Tensor:
@@ -115,7 +115,7 @@ def _bounds(name: str, value: float | Sequence[float]) -> tuple[float, float]:
     return float(values[0]), float(values[-1])
 
 
-def _drawn(value: float | Sequence[float], batch: Batch, seed: int, name: str) -> Tensor:
+def _draw(value: float | Sequence[float], batch: Batch, seed: int, name: str) -> Tensor:
     low, high = _bounds(f"outage.{name}", value)
     steps = round((high - low) / batch.epoch_s)
     if not steps:

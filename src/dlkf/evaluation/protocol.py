@@ -105,7 +105,7 @@ class Scenes:
             self._batches = [(stack, part) for part in _parts(segments, [p.epochs for p in segments], stack)]
             self.outage = protocol.outage and drives_that_fit(protocol.outage, protocol.length_s)
         else:
-            starts = self._aligned(stack, protocol.align)
+            starts = self._align(stack, protocol.align)
             starts = {d: starts[d] for d in spread_evenly(list(starts), limit)}
             order = sorted(starts, key=lambda d: -stack[d].epochs)  # like lengths together: little padding
             parts = _parts(order, [stack[d].epochs for d in order], stack)
@@ -149,7 +149,7 @@ class Scenes:
                 return cls(data.stack, Protocol("segments", length, length, data.start, seed=seed), segments=segments)
         return scenes
 
-    def withheld(self) -> list[Batch]:
+    def withhold(self) -> list[Batch]:
         """All batches with the outages applied."""
         return [withhold_fixes(batch, mask) for batch, mask in self]
 
@@ -167,7 +167,7 @@ class Scenes:
         common |= {REFUSED: self.refused} if self.refused else {}
         return common | {"outage": asdict(self.outage) if self.outage else None, "skipped": self.skipped}
 
-    def _aligned(self, drives: Sequence[Drive], config: AlignConfig) -> dict[int, Start]:
+    def _align(self, drives: Sequence[Drive], config: AlignConfig) -> dict[int, Start]:
         scored = [k for k, drive in enumerate(drives) if bool(drive.ref_valid.any())]
         for k in sorted(set(range(len(drives))) - set(scored)):
             lacks = "has no valid reference to score against; reference=smoothed or gnss needs none"

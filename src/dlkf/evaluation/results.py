@@ -179,9 +179,9 @@ def summarise_scores(
         if len(w.segment):
             samples[name] |= _outage_samples(scores, name, distance) | sigma_samples(scores, name)
         for (over, part, quantity), x in samples[name].items():
-            values += values_of(scores.kinds[0], name, over, part, quantity, summarise_errors(x))
+            values += make_values(scores.kinds[0], name, over, part, quantity, summarise_errors(x))
         spread = {"rms": rms(scores.filters[name].innovation)}  # over their 1σ; NaN of a filter without covariance
-        values += values_of(scores.kinds[0], name, "segments", "with_gnss", "innovation", spread)
+        values += make_values(scores.kinds[0], name, "segments", "with_gnss", "innovation", spread)
         values += _imu_error_quality(scores, name)
     return Results(
         kind=scores.kinds[0],
@@ -223,7 +223,7 @@ def summarise_scores(
     )
 
 
-def values_of(
+def make_values(
     kind: str, filter: str, over: str, part: str, quantity: str, statistics: Mapping[str, float]
 ) -> list[Value]:
     """Rows of several statistics of one thing, with their unit."""
@@ -235,7 +235,7 @@ def values_of(
 
 def imu_error_values(kind: str, filter: str, statistic: str, six: Array) -> list[Value]:
     """Rows of one statistic of the six axes of the IMU-error estimate at the end of a segment."""
-    rows = (values_of(kind, filter, "segments", "last", q, {statistic: float(x)}) for q, x in zip(IMU_AXES, six))
+    rows = (make_values(kind, filter, "segments", "last", q, {statistic: float(x)}) for q, x in zip(IMU_AXES, six))
     return [row for one in rows for row in one]
 
 

@@ -52,7 +52,7 @@ def score_scenes(
         for name, estimator in filters.items():
             parts[-1].filters[name] = _blank(batch, len(aid_columns(estimator)))
             for index in chunks(batch, chunk_samples):
-                _fill(parts[-1].filters[name], index, masked.select(index).trimmed(), estimator)
+                _fill(parts[-1].filters[name], index, masked.select(index).trim(), estimator)
                 done += len(index)
                 if progress is not None:
                     progress(done, total and total * len(filters))
@@ -89,18 +89,18 @@ def _fill(run: FilterRun, index: Tensor, batch: Batch, estimator: Filter) -> Non
     rows, T = index.numpy(), batch.size[1]
     here = batch.present.cpu().numpy()[..., None]
 
-    def kept(x: Tensor) -> Array:
+    def mask(x: Tensor) -> Array:
         return np.where(here, x.double().cpu().numpy(), np.nan)
 
     run.error[rows, :T] = error_series(batch, solution.posterior)
-    run.p_n[rows, :T] = kept(solution.posterior.p_n)
-    run.imu_error[rows, :T] = kept(solution.imu_error)
+    run.p_n[rows, :T] = mask(solution.posterior.p_n)
+    run.imu_error[rows, :T] = mask(solution.imu_error)
     if solution.std is not None:
-        run.imu_std[rows, :T] = kept(solution.std[..., IMU])
-        run.position_std[rows, :T] = kept(solution.std[..., :3])
+        run.imu_std[rows, :T] = mask(solution.std[..., IMU])
+        run.position_std[rows, :T] = mask(solution.std[..., :3])
     if (S := solution.innovation_covariance) is not None:
         sigma = S.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
         seen = solution.used.unsqueeze(-1) & (solution.innovation != 0)
-        run.innovation[rows, :T] = kept(torch.where(seen, solution.innovation / sigma, torch.nan))
+        run.innovation[rows, :T] = mask(torch.where(seen, solution.innovation / sigma, torch.nan))
     if solution.aids is not None:
-        run.aids[rows, :T] = kept(solution.aids)
+        run.aids[rows, :T] = mask(solution.aids)

@@ -89,9 +89,9 @@ def join_scores(parts: Sequence[Scores]) -> Scores:
     T = max(s.outage.shape[1] for s in parts)
 
     def rows(things: Sequence[object], name: str) -> Array:
-        return np.concatenate([_padded(getattr(x, name), T) for x in things])
+        return np.concatenate([_pad(getattr(x, name), T) for x in things])
 
-    def of_filter(name: str) -> FilterRun:
+    def join_filter(name: str) -> FilterRun:
         runs = [s.filters[name] for s in parts]
         return FilterRun(*(rows(runs, f.name) for f in fields(FilterRun)))
 
@@ -103,11 +103,11 @@ def join_scores(parts: Sequence[Scores]) -> Scores:
         truth_v_n=rows(parts, "truth_v_n"),
         true_imu_error=rows(parts, "true_imu_error"),
         origin_e=np.concatenate([s.origin_e for s in parts]),
-        filters={name: of_filter(name) for name in parts[0].filters},
+        filters={name: join_filter(name) for name in parts[0].filters},
     )
 
 
-def _padded(x: Array, T: int) -> Array:
+def _pad(x: Array, T: int) -> Array:
     """(P, t, …) to (P, T, …): no outage, NaN elsewhere."""
     extra = [(0, 0)] * x.ndim
     extra[1] = (0, T - x.shape[1])

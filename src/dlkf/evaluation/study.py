@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from dlkf.base.console import ProgressCallback, show_progress
 from dlkf.data.masks import BiasLaw
-from dlkf.evaluation.bias_slope import injected_response
+from dlkf.evaluation.bias_slope import inject_bias
 from dlkf.evaluation.metrics import Array, slope
 from dlkf.evaluation.protocol import Scenes
 from dlkf.evaluation.results import BASELINE, SETTLE_S, Results, imu_error_values, summarise_scores
@@ -41,11 +41,13 @@ def run_scenes(
     if law is None:
         return ScoredRun(scores)
     with counting("Running with injected biases") as progress:
-        response = injected_response(scores, filters, scenes, law=law, total=scenes.runs, progress=progress, seed=seed)
+        response = inject_bias(scores, filters, scenes, law=law, total=scenes.runs, progress=progress, seed=seed)
     return ScoredRun(scores, *response)
 
 
-def results_of(run: ScoredRun, *, baseline: str = BASELINE, settle_s: float = SETTLE_S, seed: int = 0) -> list[Results]:
+def make_results(
+    run: ScoredRun, *, baseline: str = BASELINE, settle_s: float = SETTLE_S, seed: int = 0
+) -> list[Results]:
     """The results of each kind of data, with the ``injected_slope`` of each filter's IMU-error estimate where biases
     were added."""
     scores = run.scores

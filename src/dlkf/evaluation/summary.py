@@ -21,7 +21,7 @@ METRICS = {
 }
 
 
-def metrics_of(results: Sequence[Results]) -> dict[str, float]:
+def collect_metrics(results: Sequence[Results]) -> dict[str, float]:
     """``test/<filter>/…``: the few numbers by which runs are compared, finite ones; the report has all.
 
     ``ratio_…`` are to the baseline, of the error at the end of the outages, RMS and geometric mean. With several kinds

@@ -46,7 +46,7 @@ class Adaptation:
         noise = zeros(B, states, states), zeros(B, 6), zeros(B) > 0
         return AdaptiveNoise(*noise, zeros(B), zeros(B), like.new_tensor([self.forgetting]))
 
-    def learned(
+    def learn_noise(
         self,
         noise: AdaptiveNoise,
         epoch: Epoch,

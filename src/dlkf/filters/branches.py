@@ -19,12 +19,12 @@ def may_branch(on: Tensor) -> bool:
     return on.device.type == "cpu" and not is_recorded()
 
 
-def chosen(on: Bool[Tensor, " B"], then: Parts, otherwise: Parts) -> Parts:
+def select_branch(on: Bool[Tensor, " B"], then: Parts, otherwise: Parts) -> Parts:
     """``then`` for the drives that are ``on``, else ``otherwise``: a tensor, or named tuples of the same kind.
 
     Exported C computes what only this uses of ``then`` if ``on`` alone (:mod:`dlkf.onboard.c_branches`).
     """
     if isinstance(then, Tensor):
         return torch.where(on.view(-1, *(1,) * (then.ndim - 1)), then, otherwise)  # type: ignore[return-value]
-    parts: Any = (chosen(on, x, y) for x, y in zip(then, otherwise, strict=True))
+    parts: Any = (select_branch(on, x, y) for x, y in zip(then, otherwise, strict=True))
     return type(then)(*parts)

@@ -55,7 +55,7 @@ def build_filter(name: str, imu: ImuSpec, *, tuning: Tuning | None = None, prior
     Raises InputError for an unknown name, a missing prior, or an own source that is missing.
     """
     if not is_filter(name):
-        raise InputError(f"unknown model {name!r}; known filters: {known_filters()}")
+        raise InputError(f"unknown model {name!r}; known filters: {describe_filters()}")
     if name == "ins":
         return Ins()
     kind, *own = name.split("+")
@@ -115,7 +115,7 @@ def filter_names() -> list[str]:
     return ["plus", *MODEL_BASED, *(f"{name}_{end}" for name in MODEL_BASED for end in ENDINGS)]
 
 
-def known_filters() -> str:
+def describe_filters() -> str:
     """What to write after ``model=``, for messages."""
     endings = ", ".join("_" + ending for ending in ENDINGS)
     return f"{', '.join(MODEL_BASED)}; endings of a Kalman filter: {endings}; behind a plus: {', '.join(SOURCES)}"

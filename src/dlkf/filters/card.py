@@ -34,7 +34,7 @@ def read_card(folder: Path) -> dict[str, Any]:
     return values
 
 
-def recordings_seen(card: Mapping[str, Any], dataset: str, digest: str, groups: Iterable[str]) -> set[str]:
+def find_seen_recordings(card: Mapping[str, Any], dataset: str, digest: str, groups: Iterable[str]) -> set[str]:
     """Recordings among ``groups`` that a model was trained or chosen on.
 
     They count where the dataset's name or its digest is one of the card's: recordings of other datasets may bear
@@ -46,7 +46,7 @@ def recordings_seen(card: Mapping[str, Any], dataset: str, digest: str, groups: 
     return set(groups) & {*(card.get("trained_on") or ()), *(card.get("chosen_on") or ())}
 
 
-def unseen_imus(cards: Mapping[str, Mapping[str, Any]], imus: Iterable[str]) -> list[str]:
+def describe_unseen_imus(cards: Mapping[str, Mapping[str, Any]], imus: Iterable[str]) -> list[str]:
     """A line for each model that works with its training IMUs alone, where ``imus`` are others.
 
     ``cards`` by the models' names; none for a card without ``imus``.
@@ -63,10 +63,12 @@ def unseen_imus(cards: Mapping[str, Mapping[str, Any]], imus: Iterable[str]) -> 
 
 
 class LowSampleRateWarning(UserWarning):
-    """The warning of :func:`slow_drives`, for a filter that is used from Python."""
+    """The warning of :func:`describe_slow_drives`, for a filter that is used from Python."""
 
 
-def slow_drives(models: Mapping[str, object], rates: Iterable[float], having: str = "these drives have") -> list[str]:
+def describe_slow_drives(
+    models: Mapping[str, object], rates: Iterable[float], having: str = "these drives have"
+) -> list[str]:
     """A line for each model that uses frequency bands of the samples, where ``rates`` [Hz] has one too slow.
 
     ``models`` by their names; one without ``least_rate_hz`` takes any rate. A clock a tenth slow is as good.
@@ -85,7 +87,7 @@ def slow_drives(models: Mapping[str, object], rates: Iterable[float], having: st
 
 def warn_slow_drives(model: object, rate_hz: float) -> bool:
     """Whether a stream is too slow for a filter, which is a warning (:class:`LowSampleRateWarning`)."""
-    lines = slow_drives({"the filter": model}, [rate_hz], "this stream has")
+    lines = describe_slow_drives({"the filter": model}, [rate_hz], "this stream has")
     for line in lines:
         warnings.warn(line, LowSampleRateWarning, stacklevel=3)
     return bool(lines)
@@ -94,17 +96,17 @@ def warn_slow_drives(model: object, rate_hz: float) -> bool:
 def domain_warnings(
     models: Mapping[str, object], dataset: str | Path, drives: Iterable[str], preset: str, rate_hz: int | float
 ) -> list[str]:
-    """Lines for models on drives that they were not made for: :func:`unseen_imus`, :func:`slow_drives`.
+    """Lines for models on drives that they were not made for, by IMU and by rate of the samples.
 
     The IMU is ``preset`` where the dataset names none; samples brought to ``rate_hz`` are as fast as they were at most.
     """
     drives, imus, rates = list(drives), drive_imus(dataset), drive_rates(dataset)
     cards = {name: getattr(model, "card", {}) for name, model in models.items()}
-    unmet = unseen_imus(cards, {imus.get(drive, preset) for drive in drives})
-    return unmet + slow_drives(models, [float(min(rate_hz, rates.get(drive, rate_hz))) for drive in drives])
+    unmet = describe_unseen_imus(cards, {imus.get(drive, preset) for drive in drives})
+    return unmet + describe_slow_drives(models, [float(min(rate_hz, rates.get(drive, rate_hz))) for drive in drives])
 
 
-def without_training_recordings(
+def select_scored_drives(
     cards: Mapping[str, Mapping[str, Any]], drives: Sequence[DriveRow], dataset: str, digest: str, *, leave_out: bool
 ) -> tuple[list[DriveRow], list[str]]:
     """The drives of a dataset to score models on, and a line for each model trained on some of their recordings.
@@ -113,7 +115,7 @@ def without_training_recordings(
     none is left.
     """
     groups = {d.group for d in drives}
-    seen = {name: recordings_seen(card, dataset, digest, groups) for name, card in cards.items()}
+    seen = {name: find_seen_recordings(card, dataset, digest, groups) for name, card in cards.items()}
     if leave_out:
         kept = [d for d in drives if d.group not in set().union(*seen.values())]
         if not kept:

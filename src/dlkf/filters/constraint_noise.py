@@ -42,7 +42,7 @@ class ConstraintNoise(NamedTuple):
         mean = (FIRST * EXPECTED + self.squares) / (FIRST + self.fixes)
         return torch.maximum(mean / HIGH, (mean / LOW).clamp_max(1.0)).clamp(LEAST, MOST)
 
-    def after(
+    def update(
         self,
         z: Float[Tensor, "B 2"],
         of_state: Float[Tensor, "B 2"],

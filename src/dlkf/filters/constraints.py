@@ -77,9 +77,9 @@ class CarConstraints:
 
     def rows(self, epoch: Epoch, memory: CarMemory, prediction: Predicted) -> tuple[Measurement, CarMemory]:
         """NHC (2 rows), zero velocity (3), zero angular rate (3)."""
-        zn, Hn, moving = self._across(epoch, prediction.structure)
-        zr, Hr = self._standing(epoch)
-        resting, liveliness = self.resting(epoch, zr[:, 3:], prediction, memory)
+        zn, Hn, moving = self._measure_lateral(epoch, prediction.structure)
+        zr, Hr = self._measure_standstill(epoch)
+        resting, liveliness = self.detect_rest(epoch, zr[:, 3:], prediction, memory)
         resting = resting.unsqueeze(-1)
         used = torch.cat(((moving.unsqueeze(-1) & ~resting).expand(-1, 2), resting.expand(-1, 6)), -1)
         per_second = max(1.0, 1.0 / (epoch.dt * epoch.imu.shape[1]))
@@ -91,15 +91,15 @@ class CarConstraints:
             variance = torch.cat((noise.factor * variance[:, :2], variance[:, 2:]), -1)
         S = of_state + variance[:, :2]
         if noise is not None:
-            learns = used[:, 0] & _near_fix(epoch, prediction.P)
-            noise = noise.after(zn, of_state, a_second, OUTLIER, learns)
+            learns = used[:, 0] & _is_near_fix(epoch, prediction.P)
+            noise = noise.update(zn, of_state, a_second, OUTLIER, learns)
         variance = torch.cat((variance[:, :2] * (zn.square() / (OUTLIER**2 * S)).clamp_min(1.0), variance[:, 2:]), -1)
         z = torch.cat((zn, zr), -1) * used
         return Measurement(z, torch.cat((Hn, Hr), 1), variance, used), memory._replace(
             liveliness=liveliness, noise=noise
         )
 
-    def resting(
+    def detect_rest(
         self, epoch: Epoch, turning: Float[Tensor, "B 3"], prediction: Predicted, memory: CarMemory
     ) -> tuple[Bool[Tensor, " B"], VibrationLevel]:
         """Whether the car was stationary in the window, and the vibration levels after it."""
@@ -108,7 +108,7 @@ class CarConstraints:
             wheel = WheelMotion(prediction.rolling, prediction.stopped)
         return detect_stationary(epoch, turning, prediction.P, memory.liveliness, memory.prior, wheel)
 
-    def _across(
+    def _measure_lateral(
         self, epoch: Epoch, structure: Float[Tensor, "B 5"] | None
     ) -> tuple[Float[Tensor, "B 2"], Float[Tensor, "B 2 n"], Bool[Tensor, " B"]]:
         """Innovation and H of the velocity across the car at the window's end."""
@@ -137,15 +137,15 @@ class CarConstraints:
         H = torch.cat((position, J, torch.bmm(J, skew(state.v_n)), sensors, matrices, car, others), -1)
         return model - v_b[:, 1:], H, vx.abs() > SLOWEST
 
-    def _standing(self, epoch: Epoch) -> tuple[Float[Tensor, "B 6"], Float[Tensor, "B 6 n"]]:
+    def _measure_standstill(self, epoch: Epoch) -> tuple[Float[Tensor, "B 6"], Float[Tensor, "B 6 n"]]:
         """Innovation and H of a standstill: zero velocity, and the Earth rate in body axes."""
         state = epoch.window.end
         earth_b = torch.bmm(state.C_nb.mT, epoch.frame.earth_rate_n.unsqueeze(-1)).squeeze(-1)
         z = torch.cat((-state.v_n, epoch.corrected[..., 3:].mean(1) - earth_b), -1)
-        return z, _standing(self.states.count, z.dtype, z.device).expand(len(z), -1, -1)
+        return z, _standstill_matrix(self.states.count, z.dtype, z.device).expand(len(z), -1, -1)
 
 
-def _near_fix(epoch: Epoch, P: Float[Tensor, "B n n"]) -> Bool[Tensor, " B"]:
+def _is_near_fix(epoch: Epoch, P: Float[Tensor, "B n n"]) -> Bool[Tensor, " B"]:
     """Whether the window has a fix whose horizontal position is within 3σ of the filter's."""
     S = P.diagonal(dim1=-2, dim2=-1)[:, POSITION] + epoch.fix.std[:, POSITION].square()
     near = epoch.z[:, POSITION].square() < OUTLIER**2 * S
@@ -154,7 +154,7 @@ def _near_fix(epoch: Epoch, P: Float[Tensor, "B n n"]) -> Bool[Tensor, " B"]:
 
 @lru_cache
 @torch.inference_mode(False)
-def _standing(states: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "6 n"]:
+def _standstill_matrix(states: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "6 n"]:
     """H of velocity and of the gyroscopes' rate."""
     eye = torch.eye(states, dtype=dtype, device=device)
     return torch.cat((eye[VELOCITY], eye[GYRO]))

@@ -24,8 +24,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dlkf.data.velocity_fit import FIT_STD, scattered_std
-from dlkf.filters.gating import OF_PART, PARTS, by_part
+from dlkf.data.velocity_fit import FIT_STD, scale_std
+from dlkf.filters.gating import OF_PART, PARTS, average_by_part
 from dlkf.filters.integration import Covariances, Epoch
 from dlkf.filters.virtual_outages import VirtualOutage
 from dlkf.navigation.state import POSITION, VELOCITY
@@ -56,12 +56,12 @@ class FixNoise(NamedTuple):
         variance = parts + 1.0 if noise is None else noise.square().repeat_interleave(2, -1)
         return cls(zeros(size, 3, 3), zeros(size, 3), parts, variance, parts + FIRST_FIXES)
 
-    def inflated(self, epoch: Epoch) -> Epoch:
+    def inflate_fix(self, epoch: Epoch) -> Epoch:
         """The epoch with the 1σ of its fix as large as they have scattered."""
         scatter = self.variance.clamp_min(1.0).sqrt()[:, OF_PART]
-        return epoch._replace(fix=epoch.fix._replace(std=scattered_std(epoch.fix.std, scatter, FLOOR)))
+        return epoch._replace(fix=epoch.fix._replace(std=scale_std(epoch.fix.std, scatter, FLOOR)))
 
-    def after(self, claimed: Epoch, c: Covariances, outage: VirtualOutage) -> FixNoise:
+    def update(self, claimed: Epoch, c: Covariances, outage: VirtualOutage) -> FixNoise:
         """After an update of the filter and of the virtual outage; ``claimed`` is the epoch with the fix's own 1σ, and
         ``c`` has the H of all components, both before any gate."""
         used = claimed.used
@@ -70,7 +70,7 @@ class FixNoise(NamedTuple):
         one, two, three = self.apart.unbind(1)
         change = torch.cat((apart - 3 * one + 3 * two - three, claimed.z[:, VELOCITY] - self.residual), -1)
         variance = claimed.fix.std.square() + change.new_tensor(FLOOR).square()
-        square = by_part(torch.where(used, change.square() / variance, 0.0))
+        square = average_by_part(torch.where(used, change.square() / variance, 0.0))
         square = square / square.new_tensor(DIFFERENCES)
 
         successive = torch.where(used[:, PARTS], self.successive + 1, 0.0)

@@ -33,7 +33,7 @@ def add_columns(
     return Phi
 
 
-def entries(parameters: Float[Tensor, "B k"], states: ErrorStates) -> Float[Tensor, "B 3 2"]:
+def select_matrix(parameters: Float[Tensor, "B k"], states: ErrorStates) -> Float[Tensor, "B 3 2"]:
     """G among the estimates of all sources."""
     first = states.of(NAMES[0]).start - states.of_others.start
     return parameters[:, first : first + len(NAMES)].unflatten(-1, (3, 2))

@@ -77,7 +77,7 @@ class Verdict(NamedTuple):
     shift: Tensor  # (B, 6) variance
     factor: Tensor  # (B,) ≥ 1
 
-    def inflated(self, P: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
+    def inflate_covariance(self, P: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
         """P inflated where the filter follows refused fixes, unchanged elsewhere."""
         wide = self.factor[:, None, None] * P
         wide[:, PV, PV] += torch.diag_embed(self.shift)
@@ -101,7 +101,7 @@ class FixGate(Protocol):
         """Nothing refused yet; ``like`` (B, …) gives batch and precision."""
         ...
 
-    def screened(
+    def screen_fix(
         self, memory: Any, epoch: Epoch, P: Float[Tensor, "B n n"], R: Float[Tensor, "B 6"]
     ) -> tuple[Any, Epoch, Float[Tensor, "B n n"]]:
         """The epoch without what is refused, and P of the update before, inflated where the filter is to follow."""
@@ -122,7 +122,7 @@ class CoarseGate:
         B, zeros = len(like), like.new_zeros
         return CoarseMemory(zeros(B), zeros(B, 6), zeros(B) > 0, zeros(B))
 
-    def screened(
+    def screen_fix(
         self, memory: CoarseMemory, epoch: Epoch, P: Float[Tensor, "B n n"], R: Float[Tensor, "B 6"]
     ) -> tuple[CoarseMemory, Epoch, Float[Tensor, "B n n"]]:
         """The epoch without what is refused, and P, inflated where the gate recovers; it judges by the fix's own 1σ,
@@ -132,7 +132,7 @@ class CoarseGate:
         with torch.no_grad():
             memory, verdict = self._judge(memory, epoch, P.diagonal(dim1=-2, dim2=-1))
         fix = epoch.fix._replace(used=verdict.passed)
-        return memory, epoch._replace(z=epoch.z * verdict.passed, fix=fix), verdict.inflated(P)
+        return memory, epoch._replace(z=epoch.z * verdict.passed, fix=fix), verdict.inflate_covariance(P)
 
     def _judge(
         self, memory: CoarseMemory, epoch: Epoch, variance: Float[Tensor, "B n"]
@@ -190,7 +190,7 @@ class Gate:
         usual = zeros(B, 4) + self.usual
         return GateMemory(usual, zeros(B, 2), zeros(B, 6), zeros(B, 2), nowhere, zeros(B) > 0, limits)
 
-    def screened(
+    def screen_fix(
         self, memory: GateMemory, epoch: Epoch, P: Float[Tensor, "B n n"], R: Float[Tensor, "B 6"]
     ) -> tuple[GateMemory, Epoch, Float[Tensor, "B n n"]]:
         """The epoch without what is refused, and P, inflated where the filter follows refused fixes.
@@ -210,7 +210,7 @@ class Gate:
         same = (epoch.fix.value[:, :3] == memory.fix).all(-1) & position
         frozen = same & (memory.frozen | (epoch.window.end.v_n.norm(dim=-1) > FROZEN_SPEED))
         S = _predicted_variance(epoch, P) + R + FLOOR * FLOOR
-        square = by_part(torch.where(used, z.square() / S, 0.0))
+        square = average_by_part(torch.where(used, z.square() / S, 0.0))
         offered = used[:, PARTS] & ~frozen.unsqueeze(-1)
         outlier = offered & (square > memory.limits * torch.exp(memory.usual))
         wrong = torch.stack((outlier[:, :2].any(-1), outlier[:, 2:].any(-1)), -1)
@@ -247,7 +247,7 @@ class Gate:
         return (0.0, *(float(chi2_quantile(self.probability, k)) / k for k in (1, 2)))
 
 
-def by_part(x: Float[Tensor, "B 6"]) -> Float[Tensor, "B 4"]:
+def average_by_part(x: Float[Tensor, "B 6"]) -> Float[Tensor, "B 4"]:
     """Means over the components of each part."""
     return torch.stack((0.5 * (x[:, 0] + x[:, 1]), x[:, 2], 0.5 * (x[:, 3] + x[:, 4]), x[:, 5]), -1)
 

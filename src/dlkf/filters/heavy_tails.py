@@ -44,7 +44,7 @@ class HeavyTails(NamedTuple):
         variance = sigma[:, vertical_scale(states) - IMU.start].square()
         return cls(variance, variance.clone())
 
-    def after(
+    def update(
         self, P: Float[Tensor, "B n n"], dx: Float[Tensor, "B n"], error: ImuError, states: ErrorStates,
         fixed: Bool[Tensor, " B"],
     ) -> tuple[HeavyTails, Float[Tensor, "B n n"], Float[Tensor, "B n"]]:  # fmt: skip
@@ -53,7 +53,7 @@ class HeavyTails(NamedTuple):
         Where no fix was used it stays: constraints alone would lead a filter astray.
         """
         k, before = vertical_scale(states), self.variance
-        x, p = _scale_of(error) + dx[:, k], torch.minimum(P[:, k, k], before)  # a walk is no evidence
+        x, p = _select_scale(error) + dx[:, k], torch.minimum(P[:, k, k], before)  # a walk is no evidence
         found = ((FREEDOM * self.start + x.square() + p) / (FREEDOM + 1)).minimum(MOST**2 * self.start)
         variance = torch.where(fixed, torch.maximum(before, found), before)
         P, change = widen_prior(P, x, k, before, variance)
@@ -65,7 +65,7 @@ def vertical_scale(states: ErrorStates) -> int:
     return states.of_matrix.start + len(states.elements) + states.elements.index((2, 2))
 
 
-def _scale_of(error: ImuError) -> Float[Tensor, " B"]:
+def _select_scale(error: ImuError) -> Float[Tensor, " B"]:
     """Its estimate."""
     if error.matrix is None:
         return torch.zeros_like(error.bias[:, 5])

@@ -162,11 +162,11 @@ def advance(
     """One epoch: strapdown over its samples (B, M, 6), innovation, the estimator's answer, feedback."""
     if isinstance(estimator, WholeLoop):
         return estimator.advance(memory, imu, fix, frame)
-    corrected = error.corrected(imu)
+    corrected = error.correct(imu)
     window = strapdown(state, corrected, dt, frame)
     prior = window.end
     tail = max(1, min(imu.shape[1], round(RATE_AVERAGE_S / dt)))
-    at_fix = prior if fix.lag is None else window.before(fix.lag, dt)
+    at_fix = prior if fix.lag is None else window.interpolate_before(fix.lag, dt)
     rate_b = corrected[:, -tail:, 3:].sum(1) / tail
     few = max(1, min(tail, round(ARM_RATE_S / dt)))
     if fix.lag is None:
@@ -180,7 +180,7 @@ def advance(
     after = ImuError.of(answer.imu_error)
     complete = after.bias if after[1:] == (None, None) else after.at(corrected.mean(1))
     innovation = z if answer.innovation is None else answer.innovation
-    return memory, Step(prior, prior.corrected(answer.dx), after, innovation, complete, answer)
+    return memory, Step(prior, prior.correct(answer.dx), after, innovation, complete, answer)
 
 
 def rate_before(rates: Tensor, late: Tensor, count: int) -> Tensor:
@@ -201,7 +201,7 @@ def integrate(
     """
     if isinstance(estimator, WholeLoop):
         return estimator.integrate(batch)
-    state, frame = batch.start, batch.frame.prepared()
+    state, frame = batch.start, batch.frame.prepare()
     memory, imu_error = estimator.begin(batch)
     error = ImuError.of(imu_error)
     usable = batch.gnss_valid & batch.available.unsqueeze(-1)
@@ -236,33 +236,33 @@ def integrate(
 def stack_steps(steps: list[Step], offered: Tensor, *, keep_errors: bool) -> BatchSolution:
     """The steps of a run as one solution; ``offered`` (B, T): where a fix might have been used."""
 
-    def over_time(rows: list) -> Tensor | None:
+    def stack_rows(rows: list) -> Tensor | None:
         return None if rows[0] is None else torch.stack(rows, 1)
 
-    def each(rows: Sequence[Any], kind: type) -> Any:
+    def stack_fields(rows: Sequence[Any], kind: type) -> Any:
         """Named tuples field by field; a field that appears with the first update is zero before."""
         fields = []
         for column in zip(*rows):
             known = next((x for x in column if x is not None), None)
             fill = None if known is None else torch.zeros_like(known)
-            fields.append(over_time([fill if x is None else x for x in column]))
+            fields.append(stack_rows([fill if x is None else x for x in column]))
         return kind(*fields)
 
     answers = [s.answer for s in steps]
-    accepted = over_time([a.accepted for a in answers])
+    accepted = stack_rows([a.accepted for a in answers])
     each_covariances = [a.covariances for a in answers]
-    covariances = None if each_covariances[0] is None else each(each_covariances, Covariances)
+    covariances = None if each_covariances[0] is None else stack_fields(each_covariances, Covariances)
     return BatchSolution(
-        prior=each([s.prior for s in steps], NavState),
-        posterior=each([s.posterior for s in steps], NavState),
+        prior=stack_fields([s.prior for s in steps], NavState),
+        posterior=stack_fields([s.posterior for s in steps], NavState),
         imu_error=torch.stack([s.complete_error for s in steps], 1),
         innovation=torch.stack([s.innovation for s in steps], 1),
         used=offered if accepted is None else offered & accepted,
-        std=over_time([a.std for a in answers]),
-        gain=over_time([a.gain for a in answers]),
+        std=stack_rows([a.std for a in answers]),
+        gain=stack_rows([a.gain for a in answers]),
         covariances=covariances,
-        error=each([s.error for s in steps], ImuError) if keep_errors else None,
+        error=stack_fields([s.error for s in steps], ImuError) if keep_errors else None,
         innovation_covariance=None if covariances is None else covariances.innovation,
         position_covariance=None if covariances is None else covariances.predicted[..., :2, :2],
-        aids=over_time([a.aids for a in answers]),
+        aids=stack_rows([a.aids for a in answers]),
     )

@@ -32,11 +32,11 @@ def kalman_prediction(
     if walking and torch.is_grad_enabled() and P.requires_grad and not Phi.requires_grad:
         return _KalmanPrediction.apply(P, Phi, Q)
     if walking and compiled.is_recorded():
-        return propagated(P, Phi[:, PVA]) + Q
+        return propagate_covariance(P, Phi[:, PVA]) + Q
     return torch.baddbmm(Q, Phi, torch.bmm(Phi, P).mT)
 
 
-def propagated(P: Float[Tensor, "B n n"], top: Float[Tensor, "B 9 n"]) -> Float[Tensor, "B n n"]:
+def propagate_covariance(P: Float[Tensor, "B n n"], top: Float[Tensor, "B 9 n"]) -> Float[Tensor, "B n n"]:
     """Φ P Φᵀ for symmetric P, where Φ is the identity below its rows ``top``."""
     TP = torch.bmm(top, P)
     cross = TP[:, :, PVA.stop :]
@@ -51,14 +51,14 @@ def kalman_update(
     """Correction, gain and covariance for symmetric P and diagonal R; the gain is returned without a gradient."""
     if torch.is_grad_enabled() and any(x.requires_grad for x in (P, H, R, z)):
         return _KalmanUpdate.apply(P, H, R, z)
-    return _updated(P, H, R, z)[:3]
+    return _compute_update(P, H, R, z)[:3]
 
 
-def _updated(P: Tensor, H: Tensor, R: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _compute_update(P: Tensor, H: Tensor, R: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """dx, K, P⁺ and S. For any K, P⁺ = X − K (H X − R Kᵀ) with X = P − (H P)ᵀ Kᵀ: no product of n × n matrices."""
     HP = torch.bmm(H, P)
     S = torch.baddbmm(torch.diag_embed(R), HP, H.mT)
-    Kt = _solved(S, HP)
+    Kt = _solve(S, HP)
     X = torch.baddbmm(P, HP.mT, Kt, alpha=-1)
     surplus = torch.baddbmm(R.unsqueeze(-1) * Kt, H, X, beta=-1)
     dx = torch.bmm(Kt.mT, z.unsqueeze(-1)).squeeze(-1)
@@ -66,7 +66,7 @@ def _updated(P: Tensor, H: Tensor, R: Tensor, z: Tensor) -> tuple[Tensor, Tensor
     return dx, Kt.mT, torch.lerp(P, P.mT, 0.5), S
 
 
-def _solved(S: Float[Tensor, "B m m"], X: Float[Tensor, "B m n"]) -> Float[Tensor, "B m n"]:
+def _solve(S: Float[Tensor, "B m m"], X: Float[Tensor, "B m n"]) -> Float[Tensor, "B m n"]:
     """S⁻¹ X."""
     return compiled.solve(S, X) if compiled.fits(S) else torch.linalg.solve_ex(S, X)[0]
 
@@ -99,7 +99,7 @@ class _KalmanUpdate(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, P, H, R, z):
-        dx, K, updated, S = _updated(P, H, R, z)
+        dx, K, updated, S = _compute_update(P, H, R, z)
         ctx.save_for_backward(H, z, dx, K, updated, S)
         ctx.mark_non_differentiable(K)
         return dx, K, updated
@@ -109,7 +109,7 @@ class _KalmanUpdate(torch.autograd.Function):
     def backward(ctx, of_dx, _of_K, of_P):
         H, z, dx, K, updated, S = ctx.saved_tensors
         Kt, g = K.mT, of_dx.unsqueeze(-1)
-        u = _solved(S, z.unsqueeze(-1))
+        u = _solve(S, z.unsqueeze(-1))
         G = torch.lerp(of_P, of_P.mT, 0.5)
         KG, Kg = torch.bmm(Kt, G), torch.bmm(Kt, g)
         KGK = torch.bmm(KG, K)

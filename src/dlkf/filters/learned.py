@@ -14,7 +14,7 @@ from dlkf.base.classes import TARGET
 from dlkf.base.errors import InputError
 from dlkf.base.settings import settings_from
 from dlkf.data.drive import Batch
-from dlkf.filters.branches import chosen, may_branch
+from dlkf.filters.branches import may_branch, select_branch
 from dlkf.filters.integration import Correction, Epoch, integrate
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.state import ATTITUDE, NavState
@@ -72,10 +72,10 @@ class LearnedConfig:
             values = {**values, "network": OwnNetwork.from_mapping(network)}
         return settings_from(cls, values, "model")
 
-    def plain(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """Plain values for a file."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return values | {"network": self.network.plain()}
+        return values | {"network": self.network.as_dict()}
 
 
 class LearnedMemory(NamedTuple):
@@ -148,24 +148,24 @@ class LearnedFilter(nn.Module):
             return memory, Correction(dx, epoch.error, gain=gain)
         whole = len(rows) == B
         K, error, recurrent = self._run(memory, epoch, rows, whole, has_fix)
-        part = self._limited((K @ epoch.z[rows].unsqueeze(-1)).squeeze(-1))
+        part = self._limit_turn((K @ epoch.z[rows].unsqueeze(-1)).squeeze(-1))
         if hold and not picking:
-            dx, gain = chosen(has_fix, part, dx), chosen(has_fix, K, gain)
+            dx, gain = select_branch(has_fix, part, dx), select_branch(has_fix, K, gain)
             matrix = None
             if error.matrix is not None and epoch.error.matrix is not None:
-                matrix = chosen(has_fix, error.matrix, epoch.error.matrix)
-            error = ImuError(chosen(has_fix, error.bias, epoch.error.bias), matrix)
+                matrix = select_branch(has_fix, error.matrix, epoch.error.matrix)
+            error = ImuError(select_branch(has_fix, error.bias, epoch.error.bias), matrix)
             recurrent = tuple(torch.where(has_fix[:, None], new, o) for new, o in zip(recurrent, memory.recurrent))
         elif whole:
             dx, gain = part, K
         else:
             dx, gain = dx.index_copy(0, rows, part), gain.index_copy(0, rows, K)
-            error = _with_rows(epoch.error, rows, error)
+            error = _replace_rows(epoch.error, rows, error)
             recurrent = tuple(old.index_copy(1, rows, new) for old, new in zip(memory.recurrent, recurrent))
         ran = has_fix if hold else torch.ones_like(has_fix)
         return self._remember(memory, epoch, dx, has_fix, ran, recurrent), Correction(dx, error, gain=gain)
 
-    def _limited(self, dx: Tensor) -> Tensor:
+    def _limit_turn(self, dx: Tensor) -> Tensor:
         """A correction (b, 9) whose turn is limited in training."""
         if not (self.training and self.config.training_turn):
             return dx
@@ -227,24 +227,24 @@ class LearnedFilter(nn.Module):
     ) -> LearnedMemory:
         """Memory after the network ran on some segments."""
         dx = dx.detach()
-        posterior = epoch.window.end.detach().corrected(dx)
+        posterior = epoch.window.end.detach().correct(dx)
         difference = memory.posterior.error_to(posterior)
 
         return LearnedMemory(
             recurrent=recurrent,
             origin=memory.origin,
-            elapsed=chosen(ran, torch.zeros_like(memory.elapsed), memory.elapsed),
-            since_fix=chosen(has_fix, torch.zeros_like(memory.since_fix), memory.since_fix),
-            posterior=chosen(ran, posterior, memory.posterior),
-            difference=chosen(ran, difference, memory.difference),
-            difference_s=chosen(ran, memory.elapsed, memory.difference_s),
-            correction=chosen(ran, dx, memory.correction),
+            elapsed=select_branch(ran, torch.zeros_like(memory.elapsed), memory.elapsed),
+            since_fix=select_branch(has_fix, torch.zeros_like(memory.since_fix), memory.since_fix),
+            posterior=select_branch(ran, posterior, memory.posterior),
+            difference=select_branch(ran, difference, memory.difference),
+            difference_s=select_branch(ran, memory.elapsed, memory.difference_s),
+            correction=select_branch(ran, dx, memory.correction),
             fix=torch.where(epoch.used, epoch.fix.value, memory.fix),
             had_fix=memory.had_fix | epoch.used,
         )
 
     @contextmanager
-    def recording(self) -> Iterator[list[tuple[Tensor, Tensor]]]:
+    def record_inputs(self) -> Iterator[list[tuple[Tensor, Tensor]]]:
         """Windows (b, M, 15) and components (b, 30) of every run of the network inside the block, unscaled."""
         seen: list[tuple[Tensor, Tensor]] = []
         hook = self.scaling.register_forward_pre_hook(lambda _, given: seen.append((given[0], given[1])))
@@ -255,14 +255,14 @@ class LearnedFilter(nn.Module):
 
     def learn_sizes(self, batches: Sequence[Batch]) -> None:
         """Set the sizes of the features to those of these segments, as the filter stands."""
-        with torch.inference_mode(), self.recording() as seen:
+        with torch.inference_mode(), self.record_inputs() as seen:
             for batch in batches:
                 integrate(batch, self)
         windows, components = (torch.cat(x).float() for x in zip(*seen))
         self.scaling.fit(windows.clone(), components.clone())
 
 
-def _with_rows(old: ImuError, rows: Tensor, new: ImuError) -> ImuError:
+def _replace_rows(old: ImuError, rows: Tensor, new: ImuError) -> ImuError:
     """The errors of all segments after those in ``rows`` got new ones."""
     bias = old.bias.index_copy(0, rows, new.bias)
     if new.matrix is None:

@@ -114,33 +114,33 @@ class LearnedKalmanFilter(LearnedFilter):
     def step(self, memory: LearnedKalmanMemory, epoch: Epoch) -> tuple[LearnedKalmanMemory, Correction]:  # type: ignore[override]
         """The Kalman filter's update with what the network adds."""
         span = epoch.dt * epoch.imu.shape[1]
-        kalman = self.kalman.advanced(memory.kalman, span)
-        offered = self.kalman.predicted_fix(kalman, epoch)
-        kalman, epoch = self.kalman.screened(kalman, offered)
+        kalman = self.kalman.advance_delay(memory.kalman, span)
+        offered = self.kalman.predict_fix(kalman, epoch)
+        kalman, epoch = self.kalman.screen_fix(kalman, offered)
         fixed = epoch.used.any(-1)
         network = memory.network
         network = network._replace(elapsed=network.elapsed + span, since_fix=network.since_fix + span)
         with torch.no_grad():
-            further = self._further(kalman.P, epoch)
+            further = self._kalman_inputs(kalman.P, epoch)
         gain, added, recurrent = self._run(network, epoch, torch.arange(len(fixed)), True, fixed, further)
         kalman, correction = self.kalman.update(kalman, epoch._replace(error=memory.estimate))
         estimate = ImuError.of(correction.imu_error)
-        part = self._limited(torch.bmm(gain, epoch.z.unsqueeze(-1)).squeeze(-1))
+        part = self._limit_turn(torch.bmm(gain, epoch.z.unsqueeze(-1)).squeeze(-1))
         dx = correction.dx + part
         covariances = correction.covariances
         assert covariances is not None
         with torch.no_grad():
-            P = _with_gain(kalman.P.detach(), gain * epoch.used.unsqueeze(1), covariances)
+            P = _add_gain(kalman.P.detach(), gain * epoch.used.unsqueeze(1), covariances)
         network = self._remember(network, epoch, dx, fixed, torch.ones_like(fixed), recurrent)
         total = None if correction.gain is None else correction.gain + gain
         std = P.diagonal(dim1=-2, dim2=-1)[:, :STATES].clamp_min(0).sqrt()
         whole = torch.cat((dx, covariances.dx[:, PVA.stop :]), -1)
         return LearnedKalmanMemory(network, kalman._replace(P=P), estimate), correction._replace(
-            dx=dx, imu_error=_sum(estimate, added), std=std, gain=total, innovation=offered.z,
+            dx=dx, imu_error=_add_errors(estimate, added), std=std, gain=total, innovation=offered.z,
             covariances=covariances._replace(updated=P, dx=whole),
         )  # fmt: skip
 
-    def _further(self, P: Float[Tensor, "B n n"], epoch: Epoch) -> Float[Tensor, "B K"]:
+    def _kalman_inputs(self, P: Float[Tensor, "B n n"], epoch: Epoch) -> Float[Tensor, "B K"]:
         """Inputs that a Kalman filter has: 1σ over usual ones, as logarithms, and innovations over their 1σ before the
         last samples were propagated; heading axes."""
         C_hn = level_rotation(epoch.window.end.C_nb, "heading")
@@ -151,7 +151,7 @@ class LearnedKalmanFilter(LearnedFilter):
         return torch.cat((spread, torch.asinh(normalised_innovation(P, epoch.z, epoch.fix.std, C_hn, 1e-6))), -1)
 
 
-def _with_gain(P: Float[Tensor, "B n n"], gain: Float[Tensor, "B 9 6"], c: Covariances) -> Float[Tensor, "B n n"]:
+def _add_gain(P: Float[Tensor, "B n n"], gain: Float[Tensor, "B 9 6"], c: Covariances) -> Float[Tensor, "B n n"]:
     """Covariance after an optimal update with a further gain on the fix: P + E S Eᵀ."""
     S = torch.bmm(torch.bmm(c.H, c.predicted), c.H.mT) + torch.diag_embed(c.R)
     P = P.clone()
@@ -159,7 +159,7 @@ def _with_gain(P: Float[Tensor, "B n n"], gain: Float[Tensor, "B 9 6"], c: Covar
     return P
 
 
-def _sum(a: ImuError, b: ImuError) -> ImuError:
+def _add_errors(a: ImuError, b: ImuError) -> ImuError:
     """Both errors together; a matrix of scale factors alone becomes a full one where the other is."""
     of_a, of_b = a.matrix, b.matrix
     if of_a is not None and of_b is not None and of_a.ndim == 2:

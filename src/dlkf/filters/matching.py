@@ -64,10 +64,10 @@ class Matching(NamedTuple):
         """After an innovation over its 1σ, in heading axes."""
         fixes = self.fixes + used.any(-1)
         new = normalised.square().clamp_max(LARGEST).unsqueeze(1)
-        innovations = torch.where(used.unsqueeze(1), _blended(self.innovations, new, fixes), self.innovations)
+        innovations = torch.where(used.unsqueeze(1), _blend(self.innovations, new, fixes), self.innovations)
         return self._replace(innovations=innovations, fixes=fixes)
 
-    def corrected(
+    def update_ratios(
         self, dx: Float[Tensor, "B n"], prior: Float[Tensor, "B n n"], posterior: Float[Tensor, "B n n"],
         C_nb: Float[Tensor, "B 3 3"], fixed: Bool[Tensor, " B"],
     ) -> Matching:  # fmt: skip
@@ -80,8 +80,8 @@ class Matching(NamedTuple):
         expected = torch.cat((variance_along(lost[:, :6, :6], C_nb), lost.diagonal(dim1=-2, dim2=-1)[:, 6:]), -1)
         size = squares.new_tensor(SIZES).square()
         ratio = (squares / (expected.clamp_min(0.0) + 1e-9 * size)).clamp_max(LARGEST)
-        ratios = _blended(self.ratios, ratio.unsqueeze(1), self.fixes)
-        sizes = _blended(self.sizes.unsqueeze(1), (squares / size).clamp_max(LARGEST).unsqueeze(1), self.fixes)
+        ratios = _blend(self.ratios, ratio.unsqueeze(1), self.fixes)
+        sizes = _blend(self.sizes.unsqueeze(1), (squares / size).clamp_max(LARGEST).unsqueeze(1), self.fixes)
         return self._replace(
             ratios=torch.where(fixed[:, None, None], ratios, self.ratios),
             sizes=torch.where(fixed[:, None], sizes[:, 0], self.sizes),
@@ -98,7 +98,7 @@ def ratio_by_axis(logarithms: Float[Tensor, "B L"]) -> Float[Tensor, "B 3 12"]:
     return logarithms[:, 12:].unflatten(-1, (-1, 3)).mT
 
 
-def _blended(mean: Float[Tensor, "B k m"], new: Float[Tensor, "B 1 m"], fixes: Float[Tensor, " B"]) -> Tensor:
+def _blend(mean: Float[Tensor, "B k m"], new: Float[Tensor, "B 1 m"], fixes: Float[Tensor, " B"]) -> Tensor:
     """Running means: true ones over the first fixes, then fading."""
     share = 1 / fixes[:, None].clamp_min(1).clamp_max(mean.new_tensor(MEMORIES[: mean.shape[1]]))
     return torch.lerp(mean, new.expand_as(mean), share.unsqueeze(-1))

@@ -15,12 +15,12 @@ from dlkf.data.drive import Batch
 from dlkf.filters.adaptive import Adaptation, AdaptiveNoise
 from dlkf.filters.branches import may_branch
 from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD
-from dlkf.filters.g_sensitivity import add_columns, entries, has_g_sensitivity
+from dlkf.filters.g_sensitivity import add_columns, has_g_sensitivity, select_matrix
 from dlkf.filters.gating import CoarseGate, Gate
 from dlkf.filters.heavy_tails import HeavyTails
 from dlkf.filters.integration import Correction, Covariances, Epoch, Estimator
 from dlkf.filters.kalman_update import kalman_prediction, kalman_update
-from dlkf.filters.receiver import has_receiver, let_delay_grow, predict_fix, widen_start, with_drift
+from dlkf.filters.receiver import add_drift, has_receiver, let_delay_grow, predict_fix, widen_start
 from dlkf.filters.sources import FixMemory, GnssFix, Measurement, Parameter, Predicted, Source, describe_aid
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.calibration import ImuError
@@ -142,7 +142,7 @@ class Mbkf:
         error = ImuError(torch.zeros(B, 6, **like))
         if self.prior is not None:
             mean = torch.tensor(self.prior.mean, **like).expand(B, -1)
-            error = error.updated(torch.cat((torch.zeros(B, 9, **like), mean), -1), self.states)
+            error = error.update(torch.cat((torch.zeros(B, 9, **like), mean), -1), self.states)
         if batch.start_gyro is not None:
             found, std = batch.start_gyro.split(3, -1)
             variance, bias = sigma[:, GYRO].square(), error.bias[:, 3:]
@@ -174,27 +174,27 @@ class Mbkf:
 
     def step(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Correction]:
         """:meth:`update` with what the gate leaves of the fix."""
-        memory = self.advanced(memory, epoch.dt * epoch.imu.shape[1])
-        epoch = self.predicted_fix(memory, epoch)
-        memory, correction = self.update(*self.screened(memory, epoch))
+        memory = self.advance_delay(memory, epoch.dt * epoch.imu.shape[1])
+        epoch = self.predict_fix(memory, epoch)
+        memory, correction = self.update(*self.screen_fix(memory, epoch))
         return memory, correction._replace(innovation=epoch.z)
 
-    def advanced(self, memory: KalmanMemory, seconds: float) -> KalmanMemory:
+    def advance_delay(self, memory: KalmanMemory, seconds: float) -> KalmanMemory:
         """At the end of an update interval, as far as the fix is concerned: its delay has grown."""
         if memory.parameters is None or not has_receiver(self.states):
             return memory
         P, parameters = let_delay_grow(memory.P, memory.parameters, self.states, seconds)
         return memory._replace(P=P, parameters=parameters)
 
-    def predicted_fix(self, memory: KalmanMemory, epoch: Epoch) -> Epoch:
+    def predict_fix(self, memory: KalmanMemory, epoch: Epoch) -> Epoch:
         """The epoch with the innovation that delay and antenna give, where the filter estimates them."""
         if memory.parameters is None or not has_receiver(self.states):
             return epoch
-        return predict_fix(epoch, self._named(memory))
+        return predict_fix(epoch, self._name_parameters(memory))
 
-    def screened(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Epoch]:
+    def screen_fix(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Epoch]:
         """Memory and epoch after the gate of its fixes."""
-        fix, epoch, P = self.fix.screened(memory.fix, epoch, memory.P, memory.noise)
+        fix, epoch, P = self.fix.screen_fix(memory.fix, epoch, memory.P, memory.noise)
         return memory if fix is memory.fix else memory._replace(P=P, fix=fix), epoch
 
     def update(self, memory: KalmanMemory, epoch: Epoch) -> tuple[KalmanMemory, Correction]:
@@ -210,7 +210,7 @@ class Mbkf:
         prediction = Predicted(predicted, memory.structure, memory.noise)
         fix = self.fix.rows(epoch, memory.fix, memory.noise)
         if memory.parameters is not None:
-            prediction = prediction._replace(parameters=self._named(memory))
+            prediction = prediction._replace(parameters=self._name_parameters(memory))
         parts, sources, said = [fix], [], []
         for source, of_source in zip(self.sources, memory.sources, strict=True):
             rows, of_source = source.rows(epoch, of_source, prediction)
@@ -233,11 +233,11 @@ class Mbkf:
             dx, K, P = P.new_zeros(P.shape[:2]), P.new_zeros(*P.shape[:2], H.shape[1]), torch.lerp(P, P.mT, 0.5)
         tails = memory.tails
         if tails is not None:
-            tails, P, dx = tails.after(P, dx, epoch.error, self.states, epoch.used.any(-1))
+            tails, P, dx = tails.update(P, dx, epoch.error, self.states, epoch.used.any(-1))
         noise = memory.noise
         if self.noise is not None and noise is not None:
             variance = self.fix.variance(epoch, memory.fix, memory.noise)
-            noise = self.noise.learned(noise, epoch, fix.used, H[:, :6], variance, P, dx, Q)
+            noise = self.noise.learn_noise(noise, epoch, fix.used, H[:, :6], variance, P, dx, Q)
         structure = memory.structure
         if structure is not None:
             structure = structure + dx[:, self.states.of_structure]
@@ -251,18 +251,18 @@ class Mbkf:
                 parameters = torch.maximum(torch.minimum(parameters, most), -most)
             said += [parameters, P.diagonal(dim1=-2, dim2=-1)[:, self.states.of_others].clamp_min(0).sqrt()]
         if has_receiver(self.states):
-            Phi = with_drift(Phi, self.states, epoch.dt * epoch.imu.shape[1])
+            Phi = add_drift(Phi, self.states, epoch.dt * epoch.imu.shape[1])
         memory = KalmanMemory(P, memory.windows, memory.fix, tuple(sources), structure, noise, parameters, tails)
-        error = epoch.error.updated(dx, self.states)
+        error = epoch.error.update(dx, self.states)
         if parameters is not None and has_g_sensitivity(self.states):
-            error = error._replace(g_sensitivity=entries(parameters, self.states))
+            error = error._replace(g_sensitivity=select_matrix(parameters, self.states))
         return memory, Correction(
             dx[:, PVA], error, std=std, gain=K[:, PVA, :6],
             accepted=epoch.used.any(-1), covariances=Covariances(Phi, predicted, P, fix.H, fix.R, dx),
             aids=torch.cat(said, -1) if said else None,
         )  # fmt: skip
 
-    def _named(self, memory: KalmanMemory) -> dict[str, Tensor]:
+    def _name_parameters(self, memory: KalmanMemory) -> dict[str, Tensor]:
         """Estimates (B,) of the sources' parameters."""
         assert memory.parameters is not None
         return dict(zip(self.states.others, memory.parameters.unbind(-1)))

@@ -20,7 +20,7 @@ AT_ONCE = 400  # samples of all drives up to which Python takes them at once
 Sum = Callable[..., Tensor]
 
 
-def summed(work: Sum, begin: Tensor, *samples: Tensor) -> Tensor:
+def sum_pieces(work: Sum, begin: Tensor, *samples: Tensor) -> Tensor:
     """``work(begin, *samples)`` of a function of a module, which adds something of every sample (B, M, …) to ``begin``,
     and nothing of one that is zero."""
     if not is_recorded():
@@ -34,8 +34,8 @@ def summed(work: Sum, begin: Tensor, *samples: Tensor) -> Tensor:
     return torch.ops.dlkf.summed(f"{work.__module__}:{work.__name__}", count, begin, filled)
 
 
-def of_name(name: str) -> Sum:
-    """The function that :func:`summed` has named."""
+def find_function(name: str) -> Sum:
+    """The function that :func:`sum_pieces` has named."""
     module, function = name.split(":")
     return getattr(import_module(module), function)
 
@@ -45,7 +45,7 @@ torch.library.define("dlkf::summed", "(str name, int count, Tensor begin, Tensor
 
 @torch.library.impl("dlkf::summed", "cpu")
 def _run(name: str, count: int, begin: Tensor, samples: list[Tensor]) -> Tensor:
-    return of_name(name)(begin.clone(), *samples)
+    return find_function(name)(begin.clone(), *samples)
 
 
 @torch.library.register_fake("dlkf::summed")

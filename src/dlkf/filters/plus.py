@@ -93,10 +93,10 @@ class PlusConfig:
         """From plain values; InputError for unknown keys or values that do not fit."""
         return settings_from(cls, {k: v for k, v in values.items() if v is not None}, "model")
 
-    def plain(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """Plain values for a file."""
         values = asdict(self) | {"network": {"hidden": self.network.hidden}}
-        return {**values, "tuning": dict(self.tuning), "imu": _plain(self.imu)}
+        return {**values, "tuning": dict(self.tuning), "imu": _to_plain(self.imu)}
 
 
 class PlusMemory(NamedTuple):
@@ -181,16 +181,16 @@ class PlusFilter(nn.Module):
     def step(self, memory: PlusMemory, epoch: Epoch) -> tuple[PlusMemory, Correction]:
         """Network, the Kalman filter with the noise of both, then the virtual outage beside it."""
         span = epoch.dt * epoch.imu.shape[1]
-        memory = memory._replace(kalman=self.kalman.advanced(memory.kalman, span))
-        claimed = self.kalman.predicted_fix(memory.kalman, epoch)
-        offered = memory.fix_noise.inflated(claimed)
-        kalman, epoch = self.kalman.screened(memory.kalman, offered)
+        memory = memory._replace(kalman=self.kalman.advance_delay(memory.kalman, span))
+        claimed = self.kalman.predict_fix(memory.kalman, epoch)
+        offered = memory.fix_noise.inflate_fix(claimed)
+        kalman, epoch = self.kalman.screen_fix(memory.kalman, offered)
         walk = torch.diag_embed(memory.errors.variance(offered))
-        outage = memory.outage._replace(P=_with_walk(memory.outage.P, walk))
-        memory = memory._replace(kalman=kalman._replace(P=_with_walk(kalman.P, walk)), outage=outage)
+        outage = memory.outage._replace(P=_add_walk(memory.outage.P, walk))
+        memory = memory._replace(kalman=kalman._replace(P=_add_walk(kalman.P, walk)), outage=outage)
         fixed = epoch.used.any(-1)
         with torch.no_grad():
-            normalised = self._normalised(memory, epoch)
+            normalised = self._normalise_innovation(memory, epoch)
             memory = memory._replace(
                 elapsed=memory.elapsed + span,
                 since_fix=torch.where(fixed, 0.0, memory.since_fix + span),
@@ -214,25 +214,25 @@ class PlusFilter(nn.Module):
         advice = NetworkOutput(process, memory.errors.noise(offered, kalman.fix.scale[0, 0, 0]))
         kalman, correction = self.kalman.update(memory.kalman, epoch._replace(advice=advice))
         with torch.no_grad():
-            after = epoch.window.end.corrected(correction.dx)
+            after = epoch.window.end.correct(correction.dx)
             forward = (after.C_nb[:, :, 0] * after.v_n).sum(-1)
             matching, outage, errors = memory.matching, memory.outage, memory.errors
             fix_noise = memory.fix_noise
             if (c := correction.covariances) is not None:
                 scale = source_scale(of_network, epoch.start.C_nb)
-                outage = outage.after(epoch, c, memory.kalman.windows, scale)
+                outage = outage.update(epoch, c, memory.kalman.windows, scale)
                 offering = c._replace(H=self.kalman.fix.matrix(claimed))  # before the gate
-                errors, fix_noise = errors.after(offered, offering), fix_noise.after(claimed, offering, outage)
-                matching = matching.corrected(c.dx, c.predicted, c.updated, epoch.window.end.C_nb, fixed)
+                errors, fix_noise = errors.update(offered, offering), fix_noise.update(claimed, offering, outage)
+                matching = matching.update_ratios(c.dx, c.predicted, c.updated, epoch.window.end.C_nb, fixed)
         if correction.std is not None:
-            correction = correction._replace(std=errors.stated(correction.std))
+            correction = correction._replace(std=errors.add_slow_std(correction.std))
         correction = correction._replace(innovation=claimed.z)
         return memory._replace(
             kalman=kalman, hidden=hidden, matching=matching, outage=outage, errors=errors, fix_noise=fix_noise,
             gyro_noise=gyro_noise, fix_speed=torch.where(fixed, forward, memory.fix_speed),
         ), correction  # fmt: skip
 
-    def _normalised(self, memory: PlusMemory, epoch: Epoch) -> Float[Tensor, "B 6"]:
+    def _normalise_innovation(self, memory: PlusMemory, epoch: Epoch) -> Float[Tensor, "B 6"]:
         """Innovations over their 1σ as the filter of the last epoch has it, in heading axes; zero without a fix."""
         C_hn = level_rotation(epoch.window.end.C_nb, "heading")
         return normalised_innovation(memory.kalman.P, epoch.z, epoch.fix.std, C_hn, 1e-4)
@@ -278,12 +278,12 @@ class PlusFilter(nn.Module):
         )
 
 
-def _with_walk(P: Float[Tensor, "B n n"], walk: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B n n"]:
+def _add_walk(P: Float[Tensor, "B n n"], walk: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B n n"]:
     """P after a random walk of the position."""
     P = P.clone()
     P[:, POSITION, POSITION] += walk
     return P
 
 
-def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {k: _plain(v) if isinstance(v, Mapping) else v for k, v in values.items()}
+def _to_plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: _to_plain(v) if isinstance(v, Mapping) else v for k, v in values.items()}

@@ -76,12 +76,12 @@ class PositionErrors(NamedTuple):
         factor = torch.maximum(factor, least).clamp_max(1.0)
         return torch.cat((factor, torch.ones_like(factor)), -1)
 
-    def stated(self, std: Float[Tensor, "B k"]) -> Float[Tensor, "B k"]:
+    def add_slow_std(self, std: Float[Tensor, "B k"]) -> Float[Tensor, "B k"]:
         """1σ of the states with that of the position by which the receiver is off for long: no filter averages it."""
         position = (std[:, POSITION].square() + self.slow).sqrt()
         return torch.cat((position, std[:, POSITION.stop :]), -1)
 
-    def after(self, epoch: Epoch, c: Covariances) -> PositionErrors:
+    def update(self, epoch: Epoch, c: Covariances) -> PositionErrors:
         """After an update of the filter."""
         used = epoch.used[:, POSITION]
         z = epoch.z[:, POSITION]

@@ -52,7 +52,7 @@ def let_delay_grow(
     return P, parameters
 
 
-def with_drift(Phi: Float[Tensor, "B n n"], states: ErrorStates, seconds: float) -> Float[Tensor, "B n n"]:
+def add_drift(Phi: Float[Tensor, "B n n"], states: ErrorStates, seconds: float) -> Float[Tensor, "B n n"]:
     """Φ of an update interval with the growth of the delay in it, for a smoother."""
     Phi = Phi.clone()
     Phi[:, states.of(DELAY).start, states.of(DRIFT).start] = PPM * seconds
@@ -68,7 +68,7 @@ def predict_fix(epoch: Epoch, parameters: Mapping[str, Tensor]) -> Epoch:
     if epoch.fix.lag is not None:
         lag = lag + epoch.fix.lag
     within = lag.clamp(0.0, (M - 1) * dt)
-    at_fix = epoch.window.before(within, dt)
+    at_fix = epoch.window.interpolate_before(within, dt)
     few = max(1, min(M, round(ARM_RATE_S / dt)))
     rate, beyond = rate_before(epoch.corrected[..., 3:], within / dt, few), (lag - within).unsqueeze(-1)
     p, v = antenna(at_fix, rate, arm, epoch.frame).split(3, -1)

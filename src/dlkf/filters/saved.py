@@ -26,7 +26,7 @@ KINDS: Mapping[str, type[LearnedConfig] | type[PlusConfig]] = {
 }  # fmt: skip
 
 
-def learned_settings(values: Mapping[str, Any]) -> LearnedSettings:
+def parse_learned_settings(values: Mapping[str, Any]) -> LearnedSettings:
     """Of a learned filter from plain values; InputError for an unknown ``kind`` or setting."""
     kind = values.get("kind", "dlkf")
     if not isinstance(kind, str) or kind not in KINDS:
@@ -34,7 +34,7 @@ def learned_settings(values: Mapping[str, Any]) -> LearnedSettings:
     return KINDS[kind].from_mapping(values)
 
 
-def learned_filter(settings: LearnedSettings) -> Learned:
+def build_learned_filter(settings: LearnedSettings) -> Learned:
     """A filter with fresh weights."""
     if isinstance(settings, PlusConfig):
         return PlusFilter(settings)
@@ -46,12 +46,12 @@ def save_filter(model: Learned, folder: Path | str, card: Mapping[str, Any] | No
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     save_file({k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}, folder / WEIGHTS)
-    (folder / CONFIG).write_text(yaml.safe_dump(model.config.plain(), sort_keys=False))
+    (folder / CONFIG).write_text(yaml.safe_dump(model.config.as_dict(), sort_keys=False))
     if card is not None:
         (folder / CARD).write_text(yaml.safe_dump(dict(card), sort_keys=False, allow_unicode=True))
 
 
-def grid_of(
+def choose_grid(
     models: Iterable[Any],
     rate_hz: int | float | None = None,
     epoch_s: int | float | None = None,
@@ -78,7 +78,7 @@ def load_filter(folder: Path | str) -> Learned:
     values = read_yaml(folder / CONFIG)
     if not isinstance(values, dict):
         raise InputError(f"{folder / CONFIG} holds no settings; expected the config.yaml that training wrote")
-    model = learned_filter(learned_settings(values))
+    model = build_learned_filter(parse_learned_settings(values))
     try:
         weights = load_file(folder / WEIGHTS)
     except (SafetensorError, OSError):

@@ -23,7 +23,7 @@ def trained_filter(name: str) -> Learned:
     return load_filter(shipped_folder(name) or Path(name).expanduser())
 
 
-def plus_with_imu(imu: ImuSpec) -> PlusFilter:
+def build_plus(imu: ImuSpec) -> PlusFilter:
     """``plus`` for an IMU of which a preset is known; see :meth:`~dlkf.filters.plus.PlusFilter.with_imu`."""
     plus = trained_filter("plus")
     assert isinstance(plus, PlusFilter)

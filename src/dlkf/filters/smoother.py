@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
-from dlkf.filters.g_sensitivity import entries, has_g_sensitivity
+from dlkf.filters.g_sensitivity import has_g_sensitivity, select_matrix
 from dlkf.filters.integration import BatchSolution, Estimator, integrate
 from dlkf.filters.model_based import has_covariance
 from dlkf.navigation.state import IMU, PVA, STATES, NavState
@@ -73,7 +73,7 @@ def smooth(batch: Batch, estimator: Estimator) -> BatchSolution:
     dx, variance = (torch.stack(x[::-1], 1) for x in (deltas, variances))
     return replace(
         filtered,
-        posterior=NavState(*filtered.posterior).corrected(dx[..., PVA]),
+        posterior=NavState(*filtered.posterior).correct(dx[..., PVA]),
         imu_error=filtered.imu_error + dx[..., IMU] + _matrix_part(filtered, dx, batch, estimator),
         std=variance[..., :STATES].clamp_min(0).sqrt(),
     )
@@ -94,7 +94,7 @@ def _matrix_part(filtered: BatchSolution, dx: Tensor, batch: Batch, estimator: A
     states = estimator.states
     mean = batch.imu.mean(2) - filtered.imu_error
     if has_g_sensitivity(states):
-        change = entries(dx.flatten(0, -2)[:, states.of_others], states)
+        change = select_matrix(dx.flatten(0, -2)[:, states.of_others], states)
         shown = torch.bmm(change, mean.flatten(0, -2)[:, :2].unsqueeze(-1)).reshape(*mean.shape[:-1], 3)
         of_force = torch.nn.functional.pad(shown, (3, 0))
     else:

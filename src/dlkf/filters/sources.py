@@ -159,11 +159,11 @@ class GnssFix:
         like = {"dtype": batch.imu.dtype, "device": batch.imu.device}
         return FixMemory(torch.tensor([scale], **like), self.gate.begin(batch.imu))
 
-    def screened(
+    def screen_fix(
         self, memory: FixMemory, epoch: Epoch, P: Float[Tensor, "B n n"], noise: AdaptiveNoise | None
     ) -> tuple[FixMemory, Epoch, Float[Tensor, "B n n"]]:
         """The epoch without what the gate refuses, and P of the update before, inflated where it follows such fixes."""
-        gate, epoch, P = self.gate.screened(memory.gate, epoch, P, self.variance(epoch, memory, noise))
+        gate, epoch, P = self.gate.screen_fix(memory.gate, epoch, P, self.variance(epoch, memory, noise))
         return memory if gate is memory.gate else memory._replace(gate=gate), epoch, P
 
     def rows(self, epoch: Epoch, memory: FixMemory, noise: AdaptiveNoise | None) -> Measurement:

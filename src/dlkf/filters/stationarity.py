@@ -71,7 +71,7 @@ class LastSecond(NamedTuple):
             return cls(None)
         return cls(batch.imu.new_full((B, parts.count, 6), math.nan))
 
-    def after(
+    def update(
         self, imu: Float[Tensor, "B M 6"], dt: float
     ) -> tuple[LastSecond, Float[Tensor, " B"] | None, Float[Tensor, "B 6"]]:
         """After the samples of an update interval, the vibration level (None: too few samples for one), and the mean
@@ -125,7 +125,7 @@ class PositionSpan(NamedTuple):
         nothing = like.new_full((batch_size,), math.inf)
         return cls(like.new_full((batch_size, 2), math.nan), torch.zeros_like(nothing), nothing, nothing)
 
-    def after(
+    def update(
         self, epoch: Epoch, fixed: Bool[Tensor, " B"], level: Float[Tensor, " B"], moves: Bool[Tensor, " B"],
         still: Bool[Tensor, " B"],
     ) -> tuple[PositionSpan, Float[Tensor, " B"], Float[Tensor, " B"]]:  # fmt: skip
@@ -214,7 +214,7 @@ def detect_stationary(
     forbids a standstill, one that is stopped makes it where the samples show neither acceleration nor turn, at any
     vibration; and both give levels of this car where GNSS gives no velocity.
     """
-    second, level, mean = before.second.after(epoch.corrected, epoch.dt)
+    second, level, mean = before.second.update(epoch.corrected, epoch.dt)
     if level is None:
         return torch.zeros_like(before.standing) > 0, before
     span = epoch.dt * epoch.imu.shape[1]
@@ -238,7 +238,7 @@ def detect_stationary(
         standing, moving = standing & ~wheel.rolling | stopped, (moving | wheel.rolling) & ~stopped
     still_s = torch.where(still, before.still_s + span, 0.0)
     position_alone = fixed & ~with_velocity & ~exact
-    positions, at_rest, in_motion = before.span.after(epoch, position_alone, level, speed > MOVING_SPEED, still)
+    positions, at_rest, in_motion = before.span.update(epoch, position_alone, level, speed > MOVING_SPEED, still)
     at_rest = torch.where(standing, level, math.inf).minimum(at_rest)
     in_motion = torch.where(moving, level, math.inf).minimum(in_motion)
     after = before.update(at_rest, in_motion, span)._replace(still_s=still_s, span=positions, second=second)

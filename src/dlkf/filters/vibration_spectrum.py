@@ -27,7 +27,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from dlkf.filters.pieces import summed
+from dlkf.filters.pieces import sum_pieces
 
 FAR, NEAR, STEP, LEAST = 4, 16, 0.016, 0.2  # cycles/m; a line is a near frequency ± a far one
 LINES = 2 * FAR * NEAR
@@ -48,7 +48,7 @@ def demodulate(
     x: Float[Tensor, "B M 6"], distance: Float[Tensor, "B M"], begin: Float[Tensor, "B 6 waves"]
 ) -> Float[Tensor, "B 6 waves"]:
     """``begin`` + Σ_k x_k of the products of cos and sin that :func:`components` makes the spectrum of."""
-    return summed(add_waves, begin, x, distance)
+    return sum_pieces(add_waves, begin, x, distance)
 
 
 def add_waves(
@@ -66,11 +66,11 @@ def components(spectrum: Float[Tensor, "B 6 waves"]) -> tuple[Float[Tensor, "B 6
     """Σ_k x_k cos and Σ_k x_k sin of 2π F s_k for every line, by the sums of angles."""
     far_cos, far_sin = spectrum.unflatten(2, (2, FAR, 2, NEAR)).unbind(2)
     (cos_cos, cos_sin), (sin_cos, sin_sin) = far_cos.unbind(3), far_sin.unbind(3)  # of far, of near
-    cosines = _ascending(cos_cos + sin_sin, cos_cos - sin_sin)
-    return cosines, _ascending(cos_sin - sin_cos, cos_sin + sin_cos)
+    cosines = _sort_lines(cos_cos + sin_sin, cos_cos - sin_sin)
+    return cosines, _sort_lines(cos_sin - sin_cos, cos_sin + sin_cos)
 
 
-def _ascending(below: Float[Tensor, "B 6 far near"], above: Float[Tensor, "B 6 far near"]) -> Float[Tensor, "B 6 K"]:
+def _sort_lines(below: Float[Tensor, "B 6 far near"], above: Float[Tensor, "B 6 far near"]) -> Float[Tensor, "B 6 K"]:
     """Lines at near − far and near + far, in the order of their frequency."""
     return torch.cat((*reversed(below.unbind(2)), *above.unbind(2)), -1)
 
@@ -88,7 +88,7 @@ def log_power(spectrum: Float[Tensor, "B 6 waves"]) -> Float[Tensor, "B 6 K"]:
     return torch.log(cosines.square() + sines.square() + 1e-30)
 
 
-def shape(power: Float[Tensor, "B 6 K"], weight: Float[Tensor, "B K"]) -> Float[Tensor, "B 6 K"]:
+def remove_trend(power: Float[Tensor, "B 6 K"], weight: Float[Tensor, "B K"]) -> Float[Tensor, "B 6 K"]:
     """y of every axis and line: ln |Z|² without its trend, by least squares under ``weight``."""
     trends = _trends(power.dtype, power.device)
     weighted = trends * weight.unsqueeze(1)
@@ -120,17 +120,17 @@ def log_likelihood(
     fits = s * products[..., :-1][:, line, place] + r * products[..., 1:][:, line, place]
     sizes = s * (s * squares[:, :-1][:, first] + 2 * (r * neighbours[:, first]))
     sizes = sizes + r * (r * squares[:, 1:][:, first])
-    return _independent(distance) * (fits - 0.5 * weight.unsqueeze(1) * sizes).sum(-1)
+    return _independent_share(distance) * (fits - 0.5 * weight.unsqueeze(1) * sizes).sum(-1)
 
 
 def expected_log_likelihood(
     mean: Float[Tensor, "B 6 K"], weight: Float[Tensor, "B K"], distance: Float[Tensor, " B"]
 ) -> Float[Tensor, "B 1"]:
     """ln Λ that a block of this shape has on average at the true δ."""
-    return _independent(distance) * (0.5 * weight.unsqueeze(1) * mean.square()).sum((1, 2)).unsqueeze(-1)
+    return _independent_share(distance) * (0.5 * weight.unsqueeze(1) * mean.square()).sum((1, 2)).unsqueeze(-1)
 
 
-def _independent(distance: Float[Tensor, " B"]) -> Float[Tensor, "B 1"]:
+def _independent_share(distance: Float[Tensor, " B"]) -> Float[Tensor, "B 1"]:
     """Share of the lines that are independent over a distance [m], over their variance."""
     return (STEP / APART * distance).clamp_max(1.0).unsqueeze(-1) / LOG_VARIANCE
 

@@ -33,8 +33,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dlkf.data.drive import Batch
-from dlkf.filters.aids.stretch import at_limits
-from dlkf.filters.branches import chosen, may_branch
+from dlkf.filters.aids.stretch import stack_limits
+from dlkf.filters.branches import may_branch, select_branch
 from dlkf.filters.integration import Epoch
 from dlkf.filters.sources import Measurement, Predicted, SensorSource, describe_row, predicted_variance
 from dlkf.filters.vibration_spectrum import (
@@ -47,7 +47,7 @@ from dlkf.filters.vibration_spectrum import (
     line_weights,
     log_likelihood,
     log_power,
-    shape,
+    remove_trend,
     shifts,
     tone_shares,
 )
@@ -100,11 +100,11 @@ class Stretch(NamedTuple):
         """By what the course at the end is ahead of the mean course [rad]."""
         return self.turned - self.turned_s / self.elapsed.clamp_min(1e-3)
 
-    def after(self, epoch: Epoch, block_s: float, last: Float[Tensor, "B 6"]) -> Stretch:
+    def update(self, epoch: Epoch, block_s: float, last: Float[Tensor, "B 6"]) -> Stretch:
         """With one more update interval; ``last`` is the sample before it."""
         x, dt = epoch.corrected, epoch.dt
         M = x.shape[1]
-        speed = at_limits(epoch.start.v_n, epoch.window.v_n)[..., :2].norm(dim=-1)
+        speed = stack_limits(epoch.start.v_n, epoch.window.v_n)[..., :2].norm(dim=-1)
         step = 0.5 * dt * (speed[:, 1:] + speed[:, :-1])
         distance = self.distance.unsqueeze(-1) + step.cumsum(1) - 0.5 * step
         sample = torch.arange(M, dtype=x.dtype, device=x.device)
@@ -137,7 +137,7 @@ class Mean(NamedTuple):
         """Drawn towards 0, where it is of few blocks."""
         return self.total / (self.weight + FEW).unsqueeze(1)
 
-    def after(
+    def update(
         self, y: Float[Tensor, "B 6 n"], weight: Float[Tensor, "B n"], learns: Float[Tensor, " B"]
     ) -> Mean:  # fmt: skip
         """With a block, where it ``learns`` (1, else 0)."""
@@ -186,21 +186,21 @@ class VibrationSpeed(SensorSource):
             return None, memory
         span = epoch.dt * epoch.imu.shape[1]
         block_s = max(1, round(BLOCK_S / span)) * span
-        block = memory.block.after(epoch, block_s, memory.last_sample)
+        block = memory.block.update(epoch, block_s, memory.last_sample)
         age = torch.where(epoch.used.any(-1), 0.0, memory.age + span)
         memory = memory._replace(block=block, last_sample=epoch.corrected[:, -1], age=age)
         done = block.elapsed > block_s - 0.5 * span
         if may_branch(done) and not bool(done.any()):
             return None, memory
-        row, by_distance, by_time, blocks, evidence = self._judged(epoch, memory, prediction, done)
+        row, by_distance, by_time, blocks, evidence = self._judge_block(epoch, memory, prediction, done)
         zeros, B = epoch.z.new_zeros, len(epoch.z)  # zeros like the row's would need the row, in C at any time
         nothing = Measurement(
             zeros(B, 1), zeros(B, 1, self.states.count), zeros(B, 1), zeros(B, 1, dtype=torch.bool)
         )  # fmt: skip
-        return chosen(done, row, nothing), memory._replace(
-            block=_emptied(block, done), by_distance=chosen(done, by_distance, memory.by_distance),
-            by_time=chosen(done, by_time, memory.by_time), blocks=chosen(done, blocks, memory.blocks),
-            evidence=chosen(done, evidence, memory.evidence),
+        return select_branch(done, row, nothing), memory._replace(
+            block=_reset_stretch(block, done), by_distance=select_branch(done, by_distance, memory.by_distance),
+            by_time=select_branch(done, by_time, memory.by_time), blocks=select_branch(done, blocks, memory.blocks),
+            evidence=select_branch(done, evidence, memory.evidence),
         )  # fmt: skip
 
     def describe(
@@ -210,7 +210,7 @@ class VibrationSpeed(SensorSource):
         said = describe_row(epoch, rows, P, None if rows is None else rows.R[:, 0] > 0)
         return torch.cat((said, memory.share.unsqueeze(-1)), -1)
 
-    def _judged(
+    def _judge_block(
         self, epoch: Epoch, memory: VibrationMemory, prediction: Predicted, done: Bool[Tensor, " B"]
     ) -> tuple[Measurement, Mean, Mean, Tensor, Tensor]:
         """The row of a block that is done; means, their blocks, and evidence after it."""
@@ -219,7 +219,7 @@ class VibrationSpeed(SensorSource):
         H = self._matrix(epoch, block)
         of_speed = predicted_variance(prediction.P, H)[:, 0]
         weight, tones = line_weights(speed, epoch.dt), tone_shares(speed)
-        y = shape(log_power(block.spectrum), weight)
+        y = remove_trend(log_power(block.spectrum), weight)
         of_distance, of_time = memory.by_distance.value, torch.bmm(memory.by_time.value, tones.mT)
         likelihood = log_likelihood(y - of_time, of_distance, weight, block.distance)
         expected = expected_log_likelihood(of_distance, weight, block.distance).clamp_min(1e-3)
@@ -235,8 +235,8 @@ class VibrationSpeed(SensorSource):
         on_tones = torch.bmm(weight.unsqueeze(1), tones)  # (B, 1, N)
         left = torch.bmm(weight.unsqueeze(1) * (y - of_distance), tones) / on_tones.clamp_min(1e-6)
         of_tones = (on_tones / tones.sum(1, keepdim=True).clamp_min(1e-6)).squeeze(1)
-        by_distance = memory.by_distance.after(y - of_time, weight, learns)
-        by_time = memory.by_time.after(left, of_tones, learns)
+        by_distance = memory.by_distance.update(y - of_time, weight, learns)
+        by_time = memory.by_time.update(left, of_tones, learns)
         blocks = (1 - learns / MEMORY) * memory.blocks + learns
         return row, by_distance, by_time, blocks, evidence
 
@@ -303,7 +303,7 @@ def _log_sum(log: Float[Tensor, "B m n"]) -> Float[Tensor, "B m"]:
     return (torch.log(torch.exp(log - most).sum(-1, keepdim=True)) + most).squeeze(-1)
 
 
-def _emptied(stretch: Stretch, over: Bool[Tensor, " B"]) -> Stretch:
+def _reset_stretch(stretch: Stretch, over: Bool[Tensor, " B"]) -> Stretch:
     """The stretch, or where it is over a new one."""
     return Stretch(
         torch.where(over[:, None, None], 0.0, stretch.spectrum), torch.where(over, 0.0, stretch.distance),

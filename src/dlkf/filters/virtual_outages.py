@@ -28,9 +28,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dlkf.filters.branches import chosen, may_branch
+from dlkf.filters.branches import may_branch, select_branch
 from dlkf.filters.integration import Covariances, Epoch
-from dlkf.filters.kalman_update import propagated
+from dlkf.filters.kalman_update import propagate_covariance
 from dlkf.navigation.error_model import WindowModel
 from dlkf.navigation.state import ATTITUDE, PVA, STATES
 
@@ -74,15 +74,15 @@ class VirtualOutage(NamedTuple):
         said = self.evidence.abs().flatten(1).amax(1, keepdim=True) > 0
         return torch.where(said, torch.exp(mean), 1.0), p[:, 0].sum((1, 2)) / total
 
-    def after(
+    def update(
         self, epoch: Epoch, c: Covariances, windows: WindowModel, scale: Float[Tensor, "B 4 3 3"]
     ) -> VirtualOutage:
         """After an update of the filter; ``scale`` is that of its noise at level 1, with the network's factors."""
         Phi = c.Phi
-        by_source = windows.noise_of_sources(Phi, scale)
+        by_source = windows.noise_by_source(Phi, scale)
         top = Phi[:, PVA]
         drift = torch.cat((torch.bmm(top, self.drift.unsqueeze(-1)).squeeze(-1), self.drift[:, PVA.stop :]), -1)
-        P = self._predicted(top, by_source[:, 2:].sum(1), windows.walk)
+        P = self._predict_covariance(top, by_source[:, 2:].sum(1), windows.walk)
         F = top[:, None, :, PVA]
         L = Phi[:, PVA, ATTITUDE]
         plain = (L @ L.mT) * windows.spread[1, PVA, PVA]
@@ -93,7 +93,7 @@ class VirtualOutage(NamedTuple):
         scored = fixed & (age >= self.due) & (age < STALE_S)
         gained = torch.zeros_like(self.evidence)
         if not may_branch(scored) or bool(scored.any()):
-            gained = chosen(scored, _log_evidence(epoch, c, drift, P, white), gained)
+            gained = select_branch(scored, _log_evidence(epoch, c, drift, P, white), gained)
         kept = 1 - fixed.to(age.dtype) * (epoch.dt * epoch.imu.shape[1] / MEMORY_S)
         evidence = kept[:, None, None, None] * self.evidence + gained
 
@@ -105,11 +105,11 @@ class VirtualOutage(NamedTuple):
             torch.where(over, 0.0, age), torch.where(over, SCORED_S, due), evidence,
         )  # fmt: skip
 
-    def _predicted(
+    def _predict_covariance(
         self, top: Float[Tensor, "B 9 n"], of_walks: Float[Tensor, "B s s"], walk: Float[Tensor, " n"]
     ) -> Float[Tensor, "B n n"]:
         """Φ P Φᵀ + Q of all noise but the white one; below position, velocity and attitude Φ is taken for 1."""
-        P = propagated(self.P, top)
+        P = propagate_covariance(self.P, top)
         P[:, :STATES, :STATES] += of_walks
         P.diagonal(dim1=-2, dim2=-1).add_(walk)
         return P

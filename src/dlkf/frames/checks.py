@@ -139,7 +139,7 @@ def _is_number(value: Any) -> bool:
     return True
 
 
-def _shown(value: Any) -> str:
+def _shorten(value: Any) -> str:
     """A wrong value in one short line: arrays and frames have several."""
     text = " ".join(repr(value).split())
     return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN - 1]}…"
@@ -153,10 +153,11 @@ def check_lever_arm(lever_arm: Any) -> tuple[float, float, float]:
         arm = np.empty(0)
     if arm.shape != (3,) or not np.isfinite(arm).all():
         raise InputError(
-            f"lever_arm is {_shown(lever_arm)}, must be three numbers: IMU → antenna, Forward-Right-Down [m]"
+            f"lever_arm is {_shorten(lever_arm)}, must be three numbers: IMU → antenna, Forward-Right-Down [m]"
         )
     if np.abs(arm).max() > LEVER_ARM_M:
-        raise InputError(f"lever_arm is {_shown(lever_arm)}: an antenna {np.abs(arm).max():g} m away; metres are meant")
+        far = f"{np.abs(arm).max():g} m away"
+        raise InputError(f"lever_arm is {_shorten(lever_arm)}: an antenna {far}; metres are meant")
     return (float(arm[0]), float(arm[1]), float(arm[2]))
 
 
@@ -164,7 +165,7 @@ def check_above_zero(**values: Any) -> None:
     """InputError for one that is no finite number above 0."""
     for name, value in values.items():
         if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value) or value <= 0:
-            raise InputError(f"{name} is {_shown(value)}, must be a number above 0")
+            raise InputError(f"{name} is {_shorten(value)}, must be a number above 0")
 
 
 def check_options(function: str, options: Iterable[str], of: Callable[..., Any], apart: Sequence[str]) -> None:
@@ -178,7 +179,7 @@ def check_options(function: str, options: Iterable[str], of: Callable[..., Any],
 def check_switch(name: str, value: Any) -> None:
     """InputError for what is neither true nor false."""
     if not isinstance(value, (bool, np.bool_)):
-        raise InputError(f"{name} is {_shown(value)}, must be True or False")
+        raise InputError(f"{name} is {_shorten(value)}, must be True or False")
 
 
 def check_model(model: Any) -> str:
@@ -197,7 +198,7 @@ def check_models(models: Any) -> list[str]:
     names = [models] if isinstance(models, str) else models
     if not isinstance(names, (list, tuple)) or not names:
         raise InputError(
-            f"models is {_shown(models)}, must be a name or a list of names such as ['mbkf21_nhc', 'plus']"
+            f"models is {_shorten(models)}, must be a name or a list of names such as ['mbkf21_nhc', 'plus']"
         )
     checked = [check_model(name) for name in names]
     if twice := sorted({name for name in checked if checked.count(name) > 1}):
@@ -225,7 +226,7 @@ def check_whole(name: str, value: Any, least: int) -> int:
     else:
         number = least - 1
     if number < least:
-        raise InputError(f"{name} is {_shown(value)}, must be a whole number from {least} on")
+        raise InputError(f"{name} is {_shorten(value)}, must be a whole number from {least} on")
     return number
 
 
@@ -234,7 +235,7 @@ def check_preset(group: str, name: Any, argument: str = "") -> None:
     known = sorted(f.stem for f in (config_dir() / group).glob("*.yaml") if not f.stem.startswith("_"))
     known = [name for name in known if (group, name) != ("imu", "auto")]
     if not isinstance(name, str):
-        raise InputError(f"{argument or group} is {_shown(name)}, must be the name of a preset: {', '.join(known)}")
+        raise InputError(f"{argument or group} is {_shorten(name)}, must be the name of a preset: {', '.join(known)}")
     if name not in known:
         near = did_you_mean(name, known)
         raise InputError(f"unknown {group} preset {name!r}{near or ';'} known are {', '.join(known)}")

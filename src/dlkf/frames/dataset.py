@@ -42,22 +42,22 @@ def drive_folder(
     check_frames(imu, gnss, reference, aids)
     arm = check_lever_arm(lever_arm)
     meta = {"drive": DRIVE} | dict(zip(LEVER_ARM, arm))
-    fixes = _completed("gnss", gnss, dict.fromkeys((*VELOCITY, *STD), np.nan) | {"quality": 1})
+    fixes = _complete("gnss", gnss, dict.fromkeys((*VELOCITY, *STD), np.nan) | {"quality": 1})
     fixes["quality"] = fixes["quality"].fillna(1).astype(np.int8)
     unknown = dict.fromkeys((*VELOCITY, *ATTITUDE), np.nan) | {"valid": True}
-    truth = None if reference is None else _completed("reference", reference, unknown)
-    given = {kind: _completed(kind, frame, {}) for kind, frame in aids.items() if frame is not None}
+    truth = None if reference is None else _complete("reference", reference, unknown)
+    given = {kind: _complete(kind, frame, {}) for kind, frame in aids.items() if frame is not None}
     try:
         with TemporaryDirectory(prefix="dlkf-") as here:
             folder = Path(here) / "frames"
-            row = write_drive(folder, meta, _completed("imu", imu, {}), fixes, truth, given)
+            row = write_drive(folder, meta, _complete("imu", imu, {}), fixes, truth, given)
             write_drives_table(folder, [row])
             yield folder
     except InputError as error:
         raise InputError(reword(str(error))) from None
 
 
-def _completed(kind: str, frame: pd.DataFrame, defaults: Mapping[str, Any]) -> pd.DataFrame:
+def _complete(kind: str, frame: pd.DataFrame, defaults: Mapping[str, Any]) -> pd.DataFrame:
     """The contract's columns of a frame as numbers; those that it lacks by their defaults."""
     from dlkf.data.schema import AIDS, OPTIONAL, SCHEMAS
 

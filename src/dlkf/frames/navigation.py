@@ -97,12 +97,12 @@ def navigate(
 
     from dlkf.data.kinds import drive_rates
     from dlkf.data.store import choose_aids, load_dataset
-    from dlkf.filters.aids.attach import describe_aids, tables_of, with_aids
-    from dlkf.filters.card import slow_drives
-    from dlkf.filters.saved import grid_of
+    from dlkf.filters.aids.attach import describe_aids, find_tables, with_aids
+    from dlkf.filters.card import describe_slow_drives
+    from dlkf.filters.saved import choose_grid
     from dlkf.filters.smoother import run_smoother
     from dlkf.running.innovations import OF_NETWORK, REMEDY
-    from dlkf.running.offline import UsableFixes, epoch_for, navigate_drives
+    from dlkf.running.offline import UsableFixes, choose_epoch, navigate_drives
     from dlkf.tracking.models import short_name, takes_tuning
 
     given = {"rate_hz": rate_hz, "epoch_s": epoch_s}
@@ -115,13 +115,13 @@ def navigate(
         chosen = choose_aids(folder, None)
         estimator = with_aids(load(model, imu_type=imu_type, tuning=tuning), chosen)
         named = {short_name(model): estimator}
-        unused = describe_aids(named, [t for t in chosen if t not in tables_of(estimator)])
-        slow = slow_drives(named, drive_rates(folder).values(), "this drive has")
+        unused = describe_aids(named, [t for t in chosen if t not in find_tables(estimator)])
+        slow = describe_slow_drives(named, drive_rates(folder).values(), "this drive has")
         if smoothed:
             estimator = run_smoother(estimator, "rts")
         fixes = UsableFixes.of(folder, DRIVE)
-        grid = grid_of([estimator], rate_hz, epoch_s, epoch_for([fixes], rate_hz or 50.0, estimator))
-        drives = load_dataset(folder, dtype=torch.float64, reference=False, aids=tables_of(estimator), **grid)
+        grid = choose_grid([estimator], rate_hz, epoch_s, choose_epoch([fixes], rate_hz or 50.0, estimator))
+        drives = load_dataset(folder, dtype=torch.float64, reference=False, aids=find_tables(estimator), **grid)
         (navigated,) = navigate_drives(drives, estimator, align=_align())
     solution = Solution.of(navigated, fixes, short_name(model), REMEDY if takes_tuning(model) else OF_NETWORK)
     for line in (*unused, *slow, *([solution.warning] if solution.warning else [])):
@@ -233,7 +233,7 @@ def Stream(
     InputError
         For options that do not exist, and a filter that cannot work on such a grid.
     """
-    from dlkf.filters.saved import grid_of
+    from dlkf.filters.saved import choose_grid
     from dlkf.running.streaming import StreamingFilter
 
     check_options("Stream", options, StreamingFilter, apart=("estimator", "rate_hz"))
@@ -242,7 +242,7 @@ def Stream(
     check_above_zero(**{name: value for name, value in given.items() if value is not None})
     arm = check_lever_arm(options.pop("lever_arm_b", lever_arm))
     estimator = load(model, imu_type=imu_type, tuning=tuning)
-    grid = grid_of([estimator], rate_hz, epoch_s, 1.0)
+    grid = choose_grid([estimator], rate_hz, epoch_s, 1.0)
     return StreamingFilter(estimator, **grid, lever_arm_b=arm, **options)
 
 

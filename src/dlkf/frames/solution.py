@@ -87,13 +87,13 @@ class Solution(pd.DataFrame):
         InputError
             For an unknown format, a date that is none, or a folder that cannot be written to.
         """
-        from dlkf.running.exports import chosen_formats, export, utc_times
+        from dlkf.running.exports import choose_formats, export, utc_times
 
         if not isinstance(folder, (str, Path)):
             raise InputError(f"folder is {folder!r}, must be a path")
         if not formats or not isinstance(formats, (str, list, tuple)):
             raise InputError(f"formats is {formats!r}, must be a name or a list of names such as ['gpx', 'kml']")
-        names = chosen_formats([formats] if isinstance(formats, str) else list(formats))
+        names = choose_formats([formats] if isinstance(formats, str) else list(formats))
         clock, counts = _clock(start_utc)
         when = utc_times(self, clock, counts)
         place = Path(folder).expanduser()

@@ -28,24 +28,24 @@ class ImuError(NamedTuple):
         """Of an estimator's answer: biases (B, 6) alone, or all of it."""
         return error if isinstance(error, ImuError) else cls(error)
 
-    def corrected(self, raw: Float[Tensor, "B M 6"]) -> Float[Tensor, "B M 6"]:
+    def correct(self, raw: Float[Tensor, "B M 6"]) -> Float[Tensor, "B M 6"]:
         """The samples without the error: (I + M)⁻¹ (raw − bias), the rates of these less G f."""
-        samples = self._without_matrix(raw)
+        samples = self._correct_linear(raw)
         if self.g_sensitivity is None:
             return samples
         force, rate = samples.split(3, -1)
         return torch.cat((force, rate - torch.bmm(force[..., :2], self.g_sensitivity.mT)), -1)
 
-    def _without_matrix(self, raw: Float[Tensor, "B M 6"]) -> Float[Tensor, "B M 6"]:
+    def _correct_linear(self, raw: Float[Tensor, "B M 6"]) -> Float[Tensor, "B M 6"]:
         """(I + M)⁻¹ (raw − bias)."""
         if self.matrix is not None and self.matrix.ndim == 4:
             if torch.is_grad_enabled() and not raw.requires_grad and self.matrix.requires_grad:
-                return _Corrected.apply(raw, self.bias, self.matrix)
-            return _corrected(raw, self.bias, self.matrix)[0]
+                return _Correction.apply(raw, self.bias, self.matrix)
+            return _correct(raw, self.bias, self.matrix)[0]
         samples = raw - self.bias.unsqueeze(1)
         return samples if self.matrix is None else samples / (1 + self.matrix).unsqueeze(1)
 
-    def updated(self, dx: Float[Tensor, "B n"], states: ErrorStates) -> ImuError:
+    def update(self, dx: Float[Tensor, "B n"], states: ErrorStates) -> ImuError:
         """The error after a correction of a filter's states: columns 9… of ``dx``."""
         bias = self.bias + dx[:, 9:15]
         if states.matrix == "none":
@@ -53,7 +53,7 @@ class ImuError(NamedTuple):
         if states.matrix == "scale":
             change = dx[:, states.of_matrix]
             return self._replace(bias=bias, matrix=change if self.matrix is None else self.matrix + change)
-        change = torch.index_select(dx, 1, _by_rows(states, dx.device)).unflatten(-1, (2, 3, 3))
+        change = torch.index_select(dx, 1, _index_by_rows(states, dx.device)).unflatten(-1, (2, 3, 3))
         return self._replace(bias=bias, matrix=change if self.matrix is None else self.matrix + change)
 
     def elements(self, states: ErrorStates) -> Float[Tensor, "*b k"]:
@@ -82,30 +82,30 @@ class ImuError(NamedTuple):
 
 @lru_cache
 @torch.inference_mode(False)
-def _by_rows(states: ErrorStates, device: torch.device) -> Tensor:
+def _index_by_rows(states: ErrorStates, device: torch.device) -> Tensor:
     """Which states the elements of both full matrices are, row by row."""
     place = {element: k for k, element in enumerate(states.elements)}
     one = [states.of_matrix.start + place[i, j] for i in range(3) for j in range(3)]
     return torch.tensor([*one, *(k + len(place) for k in one)], device=device)
 
 
-def _corrected(raw: Float[Tensor, "B M 6"], bias: Float[Tensor, "B 6"], matrix: Tensor) -> tuple[Tensor, Tensor]:
+def _correct(raw: Float[Tensor, "B M 6"], bias: Float[Tensor, "B 6"], matrix: Tensor) -> tuple[Tensor, Tensor]:
     """y = U (raw − bias) and U = (I + M)⁻¹ (B, 2, 3, 3)."""
     U = torch.linalg.inv_ex(torch.eye(3, dtype=raw.dtype, device=raw.device) + matrix)[0]
-    return _by_sensor(raw - bias.unsqueeze(1), U.mT), U
+    return _multiply_by_sensor(raw - bias.unsqueeze(1), U.mT), U
 
 
-def _by_sensor(samples: Float[Tensor, "B M 6"], matrices: Float[Tensor, "B 2 3 3"]) -> Float[Tensor, "B M 6"]:
+def _multiply_by_sensor(samples: Float[Tensor, "B M 6"], matrices: Float[Tensor, "B 2 3 3"]) -> Float[Tensor, "B M 6"]:
     """Each sensor's samples, as rows, times its matrix."""
     return torch.cat((torch.bmm(samples[..., :3], matrices[:, 0]), torch.bmm(samples[..., 3:], matrices[:, 1])), -1)
 
 
-class _Corrected(torch.autograd.Function):
+class _Correction(torch.autograd.Function):
     """With its gradient in closed form: a = Uᵀ ∂y of every sample, ∂bias = −Σ a, ∂M = −Σ a yᵀ."""
 
     @staticmethod
     def forward(ctx, raw, bias, matrix):
-        y, U = _corrected(raw, bias, matrix)
+        y, U = _correct(raw, bias, matrix)
         ctx.save_for_backward(y, U)
         return y
 
@@ -113,6 +113,6 @@ class _Corrected(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, g):
         y, U = ctx.saved_tensors
-        a = _by_sensor(g, U)
+        a = _multiply_by_sensor(g, U)
         of_both = torch.bmm(a.mT, y)
         return None, -a.sum(1), -torch.stack((of_both[:, :3, :3], of_both[:, 3:, 3:]), 1)

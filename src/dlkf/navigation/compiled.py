@@ -86,11 +86,11 @@ def njit(**options: Any) -> Callable[[Callable], Any]:
     """``numba.njit`` of a function, when :func:`fits` first asks for it; until then, and without numba, the function as
     it is."""
 
-    def made(function: Callable) -> Any:
+    def register(function: Callable) -> Any:
         _loops.append((function, options))
         return function
 
-    return made
+    return register
 
 
 def _load() -> None:

@@ -32,7 +32,7 @@ def adjoint(
 
 @njit(inline="always")
 @no_type_check
-def _rotated_back(A, k, u):
+def _rotate_back(A, k, u):
     """A[k]ᵀ u."""
     return (
         A[k, 0, 0] * u[0] + A[k, 1, 0] * u[1] + A[k, 2, 0] * u[2],
@@ -78,7 +78,7 @@ def _adjoint(C0, imu, gradient, w, Gp, Gv, GC, dt, grad_p0, grad_v0, turn, grad_
                     column = GC[b, n, 0, j], GC[b, n, 1, j], GC[b, n, 2, j]
                     along = A[k + 1, 0, j], A[k + 1, 1, j], A[k + 1, 2, j]
                     T = plus(T, 1, cross(along, plus(column, t, cross(earth, column))))
-            r1, r2, twist = _rotated_back(A, k, V), _rotated_back(A, k, U), _rotated_back(A, k + 1, T)
+            r1, r2, twist = _rotate_back(A, k, V), _rotate_back(A, k, U), _rotate_back(A, k + 1, T)
             ends = (gained[k, 0], gained[k, 1], gained[k, 2]), (moved[k, 0], moved[k, 1], moved[k, 2])
             T = plus(plus(T, 1, cross(ends[0], V)), 1, cross(ends[1], U))
             phi, f = (imu[b, k, 3] * dt, imu[b, k, 4] * dt, imu[b, k, 5] * dt), row(imu, b, k)

@@ -97,7 +97,7 @@ class TangentFrame:
         """The frames of some batch elements."""
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
-    def prepared(self) -> TangentFrame:
+    def prepare(self) -> TangentFrame:
         """Itself, with what all epochs share made now, for torch's compiler does not make it on the way."""
         _ = self._normal, self._gradient
         return self

@@ -102,19 +102,17 @@ class WindowModel:
         """
         L = Phi[:, :STATES, DRIVEN].unflatten(-1, (4, 3)).transpose(1, 2)
         if scale is None:
-            return self._accumulated(L)
+            return self._accumulate(L)
         if torch.is_grad_enabled() and scale.requires_grad and not L.requires_grad:
             return _ProcessNoise.apply(L, scale, self)
-        return self._accumulated(L @ scale)
+        return self._accumulate(L @ scale)
 
-    def noise_of_sources(
-        self, Phi: Float[Tensor, "B n n"], scale: Float[Tensor, "B 4 3 3"]
-    ) -> Float[Tensor, "B 4 s s"]:
+    def noise_by_source(self, Phi: Float[Tensor, "B n n"], scale: Float[Tensor, "B 4 3 3"]) -> Float[Tensor, "B 4 s s"]:
         """What each source adds to :meth:`noise`."""
         L = Phi[:, :STATES, DRIVEN].unflatten(-1, (4, 3)).transpose(1, 2) @ scale
         return (L @ L.mT) * self.spread
 
-    def _accumulated(self, L: Float[Tensor, "B 4 s 3"]) -> Float[Tensor, "B n n"]:
+    def _accumulate(self, L: Float[Tensor, "B 4 s 3"]) -> Float[Tensor, "B n n"]:
         if compiled.fits(L):
             shares = _shares(self.density.dtype, self.density.device)
             return compiled_transition.process_noise(L, self._over_window, shares, self.walk)
@@ -141,14 +139,14 @@ class WindowModel:
         later = gained.sum(-1, keepdim=True) - torch.sub(gained.cumsum(-1), gained, alpha=0.5)
         both = (len(turned), 2, *turned.shape[2:])
         lever = torch.linalg.cross(later.unsqueeze(3).expand(both), turned.expand(both), dim=2)
-        force = self._summed(-self.left[:, None, None] * turned, f)
-        rate, tilt = self._summed(lever, w), self._summed(-turned, w)
+        force = self._sum_samples(-self.left[:, None, None] * turned, f)
+        rate, tilt = self._sum_samples(lever, w), self._sum_samples(-turned, w)
         PV = torch.cat((force[..., :3], rate[..., :3], force[..., 3:], rate[..., 3:]), -1)
         zero = torch.zeros_like(tilt)
         A = torch.cat((zero[..., :3], tilt[..., :3], zero[..., 3:], tilt[..., 3:]), -1)
         return torch.cat((PV, A), 1)
 
-    def _summed(self, x: Float[Tensor, "B r 3 3 M"], e: Float[Tensor, "B 3 M"]) -> Float[Tensor, "B 3*r k"]:
+    def _sum_samples(self, x: Float[Tensor, "B r 3 3 M"], e: Float[Tensor, "B 3 M"]) -> Float[Tensor, "B 3*r k"]:
         """Σ x over the samples for a bias, then Σ x[…, row] e[column] for the elements of M."""
         of_bias, matrix = x.sum(-1), self.states.matrix
         if matrix == "none":
@@ -168,7 +166,7 @@ class _ProcessNoise(torch.autograd.Function):
     def forward(ctx, L, scale, model):
         A = L @ scale
         ctx.save_for_backward(L, A, model.spread)
-        return model._accumulated(A)
+        return model._accumulate(A)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -233,7 +231,7 @@ def antenna(
     """
     if lever_arm_b is None:
         return torch.cat((state.p_n, state.v_n), -1)
-    arm_n, swing_n = _arm(state, rate_b, lever_arm_b)
+    arm_n, swing_n = _rotate_arm(state, rate_b, lever_arm_b)
     velocity = state.v_n + swing_n - torch.linalg.cross(frame.earth_rate_n, arm_n)
     return torch.cat((state.p_n + arm_n, velocity), -1)
 
@@ -248,7 +246,7 @@ def measurement_matrix(
     """H of antenna position and velocity with the lever arm in it (paper.md 2.5)."""
     H = _identity(states, rate_b.dtype, rate_b.device) + rate_b.new_zeros(len(rate_b), 1, 1)
     if lever_arm_b is not None:
-        arm_n, swing_n = _arm(state, rate_b, lever_arm_b)
+        arm_n, swing_n = _rotate_arm(state, rate_b, lever_arm_b)
         H[:, :3, ATTITUDE] = -skew(arm_n)
         H[:, 3:, ATTITUDE] = -skew(swing_n) + skew(frame.earth_rate_n) @ skew(arm_n)
         H[:, 3:, GYRO] = state.C_nb @ skew(lever_arm_b)
@@ -272,7 +270,7 @@ def _identity(states: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.eye(6, states, dtype=dtype, device=device)
 
 
-def _arm(state: NavState, rate_b: Tensor, lever_arm_b: Tensor) -> tuple[Tensor, Tensor]:
+def _rotate_arm(state: NavState, rate_b: Tensor, lever_arm_b: Tensor) -> tuple[Tensor, Tensor]:
     """The lever arm and its swing ω × l in n."""
     both = torch.stack((lever_arm_b, torch.linalg.cross(rate_b, lever_arm_b)), -1)
     arm, swing = (state.C_nb @ both).unbind(-1)

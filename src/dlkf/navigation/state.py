@@ -112,7 +112,7 @@ class NavState(NamedTuple):
     v_n: Tensor  # (*b, 3)
     C_nb: Tensor  # (*b, 3, 3)
 
-    def corrected(self, dx: Float[Tensor, "*b 9"]) -> NavState:
+    def correct(self, dx: Float[Tensor, "*b 9"]) -> NavState:
         """State ⊞ dx: the closed-loop feedback, C ← exp([δh×]) C (paper.md 2)."""
         return NavState(
             self.p_n + dx[..., POSITION],

@@ -41,7 +41,7 @@ class Window(NamedTuple):
     end: NavState  # (B, …), attitude orthonormalised
     gravity: Tensor  # (B, 3) m/s² that acted over the window
 
-    def before(self, lag: Float[Tensor, " B"], dt: float) -> NavState:
+    def interpolate_before(self, lag: Float[Tensor, " B"], dt: float) -> NavState:
         """State ``lag`` seconds before the window's end, linear between samples (0 ≤ lag < window)."""
         M = self.p_n.shape[1]
         place = (M - 1 - lag / dt).clamp(0, M - 1)
@@ -72,7 +72,7 @@ def strapdown(start: NavState, imu: Float[Tensor, "B M 6"], dt: float, frame: Ta
         p, v, C = compiled.mechanise(*start, imu, dt, gravity, frame.earth_rate_n)
         end = p[:, -1].clone(), v[:, -1].clone(), orthonormalise(C[:, -1])  # views would keep the whole window
     else:
-        (p, v, C, *end), _ = _mechanised(*start, imu, dt, gravity, frame.earth_rate_n)
+        (p, v, C, *end), _ = _mechanise(*start, imu, dt, gravity, frame.earth_rate_n)
     return Window(p, v, C, NavState(*end), gravity)
 
 
@@ -83,7 +83,7 @@ def _times(M: int, dt: float, dtype: torch.dtype, device: torch.device) -> Tenso
     return torch.arange(1, M + 1, dtype=dtype, device=device) * dt
 
 
-def _mechanised(p0: Tensor, v0: Tensor, C0: Tensor, imu: Tensor, dt: float, g: Tensor, earth_rate: Tensor):
+def _mechanise(p0: Tensor, v0: Tensor, C0: Tensor, imu: Tensor, dt: float, g: Tensor, earth_rate: Tensor):
     """States after every sample and at the end, and what the adjoint needs of the way there.
 
     Inside, the axes come first and the samples last: (3, B, M) vectors and (3, 3, B, M) matrices, so that
@@ -123,7 +123,7 @@ class _Strapdown(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, p0, v0, C0, imu, dt, g, gradient, earth_rate):
-        states, (f, phi, A, A_before, gained, moved) = _mechanised(p0, v0, C0, imu, dt, g, earth_rate)
+        states, (f, phi, A, A_before, gained, moved) = _mechanise(p0, v0, C0, imu, dt, g, earth_rate)
         ctx.save_for_backward(f, phi, C0, A, A_before, gained, moved, gradient, earth_rate)
         ctx.dt = dt
         ctx.set_materialize_grads(False)
@@ -136,8 +136,8 @@ class _Strapdown(torch.autograd.Function):
         dt, M = ctx.dt, phi.shape[-1]
         t = _times(M, dt, phi.dtype, phi.device)
         w = earth_rate.mT.unsqueeze(-1)
-        Gp = _with_end(Gp, gp, gained, (2, 0, 1))
-        Gv = _with_end(Gv, gv, gained, (2, 0, 1))
+        Gp = _add_end_gradient(Gp, gp, gained, (2, 0, 1))
+        Gv = _add_end_gradient(Gv, gv, gained, (2, 0, 1))
         Hv, Hp = _cross(w, Gv), _cross(w, Gp)
         grad_g = (t * (Gv + 0.5 * t * Gp + t * Hv + t * t * Hp / 3)).sum(-1).mT
         grad_v0 = (Gv + t * (Gp + 2 * Hv + t * Hp)).sum(-1).mT + 0.5 * M * dt * gradient * grad_g
@@ -149,7 +149,7 @@ class _Strapdown(torch.autograd.Function):
         torque = _cross(gained, V) + _cross(moved, U)
         at_end = None
         if GC is not None or gC is not None:
-            GC = _with_end(GC, gC, A, (2, 3, 0, 1))
+            GC = _add_end_gradient(GC, gC, A, (2, 3, 0, 1))
             at_end = _cross(A, GC + t * _cross(w.unsqueeze(1), GC)).sum(1)
         T = _suffix_sum(torque if at_end is None else torque + at_end)
         grad_C0 = 0.5 * skew(T[..., 0].mT) @ C0
@@ -217,7 +217,7 @@ def _suffix_sum(x: Tensor) -> Tensor:
     return x.sum(-1, keepdim=True) - x.cumsum(-1) + x
 
 
-def _with_end(samples: Tensor | None, end: Tensor | None, like: Tensor, order: tuple[int, ...]) -> Tensor:
+def _add_end_gradient(samples: Tensor | None, end: Tensor | None, like: Tensor, order: tuple[int, ...]) -> Tensor:
     """Gradient of all samples with that of the end state added to the last, axes first."""
     full = torch.zeros_like(like) if samples is None else samples.permute(*order).contiguous()
     if end is not None:

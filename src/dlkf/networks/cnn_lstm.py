@@ -57,7 +57,7 @@ class NetworkConfig:
         """The network."""
         return CnnLstm(self)
 
-    def plain(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """Plain values for a file; ``flags`` follow from the filter's mode."""
         values = asdict(self) | {"dense": list(self.dense)}
         return {k: v for k, v in values.items() if k != "flags"}

@@ -44,6 +44,6 @@ class OwnNetwork:
         network = instantiate(values, "model.network", NETWORK, offered=offered, spare=PAPER_FIELDS)
         return require_attributes(network, ("width",), f"model.network.{TARGET}={self.target}")
 
-    def plain(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """Plain values for a file."""
         return {TARGET: self.target, "samples": self.samples, **self.settings}

@@ -77,10 +77,10 @@ class PlusNetwork(nn.Module):
         past the memory to the output, ``axes`` to that of each axis."""
         h = self.memory(nn.functional.silu(self.inward(features)), memory)
         own = self.axis_noise(nn.functional.silu(self.of_axis(axes) + self.context(h).unsqueeze(1))).squeeze(-1)
-        return bounded(self.noise(torch.cat((h, now), -1)) + own, REACH), h
+        return bound_factor(self.noise(torch.cat((h, now), -1)) + own, REACH), h
 
 
-def bounded(x: Tensor, reach: Tensor | float) -> Tensor:
+def bound_factor(x: Tensor, reach: Tensor | float) -> Tensor:
     """exp(c tanh(x / c)): a factor that is 1 at zero, has the slope of exp there, and stays within exp(±c)."""
     return torch.exp(reach * torch.tanh(x / reach))
 

@@ -41,9 +41,9 @@ class EpochProduct:
     def __init__(self, weight: Float[Tensor, "N K"], bias: Float[Tensor, " N"]) -> None:
         self.seen: list[tuple[Tensor, Tensor]] = []  # (x, g) of the epochs whose gradient has come back
         self.weight, self.bias = _Collecting.apply(weight, bias, self.seen)
-        self.forth, self.back = (_in_order(x.detach()) for x in (weight, weight.mT))
+        self.forth, self.back = (_reorder(x.detach()) for x in (weight, weight.mT))
 
-    def of(self, x: Float[Tensor, "B K"]) -> Float[Tensor, "B N"]:
+    def multiply(self, x: Float[Tensor, "B K"]) -> Float[Tensor, "B N"]:
         """x Wᵀ + b."""
         return _product(x, self.forth, self.bias.detach())
 
@@ -58,7 +58,7 @@ class EpochLayer(nn.Module):
 
     product: EpochProduct | None = None
 
-    def learning(self) -> bool:
+    def is_learning(self) -> bool:
         """Whether gradients of the layer's weights are wanted; a compiler has products of its own."""
         if not torch.is_grad_enabled() or torch.compiler.is_compiling():
             return False
@@ -81,7 +81,7 @@ class EpochLinear(EpochLayer, nn.Linear):
 
     def forward(self, x: Float[Tensor, "B K"]) -> Float[Tensor, "B N"]:
         """``torch.nn.Linear``."""
-        if not self.learning():
+        if not self.is_learning():
             return super().forward(x)
         self.product = product = self.product or EpochProduct(self.weight, self.bias)
         return _Linear.apply(x, product.weight, product.bias, product)
@@ -95,7 +95,7 @@ class EpochLSTMCell(EpochLayer, nn.LSTMCell):
 
     def forward(self, x: Float[Tensor, "B K"], memory: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         """``torch.nn.LSTMCell``."""
-        if not self.learning():
+        if not self.is_learning():
             return super().forward(x, memory)
         if self.product is None:
             both = torch.cat((self.weight_ih, self.weight_hh), 1)
@@ -103,18 +103,18 @@ class EpochLSTMCell(EpochLayer, nn.LSTMCell):
         return _LstmCell.apply(x, *memory, self.product.weight, self.product.bias, self.product)
 
 
-def _by_onednn(x: Tensor) -> bool:
+def _uses_onednn(x: Tensor) -> bool:
     return ONEDNN and x.device.type == "cpu" and x.dtype == torch.float32
 
 
-def _in_order(weight: Tensor) -> Tensor:
+def _reorder(weight: Tensor) -> Tensor:
     """A matrix in oneDNN's layout for many products."""
-    return torch.ops.mkldnn._reorder_linear_weight(weight) if _by_onednn(weight) else weight
+    return torch.ops.mkldnn._reorder_linear_weight(weight) if _uses_onednn(weight) else weight
 
 
 def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """x Wᵀ + b, by oneDNN through the operation that torch.compile uses for it."""
-    if _by_onednn(x):
+    if _uses_onednn(x):
         return torch.ops.mkldnn._linear_pointwise.default(x, weight, bias, "none", [], "")
     return linear(x, weight, bias)
 
@@ -143,7 +143,7 @@ class _Linear(torch.autograd.Function):
     def forward(ctx, x, weight, bias, product):
         ctx.save_for_backward(x)
         ctx.product = product
-        return product.of(x)
+        return product.multiply(x)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -158,7 +158,7 @@ class _LstmCell(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, h, c, weight, bias, product):
         both = torch.cat((x, h), 1)
-        i, f, g, o = product.of(both).chunk(4, 1)
+        i, f, g, o = product.multiply(both).chunk(4, 1)
         i, f, g, o = torch.sigmoid(i), torch.sigmoid(f), torch.tanh(g), torch.sigmoid(o)
         after = torch.addcmul(f * c, i, g)
         swing = torch.tanh(after)

@@ -47,7 +47,7 @@ class View:
             terms.append(str(self.meta.storage_offset()))
         return f"{self.buffer.name}[{'+'.join(terms)}]"
 
-    def viewed(self, meta: Tensor) -> View:
+    def view_as(self, meta: Tensor) -> View:
         """The same memory in another way."""
         return View(self.buffer, meta)
 
@@ -78,14 +78,14 @@ class Rows:
             place = place * n + i
         return self.items[place]
 
-    def viewed(self, shape: torch.Size) -> Rows | None:
+    def view_as(self, shape: torch.Size) -> Rows | None:
         """As another shape; None where that parts an expression."""
         for k in range(len(shape) + 1):
             if shape[:k].numel() == self.lead.numel():
                 try:
                     items = []
                     for x in self.items:
-                        operands = [v.viewed(v.meta.view(shape[k:])) for v in x.operands]
+                        operands = [v.view_as(v.meta.view(shape[k:])) for v in x.operands]
                         items.append(Expression(shape[k:], x.dtype, x.pattern, operands))
                 except RuntimeError:  # strides that do not allow it
                     return None
@@ -131,17 +131,17 @@ class Block:
             view.buffer.last = len(self.lines)
         self.lines.append(line)
 
-    def over(self, out: View, expression: str, operands: Sequence[View]) -> None:
+    def assign(self, out: View, expression: str, operands: Sequence[View]) -> None:
         """``out`` = expression at every index; operands have the shape of ``out``."""
         order = sorted(range(out.meta.ndim), key=lambda d: -out.meta.stride(d))  # along its memory
         metas = [m.permute(order) for m in (out.meta, *(o.meta for o in operands))]
-        sizes, strides = collapsed(list(metas[0].shape), [list(m.stride()) for m in metas])
-        views = [View(v.buffer, _strided(v.meta, sizes, s)) for v, s in zip((out, *operands), strides)]
+        sizes, strides = collapse_loops(list(metas[0].shape), [list(m.stride()) for m in metas])
+        views = [View(v.buffer, _restride(v.meta, sizes, s)) for v, s in zip((out, *operands), strides)]
         index = [f"i{k}" for k in range(len(sizes))]
         elements = [v.at(index) for v in views[1:]]
         self.write(f"{loops(index, sizes)}{views[0].at(index)} = {expression.format(*elements)};", out, *operands)
 
-    def laid_out(self) -> int:
+    def lay_out(self) -> int:
         """Give every buffer that is on the stack its place; bytes in all. What lives together lies apart."""
         alive: list[tuple[int, int, int]] = []  # start, end, last line
         highest = CACHE_LINE
@@ -170,36 +170,36 @@ class Tensors:
         value: Any = node.meta["val"]
         if value.ndim > 1 and value.shape[-1] < SHORT <= LONG <= value.shape[-2] and value.is_contiguous():
             out = self.block.new((*value.shape[:-2], *value.shape[:-3:-1]), value.dtype)
-            return out.viewed(out.meta.mT)
+            return out.view_as(out.meta.mT)
         whole = value.numel() and torch.ops.aten.is_non_overlapping_and_dense(value)
         return self.block.new(value.shape, value.dtype, value.stride() if whole else None)
 
-    def goes_on(self, node: Node) -> bool:
+    def may_stay_expression(self, node: Node) -> bool:
         """Whether a node's value may stay an expression: one node uses it, and that takes each element once."""
         raise NotImplementedError
 
-    def within(self, graph: GraphModule, given: Sequence[View]) -> None:
+    def write_graph(self, graph: GraphModule, given: Sequence[View]) -> None:
         """The lines of another graph, which changes the first of ``given``."""
         raise NotImplementedError
 
-    def elements_of(self, x: Any, shape: torch.Size) -> tuple[str, list[View]]:
+    def expand_elements(self, x: Any, shape: torch.Size) -> tuple[str, list[View]]:
         """Pattern and operands of a tensor of a shape."""
         if isinstance(x, Expression) and x.shape == shape:
             return f"({x.pattern})", x.operands
         view = self.tensor(x)
-        return "{0}", [view.viewed(view.meta.expand(shape))]
+        return "{0}", [view.view_as(view.meta.expand(shape))]
 
-    def stored(self, node: Node, x: Expression | Rows) -> View:
+    def store(self, node: Node, x: Expression | Rows) -> View:
         """A node's value in memory."""
-        return self._written(self.result(node), x)
+        return self._write(self.result(node), x)
 
-    def _written(self, out: View, x: Expression | Rows) -> View:
+    def _write(self, out: View, x: Expression | Rows) -> View:
         if isinstance(x, Expression):
-            self.block.over(out, x.pattern, x.operands)
+            self.block.assign(out, x.pattern, x.operands)
         else:
             for index in product(*map(range, x.lead)):
                 item = x.at(index)
-                self.block.over(out.viewed(out.meta[index]), item.pattern, item.operands)
+                self.block.assign(out.view_as(out.meta[index]), item.pattern, item.operands)
         return out
 
     def elements(self, x: Any) -> Expression:
@@ -213,7 +213,7 @@ class Tensors:
         """A value as a tensor in memory."""
         if isinstance(x, Tensor):
             return self.block.constant(x)
-        return self._written(self.block.new(x.shape, x.dtype), x) if isinstance(x, (Expression, Rows)) else x
+        return self._write(self.block.new(x.shape, x.dtype), x) if isinstance(x, (Expression, Rows)) else x
 
     def dense(self, x: Any) -> View:
         """A value as a tensor without gaps."""
@@ -221,7 +221,7 @@ class Tensors:
         if view.meta.is_contiguous():
             return view
         out = self.block.new(view.meta.shape, view.meta.dtype)
-        self.block.over(out, "{0}", [view])
+        self.block.assign(out, "{0}", [view])
         return out
 
 
@@ -230,7 +230,7 @@ def loops(names: Sequence[str], sizes: Sequence[int]) -> str:
     return "".join(f"for (int {i} = 0; {i} < {n}; {i}++) " for i, n in zip(names, sizes))
 
 
-def collapsed(sizes: list[int], strides: list[list[int]]) -> tuple[list[int], list[list[int]]]:
+def collapse_loops(sizes: list[int], strides: list[list[int]]) -> tuple[list[int], list[list[int]]]:
     """A loop nest with as few loops as all operands allow; loops of one pass fall away."""
     kept = [k for k, n in enumerate(sizes) if n != 1]
     sizes, strides = [sizes[k] for k in kept], [[s[k] for k in kept] for s in strides]
@@ -244,5 +244,5 @@ def collapsed(sizes: list[int], strides: list[list[int]]) -> tuple[list[int], li
     return sizes, strides
 
 
-def _strided(meta: Tensor, sizes: list[int], strides: list[int]) -> Tensor:
+def _restride(meta: Tensor, sizes: list[int], strides: list[int]) -> Tensor:
     return torch.as_strided(meta, sizes, strides, meta.storage_offset())

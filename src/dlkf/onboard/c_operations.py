@@ -35,31 +35,31 @@ def suffix(dtype: torch.dtype) -> str:
     return "f" if dtype == torch.float32 else ""
 
 
-def vectorised(pattern: str, elements: int) -> str:
+def vectorise(pattern: str, elements: int) -> str:
     """A pattern of many elements, with the functions of ``elementary.c.in`` for those of <math.h> where it has them."""
     return re.sub(r"\b(expf?|tanhf|log|log1p|asinh|sin|cos)\(", r"each_\1(", pattern) if elements >= MANY else pattern
 
 
-def _function(name: str) -> Pattern:
+def _make_call(name: str) -> Pattern:
     """A function of <math.h>."""
 
-    def made(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
+    def call_function(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
         return f"{name}{suffix(dtype)}({', '.join(f'{{{k}}}' for k in range(len(args)))})", args
 
-    return made
+    return call_function
 
 
-def _scaled(sign: str) -> Pattern:
+def _make_sum(sign: str) -> Pattern:
     """a ± alpha b."""
 
-    def made(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
+    def add_scaled(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
         alpha = kwargs.get("alpha", 1)
         return ("{0} " + sign + " {1}", args[:2]) if alpha == 1 else ("{0} " + sign + " {2} * {1}", [*args[:2], alpha])
 
-    return made
+    return add_scaled
 
 
-def _clamped(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
+def _clamp(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
     low, high = ([*args[1:], None, None])[:2]
     low, high = kwargs.get("min", low), kwargs.get("max", high)
     end = suffix(dtype) if dtype.is_floating_point else "_int"
@@ -81,47 +81,48 @@ def _sigmoid(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
     return f"1 / (1 + exp{suffix(dtype)}(-{{0}}))", args
 
 
-def _root(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
+def _rsqrt(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
     return f"1 / sqrt{suffix(dtype)}({{0}})", args
 
 
-def _leaky(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
+def _leaky_relu(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
     return "({0} > 0 ? {0} : {1} * {0})", [args[0], (*args[1:], 0.01)[0]]
 
 
-def _added_product(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
+def _addcmul(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
     return "{0} + {3} * {1} * {2}", [*args[:3], kwargs.get("value", 1)]
 
 
-def _degrees(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
+def _rad2deg(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
     return "{1} * {0}", [args[0], math.degrees(1)]
 
 
-def _second(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
+def _take_second(dtype: torch.dtype, args: list, kwargs: dict) -> tuple[str, list]:
     return "{0}", [args[1]]
 
 
-def _first(pattern: str) -> Pattern:
+def _apply_to_first(pattern: str) -> Pattern:
     return lambda dtype, args, kwargs: (pattern, args[:1])
 
 
 BY_ELEMENT: dict[str, Pattern] = {
-    "add": _scaled("+"), "sub": _scaled("-"), "mul": "{0} * {1}", "div": "{0} / {1}", "neg": "-{0}",
-    "reciprocal": "1 / {0}", "pow": _power, "square": _function("square"), "rsqrt": _root,
-    "sqrt": _function("sqrt"), "exp": _function("exp"), "erf": _function("erf"), "log": _function("log"),
-    "log1p": _function("log1p"), "rad2deg": _degrees,
-    "sin": _function("sin"), "cos": _function("cos"), "asin": _function("asin"), "asinh": _function("asinh"),
-    "atan2": _function("atan2"), "tanh": _function("tanh"), "hypot": _function("hypot"), "floor": _function("floor"),
-    "abs": _function("fabs"), "sigmoid": _sigmoid, "leaky_relu": _leaky, "relu": "({0} > 0 ? {0} : 0)",
-    "maximum": "({0} > {1} ? {0} : {1})", "minimum": "({0} < {1} ? {0} : {1})", "clamp": _clamped,
-    "clamp_min": _clamped, "where": "({0} ? {1} : {2})", "lerp": "{0} + {2} * ({1} - {0})", "addcmul": _added_product,
+    "add": _make_sum("+"), "sub": _make_sum("-"), "mul": "{0} * {1}", "div": "{0} / {1}", "neg": "-{0}",
+    "reciprocal": "1 / {0}", "pow": _power, "square": _make_call("square"), "rsqrt": _rsqrt,
+    "sqrt": _make_call("sqrt"), "exp": _make_call("exp"), "erf": _make_call("erf"), "log": _make_call("log"),
+    "log1p": _make_call("log1p"), "rad2deg": _rad2deg,
+    "sin": _make_call("sin"), "cos": _make_call("cos"), "asin": _make_call("asin"), "asinh": _make_call("asinh"),
+    "atan2": _make_call("atan2"), "tanh": _make_call("tanh"), "hypot": _make_call("hypot"),
+    "floor": _make_call("floor"),
+    "abs": _make_call("fabs"), "sigmoid": _sigmoid, "leaky_relu": _leaky_relu, "relu": "({0} > 0 ? {0} : 0)",
+    "maximum": "({0} > {1} ? {0} : {1})", "minimum": "({0} < {1} ? {0} : {1})", "clamp": _clamp,
+    "clamp_min": _clamp, "where": "({0} ? {1} : {2})", "lerp": "{0} + {2} * ({1} - {0})", "addcmul": _addcmul,
     "eq": "{0} == {1}", "ne": "{0} != {1}", "lt": "{0} < {1}", "le": "{0} <= {1}", "gt": "{0} > {1}",
     "ge": "{0} >= {1}", "logical_not": "!{0}", "bitwise_not": "!{0}", "bitwise_and": "{0} & {1}",
     "bitwise_or": "{0} | {1}", "logical_and": "{0} && {1}", "logical_or": "{0} || {1}", "isnan": "isnan({0}) != 0",
     "isinf": "isinf({0}) != 0",
-    "full_like": _second, "ones_like": _first("1"), "zeros_like": _first("0"), "copy": _second,
-    "_to_copy": _first("{0}"), "clone": _first("{0}"), "lift_fresh_copy": _first("{0}"),
-    "prims::copy_strided": _first("{0}"),
+    "full_like": _take_second, "ones_like": _apply_to_first("1"), "zeros_like": _apply_to_first("0"),
+    "copy": _take_second, "_to_copy": _apply_to_first("{0}"), "clone": _apply_to_first("{0}"),
+    "lift_fresh_copy": _apply_to_first("{0}"), "prims::copy_strided": _apply_to_first("{0}"),
 }  # fmt: skip
 COPIES = ("clone", "lift_fresh_copy", "_to_copy", "prims::copy_strided")
 # operations that change a part of a copy: which part of it becomes the second operand

@@ -10,16 +10,16 @@ from dlkf.onboard.c_memory import C_TYPES, Block
 LINES = 120  # of a part; more where it would end within braces
 
 
-def parts_in_c(name: str, arguments: Sequence[str], block: Block) -> list[str]:
+def write_parts(name: str, arguments: Sequence[str], block: Block) -> list[str]:
     """The lines of ``name``, which calls its parts one after the other with its own arguments; the last is ``work``,
     in which the tensors lie."""
     parts, names = list(_cut(block.lines)), [argument.split("*restrict ")[1] for argument in arguments]
     listed, unused = ", ".join(arguments), " ".join(f"(void){x};" for x in names)
     if len(parts) < 2:
-        return [f"void {name}({listed}) {{", f"  {unused}", *_indented(block, block.lines), "}"]
+        return [f"void {name}({listed}) {{", f"  {unused}", *_indent(block, block.lines), "}"]
     written = []
     for k, lines in enumerate(parts):
-        written += [f"static DLKF_APART void {name}_part{k}({listed}) {{", f"  {unused}", *_indented(block, lines), "}"]
+        written += [f"static DLKF_APART void {name}_part{k}({listed}) {{", f"  {unused}", *_indent(block, lines), "}"]
     calls = [f"  {name}_part{k}({', '.join(names)});" for k in range(len(parts))]
     return [*written, f"void {name}({listed}) {{", *calls, "}"]
 
@@ -37,7 +37,7 @@ def _cut(lines: Sequence[str]) -> Iterator[list[str]]:
         yield part
 
 
-def _indented(block: Block, lines: Sequence[str]) -> list[str]:
+def _indent(block: Block, lines: Sequence[str]) -> list[str]:
     """Lines behind the places of the tensors in them."""
     used = set(re.findall(r"\bx\d+\b", " ".join(lines)))
     places = [

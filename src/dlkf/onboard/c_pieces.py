@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.fx import Node
 
-from dlkf.filters.pieces import of_name
+from dlkf.filters.pieces import find_function
 from dlkf.onboard.c_memory import Buffer, Tensors, View
 from dlkf.onboard.recording import record
 
@@ -18,7 +18,7 @@ SUMMED = "dlkf::summed"
 def write_sum(t: Tensors, node: Node, name: str, count: int, begin: Any, samples: list) -> View:
     """What a piece adds, in ``count`` turns."""
     out = t.result(node)
-    t.block.over(out, *t.elements_of(begin, out.meta.shape))
+    t.block.assign(out, *t.expand_elements(begin, out.meta.shape))
     wholes, pieces = [t.tensor(x) for x in samples], []
     for x in wholes:
         size = x.meta.shape[1] // count
@@ -26,7 +26,7 @@ def write_sum(t: Tensors, node: Node, name: str, count: int, begin: Any, samples
         pieces.append(View(at, x.meta.narrow(1, 0, size)))
     example = tuple(torch.zeros(x.meta.shape, dtype=x.meta.dtype) for x in (out, *pieces))
     t.block.write(f"for (int t = 0; t < {count}; t++) {{", out, *wholes)
-    t.within(record(_Piece(name, example)), [out, *pieces])
+    t.write_graph(record(_Piece(name, example)), [out, *pieces])
     t.block.write("}", out, *wholes)
     return out
 
@@ -35,7 +35,7 @@ class _Piece:
     """What is done with one, as the recorder takes it."""
 
     def __init__(self, name: str, example: tuple[Tensor, ...]) -> None:
-        self._work, self._example = of_name(name), example
+        self._work, self._example = find_function(name), example
 
     def example(self) -> tuple[Tensor, ...]:
         return self._example

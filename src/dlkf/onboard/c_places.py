@@ -18,7 +18,7 @@ RESHAPES = ("view", "_unsafe_view", "reshape")
 Place = tuple[Node, Callable[[Tensor], Tensor | None]]  # the node that holds it, and where in what holds that
 
 
-def name_of(node: Node) -> str:
+def operation_name(node: Node) -> str:
     """The operation of a node; "" for what is none."""
     schema = getattr(node.target, "_schema", None)
     return "" if schema is None else schema.name.removeprefix("aten::")
@@ -28,7 +28,7 @@ def find_places(graph: GraphModule) -> dict[Node, Place]:
     """Of every node that a ``cat`` joins, directly or through views, its place in that: the first such one."""
     places: dict[Node, Place] = {}
     for node in graph.graph.nodes:
-        if name_of(node) != "cat":
+        if operation_name(node) != "cat":
             continue
         parts: Any = node.args[0]
         dim: Any = node.args[1] if len(node.args) > 1 else 0
@@ -36,41 +36,41 @@ def find_places(graph: GraphModule) -> dict[Node, Place]:
         for part in parts:
             size = part.meta["val"].shape[dim]
             if part.meta["val"].numel() and part.meta["val"].dtype == node.meta["val"].dtype:
-                _place(places, part, node, _narrowed(dim, start, size))
+                _note_place(places, part, node, _make_narrow(dim, start, size))
             start += size if part.meta["val"].numel() else 0
     return places
 
 
-def _narrowed(dim: int, start: int, size: int) -> Callable[[Tensor], Tensor | None]:
+def _make_narrow(dim: int, start: int, size: int) -> Callable[[Tensor], Tensor | None]:
     return lambda whole: whole.narrow(dim, start, size)
 
 
-def _place(places: dict[Node, Place], part: Node, holder: Node, where: Callable[[Tensor], Tensor | None]) -> None:
+def _note_place(places: dict[Node, Place], part: Node, holder: Node, where: Callable[[Tensor], Tensor | None]) -> None:
     """Of a part, or of what it is a view of."""
-    while (undo := _undone(part)) is not None:
-        part, where = part.args[0], _after(where, undo)  # type: ignore[assignment]
+    while (undo := _invert_view(part)) is not None:
+        part, where = part.args[0], _compose(where, undo)  # type: ignore[assignment]
     places.setdefault(part, (holder, where))
 
 
-def _after(
+def _compose(
     where: Callable[[Tensor], Tensor | None], undo: Callable[[Tensor], Tensor | None]
 ) -> Callable[[Tensor], Tensor | None]:
-    def made(whole: Tensor) -> Tensor | None:
+    def locate(whole: Tensor) -> Tensor | None:
         at = where(whole)
         return None if at is None else undo(at)
 
-    return made
+    return locate
 
 
-def _undone(node: Node) -> Callable[[Tensor], Tensor | None] | None:
+def _invert_view(node: Node) -> Callable[[Tensor], Tensor | None] | None:
     """What makes the tensor of its view; None where the node is no such view."""
-    name, args = name_of(node), list[Any](node.args)
+    name, args = operation_name(node), list[Any](node.args)
     if name == "unsqueeze":
         return lambda view: view.squeeze(args[1])  # type: ignore[call-overload, arg-type]
     if name == "expand" and args[0].meta["val"].shape == node.meta["val"].shape:  # type: ignore[union-attr]
         return lambda view: view
     if name in RESHAPES:
-        return lambda view: _reshaped(view, args[0].meta["val"].shape)  # type: ignore[union-attr]
+        return lambda view: _reshape(view, args[0].meta["val"].shape)  # type: ignore[union-attr]
     if name == "permute":
         order: Any = args[1]
         back = sorted(range(len(order)), key=lambda k: order[k] % len(order))
@@ -78,7 +78,7 @@ def _undone(node: Node) -> Callable[[Tensor], Tensor | None] | None:
     return None
 
 
-def _reshaped(view: Tensor, shape: torch.Size) -> Tensor | None:
+def _reshape(view: Tensor, shape: torch.Size) -> Tensor | None:
     try:
         return view.view(shape)
     except RuntimeError:  # strides that do not allow it
@@ -110,10 +110,10 @@ class Readers:
 
 
 def _puts_back(user: Node, node: Node, value: Any, whole: View) -> bool:
-    part = PARTS.get(name_of(user))
+    part = PARTS.get(operation_name(user))
     if part is None or user.args[1] is not node or not isinstance(value, View):
         return False
-    return is_same(value.viewed(part(value.meta, *user.args[2:])), whole)
+    return is_same(value.view_as(part(value.meta, *user.args[2:])), whole)
 
 
 def is_same(a: View, b: View) -> bool:

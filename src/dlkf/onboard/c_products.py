@@ -25,24 +25,24 @@ NARROW = 16  # columns up to which a branch costs more than it saves
 VECTOR = 64  # bytes of a processor's largest vector: rows as long as that go through tiles
 
 
-def product(
+def write_product(
     t: Tensors, node: Node, A: Any, B: Any, begin: Any = None, beta: float = 1, alpha: float = 1
 ) -> View | Rows:
     """A B (b × m × k · k × n), on top of β · ``begin`` where there is one."""
     a, b, value = t.tensor(A), t.tensor(B), node.meta["val"]
     n = b.meta.shape[-1]
     if begin is None and alpha == 1 and n >= WIDE and (rows := _sparse_rows(t, a)):
-        lines = _lines(rows, b, value)
-        return lines if t.goes_on(node) and max(map(len, rows)) == 1 else t.stored(node, lines)
+        lines = _product_rows(rows, b, value)
+        return lines if t.may_stay_expression(node) and max(map(len, rows)) == 1 else t.store(node, lines)
     out = t.result(node)
     given = None
     if begin is not None:
         given = t.tensor(begin)
-        given = given.viewed(given.meta.expand(value.shape))
+        given = given.view_as(given.meta.expand(value.shape))
     factors = ["" if x == 1 else f"{literal(x, value.dtype)} * " for x in (alpha, beta)]
     if a.meta.stride(-2) == out.meta.stride(-2) == 1 != out.meta.stride(-1):  # both by columns
-        of_given = None if given is None else given.viewed(given.meta.mT)
-        _write(t, out.viewed(out.meta.mT), b.viewed(b.meta.mT), a.viewed(a.meta.mT), of_given, *factors)
+        of_given = None if given is None else given.view_as(given.meta.mT)
+        _write(t, out.view_as(out.meta.mT), b.view_as(b.meta.mT), a.view_as(a.meta.mT), of_given, *factors)
     else:
         _write(t, out, a, b, given, *factors)
     return out
@@ -61,12 +61,12 @@ def _write(t: Tensors, out: View, a: View, b: View, given: View | None, scale: s
         _write_rows(t, out, a, b, given, scale, beta, small)
 
 
-def added_product(t: Tensors, node: Node, c: Any, a: Any, b: Any, beta: float = 1, alpha: float = 1) -> View | Rows:
+def write_product_sum(t: Tensors, node: Node, c: Any, a: Any, b: Any, beta: float = 1, alpha: float = 1) -> View | Rows:
     """β C + α A B."""
-    return product(t, node, a, b, c, beta, alpha)
+    return write_product(t, node, a, b, c, beta, alpha)
 
 
-def _values(t: Tensors, view: View) -> Tensor | None:
+def _find_constant(t: Tensors, view: View) -> Tensor | None:
     """A constant matrix, None for another tensor."""
     values = next((x for buffer, x in t.block.constants if buffer is view.buffer), None)
     if values is None or view.meta.numel() != view.meta.shape[-2] * view.meta.shape[-1]:
@@ -77,14 +77,14 @@ def _values(t: Tensors, view: View) -> Tensor | None:
 
 def _sparse_rows(t: Tensors, a: View) -> list[list[tuple[int, float]]]:
     """Column and value of what is not zero in each row of a constant matrix with few elements."""
-    A = _values(t, a)
+    A = _find_constant(t, a)
     if A is None:
         return []
     rows = [[(k, float(row[k])) for k in row.nonzero()[:, 0].tolist()] for row in A]
     return rows if sum(map(len, rows)) <= FEW * len(rows) else []
 
 
-def _lines(rows: list[list[tuple[int, float]]], b: View, value: Any) -> Rows:
+def _product_rows(rows: list[list[tuple[int, float]]], b: View, value: Any) -> Rows:
     """Rows of A B as sums of few rows of B."""
     matrix = b.meta[0] if b.meta.ndim == 3 else b.meta
     items = []
@@ -92,7 +92,7 @@ def _lines(rows: list[list[tuple[int, float]]], b: View, value: Any) -> Rows:
         terms = []
         for j, (_, w) in enumerate(row):
             terms.append(f"{{{j}}}" if w == 1 else f"-{{{j}}}" if w == -1 else f"{literal(w, value.dtype)} * {{{j}}}")
-        operands = [b.viewed(matrix[k]) for k, _ in row]
+        operands = [b.view_as(matrix[k]) for k, _ in row]
         items.append(Expression(matrix.shape[1:], value.dtype, f"({' + '.join(terms) or '0'})", operands))
     return Rows(value.shape, value.dtype, value.shape[:-1], items)
 
@@ -105,9 +105,9 @@ def _write_dots(t: Tensors, out: View, a: View, b: View, given: View | None, sca
     call = f"dots{suffix(out.meta.dtype)}({sizes}, {', '.join(at)}, {out.meta.stride(-1)});"
     t.block.write(loops(lead, a.meta.shape[:1]) + call, out, a, b)
     if given is not None:
-        t.block.over(out, f"{beta}{{0}} + {scale}{{1}}", [given, out])
+        t.block.assign(out, f"{beta}{{0}} + {scale}{{1}}", [given, out])
     elif scale:
-        t.block.over(out, f"{scale}{{0}}", [out])
+        t.block.assign(out, f"{scale}{{0}}", [out])
 
 
 def _write_rows(
@@ -149,7 +149,7 @@ def _write_tiles(
     overlaps = given is not None and given.buffer is out.buffer and n * out.meta.dtype.itemsize % VECTOR != 0
     if given is not None and (overlaps or given.meta.stride(-1) != 1):
         copy = t.block.new(given.meta.shape, given.meta.dtype)
-        t.block.over(copy, "{0}", [given])
+        t.block.assign(copy, "{0}", [given])
         given = copy
     lead = ["b"] if a.meta.ndim == 3 else []
 

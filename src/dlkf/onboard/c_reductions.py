@@ -15,7 +15,7 @@ import torch
 from torch.fx import Node
 
 from dlkf.base.errors import InputError
-from dlkf.onboard.c_memory import C_TYPES, Expression, Rows, Tensors, View, collapsed, loops
+from dlkf.onboard.c_memory import C_TYPES, Expression, Rows, Tensors, View, collapse_loops, loops
 from dlkf.onboard.c_operations import suffix
 
 UNKNOWN = "the C form of an exported filter does not know"
@@ -46,47 +46,47 @@ class Reduced(NamedTuple):
     how: Reduction
 
 
-def axes(dims: Any, ndim: int) -> list[int]:
+def normalise_axes(dims: Any, ndim: int) -> list[int]:
     """Axes counted from the front; None and [] are all of them."""
     listed = range(ndim) if dims in (None, []) else [dims] if isinstance(dims, int) else dims
     return [d % ndim for d in listed]
 
 
-def reduced(how: Reduction, element: str = "{0}") -> Callable[..., View]:
+def make_reduction(how: Reduction, element: str = "{0}") -> Callable[..., View]:
     """The operation that reduces what ``element`` makes of every element."""
 
-    def made(t: Tensors, node: Node, x: Any, dims: Any = None, keepdim: bool = False, **_: Any) -> View:
-        if isinstance(x, Rows) and how is SUM and element == "{0}" and (lines := _summed(x, dims, keepdim)):
-            return t.stored(node, lines)
+    def reduce(t: Tensors, node: Node, x: Any, dims: Any = None, keepdim: bool = False, **_: Any) -> View:
+        if isinstance(x, Rows) and how is SUM and element == "{0}" and (lines := _sum_rows(x, dims, keepdim)):
+            return t.store(node, lines)
         x = t.elements(t.tensor(x) if how is LARGEST else x)  # each is read twice
         x = Expression(x.shape, x.dtype, element.format(x.pattern), x.operands)
-        out, gone = t.result(node), axes(dims, len(x.shape))
+        out, gone = t.result(node), normalise_axes(dims, len(x.shape))
         into = out.meta
         for d in sorted(gone, reverse=True) if keepdim else ():
             into = into.select(d, 0)
-        write_reduced(t, Reduced(out.viewed(into), x, [d for d in range(len(x.shape)) if d not in gone], gone, how))
+        write_reduction(t, Reduced(out.view_as(into), x, [d for d in range(len(x.shape)) if d not in gone], gone, how))
         return out
 
-    return made
+    return reduce
 
 
-def _summed(x: Rows, dims: Any, keepdim: bool) -> Rows | None:
+def _sum_rows(x: Rows, dims: Any, keepdim: bool) -> Rows | None:
     """Sums of few rows; None where that is something else."""
-    gone = axes(dims, len(x.shape))
+    gone = normalise_axes(dims, len(x.shape))
     if len(gone) > 1 or gone[0] >= len(x.lead) or keepdim or x.lead[gone[0]] > TERMS:
         return None
     kept = [n for d, n in enumerate(x.lead) if d != gone[0]]
     items = []
     for place in product(*map(range, kept)):
         terms = [x.at((*place[: gone[0]], k, *place[gone[0] :])) for k in range(x.lead[gone[0]])]
-        items.append(joined(SUM.joined, terms))
+        items.append(join_terms(SUM.joined, terms))
     shape = torch.Size([*kept, *x.shape[len(x.lead) :]])
     return Rows(shape, x.dtype, torch.Size(kept), items)
 
 
-def write_reduced(t: Tensors, r: Reduced) -> None:
+def write_reduction(t: Tensors, r: Reduced) -> None:
     """The loops."""
-    r = _as_one(r)
+    r = _merge_axes(r)
     x, count = r.of, math.prod(r.of.shape[d] for d in r.gone)
     if r.how is not LARGEST and 0 < count <= TERMS and count * len(x.operands) <= 4 * TERMS:
         _write_terms(t, r)
@@ -99,15 +99,15 @@ def write_reduced(t: Tensors, r: Reduced) -> None:
         _write_across(t, r)
 
 
-def _as_one(r: Reduced) -> Reduced:
+def _merge_axes(r: Reduced) -> Reduced:
     """With one axis for those that are gone, where all operands have them as one in memory."""
     operands, gone, kept = r.of.operands, sorted(r.gone), r.kept
-    sizes, strides = collapsed([r.of.shape[d] for d in gone], [[v.meta.stride(d) for d in gone] for v in operands])
+    sizes, strides = collapse_loops([r.of.shape[d] for d in gone], [[v.meta.stride(d) for d in gone] for v in operands])
     if len(gone) < 2 or len(sizes) != 1:
         return r
     shape = torch.Size([*(r.of.shape[d] for d in kept), *sizes])
     flat = [
-        v.viewed(torch.as_strided(v.meta, shape, [*(v.meta.stride(d) for d in kept), *s], v.meta.storage_offset()))
+        v.view_as(torch.as_strided(v.meta, shape, [*(v.meta.stride(d) for d in kept), *s], v.meta.storage_offset()))
         for v, s in zip(operands, strides)
     ]
     elements = Expression(shape, r.of.dtype, r.of.pattern, flat)
@@ -123,13 +123,13 @@ def _write_terms(t: Tensors, r: Reduced) -> None:
             meta = view.meta
             for d, k in sorted(zip(r.gone, place), reverse=True):
                 meta = meta.select(d, k)
-            operands.append(view.viewed(meta))
+            operands.append(view.view_as(meta))
         terms.append(Expression(r.into.meta.shape, r.of.dtype, r.of.pattern, operands))
-    total = joined(r.how.joined, terms)
-    t.block.over(r.into, total.pattern, total.operands)
+    total = join_terms(r.how.joined, terms)
+    t.block.assign(r.into, total.pattern, total.operands)
 
 
-def joined(how: str, terms: Sequence[Expression]) -> Expression:
+def join_terms(how: str, terms: Sequence[Expression]) -> Expression:
     """One expression of several."""
     total, operands = "", []
     for x in terms:
@@ -170,7 +170,7 @@ def _write_across(t: Tensors, r: Reduced) -> None:
     term = f"({r.of.pattern.format(*(v.at(names) for v in r.of.operands))})"
     into = r.into.at([f"i{d}" for d in r.kept])
     if r.kept and r.of.shape[r.kept[-1]] > KEPT:
-        t.block.over(r.into, r.how.first, [])
+        t.block.assign(r.into, r.how.first, [])
         every = _loops(r, [*r.gone, *r.kept])
         t.block.write(f"{every}{into} = {r.how.joined.format(into, term)};", r.into, *r.of.operands)
         return
@@ -192,32 +192,32 @@ def norm(t: Tensors, node: Node, x: Any, ord: float = 2, dims: Any = None, keepd
     """The Euclidean norm; InputError for another."""
     if ord != 2:
         raise InputError(f"this filter uses a norm of order {ord}, which {UNKNOWN}")
-    out = reduced(SUM, f"square{suffix(node.meta['val'].dtype)}({{0}})")(t, node, x, dims, keepdim)
-    t.block.over(out, f"sqrt{suffix(out.meta.dtype)}({{0}})", [out])
+    out = make_reduction(SUM, f"square{suffix(node.meta['val'].dtype)}({{0}})")(t, node, x, dims, keepdim)
+    t.block.assign(out, f"sqrt{suffix(out.meta.dtype)}({{0}})", [out])
     return out
 
 
 def mean(t: Tensors, node: Node, x: Any, dims: Any = None, keepdim: bool = False, **_: Any) -> View:
     """The sum over their number."""
-    out = reduced(SUM)(t, node, x, dims, keepdim)
-    t.block.over(out, f"{{0}} / {t.elements(x).shape.numel() // max(1, out.meta.numel())}", [out])
+    out = make_reduction(SUM)(t, node, x, dims, keepdim)
+    t.block.assign(out, f"{{0}} / {t.elements(x).shape.numel() // max(1, out.meta.numel())}", [out])
     return out
 
 
 def variance(t: Tensors, node: Node, x: Any, dims: Any = None, *, correction: Any = 1, keepdim: bool = False) -> View:
     """The mean square of what is left without the mean."""
     view = t.tensor(x)
-    dims = axes(dims, view.meta.ndim)
+    dims = normalise_axes(dims, view.meta.ndim)
     middle = mean(t, node, view, dims, keepdim)
     wide = middle.meta
     if not keepdim:
         for d in sorted(dims):
             wide = wide.unsqueeze(d)
-    operands = [view, middle.viewed(wide.expand(view.meta.shape))]
+    operands = [view, middle.view_as(wide.expand(view.meta.shape))]
     swing = t.tensor(Expression(view.meta.shape, view.meta.dtype, "{0} - {1}", operands))
-    out = reduced(SUM, f"square{suffix(view.meta.dtype)}({{0}})")(t, node, swing, dims, keepdim)
+    out = make_reduction(SUM, f"square{suffix(view.meta.dtype)}({{0}})")(t, node, swing, dims, keepdim)
     n = math.prod(view.meta.shape[d] for d in dims)
-    t.block.over(out, f"{{0}} / {n - (1 if correction is None else correction)}", [out])
+    t.block.assign(out, f"{{0}} / {n - (1 if correction is None else correction)}", [out])
     return out
 
 
@@ -230,14 +230,14 @@ def running_sum(t: Tensors, node: Node, x: Any, dim: int, **_: Any) -> View:
     names = [f"i{d}" for d in range(len(shape))]
     at, size = (f"y[i{beside[0]}]", shape[beside[0]]) if beside else ("y[0]", 1)
 
-    def over(dims: Sequence[int]) -> str:
+    def loop_over(dims: Sequence[int]) -> str:
         return loops([names[d] for d in dims], [shape[d] for d in dims])
 
     term = terms.pattern.format(*(v.at(names) for v in terms.operands))
-    rest, kind = over([d for d in others if d not in beside]), C_TYPES[out.meta.dtype]
+    rest, kind = loop_over([d for d in others if d not in beside]), C_TYPES[out.meta.dtype]
     t.block.write(
-        f"{rest}{{ {kind} y[{size}]; {over(beside)}{at} = 0; "
-        f"{over([dim, *beside])}{{ {at} += {term}; {out.at(names)} = {at}; }} }}",
+        f"{rest}{{ {kind} y[{size}]; {loop_over(beside)}{at} = 0; "
+        f"{loop_over([dim, *beside])}{{ {at} += {term}; {out.at(names)} = {at}; }} }}",
         out, *terms.operands,
     )  # fmt: skip
     return out

@@ -21,12 +21,12 @@ from dlkf.base.errors import InputError, first_line
 from dlkf.data import aids, alignment, limits, resampling, spikes, velocity_fit
 from dlkf.data.aid_tables import LAST
 from dlkf.data.validate import LIMITS
-from dlkf.filters.aids.attach import aid_columns, tables_of
+from dlkf.filters.aids.attach import aid_columns, find_tables
 from dlkf.filters.integration import Estimator
 from dlkf.navigation import earth
 from dlkf.onboard.c_code import Translation
 from dlkf.onboard.c_memory import C_TYPES, Block
-from dlkf.onboard.c_parts import parts_in_c
+from dlkf.onboard.c_parts import write_parts
 from dlkf.onboard.carried import Layout
 from dlkf.onboard.functions import (
     OUTPUTS,
@@ -39,13 +39,13 @@ from dlkf.onboard.functions import (
     Grid,
     Row,
     Turn,
-    carried_state,
-    fix_numbers,
-    output_numbers,
+    count_fix_numbers,
+    count_output_numbers,
+    make_layout,
 )  # fmt: skip
 from dlkf.onboard.headings import Headings, heading_functions
-from dlkf.onboard.meanings import of_column
-from dlkf.onboard.recording import exporting, record
+from dlkf.onboard.meanings import describe_column
+from dlkf.onboard.recording import export_mode, record
 from dlkf.running import imu_stream, streaming
 from dlkf.running.reanchoring import can_reanchor
 from dlkf.running.start import LOOKBACK_S, bank, standstill
@@ -104,65 +104,66 @@ def write_source(
     ``loop_alone`` leaves out what turns fixes and solutions into those of a vehicle, which takes most of the time.
     Raises InputError for a filter that cannot be exported.
     """
-    with exporting():
-        layout = carried_state(estimator, grid)
+    with export_mode():
+        layout = make_layout(estimator, grid)
         functions: dict[str, type[Function]] = {"turn": Turn}
         if not loop_alone:
             functions |= {"start": Begin, "row": Row, "carry": Carry}
             if can_reanchor(layout.like.memory):
                 functions["anchor"] = Anchor
-        done = {f: function_in_c(f"dlkf_{f}", kind(estimator, grid, layout).eval()) for f, kind in functions.items()}
+        modules = {f: kind(estimator, grid, layout).eval() for f, kind in functions.items()}
+        done = {f: translate_function(f"dlkf_{f}", module) for f, module in modules.items()}
     anchor = "" if "anchor" in done else (CORE / "no_anchor.c.in").read_text()
     loop = (CORE / "run.c.in").read_text()
-    parts = [heading(), *(x.code for x in done.values()), loop, anchor]
+    parts = [write_preamble(), *(x.code for x in done.values()), loop, anchor]
     (folder / "step.c").write_text("\n".join(parts))
     large = "".join(x.weights for x in done.values())
     head = "/* Weights of the filter, made by dlkf.export. */\n#include <math.h>\n#include <stdint.h>\n"
     (folder / "weights.c").write_text(head + large)
-    of_search = Headings.none() if loop_alone else _headings(grid.samples, grid.dt)
+    of_search = Headings.none() if loop_alone else _translate_headings(grid.samples, grid.dt)
     values = _sizes(estimator, layout, grid, name, max(x.work for x in done.values()), "anchor" in done)
     room = max(int(values["WORK"]), -(-of_search.work // 8) + 2 * of_search.size)
     values |= {"WORK": room, **of_search.sizes(), **_aids(estimator)}
-    (folder / "step.h").write_text(_filled((CORE / "step.h.in").read_text(), values))
+    (folder / "step.h").write_text(_fill((CORE / "step.h.in").read_text(), values))
     if loop_alone:
         return layout
-    (folder / "heading.c").write_text(heading() + of_search.code)
+    (folder / "heading.c").write_text(write_preamble() + of_search.code)
     (folder / "constants.h").write_text(constants())
     for file in CORE_FILES:
         (folder / file).write_text((CORE / file).read_text())
     described = {
         "model": name, "rate_hz": 1 / grid.dt, "epoch_s": grid.epoch_s,
-        "row": [{"name": c, "place": k, "meaning": of_column(c)} for k, c in enumerate(columns_of(estimator))],
-        "memory": {"numbers": layout.size, "type": "float64", "fields": [f.plain() for f in layout.fields]}, **made,
+        "row": [{"name": c, "place": k, "meaning": describe_column(c)} for k, c in enumerate(list_columns(estimator))],
+        "memory": {"numbers": layout.size, "type": "float64", "fields": [f.as_dict() for f in layout.fields]}, **made,
     }  # fmt: skip
     (folder / "step.json").write_text(json.dumps(described, indent=1, ensure_ascii=False) + "\n")
     return layout
 
 
 @lru_cache
-def _headings(samples: int, dt: float) -> Headings:
+def _translate_headings(samples: int, dt: float) -> Headings:
     """``heading.c``, which is the same for every filter of a grid."""
-    with exporting():
+    with export_mode():
         layout, functions = heading_functions(Grid(samples, dt))
-        done = [function_in_c(f"dlkf_heading_{name}", x) for name, x in functions.items()]
+        done = [translate_function(f"dlkf_heading_{name}", x) for name, x in functions.items()]
     return Headings.of(layout, "\n".join(x.code for x in done), max(x.work for x in done))
 
 
-def heading() -> str:
+def write_preamble() -> str:
     """What stands before the functions of ``step.c``."""
     algebra = (CORE / "algebra.c.in").read_text()
     kinds = ({"REAL": "double", "F": ""}, {"REAL": "float", "F": "f"})
     include = "\n".join(f"#include {name}" for name in ("<math.h>", "<stdint.h>", "<string.h>", '"step.h"'))
     made = "/* Made by dlkf.export; do not edit: the equations are in the Python package. */"
     elementary = (CORE / "elementary.c.in").read_text()
-    twice = (_filled(text, kind) for text in (algebra, (CORE / "products.c.in").read_text()) for kind in kinds)
+    twice = (_fill(text, kind) for text in (algebra, (CORE / "products.c.in").read_text()) for kind in kinds)
     return "\n".join((made, include, FINITE, UNUSED, VECTORS, "", elementary, *twice))
 
 
 def _sizes(estimator: Estimator, layout: Layout, grid: Grid, name: str, work: int, can_anchor: bool) -> dict[str, Any]:
     """What ``step.h`` is filled with."""
     place = {f.name: f.offset for f in layout.fields}
-    window_s, columns = alignment.SEARCH.window_s, columns_of(estimator)
+    window_s, columns = alignment.SEARCH.window_s, list_columns(estimator)
     lookback = math.ceil(max(LOOKBACK_S, window_s + velocity_fit.READ_S) / grid.epoch_s) + 2
     layout_of = f"{name} {grid} {layout.size} {[(f.name, f.shape) for f in layout.fields]} {columns}"
     return {
@@ -172,7 +173,7 @@ def _sizes(estimator: Estimator, layout: Layout, grid: Grid, name: str, work: in
         "CONFIRMED": max(1, round(velocity_fit.CONFIRMED_S / grid.epoch_s)),
         "REST": round(LOOKBACK_S / grid.epoch_s), "STILL": max(1, round(standstill.SHORTEST_REST_S / grid.epoch_s)),
         "TAIL": max(1, min(grid.samples, round(alignment.RATE_AVERAGE_S / grid.dt))),
-        "FIX": fix_numbers(estimator), "START": START, "OUTPUTS": output_numbers(estimator),
+        "FIX": count_fix_numbers(estimator), "START": START, "OUTPUTS": count_output_numbers(estimator),
         "POSTERIOR": OUTPUTS["prior"], "COLUMNS": len(columns),
         "WORK": -(-work // 8) + max(layout.size, 6 * grid.samples),
         "INNOVATION": sum(OUTPUTS[k] for k in ("prior", "posterior", "error", "std")),
@@ -184,14 +185,14 @@ def _sizes(estimator: Estimator, layout: Layout, grid: Grid, name: str, work: in
     }  # fmt: skip
 
 
-def columns_of(estimator: Estimator) -> tuple[str, ...]:
+def list_columns(estimator: Estimator) -> tuple[str, ...]:
     """Of a row: :data:`COLUMNS`, and what the filter says of further sensors."""
     return (*COLUMNS, *aid_columns(estimator))
 
 
 def _aids(estimator: Estimator) -> dict[str, object]:
     """What ``step.h`` says of further sensors."""
-    tables = tables_of(estimator)
+    tables = find_tables(estimator)
     return {
         "AIDS": len(tables), "AID_NAMES": ", ".join(f'"{t.name}"' for t in tables) or '""',
         "AID_LAST": ", ".join(str(int(t.reduce == LAST)) for t in tables) or "0",
@@ -242,13 +243,13 @@ def constants() -> str:
     return "\n".join((head, FINITE, *lines, table, "\n#endif\n"))
 
 
-def _filled(text: str, values: Mapping[str, object]) -> str:
+def _fill(text: str, values: Mapping[str, object]) -> str:
     for key, value in values.items():
         text = text.replace(f"@{key}@", str(value))
     return text
 
 
-def function_in_c(name: str, function: Function) -> Written:
+def translate_function(name: str, function: Function) -> Written:
     """C of a function that works in memory it is given."""
     try:
         done = Translation(record(function))
@@ -267,21 +268,21 @@ def function_in_c(name: str, function: Function) -> Written:
         block.write(
             f"for (int i = 0; i < {dense.meta.numel()}; i++) out{k}[i] = {dense.buffer.name}[{start}+i];", dense
         )
-    size = block.laid_out()
+    size = block.lay_out()
     arguments.append("double *restrict work")
-    own, large = _constants(name, block)
+    own, large = _declare_constants(name, block)
     forget = [f"#undef {buffer.name}" for buffer, _ in block.constants]
-    code = "\n".join((*own, *parts_in_c(name, arguments, block), *forget, ""))
+    code = "\n".join((*own, *write_parts(name, arguments, block), *forget, ""))
     return Written(code, "".join(f"{line}\n" for line in large), size)
 
 
-def _constants(name: str, block: Block) -> tuple[list[str], list[str]]:
+def _declare_constants(name: str, block: Block) -> tuple[list[str], list[str]]:
     """Those that stand beside the function, and those that are weights."""
     own, large = [], []
     for buffer, values in block.constants:
         kind, label = C_TYPES[buffer.dtype], f"{name}_{buffer.name}"
         head = f"const {kind} {label}[{max(1, values.size)}]"
-        numbers = ", ".join(map(_number, values)) or "0"
+        numbers = ", ".join(map(_format_number, values)) or "0"
         if values.size > IN_A_FILE:
             own.append(f"extern {head};")
             large += [f"extern {head};", f"{head} = {{{numbers}}};"]
@@ -291,7 +292,7 @@ def _constants(name: str, block: Block) -> tuple[list[str], list[str]]:
     return own, large
 
 
-def _number(x: np.generic) -> str:
+def _format_number(x: np.generic) -> str:
     if x.dtype.kind in "biu":
         return str(int(x))
     value = float(x)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dlkf.base.errors import InputError
 from dlkf.navigation.error_model import WindowModel
-from dlkf.onboard.meanings import of_field
+from dlkf.onboard.meanings import describe_field
 
 OF_THE_DRIVE = {WindowModel: ("still", "density")}  # the rest of it is the same for every drive of a filter
 RECURRENT = "recurrent"  # cells of a network: the batch is their second axis
@@ -37,9 +37,9 @@ class Field:
         """Where the drives are."""
         return 1 if RECURRENT in self.name else 0
 
-    def plain(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """For a file."""
-        meaning = of_field(self.name)
+        meaning = describe_field(self.name)
         return {
             "name": self.name, "offset": self.offset, "shape": list(self.shape), "type": str(self.dtype)[6:],
             **({"meaning": meaning} if meaning else {}),
@@ -91,7 +91,7 @@ class Layout:
 
     def unpack(self, vector: Float[Tensor, "B K"]) -> Any:
         """The structure of vectors."""
-        return _rebuilt(self.like, iter([self._part(f, vector) for f in self.fields]))
+        return _rebuild(self.like, iter([self._part(f, vector) for f in self.fields]))
 
 
 def _children(x: Any) -> list[tuple[str, Any]] | None:
@@ -116,11 +116,11 @@ def _leaves(x: Any, name: str = "") -> Iterator[tuple[str, Any]]:
             yield from _leaves(part, f"{name}.{child}" if name else child)
 
 
-def _rebuilt(x: Any, parts: Iterator[Tensor]) -> Any:
+def _rebuild(x: Any, parts: Iterator[Tensor]) -> Any:
     children = _children(x)
     if children is None:
         return None if x is None else next(parts)
-    new = {name: _rebuilt(part, parts) for name, part in children}
+    new = {name: _rebuild(part, parts) for name, part in children}
     if hasattr(x, "_replace"):
         return x._replace(**new)
     return tuple(new.values()) if isinstance(x, tuple) else replace(x, **new)

@@ -26,12 +26,12 @@ from dlkf.onboard.c_source import COLUMNS as CORE_COLUMNS
 from dlkf.onboard.carried import Layout
 from dlkf.onboard.compiled_filter import CompiledFilter
 from dlkf.onboard.core import Core
-from dlkf.onboard.functions import Grid, output_numbers
+from dlkf.onboard.functions import Grid, count_output_numbers
 from dlkf.onboard.library import Library, build
 from dlkf.running.batched import run_filter
 from dlkf.running.replay import replay_drive
 from dlkf.running.solution import COLUMNS, solution_columns
-from dlkf.running.start import align, aligned_drives
+from dlkf.running.start import align, align_drives
 
 # m: float32 of a network beside its own rounding over minutes; of everything
 FARTHEST_M = {torch.float64: 1e-3, torch.float32: 0.05}
@@ -71,7 +71,7 @@ class Latency(NamedTuple):
         return cls(*(1e3 * float(np.quantile(seconds, q)) for q in (0.5, 0.99)))
 
 
-def core_run(core: Core, tables: CheckedTables) -> np.ndarray:
+def run_core(core: Core, tables: CheckedTables) -> np.ndarray:
     """The rows of the core over a drive, fixes and further sensors at their own times (T, columns of the core).
 
     InputError where there are none.
@@ -83,7 +83,7 @@ def core_run(core: Core, tables: CheckedTables) -> np.ndarray:
     return np.stack(rows)
 
 
-def core_of(library: Library, tables: CheckedTables, drive: Drive) -> Core:
+def make_core(library: Library, tables: CheckedTables, drive: Drive) -> Core:
     """A core on the grid of a loaded drive."""
     step_s = float(np.median(np.diff(tables.imu["t"])))
     return Core(library.path, tables.row.lever_arm_b, phase_s=drive.t0, imu_step_s=step_s)
@@ -104,12 +104,12 @@ def write_log(path: Path, tables: CheckedTables) -> None:
     path.write_text("".join(f"{kind},{','.join(f'{v:.17g}' for v in x)}\n" for kind, x in named))
 
 
-def difference(estimator: Estimator, library: Library, tables: CheckedTables, drive: Drive) -> Difference:
+def measure_difference(estimator: Estimator, library: Library, tables: CheckedTables, drive: Drive) -> Difference:
     """The core over a drive as it is against a batch run of the original, each from its own alignment.
 
     Raises InputError where the drive never moves under GNSS.
     """
-    rows = core_run(core_of(library, tables, drive), tables)
+    rows = run_core(make_core(library, tables, drive), tables)
     batch = whole_drives([drive], [align(drive, SEARCH)])
     found = run_filter(batch, estimator)
     state = NavState(*(x[0] for x in found.posterior))
@@ -129,14 +129,14 @@ def difference(estimator: Estimator, library: Library, tables: CheckedTables, dr
     return Difference(len(rows), largest, float(np.nan_to_num(np.stack(relative)).max()))
 
 
-def latencies(compiled: CompiledFilter, drive: Drive) -> dict[str, Latency]:
-    """:func:`epoch_times` in short."""
-    return {name: Latency.of(seconds) for name, seconds in epoch_times(compiled, drive).items()}
+def measure_latencies(compiled: CompiledFilter, drive: Drive) -> dict[str, Latency]:
+    """:func:`time_epochs` in short."""
+    return {name: Latency.of(seconds) for name, seconds in time_epochs(compiled, drive).items()}
 
 
-def epoch_times(compiled: CompiledFilter, drive: Drive) -> dict[str, list[float]]:
+def time_epochs(compiled: CompiledFilter, drive: Drive) -> dict[str, list[float]]:
     """Seconds of epochs in Python, as torch runs them and compiled, interleaved; without the first few."""
-    batch = aligned_drives([drive])
+    batch = align_drives([drive])
     T = min(TIMED, batch.size[1])
     usable = batch.gnss_valid & batch.available.unsqueeze(-1)
     running = {}
@@ -165,12 +165,12 @@ def check_export(
 
     Raises InputError where they are further apart than rounding.
     """
-    library = Library(build(folder, work), layout.size, output_numbers(estimator))
-    found = difference(estimator, library, tables, drive)
+    library = Library(build(folder, work), layout.size, count_output_numbers(estimator))
+    found = measure_difference(estimator, library, tables, drive)
     lines = [f"against the original {found.text()}"]
     if found.largest["position [m]"] > FARTHEST_M[grid.dtype]:
         raise InputError(f"the exported filter is not the original: {found.text()}")
     if latency:
-        for name, x in latencies(CompiledFilter(estimator, grid, layout, library), drive).items():
+        for name, x in measure_latencies(CompiledFilter(estimator, grid, layout, library), drive).items():
             lines.append(f"an epoch in {name}: p50 {x.p50:.3f} ms, p99 {x.p99:.3f} ms")
     return lines

@@ -27,7 +27,7 @@ import dlkf
 from dlkf.base.console import warn_once
 from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
-from dlkf.filters.aids.attach import aid_columns, tables_of
+from dlkf.filters.aids.attach import aid_columns, find_tables
 from dlkf.filters.integration import BatchSolution, Correction, Estimator, Fix, Step, WholeLoop, integrate
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.smoother import Filter, SmoothedSolution
@@ -37,8 +37,16 @@ from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import NavState
 from dlkf.onboard.c_source import write_source
 from dlkf.onboard.carried import Layout
-from dlkf.onboard.functions import Carried, Grid, carried_state, move_anchor, output_numbers, packed_fix, split
-from dlkf.onboard.library import FLAGS, LIBRARY, Library, build, compiler, machine
+from dlkf.onboard.functions import (
+    Carried,
+    Grid,
+    count_output_numbers,
+    make_layout,
+    move_anchor,
+    pack_fix,
+    split_outputs,
+)
+from dlkf.onboard.library import FLAGS, LIBRARY, Library, build, describe_machine, find_compiler
 from dlkf.running.reanchoring import FrameChange, can_reanchor, reanchor
 
 MANY = 16  # drives from which on torch is faster than C where a network is large: measured with dlkf at 1 and 64
@@ -67,7 +75,7 @@ class CompiledFilter(WholeLoop):
         self, estimator: Estimator, grid: Grid, layout: Layout, library: Library, *, whole: bool = False
     ) -> None:
         self.estimator, self.grid, self.layout, self.library, self.whole = estimator, grid, layout, library, whole
-        self._aids, self._columns = tables_of(estimator), aid_columns(estimator)
+        self._aids, self._columns = find_tables(estimator), aid_columns(estimator)
         self._vector = Vector if can_reanchor(layout.like.memory) else FixedVector
 
     def __reduce__(self) -> tuple[Callable, tuple]:
@@ -97,15 +105,16 @@ class CompiledFilter(WholeLoop):
 
     def advance(self, memory: Vector | FixedVector, imu: Tensor, fix: Fix, frame: TangentFrame) -> tuple[Any, Step]:
         """One epoch of one drive."""
-        vector, outputs = self.library.turn(memory.numbers, imu.contiguous(), packed_fix(fix, self._aids))
-        x = split(outputs)
+        vector, outputs = self.library.turn(memory.numbers, imu.contiguous(), pack_fix(fix, self._aids))
+        x = split_outputs(outputs)
         bias, *others = (self.layout.field(f"error.{name}", vector) for name in ImuError._fields)
         assert bias is not None
         error = ImuError(bias, *others)
         std = x["std"] if self._has_std else None
         answer = Correction(x["prior"].new_zeros(1, 9), error, std=std, accepted=x["used"][:, 0] > 0.5)
         answer = answer._replace(aids=x["aids"] if self._columns else None)
-        step = Step(_state(x["prior"]), _state(x["posterior"]), error, x["innovation"], x["error"], answer)
+        prior, posterior = _unpack_state(x["prior"]), _unpack_state(x["posterior"])
+        step = Step(prior, posterior, error, x["innovation"], x["error"], answer)
         return memory._replace(numbers=vector), step
 
     def integrate(self, batch: Batch) -> BatchSolution:
@@ -120,13 +129,13 @@ class CompiledFilter(WholeLoop):
         usable = batch.gnss_valid & batch.available.unsqueeze(-1)
         value, std = (x.flatten(0, 1).double() for x in (batch.gnss, batch.gnss_std))
         aids = {name: x.flatten(0, 1).double() for name, x in batch.aids.items()}
-        fixes = packed_fix(Fix(value, std, usable.flatten(0, 1), batch.gnss_lag.flatten().double(), aids), self._aids)
+        fixes = pack_fix(Fix(value, std, usable.flatten(0, 1), batch.gnss_lag.flatten().double(), aids), self._aids)
         fixes, imu = fixes.unflatten(0, batch.size[:2]), batch.imu.double().contiguous()
 
         outputs = self._run(memory.numbers, imu, fixes, batch.present.sum(1).tolist())
-        x = split(torch.stack(outputs).to(batch.imu.dtype))
+        x = split_outputs(torch.stack(outputs).to(batch.imu.dtype))
         return BatchSolution(
-            prior=_state(x["prior"]), posterior=_state(x["posterior"]), imu_error=x["error"],
+            prior=_unpack_state(x["prior"]), posterior=_unpack_state(x["posterior"]), imu_error=x["error"],
             innovation=x["innovation"] * batch.present.unsqueeze(-1), used=(x["used"][..., 0] > 0.5) & batch.present,
             std=x["std"] if self._has_std else None, gain=None,
             innovation_covariance=x["innovation_covariance"].unflatten(-1, (6, 6)),
@@ -136,7 +145,7 @@ class CompiledFilter(WholeLoop):
 
     def _run(self, memory: Tensor, imu: Tensor, fixes: Tensor, epochs: list[int]) -> list[Tensor]:
         """Outputs of every drive; what a drive has in common with the one that it is a copy of is run once."""
-        first, common = shared_epochs(memory, imu, fixes, epochs)
+        first, common = count_shared_epochs(memory, imu, fixes, epochs)
         splits = {b: sorted({c for f, c in zip(first, common) if f == b and c}) for b in set(first)}
         at: dict[tuple[int, int], Tensor] = {}  # memories by drive and epoch
 
@@ -178,7 +187,7 @@ class CompiledFilter(WholeLoop):
         return any(f.name.endswith(".P") for f in self.layout.fields)
 
 
-def shared_epochs(
+def count_shared_epochs(
     memory: Float[Tensor, "B K"], imu: Float[Tensor, "B T M 6"], fixes: Float[Tensor, "B T f"], epochs: Sequence[int]
 ) -> tuple[list[int], list[int]]:
     """For every drive the first of those before it with its samples and start, itself without one, and how many epochs
@@ -186,11 +195,11 @@ def shared_epochs(
     first, common = [], []
     for b, count in enumerate(epochs):
         f = first[-1] if b else 0
-        if f == b or epochs[f] != count or not (_same(memory[f], memory[b]).all() and torch.equal(imu[f], imu[b])):
+        if f == b or epochs[f] != count or not (_are_equal(memory[f], memory[b]).all() and torch.equal(imu[f], imu[b])):
             first.append(b)
             common.append(0)
             continue
-        differ = ~_same(fixes[f], fixes[b])[:count].all(-1)
+        differ = ~_are_equal(fixes[f], fixes[b])[:count].all(-1)
         first.append(f)
         common.append(int(differ.int().argmax()) if bool(differ.any()) else count)
     return first, common
@@ -213,9 +222,9 @@ def compile_filter(estimator: Filter, rate_hz: float, epoch_s: float, whole: boo
     if isinstance(estimator, SmoothedSolution):
         raise InputError("a smoothed filter runs in torch, which keeps its covariances; leave compiled=true out")
     grid = Grid(round(rate_hz * epoch_s), 1 / rate_hz)
-    folder = _cache() / (_digest(estimator, grid) + ("-core" if whole else ""))
+    folder = _find_cache() / (_digest(estimator, grid) + ("-core" if whole else ""))
     if not (folder / LIBRARY).is_file():
-        if compiler() is None:
+        if find_compiler() is None:
             build(folder)  # says so
         folder.parent.mkdir(parents=True, exist_ok=True)
         beside = Path(tempfile.mkdtemp(dir=folder.parent))
@@ -229,8 +238,8 @@ def compile_filter(estimator: Filter, rate_hz: float, epoch_s: float, whole: boo
             shutil.rmtree(beside, ignore_errors=True)
     if folder not in _LOADED:
         with torch.no_grad(), without_loops():
-            layout = carried_state(estimator, grid)
-        _LOADED[folder] = layout, Library(folder / LIBRARY, layout.size, output_numbers(estimator))
+            layout = make_layout(estimator, grid)
+        _LOADED[folder] = layout, Library(folder / LIBRARY, layout.size, count_output_numbers(estimator))
     return CompiledFilter(estimator, grid, *_LOADED[folder], whole=whole)
 
 
@@ -243,12 +252,12 @@ def compile_or_keep(estimator: Estimator, rate_hz: float, epoch_s: float) -> Est
         return estimator
 
 
-def _cache() -> Path:
+def _find_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dlkf" / "compiled"
 
 
 @cache
-def _package() -> Any:
+def _digest_package() -> Any:
     """Digest of this package."""
     made_of = hashlib.sha256()
     for file in sorted(Path(dlkf.__file__).parent.rglob("*")):
@@ -259,10 +268,11 @@ def _package() -> Any:
 
 def _digest(estimator: Estimator, grid: Grid) -> str:
     """Of everything that the code depends on: this package, torch, the filter and its weights, grid, machine."""
-    made_of = _package().copy()
+    made_of = _digest_package().copy()
     code = estimator.code if isinstance(estimator, Mbkf) else estimator
-    aids = tables_of(estimator)
-    for part in (torch.__version__, machine(), str(compiler()), *FLAGS, repr(code), repr(grid), repr(aids)):
+    aids = find_tables(estimator)
+    machine, compiler = describe_machine(), str(find_compiler())
+    for part in (torch.__version__, machine, compiler, *FLAGS, repr(code), repr(grid), repr(aids)):
         made_of.update(part.encode())
     if isinstance(estimator, nn.Module):
         made_of.update(repr(getattr(estimator, "config", "")).encode())
@@ -271,10 +281,10 @@ def _digest(estimator: Estimator, grid: Grid) -> str:
     return made_of.hexdigest()[:32]
 
 
-def _same(a: Tensor, b: Tensor) -> Tensor:
+def _are_equal(a: Tensor, b: Tensor) -> Tensor:
     """Where they are equal, or both NaN."""
     return (a == b) | (a.isnan() & b.isnan())
 
 
-def _state(x: Tensor) -> NavState:
+def _unpack_state(x: Tensor) -> NavState:
     return NavState(x[..., :3], x[..., 3:6], x[..., 6:].unflatten(-1, (3, 3)))

@@ -130,7 +130,7 @@ class Core:
         """Whether :attr:`memory` holds a filter of this library."""
         return bool(self._library.dlkf_fits(self.memory))
 
-    def says(self, status: Status) -> str:
+    def describe_status(self, status: Status) -> str:
         """The words of a status."""
         return self._library.dlkf_says(int(status)).decode()
 

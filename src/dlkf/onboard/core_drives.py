@@ -13,7 +13,7 @@ from dlkf.data.alignment import SEARCH, AlignConfig
 from dlkf.data.store import drive_from_tables
 from dlkf.data.validate import CheckedTables
 from dlkf.filters.aids.attach import aid_columns
-from dlkf.onboard.c_source import columns_of
+from dlkf.onboard.c_source import list_columns
 from dlkf.onboard.compiled_filter import CompiledFilter
 from dlkf.onboard.core import Core, Status
 from dlkf.running.offline import Navigated
@@ -27,7 +27,7 @@ def runs_in_core(align: AlignConfig) -> bool:
     return replace(align, from_rest=False) == SEARCH
 
 
-def core_drive(
+def run_core_drive(
     tables: CheckedTables, estimator: CompiledFilter, *, rate_hz: float, epoch_s: float, align: AlignConfig = SEARCH
 ) -> Navigated:
     """:func:`dlkf.running.replay.stream_drive` with the core of a vehicle in the place of the stream in Python.
@@ -45,7 +45,7 @@ def core_drive(
         found.update((row[0], row) for row in receipt.rows)
         for ended in (Status.RESTARTED, Status.DIVERGED):
             if core.count(ended):
-                raise InputError(f"drive {name}: {core.says(ended)}")
+                raise InputError(f"drive {name}: {core.describe_status(ended)}")
         if core.count(Status.LOST) > len(lost):
             lost.append(core.latest)
     if not found:
@@ -55,7 +55,7 @@ def core_drive(
             raise UnalignedError(str(error)) from None
         raise UnalignedError(f"drive {name}: ends before a filter could start")
     rows = np.stack([found[t] for t in sorted(found)])
-    table = pd.DataFrame(rows, columns=list(columns_of(estimator)))
+    table = pd.DataFrame(rows, columns=list(list_columns(estimator)))
     table = table[[*COLUMNS, "gnss_used", *aid_columns(estimator)]].astype({"gnss_used": bool})
     return Navigated(
         name, float(rows[0, 0]) - epoch_s, table, refused=drive.refused, restarts=tuple(lost), doubt=core.doubt

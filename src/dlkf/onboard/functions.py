@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from dlkf.data.aid_tables import AidTable
 from dlkf.data.aids import ROW as AID_ROW
 from dlkf.data.drive import Batch
-from dlkf.filters.aids.attach import aid_columns, tables_of
+from dlkf.filters.aids.attach import aid_columns, find_tables
 from dlkf.filters.integration import Estimator, Fix, Step, advance
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import NOMINAL_GRAVITY, TangentFrame, tangent_frame
@@ -82,7 +82,7 @@ class Carried(NamedTuple):
     lever_arm_b: Tensor
 
 
-def carried_state(estimator: Estimator, grid: Grid) -> Layout:
+def make_layout(estimator: Estimator, grid: Grid) -> Layout:
     """The layout of a filter's memory, from two epochs somewhere."""
     ones = torch.ones(1, 9, dtype=grid.dtype)
     frame = tangent_frame(0.8 * ones[0, :1], 0.2 * ones[0, :1], 300 * ones[0, :1], grid.dtype)
@@ -90,7 +90,7 @@ def carried_state(estimator: Estimator, grid: Grid) -> Layout:
     imu = ones.new_tensor([0.0, 0.0, -NOMINAL_GRAVITY, 0.0, 0.0, 0.0]).expand(1, grid.samples, 6)
     x = begin_filter(estimator, frame, state, ones, ones[:, :3], grid)
     for _ in range(2):
-        aids = {table.name: ones[:, :AID_N] for table in tables_of(estimator)}
+        aids = {table.name: ones[:, :AID_N] for table in find_tables(estimator)}
         fix = Fix(torch.cat((x.state.p_n, x.state.v_n), -1), ones[:, :6], ones[:, :6] > 0, 0 * ones[:, 0], aids)
         x, _ = advance_filter(estimator, x, imu, fix, grid)
     return Layout(x)
@@ -138,7 +138,7 @@ class Function(nn.Module):
         """Arguments of the shapes that the function takes."""
         raise NotImplementedError
 
-    def somewhere(self) -> Float[Tensor, "1 K"]:
+    def example_memory(self) -> Float[Tensor, "1 K"]:
         """A memory."""
         return self.layout.pack(self.layout.like)
 
@@ -162,17 +162,17 @@ class Begin(Function):
 
 
 class Turn(Function):
-    """(1, K), (1, M, 6), (1, :func:`fix_numbers`) → (1, K), (1, :func:`output_numbers`)."""
+    """(1, K), (1, M, 6), (1, :func:`count_fix_numbers`) → (1, K), (1, :func:`count_output_numbers`)."""
 
     def example(self) -> tuple[Tensor, ...]:
         """As in the class."""
         ones = torch.ones(1, self.grid.samples, 6, dtype=torch.float64)
-        return self.somewhere(), ones, ones.new_ones(1, fix_numbers(self.estimator))
+        return self.example_memory(), ones, ones.new_ones(1, count_fix_numbers(self.estimator))
 
     def forward(self, memory: Tensor, imu: Tensor, fix: Tensor) -> tuple[Tensor, Tensor]:
         """The loop's turn, and what a :class:`dlkf.filters.integration.BatchSolution` holds of it."""
         imu, fix = imu.to(self.grid.dtype).mT.contiguous().mT, fix.to(self.grid.dtype)  # samples beside each other
-        names = [table.name for table in tables_of(self.estimator)]
+        names = [table.name for table in find_tables(self.estimator)]
         aids = {name: fix[:, FIX_N + AID_N * k : FIX_N + AID_N * (k + 1)] for k, name in enumerate(names)}
         given = Fix(fix[:, :6], fix[:, 6:12], fix[:, 12:18] > 0.5, fix[:, 18], aids or None)
         after, step = advance_filter(self.estimator, self.layout.unpack(memory), imu, given, self.grid)
@@ -184,7 +184,7 @@ class Turn(Function):
         std = z.new_full((len(z), 15), torch.nan) if answer.std is None else answer.std
         said = z.new_zeros(len(z), 0) if answer.aids is None else answer.aids
         outputs = (
-            *flat(step.prior), *flat(step.posterior), step.complete_error, std, z, S, P,
+            *flatten_state(step.prior), *flatten_state(step.posterior), step.complete_error, std, z, S, P,
             used.double().unsqueeze(-1), said,
         )  # fmt: skip
         return self.layout.pack(after), torch.cat([x.double() for x in outputs], -1)
@@ -215,23 +215,23 @@ class Carry(Function):
     def example(self) -> tuple[Tensor, ...]:
         """As in the class."""
         ones = torch.ones(1, self.grid.samples, 6, dtype=torch.float64)
-        return self.somewhere(), ones, 0.5 * ones[:, 0, :1], ones.new_ones(1, output_numbers(self.estimator))
+        return self.example_memory(), ones, 0.5 * ones[:, 0, :1], ones.new_ones(1, count_output_numbers(self.estimator))
 
     def forward(self, memory: Tensor, imu: Tensor, share: Tensor, outputs: Tensor) -> Tensor:
         """What was said of the last epoch, with another posterior."""
         x = self.layout.unpack(memory)
-        error, state = ImuError(*_doubled(x.error)), NavState(*_doubled(x.state))
-        force, rate = error.corrected(imu).split(3, -1)
+        error, state = ImuError(*_to_double(x.error)), NavState(*_to_double(x.state))
+        force, rate = error.correct(imu).split(3, -1)
         s = share.unsqueeze(-1)
         begin, scaled = state._replace(v_n=state.v_n * share), torch.cat((force * s**2, rate * s), -1)
         frame: Any = _OtherTime(x.frame.in_precision(torch.float64), share)
         end = strapdown(begin, scaled, self.grid.dt, frame).end
         first = OUTPUTS["prior"]
-        carried = torch.cat(flat(end._replace(v_n=end.v_n / share)), -1)
+        carried = torch.cat(flatten_state(end._replace(v_n=end.v_n / share)), -1)
         return torch.cat((outputs[:, :first], carried, outputs[:, first + OUTPUTS["posterior"] :]), -1)
 
 
-def _doubled(parts: Iterable[Tensor | None]) -> list[Any]:
+def _to_double(parts: Iterable[Tensor | None]) -> list[Any]:
     return [None if x is None else x.double() for x in parts]
 
 
@@ -240,11 +240,11 @@ class Row(Function):
 
     def example(self) -> tuple[Tensor, ...]:
         """As in the class."""
-        return self.somewhere(), torch.ones(1, output_numbers(self.estimator), dtype=torch.float64)
+        return self.example_memory(), torch.ones(1, count_output_numbers(self.estimator), dtype=torch.float64)
 
     def forward(self, memory: Tensor, outputs: Tensor) -> Tensor:
         """Geodetic position, velocity and attitude in the axes there, IMU error, all 1σ, innovation."""
-        x, part = self.layout.unpack(memory), split(outputs)
+        x, part = self.layout.unpack(memory), split_outputs(outputs)
         state = NavState(*part["posterior"].split([3, 3, 9], -1))
         state = state._replace(C_nb=state.C_nb.unflatten(-1, (3, 3)))
         columns = solution_columns(outputs[:, 0], x.frame, state, part["error"], part["std"])
@@ -259,7 +259,7 @@ class Anchor(Function):
 
     def example(self) -> tuple[Tensor, ...]:
         """As in the class."""
-        return (self.somewhere(),)
+        return (self.example_memory(),)
 
     def forward(self, memory: Tensor) -> Tensor:
         """As :class:`dlkf.running.streaming.StreamingFilter` does every 50 km."""
@@ -275,12 +275,12 @@ def move_anchor(estimator: Estimator, x: Carried, grid: Grid, change: FrameChang
     return Carried(reanchor(x.memory, change, fresh.memory), state, x.error, change.new, x.lever_arm_b)
 
 
-def fix_numbers(estimator: Any) -> int:
+def count_fix_numbers(estimator: Any) -> int:
     """How many numbers a turn takes beside the samples: those of a fix, then of each further sensor."""
-    return FIX_N + AID_N * len(tables_of(estimator))
+    return FIX_N + AID_N * len(find_tables(estimator))
 
 
-def packed_fix(fix: Fix, aids: Sequence[AidTable] = ()) -> Float[Tensor, "B f"]:
+def pack_fix(fix: Fix, aids: Sequence[AidTable] = ()) -> Float[Tensor, "B f"]:
     """A fix in n, and what ``aids`` said, as numbers."""
     value = fix.value
     lag = value.new_zeros(len(value)) if fix.lag is None else fix.lag
@@ -289,17 +289,17 @@ def packed_fix(fix: Fix, aids: Sequence[AidTable] = ()) -> Float[Tensor, "B f"]:
     return torch.cat((value, fix.std, fix.used.double(), lag.unsqueeze(-1), *others), -1)
 
 
-def flat(state: NavState) -> tuple[Tensor, Tensor, Tensor]:
+def flatten_state(state: NavState) -> tuple[Tensor, Tensor, Tensor]:
     """Position, velocity, attitude by rows."""
     return state.p_n, state.v_n, state.C_nb.flatten(-2)
 
 
-def output_numbers(estimator: Any) -> int:
+def count_output_numbers(estimator: Any) -> int:
     """How many numbers a turn gives beside the memory: :data:`OUTPUTS`, then what is said of further sensors."""
     return sum(OUTPUTS.values()) + len(aid_columns(estimator))
 
 
-def split(outputs: Float[Tensor, "*b outputs"]) -> dict[str, Tensor]:
+def split_outputs(outputs: Float[Tensor, "*b outputs"]) -> dict[str, Tensor]:
     """The parts of :data:`OUTPUTS` by name, and ``aids``, which may be empty."""
     last = outputs.shape[-1] - sum(OUTPUTS.values())
     return dict(zip((*OUTPUTS, "aids"), outputs.split([*OUTPUTS.values(), last], -1)))

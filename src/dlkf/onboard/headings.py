@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dlkf.filters.integration import Fix
 from dlkf.onboard.carried import Field, Layout
-from dlkf.onboard.functions import Begin, Function, Grid, advance_filter, carried_state
+from dlkf.onboard.functions import Begin, Function, Grid, advance_filter, make_layout
 from dlkf.running.start.bank import bank_filter, fix_std, weigh_step
 
 CARRIED = ("memory.P", "memory.fix.gate.", "state.", "error.")
@@ -25,7 +25,7 @@ class Weigh(Function):
     def example(self) -> tuple[Tensor, ...]:
         """As in the class."""
         ones = torch.ones(1, self.grid.samples, 6, dtype=torch.float64)
-        return self.somewhere(), ones, ones.new_ones(1, 19)
+        return self.example_memory(), ones, ones.new_ones(1, 19)
 
     def forward(self, memory: Tensor, imu: Tensor, fix: Tensor) -> tuple[Tensor, Tensor]:
         """As :func:`dlkf.running.start.bank.advance_bank` of one heading."""
@@ -48,7 +48,7 @@ class Headings(NamedTuple):
     def of(layout: Layout, code: str, work: int) -> Headings:
         """Of what was written."""
         places = {f.name: f.offset for f in layout.fields}
-        return Headings(code, work, layout.size, _own(layout.fields), places)
+        return Headings(code, work, layout.size, _find_changing_ranges(layout.fields), places)
 
     @staticmethod
     def none() -> Headings:
@@ -77,12 +77,12 @@ def heading_functions(grid: Grid) -> tuple[Layout, dict[str, Function]]:
     """The layout of a heading's memory, and its functions, while exporting; double precision whatever the filter's."""
     grid = Grid(grid.samples, grid.dt)
     estimator = bank_filter()
-    layout = carried_state(estimator, grid)
+    layout = make_layout(estimator, grid)
     kinds = {"start": Begin, "turn": Weigh}
     return layout, {name: kind(estimator, grid, layout).eval() for name, kind in kinds.items()}
 
 
-def _own(fields: list[Field]) -> tuple[tuple[int, int], ...]:
+def _find_changing_ranges(fields: list[Field]) -> tuple[tuple[int, int], ...]:
     """What changes from epoch to epoch, as ranges."""
     ranges: list[tuple[int, int]] = []
     for f in fields:

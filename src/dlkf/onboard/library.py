@@ -29,7 +29,7 @@ CORE = ("dlkf.c", "samples.c", "spikes.c", "align.c", "search.c", "aids.c", "lim
 LIBRARY = "step.so"
 
 
-def compiler() -> str | None:
+def find_compiler() -> str | None:
     """The C compiler of this machine: ``$CC``, else cc, gcc or clang; None where there is none."""
     given = os.environ.get("CC", "").split()[:1]
     return next((found for name in (*given, "cc", "gcc", "clang") if (found := shutil.which(name))), None)
@@ -40,7 +40,7 @@ def build(folder: Path, into: Path | None = None, flags: Sequence[str] | None = 
 
     Raises InputError where there is no compiler, or it fails.
     """
-    cc = compiler()
+    cc = find_compiler()
     if cc is None:
         raise InputError("no C compiler found (cc, gcc, clang, or $CC); install one, such as apt-get install gcc")
     into = (into or folder).resolve()
@@ -92,6 +92,6 @@ def _pointer(x: Tensor) -> ctypes.c_void_p:
     return ctypes.c_void_p(x.data_ptr())
 
 
-def machine() -> str:
+def describe_machine() -> str:
     """What a library was made for."""
     return sysconfig.get_platform()

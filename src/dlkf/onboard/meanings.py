@@ -159,23 +159,23 @@ MEMORY = {  # by the last parts of a field's name
 }
 
 
-def of_field(name: str) -> str | None:
+def describe_field(name: str) -> str | None:
     """Of a field of the memory; None for one of a filter of a user's own."""
     parts = name.split(".")
     tails = (".".join(parts[k:]) for k in range(len(parts)))
     return next((MEMORY[tail] for tail in tails if tail in MEMORY), None)
 
 
-def of_column(name: str) -> str:
+def describe_column(name: str) -> str:
     """Of a column of a row.
 
     ``std_vel_n`` → 1σ of velocity North [m/s], ``innovation_pos_d`` → fix less expected: position Down [m].
     """
     for head, said in (("innovation_std_", "1σ of fix less expected: "), ("innovation_", "fix less expected: ")):
         if name.startswith(head):
-            return said + of_column(name.removeprefix(head))
+            return said + describe_column(name.removeprefix(head))
     if name.startswith("std_"):
-        return "1σ of " + of_column(name.removeprefix("std_"))
+        return "1σ of " + describe_column(name.removeprefix("std_"))
     if name in COLUMNS:
         return COLUMNS[name]
     for tail, said in SENSOR.items():

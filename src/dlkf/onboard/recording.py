@@ -93,7 +93,7 @@ class Recorder(TorchDispatchMode):
                 made = simpler(*args, **kwargs)
             if made is not NotImplemented:
                 return made
-        varies = any(id(x) in self._varies for x in _tensors_of((args, kwargs)))
+        varies = any(id(x) in self._varies for x in _iterate_tensors((args, kwargs)))
         takes_value = torch.Tag.data_dependent_output in func.tags
         if varies and (takes_value or self._has_shape_of_values(func, args)):
             raise ValueDependence(f"what {func} gives depends on values of a tensor")
@@ -123,7 +123,7 @@ class Recorder(TorchDispatchMode):
 
     def _has_shape_of_values(self, func: Any, args: tuple[Any, ...]) -> bool:
         if func is INDEX:  # by positions, or by a constant mask, the shape is known
-            masks = (x for x in _tensors_of(args[1]) if x.dtype in (torch.bool, torch.uint8))
+            masks = (x for x in _iterate_tensors(args[1]) if x.dtype in (torch.bool, torch.uint8))
             return any(id(x) in self._varies for x in masks)
         return torch.Tag.dynamic_output_shape in func.tags
 
@@ -177,7 +177,7 @@ def _merge_equal(graph: GraphModule) -> None:
 
 
 @contextmanager
-def exporting() -> Iterator[None]:
+def export_mode() -> Iterator[None]:
     """Inside the block filters run as :func:`record` can record them."""
     with compiled.tensor_forms(), torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # of torch about torch
@@ -200,11 +200,11 @@ def _is_composite(func: Any) -> bool:
     return func._can_decompose() and not torch._C._dispatch_has_kernel_for_dispatch_key(func.name(), "CPU")
 
 
-def _tensors_of(x: Any) -> Iterator[Tensor]:
+def _iterate_tensors(x: Any) -> Iterator[Tensor]:
     if isinstance(x, Tensor):
         yield x
     elif isinstance(x, (tuple, list)):
         for part in x:
-            yield from _tensors_of(part)
+            yield from _iterate_tensors(part)
     elif isinstance(x, dict):
-        yield from _tensors_of(list(x.values()))
+        yield from _iterate_tensors(list(x.values()))

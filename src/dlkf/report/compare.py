@@ -16,7 +16,7 @@ from dlkf.evaluation.results import Results
 from dlkf.evaluation.summary import headline
 from dlkf.evaluation.table import format_number
 from dlkf.report.drawing import Figure
-from dlkf.report.evaluation import best_of
+from dlkf.report.evaluation import mark_best
 from dlkf.report.page import Page, flatten_settings
 from dlkf.report.plots import FONT
 
@@ -64,10 +64,10 @@ def read_reports(folders: Sequence[str | Path]) -> list[StoredReport]:
 def shorten_names(paths: Sequence[Path]) -> list[str]:
     """The shortest tails that tell folders apart, without the ``report`` in which train leaves its evaluation."""
     parts = [(p.parent if p.name == "report" else p).absolute().parts for p in paths]
-    return [Path(*p[-_needed(p, parts[:k] + parts[k + 1 :]) :]).as_posix() for k, p in enumerate(parts)]
+    return [Path(*p[-_count_needed(p, parts[:k] + parts[k + 1 :]) :]).as_posix() for k, p in enumerate(parts)]
 
 
-def _needed(path: tuple[str, ...], others: Sequence[tuple[str, ...]]) -> int:
+def _count_needed(path: tuple[str, ...], others: Sequence[tuple[str, ...]]) -> int:
     """How many last parts of ``path`` no other has."""
     return next((n for n in range(1, len(path)) if all(o[-n:] != path[-n:] for o in others)), len(path))
 
@@ -87,7 +87,7 @@ def comparison_page(reports: Sequence[StoredReport]) -> str:
     about = "Horizontal error; RMS over the segments where there are no outages. Marked: the least median of a test. "
     about += "Own 1σ: what the filter says of its error (median); innovation / σ: expected 1, above it overconfident."
     page.heading("At the end of the outages", about)
-    page.table(columns, rows, marks=best_of_each(columns, rows, scored_on(reports)), titles=whole)
+    page.table(columns, rows, marks=mark_best_of_each(columns, rows, describe_tests(reports)), titles=whole)
     page.heading("Horizontal error against the time without GNSS", "Solid: median; dotted: 95 % of the outages.")
     page.figure("growth", growth_figure(reports))
     page.heading("In what they differ")
@@ -127,7 +127,7 @@ def end_table(reports: Sequence[StoredReport]) -> tuple[list[str], list[list[str
     return columns, rows
 
 
-def scored_on(reports: Sequence[StoredReport]) -> list[str]:
+def describe_tests(reports: Sequence[StoredReport]) -> list[str]:
     """What each row of :func:`end_table` was scored on: equal where data and rules are the same."""
     rules = [{key: report.protocol.get(key) for key in TEST} for report in reports]
     return [
@@ -138,12 +138,12 @@ def scored_on(reports: Sequence[StoredReport]) -> list[str]:
     ]
 
 
-def best_of_each(columns: Sequence[str], rows: Sequence[Sequence[str]], tests: Sequence[str]) -> list[str]:
-    """:func:`dlkf.report.evaluation.best_of` among the rows of each test that several share."""
+def mark_best_of_each(columns: Sequence[str], rows: Sequence[Sequence[str]], tests: Sequence[str]) -> list[str]:
+    """:func:`dlkf.report.evaluation.mark_best` among the rows of each test that several share."""
     marks = [""] * len(rows)
     for test in dict.fromkeys(tests):
         same = [k for k, other in enumerate(tests) if other == test]
-        for k, mark in zip(same, best_of(columns, [rows[k] for k in same]) if len(same) > 1 else ()):
+        for k, mark in zip(same, mark_best(columns, [rows[k] for k in same]) if len(same) > 1 else ()):
             marks[k] = mark
     return marks
 

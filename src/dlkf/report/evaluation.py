@@ -132,11 +132,11 @@ def evaluation_page(
 def _add_tables(page: Page, tables: Sequence[ResultTable]) -> None:
     for table in tables:
         page.heading(table.title)
-        page.table(table.columns, table.rows, marks=best_of(table.columns, table.rows))
+        page.table(table.columns, table.rows, marks=mark_best(table.columns, table.rows))
         page.note(table.note)
 
 
-def best_of(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+def mark_best(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Marks the row with the least median, where there is one."""
     column = next((i for i, c in enumerate(columns) if c.startswith("median")), None)
     values = [] if column is None else [_value(row[column]) for row in rows]
@@ -327,13 +327,13 @@ def imu_error_charts(scores: Scores, i: int, banded: str) -> Figure:
             figure.add_trace(line(scores.t, y, name, c, legend=k == 0), k + 1)
         if np.isfinite(truth).any():
             figure.add_trace(line(scores.t, truth, "truth", TRUTH, legend=k == 0), k + 1)
-        _settled(figure, scores, i, k, scale)
+        _set_limits(figure, scores, i, k, scale)
     figure.update_xaxis(6, title={"text": "Time since the start of the segment [s]"})
     shade(figure, spans(scores.t, scores.outage[i]), 6)
     return figure
 
 
-def _settled(figure: Figure, scores: Scores, i: int, k: int, scale: float) -> None:
+def _set_limits(figure: Figure, scores: Scores, i: int, k: int, scale: float) -> None:
     """Limits by the last four fifths of the lines: the first swings may leave the panel."""
     late = scores.t > 0.2 * scores.t[-1]
     lines: list[Array] = [r.imu_error[i, late, k] for r in scores.filters.values()]

@@ -69,7 +69,7 @@ def navigation_page(
     page.heading("Map", "Coloured by drive, time without GNSS, quality of the fixes, or the filter's own 1σ.")
     page.figure("map", route_map(courses))
     page.heading("Drives", "A row shows its drive on the map.")
-    columns, rows, marks = rows_of(courses)
+    columns, rows, marks = make_rows(courses)
     page.table(columns, rows, marks=marks, tall=len(courses) > 15)
     page.note(
         "Innovation / σ: what GNSS says less what the filter expects, over the filter's own 1σ of it (RMS). 1 is "
@@ -166,7 +166,7 @@ def route_map(courses: Sequence[TrackOnMap]) -> Figure:
     hidden = [np.where((c.without > GAP_S)[:, None], _place(c), np.nan) for c in courses]
     add(add_track(join_tracks([_place(c) for c in courses], 12_000), "with GNSS", "#0072B2", width=3), "outages")
     if any(np.isfinite(h).any() for h in hidden):
-        gaps = np.concatenate([_with_breaks(h, share) for h in hidden])
+        gaps = np.concatenate([_insert_breaks(h, share) for h in hidden])
         add(add_track(gaps, f"over {GAP_S:g} s without a fix", "#D55E00", width=5), "outages")
     for code, colour in QUALITY.items():
         seen = [np.stack((c.fixes.lat_deg, c.fixes.lon_deg), -1)[c.fixes.quality == code] for c in courses]
@@ -183,14 +183,14 @@ def route_map(courses: Sequence[TrackOnMap]) -> Figure:
     return chart(traces, groups)
 
 
-def _with_breaks(place: Array, most: int) -> Array:
+def _insert_breaks(place: Array, most: int) -> Array:
     """Runs of known positions, thinned each, with a NaN after each."""
     known = np.isfinite(place[:, 0])
     edge = np.flatnonzero(np.diff(np.concatenate(([0], known.astype(np.int8), [0]))))
     return join_tracks([place[max(a - 1, 0) : b] for a, b in zip(edge[::2], edge[1::2])], most)
 
 
-def rows_of(courses: Sequence[TrackOnMap]) -> tuple[list[str], list[list[str]], list[str]]:
+def make_rows(courses: Sequence[TrackOnMap]) -> tuple[list[str], list[list[str]], list[str]]:
     """Columns, rows and marks of the table of drives."""
     columns = ["Drive", "Duration\n[s]", "Distance\n[km]", "Fixes\nused", "of", "Longest gap\n[s]", "Standing\n[s]"]
     columns += ["1σ, median\n[m]", "1σ, maximum\n[m]", "Innovation\n/ σ"]

@@ -24,7 +24,7 @@ from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import NavState
 from dlkf.running.estimate import Estimate
-from dlkf.running.loss import LossWatch, far_off, impossible
+from dlkf.running.loss import LossWatch, far_off, is_impossible
 from dlkf.running.measurement_buffer import MeasurementBuffer
 from dlkf.running.reanchoring import FrameChange, can_reanchor, frame_at, reanchor
 from dlkf.running.start import LOOKBACK_S, EarthFix, Search, align
@@ -123,7 +123,7 @@ class EpochFilter:
         """The filter over closed epoch ``k`` of those held: align at its start if need be, then one turn."""
         epoch = self.closed[k]
         epoch.before = self.running
-        running = self.running or self._aligned(k)
+        running = self.running or self._find_start(k)
         if isinstance(running, Search):
             self.running = self._advance_search(running, epoch)
             return []
@@ -145,14 +145,14 @@ class EpochFilter:
             return []
         watch = running.watch
         if bool(fix.used[:, :3].any()):
-            watch = watch.after(epoch.number * self._epoch_s, float(far_off(step.innovation, fix.std)))
-        nowhere = impossible(step.posterior.v_n, step.posterior.p_n, running.frame.height.to(step.posterior.p_n))
-        if watch.lost(epoch.number * self._epoch_s) or bool(nowhere):
+            watch = watch.update(epoch.number * self._epoch_s, float(far_off(step.innovation, fix.std)))
+        nowhere = is_impossible(step.posterior.v_n, step.posterior.p_n, running.frame.height.to(step.posterior.p_n))
+        if watch.is_lost(epoch.number * self._epoch_s) or bool(nowhere):
             self.counts["lost"] += 1
             self.lost_at.append(self._boundary(epoch.number + 1))
             self.running = self.latest = None
             return []
-        self.running = self._anchored(Running(memory, step.posterior, step.error, running.frame, watch))
+        self.running = self._move_anchor(Running(memory, step.posterior, step.error, running.frame, watch))
         accepted = step.answer.accepted
         used = bool(fix.used.any()) and (accepted is None or bool(accepted.any()))
         t = self._boundary(epoch.number + 1)
@@ -168,7 +168,7 @@ class EpochFilter:
         lag = torch.from_numpy(held.lag).to(self.device) if held.lag[0] > 0 else None
         return Fix(torch.where(used, value, 0.0), torch.nan_to_num(std, nan=1.0), used, lag)
 
-    def _aligned(self, k: int) -> Running | Search | None:
+    def _find_start(self, k: int) -> Running | Search | None:
         """The filter at the start of closed epoch ``k``, or the search for its heading, if the car moves there."""
         epochs = self.closed[max(0, k - self._lookback) : k + 1]
         if not self._buffer.has_fix(epochs[-1].number):
@@ -224,7 +224,7 @@ class EpochFilter:
             lever_arm_b=self._lever_arm_b[0].cpu(),
         )  # fmt: skip
 
-    def _anchored(self, running: Running) -> Running:
+    def _move_anchor(self, running: Running) -> Running:
         """The filter in a frame whose origin is near the car."""
         away = float(running.state.p_n[0, :2].norm())
         if away <= self._anchor_m or self._first is None or not can_reanchor(running.memory):

@@ -57,9 +57,9 @@ def write_geojson(path: Path, table: pd.DataFrame, when: Times, name: str) -> No
     place = table[["lon_deg", "lat_deg", "height_m"]].to_numpy()
     speed, course = _speed(table), np.degrees(table["yaw"].to_numpy()) % 360
     sigma = np.hypot(table["std_pos_n"].to_numpy(), table["std_pos_e"].to_numpy())
-    line = {"type": "LineString", "coordinates": _rounded(place)}
+    line = {"type": "LineString", "coordinates": _round(place)}
     features = [{"type": "Feature", "properties": {"name": name}, "geometry": line}]
-    for k, point in enumerate(_rounded(place)):
+    for k, point in enumerate(_round(place)):
         properties: dict[str, Any] = {"t": float(table["t"].iloc[k]), "speed_mps": round(float(speed[k]), 3)}
         properties |= {"heading_deg": round(float(course[k]), 2), "gnss_used": bool(table["gnss_used"].iloc[k])}
         if np.isfinite(sigma[k]):
@@ -204,7 +204,7 @@ FORMATS: Mapping[str, tuple[str, Callable[[Path, pd.DataFrame, Times, str], None
 OF_EXTRA = ("mcap", "bag")  # formats that need the extra ``readers``
 
 
-def chosen_formats(export: str | list[str] | None) -> list[str]:
+def choose_formats(export: str | list[str] | None) -> list[str]:
     """Names of formats; ``all`` for every one. InputError for an unknown one."""
     if export is not None and not isinstance(export, (str, list, tuple)):
         raise InputError(f"export={export}: must be a format or a list of formats; known: {', '.join(FORMATS)}, all")
@@ -231,7 +231,7 @@ def _speed(table: pd.DataFrame) -> NDArray[np.floating]:
     return np.hypot(table["vel_n"].to_numpy(), table["vel_e"].to_numpy())
 
 
-def _rounded(place: NDArray[np.floating]) -> list[list[float]]:
+def _round(place: NDArray[np.floating]) -> list[list[float]]:
     return [[round(lon, 9), round(lat, 9), round(height, 3)] for lon, lat, height in place.tolist()]
 
 

@@ -77,4 +77,4 @@ def _refusal(screen: FixScreen, fix: ScreenedFix) -> str:
     """Why no car can have reached a fix, or nothing."""
     lat, lon, height = (float(fix.table[name][0]) for name in POSITION)
     speed = float(np.sqrt(sum(fix.table[name][0] ** 2 for name in VELOCITY)))
-    return screen.refused(fix.t, (lat, lon, height), speed, np.array([fix.table[name][0] for name in STD]))
+    return screen.find_refusal(fix.t, (lat, lon, height), speed, np.array([fix.table[name][0] for name in STD]))

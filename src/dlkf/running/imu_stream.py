@@ -72,7 +72,7 @@ class ImuStream:
         """Samples out of line have gone on for longer than an accident does: the stream must begin again."""
         return self._astray is not None and self._astray[1] - self._astray[0] >= ASTRAY_S
 
-    def refused(self, t: float, accel: Row, gyro: Row) -> str:
+    def find_refusal(self, t: float, accel: Row, gyro: Row) -> str:
         """Take a sample (s, m/s², rad/s); a reason if it cannot be, else nothing."""
         try:
             row = (float(t), *map(float, accel), *map(float, gyro))
@@ -111,7 +111,7 @@ class ImuStream:
         self.end = grid.t0 + self._epoch_s
         return True
 
-    def closed(self, ended: bool = False) -> list[np.ndarray]:
+    def close_epochs(self, ended: bool = False) -> list[np.ndarray]:
         """Samples (1, M, 6) of the epochs whose end the stream has reached, each of them once.
 
         Where the stream has ``ended``, the loader's slack before an epoch's end counts as reached, and the last
@@ -119,7 +119,7 @@ class ImuStream:
         """
         done, slack, last = [], self.slack_s if ended else 0.0, self.latest if ended else self.settled
         while last >= self.end - max(slack, 4 * math.ulp(self.end)):
-            done.append(self._resampled(SampleGrid(self.boundary(self.epochs), self._epoch_s, 1, self._samples)))
+            done.append(self._resample(SampleGrid(self.boundary(self.epochs), self._epoch_s, 1, self._samples)))
             self.epochs += 1
             self.end = self.boundary(self.epochs + 1)
             while len(self._rows) > BEFORE and self._rows[BEFORE][0] <= self.boundary(self.epochs):
@@ -149,9 +149,9 @@ class ImuStream:
         span = self.settled - begin
         if span <= 4 * math.ulp(begin):
             return None
-        return self._resampled(SampleGrid(begin, span, 1, self._samples)), span / self._samples
+        return self._resample(SampleGrid(begin, span, 1, self._samples)), span / self._samples
 
-    def _resampled(self, grid: SampleGrid) -> np.ndarray:
+    def _resample(self, grid: SampleGrid) -> np.ndarray:
         table = np.array(self._rows)
         return resample_imu(dict(zip(COLUMNS, table.T)), grid, self._step)
 

@@ -37,7 +37,7 @@ from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.masks import withhold_fixes
 from dlkf.data.segments import whole_drives
-from dlkf.filters.aids.attach import aided_name
+from dlkf.filters.aids.attach import append_aids
 from dlkf.filters.build import build_causal, is_filter
 from dlkf.filters.integration import BatchSolution, Estimator
 from dlkf.filters.tuning import Tuning
@@ -72,7 +72,7 @@ class FixOffset(NamedTuple):
     delay_s: float = 0.0  # by which the fixes are older than their stamps
     ahead_m: float = 0.0  # by which the antenna sits further forward than stated
 
-    def shifted(self, by: FixOffset, step: float) -> FixOffset:
+    def shift(self, by: FixOffset, step: float) -> FixOffset:
         """So many times ``by`` further."""
         return FixOffset(self.delay_s + step * by.delay_s, self.ahead_m + step * by.ahead_m)
 
@@ -175,8 +175,8 @@ class Evidence:
         solution = run_filter(batch, estimator, keep_covariances=True)
         scored, kept = self.offered & batch.available, self.offered & ~batch.available
         out = torch.zeros_like(batch.gnss_lag)
-        out[scored] = 0.5 * _of_used_fixes(batch, solution)[scored] / scored.sum()
-        out[kept] = 0.5 * _of_withheld_fixes(batch, solution, tuning)[kept] / kept.sum()
+        out[scored] = 0.5 * _score_used_fixes(batch, solution)[scored] / scored.sum()
+        out[kept] = 0.5 * _score_withheld_fixes(batch, solution, tuning)[kept] / kept.sum()
         return out
 
     def spans(self, shares: Float[Tensor, "B T"]) -> Float[Tensor, " n"]:
@@ -186,14 +186,14 @@ class Evidence:
         return pad(per_drive, (0, -per_drive.shape[1] % long)).unflatten(1, (-1, long)).sum(-1).flatten()
 
 
-def _of_used_fixes(batch: Batch, solution: BatchSolution) -> Float[Tensor, "B T"]:
+def _score_used_fixes(batch: Batch, solution: BatchSolution) -> Float[Tensor, "B T"]:
     """Of the innovations of fixes that the filter was offered; a component without one adds nothing."""
     assert solution.innovation_covariance is not None
     components = (batch.gnss_valid & batch.available.unsqueeze(-1)).sum(-1)
     return _density(solution.innovation, solution.innovation_covariance, components)
 
 
-def _of_withheld_fixes(batch: Batch, solution: BatchSolution, tuning: Tuning) -> Float[Tensor, "B T"]:
+def _score_withheld_fixes(batch: Batch, solution: BatchSolution, tuning: Tuning) -> Float[Tensor, "B T"]:
     """Of horizontal positions that the filter did not see, under its own covariance and that of the fix."""
     assert solution.position_covariance is not None
     state = solution.prior
@@ -253,7 +253,7 @@ def find_noise(
         place = (*(round(math.log(v), 9) for v in values.values()), *(round(x, 9) for x in placing))
         if place not in tried_before:  # a step back, or one that failed before another value moved
             away = sum(0.5 * (math.log(v / start[k]) / usual[k]) ** 2 for k, v in values.items())
-            found = evidence.negative_log_likelihood(name, *_built(values, imu, tuning, called), placing)
+            found = evidence.negative_log_likelihood(name, *_build(values, imu, tuning, called), placing)
             tried_before[place] = found + away / evidence.fixes
         return tried_before[place]
 
@@ -273,7 +273,7 @@ def find_noise(
                             best, x, moved = value, tried, True
                             tried = {k: factor * v if k in direction else v for k, v in x.items()}
                 for shift in shifts:
-                    while (value := score(x, there := placing.shifted(shift, step))) < best - SURE_GAIN:
+                    while (value := score(x, there := placing.shift(shift, step))) < best - SURE_GAIN:
                         best, placing, moved = value, there, True
         return x, placing, best
 
@@ -283,13 +283,13 @@ def find_noise(
     x, placing, best = search(x, NO_OFFSET, before, STEPS, shifts if delay else ())
     unknown = FixOffset(math.nan, math.nan)
     if not delay:
-        return NoiseFit(*_built(x, imu, tuning, called), placing, unknown, before, best)
+        return NoiseFit(*_build(x, imu, tuning, called), placing, unknown, before, best)
     coarse = placing
-    placing, std = search_fix_offset(evidence, name, *_built(x, imu, tuning, called), coarse)
+    placing, std = search_fix_offset(evidence, name, *_build(x, imu, tuning, called), coarse)
     if placing != coarse:
         best = score(x, placing)
         x, placing, best = search(x, placing, best, STEPS[1:], ())
-    return NoiseFit(*_built(x, imu, tuning, called), placing, std, before, best)
+    return NoiseFit(*_build(x, imu, tuning, called), placing, std, before, best)
 
 
 def check_finds_noise(name: str) -> None:
@@ -309,7 +309,7 @@ def generic_filter(
     as :func:`check_finds_noise`.
     """
     check_finds_noise(name)
-    name = aided_name(name, [table.name for table in aids])
+    name = append_aids(name, [table.name for table in aids])
     found = find_noise(Evidence.of(drives, align=align), name, imu, tuning, **given)
     placed = [found.placing.apply(d) for d in drives]
     return build_causal(name, found.imu, "imu=auto does not", tuning=found.tuning), placed, found
@@ -326,7 +326,7 @@ def search_fix_offset(
     def spans(of: Tensor) -> Tensor:
         return evidence.spans(evidence.shares(name, imu, tuning, FixOffset(*(of * unit).tolist())))
 
-    def bent(of: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def differentiate(of: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """A point whose neighbours are no future fixes, slopes of the spans there (n, k) and curvature (k, k)."""
         of = torch.stack((of[0].clamp_min(SLIGHT_S), of[1]))
         e = SLIGHT_S * torch.eye(2, dtype=of.dtype)[free]
@@ -346,7 +346,7 @@ def search_fix_offset(
                 at, value = there, tried
                 there = at + step * torch.tensor(way, dtype=at.dtype)
     while free:
-        value, (around, slopes, H) = float(spans(at).sum()), bent(at)
+        value, (around, slopes, H) = float(spans(at).sum()), differentiate(at)
         for _ in range(4):
             if not bool((torch.linalg.eigvalsh(H) > 0).all()):
                 break
@@ -355,7 +355,7 @@ def search_fix_offset(
             there[0] = there[0].clamp(0.0, LONGEST_DELAY_S)
             if not (tried := float(spans(there).sum())) < value:
                 break
-            at, value, (around, slopes, H) = there, tried, bent(there)
+            at, value, (around, slopes, H) = there, tried, differentiate(there)
         back = torch.linalg.pinv(H)
         convex = bool((torch.linalg.eigvalsh(H) > 0).all())
         std[free] = (back @ (slopes.T @ slopes) @ back).diagonal().sqrt() if convex else math.inf
@@ -367,7 +367,7 @@ def search_fix_offset(
     return FixOffset(*(at * unit).tolist()), FixOffset(*(std * unit).tolist())
 
 
-def _built(values: Mapping[str, float], imu: ImuSpec, tuning: Tuning, called: str) -> tuple[ImuSpec, Tuning]:
+def _build(values: Mapping[str, float], imu: ImuSpec, tuning: Tuning, called: str) -> tuple[ImuSpec, Tuning]:
     """IMU and factors with these values."""
     of = {s: {k: values[f"{s}.{k}"] for k in OF_SENSORS} for s in ("accel", "gyro")}
     source = f"found on drives without a reference, beginning with {imu.name}"

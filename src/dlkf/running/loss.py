@@ -25,13 +25,13 @@ class LossWatch(NamedTuple):
     total: float = 0.0
     since: float = 0.0
 
-    def after(self, t: float, share: float) -> LossWatch:
+    def update(self, t: float, share: float) -> LossWatch:
         """After a fix at ``t`` [s]."""
         if share == 0:
             return LossWatch()
         return LossWatch(self.count + 1, self.total + share, self.since if self.count else t)
 
-    def lost(self, t: float) -> bool:
+    def is_lost(self, t: float) -> bool:
         """Whether that is enough at ``t`` [s]."""
         return self.total >= LOST_FIXES and (t - self.since) * self.total >= LOST_S * self.count
 
@@ -44,7 +44,7 @@ def far_off(innovation: Tensor, std: Tensor) -> Tensor:
     return torch.where(share > LOST_SHARE, share.clamp_max(1.0), 0.0)
 
 
-def impossible(v_n: Tensor, p_n: Tensor, origin_height: Tensor) -> Tensor:
+def is_impossible(v_n: Tensor, p_n: Tensor, origin_height: Tensor) -> Tensor:
     """Whether velocities (…, 3) [m/s] and positions [m] in a tangent frame are none of a car.
 
     The height is that of the origin plus what lies above the tangent plane and the Earth's curvature below it.
@@ -53,11 +53,11 @@ def impossible(v_n: Tensor, p_n: Tensor, origin_height: Tensor) -> Tensor:
     return (v_n.norm(dim=-1) > ESTIMATE_M_S) | (height < ESTIMATE_HEIGHTS_M[0]) | (height > ESTIMATE_HEIGHTS_M[1])
 
 
-def first_loss(batch: Batch, row: int, solution: BatchSolution) -> int | None:
+def find_first_loss(batch: Batch, row: int, solution: BatchSolution) -> int | None:
     """The first epoch at whose end the filter of one drive of a batch was lost; None: never."""
     n = int(batch.present[row].sum())
     state = solution.posterior
-    nowhere = impossible(state.v_n[row, :n], state.p_n[row, :n], batch.frame.height[row].to(state.p_n))
+    nowhere = is_impossible(state.v_n[row, :n], state.p_n[row, :n], batch.frame.height[row].to(state.p_n))
     at = int(torch.nonzero(nowhere)[0]) if bool(nowhere.any()) else None
     offered = (batch.gnss_valid[row, :n, :3].any(-1) & batch.available[row, :n]).to(state.p_n.device)
     far = far_off(solution.innovation[row, :n], batch.gnss_std[row, :n].to(state.p_n)) * offered
@@ -66,7 +66,7 @@ def first_loss(batch: Batch, row: int, solution: BatchSolution) -> int | None:
     watch = LossWatch()
     for k in torch.nonzero(offered).flatten().tolist():
         t = k * batch.epoch_s
-        watch = watch.after(t, float(far[k]))
-        if watch.lost(t):
+        watch = watch.update(t, float(far[k]))
+        if watch.is_lost(t):
             return k if at is None else min(at, k)
     return at

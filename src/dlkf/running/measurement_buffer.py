@@ -80,7 +80,7 @@ def as_number(x: Any) -> float:
         return math.nan
 
 
-def checked_fix(
+def check_fix(
     t: float, place: Sequence[float], velocity_ned: Row | None, std: Row | None, quality: int
 ) -> dict[str, np.ndarray] | str:
     """A fix as a table of one row, unknown values as NaN; the reason where it is none."""

@@ -22,7 +22,7 @@ from dlkf.data.segments import whole_drives
 from dlkf.data.store import load_dataset
 from dlkf.data.tables import read_table
 from dlkf.data.validate import usable_fixes
-from dlkf.filters.aids.attach import aid_columns, kalman_of
+from dlkf.filters.aids.attach import aid_columns, find_kalman
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import BatchSolution, WholeLoop
 from dlkf.filters.receiver import ARM, DELAY, DRIFT
@@ -30,7 +30,7 @@ from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.compiled import without_loops
 from dlkf.running.batched import CHUNK_SAMPLES, run_filter
 from dlkf.running.innovations import FAR, Innovation, fit_sigma, worst_stretch
-from dlkf.running.loss import first_loss
+from dlkf.running.loss import find_first_loss
 from dlkf.running.solution import SCHEMA, solution_table
 from dlkf.running.start import align_each
 
@@ -78,7 +78,7 @@ class UsableFixes:
 EARLY_S = 3.0  # before a solution begins, from which on a fix without one is worth saying
 
 
-def epoch_for(spacings: Iterable[UsableFixes], rate_hz: float, estimator: Filter) -> float:
+def choose_epoch(spacings: Iterable[UsableFixes], rate_hz: float, estimator: Filter) -> float:
     """Update interval [s] that uses every fix: the closest usual spacing, at most 1 s.
 
     1 s where it is no whole number of IMU samples, and for filters with constraints, whose noise is meant for one a
@@ -87,7 +87,7 @@ def epoch_for(spacings: Iterable[UsableFixes], rate_hz: float, estimator: Filter
     closest = min((s.usual_s for s in spacings), default=1.0)
     samples = closest * rate_hz if math.isfinite(closest) else 0.0  # no drive has two fixes: any grid will do
     whole = samples >= 1 and abs(samples - round(samples)) < 1e-6
-    sources = getattr(kalman_of(estimator), "sources", ())
+    sources = getattr(find_kalman(estimator), "sources", ())
     constrained = any(isinstance(source, CarConstraints) for source in sources)
     return closest if closest < 1.0 and whole and not constrained else 1.0
 
@@ -330,7 +330,7 @@ def _solve_drive(
     tables, found, restarts = [], [], []
     aligned_at, doubt = float(batch.t_start[row]), start.doubt
     while True:
-        end = first_loss(batch, row, solution)
+        end = find_first_loss(batch, row, solution)
         if end is not None and isinstance(estimator, SmoothedSolution) and end > 0:
             short = drive.part(0, start.first + end)  # what came after would be smoothed into what was before
             batch, row = whole_drives([short], [start]), 0

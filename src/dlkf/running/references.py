@@ -90,14 +90,14 @@ def make_reference(
         v_e = torch.einsum("ij,tj->ti", frame.C_en[0], state.v_n[0, :n])
         C_eb = frame.C_en[0] @ state.C_nb[0, :n]
         rows = slice(row, row + n)
-        found = _blank(drive)
+        found = _make_blank(drive)
         found["ref_C_eb"][rows] = C_eb
         if kind == "smoothed":
             sigma = std[0, :n, POSITION]
             sure = sigma.norm(dim=-1) <= UNSURE * sigma.norm(dim=-1).median()
             found["ref_r_e"][rows], found["ref_v_e"][rows], found["ref_valid"][rows] = r_e, v_e, sure
         else:
-            r_fix, v_fix, good = _at_imu(drive, rows, C_eb, v_e)
+            r_fix, v_fix, good = _carry_to_imu(drive, rows, C_eb, v_e)
             found["ref_r_e"][rows], found["ref_v_e"][rows], found["ref_valid"][rows] = r_fix, v_fix, good
             sigma, sure = drive.gnss_std[rows, :3], good
             found["ref_C_eb"][:] = torch.nan
@@ -113,7 +113,7 @@ def make_reference(
     return ReferencedDrives(made, sigma, skipped, kind)
 
 
-def _blank(drive: Drive) -> dict[str, Tensor]:
+def _make_blank(drive: Drive) -> dict[str, Tensor]:
     """No reference at all; its rows are to be filled."""
     return {
         "ref_r_e": torch.full_like(drive.gnss_r_e, torch.nan),
@@ -124,7 +124,7 @@ def _blank(drive: Drive) -> dict[str, Tensor]:
     }
 
 
-def _at_imu(drive: Drive, rows: slice, C_eb: Tensor, v_e: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _carry_to_imu(drive: Drive, rows: slice, C_eb: Tensor, v_e: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Good fixes brought from the antenna to the IMU and from their time to the boundary: r_e, v_e, good.
 
     The velocity is the fix's where it has one, else the smoothed; the lever arm's swing ω × l is taken off.

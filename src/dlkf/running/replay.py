@@ -19,8 +19,8 @@ from dlkf.data.alignment import SEARCH, AlignConfig
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
 from dlkf.data.store import drive_from_tables, drive_rows
 from dlkf.data.tables import Columns
-from dlkf.data.validate import CheckedTables, read_checked
-from dlkf.filters.aids.attach import tables_of
+from dlkf.data.validate import CheckedTables, read_drive
+from dlkf.filters.aids.attach import find_tables
 from dlkf.filters.card import LowSampleRateWarning
 from dlkf.filters.smoother import Filter
 from dlkf.running import start
@@ -124,7 +124,7 @@ def stream_drive(
     run ``from_rest=False``.
     Raises UnalignedError if the drive cannot be aligned, InputError if the filter diverges.
     """
-    kinds = tables_of(estimator)
+    kinds = find_tables(estimator)
     drive = drive_from_tables(tables, "", rate_hz, epoch_s, torch.float64, kinds)
     causal = replace(align, from_rest=False)
     stream = StreamingFilter(
@@ -177,7 +177,7 @@ def stream_drives(
     rows = drive_rows(folder, drives)
     solved = 0
     for k, row in enumerate(rows):
-        tables = read_checked(folder, row, reference=False, aids=aids)
+        tables = read_drive(folder, row, reference=False, aids=aids)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", LowSampleRateWarning)  # commands say it once, of all drives

@@ -42,9 +42,9 @@ from dlkf.base.errors import InputError
 from dlkf.base.settings import is_number
 from dlkf.data.aids import pressure_height
 from dlkf.data.alignment import SEARCH, AlignConfig
-from dlkf.data.resampling import ON_BOUNDARY_S, boundary_after, fixes_at
+from dlkf.data.resampling import ON_BOUNDARY_S, find_boundary, make_fixes
 from dlkf.data.validate import LIMITS, Limits
-from dlkf.filters.aids.attach import tables_of
+from dlkf.filters.aids.attach import find_tables
 from dlkf.filters.card import warn_slow_drives
 from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.strapdown import strapdown
@@ -52,7 +52,7 @@ from dlkf.running.epoch_filter import EpochFilter, Running
 from dlkf.running.estimate import Estimate
 from dlkf.running.fix_history import HELD, FixHistory
 from dlkf.running.imu_stream import ImuStream, Row
-from dlkf.running.measurement_buffer import MeasurementBuffer, as_number, checked_fix
+from dlkf.running.measurement_buffer import MeasurementBuffer, as_number, check_fix
 from dlkf.running.start import Search
 
 ANCHOR_M = 50_000.0  # from its origin, beyond which the tangent frame moves
@@ -128,7 +128,7 @@ class StreamingFilter:
         )
         self._rewind = math.ceil(history_s / epoch_s) + 1  # epochs that may be replayed
         self.counts: Counter[str] = Counter()
-        self._buffer = MeasurementBuffer(tables_of(estimator))
+        self._buffer = MeasurementBuffer(find_tables(estimator))
         self._epochs = EpochFilter(
             estimator, self._buffer, self._samples.boundary, rate_hz=rate_hz, epoch_s=epoch_s, lever_arm_b=lever_arm_b,
             align=align, rewind=self._rewind, anchor_m=anchor_m, counts=self.counts,
@@ -174,7 +174,7 @@ class StreamingFilter:
         The receipt holds the estimates of the epochs that end with it: as a rule none, or one once an epoch, and
         several after a bridged gap, or where the grid has just been laid.
         """
-        if reason := self._samples.refused(t, accel, gyro):
+        if reason := self._samples.find_refusal(t, accel, gyro):
             if not self._samples.lost:
                 return self._answer(Status.REFUSED, reason)
             self._samples.clear()
@@ -209,7 +209,7 @@ class StreamingFilter:
         epoch's end holds the recomputed estimates of all epochs since; a fix that is refused does so too where later
         fixes, screened again, count otherwise than before.
         """
-        fix = checked_fix(t, (lat_deg, lon_deg, height_m), velocity_ned, std, quality)
+        fix = check_fix(t, (lat_deg, lon_deg, height_m), velocity_ned, std, quality)
         if isinstance(fix, str):
             return self._answer(Status.REFUSED, fix)
         if self._samples.grid is not None:
@@ -261,7 +261,7 @@ class StreamingFilter:
         if not isinstance(running, Running) or latest is None or tail is None:
             return latest
         imu, dt = torch.from_numpy(tail[0]).to(self._epochs.device), tail[1]
-        window = strapdown(running.state, running.error.corrected(imu), dt, running.frame)
+        window = strapdown(running.state, running.error.correct(imu), dt, running.frame)
         return replace(latest, t=self._samples.settled, frame=running.frame, state=window.end, gnss_used=False)
 
     def _answer(self, status: Status, reason: str = "", estimates: Sequence[Estimate] = ()) -> Receipt:
@@ -290,13 +290,13 @@ class StreamingFilter:
 
     @torch.inference_mode()
     def _close(self, ended: bool) -> Receipt:
-        estimates = [e for imu in self._samples.closed(ended) for e in self._epochs.close(imu)]
+        estimates = [e for imu in self._samples.close_epochs(ended) for e in self._epochs.close(imu)]
         return Receipt(Status.TAKEN, tuple(estimates))
 
     def _file(self, fix: dict[str, np.ndarray]) -> Receipt:
         """Put a fix to its boundary; replay where that is over."""
         t = float(fix["t"][0])
-        row = self._boundary_of(t)
+        row = self._find_boundary(t)
         if reason := self._timing_fault("fix", t, row, least=0):
             return self._answer(Status.REFUSED, reason)
         screened, changed = self._fixes.add(t, row, fix, oldest=self._samples.epochs - self._rewind)
@@ -318,11 +318,11 @@ class StreamingFilter:
             self._buffer.drop_fix(row)
         else:
             boundary = np.array([self._samples.boundary(row)])
-            self._buffer.put_fix(row, fix.t, fixes_at(fix.table, np.zeros(1, np.int64), boundary))
+            self._buffer.put_fix(row, fix.t, make_fixes(fix.table, np.zeros(1, np.int64), boundary))
 
     def _file_aid(self, name: str, t: float, value: float, std: float) -> Receipt:
         """Put a sample of a further sensor to the others of its interval; replay where that is over."""
-        row = self._boundary_of(t)
+        row = self._find_boundary(t)
         if reason := self._timing_fault(name, t, row, least=1):
             return self._answer(Status.REFUSED, reason)
         if not self._buffer.put_aid(row, name, t, value, std):
@@ -330,9 +330,9 @@ class StreamingFilter:
         estimates = self._replay(row)
         return TAKEN if estimates is None else self._receipt(estimates)
 
-    def _boundary_of(self, t: float) -> int:
+    def _find_boundary(self, t: float) -> int:
         assert self._samples.grid is not None
-        return int(boundary_after(np.array([t]), self._samples.grid)[0])
+        return int(find_boundary(np.array([t]), self._samples.grid)[0])
 
     def _timing_fault(self, what: str, t: float, row: int, least: int) -> str:
         """Why a measurement cannot count at boundary ``row``, or nothing; the first that can is ``least``."""

@@ -127,7 +127,7 @@ class Recipe:
     seed: int
     ranges: Mapping[str, Any] | None = None
 
-    def of_drive(self, seed: np.random.SeedSequence) -> tuple[DatasetConfig, ImuSpec]:
+    def draw_drive(self, seed: np.random.SeedSequence) -> tuple[DatasetConfig, ImuSpec]:
         """The settings of one drive. InputError where what was drawn is impossible."""
         return (self.dataset, self.imu) if self.ranges is None else _settings(draw_ranges(self.ranges, seed))
 
@@ -235,14 +235,14 @@ def draw_presets(
     ranges_seed: np.random.SeedSequence,
 ) -> tuple[DatasetConfig, ImuSpec, ImuSpec, ImuUnit]:
     """Of a drive: its settings and IMU preset out of the ranges, the type of its IMU, and the unit."""
-    config, spec = made_by.of_drive(ranges_seed)
+    config, spec = made_by.draw_drive(ranges_seed)
     kind = imu_type(config, spec, type_seed)
     if config.imu_errors == "one":
         unit_seed = np.random.SeedSequence(config.unit_seed, spawn_key=(0,))
     return config, spec, kind, draw_unit(np.random.default_rng(unit_seed), kind)
 
 
-def drive_of(made_by: Recipe, index: int, seconds: int) -> tuple[SimulatedTables, dict[str, Any]]:
+def make_drive(made_by: Recipe, index: int, seconds: int) -> tuple[SimulatedTables, dict[str, Any]]:
     """Drive ``index`` of a dataset, ``seconds`` long: its tables, and its row of ``drives.parquet``."""
     motion, imu, gnss, unit_seed, surroundings, chassis, type_seed, ranges_seed = np.random.SeedSequence(
         made_by.seed, spawn_key=(1, index)
@@ -288,7 +288,7 @@ def _write_drives(made_by: Recipe, folder: Path, workers: int, parallel: int | s
 
 def _write_one(made_by: Recipe, out: str, job: tuple[int, int]) -> dict[str, Any]:
     """A drive by its index and seconds, in its place; its row of ``drives.parquet``."""
-    tables, row = drive_of(made_by, *job)
+    tables, row = make_drive(made_by, *job)
     folder = resolve_place(out)
     if not is_url(out) and not folder.is_dir():
         raise InputError(f"{out} does not exist: the worker does not share the folder, or the command has ended")

@@ -19,7 +19,7 @@ from dlkf.base.files import folder_name, resolve_place, write_into
 from dlkf.data.limits import DEGREE_M
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR
 from dlkf.data.tables import Columns, read_drives
-from dlkf.data.validate import CheckedTables, read_checked, read_fixes
+from dlkf.data.validate import CheckedTables, read_drive, read_fixes
 
 Array = NDArray[np.floating]
 AXES = (("x", "#0072B2"), ("y", "#D55E00"), ("z", "#009E73"))
@@ -62,7 +62,7 @@ class Driving:
 
 def driving(tables: CheckedTables) -> Driving:
     """Speed, acceleration and yaw rate over the ground; derivatives by a sliding parabola of half a second."""
-    source = reference_of(tables)
+    source = require_reference(tables)
     known = source["valid"].astype(bool) & np.isfinite(source["vel_n"])
     t, lat, lon, v_n, v_e = (source[c][known] for c in ("t", "lat_deg", "lon_deg", "vel_n", "vel_e"))
     dt = float(np.median(np.diff(t)))
@@ -83,7 +83,7 @@ def driving(tables: CheckedTables) -> Driving:
 def drive_figure(tables: CheckedTables) -> Figure:
     """One drive: track, speed, specific force, rates, and the IMU's errors (paper, figure 4)."""
     moved = driving(tables)
-    reference, rows = reference_of(tables), 5
+    reference, rows = require_reference(tables), 5
     figure = Figure(figsize=(11.5, 1.9 * rows + 0.5), layout="constrained")
     grid = figure.add_gridspec(rows, 2, width_ratios=(1, 1.35))
     _track(figure.add_subplot(grid[:, 0]), figure, moved, tables)
@@ -147,7 +147,7 @@ def write_pictures(dataset: str | Path, out: str | Path) -> list[Path]:
     files, moved = [f"{rows[0].name}.png", "motion.png"], []
     with write_into(out) as folder:
         for row in rows:
-            tables = read_checked(dataset, row)
+            tables = read_drive(dataset, row)
             moved.append(driving(tables).every(0.5))
             if row is rows[0]:
                 drive_figure(tables).savefig(folder / files[0], dpi=90)
@@ -155,7 +155,7 @@ def write_pictures(dataset: str | Path, out: str | Path) -> list[Path]:
     return [resolve_place(out) / file for file in files]
 
 
-def reference_of(tables: CheckedTables) -> Columns:
+def require_reference(tables: CheckedTables) -> Columns:
     """Of a simulated drive, which has one."""
     assert tables.reference is not None
     return tables.reference

@@ -19,10 +19,10 @@ from rich.console import Console
 from rich.progress import track
 
 from dlkf.base.errors import InputError
-from dlkf.data.resampling import SampleGrid, reference_at
+from dlkf.data.resampling import SampleGrid, interpolate_reference
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR, VELOCITY, new_dataset, write_drive, write_drives_table
 from dlkf.data.tables import Columns, read_drives, read_drives_table
-from dlkf.data.validate import CheckedTables, read_checked, validate_dataset
+from dlkf.data.validate import CheckedTables, read_drive, validate_dataset
 from dlkf.navigation.attitude import rpy_from_rotation
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
@@ -53,14 +53,14 @@ def simulate_semi_real(
     with closing(iter(shown)) as drives, new_dataset(out, overwrite) as folder:  # type: ignore[type-var]
         written = []
         for index, drive in enumerate(drives):
-            tables = read_checked(source, drive)
+            tables = read_drive(source, drive)
             *streams, unit_seed, type_seed, ranges_seed = np.random.SeedSequence(
                 made_by.seed, spawn_key=(2, index)
             ).spawn(6)
             config, _, kind, unit = draw_presets(made_by, unit_seed, type_seed, ranges_seed)
             imu_rng, gnss_rng, sky_rng = (np.random.default_rng(stream) for stream in streams)
             imu, reference = inject_errors(imu_rng, tables, kind, unit)
-            received, rough = gnss_of_reference(gnss_rng, sky_rng, tables, config)
+            received, rough = simulate_gnss(gnss_rng, sky_rng, tables, config)
             row = _row(described[index], config, kind, rough)
             written.append(write_drive(folder, row, imu, received.fixes, reference))
             if config.raw:
@@ -97,7 +97,7 @@ def inject_errors(
     )
 
 
-def gnss_of_reference(
+def simulate_gnss(
     rng: np.random.Generator, sky_rng: np.random.Generator, tables: CheckedTables, config: DatasetConfig
 ) -> tuple[Received, Array]:
     """GNSS at whole multiples of 1/rate where the reference is known, and the reference's roughness (3,) [m].
@@ -111,7 +111,7 @@ def gnss_of_reference(
     assert reference is not None  # :func:`inject_errors` raises for that
     t = _epochs(tables.imu["t"], reference["t"], gnss.rate_hz, name)
     at, moving = (
-        reference_at(reference, SampleGrid(t[0] - lag, 1 / gnss.rate_hz, len(t) - 1, 1))
+        interpolate_reference(reference, SampleGrid(t[0] - lag, 1 / gnss.rate_hz, len(t) - 1, 1))
         for lag in (gnss.position_lag_s, gnss.velocity_lag_s)
     )
     valid = at.valid & moving.valid

@@ -46,7 +46,7 @@ def best_child(client, runs: Sequence):
     return min(known, key=lambda pair: pair[0])[1] if known else None
 
 
-def best_of(client, run_id: str):
+def choose_best(client, run_id: str):
     """A run, or of a grid search's parent its best child; InputError where none of them was validated."""
     runs = children(client, run_id)
     if not runs:

@@ -30,8 +30,8 @@ from dlkf.tracking.runs import (
     NOTE_TAG,
     TrackedRun,
     check_store,
-    client_of,
     experiment_id,
+    open_client,
     reachable,
     start_run,
     tracking_uri,
@@ -61,7 +61,7 @@ class GridParent(Callback):
             self.uri = tracking_uri(config.tracking.uri)
             check_store(self.uri)
             with reachable(self.uri):
-                client = client_of(self.uri)
+                client = open_client(self.uri)
                 name = "grid " + (" × ".join(grid_name(*pair) for pair in swept.items()) or "of one point")
                 run = client.create_run(experiment_id(client, config.name), run_name=name[:250])
         except InputError as error:  # Hydra would make a warning of it and go on
@@ -91,7 +91,7 @@ class GridParent(Callback):
         parent, self.run_id = self.run_id, None
         os.environ.pop(PARENT_RUN, None)
         os.environ.pop(SWEPT, None)
-        client = client_of(self.uri)
+        client = open_client(self.uri)
         for run in children(client, parent):
             if run.info.status == "RUNNING":
                 client.set_terminated(run.info.run_id, "FAILED")
@@ -171,12 +171,12 @@ def run_name(name: str, overrides: Sequence[str]) -> str:
 def points_words(overrides: Sequence[str]) -> list[str]:
     """Short, for a list: ``optimizer.lr=1e-3`` → ``lr=1e-3``, unless two keys end alike; ``loss._target_=own.Huber`` →
     ``loss=Huber``."""
-    pairs = [_without_target(*format_value(o).partition("=")[::2]) for o in overrides]
+    pairs = [_strip_target(*format_value(o).partition("=")[::2]) for o in overrides]
     ends = [key.rpartition(".")[2] for key, _ in pairs]
     return [f"{end if ends.count(end) == 1 else key}={value}" for end, (key, value) in zip(ends, pairs)]
 
 
-def _without_target(key: str, value: str) -> tuple[str, str]:
+def _strip_target(key: str, value: str) -> tuple[str, str]:
     """``loss._target_``, ``my_loss.Huber`` → ``loss``, ``Huber``."""
     owner, dot, last = key.rpartition(".")
     return (owner, value.rpartition(".")[2]) if dot and last == "_target_" else (key, value)

@@ -9,10 +9,10 @@ from typing import Any
 
 from dlkf.base.classes import find_class
 from dlkf.base.errors import InputError, did_you_mean
-from dlkf.filters.build import OWN_SOURCE, build_filter, filter_names, is_filter, known_filters
+from dlkf.filters.build import OWN_SOURCE, build_filter, describe_filters, filter_names, is_filter
 from dlkf.filters.integration import Estimator
 from dlkf.filters.saved import CONFIG, WEIGHTS, load_filter
-from dlkf.filters.shipped import KNOWN_IMU, plus_with_imu, shipped_folder
+from dlkf.filters.shipped import KNOWN_IMU, build_plus, shipped_folder
 from dlkf.filters.smoother import Filter
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
@@ -43,7 +43,7 @@ def resolve_model(
     if OWN_SOURCE.fullmatch(spec):
         return own_filter(spec, imu)
     if spec == KNOWN_IMU:
-        return plus_with_imu(imu)
+        return build_plus(imu)
     if folder := shipped_folder(spec):
         return load_filter(folder)
     if is_tracked(spec):
@@ -64,12 +64,12 @@ def resolve_model(
         raise InputError(f"model={spec}: no such folder; a model is a folder with {WEIGHTS} beside {CONFIG}")
     near = did_you_mean(spec, (*filter_names(), KNOWN_IMU))
     raise InputError(
-        f"unknown model {spec!r}{near or '.'} A model is a filter (plus, {KNOWN_IMU}, {known_filters()}), a folder, "
+        f"unknown model {spec!r}{near or '.'} A model is a filter (plus, {KNOWN_IMU}, {describe_filters()}), a folder, "
         "an MLflow run id, models:/name@alias or a class of your own, module:Class"
     )
 
 
-def settings_taken(spec: str) -> tuple[str, ...]:
+def list_settings_taken(spec: str) -> tuple[str, ...]:
     """Which of ``imu`` and ``tuning`` have an effect on a model: a trained filter has its own noise."""
     if is_filter(spec) or OWN_SOURCE.fullmatch(spec):
         return ("imu", "tuning")
@@ -78,13 +78,13 @@ def settings_taken(spec: str) -> tuple[str, ...]:
 
 def takes_tuning(spec: str) -> bool:
     """Whether the noise of a model is set by ``imu`` and ``tuning``."""
-    return "tuning" in settings_taken(spec)
+    return "tuning" in list_settings_taken(spec)
 
 
 def unused_settings(spec: str, given: Iterable[str]) -> str:
     """A line for settings that a model does not take, as they were given (``imu=consumer``); empty without any."""
     by_key = {word: word.partition("=")[0].partition(".")[0].removesuffix("_type") for word in given}
-    unused = [word for word, key in by_key.items() if key not in settings_taken(spec)]
+    unused = [word for word, key in by_key.items() if key not in list_settings_taken(spec)]
     if not unused:
         return ""
     known = spec == "plus" and "imu" in by_key.values()

@@ -36,7 +36,7 @@ class NavigationFilter(PythonModel):
         from dlkf.running.offline import navigate_drives
 
         tables = []
-        for folder, drives in self._loaded(model_input, params or {}):
+        for folder, drives in self._load_drives(model_input, params or {}):
             for result in navigate_drives(drives, self.filter, skipped={}):
                 result.table.insert(0, "drive", result.drive)
                 if folder:
@@ -44,14 +44,14 @@ class NavigationFilter(PythonModel):
                 tables.append(result.table)
         return pd.concat(tables, ignore_index=True)
 
-    def _loaded(self, given: pd.DataFrame, params: dict[str, Any]) -> Iterator[tuple[str, list]]:
+    def _load_drives(self, given: pd.DataFrame, params: dict[str, Any]) -> Iterator[tuple[str, list]]:
         import torch
 
-        from dlkf.data.rows import drives_of
+        from dlkf.data.rows import split_drives
         from dlkf.data.store import drive_from_tables, load_dataset
-        from dlkf.filters.saved import grid_of
+        from dlkf.filters.saved import choose_grid
 
-        grid = grid_of([self.filter])
+        grid = choose_grid([self.filter])
         rate_hz, epoch_s = grid["rate_hz"], grid["epoch_s"]
         if "dataset" in given and given["dataset"].notna().any():
             for folder in given["dataset"].dropna():
@@ -59,7 +59,7 @@ class NavigationFilter(PythonModel):
                 yield folder, load_dataset(folder, dtype=torch.float64, **options)
             return
         arm = [float(params.get(f"lever_arm_{a}_m", 0.0)) for a in "xyz"]
-        tables = drives_of(given, arm)
+        tables = split_drives(given, arm)
         yield "", [drive_from_tables(t, "", rate_hz, epoch_s, torch.float64) for t in tables]
 
 

@@ -24,8 +24,8 @@ from dlkf.tracking.runs import (
     PARENT_TAG,
     RUN_ID,
     TrackedRun,
-    client_of,
     mlflow_module,
+    open_client,
     reachable,
     run_exists,
     store_missing,
@@ -68,7 +68,7 @@ def log_model(
             python_model=str(CODE),
             artifacts={"filter": str(folder)},
             code_paths=[str(Path(dlkf.__file__).parent)],
-            pip_requirements=pinned_requirements(),
+            pip_requirements=pin_requirements(),
             signature=signature(),
             input_example=example_drive(),
             step=NO_STEP,
@@ -150,7 +150,7 @@ def _log_model_metrics(run: TrackedRun, model_id: str, metrics: Mapping[str, flo
         run.client.log_batch(run.id, metrics=points)
 
 
-def pinned_requirements() -> list[str]:
+def pin_requirements() -> list[str]:
     """What a logged model needs, in the installed versions; without build tags: ``2.13.0+cpu`` → ``2.13.0``."""
     return [f"{name}=={version(name).partition('+')[0]}" for name in REQUIRED]
 
@@ -182,8 +182,8 @@ def download_model(spec: str, uri: str | None = None) -> Path:
             "run from the folder of the training or give tracking.uri=…"
         )
     with reachable(uri):
-        client = client_of(uri)
-        find = _registered if spec.startswith("models:/") else _of_run
+        client = open_client(uri)
+        find = _find_registered if spec.startswith("models:/") else _find_in_run
         return _fetch(find(client, spec, uri), spec, uri)
 
 
@@ -191,7 +191,7 @@ def _logged_models(run: Run) -> list:
     return run.outputs.model_outputs if run.outputs else []
 
 
-def _of_run(client: MlflowClient, spec: str, uri: str) -> str:
+def _find_in_run(client: MlflowClient, spec: str, uri: str) -> str:
     run_id = spec.removeprefix("runs:/").partition("/")[0]
     if not RUN_ID.fullmatch(run_id) or not run_exists(client, run_id):
         raise InputError(f"model={spec}: {uri} has no run {run_id!r}")
@@ -205,7 +205,7 @@ def _of_run(client: MlflowClient, spec: str, uri: str) -> str:
     raise InputError(f"model={spec}: the run logged no model (its status is {run.info.status})")
 
 
-def _registered(client: MlflowClient, spec: str, uri: str) -> str:
+def _find_registered(client: MlflowClient, spec: str, uri: str) -> str:
     from mlflow.exceptions import MlflowException
 
     reference = spec.removeprefix("models:/")
@@ -216,7 +216,7 @@ def _registered(client: MlflowClient, spec: str, uri: str) -> str:
     try:
         if name.startswith("m-") and not alias and not number:
             return client.get_logged_model(name).artifact_location
-        versions = sorted(int(v.version) for v in client.search_model_versions(f"name='{_quoted(name)}'"))
+        versions = sorted(int(v.version) for v in client.search_model_versions(f"name='{_check_quote(name)}'"))
         aliases = client.get_registered_model(name).aliases
     except MlflowException as error:
         if error.error_code != "RESOURCE_DOES_NOT_EXIST":
@@ -237,7 +237,7 @@ def _registered(client: MlflowClient, spec: str, uri: str) -> str:
     return client.get_model_version_download_uri(name, str(wanted))
 
 
-def _quoted(name: str) -> str:
+def _check_quote(name: str) -> str:
     if "'" in name:
         raise InputError(f"model=models:/{name}: a name with a quote cannot be looked up")
     return name

@@ -64,7 +64,7 @@ def store_missing(uri: str) -> bool:
     return uri.startswith(SQLITE) and not Path(uri.removeprefix(SQLITE)).is_file()
 
 
-def client_of(uri: str) -> MlflowClient:
+def open_client(uri: str) -> MlflowClient:
     """A client of the store. An embedded store is made or brought up to date by one process at a time: MLflow does not
     see to that, and of two trainings that begin together one would fail."""
     mlflow = mlflow_module()
@@ -72,7 +72,7 @@ def client_of(uri: str) -> MlflowClient:
         return mlflow.MlflowClient(uri)
     folder = Path(uri.removeprefix(SQLITE)).parent
     folder.mkdir(parents=True, exist_ok=True)
-    _unlocked(uri, "BEGIN; SELECT * FROM sqlite_master")
+    _wait_for_lock(uri, "BEGIN; SELECT * FROM sqlite_master")
     held = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(held, fcntl.LOCK_EX)
@@ -84,13 +84,13 @@ def client_of(uri: str) -> MlflowClient:
 def check_store(uri: str) -> None:
     """Raises InputError for a store that runs cannot be written to: locked, or a server that does not answer."""
     if uri.startswith(SQLITE):
-        _unlocked(uri, "BEGIN IMMEDIATE")
+        _wait_for_lock(uri, "BEGIN IMMEDIATE")
     else:
         with reachable(uri):
-            client_of(uri).search_experiments(max_results=1)
+            open_client(uri).search_experiments(max_results=1)
 
 
-def _unlocked(uri: str, lock: str) -> None:
+def _wait_for_lock(uri: str, lock: str) -> None:
     """Waits for a lock of an embedded store, for a while: MLflow would try again for minutes."""
     if store_missing(uri):
         return
@@ -263,7 +263,7 @@ def start_run(
         tags = {PROCESS_TAG: process_label()} | ({PARENT_TAG: parent_run_id} if parent_run_id else {})
         try:
             with reachable(uri), delay_signals():
-                client = client_of(uri)
+                client = open_client(uri)
                 group = experiment_id(client, experiment)
                 close_killed_runs(client, group)
                 resumed = run_id is not None and run_exists(client, run_id)

@@ -57,7 +57,7 @@ def fit(
             max_epochs=plan.max_epochs,
             accelerator=plan.accelerator,
             devices=plan.devices,
-            strategy="auto" if plan.devices == 1 else _shared(),
+            strategy="auto" if plan.devices == 1 else _make_strategy(),
             logger=logger,
             callbacks=[
                 *settings.callbacks,
@@ -123,7 +123,7 @@ def _hush() -> None:
         logging.getLogger(name).setLevel(logging.ERROR)
 
 
-def _shared() -> DDPStrategy:
+def _make_strategy() -> DDPStrategy:
     """Gradients averaged over the processes; weights that a batch did not need may miss one."""
     return DDPStrategy(find_unused_parameters=True, cluster_environment=LightningEnvironment())
 

@@ -88,7 +88,7 @@ def pva_losses(solution: BatchSolution, batch: Batch, config: LossConfig) -> dic
     return losses
 
 
-def loss_of(values: Mapping[str, Any]) -> Loss:
+def build_loss(values: Mapping[str, Any]) -> Loss:
     """The loss of plain settings: that of the paper, or with ``_target_: module.Class`` a user's own.
 
     The class is called with the settings that it takes, and its object with (solution, batch); it gives a mapping of

@@ -16,11 +16,11 @@ from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import end_errors, mean_error
 from dlkf.filters.aids.attach import with_aids
 from dlkf.filters.integration import BatchSolution, integrate
-from dlkf.filters.saved import LearnedSettings, learned_filter
+from dlkf.filters.saved import LearnedSettings, build_learned_filter
 from dlkf.networks.heads import IMU_ERROR_SIZE, INNOVATION_SIZE, STATE_SIZE
 from dlkf.training.loss import Loss, unit_weights, weighted_loss
 from dlkf.training.optimization import OptimizationPlan
-from dlkf.training.processes import of_all
+from dlkf.training.processes import gather_all
 
 STATE, INNOVATION = torch.tensor(STATE_SIZE), torch.tensor(INNOVATION_SIZE)
 
@@ -42,7 +42,7 @@ class FilterTraining(L.LightningModule):
     ) -> None:
         super().__init__()
         torch.manual_seed(seed)
-        self.filter = learned_filter(model)
+        self.filter = build_learned_filter(model)
         self.loss = loss
         self.descent = descent
         self.covariances = getattr(loss, "likelihood", 0.0) > 0
@@ -120,7 +120,7 @@ class FilterTraining(L.LightningModule):
         ``val/gain_std`` and ``val/imu_error_std`` are relative to the heads' physical sizes: near zero they show that
         the network is a constant, for any errors.
         """
-        ends, gains, errors = np.concatenate(of_all(self._ends)), of_all(self._gains), of_all(self._errors)
+        ends, gains, errors = np.concatenate(gather_all(self._ends)), gather_all(self._gains), gather_all(self._errors)
         if len(ends):
             self.log("val/outage_end_m", mean_error(ends, "log"))
             self.log("val/outage_end_rms_m", mean_error(ends, "rms"))

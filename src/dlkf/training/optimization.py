@@ -48,8 +48,8 @@ class OptimizationPlan:
     @classmethod
     def of(cls, optimizer: Mapping[str, Any], scheduler: Mapping[str, Any]) -> OptimizationPlan:
         """From plain values. InputError for an unknown key, or a class that is not there."""
-        ours, own_optimizer = _parted(OptimizerSettings, optimizer, "optimizer", OPTIMIZER)
-        law, own_scheduler = _parted(SchedulerSettings, scheduler, "scheduler", SCHEDULER)
+        ours, own_optimizer = _split_settings(OptimizerSettings, optimizer, "optimizer", OPTIMIZER)
+        law, own_scheduler = _split_settings(SchedulerSettings, scheduler, "scheduler", SCHEDULER)
         return cls(ours, law, own_optimizer, own_scheduler)
 
     def build(self, body: Sequence[nn.Parameter], heads: Sequence[nn.Parameter]) -> tuple[Optimizer, Any]:
@@ -79,7 +79,7 @@ def _names(settings: Any) -> set[str]:
     return {f.name for f in fields(settings)}
 
 
-def _parted(
+def _split_settings(
     kind: type[Any], values: Mapping[str, Any], where: str, needs: Sequence[str]
 ) -> tuple[Any, Mapping[str, Any] | None]:
     """Our settings, and all of them where a class of one's own is named."""

@@ -45,7 +45,7 @@ def count_per_process(count: Tensor) -> Tensor:
     return count.clamp_min(1)
 
 
-def of_all(items: list) -> list:
+def gather_all(items: list) -> list:
     """The items of all processes, in the order of the processes."""
     if processes() == 1:
         return items

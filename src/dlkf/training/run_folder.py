@@ -36,7 +36,7 @@ def read_state(folder: Path) -> dict[str, Any]:
     return json.loads(path.read_text()) if path.is_file() else {}
 
 
-def checked_digests(datasets: Sequence[str], state: Mapping[str, Any]) -> dict[str, str]:
+def check_digests(datasets: Sequence[str], state: Mapping[str, Any]) -> dict[str, str]:
     """Digest of every dataset; InputError where an unfinished run began on other data."""
     digests = {str(d): dataset_digest(d) for d in datasets}
     for dataset, before in state.get("data", {}).items():

@@ -15,11 +15,11 @@ from dlkf.data.masks import BiasLaw
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.filters.build import is_filter
 from dlkf.filters.learned_kalman import LearnedKalmanConfig
-from dlkf.filters.saved import LearnedSettings, learned_settings
+from dlkf.filters.saved import LearnedSettings, parse_learned_settings
 from dlkf.filters.shipped import shipped_folder
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
-from dlkf.training.loss import Loss, loss_of
+from dlkf.training.loss import Loss, build_loss
 from dlkf.training.optimization import MANY, OptimizationPlan
 
 CALLBACK = ("setup", "on_train_epoch_start", "state_dict")  # of Lightning's methods those that every callback has
@@ -132,8 +132,8 @@ class TrainSettings:
     def fit(self) -> FitSettings:
         """What decides the weights; InputError for a class that is not there or takes other settings."""
         return FitSettings(
-            model=learned_settings(self.model),
-            loss=loss_of(self.loss),
+            model=parse_learned_settings(self.model),
+            loss=build_loss(self.loss),
             descent=OptimizationPlan.of(self.optimizer, self.scheduler),
             trainer=self.trainer,
             callbacks=[

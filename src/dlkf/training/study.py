@@ -27,23 +27,23 @@ from dlkf.evaluation.endurance import (
     score_after_gnss,
     score_without_outage,
 )
-from dlkf.evaluation.gains import gains_of, write_gains
+from dlkf.evaluation.gains import measure_gains, write_gains
 from dlkf.evaluation.metrics import PVA
 from dlkf.evaluation.protocol import Scenes
 from dlkf.evaluation.results import BASELINE, Results
 from dlkf.evaluation.scores import Scores
-from dlkf.evaluation.study import results_of, run_scenes
+from dlkf.evaluation.study import make_results, run_scenes
 from dlkf.evaluation.table import ResultTable
 from dlkf.filters.build import refuse_smoothed
 from dlkf.filters.integration import Estimator
 from dlkf.filters.learned_kalman import LearnedKalmanConfig
-from dlkf.filters.saved import LearnedSettings, learned_settings, load_filter
+from dlkf.filters.saved import LearnedSettings, load_filter, parse_learned_settings
 from dlkf.filters.shipped import shipped_folder, trained_filter
 from dlkf.report.evaluation import write_report
 from dlkf.training.callbacks.curriculum import LengthCurriculum
 from dlkf.training.fit import fit
 from dlkf.training.settings import FitSettings, ScoringSettings, StudySettings
-from dlkf.tuning.baselines import Baselines, tuned_baselines
+from dlkf.tuning.baselines import Baselines, tune_baselines
 
 Say = Callable[[str], None]
 MODEL = "model.yaml"  # settings of the model of a training, in its folder
@@ -79,15 +79,15 @@ def run_study(
     for name in names:
         refuse_smoothed(name, "the filters of this table do not")
     set_threads(settings.fit)
-    with _timed(seconds, "tuning"):
+    with _time(seconds, "tuning"):
         baselines = _baselines(settings, data, say)
-    with _timed(seconds, "training"):
+    with _time(seconds, "training"):
         card = model_card(settings, data, getattr(logger, "run_id", None))
         model = model_on_baseline(settings.fit.model, baselines)
-        (folder / MODEL).write_text(yaml.safe_dump(model.plain(), sort_keys=False))  # for further processes
+        (folder / MODEL).write_text(yaml.safe_dump(model.as_dict(), sort_keys=False))  # for further processes
         on_baseline, mean = replace(settings.fit, model=model), baselines.prior.mean
         weights = fit(on_baseline, data, folder, logger, mean_imu_error=mean, notes=card, further=further)
-    with _timed(seconds, "scoring"):
+    with _time(seconds, "scoring"):
         shipped = {name: trained_filter(name) for name in names if shipped_folder(name)}
         filters = {**baselines.build(), **shipped, learned: load_filter(weights)}
         scenes = Scenes.of_split(data, "test", plan, scoring.seed)
@@ -97,10 +97,10 @@ def run_study(
         baseline = BASELINE if BASELINE in filters else None
         groups = {d.name: d.group for d in data.stack}
         run = run_scenes(filters, scenes, kinds=kinds, groups=groups, law=scoring.injected_bias, seed=scoring.seed)
-        scores, made = run.scores, results_of(run, settle_s=scoring.settle_s, seed=scoring.seed)
+        scores, made = run.scores, make_results(run, settle_s=scoring.settle_s, seed=scoring.seed)
         title = ", ".join(Path(d).name for d in data.datasets)
         after, hour, tables = _endurance(filters, data, scoring, title, say)
-        gains = gains_of(filters, scenes, settle_s=scoring.settle_s) if scoring.gains else {}
+        gains = measure_gains(filters, scenes, settle_s=scoring.settle_s) if scoring.gains else {}
     noise = None if data.gnss_noise is None else asdict(data.gnss_noise)
     write_report(
         folder / "report",
@@ -113,7 +113,7 @@ def run_study(
             **scenes.describe(),
             "trained on": card,
             "gnss_noise": noise,
-            "left out": left_out_drives(settings, data),
+            "left out": list_left_out_drives(settings, data),
         },
         by_time=True,
         baseline=baseline,
@@ -130,7 +130,7 @@ def train_with_baselines(settings: StudySettings, data: DriveDataModule, folder:
     """The part of a further process of the same training: it writes, logs and scores nothing."""
     data.setup()
     set_threads(settings.fit)
-    model = learned_settings(read_yaml(folder / MODEL))
+    model = parse_learned_settings(read_yaml(folder / MODEL))
     fit(replace(settings.fit, model=model), data, folder, False)
 
 
@@ -141,10 +141,10 @@ def model_on_baseline(model: LearnedSettings, baselines: Baselines) -> LearnedSe
     return model.with_base(baselines.imu, baselines.tunings[model.base], baselines.priors.get(model.base))
 
 
-def left_out_drives(settings: StudySettings, data: DriveDataModule) -> list[str]:
+def list_left_out_drives(settings: StudySettings, data: DriveDataModule) -> list[str]:
     """A line for every side on drives that are too short for its segments, at the full length of a curriculum."""
     grown = [c.full_s for c in settings.fit.callbacks if isinstance(c, LengthCurriculum)]
-    return data.left_out(max(grown, default=data.train_length_s))
+    return data.list_left_out(max(grown, default=data.train_length_s))
 
 
 def set_threads(settings: FitSettings) -> None:
@@ -157,17 +157,17 @@ def _baselines(settings: StudySettings, data: DriveDataModule, say: Say) -> Base
     """The classical filters, tuned on training segments for what is scored: ends of outages, after longer GNSS too
     where that is scored, or whole segments."""
     given, scoring = settings.baselines, settings.scoring
-    segments = Scenes.of_split(data, "train", scoring.outage, scoring.seed, given.segments).withheld()
+    segments = Scenes.of_split(data, "train", scoring.outage, scoring.seed, given.segments).withhold()
     for first_s in scoring.after_s:
         limit = given.segments and max(1, given.segments // len(scoring.after_s))
         if scenes := scenes_after_gnss(data, "train", first_s, scoring.seed, limit):
-            segments += scenes.withheld()
-    longer = Scenes.of_long_segments(data, "train", scoring.seed).withheld()
+            segments += scenes.withhold()
+    longer = Scenes.of_long_segments(data, "train", scoring.seed).withhold()
     classical = [name for name in given.models if not shipped_folder(name)]
     rounds = given.rounds if given.tune else 0
     objective = "log" if scoring.outage else PVA
     tuning = {"rounds": rounds, "start": given.tuning, "objective": objective, "longer": longer}
-    return tuned_baselines(classical, settings.imu, segments, **tuning, say=say)
+    return tune_baselines(classical, settings.imu, segments, **tuning, say=say)
 
 
 def _endurance(
@@ -217,7 +217,7 @@ def model_card(settings: StudySettings, data: DriveDataModule, run: str | None) 
 
 
 @contextmanager
-def _timed(seconds: dict[str, float], what: str) -> Iterator[None]:
+def _time(seconds: dict[str, float], what: str) -> Iterator[None]:
     clock = time.perf_counter()
     yield
     seconds[what] = time.perf_counter() - clock

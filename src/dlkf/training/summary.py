@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from dlkf.evaluation.summary import describe_verdict, headline, metrics_of
+from dlkf.evaluation.summary import collect_metrics, describe_verdict, headline
 from dlkf.evaluation.table import all_tables, as_markdown
 from dlkf.training.settings import StudySettings
 from dlkf.training.study import TrainingOutcome
@@ -13,7 +13,7 @@ from dlkf.training.study import TrainingOutcome
 
 def key_metrics(outcome: TrainingOutcome) -> dict[str, float]:
     """``test/<filter>/…`` for the MLflow comparison, and times."""
-    metrics = {f"time/{k}_s": v for k, v in outcome.seconds.items()} | metrics_of(outcome.results)
+    metrics = {f"time/{k}_s": v for k, v in outcome.seconds.items()} | collect_metrics(outcome.results)
     for a in outcome.after:
         for name, row in a.filters.items():
             metrics |= {f"test/{name}/after_{a.seconds:g}_s/{k}": v for k, v in row.items()}

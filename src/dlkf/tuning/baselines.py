@@ -14,7 +14,7 @@ from dlkf.filters.build import build_causal, build_filter, has_prior
 from dlkf.filters.smoother import Filter
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.tuning.search import best_prior, drop_prior, evaluate_objective, factors_of, tune_filter
+from dlkf.tuning.search import best_prior, drop_prior, evaluate_objective, list_factors, tune_filter
 
 FIRST = "mbkf15"  # where the others' search starts, and what the mean IMU error is estimated with
 
@@ -41,7 +41,7 @@ class Baselines:
         }
 
 
-def tuned_baselines(
+def tune_baselines(
     names: Sequence[str],
     imu: ImuSpec,
     batches: Sequence[Batch],
@@ -56,7 +56,7 @@ def tuned_baselines(
     ``rounds`` leave the factors at ``start``.
 
     The search for ``mbkf15`` begins at ``start``. All others but ``ins`` begin at the factors of ``mbkf15``, and search
-    over their own (:func:`dlkf.tuning.search.factors_of`). One with ``_prior`` begins at those of the same filter
+    over their own (:func:`dlkf.tuning.search.list_factors`). One with ``_prior`` begins at those of the same filter
     without or at ``start``, with the prior that is best then, found on ``longer`` segments with GNSS throughout.
     """
     untuned = start or Tuning()
@@ -100,7 +100,7 @@ def _search_with_progress(
     prior: Prior | None = None,
 ) -> tuple[Tuning, float]:
     """A search under a bar of its own: it takes minutes on much data."""
-    most, done = rounds * sum(map(len, factors_of(name).values())), count(1)
+    most, done = rounds * sum(map(len, list_factors(name).values())), count(1)
     with show_progress(f"Tuning {name}") as bar:
         given = {"name": name, "rounds": rounds, "objective": objective, "start": start, "prior": prior}
         return tune_filter(imu, batches, **given, progress=lambda _: bar(next(done), most))

@@ -64,7 +64,7 @@ class Trial(NamedTuple):
     score: float
 
 
-def factors_of(name: str) -> dict[str, tuple[float, ...]]:
+def list_factors(name: str) -> dict[str, tuple[float, ...]]:
     """The factors of a filter that a search tries, and their values."""
     found = dict(FACTORS)
     kind, *aids = name.split("+")
@@ -129,7 +129,7 @@ def tune_filter(
     score = evaluate(best)
     for _ in range(rounds):
         before = best
-        for factor, values in (factors or factors_of(name)).items():
+        for factor, values in (factors or list_factors(name)).items():
             now = getattr(best, factor)
             up, down = sorted(v for v in values if v > now), sorted((v for v in values if v < now), reverse=True)
             for side in (up, down):

@@ -23,7 +23,7 @@ from dlkf.evaluation.table import ResultTable, as_markdown, format_number
 from dlkf.filters.build import build_causal, has_prior, is_filter
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.tuning.search import Trial, evaluate_objective, factors_of, tune_filter
+from dlkf.tuning.search import Trial, evaluate_objective, list_factors, tune_filter
 
 LIKELIHOOD = "likelihood"  # the objective that needs no reference (dlkf.tuning.found)
 OF_OUTAGES = "log, rms, median: horizontal error at the end of the outages [m], geometric mean, RMS, median over them."
@@ -98,7 +98,7 @@ def withhold_outages(
     none fits.
     """
     scenes = Scenes(drives, protocol, limit=segments)
-    kept = scenes.withheld()
+    kept = scenes.withhold()
     if left_out is not None:
         short = [describe_short(scenes.short, len(drives), protocol)] if scenes.short else []
         left_out += [*scenes.skipped.values(), *short]
@@ -125,7 +125,7 @@ def search(
     left_out: list[str] = []
     training = withhold_outages(drives["train"], protocol, segments, left_out)
     trials: list[Trial] = []
-    most = rounds * sum(map(len, factors_of(model).values()))
+    most = rounds * sum(map(len, list_factors(model).values()))
     with show_progress(f"Tuning {model}") as progress:
 
         def tell(trial: Trial) -> None:

@@ -13,7 +13,7 @@ from dlkf.data.store import load_dataset
 from dlkf.navigation.attitude import rotation_from_rpy, vector_from_rotation
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
-from dlkf.running.start import align, aligned_drives, entry
+from dlkf.running.start import align, align_drives, entry
 from tests.cars import REAL
 
 
@@ -263,7 +263,7 @@ def test_the_start_is_the_first_moment_it_can_be(drive):
     assert align(drive, earliest=33).first == 33
     state = align(drive).state
     assert state.p_n.abs().max() == 0 and state.C_nb.dtype == torch.float64
-    batch = aligned_drives([drive, drive])
+    batch = align_drives([drive, drive])
     assert batch.size[:2] == (2, 60 - align(drive).first) and batch.start.v_n.shape == (2, 3)
     error = batch.truth.v_n[:, 0] - batch.start.v_n
     assert error.norm(dim=-1).max() < 5  # a second later

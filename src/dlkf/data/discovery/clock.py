@@ -72,7 +72,7 @@ class ImuSums:
         part = slice(*np.searchsorted(self.t, (first_s, last_s)))
         return ImuSums(self.t[part], self.sums[part])
 
-    def reached(self, at: Floats) -> Floats:
+    def interpolate(self, at: Floats) -> Floats:
         """The integrals (m, 7) at given times, linear between samples."""
         i = np.clip(np.searchsorted(self.t, at, side="right") - 1, 0, len(self.t) - 2)
         share = np.clip((at - self.t[i]) / (self.t[i + 1] - self.t[i]), 0.0, 1.0)
@@ -110,12 +110,12 @@ def find_lag(imu: ImuSums, gnss: Motion, within_s: float | None = None) -> Lag |
     others = np.where(np.abs(lags - lags[best]) > NEIGHBOUR_S, gain, -np.inf)
     rival = int(others.argmax())
     other = float(others[rival]) if np.isfinite(others[rival]) else 0.0
-    peak = lags[best] + STEP_S * _between(gain[best - 1 : best + 2])
+    peak = lags[best] + STEP_S * _find_peak(gain[best - 1 : best + 2])
     numbers = (lags[best], gain[best], other, yaws[best], forces[best], angles[best], peak)
     return Lag(*(float(x) for x in numbers))
 
 
-def _between(three: Floats) -> float:
+def _find_peak(three: Floats) -> float:
     """Where the parabola through three values has its peak, in steps from the middle one."""
     if len(three) < 3 or not np.isfinite(three).all():
         return 0.0
@@ -123,7 +123,7 @@ def _between(three: Floats) -> float:
     return float(np.clip(0.5 * (three[0] - three[2]) / bend, -0.5, 0.5)) if bend < 0 else 0.0
 
 
-def known_offset(lag_s: float) -> str:
+def describe_offset(lag_s: float) -> str:
     """What an offset is known for."""
     weeks = round(lag_s / WEEK_S)
     rest = lag_s - weeks * WEEK_S
@@ -164,7 +164,7 @@ def _imu_signals(imu: ImuSums, width_s: float) -> tuple[Floats, Complex, Floats,
     grid = np.arange(imu.t[0] + width_s / 2, imu.t[-1] - width_s / 2, STEP_S)
     if len(grid) < 2:
         grid = np.array([imu.t[0], imu.t[0] + STEP_S])
-    means = ((imu.reached(grid + width_s / 2) - imu.reached(grid - width_s / 2)) / width_s).T
+    means = ((imu.interpolate(grid + width_s / 2) - imu.interpolate(grid - width_s / 2)) / width_s).T
     force: Complex = e1 @ means[1:4] + 1j * (np.cross(-up, e1) @ means[1:4])
     return -up @ means[4:], force, (means[0] > 0.9).astype(float), float(grid[0])
 
@@ -184,19 +184,19 @@ def _scores(
     r, a, g, f = r * weight, a * weight, yaw / scale * there, force / pull * there
     r2, a2, g2, f2 = (np.abs(x) ** 2 for x in (r, a, g, f))
 
-    def lagged(spectra: np.ndarray) -> np.ndarray:
+    def correlate(spectra: np.ndarray) -> np.ndarray:
         """Sums of products over all lags, rows from those of their spectra; half a spectrum is a real signal's."""
         out = np.fft.ifft(spectra) if spectra.shape[1] == size else np.fft.irfft(spectra, size)
         return np.concatenate((out[:, size - len(weight) + 1 :], out[:, : len(there)]), 1)
 
     W, R, R2, A2 = np.fft.rfft((weight, r, r2, a2), size).conj()
     M, G, G2, F2 = np.fft.rfft((there, g, g2, f2), size)
-    n, *real = lagged(np.stack((W * M, R * M, W * G, R * G, R2 * M, W * G2, A2 * M, W * F2)))
+    n, *real = correlate(np.stack((W * M, R * M, W * G, R * G, R2 * M, W * G2, A2 * M, W * F2)))
     W, A = np.fft.fft((weight, a), size).conj()
     M, F = np.fft.fft((there, f), size)
     count, n = np.round(np.maximum(n, 1e-9)), np.maximum(n, 1.0)
     mean_r, mean_g, rg, mean_r2, mean_g2, mean_a2, mean_f2 = (x / n for x in real)
-    mean_a, mean_f, af = lagged(np.stack((A * M, W * F, A * F))) / n
+    mean_a, mean_f, af = correlate(np.stack((A * M, W * F, A * F))) / n
 
     def spread(mean: np.ndarray, mean2: Floats, least: float) -> Floats:
         return np.maximum(mean2 - np.abs(mean) ** 2, least)

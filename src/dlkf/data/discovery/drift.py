@@ -28,7 +28,7 @@ class Ends(NamedTuple):
     drift: float
 
 
-def ends_apart(imu: ImuSums, gnss: Motion) -> Ends | None:
+def compare_ends(imu: ImuSums, gnss: Motion) -> Ends | None:
     """The drift by :func:`~dlkf.data.discovery.clock.find_lag` of both ends; None where one of them is not clear."""
     if len(gnss.t) < FEWEST:
         return None
@@ -57,10 +57,10 @@ def find_drifting_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag
     starts = []
     if abs(first.drift) > max(WORTH_A_LOOK * first.drift_std, LEAST_S / reach):
         starts.append((first.drift, first.lag_s))
-    ends = ends_apart(ImuSums.of(t - lag_s, accel, gyro), gnss)
+    ends = compare_ends(ImuSums.of(t - lag_s, accel, gyro), gnss)
     if ends is not None and abs(ends.drift) * reach > ROUGH_S:  # so far that the fit may see nothing of it
         starts.append((ends.drift, lag_s + 0.5 * (ends.first_s + ends.last_s)))
-    found = [_settled(t, accel, gyro, gnss, drift, lag) for drift, lag in starts]
+    found = [_settle_drift(t, accel, gyro, gnss, drift, lag) for drift, lag in starts]
     best = max((pose for pose in found if pose is not None), key=lambda pose: pose.explained, default=None)
     if best is None or best.explained < first.explained:
         return replace(first, drift=0.0)
@@ -69,7 +69,7 @@ def find_drifting_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag
     return replace(first, drift=0.0, doubt=best.drift if abs(best.drift) > DOUBTFUL * best.drift_std else 0.0)
 
 
-def _settled(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, drift: float, lag_s: float) -> Pose | None:
+def _settle_drift(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, drift: float, lag_s: float) -> Pose | None:
     """The pose on a clock that runs faster by ``drift``, and what is left of that taken off, until it is little."""
     pose = None
     for _ in range(ROUNDS):

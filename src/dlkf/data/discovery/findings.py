@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from dlkf.base.settings import Ranged
-from dlkf.data.discovery.clock import ImuSums, Lag, find_lag, known_offset
+from dlkf.data.discovery.clock import ImuSums, Lag, describe_offset, find_lag
 from dlkf.data.discovery.drift import ends_std, find_drifting_pose, middle
-from dlkf.data.discovery.motion import MOVING, Floats, Motion, motion_of, position_delay
+from dlkf.data.discovery.motion import MOVING, Floats, Motion, find_motion, position_delay
 from dlkf.data.discovery.orientation import Pose
 from dlkf.data.discovery.units import accel_units, nearest_unit, unit_left
 from dlkf.data.readers.units import ACCELERATION, RATE
@@ -84,7 +84,7 @@ def discover(
     if "imu.accel.unit" in wanted:
         finding, factor = find_accel_unit(accel, increments)
         out.append(finding)
-    moved = motion_of(gnss)
+    moved = find_motion(gnss)
     away = "imu.time.offset_s" in wanted or "gnss.time.offset_s" in wanted
     lag = find_lag(ImuSums.of(t, accel, gyro), moved, None if away else 2.0)
     if "imu.accel.unit" in wanted:  # some devices give the reaction's opposite
@@ -180,7 +180,7 @@ def _offset(lag: Lag | None, pose: Pose | None, wanted: set[str], sure: Sure, be
     value = 0.0 if hardly and not pose.drift else pose.lag_s - pose.drift * before_s
     detail = (
         f"{sign * pose.lag_s:+.3f} ± {pose.lag_std:.3f} s in the middle of the drive, ± {at_ends:.3f} at its ends, "
-        f"a delay of GNSS's velocities included; {peak}{known_offset(pose.lag_s)}"
+        f"a delay of GNSS's velocities included; {peak}{describe_offset(pose.lag_s)}"
     )
     wide = f"reader.sure.time_s={math.ceil(250 * at_ends + 1) / 100:g}" if lag.clear else ""
     return Finding(setting, round(sign * value, 4), certain, detail, wide, std=at_ends)

@@ -64,7 +64,7 @@ def motion(t: Floats, lat_deg: Floats, lon_deg: Floats, v_ned: Floats) -> Motion
     return Motion(t[known], v, np.clip(climb, -0.3, 0.3), stride=_stride(t[known]))
 
 
-def motion_of(fixes: Columns | pd.DataFrame) -> Motion:
+def find_motion(fixes: Columns | pd.DataFrame) -> Motion:
     """:func:`motion` of the usable rows of a GNSS table."""
     t, lat, lon = (np.asarray(fixes[c]) for c in ("t", "lat_deg", "lon_deg"))
     return motion(t, lat, lon, stack_columns(fixes, VELOCITY))
@@ -90,14 +90,14 @@ def _stride(t: Floats) -> int:
     return max(1, int(np.ceil(SHORTEST_STEP_S / max(step, 1e-3) - 0.01)))
 
 
-def _thinned(t: Floats, good: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _thin_rows(t: Floats, good: NDArray[np.bool_]) -> NDArray[np.int64]:
     rows = np.flatnonzero(good)
     return rows[:: _stride(t[rows])]
 
 
 def _from_positions(t: Floats, lat_deg: Floats, lon_deg: Floats) -> Motion:
     """Velocity between two fixes, at the middle of their interval."""
-    rows = _thinned(t, np.isfinite(t))
+    rows = _thin_rows(t, np.isfinite(t))
     t, moved = t[rows], displacements(lat_deg[rows], lon_deg[rows])
     step = np.diff(t)
     fine = (step > 0) & (step <= LONGEST_STEP_S)
@@ -111,7 +111,7 @@ def position_delay(t: Floats, lat_deg: Floats, lon_deg: Floats, v_ned: Floats) -
     Δp − ∫v dt = −δ Δv: what a turn or a braking car leaves between them.
     """
     good = np.isfinite(v_ned[:, :2]).all(-1) & np.isfinite(lat_deg) & np.isfinite(lon_deg)
-    rows = _thinned(t, good)
+    rows = _thin_rows(t, good)
     t, v = t[rows], v_ned[rows, 0] + 1j * v_ned[rows, 1]
     step = np.diff(t)
     fine = (step > 0) & (step < LONGEST_STEP_S)
@@ -160,7 +160,7 @@ class Levelled:
     axes: Floats  # (3, 3): rows e1, e2, down in the sensor's axes
 
 
-def _without_turn(across: Floats, about: Floats) -> Floats:
+def _gyro_biases(across: Floats, about: Floats) -> Floats:
     """Means of the gyroscopes across (n, 2) where the car does not turn ``about`` down: their biases.
 
     Their means are not: a car that leans in its turns, or is not quite level, turns about them too, and a loop of
@@ -171,7 +171,7 @@ def _without_turn(across: Floats, about: Floats) -> Floats:
     return mean - lean * about.mean()
 
 
-def levelled(t: Floats, accel: Floats, gyro: Floats, down: Floats) -> Levelled:
+def integrate_level(t: Floats, accel: Floats, gyro: Floats, down: Floats) -> Levelled:
     """Integrate samples that end at ``t`` (n,); ``accel`` [m/s²], ``gyro`` [rad/s] (n, 3), ``down`` a unit vector."""
     helper = np.eye(3)[int(np.abs(down).argmin())]
     e1 = helper - down * (helper @ down)
@@ -185,7 +185,7 @@ def levelled(t: Floats, accel: Floats, gyro: Floats, down: Floats) -> Levelled:
     middle = np.exp(0.5j * (turn[1:] + turn[:-1]))
     force = np.concatenate(([0.0], np.cumsum(middle * (f[:, 0] + 1j * f[:, 1]) * step)))
     ones = np.concatenate(([0.0], np.cumsum(middle * step)))
-    still = _without_turn(rates[:, :2], w)
+    still = _gyro_biases(rates[:, :2], w)
     pitching = middle * (rates[:, 1] - still[1] - 1j * (rates[:, 0] - still[0]))
     q = np.concatenate(([0.0], np.cumsum(pitching * step)))
     level = middle * (f[:, 0] + 1j * f[:, 1]) + f[:, 2] * 0.5 * (q[1:] + q[:-1])

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dlkf.base.angles import wrap_angle
-from dlkf.data.discovery.motion import MOVING, Complex, Floats, Levelled, Motion, levelled
+from dlkf.data.discovery.motion import MOVING, Complex, Floats, Levelled, Motion, integrate_level
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
 SPAN_S, STEP_S = 0.6, 0.04  # of the first scan round the coarse lag; the next ones are in quarters of a step
@@ -101,7 +101,7 @@ class _Equations:
         """The fit of the lag with the least residuals, by a parabola round the best."""
         step = STEP_S if span > 0.3 else STEP_S / 4
         lags = lag_s + np.arange(-round(span / step), round(span / step) + 1) * step
-        use = keep & self._covered(lags[0], lags[-1])
+        use = keep & self._is_covered(lags[0], lags[-1])
         if (use & self.parts.moving).sum() < FEWEST // 2:
             return None
         costs = np.array([self._residuals(lag, use)[-1] for lag in lags])
@@ -112,20 +112,20 @@ class _Equations:
             lag += float(np.clip(-0.5 * b / a, -span, span))
         return self._fit(lag, use)
 
-    def sound(self, lag: float) -> np.ndarray:
+    def reject_outliers(self, lag: float) -> np.ndarray:
         """Intervals without outliers of GNSS: residuals at most five medians, of a fit to all."""
-        use = self._covered(lag, lag)
+        use = self._is_covered(lag, lag)
         if not use.any():
             return use
         A, y, x, _ = self._residuals(lag, use)
         off = np.abs(y - A @ x)
         return off <= 5 * max(float(np.median(off[use])), 1e-3)
 
-    def _covered(self, least: float, most: float) -> np.ndarray:
+    def _is_covered(self, least: float, most: float) -> np.ndarray:
         """Intervals that lie inside the IMU's time at all lags from ``least`` to ``most``."""
         return (self.parts.t0 + least >= self.level.t[0]) & (self.parts.t1 + most <= self.level.t[-1])
 
-    def _gained(self, values: np.ndarray, lag: float) -> np.ndarray:
+    def _differences(self, values: np.ndarray, lag: float) -> np.ndarray:
         """What values at the limits of the samples gain in each interval."""
         t = self.level.t
         return np.interp(self.parts.t1 + lag, t, values) - np.interp(self.parts.t0 + lag, t, values)
@@ -137,11 +137,11 @@ class _Equations:
 
     def _design(self, lag: float, force: Complex, slope: float) -> tuple[Complex, Complex]:
         """Columns (α, α b, λ) and left side; ``slope`` 1 to take the way's slope from GNSS."""
-        hold = np.exp(1j * self._held(lag))
-        design = np.stack([hold * self._gained(x, lag) for x in (force, self.level.ones, self.level.swing)], -1)
+        hold = np.exp(1j * self._heading_offset(lag))
+        design = np.stack([hold * self._differences(x, lag) for x in (force, self.level.ones, self.level.swing)], -1)
         return design, self.parts.dv + slope * self.parts.slope
 
-    def _held(self, lag: float) -> Floats:
+    def _heading_offset(self, lag: float) -> Floats:
         """Heading minus turn in the middle of the intervals: averaged over seconds, weighted by speed."""
         gnss, level = self.gnss, self.level
         rows = np.arange(len(gnss.t))[:: gnss.stride]
@@ -165,7 +165,7 @@ class _Equations:
         sum of the rows in use."""
         if lag not in self._made:
             self._made[lag] = self._design(lag, self.level.tilted, 0.0)
-        quick = _quick(np.column_stack(self._made[lag]), use, self.parts.stride)
+        quick = _remove_slow(np.column_stack(self._made[lag]), use, self.parts.stride)
         A, y = quick[:, :-1], quick[:, -1]
         x, *_ = np.linalg.lstsq(A[use], y[use], rcond=None)
         return A, y, x, float(np.sum(np.abs(y[use] - A[use] @ x) ** 2)) + 1e-9
@@ -186,7 +186,7 @@ class _Equations:
         turning = use & parts.moving
         rate0, rate1 = self._rates(parts.t0 + lag), self._rates(parts.t1 + lag)
         v0, v1 = np.maximum(parts.v0, MOVING), np.maximum(parts.v1, MOVING)
-        turn = self._gained(self.level.turn, lag)
+        turn = self._differences(self.level.turn, lag)
         columns = (turn, parts.t1 - parts.t0, rate1 / v1 - rate0 / v0, rate1 * v1 - rate0 * v0)
         B = np.column_stack(columns)[turning] * parts.weight[turning, None]
         z = parts.turned[turning] * parts.weight[turning]
@@ -215,9 +215,9 @@ def find_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float
     lag, fit, level, slip = lag_s, None, None, (0.0, 0.0)
     good = np.ones(len(parts.t0), bool)
     for span in (SPAN_S, 0.1, 0.06):
-        level = levelled(t, accel, gyro * unit, down)
+        level = integrate_level(t, accel, gyro * unit, down)
         equations = _Equations(level, gnss, parts, slip)
-        good = equations.sound(lag)
+        good = equations.reject_outliers(lag)
         fit = equations.scan(lag, span, good)
         if fit is None:
             return None
@@ -319,7 +319,7 @@ def _gyro_scale(t: Floats, rate: Floats, parts: _Intervals, lag_s: float) -> flo
     return float(slope) if slope > 0 else None
 
 
-def _quick(columns: Complex, use: np.ndarray, stride: int) -> Complex:
+def _remove_slow(columns: Complex, use: np.ndarray, stride: int) -> Complex:
     """Columns less their mean over ``SLOW_ROWS`` round each row, of the rows in use: tilt drifts, cars do not wait."""
     from scipy.ndimage import gaussian_filter1d
 

@@ -41,8 +41,8 @@ def find_wheel(t: Floats, speed: Floats, gnss: Motion) -> Wheel | None:
     t, speed = t[good], np.abs(speed[good])
     if len(t) < 20 or len(gnss.t) < 20 or np.ptp(speed) == 0 or np.ptp(gnss.speed) < MOVING:
         return None
-    wheel, here = _gridded(t, speed)
-    ground, there = _gridded(gnss.t, gnss.speed)
+    wheel, here = _resample(t, speed)
+    ground, there = _resample(gnss.t, gnss.speed)
     alike, count = _correlations(wheel, here, ground, there)
     lags = (np.arange(len(alike)) - (len(wheel) - 1)) * STEP_S + gnss.t[0] - t[0]
     allowed = count * STEP_S >= min(LEAST_S, 0.5 * min(np.ptp(t), np.ptp(gnss.t)))
@@ -55,7 +55,7 @@ def find_wheel(t: Floats, speed: Floats, gnss: Motion) -> Wheel | None:
     return _between(t, speed, gnss, float(lags[best]), bool(clear))
 
 
-def _gridded(t: Floats, v: Floats) -> tuple[Floats, Floats]:
+def _resample(t: Floats, v: Floats) -> tuple[Floats, Floats]:
     """Speeds on the grid from the first stamp on, and 1 where there are samples near."""
     grid = np.arange(t[0], t[-1] + STEP_S / 2, STEP_S)
     nearest = np.abs(t[np.clip(np.searchsorted(t, grid), 0, len(t) - 1)] - grid)
@@ -69,15 +69,15 @@ def _correlations(a: Floats, a_there: Floats, b: Floats, b_there: Floats) -> tup
 
     size = fft.next_fast_len(len(a) + len(b) - 1)
 
-    def against(x: Floats, y: Floats) -> Floats:
+    def correlate(x: Floats, y: Floats) -> Floats:
         out = fft.irfft(np.conj(fft.rfft(x, size)) * fft.rfft(y, size), size)
         return np.concatenate((out[size - len(a) + 1 :], out[: len(b)]))
 
     a, b = (a - np.average(a, weights=a_there)) * a_there, (b - np.average(b, weights=b_there)) * b_there
-    count = np.maximum(np.round(against(a_there, b_there)), 1.0)
-    mean_a, mean_b = against(a, b_there) / count, against(a_there, b) / count
-    covariance = against(a, b) / count - mean_a * mean_b
-    power = [against(a * a, b_there) / count - mean_a**2, against(a_there, b * b) / count - mean_b**2]
+    count = np.maximum(np.round(correlate(a_there, b_there)), 1.0)
+    mean_a, mean_b = correlate(a, b_there) / count, correlate(a_there, b) / count
+    covariance = correlate(a, b) / count - mean_a * mean_b
+    power = [correlate(a * a, b_there) / count - mean_a**2, correlate(a_there, b * b) / count - mean_b**2]
     least = [1e-3 * float((x * x).mean()) + 1e-12 for x in (a, b)]
     return covariance / np.sqrt(np.maximum(power[0], least[0]) * np.maximum(power[1], least[1])), count
 

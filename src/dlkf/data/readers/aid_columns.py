@@ -52,7 +52,7 @@ def aid_specs(table: LogTable, numbers: pd.DataFrame, called: str, time: Spec | 
 
 def _wheel_value(numbers: pd.DataFrame, columns: list[str]) -> Spec:
     """Columns with the unit that their name states, else left to GNSS; what never falls and is called so counts on."""
-    unit = vocabulary.unit_of(columns[0])
+    unit = vocabulary.find_unit(columns[0])
     counted = vocabulary.has(columns[0], vocabulary.COUNTED) and unit not in SPEED_UNITS
     if counted and unit not in COUNTS:
         return {

@@ -11,8 +11,8 @@ import pandas as pd
 
 from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
-from dlkf.data.discovery.clock import known_offset
-from dlkf.data.discovery.motion import Motion, motion_of
+from dlkf.data.discovery.clock import describe_offset
+from dlkf.data.discovery.motion import Motion, find_motion
 from dlkf.data.discovery.wheel import Wheel, find_wheel
 from dlkf.data.readers import units
 from dlkf.data.readers.mapping import Mapped
@@ -42,9 +42,9 @@ def read_aids(
     found. InputError where they are not clear.
     """
     frames, specs, notes = {}, {}, []
-    moved = None if fixes is None or len(fixes) < 3 else motion_of(fixes[usable_fixes(fixes)])
+    moved = None if fixes is None or len(fixes) < 3 else find_motion(fixes[usable_fixes(fixes)])
     for name, part in mapped.items():
-        spec, found = _settled(name, part, zero, gnss, moved, f"{where}: {part.table.path.name}")
+        spec, found = _settle_auto(name, part, zero, gnss, moved, f"{where}: {part.table.path.name}")
         done = Mapped(part.table, spec, name, part.parts)
         frames[name], specs[name] = aid_frame(name, done, _times(done, zero)), spec
         if not len(frames[name]):
@@ -61,7 +61,7 @@ def _times(mapped: Mapped, zero: int) -> np.ndarray:
     return (whole - zero) + part
 
 
-def _settled(
+def _settle_auto(
     name: str, mapped: Mapped, zero: int, gnss: Mapped | None, moved: Motion | None, where: str
 ) -> tuple[dict[str, Any], list[str]]:
     """Offset and unit that are left ``auto``: of a table beside the fixes as those have it, of a wheel by its speed."""
@@ -96,7 +96,7 @@ def _settled(
         found = 0.0 if abs(wheel.lag_s) < 3 * wheel.lag_std else round(wheel.lag_s, 4)
         time["offset_s"] = found
         detail = f"{wheel.lag_s:+.3f} ± {wheel.lag_std:.3f} s, speeds agree to {wheel.alike:.3f} of 1"
-        notes.append(f"found reader.speed.time.offset_s={found}  ({detail}{known_offset(wheel.lag_s)})")
+        notes.append(f"found reader.speed.time.offset_s={found}  ({detail}{describe_offset(wheel.lag_s)})")
     if value.get("unit") == AUTO:
         value["unit"], detail = _unit(wheel, _counts(neutral))
         notes.append(f"found reader.speed.value.unit={value['unit']}  ({detail})")
@@ -120,11 +120,11 @@ def _speed(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
     values = np.nanmean(mapped.vector("value", tuple(range(1, 9)), nan=True), axis=1)
     unit = entry.get("unit") or "m/s"
     if _counts(mapped):
-        values = _gained(values)
+        values = _count_steps(values)
         t, values = (t[1:] + t[:-1]) / 2, values / np.maximum(np.diff(t), 1e-9)
-    out = pd.DataFrame({"t": t, "speed": values * _metres(entry, unit)})
+    out = pd.DataFrame({"t": t, "speed": values * _metres_per_unit(entry, unit)})
     if mapped.has("std") and len(out) == len(mapped):
-        out["std"] = mapped.vector("std", (1,), nan=True)[:, 0] * _metres(entry, unit)
+        out["std"] = mapped.vector("std", (1,), nan=True)[:, 0] * _metres_per_unit(entry, unit)
     return out
 
 
@@ -137,7 +137,7 @@ def _counts(mapped: Mapped) -> bool:
     return next((name for name in first if name in mapped.table.frame), "") == "ticks"
 
 
-def _gained(values: np.ndarray) -> np.ndarray:
+def _count_steps(values: np.ndarray) -> np.ndarray:
     """Differences of counters, which begin again at a power of two."""
     step = np.diff(values)
     top = float(np.nanmax(np.abs(values), initial=1.0))
@@ -145,7 +145,7 @@ def _gained(values: np.ndarray) -> np.ndarray:
     return np.where(step < -wrap / 2, step + wrap, np.where(step > wrap / 2, step - wrap, step))
 
 
-def _metres(entry: Mapping[str, Any], unit: Any) -> float:
+def _metres_per_unit(entry: Mapping[str, Any], unit: Any) -> float:
     """Metres (a second) per unit: of ticks by ``per_metre``, or by ``per_turn`` and ``radius_m``; of turns by the
     radius."""
     where = "reader.speed.value"

@@ -21,7 +21,7 @@ def is_archive(path: Path) -> bool:
 
 
 @contextmanager
-def unpacked(path: Path) -> Iterator[Path]:
+def unpack(path: Path) -> Iterator[Path]:
     """A folder as it is; of a .zip a folder with its files, gone afterwards, past folders that hold one folder alone.
 
     InputError for a damaged archive, and one that unpacks to more than a log can be.

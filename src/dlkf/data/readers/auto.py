@@ -9,11 +9,20 @@ from typing import Any
 
 from dlkf.base.errors import InputError
 from dlkf.data.readers import formats, recognise
-from dlkf.data.readers.archives import drive_name, drive_places, is_archive, unpacked
+from dlkf.data.readers.archives import drive_name, drive_places, is_archive, unpack
 from dlkf.data.readers.formats import rosbag
 from dlkf.data.readers.frames import DriveFrames, Place
 from dlkf.data.readers.logs import LogReader
-from dlkf.data.readers.offers import NO_LOGS, Contents, Offer, contents, find_format, leave_open, preset, text_options
+from dlkf.data.readers.offers import (
+    NO_LOGS,
+    Contents,
+    Offer,
+    find_format,
+    leave_open,
+    load_preset,
+    recognise_file,
+    text_options,
+)
 from dlkf.data.readers.settling import Unsure
 from dlkf.data.readers.sharing import merge_settings
 
@@ -61,49 +70,49 @@ class AutoReader:
         if is_archive(source):
             return [(source, self.drive or drive_name(source), None)]
         if source.is_file():
-            source, only = source.parent, _whole_bag(source)
+            source, only = source.parent, _find_bag(source)
         else:
             only = None
         if not source.is_dir():
             raise InputError(f"source={source}: no such file or folder; it holds one drive, or one subfolder per drive")
-        within = None if only is not None else _contents_of(source)
+        within = None if only is not None else _recognise_files(source)
         if within is None or any(one.offers for one in within):
             named = source.absolute() if only is None or only.name == "metadata.yaml" else only
             return [(source, self.drive or named.name.partition(".")[0], only)]
         if not (places := drive_places(source)):
             raise InputError(
-                f"source={source}: holds no log that can be recognised{_held(within)}; name a reader and its columns, "
-                "reader=csv reader.imu.file=… reader.gnss.file=…"
+                f"source={source}: holds no log that can be recognised{_describe_files(within)}; name a reader and "
+                "its columns, reader=csv reader.imu.file=… reader.gnss.file=…"
             )
         return [(place, drive_name(place), None) for place in places]
 
-    def sharing(self, settings: Mapping[str, Any]) -> AutoReader:
+    def with_settings(self, settings: Mapping[str, Any]) -> AutoReader:
         """The same reader, with settings found from other drives; settings given before still win."""
         known = {kind: merge_settings(settings.get(kind, {}), spec) for kind, spec in self.known.items()}
         return AutoReader(drive=self.drive, **known, **self.rest)
 
     def drive_at(self, folder: Path, name: str, only: Path | None = None) -> DriveFrames:
         """The drive of a place, by that name."""
-        with unpacked(folder) as inside:
+        with unpack(folder) as inside:
             return self._drive(inside, name, only)
 
     def _drive(self, folder: Path, name: str, only: Path | None) -> DriveFrames:
-        within = [contents(only)] if only is not None else _contents_of(folder)
+        within = [recognise_file(only)] if only is not None else _recognise_files(folder)
         specs, detail = {}, []
         for kind in ("imu", "gnss"):
-            chosen = self._chosen(within, kind, folder, only)
+            chosen = self._choose_offer(within, kind, folder, only)
             if chosen is None:
                 specs[kind] = {"file": None}
                 continue
             specs[kind] = merge_settings(chosen.specs[kind], self.known[kind])
             there = chosen.name if chosen.table else specs[kind].get("file") or chosen.name
             detail += [f"found the {kind} in {there}: {chosen.detail}", *chosen.notes]
-            if kind == "gnss" and (more := _velocities_beside(chosen, specs[kind], [] if only else folder.iterdir())):
+            if kind == "gnss" and (more := _find_velocities(chosen, specs[kind], [] if only else folder.iterdir())):
                 specs[kind]["velocity"] |= more
                 detail.append(f"found velocities in {more.get('table') or more['file']}")
         if (specs["gnss"].get("time") or {}).get("offset_s") is None and specs["gnss"].get("file"):
             specs["gnss"]["time"]["offset_s"] = "auto"
-        if not specs["gnss"].get("file") and (foreign := _foreign(within, only)):
+        if not specs["gnss"].get("file") and (foreign := _find_unread(within, only)):
             if foreign.held.startswith(DAMAGED):
                 raise InputError(f"{foreign.path}: {foreign.held}; or take it away where this is a log at rest")
             what = "it is empty" if foreign.held == "empty" else foreign.held
@@ -117,21 +126,21 @@ class AutoReader:
             detail += notes
         if not specs["gnss"].get("file"):
             rest["lever_arm_m"] = [0.0, 0.0, 0.0]
-            detail += _taken_at_rest(specs["imu"])
+            detail += _settle_at_rest(specs["imu"])
         reader = LogReader(specs["imu"], specs["gnss"], drive=name, **rest)
         try:
             drive = reader.drive_at(folder, name)
         except Unsure as unsure:
-            other = Unsure(f"{unsure}{_preset_that_fits(specs)}")
+            other = Unsure(f"{unsure}{_suggest_preset(specs)}")
             other.layout, other.offset_s = unsure.layout, unsure.offset_s
             raise other from None
         return replace(drive, notes=(*dict.fromkeys(detail), *drive.notes))
 
-    def _chosen(self, within: list[Contents], kind: str, folder: Path, only: Path | None) -> Offer | None:
+    def _choose_offer(self, within: list[Contents], kind: str, folder: Path, only: Path | None) -> Offer | None:
         offers = [o for one in within for o in one.offers]
         fits = [o for o in offers if kind in o.specs]
         if not fits and kind == "imu":
-            fits = _joined_sensors(offers)
+            fits = _join_sensors(offers)
         if (file := self.known[kind].get("file")) is not None:
             fits = [o for o in fits if o.path.match(str(file))]
             if not fits:
@@ -148,7 +157,7 @@ class AutoReader:
                 "name the reader and its columns (reader=csv reader.imu.file=… 'reader.imu.accel.columns=[…]' …)"
             )  # fmt: skip
             where = only.parent if only is not None else folder
-            raise InputError(f"{where}: no IMU found{_held(within, offers)}; {remedy}")
+            raise InputError(f"{where}: no IMU found{_describe_files(within, offers)}; {remedy}")
         return fits[0] if fits else None
 
     def _aid(self, within: list[Contents], kind: str, folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
@@ -169,29 +178,29 @@ class AutoReader:
         if not fits and file is None:
             return None, []
         if not fits:
-            return merge_settings(leave_open({kind: preset("csv")[kind]})[kind], known), []
+            return merge_settings(leave_open({kind: load_preset("csv")[kind]})[kind], known), []
         spec = merge_settings(fits[0].specs[kind], known)
         columns = [c for key in ("value", "pressure", "height") for c in (spec.get(key) or {}).get("columns") or []]
         return spec, [f"found {kind} in {fits[0].name}: {', '.join(map(str, columns))}"]
 
 
-def _contents_of(folder: Path) -> list[Contents]:
+def _recognise_files(folder: Path) -> list[Contents]:
     """What the files of a folder hold; of one whose files are known by their names, that."""
     for name, file in LAYOUTS.items():
         if (folder / file).is_file():
             if name == "phyphox" and not (folder / "Location.csv").is_file():
                 continue
-            base = preset(name)
+            base = load_preset(name)
             specs = {kind: base[kind] for kind in ("imu", "gnss")}
             beside = BAROMETERS.get(name, "")
             specs = leave_open(specs)
             if beside and (folder / beside).is_file():  # by the clock of the IMU
                 specs["baro"] = {**base["baro"], "file": beside}
             return [Contents(folder / file, [Offer(folder / file, f"layout of {name}", specs)])]
-    return [contents(p) for p in sorted(folder.iterdir()) if p.is_file() and not p.name.startswith(".")]
+    return [recognise_file(p) for p in sorted(folder.iterdir()) if p.is_file() and not p.name.startswith(".")]
 
 
-def _held(within: Iterable[Contents], offers: Iterable[Offer] = ()) -> str:
+def _describe_files(within: Iterable[Contents], offers: Iterable[Offer] = ()) -> str:
     """What stands in the files, for a line that refuses them."""
     given = {o.path: o.detail for o in offers}
     said = [f"{one.path.name} ({one.held or given.get(one.path, 'fixes')})" for one in within]
@@ -201,7 +210,7 @@ def _held(within: Iterable[Contents], offers: Iterable[Offer] = ()) -> str:
     return f" in {'; '.join(said[:MOST_HELD])}{more}"
 
 
-def _joined_sensors(offers: list[Offer]) -> list[Offer]:
+def _join_sensors(offers: list[Offer]) -> list[Offer]:
     """An accelerometer and a gyroscope that lie in tables of their own as an IMU."""
     alone = {key: [o for o in offers if o.sensor is not None and o.sensor["key"] == key] for key in ("accel", "gyro")}
     if any(len(found) != 1 for found in alone.values()):
@@ -215,7 +224,7 @@ def _joined_sensors(offers: list[Offer]) -> list[Offer]:
     return [Offer(accel.path, detail, specs, notes=(*accel.notes, *gyro.notes), table=accel.table)]
 
 
-def _taken_at_rest(imu: dict[str, Any]) -> list[str]:
+def _settle_at_rest(imu: dict[str, Any]) -> list[str]:
     """Settle what cannot be estimated without fixes, and report it."""
     detail = []
     for key in ("accel", "gyro"):
@@ -227,7 +236,7 @@ def _taken_at_rest(imu: dict[str, Any]) -> list[str]:
     return detail
 
 
-def _preset_that_fits(specs: Mapping[str, Any]) -> str:
+def _suggest_preset(specs: Mapping[str, Any]) -> str:
     """The preset of a program whose files are laid out so, for a line that refuses them."""
     imu, gnss = specs["imu"], specs["gnss"]
     columns = [*(imu["gyro"].get("columns") or []), *(imu["accel"].get("columns") or [])]
@@ -238,7 +247,7 @@ def _preset_that_fits(specs: Mapping[str, Any]) -> str:
     return ""
 
 
-def _whole_bag(path: Path) -> Path:
+def _find_bag(path: Path) -> Path:
     """Of a part of a ROS 2 bag its metadata.yaml; any other file itself."""
     if path.suffix != ".db3":
         return path
@@ -248,10 +257,10 @@ def _whole_bag(path: Path) -> Path:
     return whole
 
 
-def _velocities_beside(chosen: Offer, gnss: Mapping[str, Any], files: Iterable[Path]) -> dict[str, Any] | None:
+def _find_velocities(chosen: Offer, gnss: Mapping[str, Any], files: Iterable[Path]) -> dict[str, Any] | None:
     """Velocities for fixes without any: of the first text table of the same columns of time, or of the only topic."""
     if gnss.get("format") == "rosbag" and not gnss["velocity"].get("table") and gnss.get("table") is None:
-        topics = rosbag.velocities_beside(chosen.path)
+        topics = rosbag.find_velocities(chosen.path)
         if len(topics) > 1:
             raise InputError(
                 f"{chosen.path}: {', '.join(topics)} all hold velocities; choose one with reader.gnss.velocity.table"
@@ -273,7 +282,7 @@ def _velocities_beside(chosen: Offer, gnss: Mapping[str, Any], files: Iterable[P
     return None
 
 
-def _foreign(within: Iterable[Contents], only: Path | None) -> Contents | None:
+def _find_unread(within: Iterable[Contents], only: Path | None) -> Contents | None:
     """A text table or a receiver's log beside the IMU's file of which nothing is known; None where there is none."""
     unread = [one for one in within if not one.offers] if only is None else []
     logs = (

@@ -67,7 +67,7 @@ def gnss_spec(table: LogTable) -> Spec | None:
     taken = time["column"] if isinstance(time["column"], list) else [time["column"]]
     names = [str(c) for c in frame.columns if str(c) not in taken]
     values = frame[names].to_numpy(float)
-    t = stamps.seconds_of(table, time)
+    t = stamps.read_seconds(table, time)
     fits = []  # degrees, or u-blox' 1e-7 of them; latitude first, or longitude
     for scale, unit in ((1.0, "deg"), (1e-7, "1e-7deg")):
         for place in range(len(names) - 2):
@@ -130,25 +130,25 @@ def velocities(
     speed, course = np.hypot(north, east), np.degrees(np.arctan2(east, north))
     moving = np.isfinite(speed) & (speed > SLOWEST_COURSE)
 
-    def alike(k: int, with_what: np.ndarray) -> float:
+    def correlate(k: int, with_what: np.ndarray) -> float:
         good = np.isfinite(values[1:-1, k]) & np.isfinite(with_what)
         if good.sum() < 10 or np.ptp(values[1:-1, k][good]) == 0 or np.ptp(with_what[good]) == 0:
             return 0.0
         return float(np.corrcoef(values[1:-1, k][good], with_what[good])[0, 1])
 
-    by = {name: max(rest, key=lambda k: alike(k, what), default=None) for name, what in
+    by = {name: max(rest, key=lambda k: correlate(k, what), default=None) for name, what in
           (("north", north), ("east", east), ("speed", speed))}  # fmt: skip
     k, j = by["north"], by["east"]
-    if k is not None and j not in (None, k) and min(alike(k, north), alike(j, east)) > SPEED_AGREES:
+    if k is not None and j not in (None, k) and min(correlate(k, north), correlate(j, east)) > SPEED_AGREES:
         return {"columns": [names[k], names[j]], "frame": "ned"}
 
-    def turned(k: int) -> float:
+    def course_error(k: int) -> float:
         apart = wrap_angle(values[1:-1, k] - course, 180)
         apart = np.abs(apart[moving & np.isfinite(apart)])
         return float(np.median(apart)) if len(apart) > 10 else np.inf
 
-    heading = min((k for k in rest if k != by["speed"]), key=turned, default=None)
+    heading = min((k for k in rest if k != by["speed"]), key=course_error, default=None)
     k = by["speed"]
-    if k is None or heading is None or alike(k, speed) < SPEED_AGREES or turned(heading) > COURSE_AGREES_DEG:
+    if k is None or heading is None or correlate(k, speed) < SPEED_AGREES or course_error(heading) > COURSE_AGREES_DEG:
         return {"columns": None}
     return {"columns": [names[k], names[heading]], "frame": "course"}

@@ -51,7 +51,7 @@ def gnss_frame(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
     out = pd.DataFrame({**frame, "quality": np.where(fixed, _quality(mapped), 0).astype(np.int8)})
     late = float((mapped.spec.get("position") or {}).get("delay_s") or 0.0)
     if late:
-        out = _carried(out, late)
+        out = _carry_positions(out, late)
     every = mapped.spec.get("every_s")
     if every:
         turn = np.floor((t - t[0]) / float(every) + 1e-6)
@@ -68,7 +68,7 @@ def reference_frame(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
         frame |= dict(zip(ATTITUDE, _attitudes(mapped).T))
     valid = np.all([np.isfinite(frame[c]) for c in (*POSITION, *VELOCITY)], axis=0)
     if mapped.has("valid"):
-        marks = mapped.of("valid").column(mapped.spec["valid"]["column"], nan=True)
+        marks = mapped.find_part("valid").column(mapped.spec["valid"]["column"], nan=True)
         good = mapped.spec["valid"].get("values")
         valid &= np.isin(marks, good) if good else np.nan_to_num(marks) != 0
     return pd.DataFrame({**frame, "valid": valid})
@@ -92,7 +92,7 @@ def positions(mapped: Mapped) -> dict[str, np.ndarray]:
         lat, lon, height = _latitudes(mapped, spec.get("unit") == "ddmm")
         lat, lon, height = lat * angle, lon * angle, height * metre
         if spec.get("geoid") is not None:
-            height = height + mapped.of("position").column(spec["geoid"], nan=True) * metre
+            height = height + mapped.find_part("position").column(spec["geoid"], nan=True) * metre
     with np.errstate(invalid="ignore"):
         lost = (np.abs(lat) < NOWHERE_DEG) & (np.abs(lon) < NOWHERE_DEG) & (zero == "none")
     return dict(zip(POSITION, (np.where(lost, np.nan, x) for x in (lat, lon, height))))
@@ -130,7 +130,7 @@ def _latitudes(mapped: Mapped, minutes: bool) -> tuple[np.ndarray, np.ndarray, n
         return angles[:, 0], angles[:, 1], llh[:, 2]
     if isinstance(sides, str) or len(sides) != 2:
         raise InputError(f"reader.{mapped.kind}.position.hemispheres={sides}: must be two columns, of N/S and of E/W")
-    part = mapped.of("position")
+    part = mapped.find_part("position")
     for k, (name, letters) in enumerate(zip(sides, ("NS", "EW"))):
         texts = part.texts(name).str.upper().to_numpy()
         known = np.isin(texts, list(letters)) | ~np.isfinite(angles[:, k])
@@ -169,7 +169,7 @@ def _quality(mapped: Mapped) -> np.ndarray:
         raise InputError(f"reader.{mapped.kind}.quality.map needs the column that it is for: give quality.column")
     if name is None:
         return np.full(len(mapped), 1 if default is None else _code(default, "default"))
-    part = mapped.of("quality")
+    part = mapped.find_part("quality")
     if not spec.get("map"):
         return np.nan_to_num(part.column(name, nan=True)).astype(np.int64)
     codes = {str(k): _code(v, f"map.{k}") for k, v in spec["map"].items()}
@@ -210,7 +210,7 @@ def _attitudes(mapped: Mapped) -> np.ndarray:
     return rpy
 
 
-def _carried(gnss: pd.DataFrame, late: float) -> pd.DataFrame:
+def _carry_positions(gnss: pd.DataFrame, late: float) -> pd.DataFrame:
     """Positions that are ``late`` [s] older than the velocities beside them, carried on by these."""
     north, east, down = (np.nan_to_num(gnss[c]) for c in VELOCITY)
     out = gnss.copy()

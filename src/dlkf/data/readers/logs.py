@@ -21,7 +21,7 @@ from dlkf.base.settings import is_number, settings_from
 from dlkf.data.discovery.findings import Sure
 from dlkf.data.readers import formats
 from dlkf.data.readers.aids import read_aids
-from dlkf.data.readers.archives import drive_name, drive_places, is_archive, unpacked
+from dlkf.data.readers.archives import drive_name, drive_places, is_archive, unpack
 from dlkf.data.readers.contract import gnss_frame, imu_frame, reference_frame
 from dlkf.data.readers.formats import rosbag
 from dlkf.data.readers.frames import DriveFrames, Place
@@ -103,30 +103,31 @@ class LogReader:
         if not source.is_dir():
             raise InputError(f"source={source}: no such file or folder; it holds one drive, or one subfolder per drive")
         patterns = self.specs["imu"].get("file")
-        if _matching(source, patterns):
+        if _match_files(source, patterns):
             return [(source, self.drive or source.absolute().name, None)]
         if not (places := drive_places(source)):
-            raise InputError(f"source={source}: no file {_said(patterns)} and no subfolders; set reader.imu.file")
+            named = _name_patterns(patterns)
+            raise InputError(f"source={source}: no file {named} and no subfolders; set reader.imu.file")
         return [(place, drive_name(place), None) for place in places]
 
-    def sharing(self, settings: Mapping[str, Any]) -> LogReader:
+    def with_settings(self, settings: Mapping[str, Any]) -> LogReader:
         """The same reader, with settings that other drives found in the place of ``auto``."""
         other = copy.copy(self)
-        known = {kind: _filled(spec, settings.get(kind, {})) for kind, spec in self.specs.items()}
+        known = {kind: _fill_auto(spec, settings.get(kind, {})) for kind, spec in self.specs.items()}
         other.specs, other.wanted = known, open_settings(known, self.lever_arm_m)
         other.neutral = placeholders(known)
         return other
 
     def drive_at(self, folder: Path, name: str, only: Path | None = None) -> DriveFrames:
         """The drive of a place, by that name."""
-        with unpacked(folder) as inside:
+        with unpack(folder) as inside:
             return self._drive(inside, name, only)
 
     def _drive(self, folder: Path, name: str, only: Path | None) -> DriveFrames:
         kinds = [kind for kind, spec in self.specs.items() if spec.get("file") is not None]
         if "imu" not in kinds:
             raise InputError("reader.imu.file is null; a drive needs an IMU")
-        every = {kind: self._mapped(folder, self.neutral[kind], kind, only) for kind in kinds}
+        every = {kind: self._map_table(folder, self.neutral[kind], kind, only) for kind in kinds}
         mapped = {kind: part for kind, part in every.items() if kind in FRAMES}
         zero, t = self._times(mapped)
         arm, found, mapping = self.lever_arm_m, (), {}
@@ -154,8 +155,9 @@ class LogReader:
         meta |= dict(zip(("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m"), arm))
         notes = [note for part in every.values() for one in (part, *part.parts.values()) for note in one.table.notes]
         notes += [note for part in mapped.values() if (note := epoch_note(part)) is not None]
-        said = (*dict.fromkeys((*notes, *list_unused(every))), *_velocities_left(mapped.get("gnss")), *found, *of_aids)
-        said = said if only is not None else (*_files_left(folder, every), *said)
+        unread = _list_unread_velocities(mapped.get("gnss"))
+        said = (*dict.fromkeys((*notes, *list_unused(every))), *unread, *found, *of_aids)
+        said = said if only is not None else (*_list_unread_files(folder, every), *said)
         return DriveFrames(meta, frames["imu"], frames.get("gnss"), frames.get("reference"), said, mapping, aids)
 
     def _times(self, mapped: Mapping[str, Mapped]) -> tuple[int, dict[str, np.ndarray]]:
@@ -168,7 +170,7 @@ class LogReader:
                 t[kind] = spread_stamps(t[kind])
         return zero, t
 
-    def _mapped(self, folder: Path, spec: Spec, kind: str, only: Path | None) -> Mapped:
+    def _map_table(self, folder: Path, spec: Spec, kind: str, only: Path | None) -> Mapped:
         """The table of a kind, with the entries that come from other tables brought to its rows."""
         whole = select_rows(self._table(folder, spec, kind, f"reader.{kind}", only))
         parts: dict[str, Mapped] = {}
@@ -179,10 +181,10 @@ class LogReader:
                 continue
             own = {**spec, **{s: entry[s] for s in SOURCE if entry.get(s) is not None}}
             parts[key] = select_rows(self._table(folder, own, kind, f"reader.{kind}.{key}", only))
-        return _joined(whole, parts) if parts else whole
+        return _join_parts(whole, parts) if parts else whole
 
     def _table(self, folder: Path, spec: Spec, kind: str, where: str, only: Path | None) -> Mapped:
-        path = _file(folder, spec, kind, where, only)
+        path = _find_file(folder, spec, kind, where, only)
         text = {**self.text, **(spec.get("text") or {}), "lines": spec.get("lines")}
         if unknown := [key for key in text if key not in (*TEXT, "lines")]:
             raise InputError(f"{where}.text: unknown key {unknown[0]}; known are {', '.join(TEXT)}")
@@ -191,17 +193,17 @@ class LogReader:
         return Mapped(table, spec, kind)
 
 
-def _file(folder: Path, spec: Spec, kind: str, where: str, only: Path | None) -> Path:
+def _find_file(folder: Path, spec: Spec, kind: str, where: str, only: Path | None) -> Path:
     if only is not None and any(only.match(str(p)) for p in _patterns(spec.get("file"))):
         return only
-    found = _matching(folder, spec.get("file"))
+    found = _match_files(folder, spec.get("file"))
     if len(found) != 1:
         seen = [] if only is not None else sorted(p.name for p in folder.iterdir() if not p.name.startswith("."))
         have = ", ".join(seen[:8]) or (only.name if only is not None else "nothing")
         what = "no" if not found else f"{len(found)} files match, one must be"
         without = ", or reader.reference=null" if kind == "reference" else ""
         raise InputError(
-            f"{folder}: {what} {kind} file {_said(spec.get('file'))}; has {have}; set {where}.file{without}"
+            f"{folder}: {what} {kind} file {_name_patterns(spec.get('file'))}; has {have}; set {where}.file{without}"
         )
     return found[0]
 
@@ -210,11 +212,11 @@ def _patterns(file: Any) -> list[str]:
     return [str(p) for p in (file if isinstance(file, (list, tuple)) else [file]) if p is not None]
 
 
-def _said(file: Any) -> str:
+def _name_patterns(file: Any) -> str:
     return " or ".join(_patterns(file))
 
 
-def _matching(folder: Path, file: Any) -> list[Path]:
+def _match_files(folder: Path, file: Any) -> list[Path]:
     """What the first pattern that fits anything fits."""
     for pattern in _patterns(file):
         try:
@@ -226,7 +228,7 @@ def _matching(folder: Path, file: Any) -> list[Path]:
     return []
 
 
-def _joined(whole: Mapped, parts: Mapping[str, Mapped]) -> Mapped:
+def _join_parts(whole: Mapped, parts: Mapping[str, Mapped]) -> Mapped:
     """The parts at the rows of the whole: of GNSS the row of the same fix, of an IMU interpolated."""
     base, rest = whole.stamps()
     zero = base[0]
@@ -237,7 +239,7 @@ def _joined(whole: Mapped, parts: Mapping[str, Mapped]) -> Mapped:
         seconds, fraction = part.stamps()
         at = (seconds - zero) + fraction
         if whole.kind == "imu":
-            frame, near = _interpolated(part, key, at, t)
+            frame, near = _interpolate(part, key, at, t)
         else:
             order = np.argsort(at, kind="stable")
             place = np.clip(np.searchsorted(at[order], t), 1, max(len(at) - 1, 1))
@@ -260,7 +262,7 @@ def _joined(whole: Mapped, parts: Mapping[str, Mapped]) -> Mapped:
     return joined if keep.all() else joined.rows(keep)
 
 
-def _files_left(folder: Path, mapped: Mapping[str, Mapped]) -> list[str]:
+def _list_unread_files(folder: Path, mapped: Mapping[str, Mapped]) -> list[str]:
     """A line on files beside those that were read, of the same suffixes."""
     read = {p.table.path.name for whole in mapped.values() for p in (whole, *whole.parts.values())}
     suffixes = {Path(name).suffix.lower() for name in read} - {""}
@@ -268,11 +270,11 @@ def _files_left(folder: Path, mapped: Mapping[str, Mapped]) -> list[str]:
     return [f"files that are not read: {join_some(left)}"] if left else []
 
 
-def _velocities_left(gnss: Mapped | None) -> list[str]:
+def _list_unread_velocities(gnss: Mapped | None) -> list[str]:
     """A line where the fixes of a bag have no velocities, and topics beside them do."""
     if gnss is None or gnss.spec.get("format") != "rosbag" or "velocity" in gnss.parts:
         return []
-    topics = rosbag.velocities_beside(gnss.table.path)
+    topics = rosbag.find_velocities(gnss.table.path)
     return [f"velocities lie in {' and '.join(topics)}: reader.gnss.velocity.table={topics[0]}"] if topics else []
 
 
@@ -286,7 +288,7 @@ def _gps_time(gnss: Mapped, t: np.ndarray) -> dict[str, float]:
     return {"gps_zero_s": first - rate * float(t[0]), "gps_rate": rate}
 
 
-def _interpolated(part: Mapped, key: str, at: np.ndarray, t: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:
+def _interpolate(part: Mapped, key: str, at: np.ndarray, t: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:
     """A sensor's columns at another sensor's stamps, and where it has neighbours close enough."""
     values = part.vector(key, (3,), nan=False)
     order = np.argsort(at, kind="stable")
@@ -299,11 +301,11 @@ def _interpolated(part: Mapped, key: str, at: np.ndarray, t: np.ndarray) -> tupl
     return pd.DataFrame({n: np.interp(t, at, v) for n, v in zip(names, values.T)}), near
 
 
-def _filled(spec: Any, settings: Any) -> Any:
+def _fill_auto(spec: Any, settings: Any) -> Any:
     """A mapping with settings in the place of every ``auto`` for which there is one."""
     if not isinstance(spec, Mapping) or not isinstance(settings, Mapping):
         return settings if spec == AUTO and settings else spec
-    return {key: _filled(value, settings[key]) if key in settings else value for key, value in spec.items()}
+    return {key: _fill_auto(value, settings[key]) if key in settings else value for key, value in spec.items()}
 
 
 def _lever_arm(arm: Any) -> tuple[float, float, float]:

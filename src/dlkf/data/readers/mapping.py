@@ -51,15 +51,15 @@ SWITCHES = ("respace", "increments", "counts")
 
 def check_keys(spec: Spec, kind: str) -> None:
     """InputError for a key of ``imu``, ``gnss`` or ``reference`` that means nothing."""
-    _known(spec, (*SOURCE, *GROUPS[kind]), f"reader.{kind}")
-    _known(spec.get("time"), TIME, f"reader.{kind}.time")
+    _check_known(spec, (*SOURCE, *GROUPS[kind]), f"reader.{kind}")
+    _check_known(spec.get("time"), TIME, f"reader.{kind}.time")
     for name in GROUPS[kind]:
         if name in ENTRIES:
-            _known(spec.get(name), (*ENTRIES[name], *SOURCE), f"reader.{kind}.{name}")
-            _known((spec.get(name) or {}).get("time"), TIME, f"reader.{kind}.{name}.time")
+            _check_known(spec.get(name), (*ENTRIES[name], *SOURCE), f"reader.{kind}.{name}")
+            _check_known((spec.get(name) or {}).get("time"), TIME, f"reader.{kind}.{name}.time")
 
 
-def _known(spec: Any, known: tuple[str, ...], where: str) -> None:
+def _check_known(spec: Any, known: tuple[str, ...], where: str) -> None:
     if spec is None:
         return
     if not isinstance(spec, Mapping):
@@ -123,10 +123,10 @@ class Mapped:
             many = " or ".join(str(c) for c in count)
             has = "a single name" if isinstance(names, str) else f"{len(names)} names"
             raise InputError(f"reader.{self.kind}.{key}.columns has {has}, must have {many}")
-        part = self.of(key)
+        part = self.find_part(key)
         return np.stack([part.column(n, nan=nan).astype(float) for n in names], -1)
 
-    def of(self, key: str) -> Mapped:
+    def find_part(self, key: str) -> Mapped:
         """The table that an entry's columns are in."""
         return self.parts.get(key, self)
 
@@ -175,7 +175,7 @@ class Mapped:
             values = self.column(name[-1] if isinstance(name, list) else name, nan=False)
         day = None if time.get("day") is None else str(time["day"])
         if unit == units.HHMMSS:
-            values, unit = units.of_the_day(values), "s"
+            values, unit = units.seconds_of_day(values), "s"
             day = units.day_of_number(self._cells(name[0]).iloc[0]) if isinstance(name, list) else day
         if unit in units.DAYS:
             values, unit = (values - units.DAYS[unit]) * 86_400.0, "s"

@@ -64,7 +64,7 @@ class Contents:
     held: str = ""
 
 
-def contents(path: Path) -> Contents:
+def recognise_file(path: Path) -> Contents:
     """What a file holds."""
     try:
         with path.open("rb") as file:
@@ -81,9 +81,9 @@ def contents(path: Path) -> Contents:
     if name is None:
         return Contents(path, held="of no format that is known" if begins else "empty")
     if name == "matlab":
-        return _of_matlab(path)
+        return _offer_matlab(path)
     if name in PRESETS:
-        return _of_preset(path, name)
+        return _offer_preset(path, name)
     try:
         options: dict[str, Any] = text_options(path) if name == "csv" else {}
         table = formats.read(name, path, kind="imu", table=None, text=options, where="reader")
@@ -91,14 +91,14 @@ def contents(path: Path) -> Contents:
         return Contents(path, held=str(error).removeprefix(f"{path}: "))
     if (count := len(table.frame.columns)) > recognise.MOST_COLUMNS:
         return Contents(path, held=f"a table of {count} columns, which no log has")
-    found = _of_table(path, name, table, options, None)
-    return Contents(path, found, "" if found else recognise.missing(table))
+    found = _offer_table(path, name, table, options, None)
+    return Contents(path, found, "" if found else recognise.describe_missing(table))
 
 
-def _of_preset(path: Path, name: str) -> Contents:
-    base = preset(name)
+def _offer_preset(path: Path, name: str) -> Contents:
+    base = load_preset(name)
     source = {"file": path.name, "text": _preset_text(base)}
-    lacks = {kind: _lacks(path, name, kind) for kind in ("imu", "gnss")}
+    lacks = {kind: _describe_lack(path, name, kind) for kind in ("imu", "gnss")}
     specs = {kind: {**base[kind], **source} for kind, why in lacks.items() if why is None}
     held = f"{name}, {', '.join(f'no {kind.upper()}{why}' for kind, why in lacks.items() if why is not None)}"
     module = WITH_AIDS.get(name)
@@ -106,7 +106,7 @@ def _of_preset(path: Path, name: str) -> Contents:
     return Contents(path, [Offer(path, f"{name}, as reader={name}", leave_open(specs))] if specs else [], held)
 
 
-def _lacks(path: Path, name: str, kind: str) -> str | None:
+def _describe_lack(path: Path, name: str, kind: str) -> str | None:
     """Why a file of a preset's format gives no ``kind``, empty if there is no reason; None where it does."""
     if name == "rosbag":
         return None if rosbag.holds(path, kind) else f" among its topics ({rosbag.list_topics(path)})"
@@ -114,7 +114,7 @@ def _lacks(path: Path, name: str, kind: str) -> str | None:
         return None
     if name in GNSS_ONLY:
         return ""
-    base = preset(name)
+    base = load_preset(name)
     try:
         spec, options = base[kind], {**_preset_text(base), "lines": base[kind].get("lines")}
         table = formats.read(spec["format"], path, kind=kind, table=spec.get("table"), text=options, where="")
@@ -123,27 +123,28 @@ def _lacks(path: Path, name: str, kind: str) -> str | None:
     return None if len(table.frame) > 10 else f" (only {len(table.frame)} samples)"
 
 
-def _of_matlab(path: Path) -> Contents:
+def _offer_matlab(path: Path) -> Contents:
     try:
         tables = matlab.frames(path)
     except InputError as error:
         return Contents(path, held=str(error).removeprefix(f"{path}: "))
     if all(mark in tables.get(kind, ()) for kind, mark in NAVEGO.items()):
-        return _of_preset(path, "navego")
-    found = [o for name, frame in tables.items() for o in _of_table(path, "matlab", LogTable(frame, path), {}, name)]
-    said = "; ".join(f"{name}: {recognise.missing(LogTable(frame, path))}" for name, frame in list(tables.items())[:4])
+        return _offer_preset(path, "navego")
+    found = [o for name, frame in tables.items() for o in _offer_table(path, "matlab", LogTable(frame, path), {}, name)]
+    first = list(tables.items())[:4]
+    said = "; ".join(f"{name}: {recognise.describe_missing(LogTable(frame, path))}" for name, frame in first)
     return Contents(path, found, said or "no matrix and no structure of vectors")
 
 
-def _of_table(path: Path, name: str, table: LogTable, options: dict[str, Any], part: str | None) -> list[Offer]:
+def _offer_table(path: Path, name: str, table: LogTable, options: dict[str, Any], part: str | None) -> list[Offer]:
     imu, gnss = recognise.imu_spec(table), None
     if imu is None or vocabulary.find_column(map(str, table.frame.columns), "lat"):
         gnss = recognise.gnss_spec(table)
     source: dict[str, Any] = {"format": name, "file": path.name, "text": options}
     source |= {"table": part} if part is not None else {}
     time = next((one.spec["time"] for one in (imu, gnss) if one is not None), None)
-    numbers = recognise.numeric(table.frame)
-    aids = aid_specs(recognise.with_numbers(table, numbers), numbers, part or path.stem, time)
+    numbers = recognise.select_numeric(table.frame)
+    aids = aid_specs(recognise.replace_numeric(table, numbers), numbers, part or path.stem, time)
     aids = {kind: {**spec, **source} for kind, spec in aids.items()}
     found = {kind: one for kind, one in (("imu", imu), ("gnss", gnss)) if one is not None}
     if not found and not aids:
@@ -233,7 +234,7 @@ def _above_header(lines: list[str], separator: str) -> int:
     return first if numbers[0] == 0 and numbers[1] > 1 else 0
 
 
-def preset(name: str) -> dict[str, Any]:
+def load_preset(name: str) -> dict[str, Any]:
     """A reader's preset with what it takes over from csv's."""
     folder = config_dir() / "reader"
     own = yaml.safe_load((folder / f"{name}.yaml").read_text())

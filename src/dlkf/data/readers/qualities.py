@@ -48,31 +48,32 @@ def quality_spec(frame: pd.DataFrame, column: str | None, accuracy_m: float) -> 
     values = frame[column]
     numbers = pd.to_numeric(values, errors="coerce")
     if not bool(numbers.notna().any()):
-        words = _in_words(values, column)
-        unknown = f"quality {column} has words that are not known ({_some(values)}): all count as single; map them"
+        words = _read_words(values, column)
+        unknown = f"quality {column} has words that are not known ({_list_some(values)}): all count as single; map them"
         return words, [] if words else [f"{unknown} with reader.gnss.quality={{column: {column}, map: {{…: 4}}}}"]
     seen = sorted({float(x) for x in numbers.dropna()})
     fits = [name for name, map_ in READINGS.items() if all(x in map_ for x in seen)]
     if not fits:
-        return None, [f"quality {column} has numbers that no receiver gives ({_some(values)}): all count as single"]
+        unknown = f"quality {column} has numbers that no receiver gives ({_list_some(values)}): all count as single"
+        return None, [unknown]
     beside_hdop = vocabulary.find_column([str(c) for c in frame.columns], "hdop") is not None  # RTKLIB writes none
     unlikely = {RTKLIB: beside_hdop, GGA: 3 in seen}  # PPS is rare, 3D is not
     fits = [name for name in fits if not unlikely.get(name)] or fits
-    chosen = _reading(column, [int(x) for x in seen], numbers, fits, accuracy_m)
+    chosen = _choose_reading(column, [int(x) for x in seen], numbers, fits, accuracy_m)
     codes = {int(x): READINGS[chosen][int(x)] for x in seen}
     spec: dict[str, Any] = {"column": column}
     if any(x != code for x, code in codes.items()) or bool(numbers.isna().any()):
         spec["map"] = {str(x): code for x, code in codes.items()}
         spec["default"] = 0
-    notes = [f"quality {column}: {_said(codes)}, taken as {chosen}"]
+    notes = [f"quality {column}: {_describe_codes(codes)}, taken as {chosen}"]
     others = {name: {x: READINGS[name][x] for x in codes} for name in fits if name != chosen}
     if likely := next((n for n in _likely(column) if n in others and others[n] != codes), None):
         map_ = "{" + ", ".join(f"{x}: {code}" for x, code in others[likely].items()) + "}"
-        notes[0] += f"; as {likely} it would be {_said(others[likely])}: reader.gnss.quality.map='{map_}'"
+        notes[0] += f"; as {likely} it would be {_describe_codes(others[likely])}: reader.gnss.quality.map='{map_}'"
     return spec, notes
 
 
-def _reading(column: str, seen: list[int], numbers: pd.Series, fits: list[str], accuracy_m: float) -> str:
+def _choose_reading(column: str, seen: list[int], numbers: pd.Series, fits: list[str], accuracy_m: float) -> str:
     """The most likely reading by name, by the numbers that occur, and by the fixes' own stds."""
     usual = [name for name in _likely(column) if name in fits] or fits
     best = numbers.mode().iloc[0]
@@ -101,7 +102,7 @@ def _likely(column: str) -> list[str]:
     return [GGA, MAVLINK, UBLOX, ROS]
 
 
-def _in_words(values: pd.Series, column: str) -> Spec | None:
+def _read_words(values: pd.Series, column: str) -> Spec | None:
     """GGA codes of the words of a column; None where one of them is not known, or there are none."""
     texts = [str(word) for word in values.dropna().unique()]
     codes = {w: code for w in texts if (code := _code(vocabulary.words(w))) is not None}
@@ -115,9 +116,9 @@ def _code(word: str) -> int | None:
     return next((code for code, known in WORDS.items() if word in known or bare in known), None)
 
 
-def _said(codes: Mapping[int, int]) -> str:
+def _describe_codes(codes: Mapping[int, int]) -> str:
     return ", ".join(f"{x} is {QUALITIES[code]}" for x, code in codes.items())
 
 
-def _some(values: pd.Series) -> str:
+def _list_some(values: pd.Series) -> str:
     return ", ".join(str(x) for x in values.dropna().unique()[:4])

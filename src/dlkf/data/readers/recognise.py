@@ -34,16 +34,16 @@ class Recognised(NamedTuple):
 
 def imu_spec(table: LogTable) -> Recognised | None:
     """The mapping of a table that holds an IMU; None if it does not."""
-    frame = numeric(table.frame)
+    frame = select_numeric(table.frame)
     names = [str(c) for c in frame.columns]
     triads = {key: vocabulary.triad(names, stem) for key, stem in vocabulary.SENSORS.items()}
     if triads["accel"] and triads["gyro"]:
         known = frame[triads["accel"] + triads["gyro"]].notna().all(axis=1)
-        time = stamps.time_spec(with_numbers(table, frame), known, SLOWEST_IMU_S, FASTEST_IMU_S)
+        time = stamps.time_spec(replace_numeric(table, frame), known, SLOWEST_IMU_S, FASTEST_IMU_S)
         if time is None:
             return None
         sensors = {key: {"columns": columns} for key, columns in triads.items() if columns}
-        sensors["accel"] |= _stated_unit(frame, triads["accel"])
+        sensors["accel"] |= _find_stated_unit(frame, triads["accel"])
         notes = _spread(frame[known], time)
         return Recognised({"time": time, **sensors}, notes)
     if any(triads.values()) or vocabulary.find_column(names, "lat"):
@@ -52,7 +52,7 @@ def imu_spec(table: LogTable) -> Recognised | None:
     if spec is None:
         return None
     columns = [*spec["accel"]["columns"], *spec["gyro"]["columns"]]
-    notes = () if _unnamed(names) else (f"took {', '.join(columns[:3])} for the accelerometers by gravity, "
+    notes = () if _are_unnamed(names) else (f"took {', '.join(columns[:3])} for the accelerometers by gravity, "
                                         f"{', '.join(columns[3:])} for the gyroscopes",)  # fmt: skip
     return Recognised(spec, notes)
 
@@ -72,7 +72,7 @@ def _spread(frame: pd.DataFrame, time: Spec) -> tuple[str, ...]:
 def sensor_spec(table: LogTable, called: str) -> tuple[str, Recognised] | None:
     """``accel`` or ``gyro`` and the mapping of a table that holds that sensor alone; ``called`` is the table's name,
     which counts where the columns are plain x, y, z."""
-    frame = numeric(table.frame)
+    frame = select_numeric(table.frame)
     names = [str(c) for c in frame.columns]
     for key, stem in vocabulary.SENSORS.items():
         columns = vocabulary.triad(names, stem)
@@ -81,7 +81,7 @@ def sensor_spec(table: LogTable, called: str) -> tuple[str, Recognised] | None:
         if columns is None:
             continue
         known = frame[columns].notna().all(axis=1)
-        time = stamps.time_spec(with_numbers(table, frame), known, SLOWEST_IMU_S, FASTEST_IMU_S)
+        time = stamps.time_spec(replace_numeric(table, frame), known, SLOWEST_IMU_S, FASTEST_IMU_S)
         if time is not None:
             return key, Recognised({"time": time, key: {"columns": columns}})
     return None
@@ -89,28 +89,29 @@ def sensor_spec(table: LogTable, called: str) -> tuple[str, Recognised] | None:
 
 def gnss_spec(table: LogTable) -> Recognised | None:
     """The mapping of a table that holds fixes; None if it does not."""
-    frame = numeric(table.frame)
+    frame = select_numeric(table.frame)
     names = [str(c) for c in frame.columns]
     found = {key: vocabulary.find_column(names, key) for key in vocabulary.QUANTITIES}
     lat, lon, height = (found[key] for key in ("lat", "lon", "height"))
     if (lat is None or lon is None) and any(vocabulary.triad(names, stem) for stem in vocabulary.SENSORS.values()):
         return None
     if lat is None or lon is None:
-        spec = by_numbers.gnss_spec(with_numbers(table, frame))
+        spec = by_numbers.gnss_spec(replace_numeric(table, frame))
         if spec is None:
             return None
         columns = ", ".join(spec["position"]["columns"])
         more = "; found others by the way between the positions" if spec["velocity"].get("columns") else ""
-        return Recognised(spec, () if _unnamed(names) else (f"took {columns} for latitude, longitude, height{more}",))
+        note = f"took {columns} for latitude, longitude, height{more}"
+        return Recognised(spec, () if _are_unnamed(names) else (note,))
     known = frame[[lat, lon]].notna().all(axis=1)
-    held = _held(frame[known], [lat, lon])
+    held = _find_repeated(frame[known], [lat, lon])
     if held is not None:
         known[known] = ~held
-    time = stamps.time_spec(with_numbers(table, frame), known, SLOWEST_FIX_S, FASTEST_FIX_S)
+    time = stamps.time_spec(replace_numeric(table, frame), known, SLOWEST_FIX_S, FASTEST_FIX_S)
     if time is None or height is None:
         return None
     position: Spec = {"columns": [lat, lon, height], "unit": _angle_unit(frame, found)}
-    if (unit := vocabulary.unit_of(height)) in units.LENGTH:
+    if (unit := vocabulary.find_unit(height)) in units.LENGTH:
         position["height_unit"] = unit
     elif float(frame[height].abs().median()) > HIGHEST_M:
         position["height_unit"] = "mm"  # as u-blox has it
@@ -140,7 +141,7 @@ def gnss_spec(table: LogTable) -> Recognised | None:
 
 def _velocity_by_numbers(table: LogTable, frame: pd.DataFrame, time: Spec, position: Spec) -> Spec:
     """Velocities under names that are not known: columns that agree with the way between the positions."""
-    t = stamps.seconds_of(LogTable(table.frame.loc[frame.index], table.path, table.row), time)
+    t = stamps.read_seconds(LogTable(table.frame.loc[frame.index], table.path, table.row), time)
     scale = {"deg": 1.0, "1e-7deg": 1e-7, "rad": 180 / np.pi}.get(position["unit"])
     if scale is None:
         return {"columns": None}
@@ -159,7 +160,7 @@ def _hemispheres(frame: pd.DataFrame) -> list[str] | None:
     return [side for side in sides if side is not None] if all(sides) and len(frame) else None
 
 
-def _held(frame: pd.DataFrame, place: list[str]) -> pd.Series | None:
+def _find_repeated(frame: pd.DataFrame, place: list[str]) -> pd.Series | None:
     """Rows that repeat the position before, in a table of IMU samples beside which most do; else None."""
     names = [str(c) for c in frame.columns]
     if len(frame) < 10 or not any(vocabulary.triad(names, stem) for stem in vocabulary.SENSORS.values()):
@@ -170,19 +171,19 @@ def _held(frame: pd.DataFrame, place: list[str]) -> pd.Series | None:
 
 def velocity_spec(table: LogTable) -> tuple[Spec, Spec] | None:
     """Time and velocities of a table that has these and no positions; None if it does not."""
-    frame = numeric(table.frame)
+    frame = select_numeric(table.frame)
     names = [str(c) for c in frame.columns]
     velocity = _velocity({key: vocabulary.find_column(names, key) for key in vocabulary.QUANTITIES})
     if velocity is None:
         return None
     every = pd.Series(True, table.frame.index)
-    time = stamps.time_spec(with_numbers(table, frame), every, SLOWEST_FIX_S, FASTEST_FIX_S)
+    time = stamps.time_spec(replace_numeric(table, frame), every, SLOWEST_FIX_S, FASTEST_FIX_S)
     return None if time is None else (time, velocity)
 
 
-def missing(table: LogTable) -> str:
+def describe_missing(table: LogTable) -> str:
     """What a table has and what it lacks, in words, for a line that refuses it."""
-    frame = numeric(table.frame)
+    frame = select_numeric(table.frame)
     names = [str(c) for c in frame.columns]
     has = [key for key, stem in vocabulary.SENSORS.items() if vocabulary.triad(names, stem)]
     has += ["positions"] if vocabulary.find_column(names, "lat") else []
@@ -198,14 +199,14 @@ def missing(table: LogTable) -> str:
         lacks += [] if vocabulary.find_column(names, "lon") else ["a longitude"]
         lacks += [] if vocabulary.find_column(names, "height") else ["a height (one number in all rows will do)"]
     rows = pd.Series(True, table.frame.index)
-    if stamps.time_spec(with_numbers(table, frame), rows, SLOWEST_FIX_S, FASTEST_IMU_S) is None:
+    if stamps.time_spec(replace_numeric(table, frame), rows, SLOWEST_FIX_S, FASTEST_IMU_S) is None:
         times = [n for n in vocabulary.match_columns(columns, vocabulary.TIME) if n not in names]
         of_day = times and table.frame[times[0]].astype(str).iloc[:20].str.match(stamps.OF_DAY).all()
         lacks.append("a date beside the times of day" if of_day else "stamps that can be read")
     return f"{text}: has {' and '.join(has)}" + (f", lacks {' and '.join(lacks)}" if lacks else "")
 
 
-def numeric(frame: pd.DataFrame) -> pd.DataFrame:
+def select_numeric(frame: pd.DataFrame) -> pd.DataFrame:
     """The columns whose cells are numbers for the most part."""
     keep = {}
     for name in list(frame.columns)[:MOST_COLUMNS]:
@@ -219,22 +220,22 @@ def numeric(frame: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(keep, index=frame.index)
 
 
-def with_numbers(table: LogTable, numbers: pd.DataFrame) -> LogTable:
-    """The table with columns of :func:`numeric` in their places."""
+def replace_numeric(table: LogTable, numbers: pd.DataFrame) -> LogTable:
+    """The table with columns of :func:`select_numeric` in their places."""
     whole = table.frame.iloc[:, :MOST_COLUMNS].copy(deep=False)
     for name in numbers.columns:
         whole[name] = numbers[name]
     return replace(table, frame=whole)
 
 
-def _unnamed(names: list[str]) -> bool:
+def _are_unnamed(names: list[str]) -> bool:
     return all(name.isdigit() for name in names)
 
 
-def _stated_unit(frame: pd.DataFrame, columns: list[str]) -> Spec:
+def _find_stated_unit(frame: pd.DataFrame, columns: list[str]) -> Spec:
     """The accelerometers' unit where the header states it, gravity does not object and would not find it alone: a unit
     that gravity finds may have the opposite sign, as some phones give it."""
-    unit = vocabulary.unit_of(columns[0])
+    unit = vocabulary.find_unit(columns[0])
     if unit not in units.ACCELERATION:
         return {}
     size = float(np.median(np.linalg.norm(frame[columns].dropna().to_numpy(), axis=1)))
@@ -267,7 +268,7 @@ def _accuracies(frame: pd.DataFrame, found: dict[str, str | None], raw: bool) ->
         if not columns or (not all(axes) and others[0] is None):
             continue
         known = units.LENGTH if stem == "pos" else units.SPEED
-        out[key] = {"columns": columns} | ({"unit": u} if (u := vocabulary.unit_of(columns[0])) in known else {})
+        out[key] = {"columns": columns} | ({"unit": u} if (u := vocabulary.find_unit(columns[0])) in known else {})
         if "unit" not in out[key] and (raw or float(frame[columns[0]].median()) > 500):  # half a km is no accuracy
             out[key]["unit"] = "mm" if stem == "pos" else "mm/s"  # as u-blox has them
     return out
@@ -311,7 +312,7 @@ def _angle_unit(frame: pd.DataFrame, found: dict[str, str | None]) -> str:
         return "1e-7deg"
     if largest > 180.5:
         return "ddmm"
-    named_deg = any(vocabulary.unit_of(str(found[k])) == "deg" for k in ("lat", "lon"))
+    named_deg = any(vocabulary.find_unit(str(found[k])) == "deg" for k in ("lat", "lon"))
     # a car covers more than 10 km within a drive only rarely, and no pole or meridian has it this near by chance
     small = largest <= np.pi + 1e-9 and lat.max() <= np.pi / 2
     return "rad" if small and not named_deg and _moves_like_radians(frame, found) else "deg"

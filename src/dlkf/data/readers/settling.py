@@ -17,7 +17,7 @@ from dlkf.data.discovery.units import speed_factor
 from dlkf.data.readers import units
 from dlkf.data.readers.contract import gnss_frame, imu_frame, positions
 from dlkf.data.readers.mapping import Mapped
-from dlkf.data.readers.sharing import set_value, value_at, write_value
+from dlkf.data.readers.sharing import read_value, set_value, write_value
 from dlkf.data.schema import ACCEL, stack_columns
 from dlkf.data.tables import Columns
 from dlkf.data.validate import usable_fixes
@@ -65,7 +65,7 @@ class Settled:
 
 def open_settings(specs: Mapping[str, Any], lever_arm_m: Any) -> set[str]:
     """Settings that are ``auto``."""
-    wanted = {name for name in NEUTRAL if value_at(specs, name) == AUTO}
+    wanted = {name for name in NEUTRAL if read_value(specs, name) == AUTO}
     return wanted | ({"lever_arm_m"} if lever_arm_m == AUTO else set())
 
 
@@ -73,7 +73,7 @@ def placeholders(specs: Mapping[str, Any]) -> dict[str, Any]:
     """The specs with neutral values for every ``auto``."""
     out = _plain(specs)
     for name, value in NEUTRAL.items():
-        if value_at(out, name) == AUTO:
+        if read_value(out, name) == AUTO:
             set_value(out, name, value)
     return out
 
@@ -87,7 +87,7 @@ def settle(
     """
     specs = {kind: _plain(part.spec) for kind, part in mapped.items()}
     if "gnss" not in mapped and wanted == {"imu.accel.unit"}:
-        return _by_gravity(specs, mapped["imu"], t["imu"], where, arm)
+        return _settle_by_gravity(specs, mapped["imu"], t["imu"], where, arm)
     if "gnss" not in mapped:
         raise InputError(f"{where}: reader.{sorted(wanted)[0]}=auto needs GNSS to compare with; give the value")
     if (count := len(t["gnss"])) < FEWEST_FIXES:
@@ -110,12 +110,12 @@ def settle(
     if {"imu.accel.axes", "imu.gyro.axes"} & wanted:
         asked.add("imu.axes")
     found += discover(
-        _in_order(imu),
-        _in_order(gnss[usable_fixes(gnss)]),
+        _keep_rising(imu),
+        _keep_rising(gnss[usable_fixes(gnss)]),
         asked,
         sure,
         increments=bool(mapped["imu"].spec.get("increments")),
-        drift_given="gnss.time.drift_ppm" not in wanted and value_at(specs, "gnss.time.drift_ppm") is not None,
+        drift_given="gnss.time.drift_ppm" not in wanted and read_value(specs, "gnss.time.drift_ppm") is not None,
     )
     _refuse_doubt(found, wanted, where, t)
     for name in wanted & set(NEUTRAL):
@@ -124,7 +124,7 @@ def settle(
             set_value(specs, name, value)
     lever = find_value(found, "lever_arm_m") if "lever_arm_m" in wanted else arm
     x, y, z = (float(a) for a in lever)
-    return Settled(specs, (x, y, z), _reported(found, wanted))
+    return Settled(specs, (x, y, z), _list_by_setting(found, wanted))
 
 
 def _refuse_without_gravity(imu: pd.DataFrame, where: str) -> None:
@@ -136,7 +136,7 @@ def _refuse_without_gravity(imu: pd.DataFrame, where: str) -> None:
         )
 
 
-def _by_gravity(specs: dict[str, Any], imu: Mapped, t: np.ndarray, where: str, arm: Any) -> Settled:
+def _settle_by_gravity(specs: dict[str, Any], imu: Mapped, t: np.ndarray, where: str, arm: Any) -> Settled:
     """The accelerometers' unit of a log without fixes."""
     finding, _ = find_accel_unit(stack_columns(imu_frame(imu, t), ACCEL), increments=False)
     _refuse_doubt([finding], {"imu.accel.unit"}, where, {"imu": t})
@@ -144,7 +144,7 @@ def _by_gravity(specs: dict[str, Any], imu: Mapped, t: np.ndarray, where: str, a
     return Settled(specs, arm, [finding])
 
 
-def _in_order(frame: pd.DataFrame) -> Columns:
+def _keep_rising(frame: pd.DataFrame) -> Columns:
     """The columns of the rows that are later than the row before."""
     rows = frame[np.diff(frame["t"], prepend=-np.inf) > 0]
     return {str(name): rows[name].to_numpy() for name in rows}
@@ -177,7 +177,7 @@ def _refuse_doubt(found: list[Finding], wanted: set[str], where: str, t: Mapping
         raise InputError(
             f"{where}: the clocks drift apart, {write_value(doubt.value)} {doubt.detail}; reader.{setting}=auto"
         )
-    remedy = f"give {_by_hand(doubts, wanted, t)}, or a longer drive, with turns, starts and stops"
+    remedy = f"give {_describe_by_hand(doubts, wanted, t)}, or a longer drive, with turns, starts and stops"
     if doubt.remedy:
         remedy = doubt.remedy
     elif all(one.wide for one in doubts):
@@ -187,7 +187,7 @@ def _refuse_doubt(found: list[Finding], wanted: set[str], where: str, t: Mapping
     raise unsure
 
 
-def _by_hand(doubts: list[Finding], wanted: set[str], t: Mapping[str, np.ndarray]) -> str:
+def _describe_by_hand(doubts: list[Finding], wanted: set[str], t: Mapping[str, np.ndarray]) -> str:
     """The settings of everything in doubt, with their usual values and when these are right."""
     said = []
     for setting in (doubt.setting for doubt in doubts):
@@ -204,7 +204,7 @@ def _by_hand(doubts: list[Finding], wanted: set[str], t: Mapping[str, np.ndarray
     return " ".join(said)
 
 
-def _reported(found: list[Finding], wanted: set[str]) -> list[Finding]:
+def _list_by_setting(found: list[Finding], wanted: set[str]) -> list[Finding]:
     """Findings by the settings they answer."""
     out = []
     for one in found:

@@ -40,10 +40,10 @@ def pool_settings(mappings: Sequence[Mapping[str, Any]], *, offsets: bool) -> tu
     out: dict[str, Any] = {}
     apart: list[str] = []
     for name, limit in (ALIKE | (OFFSETS if offsets else {})).items():
-        values = [v for v in (value_at(m, name) for m in mappings) if v not in (None, "auto")]
+        values = [v for v in (read_value(m, name) for m in mappings) if v not in (None, "auto")]
         if not values:
             continue
-        value = _agreed(values, limit)
+        value = _average_alike(values, limit)
         if value is not None:
             set_value(out, name, value)
         elif name not in OFFSETS:
@@ -55,7 +55,7 @@ def pool_settings(mappings: Sequence[Mapping[str, Any]], *, offsets: bool) -> tu
 def agrees(settings: Mapping[str, Any], offset_s: float, std: float) -> bool:
     """Whether a drive's own guess of the clocks' offset is that of the others, so that it is one and the same pair of
     clocks and not one that each recording sets again."""
-    shared = next((v for name in OFFSETS if (v := value_at(settings, name)) is not None), None)
+    shared = next((v for name in OFFSETS if (v := read_value(settings, name)) is not None), None)
     return shared is not None and abs(offset_s - float(shared)) <= max(FARTHEST_OFFSET_S, 3 * std)
 
 
@@ -75,7 +75,7 @@ def write_value(value: Any) -> str:
     return "{" + ", ".join(f"{k}: {v}" for k, v in value.items()) + "}"
 
 
-def _agreed(values: Sequence[Any], limit: float) -> Any:
+def _average_alike(values: Sequence[Any], limit: float) -> Any:
     """The mean of values within the limit; None where they are not."""
     first = values[0]
     if all(isinstance(v, Mapping) for v in values):
@@ -101,7 +101,7 @@ def merge_settings(base: Any, over: Any) -> Any:
     return out | {key: merge_settings(base.get(key), value) for key, value in over.items()}
 
 
-def value_at(mapping: Any, name: str) -> Any:
+def read_value(mapping: Any, name: str) -> Any:
     """The value of a setting such as ``imu.accel.unit``, None where there is none."""
     for key in name.split("."):
         mapping = mapping.get(key) if isinstance(mapping, Mapping) else None

@@ -33,11 +33,11 @@ def time_spec(table: LogTable, rows: pd.Series, slowest: float, fastest: float) 
         return None
     names = [str(c) for c in frame.columns]
     called = vocabulary.match_columns(names, vocabulary.TIME)
-    if (dated := _dated(frame, called, vocabulary.match_columns(names, vocabulary.DATE))) is not None:
+    if (dated := _find_dates(frame, called, vocabulary.match_columns(names, vocabulary.DATE))) is not None:
         return dated
     dates = [name for name in vocabulary.match_columns(names, vocabulary.DATE) if _counts_days(frame[name], slowest)]
     numbers = [name for name in (*called, *dates) if pd.api.types.is_numeric_dtype(frame[name])]
-    column = numbers[0] if numbers else only_rising(frame)
+    column = numbers[0] if numbers else find_rising(frame)
     if column is None:
         return None
     values = frame[column].to_numpy(float)
@@ -57,7 +57,7 @@ def time_spec(table: LogTable, rows: pd.Series, slowest: float, fastest: float) 
     week = vocabulary.find_column(names, "week")
     if week is not None and pd.api.types.is_numeric_dtype(frame[week]):
         return spec | {"week": week}
-    clock = clock_of(column, float(np.nanmedian(values)) / units.TIME[unit])
+    clock = choose_clock(column, float(np.nanmedian(values)) / units.TIME[unit])
     return spec | ({"clock": clock} if clock else {})
 
 
@@ -83,7 +83,7 @@ def _counts_days(column: pd.Series, slowest: float) -> str | None:
     return next((name for name, seconds in unix.items() if OLDEST_UNIX < seconds < NEWEST_UNIX), None)
 
 
-def seconds_of(table: LogTable, time: Spec) -> np.ndarray | None:
+def read_seconds(table: LogTable, time: Spec) -> np.ndarray | None:
     """The rows' times [s] from the first on, by the mapping's ``time``; None where it cannot read them all."""
     try:
         whole, part = Mapped(table, {"time": time}, "gnss").own_stamps()
@@ -92,7 +92,7 @@ def seconds_of(table: LogTable, time: Spec) -> np.ndarray | None:
     return (whole - whole[0]) + (part - part[0])
 
 
-def clock_of(name: str, seconds: float) -> str | None:
+def choose_clock(name: str, seconds: float) -> str | None:
     """The clock that stamps of this size count by, of two possible ones that of the column's name; None if of none."""
     possible = [clock for clock, date in _dates(seconds).items() if date is not None]
     if len(possible) == 1:
@@ -102,7 +102,7 @@ def clock_of(name: str, seconds: float) -> str | None:
     return known[0] if known else (units.clock_by_size(seconds) if possible else None)
 
 
-def only_rising(frame: pd.DataFrame) -> str | None:
+def find_rising(frame: pd.DataFrame) -> str | None:
     """The column that rises all the way, of any name, where there is one and it does not merely count rows."""
     steps = {str(n): np.diff(frame[n].to_numpy(float)) for n in frame if pd.api.types.is_numeric_dtype(frame[n])}
     rising = [name for name, step in steps.items() if len(step) > 1 and np.all(step >= 0) and np.median(step) > 0]
@@ -110,7 +110,7 @@ def only_rising(frame: pd.DataFrame) -> str | None:
     return clocks[0] if len(clocks) == 1 else None
 
 
-def _dated(frame: pd.DataFrame, called: list[str], dates: list[str]) -> Spec | None:
+def _find_dates(frame: pd.DataFrame, called: list[str], dates: list[str]) -> Spec | None:
     """Calendar texts in one column, or a date and a time of day in two, by names and by what stands in them."""
     texts = {n: frame[n].astype(str) for n in frame if not pd.api.types.is_numeric_dtype(frame[n])}
     texts |= {n: frame[n].map(lambda x: f"{x:.0f}") for n in dates if n not in texts and frame[n].notna().all()}

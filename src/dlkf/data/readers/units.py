@@ -155,7 +155,7 @@ def unwrap_stamps(values: np.ndarray, wrap: float) -> np.ndarray:
     return values + turns * wrap
 
 
-def of_the_day(values: np.ndarray) -> np.ndarray:
+def seconds_of_day(values: np.ndarray) -> np.ndarray:
     """Hours, minutes and seconds as one number (hhmmss.s) as seconds of the day."""
     hours, rest = np.divmod(values, 10_000)
     minutes, seconds = np.divmod(rest, 100)

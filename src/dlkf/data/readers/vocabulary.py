@@ -140,7 +140,7 @@ def words(name: str) -> str:
     return split_unit(name)[0]
 
 
-def unit_of(name: str) -> str | None:
+def find_unit(name: str) -> str | None:
     """The unit that a name ends in or has in brackets, as the mapping calls it; None where it states none."""
     return split_unit(name)[1]
 
@@ -208,7 +208,7 @@ def wheel_columns(names: Iterable[str], called: str) -> list[str]:
             found.append(name)
     rates = [n for n in found if not re.search(COUNTED, _plain(n))] or found
     rear = [n for n in rates if re.search(REAR, _plain(n))]
-    units = {unit_of(n) for n in rates}
+    units = {find_unit(n) for n in rates}
     return rear or (rates if len(units) == 1 and len(rates) in (2, 4) else rates[:1])
 
 

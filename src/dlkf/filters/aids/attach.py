@@ -38,7 +38,7 @@ def add_sources(kalman: Mbkf, kinds: Sequence[type[Source]]) -> Mbkf:
     names = tuple(name for kind in kinds for name in getattr(kind, "parameters", {}))
     states = replace(kalman.states, others=(*kalman.states.others, *names))
     made: list[Any] = [kind(kalman.imu, kalman.tuning, states) for kind in kinds]  # type: ignore[call-arg]
-    own = [_with_states(source, states) for source in kalman.sources]
+    own = [_set_states(source, states) for source in kalman.sources]
     sensors = [source for source in made if hasattr(source, "table")]
     others = [source for source in made if not hasattr(source, "table")]
     return replace(kalman, states=states, sources=(*sensors, *own, *others))
@@ -62,7 +62,7 @@ def with_aids(model: Any, tables: Iterable[AidTable]) -> Any:
     return other
 
 
-def aided_name(name: str, aids: Iterable[str]) -> str:
+def append_aids(name: str, aids: Iterable[str]) -> str:
     """The name of a Kalman filter with vehicle constraints, with these sensors behind a plus; another unchanged."""
     kind, *own = name.split("+")
     if not {"nhc", "car"} & set(kind.split("_")):
@@ -74,7 +74,7 @@ def describe_aids(models: Mapping[str, Any], tables: Iterable[AidTable]) -> list
     """A line for each sensor of a dataset: which filters take it, and which do not."""
     lines = []
     for table in tables:
-        takes = [name for name, model in models.items() if table in tables_of(model)]
+        takes = [name for name, model in models.items() if table in find_tables(model)]
         others = [name for name in models if name not in takes]
         said = f"{table.name}: used by {', '.join(takes)}" if takes else f"{table.name}: used by no filter here"
         if others:
@@ -83,15 +83,15 @@ def describe_aids(models: Mapping[str, Any], tables: Iterable[AidTable]) -> list
     return lines
 
 
-def kalman_of(model: Any) -> Any:
+def find_kalman(model: Any) -> Any:
     """The Kalman filter in a smoothed, compiled or learned one, if it has one."""
     inner = model.filter if isinstance(model, SmoothedSolution) else getattr(model, "estimator", model)
     return getattr(inner, "kalman", inner)
 
 
-def tables_of(model: Any) -> tuple[AidTable, ...]:
+def find_tables(model: Any) -> tuple[AidTable, ...]:
     """The tables that a filter's sources use, in the order of its sources."""
-    tables = [getattr(source, "table", None) for source in getattr(kalman_of(model), "sources", ())]
+    tables = [getattr(source, "table", None) for source in getattr(find_kalman(model), "sources", ())]
     return tuple(table for table in tables if table is not None)
 
 
@@ -99,7 +99,7 @@ def aid_columns(model: Any) -> tuple[str, ...]:
     """A filter's output about its sensors, in the order of :attr:`dlkf.filters.integration.Correction.aids`:
     innovation, its 1σ and whether it counted of each, with what a source without a table adds behind its own, then the
     estimates of the sensors' parameters, then their 1σ."""
-    inner = kalman_of(model)
+    inner = find_kalman(model)
     states: ErrorStates = getattr(inner, "states", ErrorStates())
     said: list[str] = []
     for source in getattr(inner, "sources", ()):
@@ -110,7 +110,7 @@ def aid_columns(model: Any) -> tuple[str, ...]:
     return (*said, *states.others, *(f"std_{name}" for name in states.others))
 
 
-def _with_states(source: Any, states: ErrorStates) -> Any:
+def _set_states(source: Any, states: ErrorStates) -> Any:
     """A source for a filter with further states."""
     if is_dataclass(source) and not isinstance(source, type):
         return replace(source, states=states)

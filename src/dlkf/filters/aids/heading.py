@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dlkf.data.aid_tables import STANDARD, AidTable
 from dlkf.data.drive import Batch
-from dlkf.filters.aids.stretch import at_limits, stretch_weights, weighted
+from dlkf.filters.aids.stretch import stack_limits, stretch_weights, weighted_mean
 from dlkf.filters.aids.trust import Trust, judge
 from dlkf.filters.integration import Epoch
 from dlkf.filters.sources import Measurement, Parameter, Predicted, SensorSource, aid_of, predicted_variance
@@ -54,7 +54,8 @@ class DualAntennaHeading(SensorSource):
         value, std, lag, span, count = said.unbind(-1)
         seen, samples = count > 0, epoch.corrected.shape[1]
         weights = stretch_weights(lag.clamp_max(samples * epoch.dt), torch.zeros_like(span), samples, epoch.dt)
-        north, east, down = weighted(weights, at_limits(epoch.start.C_nb[..., 0], epoch.window.C_nb[..., 0])).unbind(-1)
+        forward = stack_limits(epoch.start.C_nb[..., 0], epoch.window.C_nb[..., 0])
+        north, east, down = weighted_mean(weights, forward).unbind(-1)
         axis, level = epoch.frame.axis_n, north.square() + east.square()
         convergence = -epoch.window.end.p_n[:, 1] * axis[:, 2] / (axis[:, 0] * epoch.frame.radius)
         expected = torch.atan2(east, north) + convergence + prediction.parameters["heading_offset"]

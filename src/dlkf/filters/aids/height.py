@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dlkf.data.aid_tables import STANDARD, AidTable
 from dlkf.data.drive import Batch
-from dlkf.filters.aids.stretch import at_limits, stretch_weights, weighted
+from dlkf.filters.aids.stretch import stack_limits, stretch_weights, weighted_mean
 from dlkf.filters.aids.trust import Trust, judge
 from dlkf.filters.integration import Epoch
 from dlkf.filters.sources import Measurement, Parameter, Predicted, SensorSource, aid_of, predicted_variance
@@ -49,7 +49,7 @@ class Barometer(SensorSource):
         value, std, lag, span, count = said.unbind(-1)
         seen, samples = count > 0, epoch.corrected.shape[1]
         weights = stretch_weights(lag.clamp_max(samples * epoch.dt), span, samples, epoch.dt)
-        p_n = weighted(weights, at_limits(epoch.start.p_n, epoch.window.p_n))
+        p_n = weighted_mean(weights, stack_limits(epoch.start.p_n, epoch.window.p_n))
         curved = p_n[:, :2].square().sum(-1) / (2 * epoch.frame.radius)
         z = value - (epoch.frame.height - p_n[:, 2] + curved) - prediction.parameters["baro_offset_m"]
         H = p_n.new_zeros(len(p_n), 1, self.states.count)

@@ -26,12 +26,12 @@ def stretch_weights(
     return overlap / overlap.sum(-1, keepdim=True).clamp_min(1e-9 * dt)
 
 
-def at_limits(before: Float[Tensor, "B ..."], after: Float[Tensor, "B M ..."]) -> Float[Tensor, "B m ..."]:
+def stack_limits(before: Float[Tensor, "B ..."], after: Float[Tensor, "B M ..."]) -> Float[Tensor, "B m ..."]:
     """Values at the limits of a window's samples: at its start, then at the end of each sample."""
     return torch.cat((before.unsqueeze(1), after), 1)
 
 
-def weighted(weights: Float[Tensor, "B m"], values: Float[Tensor, "B m ..."]) -> Float[Tensor, "B ..."]:
+def weighted_mean(weights: Float[Tensor, "B m"], values: Float[Tensor, "B m ..."]) -> Float[Tensor, "B ..."]:
     """Their mean."""
     flat = values.reshape(len(values), values.shape[1], -1)
     return torch.bmm(weights.unsqueeze(1), flat).reshape(len(values), *values.shape[2:])

@@ -29,7 +29,7 @@ from torch import Tensor
 from dlkf.data.aid_tables import STANDARD, AidTable
 from dlkf.data.drive import Batch
 from dlkf.filters.aids.rounding import rounded_measurement
-from dlkf.filters.aids.stretch import at_limits, mean_force, stretch_weights, weighted
+from dlkf.filters.aids.stretch import mean_force, stack_limits, stretch_weights, weighted_mean
 from dlkf.filters.aids.trust import Trust, judge
 from dlkf.filters.integration import Epoch
 from dlkf.filters.sources import Measurement, Parameter, Predicted, SensorSource, aid_of, predicted_variance
@@ -88,12 +88,12 @@ class WheelSpeed(SensorSource):
         said = aid_of(epoch, self.table.name)
         if said is None:
             return None, memory
-        second, level, _ = memory.second.after(epoch.corrected, epoch.dt)
+        second, level, _ = memory.second.update(epoch.corrected, epoch.dt)
         shaking = torch.zeros_like(memory.calmest) if level is None else level
         value, std, lag, span, count = said.unbind(-1)
         seen = count > 0
         scale = 1.0 + prediction.parameters["wheel_scale"]
-        speed, H, accel = self._predicted(epoch, prediction, lag, span, scale)
+        speed, H, accel = self._predict_speed(epoch, prediction, lag, span, scale)
         expected, unsure = scale * speed, predicted_variance(prediction.P, H)[:, 0]
         reverse = ~memory.signed & (value > 0) & (expected < -2 * unsure.clamp_min(0).sqrt())
         value = torch.where(reverse, -value, value)
@@ -129,16 +129,16 @@ class WheelSpeed(SensorSource):
         )  # fmt: skip
         return Measurement(z.unsqueeze(-1), H, R.unsqueeze(-1), used.unsqueeze(-1)), memory
 
-    def _predicted(
+    def _predict_speed(
         self, epoch: Epoch, prediction: Predicted, lag: Tensor, span: Tensor, scale: Tensor
     ) -> tuple[Float[Tensor, " B"], Float[Tensor, "B 1 n"], Float[Tensor, " B"]]:
         """Speed of the wheel over the stretch at scale 1, H of the measurement, and the acceleration along the car."""
         samples, dt = epoch.corrected.shape[1], epoch.dt
         T = samples * dt
         delay, right = prediction.parameters["wheel_delay_s"], prediction.parameters["wheel_right_m"]
-        forward = at_limits(epoch.start.C_nb[..., 0], epoch.window.C_nb[..., 0])
-        v_n = at_limits(epoch.start.v_n, epoch.window.v_n)
-        turn = at_limits(epoch.corrected[:, 0, 5], epoch.corrected[..., 5])
+        forward = stack_limits(epoch.start.C_nb[..., 0], epoch.window.C_nb[..., 0])
+        v_n = stack_limits(epoch.start.v_n, epoch.window.v_n)
+        turn = stack_limits(epoch.corrected[:, 0, 5], epoch.corrected[..., 5])
         along = (forward * v_n).sum(-1)
         wheel = along - right.unsqueeze(-1) * turn
         reach = (0.5 * span).clamp(0.5 * dt, 0.5 * T)
@@ -148,18 +148,19 @@ class WheelSpeed(SensorSource):
         half = reach.clamp_min(SLOPE_S)
         first, last = (middle + half).clamp_max(T), (middle - half).clamp_min(0.0)
         none = torch.zeros_like(span)
-        gained = weighted(stretch_weights(last, none, samples, dt) - stretch_weights(first, none, samples, dt), along)
+        between = stretch_weights(last, none, samples, dt) - stretch_weights(first, none, samples, dt)
+        gained = weighted_mean(between, along)
         accel = gained / (first - last)
-        speed = weighted(weights, wheel) - accel * (late - middle)
-        axis = weighted(weights, forward)
+        speed = weighted_mean(weights, wheel) - accel * (late - middle)
+        axis = weighted_mean(weights, forward)
         H = axis.new_zeros(len(axis), self.states.count)
         H[:, self.states.velocity] = axis
         lever = torch.linalg.cross(axis, mean_force(epoch)) * middle.unsqueeze(-1)
-        H[:, self.states.attitude] = weighted(weights, torch.linalg.cross(forward, v_n)) + lever
+        H[:, self.states.attitude] = weighted_mean(weights, torch.linalg.cross(forward, v_n)) + lever
         H[:, 9] = middle
         H[:, 14] = right
         H = scale.unsqueeze(-1) * H
         H[:, self.states.of("wheel_scale")] = speed.unsqueeze(-1)
         H[:, self.states.of("wheel_delay_s")] = -(scale * accel).unsqueeze(-1)
-        H[:, self.states.of("wheel_right_m")] = -(scale * weighted(weights, turn)).unsqueeze(-1)
+        H[:, self.states.of("wheel_right_m")] = -(scale * weighted_mean(weights, turn)).unsqueeze(-1)
         return speed, H.unsqueeze(1), accel

@@ -27,7 +27,7 @@ from torch import Tensor
 from dlkf.data.alignment import ACCEL_BIAS_STD, SIDESLIP_STD, AlignConfig, Start, level_attitude
 from dlkf.data.drive import Drive
 from dlkf.data.segments import whole_drives
-from dlkf.data.velocity_fit import JOLT_STD, scattered_std
+from dlkf.data.velocity_fit import JOLT_STD, scale_std
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.gating import Gate
 from dlkf.filters.integration import Covariances, Epoch, Fix, Step, advance
@@ -66,7 +66,7 @@ ANY_IMU = ImuSpec(
 class Sideslip(CarConstraints):
     """The constraints across the car alone, without detection of standstills."""
 
-    def resting(
+    def detect_rest(
         self, epoch: Epoch, turning: Tensor, prediction: Predicted, memory: Any
     ) -> tuple[Bool[Tensor, " B"], VibrationLevel]:
         """Never."""
@@ -172,7 +172,7 @@ def begin_bank(cases: Sequence[Case]) -> Bank:
     weighed = torch.ones(len(cases), dtype=torch.bool)
     scatter = p.new_tensor([c.scatter for c in cases]).repeat_interleave(COUNT, 0)
     return Bank(
-        memory, begun.start, error, bank.frame.prepared(), bank.lever_arm_b, torch.stack(score), weighed, scatter,
+        memory, begun.start, error, bank.frame.prepare(), bank.lever_arm_b, torch.stack(score), weighed, scatter,
         batch.start_noise,
     )  # fmt: skip
 
@@ -198,7 +198,7 @@ def advance_bank(bank: Bank, imu: Float[Tensor, "B M 6"], fix: EarthFix, dt: flo
     epoch_s = imu.shape[1] * dt
     r_e, v_e, std, valid, lag = (x.repeat_interleave(COUNT, 0) for x in fix)
     position, velocity = bank.scatter.split(1, -1)
-    std = torch.cat((scattered_std(std[:, :3], position), scattered_std(std[:, 3:], velocity, JOLT_STD)), -1)
+    std = torch.cat((scale_std(std[:, :3], position), scale_std(std[:, 3:], velocity, JOLT_STD)), -1)
     value = torch.cat((bank.frame.from_ecef(r_e), bank.frame.rotate_from_ecef(v_e)), -1)
     given = Fix(torch.where(valid, value, 0.0), fix_std(std, epoch_s), valid, lag if bool(lag.any()) else None)
     memory, step = advance(

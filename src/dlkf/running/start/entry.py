@@ -36,7 +36,7 @@ from dlkf.data.alignment import (
 )
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.segments import whole_drives
-from dlkf.data.velocity_fit import JOLT_STD, scattered_std
+from dlkf.data.velocity_fit import JOLT_STD, scale_std
 from dlkf.navigation.attitude import vector_from_rotation
 from dlkf.navigation.earth import EARTH_RATE, STANDARD_GRAVITY, ned_axes
 from dlkf.navigation.error_model import RATE_AVERAGE_S
@@ -98,13 +98,13 @@ def align_each(drives: Sequence[Drive], config: AlignConfig = ALIGN, *, earliest
     for i in range(0, len(motions), CASES_AT_ONCE):
         some = motions[i : i + CASES_AT_ONCE]
         starts += (
-            _search(some, config, earliest) if config.search_s > 0 else [_started(x, config, earliest) for x in some]
+            _search(some, config, earliest) if config.search_s > 0 else [_make_start(x, config, earliest) for x in some]
         )
     of_motions = iter(starts)
     return [x if isinstance(x, InputError) else next(of_motions) for x in found]
 
 
-def aligned_drives(drives: Sequence[Drive], config: AlignConfig = ALIGN) -> Batch:
+def align_drives(drives: Sequence[Drive], config: AlignConfig = ALIGN) -> Batch:
     """Complete drives, each from its own :func:`align`, as one padded batch."""
     return whole_drives(drives, [align(drive, config) for drive in drives], dtype=torch.float64)
 
@@ -145,7 +145,7 @@ class Search(NamedTuple):
         """The start at the present boundary (``first`` = 0), once the heading is good."""
         verdict = judge_bank(self.bank)[0]
         ready = verdict.ready(self.epochs * self.epoch_s, self.config)
-        return _start_of(self.bank, 0, verdict, 0) if ready else None
+        return _start_from_bank(self.bank, 0, verdict, 0) if ready else None
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ class FirstMotion:
         """How many times more than claimed positions and velocities scatter: √w of :mod:`dlkf.filters.fix_noise`."""
         position, velocity = self.aligned.scatter[self.row]
         claimed = self.drive.gnss_std[self.row, 3:5].amax().nan_to_num(nan=1.0)
-        return torch.stack((position, scattered_std(claimed, velocity, JOLT_STD) / claimed))
+        return torch.stack((position, scale_std(claimed, velocity, JOLT_STD) / claimed))
 
     @property
     def gyro(self) -> Tensor | None:
@@ -210,7 +210,7 @@ class FirstMotion:
         C = carry_attitude_back(drive, a.C_eb[ahead[best]], int(ahead[best]), row, self.gyros, self.rest)
         return _ned_axes_at(a.r_e[row]).mT @ C, float(total[best])
 
-    def towards(self, C_nb: Float[Tensor, "3 3"], std: float) -> FirstMotion:
+    def with_heading(self, C_nb: Float[Tensor, "3 3"], std: float) -> FirstMotion:
         """With another heading, the tilt left as it is."""
         C_en = _ned_axes_at(self.aligned.r_e[self.row])
         force_n = C_en.mT @ self.C_eb @ self.force_b
@@ -271,8 +271,8 @@ def _search(motions: Sequence[FirstMotion], config: AlignConfig, earliest: int) 
             if back is not None:
                 found = gyro_bias(bank, k * COUNT + verdict.best)
                 motion = motions[k].with_gyros(found)
-                turned = motion.towards(*back.at_first(motion, k, verdict.best, config))
-                starts[k] = replace(_started(turned, config, earliest), doubt=verdict.doubt, gyro=found)
+                turned = motion.with_heading(*back.carry_back(motion, k, verdict.best, config))
+                starts[k] = replace(_make_start(turned, config, earliest), doubt=verdict.doubt, gyro=found)
             elif ended:
                 why = f"ambiguous (the alternatives have probability {verdict.doubt:.2g})"
                 if verdict.decided:
@@ -281,7 +281,7 @@ def _search(motions: Sequence[FirstMotion], config: AlignConfig, earliest: int) 
                     f"drive {drives[k].name}: its heading is {why}; align.from_rest=true takes the most probable"
                 )
             else:
-                starts[k] = _start_of(bank, k, verdict, motions[k].row + t)
+                starts[k] = _start_from_bank(bank, k, verdict, motions[k].row + t)
         if len(starts) == len(motions):
             return [starts[k] for k in range(len(motions))]
         now = [min(m.row + t, m.drive.epochs - 1) for m in motions]
@@ -310,7 +310,7 @@ class BackCarried:
         self.epoch = torch.where(better, epoch, self.epoch)
         self.C_nb = torch.where(better[:, None, None], bank.state.C_nb, self.C_nb)
 
-    def at_first(self, motion: FirstMotion, case: int, best: int, config: AlignConfig) -> tuple[Tensor, float]:
+    def carry_back(self, motion: FirstMotion, case: int, best: int, config: AlignConfig) -> tuple[Tensor, float]:
         """Attitude at the first boundary in the tangent frame there, and 1σ of its yaw.
 
         The best course or its reverse where that is the better known of the two and agrees with the bank.
@@ -330,7 +330,7 @@ class BackCarried:
         return C, std
 
 
-def _start_of(bank: Bank, case: int, verdict: HeadingVerdict, row: int) -> Start:
+def _start_from_bank(bank: Bank, case: int, verdict: HeadingVerdict, row: int) -> Start:
     """The most probable heading of a case as a start at boundary ``row``."""
     k = case * COUNT + verdict.best
     frame = bank.frame[k : k + 1]
@@ -342,7 +342,7 @@ def _start_of(bank: Bank, case: int, verdict: HeadingVerdict, row: int) -> Start
     return replace(start, doubt=verdict.doubt, gyro=gyro_bias(bank, k), noise=noise)
 
 
-def _started(motion: FirstMotion, config: AlignConfig, earliest: int) -> Start:
+def _make_start(motion: FirstMotion, config: AlignConfig, earliest: int) -> Start:
     """The start at first motion, or further back where a fix has been and the heading can be carried to."""
     drive, row, rest = motion.drive, motion.row, motion.rest
     if not config.from_rest or row == earliest:
@@ -372,7 +372,7 @@ def _started(motion: FirstMotion, config: AlignConfig, earliest: int) -> Start:
         v_std = torch.hypot(motion.noise[1] * drive.gnss_std[k, 3:], v_n.new_tensor(STALE_ACCELERATION * lag))
         v_std = torch.where(known_v, v_std, 0.5)
     r_e = drive.gnss_r_e[k] - C_eb @ drive.lever_arm_b + float(drive.gnss_lag[k]) * v_e
-    p_std = scattered_std(drive.gnss_std[k, :3], motion.noise[0])
+    p_std = scale_std(drive.gnss_std[k, :3], motion.noise[0])
     start = _start_at(k, r_e, v_e, C_eb, torch.cat((p_std, v_std, std)))
     return replace(start, gyro=motion.gyro, noise=motion.noise)
 

@@ -62,7 +62,7 @@ def sky_along(rng: np.random.Generator, surroundings: Surroundings, distance: Ar
     return Sky(
         _mask(left_rng, surroundings, distance),
         _mask(right_rng, surroundings, distance),
-        _covered(tunnel_rng, surroundings, distance),
+        _is_covered(tunnel_rng, surroundings, distance),
     )
 
 
@@ -80,7 +80,7 @@ def _mask(rng: np.random.Generator, surroundings: Surroundings, distance: Array)
     return np.arctan2(height, away)[front]
 
 
-def _covered(rng: np.random.Generator, surroundings: Surroundings, distance: Array) -> NDArray[np.bool_]:
+def _is_covered(rng: np.random.Generator, surroundings: Surroundings, distance: Array) -> NDArray[np.bool_]:
     """Whether the road is covered: open and covered stretches in turn, the first one open."""
     if surroundings.tunnel_length == 0:
         return np.zeros(distance.shape, dtype=bool)

@@ -81,7 +81,7 @@ def observe(
     """
     arm, antenna_v_n = antenna_states(truth, rate_b, config.lever_arm_b)
     error = config.std * rng.standard_normal((len(truth.t), 6))
-    wandering, is_float = _wandering(rng.spawn(1)[0], truth.t, config)
+    wandering, is_float = _draw_wander(rng.spawn(1)[0], truth.t, config)
     error[:, :3] += wandering
     std = np.broadcast_to(config.std, error.shape).copy()
     if config.wander > 0 or config.float_share > 0:
@@ -94,7 +94,7 @@ def observe(
     return table if sky is None else table.loc[~sky.blocked].reset_index(drop=True)
 
 
-def _wandering(
+def _draw_wander(
     rng: np.random.Generator, t: NDArray[np.floating], config: GnssConfig
 ) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
     """Errors (N, 3) [m] in NED that last, by multipath and open ambiguities, and where the latter are open (N,)."""

@@ -150,8 +150,8 @@ def apply_mounting(rng: np.random.Generator, car: Car, route: Route, axle: Truth
 
     C = rotation_from_rpy(torch.from_numpy(axle.rpy)).numpy()
     rate = np.stack((-motion.yaw_rate * np.sin(slope), slope_rate, motion.yaw_rate * np.cos(slope)), -1)
-    C, rate = _turned(C, rate, 0, *route.bank(motion))
-    C, rate = _turned(C, rate, 2, shake[:, 5] - slip, shake_rate[:, 5] - slip_rate)
+    C, rate = _turn(C, rate, 0, *route.bank(motion))
+    C, rate = _turn(C, rate, 2, shake[:, 5] - slip, shake_rate[:, 5] - slip_rate)
     moved, moved_rate = shake[:, :3].copy(), shake_rate[:, :3].copy()
     moved[:, 2] -= heave
     moved_rate[:, 2] -= heave_rate
@@ -163,16 +163,16 @@ def apply_mounting(rng: np.random.Generator, car: Car, route: Route, axle: Truth
         )  # fmt: skip
         moved += mount.moved
         moved_rate += mount.moved_rate
-    offset, change = _rotated(C, moved), _rotated(C, np.cross(rate, moved) + moved_rate)
+    offset, change = _rotate(C, moved), _rotate(C, np.cross(rate, moved) + moved_rate)
     swell, swell_rate = car.swells.at(motion)
-    C, rate = _turned(C, rate, 1, pitch + swell + shake[:, 4], pitch_rate + swell_rate + shake_rate[:, 4])
-    C, rate = _turned(C, rate, 0, roll + shake[:, 3], roll_rate + shake_rate[:, 3])
+    C, rate = _turn(C, rate, 1, pitch + swell + shake[:, 4], pitch_rate + swell_rate + shake_rate[:, 4])
+    C, rate = _turn(C, rate, 0, roll + shake[:, 3], roll_rate + shake_rate[:, 3])
     arm = np.broadcast_to(car.imu_arm, rate.shape)
-    offset += _rotated(C, arm)
-    change += _rotated(C, np.cross(rate, arm))
+    offset += _rotate(C, arm)
+    change += _rotate(C, np.cross(rate, arm))
     if mount is not None:
         C = C @ rotation_from_rpy(torch.from_numpy(mount.turned)).numpy()
-    return _shifted(axle, offset, change, C @ rotation_from_rpy(torch.from_numpy(car.mounting)).numpy())
+    return _shift(axle, offset, change, C @ rotation_from_rpy(torch.from_numpy(car.mounting)).numpy())
 
 
 @dataclass(frozen=True)
@@ -221,12 +221,12 @@ def suspension(
     forward, right = loads(route, motion)
     load = np.stack((-car.roll_gradient * right, car.pitch_gradient * forward, np.zeros_like(nodes)), -1)
     w, z = 2 * math.pi * car.kind.body_hz, car.kind.body_damping
-    body = _filtered([w * w], [1, 2 * z * w, w * w], load)
+    body = _filter([w * w], [1, 2 * z * w, w * w], load)
     if car.kind.roughness > 0:
         road = rough_road(rng, car.kind, motion.distance, stretches)
         u, y = 2 * math.pi * car.kind.wheel_hz, car.kind.wheel_damping
-        wheels = _filtered([u * u], [1, 2 * y * u, u * u], road)
-        body += _filtered([2 * z * w, w * w], [1, 2 * z * w, w * w], wheels)
+        wheels = _filter([u * u], [1, 2 * y * u, u * u], road)
+        body += _filter([2 * z * w, w * w], [1, 2 * z * w, w * w], wheels)
     return scipy.interpolate.make_interp_spline(nodes, body, k=5)
 
 
@@ -272,13 +272,13 @@ def vibration(rng: np.random.Generator, kind: ChassisConfig, motion: Kinematics)
     return shake, change
 
 
-def _filtered(numerator: list[float], denominator: list[float], x: Array) -> Array:
+def _filter(numerator: list[float], denominator: list[float], x: Array) -> Array:
     """Columns of x (N, k) at the nodes through a transfer function in s, from the steady state of x₀."""
     b, a = scipy.signal.bilinear(numerator, denominator, NODE_HZ)
     return scipy.signal.lfilter(b, a, x, axis=0, zi=scipy.signal.lfilter_zi(b, a)[:, None] * x[:1])[0]
 
 
-def _turned(C: Array, rate: Array, axis: int, angle: Array, angle_rate: Array) -> tuple[Array, Array]:
+def _turn(C: Array, rate: Array, axis: int, angle: Array, angle_rate: Array) -> tuple[Array, Array]:
     """C R_axis(angle), and the rate of the turned frame in its own axes, Rᵀω + angle' e."""
     j, k = (axis + 1) % 3, (axis + 2) % 3
     cos, sin = np.cos(angle), np.sin(angle)
@@ -291,11 +291,11 @@ def _turned(C: Array, rate: Array, axis: int, angle: Array, angle_rate: Array) -
     return turned, turned_rate
 
 
-def _rotated(C: Array, u: Array) -> Array:
+def _rotate(C: Array, u: Array) -> Array:
     return np.einsum("tij,tj->ti", C, u)
 
 
-def _shifted(axle: Truth, offset: Array, change: Array, C_nb: Array) -> Truth:
+def _shift(axle: Truth, offset: Array, change: Array, C_nb: Array) -> Truth:
     """Truth of a point that stands off by ``offset`` [m] in NED, whose change [m/s] is as seen in NED.
 
     NED itself turns as the car moves over the ellipsoid: v = v_axle + o' + ω_en × o (Groves 5.44).

@@ -156,12 +156,12 @@ def engine(rng: np.random.Generator, kind: Shaking, motion: Kinematics) -> tuple
     else:
         ratios = kind.first_gear * kind.gear_step ** np.arange(kind.gears)
         target = ratios[_gear(rng, kind, ratios, speed)] * speed
-    frequency = _smoothed(np.maximum(target, kind.idle_hz), SHIFT_S * TONE_HZ)
+    frequency = _smooth(np.maximum(target, kind.idle_hz), SHIFT_S * TONE_HZ)
     frequency = frequency * (1 + kind.wander * _slow(rng, len(speed), 8.0))
     pulling = 0.7 + 0.3 * np.clip(motion.acceleration, -1, 2) + 0.2 * _slow(rng, len(speed), 3.0)
     rolling = np.clip(speed / 1.5, 0, 1)
     load = rolling * np.clip(pulling, 0.2, None) + (1 - rolling) * kind.idling
-    return frequency, kind.engine * _smoothed(load, SHIFT_S * TONE_HZ) * frequency / AT_HZ
+    return frequency, kind.engine * _smooth(load, SHIFT_S * TONE_HZ) * frequency / AT_HZ
 
 
 def _gear(rng: np.random.Generator, kind: Shaking, ratios: Array, speed: Array) -> NDArray[np.int64]:
@@ -184,7 +184,7 @@ def hum(rng: np.random.Generator, kind: Shaking, t: Array) -> tuple[Array, Array
     off = np.searchsorted(np.cumsum(spans), t, side="right") % 2 == int(starts_on)
     runs = ~off if 0 < kind.hum_share < 1 else np.full(len(t), kind.hum_share == 1)
     frequency = kind.hum_hz * (1 + kind.wander * _slow(rng, len(t), 20.0))
-    return frequency, kind.hum * _smoothed(runs.astype(float), 0.5 * TONE_HZ)
+    return frequency, kind.hum * _smooth(runs.astype(float), 0.5 * TONE_HZ)
 
 
 def _add_tones(
@@ -219,7 +219,7 @@ def _add_wheels(rng: np.random.Generator, kind: Shaking, out: Shaken, motion: Ki
         f = order * kind.wheel_turns * np.abs(coarse.speed)
         quick = (2 * math.pi * np.maximum(f, 0.1)) ** 2
         strength = limit_amplitude(size * gain(kind, f) * quick) / quick
-        spline = scipy.interpolate.make_interp_spline(coarse.t, _smoothed(strength, 4.0), k=3)
+        spline = scipy.interpolate.make_interp_spline(coarse.t, _smooth(strength, 4.0), k=3)
         _add_tone(
             rng, kind, out, math.sqrt(2 * share), order * per_metre * motion.distance, order * per_metre * motion.speed,
             spline(motion.t), spline(motion.t, nu=1),
@@ -257,14 +257,14 @@ def noise(rng: np.random.Generator, kind: Shaking, envelope: Array) -> Array:
     white = envelope[:, None] * axes * rng.standard_normal((count, 6)) if kind.rumble > 0 else np.zeros((count, 6))
     w = 2 * math.pi * ROAD_HZ
     b, a = scipy.signal.bilinear([1.0], [1.0, 2 * ROAD_DAMPING * w, w * w], NODE_HZ)
-    x = _through_mount(kind, np.asarray(scipy.signal.lfilter(b, a, white, axis=0)) / _acceleration_rms(b, a))
+    x = _filter_by_mount(kind, np.asarray(scipy.signal.lfilter(b, a, white, axis=0)) / _acceleration_rms(b, a))
     if kind.rattle > 0 and kind.rattle_per_minute > 0:
         knocks = rng.random(count) < kind.rattle_per_minute / 60 / NODE_HZ
         w, z = 2 * math.pi * kind.rattle_hz, 0.08
         b, a = scipy.signal.bilinear([w * w], [1.0, 2 * z * w, w * w], NODE_HZ)
         height = kind.rattle / w**2 * np.exp(0.6 * rng.standard_normal((count, 6))) * rng.choice((-1, 1), (count, 6))
         hit = np.asarray(scipy.signal.lfilter(b, a, knocks[:, None] * height, axis=0))
-        x += _through_mount(kind, hit * NODE_HZ / w)
+        x += _filter_by_mount(kind, hit * NODE_HZ / w)
     return x
 
 
@@ -274,7 +274,7 @@ def _acceleration_rms(b: Array, a: Array) -> float:
     return float(np.sqrt(np.mean(np.abs((2 * math.pi * f) ** 2 * H) ** 2)))
 
 
-def _through_mount(kind: Shaking, x: Array) -> Array:
+def _filter_by_mount(kind: Shaking, x: Array) -> Array:
     if kind.mount_hz == 0:
         return x
     w, z = 2 * math.pi * kind.mount_hz, kind.mount_damping
@@ -311,7 +311,7 @@ def limit_amplitude(size: Array) -> Array:
     return size / (1 + (size / LIMIT) ** 4) ** 0.25
 
 
-def _smoothed(x: Array, nodes: float) -> Array:
+def _smooth(x: Array, nodes: float) -> Array:
     """Twice through a first-order lag of so many nodes, from the steady state of x₀: no corners, no overshoot."""
     keep = math.exp(-2 / max(nodes, 1e-9))
     for _ in range(2):
@@ -324,4 +324,4 @@ def _slow(rng: np.random.Generator, count: int, seconds: float) -> Array:
     keep = math.exp(-1 / (seconds * TONE_HZ))
     first, steps = keep * rng.standard_normal(1), math.sqrt(1 - keep**2) * rng.standard_normal(count)
     drawn = scipy.signal.lfilter([1.0], [1.0, -keep], steps, zi=first)[0]
-    return _smoothed(np.clip(drawn, -2.5, 2.5), TONE_HZ / 2)
+    return _smooth(np.clip(drawn, -2.5, 2.5), TONE_HZ / 2)

@@ -52,7 +52,7 @@ class Waves:
             rate += amplitude * wavenumber * np.cos(where) * motion.speed
         return angle, rate
 
-    def steered(self, motion: Kinematics) -> Kinematics:
+    def steer(self, motion: Kinematics) -> Kinematics:
         """The motion with the angle added to its course."""
         angle, bend, curl = (np.zeros_like(motion.t) for _ in range(3))  # and its derivatives by distance
         for amplitude, wavenumber, phase in zip(self.amplitude, self.wavenumber, self.phase):
@@ -82,7 +82,7 @@ class Route:
     def motion(self, t: Array) -> Kinematics:
         """Where along the road the car is at times ``t`` [s], and how fast."""
         planned = along(self.plan, t)
-        return planned if self.wander is None else self.wander.steered(planned)
+        return planned if self.wander is None else self.wander.steer(planned)
 
     def bank(self, motion: Kinematics) -> tuple[Array, Array]:
         """Bank of the road [rad], positive where its right edge is the lower, and its rate [rad/s]."""

@@ -55,12 +55,12 @@ class AdaptiveLossWeights(Callback):
         if not self.pilot:
             return unit_weights()
         if self.rule == "normalised":
-            return {t: self._bounded(1.0, self.average.get(t)) for t in TERMS}
+            return {t: self._bound(1.0, self.average.get(t)) for t in TERMS}
         position, against = self.average.get("position"), self.pilot if self.rule == "pilot" else self.average
-        others = {t: self._bounded(position, against.get(t)) for t in TERMS if t != "position"}
+        others = {t: self._bound(position, against.get(t)) for t in TERMS if t != "position"}
         return {"position": 1.0} | others
 
-    def _bounded(self, above: float | None, below: float | None) -> float:
+    def _bound(self, above: float | None, below: float | None) -> float:
         ratio = above / below if above is not None and below else 1.0
         return min(max(ratio, 1 / self.w_max), self.w_max)
 

@@ -13,7 +13,7 @@ from lightning.pytorch.callbacks import Callback
 from dlkf.base.errors import InputError
 from dlkf.base.settings import is_number
 from dlkf.data.drive import Batch
-from dlkf.data.masks import outage_within, withhold_fixes
+from dlkf.data.masks import mask_outage, withhold_fixes
 
 if TYPE_CHECKING:
     from dlkf.training.module import FilterTraining
@@ -77,7 +77,7 @@ class OutageInjection(BatchCallback):
             return batch
         length = shortest + (longest - shortest) * torch.rand(B, 1, generator=generator)
         start = self.before_s + (room - length) * torch.rand(B, 1, generator=generator)
-        return withhold_fixes(batch, outage_within(batch, start[:, 0], length[:, 0]))
+        return withhold_fixes(batch, mask_outage(batch, start[:, 0], length[:, 0]))
 
 
 class SensorLoss(BatchCallback):

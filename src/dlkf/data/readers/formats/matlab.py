@@ -50,15 +50,15 @@ def frames(path: Path) -> dict[str, pd.DataFrame]:
 
 def variables(path: Path) -> dict[str, Any]:
     """What a file holds, by name; InputError for one that cannot be read."""
-    found = _loaded(path)
+    found = _load(path)
     vectors = {n: np.squeeze(v) for n, v in found.items() if isinstance(v, np.ndarray) and v.dtype.kind in "fiub"}
     vectors = {n: v for n, v in vectors.items() if v.ndim == 1 and v.size > 1}
     length = max((v.size for v in vectors.values()), default=0)
     alike = {n: v for n, v in vectors.items() if v.size == length}
-    return found | ({VECTORS: _dated(pd.DataFrame(alike))} if len(alike) > 3 and VECTORS not in found else {})
+    return found | ({VECTORS: _convert_dates(pd.DataFrame(alike))} if len(alike) > 3 and VECTORS not in found else {})
 
 
-def _loaded(path: Path) -> dict[str, Any]:
+def _load(path: Path) -> dict[str, Any]:
     try:
         loaded = scipy.io.loadmat(path, simplify_cells=True)
         found = {name: value for name, value in loaded.items() if not name.startswith("__")}
@@ -135,10 +135,10 @@ def _frame(value: Any, where: str, strict: bool = True) -> pd.DataFrame:
             out |= {f"{name}_{k}": column for k, column in enumerate(array.T)}
         elif array.ndim == 1 and array.size == 3 and name in ("stdm", "stdv"):  # NaveGo: one 1σ for all rows
             out |= {f"{name}_{k}": np.full(rows, x) for k, x in enumerate(array)}
-    return _dated(pd.DataFrame(out))
+    return _convert_dates(pd.DataFrame(out))
 
 
-def _dated(frame: pd.DataFrame) -> pd.DataFrame:
+def _convert_dates(frame: pd.DataFrame) -> pd.DataFrame:
     """Serial date numbers, which have 10 µs at best, as nanoseconds since 1970."""
     for name in frame.columns:
         values = frame[name].to_numpy(float)

@@ -45,7 +45,7 @@ def headings(messages: Iterator[Any], where: str) -> pd.DataFrame:
     for m in messages:
         if m.msgID in ("RMC", "ZDA"):
             date = _day(m) or date
-        of_day = of_day if (stamp := _of_day(getattr(m, "time", None))) is None else stamp
+        of_day = of_day if (stamp := _day_ns(getattr(m, "time", None))) is None else stamp
         if m.msgID not in ("HDT", "THS") or of_day is None or getattr(m, "mi", "A") not in ("A", "E"):
             continue
         angle = _float(getattr(m, "headingT", getattr(m, "headt", "")))
@@ -80,7 +80,7 @@ def fixes(messages: Iterator[Any], where: str) -> pd.DataFrame:
     seen: str | None = None
     for m in messages:
         time = getattr(m, "time", None)
-        stamp = _of_day(time)
+        stamp = _day_ns(time)
         if m.msgID in ("RMC", "ZDA") and (day := _day(m)) is not None:
             date = day
         if m.msgID == "VTG":  # carries no time: it belongs to the epoch that is open
@@ -142,7 +142,7 @@ def _set_velocity(row: dict[str, Any], knots: Any, course: Any) -> None:
     row["vel_n"], row["vel_e"] = speed * np.cos(np.radians(angle)), speed * np.sin(np.radians(angle))
 
 
-def _of_day(time: Any) -> int | None:
+def _day_ns(time: Any) -> int | None:
     if not hasattr(time, "hour"):
         return None
     return ((time.hour * 60 + time.minute) * 60 + time.second) * 10**9 + time.microsecond * 1000

@@ -18,7 +18,7 @@ import pandas as pd
 
 from dlkf.base.errors import InputError
 from dlkf.data.readers import units
-from dlkf.data.readers.formats.text import cells_of, decode_text
+from dlkf.data.readers.formats.text import decode_text, make_frame
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.schema import POSITION, STD, VELOCITY
 
@@ -44,7 +44,7 @@ def _export(lines: list[str], path: Path) -> LogTable:
     first = heads[0] + (2 if any(marks) else 1)
     rows = [(k + 1, line.split()) for k, line in enumerate(lines) if k >= first and line.strip()]
     widths = [3 if "D M S" in m else 1 for m in marks]
-    cells, notes = cells_of(rows, sum(widths), path, f"not the {sum(widths)} cells that the header names")
+    cells, notes = make_frame(rows, sum(widths), path, f"not the {sum(widths)} cells that the header names")
     out, at = {}, 0
     for name, width in zip(names, widths):
         part = cells.iloc[:, at : at + width]
@@ -133,11 +133,12 @@ def _logs(lines: list[str], path: Path, kind: str, table: str | None) -> LogTabl
             raise InputError(f"{path}: no log {name or ', '.join(IMUS)}; has {have}; set reader.imu.table")
         return LogTable(_imu(logs[name], SIZES.get(name, 0)), path, "log")
     if table == "INSPVA" or (kind == "reference" and "INSPVA" in logs):
-        return LogTable(_inspva(logs.get("INSPVA") or _absent(path, "INSPVA", have)), path, "log")
-    return LogTable(_best(logs.get("BESTPOS") or _absent(path, "BESTPOS", have), logs.get("BESTVEL", [])), path, "log")
+        return LogTable(_inspva(logs.get("INSPVA") or _refuse_absent(path, "INSPVA", have)), path, "log")
+    positions = logs.get("BESTPOS") or _refuse_absent(path, "BESTPOS", have)
+    return LogTable(_join_best(positions, logs.get("BESTVEL", [])), path, "log")
 
 
-def _absent(path: Path, name: str, have: str) -> Any:
+def _refuse_absent(path: Path, name: str, have: str) -> Any:
     raise InputError(f"{path}: has no log {name}; has {have}")
 
 
@@ -154,7 +155,9 @@ def _imu(rows: list[tuple[int, float, list[str]]], skip: int) -> pd.DataFrame:
     return pd.DataFrame(out)
 
 
-def _best(positions: list[tuple[int, float, list[str]]], speeds: list[tuple[int, float, list[str]]]) -> pd.DataFrame:
+def _join_best(
+    positions: list[tuple[int, float, list[str]]], speeds: list[tuple[int, float, list[str]]]
+) -> pd.DataFrame:
     """BESTPOS (height above sea level and undulation), with the BESTVEL of the same time."""
     velocity = {}
     for week, sow, c in speeds:

@@ -27,7 +27,7 @@ Row = dict[str, Any]
 
 def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
     """The topic ``table``, or the only one whose type holds what ``kind`` needs; ROS 2: the bag's metadata.yaml."""
-    with _opened(path) as reader:
+    with _open(path) as reader:
         return _read(reader, path, kind, table)
 
 
@@ -52,7 +52,7 @@ def _wheel_topics(topics: Mapping[str, str]) -> list[str]:
     return sorted(t for t, kind in topics.items() if kind in kinds and WHEEL.search(t) and not NO_WHEEL.search(t))
 
 
-def velocities_beside(path: Path) -> list[str]:
+def find_velocities(path: Path) -> list[str]:
     """Topics with velocities alone, where the bag's fixes (one topic of NavSatFix) have none."""
     topics = _topics(path)
     topics = {topic: kind for topic, kind in topics.items() if topic not in _wheel_topics(topics)}
@@ -61,12 +61,12 @@ def velocities_beside(path: Path) -> list[str]:
 
 
 def _topics(path: Path) -> dict[str, str]:
-    with _opened(path) as reader:
-        return {c.topic: _short(c.msgtype) for c in reader.connections}
+    with _open(path) as reader:
+        return {c.topic: _shorten_type(c.msgtype) for c in reader.connections}
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open(path: Path) -> Iterator[Any]:
     highlevel = library("rosbags.highlevel", "a ROS bag")
     typesys = library("rosbags.typesys", "a ROS bag")
     bag = path.parent if path.name == "metadata.yaml" else path
@@ -93,14 +93,14 @@ def _read(reader: Any, path: Path, kind: str, table: str | None) -> LogTable:
             raise InputError(f"{path}: no topic {table}; has {have}; name one of these")
         chosen = [topics[table]]
     else:
-        chosen = [c for c in topics.values() if _short(c.msgtype) in known]
+        chosen = [c for c in topics.values() if _shorten_type(c.msgtype) in known]
         if kind == "speed":
-            wheels = _wheel_topics({topic: _short(c.msgtype) for topic, c in topics.items()})
+            wheels = _wheel_topics({topic: _shorten_type(c.msgtype) for topic, c in topics.items()})
             chosen = [topics[topic] for topic in wheels] or chosen
         if len(chosen) != 1:
             what = "no topic" if not chosen else f"{len(chosen)} topics"
             raise InputError(f"{path}: {what} with {', '.join(sorted(known))}; has {have}; set reader.{kind}.table")
-    name = _short(chosen[0].msgtype)
+    name = _shorten_type(chosen[0].msgtype)
     every = {"imu": IMU, "speed": {**ODOMETRY, **dict.fromkeys(VELOCITIES, _forward)}}.get(kind, {**FIX, **VELOCITIES})
     if name not in (*every, SENTENCE):
         raise InputError(f"{path}: {chosen[0].topic} is {chosen[0].msgtype}; must be {', '.join(every)}")
@@ -180,7 +180,7 @@ def _sentences(messages: Iterator[tuple[int, Any]], where: str) -> pd.DataFrame:
     return nmea.fixes(nmea.sentences(content), where).rename(columns={"utc_ns": "t_ns"})
 
 
-def _short(msgtype: str) -> str:
+def _shorten_type(msgtype: str) -> str:
     return msgtype.replace("/msg/", "/")
 
 

@@ -17,7 +17,7 @@ import pymap3d
 
 from dlkf.base.errors import InputError
 from dlkf.data.readers import units
-from dlkf.data.readers.formats.text import cells_of, decode_text
+from dlkf.data.readers.formats.text import decode_text, make_frame
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.qualities import READINGS, RTKLIB
 from dlkf.data.schema import POSITION, STD, VELOCITY
@@ -46,7 +46,7 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
         if line.strip() and not line.startswith("%")
     ]
     first, usual = (rows[0][0], len(rows[0][1])) if rows else (0, 0)
-    cells, notes = cells_of(rows, usual, path, f"another number of cells than line {first}")
+    cells, notes = make_frame(rows, usual, path, f"another number of cells than line {first}")
     return LogTable(_frame(cells, names, ZONES[zone], path), path, "line", {}, notes)
 
 

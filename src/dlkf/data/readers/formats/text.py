@@ -45,16 +45,16 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
     if chosen is not None:
         every, rows = rows, [k for k in rows if chosen.search(lines[k])]
         if not rows:
-            raise InputError(f"{path}: no line matches {pattern}; {_beginnings(lines, every, pattern, kind)}")
+            raise InputError(f"{path}: no line matches {pattern}; {_describe_beginnings(lines, every, pattern, kind)}")
     units, notes = {}, []
     if head and len(rows) > 1 and _is_units(lines[rows[0]], lines[rows[1]], options):
         names, cells = (_cells(lines[k], options["separator"]) for k in (head[0], rows[0]))
         units = {n.strip().strip('"'): u.strip().strip('"') for n, u in zip(names, cells)}
         rows = rows[1:]
-    if len(rows) > 1 and (detail := _cut_off(lines, rows, content.endswith(("\n", "\r")), options)):
+    if len(rows) > 1 and (detail := _find_cut(lines, rows, content.endswith(("\n", "\r")), options)):
         notes.append(f"{path.name}: line {rows[-1] + 1}, the last, {detail}: left out, the log seems cut off there")
         rows = rows[:-1]
-    frame = _parsed(path, [lines[k] for k in (*head, *rows)], [k + 1 for k in (*head, *rows)], options)
+    frame = _parse(path, [lines[k] for k in (*head, *rows)], [k + 1 for k in (*head, *rows)], options)
     if not len(frame):
         raise InputError(f"{path}: has no rows; leave the drive out or give its data")
     frame.index = pd.Index([k + 1 for k in rows][: len(frame)])
@@ -67,7 +67,7 @@ def decode_text(path: Path, encoding: str | None) -> str:
     try:
         if path.is_file() and path.stat().st_size > LARGEST_BYTES:
             raise InputError(f"{path}: is {path.stat().st_size / 2**30:.1f} GiB of text; split it, or write Parquet")
-        raw = _unpacked(path) if path.suffix == ".gz" else path.read_bytes()
+        raw = _unpack(path) if path.suffix == ".gz" else path.read_bytes()
     except (OSError, EOFError, zlib.error) as error:
         raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
     if encoding is not None:
@@ -87,7 +87,7 @@ def decode_text(path: Path, encoding: str | None) -> str:
     return raw.decode("latin-1")
 
 
-def cells_of(
+def make_frame(
     rows: list[tuple[int, list[str]]], count: int, path: Path, otherwise: str
 ) -> tuple[pd.DataFrame, tuple[str, ...]]:
     """Numbered rows of ``count`` cells as texts, without the last where that has fewer, and a note on it.
@@ -116,7 +116,7 @@ def _likely_encodings(head: bytes) -> list[str]:
     return sorted(ENCODINGS, key=known, reverse=True)
 
 
-def _unpacked(path: Path) -> bytes:
+def _unpack(path: Path) -> bytes:
     """A gzip file's content; InputError for one that unpacks to more than a log can be."""
     most = min(LARGEST_BYTES, max(SMALL_BYTES, LARGEST_RATIO * path.stat().st_size))
     with gzip.open(path, "rb") as file:
@@ -128,7 +128,7 @@ def _unpacked(path: Path) -> bytes:
     return raw
 
 
-def _parsed(path: Path, lines: list[str], numbers: list[int], options: Mapping[str, Any]) -> pd.DataFrame:
+def _parse(path: Path, lines: list[str], numbers: list[int], options: Mapping[str, Any]) -> pd.DataFrame:
     try:
         with warnings.catch_warnings():  # of a separator at the end of every line; missing columns are reported
             warnings.simplefilter("ignore", pd.errors.ParserWarning)
@@ -153,7 +153,7 @@ def _parsed(path: Path, lines: list[str], numbers: list[int], options: Mapping[s
     return frame
 
 
-def _beginnings(lines: list[str], rows: list[int], pattern: str, kind: str) -> str:
+def _describe_beginnings(lines: list[str], rows: list[int], pattern: str, kind: str) -> str:
     """What lines begin with, words before the first number, the most frequent first, and what takes them."""
     words = (re.match(r"[^\d.+-]*", lines[k][:60]) for k in rows)
     counts = Counter((found[0] if found else "").strip(" ,;\t") for found in words)
@@ -186,7 +186,7 @@ def _is_units(first: str, second: str, options: Mapping[str, Any]) -> bool:
     )
 
 
-def _cut_off(lines: list[str], rows: list[int], ended: bool, options: Mapping[str, Any]) -> str | None:
+def _find_cut(lines: list[str], rows: list[int], ended: bool, options: Mapping[str, Any]) -> str | None:
     """What is wrong with the last line, if it is not whole."""
     before, last = (_cells(lines[k], options["separator"]) for k in rows[-2:])
     if rows[-1] != len(lines) - 1:

@@ -51,14 +51,14 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
         raise InputError(f"{path}: has no NAV-PVT message; log UBX-NAV-PVT, or give GNSS from another file{cut}")
     wanted = [table] if table else list(MESSAGES)
     if kind in ("speed", "heading"):
-        found = _headings(messages) if kind == "heading" else _first(_wheels(messages, name) for name in wanted)
+        found = _headings(messages) if kind == "heading" else _find_table(_wheels(messages, name) for name in wanted)
         if not len(found):
             what = "NAV-RELPOSNED with a valid heading" if kind == "heading" else "speed or ticks of wheels in ESF-MEAS"
             raise InputError(f"{path}: has no {what}; set reader.{kind}.file=null")
         return LogTable(found, path, "message", notes=notes)
     if kind != "imu":
         return LogTable(fixes, path, "fix", notes=notes)
-    samples = _first(_samples(messages, name) for name in wanted)
+    samples = _find_table(_samples(messages, name) for name in wanted)
     if len(samples):
         return LogTable(samples, path, "sample", notes=notes)
     have = ", ".join(sorted({m.identity for m in messages}))
@@ -68,11 +68,11 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
 def aids(path: Path) -> tuple[str, ...]:
     """Which further sensors a log has: speed, heading."""
     messages, _ = _messages(path, path.stat().st_mtime_ns)
-    found = {"speed": _first(_wheels(messages, name) for name in MESSAGES), "heading": _headings(messages)}
+    found = {"speed": _find_table(_wheels(messages, name) for name in MESSAGES), "heading": _headings(messages)}
     return tuple(name for name, table in found.items() if len(table))
 
 
-def _first(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
+def _find_table(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
     """The first that has rows."""
     return next((table for table in tables if len(table)), pd.DataFrame())
 
@@ -134,10 +134,10 @@ def _gps_ns(m: Any) -> int | None:
     if not 1980 <= m.year < 2100:
         return None
     gps = int(gps_seconds(date.astype("datetime64[s]").astype(np.int64)))
-    return _in_week(round((gps - m.iTOW / 1000) / WEEK_S), m)
+    return _gps_from_tow(round((gps - m.iTOW / 1000) / WEEK_S), m)
 
 
-def _in_week(week: int, m: Any) -> int:
+def _gps_from_tow(week: int, m: Any) -> int:
     """GPS nanoseconds of a message's iTOW."""
     return week * WEEK_S * 10**9 + m.iTOW * 10**6
 
@@ -151,8 +151,8 @@ def _quality(m: Any) -> int:
 
 def _samples(messages: list[Any], name: str) -> pd.DataFrame:
     """IMU samples: values of one time tag, where all six axes are there."""
-    stamps, values = _complete(messages, name, SENSORS)
-    columns = {c: step * _signed(x) for (c, step), x in zip(SENSORS.values(), values.T)}
+    stamps, values = _collect_complete(messages, name, SENSORS)
+    columns = {c: step * _to_signed(x) for (c, step), x in zip(SENSORS.values(), values.T)}
     return pd.DataFrame(columns)[[*GYRO, *ACCEL]].assign(t_ns=stamps)
 
 
@@ -160,11 +160,11 @@ def _wheels(messages: list[Any], name: str) -> pd.DataFrame:
     """Speed [m/s] of the car's own sensor, else ticks counted on: the mean of the rear wheels, the single tick, the
     mean of the front ones, whichever there is."""
     for kinds in (SPEED, *TICKS):
-        stamps, values = _complete(messages, name, kinds)
+        stamps, values = _collect_complete(messages, name, kinds)
         if not len(stamps):
             continue
         if kinds == SPEED:
-            return pd.DataFrame({"t_ns": stamps, "speed": 1e-3 * _signed(values[:, 0])})
+            return pd.DataFrame({"t_ns": stamps, "speed": 1e-3 * _to_signed(values[:, 0])})
         backward, count = values & BACKWARD > 0, values & (BACKWARD - 1)
         step = np.diff(count, axis=0, prepend=count[:1])
         step = (step + BACKWARD // 2) % BACKWARD - BACKWARD // 2
@@ -180,11 +180,11 @@ def _headings(messages: list[Any]) -> pd.DataFrame:
         if m.identity == "NAV-PVT" and (stamp := _gps_ns(m)) is not None:
             week = stamp // (WEEK_S * 10**9)
         if m.identity == "NAV-RELPOSNED" and week is not None and getattr(m, "relPosHeadingValid", 0):
-            rows.append({"t_ns": _in_week(week, m), "heading_deg": m.relPosHeading, "std_deg": m.accHeading})
+            rows.append({"t_ns": _gps_from_tow(week, m), "heading_deg": m.relPosHeading, "std_deg": m.accHeading})
     return pd.DataFrame(rows)
 
 
-def _complete(messages: list[Any], name: str, kinds: Collection[int]) -> tuple[np.ndarray, np.ndarray]:
+def _collect_complete(messages: list[Any], name: str, kinds: Collection[int]) -> tuple[np.ndarray, np.ndarray]:
     """GPS nanoseconds (n,) and values (n, kinds) of the time tags that have a value of every data type; none where
     these are fewer than ``FEWEST``.
 
@@ -209,7 +209,7 @@ def _complete(messages: list[Any], name: str, kinds: Collection[int]) -> tuple[n
     if len(at) < FEWEST:
         return np.zeros(0, np.int64), np.zeros((0, len(kinds)), np.int64)
     values = np.array([[tags[tag][k] for k in kinds] for tag in at])
-    return _on_gps_time(np.array(at), np.array([arrived[tag] for tag in at])), values
+    return _fit_gps_time(np.array(at), np.array([arrived[tag] for tag in at])), values
 
 
 def _values(m: Any, name: str) -> Iterator[tuple[int, int, int]]:
@@ -225,12 +225,12 @@ def _values(m: Any, name: str) -> Iterator[tuple[int, int, int]]:
         k += 1
 
 
-def _signed(values: np.ndarray) -> np.ndarray:
+def _to_signed(values: np.ndarray) -> np.ndarray:
     """24 bits, two's complement."""
     return ((values & 0xFFFFFF) ^ (1 << 23)) - (1 << 23)
 
 
-def _on_gps_time(tags: np.ndarray, after: np.ndarray) -> np.ndarray:
+def _fit_gps_time(tags: np.ndarray, after: np.ndarray) -> np.ndarray:
     """GPS nanoseconds of time tags, each of which came ``after`` a fix's time: the tags' rate by least squares.
 
     A tag of a millisecond or its like is taken as such. The first sample after a fix is taken to be of the fix's time
