@@ -88,7 +88,7 @@ class Correction(NamedTuple):
     gain: Tensor | None = None  # (B, 9, 6)
     accepted: Tensor | None = None  # (B,) bool: a fix was used; None: all that might be
     covariances: Covariances | None = None
-    aids: Tensor | None = None  # (B, A) of further sensors, see dlkf.filters.aids.report.aid_columns
+    aids: Tensor | None = None  # (B, A) of further sensors, see dlkf.filters.aids.attach.aid_columns
     innovation: Tensor | None = None  # (B, 6) as the estimator predicts the fix; None: as the loop does
 
 
@@ -144,7 +144,7 @@ class BatchSolution:
     error: ImuError | None = None  # (B, T, …) likewise: bias and sensor matrices apart
     innovation_covariance: Tensor | None = None  # (B, T, 6, 6) H P Hᵀ + R before gating, kept with the covariances
     position_covariance: Tensor | None = None  # (B, T, 2, 2) horizontal, before the update, likewise
-    aids: Tensor | None = None  # (B, T, A) of further sensors, see dlkf.filters.aids.report.aid_columns
+    aids: Tensor | None = None  # (B, T, A) of further sensors, see dlkf.filters.aids.attach.aid_columns
 
 
 def advance(
