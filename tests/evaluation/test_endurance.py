@@ -10,7 +10,7 @@ from dlkf.base.errors import InputError
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.data.segments import StartLaw
 from dlkf.data.store import load_dataset
-from dlkf.evaluation import endurance
+from dlkf.evaluation import endurance, protocol
 from dlkf.evaluation.endurance import (
     after_tables,
     hour_table,
@@ -42,6 +42,17 @@ def test_parts_of_an_hour_hold_their_own_epochs(town, monkeypatch):
     assert found["mbkf15"]["position_m_0.5_1_min"] == pytest.approx(math.sqrt(np.mean(position**2)))
     assert found["mbkf15"]["heading_deg_0.5_1_min"] < 0.8 * found["mbkf15"]["heading_deg_0_0.5_min"]
     assert len(hour_table("town", found).rows) == 2
+
+
+def test_long_segments_cover_the_drives_of_a_side_without_an_outage(town, monkeypatch):
+    """Drives of a minute: segments as long as they have room for, not of the 20 s that are scored."""
+    monkeypatch.setattr(protocol, "STEP_S", 10)
+    data = DriveDataModule(town, split={"train": ["g0"], "val": ["g1"], "test": ["g2"]}, eval_length_s=20.0, rate_hz=20)
+    data.setup()
+    (batch,) = Scenes.of_long_segments(data, "train", 0).withhold()
+    assert batch.size[1] in (50, 60) and bool(batch.available.all())
+    assert set(batch.drive) == {d.name for d in data.drives("train")}
+    assert batch.size[0] * batch.size[1] >= 0.8 * 20 * len(data.segments("train"))
 
 
 def test_a_filter_is_better_after_more_gnss(town):
