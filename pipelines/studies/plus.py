@@ -4,6 +4,7 @@
     python -m pipelines.studies.plus --train --out outputs/plus    the constants by gradient and fresh weights as well
     python -m pipelines.studies.plus --parts --real <real> --out outputs/plus_parts    against itself without its parts
     python -m pipelines.studies.plus --oracle --no-auto --sets good fleet others    beside a filter given the true noise
+    python -m pipelines.studies.plus --no-auto --rate 10 --sets good fleet others    with IMU samples of 10 Hz
 
 Makes the test sets that are missing (below ``--data``), runs every filter compiled over segments with GNSS for 60, 300
 and 900 s and then none for 120 s (real drives: 30 or 60 s), and writes ``table.md`` and ``manifest.json`` (commit,
@@ -96,9 +97,9 @@ class Row:
     groups: list[str]
 
 
-def load(folder: Path) -> list[Drive]:
-    """Drives of a dataset at 50 Hz."""
-    return list(load_dataset(folder, rate_hz=50.0, epoch_s=1.0, dtype=torch.float64))
+def load(folder: Path, rate_hz: float = 50.0) -> list[Drive]:
+    """Drives of a dataset, samples averaged to ``rate_hz``."""
+    return list(load_dataset(folder, rate_hz=rate_hz, epoch_s=1.0, dtype=torch.float64))
 
 
 def simulated_cases(name: str, drives: Sequence[Drive]) -> Iterator[Case]:
@@ -189,7 +190,7 @@ def score(case: Case, filters: Mapping[str, Estimator]) -> list[Row]:
     hidden, valid = (~batch.available & batch.present).numpy(), batch.truth_valid.numpy()
     for name, estimator in filters.items():
         with torch.inference_mode():
-            solution = compile_filter(estimator, 50.0, 1.0).integrate(batch)
+            solution = compile_filter(estimator, 1 / batch.dt, batch.epoch_s).integrate(batch)
         e = (solution.posterior.p_n - batch.truth.p_n)[..., :2].numpy()
         assert solution.std is not None
         square = 0.5 * ((e / solution.std[..., :2].numpy()) ** 2).sum(-1)
@@ -293,6 +294,7 @@ def main() -> None:
     arguments.add_argument("--oracle", action="store_true", help="beside a filter given the noise of simulated drives")
     arguments.add_argument("--parts", action="store_true", help="against itself without a part")
     arguments.add_argument("--model", default="plus", help="weights: plus, or a folder")
+    arguments.add_argument("--rate", type=float, default=50.0, help="of the IMU samples that the filters get [Hz]")
     arguments.add_argument("--train", action="store_true", help="constants and weights anew, first")
     arguments.add_argument("--out", type=Path, default=Path("outputs/plus"))
     options = arguments.parse_args()
@@ -313,7 +315,7 @@ def main() -> None:
             arguments.error(f"no dataset {name}: {folder} is no folder; real ones need --real")
     rows, digests = [], {}
     for name, folder in folders.items():
-        drives, digests[name] = load(folder), dataset_digest(folder)
+        drives, digests[name] = load(folder, options.rate), dataset_digest(folder)
         found = {} if options.no_auto or options.parts else found_noise(drives)
         baselines = parts(options.model) if options.parts else {**constants(), **found}
         filters = {**baselines, "plus": trained_filter(options.model)}
@@ -324,7 +326,8 @@ def main() -> None:
             print("\n".join(markdown(rows[-1:])[2:]), flush=True)
     lines = [*markdown(rows), "", *pooled(rows)]
     (options.out / "table.md").write_text("\n".join(lines) + "\n")
-    made = {**describe_provenance(), "simulated": dict(SIMULATED), "injected": INJECTED, "digests": digests}
+    made = {**describe_provenance(), "rate_hz": options.rate, "simulated": dict(SIMULATED)}
+    made |= {"injected": INJECTED, "digests": digests}
     (options.out / "manifest.json").write_text(json.dumps(made, indent=1) + "\n")
     print("\n".join(lines))
 
