@@ -1,9 +1,8 @@
 """What a long list of drives costs: ``python -m pipelines.studies.long_lists data/two --hours 42 100``.
 
-The drives of a dataset under new names (links: no room on the disk) until there are so many hours, and again cut into
-short drives. Each work runs in an interpreter of its own; printed are its processor time, its time by the clock and the
-most memory it had, and the least of ``--repeats`` runs counts. Work is ``open`` (load, check, resample, cut)
-or a command.
+The drives of a dataset under new names (links: no room on the disk) until there are so many hours. Each work runs in an
+interpreter of its own; printed are its processor time, its time by the clock and the most memory it had, and the least
+of ``--repeats`` runs counts. Work is ``open`` (load, check, resample, cut) or a command.
 """
 
 from __future__ import annotations
@@ -19,10 +18,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pandas as pd
-import pyarrow as pa
 
-from dlkf.data.schema import drive_file, write_drives_table, write_parquet
-from dlkf.data.tables import read_drives
+from dlkf.data.schema import drive_file, write_drives_table
 
 KINDS = ("imu", "gnss", "reference")
 OPEN = """
@@ -67,24 +64,6 @@ def link_drives(source: Path, out: Path, hours: float) -> int:
     return len(rows)
 
 
-def cut_drives(source: Path, out: Path, minutes: float) -> Path:
-    """Every drive of a dataset cut into drives of so many minutes."""
-    rows = []
-    known = {row["drive"]: row for row in pd.read_parquet(source / "drives.parquet").to_dict("records")}
-    for drive in read_drives(source):
-        tables = {k: pd.read_parquet(drive_file(source, k, drive.name), partitioning=None) for k in KINDS}
-        part = 0
-        while (first := part * 60 * minutes) + 60 * minutes <= known[drive.name]["duration_s"] + 1e-6:
-            name = f"{drive.name}-{part:03d}"
-            for kind, table in tables.items():
-                some = table[(table.t >= first) & (table.t <= first + 60 * minutes)]
-                write_parquet(drive_file(out, kind, name), pa.Table.from_pandas(some, preserve_index=False))
-            rows.append({**known[drive.name], "drive": name, "group": name, "duration_s": 60 * minutes})
-            part += 1
-    write_drives_table(out, rows)
-    return out
-
-
 def cost(work: list[str], environment: Mapping[str, str] | None = None) -> Cost:
     """Of a command of Python in an interpreter of its own, and of the processes that it starts."""
     start, nothing = time.monotonic(), subprocess.DEVNULL
@@ -101,25 +80,22 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__)
     arguments.add_argument("dataset", type=Path)
     arguments.add_argument("--hours", type=float, nargs="+", default=[42.0, 100.0])
-    arguments.add_argument("--minutes", type=float, help="of short drives of the same data, beside the dataset's own")
     arguments.add_argument("--works", nargs="+", choices=WORKS, default=["open", "navigate"])
     arguments.add_argument("--repeats", type=int, default=1)
     o = arguments.parse_args()
     with tempfile.TemporaryDirectory(dir=o.dataset.parent) as home:
-        sources = [o.dataset] + ([cut_drives(o.dataset, Path(home) / "short", o.minutes)] if o.minutes else [])
         print("| work | hours | drives | processor [s] | clock [s] | memory [GB] |\n|:--|--:|--:|--:|--:|--:|")
         for hours in o.hours:
-            for k, source in enumerate(sources):
-                data = Path(home) / f"{k}-{hours:g}"
-                count = link_drives(source, data, hours)
-                for work in o.works:
-                    runs = []
-                    for repeat in range(o.repeats):
-                        out = Path(home) / f"out-{work}-{data.name}-{repeat}"
-                        runs.append(cost([word.format(data=data, out=out) for word in WORKS[work]]))
-                    best = Cost(*(min(values) for values in zip(*runs)))
-                    figures = f"{best.processor_s:.1f} | {best.clock_s:.1f} | {best.memory_GB:.2f}"
-                    print(f"| {work} | {hours:g} | {count} | {figures} |", flush=True)
+            data = Path(home) / f"{hours:g}"
+            count = link_drives(o.dataset, data, hours)
+            for work in o.works:
+                runs = []
+                for repeat in range(o.repeats):
+                    out = Path(home) / f"out-{work}-{data.name}-{repeat}"
+                    runs.append(cost([word.format(data=data, out=out) for word in WORKS[work]]))
+                best = Cost(*(min(values) for values in zip(*runs)))
+                figures = f"{best.processor_s:.1f} | {best.clock_s:.1f} | {best.memory_GB:.2f}"
+                print(f"| {work} | {hours:g} | {count} | {figures} |", flush=True)
 
 
 if __name__ == "__main__":

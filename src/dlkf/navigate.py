@@ -29,7 +29,7 @@ from dlkf.filters.smoother import run_smoother
 from dlkf.navigation.imu_errors import AUTO
 from dlkf.onboard.compiled_filter import compile_filter, compile_or_keep
 from dlkf.onboard.core_drives import run_core_drive, runs_in_core
-from dlkf.report.navigation import MOST_DRIVES, TrackOnMap, summary_lines, write_page
+from dlkf.report.navigation import MOST_DRIVES, TrackOnMap, navigation_page, summary_lines
 from dlkf.running import offline
 from dlkf.running.exports import choose_formats, export, utc_times
 from dlkf.running.innovations import OF_NETWORK, REMEDY
@@ -117,7 +117,8 @@ def main(settings: NavigateSettings) -> None:
         remedy = REMEDY if takes_tuning(settings.model) else OF_NETWORK
         doubt = offline.sigma_warning((course.result for course in courses), name, remedy)
         warnings = [doubt] if doubt else []
-        write_page(folder, name, folder_name(settings.dataset), courses, made, warnings)
+        page = navigation_page(name, folder_name(settings.dataset), courses, made, warnings)
+        (folder / "report.html").write_text(page, encoding="utf-8")
         left_out = [f"left out: {reason}" for reason in (skipped or {}).values()]
         said = "\n".join((*sorted(lines), *left_out, *summary_lines(shown, courses), *warnings))
         (folder / LOG).write_text(f"{said}\n")

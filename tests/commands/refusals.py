@@ -25,3 +25,8 @@ def is_refused(ended, *said: str, folder: Path) -> None:
 SCORED = ("model=mbkf15", "dataset=town", "out=made", *FAST["evaluate"])
 SOLVED = ("model=mbkf15", "dataset=town", "out=made", *FAST["navigate"])
 TRAINED = ("data=drives", "data.datasets=[town]")
+
+
+def read_wrong(file: Path) -> list[str]:
+    """The lines of a table of mistakes: what is wrong, an arrow, what the error line says."""
+    return [line for line in file.read_text().splitlines() if line and not line.startswith("#")]

@@ -103,7 +103,7 @@ def test_every_column_that_is_not_used_is_named(tmp_path, drive):
 @pytest.mark.parametrize(
     ("name", "values", "accuracy", "codes"),
     [
-        ("fixtype", [4], 0.01, {4: 4}),  # the reviewers': RTK fixed
+        ("fixtype", [4], 0.01, {4: 4}),  # RTK fixed
         ("fixtype", [4], 2.0, {4: 1}),  # u-blox: GNSS and dead reckoning
         ("fix_type", [0, 3], np.nan, {0: 0, 3: 1}),
         ("fix_type", [3, 4, 5, 6], np.nan, {3: 1, 4: 2, 5: 5, 6: 4}),  # MAVLink
@@ -184,7 +184,7 @@ def test_the_order_of_day_and_month():
 
 
 def test_gps_seconds_since_1980_are_no_unix_time(tmp_path, drive):
-    """The reviewers' log: dates were ten years off; both readings are said, and the export has the right one."""
+    """Dates were ten years off; both readings are said, and the export has the right one."""
     folder = tmp_path / "a"
     write(folder, drive, HEADERS["English"])
     table = pd.read_csv(folder / "fixes.csv")

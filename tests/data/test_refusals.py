@@ -41,7 +41,7 @@ def refusal(source: Path, **options) -> str:
 
 @pytest.mark.parametrize("both", [False, True], ids=["accelerometer", "both"])
 def test_a_left_handed_sensor(tmp_path, streets, both):
-    """The reviewers' mirrors: refused with the axis to turn round; with that the log is read right."""
+    """Refused with the axis to turn round; with that the log is read right."""
     imu = streets["imu"].copy()
     for names in (ACCEL, GYRO) if both else (ACCEL,):
         imu[names[1]] = -imu[names[1]]

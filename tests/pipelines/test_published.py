@@ -1,14 +1,9 @@
-"""What stands beside published figures: KITTI's error of relative poses and the outage statistic, in closed form."""
+"""What stands beside published figures: KITTI's error of relative poses, in closed form."""
 
-import json
 import math
 
 import numpy as np
-import pytest
 from pipelines.studies.kitti_odometry import LENGTHS_M, left_out_best, longest_run, segment_errors
-from pipelines.studies.published import outage_statistic, rows_of
-
-from dlkf.base.errors import InputError
 
 
 def turned(yaw: np.ndarray) -> np.ndarray:
@@ -67,20 +62,3 @@ def test_constants_come_from_the_other_sequences():
 
     errors = [[scaled(0.0), scaled(0.04), scaled(0.04)], [scaled(0.5), scaled(0.01), scaled(0.01)]]
     assert left_out_best(errors, ["a", "b", "c"]) == {"a": 1, "b": 0, "c": 0}
-
-
-def test_the_outage_statistic_of_known_errors(tmp_path):
-    error = np.array([3.0, 4.0, 0.0, np.nan, 30.0])
-    distance = np.array([300.0, 100.0, 2.0, 500.0, 1000.0])
-    s = outage_statistic(error, distance)
-    assert s.count == 4 and s.driven == 3  # no truth; hardly moved
-    assert s.rms_m == pytest.approx(math.sqrt((9 + 16 + 900) / 4)) and s.median_m == 3.5
-    assert s.drift == pytest.approx(0.03) and s.within == pytest.approx(1 / 3)
-    with pytest.raises(InputError, match="no outage has a known error"):
-        outage_statistic(error[3:4], distance[3:4])
-    with pytest.raises(InputError, match=r"no metrics.json; give folders that dlkf evaluate left"):
-        rows_of(tmp_path)
-    ends = [{"distance_m": d, "end": {"plus": {"horizontal": e}}} for e, d in zip(error.tolist(), distance.tolist())]
-    content = {"dataset": "town", "results": [{"per_outage": ends}]}
-    (tmp_path / "metrics.json").write_text(json.dumps(content))
-    assert rows_of(tmp_path) == ["| town | plus | 4 | 15.21 | 3.50 | 3.0 | 33 % of 3 |"]

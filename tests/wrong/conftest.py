@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.wrong.spoiling import Frames
+Frames = dict[str, pd.DataFrame]
 
 
 @pytest.fixture(scope="package")
@@ -20,9 +20,7 @@ def frames(simulated) -> Frames:
     tables = {kind: table[table.t - table.t.iloc[0] < 60].reset_index(drop=True) for kind, table in tables.items()}
     fixes = tables["gnss"]
     tables["speed"] = pd.DataFrame({"t": fixes.t, "speed": np.hypot(fixes.vel_n, fixes.vel_e)})
-    yaw = tables["reference"].yaw.to_numpy()[:: max(1, len(tables["reference"]) // len(fixes))]
-    tables["heading"] = pd.DataFrame(
-        {"t": tables["reference"].t[:: max(1, len(tables["reference"]) // len(fixes))], "heading": yaw}
-    )
+    rows = tables["reference"].iloc[:: max(1, len(tables["reference"]) // len(fixes))]
+    tables["heading"] = pd.DataFrame({"t": rows.t, "heading": rows.yaw})
     tables["baro"] = pd.DataFrame({"t": fixes.t, "pressure": 101_325.0 - 12 * fixes.height_m})
     return tables

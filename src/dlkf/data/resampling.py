@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
 from dlkf.data import compiled_samples
 from dlkf.data.increments import merge_increments, two_sample
@@ -84,7 +85,7 @@ def fix_phase(t: np.ndarray, epoch_s: float) -> float:
     phase = np.mod(t, epoch_s)
     mean = np.exp(2j * np.pi * phase / epoch_s).mean()
     centre = np.angle(mean) / (2 * np.pi) * epoch_s if abs(mean) > 0.5 else phase[0]
-    around = np.mod(phase - centre + epoch_s / 2, epoch_s) - epoch_s / 2
+    around = wrap_angle(phase - centre, epoch_s / 2)
     if abs(mean) > 0.5:
         median = float(np.median(around))
         settled = np.mean(np.abs(around - median) <= ON_BOUNDARY_S) > 0.5

@@ -18,7 +18,7 @@ from dlkf.data.drive import Drive
 from dlkf.data.resampling import assign_fixes, epoch_grid, interpolate_reference, resample_imu
 from dlkf.data.spikes import remove_spikes
 from dlkf.data.tables import DriveRow, dataset_digest, read_drives
-from dlkf.data.validate import LIMITS, CheckedTables, Limits, read_drive, usable_fixes
+from dlkf.data.validate import CheckedTables, read_drive, usable_fixes
 
 __all__ = ["dataset_digest", "drive_from_tables", "load_dataset"]
 
@@ -32,7 +32,6 @@ def load_dataset(
     reference: bool = True,
     drives: Sequence[str] | None = None,
     aids: Sequence[AidTable] | None = None,
-    limits: Limits = LIMITS,
     progress: ProgressCallback | None = None,
 ) -> list[Drive]:
     """The drives of a dataset, or those named, on an epoch grid; IMU in ``dtype``, the rest float64.
@@ -43,7 +42,7 @@ def load_dataset(
     """
 
     def load(row: DriveRow) -> Drive:
-        tables = read_drive(folder, row, reference=reference, aids=aids, limits=limits)
+        tables = read_drive(folder, row, reference=reference, aids=aids)
         return drive_from_tables(tables, folder_name(folder), rate_hz, epoch_s, dtype, aids or ())
 
     rows = drive_rows(folder, drives)

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from dlkf.base.colours import COLOURS
 from dlkf.base.errors import InputError
-from dlkf.base.files import resolve_place, write_into
+from dlkf.base.files import write_into
 from dlkf.base.provenance import describe_provenance
 from dlkf.data.schema import stack_columns
 from dlkf.diagnosis.allan import AllanFit, Array, allan_variance, check_static, cluster_sizes, fit_noise, preset_yaml
@@ -111,7 +111,7 @@ def _page(log: StaticLog, table: ResultTable, picture: bytes, settings: dict[str
     return page.html()
 
 
-def write_allan(out: str | Path, log: StaticLog, spec: ImuSpec) -> list[Path]:
+def write_allan(out: str | Path, log: StaticLog, spec: ImuSpec) -> None:
     """Write imu/<name>.yaml, allan.png, allan.html, allan.csv and allan.json into ``out``, all or none."""
     picture, table = png(figure(log)), noise_table(log)
     settings = {
@@ -129,7 +129,6 @@ def write_allan(out: str | Path, log: StaticLog, spec: ImuSpec) -> list[Path]:
         (folder / "imu").mkdir()
         for name, data in files.items():
             (folder / name).write_bytes(data)
-    return [resolve_place(out) / name for name in files]
 
 
 def _csv(log: StaticLog) -> str:

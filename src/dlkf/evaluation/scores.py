@@ -116,11 +116,8 @@ def _pad(x: Array, T: int) -> Array:
 
 def sigma_samples(scores: Scores, name: str) -> dict[tuple[str, str, str], Array]:
     """The filter's own horizontal 1σ √(σ_n² + σ_e²) at the end of every outage [m], NaN where it has none."""
-    w = scores.windows
-    if not len(w.segment):
-        return {}
     std = scores.filters[name].position_std
-    return {("outages", "end", "sigma"): outage_end(np.hypot(std[..., 0], std[..., 1]), w)}
+    return {("outages", "end", "sigma"): outage_end(np.hypot(std[..., 0], std[..., 1]), scores.windows)}
 
 
 def innovation_fit(run: FilterRun) -> SigmaFit | None:

@@ -26,6 +26,7 @@ from dlkf.onboard.c_source import COLUMNS as CORE_COLUMNS
 from dlkf.onboard.carried import Layout
 from dlkf.onboard.compiled_filter import CompiledFilter
 from dlkf.onboard.core import Core
+from dlkf.onboard.core_drives import make_core
 from dlkf.onboard.functions import Grid, count_output_numbers
 from dlkf.onboard.library import Library, build
 from dlkf.running.batched import run_filter
@@ -81,12 +82,6 @@ def run_core(core: Core, tables: CheckedTables) -> np.ndarray:
     if not rows:
         raise InputError(f"drive {tables.row.name}: never gives a filter a start, so nothing can be checked on it")
     return np.stack(rows)
-
-
-def make_core(library: Library, tables: CheckedTables, drive: Drive) -> Core:
-    """A core on the grid of a loaded drive."""
-    step_s = float(np.median(np.diff(tables.imu["t"])))
-    return Core(library.path, tables.row.lever_arm_b, phase_s=drive.t0, imu_step_s=step_s)
 
 
 def write_log(path: Path, tables: CheckedTables) -> None:

@@ -10,12 +10,14 @@ import torch
 
 from dlkf.base.errors import InputError
 from dlkf.data.alignment import SEARCH, AlignConfig
+from dlkf.data.drive import Drive
 from dlkf.data.store import drive_from_tables
 from dlkf.data.validate import CheckedTables
 from dlkf.filters.aids.attach import aid_columns
 from dlkf.onboard.c_source import list_columns
 from dlkf.onboard.compiled_filter import CompiledFilter
 from dlkf.onboard.core import Core, Status
+from dlkf.onboard.library import Library
 from dlkf.running.offline import Navigated
 from dlkf.running.replay import UnalignedError, replay_drive, stream_drive
 from dlkf.running.solution import COLUMNS
@@ -25,6 +27,12 @@ from dlkf.running.start import align as find_start
 def runs_in_core(align: AlignConfig) -> bool:
     """Whether the core begins as these settings say: it has those of a stream's default."""
     return replace(align, from_rest=False) == SEARCH
+
+
+def make_core(library: Library, tables: CheckedTables, drive: Drive) -> Core:
+    """A core on the grid of a loaded drive."""
+    step_s = float(np.median(np.diff(tables.imu["t"])))
+    return Core(library.path, tables.row.lever_arm_b, phase_s=drive.t0, imu_step_s=step_s)
 
 
 def run_core_drive(
@@ -37,8 +45,7 @@ def run_core_drive(
     if not (estimator.whole and runs_in_core(align)):
         return stream_drive(tables, estimator, rate_hz=rate_hz, epoch_s=epoch_s, align=align)
     drive, name = drive_from_tables(tables, "", rate_hz, epoch_s, torch.float64), tables.row.name
-    step_s = float(np.median(np.diff(tables.imu["t"])))
-    core = Core(estimator.library.path, tables.row.lever_arm_b, phase_s=drive.t0, imu_step_s=step_s)
+    core = make_core(estimator.library, tables, drive)
     found: dict[float, np.ndarray] = {}
     lost: list[float] = []
     for receipt in replay_drive(core, tables.imu, tables.gnss, None, tables.aids):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,18 +46,6 @@ class TrackOnMap(NamedTuple):
             innovation = Innovation(innovation.ratio.astype(np.float32), np.ones((1, 1), np.float32))
         table = self.result.table[[*SHOWN, *self.result.sensor_columns]].copy()
         return self._replace(result=replace(self.result, table=table, innovation=innovation))
-
-
-def write_page(
-    out: Path,
-    model: str,
-    dataset: str,
-    courses: Sequence[TrackOnMap],
-    made: Mapping[str, Any],
-    warnings: Sequence[str] = (),
-) -> None:
-    """``report.html`` in ``out``."""
-    (out / "report.html").write_text(navigation_page(model, dataset, courses, made, warnings), encoding="utf-8")
 
 
 def navigation_page(
