@@ -149,7 +149,7 @@ def test_a_filter_that_does_not_fit_is_told_at_once():
 
 def test_a_filter_that_listens_warns_of_samples_too_slow_for_it(segment):
     """As the commands do: of the rate it is given, and of that at which samples come; no other filter does."""
-    said = "the filter needs samples at 50 Hz or more and this stream has 10 Hz"
+    said = "the filter needs samples at 50 Hz or more for its full accuracy and this stream has 10 Hz"
     with pytest.warns(LowSampleRateWarning, match=said):
         StreamingFilter(plus(), rate_hz=10.0)
     tenth = np.arange(len(segment.imu["t"])) % 10 == 9

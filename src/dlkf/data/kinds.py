@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dlkf.base.errors import InputError
-from dlkf.base.settings import is_number
-from dlkf.data.tables import read_drives_table
+from dlkf.data.tables import first_stamps, read_drives_table
 
 KINDS = ("simulated", "semi-real", "real", "unknown")
 
@@ -44,9 +45,9 @@ def drive_imus(dataset: str | Path) -> dict[str, str]:
 
 
 def drive_rates(dataset: str | Path) -> dict[str, float]:
-    """Samples a second [Hz] of every drive's IMU, where ``drives.parquet`` has it."""
-    detail = ((row["drive"], row.get("imu_rate_hz")) for row in _rows(dataset))
-    return {str(drive): float(rate) for drive, rate in detail if rate is not None and is_number(rate)}
+    """Samples a second [Hz] of every drive's IMU, by the median step of its first stamps."""
+    steps = {str(row["drive"]): np.diff(first_stamps(dataset, "imu", str(row["drive"]))) for row in _rows(dataset)}
+    return {drive: float(1 / np.median(step)) for drive, step in steps.items() if len(step) and np.median(step) > 0}
 
 
 def _rows(dataset: str | Path) -> list[dict[Any, Any]]:

@@ -163,6 +163,16 @@ def read_table(folder: str | Path, kind: str, drive: str, column: str = "") -> C
     return rows if len(rows["t"]) else None
 
 
+def first_stamps(folder: str | Path, kind: str, drive: str, count: int = 1000) -> np.ndarray:
+    """The first ``t`` [s] of a drive's table, without reading the rest; none of one that is missing or damaged."""
+    try:
+        part = min((resolve_place(folder) / kind / f"drive={drive}").glob("*.parquet"))
+        rows = next(pq.ParquetFile(open_parquet(part)).iter_batches(count, columns=["t"]))
+        return np.asarray(rows["t"].to_numpy(zero_copy_only=False), float)
+    except (ValueError, KeyError, StopIteration, pa.ArrowException, OSError):
+        return np.empty(0)
+
+
 def refuse_rows(
     table: Columns, names: Iterable[str], is_bad: Callable[[np.ndarray], np.ndarray], where: str, remedy: str
 ) -> None:

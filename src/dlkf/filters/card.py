@@ -79,8 +79,8 @@ def describe_slow_drives(
         if slow := sorted({float(f"{rate:.2g}") for rate in met if rate < 0.9 * least}):
             have = f"{slow[0]:g}" if len(slow) == 1 else f"{slow[0]:g} to {slow[-1]:g}"
             lines.append(
-                f"{name} needs samples at {least:g} Hz or more and {having} {have} Hz: "
-                "its accuracy is not validated below; consider mbkf21_car"
+                f"{name} needs samples at {least:g} Hz or more for its full accuracy and {having} {have} Hz: "
+                "expect larger errors in outages"
             )
     return lines
 
@@ -100,7 +100,8 @@ def domain_warnings(
 
     The IMU is ``preset`` where the dataset names none; samples brought to ``rate_hz`` are as fast as they were at most.
     """
-    drives, imus, rates = list(drives), drive_imus(dataset), drive_rates(dataset)
+    drives, imus = list(drives), drive_imus(dataset)
+    rates = drive_rates(dataset) if any(hasattr(model, "least_rate_hz") for model in models.values()) else {}
     cards = {name: getattr(model, "card", {}) for name, model in models.items()}
     unmet = describe_unseen_imus(cards, {imus.get(drive, preset) for drive in drives})
     return unmet + describe_slow_drives(models, [float(min(rate_hz, rates.get(drive, rate_hz))) for drive in drives])
