@@ -167,14 +167,19 @@ def test_the_best_prior_is_the_best_of_all_that_were_tried(cars, monkeypatch):
     monkeypatch.setattr("dlkf.tuning.search.MATRIX_SPREADS", (10.0, 1.0))
     batch, expected, _ = one_unit(cars)
     tunings, name = [Tuning(), Tuning(accel_noise=30.0, gyro_noise=30.0)], "mbkf33_prior"
-    prior, tuning = best_prior(expected, tunings, [hidden(batch)], name, longer=[batch])
+    steps = []
+
+    def told(*step):
+        steps.append(step)
+
+    prior, tuning = best_prior(expected, tunings, [hidden(batch)], name, longer=[batch], progress=told)
     known = [mean_imu_error(expected, t, [batch], "mbkf33") for t in tunings]
     trials = [(p.scale_spread(b, m), t) for p in known for b in (3.0, 0.3) for m in (10.0, 1.0) for t in tunings]
     tried = {
         (p, t): evaluate_objective(build_filter(name, expected, tuning=t, prior=p), [hidden(batch)]) for p, t in trials
     }
     assert (prior, tuning) == min(tried, key=tried.__getitem__)
-    assert len(set(tried.values())) == 16
+    assert len(set(tried.values())) == 16 and steps == [(k, 16) for k in range(1, 17)]
 
 
 def test_spreads_of_biases_and_matrices_scale_apart():

@@ -61,7 +61,7 @@ def tune_baselines(
     """
     untuned = start or Tuning()
     first, least = _search_with_progress(imu, batches, FIRST, rounds, objective, start)
-    prior, begin = best_prior(imu, [untuned, first], batches, objective=objective, longer=longer)
+    prior, begin = _find_prior(f"{FIRST}_prior", imu, [untuned, first], batches, objective, longer)
     priors: dict[str, Prior] = {}
     tunings: dict[str, Tuning] = {}
     for name in names:
@@ -69,7 +69,7 @@ def tune_baselines(
         if name == f"{FIRST}_prior":
             priors[name], begun = prior, begin
         elif has_prior(name):
-            priors[name], begun = best_prior(imu, [untuned, begun], batches, name, objective, longer)
+            priors[name], begun = _find_prior(name, imu, [untuned, begun], batches, objective, longer)
         if name == FIRST:
             tunings[name], error = first, least
         elif name == "ins":
@@ -81,6 +81,19 @@ def tune_baselines(
         how = "tuned" if rounds and name != "ins" else "untuned"
         say(f"{name} {how}: {_describe_error(error, objective)}")
     return Baselines(imu, tunings, prior, priors)
+
+
+def _find_prior(
+    name: str,
+    imu: ImuSpec,
+    tunings: Sequence[Tuning],
+    batches: Sequence[Batch],
+    objective: str,
+    longer: Sequence[Batch] | None,
+) -> tuple[Prior, Tuning]:
+    """The best prior, under a bar of its own."""
+    with show_progress(f"Prior of {name}") as bar:
+        return best_prior(imu, tunings, batches, name, objective, longer, progress=bar)
 
 
 def _describe_error(error: float, objective: str) -> str:
