@@ -140,6 +140,8 @@ BAD = {
     "yaw of the right": (_set("reference", "yaw", lambda y: y + np.pi / 2), r"\+90° from the course.*subtract 1.57"),
     "yaw of the left": (_set("reference", "yaw", lambda y: y - np.pi / 2), "-90° from the course.*add 1.57"),
     "yaw of the back": (_set("reference", "yaw", lambda y: y + np.pi), "yaw is 180° from the course"),
+    "a second late": (_set("reference", "t", lambda t: t + 1), "1.0 s ahead of that of GNSS; subtract 1.0 s from t"),
+    "leap seconds early": (_set("reference", "t", lambda t: t - 18), "18.0 s behind.*leap seconds.*add 18.0 s to t"),
     "above the geoid": (_set("reference", "height_m", lambda h: h - 47), "47 m below the fixes.*geoid.*position.geoid"),
     "far above": (_set("reference", "height_m", lambda h: h + 50), "50 m above the fixes.*sea level"),
     "heights in feet": (_set("reference", "height_m", _feet), "in the median; height_m must be in metres"),
@@ -241,13 +243,22 @@ def test_noisy_gnss_raises_no_alarm(tmp_path, tables):
     "change",
     [
         _look_back,
+        _set("reference", "t", lambda t: t - 0.45),
         _set("reference", "height_m", lambda h: h + 10),
         _set("reference", "height_m", lambda h: 0 * h),
         _set("gnss", "height_m", lambda h: 0 * h),
         _columns("gnss", lambda f: f.update({"height_m": f["height_m"] + 50, "std_pos_d": 0 * f["std_pos_d"] + 15})),
         _set("reference", "yaw", lambda y: y + np.radians(20)),
     ],
-    ids=["reverse", "antenna and datum", "no heights", "no heights of fixes", "unsure heights", "turned a little"],
+    ids=[
+        "reverse",
+        "late receiver",
+        "antenna and datum",
+        "no heights",
+        "no heights of fixes",
+        "unsure heights",
+        "turned a little",
+    ],
 )
 def test_references_that_differ_within_reason_pass(tmp_path, tables, change):
     """As far as a receiver's own 1σ, a mounting and unknown heights let them."""

@@ -15,7 +15,7 @@ from dlkf.data.aid_tables import STANDARD, AidTable
 from dlkf.data.discovery.motion import find_motion
 from dlkf.data.limits import FULL_SCALE, NONE_REFUSED, Refused, screen_fixes, within_full_scale
 from dlkf.data.plausibility import check_clocks, check_gnss_units, check_imu_units, check_turns
-from dlkf.data.reference_checks import check_attitude, check_same_place
+from dlkf.data.reference_checks import check_attitude, check_same_clock, check_same_place
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY, stack_columns
 from dlkf.data.tables import Columns, DriveRow, read_drives, read_table, refuse_rows
 
@@ -279,5 +279,6 @@ def _check_reference(reference: Columns, imu: Columns, fixes: Columns, where: st
         return
     rows = {name: values[known] for name, values in reference.items()}
     check_gnss_units(rows, where)
+    check_same_clock(rows, fixes, where)
     check_same_place(rows, fixes, where)
     check_attitude(rows, imu, where)
