@@ -22,7 +22,7 @@ from dlkf.command.settings import NavigateSettings
 from dlkf.data.drive import Drive
 from dlkf.data.store import choose_aids, dataset_digest, drive_rows, load_dataset
 from dlkf.data.tables import drive_clocks
-from dlkf.filters.aids.attach import describe_aids, find_tables, with_aids
+from dlkf.filters.aids.attach import describe_aids, find_tables, refuse_left_out, with_aids
 from dlkf.filters.card import domain_warnings
 from dlkf.filters.saved import choose_grid
 from dlkf.filters.smoother import run_smoother
@@ -58,6 +58,8 @@ def main(settings: NavigateSettings) -> None:
     usual = offline.choose_epoch(spacings.values(), settings.rate_hz or 50.0, model)
     step = choose_grid([model], settings.rate_hz, settings.epoch_s, usual)
     chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
+    if settings.aids is not None:
+        refuse_left_out({name: model}, chosen)
     model = with_aids(model, chosen)
     grid = {**step, "aids": find_tables(model)}
     for line in describe_aids({name: model}, chosen):
