@@ -31,7 +31,7 @@ from dlkf.onboard.compiled_filter import compile_filter, compile_or_keep
 from dlkf.onboard.core_drives import run_core_drive, runs_in_core
 from dlkf.report.navigation import MOST_DRIVES, TrackOnMap, navigation_page, summary_lines
 from dlkf.running import offline
-from dlkf.running.exports import choose_formats, export, utc_times
+from dlkf.running.exports import choose_formats, export, row_qualities, utc_times
 from dlkf.running.innovations import OF_NETWORK, REMEDY
 from dlkf.running.likelihood import check_finds_noise, generic_filter
 from dlkf.running.replay import stream_drives
@@ -103,9 +103,11 @@ def main(settings: NavigateSettings) -> None:
         for result in navigated(progress=progress):
             write_solution(folder / f"drive={result.drive}" / "solution.parquet", result.table)
             when = utc_times(result.table, clocks.get(result.drive), settings.export_clock)
-            export(folder / f"drive={result.drive}", result.table, formats, when, result.drive)
-            lines.append(result.summary(spacings[result.drive]))
-            course = TrackOnMap(result, spacings[result.drive])
+            fixes = spacings[result.drive]
+            qualities = row_qualities(result.table, fixes.t, fixes.quality)
+            export(folder / f"drive={result.drive}", result.table, formats, when, result.drive, qualities)
+            lines.append(result.summary(fixes))
+            course = TrackOnMap(result, fixes)
             courses.append(course if len(courses) < MOST_DRIVES else course.for_the_map())
         made = {
             **describe_provenance(),
