@@ -92,6 +92,8 @@ def test_the_example_writes_what_the_core_gives(exported, example, tables, tmp_p
     assert code == 0 and "waiting for the car to move under GNSS" in said and "aligned" in said
     np.testing.assert_allclose(rows[list(COLUMNS)], core.solution, rtol=1e-9, atol=1e-9)
     assert not rows.revised.any() and rows.gnss_used.mean() > 0.9
+    started = [x for x in lines if float(x.split(",")[1]) > 5.3]  # within a second
+    assert "refused" not in run_example(example, exported, "\n".join(started), *arm)[1]
     rows, _, _ = run_example(example, exported, "\n".join(lines), *arm, "--samples")
     assert np.median(np.diff(rows.t)) == pytest.approx(0.01) and len(rows) > 4000
     late = sorted(lines, key=lambda x: float(x.split(",")[1]) + 2.7 * x.startswith("gnss"))
