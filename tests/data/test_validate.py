@@ -111,6 +111,8 @@ BAD = {
     "ns taken for s": (_set("imu", "t", lambda t: 1e9 * t), "reader.imu.time.unit"),
     "s taken for us": (_set("imu", "t", lambda t: 1e-6 * t), "reader.imu.time.unit"),
     "GNSS in another unit": (_set("gnss", "t", lambda t: 1e-3 * t), "a receiver has .*reader.gnss.time.unit"),
+    "GNSS in ms": (_set("gnss", "t", lambda t: 5000 * t), r"t looks like ms.* by 1000 \(reader.gnss.time.unit=ms"),
+    "a single fix": (_rows("gnss", lambda f: f[:1].assign(t=0.0)), "the only fix, at t = 0.000, .*all along the drive"),
     "nan time": (_set("gnss", "t", _at(3, np.nan)), "row 3: t is nan"),
     "IMU gap": (_rows("imu", lambda f: f.drop(f.index[1000:1100])), "IMU gap of 1.010 s after t = 10.000"),
     "no samples": (_rows("imu", lambda f: f.iloc[:0]), "has no rows"),
