@@ -207,6 +207,13 @@ def test_what_a_source_does_not_know_may_be_nan(tmp_path, tables):
     validate_dataset(tmp_path)
 
 
+def test_folders_of_another_name_are_named(tmp_path, tables):
+    _write(tmp_path, tables)
+    for kind in ("imu", "gnss", "reference"):
+        (tmp_path / kind / f"drive={NAME}").rename(tmp_path / kind / "drive=other")
+    assert "is in drives.parquet, but imu/ has drive=other alone" in _complaint(tmp_path)
+
+
 def test_whole_numbers_may_stand_for_floats(tmp_path, tables):
     _write(tmp_path, tables)
     path = drive_file(tmp_path, "gnss", NAME)
