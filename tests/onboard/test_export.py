@@ -115,6 +115,7 @@ def test_the_example_says_what_it_does_not_understand(exported, example, tables,
         ([], ["gnss,1,48,9,100,0,0,0", *lines[:60]], "a fix has 14 values, this line has 7; write nan"),
         ([], ["imu,1,2,x,4,5,6,7"], "1 lines ignored"),
         ([], ["imu,1" + ",2" * 2000, "imu,1,2,3"], "2 lines ignored"),
+        ([], [f"imu,{10 * k},0,0,-9.8,0,0,0" for k in range(60)], "a gap: are the stamps in seconds?"),
         ([], lines[:60], "navigate: nothing solved, waiting for fixes over three seconds"),
         ([], [], "navigate: nothing solved, waiting for samples of the IMU"),
     ):
