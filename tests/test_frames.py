@@ -43,7 +43,7 @@ def test_navigate_gives_the_command_s_solution(drive, call):
     arm = row[["lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m"]].astype(float).tolist()
     solution = dlkf.navigate(drive["imu"], drive["gnss"], model="mbkf21_nhc", imu_type="consumer", lever_arm=arm)
     pd.testing.assert_frame_equal(pd.DataFrame(solution), expected, check_exact=True)
-    assert solution.summary.startswith("aligned at t = ") and "fixes used" in solution._repr_html_()
+    assert solution.summary.startswith("solution from t = ") and "fixes used" in solution._repr_html_()
     assert len(solution.map().data) and type(solution[solution.t > 10]) is pd.DataFrame
 
 

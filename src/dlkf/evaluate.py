@@ -29,7 +29,7 @@ from dlkf.evaluation.sensors import sensor_table
 from dlkf.evaluation.study import make_results
 from dlkf.evaluation.summary import FEW, collect_metrics, headline, sigma_warnings
 from dlkf.evaluation.table import ResultTable, all_tables, as_markdown, as_rich, result_tables
-from dlkf.filters.aids.attach import aid_columns, describe_aids, find_tables, with_aids
+from dlkf.filters.aids.attach import aid_columns, describe_aids, find_tables, refuse_left_out, with_aids
 from dlkf.filters.build import build_filter
 from dlkf.filters.card import domain_warnings, select_scored_drives
 from dlkf.filters.saved import choose_grid
@@ -62,6 +62,8 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console) -> Evaluation
     check_baseline(settings.baseline, models)
     check_reference(settings.reference)
     chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
+    if settings.aids is not None:
+        refuse_left_out(models, chosen)
     models = {model_name: with_aids(model, chosen) for model_name, model in models.items()}
     taken = dict.fromkeys(table for model in models.values() for table in find_tables(model))
     step = choose_grid(models.values(), settings.rate_hz, settings.epoch_s)

@@ -22,7 +22,7 @@ from dlkf.command.settings import NavigateSettings
 from dlkf.data.drive import Drive
 from dlkf.data.store import choose_aids, dataset_digest, drive_rows, load_dataset
 from dlkf.data.tables import drive_clocks
-from dlkf.filters.aids.attach import describe_aids, find_tables, with_aids
+from dlkf.filters.aids.attach import describe_aids, find_tables, refuse_left_out, with_aids
 from dlkf.filters.card import domain_warnings
 from dlkf.filters.saved import choose_grid
 from dlkf.filters.smoother import run_smoother
@@ -31,7 +31,7 @@ from dlkf.onboard.compiled_filter import compile_filter, compile_or_keep
 from dlkf.onboard.core_drives import run_core_drive, runs_in_core
 from dlkf.report.navigation import MOST_DRIVES, TrackOnMap, navigation_page, summary_lines
 from dlkf.running import offline
-from dlkf.running.exports import choose_formats, export, utc_times
+from dlkf.running.exports import choose_formats, export, row_qualities, utc_times
 from dlkf.running.innovations import OF_NETWORK, REMEDY
 from dlkf.running.likelihood import check_finds_noise, generic_filter
 from dlkf.running.replay import stream_drives
@@ -58,6 +58,8 @@ def main(settings: NavigateSettings) -> None:
     usual = offline.choose_epoch(spacings.values(), settings.rate_hz or 50.0, model)
     step = choose_grid([model], settings.rate_hz, settings.epoch_s, usual)
     chosen = choose_aids(settings.dataset, settings.aids, settings.drives)
+    if settings.aids is not None:
+        refuse_left_out({name: model}, chosen)
     model = with_aids(model, chosen)
     grid = {**step, "aids": find_tables(model)}
     for line in describe_aids({name: model}, chosen):
@@ -101,9 +103,11 @@ def main(settings: NavigateSettings) -> None:
         for result in navigated(progress=progress):
             write_solution(folder / f"drive={result.drive}" / "solution.parquet", result.table)
             when = utc_times(result.table, clocks.get(result.drive), settings.export_clock)
-            export(folder / f"drive={result.drive}", result.table, formats, when, result.drive)
-            lines.append(result.summary(spacings[result.drive]))
-            course = TrackOnMap(result, spacings[result.drive])
+            fixes = spacings[result.drive]
+            qualities = row_qualities(result.table, fixes.t, fixes.quality)
+            export(folder / f"drive={result.drive}", result.table, formats, when, result.drive, qualities)
+            lines.append(result.summary(fixes))
+            course = TrackOnMap(result, fixes)
             courses.append(course if len(courses) < MOST_DRIVES else course.for_the_map())
         made = {
             **describe_provenance(),

@@ -174,4 +174,4 @@ def test_ingested_by_workers(alone, where, call, tmp_path):
     assert len({dataset_digest(tmp_path / "made" / str(k)) for k in range(2)}) == 1
     (tmp_path / "logs" / row.name / "imu.csv").write_text("")
     done = call("ingest", "reader=csv", "source=logs", "out=made/bad", f"parallel={where}")
-    assert done.code == 2 and "cannot be read as a table" in done.err and not (tmp_path / "made" / "bad").exists()
+    assert done.code == 2 and "is empty" in done.err and not (tmp_path / "made" / "bad").exists()

@@ -40,7 +40,7 @@ def test_values_of_the_right_type_become_settings():
     [
         ({"name": "x", "lenght_s": 1}, "outer: unknown key lenght_s; did you mean length_s\\? known are name"),
         ({"length_s": 1}, "outer: name missing"),
-        ({"name": 3}, "outer\\.name is 3, must be a word"),
+        ({"name": 3}, "outer\\.name is 3, must be a name or path"),
         ({"name": "x", "length_s": "long"}, "outer\\.length_s is 'long', must be a number"),
         ({"name": "x", "length_s": True}, "outer\\.length_s is True, must be a number"),
         ({"name": "x", "length_s": float("nan")}, "must be a number"),

@@ -204,7 +204,7 @@ def test_mistakes_in_the_files(tmp_path, tables):
     for line, cells, message in (
         (41, "0.4,0,0,oops,0,0,-9.8", "line 42: column 'gyro_z' is 'oops', not a number"),
         (41, "0.4,0,0,,0,0,-9.8", "line 42: column 'gyro_z' has no value"),
-        (41, "0.4,0,0,0,0,0,-9.8,7,7", "cannot be read as a table"),
+        (41, "0.4,0,0,0,0,0,-9.8,7,7", "line 42 has 9 cells, those before have 7; correct the line"),
         (41, "0.39,0,0,0,0,0,-9.8", "row 40: t = 0.390000 appears twice|row 40: t"),
     ):
         path.write_text("\n".join([*lines[:line], cells, *lines[line + 1 :]]))
@@ -212,7 +212,7 @@ def test_mistakes_in_the_files(tmp_path, tables):
             ingest_drives(log_reader().read(tmp_path), tmp_path / "out")
         assert [p.name for p in tmp_path.iterdir()] == ["a"]  # whole or none
     path.write_text("")
-    with pytest.raises(InputError, match="cannot be read as a table"):
+    with pytest.raises(InputError, match="is empty"):
         list(log_reader().read(tmp_path))
     path.write_text(lines[0] + "\n")
     with pytest.raises(InputError, match="has no rows"):

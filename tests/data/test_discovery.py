@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from dlkf.base.errors import InputError
@@ -150,6 +152,24 @@ def test_a_small_drift_is_told_with_its_remedy(tmp_path, streets):
     (row,) = read_drives(tmp_path / "x1.002")
     (seen,) = [seen for seen in checkup(tmp_path / "x1.002", row) if "ppm" in seen.text]
     assert seen.grade == "note" and "drift_ppm=auto" in seen.text
+
+
+def test_positions_on_another_clock_than_velocities_are_told_with_one_remedy(tmp_path, streets):
+    """Velocities 0.15 s late, positions on time: no offset of the IMU suits both."""
+    gnss = streets["gnss"]
+    spline = CubicSpline(gnss.t, gnss[list(VELOCITY)])
+    frames = DriveFrames(
+        {"drive": "a", "group": "a"}, streets["imu"], gnss.assign(**dict(zip(VELOCITY, spline(gnss.t - 0.15).T)))
+    )
+    ingest_drives([frames], tmp_path / "x")
+    (row,) = read_drives(tmp_path / "x")
+    (seen,) = [seen for seen in checkup(tmp_path / "x", row) if seen.text.startswith("clocks")]
+    apart = re.search(
+        r"add \+(0\.\d+) s .* for the velocities, ([+-]0\.\d+) s for the positions, .* newer than they", seen.text
+    )
+    assert apart and abs(float(apart[1]) - 0.15) < 0.03 and abs(float(apart[2])) < 0.03
+    autos = " ".join(f"reader.{x}=auto" for x in ("imu.time.offset_s", "gnss.time.drift_ppm", "gnss.position.delay_s"))
+    assert seen.grade == "note" and seen.text.endswith(f"ingest with {autos}")
 
 
 def test_a_drift_over_a_long_drive_is_told(drive):

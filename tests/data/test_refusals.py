@@ -307,7 +307,8 @@ def test_drives_that_disagree_are_named(tmp_path, drive):
     notes = []
     count = ingest(AutoReader(), logs, tmp_path / "out", IngestOptions(), parallel=None,
                    progress=lambda one, _: notes.extend(one.notes))  # fmt: skip
-    assert count == 2 and any(n.startswith("reader.imu.accel.axes is not the same in all drives: {roll") for n in notes)
+    (said,) = (n for n in notes if n.startswith("reader.imu.accel.axes is not the same in all drives: {roll"))
+    assert count == 2 and said.endswith("; each keeps its own, set it if they are one")
 
 
 def test_a_reader_with_settings_left_open_shares_them_too(tmp_path):

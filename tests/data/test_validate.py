@@ -111,6 +111,8 @@ BAD = {
     "ns taken for s": (_set("imu", "t", lambda t: 1e9 * t), "reader.imu.time.unit"),
     "s taken for us": (_set("imu", "t", lambda t: 1e-6 * t), "reader.imu.time.unit"),
     "GNSS in another unit": (_set("gnss", "t", lambda t: 1e-3 * t), "a receiver has .*reader.gnss.time.unit"),
+    "GNSS in ms": (_set("gnss", "t", lambda t: 5000 * t), r"t looks like ms.* by 1000 \(reader.gnss.time.unit=ms"),
+    "a single fix": (_rows("gnss", lambda f: f[:1].assign(t=0.0)), "the only fix, at t = 0.000, .*all along the drive"),
     "nan time": (_set("gnss", "t", _at(3, np.nan)), "row 3: t is nan"),
     "IMU gap": (_rows("imu", lambda f: f.drop(f.index[1000:1100])), "IMU gap of 1.010 s after t = 10.000"),
     "no samples": (_rows("imu", lambda f: f.iloc[:0]), "has no rows"),
@@ -140,6 +142,8 @@ BAD = {
     "yaw of the right": (_set("reference", "yaw", lambda y: y + np.pi / 2), r"\+90° from the course.*subtract 1.57"),
     "yaw of the left": (_set("reference", "yaw", lambda y: y - np.pi / 2), "-90° from the course.*add 1.57"),
     "yaw of the back": (_set("reference", "yaw", lambda y: y + np.pi), "yaw is 180° from the course"),
+    "a second late": (_set("reference", "t", lambda t: t + 1), "1.0 s ahead of that of GNSS; subtract 1.0 s from t"),
+    "leap seconds early": (_set("reference", "t", lambda t: t - 18), "18.0 s behind.*leap seconds.*add 18.0 s to t"),
     "above the geoid": (_set("reference", "height_m", lambda h: h - 47), "47 m below the fixes.*geoid.*position.geoid"),
     "far above": (_set("reference", "height_m", lambda h: h + 50), "50 m above the fixes.*sea level"),
     "heights in feet": (_set("reference", "height_m", _feet), "in the median; height_m must be in metres"),
@@ -203,6 +207,13 @@ def test_what_a_source_does_not_know_may_be_nan(tmp_path, tables):
     validate_dataset(tmp_path)
 
 
+def test_folders_of_another_name_are_named(tmp_path, tables):
+    _write(tmp_path, tables)
+    for kind in ("imu", "gnss", "reference"):
+        (tmp_path / kind / f"drive={NAME}").rename(tmp_path / kind / "drive=other")
+    assert "is in drives.parquet, but imu/ has drive=other alone" in _complaint(tmp_path)
+
+
 def test_whole_numbers_may_stand_for_floats(tmp_path, tables):
     _write(tmp_path, tables)
     path = drive_file(tmp_path, "gnss", NAME)
@@ -241,13 +252,22 @@ def test_noisy_gnss_raises_no_alarm(tmp_path, tables):
     "change",
     [
         _look_back,
+        _set("reference", "t", lambda t: t - 0.45),
         _set("reference", "height_m", lambda h: h + 10),
         _set("reference", "height_m", lambda h: 0 * h),
         _set("gnss", "height_m", lambda h: 0 * h),
         _columns("gnss", lambda f: f.update({"height_m": f["height_m"] + 50, "std_pos_d": 0 * f["std_pos_d"] + 15})),
         _set("reference", "yaw", lambda y: y + np.radians(20)),
     ],
-    ids=["reverse", "antenna and datum", "no heights", "no heights of fixes", "unsure heights", "turned a little"],
+    ids=[
+        "reverse",
+        "late receiver",
+        "antenna and datum",
+        "no heights",
+        "no heights of fixes",
+        "unsure heights",
+        "turned a little",
+    ],
 )
 def test_references_that_differ_within_reason_pass(tmp_path, tables, change):
     """As far as a receiver's own 1σ, a mounting and unknown heights let them."""

@@ -44,9 +44,15 @@ def _half_gzip(folder: Path) -> None:
 
 GZ = "reader.imu.file=imu.csv.gz"
 WRONG: dict[str, tuple[Callable[[Path], None], list[str], str]] = {
-    "an empty file": (_bytes("imu.csv", b""), ["reader=csv"], "cannot be read as a table"),
+    "an empty file": (_bytes("imu.csv", b""), ["reader=csv"], "imu.csv: is empty; leave"),
     "a folder": (lambda f: (f / "imu.csv").mkdir(), ["reader=csv"], "Is a directory"),
     "semicolons": (lambda f: _text(f, sep=";"), ["reader=csv"], "set reader.separator=';'"),
+    "commas": (_text, ["reader=csv", "reader.separator=';'"], "set reader.separator=',' (+reader.imu.text.separator"),
+    "decimal commas": (
+        lambda f: _text(f, sep=";", decimal=","),
+        ["reader=csv", "reader.separator=';'"],
+        "not a number; set reader.decimal=','",
+    ),
     "semicolons and commas": (lambda f: _text(f, sep=";", decimal=","), ["reader=csv"], "no column 't'"),
     "no gzip": (_bytes("imu.csv.gz", b"t,gyro_x"), ["reader=csv", GZ], "Not a gzipped file"),
     "half a gzip": (_half_gzip, ["reader=csv", GZ], "ended before"),

@@ -52,7 +52,7 @@ def test_navigate_writes_solutions_without_a_reference(call, tmp_path):
     shutil.rmtree(tmp_path / "town" / "reference")
     done = call("navigate", "model=mbkf15", "dataset=town", "out=solved", "rate_hz=20", "drives=[car-01]")
     assert done.code == 0, done.err
-    assert "car-01: aligned at t = " in done.out
+    assert "car-01: solution from t = " in done.out
     assert "Left out as impossible: 1 fix of car-01." in (tmp_path / "solved" / "report.html").read_text()
     assert pq.read_schema(tmp_path / "solved" / "drive=car-01" / "solution.parquet").equals(GEO_SCHEMA)
     assert sorted(p.name for p in (tmp_path / "solved").iterdir()) == ["drive=car-01", "log.txt", "report.html"]

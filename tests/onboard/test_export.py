@@ -92,6 +92,8 @@ def test_the_example_writes_what_the_core_gives(exported, example, tables, tmp_p
     assert code == 0 and "waiting for the car to move under GNSS" in said and "aligned" in said
     np.testing.assert_allclose(rows[list(COLUMNS)], core.solution, rtol=1e-9, atol=1e-9)
     assert not rows.revised.any() and rows.gnss_used.mean() > 0.9
+    started = [x for x in lines if float(x.split(",")[1]) > 5.3]  # within a second
+    assert "refused" not in run_example(example, exported, "\n".join(started), *arm)[1]
     rows, _, _ = run_example(example, exported, "\n".join(lines), *arm, "--samples")
     assert np.median(np.diff(rows.t)) == pytest.approx(0.01) and len(rows) > 4000
     late = sorted(lines, key=lambda x: float(x.split(",")[1]) + 2.7 * x.startswith("gnss"))
@@ -113,6 +115,7 @@ def test_the_example_says_what_it_does_not_understand(exported, example, tables,
         ([], ["gnss,1,48,9,100,0,0,0", *lines[:60]], "a fix has 14 values, this line has 7; write nan"),
         ([], ["imu,1,2,x,4,5,6,7"], "1 lines ignored"),
         ([], ["imu,1" + ",2" * 2000, "imu,1,2,3"], "2 lines ignored"),
+        ([], [f"imu,{10 * k},0,0,-9.8,0,0,0" for k in range(60)], "a gap: are the stamps in seconds?"),
         ([], lines[:60], "navigate: nothing solved, waiting for fixes over three seconds"),
         ([], [], "navigate: nothing solved, waiting for samples of the IMU"),
     ):

@@ -21,7 +21,7 @@ from dlkf.onboard.compiled_filter import compile_filter
 from dlkf.onboard.library import find_compiler
 from dlkf.report.navigation import TrackOnMap
 from dlkf.running.offline import navigate_drives
-from dlkf.running.replay import stream_drive
+from dlkf.running.replay import replay_drive, stream_drive
 from dlkf.running.streaming import Status, StreamingFilter
 from tests.cars import IMU, write_cars
 
@@ -85,6 +85,18 @@ def test_a_compiled_filter_is_a_batch_run(tables, step):
     batch = next(navigate_drives([drive], model, align=CAUSAL))
     assert _apart(batch, next(navigate_drives([drive], made, align=CAUSAL))) < 1e-6
     assert _apart(batch, stream_drive(tables, made, **GRID)) < 1e-6
+
+
+def test_what_lies_before_the_first_interval_is_not_late(tables):
+    """A log that begins within a second: the grid is laid later, through its fixes."""
+
+    def cut(table):
+        return {column: values[table["t"] > 5.3] for column, values in table.items()}
+
+    stream = StreamingFilter(_filters()["mbkf21_car"], **GRID)
+    aids = {name: cut(table) for name, table in tables.aids.items()}
+    list(replay_drive(stream, cut(tables.imu), cut(tables.gnss), aids=aids))
+    assert stream.latest is not None and not stream.counts["refused"]
 
 
 def test_what_cannot_be_taken_is_refused_with_a_reason(tables):

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from dlkf.base.errors import InputError
 from dlkf.data.readers.units import GPS_EPOCH_UNIX
 from dlkf.data.tables import DriveClock
-from dlkf.running.exports import FORMATS, choose_formats, export, poses, utc_times
+from dlkf.running.exports import FORMATS, choose_formats, export, poses, row_qualities, utc_times
 from dlkf.running.solution import COLUMNS, SCHEMA, write_solution
 
 KML, GX = "{http://www.opengis.net/kml/2.2}", "{http://www.google.com/kml/ext/2.2}"
@@ -46,7 +46,9 @@ def table() -> pd.DataFrame:
 def folder(table, tmp_path_factory):
     """All formats, with a known date."""
     out = tmp_path_factory.mktemp("exports")
-    export(out, table, choose_formats("all"), utc_times(table, DriveClock(MONDAY), "unix"), "town & country")
+    when, fixes = utc_times(table, DriveClock(MONDAY), "unix"), table["t"].to_numpy() - 0.2
+    quality = row_qualities(table, fixes, np.where(fixes < 10, 1, np.where(fixes < 45, 5, 4)))
+    export(out, table, choose_formats("all"), when, "town & country", quality)
     return out
 
 
@@ -86,7 +88,7 @@ def test_tenths_of_a_second_are_kept_in_dated_tracks(table, tmp_path):
     """Rows every 0.1 s, across midnight."""
     fast = table.assign(t=0.1 * np.arange(60))
     when = utc_times(fast, DriveClock(datetime(2025, 7, 6, 23, 59, 57, tzinfo=UTC).timestamp()), "unix")
-    export(tmp_path, fast, ["kml", "gpx"], when, "town")
+    export(tmp_path, fast, ["kml", "gpx"], when, "town", np.ones(60, int))
     points = gpxpy.parse((tmp_path / "solution.gpx").read_text()).tracks[0].segments[0].points
     assert [p.time for p in points] == when
     stamps = ElementTree.parse(tmp_path / "solution.kml").getroot().iter(f"{KML}when")
@@ -101,7 +103,8 @@ def test_nmea(folder, table):
     gga, rmc, gst = read[:3]
     # minutes have seven digits: 0.2 mm; the library gives degrees to 1e-10
     assert (gga.lat, gga.lon) == pytest.approx((table.lat_deg[0], table.lon_deg[0]), abs=3e-9)
-    assert gga.alt == pytest.approx(table.height_m[0], abs=1e-3) and gga.quality == 1 and read[90].quality == 6
+    assert gga.alt == pytest.approx(table.height_m[0], abs=1e-3) and rmc.posMode == "A"
+    assert [m.quality for m in read[::3]] == [1] * 10 + [5] * 9 + [6] * 21 + [5] * 5 + [4] * 15
     assert str(rmc.date) == "2025-07-07" and rmc.spd == pytest.approx(10 / (1852 / 3600), abs=1e-3)
     assert gst.stdLat == 0.5
 
@@ -113,7 +116,13 @@ def test_pos(folder, table):
     assert (rows.lat - table.lat_deg).abs().max() < 1e-9 and (rows.height - table.height_m).abs().max() < 1e-4
     # 7 July 2025 is the Monday of GPS week 2374; GPS time was 18 s ahead of UTC
     assert rows.week[0] == 2374 and rows.tow[0] == pytest.approx(86400 + 12 * 3600 + 1 + 18)
-    assert set(rows.Q) == {1, 6}
+    assert list(rows.Q) == [5] * 10 + [2] * 9 + [7] * 21 + [2] * 5 + [1] * 15  # RTKLIB counts otherwise than NMEA
+
+
+def test_nmea_has_milliseconds(table, tmp_path):
+    late = table.assign(t=table["t"] + 0.9991)
+    export(tmp_path, late, ["nmea"], None, "town", np.ones(60, int))
+    assert [x.split(",")[1] for x in (tmp_path / "solution.nmea").open()][:4] == ["000001.999"] * 3 + ["000002.999"]
 
 
 def test_trajectories_for_evo(folder, table):
@@ -188,7 +197,7 @@ def test_without_a_date(table, tmp_path):
     dated = DriveClock(MONDAY)
     for clock, counts in ((None, "auto"), (DriveClock(), "gps"), (DriveClock(0.0), "auto"), (dated, "none")):
         assert utc_times(table, clock, counts) is None
-    export(tmp_path, table, list(FORMATS), None, "town")
+    export(tmp_path, table, list(FORMATS), None, "town", np.ones(60, int))
     assert gpxpy.parse((tmp_path / "solution.gpx").read_text()).tracks[0].segments[0].points[0].time is None
     assert "<LineString" in (tmp_path / "solution.kml").read_text()
     assert (tmp_path / "solution.pos").read_text().splitlines()[3].split()[:2] == ["0", "1.000"]

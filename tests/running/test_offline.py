@@ -71,6 +71,14 @@ def test_the_summary_says_in_which_drives_vibration_shows_the_speed():
     assert said == "Speed from vibration: the spectrum of the IMU shows it in 1 of 2 drives; 7 measurements used."
 
 
+def test_the_summary_counts_the_fixes_of_the_file():
+    """From a solution that begins late: those before its first row, and all."""
+    late = driven(0)
+    result = replace(late.result, aligned_at=9.0, table=late.result.table[10:])
+    said = result.summary(late.fixes)
+    assert "solution from t = 10.0 s, none for the 10 fixes before, 1190 epochs, 1149 of 1200 fixes used" in said
+
+
 def test_a_sensor_that_made_no_update_is_said_to_have_made_none():
     result = with_vibration(driven(0), 0.4, 7).result
     z = np.where(result.table.vibration_speed_used > 0, 0.02, np.nan)
@@ -100,6 +108,6 @@ def test_drives_without_plots_of_their_own_are_kept_small_and_shown_the_same():
     assert "Longest time without a fix: 41 s (d0)." in summary_lines("mbkf15", whole)[1]
     with_all = whole[0]._replace(result=replace(whole[0].result, table=whole[0].result.table.assign(gnss_used=True)))
     assert summary_lines("mbkf15", [with_all])[1].startswith("A fix in every epoch. ")
-    assert {row[4] for row in make_rows(whole)[1]} == {"1199"}  # of those after the start
+    assert {row[4] for row in make_rows(whole)[1]} == {"1200"}
     assert route_map(small).to_json() == route_map(whole).to_json()
     assert sum(c.result.table.memory_usage().sum() for c in small) < 80 * 3600

@@ -28,9 +28,9 @@ def settings_from(kind: type[T], config: Any, where: str) -> T:
     """A settings dataclass from a mapping of its fields; fields that are dataclasses themselves take mappings.
 
     InputError for an unknown or missing key, and for a value that is not of the field's type: a number (finite), a
-    whole one, true or false, a word, a list of numbers or words, one of the literals; ``None`` where the field may have
-    none. ``where`` is what a user calls the mapping, empty for the whole of a command's. An instance is handed on as
-    it is.
+    whole one, true or false, a name or path, a list of numbers or words, one of the literals; ``None`` where the field
+    may have none. ``where`` is what a user calls the mapping, empty for the whole of a command's. An instance is handed
+    on as it is.
     """
     if isinstance(config, kind):
         return config
@@ -96,7 +96,9 @@ def _describe_type(option: Any) -> str:
         return "a list of words" if str in get_args(option) else "a list of numbers"
     if get_origin(option) is Mapping or (isinstance(option, type) and is_dataclass(option)):
         return "a mapping"
-    return {NoneType: "null", bool: "true or false", str: "a word", int: "a whole number"}.get(option, "a number")
+    return {NoneType: "null", bool: "true or false", str: "a name or path", int: "a whole number"}.get(
+        option, "a number"
+    )
 
 
 def bounded_field(default: Any, low: float, high: float) -> Any:

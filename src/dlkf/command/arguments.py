@@ -174,7 +174,9 @@ def with_near_key(line: str, command: str) -> str:
     known = list(_paths(compose_command(command, resolve=False)))
     if key in known:
         return f"{key}: has no such key; one that its settings take is added as +{key}.<key>=…; {rest}"
-    return line[: unknown.end() - 2] + (did_you_mean(key, known) or ";") + " " + rest
+    below = [path for path in known if path.endswith(f".{key}")]
+    near = f"; did you mean {' or '.join(below[:3])}?" if below else did_you_mean(key, known) or ";"
+    return f"{line[: unknown.end() - 2]}{near} {rest}"
 
 
 def _paths(values: Mapping[str, Any], above: str = "") -> Iterator[str]:

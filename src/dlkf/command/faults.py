@@ -39,6 +39,7 @@ SAID = {
     "shorter drives, or a smaller model",
     r"invalid accelerator name|[Yy]ou selected an invalid": "trainer.accelerator is unknown; known: auto, cpu, gpu",
 }
+LISTED = ("aids", "datasets", "drives", "export", "model", "models", "runs")  # keys that take a list of words
 UNKNOWN_KEY = (
     r"is not in struct[\s\S]*full_key: (\S+)", r"Could not override '([^']+)'",
     r"full_key: (\S+)[\s\S]*is not in struct", r"Key '([^']+)' is not in struct",
@@ -82,6 +83,9 @@ def one_line(error: BaseException) -> str:
     text = str(error)
     if several := re.search(r"Ambiguous value for argument '([^=']+)=([^']+)'", text):
         key, values = several.groups()
+        if key.rpartition(".")[2] not in LISTED:
+            quoted = f"'{key}=\"{values}\"' if that is one"
+            return f"{key}={values}: takes one value; -m {key}={values} for a run each, {quoted}"
         return f"{key}={values}: several values are '{key}=[{values}]' as a list, or -m {key}={values} for a run each"
     if missing := re.search(r"Could not find '([^']+)'", text):
         options = re.search(r"Available options in '([^']+)':\n((?:\t.*\n?)+)", text)

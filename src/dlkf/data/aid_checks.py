@@ -31,7 +31,7 @@ APART_S = 0.6  # more is another clock, less a delay, which the filter estimates
 CLEARLY = 0.4  # of the difference that is left at another lag, for that lag to be the right one
 SQUARE_DEG = 30.0  # a heading so far from the course is that of antennas mounted otherwise
 PRESSURE_PA = (3e4, 1.2e5)
-DROP = "; or leave it out with aids=[]"
+DROP = "; leave it out with aids=[]"
 
 
 def check_aid(name: str, table: Columns, imu: Columns, moved: Motion, where: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, did_you_mean
 
 MEAN, LAST = "mean", "last"
 
@@ -34,6 +34,6 @@ def standard_tables(names: Sequence[str]) -> tuple[AidTable, ...]:
     """By name; InputError for an unknown one."""
     if unknown := [name for name in names if name not in STANDARD]:
         raise InputError(
-            f"aids: unknown {unknown[0]!r}; known: {', '.join(STANDARD)}, or null for all that a drive has"
+            f"aids: unknown {unknown[0]!r}{did_you_mean(unknown[0], STANDARD) or ';'} known: {', '.join(STANDARD)}"
         )
     return tuple(STANDARD[name] for name in names)

@@ -9,7 +9,7 @@ import numpy as np
 
 from dlkf.base.angles import circular_median, wrap_angle
 from dlkf.base.errors import InputError
-from dlkf.data.discovery.clock import ImuSums, find_lag
+from dlkf.data.discovery.clock import ImuSums, describe_offset, find_lag
 from dlkf.data.discovery.motion import find_motion
 from dlkf.data.limits import DEGREE_M
 from dlkf.data.plausibility import APART_S, TURNED_DEG
@@ -19,9 +19,64 @@ from dlkf.data.tables import Columns
 SAME_S = 1.0  # between a fix and a row of the reference that are compared
 REFERENCE_M, HEIGHT_M, SIGMAS = 30.0, 20.0, 5.0  # beyond the receiver's own 1σ: no antenna and no datum is so far off
 GEOID_M, STEADY_M = 110.0, 5.0  # the geoid lies no further from the ellipsoid, and is flat over a drive
+ARM_M, SINGLE_M, DELAY_S = 3.0, 3.5, 0.5  # of a car's antenna, 1σ of a fix that tells none; a receiver is no later
+SEARCH_S, STEPS_S = 45.0, (0.5, 0.05)  # leap seconds are within; coarse, fine
+ENOUGH_FIXES = 500  # to find a shift by
 FAST, FEWEST = 3.0, 10  # m/s above which the course is the heading; rows
 SIDEWAYS, STEADY = 0.5, 0.8  # rad, about the median, within which such a share of the headings lies
 FORCE_AGREES = 0.6  # correlation of the force with the acceleration that shows where the sensor looks
+
+
+def check_same_clock(reference: Columns, fixes: Columns, where: str) -> None:
+    """Moving fixes lie nearest to the reference as the clocks stand, but for a receiver's delay.
+
+    A shift counts that more than halves the median distance, and by more than lever arm and 1σ explain.
+    """
+    thin = slice(None, None, 1 + len(fixes["t"]) // ENOUGH_FIXES)
+    some = {name: values[thin] for name, values in fixes.items()}
+    here, count = _measure_apart(reference, some, 0.0)
+    sigma = np.nan_to_num(np.hypot(some["std_pos_n"], some["std_pos_e"]), nan=SINGLE_M)
+    margin = max(ARM_M, 2 * float(np.median(sigma)) if len(sigma) else 0.0)
+    if count < FEWEST or here <= margin:
+        return
+    shift, nearest, span = 0.0, here, SEARCH_S
+    for step in STEPS_S:
+        for other in shift + np.arange(-span, span + step / 2, step):
+            apart, moving = _measure_apart(reference, some, float(other))
+            if moving > count / 2 and apart < nearest:
+                shift, nearest = float(other), apart
+        span = step
+    if abs(shift) <= DELAY_S or nearest > 0.5 * here or here - nearest <= margin:
+        return
+    ahead = shift > 0
+    by = f"{'subtract' if ahead else 'add'} {abs(shift):.1f} s {'from' if ahead else 'to'} t of reference"
+    raise InputError(
+        f"{where}: lies {here:.3g} m from the moving fixes in the median, {nearest:.2g} m if shifted in time: its "
+        f"clock is {abs(shift):.1f} s {'ahead of' if ahead else 'behind'} that of GNSS{describe_offset(shift)}; {by} "
+        f"(reader.reference.time.offset_s={-shift:.1f})"
+    )
+
+
+def _measure_apart(reference: Columns, fixes: Columns, shift: float) -> tuple[float, int]:
+    """Median distance [m] from fixes in motion to the reference ``shift`` seconds later, and how many these are."""
+    t = fixes["t"] + shift
+    row = np.searchsorted(reference["t"], t).clip(max=len(reference["t"]) - 1)
+    lat, lon, north, east = (
+        np.interp(t, reference["t"], values)
+        for values in (
+            reference["lat_deg"],
+            np.unwrap(reference["lon_deg"], period=360),
+            reference["vel_n"],
+            reference["vel_e"],
+        )
+    )
+    with np.errstate(invalid="ignore"):
+        moving = (np.abs(reference["t"][row] - t) < SAME_S) & (np.hypot(north, east) > FAST)
+    if not moving.any():
+        return np.nan, 0
+    side = wrap_angle(lon - fixes["lon_deg"], 180) * np.cos(np.radians(lat))
+    apart = DEGREE_M * np.hypot(lat - fixes["lat_deg"], side)[moving]
+    return float(np.median(apart)), int(moving.sum())
 
 
 def check_same_place(reference: Columns, fixes: Columns, where: str) -> None:

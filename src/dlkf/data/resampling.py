@@ -70,7 +70,11 @@ def samples_per_epoch(rate_hz: float, epoch_s: float) -> int:
     """Samples in an epoch; InputError if that is no whole number."""
     samples = round(rate_hz * epoch_s)
     if samples < 1 or abs(samples - rate_hz * epoch_s) > 1e-6:
-        raise InputError(f"rate_hz={rate_hz:g}, epoch_s={epoch_s:g}: an epoch must hold a whole number of samples")
+        near = max(round(epoch_s * rate_hz), 1) / rate_hz
+        raise InputError(
+            f"rate_hz={rate_hz:g}, epoch_s={epoch_s:g}: an epoch must hold a whole number of samples, such as "
+            f"epoch_s={near:.6g}"
+        )
     return samples
 
 

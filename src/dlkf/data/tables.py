@@ -137,6 +137,11 @@ def read_table(folder: str | Path, kind: str, drive: str, column: str = "") -> C
     if not parts:
         if kind == "reference" or kind not in SCHEMAS:
             return None
+        root = resolve_place(folder)
+        others = sorted(other.name for other in (root / kind).glob("drive=*"))
+        if others and not (root / "imu" / place.name).exists():
+            listed = ", ".join(others[:5]) + (", …" if len(others) > 5 else "")
+            raise InputError(f"drive {drive}: is in drives.parquet, but {kind}/ has {listed} alone; give both one name")
         if kind == "gnss":
             raise InputError(f"drive {drive}: no GNSS, {place}/ has no Parquet file; a filter needs position fixes")
         raise InputError(f"drive {drive}: {place}/ has no Parquet file though drives.parquet lists the drive")

@@ -15,12 +15,13 @@ from dlkf.data.aid_tables import STANDARD, AidTable
 from dlkf.data.discovery.motion import find_motion
 from dlkf.data.limits import FULL_SCALE, NONE_REFUSED, Refused, screen_fixes, within_full_scale
 from dlkf.data.plausibility import check_clocks, check_gnss_units, check_imu_units, check_turns
-from dlkf.data.reference_checks import check_attitude, check_same_place
+from dlkf.data.reference_checks import check_attitude, check_same_clock, check_same_place
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY, stack_columns
 from dlkf.data.tables import Columns, DriveRow, read_drives, read_table, refuse_rows
 
 GNSS_QUALITIES = (1, 2, 3, 4, 5, 9)  # NMEA GGA codes that are a satellite fix; 6, 7, 8 are not
 RATES_HZ = {"imu": (1.0, 1e4), "gnss": (1e-3, 500.0)}
+UNITS = {"ms": 1e3, "us": 1e6, "ns": 1e9}  # of time, in a second
 MOST_SAME = 0.2  # of the rows, with the stamp of the row before: more are a rounded clock
 MOST_REFUSED = (0.01, 0.2)  # of the samples, of the fixes; more are no accident
 MOST_SWITCH_M = 10_000.0  # m: fixes that go on so far off make two drives of one
@@ -173,10 +174,20 @@ def _check_rate(t: np.ndarray, where: str, kind: str) -> None:
     slowest, fastest = RATES_HZ[kind]
     rate = 1 / float(np.median(np.diff(t))) if len(t) > 1 else fastest
     if not slowest <= rate <= fastest:
+        unit = _find_unit(1 / rate, 1 / fastest, 1 / slowest)
         raise InputError(
             f"{where}: {rate:.3g} rows a second, {'an IMU' if kind == 'imu' else 'a receiver'} has {slowest:g} to "
-            f"{fastest:g}: t is not in seconds; reader.{kind}.time.unit"
+            f"{fastest:g}: {_say_unit(unit, kind) if unit else f't is not in seconds; reader.{kind}.time.unit'}"
         )
+
+
+def _find_unit(length: float, shortest: float, longest: float) -> str:
+    """The unit smaller than seconds of which ``length`` are from ``shortest`` to ``longest`` seconds, if any."""
+    return next((unit for unit, count in UNITS.items() if shortest <= length / count <= longest), "")
+
+
+def _say_unit(unit: str, kind: str) -> str:
+    return f"t looks like {unit}, must be seconds; divide it by {UNITS[unit]:g} (reader.{kind}.time.unit={unit})"
 
 
 def _check_imu(imu: Columns, where: str, limits: Limits) -> Columns:
@@ -227,17 +238,10 @@ def _check_gnss(gnss: Columns, imu: Columns, where: str) -> Columns:
     refuse_rows(gnss, STD, lambda x: x < 0, where, "must be ≥ 0, or NaN if unknown")
     t, first, last = gnss["t"][fix], imu["t"][0], imu["t"][-1]
     if not ((t > first) & (t <= last + 1)).any():
-        epochs = abs(abs(t[0] - first) - UNIX_TO_GPS_S) < EPOCHS_APART_S
-        hours = round((first + last - t[0] - t[-1]) / 2 / 3600)
-        zone = 0 < abs(hours) <= MOST_HOURS and bool(
-            ((t + 3600 * hours > first) & (t + 3600 * hours <= last + 1)).any()
-        )
+        span = f"fixes from t = {t[0]:.3f} to {t[-1]:.3f}" if len(t) > 1 else f"the only fix, at t = {t[0]:.3f},"
         raise InputError(
-            f"{where}: fixes from t = {t[0]:.3f} to {t[-1]:.3f} lie outside the IMU's {first:.3f} to "
-            f"{last:.3f}; both need the same clock"
-            + (": one counts from 1970, the other from 1980; give time.clock to both or to neither" if epochs else "")
-            + (f": they are {abs(hours)} h apart, as time zones are; add {3600 * hours} s to t of gnss" if zone else "")
-            + (f" (reader.gnss.time.offset_s={3600 * hours})" if zone else "")
+            f"{where}: {span} lie{'' if len(t) > 1 else 's'} outside the IMU's {first:.3f} to {last:.3f}; "
+            + _explain_outside(t, first, last)
         )
     fixes = {name: values[fix] for name, values in gnss.items()}
     check_gnss_units(fixes, where)
@@ -261,6 +265,24 @@ def _check_gnss(gnss: Columns, imu: Columns, where: str) -> Columns:
     return {name: values[keep] for name, values in gnss.items()}
 
 
+def _explain_outside(t: np.ndarray, first: float, last: float) -> str:
+    """What fixes that lie outside the IMU's time may count."""
+    if len(t) == 1 and first - 1 <= t[0] <= last + 1:
+        return "give fixes all along the drive, or leave it out"
+    if abs(abs(t[0] - first) - UNIX_TO_GPS_S) < EPOCHS_APART_S:
+        clock = "one counts from 1970, the other from 1980; give time.clock to both or to neither"
+        return f"both need the same clock: {clock}"
+    seconds = 3600 * round((first + last - t[0] - t[-1]) / 2 / 3600)
+    if 0 < abs(seconds) <= 3600 * MOST_HOURS and ((t + seconds > first) & (t + seconds <= last + 1)).any():
+        return (
+            f"both need the same clock: they are {abs(seconds) // 3600} h apart, as time zones are; add {seconds} s to "
+            f"t of gnss (reader.gnss.time.offset_s={seconds})"
+        )
+    if unit := _find_unit(np.ptp(t) / max(last - first, 1.0), 0.5, 2.0):
+        return _say_unit(unit, "gnss")
+    return "both need the same clock"
+
+
 def _check_fixes_there(gnss: Columns, where: str) -> None:
     """Why there is no fix, where that is not because the receiver had none."""
     placed = np.isfinite(gnss["lat_deg"]) & np.isfinite(gnss["lon_deg"])
@@ -279,5 +301,6 @@ def _check_reference(reference: Columns, imu: Columns, fixes: Columns, where: st
         return
     rows = {name: values[known] for name, values in reference.items()}
     check_gnss_units(rows, where)
+    check_same_clock(rows, fixes, where)
     check_same_place(rows, fixes, where)
     check_attitude(rows, imu, where)

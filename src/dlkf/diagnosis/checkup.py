@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlkf.base.errors import InputError
-from dlkf.data.discovery.findings import discover
+from dlkf.data.discovery.findings import Finding, discover, find_value
 from dlkf.data.limits import horizontal_distance
 from dlkf.data.schema import ACCEL, GYRO, QUALITIES
 from dlkf.data.tables import Columns, DriveRow
@@ -144,19 +144,21 @@ def motion_findings(gnss: Columns) -> Iterator[CheckupResult]:
 
 def discover_findings(tables: CheckedTables) -> Iterator[CheckupResult]:
     """Clock offset, pose of the sensor in the car, and lever arm estimated from the motion, against what is stored."""
-    for finding in discover(tables.imu, read_fixes(tables.gnss), {"imu.time.offset_s", "imu.axes"}):
-        if finding.setting == "gnss.time.drift_ppm":
-            text = f"clocks: {finding.value:+.0f} {finding.detail}; {ESTIMATED}reader.{finding.setting}=auto"
-            yield CheckupResult(NOTE, text)
-        elif not finding.sure:
+    found = discover(tables.imu, read_fixes(tables.gnss), {*CLOCKS, "imu.axes"})
+    autos = " ".join(f"reader.{name}=auto" for name in CLOCKS)
+    late = float(find_value(found, "gnss.position.delay_s") or 0.0)
+    for finding in found:
+        if finding.setting == "gnss.position.delay_s" or (
+            finding.setting == "gnss.time.drift_ppm" and not finding.value
+        ):
+            continue
+        if not finding.sure:
             yield CheckupResult(NOTE, f"{finding.setting}: the motion does not show it ({finding.detail})")
+        elif finding.setting == "gnss.time.drift_ppm":
+            text = f"clocks: {finding.value:+.0f} {finding.detail}; {ESTIMATED}{autos}"
+            yield CheckupResult(NOTE, text)
         elif finding.setting == "imu.time.offset_s":
-            off = abs(finding.value)
-            fine = off < OFFSET_S
-            lead = "IMU and GNSS agree" if fine else f"add {finding.value:+.3f} s to the IMU's stamps"
-            text = f"clocks: {lead} ({finding.detail})"
-            grade = GOOD if fine else NOTE if off < DELAY_S else BAD  # receivers are late, clocks are wrong
-            yield CheckupResult(grade, text + ("" if fine else f"; {OFFSETS}"))
+            yield _grade_offset(finding, late, autos if all(x.sure for x in found if x.setting in CLOCKS) else "")
         elif finding.setting == "imu.axes":
             angle = measure_turn(finding.value)
             fine = angle < ANGLE_DEG
@@ -165,11 +167,26 @@ def discover_findings(tables: CheckedTables) -> Iterator[CheckupResult]:
             yield CheckupResult(GOOD if fine else BAD, text + remedy)
 
 
+def _grade_offset(finding: Finding, late: float, autos: str) -> CheckupResult:
+    """The offset of the velocities, and that of positions which are ``late`` s older; ``autos`` would take both out."""
+    off, apart = finding.value, abs(late) >= OFFSET_S
+    if abs(off) < OFFSET_S and not apart:
+        return CheckupResult(GOOD, f"clocks: IMU and GNSS agree ({finding.detail})")
+    lead = f"add {off:+.3f} s to the IMU's stamps"
+    if apart:
+        age = "older" if late > 0 else "newer"
+        lead += (
+            f" for the velocities, {off + late:+.3f} s for the positions, which are {abs(late):.3f} s {age} than they"
+        )
+    remedy = ESTIMATED + (autos or f"reader.imu.time.offset_s={off:g}")
+    if apart:
+        remedy = f"one offset does not suit both: ingest with {autos or f'reader.gnss.position.delay_s={late:g}'}"
+    grade = NOTE if abs(off) < DELAY_S else BAD  # receivers are late, clocks are wrong
+    return CheckupResult(grade, f"clocks: {lead} ({finding.detail}); {remedy}")
+
+
+CLOCKS = ("imu.time.offset_s", "gnss.time.drift_ppm", "gnss.position.delay_s")
 ESTIMATED = "plus and filters with +receiver estimate it; for others ingest with "
-OFFSETS = (
-    ESTIMATED + "reader.imu.time.offset_s=auto and reader.gnss.position.delay_s=auto (this is the offset of the "
-    "velocities; that of the positions may differ)"
-)
 
 
 def measure_turn(angles: Mapping[str, float]) -> float:

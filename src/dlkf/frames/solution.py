@@ -87,7 +87,7 @@ class Solution(pd.DataFrame):
         InputError
             For an unknown format, a date that is none, or a folder that cannot be written to.
         """
-        from dlkf.running.exports import choose_formats, export, utc_times
+        from dlkf.running.exports import choose_formats, export, row_qualities, utc_times
 
         if not isinstance(folder, (str, Path)):
             raise InputError(f"folder is {folder!r}, must be a path")
@@ -96,10 +96,11 @@ class Solution(pd.DataFrame):
         names = choose_formats([formats] if isinstance(formats, str) else list(formats))
         clock, counts = _clock(start_utc)
         when = utc_times(self, clock, counts)
+        qualities = row_qualities(self, self._fixes.t, self._fixes.quality)
         place = Path(folder).expanduser()
         try:
             place.mkdir(parents=True, exist_ok=True)
-            export(place, pd.DataFrame(self), names, when, "solution")
+            export(place, pd.DataFrame(self), names, when, "solution", qualities)
         except OSError as error:
             raise InputError(f"{place} cannot be written to: {(error.strerror or str(error)).lower()}") from None
         return place

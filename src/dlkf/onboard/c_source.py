@@ -212,6 +212,7 @@ def constants() -> str:
         "LOWEST_M": limits.HEIGHTS_M[0], "HIGHEST_M": limits.HEIGHTS_M[1],
         "ESTIMATE_LOWEST_M": limits.ESTIMATE_HEIGHTS_M[0], "ESTIMATE_HIGHEST_M": limits.ESTIMATE_HEIGHTS_M[1],
         "ASTRAY_S": imu_stream.ASTRAY_S, "BEFORE": imu_stream.BEFORE, "SETTLE_S": streaming.SETTLE_S,
+        "FIRST_OF_FIXES": streaming.FIRST_OF_FIXES, "FIRST_OF_AIDS": streaming.FIRST_OF_AIDS,
         "ON_BOUNDARY_S": resampling.ON_BOUNDARY_S, "SMALLEST_STD": resampling.SMALLEST_STD,
         "MIN_SPEED": alignment.SEARCH.min_speed, "RATE_AVERAGE_S": alignment.RATE_AVERAGE_S,
     }  # fmt: skip

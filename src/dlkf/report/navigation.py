@@ -188,10 +188,9 @@ def make_rows(courses: Sequence[TrackOnMap]) -> tuple[list[str], list[list[str]]
         step = float(np.median(np.diff(table["t"]))) if len(table) > 1 else 0.0
         innovation = course.result.innovation
         ratio = innovation.normalised_rms if innovation is not None else np.nan
-        offered = course.fixes.between(course.result.aligned_at, float(table["t"].iloc[-1]))
         rows.append(
             [course.result.drive, f"{np.ptp(table['t']):.0f}", f"{distance(course) / 1000:.2f}"]
-            + [str(int(table["gnss_used"].sum())), str(offered), f"{course.without.max():.3g}"]
+            + [str(int(table["gnss_used"].sum())), str(len(course.fixes.t)), f"{course.without.max():.3g}"]
             + [f"{(speed(course) < STANDING).sum() * step:.0f}"]
             + ([_two_digits(float(np.nanmedian(sigma))), _two_digits(float(np.nanmax(sigma)))] if known else ["–", "–"])
             + [_two_digits(ratio) if np.isfinite(ratio) else "–"]

@@ -2,7 +2,8 @@
 
 All functions take the rows of ``solution.parquet`` and write one file. ``when`` is the UTC time of every row
 (:func:`utc_times`); None where the date is unknown: then tracks have no times, and NMEA and ``.pos``, which cannot do
-without, count seconds from midnight of 6 January 1980 (GPS week 0).
+without, count seconds from midnight of 6 January 1980 (GPS week 0). These two also take the ``quality`` of
+every row (:func:`row_qualities`).
 """
 
 from __future__ import annotations
@@ -21,11 +22,19 @@ from numpy.typing import NDArray
 
 from dlkf.base.errors import InputError
 from dlkf.data.readers.units import GPS_EPOCH_UNIX, WEEK_S, clock_by_size, gps_seconds, leap_seconds
+from dlkf.data.resampling import ON_BOUNDARY_S
 from dlkf.data.tables import DriveClock
 from dlkf.running.bag_exports import write_bag
 
 Times = list[datetime] | None
 KNOTS = 1852 / 3600  # m/s
+DEAD_RECKONING = 6  # NMEA GGA quality
+GGA = {9: 2}  # quality as the standard has it, which counts SBAS as differential
+RMC = {1: "A", 2: "D", 3: "P", 4: "R", 5: "F", 6: "E", 9: "D"}  # mode of a quality
+RTKLIB_CODES = (
+    "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,7:dr,ns=# of satellites)"
+)
+RTKLIB = {1: 5, 2: 4, 3: 6, 4: 1, 5: 2, 6: 7, 9: 3}  # Q of a quality: single, DGPS, PPP, fix, float, DR, SBAS
 NED_ENU = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])  # and Forward-Right-Down → Forward-Left-Up is diag(1, −1, −1)
 
 
@@ -50,6 +59,12 @@ def utc_times(table: pd.DataFrame, clock: DriveClock | None, counts: str = "auto
         seconds = seconds - leap_seconds(seconds - leap_seconds(seconds))
     start = datetime(1970, 1, 1, tzinfo=UTC)
     return [start + timedelta(microseconds=round(s * 1e6)) for s in seconds]
+
+
+def row_qualities(table: pd.DataFrame, t: NDArray[np.floating], quality: NDArray[np.integer]) -> NDArray[np.integer]:
+    """NMEA GGA quality of every row: of the last of the fixes at ``t`` where one was used, else dead reckoning."""
+    last = np.searchsorted(t, table["t"].to_numpy() + ON_BOUNDARY_S, side="right") - 1
+    return np.where(table["gnss_used"], quality[last.clip(0)], DEAD_RECKONING)
 
 
 def write_geojson(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
@@ -105,8 +120,8 @@ def write_gpx(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
     path.write_text(content.to_xml(version="1.1"), encoding="utf-8")
 
 
-def write_nmea(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
-    """GGA, RMC and GST a row; quality 6 (dead reckoning) where no fix was used; the height is the ellipsoid's."""
+def write_nmea(path: Path, table: pd.DataFrame, when: Times, name: str, quality: NDArray[np.integer]) -> None:
+    """GGA, RMC and GST a row, to the millisecond; the height is the ellipsoid's."""
     from pynmeagps import GET, NMEAMessage
 
     start = datetime(1980, 1, 6, tzinfo=UTC)
@@ -116,12 +131,12 @@ def write_nmea(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
     rows: Iterator[Any] = iter(table.itertuples())
     for k, row in enumerate(rows):
         at = when[k] if when is not None else start + timedelta(seconds=float(row.t))
-        clock = f"{at:%H%M%S}.{at.microsecond // 10_000:02d}"
+        at += timedelta(microseconds=500)
+        clock = f"{at:%H%M%S}.{at.microsecond // 1000:03d}"
         place = (*_dm(row.lat_deg, "NS", 2), *_dm(row.lon_deg, "EW", 3))
-        quality = "1" if row.gnss_used else "6"
-        gga = [clock, *place, quality, "00", "", f"{row.height_m:.3f}", "M", "0.000", "M", "", ""]
-        mode = "A" if row.gnss_used else "E"
-        rmc = [clock, "A", *place, f"{speed[k]:.3f}", f"{course[k]:.2f}", f"{at:%d%m%y}", "", "", mode]
+        code = int(quality[k])
+        gga = [clock, *place, str(GGA.get(code, code)), "00", "", f"{row.height_m:.3f}", "M", "0.000", "M", "", ""]
+        rmc = [clock, "A", *place, f"{speed[k]:.3f}", f"{course[k]:.2f}", f"{at:%d%m%y}", "", "", RMC[code]]
         sentences = [("GGA", gga), ("RMC", rmc)]
         if np.isfinite(row.std_pos_n):
             std = [f"{x:.4f}" for x in (row.std_pos_n, row.std_pos_e, row.std_pos_d)]
@@ -131,18 +146,18 @@ def write_nmea(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
     path.write_text("".join(lines), encoding="ascii", newline="")
 
 
-def write_pos(path: Path, table: pd.DataFrame, when: Times, name: str) -> None:
-    """RTKLIB's solution file in GPS week and time of week; Q 1 with a fix, 6 (here: dead reckoning) without."""
+def write_pos(path: Path, table: pd.DataFrame, when: Times, name: str, quality: NDArray[np.integer]) -> None:
+    """RTKLIB's solution file in GPS week and time of week, with its codes of quality."""
     gps = table["t"].to_numpy() if when is None else gps_seconds(np.array([w.timestamp() for w in when]))
     week = np.floor(gps / WEEK_S)
     std = [table[f"std_pos_{a}"].fillna(0).to_numpy() for a in "ned"]
     head = "%  GPST               latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)"
     head += "  sdne(m)  sdeu(m)  sdun(m) age(s)  ratio    vn(m/s)    ve(m/s)    vu(m/s)"
-    lines = [f"% program   : dlkf, {name}", "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,6:dead reckoning)", head]
+    lines = [f"% program   : dlkf, {name}", RTKLIB_CODES, head]
     rows: Iterator[Any] = iter(table.itertuples())
     for k, row in enumerate(rows):
         text = f"{week[k]:4.0f} {gps[k] - week[k] * WEEK_S:10.3f} {row.lat_deg:14.9f} {row.lon_deg:14.9f} "
-        text += f"{row.height_m:10.4f} {1 if row.gnss_used else 6:3d}   0"
+        text += f"{row.height_m:10.4f} {RTKLIB[int(quality[k])]:3d}   0"
         text += f" {std[0][k]:8.4f} {std[1][k]:8.4f} {std[2][k]:8.4f}"
         text += "   0.0000   0.0000   0.0000   0.00    0.0 "
         lines.append(text + f"{row.vel_n:10.5f} {row.vel_e:10.5f} {-row.vel_d:10.5f}")
@@ -189,7 +204,7 @@ def poses(table: pd.DataFrame) -> tuple[NDArray[np.floating], NDArray[np.floatin
     return position, NED_ENU @ C_nb @ np.diag([1.0, -1.0, -1.0])
 
 
-FORMATS: Mapping[str, tuple[str, Callable[[Path, pd.DataFrame, Times, str], None]]] = {
+FORMATS: Mapping[str, tuple[str, Callable[..., None]]] = {
     "geojson": ("solution.geojson", write_geojson),
     "kml": ("solution.kml", write_kml),
     "gpx": ("solution.gpx", write_gpx),
@@ -201,6 +216,7 @@ FORMATS: Mapping[str, tuple[str, Callable[[Path, pd.DataFrame, Times, str], None
     "mcap": ("solution.mcap", write_ros),
     "bag": ("solution.bag", write_ros),
 }
+OF_RECEIVERS = ("nmea", "pos")  # formats that have the quality of a fix
 OF_EXTRA = ("mcap", "bag")  # formats that need the extra ``readers``
 
 
@@ -216,11 +232,13 @@ def choose_formats(export: str | list[str] | None) -> list[str]:
     return names
 
 
-def export(folder: Path, table: pd.DataFrame, names: list[str], when: Times, drive: str) -> None:
+def export(
+    folder: Path, table: pd.DataFrame, names: list[str], when: Times, drive: str, quality: NDArray[np.integer]
+) -> None:
     """One file a format beside ``solution.parquet``."""
     for name in names:
         file, write = FORMATS[name]
-        write(folder / file, table, when, drive)
+        write(folder / file, table, when, drive, *([quality] if name in OF_RECEIVERS else []))
 
 
 def _iso(when: datetime) -> str:

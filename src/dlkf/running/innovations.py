@@ -60,12 +60,14 @@ class Innovation(NamedTuple):
 
 
 class SigmaFit(NamedTuple):
-    """RMS of innovations over their 1σ, and within which bounds it lies where the 1σ is right."""
+    """RMS of innovations over their 1σ from update :data:`SETTLE` on, within which bounds it lies where the 1σ is
+    right, and that of all updates, which tables and summaries have too."""
 
     ratio: float
     low: float
     high: float
     degrees: float
+    of_all: float
 
     @property
     def too_small(self) -> bool:
@@ -75,14 +77,14 @@ class SigmaFit(NamedTuple):
     def warning(self, name: str, remedy: str = REMEDY) -> str:
         """One line with the remedy."""
         return (
-            f"{name} is overconfident: its innovations are {self.ratio:.2g} times their 1σ (RMS from update "
-            f"{SETTLE + 1} on; by chance at most {self.high:.2g}), so in outages it drifts further than its 1σ says; "
+            f"{name} is overconfident: its innovations are {self.of_all:.2g} times their 1σ (RMS; by chance at "
+            f"most {self.high:.2g}), so in outages it drifts further than its 1σ says; "
             f"{self.remedy(remedy)}"
         )
 
     def short_warning(self, name: str) -> str:
         """The line behind that of another filter with the same remedy."""
-        return f"{name} is overconfident, too: {self.ratio:.2g} times (by chance at most {self.high:.2g})"
+        return f"{name} is overconfident, too: {self.of_all:.2g} times (by chance at most {self.high:.2g})"
 
     def remedy(self, of_filter: str) -> str:
         """That of the filter, or of the data where the innovations are too large for any noise."""
@@ -122,7 +124,7 @@ def fit_sigma(*drives: Array) -> SigmaFit | None:
     each = min(float(seen.mean()), 2 * mean**2 / variance) if variance > 0 else float(seen.mean())
     degrees = max(independent * each, 1e-3)
     low, high = (float(np.sqrt(chi2_quantile(p, degrees) / degrees)) for p in (CHANCE / 2, 1 - CHANCE / 2))
-    return SigmaFit(float(np.sqrt(mean)), low, high, degrees)
+    return SigmaFit(float(np.sqrt(mean)), low, high, degrees, rms(np.concatenate(drives)))
 
 
 def _squares(ratio: Array) -> tuple[Array, Array]:

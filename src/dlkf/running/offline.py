@@ -114,11 +114,11 @@ class Navigated:
     doubt: float = 0.0
 
     def summary(self, spacing: UsableFixes | None = None) -> str:
-        """One line: rows, alignment, fixes used (of those in the file), and the filter's own 1σ at the end."""
-        last, used = self.table.iloc[-1], int(self.table.gnss_used.sum())
-        text = f"{self.drive}: aligned at t = {round(self.aligned_at, 1) + 0.0:.1f} s, "
-        if spacing is not None and (early := spacing.between(-np.inf, self.aligned_at - EARLY_S)):
-            text += f"no solution for the {early} fixes before, "
+        """One line: rows, where they begin, fixes used (of those in the file), and the filter's own 1σ at the end."""
+        first, last, used = self.table.t.iloc[0], self.table.iloc[-1], int(self.table.gnss_used.sum())
+        text = f"{self.drive}: solution from t = {round(first, 1) + 0.0:.1f} s, "
+        if spacing is not None and spacing.between(-np.inf, self.aligned_at - EARLY_S):
+            text += f"none for the {int((spacing.t < first - 1e-3).sum())} fixes before, "
         if self.doubt > WORTH_SAYING:
             text += f"heading ambiguous (the alternatives have probability {self.doubt:.2g}), "
         text += f"{len(self.table)} epochs, "
@@ -127,9 +127,8 @@ class Navigated:
         if spacing is None:
             text += f"{used} fixes used"
         else:
-            offered = spacing.between(self.aligned_at, last.t)
-            text += f"{used} of {offered} fixes used"
-            if offered > 1.5 * len(self.table):
+            text += f"{used} of {len(spacing.t)} fixes used"
+            if spacing.between(self.aligned_at, last.t) > 1.5 * len(self.table):
                 text += f" (one an epoch; epoch_s={spacing.usual_s:g} takes all)"
         position = np.hypot(last.std_pos_n, last.std_pos_e)
         if np.isfinite(position):

@@ -58,6 +58,7 @@ from dlkf.running.start import Search
 ANCHOR_M = 50_000.0  # from its origin, beyond which the tangent frame moves
 SETTLE_S = 3.0  # fixes over so long lay the grid
 MOST_EARLY_SAMPLES = 10_000  # of further sensors
+FIRST_OF_FIXES, FIRST_OF_AIDS = 0, 1  # boundaries at which they can count
 
 
 class Status(StrEnum):
@@ -281,11 +282,13 @@ class StreamingFilter:
         if self._samples.begin(through):
             rate_hz = min(self._rate_hz, 1 / self._samples.step_s)
             self._warned = self._warned or warn_slow_drives(self.estimator, rate_hz)
-            for fix in self._early:
-                self._file(fix)
+            for fix in self._early:  # what lies before the first interval is of no use, which is no fault of it
+                if self._find_boundary(float(fix["t"][0])) >= FIRST_OF_FIXES:
+                    self._file(fix)
             self._early.clear()
             for sample in self._early_aids:
-                self._file_aid(*sample)
+                if self._find_boundary(sample[1]) >= FIRST_OF_AIDS:
+                    self._file_aid(*sample)
             self._early_aids.clear()
 
     @torch.inference_mode()
@@ -297,7 +300,7 @@ class StreamingFilter:
         """Put a fix to its boundary; replay where that is over."""
         t = float(fix["t"][0])
         row = self._find_boundary(t)
-        if reason := self._timing_fault("fix", t, row, least=0):
+        if reason := self._timing_fault("fix", t, row, FIRST_OF_FIXES):
             return self._answer(Status.REFUSED, reason)
         screened, changed = self._fixes.add(t, row, fix, oldest=self._samples.epochs - self._rewind)
         if screened is None:
@@ -323,7 +326,7 @@ class StreamingFilter:
     def _file_aid(self, name: str, t: float, value: float, std: float) -> Receipt:
         """Put a sample of a further sensor to the others of its interval; replay where that is over."""
         row = self._find_boundary(t)
-        if reason := self._timing_fault(name, t, row, least=1):
+        if reason := self._timing_fault(name, t, row, FIRST_OF_AIDS):
             return self._answer(Status.REFUSED, reason)
         if not self._buffer.put_aid(row, name, t, value, std):
             return self._answer(Status.REFUSED, f"{name} at t = {t:.3f} again")

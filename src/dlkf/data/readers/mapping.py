@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -75,6 +76,9 @@ def _check_known(spec: Any, known: tuple[str, ...], where: str) -> None:
             raise InputError(f"{where}.{key} is {spec[key]!r}, must be true or false")
 
 
+DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
+
+
 @dataclass(frozen=True)
 class Mapped:
     """A table with the mapping of its ``kind`` (imu, gnss, reference).
@@ -102,6 +106,8 @@ class Mapped:
                 remedy = "correct the line"
                 if np.mean(numbers.isna()) > 0.5 and str(name) == str((self.spec.get("time") or {}).get("column")):
                     remedy = f"set reader.{self.kind}.time.unit=iso if that is a date and time"
+                if DECIMAL_COMMA.fullmatch(texts.iloc[bad[0]]):
+                    remedy = self._text_to_set("decimal", ",")
                 self.fail(int(bad[0]), name, f"is {values.iloc[bad[0]]!r}, not a number; {remedy}")
             values = numbers
         if not nan and bool(values.isna().any()):
@@ -217,10 +223,13 @@ class Mapped:
         if name not in self.table.frame:
             have = [str(c) for c in self.table.frame.columns]
             has = ", ".join(have[:24]) + (", …" if len(have) > 24 else "")
-            other = next((m for m in (";", "\t") if len(have) == 1 and m in have[0]), None)
-            remedy = self._entry_to_set(name) if other is None else f"set reader.separator={other!r}"
+            other = next((m for m in (";", "\t", ",") if len(have) == 1 and m in have[0]), None)
+            remedy = self._entry_to_set(name) if other is None else self._text_to_set("separator", other)
             raise InputError(f"{self.table.path}: no column {name!r}; has {has}; {remedy}")
         return self.table.frame[name]
+
+    def _text_to_set(self, key: str, value: str) -> str:
+        return f"set reader.{key}={value!r} (+reader.{self.kind}.text.{key}={value!r} for this file alone)"
 
     def _entry_to_set(self, name: str) -> str:
         """The key that names a column which is not there; an entry that a log need not have may be null."""

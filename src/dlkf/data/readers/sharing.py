@@ -48,7 +48,9 @@ def pool_settings(mappings: Sequence[Mapping[str, Any]], *, offsets: bool) -> tu
             set_value(out, name, value)
         elif name not in OFFSETS:
             listed = ", ".join(dict.fromkeys(map(write_value, values)))
-            apart.append(f"reader.{name} is not the same in all drives: {listed}")
+            apart.append(
+                f"reader.{name} is not the same in all drives: {listed}; each keeps its own, set it if they are one"
+            )
     return out, apart
 
 

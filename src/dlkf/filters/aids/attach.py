@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import is_dataclass, replace
 from typing import Any
 
+from dlkf.base.errors import InputError
 from dlkf.data.aid_tables import AidTable
 from dlkf.filters.aids.g_sensitivity import GSensitivity
 from dlkf.filters.aids.heading import DualAntennaHeading
@@ -60,6 +61,18 @@ def with_aids(model: Any, tables: Iterable[AidTable]) -> Any:
     other = copy.copy(model)
     other.kalman = kalman
     return other
+
+
+def refuse_left_out(models: Mapping[str, Any], tables: Iterable[AidTable]) -> None:
+    """InputError where the sensors that were chosen leave out one that a filter has by its name."""
+    tables = tuple(tables)
+    for name, model in models.items():
+        left_out = [x.name for x in find_tables(model) if x.name in SENSORS and x not in tables]
+        if left_out:
+            raise InputError(
+                f"aids=[{','.join(x.name for x in tables)}] leaves out {left_out[0]}, which model={name} takes by its "
+                f"name; take +{left_out[0]} off the name, or put it into aids"
+            )
 
 
 def append_aids(name: str, aids: Iterable[str]) -> str:

@@ -42,7 +42,7 @@ void dlkf_read_aids(const dlkf *d, int64_t boundary, double *out) {
 
 static dlkf_status file_aid(dlkf *d, int sensor, double t, double value, double std) {
   const double place = dlkf_samples_place(&d->samples, t);
-  const dlkf_status timing = dlkf_samples_timing(&d->samples, place, 1);
+  const dlkf_status timing = dlkf_samples_timing(&d->samples, place, FIRST_OF_AIDS);
   if (timing != DLKF_TAKEN) return dlkf_counted(d, timing);
   for (int k = 0; k < DLKF_STAMPS; k++)
     if (d->stamps[sensor][k] == t) return dlkf_counted(d, DLKF_DOUBLE);
@@ -71,7 +71,7 @@ static dlkf_status file_aid(dlkf *d, int sensor, double t, double value, double 
 void dlkf_aids_file(dlkf *d) {
   for (int k = 0; k < d->early_aid_count; k++) {
     const dlkf_early_aid *x = &d->early_aids[(d->early_aid + k) % DLKF_EARLY_AIDS];
-    file_aid(d, x->sensor, x->t, x->value, x->std);
+    if (dlkf_samples_place(&d->samples, x->t) >= FIRST_OF_AIDS) file_aid(d, x->sensor, x->t, x->value, x->std);
   }
   d->early_aid_count = 0;
 }

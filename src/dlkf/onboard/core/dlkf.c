@@ -220,7 +220,7 @@ static dlkf_report *screened(dlkf *d, const dlkf_report *x, int place, int64_t *
 /* A fix to its boundary; what is over is run anew. */
 static dlkf_status file(dlkf *d, const dlkf_report *x) {
   const double place = dlkf_samples_place(&d->samples, x->t);
-  const dlkf_status timing = dlkf_samples_timing(&d->samples, place, 0);
+  const dlkf_status timing = dlkf_samples_timing(&d->samples, place, FIRST_OF_FIXES);
   if (timing != DLKF_TAKEN) return dlkf_counted(d, timing);
   int k = d->report_count;
   while (k > 0 && report_at(d, k - 1)->t > x->t) k--;
@@ -265,9 +265,10 @@ static void settle(dlkf *d) {
   if (!dlkf_samples_begin(&d->samples, through, n)) return;
   const int count = d->report_count;
   d->report_count = 0;
-  for (int k = 0; k < count; k++) { /* the same ring, filled from its beginning with those already read */
+  for (int k = 0; k < count; k++) { /* the same ring, filled from its beginning with those already read;
+                                    * what lies before the first update interval is of no use, which is no fault of it */
     const dlkf_report x = *report_at(d, k);
-    file(d, &x);
+    if (dlkf_samples_place(&d->samples, x.t) >= FIRST_OF_FIXES) file(d, &x);
   }
   dlkf_aids_file(d);
 }

@@ -54,6 +54,8 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
     if len(rows) > 1 and (detail := _find_cut(lines, rows, content.endswith(("\n", "\r")), options)):
         notes.append(f"{path.name}: line {rows[-1] + 1}, the last, {detail}: left out, the log seems cut off there")
         rows = rows[:-1]
+    if not keep:
+        raise InputError(f"{path}: is empty; leave the drive out or give its data")
     frame = _parse(path, [lines[k] for k in (*head, *rows)], [k + 1 for k in (*head, *rows)], options)
     if not len(frame):
         raise InputError(f"{path}: has no rows; leave the drive out or give its data")
@@ -145,9 +147,12 @@ def _parse(path: Path, lines: list[str], numbers: list[int], options: Mapping[st
             )
     except (pd.errors.ParserError, pd.errors.EmptyDataError, ValueError, re.error) as error:
         detail = first_line(error).strip()
-        if found := re.search(r"line (\d+)", detail):
-            place = min(int(found[1]), len(numbers)) - 1
-            detail = detail.replace(found[0], f"line {numbers[place]}")
+        if found := re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", detail):
+            wanted, line, seen = map(int, found.groups())
+            number = numbers[min(line, len(numbers)) - 1]
+            raise InputError(
+                f"{path}: line {number} has {seen} cells, those before have {wanted}; correct the line"
+            ) from None
         raise InputError(f"{path}: cannot be read as a table: {detail}") from None
     frame.columns = [str(c).strip() for c in frame.columns]
     return frame
