@@ -231,8 +231,9 @@ def growth_chart(scores: Scores) -> Figure:
 def outage_map(scores: Scores, named: str) -> Figure:
     """Truth of all segments (a reference is ``named`` so), outages, every filter's way in them from the last fix on."""
     w = scores.windows
-    known = [~np.isnan(scores.truth_p_n[i, :, 0]) for i in range(len(scores.segments))]
-    truth = [scores.geodetic(i, scores.truth_p_n[i, known[i]]) for i in range(len(scores.segments)) if known[i].any()]
+    known = ~np.isnan(scores.truth_p_n[..., 0])
+    segments = np.flatnonzero(known.any(1)).tolist()
+    truth = [scores.geodetic(i, scores.truth_p_n[i, known[i]]) for i in segments]
     windows, far = list(zip(w.segment, np.maximum(w.first - 1, 0), w.last)), far_off(scores)
     hidden = [scores.geodetic(i, scores.truth_p_n[i, a : b + 1]) for i, a, b in windows]
     traces = [
@@ -244,7 +245,7 @@ def outage_map(scores: Scores, named: str) -> Figure:
         ways = [scores.geodetic(i, p[i, a : b + 1]) for i, a, b in windows]
         more = {"visible": "legendonly"} if name in far else {}
         traces.append(add_track(join_tracks(ways, 8000), name, c, width=2, **more))
-    return chart(traces, around=traces[:2])
+    return chart(traces, places_of_drives(scores, segments, truth))
 
 
 def far_off(scores: Scores) -> list[str]:
@@ -258,11 +259,20 @@ def far_off(scores: Scores) -> list[str]:
 def segment_map(scores: Scores, baseline: str | None, named: str) -> Figure:
     """Truth and every filter of up to eight segments from good to bad."""
     chosen = representative(scores, 8, baseline)
-    traces = [add_track(join_tracks([scores.geodetic(i, scores.truth_p_n[i]) for i in chosen]), named, TRUTH, width=2)]
+    truth = [scores.geodetic(i, scores.truth_p_n[i]) for i in chosen]
+    traces = [add_track(join_tracks(truth), named, TRUTH, width=2)]
     for name, c in colours(scores).items():
         p = scores.filters[name].p_n
         traces.append(add_track(join_tracks([scores.geodetic(i, p[i]) for i in chosen]), name, c, width=2))
-    return chart(traces, around=traces[:1])
+    return chart(traces, places_of_drives(scores, chosen, truth))
+
+
+def places_of_drives(scores: Scores, segments: Sequence[int], places: Sequence[Array]) -> dict[str, Array]:
+    """Drive → what ``places`` has of its segments."""
+    parts: dict[str, list[Array]] = {}
+    for i, place in zip(segments, places):
+        parts.setdefault(scores.segments[i].drive, []).append(place)
+    return {drive: np.concatenate(of_drive) for drive, of_drive in parts.items()}
 
 
 def least_error(scores: Scores, result: Results) -> str:

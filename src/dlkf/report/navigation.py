@@ -167,7 +167,7 @@ def route_map(courses: Sequence[TrackOnMap]) -> Figure:
         value = np.log10(np.maximum(np.nan_to_num(sigma, nan=1e-3), 1e-3))
         label = [f"{s:.2g} m" for s in sigma]
         add(dots(place, "horizontal 1σ", value.astype(np.float32), size=5, bar="log₁₀ 1σ [m]", text=label), "1σ")
-    return chart(traces, groups)
+    return chart(traces, {c.result.drive: _place(c) for c in courses}, groups)
 
 
 def _insert_breaks(place: Array, most: int) -> Array:
