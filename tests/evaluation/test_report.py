@@ -20,7 +20,7 @@ from dlkf.evaluation.figures import png
 from dlkf.evaluation.metrics import QUANTITIES
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.results import IMU_AXES, Results, summarise_scores
-from dlkf.evaluation.scores import representative
+from dlkf.evaluation.scores import FilterRun, representative
 from dlkf.evaluation.summary import describe_verdict, headline
 from dlkf.evaluation.table import (
     as_csv,
@@ -209,6 +209,32 @@ def test_the_page_of_a_training_begins_with_what_was_trained(scores):
     assert (
         0 < top.index("ins: ") < top.index("20 s without GNSS, ") and "m RMS at the end of the outages; mbkf15" in top
     )
+
+
+def test_only_what_is_drawn_is_called_the_truth(scores):
+    results = [summarise_scores(scores, resamples=50)]
+    page = evaluation_page("town", [], scores, results, [], {}, "mbkf15")
+    assert "black: truth" in page and "The truth, the outages" in page
+    unknown = replace(scores, true_imu_error=np.full_like(scores.true_imu_error, np.nan))
+    page = evaluation_page("town", [], unknown, results, [], {"reference": "smoothed solution"}, "mbkf15")
+    assert "black: truth" not in page and "The reference, the outages" in page
+    legend = figures.tracks(scores, [0], "reference").legends[0]
+    assert [text.get_text() for text in legend.get_texts()][:2] == ["reference", "outage"]
+
+
+def test_pictures_of_runs_over_one_drive_have_titles_of_their_own(scores):
+    other = np.roll(scores.outage[:1], 10, 1)
+    twice = replace(scores, outage=np.concatenate((scores.outage[:1], other)), segments=scores.segments[:1] * 2)
+    first, second = (twice.describe_segment(i) for i in range(2))
+    assert first.partition(", ")[0] == second.partition(", ")[0] and first != second
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_representative_segments_are_different_ones(scores, n):
+    for count in range(n, len(scores.segments) + 1):
+        run = FilterRun(*(x[:count] for x in vars(scores.filters["ins"]).values()))
+        part = replace(scores, outage=scores.outage[:count], filters={"ins": run})
+        assert len(set(representative(part, n, "ins"))) == n
 
 
 def test_outages_stand_in_the_order_of_the_best_filter(scores):

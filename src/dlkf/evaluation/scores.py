@@ -69,6 +69,15 @@ class Scores:
         """All outages."""
         return outage_intervals(self.outage)
 
+    def describe_segment(self, segment: int) -> str:
+        """Drive, start and the outages, which tell the runs over one drive apart."""
+        source = self.segments[segment]
+        text = f"{source.drive} from t = {source.t_start:.0f} s"
+        starts = outage_intervals(self.outage[[segment]]).first * self.epoch_s + source.t_start
+        if not len(starts):
+            return text
+        return f"{text}, {'outages' if len(starts) > 1 else 'outage'} from t = {starts[0]:.0f} s"
+
     @property
     def kinds(self) -> list[str]:
         """Kinds of data among the segments, sorted."""
@@ -136,4 +145,4 @@ def representative(scores: Scores, n: int, filter_name: str | None) -> list[int]
     order = [int(i) for i in np.argsort(worst, kind="stable") if worst[i] >= 0]
     if len(order) <= n:
         return order
-    return [order[round(q * (len(order) - 1))] for q in (np.arange(n) + 0.5) / n]
+    return [order[int(q * len(order))] for q in (np.arange(n) + 0.5) / n]

@@ -58,7 +58,7 @@ def write_report(
     cannot be written to.
     """
     parts = [*all_tables(dataset, results), *more]
-    pictures = print_figures(scores, by_time, baseline) if figures else []
+    pictures = print_figures(scores, by_time, baseline, protocol.get("reference")) if figures else []
     files: dict[str, bytes] = {
         "metrics.json": as_json(
             {
@@ -82,16 +82,24 @@ def write_report(
     return [resolve_place(out) / name for name in files]
 
 
-def print_figures(scores: Scores, by_time: bool, baseline: str | None) -> list[tuple[str, str, bytes]]:
-    """(file name, caption, PNG) of every kind of data."""
+def print_figures(
+    scores: Scores, by_time: bool, baseline: str | None, own: str | None = None
+) -> list[tuple[str, str, bytes]]:
+    """(file name, caption, PNG) of every kind of data; ``own``: a reference that was made."""
     from dlkf.evaluation.figures import all_figures, png  # matplotlib takes a second to load
 
     pictures = []
     for kind in scores.kinds:
         suffix = "" if len(scores.kinds) == 1 else f"_{kind}"
-        for name, caption, figure in all_figures(scores.of_kind(kind), by_time=by_time, baseline=baseline):
+        drawn = all_figures(scores.of_kind(kind), by_time=by_time, baseline=baseline, named=name_truth(kind, own))
+        for name, caption, figure in drawn:
             pictures.append((f"{name}{suffix}.png", f"{kind.capitalize()} data: {caption}", png(figure, 110)))
     return pictures
+
+
+def name_truth(kind: str, own: str | None) -> str:
+    """What errors are against: only simulated drives have a truth, if no reference of their ``own`` was made."""
+    return "truth" if kind == "simulated" and not own else "reference"
 
 
 def evaluation_page(
@@ -117,8 +125,7 @@ def evaluation_page(
     for result in results:
         kind = f"{result.kind}: " if many else ""
         tables = [t for t in first if not many or f"({result.kind})" in t.title]
-        named = "truth" if result.kind == "simulated" and not own else "reference"
-        _answer(page, scores.of_kind(result.kind), result, kind, baseline, named, tables)
+        _answer(page, scores.of_kind(result.kind), result, kind, baseline, name_truth(result.kind, own), tables)
     _add_tables(page, [t for t in first if many and not any(f"({r.kind})" in t.title for r in results)])
     for result in results:
         _research(page, scores.of_kind(result.kind), result, f"{result.kind}: " if many else "", baseline)
@@ -189,10 +196,9 @@ def _research(page: Page, scores: Scores, result: Results, kind: str, baseline: 
     chosen = representative(scores, 3, baseline)
     if chosen:
         i = chosen[len(chosen) // 2]
-        segment = scores.segments[i]
         best = least_error(scores, result)
-        about = f"{segment.drive} from t = {segment.t_start:.0f} s, an average segment; black: truth; "
-        about += f"band: ±3σ of {best}."
+        about = f"{scores.describe_segment(i)}, an average segment; band: ±3σ of {best}"
+        about += "; black: truth." if np.isfinite(scores.true_imu_error[i]).any() else "."
         page.heading(f"{kind}IMU errors", about)
         page.figure(f"imu-{name}", imu_error_charts(scores, i, best))
 
