@@ -34,7 +34,7 @@ from dlkf.evaluation.table import (
 )
 from dlkf.filters.build import build_filter
 from dlkf.report.compare import StoredReport, describe_tests, end_table, mark_best_of_each, shorten_names
-from dlkf.report.evaluation import evaluation_page, least_error, outage_rows, write_report
+from dlkf.report.evaluation import describe_average, evaluation_page, least_error, outage_rows, write_report
 from tests.cars import IMU
 from tests.evaluation.drawn import figures_of
 from tests.evaluation.scoring import score
@@ -227,6 +227,15 @@ def test_pictures_of_runs_over_one_drive_have_titles_of_their_own(scores):
     twice = replace(scores, outage=np.concatenate((scores.outage[:1], other)), segments=scores.segments[:1] * 2)
     first, second = (twice.describe_segment(i) for i in range(2))
     assert first.partition(", ")[0] == second.partition(", ")[0] and first != second
+
+
+def test_the_average_over_time_says_over_what_and_whether_anything_is_grey(scores):
+    count = len(scores.segments)
+    assert describe_average(scores) == f"RMS over {count} segments; grey: outages of most of them."
+    twice = replace(scores, segments=scores.segments * 2, outage=np.concatenate((scores.outage, ~scores.outage)))
+    said = f"RMS over {2 * count} runs ({count} drives, each with its outages at 2 offsets); their outages lie at different"
+    assert describe_average(twice).startswith(said)
+    assert describe_average(replace(scores, outage=scores.outage & False)) == f"RMS over {count} segments."
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])

@@ -11,7 +11,7 @@ import numpy as np
 
 from dlkf.base.colours import SHADE, TRUTH, filter_colour
 from dlkf.base.files import resolve_place, write_into
-from dlkf.evaluation.metrics import magnitudes, outage_at, outage_end, rms_over_segments
+from dlkf.evaluation.metrics import Mask, magnitudes, outage_at, outage_end, rms_over_segments
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import OFF_SCALE, Scores, representative
 from dlkf.evaluation.sensors import TITLE as SENSORS_TITLE
@@ -189,9 +189,7 @@ def _answer(
 def _research(page: Page, scores: Scores, result: Results, kind: str, baseline: str | None) -> None:
     """Errors over time, IMU errors."""
     name = kind.strip(": ") or "all"
-    page.heading(
-        f"{kind}Errors over time", f"RMS over {len(scores.segments)} segments; grey: outages of most segments."
-    )
+    page.heading(f"{kind}Errors over time", describe_average(scores))
     page.figure(f"errors-{name}", error_charts(scores))
     chosen = representative(scores, 3, baseline)
     if chosen:
@@ -201,6 +199,25 @@ def _research(page: Page, scores: Scores, result: Results, kind: str, baseline: 
         about += "; black: truth." if np.isfinite(scores.true_imu_error[i]).any() else "."
         page.heading(f"{kind}IMU errors", about)
         page.figure(f"imu-{name}", imu_error_charts(scores, i, best))
+
+
+def describe_average(scores: Scores) -> str:
+    """What the errors over time are averaged over, and what is grey in them."""
+    count, sources = len(scores.segments), len({(s.drive, s.t_start) for s in scores.segments})
+    text = f"RMS over {count} segments"
+    if sources < count:
+        what = "drives" if sources == len({s.drive for s in scores.segments}) else "segments"
+        text = f"RMS over {count} runs ({sources} {what}, each with its outages at {count / sources:.2g} offsets)"
+    if _mostly_hidden(scores).any():
+        return f"{text}; grey: outages of most of them."
+    return (
+        f"{text}; their outages lie at different times, so that none is shaded." if scores.outage.any() else f"{text}."
+    )
+
+
+def _mostly_hidden(scores: Scores) -> Mask:
+    """Epochs in which most segments have an outage."""
+    return scores.outage.mean(0) > 0.5
 
 
 def colours(scores: Scores) -> dict[str, str]:
@@ -324,7 +341,7 @@ def error_charts(scores: Scores) -> Figure:
     for row in range(1, len(known) + 1):
         figure.set_log_scale(row)
     figure.update_xaxis(len(known), title={"text": "Time since the start of a segment [s]"})
-    shade(figure, spans(scores.t, scores.outage.mean(0) > 0.5), len(known))
+    shade(figure, spans(scores.t, _mostly_hidden(scores)), len(known))
     return figure
 
 
