@@ -233,7 +233,7 @@ def test_the_average_over_time_says_over_what_and_whether_anything_is_grey(score
     count = len(scores.segments)
     assert describe_average(scores) == f"RMS over {count} segments; grey: outages of most of them."
     twice = replace(scores, segments=scores.segments * 2, outage=np.concatenate((scores.outage, ~scores.outage)))
-    said = f"RMS over {2 * count} runs ({count} drives, each with its outages at 2 offsets); their outages lie at different"
+    said = f"RMS over {2 * count} runs ({count} drives, each with its outages at 2 offsets); their outages lie at diff"
     assert describe_average(twice).startswith(said)
     assert describe_average(replace(scores, outage=scores.outage & False)) == f"RMS over {count} segments."
 

@@ -57,6 +57,12 @@ class Scores:
         """Time since the start of a segment at the end of each epoch [s], (T,)."""
         return self.epoch_s * np.arange(1, self.outage.shape[1] + 1)
 
+    @property
+    def ends(self) -> tuple[Array, list[str]]:
+        """Time of the last truth of each segment [s since its start], (P,), and their drives."""
+        last = np.where(np.isfinite(self.truth_p_n[..., 0]), self.t, 0.0).max(1)
+        return last, [segment.drive for segment in self.segments]
+
     def geodetic(self, segment: int, p_n: Array) -> Array:
         """Latitude and longitude [°] (…, 2) of positions (…, 3) in the tangent frame of a segment."""
         origin = torch.from_numpy(self.origin_e[segment])

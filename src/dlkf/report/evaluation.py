@@ -12,6 +12,7 @@ import numpy as np
 from dlkf.base.colours import SHADE, TRUTH, filter_colour
 from dlkf.base.files import resolve_place, write_into
 from dlkf.evaluation.metrics import Mask, magnitudes, outage_at, outage_end, rms_over_segments
+from dlkf.evaluation.outages import UNUSED
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import OFF_SCALE, Scores, representative
 from dlkf.evaluation.sensors import TITLE as SENSORS_TITLE
@@ -120,6 +121,8 @@ def evaluation_page(
     answers = [f"{r.kind.capitalize()} data. {line}" if many else line for r, line in said]
     own = protocol.get("reference")
     answers += [f"No truth: errors are against the {own}."] if own else []
+    unused = protocol.get(UNUSED)
+    answers += [f"{unused[0].upper()}{unused[1:]}."] if unused else []
     page = Page(f"Evaluation on {dataset}", answers, warnings=sigma_warnings(scores))
     first = [t for t in parts if "outage" in t.title or t.title == SENSORS_TITLE]
     for result in results:
