@@ -78,7 +78,15 @@ def test_tables_hold_the_summarise_scores(scores):
     longer = replace(r, count={**r.count, "outage_s": [30.0, 50.0]})
     assert headline(longer).startswith("30 to 50 s without GNSS, ")
     verdict = describe_verdict(r, "ins")
-    assert "too few recordings for an interval" in verdict and verdict.startswith("ins: ") and "; mbkf15 " in verdict
+    assert verdict.startswith("ins: ") and "; mbkf15 " in verdict and "; ins : mbkf15 = " in verdict
+    assert verdict.endswith(" by geometric mean: worse, but too few recordings for an interval.")
+    enough = [
+        replace(c, against=replace(c.against, groups=8, ratio=0.7, ratio_low=0.6, ratio_high=0.8))
+        for c in r.comparisons
+    ]
+    assert "ins : mbkf15 = 0.70 [0.60, 0.80] by geometric mean: better" in describe_verdict(
+        replace(r, comparisons=enough), "ins"
+    )
     assert describe_verdict(r, "none such") is None
     few = r.versus("ins", "outages", "end", "horizontal")
     assert format_interval(replace(few, groups=8, ratio=0.7, ratio_low=0.6, ratio_high=0.8)) == "0.70 [0.60–0.80]"
@@ -231,10 +239,12 @@ def test_pictures_of_runs_over_one_drive_have_titles_of_their_own(scores):
 
 def test_the_average_over_time_says_over_what_and_whether_anything_is_grey(scores):
     count = len(scores.segments)
-    assert describe_average(scores) == f"RMS over {count} segments; grey: outages of most of them."
+    assert describe_average(scores) == f"RMS over {count} segments; grey where most of them have an outage."
     twice = replace(scores, segments=scores.segments * 2, outage=np.concatenate((scores.outage, ~scores.outage)))
-    said = f"RMS over {2 * count} runs ({count} drives, each with its outages at 2 offsets); their outages lie at diff"
-    assert describe_average(twice).startswith(said)
+    said = (
+        f"RMS over {2 * count} runs ({count} drives, each with its outages at 2 offsets); grey where most of them have"
+    )
+    assert describe_average(twice) == f"{said} an outage (here nowhere)."
     assert describe_average(replace(scores, outage=scores.outage & False)) == f"RMS over {count} segments."
 
 

@@ -211,11 +211,9 @@ def describe_average(scores: Scores) -> str:
     if sources < count:
         what = "drives" if sources == len({s.drive for s in scores.segments}) else "segments"
         text = f"RMS over {count} runs ({sources} {what}, each with its outages at {count / sources:.2g} offsets)"
-    if _mostly_hidden(scores).any():
-        return f"{text}; grey: outages of most of them."
-    return (
-        f"{text}; their outages lie at different times, so that none is shaded." if scores.outage.any() else f"{text}."
-    )
+    if not scores.outage.any():
+        return f"{text}."
+    return f"{text}; grey where most of them have an outage{'' if _mostly_hidden(scores).any() else ' (here nowhere)'}."
 
 
 def _mostly_hidden(scores: Scores) -> Mask:
