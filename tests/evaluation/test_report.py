@@ -285,6 +285,11 @@ def test_a_failed_write_leaves_nothing(tmp_path):
         (("/a/outputs/x/report", "/b/home/y"), ["x", "y"]),
         (("/a/town/x", "/a/city/x", "/a/city/y"), ["town/x", "city/x", "y"]),
         (("/x", "/a/x", "/y"), ["/x", "a/x", "y"]),  # one is the end of the other
+        (
+            ("/s/0-model=plus,aids=[]", "/s/1-model=plus,aids=[speed,baro]"),
+            ["plus, aids=[]", "plus, aids=[speed,baro]"],
+        ),
+        (("/s/0-imu=a", "/s/3-imu=a"), ["0-imu=a", "3-imu=a"]),
     ],
 )
 def test_runs_are_named_by_the_least_that_tells_them_apart(folders, names):

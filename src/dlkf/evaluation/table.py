@@ -101,7 +101,7 @@ def outage_table(what: str, result: Results) -> ResultTable:
         "attitude at the end (RMS); drift: horizontal error per distance driven (median); own 1σ: what the filter says "
         "of its horizontal error at the end (median); innov. / σ: innovations over the 1σ that it expects (RMS).",
         columns=["Filter", "End, RMS\n[m]", "median\n[m]", "95 %\n[m]"]
-        + [f"{s} s\n[m]" for s in at]
+        + [f"RMS\n{s} s\n[m]" for s in at]
         + ["Velocity\n[m/s]", "Attitude\n[°]", "Drift\n[%]", "Own 1σ\n[m]", "Innov.\n/ σ"],
         rows=[],
     )
