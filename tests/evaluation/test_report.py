@@ -35,6 +35,7 @@ from dlkf.evaluation.table import (
 from dlkf.filters.build import build_filter
 from dlkf.report.compare import StoredReport, describe_tests, end_table, mark_best_of_each, shorten_names
 from dlkf.report.evaluation import describe_average, evaluation_page, least_error, outage_rows, write_report
+from dlkf.report.training import learning_curve
 from tests.cars import IMU
 from tests.evaluation.drawn import figures_of
 from tests.evaluation.scoring import score
@@ -217,6 +218,16 @@ def test_the_page_of_a_training_begins_with_what_was_trained(scores):
     assert (
         0 < top.index("ins: ") < top.index("20 s without GNSS, ") and "m RMS at the end of the outages; mbkf15" in top
     )
+
+
+@pytest.mark.parametrize(("at_end", "panels"), [([math.nan, 12.0], 2), ([math.nan] * 2, 1)])
+def test_the_page_of_a_training_has_its_losses(scores, at_end, panels):
+    losses = {"epoch": [1.0, 2.0], "train/loss": [2.0, 1.0], "val/loss": [math.nan, 1.5], "val/outage_end_m": at_end}
+    results = [summarise_scores(scores, resamples=50)]
+    page = evaluation_page("town", [], scores, results, [], {}, "mbkf15", trained="ins", losses=losses)
+    assert "<h1>Training of ins and evaluation on town</h1>" in page
+    assert len(figures_of(page)["training"].data) == panels + 1
+    assert [trace["y"].tolist() for trace in learning_curve(losses).data][:2] == [[2.0, 1.0], [1.5]]
 
 
 def test_only_what_is_drawn_is_called_the_truth(scores):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from dlkf.report.maps import add_track, chart, join_tracks
 from dlkf.report.navigation import mark_outages
 from dlkf.report.page import Page, embed_png
 from dlkf.report.plots import Array, band, line, shade, spans, stack_panels
+from dlkf.report.training import add_training
 
 MAP = (
     "The {truth}, the outages, and the track of each filter in them; a click on a grey name shows a filter that is far "
@@ -50,13 +52,14 @@ def write_report(
     more: Sequence[ResultTable] = (),
     figures: bool,
     trained: str | None = None,
+    losses: Mapping[str, Sequence[float]] = MappingProxyType({}),
 ) -> list[Path]:
     """Write the whole report into ``out``, all files or none; returns their paths.
 
     ``results`` has one entry per kind of data (of scores.of_kind); ``protocol`` is how the
     scores were made, in plain values; ``more`` tables follow those of the results; ``figures``: the page's figures for
-    print as well, figures/*.png; ``trained``: the filter with which the answer begins. Raises InputError if ``out``
-    cannot be written to.
+    print as well, figures/*.png; ``trained``: the filter with which the answer begins, ``losses``: of its training
+    (:func:`dlkf.report.training.add_training`). Raises InputError if ``out`` cannot be written to.
     """
     parts = [*all_tables(dataset, results), *more]
     pictures = print_figures(scores, by_time, baseline, protocol.get("reference")) if figures else []
@@ -72,7 +75,9 @@ def write_report(
         ).encode(),
         "table.md": "\n".join(map(as_markdown, parts)).encode(),
         "table.csv": as_csv(dataset, results).encode(),
-        "report.html": evaluation_page(dataset, parts, scores, results, pictures, protocol, baseline, trained).encode(),
+        "report.html": evaluation_page(
+            dataset, parts, scores, results, pictures, protocol, baseline, trained, losses
+        ).encode(),
         **{f"figures/{name}": data for name, _, data in pictures},
     }
     with write_into(out) as folder:
@@ -112,9 +117,11 @@ def evaluation_page(
     protocol: Mapping[str, Any],
     baseline: str | None,
     trained: str | None = None,
+    losses: Mapping[str, Sequence[float]] = MappingProxyType({}),
 ) -> str:
     """The page: answer, of a training what was ``trained`` first; for every kind of data the table of the outages, map,
-    growth, further sensors, every outage; then what is for research: errors over time, IMU errors, the other tables."""
+    growth, further sensors, every outage; then what is for research: the ``losses`` of the training, errors over time,
+    IMU errors, the other tables."""
     many = len(results) > 1
     verdicts = [(r, v) for r in results if trained is not None and (v := describe_verdict(r, trained))]
     said = [*verdicts, *((r, headline(r)) for r in results)]
@@ -123,13 +130,16 @@ def evaluation_page(
     answers += [f"No truth: errors are against the {own}."] if own else []
     unused = protocol.get(UNUSED)
     answers += [f"{unused[0].upper()}{unused[1:]}."] if unused else []
-    page = Page(f"Evaluation on {dataset}", answers, warnings=sigma_warnings(scores))
+    title = f"Training of {trained} and evaluation on {dataset}" if trained else f"Evaluation on {dataset}"
+    page = Page(title, answers, warnings=sigma_warnings(scores))
     first = [t for t in parts if "outage" in t.title or t.title == SENSORS_TITLE]
     for result in results:
         kind = f"{result.kind}: " if many else ""
         tables = [t for t in first if not many or f"({result.kind})" in t.title]
         _answer(page, scores.of_kind(result.kind), result, kind, baseline, name_truth(result.kind, own), tables)
     _add_tables(page, [t for t in first if many and not any(f"({r.kind})" in t.title for r in results)])
+    if losses:
+        add_training(page, losses)
     for result in results:
         _research(page, scores.of_kind(result.kind), result, f"{result.kind}: " if many else "", baseline)
     _add_tables(page, [t for t in parts if t not in first])
