@@ -277,6 +277,8 @@ def test_outages_stand_in_the_order_of_the_best_filter(scores):
         columns, rows, _ = outage_rows(scores, result, "map", name)
         errors = [float(row[columns.index(name)]) for row in rows]
         assert len(errors) > 2 and errors == sorted(errors, reverse=True)
+    page = evaluation_page("town", [], scores, [result], [], {}, "mbkf15")
+    assert f"<h2>Outages ({len(result.per_outage)})</h2>" in page and "scroll in the box" not in page
 
 
 def test_a_failed_write_leaves_nothing(tmp_path):

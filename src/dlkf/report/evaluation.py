@@ -31,6 +31,7 @@ MAP = (
     "off. A click on a row of the table of outages goes there."
 )
 MOST_OUTAGES = 300  # rows of the table of outages: the worst of them
+SEEN_AT_ONCE = 11  # of them, in the box of the page
 SENSORS = (("Accelerometer", "m/s²", 1.0), ("Gyroscope", "°/s", DEGREES))
 IMU = [(f"{name} {axis} error [{unit}]", scale) for name, unit, scale in SENSORS for axis in "xyz"]
 OVER_TIME = {
@@ -187,9 +188,10 @@ def _answer(
         page.figure(f"growth-{name}", growth_chart(scores))
         _add_tables(page, [t for t in tables if t.title == SENSORS_TITLE])
         best = least_error(scores, result)
-        about = f"Horizontal error at the end [m], the worst of {best} first; a click shows it on the map."
-        page.heading(f"{kind}Outages", about)
         columns, rows, marks = outage_rows(scores, result, f"map-{name}", best)
+        about = f"Horizontal error at the end [m], the worst of {best} first; a click shows it on the map."
+        scrolled = f" {len(rows)} rows: scroll in the box." if len(rows) > SEEN_AT_ONCE else ""
+        page.heading(f"{kind}Outages ({len(result.per_outage)})", about + scrolled)
         page.table(columns, rows, marks=marks, tall=True)
         if len(result.per_outage) > len(rows):
             page.note(f"The worst {len(rows)} of {len(result.per_outage)}; all are in metrics.json.")
