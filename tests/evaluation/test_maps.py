@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dlkf.report.maps import add_track, chart, find_areas
+from dlkf.report.maps import add_track, chart, find_areas, in_metres
 
 SIZE = 0.005  # ° of a drive
 
@@ -32,3 +32,13 @@ def test_drives_of_one_town_are_seen_together_unless_they_were_specks(size, firs
 def test_neighbours_and_what_has_no_place_make_no_area_of_their_own():
     areas = find_areas({"a": drive(49.0, 8.4), "b": drive(49.004, 8.4), "lost": np.full((3, 2), np.nan)})
     assert [area.name for area in areas] == ["a, b"] and chart([add_track(np.empty((0, 2)), "a", "#000000", width=1)])
+
+
+def test_a_map_in_metres_has_axes_of_equal_scale():
+    """0.005° are 556 m to the north, and 365 m to the east at 49°."""
+    place = drive(49.0, 8.4)
+    figure = in_metres(chart([add_track(place, "a", "#000000", width=2)], {"a": place}))
+    (trace,) = figure.data
+    assert trace["type"] == "scatter" and "map" not in figure.layout and figure.layout["yaxis"]["scaleanchor"] == "x"
+    assert np.ptp(trace["x"]) == pytest.approx(365, abs=1) and np.ptp(trace["y"]) == pytest.approx(556, abs=1)
+    assert figure.layout["xaxis"]["title"]["text"] == "East of 8.40250° [m]"

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dlkf.data.limits import DEGREE_M
 from dlkf.report.drawing import Figure, Trace
 from dlkf.report.plots import FONT
 
@@ -134,6 +136,29 @@ def chart(
         for trace, group in zip(figure.data, groups):
             trace["visible"] = group in ("", names[0])
     return figure
+
+
+def in_metres(figure: Figure) -> Figure:
+    """A map without tiles as a plane: metres east and north of its middle with equal scale, as the page draws it."""
+    views = figure.layout["meta"]
+    middle = views["areas"][views["first"]]
+    east = DEGREE_M * math.cos(math.radians(middle["lat"]))
+    plane = Figure([dict(trace) for trace in figure.data], deepcopy(figure.layout))
+    del plane.layout["map"]
+    for trace in plane.data:
+        lat, lon = trace.pop("lat"), trace.pop("lon")
+        trace |= {"type": "scatter", "x": (lon - middle["lon"]) * east, "y": (lat - middle["lat"]) * DEGREE_M}
+    look = {"gridcolor": "#eee", "zeroline": False}
+    plane.update_xaxis(title={"text": f"East of {middle['lon']:.5f}° [m]"}, **look)
+    plane.update_yaxis(title={"text": f"North of {middle['lat']:.5f}° [m]"}, scaleanchor="x", **look)
+    plane.update_layout(
+        plot_bgcolor="white",
+        margin={"l": 70, "r": 10, "b": 45},
+        legend={"y": -0.12},
+        hovermode="closest",
+        dragmode="pan",
+    )
+    return plane
 
 
 def _view(area: Area) -> dict[str, Any]:
