@@ -21,7 +21,7 @@ from dlkf.command.scored import EvaluateSettings
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import choose_aids, dataset_digest, drive_rows
 from dlkf.evaluation.chunks import EvaluationJob, evaluate_chunks
-from dlkf.evaluation.outages import check_outages
+from dlkf.evaluation.outages import UNUSED, check_outages, describe_unused
 from dlkf.evaluation.protocol import REFUSED
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import Scores
@@ -101,6 +101,9 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console) -> Evaluation
         console.print(said, style="yellow")
     scores = done.run.scores
     check_outages(protocol.outage, scores.outage, max(x.span_s for x in fixes.values()))
+    if protocol.outage and (unused := describe_unused(protocol.outage, scores.outage, *scores.ends)):
+        console.print(unused, style="yellow", highlight=False)
+        done.rules[UNUSED] = unused
     results = make_results(done.run, baseline=settings.baseline, settle_s=settings.settle_s, seed=settings.seed)
     decided = {
         "models": settings.model,

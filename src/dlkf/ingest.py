@@ -35,10 +35,10 @@ def main(settings: IngestSettings) -> None:
 
 
 def _tell(taken: IngestResult, done: int) -> None:
-    for note in taken.notes:
-        print(f"       {note}", flush=True)
     for number, line in enumerate(taken.lines, done - len(taken.lines) + 1):
         print(f"{number:5d}  {line}", flush=True)
+    for note in taken.notes:  # on these drives, or on all where there is no line
+        print(f"       {note}", flush=True)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 
 from dlkf.base.classes import instantiate
 from dlkf.base.console import make_console, save_log
+from dlkf.base.errors import InputError
 from dlkf.base.settings import settings_from
 from dlkf.command import command, repeat_command
 from dlkf.command.composing import configuration_hash
@@ -37,6 +38,12 @@ from dlkf.training.summary import key_metrics, note
 def main(config: dict[str, Any]) -> None:
     """Data, run, study, table."""
     console = make_console()
+    overrides = HydraConfig.get().overrides.task
+    if not overrides:
+        raise InputError(
+            "give what to train: +experiment=outage is the paper's network (with +profile=quick in minutes, with "
+            "+profile=tiny as a trial), data.datasets=[…] your own drives; --help lists the experiments"
+        )
     given = settings_from(TrainSettings, config, "")
     tracking, settings, data = given.tracking, given.study, instantiate(given.data, "data", ("setup", "describe"))
     check_store(uri := tracking_uri(tracking.uri))
@@ -56,7 +63,7 @@ def main(config: dict[str, Any]) -> None:
         console.print(f"left out: {line}", style="yellow", highlight=False)
     if state:
         console.print(f"resuming the unfinished run in {folder}")
-    name = run_name(given.name, HydraConfig.get().overrides.task)
+    name = run_name(given.name, overrides)
     parent = os.environ.get(PARENT_RUN)
     begun = {"parent_run_id": parent, "run_id": state.get("run_id"), "system_metrics": tracking.system_metrics}
     with start_run(uri, given.name, name, **begun) as run:

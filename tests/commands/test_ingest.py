@@ -9,6 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from dlkf.data.intake import IngestResult
+from dlkf.ingest import _tell
 from tests.cars import car
 from tests.data.logs import nmea
 from tests.data.logs.arrays import STDS
@@ -40,6 +42,13 @@ def test_a_line_for_each_drive(call, logs):
     for expected in ("monday: 30.0 s, ", " km, IMU 100 Hz, largest gap 10 ms", "GNSS 1 Hz, 31 fixes (RTK fixed 100 %)"):
         assert expected in done.out
     assert "town: 2 drives" in done.out
+
+
+def test_notes_stand_below_the_line_of_their_drive(capsys):
+    _tell(IngestResult([], ["monday: 30.0 s", "tuesday: 20.0 s"], ("found the unit",), {}), 4)
+    assert capsys.readouterr().out.split("\n")[:3] == [
+        "    3  monday: 30.0 s", "    4  tuesday: 20.0 s", "       found the unit",
+    ]  # fmt: skip
 
 
 def test_nmea_beside_an_imu_in_milliseconds(call, logs):

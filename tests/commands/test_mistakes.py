@@ -38,6 +38,12 @@ def test_a_locked_store_is_told_before_any_work(given, lock, copy, call, tmp_pat
     is_refused(ended, "store.db is locked by another program", folder=tmp_path)
 
 
+def test_a_training_without_a_word_is_not_begun(call, tmp_path):
+    done = call("train")
+    assert done.code == 2 and "give what to train: +experiment=outage" in done.err
+    assert done.err.count("\n") == 1 and not (tmp_path / "outputs").exists() and not (tmp_path / "data").exists()
+
+
 @pytest.mark.parametrize("command", FAST)
 def test_an_older_result_is_not_written_over(command, copy, call, tmp_path):
     (tmp_path / "mine").mkdir()

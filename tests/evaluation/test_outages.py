@@ -2,13 +2,14 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from dlkf.base.errors import InputError
 from dlkf.data.masks import withhold_fixes
 from dlkf.evaluation.metrics import outage_intervals
-from dlkf.evaluation.outages import OutagePlan, scorable_outages
+from dlkf.evaluation.outages import OutagePlan, describe_unused, scorable_outages
 
 
 def _windows(mask):
@@ -90,3 +91,14 @@ def test_a_fix_close_before_is_counted_in_seconds(cars):
     batch = replace(cars, dt=cars.dt / 2, available=available)
     (mask,) = OutagePlan(first_s=10, duration_s=5).masks(batch)
     assert mask.any(-1).tolist() == [True, False, True, True, True, True]
+
+
+def test_drives_without_an_outage_are_named_with_the_reason():
+    plan, mask = OutagePlan(first_s=(20, 60), duration_s=10), np.zeros((5, 40), bool)
+    mask[1, 20:30] = True  # the second run of a drive has one
+    ends = np.array([40.0, 40.0, 25.0, 40.0, 29.0])
+    assert describe_unused(plan, mask, ends, ["a", "a", "b", "c", "d"]) == (
+        "no outage in 3 of 4 drives: b, d too short for outage.first_s=20 + outage.duration_s=10 s; "
+        "c without a fix at its start or valid truth throughout"
+    )
+    assert describe_unused(plan, mask[:2], ends[:2], ["a", "a"]) == ""

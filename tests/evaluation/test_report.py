@@ -20,7 +20,7 @@ from dlkf.evaluation.figures import png
 from dlkf.evaluation.metrics import QUANTITIES
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.results import IMU_AXES, Results, summarise_scores
-from dlkf.evaluation.scores import representative
+from dlkf.evaluation.scores import FilterRun, representative
 from dlkf.evaluation.summary import describe_verdict, headline
 from dlkf.evaluation.table import (
     as_csv,
@@ -34,7 +34,8 @@ from dlkf.evaluation.table import (
 )
 from dlkf.filters.build import build_filter
 from dlkf.report.compare import StoredReport, describe_tests, end_table, mark_best_of_each, shorten_names
-from dlkf.report.evaluation import evaluation_page, least_error, outage_rows, write_report
+from dlkf.report.evaluation import describe_average, evaluation_page, least_error, outage_rows, write_report
+from dlkf.report.training import learning_curve
 from tests.cars import IMU
 from tests.evaluation.drawn import figures_of
 from tests.evaluation.scoring import score
@@ -78,7 +79,15 @@ def test_tables_hold_the_summarise_scores(scores):
     longer = replace(r, count={**r.count, "outage_s": [30.0, 50.0]})
     assert headline(longer).startswith("30 to 50 s without GNSS, ")
     verdict = describe_verdict(r, "ins")
-    assert "too few recordings for an interval" in verdict and verdict.startswith("ins: ") and "; mbkf15 " in verdict
+    assert verdict.startswith("ins: ") and "; mbkf15 " in verdict and "; ins : mbkf15 = " in verdict
+    assert verdict.endswith(" by geometric mean: worse, but too few recordings for an interval.")
+    enough = [
+        replace(c, against=replace(c.against, groups=8, ratio=0.7, ratio_low=0.6, ratio_high=0.8))
+        for c in r.comparisons
+    ]
+    assert "ins : mbkf15 = 0.70 [0.60, 0.80] by geometric mean: better" in describe_verdict(
+        replace(r, comparisons=enough), "ins"
+    )
     assert describe_verdict(r, "none such") is None
     few = r.versus("ins", "outages", "end", "horizontal")
     assert format_interval(replace(few, groups=8, ratio=0.7, ratio_low=0.6, ratio_high=0.8)) == "0.70 [0.60–0.80]"
@@ -211,6 +220,53 @@ def test_the_page_of_a_training_begins_with_what_was_trained(scores):
     )
 
 
+@pytest.mark.parametrize(("at_end", "panels"), [([math.nan, 12.0], 2), ([math.nan] * 2, 1)])
+def test_the_page_of_a_training_has_its_losses(scores, at_end, panels):
+    losses = {"epoch": [1.0, 2.0], "train/loss": [2.0, 1.0], "val/loss": [math.nan, 1.5], "val/outage_end_m": at_end}
+    results = [summarise_scores(scores, resamples=50)]
+    page = evaluation_page("town", [], scores, results, [], {}, "mbkf15", trained="ins", losses=losses)
+    assert "<h1>Training of ins and evaluation on town</h1>" in page
+    assert len(figures_of(page)["training"].data) == panels + 1
+    assert [trace["y"].tolist() for trace in learning_curve(losses).data][:2] == [[2.0, 1.0], [1.5]]
+
+
+def test_only_what_is_drawn_is_called_the_truth(scores):
+    results = [summarise_scores(scores, resamples=50)]
+    page = evaluation_page("town", [], scores, results, [], {}, "mbkf15")
+    assert "black: truth" in page and "The truth, the outages" in page
+    unknown = replace(scores, true_imu_error=np.full_like(scores.true_imu_error, np.nan))
+    page = evaluation_page("town", [], unknown, results, [], {"reference": "smoothed solution"}, "mbkf15")
+    assert "black: truth" not in page and "The reference, the outages" in page
+    legend = figures.tracks(scores, [0], "reference").legends[0]
+    assert [text.get_text() for text in legend.get_texts()][:2] == ["reference", "outage"]
+
+
+def test_pictures_of_runs_over_one_drive_have_titles_of_their_own(scores):
+    other = np.roll(scores.outage[:1], 10, 1)
+    twice = replace(scores, outage=np.concatenate((scores.outage[:1], other)), segments=scores.segments[:1] * 2)
+    first, second = (twice.describe_segment(i) for i in range(2))
+    assert first.partition(", ")[0] == second.partition(", ")[0] and first != second
+
+
+def test_the_average_over_time_says_over_what_and_whether_anything_is_grey(scores):
+    count = len(scores.segments)
+    assert describe_average(scores) == f"RMS over {count} segments; grey where most of them have an outage."
+    twice = replace(scores, segments=scores.segments * 2, outage=np.concatenate((scores.outage, ~scores.outage)))
+    said = (
+        f"RMS over {2 * count} runs ({count} drives, each with its outages at 2 offsets); grey where most of them have"
+    )
+    assert describe_average(twice) == f"{said} an outage (here nowhere)."
+    assert describe_average(replace(scores, outage=scores.outage & False)) == f"RMS over {count} segments."
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_representative_segments_are_different_ones(scores, n):
+    for count in range(n, len(scores.segments) + 1):
+        run = FilterRun(*(x[:count] for x in vars(scores.filters["ins"]).values()))
+        part = replace(scores, outage=scores.outage[:count], filters={"ins": run})
+        assert len(set(representative(part, n, "ins"))) == n
+
+
 def test_outages_stand_in_the_order_of_the_best_filter(scores):
     result = summarise_scores(scores, resamples=50)
     names = list(scores.filters)
@@ -221,6 +277,8 @@ def test_outages_stand_in_the_order_of_the_best_filter(scores):
         columns, rows, _ = outage_rows(scores, result, "map", name)
         errors = [float(row[columns.index(name)]) for row in rows]
         assert len(errors) > 2 and errors == sorted(errors, reverse=True)
+    page = evaluation_page("town", [], scores, [result], [], {}, "mbkf15")
+    assert f"<h2>Outages ({len(result.per_outage)})</h2>" in page and "scroll in the box" not in page
 
 
 def test_a_failed_write_leaves_nothing(tmp_path):
@@ -240,6 +298,11 @@ def test_a_failed_write_leaves_nothing(tmp_path):
         (("/a/outputs/x/report", "/b/home/y"), ["x", "y"]),
         (("/a/town/x", "/a/city/x", "/a/city/y"), ["town/x", "city/x", "y"]),
         (("/x", "/a/x", "/y"), ["/x", "a/x", "y"]),  # one is the end of the other
+        (
+            ("/s/0-model=plus,aids=[]", "/s/1-model=plus,aids=[speed,baro]"),
+            ["plus, aids=[]", "plus, aids=[speed,baro]"],
+        ),
+        (("/s/0-imu=a", "/s/3-imu=a"), ["0-imu=a", "3-imu=a"]),
     ],
 )
 def test_runs_are_named_by_the_least_that_tells_them_apart(folders, names):

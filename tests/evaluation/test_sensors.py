@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import re
+import math
 from dataclasses import replace
 
+import pytest
 import torch
 
 from dlkf.data.aid_tables import STANDARD
 from dlkf.evaluation.sensors import sensor_table
-from dlkf.filters.aids.attach import aid_columns, with_aids
+from dlkf.filters.aids.attach import SOURCES, aid_columns, with_aids
+from dlkf.filters.aids.estimates import estimate_heading, format_estimate
 from dlkf.filters.build import build_filter
 from tests.cars import IMU, car_batch
 from tests.evaluation.scoring import score
@@ -29,11 +31,11 @@ def test_a_row_for_each_filter_and_sensor():
     scores = score(filters, [batch])
     table = sensor_table(scores, columns)
     assert table is not None and len(table.rows) == 1
-    name, sensor, updates, used, spread, found = table.rows[0]
+    name, sensor, updates, used, spread, scale, *_ = table.rows[0]
     assert (name, sensor, updates, used) == ("aided", "speed", "50", "80.0") and 0.05 < float(spread) < 1.5
-    scale = re.match(r"wheel_scale (\S+) ± (\S+), wheel_delay_s ", found)
+    assert table.columns[5:] == ["Wheel scale error\n[%]", "Wheel delay\n[ms]", "Wheel right of IMU\n[m]"]
     last = scores.filters["aided"].aids[:, -1, columns["aided"].index("wheel_scale")]
-    assert scale and abs(float(scale[1]) - last.mean()) < 1e-4
+    assert abs(float(scale.split()[0]) - 100 * last.mean()) < 0.1
     assert sensor_table(score({"plain": plain}, [batch]), columns) is None
 
 
@@ -46,5 +48,26 @@ def test_speed_from_vibration_has_a_row_of_its_own_beside_a_wheel_sensor():
     table = sensor_table(score({"both": model}, [batch]), {"both": aid_columns(model)})
     assert table is not None
     speed, vibration = table.rows
-    assert speed[1] == "speed" and "wheel_scale" in speed[-1] and "vibration" not in speed[-1]
-    assert vibration[:2] == ["both", "vibration_speed"] and vibration[-1] == "–"  # this car does not shake
+    assert speed[1] == "speed" and all(" ± " in cell for cell in speed[5:]) and len(speed) == 8
+    assert vibration[:2] == ["both", "vibration speed"] and vibration[5:] == ["–"] * 3  # this car does not shake
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "std", "shown"),
+    [
+        ("wheel_scale", 0.03041, 0.0035, "3.04 ± 0.35"),
+        ("fix_delay_s", -0.07161, 0.009, "−71.6 ± 9.0"),
+        ("baro_offset_m", 45.31, 12.4, "45 ± 12"),
+        ("heading_offset", math.radians(0.994), math.radians(0.0996), "0.99 ± 0.10"),
+        ("mine", 0.123456, 0.0, "0.123 ± 0.000"),
+        ("mine", math.nan, 0.1, "–"),
+    ],
+)
+def test_an_estimate_has_as_many_digits_as_its_sigma_allows(name, value, std, shown):
+    assert format_estimate(name, value, std) == shown
+
+
+def test_every_estimate_of_a_source_has_words_and_a_unit():
+    for source in SOURCES.values():
+        for name in getattr(source, "parameters", {}):
+            assert estimate_heading(name) != name

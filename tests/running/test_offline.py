@@ -11,6 +11,7 @@ from dlkf.filters.build import build_filter
 from dlkf.filters.saved import choose_grid
 from dlkf.filters.shipped import trained_filter
 from dlkf.report.navigation import TrackOnMap, make_rows, route_map, summary_lines
+from dlkf.report.sensors import sensor_rows
 from dlkf.running.offline import Innovation, Navigated, UsableFixes, choose_epoch
 from dlkf.running.solution import COLUMNS
 from tests.cars import IMU
@@ -69,6 +70,11 @@ def test_the_summary_says_in_which_drives_vibration_shows_the_speed():
     assert summary_lines("plus", [none])[2] == "Speed from vibration: the spectrum of the IMU does not show it."
     said = summary_lines("plus", [with_vibration(a, 0.4, 7), none])[2]
     assert said == "Speed from vibration: the spectrum of the IMU shows it in 1 of 2 drives; 7 measurements used."
+    idle = with_vibration(a, 0.4, 0)
+    assert summary_lines("plus", [idle])[2].endswith("shows it; 0 measurements used.")  # a has an outage
+    fixes = idle.result.table.assign(gnss_used=True)
+    idle = idle._replace(result=replace(idle.result, table=fixes))
+    assert summary_lines("plus", [idle])[2].endswith("shows it; not needed: no outage.")
 
 
 def test_the_summary_counts_the_fixes_of_the_file():
@@ -87,6 +93,20 @@ def test_a_sensor_that_made_no_update_is_said_to_have_made_none():
     assert said == "in 7 of 7 updates (normalised innovation RMS 2)"
     nothing = measured.assign(vibration_speed_innovation=np.nan, vibration_speed_used=0.0)
     assert replace(result, table=nothing).sensors()["vibration_speed"] == "no update"
+
+
+def test_the_page_has_a_sensor_only_where_it_made_an_update_and_estimates_with_units():
+    idle = with_vibration(driven(0), 0.4, 0).result
+    nothing = {"vibration_speed_innovation": np.nan, "vibration_speed_innovation_std": np.nan}
+    assert sensor_rows([replace(idle, table=idle.table.assign(**nothing))])[0] == []
+    wheel = {"speed_innovation": 0.1, "speed_innovation_std": 0.2, "speed_used": 1.0}
+    late = {"fix_delay_s": 0.15, "std_fix_delay_s": 0.01}
+    other = driven(1).result
+    columns, rows = sensor_rows(
+        [replace(idle, table=idle.table.assign(**nothing, **late)), replace(other, table=other.table.assign(**wheel))]
+    )
+    assert columns == ["Drive", "Delay of fixes\n[ms]", "Wheel speed,\nupdates used", "Wheel speed,\ninnovation / σ"]
+    assert rows == [["d0", "150 ± 10", "–", "–"], ["d1", "–", "1200 of 1200", "0.50"]]
 
 
 def test_of_delay_and_antenna_what_differs_from_the_log_is_said():

@@ -11,6 +11,7 @@ import torch
 from dlkf.base.errors import InputError
 from dlkf.training.callbacks.curriculum import LengthCurriculum
 from dlkf.training.callbacks.guard import StepGuard
+from dlkf.training.callbacks.history import LossHistory, read_losses
 from dlkf.training.callbacks.loss_weights import AdaptiveLossWeights
 from dlkf.training.callbacks.masking import GnssDecimation, OutageInjection, SensorLoss
 from tests.filters.scene import scene
@@ -207,3 +208,26 @@ def test_a_third_of_the_segments_lacks_a_sensor_and_a_third_loses_it():
     assert there[(there > 0) & (there < 20)].float().mean() == pytest.approx(10.0, abs=0.5)
     with pytest.raises(InputError, match="sensor_loss"):
         SensorLoss(0.8, 0.3)
+
+
+def test_losses_go_on_where_a_training_was_killed(tmp_path):
+    """Validation every second epoch; epoch 3 comes twice, since it was written and then lost."""
+
+    def epochs(first, last):
+        history = LossHistory(str(tmp_path))
+        trainer = SimpleNamespace(is_global_zero=True, current_epoch=first, callback_metrics={})
+        history.on_train_start(trainer, None)
+        for trainer.current_epoch in range(first, last):
+            trainer.callback_metrics["train/loss"] = torch.tensor(10.0 * first + trainer.current_epoch)
+            if trainer.current_epoch % 2:
+                trainer.callback_metrics["val/loss"] = torch.tensor(7.0)
+                history.on_validation_end(trainer, None)
+            history.on_train_epoch_end(trainer, None)
+        return read_losses(tmp_path)
+
+    assert read_losses(tmp_path) == {}
+    epochs(0, 3)
+    found = epochs(2, 4)
+    assert found["epoch"] == [1, 2, 3, 4] and found["train/loss"] == [0, 1, 22, 23]
+    assert [math.isnan(x) for x in found["val/loss"]] == [True, False, True, False]
+    assert epochs(0, 1)["epoch"] == [1]

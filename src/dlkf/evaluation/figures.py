@@ -1,7 +1,7 @@
 """Figures of an evaluation; every function returns a matplotlib Figure and touches no global state.
 
 Colours are Okabe & Ito's, which colour-blind readers can distinguish; each filter also has its own line style.
-Truth is black, an outage is shaded.
+Truth (or the reference) is black, an outage is shaded, bands of 1σ are ±3σ as on the page.
 """
 
 from __future__ import annotations
@@ -49,8 +49,10 @@ def png(figure: Figure, dpi: int = 130) -> bytes:
     return out.getvalue()
 
 
-def all_figures(scores: Scores, *, by_time: bool, baseline: str | None) -> Iterator[tuple[str, str, Figure]]:
-    """(file name, caption, figure) of one kind of data.
+def all_figures(
+    scores: Scores, *, by_time: bool, baseline: str | None, named: str = "truth"
+) -> Iterator[tuple[str, str, Figure]]:
+    """(file name, caption, figure) of one kind of data; ``named``: what the errors are against.
 
     ``by_time``: the segments are alike (same length, outage at the same time), so that an average over them at
     each time means something; whole drives are shown one by one instead.
@@ -67,7 +69,7 @@ def all_figures(scores: Scores, *, by_time: bool, baseline: str | None) -> Itera
     yield (
         "tracks",
         "tracks of segments from good to bad (quantiles of the error of the baseline)",
-        tracks(scores, chosen),
+        tracks(scores, chosen, named),
     )
     if by_time and len(scores.segments) > 1:
         yield "error_over_time", "errors over time, all segments", error_over_time(scores)
@@ -81,8 +83,10 @@ def line_style(scores: Scores, name: str) -> dict[str, Any]:
     return {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[k % len(STYLES)]}
 
 
-def tracks(scores: Scores, segments: Sequence[int]) -> Figure:
+def tracks(scores: Scores, segments: Sequence[int], named: str = "truth") -> Figure:
     """2D track of some segments: truth, every filter's path, outages marked on the truth (figs 10, 12).
+
+    A reference that is no truth is ``named`` so.
 
     Below each track its outage of median error, zoomed to where GNSS comes back.
     """
@@ -102,12 +106,12 @@ def tracks(scores: Scores, segments: Sequence[int]) -> Figure:
         known = truth[~np.isnan(truth[:, 0])]
         axes[0, k].plot(known[0, 1], known[0, 0], "o", color="black", ms=5, zorder=5)
         axes[0, k].annotate("start", known[0, ::-1], xytext=(6, 6), textcoords="offset points", fontsize=8, zorder=6)
-        axes[0, k].set_title(_name(scores, i), fontsize=9)
+        axes[0, k].set_title(scores.describe_segment(i), fontsize=9)
         if i in hidden:
             _outage_end(axes[1, k], scores, i)
         elif hidden:
             axes[1, k].set_visible(False)
-    handles = [Line2D([], [], color="black", lw=1.6, label="truth")]
+    handles = [Line2D([], [], color="black", lw=1.6, label=named)]
     if hidden:
         handles.append(Line2D([], [], color=SHADE, lw=8, solid_capstyle="round", label="outage"))
     handles += [Line2D([], [], lw=1.8, label=n, **line_style(scores, n)) for n in scores.filters]
@@ -159,7 +163,9 @@ def _outage_end(ax: Axes, scores: Scores, i: int) -> None:
             absent.append(name)
         ax.plot(p[1], p[0], "o", ms=8, mfc="none", mec=line_style(scores, name)["color"], mew=1.6, zorder=5)
     _absent(ax, absent)
-    ax.set_title(f"end of the outage, {w.length[k] * scores.epoch_s:g} s without GNSS", fontsize=9)
+    start = scores.segments[i].t_start + w.first[k] * scores.epoch_s
+    title = f"end of the outage from t = {start:.0f} s, {w.length[k] * scores.epoch_s:g} s without GNSS"
+    ax.set_title(title, fontsize=9)
 
 
 def error_over_time(scores: Scores, segments: Sequence[int] | None = None) -> Figure:
@@ -192,7 +198,7 @@ def error_over_time(scores: Scores, segments: Sequence[int] | None = None) -> Fi
     axes[len(shown) - 1].set_xlabel(
         "Time since the start [s]" if len(index) == 1 else "Time since the start of the segment [s]"
     )
-    what = _name(scores, index[0]) if len(index) == 1 else f"RMS over {len(index)} segments"
+    what = scores.describe_segment(index[0]) if len(index) == 1 else f"RMS over {len(index)} segments"
     if len(index) > 4:
         what += ", band: middle 80 % of the segments"
     axes[0].set_title(what, fontsize=9, loc="left")
@@ -202,7 +208,7 @@ def error_over_time(scores: Scores, segments: Sequence[int] | None = None) -> Fi
 
 
 def imu_errors(scores: Scores, i: int) -> Figure:
-    """IMU-error estimates of a segment over time, six axes; truth in black, ±1σ as a band (figs 6, 11)."""
+    """IMU-error estimates of a segment over time, six axes; truth in black, ±3σ as a band (figs 6, 11)."""
     figure = Figure(figsize=(12, 6.4), layout="constrained")
     axes = figure.subplots(2, 3, sharex=True)
     known = not np.isnan(scores.true_imu_error[i]).all()
@@ -214,10 +220,10 @@ def imu_errors(scores: Scores, i: int) -> Figure:
         extent: list[Array] = []
         for name, run in runs.items():
             style = line_style(scores, name)
-            y, s = run.imu_error[i, :, k] * scale, run.imu_std[i, :, k] * scale
+            y, s = run.imu_error[i, :, k] * scale, 3 * run.imu_std[i, :, k] * scale
             ax.plot(scores.t, y, lw=1.7, zorder=3, **style)
             ax.fill_between(scores.t, y - s, y + s, color=style["color"], alpha=0.15, lw=0, zorder=2)
-            extent += [x[settled] for x in (y, y - s, y + s)]
+            extent.append(y[settled])
         if known:
             y = scores.true_imu_error[i, :, k] * scale
             ax.plot(scores.t, y, color="black", lw=1.4, zorder=4)
@@ -232,8 +238,8 @@ def imu_errors(scores: Scores, i: int) -> Figure:
     handles: list[Artist] = [Line2D([], [], color="black", lw=1.4, label="truth")] if known else []
     handles += [Line2D([], [], lw=1.7, label=n, **line_style(scores, n)) for n in runs]
     if any(np.isfinite(r.imu_std[i]).any() for r in scores.filters.values()):
-        handles.append(Patch(color=COLOURS[1], alpha=0.2, label="±1σ of the filter"))
-    figure.suptitle(f"IMU-error estimates, {_name(scores, i)}", fontsize=10)
+        handles.append(Patch(color=COLOURS[1], alpha=0.2, label="±3σ of each filter"))
+    figure.suptitle(f"IMU-error estimates, {scores.describe_segment(i)}", fontsize=10)
     _legend(figure, handles + _outage_handle(scores, [i]))
     return figure
 
@@ -325,11 +331,6 @@ def _limits(ax: Axes, extent: list[Array]) -> None:
         low, high = values.min(), values.max()
         margin = 0.6 * (high - low) or 1e-6
         ax.set_ylim(low - margin, high + margin)
-
-
-def _name(scores: Scores, i: int) -> str:
-    p = scores.segments[i]
-    return f"{p.drive}, from t = {p.t_start:.0f} s"
 
 
 def _legend(figure: Figure, handles: Sequence) -> None:

@@ -18,6 +18,8 @@ from dlkf.data.draws import draw_per_segment
 from dlkf.data.drive import Batch
 from dlkf.data.masks import mask_outage
 
+UNUSED = "without outage"  # of the rules of an evaluation: drives of which none could be scored
+FEW_NAMED = 4  # drives in a line
 LAST_FIX_WITHIN_S = 2.0  # an outage counts from a fix: one must lie this close before its start
 
 
@@ -91,6 +93,36 @@ def scorable_outages(batch: Batch, outage: Tensor) -> Tensor:
     faulty = torch.zeros(outage.shape[0], int(window.max()) + 1, dtype=torch.long)
     faulty.scatter_add_(1, window, (outage & (~truth | bad_start)).long())
     return outage & (faulty.gather(1, window) == 0)
+
+
+def describe_unused(plan: OutagePlan, outage: np.ndarray, ends_s: np.ndarray, drives: Sequence[str]) -> str:
+    """One line on drives without an outage that could be scored, empty if there is none.
+
+    ``outage`` (P, T) has the masks of the segments, ``ends_s`` (P,) the last time of their truth [s since the start],
+    ``drives`` (P,) their names.
+    """
+    first, duration = (_bounds(f"outage.{name}", getattr(plan, name))[0] for name in ("first_s", "duration_s"))
+    longest: dict[str, float] = {}
+    for drive, end in zip(drives, ends_s):
+        longest[drive] = max(longest.get(drive, 0.0), float(end))
+    used = {drive for drive, mask in zip(drives, outage) if mask.any()}
+    unused = sorted(set(longest) - used)
+    short = [drive for drive in unused if longest[drive] < first + duration]
+    needed = f"outage.first_s={first:g} + outage.duration_s={duration:g} s"
+    said = [
+        f"{_list_few(names)} {why}"
+        for names, why in (
+            (short, f"too short for {needed}"),
+            ([d for d in unused if d not in short], "without a fix at its start or valid truth throughout"),
+        )
+        if names
+    ]
+    return f"no outage in {len(unused)} of {len(longest)} drives: {'; '.join(said)}" if unused else ""
+
+
+def _list_few(names: Sequence[str]) -> str:
+    more = f" and {len(names) - FEW_NAMED} more" if len(names) > FEW_NAMED else ""
+    return ", ".join(names[:FEW_NAMED]) + more
 
 
 def check_outages(plan: OutagePlan | None, withheld: Tensor | np.ndarray, longest_s: float) -> None:

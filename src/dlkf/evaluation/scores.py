@@ -57,6 +57,12 @@ class Scores:
         """Time since the start of a segment at the end of each epoch [s], (T,)."""
         return self.epoch_s * np.arange(1, self.outage.shape[1] + 1)
 
+    @property
+    def ends(self) -> tuple[Array, list[str]]:
+        """Time of the last truth of each segment [s since its start], (P,), and their drives."""
+        last = np.where(np.isfinite(self.truth_p_n[..., 0]), self.t, 0.0).max(1)
+        return last, [segment.drive for segment in self.segments]
+
     def geodetic(self, segment: int, p_n: Array) -> Array:
         """Latitude and longitude [°] (…, 2) of positions (…, 3) in the tangent frame of a segment."""
         origin = torch.from_numpy(self.origin_e[segment])
@@ -68,6 +74,15 @@ class Scores:
     def windows(self) -> OutageIntervals:
         """All outages."""
         return outage_intervals(self.outage)
+
+    def describe_segment(self, segment: int) -> str:
+        """Drive, start and the outages, which tell the runs over one drive apart."""
+        source = self.segments[segment]
+        text = f"{source.drive} from t = {source.t_start:.0f} s"
+        starts = outage_intervals(self.outage[[segment]]).first * self.epoch_s + source.t_start
+        if not len(starts):
+            return text
+        return f"{text}, {'outages' if len(starts) > 1 else 'outage'} from t = {starts[0]:.0f} s"
 
     @property
     def kinds(self) -> list[str]:
@@ -136,4 +151,4 @@ def representative(scores: Scores, n: int, filter_name: str | None) -> list[int]
     order = [int(i) for i in np.argsort(worst, kind="stable") if worst[i] >= 0]
     if len(order) <= n:
         return order
-    return [order[round(q * (len(order) - 1))] for q in (np.arange(n) + 0.5) / n]
+    return [order[int(q * len(order))] for q in (np.arange(n) + 0.5) / n]

@@ -10,9 +10,12 @@ from dlkf.evaluation.metrics import Array
 from dlkf.evaluation.results import last_finite
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.table import ResultTable
+from dlkf.filters.aids.estimates import estimate_heading, format_estimate
 
 TITLE = "Further sensors"
-COLUMNS = ["Filter", "Sensor", "Updates", "Used\n[%]", "Innovation\n/ σ", "Found, median over the runs"]
+COLUMNS = ["Filter", "Sensor", "Updates", "Used\n[%]", "Innovation\n/ σ"]
+NOTE = "Innovation / σ: RMS over the updates that used the sensor, expected 1."
+FOUND = "Estimates ± 1σ: medians over the runs, at the end of each."
 
 
 def sensor_table(scores: Scores, columns: Mapping[str, Sequence[str]]) -> ResultTable | None:
@@ -20,7 +23,8 @@ def sensor_table(scores: Scores, columns: Mapping[str, Sequence[str]]) -> Result
 
     ``columns`` are those of each filter's :attr:`FilterRun.aids` (:func:`dlkf.filters.aids.attach.aid_columns`).
     """
-    rows = []
+    rows: list[list[str]] = []
+    found: list[dict[str, str]] = []
     for name, run in scores.filters.items():
         of = dict(zip(columns[name], np.moveaxis(run.aids, -1, 0)))
         for sensor in (column.removesuffix("_used") for column in of if column.endswith("_used")):
@@ -30,13 +34,18 @@ def sensor_table(scores: Scores, columns: Mapping[str, Sequence[str]]) -> Result
             spread = f"{np.sqrt(np.mean(ratio[counted] ** 2)):.2f}" if counted.any() else "–"
             share = f"{100 * counted.sum() / seen.sum():.1f}" if seen.any() else "–"
             prefix = "wheel_" if sensor == "speed" else f"{sensor}_"
-            names = [n for n in of if n.startswith(prefix) and f"std_{n}" in of]
-            found = [f"{n} {_last(of[n]):.4g} ± {_last(of[f'std_{n}']):.2g}" for n in names if np.isfinite(of[n]).any()]
-            rows.append([name, sensor, str(int(seen.sum())), share, spread, ", ".join(found) or "–"])
+            names = [n for n in of if n.startswith(prefix) and f"std_{n}" in of and np.isfinite(of[n]).any()]
+            found.append({n: format_estimate(n, _last(of[n]), _last(of[f"std_{n}"])) for n in names})
+            rows.append([name, sensor.replace("_", " "), str(int(seen.sum())), share, spread])
     if not rows:
         return None
-    note = "Innovation / σ: RMS over the updates that used the sensor, expected 1. Found: estimates at a run's end."
-    return ResultTable(title=TITLE, note=note, columns=COLUMNS, rows=rows)
+    estimates = list(dict.fromkeys(n for row in found for n in row))
+    return ResultTable(
+        title=TITLE,
+        note=f"{NOTE} {FOUND}" if estimates else NOTE,
+        columns=[*COLUMNS, *map(estimate_heading, estimates)],
+        rows=[[*row, *(of_row.get(n, "–") for n in estimates)] for row, of_row in zip(rows, found)],
+    )
 
 
 def _last(values: Array) -> float:

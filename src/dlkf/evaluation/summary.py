@@ -87,16 +87,14 @@ def describe_verdict(result: Results, name: str) -> str | None:
         ratio, low, high = (
             format_number(x, digits=2) for x in (comparison.ratio, comparison.ratio_low, comparison.ratio_high)
         )
-        known = comparison.groups >= MIN_GROUPS
-        less = (
-            "better"
-            if comparison.ratio_high < 1
-            else "worse"
-            if comparison.ratio_low > 1
-            else "no significant difference"
-        )
-        verdict = f"{ratio} [{low}, {high}], {less}" if known else f"{ratio}, too few recordings for an interval"
-        text += f"; {baseline} {format_number(result.value(baseline, *END))} m (ratio of geometric means {verdict})"
+        if comparison.groups < MIN_GROUPS:
+            direction = "worse" if comparison.ratio > 1 else "better"
+            verdict = f"{ratio} by geometric mean: {direction}, but too few recordings for an interval"
+        else:
+            less, more = comparison.ratio_high < 1, comparison.ratio_low > 1
+            direction = "better" if less else "worse" if more else "no significant difference"
+            verdict = f"{ratio} [{low}, {high}] by geometric mean: {direction}"
+        text += f"; {baseline} {format_number(result.value(baseline, *END))} m; {name} : {baseline} = {verdict}"
     if best is not None and best != baseline:
         text += f"; best other filter {best} {format_number(result.value(best, *END))} m"
     return f"{text}."

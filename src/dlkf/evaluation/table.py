@@ -65,7 +65,8 @@ def result_tables(dataset: str, result: Results) -> list[ResultTable]:
     settled = f"after {result.settle_s:g} s"
     whole = ResultTable(
         title=f"{what}: {_count(n['segments'], unit)}, {_count(n['drives'], 'drive')}",
-        note=f"RMS over each {unit}, then RMS over the {unit}s; median and 95 % over the {unit}s.",
+        note=f"RMS over each {unit}, then RMS over the {unit}s; median and 95 % over the {unit}s."
+        + (" A run has the outages of a drive at one of several offsets." if n["repeated"] else ""),
         columns=[
             "Filter", "3D\n[m]", f"3D, {settled}\n[m]", f"Horiz., {settled}\n[m]", "median\n[m]", "95 %\n[m]",
             "Velocity\n[m/s]", "Attitude\n[°]", "Heading\n[°]",
@@ -100,7 +101,7 @@ def outage_table(what: str, result: Results) -> ResultTable:
         "attitude at the end (RMS); drift: horizontal error per distance driven (median); own 1σ: what the filter says "
         "of its horizontal error at the end (median); innov. / σ: innovations over the 1σ that it expects (RMS).",
         columns=["Filter", "End, RMS\n[m]", "median\n[m]", "95 %\n[m]"]
-        + [f"{s} s\n[m]" for s in at]
+        + [f"RMS\n{s} s\n[m]" for s in at]
         + ["Velocity\n[m/s]", "Attitude\n[°]", "Drift\n[%]", "Own 1σ\n[m]", "Innov.\n/ σ"],
         rows=[],
     )

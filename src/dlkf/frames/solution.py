@@ -55,12 +55,13 @@ class Solution(pd.DataFrame):
         return pd.DataFrame
 
     def map(self) -> go.Figure:
-        """The track on a map (plotly), coloured by time without GNSS, quality of the fixes or the filter's 1σ."""
+        """The track in metres (plotly), coloured by time without GNSS, quality of the fixes or the filter's 1σ."""
         import plotly.graph_objects as go
 
+        from dlkf.report.maps import in_metres
         from dlkf.report.navigation import TrackOnMap, route_map
 
-        figure = route_map([TrackOnMap(self._navigated, self._fixes)])
+        figure = in_metres(route_map([TrackOnMap(self._navigated, self._fixes)]))
         return go.Figure(figure.data, figure.layout)
 
     def plot(self) -> NotebookFigure:

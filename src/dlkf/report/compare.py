@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +22,7 @@ from dlkf.report.page import Page, flatten_settings
 from dlkf.report.plots import FONT
 
 TEST = ("digest", "reference", "mode", "runs", "seed", "length_s", "stride_s", "start", "outage")  # of the protocol
+POINT, SETTING = re.compile(r"\d+-([\w.+]+=.*)"), re.compile(r",(?=[\w.+]+=)")  # of a sweep: folder, its settings
 NOT_SETTINGS = ("command", "date", "digest", "skipped")  # differ always, or belong to no comparison
 
 
@@ -62,9 +64,13 @@ def read_reports(folders: Sequence[str | Path]) -> list[StoredReport]:
 
 
 def shorten_names(paths: Sequence[Path]) -> list[str]:
-    """The shortest tails that tell folders apart, without the ``report`` in which train leaves its evaluation."""
+    """The shortest tails that tell folders apart, without the ``report`` in which train leaves its evaluation; points
+    of a sweep by their settings (``0-model=plus,aids=[]``: ``plus, aids=[]``)."""
     parts = [(p.parent if p.name == "report" else p).absolute().parts for p in paths]
-    return [Path(*p[-_count_needed(p, parts[:k] + parts[k + 1 :]) :]).as_posix() for k, p in enumerate(parts)]
+    names = [Path(*p[-_count_needed(p, parts[:k] + parts[k + 1 :]) :]).as_posix() for k, p in enumerate(parts)]
+    settings = [SETTING.split(found[1]) if (found := POINT.fullmatch(name)) else [name] for name in names]
+    readable = [", ".join(part.removeprefix("model=") for part in of_point) for of_point in settings]
+    return [better if readable.count(better) == 1 else name for name, better in zip(names, readable)]
 
 
 def _count_needed(path: tuple[str, ...], others: Sequence[tuple[str, ...]]) -> int:

@@ -21,7 +21,9 @@ import numpy as np
 
 Trace = dict[str, Any]
 TEMPLATE = "plotly_white"
-NARROW_DECADES, MOST_DECADES = 1.5, 5  # of a logarithmic axis: with 2 and 5; with every power of ten
+MOST_DECADES = 5  # of a logarithmic axis with every power of ten
+CONSTANT = 1e-6  # a narrower range than this share of its values has no ticks of its own
+LEAST_TICKS, LINEAR_TICKS = 2, 4  # between the least and the largest value; of evenly spaced ones about
 
 
 @dataclass
@@ -52,16 +54,13 @@ class Figure:
 
     def set_log_scale(self, row: int = 1) -> None:
         """A logarithmic value axis of the traces that the panel has, its numbers written out (10000, not 10k): powers
-        of ten, of narrow data also 2 and 5 times these."""
+        of ten, of narrower data also 2 and 5 times these, of still narrower ones evenly spaced numbers."""
         axis = f"y{_number(row)}"
         y = [np.asarray(trace["y"], float) for trace in self.data if trace.get("yaxis", "y") == axis]
         values = np.concatenate(y) if y else np.empty(0)
-        values = np.log10(values[np.isfinite(values) & (values > 0)])
-        low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
-        every = 2 if high - low > MOST_DECADES else 1
-        decades = range(every * (math.floor(low / every) - 1), math.ceil(high) + 2, every)
-        steps = (1, 2, 5) if high - low < NARROW_DECADES else (1,)
-        ticks = [float(f"{step}e{k}") for k in decades for step in steps]
+        values = values[np.isfinite(values) & (values > 0)]
+        low, high = (float(values.min()), float(values.max())) if values.size else (1.0, 10.0)
+        ticks = _log_ticks(low, high)
         texts = [np.format_float_positional(v, trim="-") for v in ticks]
         self.update_yaxis(row, type="log", tickvals=ticks, ticktext=texts)
 
@@ -116,6 +115,24 @@ def _package() -> Path:
 def _number(row: int) -> str:
     """Of an axis: the first has none."""
     return str(row) if row > 1 else ""
+
+
+def _log_ticks(low: float, high: float) -> list[float]:
+    """Round numbers from below ``low`` to above ``high``."""
+    first, last = math.log10(low), math.log10(high)
+    every = 2 if last - first > MOST_DECADES else 1
+    decades = range(every * (math.floor(first / every) - 1), math.ceil(last) + 2, every)
+    for steps in ((1,), (1, 2, 5)):
+        ticks = [float(f"{step}e{k}") for k in decades for step in steps]
+        if sum(low <= tick <= high for tick in ticks) >= LEAST_TICKS:
+            return ticks
+    if high - low < CONSTANT * high:
+        return ticks
+    least = (high - low) / LINEAR_TICKS
+    power = math.floor(math.log10(least))
+    step = next(s for s in (1, 2, 5, 10) if s * 10.0**power >= least)
+    count = [math.floor(low / step / 10.0**power) - 1, math.ceil(high / step / 10.0**power) + 2]
+    return [float(f"{k * step}e{power}") for k in range(max(count[0], 1), count[1])]
 
 
 def _merge(into: dict[str, Any], more: dict[str, Any]) -> None:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from dlkf.base.colours import SHADE, TRUTH, filter_colour
 from dlkf.base.files import resolve_place, write_into
-from dlkf.evaluation.metrics import magnitudes, outage_at, outage_end, rms_over_segments
+from dlkf.evaluation.metrics import Mask, magnitudes, outage_at, outage_end, rms_over_segments
+from dlkf.evaluation.outages import UNUSED
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import OFF_SCALE, Scores, representative
 from dlkf.evaluation.sensors import TITLE as SENSORS_TITLE
@@ -22,12 +24,14 @@ from dlkf.report.maps import add_track, chart, join_tracks
 from dlkf.report.navigation import mark_outages
 from dlkf.report.page import Page, embed_png
 from dlkf.report.plots import Array, band, line, shade, spans, stack_panels
+from dlkf.report.training import add_training
 
 MAP = (
     "The {truth}, the outages, and the track of each filter in them; a click on a grey name shows a filter that is far "
     "off. A click on a row of the table of outages goes there."
 )
 MOST_OUTAGES = 300  # rows of the table of outages: the worst of them
+SEEN_AT_ONCE = 11  # of them, in the box of the page
 SENSORS = (("Accelerometer", "m/s²", 1.0), ("Gyroscope", "°/s", DEGREES))
 IMU = [(f"{name} {axis} error [{unit}]", scale) for name, unit, scale in SENSORS for axis in "xyz"]
 OVER_TIME = {
@@ -49,16 +53,17 @@ def write_report(
     more: Sequence[ResultTable] = (),
     figures: bool,
     trained: str | None = None,
+    losses: Mapping[str, Sequence[float]] = MappingProxyType({}),
 ) -> list[Path]:
     """Write the whole report into ``out``, all files or none; returns their paths.
 
     ``results`` has one entry per kind of data (of scores.of_kind); ``protocol`` is how the
     scores were made, in plain values; ``more`` tables follow those of the results; ``figures``: the page's figures for
-    print as well, figures/*.png; ``trained``: the filter with which the answer begins. Raises InputError if ``out``
-    cannot be written to.
+    print as well, figures/*.png; ``trained``: the filter with which the answer begins, ``losses``: of its training
+    (:func:`dlkf.report.training.add_training`). Raises InputError if ``out`` cannot be written to.
     """
     parts = [*all_tables(dataset, results), *more]
-    pictures = print_figures(scores, by_time, baseline) if figures else []
+    pictures = print_figures(scores, by_time, baseline, protocol.get("reference")) if figures else []
     files: dict[str, bytes] = {
         "metrics.json": as_json(
             {
@@ -71,7 +76,9 @@ def write_report(
         ).encode(),
         "table.md": "\n".join(map(as_markdown, parts)).encode(),
         "table.csv": as_csv(dataset, results).encode(),
-        "report.html": evaluation_page(dataset, parts, scores, results, pictures, protocol, baseline, trained).encode(),
+        "report.html": evaluation_page(
+            dataset, parts, scores, results, pictures, protocol, baseline, trained, losses
+        ).encode(),
         **{f"figures/{name}": data for name, _, data in pictures},
     }
     with write_into(out) as folder:
@@ -82,16 +89,24 @@ def write_report(
     return [resolve_place(out) / name for name in files]
 
 
-def print_figures(scores: Scores, by_time: bool, baseline: str | None) -> list[tuple[str, str, bytes]]:
-    """(file name, caption, PNG) of every kind of data."""
+def print_figures(
+    scores: Scores, by_time: bool, baseline: str | None, own: str | None = None
+) -> list[tuple[str, str, bytes]]:
+    """(file name, caption, PNG) of every kind of data; ``own``: a reference that was made."""
     from dlkf.evaluation.figures import all_figures, png  # matplotlib takes a second to load
 
     pictures = []
     for kind in scores.kinds:
         suffix = "" if len(scores.kinds) == 1 else f"_{kind}"
-        for name, caption, figure in all_figures(scores.of_kind(kind), by_time=by_time, baseline=baseline):
+        drawn = all_figures(scores.of_kind(kind), by_time=by_time, baseline=baseline, named=name_truth(kind, own))
+        for name, caption, figure in drawn:
             pictures.append((f"{name}{suffix}.png", f"{kind.capitalize()} data: {caption}", png(figure, 110)))
     return pictures
+
+
+def name_truth(kind: str, own: str | None) -> str:
+    """What errors are against: only simulated drives have a truth, if no reference of their ``own`` was made."""
+    return "truth" if kind == "simulated" and not own else "reference"
 
 
 def evaluation_page(
@@ -103,23 +118,29 @@ def evaluation_page(
     protocol: Mapping[str, Any],
     baseline: str | None,
     trained: str | None = None,
+    losses: Mapping[str, Sequence[float]] = MappingProxyType({}),
 ) -> str:
     """The page: answer, of a training what was ``trained`` first; for every kind of data the table of the outages, map,
-    growth, further sensors, every outage; then what is for research: errors over time, IMU errors, the other tables."""
+    growth, further sensors, every outage; then what is for research: the ``losses`` of the training, errors over time,
+    IMU errors, the other tables."""
     many = len(results) > 1
     verdicts = [(r, v) for r in results if trained is not None and (v := describe_verdict(r, trained))]
     said = [*verdicts, *((r, headline(r)) for r in results)]
     answers = [f"{r.kind.capitalize()} data. {line}" if many else line for r, line in said]
     own = protocol.get("reference")
     answers += [f"No truth: errors are against the {own}."] if own else []
-    page = Page(f"Evaluation on {dataset}", answers, warnings=sigma_warnings(scores))
+    unused = protocol.get(UNUSED)
+    answers += [f"{unused[0].upper()}{unused[1:]}."] if unused else []
+    title = f"Training of {trained} and evaluation on {dataset}" if trained else f"Evaluation on {dataset}"
+    page = Page(title, answers, warnings=sigma_warnings(scores))
     first = [t for t in parts if "outage" in t.title or t.title == SENSORS_TITLE]
     for result in results:
         kind = f"{result.kind}: " if many else ""
         tables = [t for t in first if not many or f"({result.kind})" in t.title]
-        named = "truth" if result.kind == "simulated" and not own else "reference"
-        _answer(page, scores.of_kind(result.kind), result, kind, baseline, named, tables)
+        _answer(page, scores.of_kind(result.kind), result, kind, baseline, name_truth(result.kind, own), tables)
     _add_tables(page, [t for t in first if many and not any(f"({r.kind})" in t.title for r in results)])
+    if losses:
+        add_training(page, losses)
     for result in results:
         _research(page, scores.of_kind(result.kind), result, f"{result.kind}: " if many else "", baseline)
     _add_tables(page, [t for t in parts if t not in first])
@@ -167,9 +188,10 @@ def _answer(
         page.figure(f"growth-{name}", growth_chart(scores))
         _add_tables(page, [t for t in tables if t.title == SENSORS_TITLE])
         best = least_error(scores, result)
-        about = f"Horizontal error at the end [m], the worst of {best} first; a click shows it on the map."
-        page.heading(f"{kind}Outages", about)
         columns, rows, marks = outage_rows(scores, result, f"map-{name}", best)
+        about = f"Horizontal error at the end [m], the worst of {best} first; a click shows it on the map."
+        scrolled = f" {len(rows)} rows: scroll in the box." if len(rows) > SEEN_AT_ONCE else ""
+        page.heading(f"{kind}Outages ({len(result.per_outage)})", about + scrolled)
         page.table(columns, rows, marks=marks, tall=True)
         if len(result.per_outage) > len(rows):
             page.note(f"The worst {len(rows)} of {len(result.per_outage)}; all are in metrics.json.")
@@ -182,19 +204,33 @@ def _answer(
 def _research(page: Page, scores: Scores, result: Results, kind: str, baseline: str | None) -> None:
     """Errors over time, IMU errors."""
     name = kind.strip(": ") or "all"
-    page.heading(
-        f"{kind}Errors over time", f"RMS over {len(scores.segments)} segments; grey: outages of most segments."
-    )
+    page.heading(f"{kind}Errors over time", describe_average(scores))
     page.figure(f"errors-{name}", error_charts(scores))
     chosen = representative(scores, 3, baseline)
     if chosen:
         i = chosen[len(chosen) // 2]
-        segment = scores.segments[i]
         best = least_error(scores, result)
-        about = f"{segment.drive} from t = {segment.t_start:.0f} s, an average segment; black: truth; "
-        about += f"band: ±3σ of {best}."
+        about = f"{scores.describe_segment(i)}, an average segment; band: ±3σ of {best}"
+        about += "; black: truth." if np.isfinite(scores.true_imu_error[i]).any() else "."
         page.heading(f"{kind}IMU errors", about)
         page.figure(f"imu-{name}", imu_error_charts(scores, i, best))
+
+
+def describe_average(scores: Scores) -> str:
+    """What the errors over time are averaged over, and what is grey in them."""
+    count, sources = len(scores.segments), len({(s.drive, s.t_start) for s in scores.segments})
+    text = f"RMS over {count} segments"
+    if sources < count:
+        what = "drives" if sources == len({s.drive for s in scores.segments}) else "segments"
+        text = f"RMS over {count} runs ({sources} {what}, each with its outages at {count / sources:.2g} offsets)"
+    if not scores.outage.any():
+        return f"{text}."
+    return f"{text}; grey where most of them have an outage{'' if _mostly_hidden(scores).any() else ' (here nowhere)'}."
+
+
+def _mostly_hidden(scores: Scores) -> Mask:
+    """Epochs in which most segments have an outage."""
+    return scores.outage.mean(0) > 0.5
 
 
 def colours(scores: Scores) -> dict[str, str]:
@@ -231,8 +267,9 @@ def growth_chart(scores: Scores) -> Figure:
 def outage_map(scores: Scores, named: str) -> Figure:
     """Truth of all segments (a reference is ``named`` so), outages, every filter's way in them from the last fix on."""
     w = scores.windows
-    known = [~np.isnan(scores.truth_p_n[i, :, 0]) for i in range(len(scores.segments))]
-    truth = [scores.geodetic(i, scores.truth_p_n[i, known[i]]) for i in range(len(scores.segments)) if known[i].any()]
+    known = ~np.isnan(scores.truth_p_n[..., 0])
+    segments = np.flatnonzero(known.any(1)).tolist()
+    truth = [scores.geodetic(i, scores.truth_p_n[i, known[i]]) for i in segments]
     windows, far = list(zip(w.segment, np.maximum(w.first - 1, 0), w.last)), far_off(scores)
     hidden = [scores.geodetic(i, scores.truth_p_n[i, a : b + 1]) for i, a, b in windows]
     traces = [
@@ -244,7 +281,7 @@ def outage_map(scores: Scores, named: str) -> Figure:
         ways = [scores.geodetic(i, p[i, a : b + 1]) for i, a, b in windows]
         more = {"visible": "legendonly"} if name in far else {}
         traces.append(add_track(join_tracks(ways, 8000), name, c, width=2, **more))
-    return chart(traces, around=traces[:2])
+    return chart(traces, places_of_drives(scores, segments, truth))
 
 
 def far_off(scores: Scores) -> list[str]:
@@ -258,11 +295,20 @@ def far_off(scores: Scores) -> list[str]:
 def segment_map(scores: Scores, baseline: str | None, named: str) -> Figure:
     """Truth and every filter of up to eight segments from good to bad."""
     chosen = representative(scores, 8, baseline)
-    traces = [add_track(join_tracks([scores.geodetic(i, scores.truth_p_n[i]) for i in chosen]), named, TRUTH, width=2)]
+    truth = [scores.geodetic(i, scores.truth_p_n[i]) for i in chosen]
+    traces = [add_track(join_tracks(truth), named, TRUTH, width=2)]
     for name, c in colours(scores).items():
         p = scores.filters[name].p_n
         traces.append(add_track(join_tracks([scores.geodetic(i, p[i]) for i in chosen]), name, c, width=2))
-    return chart(traces, around=traces[:1])
+    return chart(traces, places_of_drives(scores, chosen, truth))
+
+
+def places_of_drives(scores: Scores, segments: Sequence[int], places: Sequence[Array]) -> dict[str, Array]:
+    """Drive → what ``places`` has of its segments."""
+    parts: dict[str, list[Array]] = {}
+    for i, place in zip(segments, places):
+        parts.setdefault(scores.segments[i].drive, []).append(place)
+    return {drive: np.concatenate(of_drive) for drive, of_drive in parts.items()}
 
 
 def least_error(scores: Scores, result: Results) -> str:
@@ -308,7 +354,7 @@ def error_charts(scores: Scores) -> Figure:
     for row in range(1, len(known) + 1):
         figure.set_log_scale(row)
     figure.update_xaxis(len(known), title={"text": "Time since the start of a segment [s]"})
-    shade(figure, spans(scores.t, scores.outage.mean(0) > 0.5), len(known))
+    shade(figure, spans(scores.t, _mostly_hidden(scores)), len(known))
     return figure
 
 

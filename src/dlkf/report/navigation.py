@@ -14,6 +14,7 @@ from dlkf.report.drawing import Figure
 from dlkf.report.maps import add_track, chart, dots, join_tracks
 from dlkf.report.page import Page
 from dlkf.report.plots import Array, band, every, line, shade, spans, stack_panels
+from dlkf.report.sensors import sensor_rows
 from dlkf.running.innovations import SETTLE, Innovation
 from dlkf.running.offline import Navigated, UsableFixes
 
@@ -24,6 +25,10 @@ GAP_S = 3.0  # longer without a fix is an outage
 STANDING = 0.15  # m/s
 SHARE, SHOWS = "vibration_speed_share", 0.1  # a column of the solution, and from where on vibration shows a speed
 R2D = 180 / np.pi
+SIGNS = (
+    "Innovation / σ is expected to be 1; where most updates are refused, see the unit, sign and clock of the sensor. "
+    "Positive are a wheel that reads too much or comes late, and fixes whose stamps are late."
+)
 
 
 class TrackOnMap(NamedTuple):
@@ -62,11 +67,11 @@ def navigation_page(
         "Innovation / σ: what GNSS says less what the filter expects, over the filter's own 1σ of it (RMS). 1 is "
         "right; above, the filter is overconfident: its noise is too small for this IMU and receiver."
     )
-    sensors = [course.result.sensors() for course in courses]
-    if names := list(dict.fromkeys(name for found in sensors for name in found)):
-        page.heading("Further sensors", "Updates that used them, and what was found of them at the end of the drive.")
-        values = [[c.result.drive, *(x.get(n, "–") for n in names)] for c, x in zip(courses, sensors)]
-        page.table(["Drive", *names], values, words=True, tall=len(courses) > 15)
+    columns, rows = sensor_rows([course.result for course in courses])
+    if columns:
+        page.heading("Further sensors", "Updates that used them; estimates ± 1σ at the end of the drive.")
+        page.table(columns, rows, tall=len(courses) > 15)
+        page.note(SIGNS)
     for k, course in enumerate(courses[:MOST_DRIVES]):
         _plots(page, k, course)
     if len(courses) > MOST_DRIVES:
@@ -107,7 +112,8 @@ def vibration_lines(courses: Sequence[TrackOnMap]) -> list[str]:
     if not shows:
         return ["Speed from vibration: the spectrum of the IMU does not show it."]
     where = f" in {shows} of {len(tables)} drives" if len(tables) > 1 else ""
-    done = f"{used} measurements used" + ("" if used else " (only outages use them)")
+    outage = any((c.without > GAP_S).any() for c in courses)
+    done = f"{used} measurements used" if used or outage else "not needed: no outage"
     return [f"Speed from vibration: the spectrum of the IMU shows it{where}; {done}."]
 
 
@@ -167,7 +173,7 @@ def route_map(courses: Sequence[TrackOnMap]) -> Figure:
         value = np.log10(np.maximum(np.nan_to_num(sigma, nan=1e-3), 1e-3))
         label = [f"{s:.2g} m" for s in sigma]
         add(dots(place, "horizontal 1σ", value.astype(np.float32), size=5, bar="log₁₀ 1σ [m]", text=label), "1σ")
-    return chart(traces, groups)
+    return chart(traces, {c.result.drive: _place(c) for c in courses}, groups)
 
 
 def _insert_breaks(place: Array, most: int) -> Array:

@@ -31,8 +31,18 @@ class Page:
         self.parts.append(f"<h2>{html.escape(text)}</h2>" + (f"<p class=note>{html.escape(note)}</p>" if note else ""))
 
     def figure(self, name: str, figure: Figure) -> None:
-        """An interactive figure; ``name`` is its id in the page. A map brings its switch for streets."""
+        """An interactive figure; ``name`` is its id in the page. A map brings its switch for streets, and of several
+        areas the choice."""
         if any(trace["type"] == "scattermap" for trace in figure.data):
+            meta = figure.layout["meta"]
+            if len(meta["areas"]) > 1:
+                options = "".join(
+                    f"<option value={k}{' selected' if k == meta['first'] else ''}>{html.escape(area['name'])}</option>"
+                    for k, area in enumerate(meta["areas"])
+                )
+                self.parts.append(
+                    f'<label>area <select class=area data-map="{name}">{options}</select></label> &emsp; '
+                )
             self.parts.append(
                 f'<label><input type=checkbox class=streets data-map="{name}"> streets '
                 "(loads tiles from openstreetmap.org)</label>"

@@ -19,6 +19,7 @@ from dlkf.data.datamodule import DriveDataModule
 from dlkf.filters.learned import LearnedFilter
 from dlkf.filters.shipped import trained_filter
 from dlkf.training.callbacks.checkpoints import BEST, LAST, BestWeights, ResumePoint
+from dlkf.training.callbacks.history import LossHistory
 from dlkf.training.callbacks.progress import TrainingProgress
 from dlkf.training.module import FilterTraining
 from dlkf.training.processes import is_worker, join, with_workers
@@ -62,6 +63,7 @@ def fit(
             callbacks=[
                 *settings.callbacks,
                 TrainingProgress(),
+                LossHistory(str(folder)),
                 BestWeights(str(folder), _monitor(plan.monitor, data), plan.best_from_epoch, notes),
                 ResumePoint(str(folder), plan.checkpoint_every),
             ],

@@ -41,6 +41,7 @@ from dlkf.filters.saved import LearnedSettings, load_filter, parse_learned_setti
 from dlkf.filters.shipped import shipped_folder, trained_filter
 from dlkf.report.evaluation import write_report
 from dlkf.training.callbacks.curriculum import LengthCurriculum
+from dlkf.training.callbacks.history import read_losses
 from dlkf.training.fit import fit
 from dlkf.training.settings import FitSettings, ScoringSettings, StudySettings
 from dlkf.tuning.baselines import Baselines, tune_baselines
@@ -120,6 +121,7 @@ def run_study(
         more=tables,
         figures=True,
         trained=learned,
+        losses=read_losses(folder),
     )
     if gains:
         write_gains(folder / "report", gains, title)
