@@ -85,14 +85,16 @@ def test_the_summary_counts_the_fixes_of_the_file():
     assert "solution from t = 10.0 s, none for the 10 fixes before, 1190 epochs, 1149 of 1200 fixes used" in said
 
 
-def test_a_sensor_that_made_no_update_is_said_to_have_made_none():
+def test_a_sensor_that_made_no_update_is_said_to_have_made_none_but_vibration_which_needs_none():
     result = with_vibration(driven(0), 0.4, 7).result
     z = np.where(result.table.vibration_speed_used > 0, 0.02, np.nan)
     measured = result.table.assign(vibration_speed_innovation=z, vibration_speed_innovation_std=0.01)
     said = replace(result, table=measured).sensors()["vibration_speed"]
-    assert said == "in 7 of 7 updates (normalised innovation RMS 2)"
+    assert said == "vibration_speed in 7 of 7 updates (normalised innovation RMS 2)"
     nothing = measured.assign(vibration_speed_innovation=np.nan, vibration_speed_used=0.0)
-    assert replace(result, table=nothing).sensors()["vibration_speed"] == "no update"
+    assert replace(result, table=nothing).sensors() == {}
+    wheel = nothing.assign(speed_innovation=np.nan, speed_innovation_std=np.nan, speed_used=0.0)
+    assert replace(result, table=wheel).sensors() == {"speed": "speed: no update"}
 
 
 def test_the_page_has_a_sensor_only_where_it_made_an_update_and_estimates_with_units():
@@ -118,7 +120,7 @@ def test_of_delay_and_antenna_what_differs_from_the_log_is_said():
         clock_drift_ppm=40.0, std_clock_drift_ppm=20.0, wheel_scale=0.01, std_wheel_scale=0.02,
     )  # fmt: skip
     said = replace(result, table=table).sensors()
-    assert said == {"fix_delay_s": "0.15 ± 0.01", "wheel_scale": "0.01 ± 0.02"}
+    assert said == {"fix_delay_s": "delay of fixes 150 ± 10 ms", "wheel_scale": "wheel scale error 1.0 ± 2.0 %"}
 
 
 def test_drives_without_plots_of_their_own_are_kept_small_and_shown_the_same():

@@ -23,6 +23,7 @@ from dlkf.data.store import load_dataset
 from dlkf.data.tables import read_table
 from dlkf.data.validate import usable_fixes
 from dlkf.filters.aids.attach import aid_columns, find_kalman
+from dlkf.filters.aids.estimates import describe_estimate
 from dlkf.filters.constraints import CarConstraints
 from dlkf.filters.integration import BatchSolution, WholeLoop
 from dlkf.filters.receiver import ARM, DELAY, DRIFT
@@ -135,7 +136,7 @@ class Navigated:
             text += f", final 1σ {position:.2g} m horizontal, {np.degrees(last.std_yaw):.2g}° heading"
         if self.innovation is not None and np.isfinite(spread := self.innovation.normalised_rms):
             text += f", normalised innovation RMS {spread:.2g} (expected 1)"
-        text += "".join(f", {name} {found}" for name, found in self.sensors().items())
+        text += "".join(f", {found}" for found in self.sensors().values())
         if any(self.refused):
             text += f", left out as impossible: {self.refused}"
         if self.restarts:
@@ -155,9 +156,10 @@ class Navigated:
             ratio = table[f"{name}_innovation"] / table[f"{name}_innovation_std"]
             seen = int(ratio.notna().sum())
             if not seen:
-                said[name] = "no update"
+                if name != "vibration_speed":  # which needs none while there is GNSS
+                    said[name] = f"{name}: no update"
                 continue
-            said[name] = f"in {int(table[used].sum())} of {seen} updates"
+            said[name] = f"{name} in {int(table[used].sum())} of {seen} updates"
             if table[used].sum() < MOSTLY * seen:
                 said[name] += ", most of them refused: see its unit, sign and clock"
             said[name] += f" (normalised innovation RMS {np.sqrt((ratio**2).mean()):.2g})"
@@ -166,7 +168,7 @@ class Navigated:
             floor = OF_RECEIVER.get(name)
             if floor is not None and abs(last[name]) <= SIGMAS * np.hypot(last[std], floor):
                 continue
-            said[name] = f"{last[name]:.4g} ± {last[std]:.2g}"
+            said[name] = describe_estimate(name, last[name], last[std])
         return said
 
 

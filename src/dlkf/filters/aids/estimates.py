@@ -40,6 +40,12 @@ def estimate_heading(name: str) -> str:
     return f"{known.words}\n[{known.unit}]" if known else name
 
 
+def describe_estimate(name: str, value: float, std: float) -> str:
+    """``wheel delay −20 ± 5 ms``."""
+    known = ESTIMATES.get(name, Readable(name, ""))
+    return f"{known.words[0].lower()}{known.words[1:]} {format_estimate(name, value, std)} {known.unit}".rstrip()
+
+
 def format_estimate(name: str, value: float, std: float) -> str:
     """``3.04 ± 0.35`` in the unit of :func:`estimate_heading`; – if unknown."""
     factor = ESTIMATES[name].factor if name in ESTIMATES else 1.0
