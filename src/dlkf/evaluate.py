@@ -27,7 +27,7 @@ from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.sensors import sensor_table
 from dlkf.evaluation.study import make_results
-from dlkf.evaluation.summary import FEW, collect_metrics, headline, sigma_warnings
+from dlkf.evaluation.summary import FEW, collect_metrics, describe_untuned, headline, sigma_warnings
 from dlkf.evaluation.table import ResultTable, all_tables, as_markdown, as_rich, result_tables
 from dlkf.filters.aids.attach import aid_columns, describe_aids, find_tables, refuse_left_out, with_aids
 from dlkf.filters.build import build_filter
@@ -74,7 +74,8 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console) -> Evaluation
     cards = {model_name: getattr(model, "card", {}) for model_name, model in models.items()}
     rows, seen = select_scored_drives(cards, rows, name, digest, leave_out=settings.unseen)
     strange = domain_warnings(models, settings.dataset, [row.name for row in rows], spec.name, grid["rate_hz"])
-    notes = [*seen, *strange]
+    untuned = describe_untuned(models, settings.tuning, spec.name)
+    notes = [*seen, *strange, *([untuned] if untuned else [])]
     for line in notes:
         console.print(line, style="yellow")
     for line in describe_aids(models, chosen):

@@ -21,7 +21,7 @@ from dlkf.evaluation.metrics import QUANTITIES
 from dlkf.evaluation.outages import OutagePlan
 from dlkf.evaluation.results import IMU_AXES, Results, summarise_scores
 from dlkf.evaluation.scores import FilterRun, representative
-from dlkf.evaluation.summary import describe_verdict, headline
+from dlkf.evaluation.summary import describe_untuned, describe_verdict, headline
 from dlkf.evaluation.table import (
     as_csv,
     as_json,
@@ -33,6 +33,7 @@ from dlkf.evaluation.table import (
     slope_table,
 )
 from dlkf.filters.build import build_filter
+from dlkf.filters.tuning import Tuning
 from dlkf.report.compare import StoredReport, describe_tests, end_table, mark_best_of_each, shorten_names
 from dlkf.report.evaluation import describe_average, evaluation_page, least_error, outage_rows, write_report
 from dlkf.report.training import learning_curve
@@ -101,6 +102,14 @@ def test_tables_hold_the_summarise_scores(scores):
     assert all(len(row) == len(t.columns) for t in (whole, outages) for row in t.rows)
     markdown = as_markdown(whole)
     assert markdown.count("\n| ") == 3 and "| mbkf15 |" in markdown
+
+
+def test_kalman_filters_that_nobody_tuned_are_named_beside_a_learned_one():
+    said = describe_untuned(["ins", "mbkf15", "mbkf21_car", "plus"], Tuning(), "consumer")
+    assert said is not None and said.startswith("mbkf15, mbkf21_car: noise of imu=consumer as it stands, untuned")
+    for names, tuning in (["mbkf15", "plus"], Tuning(accel_noise=25.0)), (["ins", "plus"], Tuning()):
+        assert describe_untuned(names, tuning, "consumer") is None
+    assert describe_untuned(["mbkf15", "mbkf21"], Tuning(), "consumer") is None
 
 
 def test_csv_and_json_carry_every_value(scores):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from dlkf.evaluation.bootstrap import MIN_GROUPS
 from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import Scores, innovation_fit
 from dlkf.evaluation.table import DEGREES, format_number
+from dlkf.filters.tuning import Tuning
 from dlkf.running.innovations import OF_NETWORK, REMEDY
 
 FEW = 20  # outages or segments; fewer have no 95 %: their largest error stands instead
@@ -98,6 +99,18 @@ def describe_verdict(result: Results, name: str) -> str | None:
     if best is not None and best != baseline:
         text += f"; best other filter {best} {format_number(result.value(best, *END))} m"
     return f"{text}."
+
+
+def describe_untuned(models: Iterable[str], tuning: Tuning, imu: str) -> str | None:
+    """A line where Kalman filters stand beside a learned one with the noise of a preset as it is, else None."""
+    named = list(models)
+    kalman = [name for name in named if is_classical(name) and name != "ins"]
+    if not kalman or all(map(is_classical, named)) or tuning != Tuning():
+        return None
+    return (
+        f"{', '.join(kalman)}: noise of imu={imu} as it stands, untuned; before a comparison tune on other drives "
+        "(dlkf tune), or give tuning=any_car for an unknown car"
+    )
 
 
 def sigma_warnings(scores: Scores) -> list[str]:
