@@ -86,7 +86,7 @@ def test_further_sensors_are_taken(drive):
     fixes = drive["gnss"]
     wheel = pd.DataFrame({"t": fixes.t, "speed": np.hypot(fixes.vel_n, fixes.vel_e)})
     solution = dlkf.navigate(drive["imu"], fixes, model="mbkf21_nhc", speed=wheel)
-    assert solution["speed_used"].sum() > 20 and "wheel_scale" in solution.summary
+    assert solution["speed_used"].sum() > 20 and "wheel scale error" in solution.summary
     assert "speed_used" not in dlkf.navigate(drive["imu"], fixes, model="mbkf15", speed=wheel)
 
 

@@ -22,6 +22,7 @@ class LossHistory(Callback):
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """A heading where training begins."""
         if trainer.is_global_zero and trainer.current_epoch == 0:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
             self._write("w", ["epoch", *COLUMNS])
 
     def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
