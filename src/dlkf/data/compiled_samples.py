@@ -26,7 +26,7 @@ def compose(t: np.ndarray, columns: tuple[np.ndarray, ...], at: np.ndarray, usua
     """Specific force and rate (m, 6), of samples of ``step`` [s] between the limits ``at`` (m + 1,), of six columns
     (n,) of samples that end at ``t``: :func:`dlkf.data.resampling.resample_imu`."""
     out = np.empty((len(at) - 1, 6))
-    _compose(t, columns, at, usual, step, out)
+    _compose(t, columns, at, usual, step, int(np.searchsorted(t, at[0], side="right")) + 1, out)
     return out
 
 
@@ -90,9 +90,9 @@ def _integral(t, x, usual, k):
 
 @njit(nogil=True)
 @no_type_check
-def _compose(t, x, at, usual, step, out):
+def _compose(t, x, at, usual, step, p, out):
+    """``p``: the segment that holds the beginning, or one after it."""
     n = len(t)
-    p = int(np.searchsorted(t, at[0], side="right")) + 1  # the segment that holds the beginning
     while p >= 0 and _knot(t, n, usual, p) > at[0]:
         p -= 1
     p -= 1

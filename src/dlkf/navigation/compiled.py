@@ -305,7 +305,9 @@ def _eliminate(S, X):
     B, m, n = X.shape
     W, pivot = np.empty((m, m + n), S.dtype), np.empty(m + n, S.dtype)  # S beside X
     for b in range(B):
-        W[:, :m], W[:, m:] = S[b], X[b]
+        for i in range(m):  # element by element: numba takes seconds to compile what checks the shapes of slices
+            for c in range(m + n):
+                W[i, c] = S[b, i, c] if c < m else X[b, i, c - m]
         for j in range(m):
             inverse = 1 / W[j, j]
             for c in range(m + n):
@@ -314,8 +316,11 @@ def _eliminate(S, X):
                 factor = W[i, j]
                 for c in range(m + n):
                     W[i, c] -= factor * pivot[c]
-            W[j] = pivot
-        X[b] = W[:, m:]
+            for c in range(m + n):
+                W[j, c] = pivot[c]
+        for i in range(m):
+            for c in range(n):
+                X[b, i, c] = W[i, m + c]
 
 
 @njit()

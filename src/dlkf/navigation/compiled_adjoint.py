@@ -52,7 +52,8 @@ def _adjoint(C0, imu, gradient, w, Gp, Gv, GC, dt, grad_p0, grad_v0, turn, grad_
     gained, moved = np.empty((M, 3)), np.empty((M, 3))
     zero = 0.0, 0.0, 0.0
     for b in range(B):
-        A[0] = C0[b]
+        for i in range(3):
+            A[0, i, 0], A[0, i, 1], A[0, i, 2] = row(C0, b, i)
         for k in range(M):
             phi = imu[b, k, 3] * dt, imu[b, k, 4] * dt, imu[b, k, 5] * dt
             once, twice = gains(phi, row(imu, b, k), dt)
