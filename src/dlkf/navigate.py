@@ -31,7 +31,7 @@ from dlkf.onboard.compiled_filter import compile_filter, compile_or_keep
 from dlkf.onboard.core_drives import run_core_drive, runs_in_core
 from dlkf.report.navigation import MOST_DRIVES, TrackOnMap, navigation_page, summary_lines
 from dlkf.running import offline
-from dlkf.running.exports import choose_formats, export, row_qualities, utc_times
+from dlkf.running.exports import choose_formats, export, find_row_qualities, utc_times
 from dlkf.running.innovations import OF_NETWORK, REMEDY
 from dlkf.running.likelihood import check_finds_noise, generic_filter
 from dlkf.running.replay import stream_drives
@@ -104,7 +104,7 @@ def main(settings: NavigateSettings) -> None:
             write_solution(folder / f"drive={result.drive}" / "solution.parquet", result.table)
             when = utc_times(result.table, clocks.get(result.drive), settings.export_clock)
             fixes = spacings[result.drive]
-            qualities = row_qualities(result.table, fixes.t, fixes.quality)
+            qualities = find_row_qualities(result.table, fixes.t, fixes.quality)
             export(folder / f"drive={result.drive}", result.table, formats, when, result.drive, qualities)
             lines.append(result.summary(fixes))
             course = TrackOnMap(result, fixes)

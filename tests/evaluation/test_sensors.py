@@ -11,7 +11,7 @@ import torch
 from dlkf.data.aid_tables import STANDARD
 from dlkf.evaluation.sensors import sensor_table
 from dlkf.filters.aids.attach import SOURCES, aid_columns, with_aids
-from dlkf.filters.aids.estimates import estimate_heading, format_estimate
+from dlkf.filters.aids.estimates import format_estimate, label_estimate
 from dlkf.filters.build import build_filter
 from tests.cars import IMU, car_batch
 from tests.evaluation.scoring import score
@@ -70,4 +70,4 @@ def test_an_estimate_has_as_many_digits_as_its_sigma_allows(name, value, std, sh
 def test_every_estimate_of_a_source_has_words_and_a_unit():
     for source in SOURCES.values():
         for name in getattr(source, "parameters", {}):
-            assert estimate_heading(name) != name
+            assert label_estimate(name) != name

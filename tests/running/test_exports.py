@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from dlkf.base.errors import InputError
 from dlkf.data.readers.units import GPS_EPOCH_UNIX
 from dlkf.data.tables import DriveClock
-from dlkf.running.exports import FORMATS, choose_formats, export, poses, row_qualities, utc_times
+from dlkf.running.exports import FORMATS, choose_formats, export, find_row_qualities, poses, utc_times
 from dlkf.running.solution import COLUMNS, SCHEMA, write_solution
 
 KML, GX = "{http://www.opengis.net/kml/2.2}", "{http://www.google.com/kml/ext/2.2}"
@@ -47,7 +47,7 @@ def folder(table, tmp_path_factory):
     """All formats, with a known date."""
     out = tmp_path_factory.mktemp("exports")
     when, fixes = utc_times(table, DriveClock(MONDAY), "unix"), table["t"].to_numpy() - 0.2
-    quality = row_qualities(table, fixes, np.where(fixes < 10, 1, np.where(fixes < 45, 5, 4)))
+    quality = find_row_qualities(table, fixes, np.where(fixes < 10, 1, np.where(fixes < 45, 5, 4)))
     export(out, table, choose_formats("all"), when, "town & country", quality)
     return out
 

@@ -164,7 +164,7 @@ def test_its_own_preset_is_right_where_all_errors_are_states(tmp_path, name: str
 
 def test_a_warning_has_the_number_of_the_tables_unless_uncertain_first_updates_hide_the_fault() -> None:
     x = 2.0 * np.random.default_rng(0).standard_normal((SETTLE + 60, 6))
-    assert fit_sigma(x).told == pytest.approx(rms(x))
+    assert fit_sigma(x).reported_ratio == pytest.approx(rms(x))
     few = x[: SETTLE + 6]
     few[:SETTLE] = 0.0
-    assert rms(few) < fit_sigma(few).high and fit_sigma(few).told == fit_sigma(few).ratio > 1.5
+    assert rms(few) < fit_sigma(few).high and fit_sigma(few).reported_ratio == fit_sigma(few).ratio > 1.5

@@ -169,10 +169,10 @@ def test_the_best_prior_is_the_best_of_all_that_were_tried(cars, monkeypatch):
     tunings, name = [Tuning(), Tuning(accel_noise=30.0, gyro_noise=30.0)], "mbkf33_prior"
     steps = []
 
-    def told(*step):
+    def record(*step):
         steps.append(step)
 
-    prior, tuning = best_prior(expected, tunings, [hidden(batch)], name, longer=[batch], progress=told)
+    prior, tuning = best_prior(expected, tunings, [hidden(batch)], name, longer=[batch], progress=record)
     known = [mean_imu_error(expected, t, [batch], "mbkf33") for t in tunings]
     trials = [(p.scale_spread(b, m), t) for p in known for b in (3.0, 0.3) for m in (10.0, 1.0) for t in tunings]
     tried = {

@@ -168,7 +168,7 @@ def read_table(folder: str | Path, kind: str, drive: str, column: str = "") -> C
     return rows if len(rows["t"]) else None
 
 
-def first_stamps(folder: str | Path, kind: str, drive: str, count: int = 1000) -> np.ndarray:
+def read_first_stamps(folder: str | Path, kind: str, drive: str, count: int = 1000) -> np.ndarray:
     """The first ``t`` [s] of a drive's table, without reading the rest; none of one that is missing or damaged."""
     try:
         part = min((resolve_place(folder) / kind / f"drive={drive}").glob("*.parquet"))

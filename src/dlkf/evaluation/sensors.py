@@ -10,7 +10,7 @@ from dlkf.evaluation.metrics import Array
 from dlkf.evaluation.results import last_finite
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.table import ResultTable
-from dlkf.filters.aids.estimates import estimate_heading, format_estimate
+from dlkf.filters.aids.estimates import format_estimate, label_estimate
 
 TITLE = "Further sensors"
 COLUMNS = ["Filter", "Sensor", "Updates", "Used\n[%]", "Innovation\n/ σ"]
@@ -43,7 +43,7 @@ def sensor_table(scores: Scores, columns: Mapping[str, Sequence[str]]) -> Result
     return ResultTable(
         title=TITLE,
         note=f"{NOTE} {FOUND}" if estimates else NOTE,
-        columns=[*COLUMNS, *map(estimate_heading, estimates)],
+        columns=[*COLUMNS, *map(label_estimate, estimates)],
         rows=[[*row, *(of_row.get(n, "–") for n in estimates)] for row, of_row in zip(rows, found)],
     )
 

@@ -88,7 +88,7 @@ class Solution(pd.DataFrame):
         InputError
             For an unknown format, a date that is none, or a folder that cannot be written to.
         """
-        from dlkf.running.exports import choose_formats, export, row_qualities, utc_times
+        from dlkf.running.exports import choose_formats, export, find_row_qualities, utc_times
 
         if not isinstance(folder, (str, Path)):
             raise InputError(f"folder is {folder!r}, must be a path")
@@ -97,7 +97,7 @@ class Solution(pd.DataFrame):
         names = choose_formats([formats] if isinstance(formats, str) else list(formats))
         clock, counts = _clock(start_utc)
         when = utc_times(self, clock, counts)
-        qualities = row_qualities(self, self._fixes.t, self._fixes.quality)
+        qualities = find_row_qualities(self, self._fixes.t, self._fixes.quality)
         place = Path(folder).expanduser()
         try:
             place.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dlkf.filters.aids.estimates import estimate_heading, format_estimate
+from dlkf.filters.aids.estimates import format_estimate, label_estimate
 from dlkf.running.offline import Navigated
 
 WORDS = {"speed": "Wheel speed", "baro": "Barometer"}  # of sensors; of others their name
@@ -28,6 +28,6 @@ def sensor_rows(drives: Sequence[Navigated]) -> tuple[list[str], list[list[str]]
         for name in (name for name in result.sensors() if f"std_{name}" in table):
             last = table.iloc[-1]
             cell = format_estimate(name, float(last[name]), float(last[f"std_{name}"]))
-            columns.setdefault(estimate_heading(name), {})[result.drive] = cell
+            columns.setdefault(label_estimate(name), {})[result.drive] = cell
     rows = [[result.drive, *(cells.get(result.drive, "–") for cells in columns.values())] for result in drives]
     return ["Drive", *columns] if columns else [], rows

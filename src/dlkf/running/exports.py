@@ -3,7 +3,7 @@
 All functions take the rows of ``solution.parquet`` and write one file. ``when`` is the UTC time of every row
 (:func:`utc_times`); None where the date is unknown: then tracks have no times, and NMEA and ``.pos``, which cannot do
 without, count seconds from midnight of 6 January 1980 (GPS week 0). These two also take the ``quality`` of
-every row (:func:`row_qualities`).
+every row (:func:`find_row_qualities`).
 """
 
 from __future__ import annotations
@@ -61,7 +61,9 @@ def utc_times(table: pd.DataFrame, clock: DriveClock | None, counts: str = "auto
     return [start + timedelta(microseconds=round(s * 1e6)) for s in seconds]
 
 
-def row_qualities(table: pd.DataFrame, t: NDArray[np.floating], quality: NDArray[np.integer]) -> NDArray[np.integer]:
+def find_row_qualities(
+    table: pd.DataFrame, t: NDArray[np.floating], quality: NDArray[np.integer]
+) -> NDArray[np.integer]:
     """NMEA GGA quality of every row: of the last of the fixes at ``t`` where one was used, else dead reckoning."""
     last = np.searchsorted(t, table["t"].to_numpy() + ON_BOUNDARY_S, side="right") - 1
     return np.where(table["gnss_used"], quality[last.clip(0)], DEAD_RECKONING)

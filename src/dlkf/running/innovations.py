@@ -75,21 +75,21 @@ class SigmaFit(NamedTuple):
         return self.ratio > TOLERATED * self.high
 
     @property
-    def told(self) -> float:
-        """That of all updates, as in tables; where uncertain first updates hide the fault, that of the later ones."""
+    def reported_ratio(self) -> float:
+        """Of all updates, as tables have it; where uncertain first updates hide the fault, of the later ones."""
         return self.of_all if self.of_all > self.high else self.ratio
 
     def warning(self, name: str, remedy: str = REMEDY) -> str:
         """One line with the remedy."""
         return (
-            f"{name} is overconfident: its innovations are {self.told:.2g} times their 1σ (RMS; by chance at "
+            f"{name} is overconfident: its innovations are {self.reported_ratio:.2g} times their 1σ (RMS; by chance at "
             f"most {self.high:.2g}), so in outages it drifts further than its 1σ says; "
             f"{self.remedy(remedy)}"
         )
 
     def short_warning(self, name: str) -> str:
         """The line behind that of another filter with the same remedy."""
-        return f"{name} is overconfident, too: {self.told:.2g} times (by chance at most {self.high:.2g})"
+        return f"{name} is overconfident, too: {self.reported_ratio:.2g} times (by chance at most {self.high:.2g})"
 
     def remedy(self, of_filter: str) -> str:
         """That of the filter, or of the data where the innovations are too large for any noise."""

@@ -34,7 +34,7 @@ ESTIMATES: Mapping[str, Readable] = {
 }
 
 
-def estimate_heading(name: str) -> str:
+def label_estimate(name: str) -> str:
     """``Wheel delay\\n[ms]``; an estimate of a source of one's own keeps its name."""
     known = ESTIMATES.get(name)
     return f"{known.words}\n[{known.unit}]" if known else name
@@ -47,7 +47,7 @@ def describe_estimate(name: str, value: float, std: float) -> str:
 
 
 def format_estimate(name: str, value: float, std: float) -> str:
-    """``3.04 ± 0.35`` in the unit of :func:`estimate_heading`; – if unknown."""
+    """``3.04 ± 0.35`` in the unit of :func:`label_estimate`; – if unknown."""
     factor = ESTIMATES[name].factor if name in ESTIMATES else 1.0
     value, std = value * factor, std * factor
     if not (math.isfinite(value) and math.isfinite(std)):
