@@ -18,7 +18,8 @@ from dlkf.command import command
 from dlkf.command.scored import TuneSettings
 from dlkf.data.store import choose_aids, dataset_digest, load_dataset
 from dlkf.evaluation.table import as_markdown, as_rich
-from dlkf.filters.aids.attach import append_aids
+from dlkf.filters.aids.attach import append_aids, refuse_left_out
+from dlkf.filters.build import build_filter
 from dlkf.tracking.runs import start_run, tracking_uri
 from dlkf.tuning.found import find_dataset_noise, noise_table, write_noise
 from dlkf.tuning.study import LIKELIHOOD, check_settings, search, train_test_drives, tuning_table, write_tuning
@@ -31,6 +32,8 @@ def main(settings: TuneSettings) -> None:
     model = append_aids(str(settings.model), [table.name for table in chosen])
     name, spec, start = settings.name, settings.spec, settings.tuning
     check_settings(model, settings.objective)
+    if settings.aids is not None:
+        refuse_left_out({model: build_filter(model, spec)}, chosen)
     if is_url(settings.out):
         raise InputError(f"out={settings.out}: --config-dir takes folders of this machine alone; give one")
     require_store(settings.out)

@@ -141,7 +141,7 @@ def _end(error: BaseException, name: str) -> NoReturn:
     if isinstance(error, BrokenPipeError):  # as in ``dlkf … | head``: nobody reads on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nor what is still to be flushed
         sys.exit(UNREAD)
-    if (said := describe_fault(error)) is None:
+    if (said := describe_fault(error, name)) is None:
         raise error
     print(f"dlkf: error: {with_near_key(said, name)}", file=sys.stderr)
     sys.exit(MISTAKE)

@@ -40,13 +40,14 @@ SAID = {
     r"invalid accelerator name|[Yy]ou selected an invalid": "trainer.accelerator is unknown; known: auto, cpu, gpu",
 }
 LISTED = ("aids", "datasets", "drives", "export", "model", "models", "runs")  # keys that take a list of words
+ONE_FILTER = ("export", "navigate", "tune")  # commands that take one model
 UNKNOWN_KEY = (
     r"is not in struct[\s\S]*full_key: (\S+)", r"Could not override '([^']+)'",
     r"full_key: (\S+)[\s\S]*is not in struct", r"Key '([^']+)' is not in struct",
 )  # fmt: skip
 
 
-def describe_fault(error: BaseException) -> str | None:
+def describe_fault(error: BaseException, command: str = "") -> str | None:
     """One line: what a user or the machine did wrong, where, and how to mend it."""
     chain = list(_chain(error))
     for link in chain:
@@ -64,7 +65,7 @@ def describe_fault(error: BaseException) -> str | None:
                 return meaning
     for link in chain:
         if isinstance(link, (HydraException, OmegaConfBaseException)):
-            return one_line(link)
+            return one_line(link, command)
     return None
 
 
@@ -78,12 +79,12 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
         link = link.__cause__ or (None if link.__suppress_context__ else link.__context__)
 
 
-def one_line(error: BaseException) -> str:
+def one_line(error: BaseException, command: str = "") -> str:
     """A message as one line; Hydra's and OmegaConf's lists and hints are folded into it."""
     text = str(error)
     if several := re.search(r"Ambiguous value for argument '([^=']+)=([^']+)'", text):
         key, values = several.groups()
-        if key.rpartition(".")[2] not in LISTED:
+        if key.rpartition(".")[2] not in LISTED or (key == "model" and command in ONE_FILTER):
             quoted = f"'{key}=\"{values}\"' if that is one"
             return f"{key}={values}: takes one value; -m {key}={values} for a run each, {quoted}"
         return f"{key}={values}: several values are '{key}=[{values}]' as a list, or -m {key}={values} for a run each"
