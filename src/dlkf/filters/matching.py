@@ -17,7 +17,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dlkf.navigation import compiled
 from dlkf.navigation.state import ATTITUDE, IMU, PV, VELOCITY
 
 MEMORIES = (10.0, 60.0)  # fixes
@@ -28,8 +27,6 @@ LOG_FEATURES, AXIS_FEATURES = 12 + 24 + 12, 8 + 4
 
 def variance_along(P: Float[Tensor, "B k k"], axes: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B k"]:
     """Diagonal of Cᵀ P C for every 3 × 3 block on the diagonal of P; the columns of C are the axes."""
-    if compiled.fits(P):
-        return compiled.variance_along(P, axes.detach())
     blocks = P.unflatten(-1, (-1, 3)).unflatten(-3, (-1, 3)).diagonal(dim1=1, dim2=3)  # (B, 3, 3, blocks)
     along = torch.bmm(axes.mT, blocks.flatten(2)).unflatten(-1, (3, -1))
     return (along * axes.mT.unsqueeze(-1)).sum(2).mT.flatten(1)

@@ -68,8 +68,6 @@ def _rotation_planes(q: Tensor) -> Tensor:
 
 def vector_from_rotation(C: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     """Rotation vector log(C) [rad], |φ| ≤ π, through the quaternion: accurate for small and large angles."""
-    if compiled.fits(C):
-        return compiled.rotation_vectors(C)
     q = quaternion_from_rotation(C)
     w, u = q[..., :1], q[..., 1:]
     u, w = torch.where(w < 0, -u, u), w.abs()

@@ -135,13 +135,6 @@ def rotations(phi: Tensor) -> Tensor:
     return out
 
 
-def rotation_vectors(C: Tensor) -> Tensor:
-    """log(C) of rotation matrices (…, 3, 3)."""
-    out = C.new_empty(C.shape[:-1])
-    _rotation_vectors(C.reshape(-1, 3, 3).numpy(), out.view(-1, 3).numpy())
-    return out
-
-
 def gravity(
     p_n: Tensor, stretching: Tensor, centre: Tensor, axis: Tensor, shape: Tensor, constants: tuple[float, ...]
 ) -> Tensor:
@@ -150,13 +143,6 @@ def gravity(
     given: Any = (*(x.numpy() for x in (p_n, stretching, centre, axis, shape)), *constants, g.numpy())
     _gravity(*given)
     return g
-
-
-def variance_along(P: Tensor, axes: Tensor) -> Tensor:
-    """Diagonal of Cᵀ P C (B, k) for the 3 × 3 blocks on the diagonal of P (B, k, k), C = ``axes`` (B, 3, 3)."""
-    out = P.new_empty(P.shape[:2])
-    _variance_along(P.numpy(), axes.numpy(), out.numpy())
-    return out
 
 
 def solve(S: Tensor, X: Tensor) -> Tensor:
@@ -256,46 +242,6 @@ def _rotations(phi, out):
         R = rotation((phi[b, 0], phi[b, 1], phi[b, 2]))
         for i in range(3):
             out[b, i, 0], out[b, i, 1], out[b, i, 2] = R[i]
-
-
-@njit()
-@no_type_check
-def _rotation_vectors(C, out):
-    q = np.empty(4)
-    for b in range(len(C)):
-        R = C[b]
-        trace = R[0, 0] + R[1, 1] + R[2, 2]
-        i = 0
-        for j in range(1, 3):
-            if R[j, j] > R[i, i]:
-                i = j
-        # unit quaternion from the largest of its four elements (Shepperd 1978)
-        if trace >= R[i, i]:
-            q[0], q[1], q[2], q[3] = 1 + trace, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-        else:
-            j, k = (i + 1) % 3, (i + 2) % 3
-            q[0], q[1 + i] = R[k, j] - R[j, k], 1 + 2 * R[i, i] - trace
-            q[1 + j], q[1 + k] = R[j, i] + R[i, j], R[k, i] + R[i, k]
-        norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-        sign = -1.0 if q[0] < 0 else 1.0
-        w, s = abs(q[0]) / norm, math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3]) / norm
-        scale = 2 / w * (1 - s * s / (3 * w * w)) if s < 1e-4 else 2 * math.atan2(s, w) / s
-        for j in range(3):
-            out[b, j] = sign * scale * q[1 + j] / norm
-
-
-@njit()
-@no_type_check
-def _variance_along(P, C, out):
-    for b in range(len(P)):
-        for k in range(0, P.shape[1], 3):
-            for a in range(3):
-                axis = C[b, 0, a], C[b, 1, a], C[b, 2, a]
-                out[b, k + a] = dot(axis, (
-                    P[b, k, k] * axis[0] + P[b, k, k + 1] * axis[1] + P[b, k, k + 2] * axis[2],
-                    P[b, k + 1, k] * axis[0] + P[b, k + 1, k + 1] * axis[1] + P[b, k + 1, k + 2] * axis[2],
-                    P[b, k + 2, k] * axis[0] + P[b, k + 2, k + 1] * axis[1] + P[b, k + 2, k + 2] * axis[2],
-                ))  # fmt: skip
 
 
 @njit(error_model="numpy")  # what cannot be solved is not finite, as with LAPACK, and no error
