@@ -133,13 +133,12 @@ class LogReader:
         arm, found, mapping = self.lever_arm_m, (), {}
         if self.wanted:
             try:
-                settled = settle(mapped, t, self.wanted, self.sure, f"drive {name}", arm)
+                specs, arm, found = settle(mapped, t, self.wanted, self.sure, f"drive {name}", arm)
             except Unsure as unsure:
                 unsure.layout = layout(self.neutral)
                 raise
-            mapped = {kind: replace(part, spec=settled.specs[kind]) for kind, part in mapped.items()}
+            mapped = {kind: replace(part, spec=specs[kind]) for kind, part in mapped.items()}
             zero, t = self._times(mapped)
-            arm, found = settled.lever_arm_m, settled.notes
         frames = {kind: FRAMES[kind](part, t[kind]) for kind, part in mapped.items()}
         others = {kind: part for kind, part in every.items() if kind not in FRAMES}
         aids, specs, of_aids = read_aids(others, zero, mapped.get("gnss"), frames.get("gnss"), f"drive {name}")
