@@ -26,8 +26,11 @@ from dlkf.data.readers.offers import (
 from dlkf.data.readers.settling import Unsure
 from dlkf.data.readers.sharing import merge_settings
 
-# presets whose files are known by a name
-LAYOUTS = {"kitti": "oxts/timestamps.txt", "sensor_logger": "TotalAcceleration.csv", "phyphox": "Gyroscope.csv"}
+LAYOUTS = {  # presets whose files are known by their names
+    "kitti": ("oxts/timestamps.txt",),
+    "sensor_logger": ("TotalAcceleration.csv",),
+    "phyphox": ("Gyroscope.csv", "Location.csv"),
+}
 BAROMETERS = {"sensor_logger": "Barometer.csv", "phyphox": "Pressure.csv"}
 TABLES = (".csv", ".tsv", ".txt", ".dat")
 DAMAGED = ("not a whole", "cannot be opened")  # how a line on a file begins that may hold the fixes
@@ -184,17 +187,13 @@ class AutoReader:
 
 def _recognise_files(folder: Path) -> list[Contents]:
     """What the files of a folder hold; of one whose files are known by their names, that."""
-    for name, file in LAYOUTS.items():
-        if (folder / file).is_file():
-            if name == "phyphox" and not (folder / "Location.csv").is_file():
-                continue
+    for name, files in LAYOUTS.items():
+        if all((folder / file).is_file() for file in files):
             base = load_preset(name)
-            specs = {kind: base[kind] for kind in ("imu", "gnss")}
-            beside = BAROMETERS.get(name, "")
-            specs = leave_open(specs)
-            if beside and (folder / beside).is_file():  # by the clock of the IMU
+            specs = leave_open({kind: base[kind] for kind in ("imu", "gnss")})
+            if (beside := BAROMETERS.get(name)) and (folder / beside).is_file():  # by the clock of the IMU
                 specs["baro"] = {**base["baro"], "file": beside}
-            return [Contents(folder / file, [Offer(folder / file, f"layout of {name}", specs)])]
+            return [Contents(folder / files[0], [Offer(folder / files[0], f"layout of {name}", specs)])]
     return [recognise_file(p) for p in sorted(folder.iterdir()) if p.is_file() and not p.name.startswith(".")]
 
 
@@ -282,13 +281,9 @@ def _find_velocities(chosen: Offer, gnss: Mapping[str, Any], files: Iterable[Pat
 
 def _find_unread(within: Iterable[Contents], only: Path | None) -> Contents | None:
     """A text table or a receiver's log beside the IMU's file of which nothing is known; None where there is none."""
-    unread = [one for one in within if not one.offers] if only is None else []
-    logs = (
-        one
-        for one in unread
-        if one.path.suffix.lower() in RECEIVERS
-        or one.held.startswith(DAMAGED)
-        or one.path.suffix.lower() in NO_LOGS
-        or (one.path.suffix.lower() in TABLES and (find_format(one.path) == "csv" or one.held == "empty"))
-    )
-    return next(logs, None)
+    for one in within if only is None else ():
+        suffix = one.path.suffix.lower()
+        of_text = suffix in TABLES and (find_format(one.path) == "csv" or one.held == "empty")
+        if not one.offers and (of_text or suffix in (*RECEIVERS, *NO_LOGS) or one.held.startswith(DAMAGED)):
+            return one
+    return None

@@ -38,8 +38,8 @@ NAVEGO = {"imu": "fb_0", "gnss": "stdm_0"}  # a column of each of NaveGo's struc
 
 @dataclass(frozen=True)
 class Offer:
-    """What a file, or a table in it, can give: ``specs`` of a mapping by kind: imu, gnss, speed, heading, baro, and accel
-    or gyro where that sensor stands alone."""
+    """What a file, or a table in it, can give: ``specs`` of a mapping by kind, imu, gnss, speed, heading, baro, and
+    accel or gyro where that sensor stands alone."""
 
     path: Path
     detail: str
@@ -96,7 +96,7 @@ def recognise_file(path: Path) -> Contents:
 def _offer_preset(path: Path, name: str) -> Contents:
     base = load_preset(name)
     source = {"file": path.name, "text": _preset_text(base)}
-    lacks = {kind: _describe_lack(path, name, kind) for kind in ("imu", "gnss")}
+    lacks = {kind: _describe_lack(path, name, kind, base) for kind in ("imu", "gnss")}
     specs = {kind: {**base[kind], **source} for kind, why in lacks.items() if why is None}
     held = f"{name}, {', '.join(f'no {kind.upper()}{why}' for kind, why in lacks.items() if why is not None)}"
     module = WITH_AIDS.get(name)
@@ -104,7 +104,7 @@ def _offer_preset(path: Path, name: str) -> Contents:
     return Contents(path, [Offer(path, f"{name}, as reader={name}", leave_open(specs))] if specs else [], held)
 
 
-def _describe_lack(path: Path, name: str, kind: str) -> str | None:
+def _describe_lack(path: Path, name: str, kind: str, base: Mapping[str, Any]) -> str | None:
     """Why a file of a preset's format gives no ``kind``, empty if there is no reason; None where it does."""
     if name == "rosbag":
         return None if rosbag.holds(path, kind) else f" among its topics ({rosbag.list_topics(path)})"
@@ -112,7 +112,6 @@ def _describe_lack(path: Path, name: str, kind: str) -> str | None:
         return None
     if name in GNSS_ONLY:
         return ""
-    base = load_preset(name)
     try:
         spec, options = base[kind], {**_preset_text(base), "lines": base[kind].get("lines")}
         table = formats.read(spec["format"], path, kind=kind, table=spec.get("table"), text=options, where="")

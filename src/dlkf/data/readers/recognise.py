@@ -131,7 +131,7 @@ def gnss_spec(table: LogTable) -> Recognised | None:
     if quality is not None:
         out["quality"] = quality
     if "std_position" not in out and found["hdop"] is not None:
-        spec, note = _dilutions(frame[known], found, quality)
+        spec, note = _dilutions(table.frame[known], found, quality)
         out |= spec
         notes.append(note)
     if held is not None:
@@ -146,11 +146,9 @@ def _velocity_by_numbers(table: LogTable, frame: pd.DataFrame, time: Spec, posit
     scale = {"deg": 1.0, "1e-7deg": 1e-7, "rad": 180 / np.pi}.get(position["unit"])
     if scale is None:
         return {"columns": None}
-    names = [str(c) for c in frame.columns]
     taken = {*position["columns"], *(time["column"] if isinstance(time["column"], list) else [time["column"]])}
-    rest = [k for k, name in enumerate(names) if name not in taken]
     lat, lon = (scale * frame[c].to_numpy(float) for c in position["columns"][:2])
-    return by_numbers.velocities(t, lat, lon, names, frame.to_numpy(float), rest)
+    return by_numbers.velocities(t, lat, lon, frame[[c for c in frame.columns if str(c) not in taken]])
 
 
 def _hemispheres(frame: pd.DataFrame) -> list[str] | None:
