@@ -150,9 +150,8 @@ class AutoReader:
         if len(fits) > 1:
             key = "table" if len({o.path for o in fits}) == 1 else "file"
             names = ", ".join((o.table or o.name) if key == "table" else o.name for o in fits)
-            what, none = (
-                (kind.upper(), "") if kind in ("imu", "gnss") else (kind, f", or reader.{kind}.file=null for none")
-            )
+            needed = kind in ("imu", "gnss")
+            what, none = kind.upper() if needed else kind, "" if needed else f", or reader.{kind}.file=null for none"
             raise InputError(f"{folder}: {names} all hold {what}; choose one with reader.{kind}.{key}{none}")
         return fits[0] if fits else None
 
@@ -283,7 +282,7 @@ def _find_unread(within: Iterable[Contents], only: Path | None) -> Contents | No
     """A text table or a receiver's log beside the IMU's file of which nothing is known; None where there is none."""
     for one in within if only is None else ():
         suffix = one.path.suffix.lower()
-        of_text = suffix in TABLES and (find_format(one.path) == "csv" or one.held == "empty")
-        if not one.offers and (of_text or suffix in (*RECEIVERS, *NO_LOGS) or one.held.startswith(DAMAGED)):
+        known = suffix in (*RECEIVERS, *NO_LOGS) or one.held.startswith(DAMAGED)
+        if not one.offers and (known or (suffix in TABLES and (one.held == "empty" or find_format(one.path) == "csv"))):
             return one
     return None
