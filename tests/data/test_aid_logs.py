@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from dlkf.base.errors import InputError
-from dlkf.data.discovery.motion import motion
+from dlkf.data.discovery.motion import find_motion
 from dlkf.data.discovery.wheel import find_wheel
 from dlkf.data.intake import IngestOptions, ingest, ingest_drives
 from dlkf.data.readers.auto import AutoReader
@@ -314,9 +314,7 @@ def test_an_odometer_of_kf_gins(tmp_path, drive):
 
 def test_what_a_wheel_cannot_tell(drive):
     """A constant speed has no clock; noise agrees with nothing."""
-    gnss = drive["gnss"]
-    v = np.stack([gnss[f"vel_{a}"] for a in "ned"], -1)
-    moved = motion(gnss.t.to_numpy(), gnss.lat_deg.to_numpy(), gnss.lon_deg.to_numpy(), v)
+    moved = find_motion(drive["gnss"])
     t = drive["wheel"].t.to_numpy()
     assert find_wheel(t, np.full(len(t), 10.0), moved) is None
     noise = find_wheel(t, np.random.default_rng(0).uniform(0, 20, len(t)), moved)

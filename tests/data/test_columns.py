@@ -147,6 +147,7 @@ def test_accuracies_and_dilutions():
     found, notes = gnss_spec(fixes(hdop=0.7, quality=2))
     assert found["std_position"] == {"columns": ["hdop", "hdop"], "unit": 1.0}
     assert any("1 m times hdop" in note for note in notes)
+    assert gnss_spec(fixes(hdop=0.7, fix="RTK fixed")).spec["std_position"]["unit"] == 0.02  # a quality in words
     found = gnss_spec(fixes(sdn=0.1, sde=0.1, sdu=0.2, **{"alt_ft": 3.0})).spec
     assert found["std_position"]["columns"] == ["sdn", "sde", "sdu"]
 

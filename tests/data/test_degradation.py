@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dlkf.base.errors import InputError
-from dlkf.data.degradation import GnssNoise
+from dlkf.data.masks import GnssNoise
 from dlkf.data.store import load_dataset
 from tests.cars import write_cars
 

@@ -16,7 +16,7 @@ from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import ImuSums, describe_offset, find_lag
 from dlkf.data.discovery.drift import compare_ends, ends_std, find_drifting_pose, middle
 from dlkf.data.discovery.findings import discover, find_value
-from dlkf.data.discovery.motion import integrate_level, motion, position_delay
+from dlkf.data.discovery.motion import find_motion, integrate_level, position_delay
 from dlkf.data.discovery.orientation import find_pose
 from dlkf.data.discovery.units import accel_units, nearest_unit, time_unit, unit_left
 from dlkf.data.intake import ingest_drives
@@ -37,12 +37,7 @@ TURN = Rotation.from_euler("ZYX", [130.0, -35.0, 70.0], degrees=True).as_matrix(
 def _arrays(tables, turn=TURN, offset=0.0):
     imu, gnss = tables["imu"], tables["gnss"]
     accel, gyro = (imu[list(c)].to_numpy() @ turn.T for c in (ACCEL, GYRO))
-    v = gnss[list(VELOCITY)].to_numpy()
-    return imu.t.to_numpy(), accel, gyro, motion(gnss.t.to_numpy() - offset, *_place(gnss), v)
-
-
-def _place(gnss):
-    return gnss.lat_deg.to_numpy(), gnss.lon_deg.to_numpy()
+    return imu.t.to_numpy(), accel, gyro, find_motion(gnss.assign(t=gnss.t - offset))
 
 
 @pytest.mark.parametrize("offset", [0.0, 18.0, -5123.4, 604_800.0 * 3 + 0.37])
@@ -199,7 +194,7 @@ def test_positions_older_than_velocities(drive):
     late = gnss.copy()
     late[["lat_deg", "lon_deg"]] = gnss[["lat_deg", "lon_deg"]].shift(2)
     late = late.iloc[2:]
-    delay, std = position_delay(late.t.to_numpy(), *_place(late), late[list(VELOCITY)].to_numpy())
+    delay, std = position_delay(late)
     assert delay == pytest.approx(0.2, abs=5e-3) and std < 0.02
 
 
@@ -210,8 +205,7 @@ def test_nothing_is_made_up():
     t = tables["imu"].t.to_numpy()
     noise = rng.normal(0, 0.3, (2, len(t), 3)) + np.array([[[0, 0, -9.8]], [[0, 0, 0]]])
     gnss = tables["gnss"]
-    v = gnss[list(VELOCITY)].to_numpy()
-    for moved in (motion(gnss.t.to_numpy(), *_place(gnss), v), motion(gnss.t.to_numpy(), *_place(gnss), 0 * v)):
+    for moved in (find_motion(gnss), find_motion(gnss.assign(**dict.fromkeys(VELOCITY, 0.0)))):
         lag = find_lag(ImuSums.of(t, noise[0], noise[1]), moved)
         assert lag is None or not lag.clear
         pose = find_pose(t, noise[0], noise[1], moved, 0.0)

@@ -36,16 +36,6 @@ DROP = "; leave it out with aids=[]"
 
 def check_aid(name: str, table: Columns, imu: Columns, moved: Motion, where: str) -> None:
     """InputError for the first fault of an aid's table; ``moved`` is the motion by GNSS."""
-    _check_values(name, table, imu, where)
-    if name == "speed":
-        _check_speed(table, moved, where)
-    elif name == "heading":
-        _check_heading(table, moved, where)
-    elif name == "baro":
-        _check_baro(table, where)
-
-
-def _check_values(name: str, table: Columns, imu: Columns, where: str) -> None:
     t = table["t"]
     values = [c for c in table if c not in ("t", "std")]
     if not values:
@@ -61,6 +51,12 @@ def _check_values(name: str, table: Columns, imu: Columns, where: str) -> None:
             f"{where}: t from {t[0]:.3f} to {t[-1]:.3f} lies outside the IMU's {imu['t'][0]:.3f} to "
             f"{imu['t'][-1]:.3f}; both need the same clock"
         )
+    if name == "speed":
+        _check_speed(table, moved, where)
+    elif name == "heading":
+        _check_heading(table, moved, where)
+    elif name == "baro":
+        _check_baro(table, where)
 
 
 def _check_speed(table: Columns, moved: Motion, where: str) -> None:

@@ -13,10 +13,9 @@ import torch
 from dlkf.base.console import ProgressCallback
 from dlkf.base.errors import InputError
 from dlkf.data.augmentation import turn_frames
-from dlkf.data.degradation import GnssNoise
 from dlkf.data.draws import combine_seed
 from dlkf.data.drive import Batch, Drive
-from dlkf.data.masks import BiasLaw, Outage, add_bias, mask_outage, withhold_fixes
+from dlkf.data.masks import BiasLaw, GnssNoise, Outage, add_bias, mask_outage, withhold_fixes
 from dlkf.data.segments import (
     Segment,
     StartLaw,

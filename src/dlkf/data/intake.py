@@ -17,7 +17,7 @@ from dlkf.base.errors import InputError
 from dlkf.base.files import absolute_place, is_url, replace_file
 from dlkf.base.parallel import check_engine, parallel_map
 from dlkf.data.plausibility import describe_drift, describe_rotation
-from dlkf.data.readers.frames import DriveFrames
+from dlkf.data.readers.frames import DriveFrames, Place
 from dlkf.data.readers.settling import Unsure
 from dlkf.data.readers.sharing import agrees, layout, list_settings, pool_settings
 from dlkf.data.schema import new_dataset, write_drive, write_drives_table
@@ -81,7 +81,7 @@ def ingest(
         raise InputError(f"source={source}: is a dataset already; navigate and evaluate take dataset={source}")
     if not hasattr(reader, "places"):
         return ingest_drives(reader.read(source), out, how, **options)
-    places = absolute_places(reader, source)
+    places = reader.places(source)
 
     def taking(folder: str) -> Iterable[IngestResult]:
         take_in = partial(how.take_in, folder=absolute_place(folder))
@@ -90,26 +90,19 @@ def ingest(
     return _write_dataset(taking, out, how, **options)
 
 
-AbsolutePlace = tuple[str, str, str | None]
 TakeIn = Callable[[DriveFrames], IngestResult]  # what becomes of a drive that was read
 
 
-def absolute_places(reader: Any, source: str | Path) -> list[AbsolutePlace]:
-    """Where a reader finds the drives of ``source``, for :func:`read_together`."""
-    return [
-        (absolute_place(folder), name, only and absolute_place(only)) for folder, name, only in reader.places(source)
-    ]
-
-
 def read_together(
-    reader: Any, take_in: TakeIn, places: Sequence[AbsolutePlace], parallel: int | str | None, skip_unsure: bool
+    reader: Any, take_in: TakeIn, places: Sequence[Place], parallel: int | str | None, skip_unsure: bool
 ) -> Iterator[IngestResult]:
-    """What ``take_in`` makes of the drives that are sure, then of those that are with what these found, then lines on
-    those that disagree."""
-    doubts: dict[AbsolutePlace, Unsure] = {}
+    """What ``take_in`` makes of the drives at a reader's places that are sure, then of those that are with what these
+    found, then lines on those that disagree."""
+    places = [(Path(folder).absolute(), name, only and Path(only).absolute()) for folder, name, only in places]
+    doubts: dict[Place, Unsure] = {}
     mappings: list[dict[str, Any]] = []
 
-    def read_all(reader: Any, places: Sequence[AbsolutePlace]) -> Iterator[tuple[AbsolutePlace, IngestResult]]:
+    def read_all(reader: Any, places: Sequence[Place]) -> Iterator[tuple[Place, IngestResult]]:
         for place, result in zip(places, parallel_map(partial(_read_there, reader, take_in), places, parallel)):
             doubts.pop(place, None)
             if isinstance(result, Unsure):
@@ -140,14 +133,13 @@ def read_together(
         yield IngestResult([], [], (f"left out: {doubt}",), {})
 
 
-def _read_there(reader: Any, take_in: TakeIn, place: AbsolutePlace) -> IngestResult | Unsure:
-    folder, name, only = place
+def _read_there(reader: Any, take_in: TakeIn, place: Place) -> IngestResult | Unsure:
     try:
-        drive = reader.drive_at(Path(folder), name, only and Path(only))
+        drive = reader.drive_at(*place)
     except Unsure as doubt:
         return doubt
     except MemoryError:
-        raise InputError(f"drive {name}: its logs do not fit into memory; split them, or write Parquet") from None
+        raise InputError(f"drive {place[1]}: its logs do not fit into memory; split them, or write Parquet") from None
     return take_in(drive)
 
 

@@ -46,7 +46,7 @@ def drive_imus(dataset: str | Path) -> dict[str, str]:
 
 def drive_rates(dataset: str | Path) -> dict[str, float]:
     """Samples a second [Hz] of every drive's IMU, by the median step of its first stamps."""
-    steps = {str(row["drive"]): np.diff(read_first_stamps(dataset, "imu", str(row["drive"]))) for row in _rows(dataset)}
+    steps = {str(row["drive"]): np.diff(read_first_stamps(dataset, str(row["drive"]))) for row in _rows(dataset)}
     return {drive: float(1 / np.median(step)) for drive, step in steps.items() if len(step) and np.median(step) > 0}
 
 

@@ -1,4 +1,5 @@
-"""Plausibility of a drive's numbers: wrong units, axes that do not point Forward-Right-Down, swapped columns.
+"""Plausibility of a drive's numbers: wrong units, dead, mirrored or exchanged axes, ones that do not point
+Forward-Right-Down, swapped columns.
 
 Each check compares with other data of the drive (gravity, the velocities, the course), so that an
 unusual drive does not raise an alarm.
@@ -10,8 +11,7 @@ import numpy as np
 
 from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
-from dlkf.data.axis_checks import CHUNK_S, check_climb, check_dead_axes, check_handedness
-from dlkf.data.discovery.clock import ImuSums, describe_offset, find_lag
+from dlkf.data.discovery.clock import ImuSums, Lag, describe_offset, find_lag
 from dlkf.data.discovery.drift import ROUGH_S, compare_ends, find_drifting_pose
 from dlkf.data.discovery.motion import Motion, find_motion, stretches
 from dlkf.data.limits import DEGREE_M, NOWHERE_DEG
@@ -36,6 +36,11 @@ APART_S = 1.0  # less is a delay, which the filters bear; dlkf.ingest measures i
 DRIFTED_S = 0.1  # from a drive's first to its last second: worth a line
 SHORTEST_S = 60.0  # of a drive whose drift is observable
 TURNED_DEG = (30.0, 150.0)  # backwards is found by the filters' own search
+MOVING, TURNED, SPEED_CHANGE = 3.0, 1.0, 3.0  # m/s; rad and m/s over a drive that an axis at work must show
+YAW_AGREES, FORCE_DISAGREES, FORCE_AGREES = 0.85, 0.6, 0.85  # correlations with GNSS
+CHUNK_S = 10.0  # way, height and course are compared over such stretches: metres of GNSS noise do not matter
+LEAST_CLIMB_M, ALIKE = 1.0, 0.9  # RMS of the climb; correlation
+FEET = (2.5, 4.2)  # of the climb by heights to that by velocities
 
 
 def check_imu_units(imu: Columns, where: str) -> None:
@@ -102,7 +107,7 @@ def check_gnss_units(gnss: Columns, where: str) -> None:
         raise InputError(f"{where}: fix {bad[0]}: lon_deg is {lon[bad[0]]:.4f}; must lie within ±180 degrees{remedy}")
     _check_places(lat, lon, where)
     _check_way(gnss, where)
-    check_climb(gnss, where)
+    _check_climb(gnss, where)
 
 
 def _other_degrees(lat: np.ndarray) -> str:
@@ -186,6 +191,32 @@ def _check_way(gnss: Columns, where: str) -> None:
         )
 
 
+def _check_climb(gnss: Columns, where: str) -> None:
+    """Heights against the integral of the downward velocity over stretches of ten seconds."""
+    t, height, down = gnss["t"], gnss["height_m"], gnss["vel_d"]
+    known = np.isfinite(height) & np.isfinite(down)
+    t, height, down = t[known], height[known], down[known]
+    if len(t) < 20:
+        return
+    step = np.diff(t)
+    fallen = np.concatenate(([0.0], np.cumsum(step * (down[1:] + down[:-1]) / 2)))
+    first, last = stretches(t, CHUNK_S, step > 2.0)
+    climbed, rose = height[last] - height[first], fallen[first] - fallen[last]
+    if len(rose) < 10 or np.sqrt(np.mean(rose**2)) < LEAST_CLIMB_M:
+        return
+    slope = float(climbed @ rose / (rose @ rose))
+    alike = abs(float(climbed @ rose)) / max(float(np.linalg.norm(climbed) * np.linalg.norm(rose)), 1e-12)
+    if alike < ALIKE:
+        return
+    if slope < -0.5:
+        raise InputError(f"{where}: vel_d grows where the height does: it counts upwards; negate vel_d")
+    if FEET[0] < slope < FEET[1]:
+        raise InputError(
+            f"{where}: heights change {slope:.2f} times as much as the vertical velocity says: look like feet; "
+            "reader.gnss.position.height_unit=ft, or multiply height_m by 0.3048"
+        )
+
+
 def check_turns(imu: Columns, gnss: Columns, where: str) -> None:
     """Integrated gyro_z against the change of course between fixes, where the drive turns enough."""
     t, course = gnss["t"], np.arctan2(gnss["vel_e"], gnss["vel_n"])
@@ -227,12 +258,12 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
     Then the force forward and right also shows whether the sensor looks along the car.
     """
     t, accel, gyro, moved = _signals(imu, gnss)
-    check_dead_axes(imu, moved, where)
+    _check_dead_axes(imu, moved, where)
     sums = ImuSums.of(t, accel, gyro)
     _check_drift(sums, moved, where)
     best = find_lag(sums, moved, SEARCH_S)
-    check_handedness(t, accel, gyro, moved, best, APART_S, where)
-    if best is None or not best.clear or min(best.yaw, best.force) < 0.6 or max(best.yaw, best.force) < 0.85:
+    _check_handedness(t, accel, gyro, moved, best, where)
+    if best is None or not best.certain:
         return
     if abs(best.lag_s) > APART_S:
         here = find_lag(sums, moved, APART_S / 2)
@@ -251,6 +282,41 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
             f"the {'right' if turned > 0 else 'left'}): x must point forward; reader.imu.accel.axes and "
             f"gyro.axes=auto, or {{roll: 0, pitch: 0, yaw: {turned:.0f}}}"
         )
+
+
+def _check_dead_axes(imu: Columns, moved: Motion, where: str) -> None:
+    """An axis that never changes although the car turns, brakes and accelerates."""
+    fast = moved.speed > MOVING
+    if fast.sum() < 3:
+        return
+    both = fast[1:] & fast[:-1]
+    turns = np.abs(wrap_angle(np.diff(moved.course)))[both].sum() > TURNED
+    brakes = np.ptp(moved.speed[fast]) > SPEED_CHANGE
+    for name, shown, what in (("gyro_z", turns, "turns"), ("accel_x", brakes, "brakes"), ("accel_y", turns, "turns")):
+        if shown and np.ptp(imu[name]) == 0:
+            raise InputError(
+                f"{where}: {name} is {imu[name][0]:g} in every row though the car {what}: a dead axis, or no data of it"
+            )
+
+
+def _check_handedness(
+    t: np.ndarray, accel: np.ndarray, gyro: np.ndarray, gnss: Motion, best: Lag | None, where: str
+) -> None:
+    """Turns agree with GNSS, accelerations only when an axis is turned round: the axes are left-handed."""
+    if best is None or best.yaw < YAW_AGREES or best.force > FORCE_DISAGREES or abs(best.lag_s) > APART_S:
+        return
+    mirrored = find_lag(ImuSums.of(t, accel * np.array([1.0, -1.0, 1.0]), gyro), gnss, APART_S)
+    if mirrored is None or mirrored.force < FORCE_AGREES:
+        return
+    quarter = round(float(mirrored.angle) / (np.pi / 2)) % 4
+    remedy, key = {
+        0: ("negate accel_y", "reader.imu.accel.mirror=y"),
+        2: ("negate accel_x", "reader.imu.accel.mirror=x"),
+    }.get(quarter, ("exchange accel_x and accel_y", "reader.imu.accel.columns"))
+    raise InputError(
+        f"{where}: turns agree with GNSS, accelerations only in left-handed axes ({mirrored.force:.2f} instead of "
+        f"{best.force:.2f}): {remedy}, and look at the gyroscope's axes too ({key})"
+    )
 
 
 def _check_drift(imu: ImuSums, gnss: Motion, where: str) -> None:

@@ -59,38 +59,30 @@ def check_same_clock(reference: Columns, fixes: Columns, where: str) -> None:
 
 def _measure_apart(reference: Columns, fixes: Columns, shift: float) -> tuple[float, int]:
     """Median distance [m] from fixes in motion to the reference ``shift`` seconds later, and how many these are."""
+    both, apart = _compare_places(reference, fixes, shift)
+    north, east = (np.interp(fixes["t"] + shift, reference["t"], reference[c]) for c in ("vel_n", "vel_e"))
+    with np.errstate(invalid="ignore"):
+        moving = both & (np.hypot(north, east) > FAST)
+    return float(np.median(apart[moving])) if moving.any() else np.nan, int(moving.sum())
+
+
+def _compare_places(reference: Columns, fixes: Columns, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Fixes (n,) that the reference has a row for ``shift`` seconds later, and how far each is from it [m]."""
     t = fixes["t"] + shift
     row = np.searchsorted(reference["t"], t).clip(max=len(reference["t"]) - 1)
-    lat, lon, north, east = (
-        np.interp(t, reference["t"], values)
-        for values in (
-            reference["lat_deg"],
-            np.unwrap(reference["lon_deg"], period=360),
-            reference["vel_n"],
-            reference["vel_e"],
-        )
-    )
-    with np.errstate(invalid="ignore"):
-        moving = (np.abs(reference["t"][row] - t) < SAME_S) & (np.hypot(north, east) > FAST)
-    if not moving.any():
-        return np.nan, 0
+    lat, lon = reference["lat_deg"], np.unwrap(reference["lon_deg"], period=360)
+    lat, lon = (np.interp(t, reference["t"], x) for x in (lat, lon))
     side = wrap_angle(lon - fixes["lon_deg"], 180) * np.cos(np.radians(lat))
-    apart = DEGREE_M * np.hypot(lat - fixes["lat_deg"], side)[moving]
-    return float(np.median(apart)), int(moving.sum())
+    return np.abs(reference["t"][row] - t) < SAME_S, DEGREE_M * np.hypot(lat - fixes["lat_deg"], side)
 
 
 def check_same_place(reference: Columns, fixes: Columns, where: str) -> None:
     """A reference is of the same drive: near the fixes, in the median over those that it has a row for."""
-    row = np.searchsorted(reference["t"], fixes["t"]).clip(max=len(reference["t"]) - 1)
-    both = np.abs(reference["t"][row] - fixes["t"]) < SAME_S
+    both, apart = _compare_places(reference, fixes)
     if not both.any():
         return
     near = {name: values[both] for name, values in fixes.items()}
-    lat = np.interp(near["t"], reference["t"], reference["lat_deg"])
-    lon = np.interp(near["t"], reference["t"], np.unwrap(reference["lon_deg"], period=360))
-    east = wrap_angle(lon - near["lon_deg"], 180)
-    apart = np.hypot(lat - near["lat_deg"], east * np.cos(np.radians(lat)))
-    away = DEGREE_M * float(np.median(apart))
+    away = float(np.median(apart[both]))
     sigma = np.nan_to_num(np.hypot(near["std_pos_n"], near["std_pos_e"]))
     if away > REFERENCE_M + SIGMAS * float(np.median(sigma)):
         said = f"{away / 1000:.3g} km" if away > 1000 else f"{away:.0f} m"

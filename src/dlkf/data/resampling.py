@@ -226,29 +226,23 @@ def interpolate_reference(reference: Columns | None, grid: SampleGrid) -> Refere
     i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
     h = t[i + 1] - t[i]
     s = (at - t[i]) / h
-    near = np.minimum(np.abs(at - t[i]), np.abs(at - t[i + 1])) <= ON_BOUNDARY_S
     nearest = np.where(np.abs(at - t[i]) <= np.abs(at - t[i + 1]), i, i + 1)
     between = known[i] & known[i + 1] & (h <= LONGEST_BRIDGE_S) & (s >= 0) & (s <= 1)
-    alone = near & known[nearest] & ~between
-    i = np.where(alone, np.minimum(nearest, len(t) - 2), i)
-    s = np.where(alone, nearest - i, np.clip(s, 0, 1)).astype(float)
-    h = t[i + 1] - t[i]
+    alone = (np.abs(at - t[nearest]) <= ON_BOUNDARY_S) & known[nearest] & ~between
+    exact = alone | (s == 0) | (s == 1)  # which a neighbour without attitude does not spoil
     rows_at = np.flatnonzero(between | alone)
-    i, s, h = i[rows_at], s[rows_at][:, None], h[rows_at][:, None]
+    i, j = (np.where(exact, nearest, k)[rows_at] for k in (i, i + 1))
+    s, h = np.where(exact, 0.0, s)[rows_at, None], h[rows_at, None]
     r0, v0, C0 = _ecef(reference, i, attitude=True)
-    r1, v1, C1 = _ecef(reference, i + 1, attitude=True)
+    r1, v1, C1 = _ecef(reference, j, attitude=True)
     r_e = r0 + (r1 - r0) * (s * s * (3 - 2 * s)) + h * s * (1 - s) * ((1 - s) * v0 - s * v1)
     v_e = v0 + s * (v1 - v0)
     turn = vector_from_rotation(torch.from_numpy(C0.transpose(0, 2, 1) @ C1))
     C_eb = C0 @ rotation_from_vector(torch.from_numpy(s) * turn).numpy()
-    for end, C in ((0.0, C0), (1.0, C1)):  # a neighbour without attitude does not spoil an exact hit
-        C_eb = np.where((s == end)[..., None], C, C_eb)
-        r_e = np.where(s == end, r0 if end == 0 else r1, r_e)
-        v_e = np.where(s == end, v0 if end == 0 else v1, v_e)
     error = np.full((len(i), 6), np.nan)
     if all(c in reference for c in IMU_ERROR):
         e = stack_columns(reference, IMU_ERROR)
-        error = np.where(s == 0, e[i], np.where(s == 1, e[i + 1], e[i] + s * (e[i + 1] - e[i])))
+        error = e[i] + s * (e[j] - e[i])
     out.r_e[rows_at], out.v_e[rows_at], out.C_eb[rows_at] = r_e, v_e, C_eb
     out.valid[rows_at], out.imu_error[rows_at] = True, error
     return out

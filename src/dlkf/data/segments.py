@@ -74,7 +74,7 @@ def possible_starts(
     valid = truth if attitude else stack.rows["ref_valid"]
     start = truth
     if not attitude and bool((valid & ~truth).any()):
-        start = truth | (valid & stack.start_from_gnss)
+        start = truth | (valid & stack.aligned.ok)
     bad = torch.cat((torch.zeros(1, dtype=torch.int64), (~valid).long().cumsum(0)))
     rows = len(valid)
     ends = torch.repeat_interleave(stack.first_row + stack.epochs, stack.epochs + 1)

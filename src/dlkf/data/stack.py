@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import fields, replace
 from functools import cached_property
 
 import torch
@@ -58,16 +58,11 @@ class DriveStack(Sequence[Drive]):
     def __getitem__(self, index):
         return self.drives[index]
 
-    def __iter__(self) -> Iterator[Drive]:
-        return iter(self.drives)
-
     @cached_property
     def aligned(self) -> Aligned:
         """Attitude from IMU and GNSS at every boundary of every drive."""
         parts = [align_boundaries(d) for d in self.drives]
-        return Aligned(
-            *(torch.cat([getattr(a, f) for a in parts]) for f in ("ok", "r_e", "v_e", "C_eb", "std", "scatter"))
-        )
+        return Aligned(**{f.name: torch.cat([getattr(a, f.name) for a in parts]) for f in fields(Aligned)})
 
     @cached_property
     def origin(self) -> Tensor:
@@ -90,11 +85,6 @@ class DriveStack(Sequence[Drive]):
     def start_from_truth(self) -> Tensor:
         """(rows,) bool: position, velocity and full attitude of the reference are known."""
         return self.rows["ref_valid"] & self.rows["ref_C_eb"].isfinite().flatten(1).all(-1)
-
-    @cached_property
-    def start_from_gnss(self) -> Tensor:
-        """(rows,) bool: the reference lacks attitude there, IMU and GNSS give it."""
-        return self.aligned.ok & ~self.start_from_truth
 
 
 def stack_drives(drives: Sequence[Drive]) -> DriveStack:

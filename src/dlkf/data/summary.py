@@ -34,9 +34,9 @@ def drive_line(drive: DriveFrames) -> str:
     detail.append(f"GNSS {rate}, {len(fixed)} fixes ({', '.join(named)})")
     if len(gaps):
         detail.append(f"largest gap {_short(gaps.max())}")
-    if count_and_time := _standstills(drive):
+    if count_and_time := _standstills(drive.gnss):
         detail.append("stands {} for {:.0f} s in all".format(*count_and_time))
-    detail.insert(1, f"{_way(drive) / 1000:.2f} km")
+    detail.insert(1, f"{_way(drive.gnss) / 1000:.2f} km")
     detail += [_aid(name, table) for name, table in drive.aids.items()]
     if drive.reference is not None:
         detail.append(f"reference {100 * float(drive.reference['valid'].mean()):.3g} % valid")
@@ -50,10 +50,8 @@ def _aid(name: str, table: pd.DataFrame) -> str:
     return f"{AIDS[name]}{rate}"
 
 
-def _standstills(drive: DriveFrames) -> tuple[str, float] | None:
+def _standstills(gnss: pd.DataFrame) -> tuple[str, float] | None:
     """How often and how long the fixes' speed rests for ``STANDS_S``; None where it never does, or is not known."""
-    gnss = drive.gnss
-    assert gnss is not None
     t, speed = gnss["t"].to_numpy(), np.hypot(gnss["vel_n"].to_numpy(), gnss["vel_e"].to_numpy())
     resting = speed < RESTING
     edges = np.flatnonzero(np.diff(resting, prepend=False, append=False)).reshape(-1, 2)
@@ -62,10 +60,8 @@ def _standstills(drive: DriveFrames) -> tuple[str, float] | None:
     return ("once" if len(long) == 1 else f"{len(long)} times", sum(long)) if long else None
 
 
-def _way(drive: DriveFrames) -> float:
+def _way(gnss: pd.DataFrame) -> float:
     """Length of the way [m] from velocities, or between fixes at least 5 m apart."""
-    gnss = drive.gnss
-    assert gnss is not None
     speed = np.hypot(gnss["vel_n"].to_numpy(), gnss["vel_e"].to_numpy())
     if np.isfinite(speed).mean() > 0.5:
         return driven_distance(gnss)

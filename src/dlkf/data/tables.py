@@ -168,11 +168,11 @@ def read_table(folder: str | Path, kind: str, drive: str, column: str = "") -> C
     return rows if len(rows["t"]) else None
 
 
-def read_first_stamps(folder: str | Path, kind: str, drive: str, count: int = 1000) -> np.ndarray:
-    """The first ``t`` [s] of a drive's table, without reading the rest; none of one that is missing or damaged."""
+def read_first_stamps(folder: str | Path, drive: str) -> np.ndarray:
+    """The first 1000 ``t`` [s] of a drive's IMU, without reading the rest; none of one that is missing or damaged."""
     try:
-        part = min((resolve_place(folder) / kind / f"drive={drive}").glob("*.parquet"))
-        rows = next(pq.ParquetFile(open_parquet(part)).iter_batches(count, columns=["t"]))
+        part = min((resolve_place(folder) / "imu" / f"drive={drive}").glob("*.parquet"))
+        rows = next(pq.ParquetFile(open_parquet(part)).iter_batches(1000, columns=["t"]))
         return np.asarray(rows["t"].to_numpy(zero_copy_only=False), float)
     except (ValueError, KeyError, StopIteration, pa.ArrowException, OSError):
         return np.empty(0)

@@ -105,7 +105,7 @@ def read_logs(source: str | Path, reader: str = "auto", *settings: str, skip_uns
     from dlkf.base.classes import instantiate
     from dlkf.command.arguments import quote_argument
     from dlkf.command.composing import compose_command
-    from dlkf.data.intake import absolute_places, read_together
+    from dlkf.data.intake import read_together
 
     if not isinstance(source, (str, Path)):
         raise InputError(f"source is a {type(source).__name__}, must be the path of a file or a folder with logs")
@@ -124,7 +124,7 @@ def read_logs(source: str | Path, reader: str = "auto", *settings: str, skip_uns
     opened = instantiate(values, "reader", ("read",))
     if not hasattr(opened, "places"):
         return list(opened.read(str(place)))
-    places = absolute_places(opened, place)
+    places = opened.places(place)
     made: dict[str, DriveFrames] = {}
     for result in read_together(opened, _as_frames, places, None, skip_unsure):
         for row in result.rows:

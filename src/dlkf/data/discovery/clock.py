@@ -47,6 +47,11 @@ class Lag:
         strong = self.gain > 25.0 and (self.yaw > 0.5 or self.force > 0.5)
         return strong and self.rival < 0.6 * self.gain and self.gain - self.rival > 15.0
 
+    @property
+    def certain(self) -> bool:
+        """Clear, and both correlations agree, one of them well."""
+        return self.clear and min(self.yaw, self.force) >= 0.6 and max(self.yaw, self.force) >= 0.85
+
 
 @dataclass(frozen=True)
 class ImuSums:
@@ -110,12 +115,12 @@ def find_lag(imu: ImuSums, gnss: Motion, within_s: float | None = None) -> Lag |
     others = np.where(np.abs(lags - lags[best]) > NEIGHBOUR_S, gain, -np.inf)
     rival = int(others.argmax())
     other = float(others[rival]) if np.isfinite(others[rival]) else 0.0
-    peak = lags[best] + STEP_S * _find_peak(gain[best - 1 : best + 2])
+    peak = lags[best] + STEP_S * find_peak(gain[best - 1 : best + 2])
     numbers = (lags[best], gain[best], other, yaws[best], forces[best], angles[best], peak)
     return Lag(*(float(x) for x in numbers))
 
 
-def _find_peak(three: Floats) -> float:
+def find_peak(three: Floats) -> float:
     """Where the parabola through three values has its peak, in steps from the middle one."""
     if len(three) < 3 or not np.isfinite(three).all():
         return 0.0

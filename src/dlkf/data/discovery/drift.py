@@ -37,7 +37,7 @@ def compare_ends(imu: ImuSums, gnss: Motion) -> Ends | None:
     for part in (gnss.t <= edges[0], gnss.t >= edges[1]):
         some = replace(gnss, t=gnss.t[part], v=gnss.v[part], climb=gnss.climb[part])
         lag = find_lag(imu.between(some.t[0] - SEARCH_S, some.t[-1] + SEARCH_S), some, SEARCH_S)
-        if lag is None or not lag.clear or min(lag.yaw, lag.force) < 0.6 or max(lag.yaw, lag.force) < 0.85:
+        if lag is None or not lag.certain:
             return None
         seen.append((float(some.t.mean()), lag.peak_s))
     (begin, first), (end, last) = seen

@@ -16,7 +16,7 @@ from dlkf.data.discovery.motion import MOVING, Floats, Motion, find_motion, posi
 from dlkf.data.discovery.orientation import Pose
 from dlkf.data.discovery.units import accel_units, nearest_unit, unit_left
 from dlkf.data.readers.units import ACCELERATION, RATE
-from dlkf.data.schema import ACCEL, GYRO, VELOCITY, stack_columns
+from dlkf.data.schema import ACCEL, GYRO, stack_columns
 from dlkf.data.tables import Columns
 from dlkf.navigation.earth import STANDARD_GRAVITY as G
 
@@ -218,7 +218,7 @@ def _arm(pose: Pose | None) -> Finding:
 
 def _delay(gnss: Columns) -> Finding:
     setting = "gnss.position.delay_s"
-    late, std = position_delay(gnss["t"], gnss["lat_deg"], gnss["lon_deg"], stack_columns(gnss, VELOCITY))
+    late, std = position_delay(gnss)
     if math.isnan(late) or std > 0.03 or abs(late) < max(3 * std, 0.02):
         seen = "cannot be seen" if math.isnan(late) else f"{late:+.3f} ± {std:.3f} s"
         return Finding(setting, 0.0, True, f"{seen}: none taken")

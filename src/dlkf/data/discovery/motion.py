@@ -52,8 +52,10 @@ class Motion:
         return first, first + self.stride
 
 
-def motion(t: Floats, lat_deg: Floats, lon_deg: Floats, v_ned: Floats) -> Motion:
-    """From fixes; where they have no velocities, from the differences of their positions."""
+def find_motion(fixes: Columns | pd.DataFrame) -> Motion:
+    """Of the usable rows of a GNSS table; where they have no velocities, from the differences of their positions."""
+    t, lat_deg, lon_deg = (np.asarray(fixes[c]) for c in ("t", "lat_deg", "lon_deg"))
+    v_ned = stack_columns(fixes, VELOCITY)
     place = np.isfinite(lat_deg) & np.isfinite(lon_deg)
     known = np.isfinite(v_ned[:, :2]).all(-1)
     if known.sum() < 0.2 * len(t):
@@ -62,12 +64,6 @@ def motion(t: Floats, lat_deg: Floats, lon_deg: Floats, v_ned: Floats) -> Motion
     speed = np.abs(v)
     climb = np.where(speed > MOVING, -np.nan_to_num(v_ned[known, 2]) / np.maximum(speed, 0.1), 0.0)
     return Motion(t[known], v, np.clip(climb, -0.3, 0.3), stride=_stride(t[known]))
-
-
-def find_motion(fixes: Columns | pd.DataFrame) -> Motion:
-    """:func:`motion` of the usable rows of a GNSS table."""
-    t, lat, lon = (np.asarray(fixes[c]) for c in ("t", "lat_deg", "lon_deg"))
-    return motion(t, lat, lon, stack_columns(fixes, VELOCITY))
 
 
 def stretches(t: Floats, seconds: float, broken: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -105,14 +101,14 @@ def _from_positions(t: Floats, lat_deg: Floats, lon_deg: Floats) -> Motion:
     return Motion(middle, moved[fine] / step[fine], np.zeros(int(fine.sum())))
 
 
-def position_delay(t: Floats, lat_deg: Floats, lon_deg: Floats, v_ned: Floats) -> tuple[float, float]:
+def position_delay(fixes: Columns | pd.DataFrame) -> tuple[float, float]:
     """Seconds by which positions are older than the velocities beside them, and 1σ; NaN where it is not observable.
 
     Δp − ∫v dt = −δ Δv: what a turn or a braking car leaves between them.
     """
-    good = np.isfinite(v_ned[:, :2]).all(-1) & np.isfinite(lat_deg) & np.isfinite(lon_deg)
-    rows = _thin_rows(t, good)
-    t, v = t[rows], v_ned[rows, 0] + 1j * v_ned[rows, 1]
+    north, east, lat_deg, lon_deg = (np.asarray(fixes[c]) for c in (*VELOCITY[:2], "lat_deg", "lon_deg"))
+    rows = _thin_rows(np.asarray(fixes["t"]), np.isfinite([north, east, lat_deg, lon_deg]).all(0))
+    t, v = np.asarray(fixes["t"])[rows], north[rows] + 1j * east[rows]
     step = np.diff(t)
     fine = (step > 0) & (step < LONGEST_STEP_S)
     # the mean radius is good to 0.3 %: what it spoils is a share of the way, so it is fitted beside the delay

@@ -300,11 +300,9 @@ def _intervals(gnss: Motion) -> _Intervals:
 
 def _gyro_scale(t: Floats, rate: Floats, parts: _Intervals, lag_s: float) -> float | None:
     """Radians per unit of the gyroscopes: slope of change of course over integrated rate, at the coarse lag."""
-    angle = np.concatenate(([0.0], np.cumsum(rate[1:] * np.diff(t))))
-    use = parts.moving & (parts.t0 + lag_s >= t[0]) & (parts.t1 + lag_s <= t[-1])
+    use, (turn,) = _turns(t, rate[:, None], parts, lag_s)
     if use.sum() < FEWEST // 2:
         return None
-    turn = np.interp(parts.t1[use] + lag_s, t, angle) - np.interp(parts.t0[use] + lag_s, t, angle)
     span = (parts.t1 - parts.t0)[use]
     w = parts.weight[use]
     design = np.column_stack((turn, span)) * w[:, None]
@@ -317,6 +315,14 @@ def _gyro_scale(t: Floats, rate: Floats, parts: _Intervals, lag_s: float) -> flo
         off = np.abs(parts.turned[use] * w - design @ [slope, bias])
         keep = off <= 4 * max(float(np.median(off[keep])), 1e-4)
     return float(slope) if slope > 0 else None
+
+
+def _turns(t: Floats, rates: Floats, parts: _Intervals, lag_s: float) -> tuple[np.ndarray, list[Floats]]:
+    """Intervals in motion within the IMU's time, and what the integral of each of the rates (n, k) gains in them."""
+    use = parts.moving & (parts.t0 + lag_s >= t[0]) & (parts.t1 + lag_s <= t[-1])
+    first, last = parts.t0[use] + lag_s, parts.t1[use] + lag_s
+    angles = [np.concatenate(([0.0], np.cumsum(rate[1:] * np.diff(t)))) for rate in rates.T]
+    return use, [np.interp(last, t, angle) - np.interp(first, t, angle) for angle in angles]
 
 
 def _remove_slow(columns: Complex, use: np.ndarray, stride: int) -> Complex:
@@ -341,12 +347,10 @@ def _matrix(level: Levelled, fit: _Fit, down: Floats) -> Floats:
 
 def _axis(t: Floats, gyro: Floats, parts: _Intervals, lag: float) -> tuple[Floats | None, float]:
     """The axis about which the gyroscopes turn with the course, and by how much they did [rad]; None below 1.5."""
-    total = np.concatenate((np.zeros((1, 3)), np.cumsum(gyro[1:] * np.diff(t)[:, None], 0)))
-    use = parts.moving & (parts.t0 + lag >= t[0]) & (parts.t1 + lag <= t[-1])
-    ends = [np.stack([np.interp(at[use] + lag, t, c) for c in total.T], -1) for at in (parts.t0, parts.t1)]
+    use, turns = _turns(t, gyro, parts, lag)
     turned, span = parts.turned[use], (parts.t1 - parts.t0)[use]
     much = float(np.sum(np.abs(turned[np.abs(turned) > 0.05])))
-    x, *_ = np.linalg.lstsq(np.column_stack((turned, span)), ends[1] - ends[0], rcond=None)
+    x, *_ = np.linalg.lstsq(np.column_stack((turned, span)), np.stack(turns, -1), rcond=None)
     size = float(np.linalg.norm(x[0]))
     return (x[0] / size, much) if much > 1.5 and size > 0 else (None, much)
 

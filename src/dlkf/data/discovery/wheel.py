@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dlkf.data.discovery.clock import find_peak
 from dlkf.data.discovery.motion import Floats, Motion
 
 STEP_S = 0.5
@@ -93,10 +94,8 @@ def _between(t: Floats, speed: Floats, gnss: Motion, lag_s: float, clear: bool) 
     scale = (shifted * ground[:, None]).sum(0) / np.maximum((shifted * shifted).sum(0), 1e-12)
     left = np.mean((scale * shifted - ground[:, None]) ** 2, 0)
     best = int(left.argmin())
-    if 0 < best < len(lags) - 1 and (bend := left[best - 1] - 2 * left[best] + left[best + 1]) > 0:
-        lag = lags[best] + FINE_S * 0.5 * (left[best - 1] - left[best + 1]) / bend
-    else:
-        lag, clear = lags[best], False
+    clear = clear and 0 < best < len(lags) - 1
+    lag = lags[best] + FINE_S * find_peak(-left[max(best - 1, 0) : best + 2])
     slope = np.gradient(scale[best] * shifted[:, best], at)
     apart = max(1.0, WHITE_S / max(float(np.median(np.diff(at))), 1e-3))
     std = np.sqrt(apart * left[best] / max(float((slope * slope).sum()), 1e-12))

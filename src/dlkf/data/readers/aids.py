@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,7 @@ def read_aids(
     moved = None if fixes is None or len(fixes) < 3 else find_motion(fixes[usable_fixes(fixes)])
     for name, part in mapped.items():
         spec, found = _settle_auto(name, part, zero, gnss, moved, f"{where}: {part.table.path.name}")
-        done = Mapped(part.table, spec, name, part.parts)
+        done = replace(part, spec=spec)
         frames[name], specs[name] = aid_frame(name, done, _times(done, zero)), spec
         if not len(frames[name]):
             raise InputError(f"{where}: {part.table.path.name} has no value of {name}; set reader.{name}.file=null")
@@ -55,9 +56,9 @@ def read_aids(
 
 def _times(mapped: Mapped, zero: int) -> np.ndarray:
     """Seconds on the drive's clock, with what is left ``auto`` as zero."""
-    time = dict(mapped.spec.get("time") or {})
+    time = dict(mapped.time)
     time["offset_s"] = None if time.get("offset_s") == AUTO else time.get("offset_s")
-    whole, part = Mapped(mapped.table, {**mapped.spec, "time": time}, mapped.kind, mapped.parts).stamps()
+    whole, part = replace(mapped, spec={**mapped.spec, "time": time}).stamps()
     return (whole - zero) + part
 
 
@@ -69,7 +70,7 @@ def _settle_auto(
     time, notes = spec.get("time") or {}, []
     spec["time"] = time
     if time.get("offset_s") == AUTO and gnss is not None and gnss.table.path == mapped.table.path:
-        said = gnss.spec.get("time") or {}
+        said = gnss.time
         drift = float(said.get("drift_ppm") or 0.0)
         (whole, part), (first, rest) = (one.own_stamps() for one in (mapped, gnss))
         later = float(whole[0] - first[0]) + float(part[0] - rest[0])
@@ -83,7 +84,7 @@ def _settle_auto(
     if moved is None:
         raise InputError(f"{where}: reader.speed.…=auto needs GNSS to compare with; give value.unit and time.offset_s")
     one = {**value, "unit": 1.0} if value.get("unit") == AUTO else value
-    neutral = Mapped(mapped.table, {**spec, "value": one}, name, mapped.parts)
+    neutral = replace(mapped, spec={**spec, "value": one})
     raw = aid_frame(name, neutral, _times(neutral, zero))
     wheel = find_wheel(raw["t"].to_numpy(), raw["speed"].to_numpy(), moved)
     if wheel is None or not wheel.clear:
@@ -122,10 +123,8 @@ def _speed(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
     if _counts(mapped):
         values = _count_steps(values)
         t, values = (t[1:] + t[:-1]) / 2, values / np.maximum(np.diff(t), 1e-9)
-    out = pd.DataFrame({"t": t, "speed": values * _metres_per_unit(entry, unit)})
-    if mapped.has("std") and len(out) == len(mapped):
-        out["std"] = mapped.vector("std", (1,), nan=True)[:, 0] * _metres_per_unit(entry, unit)
-    return out
+    scale = _metres_per_unit(entry, unit)
+    return pd.DataFrame({"t": t, "speed": values * scale, **(_std(mapped, scale) if len(t) == len(mapped) else {})})
 
 
 def _counts(mapped: Mapped) -> bool:
@@ -168,25 +167,27 @@ def _metres_per_unit(entry: Mapping[str, Any], unit: Any) -> float:
 def _heading(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
     """Heading of the car [rad] clockwise from North, ``antennas_deg`` (their bearing in the car) taken off."""
     entry = mapped.spec["value"]
-    angle = mapped.vector("value", (1,), nan=True)[:, 0] * mapped.scale("value", units.ANGLE)
+    scale = mapped.scale("value", units.ANGLE)
+    angle = mapped.vector("value", (1,), nan=True)[:, 0] * scale
     if (entry.get("convention") or "ned") == "enu":
         angle = np.pi / 2 - angle
     angle = angle - units.DEG * float(entry.get("antennas_deg") or 0.0)
-    out = pd.DataFrame({"t": t, "heading": wrap_angle(angle)})
-    if mapped.has("std"):
-        out["std"] = mapped.vector("std", (1,), nan=True)[:, 0] * mapped.scale("value", units.ANGLE)
-    return out
+    return pd.DataFrame({"t": t, "heading": wrap_angle(angle), **_std(mapped, scale)})
 
 
 def _baro(mapped: Mapped, t: np.ndarray) -> pd.DataFrame:
     """Pressure [Pa], or height [m]."""
-    out = pd.DataFrame({"t": t})
-    if mapped.has("pressure"):
-        out["pressure"] = mapped.vector("pressure", (1,), nan=True)[:, 0] * mapped.scale("pressure", PRESSURE)
-    if mapped.has("height"):
-        out["height_m"] = mapped.vector("height", (1,), nan=True)[:, 0] * mapped.scale("height", units.LENGTH)
-    if len(out.columns) == 1:
+    entries = (("pressure", "pressure", PRESSURE), ("height", "height_m", units.LENGTH))
+    found = {
+        name: mapped.vector(key, (1,), nan=True)[:, 0] * mapped.scale(key, known)
+        for key, name, known in entries
+        if mapped.has(key)
+    }
+    if not found:
         raise InputError("reader.baro has neither pressure nor height; name one's columns")
-    if mapped.has("std"):
-        out["std"] = mapped.vector("std", (1,), nan=True)[:, 0]
-    return out
+    return pd.DataFrame({"t": t, **found, **_std(mapped, 1.0)})
+
+
+def _std(mapped: Mapped, scale: float) -> dict[str, np.ndarray]:
+    """The column of 1σ, where there is one, in SI."""
+    return {"std": mapped.vector("std", (1,), nan=True)[:, 0] * scale} if mapped.has("std") else {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 import zipfile
 from collections.abc import Iterator
@@ -36,25 +35,12 @@ def unpack(path: Path) -> Iterator[Path]:
                 size = sum(info.file_size for info in archive.infolist())
                 if size > LARGEST_BYTES or size > max(SMALL_BYTES, LARGEST_RATIO * path.stat().st_size):
                     raise InputError(f"{path}: unpacks to {size / 2**30:.1f} GiB, which no log of its size does")
-                for info in archive.infolist():
-                    _extract(archive, info, folder)
+                archive.extractall(folder)  # never above the folder, never more than the headers state
         except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError) as error:
             raise InputError(f"{path}: cannot be unpacked ({error}); unpack it yourself and give the folder") from None
         while len(inside := [p for p in folder.iterdir() if p.name != "__MACOSX"]) == 1 and inside[0].is_dir():
             folder = inside[0]
         yield folder
-
-
-def _extract(archive: zipfile.ZipFile, info: zipfile.ZipInfo, folder: Path) -> None:
-    """One file, never above the folder, never more than its header states."""
-    place = (folder / info.filename).resolve()
-    if info.is_dir() or not place.is_relative_to(folder.resolve()):
-        return
-    place.parent.mkdir(parents=True, exist_ok=True)
-    with archive.open(info) as packed, place.open("wb") as file:
-        shutil.copyfileobj(packed, file)
-        if file.tell() > info.file_size:
-            raise InputError(f"{archive.filename}: {info.filename} is larger than its header states")
 
 
 def drive_places(source: Path) -> list[Path]:

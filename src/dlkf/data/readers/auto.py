@@ -26,8 +26,11 @@ from dlkf.data.readers.offers import (
 from dlkf.data.readers.settling import Unsure
 from dlkf.data.readers.sharing import merge_settings
 
-# presets whose files are known by a name
-LAYOUTS = {"kitti": "oxts/timestamps.txt", "sensor_logger": "TotalAcceleration.csv", "phyphox": "Gyroscope.csv"}
+LAYOUTS = {  # presets whose files are known by their names
+    "kitti": ("oxts/timestamps.txt",),
+    "sensor_logger": ("TotalAcceleration.csv",),
+    "phyphox": ("Gyroscope.csv", "Location.csv"),
+}
 BAROMETERS = {"sensor_logger": "Barometer.csv", "phyphox": "Pressure.csv"}
 TABLES = (".csv", ".tsv", ".txt", ".dat")
 DAMAGED = ("not a whole", "cannot be opened")  # how a line on a file begins that may hold the fixes
@@ -100,8 +103,9 @@ class AutoReader:
         within = [recognise_file(only)] if only is not None else _recognise_files(folder)
         specs, detail = {}, []
         for kind in ("imu", "gnss"):
-            chosen = self._choose_offer(within, kind, folder, only)
+            chosen = self._choose_offer(within, kind, folder)
             if chosen is None:
+                self._refuse_absent(within, kind, folder, only)
                 specs[kind] = {"file": None}
                 continue
             specs[kind] = merge_settings(chosen.specs[kind], self.known[kind])
@@ -131,72 +135,64 @@ class AutoReader:
         try:
             drive = reader.drive_at(folder, name)
         except Unsure as unsure:
-            other = Unsure(f"{unsure}{_suggest_preset(specs)}")
-            other.layout, other.offset_s = unsure.layout, unsure.offset_s
-            raise other from None
+            unsure.args = (f"{unsure}{_suggest_preset(specs)}",)
+            raise
         return replace(drive, notes=(*dict.fromkeys(detail), *drive.notes))
 
-    def _choose_offer(self, within: list[Contents], kind: str, folder: Path, only: Path | None) -> Offer | None:
-        offers = [o for one in within for o in one.offers]
-        fits = [o for o in offers if kind in o.specs]
-        if not fits and kind == "imu":
-            fits = _join_sensors(offers)
-        if (file := self.known[kind].get("file")) is not None:
+    def _choose_offer(self, within: list[Contents], kind: str, folder: Path) -> Offer | None:
+        """What gives a kind, of several the one in the file or table that is asked for; None where nothing does."""
+        offers, known = [o for one in within for o in one.offers], self.known[kind]
+        fits = [o for o in offers if kind in o.specs] or (_join_sensors(offers) if kind == "imu" else [])
+        if (file := known.get("file")) is not None:
             fits = [o for o in fits if o.path.match(str(file))]
-            if not fits:
-                have = ", ".join(o.name for o in offers if kind in o.specs) or "no file"
-                raise InputError(f"{folder}: reader.{kind}.file={file}: no such {kind.upper()} here; found in {have}")
-        if (table := self.known[kind].get("table")) is not None and any(o.table for o in fits):
+        if (table := known.get("table")) is not None and any(o.table for o in fits):
             fits = [o for o in fits if o.table == str(table)]
         if len(fits) > 1:
             key = "table" if len({o.path for o in fits}) == 1 else "file"
             names = ", ".join((o.table or o.name) if key == "table" else o.name for o in fits)
-            raise InputError(f"{folder}: {names} all hold {kind.upper()}; choose one with reader.{kind}.{key}")
-        if not fits and kind == "imu":
+            needed = kind in ("imu", "gnss")
+            what, none = kind.upper() if needed else kind, "" if needed else f", or reader.{kind}.file=null for none"
+            raise InputError(f"{folder}: {names} all hold {what}; choose one with reader.{kind}.{key}{none}")
+        return fits[0] if fits else None
+
+    def _refuse_absent(self, within: list[Contents], kind: str, folder: Path, only: Path | None) -> None:
+        """InputError where a file that is asked for gives no such kind, or nothing an IMU."""
+        offers = [o for one in within for o in one.offers]
+        if (file := self.known[kind].get("file")) is not None:
+            have = ", ".join(o.name for o in offers if kind in o.specs) or "no file"
+            raise InputError(f"{folder}: reader.{kind}.file={file}: no such {kind.upper()} here; found in {have}")
+        if kind == "imu":
             remedy = "give the folder that holds the IMU's file too, or name both" if only is not None else (
                 "name the reader and its columns (reader=csv reader.imu.file=… 'reader.imu.accel.columns=[…]' …)"
             )  # fmt: skip
             where = only.parent if only is not None else folder
             raise InputError(f"{where}: no IMU found{_describe_files(within, offers)}; {remedy}")
-        return fits[0] if fits else None
 
     def _aid(self, within: list[Contents], kind: str, folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
         """The spec of an aid, and what it was found in; None where there is none, or file=null leaves it out."""
         known = self.known[kind]
         if "file" in known and known["file"] is None:
             return None, []
-        fits = [o for one in within for o in one.offers if kind in o.specs]
-        if (file := known.get("file")) is not None:
-            fits = [o for o in fits if o.path.match(str(file))]
-            if not fits and not (known.get("value") or known.get("pressure") or known.get("height")):
-                raise InputError(
-                    f"{folder}: reader.{kind}.file={file}: nothing there is known as {kind}; give its columns"
-                )
-        if len(fits) > 1:
-            names = ", ".join(o.name for o in fits)
-            raise InputError(f"{folder}: {names} all hold {kind}; choose one with reader.{kind}.file, or null for none")
-        if not fits and file is None:
+        if (chosen := self._choose_offer(within, kind, folder)) is not None:
+            spec = merge_settings(chosen.specs[kind], known)
+            columns = [c for key in ("value", "pressure", "height") for c in (spec.get(key) or {}).get("columns") or []]
+            return spec, [f"found {kind} in {chosen.name}: {', '.join(map(str, columns))}"]
+        if (file := known.get("file")) is None:
             return None, []
-        if not fits:
-            return merge_settings(leave_open({kind: load_preset("csv")[kind]})[kind], known), []
-        spec = merge_settings(fits[0].specs[kind], known)
-        columns = [c for key in ("value", "pressure", "height") for c in (spec.get(key) or {}).get("columns") or []]
-        return spec, [f"found {kind} in {fits[0].name}: {', '.join(map(str, columns))}"]
+        if not (known.get("value") or known.get("pressure") or known.get("height")):
+            raise InputError(f"{folder}: reader.{kind}.file={file}: nothing there is known as {kind}; give its columns")
+        return merge_settings(leave_open({kind: load_preset("csv")[kind]})[kind], known), []
 
 
 def _recognise_files(folder: Path) -> list[Contents]:
     """What the files of a folder hold; of one whose files are known by their names, that."""
-    for name, file in LAYOUTS.items():
-        if (folder / file).is_file():
-            if name == "phyphox" and not (folder / "Location.csv").is_file():
-                continue
+    for name, files in LAYOUTS.items():
+        if all((folder / file).is_file() for file in files):
             base = load_preset(name)
-            specs = {kind: base[kind] for kind in ("imu", "gnss")}
-            beside = BAROMETERS.get(name, "")
-            specs = leave_open(specs)
-            if beside and (folder / beside).is_file():  # by the clock of the IMU
+            specs = leave_open({kind: base[kind] for kind in ("imu", "gnss")})
+            if (beside := BAROMETERS.get(name)) and (folder / beside).is_file():  # by the clock of the IMU
                 specs["baro"] = {**base["baro"], "file": beside}
-            return [Contents(folder / file, [Offer(folder / file, f"layout of {name}", specs)])]
+            return [Contents(folder / files[0], [Offer(folder / files[0], f"layout of {name}", specs)])]
     return [recognise_file(p) for p in sorted(folder.iterdir()) if p.is_file() and not p.name.startswith(".")]
 
 
@@ -212,16 +208,15 @@ def _describe_files(within: Iterable[Contents], offers: Iterable[Offer] = ()) ->
 
 def _join_sensors(offers: list[Offer]) -> list[Offer]:
     """An accelerometer and a gyroscope that lie in tables of their own as an IMU."""
-    alone = {key: [o for o in offers if o.sensor is not None and o.sensor["key"] == key] for key in ("accel", "gyro")}
-    if any(len(found) != 1 for found in alone.values()):
+    accels, gyros = ([o for o in offers if key in o.specs] for key in ("accel", "gyro"))
+    if len(accels) != 1 or len(gyros) != 1:
         return []
-    (accel,), (gyro,) = alone["accel"], alone["gyro"]
-    assert accel.sensor is not None and gyro.sensor is not None
-    spec = {key: value for key, value in accel.sensor.items() if key != "key"}
-    source = {key: gyro.sensor[key] for key in ("format", "file", "table", "text", "time") if key in gyro.sensor}
-    specs = leave_open({"imu": {**spec, "gyro": {**gyro.sensor["gyro"], **source}}})
-    detail = f"{accel.detail}, and {gyro.name} with {', '.join(gyro.sensor['gyro']['columns'])}"
-    return [Offer(accel.path, detail, specs, notes=(*accel.notes, *gyro.notes), table=accel.table)]
+    (accel,), (gyro,) = accels, gyros
+    turns = gyro.specs["gyro"]
+    source = {key: turns[key] for key in ("format", "file", "table", "text", "time") if key in turns}
+    specs = leave_open({"imu": {**accel.specs["accel"], "gyro": {**turns["gyro"], **source}}})
+    detail = f"{accel.detail}, and {gyro.name} with {', '.join(turns['gyro']['columns'])}"
+    return [Offer(accel.path, detail, specs, table=accel.table)]
 
 
 def _settle_at_rest(imu: dict[str, Any]) -> list[str]:
@@ -274,6 +269,7 @@ def _find_velocities(chosen: Offer, gnss: Mapping[str, Any], files: Iterable[Pat
         try:
             options = text_options(path)
             table = formats.read("csv", path, kind="gnss", table=None, text=options, where="reader")
+            table = recognise.convert_numbers(table)
         except InputError:
             continue
         found = recognise.velocity_spec(table) if options == gnss["text"] else None
@@ -284,13 +280,9 @@ def _find_velocities(chosen: Offer, gnss: Mapping[str, Any], files: Iterable[Pat
 
 def _find_unread(within: Iterable[Contents], only: Path | None) -> Contents | None:
     """A text table or a receiver's log beside the IMU's file of which nothing is known; None where there is none."""
-    unread = [one for one in within if not one.offers] if only is None else []
-    logs = (
-        one
-        for one in unread
-        if one.path.suffix.lower() in RECEIVERS
-        or one.held.startswith(DAMAGED)
-        or one.path.suffix.lower() in NO_LOGS
-        or (one.path.suffix.lower() in TABLES and (find_format(one.path) == "csv" or one.held == "empty"))
-    )
-    return next(logs, None)
+    for one in within if only is None else ():
+        suffix = one.path.suffix.lower()
+        known = suffix in (*RECEIVERS, *NO_LOGS) or one.held.startswith(DAMAGED)
+        if not one.offers and (known or (suffix in TABLES and (one.held == "empty" or find_format(one.path) == "csv"))):
+            return one
+    return None

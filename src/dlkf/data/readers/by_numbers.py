@@ -74,23 +74,22 @@ def gnss_spec(table: LogTable) -> Spec | None:
             three = values[:, place : place + 3] * (scale, scale, 1e-3 if scale < 1 else 1.0)
             for lat, lon in ((0, 1), (1, 0)):
                 if _are_places(three[:, [lat, lon, 2]]):
-                    rest = [k for k in range(len(names)) if not place <= k < place + 3]
-                    found = velocities(t, three[:, lat], three[:, lon], names, values, rest)
-                    fits.append((place, lat, lon, unit, rest, found))
+                    rest = frame[names[:place] + names[place + 3 :]]
+                    fits.append((place, lat, lon, unit, velocities(t, three[:, lat], three[:, lon], rest)))
         if fits:
             break
     if not fits:
         return None
-    place, lat, lon, unit, rest, found = next((fit for fit in fits if fit[-1]["columns"]), fits[0])
+    place, lat, lon, unit, found = next((fit for fit in fits if fit[-1]["columns"]), fits[0])
     columns = [names[place + lat], names[place + lon], names[place + 2]]
     spec: Spec = {"time": time, "position": {"columns": columns, "unit": unit}, "velocity": found}
     if unit != "deg":
         spec["position"]["height_unit"] = "mm"
-    after = range(place + 3, place + 6)
-    if all(k in rest for k in after) and not set(spec["velocity"]["columns"] or ()) & {names[k] for k in after}:
-        stds = values[:, after.start : after.stop]
+    after = names[place + 3 : place + 6]
+    if len(after) == 3 and not set(found["columns"] or ()) & set(after):
+        stds = values[:, place + 3 : place + 6]
         if np.nanmin(stds) > 0 and np.nanmax(stds) < SMALL_M and np.all(np.abs(np.diff(stds, axis=0)) < SMALL_M / 10):
-            spec["std_position"] = {"columns": [names[k] for k in after]}  # as KF-GINS and others write them
+            spec["std_position"] = {"columns": after}  # as KF-GINS and others write them
     return spec
 
 
@@ -117,13 +116,13 @@ def _are_places(three: np.ndarray) -> bool:
     return bool(near and still and within and not whole and somewhere and (np.abs(lat) > 1).any())
 
 
-def velocities(
-    t: np.ndarray | None, lat: np.ndarray, lon: np.ndarray, names: list[str], values: np.ndarray, rest: list[int]
-) -> Spec:
-    """Columns among ``rest`` that agree with the way between positions [deg] at times ``t`` [s]: North and East, or
-    speed and course [deg]; none without times."""
-    if t is None or len(t) < 3 or not rest:
+def velocities(t: np.ndarray | None, lat: np.ndarray, lon: np.ndarray, others: pd.DataFrame) -> Spec:
+    """Columns among the ``others`` that agree with the way between positions [deg] at times ``t`` [s]: North and East,
+    or speed and course [deg]; none without times."""
+    names, values = [str(c) for c in others.columns], others.to_numpy(float)
+    if t is None or len(t) < 3 or not names:
         return {"columns": None}
+    rest = range(len(names))
     span = t[2:] - t[:-2]
     north = EARTH_M * np.radians(lat[2:] - lat[:-2]) / span
     east = EARTH_M * np.cos(np.radians(lat[1:-1])) * np.radians(lon[2:] - lon[:-2]) / span

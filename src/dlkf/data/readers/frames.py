@@ -16,13 +16,12 @@ class LogTable:
     """A table of a log file in the file's own columns and units.
 
     The index of ``frame`` numbers its rows as ``row`` calls them (line of a text file, row, message), for messages to
-    the user; ``units`` are those that the file states, by column; ``notes`` messages of the reader.
+    the user; ``notes`` are messages of the reader.
     """
 
     frame: pd.DataFrame
     path: Path
     row: str = "row"
-    units: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
 

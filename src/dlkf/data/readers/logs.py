@@ -133,13 +133,12 @@ class LogReader:
         arm, found, mapping = self.lever_arm_m, (), {}
         if self.wanted:
             try:
-                settled = settle(mapped, t, self.wanted, self.sure, f"drive {name}", arm)
+                specs, arm, found = settle(mapped, t, self.wanted, self.sure, f"drive {name}", arm)
             except Unsure as unsure:
                 unsure.layout = layout(self.neutral)
                 raise
-            mapped = {kind: replace(part, spec=settled.specs[kind]) for kind, part in mapped.items()}
+            mapped = {kind: replace(part, spec=specs[kind]) for kind, part in mapped.items()}
             zero, t = self._times(mapped)
-            arm, found = settled.lever_arm_m, settled.notes
         frames = {kind: FRAMES[kind](part, t[kind]) for kind, part in mapped.items()}
         others = {kind: part for kind, part in every.items() if kind not in FRAMES}
         aids, specs, of_aids = read_aids(others, zero, mapped.get("gnss"), frames.get("gnss"), f"drive {name}")
@@ -166,7 +165,7 @@ class LogReader:
         zero = int(stamps["imu"][0][0]) if self.time_zero == "imu" else 0
         t = {kind: (whole - zero) + part for kind, (whole, part) in stamps.items()}
         for kind, part in mapped.items():
-            if (part.spec.get("time") or {}).get("respace"):
+            if part.time.get("respace"):
                 t[kind] = spread_stamps(t[kind])
         return zero, t
 
@@ -284,7 +283,7 @@ def _gps_time(gnss: Mapped, t: np.ndarray) -> dict[str, float]:
     first = gnss.first_gps_s()
     if first is None:
         return {}
-    rate = 1 / (1 + 1e-6 * float((gnss.spec.get("time") or {}).get("drift_ppm") or 0.0))
+    rate = 1 / (1 + 1e-6 * float(gnss.time.get("drift_ppm") or 0.0))
     return {"gps_zero_s": first - rate * float(t[0]), "gps_rate": rate}
 
 

@@ -91,6 +91,11 @@ class Mapped:
     kind: str
     parts: Mapping[str, Mapped] = field(default_factory=dict)
 
+    @property
+    def time(self) -> Spec:
+        """What the mapping says of the stamps."""
+        return self.spec.get("time") or {}
+
     def __len__(self) -> int:
         return len(self.table.frame)
 
@@ -104,7 +109,7 @@ class Mapped:
             bad = np.flatnonzero((numbers.isna() & ~empty).to_numpy())
             if len(bad):
                 remedy = "correct the line"
-                if np.mean(numbers.isna()) > 0.5 and str(name) == str((self.spec.get("time") or {}).get("column")):
+                if np.mean(numbers.isna()) > 0.5 and str(name) == str(self.time.get("column")):
                     remedy = f"set reader.{self.kind}.time.unit=iso if that is a date and time"
                 if DECIMAL_COMMA.fullmatch(texts.iloc[bad[0]]):
                     remedy = self._text_to_set("decimal", ",")
@@ -145,29 +150,26 @@ class Mapped:
 
     def stamps(self) -> tuple[np.ndarray, np.ndarray]:
         """Whole seconds and the rest of the rows' times, offset and drift included."""
-        time = self.spec.get("time") or {}
         where = f"reader.{self.kind}.time"
         whole, part = self.own_stamps()
-        offset = units.number(time.get("offset_s") or 0.0, f"{where}.offset_s")
-        if drift := units.number(time.get("drift_ppm") or 0.0, f"{where}.drift_ppm"):
+        offset = units.number(self.time.get("offset_s") or 0.0, f"{where}.offset_s")
+        if drift := units.number(self.time.get("drift_ppm") or 0.0, f"{where}.drift_ppm"):
             part = part + 1e-6 * drift * ((whole - whole[0]) + (part - part[0]))
         jump = math.floor(offset)
         return whole + jump, part + (offset - jump)
 
     def first_gps_s(self) -> float | None:
         """GPS time of the first row [s since 1980] by the table's own clock; None where that has no date."""
-        time = self.spec.get("time") or {}
         whole, part = self.own_stamps()
         first = float(whole[0]) + float(part[0])
         known = units.clock_by_size(first)
-        if known is not None and (time.get("clock") or time.get("week") or time.get("week_number") is not None):
+        if known is not None and any(self.time.get(key) is not None for key in ("clock", "week", "week_number")):
             known = "gps"
         return None if known is None else float(units.gps_seconds(first)) if known == "unix" else first
 
     def own_stamps(self) -> tuple[np.ndarray, np.ndarray]:
         """Whole seconds and the rest of the rows' times on the table's own clock, as GPS time where that is given."""
-        time = self.spec.get("time") or {}
-        where = f"reader.{self.kind}.time"
+        time, where = self.time, f"reader.{self.kind}.time"
         name, unit = time.get("column"), time.get("unit") or "s"
         if name is None:
             raise InputError(f"{where}.column is missing; name the column of the stamps")
@@ -251,10 +253,9 @@ def select_rows(mapped: Mapped) -> Mapped:
     if rows is None:
         return mapped
     if rows in ("filled", "changed"):
-        names = {
-            str(n) for key in ("accel", "gyro", "position", "value", "pressure", "height") for n in _names(mapped, key)
-        }
-        time = (mapped.spec.get("time") or {}).get("column")
+        entries = ("accel", "gyro", "position", "value", "pressure", "height")
+        names = {str(n) for key in entries for n in _names(mapped, key)}
+        time = mapped.time.get("column")
         names |= {str(n) for n in ([time] if isinstance(time, (str, int)) else time or [])}
         frame = mapped.table.frame
         cells = frame[[c for c in frame.columns if c in names]]

@@ -14,7 +14,6 @@ import yaml
 from dlkf.base.config import config_dir
 from dlkf.base.errors import InputError
 from dlkf.data.readers import formats, recognise, vocabulary
-from dlkf.data.readers.aid_columns import aid_specs
 from dlkf.data.readers.formats import autopilot, matlab, nmea, rosbag, text, ubx
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.sharing import merge_settings
@@ -39,13 +38,12 @@ NAVEGO = {"imu": "fb_0", "gnss": "stdm_0"}  # a column of each of NaveGo's struc
 
 @dataclass(frozen=True)
 class Offer:
-    """What a file, or a table in it, can give: ``specs`` of a mapping by kind (imu, gnss, speed, heading, baro);
-    ``sensor`` is an accelerometer or a gyroscope alone."""
+    """What a file, or a table in it, can give: ``specs`` of a mapping by kind, imu, gnss, speed, heading, baro, and
+    accel or gyro where that sensor stands alone."""
 
     path: Path
     detail: str
     specs: dict[str, dict[str, Any]] = field(default_factory=dict)
-    sensor: dict[str, Any] | None = None
     notes: tuple[str, ...] = ()
     table: str | None = None
 
@@ -98,7 +96,7 @@ def recognise_file(path: Path) -> Contents:
 def _offer_preset(path: Path, name: str) -> Contents:
     base = load_preset(name)
     source = {"file": path.name, "text": _preset_text(base)}
-    lacks = {kind: _describe_lack(path, name, kind) for kind in ("imu", "gnss")}
+    lacks = {kind: _describe_lack(path, name, kind, base) for kind in ("imu", "gnss")}
     specs = {kind: {**base[kind], **source} for kind, why in lacks.items() if why is None}
     held = f"{name}, {', '.join(f'no {kind.upper()}{why}' for kind, why in lacks.items() if why is not None)}"
     module = WITH_AIDS.get(name)
@@ -106,7 +104,7 @@ def _offer_preset(path: Path, name: str) -> Contents:
     return Contents(path, [Offer(path, f"{name}, as reader={name}", leave_open(specs))] if specs else [], held)
 
 
-def _describe_lack(path: Path, name: str, kind: str) -> str | None:
+def _describe_lack(path: Path, name: str, kind: str, base: Mapping[str, Any]) -> str | None:
     """Why a file of a preset's format gives no ``kind``, empty if there is no reason; None where it does."""
     if name == "rosbag":
         return None if rosbag.holds(path, kind) else f" among its topics ({rosbag.list_topics(path)})"
@@ -114,7 +112,6 @@ def _describe_lack(path: Path, name: str, kind: str) -> str | None:
         return None
     if name in GNSS_ONLY:
         return ""
-    base = load_preset(name)
     try:
         spec, options = base[kind], {**_preset_text(base), "lines": base[kind].get("lines")}
         table = formats.read(spec["format"], path, kind=kind, table=spec.get("table"), text=options, where="")
@@ -137,29 +134,25 @@ def _offer_matlab(path: Path) -> Contents:
 
 
 def _offer_table(path: Path, name: str, table: LogTable, options: dict[str, Any], part: str | None) -> list[Offer]:
+    table = recognise.convert_numbers(table)
     imu, gnss = recognise.imu_spec(table), None
     if imu is None or vocabulary.find_column(map(str, table.frame.columns), "lat"):
         gnss = recognise.gnss_spec(table)
     source: dict[str, Any] = {"format": name, "file": path.name, "text": options}
     source |= {"table": part} if part is not None else {}
     time = next((one.spec["time"] for one in (imu, gnss) if one is not None), None)
-    numbers = recognise.select_numeric(table.frame)
-    aids = aid_specs(recognise.replace_numeric(table, numbers), numbers, part or path.stem, time)
-    aids = {kind: {**spec, **source} for kind, spec in aids.items()}
+    aids = recognise.aid_specs(table, part or path.stem, time)
     found = {kind: one for kind, one in (("imu", imu), ("gnss", gnss)) if one is not None}
     if not found and not aids:
-        alone = recognise.sensor_spec(table, part or path.stem)
-        if alone is None:
-            return []
-        key, (spec, notes) = alone
-        columns = ", ".join(spec[key]["columns"])
-        return [Offer(path, f"{name} with {columns}", sensor={"key": key, **spec, **source}, notes=notes, table=part)]
+        aids = recognise.sensor_spec(table, part or path.stem)
+    aids = {kind: {**spec, **source} for kind, spec in aids.items()}
     if len(found) == 2:
         source["rows"] = "filled"
     specs = {kind: {**source, **one.spec} for kind, one in found.items()}
     columns = ", ".join(str(c) for spec in (specs or aids).values() for c in _columns(spec))
     notes = tuple(note for one in found.values() for note in one.notes)
-    return [Offer(path, f"{name} with {columns}", leave_open(specs | aids, stated=True), notes=notes, table=part)]
+    specs = leave_open(specs | aids, stated=True)
+    return [Offer(path, f"{name} with {columns}", specs, notes, part)] if specs else []
 
 
 def find_format(path: Path) -> str | None:
@@ -253,7 +246,7 @@ def leave_open(specs: Mapping[str, Any], stated: bool = False) -> dict[str, dict
             for key in ("accel", "gyro"):
                 unit = spec[key].get("unit") if stated else None
                 spec[key] = {**spec[key], "unit": unit or "auto", "axes": "auto"}
-        else:
+        elif kind not in ("accel", "gyro"):
             spec["time"] = {**spec["time"], "offset_s": "auto"}
         if kind == "gnss":
             spec["time"]["drift_ppm"] = "auto"

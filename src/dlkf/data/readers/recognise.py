@@ -11,6 +11,7 @@ import pandas as pd
 from dlkf.data.discovery.units import accel_units
 from dlkf.data.limits import DEGREE_M, EARTH_M
 from dlkf.data.readers import by_numbers, stamps, units, vocabulary
+from dlkf.data.readers.aids import COUNTS
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.qualities import quality_spec
 from dlkf.data.resampling import DEFAULT_STD
@@ -19,6 +20,9 @@ from dlkf.navigation.earth import STANDARD_GRAVITY as G
 Spec = dict[str, Any]
 SLOWEST_IMU_S, FASTEST_IMU_S = 0.21, 2e-4
 SLOWEST_FIX_S, FASTEST_FIX_S = 12.0, 0.02
+SLOWEST_AID_S, FASTEST_AID_S = 2.0, 9e-4
+PRESSURES = {"pa": (6e4, 1.1e5), "hpa": (600.0, 1100.0), "kpa": (60.0, 110.0)}
+SPEED_UNITS = ("km/h", "mph", "m/s", "knots", "rpm")
 MOST_COLUMNS = 500  # no log of a car has more; each is looked at in many ways
 NEAR_GRAVITY = 0.08
 HIGHEST_M = 9000.0  # of a road
@@ -34,12 +38,11 @@ class Recognised(NamedTuple):
 
 def imu_spec(table: LogTable) -> Recognised | None:
     """The mapping of a table that holds an IMU; None if it does not."""
-    frame = select_numeric(table.frame)
-    names = [str(c) for c in frame.columns]
+    frame, names = _select_numeric(table)
     triads = {key: vocabulary.triad(names, stem) for key, stem in vocabulary.SENSORS.items()}
     if triads["accel"] and triads["gyro"]:
         known = frame[triads["accel"] + triads["gyro"]].notna().all(axis=1)
-        time = stamps.time_spec(replace_numeric(table, frame), known, SLOWEST_IMU_S, FASTEST_IMU_S)
+        time = stamps.time_spec(table, known, SLOWEST_IMU_S, FASTEST_IMU_S)
         if time is None:
             return None
         sensors = {key: {"columns": columns} for key, columns in triads.items() if columns}
@@ -69,11 +72,10 @@ def _spread(frame: pd.DataFrame, time: Spec) -> tuple[str, ...]:
     return (f"{100 * same:.0f} % of the samples have the stamp of the one before: spread evenly (time.respace=true)",)
 
 
-def sensor_spec(table: LogTable, called: str) -> tuple[str, Recognised] | None:
-    """``accel`` or ``gyro`` and the mapping of a table that holds that sensor alone; ``called`` is the table's name,
+def sensor_spec(table: LogTable, called: str) -> dict[str, Spec]:
+    """The mapping, by ``accel`` or ``gyro``, of a table that holds that sensor alone; ``called`` is the table's name,
     which counts where the columns are plain x, y, z."""
-    frame = select_numeric(table.frame)
-    names = [str(c) for c in frame.columns]
+    frame, names = _select_numeric(table)
     for key, stem in vocabulary.SENSORS.items():
         columns = vocabulary.triad(names, stem)
         if columns is None and vocabulary.has(called, rf"\b{stem}\b"):
@@ -81,22 +83,21 @@ def sensor_spec(table: LogTable, called: str) -> tuple[str, Recognised] | None:
         if columns is None:
             continue
         known = frame[columns].notna().all(axis=1)
-        time = stamps.time_spec(replace_numeric(table, frame), known, SLOWEST_IMU_S, FASTEST_IMU_S)
+        time = stamps.time_spec(table, known, SLOWEST_IMU_S, FASTEST_IMU_S)
         if time is not None:
-            return key, Recognised({"time": time, key: {"columns": columns}})
-    return None
+            return {key: {"time": time, key: {"columns": columns}}}
+    return {}
 
 
 def gnss_spec(table: LogTable) -> Recognised | None:
     """The mapping of a table that holds fixes; None if it does not."""
-    frame = select_numeric(table.frame)
-    names = [str(c) for c in frame.columns]
+    frame, names = _select_numeric(table)
     found = {key: vocabulary.find_column(names, key) for key in vocabulary.QUANTITIES}
     lat, lon, height = (found[key] for key in ("lat", "lon", "height"))
     if (lat is None or lon is None) and any(vocabulary.triad(names, stem) for stem in vocabulary.SENSORS.values()):
         return None
     if lat is None or lon is None:
-        spec = by_numbers.gnss_spec(replace_numeric(table, frame))
+        spec = by_numbers.gnss_spec(table)
         if spec is None:
             return None
         columns = ", ".join(spec["position"]["columns"])
@@ -107,7 +108,7 @@ def gnss_spec(table: LogTable) -> Recognised | None:
     held = _find_repeated(frame[known], [lat, lon])
     if held is not None:
         known[known] = ~held
-    time = stamps.time_spec(replace_numeric(table, frame), known, SLOWEST_FIX_S, FASTEST_FIX_S)
+    time = stamps.time_spec(table, known, SLOWEST_FIX_S, FASTEST_FIX_S)
     if time is None or height is None:
         return None
     position: Spec = {"columns": [lat, lon, height], "unit": _angle_unit(frame, found)}
@@ -130,7 +131,7 @@ def gnss_spec(table: LogTable) -> Recognised | None:
     if quality is not None:
         out["quality"] = quality
     if "std_position" not in out and found["hdop"] is not None:
-        spec, note = _dilutions(frame[known], found, quality)
+        spec, note = _dilutions(table.frame[known], found, quality)
         out |= spec
         notes.append(note)
     if held is not None:
@@ -145,11 +146,9 @@ def _velocity_by_numbers(table: LogTable, frame: pd.DataFrame, time: Spec, posit
     scale = {"deg": 1.0, "1e-7deg": 1e-7, "rad": 180 / np.pi}.get(position["unit"])
     if scale is None:
         return {"columns": None}
-    names = [str(c) for c in frame.columns]
     taken = {*position["columns"], *(time["column"] if isinstance(time["column"], list) else [time["column"]])}
-    rest = [k for k, name in enumerate(names) if name not in taken]
     lat, lon = (scale * frame[c].to_numpy(float) for c in position["columns"][:2])
-    return by_numbers.velocities(t, lat, lon, names, frame.to_numpy(float), rest)
+    return by_numbers.velocities(t, lat, lon, frame[[c for c in frame.columns if str(c) not in taken]])
 
 
 def _hemispheres(frame: pd.DataFrame) -> list[str] | None:
@@ -169,22 +168,65 @@ def _find_repeated(frame: pd.DataFrame, place: list[str]) -> pd.Series | None:
     return same if same.mean() > 0.5 else None
 
 
+def aid_specs(table: LogTable, called: str, time: Spec | None = None) -> dict[str, Spec]:
+    """The mapping of every aid in a table: wheel speed, heading and barometer by the columns' names, a pressure by its
+    size too.
+
+    ``called`` is the table's name, ``time`` the mapping of its stamps where an IMU or fixes in it have set it. The
+    speed of a receiver is none of a wheel: it stands beside a latitude, or is called so.
+    """
+    numbers, names = _select_numeric(table)
+    places = vocabulary.find_column(names, "lat") is not None
+    found: dict[str, Spec] = {}
+    wheels = vocabulary.wheel_columns(names, "" if places else called)
+    if wheels:
+        found["speed"] = {"value": _wheel_value(numbers, wheels)}
+    headings = [n for n in names if vocabulary.has(n, vocabulary.HEADING)]
+    if not headings and not places and vocabulary.has(called, rf"{vocabulary.HEADING}|^heading$"):
+        headings = [n for n in names if n == vocabulary.find_column([n], "course")]
+    if headings:
+        degrees = float(np.nanmax(np.abs(numbers[headings[0]]))) > 2 * np.pi + 0.01
+        found["heading"] = {"value": {"columns": headings[:1], "unit": "deg" if degrees else "rad"}}
+    if pressures := vocabulary.match_columns(names, vocabulary.PRESSURE):
+        size = float(np.nanmedian(numbers[pressures[0]]))
+        if unit := next((u for u, (least, most) in PRESSURES.items() if least < size < most), None):
+            found["baro"] = {"pressure": {"columns": pressures[:1], "unit": unit}}
+    elif heights := vocabulary.match_columns(names, vocabulary.BARO_HEIGHT):
+        found["baro"] = {"pressure": {"columns": None}, "height": {"columns": heights[:1], "unit": "m"}}
+    out = {}
+    for name, spec in found.items():
+        column = (spec.get("value") or spec["pressure"])["columns"] or spec["height"]["columns"]
+        known = time or stamps.time_spec(table, numbers[column[0]].notna(), SLOWEST_AID_S, FASTEST_AID_S)
+        if known is not None:
+            out[name] = {"time": {**known, "offset_s": "auto"}, "rows": "filled", **spec}
+    return out
+
+
+def _wheel_value(numbers: pd.DataFrame, columns: list[str]) -> Spec:
+    """Columns with the unit that their name states, else left to GNSS; what never falls and is called so counts on."""
+    unit = vocabulary.find_unit(columns[0])
+    counted = vocabulary.has(columns[0], vocabulary.COUNTED) and unit not in SPEED_UNITS
+    if counted and unit not in COUNTS:
+        rises = bool((numbers[columns[0]].dropna().diff() >= 0).mean() > 0.9)
+        return {"columns": columns, "unit": "auto", "counts": rises}
+    return {"columns": columns, "unit": unit if unit in SPEED_UNITS and unit != "rpm" else "auto"}
+
+
 def velocity_spec(table: LogTable) -> tuple[Spec, Spec] | None:
     """Time and velocities of a table that has these and no positions; None if it does not."""
-    frame = select_numeric(table.frame)
-    names = [str(c) for c in frame.columns]
+    _, names = _select_numeric(table)
     velocity = _velocity({key: vocabulary.find_column(names, key) for key in vocabulary.QUANTITIES})
     if velocity is None:
         return None
     every = pd.Series(True, table.frame.index)
-    time = stamps.time_spec(replace_numeric(table, frame), every, SLOWEST_FIX_S, FASTEST_FIX_S)
+    time = stamps.time_spec(table, every, SLOWEST_FIX_S, FASTEST_FIX_S)
     return None if time is None else (time, velocity)
 
 
 def describe_missing(table: LogTable) -> str:
     """What a table has and what it lacks, in words, for a line that refuses it."""
-    frame = select_numeric(table.frame)
-    names = [str(c) for c in frame.columns]
+    table = convert_numbers(table)
+    _, names = _select_numeric(table)
     has = [key for key, stem in vocabulary.SENSORS.items() if vocabulary.triad(names, stem)]
     has += ["positions"] if vocabulary.find_column(names, "lat") else []
     columns = [str(c) for c in table.frame.columns]
@@ -199,33 +241,31 @@ def describe_missing(table: LogTable) -> str:
         lacks += [] if vocabulary.find_column(names, "lon") else ["a longitude"]
         lacks += [] if vocabulary.find_column(names, "height") else ["a height (one number in all rows will do)"]
     rows = pd.Series(True, table.frame.index)
-    if stamps.time_spec(replace_numeric(table, frame), rows, SLOWEST_FIX_S, FASTEST_IMU_S) is None:
+    if stamps.time_spec(table, rows, SLOWEST_FIX_S, FASTEST_IMU_S) is None:
         times = [n for n in vocabulary.match_columns(columns, vocabulary.TIME) if n not in names]
         of_day = times and table.frame[times[0]].astype(str).iloc[:20].str.match(stamps.OF_DAY).all()
         lacks.append("a date beside the times of day" if of_day else "stamps that can be read")
     return f"{text}: has {' and '.join(has)}" + (f", lacks {' and '.join(lacks)}" if lacks else "")
 
 
-def select_numeric(frame: pd.DataFrame) -> pd.DataFrame:
-    """The columns whose cells are numbers for the most part."""
-    keep = {}
-    for name in list(frame.columns)[:MOST_COLUMNS]:
+def convert_numbers(table: LogTable) -> LogTable:
+    """The table as all else here takes it: columns whose cells are numbers for the most part as numbers."""
+    frame = table.frame.iloc[:, :MOST_COLUMNS].copy(deep=False)
+    for name in frame.columns:
         values = frame[name]
         filled = values.notna()
         if not pd.api.types.is_numeric_dtype(values):
             filled &= values.astype(str).str.strip() != ""
             values = pd.to_numeric(values, errors="coerce")
-        if values.notna().sum() > 0.5 * filled.sum():  # of what stands there: rows of another kind leave it empty
-            keep[name] = values
-    return pd.DataFrame(keep, index=frame.index)
+        # of what stands there: rows of another kind leave it empty
+        frame[name] = values if values.notna().sum() > 0.5 * filled.sum() else frame[name].astype(object)
+    return replace(table, frame=frame)
 
 
-def replace_numeric(table: LogTable, numbers: pd.DataFrame) -> LogTable:
-    """The table with columns of :func:`select_numeric` in their places."""
-    whole = table.frame.iloc[:, :MOST_COLUMNS].copy(deep=False)
-    for name in numbers.columns:
-        whole[name] = numbers[name]
-    return replace(table, frame=whole)
+def _select_numeric(table: LogTable) -> tuple[pd.DataFrame, list[str]]:
+    """The columns with numbers, and their names."""
+    frame = table.frame.loc[:, [pd.api.types.is_numeric_dtype(kind) for kind in table.frame.dtypes]]
+    return frame, [str(c) for c in frame.columns]
 
 
 def _are_unnamed(names: list[str]) -> bool:

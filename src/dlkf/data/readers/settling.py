@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,9 +23,10 @@ from dlkf.data.tables import Columns
 from dlkf.data.validate import usable_fixes
 
 AUTO = "auto"
+AXES = {"imu.accel.axes", "imu.gyro.axes"}
 NEUTRAL: dict[str, Any] = {  # settings that may be auto, and what stands there until they are known
     **dict.fromkeys(("imu.accel.unit", "imu.gyro.unit", "gnss.velocity.unit"), 1.0),
-    **dict.fromkeys(("imu.accel.axes", "imu.gyro.axes"), "frd"),
+    **dict.fromkeys(AXES, "frd"),
     **dict.fromkeys(("imu.time.offset_s", "gnss.time.offset_s", "gnss.time.drift_ppm", "gnss.position.delay_s"), 0.0),
 }
 USUAL = {
@@ -49,20 +50,6 @@ class Unsure(InputError):
     offset_s: tuple[float, float] = (math.nan, math.nan)
 
 
-@dataclass(frozen=True)
-class Settled:
-    """Specs without ``auto``, the lever arm, and what was found."""
-
-    specs: dict[str, Any]
-    lever_arm_m: tuple[float, float, float]
-    findings: list[Finding]
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """A line per finding."""
-        return tuple(f"found reader.{f.setting}={write_value(f.value)}  ({f.detail})" for f in self.findings)
-
-
 def open_settings(specs: Mapping[str, Any], lever_arm_m: Any) -> set[str]:
     """Settings that are ``auto``."""
     wanted = {name for name in NEUTRAL if read_value(specs, name) == AUTO}
@@ -80,14 +67,18 @@ def placeholders(specs: Mapping[str, Any]) -> dict[str, Any]:
 
 def settle(
     mapped: Mapping[str, Mapped], t: Mapping[str, np.ndarray], wanted: set[str], sure: Sure, where: str, arm: Any
-) -> Settled:
-    """Find out what is wanted of a drive, its tables mapped with neutral values.
+) -> tuple[dict[str, Any], tuple[float, float, float], list[str]]:
+    """Find out what is wanted of a drive, its tables mapped with neutral values: specs without ``auto``, the lever arm,
+    a line per finding.
 
     ``t`` are the stamps of the tables. InputError where an answer is not sure.
     """
     specs = {kind: _plain(part.spec) for kind, part in mapped.items()}
     if "gnss" not in mapped and wanted == {"imu.accel.unit"}:
-        return _settle_by_gravity(specs, mapped["imu"], t["imu"], where, arm)
+        finding, _ = find_accel_unit(stack_columns(imu_frame(mapped["imu"], t["imu"]), ACCEL), increments=False)
+        _refuse_doubt([finding], wanted, where, t)
+        set_value(specs, "imu.accel.unit", finding.value)
+        return specs, arm, _describe_findings([finding], wanted)
     if "gnss" not in mapped:
         raise InputError(f"{where}: reader.{sorted(wanted)[0]}=auto needs GNSS to compare with; give the value")
     if (count := len(t["gnss"])) < FEWEST_FIXES:
@@ -106,13 +97,10 @@ def settle(
     if "imu.accel.unit" in wanted:
         _refuse_without_gravity(imu, where)
     gnss = gnss_frame(replace(mapped["gnss"], spec=specs["gnss"]), t["gnss"])
-    asked = set(wanted)
-    if {"imu.accel.axes", "imu.gyro.axes"} & wanted:
-        asked.add("imu.axes")
     found += discover(
         _keep_rising(imu),
         _keep_rising(gnss[usable_fixes(gnss)]),
-        asked,
+        wanted | ({"imu.axes"} if AXES & wanted else set()),
         sure,
         increments=bool(mapped["imu"].spec.get("increments")),
         drift_given="gnss.time.drift_ppm" not in wanted and read_value(specs, "gnss.time.drift_ppm") is not None,
@@ -124,7 +112,7 @@ def settle(
             set_value(specs, name, value)
     lever = find_value(found, "lever_arm_m") if "lever_arm_m" in wanted else arm
     x, y, z = (float(a) for a in lever)
-    return Settled(specs, (x, y, z), _list_by_setting(found, wanted))
+    return specs, (x, y, z), _describe_findings(found, wanted)
 
 
 def _refuse_without_gravity(imu: pd.DataFrame, where: str) -> None:
@@ -134,14 +122,6 @@ def _refuse_without_gravity(imu: pd.DataFrame, where: str) -> None:
         raise InputError(
             f"{where}: there is no gravity in the accelerations (linear acceleration?); give those of the accelerometer"
         )
-
-
-def _settle_by_gravity(specs: dict[str, Any], imu: Mapped, t: np.ndarray, where: str, arm: Any) -> Settled:
-    """The accelerometers' unit of a log without fixes."""
-    finding, _ = find_accel_unit(stack_columns(imu_frame(imu, t), ACCEL), increments=False)
-    _refuse_doubt([finding], {"imu.accel.unit"}, where, {"imu": t})
-    set_value(specs, "imu.accel.unit", finding.value)
-    return Settled(specs, arm, [finding])
 
 
 def _keep_rising(frame: pd.DataFrame) -> Columns:
@@ -197,21 +177,20 @@ def _describe_by_hand(doubts: list[Finding], wanted: set[str], t: Mapping[str, n
             value = "0 (if both files have one clock)" if overlap else "… (seconds to be added to its stamps)"
             said.append(f"reader.{setting}={value}")
         elif setting == "imu.axes":
-            names = sorted(wanted & {"imu.accel.axes", "imu.gyro.axes"})
+            names = sorted(wanted & AXES)
             said.append(f"{' '.join(f'reader.{name}=frd' for name in names)} (if x is forward, y right, z down)")
         else:
             said.append(f"reader.{setting}={USUAL.get(setting, '…')}")
     return " ".join(said)
 
 
-def _list_by_setting(found: list[Finding], wanted: set[str]) -> list[Finding]:
-    """Findings by the settings they answer."""
+def _describe_findings(found: list[Finding], wanted: set[str]) -> list[str]:
+    """A line per setting."""
     out = []
     for one in found:
-        names = sorted(wanted & {"imu.accel.axes", "imu.gyro.axes"}) if one.setting == "imu.axes" else [one.setting]
-        out += [
-            Finding(name, one.value, one.sure, one.detail if k == 0 else "the same") for k, name in enumerate(names)
-        ]
+        names = sorted(wanted & AXES) if one.setting == "imu.axes" else [one.setting]
+        details = (one.detail, "the same")
+        out += [f"found reader.{name}={write_value(one.value)}  ({why})" for name, why in zip(names, details)]
     return out
 
 

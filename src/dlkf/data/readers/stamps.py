@@ -145,7 +145,7 @@ def _day(unix: float) -> str:
 def epoch_note(part: Mapped) -> str | None:
     """From when the stamps of a table of numbers are taken to count, and what else they may mean; None for dates and
     for formats that state it themselves."""
-    time = part.spec.get("time") or {}
+    time = part.time
     if part.spec.get("format") not in TABULAR or not len(part):
         return None
     setting = f"reader.{part.kind}.time"

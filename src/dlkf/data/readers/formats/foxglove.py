@@ -42,10 +42,11 @@ class JsonBag:
 
     def deserialize(self, raw: bytes, kind: str) -> Any:
         """A message with attributes as ROS' have; Foxglove's ``timestamp`` is a header's stamp."""
-        values = json.loads(raw)
-        if isinstance(stamp := values.get("timestamp"), dict) and "header" not in values:
-            values["header"] = {"stamp": {"sec": stamp.get("sec", 0), "nanosec": stamp.get("nsec", 0)}}
-        return json.loads(json.dumps(values), object_hook=lambda fields: SimpleNamespace(**fields))
+        message = json.loads(raw, object_hook=lambda fields: SimpleNamespace(**fields))
+        if isinstance(stamp := getattr(message, "timestamp", None), SimpleNamespace) and not hasattr(message, "header"):
+            own = SimpleNamespace(sec=getattr(stamp, "sec", 0), nanosec=getattr(stamp, "nsec", 0))
+            message.header = SimpleNamespace(stamp=own)
+        return message
 
 
 def is_json(path: Path) -> bool:

@@ -22,6 +22,7 @@ from dlkf.data.readers.frames import LogTable
 
 DATENUMS = (723_000.0, 767_000.0)  # 1979 to 2099
 LARGEST_BYTES = 4 << 30
+DAMAGED = (scipy.io.matlab.MatReadError, MemoryError)
 DEEPEST = 6  # of structures in structures
 VECTORS = "vectors"
 
@@ -60,12 +61,15 @@ def variables(path: Path) -> dict[str, Any]:
 
 def _load(path: Path) -> dict[str, Any]:
     try:
-        loaded = scipy.io.loadmat(path, simplify_cells=True)
-        found = {name: value for name, value in loaded.items() if not name.startswith("__")}
-    except NotImplementedError:  # version 7.3 is HDF5
-        return _hdf5_variables(path)
-    except (scipy.io.matlab.MatReadError, ValueError, OSError, TypeError, IndexError, KeyError, MemoryError) as error:
+        try:
+            loaded = scipy.io.loadmat(path, simplify_cells=True)
+        except NotImplementedError:  # version 7.3 is HDF5
+            return _hdf5_variables(path)
+    except InputError:
+        raise
+    except (*DAMAGED, ValueError, OSError, TypeError, LookupError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be read as a MATLAB file ({first_line(error)}); save it again") from None
+    found = {name: value for name, value in loaded.items() if not name.startswith("__")}
     objects = [n for n, v in found.items() if isinstance(v, scipy.io.matlab.MatlabOpaque)]
     if objects and len(objects) == len(found):
         name = objects[0]
@@ -78,14 +82,9 @@ def _load(path: Path) -> dict[str, Any]:
 
 def _hdf5_variables(path: Path) -> dict[str, Any]:
     h5py = library("h5py", "a MATLAB file of version 7.3")
-    try:
-        with h5py.File(path) as file:
-            _check_size(h5py, file, path)
-            return {name: _hdf5(h5py, node, DEEPEST) for name, node in file.items() if not name.startswith("#")}
-    except (OSError, KeyError, RuntimeError, MemoryError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: cannot be read as a MATLAB file ({first_line(error)}); save it again") from None
+    with h5py.File(path) as file:
+        _check_size(h5py, file, path)
+        return {name: _hdf5(h5py, node, DEEPEST) for name, node in file.items() if not name.startswith("#")}
 
 
 def _check_size(h5py: Any, file: Any, path: Path) -> None:

@@ -55,9 +55,7 @@ def _export(lines: list[str], path: Path) -> LogTable:
             out[name] = part.iloc[:, 0].to_numpy() if bool(numbers.isna().any()) else numbers.to_numpy()
         at += width
     out |= _weeks(out, dict(zip(names, marks)), str(path))
-    return LogTable(
-        pd.DataFrame(out, index=cells.index), path, "line", {n: m for n, m in zip(names, marks) if m}, notes
-    )
+    return LogTable(pd.DataFrame(out, index=cells.index), path, "line", notes)
 
 
 def _marks(names: str, units_of_them: str) -> list[str]:

@@ -47,4 +47,4 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
     again = frame["t"].duplicated()
     if bool(again.any()):
         notes.append(f"{path.parent.name}: {int(again.sum())} rows with the stamp of the row before, left out")
-    return LogTable(frame[~again], path, "row", {}, tuple(notes[:3]))
+    return LogTable(frame[~again], path, "row", tuple(notes[:3]))

@@ -33,7 +33,7 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
 
 def holds(path: Path, kind: str) -> bool:
     """Whether some topic holds an IMU (``imu``), or fixes (``gnss``)."""
-    return any(t in (IMU if kind == "imu" else (*FIX, SENTENCE)) for t in _topics(path).values())
+    return any(t in (SENSORS["imu"] if kind == "imu" else (*FIX, SENTENCE)) for t in _topics(path).values())
 
 
 def list_topics(path: Path) -> str:
@@ -48,8 +48,8 @@ def aids(path: Path) -> tuple[str, ...]:
 
 def _wheel_topics(topics: Mapping[str, str]) -> list[str]:
     """Topics of the wheels: twists and odometries that are called so, and not by GNSS or a filter's output."""
-    kinds = (*VELOCITIES, *ODOMETRY)
-    return sorted(t for t, kind in topics.items() if kind in kinds and WHEEL.search(t) and not NO_WHEEL.search(t))
+    moving = (t for t, kind in topics.items() if kind in SENSORS["speed"])
+    return sorted(t for t in moving if WHEEL.search(t) and not NO_WHEEL.search(t))
 
 
 def find_velocities(path: Path) -> list[str]:
@@ -85,7 +85,7 @@ def _open(path: Path) -> Iterator[Any]:
 
 
 def _read(reader: Any, path: Path, kind: str, table: str | None) -> LogTable:
-    known = {"imu": {*IMU}, "speed": {*ODOMETRY, *VELOCITIES}}.get(kind, {*FIX, SENTENCE})
+    known = [*SENSORS[kind]] if kind in SENSORS else [*FIX, SENTENCE]
     topics = {c.topic: c for c in reader.connections}
     have = ", ".join(f"{name} ({c.msgtype})" for name, c in sorted(topics.items()))
     if table is not None:
@@ -101,7 +101,7 @@ def _read(reader: Any, path: Path, kind: str, table: str | None) -> LogTable:
             what = "no topic" if not chosen else f"{len(chosen)} topics"
             raise InputError(f"{path}: {what} with {', '.join(sorted(known))}; has {have}; set reader.{kind}.table")
     name = _shorten_type(chosen[0].msgtype)
-    every = {"imu": IMU, "speed": {**ODOMETRY, **dict.fromkeys(VELOCITIES, _forward)}}.get(kind, {**FIX, **VELOCITIES})
+    every = SENSORS.get(kind, {**FIX, **VELOCITIES})
     if name not in (*every, SENTENCE):
         raise InputError(f"{path}: {chosen[0].topic} is {chosen[0].msgtype}; must be {', '.join(every)}")
     messages = ((stamp, reader.deserialize(raw, c.msgtype)) for c, stamp, raw in reader.messages(connections=chosen))
@@ -187,15 +187,17 @@ def _shorten_type(msgtype: str) -> str:
 WHEEL = re.compile(r"wheel|odom|vehicle|can|chassis|encoder|speed", re.IGNORECASE)
 NO_WHEEL = re.compile(r"gnss|gps|fix|ublox|filter|ekf|slam|visual|lidar|imu", re.IGNORECASE)
 SENTENCE = "nmea_msgs/Sentence"  # several make a fix
-IMU: dict[str, Callable[[Any], Row]] = {"sensor_msgs/Imu": _imu}
 FIX: dict[str, Callable[[Any], Row]] = {
     "sensor_msgs/NavSatFix": _nav_sat_fix,
     "foxglove.LocationFix": _nav_sat_fix,
     "ublox_msgs/NavPVT": _nav_pvt,
     "ublox_msgs/NavPVT7": _nav_pvt,
 }
-ODOMETRY: dict[str, Callable[[Any], Row]] = {"nav_msgs/Odometry": _forward}
 VELOCITIES: dict[str, Callable[[Any], Row]] = {
     "geometry_msgs/TwistStamped": _twist,
     "geometry_msgs/TwistWithCovarianceStamped": _twist,
+}
+SENSORS: dict[str, dict[str, Callable[[Any], Row]]] = {
+    "imu": {"sensor_msgs/Imu": _imu},
+    "speed": dict.fromkeys(("nav_msgs/Odometry", *VELOCITIES), _forward),
 }

@@ -47,7 +47,7 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
     ]
     first, usual = (rows[0][0], len(rows[0][1])) if rows else (0, 0)
     cells, notes = make_frame(rows, usual, path, f"another number of cells than line {first}")
-    return LogTable(_frame(cells, names, ZONES[zone], path), path, "line", {}, notes)
+    return LogTable(_frame(cells, names, ZONES[zone], path), path, "line", notes)
 
 
 def _frame(cells: pd.DataFrame, names: list[str], clock: str, path: Path) -> pd.DataFrame:

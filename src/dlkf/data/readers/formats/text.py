@@ -46,10 +46,8 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
         every, rows = rows, [k for k in rows if chosen.search(lines[k])]
         if not rows:
             raise InputError(f"{path}: no line matches {pattern}; {_describe_beginnings(lines, every, pattern, kind)}")
-    units, notes = {}, []
+    notes = []
     if head and len(rows) > 1 and _is_units(lines[rows[0]], lines[rows[1]], options):
-        names, cells = (_cells(lines[k], options["separator"]) for k in (head[0], rows[0]))
-        units = {n.strip().strip('"'): u.strip().strip('"') for n, u in zip(names, cells)}
         rows = rows[1:]
     if len(rows) > 1 and (detail := _find_cut(lines, rows, content.endswith(("\n", "\r")), options)):
         notes.append(f"{path.name}: line {rows[-1] + 1}, the last, {detail}: left out, the log seems cut off there")
@@ -60,7 +58,7 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
     if not len(frame):
         raise InputError(f"{path}: has no rows; leave the drive out or give its data")
     frame.index = pd.Index([k + 1 for k in rows][: len(frame)])
-    return LogTable(frame, path, "line", units, tuple(notes))
+    return LogTable(frame, path, "line", tuple(notes))
 
 
 def decode_text(path: Path, encoding: str | None) -> str:

@@ -49,32 +49,31 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
     fixes = _fixes(messages)
     if not len(fixes):
         raise InputError(f"{path}: has no NAV-PVT message; log UBX-NAV-PVT, or give GNSS from another file{cut}")
-    wanted = [table] if table else list(MESSAGES)
-    if kind in ("speed", "heading"):
-        found = _headings(messages) if kind == "heading" else _find_table(_wheels(messages, name) for name in wanted)
-        if not len(found):
-            what = "NAV-RELPOSNED with a valid heading" if kind == "heading" else "speed or ticks of wheels in ESF-MEAS"
-            raise InputError(f"{path}: has no {what}; set reader.{kind}.file=null")
-        return LogTable(found, path, "message", notes=notes)
-    if kind != "imu":
+    if kind in ("gnss", "reference"):
         return LogTable(fixes, path, "fix", notes=notes)
-    samples = _find_table(_samples(messages, name) for name in wanted)
-    if len(samples):
-        return LogTable(samples, path, "sample", notes=notes)
-    have = ", ".join(sorted({m.identity for m in messages}))
-    raise InputError(f"{path}: has no IMU in {' or '.join(wanted)}; has {have}; set reader.imu.format and file{cut}")
+    wanted = (table,) if table else MESSAGES
+    if len(found := _find_table(messages, kind, wanted)):
+        return LogTable(found, path, "sample" if kind == "imu" else "message", notes=notes)
+    if kind == "imu":
+        have = ", ".join(sorted({m.identity for m in messages}))
+        remedy = f"has {have}; set reader.imu.format and file{cut}"
+        raise InputError(f"{path}: has no IMU in {' or '.join(wanted)}; {remedy}")
+    what = "NAV-RELPOSNED with a valid heading" if kind == "heading" else "speed or ticks of wheels in ESF-MEAS"
+    raise InputError(f"{path}: has no {what}; set reader.{kind}.file=null")
 
 
 def aids(path: Path) -> tuple[str, ...]:
     """Which further sensors a log has: speed, heading."""
     messages, _ = _messages(path, path.stat().st_mtime_ns)
-    found = {"speed": _find_table(_wheels(messages, name) for name in MESSAGES), "heading": _headings(messages)}
-    return tuple(name for name, table in found.items() if len(table))
+    return tuple(kind for kind in ("speed", "heading") if len(_find_table(messages, kind, MESSAGES)))
 
 
-def _find_table(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
-    """The first that has rows."""
-    return next((table for table in tables if len(table)), pd.DataFrame())
+def _find_table(messages: list[Any], kind: str, names: Iterable[str]) -> pd.DataFrame:
+    """Of headings, or of the first of the IMU's messages that has wheels or samples; empty where none has."""
+    if kind == "heading":
+        return _headings(messages)
+    make = _wheels if kind == "speed" else _samples
+    return next((table for name in names if len(table := make(messages, name))), pd.DataFrame())
 
 
 @lru_cache(maxsize=1)  # the IMU, the fixes and the wheels of a log are read one after the other
