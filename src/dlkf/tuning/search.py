@@ -9,14 +9,14 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dlkf.base.console import warn_once
+from dlkf.base.console import show_progress, warn_once
 from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import PVA, end_errors, geometric_mean, mean_error, segment_errors
@@ -149,6 +149,21 @@ def tune_filter(
         if best == before:
             break
     return best, score
+
+
+def tune_under_bar(
+    imu: ImuSpec, batches: Sequence[Batch], name: str, rounds: int, **options: Any
+) -> tuple[Tuning, float, list[Trial]]:
+    """:func:`tune_filter` under a bar, for it takes minutes on much data; the trials, too."""
+    most, trials = rounds * sum(map(len, list_factors(name).values())), list[Trial]()
+    with show_progress(f"Tuning {name}") as bar:
+
+        def tell(trial: Trial) -> None:
+            trials.append(trial)
+            bar(len(trials), most)
+
+        best, score = tune_filter(imu, batches, name=name, rounds=rounds, progress=tell, **options)
+    return best, score, trials
 
 
 def _in_c(estimator: Estimator, batch: Batch) -> CompiledFilter:
