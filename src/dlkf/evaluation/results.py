@@ -29,7 +29,7 @@ from dlkf.evaluation.metrics import (
     slope,
     summarise_errors,
 )
-from dlkf.evaluation.scores import Scores, sigma_samples
+from dlkf.evaluation.scores import Scores
 from dlkf.running.innovations import rms
 
 SETTLE_S = 10.0  # "settled" leaves out this much of every segment, where the initial error dominates
@@ -177,7 +177,7 @@ def summarise_scores(
     for name in scores.filters:
         samples[name] = _segment_samples(scores, name, settle_s)
         if len(w.segment):
-            samples[name] |= _outage_samples(scores, name, distance) | sigma_samples(scores, name)
+            samples[name] |= _outage_samples(scores, name, distance)
         for (over, part, quantity), x in samples[name].items():
             values += make_values(scores.kinds[0], name, over, part, quantity, summarise_errors(x))
         spread = {"rms": rms(scores.filters[name].innovation)}  # over their 1σ; NaN of a filter without covariance
@@ -256,7 +256,9 @@ def _outage_samples(scores: Scores, name: str, distance: Array) -> dict[tuple[st
     seconds = np.asarray(INTO_OUTAGE_S)
     seconds = seconds[seconds <= w.length.max() * scores.epoch_s + 1e-9]
     at = {q: outage_at(size[q], w, seconds, scores.epoch_s) for q in QUANTITIES}
+    std = scores.filters[name].position_std
     end = {q: outage_end(size[q], w) for q in QUANTITIES}
+    end["sigma"] = outage_end(np.hypot(std[..., 0], std[..., 1]), w)  # the filter's own
     with np.errstate(divide="ignore", invalid="ignore"):
         end["drift"] = np.where(distance > 1.0, end["horizontal"] / distance, np.nan)
     found = {("outages", "end", q): x for q, x in end.items()}

@@ -378,16 +378,5 @@ def _rows(
     )
     if solution.aids is not None:
         table = table.join(pd.DataFrame(solution.aids[row, :n].cpu().double().numpy(), columns=list(aids)))
-    innovation = _innovation(solution, row)
-    return table, Innovation(innovation.value[:n], innovation.std[:n])
-
-
-def _innovation(solution: BatchSolution, row: int) -> Innovation:
-    """Of one drive of a batch, (T, 6); components without a measurement are NaN."""
-    value = solution.innovation[row].cpu().double()
-    seen = solution.used[row].cpu().unsqueeze(-1) & (value != 0)
-    std = torch.full_like(value, torch.nan)
-    if (S := solution.innovation_covariance) is not None:
-        std = S[row].diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt().cpu().double()
-    nan = torch.tensor(torch.nan, dtype=torch.float64)
-    return Innovation(torch.where(seen, value, nan).numpy(), torch.where(seen, std, nan).numpy())
+    S = solution.innovation_covariance
+    return table, Innovation.of(solution.innovation[row, :n], solution.used[row, :n], None if S is None else S[row, :n])
