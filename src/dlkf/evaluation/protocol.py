@@ -24,7 +24,7 @@ from dlkf.data.segments import (
 from dlkf.data.stack import DriveStack, stack_drives
 from dlkf.evaluation.outages import OutagePlan, bounds
 from dlkf.evaluation.run import Scene
-from dlkf.running.batched import CHUNK_SAMPLES
+from dlkf.running.batched import CHUNK_SAMPLES, pack
 from dlkf.running.start import align_each
 
 if TYPE_CHECKING:
@@ -222,13 +222,5 @@ def drives_that_fit(plan: OutagePlan, length_s: float, length: str = "length_s",
 
 def _parts(items: Sequence, epochs: Sequence[int], stack: DriveStack) -> list[list]:
     """Items in order, as many together as four chunks hold when padded to the longest of them."""
-    samples = stack.imu.shape[1]
-    parts: list[list] = []
-    longest = 0
-    for item, n in zip(items, epochs):
-        longest = max(longest, n)
-        if not parts or (len(parts[-1]) + 1) * longest * samples > 4 * CHUNK_SAMPLES:
-            parts.append([])
-            longest = n
-        parts[-1].append(item)
-    return parts
+    sizes = [n * stack.imu.shape[1] for n in epochs]
+    return [[items[k] for k in part] for part in pack(sizes, 4 * CHUNK_SAMPLES)]

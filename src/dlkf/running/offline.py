@@ -29,7 +29,7 @@ from dlkf.filters.integration import BatchSolution, WholeLoop
 from dlkf.filters.receiver import ARM, DELAY, DRIFT
 from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.compiled import without_loops
-from dlkf.running.batched import CHUNK_SAMPLES, run_filter
+from dlkf.running.batched import CHUNK_SAMPLES, pack, run_filter
 from dlkf.running.innovations import FAR, Innovation, fit_sigma, worst_stretch
 from dlkf.running.loss import find_first_loss
 from dlkf.running.solution import SCHEMA, solution_table
@@ -290,10 +290,8 @@ def navigate_drives(
         raise no_drives(skipped)
     todo = sorted(starts, key=lambda k: drives[k].epochs - starts[k].first, reverse=True)
     done = 0
-    while done < len(todo):
-        first = drives[todo[done]]
-        at_once = max(1, CHUNK_SAMPLES // (first.epochs * first.imu.shape[1]))
-        part = todo[done : done + at_once]
+    for rows in pack([drives[k].epochs * drives[k].imu.shape[1] for k in todo], CHUNK_SAMPLES):
+        part = [todo[row] for row in rows]
         batch = whole_drives([drives[k] for k in part], [starts[k] for k in part])
         solution = _run(batch, estimator)
         for row, k in enumerate(part):

@@ -90,17 +90,15 @@ def make_reference(
         v_e = torch.einsum("ij,tj->ti", frame.C_en[0], state.v_n[0, :n])
         C_eb = frame.C_en[0] @ state.C_nb[0, :n]
         rows = slice(row, row + n)
-        found = _make_blank(drive)
-        found["ref_C_eb"][rows] = C_eb
+        found = blank_reference(len(drive.gnss_r_e))
         if kind == "smoothed":
             sigma = std[0, :n, POSITION]
             sure = sigma.norm(dim=-1) <= UNSURE * sigma.norm(dim=-1).median()
-            found["ref_r_e"][rows], found["ref_v_e"][rows], found["ref_valid"][rows] = r_e, v_e, sure
+            found["ref_C_eb"][rows] = C_eb
         else:
-            r_fix, v_fix, good = _carry_to_imu(drive, rows, C_eb, v_e)
-            found["ref_r_e"][rows], found["ref_v_e"][rows], found["ref_valid"][rows] = r_fix, v_fix, good
-            sigma, sure = drive.gnss_std[rows, :3], good
-            found["ref_C_eb"][:] = torch.nan
+            r_e, v_e, sure = _carry_to_imu(drive, rows, C_eb, v_e)
+            sigma = drive.gnss_std[rows, :3]
+        found["ref_r_e"][rows], found["ref_v_e"][rows], found["ref_valid"][rows] = r_e, v_e, sure
         sigmas.append(sigma[sure])
         made.append(replace(drive, **found))
         if progress is not None:
@@ -113,15 +111,11 @@ def make_reference(
     return ReferencedDrives(made, sigma, skipped, kind)
 
 
-def _make_blank(drive: Drive) -> dict[str, Tensor]:
-    """No reference at all; its rows are to be filled."""
-    return {
-        "ref_r_e": torch.full_like(drive.gnss_r_e, torch.nan),
-        "ref_v_e": torch.full_like(drive.gnss_r_e, torch.nan),
-        "ref_C_eb": torch.full((*drive.gnss_r_e.shape[:1], 3, 3), torch.nan, dtype=torch.float64),
-        "ref_valid": torch.zeros(len(drive.gnss_r_e), dtype=torch.bool),
-        "ref_imu_error": torch.full((len(drive.gnss_r_e), 6), torch.nan, dtype=torch.float64),
-    }
+def blank_reference(rows: int) -> dict[str, Tensor]:
+    """No reference at all, as fields of a drive with so many boundaries."""
+    shapes = {"ref_r_e": (3,), "ref_v_e": (3,), "ref_C_eb": (3, 3), "ref_imu_error": (6,)}
+    blank = {name: torch.full((rows, *shape), torch.nan, dtype=torch.float64) for name, shape in shapes.items()}
+    return blank | {"ref_valid": torch.zeros(rows, dtype=torch.bool)}
 
 
 def _carry_to_imu(drive: Drive, rows: slice, C_eb: Tensor, v_e: Tensor) -> tuple[Tensor, Tensor, Tensor]:
