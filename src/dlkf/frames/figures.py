@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from dlkf.evaluation.figures import png
 from dlkf.evaluation.metrics import magnitudes, outage_at
 from dlkf.evaluation.scores import Scores
 from dlkf.report.navigation import GAP_S, TrackOnMap, horizontal_std
+from dlkf.report.page import embed_png
 from dlkf.report.plots import spans
 from dlkf.running.offline import Navigated, UsableFixes
 
@@ -30,7 +30,7 @@ class NotebookFigure(Figure):
 
 def as_html(figure: Figure) -> str:
     """A figure as ``<img>``."""
-    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(png(figure, DPI)).decode()}">'
+    return f'<img alt="" src="{embed_png(png(figure, DPI))}">'
 
 
 def draw_solution(navigated: Navigated, fixes: UsableFixes) -> NotebookFigure:

@@ -30,7 +30,7 @@ from dlkf.filters.receiver import ARM, DELAY, DRIFT
 from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.compiled import without_loops
 from dlkf.running.batched import CHUNK_SAMPLES, pack, run_filter
-from dlkf.running.innovations import FAR, Innovation, fit_sigma, worst_stretch
+from dlkf.running.innovations import FAR, Innovation, fit_sigma, rms, worst_stretch
 from dlkf.running.loss import find_first_loss
 from dlkf.running.solution import SCHEMA, solution_table
 from dlkf.running.start import align_each
@@ -148,21 +148,25 @@ class Navigated:
         """Columns of the table that further sensors added."""
         return [column for column in self.table.columns if column not in SCHEMA.names]
 
+    @property
+    def sensor_updates(self) -> dict[str, tuple[int, int, float]]:
+        """Of further sensors: updates that used them, all updates, and RMS of the innovations over their 1σ."""
+        found, table = {}, self.table
+        for name in (c.removesuffix("_used") for c in self.sensor_columns if c.endswith("_used")):
+            ratio = (table[f"{name}_innovation"] / table[f"{name}_innovation_std"]).to_numpy()
+            found[name] = int(table[f"{name}_used"].sum()), int((~np.isnan(ratio)).sum()), rms(ratio)
+        return found
+
     def sensors(self) -> dict[str, str]:
         """Of further sensors: how many updates used them, how they fit, and what was found of them at the end."""
         said, table = {}, self.table
-        for used in (column for column in self.sensor_columns if column.endswith("_used")):
-            name = used.removesuffix("_used")
-            ratio = table[f"{name}_innovation"] / table[f"{name}_innovation_std"]
-            seen = int(ratio.notna().sum())
+        for name, (used, seen, spread) in self.sensor_updates.items():
             if not seen:
                 if name != "vibration_speed":  # which needs none while there is GNSS
                     said[name] = f"{name}: no update"
                 continue
-            said[name] = f"{name} in {int(table[used].sum())} of {seen} updates"
-            if table[used].sum() < MOSTLY * seen:
-                said[name] += ", most of them refused: see its unit, sign and clock"
-            said[name] += f" (normalised innovation RMS {np.sqrt((ratio**2).mean()):.2g})"
+            refused = ", most of them refused: see its unit, sign and clock" if used < MOSTLY * seen else ""
+            said[name] = f"{name} in {used} of {seen} updates{refused} (normalised innovation RMS {spread:.2g})"
         for std in (column for column in self.sensor_columns if column.startswith("std_")):
             name, last = std.removeprefix("std_"), table.iloc[-1]
             floor = OF_RECEIVER.get(name)
