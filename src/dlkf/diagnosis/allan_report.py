@@ -17,7 +17,7 @@ from dlkf.base.files import write_into
 from dlkf.base.provenance import describe_provenance
 from dlkf.data.schema import stack_columns
 from dlkf.diagnosis.allan import AllanFit, Array, allan_variance, check_static, cluster_sizes, fit_noise, preset_yaml
-from dlkf.evaluation.figures import png
+from dlkf.evaluation.figures import plain_axes, png
 from dlkf.evaluation.table import ResultTable, as_json, as_markdown, format_number
 from dlkf.navigation.imu_errors import DEG, MILLIGAL, ImuSpec
 from dlkf.report.page import Page, embed_png
@@ -60,14 +60,14 @@ def analyse(drive: str, imu: Array, rate_hz: float, base: ImuSpec) -> StaticLog:
 def noise_table(log: StaticLog) -> ResultTable:
     """N, B, K and the Gauss-Markov bias, by axis and by triad, in the units that data sheets use."""
     rows = []
-    for name, fit in log.fits.items():
+    for name in (*AXES[:3], "accel", *AXES[3:], "gyro"):
+        fit = log.fits[name]
         accel = name.startswith("accel")
         walk, bias = (60.0, 1 / MILLIGAL) if accel else (60 / DEG, 3600 / DEG)
         time = format_number(fit.time) + ("" if fit.resolved else "*")
         row = [format_number(x) for x in (fit.density * walk, fit.floor * bias, fit.floor_s, fit.walk * bias * 60)]
         row += [format_number(fit.sigma * bias), time] if fit.rises else ["–", "–"]
         rows.append([f"{NAMES[name]}, all axes" if name in TRIADS else name.replace("_", " "), *row])
-    order = [0, 1, 2, 6, 3, 4, 5, 7]
     return ResultTable(
         title=f"{log.drive}: {log.duration_s / 3600:.3g} h at rest, {log.rate_hz:g} Hz",
         note=(
@@ -75,7 +75,7 @@ def noise_table(log: StaticLog) -> ResultTable:
             "K in °/h/√h. τ*: too long for this log, taken from the preset; – the log is too short."
         ),
         columns=["Axis", "N", "B", "at [s]", "K", "In-run bias, 1σ", "τ [s]"],
-        rows=[rows[k] for k in order],
+        rows=rows,
     )
 
 
@@ -95,9 +95,8 @@ def figure(log: StaticLog) -> Figure:
         ax.plot([1], [fit.density], "o", mfc="white", mec="black", zorder=5, label="N, at 1 s")
         ax.plot([fit.floor_s], [fit.floor * 0.664], "s", mfc="white", mec="black", zorder=5, label="floor, 0.664 B")
         ax.set(title=NAMES[triad], xlabel="Cluster time τ [s]", ylabel=f"Allan deviation [{UNITS[triad]}]")
-        ax.grid(True, which="both", color="#EEEEEE", lw=0.8)
-        ax.set_axisbelow(True)
-        ax.spines[["top", "right"]].set_visible(False)
+        plain_axes(ax)
+        ax.grid(True, which="minor", color="#EEEEEE", lw=0.8)
         ax.legend(frameon=False, fontsize=8, ncols=2)
     return out
 

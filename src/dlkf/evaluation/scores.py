@@ -128,6 +128,19 @@ def _pad(x: Array, T: int) -> Array:
     return np.pad(x, extra, constant_values=False if x.dtype == bool else np.nan)
 
 
+def settled_limits(parts: Sequence[Array]) -> tuple[float, float] | None:
+    """Limits of an axis by the settled parts of its lines, with room to see them converge; the first swings may leave.
+
+    None where nothing is finite.
+    """
+    values = np.concatenate([*parts, np.empty(0)])
+    values = values[np.isfinite(values)]
+    if not values.size:
+        return None
+    margin = 0.6 * float(np.ptp(values)) or 1e-6
+    return float(values.min()) - margin, float(values.max()) + margin
+
+
 def representative(scores: Scores, n: int, filter_name: str | None) -> list[int]:
     """Up to n segments from good to bad: even quantiles of a filter's horizontal error in outages (or anywhere), of the
     first filter where that is not among them."""

@@ -15,7 +15,7 @@ from dlkf.base.files import resolve_place, write_into
 from dlkf.evaluation.metrics import Mask, magnitudes, outage_at, outage_end, rms_over_segments
 from dlkf.evaluation.outages import UNUSED
 from dlkf.evaluation.results import Results
-from dlkf.evaluation.scores import OFF_SCALE, Scores, representative
+from dlkf.evaluation.scores import OFF_SCALE, Scores, representative, settled_limits
 from dlkf.evaluation.sensors import TITLE as SENSORS_TITLE
 from dlkf.evaluation.summary import END, describe_verdict, headline, sigma_warnings
 from dlkf.evaluation.table import DEGREES, ResultTable, all_tables, as_csv, as_json, as_markdown, format_number
@@ -360,7 +360,7 @@ def error_charts(scores: Scores) -> Figure:
 
 def imu_error_charts(scores: Scores, i: int, banded: str) -> Figure:
     """Estimates of one segment, with the ±3σ of the filter ``banded``, and the truth where it is known."""
-    figure = stack_panels([title for title, _ in IMU], height=120)
+    figure, late = stack_panels([title for title, _ in IMU], height=120), scores.t > 0.2 * scores.t[-1]
     for k, (_, scale) in enumerate(IMU):
         truth = scores.true_imu_error[i, :, k] * scale
         for name, c in colours(scores).items():
@@ -373,18 +373,11 @@ def imu_error_charts(scores: Scores, i: int, banded: str) -> Figure:
             figure.add_trace(line(scores.t, y, name, c, legend=k == 0), k + 1)
         if np.isfinite(truth).any():
             figure.add_trace(line(scores.t, truth, "truth", TRUTH, legend=k == 0), k + 1)
-        _set_limits(figure, scores, i, k, scale)
+        settled = [
+            scale * x[i, late, k] for x in (scores.true_imu_error, *(r.imu_error for r in scores.filters.values()))
+        ]
+        if limits := settled_limits(settled):
+            figure.update_yaxis(k + 1, range=list(limits))
     figure.update_xaxis(6, title={"text": "Time since the start of the segment [s]"})
     shade(figure, spans(scores.t, scores.outage[i]), 6)
     return figure
-
-
-def _set_limits(figure: Figure, scores: Scores, i: int, k: int, scale: float) -> None:
-    """Limits by the last four fifths of the lines: the first swings may leave the panel."""
-    late = scores.t > 0.2 * scores.t[-1]
-    lines: list[Array] = [r.imu_error[i, late, k] for r in scores.filters.values()]
-    values = np.concatenate([*lines, scores.true_imu_error[i, late, k]]) * scale
-    values = values[np.isfinite(values)]
-    if values.size:
-        margin = 0.6 * float(np.ptp(values)) or 1e-6
-        figure.update_yaxis(k + 1, range=[float(values.min()) - margin, float(values.max()) + margin])
