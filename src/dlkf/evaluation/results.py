@@ -7,7 +7,7 @@ them, which quantity and statistic. Tables, CSV, ``metrics.json``, MLflow's keys
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import product
 from typing import Any, NamedTuple
@@ -63,8 +63,8 @@ class Value(NamedTuple):
     unit: str
 
 
-@dataclass(frozen=True)
-class PairedRatio:
+@dataclass(frozen=True, kw_only=True)
+class PairedRatio(Comparison):
     """A filter against the baseline in one quantity; ``over`` and ``part`` as in :class:`Value`."""
 
     kind: str
@@ -73,13 +73,6 @@ class PairedRatio:
     over: str
     part: str
     quantity: str
-    against: Comparison
-
-    def as_dict(self) -> dict[str, Any]:
-        """One flat row of plain values."""
-        row = asdict(self)
-        against = row.pop("against")
-        return row | against
 
 
 @dataclass(frozen=True)
@@ -118,9 +111,7 @@ class Results:
     def versus(self, filter: str, over: str, part: str, quantity: str, statistic: str = "rms") -> Comparison | None:
         """One comparison; None for the baseline itself, or what is not compared."""
         wanted = (filter, over, part, quantity, statistic)
-        same = (
-            c.against for c in self.comparisons if (c.filter, c.over, c.part, c.quantity, c.against.statistic) == wanted
-        )
+        same = (c for c in self.comparisons if (c.filter, c.over, c.part, c.quantity, c.statistic) == wanted)
         return next(same, None)
 
     def seconds_into_outage(self) -> list[str]:
@@ -134,7 +125,7 @@ class Results:
 
     def as_dict(self) -> dict[str, Any]:
         """For ``metrics.json``; ``pandas.DataFrame(**result["values"])`` is the frame, and so for ``comparisons``."""
-        rows = [c.as_dict() for c in self.comparisons]
+        rows = [asdict(c) for c in self.comparisons]
         return {
             "kind": self.kind,
             "count": dict(self.count),
@@ -148,11 +139,10 @@ class Results:
     @staticmethod
     def of(content: Mapping[str, Any]) -> Results:
         """Results as ``metrics.json`` has them: the inverse of :meth:`as_dict`."""
-        comparisons, columns = [], content["comparisons"]["columns"]
+        columns, comparisons = content["comparisons"]["columns"], []
         for row in content["comparisons"]["data"]:
             named: dict[str, Any] = {k: x if k in TEXT else _real(x) for k, x in zip(columns, row)}
-            against = Comparison(**{f.name: named.pop(f.name) for f in fields(Comparison)})
-            comparisons.append(PairedRatio(**named, against=against))
+            comparisons.append(PairedRatio(**named))
         values = (Value(*row[:-2], value=_real(row[-2]), unit=row[-1]) for row in content["values"]["data"])
         kept = {k: content[k] for k in ("kind", "count", "settle_s")}
         lists: dict[str, Any] = {k: tuple(content[k]) for k in ("per_segment", "per_outage")}
@@ -175,7 +165,10 @@ def summarise_scores(
     samples: dict[str, dict[tuple[str, str, str], Array]] = {}  # filter → (over, part, quantity) → one per unit
     values: list[Value] = []
     for name in scores.filters:
-        samples[name] = _segment_samples(scores, name, settle_s)
+        size, phases = magnitudes(scores.filters[name].error), _phases(scores, settle_s)
+        samples[name] = {
+            ("segments", k, q): segment_rms(size[q], mask) for q in QUANTITIES for k, mask in phases.items()
+        }
         if len(w.segment):
             samples[name] |= _outage_samples(scores, name, distance)
         for (over, part, quantity), x in samples[name].items():
@@ -246,11 +239,6 @@ def last_finite(x: Array) -> Array:
     return np.take_along_axis(x, last[:, None], axis=1)[:, 0]
 
 
-def _segment_samples(scores: Scores, name: str, settle_s: float) -> dict[tuple[str, str, str], Array]:
-    size, phases = magnitudes(scores.filters[name].error), _phases(scores, settle_s)
-    return {("segments", k, q): segment_rms(size[q], mask) for q in QUANTITIES for k, mask in phases.items()}
-
-
 def _outage_samples(scores: Scores, name: str, distance: Array) -> dict[tuple[str, str, str], Array]:
     w, size = scores.windows, magnitudes(scores.filters[name].error)
     seconds = np.asarray(INTO_OUTAGE_S)
@@ -282,8 +270,8 @@ def _comparisons(
         for ((over, part), g), q, s in product(units.items(), QUANTITIES, COMPARED):
             if name != baseline:
                 a, b = (samples[n][over, part, q] for n in (name, baseline))
-                compared = compare(a, b, statistic=s, groups=g, **options)
-                yield PairedRatio(scores.kinds[0], name, baseline, over, part, q, compared)
+                which = {"kind": scores.kinds[0], "filter": name, "over": over, "part": part, "quantity": q}
+                yield PairedRatio(**vars(compare(a, b, statistic=s, groups=g, **options)), baseline=baseline, **which)
 
 
 def _imu_error_quality(scores: Scores, name: str) -> list[Value]:

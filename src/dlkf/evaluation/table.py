@@ -131,7 +131,7 @@ def ratio_table(dataset: str, result: Results) -> ResultTable | None:
     heads = {h: which for h, which in RATIOS.items() if any(result.versus(n, *which) for n in names)}
     if not heads:
         return None
-    groups = result.comparisons[0].against.groups
+    groups = result.comparisons[0].groups
     return ResultTable(
         title=f"{dataset} ({result.kind}): ratio to {result.baseline}, {_count(groups, 'recording')}",
         note="Below 1: better than it. Of the horizontal error at the end of the outages: RMS, which the largest "

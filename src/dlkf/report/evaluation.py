@@ -24,7 +24,7 @@ from dlkf.report.maps import add_track, chart, join_tracks
 from dlkf.report.navigation import mark_outages
 from dlkf.report.page import Page, embed_png
 from dlkf.report.plots import Array, band, line, shade, spans, stack_panels
-from dlkf.report.training import add_training
+from dlkf.report.training import ABOUT, learning_curve
 
 MAP = (
     "The {truth}, the outages, and the track of each filter in them; a click on a grey name shows a filter that is far "
@@ -60,7 +60,7 @@ def write_report(
     ``results`` has one entry per kind of data (of scores.of_kind); ``protocol`` is how the
     scores were made, in plain values; ``more`` tables follow those of the results; ``figures``: the page's figures for
     print as well, figures/*.png; ``trained``: the filter with which the answer begins, ``losses``: of its training
-    (:func:`dlkf.report.training.add_training`). Raises InputError if ``out`` cannot be written to.
+    (:func:`dlkf.report.training.learning_curve`). Raises InputError if ``out`` cannot be written to.
     """
     parts = [*all_tables(dataset, results), *more]
     pictures = print_figures(scores, by_time, baseline, protocol.get("reference")) if figures else []
@@ -140,7 +140,8 @@ def evaluation_page(
         _answer(page, scores.of_kind(result.kind), result, kind, baseline, name_truth(result.kind, own), tables)
     _add_tables(page, [t for t in first if many and not any(f"({r.kind})" in t.title for r in results)])
     if losses:
-        add_training(page, losses)
+        page.heading("Training", ABOUT)
+        page.figure("training", learning_curve(losses))
     for result in results:
         _research(page, scores.of_kind(result.kind), result, f"{result.kind}: " if many else "", baseline)
     _add_tables(page, [t for t in parts if t not in first])

@@ -8,7 +8,6 @@ import numpy as np
 
 from dlkf.base.colours import COLOURS
 from dlkf.report.drawing import Figure
-from dlkf.report.page import Page
 from dlkf.report.plots import line, stack_panels
 
 ABOUT = (
@@ -19,14 +18,11 @@ LOSSES = {"train/loss": "training", "val/loss": "validation"}
 AT_END = "val/outage_end_m"
 
 
-def add_training(page: Page, losses: Mapping[str, Sequence[float]]) -> None:
-    """Loss per epoch (columns ``epoch``, ``train/loss``, ``val/loss``, ``val/outage_end_m``; NaN where unknown)."""
-    page.heading("Training", ABOUT)
-    page.figure("training", learning_curve(losses))
-
-
 def learning_curve(losses: Mapping[str, Sequence[float]]) -> Figure:
-    """Loss of training and validation, and the error at the end of validation's outages where there are some."""
+    """Loss of training and validation, and the error at the end of validation's outages where there are some.
+
+    ``losses`` has columns ``epoch``, ``train/loss``, ``val/loss``, ``val/outage_end_m``; NaN where unknown.
+    """
     epochs = np.asarray(losses["epoch"], float)
     at_end = bool(np.isfinite(losses[AT_END]).any())
     more = ["Validation, error at the end of outages, geometric mean [m]"] if at_end else []

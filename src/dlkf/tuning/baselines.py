@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from dlkf.base.console import show_progress
 from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import PVA
 from dlkf.filters.build import build_causal, build_filter, has_prior
@@ -60,7 +59,7 @@ def tune_baselines(
     """
     untuned = start or Tuning()
     first, least, _ = tune_under_bar(imu, batches, FIRST, rounds, objective=objective, start=start)
-    prior, begin = _find_prior(f"{FIRST}_prior", imu, [untuned, first], batches, objective, longer)
+    prior, begin = best_prior(imu, [untuned, first], batches, f"{FIRST}_prior", objective, longer)
     priors: dict[str, Prior] = {}
     tunings: dict[str, Tuning] = {}
     for name in names:
@@ -68,7 +67,7 @@ def tune_baselines(
         if name == f"{FIRST}_prior":
             priors[name], begun = prior, begin
         elif has_prior(name):
-            priors[name], begun = _find_prior(name, imu, [untuned, begun], batches, objective, longer)
+            priors[name], begun = best_prior(imu, [untuned, begun], batches, name, objective, longer)
         if name == FIRST:
             tunings[name], error = first, least
         elif name == "ins":
@@ -82,19 +81,6 @@ def tune_baselines(
         how = "tuned" if rounds and name != "ins" else "untuned"
         say(f"{name} {how}: {_describe_error(error, objective)}")
     return Baselines(imu, tunings, prior, priors)
-
-
-def _find_prior(
-    name: str,
-    imu: ImuSpec,
-    tunings: Sequence[Tuning],
-    batches: Sequence[Batch],
-    objective: str,
-    longer: Sequence[Batch] | None,
-) -> tuple[Prior, Tuning]:
-    """The best prior, under a bar of its own."""
-    with show_progress(f"Prior of {name}") as bar:
-        return best_prior(imu, tunings, batches, name, objective, longer, progress=bar)
 
 
 def _describe_error(error: float, objective: str) -> str:

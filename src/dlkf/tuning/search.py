@@ -233,14 +233,12 @@ def best_prior(
     name: str = "mbkf15_prior",
     objective: str = "log",
     longer: Sequence[Batch] | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Prior, Tuning]:
     """The prior, and the factors of ``tunings`` with it, with which ``name`` has the least objective on ``batches``.
 
     The mean IMU error is found with each of the factors on ``longer`` segments with GNSS throughout (default:
     ``batches``). Its spread is tried times several numbers, for biases and sensor matrices apart: it is the estimator's
-    scatter where all drives share one IMU, and then too wide or, of many segments together, too narrow. ``progress``
-    is called at every trial with its number and theirs.
+    scatter where all drives share one IMU, and then too wide or, of many segments together, too narrow.
     """
     tunings = list(dict.fromkeys(tunings))
     known = [mean_imu_error(imu, tuning, longer or batches, drop_prior(name)) for tuning in tunings]
@@ -249,9 +247,9 @@ def best_prior(
     in_c = _fits_c(build_causal(name, imu, "a prior does not", prior=trials[0][0]), batches)
 
     errors = []
-    for prior, tuning in trials:
-        estimator = build_causal(name, imu, "a prior does not", tuning=tuning, prior=prior)
-        errors.append(evaluate_objective(_in_c(estimator, batches[0]) if in_c else estimator, batches, objective))
-        if progress is not None:
-            progress(len(errors), len(trials))
+    with show_progress(f"Prior of {name}") as bar:
+        for prior, tuning in trials:
+            estimator = build_causal(name, imu, "a prior does not", tuning=tuning, prior=prior)
+            errors.append(evaluate_objective(_in_c(estimator, batches[0]) if in_c else estimator, batches, objective))
+            bar(len(errors), len(trials))
     return trials[errors.index(min(errors))]
