@@ -23,11 +23,11 @@ from dlkf.filters.integration import Estimator, Fix, advance
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import NavState
-from dlkf.running.estimate import Estimate
 from dlkf.running.loss import LossWatch, far_off, is_impossible
 from dlkf.running.measurement_buffer import MeasurementBuffer
 from dlkf.running.reanchoring import FrameChange, can_reanchor, frame_at, reanchor
 from dlkf.running.references import blank_reference
+from dlkf.running.solution import Estimate
 from dlkf.running.start import LOOKBACK_S, EarthFix, Search, align
 
 MOST_LOSSES = 1000  # whose times are kept

@@ -12,6 +12,10 @@ filter has no value. Further sensors add ``<name>_innovation``, its 1σ ``<name>
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -103,6 +107,47 @@ def _std_columns(std: Tensor | None, C_ln: Tensor, rpy: Tensor) -> Tensor:
     to_rpy = torch.linalg.inv_ex(J)[0] @ C_ln
     parts = (turned(C_ln, POSITION), turned(C_ln, VELOCITY), turned(to_rpy, ATTITUDE))
     return torch.cat((*parts, variance[:, ACCEL], variance[:, GYRO]), -1).sqrt()
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """State of the IMU at ``t`` [s, clock of the samples]; tensors have one batch element.
+
+    ``imu_error`` (1, 6) [m/s², rad/s] is what comes off the samples from ``t`` on, ``std`` (1, 15) the 1σ of
+    position, velocity, attitude in n and of the IMU error, None where the filter has none. ``gnss_used``: a fix
+    corrected this estimate.
+    """
+
+    t: float
+    frame: TangentFrame
+    state: NavState
+    imu_error: Tensor
+    std: Tensor | None
+    gnss_used: bool
+    aids: Mapping[str, float] | None = None  # of further sensors, see dlkf.filters.aids.attach.aid_columns
+
+    @cached_property
+    def row(self) -> dict[str, float | bool]:
+        """The row of ``solution.parquet``: geodetic position, NED, roll-pitch-yaw."""
+        t = torch.tensor([self.t], dtype=torch.float64)
+        columns = solution_columns(t, self.frame, self.state, self.imu_error, self.std)
+        row = {name: float(value) for name, value in columns.items()}
+        return row | {"gnss_used": self.gnss_used, **(self.aids or {})}
+
+
+def estimates_table(estimates: Iterable[Estimate]) -> pd.DataFrame:
+    """Estimates as the rows of ``solution.parquet``."""
+    parts = []
+    for _, group in groupby(estimates, key=lambda e: id(e.frame)):
+        rows = list(group)
+        state = NavState(*(torch.cat(x) for x in zip(*(e.state for e in rows))))
+        std = None if rows[0].std is None else torch.cat([e.std for e in rows if e.std is not None])
+        t = torch.tensor([e.t for e in rows], dtype=torch.float64)
+        used = torch.tensor([e.gnss_used for e in rows])
+        error = torch.cat([e.imu_error for e in rows])
+        aids = pd.DataFrame([dict(e.aids or {}) for e in rows])
+        parts.append(solution_table(t, rows[0].frame, state, error, std, used).join(aids))
+    return pd.concat(parts, ignore_index=True)
 
 
 def write_solution(path: str | Path, table: pd.DataFrame) -> None:

@@ -49,10 +49,10 @@ from dlkf.filters.card import warn_slow_drives
 from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.strapdown import strapdown
 from dlkf.running.epoch_filter import EpochFilter, Running
-from dlkf.running.estimate import Estimate
 from dlkf.running.fix_history import HELD, FixHistory
 from dlkf.running.imu_stream import ImuStream, Row
 from dlkf.running.measurement_buffer import MeasurementBuffer, as_number, check_fix
+from dlkf.running.solution import Estimate
 from dlkf.running.start import Search
 
 ANCHOR_M = 50_000.0  # from its origin, beyond which the tangent frame moves
