@@ -1,5 +1,5 @@
-"""Of the commands that simulate: a recipe by the presets of ``dlkf simulate``, missing datasets of a training, settings of
-the consistency check. Apart, as the other commands load no simulation."""
+"""Of the commands that simulate: recipes by the presets of ``dlkf simulate``, missing datasets of a training, settings
+of the consistency check. Apart, as the other commands load no simulation."""
 
 from __future__ import annotations
 

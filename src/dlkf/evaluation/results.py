@@ -270,8 +270,10 @@ def _comparisons(
         for ((over, part), g), q, s in product(units.items(), QUANTITIES, COMPARED):
             if name != baseline:
                 a, b = (samples[n][over, part, q] for n in (name, baseline))
-                which = {"kind": scores.kinds[0], "filter": name, "over": over, "part": part, "quantity": q}
-                yield PairedRatio(**vars(compare(a, b, statistic=s, groups=g, **options)), baseline=baseline, **which)
+                yield PairedRatio(
+                    kind=scores.kinds[0], filter=name, baseline=baseline, over=over, part=part, quantity=q,
+                    **vars(compare(a, b, statistic=s, groups=g, **options)),
+                )  # fmt: skip
 
 
 def _imu_error_quality(scores: Scores, name: str) -> list[Value]:

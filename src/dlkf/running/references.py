@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -111,7 +111,7 @@ def make_reference(
     return ReferencedDrives(made, sigma, skipped, kind)
 
 
-def blank_reference(rows: int) -> dict[str, Tensor]:
+def blank_reference(rows: int) -> dict[str, Any]:
     """No reference at all, as fields of a drive with so many boundaries."""
     shapes = {"ref_r_e": (3,), "ref_v_e": (3,), "ref_C_eb": (3, 3), "ref_imu_error": (6,)}
     blank = {name: torch.full((rows, *shape), torch.nan, dtype=torch.float64) for name, shape in shapes.items()}

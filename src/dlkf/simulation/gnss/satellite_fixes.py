@@ -132,13 +132,14 @@ def _fixes(
     fix = quality > 0
     r_e = np.where(fix[:, None], solution.r_e, np.nan)
     C_en = ned_at(r_e)
-    place = geodetic_from_ecef(torch.from_numpy(r_e + (C_en @ added_n[:, :3, None])[..., 0]))
+    place = torch.from_numpy(r_e + (C_en @ added_n[:, :3, None])[..., 0])
+    lat, lon, height = (x.numpy() for x in geodetic_from_ecef(place))
     v_n = (np.swapaxes(C_en, -1, -2) @ solution.v_e[..., None])[..., 0] + added_n[:, 3:]
     std = [
         np.sqrt(np.einsum("tij,tik,tkj->tj", C_en, covariance[:, :3, :3], C_en) + added**2)
         for covariance, added in zip((solution.covariance, solution.rate_covariance), scale)
     ]
-    table = fix_columns(t, *(x.numpy() for x in place), v_n, np.concatenate(std, -1), quality)
+    table = fix_columns(t, lat, lon, height, v_n, np.concatenate(std, -1), quality)
     known = solution.satellites >= 4
     dops = {f"{d}dop": np.where(known, getattr(solution.dop, f"{d}dop"), np.nan) for d in "gphv"}
     return pd.DataFrame({**table, "satellites": solution.satellites, **dops})
