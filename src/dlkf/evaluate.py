@@ -104,15 +104,11 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console) -> Evaluation
         console.print(unused, style="yellow", highlight=False)
         done.rules[UNUSED] = unused
     results = make_results(done.run, baseline=settings.baseline, settle_s=settings.settle_s, seed=settings.seed)
-    decided = {
-        "models": settings.model,
-        "dataset": settings.dataset,
-        "imu": spec.name,
-        "tuning": asdict(settings.tuning),
-    }
-    decided["imu values"] = {"accel": asdict(spec.accel), "gyro": asdict(spec.gyro)}
-    made_how = {**describe_provenance(), **decided, "digest": digest, **done.truth, **step, **done.rules}
-    made_how["aids"] = [table.name for table in taken]
+    made_how = {
+        **describe_provenance(), "models": settings.model, "dataset": settings.dataset, "imu": spec.name,
+        "tuning": asdict(settings.tuning), "imu values": {"accel": asdict(spec.accel), "gyro": asdict(spec.gyro)},
+        "digest": digest, **done.truth, **step, **done.rules, "aids": [table.name for table in taken],
+    }  # fmt: skip
     sensors = sensor_table(scores, {model_name: aid_columns(model) for model_name, model in models.items()})
     return EvaluationRun(scores, results, made_how, digest, sensors, notes)
 

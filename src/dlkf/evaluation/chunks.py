@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ from dlkf.evaluation.scores import join_scores
 from dlkf.evaluation.study import ScoredRun, run_scenes
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.smoother import Filter
-from dlkf.running.references import ReferencedDrives, make_reference
+from dlkf.running.references import describe_reference, make_reference
 
 SHORT = "too short"  # of the rules: drives of which no segment could be cut
 
@@ -92,7 +92,7 @@ def evaluate_chunks(
     refused = {drive: said for one in kept for drive, said in one.rules.get(REFUSED, {}).items()}
     rules |= {REFUSED: refused} if refused else {}
     sigmas = [one.sigma for one in kept if one.sigma is not None]
-    truth = {"reference": ReferencedDrives([], torch.cat(sigmas), {}, work.reference).describe()} if sigmas else {}
+    truth = {"reference": describe_reference(work.reference, torch.cat(sigmas))} if sigmas else {}
     return Evaluated(run, rules, truth)
 
 
@@ -131,10 +131,5 @@ def join_chunks(runs: Sequence[ScoredRun]) -> ScoredRun:
     return ScoredRun(scores, np.concatenate([r.cause for r in runs if r.cause is not None]), followed)
 
 
-@contextmanager
-def _bar(work: EvaluationJob, title: str) -> Iterator[ProgressCallback | None]:
-    if not work.shown:
-        yield None
-        return
-    with show_progress(title) as progress:
-        yield progress
+def _bar(work: EvaluationJob, title: str) -> AbstractContextManager[ProgressCallback | None]:
+    return show_progress(title) if work.shown else nullcontext()

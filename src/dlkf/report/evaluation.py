@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from dlkf.base.colours import SHADE, TRUTH, filter_colour
 from dlkf.base.files import resolve_place, write_into
@@ -161,18 +162,12 @@ def _add_tables(page: Page, tables: Sequence[ResultTable]) -> None:
 def mark_best(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Marks the row with the least median, where there is one."""
     column = next((i for i, c in enumerate(columns) if c.startswith("median")), None)
-    values = [] if column is None else [_value(row[column]) for row in rows]
-    if not values or not np.isfinite(values).any():
+    cells = [] if column is None else [row[column] for row in rows]
+    values = pd.to_numeric(pd.Series(cells, dtype=object), errors="coerce").to_numpy(float)
+    if not np.isfinite(values).any():
         return []
     least = int(np.nanargmin(values))
     return ["class=best" if k == least else "" for k in range(len(rows))]
-
-
-def _value(cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        return math.nan
 
 
 def _answer(

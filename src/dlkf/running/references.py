@@ -39,23 +39,19 @@ class ReferencedDrives(NamedTuple):
     drives: list[Drive]
     sigma: Tensor
     skipped: dict[str, str]
-    kind: str
 
-    @property
-    def horizontal_m(self) -> float:
-        """Median 1σ."""
-        return float(self.sigma.median(0).values[:2].norm())
 
-    @property
-    def vertical_m(self) -> float:
-        """Median 1σ."""
-        return float(self.sigma.median(0).values[2])
+def median_std(sigma: Tensor) -> tuple[float, float]:
+    """Median horizontal and vertical 1σ [m] of a reference."""
+    middle = sigma.median(0).values
+    return float(middle[:2].norm()), float(middle[2])
 
-    def describe(self) -> str:
-        """What errors against it are errors against."""
-        what = "smoothed solution with all fixes" if self.kind == "smoothed" else "good fixes"
-        sigma = f"{self.horizontal_m:.2g} m horizontal, {self.vertical_m:.2g} m vertical"
-        return f"{what}, 1σ {sigma} (median, its own)"
+
+def describe_reference(kind: str, sigma: Tensor) -> str:
+    """What errors against it are errors against."""
+    what = "smoothed solution with all fixes" if kind == "smoothed" else "good fixes"
+    horizontal, vertical = median_std(sigma)
+    return f"{what}, 1σ {horizontal:.2g} m horizontal, {vertical:.2g} m vertical (median, its own)"
 
 
 def check_reference(kind: str) -> None:
@@ -108,7 +104,7 @@ def make_reference(
     sigma = torch.cat(sigmas)
     if not len(sigma):
         raise InputError(f"reference={kind}: no fix is good enough to be one")
-    return ReferencedDrives(made, sigma, skipped, kind)
+    return ReferencedDrives(made, sigma, skipped)
 
 
 def blank_reference(rows: int) -> dict[str, Any]:
