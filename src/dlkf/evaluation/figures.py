@@ -25,20 +25,10 @@ from dlkf.base.colours import COLOURS, SHADE
 from dlkf.evaluation.bootstrap import MIN_GROUPS, rms_band
 from dlkf.evaluation.metrics import Array, magnitudes, outage_at, outage_intervals, rms_over_segments
 from dlkf.evaluation.scores import OFF_SCALE, Scores, representative, settled_limits
-from dlkf.evaluation.table import format_number
+from dlkf.evaluation.table import ERROR_PANELS, IMU_PANELS, format_number
 
 STYLES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (7, 2)), (0, (3, 1, 1, 1)), (0, (2, 2)))
 MANY = 20  # outages, from which on a histogram is drawn
-LABELS = {
-    "horizontal": ("Horizontal error [m]", 1.0),
-    "velocity": ("Velocity error [m/s]", 1.0),
-    "attitude": ("Attitude error [°]", 180 / math.pi),
-}
-IMU_AXES = (
-    ("Accelerometer x", "m/s²", 1.0), ("Accelerometer y", "m/s²", 1.0), ("Accelerometer z", "m/s²", 1.0),
-    ("Gyroscope x", "°/s", 180 / math.pi), ("Gyroscope y", "°/s", 180 / math.pi),
-    ("Gyroscope z", "°/s", 180 / math.pi),
-)  # fmt: skip
 
 
 def png(figure: Figure, dpi: int = 130) -> bytes:
@@ -174,12 +164,12 @@ def error_over_time(scores: Scores, segments: Sequence[int] | None = None) -> Fi
     """
     index = list(range(len(scores.segments))) if segments is None else list(segments)
     sizes = {n: magnitudes(r.error[index]) for n, r in scores.filters.items()}
-    shown = [q for q in LABELS if any(np.isfinite(s[q]).any() for s in sizes.values())]
+    shown = [q for q in ERROR_PANELS if any(np.isfinite(s[q]).any() for s in sizes.values())]
     figure = Figure(figsize=(9, 2.5 * max(len(shown), 1) + 0.9), layout="constrained")
     axes = figure.subplots(max(len(shown), 1), 1, sharex=True, squeeze=False).ravel()
     length = scores.t[np.flatnonzero(~np.isnan(scores.truth_p_n[index]).all((0, 2)))[-1]]
     for ax, q in zip(axes, shown):
-        label, scale = LABELS[q]
+        label, scale = ERROR_PANELS[q]
         _shade(ax, scores, index)
         for name in scores.filters:
             x = sizes[name][q] * scale
@@ -213,7 +203,7 @@ def imu_errors(scores: Scores, i: int) -> Figure:
     last = np.flatnonzero(~np.isnan(scores.truth_p_n[i]).all(-1))[-1]
     settled = scores.t > 0.2 * scores.t[last]
     runs = {n: r for n, r in scores.filters.items() if np.nan_to_num(r.imu_error[i]).any()}  # that estimate one
-    for k, (ax, (label, unit, scale)) in enumerate(zip(axes.ravel(), IMU_AXES)):
+    for k, (ax, (label, scale)) in enumerate(zip(axes.ravel(), IMU_PANELS)):
         _shade(ax, scores, [i])
         extent: list[Array] = []
         for name, run in runs.items():
@@ -229,7 +219,6 @@ def imu_errors(scores: Scores, i: int) -> Figure:
         if limits := settled_limits(extent):
             ax.set_ylim(*limits)
         ax.set_title(label, fontsize=9, loc="left")
-        ax.set_ylabel(f"Error [{unit}]")
         ax.set_xlim(0, scores.t[last])
         if k >= 3:
             ax.set_xlabel("Time since the start [s]")

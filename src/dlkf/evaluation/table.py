@@ -23,6 +23,14 @@ from dlkf.evaluation.results import IMU_AXES, Results, Value
 
 DASH = "–"
 DEGREES = 180 / math.pi
+# titles of panels and what a value is multiplied by
+ERROR_PANELS = {
+    "horizontal": ("Horizontal error [m]", 1.0),
+    "velocity": ("Velocity error [m/s]", 1.0),
+    "attitude": ("Attitude error [°]", DEGREES),
+}
+SENSORS = (("Accelerometer", "m/s²", 1.0), ("Gyroscope", "°/s", DEGREES))
+IMU_PANELS = [(f"{name} {axis} error [{unit}]", scale) for name, unit, scale in SENSORS for axis in "xyz"]
 
 
 class ResultTable(NamedTuple):

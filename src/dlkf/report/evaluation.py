@@ -19,7 +19,16 @@ from dlkf.evaluation.results import Results
 from dlkf.evaluation.scores import OFF_SCALE, Scores, representative, settled_limits
 from dlkf.evaluation.sensors import TITLE as SENSORS_TITLE
 from dlkf.evaluation.summary import END, describe_verdict, headline, sigma_warnings
-from dlkf.evaluation.table import DEGREES, ResultTable, all_tables, as_csv, as_json, as_markdown, format_number
+from dlkf.evaluation.table import (
+    ERROR_PANELS,
+    IMU_PANELS,
+    ResultTable,
+    all_tables,
+    as_csv,
+    as_json,
+    as_markdown,
+    format_number,
+)
 from dlkf.report.drawing import Figure
 from dlkf.report.maps import add_track, chart, join_tracks
 from dlkf.report.navigation import mark_outages
@@ -33,13 +42,6 @@ MAP = (
 )
 MOST_OUTAGES = 300  # rows of the table of outages: the worst of them
 SEEN_AT_ONCE = 11  # of them, in the box of the page
-SENSORS = (("Accelerometer", "m/s²", 1.0), ("Gyroscope", "°/s", DEGREES))
-IMU = [(f"{name} {axis} error [{unit}]", scale) for name, unit, scale in SENSORS for axis in "xyz"]
-OVER_TIME = {
-    "horizontal": ("Horizontal [m]", 1.0),
-    "velocity": ("Velocity [m/s]", 1.0),
-    "attitude": ("Attitude [°]", DEGREES),
-}
 
 
 def write_report(
@@ -339,12 +341,12 @@ def error_charts(scores: Scores) -> Figure:
     """RMS over the segments of the horizontal, velocity and attitude error at each time, of those that the reference
     has."""
     sizes = {name: magnitudes(scores.filters[name].error) for name in scores.filters}
-    known = [q for q in OVER_TIME if q == "horizontal" or any(np.isfinite(size[q]).any() for size in sizes.values())]
-    figure = stack_panels([OVER_TIME[quantity][0] for quantity in known], height=180)
+    known = [q for q in ERROR_PANELS if q == "horizontal" or any(np.isfinite(size[q]).any() for size in sizes.values())]
+    figure = stack_panels([ERROR_PANELS[quantity][0] for quantity in known], height=180)
     for name, c in colours(scores).items():
         for row, quantity in enumerate(known, 1):
             size = sizes[name][quantity]
-            y = rms_over_segments(np.where(np.isinf(size), np.nan, size)) * OVER_TIME[quantity][1]
+            y = rms_over_segments(np.where(np.isinf(size), np.nan, size)) * ERROR_PANELS[quantity][1]
             if np.isfinite(y).any():
                 figure.add_trace(line(scores.t, y, name, c, legend=row == 1), row)
     for row in range(1, len(known) + 1):
@@ -356,8 +358,8 @@ def error_charts(scores: Scores) -> Figure:
 
 def imu_error_charts(scores: Scores, i: int, banded: str) -> Figure:
     """Estimates of one segment, with the ±3σ of the filter ``banded``, and the truth where it is known."""
-    figure, late = stack_panels([title for title, _ in IMU], height=120), scores.t > 0.2 * scores.t[-1]
-    for k, (_, scale) in enumerate(IMU):
+    figure, late = stack_panels([title for title, _ in IMU_PANELS], height=120), scores.t > 0.2 * scores.t[-1]
+    for k, (_, scale) in enumerate(IMU_PANELS):
         truth = scores.true_imu_error[i, :, k] * scale
         for name, c in colours(scores).items():
             run = scores.filters[name]
