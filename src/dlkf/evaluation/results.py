@@ -246,12 +246,12 @@ def _outage_samples(scores: Scores, name: str, distance: Array) -> dict[tuple[st
     at = {q: outage_at(size[q], w, seconds, scores.epoch_s) for q in QUANTITIES}
     std = scores.filters[name].position_std
     end = {q: outage_end(size[q], w) for q in QUANTITIES}
-    end["sigma"] = outage_end(np.hypot(std[..., 0], std[..., 1]), w)  # the filter's own
     with np.errstate(divide="ignore", invalid="ignore"):
         end["drift"] = np.where(distance > 1.0, end["horizontal"] / distance, np.nan)
     found = {("outages", "end", q): x for q, x in end.items()}
     found |= {("outages", "rms", q): outage_rms(size[q], w) for q in QUANTITIES}
-    return found | {("outages", f"at {s:g} s", q): at[q][:, i] for i, s in enumerate(seconds) for q in QUANTITIES}
+    found |= {("outages", f"at {s:g} s", q): at[q][:, i] for i, s in enumerate(seconds) for q in QUANTITIES}
+    return found | {("outages", "end", "sigma"): outage_end(np.hypot(std[..., 0], std[..., 1]), w)}  # the filter's own
 
 
 def _comparisons(
