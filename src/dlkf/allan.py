@@ -11,8 +11,7 @@ from dlkf.command import command
 from dlkf.command.settings import AllanSettings
 from dlkf.data.tables import read_drives
 from dlkf.data.validate import read_imu
-from dlkf.diagnosis.allan import noise_preset
-from dlkf.diagnosis.allan_report import analyse, choose_drive, noise_table, part, write_allan
+from dlkf.diagnosis.allan import analyse, choose_drive, noise_preset, noise_table, part, write_allan
 from dlkf.evaluation.table import as_rich
 from dlkf.navigation.imu_errors import imu_spec
 

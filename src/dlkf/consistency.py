@@ -10,7 +10,7 @@ from dlkf.base.console import make_console, show_progress
 from dlkf.base.errors import InputError
 from dlkf.base.files import require_empty
 from dlkf.command import command
-from dlkf.command.matched import ConsistencySettings
+from dlkf.command.simulated import ConsistencySettings
 from dlkf.data.masks import withhold_fixes
 from dlkf.diagnosis.consistency import (
     NormalisedSquares,

@@ -20,7 +20,7 @@ from dlkf.command import command, list_typed_words
 from dlkf.command.scored import EvaluateSettings
 from dlkf.data.kinds import drive_kinds
 from dlkf.data.store import choose_aids, dataset_digest, drive_rows
-from dlkf.evaluation.chunks import EvaluationJob, evaluate_chunks
+from dlkf.evaluation.chunks import SHORT, EvaluationJob, evaluate_chunks
 from dlkf.evaluation.outages import UNUSED, check_outages, describe_unused
 from dlkf.evaluation.protocol import REFUSED
 from dlkf.evaluation.results import Results
@@ -42,13 +42,11 @@ from dlkf.tracking.runs import check_store, tracking_uri
 
 
 class EvaluationRun(NamedTuple):
-    """Scores of an evaluation, its results per kind of data, the filters' names, how it was done, on which data, and
-    what was said of drives and filters."""
+    """Scores of an evaluation, its results per kind of data, how it was done, on which data, and what was said of
+    drives and filters."""
 
     scores: Scores
     results: list[Results]
-    models: list[str]
-    mode: str
     protocol: Mapping[str, Any]
     digest: str
     sensors: ResultTable | None = None
@@ -89,15 +87,15 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console) -> Evaluation
     fixes = {row.name: UsableFixes.of(settings.dataset, row.name) for row in rows}
     many = SAMPLES_AT_ONCE if settings.parallel is None else SAMPLES_AT_ONCE // 4
     done = evaluate_chunks(work, chunk_drives(fixes, grid["rate_hz"], many), settings.parallel)
-    for reason in done.skipped.values():
+    for reason in done.rules["skipped"].values():
         console.print(f"left out: {reason}", style="yellow")
     for drive, said in done.rules.get(REFUSED, {}).items():
         console.print(f"drive {drive}: left out as impossible: {said}", style="yellow", highlight=False)
-    if done.short:
-        console.print(f"left out: {done.short}", style="yellow", highlight=False)
+    if SHORT in done.rules:
+        console.print(f"left out: {done.rules[SHORT]}", style="yellow", highlight=False)
     if done.truth:
         console.print(f"No truth: errors are against the {done.truth['reference']}.", style="bold")
-    if settings.mode == "auto" and done.mode == "drives":
+    if settings.mode == "auto" and done.rules["mode"] == "drives":
         said = f"no segment of {settings.length_s:g} s with a known attitude: whole drives, from their own alignment"
         console.print(said, style="yellow")
     scores = done.run.scores
@@ -106,17 +104,13 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console) -> Evaluation
         console.print(unused, style="yellow", highlight=False)
         done.rules[UNUSED] = unused
     results = make_results(done.run, baseline=settings.baseline, settle_s=settings.settle_s, seed=settings.seed)
-    decided = {
-        "models": settings.model,
-        "dataset": settings.dataset,
-        "imu": spec.name,
-        "tuning": asdict(settings.tuning),
-    }
-    decided["imu values"] = {"accel": asdict(spec.accel), "gyro": asdict(spec.gyro)}
-    made_how = {**describe_provenance(), **decided, "digest": digest, **done.truth, **step, **done.rules}
-    made_how["aids"] = [table.name for table in taken]
+    made_how = {
+        **describe_provenance(), "models": settings.model, "dataset": settings.dataset, "imu": spec.name,
+        "tuning": asdict(settings.tuning), "imu values": {"accel": asdict(spec.accel), "gyro": asdict(spec.gyro)},
+        "digest": digest, **done.truth, **step, **done.rules, "aids": [table.name for table in taken],
+    }  # fmt: skip
     sensors = sensor_table(scores, {model_name: aid_columns(model) for model_name, model in models.items()})
-    return EvaluationRun(scores, results, list(models), done.mode, made_how, digest, sensors, notes)
+    return EvaluationRun(scores, results, made_how, digest, sensors, notes)
 
 
 @command("evaluate", EvaluateSettings)
@@ -131,7 +125,7 @@ def main(settings: EvaluateSettings) -> None:
     if all(unused):  # beside a model that takes them nobody wonders
         console.print("\n".join(unused), style="yellow", highlight=False, soft_wrap=True)
     done = evaluate_dataset(settings, console)
-    results, segments = done.results, done.mode == "segments"
+    results, segments = done.results, done.protocol["mode"] == "segments"
     write_report(
         settings.out, name, done.scores, results, protocol=done.protocol, by_time=segments, baseline=settings.baseline,
         more=[done.sensors] if done.sensors else (), figures=settings.figures,
@@ -146,7 +140,7 @@ def main(settings: EvaluateSettings) -> None:
     save_log(console, settings.out)
     kept = ""
     if settings.tracking.log:
-        with start_point(uri, settings.name, f"{' '.join(done.models)} on {name}") as run:
+        with start_point(uri, settings.name, f"{' '.join(done.scores.filters)} on {name}") as run:
             run.log_config(asdict(settings))
             run.log_dataset(settings.dataset, done.digest, "evaluation")
             run.log_metrics(collect_metrics(results))

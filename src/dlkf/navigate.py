@@ -110,14 +110,10 @@ def main(settings: NavigateSettings) -> None:
             course = TrackOnMap(result, fixes)
             courses.append(course if len(courses) < MOST_DRIVES else course.for_the_map())
         made = {
-            **describe_provenance(),
-            "model": settings.model,
-            "dataset": settings.dataset,
-            "drives": settings.drives,
-            **step,
-            "aids": [table.name for table in grid["aids"]],
-        }
-        made |= {"digest": dataset_digest(settings.dataset), "imu": asdict(spec), "tuning": asdict(tuning)}
+            **describe_provenance(), "model": settings.model, "dataset": settings.dataset, "drives": settings.drives,
+            **step, "aids": [table.name for table in grid["aids"]], "digest": dataset_digest(settings.dataset),
+            "imu": asdict(spec), "tuning": asdict(tuning),
+        }  # fmt: skip
         remedy = REMEDY if takes_tuning(settings.model) else OF_NETWORK
         doubt = offline.sigma_warning((course.result for course in courses), name, remedy)
         warnings = [doubt] if doubt else []

@@ -30,8 +30,7 @@ from dlkf.training.fit import check_fit
 from dlkf.training.processes import is_worker
 from dlkf.training.run_folder import check_digests, run_folder, write_state
 from dlkf.training.settings import TrainSettings
-from dlkf.training.study import list_left_out_drives, run_study, train_with_baselines
-from dlkf.training.summary import key_metrics, note
+from dlkf.training.study import key_metrics, list_left_out_drives, note, run_study, train_with_baselines
 
 
 @command("train")

@@ -20,8 +20,10 @@ from dlkf.data.store import choose_aids, dataset_digest, load_dataset
 from dlkf.evaluation.table import as_markdown, as_rich
 from dlkf.filters.aids.attach import append_aids, refuse_left_out
 from dlkf.filters.build import build_filter
+from dlkf.onboard.compiled_filter import compile_or_keep
+from dlkf.running.likelihood import Evidence, find_noise
 from dlkf.tracking.runs import start_run, tracking_uri
-from dlkf.tuning.found import find_dataset_noise, noise_table, write_noise
+from dlkf.tuning.found import noise_table, write_noise
 from dlkf.tuning.study import LIKELIHOOD, check_settings, search, train_test_drives, tuning_table, write_tuning
 
 
@@ -57,7 +59,9 @@ def main(settings: TuneSettings) -> None:
         run.log_config(asdict(settings))
         run.log_dataset(settings.dataset, dataset_digest(settings.dataset), "tuning")
         if settings.objective == LIKELIHOOD:
-            found = find_dataset_noise(drives, model, spec, start, minutes=settings.minutes, name=name)
+            evidence = Evidence.of(drives, settings.minutes)
+            with show_progress(f"Noise for {model}") as bar:
+                found = find_noise(evidence, model, spec, start, called=name, progress=bar, compiler=compile_or_keep)
             table = noise_table(model, dataset, spec, start, found)
             files = write_noise(out, found, table)
             run.log_metrics({f"found/{k}": v for k, v in found.describe().items()})

@@ -10,7 +10,6 @@ from dlkf.base.classes import find_class, instantiate
 from dlkf.base.config import config_dir
 from dlkf.base.settings import settings_from
 from dlkf.command.composing import compose_command
-from dlkf.command.matched import ConsistencySettings
 from dlkf.command.scored import EvaluateSettings, TuneSettings
 from dlkf.command.settings import (
     AllanSettings,
@@ -22,6 +21,7 @@ from dlkf.command.settings import (
     NavigateSettings,
     RegisterSettings,
 )
+from dlkf.command.simulated import ConsistencySettings
 from dlkf.filters.saved import build_learned_filter
 from dlkf.simulation.dataset import SimulateSettings
 from dlkf.training.settings import TrainSettings

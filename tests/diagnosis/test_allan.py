@@ -14,8 +14,7 @@ import yaml
 from dlkf.base.config import config_dir
 from dlkf.base.errors import InputError
 from dlkf.data.schema import ACCEL, GYRO, new_dataset, write_drive, write_drives_table
-from dlkf.diagnosis.allan import allan_variance, cluster_sizes, fit_noise, noise_preset, preset_yaml
-from dlkf.diagnosis.allan_report import analyse
+from dlkf.diagnosis.allan import allan_variance, analyse, cluster_sizes, fit_noise, noise_preset, preset_yaml
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors, imu_spec
 from dlkf.simulation.imu import corrupt, draw_unit
 

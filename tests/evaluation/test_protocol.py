@@ -239,7 +239,7 @@ def test_an_evaluation_share_by_share(town, mode):
         law=BiasLaw(0.05, 0.1), shown=False,
     )  # fmt: skip
     one, many = (evaluate_chunks(work, shares) for shares in ([names], [names[:2], names[2:4], names[4:]]))
-    assert one.mode == many.mode == mode and one.rules == many.rules and one.run.scores.outage.any()
+    assert one.rules["mode"] == mode and one.rules == many.rules and one.run.scores.outage.any()
     sorted_by = [[(p.drive, p.t_start, k) for k, p in enumerate(e.run.scores.segments)] for e in (one, many)]
     order = [sorted(range(len(segments)), key=segments.__getitem__) for segments in sorted_by]
     a, b = one.run.scores, many.run.scores
@@ -265,7 +265,8 @@ def test_shares_of_which_one_has_nothing_to_score(town, tmp_path):
     )  # fmt: skip
     done = evaluate_chunks(work, [(row.name,) for row in rows[:3]])
     assert {segment.drive for segment in done.run.scores.segments} == {row.name for row in rows[1:3]}
-    assert done.short.startswith("1 of 3 drives, too short or") and f"a segment of 40 s: {rows[0].name};" in done.short
+    short = done.rules["too short"]
+    assert short.startswith("1 of 3 drives, too short or") and f"a segment of 40 s: {rows[0].name};" in short
     with pytest.raises(InputError, match="no segment of 40 s"):
         evaluate_chunks(work, [(rows[0].name,)])
 
@@ -285,11 +286,14 @@ def test_drives_too_short_for_a_segment_are_named(town, tmp_path, together):
         {"rate_hz": 20.0, "epoch_s": 1.0}, drive_kinds(town), {}, shown=False,
     )  # fmt: skip
     done = evaluate_chunks(work, [tuple(names)] if together else [(name,) for name in names])
-    assert done.mode == "segments" and {segment.drive for segment in done.run.scores.segments} == set(names[2:])
-    assert done.short == done.rules["too short"] and done.short.startswith("2 of 4 drives, too short or")
-    assert f"40 s with a known attitude: {names[0]}, {names[1]}; " in done.short and "mode=drives" in done.short
+    assert done.rules["mode"] == "segments" and {segment.drive for segment in done.run.scores.segments} == set(
+        names[2:]
+    )
+    short = done.rules["too short"]
+    assert short.startswith("2 of 4 drives, too short or")
+    assert f"40 s with a known attitude: {names[0]}, {names[1]}; " in short and "mode=drives" in short
     shorter = replace(work, protocol=Protocol("auto", 25.0, 10.0))
-    assert evaluate_chunks(shorter, [tuple(names)]).short == ""
+    assert "too short" not in evaluate_chunks(shorter, [tuple(names)]).rules
 
 
 def test_models_by_name_and_folder(tmp_path):

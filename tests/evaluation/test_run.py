@@ -9,9 +9,9 @@ import torch
 
 from dlkf.base.errors import InputError
 from dlkf.data.masks import BiasLaw
-from dlkf.evaluation.bias_slope import inject_bias
 from dlkf.evaluation.metrics import magnitudes, rms_over_segments, slope
 from dlkf.evaluation.outages import OutagePlan
+from dlkf.evaluation.study import inject_bias
 from dlkf.filters.build import build_filter
 from dlkf.filters.integration import Correction
 from dlkf.filters.model_based import Ins

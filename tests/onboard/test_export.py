@@ -37,10 +37,9 @@ from dlkf.onboard.library import LIBRARY, Library, build, find_compiler
 from dlkf.onboard.meanings import describe_column
 from dlkf.onboard.recording import export_mode, record
 from dlkf.running.batched import run_filter
-from dlkf.running.estimate import estimates_table
 from dlkf.running.reanchoring import FrameChange, reanchor
 from dlkf.running.replay import UnalignedError, replay_drive, stream_drive
-from dlkf.running.solution import COLUMNS
+from dlkf.running.solution import COLUMNS, estimates_table
 from dlkf.running.start import align_drives
 from dlkf.running.streaming import StreamingFilter
 from tests.onboard.conftest import ARM, GRID, IMU, QUICK

@@ -16,9 +16,9 @@ from dlkf.filters.learned_kalman import LearnedKalmanConfig, LearnedKalmanFilter
 from dlkf.filters.plus import PlusConfig, PlusFilter
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
-from dlkf.running.estimate import estimates_table
 from dlkf.running.offline import navigate_drives
 from dlkf.running.replay import replay_drive
+from dlkf.running.solution import estimates_table
 from dlkf.running.streaming import StreamingFilter
 
 IMU = ImuSpec(

@@ -10,8 +10,7 @@ from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY, write_drive
 from dlkf.filters.build import build_filter
 from dlkf.filters.saved import choose_grid
 from dlkf.filters.shipped import trained_filter
-from dlkf.report.navigation import TrackOnMap, make_rows, route_map, summary_lines
-from dlkf.report.sensors import sensor_rows
+from dlkf.report.navigation import TrackOnMap, make_rows, route_map, sensor_rows, summary_lines
 from dlkf.running.offline import Innovation, Navigated, UsableFixes, choose_epoch
 from dlkf.running.solution import COLUMNS
 from tests.cars import IMU

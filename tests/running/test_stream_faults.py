@@ -13,8 +13,8 @@ from dlkf.base.errors import InputError
 from dlkf.data.alignment import AlignConfig
 from dlkf.filters.build import build_filter
 from dlkf.filters.card import LowSampleRateWarning
-from dlkf.running.estimate import estimates_table
 from dlkf.running.replay import replay_drive
+from dlkf.running.solution import estimates_table
 from dlkf.running.streaming import Status, StreamingFilter
 from tests.running.streams import ARM, EARTH, IMU, ROUNDING, apart, batch, estimator, network, plus, some, table, until
 

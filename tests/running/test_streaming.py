@@ -14,9 +14,9 @@ from dlkf.base.errors import InputError
 from dlkf.data.schema import POSITION
 from dlkf.data.store import drive_from_tables, drive_rows
 from dlkf.data.validate import read_drive
-from dlkf.running.estimate import estimates_table
 from dlkf.running.offline import navigate_drives
 from dlkf.running.replay import replay_drive, stream_drive, stream_drives
+from dlkf.running.solution import estimates_table
 from dlkf.running.streaming import Status, StreamingFilter
 from tests.running.streams import ARM, EARTH, ROUNDING, apart, batch, estimator, some, table
 

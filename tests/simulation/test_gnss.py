@@ -7,7 +7,7 @@ import pymap3d
 import pytest
 
 from dlkf.base.errors import InputError
-from dlkf.simulation.gnss.reporting import delay_fixes, report_fixes
+from dlkf.simulation.gnss.satellite_fixes import delay_fixes, report_fixes
 from dlkf.simulation.gnss.white import GnssConfig, episodes, observe
 from dlkf.simulation.imu import inverse_mechanisation
 from dlkf.simulation.motion.vehicle import Truth, VehicleConfig, drive_vehicle

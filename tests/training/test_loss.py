@@ -11,8 +11,7 @@ from dlkf.filters.integration import integrate
 from dlkf.filters.model_based import Ins
 from dlkf.navigation.attitude import rotation_from_vector
 from dlkf.navigation.state import NavState
-from dlkf.training.loss import LossConfig, build_loss, pva_losses, weighted_loss
-from dlkf.training.outage_loss import likelihood_term
+from dlkf.training.loss import LossConfig, build_loss, likelihood_term, pva_losses, weighted_loss
 from tests.filters.scene import IMU, scene
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -168,11 +169,8 @@ def test_the_best_prior_is_the_best_of_all_that_were_tried(cars, monkeypatch):
     batch, expected, _ = one_unit(cars)
     tunings, name = [Tuning(), Tuning(accel_noise=30.0, gyro_noise=30.0)], "mbkf33_prior"
     steps = []
-
-    def record(*step):
-        steps.append(step)
-
-    prior, tuning = best_prior(expected, tunings, [hidden(batch)], name, longer=[batch], progress=record)
+    monkeypatch.setattr("dlkf.tuning.search.show_progress", lambda _: nullcontext(lambda *step: steps.append(step)))
+    prior, tuning = best_prior(expected, tunings, [hidden(batch)], name, longer=[batch])
     known = [mean_imu_error(expected, t, [batch], "mbkf33") for t in tunings]
     trials = [(p.scale_spread(b, m), t) for p in known for b in (3.0, 0.3) for m in (10.0, 1.0) for t in tunings]
     tried = {

@@ -76,7 +76,8 @@ def local_copy(folder: str | Path) -> Iterator[Path]:
         with store_errors_as_input_error(folder):
             for file in place.fs.find(place.path):
                 rest = file.strip("/").removeprefix(place.path.strip("/") + "/")
-                place.fs.get_file(file, str(_with_folder(Path(here) / rest)))
+                (Path(here) / rest).parent.mkdir(parents=True, exist_ok=True)
+                place.fs.get_file(file, f"{here}/{rest}")
         yield Path(here)
 
 
@@ -285,12 +286,6 @@ def _whole_prefix(path: str | Path) -> Iterator[Path]:
     finally:
         if beside.exists():
             fs.rm(beside.path, recursive=True)
-
-
-def _with_folder(file: Path) -> Path:
-    """A file whose folder is there."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    return file
 
 
 def _depth_below(file: str, folder: str) -> int:

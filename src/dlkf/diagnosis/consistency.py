@@ -25,7 +25,7 @@ from dlkf.base.console import ProgressCallback
 from dlkf.base.errors import InputError
 from dlkf.base.files import write_into
 from dlkf.data.drive import Batch
-from dlkf.evaluation.figures import SHADE, png
+from dlkf.evaluation.figures import SHADE, plain_axes, png
 from dlkf.evaluation.table import ResultTable, as_json, as_markdown, format_number
 from dlkf.filters.gating import chi2_quantile
 from dlkf.filters.integration import BatchSolution, integrate
@@ -169,9 +169,7 @@ def draw_consistency(results: Mapping[str, NormalisedSquares], outage: NDArray[n
                 ax.axvspan(hidden[0] - result.epoch_s, hidden[-1], color=SHADE, alpha=0.6, lw=0, zorder=0)
             ax.axhline(1, color="#777777", lw=0.8)
             ax.semilogy(t, result.mean(values, degrees), color="#0072B2", lw=1.1)
-            ax.grid(color="#EEEEEE", lw=0.8)
-            ax.set_axisbelow(True)
-            ax.spines[["top", "right"]].set_visible(False)
+            plain_axes(ax)
             ax.set_title(f"{name}: {what} ({degrees})", fontsize=9, loc="left")
     highest = max(np.nanmax(r.mean(values, degrees)) for r in results.values() for _, values, degrees in r.parts())
     axes[0, 0].set_ylim(0.5, min(max(2.0, 1.1 * highest), 20.0))

@@ -25,7 +25,6 @@ from dlkf.data.tables import Columns, DriveRow
 from dlkf.data.validate import CheckedTables
 from dlkf.navigation.imu_errors import ImuSpec, SensorErrors
 from dlkf.navigation.state import ErrorStates
-from dlkf.simulation.drive import slice_tables
 from dlkf.simulation.imu import corrupt, draw_unit, inverse_mechanisation
 from dlkf.simulation.motion.chassis import ChassisConfig, apply_mounting, draw_car
 from dlkf.simulation.motion.routes import VehicleConfig
@@ -109,7 +108,7 @@ def _drive(settings: MatchedDrives, spec: ImuSpec, index: int) -> tuple[Drive, n
         DriveRow(f"matched-{index:03d}", f"matched-{index:03d}", (0.0, 0.0, 0.0)),
         imu_columns(t[1:], measured),
         _gnss(settings, gnss_rng, truth, rate),
-        reference_columns(slice_tables(truth, slice(None, None, rate)), np.concatenate((bias[:1], bias))[::rate]),
+        reference_columns(truth.at(slice(None, None, rate)), np.concatenate((bias[:1], bias))[::rate]),
     )
     return drive_from_tables(tables, "matched", float(rate), 1.0, torch.float64), unit.matrix
 

@@ -17,7 +17,7 @@ interval of the geometric mean's ratio covered 93 to 96 % throughout.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,10 +50,6 @@ class Comparison:
     units: int
     groups: int
     confidence: float
-
-    def as_dict(self) -> dict[str, float | int | str]:
-        """Plain values."""
-        return asdict(self)
 
 
 def weighted_means(values: Array, weights: Array, statistic: str) -> Array:

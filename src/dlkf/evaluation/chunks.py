@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -23,7 +23,9 @@ from dlkf.evaluation.scores import join_scores
 from dlkf.evaluation.study import ScoredRun, run_scenes
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.smoother import Filter
-from dlkf.running.references import ReferencedDrives, make_reference
+from dlkf.running.references import describe_reference, make_reference
+
+SHORT = "too short"  # of the rules: drives of which no segment could be cut
 
 
 @dataclass(frozen=True)
@@ -45,27 +47,24 @@ class EvaluationJob:
 
 
 class ChunkResult(NamedTuple):
-    """What became of a chunk: its run, or why nothing of it can be scored."""
+    """What became of a chunk: its run and the rules of its scenes, or why nothing of it can be scored."""
 
     names: tuple[str, ...]
-    run: ScoredRun | None
-    mode: str
-    rules: Mapping[str, Any]
-    skipped: Mapping[str, str]
-    sigma: Tensor | None  # (n, 3) of a made reference [m]
+    run: ScoredRun | None = None
+    rules: Mapping[str, Any] = {}
+    skipped: Mapping[str, str] = {}
+    sigma: Tensor | None = None  # (n, 3) of a made reference [m]
     short: Sequence[str] = ()  # drives of which no segment could be cut
     refused: InputError | None = None
 
 
 class Evaluated(NamedTuple):
-    """All chunks together; ``truth`` describes a made reference, ``short`` which drives have no segment."""
+    """All chunks together, the rules with ``skipped`` and, of drives without a segment, ``too short``; ``truth``
+    describes a made reference."""
 
     run: ScoredRun
-    mode: str
     rules: dict[str, Any]
-    skipped: dict[str, str]
     truth: dict[str, str]
-    short: str
 
 
 def evaluate_chunks(
@@ -81,21 +80,20 @@ def evaluate_chunks(
     scorable = [one for one in done if one.run is not None]
     if not scorable:
         raise done[0].refused or no_drives()
-    mode = "segments" if any(one.mode == "segments" for one in scorable) else "drives"
-    kept = [one for one in scorable if one.mode == mode]
+    mode = "segments" if any(one.rules["mode"] == "segments" for one in scorable) else "drives"
+    kept = [one for one in scorable if one.rules["mode"] == mode]
     run = join_chunks([one.run for one in kept if one.run is not None])
-    of_other_mode = [one for one in scorable if one.mode != mode]  # no segment, where others have some
+    of_other_mode = [one for one in scorable if one.rules["mode"] != mode]  # no segment, where others have some
     lost = {name for one in done for name in one.short} | {name for one in of_other_mode for name in one.names}
     names = [name for one in done for name in one.names]
     unused = [name for name in names if name in lost - set(skipped)]
-    short = describe_short(unused, len(names), work.protocol) if unused else ""
     rules = {**kept[0].rules, "runs": sum(one.rules["runs"] for one in kept), "skipped": skipped}
-    rules |= {"too short": short} if short else {}
+    rules |= {SHORT: describe_short(unused, len(names), work.protocol)} if unused else {}
     refused = {drive: said for one in kept for drive, said in one.rules.get(REFUSED, {}).items()}
     rules |= {REFUSED: refused} if refused else {}
     sigmas = [one.sigma for one in kept if one.sigma is not None]
-    truth = {"reference": ReferencedDrives([], torch.cat(sigmas), {}, work.reference).describe()} if sigmas else {}
-    return Evaluated(run, mode, rules, skipped, truth, short)
+    truth = {"reference": describe_reference(work.reference, torch.cat(sigmas))} if sigmas else {}
+    return Evaluated(run, rules, truth)
 
 
 def score_chunk(work: EvaluationJob, names: tuple[str, ...]) -> ChunkResult:
@@ -112,14 +110,14 @@ def score_chunk(work: EvaluationJob, names: tuple[str, ...]) -> ChunkResult:
             drives, sigma, left_out = made.drives, made.sigma, made.skipped
         scenes = Scenes(drives, work.protocol)
     except NoSegment as error:
-        return ChunkResult(names, None, "", {}, {}, None, names, error)
+        return ChunkResult(names, short=names, refused=error)
     except InputError as error:
-        return ChunkResult(names, None, "", {}, {names[0]: str(error)}, None, refused=error)
+        return ChunkResult(names, skipped={names[0]: str(error)}, refused=error)
     bar: Callable[[str], Any] = partial(_bar, work)
     run = run_scenes(
         work.filters, scenes, kinds=work.kinds, groups=work.groups, law=work.law, seed=work.seed, counting=bar
     )
-    return ChunkResult(names, run, scenes.mode, scenes.describe(), {**left_out, **scenes.skipped}, sigma, scenes.short)
+    return ChunkResult(names, run, scenes.describe(), {**left_out, **scenes.skipped}, sigma, scenes.short)
 
 
 def join_chunks(runs: Sequence[ScoredRun]) -> ScoredRun:
@@ -133,10 +131,5 @@ def join_chunks(runs: Sequence[ScoredRun]) -> ScoredRun:
     return ScoredRun(scores, np.concatenate([r.cause for r in runs if r.cause is not None]), followed)
 
 
-@contextmanager
-def _bar(work: EvaluationJob, title: str) -> Iterator[ProgressCallback | None]:
-    if not work.shown:
-        yield None
-        return
-    with show_progress(title) as progress:
-        yield progress
+def _bar(work: EvaluationJob, title: str) -> AbstractContextManager[ProgressCallback | None]:
+    return show_progress(title) if work.shown else nullcontext()

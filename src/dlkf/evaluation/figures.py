@@ -24,21 +24,11 @@ from matplotlib.patches import Patch
 from dlkf.base.colours import COLOURS, SHADE
 from dlkf.evaluation.bootstrap import MIN_GROUPS, rms_band
 from dlkf.evaluation.metrics import Array, magnitudes, outage_at, outage_intervals, rms_over_segments
-from dlkf.evaluation.scores import OFF_SCALE, Scores, representative
-from dlkf.evaluation.table import format_number
+from dlkf.evaluation.scores import OFF_SCALE, Scores, representative, settled_limits
+from dlkf.evaluation.table import ERROR_PANELS, IMU_PANELS, format_number
 
 STYLES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (7, 2)), (0, (3, 1, 1, 1)), (0, (2, 2)))
 MANY = 20  # outages, from which on a histogram is drawn
-LABELS = {
-    "horizontal": ("Horizontal error [m]", 1.0),
-    "velocity": ("Velocity error [m/s]", 1.0),
-    "attitude": ("Attitude error [°]", 180 / math.pi),
-}
-IMU_AXES = (
-    ("Accelerometer x", "m/s²", 1.0), ("Accelerometer y", "m/s²", 1.0), ("Accelerometer z", "m/s²", 1.0),
-    ("Gyroscope x", "°/s", 180 / math.pi), ("Gyroscope y", "°/s", 180 / math.pi),
-    ("Gyroscope z", "°/s", 180 / math.pi),
-)  # fmt: skip
 
 
 def png(figure: Figure, dpi: int = 130) -> bytes:
@@ -114,8 +104,7 @@ def tracks(scores: Scores, segments: Sequence[int], named: str = "truth") -> Fig
     handles = [Line2D([], [], color="black", lw=1.6, label=named)]
     if hidden:
         handles.append(Line2D([], [], color=SHADE, lw=8, solid_capstyle="round", label="outage"))
-    handles += [Line2D([], [], lw=1.8, label=n, **line_style(scores, n)) for n in scores.filters]
-    _legend(figure, handles)
+    _legend(figure, handles + _filter_handles(scores, scores.filters))
     return figure
 
 
@@ -134,7 +123,7 @@ def _track(ax: Axes, scores: Scores, i: int, middle: Array, half: float) -> None
     ax.set_xlim(middle[1] - half, middle[1] + half)
     ax.set_ylim(middle[0] - half, middle[0] + half)
     ax.set(xlabel="East [m]", ylabel="North [m]")
-    _plain(ax)
+    plain_axes(ax)
 
 
 def _absent(ax: Axes, names: Sequence[str]) -> None:
@@ -175,12 +164,12 @@ def error_over_time(scores: Scores, segments: Sequence[int] | None = None) -> Fi
     """
     index = list(range(len(scores.segments))) if segments is None else list(segments)
     sizes = {n: magnitudes(r.error[index]) for n, r in scores.filters.items()}
-    shown = [q for q in LABELS if any(np.isfinite(s[q]).any() for s in sizes.values())]
+    shown = [q for q in ERROR_PANELS if any(np.isfinite(s[q]).any() for s in sizes.values())]
     figure = Figure(figsize=(9, 2.5 * max(len(shown), 1) + 0.9), layout="constrained")
     axes = figure.subplots(max(len(shown), 1), 1, sharex=True, squeeze=False).ravel()
     length = scores.t[np.flatnonzero(~np.isnan(scores.truth_p_n[index]).all((0, 2)))[-1]]
     for ax, q in zip(axes, shown):
-        label, scale = LABELS[q]
+        label, scale = ERROR_PANELS[q]
         _shade(ax, scores, index)
         for name in scores.filters:
             x = sizes[name][q] * scale
@@ -194,7 +183,7 @@ def error_over_time(scores: Scores, segments: Sequence[int] | None = None) -> Fi
         ax.set_yscale("log")
         ax.set_ylabel(label)
         ax.set_xlim(0, length)
-        _plain(ax)
+        plain_axes(ax)
     axes[len(shown) - 1].set_xlabel(
         "Time since the start [s]" if len(index) == 1 else "Time since the start of the segment [s]"
     )
@@ -202,8 +191,7 @@ def error_over_time(scores: Scores, segments: Sequence[int] | None = None) -> Fi
     if len(index) > 4:
         what += ", band: middle 80 % of the segments"
     axes[0].set_title(what, fontsize=9, loc="left")
-    handles = [Line2D([], [], lw=1.8, label=n, **line_style(scores, n)) for n in scores.filters]
-    _legend(figure, handles + _outage_handle(scores, index))
+    _legend(figure, _filter_handles(scores, scores.filters) + _outage_handle(scores, index))
     return figure
 
 
@@ -215,7 +203,7 @@ def imu_errors(scores: Scores, i: int) -> Figure:
     last = np.flatnonzero(~np.isnan(scores.truth_p_n[i]).all(-1))[-1]
     settled = scores.t > 0.2 * scores.t[last]
     runs = {n: r for n, r in scores.filters.items() if np.nan_to_num(r.imu_error[i]).any()}  # that estimate one
-    for k, (ax, (label, unit, scale)) in enumerate(zip(axes.ravel(), IMU_AXES)):
+    for k, (ax, (label, scale)) in enumerate(zip(axes.ravel(), IMU_PANELS)):
         _shade(ax, scores, [i])
         extent: list[Array] = []
         for name, run in runs.items():
@@ -228,15 +216,15 @@ def imu_errors(scores: Scores, i: int) -> Figure:
             y = scores.true_imu_error[i, :, k] * scale
             ax.plot(scores.t, y, color="black", lw=1.4, zorder=4)
             extent.append(y[settled])
-        _limits(ax, extent)
+        if limits := settled_limits(extent):
+            ax.set_ylim(*limits)
         ax.set_title(label, fontsize=9, loc="left")
-        ax.set_ylabel(f"Error [{unit}]")
         ax.set_xlim(0, scores.t[last])
         if k >= 3:
             ax.set_xlabel("Time since the start [s]")
-        _plain(ax)
+        plain_axes(ax)
     handles: list[Artist] = [Line2D([], [], color="black", lw=1.4, label="truth")] if known else []
-    handles += [Line2D([], [], lw=1.7, label=n, **line_style(scores, n)) for n in runs]
+    handles += _filter_handles(scores, runs)
     if any(np.isfinite(r.imu_std[i]).any() for r in scores.filters.values()):
         handles.append(Patch(color=COLOURS[1], alpha=0.2, label="±3σ of each filter"))
     figure.suptitle(f"IMU-error estimates, {scores.describe_segment(i)}", fontsize=10)
@@ -272,7 +260,7 @@ def error_growth(scores: Scores) -> Figure:
     band = "band: 95 % bootstrap interval of the RMS" if banded else f"under {MIN_GROUPS} recordings: no intervals"
     note = f"\noff the scale at the end: {', '.join(outside)}" if outside else ""
     ax.set_title(f"{len(w.segment)} outages, {band}{note}", fontsize=9, loc="left")
-    _plain(ax)
+    plain_axes(ax)
     _legend(figure, ax.get_legend_handles_labels()[0])
     return figure
 
@@ -299,14 +287,14 @@ def error_histograms(scores: Scores, names: Sequence[str]) -> Figure:
             ax.stairs(heights, edges, lw=1.6, fill=last, alpha=0.7 if last else 1, **line_style(scores, n))
         ax.set(xlim=(0, top))
         ax.set_title(f"{count * scores.epoch_s:g} s without GNSS", fontsize=9)
-        _plain(ax)
+        plain_axes(ax)
     for ax in panels.flat[len(counts) :]:
         ax.set_visible(False)
     for ax in panels[-1]:
         ax.set_xlabel("Horizontal RMS since the outage began [m]", fontsize=9)
     for ax in panels[:, 0]:
         ax.set_ylabel("Outages", fontsize=9)
-    _legend(figure, [Line2D([], [], label=n, **line_style(scores, n)) for n in names])
+    _legend(figure, _filter_handles(scores, names))
     return figure
 
 
@@ -319,25 +307,20 @@ def _shade(ax: Axes, scores: Scores, segments: Iterable[int]) -> None:
             ax.axvspan(edges[a], edges[b], color=SHADE, alpha=0.25 + 0.75 * share[a], lw=0, zorder=0)
 
 
-def _outage_handle(scores: Scores, segments: Sequence[int]) -> list[Patch]:
+def _filter_handles(scores: Scores, names: Iterable[str]) -> list[Artist]:
+    return [Line2D([], [], lw=1.8, label=n, **line_style(scores, n)) for n in names]
+
+
+def _outage_handle(scores: Scores, segments: Sequence[int]) -> list[Artist]:
     return [Patch(color=SHADE, label="outage")] if scores.outage[list(segments)].any() else []
-
-
-def _limits(ax: Axes, extent: list[Array]) -> None:
-    """Limits by the settled part of the lines with room to see them converge; the first swings may leave."""
-    values = np.concatenate(extent) if extent else np.empty(0)
-    values = values[np.isfinite(values)]
-    if values.size:
-        low, high = values.min(), values.max()
-        margin = 0.6 * (high - low) or 1e-6
-        ax.set_ylim(low - margin, high + margin)
 
 
 def _legend(figure: Figure, handles: Sequence) -> None:
     figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 6), frameon=False, fontsize=9)
 
 
-def _plain(ax: Axes) -> None:
+def plain_axes(ax: Axes) -> None:
+    """A light grid behind the lines, no frame."""
     ax.spines[["top", "right"]].set_visible(False)
     ax.grid(color="#EEEEEE", lw=0.8, zorder=0)
     ax.set_axisbelow(True)

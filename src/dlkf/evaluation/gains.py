@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from dlkf.base.files import write_into
 from dlkf.data.masks import withhold_fixes
+from dlkf.evaluation.figures import png
 from dlkf.evaluation.metrics import Array
 from dlkf.evaluation.run import Scene
 from dlkf.filters.smoother import Filter
@@ -81,7 +81,7 @@ def write_gains(out: Path, gains: Mapping[str, Gains], title: str) -> None:
         (folder / "figures").mkdir()
         panels = [(name, g.last[0]) for name, g in gains.items()]
         figure = heat_map(panels, len(panels), f"{title}: gain at the last fix of one segment")
-        FigureCanvasAgg(figure).print_png(str(folder / "figures" / "gains.png"))
+        (folder / "figures" / "gains.png").write_bytes(png(figure, 100))
 
 
 def heat_map(gains: Sequence[tuple[str, Array]], columns: int, title: str) -> Figure:

@@ -39,8 +39,8 @@ class OutagePlan:
     offsets_s: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
-        low, high = _bounds("outage.duration_s", self.duration_s)
-        _bounds("outage.first_s", self.first_s)
+        low, high = bounds("outage.duration_s", self.duration_s)
+        bounds("outage.first_s", self.first_s)
         if low <= 0:
             raise InputError(f"outage.duration_s is {low:g} s, must be above 0")
         if min(self.offsets_s or (0.0,)) < 0:
@@ -101,7 +101,7 @@ def describe_unused(plan: OutagePlan, outage: np.ndarray, ends_s: np.ndarray, dr
     ``outage`` (P, T) has the masks of the segments, ``ends_s`` (P,) the last time of their truth [s since the start],
     ``drives`` (P,) their names.
     """
-    first, duration = (_bounds(f"outage.{name}", getattr(plan, name))[0] for name in ("first_s", "duration_s"))
+    first, duration = (bounds(f"outage.{name}", getattr(plan, name))[0] for name in ("first_s", "duration_s"))
     longest: dict[str, float] = {}
     for drive, end in zip(drives, ends_s):
         longest[drive] = max(longest.get(drive, 0.0), float(end))
@@ -138,7 +138,8 @@ def check_outages(plan: OutagePlan | None, withheld: Tensor | np.ndarray, longes
         )
 
 
-def _bounds(name: str, value: float | Sequence[float]) -> tuple[float, float]:
+def bounds(name: str, value: float | Sequence[float]) -> tuple[float, float]:
+    """Least and greatest of a number or (low, high); InputError for what is neither."""
     values = [value] if isinstance(value, (int, float)) else list(value)
     if len(values) not in (1, 2) or not np.isfinite(values).all() or min(values) < 0 or values[0] > values[-1]:
         several = f"; for a run each -m {name}={','.join(f'{x:g}' for x in values)}" if len(values) > 2 else ""
@@ -148,7 +149,7 @@ def _bounds(name: str, value: float | Sequence[float]) -> tuple[float, float]:
 
 
 def _draw(value: float | Sequence[float], batch: Batch, seed: int, name: str) -> Tensor:
-    low, high = _bounds(f"outage.{name}", value)
+    low, high = bounds(f"outage.{name}", value)
     steps = round((high - low) / batch.epoch_s)
     if not steps:
         return torch.full((batch.size[0],), low, dtype=torch.float64)

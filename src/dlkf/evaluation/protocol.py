@@ -22,9 +22,9 @@ from dlkf.data.segments import (
     whole_drives,
 )
 from dlkf.data.stack import DriveStack, stack_drives
-from dlkf.evaluation.outages import OutagePlan
+from dlkf.evaluation.outages import OutagePlan, bounds
 from dlkf.evaluation.run import Scene
-from dlkf.running.batched import CHUNK_SAMPLES
+from dlkf.running.batched import CHUNK_SAMPLES, pack
 from dlkf.running.start import align_each
 
 if TYPE_CHECKING:
@@ -203,16 +203,15 @@ def spread_evenly(items: Sequence[Item], limit: int | None) -> list[Item]:
 
 def repeat_outages(plan: OutagePlan) -> OutagePlan:
     """The plan for whole drives: repeated to the end, in as many runs as cover the drive, where not given."""
-    longest = plan.duration_s if isinstance(plan.duration_s, (int, float)) else max(plan.duration_s)
+    longest = bounds("outage.duration_s", plan.duration_s)[1]
     every = plan.every_s if plan.every_s is not None else 2.0 * longest
-    return replace(plan, every_s=every, offsets_s=plan.offsets_s or (0.0, float(longest)))
+    return replace(plan, every_s=every, offsets_s=plan.offsets_s or (0.0, longest))
 
 
 def drives_that_fit(plan: OutagePlan, length_s: float, length: str = "length_s", outage: str = "outage") -> OutagePlan:
     """The plan with its offsets; InputError, which names the settings, where segments are too short for it."""
     offsets = plan.offsets_s or (0.0,)
-    first, last = (x if isinstance(x, (int, float)) else max(x) for x in (plan.first_s, plan.duration_s))
-    end = first + last + max(offsets)
+    end = bounds("outage.first_s", plan.first_s)[1] + bounds("outage.duration_s", plan.duration_s)[1] + max(offsets)
     if end > length_s + 1e-6:
         raise InputError(
             f"the outage ends after {end:g} s but segments are {length_s:g} s long; "
@@ -223,13 +222,5 @@ def drives_that_fit(plan: OutagePlan, length_s: float, length: str = "length_s",
 
 def _parts(items: Sequence, epochs: Sequence[int], stack: DriveStack) -> list[list]:
     """Items in order, as many together as four chunks hold when padded to the longest of them."""
-    samples = stack.imu.shape[1]
-    parts: list[list] = []
-    longest = 0
-    for item, n in zip(items, epochs):
-        longest = max(longest, n)
-        if not parts or (len(parts[-1]) + 1) * longest * samples > 4 * CHUNK_SAMPLES:
-            parts.append([])
-            longest = n
-        parts[-1].append(item)
-    return parts
+    sizes = [n * stack.imu.shape[1] for n in epochs]
+    return [[items[k] for k in part] for part in pack(sizes, 4 * CHUNK_SAMPLES)]

@@ -7,7 +7,7 @@ them, which quantity and statistic. Tables, CSV, ``metrics.json``, MLflow's keys
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import product
 from typing import Any, NamedTuple
@@ -29,7 +29,7 @@ from dlkf.evaluation.metrics import (
     slope,
     summarise_errors,
 )
-from dlkf.evaluation.scores import Scores, sigma_samples
+from dlkf.evaluation.scores import Scores
 from dlkf.running.innovations import rms
 
 SETTLE_S = 10.0  # "settled" leaves out this much of every segment, where the initial error dominates
@@ -63,8 +63,8 @@ class Value(NamedTuple):
     unit: str
 
 
-@dataclass(frozen=True)
-class PairedRatio:
+@dataclass(frozen=True, kw_only=True)
+class PairedRatio(Comparison):
     """A filter against the baseline in one quantity; ``over`` and ``part`` as in :class:`Value`."""
 
     kind: str
@@ -73,13 +73,6 @@ class PairedRatio:
     over: str
     part: str
     quantity: str
-    against: Comparison
-
-    def as_dict(self) -> dict[str, Any]:
-        """One flat row of plain values."""
-        row = asdict(self)
-        against = row.pop("against")
-        return row | against
 
 
 @dataclass(frozen=True)
@@ -118,9 +111,7 @@ class Results:
     def versus(self, filter: str, over: str, part: str, quantity: str, statistic: str = "rms") -> Comparison | None:
         """One comparison; None for the baseline itself, or what is not compared."""
         wanted = (filter, over, part, quantity, statistic)
-        same = (
-            c.against for c in self.comparisons if (c.filter, c.over, c.part, c.quantity, c.against.statistic) == wanted
-        )
+        same = (c for c in self.comparisons if (c.filter, c.over, c.part, c.quantity, c.statistic) == wanted)
         return next(same, None)
 
     def seconds_into_outage(self) -> list[str]:
@@ -134,7 +125,7 @@ class Results:
 
     def as_dict(self) -> dict[str, Any]:
         """For ``metrics.json``; ``pandas.DataFrame(**result["values"])`` is the frame, and so for ``comparisons``."""
-        rows = [c.as_dict() for c in self.comparisons]
+        rows = [asdict(c) for c in self.comparisons]
         return {
             "kind": self.kind,
             "count": dict(self.count),
@@ -148,11 +139,10 @@ class Results:
     @staticmethod
     def of(content: Mapping[str, Any]) -> Results:
         """Results as ``metrics.json`` has them: the inverse of :meth:`as_dict`."""
-        comparisons, columns = [], content["comparisons"]["columns"]
+        columns, comparisons = content["comparisons"]["columns"], []
         for row in content["comparisons"]["data"]:
             named: dict[str, Any] = {k: x if k in TEXT else _real(x) for k, x in zip(columns, row)}
-            against = Comparison(**{f.name: named.pop(f.name) for f in fields(Comparison)})
-            comparisons.append(PairedRatio(**named, against=against))
+            comparisons.append(PairedRatio(**named))
         values = (Value(*row[:-2], value=_real(row[-2]), unit=row[-1]) for row in content["values"]["data"])
         kept = {k: content[k] for k in ("kind", "count", "settle_s")}
         lists: dict[str, Any] = {k: tuple(content[k]) for k in ("per_segment", "per_outage")}
@@ -175,9 +165,12 @@ def summarise_scores(
     samples: dict[str, dict[tuple[str, str, str], Array]] = {}  # filter → (over, part, quantity) → one per unit
     values: list[Value] = []
     for name in scores.filters:
-        samples[name] = _segment_samples(scores, name, settle_s)
+        size, phases = magnitudes(scores.filters[name].error), _phases(scores, settle_s)
+        samples[name] = {
+            ("segments", k, q): segment_rms(size[q], mask) for q in QUANTITIES for k, mask in phases.items()
+        }
         if len(w.segment):
-            samples[name] |= _outage_samples(scores, name, distance) | sigma_samples(scores, name)
+            samples[name] |= _outage_samples(scores, name, distance)
         for (over, part, quantity), x in samples[name].items():
             values += make_values(scores.kinds[0], name, over, part, quantity, summarise_errors(x))
         spread = {"rms": rms(scores.filters[name].innovation)}  # over their 1σ; NaN of a filter without covariance
@@ -246,22 +239,19 @@ def last_finite(x: Array) -> Array:
     return np.take_along_axis(x, last[:, None], axis=1)[:, 0]
 
 
-def _segment_samples(scores: Scores, name: str, settle_s: float) -> dict[tuple[str, str, str], Array]:
-    size, phases = magnitudes(scores.filters[name].error), _phases(scores, settle_s)
-    return {("segments", k, q): segment_rms(size[q], mask) for q in QUANTITIES for k, mask in phases.items()}
-
-
 def _outage_samples(scores: Scores, name: str, distance: Array) -> dict[tuple[str, str, str], Array]:
     w, size = scores.windows, magnitudes(scores.filters[name].error)
     seconds = np.asarray(INTO_OUTAGE_S)
     seconds = seconds[seconds <= w.length.max() * scores.epoch_s + 1e-9]
     at = {q: outage_at(size[q], w, seconds, scores.epoch_s) for q in QUANTITIES}
+    std = scores.filters[name].position_std
     end = {q: outage_end(size[q], w) for q in QUANTITIES}
     with np.errstate(divide="ignore", invalid="ignore"):
         end["drift"] = np.where(distance > 1.0, end["horizontal"] / distance, np.nan)
     found = {("outages", "end", q): x for q, x in end.items()}
     found |= {("outages", "rms", q): outage_rms(size[q], w) for q in QUANTITIES}
-    return found | {("outages", f"at {s:g} s", q): at[q][:, i] for i, s in enumerate(seconds) for q in QUANTITIES}
+    found |= {("outages", f"at {s:g} s", q): at[q][:, i] for i, s in enumerate(seconds) for q in QUANTITIES}
+    return found | {("outages", "end", "sigma"): outage_end(np.hypot(std[..., 0], std[..., 1]), w)}  # the filter's own
 
 
 def _comparisons(
@@ -280,8 +270,10 @@ def _comparisons(
         for ((over, part), g), q, s in product(units.items(), QUANTITIES, COMPARED):
             if name != baseline:
                 a, b = (samples[n][over, part, q] for n in (name, baseline))
-                compared = compare(a, b, statistic=s, groups=g, **options)
-                yield PairedRatio(scores.kinds[0], name, baseline, over, part, q, compared)
+                yield PairedRatio(
+                    kind=scores.kinds[0], filter=name, baseline=baseline, over=over, part=part, quantity=q,
+                    **vars(compare(a, b, statistic=s, groups=g, **options)),
+                )  # fmt: skip
 
 
 def _imu_error_quality(scores: Scores, name: str) -> list[Value]:

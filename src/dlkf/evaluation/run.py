@@ -18,6 +18,7 @@ from dlkf.filters.aids.attach import aid_columns
 from dlkf.filters.smoother import Filter
 from dlkf.navigation.state import IMU
 from dlkf.running.batched import CHUNK_SAMPLES, chunks, run_filter
+from dlkf.running.innovations import Innovation
 
 Scene = tuple[Batch, Tensor]
 
@@ -98,9 +99,7 @@ def _fill(run: FilterRun, index: Tensor, batch: Batch, estimator: Filter) -> Non
     if solution.std is not None:
         run.imu_std[rows, :T] = mask(solution.std[..., IMU])
         run.position_std[rows, :T] = mask(solution.std[..., :3])
-    if (S := solution.innovation_covariance) is not None:
-        sigma = S.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
-        seen = solution.used.unsqueeze(-1) & (solution.innovation != 0)
-        run.innovation[rows, :T] = mask(torch.where(seen, solution.innovation / sigma, torch.nan))
+    innovation = Innovation.of(solution.innovation, solution.used, solution.innovation_covariance)
+    run.innovation[rows, :T] = np.where(here, innovation.ratio, np.nan)
     if solution.aids is not None:
         run.aids[rows, :T] = mask(solution.aids)

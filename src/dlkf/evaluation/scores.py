@@ -8,10 +8,9 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 import torch
 
-from dlkf.evaluation.metrics import Array, Mask, OutageIntervals, magnitudes, outage_end, outage_intervals
+from dlkf.evaluation.metrics import Array, Mask, OutageIntervals, magnitudes, outage_intervals
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
-from dlkf.running.innovations import SigmaFit, fit_sigma
 
 OFF_SCALE = 20.0  # a filter this many times worse than the best does not set the scale of a figure
 
@@ -129,15 +128,17 @@ def _pad(x: Array, T: int) -> Array:
     return np.pad(x, extra, constant_values=False if x.dtype == bool else np.nan)
 
 
-def sigma_samples(scores: Scores, name: str) -> dict[tuple[str, str, str], Array]:
-    """The filter's own horizontal 1σ √(σ_n² + σ_e²) at the end of every outage [m], NaN where it has none."""
-    std = scores.filters[name].position_std
-    return {("outages", "end", "sigma"): outage_end(np.hypot(std[..., 0], std[..., 1]), scores.windows)}
+def settled_limits(parts: Sequence[Array]) -> tuple[float, float] | None:
+    """Limits of an axis by the settled parts of its lines, with room to see them converge; the first swings may leave.
 
-
-def innovation_fit(run: FilterRun) -> SigmaFit | None:
-    """Whether the filter's 1σ fits its innovations; segments count as independent."""
-    return fit_sigma(*run.innovation)
+    None where nothing is finite.
+    """
+    values = np.concatenate([*parts, np.empty(0)])
+    values = values[np.isfinite(values)]
+    if not values.size:
+        return None
+    margin = 0.6 * float(np.ptp(values)) or 1e-6
+    return float(values.min()) - margin, float(values.max()) + margin
 
 
 def representative(scores: Scores, n: int, filter_name: str | None) -> list[int]:

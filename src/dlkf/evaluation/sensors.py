@@ -11,6 +11,7 @@ from dlkf.evaluation.results import last_finite
 from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.table import ResultTable
 from dlkf.filters.aids.estimates import format_estimate, label_estimate
+from dlkf.running.innovations import rms
 
 TITLE = "Further sensors"
 COLUMNS = ["Filter", "Sensor", "Updates", "Used\n[%]", "Innovation\n/ σ"]
@@ -31,7 +32,7 @@ def sensor_table(scores: Scores, columns: Mapping[str, Sequence[str]]) -> Result
             ratio = of[f"{sensor}_innovation"] / of[f"{sensor}_innovation_std"]
             seen, used = np.isfinite(ratio), of[f"{sensor}_used"] > 0.5
             counted = seen & used
-            spread = f"{np.sqrt(np.mean(ratio[counted] ** 2)):.2f}" if counted.any() else "–"
+            spread = f"{rms(ratio[counted]):.2f}" if counted.any() else "–"
             share = f"{100 * counted.sum() / seen.sum():.1f}" if seen.any() else "–"
             prefix = "wheel_" if sensor == "speed" else f"{sensor}_"
             names = [n for n in of if n.startswith(prefix) and f"std_{n}" in of and np.isfinite(of[n]).any()]

@@ -7,10 +7,11 @@ from collections.abc import Iterable, Sequence
 
 from dlkf.evaluation.bootstrap import MIN_GROUPS
 from dlkf.evaluation.results import Results
-from dlkf.evaluation.scores import Scores, innovation_fit
+from dlkf.evaluation.scores import Scores
 from dlkf.evaluation.table import DEGREES, format_number
+from dlkf.filters.build import is_filter
 from dlkf.filters.tuning import Tuning
-from dlkf.running.innovations import OF_NETWORK, REMEDY
+from dlkf.running.innovations import OF_NETWORK, REMEDY, fit_sigma
 
 FEW = 20  # outages or segments; fewer have no 95 %: their largest error stands instead
 END = ("outages", "end", "horizontal")
@@ -65,9 +66,9 @@ def headline(result: Results) -> str:
     drift = result.value(best, "outages", "end", "drift", "median") if span else math.nan
     share = f" ({format_number(100 * drift, digits=2)} % of the distance driven)" if math.isfinite(drift) else ""
     text += _spread(texts[best], count, unit, share)
-    other = next((n for n in order[1:] if is_classical(best) or is_classical(n)), None)
+    other = next((n for n in order[1:] if is_filter(best) or is_filter(n)), None)
     if other is not None:
-        which = "next" if is_classical(best) else "best classical filter"
+        which = "next" if is_filter(best) else "best classical filter"
         text += f"; {which} {other} {', '.join(texts[other])}"
     few = f" Based on {count} {unit}{'s' if count > 1 else ''} only; larger errors can occur." if count < FEW else ""
     return f"{text}.{few}"
@@ -104,8 +105,8 @@ def describe_verdict(result: Results, name: str) -> str | None:
 def describe_untuned(models: Iterable[str], tuning: Tuning, imu: str) -> str | None:
     """A line where Kalman filters stand beside a learned one with the noise of a preset as it is, else None."""
     named = list(models)
-    kalman = [name for name in named if is_classical(name) and name != "ins"]
-    if not kalman or all(map(is_classical, named)) or tuning != Tuning():
+    kalman = [name for name in named if is_filter(name) and name != "ins"]
+    if not kalman or all(map(is_filter, named)) or tuning != Tuning():
         return None
     return (
         f"{', '.join(kalman)}: noise of imu={imu} as it stands, untuned; before a comparison tune on other drives "
@@ -119,9 +120,9 @@ def sigma_warnings(scores: Scores) -> list[str]:
     lines: list[str] = []
     remedies: set[str] = set()
     for name, run in scores.filters.items():
-        fit = innovation_fit(run)
+        fit = fit_sigma(*run.innovation)  # segments count as independent
         if fit is not None and fit.too_small:
-            remedy = fit.remedy(REMEDY if is_classical(name) else OF_NETWORK)
+            remedy = fit.remedy(REMEDY if is_filter(name) else OF_NETWORK)
             lines.append(fit.short_warning(name) if remedy in remedies else fit.warning(name, remedy))
             remedies.add(remedy)
     return lines
@@ -139,8 +140,3 @@ def _spread(texts: Sequence[str], count: int, unit: str, share: str) -> str:
     if count == 1:
         return f"{texts[0]}{where}{share}"
     return f"{texts[0]}{where} in the median{share}, {texts[1]} in the largest"
-
-
-def is_classical(name: str) -> bool:
-    """Whether a name in a table is that of a model-based filter."""
-    return name == "ins" or name.split("_")[0] in ("mbkf15", "mbkf21", "mbkf33", "aekf")

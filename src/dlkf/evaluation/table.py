@@ -23,6 +23,14 @@ from dlkf.evaluation.results import IMU_AXES, Results, Value
 
 DASH = "–"
 DEGREES = 180 / math.pi
+# titles of panels and what a value is multiplied by
+ERROR_PANELS = {
+    "horizontal": ("Horizontal error [m]", 1.0),
+    "velocity": ("Velocity error [m/s]", 1.0),
+    "attitude": ("Attitude error [°]", DEGREES),
+}
+SENSORS = (("Accelerometer", "m/s²", 1.0), ("Gyroscope", "°/s", DEGREES))
+IMU_PANELS = [(f"{name} {axis} error [{unit}]", scale) for name, unit, scale in SENSORS for axis in "xyz"]
 
 
 class ResultTable(NamedTuple):
@@ -131,7 +139,7 @@ def ratio_table(dataset: str, result: Results) -> ResultTable | None:
     heads = {h: which for h, which in RATIOS.items() if any(result.versus(n, *which) for n in names)}
     if not heads:
         return None
-    groups = result.comparisons[0].against.groups
+    groups = result.comparisons[0].groups
     return ResultTable(
         title=f"{dataset} ({result.kind}): ratio to {result.baseline}, {_count(groups, 'recording')}",
         note="Below 1: better than it. Of the horizontal error at the end of the outages: RMS, which the largest "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from typing import Any
 
 import numpy as np
@@ -11,10 +10,11 @@ from matplotlib.figure import Figure
 
 from dlkf.base.colours import COLOURS, SHADE, filter_colour
 from dlkf.data.limits import DEGREE_M
-from dlkf.evaluation.figures import png
+from dlkf.evaluation.figures import plain_axes, png
 from dlkf.evaluation.metrics import magnitudes, outage_at
 from dlkf.evaluation.scores import Scores
 from dlkf.report.navigation import GAP_S, TrackOnMap, horizontal_std
+from dlkf.report.page import embed_png
 from dlkf.report.plots import spans
 from dlkf.running.offline import Navigated, UsableFixes
 
@@ -30,7 +30,7 @@ class NotebookFigure(Figure):
 
 def as_html(figure: Figure) -> str:
     """A figure as ``<img>``."""
-    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(png(figure, DPI)).decode()}">'
+    return f'<img alt="" src="{embed_png(png(figure, DPI))}">'
 
 
 def draw_solution(navigated: Navigated, fixes: UsableFixes) -> NotebookFigure:
@@ -73,7 +73,9 @@ def draw_solution(navigated: Navigated, fixes: UsableFixes) -> NotebookFigure:
     for name in ("sigma", "innovation"):
         for a, b in spans(t, course.without > GAP_S):
             axes[name].axvspan(a, b, color=SHADE, alpha=0.6, zorder=0)
-    return _plain(figure)
+    for ax in figure.axes:
+        plain_axes(ax)
+    return figure
 
 
 def draw_evaluation(scores: Scores, outages: pd.DataFrame) -> NotebookFigure:
@@ -96,12 +98,6 @@ def draw_evaluation(scores: Scores, outages: pd.DataFrame) -> NotebookFigure:
     growth.legend(fontsize=8)
     ends.set_title("Outages that end with less than this error", fontsize=9, loc="left")
     ends.set(xlabel="Horizontal error at the end [m]", xscale="log", ylim=(0, None))
-    return _plain(figure)
-
-
-def _plain(figure: NotebookFigure) -> NotebookFigure:
     for ax in figure.axes:
-        ax.grid(alpha=0.3)
-        ax.spines[["top", "right"]].set_visible(False)
-        ax.tick_params(labelsize=8)
+        plain_axes(ax)
     return figure

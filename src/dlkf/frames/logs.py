@@ -48,9 +48,7 @@ def simulate(
     InputError
         For a preset that does not exist, and for no time or no drives.
     """
-    from dlkf.base.settings import settings_from
-    from dlkf.command.composing import compose_command
-    from dlkf.command.simulated import SimulateSettings
+    from dlkf.command.simulated import compose_recipe
     from dlkf.data.readers.frames import DriveFrames
     from dlkf.data.schema import drive_file
     from dlkf.data.tables import read_drives_table
@@ -65,7 +63,7 @@ def simulate(
     drives, seed = check_whole("drives", drives, 1), check_whole("seed", seed, 0)
     words = [f"simulated@dataset={preset}", f"dataset.hours={minutes * drives / 60}", f"seed={seed}"]
     words += [f"dataset.drive_minutes={minutes}", *([f"imu={imu_type}"] if imu_type else [])]
-    recipe = settings_from(SimulateSettings, compose_command("simulate", *words), "").recipe
+    recipe = compose_recipe(*words)
     with TemporaryDirectory(prefix="dlkf-") as folder:
         out = Path(folder) / "simulated"
         simulate_dataset(recipe, out, progress=False)

@@ -19,7 +19,7 @@ from dlkf.evaluation.table import format_number
 from dlkf.report.drawing import Figure
 from dlkf.report.evaluation import mark_best
 from dlkf.report.page import Page, flatten_settings
-from dlkf.report.plots import FONT
+from dlkf.report.plots import line, stack_panels
 
 TEST = ("digest", "reference", "mode", "runs", "seed", "length_s", "stride_s", "start", "outage")  # of the protocol
 POINT, SETTING = re.compile(r"\d+-([\w.+]+=.*)"), re.compile(r",(?=[\w.+]+=)")  # of a sweep: folder, its settings
@@ -156,7 +156,7 @@ def mark_best_of_each(columns: Sequence[str], rows: Sequence[Sequence[str]], tes
 
 def growth_figure(reports: Sequence[StoredReport]) -> Figure:
     """Errors at round times into the outages, a colour for every run and filter."""
-    figure, k = Figure(), 0
+    figure, k = stack_panels(["Horizontal error [m]"], height=390), 0
     for report in reports:
         for result in report.results:
             seconds = result.seconds_into_outage()
@@ -164,21 +164,12 @@ def growth_figure(reports: Sequence[StoredReport]) -> Figure:
                 label = f"{report.name}: {name}"
                 for statistic, dash in (("median", "solid"), ("p95", "dot")):
                     y = [result.value(name, "outages", f"at {s} s", "horizontal", statistic) for s in seconds]
-                    y = np.array([v if v is not None and np.isfinite(v) else np.nan for v in y])
-                    figure.add_trace(
-                        {
-                            "type": "scatter", "x": [float(s) for s in seconds], "y": y, "name": label,
-                            "legendgroup": label, "showlegend": statistic == "median", "mode": "lines+markers",
-                            "line": {"color": filter_colour(k), "dash": dash},
-                        }
-                    )  # fmt: skip
+                    y = np.where(np.isfinite(y), y, np.nan)
+                    trace = line(np.array(seconds, float), y, label, filter_colour(k), legend=statistic == "median")
+                    trace["line"]["dash"] = dash
+                    figure.add_trace(trace | {"mode": "lines+markers"})
                 k += 1
-    figure.update_layout(
-        height=480, font=FONT, margin={"l": 60, "r": 15, "t": 20, "b": 45},
-        legend={"orientation": "h", "y": -0.18, "yanchor": "top"},
-    )  # fmt: skip
     figure.update_xaxis(title={"text": "Time without GNSS [s]"})
-    figure.update_yaxis(title={"text": "Horizontal error [m]"})
     figure.set_log_scale()
     return figure
 

@@ -9,22 +9,32 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from dlkf.base.colours import SHADE, TRUTH, filter_colour
 from dlkf.base.files import resolve_place, write_into
 from dlkf.evaluation.metrics import Mask, magnitudes, outage_at, outage_end, rms_over_segments
 from dlkf.evaluation.outages import UNUSED
 from dlkf.evaluation.results import Results
-from dlkf.evaluation.scores import OFF_SCALE, Scores, representative
+from dlkf.evaluation.scores import OFF_SCALE, Scores, representative, settled_limits
 from dlkf.evaluation.sensors import TITLE as SENSORS_TITLE
 from dlkf.evaluation.summary import END, describe_verdict, headline, sigma_warnings
-from dlkf.evaluation.table import DEGREES, ResultTable, all_tables, as_csv, as_json, as_markdown, format_number
+from dlkf.evaluation.table import (
+    ERROR_PANELS,
+    IMU_PANELS,
+    ResultTable,
+    all_tables,
+    as_csv,
+    as_json,
+    as_markdown,
+    format_number,
+)
 from dlkf.report.drawing import Figure
 from dlkf.report.maps import add_track, chart, join_tracks
 from dlkf.report.navigation import mark_outages
 from dlkf.report.page import Page, embed_png
 from dlkf.report.plots import Array, band, line, shade, spans, stack_panels
-from dlkf.report.training import add_training
+from dlkf.report.training import ABOUT, learning_curve
 
 MAP = (
     "The {truth}, the outages, and the track of each filter in them; a click on a grey name shows a filter that is far "
@@ -32,13 +42,6 @@ MAP = (
 )
 MOST_OUTAGES = 300  # rows of the table of outages: the worst of them
 SEEN_AT_ONCE = 11  # of them, in the box of the page
-SENSORS = (("Accelerometer", "m/s²", 1.0), ("Gyroscope", "°/s", DEGREES))
-IMU = [(f"{name} {axis} error [{unit}]", scale) for name, unit, scale in SENSORS for axis in "xyz"]
-OVER_TIME = {
-    "horizontal": ("Horizontal [m]", 1.0),
-    "velocity": ("Velocity [m/s]", 1.0),
-    "attitude": ("Attitude [°]", DEGREES),
-}
 
 
 def write_report(
@@ -60,7 +63,7 @@ def write_report(
     ``results`` has one entry per kind of data (of scores.of_kind); ``protocol`` is how the
     scores were made, in plain values; ``more`` tables follow those of the results; ``figures``: the page's figures for
     print as well, figures/*.png; ``trained``: the filter with which the answer begins, ``losses``: of its training
-    (:func:`dlkf.report.training.add_training`). Raises InputError if ``out`` cannot be written to.
+    (:func:`dlkf.report.training.learning_curve`). Raises InputError if ``out`` cannot be written to.
     """
     parts = [*all_tables(dataset, results), *more]
     pictures = print_figures(scores, by_time, baseline, protocol.get("reference")) if figures else []
@@ -140,7 +143,8 @@ def evaluation_page(
         _answer(page, scores.of_kind(result.kind), result, kind, baseline, name_truth(result.kind, own), tables)
     _add_tables(page, [t for t in first if many and not any(f"({r.kind})" in t.title for r in results)])
     if losses:
-        add_training(page, losses)
+        page.heading("Training", ABOUT)
+        page.figure("training", learning_curve(losses))
     for result in results:
         _research(page, scores.of_kind(result.kind), result, f"{result.kind}: " if many else "", baseline)
     _add_tables(page, [t for t in parts if t not in first])
@@ -160,18 +164,12 @@ def _add_tables(page: Page, tables: Sequence[ResultTable]) -> None:
 def mark_best(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Marks the row with the least median, where there is one."""
     column = next((i for i, c in enumerate(columns) if c.startswith("median")), None)
-    values = [] if column is None else [_value(row[column]) for row in rows]
-    if not values or not np.isfinite(values).any():
+    cells = [] if column is None else [row[column] for row in rows]
+    values = pd.to_numeric(pd.Series(cells, dtype=object), errors="coerce").to_numpy(float)
+    if not np.isfinite(values).any():
         return []
     least = int(np.nanargmin(values))
     return ["class=best" if k == least else "" for k in range(len(rows))]
-
-
-def _value(cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        return math.nan
 
 
 def _answer(
@@ -343,12 +341,12 @@ def error_charts(scores: Scores) -> Figure:
     """RMS over the segments of the horizontal, velocity and attitude error at each time, of those that the reference
     has."""
     sizes = {name: magnitudes(scores.filters[name].error) for name in scores.filters}
-    known = [q for q in OVER_TIME if q == "horizontal" or any(np.isfinite(size[q]).any() for size in sizes.values())]
-    figure = stack_panels([OVER_TIME[quantity][0] for quantity in known], height=180)
+    known = [q for q in ERROR_PANELS if q == "horizontal" or any(np.isfinite(size[q]).any() for size in sizes.values())]
+    figure = stack_panels([ERROR_PANELS[quantity][0] for quantity in known], height=180)
     for name, c in colours(scores).items():
         for row, quantity in enumerate(known, 1):
             size = sizes[name][quantity]
-            y = rms_over_segments(np.where(np.isinf(size), np.nan, size)) * OVER_TIME[quantity][1]
+            y = rms_over_segments(np.where(np.isinf(size), np.nan, size)) * ERROR_PANELS[quantity][1]
             if np.isfinite(y).any():
                 figure.add_trace(line(scores.t, y, name, c, legend=row == 1), row)
     for row in range(1, len(known) + 1):
@@ -360,8 +358,8 @@ def error_charts(scores: Scores) -> Figure:
 
 def imu_error_charts(scores: Scores, i: int, banded: str) -> Figure:
     """Estimates of one segment, with the ±3σ of the filter ``banded``, and the truth where it is known."""
-    figure = stack_panels([title for title, _ in IMU], height=120)
-    for k, (_, scale) in enumerate(IMU):
+    figure, late = stack_panels([title for title, _ in IMU_PANELS], height=120), scores.t > 0.2 * scores.t[-1]
+    for k, (_, scale) in enumerate(IMU_PANELS):
         truth = scores.true_imu_error[i, :, k] * scale
         for name, c in colours(scores).items():
             run = scores.filters[name]
@@ -373,18 +371,11 @@ def imu_error_charts(scores: Scores, i: int, banded: str) -> Figure:
             figure.add_trace(line(scores.t, y, name, c, legend=k == 0), k + 1)
         if np.isfinite(truth).any():
             figure.add_trace(line(scores.t, truth, "truth", TRUTH, legend=k == 0), k + 1)
-        _set_limits(figure, scores, i, k, scale)
+        settled = [
+            scale * x[i, late, k] for x in (scores.true_imu_error, *(r.imu_error for r in scores.filters.values()))
+        ]
+        if limits := settled_limits(settled):
+            figure.update_yaxis(k + 1, range=list(limits))
     figure.update_xaxis(6, title={"text": "Time since the start of the segment [s]"})
     shade(figure, spans(scores.t, scores.outage[i]), 6)
     return figure
-
-
-def _set_limits(figure: Figure, scores: Scores, i: int, k: int, scale: float) -> None:
-    """Limits by the last four fifths of the lines: the first swings may leave the panel."""
-    late = scores.t > 0.2 * scores.t[-1]
-    lines: list[Array] = [r.imu_error[i, late, k] for r in scores.filters.values()]
-    values = np.concatenate([*lines, scores.true_imu_error[i, late, k]]) * scale
-    values = values[np.isfinite(values)]
-    if values.size:
-        margin = 0.6 * float(np.ptp(values)) or 1e-6
-        figure.update_yaxis(k + 1, range=[float(values.min()) - margin, float(values.max()) + margin])

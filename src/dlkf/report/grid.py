@@ -15,9 +15,9 @@ from dlkf.report.plots import FONT
 NAMES = ("run", "run_id", "status")
 
 
-def grid_page(title: str, table: pd.DataFrame, chosen: pd.DataFrame, rows: Sequence[Sequence[str]]) -> str:
+def grid_page(title: str, table: pd.DataFrame, chosen: pd.DataFrame, metric: str, rows: Sequence[Sequence[str]]) -> str:
     """``table`` has all points: name, swept settings, ``val/…``, ``test/…``; ``chosen`` the few columns to read, the
-    best point first, ``rows`` its cells.
+    best point first and ``metric`` of every filter, ``rows`` its cells.
     """
     validated = next((c for c in map(str, table) if c.startswith("val/")), None)
     page = Page(f"{len(table)} points of a grid search", [_best(chosen, validated)])
@@ -25,7 +25,8 @@ def grid_page(title: str, table: pd.DataFrame, chosen: pd.DataFrame, rows: Seque
     marks = ["class=best" if validated and not k else "" for k in range(len(rows))]
     page.table(list(map(str, chosen)), rows, marks=marks)
     settings = [c for c in map(str, table) if c not in NAMES and "/" not in c]
-    seen = [c for c in (validated, *_scores(table, chosen)) if c is not None]
+    scores = [f"test/{c}/{metric}" for c in map(str, chosen) if c not in NAMES and not c.startswith("val/")]
+    seen = [c for c in (validated, *scores[:1]) if c is not None]
     known = table.dropna(subset=seen)
     if len(known) > 1 and settings and seen:
         page.heading("What was swept, and what came of it", "A line is a point. Drag along an axis to choose some.")
@@ -40,15 +41,6 @@ def _best(chosen: pd.DataFrame, validated: str | None) -> str:
     filters = [c for c in map(str, chosen) if c not in (*NAMES, validated)]
     on_test = f"; on test {filters[0]} {format_number(best[filters[0]])}" if filters else ""
     return f"Best by validation: {best['run']}, {validated} {format_number(best[validated])}{on_test}."
-
-
-def _scores(table: pd.DataFrame, chosen: pd.DataFrame) -> list[str]:
-    """The column of ``table`` that ``chosen`` shows first of the filters."""
-    filters = [c for c in map(str, chosen) if c not in NAMES and not c.startswith("val/")]
-    if not filters:
-        return []
-    shown = chosen[filters[0]].sort_index()
-    return [c for c in map(str, table) if c.startswith(f"test/{filters[0]}/") and table[c].equals(shown)][:1]
 
 
 def coordinates(table: pd.DataFrame, settings: Sequence[str], scores: Sequence[str]) -> Figure:

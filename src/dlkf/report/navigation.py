@@ -10,11 +10,11 @@ import numpy as np
 
 from dlkf.base.colours import COLOURS, QUALITY
 from dlkf.data.schema import QUALITIES
+from dlkf.filters.aids.estimates import format_estimate, label_estimate
 from dlkf.report.drawing import Figure
 from dlkf.report.maps import add_track, chart, dots, join_tracks
 from dlkf.report.page import Page
 from dlkf.report.plots import Array, band, every, line, shade, spans, stack_panels
-from dlkf.report.sensors import sensor_rows
 from dlkf.running.innovations import SETTLE, Innovation
 from dlkf.running.offline import Navigated, UsableFixes
 
@@ -25,6 +25,7 @@ GAP_S = 3.0  # longer without a fix is an outage
 STANDING = 0.15  # m/s
 SHARE, SHOWS = "vibration_speed_share", 0.1  # a column of the solution, and from where on vibration shows a speed
 R2D = 180 / np.pi
+WORDS = {"speed": "Wheel speed", "baro": "Barometer"}  # of sensors; of others their name
 SIGNS = (
     "Innovation / σ is expected to be 1; where most updates are refused, see the unit, sign and clock of the sensor. "
     "Positive are a wheel that reads too much or comes late, and fixes whose stamps are late."
@@ -206,6 +207,24 @@ def make_rows(courses: Sequence[TrackOnMap]) -> tuple[list[str], list[list[str]]
         lat, lon = place.mean(0)
         marks.append(mark_outages("map", lat, lon, half))
     return columns, rows, marks
+
+
+def sensor_rows(drives: Sequence[Navigated]) -> tuple[list[str], list[list[str]]]:
+    """Columns and rows of the table of further sensors; no columns where no drive has an update of one or an estimate
+    worth a word."""
+    columns: dict[str, dict[str, str]] = {}  # heading → drive → cell
+    for result in drives:
+        for sensor, (used, seen, spread) in result.sensor_updates.items():
+            if seen:
+                words = WORDS.get(sensor) or sensor.replace("_", " ").capitalize()
+                columns.setdefault(f"{words},\nupdates used", {})[result.drive] = f"{used} of {seen}"
+                columns.setdefault(f"{words},\ninnovation / σ", {})[result.drive] = f"{spread:.2f}"
+        for name in (name for name in result.sensors() if f"std_{name}" in result.table):
+            last = result.table.iloc[-1]
+            cell = format_estimate(name, float(last[name]), float(last[f"std_{name}"]))
+            columns.setdefault(label_estimate(name), {})[result.drive] = cell
+    rows = [[result.drive, *(cells.get(result.drive, "–") for cells in columns.values())] for result in drives]
+    return ["Drive", *columns] if columns else [], rows
 
 
 def _two_digits(value: float) -> str:

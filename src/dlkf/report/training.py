@@ -8,8 +8,7 @@ import numpy as np
 
 from dlkf.base.colours import COLOURS
 from dlkf.report.drawing import Figure
-from dlkf.report.page import Page
-from dlkf.report.plots import stack_panels
+from dlkf.report.plots import line, stack_panels
 
 ABOUT = (
     "Training has the weights, outages and decimated fixes of its epoch, validation equal weights: their levels "
@@ -19,14 +18,12 @@ LOSSES = {"train/loss": "training", "val/loss": "validation"}
 AT_END = "val/outage_end_m"
 
 
-def add_training(page: Page, losses: Mapping[str, Sequence[float]]) -> None:
-    """Loss per epoch (columns ``epoch``, ``train/loss``, ``val/loss``, ``val/outage_end_m``; NaN where unknown)."""
-    page.heading("Training", ABOUT)
-    page.figure("training", learning_curve(losses))
-
-
 def learning_curve(losses: Mapping[str, Sequence[float]]) -> Figure:
-    """Loss of training and validation, and the error at the end of validation's outages where there are some."""
+    """Loss of training and validation, and the error at the end of validation's outages where there are some.
+
+    ``losses`` has columns ``epoch``, ``train/loss``, ``val/loss``, ``val/outage_end_m``; NaN where unknown.
+    """
+    epochs = np.asarray(losses["epoch"], float)
     at_end = bool(np.isfinite(losses[AT_END]).any())
     more = ["Validation, error at the end of outages, geometric mean [m]"] if at_end else []
     figure = stack_panels(["Loss", *more], height=150)
@@ -34,12 +31,8 @@ def learning_curve(losses: Mapping[str, Sequence[float]]) -> Figure:
     for k, (name, label, row) in enumerate([*drawn, (AT_END, "validation", 2)] if at_end else drawn):
         y = np.asarray(losses[name], float)
         known = np.isfinite(y)
-        trace = {
-            "type": "scatter", "x": np.asarray(losses["epoch"], float)[known], "y": y[known], "name": label,
-            "legendgroup": label, "showlegend": row == 1, "mode": "lines+markers", "marker": {"size": 4},
-            "line": {"color": COLOURS[min(k, 1)], "width": 1.5},
-        }  # fmt: skip
-        figure.add_trace(trace, row)
+        trace = line(epochs[known], y[known], label, COLOURS[min(k, 1)], legend=row == 1)
+        figure.add_trace(trace | {"mode": "lines+markers", "marker": {"size": 4}}, row)
     for row in range(1, figure.rows + 1):
         figure.set_log_scale(row)
     figure.update_xaxis(figure.rows, title={"text": "Epoch"})

@@ -49,11 +49,9 @@ def _writer(target: Path, ros2: bool) -> Any:
 
 
 def _nanoseconds(table: pd.DataFrame, when: list[datetime] | None) -> list[int]:
-    seconds = table["t"].to_numpy() - min(0.0, float(table["t"].iloc[0])) if when is None else None
-    if seconds is not None:
-        return [round(s * 1e9) for s in seconds]
-    assert when is not None
-    return [round(w.timestamp() * 1e6) * 1000 for w in when]
+    if when is not None:
+        return [round(w.timestamp() * 1e6) * 1000 for w in when]
+    return [round(s * 1e9) for s in table["t"] - min(0.0, table["t"].iloc[0])]
 
 
 def _messages(store: Any, table: pd.DataFrame, k: int, ns: int, poses: tuple[Any, Any], ros2: bool) -> dict[str, Any]:

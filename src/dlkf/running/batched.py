@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -14,15 +14,24 @@ from dlkf.filters.smoother import Filter, SmoothedSolution, smooth
 CHUNK_SAMPLES = 1_500_000  # IMU samples integrated at a time: bounds the memory
 
 
+def pack(sizes: Sequence[int], most: int) -> list[list[int]]:
+    """Indices in order, as many together as hold ``most`` when padded to the largest of them (at least one)."""
+    parts: list[list[int]] = []
+    largest = 0
+    for k, size in enumerate(sizes):
+        largest = max(largest, size)
+        if not parts or (len(parts[-1]) + 1) * largest > most:
+            parts.append([])
+            largest = size
+        parts[-1].append(k)
+    return parts
+
+
 def chunks(batch: Batch, samples: int = CHUNK_SAMPLES) -> Iterator[Tensor]:
     """Indices of segments of like length, as many at a time as ``samples`` IMU samples allow (at least one)."""
     length = batch.present.sum(-1).cpu()
     order = torch.argsort(length, descending=True, stable=True)
-    start = 0
-    while start < len(order):
-        size = max(1, samples // (int(length[order[start]]) * batch.size[2] or 1))
-        yield order[start : start + size]
-        start += size
+    yield from (order[part] for part in pack((length[order] * batch.size[2]).tolist(), samples))
 
 
 def run_filter(

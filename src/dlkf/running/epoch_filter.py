@@ -23,10 +23,11 @@ from dlkf.filters.integration import Estimator, Fix, advance
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.earth import TangentFrame
 from dlkf.navigation.state import NavState
-from dlkf.running.estimate import Estimate
 from dlkf.running.loss import LossWatch, far_off, is_impossible
 from dlkf.running.measurement_buffer import MeasurementBuffer
 from dlkf.running.reanchoring import FrameChange, can_reanchor, frame_at, reanchor
+from dlkf.running.references import blank_reference
+from dlkf.running.solution import Estimate
 from dlkf.running.start import LOOKBACK_S, EarthFix, Search, align
 
 MOST_LOSSES = 1000  # whose times are kept
@@ -179,11 +180,11 @@ class EpochFilter:
             start = None if search is None else search.start()
             if start is None:
                 return search
-            return self._begin_filter(replace(start, first=0), drive.part(row, row + 1))
-        try:
-            start = align(drive, self._align, earliest=row)
-        except InputError:
-            return None
+        else:
+            try:
+                start = align(drive, self._align, earliest=row)
+            except InputError:
+                return None
         return self._begin_filter(replace(start, first=0), drive.part(row, row + 1))
 
     def _advance_search(self, search: Search, epoch: Closed) -> Running | Search | None:
@@ -209,18 +210,11 @@ class EpochFilter:
         numbers = range(epochs[0].number, epochs[-1].number + 2)
         fixes = [self._buffer.fix(n) for n in numbers]
         found = {name: torch.from_numpy(np.concatenate([getattr(f, name) for f in fixes])) for name in BLANK}
-        rows = len(fixes)
-
-        def unknown(*shape: int) -> Tensor:
-            return torch.full((rows, *shape), torch.nan, dtype=torch.float64)
-
         return Drive(
             name="stream", group="stream", dataset="", t0=0.0, epoch_s=self._epoch_s, rate_hz=self._rate_hz,
             imu=torch.cat([e.imu for e in epochs]).cpu(),
             gnss_r_e=found["r_e"], gnss_v_e=found["v_e"], gnss_std=found["std"], gnss_valid=found["valid"],
-            gnss_lag=found["lag"], quality=found["quality"],
-            ref_r_e=unknown(3), ref_v_e=unknown(3), ref_C_eb=unknown(3, 3),
-            ref_valid=torch.zeros(rows, dtype=torch.bool), ref_imu_error=unknown(6),
+            gnss_lag=found["lag"], quality=found["quality"], **blank_reference(len(fixes)),
             lever_arm_b=self._lever_arm_b[0].cpu(),
         )  # fmt: skip
 

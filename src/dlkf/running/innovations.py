@@ -19,7 +19,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from dlkf.filters.gating import chi2_quantile
 
@@ -46,6 +48,16 @@ class Innovation(NamedTuple):
 
     value: np.ndarray
     std: np.ndarray
+
+    @staticmethod
+    def of(value: Tensor, used: Tensor, covariance: Tensor | None) -> Innovation:
+        """Of a filter's innovations (…, T, 6), where it ``used`` a fix (…, T), and their covariance, if it has one."""
+        value, nan = value.cpu().double(), torch.tensor(torch.nan, dtype=torch.float64)
+        seen = used.cpu().unsqueeze(-1) & (value != 0)  # zero: a component without a measurement
+        std = nan.expand_as(value)
+        if covariance is not None:
+            std = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt().cpu().double()
+        return Innovation(torch.where(seen, value, nan).numpy(), torch.where(seen, std, nan).numpy())
 
     @property
     def ratio(self) -> Array:

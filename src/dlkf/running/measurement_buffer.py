@@ -50,13 +50,11 @@ class MeasurementBuffer:
         """The fix of a boundary, :data:`NO_FIX` without one."""
         return self._fixes.get(boundary, (0.0, NO_FIX))[1]
 
-    def put_fix(self, boundary: int, t: float, fix: FixRows) -> None:
-        """A fix in the place of an earlier one."""
-        self._fixes[boundary] = (t, fix)
-
-    def drop_fix(self, boundary: int) -> None:
-        """Leave a boundary without a fix."""
+    def put_fix(self, boundary: int, fix: tuple[float, FixRows] | None) -> None:
+        """A fix with its time [s] in the place of an earlier one; None leaves the boundary without."""
         self._fixes.pop(boundary, None)
+        if fix is not None:
+            self._fixes[boundary] = fix
 
     def put_aid(self, boundary: int, name: str, t: float, value: float, std: float) -> bool:
         """A sample beside the others of its interval; False where one of its time is there already."""

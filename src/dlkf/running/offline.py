@@ -29,8 +29,8 @@ from dlkf.filters.integration import BatchSolution, WholeLoop
 from dlkf.filters.receiver import ARM, DELAY, DRIFT
 from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.compiled import without_loops
-from dlkf.running.batched import CHUNK_SAMPLES, run_filter
-from dlkf.running.innovations import FAR, Innovation, fit_sigma, worst_stretch
+from dlkf.running.batched import CHUNK_SAMPLES, pack, run_filter
+from dlkf.running.innovations import FAR, Innovation, fit_sigma, rms, worst_stretch
 from dlkf.running.loss import find_first_loss
 from dlkf.running.solution import SCHEMA, solution_table
 from dlkf.running.start import align_each
@@ -148,21 +148,25 @@ class Navigated:
         """Columns of the table that further sensors added."""
         return [column for column in self.table.columns if column not in SCHEMA.names]
 
+    @property
+    def sensor_updates(self) -> dict[str, tuple[int, int, float]]:
+        """Of further sensors: updates that used them, all updates, and RMS of the innovations over their 1σ."""
+        found, table = {}, self.table
+        for name in (c.removesuffix("_used") for c in self.sensor_columns if c.endswith("_used")):
+            ratio = (table[f"{name}_innovation"] / table[f"{name}_innovation_std"]).to_numpy()
+            found[name] = int(table[f"{name}_used"].sum()), int((~np.isnan(ratio)).sum()), rms(ratio)
+        return found
+
     def sensors(self) -> dict[str, str]:
         """Of further sensors: how many updates used them, how they fit, and what was found of them at the end."""
         said, table = {}, self.table
-        for used in (column for column in self.sensor_columns if column.endswith("_used")):
-            name = used.removesuffix("_used")
-            ratio = table[f"{name}_innovation"] / table[f"{name}_innovation_std"]
-            seen = int(ratio.notna().sum())
+        for name, (used, seen, spread) in self.sensor_updates.items():
             if not seen:
                 if name != "vibration_speed":  # which needs none while there is GNSS
                     said[name] = f"{name}: no update"
                 continue
-            said[name] = f"{name} in {int(table[used].sum())} of {seen} updates"
-            if table[used].sum() < MOSTLY * seen:
-                said[name] += ", most of them refused: see its unit, sign and clock"
-            said[name] += f" (normalised innovation RMS {np.sqrt((ratio**2).mean()):.2g})"
+            refused = ", most of them refused: see its unit, sign and clock" if used < MOSTLY * seen else ""
+            said[name] = f"{name} in {used} of {seen} updates{refused} (normalised innovation RMS {spread:.2g})"
         for std in (column for column in self.sensor_columns if column.startswith("std_")):
             name, last = std.removeprefix("std_"), table.iloc[-1]
             floor = OF_RECEIVER.get(name)
@@ -290,10 +294,8 @@ def navigate_drives(
         raise no_drives(skipped)
     todo = sorted(starts, key=lambda k: drives[k].epochs - starts[k].first, reverse=True)
     done = 0
-    while done < len(todo):
-        first = drives[todo[done]]
-        at_once = max(1, CHUNK_SAMPLES // (first.epochs * first.imu.shape[1]))
-        part = todo[done : done + at_once]
+    for rows in pack([drives[k].epochs * drives[k].imu.shape[1] for k in todo], CHUNK_SAMPLES):
+        part = [todo[row] for row in rows]
         batch = whole_drives([drives[k] for k in part], [starts[k] for k in part])
         solution = _run(batch, estimator)
         for row, k in enumerate(part):
@@ -378,16 +380,5 @@ def _rows(
     )
     if solution.aids is not None:
         table = table.join(pd.DataFrame(solution.aids[row, :n].cpu().double().numpy(), columns=list(aids)))
-    innovation = _innovation(solution, row)
-    return table, Innovation(innovation.value[:n], innovation.std[:n])
-
-
-def _innovation(solution: BatchSolution, row: int) -> Innovation:
-    """Of one drive of a batch, (T, 6); components without a measurement are NaN."""
-    value = solution.innovation[row].cpu().double()
-    seen = solution.used[row].cpu().unsqueeze(-1) & (value != 0)
-    std = torch.full_like(value, torch.nan)
-    if (S := solution.innovation_covariance) is not None:
-        std = S[row].diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt().cpu().double()
-    nan = torch.tensor(torch.nan, dtype=torch.float64)
-    return Innovation(torch.where(seen, value, nan).numpy(), torch.where(seen, std, nan).numpy())
+    S = solution.innovation_covariance
+    return table, Innovation.of(solution.innovation[row, :n], solution.used[row, :n], None if S is None else S[row, :n])

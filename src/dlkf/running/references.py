@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -39,23 +39,19 @@ class ReferencedDrives(NamedTuple):
     drives: list[Drive]
     sigma: Tensor
     skipped: dict[str, str]
-    kind: str
 
-    @property
-    def horizontal_m(self) -> float:
-        """Median 1σ."""
-        return float(self.sigma.median(0).values[:2].norm())
 
-    @property
-    def vertical_m(self) -> float:
-        """Median 1σ."""
-        return float(self.sigma.median(0).values[2])
+def median_std(sigma: Tensor) -> tuple[float, float]:
+    """Median horizontal and vertical 1σ [m] of a reference."""
+    middle = sigma.median(0).values
+    return float(middle[:2].norm()), float(middle[2])
 
-    def describe(self) -> str:
-        """What errors against it are errors against."""
-        what = "smoothed solution with all fixes" if self.kind == "smoothed" else "good fixes"
-        sigma = f"{self.horizontal_m:.2g} m horizontal, {self.vertical_m:.2g} m vertical"
-        return f"{what}, 1σ {sigma} (median, its own)"
+
+def describe_reference(kind: str, sigma: Tensor) -> str:
+    """What errors against it are errors against."""
+    what = "smoothed solution with all fixes" if kind == "smoothed" else "good fixes"
+    horizontal, vertical = median_std(sigma)
+    return f"{what}, 1σ {horizontal:.2g} m horizontal, {vertical:.2g} m vertical (median, its own)"
 
 
 def check_reference(kind: str) -> None:
@@ -90,17 +86,15 @@ def make_reference(
         v_e = torch.einsum("ij,tj->ti", frame.C_en[0], state.v_n[0, :n])
         C_eb = frame.C_en[0] @ state.C_nb[0, :n]
         rows = slice(row, row + n)
-        found = _make_blank(drive)
-        found["ref_C_eb"][rows] = C_eb
+        found = blank_reference(len(drive.gnss_r_e))
         if kind == "smoothed":
             sigma = std[0, :n, POSITION]
             sure = sigma.norm(dim=-1) <= UNSURE * sigma.norm(dim=-1).median()
-            found["ref_r_e"][rows], found["ref_v_e"][rows], found["ref_valid"][rows] = r_e, v_e, sure
+            found["ref_C_eb"][rows] = C_eb
         else:
-            r_fix, v_fix, good = _carry_to_imu(drive, rows, C_eb, v_e)
-            found["ref_r_e"][rows], found["ref_v_e"][rows], found["ref_valid"][rows] = r_fix, v_fix, good
-            sigma, sure = drive.gnss_std[rows, :3], good
-            found["ref_C_eb"][:] = torch.nan
+            r_e, v_e, sure = _carry_to_imu(drive, rows, C_eb, v_e)
+            sigma = drive.gnss_std[rows, :3]
+        found["ref_r_e"][rows], found["ref_v_e"][rows], found["ref_valid"][rows] = r_e, v_e, sure
         sigmas.append(sigma[sure])
         made.append(replace(drive, **found))
         if progress is not None:
@@ -110,18 +104,14 @@ def make_reference(
     sigma = torch.cat(sigmas)
     if not len(sigma):
         raise InputError(f"reference={kind}: no fix is good enough to be one")
-    return ReferencedDrives(made, sigma, skipped, kind)
+    return ReferencedDrives(made, sigma, skipped)
 
 
-def _make_blank(drive: Drive) -> dict[str, Tensor]:
-    """No reference at all; its rows are to be filled."""
-    return {
-        "ref_r_e": torch.full_like(drive.gnss_r_e, torch.nan),
-        "ref_v_e": torch.full_like(drive.gnss_r_e, torch.nan),
-        "ref_C_eb": torch.full((*drive.gnss_r_e.shape[:1], 3, 3), torch.nan, dtype=torch.float64),
-        "ref_valid": torch.zeros(len(drive.gnss_r_e), dtype=torch.bool),
-        "ref_imu_error": torch.full((len(drive.gnss_r_e), 6), torch.nan, dtype=torch.float64),
-    }
+def blank_reference(rows: int) -> dict[str, Any]:
+    """No reference at all, as fields of a drive with so many boundaries."""
+    shapes = {"ref_r_e": (3,), "ref_v_e": (3,), "ref_C_eb": (3, 3), "ref_imu_error": (6,)}
+    blank = {name: torch.full((rows, *shape), torch.nan, dtype=torch.float64) for name, shape in shapes.items()}
+    return blank | {"ref_valid": torch.zeros(rows, dtype=torch.bool)}
 
 
 def _carry_to_imu(drive: Drive, rows: slice, C_eb: Tensor, v_e: Tensor) -> tuple[Tensor, Tensor, Tensor]:

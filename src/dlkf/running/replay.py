@@ -24,8 +24,8 @@ from dlkf.filters.aids.attach import find_tables
 from dlkf.filters.card import LowSampleRateWarning
 from dlkf.filters.smoother import Filter
 from dlkf.running import start
-from dlkf.running.estimate import Estimate, estimates_table
 from dlkf.running.offline import Navigated
+from dlkf.running.solution import Estimate, estimates_table
 from dlkf.running.streaming import Status, StreamingFilter
 
 R = TypeVar("R", covariant=True)  # its receipts

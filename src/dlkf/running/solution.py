@@ -12,6 +12,10 @@ filter has no value. Further sensors add ``<name>_innovation``, its 1σ ``<name>
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -21,21 +25,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dlkf.data.schema import write_parquet
+from dlkf.data import schema
 from dlkf.navigation.attitude import rotation_from_rpy, rpy_from_rotation
 from dlkf.navigation.earth import TangentFrame, ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.navigation.state import ACCEL, ATTITUDE, GYRO, POSITION, VELOCITY, NavState
 
-_NED, _XYZ, _RPY = ("n", "e", "d"), ("x", "y", "z"), ("roll", "pitch", "yaw")
-IMU_COLUMNS = tuple(f"{sensor}_error_{axis}" for sensor in ("accel", "gyro") for axis in _XYZ)
-STD_COLUMNS = (
-    tuple(f"std_pos_{a}" for a in _NED)
-    + tuple(f"std_vel_{a}" for a in _NED)
-    + tuple(f"std_{a}" for a in _RPY)
-    + tuple(f"std_{c}" for c in IMU_COLUMNS)
-)
-COLUMNS = ("t", "lat_deg", "lon_deg", "height_m") + tuple(f"vel_{a}" for a in _NED) + _RPY + IMU_COLUMNS + STD_COLUMNS
+STD_COLUMNS = (*schema.STD, *(f"std_{c}" for c in (*schema.ATTITUDE, *schema.IMU_ERROR)))
+COLUMNS = ("t", *schema.POSITION, *schema.VELOCITY, *schema.ATTITUDE, *schema.IMU_ERROR, *STD_COLUMNS)
 GEOMETRY = {  # geoparquet.org, version 1.1; without a crs it is longitude and latitude on WGS 84 (OGC:CRS84)
     "version": "1.1.0",
     "primary_column": "geometry",
@@ -77,14 +74,10 @@ def solution_columns(
     lat, lon, height = geodetic_from_ecef(r_e)
     C_ln = ned_axes(lat, lon).mT @ C_en
     rpy = rpy_from_rotation(C_ln @ state.C_nb)
-    columns = {"t": t.double(), "lat_deg": torch.rad2deg(lat), "lon_deg": torch.rad2deg(lon)}
-    columns["height_m"] = height
     velocity = torch.einsum("tij,tj->ti", C_ln, state.v_n)
-    columns |= dict(zip((f"vel_{a}" for a in _NED), velocity.unbind(-1)))
-    columns |= dict(zip(_RPY, rpy.unbind(-1)))
-    columns |= dict(zip(IMU_COLUMNS, imu_error.detach().cpu().double().unbind(-1)))
-    columns |= dict(zip(STD_COLUMNS, _std_columns(std, C_ln, rpy).unbind(-1)))
-    return columns
+    error, std = imu_error.detach().cpu().double(), _std_columns(std, C_ln, rpy)
+    values = (x for part in (velocity, rpy, error, std) for x in part.unbind(-1))
+    return dict(zip(COLUMNS, (t.double(), torch.rad2deg(lat), torch.rad2deg(lon), height, *values)))
 
 
 def _std_columns(std: Tensor | None, C_ln: Tensor, rpy: Tensor) -> Tensor:
@@ -105,17 +98,58 @@ def _std_columns(std: Tensor | None, C_ln: Tensor, rpy: Tensor) -> Tensor:
     return torch.cat((*parts, variance[:, ACCEL], variance[:, GYRO]), -1).sqrt()
 
 
+@dataclass(frozen=True)
+class Estimate:
+    """State of the IMU at ``t`` [s, clock of the samples]; tensors have one batch element.
+
+    ``imu_error`` (1, 6) [m/s², rad/s] is what comes off the samples from ``t`` on, ``std`` (1, 15) the 1σ of
+    position, velocity, attitude in n and of the IMU error, None where the filter has none. ``gnss_used``: a fix
+    corrected this estimate.
+    """
+
+    t: float
+    frame: TangentFrame
+    state: NavState
+    imu_error: Tensor
+    std: Tensor | None
+    gnss_used: bool
+    aids: Mapping[str, float] | None = None  # of further sensors, see dlkf.filters.aids.attach.aid_columns
+
+    @cached_property
+    def row(self) -> dict[str, float | bool]:
+        """The row of ``solution.parquet``: geodetic position, NED, roll-pitch-yaw."""
+        t = torch.tensor([self.t], dtype=torch.float64)
+        columns = solution_columns(t, self.frame, self.state, self.imu_error, self.std)
+        row = {name: float(value) for name, value in columns.items()}
+        return row | {"gnss_used": self.gnss_used, **(self.aids or {})}
+
+
+def estimates_table(estimates: Iterable[Estimate]) -> pd.DataFrame:
+    """Estimates as the rows of ``solution.parquet``."""
+    parts = []
+    for _, group in groupby(estimates, key=lambda e: id(e.frame)):
+        rows = list(group)
+        state = NavState(*(torch.cat(x) for x in zip(*(e.state for e in rows))))
+        std = None if rows[0].std is None else torch.cat([e.std for e in rows if e.std is not None])
+        t = torch.tensor([e.t for e in rows], dtype=torch.float64)
+        used = torch.tensor([e.gnss_used for e in rows])
+        error = torch.cat([e.imu_error for e in rows])
+        aids = pd.DataFrame([dict(e.aids or {}) for e in rows])
+        parts.append(solution_table(t, rows[0].frame, state, error, std, used).join(aids))
+    return pd.concat(parts, ignore_index=True)
+
+
 def write_solution(path: str | Path, table: pd.DataFrame) -> None:
     """Write ``solution.parquet``: to a file beside, then renamed.
 
     Behind the columns comes ``geometry``, points as GeoParquet has them, for QGIS, GeoPandas and DuckDB.
     """
     further = [pa.field(name, pa.float64()) for name in table.columns if name not in SCHEMA.names]
-    schema = pa.schema([*SCHEMA, *further])
-    arrays = [pa.array(table[f.name].to_numpy(), f.type, from_pandas=False) for f in schema]  # NaN stays NaN
+    fields = pa.schema([*SCHEMA, *further])
+    arrays = [pa.array(table[f.name].to_numpy(), f.type, from_pandas=False) for f in fields]  # NaN stays NaN
     place = table[["lon_deg", "lat_deg", "height_m"]].to_numpy()
-    full = schema.append(GEO_SCHEMA.field("geometry")).with_metadata(GEO_SCHEMA.metadata)
-    write_parquet(Path(path), pa.Table.from_arrays([*arrays, points(place)], schema=full))
+    full = fields.append(GEO_SCHEMA.field("geometry")).with_metadata(GEO_SCHEMA.metadata)
+    schema.write_parquet(Path(path), pa.Table.from_arrays([*arrays, points(place)], schema=full))
 
 
 def points(place: np.ndarray) -> pa.Array:

@@ -49,10 +49,10 @@ from dlkf.filters.card import warn_slow_drives
 from dlkf.filters.smoother import Filter, SmoothedSolution
 from dlkf.navigation.strapdown import strapdown
 from dlkf.running.epoch_filter import EpochFilter, Running
-from dlkf.running.estimate import Estimate
 from dlkf.running.fix_history import HELD, FixHistory
 from dlkf.running.imu_stream import ImuStream, Row
 from dlkf.running.measurement_buffer import MeasurementBuffer, as_number, check_fix
+from dlkf.running.solution import Estimate
 from dlkf.running.start import Search
 
 ANCHOR_M = 50_000.0  # from its origin, beyond which the tangent frame moves
@@ -316,12 +316,8 @@ class StreamingFilter:
 
     def _put_fix(self, row: int) -> None:
         """The fix of a boundary into the buffer, or none."""
-        fix = self._fixes.at(row)
-        if fix is None:
-            self._buffer.drop_fix(row)
-        else:
-            boundary = np.array([self._samples.boundary(row)])
-            self._buffer.put_fix(row, fix.t, make_fixes(fix.table, np.zeros(1, np.int64), boundary))
+        fix, boundary = self._fixes.at(row), np.array([self._samples.boundary(row)])
+        self._buffer.put_fix(row, fix and (fix.t, make_fixes(fix.table, np.zeros(1, np.int64), boundary)))
 
     def _file_aid(self, name: str, t: float, value: float, std: float) -> Receipt:
         """Put a sample of a further sensor to the others of its interval; replay where that is over."""

@@ -223,8 +223,15 @@ def simulate(
     check_engine(parallel, out)
     if workers is not None and workers < 1:
         raise InputError(f"workers={workers} must be at least 1")
+    config, threads = made_by.dataset, workers or os.cpu_count() or 1
+    jobs = list(enumerate(config.durations))
     with new_dataset(out, overwrite) as folder:
-        _write_drives(made_by, folder, workers or os.cpu_count() or 1, parallel, progress)
+        written = parallel_map(partial(_write_one, made_by, absolute_place(folder)), jobs, parallel, threads=threads)
+        unseen, console = not (progress and sys.stderr.isatty()), Console(stderr=True)
+        shown = track(written, f"simulating {config.name}", total=len(jobs), disable=unseen, console=console)
+        with closing(shown) as rows:  # type: ignore[type-var]
+            write_drives_table(folder, list(rows))
+        (folder / "simulation.json").write_text(json.dumps(made_by.described, indent=2, ensure_ascii=False) + "\n")
     return out
 
 
@@ -272,18 +279,6 @@ def make_drive(made_by: Recipe, index: int, seconds: int) -> tuple[SimulatedTabl
     if made_by.ranges is not None:
         row["drawn"] = json.dumps({"dataset": _plain(config), "imu": asdict(spec)}, ensure_ascii=False)
     return tables, row
-
-
-def _write_drives(made_by: Recipe, folder: Path, workers: int, parallel: int | str | None, progress: bool) -> None:
-    config = made_by.dataset
-    jobs = list(enumerate(config.durations))
-    written = parallel_map(partial(_write_one, made_by, absolute_place(folder)), jobs, parallel, threads=workers)
-    console = Console(stderr=True)
-    unseen = not (progress and sys.stderr.isatty())
-    shown = track(written, f"simulating {config.name}", total=len(jobs), disable=unseen, console=console)
-    with closing(shown) as rows:  # type: ignore[type-var]
-        write_drives_table(folder, list(rows))
-    (folder / "simulation.json").write_text(json.dumps(made_by.described, indent=2, ensure_ascii=False) + "\n")
 
 
 def _write_one(made_by: Recipe, out: str, job: tuple[int, int]) -> dict[str, Any]:

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from dlkf.navigation.attitude import rotation_from_rpy
 from dlkf.navigation.imu_errors import ImuSpec
 from dlkf.simulation.gnss.receiver import Receiver
-from dlkf.simulation.gnss.reporting import delay_fixes
-from dlkf.simulation.gnss.satellite_fixes import receive
+from dlkf.simulation.gnss.satellite_fixes import delay_fixes, receive
 from dlkf.simulation.gnss.surroundings import Surroundings, sky_along
 from dlkf.simulation.gnss.white import GnssConfig
 from dlkf.simulation.imu import ImuUnit, corrupt, interval_means, inverse_mechanisation
@@ -86,7 +85,7 @@ def simulate_drive(
     axle = follow_route(route, vehicle, t)
     truth = axle if chassis.is_point and not vehicle.is_banked else apply_mounting(chassis_rng, car, route, axle)
     true_imu = interval_means(truth, parts) if rates.imu_parts else inverse_mechanisation(truth)
-    t, axle, truth = t[::parts], *(slice_tables(x, slice(None, None, parts)) for x in (axle, truth))
+    t, axle, truth = t[::parts], *(x.at(slice(None, None, parts)) for x in (axle, truth))
     measured, error = corrupt(imu_rng, true_imu, spec, unit, rates.imu_hz)
     fixes = np.arange(0, len(t), round(rates.imu_hz / rates.gnss_hz))
     rows = slice(None, None, rates.imu_hz // rates.reference_hz)
@@ -96,18 +95,13 @@ def simulate_drive(
     return SimulatedTables(
         imu=pd.DataFrame(imu_columns(t[1:], measured)),
         gnss=received.fixes,
-        reference=pd.DataFrame(reference_columns(slice_tables(truth, rows), np.concatenate((error[:1], error))[rows])),
+        reference=pd.DataFrame(reference_columns(truth.at(rows), np.concatenate((error[:1], error))[rows])),
         raw=received.raw,
         facts=_facts(car, route, axle, truth, rates.imu_hz),
         aids={}
         if sensors is None
         else sense(sensor_seed or np.random.SeedSequence(0), sensors, axle, route.motion(axle.t).yaw_rate),
     )
-
-
-def slice_tables(truth: Truth, rows: slice) -> Truth:
-    """Some rows of the truth."""
-    return Truth(*(getattr(truth, name)[rows] for name in Truth.__dataclass_fields__))
 
 
 def _rate_at_rows(rate: NDArray[np.floating]) -> NDArray[np.floating]:

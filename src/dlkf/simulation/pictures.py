@@ -1,7 +1,4 @@
-"""Pictures of a simulated dataset: its first drive as in the paper's figure 4, and how all its drives move.
-
-Colours are Okabe & Ito's, which colour-blind readers can distinguish.
-"""
+"""Pictures of a simulated dataset: its first drive as in the paper's figure 4, and how all its drives move."""
 
 from __future__ import annotations
 
@@ -15,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from dlkf.base.colours import COLOURS
 from dlkf.base.files import folder_name, resolve_place, write_into
 from dlkf.data.limits import DEGREE_M
 from dlkf.data.schema import ACCEL, GYRO, IMU_ERROR
@@ -22,8 +20,8 @@ from dlkf.data.tables import Columns, read_drives
 from dlkf.data.validate import CheckedTables, read_drive, read_fixes
 
 Array = NDArray[np.floating]
-AXES = (("x", "#0072B2"), ("y", "#D55E00"), ("z", "#009E73"))
-INK, GREY, LIMIT = "#222222", "#BBBBBB", "#CC79A7"
+AXES = tuple(zip("xyz", COLOURS))
+INK, GREY, LIMIT = "#222222", "#BBBBBB", COLOURS[3]
 PAPER = {"speed": (0.0, 80.0), "along": (0.0, 2.0), "radius": (40.0, 150.0), "lateral": (0.5, 5.0)}  # R085-R088
 SMOOTH_S = 0.5  # window of the derivatives
 MOVING = 2.0  # m/s above which a course means something

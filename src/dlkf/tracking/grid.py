@@ -120,7 +120,7 @@ class GridParent(Callback):
         text = as_text(chosen) + "".join(f"\nfailed: {f.point}: {f.why}\n" for f in failed)
         client.log_text(parent, table.to_csv(index=False), "comparison.csv")
         client.log_text(parent, text, "comparison.md")
-        client.log_text(parent, grid_page(title, table, chosen, cells(chosen)), "comparison.html")
+        client.log_text(parent, grid_page(title, table, chosen, metric, cells(chosen)), "comparison.html")
         client.set_tag(parent, NOTE_TAG, f"{title}\n\n{text}")
         print(f"\n{title}\n{text}\nGrid search: MLflow run {parent} in {self.uri}")
 

@@ -146,8 +146,7 @@ def _log_model_metrics(run: TrackedRun, model_id: str, metrics: Mapping[str, flo
     # a time of its own: MLflow links what the run has logged to a new model itself, and refuses the same point twice
     now = get_current_time_millis()
     points = [Metric(key, float(value), now, 0, model_id=model_id, **data) for key, value in metrics.items()]
-    if points:
-        run.client.log_batch(run.id, metrics=points)
+    run.client.log_batch(run.id, metrics=points)
 
 
 def pin_requirements() -> list[str]:

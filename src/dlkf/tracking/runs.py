@@ -33,7 +33,7 @@ SQLITE = "sqlite:///"
 RUN_ID = re.compile(r"[0-9a-f]{32}")
 PARENT_TAG, NOTE_TAG = "mlflow.parentRunId", "mlflow.note.content"
 KIND = {"mlflow.experimentKind": "custom_model_development"}  # else the UI shows pages for language models
-KEY_LENGTH, VALUE_LENGTH, NOTE_LENGTH, PARAMS_AT_ONCE, METRICS_AT_ONCE = 250, 6000, 8000, 100, 1000  # MLflow's limits
+KEY_LENGTH, VALUE_LENGTH, NOTE_LENGTH = 250, 6000, 8000  # MLflow's limits
 MONITORS = ("val/outage_end_m", "val/loss")  # what training keeps the best weights by, unless it is given another
 NOT_IN_NAMES = re.compile(r"[^\w\-. :/]")  # of metrics
 SCHEMES = ("sqlite", "http", "https", "file", "postgresql", "mysql", "mssql", "databricks", "uc", "databricks-uc")
@@ -175,9 +175,8 @@ class TrackedRun:
         from mlflow.entities import Param
 
         there = self.client.get_run(self.id).data.params
-        params = [Param(k, v) for k, v in flatten_config(config).items() if k not in there]
-        for first in range(0, len(params), PARAMS_AT_ONCE):
-            self.client.log_batch(self.id, params=params[first : first + PARAMS_AT_ONCE])
+        new = [Param(k, v) for k, v in flatten_config(config).items() if k not in there]
+        self.client.log_batch(self.id, params=new)
         self.client.log_text(self.id, yaml.safe_dump(dict(config), sort_keys=False), "config.yaml")
 
     def log_dataset(self, folder: Path | str, digest: str, context: str) -> None:
@@ -188,7 +187,7 @@ class TrackedRun:
         self.client.log_inputs(self.id, datasets=[given])
 
     def log_metrics(self, metrics: Mapping[str, float], step: int = 0) -> None:
-        """Many metrics in one transaction; those that are not finite are left out.
+        """Many metrics together; those that are not finite are left out.
 
         A name of a model may have what MLflow does not take in a metric's (``outage@champion``): a dot stands for it.
         """
@@ -197,8 +196,7 @@ class TrackedRun:
 
         now = get_current_time_millis()
         kept = [Metric(NOT_IN_NAMES.sub(".", k), float(v), now, step) for k, v in metrics.items() if math.isfinite(v)]
-        for first in range(0, len(kept), METRICS_AT_ONCE):
-            self.client.log_batch(self.id, metrics=kept[first : first + METRICS_AT_ONCE])
+        self.client.log_batch(self.id, metrics=kept)
 
     def log_files(self, folder: Path | str) -> None:
         """Everything in a folder, or one file, as artifacts."""
@@ -328,8 +326,7 @@ def lightning_logger(run: TrackedRun, monitor: str | None = None) -> MLFlowLogge
         def release(self) -> None:
             """Log what was held back."""
             held, self.held = self.held or [], None
-            for i in range(0, len(held), METRICS_AT_ONCE):
-                run.client.log_batch(run.id, metrics=held[i : i + METRICS_AT_ONCE])
+            run.client.log_batch(run.id, metrics=held)
 
         def log_hyperparams(self, params: Any) -> None:
             """The run has the whole config already, uncut."""

@@ -17,6 +17,7 @@ from lightning.pytorch.strategies import DDPStrategy
 from dlkf.base.errors import InputError
 from dlkf.data.datamodule import DriveDataModule
 from dlkf.filters.learned import LearnedFilter
+from dlkf.filters.learned_kalman import LearnedKalmanFilter
 from dlkf.filters.shipped import trained_filter
 from dlkf.training.callbacks.checkpoints import BEST, LAST, BestWeights, ResumePoint
 from dlkf.training.callbacks.history import LossHistory
@@ -24,7 +25,8 @@ from dlkf.training.callbacks.progress import TrainingProgress
 from dlkf.training.module import FilterTraining
 from dlkf.training.processes import is_worker, join, with_workers
 from dlkf.training.settings import FitSettings
-from dlkf.training.warm_start import warm_start
+
+WARM_SEGMENTS = 60
 
 
 def fit(
@@ -93,6 +95,29 @@ def fit(
         score = float(trainer.callback_metrics.get(monitor, math.nan))
         raise InputError(f"no weights to keep: {monitor} is {score}, the training diverged; lower optimizer.lr")
     return folder / BEST
+
+
+def warm_start(model: LearnedFilter, data: DriveDataModule, mean_imu_error: Sequence[float] | None) -> None:
+    """Start the IMU error at ``mean_imu_error`` (m/s² x 3, rad/s x 3) and learn the sizes of the features.
+
+    Neither uses the truth. The mean is what the tuned 15-state filter estimates with GNSS, as ``mbkf15_prior`` is given
+    to it; without it the cheapest descent moves the mean of everything inside the network, and what is learned is a
+    constant (paper.md 4.11). Nothing happens to a model whose ``known_from`` is not ``training``. Round a Kalman filter
+    the network's own error starts at zero: the filter has the mean, if it is one with ``_prior``.
+    """
+    if model.config.known_from != "training":
+        return
+    if mean_imu_error is not None and not isinstance(model, LearnedKalmanFilter):
+        model.imu_error.start_at(mean_imu_error)
+    batches, seen = [], 0
+    for step in range(len(data.train_segments(0))):
+        batches.append(data.train_batch(0, step))
+        seen += batches[-1].size[0]
+        if seen >= WARM_SEGMENTS:
+            break
+    was = model.training
+    model.eval().learn_sizes(batches)
+    model.train(was)
 
 
 def check_fit(settings: FitSettings) -> None:

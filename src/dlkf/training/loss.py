@@ -1,4 +1,10 @@
-"""Training loss on position, velocity and attitude (paper eq 9; R061–R067)."""
+"""Training loss on position, velocity and attitude (paper eq 9; R061–R067), and two terms of filters with a covariance:
+
+    outage      mean of log(1 + |e|²/m²) of the horizontal error e over the epochs without GNSS
+    likelihood  ½ log|P| + ½ (ν + 2) log(1 + eᵀP⁻¹e / ν), horizontal: Student's t with ν = 8 under the filter's own P
+
+Their logarithms keep the few hardest segments of a batch from deciding its gradient.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +14,7 @@ from functools import reduce
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
 
@@ -16,10 +23,11 @@ from dlkf.base.settings import settings_from
 from dlkf.data.drive import Batch
 from dlkf.filters.integration import BatchSolution
 from dlkf.navigation.state import NavState
-from dlkf.training.outage_loss import likelihood_term, outage_term
 from dlkf.training.processes import count_per_process
 
 TERMS = ("position", "velocity", "attitude")
+FREEDOM = 8.0  # ν
+SMALLEST_VARIANCE = 1e-4  # m²
 
 
 @dataclass(frozen=True)
@@ -28,7 +36,7 @@ class LossConfig:
     ``posterior``: how much the states before and after the update count (paper.md 2.8, 4.12); ``position``,
     ``velocity``, ``attitude``: fixed factors of the three losses, 0 leaves one out (R124). A segment whose position
     error passes ``diverged_m`` is left out of the batch's loss (paper.md 4.13). ``outage``, ``likelihood``: factors
-    of the terms of :mod:`dlkf.training.outage_loss`."""
+    of the two terms above."""
 
     position_scale: float = 1.0
     velocity_scale: float = 0.1
@@ -86,6 +94,33 @@ def pva_losses(solution: BatchSolution, batch: Batch, config: LossConfig) -> dic
             value = value + weight / total * torch.where(keep, each, torch.zeros_like(each)).sum() / count
         losses[term] = getattr(config, term) * value
     return losses
+
+
+def outage_term(solution: BatchSolution, batch: Batch) -> Tensor:
+    """Mean over the epochs without GNSS; 0 without any."""
+    hidden = ~batch.available & batch.truth_valid & batch.present
+    return _mean(torch.log1p(_horizontal(solution, batch).square().sum(-1)), hidden)
+
+
+def likelihood_term(solution: BatchSolution, batch: Batch) -> Tensor:
+    """Half the mean over epochs with GNSS, half that over epochs without; needs ``keep_covariances``."""
+    assert solution.covariances is not None
+    e = _horizontal(solution, batch)
+    P = solution.covariances.updated[..., :2, :2]
+    a, b, c = P[..., 0, 0] + SMALLEST_VARIANCE, P[..., 1, 1] + SMALLEST_VARIANCE, P[..., 0, 1]
+    det = (a * b - c * c).clamp_min(SMALLEST_VARIANCE**2)
+    square = (b * e[..., 0] ** 2 + a * e[..., 1] ** 2 - 2 * c * e[..., 0] * e[..., 1]) / det
+    value = 0.5 * det.log() + 0.5 * (FREEDOM + 2) * torch.log1p(square / FREEDOM)
+    known = batch.truth_valid & batch.present
+    return 0.5 * (_mean(value, known & batch.available) + _mean(value, known & ~batch.available))
+
+
+def _horizontal(solution: BatchSolution, batch: Batch) -> Float[Tensor, "B T 2"]:
+    return (solution.posterior.p_n - torch.nan_to_num(batch.truth.p_n))[..., :2]
+
+
+def _mean(value: Float[Tensor, "B T"], where: Tensor) -> Tensor:
+    return torch.where(where, value, 0.0).sum() / count_per_process(where.sum())
 
 
 def build_loss(values: Mapping[str, Any]) -> Loss:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import lightning as L
 import numpy as np
@@ -68,7 +68,7 @@ class FilterTraining(L.LightningModule):
             batch = batch.select(torch.arange(rank, segments, processes))
         batch = batch.to(self.device)
         torch.manual_seed(step_seed(self.seed, self.global_step, *([rank] if rank else ())))  # dropout
-        losses = self._losses(batch)
+        losses = self.loss(self._run(batch), batch)
         total = weighted_loss(losses, self.loss_weights())
         values = {f"train/{k}_loss": v.detach() for k, v in losses.items()}
         values["train/loss"] = total.detach()
@@ -91,9 +91,6 @@ class FilterTraining(L.LightningModule):
     def _run(self, batch: Batch) -> BatchSolution:
         there = [name for name, rows in batch.aids.items() if bool((rows[..., -1] > 0).any())]
         return integrate(batch, with_aids(self.filter, standard_tables(there)), keep_covariances=self.covariances)
-
-    def _losses(self, batch: Batch) -> Mapping[str, Tensor]:
-        return self.loss(self._run(batch), batch)
 
     def validation_step(self, batch: Batch, step: int) -> None:
         """Errors at the ends of fixed outages, as they will be scored on test drives, and what the filter answers."""

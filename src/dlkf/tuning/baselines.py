@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from itertools import count
 from typing import Any
 
-from dlkf.base.console import show_progress
 from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import PVA
 from dlkf.filters.build import build_causal, build_filter, has_prior
 from dlkf.filters.smoother import Filter
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.tuning.search import best_prior, drop_prior, evaluate_objective, list_factors, tune_filter
+from dlkf.tuning.search import best_prior, drop_prior, evaluate_objective, tune_under_bar
 
 FIRST = "mbkf15"  # where the others' search starts, and what the mean IMU error is estimated with
 
@@ -60,8 +58,8 @@ def tune_baselines(
     without or at ``start``, with the prior that is best then, found on ``longer`` segments with GNSS throughout.
     """
     untuned = start or Tuning()
-    first, least = _search_with_progress(imu, batches, FIRST, rounds, objective, start)
-    prior, begin = _find_prior(f"{FIRST}_prior", imu, [untuned, first], batches, objective, longer)
+    first, least, _ = tune_under_bar(imu, batches, FIRST, rounds, objective=objective, start=start)
+    prior, begin = best_prior(imu, [untuned, first], batches, f"{FIRST}_prior", objective, longer)
     priors: dict[str, Prior] = {}
     tunings: dict[str, Tuning] = {}
     for name in names:
@@ -69,7 +67,7 @@ def tune_baselines(
         if name == f"{FIRST}_prior":
             priors[name], begun = prior, begin
         elif has_prior(name):
-            priors[name], begun = _find_prior(name, imu, [untuned, begun], batches, objective, longer)
+            priors[name], begun = best_prior(imu, [untuned, begun], batches, name, objective, longer)
         if name == FIRST:
             tunings[name], error = first, least
         elif name == "ins":
@@ -77,23 +75,12 @@ def tune_baselines(
             estimator = build_causal(name, imu, "tuning does not", tuning=begun)
             error = evaluate_objective(estimator, batches, objective)
         else:
-            tunings[name], error = _search_with_progress(imu, batches, name, rounds, objective, begun, priors.get(name))
+            tunings[name], error, _ = tune_under_bar(
+                imu, batches, name, rounds, objective=objective, start=begun, prior=priors.get(name)
+            )
         how = "tuned" if rounds and name != "ins" else "untuned"
         say(f"{name} {how}: {_describe_error(error, objective)}")
     return Baselines(imu, tunings, prior, priors)
-
-
-def _find_prior(
-    name: str,
-    imu: ImuSpec,
-    tunings: Sequence[Tuning],
-    batches: Sequence[Batch],
-    objective: str,
-    longer: Sequence[Batch] | None,
-) -> tuple[Prior, Tuning]:
-    """The best prior, under a bar of its own."""
-    with show_progress(f"Prior of {name}") as bar:
-        return best_prior(imu, tunings, batches, name, objective, longer, progress=bar)
 
 
 def _describe_error(error: float, objective: str) -> str:
@@ -101,19 +88,3 @@ def _describe_error(error: float, objective: str) -> str:
     if objective == PVA:
         return f"geometric mean of position (m), velocity (m/s), attitude (rad) on training segments {error:.4g}"
     return f"{error:.2f} m at the end of the outages of training segments (geometric mean)"
-
-
-def _search_with_progress(
-    imu: ImuSpec,
-    batches: Sequence[Batch],
-    name: str,
-    rounds: int,
-    objective: str,
-    start: Tuning | None = None,
-    prior: Prior | None = None,
-) -> tuple[Tuning, float]:
-    """A search under a bar of its own: it takes minutes on much data."""
-    most, done = rounds * sum(map(len, list_factors(name).values())), count(1)
-    with show_progress(f"Tuning {name}") as bar:
-        given = {"name": name, "rounds": rounds, "objective": objective, "start": start, "prior": prior}
-        return tune_filter(imu, batches, **given, progress=lambda _: bar(next(done), most))

@@ -2,29 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import yaml
 
-from dlkf.base.console import show_progress
 from dlkf.base.files import write_into
-from dlkf.data.drive import Drive
 from dlkf.evaluation.table import ResultTable, as_markdown, format_number
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import NEEDED, ImuSpec
-from dlkf.onboard.compiled_filter import compile_or_keep
-from dlkf.running.likelihood import NO_OFFSET, Evidence, NoiseFit, find_noise
-
-
-def find_dataset_noise(
-    drives: Sequence[Drive], model: str, imu: ImuSpec, tuning: Tuning, *, minutes: float, name: str
-) -> NoiseFit:
-    """:func:`dlkf.running.likelihood.find_noise` on drives, under a bar."""
-    evidence = Evidence.of(drives, minutes)
-    with show_progress(f"Noise for {model}") as progress:
-        return find_noise(evidence, model, imu, tuning, called=name, progress=progress, compiler=compile_or_keep)
+from dlkf.running.likelihood import NO_OFFSET, NoiseFit
 
 
 def noise_table(model: str, dataset: str, imu: ImuSpec, tuning: Tuning, found: NoiseFit) -> ResultTable:

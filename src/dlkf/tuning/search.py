@@ -9,14 +9,14 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dlkf.base.console import warn_once
+from dlkf.base.console import show_progress, warn_once
 from dlkf.base.errors import InputError
 from dlkf.data.drive import Batch
 from dlkf.evaluation.metrics import PVA, end_errors, geometric_mean, mean_error, segment_errors
@@ -151,6 +151,21 @@ def tune_filter(
     return best, score
 
 
+def tune_under_bar(
+    imu: ImuSpec, batches: Sequence[Batch], name: str, rounds: int, **options: Any
+) -> tuple[Tuning, float, list[Trial]]:
+    """:func:`tune_filter` under a bar, for it takes minutes on much data; the trials, too."""
+    most, trials = rounds * sum(map(len, list_factors(name).values())), list[Trial]()
+    with show_progress(f"Tuning {name}") as bar:
+
+        def tell(trial: Trial) -> None:
+            trials.append(trial)
+            bar(len(trials), most)
+
+        best, score = tune_filter(imu, batches, name=name, rounds=rounds, progress=tell, **options)
+    return best, score, trials
+
+
 def _in_c(estimator: Estimator, batch: Batch) -> CompiledFilter:
     return compile_filter(estimator, 1 / batch.dt, batch.epoch_s)
 
@@ -218,14 +233,12 @@ def best_prior(
     name: str = "mbkf15_prior",
     objective: str = "log",
     longer: Sequence[Batch] | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Prior, Tuning]:
     """The prior, and the factors of ``tunings`` with it, with which ``name`` has the least objective on ``batches``.
 
     The mean IMU error is found with each of the factors on ``longer`` segments with GNSS throughout (default:
     ``batches``). Its spread is tried times several numbers, for biases and sensor matrices apart: it is the estimator's
-    scatter where all drives share one IMU, and then too wide or, of many segments together, too narrow. ``progress``
-    is called at every trial with its number and theirs.
+    scatter where all drives share one IMU, and then too wide or, of many segments together, too narrow.
     """
     tunings = list(dict.fromkeys(tunings))
     known = [mean_imu_error(imu, tuning, longer or batches, drop_prior(name)) for tuning in tunings]
@@ -234,9 +247,9 @@ def best_prior(
     in_c = _fits_c(build_causal(name, imu, "a prior does not", prior=trials[0][0]), batches)
 
     errors = []
-    for prior, tuning in trials:
-        estimator = build_causal(name, imu, "a prior does not", tuning=tuning, prior=prior)
-        errors.append(evaluate_objective(_in_c(estimator, batches[0]) if in_c else estimator, batches, objective))
-        if progress is not None:
-            progress(len(errors), len(trials))
+    with show_progress(f"Prior of {name}") as bar:
+        for prior, tuning in trials:
+            estimator = build_causal(name, imu, "a prior does not", tuning=tuning, prior=prior)
+            errors.append(evaluate_objective(_in_c(estimator, batches[0]) if in_c else estimator, batches, objective))
+            bar(len(errors), len(trials))
     return trials[errors.index(min(errors))]

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import pandas as pd
 import yaml
 
-from dlkf.base.console import show_progress
 from dlkf.base.errors import InputError
 from dlkf.base.files import write_into
 from dlkf.data.drive import Batch, Drive
@@ -23,7 +21,7 @@ from dlkf.evaluation.table import ResultTable, as_markdown, format_number
 from dlkf.filters.build import build_causal, has_prior, is_filter
 from dlkf.filters.tuning import Prior, Tuning
 from dlkf.navigation.imu_errors import ImuSpec
-from dlkf.tuning.search import Trial, evaluate_objective, list_factors, tune_filter
+from dlkf.tuning.search import Trial, evaluate_objective, tune_under_bar
 
 LIKELIHOOD = "likelihood"  # the objective that needs no reference (dlkf.tuning.found)
 OF_OUTAGES = "log, rms, median: horizontal error at the end of the outages [m], geometric mean, RMS, median over them."
@@ -124,17 +122,7 @@ def search(
         raise InputError(f"objective={objective} is of outages and outage=null has none; give objective={PVA}")
     left_out: list[str] = []
     training = withhold_outages(drives["train"], protocol, segments, left_out)
-    trials: list[Trial] = []
-    most = rounds * sum(map(len, list_factors(model).values()))
-    with show_progress(f"Tuning {model}") as progress:
-
-        def tell(trial: Trial) -> None:
-            trials.append(trial)
-            progress(len(trials), most)
-
-        after, _ = tune_filter(
-            imu, training, name=model, start=start, objective=objective, rounds=rounds, prior=prior, progress=tell
-        )
+    after, _, trials = tune_under_bar(imu, training, model, rounds, start=start, objective=objective, prior=prior)
     batches = {"train": training}
     if drives["test"]:
         batches["test"] = withhold_outages(drives["test"], protocol, left_out=left_out)
@@ -169,14 +157,11 @@ def tuning_table(result: TuningResult, dataset: str) -> ResultTable:
 def write_tuning(out: str | Path, name: str, result: TuningResult, table: ResultTable) -> list[str]:
     """Write tuning/<name>.yaml, table.md and search.csv into ``out``, all or none; their names."""
     factors = f"# {table.title}\n{yaml.safe_dump(asdict(result.after), sort_keys=False)}"
-    trials = io.StringIO()
-    writer = csv.writer(trials, lineterminator="\n")
-    writer.writerow(["factor", "value", "objective"])
-    writer.writerows(result.trials)
+    trials = pd.DataFrame(result.trials, columns=["factor", "value", "objective"])
     with write_into(out) as folder:
         (folder / "tuning").mkdir()
         (folder / "tuning" / f"{name}.yaml").write_text(factors)
         (folder / "table.md").write_text(as_markdown(table))
-        (folder / "search.csv").write_text(trials.getvalue())
+        trials.to_csv(folder / "search.csv", index=False, lineterminator="\n")
         (folder / "errors.json").write_text(json.dumps(result.metrics(), indent=1) + "\n")
     return [f"tuning/{name}.yaml", "table.md", "search.csv"]

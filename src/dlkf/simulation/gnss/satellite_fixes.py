@@ -1,4 +1,5 @@
-"""GNSS fixes and raw observations of a drive, from the satellites above it."""
+"""GNSS fixes and raw observations of a drive, from the satellites above it or with white noise, and how a receiver
+reports them: delayed, with a scaled std, and with gaps."""
 
 from __future__ import annotations
 
@@ -9,17 +10,17 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
-from dlkf.data.schema import POSITION, STD, VELOCITY
+from dlkf.data.schema import STD
 from dlkf.navigation.earth import ecef_from_geodetic, ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
 from dlkf.simulation.gnss.almanac import Almanac, read_almanac
 from dlkf.simulation.gnss.least_squares import LeastSquaresFix, Observations, solve
 from dlkf.simulation.gnss.receiver import Receiver, clock, range_errors
-from dlkf.simulation.gnss.reporting import report_fixes
 from dlkf.simulation.gnss.satellites import L1, LIGHT, Signals, ned_at, signals
 from dlkf.simulation.gnss.surroundings import Sky, hold_visibility, in_view
-from dlkf.simulation.gnss.white import FLOAT, GnssConfig, antenna_states, observe, shift_positions
+from dlkf.simulation.gnss.white import FLOAT, GnssConfig, antenna_states, episodes, observe, shift_positions
 from dlkf.simulation.motion.vehicle import Truth
+from dlkf.simulation.tables import fix_columns
 
 Array = NDArray[np.floating]
 WEEK = 604800  # s
@@ -56,6 +57,36 @@ def receive(
     else:
         received = observe_satellites(rng, truth, rate_b, config, receiver, sky)
     return Received(report_fixes(reporting_rng, received.fixes, config), received.raw)
+
+
+def delay_fixes(
+    truth: Truth, rate_b: Array, rows: NDArray[np.int64], config: GnssConfig, rate_hz: float
+) -> tuple[Truth, Array]:
+    """The truth of which the fixes stamped with the times of ``rows`` are made, and the body's rate there (N, 3).
+
+    Position and velocity of the antenna are those of ``position_lag_s`` and ``velocity_lag_s`` before, to the nearest
+    sample; the time is the stamp. Where they differ, the body is moved so that its antenna is where it was.
+    """
+    earlier = [np.maximum(rows - round(lag * rate_hz), 0) for lag in (config.position_lag_s, config.velocity_lag_s)]
+    place, moving = (truth.at(k) for k in earlier)
+    swing = rate_b[earlier[1]]
+    if config.position_lag_s == config.velocity_lag_s:
+        where = place.lat, place.lon, place.height
+    else:
+        arms = [antenna_states(x, rate_b[k], config.lever_arm_b)[0] for x, k in zip((place, moving), earlier)]
+        where = shift_positions(place, arms[0] - arms[1])
+    return Truth(truth.t[rows], *where, moving.v_n, moving.rpy), swing
+
+
+def report_fixes(rng: np.random.Generator, fixes: pd.DataFrame, config: GnssConfig) -> pd.DataFrame:
+    """The fixes with stds of ``std_factor`` times what they are, and gaps of ``dropout_s`` on average (exponential)
+    that make ``dropout_share`` of the time."""
+    if config.std_factor != 1:
+        fixes = fixes.assign(**{name: config.std_factor * fixes[name] for name in STD})
+    if config.dropout_share > 0:
+        lost = episodes(rng, fixes.t.to_numpy(), config.dropout_share, config.dropout_s)
+        fixes = fixes.loc[~lost].reset_index(drop=True)
+    return fixes
 
 
 def observe_satellites(
@@ -101,19 +132,17 @@ def _fixes(
     fix = quality > 0
     r_e = np.where(fix[:, None], solution.r_e, np.nan)
     C_en = ned_at(r_e)
-    place = geodetic_from_ecef(torch.from_numpy(r_e + (C_en @ added_n[:, :3, None])[..., 0]))
+    place = torch.from_numpy(r_e + (C_en @ added_n[:, :3, None])[..., 0])
+    lat, lon, height = (x.numpy() for x in geodetic_from_ecef(place))
     v_n = (np.swapaxes(C_en, -1, -2) @ solution.v_e[..., None])[..., 0] + added_n[:, 3:]
     std = [
         np.sqrt(np.einsum("tij,tik,tkj->tj", C_en, covariance[:, :3, :3], C_en) + added**2)
         for covariance, added in zip((solution.covariance, solution.rate_covariance), scale)
     ]
-    values = (*(x.numpy() for x in place), *v_n.T, *std[0].T, *std[1].T)
-    table = {"t": t, **dict(zip((*POSITION, *VELOCITY, *STD), values))}
-    for name in POSITION[:2]:
-        table[name] = np.degrees(table[name])
+    table = fix_columns(t, lat, lon, height, v_n, np.concatenate(std, -1), quality)
     known = solution.satellites >= 4
     dops = {f"{d}dop": np.where(known, getattr(solution.dop, f"{d}dop"), np.nan) for d in "gphv"}
-    return pd.DataFrame({**table, "quality": quality, "satellites": solution.satellites, **dops})
+    return pd.DataFrame({**table, "satellites": solution.satellites, **dops})
 
 
 def _raw(t: Array, start: float, almanac: Almanac, seen: Signals, observed: Observations) -> pd.DataFrame:

@@ -8,7 +8,7 @@ What a car adds is in ``chassis``.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -31,6 +31,10 @@ class Truth:
     height: Array  # m
     v_n: Array  # (N, 3) m/s
     rpy: Array  # (N, 3) rad, yaw continuous
+
+    def at(self, rows: slice | NDArray[np.int64]) -> Truth:
+        """Some rows of it."""
+        return Truth(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
 @dataclass(frozen=True)

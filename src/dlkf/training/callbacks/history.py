@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import csv
-import math
 from pathlib import Path
 
 import lightning as L
+import pandas as pd
 from lightning.pytorch.callbacks import Callback
 
 LOSSES = "losses.csv"
@@ -48,7 +48,5 @@ def read_losses(folder: Path) -> dict[str, list[float]]:
     Empty of a folder without it."""
     if not (folder / LOSSES).is_file():
         return {}
-    with (folder / LOSSES).open(newline="", encoding="utf-8") as file:
-        rows = {row["epoch"]: row for row in csv.DictReader(file)}
-    of_epochs = sorted(rows.values(), key=lambda row: int(row["epoch"]))
-    return {c: [float(row[c] or math.nan) for row in of_epochs] for c in ("epoch", *COLUMNS)}
+    table = pd.read_csv(folder / LOSSES, dtype=float).drop_duplicates("epoch", keep="last").sort_values("epoch")
+    return {str(name): column.tolist() for name, column in table.items()}
