@@ -107,7 +107,7 @@ def position_delay(fixes: Columns | pd.DataFrame) -> tuple[float, float]:
     Δp − ∫v dt = −δ Δv: what a turn or a braking car leaves between them.
     """
     north, east, lat_deg, lon_deg = (np.asarray(fixes[c]) for c in (*VELOCITY[:2], "lat_deg", "lon_deg"))
-    rows = _thin_rows(np.asarray(fixes["t"]), np.isfinite([north, east, lat_deg, lon_deg]).all(0))
+    rows = _thin_rows(np.asarray(fixes["t"]), np.isfinite(north + east + lat_deg + lon_deg))
     t, v = np.asarray(fixes["t"])[rows], north[rows] + 1j * east[rows]
     step = np.diff(t)
     fine = (step > 0) & (step < LONGEST_STEP_S)
