@@ -10,6 +10,7 @@ from dlkf.base.errors import InputError
 from dlkf.data.discovery.motion import find_motion
 from dlkf.data.discovery.wheel import find_wheel
 from dlkf.data.intake import IngestOptions, ingest, ingest_drives
+from dlkf.data.readers import formats
 from dlkf.data.readers.auto import AutoReader
 from dlkf.data.tables import read_table
 from tests.cars import car
@@ -177,6 +178,13 @@ def ubx_log(folder, drive, messages):
         out += [b"\xb5b\x01\x07", part, *(m.serialize() for m in more)]
     (folder / "town.ubx").write_bytes(b"".join(out))
     drive["imu"].assign(t=UNIX + drive["imu"].t).to_csv(folder / "imu.csv", index=False)
+
+
+@pytest.mark.parametrize("kind, lacks", [("speed", "wheels"), ("heading", "RELPOSNED"), ("baro", "barometer")])
+def test_ubx_without_a_sensor_says_which(tmp_path, drive, kind, lacks):
+    ubx_fixes(tmp_path / "town.ubx", drive)
+    with pytest.raises(InputError, match=rf"has no .*{lacks}.*; set reader\.{kind}\.file=null"):
+        formats.read("ubx", tmp_path / "town.ubx", kind=kind, table=None, text={}, where="")
 
 
 @pytest.mark.parametrize("ticks", [False, True], ids=["speed", "ticks"])

@@ -212,10 +212,10 @@ def _join_sensors(offers: list[Offer]) -> list[Offer]:
     if len(accels) != 1 or len(gyros) != 1:
         return []
     (accel,), (gyro,) = accels, gyros
-    turns = gyro.specs["gyro"]
-    source = {key: turns[key] for key in ("format", "file", "table", "text", "time") if key in turns}
-    specs = leave_open({"imu": {**accel.specs["accel"], "gyro": {**turns["gyro"], **source}}})
-    detail = f"{accel.detail}, and {gyro.name} with {', '.join(turns['gyro']['columns'])}"
+    rate = gyro.specs["gyro"]
+    source = {key: rate[key] for key in ("format", "file", "table", "text", "time") if key in rate}
+    specs = leave_open({"imu": {**accel.specs["accel"], "gyro": {**rate["gyro"], **source}}})
+    detail = f"{accel.detail}, and {gyro.name} with {', '.join(rate['gyro']['columns'])}"
     return [Offer(accel.path, detail, specs, table=accel.table)]
 
 

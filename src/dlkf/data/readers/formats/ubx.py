@@ -37,12 +37,17 @@ TICKS = ((8, 9), (10,), (6, 7))  # rear left and right, single, front
 BACKWARD = 1 << 23  # of ticks, whose count has the bits below
 FEWEST = 10
 MESSAGES = ("ESF-RAW", "ESF-MEAS")
+AIDS = {
+    "speed": "speed or ticks of wheels in ESF-MEAS", "heading": "NAV-RELPOSNED with a valid heading",
+    "baro": "pressure or height of a barometer",
+}  # fmt: skip
 TAG_WRAP = 2**32
 SYNC = b"\xb5b"  # every message begins so
 
 
 def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
-    """Fixes (``kind`` gnss or reference) or IMU samples of a log; ``table`` ESF-RAW or ESF-MEAS chooses the IMU."""
+    """Fixes (``kind`` gnss or reference), IMU samples, wheels or headings of a log; ``table`` ESF-RAW or ESF-MEAS
+    chooses the IMU."""
     messages, left = _messages(path, path.stat().st_mtime_ns)
     notes = (f"{path.name}: the last message is cut off or damaged: {left} bytes left out",) if left else ()
     cut = f"; its last {left} bytes are a message cut off, so copy the log again" if left else ""
@@ -58,8 +63,7 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
         have = ", ".join(sorted({m.identity for m in messages}))
         remedy = f"has {have}; set reader.imu.format and file{cut}"
         raise InputError(f"{path}: has no IMU in {' or '.join(wanted)}; {remedy}")
-    what = "NAV-RELPOSNED with a valid heading" if kind == "heading" else "speed or ticks of wheels in ESF-MEAS"
-    raise InputError(f"{path}: has no {what}; set reader.{kind}.file=null")
+    raise InputError(f"{path}: has no {AIDS[kind]}; set reader.{kind}.file=null")
 
 
 def aids(path: Path) -> tuple[str, ...]:
@@ -72,8 +76,9 @@ def _find_table(messages: list[Any], kind: str, names: Iterable[str]) -> pd.Data
     """Of headings, or of the first of the IMU's messages that has wheels or samples; empty where none has."""
     if kind == "heading":
         return _headings(messages)
-    make = _wheels if kind == "speed" else _samples
-    return next((table for name in names if len(table := make(messages, name))), pd.DataFrame())
+    make = {"imu": _samples, "speed": _wheels}.get(kind)
+    tables = (make(messages, name) for name in names) if make else ()
+    return next((table for table in tables if len(table)), pd.DataFrame())
 
 
 @lru_cache(maxsize=1)  # the IMU, the fixes and the wheels of a log are read one after the other
