@@ -10,7 +10,6 @@ import pytest
 from plotly.subplots import make_subplots
 
 from dlkf.report.drawing import Figure, library, panels, template
-from dlkf.report.grid import coordinates
 from dlkf.report.navigation import navigation_page
 from dlkf.report.page import Page
 from dlkf.report.plots import MOST, extremes
@@ -94,13 +93,6 @@ def test_a_page_of_drives_holds_figures_that_plotly_knows():
     assert list(figures) == ["map", *(f"{what}-{k}" for k in range(2) for what in ("motion", "innovations", "imu"))]
     assert len(figures["motion-0"].data) == 4 and len(figures["imu-1"].data) == 12
     assert library() in page and f"const TEMPLATE = {template()};" in page and "{{" not in page.replace(library(), "")
-
-
-def test_coordinates_of_a_grid_are_figures_that_plotly_knows():
-    pd = pytest.importorskip("pandas")
-    table = pd.DataFrame({"imu": ["a", "b"], "factor": [1, 2], "val/error": [3.0, 4.0]})
-    figure = json.loads(coordinates(table, ["imu", "factor"], ["val/error"]).to_json())
-    assert len(go.Figure(figure).data[0].dimensions) == 3
 
 
 def test_thinning_keeps_every_peak_and_every_gap():

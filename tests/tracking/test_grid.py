@@ -1,8 +1,6 @@
 """Grid search: parent run, children, final status, comparison; with sweeps that take no training."""
 
-import json
 import os
-import re
 import shutil
 import signal
 import socket
@@ -162,20 +160,6 @@ def test_a_grid_over_nothing_has_short_names(uri, client):
     job.overrides.task.append("imu=bmi270")
     assert job_folder(job) == "0-imu=bmi270"
     grid.close(ended=False)
-
-
-def test_the_page_of_a_grid(uri, client):
-    """The best first, an axis for each setting that was swept and for what came of it."""
-    grid = GridParent()
-    grid.on_multirun_start(sweep_config(uri))
-    parent = os.environ[PARENT_RUN]
-    point(uri, "worse", 5.0), point(uri, "better", 2.0)
-    grid.on_multirun_end(OmegaConf.create())
-    page = mlflow_module().artifacts.load_text(f"{client.get_run(parent).info.artifact_uri}/comparison.html")
-    assert "Best by validation: better, val/outage_end_m 4.00; on test dlkf 2.00." in page
-    drawn = json.loads(re.search(r'id="data-coordinates">(.*?)</script>', page, re.S)[1])
-    labels = [axis["label"] for axis in drawn["data"][0]["dimensions"]]
-    assert labels == ["lr", "val/outage_end_m", "test/dlkf/outage_end_horizontal_m"]
 
 
 @pytest.mark.parametrize(

@@ -96,18 +96,13 @@ def compare_children(table: pd.DataFrame) -> tuple[str, pd.DataFrame]:
 
 def as_text(table: pd.DataFrame) -> str:
     """A Markdown table with aligned columns; metrics with three digits, an empty cell where there is none."""
-    rows = [list(table), *cells(table)]
+    rows = [list(table), *([_cell(v) for v in row] for row in table.itertuples(index=False))]
     widths = [max(len(row[i]) for row in rows) for i in range(len(table.columns))]
     rows.insert(1, ["-" * w for w in widths])
     return "\n".join("| " + " | ".join(c.ljust(w) for c, w in zip(row, widths)) + " |" for row in rows) + "\n"
 
 
-def cells(table: pd.DataFrame) -> list[list[str]]:
-    """The rows of a table as texts."""
-
-    def cell(value: Any) -> str:
-        if isinstance(value, float):
-            return format_number(value) if value == value else ""
-        return "" if value is None else str(value).replace("|", "\\|")
-
-    return [[cell(v) for v in row] for row in table.itertuples(index=False)]
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return format_number(value) if value == value else ""
+    return "" if value is None else str(value).replace("|", "\\|")

@@ -23,8 +23,7 @@ from dlkf.base.errors import InputError
 from dlkf.base.files import resolve_place
 from dlkf.base.points import SWEPT, Failure, failures
 from dlkf.report.compare import read_reports, write_comparison
-from dlkf.report.grid import grid_page
-from dlkf.tracking.comparison import NAMELESS, as_text, best_child, cells, children, compare_children, comparison
+from dlkf.tracking.comparison import NAMELESS, as_text, best_child, children, compare_children, comparison
 from dlkf.tracking.registry import check_registration, register_model
 from dlkf.tracking.runs import (
     NOTE_TAG,
@@ -112,7 +111,7 @@ class GridParent(Callback):
             print(f"Registered the best, {best.info.run_name}: models:/{name}/{number}, alias {self.alias or 'none'}")
 
     def _compare(self, client, parent: str, table: pd.DataFrame, failed: Sequence[Failure]) -> None:
-        """The table of all points as text, CSV, page and note of the parent."""
+        """The table of all points as text, CSV and note of the parent."""
         metric, chosen = compare_children(table)
         ordered = any(c.startswith("val/") for c in map(str, table))
         title = f"{metric} of the test segments" if metric else "no run was scored"
@@ -120,7 +119,6 @@ class GridParent(Callback):
         text = as_text(chosen) + "".join(f"\nfailed: {f.point}: {f.why}\n" for f in failed)
         client.log_text(parent, table.to_csv(index=False), "comparison.csv")
         client.log_text(parent, text, "comparison.md")
-        client.log_text(parent, grid_page(title, table, chosen, metric, cells(chosen)), "comparison.html")
         client.set_tag(parent, NOTE_TAG, f"{title}\n\n{text}")
         print(f"\n{title}\n{text}\nGrid search: MLflow run {parent} in {self.uri}")
 
