@@ -41,30 +41,24 @@ def png(figure: Figure, dpi: int = 130) -> bytes:
 
 def all_figures(
     scores: Scores, *, by_time: bool, baseline: str | None, named: str = "truth"
-) -> Iterator[tuple[str, str, Figure]]:
-    """(file name, caption, figure) of one kind of data; ``named``: what the errors are against.
+) -> Iterator[tuple[str, Figure]]:
+    """(file name, figure) of one kind of data; ``named``: what the errors are against.
 
     ``by_time``: the segments are alike (same length, outage at the same time), so that an average over them at
-    each time means something; whole drives are shown one by one instead.
+    each time means something.
     """
     chosen = representative(scores, 4, baseline)
     if not chosen:
         return
-    middle = chosen[len(chosen) // 2]
     if scores.outage.any():
-        yield "error_growth", "horizontal error against the time without GNSS", error_growth(scores)
+        yield "error_growth", error_growth(scores)
         pair = [baseline, list(scores.filters)[-1]]
         if len(scores.windows.segment) >= MANY and baseline in scores.filters and pair[0] != pair[1]:
-            yield "error_histograms", "how the outages are spread, so long into them", error_histograms(scores, pair)
-    yield (
-        "tracks",
-        "tracks of segments from good to bad (quantiles of the error of the baseline)",
-        tracks(scores, chosen, named),
-    )
+            yield "error_histograms", error_histograms(scores, pair)
+    yield "tracks", tracks(scores, chosen, named)
     if by_time and len(scores.segments) > 1:
-        yield "error_over_time", "errors over time, all segments", error_over_time(scores)
-    yield "error_over_time_one", "errors over time, one segment", error_over_time(scores, [middle])
-    yield "imu_errors", "IMU-error estimates, one segment", imu_errors(scores, middle)
+        yield "error_over_time", error_over_time(scores)
+    yield "imu_errors", imu_errors(scores, chosen[len(chosen) // 2])
 
 
 def line_style(scores: Scores, name: str) -> dict[str, Any]:
@@ -157,26 +151,26 @@ def _outage_end(ax: Axes, scores: Scores, i: int) -> None:
     ax.set_title(title, fontsize=9)
 
 
-def error_over_time(scores: Scores, segments: Sequence[int] | None = None) -> Figure:
+def error_over_time(scores: Scores) -> Figure:
     """RMS over segments at each time since their start, middle 80 % of the segments as a band (figs 13, 14).
 
-    One segment gives its error itself. Outages are shaded, darker where more segments have one.
+    Outages are shaded, darker where more segments have one.
     """
-    index = list(range(len(scores.segments))) if segments is None else list(segments)
-    sizes = {n: magnitudes(r.error[index]) for n, r in scores.filters.items()}
+    every = range(len(scores.segments))
+    sizes = {n: magnitudes(r.error) for n, r in scores.filters.items()}
     shown = [q for q in ERROR_PANELS if any(np.isfinite(s[q]).any() for s in sizes.values())]
     figure = Figure(figsize=(9, 2.5 * max(len(shown), 1) + 0.9), layout="constrained")
     axes = figure.subplots(max(len(shown), 1), 1, sharex=True, squeeze=False).ravel()
-    length = scores.t[np.flatnonzero(~np.isnan(scores.truth_p_n[index]).all((0, 2)))[-1]]
+    length = scores.t[np.flatnonzero(~np.isnan(scores.truth_p_n).all((0, 2)))[-1]]
     for ax, q in zip(axes, shown):
         label, scale = ERROR_PANELS[q]
-        _shade(ax, scores, index)
+        _shade(ax, scores, every)
         for name in scores.filters:
             x = sizes[name][q] * scale
             finite = np.where(np.isfinite(x), x, np.nan)
             style = line_style(scores, name)
             ax.plot(scores.t, rms_over_segments(np.where(np.isinf(x), np.nan, x)), lw=1.8, zorder=3, **style)
-            if len(index) > 4:
+            if len(every) > 4:
                 some = (~np.isnan(finite)).sum(0) > 4
                 band = np.nanpercentile(finite[:, some], [10, 90], axis=0)
                 ax.fill_between(scores.t[some], *band, color=style["color"], alpha=0.13, lw=0, zorder=2)
@@ -184,14 +178,10 @@ def error_over_time(scores: Scores, segments: Sequence[int] | None = None) -> Fi
         ax.set_ylabel(label)
         ax.set_xlim(0, length)
         plain_axes(ax)
-    axes[len(shown) - 1].set_xlabel(
-        "Time since the start [s]" if len(index) == 1 else "Time since the start of the segment [s]"
-    )
-    what = scores.describe_segment(index[0]) if len(index) == 1 else f"RMS over {len(index)} segments"
-    if len(index) > 4:
-        what += ", band: middle 80 % of the segments"
-    axes[0].set_title(what, fontsize=9, loc="left")
-    _legend(figure, _filter_handles(scores, scores.filters) + _outage_handle(scores, index))
+    axes[len(shown) - 1].set_xlabel("Time since the start of the segment [s]")
+    band = ", band: middle 80 % of the segments" if len(every) > 4 else ""
+    axes[0].set_title(f"RMS over {len(every)} segments{band}", fontsize=9, loc="left")
+    _legend(figure, _filter_handles(scores, scores.filters) + _outage_handle(scores, every))
     return figure
 
 

@@ -32,7 +32,7 @@ from dlkf.evaluation.table import (
 from dlkf.report.drawing import Figure
 from dlkf.report.maps import add_track, chart, join_tracks
 from dlkf.report.navigation import mark_outages
-from dlkf.report.page import Page, embed_png
+from dlkf.report.page import Page
 from dlkf.report.plots import Array, band, line, shade, spans, stack_panels
 from dlkf.report.training import ABOUT, learning_curve
 
@@ -61,8 +61,8 @@ def write_report(
     """Write the whole report into ``out``, all files or none; returns their paths.
 
     ``results`` has one entry per kind of data (of scores.of_kind); ``protocol`` is how the
-    scores were made, in plain values; ``more`` tables follow those of the results; ``figures``: the page's figures for
-    print as well, figures/*.png; ``trained``: the filter with which the answer begins, ``losses``: of its training
+    scores were made, in plain values; ``more`` tables follow those of the results; ``figures``: figures for print as
+    well, figures/*.png; ``trained``: the filter with which the answer begins, ``losses``: of its training
     (:func:`dlkf.report.training.learning_curve`). Raises InputError if ``out`` cannot be written to.
     """
     parts = [*all_tables(dataset, results), *more]
@@ -79,10 +79,8 @@ def write_report(
         ).encode(),
         "table.md": "\n".join(map(as_markdown, parts)).encode(),
         "table.csv": as_csv(dataset, results).encode(),
-        "report.html": evaluation_page(
-            dataset, parts, scores, results, pictures, protocol, baseline, trained, losses
-        ).encode(),
-        **{f"figures/{name}": data for name, _, data in pictures},
+        "report.html": evaluation_page(dataset, parts, scores, results, protocol, baseline, trained, losses).encode(),
+        **{f"figures/{name}.png": data for name, data in pictures},
     }
     with write_into(out) as folder:
         if pictures:
@@ -94,16 +92,15 @@ def write_report(
 
 def print_figures(
     scores: Scores, by_time: bool, baseline: str | None, own: str | None = None
-) -> list[tuple[str, str, bytes]]:
-    """(file name, caption, PNG) of every kind of data; ``own``: a reference that was made."""
+) -> list[tuple[str, bytes]]:
+    """(file name, PNG) of every kind of data; ``own``: a reference that was made."""
     from dlkf.evaluation.figures import all_figures, png  # matplotlib takes a second to load
 
     pictures = []
     for kind in scores.kinds:
         suffix = "" if len(scores.kinds) == 1 else f"_{kind}"
         drawn = all_figures(scores.of_kind(kind), by_time=by_time, baseline=baseline, named=name_truth(kind, own))
-        for name, caption, figure in drawn:
-            pictures.append((f"{name}{suffix}.png", f"{kind.capitalize()} data: {caption}", png(figure, 110)))
+        pictures += [(f"{name}{suffix}", png(figure, 110)) for name, figure in drawn]
     return pictures
 
 
@@ -117,7 +114,6 @@ def evaluation_page(
     parts: Sequence[ResultTable],
     scores: Scores,
     results: Sequence[Results],
-    pictures: Sequence[tuple[str, str, bytes]],
     protocol: Mapping[str, Any],
     baseline: str | None,
     trained: str | None = None,
@@ -148,8 +144,6 @@ def evaluation_page(
     for result in results:
         _research(page, scores.of_kind(result.kind), result, f"{result.kind}: " if many else "", baseline)
     _add_tables(page, [t for t in parts if t not in first])
-    if pictures:
-        page.for_print([(caption, embed_png(data)) for _, caption, data in pictures])
     page.protocol(protocol)
     return page.html()
 

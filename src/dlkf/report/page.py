@@ -83,13 +83,6 @@ class Page:
         words = html.escape(caption)
         self.parts.append(f'<h2>{words}</h2><img loading=lazy alt="{words}" src="{source}">')
 
-    def for_print(self, pictures: Sequence[tuple[str, str]]) -> None:
-        """Pictures (caption, data URI) behind a fold."""
-        self.parts.append("<details><summary>The figures for print</summary>")
-        for caption, source in pictures:
-            self.picture(caption, source)
-        self.parts.append("</details>")
-
     def protocol(self, values: Mapping[str, Any]) -> None:
         """How the numbers were made, as words: nested settings indented, numbers as they are written by hand."""
         rows = "".join(
