@@ -1,4 +1,4 @@
-"""The same training on two processes: ``trainer.devices=2 trainer.strategy=ddp``, nothing else changed."""
+"""The same training on two processes: ``trainer.devices=2``, nothing else changed."""
 
 import json
 import subprocess
@@ -30,7 +30,7 @@ ALONG = """
 
 
 def settings(devices: int):
-    return make_settings(max_epochs=EPOCHS, validate_every=1, devices=devices, strategy="ddp")
+    return make_settings(max_epochs=EPOCHS, validate_every=1, devices=devices)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,7 @@ SMALL = (
 @pytest.mark.commands
 def test_the_command_on_two_processes_leaves_the_same_table(dataset, tmp_path):
     tables, losses = [], []
-    for name, more in (("one", ()), ("two", ("trainer.devices=2", "trainer.strategy=ddp"))):
+    for name, more in (("one", ()), ("two", ("trainer.devices=2",))):
         words = [sys.executable, "-m", "dlkf.train", f"name={name}", f"data.datasets=[{dataset}]", *SMALL, *more]
         done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr[-2000:]

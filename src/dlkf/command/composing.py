@@ -16,7 +16,6 @@ from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
 
 NOT_HASHED = ("tracking", "resume")
-NOT_HASHED_OF_TRAINER = ("devices", "strategy")  # the same training on more processes
 
 
 def compose_command(command: str, *overrides: str, resolve: bool = True) -> dict[str, Any]:
@@ -39,7 +38,7 @@ def configuration_hash(values: Mapping[str, Any]) -> str:
     """Eight hex digits of everything that decides a training's weights and scores."""
     kept = {k: v for k, v in values.items() if k not in NOT_HASHED}
     if "trainer" in kept:
-        kept["trainer"] = {k: v for k, v in kept["trainer"].items() if k not in NOT_HASHED_OF_TRAINER}
+        kept["trainer"] = {k: v for k, v in kept["trainer"].items() if k != "devices"}  # the same training on more
     return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()[:8]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 from lightning.pytorch.callbacks import Callback
 
@@ -38,7 +38,6 @@ class TrainerSettings(Ranged, where="trainer"):
     threads: int | None = bounded_field(1, 1, MANY)
     accelerator: str = "auto"
     devices: int = bounded_field(1, 1, MANY)
-    strategy: Literal["auto", "ddp"] = "auto"  # the same: several processes average their gradients, one has its own
 
 
 @dataclass(frozen=True)
