@@ -64,8 +64,7 @@ def main(config: dict[str, Any]) -> None:
         console.print(f"resuming the unfinished run in {folder}")
     name = run_name(given.name, overrides)
     parent = os.environ.get(PARENT_RUN)
-    begun = {"parent_run_id": parent, "run_id": state.get("run_id"), "system_metrics": tracking.system_metrics}
-    with start_run(uri, given.name, name, **begun) as run:
+    with start_run(uri, given.name, name, parent_run_id=parent, run_id=state.get("run_id")) as run:
         write_state(folder, run_id=run.id, data=check_digests(data.datasets, state))
         run.log_config(config)
         for dataset in data.datasets:

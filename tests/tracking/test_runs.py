@@ -4,7 +4,6 @@ import gc
 import json
 import os
 import signal
-import time
 from contextlib import nullcontext
 from multiprocessing import Pipe
 
@@ -15,7 +14,6 @@ from sqlalchemy.orm import loading
 
 from dlkf.base.errors import InputError, Terminated
 from dlkf.base.signals import delay_signals
-from dlkf.tracking import runs as tracking
 from dlkf.tracking.endings import PROCESS_TAG, TRACKING_URI
 from dlkf.tracking.runs import (
     VALUE_LENGTH,
@@ -278,14 +276,6 @@ def test_epochs_before_an_end_without_validation_are_logged(uri, client):
         lightning_logger(again).log_metrics({"epoch": 2, "train/loss": 0.5})
     history = client.get_metric_history(run.id, "train/loss")
     assert [(m.value, m.step) for m in history] == [(2.0, 0), (1.0, 1), (0.5, 2)]
-
-
-def test_system_metrics_are_sampled_every_second(uri, client, monkeypatch):
-    """MLflow's own interval of ten seconds leaves short runs empty."""
-    monkeypatch.setattr(tracking, "SAMPLES_PER_POINT", 1)
-    with start_run(uri, "town", "one", system_metrics=True) as run:
-        time.sleep(1.3)
-    assert "system/cpu_utilization_percentage" in client.get_run(run.id).data.metrics
 
 
 def test_mistakes_are_one_line(uri, client, monkeypatch):

@@ -11,7 +11,6 @@ import sqlite3
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
@@ -38,7 +37,6 @@ MONITORS = ("val/outage_end_m", "val/loss")  # what training keeps the best weig
 NOT_IN_NAMES = re.compile(r"[^\w\-. :/]")  # of metrics
 SCHEMES = ("sqlite", "http", "https", "file", "postgresql", "mysql", "mssql", "databricks", "uc", "databricks-uc")
 LOCKED_S = 15.0  # a writer of many metrics holds the store for less
-SAMPLE_EVERY_S, SAMPLES_PER_POINT = 1, 5  # system metrics: MLflow's own 10 s leaves short runs empty
 
 
 def tracking_uri(given: str | None = None) -> str:
@@ -243,7 +241,6 @@ def start_run(
     *,
     parent_run_id: str | None = None,
     run_id: str | None = None,
-    system_metrics: bool = False,
 ) -> Iterator[TrackedRun]:
     """Open a run, or go on with ``run_id`` if this store has it; its status at the end is how it ended.
 
@@ -253,10 +250,6 @@ def start_run(
     """
     mlflow = mlflow_module()
     with use_store(uri):
-        if system_metrics and find_spec("psutil") is None:
-            raise InputError("tracking.system_metrics=true needs psutil; pip install psutil")
-        mlflow.set_system_metrics_sampling_interval(SAMPLE_EVERY_S)
-        mlflow.set_system_metrics_samples_before_logging(SAMPLES_PER_POINT)
         check_store(uri)
         tags = {PROCESS_TAG: process_label()} | ({PARENT_TAG: parent_run_id} if parent_run_id else {})
         try:
@@ -266,13 +259,11 @@ def start_run(
                 close_killed_runs(client, group)
                 resumed = run_id is not None and run_exists(client, run_id)
                 if resumed:
-                    active = mlflow.start_run(run_id, log_system_metrics=system_metrics)
+                    active = mlflow.start_run(run_id)
                     for key, value in tags.items():  # a point of a grid search started again has another parent
                         client.set_tag(active.info.run_id, key, value)
                 else:
-                    active = mlflow.start_run(
-                        experiment_id=group, run_name=name, tags=tags, log_system_metrics=system_metrics
-                    )
+                    active = mlflow.start_run(experiment_id=group, run_name=name, tags=tags)
             yield TrackedRun(active.info.run_id, uri, resumed, client)
         except BaseException as error:
             end_run("KILLED" if isinstance(error, KeyboardInterrupt) else "FAILED", error)

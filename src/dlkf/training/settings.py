@@ -42,10 +42,9 @@ class TrainerSettings(Ranged, where="trainer"):
 
 @dataclass(frozen=True)
 class TrackingSettings:
-    """Where the run is kept, what is watched, and under which name the model is registered."""
+    """Where the run is kept, and under which name the model is registered."""
 
     uri: str | None
-    system_metrics: bool
     register: str | None
     alias: str | None
 
