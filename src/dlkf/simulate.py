@@ -48,10 +48,6 @@ def main(settings: SimulateSettings) -> None:
     if "lateral_axle_mps" in drives:
         axle, at_imu = (math.sqrt(np.mean(drives[f"lateral_{at}_mps"].to_numpy() ** 2)) for at in ("axle", "imu"))
         print(f"velocity across the car, RMS above 2 m/s: {axle:.3f} m/s at the rear axle, {at_imu:.3f} m/s at the IMU")
-    if settings.pictures:
-        from dlkf.simulation.pictures import write_pictures  # matplotlib takes a second to load
-
-        print("pictures: " + ", ".join(str(path) for path in write_pictures(out, out / "pictures")))
 
 
 make_callable(__name__, "dlkf.frames:simulate")

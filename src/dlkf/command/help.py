@@ -13,7 +13,7 @@ from pathlib import Path
 from dlkf.base.config import config_dir
 
 MOST = {
-    "simulate": ("dataset.hours", "dataset.drive_minutes", "seed", "out", "pictures"),
+    "simulate": ("dataset.hours", "dataset.drive_minutes", "seed", "out", "overwrite"),
     "ingest": ("source", "out", "overwrite", "split_gaps", "shortest_s"),
     "train": ("data.datasets", "trainer.max_epochs", "seed", "scoring.outage.duration_s", "tracking.uri"),
     "evaluate": ("model", "dataset", "out", "outage.duration_s", "length_s"),

@@ -175,7 +175,6 @@ class SimulateSettings:
     out: str
     raw: bool
     source: str | None
-    pictures: bool
     overwrite: bool
     workers: int | None
     parallel: int | str | None

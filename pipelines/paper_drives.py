@@ -1,7 +1,14 @@
-"""Pictures of a simulated dataset: its first drive as in the paper's figure 4, and how all its drives move."""
+"""Pictures of a simulated dataset: its first drive as in the paper's figure 4, and how all its drives move.
+
+    python pipelines/paper_drives.py data/paper_mems
+    python pipelines/paper_drives.py data/tunnel outputs/tunnel
+
+Into a folder, ``<dataset>/pictures`` where none is named.
+"""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -28,6 +35,16 @@ MOVING = 2.0  # m/s above which a course means something
 TURNING = 1 / 2000  # 1/m, curvature of what counts as a turn
 SHARP = 300.0  # m, radius of the turns whose lateral acceleration is shown
 STEADY = 0.02  # rad/s² below which the yaw rate of a turn counts as steady
+
+
+def main() -> None:
+    """Draw a dataset."""
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    arguments.add_argument("dataset", help="a folder of dlkf simulate")
+    arguments.add_argument("out", nargs="?", help="the folder of the pictures")
+    given = arguments.parse_args()
+    for path in write_pictures(given.dataset, given.out or Path(given.dataset) / "pictures"):
+        print(path)
 
 
 @dataclass(frozen=True)
@@ -140,7 +157,7 @@ def motion_figure(drives: Sequence[Driving], title: str) -> Figure:
 
 
 def write_pictures(dataset: str | Path, out: str | Path) -> list[Path]:
-    """Draw the first drive of a dataset, and all of its motion, into ``out``."""
+    """The first drive of a dataset, and the motion of all, drawn into ``out``."""
     rows = read_drives(dataset)
     files, moved = [f"{rows[0].name}.png", "motion.png"], []
     with write_into(out) as folder:
@@ -199,3 +216,7 @@ def _histogram(
     for bound in bounds:
         axes.axvline(bound, color=LIMIT, linestyle="--", linewidth=1)
     axes.set_xlabel(label)
+
+
+if __name__ == "__main__":
+    main()
