@@ -163,7 +163,7 @@ def test_mistakes_are_one_line(drive, case):
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", ["navigate", "smooth", "evaluate", "Stream", "load", "simulate", "read_logs"])
+@pytest.mark.parametrize("name", ["navigate", "evaluate", "Stream", "load", "simulate", "read_logs"])
 def test_docstrings_name_every_parameter_with_its_type(name):
     """As numpydoc has them: a type or choice for each, what is returned, and the errors."""
     function = getattr(dlkf.frames, name)

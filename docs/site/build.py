@@ -114,9 +114,7 @@ def room_text(room: str) -> str:
 
 def overview() -> str:
     """The glossary of the package, and what is in which room."""
-    public = (
-        "The public functions (`dlkf.navigate`, `smooth`, `evaluate`, `Stream`, `load`, `simulate`, `read_logs`) are"
-    )
+    public = "The public functions (`dlkf.navigate`, `evaluate`, `Stream`, `load`, `simulate`, `read_logs`) are"
     lines = [
         "# API",
         "",

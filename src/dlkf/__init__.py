@@ -53,7 +53,7 @@ from typing import Any
 __version__ = "0.2.0"
 
 PUBLIC = {  # imported when first used: torch takes seconds
-    **dict.fromkeys(("navigate", "smooth", "evaluate", "load", "Stream", "simulate", "read_logs"), "dlkf.frames"),
+    **dict.fromkeys(("navigate", "evaluate", "load", "Stream", "simulate", "read_logs"), "dlkf.frames"),
     "Solution": "dlkf.frames",
     "Evaluation": "dlkf.frames",
     "InputError": "dlkf.base.errors",

@@ -8,7 +8,7 @@ height_m and, where known, vel_n|e|d, roll, pitch, yaw [rad], valid. Other units
 
 from dlkf.frames.evaluation import Evaluation, evaluate
 from dlkf.frames.logs import read_logs, simulate
-from dlkf.frames.navigation import Stream, load, navigate, smooth
+from dlkf.frames.navigation import Stream, load, navigate
 from dlkf.frames.solution import Solution
 
-__all__ = ["Evaluation", "Solution", "Stream", "evaluate", "load", "navigate", "read_logs", "simulate", "smooth"]
+__all__ = ["Evaluation", "Solution", "Stream", "evaluate", "load", "navigate", "read_logs", "simulate"]

@@ -73,7 +73,8 @@ def navigate(
     lever_arm : sequence of 3 floats
         IMU → antenna, Forward-Right-Down [m].
     smoothed : bool
-        Also run the Rauch-Tung-Striebel smoother backwards over the drive.
+        Also run the Rauch-Tung-Striebel smoother backwards over the drive: all its fixes in every row. For a filter
+        with a covariance, a Kalman filter or ``plus``.
     rate_hz, epoch_s : float, optional
         IMU rate the filter runs at [Hz] and its update interval [s]; default: the filter's own.
 
@@ -135,32 +136,6 @@ def _depth() -> int:
     while frame.f_back is not None and frame.f_code.co_filename.startswith(PACKAGE):
         frame, depth = frame.f_back, depth + 1
     return depth
-
-
-def smooth(imu: pd.DataFrame, gnss: pd.DataFrame, *, model: str | Path = "plus", **options: Any) -> Solution:
-    """Run a filter over one drive and the Rauch-Tung-Striebel smoother back over it.
-
-    Parameters
-    ----------
-    imu, gnss : pandas.DataFrame
-        As in :func:`navigate`.
-    model : str or Path
-        A filter with a covariance: a Kalman filter or ``plus``.
-    **options
-        The others of :func:`navigate`: ``imu_type``, ``tuning``, ``lever_arm``, ``speed``, ….
-
-    Returns
-    -------
-    Solution
-        As of :func:`navigate`, with all fixes of the drive used in every row.
-
-    Raises
-    ------
-    InputError
-        As :func:`navigate`, and for a filter without a covariance (``ins``).
-    """
-    check_options("smooth", options, navigate, apart=("imu", "gnss", "model", "smoothed"))
-    return navigate(imu, gnss, model=model, smoothed=True, **options)
 
 
 def load(
