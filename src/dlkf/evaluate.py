@@ -98,12 +98,12 @@ def evaluate_dataset(settings: EvaluateSettings, console: Console) -> Evaluation
     if settings.mode == "auto" and done.rules["mode"] == "drives":
         said = f"no segment of {settings.length_s:g} s with a known attitude: whole drives, from their own alignment"
         console.print(said, style="yellow")
-    scores = done.run.scores
+    scores = done.scores
     check_outages(protocol.outage, scores.outage, max(x.span_s for x in fixes.values()))
     if protocol.outage and (unused := describe_unused(protocol.outage, scores.outage, *scores.ends)):
         console.print(unused, style="yellow", highlight=False)
         done.rules[UNUSED] = unused
-    results = make_results(done.run, baseline=settings.baseline, settle_s=settings.settle_s, seed=settings.seed)
+    results = make_results(scores, baseline=settings.baseline, settle_s=settings.settle_s, seed=settings.seed)
     made_how = {
         **describe_provenance(), "models": settings.model, "dataset": settings.dataset, "imu": spec.name,
         "tuning": asdict(settings.tuning), "imu values": {"accel": asdict(spec.accel), "gyro": asdict(spec.gyro)},

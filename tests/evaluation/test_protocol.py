@@ -239,18 +239,18 @@ def test_an_evaluation_share_by_share(town, mode):
         law=BiasLaw(0.05, 0.1), shown=False,
     )  # fmt: skip
     one, many = (evaluate_chunks(work, shares) for shares in ([names], [names[:2], names[2:4], names[4:]]))
-    assert one.rules["mode"] == mode and one.rules == many.rules and one.run.scores.outage.any()
-    sorted_by = [[(p.drive, p.t_start, k) for k, p in enumerate(e.run.scores.segments)] for e in (one, many)]
+    assert one.rules["mode"] == mode and one.rules == many.rules and one.scores.outage.any()
+    sorted_by = [[(p.drive, p.t_start, k) for k, p in enumerate(e.scores.segments)] for e in (one, many)]
     order = [sorted(range(len(segments)), key=segments.__getitem__) for segments in sorted_by]
-    a, b = one.run.scores, many.run.scores
+    a, b = one.scores, many.scores
     assert [a.segments[k] for k in order[0]] == [b.segments[k] for k in order[1]]
     assert (a.outage[order[0]] == b.outage[order[1]]).all()
     for name in work.filters:  # sums over a batch of another size
         errors = [s.filters[name].error[o] for s, o in zip((a, b), order)]
         assert np.allclose(*errors, rtol=0, atol=1e-8, equal_nan=True)
-        followed = [e.run.followed[name][o] for e, o in zip((one, many), order)]
+        followed = [s.filters[name].bias_response[o] for s, o in zip((a, b), order)]
         assert np.allclose(*followed, rtol=0, atol=1e-8, equal_nan=True)
-    assert (one.run.cause[order[0]] == many.run.cause[order[1]]).all()
+    assert (a.injected_bias[order[0]] == b.injected_bias[order[1]]).all()
 
 
 def test_shares_of_which_one_has_nothing_to_score(town, tmp_path):
@@ -264,7 +264,7 @@ def test_shares_of_which_one_has_nothing_to_score(town, tmp_path):
         {"rate_hz": 20.0, "epoch_s": 1.0}, drive_kinds(town), {}, shown=False,
     )  # fmt: skip
     done = evaluate_chunks(work, [(row.name,) for row in rows[:3]])
-    assert {segment.drive for segment in done.run.scores.segments} == {row.name for row in rows[1:3]}
+    assert {segment.drive for segment in done.scores.segments} == {row.name for row in rows[1:3]}
     short = done.rules["too short"]
     assert short.startswith("1 of 3 drives, too short or") and f"a segment of 40 s: {rows[0].name};" in short
     with pytest.raises(InputError, match="no segment of 40 s"):
@@ -286,9 +286,7 @@ def test_drives_too_short_for_a_segment_are_named(town, tmp_path, together):
         {"rate_hz": 20.0, "epoch_s": 1.0}, drive_kinds(town), {}, shown=False,
     )  # fmt: skip
     done = evaluate_chunks(work, [tuple(names)] if together else [(name,) for name in names])
-    assert done.rules["mode"] == "segments" and {segment.drive for segment in done.run.scores.segments} == set(
-        names[2:]
-    )
+    assert done.rules["mode"] == "segments" and {segment.drive for segment in done.scores.segments} == set(names[2:])
     short = done.rules["too short"]
     assert short.startswith("2 of 4 drives, too short or")
     assert f"40 s with a known attitude: {names[0]}, {names[1]}; " in short and "mode=drives" in short

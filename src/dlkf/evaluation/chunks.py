@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,8 +18,8 @@ from dlkf.data.alignment import ALIGN, AlignConfig
 from dlkf.data.masks import BiasLaw
 from dlkf.data.store import load_dataset
 from dlkf.evaluation.protocol import REFUSED, NoSegment, Protocol, Scenes, describe_short
-from dlkf.evaluation.scores import join_scores
-from dlkf.evaluation.study import ScoredRun, run_scenes
+from dlkf.evaluation.scores import Scores, join_scores
+from dlkf.evaluation.study import run_scenes
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.smoother import Filter
 from dlkf.running.references import describe_reference, make_reference
@@ -47,10 +46,10 @@ class EvaluationJob:
 
 
 class ChunkResult(NamedTuple):
-    """What became of a chunk: its run and the rules of its scenes, or why nothing of it can be scored."""
+    """What became of a chunk: its scores and the rules of its scenes, or why nothing of it can be scored."""
 
     names: tuple[str, ...]
-    run: ScoredRun | None = None
+    scores: Scores | None = None
     rules: Mapping[str, Any] = {}
     skipped: Mapping[str, str] = {}
     sigma: Tensor | None = None  # (n, 3) of a made reference [m]
@@ -62,7 +61,7 @@ class Evaluated(NamedTuple):
     """All chunks together, the rules with ``skipped`` and, of drives without a segment, ``too short``; ``truth``
     describes a made reference."""
 
-    run: ScoredRun
+    scores: Scores
     rules: dict[str, Any]
     truth: dict[str, str]
 
@@ -77,12 +76,12 @@ def evaluate_chunks(
     """
     done = list(parallel_map(partial(score_chunk, work), chunks, parallel))
     skipped = {drive: why for one in done for drive, why in one.skipped.items()}
-    scorable = [one for one in done if one.run is not None]
+    scorable = [one for one in done if one.scores is not None]
     if not scorable:
         raise done[0].refused or no_drives()
     mode = "segments" if any(one.rules["mode"] == "segments" for one in scorable) else "drives"
     kept = [one for one in scorable if one.rules["mode"] == mode]
-    run = join_chunks([one.run for one in kept if one.run is not None])
+    scores = join_scores([one.scores for one in kept if one.scores is not None])
     of_other_mode = [one for one in scorable if one.rules["mode"] != mode]  # no segment, where others have some
     lost = {name for one in done for name in one.short} | {name for one in of_other_mode for name in one.names}
     names = [name for one in done for name in one.names]
@@ -93,7 +92,7 @@ def evaluate_chunks(
     rules |= {REFUSED: refused} if refused else {}
     sigmas = [one.sigma for one in kept if one.sigma is not None]
     truth = {"reference": describe_reference(work.reference, torch.cat(sigmas))} if sigmas else {}
-    return Evaluated(run, rules, truth)
+    return Evaluated(scores, rules, truth)
 
 
 def score_chunk(work: EvaluationJob, names: tuple[str, ...]) -> ChunkResult:
@@ -114,21 +113,10 @@ def score_chunk(work: EvaluationJob, names: tuple[str, ...]) -> ChunkResult:
     except InputError as error:
         return ChunkResult(names, skipped={names[0]: str(error)}, refused=error)
     bar: Callable[[str], Any] = partial(_bar, work)
-    run = run_scenes(
+    scores = run_scenes(
         work.filters, scenes, kinds=work.kinds, groups=work.groups, law=work.law, seed=work.seed, counting=bar
     )
-    return ChunkResult(names, run, scenes.describe(), {**left_out, **scenes.skipped}, sigma, scenes.short)
-
-
-def join_chunks(runs: Sequence[ScoredRun]) -> ScoredRun:
-    """The segments of several runs in their order."""
-    if len(runs) == 1:
-        return runs[0]
-    scores = join_scores([run.scores for run in runs])
-    if runs[0].cause is None:
-        return ScoredRun(scores)
-    followed = {name: np.concatenate([(r.followed or {})[name] for r in runs]) for name in scores.filters}
-    return ScoredRun(scores, np.concatenate([r.cause for r in runs if r.cause is not None]), followed)
+    return ChunkResult(names, scores, scenes.describe(), {**left_out, **scenes.skipped}, sigma, scenes.short)
 
 
 def _bar(work: EvaluationJob, title: str) -> AbstractContextManager[ProgressCallback | None]:

@@ -6,8 +6,8 @@ them, which quantity and statistic. Tables, CSV, ``metrics.json``, MLflow's keys
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from itertools import product
 from typing import Any, NamedTuple
@@ -119,10 +119,6 @@ class Results:
         found = dict.fromkeys(v.part for v in self.values if v.part.startswith("at "))
         return [part.removeprefix("at ").removesuffix(" s") for part in found]
 
-    def with_values(self, values: Sequence[Value]) -> Results:
-        """The same and more."""
-        return replace(self, values=(*self.values, *values))
-
     def as_dict(self) -> dict[str, Any]:
         """For ``metrics.json``; ``pandas.DataFrame(**result["values"])`` is the frame, and so for ``comparisons``."""
         rows = [asdict(c) for c in self.comparisons]
@@ -176,6 +172,7 @@ def summarise_scores(
         spread = {"rms": rms(scores.filters[name].innovation)}  # over their 1σ; NaN of a filter without covariance
         values += make_values(scores.kinds[0], name, "segments", "with_gnss", "innovation", spread)
         values += _imu_error_quality(scores, name)
+    values += _bias_response(scores)
     return Results(
         kind=scores.kinds[0],
         count={
@@ -286,6 +283,19 @@ def _imu_error_quality(scores: Scores, name: str) -> list[Value]:
     slopes, rms = slope(estimate, truth, intercept=True), segment_rms((estimate - truth).T)
     kind = scores.kinds[0]
     return imu_error_values(kind, name, "slope", slopes) + imu_error_values(kind, name, "rms", rms)
+
+
+def _bias_response(scores: Scores) -> list[Value]:
+    """Slope over the segments of what each filter's last estimate made of an injected bias; six axes.
+
+    1 for an estimator, 0 for a memoriser (paper.md 4.7). Empty where no bias was injected.
+    """
+    cause = scores.injected_bias
+    if np.isnan(cause).all():
+        return []
+    slopes = {name: slope(run.bias_response, cause, intercept=False) for name, run in scores.filters.items()}
+    rows = (imu_error_values(scores.kinds[0], name, "injected_slope", six) for name, six in slopes.items())
+    return [value for row in rows for value in row]
 
 
 def _phases(scores: Scores, settle_s: float) -> dict[str, Mask]:

@@ -77,12 +77,14 @@ def _blank_scores(batch: Batch, mask: Tensor, groups: Mapping[str, str], kinds: 
         truth_v_n=v,
         true_imu_error=batch.true_imu_error.double().cpu().numpy(),
         origin_e=batch.frame.origin_e.cpu().numpy(),
+        injected_bias=np.full((batch.size[0], 6), np.nan),
     )
 
 
 def _blank(batch: Batch, aids: int) -> FilterRun:
     B, T, _ = batch.size
-    return FilterRun(*(np.full((B, T, n), np.nan) for n in (9, 3, 6, 6, 3, 6, aids)))
+    sizes = [(B, T, n) for n in (9, 3, 6, 6, 3, 6, aids)]
+    return FilterRun(*(np.full(size, np.nan) for size in (*sizes, (B, 6))))
 
 
 def _fill(run: FilterRun, index: Tensor, batch: Batch, estimator: Filter) -> None:

@@ -12,6 +12,7 @@ from dlkf.evaluation.metrics import Array, Mask, OutageIntervals, magnitudes, ou
 from dlkf.navigation.earth import ned_axes
 from dlkf.navigation.geodetic import geodetic_from_ecef
 
+OF_SEGMENTS = ("origin_e", "injected_bias", "bias_response")  # without an axis of time
 OFF_SCALE = 20.0  # a filter this many times worse than the best does not set the scale of a figure
 
 
@@ -36,6 +37,7 @@ class FilterRun:
     position_std: Array  # (P, T, 3) 1σ of the position, likewise
     innovation: Array  # (P, T, 6) innovation over its 1σ, NaN where no fix was used or the filter has no covariance
     aids: Array  # (P, T, A) of further sensors, columns of dlkf.filters.aids.attach.aid_columns
+    bias_response: Array  # (P, 6) how far the last estimate of the IMU error followed an injected bias, NaN without
 
 
 @dataclass
@@ -49,6 +51,7 @@ class Scores:
     truth_v_n: Array  # (P, T, 3)
     true_imu_error: Array  # (P, T, 6)
     origin_e: Array  # (P, 3) ECEF of the tangent frames' origins
+    injected_bias: Array  # (P, 6) that was added to the IMU in runs of their own, NaN without
     filters: dict[str, FilterRun] = field(default_factory=dict)
 
     @property
@@ -103,7 +106,8 @@ def join_scores(parts: Sequence[Scores]) -> Scores:
     T = max(s.outage.shape[1] for s in parts)
 
     def rows(things: Sequence[object], name: str) -> Array:
-        return np.concatenate([_pad(getattr(x, name), T) for x in things])
+        values = [getattr(x, name) for x in things]
+        return np.concatenate(values if name in OF_SEGMENTS else [_pad(x, T) for x in values])
 
     def join_filter(name: str) -> FilterRun:
         runs = [s.filters[name] for s in parts]
@@ -116,7 +120,8 @@ def join_scores(parts: Sequence[Scores]) -> Scores:
         truth_p_n=rows(parts, "truth_p_n"),
         truth_v_n=rows(parts, "truth_v_n"),
         true_imu_error=rows(parts, "true_imu_error"),
-        origin_e=np.concatenate([s.origin_e for s in parts]),
+        origin_e=rows(parts, "origin_e"),
+        injected_bias=rows(parts, "injected_bias"),
         filters={name: join_filter(name) for name in parts[0].filters},
     )
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,20 +12,11 @@ from torch import Tensor
 from dlkf.base.console import ProgressCallback, show_progress
 from dlkf.data.draws import segment_generator
 from dlkf.data.masks import BiasLaw, add_bias
-from dlkf.evaluation.metrics import Array, slope
 from dlkf.evaluation.protocol import Scenes
-from dlkf.evaluation.results import BASELINE, SETTLE_S, Results, imu_error_values, last_finite, summarise_scores
+from dlkf.evaluation.results import BASELINE, SETTLE_S, Results, last_finite, summarise_scores
 from dlkf.evaluation.run import Scene, score_scenes
 from dlkf.evaluation.scores import Scores
 from dlkf.filters.smoother import Filter
-
-
-class ScoredRun(NamedTuple):
-    """Scores of every filter; with injected biases these (P, 6) and how far each filter's estimate followed them."""
-
-    scores: Scores
-    cause: Array | None = None
-    followed: Mapping[str, Array] | None = None
 
 
 def run_scenes(
@@ -38,27 +28,25 @@ def run_scenes(
     law: BiasLaw | None = None,
     seed: int = 0,
     counting: Callable[[str], AbstractContextManager[ProgressCallback | None]] = show_progress,
-) -> ScoredRun:
+) -> Scores:
     """Every filter over the scenes, with ``law`` once more with biases added to the IMU; ``counting`` shows how far."""
     with counting("Running filters") as progress:
         scores = score_scenes(filters, scenes, total=scenes.runs, kinds=kinds, groups=groups, progress=progress)
-    if law is None:
-        return ScoredRun(scores)
-    with counting("Running with injected biases") as progress:
-        response = inject_bias(scores, filters, scenes, law=law, total=scenes.runs, progress=progress, seed=seed)
-    return ScoredRun(scores, *response)
+    if law is not None:
+        with counting("Running with injected biases") as progress:
+            inject_bias(scores, filters, scenes, law=law, total=scenes.runs, progress=progress, seed=seed)
+    return scores
 
 
 def inject_bias(
-    base: Scores, filters: Mapping[str, Filter], scenes: Iterable[Scene], *, law: BiasLaw, seed: int,
+    scores: Scores, filters: Mapping[str, Filter], scenes: Iterable[Scene], *, law: BiasLaw, seed: int,
     total: int | None = None, progress: ProgressCallback | None = None,
-) -> tuple[Array, dict[str, Array]]:  # fmt: skip
-    """A bias injected into every segment (P, 6), and how far each filter's last estimate followed it (P, 6).
+) -> None:  # fmt: skip
+    """A bias injected into every segment, and how far each filter's last estimate followed it, into the ``scores`` of
+    the same filters and scenes without it.
 
     The bias is drawn from N(0, σ²), the σ of ``law``, for each segment by itself, again where the same segment comes
-    again with another outage; ``base`` are the scores of the same filters and scenes without it. Works on real drives,
-    whose IMU error is unknown. The slope of the second against the first (metrics.slope; paper.md 4.7) is 1 for an
-    estimator, 0 for a memoriser.
+    again with another outage. Works on real drives, whose IMU error is unknown.
     """
     drawn: list[Tensor] = []
     seen: Counter[tuple[str, float]] = Counter()
@@ -74,27 +62,16 @@ def inject_bias(
             seen.update(segments)
             yield add_bias(batch, drawn[-1]), mask
 
-    scores = score_scenes(filters, shift_scenes(), total=total, progress=progress)
-    return torch.cat(drawn).numpy(), {
-        name: last_finite(run.imu_error) - last_finite(base.filters[name].imu_error)
-        for name, run in scores.filters.items()
-    }
+    shifted = score_scenes(filters, shift_scenes(), total=total, progress=progress)
+    scores.injected_bias = torch.cat(drawn).numpy()
+    for name, run in scores.filters.items():
+        run.bias_response = last_finite(shifted.filters[name].imu_error) - last_finite(run.imu_error)
 
 
 def make_results(
-    run: ScoredRun, *, baseline: str = BASELINE, settle_s: float = SETTLE_S, seed: int = 0
+    scores: Scores, *, baseline: str = BASELINE, settle_s: float = SETTLE_S, seed: int = 0
 ) -> list[Results]:
-    """The results of each kind of data, with the ``injected_slope`` of each filter's IMU-error estimate where biases
-    were added."""
-    scores = run.scores
-    made = [
+    """The results of each kind of data."""
+    return [
         summarise_scores(scores.of_kind(kind), settle_s=settle_s, baseline=baseline, seed=seed) for kind in scores.kinds
     ]
-    if run.cause is None:
-        return made
-    for k, result in enumerate(made):
-        rows = [i for i, p in enumerate(scores.segments) if p.kind == result.kind]
-        slopes = {n: slope(x[rows], run.cause[rows], intercept=False) for n, x in (run.followed or {}).items()}
-        values = (imu_error_values(result.kind, n, "injected_slope", six) for n, six in slopes.items())
-        made[k] = result.with_values([v for six in values for v in six])
-    return made

@@ -99,8 +99,8 @@ def run_study(
             kinds |= drive_kinds(dataset)
         baseline = BASELINE if BASELINE in filters else None
         groups = {d.name: d.group for d in data.stack}
-        run = run_scenes(filters, scenes, kinds=kinds, groups=groups, law=scoring.injected_bias, seed=scoring.seed)
-        scores, made = run.scores, make_results(run, settle_s=scoring.settle_s, seed=scoring.seed)
+        scores = run_scenes(filters, scenes, kinds=kinds, groups=groups, law=scoring.injected_bias, seed=scoring.seed)
+        made = make_results(scores, settle_s=scoring.settle_s, seed=scoring.seed)
         title = ", ".join(Path(d).name for d in data.datasets)
         after, hour, tables = _endurance(filters, data, scoring, title, say)
         gains = measure_gains(filters, scenes, settle_s=scoring.settle_s) if scoring.gains else {}
