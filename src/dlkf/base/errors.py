@@ -1,7 +1,7 @@
 """A user's mistake, and the end that a signal asks for."""
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 LONGEST_LINE = 200  # letters of a message of another library
 CLOSE = 0.7  # difflib's ratio from which on another name is worth naming
@@ -30,6 +30,12 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     name = str(name)
     best = max(known, key=closeness, default="")
     return f"; did you mean {best}?" if best and closeness(best)[0] >= CLOSE else ""
+
+
+def list_some(names: Sequence[str], most: int = 8) -> str:
+    """The first of several names, and how many more there are: ``a, b and 5 more``."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def no_drives(skipped: Mapping[str, str] | None = None) -> InputError:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, list_some
 from dlkf.base.settings import Ranged
 from dlkf.data.alignment import Start
 from dlkf.data.draws import draw_per_segment
@@ -132,9 +132,8 @@ def find_unused_drives(drives: Sequence[Drive], segments: Sequence[Segment]) -> 
 
 def describe_unused_drives(names: Sequence[str], of: int, segment: str, mend: str) -> str:
     """``3 of 10 drives, too short or not valid long enough for a segment of 120 s: a, b, c; …``: four names at most."""
-    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
     short = f"too short or not valid long enough for a {segment}"
-    return f"{len(names)} of {of} drives, {short}: {', '.join(names[:4])}{more}; {mend}"
+    return f"{len(names)} of {of} drives, {short}: {list_some(names, 4)}; {mend}"
 
 
 def make_batch(

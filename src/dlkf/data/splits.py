@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, list_some
 from dlkf.data.segments import count_epochs
 from dlkf.data.stack import DriveStack
 
@@ -85,8 +85,7 @@ def _split_by_name(stack: DriveStack, split: Mapping[str, Sequence[str] | str]) 
             continue
         listed = [groups] if isinstance(groups, str) else [str(g) for g in groups or ()]
         if missing := [g for g in listed if g not in known]:
-            shown = ", ".join(sorted(known)[:8]) + (", …" if len(known) > 8 else "")
-            raise InputError(f"split.{side}: no group {missing[0]}; has {shown}")
+            raise InputError(f"split.{side}: no group {missing[0]}; has {list_some(sorted(known))}")
         sides[side] = set(listed)
     taken = set().union(*sides.values())
     for side, groups in split.items():

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from dlkf.base.console import ProgressCallback
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, list_some
 from dlkf.base.files import folder_name, resolve_place
 from dlkf.base.parallel import parallel_map
 from dlkf.data.aid_tables import STANDARD, AidTable, standard_tables
@@ -70,8 +70,7 @@ def drive_rows(folder: str | Path, drives: Sequence[str] | str | None = None) ->
         raise InputError(f"drives names {doubles[0]} twice; name each drive once")
     known = {row.name: row for row in rows}
     if unknown := [name for name in drives if name not in known]:
-        shown = ", ".join(list(known)[:8]) + (", …" if len(known) > 8 else "")
-        raise InputError(f"dataset {folder}: no drive {unknown[0]}; has {shown}")
+        raise InputError(f"dataset {folder}: no drive {unknown[0]}; has {list_some(list(known))}")
     return [known[name] for name in drives]
 
 

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from dlkf.base.errors import InputError, did_you_mean, first_line
+from dlkf.base.errors import InputError, did_you_mean, first_line, list_some
 from dlkf.base.files import (
     is_url,
     open_parquet,
@@ -140,7 +140,7 @@ def read_table(folder: str | Path, kind: str, drive: str, column: str = "") -> C
         root = resolve_place(folder)
         others = sorted(other.name for other in (root / kind).glob("drive=*"))
         if others and not (root / "imu" / place.name).exists():
-            listed = ", ".join(others[:5]) + (", …" if len(others) > 5 else "")
+            listed = list_some(others, 5)
             raise InputError(f"drive {drive}: is in drives.parquet, but {kind}/ has {listed} alone; give both one name")
         if kind == "gnss":
             raise InputError(f"drive {drive}: no GNSS, {place}/ has no Parquet file; a filter needs position fixes")

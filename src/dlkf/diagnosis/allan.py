@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from dlkf.base.colours import COLOURS
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, list_some
 from dlkf.base.files import write_into
 from dlkf.base.provenance import describe_provenance
 from dlkf.data.schema import stack_columns
@@ -317,6 +317,5 @@ def choose_drive(names: Sequence[str], drive: str | None) -> str:
     if drive is None and len(names) == 1:
         return names[0]
     if drive is None or drive not in names:
-        shown = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
-        raise InputError(f"drive={drive}: give the drive at rest, one of {shown}")
+        raise InputError(f"drive={drive}: give the drive at rest, one of {list_some(names)}")
     return drive

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, list_some
 from dlkf.data.draws import draw_per_segment
 from dlkf.data.drive import Batch
 from dlkf.data.masks import mask_outage
@@ -110,7 +110,7 @@ def describe_unused(plan: OutagePlan, outage: np.ndarray, ends_s: np.ndarray, dr
     short = [drive for drive in unused if longest[drive] < first + duration]
     needed = f"outage.first_s={first:g} + outage.duration_s={duration:g} s"
     said = [
-        f"{_list_few(names)} {why}"
+        f"{list_some(names, FEW_NAMED)} {why}"
         for names, why in (
             (short, f"too short for {needed}"),
             ([d for d in unused if d not in short], "without a fix at its start or valid truth throughout"),
@@ -118,11 +118,6 @@ def describe_unused(plan: OutagePlan, outage: np.ndarray, ends_s: np.ndarray, dr
         if names
     ]
     return f"no outage in {len(unused)} of {len(longest)} drives: {'; '.join(said)}" if unused else ""
-
-
-def _list_few(names: Sequence[str]) -> str:
-    more = f" and {len(names) - FEW_NAMED} more" if len(names) > FEW_NAMED else ""
-    return ", ".join(names[:FEW_NAMED]) + more
 
 
 def check_outages(plan: OutagePlan | None, withheld: Tensor | np.ndarray, longest_s: float) -> None:

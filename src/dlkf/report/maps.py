@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dlkf.base.errors import list_some
 from dlkf.data.limits import DEGREE_M
 from dlkf.report.drawing import Figure, Trace
 from dlkf.report.plots import FONT
@@ -74,8 +75,7 @@ def _shrink(place: Array) -> Array:
 
 
 def _join(areas: Sequence[Area], name: str | None = None) -> Area:
-    more = f" and {len(areas) - FEW_NAMED} more" if len(areas) > FEW_NAMED else ""
-    name = name or ", ".join(area.name for area in areas[:FEW_NAMED]) + more
+    name = name or list_some([area.name for area in areas], FEW_NAMED)
     return Area(name, np.min([a.low for a in areas], 0), np.max([a.high for a in areas], 0))
 
 

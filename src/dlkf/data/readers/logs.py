@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from dlkf.base.errors import InputError
+from dlkf.base.errors import InputError, list_some
 from dlkf.base.settings import is_number, settings_from
 from dlkf.data.discovery.findings import Sure
 from dlkf.data.readers import formats
@@ -26,11 +26,11 @@ from dlkf.data.readers.contract import gnss_frame, imu_frame, reference_frame
 from dlkf.data.readers.formats import rosbag
 from dlkf.data.readers.frames import DriveFrames, Place
 from dlkf.data.readers.mapping import (
+    MOST_NAMED,
     SOURCE,
     Mapped,
     Spec,
     check_keys,
-    join_some,
     list_unused,
     select_rows,
     spread_stamps,
@@ -266,7 +266,7 @@ def _list_unread_files(folder: Path, mapped: Mapping[str, Mapped]) -> list[str]:
     read = {p.table.path.name for whole in mapped.values() for p in (whole, *whole.parts.values())}
     suffixes = {Path(name).suffix.lower() for name in read} - {""}
     left = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in suffixes and p.name not in read)
-    return [f"files that are not read: {join_some(left)}"] if left else []
+    return [f"files that are not read: {list_some(left, MOST_NAMED)}"] if left else []
 
 
 def _list_unread_velocities(gnss: Mapped | None) -> list[str]:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from dlkf.base.errors import InputError, did_you_mean
+from dlkf.base.errors import InputError, did_you_mean, list_some
 from dlkf.data.readers import units
 from dlkf.data.readers.frames import LogTable
 
@@ -224,10 +224,9 @@ class Mapped:
         name = next((one for one in (str(name), *str(name).split(" | ")) if one in self.table.frame), str(name))
         if name not in self.table.frame:
             have = [str(c) for c in self.table.frame.columns]
-            has = ", ".join(have[:24]) + (", …" if len(have) > 24 else "")
             other = next((m for m in (";", "\t", ",") if len(have) == 1 and m in have[0]), None)
             remedy = self._entry_to_set(name) if other is None else self._text_to_set("separator", other)
-            raise InputError(f"{self.table.path}: no column {name!r}; has {has}; {remedy}")
+            raise InputError(f"{self.table.path}: no column {name!r}; has {list_some(have, MOST_NAMED)}; {remedy}")
         return self.table.frame[name]
 
     def _text_to_set(self, key: str, value: str) -> str:
@@ -297,7 +296,8 @@ def list_unused(mapped: Mapping[str, Mapped]) -> list[str]:
             there.setdefault(name, [str(c) for c in part.table.frame.columns])
             used.setdefault(name, set()).update(_column_names(part.spec))
     left = {name: [c for c in columns if c not in used[name]] for name, columns in there.items()}
-    return [f"columns of {name} that are not used: {join_some(columns)}" for name, columns in left.items() if columns]
+    some = {name: list_some(columns, MOST_NAMED) for name, columns in left.items() if columns}
+    return [f"columns of {name} that are not used: {columns}" for name, columns in some.items()]
 
 
 def _column_names(spec: Any) -> set[str]:
@@ -312,12 +312,6 @@ def _column_names(spec: Any) -> set[str]:
         else:
             found |= _column_names(value)
     return found
-
-
-def join_some(names: Sequence[str]) -> str:
-    """Names after one another, the first :data:`MOST_NAMED` of them."""
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return ", ".join(names[:MOST_NAMED]) + more
 
 
 def _names(mapped: Mapped, key: str) -> list[Any]:
