@@ -12,7 +12,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
-from dlkf.base.config import config_dir
+from dlkf.base.config import config_dir, preset_names
 from dlkf.base.documents import read_yaml
 from dlkf.base.errors import InputError, did_you_mean
 from dlkf.base.files import is_url
@@ -72,8 +72,7 @@ def check_choices(arguments: Sequence[str]) -> None:
         meant = key.lstrip("+").partition("@")[2] or group
         if re.fullmatch(r"null|none|true|false|[-+.\d][\d.e+-]*", value, re.IGNORECASE):
             more = f"; a length in seconds is outage.duration_s={value}" if group == "outage" else ""
-            names = sorted(file.stem for file in (config_dir() / group).glob("[!_]*.yaml"))
-            raise InputError(f"{meant}={value}: must be the name of a preset: {', '.join(names)}{more}")
+            raise InputError(f"{meant}={value}: must be the name of a preset: {', '.join(preset_names(group))}{more}")
         if value.startswith("[") and "," in value and not key.startswith("+"):
             each = value.strip("[]").replace(" ", "")
             raise InputError(f"{meant}={value}: one preset at a time; -m {meant}={each} runs one after the other")

@@ -10,7 +10,7 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from dlkf.base.config import config_dir
+from dlkf.base.config import config_dir, read_preset
 from dlkf.base.settings import settings_from
 from dlkf.filters.tuning import Tuning
 from dlkf.navigation.imu_errors import ImuSpec, imu_spec
@@ -26,12 +26,12 @@ def compose_command(command: str, *overrides: str, resolve: bool = True) -> dict
 
 def imu_preset(name: str) -> ImuSpec:
     """Of ``conf/imu``."""
-    return imu_spec(compose_command("allan", f"imu={name}")["imu"])
+    return imu_spec(read_preset("imu", name))
 
 
 def tuning_preset(name: str) -> Tuning:
     """Of ``conf/tuning``."""
-    return settings_from(Tuning, compose_command("evaluate", f"tuning={name}")["tuning"], "tuning")
+    return settings_from(Tuning, read_preset("tuning", name), "tuning")
 
 
 def configuration_hash(values: Mapping[str, Any]) -> str:

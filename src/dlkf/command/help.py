@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 
-from dlkf.base.config import config_dir
+from dlkf.base.config import config_dir, preset_names
 
 MOST = {
     "simulate": ("dataset.hours", "dataset.drive_minutes", "seed", "out", "overwrite"),
@@ -74,10 +74,9 @@ def list_groups(text: str) -> list[dict[str, str]]:
 
 
 def list_presets(group: str, command: str) -> list[str]:
-    """Names to choose from; what several share begins with an underscore."""
+    """Names to choose from."""
     preset, taker = ALONE.get(group, ("", command))
-    found = sorted(path.stem for path in (config_dir() / group).glob("[!_]*.yaml"))
-    return [name for name in found if name != preset or command == taker]
+    return [name for name in preset_names(group) if name != preset or command == taker]
 
 
 def list_keys(text: str) -> dict[str, tuple[str, str]]:

@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import yaml
 
-from dlkf.base.config import config_dir
+from dlkf.base.config import preset_names, read_preset
 from dlkf.base.errors import InputError, did_you_mean
 from dlkf.data.limits import LEVER_ARM_M
 
@@ -300,8 +299,7 @@ def check_whole(name: str, value: Any, least: int) -> int:
 
 def check_preset(group: str, name: Any, argument: str = "") -> None:
     """InputError for a name that is no preset of ``conf/<group>``, with the closest."""
-    known = sorted(f.stem for f in (config_dir() / group).glob("*.yaml") if not f.stem.startswith("_"))
-    known = [name for name in known if (group, name) != ("imu", "auto")]
+    known = [name for name in preset_names(group) if (group, name) != ("imu", "auto")]
     if not isinstance(name, str):
         raise InputError(f"{argument or group} is {_shorten(name)}, must be the name of a preset: {', '.join(known)}")
     if name not in known:
@@ -309,21 +307,18 @@ def check_preset(group: str, name: Any, argument: str = "") -> None:
         raise InputError(f"unknown {group} preset {name!r}{near or ';'} known are {', '.join(known)}")
 
 
-def read_preset(group: str, name: Any) -> dict[str, Any]:
-    """The content of a preset of ``conf/<group>``."""
-    check_preset(group, name)
-    return yaml.safe_load((config_dir() / group / f"{name}.yaml").read_text())
-
-
 def tuning_values(tuning: str | Mapping[str, Any]) -> Mapping[str, Any]:
     """The factors of a Kalman filter's noise: a preset of ``conf/tuning``, or such factors by name."""
-    if isinstance(tuning, Mapping):
-        return tuning
-    check_preset("tuning", tuning)
-    below = tuning_values("untuned") if tuning != "untuned" else {}
-    return {**below, **{key: value for key, value in read_preset("tuning", tuning).items() if key != "defaults"}}
+    return _preset_values("tuning", tuning)
 
 
 def imu_values(imu_type: str | Mapping[str, Any]) -> Mapping[str, Any]:
     """The values of an IMU's error model."""
-    return imu_type if isinstance(imu_type, Mapping) else read_preset("imu", imu_type)
+    return _preset_values("imu", imu_type)
+
+
+def _preset_values(group: str, given: str | Mapping[str, Any]) -> Mapping[str, Any]:
+    if isinstance(given, Mapping):
+        return given
+    check_preset(group, given)
+    return read_preset(group, given)

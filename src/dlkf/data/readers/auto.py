@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from dlkf.base.config import merge_settings, read_preset
 from dlkf.base.errors import InputError
 from dlkf.data.readers import formats, recognise
 from dlkf.data.readers.archives import drive_name, drive_places, is_archive, unpack
@@ -19,12 +20,10 @@ from dlkf.data.readers.offers import (
     Offer,
     find_format,
     leave_open,
-    load_preset,
     recognise_file,
     text_options,
 )
 from dlkf.data.readers.settling import Unsure
-from dlkf.data.readers.sharing import merge_settings
 
 LAYOUTS = {  # presets whose files are known by their names
     "kitti": ("oxts/timestamps.txt",),
@@ -181,14 +180,14 @@ class AutoReader:
             return None, []
         if not (known.get("value") or known.get("pressure") or known.get("height")):
             raise InputError(f"{folder}: reader.{kind}.file={file}: nothing there is known as {kind}; give its columns")
-        return merge_settings(leave_open({kind: load_preset("csv")[kind]})[kind], known), []
+        return merge_settings(leave_open({kind: read_preset("reader", "csv")[kind]})[kind], known), []
 
 
 def _recognise_files(folder: Path) -> list[Contents]:
     """What the files of a folder hold; of one whose files are known by their names, that."""
     for name, files in LAYOUTS.items():
         if all((folder / file).is_file() for file in files):
-            base = load_preset(name)
+            base = read_preset("reader", name)
             specs = leave_open({kind: base[kind] for kind in ("imu", "gnss")})
             if (beside := BAROMETERS.get(name)) and (folder / beside).is_file():  # by the clock of the IMU
                 specs["baro"] = {**base["baro"], "file": beside}

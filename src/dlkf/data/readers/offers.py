@@ -9,14 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from dlkf.base.config import config_dir
+from dlkf.base.config import read_preset
 from dlkf.base.errors import InputError
 from dlkf.data.readers import formats, recognise, vocabulary
 from dlkf.data.readers.formats import autopilot, matlab, nmea, rosbag, text, ubx
 from dlkf.data.readers.frames import LogTable
-from dlkf.data.readers.sharing import merge_settings
 
 GNSS_ONLY = ("nmea", "rtklib", "inertial_explorer")
 PRESETS = (*GNSS_ONLY, "ubx", "rosbag", "gnss_logger", "novatel", "navego", "px4", "ardupilot")
@@ -94,7 +91,7 @@ def recognise_file(path: Path) -> Contents:
 
 
 def _offer_preset(path: Path, name: str) -> Contents:
-    base = load_preset(name)
+    base = read_preset("reader", name)
     source = {"file": path.name, "text": _preset_text(base)}
     lacks = {kind: _describe_lack(path, name, kind, base) for kind in ("imu", "gnss")}
     specs = {kind: {**base[kind], **source} for kind, why in lacks.items() if why is None}
@@ -225,13 +222,6 @@ def _above_header(lines: list[str], separator: str) -> int:
         return 0
     numbers = [sum(text._is_number(c, ".") for c in row) for row in cells[first : first + 2]]
     return first if numbers[0] == 0 and numbers[1] > 1 else 0
-
-
-def load_preset(name: str) -> dict[str, Any]:
-    """A reader's preset with what it takes over from csv's."""
-    folder = config_dir() / "reader"
-    own = yaml.safe_load((folder / f"{name}.yaml").read_text())
-    return merge_settings(yaml.safe_load((folder / "csv.yaml").read_text()), own)
 
 
 def _preset_text(base: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -93,14 +92,6 @@ def _average_alike(values: Sequence[Any], limit: float) -> Any:
             return round(middle, 4) if spread <= limit else None
         return float(f"{middle:.6g}") if spread <= limit * abs(middle) else None
     return first if all(v == first for v in values) else None
-
-
-def merge_settings(base: Any, over: Any) -> Any:
-    """A mapping with the values of another one in their place."""
-    if not isinstance(base, Mapping) or not isinstance(over, Mapping):
-        return copy.deepcopy(over)
-    out = {key: copy.deepcopy(value) for key, value in base.items() if key not in over}
-    return out | {key: merge_settings(base.get(key), value) for key, value in over.items()}
 
 
 def read_value(mapping: Any, name: str) -> Any:
