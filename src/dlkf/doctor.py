@@ -23,7 +23,7 @@ def main(settings: DoctorSettings) -> None:
     bad = noted = 0
     for row in drive_rows(settings.dataset, settings.drives):
         console.print(Text(row.name, style="bold"))
-        for finding in checkup(settings.dataset, row, discover_pose=settings.discover):
+        for finding in checkup(settings.dataset, row):
             console.print(Text(f"  {finding.grade:5}", style=STYLES[finding.grade]) + Text(f" {finding.text}"))
             bad, noted = bad + (finding.grade == "BAD"), noted + (finding.grade not in (GOOD, "BAD"))
     console.print(f"{bad} bad, {noted} to know" if bad or noted else "all good")

@@ -189,7 +189,7 @@ def test_doctor_sees_what_is_wrong(town, call, tmp_path):
     change("imu", second, saturated)
     done = call("doctor", "dataset=town", f"drives={first}")
     assert done.code == 1 and re.search(r"BAD .*yaw: 90", " ".join(done.out.split())), done.out
-    done = call("doctor", "dataset=town", f"drives={second}", "discover=false")
+    done = call("doctor", "dataset=town", f"drives={second}")
     assert done.code == 1 and "gyro_z stays at 0.05" in done.out, done.out
 
 

@@ -152,7 +152,6 @@ class DoctorSettings:
 
     dataset: str
     drives: Names
-    discover: bool
 
 
 @dataclass(frozen=True)

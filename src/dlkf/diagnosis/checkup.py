@@ -32,11 +32,10 @@ class CheckupResult(NamedTuple):
     text: str
 
 
-def checkup(folder: str | Path, row: DriveRow, *, discover_pose: bool = True) -> Iterator[CheckupResult]:
+def checkup(folder: str | Path, row: DriveRow) -> Iterator[CheckupResult]:
     """The findings about a drive; one that cannot be read is a single bad one.
 
-    ``discover_pose`` also estimates clock offset, sensor pose and lever arm from the motion
-    (:mod:`dlkf.data.discovery`).
+    Clock offset, sensor pose and lever arm are estimated from the motion (:mod:`dlkf.data.discovery`).
     """
     try:
         tables = read_drive(folder, row, reference=True)
@@ -54,8 +53,7 @@ def checkup(folder: str | Path, row: DriveRow, *, discover_pose: bool = True) ->
         attitude = bool(np.isfinite(tables.reference["roll"]).any())
         text = f"reference: {share:.0%} of its rows valid, {'with' if attitude else 'without'} attitude"
         yield CheckupResult(GOOD if share > 0.5 and attitude else NOTE, text)
-    if discover_pose:
-        yield from discover_findings(tables)
+    yield from discover_findings(tables)
 
 
 def imu_findings(imu: Columns) -> Iterator[CheckupResult]:
