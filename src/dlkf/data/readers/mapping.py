@@ -225,9 +225,7 @@ class Mapped:
         if name not in self.table.frame:
             have = [str(c) for c in self.table.frame.columns]
             has = ", ".join(have[:24]) + (", …" if len(have) > 24 else "")
-            other = next((m for m in (";", "\t", ",") if len(have) == 1 and m in have[0]), None)
-            remedy = self._entry_to_set(name) if other is None else self._text_to_set("separator", other)
-            raise InputError(f"{self.table.path}: no column {name!r}; has {has}; {remedy}")
+            raise InputError(f"{self.table.path}: no column {name!r}; has {has}; {self._entry_to_set(name)}")
         return self.table.frame[name]
 
     def _text_to_set(self, key: str, value: str) -> str:
