@@ -208,6 +208,16 @@ def test_what_is_not_sure_is_refused(tmp_path):
     assert "\n" not in str(error.value)
 
 
+def test_a_clock_that_was_set_back_is_named_before_anything_is_estimated(tmp_path):
+    _hidden(tmp_path / "logs", car(20))
+    box = tmp_path / "logs" / "box.txt"
+    imu = pd.read_csv(box, sep=";")
+    imu.loc[500:, "stamp"] -= 9000
+    imu.to_csv(box, sep=";", index=False)
+    with pytest.raises(InputError, match=r"box.txt: row 500: .*the clock was set back there: make two drives of it"):
+        list(AutoReader().read(tmp_path / "logs"))
+
+
 def test_kf_gins_files_by_their_numbers(tmp_path, drive):
     """No header, increments, blanks: told by gravity and by what rises."""
     folder = tmp_path / "a"

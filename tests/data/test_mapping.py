@@ -61,6 +61,20 @@ def test_date_and_time_in_two_columns_and_seconds_of_the_day(tmp_path, tables):
     np.testing.assert_allclose(drive.gnss.t, tables["gnss"].t, atol=1e-6)
 
 
+@pytest.mark.parametrize("day", [None, "2025-07-05"])
+def test_times_of_day_without_a_date_go_on_after_midnight(tmp_path, tables, day):
+    """Nor do they get a date that nobody gave, as today's."""
+    for kind in ("imu", "gnss"):
+        stamps = pd.to_datetime(np.round((86_390 + tables[kind].t) * 1e9).astype(np.int64))
+        tables[kind].assign(t=stamps.dt.strftime("%H:%M:%S.%f")).to_csv(tmp_path / f"{kind}.csv", index=False)
+    time = {"column": "t", "unit": "iso", "day": day, "clock": "utc" if day else None}
+    drive = read(tmp_path, tables, imu__time=time, gnss__time=time)
+    np.testing.assert_allclose(drive.imu.t, tables["imu"].t, atol=1e-6)
+    np.testing.assert_allclose(drive.gnss.t, tables["gnss"].t, atol=1e-6)
+    assert (drive.meta.get("gps_zero_s") is not None) == (day is not None)
+    assert any("which have no date; reader.gnss.time.day=" in note for note in drive.notes) == (day is None)
+
+
 def test_leap_seconds_and_wrapping_counters():
     """IERS Bulletin C: none in 1980, 15 in 2011, 17 from July 2015, 18 since 2017."""
     dates = ["1980-02-01", "2011-09-26", "2015-06-30T23:59:59", "2015-07-01", "2018-01-01"]
@@ -221,6 +235,10 @@ MISTAKES = {
     "lever arm": ({"lever_arm_m": 0.5}, "reader.lever_arm_m=0.5: must be three numbers"),
     "separator": ({"separator": "((("}, "reader.separator='(((' is no regular expression"),
     "encoding": ({"encoding": "klingon"}, "reader.encoding=klingon"),
+    "dates that start again": (
+        {"gnss__time": {"column": "when", "unit": "iso", "wraps_s": 86_400}},
+        "wraps_s=86400: stamps with a date do not start again",
+    ),
     "text stamps": ({"gnss__time__column": "when"}, "reader.gnss.time.unit=iso"),
     "no GNSS for auto": ({"gnss__file": None, "imu__accel__axes": "auto"}, "needs GNSS to compare with"),
 }

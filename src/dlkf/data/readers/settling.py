@@ -20,7 +20,7 @@ from dlkf.data.readers.mapping import Mapped
 from dlkf.data.readers.sharing import read_value, set_value, write_value
 from dlkf.data.schema import ACCEL, stack_columns
 from dlkf.data.tables import Columns
-from dlkf.data.validate import usable_fixes
+from dlkf.data.validate import check_time, usable_fixes
 
 AUTO = "auto"
 AXES = {"imu.accel.axes", "imu.gyro.axes"}
@@ -88,6 +88,8 @@ def settle(
             f"{where}: {log.path} has {count} {'fix' if count == 1 else 'fixes'}, which are not the "
             f"motion of a car{why}; copy the log again, or leave the drive out"
         )
+    for kind in ("imu", "gnss"):
+        check_time(t[kind], f"{where}, {mapped[kind].table.path.name}", kind)
     found: list[Finding] = []
     if "gnss.velocity.unit" in wanted:
         found.append(_speed_unit(mapped["gnss"], t["gnss"]))
