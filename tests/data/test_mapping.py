@@ -61,6 +61,20 @@ def test_date_and_time_in_two_columns_and_seconds_of_the_day(tmp_path, tables):
     np.testing.assert_allclose(drive.gnss.t, tables["gnss"].t, atol=1e-6)
 
 
+@pytest.mark.parametrize(("zone", "ahead_s"), [("", 7200), ("Z", 0), ("+02:00", 0)])
+def test_dates_of_local_time_are_told_by_the_imus_unix_time(tmp_path, tables, zone, ahead_s):
+    """A zone that a text names is its own; then the clocks are otherwise 2 h apart, which changes no date."""
+    shown = pd.to_datetime((UNIX + 7200) * 10**9 + np.round(tables["gnss"].t * 1e9).astype(np.int64))
+    tables["gnss"].assign(t=shown.dt.strftime("%d.%m.%Y %H:%M:%S.%f") + zone).to_csv(tmp_path / "gnss.csv", index=False)
+    tables["imu"].assign(t=UNIX + tables["imu"].t).to_csv(tmp_path / "imu.csv", index=False)
+    offset_s = 0 if zone == "+02:00" else -7200
+    drive = read(tmp_path, tables, gnss__time={"column": "t", "unit": "iso", "clock": None, "offset_s": offset_s})
+    np.testing.assert_allclose(drive.gnss.t, tables["gnss"].t, atol=1e-6)
+    expected = GPS + (7200 if zone == "Z" else 0) - drive.meta["time_zero_s"] + UNIX
+    assert drive.meta["gps_zero_s"] == pytest.approx(expected, abs=1e-3)
+    assert any("so they are local time" in note for note in drive.notes) == (ahead_s > 0)
+
+
 @pytest.mark.parametrize("day", [None, "2025-07-05"])
 def test_times_of_day_without_a_date_go_on_after_midnight(tmp_path, tables, day):
     """Nor do they get a date that nobody gave, as today's."""

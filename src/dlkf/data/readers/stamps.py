@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from dlkf.base.errors import InputError
+from dlkf.data.discovery.clock import FARTHEST_ZONE_H
 from dlkf.data.discovery.units import time_unit
 from dlkf.data.readers import units, vocabulary
 from dlkf.data.readers.frames import LogTable
@@ -20,6 +21,8 @@ CALENDAR += r"[T ]+\d{1,2}:\d{2}"
 DAY = r"^\s*(\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4}|\d{1,2}[/.]\d{1,2}[/.]\d{2}|\d{8}"
 DAY += r"|\d{4}年\d{1,2}月\d{1,2}日)\s*$"
 NEWEST_UNIX = 2e9  # s: 2033; a stamp beyond it counts from no known epoch
+NAMED_ZONE = r"(?:Z|UTC|GMT|[+-]\d{2}:?\d{2})\s*$"
+QUARTER_S, LEAST_ZONE_S = 900, 3600  # time zones are whole quarters of an hour
 SWITCHED_ON_S = 1000.0  # a log that begins with less counts from its own beginning, which is nothing to report
 OLDEST_UNIX = 1.0e9  # s: 2001; no log of a car with an IMU of this kind is older
 
@@ -138,6 +141,20 @@ def _dates(seconds: float) -> dict[str, str | None]:
 
 def _day(unix: float) -> str:
     return str(np.datetime64(int(unix), "s"))[:10]
+
+
+def local_time_s(gnss: Mapped, imu: Mapped) -> int:
+    """Time zone [s ahead of UTC] of the fixes' calendar texts, by the offset that brings them to an IMU's Unix time; 0
+    where they name a zone themselves, or the IMU's stamps have no date or are texts too."""
+    texts, ahead_s = gnss.time.get("unit") == units.ISO, -float(gnss.time.get("offset_s") or 0.0)
+    if not texts or imu.time.get("unit") == units.ISO or imu.first_gps_s() is None or gnss.time.get("clock") == "gps":
+        return 0
+    column = gnss.time["column"]
+    last = gnss.texts(column[-1] if isinstance(column, list) else column)
+    if bool(last.str.contains(NAMED_ZONE).any()) or gnss.first_gps_s() is None:
+        return 0
+    zone_s = QUARTER_S * round(ahead_s / QUARTER_S)
+    return zone_s if LEAST_ZONE_S <= abs(zone_s) <= FARTHEST_ZONE_H * 3600 and abs(ahead_s - zone_s) < 40 else 0
 
 
 def epoch_note(part: Mapped) -> str | None:
