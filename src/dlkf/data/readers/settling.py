@@ -138,7 +138,15 @@ def _speed_unit(gnss: Mapped, t: np.ndarray) -> Finding:
         return Finding("gnss.velocity.unit", "m/s", True, "no velocities")
     speed = v[:, 0] if gnss.spec["velocity"].get("frame") == "course" else np.hypot(v[:, 0], v[:, 1])
     place = positions(gnss)
-    factor, spread = speed_factor(t, place["lat_deg"], place["lon_deg"], speed)
+    finding = _unit_by_way(t, place["lat_deg"], place["lon_deg"], speed)
+    if not finding.sure and _unit_by_way(t, place["lon_deg"], place["lat_deg"], speed).sure:
+        remedy = "latitude and longitude look swapped: exchange them in reader.gnss.position.columns"
+        return replace(finding, value=None, remedy=remedy)
+    return finding
+
+
+def _unit_by_way(t: np.ndarray, lat_deg: np.ndarray, lon_deg: np.ndarray, speed: np.ndarray) -> Finding:
+    factor, spread = speed_factor(t, lat_deg, lon_deg, speed)
     apart = {name: abs(np.log(factor / f)) if factor > 0 else np.inf for name, f in units.SPEED.items()}
     best = min(apart, key=lambda name: apart[name])
     certain = apart[best] < 0.08 and spread < 0.2 * factor
