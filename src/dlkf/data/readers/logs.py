@@ -282,8 +282,8 @@ def _list_unread_velocities(gnss: Mapped | None) -> list[str]:
 
 
 def _gps_time(gnss: Mapped, t: np.ndarray, zone_s: int) -> dict[str, float]:
-    """GPS time = ``gps_zero_s`` + ``gps_rate`` t by the fixes' own stamps, which are ``zone_s`` ahead of UTC, independent
-    of t's clock; empty where they have no date."""
+    """GPS time = ``gps_zero_s`` + ``gps_rate`` t by the fixes' own stamps (``zone_s`` ahead of UTC), independent of t's
+    clock; empty where they have no date."""
     first = gnss.first_gps_s()
     if first is None:
         return {}

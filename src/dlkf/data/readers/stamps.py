@@ -182,7 +182,8 @@ def epoch_note(part: Mapped) -> str | None:
         return f"{what}: taken as hours, minutes and seconds (hhmmss), which have no date; {setting}.day=… gives it"
     single = time.get("unit") == units.ISO and not isinstance(column, list)
     if single and bool(part.texts(str(column)).str.match(units.OF_DAY).all()):
-        return None if time.get("day") else f"{what}: times of day, which have no date; {setting}.day=2025-07-05 gives it"
+        undated = f"{what}: times of day, which have no date; {setting}.day=2025-07-05 gives it"
+        return None if time.get("day") else undated
     if time.get("unit") == units.ISO:
         as_what = {"gps": "GPS time", None: "of an unnamed clock"}.get(clock, "UTC")
         other = ""

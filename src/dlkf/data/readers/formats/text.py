@@ -149,7 +149,7 @@ def _check_separator(path: Path, lines: list[str], separator: str, kind: str) ->
 
 def _parse(path: Path, lines: list[str], numbers: list[int], options: Mapping[str, Any]) -> pd.DataFrame:
     separator = options["separator"]
-    by_c = {"low_memory": False} if len(separator) == 1 or separator == r"\s+" else {}  # pandas' C parser takes no other
+    simple = len(separator) == 1 or separator == r"\s+"  # pandas' parser in C takes no other
     try:
         with warnings.catch_warnings():  # of a separator at the end of every line; missing columns are reported
             warnings.simplefilter("ignore", pd.errors.ParserWarning)
@@ -162,7 +162,7 @@ def _parse(path: Path, lines: list[str], numbers: list[int], options: Mapping[st
                 comment=options["comment"],
                 skipinitialspace=True,
                 index_col=False,
-                **by_c,
+                **({"low_memory": False} if simple else {}),
             )
     except (pd.errors.ParserError, pd.errors.EmptyDataError, ValueError, re.error) as error:
         detail = first_line(error).strip()
