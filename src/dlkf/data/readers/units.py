@@ -165,8 +165,9 @@ def seconds_of_day(values: np.ndarray) -> np.ndarray:
 
 def nanoseconds_of_day(texts: np.ndarray, where: str) -> np.ndarray | None:
     """Times of day without a date (23:57:12.7) as nanoseconds of the day; None for any other texts."""
-    times = pd.Series(texts)
-    return _calendar(("1970-01-01 " + times).to_numpy(), where) if bool(times.str.match(OF_DAY).all()) else None
+    if not all(re.match(OF_DAY, text) for text in texts):
+        return None
+    return _calendar(np.array([f"1970-01-01 {text}" for text in texts]), where)
 
 
 def day_of_number(value: object) -> str | None:

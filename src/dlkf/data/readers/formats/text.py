@@ -10,6 +10,7 @@ import warnings
 import zlib
 from collections import Counter
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -149,11 +150,12 @@ def _check_separator(path: Path, lines: list[str], separator: str, kind: str) ->
 
 def _parse(path: Path, lines: list[str], numbers: list[int], options: Mapping[str, Any]) -> pd.DataFrame:
     separator = options["separator"]
-    simple = len(separator) == 1 or separator == r"\s+"  # pandas' parser in C takes no other
+    in_c = len(separator) == 1 or separator == r"\s+"  # pandas' parser in C takes no other
+    read_csv = partial(pd.read_csv, low_memory=False) if in_c else pd.read_csv
     try:
         with warnings.catch_warnings():  # of a separator at the end of every line; missing columns are reported
             warnings.simplefilter("ignore", pd.errors.ParserWarning)
-            frame = pd.read_csv(
+            frame = read_csv(
                 io.BytesIO("\n".join(lines).encode()),  # a StringIO has four bytes a letter
                 encoding="utf-8",
                 sep=separator,
@@ -162,7 +164,6 @@ def _parse(path: Path, lines: list[str], numbers: list[int], options: Mapping[st
                 comment=options["comment"],
                 skipinitialspace=True,
                 index_col=False,
-                **({"low_memory": False} if simple else {}),
             )
     except (pd.errors.ParserError, pd.errors.EmptyDataError, ValueError, re.error) as error:
         detail = first_line(error).strip()
