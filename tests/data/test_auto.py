@@ -208,6 +208,16 @@ def test_what_is_not_sure_is_refused(tmp_path):
     assert "\n" not in str(error.value)
 
 
+def test_a_clock_that_was_set_back_is_named_before_anything_is_estimated(tmp_path):
+    _hidden(tmp_path / "logs", car(20))
+    box = tmp_path / "logs" / "box.txt"
+    imu = pd.read_csv(box, sep=";")
+    imu.loc[500:, "stamp"] -= 9000
+    imu.to_csv(box, sep=";", index=False)
+    with pytest.raises(InputError, match=r"box.txt: row 500: .*the clock was set back there: make two drives of it"):
+        list(AutoReader().read(tmp_path / "logs"))
+
+
 def test_kf_gins_files_by_their_numbers(tmp_path, drive):
     """No header, increments, blanks: told by gravity and by what rises."""
     folder = tmp_path / "a"
@@ -232,6 +242,34 @@ def test_an_opposite_accelerometer(tmp_path, streets):
     (got,) = AutoReader().read(tmp_path / "a")
     assert got.mapping["imu"]["accel"]["unit"] == pytest.approx(-9.80665)
     np.testing.assert_allclose(got.imu.accel_z, drive["imu"].accel_z, atol=0.02)
+
+
+def test_latitude_and_longitude_under_each_others_names(tmp_path, drive):
+    _hidden(tmp_path / "a", drive)
+    file = tmp_path / "a" / "receiver.csv"
+    fixes = pd.read_csv(file)
+    fixes.rename(columns={"Latitude": "Longitude", "Longitude": "Latitude"}).to_csv(file, index=False)
+    with pytest.raises(InputError, match=r"look swapped: exchange them in reader\.gnss\.position\.columns"):
+        list(AutoReader().read(tmp_path / "a"))
+
+
+def test_sensor_logger_without_gravity_is_not_taken_for_phyphox(tmp_path, drive):
+    """Its Accelerometer.csv, a file of both apps, is without gravity; TotalAcceleration.csv was not recorded."""
+    imu, gnss = drive["imu"], drive["gnss"]
+    for name, columns, mean in (("Accelerometer", ACCEL, 1), ("Gyroscope", GYRO, 0)):
+        values = imu[list(columns)].to_numpy() - mean * imu[list(columns)].to_numpy().mean(0)
+        frame = pd.DataFrame({"time": ((UNIX + imu.t) * 1e9).astype("int64"), **dict(zip("xyz", values.T))})
+        frame.to_csv(tmp_path / f"{name}.csv", index=False)
+    fix = {"time": ((UNIX + gnss.t) * 1e9).astype("int64"), "latitude": gnss.lat_deg, "longitude": gnss.lon_deg}
+    pd.DataFrame({**fix, "altitude": gnss.height_m}).to_csv(tmp_path / "Location.csv", index=False)
+    with pytest.raises(InputError, match=r"there is no gravity in the accelerations"):
+        list(AutoReader().read(tmp_path))
+
+
+def test_the_names_of_a_racebox():
+    rows = "".join(f"{1e9 + 0.04 * k:.2f},0,0.1,1,2,3,4\n" for k in range(50))
+    spec = imu_spec(_table(f"Time,GForceX,GForceY,GForceZ,GyroX,GyroY,GyroZ\n{rows}"))
+    assert spec is not None and spec.spec["accel"]["columns"] == ["GForceX", "GForceY", "GForceZ"]
 
 
 def test_a_chosen_file_that_is_not_there(tmp_path):

@@ -61,6 +61,34 @@ def test_date_and_time_in_two_columns_and_seconds_of_the_day(tmp_path, tables):
     np.testing.assert_allclose(drive.gnss.t, tables["gnss"].t, atol=1e-6)
 
 
+@pytest.mark.parametrize(("zone", "ahead_s"), [("", 7200), ("Z", 0), ("+02:00", 0)])
+def test_dates_of_local_time_are_told_by_the_imus_unix_time(tmp_path, tables, zone, ahead_s):
+    """A zone that a text names is its own; then the clocks are otherwise 2 h apart, which changes no date."""
+    shown = pd.to_datetime((UNIX + 7200) * 10**9 + np.round(tables["gnss"].t * 1e9).astype(np.int64))
+    tables["gnss"].assign(t=shown.dt.strftime("%d.%m.%Y %H:%M:%S.%f") + zone).to_csv(tmp_path / "gnss.csv", index=False)
+    tables["imu"].assign(t=UNIX + tables["imu"].t).to_csv(tmp_path / "imu.csv", index=False)
+    offset_s = 0 if zone == "+02:00" else -7200
+    drive = read(tmp_path, tables, gnss__time={"column": "t", "unit": "iso", "clock": None, "offset_s": offset_s})
+    np.testing.assert_allclose(drive.gnss.t, tables["gnss"].t, atol=1e-6)
+    expected = GPS + (7200 if zone == "Z" else 0) - drive.meta["time_zero_s"] + UNIX
+    assert drive.meta["gps_zero_s"] == pytest.approx(expected, abs=1e-3)
+    assert any("so they are local time" in note for note in drive.notes) == (ahead_s > 0)
+
+
+@pytest.mark.parametrize("day", [None, "2025-07-05"])
+def test_times_of_day_without_a_date_go_on_after_midnight(tmp_path, tables, day):
+    """Nor do they get a date that nobody gave, as today's."""
+    for kind in ("imu", "gnss"):
+        stamps = pd.to_datetime(np.round((86_390 + tables[kind].t) * 1e9).astype(np.int64))
+        tables[kind].assign(t=stamps.dt.strftime("%H:%M:%S.%f")).to_csv(tmp_path / f"{kind}.csv", index=False)
+    time = {"column": "t", "unit": "iso", "day": day, "clock": "utc" if day else None}
+    drive = read(tmp_path, tables, imu__time=time, gnss__time=time)
+    np.testing.assert_allclose(drive.imu.t, tables["imu"].t, atol=1e-6)
+    np.testing.assert_allclose(drive.gnss.t, tables["gnss"].t, atol=1e-6)
+    assert (drive.meta.get("gps_zero_s") is not None) == (day is not None)
+    assert any("which have no date; reader.gnss.time.day=" in note for note in drive.notes) == (day is None)
+
+
 def test_leap_seconds_and_wrapping_counters():
     """IERS Bulletin C: none in 1980, 15 in 2011, 17 from July 2015, 18 since 2017."""
     dates = ["1980-02-01", "2011-09-26", "2015-06-30T23:59:59", "2015-07-01", "2018-01-01"]
@@ -221,6 +249,10 @@ MISTAKES = {
     "lever arm": ({"lever_arm_m": 0.5}, "reader.lever_arm_m=0.5: must be three numbers"),
     "separator": ({"separator": "((("}, "reader.separator='(((' is no regular expression"),
     "encoding": ({"encoding": "klingon"}, "reader.encoding=klingon"),
+    "dates that start again": (
+        {"gnss__time": {"column": "when", "unit": "iso", "wraps_s": 86_400}},
+        "wraps_s=86400: stamps with a date do not start again",
+    ),
     "text stamps": ({"gnss__time__column": "when"}, "reader.gnss.time.unit=iso"),
     "no GNSS for auto": ({"gnss__file": None, "imu__accel__axes": "auto"}, "needs GNSS to compare with"),
 }

@@ -53,7 +53,11 @@ WRONG: dict[str, tuple[Callable[[Path], None], list[str], str]] = {
         ["reader=csv", "reader.separator=';'"],
         "not a number; set reader.decimal=','",
     ),
-    "semicolons and commas": (lambda f: _text(f, sep=";", decimal=","), ["reader=csv"], "no column 't'"),
+    "semicolons and commas": (
+        lambda f: _text(f, sep=";", decimal=","),
+        ["reader=csv"],
+        "set reader.separator=';' reader.decimal=','",
+    ),
     "no gzip": (_bytes("imu.csv.gz", b"t,gyro_x"), ["reader=csv", GZ], "Not a gzipped file"),
     "half a gzip": (_half_gzip, ["reader=csv", GZ], "ended before"),
     "a Parquet of other columns": (_parquet, ["reader=parquet"], "no column 't'; has a"),
@@ -98,6 +102,13 @@ def test_marks_and_letters_of_windows(tmp_path):
     for file in tmp_path.iterdir():
         file.write_bytes(b"\xef\xbb\xbf" + file.read_text().replace("\n", "\r\n").encode())
     (drive,) = read(tmp_path, ["reader=csv", "reader.separator=';'", "reader.decimal=','"])
+    pd.testing.assert_frame_equal(drive.imu, car(12)["imu"], check_exact=False, atol=1e-9)
+
+
+@pytest.mark.parametrize("setting", [r"reader.separator='\t'", r"reader.separator='\s*\t'"])
+def test_a_tab_as_a_shell_passes_it_and_a_regular_expression(setting, tmp_path):
+    _text(tmp_path, sep="\t", decimal=",")
+    (drive,) = read(tmp_path, ["reader=csv", setting, "reader.decimal=','"])
     pd.testing.assert_frame_equal(drive.imu, car(12)["imu"], check_exact=False, atol=1e-9)
 
 

@@ -90,6 +90,10 @@ def test_a_sensor_that_made_no_update_is_said_to_have_made_none_but_vibration_wh
     measured = result.table.assign(vibration_speed_innovation=z, vibration_speed_innovation_std=0.01)
     said = replace(result, table=measured).sensors()["vibration_speed"]
     assert said == "vibration_speed in 7 of 7 updates (normalised innovation RMS 2)"
+    unused = measured.assign(vibration_speed_used=0.0)  # no sensor that has a unit or a clock to look at
+    assert replace(result, table=unused).sensors() == {
+        "vibration_speed": "vibration_speed in 0 of 7 updates (normalised innovation RMS 2)"
+    }
     nothing = measured.assign(vibration_speed_innovation=np.nan, vibration_speed_used=0.0)
     assert replace(result, table=nothing).sensors() == {}
     wheel = nothing.assign(speed_innovation=np.nan, speed_innovation_std=np.nan, speed_used=0.0)

@@ -92,6 +92,7 @@ def one_line(error: BaseException, command: str = "") -> str:
         options = re.search(r"Available options in '([^']+)':\n((?:\t.*\n?)+)", text)
         near = did_you_mean(missing[1].rpartition("/")[2], options[2].split()) if options else ""
         hint = f"{near or ';'} available in {options[1]}: {', '.join(options[2].split())}" if options else ""
+        hint += "" if near else "; --config-dir adds a folder of your own"
         return f"unknown preset or config {missing[1]!r}{hint}"
     if missing := re.search(r"Could not load '([^']+)'", text):
         return f"unknown preset or config {missing[1]!r}; --help names those that there are"

@@ -84,7 +84,7 @@ def _check_speed(table: Columns, moved: Motion, where: str) -> None:
     if SCALES[0] <= -ratio <= SCALES[1]:
         raise InputError(f"{where}: speed is negative where the car drives forward; negate it")
     close = [text for text, factor in UNITS.items() if abs(np.log(max(ratio, 1e-9) / factor)) < 0.1]
-    looks = f": looks like {close[0]}" if close else "; it must be in m/s, correct its scale"
+    looks = f": looks like {close[0]}" if close else "; it must be in m/s, correct its scale (reader.speed.value.unit)"
     raise InputError(f"{where}: speed is {ratio:.2f} times that of GNSS in the median{looks}")
 
 

@@ -26,6 +26,8 @@ MOST_SAME = 0.2  # of the rows, with the stamp of the row before: more are a rou
 MOST_REFUSED = (0.01, 0.2)  # of the samples, of the fixes; more are no accident
 MOST_SWITCH_M = 10_000.0  # m: fixes that go on so far off make two drives of one
 MOST_HOURS = 14  # between time zones
+DAY_S, WEEK_S, NEAR_WRAP_S = 86_400, 604_800, 60.0
+SET_BACK_S, MOST_SET_BACK = 5.0, 10  # stamps that go back by more, but not often, are of a clock that was set back
 UNIX_TO_GPS_S, EPOCHS_APART_S = 315_964_800.0, 86_400.0  # 1970 to 1980; as near is no chance
 
 
@@ -102,7 +104,7 @@ def check_tables(tables: CheckedTables, limits: Limits = LIMITS) -> CheckedTable
     if tables.aids:
         moved = find_motion(read_fixes(gnss))
         for kind, table in tables.aids.items():
-            _check_time(table["t"], _where(name, kind), kind)
+            check_time(table["t"], _where(name, kind), kind)
             check_aid(kind, table, imu, moved, _where(name, kind))
     return tables
 
@@ -148,7 +150,8 @@ def _describe_rounding(t: np.ndarray) -> str:
     return "t is rounded; give more decimals"
 
 
-def _check_time(t: np.ndarray, where: str, kind: str = "imu") -> None:
+def check_time(t: np.ndarray, where: str, kind: str = "imu") -> None:
+    """InputError for stamps that do not rise from row to row."""
     refuse_rows({"t": t}, ("t",), lambda x: ~np.isfinite(x), where, "remove the row or give its time in seconds")
     back = np.flatnonzero(np.diff(t) <= 0)
     if len(back):
@@ -165,8 +168,19 @@ def _check_time(t: np.ndarray, where: str, kind: str = "imu") -> None:
             rows = {"imu": "samples", "gnss": "fixes"}.get(kind, "rows")
             raise InputError(f"{where}: row {k + 1}: t = {t[k]:.6f} appears twice; remove duplicate {rows}{coarse}")
         raise InputError(
-            f"{where}: row {k + 1}: t goes back from {t[k]:.6f} to {t[k + 1]:.6f}; sort the rows, or split the drive"
+            f"{where}: row {k + 1}: t goes back from {t[k]:.6f} to {t[k + 1]:.6f}; {_explain_return(t, k, kind)}"
         )
+
+
+def _explain_return(t: np.ndarray, k: int, kind: str) -> str:
+    """What stamps that go back after row ``k`` may be: of the next day, of a clock that was set back, out of order."""
+    back = t[k] - t[k + 1]
+    for wraps_s, name in ((DAY_S, "at midnight"), (WEEK_S, "at the end of a week")):
+        if abs(back - wraps_s) < NEAR_WRAP_S:
+            return f"they start again {name}: add {wraps_s} s from there on (reader.{kind}.time.wraps_s={wraps_s})"
+    if back > SET_BACK_S and int((np.diff(t) < 0).sum()) <= MOST_SET_BACK:
+        return "the clock was set back there: make two drives of it; sorting would mix them"
+    return "sort the rows"
 
 
 def _check_rate(t: np.ndarray, where: str, kind: str) -> None:
@@ -193,7 +207,7 @@ def _say_unit(unit: str, kind: str) -> str:
 def _check_imu(imu: Columns, where: str, limits: Limits) -> Columns:
     """The samples within full scale, where the others are few."""
     t = imu["t"]
-    _check_time(t, where)
+    check_time(t, where)
     remedy = "remove the row or split the drive there"
     refuse_rows(imu, (*GYRO, *ACCEL), lambda x: ~np.isfinite(x), where, remedy)
     if len(t) < 2:
@@ -228,7 +242,7 @@ def _check_scale(imu: Columns) -> np.ndarray:
 
 def _check_gnss(gnss: Columns, imu: Columns, where: str) -> Columns:
     """All rows but the fixes that no car can have reached, where those are few."""
-    _check_time(gnss["t"], where, "gnss")
+    check_time(gnss["t"], where, "gnss")
     _check_rate(gnss["t"], where, "gnss")
     refuse_rows(gnss, (*POSITION, *VELOCITY, *STD), np.isinf, where, "write NaN where it is unknown")
     fix = usable_fixes(gnss)
@@ -280,7 +294,7 @@ def _explain_outside(t: np.ndarray, first: float, last: float) -> str:
         )
     if unit := _find_unit(np.ptp(t) / max(last - first, 1.0), 0.5, 2.0):
         return _say_unit(unit, "gnss")
-    return "both need the same clock"
+    return "both need the same clock (reader.gnss.time.offset_s=auto estimates the offset)"
 
 
 def _check_fixes_there(gnss: Columns, where: str) -> None:
@@ -294,7 +308,7 @@ def _check_fixes_there(gnss: Columns, where: str) -> None:
 
 
 def _check_reference(reference: Columns, imu: Columns, fixes: Columns, where: str) -> None:
-    _check_time(reference["t"], where, "reference")
+    check_time(reference["t"], where, "reference")
     refuse_rows(reference, (*POSITION, *VELOCITY, *ATTITUDE), np.isinf, where, "write NaN where it is unknown")
     known = reference["valid"] & np.isfinite(reference["lat_deg"]) & np.isfinite(reference["lon_deg"])
     if not known.any():

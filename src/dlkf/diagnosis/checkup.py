@@ -151,7 +151,8 @@ def discover_findings(tables: CheckedTables) -> Iterator[CheckupResult]:
         ):
             continue
         if not finding.sure:
-            yield CheckupResult(NOTE, f"{finding.setting}: the motion does not show it ({finding.detail})")
+            text = f"{finding.setting}: the motion does not determine it well enough ({finding.detail})"
+            yield CheckupResult(NOTE, text)
         elif finding.setting == "gnss.time.drift_ppm":
             text = f"clocks: {finding.value:+.0f} {finding.detail}; {ESTIMATED}{autos}"
             yield CheckupResult(NOTE, text)

@@ -41,6 +41,7 @@ SIGMAS = 3.0  # what differs from what a log says by so many 1σ is worth saying
 OF_RECEIVER = {DELAY: 0.01, **dict.fromkeys(ARM, 0.1), DRIFT: 30.0}  # s, m, ppm: 1σ of what no model of a car contains
 SAMPLES_AT_ONCE = CHUNK_SAMPLES  # IMU samples of drives in memory, 8 h at 50 Hz
 FASTER_THAN_REVERSE = 8.0  # m/s
+VIBRATION = "vibration_speed"
 MOSTLY = 0.5  # of the updates of a further sensor; where fewer are used, its numbers are likely wrong
 
 
@@ -162,10 +163,11 @@ class Navigated:
         said, table = {}, self.table
         for name, (used, seen, spread) in self.sensor_updates.items():
             if not seen:
-                if name != "vibration_speed":  # which needs none while there is GNSS
+                if name != VIBRATION:  # which needs none while there is GNSS
                     said[name] = f"{name}: no update"
                 continue
-            refused = ", most of them refused: see its unit, sign and clock" if used < MOSTLY * seen else ""
+            wrong = used < MOSTLY * seen and name != VIBRATION  # which has neither unit nor clock
+            refused = ", most of them refused: see its unit, sign and clock" if wrong else ""
             said[name] = f"{name} in {used} of {seen} updates{refused} (normalised innovation RMS {spread:.2g})"
         for std in (column for column in self.sensor_columns if column.startswith("std_")):
             name, last = std.removeprefix("std_"), table.iloc[-1]

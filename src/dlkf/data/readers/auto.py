@@ -186,13 +186,18 @@ class AutoReader:
 def _recognise_files(folder: Path) -> list[Contents]:
     """What the files of a folder hold; of one whose files are known by their names, that."""
     for name, files in LAYOUTS.items():
-        if all((folder / file).is_file() for file in files):
+        if all((folder / file).is_file() for file in files) and _has_its_columns(folder / files[0], name):
             base = read_preset("reader", name)
             specs = leave_open({kind: base[kind] for kind in ("imu", "gnss")})
             if (beside := BAROMETERS.get(name)) and (folder / beside).is_file():  # by the clock of the IMU
                 specs["baro"] = {**base["baro"], "file": beside}
             return [Contents(folder / files[0], [Offer(folder / files[0], f"layout of {name}", specs)])]
     return [recognise_file(p) for p in sorted(folder.iterdir()) if p.is_file() and not p.name.startswith(".")]
+
+
+def _has_its_columns(path: Path, layout: str) -> bool:
+    """Whether a file of phyphox has its columns: Sensor Logger calls its files the same."""
+    return layout != "phyphox" or b"Time (s)" in path.open("rb").read(200)
 
 
 def _describe_files(within: Iterable[Contents], offers: Iterable[Offer] = ()) -> str:

@@ -37,7 +37,7 @@ from dlkf.data.readers.mapping import (
 )
 from dlkf.data.readers.settling import AUTO, Unsure, open_settings, placeholders, settle
 from dlkf.data.readers.sharing import layout
-from dlkf.data.readers.stamps import epoch_note
+from dlkf.data.readers.stamps import epoch_note, local_time_s
 
 TEXT = ("separator", "decimal", "header", "comment", "skip_rows", "encoding")
 NEAR_S = 0.05  # rows of two GNSS tables this close are of one fix
@@ -149,11 +149,15 @@ class LogReader:
             mapping = {"_target_": "dlkf.data.readers.logs.LogReader", **self.text, **named, **known}
         meta = {"drive": name, "group": self.group or name, "time_zero_s": float(zero)}
         if "gnss" in mapped:
-            meta |= _gps_time(mapped["gnss"], t["gnss"])
+            zone_s = local_time_s(mapped["gnss"], mapped["imu"])
+            meta |= _gps_time(mapped["gnss"], t["gnss"], zone_s)
         meta |= self.meta
         meta |= dict(zip(("lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m"), arm))
         notes = [note for part in every.values() for one in (part, *part.parts.values()) for note in one.table.notes]
         notes += [note for part in mapped.values() if (note := epoch_note(part)) is not None]
+        if "gnss" in mapped and zone_s:
+            file = mapped["gnss"].table.path.name
+            notes.append(f"dates of {file}: {zone_s / 3600:+g} h from UTC by the IMU's stamps, so they are local time")
         unread = _list_unread_velocities(mapped.get("gnss"))
         said = (*dict.fromkeys((*notes, *list_unused(every))), *unread, *found, *of_aids)
         said = said if only is not None else (*_list_unread_files(folder, every), *said)
@@ -277,14 +281,14 @@ def _list_unread_velocities(gnss: Mapped | None) -> list[str]:
     return [f"velocities lie in {' and '.join(topics)}: reader.gnss.velocity.table={topics[0]}"] if topics else []
 
 
-def _gps_time(gnss: Mapped, t: np.ndarray) -> dict[str, float]:
-    """GPS time = ``gps_zero_s`` + ``gps_rate`` t by the fixes' own stamps, independent of t's clock; empty where they
-    have no date."""
+def _gps_time(gnss: Mapped, t: np.ndarray, zone_s: int) -> dict[str, float]:
+    """GPS time = ``gps_zero_s`` + ``gps_rate`` t by the fixes' own stamps (``zone_s`` ahead of UTC), independent of t's
+    clock; empty where they have no date."""
     first = gnss.first_gps_s()
     if first is None:
         return {}
     rate = 1 / (1 + 1e-6 * float(gnss.time.get("drift_ppm") or 0.0))
-    return {"gps_zero_s": first - rate * float(t[0]), "gps_rate": rate}
+    return {"gps_zero_s": first - zone_s - rate * float(t[0]), "gps_rate": rate}
 
 
 def _interpolate(part: Mapped, key: str, at: np.ndarray, t: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:

@@ -173,12 +173,17 @@ class Mapped:
         name, unit = time.get("column"), time.get("unit") or "s"
         if name is None:
             raise InputError(f"{where}.column is missing; name the column of the stamps")
+        wraps_s = time.get("wraps_s")
         if unit == units.ISO:
             names = [name] if isinstance(name, (str, int)) else list(name)
             values = self._cells(names[0]).astype(str)
             for more in names[1:]:
                 values = values.str.cat(self._cells(more).astype(str), sep=" ")
             values = values.to_numpy()
+            if (of_day := units.nanoseconds_of_day(values, where)) is not None:
+                values, unit, wraps_s = of_day, "ns", wraps_s or units.DAY_S
+            elif wraps_s is not None:
+                raise InputError(f"{where}.wraps_s={wraps_s}: stamps with a date do not start again; leave it out")
         else:
             values = self.column(name[-1] if isinstance(name, list) else name, nan=False)
         day = None if time.get("day") is None else str(time["day"])
@@ -187,8 +192,8 @@ class Mapped:
             day = units.day_of_number(self._cells(name[0]).iloc[0]) if isinstance(name, list) else day
         if unit in units.DAYS:
             values, unit = (values - units.DAYS[unit]) * 86_400.0, "s"
-        if time.get("wraps_s") is not None:
-            values = units.unwrap_stamps(values, float(time["wraps_s"]) * units.TIME.get(unit, 1))
+        if wraps_s is not None:
+            values = units.unwrap_stamps(values, float(wraps_s) * units.TIME.get(unit, 1))
         week = self.column(time["week"], nan=False) if time.get("week") is not None else None
         if time.get("week_number") is not None:
             week = np.full(len(self), int(time["week_number"]))
@@ -224,9 +229,9 @@ class Mapped:
         name = next((one for one in (str(name), *str(name).split(" | ")) if one in self.table.frame), str(name))
         if name not in self.table.frame:
             have = [str(c) for c in self.table.frame.columns]
-            other = next((m for m in (";", "\t", ",") if len(have) == 1 and m in have[0]), None)
-            remedy = self._entry_to_set(name) if other is None else self._text_to_set("separator", other)
-            raise InputError(f"{self.table.path}: no column {name!r}; has {list_some(have, MOST_NAMED)}; {remedy}")
+            raise InputError(
+                f"{self.table.path}: no column {name!r}; has {list_some(have, MOST_NAMED)}; {self._entry_to_set(name)}"
+            )
         return self.table.frame[name]
 
     def _text_to_set(self, key: str, value: str) -> str:

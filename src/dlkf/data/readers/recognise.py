@@ -243,7 +243,7 @@ def describe_missing(table: LogTable) -> str:
     rows = pd.Series(True, table.frame.index)
     if stamps.time_spec(table, rows, SLOWEST_FIX_S, FASTEST_IMU_S) is None:
         times = [n for n in vocabulary.match_columns(columns, vocabulary.TIME) if n not in names]
-        of_day = times and table.frame[times[0]].astype(str).iloc[:20].str.match(stamps.OF_DAY).all()
+        of_day = times and table.frame[times[0]].astype(str).iloc[:20].str.match(units.OF_DAY).all()
         lacks.append("a date beside the times of day" if of_day else "stamps that can be read")
     return f"{text}: has {' and '.join(has)}" + (f", lacks {' and '.join(lacks)}" if lacks else "")
 

@@ -20,7 +20,7 @@ from dlkf.data.readers.mapping import Mapped
 from dlkf.data.readers.sharing import read_value, set_value, write_value
 from dlkf.data.schema import ACCEL, stack_columns
 from dlkf.data.tables import Columns
-from dlkf.data.validate import usable_fixes
+from dlkf.data.validate import check_time, usable_fixes
 
 AUTO = "auto"
 AXES = {"imu.accel.axes", "imu.gyro.axes"}
@@ -88,6 +88,8 @@ def settle(
             f"{where}: {log.path} has {count} {'fix' if count == 1 else 'fixes'}, which are not the "
             f"motion of a car{why}; copy the log again, or leave the drive out"
         )
+    for kind in ("imu", "gnss"):
+        check_time(t[kind], f"{where}, {mapped[kind].table.path.name}", kind)
     found: list[Finding] = []
     if "gnss.velocity.unit" in wanted:
         found.append(_speed_unit(mapped["gnss"], t["gnss"]))
@@ -136,7 +138,15 @@ def _speed_unit(gnss: Mapped, t: np.ndarray) -> Finding:
         return Finding("gnss.velocity.unit", "m/s", True, "no velocities")
     speed = v[:, 0] if gnss.spec["velocity"].get("frame") == "course" else np.hypot(v[:, 0], v[:, 1])
     place = positions(gnss)
-    factor, spread = speed_factor(t, place["lat_deg"], place["lon_deg"], speed)
+    finding = _unit_by_way(t, place["lat_deg"], place["lon_deg"], speed)
+    if not finding.sure and _unit_by_way(t, place["lon_deg"], place["lat_deg"], speed).sure:
+        remedy = "latitude and longitude look swapped: exchange them in reader.gnss.position.columns"
+        return replace(finding, value=None, remedy=remedy)
+    return finding
+
+
+def _unit_by_way(t: np.ndarray, lat_deg: np.ndarray, lon_deg: np.ndarray, speed: np.ndarray) -> Finding:
+    factor, spread = speed_factor(t, lat_deg, lon_deg, speed)
     apart = {name: abs(np.log(factor / f)) if factor > 0 else np.inf for name, f in units.SPEED.items()}
     best = min(apart, key=lambda name: apart[name])
     certain = apart[best] < 0.08 and spread < 0.2 * factor

@@ -8,21 +8,22 @@ import numpy as np
 import pandas as pd
 
 from dlkf.base.errors import InputError
+from dlkf.data.discovery.clock import FARTHEST_ZONE_H
 from dlkf.data.discovery.units import time_unit
 from dlkf.data.readers import units, vocabulary
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.mapping import TABULAR, Mapped
 
 Spec = dict[str, Any]
-OF_DAY = r"^\s*\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?\s*([AaPp][Mm])?\s*Z?\s*$"
 CALENDAR = r"^\s*(\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}-[A-Za-z]{3}-\d{4}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4}"
 CALENDAR += r"|\d{1,2}[/.]\d{1,2}[/.]\d{2}|\d{8})"
 CALENDAR += r"[T ]+\d{1,2}:\d{2}"
 DAY = r"^\s*(\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4}|\d{1,2}[/.]\d{1,2}[/.]\d{2}|\d{8}"
 DAY += r"|\d{4}年\d{1,2}月\d{1,2}日)\s*$"
 NEWEST_UNIX = 2e9  # s: 2033; a stamp beyond it counts from no known epoch
+NAMED_ZONE = r"(?:Z|UTC|GMT|[+-]\d{2}:?\d{2})\s*$"
+QUARTER_S, LEAST_ZONE_S = 900, 3600  # time zones are whole quarters of an hour
 SWITCHED_ON_S = 1000.0  # a log that begins with less counts from its own beginning, which is nothing to report
-DAY_S = 86_400
 OLDEST_UNIX = 1.0e9  # s: 2001; no log of a car with an IMU of this kind is older
 
 
@@ -44,7 +45,7 @@ def time_spec(table: LogTable, rows: pd.Series, slowest: float, fastest: float) 
     if _is_clock_face(values, slowest):
         dates = vocabulary.match_columns(names, vocabulary.DATE)
         date = next((n for n in dates if units.day_of_number(frame[n].iloc[0]) is not None), None)
-        of_day: Spec = {"column": column, "unit": units.HHMMSS, "wraps_s": DAY_S}
+        of_day: Spec = {"column": column, "unit": units.HHMMSS, "wraps_s": units.DAY_S}
         return of_day if date is None else of_day | {"column": [date, column], "clock": "utc"}
     if column in called and vocabulary.words(column) == "sample time fine":  # Xsens: ticks of 0.1 ms
         return {"column": column, "unit": "1e-4s", "wraps_s": 2**32 / 10_000}
@@ -76,10 +77,10 @@ def _counts_days(column: pd.Series, slowest: float) -> str | None:
     if not pd.api.types.is_numeric_dtype(column):
         return None
     values = column.to_numpy(float)
-    steps = DAY_S * np.diff(values[np.isfinite(values)])
+    steps = units.DAY_S * np.diff(values[np.isfinite(values)])
     if not len(steps) or not 0 < np.median(steps) <= slowest:
         return None
-    unix = {name: DAY_S * (float(np.nanmedian(values)) - day) for name, day in units.DAYS.items()}
+    unix = {name: units.DAY_S * (float(np.nanmedian(values)) - day) for name, day in units.DAYS.items()}
     return next((name for name, seconds in unix.items() if OLDEST_UNIX < seconds < NEWEST_UNIX), None)
 
 
@@ -120,7 +121,7 @@ def _find_dates(frame: pd.DataFrame, called: list[str], dates: list[str]) -> Spe
 
     others = [str(n) for n in texts]
     whole = fit(called, CALENDAR) or fit(dates, CALENDAR) or fit(others, CALENDAR)
-    days, times = fit(dates, DAY) or fit(others, DAY), fit(called, OF_DAY) or fit(others, OF_DAY)
+    days, times = fit(dates, DAY) or fit(others, DAY), fit(called, units.OF_DAY) or fit(others, units.OF_DAY)
     columns = whole[:1] or (days[:1] + times[:1] if days and times else [])
     if not columns:
         return None
@@ -142,6 +143,20 @@ def _day(unix: float) -> str:
     return str(np.datetime64(int(unix), "s"))[:10]
 
 
+def local_time_s(gnss: Mapped, imu: Mapped) -> int:
+    """Time zone [s ahead of UTC] of the fixes' calendar texts, by the offset that brings them to an IMU's Unix time; 0
+    where they name a zone themselves, or the IMU's stamps have no date or are texts too."""
+    texts, ahead_s = gnss.time.get("unit") == units.ISO, -float(gnss.time.get("offset_s") or 0.0)
+    if not texts or imu.time.get("unit") == units.ISO or imu.first_gps_s() is None or gnss.time.get("clock") == "gps":
+        return 0
+    column = gnss.time["column"]
+    last = gnss.texts(column[-1] if isinstance(column, list) else column)
+    if bool(last.str.contains(NAMED_ZONE).any()) or gnss.first_gps_s() is None:
+        return 0
+    zone_s = QUARTER_S * round(ahead_s / QUARTER_S)
+    return zone_s if LEAST_ZONE_S <= abs(zone_s) <= FARTHEST_ZONE_H * 3600 and abs(ahead_s - zone_s) < 40 else 0
+
+
 def epoch_note(part: Mapped) -> str | None:
     """From when the stamps of a table of numbers are taken to count, and what else they may mean; None for dates and
     for formats that state it themselves."""
@@ -157,7 +172,7 @@ def epoch_note(part: Mapped) -> str | None:
         day = _day(first + units.GPS_EPOCH_UNIX)
         return f"{what}: taken as week {int(first // units.WEEK_S)} of GPS and seconds of it, of {day}"
     if (unit := time.get("unit")) in units.DAYS:
-        first = DAY_S * (float(part.column(str(column), nan=False)[0]) - units.DAYS[unit])
+        first = units.DAY_S * (float(part.column(str(column), nan=False)[0]) - units.DAYS[unit])
         name = {"datenum": "MATLAB's datenum", "excel": "a spreadsheet's dates"}[unit]
         return f"{what}: days, taken as {name} in UTC, of {_day(first)}"
     if time.get("unit") == units.HHMMSS and isinstance(column, list):
@@ -165,6 +180,10 @@ def epoch_note(part: Mapped) -> str | None:
         return f"{what}: taken as hours, minutes and seconds (hhmmss) in UTC, from {day} on"
     if time.get("unit") == units.HHMMSS:
         return f"{what}: taken as hours, minutes and seconds (hhmmss), which have no date; {setting}.day=… gives it"
+    single = time.get("unit") == units.ISO and not isinstance(column, list)
+    if single and bool(part.texts(str(column)).str.match(units.OF_DAY).all()):
+        undated = f"{what}: times of day, which have no date; {setting}.day=2025-07-05 gives it"
+        return None if time.get("day") else undated
     if time.get("unit") == units.ISO:
         as_what = {"gps": "GPS time", None: "of an unnamed clock"}.get(clock, "UTC")
         other = ""
@@ -181,7 +200,7 @@ def epoch_note(part: Mapped) -> str | None:
     if known is None:
         if part.kind != "gnss" or not SWITCHED_ON_S < seconds < units.WEEK_S:
             return None
-        if seconds < DAY_S and not vocabulary.has(str(column), r"\b(?:tow|sow|itow|week)\b"):
+        if seconds < units.DAY_S and not vocabulary.has(str(column), r"\b(?:tow|sow|itow|week)\b"):
             return (
                 f"{what}: seconds of a day or of a GPS week, which have no date; {setting}.day=2025-07-05 or "
                 f"{setting}.week_number=… gives it"

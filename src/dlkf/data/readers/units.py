@@ -27,7 +27,8 @@ HHMMSS = "hhmmss"  # a clock's face as one number: 235712.7, as NMEA has it
 DAYS = {"datenum": 719_529, "excel": 25_569}  # day 0 of 1970 in MATLAB's datenum and in a spreadsheet's dates
 ISO = "iso"  # calendar texts: 2025-07-05T23:57:12.7Z, 2025/07/05 23:57:12.700
 CLOCKS = ("gps", "unix", "utc")
-WEEK_S = 604_800
+OF_DAY = r"^\s*\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?\s*([AaPp][Mm])?\s*Z?\s*$"  # calendar texts without a date
+DAY_S, WEEK_S = 86_400, 604_800
 GPS_EPOCH_UNIX = 315_964_800  # 1980-01-06 in Unix seconds
 UNIX_SINCE, GPS_SINCE = 1.55e9, 3e8  # s; a Unix second after January 2019; a GPS second after 1989
 # days from which GPS − UTC is one second more than before (IERS Bulletin C): 0 in 1980, 18 since 2017
@@ -160,6 +161,13 @@ def seconds_of_day(values: np.ndarray) -> np.ndarray:
     hours, rest = np.divmod(values, 10_000)
     minutes, seconds = np.divmod(rest, 100)
     return 3600 * hours + 60 * minutes + seconds
+
+
+def nanoseconds_of_day(texts: np.ndarray, where: str) -> np.ndarray | None:
+    """Times of day without a date (23:57:12.7) as nanoseconds of the day; None for any other texts."""
+    if not all(re.match(OF_DAY, text) for text in texts):
+        return None
+    return _calendar(np.array([f"1970-01-01 {text}" for text in texts]), where)
 
 
 def day_of_number(value: object) -> str | None:

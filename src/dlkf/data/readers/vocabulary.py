@@ -19,7 +19,7 @@ CARRIER = r"carr(?:ier)? ?soln?"
 VELOCITY = r"v(?:el(?:ocity)?)?|velocity|geschwindigkeit|vitesse|velocidad|速度"
 
 SENSORS = {
-    "accel": r"(?:(?:total|raw) )?(?:acc(?:el(?:eration|erometer|erometre)?)?|specific ?force|force|f|a|fb"
+    "accel": r"(?:(?:total|raw) )?(?:acc(?:el(?:eration|erometer|erometre)?)?|specific ?force|g ?force|force|f|a|fb"
     r"|accelerometer acceleration|beschl(?:eunigung(?:ssensor|smesser)?)?|acel(?:er(?:acion|ometro)?)?"
     r"|加速度(?:计|計|センサ|センサー)?)",
     "gyro": r"(?:raw )?(?:gyro?(?:s[ck]op(?:e|io)?|met(?:er|re))?|omega|w|g|ang(?:ular)? ?(?:velocity|vel|rate|speed)"

@@ -118,7 +118,8 @@ int main(int argc, char **argv) {
     if (printed(c)) printf("%s%s", c ? "," : "", NAMES[c]);
   putchar('\n');
   char line[1024];
-  long lines = 0, strange = 0, stamps = 0;
+  long lines = 0, strange = 0, stamps = 0, taken = 0;
+  double along_z = 0;
   while (fgets(line, sizeof line, stdin)) {
     const size_t length = strlen(line);
     int whole = feof(stdin) || (length && line[length - 1] == '\n');
@@ -129,7 +130,7 @@ int main(int argc, char **argv) {
     const int imu = !strncmp(line, "imu,", 4) && n == 7;
     dlkf_status status;
     stamps += imu;
-    if (imu) status = dlkf_imu(&filter, x[0], x + 1, x + 4);
+    if (imu) status = dlkf_imu(&filter, x[0], x + 1, x + 4), along_z += status == DLKF_TAKEN ? x[3] : 0, taken += status == DLKF_TAKEN;
     else if (!strncmp(line, "gnss,", 5) && n == 14) status = dlkf_gnss(&filter, x[0], x[1], x[2], x[3], x + 4, x + 7, x[13] >= 0 && x[13] < 100 ? (int)x[13] : -1);
     else if ((n == 2 || n == 3) && sensor(line) > -2) status = dlkf_aid(&filter, sensor(line), x[0], strncmp(line, "pressure,", 9) ? x[1] : dlkf_pressure_height(x[1]), n == 3 ? x[2] : NAN);
     else {
@@ -158,6 +159,7 @@ int main(int argc, char **argv) {
   if (timing) quantiles();
   if (!rows) fprintf(stderr, "navigate: nothing solved, waiting for %s\n", dlkf_waits_for(dlkf_waits(&filter)));
   if (2 * dlkf_count(&filter, DLKF_GAP) > stamps) fprintf(stderr, "navigate: most samples of the IMU come after a gap: are the stamps in seconds?\n");
+  if (taken && !(along_z / (double)taken > -13 && along_z / (double)taken < -7)) fprintf(stderr, "navigate: az is %.2f m/s2 in the mean, must be near -9.8: are accelerations in m/s2, and axes forward-right-down?\n", along_z / (double)taken);
   if (fflush(stdout) || ferror(stdout)) return fprintf(stderr, "navigate: %s\n", strerror(errno)), 1;
   return rows ? 0 : 2;
 }

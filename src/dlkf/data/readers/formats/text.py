@@ -10,6 +10,7 @@ import warnings
 import zlib
 from collections import Counter
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,15 @@ DEFAULTS = dict(separator=",", decimal=".", header=True, comment=None, skip_rows
 LARGEST_BYTES = 2 << 30  # unpacked: a day of an IMU at 100 Hz is a third
 LARGEST_RATIO, SMALL_BYTES = 100, 64 << 20  # of unpacked to packed size: text of sensors packs tenfold
 ENCODINGS = ("cp1252", "gb18030", "cp932", "big5")  # of files that are not UTF-8; where none fits, Latin-1 reads any
+SEPARATORS = (";", "\t", "|", ",")
 PEEK = 1 << 16  # bytes by which one of them is chosen
 
 
 def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -> LogTable:
     """A text table; the frame's index is the number of each row's line in the file."""
     options = {**DEFAULTS, **{k: v for k, v in text.items() if v is not None}}
+    if options["separator"] == r"\t":  # as a shell passes it
+        options["separator"] = "\t"
     if len(options["separator"]) > 1:
         _pattern(options["separator"], "separator")
     content = decode_text(path, options["encoding"])
@@ -54,6 +58,7 @@ def read(path: Path, *, kind: str, table: str | None, text: Mapping[str, Any]) -
         rows = rows[:-1]
     if not keep:
         raise InputError(f"{path}: is empty; leave the drive out or give its data")
+    _check_separator(path, [lines[k] for k in keep[:2]], options["separator"], kind)
     frame = _parse(path, [lines[k] for k in (*head, *rows)], [k + 1 for k in (*head, *rows)], options)
     if not len(frame):
         raise InputError(f"{path}: has no rows; leave the drive out or give its data")
@@ -128,20 +133,37 @@ def _unpack(path: Path) -> bytes:
     return raw
 
 
+def _check_separator(path: Path, lines: list[str], separator: str, kind: str) -> None:
+    """InputError where the first line has one cell by this separator, and several by another."""
+    counts = {other: len(_cells(lines[0], other)) for other in SEPARATORS}
+    other = max(SEPARATORS, key=lambda one: counts[one])
+    if len(_cells(lines[0], separator)) > 1 or counts[other] == 1:
+        return
+    settings = [("separator", other)]
+    if other != "," and re.search(r"\d,\d", lines[-1]):
+        settings.append(("decimal", ","))
+    whole, alone = (
+        " ".join(f"{where}.{key}={value!r}" for key, value in settings) for where in ("reader", f"+reader.{kind}.text")
+    )
+    raise InputError(f"{path}: a line is one cell: {lines[0][:60]!r}; set {whole} ({alone} for this file alone)")
+
+
 def _parse(path: Path, lines: list[str], numbers: list[int], options: Mapping[str, Any]) -> pd.DataFrame:
+    separator = options["separator"]
+    in_c = len(separator) == 1 or separator == r"\s+"  # pandas' parser in C takes no other
+    read_csv = partial(pd.read_csv, low_memory=False) if in_c else pd.read_csv
     try:
         with warnings.catch_warnings():  # of a separator at the end of every line; missing columns are reported
             warnings.simplefilter("ignore", pd.errors.ParserWarning)
-            frame = pd.read_csv(
+            frame = read_csv(
                 io.BytesIO("\n".join(lines).encode()),  # a StringIO has four bytes a letter
                 encoding="utf-8",
-                sep=options["separator"],
+                sep=separator,
                 decimal=options["decimal"],
                 header=0 if options["header"] else None,
                 comment=options["comment"],
                 skipinitialspace=True,
                 index_col=False,
-                low_memory=False,
             )
     except (pd.errors.ParserError, pd.errors.EmptyDataError, ValueError, re.error) as error:
         detail = first_line(error).strip()
