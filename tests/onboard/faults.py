@@ -265,6 +265,7 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "fixes at 2 Hz off the second": (
         _changed("gnss", lambda t: True, lambda x: [_put(x, 0, x[0] - 0.18), _put(x, 0, x[0] + 0.31)]), ()),
     "fix stamps that jitter": (_stamps(_jitter(2, 0.04), ("gnss",)), ()),
+    "positions alone whose stamps jitter": (lambda sent: _stamps(_jitter(3, 0.04), ("gnss",))(ALONE(sent)), ()),
     "sensors 0.4 s late": (_late(0.4, 30.0, 34.0, SENSORS), ("replayed",)),
     "sensors 15 s late": (_late(15.0, 25.0, 40.0, SENSORS), ("late",)),
     "wheel speeds with 1σ, and some without": (
