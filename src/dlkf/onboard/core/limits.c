@@ -25,7 +25,9 @@ void dlkf_screen_clear(dlkf_screen *s) { s->count = s->others = s->known = 0; }
 
 /* 1 for a fix that a car can have reached; it is then the good one. */
 int dlkf_screen_take(dlkf_screen *s, const dlkf_report *x) {
-  const double speed = sqrt(x->v[0] * x->v[0] + x->v[1] * x->v[1] + x->v[2] * x->v[2]);
+  double speed = 0; /* by the components that are known */
+  for (int k = 0; k < 3; k++) speed += isnan(x->v[k]) ? 0 : x->v[k] * x->v[k];
+  speed = sqrt(speed);
   if (fabs(x->lat_deg) < NOWHERE_DEG && fabs(x->lon_deg) < NOWHERE_DEG) return 0;
   if (!(x->height_m >= LOWEST_M && x->height_m <= HIGHEST_M) || speed > FASTEST_M_S) return 0;
   double squares = 0;
