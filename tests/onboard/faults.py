@@ -184,6 +184,7 @@ JUMPY = _changed("gnss", lambda t: round(t) % 7 == 3, lambda x: _put(x, 1, x[1] 
 SCATTERED = _changed("gnss", lambda t: True, lambda x: _put(x, 1, x[1] + 2.5e-5 * sin(round(x[0]) ** 2)))
 COARSE = _changed("gnss", lambda t: True, lambda x: (*x[:4], WITHOUT_VELOCITY, [3.0] * 3 + WITHOUT_VELOCITY, x[6]))
 AROUND = (48.8, 9.2, 300.0)  # some place, far from the drive
+LEVEL = _changed("gnss", lambda t: True, lambda x: _put(x, 4, [*x[4][:2], nan]))
 FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "none": (lambda sent: sent, ("taken",)),
     "single samples": (_one_by_one(
@@ -252,6 +253,9 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     **{name: (jump, ("implausible_fix",)) for name, jump in JUMPS.items()},
     **{name: (lambda sent, jump=JUMPS[jump], late=late: late(jump(sent)), ("implausible_fix",))
        for name, (jump, late) in JUMPS_LATE.items()},
+    "a frozen receiver without velocity down": (lambda sent: LEVEL(_frozen(sent)), ("implausible_fix",)),
+    "sensors that mark invalid values": (
+        _changed("speed", _between(25.0, 28.0), lambda x: _put(x, 1, 1.7e308)), ("implausible",)),
     "a gyroscope that saturates for a second": (
         _changed("imu", _between(30.0, 31.0), lambda x: _put(x, 2, [0.0, 0.0, 35.0])), ()),
     "velocities 4 m/s off, one in five": (
