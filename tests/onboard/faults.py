@@ -254,6 +254,7 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     **{name: (lambda sent, jump=JUMPS[jump], late=late: late(jump(sent)), ("implausible_fix",))
        for name, (jump, late) in JUMPS_LATE.items()},
     "a frozen receiver without velocity down": (lambda sent: LEVEL(_frozen(sent)), ("implausible_fix",)),
+    "a receiver that holds its last position": (lambda sent: ALONE(_frozen(sent)), ()),
     "sensors that mark invalid values": (
         _changed("speed", _between(25.0, 28.0), lambda x: _put(x, 1, 1.7e308)), ("implausible",)),
     "a gyroscope that saturates for a second": (

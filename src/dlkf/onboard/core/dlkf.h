@@ -105,6 +105,7 @@ typedef struct {
 
 typedef struct {
   double since, total; /* of fixes in a row far off the filter: time of the first, sum of how far */
+  double place[3];     /* of the last fix, r_e */
   int32_t count;
 } dlkf_watch;
 
