@@ -94,9 +94,8 @@ def test_without_velocities_positions_do(drive):
 def test_positions_alone_that_wait_for_their_boundary_do_too(drive):
     """Stamps of a host, a receiver on another clock: no fix is on a boundary, each up to 0.9 s before."""
     lag = 0.1 + 0.8 * torch.rand(len(drive.gnss_lag), generator=torch.Generator().manual_seed(8), dtype=torch.float64)
-    s = (1 - lag / drive.epoch_s)[:, None]
-    r, v = drive.ref_r_e, drive.epoch_s * drive.ref_v_e
-    late = r[:-1] + (r[1:] - r[:-1]) * (s * s * (3 - 2 * s))[1:] + (s * (1 - s))[1:] * ((1 - s[1:]) * v[:-1] - s[1:] * v[1:])
+    r, v, s = drive.ref_r_e, drive.epoch_s * drive.ref_v_e, (1 - lag / drive.epoch_s)[1:, None]
+    late = r[:-1] + (r[1:] - r[:-1]) * (s * s * (3 - 2 * s)) + s * (1 - s) * ((1 - s) * v[:-1] - s * v[1:])
     late = torch.cat((r[:1] - lag[0] * v[:1], late))
     blind = replace(drive, gnss_valid=drive.gnss_valid & (torch.arange(6) < 3), gnss_r_e=late, gnss_lag=lag)
     attitude, dr, dv, std = _errors(blind, align_boundaries(blind))
