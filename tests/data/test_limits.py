@@ -89,6 +89,8 @@ def test_a_position_that_stays_while_the_velocity_goes_on_is_frozen():
     gnss["lat_deg"][30:40] = gnss["lat_deg"][30]
     assert refused(gnss) == list(range(32, 40))
     assert refused(fixes(60, speed=0.0)) == []
+    gnss["vel_d"][:] = np.nan  # of NMEA
+    assert refused(gnss) == list(range(32, 40))
 
 
 def test_row_by_row_is_as_the_whole_table():

@@ -19,6 +19,7 @@ from dlkf.filters.integration import Epoch, Fix, integrate
 from dlkf.filters.receiver import ARM, DELAY, DRIFT, PPM, add_drift, let_delay_grow, predict_fix
 from dlkf.navigation.calibration import ImuError
 from dlkf.navigation.error_model import antenna
+from dlkf.navigation.state import NavState
 from dlkf.navigation.strapdown import strapdown
 from dlkf.running.start import align_each
 from tests.cars import IMU, car, car_batch
@@ -158,6 +159,24 @@ def test_the_drift_of_a_clock_is_found(cars):
         for _, s, b in ((kalman, solution, batch), run(cars["right"], "mbkf21_car+receiver", outage=True))
     )
     assert off < of_right + 0.5
+
+
+def test_a_stationary_car_shows_no_delay():
+    """After half an hour at rest under good fixes the delay is as unknown as without any, and not moved: there its H
+    would be the filter's own error in velocity, which the innovation has too."""
+    T, M = 1800, 10
+    batch, g = car_batch(1, T, M), torch.Generator().manual_seed(1)
+    still = NavState(*(0 * x for x in batch.start[:2]), batch.start.C_nb)
+    noise = torch.randn(1, T, M + 1, 6, generator=g, dtype=torch.float64)
+    gravity = batch.frame.gravity(still.p_n) @ still.C_nb[0]
+    rest = torch.cat((-gravity, batch.frame.earth_rate_n @ still.C_nb[0]), -1)
+    batch = replace(
+        batch, start=still, imu=rest + noise[:, :, :M] * noise.new_tensor([0.02] * 3 + [1e-3] * 3),
+        gnss=0.02 * noise[:, :, M], gnss_std=torch.full((1, T, 6), 0.02, dtype=torch.float64),
+    )  # fmt: skip
+    kalman = build_filter("mbkf21_car+receiver", IMU)
+    last = dict(zip(aid_columns(kalman), integrate(batch, kalman).aids[0, -1].tolist()))
+    assert abs(last[DELAY]) < 0.2 * last[f"std_{DELAY}"] and last[f"std_{DELAY}"] > 0.15
 
 
 def test_an_outage_is_as_good_as_with_the_right_ones(cars):

@@ -184,6 +184,7 @@ JUMPY = _changed("gnss", lambda t: round(t) % 7 == 3, lambda x: _put(x, 1, x[1] 
 SCATTERED = _changed("gnss", lambda t: True, lambda x: _put(x, 1, x[1] + 2.5e-5 * sin(round(x[0]) ** 2)))
 COARSE = _changed("gnss", lambda t: True, lambda x: (*x[:4], WITHOUT_VELOCITY, [3.0] * 3 + WITHOUT_VELOCITY, x[6]))
 AROUND = (48.8, 9.2, 300.0)  # some place, far from the drive
+LEVEL = _changed("gnss", lambda t: True, lambda x: _put(x, 4, [*x[4][:2], nan]))
 FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "none": (lambda sent: sent, ("taken",)),
     "single samples": (_one_by_one(
@@ -252,6 +253,10 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     **{name: (jump, ("implausible_fix",)) for name, jump in JUMPS.items()},
     **{name: (lambda sent, jump=JUMPS[jump], late=late: late(jump(sent)), ("implausible_fix",))
        for name, (jump, late) in JUMPS_LATE.items()},
+    "a frozen receiver without velocity down": (lambda sent: LEVEL(_frozen(sent)), ("implausible_fix",)),
+    "a receiver that holds its last position": (lambda sent: ALONE(_frozen(sent)), ()),
+    "sensors that mark invalid values": (
+        _changed("speed", _between(25.0, 28.0), lambda x: _put(x, 1, 1.7e308)), ("implausible",)),
     "a gyroscope that saturates for a second": (
         _changed("imu", _between(30.0, 31.0), lambda x: _put(x, 2, [0.0, 0.0, 35.0])), ()),
     "velocities 4 m/s off, one in five": (
@@ -265,6 +270,7 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "fixes at 2 Hz off the second": (
         _changed("gnss", lambda t: True, lambda x: [_put(x, 0, x[0] - 0.18), _put(x, 0, x[0] + 0.31)]), ()),
     "fix stamps that jitter": (_stamps(_jitter(2, 0.04), ("gnss",)), ()),
+    "positions alone whose stamps jitter": (lambda sent: _stamps(_jitter(3, 0.04), ("gnss",))(ALONE(sent)), ()),
     "sensors 0.4 s late": (_late(0.4, 30.0, 34.0, SENSORS), ("replayed",)),
     "sensors 15 s late": (_late(15.0, 25.0, 40.0, SENSORS), ("late",)),
     "wheel speeds with 1σ, and some without": (

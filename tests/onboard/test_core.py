@@ -71,8 +71,15 @@ def test_samples_of_sensors_that_cannot_be_taken(exported):
     assert core.aid("radar", 1.0, 2.0).status is Status.NO_SENSOR
     assert core.speed(1.0, 2.0, -0.1).status is Status.OUTSIDE
     assert core.speed(np.inf, 2.0).status is Status.NOT_FINITE
+    assert core.speed(1.0, -1.7e308).status is Status.IMPLAUSIBLE
     assert core.baro(1.0, pressure=95_000.0).status is Status.TAKEN
-    assert core.counts == {Status.NO_SENSOR: 1, Status.OUTSIDE: 1, Status.NOT_FINITE: 1, Status.TAKEN: 1}
+    assert core.counts == {
+        Status.NO_SENSOR: 1,
+        Status.OUTSIDE: 1,
+        Status.NOT_FINITE: 1,
+        Status.IMPLAUSIBLE: 1,
+        Status.TAKEN: 1,
+    }
     height = core._library.dlkf_pressure_height(95_000.0)
     assert height == pytest.approx(float(pressure_height(np.float64(95_000.0))), abs=1e-9) and 500 < height < 600
     assert [core.describe_status(x) for x in Status] and core.waiting is Waiting.SAMPLES and core.doubt == 1.0

@@ -107,6 +107,7 @@ def test_what_cannot_be_taken_is_refused_with_a_reason(tables):
         (stream.heading(1.0, 0.1), "takes no heading"),
         (stream.speed(1.0, float("nan")), "not a finite number"),
         (stream.speed(float("inf"), 1.0), "not a finite number"),
+        (stream.speed(1.0, 1.7e308), "a value beyond 1e+09"),
         (stream.speed(1.0, 1.0, -0.1), "std is below 0"),
         (stream.speed(None, 1.0), "not a finite number"),
         (stream.speed(1.0, "fast"), "not a finite number"),

@@ -95,6 +95,12 @@ def error_at_the_end(tables: CheckedTables, found, end: float) -> float:
     return float(np.hypot(off[0], off[1] * np.cos(np.radians(truth[0]))) * EARTH)
 
 
+def error_of_fix(tables: CheckedTables, gnss, t: float) -> float:
+    """Latitude [m] of a fix against the drive's own."""
+    k = int(np.searchsorted(gnss["t"], t))
+    return float(abs(np.radians(gnss["lat_deg"][k] - tables.gnss["lat_deg"][k])) * EARTH)
+
+
 @pytest.fixture(scope="module")
 def begun(minutes):
     """``begun(name)``: a stream that has had the good data before the fault, run once, and what it said of them."""
@@ -124,6 +130,22 @@ def test_it_is_back_after_thirty_seconds_of_good_data(minutes, begun, fault, nam
         assert stream.counts["refused"] >= 1
 
 
+def test_a_receiver_that_holds_its_last_position_costs_no_solution(minutes, begun):
+    """As in a tunnel, for 25 s and without velocities: the gate sees that it is frozen, and the filter is not lost."""
+    gnss = {name: x.copy() for name, x in minutes.gnss.items()}
+    held = (gnss["t"] >= AT) & (gnss["t"] < AT + 25.0)
+    for name in ("lat_deg", "lon_deg", "height_m"):
+        gnss[name][held] = gnss[name][held.argmax() - 1]
+    for name in ("vel_n", "vel_e", "vel_d"):
+        gnss[name][held] = np.nan
+    stream, _, since = begun("mbkf21_nhc_gated")
+    bad = replace(minutes, gnss=gnss)
+    bad = some(some(bad, bad.imu["t"] > since, "imu"), bad.gnss["t"] > since, "gnss")
+    found = [e for r in replay_drive(stream, bad.imu, bad.gnss) for e in r.estimates]
+    assert stream.counts["lost"] == 0
+    assert error_at_the_end(minutes, found, AT + 25.0) < 20.0 < 25.0 < error_of_fix(minutes, gnss, AT + 24.0)
+
+
 def test_a_filter_is_lost_after_fixes_in_a_row_far_off():
     """So many, for so long, each beyond the limit, or half as far off in twice as many; one near fix ends the row."""
     z = torch.tensor([[LOST_M + 1, 0, 0, 0, 0, 0], [0, LOST_M / 2, 0, 0, 0, 0], [0, 0, 0.29 * LOST_M, 0, 0, 0]])
@@ -132,13 +154,14 @@ def test_a_filter_is_lost_after_fixes_in_a_row_far_off():
     watch = LossWatch()
     for k in range(LOST_FIXES):
         assert not watch.is_lost(k)
-        watch = watch.update(float(k), 1.0)
+        watch = watch.update(float(k), 1.0, [k])
+        assert watch.update(k + 0.5, 1.0, [k]) == watch  # the same place again
     assert watch.count == LOST_FIXES and not watch.is_lost(LOST_S - 1) and watch.is_lost(LOST_S)
-    assert watch.update(20.0, 0.0).count == 0
+    assert watch.update(20.0, 0.0, [0]).count == 0
     watch = LossWatch()
     for k in range(2 * LOST_FIXES):
         assert not watch.is_lost(k)
-        watch = watch.update(float(k), 0.5)
+        watch = watch.update(float(k), 0.5, [k])
     assert not watch.is_lost(2 * LOST_S - 1) and watch.is_lost(2 * LOST_S)
 
 

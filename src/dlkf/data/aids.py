@@ -17,6 +17,7 @@ from dlkf.data.resampling import SampleGrid, find_boundary
 from dlkf.data.tables import Columns
 
 ROW = ("value", "std", "lag_s", "span_s", "count")  # of an update interval; a std of 0 is not known, a count of 0: none
+LARGEST_VALUE = 1e9  # of a value in any unit: beyond is a mark of an invalid one, and sums of some overflow
 SEA_LEVEL_PA, SCALE_M, EXPONENT = 101_325.0, 44_330.77, 0.190263  # of the international standard atmosphere
 
 
@@ -25,7 +26,7 @@ def aid_rows(table: AidTable, columns: Columns, grid: SampleGrid) -> np.ndarray:
     value = aid_values(table, columns)
     std = columns.get("std", np.full(len(value), np.nan))
     place = find_boundary(columns["t"], grid)
-    good = np.isfinite(value) & (place >= 1) & (place <= grid.epochs)
+    good = (np.abs(value) <= LARGEST_VALUE) & (place >= 1) & (place <= grid.epochs)
     lag = np.clip(grid.boundaries[place[good]] - columns["t"][good], 0.0, None)
     return _reduce(table, place[good], value[good], std[good], lag, grid.epochs + 1)
 

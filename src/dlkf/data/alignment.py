@@ -106,13 +106,13 @@ def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     position = drive.gnss_valid[:, :3].all(-1)
     u_b, rate_b, turned = _average_force(drive, back)
     down_b = -u_b / u_b.norm(dim=-1, keepdim=True).clamp_min(1.0)
-    v_n, v_std, known, moving, scatter, off = antenna_velocity(drive, C_en, down_b)
+    v_n, v_std, known, moving, scatter, off, lag = antenna_velocity(drive, C_en, down_b)
 
     then = torch.arange(rows) - back
     ok = position & moving & (then >= 0)
     then = then.clamp_min(0)
     ok &= known[then]
-    span = back * drive.epoch_s - drive.gnss_lag + drive.gnss_lag[then]
+    span = back * drive.epoch_s - lag + lag[then]
     ok &= span > 0.5 * drive.epoch_s
     span = span.clamp_min(0.5 * drive.epoch_s)
 
@@ -120,7 +120,7 @@ def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     swing_b = torch.linalg.cross(rate_b, drive.lever_arm_b.expand_as(rate_b))
     speed = v_n[:, :2].norm(dim=-1)
     slip = torch.asin((swing_b[:, 1] / speed.clamp_min(0.1)).clamp(-0.9, 0.9))
-    yaw = torch.atan2(v_n[:, 1], v_n[:, 0]) - slip + drive.gnss_lag * rate_b[:, 2]
+    yaw = torch.atan2(v_n[:, 1], v_n[:, 0]) - slip + lag * rate_b[:, 2]
     C_level = rotation_from_rpy(torch.stack((torch.zeros_like(yaw), torch.zeros_like(yaw), yaw), -1))
     v_imu = v_n - (C_level @ swing_b.unsqueeze(-1)).squeeze(-1)
     swing_then = torch.linalg.cross(rate_b[then], drive.lever_arm_b.expand_as(rate_b))
@@ -131,12 +131,12 @@ def align_boundaries(drive: Drive, config: AlignConfig = ALIGN) -> Aligned:
     u_n = acceleration + 2 * torch.linalg.cross(earth_n, (v_imu + v_then) / 2) - gravity
     roll, pitch = _level(u_b, (C_level.mT @ u_n.unsqueeze(-1)).squeeze(-1))
     C_nb = rotation_from_rpy(torch.stack((roll, pitch, yaw), -1))
-    now = v_imu + drive.gnss_lag.unsqueeze(-1) * acceleration
+    now = v_imu + lag.unsqueeze(-1) * acceleration
     r_e = drive.gnss_r_e + (C_en @ (drive.gnss_lag.unsqueeze(-1) * v_n).unsqueeze(-1)).squeeze(-1)
     r_e = r_e - (C_en @ C_nb @ drive.lever_arm_b).reshape(rows, 3)
 
     noise = v_std[:, :2].amax(-1)
-    shift = torch.maximum(drive.gnss_lag, drive.gnss_lag[then])  # of the velocities' window against the IMU's
+    shift = torch.maximum(lag, lag[then])  # of the velocities' window against the IMU's
     pull = (1.41 * noise / span) ** 2 + (JERK_STD * shift) ** 2 + ACCEL_BIAS_STD**2  # (m/s²)²
     tilt = torch.sqrt(pull / STANDARD_GRAVITY**2 + SPREAD_STD**2)
     turning = AXLE_STD * rate_b[:, 2]  # m/s across the car

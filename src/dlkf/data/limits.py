@@ -78,6 +78,11 @@ def _spread(std: np.ndarray) -> np.ndarray:
     return np.minimum(np.sqrt((np.nan_to_num(std, nan=0.0) ** 2).sum(-1)), MOST_JUMP_STD_M)
 
 
+def known_speed(velocity: np.ndarray) -> np.ndarray:
+    """Magnitude [m/s] of velocities (…, 3) by the components that are known: many receivers give none down."""
+    return np.sqrt(np.nansum(velocity**2, -1))
+
+
 def is_reachable(dt, way_m, climb_m, std_m):
     """Whether a car can have moved so far [m] in ``dt`` [s]; ``std_m`` is the sum of both fixes' 1σ."""
     slack = JUMP_M + JUMP_SIGMAS * std_m
@@ -100,7 +105,7 @@ class FixScreen:
         self.switched: list[tuple[float, float]] = []
 
     def find_refusal(self, t: float, place: tuple[float, float, float], speed: float, std: np.ndarray) -> str:
-        """Why a fix cannot be: time [s], lat [°], lon [°], height [m], speed [m/s] or NaN, 1σ (6); empty if it can."""
+        """Why a fix cannot be: time [s], lat [°], lon [°], height [m], speed [m/s], 1σ (6); empty if it can."""
         lat, lon, height = place
         if reason := find_implausible(lat, lon, height, speed, std):
             return reason
@@ -165,7 +170,7 @@ def screen_fixes(gnss: dict[str, np.ndarray]) -> Screened:
     """A table of usable fixes in order of time through a :class:`FixScreen`; no loop where no two contradict."""
     t, (lat, lon, height) = gnss["t"], (gnss[c] for c in POSITION)
     std = stack_columns(gnss, STD)
-    speed = np.sqrt(sum(gnss[c] ** 2 for c in VELOCITY))
+    speed = known_speed(stack_columns(gnss, VELOCITY))
     spread = _spread(std[:, :3])
     keep = np.ones(len(t), bool)
     way = horizontal_distance(lat[:-1], lon[:-1], lat[1:], lon[1:])
@@ -182,8 +187,8 @@ def screen_fixes(gnss: dict[str, np.ndarray]) -> Screened:
         return Screened(keep, "", [])
     screen, first = FixScreen(), ""
     for k in range(len(t)):
-        speed_k = float(speed[k]) if math.isfinite(speed[k]) else math.nan
-        reason = screen.find_refusal(float(t[k]), (float(lat[k]), float(lon[k]), float(height[k])), speed_k, std[k])
+        place = (float(lat[k]), float(lon[k]), float(height[k]))
+        reason = screen.find_refusal(float(t[k]), place, float(speed[k]), std[k])
         if reason:
             keep[k] = False
             first = first or f"t = {t[k]:.3f}: {reason}"

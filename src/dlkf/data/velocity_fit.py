@@ -7,7 +7,8 @@ v(t) = e^{iα(t)} (z − w τ), τ = t_end − t, so
     p(t) = p_end − z ∫ e^{iα} dτ + w ∫ τ e^{iα} dτ,
 
 which is linear in position, velocity z and acceleration w at the boundary; w has a prior of :data:`ACCELERATION_STD`,
-so that coarse positions are fitted by a constant speed and fine ones by an accelerated motion.
+so that coarse positions are fitted by a constant speed and fine ones by an accelerated motion. A fix that lies before
+its boundary is one of an earlier τ, up to which the car turns evenly.
 
 Positions may be wrong by more than they claim. Outliers are left out by data snooping (Baarda 1968): the largest of
 the residuals over their own 1σ, eᵢ / (σᵢ √(1 − hᵢ)) with h the diagonal of the hat matrix, where it is beyond
@@ -30,6 +31,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from dlkf.data.drive import Drive
 
@@ -61,6 +63,7 @@ class AntennaVelocity(NamedTuple):
     moving: Bool[Tensor, " rows"]  # not just noise, now and a second before
     scatter: Float[Tensor, "rows 2"]  # Birge ratio ≥ 1 of positions, and the like of velocities
     off: Float[Tensor, " rows"]  # m, of the position at the boundary from the fit to the others
+    lag: Float[Tensor, " rows"]  # s before the boundary: of the receiver's, that of its fix
 
 
 def antenna_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Float[Tensor, "rows 3"]) -> AntennaVelocity:
@@ -77,12 +80,12 @@ def antenna_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Floa
     change = (level[before:] / turn[before:] - level[:-before] / turn[:-before]).abs()
     most = CHANGE_SIGMAS * torch.hypot(noise[before:], noise[:-before]) + MOST_ACCELERATION * drive.epoch_s * before
     given = known[:, :2].all(-1) & drive.gnss_valid[:, :3].all(-1)
-    agrees = given & torch.nn.functional.pad((change <= most) | ~given[:-before], (before, 0), value=True)
+    agrees = given & pad((change <= most) | ~given[:-before], (before, 0), value=True)
     scatter = _scatter_of_velocities(drive, level / turn, given, noise)
     std[:, :2] = scale_std(std[:, :2], scatter[:, None], JOLT_STD)
     moving = _confirm_motion(agrees & (level.abs() > MOTION_SIGMAS * std[:, :2].amax(-1)), before)
     both = torch.stack((_scatter_of_positions(drive, C_en, v_n, given, noise, scatter), scatter), -1)
-    return AntennaVelocity(v_n, std, agrees, moving, both, torch.zeros_like(scatter))
+    return AntennaVelocity(v_n, std, agrees, moving, both, torch.zeros_like(scatter), drive.gnss_lag)
 
 
 def _scatter_of_velocities(
@@ -123,7 +126,7 @@ def _scatter_of_positions(
 def _unfold_last(x: Float[Tensor, " n"], drive: Drive) -> Float[Tensor, "rows k"]:
     """Those of the ``FIT_S`` before each boundary; the last n boundaries have one."""
     count = max(2, round(FIT_S / drive.epoch_s))
-    return torch.nn.functional.pad(x, (count + drive.epochs + 1 - len(x), 0), value=torch.inf).unfold(0, count + 1, 1)
+    return pad(x, (count + drive.epochs + 1 - len(x), 0), value=torch.inf).unfold(0, count + 1, 1)
 
 
 def _root_of_median(square: Float[Tensor, "rows k"]) -> Float[Tensor, " rows"]:
@@ -139,13 +142,13 @@ def _count_confirming(drive: Drive) -> int:
 
 
 def _confirm_motion(moves: Bool[Tensor, " rows"], before: int) -> Bool[Tensor, " rows"]:
-    return moves & torch.nn.functional.pad(moves[:-before], (before, 0))
+    return moves & pad(moves[:-before], (before, 0))
 
 
 def _yaw(drive: Drive, down_b: Float[Tensor, "rows 3"]) -> Float[Tensor, " rows"]:
     """Yaw at the boundaries since the first, by the gyroscopes."""
     turned = (drive.imu[..., 3:].double().mean(1) * down_b[1:]).sum(-1) * drive.epoch_s
-    return torch.nn.functional.pad(turned.cumsum(0), (1, 0))
+    return pad(turned.cumsum(0), (1, 0))
 
 
 def scale_std(
@@ -164,16 +167,18 @@ def _fit_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Float[T
     """Fitted to the positions of ``FIT_S`` before a boundary, three at least; its std grows with what an unknown
     gyroscope bias turns the fit by."""
     h, rows = drive.epoch_s, drive.epochs + 1
-    usable = drive.gnss_valid[:, :3].all(-1) & (drive.gnss_lag == 0)
+    usable = drive.gnss_valid[:, :3].all(-1)
     count = max(2, min(round(FIT_S / h), rows - 1))
     before = torch.arange(rows)[:, None] - torch.arange(count + 1)  # boundary, epochs back
     fixed = usable[before.clamp_min(0)] & (before >= 0) & usable[:, None]
-    yaw = _yaw(drive, down_b)[before.clamp_min(0)]
-    heading = torch.polar(torch.ones_like(yaw), yaw - yaw[:, :1])
+    course, lag = _yaw(drive, down_b), drive.gnss_lag[before.clamp_min(0)]
+    yaw, turned = course[before.clamp_min(0)] - course[:, None], pad(course.diff(), (1, 0))[before.clamp_min(0)]
+    heading, then = torch.polar(torch.ones_like(yaw), yaw), torch.polar(torch.ones_like(yaw), yaw - turned * lag / h)
     tau = h * torch.arange(count + 1, dtype=torch.float64)
-    middle, pad = 0.5 * (heading[:, 1:] + heading[:, :-1]) * h, torch.nn.functional.pad
-    way = pad(middle.cumsum(-1), (1, 0))
-    slowed = pad((middle * 0.5 * (tau[1:] + tau[:-1])).cumsum(-1), (1, 0))
+    middle, late = 0.5 * (heading[:, 1:] + heading[:, :-1]) * h, 0.5 * (heading + then) * lag
+    way = pad(middle.cumsum(-1), (1, 0)) + late
+    slowed = pad((middle * 0.5 * (tau[1:] + tau[:-1])).cumsum(-1), (1, 0)) + late * (tau + 0.5 * lag)
+    tau = tau + lag
     r_e = drive.gnss_r_e[before.clamp_min(0)] - drive.gnss_r_e.unsqueeze(1)
     r_n = torch.where(fixed[..., None], (C_en.mT.unsqueeze(1) @ r_e.unsqueeze(-1))[..., 0], 0.0)
     std = torch.hypot(drive.gnss_std[:, :3].amax(-1), torch.tensor(FIT_STD))[before.clamp_min(0)]
@@ -191,14 +196,14 @@ def _fit_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Float[T
     velocity, spread = fit.found[:, 1], scatter * fit.covariance[:, 1, 1].real.sqrt()
     spread = torch.hypot(spread, 0.5 * GYRO_BIAS_STD * (tau * fixed).amax(-1) * velocity.abs())
     v_n = torch.stack((velocity.real, velocity.imag, torch.zeros_like(spread)), -1)
-    slope, level = _vertical_std(v_n), torch.stack((torch.ones_like(tau), -tau), -1).expand(rows, -1, -1)
+    slope, level = _vertical_std(v_n), torch.stack((torch.ones_like(tau), -tau), -1)
     down = _fit(level, r_n[..., 2], weight, torch.stack((torch.full_like(slope, 1e-9), slope**-2), -1))
     v_n[:, 2] = down.found[:, 1]
 
     moves = fixed[:, 0] & (fixed.sum(-1) >= 3) & (velocity.abs() > MOTION_SIGMAS * spread)
     moving = _confirm_motion(moves, _count_confirming(drive))
     one = torch.ones_like(scatter)
-    off = fit.found[:, 0].abs() / (1 - fit.own[:, 0]).clamp_min(LEAST_SHARE)
+    off = (x[:, :1] @ fit.found.unsqueeze(-1))[:, 0, 0].abs() / (1 - fit.own[:, 0]).clamp_min(LEAST_SHARE)
     return AntennaVelocity(
         v_n,
         torch.stack((spread, spread, down.covariance[:, 1, 1].sqrt()), -1),
@@ -206,6 +211,7 @@ def _fit_velocity(drive: Drive, C_en: Float[Tensor, "rows 3 3"], down_b: Float[T
         moving,
         torch.stack((scatter, one), -1),
         off,
+        torch.zeros_like(off),
     )
 
 

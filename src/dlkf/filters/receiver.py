@@ -2,8 +2,9 @@
 
 With a delay d of the fixes and an antenna at l̂ = l + δl from the IMU, a fix that is stamped t is predicted as position
 and velocity of the antenna at t − d (:func:`dlkf.navigation.error_model.antenna`): between two samples of the window,
-and beyond its ends with its mean acceleration a. H has −v_a and −a for δd, C and C [ω×] for δl, with v_a the velocity
-of the antenna, and −(λ + d) I for the velocity in a position that lies λ before the window's end by its stamp. A
+and beyond its ends with its mean acceleration a. H has −v_a and −a for δd (zero below ``MOVING``, where v_a is mostly
+the filter's own error, which is in the innovation too), C and C [ω×] for δl, with v_a the velocity of the antenna, and
+−(λ + d) I for the velocity in a position that lies λ before the window's end by its stamp. A
 receiver's clock that is fast by r against that of the IMU makes the delay grow, ḋ = r (:func:`let_delay_grow`). A
 filter with the source ``+receiver`` (:class:`dlkf.filters.aids.receiver.Receiver`) estimates d, δl and r.
 """
@@ -25,6 +26,7 @@ DELAY = "fix_delay_s"
 ARM = ("lever_forward_m", "lever_right_m", "lever_down_m")
 DRIFT = "clock_drift_ppm"
 PPM = 1e-6
+MOVING = 1.0  # m/s: a slower car shows no delay
 
 
 def has_receiver(states: ErrorStates) -> bool:
@@ -82,7 +84,8 @@ def add_columns(H: Float[Tensor, "B 6 n"], epoch: Epoch, states: ErrorStates) ->
     """H with the columns of delay and antenna, for an epoch of :func:`predict_fix`."""
     H, C, k = H.clone(), epoch.at_fix.C_nb, states.of(ARM[0]).start
     v = antenna(epoch.at_fix, epoch.rate_at_fix_b, epoch.lever_arm_b, epoch.frame)[:, 3:]
-    H[:, :, states.of(DELAY).start] = -torch.cat((v, _acceleration(epoch)), -1)
+    moves = v.norm(dim=-1, keepdim=True) > MOVING
+    H[:, :, states.of(DELAY).start] = torch.where(moves, -torch.cat((v, _acceleration(epoch)), -1), 0.0)
     H[:, :, k : k + 3] = torch.cat((C, C @ skew(epoch.rate_at_fix_b)), 1)
     return H
 

@@ -221,7 +221,7 @@ def constants() -> str:
     values |= {f"SPIKE_{name}": getattr(spikes, name) for name in names}
     values |= {"REST_SPREAD_ACCEL": standstill.REST_SPREAD[0], "REST_SPREAD_GYRO": standstill.REST_SPREAD[1]}
     for module, names in (
-        (aids, ("SEA_LEVEL_PA", "SCALE_M", "EXPONENT")),
+        (aids, ("LARGEST_VALUE", "SEA_LEVEL_PA", "SCALE_M", "EXPONENT")),
         (bank, ("RING", "REVERSE_PRIOR", "REVERSE_SPEED", "RING_PRIOR", "COARSE", "NIS_CAP", "DECIDED", "OTHER",
                 "READY_STD", "OVERBOUND", "BIAS_OVERBOUND", "LEAST_BIAS_STD")),
         (standstill, ("REST_RATE", "REST_SPEED", "REST_POSITION_STD", "RATE_STD", "RATE_DRIFT_STD", "RATE_SCALE_STD")),

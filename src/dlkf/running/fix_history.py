@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dlkf.data.limits import FixScreen
+from dlkf.data.limits import FixScreen, known_speed
 from dlkf.data.schema import POSITION, STD, VELOCITY
 
 HELD = 200  # fixes; ``DLKF_EARLY`` of the C core
@@ -76,5 +76,5 @@ class FixHistory:
 def _refusal(screen: FixScreen, fix: ScreenedFix) -> str:
     """Why no car can have reached a fix, or nothing."""
     lat, lon, height = (float(fix.table[name][0]) for name in POSITION)
-    speed = float(np.sqrt(sum(fix.table[name][0] ** 2 for name in VELOCITY)))
+    speed = float(known_speed(np.array([fix.table[name][0] for name in VELOCITY])))
     return screen.find_refusal(fix.t, (lat, lon, height), speed, np.array([fix.table[name][0] for name in STD]))

@@ -2,12 +2,14 @@
 
 Gates inside filters judge one fix by the filter. Here fixes that passed the physical limits (:mod:`dlkf.data.limits`)
 judge the filter: if its position is far off in ``LOST_FIXES`` of them in a row, over ``LOST_S`` seconds, or less far in
-more of them, it must start over with an alignment. So a filter whose attitude was ruined by damaged samples comes back,
+more of them, it must start over with an alignment. A receiver that repeats its last position, as many do in a tunnel,
+says nothing by it: such a fix does not count. So a filter whose attitude was ruined by damaged samples comes back,
 a gated one too, which would refuse good fixes for ever.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -19,17 +21,21 @@ from dlkf.filters.integration import BatchSolution
 
 
 class LossWatch(NamedTuple):
-    """Fixes in a row that lie far off, the sum of their shares (:func:`far_off`), the time [s] of the first of them."""
+    """Fixes in a row that lie far off, the sum of their shares (:func:`far_off`), the time [s] of the first of them,
+    and the place of the last fix."""
 
     count: int = 0
     total: float = 0.0
     since: float = 0.0
+    place: tuple[float, ...] = ()
 
-    def update(self, t: float, share: float) -> LossWatch:
-        """After a fix at ``t`` [s]."""
+    def update(self, t: float, share: float, place: Sequence[float]) -> LossWatch:
+        """After a fix at ``t`` [s]; ``place`` is its position, in any axes."""
+        if (place := tuple(place)) == self.place:
+            return self
         if share == 0:
-            return LossWatch()
-        return LossWatch(self.count + 1, self.total + share, self.since if self.count else t)
+            return LossWatch(place=place)
+        return LossWatch(self.count + 1, self.total + share, self.since if self.count else t, place)
 
     def is_lost(self, t: float) -> bool:
         """Whether that is enough at ``t`` [s]."""
@@ -66,7 +72,7 @@ def find_first_loss(batch: Batch, row: int, solution: BatchSolution) -> int | No
     watch = LossWatch()
     for k in torch.nonzero(offered).flatten().tolist():
         t = k * batch.epoch_s
-        watch = watch.update(t, float(far[k]))
+        watch = watch.update(t, float(far[k]), batch.gnss[row, k, :3].tolist())
         if watch.is_lost(t):
             return k if at is None else min(at, k)
     return at

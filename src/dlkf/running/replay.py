@@ -14,7 +14,7 @@ import torch
 from dlkf.base.console import ProgressCallback
 from dlkf.base.errors import InputError, no_drives
 from dlkf.data.aid_tables import STANDARD, AidTable
-from dlkf.data.aids import aid_values
+from dlkf.data.aids import LARGEST_VALUE, aid_values
 from dlkf.data.alignment import SEARCH, AlignConfig
 from dlkf.data.schema import ACCEL, GYRO, POSITION, STD, VELOCITY
 from dlkf.data.store import drive_from_tables, drive_rows
@@ -104,7 +104,7 @@ def _aid_samples(aids: Mapping[str, Columns], tables: Sequence[AidTable]) -> Ite
     for name, columns in aids.items():
         value = aid_values(kinds[name], columns)
         std = columns.get("std", np.full(len(value), np.nan))
-        good = np.isfinite(value)
+        good = np.abs(value) <= LARGEST_VALUE
         yield from zip([name] * int(good.sum()), columns["t"][good].tolist(), value[good].tolist(), std[good].tolist())
 
 

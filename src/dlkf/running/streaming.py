@@ -40,7 +40,7 @@ import torch
 
 from dlkf.base.errors import InputError
 from dlkf.base.settings import is_number
-from dlkf.data.aids import pressure_height
+from dlkf.data.aids import LARGEST_VALUE, pressure_height
 from dlkf.data.alignment import SEARCH, AlignConfig
 from dlkf.data.resampling import ON_BOUNDARY_S, find_boundary, make_fixes
 from dlkf.data.validate import LIMITS, Limits
@@ -239,7 +239,7 @@ class StreamingFilter:
         """Take a sample of the sensor ``name`` of the filter, in the unit of its table.
 
         It may come late, as a fix may. Refused are a sensor that the filter does not take, and values that are not
-        finite.
+        finite or beyond :data:`dlkf.data.aids.LARGEST_VALUE`.
         """
         if name not in self._buffer.tables:
             known = ", ".join(self._buffer.tables) or "none"
@@ -247,6 +247,8 @@ class StreamingFilter:
         sample = (name, as_number(t), as_number(value), as_number(std))
         if not (math.isfinite(sample[1]) and math.isfinite(sample[2])):
             return self._answer(Status.REFUSED, f"{name}: t or value is not a finite number")
+        if abs(sample[2]) > LARGEST_VALUE:
+            return self._answer(Status.REFUSED, f"{name}: a value beyond {LARGEST_VALUE:g}")
         if sample[3] < 0:
             return self._answer(Status.REFUSED, f"{name}: std is below 0; NaN if unknown")
         if self._samples.grid is not None:

@@ -91,6 +91,20 @@ def test_without_velocities_positions_do(drive):
     assert (v.abs() < 3 * std[:, 3:6]).all()
 
 
+def test_positions_alone_that_wait_for_their_boundary_do_too(drive):
+    """Stamps of a host, a receiver on another clock: no fix is on a boundary, each up to 0.9 s before."""
+    lag = 0.1 + 0.8 * torch.rand(len(drive.gnss_lag), generator=torch.Generator().manual_seed(8), dtype=torch.float64)
+    r, v, s = drive.ref_r_e, drive.epoch_s * drive.ref_v_e, (1 - lag / drive.epoch_s)[1:, None]
+    late = r[:-1] + (r[1:] - r[:-1]) * (s * s * (3 - 2 * s)) + s * (1 - s) * ((1 - s) * v[:-1] - s * v[1:])
+    late = torch.cat((r[:1] - lag[0] * v[:1], late))
+    blind = replace(drive, gnss_valid=drive.gnss_valid & (torch.arange(6) < 3), gnss_r_e=late, gnss_lag=lag)
+    attitude, dr, dv, std = _errors(blind, align_boundaries(blind))
+    assert len(attitude) >= 55
+    # the position is carried on with the velocity of the boundary: ½ · 2.7 m/s² · (0.9 s)² in a turn
+    assert attitude.abs().max() < 2.5 and dv.norm(dim=-1).max() < 0.6 and dr.norm(dim=-1).max() < 1.1
+    assert (dv.abs() < 3 * std[:, 3:6]).all()
+
+
 def test_coarse_positions_give_a_course_as_good_as_it_says(drive):
     """Half a metre of white noise at 10 m/s: three successive positions gave 7° (0.5 m · √26 / 2 s / 10 m/s)."""
     g = torch.Generator().manual_seed(0)

@@ -80,6 +80,7 @@ dlkf_status dlkf_aid(dlkf *d, int sensor, double t, double value, double std) {
   d->made = d->given = 0;
   if (sensor < 0 || sensor >= DLKF_AIDS) return dlkf_counted(d, DLKF_NO_SENSOR);
   if (!isfinite(t) || !isfinite(value)) return dlkf_counted(d, DLKF_NOT_FINITE);
+  if (fabs(value) > LARGEST_VALUE) return dlkf_counted(d, DLKF_IMPLAUSIBLE);
   if (std < 0) return dlkf_counted(d, DLKF_OUTSIDE);
   if (!isnan(d->samples.t0)) return file_aid(d, sensor, t, value, std);
   if (d->early_aid_count == DLKF_EARLY_AIDS) d->early_aid = (d->early_aid + 1) % DLKF_EARLY_AIDS, d->early_aid_count--;

@@ -14,6 +14,7 @@ typedef struct {
   const dlkf_fix *fix;
   double C_en[9], lat, height, v_n[3], std[3];
   double scatter[2], off; /* of positions and velocities over what they claim; m of the position from the fit */
+  double lag;             /* of the velocity, s before the boundary */
 } boundary;
 
 typedef struct {
@@ -145,7 +146,6 @@ static int fit_velocity(const dlkf *d, int64_t number, int64_t first, boundary *
   double D[3] = {1e-9, 0, 0}, down[2] = {0};
   fitted at[DLKF_FITTED + 1];
   int count = 0;
-  if (b->fix->lag > 0) return 0;
   for (int j = 0; j <= DLKF_FITTED && number - j >= first; j++) {
     const double tau = j * EPOCH_S;
     if (j) {
@@ -159,10 +159,20 @@ static int fit_velocity(const dlkf *d, int64_t number, int64_t first, boundary *
       }
     }
     const dlkf_fix *fix = dlkf_fix_at(d, number - j);
-    if (!has_position(fix) || fix->lag > 0) continue;
+    if (!has_position(fix)) continue;
+    double late[2] = {0, 0}; /* the way since a fix to its boundary, over which the car turns evenly */
+    if (fix->lag > 0) {
+      const double turn = number - j > first ? yaw_turned(d, number - j - 1, first) * fix->lag / EPOCH_S : 0;
+      late[0] = 0.5 * (before[0] + cos(yaw - turn)) * fix->lag, late[1] = 0.5 * (before[1] + sin(yaw - turn)) * fix->lag;
+    }
     double std = fix->std[0] > fix->std[1] ? fix->std[0] : fix->std[1];
     std = hypot(fix->std[2] > std ? fix->std[2] : std, FIT_STD);
-    at[count] = (fitted){1 / (std * std), {1, -way[0], slowed[0], 0, -way[1], slowed[1]}, {0}, tau};
+    fitted *one = &at[count];
+    *one = (fitted){1 / (std * std), {1, 0, 0, 0, 0, 0}, {0}, tau + fix->lag};
+    for (int c = 0; c < 2; c++) {
+      one->row[3 * c + 1] = -(way[c] + late[c]);
+      one->row[3 * c + 2] = slowed[c] + late[c] * (tau + 0.5 * fix->lag);
+    }
     for (int k = 0; k < 3; k++) u[k] = fix->r_e[k] - b->fix->r_e[k];
     apply3_transposed(b->C_en, u, at[count++].r_n);
   }
@@ -179,7 +189,11 @@ static int fit_velocity(const dlkf *d, int64_t number, int64_t first, boundary *
   if (s.fixes < 3 || !(at[0].weight > 0)) return 0;
   const double squares = s.squares / (s.fixes > 4 ? 2 * s.fixes - 7 : 1);
   b->scatter[0] = squares > 1 ? sqrt(squares) : 1;
-  b->off = hypot(s.x[0], s.x[3]) / s.others_share;
+  const double *row = at[0].row;
+  double north = 0, east = 0;
+  for (int k = 0; k < 3; k++) north += row[k] * s.x[k] - row[3 + k] * s.x[3 + k], east += row[k] * s.x[3 + k] + row[3 + k] * s.x[k];
+  b->off = hypot(north, east) / s.others_share;
+  b->lag = 0;
   for (int n = 0; n < count; n++) {
     const double weight = at[n].weight, tau = at[n].tau;
     if (weight > 0) span = tau;
@@ -202,6 +216,7 @@ static int find_boundary(const dlkf *d, int64_t number, boundary *b) {
   b->fix = dlkf_fix_at(d, number);
   b->scatter[0] = b->scatter[1] = 1, b->off = 0;
   if (!has_position(b->fix)) return 0;
+  b->lag = b->fix->lag;
   geodetic_from_ecef(b->fix->r_e, &b->lat, &lon, &b->height);
   ned_axes(b->lat, lon, b->C_en);
   return 1;
@@ -337,7 +352,7 @@ int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b, double 
   if (velocities && !(read_velocity(d, epoch, &now) && hypot(now.v_n[0], now.v_n[1]) > MIN_SPEED)) return 0; /* quick */
   if (!read_boundary(d, epoch, first, velocities, &now) || !is_moving(d, epoch, first, velocities, &now)) return 0;
   if (!read_boundary(d, epoch - BACK, first, velocities, &then)) return 0;
-  const double lag = now.fix->lag, lag_then = then.fix->lag, span = BACK * EPOCH_S - lag + lag_then;
+  const double lag = now.lag, lag_then = then.lag, span = BACK * EPOCH_S - lag + lag_then;
   const double speed = hypot(now.v_n[0], now.v_n[1]), slow = speed > 0.1 ? speed : 0.1;
   const double noise = noise_of(&now);
   if (!(span > 0.5 * EPOCH_S) || !(speed > MIN_SPEED) || !(speed > MOTION_SIGMAS * noise)) return 0;
@@ -371,7 +386,7 @@ int dlkf_align(const dlkf *d, int64_t epoch, double *start, double *u_b, double 
   rotation_from_rpy(roll, pitch, yaw, C_nb);
 
   double r_e[3], v_e[3], C_eb[9], C_new[9];
-  for (int k = 0; k < 3; k++) u[k] = lag * now.v_n[k];
+  for (int k = 0; k < 3; k++) u[k] = now.fix->lag * now.v_n[k];
   apply3(now.C_en, u, w);
   product3(now.C_en, C_nb, C_eb);
   apply3(C_eb, arm, u);

@@ -55,7 +55,7 @@ typedef enum {
   DLKF_REPLAYED,    /* came late: the filter went back and came again; dlkf_next gives those rows anew */
   DLKF_SUPERSEDED,  /* a later one of the same update interval is there already */
   DLKF_NOT_FINITE,  /* refused: a number is NaN or infinite */
-  DLKF_IMPLAUSIBLE, /* refused: beyond what an IMU of a car measures */
+  DLKF_IMPLAUSIBLE, /* refused: beyond what an IMU of a car, or any sensor, measures */
   DLKF_DOUBLE,      /* refused: this stamp again */
   DLKF_BACK,        /* refused: the stamp lies before the last sample's */
   DLKF_GAP,         /* refused: the stamp leaps ahead by more than is bridged */
@@ -105,6 +105,7 @@ typedef struct {
 
 typedef struct {
   double since, total; /* of fixes in a row far off the filter: time of the first, sum of how far */
+  double place[3];     /* of the last fix, r_e */
   int32_t count;
 } dlkf_watch;
 

@@ -1,5 +1,6 @@
 /* Fixes one at a time, each compared with the last good one; what no car can have reached is refused (dlkf.data.limits). */
 #include <math.h>
+#include <string.h>
 
 #include "constants.h"
 #include "dlkf.h"
@@ -25,7 +26,9 @@ void dlkf_screen_clear(dlkf_screen *s) { s->count = s->others = s->known = 0; }
 
 /* 1 for a fix that a car can have reached; it is then the good one. */
 int dlkf_screen_take(dlkf_screen *s, const dlkf_report *x) {
-  const double speed = sqrt(x->v[0] * x->v[0] + x->v[1] * x->v[1] + x->v[2] * x->v[2]);
+  double speed = 0; /* by the components that are known */
+  for (int k = 0; k < 3; k++) speed += isnan(x->v[k]) ? 0 : x->v[k] * x->v[k];
+  speed = sqrt(speed);
   if (fabs(x->lat_deg) < NOWHERE_DEG && fabs(x->lon_deg) < NOWHERE_DEG) return 0;
   if (!(x->height_m >= LOWEST_M && x->height_m <= HIGHEST_M) || speed > FASTEST_M_S) return 0;
   double squares = 0;
@@ -65,13 +68,17 @@ int dlkf_screen_take(dlkf_screen *s, const dlkf_report *x) {
  * so many that the filter is lost, or its state is that of no car (dlkf.running.loss). */
 int dlkf_lost(dlkf *d, int64_t number, const double *fix) {
   const double t = (double)number * (DLKF_SAMPLES / DLKF_RATE_HZ), *z = d->outputs + DLKF_OUTPUTS_INNOVATION;
-  if (fix[12] > 0 || fix[13] > 0 || fix[14] > 0) {
+  const dlkf_fix *held = dlkf_fix_at(d, number + 1);
+  int repeated = held != NULL; /* a receiver that repeats its last position says nothing by it */
+  for (int k = 0; repeated && k < 3; k++) repeated = held->r_e[k] >= d->watch.place[k] && held->r_e[k] <= d->watch.place[k];
+  if (!repeated && (fix[12] > 0 || fix[13] > 0 || fix[14] > 0)) {
     const double std = sqrt(fix[6] * fix[6] + fix[7] * fix[7] + fix[8] * fix[8]) * LOST_SIGMAS;
     const double share = sqrt(z[0] * z[0] + z[1] * z[1] + z[2] * z[2]) / (std > LOST_M ? std : LOST_M);
     const int far = share > LOST_SHARE;
     if (far && !d->watch.count) d->watch.since = t;
     d->watch.total = far ? d->watch.total + (share < 1 ? share : 1) : 0;
     d->watch.count = far ? d->watch.count + 1 : 0;
+    if (held) memcpy(d->watch.place, held->r_e, sizeof d->watch.place);
   }
   const double *p = d->outputs + DLKF_OUTPUTS_POSTERIOR, *v = p + 3;
   const double height = d->now.filter[DLKF_AT_HEIGHT] - p[2] + (p[0] * p[0] + p[1] * p[1]) / 2 / EARTH_M;
