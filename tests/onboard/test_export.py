@@ -328,6 +328,7 @@ def test_many_drives_through_a_large_network_go_through_torch(drive, monkeypatch
     assert torch.equal(got.posterior.p_n, want.posterior.p_n)
 
 
+@pytest.mark.exports
 def test_ten_hours_with_one_call_in_twenty_faulty(exported, tmp_path):
     """36,000 update intervals in C, allocations counted by the program's own allocator; it still knows where it is."""
     folder, *_ = exported

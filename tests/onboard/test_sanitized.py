@@ -12,7 +12,7 @@ from dlkf.onboard.c_source import EXAMPLES
 from dlkf.onboard.core import Core
 from dlkf.onboard.library import find_compiler
 from tests.onboard.conftest import ARM
-from tests.onboard.faults import FAULTS
+from tests.onboard.faults import FAULTS, USUAL
 from tests.onboard.programs import HERE, SANITIZED, compile_program, lines, run, tool
 from tests.onboard.streams import apart, calls, through_core
 
@@ -30,11 +30,12 @@ def sanitized(request, exported, tmp_path_factory):
     return compile_program(str(find_compiler()), exported[0], main, folder / "navigate", SANITIZED, filter_of=made)
 
 
-def test_every_fault_as_lines(sanitized, tables):
-    """All faults, one after the other through one program each; the exit code of a report would be another."""
+@pytest.mark.parametrize("names", [USUAL, pytest.param(FAULTS, marks=pytest.mark.exports)], ids=["usual", "all"])
+def test_faults_as_lines(names, sanitized, tables):
+    """One after the other through one program each; the exit code of a report would be another."""
     sent = calls(tables)
-    for name, (fault, _) in FAULTS.items():
-        given = {"input": lines(fault(sent)), "capture_output": True, "text": True}
+    for name in names:
+        given = {"input": lines(FAULTS[name][0](sent)), "capture_output": True, "text": True}
         every = ["--samples"] if name in EVERY_SAMPLE else []
         done = subprocess.run([sanitized, *every, "--arm", *map(str, ARM)], **given)
         assert done.returncode == 0, f"{name}: {done.stderr[-2000:]}"
