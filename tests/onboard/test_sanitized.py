@@ -12,12 +12,14 @@ from dlkf.onboard.c_source import EXAMPLES
 from dlkf.onboard.core import Core
 from dlkf.onboard.library import find_compiler
 from tests.onboard.conftest import ARM
-from tests.onboard.faults import FAULTS, USUAL
+from tests.onboard.faults import FAULTS
 from tests.onboard.programs import HERE, SANITIZED, compile_program, lines, run, tool
 from tests.onboard.streams import apart, calls, through_core
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 EVERY_SAMPLE = ("none", "a gap of 0.2 s", "damage of all kinds")  # the state at every sample takes its time
+USUAL = (*EVERY_SAMPLE, "single samples", "single fixes", "single samples of sensors", "clocks set back 50 s",
+         "coarse positions alone, 3 s late", "sensors 15 s late")  # fmt: skip
 FUZZ_S = 600  # of each of the two
 
 

@@ -25,7 +25,7 @@ def home(tmp_path_factory):
     folder = tmp_path_factory.mktemp("kalman_gain")
     filters = {"dlkf": build_filter("mbkf21", IMU), "mbkf15": build_filter("mbkf15", IMU)}
     for name, (s_p, s_v) in NOISE.items():
-        batch = scene(3, 30, seed=1, position_std=0.03 + s_p, velocity_std=0.02 + s_v)
+        batch = scene(2, 20, seed=1, position_std=0.03 + s_p, velocity_std=0.02 + s_v)
         report = folder / name / "report"
         write_gains(report, measure_gains(filters, [(batch, torch.zeros(batch.size[:2], dtype=torch.bool))]), name)
         results = summarise_scores(score(filters, [batch], kinds="simulated"))
