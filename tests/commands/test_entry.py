@@ -105,6 +105,7 @@ def test_every_command_has_a_module_and_every_configured_one_is_listed():
     assert {p.stem for p in config_dir().glob("*.yaml")} - {"hydra_output"} <= set(COMMANDS)
 
 
+@pytest.mark.whole
 def test_modules_of_the_current_folder_are_found(tmp_path):
     """As ``python -m dlkf.evaluate`` finds them; one with the name of a library does not take its place."""
     (tmp_path / "blend.py").write_text("class Blend:\n    begin = 1\n")
