@@ -241,6 +241,7 @@ def test_nmea_with_a_heading(tmp_path, drive, kind):
 @pytest.mark.parametrize("stamped", [False, True], ids=["Odometry", "TwistStamped"])
 def test_a_bag_with_wheels(tmp_path, drive, stamped):
     """Beside the velocities of GNSS, which are TwistStamped too."""
+
     class Both(_Bag):
         def imu(self, tables, base):
             super().imu(tables, base)

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,26 +29,26 @@ def settings(devices: int):
     return make_settings(max_epochs=EPOCHS, validate_every=1, devices=devices, strategy="ddp")
 
 
+def train(devices: int, dataset: Path, folder: Path) -> tuple[dict, Path]:
+    """Last state and best weights; a further process is a fork: what a command would import anew is there."""
+
+    def fit_here() -> Path:
+        return fit(settings(devices), data(dataset), folder / "study", False, further=["along"])
+
+    def fork(_, env):
+        process = start_fork(folder, folder / "said", lambda: (os.environ.update(env), fit_here()))
+        return SimpleNamespace(poll=lambda: process.exitcode, wait=process.join, kill=process.kill)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dlkf.training.processes.subprocess", SimpleNamespace(Popen=fork))
+        best = fit_here()
+    return torch.load(folder / "study" / "last.ckpt", weights_only=True), best
+
+
 @pytest.fixture(scope="module")
 def trained(dataset, tmp_path_factory) -> list:
-    """Last state and best weights of one process and of two, of which the second is a fork: what a command would import
-    anew is there."""
-    out = []
-    for devices in (1, 2):
-        folder = tmp_path_factory.mktemp("run")
-
-        def train():
-            return fit(settings(devices), data(dataset), folder / "study", False, further=["along"])
-
-        def fork(_, env):
-            process = start_fork(folder, folder / "said", lambda: (os.environ.update(env), train()))
-            return SimpleNamespace(poll=lambda: process.exitcode, wait=process.join, kill=process.kill)
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("dlkf.training.processes.subprocess", SimpleNamespace(Popen=fork))
-            best = train()
-        out.append((torch.load(folder / "study" / "last.ckpt", weights_only=True), best))
-    return out
+    """By one process and by two."""
+    return [train(devices, dataset, tmp_path_factory.mktemp("run")) for devices in (1, 2)]
 
 
 def test_two_processes_learn_what_one_does(trained):
