@@ -43,6 +43,7 @@ def test_a_filter_that_listens_says_that_samples_are_too_slow_for_it():
     assert line.startswith("plus needs samples at 50 Hz or more for its full accuracy and these drives have 1 to 10 Hz")
 
 
+@pytest.mark.commands
 @pytest.mark.whole
 def test_navigate_and_evaluate_say_so_of_a_file_and_of_a_rate(call, town, tmp_path):
     """The rate of the samples in the file counts, whatever its ``drives.parquet`` says and they are brought to: what

@@ -7,6 +7,7 @@ import pytest
 from tests.docs.pages import ROOT, blocks
 
 
+@pytest.mark.commands
 @pytest.mark.whole
 def test_the_blocks_run(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)

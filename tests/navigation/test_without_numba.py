@@ -54,6 +54,7 @@ def test_short_work_can_do_without():
         assert not compiled.fits(torch.zeros(1))
 
 
+@pytest.mark.commands
 @pytest.mark.whole
 def test_numba_loads_with_the_first_loop():
     """It takes half a second, which a command that needs no loop saves."""

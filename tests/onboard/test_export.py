@@ -349,6 +349,7 @@ INCLUDED = (
 )  # fmt: skip
 
 
+@pytest.mark.exports
 def test_the_ros_2_node_says_what_the_example_does(exported, example, tables, tmp_path):
     """With what it takes of ROS 2 in ros2.hpp, never built with ROS 2 itself. Late fixes change nothing in the end."""
     folder, *_ = exported

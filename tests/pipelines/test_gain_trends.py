@@ -42,6 +42,7 @@ def study(monkeypatch, folder) -> int:
     return gain_trends.main()
 
 
+@pytest.mark.commands
 def test_figures_tables_and_trends(home, monkeypatch, capsys):
     assert study(monkeypatch, home) == 0, capsys.readouterr().out
     assert all((home / f"figure{n}.png").read_bytes().startswith(b"\x89PNG") for n in (7, 8, 9))
@@ -50,6 +51,7 @@ def test_figures_tables_and_trends(home, monkeypatch, capsys):
     assert (home / "trends.md").read_text().count("| yes |") == 2 * 4
 
 
+@pytest.mark.commands
 def test_a_gain_that_does_not_follow_is_said(home, monkeypatch, capsys):
     monkeypatch.setattr(gain_trends, "FIGURES", {})  # drawn above
     file = home / "set3" / "report" / "gains.json"

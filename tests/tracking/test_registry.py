@@ -185,6 +185,7 @@ assert {{"rich", "hydra", "lightning"}} <= foreign and "torch" not in foreign
 """
 
 
+@pytest.mark.commands
 def test_a_logged_model_brings_its_code_and_no_pickle(logged, uri, cars):
     """Loaded in an interpreter where pickles are refused and its requirements alone can be imported."""
     folder = download_model("models:/town/1", uri).parents[1]

@@ -91,6 +91,7 @@ def dataset(once) -> Path:
     return once("quarter", lambda folder: drives_in(config, folder / "quarter")) / "quarter"
 
 
+@pytest.mark.commands
 @pytest.mark.whole
 def test_a_whole_training_runs_there(dataset, tmp_path, monkeypatch):
     """Curriculum, masks, loss weights, validation and the kept weights, which are those of the CPU to rounding."""
