@@ -149,6 +149,7 @@ def test_ordinary_paths_need_no_quotes(given, taken):
     assert quote_argument(f"out=~{user.pw_name}/x") == f"out={user.pw_dir}/x"
 
 
+@pytest.mark.commands
 @pytest.mark.whole
 def test_in_a_shell(tmp_path, town):
     """The same command as ``python -m dlkf.navigate``, with a folder that Hydra's grammar does not take."""

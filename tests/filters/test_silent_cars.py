@@ -115,7 +115,7 @@ def solve(batch, used: bool):
         return run_filter(batch, estimator), torch.stack(eyes[0].seen, 1)
 
 
-@pytest.mark.parametrize("name", ["mbkf21_car", "plus"])
+@pytest.mark.parametrize("name", ["mbkf21_car", pytest.param("plus", marks=pytest.mark.commands)])
 def test_two_minutes_with_curves_are_bridged(silent, classically, name):
     """Horizontal RMS at the ends of the outages below 15 m."""
     batch, ends = silent

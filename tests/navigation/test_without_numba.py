@@ -32,7 +32,7 @@ WORLDS = {  # what is wrong before dlkf is loaded, whether loops are compiled th
 }
 
 
-@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("world", ["no numba", pytest.param("nowhere to keep it", marks=pytest.mark.commands)])
 @pytest.mark.whole
 def test_what_is_wrong_is_said_once(world):
     before, available, said = WORLDS[world]

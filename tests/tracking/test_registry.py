@@ -260,6 +260,7 @@ def test_names_the_registry_would_refuse(name, alias):
     check_registration(None, None)
 
 
+@pytest.mark.commands
 def test_a_store_that_was_moved_says_so(logged, uri, weights, tmp_path):
     """It names absolute places; a new run would write to where it was."""
     old, new = tmp_path / "here", tmp_path / "there"

@@ -229,6 +229,7 @@ def _puck(drive, seed: int):
     return replace(drive, gnss_r_e=drive.gnss_r_e + noise, gnss_std=std, gnss_valid=valid)
 
 
+@pytest.mark.commands
 def test_a_glimpse_between_two_outages_does_not_start_the_wrong_way_round():
     """15 s of 5 Hz positions at 3 m/s and more, on real roads with an IMU of 1 °/s: 174° off, and 55° RMS, before."""
     if not (REAL / "wid").is_dir():
