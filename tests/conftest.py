@@ -20,11 +20,12 @@ LONG_ROOMS = ("training", "tuning", "tracking", "pipelines", "onboard", "docs") 
 
 WHOLE_FIXTURES = {"uri", "exported", "site", "trained", "cluster", "alone", "server"}
 WHOLE_ROOMS = {"onboard", "pipelines"}
-WHOLE_FILES = {  # that take ten seconds and more
+WHOLE_FILES = {  # that take five seconds and more
     "test_aid_logs.py", "test_aid_stream.py", "test_bank.py", "test_chassis.py", "test_configuration.py",
-    "test_faulty_data.py", "test_foreign_tables.py", "test_likelihood.py", "test_receiver.py", "test_recovery.py",
-    "test_refusals.py", "test_silent_cars.py", "test_stationarity.py", "test_streaming.py", "test_wheel_faults.py",
-    "test_wrong_words.py",
+    "test_consistency.py", "test_datamodule.py", "test_faulty_data.py", "test_foreign_tables.py", "test_formats.py",
+    "test_likelihood.py", "test_receiver.py", "test_recorders.py", "test_recovery.py", "test_refusals.py",
+    "test_silent_cars.py", "test_stationarity.py", "test_stores.py", "test_streaming.py", "test_tuning.py",
+    "test_wheel_faults.py", "test_wrong_words.py",
 }  # fmt: skip
 
 

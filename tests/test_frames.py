@@ -108,6 +108,7 @@ def test_a_solution_shows_and_writes_itself(drive, tmp_path):
     assert "<time>" not in (place / "solution.gpx").read_text()  # t counts from 0: no date
 
 
+@pytest.mark.whole
 def test_a_filter_that_is_too_sure_of_itself_is_said(drive):
     """A tenth of the preset's noise: one line with the remedy; a filter tuned for any car has none."""
     spec = yaml.safe_load((config_dir() / "imu" / "consumer.yaml").read_text())

@@ -62,7 +62,7 @@ def test_results_come_in_order_and_a_mistake_ends_it():
         list(parallel_map(ended, range(6), 2))
 
 
-@pytest.mark.parametrize("after_s", np.linspace(0.02, 0.4, 8))
+@pytest.mark.parametrize("after_s", np.linspace(0.02, 0.4, 4))
 def test_an_interrupt_at_any_moment_ends_the_threads(after_s, tmp_path):
     """None waits for a lock that the interrupted thread took with it."""
 
@@ -128,6 +128,7 @@ def solutions(folder: Path) -> dict[str, np.ndarray]:
     return {name: table.select_dtypes("number").to_numpy(float) for name, table in found.items()}
 
 
+@pytest.mark.commands
 def test_navigated_by_workers(alone, where, call, tmp_path):
     """Each drive by itself, so to the bit; the dataset by a path that the workers, who stand elsewhere, lack."""
     Path("many").symlink_to(alone)
@@ -141,6 +142,7 @@ def test_navigated_by_workers(alone, where, call, tmp_path):
     assert all(np.array_equal(one[name], other[name], equal_nan=True) for name in one)
 
 
+@pytest.mark.commands
 def test_evaluated_by_workers_of_which_one_is_killed(alone, cluster, where, call, tmp_path, monkeypatch):
     """Every drive a share of its own; segments run alone, so the numbers are those of one process to rounding."""
     monkeypatch.setattr(importlib.import_module("dlkf.evaluate"), "SAMPLES_AT_ONCE", 4)
@@ -158,6 +160,7 @@ def test_evaluated_by_workers_of_which_one_is_killed(alone, cluster, where, call
     assert len(numbers_in(results[0])) > 20
 
 
+@pytest.mark.commands
 def test_ingested_by_workers(alone, where, call, tmp_path):
     for row in read_drives(alone)[:4]:
         for kind in ("imu", "gnss"):

@@ -132,6 +132,7 @@ def test_commands(town, bucket, call):
     assert done.code == 2 and "no such folder" in done.err and len(done.err.splitlines()) == 1
 
 
+@pytest.mark.commands
 def test_an_evaluation_in_a_store(town, bucket, call, uri):
     """Which MLflow logs, too."""
     given = (f"dataset={copied(town, bucket)}", f"out={bucket}/eval")

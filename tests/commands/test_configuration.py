@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import zip_longest
 from pathlib import Path
 
 import pytest
@@ -73,26 +74,29 @@ EXPERIMENTS = [
     for experiment in presets("experiment")
     for profile in ([], *([f"+profile={name}"] for name in presets("profile")))
 ] + [["+experiment=kalman_gain", f"+noise={name}"] for name in presets("noise")]
-ALL_IMUS = {"simulate", "evaluate", "train"}  # the other commands read a preset of an IMU as evaluate does
+ALL_IMUS = {"simulate", "evaluate"}  # the other commands read a preset of an IMU as evaluate does
 SOME_IMUS = {"auto", "consumer", "perfect"}
 
 
 def options(primary: str, groups: dict[str, str]) -> list[list[str]]:
-    """What chooses a preset for a command."""
-    chosen = [(group, name) for group, folder in groups.items() for name in presets(folder)]
-    kept = [(group, name) for group, name in chosen if group != "imu" or primary in ALL_IMUS or name in SOME_IMUS]
-    return [[], *([f"{group}={name}"] for group, name in kept)]
+    """What chooses presets for a command: every one of each group, groups side by side."""
+    kept = {group: presets(folder) for group, folder in groups.items()}
+    kept["imu"] = [x for x in kept.get("imu", ()) if x in SOME_IMUS or primary in ALL_IMUS]
+    if primary != "navigate":  # which alone finds the noise
+        kept["imu"] = [x for x in kept["imu"] if x != "auto"]
+    words = [[f"{group}={name}" for name in names] for group, names in kept.items()]
+    return [[], *([x for x in chosen if x] for chosen in zip_longest(*words))]
 
 
-OPTIONS = {primary: options(primary, groups) for primary, groups in GROUPS.items()}
-CASES = [(p, option) for p in GROUPS for option in OPTIONS[p] if option != ["imu=auto"] or p == "navigate"]
-CASES = [(p, [*o, "++dataset.imu_errors=wide"] if (p, o) == ("simulate", ["imu=wide"]) else o) for p, o in CASES]
-CASES += [("train", experiment) for experiment in EXPERIMENTS]
-CASES += [  # profiles and noises set numbers only, and a preset of the others replaces one node whole
-    ("train", [*option, f"+experiment={experiment}"])
-    for option in OPTIONS["train"]
+CASES = {primary: options(primary, groups) for primary, groups in GROUPS.items()}
+for words in CASES["simulate"]:
+    words += ["++dataset.imu_errors=wide"] * ("imu=wide" in words)
+CASES["train +experiment"] = EXPERIMENTS
+CASES["train filter and data"] = [  # profiles and noises set numbers only, other presets replace one node whole
+    [f"{group}={name}", f"+experiment={experiment}"]
+    for group in ("data", "filter@model")
+    for name in presets(GROUPS["train"][group])
     for experiment in presets("experiment")
-    if option and option[0].startswith(("data=", "filter@"))
 ]
 
 
@@ -102,24 +106,18 @@ def test_all_folders_are_covered():
     assert folders == {f for groups in GROUPS.values() for f in groups.values()} | {"experiment", "noise", "profile"}
 
 
-BY_GROUP: dict[str, list[tuple[str, list[str]]]] = {}  # "train data": what chooses a preset of one folder
-for command, words in CASES:
-    chooses = words[0].partition("=")[0] if words else ""
-    BY_GROUP.setdefault(f"{command} {chooses}".rstrip(), []).append((command, words))
-
-
-SLOW = [group for group in BY_GROUP if group.startswith("train ") and "experiment" not in group]  # 0.2 s each preset
-
-
-@pytest.mark.parametrize("group", [pytest.param(g, marks=[pytest.mark.whole] * (g in SLOW)) for g in BY_GROUP])
-def test_every_preset_composes_and_builds(group):
-    wrong = []
-    for primary, overrides in BY_GROUP[group]:
+@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.whole] * x.startswith("train ")) for x in CASES])
+def test_every_preset_composes_and_builds(name):
+    wrong, primary = [], name.split()[0]
+    for overrides in CASES[name]:
         try:
             compose_and_build(primary, overrides)
         except Exception as error:
             wrong.append(f"{primary} {' '.join(overrides)}: {type(error).__name__}: {error}")
     assert not wrong, "\n".join(wrong)
+
+
+BUILT: set[str] = set()  # settings of networks
 
 
 def compose_and_build(primary: str, overrides: list[str]) -> None:
@@ -138,7 +136,9 @@ def compose_and_build(primary: str, overrides: list[str]) -> None:
         instantiate(settings.reader, "reader", ("read",))
     if isinstance(settings, TrainSettings):
         fit = settings.study.fit
-        build_learned_filter(fit.model)
+        if (model := repr(fit.model)) not in BUILT:
+            build_learned_filter(fit.model)
+            BUILT.add(model)
         assert all(callback.state_dict() is not None for callback in fit.callbacks)
         find_class(settings.data["_target_"], "data._target_", ("setup", "describe"))
 

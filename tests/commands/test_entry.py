@@ -105,6 +105,7 @@ def test_every_command_has_a_module_and_every_configured_one_is_listed():
     assert {p.stem for p in config_dir().glob("*.yaml")} - {"hydra_output"} <= set(COMMANDS)
 
 
+@pytest.mark.whole
 def test_modules_of_the_current_folder_are_found(tmp_path):
     """As ``python -m dlkf.evaluate`` finds them; one with the name of a library does not take its place."""
     (tmp_path / "blend.py").write_text("class Blend:\n    begin = 1\n")
@@ -148,6 +149,7 @@ def test_ordinary_paths_need_no_quotes(given, taken):
     assert quote_argument(f"out=~{user.pw_name}/x") == f"out={user.pw_dir}/x"
 
 
+@pytest.mark.commands
 @pytest.mark.whole
 def test_in_a_shell(tmp_path, town):
     """The same command as ``python -m dlkf.navigate``, with a folder that Hydra's grammar does not take."""

@@ -130,6 +130,7 @@ def test_an_interrupt_that_became_another_error_is_one(signal_, code, call, monk
     assert ended.code == code and "cannot be read" not in ended.err
 
 
+@pytest.mark.commands
 def test_a_reader_that_has_gone_ends_a_command_without_a_word(town, tmp_path):
     """As ``dlkf navigate … | head -1`` does."""
     command = (sys.executable, "-m", "dlkf.navigate", "model=ins", f"dataset={town}", f"out={tmp_path}/solved")

@@ -94,7 +94,7 @@ def tried_models(seeds: range, town: Path, sound: Path, call: Callable[..., Ende
 @pytest.mark.whole
 @pytest.mark.filterwarnings("ignore")
 def test_some_spoilt_datasets(town, call):
-    assert tried_datasets(range(0, DATASETS, DATASETS // 10), town, call) == []
+    assert tried_datasets(range(0, DATASETS, DATASETS // 5), town, call) == []
 
 
 @pytest.mark.whole

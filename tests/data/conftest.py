@@ -11,8 +11,8 @@ from tests.drives import drives_in
 
 @pytest.fixture(scope="session")
 def drive():
-    """Three minutes of perfect sensors."""
-    return car(180)
+    """A hundred seconds of perfect sensors."""
+    return car(100)
 
 
 @pytest.fixture(scope="session")

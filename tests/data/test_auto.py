@@ -97,7 +97,7 @@ def test_fixes_repeated_beside_every_sample(tmp_path, drive):
     both.rename(columns={"lat_deg": "lat", "lon_deg": "lon", "height_m": "alt"}).to_csv(tmp_path / "a.csv", index=False)
     (got,) = AutoReader().read(tmp_path)
     np.testing.assert_allclose(got.gnss.t, drive["gnss"].t, atol=0.02)  # found at the sample that follows
-    assert "took 181 of 18000 rows for fixes: the others repeat the position before" in got.notes
+    assert "took 101 of 10000 rows for fixes: the others repeat the position before" in got.notes
 
 
 def test_stamps_under_a_name_of_their_own():

@@ -46,6 +46,7 @@ def _residuals(wh: float) -> tuple[float, float]:
     return plain, plain - np.sin(wh / 2) ** 2 * np.sin(wh) / 3
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("rate, hz", [(10, 1.0), (50, 5.0), (100, 7.0)])
 def test_coning_drift_has_its_closed_form(rate, hz):
     """q = (cos a/2, sin a/2 cos wt, sin a/2 sin wt, 0) does not drift; samples do about z (Savage 1998)."""

@@ -273,7 +273,7 @@ def test_an_unsure_drive_does_not_lose_the_others(tmp_path):
     """Short ones take pose, units and clocks of a long one; one whose clock was set anew is left out, or refused."""
     logs = tmp_path / "logs"
     noise = np.random.default_rng(1)
-    for name, seconds in (("long", 180), ("short", 45), ("other", 45)):
+    for name, seconds in (("long", 100), ("short", 45), ("other", 45)):
         tables = car(seconds)
         tables["gnss"]["vel_n"] += noise.normal(0.0, 0.02, seconds + 1)
         tables["gnss"]["vel_e"] += noise.normal(0.0, 0.02, seconds + 1)
@@ -314,7 +314,7 @@ def test_drives_that_disagree_are_named(tmp_path, drive):
 def test_a_reader_with_settings_left_open_shares_them_too(tmp_path):
     """As reader=csv with auto in it."""
     logs = tmp_path / "logs"
-    for name, seconds in (("long", 180), ("short", 15)):
+    for name, seconds in (("long", 100), ("short", 15)):
         tables = car(seconds)
         (logs / name).mkdir(parents=True)
         for kind in ("imu", "gnss"):

@@ -129,6 +129,7 @@ def cut(logged: Path, folder: Path, keep: int) -> Path:
     return log
 
 
+@pytest.mark.whole
 def test_a_ubx_log_without_its_last_bytes_says_so(logged, tmp_path):
     """It is read but for the last message: as the receiver leaves it when the power goes."""
     (drive,) = read(cut(logged, tmp_path, -5), ["reader=ubx"])

@@ -40,7 +40,7 @@ def test_interval_covers_the_true_ratio_about_as_often_as_it_says():
     assert 0.88 <= hits / 200 <= 0.99
 
 
-@pytest.mark.parametrize(("recordings", "segments"), [(8, 5), (12, 8), (19, 7), (40, 3)])
+@pytest.mark.parametrize(("recordings", "segments"), [(8, 5), (19, 7)])
 def test_interval_of_few_recordings_covers_what_it_says(recordings, segments):
     """Log-normal errors of two equal filters: spread 0.6 shared and 0.4 each between recordings, 0.5 within.
 

@@ -167,6 +167,7 @@ def test_kind_of_a_drive():
         drive_kind({"drive": "a", "kind": "fake"})
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("draw", ["tracks", "over_time", "imu", "growth", "spread"])
 def test_figures_have_content(scores, draw):
     figure = {

@@ -230,20 +230,19 @@ def driven(base, start: NavState, clean: torch.Tensor):
     )
 
 
-@pytest.mark.parametrize("name,states", [("mbkf21_car", 26), ("mbkf33_car", 38)])
 @pytest.mark.whole
-def test_ten_minutes_in_float32_are_those_in_float64(name, states):
+def test_five_minutes_in_float32_are_those_in_float64():
     """Training runs in float32: rounding stays small beside what the filter does not know, in an outage too."""
     errors = {"scale_factor": 3e-3, "misalignment": 3e-3}
     imu = ImuSpec("all", SensorErrors(1e-3, 0.1, 1e-3, **errors), SensorErrors(7e-5, 5e-3, 5e-5, **errors))
-    batch = outage(slipping(2, 600, (0.03, -0.02, 1.2, 0.008, 0.004)), 540, 600)
+    batch = outage(slipping(2, 300, (0.03, -0.02, 1.2, 0.008, 0.004)), 240, 300)
     with torch.inference_mode():
         both = (batch, batch.in_precision(torch.float32))
-        double, single = (integrate(b, build_filter(name, imu), keep_covariances=True) for b in both)
+        double, single = (integrate(b, build_filter("mbkf33_car", imu), keep_covariances=True) for b in both)
     apart = (double.posterior.p_n - single.posterior.p_n).norm(dim=-1)
     assert (apart / double.std[..., :3].norm(dim=-1)).max() < 0.06  # 0.03 was measured
     assert (single.std / double.std - 1).abs().max() < 0.015  # 0.009
     P = single.covariances.updated[:, -1].double()
     sigma = P.diagonal(dim1=-2, dim2=-1).sqrt()
-    assert P.shape[-1] == states
+    assert P.shape[-1] == 38
     assert torch.linalg.eigvalsh(P / (sigma[:, :, None] * sigma[:, None, :])).min() > 0

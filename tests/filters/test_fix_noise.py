@@ -167,6 +167,7 @@ def test_plus_takes_no_position_for_good_that_is_noisy(down):
     assert least[:, 0].median() > 0.5 and least[:, 1].median() > 0.5 * down
 
 
+@pytest.mark.commands
 @pytest.mark.whole
 def test_plus_does_not_blame_its_imu(monkeypatch):
     """Fixes that claim 5 cm and 5 cm/s, all positions or all velocities noisier by far: after two minutes half a minute

@@ -49,6 +49,7 @@ def test_plus_imu_takes_biases_scale_factors_and_misalignments_of_a_preset():
     assert known.tuning == plus.tuning
 
 
+@pytest.mark.whole
 def test_without_any_fix_a_known_imu_drifts_less():
     """Nothing else shows a bias along the road: an unknown IMU's acceleration may well be one."""
     batch = slipping(24, 60, (0.0, 0.0, 0.8, 0.0, 0.0))
@@ -62,6 +63,7 @@ def test_without_any_fix_a_known_imu_drifts_less():
     assert (a.std[:, -1, :2] < 0.5 * b.std[:, -1, :2]).all()
 
 
+@pytest.mark.commands
 @pytest.mark.whole
 def test_it_finds_out_what_imu_it_has():
     """An IMU far noisier than it takes an unknown one for: its own σ in the outage says so. Cars that move as the

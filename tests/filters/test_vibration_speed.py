@@ -254,7 +254,7 @@ def test_it_learns_the_shape_of_a_road_under_two_axles():
     assert float(torch.corrcoef(torch.stack((pitch[inside], notch[inside])))[0, 1]) < -0.8  # none at n/L
 
 
-@pytest.mark.parametrize("epoch_s", [0.2, 0.5, 2.0])
+@pytest.mark.parametrize("epoch_s", [0.2, 2.0])
 @pytest.mark.whole
 def test_other_update_intervals_learn_it_too(epoch_s):
     assert (memory(cars(2, round(120 / epoch_s), road, 8, epoch_s=epoch_s)).share > 0.3).all()

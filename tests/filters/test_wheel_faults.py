@@ -46,11 +46,16 @@ def _rows(batch, change=lambda v, t: v):
     return {"speed": torch.stack((torch.where(known, value, zero), zero, zero, zero, known.double()), -1)}
 
 
-def _end(batch, model):
-    """RMS error of the distance driven forward in the outage: what a wheel is for; heading has no part in it."""
+def _end(batch, model, rows=None):
+    """RMS error of the distance driven forward in the outage, for each of some sets of rows in one run, and the
+    solution: what a wheel is for; heading has no part in it."""
+    if rows is not None:
+        batch = batch.select(torch.arange(len(batch.imu)).repeat(len(rows)))
+        batch = replace(batch, aids={"speed": torch.cat([x["speed"] for x in rows])})
     solution = integrate(batch, model)
     driven = [(x.C_nb[..., 0] * x.v_n).sum(-1)[:, BEGIN:END].sum(1) for x in (solution.posterior, batch.truth)]
-    return (driven[0] - driven[1]).square().mean().sqrt(), solution
+    errors = (driven[0] - driven[1]).unflatten(0, (len(rows or "1"), -1)).square().mean(1).sqrt()
+    return (errors[0] if rows is None else errors), solution
 
 
 def _from(t, value, otherwise):
@@ -78,12 +83,12 @@ def without(drives):
         return _end(drives, build_filter("mbkf21_car", IMU))[0]
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_costs_no_more_than_the_wheel(drives, without, fault):
+def test_a_fault_costs_no_more_than_the_wheel(drives, without):
     model = with_aids(build_filter("mbkf21_car", IMU), [STANDARD["speed"]])
     with torch.no_grad():
-        error, _ = _end(replace(drives, aids=_rows(drives, FAULTS[fault])), model)
-    assert error < 1.1 * without + 0.05, f"{float(error):.2f} m, without a wheel {float(without):.2f} m"
+        errors, _ = _end(drives, model, [_rows(drives, change) for change in FAULTS.values()])
+    costly = {name: float(error) for name, error in zip(FAULTS, errors) if not error < 1.1 * without + 0.05}
+    assert not costly, f"{costly} m, without a wheel {float(without):.2f} m"
 
 
 def test_a_wheel_halves_the_error(drives, without):

@@ -39,8 +39,8 @@ def at_rest(batch: int = 1) -> NavState:
 
 
 def test_sample_by_sample_parity():
-    """10 s of rough motion. The oracle's own step error (Heun, 0.5 ms) bounds the agreement."""
-    frame, imu = frame_at(batch=3), lively_imu(3, 10 * M)
+    """5 s of rough motion. The oracle's own step error (Heun, 0.5 ms) bounds the agreement."""
+    frame, imu = frame_at(batch=3), lively_imu(3, 5 * M)
     expected = mechanise(start(3), imu, DT, frame)
     got = run(start(3), imu, frame)
     assert (got.p_n - expected.p_n[:, -1]).abs().max() < 1e-4

@@ -32,7 +32,7 @@ WORLDS = {  # what is wrong before dlkf is loaded, whether loops are compiled th
 }
 
 
-@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("world", ["no numba", pytest.param("nowhere to keep it", marks=pytest.mark.commands)])
 @pytest.mark.whole
 def test_what_is_wrong_is_said_once(world):
     before, available, said = WORLDS[world]
@@ -54,6 +54,7 @@ def test_short_work_can_do_without():
         assert not compiled.fits(torch.zeros(1))
 
 
+@pytest.mark.commands
 @pytest.mark.whole
 def test_numba_loads_with_the_first_loop():
     """It takes half a second, which a command that needs no loop saves."""

@@ -280,3 +280,10 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "no sensors": (lambda sent: [c for c in sent if c.kind not in SENSORS], ()),
     "damage of all kinds": (_many, ("not_finite", "implausible", "double", "back")),
 }  # fmt: skip
+USUAL = (  # one of each kind, of every day's tests; all of them: pytest -m exports
+    "none", "single samples", "single fixes", "single samples of sensors", "a gap of 0.2 s", "a gap of 3 s",
+    "spikes in the last and the last but one sample of an update interval", "a tenth of the samples missing",
+    "clocks set back 50 s", "coarse positions alone, 3 s late", *JUMPS, *JUMPS_LATE, "a first fix 18 s ahead",
+    "wheel speeds at 100 Hz, some again after three seconds", "fix stamps that jitter", "sensors 15 s late",
+    "a locked wheel on a moving car", "damage of all kinds",
+)  # fmt: skip

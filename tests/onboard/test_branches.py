@@ -272,8 +272,8 @@ class Random(Choice):
 
 
 def test_random_functions_have_the_values_of_torch(tmp_path):
-    functions = translate(tmp_path, *(Random(seed) for seed in range(20)))
-    assert sum(len(BRANCH.findall(f.code)) for f in functions) > 20
+    functions = translate(tmp_path, *(Random(seed) for seed in range(8)))
+    assert sum(len(BRANCH.findall(f.code)) for f in functions) > 8
     for f in functions:
         for u, v in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
             args = torch.tensor([u]).double(), torch.tensor([v]).double(), GOOD

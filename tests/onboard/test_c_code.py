@@ -132,11 +132,19 @@ class Constants(Places):
         return torch.cat((y, fixed), 1)
 
 
-@pytest.mark.parametrize(
-    "module", [Sums(), Places(), Constants(), Elements(), ManyElements(), Layers()], ids=lambda m: type(m).__name__
-)
-def test_c_does_what_torch_does(module, tmp_path):
-    (function,), example = translate(tmp_path, module), module.example()
+KINDS = Sums, Places, Constants, Elements, ManyElements, Layers
+
+
+@pytest.fixture(scope="module")
+def translated(tmp_path_factory):
+    """All of them, in one library."""
+    return dict(zip(KINDS, translate(tmp_path_factory.mktemp("code"), *(kind() for kind in KINDS))))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_c_does_what_torch_does(translated, kind):
+    function = translated[kind]
+    module, example = function.module, function.module.example()
     got, want = function(*example), function.wanted(*example)
     # sums in another order; float32 inside the network
     tolerance = 1e-5 if isinstance(module, Layers) else 1e-6 if isinstance(module, Elements) else 1e-12

@@ -13,7 +13,7 @@ from dlkf.onboard.core import Core, Status, Waiting
 from dlkf.onboard.library import find_compiler
 from dlkf.running.streaming import StreamingFilter
 from tests.onboard.conftest import ARM
-from tests.onboard.faults import FAULTS, JUMPS, JUMPS_LATE
+from tests.onboard.faults import FAULTS, JUMPS, JUMPS_LATE, USUAL
 from tests.onboard.streams import Trunk, apart, calls, through_core
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
@@ -35,7 +35,7 @@ def python(exported, plain):
     return cache(lambda name: trunk.branch(FAULTS[name][0](plain)))
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.exports] * (x not in USUAL)) for x in FAULTS])
 def test_the_core_answers_every_fault_as_the_python_stream_does(name, exported, plain, python):
     """The same word on every call, the same rows at the same calls, the same state in between."""
     fault, words = FAULTS[name]

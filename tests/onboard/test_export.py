@@ -329,6 +329,7 @@ def test_many_drives_through_a_large_network_go_through_torch(drive, monkeypatch
     assert torch.equal(got.posterior.p_n, want.posterior.p_n)
 
 
+@pytest.mark.exports
 def test_ten_hours_with_one_call_in_twenty_faulty(exported, tmp_path):
     """36,000 update intervals in C, allocations counted by the program's own allocator; it still knows where it is."""
     folder, *_ = exported
@@ -349,6 +350,7 @@ INCLUDED = (
 )  # fmt: skip
 
 
+@pytest.mark.exports
 def test_the_ros_2_node_says_what_the_example_does(exported, example, tables, tmp_path):
     """With what it takes of ROS 2 in ros2.hpp, never built with ROS 2 itself. Late fixes change nothing in the end."""
     folder, *_ = exported

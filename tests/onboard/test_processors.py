@@ -27,11 +27,13 @@ KINDS = {"gnss": 0, "imu": 1, "speed": -1, "heading": -2, "baro": -3}  # as boar
 STACK = 8192  # bytes of any call
 
 
-def test_clang_has_no_warnings(exported):
-    command = [tool("clang"), *STRICT, "-fsyntax-only", f"-I{exported[0]}"]
+@pytest.mark.parametrize("cc", ["clang", "gcc"])
+def test_a_compiler_has_no_warnings(cc, exported):
+    command = [tool(cc), *STRICT, "-fsyntax-only", f"-I{exported[0]}"]
     run([*command, *(exported[0] / name for name in (*CORE, *FILTER)), EXAMPLES / "navigate.c"])
 
 
+@pytest.mark.exports
 def test_gcc_has_no_warnings_and_the_stack_of_every_call_is_small(exported, tmp_path):
     deepest = stack_of_calls(tool("gcc"), exported[0], tmp_path, ("-O2", *STRICT))
     assert {"dlkf_imu", "dlkf_gnss", "dlkf_aid", "dlkf_pose", "dlkf_open", "dlkf_finish"} < set(deepest)

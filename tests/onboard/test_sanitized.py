@@ -18,6 +18,8 @@ from tests.onboard.streams import apart, calls, through_core
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
 EVERY_SAMPLE = ("none", "a gap of 0.2 s", "damage of all kinds")  # the state at every sample takes its time
+USUAL = (*EVERY_SAMPLE, "single samples", "single fixes", "single samples of sensors", "clocks set back 50 s",
+         "coarse positions alone, 3 s late", "sensors 15 s late")  # fmt: skip
 FUZZ_S = 600  # of each of the two
 
 
@@ -30,11 +32,12 @@ def sanitized(request, exported, tmp_path_factory):
     return compile_program(str(find_compiler()), exported[0], main, folder / "navigate", SANITIZED, filter_of=made)
 
 
-def test_every_fault_as_lines(sanitized, tables):
-    """All faults, one after the other through one program each; the exit code of a report would be another."""
+@pytest.mark.parametrize("names", [USUAL, pytest.param(FAULTS, marks=pytest.mark.exports)], ids=["usual", "all"])
+def test_faults_as_lines(names, sanitized, tables):
+    """One after the other through one program each; the exit code of a report would be another."""
     sent = calls(tables)
-    for name, (fault, _) in FAULTS.items():
-        given = {"input": lines(fault(sent)), "capture_output": True, "text": True}
+    for name in names:
+        given = {"input": lines(FAULTS[name][0](sent)), "capture_output": True, "text": True}
         every = ["--samples"] if name in EVERY_SAMPLE else []
         done = subprocess.run([sanitized, *every, "--arm", *map(str, ARM)], **given)
         assert done.returncode == 0, f"{name}: {done.stderr[-2000:]}"

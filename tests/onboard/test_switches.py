@@ -25,7 +25,7 @@ def log(tables):
 
 def ran(exported, sent, out, *switches: str) -> subprocess.CompletedProcess:
     """``navigate`` with a core that was compiled with these."""
-    flags = ("-O1", *STRICT, *switches)
+    flags = ("-O0", *STRICT, *switches)
     program = compile_program(
         str(find_compiler()), exported[0], EXAMPLES / "navigate.c", out / "navigate", flags, filter_of=exported[3].path
     )

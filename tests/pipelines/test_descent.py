@@ -32,7 +32,7 @@ def test_a_factor_by_advice_is_a_factor_by_tuning(batch):
 
 def test_it_descends(batch):
     kalman = build_filter("mbkf33_car", IMU, tuning=Tuning(accel_noise=30.0, lateral_std=2.0))
-    found = tune_by_gradient(kalman, batch, 34, steps=6)
+    found = tune_by_gradient(kalman, batch, 34, steps=3)
     before, after = (
         evaluate_objective(build_filter("mbkf33_car", IMU, tuning=tuning), [batch]) for tuning in (kalman.tuning, found)
     )

@@ -25,7 +25,7 @@ def home(tmp_path_factory):
     folder = tmp_path_factory.mktemp("kalman_gain")
     filters = {"dlkf": build_filter("mbkf21", IMU), "mbkf15": build_filter("mbkf15", IMU)}
     for name, (s_p, s_v) in NOISE.items():
-        batch = scene(3, 30, seed=1, position_std=0.03 + s_p, velocity_std=0.02 + s_v)
+        batch = scene(2, 20, seed=1, position_std=0.03 + s_p, velocity_std=0.02 + s_v)
         report = folder / name / "report"
         write_gains(report, measure_gains(filters, [(batch, torch.zeros(batch.size[:2], dtype=torch.bool))]), name)
         results = summarise_scores(score(filters, [batch], kinds="simulated"))
@@ -42,6 +42,7 @@ def study(monkeypatch, folder) -> int:
     return gain_trends.main()
 
 
+@pytest.mark.commands
 def test_figures_tables_and_trends(home, monkeypatch, capsys):
     assert study(monkeypatch, home) == 0, capsys.readouterr().out
     assert all((home / f"figure{n}.png").read_bytes().startswith(b"\x89PNG") for n in (7, 8, 9))
@@ -50,6 +51,7 @@ def test_figures_tables_and_trends(home, monkeypatch, capsys):
     assert (home / "trends.md").read_text().count("| yes |") == 2 * 4
 
 
+@pytest.mark.commands
 def test_a_gain_that_does_not_follow_is_said(home, monkeypatch, capsys):
     monkeypatch.setattr(gain_trends, "FIGURES", {})  # drawn above
     file = home / "set3" / "report" / "gains.json"

@@ -46,6 +46,6 @@ def test_a_log_at_rest(tmp_path, monkeypatch):
 
 def test_the_benchmark_runs_on_a_small_world(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    words = ["--threads", "1", "--hours", "0.1", "--length-s", "8", "--repeats", "1", "--parts", "strapdown", "scaling"]
+    words = ["--threads", "1", "--hours", "0.1", "--length-s", "8", "--repeats", "1", "--parts", "strapdown"]
     assert started("benchmark", monkeypatch, *words) == 0
     assert "bench.json" in capsys.readouterr().out

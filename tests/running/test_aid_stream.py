@@ -57,9 +57,9 @@ def _apart(a, b) -> float:
     return max(6.4e6 * float(np.abs(place).max()), float(height))
 
 
-@pytest.mark.parametrize("name, lateness_s", [("mbkf21_car", (0.0, 0.45)), ("plus", (0.45,))])
-def test_a_stream_is_a_batch_run(tables, name, lateness_s):
-    """With sensors on time, and with all of them late: then every update interval is replayed."""
+@pytest.mark.parametrize("name, late_s", [("mbkf21_car", 0.45), ("plus", 0.0)])
+def test_a_stream_is_a_batch_run(tables, name, late_s):
+    """With sensors on time, or all of them late: then every update interval is replayed."""
     model = _filters()[name]
     drive = drive_from_tables(tables, "", **GRID, dtype=torch.float64)
     batch = next(navigate_drives([drive], model, align=CAUSAL))
@@ -67,8 +67,7 @@ def test_a_stream_is_a_batch_run(tables, name, lateness_s):
     expected = r", speed in 4\d of 4\d updates \(normalised innovation RMS .*, wheel scale error [12]\.\d+ ± [^,]* %"
     assert re.search(expected, batch.summary())
     assert TrackOnMap(batch, None).for_the_map().result.sensors() == batch.sensors()
-    for late_s in lateness_s:
-        assert _apart(batch, stream_drive(tables, model, **GRID, late_s=late_s)) < 1e-6, late_s
+    assert _apart(batch, stream_drive(tables, model, **GRID, late_s=late_s)) < 1e-6
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")

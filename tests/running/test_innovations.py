@@ -117,6 +117,7 @@ def test_a_drive_with_a_bad_stretch_gets_a_line_with_its_times() -> None:
     assert line.endswith("do this") and "\n" not in line
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("name", "factor", "warned"),
     [

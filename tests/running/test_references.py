@@ -39,6 +39,7 @@ def ends(drives, spec, seconds: float) -> np.ndarray:
     return outage_end(magnitudes(scores.filters["mbkf15"].error)["horizontal"], scores.windows)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("kind", ["smoothed", "gnss"])
 def test_errors_are_those_against_the_truth(world, kind):
     """RMS at the end of outages of 30 and 60 s within 5 %: the references are centimetres off, the errors metres."""

@@ -13,6 +13,7 @@ from dlkf.running.streaming import StreamingFilter
 from tests.running.streams import ARM, apart, estimator, network, some, table
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "name,metres",
     # with an outage of 25 s: gravity is good to 1e-8 m/s² within a kilometre, the linear model to its square

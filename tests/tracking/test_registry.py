@@ -185,6 +185,7 @@ assert {{"rich", "hydra", "lightning"}} <= foreign and "torch" not in foreign
 """
 
 
+@pytest.mark.commands
 def test_a_logged_model_brings_its_code_and_no_pickle(logged, uri, cars):
     """Loaded in an interpreter where pickles are refused and its requirements alone can be imported."""
     folder = download_model("models:/town/1", uri).parents[1]
@@ -259,6 +260,7 @@ def test_names_the_registry_would_refuse(name, alias):
     check_registration(None, None)
 
 
+@pytest.mark.commands
 def test_a_store_that_was_moved_says_so(logged, uri, weights, tmp_path):
     """It names absolute places; a new run would write to where it was."""
     old, new = tmp_path / "here", tmp_path / "there"

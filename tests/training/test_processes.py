@@ -1,9 +1,11 @@
 """The same training on two processes: ``trainer.devices=2``, nothing else changed."""
 
 import json
+import os
 import subprocess
 import sys
-import textwrap
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,33 +18,37 @@ from dlkf.filters.saved import load_filter
 from dlkf.training.fit import fit
 from dlkf.training.processes import with_workers
 from tests.numbers_in import numbers_in
+from tests.shell import start_fork
 
 from .test_resume import data, make_settings
 
 EPOCHS = 2
-ALONG = """
-    import sys
-    sys.path.insert(0, {root!r})
-    from pathlib import Path
-    from tests.training import test_processes as t
-    t.fit(t.settings(2), t.data({dataset!r}), Path({folder!r}), False)
-"""
 
 
 def settings(devices: int):
     return make_settings(max_epochs=EPOCHS, validate_every=1, devices=devices)
 
 
+def train(devices: int, dataset: Path, folder: Path) -> tuple[dict, Path]:
+    """Last state and best weights; a further process is a fork: what a command would import anew is there."""
+
+    def fit_here() -> Path:
+        return fit(settings(devices), data(dataset), folder / "study", False, further=["along"])
+
+    def fork(_, env):
+        process = start_fork(folder, folder / "said", lambda: (os.environ.update(env), fit_here()))
+        return SimpleNamespace(poll=lambda: process.exitcode, wait=process.join, kill=process.kill)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dlkf.training.processes.subprocess", SimpleNamespace(Popen=fork))
+        best = fit_here()
+    return torch.load(folder / "study" / "last.ckpt", weights_only=True), best
+
+
 @pytest.fixture(scope="module")
-def trained(dataset, tmp_path_factory, request) -> list:
-    """Last state and best weights of one process and of two."""
-    root, out = str(request.config.rootpath), []
-    for devices in (1, 2):
-        folder = tmp_path_factory.mktemp("run") / "study"
-        script = textwrap.dedent(ALONG.format(root=root, dataset=str(dataset), folder=str(folder)))
-        best = fit(settings(devices), data(dataset), folder, False, further=[sys.executable, "-c", script])
-        out.append((torch.load(folder / "last.ckpt", weights_only=True), best))
-    return out
+def trained(dataset, tmp_path_factory) -> list:
+    """By one process and by two."""
+    return [train(devices, dataset, tmp_path_factory.mktemp("run")) for devices in (1, 2)]
 
 
 def test_two_processes_learn_what_one_does(trained):

@@ -36,7 +36,7 @@ def settings(**trainer) -> dict:
     callbacks = train["callbacks"]
     callbacks["curriculum"] |= {"warm_s": 8.0, "full_s": 12.0, "warm_until": 1, "full_from": 3}
     callbacks["outage"] |= {"duration_s": [2.0, 4.0], "before_s": 4.0, "start_epoch": 2}
-    train["trainer"] |= {"max_epochs": 5, "validate_every": 2, "best_from_epoch": 0, "accelerator": "cpu", **trainer}
+    train["trainer"] |= {"max_epochs": 4, "validate_every": 2, "best_from_epoch": 0, "accelerator": "cpu", **trainer}
     train["scheduler"]["restart_epochs"] = 3
     train["model"]["network"] |= {"lstm_hidden": 16, "lstm_layers": 2, "dense": [16, 8]}
     return train
@@ -89,7 +89,7 @@ def test_training_moves_towards_the_reference(dataset, tmp_path):
 
     torch.manual_seed(3)
     before = LearnedFilter(LearnedConfig.from_mapping(settings()["model"])).eval()
-    longer = settings(max_epochs=8)
+    longer = settings(max_epochs=5, validate_every=5)
     longer["optimizer"]["lr"] = 2e-2
     after = load_filter(fit(fit_of(longer), data(dataset), tmp_path / "run", False))
     batch = data(dataset).batches("test")[0]

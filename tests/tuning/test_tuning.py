@@ -211,6 +211,7 @@ def test_the_command_writes_factors_that_evaluate_takes(uri, call, town):
     assert done.code == 2 and not Path("none").exists(), done.err
 
 
+@pytest.mark.commands
 def test_the_command_tunes_for_gnss_throughout(uri, call, town):
     common = ("tune", "model=mbkf15", f"dataset={town}", "imu=perfect", "length_s=50", "outage=null", "rounds=1")
     done = call(*common, "fractions=[0.5,0,0.5]", "objective=pva", "name=cars", "out=found")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
 
 from dlkf.base.errors import InputError
 from dlkf.base.settings import settings_from
-from dlkf.data.alignment import AlignConfig, level_attitude, mean_force
+from dlkf.data.alignment import ALIGN, AlignConfig, level_attitude, mean_force
 from dlkf.data.store import load_dataset
 from dlkf.navigation.attitude import rotation_from_rpy, vector_from_rotation
 from dlkf.navigation.earth import ned_axes
@@ -41,6 +42,12 @@ def drives(tmp_path_factory):
     return load_dataset(folder, dtype=torch.float64)
 
 
+@pytest.fixture(scope="module")
+def starts(drives):
+    """Of the drives as they are, by a configuration."""
+    return cache(lambda config=ALIGN: align_each(drives, config))
+
+
 def _errors(drives, starts):
     """truth ⊖ start in n over the stated 1σ (n, 9), and the heading's error [°]."""
     rows, headings = [], []
@@ -60,8 +67,8 @@ def _in_reverse(drive):
     return replace(drive, imu=imu, ref_C_eb=drive.ref_C_eb @ about, lever_arm_b=about.mT @ drive.lever_arm_b)
 
 
-def test_a_drive_that_begins_at_rest_starts_with_its_first_fix(drives):
-    causal, around = align_each(drives), align_each(drives, AROUND)
+def test_a_drive_that_begins_at_rest_starts_with_its_first_fix(drives, starts):
+    causal, around = starts(), starts(AROUND)
     waited = sum(s.first for s in causal)
     assert all(s.first == 0 for s in around) and waited > 5 * len(drives)
     normalised, heading = _errors(drives, around)
@@ -108,8 +115,8 @@ def test_reverse_is_recognised_where_the_course_is_mistaken(drives, config):
     assert heading.abs().max() < 3 and normalised[:, 5].abs().max() < 3.5
 
 
-def test_the_search_leaves_a_good_course_alone(drives):
-    causal, searched = _errors(drives, align_each(drives))[1], _errors(drives, align_each(drives, SEARCH))[1]
+def test_the_search_leaves_a_good_course_alone(drives, starts):
+    causal, searched = _errors(drives, starts())[1], _errors(drives, starts(SEARCH))[1]
     assert searched.square().mean().sqrt() < causal.square().mean().sqrt() + 0.2
 
 
@@ -222,6 +229,7 @@ def _puck(drive, seed: int):
     return replace(drive, gnss_r_e=drive.gnss_r_e + noise, gnss_std=std, gnss_valid=valid)
 
 
+@pytest.mark.commands
 def test_a_glimpse_between_two_outages_does_not_start_the_wrong_way_round():
     """15 s of 5 Hz positions at 3 m/s and more, on real roads with an IMU of 1 °/s: 174° off, and 55° RMS, before."""
     if not (REAL / "wid").is_dir():
@@ -245,16 +253,16 @@ def test_a_glimpse_between_two_outages_does_not_start_the_wrong_way_round():
 
 
 @pytest.mark.parametrize("config", [SEARCH, AROUND])
-def test_gyroscopes_that_are_degrees_a_second_off_are_found(drives, config):
+def test_gyroscopes_that_are_degrees_a_second_off_are_found(drives, starts, config):
     """3 °/s on each axis: the start shows them with its 1σ, from rest and from motion alone, and the heading holds."""
     error = torch.deg2rad(torch.tensor([3.0, -3.0, 3.0], dtype=torch.float64))
     wrong = [replace(d, imu=d.imu + torch.cat((0 * error, error))) for d in drives]
-    moving = [d.part(s.first, d.epochs) for d, s in zip(wrong, align_each(drives))]
+    moving = [d.part(s.first, d.epochs) for d, s in zip(wrong, starts())]
     for some in (wrong, moving):
-        starts = align_each(some, config)
-        _, heading = _errors(some, starts)
+        found = align_each(some, config)
+        _, heading = _errors(some, found)
         assert heading.abs().max() < 4
-        for d, s in zip(some, starts):
+        for d, s in zip(some, found):
             bias, std = s.gyro.split(3)
             off = bias - d.ref_imu_error[s.first, 3:] - error
             assert (off.abs() < 4 * std).all()
