@@ -6,15 +6,23 @@ road that the front axle has just left, so the pitch of a car lacks the spatial 
 line at its turns per metre. Over the distance s of a stretch with a window w, a spatial frequency F in cycles per metre
 has
 
-    Z(F) = Σ_k w_k (x_k − x_{k−1}) exp(−2πi F s_k),    y(F) = ln |Z(F)|² less a smooth trend in ln F
+    Z(F) = Σ_k w_k (x_k − x_{k−1}) exp(−2πi F s_k)
 
-Where s comes from a speed v̂ of the true v = v̂ e^δ, what car and road show at F is found at F e^δ. With the mean A(F) of
-earlier stretches and a variance of y of π²/6, that of the logarithm of exponential power,
+The power of an axis says where lines and notches are. The two axles shake several axes, pitch by what one meets more
+than the other, heave by what both meet, so the phase between two axes depends on F L too, and not on how the road
+happens to be. So y(F) has 18 parts of unit variance where nothing is known: of each axis
 
-    ln Λ(δ) = Σ_axes Σ_F [y(F) A(F e^−δ) − ½ A(F e^−δ)²] / (π²/6)
+    (ln |Z|² less a smooth trend in ln F) / (π/√6)
+
+with the variance π²/6 of the logarithm of exponential power, and √2 times cosine and sine of the phase between the axes
+in the plane of symmetry of the car (forward, down, pitch), and of those across it (right, roll, yaw). Where s comes
+from a speed v̂ of the true v = v̂ e^δ, what car and road show at F is found at F e^δ. With the mean A(F) of earlier
+stretches
+
+    ln Λ(δ) = Σ_parts Σ_F [y(F) A(F e^−δ) − ½ A(F e^−δ)²]
 
 against a spectrum without a shape, for as many independent frequencies as the distance resolves. A block of the shape
-has Σ Σ ½ A² / (π²/6) on average at the true δ.
+has Σ Σ ½ A² on average at the true δ. The phases are bounded, so a loud tone counts there no more than a line.
 """
 
 from __future__ import annotations
@@ -36,11 +44,12 @@ SLOW_HZ, FAST_HZ = 1.5, 20.0  # between which a line is looked at: above the car
 SLOW_EDGE_HZ, FAST_EDGE_HZ = 0.2, 0.5
 NYQUIST = 0.45  # share of the sampling rate up to which it is
 COSINES = 4  # in ln F, of the trend
-LOWEST, HIGHEST = -3.0, 2.5  # of y: a knock or a zero says no more
+LOWEST, HIGHEST = -3.0, 2.5  # of ln |Z|² less its trend: a knock or a zero says no more
 TONES, FIRST_HZ, TONE_HZ = 40, 1.0, 0.5  # frequencies in time: how many, the first, and their distance
 SHIFTS, SHIFT = 16, 0.01  # δ to both sides, and its step
 REACH = math.ceil((LINES + LEAST / STEP) * math.expm1(SHIFTS * SHIFT))  # lines between F and F e^−δ at most
-LOG_VARIANCE = math.pi**2 / 6  # of the logarithm of exponential power
+LOG_STD = math.pi / 6**0.5  # of the logarithm of exponential power
+PARTS = 18  # of y: power of six axes, cosine and sine of the phases of six pairs
 APART = 1.5  # distance times the least difference of independent frequencies, for a sine as the window
 
 
@@ -82,19 +91,34 @@ def line_weights(speed: Float[Tensor, " B"], dt: float) -> Float[Tensor, "B K"]:
     return torch.sigmoid((f - SLOW_HZ) / SLOW_EDGE_HZ) * torch.sigmoid((fast - f) / FAST_EDGE_HZ)
 
 
-def log_power(spectrum: Float[Tensor, "B 6 waves"]) -> Float[Tensor, "B 6 K"]:
+def log_power(cosines: Float[Tensor, "B 6 K"], sines: Float[Tensor, "B 6 K"]) -> Float[Tensor, "B 6 K"]:
     """ln |Z(F)|² of every axis and line."""
-    cosines, sines = components(spectrum)
     return torch.log(cosines.square() + sines.square() + 1e-30)
 
 
 def remove_trend(power: Float[Tensor, "B 6 K"], weight: Float[Tensor, "B K"]) -> Float[Tensor, "B 6 K"]:
-    """y of every axis and line: ln |Z|² without its trend, by least squares under ``weight``."""
+    """ln |Z|² of every axis and line without its trend, by least squares under ``weight``."""
     trends = _trends(power.dtype, power.device)
     weighted = trends * weight.unsqueeze(1)
     normal = weighted @ trends.mT + 1e-6 * torch.eye(COSINES, dtype=power.dtype, device=power.device)
     trend = torch.linalg.solve(normal, weighted @ power.mT).mT @ trends
     return (power - trend).clamp(LOWEST, HIGHEST)
+
+
+def phases(cosines: Float[Tensor, "B 6 K"], sines: Float[Tensor, "B 6 K"]) -> Float[Tensor, "B 12 K"]:
+    """Cosine and sine of the phase between the axes 0 and 2, 0 and 4, 2 and 4, and between 1 and 3, 1 and 5, 3 and 5,
+    at every line: first the cosines, those of both triples in turn."""
+    size = torch.rsqrt(cosines.square() + sines.square() + 1e-30)
+    c, s = ((x * size).unflatten(1, (3, 2)) for x in (cosines, sines))  # axis of a triple, triple
+    (ca, cb), (sa, sb) = ((torch.cat((x[:, :1], x[:, :2]), 1), torch.cat((x[:, 1:], x[:, 2:]), 1)) for x in (c, s))
+    return torch.cat((ca * cb + sa * sb, ca * sb - sa * cb), 1).flatten(1, 2)
+
+
+def describe_block(spectrum: Float[Tensor, "B 6 waves"], weight: Float[Tensor, "B K"]) -> Float[Tensor, "B 18 K"]:
+    """y of a block."""
+    cosines, sines = components(spectrum)
+    power = remove_trend(log_power(cosines, sines), weight)
+    return torch.cat((power / LOG_STD, 2**0.5 * phases(cosines, sines)), 1)
 
 
 def tone_shares(speed: Float[Tensor, " B"]) -> Float[Tensor, "B K N"]:
@@ -105,7 +129,7 @@ def tone_shares(speed: Float[Tensor, " B"]) -> Float[Tensor, "B K N"]:
 
 
 def log_likelihood(
-    y: Float[Tensor, "B 6 K"], mean: Float[Tensor, "B 6 K"], weight: Float[Tensor, "B K"], distance: Float[Tensor, " B"]
+    y: Float[Tensor, "B 18 K"], mean: Float[Tensor, "B 18 K"], weight: Float[Tensor, "B K"], distance: Float[Tensor, " B"]
 ) -> Float[Tensor, "B O"]:
     """ln Λ of every shift δ (:func:`shifts`), from the products of y and A at all lines.
 
@@ -113,7 +137,7 @@ def log_likelihood(
     """
     first, r = _places(y.dtype, y.device)
     around = pad(mean, (REACH, REACH)).unfold(-1, 2 * REACH + 1, 1)  # A of the lines beside each
-    products = ((weight.unsqueeze(1) * y).unsqueeze(-1) * around).sum(1)  # Σ_axes w y(F) A(F′)
+    products = ((weight.unsqueeze(1) * y).unsqueeze(-1) * around).sum(1)  # Σ_parts w y(F) A(F′)
     squares, neighbours = mean.square().sum(1), (mean[..., :-1] * mean[..., 1:]).sum(1)
     line, s = torch.arange(LINES, device=y.device), 1 - r
     place = first - line + REACH
@@ -124,15 +148,15 @@ def log_likelihood(
 
 
 def expected_log_likelihood(
-    mean: Float[Tensor, "B 6 K"], weight: Float[Tensor, "B K"], distance: Float[Tensor, " B"]
+    mean: Float[Tensor, "B 18 K"], weight: Float[Tensor, "B K"], distance: Float[Tensor, " B"]
 ) -> Float[Tensor, "B 1"]:
     """ln Λ that a block of this shape has on average at the true δ."""
     return _independent_share(distance) * (0.5 * weight.unsqueeze(1) * mean.square()).sum((1, 2)).unsqueeze(-1)
 
 
 def _independent_share(distance: Float[Tensor, " B"]) -> Float[Tensor, "B 1"]:
-    """Share of the lines that are independent over a distance [m], over their variance."""
-    return (STEP / APART * distance).clamp_max(1.0).unsqueeze(-1) / LOG_VARIANCE
+    """Share of the lines that are independent over a distance [m]."""
+    return (STEP / APART * distance).clamp_max(1.0).unsqueeze(-1)
 
 
 def lines(like: Tensor) -> Float[Tensor, " K"]:

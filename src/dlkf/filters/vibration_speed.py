@@ -39,15 +39,15 @@ from dlkf.filters.integration import Epoch
 from dlkf.filters.sources import Measurement, Predicted, SensorSource, describe_row, predicted_variance
 from dlkf.filters.vibration_spectrum import (
     LINES,
+    PARTS,
     SHIFT,
     TONES,
     WAVES,
     demodulate,
+    describe_block,
     expected_log_likelihood,
     line_weights,
     log_likelihood,
-    log_power,
-    remove_trend,
     shifts,
     tone_shares,
 )
@@ -124,21 +124,21 @@ class Stretch(NamedTuple):
 class Mean(NamedTuple):
     """A mean of y over blocks, at frequencies in distance or in time."""
 
-    total: Tensor  # (B, 6, n)
+    total: Tensor  # (B, 18, n)
     weight: Tensor  # (B, n)
 
     @classmethod
     def begin(cls, like: Tensor, B: int, n: int) -> Mean:
         """Of nothing."""
-        return cls(like.new_zeros(B, 6, n), like.new_zeros(B, n))
+        return cls(like.new_zeros(B, PARTS, n), like.new_zeros(B, n))
 
     @property
-    def value(self) -> Float[Tensor, "B 6 n"]:
+    def value(self) -> Float[Tensor, "B 18 n"]:
         """Drawn towards 0, where it is of few blocks."""
         return self.total / (self.weight + FEW).unsqueeze(1)
 
     def update(
-        self, y: Float[Tensor, "B 6 n"], weight: Float[Tensor, "B n"], learns: Float[Tensor, " B"]
+        self, y: Float[Tensor, "B 18 n"], weight: Float[Tensor, "B n"], learns: Float[Tensor, " B"]
     ) -> Mean:  # fmt: skip
         """With a block, where it ``learns`` (1, else 0)."""
         keep, weight = (1 - learns / MEMORY).unsqueeze(-1), learns.unsqueeze(-1) * weight
@@ -219,7 +219,7 @@ class VibrationSpeed(SensorSource):
         H = self._matrix(epoch, block)
         of_speed = predicted_variance(prediction.P, H)[:, 0]
         weight, tones = line_weights(speed, epoch.dt), tone_shares(speed)
-        y = remove_trend(log_power(block.spectrum), weight)
+        y = describe_block(block.spectrum, weight)
         of_distance, of_time = memory.by_distance.value, torch.bmm(memory.by_time.value, tones.mT)
         likelihood = log_likelihood(y - of_time, of_distance, weight, block.distance)
         expected = expected_log_likelihood(of_distance, weight, block.distance).clamp_min(1e-3)
