@@ -28,7 +28,12 @@ LIST = Path(__file__).with_suffix(".yaml")
 COPIED = ("src", "tests", "conf", "docs", "pipelines", "pyproject.toml", "README.md", "RESULTS.md", "Makefile")
 LOADED = (
     "pytest",
-    "tests.worlds",
+    "torch",
+    "lightning.pytorch",
+    "pandas",
+    "pyarrow.parquet",
+    "numba",
+    "hydra",
     "scipy.stats",
     "scipy.linalg",
     "scipy.spatial.transform",
@@ -71,11 +76,12 @@ def copy_tree(to: Path) -> None:
 
 
 def load_libraries() -> None:
-    """All that the tests need but the package and the tests themselves, which every fork reads from the copy."""
+    """What the package and the tests import: these themselves every fork reads from the copy."""
     for name in LOADED:
         importlib.import_module(name)
-    for name in [name for name in sys.modules if name.partition(".")[0] in ("dlkf", "tests")]:
+    for name in [name for name in sys.modules if name.partition(".")[0] == "tests"]:
         del sys.modules[name]
+    assert not any(name.partition(".")[0] == "dlkf" for name in sys.modules)
 
 
 def run_tests(tree: Path, mutant: Mutant | None, tests: tuple[str, ...], output: Path) -> int:

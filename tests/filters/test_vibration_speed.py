@@ -19,18 +19,20 @@ from dlkf.filters.vibration_spectrum import (
     FIRST_HZ,
     LEAST,
     LINES,
-    LOG_VARIANCE,
+    PARTS,
     STEP,
     TONE_HZ,
     TONES,
     WAVES,
     components,
     demodulate,
+    describe_block,
     expected_log_likelihood,
     line_weights,
     lines,
     log_likelihood,
     log_power,
+    phases,
     remove_trend,
     shifts,
     tone_shares,
@@ -145,10 +147,33 @@ def test_the_spectrum_is_the_sum_that_its_equation_says():
 
 def test_a_shape_has_no_trend_and_no_size():
     """Whatever is smooth in ln F leaves it as it is."""
-    power, weight = log_power(0.3 * made(4, 1, 6, WAVES) + 1), torch.ones(1, LINES).double()
+    power, weight = log_power(*components(0.3 * made(4, 1, 6, WAVES) + 1)), torch.ones(1, LINES).double()
     share = torch.log(lines(power) / LEAST) / math.log(float(lines(power)[-1]) / LEAST)
     again = power + 4 + 1.4 * torch.cos(math.pi * share) - 0.8 * torch.cos(3 * math.pi * share)
     assert torch.allclose(remove_trend(power, weight), remove_trend(again, weight), atol=1e-4)
+
+
+def test_phases_are_those_of_the_products_of_two_axes():
+    """cos and sin of arg(Z_a* Z_b), whatever the size and where the stretch begins."""
+    c, s = made(14, 2, 6, LINES), made(15, 2, 6, LINES)
+    z = torch.complex(c, s)
+    got = torch.complex(*phases(c, s).unflatten(1, (2, 6)).unbind(1))
+    for number, (a, b) in enumerate(((0, 2), (1, 3), (0, 4), (1, 5), (2, 4), (3, 5))):
+        product = z[:, a].conj() * z[:, b]
+        assert torch.allclose(got[:, number], product / product.abs(), atol=1e-12)
+    turned = 3 * z * torch.exp(1j * made(16, LINES))
+    assert torch.allclose(phases(turned.real, turned.imag), phases(c, s), atol=1e-12)
+
+
+@pytest.mark.whole
+def test_parts_of_a_block_have_unit_variance_where_nothing_is_known():
+    """Of white noise, but for what its clamped power and its trend take."""
+    x, s = made(17, 400, 300, 6), torch.linspace(0, 30, 300).double().expand(400, -1)
+    y = describe_block(demodulate(x, s, torch.zeros(400, 6, WAVES).double()), torch.ones(400, LINES).double())
+    square = y[..., 10:-10].square().mean((0, 2))
+    assert ((square[:6] > 0.75) & (square[:6] < 1.0)).all() and torch.allclose(
+        square[6:], torch.ones(12).double(), atol=0.05
+    )
 
 
 def test_lines_count_between_two_frequencies_in_time():
@@ -167,13 +192,13 @@ def test_what_is_of_frequencies_in_time_is_interpolated():
 
 
 def test_the_likelihood_of_a_shift_is_what_its_equation_says():
-    y, mean, weight = made(5, 1, 6, LINES), made(6, 1, 6, LINES), torch.rand(1, LINES).double()
+    y, mean, weight = made(5, 1, PARTS, LINES), made(6, 1, PARTS, LINES), torch.rand(1, LINES).double()
     got = log_likelihood(y, mean, weight, torch.tensor([50.0]).double())[0]
     F, w = lines(y).numpy(), weight[0].numpy()
     for number in (0, 10, 16, 32):
         at = F * math.exp(-float(shifts(y)[number]))
         A = np.stack([np.interp(at, F, a) for a in mean[0].numpy()])
-        said = (w * (y[0].numpy() * A - 0.5 * A**2)).sum() * (STEP * 50 / 1.5) / LOG_VARIANCE
+        said = (w * (y[0].numpy() * A - 0.5 * A**2)).sum() * (STEP * 50 / 1.5)
         assert got[number] == pytest.approx(said, rel=1e-3, abs=0.02)
 
 
@@ -181,20 +206,20 @@ def test_the_likelihood_of_a_shift_is_what_its_equation_says():
 def test_a_shape_that_stands_further_up_is_of_a_car_that_is_faster(delta):
     """y(F) = A(F e^−δ)."""
     F = lines(torch.zeros(1).double())
-    A = torch.log(1.3 - torch.cos(2 * math.pi * WHEELBASE * F)).expand(1, 6, -1)
-    y = torch.log(1.3 - torch.cos(2 * math.pi * WHEELBASE * F * math.exp(-delta))).expand(1, 6, -1)
+    A = torch.log(1.3 - torch.cos(2 * math.pi * WHEELBASE * F)).expand(1, PARTS, -1)
+    y = torch.log(1.3 - torch.cos(2 * math.pi * WHEELBASE * F * math.exp(-delta))).expand(1, PARTS, -1)
     said = log_likelihood(y, A, torch.ones(1, LINES).double(), torch.tensor([30.0]).double())
     assert float(shifts(y)[said.argmax()]) == pytest.approx(delta, abs=1e-9)
 
 
 def test_a_mean_of_few_blocks_is_drawn_towards_nothing():
     mean, one = Mean.begin(torch.zeros(1).double(), 1, 3), torch.ones(1).double()
-    y, weight = torch.full((1, 6, 3), 2.0).double(), torch.tensor([[1.0, 0.5, 0.0]]).double()
+    y, weight = torch.full((1, PARTS, 3), 2.0).double(), torch.tensor([[1.0, 0.5, 0.0]]).double()
     for _ in range(10):
         mean = mean.update(y, weight, one)
     n = sum((1 - 1 / MEMORY) ** k for k in range(10))  # blocks, of which older ones count less
     expected = torch.tensor([2 * n / (n + FEW), n / (0.5 * n + FEW), 0.0]).double()
-    assert torch.allclose(mean.value, expected.expand(1, 6, 3), atol=1e-6) and 1.3 < float(expected[0]) < 1.4
+    assert torch.allclose(mean.value, expected.expand(1, PARTS, 3), atol=1e-6) and 1.3 < float(expected[0]) < 1.4
     assert torch.equal(mean.update(y, weight, 0 * one).value, mean.value)
 
 
@@ -293,8 +318,8 @@ def test_what_does_not_follow_the_speed_is_not_trusted():
 
 @pytest.mark.whole
 def test_a_shape_has_the_likelihood_that_is_expected_of_it():
-    A, weight, distance = 0.5 * made(11, 1, 6, LINES), made(12, 1, LINES).sigmoid(), torch.tensor([30.0]).double()
-    y = A + LOG_VARIANCE**0.5 * made(13, 4000, 6, LINES)
+    A, weight, distance = 0.5 * made(11, 1, PARTS, LINES), made(12, 1, LINES).sigmoid(), torch.tensor([30.0]).double()
+    y = A + made(13, 4000, PARTS, LINES)
     found = log_likelihood(y, A.expand_as(y), weight.expand(4000, -1), distance.expand(4000))[:, 16]
     expected = expected_log_likelihood(A, weight, distance)[0, 0]
     assert float(found.mean()) == pytest.approx(float(expected), rel=0.05)

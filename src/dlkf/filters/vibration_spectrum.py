@@ -129,7 +129,10 @@ def tone_shares(speed: Float[Tensor, " B"]) -> Float[Tensor, "B K N"]:
 
 
 def log_likelihood(
-    y: Float[Tensor, "B 18 K"], mean: Float[Tensor, "B 18 K"], weight: Float[Tensor, "B K"], distance: Float[Tensor, " B"]
+    y: Float[Tensor, "B 18 K"],
+    mean: Float[Tensor, "B 18 K"],
+    weight: Float[Tensor, "B K"],
+    distance: Float[Tensor, " B"],
 ) -> Float[Tensor, "B O"]:
     """ln Λ of every shift δ (:func:`shifts`), from the products of y and A at all lines.
 
