@@ -143,10 +143,12 @@ def list_presets_once() -> Callable[..., DefaultsList]:
     found: dict[tuple, DefaultsList] = {}
 
     def list_presets(repo: IConfigRepository, config_name: str, overrides_list: list[Override], **options: bool):
+        if not are_shipped(repo):
+            return create_defaults_list(repo, config_name, overrides_list, **options)
         values = Overrides(repo, overrides_list).config_overrides
         chosen = [x.input_line for x in overrides_list if x not in values]
         key = config_name, *chosen, *options.items()
-        if key not in found or not are_shipped(repo):
+        if key not in found:
             found[key] = create_defaults_list(repo, config_name, overrides_list, **options)
         return replace(found[key], config_overrides=values)
 
