@@ -62,7 +62,7 @@ def test_navigate_and_evaluate_say_so_of_a_file_and_of_a_rate(call, town, tmp_pa
     done = call("navigate", f"dataset={town}", "out=untold", drive, *noise)
     assert done.code == 0 and f"plus has its own noise: {' '.join(noise)} have no effect" in done.out, done
     assert said not in done.out
-    done = call("navigate", "model=ins", f"dataset={town}", "out=told", drive, *noise)
+    done = call("navigate", "model=ins", f"dataset={town}", "out=solved", drive, *noise)
     assert done.code == 0 and "have no effect" not in done.out, done
     done = call("evaluate", "model=[mbkf15,plus]", f"dataset={slow}", "out=scored", drive, *SCORING)
     assert done.code == 0 and said in " ".join(done.out.split()), done

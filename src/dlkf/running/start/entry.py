@@ -225,11 +225,8 @@ def _first_motion(drive: Drive, config: AlignConfig, earliest: int) -> FirstMoti
     aligned, row = _align_until_motion(drive, config, earliest)
     if row is None:
         apart = torch.nonzero(drive.gnss_valid[:, :3].all(-1)).flatten().diff().double() * drive.epoch_s
-        if len(apart) and (often := float(apart.median())) > SLOWEST_FIXES_S:
-            raise InputError(
-                f"drive {drive.name}: fixes are {often:g} s apart, and a start needs one every second; "
-                "leave the drive out"
-            )
+        if len(apart) and (gap := float(apart.median())) > SLOWEST_FIXES_S:
+            raise InputError(f"drive {drive.name}: fixes are {gap:g} s apart, a start needs one a second; leave it out")
         raise InputError(
             f"drive {drive.name}: never moves faster than {config.min_speed:g} m/s for {config.window_s:g} s "
             "with GNSS, so yaw is unknown; lower align.min_speed or leave the drive out"
