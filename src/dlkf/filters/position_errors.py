@@ -9,7 +9,8 @@ its update, the error has changed by
 
 σ as it is in force (:mod:`dlkf.filters.fix_noise`), and by what the filter's velocity is off. White noise of variance w
 beside a walk of variance q per interval, in units of σ², has E[uₖ²] = 2 w + q + P_v Δt² / σ² and E[uₖ uₖ₋₁] = −w, so
-running means of both products give w and q. What is not white may wander: q is at most the share 1 − w of what a
+running means of both products give w and q. Of few fixes the mean of u²/2 is far less scattered; it is no smaller than
+w and limits it, so a receiver that claims ten times its error is known after a few fixes. What is not white may wander: q is at most the share 1 − w of what a
 Gauss-Markov process of 1σ ``WANDER`` σ and correlation time ``WANDER_S`` moves by in Δt, 2 Δt / ``WANDER_S`` of its
 variance.
 
@@ -34,9 +35,10 @@ from dlkf.navigation.state import POSITION, VELOCITY
 
 WANDER, WANDER_S = 2.0, 40.0  # σ, s
 USUAL_FIXES = 20.0  # that white noise as claimed counts for before anything is known
+FEW_FIXES = 3.0  # the same of the mean square alone
 MEMORY, QUICK = 300.0, 10.0  # fixes
 LARGEST = 5.0  # σ: the most that a change of the error counts
-NOISE_S = 8.0  # an error that takes longer to change is no noise
+NOISE_S = 4.0  # an error that takes longer to change is no noise
 MOVING = 1.0  # m/s: slower cars are left out, but for receivers of ``CARRIER_STD``
 LEAST_STD = 0.02  # m, the least 1σ of a fix that is made smaller than claimed
 PART = [0, 0, 1]  # of a position's components: horizontal, vertical
@@ -50,6 +52,7 @@ class PositionErrors(NamedTuple):
     successive: Tensor  # (B, 2) fixes up to the last; as below, horizontal and vertical
     white: Tensor  # (B, 2) w
     walk: Tensor  # (B, 2) q
+    square: Tensor  # (B, 2) mean of u² / 2
     recent: Tensor  # (B, 2) mean of (u² − P_v Δt² / σ²) / 2 over the last fixes
     fixes: Tensor  # (B, 2) what the means count for
     slow: Tensor  # (B, 3) m², variance of the last fix that is not white
@@ -58,11 +61,16 @@ class PositionErrors(NamedTuple):
     def begin(cls, like: Tensor, size: int, epoch_s: float) -> PositionErrors:
         """Before the first fix."""
         zero, zeros = like.new_zeros(size, 2), like.new_zeros(size, 3)
-        return cls(zeros, zeros, zero, zero + 1.0, zero, zero, zero + USUAL_FIXES, zeros)
+        return cls(zeros, zeros, zero, zero + 1.0, zero, zero + 1.0, zero, zero + USUAL_FIXES, zeros)
+
+    @property
+    def white_share(self) -> Float[Tensor, "B 2"]:
+        """Variance of the white noise over that in force, not above that of the changes."""
+        return torch.minimum(self.white, self.square).clamp_min(0.0)
 
     def variance(self, epoch: Epoch) -> Float[Tensor, "B 3"]:
         """By which the errors of the positions have moved in this update interval [m²]; zero without a fix."""
-        largest = (1 - self.white.clamp(0.0, 1.0)) * _largest_walk(epoch.dt * epoch.imu.shape[1])
+        largest = (1 - self.white_share.clamp_max(1.0)) * _largest_walk(epoch.dt * epoch.imu.shape[1])
         std = torch.where(epoch.used[:, POSITION], epoch.fix.std[:, POSITION], 0.0)
         return torch.minimum(self.walk.clamp_min(0.0), largest)[:, PART] * std.square()
 
@@ -70,7 +78,7 @@ class PositionErrors(NamedTuple):
         """Factors on the 1σ of position, horizontal and down, and of velocity (1), of a filter that takes positions
         for ``position_std`` times as noisy as claimed."""
         intervals = NOISE_S / (epoch.dt * epoch.imu.shape[1])
-        slow = self.white.clamp_min(0.0) + 0.5 * intervals * self.walk.clamp_min(0.0)
+        slow = self.white_share + 0.5 * intervals * self.walk.clamp_min(0.0)
         factor = torch.maximum(slow, 0.5 * self.recent).clamp_min(1e-6).sqrt()
         least = LEAST_STD / (position_std * epoch.fix.std[:, [0, 2]]).clamp_min(LEAST_STD)
         factor = torch.maximum(factor, least).clamp_max(1.0)
@@ -95,19 +103,20 @@ class PositionErrors(NamedTuple):
         of_velocity = c.predicted.diagonal(dim1=-2, dim2=-1)[:, VELOCITY] * (span / std).square()
         fixes = (self.fixes + 1).clamp_max(MEMORY)
         white = self.white - (product + self.white) / fixes
-        square = square - _parts(of_velocity)
-        walk = self.walk + (square + 2 * product - self.walk) / fixes
-        recent = self.recent + (0.5 * square - self.recent) / QUICK
+        excess = square - _parts(of_velocity)
+        walk = self.walk + (excess + 2 * product - self.walk) / fixes
+        recent = self.recent + (0.5 * excess - self.recent) / QUICK
+        square = self.square + (0.5 * square - self.square) / (fixes - USUAL_FIXES + FEW_FIXES)
         shown = (epoch.window.end.v_n.norm(dim=-1) > MOVING) | (std[:, :2].amax(-1) < CARRIER_STD)
         counts = (successive >= 3) & shown.unsqueeze(-1)  # two changes of the error
         residual = z - torch.bmm(c.H[:, POSITION], c.dx.unsqueeze(-1)).squeeze(-1)
-        white = torch.where(counts, white, self.white)
-        slow = (1 - white.clamp(0.0, 1.0))[:, PART] * std.square()
-        return PositionErrors(
-            torch.where(used, residual, 0.0), change, successive, white, torch.where(counts, walk, self.walk),
-            torch.where(counts, recent, self.recent), torch.where(counts, fixes, self.fixes),
-            torch.where(used, slow, self.slow),
+        found = PositionErrors(
+            torch.where(used, residual, 0.0), change, successive, torch.where(counts, white, self.white),
+            torch.where(counts, walk, self.walk), torch.where(counts, square, self.square),
+            torch.where(counts, recent, self.recent), torch.where(counts, fixes, self.fixes), self.slow,
         )  # fmt: skip
+        slow = (1 - found.white_share.clamp_max(1.0))[:, PART] * std.square()
+        return found._replace(slow=torch.where(used, slow, self.slow))
 
 
 def _parts(x: Float[Tensor, "B 3"]) -> Float[Tensor, "B 2"]:
