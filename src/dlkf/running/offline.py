@@ -34,6 +34,7 @@ from dlkf.running.innovations import FAR, Innovation, fit_sigma, rms, worst_stre
 from dlkf.running.loss import find_first_loss
 from dlkf.running.solution import SCHEMA, solution_table
 from dlkf.running.start import align_each
+from dlkf.running.start.entry import SLOWEST_FIXES_S, SLOWEST_START_S
 
 FEW_DRIVES = 8  # whose start in tensor operations takes less than numba takes to load
 WORTH_SAYING = 0.01  # probability of another heading
@@ -81,12 +82,14 @@ EARLY_S = 3.0  # before a solution begins, from which on a fix without one is wo
 
 
 def choose_epoch(spacings: Iterable[UsableFixes], rate_hz: float, estimator: Filter) -> float:
-    """Update interval [s] that uses every fix: the closest usual spacing, at most 1 s.
+    """Update interval [s] that uses every fix: the closest usual spacing.
 
-    1 s where it is no whole number of IMU samples, and for filters with constraints, whose noise is meant for one a
-    second.
+    1 s where it is no whole number of IMU samples, and at least for filters with constraints, whose noise is meant for
+    one a second. Of slow receivers that spacing in whole seconds, for a start needs a fix in every interval.
     """
     closest = min((s.usual_s for s in spacings), default=1.0)
+    if SLOWEST_FIXES_S < closest <= SLOWEST_START_S:
+        return float(round(closest))
     samples = closest * rate_hz if math.isfinite(closest) else 0.0  # no drive has two fixes: any grid will do
     whole = samples >= 1 and abs(samples - round(samples)) < 1e-6
     sources = getattr(find_kalman(estimator), "sources", ())
