@@ -15,6 +15,7 @@ from dlkf.data.aid_tables import STANDARD, AidTable
 from dlkf.data.discovery.motion import find_motion
 from dlkf.data.limits import FULL_SCALE, NONE_REFUSED, Refused, screen_fixes, within_full_scale
 from dlkf.data.plausibility import check_clocks, check_gnss_units, check_imu_units, check_turns
+from dlkf.data.readers.units import DAY_S, GPS_EPOCH_UNIX, WEEK_S
 from dlkf.data.reference_checks import check_attitude, check_same_clock, check_same_place
 from dlkf.data.schema import ACCEL, ATTITUDE, GYRO, POSITION, STD, VELOCITY, stack_columns
 from dlkf.data.tables import Columns, DriveRow, read_drives, read_table, refuse_rows
@@ -26,9 +27,8 @@ MOST_SAME = 0.2  # of the rows, with the stamp of the row before: more are a rou
 MOST_REFUSED = (0.01, 0.2)  # of the samples, of the fixes; more are no accident
 MOST_SWITCH_M = 10_000.0  # m: fixes that go on so far off make two drives of one
 MOST_HOURS = 14  # between time zones
-DAY_S, WEEK_S, NEAR_WRAP_S = 86_400, 604_800, 60.0
+NEAR_WRAP_S = 60.0
 SET_BACK_S, MOST_SET_BACK = 5.0, 10  # stamps that go back by more, but not often, are of a clock that was set back
-UNIX_TO_GPS_S, EPOCHS_APART_S = 315_964_800.0, 86_400.0  # 1970 to 1980; as near is no chance
 
 
 @dataclass(frozen=True)
@@ -283,7 +283,7 @@ def _explain_outside(t: np.ndarray, first: float, last: float) -> str:
     """What fixes that lie outside the IMU's time may count."""
     if len(t) == 1 and first - 1 <= t[0] <= last + 1:
         return "give fixes all along the drive, or leave it out"
-    if abs(abs(t[0] - first) - UNIX_TO_GPS_S) < EPOCHS_APART_S:
+    if abs(abs(t[0] - first) - GPS_EPOCH_UNIX) < DAY_S:
         clock = "one counts from 1970, the other from 1980; give time.clock to both or to neither"
         return f"both need the same clock: {clock}"
     seconds = 3600 * round((first + last - t[0] - t[-1]) / 2 / 3600)

@@ -7,12 +7,12 @@ its update, the error has changed by
 
     u = (zₖ − rₖ₋₁) / σ,
 
-σ as it is in force (:mod:`dlkf.filters.fix_noise`), and by what the filter's velocity is off. White noise of variance w
-beside a walk of variance q per interval, in units of σ², has E[uₖ²] = 2 w + q + P_v Δt² / σ² and E[uₖ uₖ₋₁] = −w, so
-running means of both products give w and q. Of few fixes the mean of u²/2 is far less scattered; it is no smaller than
-w and limits it, so a receiver that claims ten times its error is known after a few fixes. What is not white may wander: q is at most the share 1 − w of what a
-Gauss-Markov process of 1σ ``WANDER`` σ and correlation time ``WANDER_S`` moves by in Δt, 2 Δt / ``WANDER_S`` of its
-variance.
+σ as it is in force (:mod:`dlkf.filters.fix_noise`), and by what the filter's velocity is off. White noise of variance
+w beside a walk of variance q per interval, in units of σ², has E[uₖ²] = 2 w + q + P_v Δt² / σ² and E[uₖ uₖ₋₁] = −w,
+so running means of both products give w and q. Of few fixes the mean of u²/2 is far less scattered; it is no smaller
+than w and limits it, so a receiver that claims ten times its error is known after a few fixes. What is not white may
+wander: q is at most the share 1 − w of what a Gauss-Markov process of 1σ ``WANDER`` σ and correlation time
+``WANDER_S`` moves by in Δt, 2 Δt / ``WANDER_S`` of its variance.
 
 The noise of a fix is half the mean square by which the error changes in ``NOISE_S``, w + q ``NOISE_S`` / (2 Δt), where
 that is less than claimed; what moves slower is a wander of the position. It rises at once where the last changes are

@@ -147,7 +147,7 @@ MEMORY = {  # by the last parts of a field's name
     "errors.successive": "fixes in successive epochs",
     "errors.white": "white part of the variance of positions",
     "errors.walk": "variance by which errors of positions move in an epoch, over that of a position",
-    "errors.square": "half the mean square change of the error, of the variance of positions: a limit of its white part",
+    "errors.square": "half the mean square change of the error, of the variance of positions: limits its white part",
     "errors.recent": "half the mean square change of the error over the last fixes, of the variance of positions",
     "errors.fixes": "fixes that both count for",
     "errors.slow": "variance of the last position that is not white [m²]",
