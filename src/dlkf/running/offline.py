@@ -34,7 +34,7 @@ from dlkf.running.innovations import FAR, Innovation, fit_sigma, rms, worst_stre
 from dlkf.running.loss import find_first_loss
 from dlkf.running.solution import SCHEMA, solution_table
 from dlkf.running.start import align_each
-from dlkf.running.start.entry import SLOWEST_FIXES_S, SLOWEST_START_S
+from dlkf.running.start.entry import SLACK_S, SLOWEST_FIXES_S, SLOWEST_START_S
 
 FEW_DRIVES = 8  # whose start in tensor operations takes less than numba takes to load
 WORTH_SAYING = 0.01  # probability of another heading
@@ -89,7 +89,7 @@ def choose_epoch(spacings: Iterable[UsableFixes], rate_hz: float, estimator: Fil
     """
     closest = min((s.usual_s for s in spacings), default=1.0)
     if SLOWEST_FIXES_S < closest <= SLOWEST_START_S:
-        return float(round(closest))
+        return float(math.ceil(closest - SLACK_S))
     samples = closest * rate_hz if math.isfinite(closest) else 0.0  # no drive has two fixes: any grid will do
     whole = samples >= 1 and abs(samples - round(samples)) < 1e-6
     sources = getattr(find_kalman(estimator), "sources", ())
