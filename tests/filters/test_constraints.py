@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dlkf.filters.build import build_filter
-from dlkf.filters.constraints import STRUCTURE_STD, STRUCTURE_WALK_STD, CarConstraints
+from dlkf.filters.constraints import MEAN_S, STRUCTURE_STD, STRUCTURE_WALK_STD, CarConstraints
 from dlkf.filters.integration import Epoch, Fix, integrate
 from dlkf.filters.model_based import Mbkf
 from dlkf.filters.sources import Predicted
@@ -41,13 +41,15 @@ def test_jacobian_matches_finite_differences():
     structure = torch.tensor([[0.03, -0.02, 1.2, 0.008, 0.004]], dtype=D)
     error = ImuError(torch.zeros(1, 6, dtype=D))
     rules = CarConstraints(Tuning(), STATES)
+    still = epoch_of(batch, batch.start, error)
 
     def innovation(dx):
         moved = epoch_of(batch, batch.start.correct(dx[:, :9]), error.update(dx, STATES))
+        states = NavState(*(x[0] for x in still.window[:3])).correct(dx[:, :9].expand(M, -1))  # off alike all along
+        moved = moved._replace(window=moved.window._replace(**{k: x[None] for k, x in states._asdict().items()}))
         across = rules._measure_lateral(moved, structure + dx[:, STATES.of_structure])[0]
         return torch.cat((across, rules._measure_standstill(moved)[0]), -1)
 
-    still = epoch_of(batch, batch.start, error)
     H = torch.cat((rules._measure_lateral(still, structure)[1], rules._measure_standstill(still)[1]), 1)[0]
     for i in (*range(3, 10), *range(12, 15), *range(21, 26)):
         dx = torch.zeros(1, STATES.count, dtype=D)
@@ -55,6 +57,20 @@ def test_jacobian_matches_finite_differences():
         numeric = -(innovation(dx) - innovation(-dx))[0] / 2e-6
         # left out on purpose: Earth rate turned by an attitude error (7e-5)
         assert (numeric - H[:, i]).abs().max() < 1e-4, i
+
+
+def test_a_knock_that_the_springs_bring_back_is_no_motion_across_the_car():
+    """A metre a second to the right in the last sample moves the mean of half a second by its share, 2 cm/s in 50."""
+    batch = scene(1, 1, seed=3)
+    epoch = epoch_of(batch, batch.start, ImuError(torch.zeros(1, 6, dtype=D)))
+    rules, knocked = CarConstraints(Tuning(), STATES), epoch.window.v_n.clone()
+    knocked[:, -1] += epoch.window.C_nb[:, -1, :, 1]
+    calm, shaken = (
+        rules._measure_lateral(epoch._replace(window=epoch.window._replace(v_n=v_n)), None)[0]
+        for v_n in (epoch.window.v_n, knocked)
+    )
+    samples = round(MEAN_S / batch.dt)
+    assert samples < M and torch.allclose(calm - shaken, torch.tensor([[1.0 / samples, 0.0]], dtype=D), atol=1e-3)
 
 
 def test_beyond_three_sigma_a_larger_innovation_corrects_less():
@@ -66,9 +82,10 @@ def test_beyond_three_sigma_a_larger_innovation_corrects_less():
     correction, variances = [], []
     for sideways in (0.1, 2.0, 4.0):
         state = batch.start._replace(v_n=(C_nb @ torch.tensor([10.0, sideways, 0.0], dtype=D)).unsqueeze(0))
-        row, _ = rules.rows(
-            epoch_of(batch, state, ImuError(torch.zeros(1, 6, dtype=D))), rules.begin(batch), Predicted(P)
-        )
+        epoch = epoch_of(batch, state, ImuError(torch.zeros(1, 6, dtype=D)))
+        steady = {k: x.unsqueeze(1).expand_as(getattr(epoch.window, k)) for k, x in state._asdict().items()}
+        epoch = epoch._replace(window=epoch.window._replace(**steady))
+        row, _ = rules.rows(epoch, rules.begin(batch), Predicted(P))
         variances.append(float(row.R[0, 0]))
         S = float(row.H[0, 0] @ P[0] @ row.H[0, 0]) + variances[-1]
         correction.append(abs(float(row.z[0, 0])) / S)

@@ -10,8 +10,9 @@ car pitch back per specific force f_x forward (pitch gradient; Gillespie 1992). 
 they are further states of the filter. A standstill (:mod:`dlkf.filters.stationarity`) measures v = 0
 (zero-velocity update) and ω_b = Earth rate (zero-angular-rate update).
 
-A pothole or a knock turns or moves the IMU for a moment, so that a row across the car is off by many σ. Beyond
-``OUTLIER`` σ the 1σ of the row grows in proportion to its innovation, and its correction falls with one over it.
+Roads shake a car across its way by more than that, and its springs bring it back. So velocity and rate are means over
+the last ``MEAN_S``, in which the errors of the filter count as constant. A pothole or a knock may still make a row off
+by many σ: beyond ``OUTLIER`` σ its 1σ grows in proportion to its innovation, and its correction falls with one over it.
 
 The 1σ of a row is that of one a second: of shorter update intervals each row has a larger one, so that a second says
 the same.
@@ -33,11 +34,11 @@ from dlkf.filters.integration import Epoch
 from dlkf.filters.sources import Measurement, Predicted, predicted_variance
 from dlkf.filters.stationarity import VibrationLevel, WheelMotion, detect_stationary
 from dlkf.filters.tuning import Tuning
-from dlkf.navigation.attitude import skew
 from dlkf.navigation.state import GYRO, POSITION, STATES, VELOCITY, ErrorStates
 
 STRUCTURE_STD = (0.05, 0.05, 1.5, 0.01, 0.005)  # rad, rad, m, s²/m, s²·rad/m: what is known of a car before it moves
 STRUCTURE_WALK_STD = (2e-5, 2e-5, 1e-4, 1e-6, 1e-6)  # per √s
+MEAN_S = 0.5  # of velocity and rate across the car, at most an epoch
 SPRINGS_S = 0.3  # the springs follow the force so slowly: it is averaged over so long, at most an epoch
 OUTLIER = 3.0  # σ of an innovation across the car, from which on its 1σ grows with it
 SLOWEST = 0.5  # m/s: below, course and yaw rate do not show the vehicle parameters
@@ -111,10 +112,12 @@ class CarConstraints:
     def _measure_lateral(
         self, epoch: Epoch, structure: Float[Tensor, "B 5"] | None
     ) -> tuple[Float[Tensor, "B 2"], Float[Tensor, "B 2 n"], Bool[Tensor, " B"]]:
-        """Innovation and H of the velocity across the car at the window's end."""
-        state, rate = epoch.window.end, epoch.rate_b
-        C_bn = state.C_nb.mT
-        v_b = torch.bmm(C_bn, state.v_n.unsqueeze(-1)).squeeze(-1)
+        """Innovation and H of the mean velocity across the car at the window's end."""
+        last = max(1, min(epoch.corrected.shape[1], round(MEAN_S / epoch.dt)))
+        axes, v_n = epoch.window.C_nb[:, -last:].mT, epoch.window.v_n[:, -last:].unsqueeze(2)
+        v_b, rate = (axes * v_n).sum((1, 3)) / last, epoch.corrected[:, -last:, 3:].sum(1) / last
+        C_bn = axes.sum(1) / last
+        turned = torch.linalg.cross(axes, v_n.expand_as(axes)).sum(1) / last  # Cᵀ [v×]
         vx, w_y, w_z = v_b[:, 0], rate[:, 1], rate[:, 2]
         zero = torch.zeros_like(vx)
         yaw, pitch, axle, slip, gradient = (zero,) * 5 if structure is None else structure.unbind(-1)
@@ -123,7 +126,8 @@ class CarConstraints:
         pitch = pitch + gradient * force
         model = torch.stack((yaw * vx + (axle + slip * vx * vx) * w_z, pitch * vx - axle * w_y), -1)
         # h(x) = v_across − model = 0; the innovation is 0 − h(x̂)
-        J = C_bn[:, 1:] - torch.stack((yaw + 2 * slip * vx * w_z, pitch), -1).unsqueeze(-1) * C_bn[:, :1]
+        slope = torch.stack((yaw + 2 * slip * vx * w_z, pitch), -1).unsqueeze(-1)
+        J, of_attitude = (x[:, 1:] - slope * x[:, :1] for x in (C_bn, turned))
         # δω = −ζ, δf = −ε: the model's rates and forces are too large by the sensors' remaining errors
         lateral = [zero] * 5 + [axle + slip * vx * vx]
         vertical = [gradient * vx, zero, zero, zero, -axle, zero]
@@ -134,7 +138,7 @@ class CarConstraints:
         sensors, car = known.split((6, known.shape[-1] - 6), -1)
         position, matrices = J.new_zeros(len(J), 2, 3), J.new_zeros(len(J), 2, self.states.navigation - STATES)
         others = J.new_zeros(len(J), 2, len(self.states.others))
-        H = torch.cat((position, J, torch.bmm(J, skew(state.v_n)), sensors, matrices, car, others), -1)
+        H = torch.cat((position, J, of_attitude, sensors, matrices, car, others), -1)
         return model - v_b[:, 1:], H, vx.abs() > SLOWEST
 
     def _measure_standstill(self, epoch: Epoch) -> tuple[Float[Tensor, "B 6"], Float[Tensor, "B 6 n"]]:
