@@ -382,6 +382,17 @@ def test_a_second_as_calm_as_a_standstill_is_none():
     assert taken[:, 2:9].any() and not taken[:, 31:].any()
 
 
+def test_the_limit_of_a_long_rest_lies_above_the_quietest_second():
+    none, nothing = torch.full((4,), math.inf, dtype=D), VibrationLevel.begin(scene(4, 1))
+    assert nothing.resting_limit().isinf().all()
+    moved = nothing.update(none, torch.tensor([9e-3, 9e-3, 3e-5, 9e-3], dtype=D), 1.0)
+    torch.testing.assert_close(moved.resting_limit(), moved.moving / 15)
+    both = moved.update(torch.tensor([9e-6, 1.125e-3, 1e-5, math.inf], dtype=D), none, 1.0)
+    # a third of the way as logarithms: ten times as loud, twice, 1.4 times; the last as before
+    limits = torch.tensor([9e-5, 2.25e-3, 1e-5 * 3 ** (1 / 3), 6e-4], dtype=D)
+    torch.testing.assert_close(both.resting_limit(), limits)
+
+
 def test_a_long_rest_is_one_against_the_filters_speed():
     """An accelerometer is off for twenty seconds that end at the stop, in an outage: the filter's speed there is off by
     4 to 9σ, which ten seconds show."""

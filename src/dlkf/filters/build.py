@@ -112,7 +112,7 @@ def refuse_smoothed(name: str, why: str) -> None:
 
 def filter_names() -> list[str]:
     """Names that are close to what somebody mistyped: every filter with no ending or one, and ``plus``."""
-    return ["plus", *MODEL_BASED, *(f"{name}_{end}" for name in MODEL_BASED for end in ENDINGS)]
+    return ["plus", *MODEL_BASED, *(f"{name}_{end}" for name in MODEL_BASED[1:] for end in ENDINGS)]  # ins has none
 
 
 def describe_filters() -> str:

@@ -178,6 +178,16 @@ class VibrationLevel(NamedTuple):
         distinct, surely = moving > DISTINCT * standing, moving > SURELY_DISTINCT * standing
         return torch.where(distinct, (standing * moving).sqrt(), prior / APART), distinct, surely
 
+    def resting_limit(self) -> Float[Tensor, " B"]:
+        """Level up to which a long rest is believed against the filter's speed; inf: nothing learned.
+
+        The least standing level is that of the quietest second so far, perhaps without the engine. So the limit lies a
+        third of the way, as logarithms, to the least level of motion.
+        """
+        least = ALIKE * torch.minimum(self.standing, self.moving / FAR_APART)
+        between = torch.where(self.standing.isinf(), 0.0, self.standing * (self.moving / self.standing) ** (1 / 3))
+        return torch.maximum(least, between)
+
     def update(self, standing: Tensor, moving: Tensor, span: float) -> VibrationLevel:
         """After ``span`` seconds with the levels of a second in which the car was surely stationary, or moving; inf:
         neither."""
@@ -246,8 +256,8 @@ def detect_stationary(
     limit, distinct, surely = after.thresholds(prior)
     calm = level <= limit
     calm_s = torch.where(still, (before.calm_s + torch.where(calm, span, -span)).clamp_min(0.0), 0.0)
-    least = ALIKE * torch.minimum(after.standing, after.moving / FAR_APART)  # inf: nothing learned
-    rest_s = torch.where(still_long & surely & (level <= least) & ~after.moving.isinf(), before.rest_s + span, 0.0)
+    resting = still_long & surely & (level <= after.resting_limit()) & ~after.moving.isinf()
+    rest_s = torch.where(resting, before.rest_s + span, 0.0)
     after = after._replace(calm_s=calm_s, rest_s=rest_s)
     learned = ~(after.standing.isinf() & after.moving.isinf())
     slow = (speed < PLAUSIBLE_SPEED) & (still_s > LEAST_S - 0.5 * span)
