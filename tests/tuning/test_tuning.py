@@ -22,7 +22,7 @@ from dlkf.filters.tuning import Prior, Tuning
 from dlkf.onboard.library import find_compiler
 from dlkf.tuning.baselines import tune_baselines
 from dlkf.tuning.search import FACTORS, best_prior, evaluate_objective, list_factors, mean_imu_error, tune_filter
-from dlkf.tuning.study import check_settings, train_test_drives
+from dlkf.tuning.study import TuningResult, _count_compared, check_settings, train_test_drives, tuning_table
 from tests.cars import IMU
 
 
@@ -235,3 +235,14 @@ def test_a_split_that_cuts_drives_is_refused():
     """Segments of one drive on both sides: what is tuned on would be tested on."""
     with pytest.raises(InputError, match="split=group"):
         train_test_drives([], "random", (0.7, 0.15, 0.15), 0, 60.0)
+
+
+def test_the_table_says_of_how_many_outages_it_is(cars):
+    """Whole drives: two outages in each, or none."""
+    masks = OutagePlan(30.0, 5.0).masks(cars)[0] | OutagePlan(50.0, 5.0).masks(cars)[0]
+    assert _count_compared([withhold_fixes(cars, masks)]) == (2 * len(masks), len(set(cars.drive)))
+    assert _count_compared([cars]) == (len(masks), len(set(cars.drive)))
+    errors = (("train", "rms", 2.0, 1.0), ("test", "rms", 2.0, 1.0))
+    compared = {"train": (60, 7), "test": (1, 1)}
+    table = tuning_table(TuningResult("mbkf21", Tuning(), Tuning(), (), errors, (), compared), "town")
+    assert "train: 60 outages of 7 drives. test: 1 outage of 1 drive, too few to conclude from." in table.note

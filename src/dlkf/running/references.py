@@ -67,8 +67,8 @@ def make_reference(
 
     ``smoothed``: position, velocity and attitude of ``estimator`` with all fixes, smoothed backwards
     (:mod:`dlkf.filters.smoother`), where its 1σ is not far above the usual. ``gnss``: the fixes of the best quality
-    that is frequent, brought to the IMU by the smoothed attitude; no attitude. Drives that cannot be aligned are left
-    out and the reason reported, unless none is left (InputError).
+    that is frequent, of those that the filter uses, brought to the IMU by the smoothed attitude; no attitude. Drives
+    that cannot be aligned are left out and the reason reported, unless none is left (InputError).
     """
     check_reference(kind)
     made, sigmas, skipped = [], [], {}
@@ -92,7 +92,8 @@ def make_reference(
             sure = sigma.norm(dim=-1) <= UNSURE * sigma.norm(dim=-1).median()
             found["ref_C_eb"][rows] = C_eb
         else:
-            r_e, v_e, sure = _carry_to_imu(drive, rows, C_eb, v_e)
+            r_e, v_e, good = _carry_to_imu(drive, rows, C_eb, v_e)
+            sure = good & solution.used[0, :n]
             sigma = drive.gnss_std[rows, :3]
         found["ref_r_e"][rows], found["ref_v_e"][rows], found["ref_valid"][rows] = r_e, v_e, sure
         sigmas.append(sigma[sure])

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import pandas as pd
+import torch
 import yaml
 
 from dlkf.base.errors import InputError
@@ -17,6 +18,7 @@ from dlkf.data.splits import Split, split_rows
 from dlkf.data.stack import DriveStack
 from dlkf.evaluation.metrics import OBJECTIVES, PVA
 from dlkf.evaluation.protocol import Protocol, Scenes, describe_short
+from dlkf.evaluation.summary import FEW
 from dlkf.evaluation.table import ResultTable, as_markdown, format_number
 from dlkf.filters.build import build_causal, has_prior, is_filter
 from dlkf.filters.tuning import Prior, Tuning
@@ -41,6 +43,7 @@ class TuningResult:
     trials: tuple[Trial, ...]
     errors: tuple[tuple[str, str, float, float], ...]
     left_out: tuple[str, ...] = ()  # drives, and why
+    compared: Mapping[str, tuple[int, int]] = field(default_factory=dict)  # by side: outages (or segments), drives
 
     @property
     def changed(self) -> dict[str, float]:
@@ -101,7 +104,11 @@ def withhold_outages(
         short = [describe_short(scenes.short, len(drives), protocol)] if scenes.short else []
         left_out += [*scenes.skipped.values(), *short]
     if protocol.outage and not any(bool((~b.available & b.truth_valid & b.present).any()) for b in kept):
-        raise InputError("no outage fits into the valid truth of the training drives; see outage.* and length_s")
+        longest = max(d.epochs * d.epoch_s for d in drives)
+        raise InputError(
+            f"no outage fits into the reference of the training drives (the longest has {longest:.0f} s); make "
+            "outage.first_s, outage.duration_s or length_s smaller, or take objective=likelihood, which needs neither"
+        )
     return kept
 
 
@@ -127,13 +134,26 @@ def search(
     if drives["test"]:
         batches["test"] = withhold_outages(drives["test"], protocol, left_out=left_out)
     old, new = (build_causal(model, imu, "tuning does not", tuning=t, prior=prior) for t in (start, after))
+    compared = {side: _count_compared(part) for side, part in batches.items()}
     objectives = (*OBJECTIVES, PVA) if protocol.outage else (PVA,)
     errors = [
         (side, name, evaluate_objective(old, part, name), evaluate_objective(new, part, name))
         for side, part in batches.items()
         for name in objectives
     ]
-    return TuningResult(model, start, after, tuple(trials), tuple(errors), tuple(left_out))
+    return TuningResult(model, start, after, tuple(trials), tuple(errors), tuple(left_out), compared)
+
+
+def _count_compared(batches: Sequence[Batch]) -> tuple[int, int]:
+    """Outages that are scored, or segments where there are none, and the drives that they are of."""
+    count, drives = 0, set()
+    for batch in batches:
+        hidden = ~batch.available & batch.present
+        begins = hidden & ~torch.nn.functional.pad(hidden[:, :-1], (1, 0))
+        each = begins.sum(-1) if bool(hidden.any()) else torch.ones(len(hidden), dtype=torch.int64)
+        count += int(each.sum())
+        drives |= {d for d, n in zip(batch.drive, each.tolist()) if n}
+    return count, len(drives)
 
 
 def tuning_table(result: TuningResult, dataset: str) -> ResultTable:
@@ -143,15 +163,22 @@ def tuning_table(result: TuningResult, dataset: str) -> ResultTable:
         for side, objective, before, after in result.errors
     ]
     outages = any(objective != PVA for _, objective, *_ in result.errors)
+    kind = "outage" if outages else "segment"
+    compared = [describe_compared(side, kind, *counts) for side, counts in result.compared.items()]
+    objectives = [OF_OUTAGES, OF_SEGMENTS] if outages else [OF_SEGMENTS]
     factors = ", ".join(f"{k}={v:g}" for k, v in result.changed.items()) or "all as they were"
     return ResultTable(
         title=f"{result.model} on {dataset}: {factors}",
-        note=" ".join(
-            [*([OF_OUTAGES] if outages else []), OF_SEGMENTS, *(f"Left out: {line}." for line in result.left_out)]
-        ),
+        note=" ".join([*compared, *objectives, *(f"Left out: {line}." for line in result.left_out)]),
         columns=["Drives", "Objective", "Before", "After", "Ratio"],
         rows=rows,
     )
+
+
+def describe_compared(side: str, kind: str, count: int, drives: int) -> str:
+    """How much the errors of one side are of."""
+    many = f"{side}: {count} {kind}{'s' * (count != 1)} of {drives} drive{'s' * (drives != 1)}"
+    return many + (", too few to conclude from." if side == "test" and count < FEW else ".")
 
 
 def write_tuning(out: str | Path, name: str, result: TuningResult, table: ResultTable) -> list[str]:
