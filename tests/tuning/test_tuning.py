@@ -240,8 +240,8 @@ def test_a_split_that_cuts_drives_is_refused():
 def test_the_table_says_of_how_many_outages_it_is(cars):
     """Whole drives: two outages in each, or none."""
     masks = OutagePlan(30.0, 5.0).masks(cars)[0] | OutagePlan(50.0, 5.0).masks(cars)[0]
-    assert _count_compared([withhold_fixes(cars, masks)]) == (2 * len(masks), len(set(cars.drive)))
-    assert _count_compared([cars]) == (len(masks), len(set(cars.drive)))
+    assert _count_compared([withhold_fixes(cars, masks), cars], True) == (2 * len(masks), len(set(cars.drive)))
+    assert _count_compared([cars], False) == (len(masks), len(set(cars.drive)))
     errors = (("train", "rms", 2.0, 1.0), ("test", "rms", 2.0, 1.0))
     compared = {"train": (60, 7), "test": (1, 1)}
     table = tuning_table(TuningResult("mbkf21", Tuning(), Tuning(), (), errors, (), compared), "town")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import pandas as pd
-import torch
 import yaml
 
 from dlkf.base.errors import InputError
@@ -16,7 +16,7 @@ from dlkf.base.files import write_into
 from dlkf.data.drive import Batch, Drive
 from dlkf.data.splits import Split, split_rows
 from dlkf.data.stack import DriveStack
-from dlkf.evaluation.metrics import OBJECTIVES, PVA
+from dlkf.evaluation.metrics import OBJECTIVES, PVA, outage_intervals
 from dlkf.evaluation.protocol import Protocol, Scenes, describe_short
 from dlkf.evaluation.summary import FEW
 from dlkf.evaluation.table import ResultTable, as_markdown, format_number
@@ -134,7 +134,7 @@ def search(
     if drives["test"]:
         batches["test"] = withhold_outages(drives["test"], protocol, left_out=left_out)
     old, new = (build_causal(model, imu, "tuning does not", tuning=t, prior=prior) for t in (start, after))
-    compared = {side: _count_compared(part) for side, part in batches.items()}
+    compared = {side: _count_compared(part, protocol.outage is not None) for side, part in batches.items()}
     objectives = (*OBJECTIVES, PVA) if protocol.outage else (PVA,)
     errors = [
         (side, name, evaluate_objective(old, part, name), evaluate_objective(new, part, name))
@@ -144,16 +144,14 @@ def search(
     return TuningResult(model, start, after, tuple(trials), tuple(errors), tuple(left_out), compared)
 
 
-def _count_compared(batches: Sequence[Batch]) -> tuple[int, int]:
-    """Outages that are scored, or segments where there are none, and the drives that they are of."""
-    count, drives = 0, set()
+def _count_compared(batches: Sequence[Batch], outages: bool) -> tuple[int, int]:
+    """Outages that are scored, or segments, and the drives that they are of."""
+    each: Counter[str] = Counter()
     for batch in batches:
-        hidden = ~batch.available & batch.present
-        begins = hidden & ~torch.nn.functional.pad(hidden[:, :-1], (1, 0))
-        each = begins.sum(-1) if bool(hidden.any()) else torch.ones(len(hidden), dtype=torch.int64)
-        count += int(each.sum())
-        drives |= {d for d, n in zip(batch.drive, each.tolist()) if n}
-    return count, len(drives)
+        hidden = ~batch.available & batch.truth_valid & batch.present
+        rows = outage_intervals(hidden.cpu().numpy()).segment if outages else range(len(hidden))
+        each.update(batch.drive[row] for row in rows)
+    return each.total(), len(each)
 
 
 def tuning_table(result: TuningResult, dataset: str) -> ResultTable:
