@@ -81,6 +81,8 @@ def main(settings: NavigateSettings) -> None:
             )  # fmt: skip
         print("found: " + ", ".join(f"{k} {v:.2g}" for k, v in found.describe().items()))
         print(found.describe_offset())
+        if doubt := found.describe_doubt():
+            print(doubt)
         spec, tuning = found.imu, found.tuning
     if settings.smoother is not None:
         model = run_smoother(model, settings.smoother)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -129,6 +130,13 @@ def test_a_delay_is_told_from_a_wrong_lever_arm(long_town, tmp_path, delay_s, ar
     assert placing.ahead_m == (pytest.approx(-arm_m, abs=4 * std.ahead_m) if arm_m else 0.0)
     said = NoiseFit(IMU, Tuning(), placing, std, 0.0, 0.0).describe_offset()
     assert ("not late" in said) == (not delay_s) and ("further back" in said) == bool(arm_m)
+
+
+def test_what_no_car_does_is_told():
+    fit = NoiseFit(IMU, Tuning(lateral_std=0.3), FixOffset(), FixOffset(0.01, 0.1), 0.0, 0.0)
+    assert not fit.describe_doubt() and "± 0.010 s" in fit.describe_offset()
+    wrong = fit._replace(tuning=Tuning(lateral_std=19.0, vertical_std=32.0), placing_std=FixOffset(math.inf, 0.1))
+    assert "vertical_std 32 m/s" in wrong.describe_doubt() and "inf" not in wrong.describe_offset()
 
 
 def test_the_command_writes_what_the_others_take(uri, call, long_town, coarse):

@@ -63,6 +63,7 @@ WAYS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1))  # late, ahead, and 
 SURE = 3.0  # σ from which on a delay or a place of the antenna is taken
 SURE_GAIN = 1e-3  # of the mean: less is no gain
 USUAL, USUAL_OF_CAR = math.log(30.0), math.log(3.0)  # 1σ of ln(value / that at the start): keeps what nothing shows
+DOUBTFUL_OF_CAR = 2.0  # m/s, a constraint's noise that no car has
 LARGEST = {"accel.turn_on_bias": 1.0, "gyro.turn_on_bias": 0.1}  # m/s², rad/s
 
 
@@ -113,6 +114,8 @@ class NoiseFit(NamedTuple):
             return ""
         way = "forward" if ahead > 0 else "back"
         far = f"{abs(ahead):.2f} m ± {ahead_std:.2f} m further {way} than lever_arm_m says"
+        if not math.isfinite(late_std) or not math.isfinite(ahead_std):
+            return "The drives do not show whether the fixes are late, nor where the antenna is"
         when = (
             f"{late:.3f} s ± {late_std:.3f} s late"
             if late
@@ -120,6 +123,16 @@ class NoiseFit(NamedTuple):
         )
         where = far if ahead else f"where lever_arm_m says (± {ahead_std:.2f} m along the car)"
         return f"The fixes are {when}; the antenna sits {where}"
+
+    def describe_doubt(self) -> str:
+        """One line where the fixes contradict the constraints of a car; empty where they do not."""
+        widest = max(OF_CAR, key=lambda name: getattr(self.tuning, name))
+        if (std := getattr(self.tuning, widest)) < DOUBTFUL_OF_CAR:
+            return ""
+        return (
+            f"The fixes contradict the vehicle constraints ({widest} {std:.2g} m/s): wrong axes of the IMU, or fixes that "
+            "stand still or jump; see dlkf doctor, or take model=plus, which refuses such fixes"
+        )
 
 
 @dataclass(frozen=True)
