@@ -130,8 +130,8 @@ class NoiseFit(NamedTuple):
         if (std := getattr(self.tuning, widest)) < DOUBTFUL_OF_CAR:
             return ""
         return (
-            f"The fixes contradict the vehicle constraints ({widest} {std:.2g} m/s): wrong axes of the IMU, or fixes that "
-            "stand still or jump; see dlkf doctor, or take model=plus, which refuses such fixes"
+            f"The fixes contradict the vehicle constraints ({widest} {std:.2g} m/s): wrong axes of the IMU, or fixes "
+            "that stand still or jump; see dlkf doctor, or take model=plus, which refuses such fixes"
         )
 
 
