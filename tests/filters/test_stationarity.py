@@ -382,7 +382,7 @@ def test_a_second_as_calm_as_a_standstill_is_none():
     assert taken[:, 2:9].any() and not taken[:, 31:].any()
 
 
-def test_the_limit_of_a_long_rest_lies_above_the_quietest_second():
+def test_the_limit_of_a_long_rest_lies_above_the_least_level():
     none, nothing = torch.full((4,), math.inf, dtype=D), VibrationLevel.begin(scene(4, 1))
     assert nothing.resting_limit().isinf().all()
     moved = nothing.update(none, torch.tensor([9e-3, 9e-3, 3e-5, 9e-3], dtype=D), 1.0)

@@ -179,9 +179,9 @@ class VibrationLevel(NamedTuple):
         return torch.where(distinct, (standing * moving).sqrt(), prior / APART), distinct, surely
 
     def resting_limit(self) -> Float[Tensor, " B"]:
-        """Level up to which a long rest is believed against the filter's speed; inf: nothing learned.
+        """Level up to which a long rest counts against the filter's speed; inf: nothing learned.
 
-        The least standing level is that of the quietest second so far, perhaps without the engine. So the limit lies a
+        The least standing level is that of one second, perhaps without the engine. So the limit lies a
         third of the way, as logarithms, to the least level of motion.
         """
         least = ALIKE * torch.minimum(self.standing, self.moving / FAR_APART)

@@ -131,7 +131,7 @@ class NoiseFit(NamedTuple):
             return ""
         return (
             f"The fixes contradict the vehicle constraints ({widest} {std:.2g} m/s): wrong axes of the IMU, or fixes "
-            "that stand still or jump; see dlkf doctor, or take model=plus, which refuses such fixes"
+            "that are frozen or jump; see dlkf doctor, or take model=plus, which refuses such fixes"
         )
 
 
