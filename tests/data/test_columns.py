@@ -17,7 +17,17 @@ from dlkf.data.readers.qualities import quality_spec
 from dlkf.data.readers.recognise import gnss_spec, imu_spec
 from dlkf.data.readers.stamps import choose_clock
 from dlkf.data.readers.units import day_order
-from dlkf.data.readers.vocabulary import DATE, QUANTITIES, SENSORS, TIME, find_column, match_columns, split_unit, triad
+from dlkf.data.readers.vocabulary import (
+    DATE,
+    QUANTITIES,
+    SENSORS,
+    TIME,
+    find_column,
+    find_triads,
+    match_columns,
+    split_unit,
+    triad,
+)
 from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.tables import DriveClock, read_drives
 from dlkf.running.exports import utc_times
@@ -275,6 +285,28 @@ def test_names_mean_one_thing():
         assert not [k for k in QUANTITIES if find_column([name], k)], name
         assert not match_columns([name], TIME) and not match_columns([name], DATE)
     assert split_unit("Länge (°)") == ("lange", "deg") and split_unit("alt_ft") == ("alt", "ft")
+
+
+@pytest.mark.parametrize("prefix", ["", "imu.", "field."])
+def test_accelerations_as_ros_calls_them(prefix):
+    """Beside the rates of the same message; where nothing else is the accelerometer's, and never alone: a phone's
+    linear acceleration has no gravity."""
+    linear = [f"{prefix}linear_acceleration.{a}" for a in "xyz"]
+    rates = [f"{prefix}angular_velocity.{a}" for a in "xyz"]
+    assert find_triads([*linear, *rates]) == {"accel": linear, "gyro": rates}
+    assert find_triads([*linear, *rates, "ax", "ay", "az"])["accel"] == ["ax", "ay", "az"]
+    assert find_triads(linear) == {}
+
+
+@pytest.mark.parametrize("name", ["{}rate", "{}_rate", "{}Rate [deg/s]", "gyro_{}"])
+def test_rates_of_roll_pitch_and_yaw(name):
+    rates = [name.format(angle) for angle in ("roll", "pitch", "yaw")]
+    assert find_triads(["roll", "pitch", "yaw", *rates]) == {"gyro": rates}
+
+
+def test_units_of_rates_with_sec():
+    assert find_triads([f"gy_{a}[rad/sec]" for a in "xyz"]) == {"gyro": [f"gy_{a}[rad/sec]" for a in "xyz"]}
+    assert split_unit("wx_deg_sec") == ("wx", "deg/s")
 
 
 def test_a_unit_that_the_header_states_and_gravity_does_not_deny():

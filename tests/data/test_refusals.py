@@ -213,7 +213,7 @@ def test_sensors_in_files_of_their_own(tmp_path, streets):
     (got,) = AutoReader().read(tmp_path)
     np.testing.assert_allclose(got.imu.gyro_z, imu.gyro_z, atol=0.01)
     (tmp_path / "gyroscope.csv").unlink()
-    assert "accelerometer.csv (csv with x, y, z); gps.csv (csv with" in refusal(tmp_path)
+    assert "accelerometer.csv (csv with x, y, z, without a gyroscope); gps.csv (csv with" in refusal(tmp_path)
 
 
 def test_what_each_file_holds_is_said(tmp_path, drive):
@@ -226,6 +226,17 @@ def test_what_each_file_holds_is_said(tmp_path, drive):
     said = refusal(tmp_path)
     for part in ("acc.csv (csv with accel_x", "photo.jpg (of no format that is known)", "empty.txt (empty)"):
         assert part in said, part
+
+
+@pytest.mark.parametrize(("kept", "lacks"), [(ACCEL, "a gyroscope"), (GYRO, "an accelerometer")])
+def test_the_sensor_that_an_imu_lacks_is_named(kept, lacks, tmp_path, drive):
+    """In a table of its own, and beside fixes; where a file is given, the line begins with that file."""
+    alone, both = tmp_path / "alone.csv", tmp_path / "both.csv"
+    drive["imu"][["t", *kept]].to_csv(alone, index=False)
+    pd.merge_asof(drive["gnss"], drive["imu"][["t", *kept]], on="t").to_csv(both, index=False)
+    for file in (alone, both):
+        said = refusal(file)
+        assert said.startswith(f"{file}: no IMU found") and f", without {lacks})" in said
 
 
 def test_a_table_of_a_hundred_thousand_columns(tmp_path):

@@ -164,8 +164,7 @@ class AutoReader:
             remedy = "give the folder that holds the IMU's file too, or name both" if only is not None else (
                 "name the reader and its columns (reader=csv reader.imu.file=… 'reader.imu.accel.columns=[…]' …)"
             )  # fmt: skip
-            where = only.parent if only is not None else folder
-            raise InputError(f"{where}: no IMU found{_describe_files(within, offers)}; {remedy}")
+            raise InputError(f"{only or folder}: no IMU found{_describe_files(within, offers)}; {remedy}")
 
     def _aid(self, within: list[Contents], kind: str, folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
         """The spec of an aid, and what it was found in; None where there is none, or file=null leaves it out."""

@@ -87,7 +87,18 @@ def recognise_file(path: Path) -> Contents:
     if (count := len(table.frame.columns)) > recognise.MOST_COLUMNS:
         return Contents(path, held=f"a table of {count} columns, which no log has")
     found = _offer_table(path, name, table, options, None)
-    return Contents(path, found, "" if found else recognise.describe_missing(table))
+    if not found:
+        return Contents(path, held=recognise.describe_missing(table))
+    return Contents(path, found, _describe_lone_sensor(table, found[0]))
+
+
+def _describe_lone_sensor(table: LogTable, offer: Offer) -> str:
+    """What a table offers and which sensor it lacks of an IMU of which it has the other; empty where it has neither."""
+    triads = vocabulary.find_triads([str(name) for name in table.frame.columns])
+    alone = {*triads, *offer.specs} & {*recognise.COUNTERPARTS}
+    if len(alone) != 1 or "imu" in offer.specs:
+        return ""
+    return f"{offer.detail}, without {recognise.COUNTERPARTS[alone.pop()]}"
 
 
 def _offer_preset(path: Path, name: str) -> Contents:

@@ -26,6 +26,7 @@ SPEED_UNITS = ("km/h", "mph", "m/s", "knots", "rpm")
 MOST_COLUMNS = 500  # no log of a car has more; each is looked at in many ways
 NEAR_GRAVITY = 0.08
 HIGHEST_M = 9000.0  # of a road
+COUNTERPARTS = {"accel": "a gyroscope", "gyro": "an accelerometer"}  # what a table with one sensor alone lacks
 COARSE = 0.2  # of the samples, with the stamp of the one before: the clock is coarser than the rate
 
 
@@ -39,17 +40,17 @@ class Recognised(NamedTuple):
 def imu_spec(table: LogTable) -> Recognised | None:
     """The mapping of a table that holds an IMU; None if it does not."""
     frame, names = _select_numeric(table)
-    triads = {key: vocabulary.triad(names, stem) for key, stem in vocabulary.SENSORS.items()}
-    if triads["accel"] and triads["gyro"]:
+    triads = vocabulary.find_triads(names)
+    if len(triads) == 2:
         known = frame[triads["accel"] + triads["gyro"]].notna().all(axis=1)
         time = stamps.time_spec(table, known, SLOWEST_IMU_S, FASTEST_IMU_S)
         if time is None:
             return None
-        sensors = {key: {"columns": columns} for key, columns in triads.items() if columns}
+        sensors = {key: {"columns": columns} for key, columns in triads.items()}
         sensors["accel"] |= _find_stated_unit(frame, triads["accel"])
         notes = _spread(frame[known], time)
         return Recognised({"time": time, **sensors}, notes)
-    if any(triads.values()) or vocabulary.find_column(names, "lat"):
+    if triads or vocabulary.find_column(names, "lat"):
         return None
     spec = by_numbers.imu_spec(frame)
     if spec is None:
@@ -77,7 +78,7 @@ def sensor_spec(table: LogTable, called: str) -> dict[str, Spec]:
     which counts where the columns are plain x, y, z."""
     frame, names = _select_numeric(table)
     for key, stem in vocabulary.SENSORS.items():
-        columns = vocabulary.triad(names, stem)
+        columns = vocabulary.find_triads(names).get(key)
         if columns is None and vocabulary.has(called, rf"\b{stem}\b"):
             columns = vocabulary.triad(names, "(?:)") or vocabulary.triad(names, r"\w*")
         if columns is None:
@@ -94,7 +95,7 @@ def gnss_spec(table: LogTable) -> Recognised | None:
     frame, names = _select_numeric(table)
     found = {key: vocabulary.find_column(names, key) for key in vocabulary.QUANTITIES}
     lat, lon, height = (found[key] for key in ("lat", "lon", "height"))
-    if (lat is None or lon is None) and any(vocabulary.triad(names, stem) for stem in vocabulary.SENSORS.values()):
+    if (lat is None or lon is None) and vocabulary.find_triads(names):
         return None
     if lat is None or lon is None:
         spec = by_numbers.gnss_spec(table)
@@ -162,7 +163,7 @@ def _hemispheres(frame: pd.DataFrame) -> list[str] | None:
 def _find_repeated(frame: pd.DataFrame, place: list[str]) -> pd.Series | None:
     """Rows that repeat the position before, in a table of IMU samples beside which most do; else None."""
     names = [str(c) for c in frame.columns]
-    if len(frame) < 10 or not any(vocabulary.triad(names, stem) for stem in vocabulary.SENSORS.values()):
+    if len(frame) < 10 or not vocabulary.find_triads(names):
         return None
     same = (frame[place] == frame[place].shift()).all(axis=1)
     return same if same.mean() > 0.5 else None
@@ -227,7 +228,7 @@ def describe_missing(table: LogTable) -> str:
     """What a table has and what it lacks, in words, for a line that refuses it."""
     table = convert_numbers(table)
     _, names = _select_numeric(table)
-    has = [key for key, stem in vocabulary.SENSORS.items() if vocabulary.triad(names, stem)]
+    has = list(vocabulary.find_triads(names))
     has += ["positions"] if vocabulary.find_column(names, "lat") else []
     columns = [str(c) for c in table.frame.columns]
     text = f"columns {', '.join(columns[:12])}{', …' if len(columns) > 12 else ''}"
@@ -236,7 +237,7 @@ def describe_missing(table: LogTable) -> str:
         if lat is not None and len(table.frame):
             return f"{text}: {lat} has text such as {table.frame[lat].iloc[0]}, must be decimal degrees"
         return f"{text}, of which none is known"
-    lacks = [] if len(has) > 1 or "positions" in has else [{"accel": "a gyroscope", "gyro": "an accelerometer"}[has[0]]]
+    lacks = [] if len(has) > 1 or "positions" in has else [COUNTERPARTS[has[0]]]
     if "positions" in has:
         lacks += [] if vocabulary.find_column(names, "lon") else ["a longitude"]
         lacks += [] if vocabulary.find_column(names, "height") else ["a height (one number in all rows will do)"]
