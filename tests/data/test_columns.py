@@ -33,6 +33,7 @@ from dlkf.data.tables import DriveClock, read_drives
 from dlkf.running.exports import utc_times
 from tests.data.logs.clock import GPS, UNIX
 from tests.data.logs.clock import G as GRAVITY
+from tests.data.test_validate import hilly
 
 DEG = np.pi / 180
 # stamps, accelerometers, gyroscopes; stamps, latitude, longitude, height, speed [km/h], course, accuracy, quality
@@ -262,6 +263,21 @@ def test_fixes_that_are_no_table_of_them(name, text, said, tmp_path):
     with pytest.raises(InputError) as refused:
         list(AutoReader().read(tmp_path))
     assert said in str(refused.value)
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("mm", 1e-3), ("cm", 0.01), ("km", 1e3), ("ft", 0.3048)])
+def test_the_unit_of_heights_by_the_vertical_velocity(unit, metres, tmp_path, drive):
+    """It is printed, as every estimate is; without a vertical velocity heights above all roads are mm."""
+    gnss = hilly(drive["gnss"], metres, 0.02)
+    frd = {"accel": {"axes": "frd"}, "gyro": {"axes": "frd"}}
+    drive["imu"].to_csv(tmp_path / "imu.csv", index=False)
+    for vel_d in (True, False) if unit == "mm" else (True,):
+        (gnss if vel_d else gnss.drop(columns="vel_d")).rename(columns={"height_m": "alt"}).to_csv(
+            tmp_path / "gnss.csv", index=False
+        )
+        (got,) = AutoReader(frd, {"time": {"offset_s": 0.0}}).read(tmp_path)
+        assert abs(got.gnss.height_m.mean() - 100) < 5
+        assert any(note.startswith(f"found reader.gnss.position.height_unit={unit}  (") for note in got.notes)
 
 
 def test_accelerations_without_gravity_are_refused(tmp_path, drive):

@@ -10,6 +10,7 @@ import pytest
 
 from dlkf.base.errors import InputError
 from dlkf.data.plausibility import check_imu_units
+from dlkf.data.readers.units import LENGTH
 from dlkf.data.schema import drive_file, write_drive, write_drives_table
 from dlkf.data.store import load_dataset
 from dlkf.data.validate import LIMITS, Limits, find_gaps, read_drive, validate_dataset
@@ -159,6 +160,28 @@ def test_bad_numbers(tmp_path, tables, case):
     import re
 
     assert re.search(expected, text), text
+
+
+def hilly(gnss: pd.DataFrame, unit_m: float, noise_m: float) -> pd.DataFrame:
+    """Fixes over hills of 10 m, their heights in a unit of ``unit_m``."""
+    rise = 2 * np.pi / 50.0
+    noise = noise_m * np.random.default_rng(1).standard_normal(len(gnss))
+    height = (100.0 + 10.0 * np.sin(rise * gnss["t"]) + noise) / unit_m
+    return gnss.assign(height_m=height, vel_d=-10.0 * rise * np.cos(rise * gnss["t"]))
+
+
+@pytest.mark.parametrize("noise_m", [0.02, 1.0])
+@pytest.mark.parametrize("unit", ["m", "mm", "cm", "km", "ft", "4 m"])
+def test_heights_in_another_unit_are_refused(tmp_path, tables, unit, noise_m):
+    """Also through the height noise of a single-frequency receiver, which raises no alarm in metres; a ratio of no unit
+    is refused as such."""
+    gnss = hilly(tables["gnss"], {**LENGTH, "4 m": 4.0}[unit], noise_m)
+    _write(tmp_path, {**tables, "gnss": gnss})
+    if unit == "m":
+        validate_dataset(tmp_path, reference=False)
+        return
+    said = _complaint(tmp_path, reference=False)
+    assert f"height_unit={unit}, or multiply" in said or (unit == "4 m" and "one of them is in another unit" in said)
 
 
 @pytest.mark.parametrize("kind", ["imu", "gnss", "reference"])

@@ -14,7 +14,9 @@ from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import ImuSums, Lag, describe_offset, find_lag
 from dlkf.data.discovery.drift import ROUGH_S, compare_ends, find_drifting_pose
 from dlkf.data.discovery.motion import Motion, find_motion, stretches
+from dlkf.data.discovery.units import compare_climbs, nearest_unit
 from dlkf.data.limits import DEGREE_M, NOWHERE_DEG
+from dlkf.data.readers.units import LENGTH
 from dlkf.data.schema import ACCEL, GYRO, stack_columns
 from dlkf.data.tables import Columns
 from dlkf.navigation.earth import SEMI_MAJOR
@@ -38,9 +40,10 @@ SHORTEST_S = 60.0  # of a drive whose drift is observable
 TURNED_DEG = (30.0, 150.0)  # backwards is found by the filters' own search
 MOVING, TURNED, SPEED_CHANGE = 3.0, 1.0, 3.0  # m/s; rad and m/s over a drive that an axis at work must show
 YAW_AGREES, FORCE_DISAGREES, FORCE_AGREES = 0.85, 0.6, 0.85  # correlations with GNSS
-CHUNK_S = 10.0  # way, height and course are compared over such stretches: metres of GNSS noise do not matter
-LEAST_CLIMB_M, ALIKE = 1.0, 0.9  # RMS of the climb; correlation
-FEET = (2.5, 4.2)  # of the climb by heights to that by velocities
+CHUNK_S = 10.0  # way and course are compared over such stretches: metres of GNSS noise do not matter
+ALIKE = 0.9  # correlation of heights with the integral of vel_d
+OTHER_UNIT, CERTAIN = 2.0, 5.0  # of the climb by heights to that by velocities, or its inverse; σ
+UNIT_WORDS = {"ft": "feet"}
 
 
 def check_imu_units(imu: Columns, where: str) -> None:
@@ -192,29 +195,22 @@ def _check_way(gnss: Columns, where: str) -> None:
 
 
 def _check_climb(gnss: Columns, where: str) -> None:
-    """Heights against the integral of the downward velocity over stretches of ten seconds."""
-    t, height, down = gnss["t"], gnss["height_m"], gnss["vel_d"]
-    known = np.isfinite(height) & np.isfinite(down)
-    t, height, down = t[known], height[known], down[known]
-    if len(t) < 20:
+    """Heights against the integral of the downward velocity."""
+    climb = compare_climbs(gnss["t"], gnss["height_m"], gnss["vel_d"])
+    if climb is None:
         return
-    step = np.diff(t)
-    fallen = np.concatenate(([0.0], np.cumsum(step * (down[1:] + down[:-1]) / 2)))
-    first, last = stretches(t, CHUNK_S, step > 2.0)
-    climbed, rose = height[last] - height[first], fallen[first] - fallen[last]
-    if len(rose) < 10 or np.sqrt(np.mean(rose**2)) < LEAST_CLIMB_M:
-        return
-    slope = float(climbed @ rose / (rose @ rose))
-    alike = abs(float(climbed @ rose)) / max(float(np.linalg.norm(climbed) * np.linalg.norm(rose)), 1e-12)
-    if alike < ALIKE:
-        return
-    if slope < -0.5:
+    if climb.slope < -0.5 and climb.alike > ALIKE:
         raise InputError(f"{where}: vel_d grows where the height does: it counts upwards; negate vel_d")
-    if FEET[0] < slope < FEET[1]:
-        raise InputError(
-            f"{where}: heights change {slope:.2f} times as much as the vertical velocity says: look like feet; "
-            "reader.gnss.position.height_unit=ft, or multiply height_m by 0.3048"
-        )
+    if not climb.differs(OTHER_UNIT, CERTAIN):
+        return
+    unit = nearest_unit(1 / climb.slope, climb.std / climb.slope**2, LENGTH)
+    remedy = (
+        f"look like {UNIT_WORDS.get(unit, unit)}; reader.gnss.position.height_unit={unit}, or multiply height_m by "
+        f"{LENGTH[unit]:g}"
+        if unit is not None
+        else "one of them is in another unit; reader.gnss.position.height_unit, or correct vel_d"
+    )
+    raise InputError(f"{where}: heights change {climb.slope:.3g} times as much as the vertical velocity says: {remedy}")
 
 
 def check_turns(imu: Columns, gnss: Columns, where: str) -> None:

@@ -240,7 +240,8 @@ def _preset_text(base: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def leave_open(specs: Mapping[str, Any], stated: bool = False) -> dict[str, dict[str, Any]]:
-    """Specs with everything that can be estimated left open, but an accelerometer's unit that a header ``stated``."""
+    """Specs with everything that can be estimated left open, but an accelerometer's unit and that of
+    the heights where a header ``stated`` them."""
     out = {kind: copy.deepcopy(dict(spec)) for kind, spec in specs.items()}
     for kind, spec in out.items():
         if kind == "imu":
@@ -252,7 +253,8 @@ def leave_open(specs: Mapping[str, Any], stated: bool = False) -> dict[str, dict
         if kind == "gnss":
             spec["time"]["drift_ppm"] = "auto"
             spec["velocity"] = {**(spec.get("velocity") or {}), "unit": "auto"}
-            spec["position"] = {**spec["position"], "zero": "none", "delay_s": "auto"}
+            left = {"height_unit": "auto"} if stated else {}  # a preset's format defines it
+            spec["position"] = {**left, **spec["position"], "zero": "none", "delay_s": "auto"}
     return out
 
 

@@ -25,7 +25,6 @@ PRESSURES = {"pa": (6e4, 1.1e5), "hpa": (600.0, 1100.0), "kpa": (60.0, 110.0)}
 SPEED_UNITS = ("km/h", "mph", "m/s", "knots", "rpm")
 MOST_COLUMNS = 500  # no log of a car has more; each is looked at in many ways
 NEAR_GRAVITY = 0.08
-HIGHEST_M = 9000.0  # of a road
 COUNTERPARTS = {"accel": "a gyroscope", "gyro": "an accelerometer"}  # what a table with one sensor alone lacks
 COARSE = 0.2  # of the samples, with the stamp of the one before: the clock is coarser than the rate
 
@@ -115,8 +114,6 @@ def gnss_spec(table: LogTable) -> Recognised | None:
     position: Spec = {"columns": [lat, lon, height], "unit": _angle_unit(frame, found)}
     if (unit := vocabulary.find_unit(height)) in units.LENGTH:
         position["height_unit"] = unit
-    elif float(frame[height].abs().median()) > HIGHEST_M:
-        position["height_unit"] = "mm"  # as u-blox has it
     if found["geoid"] is not None:
         position["geoid"] = found["geoid"]
     if (sides := _hemispheres(table.frame[known])) is not None:

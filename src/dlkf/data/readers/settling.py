@@ -13,7 +13,7 @@ import pandas as pd
 
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.findings import Finding, Sure, discover, find_accel_unit, find_value
-from dlkf.data.discovery.units import speed_factor
+from dlkf.data.discovery.units import compare_climbs, nearest_unit, speed_factor
 from dlkf.data.readers import units
 from dlkf.data.readers.contract import gnss_frame, imu_frame, positions
 from dlkf.data.readers.mapping import Mapped
@@ -25,7 +25,7 @@ from dlkf.data.validate import check_time, usable_fixes
 AUTO = "auto"
 AXES = {"imu.accel.axes", "imu.gyro.axes"}
 NEUTRAL: dict[str, Any] = {  # settings that may be auto, and what stands there until they are known
-    **dict.fromkeys(("imu.accel.unit", "imu.gyro.unit", "gnss.velocity.unit"), 1.0),
+    **dict.fromkeys(("imu.accel.unit", "imu.gyro.unit", "gnss.velocity.unit", "gnss.position.height_unit"), 1.0),
     **dict.fromkeys(AXES, "frd"),
     **dict.fromkeys(("imu.time.offset_s", "gnss.time.offset_s", "gnss.time.drift_ppm", "gnss.position.delay_s"), 0.0),
 }
@@ -37,6 +37,7 @@ USUAL = {
 }
 MOSTLY = 0.8  # of the fixes
 FEWEST_FIXES = 3  # below, no finding has a spread
+HIGHEST_M = 9000.0  # of a road
 LEAST_GRAVITY = 0.5  # of the mean force: the length of the mean; with gravity in it nearly 1
 
 
@@ -99,6 +100,8 @@ def settle(
     if "imu.accel.unit" in wanted:
         _refuse_without_gravity(imu, where)
     gnss = gnss_frame(replace(mapped["gnss"], spec=specs["gnss"]), t["gnss"])
+    if "gnss.position.height_unit" in wanted:
+        found.append(_height_unit(gnss))
     found += discover(
         _keep_rising(imu),
         _keep_rising(gnss[usable_fixes(gnss)]),
@@ -143,6 +146,19 @@ def _speed_unit(gnss: Mapped, t: np.ndarray) -> Finding:
         remedy = "latitude and longitude look swapped: exchange them in reader.gnss.position.columns"
         return replace(finding, value=None, remedy=remedy)
     return finding
+
+
+def _height_unit(gnss: pd.DataFrame) -> Finding:
+    """By the vertical velocity; without one metres, but mm as u-blox has them where no road is as high."""
+    setting, heights = "gnss.position.height_unit", gnss["height_m"].to_numpy()
+    climb = compare_climbs(*(gnss[name].to_numpy() for name in ("t", "height_m", "vel_d")))
+    unit = None if climb is None else nearest_unit(1 / climb.slope, climb.std / climb.slope**2, units.LENGTH)
+    if unit is not None and climb is not None:
+        return Finding(setting, unit, True, f"they change {climb.slope:.3g} ± {climb.std:.1g} times as vel_d says")
+    size = float(np.nanmedian(np.abs(heights)))
+    if size > HIGHEST_M:
+        return Finding(setting, "mm", True, f"{size:.0f} in the median, as u-blox has them; no vel_d tells")
+    return Finding(setting, "m", True, "no vel_d tells another unit")
 
 
 def _unit_by_way(t: np.ndarray, lat_deg: np.ndarray, lon_deg: np.ndarray, speed: np.ndarray) -> Finding:
