@@ -17,6 +17,7 @@ from dlkf.data.readers.logs import LogReader
 from dlkf.data.readers.offers import (
     NO_LOGS,
     Contents,
+    Known,
     Offer,
     find_format,
     leave_open,
@@ -77,7 +78,7 @@ class AutoReader:
             only = None
         if not source.is_dir():
             raise InputError(f"source={source}: no such file or folder; it holds one drive, or one subfolder per drive")
-        within = None if only is not None else _recognise_files(source)
+        within = None if only is not None else _recognise_files(source, self.known)
         if within is None or any(one.offers for one in within):
             named = source.absolute() if only is None or only.name == "metadata.yaml" else only
             return [(source, self.drive or named.name.partition(".")[0], only)]
@@ -99,7 +100,7 @@ class AutoReader:
             return self._drive(inside, name, only)
 
     def _drive(self, folder: Path, name: str, only: Path | None) -> DriveFrames:
-        within = [recognise_file(only)] if only is not None else _recognise_files(folder)
+        within = [recognise_file(only, self.known)] if only is not None else _recognise_files(folder, self.known)
         specs, detail = {}, []
         for kind in ("imu", "gnss"):
             chosen = self._choose_offer(within, kind, folder)
@@ -158,8 +159,14 @@ class AutoReader:
         """InputError where a file that is asked for gives no such kind, or nothing an IMU."""
         offers = [o for one in within for o in one.offers]
         if (file := self.known[kind].get("file")) is not None:
+            if there := [one for one in within if one.path.match(str(file))]:
+                columns = "accel.columns=[…] and .gyro.columns" if kind == "imu" else "position.columns"
+                raise InputError(
+                    f"{folder}: no {kind.upper()} found{_describe_files(there, offers)}; name its columns "
+                    f"(reader.{kind}.{columns}=[…])"
+                )
             have = ", ".join(o.name for o in offers if kind in o.specs) or "no file"
-            raise InputError(f"{folder}: reader.{kind}.file={file}: no such {kind.upper()} here; found in {have}")
+            raise InputError(f"{folder}: reader.{kind}.file={file}: no such file here; {kind.upper()} found in {have}")
         if kind == "imu":
             remedy = "give the folder that holds the IMU's file too, or name both" if only is not None else (
                 "name the reader and its columns (reader=csv reader.imu.file=… 'reader.imu.accel.columns=[…]' …)"
@@ -182,7 +189,7 @@ class AutoReader:
         return merge_settings(leave_open({kind: read_preset("reader", "csv")[kind]})[kind], known), []
 
 
-def _recognise_files(folder: Path) -> list[Contents]:
+def _recognise_files(folder: Path, known: Known) -> list[Contents]:
     """What the files of a folder hold; of one whose files are known by their names, that."""
     for name, files in LAYOUTS.items():
         if all((folder / file).is_file() for file in files) and _has_its_columns(folder / files[0], name):
@@ -191,7 +198,7 @@ def _recognise_files(folder: Path) -> list[Contents]:
             if (beside := BAROMETERS.get(name)) and (folder / beside).is_file():  # by the clock of the IMU
                 specs["baro"] = {**base["baro"], "file": beside}
             return [Contents(folder / files[0], [Offer(folder / files[0], f"layout of {name}", specs)])]
-    return [recognise_file(p) for p in sorted(folder.iterdir()) if p.is_file() and not p.name.startswith(".")]
+    return [recognise_file(p, known) for p in sorted(folder.iterdir()) if p.is_file() and not p.name.startswith(".")]
 
 
 def _has_its_columns(path: Path, layout: str) -> bool:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +27,7 @@ PRESSURES = {"pa": (6e4, 1.1e5), "hpa": (600.0, 1100.0), "kpa": (60.0, 110.0)}
 SPEED_UNITS = ("km/h", "mph", "m/s", "knots", "rpm")
 MOST_COLUMNS = 500  # no log of a car has more; each is looked at in many ways
 NEAR_GRAVITY = 0.08
+NONE_NAMED: Mapping[str, list[str]] = MappingProxyType({})
 COUNTERPARTS = {"accel": "a gyroscope", "gyro": "an accelerometer"}  # what a table with one sensor alone lacks
 COARSE = 0.2  # of the samples, with the stamp of the one before: the clock is coarser than the rate
 
@@ -36,10 +39,18 @@ class Recognised(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def imu_spec(table: LogTable) -> Recognised | None:
-    """The mapping of a table that holds an IMU; None if it does not."""
+def named_columns(table: LogTable, known: Mapping[str, Any]) -> dict[str, list[str]]:
+    """The columns that a user's settings name for each entry of a mapping, of those entries that a table has whole."""
+    entries = {key: spec["columns"] for key, spec in known.items() if isinstance(spec, Mapping) and spec.get("columns")}
+    _, names = _select_numeric(table)
+    return {key: [str(c) for c in columns] for key, columns in entries.items() if {*map(str, columns)} <= {*names}}
+
+
+def imu_spec(table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED) -> Recognised | None:
+    """The mapping of a table that holds an IMU, in the columns that are ``named`` by entry (:func:`named_columns`) or
+    known by their names or numbers; None if it does not."""
     frame, names = _select_numeric(table)
-    triads = vocabulary.find_triads(names)
+    triads = vocabulary.find_triads(names) | {key: named[key] for key in vocabulary.SENSORS if key in named}
     if len(triads) == 2:
         known = frame[triads["accel"] + triads["gyro"]].notna().all(axis=1)
         time = stamps.time_spec(table, known, SLOWEST_IMU_S, FASTEST_IMU_S)
@@ -89,10 +100,11 @@ def sensor_spec(table: LogTable, called: str) -> dict[str, Spec]:
     return {}
 
 
-def gnss_spec(table: LogTable) -> Recognised | None:
-    """The mapping of a table that holds fixes; None if it does not."""
+def gnss_spec(table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED) -> Recognised | None:
+    """The mapping of a table that holds fixes, in the columns ``named`` as an IMU's; None if it does not."""
     frame, names = _select_numeric(table)
     found = {key: vocabulary.find_column(names, key) for key in vocabulary.QUANTITIES}
+    found |= dict(zip(("lat", "lon", "height"), named.get("position", ())))
     lat, lon, height = (found[key] for key in ("lat", "lon", "height"))
     if (lat is None or lon is None) and vocabulary.find_triads(names):
         return None
@@ -119,7 +131,9 @@ def gnss_spec(table: LogTable) -> Recognised | None:
     if (sides := _hemispheres(table.frame[known])) is not None:
         position["hemispheres"] = sides
     velocity, more = _velocity(found), []
-    if velocity is None:
+    if "velocity" in named:
+        velocity = {"columns": named["velocity"], "frame": "ned"}
+    elif velocity is None:
         velocity = _velocity_by_numbers(table, frame[known], time, position)
         if columns := velocity["columns"]:
             more = [f"took {', '.join(columns)} for the velocities by the way between the positions"]
