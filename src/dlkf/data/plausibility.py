@@ -12,7 +12,7 @@ import numpy as np
 from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import ImuSums, Lag, describe_offset, find_lag
-from dlkf.data.discovery.drift import ROUGH_S, compare_ends, find_drifting_pose
+from dlkf.data.discovery.drift import ROUGH_S, compare_ends, find_drifting_pose, find_step
 from dlkf.data.discovery.motion import Motion, find_motion, stretches
 from dlkf.data.discovery.units import compare_climbs, nearest_unit
 from dlkf.data.limits import DEGREE_M, NOWHERE_DEG
@@ -35,6 +35,7 @@ FEW = 2  # single fixes at 0°/0° or a continent away are refused by themselves
 FARTHEST_KM = 2000.0
 SEARCH_S = 600.0  # clocks of logs that have time in common are hardly further apart
 APART_S = 1.0  # less is a delay, which the filters bear; dlkf.ingest measures it on request
+WORST_PPM = 1e5  # of clocks that both count seconds
 DRIFTED_S = 0.1  # from a drive's first to its last second: worth a line
 SHORTEST_S = 60.0  # of a drive whose drift is observable
 TURNED_DEG = (30.0, 150.0)  # backwards is found by the filters' own search
@@ -318,14 +319,21 @@ def _check_handedness(
 def _check_drift(imu: ImuSums, gnss: Motion, where: str) -> None:
     """The first and the last third of a drive have the same lag."""
     ends = compare_ends(imu, gnss)
-    if ends is None or abs(ends.last_s - ends.first_s) <= APART_S:
+    if ends is None:
+        return
+    if (at := find_step(imu, gnss, ends)) is not None:
+        raise InputError(
+            f"{where}: the clock of IMU or GNSS steps between t = {at[0]:.0f} and {at[1]:.0f} s: the offset is "
+            f"{ends.first_s:+.2f} s before and {ends.last_s:+.2f} s after it; make two drives there"
+        )
+    if abs(ends.last_s - ends.first_s) <= APART_S:
         return
     ppm = 1e6 * ends.drift
     raise InputError(
         f"{where}: the clocks of IMU and GNSS drift apart, by about {ppm:.0f} ppm: {ends.first_s:+.1f} s at the "
         f"beginning, {ends.last_s:+.1f} s at the end; reader.gnss.time.drift_ppm={ppm:.0f} and "
         f"offset_s={ends.first_s:.1f}, then drift_ppm=auto on what is left"
-        if abs(ppm) < 1e5
+        if abs(ppm) < WORST_PPM
         else f"{where}: the clocks of IMU and GNSS have different seconds; correct reader.imu.time.unit"
     )
 
