@@ -28,6 +28,7 @@ MOST_REFUSED = (0.01, 0.2)  # of the samples, of the fixes; more are no accident
 MOST_SWITCH_M = 10_000.0  # m: fixes that go on so far off make two drives of one
 MOST_HOURS = 14  # between time zones
 NEAR_WRAP_S = 60.0
+COUNTERS_S = (2**16 / 1e3, 2**32 / 1e6, 2**32 / 1e3)  # of ms in 16 bits; of us, of ms in 32
 SET_BACK_S, MOST_SET_BACK = 5.0, 10  # stamps that go back by more, but not often, are of a clock that was set back
 
 
@@ -175,12 +176,27 @@ def check_time(t: np.ndarray, where: str, kind: str = "imu") -> None:
 def _explain_return(t: np.ndarray, k: int, kind: str) -> str:
     """What stamps that go back after row ``k`` may be: of the next day, of a clock that was set back, out of order."""
     back = t[k] - t[k + 1]
+    if (wraps_s := _find_wrap(t)) is not None:
+        return f"they start again every {wraps_s:.6g} s: reader.{kind}.time.wraps_s={wraps_s:.10g}"
     for wraps_s, name in ((DAY_S, "at midnight"), (WEEK_S, "at the end of a week")):
         if abs(back - wraps_s) < NEAR_WRAP_S:
             return f"they start again {name}: add {wraps_s} s from there on (reader.{kind}.time.wraps_s={wraps_s})"
     if back > SET_BACK_S and int((np.diff(t) < 0).sum()) <= MOST_SET_BACK:
         return "the clock was set back there: make two drives of it; sorting would mix them"
     return "sort the rows"
+
+
+def _find_wrap(t: np.ndarray) -> float | None:
+    """The seconds after which a counter starts again: several jumps back of one size, or one of a counter's; None where
+    they are not."""
+    step = np.diff(t)
+    usual = float(np.median(step))
+    wraps = usual - step[step < 0]
+    near = [size for size in COUNTERS_S if (np.abs(wraps - size) <= 2 * usual).all()]
+    if near:
+        return near[0]
+    several = len(wraps) > 1 and float(np.median(wraps)) > SET_BACK_S and np.ptp(wraps) <= 2 * usual
+    return float(np.median(wraps)) if several else None
 
 
 def _check_rate(t: np.ndarray, where: str, kind: str) -> None:
