@@ -141,6 +141,7 @@ BAD = {
     "leap seconds": (_set("gnss", "t", lambda t: t - 18), r"clocks of IMU and GNSS are 18.0 s apart.*offset_s=auto"),
     "turned right": (_rows("imu", _quarter), r"turned by \+90° .*reader.imu.accel.axes"),
     "another clock": (_set("gnss", "t", lambda t: t + 1e5), "same clock"),
+    "an IMU of a moment": (_rows("imu", lambda f: f[:50]), r"share 0.5 s with the IMU, from 0.010 to 0.500; give logs"),
     "negative std": (_set("gnss", "std_pos_n", _at(2, -1.0)), "row 2: std_pos_n is -1.0"),
     "attitude in degrees": (_columns("reference", _scale(["yaw"], 180 / np.pi)), "yaw reaches .* degrees"),
     "yaw from East": (_set("reference", "yaw", lambda y: np.pi / 2 - y), "yaw counts from East"),

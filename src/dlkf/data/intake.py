@@ -21,7 +21,7 @@ from dlkf.data.readers.frames import DriveFrames, Place
 from dlkf.data.readers.settling import Unsure
 from dlkf.data.readers.sharing import agrees, layout, list_settings, pool_settings
 from dlkf.data.schema import new_dataset, write_drive, write_drives_table
-from dlkf.data.summary import drive_line
+from dlkf.data.summary import describe_cover, drive_line
 from dlkf.data.tables import DriveRow, read_drives
 from dlkf.data.validate import LIMITS, Limits, find_gaps, read_drive, read_fixes, read_imu
 
@@ -51,7 +51,7 @@ class IngestOptions:
             rows.append(write_drive(folder, part.meta, part.imu, part.gnss, part.reference, part.aids))
             if part.gnss is not None:
                 tables = read_drive(folder, DriveRow(part.name, part.name, (0.0, 0.0, 0.0)), limits=self.limits)
-                for check in (describe_drift, describe_rotation):
+                for check in (describe_cover, describe_drift, describe_rotation):
                     if line := check(tables.imu, read_fixes(tables.gnss)):
                         detail.append(f"{part.name}: {line}")
             else:

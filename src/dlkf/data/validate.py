@@ -27,6 +27,7 @@ MOST_SAME = 0.2  # of the rows, with the stamp of the row before: more are a rou
 MOST_REFUSED = (0.01, 0.2)  # of the samples, of the fixes; more are no accident
 MOST_SWITCH_M = 10_000.0  # m: fixes that go on so far off make two drives of one
 MOST_HOURS = 14  # between time zones
+LEAST_SPAN_S, LEAST_SHARED = 10.0, (1.0, 0.02)  # of fixes; by them and the IMU: seconds, share of the shorter
 NEAR_WRAP_S = 60.0
 COUNTERS_S = (2**16 / 1e3, 2**32 / 1e6, 2**32 / 1e3)  # of ms in 16 bits; of us, of ms in 32
 SET_BACK_S, MOST_SET_BACK = 5.0, 10  # stamps that go back by more, but not often, are of a clock that was set back
@@ -272,6 +273,12 @@ def _check_gnss(gnss: Columns, imu: Columns, where: str) -> Columns:
         raise InputError(
             f"{where}: {span} lie{'' if len(t) > 1 else 's'} outside the IMU's {first:.3f} to {last:.3f}; "
             + _explain_outside(t, first, last)
+        )
+    span, shared = t[-1] - t[0], min(t[-1], last) - max(t[0], first)
+    if span > LEAST_SPAN_S and shared < max(LEAST_SHARED[0], LEAST_SHARED[1] * min(span, last - first)):
+        raise InputError(
+            f"{where}: fixes from t = {t[0]:.3f} to {t[-1]:.3f} share {max(shared, 0.0):.1f} s with the IMU, from "
+            f"{first:.3f} to {last:.3f}; give logs of the same drive, on one clock"
         )
     fixes = {name: values[fix] for name, values in gnss.items()}
     check_gnss_units(fixes, where)
