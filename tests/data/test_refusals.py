@@ -306,6 +306,35 @@ def test_an_unsure_drive_does_not_lose_the_others(tmp_path):
     assert any(note.startswith("left out: drive other: not sure of") for note in notes)
 
 
+def test_a_stray_folder_and_a_faulty_drive_do_not_stop_the_others(tmp_path, drive):
+    """Refused with the option that leaves them out; with it each has a line, and no table of theirs is written."""
+    logs = tmp_path / "logs"
+    for name in ("a-bad", "b-good"):
+        _hidden(logs / name, drive)
+    fixes = pd.read_csv(logs / "a-bad" / "receiver.csv")
+    fixes.loc[5, "Latitude"] += 100
+    fixes.to_csv(logs / "a-bad" / "receiver.csv", index=False)
+    (logs / "c-notes").mkdir()
+    (logs / "c-notes" / "read.me").write_text("Tuesday: rain\n")
+    with pytest.raises(InputError, match=r"lat_deg is 148.*; or skip_unsure=true leaves such drives out"):
+        ingest(AutoReader(), logs, tmp_path / "out", IngestOptions(), parallel=None)
+    notes = []
+    options = {"parallel": None, "skip_unsure": True, "progress": lambda one, _: notes.extend(one.notes)}
+    assert ingest(AutoReader(), logs, tmp_path / "out", IngestOptions(), **options) == 1
+    left = [note for note in notes if note.startswith("left out: ")]
+    assert len(left) == 2 and "lat_deg is 148" in left[0] and "c-notes: no IMU found in read.me" in left[1]
+    assert not list((tmp_path / "out").rglob("*a-bad*")) and list((tmp_path / "out").rglob("*b-good*"))
+
+
+def test_subfolders_beside_logs_are_named(tmp_path, drive):
+    _hidden(tmp_path / "logs", drive)
+    _hidden(tmp_path / "logs" / "monday", drive)
+    (tmp_path / "logs" / "pictures").mkdir()
+    (got,) = AutoReader().read(tmp_path / "logs")
+    (said,) = (note for note in got.notes if note.startswith("subfolders that are not read"))
+    assert "monday" in said and "pictures" not in said and got.name == "logs"
+
+
 def test_drives_that_disagree_are_named(tmp_path, drive):
     """A sensor that was mounted anew: each drive has its own pose, and the difference is said."""
     logs = tmp_path / "logs"

@@ -18,6 +18,7 @@ NaN stands for unknown values. Any other column is carried along.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -186,6 +187,12 @@ def check_name(drive: str) -> str:
 def _rate(t: pd.Series) -> float:
     step = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     return 1 / step if step else float("nan")
+
+
+def remove_drive(folder: str | Path, name: str) -> None:
+    """Delete the tables of a drive that :func:`write_drive` wrote."""
+    for kind in resolve_place(folder).iterdir():
+        shutil.rmtree(kind / f"drive={name}", ignore_errors=True)
 
 
 def way_with_imu(frame: pd.DataFrame, imu: pd.DataFrame) -> pd.DataFrame:

@@ -266,11 +266,25 @@ def _join_parts(whole: Mapped, parts: Mapping[str, Mapped]) -> Mapped:
 
 
 def _list_unread_files(folder: Path, mapped: Mapping[str, Mapped]) -> list[str]:
-    """A line on files beside those that were read, of the same suffixes."""
-    read = {p.table.path.name for whole in mapped.values() for p in (whole, *whole.parts.values())}
-    suffixes = {Path(name).suffix.lower() for name in read} - {""}
-    left = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in suffixes and p.name not in read)
-    return [f"files that are not read: {list_some(left, MOST_NAMED)}"] if left else []
+    """Lines on files beside those that were read, of the same suffixes, and on subfolders that have such."""
+    read = {p.table.path for whole in mapped.values() for p in (whole, *whole.parts.values())}
+    suffixes = {path.suffix.lower() for path in read} - {""}
+
+    def lists_logs(inside: Path) -> bool:
+        return inside not in {up for path in read for up in path.parents} and any(
+            p.suffix.lower() in suffixes for p in inside.iterdir()
+        )
+
+    names = {path.name for path in read}
+    left = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in suffixes and p.name not in names)
+    below = sorted(p.name for p in folder.iterdir() if p.is_dir() and p.name[0] not in "._" and lists_logs(p))
+    said = [f"files that are not read: {list_some(left, MOST_NAMED)}"] if left else []
+    if below:
+        said.append(
+            f"subfolders that are not read: {list_some(below, MOST_NAMED)}, since files beside them make a drive; "
+            "give each as source, or move these files into a subfolder too"
+        )
+    return said
 
 
 def _list_unread_velocities(gnss: Mapped | None) -> list[str]:
