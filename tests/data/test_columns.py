@@ -144,6 +144,12 @@ def test_two_readings_of_a_quality_are_both_said():
     assert spec == {"column": "fixtype"}
     assert "4 is RTK fixed, taken as NMEA's GGA code; as u-blox's fix type" in note
     assert "reader.gnss.quality.map='{4: 1}'" in note
+    spec, notes = quality_spec(pd.DataFrame({"quality": [4, 4]}), "quality", 20.0)
+    assert "accuracies of 20 m in the median are none of RTK; if they are mm: reader.gnss.std_position.unit=mm" in notes
+    for empty in ([np.nan] * 3, ["", " ", ""]):
+        assert quality_spec(pd.DataFrame({"fix": empty}), "fix", np.nan)[1] == [
+            "quality fix is empty: all count as single"
+        ]
     spec, (note,) = quality_spec(pd.DataFrame({"fix": ["rather good"]}), "fix", np.nan)
     assert spec is None and "rather good" in note
 

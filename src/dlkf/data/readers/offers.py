@@ -171,7 +171,7 @@ def _offer_table(
     if len(found) == 2:
         source["rows"] = "filled"
     specs = {kind: {**source, **one.spec} for kind, one in found.items()}
-    columns = ", ".join(str(c) for spec in (specs or aids).values() for c in _columns(spec))
+    columns = ", ".join(dict.fromkeys(str(c) for spec in (specs or aids).values() for c in _columns(spec)))
     notes = tuple(note for one in found.values() for note in one.notes)
     specs = leave_open(specs | aids, stated=True)
     return [Offer(path, f"{name} with {columns}", specs, notes, part)] if specs else []
