@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 from dlkf.base.errors import InputError
 from dlkf.data.intake import IngestOptions, ingest_drives
+from dlkf.data.readers.auto import AutoReader
 from dlkf.data.readers.logs import LogReader
 from dlkf.data.readers.units import rotation, seconds
 from dlkf.data.tables import read_drives, read_table
@@ -205,7 +206,7 @@ def test_mistakes_in_the_files(tmp_path, tables):
         (41, "0.4,0,0,oops,0,0,-9.8", "line 42: column 'gyro_z' is 'oops', not a number"),
         (41, "0.4,0,0,,0,0,-9.8", "line 42: column 'gyro_z' has no value"),
         (41, "0.4,0,0,0,0,0,-9.8,7,7", "line 42 has 9 cells, those before have 7; correct the line"),
-        (41, "0.39,0,0,0,0,0,-9.8", "row 40: t = 0.390000 appears twice|row 40: t"),
+        (41, "0.39,0,0,0,0,0,-9.8", r"line 42 \(t 0.39\): t goes back"),
     ):
         path.write_text("\n".join([*lines[:line], cells, *lines[line + 1 :]]))
         with pytest.raises(InputError, match=message):
@@ -305,3 +306,16 @@ def test_gps_time_is_that_of_the_fixes_whatever_the_imu_counts(tmp_path, tables,
     gps = drive.meta["gps_zero_s"] + drive.meta["gps_rate"] * drive.gnss.t
     np.testing.assert_allclose(gps, GPS_WEEK * 604_800 + TOW - 37.5 + own, atol=2e-6)
     assert drive.meta["time_zero_s"] == 0
+
+
+@pytest.mark.parametrize("auto", [False, True], ids=["csv", "auto"])
+def test_a_fault_of_the_stamps_names_the_line_and_the_stamp_of_the_file(tmp_path, auto):
+    """As an editor shows them: lines count from 1, the header among them, and t counts from the first second."""
+    tables = {kind: car(20)[kind] for kind in ("imu", "gnss")}
+    tables["imu"] = pd.concat([tables["imu"][:1001], tables["imu"][1000:]])
+    for kind, table in tables.items():
+        table.assign(t=table.t + 4000).to_csv(tmp_path / f"{kind}.csv", index=False, float_format="%.6f")
+    with pytest.raises(InputError) as refused:
+        list((AutoReader() if auto else LogReader(**PLAIN)).read(tmp_path))
+    line = (tmp_path / "imu.csv").read_text().splitlines()[1002]
+    assert line.startswith("4010.010000") and "imu.csv: line 1003 (t 4010.01): t = 10.01" in str(refused.value)

@@ -230,6 +230,17 @@ def test_what_each_file_holds_is_said(tmp_path, drive):
         assert part in said, part
 
 
+@pytest.mark.parametrize(("dead", "named"), [("gyro_z", "gyro_y is -0.1"), ("accel_x", "accel_x is 0.1")])
+def test_a_dead_axis_is_named_in_any_pose(dead, named, tmp_path, streets):
+    """Of a sensor on its side, whose y points up: it is no doubt of a unit."""
+    imu = streets["imu"].assign(**{dead: 0.1})
+    for sensor in ("gyro", "accel"):
+        imu[[f"{sensor}_y", f"{sensor}_z"]] = np.column_stack((-imu[f"{sensor}_z"], imu[f"{sensor}_y"]))
+    imu.to_csv(tmp_path / "imu.csv", index=False)
+    streets["gnss"].to_csv(tmp_path / "gnss.csv", index=False)
+    assert f"imu.csv: {named} in every row though the car turns" in refusal(tmp_path)
+
+
 @pytest.mark.parametrize(("kept", "lacks"), [(ACCEL, "a gyroscope"), (GYRO, "an accelerometer")])
 def test_the_sensor_that_an_imu_lacks_is_named(kept, lacks, tmp_path, drive):
     """In a table of its own, and beside fixes; where a file is given, the line begins with that file."""

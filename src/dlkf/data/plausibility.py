@@ -255,7 +255,7 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
     Then the force forward and right also shows whether the sensor looks along the car.
     """
     t, accel, gyro, moved = _signals(imu, gnss)
-    _check_dead_axes(imu, moved, where)
+    check_dead_axes(imu, moved, where)
     sums = ImuSums.of(t, accel, gyro)
     _check_drift(sums, moved, where)
     best = find_lag(sums, moved, SEARCH_S)
@@ -281,15 +281,17 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
         )
 
 
-def _check_dead_axes(imu: Columns, moved: Motion, where: str) -> None:
-    """An axis that never changes although the car turns, brakes and accelerates."""
+def check_dead_axes(imu: Columns, moved: Motion, where: str) -> None:
+    """An axis that never changes although the car turns, brakes and accelerates; gravity lies on that which is down."""
     fast = moved.speed > MOVING
     if fast.sum() < 3:
         return
     both = fast[1:] & fast[:-1]
     turns = np.abs(wrap_angle(np.diff(moved.course)))[both].sum() > TURNED
     brakes = np.ptp(moved.speed[fast]) > SPEED_CHANGE
-    for name, shown, what in (("gyro_z", turns, "turns"), ("accel_x", brakes, "brakes"), ("accel_y", turns, "turns")):
+    down = int(np.argmax([abs(float(np.median(imu[c]))) for c in ACCEL]))
+    level = [(name, turns and brakes, "turns and brakes") for k, name in enumerate(ACCEL) if k != down]
+    for name, shown, what in ((GYRO[down], turns, "turns"), *level):
         if shown and np.ptp(imu[name]) == 0:
             raise InputError(
                 f"{where}: {name} is {imu[name][0]:g} in every row though the car {what}: a dead axis, or no data of it"

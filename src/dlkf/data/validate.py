@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -152,8 +152,8 @@ def _describe_rounding(t: np.ndarray) -> str:
     return "t is rounded; give more decimals"
 
 
-def check_time(t: np.ndarray, where: str, kind: str = "imu") -> None:
-    """InputError for stamps that do not rise from row to row."""
+def check_time(t: np.ndarray, where: str, kind: str = "imu", name_row: Callable[[int], str] = "row {}".format) -> None:
+    """InputError for stamps that do not rise from row to row; ``name_row`` calls a row as a user finds it."""
     refuse_rows({"t": t}, ("t",), lambda x: ~np.isfinite(x), where, "remove the row or give its time in seconds")
     back = np.flatnonzero(np.diff(t) <= 0)
     if len(back):
@@ -168,9 +168,11 @@ def check_time(t: np.ndarray, where: str, kind: str = "imu") -> None:
         if t[k + 1] == t[k]:
             coarse = " (of an IMU with a coarse clock: reader.imu.time.respace=true)" if kind == "imu" else ""
             rows = {"imu": "samples", "gnss": "fixes"}.get(kind, "rows")
-            raise InputError(f"{where}: row {k + 1}: t = {t[k]:.6f} appears twice; remove duplicate {rows}{coarse}")
+            raise InputError(
+                f"{where}: {name_row(k + 1)}: t = {t[k]:.6f} appears twice; remove duplicate {rows}{coarse}"
+            )
         raise InputError(
-            f"{where}: row {k + 1}: t goes back from {t[k]:.6f} to {t[k + 1]:.6f}; {_explain_return(t, k, kind)}"
+            f"{where}: {name_row(k + 1)}: t goes back from {t[k]:.6f} to {t[k + 1]:.6f}; {_explain_return(t, k, kind)}"
         )
 
 

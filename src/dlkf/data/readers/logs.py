@@ -38,6 +38,7 @@ from dlkf.data.readers.mapping import (
 from dlkf.data.readers.settling import AUTO, Unsure, open_settings, placeholders, settle
 from dlkf.data.readers.sharing import layout
 from dlkf.data.readers.stamps import epoch_note, local_time_s
+from dlkf.data.validate import check_time
 
 TEXT = ("separator", "decimal", "header", "comment", "skip_rows", "encoding")
 NEAR_S = 0.05  # rows of two GNSS tables this close are of one fix
@@ -140,6 +141,8 @@ class LogReader:
             mapped = {kind: replace(part, spec=specs[kind]) for kind, part in mapped.items()}
             zero, t = self._times(mapped)
         frames = {kind: FRAMES[kind](part, t[kind]) for kind, part in mapped.items()}
+        for kind, part in mapped.items():
+            check_time(t[kind], f"drive {name}, {part.table.path.name}", kind, part.name_row)
         others = {kind: part for kind, part in every.items() if kind not in FRAMES}
         aids, specs, of_aids = read_aids(others, zero, mapped.get("gnss"), frames.get("gnss"), f"drive {name}")
         if self.wanted or of_aids:

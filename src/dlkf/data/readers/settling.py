@@ -13,7 +13,9 @@ import pandas as pd
 
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.findings import Finding, Sure, discover, find_accel_unit, find_value
+from dlkf.data.discovery.motion import find_motion
 from dlkf.data.discovery.units import compare_climbs, nearest_unit, speed_factor
+from dlkf.data.plausibility import check_dead_axes
 from dlkf.data.readers import units
 from dlkf.data.readers.contract import gnss_frame, imu_frame, positions
 from dlkf.data.readers.mapping import Mapped
@@ -90,7 +92,7 @@ def settle(
             f"motion of a car{why}; copy the log again, or leave the drive out"
         )
     for kind in ("imu", "gnss"):
-        check_time(t[kind], f"{where}, {mapped[kind].table.path.name}", kind)
+        check_time(t[kind], f"{where}, {mapped[kind].table.path.name}", kind, mapped[kind].name_row)
     found: list[Finding] = []
     if "gnss.velocity.unit" in wanted:
         found.append(_speed_unit(mapped["gnss"], t["gnss"]))
@@ -102,9 +104,11 @@ def settle(
     gnss = gnss_frame(replace(mapped["gnss"], spec=specs["gnss"]), t["gnss"])
     if "gnss.position.height_unit" in wanted:
         found.append(_height_unit(gnss))
+    samples, fixes = _keep_rising(imu), _keep_rising(gnss[usable_fixes(gnss)])
+    check_dead_axes(samples, find_motion(fixes), f"{where}, {mapped['imu'].table.path.name}")
     found += discover(
-        _keep_rising(imu),
-        _keep_rising(gnss[usable_fixes(gnss)]),
+        samples,
+        fixes,
         wanted | ({"imu.axes"} if AXES & wanted else set()),
         sure,
         increments=bool(mapped["imu"].spec.get("increments")),
