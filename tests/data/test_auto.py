@@ -249,7 +249,7 @@ def test_a_clock_that_was_set_back_is_named_before_anything_is_estimated(tmp_pat
     imu = pd.read_csv(box, sep=";")
     imu.loc[500:, "stamp"] -= 9000
     imu.to_csv(box, sep=";", index=False)
-    with pytest.raises(InputError, match=r"box.txt: row 500: .*the clock was set back there: make two drives of it"):
+    with pytest.raises(InputError, match=r"box.txt: line 502 .*the clock was set back there: make two drives of it"):
         list(AutoReader().read(tmp_path / "logs"))
 
 

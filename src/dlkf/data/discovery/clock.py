@@ -133,7 +133,7 @@ def compute_misfits(imu: ImuSums, gnss: Motion, lags: Callable[[Floats], Floats]
     inside = np.interp(cell, grid, there, left=0.0, right=0.0) > 0.99
     out = np.zeros(len(middle))
     for own, other in ((yaw, rate[known]), (force, pull[known])):
-        x, y = np.interp(cell, grid, own)[inside], other[inside]
+        x, y = np.asarray(np.interp(cell, grid, own))[inside], other[inside]
         gain = np.vdot(x, y) / max(float(np.vdot(x, x).real), 1e-12)
         out[inside] += np.abs(y - gain * x) ** 2 / max(float(np.mean(np.abs(y) ** 2)), 1e-12)
     return middle, out
