@@ -281,17 +281,23 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
         )
 
 
-def check_dead_axes(imu: Columns, moved: Motion, where: str) -> None:
-    """An axis that never changes although the car turns, brakes and accelerates; gravity lies on that which is down."""
+def check_dead_axes(imu: Columns, moved: Motion, where: str, frd: bool = True) -> None:
+    """An axis that never changes although the car turns, brakes and accelerates.
+
+    In the sensor's own axes (``frd=False``) the one that gravity lies on is down, and two are level.
+    """
     fast = moved.speed > MOVING
     if fast.sum() < 3:
         return
     both = fast[1:] & fast[:-1]
     turns = np.abs(wrap_angle(np.diff(moved.course)))[both].sum() > TURNED
     brakes = np.ptp(moved.speed[fast]) > SPEED_CHANGE
-    down = int(np.argmax([abs(float(np.median(imu[c]))) for c in ACCEL]))
-    level = [(name, turns and brakes, "turns and brakes") for k, name in enumerate(ACCEL) if k != down]
-    for name, shown, what in ((GYRO[down], turns, "turns"), *level):
+    needs = [("gyro_z", turns, "turns"), ("accel_x", brakes, "brakes"), ("accel_y", turns, "turns")]
+    if not frd:
+        down = int(np.argmax([abs(float(np.median(imu[c]))) for c in ACCEL]))
+        level = [name for k, name in enumerate(ACCEL) if k != down]
+        needs = [(GYRO[down], turns, "turns"), *((name, turns and brakes, "turns and brakes") for name in level)]
+    for name, shown, what in needs:
         if shown and np.ptp(imu[name]) == 0:
             raise InputError(
                 f"{where}: {name} is {imu[name][0]:g} in every row though the car {what}: a dead axis, or no data of it"

@@ -105,7 +105,7 @@ def settle(
     if "gnss.position.height_unit" in wanted:
         found.append(_height_unit(gnss))
     samples, fixes = _keep_rising(imu), _keep_rising(gnss[usable_fixes(gnss)])
-    check_dead_axes(samples, find_motion(fixes), f"{where}, {mapped['imu'].table.path.name}")
+    check_dead_axes(samples, find_motion(fixes), f"{where}, {mapped['imu'].table.path.name}", frd=False)
     found += discover(
         samples,
         fixes,
