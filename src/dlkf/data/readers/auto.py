@@ -14,6 +14,7 @@ from dlkf.data.readers.archives import drive_name, drive_places, is_archive, unp
 from dlkf.data.readers.formats import rosbag
 from dlkf.data.readers.frames import DriveFrames, Place
 from dlkf.data.readers.logs import LogReader
+from dlkf.data.readers.mapping import Mapped
 from dlkf.data.readers.offers import (
     NO_LOGS,
     Contents,
@@ -21,9 +22,11 @@ from dlkf.data.readers.offers import (
     Offer,
     find_format,
     leave_open,
+    matches,
     recognise_file,
     text_options,
 )
+from dlkf.data.readers.parts import join_parts
 from dlkf.data.readers.settling import Unsure
 
 LAYOUTS = {  # presets whose files are known by their names
@@ -109,7 +112,8 @@ class AutoReader:
                 specs[kind] = {"file": None}
                 continue
             specs[kind] = merge_settings(chosen.specs[kind], self.known[kind])
-            there = chosen.name if chosen.table else specs[kind].get("file") or chosen.name
+            file = specs[kind].get("file")
+            there = chosen.name if chosen.table else ", ".join(file) if isinstance(file, list) else file or chosen.name
             detail += [f"found the {kind} in {there}: {chosen.detail}", *chosen.notes]
             if kind == "gnss" and (more := _find_velocities(chosen, specs[kind], [] if only else folder.iterdir())):
                 specs[kind]["velocity"] |= more
@@ -144,9 +148,11 @@ class AutoReader:
         offers, known = [o for one in within for o in one.offers], self.known[kind]
         fits = [o for o in offers if kind in o.specs] or (_join_sensors(offers) if kind == "imu" else [])
         if (file := known.get("file")) is not None:
-            fits = [o for o in fits if o.path.match(str(file))]
+            fits = [o for o in fits if matches(o.path, file)]
         if (table := known.get("table")) is not None and any(o.table for o in fits):
             fits = [o for o in fits if o.table == str(table)]
+        if len(fits) > 1 and (whole := _join_offers(fits, kind)) is not None:
+            return whole
         if len(fits) > 1:
             key = "table" if len({o.path for o in fits}) == 1 else "file"
             names = ", ".join((o.table or o.name) if key == "table" else o.name for o in fits)
@@ -159,7 +165,7 @@ class AutoReader:
         """InputError where a file that is asked for gives no such kind, or nothing an IMU."""
         offers = [o for one in within for o in one.offers]
         if (file := self.known[kind].get("file")) is not None:
-            if there := [one for one in within if one.path.match(str(file))]:
+            if there := [one for one in within if matches(one.path, file)]:
                 columns = "accel.columns=[…] and .gyro.columns" if kind == "imu" else "position.columns"
                 raise InputError(
                     f"{folder}: no {kind.upper()} found{_describe_files(there, offers)}; name its columns "
@@ -214,6 +220,23 @@ def _describe_files(within: Iterable[Contents], offers: Iterable[Offer] = ()) ->
         return ""
     more = f" and {len(said) - MOST_HELD} other files" if len(said) > MOST_HELD else ""
     return f" in {'; '.join(said[:MOST_HELD])}{more}"
+
+
+def _join_offers(offers: list[Offer], kind: str) -> Offer | None:
+    """Files of the same columns whose stamps follow each other as one log; None where they are none."""
+    specs = [{key: value for key, value in o.specs[kind].items() if key != "file"} for o in offers]
+    first = offers[0]
+    if any(spec != specs[0] for spec in specs) or any(o.table is not None for o in offers):
+        return None
+    spec = first.specs[kind]
+    name, options = spec.get("format", "csv"), spec.get("text") or {}
+    parts = [
+        Mapped(formats.read(name, o.path, kind=kind, table=spec.get("table"), text=options, where="reader"), spec, kind)
+        for o in offers
+    ]
+    if join_parts(parts) is None:
+        return None
+    return replace(first, specs={**first.specs, kind: {**spec, "file": [o.path.name for o in offers]}})
 
 
 def _join_sensors(offers: list[Offer]) -> list[Offer]:

@@ -35,6 +35,7 @@ from dlkf.data.readers.mapping import (
     select_rows,
     spread_stamps,
 )
+from dlkf.data.readers.parts import join_parts
 from dlkf.data.readers.settling import AUTO, Unsure, open_settings, placeholders, settle
 from dlkf.data.readers.sharing import layout
 from dlkf.data.readers.stamps import epoch_note, local_time_s
@@ -190,28 +191,50 @@ class LogReader:
         return _join_parts(whole, parts) if parts else whole
 
     def _table(self, folder: Path, spec: Spec, kind: str, where: str, only: Path | None) -> Mapped:
-        path = _find_file(folder, spec, kind, where, only)
+        first, *others = _find_files(folder, spec, kind, where, only)
         text = {**self.text, **(spec.get("text") or {}), "lines": spec.get("lines")}
         if unknown := [key for key in text if key not in (*TEXT, "lines")]:
             raise InputError(f"{where}.text: unknown key {unknown[0]}; known are {', '.join(TEXT)}")
         name = None if spec.get("table") is None else str(spec["table"])
-        table = formats.read(spec.get("format") or "csv", path, kind=kind, table=name, text=text, where=where)
-        return Mapped(table, spec, kind)
+
+        def read(path: Path) -> Mapped:
+            table = formats.read(spec.get("format") or "csv", path, kind=kind, table=name, text=text, where=where)
+            return Mapped(table, spec, kind)
+
+        whole = read(first)
+        if not others:
+            return whole
+        try:
+            joined = join_parts([whole, *map(read, others)])
+        except InputError:
+            joined = None
+        if joined is not None:
+            return joined
+        if isinstance(spec.get("file"), str):
+            names = ", ".join(path.name for path in (first, *others))
+            raise InputError(
+                f"{folder}: {names} match {spec['file']}, and are no parts of one log: their columns differ or their "
+                f"times overlap; set {where}.file"
+            )
+        return whole
 
 
-def _find_file(folder: Path, spec: Spec, kind: str, where: str, only: Path | None) -> Path:
-    if only is not None and any(only.match(str(p)) for p in _patterns(spec.get("file"))):
-        return only
-    found = _match_files(folder, spec.get("file"))
-    if len(found) != 1:
+def _find_files(folder: Path, spec: Spec, kind: str, where: str, only: Path | None) -> list[Path]:
+    """The file of a kind; several that match a pattern, or are listed by their names, may be parts of one log."""
+    patterns = _patterns(spec.get("file"))
+    if only is not None and any(only.match(p) for p in patterns):
+        return [only]
+    listed = [found for p in patterns if (found := _match_files(folder, p))]
+    if len(listed) > 1 and len(listed) == len(patterns) and all(len(found) == 1 for found in listed):
+        return [path for (path,) in listed]
+    if not listed:
         seen = [] if only is not None else sorted(p.name for p in folder.iterdir() if not p.name.startswith("."))
         have = ", ".join(seen[:8]) or (only.name if only is not None else "nothing")
-        what = "no" if not found else f"{len(found)} files match, one must be"
         without = ", or reader.reference=null" if kind == "reference" else ""
         raise InputError(
-            f"{folder}: {what} {kind} file {_name_patterns(spec.get('file'))}; has {have}; set {where}.file{without}"
+            f"{folder}: no {kind} file {_name_patterns(spec.get('file'))}; has {have}; set {where}.file{without}"
         )
-    return found[0]
+    return listed[0]
 
 
 def _patterns(file: Any) -> list[str]:
@@ -270,7 +293,8 @@ def _join_parts(whole: Mapped, parts: Mapping[str, Mapped]) -> Mapped:
 
 def _list_unread_files(folder: Path, mapped: Mapping[str, Mapped]) -> list[str]:
     """Lines on files beside those that were read, of the same suffixes, and on subfolders that have such."""
-    read = {p.table.path for whole in mapped.values() for p in (whole, *whole.parts.values())}
+    tables = [p.table for whole in mapped.values() for p in (whole, *whole.parts.values())]
+    read = {path for table in tables for path in (table.path, *table.beside)}
     suffixes = {path.suffix.lower() for path in read} - {""}
 
     def lists_logs(inside: Path) -> bool:

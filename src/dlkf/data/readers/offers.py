@@ -65,7 +65,7 @@ class Contents:
 
 def recognise_file(path: Path, known: Known = MappingProxyType({})) -> Contents:
     """What a file holds; ``known`` are a user's settings by kind, whose ``format`` and columns count for their file."""
-    known = {kind: spec for kind, spec in known.items() if spec.get("file") is None or path.match(str(spec["file"]))}
+    known = {kind: spec for kind, spec in known.items() if matches(path, spec.get("file"))}
     try:
         with path.open("rb") as file:
             begins = file.read(64)
@@ -96,6 +96,11 @@ def recognise_file(path: Path, known: Known = MappingProxyType({})) -> Contents:
     if not found:
         return Contents(path, held=recognise.describe_missing(table))
     return Contents(path, found, _describe_lone_sensor(table, found[0]))
+
+
+def matches(path: Path, file: Any) -> bool:
+    """Whether a file is the one, or one of several, of a setting ``file``; any is of none."""
+    return file is None or any(path.match(str(one)) for one in (file if isinstance(file, (list, tuple)) else [file]))
 
 
 def _describe_lone_sensor(table: LogTable, offer: Offer) -> str:
