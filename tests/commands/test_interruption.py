@@ -141,6 +141,15 @@ def test_a_reader_that_has_gone_ends_a_command_without_a_word(town, tmp_path):
     assert (tmp_path / "solved" / "report.html").exists()
 
 
+@pytest.mark.commands
+@pytest.mark.parametrize("command", [("dlkf.ingest", "--help"), ("dlkf", "ingest", "--help")], ids=" ".join)
+def test_a_reader_of_the_help_that_has_gone_ends_it_without_a_word(command):
+    with subprocess.Popen((sys.executable, "-m", *command), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        assert (process.stderr.read(), process.wait(PATIENCE_S)) == (b"", 141)
+
+
 def killed(program: str) -> None:
     """Run a program that ends itself by SIGKILL."""
     done = subprocess.run([sys.executable, "-c", f"import os, pathlib, signal\n{program}"], timeout=PATIENCE_S)

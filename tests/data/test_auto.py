@@ -15,7 +15,7 @@ from dlkf.data.intake import ingest_drives
 from dlkf.data.readers.auto import AutoReader, _find_velocities
 from dlkf.data.readers.frames import LogTable
 from dlkf.data.readers.logs import LogReader
-from dlkf.data.readers.offers import recognise_file
+from dlkf.data.readers.offers import find_format, recognise_file
 from dlkf.data.readers.recognise import gnss_spec, imu_spec
 from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.tables import read_table
@@ -111,6 +111,41 @@ def test_stamps_under_a_name_of_their_own():
     spec = imu_spec(without("Odo"))
     assert spec is not None and spec.spec["time"] == {"column": "Stand [ms]", "unit": "ms"}
     assert imu_spec(without("Odo", "Stand [ms]")) is None is imu_spec(table)
+
+
+def test_a_sentence_in_a_column_of_a_table_makes_no_nmea_log(tmp_path):
+    """A logger's table with the sentence beside what it read from it; one with a stamp before each sentence is NMEA."""
+    gga = "$GPGGA,183244.000,4220.2322,N,07105.3712,W,1,09,1.1,16.6,M,-33.8,M,,0000*5A"
+    for name, row, found in (
+        ("table", '{},42.3,-71.1,16.6,"' + gga + '"', "csv"),
+        ("stamped", "{}," + gga, "nmea"),
+        ("plain", gga, "nmea"),
+    ):
+        (tmp_path / name).write_text("t,lat,lon,alt,read\n" + "".join(f"{row.format(k)}\n" for k in range(9)))
+        assert find_format(tmp_path / name) == found, name
+    (tmp_path / "stamped").rename(tmp_path / "stamped.csv")
+    assert recognise_file(tmp_path / "stamped.csv").offers[0].detail.startswith("nmea")
+    stated = {"gnss": {"file": "stamped.csv", "format": "csv"}}
+    assert not any(one.detail.startswith("nmea") for one in recognise_file(tmp_path / "stamped.csv", stated).offers)
+
+
+def test_columns_that_are_named_count(tmp_path, drive):
+    """Under any names, for the IMU and for the fixes; the rest is found. What is still not found has one line."""
+    names = dict(zip(("t", *GYRO, *ACCEL), ("t", "p1", "p2", "p3", "s1", "s2", "s3")))
+    imu = drive["imu"].assign(more=1.0).rename(columns=names)
+    imu[["p1", "s1", "p2", "more", "s2", "s3", "p3", "t"]].to_csv(tmp_path / "imu.csv", index=False)
+    fix = {"lat_deg": "a", "lon_deg": "b", "height_m": "c", "vel_n": "d", "vel_e": "e", "vel_d": "f"}
+    drive["gnss"][["t", *fix]].rename(columns=fix).assign(n=7.0).to_csv(tmp_path / "gnss.csv", index=False)
+    known = {"accel": {"columns": ["s1", "s2", "s3"]}, "gyro": {"columns": ["p1", "p2", "p3"]}}
+    place = {"position": {"columns": ["a", "b", "c"]}, "velocity": {"columns": ["d", "e", "f"]}}
+    for file in ({}, {"file": "imu.csv"}):
+        (got,) = AutoReader({**file, **known}, place).read(tmp_path)
+        np.testing.assert_allclose(got.imu.accel_z, drive["imu"].accel_z, atol=0.02)
+        np.testing.assert_allclose(got.gnss.vel_d, drive["gnss"].vel_d, atol=1e-6)
+    with pytest.raises(
+        InputError, match=r"no IMU found in imu.csv \(columns p1, .*; name its columns \(reader.imu.acc"
+    ):
+        list(AutoReader({"file": "imu.csv", "accel": known["accel"]}, place).read(tmp_path))
 
 
 def test_a_log_at_rest_in_units_of_its_own(tmp_path):
@@ -214,7 +249,7 @@ def test_a_clock_that_was_set_back_is_named_before_anything_is_estimated(tmp_pat
     imu = pd.read_csv(box, sep=";")
     imu.loc[500:, "stamp"] -= 9000
     imu.to_csv(box, sep=";", index=False)
-    with pytest.raises(InputError, match=r"box.txt: row 500: .*the clock was set back there: make two drives of it"):
+    with pytest.raises(InputError, match=r"box.txt: line 502 .*the clock was set back there: make two drives of it"):
         list(AutoReader().read(tmp_path / "logs"))
 
 
@@ -274,7 +309,7 @@ def test_the_names_of_a_racebox():
 
 def test_a_chosen_file_that_is_not_there(tmp_path):
     _hidden(tmp_path / "a", car(20))
-    with pytest.raises(InputError, match=r"reader.imu.file=nope.csv: no such IMU here; found in box.txt"):
+    with pytest.raises(InputError, match=r"reader.imu.file=nope.csv: no such file here; IMU found in box.txt"):
         list(AutoReader(imu={"file": "nope.csv"}).read(tmp_path / "a"))
 
 

@@ -17,12 +17,23 @@ from dlkf.data.readers.qualities import quality_spec
 from dlkf.data.readers.recognise import gnss_spec, imu_spec
 from dlkf.data.readers.stamps import choose_clock
 from dlkf.data.readers.units import day_order
-from dlkf.data.readers.vocabulary import DATE, QUANTITIES, SENSORS, TIME, find_column, match_columns, split_unit, triad
+from dlkf.data.readers.vocabulary import (
+    DATE,
+    QUANTITIES,
+    SENSORS,
+    TIME,
+    find_column,
+    find_triads,
+    match_columns,
+    split_unit,
+    triad,
+)
 from dlkf.data.schema import ACCEL, GYRO
 from dlkf.data.tables import DriveClock, read_drives
 from dlkf.running.exports import utc_times
 from tests.data.logs.clock import GPS, UNIX
 from tests.data.logs.clock import G as GRAVITY
+from tests.data.test_validate import hilly
 
 DEG = np.pi / 180
 # stamps, accelerometers, gyroscopes; stamps, latitude, longitude, height, speed [km/h], course, accuracy, quality
@@ -133,6 +144,12 @@ def test_two_readings_of_a_quality_are_both_said():
     assert spec == {"column": "fixtype"}
     assert "4 is RTK fixed, taken as NMEA's GGA code; as u-blox's fix type" in note
     assert "reader.gnss.quality.map='{4: 1}'" in note
+    spec, notes = quality_spec(pd.DataFrame({"quality": [4, 4]}), "quality", 20.0)
+    assert "accuracies of 20 m in the median are none of RTK; if they are mm: reader.gnss.std_position.unit=mm" in notes
+    for empty in ([np.nan] * 3, ["", " ", ""]):
+        assert quality_spec(pd.DataFrame({"fix": empty}), "fix", np.nan)[1] == [
+            "quality fix is empty: all count as single"
+        ]
     spec, (note,) = quality_spec(pd.DataFrame({"fix": ["rather good"]}), "fix", np.nan)
     assert spec is None and "rather good" in note
 
@@ -254,6 +271,21 @@ def test_fixes_that_are_no_table_of_them(name, text, said, tmp_path):
     assert said in str(refused.value)
 
 
+@pytest.mark.parametrize(("unit", "metres"), [("mm", 1e-3), ("cm", 0.01), ("km", 1e3), ("ft", 0.3048)])
+def test_the_unit_of_heights_by_the_vertical_velocity(unit, metres, tmp_path, drive):
+    """It is printed, as every estimate is; without a vertical velocity heights above all roads are mm."""
+    gnss = hilly(drive["gnss"], metres, 0.02)
+    frd = {"accel": {"axes": "frd"}, "gyro": {"axes": "frd"}}
+    drive["imu"].to_csv(tmp_path / "imu.csv", index=False)
+    for vel_d in (True, False) if unit == "mm" else (True,):
+        (gnss if vel_d else gnss.drop(columns="vel_d")).rename(columns={"height_m": "alt"}).to_csv(
+            tmp_path / "gnss.csv", index=False
+        )
+        (got,) = AutoReader(frd, {"time": {"offset_s": 0.0}}).read(tmp_path)
+        assert abs(got.gnss.height_m.mean() - 100) < 5
+        assert any(note.startswith(f"found reader.gnss.position.height_unit={unit}  (") for note in got.notes)
+
+
 def test_accelerations_without_gravity_are_refused(tmp_path, drive):
     write(tmp_path / "a", {**drive, "imu": drive["imu"].assign(accel_z=drive["imu"].accel_z + 9.8)}, HEADERS["English"])
     with pytest.raises(InputError, match="there is no gravity in the accelerations"):
@@ -275,6 +307,28 @@ def test_names_mean_one_thing():
         assert not [k for k in QUANTITIES if find_column([name], k)], name
         assert not match_columns([name], TIME) and not match_columns([name], DATE)
     assert split_unit("Länge (°)") == ("lange", "deg") and split_unit("alt_ft") == ("alt", "ft")
+
+
+@pytest.mark.parametrize("prefix", ["", "imu.", "field."])
+def test_accelerations_as_ros_calls_them(prefix):
+    """Beside the rates of the same message; where nothing else is the accelerometer's, and never alone: a phone's
+    linear acceleration has no gravity."""
+    linear = [f"{prefix}linear_acceleration.{a}" for a in "xyz"]
+    rates = [f"{prefix}angular_velocity.{a}" for a in "xyz"]
+    assert find_triads([*linear, *rates]) == {"accel": linear, "gyro": rates}
+    assert find_triads([*linear, *rates, "ax", "ay", "az"])["accel"] == ["ax", "ay", "az"]
+    assert find_triads(linear) == {}
+
+
+@pytest.mark.parametrize("name", ["{}rate", "{}_rate", "{}Rate [deg/s]", "gyro_{}"])
+def test_rates_of_roll_pitch_and_yaw(name):
+    rates = [name.format(angle) for angle in ("roll", "pitch", "yaw")]
+    assert find_triads(["roll", "pitch", "yaw", *rates]) == {"gyro": rates}
+
+
+def test_units_of_rates_with_sec():
+    assert find_triads([f"gy_{a}[rad/sec]" for a in "xyz"]) == {"gyro": [f"gy_{a}[rad/sec]" for a in "xyz"]}
+    assert split_unit("wx_deg_sec") == ("wx", "deg/s")
 
 
 def test_a_unit_that_the_header_states_and_gravity_does_not_deny():

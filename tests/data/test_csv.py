@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 from dlkf.base.errors import InputError
 from dlkf.data.intake import IngestOptions, ingest_drives
+from dlkf.data.readers.auto import AutoReader
 from dlkf.data.readers.logs import LogReader
 from dlkf.data.readers.units import rotation, seconds
 from dlkf.data.tables import read_drives, read_table
@@ -180,7 +181,7 @@ MISTAKES = {
     "imu__time__clock": ("tai", "unknown clock 'tai'"),
     "imu__stamp": ("late", "reader.imu.stamp=late"),
     "imu__file": ("imu.txt", "no file imu.txt and no subfolders"),
-    "gnss__file": ("*.csv", "3 files match, one must be"),
+    "gnss__file": ("*.csv", "match *.csv, and are no parts of one log"),
     "gnss__velocity__frame": ("nwu", "reader.gnss.velocity.frame=nwu"),
     "gnss__quality__map": ({"5": 5}, "quality '4' is not in reader.gnss.quality.map"),
     "time_zero": ("now", "reader.time_zero=now"),
@@ -205,7 +206,7 @@ def test_mistakes_in_the_files(tmp_path, tables):
         (41, "0.4,0,0,oops,0,0,-9.8", "line 42: column 'gyro_z' is 'oops', not a number"),
         (41, "0.4,0,0,,0,0,-9.8", "line 42: column 'gyro_z' has no value"),
         (41, "0.4,0,0,0,0,0,-9.8,7,7", "line 42 has 9 cells, those before have 7; correct the line"),
-        (41, "0.39,0,0,0,0,0,-9.8", "row 40: t = 0.390000 appears twice|row 40: t"),
+        (41, "0.39,0,0,0,0,0,-9.8", r"line 42 \(t 0.39\): t goes back"),
     ):
         path.write_text("\n".join([*lines[:line], cells, *lines[line + 1 :]]))
         with pytest.raises(InputError, match=message):
@@ -305,3 +306,49 @@ def test_gps_time_is_that_of_the_fixes_whatever_the_imu_counts(tmp_path, tables,
     gps = drive.meta["gps_zero_s"] + drive.meta["gps_rate"] * drive.gnss.t
     np.testing.assert_allclose(gps, GPS_WEEK * 604_800 + TOW - 37.5 + own, atol=2e-6)
     assert drive.meta["time_zero_s"] == 0
+
+
+@pytest.mark.parametrize("auto", [False, True], ids=["csv", "auto"])
+def test_a_fault_of_the_stamps_names_the_line_and_the_stamp_of_the_file(tmp_path, auto):
+    """As an editor shows them: lines count from 1, the header among them, and t counts from the first second."""
+    tables = {kind: car(20)[kind] for kind in ("imu", "gnss")}
+    tables["imu"] = pd.concat([tables["imu"][:1001], tables["imu"][1000:]])
+    for kind, table in tables.items():
+        table.assign(t=table.t + 4000).to_csv(tmp_path / f"{kind}.csv", index=False, float_format="%.6f")
+    with pytest.raises(InputError) as refused:
+        list((AutoReader() if auto else LogReader(**PLAIN)).read(tmp_path))
+    line = (tmp_path / "imu.csv").read_text().splitlines()[1002]
+    assert line.startswith("4010.010000") and "imu.csv: line 1003 (t 4010.01): t = 10.01" in str(refused.value)
+
+
+PARTS = (
+    ({"file": "imu_*.csv"}, {"file": "gnss_*.csv"}),
+    ({"file": ["imu_2.csv", "imu_1.csv"]}, {"file": ["gnss_1.csv", "gnss_2.csv"]}),
+)
+
+
+@pytest.mark.parametrize("files", [*PARTS, ({}, {})], ids=["pattern", "list", "auto"])
+@pytest.mark.parametrize("reader", [LogReader, AutoReader])
+def test_files_of_one_log_are_joined_where_their_stamps_follow(tmp_path, reader, files):
+    """Each file has a header of its own; parts that overlap are refused, or the first of a list is taken alone."""
+    tables = {kind: car(100)[kind] for kind in ("imu", "gnss")}
+    for kind, table in tables.items():
+        for part, rows in (("1", table.t <= 50), ("2", table.t > 50)):
+            table[rows].to_csv(tmp_path / f"{kind}_{part}.csv", index=False)
+    if reader is LogReader and files == ({}, {}):
+        return
+    specs = [{**spec, **file} for spec, file in zip((PLAIN["imu"], PLAIN["gnss"]), files)]
+    (got,) = reader(*(specs if reader is LogReader else files)).read(tmp_path)
+    assert len(got.imu) == len(tables["imu"]) and len(got.gnss) == len(tables["gnss"])
+    assert "joined imu_1.csv, imu_2.csv" in got.notes and not any("not read" in note for note in got.notes)
+    np.testing.assert_allclose(got.imu.accel_x, tables["imu"].accel_x, atol=0.02)
+    faulty = tables["imu"][5000:].astype(object)
+    faulty.iloc[3, 1] = "oops"
+    faulty.to_csv(tmp_path / "imu_2.csv", index=False)
+    if reader is LogReader:
+        with pytest.raises(InputError, match=r"line 5 of imu_2.csv: column 'gyro_x' is 'oops'"):
+            list(reader(*specs).read(tmp_path))
+    tables["imu"].to_csv(tmp_path / "imu_2.csv", index=False)
+    if files[0] == {"file": "imu_*.csv"} or reader is AutoReader:
+        with pytest.raises(InputError, match=r"no parts of one log|all hold IMU"):
+            list(reader(*(specs if reader is LogReader else files)).read(tmp_path))

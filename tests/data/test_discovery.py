@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import ImuSums, describe_offset, find_lag
-from dlkf.data.discovery.drift import compare_ends, ends_std, find_drifting_pose, middle
+from dlkf.data.discovery.drift import compare_ends, ends_std, find_drifting_pose, find_step, middle
 from dlkf.data.discovery.findings import discover, find_value
 from dlkf.data.discovery.motion import find_motion, integrate_level, position_delay
 from dlkf.data.discovery.orientation import find_pose
@@ -109,6 +109,29 @@ def test_a_drift_is_found_or_refused(tmp_path, drive):
     assert found.mapping["gnss"]["time"]["drift_ppm"] == pytest.approx(1000, abs=20)
     assert found.gnss is not None
     np.testing.assert_allclose(found.gnss.t, 1.001 * drive["gnss"].t, atol=4e-3)
+
+
+@pytest.mark.parametrize("ppm", [1000, 3000, 5000])
+def test_a_drift_is_no_step_of_a_clock(streets, ppm):
+    t, accel, gyro, moved = _arrays({**streets, "imu": streets["imu"].assign(t=(1 + 1e-6 * ppm) * streets["imu"].t)})
+    sums = ImuSums.of(t, accel, gyro)
+    ends = compare_ends(sums, moved)
+    assert ends is not None and find_step(sums, moved, ends) is None
+
+
+@pytest.mark.parametrize(("step_s", "at"), [(0.6, 90.0), (1.0, 70.0), (1.0, 110.0), (4.0, 70.0)])
+def test_a_clock_that_steps_is_no_drift(tmp_path, streets, step_s, at):
+    """No offset and no drift is right then: the line says when, and nothing is taken for sure."""
+    gnss = streets["gnss"].assign(t=streets["gnss"].t + np.where(streets["gnss"].t > at, step_s, 0.0))
+    when = r"between t = (\d+) and (\d+) s"
+    with pytest.raises(InputError, match=f"the clock of IMU or GNSS steps {when}") as refused:
+        check_clocks(*({c: frame[c].to_numpy() for c in frame} for frame in (streets["imu"], gnss)), "drive")
+    first, last = map(int, re.findall(when, str(refused.value))[0])
+    assert first - 3 <= at <= last + 3 and last - first < 60  # a straight road
+    streets["imu"].to_csv(tmp_path / "imu.csv", index=False)
+    gnss.to_csv(tmp_path / "gnss.csv", index=False)
+    with pytest.raises(InputError, match=rf"a clock steps by {step_s:.1f} s, \d+ to \d+ s after the first"):
+        list(AutoReader(sure={"time_s": 1.0}).read(tmp_path))
 
 
 def test_a_drift_that_no_lag_fits_is_found(streets):

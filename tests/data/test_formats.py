@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import pytest
 from hydra.utils import get_class
 
@@ -17,6 +18,7 @@ from dlkf.data.intake import ingest_drives
 from dlkf.data.readers.formats import novatel, rtklib
 from dlkf.data.readers.frames import DriveFrames
 from dlkf.data.readers.units import WEEK_S
+from dlkf.data.schema import driven_distance
 from dlkf.data.summary import drive_line
 from tests.cars import car
 from tests.data import logs
@@ -129,6 +131,27 @@ def test_standstills_are_told(drive):
     assert drive_line(frames).endswith("stands 2 times for 8 s in all") and "missing" not in drive_line(frames)
     thinned = DriveFrames(frames.meta, drive["imu"][np.arange(len(drive["imu"])) % 4 > 0], gnss)
     assert "25 % of its samples missing" in drive_line(thinned)
+
+
+@pytest.mark.parametrize(
+    ("short", "said"),
+    [("imu", "the IMU covers 60 of 100 s of the fixes"), ("gnss", "the fixes cover 60 of 100 s of the IMU")],
+)
+def test_a_log_that_ends_before_the_other_is_told(tmp_path, short, said):
+    """In one line; fixes and way are those that both have."""
+    tables = {kind: car(100)[kind] for kind in ("imu", "gnss")}
+    both = tables["gnss"][tables["gnss"].t <= (61 if short == "imu" else 60)]
+    tables[short] = tables[short][tables[short].t <= 60]
+    notes, lines = [], []
+    ingest_drives(
+        [DriveFrames({"drive": "a", "group": "a"}, *tables.values())],
+        tmp_path / "out",
+        progress=lambda one, _: (notes.extend(one.notes), lines.extend(one.lines)),
+    )
+    assert notes == [f"a: {said}"]
+    table = pd.read_parquet(tmp_path / "out" / "drives.parquet")
+    assert table["distance_m"].tolist() == pytest.approx([driven_distance(both)])
+    assert f"{driven_distance(both) / 1000:.2f} km" in lines[0] and f"{len(both)} fixes" in lines[0]
 
 
 def _pykitti():

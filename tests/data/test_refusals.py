@@ -165,7 +165,9 @@ def test_a_zip_that_is_none_or_unpacks_without_end(tmp_path):
     assert "unpacks to 0.1 GiB, which no log of its size does" in refusal(tmp_path / "a.zip")
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
         archive.writestr("../../evil.csv", "t,ax,ay,az,gx,gy,gz\n")
-    assert "no IMU found" in refusal(tmp_path / "a.zip") and not list(tmp_path.parent.glob("evil.csv"))
+    assert refusal(tmp_path / "a.zip").startswith(f"{tmp_path / 'a.zip'}: no IMU found") and not list(
+        tmp_path.parent.glob("evil.csv")
+    )
 
 
 def test_matlab_matrices_and_a_phones_structures(tmp_path, streets):
@@ -213,7 +215,7 @@ def test_sensors_in_files_of_their_own(tmp_path, streets):
     (got,) = AutoReader().read(tmp_path)
     np.testing.assert_allclose(got.imu.gyro_z, imu.gyro_z, atol=0.01)
     (tmp_path / "gyroscope.csv").unlink()
-    assert "accelerometer.csv (csv with x, y, z); gps.csv (csv with" in refusal(tmp_path)
+    assert "accelerometer.csv (csv with x, y, z, without a gyroscope); gps.csv (csv with" in refusal(tmp_path)
 
 
 def test_what_each_file_holds_is_said(tmp_path, drive):
@@ -226,6 +228,28 @@ def test_what_each_file_holds_is_said(tmp_path, drive):
     said = refusal(tmp_path)
     for part in ("acc.csv (csv with accel_x", "photo.jpg (of no format that is known)", "empty.txt (empty)"):
         assert part in said, part
+
+
+@pytest.mark.parametrize(("dead", "named"), [("gyro_z", "gyro_y is -0.1"), ("accel_x", "accel_x is 0.1")])
+def test_a_dead_axis_is_named_in_any_pose(dead, named, tmp_path, streets):
+    """Of a sensor on its side, whose y points up: it is no doubt of a unit."""
+    imu = streets["imu"].assign(**{dead: 0.1})
+    for sensor in ("gyro", "accel"):
+        imu[[f"{sensor}_y", f"{sensor}_z"]] = np.column_stack((-imu[f"{sensor}_z"], imu[f"{sensor}_y"]))
+    imu.to_csv(tmp_path / "imu.csv", index=False)
+    streets["gnss"].to_csv(tmp_path / "gnss.csv", index=False)
+    assert f"imu.csv: {named} in every row though the car turns" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize(("kept", "lacks"), [(ACCEL, "a gyroscope"), (GYRO, "an accelerometer")])
+def test_the_sensor_that_an_imu_lacks_is_named(kept, lacks, tmp_path, drive):
+    """In a table of its own, and beside fixes; where a file is given, the line begins with that file."""
+    alone, both = tmp_path / "alone.csv", tmp_path / "both.csv"
+    drive["imu"][["t", *kept]].to_csv(alone, index=False)
+    pd.merge_asof(drive["gnss"], drive["imu"][["t", *kept]], on="t").to_csv(both, index=False)
+    for file in (alone, both):
+        said = refusal(file)
+        assert said.startswith(f"{file}: no IMU found") and f", without {lacks})" in said
 
 
 def test_a_table_of_a_hundred_thousand_columns(tmp_path):
@@ -293,6 +317,35 @@ def test_an_unsure_drive_does_not_lose_the_others(tmp_path):
     (shared,) = (note for note in notes if note.startswith("short: not sure by itself"))
     assert "reader.imu.accel.axes={roll" in shared and "reader.imu.accel.unit=g" in shared and "offset_s=" in shared
     assert any(note.startswith("left out: drive other: not sure of") for note in notes)
+
+
+def test_a_stray_folder_and_a_faulty_drive_do_not_stop_the_others(tmp_path, drive):
+    """Refused with the option that leaves them out; with it each has a line, and no table of theirs is written."""
+    logs = tmp_path / "logs"
+    for name in ("a-bad", "b-good"):
+        _hidden(logs / name, drive)
+    fixes = pd.read_csv(logs / "a-bad" / "receiver.csv")
+    fixes.loc[5, "Latitude"] += 100
+    fixes.to_csv(logs / "a-bad" / "receiver.csv", index=False)
+    (logs / "c-notes").mkdir()
+    (logs / "c-notes" / "read.me").write_text("Tuesday: rain\n")
+    with pytest.raises(InputError, match=r"lat_deg is 148.*; or skip_unsure=true leaves such drives out"):
+        ingest(AutoReader(), logs, tmp_path / "out", IngestOptions(), parallel=None)
+    notes = []
+    options = {"parallel": None, "skip_unsure": True, "progress": lambda one, _: notes.extend(one.notes)}
+    assert ingest(AutoReader(), logs, tmp_path / "out", IngestOptions(), **options) == 1
+    left = [note for note in notes if note.startswith("left out: ")]
+    assert len(left) == 2 and "lat_deg is 148" in left[0] and "c-notes: no IMU found in read.me" in left[1]
+    assert not list((tmp_path / "out").rglob("*a-bad*")) and list((tmp_path / "out").rglob("*b-good*"))
+
+
+def test_subfolders_beside_logs_are_named(tmp_path, drive):
+    _hidden(tmp_path / "logs", drive)
+    _hidden(tmp_path / "logs" / "monday", drive)
+    (tmp_path / "logs" / "pictures").mkdir()
+    (got,) = AutoReader().read(tmp_path / "logs")
+    (said,) = (note for note in got.notes if note.startswith("subfolders that are not read"))
+    assert "monday" in said and "pictures" not in said and got.name == "logs"
 
 
 def test_drives_that_disagree_are_named(tmp_path, drive):

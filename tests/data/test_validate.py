@@ -10,6 +10,7 @@ import pytest
 
 from dlkf.base.errors import InputError
 from dlkf.data.plausibility import check_imu_units
+from dlkf.data.readers.units import LENGTH
 from dlkf.data.schema import drive_file, write_drive, write_drives_table
 from dlkf.data.store import load_dataset
 from dlkf.data.validate import LIMITS, Limits, find_gaps, read_drive, validate_dataset
@@ -106,6 +107,10 @@ BAD = {
     "nan in the IMU": (_set("imu", "gyro_y", _at(17, np.nan)), "row 17: gyro_y is nan"),
     "inf in the IMU": (_set("imu", "accel_x", _at(18, np.inf)), "row 18: accel_x is inf"),
     "time goes back": (_set("imu", "t", _at(100, 0.5)), "row 100: t goes back"),
+    "ms of 16 bits": (_set("imu", "t", lambda t: (t + 40) % 65.536), "every 65.536 s: reader.imu.time.wraps_s=65.536"),
+    "us of 32 bits": (_set("imu", "t", lambda t: (t + 4260) % 4294.967296), r"wraps_s=4294.967296"),
+    "another counter": (_set("imu", "t", lambda t: (t + 1) % 20), r"t goes back .*wraps_s=20$"),
+    "clock set back": (_set("imu", "t", lambda t: np.where(t > 30, t - 20, t)), "the clock was set back there"),
     "duplicate stamp": (_set("imu", "t", lambda t: _at(100, t[99])(t)), "row 100: t = 1.0.* appears twice"),
     "ms taken for s": (_set("imu", "t", lambda t: 1000 * t), "row.* a second, an IMU has 1 to 10000: .*imu.time.unit"),
     "ns taken for s": (_set("imu", "t", lambda t: 1e9 * t), "reader.imu.time.unit"),
@@ -136,6 +141,7 @@ BAD = {
     "leap seconds": (_set("gnss", "t", lambda t: t - 18), r"clocks of IMU and GNSS are 18.0 s apart.*offset_s=auto"),
     "turned right": (_rows("imu", _quarter), r"turned by \+90° .*reader.imu.accel.axes"),
     "another clock": (_set("gnss", "t", lambda t: t + 1e5), "same clock"),
+    "an IMU of a moment": (_rows("imu", lambda f: f[:50]), r"share 0.5 s with the IMU, from 0.010 to 0.500; give logs"),
     "negative std": (_set("gnss", "std_pos_n", _at(2, -1.0)), "row 2: std_pos_n is -1.0"),
     "attitude in degrees": (_columns("reference", _scale(["yaw"], 180 / np.pi)), "yaw reaches .* degrees"),
     "yaw from East": (_set("reference", "yaw", lambda y: np.pi / 2 - y), "yaw counts from East"),
@@ -159,6 +165,28 @@ def test_bad_numbers(tmp_path, tables, case):
     import re
 
     assert re.search(expected, text), text
+
+
+def hilly(gnss: pd.DataFrame, unit_m: float, noise_m: float) -> pd.DataFrame:
+    """Fixes over hills of 10 m, their heights in a unit of ``unit_m``."""
+    rise = 2 * np.pi / 50.0
+    noise = noise_m * np.random.default_rng(1).standard_normal(len(gnss))
+    height = (100.0 + 10.0 * np.sin(rise * gnss["t"]) + noise) / unit_m
+    return gnss.assign(height_m=height, vel_d=-10.0 * rise * np.cos(rise * gnss["t"]))
+
+
+@pytest.mark.parametrize("noise_m", [0.02, 1.0])
+@pytest.mark.parametrize("unit", ["m", "mm", "cm", "km", "ft", "4 m"])
+def test_heights_in_another_unit_are_refused(tmp_path, tables, unit, noise_m):
+    """Also through the height noise of a single-frequency receiver, which raises no alarm in metres; a ratio of no unit
+    is refused as such."""
+    gnss = hilly(tables["gnss"], {**LENGTH, "4 m": 4.0}[unit], noise_m)
+    _write(tmp_path, {**tables, "gnss": gnss})
+    if unit == "m":
+        validate_dataset(tmp_path, reference=False)
+        return
+    said = _complaint(tmp_path, reference=False)
+    assert f"height_unit={unit}, or multiply" in said or (unit == "4 m" and "one of them is in another unit" in said)
 
 
 @pytest.mark.parametrize("kind", ["imu", "gnss", "reference"])

@@ -112,7 +112,10 @@ def command(
 
 def print_help(name: str) -> None:
     """The page of a command."""
-    print(help_text(name, GROUPS.get(name, {})))
+    try:
+        print(help_text(name, GROUPS.get(name, {})), flush=True)
+    except BrokenPipeError as error:
+        _end(error, name)
 
 
 def list_typed_words(*keys: str) -> list[str]:

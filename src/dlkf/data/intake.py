@@ -20,8 +20,8 @@ from dlkf.data.plausibility import describe_drift, describe_rotation
 from dlkf.data.readers.frames import DriveFrames, Place
 from dlkf.data.readers.settling import Unsure
 from dlkf.data.readers.sharing import agrees, layout, list_settings, pool_settings
-from dlkf.data.schema import new_dataset, write_drive, write_drives_table
-from dlkf.data.summary import drive_line
+from dlkf.data.schema import new_dataset, remove_drive, write_drive, write_drives_table
+from dlkf.data.summary import describe_cover, drive_line
 from dlkf.data.tables import DriveRow, read_drives
 from dlkf.data.validate import LIMITS, Limits, find_gaps, read_drive, read_fixes, read_imu
 
@@ -45,18 +45,24 @@ class IngestOptions:
     limits: Limits = LIMITS
 
     def take_in(self, drive: DriveFrames, folder: str | Path) -> IngestResult:
-        """Write a drive into a dataset's folder and check what lies there; InputError for the first fault."""
+        """Write a drive into a dataset's folder and check what lies there; InputError for the first fault, with
+        nothing of the drive left."""
         rows, lines, detail = [], [], list(drive.notes)
-        for part in split_at_gaps(drive, self.shortest_s, self.limits) if self.split_gaps else [drive]:
-            rows.append(write_drive(folder, part.meta, part.imu, part.gnss, part.reference, part.aids))
-            if part.gnss is not None:
-                tables = read_drive(folder, DriveRow(part.name, part.name, (0.0, 0.0, 0.0)), limits=self.limits)
-                for check in (describe_drift, describe_rotation):
-                    if line := check(tables.imu, read_fixes(tables.gnss)):
-                        detail.append(f"{part.name}: {line}")
-            else:
-                read_imu(folder, part.name, self.limits)
-            lines.append(f"{part.name}: {drive_line(part)}")
+        try:
+            for part in split_at_gaps(drive, self.shortest_s, self.limits) if self.split_gaps else [drive]:
+                rows.append(write_drive(folder, part.meta, part.imu, part.gnss, part.reference, part.aids))
+                if part.gnss is not None:
+                    tables = read_drive(folder, DriveRow(part.name, part.name, (0.0, 0.0, 0.0)), limits=self.limits)
+                    for check in (describe_cover, describe_drift, describe_rotation):
+                        if line := check(tables.imu, read_fixes(tables.gnss)):
+                            detail.append(f"{part.name}: {line}")
+                else:
+                    read_imu(folder, part.name, self.limits)
+                lines.append(f"{part.name}: {drive_line(part)}")
+        except InputError:
+            for name in (drive.name, *(str(row["drive"]) for row in rows)):
+                remove_drive(folder, name)
+            raise
         return IngestResult(rows, lines, tuple(detail), drive.mapping)
 
 
@@ -74,7 +80,7 @@ def ingest(
     (``places``, ``drive_at``) reads them on ``parallel`` engines (:func:`dlkf.base.parallel.parallel_map`).
 
     Drives that are not sure of a setting are read again with what the others of the same IMU found. One that still is
-    not raises its InputError, or is left out with ``skip_unsure``.
+    not, or is faulty, raises its InputError, or is left out with ``skip_unsure``.
     """
     check_engine(parallel, out)
     if not is_url(source) and (Path(source) / "drives.parquet").is_file():
@@ -97,9 +103,11 @@ def read_together(
     reader: Any, take_in: TakeIn, places: Sequence[Place], parallel: int | str | None, skip_unsure: bool
 ) -> Iterator[IngestResult]:
     """What ``take_in`` makes of the drives at a reader's places that are sure, then of those that are with what these
-    found, then lines on those that disagree."""
+    found, then lines on those that disagree and on those that are left out."""
     places = [(Path(folder).absolute(), name, only and Path(only).absolute()) for folder, name, only in places]
     doubts: dict[Place, Unsure] = {}
+    faults: list[InputError] = []
+    several = "; or skip_unsure=true leaves such drives out" if len(places) > 1 else ""
     mappings: list[dict[str, Any]] = []
 
     def read_all(reader: Any, places: Sequence[Place]) -> Iterator[tuple[Place, IngestResult]]:
@@ -107,6 +115,10 @@ def read_together(
             doubts.pop(place, None)
             if isinstance(result, Unsure):
                 doubts[place] = result
+            elif isinstance(result, InputError):
+                if not skip_unsure:
+                    raise InputError(f"{result}{several}")
+                faults.append(result)
             else:
                 yield place, result
 
@@ -128,19 +140,18 @@ def read_together(
                 yield result._replace(notes=(f"{name}: {shared}", *result.notes))
     if doubts and not skip_unsure:
         first = next(iter(doubts.values()))
-        raise first if len(places) == 1 else InputError(f"{first}; or skip_unsure=true leaves such drives out")
-    for doubt in doubts.values():
-        yield IngestResult([], [], (f"left out: {doubt}",), {})
+        raise InputError(f"{first}{several}") if several else first
+    for fault in (*faults, *doubts.values()):
+        yield IngestResult([], [], (f"left out: {fault}",), {})
 
 
-def _read_there(reader: Any, take_in: TakeIn, place: Place) -> IngestResult | Unsure:
+def _read_there(reader: Any, take_in: TakeIn, place: Place) -> IngestResult | InputError:
     try:
-        drive = reader.drive_at(*place)
-    except Unsure as doubt:
-        return doubt
+        return take_in(reader.drive_at(*place))
+    except InputError as fault:
+        return fault
     except MemoryError:
-        raise InputError(f"drive {place[1]}: its logs do not fit into memory; split them, or write Parquet") from None
-    return take_in(drive)
+        return InputError(f"drive {place[1]}: its logs do not fit into memory; split them, or write Parquet")
 
 
 def ingest_drives(

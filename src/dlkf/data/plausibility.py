@@ -12,9 +12,11 @@ import numpy as np
 from dlkf.base.angles import wrap_angle
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.clock import ImuSums, Lag, describe_offset, find_lag
-from dlkf.data.discovery.drift import ROUGH_S, compare_ends, find_drifting_pose
+from dlkf.data.discovery.drift import ROUGH_S, compare_ends, find_drifting_pose, find_step
 from dlkf.data.discovery.motion import Motion, find_motion, stretches
+from dlkf.data.discovery.units import compare_climbs, nearest_unit
 from dlkf.data.limits import DEGREE_M, NOWHERE_DEG
+from dlkf.data.readers.units import LENGTH
 from dlkf.data.schema import ACCEL, GYRO, stack_columns
 from dlkf.data.tables import Columns
 from dlkf.navigation.earth import SEMI_MAJOR
@@ -33,14 +35,16 @@ FEW = 2  # single fixes at 0°/0° or a continent away are refused by themselves
 FARTHEST_KM = 2000.0
 SEARCH_S = 600.0  # clocks of logs that have time in common are hardly further apart
 APART_S = 1.0  # less is a delay, which the filters bear; dlkf.ingest measures it on request
+WORST_PPM = 1e5  # of clocks that both count seconds
 DRIFTED_S = 0.1  # from a drive's first to its last second: worth a line
 SHORTEST_S = 60.0  # of a drive whose drift is observable
 TURNED_DEG = (30.0, 150.0)  # backwards is found by the filters' own search
 MOVING, TURNED, SPEED_CHANGE = 3.0, 1.0, 3.0  # m/s; rad and m/s over a drive that an axis at work must show
 YAW_AGREES, FORCE_DISAGREES, FORCE_AGREES = 0.85, 0.6, 0.85  # correlations with GNSS
-CHUNK_S = 10.0  # way, height and course are compared over such stretches: metres of GNSS noise do not matter
-LEAST_CLIMB_M, ALIKE = 1.0, 0.9  # RMS of the climb; correlation
-FEET = (2.5, 4.2)  # of the climb by heights to that by velocities
+CHUNK_S = 10.0  # way and course are compared over such stretches: metres of GNSS noise do not matter
+ALIKE = 0.9  # correlation of heights with the integral of vel_d
+OTHER_UNIT, CERTAIN = 2.0, 5.0  # of the climb by heights to that by velocities, or its inverse; σ
+UNIT_WORDS = {"ft": "feet"}
 
 
 def check_imu_units(imu: Columns, where: str) -> None:
@@ -192,29 +196,22 @@ def _check_way(gnss: Columns, where: str) -> None:
 
 
 def _check_climb(gnss: Columns, where: str) -> None:
-    """Heights against the integral of the downward velocity over stretches of ten seconds."""
-    t, height, down = gnss["t"], gnss["height_m"], gnss["vel_d"]
-    known = np.isfinite(height) & np.isfinite(down)
-    t, height, down = t[known], height[known], down[known]
-    if len(t) < 20:
+    """Heights against the integral of the downward velocity."""
+    climb = compare_climbs(gnss["t"], gnss["height_m"], gnss["vel_d"])
+    if climb is None:
         return
-    step = np.diff(t)
-    fallen = np.concatenate(([0.0], np.cumsum(step * (down[1:] + down[:-1]) / 2)))
-    first, last = stretches(t, CHUNK_S, step > 2.0)
-    climbed, rose = height[last] - height[first], fallen[first] - fallen[last]
-    if len(rose) < 10 or np.sqrt(np.mean(rose**2)) < LEAST_CLIMB_M:
-        return
-    slope = float(climbed @ rose / (rose @ rose))
-    alike = abs(float(climbed @ rose)) / max(float(np.linalg.norm(climbed) * np.linalg.norm(rose)), 1e-12)
-    if alike < ALIKE:
-        return
-    if slope < -0.5:
+    if climb.slope < -0.5 and climb.alike > ALIKE:
         raise InputError(f"{where}: vel_d grows where the height does: it counts upwards; negate vel_d")
-    if FEET[0] < slope < FEET[1]:
-        raise InputError(
-            f"{where}: heights change {slope:.2f} times as much as the vertical velocity says: look like feet; "
-            "reader.gnss.position.height_unit=ft, or multiply height_m by 0.3048"
-        )
+    if not climb.differs(OTHER_UNIT, CERTAIN):
+        return
+    unit = nearest_unit(1 / climb.slope, climb.std / climb.slope**2, LENGTH)
+    remedy = (
+        f"look like {UNIT_WORDS.get(unit, unit)}; reader.gnss.position.height_unit={unit}, or multiply height_m by "
+        f"{LENGTH[unit]:g}"
+        if unit is not None
+        else "one of them is in another unit; reader.gnss.position.height_unit, or correct vel_d"
+    )
+    raise InputError(f"{where}: heights change {climb.slope:.3g} times as much as the vertical velocity says: {remedy}")
 
 
 def check_turns(imu: Columns, gnss: Columns, where: str) -> None:
@@ -258,7 +255,7 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
     Then the force forward and right also shows whether the sensor looks along the car.
     """
     t, accel, gyro, moved = _signals(imu, gnss)
-    _check_dead_axes(imu, moved, where)
+    check_dead_axes(imu, moved, where)
     sums = ImuSums.of(t, accel, gyro)
     _check_drift(sums, moved, where)
     best = find_lag(sums, moved, SEARCH_S)
@@ -284,15 +281,23 @@ def check_clocks(imu: Columns, gnss: Columns, where: str) -> None:
         )
 
 
-def _check_dead_axes(imu: Columns, moved: Motion, where: str) -> None:
-    """An axis that never changes although the car turns, brakes and accelerates."""
+def check_dead_axes(imu: Columns, moved: Motion, where: str, frd: bool = True) -> None:
+    """An axis that never changes although the car turns, brakes and accelerates.
+
+    In the sensor's own axes (``frd=False``) the one that gravity lies on is down, and two are level.
+    """
     fast = moved.speed > MOVING
     if fast.sum() < 3:
         return
     both = fast[1:] & fast[:-1]
     turns = np.abs(wrap_angle(np.diff(moved.course)))[both].sum() > TURNED
     brakes = np.ptp(moved.speed[fast]) > SPEED_CHANGE
-    for name, shown, what in (("gyro_z", turns, "turns"), ("accel_x", brakes, "brakes"), ("accel_y", turns, "turns")):
+    needs = [("gyro_z", turns, "turns"), ("accel_x", brakes, "brakes"), ("accel_y", turns, "turns")]
+    if not frd:
+        down = int(np.argmax([abs(float(np.median(imu[c]))) for c in ACCEL]))
+        level = [name for k, name in enumerate(ACCEL) if k != down]
+        needs = [(GYRO[down], turns, "turns"), *((name, turns and brakes, "turns and brakes") for name in level)]
+    for name, shown, what in needs:
         if shown and np.ptp(imu[name]) == 0:
             raise InputError(
                 f"{where}: {name} is {imu[name][0]:g} in every row though the car {what}: a dead axis, or no data of it"
@@ -322,14 +327,21 @@ def _check_handedness(
 def _check_drift(imu: ImuSums, gnss: Motion, where: str) -> None:
     """The first and the last third of a drive have the same lag."""
     ends = compare_ends(imu, gnss)
-    if ends is None or abs(ends.last_s - ends.first_s) <= APART_S:
+    if ends is None:
+        return
+    if (at := find_step(imu, gnss, ends)) is not None:
+        raise InputError(
+            f"{where}: the clock of IMU or GNSS steps between t = {at[0]:.0f} and {at[1]:.0f} s: the offset is "
+            f"{ends.first_s:+.2f} s before and {ends.last_s:+.2f} s after it; make two drives there"
+        )
+    if abs(ends.last_s - ends.first_s) <= APART_S:
         return
     ppm = 1e6 * ends.drift
     raise InputError(
         f"{where}: the clocks of IMU and GNSS drift apart, by about {ppm:.0f} ppm: {ends.first_s:+.1f} s at the "
         f"beginning, {ends.last_s:+.1f} s at the end; reader.gnss.time.drift_ppm={ppm:.0f} and "
         f"offset_s={ends.first_s:.1f}, then drift_ppm=auto on what is left"
-        if abs(ppm) < 1e5
+        if abs(ppm) < WORST_PPM
         else f"{where}: the clocks of IMU and GNSS have different seconds; correct reader.imu.time.unit"
     )
 

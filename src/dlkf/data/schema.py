@@ -18,6 +18,7 @@ NaN stands for unknown values. Any other column is carried along.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -144,7 +145,7 @@ def write_drive(
         row.setdefault("gnss_rate_hz", _rate(gnss["t"]))
     row.setdefault("duration_s", float(imu["t"].iloc[-1] - imu["t"].iloc[0]) if len(imu) else 0.0)
     way = gnss if reference is None else reference
-    row.setdefault("distance_m", float("nan") if way is None else driven_distance(way))
+    row.setdefault("distance_m", float("nan") if way is None else driven_distance(way_with_imu(way, imu)))
     return row
 
 
@@ -186,6 +187,18 @@ def check_name(drive: str) -> str:
 def _rate(t: pd.Series) -> float:
     step = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     return 1 / step if step else float("nan")
+
+
+def remove_drive(folder: str | Path, name: str) -> None:
+    """Delete the tables of a drive that :func:`write_drive` wrote."""
+    for kind in resolve_place(folder).iterdir():
+        shutil.rmtree(kind / f"drive={name}", ignore_errors=True)
+
+
+def way_with_imu(frame: pd.DataFrame, imu: pd.DataFrame) -> pd.DataFrame:
+    """The rows at times of the IMU, a second before and after it included."""
+    t = imu["t"].to_numpy()
+    return frame[frame["t"].between(t[0] - 1, t[-1] + 1)] if len(t) else frame
 
 
 def driven_distance(frame: pd.DataFrame) -> float:

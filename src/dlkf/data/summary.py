@@ -8,11 +8,13 @@ import pandas as pd
 from dlkf.data.discovery.motion import RESTING
 from dlkf.data.limits import EARTH_M
 from dlkf.data.readers.frames import DriveFrames
-from dlkf.data.schema import QUALITIES, driven_distance
+from dlkf.data.schema import QUALITIES, driven_distance, way_with_imu
+from dlkf.data.tables import Columns
 from dlkf.data.validate import usable_fixes
 
 AIDS = {"speed": "wheel speed", "heading": "heading", "baro": "barometer"}
 MISSING = 0.02  # share of the IMU's samples, from which on it is worth a word
+COVERED, LEFT_S = 0.8, 10.0  # of the longer of two logs by the shorter; less, and so many seconds, is worth a line
 STANDS_S = 2.0  # less is a creeping car
 
 
@@ -23,24 +25,36 @@ def drive_line(drive: DriveFrames) -> str:
     missing = 1 - len(step) * np.median(step) / (t[-1] - t[0])
     lost = f", {100 * missing:.2g} % of its samples missing" if missing > MISSING else ""
     detail = [_duration(t[-1] - t[0]), f"IMU {1 / np.median(step):.4g} Hz{lost}, largest gap {_short(step.max())}"]
-    if drive.gnss is None or not len(drive.gnss):
+    gnss = None if drive.gnss is None else way_with_imu(drive.gnss, drive.imu)
+    if gnss is None or not len(gnss):
         return ", ".join((*detail, "no GNSS"))
-    at, quality = drive.gnss["t"].to_numpy(), drive.gnss["quality"].to_numpy()
+    at, quality = gnss["t"].to_numpy(), gnss["quality"].to_numpy()
     shares = {int(q): float(np.mean(quality == q)) for q in np.unique(quality)}
     named = (f"{QUALITIES.get(q, f'quality {q}')} {100 * share:.3g} %" for q, share in shares.items())
-    fixed = at[usable_fixes(drive.gnss)]
+    fixed = at[usable_fixes(gnss)]
     gaps = np.diff(fixed)
     rate = f"{1 / np.median(np.diff(at)):.3g} Hz" if len(at) > 1 else "a single row"
     detail.append(f"GNSS {rate}, {len(fixed)} fixes ({', '.join(named)})")
     if len(gaps):
         detail.append(f"largest gap {_short(gaps.max())}")
-    if count_and_time := _standstills(drive.gnss):
+    if count_and_time := _standstills(gnss):
         detail.append("stands {} for {:.0f} s in all".format(*count_and_time))
-    detail.insert(1, f"{_way(drive.gnss) / 1000:.2f} km")
+    detail.insert(1, f"{_way(gnss) / 1000:.2f} km")
     detail += [_aid(name, table) for name, table in drive.aids.items()]
     if drive.reference is not None:
         detail.append(f"reference {100 * float(drive.reference['valid'].mean()):.3g} % valid")
     return ", ".join(detail)
+
+
+def describe_cover(imu: Columns, fixes: Columns) -> str | None:
+    """A line where one of IMU and fixes ends well before the other, or begins after it; None where they do not."""
+    spans = {"the IMU": (imu["t"][0], imu["t"][-1]), "the fixes": (fixes["t"][0], fixes["t"][-1])}
+    shared = min(last for _, last in spans.values()) - max(first for first, _ in spans.values())
+    for one, other in (("the IMU", "the fixes"), ("the fixes", "the IMU")):
+        whole = spans[other][1] - spans[other][0]
+        if whole - shared > max(LEFT_S, (1 - COVERED) * whole):
+            return f"{one} cover{'s' if one == 'the IMU' else ''} {shared:.0f} of {whole:.0f} s of {other}"
+    return None
 
 
 def _aid(name: str, table: pd.DataFrame) -> str:

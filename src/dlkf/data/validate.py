@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -27,7 +27,9 @@ MOST_SAME = 0.2  # of the rows, with the stamp of the row before: more are a rou
 MOST_REFUSED = (0.01, 0.2)  # of the samples, of the fixes; more are no accident
 MOST_SWITCH_M = 10_000.0  # m: fixes that go on so far off make two drives of one
 MOST_HOURS = 14  # between time zones
+LEAST_SPAN_S, LEAST_SHARED = 10.0, (1.0, 0.02)  # of fixes; by them and the IMU: seconds, share of the shorter
 NEAR_WRAP_S = 60.0
+COUNTERS_S = (2**16 / 1e3, 2**32 / 1e6, 2**32 / 1e3)  # of ms in 16 bits; of us, of ms in 32
 SET_BACK_S, MOST_SET_BACK = 5.0, 10  # stamps that go back by more, but not often, are of a clock that was set back
 
 
@@ -150,8 +152,8 @@ def _describe_rounding(t: np.ndarray) -> str:
     return "t is rounded; give more decimals"
 
 
-def check_time(t: np.ndarray, where: str, kind: str = "imu") -> None:
-    """InputError for stamps that do not rise from row to row."""
+def check_time(t: np.ndarray, where: str, kind: str = "imu", name_row: Callable[[int], str] = "row {}".format) -> None:
+    """InputError for stamps that do not rise from row to row; ``name_row`` calls a row as a user finds it."""
     refuse_rows({"t": t}, ("t",), lambda x: ~np.isfinite(x), where, "remove the row or give its time in seconds")
     back = np.flatnonzero(np.diff(t) <= 0)
     if len(back):
@@ -166,21 +168,38 @@ def check_time(t: np.ndarray, where: str, kind: str = "imu") -> None:
         if t[k + 1] == t[k]:
             coarse = " (of an IMU with a coarse clock: reader.imu.time.respace=true)" if kind == "imu" else ""
             rows = {"imu": "samples", "gnss": "fixes"}.get(kind, "rows")
-            raise InputError(f"{where}: row {k + 1}: t = {t[k]:.6f} appears twice; remove duplicate {rows}{coarse}")
+            raise InputError(
+                f"{where}: {name_row(k + 1)}: t = {t[k]:.6f} appears twice; remove duplicate {rows}{coarse}"
+            )
         raise InputError(
-            f"{where}: row {k + 1}: t goes back from {t[k]:.6f} to {t[k + 1]:.6f}; {_explain_return(t, k, kind)}"
+            f"{where}: {name_row(k + 1)}: t goes back from {t[k]:.6f} to {t[k + 1]:.6f}; {_explain_return(t, k, kind)}"
         )
 
 
 def _explain_return(t: np.ndarray, k: int, kind: str) -> str:
     """What stamps that go back after row ``k`` may be: of the next day, of a clock that was set back, out of order."""
     back = t[k] - t[k + 1]
+    if (wraps_s := _find_wrap(t)) is not None:
+        return f"they start again every {wraps_s:.6g} s: reader.{kind}.time.wraps_s={wraps_s:.10g}"
     for wraps_s, name in ((DAY_S, "at midnight"), (WEEK_S, "at the end of a week")):
         if abs(back - wraps_s) < NEAR_WRAP_S:
             return f"they start again {name}: add {wraps_s} s from there on (reader.{kind}.time.wraps_s={wraps_s})"
     if back > SET_BACK_S and int((np.diff(t) < 0).sum()) <= MOST_SET_BACK:
         return "the clock was set back there: make two drives of it; sorting would mix them"
     return "sort the rows"
+
+
+def _find_wrap(t: np.ndarray) -> float | None:
+    """The seconds after which a counter starts again: several jumps back of one size, or one of a counter's; None where
+    they are not."""
+    step = np.diff(t)
+    usual = float(np.median(step))
+    wraps = usual - step[step < 0]
+    near = [size for size in COUNTERS_S if (np.abs(wraps - size) <= 2 * usual).all()]
+    if near:
+        return near[0]
+    several = len(wraps) > 1 and float(np.median(wraps)) > SET_BACK_S and np.ptp(wraps) <= 2 * usual
+    return float(np.median(wraps)) if several else None
 
 
 def _check_rate(t: np.ndarray, where: str, kind: str) -> None:
@@ -256,6 +275,12 @@ def _check_gnss(gnss: Columns, imu: Columns, where: str) -> Columns:
         raise InputError(
             f"{where}: {span} lie{'' if len(t) > 1 else 's'} outside the IMU's {first:.3f} to {last:.3f}; "
             + _explain_outside(t, first, last)
+        )
+    span, shared = t[-1] - t[0], min(t[-1], last) - max(t[0], first)
+    if span > LEAST_SPAN_S and shared < max(LEAST_SHARED[0], LEAST_SHARED[1] * min(span, last - first)):
+        raise InputError(
+            f"{where}: fixes from t = {t[0]:.3f} to {t[-1]:.3f} share {max(shared, 0.0):.1f} s with the IMU, from "
+            f"{first:.3f} to {last:.3f}; give logs of the same drive, on one clock"
         )
     fixes = {name: values[fix] for name, values in gnss.items()}
     check_gnss_units(fixes, where)

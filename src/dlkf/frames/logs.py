@@ -87,7 +87,8 @@ def read_logs(source: str | Path, reader: str = "auto", *settings: str, skip_uns
     *settings : str
         What is known, as on the command line: ``"reader.imu.accel.unit=g"``, ``"reader.gnss.time.offset_s=0.3"``.
     skip_unsure : bool
-        Leave out drives with too little motion for what is to be found, with a warning; else the first is an error.
+        Leave out drives that cannot be read or have too little motion for what is to be found, with a warning; else
+        the first is an error.
 
     Returns
     -------

@@ -8,6 +8,7 @@ plus −n ln(1 − |ρ|²) of the other is the gain in log-likelihood over no co
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -118,6 +119,24 @@ def find_lag(imu: ImuSums, gnss: Motion, within_s: float | None = None) -> Lag |
     peak = lags[best] + STEP_S * find_peak(gain[best - 1 : best + 2])
     numbers = (lags[best], gain[best], other, yaws[best], forces[best], angles[best], peak)
     return Lag(*(float(x) for x in numbers))
+
+
+def compute_misfits(imu: ImuSums, gnss: Motion, lags: Callable[[Floats], Floats]) -> tuple[Floats, Floats]:
+    """The middles of the fixes' intervals, and the squares of what yaw rate and horizontal force miss of GNSS there,
+    each of its mean square, with ``lags`` of the middles added to the stamps of GNSS."""
+    first, last = gnss.intervals()
+    known, rate, pull = _gnss_signals(gnss, first, last)
+    yaw, force, there, start = _imu_signals(imu, float(np.median(gnss.t[last] - gnss.t[first])))
+    middle = 0.5 * (gnss.t[first] + gnss.t[last])[known]
+    cell = (middle + lags(middle) - start) / STEP_S
+    grid = np.arange(len(there))
+    inside = np.interp(cell, grid, there, left=0.0, right=0.0) > 0.99
+    out = np.zeros(len(middle))
+    for own, other in ((yaw, rate[known]), (force, pull[known])):
+        x, y = np.asarray(np.interp(cell, grid, own))[inside], other[inside]
+        gain = np.vdot(x, y) / max(float(np.vdot(x, x).real), 1e-12)
+        out[inside] += np.abs(y - gain * x) ** 2 / max(float(np.mean(np.abs(y) ** 2)), 1e-12)
+    return middle, out
 
 
 def find_peak(three: Floats) -> float:

@@ -7,12 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dlkf.data.discovery.clock import ImuSums, find_lag
+from dlkf.data.discovery.clock import ImuSums, compute_misfits, find_lag
 from dlkf.data.discovery.motion import Floats, Motion
 from dlkf.data.discovery.orientation import Pose, find_pose
 
 WORTH_A_LOOK, DOUBTFUL, CERTAIN = 1.5, 2.0, 4.5  # σ; a drift blurs the fit, so the first look's σ is too large
 LEAST_S = 0.008  # from the middle of the drive to its ends: less does not matter
+LEAST_STEP_S, STEPS = 0.25, 0.9  # of a clock; of the misfit with a drift, that of a step is less
+WORSE = 1.0  # misfit of a turn, or of an acceleration, at a wrong lag; straight roads have none
 ROUNDS = 6
 FEWEST = 60  # fixes of a drive whose ends are compared
 SEARCH_S = 30.0  # as far may the ends be from each other
@@ -42,6 +44,22 @@ def compare_ends(imu: ImuSums, gnss: Motion) -> Ends | None:
         seen.append((float(some.t.mean()), lag.peak_s))
     (begin, first), (end, last) = seen
     return Ends(first, last, (last - first) / (end - begin))
+
+
+def find_step(imu: ImuSums, gnss: Motion, ends: Ends) -> tuple[float, float] | None:
+    """Between which times a clock steps from the lag of one end to that of the other: where the car turns, brakes and
+    accelerates before and after it. None where a drift explains the motion as well, or the step is small."""
+    if abs(ends.last_s - ends.first_s) < LEAST_STEP_S:
+        return None
+    begin = float(gnss.t[gnss.t <= gnss.t[0] + (gnss.t[-1] - gnss.t[0]) / 3].mean())
+    at, drifting = compute_misfits(imu, gnss, lambda t: ends.first_s + ends.drift * (t - begin))
+    before = compute_misfits(imu, gnss, lambda t: 0 * t + ends.first_s)[1]
+    after = compute_misfits(imu, gnss, lambda t: 0 * t + ends.last_s)[1]
+    until = np.concatenate(([0.0], np.cumsum(before))) + np.concatenate((np.cumsum(after[::-1])[::-1], [0.0]))
+    if until.min() > STEPS * drifting.sum():
+        return None
+    near = np.flatnonzero(until < until.min() + WORSE)
+    return float(at[max(near[0] - 1, 0)]), float(at[min(near[-1], len(at) - 1)])
 
 
 def find_drifting_pose(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, lag_s: float) -> Pose | None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from dlkf.base.settings import Ranged
 from dlkf.data.discovery.clock import ImuSums, Lag, describe_offset, find_lag
-from dlkf.data.discovery.drift import ends_std, find_drifting_pose, middle
+from dlkf.data.discovery.drift import compare_ends, ends_std, find_drifting_pose, find_step, middle
 from dlkf.data.discovery.motion import MOVING, Floats, Motion, find_motion, position_delay
 from dlkf.data.discovery.orientation import Pose
 from dlkf.data.discovery.units import accel_units, nearest_unit, unit_left
@@ -97,6 +97,8 @@ def discover(
         remedy = "give it as the sensor's axis that counts the other way (x, y or z), the gyroscope's too if need be"
         seen = f"the axes seem left-handed: {detail}"
         return [*out, Finding("imu.accel.mirror", "y", False, seen, remedy=remedy)]
+    if lag is not None and away and (step := _clock_step(t - lag.lag_s, accel, gyro, moved, wanted)) is not None:
+        return [*out, step]
     pose = None
     if lag is not None:
         pose = find_drifting_pose(t, accel * factor, gyro, moved, lag.lag_s)
@@ -127,6 +129,19 @@ def _is_mirrored(t: Floats, accel: Floats, gyro: Floats, lag: Lag, gnss: Motion)
         return False
     other = find_lag(ImuSums.of(t, accel * [1.0, -1.0, 1.0], gyro), gnss)
     return other is not None and 1 - other.force < 0.5 * (1 - lag.force) and other.gain > 1.1 * lag.gain
+
+
+def _clock_step(t: Floats, accel: Floats, gyro: Floats, gnss: Motion, wanted: set[str]) -> Finding | None:
+    """A clock that was set during the drive: no offset is right, nor any drift."""
+    sums = ImuSums.of(t, accel, gyro)
+    ends = compare_ends(sums, gnss)
+    at = None if ends is None else find_step(sums, gnss, ends)
+    if ends is None or at is None:
+        return None
+    size, first, last = abs(ends.last_s - ends.first_s), *(time - gnss.t[0] for time in at)
+    detail = f"a clock steps by {size:.1f} s, {first:.0f} to {last:.0f} s after the first fix"
+    setting = next(name for name in sorted(wanted) if name.endswith("offset_s"))
+    return Finding(setting, None, False, detail, remedy="make two drives of it there")
 
 
 def _gyro_unit(gyro: Floats, pose: Pose | None, increments: bool) -> Finding:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from dlkf.navigation.earth import STANDARD_GRAVITY as G
 NEAR = 0.06  # of gravity: a scale error, the road's curves, a cold sensor
 ALIKE = 0.12  # of a unit's size, of what is regressed
 TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}  # of a stamp, in a second
+CLIMB_S, LEAST_CLIMB_M = 10.0, 1.0  # heights are compared over such stretches, of which the RMS of the climb is more
+CLIMBS_ALIKE = 0.7  # correlation
 SHAKES = np.radians((0.15, 8.0))  # rad/s RMS of a car on its way, noise and turns included; less wide than °/s in rad/s
 
 
@@ -66,6 +69,41 @@ def speed_factor(t: Floats, lat_deg: Floats, lon_deg: Floats, speed: Floats) -> 
     ratio = (moved[last] - moved[first])[far] / np.maximum((way[last] - way[first])[far], 1e-9)
     middle = float(np.median(ratio))
     return middle, float(np.median(np.abs(ratio - middle))) * 1.5
+
+
+class Climb(NamedTuple):
+    """How much the heights change per metre that the vertical velocity climbs: ``slope``, its 1σ, the correlation."""
+
+    slope: float
+    std: float
+    alike: float
+
+    def differs(self, factor: float, sigmas: float) -> bool:
+        """Whether the slope is above ``factor`` or below its inverse for certain, and not by a few wrong heights."""
+        doubt = sigmas * self.std
+        return self.alike > CLIMBS_ALIKE and (self.slope - doubt > factor or 0 < self.slope < 1 / factor - doubt)
+
+
+def compare_climbs(t: Floats, height: Floats, down: Floats) -> Climb | None:
+    """Heights against the integral of the downward velocity [m/s]; None without enough vertical motion.
+
+    Over stretches of ten seconds, one from every row: those that overlap count as one for the 1σ.
+    """
+    known = np.isfinite(height) & np.isfinite(down)
+    t, height, down = t[known], height[known], down[known]
+    if len(t) < 20:
+        return None
+    step = np.diff(t)
+    fallen = np.concatenate(([0.0], np.cumsum(step * (down[1:] + down[:-1]) / 2)))
+    first, last = stretches(t, CLIMB_S, step > 2.0)
+    climbed, rose = height[last] - height[first], fallen[first] - fallen[last]
+    if len(rose) < 10 or np.sqrt(np.mean(rose**2)) < LEAST_CLIMB_M:
+        return None
+    slope = float(climbed @ rose / (rose @ rose))
+    count = max(len(rose) * float(np.median(step)) / CLIMB_S, 1.0)
+    std = float(np.sqrt(np.mean((climbed - slope * rose) ** 2) / np.mean(rose**2) / count))
+    alike = abs(float(climbed @ rose)) / max(float(np.linalg.norm(climbed) * np.linalg.norm(rose)), 1e-12)
+    return Climb(slope, std, alike)
 
 
 def time_unit(values: Floats, slowest_s: float, fastest_s: float) -> str | None:

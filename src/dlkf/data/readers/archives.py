@@ -40,7 +40,11 @@ def unpack(path: Path) -> Iterator[Path]:
             raise InputError(f"{path}: cannot be unpacked ({error}); unpack it yourself and give the folder") from None
         while len(inside := [p for p in folder.iterdir() if p.name != "__MACOSX"]) == 1 and inside[0].is_dir():
             folder = inside[0]
-        yield folder
+        try:
+            yield folder
+        except InputError as error:
+            error.args = (str(error).replace(str(folder), str(path)),)  # where its user finds the files
+            raise
 
 
 def drive_places(source: Path) -> list[Path]:

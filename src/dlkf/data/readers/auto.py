@@ -14,15 +14,19 @@ from dlkf.data.readers.archives import drive_name, drive_places, is_archive, unp
 from dlkf.data.readers.formats import rosbag
 from dlkf.data.readers.frames import DriveFrames, Place
 from dlkf.data.readers.logs import LogReader
+from dlkf.data.readers.mapping import Mapped
 from dlkf.data.readers.offers import (
     NO_LOGS,
     Contents,
+    Known,
     Offer,
     find_format,
     leave_open,
+    matches,
     recognise_file,
     text_options,
 )
+from dlkf.data.readers.parts import join_parts
 from dlkf.data.readers.settling import Unsure
 
 LAYOUTS = {  # presets whose files are known by their names
@@ -77,7 +81,7 @@ class AutoReader:
             only = None
         if not source.is_dir():
             raise InputError(f"source={source}: no such file or folder; it holds one drive, or one subfolder per drive")
-        within = None if only is not None else _recognise_files(source)
+        within = None if only is not None else _recognise_files(source, self.known)
         if within is None or any(one.offers for one in within):
             named = source.absolute() if only is None or only.name == "metadata.yaml" else only
             return [(source, self.drive or named.name.partition(".")[0], only)]
@@ -99,7 +103,7 @@ class AutoReader:
             return self._drive(inside, name, only)
 
     def _drive(self, folder: Path, name: str, only: Path | None) -> DriveFrames:
-        within = [recognise_file(only)] if only is not None else _recognise_files(folder)
+        within = [recognise_file(only, self.known)] if only is not None else _recognise_files(folder, self.known)
         specs, detail = {}, []
         for kind in ("imu", "gnss"):
             chosen = self._choose_offer(within, kind, folder)
@@ -108,7 +112,8 @@ class AutoReader:
                 specs[kind] = {"file": None}
                 continue
             specs[kind] = merge_settings(chosen.specs[kind], self.known[kind])
-            there = chosen.name if chosen.table else specs[kind].get("file") or chosen.name
+            file = specs[kind].get("file")
+            there = chosen.name if chosen.table else ", ".join(file) if isinstance(file, list) else file or chosen.name
             detail += [f"found the {kind} in {there}: {chosen.detail}", *chosen.notes]
             if kind == "gnss" and (more := _find_velocities(chosen, specs[kind], [] if only else folder.iterdir())):
                 specs[kind]["velocity"] |= more
@@ -143,9 +148,11 @@ class AutoReader:
         offers, known = [o for one in within for o in one.offers], self.known[kind]
         fits = [o for o in offers if kind in o.specs] or (_join_sensors(offers) if kind == "imu" else [])
         if (file := known.get("file")) is not None:
-            fits = [o for o in fits if o.path.match(str(file))]
+            fits = [o for o in fits if matches(o.path, file)]
         if (table := known.get("table")) is not None and any(o.table for o in fits):
             fits = [o for o in fits if o.table == str(table)]
+        if len(fits) > 1 and (whole := _join_offers(fits, kind)) is not None:
+            return whole
         if len(fits) > 1:
             key = "table" if len({o.path for o in fits}) == 1 else "file"
             names = ", ".join((o.table or o.name) if key == "table" else o.name for o in fits)
@@ -158,14 +165,19 @@ class AutoReader:
         """InputError where a file that is asked for gives no such kind, or nothing an IMU."""
         offers = [o for one in within for o in one.offers]
         if (file := self.known[kind].get("file")) is not None:
+            if there := [one for one in within if matches(one.path, file)]:
+                columns = "accel.columns=[…] and .gyro.columns" if kind == "imu" else "position.columns"
+                raise InputError(
+                    f"{folder}: no {kind.upper()} found{_describe_files(there, offers)}; name its columns "
+                    f"(reader.{kind}.{columns}=[…])"
+                )
             have = ", ".join(o.name for o in offers if kind in o.specs) or "no file"
-            raise InputError(f"{folder}: reader.{kind}.file={file}: no such {kind.upper()} here; found in {have}")
+            raise InputError(f"{folder}: reader.{kind}.file={file}: no such file here; {kind.upper()} found in {have}")
         if kind == "imu":
             remedy = "give the folder that holds the IMU's file too, or name both" if only is not None else (
                 "name the reader and its columns (reader=csv reader.imu.file=… 'reader.imu.accel.columns=[…]' …)"
             )  # fmt: skip
-            where = only.parent if only is not None else folder
-            raise InputError(f"{where}: no IMU found{_describe_files(within, offers)}; {remedy}")
+            raise InputError(f"{only or folder}: no IMU found{_describe_files(within, offers)}; {remedy}")
 
     def _aid(self, within: list[Contents], kind: str, folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
         """The spec of an aid, and what it was found in; None where there is none, or file=null leaves it out."""
@@ -183,7 +195,7 @@ class AutoReader:
         return merge_settings(leave_open({kind: read_preset("reader", "csv")[kind]})[kind], known), []
 
 
-def _recognise_files(folder: Path) -> list[Contents]:
+def _recognise_files(folder: Path, known: Known) -> list[Contents]:
     """What the files of a folder hold; of one whose files are known by their names, that."""
     for name, files in LAYOUTS.items():
         if all((folder / file).is_file() for file in files) and _has_its_columns(folder / files[0], name):
@@ -192,7 +204,7 @@ def _recognise_files(folder: Path) -> list[Contents]:
             if (beside := BAROMETERS.get(name)) and (folder / beside).is_file():  # by the clock of the IMU
                 specs["baro"] = {**base["baro"], "file": beside}
             return [Contents(folder / files[0], [Offer(folder / files[0], f"layout of {name}", specs)])]
-    return [recognise_file(p) for p in sorted(folder.iterdir()) if p.is_file() and not p.name.startswith(".")]
+    return [recognise_file(p, known) for p in sorted(folder.iterdir()) if p.is_file() and not p.name.startswith(".")]
 
 
 def _has_its_columns(path: Path, layout: str) -> bool:
@@ -208,6 +220,23 @@ def _describe_files(within: Iterable[Contents], offers: Iterable[Offer] = ()) ->
         return ""
     more = f" and {len(said) - MOST_HELD} other files" if len(said) > MOST_HELD else ""
     return f" in {'; '.join(said[:MOST_HELD])}{more}"
+
+
+def _join_offers(offers: list[Offer], kind: str) -> Offer | None:
+    """Files of the same columns whose stamps follow each other as one log; None where they are none."""
+    specs = [{key: value for key, value in o.specs[kind].items() if key != "file"} for o in offers]
+    first = offers[0]
+    if any(spec != specs[0] for spec in specs) or any(o.table is not None for o in offers):
+        return None
+    spec = first.specs[kind]
+    name, options = spec.get("format", "csv"), spec.get("text") or {}
+    parts = [
+        Mapped(formats.read(name, o.path, kind=kind, table=spec.get("table"), text=options, where="reader"), spec, kind)
+        for o in offers
+    ]
+    if join_parts(parts) is None:
+        return None
+    return replace(first, specs={**first.specs, kind: {**spec, "file": [o.path.name for o in offers]}})
 
 
 def _join_sensors(offers: list[Offer]) -> list[Offer]:

@@ -16,13 +16,14 @@ class LogTable:
     """A table of a log file in the file's own columns and units.
 
     The index of ``frame`` numbers its rows as ``row`` calls them (line of a text file, row, message), for messages to
-    the user; ``notes`` are messages of the reader.
+    the user; ``notes`` are messages of the reader, ``beside`` further files whose rows follow.
     """
 
     frame: pd.DataFrame
     path: Path
     row: str = "row"
     notes: tuple[str, ...] = ()
+    beside: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)

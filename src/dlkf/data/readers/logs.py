@@ -35,9 +35,11 @@ from dlkf.data.readers.mapping import (
     select_rows,
     spread_stamps,
 )
+from dlkf.data.readers.parts import join_parts
 from dlkf.data.readers.settling import AUTO, Unsure, open_settings, placeholders, settle
 from dlkf.data.readers.sharing import layout
 from dlkf.data.readers.stamps import epoch_note, local_time_s
+from dlkf.data.validate import check_time
 
 TEXT = ("separator", "decimal", "header", "comment", "skip_rows", "encoding")
 NEAR_S = 0.05  # rows of two GNSS tables this close are of one fix
@@ -140,6 +142,8 @@ class LogReader:
             mapped = {kind: replace(part, spec=specs[kind]) for kind, part in mapped.items()}
             zero, t = self._times(mapped)
         frames = {kind: FRAMES[kind](part, t[kind]) for kind, part in mapped.items()}
+        for kind, part in mapped.items():
+            check_time(t[kind], f"drive {name}, {part.table.path.name}", kind, part.name_row)
         others = {kind: part for kind, part in every.items() if kind not in FRAMES}
         aids, specs, of_aids = read_aids(others, zero, mapped.get("gnss"), frames.get("gnss"), f"drive {name}")
         if self.wanted or of_aids:
@@ -187,28 +191,50 @@ class LogReader:
         return _join_parts(whole, parts) if parts else whole
 
     def _table(self, folder: Path, spec: Spec, kind: str, where: str, only: Path | None) -> Mapped:
-        path = _find_file(folder, spec, kind, where, only)
+        first, *others = _find_files(folder, spec, kind, where, only)
         text = {**self.text, **(spec.get("text") or {}), "lines": spec.get("lines")}
         if unknown := [key for key in text if key not in (*TEXT, "lines")]:
             raise InputError(f"{where}.text: unknown key {unknown[0]}; known are {', '.join(TEXT)}")
         name = None if spec.get("table") is None else str(spec["table"])
-        table = formats.read(spec.get("format") or "csv", path, kind=kind, table=name, text=text, where=where)
-        return Mapped(table, spec, kind)
+
+        def read(path: Path) -> Mapped:
+            table = formats.read(spec.get("format") or "csv", path, kind=kind, table=name, text=text, where=where)
+            return Mapped(table, spec, kind)
+
+        whole = read(first)
+        if not others:
+            return whole
+        try:
+            joined = join_parts([whole, *map(read, others)])
+        except InputError:
+            joined = None
+        if joined is not None:
+            return joined
+        if isinstance(spec.get("file"), str):
+            names = ", ".join(path.name for path in (first, *others))
+            raise InputError(
+                f"{folder}: {names} match {spec['file']}, and are no parts of one log: their columns differ or their "
+                f"times overlap; set {where}.file"
+            )
+        return whole
 
 
-def _find_file(folder: Path, spec: Spec, kind: str, where: str, only: Path | None) -> Path:
-    if only is not None and any(only.match(str(p)) for p in _patterns(spec.get("file"))):
-        return only
-    found = _match_files(folder, spec.get("file"))
-    if len(found) != 1:
+def _find_files(folder: Path, spec: Spec, kind: str, where: str, only: Path | None) -> list[Path]:
+    """The file of a kind; several that match a pattern, or are listed by their names, may be parts of one log."""
+    patterns = _patterns(spec.get("file"))
+    if only is not None and any(only.match(p) for p in patterns):
+        return [only]
+    listed = [found for p in patterns if (found := _match_files(folder, p))]
+    if len(listed) > 1 and len(listed) == len(patterns) and all(len(found) == 1 for found in listed):
+        return [path for (path,) in listed]
+    if not listed:
         seen = [] if only is not None else sorted(p.name for p in folder.iterdir() if not p.name.startswith("."))
         have = ", ".join(seen[:8]) or (only.name if only is not None else "nothing")
-        what = "no" if not found else f"{len(found)} files match, one must be"
         without = ", or reader.reference=null" if kind == "reference" else ""
         raise InputError(
-            f"{folder}: {what} {kind} file {_name_patterns(spec.get('file'))}; has {have}; set {where}.file{without}"
+            f"{folder}: no {kind} file {_name_patterns(spec.get('file'))}; has {have}; set {where}.file{without}"
         )
-    return found[0]
+    return listed[0]
 
 
 def _patterns(file: Any) -> list[str]:
@@ -266,11 +292,26 @@ def _join_parts(whole: Mapped, parts: Mapping[str, Mapped]) -> Mapped:
 
 
 def _list_unread_files(folder: Path, mapped: Mapping[str, Mapped]) -> list[str]:
-    """A line on files beside those that were read, of the same suffixes."""
-    read = {p.table.path.name for whole in mapped.values() for p in (whole, *whole.parts.values())}
-    suffixes = {Path(name).suffix.lower() for name in read} - {""}
-    left = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in suffixes and p.name not in read)
-    return [f"files that are not read: {list_some(left, MOST_NAMED)}"] if left else []
+    """Lines on files beside those that were read, of the same suffixes, and on subfolders that have such."""
+    tables = [p.table for whole in mapped.values() for p in (whole, *whole.parts.values())]
+    read = {path for table in tables for path in (table.path, *table.beside)}
+    suffixes = {path.suffix.lower() for path in read} - {""}
+
+    def lists_logs(inside: Path) -> bool:
+        return inside not in {up for path in read for up in path.parents} and any(
+            p.suffix.lower() in suffixes for p in inside.iterdir()
+        )
+
+    names = {path.name for path in read}
+    left = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in suffixes and p.name not in names)
+    below = sorted(p.name for p in folder.iterdir() if p.is_dir() and p.name[0] not in "._" and lists_logs(p))
+    said = [f"files that are not read: {list_some(left, MOST_NAMED)}"] if left else []
+    if below:
+        said.append(
+            f"subfolders that are not read: {list_some(below, MOST_NAMED)}, since files beside them make a drive; "
+            "give each as source, or move these files into a subfolder too"
+        )
+    return said
 
 
 def _list_unread_velocities(gnss: Mapped | None) -> list[str]:

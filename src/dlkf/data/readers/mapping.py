@@ -219,6 +219,13 @@ class Mapped:
         parts = {key: part.rows(keep) for key, part in self.parts.items()}
         return replace(self, table=replace(self.table, frame=self.table.frame[keep]), parts=parts)
 
+    def name_row(self, row: int) -> str:
+        """A row by its number in the file, with its stamp as it stands there."""
+        column = self.time.get("column")
+        names = [str(one) for one in (column if isinstance(column, list) else [column]) if one is not None]
+        there = [f"{name} {self.table.frame[name].iloc[row]}" for name in names if name in self.table.frame]
+        return f"{self.table.row} {self.table.frame.index[row]}" + (f" ({', '.join(there)})" if there else "")
+
     def fail(self, row: int, name: str | int, what: str) -> None:
         """Raise InputError for a row, by its number in the file."""
         number = self.table.frame.index[row]

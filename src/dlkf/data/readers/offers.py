@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from dlkf.base.config import read_preset
@@ -15,6 +16,7 @@ from dlkf.data.readers import formats, recognise, vocabulary
 from dlkf.data.readers.formats import autopilot, matlab, nmea, rosbag, text, ubx
 from dlkf.data.readers.frames import LogTable
 
+Known = Mapping[str, Mapping[str, Any]]
 GNSS_ONLY = ("nmea", "rtklib", "inertial_explorer")
 PRESETS = (*GNSS_ONLY, "ubx", "rosbag", "gnss_logger", "novatel", "navego", "px4", "ardupilot")
 WITH_AIDS = {"ubx": ubx, "nmea": nmea, "rosbag": rosbag, "px4": autopilot, "ardupilot": autopilot}
@@ -28,6 +30,8 @@ NO_LOGS = {  # formats of other programs, and what makes a table of them
     **dict.fromkeys((".mf4", ".mdf", ".blf"), "a CAN or measurement log; export its signals as CSV"),
     **dict.fromkeys((".pcap", ".pcapng"), "a capture of network packets; save the device's own log"),
 }
+# at the beginning of a line, where a logger's stamp may stand before it; elsewhere it is a column of a table
+SENTENCE = re.compile(rb"(?:^|[\r\n])(?:[^$,;\t\r\n]*[,;\t])?[^$,;\t\r\n]*\$[A-Z]{2}(?:GGA|RMC|GNS),")
 LARGEST_PEEK = 400  # lines
 MOST_ABOVE = 60  # lines above a header
 NAVEGO = {"imu": "fb_0", "gnss": "stdm_0"}  # a column of each of NaveGo's structures
@@ -59,8 +63,9 @@ class Contents:
     held: str = ""
 
 
-def recognise_file(path: Path) -> Contents:
-    """What a file holds."""
+def recognise_file(path: Path, known: Known = MappingProxyType({})) -> Contents:
+    """What a file holds; ``known`` are a user's settings by kind, whose ``format`` and columns count for their file."""
+    known = {kind: spec for kind, spec in known.items() if matches(path, spec.get("file"))}
     try:
         with path.open("rb") as file:
             begins = file.read(64)
@@ -72,11 +77,12 @@ def recognise_file(path: Path) -> Contents:
         return Contents(path, held=NO_LOGS[".html"])
     if begins.startswith(b"PK\3\4"):
         return Contents(path, held="a .zip; give it as source, or unpack it")
-    name = find_format(path)
+    stated = [spec["format"] for spec in known.values() if spec.get("format") and spec.get("file")]
+    name = stated[0] if stated else find_format(path)
     if name is None:
         return Contents(path, held="of no format that is known" if begins else "empty")
     if name == "matlab":
-        return _offer_matlab(path)
+        return _offer_matlab(path, known)
     if name in PRESETS:
         return _offer_preset(path, name)
     try:
@@ -86,8 +92,24 @@ def recognise_file(path: Path) -> Contents:
         return Contents(path, held=str(error).removeprefix(f"{path}: "))
     if (count := len(table.frame.columns)) > recognise.MOST_COLUMNS:
         return Contents(path, held=f"a table of {count} columns, which no log has")
-    found = _offer_table(path, name, table, options, None)
-    return Contents(path, found, "" if found else recognise.describe_missing(table))
+    found = _offer_table(path, name, table, options, None, known)
+    if not found:
+        return Contents(path, held=recognise.describe_missing(table))
+    return Contents(path, found, _describe_lone_sensor(table, found[0]))
+
+
+def matches(path: Path, file: Any) -> bool:
+    """Whether a file is the one, or one of several, of a setting ``file``; any is of none."""
+    return file is None or any(path.match(str(one)) for one in (file if isinstance(file, (list, tuple)) else [file]))
+
+
+def _describe_lone_sensor(table: LogTable, offer: Offer) -> str:
+    """What a table offers and which sensor it lacks of an IMU of which it has the other; empty where it has neither."""
+    triads = vocabulary.find_triads([str(name) for name in table.frame.columns])
+    alone = {*triads, *offer.specs} & {*recognise.COUNTERPARTS}
+    if len(alone) != 1 or "imu" in offer.specs:
+        return ""
+    return f"{offer.detail}, without {recognise.COUNTERPARTS[alone.pop()]}"
 
 
 def _offer_preset(path: Path, name: str) -> Contents:
@@ -117,24 +139,32 @@ def _describe_lack(path: Path, name: str, kind: str, base: Mapping[str, Any]) ->
     return None if len(table.frame) > 10 else f" (only {len(table.frame)} samples)"
 
 
-def _offer_matlab(path: Path) -> Contents:
+def _offer_matlab(path: Path, known: Known) -> Contents:
     try:
         tables = matlab.frames(path)
     except InputError as error:
         return Contents(path, held=str(error).removeprefix(f"{path}: "))
     if all(mark in tables.get(kind, ()) for kind, mark in NAVEGO.items()):
         return _offer_preset(path, "navego")
-    found = [o for name, frame in tables.items() for o in _offer_table(path, "matlab", LogTable(frame, path), {}, name)]
+    found = [
+        offer
+        for name, frame in tables.items()
+        for offer in _offer_table(path, "matlab", LogTable(frame, path), {}, name, known)
+    ]
     first = list(tables.items())[:4]
     said = "; ".join(f"{name}: {recognise.describe_missing(LogTable(frame, path))}" for name, frame in first)
     return Contents(path, found, said or "no matrix and no structure of vectors")
 
 
-def _offer_table(path: Path, name: str, table: LogTable, options: dict[str, Any], part: str | None) -> list[Offer]:
+def _offer_table(
+    path: Path, name: str, table: LogTable, options: dict[str, Any], part: str | None, known: Known
+) -> list[Offer]:
     table = recognise.convert_numbers(table)
-    imu, gnss = recognise.imu_spec(table), None
-    if imu is None or vocabulary.find_column(map(str, table.frame.columns), "lat"):
-        gnss = recognise.gnss_spec(table)
+    named = {kind: recognise.named_columns(table, spec) for kind, spec in known.items()}
+    imu, gnss = recognise.imu_spec(table, named.get("imu", {})), None
+    place = named.get("gnss", {})
+    if imu is None or "position" in place or vocabulary.find_column(map(str, table.frame.columns), "lat"):
+        gnss = recognise.gnss_spec(table, place)
     source: dict[str, Any] = {"format": name, "file": path.name, "text": options}
     source |= {"table": part} if part is not None else {}
     time = next((one.spec["time"] for one in (imu, gnss) if one is not None), None)
@@ -146,7 +176,7 @@ def _offer_table(path: Path, name: str, table: LogTable, options: dict[str, Any]
     if len(found) == 2:
         source["rows"] = "filled"
     specs = {kind: {**source, **one.spec} for kind, one in found.items()}
-    columns = ", ".join(str(c) for spec in (specs or aids).values() for c in _columns(spec))
+    columns = ", ".join(dict.fromkeys(str(c) for spec in (specs or aids).values() for c in _columns(spec)))
     notes = tuple(note for one in found.values() for note in one.notes)
     specs = leave_open(specs | aids, stated=True)
     return [Offer(path, f"{name} with {columns}", specs, notes, part)] if specs else []
@@ -169,7 +199,7 @@ def find_format(path: Path) -> str | None:
         return "matlab"
     if b"\xb5b\x01\x07" in head:
         return "ubx"
-    if len(re.findall(rb"\$[A-Z]{2}(GGA|RMC|GNS),", head)) >= 3:
+    if len(SENTENCE.findall(head)) >= 3:
         return "nmea"
     if path.suffix == ".gz":
         return "csv"
@@ -229,7 +259,8 @@ def _preset_text(base: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def leave_open(specs: Mapping[str, Any], stated: bool = False) -> dict[str, dict[str, Any]]:
-    """Specs with everything that can be estimated left open, but an accelerometer's unit that a header ``stated``."""
+    """Specs with everything that can be estimated left open, but an accelerometer's unit and that of
+    the heights where a header ``stated`` them."""
     out = {kind: copy.deepcopy(dict(spec)) for kind, spec in specs.items()}
     for kind, spec in out.items():
         if kind == "imu":
@@ -241,7 +272,8 @@ def leave_open(specs: Mapping[str, Any], stated: bool = False) -> dict[str, dict
         if kind == "gnss":
             spec["time"]["drift_ppm"] = "auto"
             spec["velocity"] = {**(spec.get("velocity") or {}), "unit": "auto"}
-            spec["position"] = {**spec["position"], "zero": "none", "delay_s": "auto"}
+            left = {"height_unit": "auto"} if stated else {}  # a preset's format defines it
+            spec["position"] = {**left, **spec["position"], "zero": "none", "delay_s": "auto"}
     return out
 
 

@@ -36,6 +36,7 @@ READINGS: dict[str, dict[int, int]] = {
 }
 GGA, UBLOX, MAVLINK, RTKLIB, ROS, CARRIER = READINGS
 GOOD_M, POOR_M = 0.15, 1.0  # accuracy of an RTK fix; of one that is none
+LEAST_RTK_MM = 5.0  # no receiver states less
 
 
 def quality_spec(frame: pd.DataFrame, column: str | None, accuracy_m: float) -> tuple[Spec | None, list[str]]:
@@ -46,6 +47,8 @@ def quality_spec(frame: pd.DataFrame, column: str | None, accuracy_m: float) -> 
     if column is None:
         return None, []
     values = frame[column]
+    if not any(str(word).strip() for word in values.dropna().unique()):
+        return None, [f"quality {column} is empty: all count as single"]
     numbers = pd.to_numeric(values, errors="coerce")
     if not bool(numbers.notna().any()):
         words = _read_words(values, column)
@@ -66,6 +69,12 @@ def quality_spec(frame: pd.DataFrame, column: str | None, accuracy_m: float) -> 
         spec["map"] = {str(x): code for x, code in codes.items()}
         spec["default"] = 0
     notes = [f"quality {column}: {_describe_codes(codes)}, taken as {chosen}"]
+    named, usual = fits[0], int(numbers.mode().iloc[0])
+    if chosen != named and accuracy_m > LEAST_RTK_MM and READINGS[named][usual] in (4, 5):
+        notes.append(
+            f"accuracies of {accuracy_m:g} m in the median are none of RTK; if they are mm: "
+            "reader.gnss.std_position.unit=mm"
+        )
     others = {name: {x: READINGS[name][x] for x in codes} for name in fits if name != chosen}
     if likely := next((n for n in _likely(column) if n in others and others[n] != codes), None):
         map_ = "{" + ", ".join(f"{x}: {code}" for x, code in others[likely].items()) + "}"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +27,8 @@ PRESSURES = {"pa": (6e4, 1.1e5), "hpa": (600.0, 1100.0), "kpa": (60.0, 110.0)}
 SPEED_UNITS = ("km/h", "mph", "m/s", "knots", "rpm")
 MOST_COLUMNS = 500  # no log of a car has more; each is looked at in many ways
 NEAR_GRAVITY = 0.08
-HIGHEST_M = 9000.0  # of a road
+NONE_NAMED: Mapping[str, list[str]] = MappingProxyType({})
+COUNTERPARTS = {"accel": "a gyroscope", "gyro": "an accelerometer"}  # what a table with one sensor alone lacks
 COARSE = 0.2  # of the samples, with the stamp of the one before: the clock is coarser than the rate
 
 
@@ -36,20 +39,28 @@ class Recognised(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def imu_spec(table: LogTable) -> Recognised | None:
-    """The mapping of a table that holds an IMU; None if it does not."""
+def named_columns(table: LogTable, known: Mapping[str, Any]) -> dict[str, list[str]]:
+    """The columns that a user's settings name for each entry of a mapping, of those entries that a table has whole."""
+    entries = {key: spec["columns"] for key, spec in known.items() if isinstance(spec, Mapping) and spec.get("columns")}
+    _, names = _select_numeric(table)
+    return {key: [str(c) for c in columns] for key, columns in entries.items() if {*map(str, columns)} <= {*names}}
+
+
+def imu_spec(table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED) -> Recognised | None:
+    """The mapping of a table that holds an IMU, in the columns that are ``named`` by entry (:func:`named_columns`) or
+    known by their names or numbers; None if it does not."""
     frame, names = _select_numeric(table)
-    triads = {key: vocabulary.triad(names, stem) for key, stem in vocabulary.SENSORS.items()}
-    if triads["accel"] and triads["gyro"]:
+    triads = vocabulary.find_triads(names) | {key: named[key] for key in vocabulary.SENSORS if key in named}
+    if len(triads) == 2:
         known = frame[triads["accel"] + triads["gyro"]].notna().all(axis=1)
         time = stamps.time_spec(table, known, SLOWEST_IMU_S, FASTEST_IMU_S)
         if time is None:
             return None
-        sensors = {key: {"columns": columns} for key, columns in triads.items() if columns}
+        sensors = {key: {"columns": columns} for key, columns in triads.items()}
         sensors["accel"] |= _find_stated_unit(frame, triads["accel"])
         notes = _spread(frame[known], time)
         return Recognised({"time": time, **sensors}, notes)
-    if any(triads.values()) or vocabulary.find_column(names, "lat"):
+    if triads or vocabulary.find_column(names, "lat"):
         return None
     spec = by_numbers.imu_spec(frame)
     if spec is None:
@@ -77,7 +88,7 @@ def sensor_spec(table: LogTable, called: str) -> dict[str, Spec]:
     which counts where the columns are plain x, y, z."""
     frame, names = _select_numeric(table)
     for key, stem in vocabulary.SENSORS.items():
-        columns = vocabulary.triad(names, stem)
+        columns = vocabulary.find_triads(names).get(key)
         if columns is None and vocabulary.has(called, rf"\b{stem}\b"):
             columns = vocabulary.triad(names, "(?:)") or vocabulary.triad(names, r"\w*")
         if columns is None:
@@ -89,12 +100,13 @@ def sensor_spec(table: LogTable, called: str) -> dict[str, Spec]:
     return {}
 
 
-def gnss_spec(table: LogTable) -> Recognised | None:
-    """The mapping of a table that holds fixes; None if it does not."""
+def gnss_spec(table: LogTable, named: Mapping[str, list[str]] = NONE_NAMED) -> Recognised | None:
+    """The mapping of a table that holds fixes, in the columns ``named`` as an IMU's; None if it does not."""
     frame, names = _select_numeric(table)
     found = {key: vocabulary.find_column(names, key) for key in vocabulary.QUANTITIES}
+    found |= dict(zip(("lat", "lon", "height"), named.get("position", ())))
     lat, lon, height = (found[key] for key in ("lat", "lon", "height"))
-    if (lat is None or lon is None) and any(vocabulary.triad(names, stem) for stem in vocabulary.SENSORS.values()):
+    if (lat is None or lon is None) and vocabulary.find_triads(names):
         return None
     if lat is None or lon is None:
         spec = by_numbers.gnss_spec(table)
@@ -114,14 +126,14 @@ def gnss_spec(table: LogTable) -> Recognised | None:
     position: Spec = {"columns": [lat, lon, height], "unit": _angle_unit(frame, found)}
     if (unit := vocabulary.find_unit(height)) in units.LENGTH:
         position["height_unit"] = unit
-    elif float(frame[height].abs().median()) > HIGHEST_M:
-        position["height_unit"] = "mm"  # as u-blox has it
     if found["geoid"] is not None:
         position["geoid"] = found["geoid"]
     if (sides := _hemispheres(table.frame[known])) is not None:
         position["hemispheres"] = sides
     velocity, more = _velocity(found), []
-    if velocity is None:
+    if "velocity" in named:
+        velocity = {"columns": named["velocity"], "frame": "ned"}
+    elif velocity is None:
         velocity = _velocity_by_numbers(table, frame[known], time, position)
         if columns := velocity["columns"]:
             more = [f"took {', '.join(columns)} for the velocities by the way between the positions"]
@@ -162,7 +174,7 @@ def _hemispheres(frame: pd.DataFrame) -> list[str] | None:
 def _find_repeated(frame: pd.DataFrame, place: list[str]) -> pd.Series | None:
     """Rows that repeat the position before, in a table of IMU samples beside which most do; else None."""
     names = [str(c) for c in frame.columns]
-    if len(frame) < 10 or not any(vocabulary.triad(names, stem) for stem in vocabulary.SENSORS.values()):
+    if len(frame) < 10 or not vocabulary.find_triads(names):
         return None
     same = (frame[place] == frame[place].shift()).all(axis=1)
     return same if same.mean() > 0.5 else None
@@ -227,7 +239,7 @@ def describe_missing(table: LogTable) -> str:
     """What a table has and what it lacks, in words, for a line that refuses it."""
     table = convert_numbers(table)
     _, names = _select_numeric(table)
-    has = [key for key, stem in vocabulary.SENSORS.items() if vocabulary.triad(names, stem)]
+    has = list(vocabulary.find_triads(names))
     has += ["positions"] if vocabulary.find_column(names, "lat") else []
     columns = [str(c) for c in table.frame.columns]
     text = f"columns {', '.join(columns[:12])}{', …' if len(columns) > 12 else ''}"
@@ -236,7 +248,7 @@ def describe_missing(table: LogTable) -> str:
         if lat is not None and len(table.frame):
             return f"{text}: {lat} has text such as {table.frame[lat].iloc[0]}, must be decimal degrees"
         return f"{text}, of which none is known"
-    lacks = [] if len(has) > 1 or "positions" in has else [{"accel": "a gyroscope", "gyro": "an accelerometer"}[has[0]]]
+    lacks = [] if len(has) > 1 or "positions" in has else [COUNTERPARTS[has[0]]]
     if "positions" in has:
         lacks += [] if vocabulary.find_column(names, "lon") else ["a longitude"]
         lacks += [] if vocabulary.find_column(names, "height") else ["a height (one number in all rows will do)"]

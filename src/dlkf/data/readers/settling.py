@@ -13,7 +13,9 @@ import pandas as pd
 
 from dlkf.base.errors import InputError
 from dlkf.data.discovery.findings import Finding, Sure, discover, find_accel_unit, find_value
-from dlkf.data.discovery.units import speed_factor
+from dlkf.data.discovery.motion import find_motion
+from dlkf.data.discovery.units import compare_climbs, nearest_unit, speed_factor
+from dlkf.data.plausibility import check_dead_axes
 from dlkf.data.readers import units
 from dlkf.data.readers.contract import gnss_frame, imu_frame, positions
 from dlkf.data.readers.mapping import Mapped
@@ -25,7 +27,7 @@ from dlkf.data.validate import check_time, usable_fixes
 AUTO = "auto"
 AXES = {"imu.accel.axes", "imu.gyro.axes"}
 NEUTRAL: dict[str, Any] = {  # settings that may be auto, and what stands there until they are known
-    **dict.fromkeys(("imu.accel.unit", "imu.gyro.unit", "gnss.velocity.unit"), 1.0),
+    **dict.fromkeys(("imu.accel.unit", "imu.gyro.unit", "gnss.velocity.unit", "gnss.position.height_unit"), 1.0),
     **dict.fromkeys(AXES, "frd"),
     **dict.fromkeys(("imu.time.offset_s", "gnss.time.offset_s", "gnss.time.drift_ppm", "gnss.position.delay_s"), 0.0),
 }
@@ -37,6 +39,7 @@ USUAL = {
 }
 MOSTLY = 0.8  # of the fixes
 FEWEST_FIXES = 3  # below, no finding has a spread
+HIGHEST_M = 9000.0  # of a road
 LEAST_GRAVITY = 0.5  # of the mean force: the length of the mean; with gravity in it nearly 1
 
 
@@ -89,7 +92,7 @@ def settle(
             f"motion of a car{why}; copy the log again, or leave the drive out"
         )
     for kind in ("imu", "gnss"):
-        check_time(t[kind], f"{where}, {mapped[kind].table.path.name}", kind)
+        check_time(t[kind], f"{where}, {mapped[kind].table.path.name}", kind, mapped[kind].name_row)
     found: list[Finding] = []
     if "gnss.velocity.unit" in wanted:
         found.append(_speed_unit(mapped["gnss"], t["gnss"]))
@@ -99,9 +102,13 @@ def settle(
     if "imu.accel.unit" in wanted:
         _refuse_without_gravity(imu, where)
     gnss = gnss_frame(replace(mapped["gnss"], spec=specs["gnss"]), t["gnss"])
+    if "gnss.position.height_unit" in wanted:
+        found.append(_height_unit(gnss))
+    samples, fixes = _keep_rising(imu), _keep_rising(gnss[usable_fixes(gnss)])
+    check_dead_axes(samples, find_motion(fixes), f"{where}, {mapped['imu'].table.path.name}", frd=False)
     found += discover(
-        _keep_rising(imu),
-        _keep_rising(gnss[usable_fixes(gnss)]),
+        samples,
+        fixes,
         wanted | ({"imu.axes"} if AXES & wanted else set()),
         sure,
         increments=bool(mapped["imu"].spec.get("increments")),
@@ -143,6 +150,19 @@ def _speed_unit(gnss: Mapped, t: np.ndarray) -> Finding:
         remedy = "latitude and longitude look swapped: exchange them in reader.gnss.position.columns"
         return replace(finding, value=None, remedy=remedy)
     return finding
+
+
+def _height_unit(gnss: pd.DataFrame) -> Finding:
+    """By the vertical velocity; without one metres, but mm as u-blox has them where no road is as high."""
+    setting, heights = "gnss.position.height_unit", gnss["height_m"].to_numpy()
+    climb = compare_climbs(*(gnss[name].to_numpy() for name in ("t", "height_m", "vel_d")))
+    unit = None if climb is None else nearest_unit(1 / climb.slope, climb.std / climb.slope**2, units.LENGTH)
+    if unit is not None and climb is not None:
+        return Finding(setting, unit, True, f"they change {climb.slope:.3g} ± {climb.std:.1g} times as vel_d says")
+    size = float(np.nanmedian(np.abs(heights)))
+    if size > HIGHEST_M:
+        return Finding(setting, "mm", True, f"{size:.0f} in the median, as u-blox has them; no vel_d tells")
+    return Finding(setting, "m", True, "no vel_d tells another unit")
 
 
 def _unit_by_way(t: np.ndarray, lat_deg: np.ndarray, lon_deg: np.ndarray, speed: np.ndarray) -> Finding:

@@ -22,15 +22,17 @@ SENSORS = {
     "accel": r"(?:(?:total|raw) )?(?:acc(?:el(?:eration|erometer|erometre)?)?|specific ?force|g ?force|force|f|a|fb"
     r"|accelerometer acceleration|beschl(?:eunigung(?:ssensor|smesser)?)?|acel(?:er(?:acion|ometro)?)?"
     r"|加速度(?:计|計|センサ|センサー)?)",
-    "gyro": r"(?:raw )?(?:gyro?(?:s[ck]op(?:e|io)?|met(?:er|re))?|omega|w|g|ang(?:ular)? ?(?:velocity|vel|rate|speed)"
+    "gyro": r"(?:raw )?(?:gyr?o?(?:s[ck]op(?:e|io)?|met(?:er|re))?|omega|w|g|ang(?:ular)? ?(?:velocity|vel|rate|speed)"
     r"|rate|(?:motion )?(?:rotation|turn) ?rate|gyro(?:scope)? rotation|wb"
     r"|drehrate|drehgeschwindigkeit|winkelgeschwindigkeit|kreisel|vitesse (?:angulaire|de rotation)"
     r"|giro(?:scopi?o|metro)?"
     r"|velocidad angular|角速度|陀螺仪?|陀螺儀|ジャイロ(?:センサー?)?)",
 }
+LINEAR = r"linear ?acc(?:el(?:eration)?)?"  # a phone's is without gravity, ROS' with it: beside a gyroscope alone
+ANGLES = ("roll", "pitch", "yaw")
 AXES = {
     axis: rf"(?:{axis}|(?:axis|achse|axe|eje) {axis}|{axis} ?(?:axis|achse|axe|eje|轴|軸)(?: ?方向)?)"
-    for axis in "xyz012"
+    for axis in (*"xyz012", *ANGLES)
 }
 
 QUANTITIES: dict[str, list[str]] = {
@@ -113,8 +115,8 @@ UNITS = {
     **dict.fromkeys(("m s2", "mps2", "m s 2", "ms2", "ms 2", "m s s"), "m/s2"),
     **dict.fromkeys(("mm s", "mmps"), "mm/s"),
     **dict.fromkeys(("cm s", "cmps"), "cm/s"),
-    **dict.fromkeys(("rad s", "rps", "rads"), "rad/s"),
-    **dict.fromkeys(("deg s", "dps", "grad s", "° s"), "deg/s"),
+    **dict.fromkeys(("rad s", "rps", "rads", "rad sec"), "rad/s"),
+    **dict.fromkeys(("deg s", "dps", "grad s", "° s", "deg sec"), "deg/s"),
     **dict.fromkeys(("deg", "degree", "degrees", "grad", "°", "度"), "deg"),
     **{
         u: u for u in ["g", "mg", "rad", "m", "mm", "cm", "km", "ft", "s", "ms", "us", "ns", "pa", "hpa", "mbar", "rpm"]
@@ -184,13 +186,25 @@ def match_columns(names: Iterable[str], pattern: str) -> list[str]:
     return [name for name in names if re.fullmatch(pattern, words(name)) or re.fullmatch(pattern, _plain(name))]
 
 
-def triad(names: Sequence[str], stem: str) -> list[str] | None:
+def find_triads(names: Sequence[str]) -> dict[str, list[str]]:
+    """The columns of the accelerometer and of the gyroscope, of those that a table has.
+
+    ``roll_rate``, ``pitch_rate``, ``yaw_rate`` are a gyroscope too, ``linear_acceleration.x`` is an accelerometer
+    beside one.
+    """
+    accel, gyro = triad(names, SENSORS["accel"]), triad(names, SENSORS["gyro"])
+    gyro = gyro or triad(names, SENSORS["gyro"], (ANGLES,))
+    accel = accel or (triad(names, LINEAR) if gyro else None)
+    return {key: columns for key, columns in (("accel", accel), ("gyro", gyro)) if columns}
+
+
+def triad(names: Sequence[str], stem: str, triples: Sequence[Sequence[str]] = ("xyz", "012")) -> list[str] | None:
     """Three columns of one sensor: ``acc_x``, ``accX``, ``x_acc``, ``加速度X轴``, ``Beschleunigung X-Achse``."""
     bare = [(name, words(name)) for name in names]
-    for axes in ("xyz", "012"):
+    for axes in triples:
         found = []
         for axis in axes:
-            both = rf"(?:imu )?(?:{stem} ?{AXES[axis]}|{AXES[axis]} ?{stem})(?: ?(?:wert|value))?"
+            both = rf"(?:(?:imu|field|data|msg) )*(?:{stem} ?{AXES[axis]}|{AXES[axis]} ?{stem})(?: ?(?:wert|value))?"
             found.append(next((name for name, said in bare if re.fullmatch(both, said)), None))
         if all(found):
             return [str(f) for f in found]
