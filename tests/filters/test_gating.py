@@ -265,3 +265,18 @@ def test_a_stationary_car_may_have_a_receiver_that_holds_its_position(name):
     batch = slipping(3, 120, (0.0,) * 5, stop=60.0)
     held = stopped_receiver(batch, slice(62, 120), 0.0)
     assert solved(held, name).used.all()
+
+
+@pytest.mark.parametrize("name", ["mbkf15_gated", "mbkf21_car_gated", "plus"])
+@pytest.mark.parametrize("wrong", ["zero", "5 m/s more"])
+def test_wrong_velocities_are_not_followed_where_positions_contradict_them(name, wrong):
+    """For half a minute, beside positions of 5 cm: nearly the solution of the positions alone, and no position is
+    refused."""
+    batch = cars(name, 80)
+    gnss, valid = batch.gnss.clone(), batch.gnss_valid.clone()
+    gnss[:, 40:70, 3:] = 0.0 if wrong == "zero" else gnss[:, 40:70, 3:] + gnss.new_tensor([3.0, 4.0, 0.0])
+    valid[:, 40:70, 3:] = False
+    both = beside(replace(batch, gnss=gnss), replace(batch, gnss_valid=valid))
+    found = solved(both, name)
+    error = (found.posterior.p_n - both.truth.p_n)[:, 40:, :2].norm(dim=-1)
+    assert found.used.all() and error[:3].max() < error[3:].max() + 0.1

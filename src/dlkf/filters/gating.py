@@ -12,8 +12,9 @@ large innovations all the time, and loses no fixes for that; an outlier is one t
 
 A filter that is sure of a wrong position would refuse good fixes; so with ``PATIENCE`` in a row that agree with each
 other they pass, and z² is added to the variance: the position is elsewhere, for whichever reason, and attitude and
-biases need not explain it. A receiver that repeats the same fix while the car moves is frozen, and not used until it
-changes.
+biases need not explain it. Velocities do not pass in this way while positions in the same fixes show that they are
+wrong: those are no outliers, but would be if the filter had moved with the refused velocities. Nor do such velocities
+become usual. A receiver that repeats the same fix while the car moves is frozen, and not used until it changes.
 
 Filters without that gate have a coarse one that cannot be switched off (:class:`CoarseGate`): a fix ``COARSE_SIGMAS``
 off, such as the first one after a tunnel, is left out, and so are the fixes of a frozen receiver: positions that are
@@ -240,7 +241,8 @@ class Gate:
         S = _predicted_variance(epoch, P) + R + FLOOR * FLOOR
         square = average_by_part(torch.where(used, z.square() / S, 0.0))
         offered = used[:, PARTS] & ~frozen.unsqueeze(-1)
-        outlier = offered & (square > memory.limits * torch.exp(memory.usual))
+        limit = memory.limits * torch.exp(memory.usual)
+        outlier = offered & (square > limit)
         wrong = torch.stack((outlier[:, :2].any(-1), outlier[:, 2:].any(-1)), -1)
 
         age = memory.age + span
@@ -253,6 +255,12 @@ class Gate:
         seen = torch.stack((offered[:, :2].any(-1), offered[:, 2:].any(-1)), -1)
         refused = torch.where(wrong, refused, torch.where(seen, 0.0, memory.refused))
         follows = wrong & (refused >= PATIENCE)
+        # with refused velocities, positions would be off by so much: where they are not, the filter is right
+        way = z[:, 3:] * used[:, 3:] * (span * refused[:, 1:])
+        far = average_by_part(torch.cat((z[:, :3] - way, way), -1).square() / S)[:, :2]
+        fits = offered[:, :2] & ~outlier[:, :2] & (far > limit[:, :2])
+        denied = torch.stack((torch.zeros_like(position), (outlier[:, 2:] & fits).any(-1)), -1)
+        follows = follows & ~denied
         of_parts, of_components = follows[:, [0, 0, 1, 1]], follows[:, [0, 0, 0, 1, 1, 1]]
 
         passed = offered & (~outlier | of_parts)
@@ -260,7 +268,7 @@ class Gate:
         more = square > square.new_tensor(MEDIANS) * torch.exp(memory.usual)
         usual = (memory.usual + torch.where(more, USUAL_STEP, -USUAL_STEP)).clamp_min(0.0)
         return GateMemory(
-            torch.where(offered, usual, memory.usual),
+            torch.where(offered & ~denied[:, [0, 0, 1, 1]], usual, memory.usual),
             torch.where(follows, 0.0, refused),
             torch.where(wrong[:, [0, 0, 0, 1, 1, 1]], z, memory.innovation),
             torch.where(wrong, 0.0, age),
