@@ -289,7 +289,9 @@ static void close_epochs(dlkf *d, int ended) {
 dlkf_status dlkf_imu(dlkf *d, double t, const double accel[3], const double gyro[3]) {
   d->made = d->given = 0;
   const int64_t spiked = d->samples.spiked;
-  const dlkf_status status = dlkf_samples_take(&d->samples, t, accel, gyro);
+  const double *v = d->last + DLKF_VEL_N;
+  const int moves = d->latest && v[0] * v[0] + v[1] * v[1] + v[2] * v[2] > FROZEN_SPEED_M_S * FROZEN_SPEED_M_S;
+  const dlkf_status status = dlkf_samples_take(&d->samples, t, accel, gyro, moves);
   d->counts[DLKF_SPIKE] += d->samples.spiked - spiked;
   if (status != DLKF_TAKEN) {
     if (!dlkf_samples_lost(&d->samples)) return dlkf_counted(d, status);
@@ -368,7 +370,8 @@ const char *dlkf_says(dlkf_status status) {
       "refused: the stamp is before the last one", "refused: a gap before the stamp", "refused: more samples than the memory holds",
       "refused: no fix", "refused: latitude, longitude or 1-sigma out of range", "refused: not reachable since the last good fix", "refused: too late",
       "refused: ahead of the IMU; both need one clock", "refused: this filter takes no such sensor", "restarted: stamps were inconsistent for a second",
-      "the filter diverged and realigns", "the filter was far from good fixes and realigns", "an isolated spike of the IMU, left out"};
+      "the filter diverged and realigns", "the filter was far from good fixes and realigns", "an isolated spike of the IMU, left out",
+      "refused: the IMU repeats the same sample while the car moves"};
   return (unsigned)status < DLKF_STATUSES ? words[status] : "no such status";
 }
 

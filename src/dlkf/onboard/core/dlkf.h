@@ -70,6 +70,7 @@ typedef enum {
   DLKF_DIVERGED,    /* only a count: the state was not finite, so the filter aligns anew */
   DLKF_LOST,        /* only a count: far off ten good fixes in a row, or where no car can be; it aligns anew */
   DLKF_SPIKE,       /* only a count: a sample proved to be an isolated spike, and was left out */
+  DLKF_FROZEN,      /* refused: all six numbers of the IMU have been the same for half a second on a moving car */
   DLKF_STATUSES
 } dlkf_status;
 
@@ -160,6 +161,7 @@ typedef struct {
   double step, longest;   /* in force: usual, and longest that is no gap [s] */
   double t0;              /* of the grid; NAN: not laid yet */
   double astray[2];       /* first and last stamp of a run out of line; NAN: none */
+  double same[6], since[2]; /* the last sample; first and last stamp of its repetitions; NAN: none */
   int64_t epochs;         /* closed */
   int64_t spiked;         /* samples that proved to be spikes */
   dlkf_spikes spikes;
@@ -259,7 +261,7 @@ extern const int dlkf_columns, dlkf_search_seconds;
 int dlkf_fits(const dlkf *d);
 
 /* Between the files of the core. */
-dlkf_status dlkf_samples_take(dlkf_samples *s, double t, const double accel[3], const double gyro[3]);
+dlkf_status dlkf_samples_take(dlkf_samples *s, double t, const double accel[3], const double gyro[3], int moves);
 void dlkf_samples_clear(dlkf_samples *s);
 int dlkf_samples_lost(const dlkf_samples *s);
 int dlkf_samples_begin(dlkf_samples *s, const double *t_fix, int count);

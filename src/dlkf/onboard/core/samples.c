@@ -25,7 +25,7 @@ void dlkf_samples_clear(dlkf_samples *s) {
   s->first = s->count = 0;
   s->spiked = 0;
   memset(&s->spikes, 0, sizeof s->spikes);
-  s->astray[0] = s->astray[1] = s->t0 = NAN;
+  s->astray[0] = s->astray[1] = s->t0 = s->since[0] = s->since[1] = NAN;
   s->step = s->step_s;
   s->longest = longest(s->step_s);
   s->epochs = 0;
@@ -61,13 +61,26 @@ static dlkf_status out_of_line(dlkf_samples *s, double t, double last) {
   return t > last ? DLKF_GAP : t < last ? DLKF_BACK : DLKF_DOUBLE;
 }
 
-dlkf_status dlkf_samples_take(dlkf_samples *s, double t, const double accel[3], const double gyro[3]) {
+/* Whether all six numbers have been the same for longer than a working sensor repeats them. */
+static int repeats(dlkf_samples *s, const dlkf_sample *x) {
+  int same = x->t >= s->since[1] && x->t - s->since[1] <= s->longest;
+  for (int k = 0; k < 6; k++) same &= x->x[k] >= s->same[k] && x->x[k] <= s->same[k];
+  if (!same) {
+    memcpy(s->same, x->x, sizeof s->same);
+    s->since[0] = x->t;
+  }
+  s->since[1] = x->t;
+  return x->t - s->since[0] > FROZEN_IMU_S;
+}
+
+dlkf_status dlkf_samples_take(dlkf_samples *s, double t, const double accel[3], const double gyro[3], int moves) {
   dlkf_sample sample = {t, {accel[0], accel[1], accel[2], gyro[0], gyro[1], gyro[2]}};
   double sum = t;
   for (int k = 0; k < 6; k++) sum += sample.x[k];
   if (!isfinite(sum)) return DLKF_NOT_FINITE;
   for (int k = 0; k < 6; k++)
     if (fabs(sample.x[k]) > (k < 3 ? FULL_SCALE_ACCEL : FULL_SCALE_GYRO)) return DLKF_IMPLAUSIBLE;
+  if (repeats(s, &sample) && moves) return DLKF_FROZEN;
   const double last = dlkf_samples_latest(s);
   if (s->count && !(last < t && t <= last + s->longest)) return out_of_line(s, t, last);
   if (s->count == DLKF_RAW) {
