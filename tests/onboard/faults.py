@@ -162,6 +162,13 @@ def _repeated(sent: Calls) -> Calls:
     return out
 
 
+def _often(sent: Calls) -> Calls:
+    """Each fix four times more in the second after it."""
+    again = [Call("gnss", (c.arguments[0] + 0.2 * k, *c.arguments[1:])) for c in sent if c.kind == "gnss"
+             for k in range(1, 5)]  # fmt: skip
+    return sorted([*sent, *again], key=lambda call: call.arguments[0])
+
+
 def _fast_speeds(sent: Calls) -> Calls:
     """Speeds between those of the drive at every sample of five seconds, the first ten of them once more."""
     fast = [
@@ -221,7 +228,7 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "single fixes": (_one_by_one(
         "gnss", 0.5,
         lambda x: [x, x],
-        lambda x: [x, _put(x, 0, x[0] - 0.3)],  # an older one of the same interval
+        lambda x: [x, (x[0] - 0.3, x[1] + 1e-7, *x[2:])],  # an older one of the same interval
         lambda x: _put(x, 4, WITHOUT_VELOCITY),
         lambda x: [x, _put(x, 0, x[0] + 100)],  # ahead of the samples
         lambda x: _put(x, 1, nan),
@@ -278,6 +285,7 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     **{name: (lambda sent, jump=JUMPS[jump], late=late: late(jump(sent)), ("implausible_fix",))
        for name, (jump, late) in JUMPS_LATE.items()},
     "a frozen receiver without velocity down": (lambda sent: LEVEL(_frozen(sent)), ("implausible_fix",)),
+    "fixes at 5 Hz that hold the last position": (lambda sent: _often(ALONE(_frozen(sent))), ()),
     "a receiver that holds its last position": (lambda sent: ALONE(_frozen(sent)), ()),
     "sensors that mark invalid values": (
         _changed("speed", _between(25.0, 28.0), lambda x: _put(x, 1, 1.7e308)), ("implausible",)),

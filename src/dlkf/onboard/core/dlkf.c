@@ -163,12 +163,20 @@ static void run(dlkf *d, int64_t number, int revised) {
   }
 }
 
-/* The fix of a boundary: the latest report of its update interval that the screen takes, or none. */
+static int same_place(const dlkf_report *a, const dlkf_report *b) {
+  return !(a->lat_deg < b->lat_deg || a->lat_deg > b->lat_deg || a->lon_deg < b->lon_deg || a->lon_deg > b->lon_deg ||
+           a->height_m < b->height_m || a->height_m > b->height_m);
+}
+
+/* The fix of a boundary: the latest report of its update interval that the screen takes and that does not repeat the
+ * position before, or none. */
 static void put_fix(dlkf *d, int64_t row) {
   dlkf_fix *fix = &d->fixes[row % DLKF_BOUNDARIES];
   const dlkf_report *x = NULL;
-  for (int k = d->report_count; k-- && !x;)
-    if (report_at(d, k)->used && (int64_t)dlkf_samples_place(&d->samples, report_at(d, k)->t) == row) x = report_at(d, k);
+  for (int k = 0; k < d->report_count; k++) {
+    const dlkf_report *one = report_at(d, k);
+    if (one->used && (int64_t)dlkf_samples_place(&d->samples, one->t) == row && !(x && same_place(x, one))) x = one;
+  }
   if (!x) {
     if (fix->number == row) fix->number = -1;
     return;
