@@ -44,8 +44,8 @@ void dlkf_open(dlkf *d, const double *lever_arm_b) {
 }
 
 void dlkf_lay(dlkf *d, double t, double step_s) {
-  d->samples.phase_s = isfinite(t) ? t : NAN;
-  d->samples.step_s = step_s > 0 && step_s < EPOCH_S ? step_s : NAN;
+  d->samples.phase_s = isfinite(t) ? t : (double)NAN;
+  d->samples.step_s = step_s > 0 && step_s < EPOCH_S ? step_s : (double)NAN;
   clear(d);
 }
 

@@ -19,7 +19,8 @@
 #include "step.h"
 
 /* Sizes, whole numbers for the compiler's command line: how late a fix or an aid may come, how fast an IMU or a further sensor may be
- * for samples to be kept that long before the first fixes (a faster one is taken, and starts with fewer of them), and
+ * for samples to be kept that long before the first fixes (a faster one is taken, and starts with fewer of them, as long
+ * as those of an update interval fit), and
  * for how long a search for the heading goes on; 0: none, the course of the first motion is the heading. */
 #ifndef DLKF_LATE_S
 #define DLKF_LATE_S 10
@@ -32,6 +33,10 @@
 #endif
 #ifndef DLKF_SEARCH_S
 #define DLKF_SEARCH_S 20
+#endif
+
+#if DLKF_LATE_S < 0 || DLKF_IMU_HZ < 1 || DLKF_AID_HZ < 1 || DLKF_SEARCH_S < 0
+#error DLKF_LATE_S and DLKF_SEARCH_S must be whole numbers from 0 on, DLKF_IMU_HZ and DLKF_AID_HZ from 1 on
 #endif
 
 #define DLKF_KEEP_S (DLKF_LATE_S > 6 ? DLKF_LATE_S : 6)            /* samples before the update intervals are laid */
@@ -195,6 +200,10 @@ typedef struct {
   int64_t counts[DLKF_STATUSES];
   double work[DLKF_WORK];
 } dlkf;
+
+#if DLKF_RAW < DLKF_SAMPLES || DLKF_KEEP_S * DLKF_RATE_MILLIHZ < DLKF_SAMPLES * 1000
+#error DLKF_IMU_HZ and DLKF_LATE_S leave no room for the samples of an update interval
+#endif
 
 #if DLKF_WORK < DLKF_EARLY
 #error DLKF_EARLY is more than there is room for

@@ -31,12 +31,12 @@ void dlkf_samples_clear(dlkf_samples *s) {
   s->epochs = 0;
 }
 
-double dlkf_samples_latest(const dlkf_samples *s) { return s->count ? at(s, s->count - 1)->t : -INFINITY; }
+double dlkf_samples_latest(const dlkf_samples *s) { return s->count ? at(s, s->count - 1)->t : -(double)INFINITY; }
 
 /* Stamp of the last sample that can no longer prove to be a spike. */
 double dlkf_samples_settled(const dlkf_samples *s) {
   const int k = s->count - 1 - s->spikes.undecided;
-  return k < 0 ? -INFINITY : at(s, k)->t;
+  return k < 0 ? -(double)INFINITY : at(s, k)->t;
 }
 
 double dlkf_samples_boundary(const dlkf_samples *s, int64_t number) { return s->t0 + (double)number * EPOCH_S; }
@@ -250,7 +250,7 @@ static void resampled(const dlkf_samples *s, double begin, double span, int coun
     double total[6] = {0}, products[6] = {0};
     int pieces = 0;
     while (now < limit) {
-      const double knot = early ? opening : k < end ? at(s, k)->t : INFINITY;
+      const double knot = early ? opening : k < end ? at(s, k)->t : (double)INFINITY;
       const double until = knot < limit ? knot : limit;
       double piece[6];
       for (int c = 0; c < 6; c++) piece[c] = force[c] * (until - now);
