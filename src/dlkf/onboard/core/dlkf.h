@@ -56,7 +56,7 @@
 
 /* What became of a sample, a fix or an aid. */
 typedef enum {
-  DLKF_TAKEN,       /* counts from now on, or at the end of its update interval */
+  DLKF_TAKEN,       /* counts from now on; a fix is stored, for the filter at the end of its update interval */
   DLKF_REPLAYED,    /* came late: the filter went back and came again; dlkf_next gives those rows anew */
   DLKF_SUPERSEDED,  /* a later one of the same update interval is there already */
   DLKF_NOT_FINITE,  /* refused: a number is NaN or infinite */
@@ -266,7 +266,8 @@ const char *dlkf_waits_for(dlkf_waiting waiting);
 extern const size_t dlkf_bytes;
 extern const int dlkf_columns, dlkf_search_seconds;
 
-/* 1 where sizeof(dlkf) bytes that were stored are a filter of this header and may go on, else 0. */
+/* 1 where sizeof(dlkf) bytes that were stored have the layout of this header, else 0. Damage elsewhere is not detected:
+ * store a checksum with them. */
 int dlkf_fits(const dlkf *d);
 
 /* Between the files of the core. */
